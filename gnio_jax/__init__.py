@@ -1,0 +1,1 @@
+"""gnio-jax: Gated Neural Inertial Odometry in JAX. See README.md."""

@@ -1,0 +1,263 @@
+"""Static configuration: frozen dataclasses, strict YAML, validated once before anything is loaded.
+
+One experiment is one YAML file of a `TrainConfig`; a run keeps its own as `config.yaml`. Fields named on the command
+line win over the file, the file over the defaults, and the defaults are the paper's.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import types
+import typing
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import yaml
+
+from gnio_jax.files import replacing
+from gnio_jax.types import InputError
+
+
+@dataclass(frozen=True)
+class DataConfig:
+    """Which recordings, and how windows are cut from them."""
+
+    rate: float = 200.0
+    """Samples per second everything is resampled to, Hz."""
+    window_seconds: float = 1.0
+    """Length of the network's window, s (paper: 1 s)."""
+    stride_seconds: float = 0.1
+    """Distance of window starts, and of the filter's clones, s (paper: 0.1 s)."""
+    window_rotation: Literal["per_sample", "single"] = "per_sample"
+    """Rotate each sample with its own attitude, or the whole window with that of its start (eq. 1 read literally)."""
+    train_split: str = "train"
+    """Split of the dataset the network learns from."""
+    val_split: str = "val"
+    """Split of the dataset that chooses the best checkpoint."""
+
+    @property
+    def window(self) -> int:
+        """Samples in a window."""
+        return round(self.window_seconds * self.rate)
+
+    @property
+    def stride(self) -> int:
+        """Samples between window starts, which is also one clone interval of the filter."""
+        return round(self.stride_seconds * self.rate)
+
+
+@dataclass(frozen=True)
+class AugmentConfig:
+    """Random changes of a training window (TLIO's; the paper is silent). Zero or false switches one off."""
+
+    gyro_bias: float = 0.05
+    """Half-width of the uniform constant gyro bias, rad/s."""
+    accel_bias: float = 0.2
+    """Half-width of the uniform constant accelerometer bias, m/s²."""
+    tilt_degrees: float = 5.0
+    """Largest tilt of gravity about a random horizontal axis, degrees."""
+    yaw: bool = True
+    """Turn window and target by a random yaw."""
+    gyro_noise: float = 0.0
+    """Standard deviation of white gyro noise, rad/s."""
+    accel_noise: float = 0.0
+    """Standard deviation of white accelerometer noise, m/s²."""
+
+
+@dataclass(frozen=True)
+class ModelConfig:
+    """The network (paper §III-B..E) and its ablation switches."""
+
+    name: str = "gnio"
+    """Network in the registry of `gnio_jax.models`."""
+    width: int = 64
+    """Channels of the first encoder group; features are 8 × width (paper: 64)."""
+    bank_size: int = 64
+    """Prototypes in the Motion Bank; 0 leaves the bank out (paper: 64)."""
+    bank_heads: int = 8
+    """Attention heads of the bank's query."""
+    head: Literal["gated", "linear"] = "gated"
+    """Displacement as scale × gate, or a plain linear layer."""
+    gate: Literal["tanh", "sigmoid"] = "tanh"
+    """Activation of the gate."""
+    scale: Literal["softplus", "pos_elu", "abs", "exp", "linear"] = "softplus"
+    """Activation of the scale."""
+
+
+@dataclass(frozen=True)
+class LossConfig:
+    """Weighted sum of squared error and Gaussian negative log-likelihood (paper §III-F)."""
+
+    mse_weight: float = 1e2
+    """λ_MSE."""
+    nll_weight: float = 1e-4
+    """λ_NLL."""
+    nll_from_epoch: int = 0
+    """First epoch in which the likelihood counts: above 0 the two-stage reading of the paper's text."""
+    log_std_floor: float | None = None
+    """Smallest log standard deviation the likelihood sees (TLIO: log 1e-3); none by default."""
+
+
+@dataclass(frozen=True)
+class OptimConfig:
+    """Adam with linear warm-up and cosine decay (paper §IV-A)."""
+
+    epochs: int = 200
+    """Passes over the training windows."""
+    batch_size: int = 1024
+    """Windows per step."""
+    learning_rate: float = 1e-4
+    """Peak, reached after the warm-up."""
+    start_learning_rate: float = 1e-6
+    """At the first step."""
+    end_learning_rate: float = 1e-6
+    """At the last step."""
+    warmup_epochs: float = 5.0
+    """Epochs of linear warm-up."""
+    clip_norm: float | None = None
+    """Largest global norm of the gradient; none by default."""
+
+
+@dataclass(frozen=True)
+class FilterOptions:
+    """What the stochastic-cloning EKF believes about the IMU and its start (METHOD §4; TLIO's values)."""
+
+    gyro_density: float = 3.16e-4
+    """White gyro noise, rad/s/√Hz."""
+    accel_density: float = 1.0e-3
+    """White accelerometer noise, m/s²/√Hz."""
+    gyro_bias_walk: float = 1e-6
+    """Random walk of the gyro bias, rad/s/√s."""
+    accel_bias_walk: float = 1e-4
+    """Random walk of the accelerometer bias, m/s²/√s."""
+    tilt_std_degrees: float = 1.0
+    """Initial standard deviation of roll and pitch."""
+    yaw_std_degrees: float = 0.1
+    """Initial standard deviation of yaw."""
+    velocity_std: float = 1.0
+    """Initial standard deviation of the velocity, m/s."""
+    position_std: float = 1e-3
+    """Initial standard deviation of the position, m."""
+    gyro_bias_std: float = 1e-4
+    """Initial standard deviation of the gyro bias, rad/s."""
+    accel_bias_std: float = 0.02
+    """Initial standard deviation of the accelerometer bias, m/s²."""
+    measurement_scale: float = 10.0
+    """The network's covariance is multiplied by this before the update."""
+    mahalanobis_fail_scale: float = 0.0
+    """0 skips a rejected update; above 0 its covariance is multiplied by this and it is applied."""
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """One experiment: everything `python train.py` needs, kept with the run as config.yaml."""
+
+    dataset: str = "synthetic"
+    """Dataset to learn from; `python train.py --dataset ?` lists the known ones."""
+    data_root: str | None = None
+    """Folder of the dataset; without it $GNIO_DATA/<dataset>, then data/<dataset>."""
+    workdir: str | None = None
+    """Where checkpoints and logs go; without it runs/<dataset>_<model>."""
+    seed: int = 0
+    """Seed of the initial parameters, the shuffling and the augmentation."""
+    data: DataConfig = field(default_factory=DataConfig)
+    augment: AugmentConfig = field(default_factory=AugmentConfig)
+    model: ModelConfig = field(default_factory=ModelConfig)
+    loss: LossConfig = field(default_factory=LossConfig)
+    optim: OptimConfig = field(default_factory=OptimConfig)
+    filter: FilterOptions = field(default_factory=FilterOptions)
+    checkpoint_every_seconds: float = 600.0
+    """Longest time between checkpoints within an epoch, s; every epoch ends with one anyway."""
+
+
+def load(path: str | Path) -> TrainConfig:
+    """Read a `TrainConfig` from a YAML file. Raises `InputError` on a missing file, an unknown key or a wrong type."""
+    path = Path(path)
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise InputError(path, "no such config file", "see configs/ for the ones that come with the package") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(path, f"cannot be read ({error})") from None
+    except yaml.YAMLError as error:
+        raise InputError(path, f"is not YAML ({' '.join(str(error).split())})") from None
+    return _build(TrainConfig, {} if content is None else content, str(path), "")
+
+
+def save(path: str | Path, config: TrainConfig) -> None:
+    """Write `config` as YAML that `load` reads back to an equal value."""
+    with replacing(path) as temporary:
+        temporary.write_text(yaml.safe_dump(dataclasses.asdict(config), sort_keys=False), encoding="utf-8")
+
+
+def _build(kind: type, content: Any, source: str, prefix: str) -> Any:
+    if not isinstance(content, dict):
+        raise InputError(source, f"{prefix.rstrip('.') or 'the file'} must be a mapping of fields, found {type(content).__name__}")
+    hints = typing.get_type_hints(kind)
+    for key in content:
+        if key not in hints:
+            close = difflib.get_close_matches(str(key), hints, n=1)
+            raise InputError(source, f"unknown field '{prefix}{key}'",
+                             f"did you mean '{prefix}{close[0]}'?" if close else f"known fields: {', '.join(hints)}")
+    return kind(**{key: _value(hints[key], value, source, prefix + key) for key, value in content.items()})
+
+
+def _value(hint: Any, value: Any, source: str, name: str) -> Any:
+    if dataclasses.is_dataclass(hint):
+        return _build(typing.cast(type, hint), value, source, name + ".")
+    options = typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
+    if value is None and type(None) in options:
+        return None
+    for option in options:
+        if typing.get_origin(option) is Literal:
+            if value in typing.get_args(option):
+                return value
+        elif option is float and isinstance(value, int | float) and not isinstance(value, bool):
+            return float(value)
+        elif option in (int, str, bool) and type(value) is option:
+            return value
+    wanted = " or ".join(_spell(option) for option in options)
+    remedy = ""
+    if isinstance(value, str) and float in options:
+        try:
+            remedy = f"YAML reads '{value}' as text: write {float(value)!r} with a dot and a sign, such as 1.0e-4"
+        except ValueError:
+            pass
+    raise InputError(source, f"field '{name}' must be {wanted}, found {value!r}", remedy)
+
+
+def _spell(option: Any) -> str:
+    if typing.get_origin(option) is Literal:
+        return "one of " + ", ".join(typing.get_args(option))
+    return {float: "a number", int: "a whole number", str: "text", bool: "true or false", type(None): "null"}[option]
+
+
+def validate(config: TrainConfig, source: str = "config") -> TrainConfig:
+    """Return `config` if its values make sense together; raises `InputError` naming the first field that does not."""
+
+    def require(condition: bool, name: str, problem: str) -> None:
+        if not condition:
+            raise InputError(source, f"field '{name}' {problem}")
+
+    data, optim, model = config.data, config.optim, config.model
+    for name, value in [("data.rate", data.rate), ("data.window_seconds", data.window_seconds), ("data.stride_seconds", data.stride_seconds),
+                        ("optim.learning_rate", optim.learning_rate), ("filter.measurement_scale", config.filter.measurement_scale),
+                        ("filter.gyro_density", config.filter.gyro_density), ("filter.accel_density", config.filter.accel_density)]:
+        require(value > 0, name, f"must be positive, found {value!r}")
+    for name, value in [("optim.epochs", optim.epochs), ("optim.batch_size", optim.batch_size), ("model.width", model.width),
+                        ("model.bank_heads", model.bank_heads)]:
+        require(value >= 1, name, f"must be at least 1, found {value!r}")
+    for section in ("augment", "filter"):
+        for key, value in dataclasses.asdict(getattr(config, section)).items():
+            require(value >= 0, f"{section}.{key}", f"must not be negative, found {value!r}")
+    for name, seconds in [("data.window_seconds", data.window_seconds), ("data.stride_seconds", data.stride_seconds)]:
+        samples = seconds * data.rate
+        require(abs(samples - round(samples)) < 1e-6, name, f"is not a whole number of samples at {data.rate:g} Hz ({samples:g})")
+    require(data.window % data.stride == 0, "data.stride_seconds", f"must divide the window of {data.window_seconds:g} s")
+    require(model.bank_size >= 0, "model.bank_size", f"must not be negative, found {model.bank_size!r}")
+    require((8 * model.width) % model.bank_heads == 0, "model.bank_heads", f"must divide the {8 * model.width} features")
+    require(optim.warmup_epochs <= optim.epochs, "optim.warmup_epochs", f"must not exceed optim.epochs = {optim.epochs}")
+    require(optim.clip_norm is None or optim.clip_norm > 0, "optim.clip_norm", "must be positive or null")
+    return config

@@ -1,0 +1,78 @@
+"""The values that cross a room's door: what every dataset, network and estimator agrees on.
+
+Units are SI (s, rad, m), quaternions are wxyz, the world is z-up with gravity (0, 0, -9.81) m/s².
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Bool, Float
+
+Array = jax.Array | np.ndarray
+
+GRAVITY = 9.81
+"""Magnitude of gravity in the world frame, m/s² (METHOD: g = (0, 0, -9.81))."""
+
+STANDARD_G = 9.80665
+"""The unit "G" in which phones report acceleration, m/s²."""
+
+
+class InputError(ValueError):
+    """A mistake a user can mend: its text is one line naming the place, the problem and the remedy.
+
+    The command lines print it on stderr and leave with exit status 2.
+    """
+
+    def __init__(self, where: object, problem: str, remedy: str = ""):
+        parts = [f"{where}: {problem}", remedy]
+        super().__init__("; ".join(part for part in parts if part).replace("\n", " "))
+
+
+class Sequence(NamedTuple):
+    """One recording: IMU and reference on one uniform clock. Host arrays in float64.
+
+    A recording without (part of) a reference holds NaN there and `valid` is False.
+    """
+
+    name: str
+    time: Float[np.ndarray, "n"]
+    """Stamps, s, strictly increasing and uniform. Sample k drives the interval [t_k, t_{k+1}]."""
+    gyro: Float[np.ndarray, "n 3"]
+    """Angular rate in the IMU body frame, rad/s."""
+    accel: Float[np.ndarray, "n 3"]
+    """Specific force in the IMU body frame, m/s² (level at rest reads +9.81 on the up axis)."""
+    orientation: Float[np.ndarray, "n 4"]
+    """Reference body→world quaternion wxyz, unit norm, at the stamp of the sample."""
+    position: Float[np.ndarray, "n 3"]
+    """Reference position of the IMU in the world, m."""
+    velocity: Float[np.ndarray, "n 3"]
+    """Reference velocity in the world, m/s."""
+    valid: Bool[np.ndarray, "n"]
+    """True where the reference can be trusted; windows that touch a False are never cut."""
+    device_orientation: Float[np.ndarray, "n 4"] | None = None
+    """The device's own body→world estimate (its yaw is arbitrary), where it gives one."""
+    attributes: dict[str, Any] = {}
+    """Where it comes from: dataset, session, group, subject, device, placement, truth, licence, ... (str/float/bool)."""
+
+
+class Windows(NamedTuple):
+    """A batch of training windows in the gravity-aligned frame whose first sample has zero yaw."""
+
+    imu: Float[Array, "b n 6"]
+    """[accel m/s², gyro rad/s], the paper's channel order (eq. 1)."""
+    displacement: Float[Array, "b 3"]
+    """Displacement over the window in the same frame, m."""
+
+
+class Prediction(NamedTuple):
+    """What every network says of a window."""
+
+    displacement: Float[Array, "*b 3"]
+    """m, in the gravity-aligned zero-yaw frame of the window's start."""
+    log_std: Float[Array, "*b 3"]
+    """Logarithm of the standard deviation of `displacement`, per axis."""
+    diagnostics: dict[str, Array] = {}
+    """What people want to look at: `gate`, `scale` (b, 3), `attention` (b, heads, m), where a model has them."""

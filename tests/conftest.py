@@ -1,0 +1,23 @@
+"""Shared set-up: float64 available, rank promotion forbidden, shapes and types checked at run time."""
+
+import os
+
+# Small CPU programs: one thread each, so that pytest-xdist's workers do not fight over the cores.
+os.environ.setdefault("JAX_PLATFORMS", "cpu")
+
+import jax
+import pytest
+
+jax.config.update("jax_enable_x64", True)
+jax.config.update("jax_numpy_rank_promotion", "raise")
+
+
+@pytest.fixture(scope="session")
+def recordings():
+    """The folder of real recordings, $GNIO_DATA/<name>; tests that ask for it are skipped, and say so, without it."""
+    from pathlib import Path
+
+    root = os.environ.get("GNIO_DATA")
+    if not root or not Path(root).is_dir():
+        pytest.skip("real recordings: set GNIO_DATA to a folder that holds oxiod/, tlio_layout/, ...")
+    return Path(root)
