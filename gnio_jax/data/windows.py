@@ -1,0 +1,84 @@
+"""Training windows: an index over recordings that lie on the device once, gathered and rotated inside the jitted step.
+
+Overlapping windows are never copied: a second of IMU belongs to ten windows and is stored once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.spatial.transform import Rotation
+
+from gnio_jax.config import DataConfig
+from gnio_jax.types import Array, InputError, Sequence, Windows
+
+
+class WindowSource(NamedTuple):
+    """All recordings of a split, end to end, and where windows may start in them. float32.
+
+    What does not depend on the augmentation is done here, once: with `window_rotation="per_sample"` the samples are
+    stored in the world frame and a window needs only its start's yaw removed; with `"single"` they stay in the body
+    frame and a window is rotated by its start's attitude without yaw. Either way it is one rotation per window.
+    """
+
+    imu: Float[Array, "t 6"]
+    """[accel m/s², gyro rad/s]."""
+    start: Int[Array, "m"]
+    """Row of `imu` at which each window begins."""
+    rotation: Float[Array, "m 3 3"]
+    """From the frame of `imu` to the gravity-aligned frame in which the window's start has zero yaw."""
+    displacement: Float[Array, "m 3"]
+    """Target in that frame, m: from the stamp of the first sample to one interval after the last (paper eq. 1)."""
+
+
+def index(sequences: Iterable[Sequence], config: DataConfig) -> WindowSource:
+    """Cut `sequences` (all at `config.rate`) into windows every `config.stride` samples.
+
+    A window of N samples from i needs the reference at i … i+N, all of it valid. Attitude and biases come from the
+    reference (biases zero). Differences of positions are taken in float64, before they are stored in float32.
+    Raises `InputError` when not a single window fits.
+    """
+    length = config.window
+    parts: list[WindowSource] = []
+    offset = 0
+    for sequence in sequences:
+        start = np.arange(0, len(sequence.time) - length, config.stride)
+        bad = np.concatenate([[0], np.cumsum(~sequence.valid)])
+        start = start[bad[start + length + 1] == bad[start]]
+        body = Rotation.from_quat(sequence.orientation, scalar_first=True) if start.size else None
+        if body is None:
+            continue
+        first = body[start].as_matrix()
+        unyaw = Rotation.from_euler("z", -np.arctan2(first[:, 1, 0], first[:, 0, 0])).as_matrix()
+        imu = np.hstack([sequence.accel, sequence.gyro])
+        if config.window_rotation == "per_sample":
+            imu = np.hstack([body.apply(sequence.accel), body.apply(sequence.gyro)])
+        parts.append(
+            WindowSource(
+                imu=imu.astype(np.float32),
+                start=(start + offset).astype(np.int32),
+                rotation=(unyaw if config.window_rotation == "per_sample" else unyaw @ first).astype(np.float32),
+                displacement=np.einsum("mij,mj->mi", unyaw, sequence.position[start + length] - sequence.position[start]).astype(np.float32),
+            )
+        )
+        offset += len(sequence.time)
+    if not parts:
+        raise InputError("data", f"no window of {config.window_seconds:g} s with a valid reference in any sequence")
+    return WindowSource(*(np.concatenate(field) for field in zip(*parts, strict=True)))
+
+
+def gather(source: WindowSource, which: Int[jax.Array, "b"], length: int) -> Windows:
+    """The windows number `which` of `source`, each `length` samples, rotated to their own frames. Jittable."""
+    rows = source.start[which][:, None] + jnp.arange(length, dtype=jnp.int32)[None, :]
+    imu = source.imu[rows].reshape(which.shape[0], length, 2, 3)
+    return Windows(rotate(source.rotation[which], imu).reshape(which.shape[0], length, 6), source.displacement[which])
+
+
+def rotate(rotation: Float[jax.Array, "b 3 3"], vectors: Float[jax.Array, "b n 2 3"]) -> Float[jax.Array, "b n 2 3"]:
+    """Rotate the accel and gyro vectors of each window, in full float32 on every kind of device."""
+    return jnp.einsum("bij,bnkj->bnki", rotation, vectors, precision=jax.lax.Precision.HIGHEST)

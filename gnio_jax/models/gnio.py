@@ -1,0 +1,43 @@
+"""GNIO: encoder, Motion Bank and gated head put together (paper §III, fig. 2), with the paper's ablations as options."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+from flax import linen as nn
+from jaxtyping import Float
+
+from gnio_jax.models.heads import GatedHead, LinearHead, UncertaintyHead
+from gnio_jax.models.motion_bank import MotionBank
+from gnio_jax.models.resnet import ResNet18
+from gnio_jax.types import Prediction
+
+
+class GNIO(nn.Module):
+    """Windows [accel, gyro] in the gravity-aligned frame to displacement, its uncertainty, gate and attention.
+
+    The defaults are the paper's: 4,934,153 parameters, 32,768 of them the bank. `bank_size = 0` leaves the bank out
+    (h = f). Widths other than 64 scale every layer, for machines without an accelerator.
+    """
+
+    width: int = 64
+    bank_size: int = 64
+    bank_heads: int = 8
+    head: Literal["gated", "linear"] = "gated"
+    gate: Literal["tanh", "sigmoid"] = "tanh"
+    scale: Literal["softplus", "pos_elu", "abs", "exp", "linear"] = "softplus"
+
+    @nn.compact
+    def __call__(self, windows: Float[jax.Array, "b n 6"], train: bool = False) -> Prediction:
+        features = ResNet18(self.width, name="encoder")(windows.astype(jnp.float32), train)
+        h = features.mean(axis=1)
+        diagnostics = {}
+        if self.bank_size:
+            context, diagnostics["attention"] = MotionBank(self.bank_size, self.bank_heads, name="bank")(h)
+            h = h + context
+        head = GatedHead(self.gate, self.scale, name="head") if self.head == "gated" else LinearHead(name="head")
+        displacement, seen = head(h)
+        log_std = UncertaintyHead(name="uncertainty")(h)
+        return Prediction(displacement, log_std, diagnostics | seen)

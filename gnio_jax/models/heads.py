@@ -1,0 +1,54 @@
+"""Prediction heads: the gated displacement with its ablations, and the uncertainty (paper §III-D, §III-E)."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from flax import linen as nn
+from jaxtyping import Float
+
+GATES = {"tanh": jnp.tanh, "sigmoid": nn.sigmoid}
+SCALES = {
+    "softplus": nn.softplus,
+    "pos_elu": lambda x: nn.elu(x) + 1,
+    "abs": jnp.abs,
+    "exp": jnp.exp,
+    "linear": lambda x: x,
+}
+
+
+def dense(name: str, **options: object) -> nn.Dense:
+    """A linear layer to three axes, in float32."""
+    return nn.Dense(3, dtype=jnp.float32, param_dtype=jnp.float32, name=name, **options)
+
+
+class GatedHead(nn.Module):
+    """d̂ = s ⊙ γ: a scale s = softplus(W_s h + b_s) and a gate γ = tanh(W_g h + b_g) that closes at rest.
+
+    Ours: the gate starts with zero bias and a small kernel, so that an untrained network predicts d̂ ≈ 0.
+    """
+
+    gate: str = "tanh"
+    scale: str = "softplus"
+
+    @nn.compact
+    def __call__(self, h: Float[jax.Array, "b d"]) -> tuple[Float[jax.Array, "b 3"], dict[str, jax.Array]]:
+        scale = SCALES[self.scale](dense("scale")(h))
+        gate = GATES[self.gate](dense("gate", kernel_init=nn.initializers.normal(1e-2))(h))
+        return scale * gate, {"scale": scale, "gate": gate}
+
+
+class LinearHead(nn.Module):
+    """d̂ = W h + b: the ablation without a gate."""
+
+    @nn.compact
+    def __call__(self, h: Float[jax.Array, "b d"]) -> tuple[Float[jax.Array, "b 3"], dict[str, jax.Array]]:
+        return dense("displacement")(h), {}
+
+
+class UncertaintyHead(nn.Module):
+    """u = W_u h + b_u, the log standard deviation per axis: Σ̂ = diag(exp 2u)."""
+
+    @nn.compact
+    def __call__(self, h: Float[jax.Array, "b d"]) -> Float[jax.Array, "b 3"]:
+        return dense("log_std")(h)

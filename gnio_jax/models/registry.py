@@ -1,0 +1,34 @@
+"""Names of networks to Flax modules; every one maps windows (b, n, 6) to a `Prediction`."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+
+from flax import linen as nn
+
+from gnio_jax.models.gnio import GNIO
+from gnio_jax.types import InputError
+
+_MODELS: dict[str, type[nn.Module]] = {"gnio": GNIO}
+
+
+def names() -> list[str]:
+    """The networks `create` knows."""
+    return sorted(_MODELS)
+
+
+def create(name: str, **options: object) -> nn.Module:
+    """The network `name` with its options set; its `apply(variables, windows)` returns a `Prediction`.
+
+    Raises `InputError` for an unknown name or option, naming the known ones.
+    """
+    if name not in _MODELS:
+        raise InputError(f"model '{name}'", "unknown", f"known models: {', '.join(names())}")
+    known = [field.name for field in dataclasses.fields(_MODELS[name]) if field.name not in ("parent", "name")]
+    for option in options:
+        if option not in known:
+            close = difflib.get_close_matches(option, known, n=1)
+            raise InputError(f"model '{name}'", f"unknown option '{option}'",
+                             (f"did you mean '{close[0]}'? " if close else "") + f"known options: {', '.join(known)}")
+    return _MODELS[name](**options)

@@ -1,0 +1,101 @@
+"""The encoder: a 1-D ResNet-18 over a window of IMU samples (paper §III-B; the shape TLIO and RoNIN share)."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from flax import linen as nn
+from jaxtyping import Float
+
+BLOCKS_PER_GROUP = 2
+GROUP_STRIDES = (1, 2, 2, 2)
+
+he_normal_fan_out = nn.initializers.variance_scaling(2.0, "fan_out", "normal")
+
+
+def convolve(
+    x: Float[jax.Array, "b n c"],
+    kernel: Float[jax.Array, "k c d"],
+    window_strides: tuple[int],
+    padding: list[tuple[int, int]],
+    **_: object,
+) -> Float[jax.Array, "b m d"]:
+    """A 1-D convolution written as one matrix product of the k shifted inputs with the kernel.
+
+    Same numbers as `lax.conv_general_dilated`, whose place in `flax.linen.Conv` it takes: on CPUs XLA runs the
+    gradients of strided convolutions through a generic loop, while both gradients of a product are products again.
+    """
+    size, channels, features = kernel.shape
+    stride, (before, after) = window_strides[0], padding[0]
+    x = jnp.pad(x, ((0, 0), (before, after), (0, 0)))
+    length = (x.shape[1] - size) // stride + 1
+    shifted = [x[:, i : i + stride * (length - 1) + 1 : stride] for i in range(size)]
+    columns = jnp.concatenate(shifted, axis=-1).reshape(-1, size * channels)
+    return (columns @ kernel.reshape(size * channels, features)).reshape(-1, length, features)
+
+
+def max_pool(x: Float[jax.Array, "b n c"]) -> Float[jax.Array, "b m c"]:
+    """Maximum over 3 samples, stride 2, padded by one −∞ on both sides.
+
+    Three shifted maxima instead of `lax.reduce_window`, whose gradient (a scatter) is slow on CPUs.
+    """
+    length = (x.shape[1] - 1) // 2 + 1
+    x = jnp.pad(x, ((0, 0), (1, 2), (0, 0)), constant_values=-jnp.inf)
+    return jnp.maximum(jnp.maximum(x[:, 0 : 2 * length : 2], x[:, 1 : 2 * length + 1 : 2]), x[:, 2 : 2 * length + 2 : 2])
+
+
+def conv(features: int, size: int, stride: int, name: str) -> nn.Conv:
+    """A convolution without bias and with explicit symmetric padding ("SAME" pads differently at stride 2)."""
+    return nn.Conv(
+        features,
+        kernel_size=(size,),
+        strides=(stride,),
+        padding=[((size - 1) // 2, (size - 1) // 2)],
+        use_bias=False,
+        kernel_init=he_normal_fan_out,
+        dtype=jnp.float32,
+        param_dtype=jnp.float32,
+        conv_general_dilated=convolve,
+        name=name,
+    )
+
+
+def batch_norm(train: bool, name: str) -> nn.BatchNorm:
+    """Batch normalisation with PyTorch's constants (its momentum 0.1 is Flax's 0.9)."""
+    return nn.BatchNorm(use_running_average=not train, momentum=0.9, epsilon=1e-5, dtype=jnp.float32, param_dtype=jnp.float32, name=name)
+
+
+class BasicBlock(nn.Module):
+    """Two 3-sample convolutions and a shortcut, projected by a 1×1 convolution where the shape changes."""
+
+    features: int
+    stride: int
+
+    @nn.compact
+    def __call__(self, x: Float[jax.Array, "b n c"], train: bool) -> Float[jax.Array, "b m d"]:
+        y = conv(self.features, 3, self.stride, "conv1")(x)
+        y = nn.relu(batch_norm(train, "bn1")(y))
+        y = conv(self.features, 3, 1, "conv2")(y)
+        y = batch_norm(train, "bn2")(y)
+        if self.stride != 1 or x.shape[-1] != self.features:
+            x = conv(self.features, 1, self.stride, "shortcut_conv")(x)
+            x = batch_norm(train, "shortcut_bn")(x)
+        return nn.relu(x + y)
+
+
+class ResNet18(nn.Module):
+    """Windows (b, n, 6) to feature maps (b, ⌈n/32⌉, 8·width): stem, max-pool, four groups of two basic blocks."""
+
+    width: int = 64
+
+    @nn.compact
+    def __call__(self, windows: Float[jax.Array, "b n 6"], train: bool = False) -> Float[jax.Array, "b m d"]:
+        x = conv(self.width, 7, 2, "stem_conv")(windows)
+        x = max_pool(nn.relu(batch_norm(train, "stem_bn")(x)))
+        for group, stride in enumerate(GROUP_STRIDES):
+            for block in range(BLOCKS_PER_GROUP):
+                name = f"group{group + 1}_block{block + 1}"
+                x = BasicBlock(self.width * 2**group, stride if block == 0 else 1, name=name)(x, train)
+        return x
+
+

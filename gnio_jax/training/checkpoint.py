@@ -1,0 +1,158 @@
+"""Checkpoints of a run: `checkpoints/latest` to resume from and `checkpoints/best` to evaluate. The only importer of Orbax.
+
+Orbax writes a checkpoint into a temporary folder and renames it, so a killed process leaves the previous one whole.
+"""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import orbax.checkpoint as ocp
+from flax import linen as nn
+
+from gnio_jax import config as configuration
+from gnio_jax import models
+from gnio_jax.config import TrainConfig
+from gnio_jax.training.step import TrainState
+from gnio_jax.types import InputError
+
+Which = Literal["best", "latest"]
+
+logging.getLogger("absl").setLevel(logging.ERROR)  # Orbax logs every save there
+
+
+class Position(NamedTuple):
+    """Where a run stands besides its `TrainState`: kept as JSON with the checkpoint."""
+
+    epoch: int
+    """Epoch in progress, or finished if `step` is a multiple of the steps per epoch."""
+    step: int
+    best_loss: float | None
+    """Smallest validation loss so far."""
+    loss_sums: tuple[float, float, float]
+    """Training losses summed over the steps of the epoch in progress."""
+    seconds: float
+    """Time spent training so far."""
+
+
+class Run(NamedTuple):
+    """A trained network as evaluation needs it."""
+
+    config: TrainConfig
+    model: nn.Module
+    variables: Any
+    epoch: int
+    step: int
+
+
+def create_model(config: TrainConfig) -> nn.Module:
+    """The network that `config.model` describes."""
+    options = {key: value for key, value in vars(config.model).items() if key != "name"}
+    return models.create(config.model.name, **options)
+
+
+def exists(workdir: Path, which: Which = "latest") -> bool:
+    """Whether `workdir` holds a finished checkpoint."""
+    folder = workdir / "checkpoints" / which
+    return folder.is_dir() and any(child.name.isdigit() for child in folder.iterdir())
+
+
+class Checkpoints:
+    """The two series of a run; a context manager, because Orbax keeps threads that want closing."""
+
+    def __init__(self, workdir: Path):
+        self._workdir = workdir
+        self._managers = {which: _manager(workdir / "checkpoints" / which, create=True) for which in ("latest", "best")}
+
+    def __enter__(self) -> Checkpoints:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for manager in self._managers.values():
+            manager.close()
+
+    def save(self, which: Which, state: TrainState, position: Position) -> None:
+        """Write a checkpoint at `position.step`; one that is already there for this step is the same and stays."""
+        manager = self._managers[which]
+        if position.step in manager.all_steps():
+            return
+        variables = {"params": state.params, "batch_stats": state.batch_stats}
+        meta = {"position": position._asdict(), "shapes": _shapes(variables), "x64": bool(jax.config.jax_enable_x64)}
+        items = {"variables": ocp.args.StandardSave(variables), "meta": ocp.args.JsonSave(meta)}
+        if which == "latest":
+            items["optimizer"] = ocp.args.StandardSave(state.opt_state)
+        manager.save(position.step, args=ocp.args.Composite(**items))
+
+    def restore(self, template: TrainState) -> tuple[TrainState, Position]:
+        """The latest state, in the structure of `template`. Raises `InputError` if it does not fit."""
+        manager = self._managers["latest"]
+        step = manager.latest_step()
+        where = self._workdir / "checkpoints" / "latest"
+        if step is None:
+            raise InputError(where, "holds no checkpoint", "start the run without --resume")
+        variables = {"params": template.params, "batch_stats": template.batch_stats}
+        meta = _checked_meta(manager, step, variables, where)
+        if meta["x64"] != bool(jax.config.jax_enable_x64):
+            raise InputError(where, f"was written with jax_enable_x64={meta['x64']}", "random draws differ: resume with the same setting")
+        restored = manager.restore(step, args=ocp.args.Composite(
+            variables=ocp.args.StandardRestore(variables), optimizer=ocp.args.StandardRestore(template.opt_state)))  # fmt: skip
+        found = meta["position"]
+        position = Position(**(found | {"loss_sums": tuple(found["loss_sums"])}))
+        state = TrainState(jnp.int32(step), restored.variables["params"], restored.variables["batch_stats"], restored.optimizer)
+        # Orbax hands out arrays that are committed to a device; a plain copy keeps one compiled step for both cases.
+        return jax.tree.map(lambda x: jnp.array(jax.device_get(x)), state), position
+
+
+def load_run(workdir: Path, which: Which = "best") -> Run:
+    """The network of a run with its trained variables.
+
+    Raises `InputError` for a folder without a run or checkpoint, or one whose arrays do not fit the run's config.yaml.
+    """
+    workdir = Path(workdir)
+    if not (workdir / "config.yaml").is_file():
+        raise InputError(workdir, "holds no run (config.yaml is missing)", "train one with python train.py --workdir ...")
+    config = configuration.validate(configuration.load(workdir / "config.yaml"), str(workdir / "config.yaml"))
+    where = workdir / "checkpoints" / which
+    if not exists(workdir, which):
+        raise InputError(where, "holds no checkpoint", "let python train.py finish its first epoch, or give another --workdir")
+    model = create_model(config)
+    template = jax.eval_shape(model.init, jax.random.key(0), jax.ShapeDtypeStruct((1, config.data.window, 6), jnp.float32))
+    template = {"params": template["params"], "batch_stats": template.get("batch_stats", {})}
+    with _manager(where, create=False) as manager:
+        step = manager.latest_step()
+        meta = _checked_meta(manager, step, template, where)
+        try:
+            variables = manager.restore(step, args=ocp.args.Composite(variables=ocp.args.StandardRestore(template))).variables
+        except (OSError, ValueError, KeyError) as error:
+            raise InputError(where / str(step), f"cannot be read ({str(error)[:120]})", "the checkpoint is damaged: use the other one") from None
+    return Run(config, model, jax.tree.map(lambda x: jnp.array(jax.device_get(x)), variables), meta["position"]["epoch"], step)
+
+
+def _manager(folder: Path, create: bool) -> ocp.CheckpointManager:
+    options = ocp.CheckpointManagerOptions(max_to_keep=1, enable_async_checkpointing=False, create=create)
+    return ocp.CheckpointManager(folder.absolute(), options=options)
+
+
+def _shapes(variables: Any) -> dict[str, list[int]]:
+    return {jax.tree_util.keystr(path, simple=True, separator="/"): list(leaf.shape)
+            for path, leaf in jax.tree_util.tree_leaves_with_path(variables)}  # fmt: skip
+
+
+def _checked_meta(manager: ocp.CheckpointManager, step: int, variables: Any, where: Path) -> dict[str, Any]:
+    try:
+        meta = manager.restore(step, args=ocp.args.Composite(meta=ocp.args.JsonRestore())).meta
+        found = meta["shapes"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(where / str(step), f"cannot be read ({str(error)[:120]})", "the checkpoint is damaged") from None
+    wanted = _shapes(variables)
+    for name in sorted(wanted.keys() | found.keys()):
+        if wanted.get(name) != found.get(name):
+            raise InputError(
+                where, f"'{name}' has shape {found.get(name)} in the checkpoint and {wanted.get(name)} in the configured model",
+                "model.width and the other model fields must be those of the run",
+            )  # fmt: skip
+    return meta

@@ -1,0 +1,115 @@
+"""The jitted training and validation steps: gather, rotate, augment, forward, backward, update, all on the device."""
+
+from __future__ import annotations
+
+import functools
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import linen as nn
+from jaxtyping import Float, Int, PRNGKeyArray
+
+from gnio_jax.config import TrainConfig
+from gnio_jax.data.augment import augment
+from gnio_jax.data.windows import WindowSource, gather
+from gnio_jax.training.losses import Losses, losses
+
+
+class TrainState(NamedTuple):
+    """All that changes from step to step. Random draws are functions of the seed and `step` alone."""
+
+    step: Int[jax.Array, ""]
+    params: Any
+    batch_stats: Any
+    opt_state: Any
+
+
+class Progress(NamedTuple):
+    """What a run of steps reports."""
+
+    sums: Losses
+    """Losses summed over the steps."""
+    failed_step: Int[jax.Array, ""]
+    """First step whose loss was not finite; −1 when all were."""
+
+
+def create_state(model: nn.Module, optimizer: optax.GradientTransformation, key: PRNGKeyArray, window: int) -> TrainState:
+    """Fresh parameters for windows of `window` samples, at step 0."""
+    variables = jax.jit(model.init)(key, jnp.zeros((1, window, 6), jnp.float32))
+    params = variables["params"]
+    return TrainState(jnp.int32(0), params, variables.get("batch_stats", {}), optimizer.init(params))
+
+
+def epoch_order(key: PRNGKeyArray, epoch: int, count: int) -> Int[jax.Array, "m"]:
+    """The order in which epoch `epoch` visits the windows: a permutation that depends on nothing else."""
+    return jax.random.permutation(jax.random.fold_in(key, epoch), jnp.arange(count, dtype=jnp.int32))
+
+
+@functools.partial(jax.jit, static_argnames=("model", "optimizer", "config"), donate_argnames="state")
+def train_steps(
+    state: TrainState,
+    source: WindowSource,
+    order: Int[jax.Array, "m"],
+    first: Int[jax.Array, ""],
+    count: Int[jax.Array, ""],
+    nll_weight: Float[jax.Array, ""],
+    key: PRNGKeyArray,
+    *,
+    model: nn.Module,
+    optimizer: optax.GradientTransformation,
+    config: TrainConfig,
+) -> tuple[TrainState, Progress]:
+    """Take `count` steps of an epoch from its step number `first` on, in one dispatch.
+
+    `count` is not static: however an epoch is cut into dispatches it is the same program, so a run that was
+    interrupted and resumed has the same parameters to the bit.
+    """
+    size = config.optim.batch_size
+
+    def one_step(i: jax.Array, carry: tuple[TrainState, Progress]) -> tuple[TrainState, Progress]:
+        state, progress = carry
+        which = jax.lax.dynamic_slice(order, ((first + i) * size,), (size,))
+        augment_key, dropout_key = jax.random.split(jax.random.fold_in(key, state.step))
+        windows = augment(augment_key, gather(source, which, config.data.window), config.augment)
+
+        def objective(params: Any) -> tuple[jax.Array, tuple[Losses, Any]]:
+            prediction, changed = model.apply(
+                {"params": params, "batch_stats": state.batch_stats}, windows.imu, train=True,
+                mutable=["batch_stats"], rngs={"dropout": dropout_key},
+            )  # fmt: skip
+            loss = losses(prediction, windows.displacement, config.loss, nll_weight)
+            return loss.total, (loss, changed.get("batch_stats", {}))
+
+        gradient, (loss, batch_stats) = jax.grad(objective, has_aux=True)(state.params)
+        update, opt_state = optimizer.update(gradient, state.opt_state, state.params)
+        failed = jnp.where((progress.failed_step < 0) & ~jnp.isfinite(loss.total), state.step, progress.failed_step)
+        state = TrainState(state.step + 1, optax.apply_updates(state.params, update), batch_stats, opt_state)
+        return state, Progress(jax.tree.map(jnp.add, progress.sums, loss), failed)
+
+    zero = jnp.float32(0)
+    return jax.lax.fori_loop(jnp.int32(0), count, one_step, (state, Progress(Losses(zero, zero, zero), jnp.int32(-1))))
+
+
+@functools.partial(jax.jit, static_argnames=("model", "config"))
+def validate(
+    state: TrainState, source: WindowSource, nll_weight: Float[jax.Array, ""], *, model: nn.Module, config: TrainConfig
+) -> Losses:
+    """Mean losses over every window of `source`, without augmentation and with the running batch statistics."""
+    count = source.start.shape[0]
+    size = min(config.optim.batch_size, count)
+    batches = -(-count // size)
+    # The last batch is filled up with windows of weight zero.
+    which = jnp.minimum(jnp.arange(batches * size, dtype=jnp.int32), count - 1).reshape(batches, size)
+    weight = (jnp.arange(batches * size) < count).astype(jnp.float32).reshape(batches, size)
+
+    def one_batch(which_weight: tuple[jax.Array, jax.Array]) -> Losses:
+        windows = gather(source, which_weight[0], config.data.window)
+        prediction = model.apply({"params": state.params, "batch_stats": state.batch_stats}, windows.imu)
+        each = jax.vmap(lambda p, d: losses(jax.tree.map(lambda x: x[None], p), d[None], config.loss, nll_weight))(
+            prediction._replace(diagnostics={}), windows.displacement
+        )
+        return jax.tree.map(lambda x: jnp.sum(x * which_weight[1]), each)
+
+    return jax.tree.map(lambda x: jnp.sum(x) / count, jax.lax.map(one_batch, (which, weight)))
