@@ -1,0 +1,472 @@
+"""Errors of a trajectory, each under a name that says which of the field's definitions it is.
+
+Positions are (n, d) arrays in metres, rows a constant `step` (s) apart, d = 3 or, for the horizontal metrics, 2. A row of
+the reference that cannot be trusted is NaN and counts nowhere, nor does a displacement that starts or ends there.
+A metric without a value (no reference, too short, never standing) raises `Undefined` with the reason; `measure` turns
+that into None and keeps the reason. Everything is NumPy in float64 and pure.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.stats import chi2
+
+Alignment = Literal["origin", "none", "yaw_position", "se3"]
+Positions = Float[np.ndarray, "n d"]
+Quaternions = Float[np.ndarray, "n 4"]
+Angles = Float[np.ndarray, "n"]
+
+STANDING_SPEED = 0.05
+"""Mean speed over one second below which the reference stands still, m/s."""
+STANDING_SECONDS = 2.0
+"""Shortest stretch that counts as standing still, s."""
+
+
+class Undefined(ValueError):
+    """The metric has no value for this trajectory; the text is the reason."""
+
+
+class Trajectory(NamedTuple):
+    """Poses at uniform times. A row without a trusted pose is NaN."""
+
+    time: Float[np.ndarray, "n"]
+    """Stamps, s."""
+    position: Float[np.ndarray, "n 3"]
+    """In the world (z up), m."""
+    orientation: Quaternions
+    """Body→world, unit quaternion wxyz."""
+
+
+class Measures(NamedTuple):
+    """The metrics of one sequence."""
+
+    values: dict[str, float | None]
+    """Metric -> value; None where it is not defined."""
+    undefined: dict[str, str]
+    """Metric -> reason, for those without a value."""
+
+
+# Rotations ------------------------------------------------------------------------------------------------------------
+
+
+def yaw(orientation: Quaternions) -> Angles:
+    """Yaw atan2(R[1,0], R[0,0]) of quaternions wxyz, rad."""
+    w, x, y, z = orientation.T
+    return np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+
+
+def rotation_matrices(orientation: Quaternions) -> Float[np.ndarray, "n 3 3"]:
+    """Rotation matrices of unit quaternions wxyz; NaN stays NaN."""
+    w, x, y, z = orientation.T
+    return np.stack([np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], -1),
+                     np.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], -1),
+                     np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], -1)], -2)
+
+
+def _multiply(left: Float[np.ndarray, "4"], right: Quaternions) -> Quaternions:
+    w, x, y, z = left
+    matrix = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
+    return right @ matrix.T
+
+
+def _about_z(angle: Float[np.ndarray, "*k"] | float) -> Float[np.ndarray, "*k 3 3"]:
+    cosine, sine = np.cos(angle), np.sin(angle)
+    zero, one = np.zeros_like(cosine), np.ones_like(cosine)
+    return np.stack([np.stack([cosine, -sine, zero], -1), np.stack([sine, cosine, zero], -1), np.stack([zero, zero, one], -1)], -2)
+
+
+def _quaternion(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "4"]:
+    from scipy.spatial.transform import Rotation
+
+    return np.roll(Rotation.from_matrix(rotation).as_quat(), 1)
+
+
+# Alignment ------------------------------------------------------------------------------------------------------------
+
+
+def align(estimate: Trajectory, reference: Trajectory, how: Alignment = "origin") -> Trajectory:
+    """The estimate moved into the reference's frame by one rigid motion, fitted over the trusted rows.
+
+    `origin` matches position and yaw at the first trusted row (what a user of odometry knows); `none` changes nothing;
+    `yaw_position` is the least-squares motion of four degrees of freedom (the unobservable ones of inertial odometry;
+    VIO benchmarks); `se3` the least-squares motion of six (Horn/Kabsch, no scale; TUM, evo). Raises `Undefined` without
+    a trusted row, or for `se3` with fewer than three.
+    """
+    if how == "none":
+        return estimate
+    rows = np.flatnonzero(_finite(reference.position))
+    if not len(rows):
+        raise Undefined("no trusted reference")
+    if how == "origin":
+        first = rows[0]
+        turn = _about_z((yaw(reference.orientation[first:first + 1]) - yaw(estimate.orientation[first:first + 1]))[0])
+        source, target = estimate.position[first], reference.position[first]
+    else:
+        source, target = estimate.position[rows].mean(0), reference.position[rows].mean(0)
+        a, b = estimate.position[rows] - source, reference.position[rows] - target
+        if how == "yaw_position":
+            turn = _about_z(np.arctan2(a[:, 0] @ b[:, 1] - a[:, 1] @ b[:, 0], a[:, 0] @ b[:, 0] + a[:, 1] @ b[:, 1]))
+        else:
+            if len(rows) < 3:
+                raise Undefined("fewer than three trusted rows to align")
+            u, _, vt = np.linalg.svd(b.T @ a)
+            turn = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
+    return Trajectory(estimate.time, (estimate.position - source) @ turn.T + target, _multiply(_quaternion(turn), estimate.orientation))
+
+
+# Absolute errors ------------------------------------------------------------------------------------------------------
+
+
+def ate(estimate: Positions, reference: Positions) -> float:
+    """Absolute trajectory error sqrt(mean ‖p̂ − p‖²), m (TUM/evo's APE rmse, RNIN, TLIO's filter)."""
+    return float(np.sqrt(np.mean(np.sum(_errors(estimate, reference) ** 2, 1))))
+
+
+def ate_ronin(estimate: Positions, reference: Positions) -> float:
+    """sqrt of the mean over rows and components of (p̂ − p)², m: `ate`/√d (the code of RoNIN and DeepILS)."""
+    return float(np.sqrt(np.mean(_errors(estimate, reference) ** 2)))
+
+
+def ate_mean(estimate: Positions, reference: Positions) -> float:
+    """mean ‖p̂ − p‖, m (TLIO's network test)."""
+    return float(np.mean(np.linalg.norm(_errors(estimate, reference), axis=1)))
+
+
+def drift(estimate: Positions, reference: Positions, step: float) -> float:
+    """Error at the last trusted row over the length of the reference path (`path_length`), % (position drift error, PDE).
+
+    Undefined for a path below 1 m, where it says nothing.
+    """
+    length = path_length(reference, step)
+    if length < 1.0:
+        raise Undefined(f"the reference path is {length:.2f} m long, under 1 m")
+    return float(100 * np.linalg.norm(_errors(estimate, reference)[-1]) / length)
+
+
+# Relative errors ------------------------------------------------------------------------------------------------------
+
+
+def rte(estimate: Positions, reference: Positions, step: float, seconds: float = 60.0) -> float:
+    """Relative trajectory error: RMS norm of the error of displacements over `seconds`, from every row, m (RoNIN's T-RTE, RNIN).
+
+    Displacements are compared in the world, without turning the start. Where the trusted rows span less than `seconds`,
+    the error at their end relative to their start, times `seconds` over that span (RoNIN's rule).
+    """
+    error = estimate - reference
+    rows = np.flatnonzero(_finite(reference))
+    if len(rows) < 2:
+        raise Undefined("no trusted reference" if not len(rows) else "a single trusted row")
+    rows_apart, span = round(seconds / step), int(rows[-1] - rows[0])
+    if span < rows_apart:
+        return float(np.linalg.norm(error[rows[-1]] - error[rows[0]]) * rows_apart / span)
+    return _rms(error[rows_apart:] - error[:-rows_apart], _pairs(reference, rows_apart), f"no two trusted rows {seconds:g} s apart")
+
+
+def rte_ronin(estimate: Positions, reference: Positions, step: float, seconds: float = 60.0) -> float:
+    """`rte` over √d, m: the mean is over components too, as RoNIN's code has it."""
+    return rte(estimate, reference, step, seconds) / float(np.sqrt(estimate.shape[1]))
+
+
+def rte_distance(estimate: Positions, reference: Positions, metres: float) -> float:
+    """RMS norm of the error of displacements over `metres` walked, from every row, m (D-RTE of CTIN and iMoT, with 1 m).
+
+    The end of a displacement is the first row by which the reference has walked `metres`, its path summed row by row.
+    """
+    good = _finite(reference)
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], good.astype(int), [0]])))
+    errors = [np.zeros((0, estimate.shape[1]))]
+    for start, stop in zip(edges[::2], edges[1::2], strict=True):  # a path is known within an unbroken stretch only
+        truth, error = reference[start:stop], (estimate - reference)[start:stop]
+        walked = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(truth, axis=0), axis=1))])
+        end = np.searchsorted(walked, walked + metres - 1e-9)
+        begin = np.flatnonzero(end < len(walked))
+        errors.append(error[end[begin]] - error[begin])
+    found = np.concatenate(errors)
+    return _rms(found, np.ones(len(found), bool), f"no unbroken reference of {metres:g} m")
+
+
+def rpe(estimate: Positions, reference: Positions, estimate_yaw: Angles, reference_yaw: Angles, step: float, seconds: float) -> float:
+    """Relative pose error: RMS norm of the error of displacements over `seconds` with the yaw at their start aligned, m (TLIO).
+
+    error_i = R_z(yaw_i − yaŵ_i)(p̂_j − p̂_i) − (p_j − p_i), from every row i, so that a wrong heading of the whole
+    trajectory costs nothing.
+    """
+    rows_apart = round(seconds / step)
+    reason = f"no two trusted rows {seconds:g} s apart"
+    if rows_apart >= len(estimate):
+        raise Undefined(reason)
+    angle = (reference_yaw - estimate_yaw)[:-rows_apart]
+    turn = _about_z(angle)[:, :estimate.shape[1], :estimate.shape[1]]
+    moved = np.einsum("nij,nj->ni", turn, estimate[rows_apart:] - estimate[:-rows_apart])
+    return _rms(moved - (reference[rows_apart:] - reference[:-rows_apart]), _pairs(reference, rows_apart), reason)
+
+
+def rpe_se3(estimate: Trajectory, reference: Trajectory, step: float, seconds: float = 1.0, dims: Literal[2, 3] = 3) -> float:
+    """RMS of the translation part of the relative pose error with the full orientation at the start, all pairs, m (TUM, evo).
+
+    error_i = R_i R̂_iᵀ (p̂_j − p̂_i) − (p_j − p_i) in the reference's world (its norm is evo's); with `dims` 2 its
+    horizontal part.
+    """
+    rows_apart = round(seconds / step)
+    reason = f"no two trusted rows {seconds:g} s apart"
+    if rows_apart >= len(estimate.time):
+        raise Undefined(reason)
+    start, start_true = (rotation_matrices(trajectory.orientation[:-rows_apart]) for trajectory in (estimate, reference))
+    moved, moved_true = (trajectory.position[rows_apart:] - trajectory.position[:-rows_apart] for trajectory in (estimate, reference))
+    error = np.einsum("nij,nkj,nk->ni", start_true, start, moved) - moved_true
+    return _rms(error[:, :dims], _pairs(reference.position, rows_apart), reason)
+
+
+# Heading --------------------------------------------------------------------------------------------------------------
+
+
+def yaw_rmse(estimate_yaw: Angles, reference_yaw: Angles) -> float:
+    """Root mean square of the yaw error, wrapped to ±180°, degrees (TLIO). The angles are rad."""
+    error = _yaw_errors(estimate_yaw, reference_yaw)
+    return float(np.degrees(np.sqrt(np.mean(((error + np.pi) % (2 * np.pi) - np.pi) ** 2))))
+
+
+def yaw_drift(estimate_yaw: Angles, reference_yaw: Angles, step: float) -> float:
+    """Size of the change of the unwrapped yaw error from the first to the last trusted row, degrees per hour (TLIO).
+
+    Undefined for less than 10 s, which an hour cannot be told from.
+    """
+    rows = np.flatnonzero(np.isfinite(reference_yaw))
+    error = np.unwrap(_yaw_errors(estimate_yaw, reference_yaw))
+    hours = (rows[-1] - rows[0]) * step / 3600
+    if hours < 10 / 3600:
+        raise Undefined("trusted for less than 10 s")
+    return float(abs(np.degrees(error[-1] - error[0])) / hours)
+
+
+# Movement -------------------------------------------------------------------------------------------------------------
+
+
+def path_length(position: Positions, step: float, seconds: float = 1.0) -> float:
+    """Length of the polygon through the rows `seconds` apart (and the last row), m; what touches an untrusted row is left out.
+
+    Summing row by row would count the noise of positions as walking: 5 mm at 10 Hz is 3 m a minute.
+    """
+    if len(position) < 2:
+        raise Undefined("a single row")
+    corners = position[np.unique(np.append(np.arange(0, len(position), max(1, round(seconds / step))), len(position) - 1))]
+    return float(np.nansum(np.linalg.norm(np.diff(corners, axis=0), axis=1)))
+
+
+def path_length_ratio(estimate: Positions, reference: Positions, step: float) -> float:
+    """Estimated over true `path_length` (through points 1 s apart), over the stretches that are trusted: 1 is right, 0 never moved."""
+    length = path_length(reference, step)
+    if length < 1.0:
+        raise Undefined(f"the reference path is {length:.2f} m long, under 1 m")
+    return path_length(np.where(_finite(reference)[:, None], estimate, np.nan), step) / length
+
+
+def standing(reference: Positions, step: float) -> Bool[np.ndarray, "n"]:
+    """Rows of the stretches of at least 2 s in which every displacement over 1 s is below 0.05 m.
+
+    One second, because that is what the network is asked for, and because it forgives the noise of the reference and the
+    swaying of a person who stands.
+    """
+    apart = max(1, round(1.0 / step))
+    still = np.zeros(len(reference), bool)
+    if len(reference) <= apart:
+        return still
+    with np.errstate(invalid="ignore"):
+        slow = np.linalg.norm(reference[apart:] - reference[:-apart], axis=1) < STANDING_SPEED * apart * step
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], slow.astype(int), [0]])))
+    for start, stop in zip(edges[::2], edges[1::2], strict=True):
+        if (stop - 1 - start + apart) * step >= STANDING_SECONDS - 1e-9:
+            still[start:stop + apart] = True
+    return still & _finite(reference)
+
+
+def stationary_drift(estimate: Positions, reference: Positions, step: float) -> float:
+    """Metres the estimate walks per minute in which the reference stands (`standing`); the path is through points 1 s apart.
+
+    What a gate on the displacement is for (GNIO). Undefined where the reference never stands for 2 s.
+    """
+    still = standing(reference, step)
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], still.astype(int), [0]])))
+    walked, seconds = 0.0, 0.0
+    for start, stop in zip(edges[::2], edges[1::2], strict=True):
+        if stop - start > 1:
+            walked += path_length(estimate[start:stop], step)
+            seconds += (stop - 1 - start) * step
+    if not seconds:
+        raise Undefined(f"the reference never stands still for {STANDING_SECONDS:g} s")
+    return float(walked / (seconds / 60))
+
+
+# Consistency ----------------------------------------------------------------------------------------------------------
+
+
+def normalised_squared(error: Float[np.ndarray, "n d"], covariance: Float[np.ndarray, "n d d"]) -> Float[np.ndarray, "n"]:
+    """eᵀ P⁻¹ e of each row."""
+    return np.einsum("ni,ni->n", error, np.linalg.solve(covariance, error[..., None])[..., 0])
+
+
+def mean_normalised(squared: Float[np.ndarray, "n"], dims: int) -> float:
+    """Mean of normalised squared errors over their expectation d: 1 is consistent, above it the filter is overconfident.
+
+    With eᵀ P⁻¹ e of the position it is `nees`, with rᵀ S⁻¹ r of the measurements `nis` (Bar-Shalom). NaN counts nowhere.
+    """
+    return float(np.mean(_present(squared)) / dims)
+
+
+def coverage(squared: Float[np.ndarray, "n"], dims: int, level: float = 0.95) -> float:
+    """Share of rows whose normalised squared error lies inside the χ² region of probability `level`, %: 95 is consistent."""
+    return float(100 * np.mean(_present(squared) <= chi2.ppf(level, dims)))
+
+
+# All of them ----------------------------------------------------------------------------------------------------------
+
+
+def measure(estimate: Trajectory, reference: Trajectory, alignment: Alignment = "origin",
+            position_covariance: Float[np.ndarray, "n 3 3"] | None = None, nis: Float[np.ndarray, "k"] | None = None) -> Measures:
+    """Every metric of one sequence, in 3-D under its plain name and horizontally as `<name>_2d`.
+
+    `reference` has the estimate's stamps and NaN where it cannot be trusted. The absolute metrics, `rte_*` and `yaw_rmse`
+    see the estimate under `alignment`; `se3` is fitted in 3-D for the horizontal ones too. `nees` is taken in the frame
+    of the filter, whose covariance is relative to its start, so with the start aligned whatever `alignment` is.
+    """
+    reference = Trajectory(reference.time, np.where(_finite(reference.position)[:, None], reference.position, np.nan),
+                           np.where(_finite(reference.position)[:, None], reference.orientation, np.nan))
+    step = float(np.median(np.diff(estimate.time))) if len(estimate.time) > 1 else 1.0
+    metrics: dict[str, Callable[[], float]] = {}
+    aligned, origin, missing = estimate, estimate, ""
+    finite = _finite(estimate.position) & _finite(estimate.orientation)
+    try:
+        if not finite.all():
+            raise Undefined(f"the estimate is not finite from {estimate.time[np.argmin(finite)] - estimate.time[0]:.1f} s on")
+        aligned, origin = align(estimate, reference, alignment), align(estimate, reference, "origin")
+    except Undefined as reason:
+        missing = str(reason)
+    a_yaw, e_yaw, r_yaw = yaw(aligned.orientation), yaw(estimate.orientation), yaw(reference.orientation)
+    for dims in (3, 2):
+        a, e, r = aligned.position[:, :dims], estimate.position[:, :dims], reference.position[:, :dims]
+        tag = "" if dims == 3 else "_2d"
+        metrics |= {
+            f"ate{tag}": lambda a=a, r=r: ate(a, r),
+            f"ate_ronin{tag}": lambda a=a, r=r: ate_ronin(a, r),
+            f"ate_mean{tag}": lambda a=a, r=r: ate_mean(a, r),
+            f"rte_60s{tag}": lambda a=a, r=r: rte(a, r, step),
+            f"rte_60s_ronin{tag}": lambda a=a, r=r: rte_ronin(a, r, step),
+            f"rte_1m{tag}": lambda a=a, r=r: rte_distance(a, r, 1.0),
+            f"rte_10m{tag}": lambda a=a, r=r: rte_distance(a, r, 10.0),
+            f"rpe_1s{tag}": lambda e=e, r=r: rpe(e, r, e_yaw, r_yaw, step, 1.0),
+            f"rpe_10s{tag}": lambda e=e, r=r: rpe(e, r, e_yaw, r_yaw, step, 10.0),
+            f"rpe_se3{tag}": lambda dims=dims: rpe_se3(estimate, reference, step, 1.0, dims),
+            f"drift{tag}": lambda a=a, r=r: drift(a, r, step),
+            f"path_length_ratio{tag}": lambda e=e, r=r: path_length_ratio(e, r, step),
+            f"stationary_drift{tag}": lambda e=e, r=r: stationary_drift(e, r, step),
+        }
+        if position_covariance is not None:
+            squared = lambda dims=dims: position_nees(origin, estimate, reference, position_covariance, dims)  # noqa: E731
+            metrics |= {f"nees{tag}": lambda s=squared, dims=dims: mean_normalised(s(), dims),
+                        f"nees_coverage{tag}": lambda s=squared, dims=dims: coverage(s(), dims)}
+    metrics |= {"yaw_rmse": lambda: yaw_rmse(a_yaw, r_yaw), "yaw_drift": lambda: yaw_drift(e_yaw, r_yaw, step),
+                "path_length": lambda: path_length(reference.position, step)}
+    free_of_truth = {}
+    if nis is not None:
+        free_of_truth = {"nis": lambda: mean_normalised(nis, 3), "nis_coverage": lambda: coverage(nis, 3)}
+    values: dict[str, float | None] = {"duration": float(estimate.time[-1] - estimate.time[0])}
+    undefined: dict[str, str] = {}
+    for name, compute in (metrics | free_of_truth).items():
+        try:
+            if missing and name in metrics:
+                raise Undefined(missing)
+            values[name] = compute()
+        except Undefined as reason:
+            values[name], undefined[name] = None, str(reason)
+    return Measures(values, undefined)
+
+
+def position_nees(aligned: Trajectory, estimate: Trajectory, reference: Trajectory, covariance: Float[np.ndarray, "n 3 3"],
+                  dims: Literal[2, 3] = 3) -> Float[np.ndarray, "n"]:
+    """eᵀ P⁻¹ e of the position, NaN where there is no reference: the error of the start-aligned estimate, turned back into
+    the filter's own frame, in which its covariance is."""
+    turn = _about_z((yaw(estimate.orientation[:1]) - yaw(aligned.orientation[:1]))[0])
+    error = (aligned.position - reference.position) @ turn.T
+    good = _finite(error) & (np.einsum("nii->ni", covariance) > 0).all(1)  # a start given as exact has nothing to be normalised by
+    squared = np.full(len(error), np.nan)
+    squared[good] = normalised_squared(error[good, :dims], covariance[good, :dims, :dims])
+    return squared
+
+
+class Summary(NamedTuple):
+    """Metrics over the sequences of a set. None where no sequence has the metric, or (interval) it has fewer than two groups."""
+
+    mean: dict[str, float | None]
+    median: dict[str, float | None]
+    interval: dict[str, tuple[float, float] | None]
+    """Bootstrap 95 % interval of the mean, groups (people, sessions) drawn with replacement."""
+    count: dict[str, int]
+    """Sequences that have the metric."""
+
+
+def summarise(measures: Mapping[str, Mapping[str, float | None]], groups: Mapping[str, Any], seed: int = 0, draws: int = 2000) -> Summary:
+    """Mean, median and bootstrap 95 % interval of every metric over sequences, each sequence counted once.
+
+    `measures` is sequence -> metric -> value, `groups` sequence -> the person or session it belongs to: recordings of one
+    are not independent, so whole groups are drawn. The same seed gives the same interval.
+    """
+    names = list(dict.fromkeys(metric for values in measures.values() for metric in values))
+    mean: dict[str, float | None] = {}
+    median: dict[str, float | None] = {}
+    interval: dict[str, tuple[float, float] | None] = {}
+    count: dict[str, int] = {}
+    for metric in names:
+        present = [(groups[name], value) for name, values in measures.items() if (value := values.get(metric)) is not None]
+        count[metric] = len(present)
+        mean[metric] = median[metric] = interval[metric] = None
+        if not present:
+            continue
+        numbers = np.array([value for _, value in present])
+        mean[metric], median[metric] = float(numbers.mean()), float(np.median(numbers))
+        members, index = np.unique([str(group) for group, _ in present], return_inverse=True)
+        if len(members) > 1:
+            sums, sizes = np.bincount(index, numbers), np.bincount(index)
+            drawn = np.random.default_rng(seed).integers(0, len(members), (draws, len(members)))
+            low, high = np.percentile(sums[drawn].sum(1) / sizes[drawn].sum(1), [2.5, 97.5])
+            interval[metric] = (float(low), float(high))
+    return Summary(mean, median, interval, count)
+
+
+def _finite(rows: Float[np.ndarray, "n d"]) -> Bool[np.ndarray, "n"]:
+    return np.isfinite(rows).all(1)
+
+
+def _errors(estimate: Positions, reference: Positions) -> Positions:
+    good = _finite(reference)
+    if not good.any():
+        raise Undefined("no trusted reference")
+    return (estimate - reference)[good]
+
+
+def _yaw_errors(estimate_yaw: Angles, reference_yaw: Angles) -> Angles:
+    good = np.isfinite(reference_yaw)
+    if not good.any():
+        raise Undefined("no trusted reference")
+    return (estimate_yaw - reference_yaw)[good]
+
+
+def _pairs(reference: Positions, rows_apart: int) -> Bool[np.ndarray, "m"]:
+    good = _finite(reference)
+    return good[rows_apart:] & good[:-rows_apart]
+
+
+def _rms(errors: Float[np.ndarray, "m d"], trusted: Bool[np.ndarray, "m"], reason: str) -> float:
+    if not trusted.any():
+        raise Undefined(reason)
+    return float(np.sqrt(np.mean(np.sum(errors[trusted] ** 2, 1))))
+
+
+def _present(squared: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+    present = squared[~np.isnan(squared)]
+    if not len(present):
+        raise Undefined("no measurement or no trusted reference")
+    return present
