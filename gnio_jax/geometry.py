@@ -33,6 +33,26 @@ def log(rotation: Matrix) -> Vector:
     return jaxlie.SO3.from_matrix(rotation).log()
 
 
+def cumulative_rotation(phi: Float[jax.Array, "n 3"]) -> Float[jax.Array, "n+1 3 3"]:
+    """I, exp(φ_0), exp(φ_0) exp(φ_1), …: the rotation since the start before each of n steps and after the last.
+
+    The products are formed in about log2(n) rounds over the whole array, each doubling the reach of every product.
+    """
+    turns = jaxlie.SO3.exp(phi).wxyz
+    reach = 1
+    while reach < turns.shape[0]:
+        turns = jnp.concatenate([turns[:reach], _quaternion_product(turns[:-reach], turns[reach:])])
+        reach *= 2
+    return jnp.concatenate([jnp.eye(3, dtype=phi.dtype)[None], jaxlie.SO3(turns).as_matrix()])
+
+
+def _quaternion_product(a: Float[jax.Array, "n 4"], b: Float[jax.Array, "n 4"]) -> Float[jax.Array, "n 4"]:
+    aw, ax, ay, az = a.T
+    bw, bx, by, bz = b.T
+    return jnp.stack([aw * bw - ax * bx - ay * by - az * bz, aw * bx + ax * bw + ay * bz - az * by,
+                      aw * by - ax * bz + ay * bw + az * bx, aw * bz + ax * by - ay * bx + az * bw], axis=1)
+
+
 def matrix_from_quaternion(wxyz: Quaternion) -> Matrix:
     """Rotation matrix of a unit quaternion wxyz."""
     return jaxlie.SO3(wxyz).as_matrix()
@@ -83,7 +103,7 @@ def rotation_z(angle: Scalar) -> Matrix:
 
 
 def yaw_rotation(rotation: Matrix) -> Matrix:
-    """R_γ(R): the rotation by the yaw of `rotation` about z (METHOD §1)."""
+    """R_γ(R): the rotation by the yaw of `rotation` about z."""
     return _rotation_z(*yaw_direction(rotation))
 
 
