@@ -34,7 +34,7 @@ class GatedHead(nn.Module):
     @nn.compact
     def __call__(self, h: Float[jax.Array, "b d"]) -> tuple[Float[jax.Array, "b 3"], dict[str, jax.Array]]:
         scale = SCALES[self.scale](dense("scale")(h))
-        gate = GATES[self.gate](dense("gate", kernel_init=nn.initializers.normal(1e-2))(h))
+        gate = GATES[self.gate](dense("gate", kernel_init=nn.initializers.normal(1e-3))(h))
         return scale * gate, {"scale": scale, "gate": gate}
 
 

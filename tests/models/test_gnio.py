@@ -1,0 +1,213 @@
+"""The network against its specification: sizes, ablations, and a plain NumPy forward pass."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import lax
+
+from gnio_jax import models
+from gnio_jax.models import resnet
+from gnio_jax.types import InputError
+
+
+def count(tree):
+    return sum(int(np.prod(leaf.shape)) for leaf in jax.tree.leaves(tree))
+
+
+def shapes(**options):
+    model = models.create("gnio", **options)
+    return jax.eval_shape(model.init, jax.random.key(0), jax.ShapeDtypeStruct((1, 200, 6), jnp.float32))
+
+
+def test_parameters_of_the_paper_block_by_block():
+    params = shapes()["params"]
+    assert count(params) == 4_934_153
+    conv_bn = lambda k, i, o: k * i * o + 2 * o  # noqa: E731
+    encoder = conv_bn(7, 6, 64) + 4 * conv_bn(3, 64, 64)
+    for i, o in [(64, 128), (128, 256), (256, 512)]:
+        encoder += conv_bn(3, i, o) + 3 * conv_bn(3, o, o) + conv_bn(1, i, o)
+    assert count(params["encoder"]) == encoder == 3_846_144
+    assert count(params["bank"]["prototypes"]) == 64 * 512 == 32_768
+    assert count(params["bank"]) == 32_768 + 4 * (512 * 512 + 512)
+    assert count(params["head"]) == 2 * (512 * 3 + 3)
+    assert count(params["uncertainty"]) == 512 * 3 + 3
+    assert count(params["encoder"]["group2_block1"]) == conv_bn(3, 64, 128) + conv_bn(3, 128, 128) + conv_bn(1, 64, 128)
+
+
+@pytest.mark.parametrize("size, total", [(16, 4_909_577), (32, 4_917_769), (64, 4_934_153), (128, 4_966_921)])
+def test_bank_sizes(size, total):
+    assert count(shapes(bank_size=size)["params"]) == total
+
+
+def test_without_a_bank_the_attention_goes_with_it():
+    params = shapes(bank_size=0)["params"]
+    assert "bank" not in params
+    assert count(params) == 3_846_144 + 3 * (512 * 3 + 3)
+
+
+def numpy_forward(variables, windows):
+    """The whole network, one sample, one output at a time: direct sums, no matrix tricks."""
+    p = jax.tree.map(np.asarray, variables["params"])
+    s = jax.tree.map(np.asarray, variables["batch_stats"])
+
+    def conv(x, kernel, stride, padding):
+        size = kernel.shape[0]
+        x = np.pad(x, ((padding, padding), (0, 0)))
+        rows = range(0, len(x) - size + 1, stride)
+        return np.stack([sum(x[r + k] @ kernel[k] for k in range(size)) for r in rows])
+
+    def bn(x, scale, stats):
+        return (x - stats["mean"]) / np.sqrt(stats["var"] + 1e-5) * scale["scale"] + scale["bias"]
+
+    def block(x, params, stats, stride):
+        y = np.maximum(bn(conv(x, params["conv1"]["kernel"], stride, 1), params["bn1"], stats["bn1"]), 0)
+        y = bn(conv(y, params["conv2"]["kernel"], 1, 1), params["bn2"], stats["bn2"])
+        if "shortcut_conv" in params:
+            x = bn(conv(x, params["shortcut_conv"]["kernel"], stride, 0), params["shortcut_bn"], stats["shortcut_bn"])
+        return np.maximum(x + y, 0)
+
+    e, t = p["encoder"], s["encoder"]
+    displacement, log_std, gates, attention = [], [], [], []
+    for x in np.asarray(windows, np.float64):
+        x = np.maximum(bn(conv(x, e["stem_conv"]["kernel"], 2, 3), e["stem_bn"], t["stem_bn"]), 0)
+        x = np.stack([x[max(0, r - 1): r + 2].max(axis=0) for r in range(0, len(x), 2)])
+        for group in range(4):
+            for b in range(2):
+                name = f"group{group + 1}_block{b + 1}"
+                x = block(x, e[name], t[name], 2 if group and not b else 1)
+        f = x.mean(axis=0)
+        bank = p["bank"]
+        heads = []
+        weights = []
+        for h in range(bank["query"]["bias"].shape[0]):
+            q = f @ bank["query"]["kernel"][:, h] + bank["query"]["bias"][h]
+            k = bank["prototypes"] @ bank["key"]["kernel"][:, h] + bank["key"]["bias"][h]
+            v = bank["prototypes"] @ bank["value"]["kernel"][:, h] + bank["value"]["bias"][h]
+            a = np.exp(k @ q / np.sqrt(len(q)))
+            weights.append(a / a.sum())
+            heads.append(weights[-1] @ v)
+        h = f + np.concatenate(heads) @ bank["output"]["kernel"].reshape(len(f), len(f)) + bank["output"]["bias"]
+        linear = lambda q, h=h: h @ q["kernel"] + q["bias"]  # noqa: E731
+        gate = np.tanh(linear(p["head"]["gate"]))
+        displacement.append(np.log1p(np.exp(linear(p["head"]["scale"]))) * gate)
+        log_std.append(linear(p["uncertainty"]["log_std"]))
+        gates.append(gate)
+        attention.append(weights)
+    return tuple(map(np.array, (displacement, log_std, gates, attention)))
+
+
+@pytest.mark.parametrize("samples", [100, 200])
+def test_forward_against_numpy(samples):
+    model = models.create("gnio", width=8, bank_size=5, bank_heads=4)
+    windows = jax.random.normal(jax.random.key(1), (2, samples, 6), jnp.float32)
+    variables = jax.jit(model.init)(jax.random.key(0), windows)
+    # Statistics and gate away from their neutral start, so that none can be left out unnoticed.
+    rng = np.random.default_rng(3)
+    variables = jax.tree.map(lambda x: x + 0.1 * rng.random(x.shape, np.float32) if x.ndim == 1 else x, variables)
+    found = jax.jit(model.apply)(variables, windows)
+    displacement, log_std, gate, attention = numpy_forward(variables, windows)
+    np.testing.assert_allclose(found.displacement, displacement, rtol=2e-4, atol=2e-5)
+    np.testing.assert_allclose(found.log_std, log_std, rtol=2e-4, atol=2e-5)
+    np.testing.assert_allclose(found.diagnostics["gate"], gate, rtol=2e-4, atol=2e-5)
+    np.testing.assert_allclose(found.diagnostics["attention"], attention, rtol=2e-4, atol=2e-6)
+
+
+@pytest.mark.parametrize("size, stride, length", [(7, 2, 200), (3, 1, 25), (3, 2, 25), (1, 2, 13), (3, 2, 50)])
+def test_convolution_and_its_gradients_against_xla(size, stride, length):
+    x = jax.random.normal(jax.random.key(0), (3, length, 4), jnp.float32)
+    kernel = jax.random.normal(jax.random.key(1), (size, 4, 5), jnp.float32)
+    padding = [((size - 1) // 2, (size - 1) // 2)]
+    oracle = lambda x, k: lax.conv_general_dilated(x, k, (stride,), padding, dimension_numbers=("NWC", "WIO", "NWC"))  # noqa: E731
+    ours = lambda x, k: resnet.convolve(x, k, (stride,), padding)  # noqa: E731
+    np.testing.assert_allclose(ours(x, kernel), oracle(x, kernel), rtol=1e-5, atol=1e-5)
+    weight = jax.random.normal(jax.random.key(2), oracle(x, kernel).shape, jnp.float32)
+    for a, b in zip(*(jax.grad(lambda x, k, f=f: jnp.sum(f(x, k) * weight), (0, 1))(x, kernel) for f in (ours, oracle)), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("length", [100, 50, 25, 13])
+def test_max_pool_against_torch_convention(length):
+    x = -1 - np.random.default_rng(0).random((2, length, 3)).astype(np.float32)  # negative: a zero padding would show
+    rows = range(0, length + 2 - 3 + 1, 2)
+    padded = np.pad(x, ((0, 0), (1, 1), (0, 0)), constant_values=-np.inf)
+    np.testing.assert_array_equal(resnet.max_pool(jnp.asarray(x)), np.stack([padded[:, r: r + 3].max(axis=1) for r in rows], axis=1))
+
+
+SCALES = {"softplus": lambda x: np.log1p(np.exp(x)), "pos_elu": lambda x: np.where(x > 0, x + 1, np.exp(np.minimum(x, 0))),
+          "abs": np.abs, "exp": np.exp, "linear": lambda x: x}
+GATES = {"tanh": np.tanh, "sigmoid": lambda x: 1 / (1 + np.exp(-x))}
+
+
+@pytest.mark.parametrize("scale", SCALES)
+@pytest.mark.parametrize("gate", GATES)
+def test_gates_and_scales(gate, scale):
+    from gnio_jax.models.heads import GatedHead
+
+    head = GatedHead(gate, scale)
+    h = jax.random.normal(jax.random.key(0), (4, 16), jnp.float32)
+    variables = head.init(jax.random.key(1), h)
+    variables = jax.tree.map(lambda x: x + 0.3 * jax.random.normal(jax.random.key(7), x.shape, x.dtype), variables)
+    displacement, seen = head.apply(variables, h)
+    linear = lambda q: np.asarray(h, np.float64) @ np.asarray(q["kernel"]) + np.asarray(q["bias"])  # noqa: E731
+    s, g = SCALES[scale](linear(variables["params"]["scale"])), GATES[gate](linear(variables["params"]["gate"]))
+    np.testing.assert_allclose(displacement, s * g, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(seen["gate"], g, rtol=1e-4, atol=1e-5)
+
+
+def test_a_new_network_predicts_that_it_stands_still():
+    model = models.create("gnio", width=8)
+    windows = jax.random.normal(jax.random.key(1), (4, 100, 6), jnp.float32)
+    variables = jax.jit(model.init)(jax.random.key(0), windows)
+    prediction, _ = jax.jit(lambda v, w: model.apply(v, w, train=True, mutable=["batch_stats"]))(variables, windows)
+    assert float(jnp.abs(prediction.displacement).max()) < 0.1
+
+
+@pytest.mark.parametrize("options", [{}, {"scale": "abs"}, {"head": "linear", "bank_size": 0}], ids=str)
+def test_gradient_is_finite_where_everything_is_zero(options):
+    """Zero input, zero parameters, zero gate, |0| as scale."""
+    model = models.create("gnio", width=8, **options)
+    still = jnp.zeros((2, 32, 6), jnp.float32)
+    variables = jax.tree.map(jnp.zeros_like, jax.eval_shape(model.init, jax.random.key(0), still))
+    gradient = jax.jit(jax.grad(lambda v: jnp.sum(model.apply(v, still).displacement)))(variables)
+    assert all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves(gradient))
+
+
+def test_training_mode_updates_the_statistics_with_momentum():
+    model = models.create("gnio", width=8)
+    windows = 3 + jax.random.normal(jax.random.key(1), (16, 100, 6), jnp.float32)
+    variables = jax.jit(model.init)(jax.random.key(0), windows)
+    _, changed = jax.jit(lambda v, w: model.apply(v, w, train=True, mutable=["batch_stats"]))(variables, windows)
+    stem = resnet.convolve(windows, variables["params"]["encoder"]["stem_conv"]["kernel"], (2,), [(3, 3)])
+    expected = 0.1 * np.asarray(stem).mean(axis=(0, 1))
+    np.testing.assert_allclose(changed["batch_stats"]["encoder"]["stem_bn"]["mean"], expected, rtol=1e-4, atol=1e-5)
+
+
+def test_parameters_and_outputs_are_float32_whatever_comes_in():
+    model = models.create("gnio", width=8)
+    windows = jnp.ones((1, 100, 6), jnp.float64)
+    variables = jax.jit(model.init)(jax.random.key(0), windows)
+    assert {leaf.dtype for leaf in jax.tree.leaves(variables)} == {jnp.dtype("float32")}
+    prediction = jax.eval_shape(model.apply, variables, windows)
+    assert prediction.displacement.dtype == prediction.log_std.dtype == jnp.float32
+
+
+def test_keys_and_values_are_projected_once_per_call():
+    """Cost of the compiled program: 2 × 37.4 M multiply-adds a window, the bank's projections not repeated per window."""
+    model = models.create("gnio")
+    variables = shapes()
+
+    def flops(batch):
+        lowered = jax.jit(model.apply).lower(variables, jax.ShapeDtypeStruct((batch, 200, 6), jnp.float32))
+        return lowered.cost_analysis()["flops"]
+
+    per_window = (flops(65) - flops(1)) / 64
+    assert per_window == pytest.approx(2 * 37.4e6, rel=0.02)
+    assert flops(1) - per_window == pytest.approx(2 * 2 * 64 * 512 * 512, rel=0.05)
+
+
+def test_unknown_names_are_told_the_known_ones():
+    with pytest.raises(InputError, match=r"model 'gnoi': unknown; known models: .*gnio"):
+        models.create("gnoi")
+    with pytest.raises(InputError, match=r"unknown option 'bank_sise'; did you mean 'bank_size'\?"):
+        models.create("gnio", bank_sise=3)
