@@ -9,6 +9,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 import jaxlie
+import numpy as np
 from jaxtyping import Float
 
 Scalar = Float[jax.Array, ""]
@@ -17,15 +18,43 @@ Matrix = Float[jax.Array, "3 3"]
 Quaternion = Float[jax.Array, "4"]
 
 
+_LEVI_CIVITA = np.zeros((3, 3, 3))
+for _i, _j, _k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+    _LEVI_CIVITA[_i, _j, _k], _LEVI_CIVITA[_j, _i, _k] = 1.0, -1.0
+
+
 def hat(v: Vector) -> Matrix:
     """The cross-product matrix: hat(v) w = v × w."""
-    zero = jnp.zeros_like(v[0])
-    return jnp.array([[zero, -v[2], v[1]], [v[2], zero, -v[0]], [-v[1], v[0], zero]])
+    return jnp.sum(-_LEVI_CIVITA.astype(v.dtype) * v[None, None, :], axis=2)
+
+
+def _series(squared: Scalar) -> tuple[Scalar, Scalar, Scalar]:
+    """sin θ/θ, (1 − cos θ)/θ² and (θ − sin θ)/θ³ from θ².
+
+    The quotients lose digits as θ → 0 and have no derivative there, so below θ² = 1e-2 the power series takes over, to the last bit.
+    """
+    small = squared < 1e-2
+    x = jnp.where(small, squared, 0.0)
+    safe = jnp.where(small, 1.0, squared)
+    half = 0.5 * jnp.sqrt(safe)
+    sine, cosine = jnp.sin(half), jnp.cos(half)
+    first = sine * cosine / half
+    return (jnp.where(small, 1 - x / 6 * (1 - x / 20 * (1 - x / 42 * (1 - x / 72))), first),
+            jnp.where(small, 0.5 - x / 24 * (1 - x / 30 * (1 - x / 56 * (1 - x / 90))), 2 * sine**2 / safe),
+            jnp.where(small, 1 / 6 - x / 120 * (1 - x / 42 * (1 - x / 72 * (1 - x / 110))), (1 - first) / safe))
+
+
+def _polynomial(phi: Vector, squared: Scalar, first: Scalar, second: Scalar) -> Matrix:
+    """I + first · hat(φ) + second · hat(φ)², the second power being φφᵀ − θ² I."""
+    eye = np.eye(3, dtype=phi.dtype)
+    return (1 - second * squared) * eye + first * hat(phi) + second * (phi[:, None] * phi[None, :])
 
 
 def exp(phi: Vector) -> Matrix:
-    """Rotation by the rotation vector `phi` (rad)."""
-    return jaxlie.SO3.exp(phi).as_matrix()
+    """Rotation by the rotation vector `phi` (rad): I + sin θ/θ hat(φ) + (1 − cos θ)/θ² hat(φ)²."""
+    squared = jnp.sum(phi * phi)
+    sine, versine, _ = _series(squared)
+    return _polynomial(phi, squared, sine, versine)
 
 
 def log(rotation: Matrix) -> Vector:
@@ -33,24 +62,21 @@ def log(rotation: Matrix) -> Vector:
     return jaxlie.SO3.from_matrix(rotation).log()
 
 
-def cumulative_rotation(phi: Float[jax.Array, "n 3"]) -> Float[jax.Array, "n+1 3 3"]:
-    """I, exp(φ_0), exp(φ_0) exp(φ_1), …: the rotation since the start before each of n steps and after the last.
+def matmul(a: Float[jax.Array, "#n 3 3"], b: Float[jax.Array, "#n 3 3"]) -> Float[jax.Array, "n 3 3"]:
+    """a_i b_i for stacks of small matrices, as a sum that XLA fuses with its neighbours: a batch of dots would be a call for each."""
+    return jnp.sum(a[:, :, :, None] * b[:, None, :, :], axis=2)
 
-    The products are formed in about log2(n) rounds over the whole array, each doubling the reach of every product.
+
+def cumulative_rotation(start: Matrix, turns: Float[jax.Array, "n 3 3"]) -> Float[jax.Array, "n+1 3 3"]:
+    """R_0 = start, R_{j+1} = R_j turns_j: the rotation before each of n steps and after the last.
+
+    The products are formed in about log2(n) rounds over the whole array; each doubles the reach of every product.
     """
-    turns = jaxlie.SO3.exp(phi).wxyz
-    reach = 1
-    while reach < turns.shape[0]:
-        turns = jnp.concatenate([turns[:reach], _quaternion_product(turns[:-reach], turns[reach:])])
+    products, reach = jnp.concatenate([start[None], turns]), 1
+    while reach < products.shape[0]:
+        products = jnp.concatenate([products[:reach], matmul(products[:-reach], products[reach:])])
         reach *= 2
-    return jnp.concatenate([jnp.eye(3, dtype=phi.dtype)[None], jaxlie.SO3(turns).as_matrix()])
-
-
-def _quaternion_product(a: Float[jax.Array, "n 4"], b: Float[jax.Array, "n 4"]) -> Float[jax.Array, "n 4"]:
-    aw, ax, ay, az = a.T
-    bw, bx, by, bz = b.T
-    return jnp.stack([aw * bw - ax * bx - ay * by - az * bz, aw * bx + ax * bw + ay * bz - az * by,
-                      aw * by - ax * bz + ay * bw + az * bx, aw * bz + ax * by - ay * bx + az * bw], axis=1)
+    return products
 
 
 def matrix_from_quaternion(wxyz: Quaternion) -> Matrix:
@@ -64,19 +90,10 @@ def quaternion_from_matrix(rotation: Matrix) -> Quaternion:
 
 
 def right_jacobian(phi: Vector) -> Matrix:
-    """J_r(φ): exp(φ + δ) ≈ exp(φ) exp(J_r(φ) δ).
-
-    J_r = I − (1 − cos θ)/θ² hat(φ) + (θ − sin θ)/θ³ hat(φ)²; below θ² = 1e-4 (1e-2 in float32, where 1 − cos θ
-    has few digits left) the series takes over, so that the derivative at zero is the true one.
-    """
-    squared = jnp.dot(phi, phi)
-    small = squared < (1e-4 if phi.dtype == jnp.float64 else 1e-2)
-    safe = jnp.where(small, 1.0, squared)
-    theta = jnp.sqrt(safe)
-    first = jnp.where(small, 0.5 - squared / 24 + squared**2 / 720, (1 - jnp.cos(theta)) / safe)
-    second = jnp.where(small, 1 / 6 - squared / 120 + squared**2 / 5040, (theta - jnp.sin(theta)) / (safe * theta))
-    cross = hat(phi)
-    return jnp.eye(3, dtype=phi.dtype) - first * cross + second * (cross @ cross)
+    """J_r(φ): exp(φ + δ) ≈ exp(φ) exp(J_r(φ) δ).  J_r = I − (1 − cos θ)/θ² hat(φ) + (θ − sin θ)/θ³ hat(φ)²."""
+    squared = jnp.sum(phi * phi)
+    _, versine, excess = _series(squared)
+    return _polynomial(phi, squared, -versine, excess)
 
 
 def yaw_direction(rotation: Matrix) -> tuple[Scalar, Scalar]:

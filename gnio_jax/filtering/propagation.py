@@ -46,51 +46,56 @@ class Interval(NamedTuple):
 def interval(state: FilterState, gyro: Float[Array, "n 3"], accel: Float[Array, "n 3"], noise: NoiseModel, dt: float) -> Interval:
     """Integrate the n samples of one clone interval, gyro rad/s and accel m/s² raw in the body frame, from `state`."""
     n, dtype = gyro.shape[0], gyro.dtype
-    tail = np.triu(np.ones((n, n)))  # row m sums the samples from m on
-    lever = tail * ((n - 0.5 - np.arange(n)) * dt)  # and carries a step in velocity on to the position at the end
-    left = np.concatenate([(n - 1.5 - np.arange(n)) * dt])[:, None, None] + dt  # same lever, per sample
+    after = np.triu(np.ones((n, n)))  # row m sums the samples from m on
+    lever = (n - 0.5 - np.arange(n)) * dt  # metres at the end of the interval for each m/s that sample l adds
+    eye = np.eye(3, dtype=dtype)
 
     phi = (gyro - state.gyro_bias[None]) * dt
-    rotations = _matmul(state.rotation[None], geometry.cumulative_rotation(phi))  # R_0 … R_n
-    velocity_steps = _matvec(rotations[:-1], (accel - state.accel_bias[None]) * dt)
-    velocity_tail, position_tail = tail.astype(dtype) @ velocity_steps, lever.astype(dtype) @ velocity_steps
-    carry_velocity, carry_position = -jax.vmap(geometry.hat)(velocity_tail), -jax.vmap(geometry.hat)(position_tail)
+    rotations = geometry.cumulative_rotation(state.rotation, jax.vmap(geometry.exp)(phi))
+    steps = jnp.sum(rotations[:-1] * ((accel - state.accel_bias[None]) * dt)[:, None, :], axis=2)  # Δv of every sample
+    tails = np.concatenate([after, after * lever], dtype=dtype) @ steps  # Σ_{j≥m} Δv_j, then Σ_{j≥m} (n − j − ½) dt Δv_j
+    carry = -jax.vmap(geometry.hat)(tails).reshape(2, n, 3, 3)  # Φ_m[v, θ], Φ_m[p, θ] for m = 0 … n − 1
 
-    # N_l, rows θ, v, p: the noise of sample l turns the rotation after it and so all later Δv.
-    by_gyro = dt * _matmul(rotations[1:], jax.vmap(geometry.right_jacobian)(phi))
+    # N_l: the noise of sample l turns the rotation after it, and by that every later Δv.
+    by_gyro = dt * geometry.matmul(rotations[1:], jax.vmap(geometry.right_jacobian)(phi))
+    later = jnp.concatenate([carry[:, 1:], jnp.zeros((2, 1, 3, 3), dtype)], axis=1)
+    by_gyro = jnp.stack([by_gyro, geometry.matmul(later[0], by_gyro), geometry.matmul(later[1], by_gyro)], axis=1).reshape(n, 9, 3)
     by_accel = dt * rotations[:-1]
-    zero = jnp.zeros((1, 3, 3), dtype)
-    reach = jnp.concatenate([
-        jnp.concatenate([by_gyro, _matmul(jnp.concatenate([carry_velocity[1:], zero]), by_gyro),
-                         _matmul(jnp.concatenate([carry_position[1:], zero]), by_gyro)], axis=1),
-        jnp.concatenate([jnp.zeros((n, 3, 3), dtype), by_accel, left.astype(dtype) * by_accel], axis=1)], axis=2)
-    bias_tail = -(tail.astype(dtype) @ reach.reshape(n, 54)).reshape(n, 9, 6)  # Φ_m[θ v p, b], m = 0 … n−1; Φ_n's is zero
+    by_accel = jnp.stack([jnp.zeros_like(by_accel), by_accel, lever.astype(dtype)[:, None, None] * by_accel], axis=1).reshape(n, 9, 3)
+    reach = jnp.concatenate([by_gyro, by_accel], axis=2)
 
-    identity = jnp.eye(3, dtype=dtype)
-    transition = jnp.eye(CORE, dtype=dtype).at[3:6, 0:3].set(carry_velocity[0]).at[6:9, 0:3].set(carry_position[0])
-    transition = transition.at[6:9, 3:6].set(n * dt * identity).at[:9, 9:].set(bias_tail[0])
-    std = jnp.stack([jnp.asarray(value, dtype) for value in noise])
-    white = (std[:2] / np.sqrt(dt))[np.array([0, 0, 0, 1, 1, 1])]
-    walk = (std[2:] * np.sqrt(dt))[np.array([0, 0, 0, 1, 1, 1])]
-    by_white = jnp.concatenate([reach, jnp.zeros((n, 6, 6), dtype)], axis=1) * white[None, None]
-    by_walk = jnp.concatenate([jnp.concatenate([bias_tail[1:], jnp.zeros((1, 9, 6), dtype)]),
-                               jnp.tile(jnp.eye(6, dtype=dtype)[None], (n, 1, 1))], axis=1) * walk[None, None]
-    columns = jnp.concatenate([by_white, by_walk], axis=2).transpose(1, 0, 2).reshape(CORE, n * 12)
-
+    # Φ_m[θ v p, b] for m = 1 … n − 1 (it is zero for m = n), and last its sum over m, which is Σ_l l N_l
+    bias_tails = -(np.concatenate([after, np.arange(n)[None]], dtype=dtype) @ reach.reshape(n, 54)).reshape(n + 1, 9, 6)
     duration = n * dt
-    gravity = jnp.array([0.0, 0.0, -GRAVITY], dtype)
+    kinematics = np.block([[0 * eye, 0 * eye], [eye, 0 * eye], [duration * eye, eye]])
+    by_tilt = jnp.concatenate([eye, carry[0, 0], carry[1, 0]])
+    transition = jnp.concatenate([jnp.concatenate([by_tilt, kinematics, bias_tails[0]], axis=1), np.eye(CORE, dtype=dtype)[9:]])
+
+    gyro_white, accel_white = noise.gyro_density / np.sqrt(dt), noise.accel_density / np.sqrt(dt)
+    walk = jnp.repeat(jnp.stack([noise.gyro_bias_walk, noise.accel_bias_walk]), 3) * np.sqrt(dt)
+    # The accelerometer's white noise is isotropic, so its rotations drop out of R Rᵀ.
+    per_axis = dt**2 * np.array([[n, lever.sum()], [lever.sum(), (lever**2).sum()]])
+    isotropic = np.kron(np.pad(per_axis, ((1, 0), (1, 0))), np.eye(3)).astype(dtype)
+    columns = jnp.concatenate([gyro_white * by_gyro, walk[None, None] * bias_tails[:n].at[0].set(0.0)], axis=2)
+    columns = columns.transpose(1, 0, 2).reshape(9, 9 * n)
+    moved = accel_white**2 * isotropic + columns @ columns.T
+    mixed = bias_tails[n] * walk[None] ** 2
+    added = jnp.concatenate([jnp.concatenate([moved, mixed], axis=1),
+                             jnp.concatenate([mixed.T, jnp.diag(n * walk**2)], axis=1)])
+
+    gravity = np.array([0.0, 0.0, -GRAVITY], dtype)
     return Interval(
-        rotation=rotations[-1], velocity=state.velocity + velocity_tail[0] + gravity * duration,
-        position=state.position + state.velocity * duration + position_tail[0] + gravity * (0.5 * duration**2),
-        transition=transition, noise=columns @ columns.T)
+        rotation=rotations[-1], velocity=state.velocity + tails[0] + gravity * duration,
+        position=state.position + state.velocity * duration + tails[n] + gravity * (0.5 * duration**2),
+        transition=transition, noise=added)
 
 
 def propagate(state: FilterState, motion: Interval, slot: Array | int) -> FilterState:
     """Move mean and covariance over one interval and clone the new pose into `slot` of the ring, in the place of the oldest."""
     core = motion.transition @ state.core_covariance @ motion.transition.T + motion.noise
-    pose = np.r_[THETA, POSITION]
-    cross = _put(motion.transition @ state.cross_covariance, core[:, pose], 0, CLONE * slot)
-    rows = cross[pose]
+    of_pose = jnp.concatenate([core[:, THETA], core[:, POSITION]], axis=1)
+    cross = _put(motion.transition @ state.cross_covariance, of_pose, 0, CLONE * slot)
+    rows = jnp.concatenate([cross[THETA], cross[POSITION]])
     clones = _put(_put(state.clone_covariance, rows, CLONE * slot, 0), rows.T, 0, CLONE * slot)
     return state._replace(
         rotation=motion.rotation, velocity=motion.velocity, position=motion.position,
@@ -101,12 +106,3 @@ def propagate(state: FilterState, motion: Interval, slot: Array | int) -> Filter
 
 def _put(matrix: Array, block: Array, row: Array | int, column: Array | int) -> Array:
     return jax.lax.dynamic_update_slice(matrix, block, (jnp.int32(row), jnp.int32(column)))
-
-
-# Written as sums: XLA fuses them with their neighbours, where a batch of 3×3 dots would be a call each.
-def _matmul(a: Float[Array, "#n 3 3"], b: Float[Array, "#n 3 3"]) -> Float[Array, "n 3 3"]:
-    return jnp.sum(a[:, :, :, None] * b[:, None, :, :], axis=2)
-
-
-def _matvec(a: Float[Array, "n 3 3"], v: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
-    return jnp.sum(a * v[:, None, :], axis=2)

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from gnio_jax import geometry
-from gnio_jax.filtering.state import CLONE, CORE, POSITION, FilterConfig, FilterState, GateState
+from gnio_jax.filtering.state import ACCEL_BIAS, CLONE, GYRO_BIAS, POSITION, VELOCITY, FilterConfig, FilterState, GateState
 from gnio_jax.types import Array
 
 GIMBAL = 1e-5
@@ -92,10 +92,10 @@ def update(state: FilterState, measurement: Measurement, newest: Array | int, ol
     old = CLONE * oldest
     old_core = jax.lax.dynamic_slice_in_dim(state.cross_covariance, old, CLONE, 1)
     old_clones = jax.lax.dynamic_slice_in_dim(state.clone_covariance, old, CLONE, 0)
-    over_core = jacobian[:, :6] @ old_core.T + jacobian[:, 6:] @ state.core_covariance[POSITION]
-    over_clones = jacobian[:, :6] @ old_clones + jacobian[:, 6:] @ state.cross_covariance[POSITION]
-    innovation_covariance = (jax.lax.dynamic_slice_in_dim(over_clones, old, CLONE, 1) @ jacobian[:, :6].T
-                             + over_core[:, POSITION] @ jacobian[:, 6:].T)
+    over_core = _times(jacobian, jnp.concatenate([old_core.T, state.core_covariance[POSITION]]))
+    over_clones = _times(jacobian, jnp.concatenate([old_clones, state.cross_covariance[POSITION]]))
+    over_touched = jnp.concatenate([jax.lax.dynamic_slice_in_dim(over_clones, old, CLONE, 1), over_core[:, POSITION]], axis=1)
+    innovation_covariance = _times(over_touched, jacobian.T)
 
     whiten = _whitener(innovation_covariance + measurement.covariance, present)
     whitened = whiten(innovation[:, None])[:, 0]
@@ -111,7 +111,7 @@ def update(state: FilterState, measurement: Measurement, newest: Array | int, ol
         accepted = tried
 
     over_core, over_clones = (jnp.where(accepted, whiten(rows), 0.0) for rows in (over_core, over_clones))
-    corrected = _retract(state, over_core.T @ whitened, (over_clones.T @ whitened).reshape(-1, CLONE))
+    corrected = _retract(state, _times(whitened[None], over_core)[0], _times(whitened[None], over_clones).reshape(-1, CLONE), newest)
     return corrected._replace(
         core_covariance=state.core_covariance - _square(over_core, over_core),
         cross_covariance=state.cross_covariance - _square(over_core, over_clones),
@@ -137,17 +137,21 @@ def _whitener(covariance: Float[Array, "3 3"], present: Array):
     return whiten
 
 
+# Sums instead of dots, so that XLA fuses them with what comes before and after: the matrices are small, a call is not.
+def _times(a: Float[Array, "m k"], b: Float[Array, "k n"]) -> Float[Array, "m n"]:
+    return jnp.sum(a[:, :, None] * b[None, :, :], axis=1)
+
+
 def _square(a: Float[Array, "3 m"], b: Float[Array, "3 k"]) -> Float[Array, "m k"]:
-    """aᵀ b, spelt out so that it is fused with the subtraction into one pass over P."""
+    """aᵀ b, which together with the subtraction is one pass over P."""
     return a[0][:, None] * b[0][None, :] + a[1][:, None] * b[1][None, :] + a[2][:, None] * b[2][None, :]
 
 
-def _retract(state: FilterState, core: Float[Array, "15"], clones: Float[Array, "c 6"]) -> FilterState:
-    """Add an error to the mean: R ← exp(δθ) R, the rest adds."""
-    parts = core.reshape(CORE // 3, 3)
-    turns = jax.vmap(geometry.exp)(clones[:, :3])
+def _retract(state: FilterState, core: Float[Array, "15"], clones: Float[Array, "c 6"], newest: Array | int) -> FilterState:
+    """Add an error to the mean: R ← exp(δθ) R, the rest adds. The core's pose is that of the newest clone."""
+    rotations = geometry.matmul(jax.vmap(geometry.exp)(clones[:, :3]), state.clone_rotation)
+    positions = state.clone_position + clones[:, 3:]
     return state._replace(
-        rotation=geometry.exp(parts[0]) @ state.rotation, velocity=state.velocity + parts[1], position=state.position + parts[2],
-        gyro_bias=state.gyro_bias + parts[3], accel_bias=state.accel_bias + parts[4],
-        clone_rotation=jnp.sum(turns[:, :, :, None] * state.clone_rotation[:, None], axis=2),
-        clone_position=state.clone_position + clones[:, 3:])
+        rotation=rotations[newest], velocity=state.velocity + core[VELOCITY], position=positions[newest],
+        gyro_bias=state.gyro_bias + core[GYRO_BIAS], accel_bias=state.accel_bias + core[ACCEL_BIAS],
+        clone_rotation=rotations, clone_position=positions)
