@@ -73,7 +73,8 @@ def _multiply(left: Float[np.ndarray, "4"], right: Quaternions) -> Quaternions:
     return right @ matrix.T
 
 
-def _about_z(angle: Float[np.ndarray, "*k"] | float) -> Float[np.ndarray, "*k 3 3"]:
+def rotation_z(angle: Float[np.ndarray, "*k"] | float) -> Float[np.ndarray, "*k 3 3"]:
+    """Rotation by an angle (rad) about the world's z axis."""
     cosine, sine = np.cos(angle), np.sin(angle)
     zero, one = np.zeros_like(cosine), np.ones_like(cosine)
     return np.stack([np.stack([cosine, -sine, zero], -1), np.stack([sine, cosine, zero], -1), np.stack([zero, zero, one], -1)], -2)
@@ -103,13 +104,13 @@ def align(estimate: Trajectory, reference: Trajectory, how: Alignment = "origin"
         raise Undefined("no trusted reference")
     if how == "origin":
         first = rows[0]
-        turn = _about_z((yaw(reference.orientation[first:first + 1]) - yaw(estimate.orientation[first:first + 1]))[0])
+        turn = rotation_z((yaw(reference.orientation[first:first + 1]) - yaw(estimate.orientation[first:first + 1]))[0])
         source, target = estimate.position[first], reference.position[first]
     else:
         source, target = estimate.position[rows].mean(0), reference.position[rows].mean(0)
         a, b = estimate.position[rows] - source, reference.position[rows] - target
         if how == "yaw_position":
-            turn = _about_z(np.arctan2(a[:, 0] @ b[:, 1] - a[:, 1] @ b[:, 0], a[:, 0] @ b[:, 0] + a[:, 1] @ b[:, 1]))
+            turn = rotation_z(np.arctan2(a[:, 0] @ b[:, 1] - a[:, 1] @ b[:, 0], a[:, 0] @ b[:, 0] + a[:, 1] @ b[:, 1]))
         else:
             if len(rows) < 3:
                 raise Undefined("fewer than three trusted rows to align")
@@ -200,7 +201,7 @@ def rpe(estimate: Positions, reference: Positions, estimate_yaw: Angles, referen
     if rows_apart >= len(estimate):
         raise Undefined(reason)
     angle = (reference_yaw - estimate_yaw)[:-rows_apart]
-    turn = _about_z(angle)[:, :estimate.shape[1], :estimate.shape[1]]
+    turn = rotation_z(angle)[:, :estimate.shape[1], :estimate.shape[1]]
     moved = np.einsum("nij,nj->ni", turn, estimate[rows_apart:] - estimate[:-rows_apart])
     return _rms(moved - (reference[rows_apart:] - reference[:-rows_apart]), _pairs(reference, rows_apart), reason)
 
@@ -389,7 +390,7 @@ def position_nees(aligned: Trajectory, estimate: Trajectory, reference: Trajecto
                   dims: Literal[2, 3] = 3) -> Float[np.ndarray, "n"]:
     """eᵀ P⁻¹ e of the position, NaN where there is no reference: the error of the start-aligned estimate, turned back into
     the filter's own frame, in which its covariance is."""
-    turn = _about_z((yaw(estimate.orientation[:1]) - yaw(aligned.orientation[:1]))[0])
+    turn = rotation_z((yaw(estimate.orientation[:1]) - yaw(aligned.orientation[:1]))[0])
     error = (aligned.position - reference.position) @ turn.T
     good = _finite(error) & (np.einsum("nii->ni", covariance) > 0).all(1)  # a start given as exact has nothing to be normalised by
     squared = np.full(len(error), np.nan)
