@@ -146,9 +146,11 @@ def check_units(gyro: Float[np.ndarray, "n 3"], accel: Float[np.ndarray, "n 3"],
     pull = float(np.median(np.linalg.norm(accel, axis=1)))
     if 0.5 < pull < 2.0:
         raise InputError(source, f"field 'accel' looks like G (median magnitude {pull:.3g})", "convert it to m/s² (× 9.80665)")
-    if pull <= 0.5:
+    if pull < 5.0:  # a walker's linear acceleration is 1–4 m/s²
         raise InputError(source, f"field 'accel' has no gravity in it (median magnitude {pull:.3g} m/s²)",
                          "give the specific force, gravity included")
+    if pull > 50.0:
+        raise InputError(source, f"field 'accel' is not in m/s² (median magnitude {pull:.3g})", "convert it to m/s²")
     turn = float(np.median(np.linalg.norm(gyro, axis=1)))
     if turn > 20.0:
         raise InputError(source, f"field 'gyro' looks like deg/s (median magnitude {turn:.3g})", "convert it to rad/s (× π/180)")
@@ -462,7 +464,11 @@ def read_hdf5(path: str | os.PathLike[str]) -> Sequence:
             for field in _FIELDS:
                 if field not in file:
                     raise InputError(path, f"field '{field}' is missing", "convert the recording again")
-                values[field] = file[field][()]  # pyright: ignore[reportIndexIssue]
+                value = file[field][()]  # pyright: ignore[reportIndexIssue]
+                if not isinstance(value, np.ndarray) or value.dtype.kind != ("b" if field == "valid" else "f"):
+                    raise InputError(path, f"field '{field}' is not an array of {'booleans' if field == 'valid' else 'numbers'}",
+                                     "convert the recording again")
+                values[field] = value
             device = file["device_orientation"][()] if "device_orientation" in file else None  # pyright: ignore[reportIndexIssue]
             stored = file["attributes"].attrs if "attributes" in file else {}
             attributes = {key: value.item() if isinstance(value, np.generic) else value for key, value in stored.items()}
