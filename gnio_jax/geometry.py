@@ -6,6 +6,8 @@ dtype of its input and has finite derivatives at its singular points.
 
 from __future__ import annotations
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import jaxlie
@@ -18,14 +20,13 @@ Matrix = Float[jax.Array, "3 3"]
 Quaternion = Float[jax.Array, "4"]
 
 
-_LEVI_CIVITA = np.zeros((3, 3, 3))
-for _i, _j, _k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-    _LEVI_CIVITA[_i, _j, _k], _LEVI_CIVITA[_j, _i, _k] = 1.0, -1.0
+_GENERATORS = np.array([[[0, 0, 0], [0, 0, -1], [0, 1, 0]], [[0, 0, 1], [0, 0, 0], [-1, 0, 0]], [[0, -1, 0], [1, 0, 0], [0, 0, 0]]])
+"""hat of the unit vectors. Sums over three are spelt out in this file: XLA fuses them, while a reduction can end as a library call."""
 
 
 def hat(v: Vector) -> Matrix:
     """The cross-product matrix: hat(v) w = v × w."""
-    return jnp.sum(-_LEVI_CIVITA.astype(v.dtype) * v[None, None, :], axis=2)
+    return v[0] * _GENERATORS[0].astype(v.dtype) + v[1] * _GENERATORS[1].astype(v.dtype) + v[2] * _GENERATORS[2].astype(v.dtype)
 
 
 def _series(squared: Scalar) -> tuple[Scalar, Scalar, Scalar]:
@@ -62,19 +63,19 @@ def log(rotation: Matrix) -> Vector:
     return jaxlie.SO3.from_matrix(rotation).log()
 
 
-def matmul(a: Float[jax.Array, "#n 3 3"], b: Float[jax.Array, "#n 3 3"]) -> Float[jax.Array, "n 3 3"]:
-    """a_i b_i for stacks of small matrices, as a sum that XLA fuses with its neighbours: a batch of dots would be a call for each."""
-    return jnp.sum(a[:, :, :, None] * b[:, None, :, :], axis=2)
+def matmul(a: Float[jax.Array, "p k *n"], b: Float[jax.Array, "k q *n"]) -> Float[jax.Array, "p q *n"]:
+    """a b for small matrices stacked along trailing axes, as a sum that XLA fuses with its neighbours, where a dot is a library call."""
+    return functools.reduce(jnp.add, [a[:, None, k] * b[None, k] for k in range(b.shape[0])])
 
 
-def cumulative_rotation(start: Matrix, turns: Float[jax.Array, "n 3 3"]) -> Float[jax.Array, "n+1 3 3"]:
-    """R_0 = start, R_{j+1} = R_j turns_j: the rotation before each of n steps and after the last.
+def cumulative_rotation(start: Matrix, turns: Float[jax.Array, "3 3 n"]) -> Float[jax.Array, "3 3 n+1"]:
+    """R_0 = start, R_{j+1} = R_j turns_j: the rotation before each of n steps and after the last, along the last axis.
 
     The products are formed in about log2(n) rounds over the whole array; each doubles the reach of every product.
     """
-    products, reach = jnp.concatenate([start[None], turns]), 1
-    while reach < products.shape[0]:
-        products = jnp.concatenate([products[:reach], matmul(products[:-reach], products[reach:])])
+    products, reach = jnp.concatenate([start[:, :, None], turns], axis=2), 1
+    while reach < products.shape[2]:
+        products = jnp.concatenate([products[:, :, :reach], matmul(products[:, :, :-reach], products[:, :, reach:])], axis=2)
         reach *= 2
     return products
 

@@ -25,6 +25,7 @@ from jaxtyping import Float
 
 from gnio_jax import geometry
 from gnio_jax.filtering.state import CLONE, CORE, POSITION, THETA, FilterState, NoiseModel
+from gnio_jax.geometry import matmul
 from gnio_jax.types import GRAVITY, Array
 
 
@@ -46,47 +47,49 @@ class Interval(NamedTuple):
 def interval(state: FilterState, gyro: Float[Array, "n 3"], accel: Float[Array, "n 3"], noise: NoiseModel, dt: float) -> Interval:
     """Integrate the n samples of one clone interval, gyro rad/s and accel m/s² raw in the body frame, from `state`."""
     n, dtype = gyro.shape[0], gyro.dtype
-    after = np.triu(np.ones((n, n)))  # row m sums the samples from m on
+    after = np.tril(np.ones((n, n)))  # column m sums the samples from m on; the samples lie along the last axis of everything here
     lever = (n - 0.5 - np.arange(n)) * dt  # metres at the end of the interval for each m/s that sample l adds
     eye = np.eye(3, dtype=dtype)
 
     phi = (gyro - state.gyro_bias[None]) * dt
-    rotations = geometry.cumulative_rotation(state.rotation, jax.vmap(geometry.exp)(phi))
-    steps = jnp.sum(rotations[:-1] * ((accel - state.accel_bias[None]) * dt)[:, None, :], axis=2)  # Δv of every sample
-    tails = np.concatenate([after, after * lever], dtype=dtype) @ steps  # Σ_{j≥m} Δv_j, then Σ_{j≥m} (n − j − ½) dt Δv_j
-    carry = -jax.vmap(geometry.hat)(tails).reshape(2, n, 3, 3)  # Φ_m[v, θ], Φ_m[p, θ] for m = 0 … n − 1
+    rotations = geometry.cumulative_rotation(state.rotation, jax.vmap(geometry.exp, out_axes=2)(phi))
+    steps = matmul(rotations[:, :, :-1], ((accel - state.accel_bias[None]) * dt).T[:, None])[:, 0]  # Δv of every sample
+    tails = steps @ np.concatenate([after, after * lever[:, None]], axis=1, dtype=dtype)  # Σ_{j≥m} Δv_j, Σ_{j≥m} (n − j − ½) dt Δv_j
+    carry = -jax.vmap(geometry.hat, in_axes=1, out_axes=2)(tails).reshape(3, 3, 2, n)  # Φ_m[v, θ] and Φ_m[p, θ], m = 0 … n − 1
 
     # N_l: the noise of sample l turns the rotation after it, and by that every later Δv.
-    by_gyro = dt * geometry.matmul(rotations[1:], jax.vmap(geometry.right_jacobian)(phi))
-    later = jnp.concatenate([carry[:, 1:], jnp.zeros((2, 1, 3, 3), dtype)], axis=1)
-    by_gyro = jnp.stack([by_gyro, geometry.matmul(later[0], by_gyro), geometry.matmul(later[1], by_gyro)], axis=1).reshape(n, 9, 3)
-    by_accel = dt * rotations[:-1]
-    by_accel = jnp.stack([jnp.zeros_like(by_accel), by_accel, lever.astype(dtype)[:, None, None] * by_accel], axis=1).reshape(n, 9, 3)
-    reach = jnp.concatenate([by_gyro, by_accel], axis=2)
+    by_gyro = dt * matmul(rotations[:, :, 1:], jax.vmap(geometry.right_jacobian, out_axes=2)(phi))
+    later = jnp.concatenate([carry[:, :, :, 1:], jnp.zeros((3, 3, 2, 1), dtype)], axis=3)
+    by_gyro = jnp.concatenate([by_gyro, matmul(later[:, :, 0], by_gyro), matmul(later[:, :, 1], by_gyro)])
+    by_accel = dt * rotations[:, :, :-1]
+    by_accel = jnp.concatenate([jnp.zeros_like(by_accel), by_accel, lever.astype(dtype)[None, None] * by_accel])
+    reach = jnp.concatenate([by_gyro, by_accel], axis=1)
 
-    # Φ_m[θ v p, b] for m = 1 … n − 1 (it is zero for m = n), and last its sum over m, which is Σ_l l N_l
-    bias_tails = -(np.concatenate([after, np.arange(n)[None]], dtype=dtype) @ reach.reshape(n, 54)).reshape(n + 1, 9, 6)
+    # Φ_m[θ v p, b] for m = 0 … n − 1 (it is zero for m = n), and last its sum over m ≥ 1, which is Σ_l l N_l
+    bias_tails = -(reach.reshape(54, n) @ np.concatenate([after, np.arange(n)[:, None]], axis=1, dtype=dtype)).reshape(9, 6, n + 1)
     duration = n * dt
     kinematics = np.block([[0 * eye, 0 * eye], [eye, 0 * eye], [duration * eye, eye]])
-    by_tilt = jnp.concatenate([eye, carry[0, 0], carry[1, 0]])
-    transition = jnp.concatenate([jnp.concatenate([by_tilt, kinematics, bias_tails[0]], axis=1), np.eye(CORE, dtype=dtype)[9:]])
+    by_tilt = jnp.concatenate([eye, carry[:, :, 0, 0], carry[:, :, 1, 0]])
+    transition = jnp.concatenate([jnp.concatenate([by_tilt, kinematics, bias_tails[:, :, 0]], axis=1), np.eye(CORE, dtype=dtype)[9:]])
 
     gyro_white, accel_white = noise.gyro_density / np.sqrt(dt), noise.accel_density / np.sqrt(dt)
     walk = jnp.repeat(jnp.stack([noise.gyro_bias_walk, noise.accel_bias_walk]), 3) * np.sqrt(dt)
     # The accelerometer's white noise is isotropic, so its rotations drop out of R Rᵀ.
     per_axis = dt**2 * np.array([[n, lever.sum()], [lever.sum(), (lever**2).sum()]])
     isotropic = np.kron(np.pad(per_axis, ((1, 0), (1, 0))), np.eye(3)).astype(dtype)
-    columns = jnp.concatenate([gyro_white * by_gyro, walk[None, None] * bias_tails[:n].at[0].set(0.0)], axis=2)
-    columns = columns.transpose(1, 0, 2).reshape(9, 9 * n)
-    moved = accel_white**2 * isotropic + columns @ columns.T
-    mixed = bias_tails[n] * walk[None] ** 2
+    columns = [by_gyro, bias_tails[:, :, 1:n]]
+    weights = [gyro_white**2, walk[:, None, None] ** 2]
+    left = jnp.concatenate([part.reshape(9, -1) for part in columns], axis=1)
+    right = jnp.concatenate([(weight * part.transpose(1, 2, 0)).reshape(-1, 9) for weight, part in zip(weights, columns, strict=True)])
+    moved = accel_white**2 * isotropic + left @ right
+    mixed = bias_tails[:, :, n] * walk[None] ** 2
     added = jnp.concatenate([jnp.concatenate([moved, mixed], axis=1),
                              jnp.concatenate([mixed.T, jnp.diag(n * walk**2)], axis=1)])
 
     gravity = np.array([0.0, 0.0, -GRAVITY], dtype)
     return Interval(
-        rotation=rotations[-1], velocity=state.velocity + tails[0] + gravity * duration,
-        position=state.position + state.velocity * duration + tails[n] + gravity * (0.5 * duration**2),
+        rotation=rotations[:, :, -1], velocity=state.velocity + tails[:, 0] + gravity * duration,
+        position=state.position + state.velocity * duration + tails[:, n] + gravity * (0.5 * duration**2),
         transition=transition, noise=added)
 
 

@@ -121,8 +121,8 @@ def network_window(rotation: Float[Array, "3 3"], gyro: Float[Array, "n 3"], acc
     level = geometry.yaw_rotation(rotation).T @ rotation
     if config.window_rotation == "single":
         return jnp.concatenate([accel @ level.T, gyro @ level.T], axis=1)
-    rotations = geometry.cumulative_rotation(level, jax.vmap(geometry.exp)(gyro * config.dt)[:-1])
-    return jnp.sum(rotations[:, None] * jnp.stack([accel, gyro], axis=1)[:, :, None, :], axis=3).reshape(-1, 6)
+    rotations = geometry.cumulative_rotation(level, jax.vmap(geometry.exp, out_axes=2)(gyro[:-1] * config.dt))
+    return geometry.matmul(rotations, jnp.stack([accel.T, gyro.T], axis=1)).transpose(2, 1, 0).reshape(-1, 6)
 
 
 def _scan(measure: Callable, state: FilterState, gyro: Array, accel: Array, config: FilterConfig, noise: NoiseModel,

@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float
 
 from gnio_jax import geometry
 from gnio_jax.filtering.state import ACCEL_BIAS, CLONE, GYRO_BIAS, POSITION, VELOCITY, FilterConfig, FilterState, GateState
+from gnio_jax.geometry import matmul
 from gnio_jax.types import Array
 
 GIMBAL = 1e-5
@@ -92,10 +93,10 @@ def update(state: FilterState, measurement: Measurement, newest: Array | int, ol
     old = CLONE * oldest
     old_core = jax.lax.dynamic_slice_in_dim(state.cross_covariance, old, CLONE, 1)
     old_clones = jax.lax.dynamic_slice_in_dim(state.clone_covariance, old, CLONE, 0)
-    over_core = _times(jacobian, jnp.concatenate([old_core.T, state.core_covariance[POSITION]]))
-    over_clones = _times(jacobian, jnp.concatenate([old_clones, state.cross_covariance[POSITION]]))
+    over_core = matmul(jacobian, jnp.concatenate([old_core.T, state.core_covariance[POSITION]]))
+    over_clones = matmul(jacobian, jnp.concatenate([old_clones, state.cross_covariance[POSITION]]))
     over_touched = jnp.concatenate([jax.lax.dynamic_slice_in_dim(over_clones, old, CLONE, 1), over_core[:, POSITION]], axis=1)
-    innovation_covariance = _times(over_touched, jacobian.T)
+    innovation_covariance = matmul(over_touched, jacobian.T)
 
     whiten = _whitener(innovation_covariance + measurement.covariance, present)
     whitened = whiten(innovation[:, None])[:, 0]
@@ -111,11 +112,11 @@ def update(state: FilterState, measurement: Measurement, newest: Array | int, ol
         accepted = tried
 
     over_core, over_clones = (jnp.where(accepted, whiten(rows), 0.0) for rows in (over_core, over_clones))
-    corrected = _retract(state, _times(whitened[None], over_core)[0], _times(whitened[None], over_clones).reshape(-1, CLONE), newest)
+    corrected = _retract(state, matmul(whitened[None], over_core)[0], matmul(whitened[None], over_clones).reshape(-1, CLONE), newest)
     return corrected._replace(
-        core_covariance=state.core_covariance - _square(over_core, over_core),
-        cross_covariance=state.cross_covariance - _square(over_core, over_clones),
-        clone_covariance=state.clone_covariance - _square(over_clones, over_clones),
+        core_covariance=state.core_covariance - matmul(over_core.T, over_core),
+        cross_covariance=state.cross_covariance - matmul(over_core.T, over_clones),
+        clone_covariance=state.clone_covariance - matmul(over_clones.T, over_clones),
         gate=memory,
     ), Outcome(present=present, innovation=innovation, nis=nis, gate_passed=passed, accepted=accepted)
 
@@ -137,19 +138,9 @@ def _whitener(covariance: Float[Array, "3 3"], present: Array):
     return whiten
 
 
-# Sums instead of dots, so that XLA fuses them with what comes before and after: the matrices are small, a call is not.
-def _times(a: Float[Array, "m k"], b: Float[Array, "k n"]) -> Float[Array, "m n"]:
-    return jnp.sum(a[:, :, None] * b[None, :, :], axis=1)
-
-
-def _square(a: Float[Array, "3 m"], b: Float[Array, "3 k"]) -> Float[Array, "m k"]:
-    """aᵀ b, which together with the subtraction is one pass over P."""
-    return a[0][:, None] * b[0][None, :] + a[1][:, None] * b[1][None, :] + a[2][:, None] * b[2][None, :]
-
-
 def _retract(state: FilterState, core: Float[Array, "15"], clones: Float[Array, "c 6"], newest: Array | int) -> FilterState:
     """Add an error to the mean: R ← exp(δθ) R, the rest adds. The core's pose is that of the newest clone."""
-    rotations = geometry.matmul(jax.vmap(geometry.exp)(clones[:, :3]), state.clone_rotation)
+    rotations = jax.vmap(matmul)(jax.vmap(geometry.exp)(clones[:, :3]), state.clone_rotation)
     positions = state.clone_position + clones[:, 3:]
     return state._replace(
         rotation=rotations[newest], velocity=state.velocity + core[VELOCITY], position=positions[newest],
