@@ -1,0 +1,483 @@
+"""Where an IMU sits on a tracked marker body, and the reference that follows from it.
+
+An optical tracker gives the poses of a *marker body* on its own clock in its own, slightly tilted world. The IMU is bolted
+somewhere else on that body, turned against it, on another clock. `align` estimates all of it at once from one recording:
+
+    gyro(t + lag(t))  = Rxᵀ ω_marker(t) + b_g                      ω from differences of the tracked attitude
+    accel(t + lag(t) + δ) = Rxᵀ R(t)ᵀ (p̈(t) + d²/dt² [R(t) l] − g) + b_a    p̈ from second differences of the tracked position
+
+with the extrinsic rotation Rx (IMU → marker body), lever arm l, biases b_g and b_a, the direction of gravity g in the tracker's
+world, a lag that is piecewise linear in time and a delay δ of the accelerometer against the gyro (phones filter it: 10 to 50 ms).
+A first guess comes from Wahba's problem on the angular rates (people turn about one axis, so alone it errs by degrees about that
+axis) and a cross-correlation of their magnitudes; a robust Gauss-Newton fit of gyro and accel together settles the rest. Both
+sides of each equation pass the same Gaussian filter, so that filtering removes noise but biases nothing.
+
+Quaternions never appear here: attitudes are SciPy rotations, body→world.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.linalg import solveh_banded
+from scipy.ndimage import binary_dilation, gaussian_filter1d
+from scipy.signal import correlate, correlation_lags
+from scipy.spatial.transform import Rotation
+
+from gnio_jax.types import GRAVITY
+
+FILTER_SECONDS = 0.03
+"""Standard deviation of the Gaussian that both sides of the fit pass: a pass band of 5 Hz holds the motion of a gait."""
+
+KNOT_SECONDS = 30.0
+"""Spacing of the knots of the lag."""
+
+BLOCK_SECONDS = 2.0
+"""Errors within this time share an offset."""
+
+
+class Track(NamedTuple):
+    """Poses of a marker body on a uniform clock."""
+
+    time: Float[np.ndarray, "n"]
+    """s, on the tracker's clock, uniform."""
+    position: Float[np.ndarray, "n 3"]
+    """m, in the tracker's world; anything finite where not `good`."""
+    attitude: Rotation
+    """n rotations, marker body → tracker's world."""
+    good: Bool[np.ndarray, "n"]
+    """False where the tracker had no pose, or one that cannot be."""
+
+
+class Alignment(NamedTuple):
+    """What `align` estimates; SI units."""
+
+    extrinsic: Rotation
+    """IMU → marker body."""
+    lever: Float[np.ndarray, "3"]
+    """From the marker body's origin to the IMU, in the marker body, m."""
+    up: Float[np.ndarray, "3"]
+    """Unit vector against gravity in the tracker's world."""
+    gyro_bias: Float[np.ndarray, "3"]
+    accel_bias: Float[np.ndarray, "3"]
+    knots: Float[np.ndarray, "k"]
+    """Knots of the lag on the tracker's clock, s."""
+    lag: Float[np.ndarray, "k"]
+    """Time of the IMU minus time of the tracker for the same event, at the knots, s."""
+    accel_delay: float
+    """How much later than the gyro the accelerometer tells of the same event, s."""
+    gyro_residual: float
+    """Robust standard deviation of the filtered angular rate's residual, rad/s."""
+    accel_residual: float
+    """Robust standard deviation of the filtered acceleration's residual, m/s²."""
+    mismatch: Bool[np.ndarray, "n"]
+    """Samples of the track whose acceleration contradicts the IMU grossly: the tracker jumped."""
+
+    def track_time(self, imu_time: Float[np.ndarray, "m"]) -> Float[np.ndarray, "m"]:
+        """Tracker's time of the events that the IMU stamped `imu_time`."""
+        imu_knots = self.knots + self.lag
+        # np.interp holds the ends; here the slopes of the outer intervals go on.
+        inner = np.interp(imu_time, imu_knots, self.knots)
+        before, after = imu_time < imu_knots[0], imu_time > imu_knots[-1]
+        inner = np.where(before, self.knots[0] + imu_time - imu_knots[0], inner)
+        return np.where(after, self.knots[-1] + imu_time - imu_knots[-1], inner)
+
+    def leveling(self) -> Rotation:
+        """The smallest rotation that turns `up` onto z: tracker's world → level world."""
+        axis = np.cross(self.up, [0.0, 0.0, 1.0])
+        sine = float(np.linalg.norm(axis))
+        return Rotation.from_rotvec(axis / sine * np.arctan2(sine, self.up[2]) if sine > 0 else np.zeros(3))
+
+
+def align(
+    time: Float[np.ndarray, "m"],
+    gyro: Float[np.ndarray, "m 3"],
+    accel: Float[np.ndarray, "m 3"],
+    track: Track,
+    search_seconds: float = 5.0,
+    iterations: int = 12,
+) -> Alignment:
+    """Estimate extrinsic rotation, lever arm, gravity, biases and lag (module's docstring).
+
+    `time` s is the IMU's uniform clock, `gyro` rad/s, `accel` m/s² specific force. `search_seconds` bounds the first guess of the
+    lag after the two clocks have been laid on each other as they are. Raises `ValueError` when too little of the track is usable.
+    """
+    step = float(np.median(np.diff(track.time)))
+    sigma = FILTER_SECONDS / step
+
+    # Left sides: what the tracker saw. They do not depend on the unknowns and are filtered once.
+    attitude = track.attitude.as_matrix()
+    rate = (track.attitude[:-1].inv() * track.attitude[1:]).as_rotvec() / step
+    rate = np.concatenate([rate[:1], 0.5 * (rate[:-1] + rate[1:]), rate[-1:]])
+    rate = _smooth(rate, sigma)
+    acceleration = _smooth(_second_difference(track.position, step), sigma)
+    turning = _smooth(_second_difference(attitude, step), sigma)  # d²/dt² [R l] = turning @ l
+    # A bad sample spoils everything within the filter's reach.
+    bad = binary_dilation(~track.good, iterations=int(np.ceil(3 * sigma)))
+
+    # Right sides are the IMU's, filtered after they have been turned into the same frame; interpolated at each guess of the lag.
+    imu_step = float(np.median(np.diff(time)))
+    slope = np.gradient(np.concatenate([gyro, accel], axis=1), imu_step, axis=0)
+    turn = np.linalg.norm(_smooth(gyro, FILTER_SECONDS / imu_step), axis=1)
+
+    lag_guess = _correlate_turns(track.time, np.where(bad, 0.0, np.linalg.norm(rate, axis=1)), time, turn, search_seconds)
+    knots = np.linspace(track.time[0], track.time[-1], max(int(np.ceil((track.time[-1] - track.time[0]) / KNOT_SECONDS)), 1) + 1)
+    lag = _refine_by_segment(track.time, np.linalg.norm(rate, axis=1), bad, time, turn, knots, lag_guess)
+    hats = np.stack([np.clip((track.time - knots[0]) / np.diff(knots)[0] - j, -1.0, 1.0) for j in range(len(knots))], axis=1)
+    hats = 1.0 - np.abs(hats)  # value of each knot's hat function at each sample
+
+    inside = _covered(track.time + hats @ lag, time, margin=4 * FILTER_SECONDS)
+    usable = ~bad & inside
+    if usable.sum() * step < 10.0:
+        raise ValueError(f"only {usable.sum() * step:.1f} s of the tracker's poses overlap the IMU's")
+    gyro_there = _smooth(_at(time, gyro, track.time + hats @ lag), sigma)
+    extrinsic = Rotation.align_vectors(rate[usable], gyro_there[usable])[0]
+    gyro_bias, accel_bias, lever, tilt, delay = np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(2), 0.0
+
+    # Neighbours are correlated by the filter: one row per standard deviation of it loses nothing.
+    rows = np.arange(0, len(track.time), max(int(sigma), 1))
+    gyro_scale, accel_scale = 0.3, 3.0
+    gyro_error = accel_error = np.zeros((len(track.time), 3))
+    for iteration in range(iterations):
+        there = track.time + hats @ lag
+        usable = ~bad & _covered(there, time, margin=4 * FILTER_SECONDS) & _covered(there + delay, time, margin=4 * FILTER_SECONDS)
+        turned, turned_slope = _at(time, gyro, there), _at(time, slope[:, :3], there)
+        force, force_slope = _at(time, accel, there + delay) - accel_bias, _at(time, slope[:, 3:], there + delay)
+        to_marker = extrinsic.as_matrix()
+        to_world = attitude @ to_marker
+        omega, omega_slope = _smooth(turned, sigma) - gyro_bias, _smooth(turned_slope, sigma)
+        up = np.array([tilt[0], tilt[1], 1.0]) / np.sqrt(1.0 + tilt @ tilt)
+
+        gyro_error = rate - omega @ to_marker.T
+        felt = _smooth(np.einsum("nij,nj->ni", to_world, force), sigma)
+        accel_error = acceleration + turning @ lever - felt + GRAVITY * up
+
+        if iteration > 0:
+            gyro_scale = max(_robust_std(gyro_error[usable]), 1e-4)
+            accel_scale = max(_robust_std(accel_error[usable]), 1e-3)
+        chosen = rows[usable[rows]]
+        gyro_weight = _cauchy(gyro_error[chosen], gyro_scale)
+        accel_weight = _cauchy(accel_error[chosen], accel_scale)
+
+        # Jacobians of the errors in (rotation 3, gyro bias 3, accel bias 3, lever 3, tilt 2, delay 1, lag k).
+        count = 15 + len(knots)
+        gyro_jacobian = np.zeros((len(chosen), 3, count))
+        gyro_jacobian[:, :, 0:3] = to_marker @ _hat(omega[chosen])
+        gyro_jacobian[:, :, 3:6] = to_marker
+        gyro_jacobian[:, :, 15:] = -(omega_slope[chosen] @ to_marker.T)[:, :, None] * hats[chosen][:, None, :]
+        accel_jacobian = np.zeros((len(chosen), 3, count))
+        accel_jacobian[:, :, 0:3] = _smooth(to_world @ _hat(force), sigma)[chosen]
+        accel_jacobian[:, :, 6:9] = _smooth(to_world, sigma)[chosen]
+        accel_jacobian[:, :, 9:12] = turning[chosen]
+        accel_jacobian[:, [0, 1], [12, 13]] = GRAVITY
+        felt_slope = _smooth(np.einsum("nij,nj->ni", to_world, force_slope), sigma)[chosen]
+        accel_jacobian[:, :, 14] = -felt_slope
+        accel_jacobian[:, :, 15:] = -felt_slope[:, :, None] * hats[chosen][:, None, :]
+
+        block = np.floor(track.time[chosen] / BLOCK_SECONDS).astype(int)
+        from_gyro = _normal_equations(gyro_jacobian, gyro_error[chosen], gyro_weight, block)
+        from_accel = _normal_equations(accel_jacobian, accel_error[chosen], accel_weight, block)
+        normal, gradient = from_gyro[0] + from_accel[0], from_gyro[1] + from_accel[1]
+
+        # Weak priors settle what a recording cannot tell: biases of a phone, a lever on the hand, clocks that run straight.
+        state = np.concatenate([gyro_bias, accel_bias, lever, tilt, [delay]])
+        precision = np.repeat([0.05, 0.15, 0.2, 0.05, 0.05], [3, 3, 3, 2, 1]) ** -2.0
+        normal[3:15, 3:15] += np.diag(precision)
+        gradient[3:15] += precision * state
+        if len(knots) > 2:
+            bend = np.diff(np.eye(len(knots)), 2, axis=0) / 0.02
+            normal[15:, 15:] += bend.T @ bend
+            gradient[15:] += bend.T @ bend @ lag
+
+        change = -np.linalg.lstsq(normal, gradient, rcond=1e-12)[0]
+        # Linearisation holds for a tenth of a gait cycle and a tenth of a radian.
+        change[14:] = np.clip(change[14:], -0.05, 0.05)  # delay and lag
+        change[:3] *= min(1.0, 0.2 / max(float(np.linalg.norm(change[:3])), 1e-12))
+        extrinsic = extrinsic * Rotation.from_rotvec(change[:3])
+        gyro_bias, accel_bias, lever = gyro_bias + change[3:6], accel_bias + change[6:9], lever + change[9:12]
+        tilt, delay, lag = tilt + change[12:14], delay + float(change[14]), lag + change[15:]
+        if iteration > 3 and np.linalg.norm(change[:3]) < 1e-5 and np.abs(change[14:]).max() < 1e-5:
+            break
+
+    up = np.array([tilt[0], tilt[1], 1.0]) / np.sqrt(1.0 + tilt @ tilt)
+    limit = max(6.0, 8.0 * accel_scale)
+    return Alignment(
+        extrinsic=extrinsic,
+        lever=lever,
+        up=up,
+        gyro_bias=gyro_bias,
+        accel_bias=accel_bias,
+        knots=knots,
+        lag=lag,
+        accel_delay=delay,
+        gyro_residual=_robust_std(gyro_error[usable]),
+        accel_residual=_robust_std(accel_error[usable]),
+        mismatch=usable & (np.linalg.norm(accel_error, axis=1) > limit),
+    )
+
+
+class Heading(NamedTuple):
+    """What `align_heading` estimates; SI units."""
+
+    knots: Float[np.ndarray, "k"]
+    """On the tracker's clock, s."""
+    lag: Float[np.ndarray, "k"]
+    """Time of the IMU minus time of the tracker for the same event, at the knots, s."""
+    yaw: Float[np.ndarray, "k"]
+    """To be added to the IMU's heading, at the knots, rad."""
+    correlation: float
+    """Median over stretches of the correlation of the horizontal accelerations."""
+
+
+def align_heading(
+    time: Float[np.ndarray, "m"],
+    acceleration: Float[np.ndarray, "m 2"],
+    track_time: Float[np.ndarray, "n"],
+    position: Float[np.ndarray, "n 3"],
+    good: Bool[np.ndarray, "n"],
+    search_seconds: float = 4.0,
+    filter_seconds: float = 0.08,
+) -> Heading:
+    """Lag and heading that lay an IMU's horizontal acceleration on that of tracked positions.
+
+    `acceleration` m/s² is the IMU's in a level frame of its own whose yaw is arbitrary and drifts slowly. As complex numbers the two
+    differ by a factor exp(i yaw), so the magnitude of their correlation over a stretch tells the lag whatever the yaw.
+    Both are piecewise linear with a knot per 30 s. Raises `ValueError` when there are less than 30 s.
+    """
+    step = float(np.median(np.diff(track_time)))
+    sigma = filter_seconds / step
+    seen = _smooth(_second_difference(position[:, :2], step), sigma)
+    seen = seen[:, 0] + 1j * seen[:, 1]
+    usable = ~binary_dilation(~good, iterations=int(np.ceil(2 * sigma)))
+    # A tracker that relocalises makes accelerations that no pedestrian makes.
+    usable &= np.abs(seen) < 8.0 * max(float(np.median(np.abs(seen))), 0.1)
+    felt = _smooth(acceleration, filter_seconds / float(np.median(np.diff(time))))
+    felt = felt[:, 0] + 1j * felt[:, 1]
+    slope = np.gradient(felt, time)
+    stretches = np.floor((track_time - track_time[0]) / 15.0).astype(int)
+    if stretches.max() < 2:
+        raise ValueError("less than 30 s to align")
+    knots = np.linspace(track_time[0], track_time[-1], int(np.ceil((track_time[-1] - track_time[0]) / KNOT_SECONDS)) + 1)
+    hats = np.clip(1.0 - np.abs((track_time[:, None] - knots) / (knots[1] - knots[0])), 0.0, 1.0)
+
+    def products(there: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Per stretch: Σ conj(felt) seen, and √(Σ|felt|² Σ|seen|²)."""
+        inside = usable & (there > time[0]) & (there < time[-1])
+        value = np.interp(there, time, felt) * inside
+        both = np.conj(value) * seen
+        cross = np.bincount(stretches, both.real) + 1j * np.bincount(stretches, both.imag)
+        power = np.bincount(stretches, np.abs(value) ** 2) * np.bincount(stretches, np.abs(seen * inside) ** 2)
+        return cross, np.sqrt(power) + 1e-9
+
+    offsets = np.arange(-round(search_seconds / 0.02), round(search_seconds / 0.02) + 1) * 0.02
+    scores = []
+    for offset in offsets:
+        cross, power = products(track_time + offset)
+        scores.append(float(np.mean(np.abs(cross / power) ** 2)))
+    lag = np.full(len(knots), offsets[int(np.argmax(scores))])
+    cross, _ = products(track_time + hats @ lag)
+    centres = np.array([track_time[stretches == j].mean() for j in range(stretches.max() + 1)])
+    # The mean of neighbouring stretches starts the fit on the right turn.
+    yaw = np.interp(knots, centres, np.unwrap(np.angle(np.convolve(cross, np.ones(3), mode="same"))))
+    for _ in range(15):
+        there = track_time + hats @ lag
+        inside = usable & (there > time[0]) & (there < time[-1])
+        turned = np.exp(1j * (hats @ yaw)) * np.interp(there, time, felt)
+        turned_slope = np.exp(1j * (hats @ yaw)) * np.interp(there, time, slope)
+        error = (seen - turned)[inside]
+        scale = max(_robust_std(np.stack([error.real, error.imag])), 1e-3)
+        # One independent row per filter length.
+        weight = 1.0 / scale**2 / (1.0 + (np.abs(error) / (2.0 * scale)) ** 2) / max(2.5 * sigma, 1.0)
+        jacobian = -np.concatenate([1j * turned[inside, None] * hats[inside], turned_slope[inside, None] * hats[inside]], axis=1)
+        normal = np.einsum("ni,n,nj->ij", jacobian.conj(), weight, jacobian, optimize=True).real
+        gradient = np.einsum("ni,n,n->i", jacobian.conj(), weight, error, optimize=True).real
+        count = len(knots)
+        for block, value, bend in ((slice(0, count), yaw, np.radians(5.0)), (slice(count, None), lag, 0.02)):
+            stiff = np.diff(np.eye(count), 2, axis=0) / bend if count > 2 else np.zeros((1, count))
+            normal[block, block] += stiff.T @ stiff + 1e-6 * np.eye(count)
+            gradient[block] += stiff.T @ stiff @ value
+        change = -np.linalg.solve(normal, gradient)
+        yaw = yaw + np.clip(change[:count], -0.3, 0.3)
+        lag = lag + np.clip(change[count:], -0.03, 0.03)
+    cross, power = products(track_time + hats @ lag)
+    return Heading(knots, lag, yaw, float(np.median(np.abs(cross / power))))
+
+
+def integrate_gyro(gyro: Float[np.ndarray, "n 3"], step: float) -> Rotation:
+    """Attitude relative to the first sample: n rotations, each rate averaged over the interval between two stamps (rad/s, s)."""
+    middle = 0.5 * (gyro[:-1] + gyro[1:])
+    total = Rotation.concatenate([Rotation.identity(1), Rotation.from_rotvec(middle * step)]).as_quat()
+    # Prefix product in log2(n) vectorized passes.
+    shift = 1
+    while shift < len(total):
+        product = Rotation.from_quat(total[:-shift]) * Rotation.from_quat(total[shift:])
+        total = np.concatenate([total[:shift], product.as_quat()])
+        shift *= 2
+    return Rotation.from_quat(total)
+
+
+def follow(
+    integrated: Rotation, measured: Rotation, good: Bool[np.ndarray, "n"], step: float, seconds: float = 0.3
+) -> tuple[Rotation, Bool[np.ndarray, "n"]]:
+    """Integrated attitude times a smooth correction towards the measured one, and where the measured one was believed.
+
+    The correction measured · integrated⁻¹ moves as slowly as the gyro's bias does. Samples more than 15° off its median course
+    (σ 3 s) are flips of the tracker; the rest is smoothed over `seconds` (σ), with weights that fall with the residual.
+    Where nothing was measured the correction is interpolated, so that the gyro bridges the gap.
+    """
+    correction = (measured * integrated.inv()).as_quat()
+    # q and −q are one rotation: give neighbours the same sign.
+    known = correction[good]
+    correction[good] = known * np.cumprod(np.concatenate([[1.0], np.where((known[1:] * known[:-1]).sum(axis=1) < 0, -1.0, 1.0)]))[:, None]
+
+    believed = good
+    course = _fill(correction, good)
+    for sigma, limit, floor in ((3.0, 15.0, 1.0), (3.0, 15.0, 1.0), (3.0, 15.0, 1.0), (3.0, 15.0, 1.0), *((seconds, 180.0, 0.3),) * 3):
+        correction = correction * np.where((correction * course).sum(axis=1) < 0, -1.0, 1.0)[:, None]
+        angle = 2.0 * np.arccos(np.clip((correction * course).sum(axis=1), -1.0, 1.0))
+        nearby = believed & (angle < np.radians(limit)) if sigma == seconds else good & (angle < np.radians(limit))
+        believed = nearby if nearby.sum() > 0.2 * good.sum() else good
+        scale = max(3.0 * float(np.median(angle[believed])), np.radians(floor))
+        weight = np.where(believed, 1.0 / (1.0 + (angle / scale) ** 2) ** 2, 1e-6)
+        course = _smooth(weight[:, None] * _fill(correction, believed), sigma / step)
+        course /= np.linalg.norm(course, axis=1, keepdims=True)
+    return Rotation.from_quat(course) * integrated, believed
+
+
+def _fill(values: np.ndarray, good: np.ndarray) -> np.ndarray:
+    """Rows that are not good, interpolated between those that are."""
+    rows = np.flatnonzero(good)
+    return np.stack([np.interp(np.arange(len(good)), rows, column) for column in values[rows].T], axis=1)
+
+
+def smooth_positions(
+    position: Float[np.ndarray, "n 3"], good: Bool[np.ndarray, "n"], step: float, cutoff: float = 8.0
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"], Bool[np.ndarray, "n"]]:
+    """Positions (m), velocities (m/s) and which measurements were believed.
+
+    The positions minimise Σ w |p − z|² + λ Σ |Δ³p|² (Whittaker's smoother): the response falls to one half at `cutoff` Hz and
+    stays 1 to 0.1 % below a third of it. Weights fall with the residual, which removes single jumps; where nothing was measured the
+    smoother bridges with the smoothest acceleration.
+    """
+    n = len(position)
+    smoothness = (2.0 * np.sin(np.pi * cutoff * step)) ** -6
+    # Bands of Δ³ᵀΔ³, from its stencil (−1, 3, −3, 1).
+    stencil = np.array([-1.0, 3.0, -3.0, 1.0])
+    bands = np.zeros((4, n))  # upper form: bands[3 - d, j] couples j and j − d
+    for a in range(4):
+        for b in range(a, 4):
+            bands[3 - (b - a), b : n - 3 + b] += stencil[a] * stencil[b]
+    bands *= smoothness
+
+    filled = np.where(good[:, None], position, 0.0)
+    weight = good.astype(float)
+    smooth = filled
+    for _ in range(5):
+        system = bands.copy()
+        system[3] += weight + 1e-9
+        smooth = solveh_banded(system, weight[:, None] * filled)
+        distance = np.linalg.norm(filled - smooth, axis=1)
+        scale = max(4.0 * float(np.median(distance[good])), 2e-3) if good.any() else 1.0
+        weight = good / (1.0 + (distance / scale) ** 2) ** 2
+    velocity = np.gradient(smooth, step, axis=0)
+    return smooth, velocity, good & (weight > 0.1)
+
+
+def _normal_equations(
+    jacobian: np.ndarray, error: np.ndarray, weight: np.ndarray, block: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """(Jᵀ W J, Jᵀ W e) when the errors of a block share an unknown offset, whose variance is that of the blocks' means.
+
+    A gyro's bias drifts and a tracker's attitude is off by some tenths of a degree that depend on the place; white noise would
+    take a minute of standing for thousands of proofs of one direction.
+    """
+    starts = np.flatnonzero(np.diff(block, prepend=block[0] - 1))
+    member = np.cumsum(np.diff(block, prepend=block[0] - 1) != 0) - 1
+    total = np.add.reduceat(weight, starts)
+    mean_jacobian = np.add.reduceat(weight[:, None, None] * jacobian, starts) / total[:, None, None]
+    mean_error = np.add.reduceat(weight[:, None] * error, starts) / total[:, None]
+    inner_jacobian, inner_error = jacobian - mean_jacobian[member], error - mean_error[member]
+    mean_weight = 1.0 / (_robust_std(mean_error) ** 2 + 1.0 / total)
+    rows = np.concatenate([inner_jacobian, mean_jacobian]).reshape(-1, jacobian.shape[2])
+    errors = np.concatenate([inner_error, mean_error]).reshape(-1)
+    weighted = rows * np.repeat(np.concatenate([weight, mean_weight]), 3)[:, None]
+    return weighted.T @ rows, weighted.T @ errors
+
+
+def _smooth(values: np.ndarray, sigma: float) -> np.ndarray:
+    return gaussian_filter1d(values, sigma, axis=0, mode="nearest")
+
+
+def _second_difference(values: np.ndarray, step: float) -> np.ndarray:
+    """Of a constant it is zero to the last bit, unlike a sampled derivative of a Gaussian."""
+    inner = (values[2:] - 2.0 * values[1:-1] + values[:-2]) / step**2
+    return np.concatenate([inner[:1], inner, inner[-1:]])
+
+
+def _at(time: np.ndarray, values: np.ndarray, where: np.ndarray) -> np.ndarray:
+    """Linear interpolation of rows on a uniform clock: the filter that follows hides what a spline would add."""
+    place = np.clip((where - time[0]) / (time[-1] - time[0]) * (len(time) - 1), 0.0, len(time) - 1.000001)
+    left = place.astype(int)
+    share = (place - left)[:, None]
+    return (1.0 - share) * values[left] + share * values[left + 1]
+
+
+def _covered(where: np.ndarray, time: np.ndarray, margin: float) -> np.ndarray:
+    return (where > time[0] + margin) & (where < time[-1] - margin)
+
+
+def _hat(vector: np.ndarray) -> np.ndarray:
+    """(n, 3) → (n, 3, 3) cross-product matrices."""
+    x, y, z = vector.T
+    zero = np.zeros_like(x)
+    return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
+
+
+def _robust_std(error: np.ndarray) -> float:
+    return 1.4826 * float(np.median(np.abs(error)))
+
+
+def _cauchy(error: np.ndarray, scale: float) -> np.ndarray:
+    """Weights 1/scale² that fall with the squared length of each row, so that a flip counts for nothing."""
+    return 1.0 / scale**2 / (1.0 + (error**2).sum(axis=1) / (3.0 * scale) ** 2)
+
+
+def _correlate_turns(track_time: np.ndarray, track_turn: np.ndarray, time: np.ndarray, turn: np.ndarray, search: float) -> float:
+    """Lag (s) at the peak of the cross-correlation of two magnitudes of angular rate, within ± `search`."""
+    step = float(np.median(np.diff(track_time)))
+    start = min(track_time[0], time[0])
+    grid = np.arange(start, max(track_time[-1], time[-1]) + step, step)
+    # Flips make rates that no hand makes: compare what is common.
+    first = np.interp(grid, track_time, np.minimum(track_turn, 6.0), left=0.0, right=0.0)
+    second = np.interp(grid, time, np.minimum(turn, 6.0), left=0.0, right=0.0)
+    first, second = first - first.mean(), second - second.mean()
+    score = correlate(second, first, method="fft")
+    lags = correlation_lags(len(second), len(first)) * step
+    score = np.where(np.abs(lags) <= search, score, -np.inf)
+    return float(lags[np.argmax(score)])
+
+
+def _refine_by_segment(
+    track_time: np.ndarray, track_turn: np.ndarray, bad: np.ndarray, time: np.ndarray, turn: np.ndarray, knots: np.ndarray, guess: float
+) -> np.ndarray:
+    """Lag at each knot from the stretch around it, within ± 0.4 s of the common guess: some phones' clocks drift."""
+    step = float(np.median(np.diff(track_time)))
+    offsets = np.arange(-40, 41) * 0.01
+    lag = np.full(len(knots), guess)
+    for j, knot in enumerate(knots):
+        rows = np.flatnonzero((np.abs(track_time - knot) < KNOT_SECONDS / 2) & ~bad)
+        if len(rows) * step < 5.0:
+            continue
+        seen = np.minimum(track_turn[rows], 6.0)
+        if seen.std() < 0.05 or not _covered(track_time[rows] + guess, time, 1.0).all():
+            continue
+        score = [np.corrcoef(seen, np.interp(track_time[rows] + guess + offset, time, turn))[0, 1] for offset in offsets]
+        if max(score) > 0.6:
+            lag[j] = guess + offsets[int(np.argmax(score))]
+    # One wild knot among agreeing neighbours is a quiet stretch, not a clock.
+    if len(lag) >= 3:
+        padded = np.concatenate([lag[:1], lag, lag[-1:]])
+        lag = np.median(np.stack([padded[:-2], padded[1:-1], padded[2:]]), axis=0)
+    return lag
