@@ -115,7 +115,7 @@ class OptimConfig:
     end_learning_rate: float = 1e-6
     """At the last step."""
     warmup_epochs: float = 5.0
-    """Epochs of linear warm-up."""
+    """Epochs of linear warm-up; a run shorter than twice this warms up for its first half."""
     clip_norm: float | None = None
     """Largest global norm of the gradient; none by default."""
 
@@ -258,6 +258,41 @@ def validate(config: TrainConfig, source: str = "config") -> TrainConfig:
     require(data.window % data.stride == 0, "data.stride_seconds", f"must divide the window of {data.window_seconds:g} s")
     require(model.bank_size >= 0, "model.bank_size", f"must not be negative, found {model.bank_size!r}")
     require((8 * model.width) % model.bank_heads == 0, "model.bank_heads", f"must divide the {8 * model.width} features")
-    require(optim.warmup_epochs <= optim.epochs, "optim.warmup_epochs", f"must not exceed optim.epochs = {optim.epochs}")
+    require(optim.warmup_epochs >= 0, "optim.warmup_epochs", f"must not be negative, found {optim.warmup_epochs!r}")
     require(optim.clip_norm is None or optim.clip_norm > 0, "optim.clip_norm", "must be positive or null")
     return config
+
+
+@dataclass(frozen=True)
+class EvaluateConfig:
+    """What `python evaluate.py` is asked for."""
+
+    workdir: str
+    """Folder of the run, with its config.yaml and checkpoints; results go to its folder eval/."""
+    dataset: str | None = None
+    """Dataset to evaluate on; without it the run's own."""
+    data_root: str | None = None
+    """Folder of the dataset; without it the run's (for its own dataset), $GNIO_DATA/<dataset>, or data/<dataset>."""
+    split: str = "test"
+    """Split of the dataset."""
+    estimator: Literal["ekf", "integrate", "imu_only"] = "ekf"
+    """The paper's filter, the displacements summed, or the IMU integrated without the network."""
+    coupling: Literal["tight", "loose"] = "tight"
+    """Of the ekf: the network inside the filter, or over all windows before it with a given orientation."""
+    orientation: Literal["filter", "device", "reference"] | None = None
+    """Attitude that rotates the network's windows; by default the filter's for the tight coupling, else the reference's.
+    Without a filter, `filter` is the gyro integrated from the start."""
+    init: Literal["reference", "static"] = "reference"
+    """Start from the reference's pose and velocity, or from gravity with yaw, velocity and position zero."""
+    gyro_bias: Literal["zero", "rest", "reference"] = "zero"
+    """First gyro bias: zero, the mean of a rest at the start, or the first 10 s against the reference orientation."""
+    alignment: Literal["origin", "none", "yaw_position", "se3"] = "origin"
+    """How an estimate is laid on the reference before absolute errors: start position and yaw, not at all, least squares."""
+    checkpoint: Literal["best", "latest"] = "best"
+    """Which checkpoint of the run."""
+    batch_size: int = 16
+    """Recordings estimated side by side."""
+    plots: bool = True
+    """Draw the trajectories, errors, displacements and the errors' distribution."""
+    filter: FilterOptions = field(default_factory=FilterOptions)
+    """Noise and start of the filter; fields that are not given are the run's own."""

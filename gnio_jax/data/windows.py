@@ -50,11 +50,12 @@ def index(sequences: Iterable[Sequence], config: DataConfig) -> WindowSource:
         start = np.arange(0, len(sequence.time) - length, config.stride)
         bad = np.concatenate([[0], np.cumsum(~sequence.valid)])
         start = start[bad[start + length + 1] == bad[start]]
-        body = Rotation.from_quat(sequence.orientation, scalar_first=True) if start.size else None
-        if body is None:
+        if start.size == 0:
             continue
+        # An invalid row may hold NaN; no window touches it, so any rotation will do there.
+        body = Rotation.from_quat(np.where(sequence.valid[:, None], sequence.orientation, [1.0, 0, 0, 0]), scalar_first=True)
         first = body[start].as_matrix()
-        unyaw = Rotation.from_euler("z", -np.arctan2(first[:, 1, 0], first[:, 0, 0])).as_matrix()
+        unyaw = Rotation.from_rotvec(np.outer(np.arctan2(first[:, 1, 0], first[:, 0, 0]), [0, 0, -1])).as_matrix()
         imu = np.hstack([sequence.accel, sequence.gyro])
         if config.window_rotation == "per_sample":
             imu = np.hstack([body.apply(sequence.accel), body.apply(sequence.gyro)])
