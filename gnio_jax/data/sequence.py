@@ -337,7 +337,7 @@ def self_check(
         failures.append(f"gyro is off the reference orientation by {gyro_degrees:.1f}° in the median window of {window_seconds:g} s")
     if pedestrian and speed > max_speed:
         failures.append(f"median speed is {speed:.1f} m/s, too fast for a pedestrian")
-    if strength > 0.2 and correlation < min_correlation:
+    if strength > 0.2 and not correlation >= min_correlation:  # NaN when the positions do not move at all
         failures.append(f"horizontal acceleration of the positions correlates by only {correlation:.2f} with R·accel")
     return SelfCheck(gravity_mean=gravity_mean, gyro_consistency_degrees=gyro_degrees, median_speed=speed,
                      accel_correlation_horizontal=correlation, failures=tuple(failures), **figures)
