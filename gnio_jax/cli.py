@@ -16,7 +16,8 @@ import re
 import sys
 import types
 import typing
-from collections.abc import Callable, Sequence
+import warnings
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
@@ -61,10 +62,12 @@ def run(main: Callable[[], object]) -> None:
     """Call `main()`; a user's mistake becomes one line on stderr and exit status 2, Ctrl-C status 130, both without a traceback.
 
     A full disk or a folder that may not be written is told the same way; any other exception is a fault of the program
-    and keeps its traceback.
+    and keeps its traceback. A warning is one line on stderr, too.
     """
     try:
-        main()
+        with warnings.catch_warnings():
+            warnings.showwarning = _warn
+            main()
         sys.stdout.flush()
     except InputError as error:
         _leave(str(error), 2)
@@ -79,9 +82,35 @@ def run(main: Callable[[], object]) -> None:
         _leave(f"{error.filename or 'output'}: {error.strerror}", 2)
 
 
+@contextlib.contextmanager
+def progress() -> Iterator[Callable[[str, float], None]]:
+    """Yield a function of (what is being done, share of it done from 0 to 1) that draws a bar on stderr, if that is a terminal."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+    console = Console(stderr=True)
+    columns = TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeElapsedColumn(), TimeRemainingColumn()
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bars:
+        task = bars.add_task("loading", total=None)
+        stage = "loading"
+
+        def tell(what: str, share: float) -> None:
+            nonlocal stage
+            if what != stage:
+                bars.reset(task)
+                stage = what
+            bars.update(task, description=what, completed=share, total=1.0)
+
+        yield tell
+
+
 def _leave(line: str, status: int) -> typing.NoReturn:
     print(" ".join(line.split()), file=sys.stderr)
     raise SystemExit(status) from None
+
+
+def _warn(message: Warning | str, *_: object) -> None:
+    print(f"warning: {' '.join(str(message).split())}", file=sys.stderr)
 
 
 def _options(kind: Any, prefix: str = "") -> dict[str, Any]:

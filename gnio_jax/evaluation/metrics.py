@@ -380,7 +380,10 @@ def measure(estimate: Trajectory, reference: Trajectory, alignment: Alignment = 
         try:
             if missing and name in metrics:
                 raise Undefined(missing)
-            values[name] = compute()
+            value = compute()
+            if not np.isfinite(value):
+                raise Undefined("the error is too large for a number")
+            values[name] = value
         except Undefined as reason:
             values[name], undefined[name] = None, str(reason)
     return Measures(values, undefined)

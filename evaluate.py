@@ -1,0 +1,49 @@
+"""Evaluate a trained network: python evaluate.py --workdir runs/synthetic_gnio. Everything it does is in gnio_jax.evaluation."""
+
+import dataclasses
+import os
+from pathlib import Path
+
+os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
+
+import jax
+
+from gnio_jax import cli
+from gnio_jax import config as configuration
+from gnio_jax.config import EvaluateConfig
+
+DESCRIPTION = """Estimate the trajectories of a split with the network of a run, and report their errors.
+
+  python evaluate.py --workdir runs/tlio
+  python evaluate.py --workdir runs/tlio --dataset ronin --data-root ~/ronin --split test_unseen
+  python evaluate.py --workdir runs/tlio --estimator integrate --orientation device
+
+Results go to <workdir>/eval/<dataset>_<split>_<estimator>/: metrics.json, metrics.csv, trajectories/ and references/ in TUM
+format (for evo), plots/. Every table has two rows to compare with: never_moves, the start pose throughout, and
+perfect_displacements, the same estimator fed with the reference's displacements."""
+
+
+def main() -> None:
+    jax.config.update("jax_enable_x64", True)  # the filter needs float64; the network states its float32 everywhere
+    config = cli.parse(EvaluateConfig, description=DESCRIPTION)
+    kept = Path(config.workdir) / "config.yaml"
+    if kept.is_file():  # the run's own filter options are the defaults of those that are not given
+        default = dataclasses.replace(EvaluateConfig(config.workdir), filter=configuration.load(kept).filter)
+        config = cli.parse(EvaluateConfig, default, DESCRIPTION)
+
+    from rich.console import Console
+
+    from gnio_jax import evaluation  # after the options: --help and mistakes should not wait for the imports
+    from gnio_jax.evaluation import report
+
+    with cli.progress() as progress:
+        found, folder = evaluation.evaluate(config, progress)
+    console = Console(highlight=False)
+    if not console.is_terminal:
+        console = Console(highlight=False, width=160)  # into a file or a pipe: no line is cut to a terminal's width
+    console.print(report.table(found))
+    print(f"results: {folder}")
+
+
+if __name__ == "__main__":
+    cli.run(main)

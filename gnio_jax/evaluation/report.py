@@ -1,0 +1,204 @@
+"""The figures of an evaluation: a table for the screen, JSON and CSV for programs, TUM trajectories for evo."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+import shutil
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from rich.console import Group
+from rich.table import Table
+from rich.text import Text
+
+from gnio_jax.evaluation import metrics
+from gnio_jax.evaluation.metrics import Measures, Summary, Trajectory
+from gnio_jax.evaluation.odometry import Estimate
+
+COLUMNS = {
+    "duration": ("time", "s", 0),
+    "path_length": ("path", "m", 0),
+    "ate": ("ATE", "m", 2),
+    "ate_2d": ("ATE 2-D", "m", 2),
+    "rte_60s": ("RTE 60 s", "m", 2),
+    "rpe_1s": ("RPE 1 s", "m", 3),
+    "yaw_rmse": ("yaw", "°", 1),
+    "path_length_ratio": ("path ratio", "", 2),
+    "stationary_drift": ("standing", "m/min", 1),
+    "nees_coverage": ("in 95 %", "%", 0),
+    "nis": ("NIS/3", "", 2),
+    "accepted": ("accepted", "%", 0),
+}
+"""Metrics in the table: heading, unit, digits. The files hold them all."""
+
+
+class Scores(NamedTuple):
+    """Metrics of one way of estimating, over sequences."""
+
+    sequences: dict[str, Measures]
+    summary: Summary
+
+
+class Report(NamedTuple):
+    """Everything the files say."""
+
+    settings: dict[str, Any]
+    """What changes the meaning of the figures, for the reader of the table and of the JSON."""
+    scores: Scores
+    reference_rows: dict[str, Scores]
+    """`never_moves` and `perfect_displacements`."""
+    notes: dict[str, list[str]]
+    """Sequence -> what a reader should know of its start."""
+    left_out: dict[str, str]
+    """Sequence -> why it has no figures."""
+
+
+def score(estimates: list[Estimate], groups: Mapping[str, Any], alignment: metrics.Alignment = "origin") -> Scores:
+    """Every metric of every estimate, and over all of them; `groups` says which sequences belong together (`metrics.summarise`)."""
+    sequences = {}
+    for e in estimates:
+        found = metrics.measure(e.trajectory, e.reference, alignment, e.position_covariance, e.nis)
+        if e.accepted is not None:
+            tried = e.accepted[~np.isnan(e.accepted)]
+            share = float(100 * tried.mean()) if len(tried) else None
+            found = Measures(found.values | {"accepted": share}, found.undefined | ({} if len(tried) else {"accepted": "no measurement"}))
+        sequences[e.name] = found
+    return Scores(sequences, metrics.summarise({name: m.values for name, m in sequences.items()}, groups))
+
+
+# On the screen --------------------------------------------------------------------------------------------------------
+
+
+def table(report: Report) -> Group:
+    """The table and what belongs under it, for `rich.console.Console.print`."""
+    shown = [name for name in COLUMNS if any(name in m.values for m in report.scores.sequences.values())]
+    settings = report.settings
+    grid = Table(title=f"{settings['dataset']} {settings['split']}: {settings['estimator']}"
+                       + (f", {settings['coupling']} coupling" if settings["estimator"] == "ekf" else ""), title_style="bold")
+    grid.add_column("sequence", overflow="fold", min_width=12)
+    for name in shown:
+        heading, unit, _ = COLUMNS[name]
+        grid.add_column(f"{heading}\n[dim]{unit}[/dim]", justify="right", no_wrap=True)
+
+    def add(label: str, values: Mapping[str, Any], style: str = "", last: bool = False) -> None:
+        grid.add_row(Text(label), *(_cell(values.get(name), COLUMNS[name][2]) for name in shown), style=style, end_section=last)
+
+    names = list(report.scores.sequences)
+    for name in names:
+        add(name, report.scores.sequences[name].values, last=name == names[-1])
+    summary = report.scores.summary
+    add("mean", summary.mean, "bold")
+    add("median", summary.median)
+    add("95 % of mean", summary.interval)
+    grid.add_row("n", *(str(summary.count.get(name, 0)) for name in shown), style="dim", end_section=True)
+    for label, scores in report.reference_rows.items():
+        add(label, scores.summary.mean, "italic")
+    words = [f"window orientation: {settings['orientation_source']}", f"initial state: {settings['initial_state']}",
+             f"gyro bias: {settings['gyro_bias']}", f"IMU compensated: {settings['imu_compensated']}",
+             f"alignment: {settings['alignment']}"]
+    lines = [Text("; ".join(words), style="dim"),
+             Text("reference rows are means; – is not defined (the reason is in metrics.json)", style="dim")]
+    lines += [Text(f"{name}: {note}", style="yellow") for name, notes in report.notes.items() for note in notes]
+    lines += [Text(f"left out: {name}: {reason}", style="yellow") for name, reason in report.left_out.items()]
+    return Group(grid, *lines)
+
+
+def _cell(value: Any, digits: int) -> str:
+    if value is None:
+        return "–"
+    if isinstance(value, tuple):
+        return f"{_cell(value[0], digits)}…{_cell(value[1], digits)}"
+    return f"{value:.{digits}f}" if abs(value) < 10 ** (7 - digits) else f"{value:.1e}"
+
+
+# Files ----------------------------------------------------------------------------------------------------------------
+
+
+def as_json(report: Report) -> dict[str, Any]:
+    """The whole report as plain values; a metric without a value is None, its reason under `undefined`."""
+    nowhere = {name: next(m.undefined[name] for m in report.scores.sequences.values() if name in m.undefined)
+               for name, value in report.scores.summary.mean.items() if value is None}
+    sequences = _sequences(report.scores)
+    for name, notes in report.notes.items():
+        sequences[name]["notes"] = notes
+    return {
+        "settings": report.settings,
+        "sequences": sequences,
+        **_summary(report.scores.summary),
+        "undefined": nowhere,
+        "reference_rows": {label: {"sequences": _sequences(scores), **_summary(scores.summary)}
+                           for label, scores in report.reference_rows.items()},
+        "left_out": report.left_out,
+    }
+
+
+def _sequences(scores: Scores) -> dict[str, dict[str, Any]]:
+    return {name: {**m.values, **({"undefined": m.undefined} if m.undefined else {})} for name, m in scores.sequences.items()}
+
+
+def _summary(summary: Summary) -> dict[str, Any]:
+    interval = {name: None if value is None else list(value) for name, value in summary.interval.items()}
+    return {"mean": summary.mean, "median": summary.median, "interval": interval, "n": summary.count}
+
+
+def write(folder: Path, report: Report, estimates: list[Estimate]) -> None:
+    """metrics.json, metrics.csv, trajectories/ and references/ (TUM format) into an empty folder (see `replacing_folder`)."""
+    text = json.dumps(as_json(report), indent=2, allow_nan=False, ensure_ascii=False)
+    (folder / "metrics.json").write_text(text + "\n", encoding="utf-8")
+    columns = list(dict.fromkeys(metric for m in report.scores.sequences.values() for metric in m.values))
+    with open(folder / "metrics.csv", "w", newline="", encoding="utf-8") as file:
+        rows = csv.writer(file)
+        rows.writerow(["sequence", *columns])
+        for name, m in report.scores.sequences.items():
+            rows.writerow([name, *("" if m.values.get(column) is None else repr(m.values[column]) for column in columns)])
+    for kind in ("trajectories", "references"):
+        (folder / kind).mkdir()
+    for stem, e in zip(file_names(estimates), estimates, strict=True):
+        write_tum(folder / "trajectories" / f"{stem}.txt", e.trajectory)
+        if np.isfinite(e.reference.position).any():
+            write_tum(folder / "references" / f"{stem}.txt", e.reference)
+
+
+def write_tum(path: Path, trajectory: Trajectory) -> None:
+    """`t x y z qx qy qz qw` a line, s and m, body→world; rows that are not finite are left out."""
+    rows = np.column_stack([trajectory.time, trajectory.position, trajectory.orientation[:, [1, 2, 3, 0]]])
+    np.savetxt(path, rows[np.isfinite(rows).all(1)], fmt="%.9f", header="t x y z qx qy qz qw")
+
+
+def file_names(estimates: list[Estimate]) -> list[str]:
+    """A distinct file name for each estimate: its sequence's name with anything a file system could mind as `_`."""
+    stems: list[str] = []
+    for e in estimates:
+        stem = re.sub(r"[^\w.=+-]+", "_", e.name).strip("._") or "sequence"
+        while stem in stems:
+            stem += "_"
+        stems.append(stem)
+    return stems
+
+
+@contextmanager
+def replacing_folder(path: Path) -> Iterator[Path]:
+    """Yield an empty folder beside `path`; on success it takes the place of `path`, on failure it is removed and `path` stays."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
+    try:
+        new = temporary / "new"
+        new.mkdir()
+        yield new
+        old = temporary / "old"
+        if path.exists():
+            path.rename(old)
+        try:
+            new.rename(path)
+        except OSError:
+            if old.exists():
+                old.rename(path)
+            raise
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
