@@ -31,9 +31,6 @@ from gnio_jax.types import GRAVITY
 FILTER_SECONDS = 0.03
 """Standard deviation of the Gaussian that both sides of the fit pass: a pass band of 5 Hz holds the motion of a gait."""
 
-KNOT_SECONDS = 30.0
-"""Spacing of the knots of the lag."""
-
 BLOCK_SECONDS = 2.0
 """Errors within this time share an offset."""
 
@@ -96,13 +93,14 @@ def align(
     gyro: Float[np.ndarray, "m 3"],
     accel: Float[np.ndarray, "m 3"],
     track: Track,
+    knot_seconds: float = 30.0,
     search_seconds: float = 5.0,
     iterations: int = 12,
 ) -> Alignment:
     """Estimate extrinsic rotation, lever arm, gravity, biases and lag (module's docstring).
 
-    `time` s is the IMU's uniform clock, `gyro` rad/s, `accel` m/s² specific force. `search_seconds` bounds the first guess of the
-    lag after the two clocks have been laid on each other as they are. Raises `ValueError` when too little of the track is usable.
+    `time` s is the IMU's uniform clock, `gyro` rad/s, `accel` m/s² specific force. `knot_seconds` is the spacing of
+    the lag's knots, `search_seconds` bounds its first guess. Raises `ValueError` when too little of the track is usable.
     """
     step = float(np.median(np.diff(track.time)))
     sigma = FILTER_SECONDS / step
@@ -123,10 +121,11 @@ def align(
     turn = np.linalg.norm(_smooth(gyro, FILTER_SECONDS / imu_step), axis=1)
 
     lag_guess = _correlate_turns(track.time, np.where(bad, 0.0, np.linalg.norm(rate, axis=1)), time, turn, search_seconds)
-    knots = np.linspace(track.time[0], track.time[-1], max(int(np.ceil((track.time[-1] - track.time[0]) / KNOT_SECONDS)), 1) + 1)
-    lag = _refine_by_segment(track.time, np.linalg.norm(rate, axis=1), bad, time, turn, knots, lag_guess)
-    hats = np.stack([np.clip((track.time - knots[0]) / np.diff(knots)[0] - j, -1.0, 1.0) for j in range(len(knots))], axis=1)
-    hats = 1.0 - np.abs(hats)  # value of each knot's hat function at each sample
+    coarse = _knots(track.time, 30.0)
+    knots = _knots(track.time, knot_seconds)
+    lag = _refine_by_segment(track.time, np.linalg.norm(rate, axis=1), bad, time, turn, coarse, lag_guess)
+    lag = np.interp(knots, coarse, lag)
+    hats = _hat_functions(track.time, knots)
 
     inside = _covered(track.time + hats @ lag, time, margin=4 * FILTER_SECONDS)
     usable = ~bad & inside
@@ -198,7 +197,7 @@ def align(
         extrinsic = extrinsic * Rotation.from_rotvec(change[:3])
         gyro_bias, accel_bias, lever = gyro_bias + change[3:6], accel_bias + change[6:9], lever + change[9:12]
         tilt, delay, lag = tilt + change[12:14], delay + float(change[14]), lag + change[15:]
-        if iteration > 3 and np.linalg.norm(change[:3]) < 1e-5 and np.abs(change[14:]).max() < 1e-5:
+        if iteration > 3 and np.linalg.norm(change[:3]) < 1e-4 and np.abs(change[14:]).max() < 2e-4:
             break
 
     up = np.array([tilt[0], tilt[1], 1.0]) / np.sqrt(1.0 + tilt @ tilt)
@@ -259,8 +258,8 @@ def align_heading(
     stretches = np.floor((track_time - track_time[0]) / 15.0).astype(int)
     if stretches.max() < 2:
         raise ValueError("less than 30 s to align")
-    knots = np.linspace(track_time[0], track_time[-1], int(np.ceil((track_time[-1] - track_time[0]) / KNOT_SECONDS)) + 1)
-    hats = np.clip(1.0 - np.abs((track_time[:, None] - knots) / (knots[1] - knots[0])), 0.0, 1.0)
+    knots = _knots(track_time, 30.0)
+    hats = _hat_functions(track_time, knots)
 
     def products(there: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Per stretch: Σ conj(felt) seen, and √(Σ|felt|² Σ|seen|²)."""
@@ -353,7 +352,7 @@ def _fill(values: np.ndarray, good: np.ndarray) -> np.ndarray:
 
 
 def smooth_positions(
-    position: Float[np.ndarray, "n 3"], good: Bool[np.ndarray, "n"], step: float, cutoff: float = 8.0
+    position: Float[np.ndarray, "n 3"], good: Bool[np.ndarray, "n"], step: float, cutoff: float = 12.0
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"], Bool[np.ndarray, "n"]]:
     """Positions (m), velocities (m/s) and which measurements were believed.
 
@@ -428,6 +427,15 @@ def _covered(where: np.ndarray, time: np.ndarray, margin: float) -> np.ndarray:
     return (where > time[0] + margin) & (where < time[-1] - margin)
 
 
+def _knots(time: np.ndarray, spacing: float) -> np.ndarray:
+    return np.linspace(time[0], time[-1], max(int(np.ceil((time[-1] - time[0]) / spacing)), 1) + 1)
+
+
+def _hat_functions(time: np.ndarray, knots: np.ndarray) -> np.ndarray:
+    """(n, k): value at each time of the piecewise linear function that is 1 at one knot and 0 at the others."""
+    return np.clip(1.0 - np.abs((time[:, None] - knots) / (knots[1] - knots[0])), 0.0, 1.0)
+
+
 def _hat(vector: np.ndarray) -> np.ndarray:
     """(n, 3) → (n, 3, 3) cross-product matrices."""
     x, y, z = vector.T
@@ -467,7 +475,7 @@ def _refine_by_segment(
     offsets = np.arange(-40, 41) * 0.01
     lag = np.full(len(knots), guess)
     for j, knot in enumerate(knots):
-        rows = np.flatnonzero((np.abs(track_time - knot) < KNOT_SECONDS / 2) & ~bad)
+        rows = np.flatnonzero((np.abs(track_time - knot) < 15.0) & ~bad)
         if len(rows) * step < 5.0:
             continue
         seen = np.minimum(track_turn[rows], 6.0)
