@@ -360,7 +360,7 @@ def _gyro_consistency(sequence: Sequence, attitude: Rotation, step: float, windo
     middle = 0.5 * (sequence.gyro[:-1] + sequence.gyro[1:])
     bias = np.zeros(3)
     error = np.zeros((len(starts), 3))
-    for _ in range(3):
+    for _ in range(2):
         error = (_product((middle - bias) * step, samples) * reference.inv()).as_rotvec()
         correction = np.zeros(3)
         for _ in range(10):  # least absolute deviations: one broken window must not bend the bias
@@ -374,16 +374,16 @@ def _gyro_consistency(sequence: Sequence, attitude: Rotation, step: float, windo
 
 def _product(angles: np.ndarray, samples: np.ndarray) -> Rotation:
     """Product over each row of `samples` of the rotations by the vectors `angles`, halving the rows until one is left."""
-    rows, length = samples.shape
-    quaternion = Rotation.from_rotvec(angles).as_quat()[samples]
-    while length > 1:
-        if length % 2:
-            quaternion = np.concatenate([quaternion, np.broadcast_to([0.0, 0.0, 0.0, 1.0], (rows, 1, 4))], axis=1)
-        first = Rotation.from_quat(quaternion[:, 0::2].reshape(-1, 4))
-        second = Rotation.from_quat(quaternion[:, 1::2].reshape(-1, 4))
-        quaternion = (first * second).as_quat().reshape(rows, -1, 4)
-        length = quaternion.shape[1]
-    return Rotation.from_quat(quaternion[:, 0])
+    parts = Rotation.from_rotvec(angles).as_quat().T[:, samples]  # (4, rows, length): long inner loops
+    while parts.shape[2] > 1:
+        if parts.shape[2] % 2:
+            one = np.zeros((4, len(samples), 1))
+            one[3] = 1.0
+            parts = np.concatenate([parts, one], axis=2)
+        (a, b, c, d), (e, f, g, h) = parts[:, :, 0::2], parts[:, :, 1::2]  # x, y, z, w of both factors
+        parts = np.stack([d * e + a * h + b * g - c * f, d * f - a * g + b * h + c * e, d * g + a * f - b * e + c * h,
+                          d * h - a * e - b * f - c * g])
+    return Rotation.from_quat(parts[:, :, 0].T)
 
 
 def _accel_correlation(sequence: Sequence, force: np.ndarray, step: float) -> tuple[float, float]:

@@ -10,7 +10,7 @@ from gnio_jax.types import InputError
 
 
 def test_every_dataset_says_what_a_user_must_know():
-    assert data.names() == sorted(data.names()) and {"synthetic", "tlio"} <= set(data.names())
+    assert data.names() == sorted(data.names()) and {"oxiod", "synthetic", "tlio"} <= set(data.names())
     for name in data.names():
         dataset = data.get(name)
         assert dataset.name == name and dataset.splits and dataset.rate > 0 and callable(dataset.read)

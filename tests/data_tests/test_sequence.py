@@ -133,6 +133,7 @@ def test_resampling_accepts_uneven_stamps():
     stamps = np.arange(400) / 100
     stamps[1:-1] += rng.uniform(-0.003, 0.003, 398)
     result = seq.resample(circle(stamps=stamps), 100.0)
+    np.testing.assert_allclose(np.diff(result.time), 0.01, rtol=1e-9)
     truth = circle(stamps=result.time)
     np.testing.assert_allclose(result.position, truth.position, atol=1e-6)
     np.testing.assert_allclose(result.accel, truth.accel, atol=5e-3)

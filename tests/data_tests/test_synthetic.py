@@ -85,6 +85,7 @@ def test_a_seed_is_a_walk_and_splits_share_neither_seeds_nor_people(val):
         assert once.attributes == again.attributes
     used = {split: [(s.attributes["seed"], s.attributes["subject"]) for s in synthetic.read(None, split)] for split in ("val", "test")}
     assert not {seed for seed, _ in used["val"]} & {seed for seed, _ in used["test"]}
+    assert all(len({seed for seed, _ in pairs}) == len(pairs) for pairs in used.values())
     assert not {subject for _, subject in used["val"]} & {subject for _, subject in used["test"]}
     assert len({s.attributes["placement"] for s in val}) == len(synthetic.PLACEMENTS)
     with pytest.raises(InputError, match="unknown split 'dev'; known splits: train, val, test"):
