@@ -1,4 +1,4 @@
-"""Where an IMU sits on a tracked marker body, and the reference that follows from it.
+"""Where an IMU sits on a tracked body, and the reference that follows from it.
 
 An optical tracker gives the poses of a *marker body* on its own clock in its own, slightly tilted world. The IMU is bolted
 somewhere else on that body, turned against it, on another clock. `align` estimates all of it at once from one recording:
@@ -24,7 +24,7 @@ from jaxtyping import Bool, Float
 from scipy.linalg import solveh_banded
 from scipy.ndimage import binary_dilation, gaussian_filter1d
 from scipy.signal import correlate, correlation_lags
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import Rotation, Slerp
 
 from gnio_jax.types import GRAVITY
 
@@ -302,6 +302,54 @@ def align_heading(
         lag = lag + np.clip(change[count:], -0.03, 0.03)
     cross, power = products(track_time + hats @ lag)
     return Heading(knots, lag, yaw, float(np.median(np.abs(cross / power))))
+
+
+def follow_acceleration(
+    integrated: Rotation,
+    guess: Rotation,
+    accel: Float[np.ndarray, "n 3"],
+    position: Float[np.ndarray, "n 3"],
+    good: Bool[np.ndarray, "n"],
+    step: float,
+    knot_seconds: float = 10.0,
+    filter_seconds: float = 0.25,
+) -> Rotation:
+    """Attitude whose accelerations agree with those of tracked positions: integrated gyro times a slow correction.
+
+    `integrated` are n rotations from the gyro alone, `guess` what the correction starts from, all body→world, `accel` m/s² specific
+    force, `position` m in a level world, `good` where it can be trusted, on one clock of `step` s. The correction is a rotation per
+    knot, with the shorter arc between; it leads R·accel + g, filtered until no gait is left, onto the second difference
+    of `position`. What changes the drift of the gyro between knots (0.005 rad/s in tilt, 0.002 rad/s in yaw) pays a price.
+    """
+    n = len(accel)
+    time = np.arange(n) * step
+    knots = _knots(time, knot_seconds)
+    hats = _hat_functions(time, knots)
+    near = np.clip(np.round(knots / step).astype(int), 0, n - 1)
+    offset = guess * integrated.inv()
+    half = round(1.0 / step)
+    correction = Rotation.concatenate([offset[max(i - half, 0) : i + half].mean() for i in near])
+    sigma = filter_seconds / step
+    seen = _smooth(_second_difference(position, step), sigma) + np.array([0.0, 0.0, GRAVITY])
+    usable = ~binary_dilation(~good, iterations=int(np.ceil(3 * sigma)))
+    rows = np.flatnonzero(usable)[:: max(round(sigma), 1)]
+    spread = np.tile([0.05, 0.05, 0.02], max(len(knots) - 2, 0))
+    bend = np.kron(np.diff(np.eye(len(knots)), 2, axis=0), np.eye(3)) / spread[:, None]
+    for _ in range(8):
+        attitude = Slerp(knots, correction)(time) * integrated
+        felt = _smooth(attitude.apply(accel), sigma)[rows]
+        error = seen[rows] - felt
+        scale = max(_robust_std(error), 1e-3)
+        weight = _cauchy(error, scale) / 2.5
+        jacobian = (_hat(felt)[:, :, None, :] * hats[rows][:, None, :, None]).reshape(len(rows), 3, -1)
+        turns = (correction[1:] * correction[:-1].inv()).as_rotvec()
+        drift = np.diff(turns, axis=0).reshape(-1) / spread
+        normal = np.einsum("nai,n,naj->ij", jacobian, weight, jacobian, optimize=True) + bend.T @ bend
+        gradient = np.einsum("nai,n,na->i", jacobian, weight, error, optimize=True) + bend.T @ drift
+        change = -np.linalg.lstsq(normal, gradient, rcond=1e-10)[0].reshape(-1, 3)
+        change *= min(1.0, 0.3 / max(float(np.abs(change).max()), 1e-12))
+        correction = Rotation.from_rotvec(change) * correction
+    return Slerp(knots, correction)(time) * integrated
 
 
 def integrate_gyro(gyro: Float[np.ndarray, "n 3"], step: float) -> Rotation:
