@@ -16,7 +16,7 @@ import h5py
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.interpolate import CubicSpline
-from scipy.signal import fftconvolve, firwin, kaiserord
+from scipy.signal import fftconvolve, kaiserord
 from scipy.spatial.transform import Rotation
 
 from gnio_jax.files import replacing
@@ -120,7 +120,7 @@ def validate(sequence: Sequence, source: object) -> Sequence:
     orientation = check_unit_norm(sequence.orientation, sequence.valid, "orientation", source)
     device = sequence.device_orientation
     if device is not None:
-        device = check_unit_norm(device, np.isfinite(device).all(axis=1), "device_orientation", source)
+        device = check_unit_norm(device, np.asarray(np.isfinite(device).all(axis=1)), "device_orientation", source)
     return sequence._replace(orientation=orientation, device_orientation=device)
 
 
@@ -285,8 +285,9 @@ def _slerp(time: np.ndarray, wxyz: np.ndarray, clock: np.ndarray) -> np.ndarray:
 def _low_pass(values: np.ndarray, factor: int) -> np.ndarray:
     """Zero-phase FIR that keeps what `factor` times fewer samples can carry; 70 dB in the stop band."""
     count, beta = kaiserord(70.0, 0.2 / factor)
-    taps = firwin(count | 1, 0.9 / factor, window=("kaiser", beta))
-    half = len(taps) // 2
+    half = int(count) // 2
+    taps = np.sinc(0.9 / factor * np.arange(-half, half + 1)) * np.kaiser(2 * half + 1, beta)
+    taps = taps / taps.sum()
     padded = np.pad(values, ((half, half), (0, 0)), mode="reflect", reflect_type="odd")
     return fftconvolve(padded, taps[:, None], mode="valid", axes=0)
 
@@ -320,8 +321,8 @@ def self_check(
 
     # Invalid rows take the last valid attitude: they are left out of every mean and only bridge the gyro windows.
     held = np.maximum.accumulate(np.where(valid, np.arange(len(valid)), int(np.argmax(valid))))
-    attitude = rotations(sequence.orientation[held])
-    force = attitude.apply(sequence.accel)
+    attitude = sequence.orientation[held]
+    force = rotations(attitude).apply(sequence.accel)
     gravity_mean = force[valid].mean(axis=0)
     speed = float(np.median(np.linalg.norm(sequence.velocity[valid], axis=1)))
     gyro_degrees = _gyro_consistency(sequence, attitude, step, window_seconds)
@@ -343,7 +344,7 @@ def self_check(
                      accel_correlation_horizontal=correlation, failures=tuple(failures), **figures)
 
 
-def _gyro_consistency(sequence: Sequence, attitude: Rotation, step: float, window_seconds: float) -> float:
+def _gyro_consistency(sequence: Sequence, attitude: np.ndarray, step: float, window_seconds: float) -> float:
     """Median angle (degrees) over windows that start every half window, after the one bias that explains most of them."""
     n = len(sequence.time)
     length = min(round(window_seconds / step), n - 1)
@@ -351,10 +352,11 @@ def _gyro_consistency(sequence: Sequence, attitude: Rotation, step: float, windo
     starts = starts[sequence.valid[starts] & sequence.valid[starts + length]]
     if not starts.size:
         return float("nan")
-    reference = attitude[starts].inv() * attitude[starts + length]
+    rotation = rotations(attitude).as_matrix()
+    reference = rotations(attitude[starts]).inv() * rotations(attitude[starts + length])
     # exp(J b) R ≈ rotation integrated from gyro + b, J = R_startᵀ Σ R_k dt
-    summed = np.concatenate([np.zeros((1, 3, 3)), np.cumsum(attitude.as_matrix() * step, axis=0)])
-    jacobian = np.einsum("wji,wjk->wik", attitude[starts].as_matrix(), summed[starts + length] - summed[starts])
+    summed = np.concatenate([np.zeros((1, 3, 3)), np.cumsum(rotation * step, axis=0)])
+    jacobian = np.einsum("wji,wjk->wik", rotation[starts], summed[starts + length] - summed[starts])
     samples = starts[:, None] + np.arange(length)
     # A rate sampled at the stamps is worth most at the middle of the interval it drives.
     middle = 0.5 * (sequence.gyro[:-1] + sequence.gyro[1:])
@@ -469,7 +471,7 @@ def read_hdf5(path: str | os.PathLike[str]) -> Sequence:
                     raise InputError(path, f"field '{field}' is not an array of {'booleans' if field == 'valid' else 'numbers'}",
                                      "convert the recording again")
                 values[field] = value
-            device = file["device_orientation"][()] if "device_orientation" in file else None  # pyright: ignore[reportIndexIssue]
+            device: Any = file["device_orientation"][()] if "device_orientation" in file else None  # pyright: ignore[reportIndexIssue]
             stored = file["attributes"].attrs if "attributes" in file else {}
             attributes = {key: value.item() if isinstance(value, np.generic) else value for key, value in stored.items()}
             name = str(file.attrs.get("name", path.stem))
