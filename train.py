@@ -5,8 +5,6 @@ import sys
 
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
 
-import jax
-
 from gnio_jax import cli
 from gnio_jax import config as configuration
 from gnio_jax.config import TrainConfig
@@ -21,7 +19,6 @@ DESCRIPTION = """Train GNIO and leave a run: config.yaml, checkpoints/, metrics.
 
 
 def main() -> None:
-    jax.config.update("jax_enable_x64", True)  # the filter needs float64; the network states its float32 everywhere
     arguments = sys.argv[1:]
     resume = "--resume" in arguments
     arguments = [argument for argument in arguments if argument != "--resume"]

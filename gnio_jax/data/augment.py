@@ -5,6 +5,8 @@ They act on the rotated windows in TLIO's order: bias, then tilt, then yaw, nois
 
 from __future__ import annotations
 
+import math
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Float, PRNGKeyArray
@@ -19,7 +21,7 @@ ACCEL, GYRO = slice(0, 3), slice(3, 6)
 def bias(key: PRNGKeyArray, windows: Windows, gyro: float, accel: float) -> Windows:
     """Add a constant bias per window, uniform in ±`gyro` rad/s and ±`accel` m/s² per axis."""
     half_width = jnp.array([accel] * 3 + [gyro] * 3, jnp.float32)
-    offset = jax.random.uniform(key, (windows.imu.shape[0], 1, 6), jnp.float32, -1, 1) * half_width[None, None, :]
+    offset = _uniform(key, (windows.imu.shape[0], 1, 6), -1, 1) * half_width[None, None, :]
     return windows._replace(imu=windows.imu + offset)
 
 
@@ -27,8 +29,8 @@ def tilt(key: PRNGKeyArray, windows: Windows, degrees: float) -> Windows:
     """Turn the IMU by up to `degrees` about a random horizontal axis: a wrong gravity direction. The target stays."""
     heading_key, angle_key = jax.random.split(key)
     count = windows.imu.shape[0]
-    heading = jax.random.uniform(heading_key, (count,), jnp.float32, 0, 2 * jnp.pi)
-    angle = jax.random.uniform(angle_key, (count,), jnp.float32, 0, jnp.deg2rad(jnp.float32(degrees)))
+    heading = _uniform(heading_key, (count,), 0, 2 * jnp.pi)
+    angle = _uniform(angle_key, (count,), 0, math.radians(degrees))
     x, y, c, s = jnp.cos(heading), jnp.sin(heading), jnp.cos(angle), jnp.sin(angle)
     # Rodrigues' formula for the unit axis (x, y, 0).
     rotation = jnp.stack(
@@ -40,7 +42,7 @@ def tilt(key: PRNGKeyArray, windows: Windows, degrees: float) -> Windows:
 def yaw(key: PRNGKeyArray, windows: Windows) -> Windows:
     """Turn window and target together by a uniform yaw: the network must not depend on the choice of heading."""
     count = windows.imu.shape[0]
-    angle = jax.random.uniform(key, (count,), jnp.float32, 0, 2 * jnp.pi)
+    angle = _uniform(key, (count,), 0, 2 * jnp.pi)
     c, s, zero, one = jnp.cos(angle), jnp.sin(angle), jnp.zeros(count, jnp.float32), jnp.ones(count, jnp.float32)
     rotation = jnp.stack([c, -s, zero, s, c, zero, zero, zero, one], axis=-1).reshape(count, 3, 3)
     target = jnp.einsum("bij,bj->bi", rotation, windows.displacement, precision=jax.lax.Precision.HIGHEST)
@@ -65,6 +67,11 @@ def augment(key: PRNGKeyArray, windows: Windows, config: AugmentConfig) -> Windo
     if config.gyro_noise or config.accel_noise:
         windows = noise(noise_key, windows, config.gyro_noise, config.accel_noise)
     return windows
+
+
+def _uniform(key: PRNGKeyArray, shape: tuple[int, ...], low: float, high: float) -> jax.Array:
+    # Plain numbers as limits would be float64 inside where that is switched on.
+    return jax.random.uniform(key, shape, jnp.float32, jnp.float32(low), jnp.float32(high))
 
 
 def _rotate_imu(rotation: Float[jax.Array, "b 3 3"], imu: Float[jax.Array, "b n 6"]) -> Float[jax.Array, "b n 6"]:

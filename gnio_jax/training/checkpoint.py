@@ -81,7 +81,7 @@ class Checkpoints:
         if position.step in manager.all_steps():
             return
         variables = {"params": state.params, "batch_stats": state.batch_stats}
-        meta = {"position": position._asdict(), "shapes": _shapes(variables), "x64": bool(jax.config.jax_enable_x64)}
+        meta = {"position": position._asdict(), "shapes": _shapes(variables)}
         items = {"variables": ocp.args.StandardSave(variables), "meta": ocp.args.JsonSave(meta)}
         if which == "latest":
             items["optimizer"] = ocp.args.StandardSave(state.opt_state)
@@ -96,8 +96,6 @@ class Checkpoints:
             raise InputError(where, "holds no checkpoint", "start the run without --resume")
         variables = {"params": template.params, "batch_stats": template.batch_stats}
         meta = _checked_meta(manager, step, variables, where)
-        if meta["x64"] != bool(jax.config.jax_enable_x64):
-            raise InputError(where, f"was written with jax_enable_x64={meta['x64']}", "random draws differ: resume with the same setting")
         restored = manager.restore(step, args=ocp.args.Composite(
             variables=ocp.args.StandardRestore(variables), optimizer=ocp.args.StandardRestore(template.opt_state)))  # fmt: skip
         found = meta["position"]

@@ -77,9 +77,13 @@ def train(config: TrainConfig, resume: bool = False, console: Console | None = N
     those of config.yaml; without a checkpoint yet the run starts over; log rows after the checkpoint are dropped.
     SIGTERM and Ctrl-C save and return; a loss that is not finite raises `FloatingPointError` naming the step.
     """
+    with jax.enable_x64(False):  # whatever the process has: no float64 in the step, and the same random draws
+        return _train(config, resume, console or Console(stderr=True, soft_wrap=True))
+
+
+def _train(config: TrainConfig, resume: bool, console: Console) -> Outcome:
     configuration.validate(config)
     workdir = prepare_workdir(config, resume)
-    console = console or Console(stderr=True)
     model = create_model(config)
 
     console.print(f"reading {config.dataset}: {config.data.train_split} and {config.data.val_split}")

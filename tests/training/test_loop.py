@@ -1,0 +1,238 @@
+"""Runs of a tiny network on a tiny recording: what is logged, resumed, refused; whole processes where signals matter."""
+
+import dataclasses
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from test_tlio_layout import write_sequence
+
+from gnio_jax import config as configuration
+from gnio_jax.config import DataConfig, LossConfig, ModelConfig, OptimConfig, TrainConfig
+from gnio_jax.data import windows
+from gnio_jax.training import checkpoint, loop, optimizer, step
+from gnio_jax.types import InputError
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    """A TLIO folder of three short walks."""
+    root = tmp_path_factory.mktemp("tlio")
+    for name in "abc":
+        write_sequence(root / name)
+    (root / "train_list.txt").write_text("a\nb\n")
+    for split in ("val", "test"):
+        (root / f"{split}_list.txt").write_text("c\n")
+    return root
+
+
+def tiny(recording, workdir, **changes):
+    config = TrainConfig(
+        dataset="tlio", data_root=str(recording), workdir=str(workdir), data=DataConfig(rate=50.0),
+        model=ModelConfig(width=2, bank_size=3, bank_heads=2),
+        optim=OptimConfig(epochs=3, batch_size=16, learning_rate=1e-3, warmup_epochs=1),
+    )  # fmt: skip
+    return dataclasses.replace(config, **changes)
+
+
+def parameters(workdir, which="latest"):
+    return jax.tree.map(np.asarray, checkpoint.load_run(Path(workdir), which).variables)
+
+
+def same(a, b):
+    return all(jax.tree.leaves(jax.tree.map(np.array_equal, a, b)))
+
+
+@pytest.fixture(scope="module")
+def finished(recording, tmp_path_factory):
+    """A run of three epochs that nothing interrupted."""
+    workdir = tmp_path_factory.mktemp("finished") / "run"
+    outcome = loop.train(tiny(recording, workdir))
+    return workdir, outcome
+
+
+def test_a_run_leaves_its_config_log_events_and_checkpoints(recording, finished):
+    workdir, outcome = finished
+    assert configuration.load(workdir / "config.yaml") == tiny(recording, workdir)
+    rows = [json.loads(line) for line in (workdir / "metrics.jsonl").read_text().splitlines()]
+    assert [row["epoch"] for row in rows] == [0, 1, 2]
+    windows_per_epoch = 2 * len(range(0, 600 - 50, 5))  # 12 s at 50 Hz, a window of 1 s every 0.1 s, two recordings
+    assert [row["step"] for row in rows] == [windows_per_epoch // 16 * (i + 1) for i in range(3)]
+    assert outcome.best_loss == min(row["val_loss"] for row in rows)
+    assert rows[-1]["loss"] < rows[0]["loss"]
+    assert rows[-1]["loss"] == pytest.approx(100 * rows[-1]["mse"] + 1e-4 * rows[-1]["nll"], rel=1e-5)
+    assert list((workdir / "tensorboard").glob("events*"))
+    best = min(rows, key=lambda row: row["val_loss"])
+    assert checkpoint.load_run(workdir, "best").step == best["step"]
+    assert checkpoint.load_run(workdir, "latest").step == rows[-1]["step"]
+
+
+def test_validation_is_the_plain_mean_over_every_window(recording, finished):
+    workdir, _ = finished
+    run = checkpoint.load_run(workdir, "latest")
+    from gnio_jax import data
+
+    source = windows.index([data.resample(s, 50.0) for s in data.load("tlio", recording, "val")], run.config.data)
+    source = jax.device_put(source)
+    every = windows.gather(source, jnp.arange(source.start.shape[0], dtype=jnp.int32), 50)
+    prediction = jax.jit(run.model.apply)(run.variables, every.imu)
+    mse = np.mean(np.sum((np.asarray(prediction.displacement, np.float64) - np.asarray(every.displacement)) ** 2, axis=1))
+    row = json.loads((workdir / "metrics.jsonl").read_text().splitlines()[-1])
+    assert row["val_mse"] == pytest.approx(mse, rel=1e-4)
+    assert len(every.displacement) % 16 != 0  # so that the filled-up last batch is part of the test
+
+
+@pytest.mark.parametrize("dispatches", [1, 4, 9])
+def test_stopping_within_an_epoch_and_resuming_gives_the_same_bits(recording, finished, tmp_path, monkeypatch, dispatches):
+    calls = []
+    real = step.train_steps
+
+    def stopping(*arguments, **options):
+        calls.append(1)
+        if len(calls) == dispatches:
+            os.kill(os.getpid(), signal.SIGTERM)
+        return real(*arguments, **options)
+
+    monkeypatch.setattr(loop, "train_steps", stopping)
+    monkeypatch.setattr(loop, "DISPATCH_SECONDS", 0.01)
+    outcome = loop.train(tiny(recording, tmp_path / "run"))
+    assert outcome.stopped_by == signal.SIGTERM
+    assert checkpoint.load_run(tmp_path / "run", "latest").step < checkpoint.load_run(finished[0], "latest").step
+    monkeypatch.setattr(loop, "DISPATCH_SECONDS", 0.5)
+    assert loop.train(tiny(recording, tmp_path / "run"), resume=True).stopped_by is None
+    for which in ("latest", "best"):
+        assert same(parameters(tmp_path / "run", which), parameters(finished[0], which))
+    kept = ("epoch", "step", "loss", "mse", "nll", "val_loss", "learning_rate")
+    rows = [[{key: row[key] for key in kept} for row in map(json.loads, (folder / "metrics.jsonl").read_text().splitlines())]
+            for folder in (tmp_path / "run", finished[0])]  # fmt: skip
+    for ours, theirs in zip(*rows, strict=True):  # sums over an epoch are made of fewer or more parts: equal but for rounding
+        assert ours == pytest.approx(theirs, rel=1e-6)
+
+
+def command(recording, workdir, *more):
+    return [sys.executable, "train.py", "--dataset", "tlio", "--data-root", str(recording), "--workdir", str(workdir), "--data.rate", "50",
+            "--model.width", "2", "--model.bank-size", "3", "--model.bank-heads", "2", "--optim.batch-size", "16",
+            "--optim.learning-rate", "1e-3", "--optim.warmup-epochs", "1", *more]  # fmt: skip
+
+
+ENVIRONMENT = {**os.environ, "JAX_PLATFORMS": "cpu"}
+
+
+def test_killed_at_any_moment_and_resumed_gives_the_same_bits(recording, tmp_path):
+    """SIGKILL at three moments, one of them while a checkpoint is being written, against a run left alone."""
+    epochs = ["--optim.epochs", "12"]
+    subprocess.run(command(recording, tmp_path / "alone", *epochs), cwd=ROOT, check=True, capture_output=True, env=ENVIRONMENT)
+    run = tmp_path / "killed"
+    for kill in range(3):
+        process = subprocess.Popen(command(recording, run, *epochs, *(["--resume"] if kill else [])), cwd=ROOT, env=ENVIRONMENT,
+                                   stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)  # fmt: skip
+        seen = (run / "metrics.jsonl").read_text().count("\n") if kill else 0
+        deadline = time.time() + 120
+        while time.time() < deadline and process.poll() is None:
+            log = run / "metrics.jsonl"
+            if log.exists() and log.read_text().count("\n") >= seen + 1 + kill:
+                # The log row comes right before the checkpoints: kill before, amid or after them.
+                time.sleep(0.03 * kill)
+                break
+            time.sleep(0.002)
+        process.send_signal(signal.SIGKILL)
+        _, errors = process.communicate()
+        assert process.returncode == -signal.SIGKILL, errors
+    final = subprocess.run(command(recording, run, *epochs, "--resume"), cwd=ROOT, capture_output=True, text=True, env=ENVIRONMENT)
+    assert final.returncode == 0, final.stderr
+    for which in ("latest", "best"):
+        assert same(parameters(run, which), parameters(tmp_path / "alone", which))
+    epochs_logged = [json.loads(line)["epoch"] for line in (run / "metrics.jsonl").read_text().splitlines()]
+    assert epochs_logged == list(range(12))
+
+
+def test_a_loss_that_is_not_finite_stops_with_its_step(recording, tmp_path, monkeypatch):
+    real = windows.index
+
+    def spoiled(sequences, config):
+        source = real(sequences, config)
+        return source._replace(displacement=np.where(np.arange(len(source.start))[:, None] == 77, np.float32(np.inf), source.displacement))
+
+    monkeypatch.setattr(windows, "index", spoiled)
+    config = tiny(recording, tmp_path / "run")
+    order_key = jax.random.split(jax.random.key(config.seed), 3)[1]
+    expected = int(np.flatnonzero(np.asarray(step.epoch_order(order_key, 0, 220)) == 77)[0]) // 16
+    with pytest.raises(FloatingPointError, match=rf"not finite at step {expected} \(epoch 0\)"):
+        loop.train(config)
+
+
+def test_two_stage_loss_leaves_the_uncertainty_head_alone_until_its_epoch(recording, tmp_path):
+    loop.train(tiny(recording, tmp_path / "run", loss=LossConfig(nll_from_epoch=99)))
+    template = step.create_state(checkpoint.create_model(tiny(recording, "")), optimizer.create(OptimConfig(), 1),
+                                 jax.random.split(jax.random.key(0), 3)[0], 50)  # fmt: skip
+    trained = parameters(tmp_path / "run")["params"]
+    assert same(trained["uncertainty"], jax.tree.map(np.asarray, template.params["uncertainty"]))
+    assert not same(trained["head"], jax.tree.map(np.asarray, template.params["head"]))
+
+
+def test_the_step_holds_no_float64(recording, tmp_path, monkeypatch):
+    """As a run has it, in a process with 64-bit types switched on, as the command lines switch them."""
+    assert jax.config.jax_enable_x64
+    texts = []
+
+    def spy(function):
+        def spying(*arguments, **options):
+            texts.append(function.lower(*arguments, **options).as_text())
+            return function(*arguments, **options)
+
+        return spying
+
+    monkeypatch.setattr(loop, "train_steps", spy(step.train_steps))
+    monkeypatch.setattr(loop, "validate", spy(step.validate))
+    loop.train(tiny(recording, tmp_path / "run", optim=OptimConfig(epochs=1, batch_size=16)))
+    assert len(texts) >= 2
+    for text in texts:
+        assert "xf32>" in text and "f64" not in text
+    assert {leaf.dtype for leaf in jax.tree.leaves(parameters(tmp_path / "run"))} == {np.dtype("float32")}
+
+
+def test_a_run_is_never_overwritten_nor_continued_with_other_settings(recording, finished, tmp_path):
+    workdir, _ = finished
+    with pytest.raises(InputError, match="already holds a run; continue it with --resume"):
+        loop.train(tiny(recording, workdir))
+    with pytest.raises(InputError, match=r"config\.yaml: 'seed' was 0 and is now 5"):
+        loop.train(tiny(recording, workdir, seed=5), resume=True)
+    with pytest.raises(InputError, match="holds no run to resume"):
+        loop.train(tiny(recording, tmp_path / "nothing"), resume=True)
+    assert not (tmp_path / "nothing").exists()
+
+
+def test_a_batch_larger_than_the_data_is_refused_before_anything_is_written(recording, tmp_path):
+    with pytest.raises(InputError, match=r"optim\.batch_size: is 4096, but there are only 220 windows"):
+        loop.train(tiny(recording, tmp_path / "run", optim=OptimConfig(batch_size=4096)))
+    assert not (tmp_path / "run").exists()
+
+
+def test_runs_that_cannot_be_loaded(finished, tmp_path):
+    workdir, _ = finished
+    with pytest.raises(InputError, match=r"holds no run \(config\.yaml is missing\)"):
+        checkpoint.load_run(tmp_path)
+    configuration.save(tmp_path / "empty" / "config.yaml", TrainConfig())
+    with pytest.raises(InputError, match="holds no checkpoint"):
+        checkpoint.load_run(tmp_path / "empty")
+    other = tmp_path / "other"
+    subprocess.run(["cp", "-r", workdir, other], check=True)
+    config = configuration.load(other / "config.yaml")
+    configuration.save(other / "config.yaml", dataclasses.replace(config, model=dataclasses.replace(config.model, width=4)))
+    with pytest.raises(InputError, match=r"has shape \[.*\] in the checkpoint and \[.*\] in the configured model"):
+        checkpoint.load_run(other)
+    for damaged in (other / "checkpoints" / "best").glob("*/variables/**/d/*"):
+        damaged.write_bytes(damaged.read_bytes()[:10])
+    configuration.save(other / "config.yaml", config)
+    with pytest.raises(InputError, match="cannot be read"):
+        checkpoint.load_run(other)
