@@ -387,7 +387,7 @@ def follow(
         nearby = believed & (angle < np.radians(limit)) if sigma == seconds else good & (angle < np.radians(limit))
         believed = nearby if nearby.sum() > 0.2 * good.sum() else good
         scale = max(3.0 * float(np.median(angle[believed])), np.radians(floor))
-        weight = np.where(believed, 1.0 / (1.0 + (angle / scale) ** 2) ** 2, 1e-6)
+        weight = np.where(believed, 1.0 / (1.0 + (angle / scale) ** 2) ** 2, 1.0)
         course = _smooth(weight[:, None] * _fill(correction, believed), sigma / step)
         course /= np.linalg.norm(course, axis=1, keepdims=True)
     return Rotation.from_quat(course) * integrated, believed

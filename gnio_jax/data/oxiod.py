@@ -48,7 +48,7 @@ from gnio_jax.data.sequence import Dataset, check_units, keep_plausible, quatern
 from gnio_jax.types import STANDARD_G, InputError, Sequence
 
 RATE = 100.0
-VERSION = "oxiod 3"
+VERSION = "oxiod 5"
 """Changes whenever other sequences would come of the same files: it is part of the cache's key."""
 
 SINGLE_USER = ("handheld", "pocket", "handbag", "trolley", "running", "slow walking")
@@ -399,7 +399,7 @@ def build(walk: Walk, kind: str) -> Sequence:
         attributes[f"lever_{name}"] = float(fit.lever[axis])
         attributes[f"gyro_bias_{name}"] = float(fit.gyro_bias[axis])
         attributes[f"accel_bias_{name}"] = float(fit.accel_bias[axis])
-    return _sequence(walk, truth_path, time, gyro, accel, orientation, position, velocity, valid, device, attributes)
+    return _sequence(walk, truth_path, imu.epoch, time, gyro, accel, orientation, position, velocity, valid, device, attributes)
 
 
 def _resample(imu: Imu) -> tuple[np.ndarray, np.ndarray, np.ndarray, Rotation | None, np.ndarray]:
@@ -427,7 +427,7 @@ def _bridged(good: Bool[np.ndarray, "n"], seconds: float) -> Bool[np.ndarray, "n
 
 def _attributes(walk: Walk, kind: str, truth: str) -> dict[str, str | float]:
     user = walk.folder if walk.scene == "multi users" else "user1" if walk.scene in SINGLE_USER else "unknown"
-    device = walk.folder if walk.scene == "multi devices" else "iPhone"
+    device = walk.folder if walk.scene == "multi devices" else "iPhone 7 Plus"
     return {
         "dataset": "oxiod",
         "scene": walk.scene,
@@ -443,10 +443,10 @@ def _attributes(walk: Walk, kind: str, truth: str) -> dict[str, str | float]:
 
 
 def _sequence(
-    walk: Walk, source: Path, time: np.ndarray, gyro: np.ndarray, accel: np.ndarray, orientation: Rotation, position: np.ndarray,
-    velocity: np.ndarray, valid: np.ndarray, device: Rotation | None, attributes: dict[str, str | float]
+    walk: Walk, source: Path, epoch: float, time: np.ndarray, gyro: np.ndarray, accel: np.ndarray, orientation: Rotation,
+    position: np.ndarray, velocity: np.ndarray, valid: np.ndarray, device: Rotation | None, attributes: dict[str, str | float]
 ) -> Sequence:
-    """The stretch from the first to the last valid sample, starting at 0 s."""
+    """The stretch from the first to the last valid sample, starting at 0 s; `start_time` is that moment on the phone's clock."""
     if valid.sum() < 10 * RATE:
         raise Refusal(source, f"only {valid.sum() / RATE:.1f} s have a usable reference", "leave it out")
     span = slice(int(np.argmax(valid)), len(valid) - int(np.argmax(valid[::-1])))
@@ -462,7 +462,7 @@ def _sequence(
             velocity=velocity[span],
             valid=valid[span],
             device_orientation=None if device is None else quaternions(device[span]),
-            attributes=dict(attributes),
+            attributes=attributes | {"start_time": epoch + float(time[span.start])},
         ),
         source,
     )
@@ -511,7 +511,7 @@ def _with_tango(walk: Walk, kind: str, imu: Imu, path: Path) -> Sequence:
         "heading_correlation": fit.correlation,
     }
     valid = _bridged(kept, LONGEST_BRIDGE) & measured
-    return _sequence(walk, path, time, gyro, accel, orientation, position, velocity, valid, device, attributes)
+    return _sequence(walk, path, imu.epoch, time, gyro, accel, orientation, position, velocity, valid, device, attributes)
 
 
 # --- 6. splits -------------------------------------------------------------------------------------------------------
