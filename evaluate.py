@@ -40,7 +40,7 @@ def main() -> None:
         found, folder = evaluation.evaluate(config, progress)
     console = Console(highlight=False)
     if not console.is_terminal:
-        console = Console(highlight=False, width=160)  # into a file or a pipe: no line is cut to a terminal's width
+        console = Console(highlight=False, width=200)  # into a file or a pipe: no line is cut to a terminal's width
     console.print(report.table(found))
     print(f"results: {folder}")
 

@@ -71,7 +71,7 @@ def trajectory(estimate: Estimate, ate: float | None = None, ate_2d: float | Non
     axes.set_ylabel("y (m)")
     found = [f"ATE {ate:.2f} m" if ate is not None else "", f"{ate_2d:.2f} m in 2-D" if ate_2d is not None else ""]
     axes.set_title("\n".join(filter(None, [_short(estimate.name), ", ".join(filter(None, found))])), fontsize=11)
-    axes.legend(ncols=2, fontsize=9, framealpha=0.9)
+    axes.legend(loc="best", ncols=2, fontsize=9, framealpha=0.9)
     _finish(axes)
     return figure
 
@@ -89,12 +89,12 @@ def position_error(estimate: Estimate) -> Figure:
         _shade(panel, time, still)
         if estimate.std is not None:
             bound = 3 * estimate.std[:, 6 + k]
-            panel.fill_between(time, -bound, bound, color=colour, alpha=0.16, lw=0, label="±3σ of the filter")
+            panel.fill_between(time, -bound, bound, color=colour, alpha=0.16, lw=0, label="±3σ")
         panel.plot(time, error[:, k], color=colour, lw=1.2, label="error")
         panel.axhline(0, color=REFERENCE, lw=0.6)
         panel.set_ylabel(f"{name} (m)")
+        _legend(panel)
         _finish(panel)
-    panels[0].legend(loc="upper left", ncols=3, fontsize=9, framealpha=0.9)
     panels[0].set_title(f"{_short(estimate.name)}: position error", fontsize=11)
     panels[-1].set_xlabel("time (s)")
     panels[-1].set_xlim(time[0], time[-1])
@@ -122,8 +122,9 @@ def displacement(estimate: Estimate, window_seconds: float) -> Figure:
     panels[0].set_title(f"{_short(estimate.name)}: displacement of the window, at its middle", fontsize=11)
 
     for k, (name, colour) in enumerate(AXES.items()):
-        panels[1].plot(middle, truth[:, k], color=REFERENCE, lw=0.9, ls=":", label="reference" if k == 2 else None)
-        panels[1].plot(middle, estimate.displacement[:, k], color=colour, lw=1.1, label=name)
+        panels[1].plot(middle, truth[:, k], color=colour, lw=3.0, alpha=0.35, label=f"{name}, reference")
+    for k, (name, colour) in enumerate(AXES.items()):
+        panels[1].plot(middle, estimate.displacement[:, k], color=colour, lw=1.0, label=name)
     panels[1].set_ylabel("displacement (m)")
     if gate is not None:
         for k, (name, colour) in enumerate(AXES.items()):
@@ -133,7 +134,7 @@ def displacement(estimate: Estimate, window_seconds: float) -> Figure:
         panels[2].set_ylim(lowest, 1.05)
         panels[2].set_ylabel("gate γ (–)")
     for panel in panels:
-        panel.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize=9, framealpha=0.9)
+        _legend(panel)
         _finish(panel)
     panels[-1].set_xlabel("time (s)")
     panels[-1].set_xlim(time[0], time[-1])
@@ -202,6 +203,11 @@ def _shade(axes: Axes, time: Float[np.ndarray, "k"], still: np.ndarray) -> None:
 def _step(axes: Axes, values: Float[np.ndarray, "k"], colour: str, width: float, **style: Any) -> None:
     x = np.sort(values)
     axes.step(np.concatenate([[0.0], x]), np.arange(len(x) + 1) / len(x), where="post", color=colour, lw=width, **style)
+
+
+def _legend(axes: Axes) -> None:
+    """Beside the axes, where it hides nothing."""
+    axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize=9, frameon=False)
 
 
 def _short(name: str) -> str:

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from rich import box
 from rich.console import Group
 from rich.table import Table
 from rich.text import Text
@@ -31,7 +32,7 @@ COLUMNS = {
     "yaw_rmse": ("yaw", "°", 1),
     "path_length_ratio": ("path ratio", "", 2),
     "stationary_drift": ("standing", "m/min", 1),
-    "nees_coverage": ("in 95 %", "%", 0),
+    "nees_coverage": ("NEES<95 %", "%", 0),
     "nis": ("NIS/3", "", 2),
     "accepted": ("accepted", "%", 0),
 }
@@ -79,9 +80,11 @@ def table(report: Report) -> Group:
     """The table and what belongs under it, for `rich.console.Console.print`."""
     shown = [name for name in COLUMNS if any(name in m.values for m in report.scores.sequences.values())]
     settings = report.settings
-    grid = Table(title=f"{settings['dataset']} {settings['split']}: {settings['estimator']}"
-                       + (f", {settings['coupling']} coupling" if settings["estimator"] == "ekf" else ""), title_style="bold")
-    grid.add_column("sequence", overflow="fold", min_width=12)
+    coupling = f", {settings['coupling']} coupling" if settings["estimator"] == "ekf" else ""
+    grid = Table(title=f"{settings['dataset']} {settings['split']}: {settings['estimator']}{coupling}", title_style="bold",
+                 title_justify="left", box=box.SIMPLE_HEAD)
+    labels = [*report.scores.sequences, *report.reference_rows]
+    grid.add_column("sequence", overflow="fold", min_width=min(40, max(map(len, labels))))
     for name in shown:
         heading, unit, _ = COLUMNS[name]
         grid.add_column(f"{heading}\n[dim]{unit}[/dim]", justify="right", no_wrap=True)
@@ -95,7 +98,7 @@ def table(report: Report) -> Group:
     summary = report.scores.summary
     add("mean", summary.mean, "bold")
     add("median", summary.median)
-    add("95 % of mean", summary.interval)
+    add("95 % interval", summary.interval)
     grid.add_row("n", *(str(summary.count.get(name, 0)) for name in shown), style="dim", end_section=True)
     for label, scores in report.reference_rows.items():
         add(label, scores.summary.mean, "italic")
@@ -104,7 +107,12 @@ def table(report: Report) -> Group:
              f"alignment: {settings['alignment']}"]
     lines = [Text("; ".join(words), style="dim"),
              Text("reference rows are means; – is not defined (the reason is in metrics.json)", style="dim")]
-    lines += [Text(f"{name}: {note}", style="yellow") for name, notes in report.notes.items() for note in notes]
+    said: dict[str, list[str]] = {}
+    for name, notes in report.notes.items():
+        for note in notes:
+            said.setdefault(note, []).append(name)
+    for note, names in said.items():
+        lines.append(Text(f"{', '.join(names) if len(names) < 4 else f'{len(names)} sequences'}: {note}", style="yellow"))
     lines += [Text(f"left out: {name}: {reason}", style="yellow") for name, reason in report.left_out.items()]
     return Group(grid, *lines)
 
@@ -113,7 +121,7 @@ def _cell(value: Any, digits: int) -> str:
     if value is None:
         return "–"
     if isinstance(value, tuple):
-        return f"{_cell(value[0], digits)}…{_cell(value[1], digits)}"
+        return f"{_cell(value[0], digits)}–{_cell(value[1], digits)}"
     return f"{value:.{digits}f}" if abs(value) < 10 ** (7 - digits) else f"{value:.1e}"
 
 

@@ -105,8 +105,8 @@ def test_table_says_what_matters(made):
     console = Console(width=160, record=True, file=open("/dev/null", "w"))
     console.print(report.table(made))
     text = console.export_text()
-    for words in ("room 1/walk", "ATE 2-D", "mean", "95 % of mean", "never_moves", "window orientation: filter", "initial state: reference",
-                  "gyro bias: zero", "IMU compensated: no", "blind: start: rough", "left out: short", "–"):
+    for words in ("room 1/walk", "ATE 2-D", "mean", "95 % interval", "never_moves", "window orientation: filter",
+                  "initial state: reference", "gyro bias: zero", "IMU compensated: no", "blind: start: rough", "left out: short", "–"):
         assert words in text
     assert f"{made.scores.summary.mean['ate']:.2f}" in text
 
