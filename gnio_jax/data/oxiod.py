@@ -48,7 +48,7 @@ from gnio_jax.data.sequence import Dataset, check_units, keep_plausible, quatern
 from gnio_jax.types import STANDARD_G, InputError, Sequence
 
 RATE = 100.0
-VERSION = "oxiod 5"
+VERSION = "oxiod 6"
 """Changes whenever other sequences would come of the same files: it is part of the cache's key."""
 
 SINGLE_USER = ("handheld", "pocket", "handbag", "trolley", "running", "slow walking")
@@ -503,7 +503,9 @@ def _with_tango(walk: Walk, kind: str, imu: Imu, path: Path) -> Sequence:
     position, velocity, kept = smooth_positions(there, good[place], 1.0 / RATE, cutoff=4.0)
     turned = Rotation.from_rotvec(np.interp(at, fit.knots, fit.yaw)[:, None] * [0.0, 0.0, 1.0]) * device
     # The phone's own attitude takes part of each stride's acceleration for gravity: up to 6° of tilt, and it drifts in yaw.
-    orientation = follow_acceleration(integrate_gyro(gyro, 1.0 / RATE), turned, accel, position, kept, 1.0 / RATE)
+    # Over minutes, though, gravity tells it the gyro's bias in tilt.
+    bias = (0.5 * (gyro[1:] + gyro[:-1]) - (device[:-1].inv() * device[1:]).as_rotvec() * RATE).mean(axis=0)
+    orientation = follow_acceleration(integrate_gyro(gyro - bias, 1.0 / RATE), turned, accel, position, kept, 1.0 / RATE)
     attributes = _attributes(walk, kind, "tango") | {
         "lag": float(np.mean(fit.lag)),
         "lag_drift": float(np.ptp(fit.lag)),
