@@ -444,14 +444,14 @@ def _finite(rows: Float[np.ndarray, "n d"]) -> Bool[np.ndarray, "n"]:
     return np.isfinite(rows).all(1)
 
 
-def _errors(estimate: Positions, reference: Positions) -> Positions:
+def _errors(estimate: Positions, reference: Positions) -> Float[np.ndarray, "m d"]:
     good = _finite(reference)
     if not good.any():
         raise Undefined("no trusted reference")
     return (estimate - reference)[good]
 
 
-def _yaw_errors(estimate_yaw: Angles, reference_yaw: Angles) -> Angles:
+def _yaw_errors(estimate_yaw: Angles, reference_yaw: Angles) -> Float[np.ndarray, "m"]:
     good = np.isfinite(reference_yaw)
     if not good.any():
         raise Undefined("no trusted reference")
@@ -469,7 +469,7 @@ def _rms(errors: Float[np.ndarray, "m d"], trusted: Bool[np.ndarray, "m"], reaso
     return float(np.sqrt(np.mean(np.sum(errors[trusted] ** 2, 1))))
 
 
-def _present(squared: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+def _present(squared: Float[np.ndarray, "n"]) -> Float[np.ndarray, "m"]:
     present = squared[~np.isnan(squared)]
     if not len(present):
         raise Undefined("no measurement or no trusted reference")

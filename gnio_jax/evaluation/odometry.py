@@ -263,7 +263,7 @@ def attitude(recording: Recording, config: DataConfig, source: Orientation) -> F
     return np.where(known[:, None, None], matrices, bridged)
 
 
-def predict_windows(network: Network, recordings: list[Recording], attitudes: list[Float[np.ndarray, "t 3 3"]], config: DataConfig,
+def predict_windows(network: Network, recordings: list[Recording], attitudes: list[Float[np.ndarray, "_ 3 3"]], config: DataConfig,
                     progress: Progress | None = None) -> list[Prediction]:
     """What the network says of every window of the recordings, cut with the given attitudes, in large batches over all of them."""
     parts, counts, offset = [], [], 0
