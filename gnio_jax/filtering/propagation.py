@@ -16,6 +16,7 @@ and every sum is one product with a constant triangular matrix: no loop over sam
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import jax
@@ -72,8 +73,8 @@ def interval(state: FilterState, gyro: Float[Array, "n 3"], accel: Float[Array, 
     by_tilt = jnp.concatenate([eye, carry[:, :, 0, 0], carry[:, :, 1, 0]])
     transition = jnp.concatenate([jnp.concatenate([by_tilt, kinematics, bias_tails[:, :, 0]], axis=1), np.eye(CORE, dtype=dtype)[9:]])
 
-    gyro_white, accel_white = noise.gyro_density / np.sqrt(dt), noise.accel_density / np.sqrt(dt)
-    walk = jnp.repeat(jnp.stack([noise.gyro_bias_walk, noise.accel_bias_walk]), 3) * np.sqrt(dt)
+    gyro_white, accel_white = noise.gyro_density / math.sqrt(dt), noise.accel_density / math.sqrt(dt)
+    walk = jnp.repeat(jnp.stack([noise.gyro_bias_walk, noise.accel_bias_walk]), 3) * math.sqrt(dt)
     # The accelerometer's white noise is isotropic, so its rotations drop out of R Rᵀ.
     per_axis = dt**2 * np.array([[n, lever.sum()], [lever.sum(), (lever**2).sum()]])
     isotropic = np.kron(np.pad(per_axis, ((1, 0), (1, 0))), np.eye(3)).astype(dtype)
@@ -95,7 +96,7 @@ def interval(state: FilterState, gyro: Float[Array, "n 3"], accel: Float[Array, 
 
 def propagate(state: FilterState, motion: Interval, slot: Array | int) -> FilterState:
     """Move mean and covariance over one interval and clone the new pose into `slot` of the ring, in the place of the oldest."""
-    core = motion.transition @ state.core_covariance @ motion.transition.T + motion.noise
+    core = matmul(motion.transition @ state.core_covariance, motion.transition.T) + motion.noise
     of_pose = jnp.concatenate([core[:, THETA], core[:, POSITION]], axis=1)
     cross = _put(motion.transition @ state.cross_covariance, of_pose, 0, CLONE * slot)
     rows = jnp.concatenate([cross[THETA], cross[POSITION]])

@@ -146,7 +146,8 @@ def _scan(measure: Callable, state: FilterState, gyro: Array, accel: Array, conf
     return _oldest_first(state, intervals % clones), _history(mean, kept, measurement, outcome, diagnostics, config)
 
 
-def _history(mean: tuple, kept: Array, measurement: Measurement, outcome: Outcome, diagnostics: dict, config: FilterConfig) -> FilterHistory:
+def _history(mean: tuple, kept: Array, measurement: Measurement, outcome: Outcome, diagnostics: dict,
+             config: FilterConfig) -> FilterHistory:
     def where_present(value: Array) -> Array:
         present = outcome.present.reshape(-1, *[1] * (value.ndim - 1))
         return jnp.where(present, value, jnp.nan).astype(kept.dtype)
@@ -163,8 +164,8 @@ def _history(mean: tuple, kept: Array, measurement: Measurement, outcome: Outcom
 def _measurement(displacement: Float[Array, "3"], covariance: Float[Array, "3 3"], config: FilterConfig) -> Measurement:
     """Scale; keep NaN out of the arithmetic, or its derivatives would be NaN too."""
     present = jnp.all(jnp.isfinite(displacement)) & jnp.all(jnp.isfinite(covariance))
-    return Measurement(displacement=jnp.where(present, displacement, 0.0),
-                       covariance=jnp.where(present, config.measurement_scale * covariance, jnp.eye(3, dtype=covariance.dtype)), present=present)
+    scaled = jnp.where(present, config.measurement_scale * covariance, jnp.eye(3, dtype=covariance.dtype))
+    return Measurement(displacement=jnp.where(present, displacement, 0.0), covariance=scaled, present=present)
 
 
 def _oldest_first(state: FilterState, shift: int) -> FilterState:
@@ -180,7 +181,8 @@ def _floating(value: Any) -> Any:
     return value if jnp.issubdtype(value.dtype, jnp.floating) else value.astype(jnp.float32)
 
 
-def _admit(state: FilterState, gyro: Any, accel: Any, config: FilterConfig, noise: NoiseModel) -> tuple[FilterState, Array, Array, NoiseModel]:
+def _admit(state: FilterState, gyro: Any, accel: Any, config: FilterConfig,
+           noise: NoiseModel) -> tuple[FilterState, Array, Array, NoiseModel]:
     """Check what both doors take, and bring it to the state's precision."""
     clones = config.clones_per_window + 1
     shapes = FilterState((3, 3), (3,), (3,), (3,), (3,), (clones, 3, 3), (clones, 3), (CORE, CORE), (CORE, CLONE * clones),
@@ -190,7 +192,7 @@ def _admit(state: FilterState, gyro: Any, accel: Any, config: FilterConfig, nois
     dtype = fields["position"].dtype
     samples = jnp.shape(gyro)[0] if jnp.ndim(gyro) else 0
     if samples < config.samples_per_clone or samples % config.samples_per_clone:
-        raise ValueError(f"gyro: the number of samples must be a multiple of samples_per_clone = {config.samples_per_clone}, found {samples}")
+        raise ValueError(f"gyro: the samples must be a multiple of samples_per_clone = {config.samples_per_clone}, found {samples}")
     gyro, accel = (check(name, value, (samples, 3), config).astype(dtype) for name, value in [("gyro", gyro), ("accel", accel)])
     for name, value in noise._asdict().items():
         if jnp.shape(value) != ():

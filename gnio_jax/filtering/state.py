@@ -66,8 +66,8 @@ class FilterConfig:
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
             if field.type == "float":
-                try:
-                    number = float("nan") if isinstance(value, bool | str) else float(value)  # 0-d arrays, as NumPy files give them, are welcome
+                try:  # 0-d arrays, as NumPy files give them, are welcome
+                    number = float("nan") if isinstance(value, bool | str) else float(value)
                 except (TypeError, ValueError):
                     number = float("nan")
                 require(math.isfinite(number), field.name, "must be a finite number")
@@ -131,6 +131,9 @@ class InitialStd(NamedTuple):
     """m/s²"""
 
 
+TLIO_STD = InitialStd()
+
+
 class GateState(NamedTuple):
     """Memory of the χ² gate. Times count IMU samples since initialisation, so that no rounding can move a decision."""
 
@@ -181,15 +184,16 @@ def check(name: str, value: Any, shape: tuple[int, ...], config: FilterConfig) -
     if value.shape != shape:
         raise ValueError(f"{name}: the shape must be {shape}, found {value.shape}; for a batch of sequences use jax.vmap")
     if value.dtype != jnp.float64 and not (config.allow_float32 and value.dtype == jnp.float32):
-        remedy = "call jax.config.update('jax_enable_x64', True) first, or ask for FilterConfig(allow_float32=True)" if not jax.config.jax_enable_x64 \
-            else "cast it, or ask for FilterConfig(allow_float32=True)" if value.dtype == jnp.float32 else "cast it"
+        remedy = "cast it" if jax.config.jax_enable_x64 else "call jax.config.update('jax_enable_x64', True) first"
+        if value.dtype == jnp.float32:
+            remedy += ", or ask for FilterConfig(allow_float32=True)"
         raise ValueError(f"{name}: the filter runs in float64, found {value.dtype}; {remedy}")
     return value
 
 
 # The arguments of the doors carry no shapes for the run-time checker: a wrong one is the user's mistake and a ValueError.
 def initial_state(config: FilterConfig, rotation: Any, velocity: Any, position: Any, gyro_bias: Any = 0, accel_bias: Any = 0,
-                  std: InitialStd = InitialStd()) -> FilterState:
+                  std: InitialStd = TLIO_STD) -> FilterState:
     """Start of the filter from a known pose, without clones.
 
     rotation (3, 3) body → world; velocity (3,) m/s and position (3,) m in the world frame; gyro_bias rad/s and accel_bias m/s²,

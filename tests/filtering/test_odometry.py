@@ -1,0 +1,213 @@
+"""The network in the loop against windows cut by brute force, and derivatives of the whole filter against central differences."""
+
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from gnio_jax import filtering
+from gnio_jax.types import Prediction
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "reference"))
+import scekf_numpy
+
+N, CLONES, INTERVALS, DT = 5, 4, 26, 0.02
+CONFIG = filtering.FilterConfig(DT, N, CLONES, convergence_seconds=0.6, measurement_scale=2.0)
+PARAMETERS = np.random.default_rng(5).standard_normal((6, 3)) * 0.02
+
+
+def recording(seed):
+    rng = np.random.default_rng(seed)
+    t = np.arange(N * INTERVALS) * DT
+    gyro = np.sin(t[:, None] * rng.uniform(2, 5, 3) + rng.uniform(0, 6, 3))
+    accel = np.cos(t[:, None] * rng.uniform(2, 5, 3)) + Rotation.from_euler("xyz", [0.3, -0.2, 1.0]).inv().apply([0, 0, 9.81])
+    return gyro, accel
+
+
+def start(config=CONFIG):
+    rotation = Rotation.from_euler("xyz", [0.3, -0.2, 1.0]).as_matrix()
+    return filtering.initial_state(config, rotation, np.array([0.5, 0.0, 0.0]), np.zeros(3), np.array([0.02, -0.01, 0.03]), 0.1)
+
+
+def predict(windows, parameters=PARAMETERS):
+    """A network of one layer, whose output depends on the order of the samples and of the channels."""
+    assert windows.shape == (1, N * CLONES, 6) and windows.dtype == jnp.float32
+    ramp = jnp.linspace(0.5, 1.5, N * CLONES, dtype=jnp.float32)[None, :, None]
+    pooled = jnp.mean(ramp * windows, axis=1) @ jnp.asarray(parameters, jnp.float32)
+    return Prediction(pooled, -2.0 + 0.1 * pooled, {"gate": jnp.tanh(pooled), "attention": jnp.ones((1, 2, 3), jnp.float32)})
+
+
+def predict_numpy(window):
+    pooled = (np.linspace(0.5, 1.5, N * CLONES)[:, None] * window).mean(0) @ PARAMETERS
+    return pooled, np.diag(np.exp(2 * np.maximum(-2.0 + 0.1 * pooled, -4.0)))
+
+
+@pytest.mark.parametrize("window_rotation", ["per_sample", "single"])
+def test_windows_are_cut_with_the_state_of_the_filter(window_rotation):
+    gyro, accel = recording(0)
+    config = filtering.FilterConfig(DT, N, CLONES, convergence_seconds=0.6, measurement_scale=2.0, window_rotation=window_rotation)
+
+    def measure(k, clone_rotation, gyro_bias, accel_bias):
+        cut = slice((k - CLONES + 1) * N, (k + 1) * N)
+        unyaw = scekf_numpy.yaw_matrix(clone_rotation).T
+        R, rows = clone_rotation, []
+        for w, a in zip(gyro[cut] - gyro_bias, accel[cut] - accel_bias, strict=True):
+            rows.append(np.concatenate([unyaw @ R @ a, unyaw @ R @ w]))
+            if window_rotation == "per_sample":
+                R = R @ Rotation.from_rotvec(w * DT).as_matrix()
+        return predict_numpy(np.array(rows))
+
+    state = start(config)
+    _, history = jax.jit(lambda state: filtering.run_odometry(predict, state, gyro, accel, config, filtering.NoiseModel()))(state)
+    noise = filtering.NoiseModel()
+    wanted = scekf_numpy.run(
+        gyro, accel, None, None, *[np.asarray(value) for value in state[:3]], dt=DT, n=N, clones=CLONES,
+        bg=np.asarray(state.gyro_bias), ba=np.asarray(state.accel_bias), sigma_gyro=noise.gyro_density / np.sqrt(DT),
+        sigma_accel=noise.accel_density / np.sqrt(DT), convergence=0.6, scale=2.0, measure=measure)
+    assert np.nansum(wanted["accepted"]) > 5
+    for name in ("accepted", "gate_passed"):
+        np.testing.assert_array_equal(getattr(history, name), wanted[name])
+    for name in ("displacement", "position", "velocity", "rotation", "gyro_bias", "accel_bias", "innovation"):
+        np.testing.assert_allclose(getattr(history, name), wanted[name], atol=3e-6, err_msg=name)  # the network is float32
+    std = np.sqrt(2.0) * np.exp(np.maximum(-2.0 + 0.1 * wanted["displacement"], -4.0))
+    np.testing.assert_allclose(history.measurement_std, std, rtol=1e-5)
+    np.testing.assert_allclose(history.diagnostics["gate"], np.tanh(wanted["displacement"]), atol=3e-6)
+    assert history.diagnostics["attention"].shape == (INTERVALS, 2, 3)
+    assert np.isnan(history.diagnostics["attention"][:CLONES]).all() and (history.diagnostics["attention"][CLONES:] == 1).all()
+
+
+def test_given_its_own_measurements_the_filter_repeats_itself():
+    gyro, accel = recording(1)
+    final, history = jax.jit(lambda s: filtering.run_odometry(predict, s, gyro, accel, CONFIG, filtering.NoiseModel()))(start())
+    covariance = jax.vmap(jnp.diag)(history.measurement_std**2 / CONFIG.measurement_scale)
+    again_final, again = filtering.run_filter(start(), gyro, accel, history.displacement, covariance, CONFIG, filtering.NoiseModel())
+    assert again.diagnostics == {}
+    for wanted, found in [(history._replace(diagnostics={}), again), (final, again_final)]:
+        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-9), wanted, found)
+
+
+def test_log_std_is_raised_to_its_floor():
+    gyro, accel = recording(1)
+
+    def sure(windows):
+        return Prediction(jnp.zeros((1, 3), jnp.float32), jnp.asarray([[-9.0, -4.5, 1.0]], jnp.float32))
+
+    _, history = jax.jit(lambda s: filtering.run_odometry(sure, s, gyro, accel, CONFIG, filtering.NoiseModel()))(start())
+    np.testing.assert_allclose(history.measurement_std[-1], np.sqrt(2.0) * np.exp([-4.0, -4.0, 1.0]), rtol=1e-12)
+
+
+def test_vmap_keeps_the_branch_and_equals_single():
+    signals = [np.stack(column) for column in zip(recording(0), recording(1), strict=True)]
+    calls = []
+
+    def counting(windows):
+        jax.debug.callback(lambda: calls.append(1))
+        return predict(windows)
+
+    def run(network, gyro, accel):
+        return filtering.run_odometry(network, start(), gyro, accel, CONFIG, filtering.NoiseModel())
+
+    many = jax.jit(jax.vmap(lambda *given: run(counting, *given)))(*signals)
+    jax.effects_barrier()
+    assert len(calls) in (INTERVALS - CLONES, 2 * (INTERVALS - CLONES))  # once a step (or once a sequence), never before there is a window
+    alone = jax.jit(lambda *given: run(predict, *given))
+    for index in range(2):
+        one = alone(*[signal[index] for signal in signals])
+        jax.tree.map(lambda a, b, index=index: np.testing.assert_allclose(a[index], b, atol=3e-6), many, one)
+
+
+def test_predict_is_asked_for_what_it_must_return():
+    gyro, accel = recording(0)
+    good = predict(jnp.zeros((1, N * CLONES, 6), jnp.float32))
+    for bad in ((good.displacement, good.log_std), good._replace(displacement=good.displacement[0]),
+                good._replace(log_std=jnp.zeros((1, 2))), good._replace(diagnostics={"gate": jnp.zeros(3)})):
+        with pytest.raises(ValueError, match=r"^predict: "):
+            filtering.run_odometry(lambda _, bad=bad: bad, start(), gyro, accel, CONFIG, filtering.NoiseModel())
+
+
+def central(function, x, step):
+    x = np.asarray(x, float)
+    out = np.empty(x.size)
+    for i in range(x.size):
+        e = np.zeros(x.size)
+        e[i] = step
+        out[i] = (function(x + e.reshape(x.shape)) - function(x - e.reshape(x.shape))) / (2 * step)
+    return out.reshape(x.shape)
+
+
+def test_gradients_of_the_filter_against_differences():
+    """With respect to noise, initial state and measurements at once, over a run with missing rows."""
+    gyro, accel = recording(2)
+    rng = np.random.default_rng(3)
+    displacement = 0.1 * rng.standard_normal((INTERVALS, 3))
+    displacement[[7, 8]] = np.nan
+    covariance = np.tile(0.01 * np.eye(3), (INTERVALS, 1, 1))
+    config = filtering.FilterConfig(DT, N, CLONES)  # never converged: no decision that a small step could turn
+    weights = rng.standard_normal((INTERVALS, 3))
+
+    @jax.jit
+    @jax.value_and_grad
+    def loss(x):
+        noise = filtering.NoiseModel(*(jnp.asarray([1e-2, 1e-1, 1e-2, 1e-1]) * jnp.exp(x["noise"])))
+        state = start(config)
+        state = state._replace(velocity=state.velocity + x["velocity"], gyro_bias=state.gyro_bias + x["gyro_bias"],
+                               core_covariance=state.core_covariance * jnp.exp(x["covariance"]))
+        measured, scaled = displacement + x["displacement"][None], covariance * jnp.exp(x["scale"])
+        _, history = filtering.run_filter(state, gyro, accel, measured, scaled, config, noise)
+        return jnp.sum(weights * history.position) + jnp.sum(history.rotation[-1, 0]) + jnp.nansum(history.nis) * 0.01 + jnp.log(
+            history.covariance_diagonal[-1]).sum()
+
+    x = {name: jnp.zeros(shape) for name, shape in
+         dict(noise=(4,), velocity=(3,), gyro_bias=(3,), covariance=(), displacement=(3,), scale=()).items()}
+    found = loss(x)[1]
+    for name in x:
+        step = 1e-4 if name == "noise" else 1e-5
+        expected = central(lambda value, name=name: float(loss({**x, name: jnp.asarray(value)})[0]), x[name], step)
+        np.testing.assert_allclose(found[name], expected, rtol=1e-5, atol=1e-6 * np.abs(expected).max(), err_msg=name)
+        assert np.all(np.abs(expected) > 0)
+
+
+def test_gradients_are_finite_at_rest():
+    """Nothing turns, nothing moves, every innovation is zero: each norm in the filter is at its singular point."""
+    gyro, accel = np.zeros((N * INTERVALS, 3)), np.tile([0.0, 0.0, 9.81], (N * INTERVALS, 1))
+    measured, covariance = np.zeros((INTERVALS, 3)), np.tile(np.eye(3), (INTERVALS, 1, 1))
+
+    @jax.jit
+    @jax.grad
+    def gradient(given):
+        state = filtering.initial_state(CONFIG, *given[:3])
+        _, history = filtering.run_filter(state, *given[3:], CONFIG, filtering.NoiseModel())
+        return sum(jnp.nansum(value) for value in history[:-1] if value is not None)
+
+    found = gradient((jnp.eye(3), jnp.zeros(3), jnp.zeros(3), *map(jnp.asarray, (gyro, accel, measured, covariance))))
+    for value in found:
+        assert np.isfinite(value).all() and np.abs(value).max() > 0
+
+
+def test_gradient_reaches_the_network_through_the_loop():
+    """Against differences of the same program, whose network is given in float64 so that differences mean something."""
+    gyro, accel = recording(0)
+    config = filtering.FilterConfig(DT, N, CLONES)
+
+    @jax.jit
+    @jax.value_and_grad
+    def loss(parameters):
+        def network(windows):
+            ramp = jnp.linspace(0.5, 1.5, N * CLONES)[None, :, None]
+            pooled = jnp.mean(ramp * windows.astype(jnp.float64), axis=1) @ parameters
+            return Prediction(pooled, -2.0 + 0.1 * pooled)
+
+        _, history = filtering.run_odometry(network, start(config), gyro, accel, config, filtering.NoiseModel())
+        return jnp.sum(history.position[-1] ** 2) + jnp.nansum(history.nis)
+
+    value, found = loss(jnp.asarray(PARAMETERS))
+    # The windows depend on the parameters through the state and are rounded to float32, which bounds what differences can say.
+    expected = central(lambda p: float(loss(jnp.asarray(p))[0]), PARAMETERS, 1e-2)
+    finer = central(lambda p: float(loss(jnp.asarray(p))[0]), PARAMETERS, 5e-3)
+    expected = (4 * finer - expected) / 3
+    np.testing.assert_allclose(found, expected, rtol=2e-3, atol=2e-3 * np.abs(expected).max())
+    assert np.isfinite(value) and np.abs(expected).max() > 0
