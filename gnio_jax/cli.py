@@ -13,6 +13,7 @@ import errno
 import io
 import os
 import re
+import signal
 import sys
 import types
 import typing
@@ -59,11 +60,14 @@ def parse(kind: type[Config], default: Config | None = None, description: str = 
 
 
 def run(main: Callable[[], object]) -> None:
-    """Call `main()`; a user's mistake becomes one line on stderr and exit status 2, Ctrl-C status 130, both without a traceback.
+    """Call `main()`; a user's mistake becomes one line on stderr and exit status 2, Ctrl-C status 130, no traceback either way.
+
+    SIGTERM unwinds the program like an exception, so that nothing half-written stays behind, and gives status 143.
 
     A full disk or a folder that may not be written is told the same way; any other exception is a fault of the program
     and keeps its traceback. A warning is one line on stderr, too.
     """
+    signal.signal(signal.SIGTERM, _terminated)
     try:
         with warnings.catch_warnings():
             warnings.showwarning = _warn
@@ -107,6 +111,10 @@ def progress() -> Iterator[Callable[[str, float], None]]:
 def _leave(line: str, status: int) -> typing.NoReturn:
     print(" ".join(line.split()), file=sys.stderr)
     raise SystemExit(status) from None
+
+
+def _terminated(number: int, _frame: object) -> typing.NoReturn:
+    raise SystemExit(128 + number)
 
 
 def _warn(message: Warning | str, *_: object) -> None:

@@ -96,6 +96,8 @@ def outcome(body):
     ("raise InputError('file.csv', 'has no column x', 'add\\nit')", 2, "file.csv: has no column x; add it\n"),
     ("raise KeyboardInterrupt", 130, "interrupted\n"),
     ("open('/dev/null/x', 'w')", 2, "/dev/null/x: Not a directory\n"),
+    ("import os; os.kill(os.getpid(), 15)", 143, ""),
+    ("import warnings; warnings.warn('two\\nlines')", 0, "warning: two lines\n"),
     ("print('fine')", 0, ""),
 ])
 def test_run_ends_in_one_line_and_a_status(body, status, line):
