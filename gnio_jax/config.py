@@ -122,7 +122,7 @@ class OptimConfig:
 
 @dataclass(frozen=True)
 class FilterOptions:
-    """What the stochastic-cloning EKF believes about the IMU and its start (METHOD §4; TLIO's values)."""
+    """What the stochastic-cloning EKF believes about the IMU and its start (paper §III-G; TLIO's values)."""
 
     gyro_density: float = 3.16e-4
     """White gyro noise, rad/s/√Hz."""

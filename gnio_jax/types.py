@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 Array = jax.Array | np.ndarray
 
 GRAVITY = 9.81
-"""Magnitude of gravity in the world frame, m/s² (METHOD: g = (0, 0, -9.81))."""
+"""Magnitude of gravity in the world frame, m/s²."""
 
 STANDARD_G = 9.80665
 """The unit "G" in which phones report acceleration, m/s²."""
