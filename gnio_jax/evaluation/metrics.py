@@ -99,7 +99,7 @@ def align(estimate: Trajectory, reference: Trajectory, how: Alignment = "origin"
     """
     if how == "none":
         return estimate
-    rows = np.flatnonzero(_finite(reference.position))
+    rows = np.flatnonzero(finite_rows(reference.position))
     if not len(rows):
         raise Undefined("no trusted reference")
     if how == "origin":
@@ -158,7 +158,7 @@ def rte(estimate: Positions, reference: Positions, step: float, seconds: float =
     the error at their end relative to their start, times `seconds` over that span (RoNIN's rule).
     """
     error = estimate - reference
-    rows = np.flatnonzero(_finite(reference))
+    rows = np.flatnonzero(finite_rows(reference))
     if len(rows) < 2:
         raise Undefined("no trusted reference" if not len(rows) else "a single trusted row")
     rows_apart, span = round(seconds / step), int(rows[-1] - rows[0])
@@ -177,7 +177,7 @@ def rte_distance(estimate: Positions, reference: Positions, metres: float) -> fl
 
     The end of a displacement is the first row by which the reference has walked `metres`, its path summed row by row.
     """
-    good = _finite(reference)
+    good = finite_rows(reference)
     edges = np.flatnonzero(np.diff(np.concatenate([[0], good.astype(int), [0]])))
     errors = [np.zeros((0, estimate.shape[1]))]
     for start, stop in zip(edges[::2], edges[1::2], strict=True):  # a path is known within an unbroken stretch only
@@ -206,7 +206,7 @@ def rpe(estimate: Positions, reference: Positions, estimate_yaw: Angles, referen
     return _rms(moved - (reference[rows_apart:] - reference[:-rows_apart]), _pairs(reference, rows_apart), reason)
 
 
-def rpe_se3(estimate: Trajectory, reference: Trajectory, step: float, seconds: float = 1.0, dims: Literal[2, 3] = 3) -> float:
+def rpe_se3(estimate: Trajectory, reference: Trajectory, step: float, seconds: float = 1.0, dims: int = 3) -> float:
     """RMS of the translation part of the relative pose error with the full orientation at the start, all pairs, m (TUM, evo).
 
     error_i = R_i R̂_iᵀ (p̂_j − p̂_i) − (p_j − p_i) in the reference's world (its norm is evo's); with `dims` 2 its
@@ -263,7 +263,7 @@ def path_length_ratio(estimate: Positions, reference: Positions, step: float) ->
     length = path_length(reference, step)
     if length < 1.0:
         raise Undefined(f"the reference path is {length:.2f} m long, under 1 m")
-    return path_length(np.where(_finite(reference)[:, None], estimate, np.nan), step) / length
+    return path_length(np.where(finite_rows(reference)[:, None], estimate, np.nan), step) / length
 
 
 def standing(reference: Positions, step: float) -> Bool[np.ndarray, "n"]:
@@ -282,7 +282,7 @@ def standing(reference: Positions, step: float) -> Bool[np.ndarray, "n"]:
     for start, stop in zip(edges[::2], edges[1::2], strict=True):
         if (stop - 1 - start + apart) * step >= STANDING_SECONDS - 1e-9:
             still[start:stop + apart] = True
-    return still & _finite(reference)
+    return still & finite_rows(reference)
 
 
 def stationary_drift(estimate: Positions, reference: Positions, step: float) -> float:
@@ -334,12 +334,12 @@ def measure(estimate: Trajectory, reference: Trajectory, alignment: Alignment = 
     see the estimate under `alignment`; `se3` is fitted in 3-D for the horizontal ones too. `nees` is taken in the frame
     of the filter, whose covariance is relative to its start, so with the start aligned whatever `alignment` is.
     """
-    reference = Trajectory(reference.time, np.where(_finite(reference.position)[:, None], reference.position, np.nan),
-                           np.where(_finite(reference.position)[:, None], reference.orientation, np.nan))
+    reference = Trajectory(reference.time, np.where(finite_rows(reference.position)[:, None], reference.position, np.nan),
+                           np.where(finite_rows(reference.position)[:, None], reference.orientation, np.nan))
     step = float(np.median(np.diff(estimate.time))) if len(estimate.time) > 1 else 1.0
     metrics: dict[str, Callable[[], float]] = {}
     aligned, origin, missing = estimate, estimate, ""
-    finite = _finite(estimate.position) & _finite(estimate.orientation)
+    finite = finite_rows(estimate.position) & finite_rows(estimate.orientation)
     try:
         if not finite.all():
             raise Undefined(f"the estimate is not finite from {estimate.time[np.argmin(finite)] - estimate.time[0]:.1f} s on")
@@ -390,12 +390,12 @@ def measure(estimate: Trajectory, reference: Trajectory, alignment: Alignment = 
 
 
 def position_nees(aligned: Trajectory, estimate: Trajectory, reference: Trajectory, covariance: Float[np.ndarray, "n 3 3"],
-                  dims: Literal[2, 3] = 3) -> Float[np.ndarray, "n"]:
+                  dims: int = 3) -> Float[np.ndarray, "n"]:
     """eᵀ P⁻¹ e of the position, NaN where there is no reference: the error of the start-aligned estimate, turned back into
     the filter's own frame, in which its covariance is."""
     turn = rotation_z((yaw(estimate.orientation[:1]) - yaw(aligned.orientation[:1]))[0])
     error = (aligned.position - reference.position) @ turn.T
-    good = _finite(error) & (np.einsum("nii->ni", covariance) > 0).all(1)  # a start given as exact has nothing to be normalised by
+    good = finite_rows(error) & (np.einsum("nii->ni", covariance) > 0).all(1)  # a start given as exact has nothing to be normalised by
     squared = np.full(len(error), np.nan)
     squared[good] = normalised_squared(error[good, :dims], covariance[good, :dims, :dims])
     return squared
@@ -440,12 +440,13 @@ def summarise(measures: Mapping[str, Mapping[str, float | None]], groups: Mappin
     return Summary(mean, median, interval, count)
 
 
-def _finite(rows: Float[np.ndarray, "n d"]) -> Bool[np.ndarray, "n"]:
-    return np.isfinite(rows).all(1)
+def finite_rows(rows: Float[np.ndarray, "n d"]) -> Bool[np.ndarray, "n"]:
+    """Which rows hold neither NaN nor Inf."""
+    return np.asarray(np.isfinite(rows).all(1))
 
 
 def _errors(estimate: Positions, reference: Positions) -> Float[np.ndarray, "m d"]:
-    good = _finite(reference)
+    good = finite_rows(reference)
     if not good.any():
         raise Undefined("no trusted reference")
     return (estimate - reference)[good]
@@ -459,7 +460,7 @@ def _yaw_errors(estimate_yaw: Angles, reference_yaw: Angles) -> Float[np.ndarray
 
 
 def _pairs(reference: Positions, rows_apart: int) -> Bool[np.ndarray, "m"]:
-    good = _finite(reference)
+    good = finite_rows(reference)
     return good[rows_apart:] & good[:-rows_apart]
 
 

@@ -24,9 +24,9 @@ from scipy.spatial.transform import Rotation
 from gnio_jax import data
 from gnio_jax.config import DataConfig, FilterOptions
 from gnio_jax.data.windows import WindowSource, gather
-from gnio_jax.evaluation.metrics import Trajectory, rotation_z
+from gnio_jax.evaluation.metrics import Trajectory, finite_rows, rotation_z
 from gnio_jax.filtering import FilterConfig, FilterHistory, InitialStd, NoiseModel, initial_state, run_filter, run_odometry
-from gnio_jax.types import InputError, Prediction, Sequence
+from gnio_jax.types import Array, InputError, Prediction, Sequence
 
 Estimator = Literal["ekf", "integrate", "imu_only"]
 Orientation = Literal["filter", "device", "reference"]
@@ -147,7 +147,7 @@ def prepare(sequences: Iterable[Sequence], config: DataConfig, setup: Setup = DE
     recordings, left_out = [], {}
     for sequence in sequences:
         sequence = data.resample(sequence, config.rate)
-        trusted = sequence.valid & np.isfinite(sequence.position).all(1) & np.isfinite(sequence.orientation).all(1)
+        trusted = sequence.valid & finite_rows(sequence.position) & finite_rows(sequence.orientation)
         if not trusted.any() and (setup.init == "reference" or setup.gyro_bias == "reference"):
             wanted = "--init static" if setup.init == "reference" else "--gyro-bias zero"
             raise InputError(sequence.name, "has no reference to start from", f"give {wanted}")
@@ -162,8 +162,8 @@ def prepare(sequences: Iterable[Sequence], config: DataConfig, setup: Setup = DE
             left_out[sequence.name] = f"{seconds:.2f} s from its first trusted sample on, too short for a window and a stride"
             continue
         rows = slice(first, first + strides * config.stride + 1)
-        cut = Sequence(sequence.name, *(field[rows] for field in sequence[1:7]), trusted[rows],
-                       None if sequence.device_orientation is None else sequence.device_orientation[rows], sequence.attributes)
+        uncut = sequence._replace(valid=trusted)
+        cut = uncut._replace(**{name: value[rows] for name, value in uncut._asdict().items() if isinstance(value, np.ndarray)})
         bias, notes = _gyro_bias(cut, config.rate, setup.gyro_bias)
         if setup.init == "reference":
             rotation = Rotation.from_quat(cut.orientation[0], scalar_first=True).as_matrix()
@@ -234,7 +234,7 @@ def true_displacements(recording: Recording, config: DataConfig) -> Float[np.nda
     sequence, n, length = recording.sequence, config.stride, config.window
     start = np.arange(0, len(sequence.time) - length, n)
     moved = sequence.position[start + length] - sequence.position[start]
-    good = sequence.valid[start] & sequence.valid[start + length]
+    good = np.asarray(sequence.valid[start] & sequence.valid[start + length])
     result = np.full_like(moved, np.nan)
     turn = Rotation.from_quat(sequence.orientation[start[good]], scalar_first=True).as_matrix() if good.any() else np.zeros((0, 3, 3))
     result[good] = np.einsum("mji,mj->mi", _yaw_rotation(turn), moved[good])
@@ -251,7 +251,7 @@ def attitude(recording: Recording, config: DataConfig, source: Orientation) -> F
         return integrated
     given = sequence.orientation if source == "reference" else sequence.device_orientation
     assert given is not None  # `prepare` has seen to it
-    known = np.isfinite(given).all(1) & (sequence.valid if source == "reference" else True)
+    known = finite_rows(given) & (sequence.valid if source == "reference" else True)
     if not known[0]:
         raise InputError(sequence.name, f"has no {source} orientation at its start", "give --orientation filter")
     matrices = Rotation.from_quat(np.where(known[:, None], given, [1.0, 0, 0, 0]), scalar_first=True).as_matrix()
@@ -376,7 +376,7 @@ def _filtered(recordings: list[Recording], config: DataConfig, options: FilterOp
 
 
 def _from_filter(recording: Recording, history: FilterHistory, options: FilterOptions, n: int) -> Estimate:
-    def rows(first: Any, rest: np.ndarray) -> np.ndarray:
+    def rows(first: Any, rest: Any) -> np.ndarray:
         return np.concatenate([np.broadcast_to(np.asarray(first, float), rest.shape[1:])[None], rest])
 
     tilt, yaw = math.radians(options.tilt_std_degrees), math.radians(options.yaw_std_degrees)
@@ -396,7 +396,7 @@ def _from_filter(recording: Recording, history: FilterHistory, options: FilterOp
         accepted=rows(np.nan, history.accepted), nis=rows(np.nan, history.nis), notes=recording.notes)
 
 
-def _measurements(recording: Recording, displacement: Float[np.ndarray, "m 3"], std: Float[np.ndarray, "m 3"], config: DataConfig) -> tuple:
+def _measurements(recording: Recording, displacement: Float[Array, "m 3"], std: Float[Array, "m 3"], config: DataConfig) -> tuple:
     """Of all windows, as `run_filter` takes them, a row per stride. It has no clone at its start, so the first window is of no use."""
     strides = (len(recording.sequence.time) - 1) // config.stride
     return _at_window_end(displacement[1:], strides), _at_window_end(std[1:], strides)
@@ -428,7 +428,7 @@ def _mean_over_cover(steps: Float[np.ndarray, "m 3"], strides: int, window: int)
     Taking the one window that starts (or ends) at the stride instead puts the whole trajectory half a window ahead of (or
     behind) its time: 0.6 m at walking speed. A stride without any window keeps the movement of the one before.
     """
-    good = np.isfinite(steps).all(1)
+    good = finite_rows(steps)
     sums = np.concatenate([np.zeros((1, 3)), np.cumsum(np.where(good[:, None], steps, 0.0), 0)])
     counts = np.concatenate([[0], np.cumsum(good)])
     stride = np.arange(strides)
@@ -486,7 +486,7 @@ def _cumulative(turns: Rotation) -> Rotation:
 
 
 def _quaternions(rotation: Float[np.ndarray, "k 3 3"]) -> Float[np.ndarray, "k 4"]:
-    finite = np.isfinite(rotation).all((1, 2))
+    finite = finite_rows(rotation.reshape(-1, 9))
     wxyz = Rotation.from_matrix(np.where(finite[:, None, None], rotation, np.eye(3))).as_quat(scalar_first=True)
     return np.where(finite[:, None], wxyz, np.nan)
 
@@ -497,6 +497,6 @@ def _reference(recording: Recording, n: int) -> Trajectory:
     return Trajectory(sequence.time[::n], np.where(good, sequence.position[::n], np.nan), np.where(good, sequence.orientation[::n], np.nan))
 
 
-def _at_window_end(values: Float[np.ndarray, "m 3"], rows: int) -> Float[np.ndarray, "k 3"]:
+def _at_window_end(values: Float[Array, "m 3"], rows: int) -> Float[np.ndarray, "k 3"]:
     """Values of the last m windows at the last m of `rows`, NaN before."""
     return np.concatenate([np.full((rows - len(values), *values.shape[1:]), np.nan), values])

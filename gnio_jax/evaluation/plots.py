@@ -197,7 +197,8 @@ def _aligned(estimate: Estimate, alignment: metrics.Alignment) -> Float[np.ndarr
 def _shade(axes: Axes, time: Float[np.ndarray, "k"], still: np.ndarray) -> None:
     edges = np.flatnonzero(np.diff(np.concatenate([[0], still.astype(int), [0]])))
     for number, (start, stop) in enumerate(zip(edges[::2], edges[1::2], strict=True)):
-        axes.axvspan(time[start], time[stop - 1], color=STANDING, lw=0, zorder=0, label="standing still" if not number else None)
+        label = "standing still" if not number else None  # once in the legend
+        axes.axvspan(float(time[start]), float(time[stop - 1]), color=STANDING, lw=0, zorder=0, label=label)
 
 
 def _step(axes: Axes, values: Float[np.ndarray, "k"], colour: str, width: float, **style: Any) -> None:

@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import jax
 
@@ -112,7 +112,7 @@ def _load(config: EvaluateConfig) -> tuple[TrainConfig, Network | None, dict[str
 
     run = checkpoint.load_run(workdir, config.checkpoint)
     provenance = {"model": run.config.model.name, "checkpoint": config.checkpoint, "epoch": run.epoch, "step": run.step}
-    return run.config, Network(run.model.apply, run.variables), provenance
+    return run.config, Network(cast(Any, run.model.apply), run.variables), provenance
 
 
 def _group(sequence: Sequence) -> str:

@@ -175,6 +175,23 @@ def test_tight_and_loose_see_the_same_windows(clean):
     assert np.std(tight.displacement[11:], axis=0).max() > 0.01  # else the agreement would say nothing
 
 
+def test_loose_measurements_have_the_same_least_std(clean):
+    network = Network(sensed, {"gain": jnp.float32(0.0), "log_std": jnp.float32(-90.0)})
+    recordings, _ = odometry.prepare([clean], CONFIG, LOOSE)
+    (found,) = odometry.estimate(recordings, network, CONFIG, OPTIONS, LOOSE, batch_size=1)
+    np.testing.assert_allclose(found.displacement_std[11:], np.exp(-4) * np.sqrt(10), rtol=1e-6)
+
+
+def test_the_first_gyro_bias_is_taken_off_the_windows_and_the_attitude(clean):
+    (recording,), _ = odometry.prepare([clean], CONFIG, INTEGRATE)
+    bias = np.array([0.1, -0.05, 0.02])
+    biased = recording._replace(sequence=recording.sequence._replace(gyro=recording.sequence.gyro + bias), gyro_bias=bias)
+    attitudes = [odometry.attitude(r, CONFIG, "filter") for r in (recording, biased)]
+    np.testing.assert_allclose(*attitudes, atol=1e-9)
+    a, b = odometry.predict_windows(NETWORK, [recording, biased], attitudes, CONFIG)
+    np.testing.assert_allclose(a.log_std, b.log_std, atol=1e-5)
+
+
 def test_start_is_the_first_trusted_sample(walks):
     hidden = walks[0]._replace(valid=np.arange(len(walks[0].time)) >= 137)
     (recording,), _ = odometry.prepare([hidden], CONFIG)
