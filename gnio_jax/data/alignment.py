@@ -22,7 +22,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.linalg import solveh_banded
-from scipy.ndimage import binary_dilation, gaussian_filter1d
+from scipy.ndimage import gaussian_filter1d, maximum_filter1d
 from scipy.signal import correlate, correlation_lags
 from scipy.spatial.transform import Rotation, Slerp
 
@@ -38,13 +38,13 @@ BLOCK_SECONDS = 2.0
 class Track(NamedTuple):
     """Poses of a marker body on a uniform clock."""
 
-    time: Float[np.ndarray, "n"]
+    time: Float[np.ndarray, " n"]
     """s, on the tracker's clock, uniform."""
     position: Float[np.ndarray, "n 3"]
     """m, in the tracker's world; anything finite where not `good`."""
     attitude: Rotation
     """n rotations, marker body → tracker's world."""
-    good: Bool[np.ndarray, "n"]
+    good: Bool[np.ndarray, " n"]
     """False where the tracker had no pose, or one that cannot be."""
 
 
@@ -59,9 +59,9 @@ class Alignment(NamedTuple):
     """Unit vector against gravity in the tracker's world."""
     gyro_bias: Float[np.ndarray, "3"]
     accel_bias: Float[np.ndarray, "3"]
-    knots: Float[np.ndarray, "k"]
+    knots: Float[np.ndarray, " k"]
     """Knots of the lag on the tracker's clock, s."""
-    lag: Float[np.ndarray, "k"]
+    lag: Float[np.ndarray, " k"]
     """Time of the IMU minus time of the tracker for the same event, at the knots, s."""
     accel_delay: float
     """How much later than the gyro the accelerometer tells of the same event, s."""
@@ -69,10 +69,10 @@ class Alignment(NamedTuple):
     """Robust standard deviation of the filtered angular rate's residual, rad/s."""
     accel_residual: float
     """Robust standard deviation of the filtered acceleration's residual, m/s²."""
-    mismatch: Bool[np.ndarray, "n"]
+    mismatch: Bool[np.ndarray, " n"]
     """Samples of the track whose acceleration contradicts the IMU grossly: the tracker jumped."""
 
-    def track_time(self, imu_time: Float[np.ndarray, "m"]) -> Float[np.ndarray, "m"]:
+    def track_time(self, imu_time: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
         """Tracker's time of the events that the IMU stamped `imu_time`."""
         imu_knots = self.knots + self.lag
         # np.interp holds the ends; here the slopes of the outer intervals go on.
@@ -89,7 +89,7 @@ class Alignment(NamedTuple):
 
 
 def align(
-    time: Float[np.ndarray, "m"],
+    time: Float[np.ndarray, " m"],
     gyro: Float[np.ndarray, "m 3"],
     accel: Float[np.ndarray, "m 3"],
     track: Track,
@@ -113,7 +113,7 @@ def align(
     acceleration = _smooth(_second_difference(track.position, step), sigma)
     turning = _smooth(_second_difference(attitude, step), sigma)  # d²/dt² [R l] = turning @ l
     # A bad sample spoils everything within the filter's reach.
-    bad = binary_dilation(~track.good, iterations=int(np.ceil(3 * sigma)))
+    bad = _within(~track.good, 3 * sigma)
 
     # Right sides are the IMU's, filtered after they have been turned into the same frame; interpolated at each guess of the lag.
     imu_step = float(np.median(np.diff(time)))
@@ -220,22 +220,22 @@ def align(
 class Heading(NamedTuple):
     """What `align_heading` estimates; SI units."""
 
-    knots: Float[np.ndarray, "k"]
+    knots: Float[np.ndarray, " k"]
     """On the tracker's clock, s."""
-    lag: Float[np.ndarray, "k"]
+    lag: Float[np.ndarray, " k"]
     """Time of the IMU minus time of the tracker for the same event, at the knots, s."""
-    yaw: Float[np.ndarray, "k"]
+    yaw: Float[np.ndarray, " k"]
     """To be added to the IMU's heading, at the knots, rad."""
     correlation: float
     """Median over stretches of the correlation of the horizontal accelerations."""
 
 
 def align_heading(
-    time: Float[np.ndarray, "m"],
+    time: Float[np.ndarray, " m"],
     acceleration: Float[np.ndarray, "m 2"],
-    track_time: Float[np.ndarray, "n"],
+    track_time: Float[np.ndarray, " n"],
     position: Float[np.ndarray, "n 3"],
-    good: Bool[np.ndarray, "n"],
+    good: Bool[np.ndarray, " n"],
     search_seconds: float = 4.0,
     filter_seconds: float = 0.08,
 ) -> Heading:
@@ -249,7 +249,7 @@ def align_heading(
     sigma = filter_seconds / step
     seen = _smooth(_second_difference(position[:, :2], step), sigma)
     seen = seen[:, 0] + 1j * seen[:, 1]
-    usable = ~binary_dilation(~good, iterations=int(np.ceil(2 * sigma)))
+    usable = ~_within(~good, 2 * sigma)
     # A tracker that relocalises makes accelerations that no pedestrian makes.
     usable &= np.abs(seen) < 8.0 * max(float(np.median(np.abs(seen))), 0.1)
     felt = _smooth(acceleration, filter_seconds / float(np.median(np.diff(time))))
@@ -309,7 +309,7 @@ def follow_acceleration(
     guess: Rotation,
     accel: Float[np.ndarray, "n 3"],
     position: Float[np.ndarray, "n 3"],
-    good: Bool[np.ndarray, "n"],
+    good: Bool[np.ndarray, " n"],
     step: float,
     knot_seconds: float = 10.0,
     filter_seconds: float = 0.25,
@@ -331,7 +331,7 @@ def follow_acceleration(
     correction = Rotation.concatenate([offset[max(i - half, 0) : i + half].mean() for i in near])
     sigma = filter_seconds / step
     seen = _smooth(_second_difference(position, step), sigma) + np.array([0.0, 0.0, GRAVITY])
-    usable = ~binary_dilation(~good, iterations=int(np.ceil(3 * sigma)))
+    usable = ~_within(~good, 3 * sigma)
     rows = np.flatnonzero(usable)[:: max(round(sigma), 1)]
     spread = np.tile([0.05, 0.05, 0.02], max(len(knots) - 2, 0))
     bend = np.kron(np.diff(np.eye(len(knots)), 2, axis=0), np.eye(3)) / spread[:, None]
@@ -366,8 +366,8 @@ def integrate_gyro(gyro: Float[np.ndarray, "n 3"], step: float) -> Rotation:
 
 
 def follow(
-    integrated: Rotation, measured: Rotation, good: Bool[np.ndarray, "n"], step: float, seconds: float = 0.3
-) -> tuple[Rotation, Bool[np.ndarray, "n"]]:
+    integrated: Rotation, measured: Rotation, good: Bool[np.ndarray, " n"], step: float, seconds: float = 0.3
+) -> tuple[Rotation, Bool[np.ndarray, " n"]]:
     """Integrated attitude times a smooth correction towards the measured one, and where the measured one was believed.
 
     The correction measured · integrated⁻¹ moves as slowly as the gyro's bias does. Samples more than 15° off its median course
@@ -400,8 +400,8 @@ def _fill(values: np.ndarray, good: np.ndarray) -> np.ndarray:
 
 
 def smooth_positions(
-    position: Float[np.ndarray, "n 3"], good: Bool[np.ndarray, "n"], step: float, cutoff: float = 12.0
-) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"], Bool[np.ndarray, "n"]]:
+    position: Float[np.ndarray, "n 3"], good: Bool[np.ndarray, " n"], step: float, cutoff: float = 12.0
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
     """Positions (m), velocities (m/s) and which measurements were believed.
 
     The positions minimise Σ w |p − z|² + λ Σ |Δ³p|² (Whittaker's smoother): the response falls to one half at `cutoff` Hz and
@@ -455,6 +455,11 @@ def _normal_equations(
 
 def _smooth(values: np.ndarray, sigma: float) -> np.ndarray:
     return gaussian_filter1d(values, sigma, axis=0, mode="nearest")
+
+
+def _within(where: np.ndarray, reach: float) -> np.ndarray:
+    """True within `reach` samples of a True."""
+    return np.asarray(maximum_filter1d(where.astype(np.uint8), 2 * int(np.ceil(reach)) + 1)).astype(bool)
 
 
 def _second_difference(values: np.ndarray, step: float) -> np.ndarray:

@@ -118,7 +118,7 @@ def _scene_folders(root: Path, scene: str) -> list[Path]:
 
 def _walks_of(scene: str, folder: Path) -> list[Walk]:
     files: dict[int, dict[str, tuple[Path, Path]]] = {}
-    for kind in ("raw", "syn"):
+    for kind in ("syn",) if scene == LARGE_SCALE else ("raw", "syn"):  # raw of the large scale is another format, without Tango's pairs
         for imu in sorted((folder / kind).glob("imu*.csv")):
             match = re.fullmatch(r"imu(\d+)\.csv", imu.name)
             truth = next((imu.with_name(f"{name}{match[1]}.csv") for name in ("vi", "hand", "tango")
@@ -151,7 +151,7 @@ def _placements(scene: str, folder: Path) -> Callable[[int], str]:
 class Imu(NamedTuple):
     """A phone's samples on its own clock."""
 
-    time: Float[np.ndarray, "n"]
+    time: Float[np.ndarray, " n"]
     """s since `epoch`, as uniform as the phone samples."""
     gyro: Float[np.ndarray, "n 3"]
     """rad/s."""
@@ -261,7 +261,7 @@ def _parts(error: InputError) -> tuple[str, str, str]:
 # --- 3. clocks -------------------------------------------------------------------------------------------------------
 
 
-def _uniform(stamps: Float[np.ndarray, "n"], path: Path) -> Float[np.ndarray, "n"]:
+def _uniform(stamps: Float[np.ndarray, " n"], path: Path) -> Float[np.ndarray, " n"]:
     """Times of uniformly taken samples from stamps rounded to 10 ms, s: a continuous line, with a knot per 30 s.
 
     Lost rows leave a step behind; each is counted by its length. Raises `Refusal` when the stamps cannot come from a
@@ -339,7 +339,7 @@ def read_vicon(path: Path, kind: str, epoch: float) -> Track:
     keep = np.flatnonzero(good)
     inside = np.clip(time, stamps[keep[0]], stamps[keep[-1]])
     position = np.stack([np.interp(inside, stamps[keep], column) for column in position[keep].T], axis=1)
-    return Track(time, position, Slerp(stamps[keep], attitude[keep])(inside), reached)
+    return Track(time, position, Slerp(stamps[keep], Rotation.from_quat(quaternion[keep]))(inside), reached)
 
 
 # --- 4 and 5. alignment and reference ---------------------------------------------------------------------------------
@@ -369,7 +369,7 @@ def build(walk: Walk, kind: str) -> Sequence:
     time, gyro, accel, at, measured = time[span], gyro[span], accel[span], at[span], measured[span]
     device = None if device is None else device[span]
     inside = np.clip(at, track.time[0], track.time[-1])
-    good = track.good & ~binary_dilation(fit.mismatch, iterations=10)
+    good = track.good & np.logical_not(binary_dilation(fit.mismatch, iterations=10))
     right = np.clip(np.searchsorted(track.time, inside), 1, len(track.time) - 1)
     seen = good[right] & good[right - 1]
 
@@ -417,7 +417,7 @@ def _resample(imu: Imu) -> tuple[np.ndarray, np.ndarray, np.ndarray, Rotation | 
     return time, values[:, :3], values[:, 3:], None if imu.attitude is None else Slerp(imu.time, imu.attitude)(time), measured
 
 
-def _bridged(good: Bool[np.ndarray, "n"], seconds: float) -> Bool[np.ndarray, "n"]:
+def _bridged(good: Bool[np.ndarray, " n"], seconds: float) -> Bool[np.ndarray, " n"]:
     """`good`, with holes of up to `seconds` counted in."""
     reach = max(round(seconds * RATE / 2), 1)
     padded = np.pad(good, reach)
@@ -473,10 +473,9 @@ def _sequence(
 def _with_tango(walk: Walk, kind: str, imu: Imu, path: Path) -> Sequence:
     """Positions from a Tango tablet, orientation from the phone, turned about the vertical onto Tango's track."""
     table = _table(path, (9,))
-    if kind != "syn" or imu.attitude is None:
-        raise Refusal(path, "only the syn files of an iPhone are understood here", "add the syn folder")
     time, gyro, accel, device, measured = _resample(imu)
-    assert device is not None
+    if device is None:
+        raise Refusal(path, "goes with a phone that gives no attitude", "leave it out")
     # Tango's stamps are rounded to a second in some files, and its rows are 1/100 s apart; a repeated row is filler.
     stamps = np.arange(len(table)) / RATE
     fresh = np.concatenate([[True], (np.diff(table[:, 2:5], axis=0) != 0).any(axis=1)])
@@ -485,8 +484,8 @@ def _with_tango(walk: Walk, kind: str, imu: Imu, path: Path) -> Sequence:
         raise Refusal(path, f"only {len(rows)} of {len(table)} rows hold a position (field 'translation')", "copy it again")
     position = np.stack([np.interp(stamps, stamps[rows], column) for column in table[rows, 2:5].T], axis=1)
     # Where Tango relocalises, it jumps.
-    good = ~binary_dilation(np.linalg.norm(np.gradient(position, 1.0 / RATE, axis=0), axis=1) > 5.0, iterations=10)
-    good &= np.interp(stamps, stamps[rows], np.gradient(stamps[rows])) < 0.1
+    jumps = binary_dilation(np.linalg.norm(np.gradient(position, 1.0 / RATE, axis=0), axis=1) > 5.0, iterations=10)
+    good = np.logical_not(jumps) & (np.interp(stamps, stamps[rows], np.gradient(stamps[rows])) < 0.1)
     try:
         fit = align_heading(time, device.apply(accel)[:, :2], stamps, position, good)
     except ValueError as error:
@@ -682,7 +681,7 @@ def _build_all(walks: list[Walk]) -> list[Sequence]:
     workers = min(os.cpu_count() or 1, len(missing))
     with Progress(console=Console(file=sys.stderr), transient=True, disable=len(missing) < 2) as progress:
         task = progress.add_task("OxIOD: aligning phones and Vicon", total=len(missing))
-        if workers > 1 and multiprocessing.parent_process() is None:
+        if workers > 1:
             try:
                 # Processes are spawned: a fork after JAX has started its threads can hang.
                 with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")) as pool:
@@ -690,7 +689,7 @@ def _build_all(walks: list[Walk]) -> list[Sequence]:
                         results[index] = result
                         progress.advance(task)
             except BrokenProcessPool:
-                pass  # a script without `if __name__ == "__main__":` cannot spawn; go on alone
+                pass  # a script without `if __name__ == "__main__":` cannot spawn, as it is told on stderr; go on alone
         for index in missing:
             if index not in results:
                 results[index] = build_walk(walks[index])

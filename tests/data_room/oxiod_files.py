@@ -136,7 +136,7 @@ def write_syn(folder: Path, number: int, truth: Truth, seconds: float = 60.0, ra
 
 
 def write_nexus_raw(folder: Path, number: int, truth: Truth, seconds: float = 60.0, rate_hz: float = 99.297) -> None:
-    """Rows `t_ms, type, x, y, z`: 1 accelerometer (m/s², Android's sign), 2 magnetometer, 4 gyro; Vicon as everywhere."""
+    """Rows `t_ms, type, x, y, z`: 1 accelerometer (m/s², Android's sign), 2 magnetometer, 4 gyro; Vicon at 200 Hz."""
     time = np.arange(int(seconds * rate_hz)) / rate_hz
     rows = []
     for kind, values in ((1, force(time, truth)), (2, np.full((len(time), 3), 20.0)), (4, rate(time, truth) + truth.gyro_bias)):
@@ -146,7 +146,7 @@ def write_nexus_raw(folder: Path, number: int, truth: Truth, seconds: float = 60
     path = folder / "raw" / f"imu{number}.csv"
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text("\n".join(f"{row[0]},{row[1]},{row[2]:.7f},{row[3]:.7f},{row[4]:.7f}" for row in rows) + "\n")
-    seen = np.arange(-1.0, seconds + 1.0, 0.01)
+    seen = np.arange(-1.0, seconds + 1.0, 0.005)
     stamps = [str(round((EPOCH + t + truth.offset) * 1e3) * 1_000_000) for t in seen]
     vicon = np.concatenate([np.arange(len(seen))[:, None], vicon_columns(seen, truth)], axis=1)
     write_rows(folder / "raw" / f"vi{number}.csv", stamps, vicon, "%.9f")
