@@ -2,8 +2,11 @@
 
 import os
 
-# Small CPU programs: one thread each, so that pytest-xdist's workers do not fight over the cores.
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
+
+from jaxtyping import install_import_hook
+
+install_import_hook("gnio_jax", "beartype.beartype")  # every annotated shape and type is checked, in the tests alone
 
 import jax
 import pytest

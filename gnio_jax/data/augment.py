@@ -21,7 +21,7 @@ ACCEL, GYRO = slice(0, 3), slice(3, 6)
 def bias(key: PRNGKeyArray, windows: Windows, gyro: float, accel: float) -> Windows:
     """Add a constant bias per window, uniform in ±`gyro` rad/s and ±`accel` m/s² per axis."""
     half_width = jnp.array([accel] * 3 + [gyro] * 3, jnp.float32)
-    offset = _uniform(key, (windows.imu.shape[0], 1, 6), -1, 1) * half_width[None, None, :]
+    offset = _uniform(key, (windows.imu.shape[0], 1, 6), -1.0, 1.0) * half_width[None, None, :]
     return windows._replace(imu=windows.imu + offset)
 
 
@@ -29,8 +29,8 @@ def tilt(key: PRNGKeyArray, windows: Windows, degrees: float) -> Windows:
     """Turn the IMU by up to `degrees` about a random horizontal axis: a wrong gravity direction. The target stays."""
     heading_key, angle_key = jax.random.split(key)
     count = windows.imu.shape[0]
-    heading = _uniform(heading_key, (count,), 0, 2 * jnp.pi)
-    angle = _uniform(angle_key, (count,), 0, math.radians(degrees))
+    heading = _uniform(heading_key, (count,), 0.0, 2 * jnp.pi)
+    angle = _uniform(angle_key, (count,), 0.0, math.radians(degrees))
     x, y, c, s = jnp.cos(heading), jnp.sin(heading), jnp.cos(angle), jnp.sin(angle)
     # Rodrigues' formula for the unit axis (x, y, 0).
     rotation = jnp.stack(
@@ -42,7 +42,7 @@ def tilt(key: PRNGKeyArray, windows: Windows, degrees: float) -> Windows:
 def yaw(key: PRNGKeyArray, windows: Windows) -> Windows:
     """Turn window and target together by a uniform yaw: the network must not depend on the choice of heading."""
     count = windows.imu.shape[0]
-    angle = _uniform(key, (count,), 0, 2 * jnp.pi)
+    angle = _uniform(key, (count,), 0.0, 2 * jnp.pi)
     c, s, zero, one = jnp.cos(angle), jnp.sin(angle), jnp.zeros(count, jnp.float32), jnp.ones(count, jnp.float32)
     rotation = jnp.stack([c, -s, zero, s, c, zero, zero, zero, one], axis=-1).reshape(count, 3, 3)
     target = jnp.einsum("bij,bj->bi", rotation, windows.displacement, precision=jax.lax.Precision.HIGHEST)
