@@ -10,7 +10,7 @@ import dataclasses
 import math
 import numbers
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, no_type_check
 
 import jax
 import jax.numpy as jnp
@@ -26,6 +26,7 @@ THETA, VELOCITY, POSITION, GYRO_BIAS, ACCEL_BIAS = (slice(3 * i, 3 * i + 3) for 
 _NEVER = -1
 
 
+@no_type_check  # by the tests' run-time checker, that is: __post_init__ says what is wrong, and takes 0-d arrays
 @dataclass(frozen=True)
 class FilterConfig:
     """What is fixed when the filter is compiled. The defaults are TLIO's. Raises `ValueError` naming a field that makes no sense."""

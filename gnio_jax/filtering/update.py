@@ -112,7 +112,9 @@ def update(state: FilterState, measurement: Measurement, newest: Array | int, ol
         accepted = tried
 
     over_core, over_clones = (jnp.where(accepted, whiten(rows), 0.0) for rows in (over_core, over_clones))
-    corrected = _retract(state, matmul(whitened[None], over_core)[0], matmul(whitened[None], over_clones).reshape(-1, CLONE), newest)
+    # A reduction on purpose: it is kept, where the sum spelt out would be computed anew for every entry that the retraction reads.
+    error, clone_errors = (jnp.sum(whitened[:, None] * rows, axis=0) for rows in (over_core, over_clones))
+    corrected = _retract(state, error, clone_errors.reshape(-1, CLONE), newest)
     return corrected._replace(
         core_covariance=state.core_covariance - matmul(over_core.T, over_core),
         cross_covariance=state.cross_covariance - matmul(over_core.T, over_clones),

@@ -189,7 +189,8 @@ def arguments():
 
 @pytest.mark.parametrize("name,value", [
     ("gyro", np.zeros((23, 3))), ("gyro", np.zeros((0, 3))), ("gyro", np.zeros(24)), ("gyro", np.zeros((24, 4))),
-    ("gyro", np.zeros((24, 3), np.float32)), ("gyro", np.zeros((24, 3), int)), ("accel", np.zeros((18, 3))), ("accel", np.zeros((2, 24, 3))),
+    ("gyro", np.zeros((24, 3), np.float32)), ("gyro", np.zeros((24, 3), int)), ("accel", np.zeros((18, 3))),
+    ("accel", np.zeros((2, 24, 3))),
     ("displacement", np.zeros((3, 3))), ("displacement", np.zeros((4, 3), np.float32)), ("covariance", np.zeros((4, 3))),
     ("noise.gyro_density", filtering.NoiseModel(np.zeros(3)))])
 def test_run_filter_names_the_bad_argument(name, value):
