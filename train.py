@@ -31,7 +31,7 @@ def main() -> None:
         config = cli.parse(TrainConfig, default=configuration.load(kept), description=DESCRIPTION, argv=arguments)
     outcome = loop.train(config, resume)
     if outcome.stopped_by:
-        print(f"stopped by signal {outcome.stopped_by}; continue with: python train.py --workdir {outcome.workdir} --resume", file=sys.stderr)
+        print(f"stopped and saved; continue with: python train.py --workdir {outcome.workdir} --resume", file=sys.stderr)
         sys.exit(128 + outcome.stopped_by)
     print(f"best validation loss {outcome.best_loss:.4g}; look at it with: python evaluate.py --workdir {outcome.workdir}")
 

@@ -108,8 +108,8 @@ def main() -> None:
                 steps = program()
                 times[name].append((time.perf_counter() - began) / steps)
         for name, seconds in times.items():
-            best = min(seconds)
-            print(f"  batch {size}: {name:14s} {1e3 * best:8.1f} ms (median {1e3 * float(np.median(seconds)):8.1f})   {size / best:8,.0f} windows/s")
+            best, median = min(seconds), float(np.median(seconds))
+            print(f"  batch {size}: {name:14s} {1e3 * best:8.1f} ms (median {1e3 * median:8.1f})   {size / best:8,.0f} windows/s")
         print(f"  batch {size}: whole step / bare gradient = {min(times['whole step']) / min(times['bare gradient']):.3f}", end="")
         if "PyTorch, TLIO" in times:
             print(f", PyTorch / whole step = {min(times['PyTorch, TLIO']) / min(times['whole step']):.2f}", end="")

@@ -242,9 +242,12 @@ def validate(config: TrainConfig, source: str = "config") -> TrainConfig:
             raise InputError(source, f"field '{name}' {problem}")
 
     data, optim, model = config.data, config.optim, config.model
-    for name, value in [("data.rate", data.rate), ("data.window_seconds", data.window_seconds), ("data.stride_seconds", data.stride_seconds),
-                        ("optim.learning_rate", optim.learning_rate), ("filter.measurement_scale", config.filter.measurement_scale),
-                        ("filter.gyro_density", config.filter.gyro_density), ("filter.accel_density", config.filter.accel_density)]:
+    positive = {
+        "data.rate": data.rate, "data.window_seconds": data.window_seconds, "data.stride_seconds": data.stride_seconds,
+        "optim.learning_rate": optim.learning_rate, "filter.measurement_scale": config.filter.measurement_scale,
+        "filter.gyro_density": config.filter.gyro_density, "filter.accel_density": config.filter.accel_density,
+    }  # fmt: skip
+    for name, value in positive.items():
         require(value > 0, name, f"must be positive, found {value!r}")
     for name, value in [("optim.epochs", optim.epochs), ("optim.batch_size", optim.batch_size), ("model.width", model.width),
                         ("model.bank_heads", model.bank_heads)]:

@@ -8,8 +8,8 @@ from jaxtyping import install_import_hook
 
 install_import_hook("gnio_jax", "beartype.beartype")  # every annotated shape and type is checked, in the tests alone
 
-import jax
-import pytest
+import jax  # noqa: E402
+import pytest  # noqa: E402
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")

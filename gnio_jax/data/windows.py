@@ -59,12 +59,13 @@ def index(sequences: Iterable[Sequence], config: DataConfig) -> WindowSource:
         imu = np.hstack([sequence.accel, sequence.gyro])
         if config.window_rotation == "per_sample":
             imu = np.hstack([body.apply(sequence.accel), body.apply(sequence.gyro)])
+        moved = sequence.position[start + length] - sequence.position[start]
         parts.append(
             WindowSource(
                 imu=imu.astype(np.float32),
                 start=(start + offset).astype(np.int32),
                 rotation=(unyaw if config.window_rotation == "per_sample" else unyaw @ first).astype(np.float32),
-                displacement=np.einsum("mij,mj->mi", unyaw, sequence.position[start + length] - sequence.position[start]).astype(np.float32),
+                displacement=np.einsum("mij,mj->mi", unyaw, moved).astype(np.float32),
             )
         )
         offset += len(sequence.time)

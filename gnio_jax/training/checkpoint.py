@@ -126,7 +126,7 @@ def load_run(workdir: Path, which: Which = "best") -> Run:
         try:
             variables = manager.restore(step, args=ocp.args.Composite(variables=ocp.args.StandardRestore(template))).variables
         except (OSError, ValueError, KeyError) as error:
-            raise InputError(where / str(step), f"cannot be read ({str(error)[:120]})", "the checkpoint is damaged: use the other one") from None
+            raise InputError(where / str(step), f"cannot be read ({str(error)[:120]})", "the checkpoint is damaged") from None
     return Run(config, model, jax.tree.map(lambda x: jnp.array(jax.device_get(x)), variables), meta["position"]["epoch"], step)
 
 

@@ -7,13 +7,15 @@ import json
 import math
 import signal
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import optax
+from flax import linen as nn
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from tensorboardX import SummaryWriter
@@ -25,7 +27,8 @@ from gnio_jax.data import windows
 from gnio_jax.files import replacing
 from gnio_jax.training import optimizer as optimizers
 from gnio_jax.training.checkpoint import Checkpoints, Position, create_model, exists
-from gnio_jax.training.step import create_state, epoch_order, train_steps, validate
+from gnio_jax.training.losses import Losses
+from gnio_jax.training.step import TrainState, create_state, epoch_order, train_steps, validate
 from gnio_jax.types import InputError
 
 DISPATCH_SECONDS = 0.5
@@ -84,88 +87,119 @@ def train(config: TrainConfig, resume: bool = False, console: Console | None = N
 def _train(config: TrainConfig, resume: bool, console: Console) -> Outcome:
     configuration.validate(config)
     workdir = prepare_workdir(config, resume)
-    model = create_model(config)
-
-    console.print(f"reading {config.dataset}: {config.data.train_split} and {config.data.val_split}")
-    source, held_out = (_load_windows(config, split, console) for split in (config.data.train_split, config.data.val_split))
-    steps_per_epoch = source.start.shape[0] // config.optim.batch_size
-    if steps_per_epoch == 0:
-        raise InputError("optim.batch_size", f"is {config.optim.batch_size}, but there are only {source.start.shape[0]} windows", "lower it")
-    total_steps = config.optim.epochs * steps_per_epoch
-
-    optimizer = optimizers.create(config.optim, steps_per_epoch)
-    learning_rate = optimizers.schedule(config.optim, steps_per_epoch)
-    init_key, order_key, step_key = jax.random.split(jax.random.key(config.seed), 3)
-    state = create_state(model, optimizer, init_key, config.data.window)
+    run = _prepare(config, workdir, console)
+    state = create_state(run.model, run.optimizer, jax.random.split(jax.random.key(config.seed), 3)[0], config.data.window)
     console.print(f"{config.model.name}: {sum(x.size for x in jax.tree.leaves(state.params)):,} parameters on {jax.devices()[0].platform}, "
-                  f"{steps_per_epoch} steps of {config.optim.batch_size} windows an epoch, {config.optim.epochs} epochs → {workdir}")
+                  f"{run.steps_per_epoch} steps of {config.optim.batch_size} windows an epoch, {config.optim.epochs} epochs → {workdir}")
 
     workdir.mkdir(parents=True, exist_ok=True)
     if not resume:
         configuration.save(workdir / "config.yaml", config)
     position = Position(epoch=0, step=0, best_loss=None, loss_sums=(0.0, 0.0, 0.0), seconds=0.0)
-    with Checkpoints(workdir) as checkpoints, _stop_signals() as stop, _progress(console, total_steps) as bar:
+    with Checkpoints(workdir) as checkpoints, _stop_signals() as stop, _progress(console, config.optim.epochs * run.steps_per_epoch) as bar:
         if resume and exists(workdir):
             state, position = checkpoints.restore(state)
-            console.print(f"resuming at step {position.step} of {total_steps}")
+            console.print(f"resuming at step {position.step}")
         rows = _kept_rows(workdir / "metrics.jsonl", position.epoch)
         board = SummaryWriter(str(workdir / "tensorboard"), purge_step=position.step)
-        began = time.perf_counter() - position.seconds
-        saved_at, dispatch = time.perf_counter(), 1
-        nll_weight = jnp.float32(0)
-
         for epoch in range(position.epoch, config.optim.epochs):
-            order = epoch_order(order_key, epoch, source.start.shape[0])
             nll_weight = jnp.float32(config.loss.nll_weight if epoch >= config.loss.nll_from_epoch else 0.0)
-            sums, done = position.loss_sums, position.step - epoch * steps_per_epoch
-            epoch_began, first_done = time.perf_counter(), done
+            state, position, rate = _run_epoch(run, epoch, nll_weight, state, position, checkpoints, stop, bar)
+            if position.step < (epoch + 1) * run.steps_per_epoch:
+                break  # stopped on the way, and saved
 
-            while done < steps_per_epoch:
-                count = min(dispatch, steps_per_epoch - done)
-                tick = time.perf_counter()
-                state, progress = train_steps(state, source, order, jnp.int32(done), jnp.int32(count), nll_weight, step_key,
-                                              model=model, optimizer=optimizer, config=config)  # fmt: skip
-                failed_step = int(progress.failed_step)  # waits for the device
-                if failed_step >= 0:
-                    raise FloatingPointError(f"the loss is not finite at step {failed_step} (epoch {epoch}); lower optim.learning_rate, "
-                                             f"set optim.clip_norm, or look at the data")
-                # The first dispatch of a process compiles; its time says nothing of a step's.
-                dispatch = max(1, min(2 * dispatch, round(DISPATCH_SECONDS * count / (time.perf_counter() - tick))))
-                sums = tuple(a + float(b) for a, b in zip(sums, progress.sums, strict=True))
-                done += count
-                position = position._replace(epoch=epoch, step=epoch * steps_per_epoch + done, loss_sums=sums, seconds=time.perf_counter() - began)
-                bar(position.step, epoch, sums[0] / done, float(learning_rate(position.step)),
-                    (done - first_done) * config.optim.batch_size / (time.perf_counter() - epoch_began))  # fmt: skip
-                if done < steps_per_epoch and (stop.signum or time.perf_counter() - saved_at > config.checkpoint_every_seconds):
-                    checkpoints.save("latest", state, position)
-                    saved_at = time.perf_counter()
-                if stop.signum and done < steps_per_epoch:
-                    return Outcome(workdir, position.best_loss, stop.signum)
-
-            rate = (steps_per_epoch - first_done) * config.optim.batch_size / (time.perf_counter() - epoch_began)
-            held = [float(x) for x in validate(state, held_out, nll_weight, model=model, config=config)]
-            train_loss, train_mse, train_nll = (x / steps_per_epoch for x in sums)
-            row = {
-                "epoch": epoch, "step": position.step, "loss": train_loss, "mse": train_mse, "nll": train_nll,
-                "val_loss": held[0], "val_mse": held[1], "val_nll": held[2], "val_rmse": math.sqrt(held[1]),
-                "learning_rate": float(learning_rate(position.step)), "windows_per_second": rate, "seconds": position.seconds,
-            }  # fmt: skip
-            improved = position.best_loss is None or held[0] < position.best_loss
+            held_out = validate(state, run.held_out, nll_weight, model=run.model, config=config)
+            row = _row(run, epoch, position, held_out, rate)
+            improved = position.best_loss is None or row["val_loss"] < position.best_loss
+            best_loss = row["val_loss"] if improved else position.best_loss
             # The position of a finished epoch is the start of the next one.
-            position = position._replace(epoch=epoch + 1, best_loss=held[0] if improved else position.best_loss, loss_sums=(0.0, 0.0, 0.0))
+            position = position._replace(epoch=epoch + 1, best_loss=best_loss, loss_sums=(0.0, 0.0, 0.0))
             rows.append(row)
             _write_rows(workdir / "metrics.jsonl", rows)
             for name, value in row.items():
                 board.add_scalar(name, value, position.step)
-            console.print(f"epoch {epoch + 1:4d}/{config.optim.epochs}  loss {train_loss:.4g}  val {held[0]:.4g}  val rmse {row['val_rmse']:.4f} m  "
-                          f"lr {row['learning_rate']:.2e}  {rate:,.0f} windows/s{'  best' if improved else ''}")
+            console.print(
+                f"epoch {epoch + 1:4d}/{config.optim.epochs}  loss {row['loss']:.4g}  val {row['val_loss']:.4g}  "
+                f"val rmse {row['val_rmse']:.4f} m  lr {row['learning_rate']:.2e}  {rate:,.0f} windows/s{'  best' if improved else ''}")
             if improved:
                 checkpoints.save("best", state, position)
             checkpoints.save("latest", state, position)
-            saved_at = time.perf_counter()
             if stop.signum:
-                return Outcome(workdir, position.best_loss, stop.signum)
-    return Outcome(workdir, position.best_loss, None)
+                break
+        board.close()
+    return Outcome(workdir, position.best_loss, stop.signum)
+
+
+class _Run(NamedTuple):
+    """What stays the same from the first step of a run to its last."""
+
+    config: TrainConfig
+    model: nn.Module
+    optimizer: optax.GradientTransformation
+    learning_rate: optax.Schedule
+    source: windows.WindowSource
+    held_out: windows.WindowSource
+    steps_per_epoch: int
+    order_key: jax.Array
+    step_key: jax.Array
+
+
+def _prepare(config: TrainConfig, workdir: Path, console: Console) -> _Run:
+    model = create_model(config)  # a mistake in its options should not wait for the data
+    console.print(f"reading {config.dataset}: {config.data.train_split} and {config.data.val_split}")
+    source, held_out = (_load_windows(config, split, console) for split in (config.data.train_split, config.data.val_split))
+    count, size = source.start.shape[0], config.optim.batch_size
+    if count < size:
+        raise InputError("optim.batch_size", f"is {size}, but there are only {count} windows", "lower it")
+    steps_per_epoch = count // size
+    _, order_key, step_key = jax.random.split(jax.random.key(config.seed), 3)
+    return _Run(config, model, optimizers.create(config.optim, steps_per_epoch), optimizers.schedule(config.optim, steps_per_epoch),
+                source, held_out, steps_per_epoch, order_key, step_key)  # fmt: skip
+
+
+def _run_epoch(
+    run: _Run, epoch: int, nll_weight: jax.Array, state: TrainState, position: Position, checkpoints: Checkpoints, stop: _Stop,
+    bar: Callable[[int, int, float, float, float], None],
+) -> tuple[TrainState, Position, float]:
+    """Finish epoch `epoch` from `position` on, or save and return when asked to stop; with the windows/s of these steps."""
+    size = run.config.optim.batch_size
+    order = epoch_order(run.order_key, epoch, run.source.start.shape[0])
+    began = saved = time.perf_counter()
+    before, first = position.seconds, position.step - epoch * run.steps_per_epoch
+    done, dispatch, rate = first, 1, 0.0
+    while done < run.steps_per_epoch:
+        count = min(dispatch, run.steps_per_epoch - done)
+        tick = time.perf_counter()
+        state, progress = train_steps(state, run.source, order, jnp.int32(done), jnp.int32(count), nll_weight, run.step_key,
+                                      model=run.model, optimizer=run.optimizer, config=run.config)  # fmt: skip
+        failed_step = int(progress.failed_step)  # waits for the device
+        if failed_step >= 0:
+            raise FloatingPointError(f"the loss is not finite at step {failed_step} (epoch {epoch}); lower optim.learning_rate, "
+                                     "set optim.clip_norm, or look at the data")
+        now = time.perf_counter()
+        dispatch = max(1, min(2 * dispatch, round(DISPATCH_SECONDS * count / (now - tick))))
+        done += count
+        sums = tuple(a + float(b) for a, b in zip(position.loss_sums, progress.sums, strict=True))
+        position = Position(epoch, epoch * run.steps_per_epoch + done, position.best_loss, sums, before + now - began)
+        rate = (done - first) * size / (now - began)
+        bar(position.step, epoch, sums[0] / done, float(run.learning_rate(position.step)), rate)
+        if done < run.steps_per_epoch and (stop.signum or now - saved > run.config.checkpoint_every_seconds):
+            checkpoints.save("latest", state, position)
+            saved = now
+            if stop.signum:
+                break
+    return state, position, rate
+
+
+def _row(run: _Run, epoch: int, position: Position, held_out: Losses, rate: float) -> dict[str, int | float]:
+    """The log's line of a finished epoch: mean losses of training (as its steps met them) and of validation."""
+    loss, mse, nll = (x / run.steps_per_epoch for x in position.loss_sums)
+    val_loss, val_mse, val_nll = (float(x) for x in held_out)
+    return {
+        "epoch": epoch, "step": position.step, "loss": loss, "mse": mse, "nll": nll,
+        "val_loss": val_loss, "val_mse": val_mse, "val_nll": val_nll, "val_rmse": math.sqrt(val_mse),
+        "learning_rate": float(run.learning_rate(position.step)), "windows_per_second": rate, "seconds": position.seconds,
+    }  # fmt: skip
 
 
 def _load_windows(config: TrainConfig, split: str, console: Console) -> windows.WindowSource:

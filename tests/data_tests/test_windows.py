@@ -72,7 +72,8 @@ def test_samples_without_a_reference_may_hold_nan():
 
 def batch(count=4000, length=5):
     rng = np.random.default_rng(7)
-    return Windows(jnp.asarray(rng.standard_normal((count, length, 6)), jnp.float32), jnp.asarray(rng.standard_normal((count, 3)), jnp.float32))
+    draw = lambda *shape: jnp.asarray(rng.standard_normal(shape), jnp.float32)  # noqa: E731
+    return Windows(draw(count, length, 6), draw(count, 3))
 
 
 KEY = jax.random.key(3)

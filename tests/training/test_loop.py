@@ -40,7 +40,7 @@ def tiny(recording, workdir, **changes):
     config = TrainConfig(
         dataset="tlio", data_root=str(recording), workdir=str(workdir), data=DataConfig(rate=50.0),
         model=ModelConfig(width=2, bank_size=3, bank_heads=2),
-        optim=OptimConfig(epochs=3, batch_size=16, learning_rate=1e-3, warmup_epochs=1),
+        optim=OptimConfig(epochs=3, batch_size=16, learning_rate=1e-3, warmup_epochs=1.0),
     )  # fmt: skip
     return dataclasses.replace(config, **changes)
 
