@@ -471,7 +471,7 @@ def _sequence(
 
 
 def _with_tango(walk: Walk, kind: str, imu: Imu, path: Path) -> Sequence:
-    """Positions from a Tango tablet, orientation from the phone, turned about the vertical onto Tango's track."""
+    """Positions from a Tango tablet, orientation from integrated gyro led by the accelerations of both."""
     table = _table(path, (9,))
     time, gyro, accel, device, measured = _resample(imu)
     if device is None:
