@@ -223,19 +223,19 @@ def test_sessions_are_shared_out_whole(tmp_path):
     made = walks(tmp_path, {
         **{f"handheld/data{n}": [4, 4, 3] for n in range(1, 6)},
         "pocket/data1": [4], "running/data1": [5, 5], "trolley/data1": [4, 4], "trolley/data2": [3, 3, 3],
+        "multi users/user2": [4, 4], "multi users/user3": [4], "multi users/user4": [4],
     })
     shares = oxiod.share_out(made)
     assert shares == oxiod.share_out(made)
-    assert set(shares) == {(walk.session, walk.number) for walk in made}
-    for session in {walk.session for walk in made if walk.scene == "handheld"}:
-        assert len({shares[walk.session, walk.number] for walk in made if walk.session == session}) == 1
+    assert set(shares) == {walk.session for walk in made}
     total = sum(walk.minutes for walk in made)
     for split, share in (("train", 0.7), ("val", 0.1), ("test", 0.2)):
-        here = [walk for walk in made if shares[walk.session, walk.number] == split]
+        here = [walk for walk in made if shares[walk.session] == split]
         assert sum(walk.minutes for walk in here) / total == pytest.approx(share, abs=0.1)
-        assert {"handheld", "trolley"} <= {walk.scene for walk in here}
-    assert shares["pocket/data1", 1] == "train"
-    assert {shares["running/data1", 1], shares["running/data1", 2]} == {"train", "test"}
+        assert {"handheld", "multi users"} <= {walk.scene for walk in here}
+        assert {walk.name for walk in oxiod.select(made, f"sessions_{split}", tmp_path)} == {walk.name for walk in here}
+    assert shares["pocket/data1"] == shares["running/data1"] == "train"  # the only session of its scene
+    assert {shares["trolley/data1"], shares["trolley/data2"]} == {"train", "test"}
 
 
 def test_validation_holds_out_whole_sessions_but_no_scene(tmp_path):
@@ -408,8 +408,10 @@ def test_real_splits_share_no_walk(recordings):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         splits = {split: {walk.name for walk in oxiod.select(found, split, root)} for split in oxiod.SPLITS}
-    for protocol in (("train", "val", "test"), ("sessions_train", "sessions_val", "sessions_test")):
+    for protocol in (("train", "val", "test", "unseen", "large_scale"), ("sessions_train", "sessions_val", "sessions_test", "large_scale")):
         for first in protocol:
             assert splits[first]
-            assert all(not splits[first] & splits[other] for other in (*protocol, "unseen", "large_scale") if other != first)
+            assert all(not splits[first] & splits[other] for other in protocol if other != first)
+    sessions = {split: {walk.session for walk in found if walk.name in splits[f"sessions_{split}"]} for split in ("train", "val", "test")}
+    assert not sessions["train"] & (sessions["val"] | sessions["test"]) and not sessions["val"] & sessions["test"]
     assert splits["test"] == {"running_data1_7", "trolley_data2_6"}
