@@ -22,7 +22,7 @@ test: $(VENV)/.tests
 
 lint: $(VENV)/.dev
 	$(BIN)/ruff check .
-	$(BIN)/pyright
+	$(BIN)/pyright --pythonpath $(BIN)/python
 
 clean:
 	rm -rf $(VENV) .jax_cache .pytest_cache build *.egg-info

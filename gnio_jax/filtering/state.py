@@ -76,7 +76,7 @@ class FilterConfig:
             elif field.type == "int":
                 if isinstance(value, np.ndarray) and value.ndim == 0:
                     value = value.item()
-                require(isinstance(value, numbers.Integral) and not isinstance(value, bool) and value >= 1, field.name,
+                require(isinstance(value, numbers.Integral) and not isinstance(value, bool) and int(value) >= 1, field.name,
                         "must be a whole number of at least 1")
                 object.__setattr__(self, field.name, int(value))
         require(isinstance(self.allow_float32, bool), "allow_float32", "must be True or False")
@@ -185,7 +185,7 @@ def check(name: str, value: Any, shape: tuple[int, ...], config: FilterConfig) -
     if value.shape != shape:
         raise ValueError(f"{name}: the shape must be {shape}, found {value.shape}; for a batch of sequences use jax.vmap")
     if value.dtype != jnp.float64 and not (config.allow_float32 and value.dtype == jnp.float32):
-        remedy = "cast it" if jax.config.jax_enable_x64 else "call jax.config.update('jax_enable_x64', True) first"
+        remedy = "cast it" if jax.config.read("jax_enable_x64") else "call jax.config.update('jax_enable_x64', True) first"
         if value.dtype == jnp.float32:
             remedy += ", or ask for FilterConfig(allow_float32=True)"
         raise ValueError(f"{name}: the filter runs in float64, found {value.dtype}; {remedy}")

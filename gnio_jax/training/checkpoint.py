@@ -100,7 +100,7 @@ class Checkpoints:
             variables=ocp.args.StandardRestore(variables), optimizer=ocp.args.StandardRestore(template.opt_state)))  # fmt: skip
         found = meta["position"]
         position = Position(**(found | {"loss_sums": tuple(found["loss_sums"])}))
-        state = TrainState(jnp.int32(step), restored.variables["params"], restored.variables["batch_stats"], restored.optimizer)
+        state = TrainState(jnp.int32(step), restored["variables"]["params"], restored["variables"]["batch_stats"], restored["optimizer"])
         # Orbax hands out arrays that are committed to a device; a plain copy keeps one compiled step for both cases.
         return jax.tree.map(lambda x: jnp.array(jax.device_get(x)), state), position
 
@@ -124,7 +124,7 @@ def load_run(workdir: Path, which: Which = "best") -> Run:
         step = manager.latest_step()
         meta = _checked_meta(manager, step, template, where)
         try:
-            variables = manager.restore(step, args=ocp.args.Composite(variables=ocp.args.StandardRestore(template))).variables
+            variables = manager.restore(step, args=ocp.args.Composite(variables=ocp.args.StandardRestore(template)))["variables"]
         except (OSError, ValueError, KeyError) as error:
             raise InputError(where / str(step), f"cannot be read ({str(error)[:120]})", "the checkpoint is damaged") from None
     return Run(config, model, jax.tree.map(lambda x: jnp.array(jax.device_get(x)), variables), meta["position"]["epoch"], step)
@@ -142,7 +142,7 @@ def _shapes(variables: Any) -> dict[str, list[int]]:
 
 def _checked_meta(manager: ocp.CheckpointManager, step: int, variables: Any, where: Path) -> dict[str, Any]:
     try:
-        meta = manager.restore(step, args=ocp.args.Composite(meta=ocp.args.JsonRestore())).meta
+        meta = manager.restore(step, args=ocp.args.Composite(meta=ocp.args.JsonRestore()))["meta"]
         found = meta["shapes"]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise InputError(where / str(step), f"cannot be read ({str(error)[:120]})", "the checkpoint is damaged") from None

@@ -65,7 +65,7 @@ def prepare_workdir(config: TrainConfig, resume: bool) -> Path:
         raise InputError(workdir, "holds no run to resume (config.yaml is missing)", "start it without --resume")
     ours, theirs = (dataclasses.asdict(c) for c in (config, configuration.load(kept)))
     for name in ("workdir", "data_root", "checkpoint_every_seconds"):  # where things lie may change, what is computed may not
-        ours.pop(name), theirs.pop(name)
+        del ours[name], theirs[name]
     for name in ours:
         if ours[name] != theirs[name]:
             raise InputError(kept, f"'{name}' was {theirs[name]} and is now {ours[name]}", "resume with the same settings")

@@ -106,7 +106,7 @@ def validate(
 
     def one_batch(which_weight: tuple[jax.Array, jax.Array]) -> Losses:
         windows = gather(source, which_weight[0], config.data.window)
-        prediction = model.apply({"params": state.params, "batch_stats": state.batch_stats}, windows.imu)
+        prediction: Any = model.apply({"params": state.params, "batch_stats": state.batch_stats}, windows.imu)
         each = jax.vmap(lambda p, d: losses(jax.tree.map(lambda x: x[None], p), d[None], config.loss, nll_weight))(
             prediction._replace(diagnostics={}), windows.displacement
         )
