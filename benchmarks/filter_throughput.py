@@ -13,6 +13,7 @@ import sys
 import time
 from pathlib import Path
 
+import baseline
 import jax
 import numpy as np
 
@@ -85,13 +86,16 @@ def main() -> None:
     arguments = parser.parse_args()
     print(f"{jax.devices()[0].device_kind}, jax {jax.__version__}, 200 Hz IMU, float64; samples per second\n")
     print(f"{'clones':>8} {'window':>8} {'batch':>6} {'best':>10} {'median':>10} {'per cpu-s':>10} {'compile s':>10} {'MiB':>7}")
+    rows: dict[str, dict[str, float]] = {}
     for n, clones, batch in [(10, 20, 1), (10, 20, 16), (10, 20, 64), (20, 10, 1), (20, 10, 16), (10, 40, 1), (20, 20, 1)]:
         config = filtering.FilterConfig(DT, n, clones)
         row = measure(config, batch, arguments.seconds if batch < 64 else arguments.seconds / 4, arguments.repeats)
+        rows[f"samples/s, {1 / (n * DT):.0f} Hz clones, {n * clones * DT:.0f} s window, batch {batch}"] = row
         print(f"{1 / (n * DT):5.0f} Hz {n * clones * DT:6.1f} s {batch:6} {row['best']:10,.0f} {row['median']:10,.0f} {row['cpu']:10,.0f} "
               f"{row['compile']:10.1f} {row['memory']:7.1f}", flush=True)
     rate = measure_numpy(filtering.FilterConfig(DT, 10, 20), min(arguments.seconds, 10.0))
     print(f"\nplain NumPy filter, 20 Hz clones, 1 s window, one sequence: {rate:,.0f}")
+    baseline.compare("filter_throughput", {name: row["best"] for name, row in rows.items()})
 
 
 if __name__ == "__main__":

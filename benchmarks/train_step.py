@@ -11,6 +11,7 @@ apart. The best round counts (noise only ever adds), medians are printed beside 
 import argparse
 import time
 
+import baseline
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -93,6 +94,7 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=5)
     arguments = parser.parse_args()
     print(f"{jax.devices()[0].device_kind}, jax {jax.__version__}, width {arguments.width}, windows of {arguments.samples} samples")
+    figures: dict[str, float] = {}
     for size in arguments.batches:
         config = TrainConfig(data=DataConfig(rate=float(arguments.samples)), model=ModelConfig(width=arguments.width),
                              optim=OptimConfig(batch_size=size))  # fmt: skip
@@ -110,10 +112,11 @@ def main() -> None:
         for name, seconds in times.items():
             best, median = min(seconds), float(np.median(seconds))
             print(f"  batch {size}: {name:14s} {1e3 * best:8.1f} ms (median {1e3 * median:8.1f})   {size / best:8,.0f} windows/s")
-        print(f"  batch {size}: whole step / bare gradient = {min(times['whole step']) / min(times['bare gradient']):.3f}", end="")
+        figures[f"whole step / bare gradient, batch {size}"] = min(times["whole step"]) / min(times["bare gradient"])
         if "PyTorch, TLIO" in times:
-            print(f", PyTorch / whole step = {min(times['PyTorch, TLIO']) / min(times['whole step']):.2f}", end="")
-        print(flush=True)
+            figures[f"PyTorch / whole step, batch {size}"] = min(times["PyTorch, TLIO"]) / min(times["whole step"])
+    if (arguments.width, arguments.samples) == (64, 200):
+        baseline.compare("train_step", figures)
 
 
 if __name__ == "__main__":
