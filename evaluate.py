@@ -14,6 +14,7 @@ from gnio_jax.config import EvaluateConfig
 
 DESCRIPTION = """Estimate the trajectories of a split with the network of a run, and report their errors.
 
+  python evaluate.py                       (the newest run below runs/)
   python evaluate.py --workdir runs/tlio
   python evaluate.py --workdir runs/tlio --dataset ronin --data-root ~/ronin --split test_unseen
   python evaluate.py --workdir runs/tlio --estimator integrate --orientation device
@@ -25,11 +26,12 @@ perfect_displacements, the same estimator fed with the reference's displacements
 
 def main() -> None:
     jax.config.update("jax_enable_x64", True)  # the filter needs float64; the network states its float32 everywhere
-    config = cli.parse(EvaluateConfig, description=DESCRIPTION)
-    kept = Path(config.workdir) / "config.yaml"
+    workdir = cli.parse(EvaluateConfig, description=DESCRIPTION).workdir or str(configuration.newest_run())
+    default = EvaluateConfig(workdir)
+    kept = Path(workdir) / "config.yaml"
     if kept.is_file():  # the run's own filter options are the defaults of those that are not given
-        default = dataclasses.replace(EvaluateConfig(config.workdir), filter=configuration.load(kept).filter)
-        config = cli.parse(EvaluateConfig, default, DESCRIPTION)
+        default = dataclasses.replace(default, filter=configuration.load(kept).filter)
+    config = cli.parse(EvaluateConfig, default, DESCRIPTION)
 
     from rich.console import Console
 

@@ -192,6 +192,14 @@ def save(path: str | Path, config: TrainConfig) -> None:
         temporary.write_text(yaml.safe_dump(dataclasses.asdict(config), sort_keys=False), encoding="utf-8")
 
 
+def newest_run(folder: str | Path = "runs") -> Path:
+    """The run below `folder` that was trained last. Raises `InputError` when there is none."""
+    runs = [path.parent for path in Path(folder).glob("*/config.yaml")]
+    if not runs:
+        raise InputError(folder, "holds no run", "train one with python train.py, or name its folder with --workdir")
+    return max(runs, key=lambda run: max(path.stat().st_mtime for path in (run / "config.yaml", run / "metrics.jsonl") if path.exists()))
+
+
 def _build(kind: type, content: Any, source: str, prefix: str) -> Any:
     if not isinstance(content, dict):
         raise InputError(source, f"{prefix.rstrip('.') or 'the file'} must be a mapping of fields, found {type(content).__name__}")
@@ -270,8 +278,8 @@ def validate(config: TrainConfig, source: str = "config") -> TrainConfig:
 class EvaluateConfig:
     """What `python evaluate.py` is asked for."""
 
-    workdir: str
-    """Folder of the run, with its config.yaml and checkpoints; results go to its folder eval/."""
+    workdir: str | None = None
+    """Folder of the run, with its config.yaml and checkpoints; without it the newest below runs/. Results go to its folder eval/."""
     dataset: str | None = None
     """Dataset to evaluate on; without it the run's own."""
     data_root: str | None = None

@@ -1,5 +1,6 @@
 """The training command as a person types it: one line on stderr and status 2 for every mistake, nothing left behind."""
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -10,6 +11,7 @@ import train
 from gnio_jax import cli
 from gnio_jax import config as configuration
 from gnio_jax.config import TrainConfig
+from gnio_jax.types import InputError
 
 ROOT = Path(__file__).parents[1]
 
@@ -98,3 +100,18 @@ def test_help_teaches():
     shown = subprocess.run([sys.executable, "train.py", "--help"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
     for word in ("--dataset", "--resume", "--config", "--optim.epochs", "--data.window-rotation", "linear warm-up", "Prototypes in the"):
         assert word in " ".join(shown.split()), word
+
+
+def test_the_newest_run_is_the_one_trained_last(tmp_path):
+    import os
+
+    with pytest.raises(InputError, match=r"holds no run; train one with python train\.py, or name its folder with --workdir"):
+        configuration.newest_run(tmp_path)
+    for age, name in [(30, "old"), (10, "new"), (20, "middle")]:
+        configuration.save(tmp_path / name / "config.yaml", TrainConfig())
+        (tmp_path / name / "metrics.jsonl").write_text("")
+        for path in (tmp_path / name).iterdir():
+            os.utime(path, (1e9 - age, 1e9 - age))
+    assert configuration.newest_run(tmp_path).name == "new"
+    os.utime(tmp_path / "old" / "metrics.jsonl")  # trained on
+    assert configuration.newest_run(tmp_path).name == "old"

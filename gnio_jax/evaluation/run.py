@@ -39,7 +39,8 @@ def evaluate(config: EvaluateConfig, progress: Progress = lambda stage, share: N
     setup = odometry.resolve(Setup(config.estimator, config.coupling, config.orientation, config.init, config.gyro_bias))
     if config.batch_size < 1:
         raise InputError("--batch-size", f"must be at least 1, found {config.batch_size}")
-    trained, network, provenance = _load(config)
+    workdir = Path(config.workdir) if config.workdir else configuration.newest_run()
+    trained, network, provenance = _load(workdir, config)
     options = configuration.validate(dataclasses.replace(trained, filter=config.filter), "command line").filter
     name = config.dataset or trained.dataset
     root = config.data_root or (trained.data_root if name == trained.dataset else None)
@@ -70,7 +71,7 @@ def evaluate(config: EvaluateConfig, progress: Progress = lambda stage, share: N
          "perfect_displacements": report.score(floor, groups, config.alignment)},
         {r.sequence.name: list(r.notes) for r in recordings if r.notes}, left_out)
 
-    folder = Path(config.workdir) / "eval" / folder_name(config, name, trained)
+    folder = workdir / "eval" / folder_name(config, name, trained)
     with report.replacing_folder(folder) as new:
         report.write(new, found, estimates)
         if config.plots:
@@ -103,9 +104,8 @@ def folder_name(config: EvaluateConfig, dataset: str, trained: TrainConfig) -> s
     return "_".join(parts)
 
 
-def _load(config: EvaluateConfig) -> tuple[TrainConfig, Network | None, dict[str, Any]]:
+def _load(workdir: Path, config: EvaluateConfig) -> tuple[TrainConfig, Network | None, dict[str, Any]]:
     """The run's configuration, its network (none for `imu_only`, which needs no checkpoint) and where that is from."""
-    workdir = Path(config.workdir)
     if config.estimator == "imu_only" and (workdir / "config.yaml").is_file():
         return configuration.load(workdir / "config.yaml"), None, {"model": None, "checkpoint": None, "epoch": None, "step": None}
     from gnio_jax.training import checkpoint  # Orbax takes seconds to import
