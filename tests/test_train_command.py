@@ -103,8 +103,6 @@ def test_help_teaches():
 
 
 def test_the_newest_run_is_the_one_trained_last(tmp_path):
-    import os
-
     with pytest.raises(InputError, match=r"holds no run; train one with python train\.py, or name its folder with --workdir"):
         configuration.newest_run(tmp_path)
     for age, name in [(30, "old"), (10, "new"), (20, "middle")]:
