@@ -45,6 +45,8 @@ def main() -> None:
         console = Console(highlight=False, width=200)  # into a file or a pipe: no line is cut to a terminal's width
     console.print(report.table(found))
     print(f"results: {folder}")
+    if config.plots:
+        print(f"pictures: {folder / 'plots' / 'error_cdf.png'}, and there of each sequence <name>_{{trajectory,error,displacement}}.png")
 
 
 if __name__ == "__main__":
