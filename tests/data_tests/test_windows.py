@@ -128,7 +128,7 @@ def test_noise_has_the_stated_deviation():
 
 def test_switched_off_augmentation_changes_nothing_and_draws_depend_on_the_key_alone():
     before = batch(10)
-    off = AugmentConfig(gyro_bias=0, accel_bias=0, tilt_degrees=0, yaw=False)
+    off = AugmentConfig(gyro_bias=0.0, accel_bias=0.0, tilt_degrees=0.0, yaw=False)
     after = augment.augment(KEY, before, off)
     np.testing.assert_array_equal(after.imu, before.imu)
     first, again, other = (augment.augment(k, before, AugmentConfig()) for k in (KEY, KEY, jax.random.key(4)))
