@@ -30,6 +30,8 @@ class DataConfig:
     """Length of the network's window, s (paper: 1 s)."""
     stride_seconds: float = 0.1
     """Distance of window starts, and of the filter's clones, s (paper: 0.1 s)."""
+    train_stride_seconds: float = 0.1
+    """Distance of window starts in training, s (paper: 0.1 s); a shorter one shows more phases of the same steps."""
     window_rotation: Literal["per_sample", "single"] = "per_sample"
     """Rotate each sample with its own attitude, or the whole window with that of its start (eq. 1 read literally)."""
     train_split: str = "train"
@@ -46,6 +48,11 @@ class DataConfig:
     def stride(self) -> int:
         """Samples between window starts, which is also one clone interval of the filter."""
         return round(self.stride_seconds * self.rate)
+
+    @property
+    def train_stride(self) -> int:
+        """Samples between window starts in training."""
+        return round(self.train_stride_seconds * self.rate)
 
 
 @dataclass(frozen=True)
@@ -252,8 +259,9 @@ def validate(config: TrainConfig, source: str = "config") -> TrainConfig:
     data, optim, model = config.data, config.optim, config.model
     positive = {
         "data.rate": data.rate, "data.window_seconds": data.window_seconds, "data.stride_seconds": data.stride_seconds,
-        "optim.learning_rate": optim.learning_rate, "filter.measurement_scale": config.filter.measurement_scale,
-        "filter.gyro_density": config.filter.gyro_density, "filter.accel_density": config.filter.accel_density,
+        "data.train_stride_seconds": data.train_stride_seconds, "optim.learning_rate": optim.learning_rate,
+        "filter.measurement_scale": config.filter.measurement_scale, "filter.gyro_density": config.filter.gyro_density,
+        "filter.accel_density": config.filter.accel_density,
     }  # fmt: skip
     for name, value in positive.items():
         require(value > 0, name, f"must be positive, found {value!r}")
@@ -263,7 +271,8 @@ def validate(config: TrainConfig, source: str = "config") -> TrainConfig:
     for section in ("augment", "filter"):
         for key, value in dataclasses.asdict(getattr(config, section)).items():
             require(value >= 0, f"{section}.{key}", f"must not be negative, found {value!r}")
-    for name, seconds in [("data.window_seconds", data.window_seconds), ("data.stride_seconds", data.stride_seconds)]:
+    for name, seconds in [("data.window_seconds", data.window_seconds), ("data.stride_seconds", data.stride_seconds),
+                          ("data.train_stride_seconds", data.train_stride_seconds)]:  # fmt: skip
         samples = seconds * data.rate
         require(abs(samples - round(samples)) < 1e-6, name, f"is not a whole number of samples at {data.rate:g} Hz ({samples:g})")
     require(data.window % data.stride == 0, "data.stride_seconds", f"must divide the window of {data.window_seconds:g} s")

@@ -36,8 +36,8 @@ class WindowSource(NamedTuple):
     """Target in that frame, m: from the stamp of the first sample to one interval after the last (paper eq. 1)."""
 
 
-def index(sequences: Iterable[Sequence], config: DataConfig) -> WindowSource:
-    """Cut `sequences` (all at `config.rate`) into windows every `config.stride` samples.
+def index(sequences: Iterable[Sequence], config: DataConfig, stride: int) -> WindowSource:
+    """Cut `sequences` (all at `config.rate`) into windows every `stride` samples.
 
     A window of N samples from i needs the reference at i … i+N, all of it valid. Attitude and biases come from the
     reference (biases zero). Differences of positions are taken in float64, before they are stored in float32.
@@ -47,7 +47,7 @@ def index(sequences: Iterable[Sequence], config: DataConfig) -> WindowSource:
     parts: list[WindowSource] = []
     offset = 0
     for sequence in sequences:
-        start = np.arange(0, len(sequence.time) - length, config.stride)
+        start = np.arange(0, len(sequence.time) - length, stride)
         bad = np.concatenate([[0], np.cumsum(~sequence.valid)])
         start = start[bad[start + length + 1] == bad[start]]
         if start.size == 0:

@@ -147,7 +147,8 @@ class _Run(NamedTuple):
 def _prepare(config: TrainConfig, workdir: Path, console: Console) -> _Run:
     model = create_model(config)  # a mistake in its options should not wait for the data
     console.print(f"reading {config.dataset}: {config.data.train_split} and {config.data.val_split}")
-    source, held_out = (_load_windows(config, split, console) for split in (config.data.train_split, config.data.val_split))
+    source = _load_windows(config, config.data.train_split, config.data.train_stride, console)
+    held_out = _load_windows(config, config.data.val_split, config.data.stride, console)
     count, size = source.start.shape[0], config.optim.batch_size
     if count < size:
         raise InputError("optim.batch_size", f"is {size}, but there are only {count} windows", "lower it")
@@ -202,9 +203,9 @@ def _row(run: _Run, epoch: int, position: Position, held_out: Losses, rate: floa
     }  # fmt: skip
 
 
-def _load_windows(config: TrainConfig, split: str, console: Console) -> windows.WindowSource:
+def _load_windows(config: TrainConfig, split: str, stride: int, console: Console) -> windows.WindowSource:
     sequences = [data.resample(s, config.data.rate) for s in data.load(config.dataset, config.data_root, split)]
-    source = windows.index(sequences, config.data)
+    source = windows.index(sequences, config.data, stride)
     hours = sum(len(s.time) for s in sequences) / config.data.rate / 3600
     console.print(f"  {split}: {len(sequences)} sequences, {hours:.2f} h, {source.start.shape[0]:,} windows")
     return jax.device_put(source)

@@ -24,10 +24,10 @@ def tumbling(count, seed, invalid=()):
     )  # fmt: skip
 
 
-def cut(sequences, rotation):
+def cut(sequences, rotation, stride):
     imu, target = [], []
     for s in sequences:
-        for i in range(0, len(s.time), 2):
+        for i in range(0, len(s.time), stride):
             if i + 20 >= len(s.time) or not all(s.valid[j] for j in range(i, i + 21)):
                 continue
             start = Rotation.from_quat(s.orientation[i], scalar_first=True)
@@ -42,11 +42,11 @@ def cut(sequences, rotation):
     return np.array(imu), np.array(target)
 
 
-@pytest.mark.parametrize("rotation", ["per_sample", "single"])
-def test_gather_against_a_brute_force_cutter(rotation):
+@pytest.mark.parametrize("rotation, stride", [("per_sample", 2), ("single", 2), ("per_sample", 1)])
+def test_gather_against_a_brute_force_cutter(rotation, stride):
     sequences = [tumbling(57, 1), tumbling(61, 2, invalid=[0, 33]), tumbling(15, 3), tumbling(21, 4), tumbling(20, 5)]
-    source = windows.index(sequences, DataConfig(rate=20.0, window_rotation=rotation))
-    imu, target = cut(sequences, rotation)
+    source = windows.index(sequences, DataConfig(rate=20.0, window_rotation=rotation), stride)
+    imu, target = cut(sequences, rotation, stride)
     assert source.start.shape == (len(target),)
     order = np.random.default_rng(0).permutation(len(target)).astype(np.int32)
     found = jax.jit(windows.gather, static_argnums=2)(jax.device_put(source), jnp.asarray(order), 20)
@@ -57,15 +57,15 @@ def test_gather_against_a_brute_force_cutter(rotation):
 
 def test_a_window_of_exactly_its_length_lacks_the_pose_after_it():
     with pytest.raises(InputError, match="no window of 1 s"):
-        windows.index([tumbling(20, 0)], CONFIG)
-    assert windows.index([tumbling(21, 0)], CONFIG).start.shape == (1,)
+        windows.index([tumbling(20, 0)], CONFIG, 2)
+    assert windows.index([tumbling(21, 0)], CONFIG, 2).start.shape == (1,)
 
 
 def test_samples_without_a_reference_may_hold_nan():
     sequence = tumbling(60, 0, invalid=range(25, 30))
     for field in (sequence.orientation, sequence.position):
         field[25:30] = np.nan
-    source = windows.index([sequence], CONFIG)
+    source = windows.index([sequence], CONFIG, 2)
     found = windows.gather(jax.device_put(source), jnp.arange(source.start.shape[0], dtype=jnp.int32), 20)
     assert bool(jnp.isfinite(found.imu).all() & jnp.isfinite(found.displacement).all())
 

@@ -82,7 +82,7 @@ def test_validation_is_the_plain_mean_over_every_window(recording, finished):
     run = checkpoint.load_run(workdir, "latest")
     from gnio_jax import data
 
-    source = windows.index([data.resample(s, 50.0) for s in data.load("tlio", recording, "val")], run.config.data)
+    source = windows.index([data.resample(s, 50.0) for s in data.load("tlio", recording, "val")], run.config.data, 5)
     source = jax.device_put(source)
     every = windows.gather(source, jnp.arange(source.start.shape[0], dtype=jnp.int32), 50)
     prediction = jax.jit(run.model.apply)(run.variables, every.imu)
@@ -159,8 +159,8 @@ def test_killed_at_any_moment_and_resumed_gives_the_same_bits(recording, tmp_pat
 def test_a_loss_that_is_not_finite_stops_with_its_step(recording, tmp_path, monkeypatch):
     real = windows.index
 
-    def spoiled(sequences, config):
-        source = real(sequences, config)
+    def spoiled(sequences, config, stride):
+        source = real(sequences, config, stride)
         return source._replace(displacement=np.where(np.arange(len(source.start))[:, None] == 77, np.float32(np.inf), source.displacement))
 
     monkeypatch.setattr(windows, "index", spoiled)
