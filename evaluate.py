@@ -16,7 +16,7 @@ DESCRIPTION = """Estimate the trajectories of a split with the network of a run,
 
   python evaluate.py                       (the newest run below runs/)
   python evaluate.py --workdir runs/tlio
-  python evaluate.py --workdir runs/tlio --dataset ronin --data-root ~/ronin --split test_unseen
+  python evaluate.py --workdir runs/tlio --dataset oxiod --data-root ~/oxiod --split unseen
   python evaluate.py --workdir runs/tlio --estimator integrate --orientation device
 
 Results go to <workdir>/eval/<dataset>_<split>_<estimator>/: metrics.json, metrics.csv, trajectories/ and references/ in TUM
