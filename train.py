@@ -29,7 +29,11 @@ def main() -> None:
     kept = loop.default_workdir(config) / "config.yaml"
     if resume and kept.exists() and not any(argument.startswith("--config") for argument in arguments):
         config = cli.parse(TrainConfig, default=configuration.load(kept), description=DESCRIPTION, argv=arguments)
-    outcome = loop.train(config, resume)
+    try:
+        outcome = loop.train(config, resume)
+    except FloatingPointError as error:
+        print(error, file=sys.stderr)
+        sys.exit(1)
     if outcome.stopped_by:
         print(f"stopped and saved; continue with: python train.py --workdir {outcome.workdir} --resume", file=sys.stderr)
         sys.exit(128 + outcome.stopped_by)
