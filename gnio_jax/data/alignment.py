@@ -26,6 +26,7 @@ from scipy.ndimage import gaussian_filter1d, maximum_filter1d
 from scipy.signal import correlate, correlation_lags
 from scipy.spatial.transform import Rotation, Slerp
 
+from gnio_jax.data.sequence import cumulative_rotation
 from gnio_jax.types import GRAVITY
 
 FILTER_SECONDS = 0.03
@@ -355,14 +356,7 @@ def follow_acceleration(
 def integrate_gyro(gyro: Float[np.ndarray, "n 3"], step: float) -> Rotation:
     """Attitude relative to the first sample: n rotations, each rate averaged over the interval between two stamps (rad/s, s)."""
     middle = 0.5 * (gyro[:-1] + gyro[1:])
-    total = Rotation.concatenate([Rotation.identity(1), Rotation.from_rotvec(middle * step)]).as_quat()
-    # Prefix product in log2(n) vectorized passes.
-    shift = 1
-    while shift < len(total):
-        product = Rotation.from_quat(total[:-shift]) * Rotation.from_quat(total[shift:])
-        total = np.concatenate([total[:shift], product.as_quat()])
-        shift *= 2
-    return Rotation.from_quat(total)
+    return cumulative_rotation(Rotation.concatenate([Rotation.identity(1), Rotation.from_rotvec(middle * step)]))
 
 
 def follow(

@@ -81,9 +81,13 @@ def quaternions(rotation: Rotation) -> Float[np.ndarray, "... 4"]:
     return rotation.as_quat()[..., [3, 0, 1, 2]]
 
 
-def central_velocity(time: Float[np.ndarray, "n"], position: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    """Velocity (m/s) of positions by second-order differences, one-sided at the ends; NaN beside a NaN."""
-    return np.gradient(position, time, axis=0)
+def cumulative_rotation(turns: Rotation) -> Rotation:
+    """R_0, R_0 R_1, R_0 R_1 R_2, … of a stack of rotations, in log2(n) vectorized passes."""
+    reach = 1
+    while reach < len(turns):
+        turns = Rotation.concatenate([turns[:reach], turns[:-reach] * turns[reach:]])
+        reach *= 2
+    return turns
 
 
 # --- validation ------------------------------------------------------------------------------------------------------

@@ -23,6 +23,7 @@ from scipy.spatial.transform import Rotation
 
 from gnio_jax import data
 from gnio_jax.config import DataConfig, FilterOptions
+from gnio_jax.data.sequence import cumulative_rotation
 from gnio_jax.data.windows import WindowSource, gather
 from gnio_jax.evaluation.metrics import Trajectory, finite_rows, rotation_z
 from gnio_jax.filtering import FilterConfig, FilterHistory, InitialStd, NoiseModel, initial_state, run_filter, run_odometry
@@ -245,7 +246,7 @@ def attitude(recording: Recording, config: DataConfig, source: Orientation) -> F
     """Body→world at every sample: the gyro integrated from the start (`filter`), the reference, or the device's own estimate
     turned about z to the start's yaw. Where the latter two are missing, the gyro carries on from the last known attitude."""
     sequence = recording.sequence
-    turned = _cumulative(Rotation.from_rotvec((sequence.gyro[:-1] - recording.gyro_bias) / config.rate)).as_matrix()
+    turned = cumulative_rotation(Rotation.from_rotvec((sequence.gyro[:-1] - recording.gyro_bias) / config.rate)).as_matrix()
     integrated = recording.rotation @ np.concatenate([np.eye(3)[None], turned])
     if source == "filter":
         return integrated
@@ -474,15 +475,6 @@ def _level(accel: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
 def _yaw_rotation(rotation: Float[np.ndarray, "m 3 3"]) -> Float[np.ndarray, "m 3 3"]:
     """R_γ: the rotation about z by the yaw atan2(R[1,0], R[0,0])."""
     return rotation_z(np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0]))
-
-
-def _cumulative(turns: Rotation) -> Rotation:
-    """exp(φ_0), exp(φ_0) exp(φ_1), … by doubling."""
-    reach = 1
-    while reach < len(turns):
-        turns = Rotation.concatenate([turns[:reach], turns[:-reach] * turns[reach:]])
-        reach *= 2
-    return turns
 
 
 def _quaternions(rotation: Float[np.ndarray, "k 3 3"]) -> Float[np.ndarray, "k 4"]:

@@ -87,8 +87,8 @@ def train(config: TrainConfig, resume: bool = False, console: Console | None = N
 def _train(config: TrainConfig, resume: bool, console: Console) -> Outcome:
     configuration.validate(config)
     workdir = prepare_workdir(config, resume)
-    run = _prepare(config, workdir, console)
-    state = create_state(run.model, run.optimizer, jax.random.split(jax.random.key(config.seed), 3)[0], config.data.window)
+    run = _prepare(config, console)
+    state = create_state(run.model, run.optimizer, run.init_key, config.data.window)
     console.print(f"{config.model.name}: {sum(x.size for x in jax.tree.leaves(state.params)):,} parameters on {jax.devices()[0].platform}, "
                   f"{run.steps_per_epoch} steps of {config.optim.batch_size} windows an epoch, {config.optim.epochs} epochs → {workdir}")
 
@@ -140,11 +140,12 @@ class _Run(NamedTuple):
     source: windows.WindowSource
     held_out: windows.WindowSource
     steps_per_epoch: int
+    init_key: jax.Array
     order_key: jax.Array
     step_key: jax.Array
 
 
-def _prepare(config: TrainConfig, workdir: Path, console: Console) -> _Run:
+def _prepare(config: TrainConfig, console: Console) -> _Run:
     model = create_model(config)  # a mistake in its options should not wait for the data
     console.print(f"reading {config.dataset}: {config.data.train_split} and {config.data.val_split}")
     source = _load_windows(config, config.data.train_split, config.data.train_stride, console)
@@ -153,9 +154,9 @@ def _prepare(config: TrainConfig, workdir: Path, console: Console) -> _Run:
     if count < size:
         raise InputError("optim.batch_size", f"is {size}, but there are only {count} windows", "lower it")
     steps_per_epoch = count // size
-    _, order_key, step_key = jax.random.split(jax.random.key(config.seed), 3)
+    init_key, order_key, step_key = jax.random.split(jax.random.key(config.seed), 3)
     return _Run(config, model, optimizers.create(config.optim, steps_per_epoch), optimizers.schedule(config.optim, steps_per_epoch),
-                source, held_out, steps_per_epoch, order_key, step_key)  # fmt: skip
+                source, held_out, steps_per_epoch, init_key, order_key, step_key)  # fmt: skip
 
 
 def _run_epoch(

@@ -3,6 +3,7 @@
 import h5py
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from gnio_jax.data import sequence as seq
 from gnio_jax.types import InputError, Sequence
@@ -93,11 +94,14 @@ def test_check_rate_and_gaps():
         seq.check_gaps(time, "walk.csv")
 
 
-def test_central_velocity_is_exact_for_parabolas_on_uneven_stamps():
-    time = np.array([0.0, 0.01, 0.03, 0.04, 0.07, 0.08])
-    position = np.stack([1 + 2 * time, 3 * time**2, time - time**2], axis=1)
-    truth = np.stack([2 + 0 * time, 6 * time, 1 - 2 * time], axis=1)
-    np.testing.assert_allclose(seq.central_velocity(time, position)[1:-1], truth[1:-1], atol=1e-12)
+@pytest.mark.parametrize("count", [1, 2, 7, 16])
+def test_cumulative_rotation_against_a_loop(count):
+    turns = Rotation.random(count, random_state=3)
+    product, expected = np.eye(3), []
+    for turn in turns.as_matrix():
+        product = product @ turn
+        expected.append(product)
+    np.testing.assert_allclose(seq.cumulative_rotation(turns).as_matrix(), expected, atol=1e-12)
 
 
 # --- resample --------------------------------------------------------------------------------------------------------
