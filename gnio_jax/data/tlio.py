@@ -11,7 +11,6 @@ from __future__ import annotations
 import json
 import os
 import re
-import warnings
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +27,7 @@ from gnio_jax.data.sequence import (
     rotations,
     validate,
 )
+from gnio_jax.data.text import listed
 from gnio_jax.types import InputError, Sequence
 
 RATE = 200.0
@@ -88,20 +88,7 @@ def read_sequence(folder: str | os.PathLike[str]) -> Sequence:
 def _listed(root: Path, split: str) -> list[Path]:
     if split not in _LISTS:
         raise InputError(root, f"unknown split '{split}'", f"known splits: {', '.join(_LISTS)}")
-    path = root / _LISTS[split]
-    try:
-        entries = [line.strip() for line in path.read_text(encoding="utf-8").splitlines() if line.strip()]
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(path, f"the list of split '{split}' cannot be read ({error})", f"expected layout: {DATASET.layout}") from None
-    entries = list(dict.fromkeys(entries))
-    present = [root / entry for entry in entries if (root / entry / _TABLE).is_file()]
-    absent = [entry for entry in entries if (root / entry) not in present]
-    if not present:
-        raise InputError(path, f"none of its {len(entries)} sequences is below {root}", f"expected layout: {DATASET.layout}")
-    if absent:
-        warnings.warn(f"{path}: {len(absent)} of {len(entries)} listed sequences are absent: {', '.join(absent[:3])}"
-                      f"{', ...' if len(absent) > 3 else ''}", stacklevel=3)
-    return present
+    return listed(root / _LISTS[split], lambda entry: root / entry if (root / entry / _TABLE).is_file() else None, root, DATASET.layout)
 
 
 def _columns(path: Path) -> tuple[dict[str, slice], int]:

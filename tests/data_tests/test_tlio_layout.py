@@ -80,7 +80,7 @@ def test_lists_name_splits_and_absent_sequences_are_counted(tmp_path):
     with pytest.raises(InputError, match=r"val_list\.txt: none of its 1 sequences is below .*expected layout"):
         data.load("tlio", tmp_path, "val")
     (tmp_path / "val_list.txt").unlink()
-    with pytest.raises(InputError, match=r"val_list\.txt: the list of split 'val' cannot be read"):
+    with pytest.raises(InputError, match=r"val_list\.txt: the list cannot be read"):
         data.load("tlio", tmp_path, "val")
 
 
