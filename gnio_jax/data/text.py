@@ -81,7 +81,8 @@ def listed(path: str | os.PathLike[str], find: Callable[[str], Path | None], roo
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(path, f"the list cannot be read ({getattr(error, 'strerror', None) or error})", f"expected layout: {layout}") from None
+        reason = getattr(error, "strerror", None) or error
+        raise InputError(path, f"the list cannot be read ({reason})", f"expected layout: {layout}") from None
     entries = list(dict.fromkeys(line.strip() for line in lines if line.strip() and not line.startswith("#")))
     found = {entry: find(entry) for entry in entries}
     present = [place for place in found.values() if place is not None]
