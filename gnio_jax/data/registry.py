@@ -6,11 +6,11 @@ import difflib
 import os
 from pathlib import Path
 
-from gnio_jax.data import oxiod, synthetic, tlio
+from gnio_jax.data import idol, oxiod, ridi, ronin, synthetic, tlio
 from gnio_jax.data.sequence import Dataset
 from gnio_jax.types import InputError, Sequence
 
-_DATASETS: dict[str, Dataset] = {module.DATASET.name: module.DATASET for module in (oxiod, synthetic, tlio)}
+_DATASETS: dict[str, Dataset] = {module.DATASET.name: module.DATASET for module in (idol, oxiod, ridi, ronin, synthetic, tlio)}
 
 # Rewritten recordings lie in a folder of another name than the public set's, so that nobody takes the one for the other.
 _FOLDERS = {"tlio": ("tlio", "tlio_layout")}

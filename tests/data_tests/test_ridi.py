@@ -1,0 +1,377 @@
+"""RIDI: a known walk written in both of its layouts, traps included, must come back; a real recording must be physically plausible."""
+
+from __future__ import annotations
+
+import warnings
+
+import known_walk as walk
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from gnio_jax import data
+from gnio_jax.data import ridi
+from gnio_jax.data.sequence import rotations, self_check
+from gnio_jax.types import InputError
+
+BOOT = 177_001_880_550_403  # ns
+GAME_YAW = Rotation.from_euler("z", -1.3)
+"""The phone's own filter has a north of its own."""
+HEADER = ("", "time", "gyro_x", "gyro_y", "gyro_z", "acce_x", "acce_y", "acce_z", "linacce_x", "linacce_y", "linacce_z", "grav_x", "grav_y",
+          "grav_z", "magnet_x", "magnet_y", "magnet_z", "pos_x", "pos_y", "pos_z", "ori_w", "ori_x", "ori_y", "ori_z", "rv_w", "rv_x",
+          "rv_y", "rv_z")
+
+
+def wxyz(rotation):
+    return rotation.as_quat()[:, [3, 0, 1, 2]]
+
+
+def table(time):
+    """The table's columns by name, without its index."""
+    gravity = walk.attitude(time).inv().apply([0, 0, 9.81])
+    blocks = [np.round(BOOT + time * 1e9)[:, None], walk.rate(time), walk.force(time), walk.force(time) - gravity, gravity,
+              np.full((len(time), 3), 30.0), walk.position(time), wxyz(walk.attitude(time)), wxyz(GAME_YAW * walk.attitude(time))]
+    return dict(zip(HEADER[1:], np.concatenate(blocks, axis=1).T, strict=True))
+
+
+def write_table(root, name, time=None, order=None, rows=None, spoil=None):
+    """`<name>/processed/data.csv` as pandas writes it: an index without a name first. `rows` picks (and reorders) rows."""
+    time = np.arange(int(walk.SECONDS * 202.3)) / 202.3 if time is None else time
+    columns = table(time)
+    if spoil:
+        spoil(columns)
+    names = [name for name in HEADER[1:] if name in columns] if order is None else order
+    values = np.stack([columns[name] for name in names], axis=1)
+    rows = np.arange(len(time)) if rows is None else rows
+    path = root / name / "processed" / "data.csv"
+    path.parent.mkdir(parents=True)
+    lines = [",".join(["", *names])]
+    lines += [f"{i}," + ",".join(repr(float(value)) for value in values[row]) for i, row in enumerate(rows)]
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def write_text(root, name, poses="pose.txt", pose_time=None, gyro_time=None, spoil=None):
+    """The recorder's files: every sensor on its own clock, quaternions xyzw, two rows late and one there twice."""
+    gyro_time = np.arange(-0.3, walk.SECONDS, 1 / 388.0) if gyro_time is None else gyro_time
+    pose_time = np.arange(0.0, walk.SECONDS - 0.4, 1 / 30.0) if pose_time is None else pose_time
+    force_time, own_time = np.arange(-0.2, walk.SECONDS, 1 / 388.0) + 5.3e-4, np.arange(-0.25, walk.SECONDS, 1 / 194.0)
+    place, attitude = walk.position(pose_time), walk.attitude(pose_time)
+    if poses == "android_sensor_pose.txt":
+        # ARCore's world is y-up: z of the level world is its y, y its −z.
+        turn = Rotation.from_euler("x", -90, degrees=True)
+        place, attitude = turn.apply(place), turn * attitude
+    files = {
+        "gyro.txt": [gyro_time, walk.rate(gyro_time)],
+        "acce.txt": [force_time, walk.force(force_time)],
+        "orientation.txt": [own_time, (GAME_YAW * walk.attitude(own_time)).as_quat()],
+        poses: [pose_time, np.concatenate([place, attitude.as_quat()], axis=1)],
+    }
+    if poses != "pose.txt":  # the camera's, looking elsewhere
+        camera = (attitude * Rotation.from_euler("z", 90, degrees=True)).as_quat()
+        files["pose.txt"] = [pose_time, np.concatenate([place, camera], axis=1)]
+    if spoil:
+        spoil(files)
+    folder = root / name
+    folder.mkdir(parents=True)
+    for file, (time, values) in files.items():
+        rows = np.arange(len(time))
+        rows[[40, 41]] = rows[[41, 40]]
+        rows = np.insert(rows, 70, rows[70])
+        lines = [f"{BOOT + round(time[row] * 1e9)} " + " ".join(f"{value:.9f}" for value in values[row]) for row in rows]
+        (folder / file).write_text("# Created at Wed Dec 27 22:30:22 GMT+09:00 2023\n" + "\n".join(lines) + "\n")
+    return folder
+
+
+def compare(sequence, edge=20):
+    """The sequence against the walk at its own stamps; splines err more at the first and last samples, which have one neighbour."""
+    time = sequence.time + (sequence.attributes["start_time"] - BOOT * 1e-9)
+    inner, valid = slice(edge, -edge), sequence.valid
+    np.testing.assert_allclose(np.diff(sequence.time), 1 / 200, rtol=1e-6)
+    np.testing.assert_allclose(sequence.gyro[inner], walk.rate(time)[inner], atol=1e-3)
+    np.testing.assert_allclose(sequence.accel[inner], walk.force(time)[inner], atol=1e-3)
+    np.testing.assert_allclose(sequence.position[valid], walk.position(time)[valid], atol=1e-3)
+    error = rotations(sequence.orientation) * walk.attitude(time).inv()
+    assert np.degrees(error.magnitude())[valid].max() < 0.1
+    np.testing.assert_allclose(sequence.velocity[inner][valid[inner]], walk.velocity(time)[inner][valid[inner]], atol=0.02)
+    assert data.self_check(sequence).failures == ()
+    return time
+
+
+def check_device(sequence, begin=0.0):
+    """The game rotation vector is right but for its yaw, and it begins as the reference does."""
+    time = sequence.time + (sequence.attributes["start_time"] - BOOT * 1e-9)
+    error = rotations(sequence.device_orientation) * walk.attitude(time).inv()
+    assert np.degrees(error.magnitude()).max() < 0.1
+    assert begin == pytest.approx(time[0], abs=0.02)
+
+
+SHUFFLED = ["rv_z", "pos_z", "ori_y", "time", "acce_x", "gyro_z", "ori_w", "rv_w", "pos_x", "gyro_x", "acce_z", "acce_y", "gyro_y", "rv_x",
+            "rv_y", "pos_y", "ori_x", "ori_z"]
+
+
+@pytest.mark.parametrize("order", [None, SHUFFLED], ids=["native", "shuffled"])
+def test_table_comes_back(tmp_path, order):
+    sequence = ridi.read_sequence(write_table(tmp_path, "dan_bag1", order=order).parent.parent)
+    compare(sequence)
+    check_device(sequence)
+    assert sequence.valid.all() and sequence.name == "dan_bag1"
+    a = sequence.attributes
+    assert (a["subject"], a["group"], a["placement"], a["imu_compensated"]) == ("dan", "dan", "bag", "no")
+    assert a["truth"] == "Tango VIO of the phone itself" and "not stated" in a["licence"]
+
+
+def test_rows_late_or_twice_are_put_in_order(tmp_path):
+    rows = np.arange(int(walk.SECONDS * 202.3))
+    rows[[100, 101]] = rows[[101, 100]]
+    rows[2000:2010] = rows[2000:2010][::-1]
+    rows = np.insert(rows, 500, [500, 500])
+    compare(ridi.read_sequence(write_table(tmp_path, "dan_bag1", rows=rows).parent.parent))
+
+
+def test_of_a_recording_with_a_gap_the_longer_piece_is_kept(tmp_path):
+    time = np.arange(int(walk.SECONDS * 202.3)) / 202.3
+    path = write_table(tmp_path, "huayi_bag2", time=time[(time < 9.0) | (time > 13.4)])
+    with pytest.warns(UserWarning, match=r"data\.csv: field 'time' has gaps longer than 1 s \(1, up to 4\.4 s\).* 22\.6 of 36\.0 s"):
+        sequence = ridi.read_sequence(path.parent.parent)
+    time = compare(sequence)
+    check_device(sequence, begin=13.4)
+    assert sequence.valid.all() and sequence.time[0] == 0.0 and len(time) == pytest.approx(22.6 * 200, abs=3)
+
+
+def test_a_short_gap_is_marked(tmp_path):
+    time = np.arange(int(walk.SECONDS * 202.3)) / 202.3
+    path = write_table(tmp_path, "dan_leg1", time=time[(time < 20.0) | (time > 20.5)])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        sequence = ridi.read_sequence(path.parent.parent)
+    hole = (sequence.time > 20.02) & (sequence.time < 20.48)
+    assert not sequence.valid[hole].any() and sequence.valid[(sequence.time < 19.9) | (sequence.time > 20.6)].all()
+    assert sequence.attributes["placement"] == "pocket"
+    np.testing.assert_allclose(sequence.position[sequence.valid], walk.position(sequence.time)[sequence.valid], atol=1e-3)
+
+
+@pytest.mark.parametrize("poses", ["pose.txt", "android_sensor_pose.txt"])
+def test_text_files_come_back(tmp_path, poses):
+    sequence = ridi.read_sequence(write_text(tmp_path, "hang_leg_new3", poses))
+    compare(sequence)
+    check_device(sequence)
+    assert sequence.valid.mean() > 0.999
+    assert sequence.attributes["truth"].startswith("ARCore" if poses.startswith("android") else "Tango")
+
+
+def test_a_lost_odometry_ends_a_piece_and_a_short_loss_is_marked(tmp_path):
+    pose_time = np.arange(0.0, walk.SECONDS - 0.4, 1 / 30.0)
+    pose_time = pose_time[((pose_time < 24.0) | (pose_time > 25.6)) & ((pose_time < 10.0) | (pose_time > 10.4))]
+    with pytest.warns(UserWarning, match=r"hang_leg1: field 'time' has gaps longer than 1 s \(1, up to 1\.7 s\)"):
+        sequence = ridi.read_sequence(write_text(tmp_path, "hang_leg1", pose_time=pose_time))
+    compare(sequence)
+    assert sequence.time[-1] == pytest.approx(24.0, abs=0.05)
+    assert not sequence.valid[(sequence.time > 10.01) & (sequence.time < 10.39)].any()
+    assert sequence.valid[(sequence.time < 9.9) | (sequence.time > 10.5)].all()
+
+
+def test_a_jump_of_the_odometry_is_marked(tmp_path):
+    def jump(columns):
+        columns["pos_x"][3000:] += 0.5
+
+    sequence = ridi.read_sequence(write_table(tmp_path, "dan_body1", spoil=jump).parent.parent)
+    when = 3000 / 202.3
+    assert not sequence.valid[np.abs(sequence.time - when) < 0.08].any()
+    assert sequence.valid[np.abs(sequence.time - when) > 0.2].all()
+
+
+# --- splits ----------------------------------------------------------------------------------------------------------
+
+TRAIN = ["dan_bag1", "dan_body1", "dan_leg2", "hang_bag1", "hang_handheld1", "hao_bag1", "hao_body1", "ma_bag1", "yajie_leg1",
+         "zhicheng_bag1"]
+
+
+@pytest.fixture
+def copy(tmp_path):
+    """A copy whose lists have no newline at the end, name what is not there, and leave out what is (`dan_bag9`)."""
+    root = tmp_path / "downloaded" / "data_publish_v2"
+    time = np.arange(int(11 * 202.3)) / 202.3
+    for name in [*TRAIN[:-1], "hang_leg7", "shali_bag1", "dan_bag9"]:
+        write_table(root, name, time=time)
+    (root / "list_train_publish_v2.txt").write_text("\n".join(f"{name},{name.split('_')[1][:-1]}" for name in TRAIN))
+    (root / "list_test_publish_v2.txt").write_text("hang_leg7,leg\nhang_leg_new3,leg\nhuayi_handheld_test1,handheld")
+    (root / "list_crosssubject.txt").write_text("# others\nshali_bag1\nruixuan_bag1")
+    return tmp_path
+
+
+def names(sequences):
+    return {sequence.name for sequence in sequences}
+
+
+def test_splits(copy):
+    with pytest.warns(UserWarning, match=r"list_train_publish_v2\.txt: 1 of 10 listed sequences are absent: zhicheng_bag1,bag"):
+        train = data.load("ridi", copy, "train")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        val, test, seen, unseen = (data.load("ridi", copy, split) for split in ("val", "test", "seen", "unseen"))
+    assert names(test) == names(seen) == {"hang_leg7"} and names(unseen) == {"shali_bag1"}
+    assert names(train) | names(val) == set(TRAIN[:-1]) and val and not names(train) & names(val)
+    # Whole people are held out, and every sequence says which.
+    people = {sequence.attributes["subject"] for sequence in val}
+    assert not people & {sequence.attributes["subject"] for sequence in train}
+    assert {sequence.attributes["held_out"] for sequence in [*train, *val]} == {", ".join(sorted(people))}
+    with pytest.raises(InputError, match="known splits: train, val"):
+        ridi.read(copy, "tset")
+
+
+def test_the_hold_out_depends_on_the_list_alone(tmp_path):
+    path = tmp_path / "list_train_publish_v2.txt"
+    path.write_text("\n".join(f"{name},bag" for name in TRAIN))
+    held = ridi.held_out_of_train(path)
+    path.write_text("\n".join(reversed(TRAIN)) + "\n\n")
+    assert ridi.held_out_of_train(path) == held
+    subjects = {name.split("_")[0] for name in held}
+    assert held == {name for name in TRAIN if name.split("_")[0] in subjects} and 1 <= len(held) <= 2
+    # One person, many walks: whole walks then; too few to part with: none.
+    path.write_text("\n".join(f"dan_bag{n}" for n in range(20)))
+    assert len(ridi.held_out_of_train(path)) == 2
+    path.write_text("dan_bag1\ndan_bag2\nhang_bag1")
+    assert ridi.held_out_of_train(path) == set()
+
+
+def test_lists_gone_wrong(copy):
+    root = copy / "downloaded" / "data_publish_v2"
+    (root / "list_crosssubject.txt").write_text("ruixuan_bag1\n")
+    with pytest.raises(InputError, match=r"list_crosssubject\.txt: none of its 1 sequences is below .*expected layout"):
+        ridi.read(copy, "unseen")
+    (root / "list_crosssubject.txt").unlink()
+    with pytest.raises(InputError, match=r"list_crosssubject\.txt: the list cannot be read"):
+        ridi.read(copy, "unseen")
+    (root / "list_train_publish_v2.txt").write_text("dan_bag1,bag\n")
+    with pytest.raises(InputError, match="split 'val' would be empty"):
+        ridi.read(copy, "val")
+
+
+def test_an_implausible_recording_is_left_out_by_name(copy):
+    def drift(columns):
+        columns["acce_x"] += 3.0
+
+    root = copy / "downloaded" / "data_publish_v2"
+    write_table(root, "ruixuan_bag1", time=np.arange(2300) / 202.3, spoil=drift)
+    with pytest.warns(UserWarning, match="ruixuan_bag1: left out by the self-check: mean of R·accel"):
+        assert names(ridi.read(copy, "unseen")) == {"shali_bag1"}
+
+
+# --- mistakes --------------------------------------------------------------------------------------------------------
+
+
+def setting(name, row, value):
+    def change(columns):
+        columns[name][row] = value
+
+    return change
+
+
+def scaling(prefix, factor):
+    def change(columns):
+        for name in columns:
+            if name.startswith(prefix):
+                columns[name] = columns[name] * factor
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "field", "problem"),
+    [
+        (lambda columns: columns.pop("gyro_y"), "'gyro_y'", "is missing"),
+        (lambda columns: columns.pop("time"), "'time'", "is missing"),
+        (setting("acce_x", 50, np.nan), "'acce'", "row 50"),
+        (setting("pos_y", 50, np.inf), "'pos'", "row 50"),
+        (setting("time", 50, np.nan), "'time'", "row 50"),
+        (setting("time", slice(None), 7.0), "'time'", "only 1 different stamps"),
+        (setting("ori_w", 60, 3.0), "'ori'", "not a unit quaternion"),
+        (setting("rv_x", 60, 3.0), "'rv'", "not a unit quaternion"),
+        (scaling("acce", 1 / 9.81), "'accel'", "looks like G"),
+        (scaling("gyro", 100.0), "'gyro'", "looks like deg/s"),
+        (scaling("time", 1e-6), "'time'", "expected about 202.3 Hz"),
+    ],
+)
+def test_a_bad_table_is_refused_by_file_and_field(tmp_path, change, field, problem):
+    path = write_table(tmp_path, "dan_bag1", time=np.arange(1000) / 202.3, spoil=change)
+    with pytest.raises(InputError) as caught:
+        ridi.read_sequence(path.parent.parent)
+    text = str(caught.value)
+    assert text.startswith(f"{path}: ") and field in text and problem in text and "\n" not in text
+
+
+def test_a_table_cut_short_or_with_words_is_refused(tmp_path):
+    path = write_table(tmp_path, "dan_bag1", time=np.arange(1000) / 202.3)
+    whole = path.read_text()
+    path.write_text(whole[: len(whole) // 2])
+    with pytest.raises(InputError, match=r"data\.csv: field '\w+' is NaN or Inf in 1 rows"):
+        ridi.read_sequence(path.parent.parent)
+    lines = whole.splitlines()
+    lines[300] = lines[300].replace(lines[300].split(",")[3], "none")
+    path.write_text("\n".join(lines))
+    with pytest.raises(InputError, match=r"data\.csv: column 'gyro_y' holds 'none' in its row 300"):
+        ridi.read_sequence(path.parent.parent)
+    path.write_text("")
+    with pytest.raises(InputError, match=r"data\.csv: holds no row"):
+        ridi.read_sequence(path.parent.parent)
+
+
+def columns_of(file, change):
+    def apply(files):
+        files[file] = change(*files[file])
+
+    return apply
+
+
+def with_value(time, values, row, column, value):
+    values = values.copy()
+    values[row, column] = value
+    return [time, values]
+
+
+@pytest.mark.parametrize(
+    ("change", "file", "problem"),
+    [
+        (columns_of("gyro.txt", lambda time, values: with_value(time, values, 90, 1, np.nan)), "gyro.txt", "is NaN or Inf in 1 rows"),
+        (columns_of("acce.txt", lambda time, values: [time, values[:, :2]]), "acce.txt", "has 3 columns, expected the time and 3 values"),
+        (columns_of("pose.txt", lambda time, values: with_value(time, values, 90, 6, 2.0)), "pose.txt", "not a unit quaternion"),
+        (columns_of("pose.txt", lambda time, values: [time + 1000.0, values]), "pose.txt", "share nothing with"),
+        (columns_of("gyro.txt", lambda time, values: [time * 1e-3, values]), "gyro.txt", "check the unit of the stamps"),
+        (lambda files: files.pop("acce.txt"), "acce.txt", "cannot be read"),
+        (lambda files: files.pop("pose.txt"), "pose.txt", "cannot be read"),
+    ],
+)
+def test_bad_text_files_are_refused_by_name(tmp_path, change, file, problem):
+    folder = write_text(tmp_path, "dan_bag1", spoil=change)
+    with pytest.raises(InputError) as caught:
+        ridi.read_sequence(folder)
+    text = str(caught.value)
+    assert text.startswith(f"{folder / file}: ") and problem in text and "\n" not in text
+
+
+def test_without_the_phones_own_filter_there_is_no_device_orientation(tmp_path):
+    sequence = ridi.read_sequence(write_text(tmp_path, "dan_bag1", spoil=lambda files: files.pop("orientation.txt")))
+    assert sequence.device_orientation is None
+    compare(sequence)
+
+
+# --- a real recording ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.recordings
+def test_real_recording_is_plausible(recordings):
+    folder = recordings / "kiod" / "01"
+    if not folder.is_dir():
+        pytest.skip("no kiod below GNIO_DATA")
+    with pytest.warns(UserWarning, match=r"kiod/01: field 'time' has gaps longer than 1 s \(1, up to 1\.5 s\).*54\.8 of 105\.2 s"):
+        sequence = ridi.read_sequence(folder)
+    check = self_check(sequence)
+    assert check.failures == () and check.share_valid > 0.99
+    assert check.duration == pytest.approx(54.8, abs=0.1) and check.rate == pytest.approx(200.0)
+    np.testing.assert_allclose(check.gravity_mean, [0, 0, 9.81], atol=0.1)
+    assert check.gyro_consistency_degrees < 2.0 and 1.2 < check.median_speed < 1.6
+    assert check.accel_correlation_horizontal > 0.55
+    # The phone's own filter, laid on the reference at the first row, stays near it.
+    apart = (rotations(sequence.device_orientation) * rotations(sequence.orientation).inv()).magnitude()
+    assert np.degrees(np.median(apart)) < 5.0
