@@ -1,4 +1,7 @@
-"""From a dataset's name to its sequences. A new dataset is one module with a `DATASET`, imported and listed here."""
+"""From a dataset's name to its sequences. A new dataset is one module with a `DATASET`, imported and listed here.
+
+A module that reads several sets of one layout has `DATASETS`, a tuple, besides.
+"""
 
 from __future__ import annotations
 
@@ -6,11 +9,14 @@ import difflib
 import os
 from pathlib import Path
 
-from gnio_jax.data import idol, oxiod, ridi, ronin, synthetic, tlio
+from gnio_jax.data import blackbird, csv, euroc, idol, kitti, oxiod, ridi, ronin, synthetic, tlio
 from gnio_jax.data.sequence import Dataset
 from gnio_jax.types import InputError, Sequence
 
-_DATASETS: dict[str, Dataset] = {module.DATASET.name: module.DATASET for module in (idol, oxiod, ridi, ronin, synthetic, tlio)}
+_MODULES = (blackbird, csv, euroc, idol, kitti, oxiod, ridi, ronin, synthetic, tlio)
+_DATASETS: dict[str, Dataset] = {
+    dataset.name: dataset for module in _MODULES for dataset in getattr(module, "DATASETS", (module.DATASET,))
+}
 
 # Rewritten recordings lie in a folder of another name than the public set's, so that nobody takes the one for the other.
 _FOLDERS = {"tlio": ("tlio", "tlio_layout")}
