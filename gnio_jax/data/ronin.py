@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from gnio_jax.data.phones import find_folders, find_list, with_velocity
+from gnio_jax.data.phones import find_folders, find_list, keep_walks, with_velocity
 from gnio_jax.data.sequence import (
     Dataset,
     check_finite,
@@ -31,7 +31,6 @@ from gnio_jax.data.sequence import (
     check_rate,
     check_unit_norm,
     cumulative_rotation,
-    keep_plausible,
     quaternions,
     resample,
     rotations,
@@ -58,7 +57,8 @@ def read(root: Path, split: str) -> list[Sequence]:
         raise InputError(root, f"unknown split '{split}'", f"known splits: {', '.join(_LISTS)}")
     folders = find_folders(root, lambda folder: (folder / _TABLE).is_file())
     chosen = listed(find_list(root, _LISTS[split]), folders.get, root, DATASET.layout)
-    return keep_plausible([read_sequence(folder, choose=split in ("train", "val")) for folder in chosen], pedestrian=DATASET.pedestrian)
+    # The chest's accelerations are not the phone's.
+    return keep_walks([read_sequence(folder, choose=split in ("train", "val")) for folder in chosen])
 
 
 def read_sequence(folder: str | os.PathLike[str], choose: bool = False) -> Sequence:

@@ -160,6 +160,16 @@ def test_rows_without_a_pose_are_marked(tmp_path):
     compare(sequence)
 
 
+def test_smoothed_positions_are_no_reason_to_leave_a_walk_out(tmp_path):
+    """The authors' positions hold no gait: they do not correlate with the accelerometer, as little as a wrong time would."""
+    table = frame()
+    time = table["timestamp"] - EPOCH
+    table["processedPosX"], table["processedPosY"], table["processedPosZ"] = 0.9 * time, 0.3 * np.sin(time / 4.0), 1.0
+    write(tmp_path, table)
+    (sequence,) = idol.read(tmp_path, "known")
+    assert data.self_check(sequence).accel_correlation_horizontal < 0.3
+
+
 def test_without_core_motion_there_is_no_device_orientation(tmp_path):
     table = frame()
     path = write(tmp_path, table.drop(columns="iphoneOrientX"))

@@ -214,6 +214,19 @@ def test_a_tilted_reference_is_left_out_by_name(copy):
         assert [sequence.name for sequence in ronin.read(copy, "unseen")] == ["a006_2"]
 
 
+def test_the_chest_may_move_as_the_phone_does_not(copy):
+    """A phone in a swinging hand accelerates otherwise than the chest: that is no reason to leave the walk out."""
+
+    def steady(fields):
+        time = fields["synced/time"] - FIRST
+        fields["pose/tango_pos"] = np.stack([0.9 * time, 0.02 * np.sin(2 * np.pi * 1.3 * time), 0.0 * time], axis=1)
+
+    write(copy / "more" / "a019_3", seconds=20.0, start_frame=0, spoil=steady)
+    (copy / "ronin" / "lists" / "list_test_unseen.txt").write_text("a019_3")
+    (sequence,) = ronin.read(copy, "unseen")
+    assert data.self_check(sequence).accel_correlation_horizontal < 0.3
+
+
 # --- mistakes --------------------------------------------------------------------------------------------------------
 
 
