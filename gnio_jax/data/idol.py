@@ -153,7 +153,8 @@ def read_sequence(path: str | os.PathLike[str]) -> Sequence:
     time = time[piece]
     columns = {name: values[piece] for name, values in columns.items()}
     gyro, accel = columns["iphoneGyro"], -STANDARD_G * columns["iphoneAcc"]
-    known = np.isfinite(columns["orient"]).all(axis=1) & np.isfinite(columns["processedPos"]).all(axis=1)
+    # A quaternion of zeros is no attitude, as little as NaN is.
+    known = columns["orient"].any(axis=1) & np.isfinite(columns["orient"]).all(axis=1) & np.isfinite(columns["processedPos"]).all(axis=1)
     if known.sum() < max(10 * RATE, 0.5 * len(time)):
         raise Refusal(path, f"columns 'orient', 'processedPos' hold a pose in only {known.sum()} of {len(time)} rows", "leave it out")
     rig = rotations(check_unit_norm(columns["orient"], known, "orient", path)[known])

@@ -111,7 +111,7 @@ def read_sequence(folder: str | os.PathLike[str], choose: bool = False) -> Seque
         "licence": DATASET.licence,
         "start_time": float(time[int(start)]),
     }
-    if error is not None:
+    if isinstance(error, int | float):
         attributes["orientation_error_degrees"] = float(error)
     sequence = Sequence(
         name=folder.name,

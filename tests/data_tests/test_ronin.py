@@ -295,6 +295,11 @@ def test_bad_information_is_refused_by_file_and_field(tmp_path, change, field, p
     assert text.startswith(f"{folder / 'info.json'}: ") and field in text and problem in text and "\n" not in text
 
 
+def test_what_only_training_asks_for_may_be_missing_in_a_test(tmp_path):
+    folder = write(tmp_path / "a001_2", seconds=20.0, spoil_info=lambda info: info.update(grv_ori_error="unknown"))
+    assert "orientation_error_degrees" not in ronin.read_sequence(folder).attributes
+
+
 def test_damaged_files_are_refused(tmp_path):
     folder = write(tmp_path / "a001_1", seconds=20.0)
     table, info = folder / "data.hdf5", folder / "info.json"
