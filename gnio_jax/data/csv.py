@@ -51,8 +51,14 @@ def read(root: Path, split: str) -> list[Sequence]:
     """
     sequences = [read_recording(path) for path in _files(Path(root), split)]
     checked = [sequence for sequence in sequences if sequence.valid.any()]
-    kept = {id(sequence) for sequence in (keep_plausible(checked, pedestrian=DATASET.pedestrian) if checked else [])}
-    return [sequence for sequence in sequences if id(sequence) in kept or not sequence.valid.any()]
+    bare = [sequence for sequence in sequences if not sequence.valid.any()]
+    try:
+        kept = keep_plausible(checked, pedestrian=DATASET.pedestrian) if checked else []
+    except InputError:
+        if not bare:
+            raise
+        kept = []  # each was named in a warning
+    return sorted([*kept, *bare], key=lambda sequence: sequence.name)
 
 
 def read_recording(path: str | os.PathLike[str]) -> Sequence:
@@ -178,8 +184,10 @@ class _Stream(NamedTuple):
     """One sensor's samples."""
 
     time: np.ndarray
-    """s from the recording's start."""
+    """s from `epoch`."""
     values: np.ndarray
+    epoch: float
+    """The first stamp, s: unix time in a float is good to a quarter of a microsecond, so stamps are counted from it."""
 
 
 def import_recording(
@@ -236,15 +244,13 @@ def import_recording(
     gyro_file, accel_file = path, other or path
     stamps = _column(table, named["time"], gyro_file, exact=True)
     accel_stamps = _column(accel_table, named["accel_time"], accel_file, exact=True)
-    known_stamps = [column[np.isfinite(column)] for column in (stamps, accel_stamps)]
-    start = min((column.min() for column in known_stamps if column.size), default=0)
     rates = np.stack([_column(table, named[axis], gyro_file) for axis in _GYRO], axis=1)
     forces = np.stack([_column(accel_table, named[axis], accel_file) for axis in _ACCEL], axis=1)
-    gyro = _stream(stamps - start, rates, "gyro", gyro_file, time_unit, order, notes)
-    accel = _stream(accel_stamps - start, forces, "accel", accel_file, time_unit, order, notes)
+    gyro = _stream(stamps, rates, "gyro", gyro_file, time_unit, order, notes)
+    accel = _stream(accel_stamps, forces, "accel", accel_file, time_unit, order, notes)
 
     pull = _accel_scale(accel.values, accel_unit, accel_file, notes)
-    time, rates, forces = _joined(gyro, accel._replace(values=accel.values * pull), gyro_file, accel_file, notes)
+    start, time, rates, forces = _joined(gyro, accel._replace(values=accel.values * pull), gyro_file, accel_file, notes)
     rates = rates * _gyro_scale(time, rates, forces, gyro_unit, gyro_file, notes)
     forces = _signed(forces, accel_sign, accel_file, notes)
     _note_gravity(time, forces, accel_file, notes)
@@ -253,7 +259,7 @@ def import_recording(
     sequence = validate(Sequence(
         name=name or path.stem, time=time, gyro=rates, accel=forces, orientation=np.full((count, 4), np.nan), position=nothing,
         velocity=nothing, valid=np.zeros(count, dtype=bool),
-        attributes={"dataset": "csv", "group": name or path.stem, "truth": "none"}), path)
+        attributes={"dataset": "csv", "group": name or path.stem, "truth": "none", "start_time": start}), path)
     target = rate or _rate(time)
     notes.append(f"put on a uniform clock of {target:g} Hz")
     return Imported(resample(sequence, target), tuple(notes))
@@ -305,6 +311,8 @@ def _stream(
         raise InputError(path, f"holds {len(stamps)} samples of field '{sensor}'", "record for longer")
     check_finite(stamps.astype(np.float64), "time", path)
     check_finite(values, sensor, path)
+    first = stamps.min()
+    stamps = stamps - first
     if unit is None:
         unit, rate = _time_unit(stamps)
         if unit is None:
@@ -334,7 +342,7 @@ def _stream(
     holes = np.diff(time)[np.diff(time) > max(0.1, 3.0 / rate)]
     if holes.size:
         notes.append(f"{path.name}: {sensor} lacks samples {holes.size} times, for up to {holes.max():.2f} s; bridged linearly")
-    return _Stream(time, values)
+    return _Stream(time - time[0], values, float(first) / _PER_SECOND[unit])
 
 
 def _accel_scale(accel: np.ndarray, unit: str | None, path: Path, notes: list[str]) -> float:
@@ -351,10 +359,11 @@ def _accel_scale(accel: np.ndarray, unit: str | None, path: Path, notes: list[st
 
 def _joined(
     gyro: _Stream, accel: _Stream, gyro_file: Path, accel_file: Path, notes: list[str]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(time, gyro, accel) on the stamps of the faster sensor, over what both cover, time from 0."""
-    if len(gyro.time) == len(accel.time) and (gyro.time == accel.time).all():
-        return gyro.time - gyro.time[0], gyro.values, accel.values
+) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
+    """(first stamp s, time, gyro, accel) on the stamps of the faster sensor, over what both cover, time from 0."""
+    if gyro.epoch == accel.epoch and len(gyro.time) == len(accel.time) and (gyro.time == accel.time).all():
+        return gyro.epoch, gyro.time, gyro.values, accel.values
+    accel = accel._replace(time=accel.time + (accel.epoch - gyro.epoch))
     first, last = max(gyro.time[0], accel.time[0]), min(gyro.time[-1], accel.time[-1])
     if last - first < 1.0:
         raise InputError(accel_file, f"field 'time' overlaps by {max(last - first, 0.0):.3g} s with that of gyro in {gyro_file.name}",
@@ -371,9 +380,8 @@ def _joined(
     cut = max(gyro.time[-1], accel.time[-1]) - min(gyro.time[0], accel.time[0]) - (last - first)
     moved = "accel" if faster is gyro else "gyro"
     notes.append(f"gyro and accel have stamps of their own: {moved} interpolated, {cut:.2f} s cut that only one of them covers")
-    if faster is gyro:
-        return time - time[0], gyro.values[inside], values
-    return time - time[0], values, accel.values[inside]
+    rates, forces = (gyro.values[inside], values) if faster is gyro else (values, accel.values[inside])
+    return gyro.epoch + float(time[0]), time - time[0], rates, forces
 
 
 def _gyro_scale(time: np.ndarray, gyro: np.ndarray, accel: np.ndarray, unit: str | None, path: Path, notes: list[str]) -> float:

@@ -35,6 +35,7 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline, Slerp
 
 from gnio_jax.data.alignment import follow, integrate_gyro, smooth_positions
+from gnio_jax.data.cache import cached
 from gnio_jax.data.csv import in_order
 from gnio_jax.data.sequence import (
     Dataset,
@@ -52,6 +53,8 @@ from gnio_jax.data.text import numbers, read_csv
 from gnio_jax.types import InputError, Sequence
 
 RATE = 200.0
+VERSION = "asl 1"
+"""Changes whenever other sequences would come of the same files: it is part of the cache's key."""
 SPLITS = ("train", "val", "test", "seen", "unseen")
 EUROC_SPLITS = {
     "train": ("MH_01_easy", "MH_02_easy", "MH_03_medium", "V1_01_easy", "V1_03_difficult"),
@@ -96,7 +99,13 @@ def read(root: Path, split: str, dataset: str = "euroc") -> list[Sequence]:
     chosen = [folder for name, folder in find_sequences(Path(root), about).items() if _split_of(name, known) == wanted]
     if not chosen:
         raise InputError(root, f"holds no sequence of split '{split}'", f"its sequences are {', '.join(known[wanted])}")
-    return keep_plausible([read_sequence(folder, about) for folder in chosen], pedestrian=about.pedestrian)
+    return keep_plausible([_cached(folder, about) for folder in chosen], pedestrian=about.pedestrian)
+
+
+def _cached(folder: Path, about: Dataset) -> Sequence:
+    sensors = [folder / "mav0" / sensor for sensor in ("imu0", *_REFERENCES)]
+    sources = [path for sensor in sensors for path in (sensor / "data.csv", sensor / "sensor.yaml") if path.is_file()]
+    return cached(sources, f"{VERSION} {about.name}", lambda: read_sequence(folder, about))
 
 
 def find_sequences(root: Path, about: Dataset) -> dict[str, Path]:

@@ -159,6 +159,8 @@ def read_packets(oxts: str | os.PathLike[str]) -> list[Sequence]:
     if rows[-1] >= len(stamps):
         raise InputError(oxts / "timestamps.txt", f"holds {len(stamps)} stamps, but there is a packet {rows[-1]}", "copy the drive again")
     known = ~np.isnat(stamps[rows])
+    if known.sum() < 2:
+        raise InputError(oxts / "timestamps.txt", f"gives {known.sum()} packets a stamp", "copy the drive again")
     stamps, packets = stamps[rows][known], packets[known]
     for index in range(_VALUES.index("wz") + 1):  # the rest is not used
         check_finite(packets[:, index], _VALUES[index], oxts / "data")

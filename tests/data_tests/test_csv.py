@@ -129,6 +129,12 @@ def test_a_reference_that_contradicts_the_imu_is_left_out(tmp_path):
     write_native(tmp_path / "turned.csv", spoil=lambda columns: columns.update(px=-columns["px"], py=-columns["py"]))
     with pytest.warns(UserWarning, match="turned: left out by the self-check"):
         assert [s.name for s in data.load("csv", tmp_path, "test")] == ["bare", "good"]
+    (tmp_path / "good.csv").unlink()
+    with pytest.warns(UserWarning, match="turned: left out by the self-check"):
+        assert [s.name for s in data.load("csv", tmp_path, "test")] == ["bare"]
+    (tmp_path / "bare.csv").unlink()
+    with pytest.warns(UserWarning, match="turned: left out"), pytest.raises(InputError, match="none of 1 sequences passes"):
+        data.load("csv", tmp_path, "test")
 
 
 def set_value(name, row, value):
@@ -387,6 +393,13 @@ def test_one_file_per_sensor_is_joined_on_one_clock(tmp_path, gyro_rate, accel_r
     assert sequence.time[-1] == pytest.approx(SECONDS - 0.3 - start, abs=0.03)
     moved = "accel" if gyro_rate > accel_rate else "gyro"
     assert any(f"stamps of their own: {moved} interpolated" in note and "1.0" in note for note in notes)
+
+    # One clock, but another unit in the other file.
+    accel = write(tmp_path / "Accelerometer.csv", ["t", *head[1:]],
+                  [stamps_of(accel_time, "us"), *imu(accel_time)[:, 5:2:-1].T, np.full(len(accel_time), 3)])
+    same, _ = csv.import_recording(gyro, columns, accel_path=accel, rate=100.0)
+    np.testing.assert_allclose(same.accel[inner], known[inner, 3:], atol=1e-3)
+    assert same.attributes["start_time"] == pytest.approx(UNIX * 1e-9 + start, abs=2e-6)
 
     later = write(tmp_path / "later.csv", ["t", *head[1:]],
                   [stamps_of(accel_time + 3600, "ns"), *imu(accel_time)[:, 5:2:-1].T, np.full(len(accel_time), 3)])

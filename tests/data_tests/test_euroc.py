@@ -14,6 +14,11 @@ from gnio_jax.data.sequence import rotations, self_check
 from gnio_jax.types import InputError
 
 
+@pytest.fixture(autouse=True)
+def own_cache(tmp_path_factory, monkeypatch):
+    monkeypatch.setenv("GNIO_CACHE", str(tmp_path_factory.mktemp("cache")))
+
+
 def known_time(sequence):
     """s on the known walk's clock; unix seconds alone would lose the nanoseconds' digits."""
     return sequence.time + (sequence.attributes["start_time"] - files.EPOCH * 1e-9)
@@ -96,6 +101,31 @@ def test_gaps_and_jumps_of_an_estimate_are_not_valid(tmp_path):
     assert not valid[(time > 8.005) & (time < 8.495)].any() and 1 <= (~valid[np.abs(time - 6.0) < 0.006]).sum() <= 2
     shift = np.where(time > 6.0, 0.1, 0.0)[:, None]
     compare(sequence._replace(position=sequence.position - shift), metres=2e-3)
+
+
+def test_a_gap_of_the_imu_is_not_valid(tmp_path):
+    keep = np.delete(np.arange(2400), np.arange(1000, 1060))
+    mav = tmp_path / "V1_01_easy" / "mav0"
+    files.write_imu(mav, spoil=lambda stamps, values: (stamps[keep], values[keep]))
+    files.write_estimate(mav)
+    sequence = euroc.read_sequence(mav.parent)
+    time = known_time(sequence)
+    hole = (time > 4.996) & (time < 5.299)
+    assert not sequence.valid[hole].any() and sequence.valid[~hole].mean() > 0.999
+
+
+def test_a_cached_sequence_is_the_same_and_follows_its_files(tmp_path):
+    mav = tmp_path / "MH_04_difficult" / "mav0"
+    files.write_imu(mav)
+    files.write_estimate(mav)
+    (first,), (again,) = data.load("euroc", tmp_path, "test"), data.load("euroc", tmp_path, "test")
+    for field in ("time", "gyro", "accel", "orientation", "position", "velocity", "valid"):
+        np.testing.assert_array_equal(getattr(first, field), getattr(again, field))
+    assert first.attributes == again.attributes
+    files.write_yaml(mav / "imu0" / "sensor.yaml", files.Mount(translation=np.array([0.5, 0.0, 0.0])))
+    (moved,) = data.load("euroc", tmp_path, "test")
+    # Half a metre along the body's x.
+    np.testing.assert_allclose(moved.position, first.position + rotations(first.orientation).apply([0.5, 0.0, 0.0]), atol=1e-6)
 
 
 def test_a_trackers_gaps_are_not_valid_and_its_attitudes_come_back(tmp_path):

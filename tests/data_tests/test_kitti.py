@@ -141,6 +141,8 @@ def test_damaged_packets_are_refused_by_file_and_field(tmp_path):
     refused(lambda: kitti.read_packets(oxts), stamps, "holds 397 stamps, but there is a packet 399")
     stamps.write_text("\n".join([*lines[:4], "26.9.2011 13:02", *lines[5:]]))
     refused(lambda: kitti.read_packets(oxts), stamps, "line 5", "no stamp")
+    stamps.write_text("\n" * 399 + lines[0])
+    refused(lambda: kitti.read_packets(oxts), stamps, "gives 1 packets a stamp")
     stamps.unlink()
     refused(lambda: kitti.read_packets(oxts), stamps, "cannot be read")
     (tmp_path / "empty" / "data").mkdir(parents=True)
