@@ -53,7 +53,7 @@ from gnio_jax.data.text import numbers, read_csv
 from gnio_jax.types import InputError, Sequence
 
 RATE = 200.0
-VERSION = "asl 1"
+VERSION = "asl 2"
 """Changes whenever other sequences would come of the same files: it is part of the cache's key."""
 SPLITS = ("train", "val", "test", "seen", "unseen")
 EUROC_SPLITS = {
@@ -71,7 +71,9 @@ TUMVI_SPLITS = {
 }
 
 LONGEST_BRIDGE = 0.1
-"""Stretches without a reference pose up to here (s) are interpolated; longer ones are not valid."""
+"""Stretches without a reference pose up to here (s) are bridged; longer ones are not valid."""
+LOST_POSES = 2.5
+"""Of a noisy tracker, poses up to this many intervals apart (one is lost) are interpolated; further apart gyro and smoother bridge."""
 LARGEST_JUMP = 0.02
 """m by which a step of the position may contradict the reference's own velocity, and smoothed positions the seen ones."""
 SHORTEST_RUN = 8
@@ -117,7 +119,8 @@ def find_sequences(root: Path, about: Dataset) -> dict[str, Path]:
     found: dict[str, Path] = {}
     for depth in ("", "*/", "*/*/", "*/*/*/"):
         for mav in sorted(root.glob(f"{depth}mav0")):
-            if (mav / "imu0" / "data.csv").is_file():
+            # TUM-VI's calibration recordings shake a camera in front of a board: no walk.
+            if (mav / "imu0" / "data.csv").is_file() and not mav.parent.name.startswith("dataset-calib"):
                 found.setdefault(short_name(mav.parent.name), mav.parent)
     if not found:
         raise InputError(root, "holds no mav0/imu0/data.csv", f"expected layout: {about.layout}")
@@ -216,6 +219,9 @@ def _reference(
     if seen.sum() < SHORTEST_RUN:
         raise InputError(path, f"holds {seen.sum()} poses", "copy it again")
     time, values, _ = in_order((stamps[seen] - start) * 1e-9, values[seen], path)
+    if (slowest := float(np.median(np.diff(time)))) > LONGEST_BRIDGE:
+        raise InputError(path, f"field 'time' runs at {1 / slowest:.3g} Hz, too slow for a reference",
+                         f"give at least {1 / LONGEST_BRIDGE:g} Hz")
     quaternion = check_unit_norm(values[:, 3:7], np.ones(len(values), dtype=bool), "q_rs", path)
     return time, rotations(quaternion), values[:, :3], values[:, 7:] if len(names) > 7 else None
 
@@ -304,27 +310,34 @@ def _fuse(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """(orientation, position, velocity, valid) of a noisy tracker without velocities."""
     clock, step = clocked.time, 1.0 / RATE
+    usual = LOST_POSES * float(np.median(np.diff(seen)))
+    # Single poses between gaps are those that the tracker hardly saw.
+    runs = [run for run in np.split(np.arange(len(seen)), np.flatnonzero(np.diff(seen) > usual) + 1) if len(run) >= SHORTEST_RUN]
+    rows = np.concatenate(runs) if runs else np.arange(len(seen))
+    seen, attitude, position = seen[rows], attitude[rows], position[rows]
     right = np.clip(np.searchsorted(seen, clock), 1, len(seen) - 1)
-    bridged = np.asarray(seen[right] - seen[right - 1] <= LONGEST_BRIDGE)
-    bridged &= (clock >= seen[0] - 1e-6) & (clock <= seen[-1] + 1e-6)
+    covered = (clock >= seen[0] - 1e-6) & (clock <= seen[-1] + 1e-6)
+    measured = covered & (seen[right] - seen[right - 1] <= usual)
+    bridged = covered & (seen[right] - seen[right - 1] <= LONGEST_BRIDGE)
     at = np.clip(clock, seen[0], seen[-1])
-    measured, place = Slerp(seen, attitude)(at), np.stack([np.interp(at, seen, column) for column in position.T], axis=1)
+    turned, straight = Slerp(seen, attitude)(at), np.stack([np.interp(at, seen, column) for column in position.T], axis=1)
     # The gyro's constant bias would bend the correction at its ends.
-    rate = (measured[:-1].inv() * measured[1:]).as_rotvec() / step
-    both = bridged[:-1] & bridged[1:]
+    rate = (turned[:-1].inv() * turned[1:]).as_rotvec() / step
+    both = measured[:-1] & measured[1:]
     bias = np.median((0.5 * (clocked.gyro[1:] + clocked.gyro[:-1]) - rate)[both], axis=0) if both.any() else np.zeros(3)
-    fused, believed_turn = follow(integrate_gyro(clocked.gyro - bias, step), measured, bridged, step)
-    smooth, speed, believed_place = smooth_positions(_splined(at, seen, position, place), bridged, step)
+    fused, believed_turn = follow(integrate_gyro(clocked.gyro - bias, step), turned, measured, step)
+    smooth, speed, believed_place = smooth_positions(_splined(at, seen, position, straight, usual), measured, step)
     # Where few poses are left between gaps the smoother may swing; it must stay with what was seen.
-    close = np.linalg.norm(smooth - place, axis=1) < LARGEST_JUMP
-    return quaternions(fused), smooth, speed, np.asarray(bridged & believed_turn & believed_place & close)
+    close = np.linalg.norm(smooth - straight, axis=1) < LARGEST_JUMP
+    return quaternions(fused), smooth, speed, np.asarray(bridged & close & (believed_turn & believed_place | ~measured))
 
 
-def _splined(at: np.ndarray, seen: np.ndarray, position: np.ndarray, linear: np.ndarray) -> np.ndarray:
-    """Cubic splines within runs without a gap; linear interpolation bends less elsewhere."""
-    place = linear.copy()
-    for run in np.split(np.arange(len(seen)), np.flatnonzero(np.diff(seen) > LONGEST_BRIDGE) + 1):
-        if len(run) >= SHORTEST_RUN:
+def _splined(at: np.ndarray, seen: np.ndarray, position: np.ndarray, straight: np.ndarray, longest: float) -> np.ndarray:
+    """Positions at the times `at`: cubic splines within runs whose poses are no further apart than `longest` s, else `straight`,
+    since a spline would swing."""
+    place = straight.copy()
+    for run in np.split(np.arange(len(seen)), np.flatnonzero(np.diff(seen) > longest) + 1):
+        if len(run) >= 4:
             rows = (at >= seen[run[0]]) & (at <= seen[run[-1]])
             place[rows] = CubicSpline(seen[run], position[run], axis=0)(at[rows])
     return place

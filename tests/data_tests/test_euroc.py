@@ -163,6 +163,27 @@ def test_a_noisy_tracker_is_smoothed_and_its_flips_are_masked(tmp_path):
     assert self_check(sequence).failures == ()
 
 
+def test_a_few_doubtful_poses_between_gaps_make_no_swing(tmp_path):
+    """For a second pairs of poses alone, 90 ms apart, one of each off by 3 cm: a spline through them would swing by more."""
+
+    def thin(stamps, values):
+        time = (stamps - files.EPOCH) * 1e-9
+        sparse = (time > 6.0) & (time < 7.0)
+        place = np.arange(len(time)) % 11
+        values[sparse & (place == 1), :3] += 0.03
+        keep = ~sparse | (place < 2)
+        return stamps[keep], values[keep]
+
+    mav = tmp_path / "dataset-room1_512_16" / "mav0"
+    files.write_imu(mav, seconds=14.0, step=0.005016)
+    files.write_mocap(mav, last=13.0, spoil=thin)
+    sequence = euroc.read_sequence(mav.parent, euroc.TUMVI)
+    time, valid = known_time(sequence), sequence.valid
+    assert np.linalg.norm(sequence.position - known_walk.position(time), axis=1)[valid].max() < 0.03
+    assert np.abs(sequence.velocity - known_walk.velocity(time))[valid].max() < 0.5
+    assert valid[(time < 5.9) | (time > 7.1)].all()
+
+
 def test_truth_at_both_ends_alone_is_kept(tmp_path):
     """TUM-VI's corridors: minutes without a pose in the middle."""
     mav = tmp_path / "dataset-corridor1_512_16" / "mav0"
@@ -202,7 +223,10 @@ def test_splits_hold_whole_environments_out(tmp_path):
 
 def test_a_walk_published_in_two_sizes_is_taken_once(tmp_path):
     write(tmp_path, "dataset-room1_512_16", "dataset-room1_1024_16", "dataset-room2_1024_16", mocap=True)
+    write(tmp_path, "dataset-calib-imu1_512_16", mocap=True)
     assert names(data.load("tumvi", tmp_path, "train")) == ["room1", "room2"]
+    with pytest.raises(InputError, match="holds no sequence of split 'test'"):
+        data.load("tumvi", tmp_path, "test")
     with pytest.raises(InputError, match=r"holds no sequence of split 'val'; its sequences are room3"):
         data.load("tumvi", tmp_path, "val")
 
@@ -259,6 +283,7 @@ def test_a_bad_imu_is_refused_by_file_and_field(tmp_path, change, words):
     [
         (set_value(slice(3, None), 2, np.nan), ("holds 3 poses",)),
         (set_value(7, slice(3, 7), 0.0), ("field 'q_rs'", "not a unit quaternion", "row 7")),
+        (lambda s, v: (s[::40], v[::40]), ("field 'time'", "5 Hz, too slow for a reference")),
         (lambda s, v: (s + 3600 * 10**9, v), ("field 'time'", "does not overlap the IMU's")),
         (lambda s, v: (np.where(np.arange(len(s)) == 9, s[8], s), v), ("field 'time'", "stamp of another row")),
     ],
