@@ -206,9 +206,10 @@ def import_recording(
 ) -> Imported:
     """A phone logger's CSV as a `Sequence` without a reference, on a uniform clock.
 
-    path        the gyro's file, and the accelerometer's unless `accel_path` is given; each has a header that names its columns.
+    path        the gyro's file, and the accelerometer's unless `accel_path` is given; lines that begin with # are comments.
     columns     from our names to the file's: `time`, `gyro_x..z`, `accel_x..z`, and `accel_time` if the accelerometer's time is another
                 column. What is not mapped is looked up by our name. "a+b" is the sum of two columns (gravity and user acceleration).
+                In a file whose header names nothing, or that has none, all are places counted from "0".
     time_unit   None detects it: of s, ms, us and ns the one by which the IMU runs at 10 to 2000 Hz; the ranges do not overlap.
     gyro_unit   None detects it: above 35 (rad/s: 2000 deg/s) it is deg/s; else the turning of gravity in the accelerometer decides where
                 there is enough of it; else, if steps shake the recording, what never exceeds 10 is rad/s; else it is ambiguous and refused.
@@ -217,7 +218,7 @@ def import_recording(
                 screen (+z) points up more than down over the recording. Nothing in the data alone tells the sign.
     order       rows out of order are sorted and rows that are there twice dropped, or refused.
     rate        Hz of the result; None keeps the faster sensor's own.
-    separator   of the columns; None takes the most frequent of comma, semicolon and tab in the header.
+    separator   of the columns; None takes the most frequent of comma, semicolon and tab, or blanks where there is none of them.
 
     Two sensors with stamps of their own are put on the faster one's over the time that both cover, by cubic splines. Raises `InputError`
     naming file, field and remedy.
@@ -239,8 +240,10 @@ def import_recording(
     notes: list[str] = []
     named = {name: columns.get(name, name) for name in known - {"accel_time"}}
     named["accel_time"] = columns.get("accel_time", named["time"])
-    table = _read(path, separator)
-    accel_table = _read(other, separator) if other else table
+    places = {sensor: all(named[field].isdigit() for field in fields) for sensor, fields in
+              (("gyro", ("time", *_GYRO)), ("accel", ("accel_time", *_ACCEL)))}
+    table = _read(path, separator, header=not places["gyro"])
+    accel_table = _read(other, separator, header=not places["accel"]) if other else table
     gyro_file, accel_file = path, other or path
     stamps = _column(table, named["time"], gyro_file, exact=True)
     accel_stamps = _column(accel_table, named["accel_time"], accel_file, exact=True)
@@ -265,17 +268,18 @@ def import_recording(
     return Imported(resample(sequence, target), tuple(notes))
 
 
-def _read(path: Path, separator: str | None) -> pd.DataFrame:
+def _read(path: Path, separator: str | None, header: bool) -> pd.DataFrame:
     if separator is None:
         try:
             with path.open(encoding="utf-8") as file:
-                header = next((line for line in file if line.strip()), "")
+                first = next((line for line in file if line.strip() and not line.startswith("#")), "")
         except OSError as error:
             raise InputError(path, f"cannot be read ({error.strerror})") from None
         except UnicodeDecodeError as error:
             raise InputError(path, f"is no text ({error})", "export the recording as CSV") from None
-        separator = max((",", ";", "\t"), key=header.count)
-    table = read_csv(path, separator=separator)
+        separator = max((",", ";", "\t"), key=first.count)
+        separator = separator if separator in first else " "
+    table = read_csv(path, separator=separator, header=header)
     table.columns = [str(label).strip("\ufeff \"'") for label in table.columns]  # a byte order mark, quoted names
     return table
 

@@ -407,6 +407,20 @@ def test_one_file_per_sensor_is_joined_on_one_clock(tmp_path, gyro_rate, accel_r
         csv.import_recording(gyro, columns, accel_path=later)
 
 
+def test_files_without_a_header_are_read_by_the_places_of_their_columns(tmp_path):
+    """Blanks between the columns, and a comment where a header would stand."""
+    time = np.arange(2800) / 200
+    values = imu(time)
+    for name, part in (("gyro", values[:, :3]), ("acce", values[:, 3:])):
+        rows = [f"{stamp} {x:.9f}  {y:.9f} {z:.9f}" for stamp, (x, y, z) in zip(stamps_of(time, "ns"), part, strict=True)]
+        (tmp_path / f"{name}.txt").write_text("\n".join(["# Created at Wed Dec 27 22:30:22 GMT 2023", *rows]) + "\n")
+    columns = {"time": "0"} | {f"{sensor}_{axis}": str(place) for sensor in ("gyro", "accel") for place, axis in enumerate("xyz", 1)}
+    sequence, _ = csv.import_recording(tmp_path / "gyro.txt", columns, accel_path=tmp_path / "acce.txt")
+    compare_imu(sequence)
+    with pytest.raises(InputError, match=r"gyro\.txt: column '4' is missing; found: 0, 1, 2, 3"):
+        csv.import_recording(tmp_path / "gyro.txt", columns | {"gyro_z": "4"}, accel_path=tmp_path / "acce.txt")
+
+
 def test_rows_of_one_sensor_each_are_told_apart(tmp_path):
     """A merged table: a row is of the gyro or of the accelerometer, the other's columns are empty."""
     gyro_time, accel_time = np.arange(0, SECONDS, 0.01), np.arange(0, SECONDS, 0.01) + 0.004
@@ -450,3 +464,16 @@ def test_an_import_goes_through_the_package_s_own_file(tmp_path):
     (again,) = data.load("csv", tmp_path / "mine", "test")
     np.testing.assert_array_equal(again.gyro, sequence.gyro)
     assert not again.valid.any()
+
+
+@pytest.mark.recordings
+def test_a_real_logger_s_files_are_imported(recordings):
+    """An Android phone's raw text, one file per sensor at 388 Hz."""
+    folder = recordings / "kiod" / "01"
+    if not folder.is_dir():
+        pytest.skip("real recordings: no kiod/")
+    columns = {"time": "0"} | {f"{sensor}_{axis}": str(place) for sensor in ("gyro", "accel") for place, axis in enumerate("xyz", 1)}
+    sequence, notes = csv.import_recording(folder / "gyro.txt", columns, accel_path=folder / "acce.txt", rate=200.0)
+    assert 100 < sequence.time[-1] < 110 and np.median(np.linalg.norm(sequence.accel, axis=1)) == pytest.approx(9.8, abs=0.2)
+    text = " | ".join(notes)
+    assert "time of gyro taken as ns, by which it runs at 388 Hz" in text and "gyro taken as rad/s" in text and "accel taken as m/s2" in text
