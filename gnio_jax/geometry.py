@@ -68,6 +68,24 @@ def matmul(a: Float[jax.Array, "p k *n"], b: Float[jax.Array, "k q *n"]) -> Floa
     return functools.reduce(jnp.add, [a[:, None, k] * b[None, k] for k in range(b.shape[0])])
 
 
+def orthonormalize(rotation: Matrix) -> Matrix:
+    """The rotation nearest to a matrix that is one but for rounding: one Newton step R (3 I − RᵀR)/2 of the polar decomposition."""
+    return matmul(rotation, 1.5 * np.eye(3, dtype=rotation.dtype) - 0.5 * matmul(rotation.T, rotation))
+
+
+def level(up: Vector) -> Matrix:
+    """The rotation body → world of yaw 0 (as `yaw` has it) that turns `up`, a direction in the body, to the world's z.
+
+    Where the body's x axis is vertical, and its yaw with it undefined, the body's y axis takes the world's y.
+    """
+    z = up / jnp.sqrt(jnp.sum(up * up))
+    along = jnp.array([1.0, 0.0, 0.0], up.dtype) - z[0] * z  # the body's x axis, made horizontal
+    squared = jnp.sum(along * along)
+    vertical = squared < 1e-12
+    x = jnp.where(vertical, jnp.array([0.0, 0.0, 1.0], up.dtype) - z[2] * z, along) / jnp.sqrt(jnp.where(vertical, 1.0, squared))
+    return jnp.stack([x, hat(z) @ x, z])
+
+
 def cumulative_rotation(start: Matrix, turns: Float[jax.Array, "3 3 n"]) -> Float[jax.Array, "3 3 n+1"]:
     """R_0 = start, R_{j+1} = R_j turns_j: the rotation before each of n steps and after the last, along the last axis.
 

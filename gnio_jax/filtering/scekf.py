@@ -3,17 +3,32 @@
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Float
+import numpy as np
+from jaxtyping import Bool, Float
 
 from gnio_jax import geometry
-from gnio_jax.filtering.propagation import interval, propagate
-from gnio_jax.filtering.state import CLONE, CORE, FilterConfig, FilterState, NoiseModel, check
-from gnio_jax.filtering.update import Measurement, Outcome, update
+from gnio_jax.filtering.gaps import Imu, bridge
+from gnio_jax.filtering.propagation import interval, move_anchor, propagate
+from gnio_jax.filtering.state import (
+    CLONE,
+    MOVE,
+    FilterConfig,
+    FilterState,
+    NoiseModel,
+    admit_noise,
+    admit_state,
+    check,
+    check_finite,
+    check_positive,
+    core_covariance,
+)
+from gnio_jax.filtering.update import Measurement, Outcome, rest, update, zero_velocity
 from gnio_jax.types import Array, Prediction
 
 
@@ -43,51 +58,85 @@ class FilterHistory(NamedTuple):
     accepted: Float[Array, "k"]
     """1 an update was applied (also one with scaled covariance), 0 none was (gate or gimbal lock), NaN no measurement."""
     gate_passed: Float[Array, "k"]
-    """1 the gate let the measurement through as it is, 0 it did not, NaN no measurement."""
+    """1 the gate let the measurement through as it is, 0 it did not, between them its weight (`gate_softness`), NaN no measurement."""
     nis: Float[Array, "k"]
     """Normalised innovation squared, rᵀ S⁻¹ r; NaN where no measurement."""
+    log_likelihood: Float[Array, "k"]
+    """ln N(r; 0, S) of the innovation, r in m; NaN where no measurement. Their sum is the evidence for the noise model."""
+    at_rest: Float[Array, "k"]
+    """1 the velocity was measured as zero (`zero_velocity_std`), else 0."""
+    imu_gap: Float[Array, "k"]
+    """Age of the oldest held IMU sample of the interval, s; 0 where none was missing. Above `bridge_seconds` the filter coasted."""
+    healthy: Float[Array, "k"]
+    """0 where the state is not finite or a variance is negative: bad input that could not be seen before, and all after it is void."""
     diagnostics: dict[str, Array]
     """The network's diagnostics stacked over K, NaN where it had no window; empty without a network."""
 
 
 def run_filter(state: FilterState, gyro: Any, accel: Any, displacement: Any, covariance: Any, config: FilterConfig,
-               noise: NoiseModel) -> tuple[FilterState, FilterHistory]:
+               noise: NoiseModel, imu_valid: Any = None) -> tuple[FilterState, FilterHistory]:
     """Filter K clone intervals of IMU samples with given displacement measurements.
 
     gyro rad/s and accel m/s² (K·n, 3), raw, in the body frame: the filter's biases are subtracted inside; displacement (K, 3), m, row k
     from clone k−W to clone k in the yaw frame of clone k−W; covariance (K, 3, 3), m², before `measurement_scale`. A row with a NaN, or
-    before there are W + 1 clones, is no measurement. Returns the final state, from which a later call goes on (clone numbers k then count
+    before there are W + 1 clones, is no measurement. imu_valid (K·n,) says which IMU samples are there; the others, and with it those
+    that are not finite, are bridged (see `gaps`). Returns the final state, from which a later call goes on (clone numbers k then count
     on, too), and the history. Works under `jax.jit`, `jax.vmap` and `jax.grad`.
-    Raises `ValueError` naming an argument of wrong shape or precision.
+    Raises `ValueError` naming an argument of wrong shape or precision, with values that are not finite, or a covariance that is not
+    positive definite; of values that only exist inside `jit`, `FilterHistory.healthy` tells.
     """
-    state, gyro, accel, noise = _admit(state, gyro, accel, config, noise)
+    state, gyro, accel, valid, noise = _admit(state, gyro, accel, imu_valid, config, noise)
     intervals = gyro.shape[0] // config.samples_per_clone
     displacement = check("displacement", displacement, (intervals, 3), config).astype(gyro.dtype)
     covariance = check("covariance", covariance, (intervals, 3, 3), config).astype(gyro.dtype)
-    return _run_filter(state, gyro, accel, displacement, covariance, config, noise)
+    check_positive("covariance", covariance)
+    return _run_filter(state, gyro, accel, valid, displacement, covariance, config, noise)
 
 
 @functools.partial(jax.jit, static_argnames="config")
-def _run_filter(state, gyro, accel, displacement, covariance, config, noise):
+def _run_filter(state, gyro, accel, valid, displacement, covariance, config, noise):
     measurements = jax.vmap(functools.partial(_measurement, config=config))(displacement, covariance)
-    return _scan(lambda k, _state, _oldest, given: (given, {}), state, gyro, accel, config, noise, measurements)
+    return _scan(lambda k, _state, _oldest, _imu, given: (given, {}), state, gyro, accel, valid, config, noise, measurements)
 
 
 def run_odometry(predict: Callable[[Any], Prediction], state: FilterState, gyro: Any, accel: Any, config: FilterConfig,
-                 noise: NoiseModel) -> tuple[FilterState, FilterHistory]:
+                 noise: NoiseModel, imu_valid: Any = None) -> tuple[FilterState, FilterHistory]:
     """Filter K clone intervals with the network in the loop (paper fig. 2): its windows are cut with the filter's own state.
 
     predict maps windows (1, N, 6) float32, N = n·W, channels [accel m/s², gyro rad/s], to a `Prediction` with the same leading axis.
     A window spans the samples between its two clones i and j; the filter's present biases are subtracted and the samples rotated by
     R_γ(R_i)ᵀ R_j, R_j being the present estimate of clone i advanced by integrating gyro − b_g (paper eq. 1; TLIO). The measurement's
-    covariance is diag(exp 2u), u raised to `log_std_min`. The network is not called in the first W intervals, which have no window.
-    gyro and accel as in `run_filter`. Jit it from outside; differentiable in whatever `predict` closes over, too.
-    Raises `ValueError` naming an argument of wrong shape or precision, or a `predict` that returns something else.
+    covariance is diag(exp 2u), u raised to `log_std_min`. The network is not called in the first W intervals, which have no window, and
+    a window in which the filter coasted through a gap is no measurement.
+    gyro, accel and imu_valid as in `run_filter`. Jit it from outside; differentiable in whatever `predict` closes over, too.
+    Raises `ValueError` as `run_filter` does, or for a `predict` that returns something else.
     """
-    state, gyro, accel, noise = _admit(state, gyro, accel, config, noise)
-    dtype = gyro.dtype
-    window = jax.ShapeDtypeStruct((1, config.window, 6), jnp.float32)
-    expected = jax.eval_shape(predict, window)
+    state, gyro, accel, valid, noise = _admit(state, gyro, accel, imu_valid, config, noise)
+    dtype, expected = gyro.dtype, expect(predict, config)
+
+    def infer(k: Array, state: FilterState, oldest: Array, imu: Imu) -> Prediction:
+        start = (k - config.clones_per_window + 1) * config.samples_per_clone
+        gyro, accel = (jax.lax.dynamic_slice_in_dim(signal, start, config.window) for signal in (imu.gyro, imu.accel))
+        prediction = infer_window(predict, state, state.clone_rotation[oldest], gyro, accel, config)
+        if imu.gap is not None:
+            whole = jnp.all(jax.lax.dynamic_slice_in_dim(imu.gap.used, start, config.window) > 0)
+            prediction = prediction._replace(displacement=jnp.where(whole, prediction.displacement, jnp.nan))
+        return prediction
+
+    def nothing(k: Array, state: FilterState, oldest: Array, imu: Imu) -> Prediction:
+        return no_prediction(expected)
+
+    def measure(k: Array, state: FilterState, oldest: Array, imu: Imu, _given: None) -> tuple[Measurement, dict]:
+        # k is the scan's own counter, the same for every sequence of a batch, so that this stays a branch under vmap.
+        prediction = jax.lax.cond(k >= config.clones_per_window, infer, nothing, k, state, oldest, imu)
+        return measured(prediction, config, dtype), prediction.diagnostics
+
+    return _scan(measure, state, gyro, accel, valid, config, noise, None)
+
+
+def expect(predict: Callable[[Any], Prediction], config: FilterConfig) -> Prediction:
+    """Shapes of what `predict` returns for one window; `ValueError` if that is not what the filter needs."""
+    expected = jax.eval_shape(predict, jax.ShapeDtypeStruct((1, config.window, 6), jnp.float32))
     if not isinstance(expected, Prediction):
         raise ValueError(f"predict: must return a gnio_jax.types.Prediction, found {type(expected).__name__}")
     for name, value in [("displacement", expected.displacement), ("log_std", expected.log_std)]:
@@ -96,23 +145,25 @@ def run_odometry(predict: Callable[[Any], Prediction], state: FilterState, gyro:
     for name, value in expected.diagnostics.items():
         if value.shape[:1] != (1,):
             raise ValueError(f"predict: diagnostics['{name}'] must have a leading axis of one window, found {value.shape}")
+    return expected
 
-    def infer(k: Array, state: FilterState, oldest: Array) -> Prediction:
-        start = (k - config.clones_per_window + 1) * config.samples_per_clone
-        cut = [jax.lax.dynamic_slice_in_dim(signal, start, config.window) for signal in (gyro, accel)]
-        imu = network_window(state.clone_rotation[oldest], cut[0] - state.gyro_bias[None], cut[1] - state.accel_bias[None], config)
-        return jax.tree.map(lambda leaf: _floating(leaf[0]), predict(imu[None].astype(jnp.float32)))
 
-    def nothing(k: Array, state: FilterState, oldest: Array) -> Prediction:
-        return jax.tree.map(lambda leaf: jnp.full(leaf.shape[1:], jnp.nan, _floating(leaf).dtype), expected)
+def infer_window(predict: Callable[[Any], Prediction], state: FilterState, rotation: Float[Array, "3 3"], gyro: Float[Array, "n 3"],
+                 accel: Float[Array, "n 3"], config: FilterConfig) -> Prediction:
+    """What the network says of one window of raw samples whose first has this attitude; the leading axis of one is gone."""
+    imu = network_window(rotation, gyro - state.gyro_bias[None], accel - state.accel_bias[None], config)
+    return jax.tree.map(lambda leaf: _floating(leaf[0]), predict(imu[None].astype(jnp.float32)))
 
-    def measure(k: Array, state: FilterState, oldest: Array, _given: None) -> tuple[Measurement, dict]:
-        # k is the scan's own counter, the same for every sequence of a batch, so that this stays a branch under vmap.
-        prediction = jax.lax.cond(k >= config.clones_per_window, infer, nothing, k, state, oldest)
-        log_std = jnp.maximum(prediction.log_std.astype(dtype), config.log_std_min)
-        return _measurement(prediction.displacement.astype(dtype), jnp.diag(jnp.exp(2 * log_std)), config), prediction.diagnostics
 
-    return _scan(measure, state, gyro, accel, config, noise, None)
+def no_prediction(expected: Prediction) -> Prediction:
+    """NaN in the shapes of one window's prediction."""
+    return jax.tree.map(lambda leaf: jnp.full(leaf.shape[1:], jnp.nan, _floating(leaf).dtype), expected)
+
+
+def measured(prediction: Prediction, config: FilterConfig, dtype: Any) -> Measurement:
+    """The measurement that the filter makes of a prediction."""
+    log_std = jnp.maximum(prediction.log_std.astype(dtype), config.log_std_min)
+    return _measurement(prediction.displacement.astype(dtype), jnp.diag(jnp.exp(2 * log_std)), config)
 
 
 def network_window(rotation: Float[Array, "3 3"], gyro: Float[Array, "n 3"], accel: Float[Array, "n 3"],
@@ -125,40 +176,88 @@ def network_window(rotation: Float[Array, "3 3"], gyro: Float[Array, "n 3"], acc
     return geometry.matmul(rotations, jnp.stack([accel.T, gyro.T], axis=1)).transpose(2, 1, 0).reshape(-1, 6)
 
 
-def _scan(measure: Callable, state: FilterState, gyro: Array, accel: Array, config: FilterConfig, noise: NoiseModel,
+class Row(NamedTuple):
+    """What one step adds to the history."""
+
+    state: tuple[Array, ...]
+    """Rotation, velocity, position, gyro bias, accel bias."""
+    covariance: Array
+    """Of θ, v, p, b_g, b_a, or its diagonal."""
+    measurement: Measurement
+    outcome: Outcome
+    at_rest: Bool[Array, ""]
+    diagnostics: dict[str, Array]
+
+
+def clone_step(state: FilterState, imu: Imu, measure: Callable[[FilterState, Array | int], tuple[Measurement, dict]], slot: Array | int,
+               config: FilterConfig, noise: NoiseModel) -> tuple[FilterState, Row]:
+    """One clone interval: propagate, clone into `slot` of the ring, measure, update. `measure` is given the state and the oldest slot."""
+    # A ring of clones: the newest takes the place of the one that has served as oldest, and the next slot is the oldest now.
+    newest, oldest = slot, (slot + 1) % (config.clones_per_window + 1)
+    state = move_anchor(state, newest == 0)
+    state = propagate(state, interval(state, imu, noise, config.dt), newest == 0, newest)
+    measurement, diagnostics = measure(state, oldest)
+    state, outcome = update(state, measurement, newest, oldest, config)
+    at_rest = jnp.bool_(False)
+    if config.zero_velocity_std > 0:
+        state, at_rest = rest(state, imu, config)
+        state = zero_velocity(state, at_rest, newest, config)
+    kept = core_covariance(state.core_covariance)
+    mean = (state.rotation, state.velocity, state.position, state.gyro_bias, state.accel_bias)
+    return state, Row(mean, kept if config.history == "core" else jnp.diagonal(kept), measurement, outcome, at_rest, diagnostics)
+
+
+def _scan(measure: Callable, state: FilterState, gyro: Array, accel: Array, valid: Array | None, config: FilterConfig, noise: NoiseModel,
           measurements: Any) -> tuple[FilterState, FilterHistory]:
     n, clones = config.samples_per_clone, config.clones_per_window + 1
     intervals = gyro.shape[0] // n
+    stream, age, memory = bridge(gyro, accel, valid, state.imu, config)
 
-    def step(state: FilterState, inputs: tuple) -> tuple[FilterState, tuple]:
-        k, gyro, accel, given = inputs
-        # A ring of clones: the newest takes the place of the one that has served as oldest, and the next slot is the oldest now.
-        newest, oldest = k % clones, (k + 1) % clones
-        state = propagate(state, interval(state, gyro, accel, noise, config.dt), newest)
-        measurement, diagnostics = measure(k, state, oldest, given)
-        state, outcome = update(state, measurement, newest, oldest, state.step >= clones, config)
-        kept = state.core_covariance if config.history == "core" else jnp.diagonal(state.core_covariance)
-        mean = (state.rotation, state.velocity, state.position, state.gyro_bias, state.accel_bias)
-        return state, (mean, kept, measurement, outcome, diagnostics)
+    def step(state: FilterState, inputs: tuple) -> tuple[FilterState, Row]:
+        k, imu, given = inputs
+        return clone_step(state, imu, lambda state, oldest: measure(k, state, oldest, stream, given), k % clones, config, noise)
 
-    inputs = (jnp.arange(intervals), gyro.reshape(intervals, n, 3), accel.reshape(intervals, n, 3), measurements)
-    state, (mean, kept, measurement, outcome, diagnostics) = jax.lax.scan(step, state, inputs)
-    return _oldest_first(state, intervals % clones), _history(mean, kept, measurement, outcome, diagnostics, config)
+    by_interval = jax.tree.map(lambda x: x.reshape(intervals, n, *x.shape[1:]), stream)
+    state, rows = checkpointed_scan(step, state, (jnp.arange(intervals), by_interval, measurements), config.checkpoint_every)
+    state = state._replace(imu=memory._replace(quiet=state.imu.quiet))
+    return settled(state, intervals % clones), history(rows, age.reshape(intervals, n).max(1), config)
 
 
-def _history(mean: tuple, kept: Array, measurement: Measurement, outcome: Outcome, diagnostics: dict,
-             config: FilterConfig) -> FilterHistory:
+def checkpointed_scan(step: Callable, carry: Any, inputs: Any, every: int) -> tuple[Any, Any]:
+    """`lax.scan` whose backward pass keeps the carry of every `every`-th step only, and computes the steps between them again."""
+    length = jax.tree.leaves(inputs)[0].shape[0]
+    if every == 0 or every >= length:
+        return jax.lax.scan(step, carry, inputs)
+    blocks = length // every
+    whole = jax.tree.map(lambda x: x[: blocks * every].reshape(blocks, every, *x.shape[1:]), inputs)
+    carry, out = jax.lax.scan(jax.checkpoint(lambda carry, block: jax.lax.scan(step, carry, block), prevent_cse=False), carry, whole)
+    out = jax.tree.map(lambda x: x.reshape(blocks * every, *x.shape[2:]), out)
+    if length % every:
+        carry, rest = jax.lax.scan(step, carry, jax.tree.map(lambda x: x[blocks * every :], inputs))
+        out = jax.tree.map(lambda x, y: jnp.concatenate([x, y]), out, rest)
+    return carry, out
+
+
+def history(rows: Row, imu_gap: Float[Array, "k"], config: FilterConfig) -> FilterHistory:
+    """The history of the rows stacked over K steps."""
+    outcome, kept = rows.outcome, rows.covariance
+
     def where_present(value: Array) -> Array:
         present = outcome.present.reshape(-1, *[1] * (value.ndim - 1))
         return jnp.where(present, value, jnp.nan).astype(kept.dtype)
 
-    std = jnp.sqrt(jnp.diagonal(measurement.covariance, axis1=1, axis2=2))
+    # S is the identity where there is no measurement, so that the logarithm has a derivative there.
+    log_likelihood = -0.5 * (outcome.nis + 3 * math.log(2 * math.pi)) - jnp.log(outcome.volume)
+    std = jnp.sqrt(jnp.diagonal(rows.measurement.covariance, axis1=1, axis2=2))
+    diagonal = jnp.diagonal(kept, axis1=1, axis2=2) if config.history == "core" else kept
+    finite = [jnp.all(jnp.isfinite(part.reshape(len(part), -1)), axis=1) for part in (*rows.state, kept)]
+    healthy = jnp.all(jnp.stack(finite), axis=0) & jnp.all(diagonal >= 0, axis=1)
     return FilterHistory(
-        *mean, displacement=where_present(measurement.displacement), measurement_std=where_present(std),
-        innovation=where_present(outcome.innovation),
-        covariance_diagonal=jnp.diagonal(kept, axis1=1, axis2=2) if config.history == "core" else kept,
-        covariance=kept if config.history == "core" else None, accepted=where_present(outcome.accepted),
-        gate_passed=where_present(outcome.gate_passed), nis=where_present(outcome.nis), diagnostics=diagnostics)
+        *rows.state, displacement=where_present(rows.measurement.displacement), measurement_std=where_present(std),
+        innovation=where_present(outcome.innovation), covariance_diagonal=diagonal, covariance=kept if config.history == "core" else None,
+        accepted=where_present(outcome.accepted), gate_passed=where_present(outcome.gate_passed), nis=where_present(outcome.nis),
+        log_likelihood=where_present(log_likelihood), at_rest=rows.at_rest.astype(kept.dtype), imu_gap=imu_gap.astype(kept.dtype),
+        healthy=healthy.astype(kept.dtype), diagnostics=rows.diagnostics)
 
 
 def _measurement(displacement: Float[Array, "3"], covariance: Float[Array, "3 3"], config: FilterConfig) -> Measurement:
@@ -168,34 +267,41 @@ def _measurement(displacement: Float[Array, "3"], covariance: Float[Array, "3 3"
     return Measurement(displacement=jnp.where(present, displacement, 0.0), covariance=scaled, present=present)
 
 
-def _oldest_first(state: FilterState, shift: int) -> FilterState:
-    """The ring of clones turned by `shift`, so that slot 0 is the oldest again."""
-    blocks = CLONE * shift
+def settled(state: FilterState, newer: int) -> FilterState:
+    """The state between runs: all clones at the present anchor, which the first `newer` of the ring have already, and the oldest first."""
+    clones, dtype = state.clone_offset.shape[0], state.move.dtype
+    older = (np.arange(clones) >= (newer or clones)).astype(dtype)[:, None]
+    # o ← o − s for those, in the mean and in the covariance
+    loss = np.kron(older, np.concatenate([np.zeros((3, 3)), np.eye(3)])).astype(dtype)
+    across = loss @ state.cross_covariance[MOVE]
+    among = state.clone_covariance - across - across.T + loss @ state.core_covariance[MOVE, MOVE] @ loss.T
+    first, blocks = state.first, CLONE * newer
+    if first is not None:
+        first = first._replace(clone_offset=jnp.roll(first.clone_offset - older * first.move[None], -newer, 0))
     return state._replace(
-        clone_rotation=jnp.roll(state.clone_rotation, -shift, 0), clone_position=jnp.roll(state.clone_position, -shift, 0),
-        cross_covariance=jnp.roll(state.cross_covariance, -blocks, 1),
-        clone_covariance=jnp.roll(state.clone_covariance, (-blocks, -blocks), (0, 1)))
+        clone_rotation=jnp.roll(state.clone_rotation, -newer, 0),
+        clone_offset=jnp.roll(state.clone_offset - older * state.move[None], -newer, 0),
+        cross_covariance=jnp.roll(state.cross_covariance - state.core_covariance[:, MOVE] @ loss.T, -blocks, 1),
+        clone_covariance=jnp.roll(among, (-blocks, -blocks), (0, 1)), first=first)
 
 
 def _floating(value: Any) -> Any:
     return value if jnp.issubdtype(value.dtype, jnp.floating) else value.astype(jnp.float32)
 
 
-def _admit(state: FilterState, gyro: Any, accel: Any, config: FilterConfig,
-           noise: NoiseModel) -> tuple[FilterState, Array, Array, NoiseModel]:
+def _admit(state: FilterState, gyro: Any, accel: Any, imu_valid: Any, config: FilterConfig,
+           noise: NoiseModel) -> tuple[FilterState, Array, Array, Array | None, NoiseModel]:
     """Check what both doors take, and bring it to the state's precision."""
-    clones = config.clones_per_window + 1
-    shapes = FilterState((3, 3), (3,), (3,), (3,), (3,), (clones, 3, 3), (clones, 3), (CORE, CORE), (CORE, CLONE * clones),
-                         (CLONE * clones, CLONE * clones), (), None)
-    fields = {name: check(f"state.{name}", getattr(state, name), shape, config) for name, shape in shapes._asdict().items()
-              if name not in ("step", "gate")}
-    dtype = fields["position"].dtype
+    state = admit_state(state, config)
     samples = jnp.shape(gyro)[0] if jnp.ndim(gyro) else 0
     if samples < config.samples_per_clone or samples % config.samples_per_clone:
         raise ValueError(f"gyro: the samples must be a multiple of samples_per_clone = {config.samples_per_clone}, found {samples}")
-    gyro, accel = (check(name, value, (samples, 3), config).astype(dtype) for name, value in [("gyro", gyro), ("accel", accel)])
-    for name, value in noise._asdict().items():
-        if jnp.shape(value) != ():
-            raise ValueError(f"noise.{name}: must be one number, found shape {jnp.shape(value)}")
-    return state._replace(**{name: value.astype(dtype) for name, value in fields.items()}), gyro, accel, NoiseModel(
-        *[jnp.asarray(value, dtype) for value in noise])
+    gyro, accel = (check(name, value, (samples, 3), config) for name, value in [("gyro", gyro), ("accel", accel)])
+    if imu_valid is not None:
+        imu_valid = jnp.asarray(imu_valid)
+        if imu_valid.shape != (samples,) or imu_valid.dtype != jnp.bool_:
+            raise ValueError(f"imu_valid: must be {samples} booleans, found {imu_valid.dtype} of shape {imu_valid.shape}")
+    else:
+        check_finite("gyro", gyro, "name the missing samples with imu_valid to have them bridged")
+        check_finite("accel", accel, "name the missing samples with imu_valid to have them bridged")
+    return state, gyro.astype(state.offset.dtype), accel.astype(state.offset.dtype), imu_valid, admit_noise(noise, state.offset.dtype)

@@ -10,10 +10,13 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from gnio_jax import geometry
-from gnio_jax.filtering.state import ACCEL_BIAS, CLONE, GYRO_BIAS, POSITION, VELOCITY, FilterConfig, FilterState, GateState
+from gnio_jax.filtering.gaps import Imu
+from gnio_jax.filtering.state import ACCEL_BIAS, ANCHOR, CLONE, GYRO_BIAS, MOVE, OFFSET, VELOCITY, FilterConfig, FilterState, GateState
 from gnio_jax.geometry import matmul
-from gnio_jax.types import Array
+from gnio_jax.types import GRAVITY, Array
 
+LEAST_WEIGHT = 1e-6
+"""Of a measurement behind a gate with a slope: its covariance grows no further."""
 GIMBAL = 1e-5
 """Below this |cos pitch| the yaw of the oldest clone has no derivative and the measurement is not used."""
 
@@ -35,34 +38,41 @@ class Outcome(NamedTuple):
     """r, m."""
     nis: Float[Array, ""]
     """Normalised innovation squared, rᵀ S⁻¹ r, before any fail scale."""
-    gate_passed: Bool[Array, ""]
+    volume: Float[Array, ""]
+    """√det S, m³, before any fail scale."""
+    gate_passed: Float[Array, ""]
+    """1 or 0, or the weight of a gate with a slope."""
     accepted: Bool[Array, ""]
 
 
-def displacement_residual(rotation_i: Float[Array, "3 3"], position_i: Float[Array, "3"], position_j: Float[Array, "3"],
-                          displacement: Float[Array, "3"]) -> tuple[Float[Array, "3"], Float[Array, "3 9"], Bool[Array, ""]]:
+def displacement_residual(rotation_i: Float[Array, "3 3"], moved: Float[Array, "3"], displacement: Float[Array, "3"],
+                          turning: Float[Array, "3"]) -> tuple[Float[Array, "3"], Float[Array, "3 9"], Bool[Array, ""]]:
     """r = d − R_γ(R_i)ᵀ (p_j − p_i), its prediction's Jacobian H over (θ_i, p_i, p_j), and whether H exists (no gimbal lock).
+
+    `moved` is p_j − p_i; `turning` the same where H[θ_i] is to be taken.
 
     H[θ_i] = R_γᵀ hat(p_j − p_i) Hz, where only the last row of Hz, (cos y tan q, sin y tan q, 1), is not zero: the change of the yaw y
     of exp(δθ) R_i, q being its pitch (R = Rz(y) Ry(q) Rx).  At gimbal lock tan q is taken as 0.
     """
     unyaw = geometry.yaw_rotation(rotation_i).T
-    predicted = unyaw @ (position_j - position_i)
+    predicted, levered = unyaw @ moved, unyaw @ turning
     cosine_squared = rotation_i[0, 0] ** 2 + rotation_i[1, 0] ** 2
     defined = cosine_squared >= GIMBAL**2
     scale = jnp.where(defined, -rotation_i[2, 0] / jnp.where(defined, cosine_squared, 1.0), 0.0)  # tan q / cos q
     yaw_row = jnp.stack([scale * rotation_i[0, 0], scale * rotation_i[1, 0], jnp.ones_like(scale)])
     # hat(d) Hz is a single outer product, (d × z) ⊗ yaw_row, and the yaw leaves z alone.
-    turned = jnp.stack([predicted[1], -predicted[0], jnp.zeros_like(scale)])
+    turned = jnp.stack([levered[1], -levered[0], jnp.zeros_like(scale)])
     jacobian = jnp.concatenate([turned[:, None] * yaw_row[None, :], -unyaw, unyaw], axis=1)
     return displacement - predicted, jacobian, defined
 
 
-def gate(memory: GateState, config: FilterConfig, now: Array, oldest: Array, nis: Array, tried: Array) -> tuple[GateState, Bool[Array, ""]]:
-    """TLIO's gate: whether the measurement passes as it is, and the gate's memory after it.
+def gate(memory: GateState, config: FilterConfig, now: Array, oldest: Array, nis: Float[Array, ""],
+         tried: Array) -> tuple[GateState, Float[Array, ""]]:
+    """TLIO's gate: the weight of the measurement, 1 if it passes as it is and 0 if not, and the gate's memory after it.
 
     `now` and `oldest` are the samples of the newest and the oldest clone; where `tried` is False nothing changes.
     Comparisons are strict, as "more than" and "older" say; at the very end of a pause the gate is active again.
+    With `gate_softness` the active gate weighs instead (ours); its memory still takes what is above the threshold for a failure.
     """
     def whole(seconds: float) -> int:  # t·dt > seconds  ⇔  t > whole(seconds), whatever the last bit of seconds / dt
         return int(np.floor(seconds / config.dt + 1e-6))
@@ -70,81 +80,127 @@ def gate(memory: GateState, config: FilterConfig, now: Array, oldest: Array, nis
     converged = memory.converged | (tried & (oldest > whole(config.convergence_seconds)))
     watching = converged & (now >= memory.pause_end)
     stale = watching & (memory.last_success >= 0) & (now - memory.last_success > whole(config.success_seconds))
-    passed = ~(watching & ~stale & (nis > config.gate_threshold))
+    active, fits = watching & ~stale, nis <= config.gate_threshold
+    passed = tried & (~active | fits)
     pause = -int(np.floor(-config.pause_seconds / config.dt + 1e-6))
+    weight = passed.astype(nis.dtype)
+    if config.gate_softness > 0:
+        slope = jax.nn.sigmoid((config.gate_threshold - nis) / config.gate_softness)
+        weight = jnp.where(tried, jnp.where(active, slope, 1.0), 0.0)
     return GateState(
         converged=converged,
-        last_success=jnp.where(tried & passed, now, memory.last_success),
-        pause_end=jnp.where(tried & stale, now + pause, memory.pause_end)), passed & tried
+        last_success=jnp.where(passed, now, memory.last_success),
+        pause_end=jnp.where(tried & stale, now + pause, memory.pause_end)), weight
 
 
-def update(state: FilterState, measurement: Measurement, newest: Array | int, oldest: Array | int, full: Array | bool,
+def update(state: FilterState, measurement: Measurement, newest: Array | int, oldest: Array | int,
            config: FilterConfig) -> tuple[FilterState, Outcome]:
-    """One EKF update with the displacement between the clones in slots `oldest` and `newest`; `full` says whether both exist.
+    """One EKF update with the displacement between the clones in slots `oldest` and `newest` of the ring, once it is full.
 
-    H touches nine rows of the covariance P, so H P is three rows. With S = H P Hᵀ + R = L Lᵀ and Y = L⁻¹ H P the gain is Yᵀ L⁻¹ and
+    H touches twelve rows of the covariance P, so H P is three rows. With S = H P Hᵀ + R = L Lᵀ and Y = L⁻¹ H P the gain is Yᵀ L⁻¹ and
     P ← P − Yᵀ Y, symmetric to the last bit. Nothing changes where there is no measurement, or it is rejected, or at gimbal lock.
     """
-    present = measurement.present & full
-    innovation, jacobian, defined = displacement_residual(
-        state.clone_rotation[oldest], state.clone_position[oldest], state.position, measurement.displacement)
+    present = measurement.present & (state.step >= state.clone_offset.shape[0])
+    # Once in a round of the ring the oldest clone has the core's anchor, else the one before it.
+    apart = jnp.where(oldest == 0, 0.0, 1.0).astype(state.move.dtype)
+    moved = state.offset + apart * state.move - state.clone_offset[oldest]
+    first = state.first
+    turning = moved if first is None else first.offset + apart * first.move - first.clone_offset[oldest]
+    innovation, jacobian, defined = displacement_residual(state.clone_rotation[oldest], moved, measurement.displacement, turning)
 
     # The newest clone is the core's own pose: its rows of P are the core's.
     old = CLONE * oldest
     old_core = jax.lax.dynamic_slice_in_dim(state.cross_covariance, old, CLONE, 1)
     old_clones = jax.lax.dynamic_slice_in_dim(state.clone_covariance, old, CLONE, 0)
-    over_core = matmul(jacobian, jnp.concatenate([old_core.T, state.core_covariance[POSITION]]))
-    over_clones = matmul(jacobian, jnp.concatenate([old_clones, state.cross_covariance[POSITION]]))
-    over_touched = jnp.concatenate([jax.lax.dynamic_slice_in_dim(over_clones, old, CLONE, 1), over_core[:, POSITION]], axis=1)
+    new_core, new_clones = (part[OFFSET] + apart * part[MOVE] for part in (state.core_covariance, state.cross_covariance))
+    over_core = matmul(jacobian, jnp.concatenate([old_core.T, new_core]))
+    over_clones = matmul(jacobian, jnp.concatenate([old_clones, new_clones]))
+    over_new = over_core[:, OFFSET] + apart * over_core[:, MOVE]
+    over_touched = jnp.concatenate([jax.lax.dynamic_slice_in_dim(over_clones, old, CLONE, 1), over_new], axis=1)
     innovation_covariance = matmul(over_touched, jacobian.T)
 
-    whiten = _whitener(innovation_covariance + measurement.covariance, present)
-    whitened = whiten(innovation[:, None])[:, 0]
+    def factor(scale: Array | float) -> Cholesky:
+        return cholesky(jnp.where(present, innovation_covariance + scale * measurement.covariance, jnp.eye(3, dtype=innovation.dtype)))
+
+    root = factor(1.0)
+    whitened = root.solve(innovation[:, None])[:, 0]
     nis = jnp.dot(whitened, whitened)
+    volume = root.diagonal[0] * root.diagonal[1] * root.diagonal[2]
     tried = present & defined
     now = state.step * config.samples_per_clone
-    memory, passed = gate(state.gate, config, now, now - config.window, nis, tried)
-    accepted = passed
+    memory, weight = gate(state.gate, config, now, now - config.window, nis, tried)
+    accepted = weight > 0
     if config.mahalanobis_fail_scale > 0:
-        factor = jnp.where(tried & ~passed, config.mahalanobis_fail_scale, 1.0).astype(nis.dtype)
-        whiten = _whitener(innovation_covariance + factor * measurement.covariance, present)
-        whitened = whiten(innovation[:, None])[:, 0]
-        accepted = tried
-
-    over_core, over_clones = (jnp.where(accepted, whiten(rows), 0.0) for rows in (over_core, over_clones))
-    # A reduction on purpose: it is kept, where the sum spelt out would be computed anew for every entry that the retraction reads.
-    error, clone_errors = (jnp.sum(whitened[:, None] * rows, axis=0) for rows in (over_core, over_clones))
-    corrected = _retract(state, error, clone_errors.reshape(-1, CLONE), newest)
-    return corrected._replace(
-        core_covariance=state.core_covariance - matmul(over_core.T, over_core),
-        cross_covariance=state.cross_covariance - matmul(over_core.T, over_clones),
-        clone_covariance=state.clone_covariance - matmul(over_clones.T, over_clones),
-        gate=memory,
-    ), Outcome(present=present, innovation=innovation, nis=nis, gate_passed=passed, accepted=accepted)
+        root, accepted = factor(jnp.where(tried & ~accepted, config.mahalanobis_fail_scale, 1.0).astype(nis.dtype)), tried
+    if config.gate_softness > 0:
+        root, accepted = factor(1 / jnp.clip(jnp.where(tried, weight, 1.0), LEAST_WEIGHT)), tried
+    whitened = root.solve(innovation[:, None])[:, 0]
+    over_core, over_clones = (jnp.where(accepted, root.solve(rows), 0.0) for rows in (over_core, over_clones))
+    return _apply(state, whitened, over_core, over_clones, newest)._replace(gate=memory), Outcome(
+        present=present, innovation=innovation, nis=nis, volume=volume, gate_passed=weight, accepted=accepted)
 
 
-def _whitener(covariance: Float[Array, "3 3"], present: Array):
-    """The function x → L⁻¹ x, L Lᵀ = covariance; written out, because a call to LAPACK costs more than the whole update."""
-    s = jnp.where(present, covariance, jnp.eye(3, dtype=covariance.dtype))
-    a = jnp.sqrt(s[0, 0])
-    b, c = s[1, 0] / a, s[2, 0] / a
-    d = jnp.sqrt(s[1, 1] - b * b)
-    e = (s[2, 1] - c * b) / d
-    f = jnp.sqrt(s[2, 2] - c * c - e * e)
+def rest(state: FilterState, imu: Imu, config: FilterConfig) -> tuple[FilterState, Bool[Array, ""]]:
+    """Whether the IMU has been quiet for `rest_seconds` (ours), and the state with the intervals that it has been so counted on."""
+    gyro, force = imu.gyro - state.gyro_bias[None], imu.accel - state.accel_bias[None]
+    quiet = (jnp.all(jnp.sum(gyro**2, axis=1) < config.rest_gyro**2)
+             & jnp.all(jnp.abs(jnp.sqrt(jnp.maximum(jnp.sum(force**2, axis=1), 1e-12)) - GRAVITY) < config.rest_accel))
+    if imu.gap is not None:
+        quiet = quiet & jnp.all(imu.gap.gyro_variance == 0)
+    count = jnp.where(quiet, state.imu.quiet + 1, 0).astype(state.imu.quiet.dtype)
+    enough = int(np.ceil(config.rest_seconds / (config.dt * config.samples_per_clone) - 1e-6))
+    return state._replace(imu=state.imu._replace(quiet=count)), count >= max(enough, 1)
 
-    def whiten(rows: Float[Array, "3 m"]) -> Float[Array, "3 m"]:
+
+def zero_velocity(state: FilterState, wanted: Bool[Array, ""], newest: Array | int, config: FilterConfig) -> FilterState:
+    """One EKF update with the velocity measured as zero, if `wanted` (ours; the paper's gate makes displacements small instead)."""
+    noise = config.zero_velocity_std**2 * np.eye(3, dtype=state.velocity.dtype)
+    root = cholesky(jnp.where(wanted, state.core_covariance[VELOCITY, VELOCITY], 0.0) + noise)
+    whitened = -root.solve(state.velocity[:, None])[:, 0]
+    rows = (state.core_covariance[VELOCITY], state.cross_covariance[VELOCITY])
+    return _apply(state, whitened, *(jnp.where(wanted, root.solve(part), 0.0) for part in rows), newest)
+
+
+class Cholesky(NamedTuple):
+    """L of L Lᵀ = S, 3×3, written out, because a call to LAPACK costs more than the whole update."""
+
+    diagonal: tuple[Array, Array, Array]
+    below: tuple[Array, Array, Array]
+    """L[1,0], L[2,0], L[2,1]."""
+
+    def solve(self, rows: Float[Array, "3 m"]) -> Float[Array, "3 m"]:
+        """L⁻¹ rows."""
+        (a, d, f), (b, c, e) = self.diagonal, self.below
         x = rows[0] / a
         y = (rows[1] - b * x) / d
         return jnp.stack([x, y, (rows[2] - c * x - e * y) / f])
 
-    return whiten
+
+def cholesky(s: Float[Array, "3 3"]) -> Cholesky:
+    """The lower triangular root of S; NaN where S is not positive definite."""
+    a = jnp.sqrt(s[0, 0])
+    b, c = s[1, 0] / a, s[2, 0] / a
+    d = jnp.sqrt(s[1, 1] - b * b)
+    e = (s[2, 1] - c * b) / d
+    return Cholesky((a, d, jnp.sqrt(s[2, 2] - c * c - e * e)), (b, c, e))
 
 
-def _retract(state: FilterState, core: Float[Array, "15"], clones: Float[Array, "c 6"], newest: Array | int) -> FilterState:
+def _apply(state: FilterState, whitened: Float[Array, "3"], over_core: Float[Array, "3 21"], over_clones: Float[Array, "3 m"],
+           newest: Array | int) -> FilterState:
+    """Mean and covariance after an update with L⁻¹ r and Y = L⁻¹ H P: the error is Yᵀ L⁻¹ r, and P ← P − Yᵀ Y."""
+    # A reduction on purpose: it is kept, where the sum spelt out would be computed anew for every entry that the retraction reads.
+    error, clone_errors = (jnp.sum(whitened[:, None] * rows, axis=0) for rows in (over_core, over_clones))
+    return retract(state, error, clone_errors.reshape(-1, CLONE), newest)._replace(
+        core_covariance=state.core_covariance - matmul(over_core.T, over_core),
+        cross_covariance=state.cross_covariance - matmul(over_core.T, over_clones),
+        clone_covariance=state.clone_covariance - matmul(over_clones.T, over_clones))
+
+
+def retract(state: FilterState, core: Float[Array, "21"], clones: Float[Array, "c 6"], newest: Array | int) -> FilterState:
     """Add an error to the mean: R ← exp(δθ) R, the rest adds. The core's pose is that of the newest clone."""
     rotations = jax.vmap(matmul)(jax.vmap(geometry.exp)(clones[:, :3]), state.clone_rotation)
-    positions = state.clone_position + clones[:, 3:]
+    offsets = state.clone_offset + clones[:, 3:]
     return state._replace(
-        rotation=rotations[newest], velocity=state.velocity + core[VELOCITY], position=positions[newest],
+        rotation=rotations[newest], velocity=state.velocity + core[VELOCITY], offset=offsets[newest],
         gyro_bias=state.gyro_bias + core[GYRO_BIAS], accel_bias=state.accel_bias + core[ACCEL_BIAS],
-        clone_rotation=rotations, clone_position=positions)
+        anchor=state.anchor + core[ANCHOR], move=state.move + core[MOVE], clone_rotation=rotations, clone_offset=offsets)
