@@ -20,14 +20,15 @@ from jaxtyping import Float
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
+from gnio_jax.data.recordings import read_all, single
 from gnio_jax.data.sequence import (
     Dataset,
+    Recording,
     check_finite,
     check_gaps,
     check_increasing,
     check_rate,
     check_unit_norm,
-    keep_plausible,
     quaternions,
     resample,
     rotations,
@@ -45,12 +46,17 @@ _FIELDS = {"ts": None, "gyro_calib": 3, "accel_calib": 3, "traj_target": 7}
 
 def read(root: Path, split: str) -> list[Sequence]:
     """The sequences of a split, those that fail the physical self-check named and left out."""
+    return read_all(DATASET, Path(root), split)
+
+
+def recordings(root: Path, split: str) -> list[Recording]:
+    """The recordings of a split's list that are present."""
     root = Path(root)
     if split not in SPLITS:
         raise InputError(root, f"unknown split '{split}'", f"known splits: {', '.join(SPLITS)}")
     folders = listed(root / f"{split}.txt", lambda entry: root / entry if (root / entry / _TABLE).is_file() else None, root, DATASET.layout)
-    sequences = [read_sequence(folder, "_".join(folder.relative_to(root).parts)) for folder in folders]
-    return keep_plausible(sequences, pedestrian=DATASET.pedestrian)
+    names = ["_".join(folder.relative_to(root).parts) for folder in folders]
+    return [single(name, read_sequence, folder, name) for name, folder in zip(names, folders, strict=True)]
 
 
 def read_sequence(folder: str | os.PathLike[str], name: str | None = None) -> Sequence:
@@ -127,6 +133,7 @@ def _velocity(path: Path, stamps: Float[np.ndarray, " n"]) -> Float[np.ndarray, 
 DATASET = Dataset(
     name="blackbird",
     read=read,
+    recordings=recordings,
     splits=SPLITS,
     rate=RATE,
     source="https://github.com/mit-aera/Blackbird-Dataset",

@@ -11,6 +11,7 @@ not valid.
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -21,12 +22,13 @@ from jaxtyping import Float
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d
 
+from gnio_jax.data.recordings import read_all, single
 from gnio_jax.data.sequence import (
     Dataset,
+    Recording,
     check_finite,
     check_gaps,
     check_increasing,
-    keep_plausible,
     read_hdf5,
     resample,
     validate,
@@ -49,16 +51,18 @@ def read(root: Path, split: str) -> list[Sequence]:
 
     Those that have a reference pass the physical self-check or are named and left out.
     """
-    sequences = [read_recording(path) for path in _files(Path(root), split)]
-    checked = [sequence for sequence in sequences if sequence.valid.any()]
-    bare = [sequence for sequence in sequences if not sequence.valid.any()]
-    try:
-        kept = keep_plausible(checked, pedestrian=DATASET.pedestrian) if checked else []
-    except InputError:
-        if not bare:
-            raise
-        kept = []  # each was named in a warning
-    return sorted([*kept, *bare], key=lambda sequence: sequence.name)
+    return sorted(read_all(DATASET, Path(root), split), key=lambda sequence: sequence.name)
+
+
+def recordings(root: Path, split: str) -> list[Recording]:
+    """The recordings of a split."""
+    return [single(path.stem, read_recording, path) for path in _files(Path(root), split)]
+
+
+def list_splits(root: Path) -> tuple[str, ...]:
+    """The splits that the lists <root>/<split>.txt name; `test` alone where there is none."""
+    lists = {path.stem for path in root.glob("*.txt") if re.fullmatch("[a-z][a-z0-9_]*", path.stem)}
+    return (*(split for split in SPLITS if split in lists), *sorted(lists - set(SPLITS))) or ("test",)
 
 
 def read_recording(path: str | os.PathLike[str]) -> Sequence:
@@ -114,9 +118,9 @@ def in_order(
 
 
 def _files(root: Path, split: str) -> list[Path]:
-    if split not in SPLITS:
-        raise InputError(root, f"unknown split '{split}'", f"known splits: {', '.join(SPLITS)}")
-    if any((root / f"{name}.txt").is_file() for name in SPLITS):
+    if split not in SPLITS and not (root / f"{split}.txt").is_file():
+        raise InputError(root, f"unknown split '{split}'", f"known splits: {', '.join(SPLITS)}, or that of a list {split}.txt there")
+    if split not in SPLITS or any((root / f"{name}.txt").is_file() for name in SPLITS):
         return listed(root / f"{split}.txt", lambda entry: _find(root, entry), root, DATASET.layout)
     paths = sorted(path for path in root.glob("*") if path.suffix.lower() in _FILES and path.is_file())
     if not paths:
@@ -460,10 +464,13 @@ def _note_gravity(time: np.ndarray, accel: np.ndarray, path: Path, notes: list[s
 DATASET = Dataset(
     name="csv",
     read=read,
+    recordings=recordings,
     splits=SPLITS,
     rate=100.0,
     source="your own recordings (python -m gnio_jax.data import brings a logger's CSV into this form)",
     layout="<root>/*.csv (time, gyro_x..z, accel_x..z[, qw..qz][, px..pz][, vx..vz]) or *.h5; optionally <root>/{train,val,test}.txt",
     licence="yours",
     pedestrian=False,
+    needs_reference=False,
+    list_splits=list_splits,
 )

@@ -37,13 +37,14 @@ from scipy.spatial.transform import Rotation, RotationSpline, Slerp
 from gnio_jax.data.alignment import follow, integrate_gyro, smooth_positions
 from gnio_jax.data.cache import cached
 from gnio_jax.data.csv import in_order
+from gnio_jax.data.recordings import read_all, single
 from gnio_jax.data.sequence import (
     Dataset,
+    Recording,
     check_finite,
     check_gaps,
     check_rate,
     check_unit_norm,
-    keep_plausible,
     quaternions,
     resample,
     rotations,
@@ -93,18 +94,28 @@ _AXES = {
 
 def read(root: Path, split: str, dataset: str = "euroc") -> list[Sequence]:
     """The sequences of a split, those that fail the physical self-check named and left out."""
+    return read_all(_about(dataset), Path(root), split)
+
+
+def recordings(root: Path, split: str, dataset: str = "euroc") -> list[Recording]:
+    """The recordings of a split."""
     if split not in SPLITS:
         raise InputError(root, f"unknown split '{split}'", f"known splits: {', '.join(SPLITS)}")
-    about = next(entry for entry in DATASETS if entry.name == dataset)
+    about = _about(dataset)
     known = EUROC_SPLITS if dataset == "euroc" else TUMVI_SPLITS
     wanted = "test" if split == "seen" else split
     chosen = [folder for name, folder in find_sequences(Path(root), about).items() if _split_of(name, known) == wanted]
     if not chosen:
         raise InputError(root, f"holds no sequence of split '{split}'", f"its sequences are {', '.join(known[wanted])}")
-    return keep_plausible([_cached(folder, about) for folder in chosen], pedestrian=about.pedestrian)
+    return [single(short_name(folder.name), _cached, folder, dataset) for folder in chosen]
 
 
-def _cached(folder: Path, about: Dataset) -> Sequence:
+def _about(dataset: str) -> Dataset:
+    return next(entry for entry in DATASETS if entry.name == dataset)
+
+
+def _cached(folder: Path, dataset: str) -> Sequence:
+    about = _about(dataset)
     sensors = [folder / "mav0" / sensor for sensor in ("imu0", *_REFERENCES)]
     sources = [path for sensor in sensors for path in (sensor / "data.csv", sensor / "sensor.yaml") if path.is_file()]
     return cached(sources, f"{VERSION} {about.name}", lambda: read_sequence(folder, about))
@@ -346,6 +357,7 @@ def _splined(at: np.ndarray, seen: np.ndarray, position: np.ndarray, straight: n
 EUROC = Dataset(
     name="euroc",
     read=partial(read, dataset="euroc"),
+    recordings=partial(recordings, dataset="euroc"),
     splits=SPLITS,
     rate=RATE,
     source="https://projects.asl.ethz.ch/datasets/euroc-mav/",
@@ -356,6 +368,7 @@ EUROC = Dataset(
 TUMVI = Dataset(
     name="tumvi",
     read=partial(read, dataset="tumvi"),
+    recordings=partial(recordings, dataset="tumvi"),
     splits=SPLITS,
     rate=RATE,
     source="https://cvg.cit.tum.de/data/datasets/visual-inertial-dataset (exported Euroc / DSO 512x512)",

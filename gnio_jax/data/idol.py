@@ -28,9 +28,11 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
 from gnio_jax.data.cache import Refusal, cached
-from gnio_jax.data.phones import held_out, keep_walks, longest_piece, poses_at, with_velocity
+from gnio_jax.data.phones import held_out, longest_piece, poses_at, with_velocity
+from gnio_jax.data.recordings import read_all, single
 from gnio_jax.data.sequence import (
     Dataset,
+    Recording,
     check_finite,
     check_rate,
     check_unit_norm,
@@ -62,6 +64,11 @@ _FILTER_SECONDS = 0.05
 
 def read(root: Path, split: str) -> list[Sequence]:
     """The sequences of a split; those that are of no use or fail the physical self-check are named and left out. Raises `InputError`."""
+    return read_all(DATASET, Path(root), split)
+
+
+def recordings(root: Path, split: str) -> list[Recording]:
+    """The walks of a split."""
     root = Path(root)
     if split not in _SPLITS:
         raise InputError(root, f"unknown split '{split}'", f"known splits: {', '.join(_SPLITS)}")
@@ -74,18 +81,7 @@ def read(root: Path, split: str) -> list[Sequence]:
         if not chosen:
             raise InputError(root, f"split '{split}' would be empty: {len(held)} recordings are held out for validation",
                              "complete the data, or choose another split")
-    sequences = []
-    for walk in chosen:
-        try:
-            sequence = cached([walk.path], VERSION, lambda walk=walk: read_sequence(walk.path))
-        except Refusal as refusal:
-            warnings.warn(f"{walk.name}: left out: {refusal}", stacklevel=2)
-            continue
-        about = {"subject": walk.subject, "group": walk.subject, "calibration": walk.calibration, **note}
-        sequences.append(sequence._replace(attributes=sequence.attributes | about))
-    if not sequences:
-        raise InputError(root, f"none of the {len(chosen)} recordings of split '{split}' can be used", "see the warnings above")
-    return keep_walks(sequences)
+    return [single(walk.name, _cached, walk, note) for walk in chosen]
 
 
 class Walk(NamedTuple):
@@ -100,6 +96,12 @@ class Walk(NamedTuple):
     @property
     def name(self) -> str:
         return _name(self.path)
+
+
+def _cached(walk: Walk, note: dict[str, Any]) -> Sequence:
+    sequence = cached([walk.path], VERSION, lambda: read_sequence(walk.path))
+    about = {"subject": walk.subject, "group": walk.subject, "calibration": walk.calibration, **note}
+    return sequence._replace(attributes=sequence.attributes | about)
 
 
 def find_walks(root: Path, folder: str) -> list[Walk]:
@@ -304,9 +306,11 @@ def _name(path: Path) -> str:
 DATASET = Dataset(
     name="idol",
     read=read,
+    recordings=recordings,
     splits=tuple(_SPLITS),
     rate=RATE,
     source="https://zenodo.org/records/4484093",
     layout="<root>/building{1,2,3}/{train,known,unknown}/<k>.feather with metadata.json beside them",
     licence="CC BY 4.0",
+    min_correlation=None,  # the authors' positions are smoothed: no gait is left in them
 )

@@ -28,6 +28,7 @@ import re
 import warnings
 import zipfile
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -37,16 +38,16 @@ from scipy.ndimage import binary_dilation
 from scipy.spatial.transform import Rotation
 
 from gnio_jax.data.csv import in_order
+from gnio_jax.data.recordings import read_all, single
 from gnio_jax.data.sequence import (
     Dataset,
+    Recording,
     check_finite,
     check_gaps,
     check_increasing,
     check_rate,
-    keep_plausible,
     quaternions,
     resample,
-    rotations,
     validate,
 )
 from gnio_jax.types import InputError, Sequence
@@ -84,16 +85,23 @@ class Drive(NamedTuple):
 
 def read(root: Path, split: str) -> list[Sequence]:
     """The sequences of a split, those that fail the physical self-check named and left out."""
+    return read_all(DATASET, Path(root), split)
+
+
+def recordings(root: Path, split: str) -> list[Recording]:
+    """The drives of a split, or their pieces where these are files of their own."""
     if split not in SPLITS:
         raise InputError(root, f"unknown split '{split}'", f"known splits: {', '.join(SPLITS)}")
-    sequences = []
+    found = []
     for drive in find_drives(Path(root)):
-        if share_of(drive.name) == split:
-            sequences += read_packets(drive.oxts) if drive.oxts else [read_piece(path) for path in drive.pieces]
-    if not sequences:
+        if share_of(drive.name) == split and drive.oxts:
+            found.append(Recording(drive.name, partial(read_packets, drive.oxts)))
+        elif share_of(drive.name) == split:
+            found += [single(_piece_name(path), read_piece, path) for path in drive.pieces]
+    if not found:
         raise InputError(root, f"none of its drives falls into split '{split}'",
                          "drives are drawn by their names; take another split or more drives")
-    return plausible(sequences)
+    return found
 
 
 def share_of(drive: str) -> str:
@@ -129,23 +137,6 @@ def find_drives(root: Path) -> list[Drive]:
     if not drives:
         raise InputError(root, "holds no drive of KITTI", f"expected layout: {DATASET.layout}")
     return drives
-
-
-def plausible(sequences: list[Sequence]) -> list[Sequence]:
-    """The sequences that pass the physical self-check.
-
-    A car that ends faster than it began accelerates in the mean, by 1 m/s² over some seconds, and the self-check would take that for
-    a tilt: it is shown the specific force without it.
-    """
-    shown = []
-    for sequence in sequences:
-        rows = np.flatnonzero(sequence.valid)
-        mean = np.zeros(3)
-        if rows.size > 1:
-            mean = (sequence.velocity[rows[-1]] - sequence.velocity[rows[0]]) / (sequence.time[rows[-1]] - sequence.time[rows[0]])
-        shown.append(sequence._replace(accel=sequence.accel - rotations(sequence.orientation).inv().apply(mean)))
-    kept = {sequence.name for sequence in keep_plausible(shown, pedestrian=DATASET.pedestrian)}
-    return [sequence for sequence in sequences if sequence.name in kept]
 
 
 # --- text packets ----------------------------------------------------------------------------------------------------
@@ -270,8 +261,12 @@ def read_piece(path: str | os.PathLike[str]) -> Sequence:
     check_increasing(time, path)
     check_rate(time, RATE, path)
     check_gaps(time, path)
-    return _sequence(re.sub(r"^(train|val|test)__", "", path.stem), time, values["u"][:, :3], values["u"][:, 3:],
+    return _sequence(_piece_name(path), time, values["u"][:, :3], values["u"][:, 3:],
                      Rotation.from_euler("ZYX", values["ang_gt"][:, ::-1]), values["p_gt"], values["v_gt"], _drive_of(path), path, {})
+
+
+def _piece_name(path: Path) -> str:
+    return re.sub(r"^(train|val|test)__", "", path.stem)
 
 
 # --- both ------------------------------------------------------------------------------------------------------------
@@ -310,6 +305,7 @@ def _jumps(sequence: Sequence) -> np.ndarray:
 DATASET = Dataset(
     name="kitti",
     read=read,
+    recordings=recordings,
     splits=SPLITS,
     rate=RATE,
     source="https://www.cvlibs.net/datasets/kitti/raw_data.php (the unsynced+unrectified, _extract, archives)",

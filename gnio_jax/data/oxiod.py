@@ -43,7 +43,8 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from gnio_jax.data.alignment import Track, align, align_heading, follow, follow_acceleration, integrate_gyro, smooth_positions
 from gnio_jax.data.cache import Refusal, cached
-from gnio_jax.data.sequence import Dataset, check_units, keep_plausible, quaternions, validate
+from gnio_jax.data.recordings import single
+from gnio_jax.data.sequence import Dataset, Recording, check_units, keep_plausible, quaternions, validate
 from gnio_jax.types import STANDARD_G, InputError, Sequence
 
 RATE = 100.0
@@ -534,16 +535,34 @@ def read(root: Path, split: str) -> list[Sequence]:
     Recordings that are ruined or fail the self-check are left out with a warning. Raises `InputError` when the split is unknown or
     empty, or the root holds no recording.
     """
-    root = Path(root)
+    chosen = _chosen(Path(root), split)
+    sequences = _build_all(chosen)
+    if not sequences:
+        raise InputError(root, f"none of the {len(chosen)} recordings of split '{split}' can be used", "see the warnings above")
+    return keep_plausible(sequences, DATASET.pedestrian, DATASET.min_correlation)
+
+
+def recordings(root: Path, split: str) -> list[Recording]:
+    """The walks of a split."""
+    return [single(walk.name, _build_one, walk) for walk in _chosen(Path(root), split)]
+
+
+def _build_one(walk: Walk) -> Sequence:
+    sequence, reasons = build_walk(walk)
+    if sequence is None:
+        raise Refusal(walk.name, "; ".join(reasons))
+    for reason in reasons:
+        warnings.warn(f"{walk.name}: syn is used: {reason}", stacklevel=2)
+    return sequence
+
+
+def _chosen(root: Path, split: str) -> list[Walk]:
     if split not in SPLITS:
         raise InputError(f"split '{split}'", "OxIOD has no such split", f"it has {', '.join(SPLITS)}")
     chosen = select(find_walks(root), split, root)
     if not chosen:
         raise InputError(root, f"no recording of split '{split}' is present", "see the warnings above, or choose another split")
-    sequences = _build_all(chosen)
-    if not sequences:
-        raise InputError(root, f"none of the {len(chosen)} recordings of split '{split}' can be used", "see the warnings above")
-    return keep_plausible(sequences)
+    return chosen
 
 
 def select(walks: list[Walk], split: str, root: Path) -> list[Walk]:
@@ -699,6 +718,7 @@ def _build_all(walks: list[Walk]) -> list[Sequence]:
 DATASET = Dataset(
     name="oxiod",
     read=read,
+    recordings=recordings,
     splits=SPLITS,
     rate=RATE,
     source="http://deepio.cs.ox.ac.uk",

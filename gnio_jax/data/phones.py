@@ -15,8 +15,8 @@ from scipy.ndimage import binary_dilation
 from scipy.spatial.transform import Rotation, RotationSpline, Slerp
 
 from gnio_jax.data.alignment import smooth_positions
-from gnio_jax.data.sequence import WINDOW_SECONDS, self_check
-from gnio_jax.types import InputError, Sequence
+from gnio_jax.data.sequence import WINDOW_SECONDS
+from gnio_jax.types import Sequence
 
 JUMP_SPEED = 6.0
 """m/s: faster than this not a person walks but a visual odometry that relocalises."""
@@ -119,23 +119,3 @@ def with_velocity(sequence: Sequence) -> Sequence:
     jumps = np.concatenate([fast, [False]]) | np.concatenate([[False], fast])
     good = sequence.valid & np.logical_not(binary_dilation(jumps, iterations=max(round(0.1 / step), 1)))
     return sequence._replace(velocity=smooth_positions(sequence.position, good, step)[1], valid=good)
-
-
-def keep_walks(sequences: list[Sequence]) -> list[Sequence]:
-    """`keep_plausible` for positions that do not carry the IMU's own accelerations, being another body's or heavily smoothed.
-
-    Gravity, gyro and speed must agree as ever; that accelerations do not correlate is no failure here. Raises `InputError` when
-    none is left.
-    """
-    kept = []
-    for sequence in sequences:
-        failures = self_check(sequence, min_correlation=-1.0).failures
-        if failures:
-            warnings.warn(f"{sequence.name}: left out by the self-check: {'; '.join(failures)}", stacklevel=3)
-        else:
-            kept.append(sequence)
-    if not kept:
-        raise InputError(", ".join(sequence.name for sequence in sequences[:3]) or "no sequence",
-                         f"none of {len(sequences)} sequences passes the physical self-check",
-                         "see the warnings above; check units, frames and time offset of the recordings")
-    return kept

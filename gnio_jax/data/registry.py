@@ -61,7 +61,7 @@ def load(name: str, root: str | os.PathLike[str] | None = None, split: str = "te
     Raises `InputError` on an unknown name or split, a missing folder, or a split without a sequence.
     """
     dataset = get(name)
-    if split not in dataset.splits:
+    if split not in dataset.splits and dataset.list_splits is None:
         close = difflib.get_close_matches(split, dataset.splits, n=1)
         hint = f"did you mean '{close[0]}'? " if close else ""
         raise InputError(f"dataset {name}", f"unknown split '{split}'", f"{hint}known splits: {', '.join(dataset.splits)}")

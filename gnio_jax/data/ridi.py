@@ -24,13 +24,14 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from gnio_jax.data.phones import find_folders, find_list, held_out, longest_piece, poses_at, with_velocity
+from gnio_jax.data.recordings import read_all, single
 from gnio_jax.data.sequence import (
     WINDOW_SECONDS,
     Dataset,
+    Recording,
     check_finite,
     check_rate,
     check_unit_norm,
-    keep_plausible,
     quaternions,
     resample,
     rotations,
@@ -50,6 +51,7 @@ MAX_GAP = 0.1
 _TABLE = Path("processed") / "data.csv"
 _LISTS = {"train": "list_train_publish_v2.txt", "val": "list_train_publish_v2.txt", "test": "list_test_publish_v2.txt",
           "seen": "list_test_publish_v2.txt", "unseen": "list_crosssubject.txt"}
+SPLITS = (*_LISTS, "all")
 _PLACEMENTS = {"handheld": "handheld", "leg": "pocket", "bag": "bag", "body": "body"}
 _Y_UP = Rotation.from_matrix([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 _POSES = (("android_sensor_pose.txt", _Y_UP), ("pose.txt", Rotation.identity()))
@@ -58,12 +60,22 @@ _POSES = (("android_sensor_pose.txt", _Y_UP), ("pose.txt", Rotation.identity()))
 def read(root: Path, split: str) -> list[Sequence]:
     """The sequences of a split (`seen` is `test`), those that fail the physical self-check named and left out. Raises `InputError`.
 
-    `unseen` is the authors' cross-subject list. Recordings that are in no list are in no split.
+    `unseen` is the authors' cross-subject list. Recordings that are in no list are in no split but `all`, every recording below the
+    root, which needs no list.
     """
+    return read_all(DATASET, Path(root), split)
+
+
+def recordings(root: Path, split: str) -> list[Recording]:
+    """The recordings of a split that are present, wherever below the root."""
     root = Path(root)
-    if split not in _LISTS:
-        raise InputError(root, f"unknown split '{split}'", f"known splits: {', '.join(_LISTS)}")
+    if split not in SPLITS:
+        raise InputError(root, f"unknown split '{split}'", f"known splits: {', '.join(SPLITS)}")
     folders = find_folders(root, _is_recording)
+    if split == "all":
+        if not folders:
+            raise InputError(root, "holds no recording of RIDI", f"expected layout: {DATASET.layout}")
+        return [single(name, read_sequence, folder) for name, folder in sorted(folders.items())]
     path = find_list(root, _LISTS[split])
     chosen = listed(path, lambda entry: folders.get(_name(entry)), root, DATASET.layout)
     held: set[str] = set()
@@ -73,11 +85,13 @@ def read(root: Path, split: str) -> list[Sequence]:
         if not chosen:
             raise InputError(path, f"split '{split}' would be empty: {len(held)} sequences of this list are held out for validation",
                              "complete the data, or choose another split")
-    sequences = [read_sequence(folder) for folder in chosen]
-    if split in ("train", "val"):
-        note = ", ".join(sorted({_subject(name) for name in held}))
-        sequences = [sequence._replace(attributes=sequence.attributes | {"held_out": note}) for sequence in sequences]
-    return keep_plausible(sequences, pedestrian=DATASET.pedestrian)
+    note = {"held_out": ", ".join(sorted({_subject(name) for name in held}))} if split in ("train", "val") else {}
+    return [single(folder.name, _with_note, folder, note) for folder in chosen]
+
+
+def _with_note(folder: Path, note: dict[str, str]) -> Sequence:
+    sequence = read_sequence(folder)
+    return sequence._replace(attributes=sequence.attributes | note)
 
 
 def held_out_of_train(path: str | os.PathLike[str]) -> set[str]:
@@ -243,7 +257,8 @@ def _subject(name: str) -> str:
 DATASET = Dataset(
     name="ridi",
     read=read,
-    splits=tuple(_LISTS),
+    recordings=recordings,
+    splits=SPLITS,
     rate=RATE,
     source="https://github.com/higerra/ridi_imu (its README links the data, ridi_data_publish_v2.zip)",
     layout="<root>/**/<sequence>/{processed/data.csv or acce.txt,gyro.txt,pose.txt,orientation.txt} and "

@@ -22,9 +22,11 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from gnio_jax.data.phones import find_folders, find_list, keep_walks, with_velocity
+from gnio_jax.data.phones import find_folders, find_list, with_velocity
+from gnio_jax.data.recordings import read_all, single
 from gnio_jax.data.sequence import (
     Dataset,
+    Recording,
     check_finite,
     check_gaps,
     check_increasing,
@@ -52,13 +54,17 @@ _ERRORS = {"gyro_integration": "gyro_integration_error", "game_rv": "grv_ori_err
 
 def read(root: Path, split: str) -> list[Sequence]:
     """The sequences of a split (`test` is `seen`), those that fail the physical self-check named and left out. Raises `InputError`."""
+    return read_all(DATASET, Path(root), split)
+
+
+def recordings(root: Path, split: str) -> list[Recording]:
+    """The recordings of a split's list that are present, wherever below the root."""
     root = Path(root)
     if split not in _LISTS:
         raise InputError(root, f"unknown split '{split}'", f"known splits: {', '.join(_LISTS)}")
     folders = find_folders(root, lambda folder: (folder / _TABLE).is_file())
     chosen = listed(find_list(root, _LISTS[split]), folders.get, root, DATASET.layout)
-    # The chest's accelerations are not the phone's.
-    return keep_walks([read_sequence(folder, choose=split in ("train", "val")) for folder in chosen])
+    return [single(folder.name, read_sequence, folder, choose=split in ("train", "val")) for folder in chosen]
 
 
 def read_sequence(folder: str | os.PathLike[str], choose: bool = False) -> Sequence:
@@ -199,9 +205,11 @@ def _number(info: dict[str, Any], name: str, folder: Path) -> float:
 DATASET = Dataset(
     name="ronin",
     read=read,
+    recordings=recordings,
     splits=tuple(_LISTS),
     rate=RATE,
     source="https://ronin.cs.sfu.ca (half of it is public; the lists are in https://github.com/Sachini/ronin)",
     layout="<root>/**/<sequence>/{data.hdf5,info.json} and <root>/lists/list_{train,val,test_seen,test_unseen}.txt",
     licence="RoNIN data licence: non-commercial research only",
+    min_correlation=None,  # the chest's accelerations are not the phone's
 )

@@ -26,6 +26,16 @@ WINDOW_SECONDS = 1.0
 """A hole in the IMU longer than the network's window is no jitter: loaders refuse it."""
 
 
+class Recording(NamedTuple):
+    """One recording that was found, but not yet read."""
+
+    name: str
+    """Unique within a dataset; that of its sequence, if it yields one."""
+    read: Callable[[], list[Sequence]]
+    """Its sequences, validated, not yet self-checked: one, or the pieces between its gaps. Can be sent to another process.
+    Raises `InputError`."""
+
+
 @dataclass(frozen=True)
 class Dataset:
     """What the registry knows of one dataset; every loader module ends with `DATASET = Dataset(...)`."""
@@ -33,7 +43,9 @@ class Dataset:
     name: str
     """The name of `--dataset`."""
     read: Callable[[Path, str], list[Sequence]]
-    """(root, split) -> sequences at the native rate, validated. Raises `InputError`."""
+    """(root, split) -> sequences at the native rate, validated, that pass the self-check. Raises `InputError`."""
+    recordings: Callable[[Path, str], list[Recording]]
+    """(root, split) -> what `read` would read. Raises `InputError`."""
     splits: tuple[str, ...]
     """Splits that `read` knows."""
     rate: float
@@ -48,6 +60,16 @@ class Dataset:
     """False for a dataset that is made, not read."""
     pedestrian: bool = True
     """False for drones and vehicles: no speed is implausible then."""
+    min_correlation: float | None = 0.3
+    """What the self-check asks of the horizontal accelerations; None where positions are those of another body, or smoothed."""
+    needs_reference: bool = True
+    """False where recordings without any reference are of use."""
+    list_splits: Callable[[Path], tuple[str, ...]] | None = None
+    """Where the root's own lists name the splits: root -> splits, of which there may be others than `splits`."""
+
+    def splits_at(self, root: Path) -> tuple[str, ...]:
+        """The splits that may be asked for at this root."""
+        return self.list_splits(root) if self.list_splits else self.splits
 
 
 class SelfCheck(NamedTuple):
@@ -58,9 +80,10 @@ class SelfCheck(NamedTuple):
     rate: float
     """Hz, from the median interval."""
     gravity_mean: Float[np.ndarray, "3"]
-    """Mean of R·accel in the world, m/s²: (0, 0, 9.81) for anything that ends about as fast as it began."""
+    """Mean of R·accel in the world less the mean acceleration of the reference, (v_end − v_start)/T, m/s²: (0, 0, 9.81)."""
     gyro_consistency_degrees: float
-    """Median angle between gyro-integrated and reference rotation over 10 s windows, one constant bias removed."""
+    """Median angle between gyro-integrated and reference rotation over 10 s windows, one constant bias removed. NaN for what is
+    shorter than two windows: the bias would take up whatever is wrong."""
     median_speed: float
     """m/s."""
     accel_correlation_horizontal: float
@@ -306,14 +329,15 @@ def self_check(
     max_gravity_error: float = 0.5,
     max_gyro_degrees: float = 5.0,
     max_speed: float = 3.0,
-    min_correlation: float = 0.3,
+    min_correlation: float | None = 0.3,
 ) -> SelfCheck:
     """Do IMU and reference describe the same motion? `sequence` must be on a uniform clock.
 
-    Fails: mean of R·accel off (0, 0, 9.81) by `max_gravity_error` m/s²; gyro off the reference orientation by more than
-    `max_gyro_degrees` in the median window; a pedestrian whose median speed exceeds `max_speed` m/s; a horizontal
-    acceleration above 0.2 m/s² rms that correlates with that of the positions by less than `min_correlation`.
-    Standing still is no failure: it is what the gate is for.
+    Fails: mean of R·accel off (0, 0, 9.81) and the reference's own mean acceleration by `max_gravity_error` m/s²; gyro off
+    the reference orientation by more than `max_gyro_degrees` in the median window; a pedestrian whose median speed exceeds
+    `max_speed` m/s; a horizontal acceleration above 0.2 m/s² rms that correlates with that of the positions by less than
+    `min_correlation` (None asks for nothing). Standing still is no failure: it is what the gate is for. Neither is being too
+    short for the gyro's windows.
     """
     time, valid = sequence.time, sequence.valid
     step = float(np.median(np.diff(time)))
@@ -323,39 +347,58 @@ def self_check(
         return SelfCheck(gravity_mean=nothing, gyro_consistency_degrees=np.nan, median_speed=np.nan,
                          accel_correlation_horizontal=np.nan, failures=("no sample has a valid reference",), **figures)
 
-    # Invalid rows take the last valid attitude: they are left out of every mean and only bridge the gyro windows.
-    held = np.maximum.accumulate(np.where(valid, np.arange(len(valid)), int(np.argmax(valid))))
-    attitude = sequence.orientation[held]
-    force = rotations(attitude).apply(sequence.accel)
-    gravity_mean = force[valid].mean(axis=0)
+    force = rotations(_held_attitude(sequence)).apply(sequence.accel)
+    gravity_mean = force[valid].mean(axis=0) - _mean_acceleration(sequence, step)
     speed = float(np.median(np.linalg.norm(sequence.velocity[valid], axis=1)))
-    gyro_degrees = _gyro_consistency(sequence, attitude, step, window_seconds)
+    starts, gyro_errors = gyro_windows(sequence, window_seconds)
+    # Windows that overlap throughout are one window, and one bias explains one window whatever it holds.
+    apart = starts.size > 0 and float(np.ptp(starts)) > window_seconds - 0.5 * step
+    gyro_degrees = float(np.median(gyro_errors)) if apart else float("nan")
     correlation, strength = _accel_correlation(sequence, force, step)
 
     failures = []
     off = float(np.linalg.norm(gravity_mean - [0.0, 0.0, GRAVITY]))
     if not off <= max_gravity_error:
         failures.append(f"mean of R·accel is ({', '.join(f'{value:.2f}' for value in gravity_mean)}) m/s², off (0, 0, 9.81) by {off:.2f}")
-    if np.isnan(gyro_degrees):
+    if not starts.size and time[-1] - time[0] >= 2.0 * window_seconds:
         failures.append(f"no window of {window_seconds:g} s has a valid reference at its ends")
     elif gyro_degrees > max_gyro_degrees:
         failures.append(f"gyro is off the reference orientation by {gyro_degrees:.1f}° in the median window of {window_seconds:g} s")
     if pedestrian and speed > max_speed:
         failures.append(f"median speed is {speed:.1f} m/s, too fast for a pedestrian")
-    if strength > 0.2 and not correlation >= min_correlation:  # NaN when the positions do not move at all
+    if min_correlation is not None and strength > 0.2 and not correlation >= min_correlation:  # NaN when the positions do not move at all
         failures.append(f"horizontal acceleration of the positions correlates by only {correlation:.2f} with R·accel")
     return SelfCheck(gravity_mean=gravity_mean, gyro_consistency_degrees=gyro_degrees, median_speed=speed,
                      accel_correlation_horizontal=correlation, failures=tuple(failures), **figures)
 
 
-def _gyro_consistency(sequence: Sequence, attitude: np.ndarray, step: float, window_seconds: float) -> float:
-    """Median angle (degrees) over windows that start every half window, after the one bias that explains most of them."""
-    n = len(sequence.time)
+def _held_attitude(sequence: Sequence) -> np.ndarray:
+    """Invalid rows take the last valid attitude: they are left out of every mean and only bridge the gyro's windows."""
+    valid = sequence.valid
+    return sequence.orientation[np.maximum.accumulate(np.where(valid, np.arange(len(valid)), int(np.argmax(valid))))]
+
+
+def _mean_acceleration(sequence: Sequence, step: float) -> Float[np.ndarray, "3"]:
+    """Of the reference over the stretches that are valid, by its velocities at their ends."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], sequence.valid, [False]])))
+    first, last = edges[::2], edges[1::2] - 1
+    seconds = float((last - first).sum()) * step
+    gained = (sequence.velocity[last] - sequence.velocity[first]).sum(axis=0)
+    return gained / seconds if seconds > 0 else np.zeros(3)
+
+
+def gyro_windows(sequence: Sequence, window_seconds: float = 10.0) -> tuple[Float[np.ndarray, "w"], Float[np.ndarray, "w"]]:
+    """(start s, degrees) of windows that start every half window: the angle between the rotation integrated from the gyro and the
+    reference's, after the one constant bias that explains most of them. A recording shorter than a window is one."""
+    time, valid = sequence.time, sequence.valid
+    step = float(np.median(np.diff(time)))
+    n = len(time)
     length = min(round(window_seconds / step), n - 1)
     starts = np.arange(0, n - length, max(length // 2, 1))
-    starts = starts[sequence.valid[starts] & sequence.valid[starts + length]]
+    starts = starts[valid[starts] & valid[starts + length]]
     if not starts.size:
-        return float("nan")
+        return np.zeros(0), np.zeros(0)
+    attitude = _held_attitude(sequence)
     rotation = rotations(attitude).as_matrix()
     reference = rotations(attitude[starts]).inv() * rotations(attitude[starts + length])
     # exp(J b) R ≈ rotation integrated from gyro + b, J = R_startᵀ Σ R_k dt
@@ -375,7 +418,7 @@ def _gyro_consistency(sequence: Sequence, attitude: np.ndarray, step: float, win
             correction = np.linalg.lstsq(normal, np.einsum("w,wji,wj->i", weight, jacobian, error), rcond=1e-9)[0]
         bias = bias + correction
     error = (_product((middle - bias) * step, samples) * reference.inv()).as_rotvec()
-    return float(np.degrees(np.median(np.linalg.norm(error, axis=1))))
+    return time[starts], np.degrees(np.linalg.norm(error, axis=1))
 
 
 def _product(angles: np.ndarray, samples: np.ndarray) -> Rotation:
@@ -416,14 +459,28 @@ def _accel_correlation(sequence: Sequence, force: np.ndarray, step: float) -> tu
     return (float((geometric * inertial).sum()) / scale if scale > 0 else float("nan")), strength
 
 
-def keep_plausible(sequences: list[Sequence], pedestrian: bool = True) -> list[Sequence]:
-    """The sequences that pass `self_check`; the others are named, with the reason, in one warning each.
+def judge(
+    sequence: Sequence, pedestrian: bool = True, min_correlation: float | None = 0.3, needs_reference: bool = True
+) -> SelfCheck:
+    """`self_check` by what its dataset asks (see `Dataset`). What a converted recording brings along as `check_pedestrian` and
+    `check_min_correlation` wins: its own dataset asked it."""
+    pedestrian = bool(sequence.attributes.get("check_pedestrian", pedestrian))
+    asked = sequence.attributes.get("check_min_correlation", min_correlation)
+    check = self_check(sequence, pedestrian, min_correlation=None if asked is None or asked <= -1.0 else float(asked))
+    return check if needs_reference or sequence.valid.any() else check._replace(failures=())
+
+
+def keep_plausible(
+    sequences: list[Sequence], pedestrian: bool = True, min_correlation: float | None = 0.3, needs_reference: bool = True
+) -> list[Sequence]:
+    """The sequences that pass `self_check`; the others are named, with the reason, in one warning each. The options are those of
+    `Dataset`.
 
     Raises `InputError` when none is left.
     """
     kept, refused = [], []
     for sequence in sequences:
-        failures = self_check(sequence, pedestrian).failures
+        failures = judge(sequence, pedestrian, min_correlation, needs_reference).failures
         if failures:
             warnings.warn(f"{sequence.name}: left out by the self-check: {'; '.join(failures)}", stacklevel=2)
             refused.append(sequence.name)

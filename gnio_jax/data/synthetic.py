@@ -21,7 +21,8 @@ from scipy.interpolate import make_interp_spline
 from scipy.signal import fftconvolve
 from scipy.spatial.transform import Rotation
 
-from gnio_jax.data.sequence import Dataset, quaternions
+from gnio_jax.data.recordings import single
+from gnio_jax.data.sequence import Dataset, Recording, quaternions
 from gnio_jax.types import GRAVITY, InputError, Sequence
 
 
@@ -164,7 +165,7 @@ def pedestrian(
         attributes[f"gyro_bias_{letter}"] = float(gyro_bias[axis])
         attributes[f"accel_bias_{letter}"] = float(accel_bias[axis])
     return Sequence(
-        name=f"synthetic_{seed}_{placement}",
+        name=_name(placement, seed),
         time=time[:-1],
         gyro=gyro,
         accel=accel,
@@ -179,19 +180,32 @@ def pedestrian(
 
 def read(root: Path | None, split: str) -> list[Sequence]:
     """The sequences of a split, always the same ones; `root` is not used."""
+    return [sequence for recording in recordings(root, split) for sequence in recording.read()]
+
+
+def recordings(root: Path | None, split: str) -> list[Recording]:
+    """The walks of a split, not yet computed."""
     del root
     if split not in _SPLITS:
         raise InputError("synthetic", f"unknown split '{split}'", f"known splits: {', '.join(_SPLITS)}")
     seed, first_person, people, count, seconds = _SPLITS[split]
     placements = list(PLACEMENTS)
-    sequences = []
+    walks = []
     for index in range(count):
         who = first_person + index % people
         # Shifted by one per round of people, so that nobody carries the phone in one place only.
         where = placements[(index + index // people) % len(placements)]
-        sequence = pedestrian(seed + index, person(who), where, seconds)
-        sequences.append(sequence._replace(attributes={**sequence.attributes, "subject": f"person {who}"}))
-    return sequences
+        walks.append(single(_name(where, seed + index), _walk, seed + index, who, where, seconds))
+    return walks
+
+
+def _name(placement: str, seed: int) -> str:
+    return f"synthetic_{seed}_{placement}"
+
+
+def _walk(seed: int, who: int, where: str, seconds: float) -> Sequence:
+    sequence = pedestrian(seed, person(who), where, seconds)
+    return sequence._replace(attributes={**sequence.attributes, "subject": f"person {who}"})
 
 
 def _plan(rng: np.random.Generator, time: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -291,6 +305,7 @@ def _integral(time: np.ndarray, values: np.ndarray) -> np.ndarray:
 DATASET = Dataset(
     name="synthetic",
     read=read,
+    recordings=recordings,
     splits=tuple(_SPLITS),
     rate=200.0,
     source="computed by gnio_jax.data.synthetic",

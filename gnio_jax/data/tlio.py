@@ -16,14 +16,15 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from gnio_jax.data.recordings import read_all, single
 from gnio_jax.data.sequence import (
     Dataset,
+    Recording,
     check_finite,
     check_gaps,
     check_increasing,
     check_rate,
     check_unit_norm,
-    keep_plausible,
     rotations,
     validate,
 )
@@ -46,7 +47,12 @@ _COLUMNS = {
 
 def read(root: Path, split: str) -> list[Sequence]:
     """The sequences of a split, those that fail the physical self-check named and left out."""
-    return keep_plausible([read_sequence(folder) for folder in _listed(Path(root), split)], pedestrian=DATASET.pedestrian)
+    return read_all(DATASET, Path(root), split)
+
+
+def recordings(root: Path, split: str) -> list[Recording]:
+    """The recordings of a split's list that are present."""
+    return [single(folder.name, read_sequence, folder) for folder in _listed(Path(root), split)]
 
 
 def read_sequence(folder: str | os.PathLike[str]) -> Sequence:
@@ -128,6 +134,7 @@ def _table(path: Path, width: int) -> Float[np.ndarray, "n w"]:
 DATASET = Dataset(
     name="tlio",
     read=read,
+    recordings=recordings,
     splits=tuple(_LISTS),
     rate=RATE,
     source="https://github.com/CathIAS/TLIO (its README links the data)",

@@ -248,6 +248,19 @@ def test_lists_gone_wrong(copy):
         ridi.read(copy, "val")
 
 
+def test_every_recording_below_the_root_needs_no_list(copy):
+    listed = {*TRAIN[:-1], "hang_leg7", "shali_bag1"}
+    for _ in range(2):
+        assert names(ridi.read(copy, "all")) == {*listed, "dan_bag9"}
+        for path in copy.rglob("list_*.txt"):
+            path.unlink()
+    with pytest.raises(InputError, match=r"list_test_publish_v2\.txt: the list cannot be read"):
+        ridi.read(copy, "test")
+    (copy / "elsewhere").mkdir()
+    with pytest.raises(InputError, match="elsewhere: holds no recording of RIDI; expected layout"):
+        ridi.read(copy / "elsewhere", "all")
+
+
 def test_an_implausible_recording_is_left_out_by_name(copy):
     def drift(columns):
         columns["acce_x"] += 3.0
