@@ -15,6 +15,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import optax
+import yaml
 from flax import linen as nn
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
@@ -95,6 +96,7 @@ def _train(config: TrainConfig, resume: bool, console: Console) -> Outcome:
     workdir.mkdir(parents=True, exist_ok=True)
     if not resume:
         configuration.save(workdir / "config.yaml", config)
+    _keep_splits(workdir / "splits.yaml", run.splits)
     position = Position(epoch=0, step=0, best_loss=None, loss_sums=(0.0, 0.0, 0.0), seconds=0.0)
     with Checkpoints(workdir) as checkpoints, _stop_signals() as stop, _progress(console, config.optim.epochs * run.steps_per_epoch) as bar:
         if resume and exists(workdir):
@@ -139,6 +141,8 @@ class _Run(NamedTuple):
     learning_rate: optax.Schedule
     source: windows.WindowSource
     held_out: windows.WindowSource
+    splits: dict[str, list[str]]
+    """Names of the recordings of each split."""
     steps_per_epoch: int
     init_key: jax.Array
     order_key: jax.Array
@@ -148,15 +152,16 @@ class _Run(NamedTuple):
 def _prepare(config: TrainConfig, console: Console) -> _Run:
     model = create_model(config)  # a mistake in its options should not wait for the data
     console.print(f"reading {config.dataset}: {config.data.train_split} and {config.data.val_split}")
-    source = _load_windows(config, config.data.train_split, config.data.train_stride, console)
-    held_out = _load_windows(config, config.data.val_split, config.data.stride, console)
+    source, learnt_from = _load_windows(config, config.data.train_split, config.data.train_stride, console)
+    held_out, validated_with = _load_windows(config, config.data.val_split, config.data.stride, console)
+    splits = {config.data.train_split: learnt_from, config.data.val_split: validated_with}
     count, size = source.start.shape[0], config.optim.batch_size
     if count < size:
         raise InputError("optim.batch_size", f"is {size}, but there are only {count} windows", "lower it")
     steps_per_epoch = count // size
     init_key, order_key, step_key = jax.random.split(jax.random.key(config.seed), 3)
     return _Run(config, model, optimizers.create(config.optim, steps_per_epoch), optimizers.schedule(config.optim, steps_per_epoch),
-                source, held_out, steps_per_epoch, init_key, order_key, step_key)  # fmt: skip
+                source, held_out, splits, steps_per_epoch, init_key, order_key, step_key)  # fmt: skip
 
 
 def _run_epoch(
@@ -204,12 +209,34 @@ def _row(run: _Run, epoch: int, position: Position, held_out: Losses, rate: floa
     }  # fmt: skip
 
 
-def _load_windows(config: TrainConfig, split: str, stride: int, console: Console) -> windows.WindowSource:
+def _load_windows(config: TrainConfig, split: str, stride: int, console: Console) -> tuple[windows.WindowSource, list[str]]:
+    """The windows of a split on the device, and the names of its recordings."""
     sequences = [data.resample(s, config.data.rate) for s in data.load(config.dataset, config.data_root, split)]
     source = windows.index(sequences, config.data, stride)
     hours = sum(len(s.time) for s in sequences) / config.data.rate / 3600
     console.print(f"  {split}: {len(sequences)} sequences, {hours:.2f} h, {source.start.shape[0]:,} windows")
-    return jax.device_put(source)
+    return jax.device_put(source), [s.name for s in sequences]
+
+
+def _keep_splits(path: Path, splits: dict[str, list[str]]) -> None:
+    """Note which recordings the network learns from and is chosen by: hold-outs are drawn from what a copy of the data holds.
+
+    Raises `InputError` when the run was begun with others.
+    """
+    if not path.exists():
+        with replacing(path) as temporary:
+            temporary.write_text(yaml.safe_dump(splits, sort_keys=False, allow_unicode=True), encoding="utf-8")
+        return
+    try:
+        before = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise InputError(path, f"cannot be read ({' '.join(str(error).split())})", "remove it, and the recordings are noted anew") from None
+    for split, names in splits.items():
+        theirs = before.get(split) if isinstance(before, dict) else None
+        if names != theirs:
+            changed = sorted(set(names) ^ set(theirs if isinstance(theirs, list) else []))
+            raise InputError(path, f"the run was begun with other recordings in split '{split}' ({len(changed)} differ"
+                                   f"{f', e.g. {changed[0]}' if changed else ', their order does'})", "resume with the same data")
 
 
 def _kept_rows(path: Path, epoch: int) -> list[dict]:

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -13,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import yaml
 from test_tlio_layout import write_sequence
 
 from gnio_jax import config as configuration
@@ -71,6 +73,7 @@ def test_a_run_leaves_its_config_log_events_and_checkpoints(recording, finished)
     assert outcome.best_loss == min(row["val_loss"] for row in rows)
     assert rows[-1]["loss"] < rows[0]["loss"]
     assert rows[-1]["loss"] == pytest.approx(100 * rows[-1]["mse"] + 1e-4 * rows[-1]["nll"], rel=1e-5)
+    assert yaml.safe_load((workdir / "splits.yaml").read_text()) == {"train": ["a", "b"], "val": ["c"]}
     assert list((workdir / "tensorboard").glob("events*"))
     best = min(rows, key=lambda row: row["val_loss"])
     assert checkpoint.load_run(workdir, "best").step == best["step"]
@@ -90,6 +93,23 @@ def test_validation_is_the_plain_mean_over_every_window(recording, finished):
     row = json.loads((workdir / "metrics.jsonl").read_text().splitlines()[-1])
     assert row["val_mse"] == pytest.approx(mse, rel=1e-4)
     assert len(every.displacement) % 16 != 0  # so that the filled-up last batch is part of the test
+
+
+def test_a_run_is_not_resumed_with_other_recordings(recording, finished, tmp_path):
+    shutil.copytree(finished[0], tmp_path / "run")
+    shutil.copytree(recording, tmp_path / "data")
+    (tmp_path / "data" / "train_list.txt").write_text("b\na\n")
+    config = tiny(recording, tmp_path / "run", data_root=str(tmp_path / "data"))
+    before = (tmp_path / "run" / "splits.yaml").read_bytes()
+    with pytest.raises(InputError, match=r"splits\.yaml: .*split 'train' \(0 differ, their order does\); resume with the same data"):
+        loop.train(config, resume=True)
+    (tmp_path / "data" / "train_list.txt").write_text("b\n")
+    with pytest.raises(InputError, match=r"split 'train' \(1 differ, e\.g\. a\)"):
+        loop.train(config, resume=True)
+    assert (tmp_path / "run" / "splits.yaml").read_bytes() == before
+    (tmp_path / "run" / "splits.yaml").write_text("{")
+    with pytest.raises(InputError, match=r"splits\.yaml: cannot be read"):
+        loop.train(config, resume=True)
 
 
 @pytest.mark.parametrize("dispatches", [1, 4, 9])
