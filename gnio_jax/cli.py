@@ -32,10 +32,12 @@ Config = TypeVar("Config")
 _DISK_ERRORS = {errno.EACCES, errno.EPERM, errno.ENOSPC, errno.EROFS, errno.EDQUOT, errno.ENOTDIR, errno.ENAMETOOLONG}
 
 
-def parse(kind: type[Config], default: Config | None = None, description: str = "", argv: Sequence[str] | None = None) -> Config:
+def parse(kind: type[Config], default: Config | None = None, description: str = "", argv: Sequence[str] | None = None,
+          prog: str | None = None) -> Config:
     """Read a value of the dataclass `kind` from `argv` (default: the process's own arguments).
 
-    Nested fields are dotted (`--optim.epochs 3`), words are joined by `-` or `_`, a flag's negation is `--no-flag`.
+    Nested fields are dotted (`--optim.epochs 3`), words are joined by `-` or `_`, a flag's negation is `--no-flag`; fields of a
+    type `tyro.conf.Positional[...]` are given without a name.
     Options win over `default`, which wins over the class's own defaults. For a `TrainConfig`, `--config FILE` names a
     YAML file whose fields win over `default` as a whole and lose to the options, wherever it stands among them.
     `--help` prints the options with their meaning and leaves with status 0. Raises `InputError` for an option that does
@@ -48,11 +50,12 @@ def parse(kind: type[Config], default: Config | None = None, description: str = 
         description = f"{description}\n\n--config FILE reads the options below from a YAML file; those given here win over it.".strip()
     options = _options(kind)
     if "-h" not in arguments and "--help" not in arguments:
-        _check(arguments, options, {} if default is not None else _required(kind))
+        _check(arguments, options, {} if default is not None else _required(kind), _positionals(kind))
     captured = io.StringIO()
     try:
         with contextlib.redirect_stderr(captured):
-            return tyro.cli(kind, default=tyro.MISSING_NONPROP if default is None else default, description=description, args=arguments)
+            return tyro.cli(kind, default=tyro.MISSING_NONPROP if default is None else default, description=description, args=arguments,
+                            prog=prog)
     except SystemExit as leaving:
         if not leaving.code:
             raise
@@ -124,7 +127,10 @@ def _warn(message: Warning | str, *_: object) -> None:
 def _options(kind: Any, prefix: str = "") -> dict[str, Any]:
     """Every option of the dataclass `kind` as tyro spells it, without the dashes: {"optim.batch-size": int, ...}."""
     found: dict[str, Any] = {}
+    words = _positionals(kind)
     for name, hint in typing.get_type_hints(kind).items():
+        if name in words:
+            continue
         option = prefix + name.replace("_", "-")
         if dataclasses.is_dataclass(hint):
             found |= _options(hint, option + ".")
@@ -139,6 +145,12 @@ def _options(kind: Any, prefix: str = "") -> dict[str, Any]:
 def _required(kind: Any) -> dict[str, str]:
     return {field.name.replace("_", "-"): field.name.upper() for field in dataclasses.fields(kind)
             if field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING}
+
+
+def _positionals(kind: Any) -> list[str]:
+    """Names of the fields that are words without a name, in their order."""
+    marker = typing.get_args(tyro.conf.Positional[str])[1]
+    return [name for name, hint in typing.get_type_hints(kind, include_extras=True).items() if marker in typing.get_args(hint)[1:]]
 
 
 def _spelling(argument: str) -> str:
@@ -164,11 +176,15 @@ def _take(arguments: list[str], option: str) -> tuple[str | None, list[str]]:
     return value, rest
 
 
-def _check(arguments: list[str], options: dict[str, Any], required: dict[str, str]) -> None:
-    position = 0
+def _check(arguments: list[str], options: dict[str, Any], required: dict[str, str], words: list[str]) -> None:
+    position, words = 0, list(words)
     while position < len(arguments):
         argument = arguments[position]
         name = _spelling(argument)
+        if words and not re.match(r"--?[A-Za-z]", argument):
+            required.pop(words.pop(0).replace("_", "-"), None)
+            position += 1
+            continue
         if not re.match(r"--?[A-Za-z]", argument):
             raise InputError(f"'{argument}'", "is not an option", "options are --name VALUE; --help lists them")
         if not argument.startswith("--") or name not in options:
@@ -182,6 +198,8 @@ def _check(arguments: list[str], options: dict[str, Any], required: dict[str, st
                 raise InputError(f"--{name}", f"needs a value, which must be {_spell(options[name])}")
             position += 1
     for name, value in required.items():
+        if name.replace("-", "_") in words:
+            raise InputError(value, "is missing", "give it as a word of its own; --help explains it")
         raise InputError(f"--{name}", "is missing", f"give --{name} {value}; --help explains it")
 
 
