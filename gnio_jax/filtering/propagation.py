@@ -120,19 +120,27 @@ def move_anchor(state: FilterState, wanted: Bool[Array, ""]) -> FilterState:
     return state._replace(anchor=state.anchor + (state.offset - offset), offset=offset, move=move, first=first)
 
 
-def propagate(state: FilterState, motion: Interval, anchored: Bool[Array, ""], slot: Array | int) -> FilterState:
-    """Move mean and covariance over one interval and clone the new pose into `slot` of the ring, in the place of the oldest.
-
-    `anchored`: the interval began with a new anchor, so the offset's error went over into the anchor's and its move's.
-    """
-    kept = 1 - anchored.astype(motion.offset.dtype)
-    turned = motion.transition[:9].at[:, OFFSET].multiply(kept)
+def transition(state: FilterState, motion: Interval, anchored: Bool[Array, ""]) -> Float[Array, "9 15"]:
+    """Of θ, v, o from those and the biases over an interval that begins from `state`, its anchor's move (`anchored`) included."""
+    turned = motion.transition[:9].at[:, OFFSET].multiply(1 - anchored.astype(motion.offset.dtype))
     first = state.first
     if first is not None:
         # Φ[v, θ] = −hat(v' − v − g T), Φ[p, θ] = −hat(p' − p − v T − ½ g T²), with the first v and p in the place of the latest
         duration = motion.transition[OFFSET.start, VELOCITY.start]
         velocity, offset = geometry.hat(state.velocity - first.velocity), geometry.hat(state.offset - first.offset)
         turned = turned.at[VELOCITY, THETA].add(-velocity).at[OFFSET, THETA].add(-offset - duration * velocity)
+    return turned
+
+
+def propagate(state: FilterState, motion: Interval, anchored: Bool[Array, ""], slot: Array | int) -> FilterState:
+    """Move mean and covariance over one interval and clone the new pose into `slot` of the ring, in the place of the oldest.
+
+    `anchored`: the interval began with a new anchor, so the offset's error went over into the anchor's and its move's.
+    """
+    kept = 1 - anchored.astype(motion.offset.dtype)
+    turned = transition(state, motion, anchored)
+    first = state.first
+    if first is not None:
         first = first._replace(
             velocity=motion.velocity, offset=motion.offset,
             clone_offset=jax.lax.dynamic_update_index_in_dim(first.clone_offset, motion.offset, slot, 0))

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 
 from gnio_jax import geometry
 from gnio_jax.filtering.gaps import Imu, bridge
-from gnio_jax.filtering.propagation import interval, move_anchor, propagate
+from gnio_jax.filtering.propagation import interval, move_anchor, propagate, transition
 from gnio_jax.filtering.state import (
     CLONE,
     MOVE,
@@ -28,7 +28,7 @@ from gnio_jax.filtering.state import (
     check_positive,
     core_covariance,
 )
-from gnio_jax.filtering.update import Measurement, Outcome, rest, update, zero_velocity
+from gnio_jax.filtering.update import Correction, Measurement, Outcome, correct, rest, zero_velocity
 from gnio_jax.types import Array, Prediction
 
 
@@ -192,19 +192,39 @@ class Row(NamedTuple):
 def clone_step(state: FilterState, imu: Imu, measure: Callable[[FilterState, Array | int], tuple[Measurement, dict]], slot: Array | int,
                config: FilterConfig, noise: NoiseModel) -> tuple[FilterState, Row]:
     """One clone interval: propagate, clone into `slot` of the ring, measure, update. `measure` is given the state and the oldest slot."""
+    state, row, _ = traced_step(state, imu, measure, slot, config, noise)
+    return state, row
+
+
+class Trace(NamedTuple):
+    """What happened to the error in one clone interval, as smoothing needs it."""
+
+    transition: Float[Array, "9 15"]
+    """See `propagation.transition`."""
+    corrections: tuple[Correction, ...]
+    """The updates in the order in which they were made."""
+
+
+def traced_step(state: FilterState, imu: Imu, measure: Callable[[FilterState, Array | int], tuple[Measurement, dict]], slot: Array | int,
+                config: FilterConfig, noise: NoiseModel) -> tuple[FilterState, Row, Trace]:
+    """`clone_step` and its trace."""
     # A ring of clones: the newest takes the place of the one that has served as oldest, and the next slot is the oldest now.
     newest, oldest = slot, (slot + 1) % (config.clones_per_window + 1)
     state = move_anchor(state, newest == 0)
-    state = propagate(state, interval(state, imu, noise, config.dt), newest == 0, newest)
+    motion = interval(state, imu, noise, config.dt)
+    turned = transition(state, motion, newest == 0)
+    state = propagate(state, motion, newest == 0, newest)
     measurement, diagnostics = measure(state, oldest)
-    state, outcome = update(state, measurement, newest, oldest, config)
+    state, outcome, *corrections = correct(state, measurement, newest, oldest, config)
     at_rest = jnp.bool_(False)
     if config.zero_velocity_std > 0:
         state, at_rest = rest(state, imu, config)
-        state = zero_velocity(state, at_rest, newest, config)
+        state, correction = zero_velocity(state, at_rest, newest, config)
+        corrections.append(correction)
     kept = core_covariance(state.core_covariance)
     mean = (state.rotation, state.velocity, state.position, state.gyro_bias, state.accel_bias)
-    return state, Row(mean, kept if config.history == "core" else jnp.diagonal(kept), measurement, outcome, at_rest, diagnostics)
+    row = Row(mean, kept if config.history == "core" else jnp.diagonal(kept), measurement, outcome, at_rest, diagnostics)
+    return state, row, Trace(turned, tuple(corrections))
 
 
 def _scan(measure: Callable, state: FilterState, gyro: Array, accel: Array, valid: Array | None, config: FilterConfig, noise: NoiseModel,

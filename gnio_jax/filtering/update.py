@@ -11,7 +11,19 @@ from jaxtyping import Bool, Float
 
 from gnio_jax import geometry
 from gnio_jax.filtering.gaps import Imu
-from gnio_jax.filtering.state import ACCEL_BIAS, ANCHOR, CLONE, GYRO_BIAS, MOVE, OFFSET, VELOCITY, FilterConfig, FilterState, GateState
+from gnio_jax.filtering.state import (
+    ACCEL_BIAS,
+    ANCHOR,
+    CLONE,
+    CORE,
+    GYRO_BIAS,
+    MOVE,
+    OFFSET,
+    VELOCITY,
+    FilterConfig,
+    FilterState,
+    GateState,
+)
 from gnio_jax.geometry import matmul
 from gnio_jax.types import GRAVITY, Array
 
@@ -28,6 +40,21 @@ class Measurement(NamedTuple):
     covariance: Float[Array, "3 3"]
     """After scaling, m²; positive definite also where there is none."""
     present: Bool[Array, ""]
+
+
+class Correction(NamedTuple):
+    """What an update with S = L Lᵀ did to the error e: e ← e − Yᵀ (L⁻¹ r), where L⁻¹ r = L⁻¹ H e and noise. Smoothing undoes it."""
+
+    whitened: Float[Array, "3"]
+    """L⁻¹ r."""
+    core_rows: Float[Array, "3 21"]
+    """Y = L⁻¹ H P against the core; zero where there was no update, and so are the other rows."""
+    clone_rows: Float[Array, "3 m"]
+    """Y against the clones."""
+    core_jacobian: Float[Array, "3 21"]
+    """L⁻¹ H over the core …"""
+    oldest_jacobian: Float[Array, "3 6"]
+    """… and over the oldest clone; it is zero over the others."""
 
 
 class Outcome(NamedTuple):
@@ -95,6 +122,13 @@ def gate(memory: GateState, config: FilterConfig, now: Array, oldest: Array, nis
 
 def update(state: FilterState, measurement: Measurement, newest: Array | int, oldest: Array | int,
            config: FilterConfig) -> tuple[FilterState, Outcome]:
+    """`correct` for those who do not smooth."""
+    state, outcome, _ = correct(state, measurement, newest, oldest, config)
+    return state, outcome
+
+
+def correct(state: FilterState, measurement: Measurement, newest: Array | int, oldest: Array | int,
+            config: FilterConfig) -> tuple[FilterState, Outcome, Correction]:
     """One EKF update with the displacement between the clones in slots `oldest` and `newest` of the ring, once it is full.
 
     H touches twelve rows of the covariance P, so H P is three rows. With S = H P Hᵀ + R = L Lᵀ and Y = L⁻¹ H P the gain is Yᵀ L⁻¹ and
@@ -135,9 +169,11 @@ def update(state: FilterState, measurement: Measurement, newest: Array | int, ol
     if config.gate_softness > 0:
         root, accepted = factor(1 / jnp.clip(jnp.where(tried, weight, 1.0), LEAST_WEIGHT)), tried
     whitened = root.solve(innovation[:, None])[:, 0]
-    over_core, over_clones = (jnp.where(accepted, root.solve(rows), 0.0) for rows in (over_core, over_clones))
-    return _apply(state, whitened, over_core, over_clones, newest)._replace(gate=memory), Outcome(
-        present=present, innovation=innovation, nis=nis, volume=volume, gate_passed=weight, accepted=accepted)
+    over_core, over_clones, jacobian = (jnp.where(accepted, root.solve(rows), 0.0) for rows in (over_core, over_clones, jacobian))
+    of_new = jnp.zeros_like(over_core).at[:, OFFSET].set(jacobian[:, 6:]).at[:, MOVE].set(apart * jacobian[:, 6:])
+    correction = Correction(whitened, over_core, over_clones, of_new, jacobian[:, :CLONE])
+    outcome = Outcome(present=present, innovation=innovation, nis=nis, volume=volume, gate_passed=weight, accepted=accepted)
+    return _apply(state, correction, newest)._replace(gate=memory), outcome, correction
 
 
 def rest(state: FilterState, imu: Imu, config: FilterConfig) -> tuple[FilterState, Bool[Array, ""]]:
@@ -152,13 +188,17 @@ def rest(state: FilterState, imu: Imu, config: FilterConfig) -> tuple[FilterStat
     return state._replace(imu=state.imu._replace(quiet=count)), count >= max(enough, 1)
 
 
-def zero_velocity(state: FilterState, wanted: Bool[Array, ""], newest: Array | int, config: FilterConfig) -> FilterState:
+def zero_velocity(state: FilterState, wanted: Bool[Array, ""], newest: Array | int,
+                  config: FilterConfig) -> tuple[FilterState, Correction]:
     """One EKF update with the velocity measured as zero, if `wanted` (ours; the paper's gate makes displacements small instead)."""
     noise = config.zero_velocity_std**2 * np.eye(3, dtype=state.velocity.dtype)
     root = cholesky(jnp.where(wanted, state.core_covariance[VELOCITY, VELOCITY], 0.0) + noise)
     whitened = -root.solve(state.velocity[:, None])[:, 0]
-    rows = (state.core_covariance[VELOCITY], state.cross_covariance[VELOCITY])
-    return _apply(state, whitened, *(jnp.where(wanted, root.solve(part), 0.0) for part in rows), newest)
+    picked = np.eye(CORE, dtype=state.velocity.dtype)[VELOCITY]
+    rows = (state.core_covariance[VELOCITY], state.cross_covariance[VELOCITY], picked)
+    correction = Correction(whitened, *(jnp.where(wanted, root.solve(part), 0.0) for part in rows),
+                            oldest_jacobian=jnp.zeros((3, CLONE), state.velocity.dtype))
+    return _apply(state, correction, newest), correction
 
 
 class Cholesky(NamedTuple):
@@ -185,9 +225,9 @@ def cholesky(s: Float[Array, "3 3"]) -> Cholesky:
     return Cholesky((a, d, jnp.sqrt(s[2, 2] - c * c - e * e)), (b, c, e))
 
 
-def _apply(state: FilterState, whitened: Float[Array, "3"], over_core: Float[Array, "3 21"], over_clones: Float[Array, "3 m"],
-           newest: Array | int) -> FilterState:
-    """Mean and covariance after an update with L⁻¹ r and Y = L⁻¹ H P: the error is Yᵀ L⁻¹ r, and P ← P − Yᵀ Y."""
+def _apply(state: FilterState, correction: Correction, newest: Array | int) -> FilterState:
+    """Mean and covariance after an update: the error is Yᵀ L⁻¹ r, and P ← P − Yᵀ Y."""
+    whitened, over_core, over_clones = correction[:3]
     # A reduction on purpose: it is kept, where the sum spelt out would be computed anew for every entry that the retraction reads.
     error, clone_errors = (jnp.sum(whitened[:, None] * rows, axis=0) for rows in (over_core, over_clones))
     return retract(state, error, clone_errors.reshape(-1, CLONE), newest)._replace(
