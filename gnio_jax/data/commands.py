@@ -79,7 +79,7 @@ class ListOptions:
 class CheckOptions:
     """What `check` is asked for."""
 
-    what: tyro.conf.Positional[Annotated[str, tyro.conf.arg(metavar="DATASET_OR_ROOT")]]
+    dataset_or_root: tyro.conf.Positional[Annotated[str, tyro.conf.arg(metavar="DATASET_OR_ROOT")]]
     """Name of a dataset, which is looked for in the usual place, or the folder of one."""
     dataset: str | None = None
     """Dataset whose layout the folder has; without it the one that finds its recordings there."""
@@ -251,7 +251,7 @@ def check(options: CheckOptions) -> None:
             raise InputError(option, f"{path} is a folder", "name a file")
     if options.plots is not None and options.plots.exists() and not options.plots.is_dir():
         raise InputError("--plots", f"{options.plots} is a file", "name a folder")
-    dataset, root = resolve(options.what, options.dataset)
+    dataset, root = resolve(options.dataset_or_root, options.dataset)
     found, splits, notes = in_splits(dataset, root, options.split)
     items = [(recording, dataset, options.plots) for recording in found.values()]
     with cli.progress() as progress:
@@ -292,13 +292,15 @@ def resolve(what: str, name: str | None) -> tuple[Dataset, Path]:
         return dataset, registry.find_root(name, what) if dataset.needs_root else Path(what)
     if what in registry.names():
         dataset = registry.get(what)
-        return dataset, registry.find_root(what) if dataset.needs_root else Path(".")
+        return dataset, registry.find_root(what, hint=f"give its folder with --dataset {what}") if dataset.needs_root else Path(".")
     root = Path(what)
     if not root.is_dir():
         if os.sep in what or what.startswith("."):
             raise InputError(what, "no such folder", "give the name of a dataset, or the folder of one")
         registry.get(what)  # raises, with the names that are known
     fitting = [dataset for dataset in map(registry.get, registry.names()) if dataset.needs_root and _fits(dataset, root)]
+    # EuRoC's layout is TUM-VI's, too: the folder's own name may tell.
+    fitting = [dataset for dataset in fitting if dataset.name == root.resolve().name.lower()] or fitting
     if len(fitting) != 1:
         fits = f"has the layout of {' and of '.join(dataset.name for dataset in fitting)}" if fitting else "has the layout of no dataset"
         raise InputError(root, fits, f"say which it is: --dataset NAME, one of {', '.join(registry.names())}")
@@ -417,9 +419,12 @@ def convert(options: ConvertOptions) -> None:
         raise InputError(out, "is the folder that is read", "choose another one for the result")
     found, splits, notes = in_splits(dataset, root, options.split)
     _claim(out, {"dataset": dataset.name, "rate": options.rate})
-    items = [(recording, dataset, out, options.rate) for recording in found.values()]
+    results = {name: done for name in found if (done := _done(_journal(out, name), out)) is not None}
+    missing = [name for name in found if name not in results]
+    items = [(found[name], dataset, out, options.rate) for name in missing]
     with cli.progress() as progress:
-        results = dict(zip(found, each(_convert_one, items, options.workers, lambda share: progress("converting", share)), strict=True))
+        results |= zip(missing, each(_convert_one, items, options.workers, lambda share: progress("converting", share)), strict=True)
+    results = {name: results[name] for name in found}
 
     for split, names in splits.items():
         kept = [stem for name in names for stem in results[name].kept]
@@ -457,7 +462,8 @@ def _claim(out: Path, settings: dict[str, Any]) -> None:
         except (OSError, ValueError) as error:
             raise InputError(path, f"cannot be read ({error})", "choose another folder") from None
         if there != settings:
-            found, wanted = (f"{entry.get('dataset')} at {entry.get('rate') or 'its own'} Hz" for entry in (there, settings))
+            found, wanted = (f"{entry.get('dataset')} at {f'{rate:g} Hz' if (rate := entry.get('rate')) else 'its own rate'}"
+                             for entry in (there, settings))
             raise InputError(out, f"holds {found}, not {wanted}", "choose another folder")
     elif any(entry.suffix in (".h5", ".hdf5", ".csv", ".txt") for entry in (out.iterdir() if out.is_dir() else ())):
         raise InputError(out, "holds recordings or lists that no conversion has written", "choose another folder")
@@ -466,10 +472,7 @@ def _claim(out: Path, settings: dict[str, Any]) -> None:
 
 
 def _convert_one(recording: Recording, dataset: Dataset, out: Path, rate: float | None) -> Converted:
-    """Write the sequences of a recording that pass the self-check, unless that is done already."""
-    journal = out / _JOURNAL / f"{file_name(recording.name)}.json"
-    if (done := _done(journal, out)) is not None:
-        return done
+    """Write the sequences of a recording that pass the self-check."""
     found = examine(recording, dataset)
     if found.problem:  # not noted as done: it may be mended
         return Converted((), {recording.name: found.problem}, 0.0, found.notes, False)
@@ -486,8 +489,12 @@ def _convert_one(recording: Recording, dataset: Dataset, out: Path, rate: float 
         kept.append(stem)
         seconds += figures.duration
     result = Converted(tuple(kept), left_out, seconds, found.notes, False)
-    _write(journal, json.dumps(result._asdict()))
+    _write(_journal(out, recording.name), json.dumps(result._asdict()))
     return result
+
+
+def _journal(out: Path, name: str) -> Path:
+    return out / _JOURNAL / f"{file_name(name)}.json"
 
 
 def _done(journal: Path, out: Path) -> Converted | None:

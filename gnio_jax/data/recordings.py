@@ -19,7 +19,7 @@ from gnio_jax.types import InputError, Sequence
 
 Result = TypeVar("Result")
 
-FEW = 4
+FEW = 8
 """Recordings up to here are quicker read than processes are started."""
 
 
@@ -77,9 +77,10 @@ def in_splits(dataset: Dataset, root: Path, wanted: str) -> tuple[dict[str, Reco
         splits[split] = tuple(recording.name for recording in here)
         for recording in here:
             found.setdefault(recording.name, recording)
+    if not found and mistakes:
+        raise mistakes[-1 if "all" in known else 0]  # where a split takes everything, it says best why there is nothing
     if not found:
-        raise mistakes[0] if mistakes else InputError(root, f"split '{wanted}' of dataset '{dataset.name}' holds no recording",
-                                                      f"expected layout: {dataset.layout}")
+        raise InputError(root, f"split '{wanted}' of dataset '{dataset.name}' holds no recording", f"expected layout: {dataset.layout}")
     return found, splits, [*notes, *(f"nothing in split {', '.join(empty)}: {reason}" for reason, empty in reasons.items())]
 
 

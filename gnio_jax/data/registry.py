@@ -36,10 +36,10 @@ def get(name: str) -> Dataset:
     return _DATASETS[name]
 
 
-def find_root(name: str, root: str | os.PathLike[str] | None = None) -> Path:
+def find_root(name: str, root: str | os.PathLike[str] | None = None, hint: str = "give --data-root") -> Path:
     """The folder of dataset `name`: `root` if given, else $GNIO_DATA/<name>, else data/<name>.
 
-    Raises `InputError` when it is missing, saying where the public set is had and which layout is expected.
+    Raises `InputError` when it is missing, saying how to name it (`hint`), where the public set is had and which layout is expected.
     """
     dataset = get(name)
     if root is not None:
@@ -52,7 +52,7 @@ def find_root(name: str, root: str | os.PathLike[str] | None = None) -> Path:
             return candidate
     looked = ", ".join(dict.fromkeys(str(candidate) for candidate in candidates))
     raise InputError(looked, f"no folder of dataset '{name}'",
-                     f"give --data-root, or set GNIO_DATA to its parent; get it from {dataset.source}; expected layout: {dataset.layout}")
+                     f"{hint}, or set GNIO_DATA to its parent; get it from {dataset.source}; expected layout: {dataset.layout}")
 
 
 def load(name: str, root: str | os.PathLike[str] | None = None, split: str = "test") -> list[Sequence]:
