@@ -50,7 +50,7 @@ from gnio_jax.data.sequence import (
     rotations,
     validate,
 )
-from gnio_jax.data.text import numbers, read_csv
+from gnio_jax.data.text import numbers, read_csv, shortened
 from gnio_jax.types import InputError, Sequence
 
 RATE = 200.0
@@ -77,6 +77,8 @@ LOST_POSES = 2.5
 """Of a noisy tracker, poses up to this many intervals apart (one is lost) are interpolated; further apart gyro and smoother bridge."""
 LARGEST_JUMP = 0.02
 """m by which a step of the position may contradict the reference's own velocity, and smoothed positions the seen ones."""
+LONGEST_LEVER = 100.0
+"""m; no sensor is further away from its body."""
 SHORTEST_RUN = 8
 """Poses in a row below which a stretch between gaps is not believed."""
 
@@ -259,17 +261,21 @@ def _pose(path: Path) -> _Pose:
         # Some exports carry OpenCV's header and tag, which are no YAML.
         text = re.sub(r"^%YAML.*$|!!opencv-matrix", "", path.read_text(encoding="utf-8"), flags=re.MULTILINE)
         content = yaml.safe_load(text)
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise InputError(path, f"cannot be read as YAML ({str(error).splitlines()[0]})", "copy it again") from None
+    except (OSError, ValueError, TypeError, LookupError, AttributeError, RecursionError, yaml.YAMLError) as error:  # tags fail in any way
+        raise InputError(path, f"cannot be read as YAML ({shortened(error, 200)})", "copy it again") from None
     entry = content.get("T_BS") if isinstance(content, dict) else None
     if entry is None:
         return _Pose()
     try:
-        matrix = np.asarray(entry["data"] if isinstance(entry, dict) else entry, dtype=np.float64).reshape(4, 4)
+        rows = entry["data"] if isinstance(entry, dict) else entry
+        # One by one, since aliases can make a few lines of YAML a list of billions.
+        matrix = np.array([float(number) for row in rows for number in (row if isinstance(row, list) else [row])]).reshape(4, 4)
         turn = matrix[:3, :3]
-        if np.abs(turn @ turn.T - np.eye(3)).max() > 1e-3 or np.linalg.det(turn) < 0 or not np.isfinite(matrix).all():
+        if np.abs(turn @ turn.T - np.eye(3)).max() > 1e-3 or not np.isfinite(turn).all() or np.linalg.det(turn) < 0:
             raise ValueError("its rotation is none")
-    except (KeyError, TypeError, ValueError) as error:
+        if not np.linalg.norm(matrix[:3, 3]) < LONGEST_LEVER:
+            raise ValueError(f"its translation is beyond {LONGEST_LEVER:g} m")
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise InputError(path, f"field 'T_BS' is no pose ({error})", "it holds cols, rows and data of a 4 × 4 matrix") from None
     return _Pose(Rotation.from_matrix(turn), matrix[:3, 3])
 

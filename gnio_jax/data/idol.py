@@ -41,7 +41,7 @@ from gnio_jax.data.sequence import (
     rotations,
     validate,
 )
-from gnio_jax.data.text import numbers
+from gnio_jax.data.text import numbers, shortened
 from gnio_jax.types import STANDARD_G, InputError, Sequence
 
 RATE = 100.0
@@ -116,8 +116,8 @@ def find_walks(root: Path, folder: str) -> list[Walk]:
                 entry = entry if isinstance(entry, dict) else {}
                 if entry.get("subjectID") is None:
                     nameless.append(path)
-                subject = _name(path) if entry.get("subjectID") is None else f"subject{entry['subjectID']}"
-                walks.append(Walk(path, subject, str(entry.get("calibration", "unknown"))))
+                subject = _name(path) if entry.get("subjectID") is None else shortened(f"subject{entry['subjectID']}")
+                walks.append(Walk(path, subject, shortened(entry.get("calibration", "unknown"))))
     if not walks:
         raise InputError(root, f"holds no recording in building*/{folder}",
                          f"get it from {DATASET.source}; expected layout: {DATASET.layout}")
@@ -275,7 +275,7 @@ def _device(table: pd.DataFrame, order: np.ndarray, path: Path) -> Float[np.ndar
 
 def _table(path: Path) -> pd.DataFrame:
     try:
-        from pyarrow import ArrowException, feather
+        from pyarrow import feather
     except ImportError:
         raise InputError(path, "feather files need pyarrow, which is not installed", "pip install 'gnio-jax[idol]'") from None
     try:
@@ -283,8 +283,8 @@ def _table(path: Path) -> pd.DataFrame:
         return feather.read_table(str(path)).to_pandas(ignore_metadata=True)
     except FileNotFoundError:
         raise InputError(path, "no such file") from None
-    except (ArrowException, OSError, ValueError) as error:
-        raise InputError(path, f"cannot be read as feather, it may be cut short ({error})", "copy it again") from None
+    except Exception as error:  # a damaged file makes the parser fail in any way
+        raise InputError(path, f"cannot be read as feather, it may be cut short ({shortened(error, 200)})", "copy it again") from None
 
 
 def _metadata(path: Path) -> dict[str, Any]:
@@ -292,7 +292,7 @@ def _metadata(path: Path) -> dict[str, Any]:
         return {}
     try:
         about = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise InputError(path, f"is no JSON ({error})", "copy it again") from None
     if not isinstance(about, dict):
         raise InputError(path, "is no JSON object", "copy it again")

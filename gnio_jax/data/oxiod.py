@@ -45,6 +45,7 @@ from gnio_jax.data.alignment import Track, align, align_heading, follow, follow_
 from gnio_jax.data.cache import Refusal, cached
 from gnio_jax.data.recordings import single
 from gnio_jax.data.sequence import Dataset, Recording, check_units, keep_plausible, quaternions, validate
+from gnio_jax.data.text import shortened
 from gnio_jax.types import STANDARD_G, InputError, Sequence
 
 RATE = 100.0
@@ -170,13 +171,13 @@ def _table(path: Path, columns: Iterable[int]) -> np.ndarray:
         skip = 0 if re.match(r"\s*[-+.\d]", str(table.iloc[0, 0])) else 1  # some exports carry a header
         table = pd.read_csv(path, header=None, skiprows=skip, low_memory=False)
     except (OSError, ValueError, IndexError, UnicodeDecodeError) as error:
-        raise Refusal(path, f"cannot be read as comma-separated numbers ({str(error).strip()})", "copy it again") from None
+        raise Refusal(path, f"cannot be read as comma-separated numbers ({shortened(str(error).strip(), 200)})", "copy it again") from None
     if table.shape[1] not in columns:
         raise Refusal(path, f"has {table.shape[1]} columns, expected {' or '.join(str(count) for count in columns)}", "copy it again")
     try:
         return table.to_numpy(dtype=np.float64)
     except ValueError as error:
-        raise Refusal(path, f"holds what is no number ({error})", "copy it again") from None
+        raise Refusal(path, f"holds what is no number ({shortened(error, 200)})", "copy it again") from None
 
 
 def _complete(table: np.ndarray, names: Iterable[str], path: Path) -> None:
@@ -599,7 +600,7 @@ def _listed(walks: list[Walk], name: str, root: Path) -> list[Walk]:
             for entry in entries:
                 match = re.fullmatch(r"(data\d+)(?:/(?:imu)?(\d+)(?:\.csv)?)?", entry)
                 if not match:
-                    raise InputError(path, f"entry '{entry}' is neither dataN nor dataN/imuK.csv", "copy the list again")
+                    raise InputError(path, f"entry '{shortened(entry)}' is neither dataN nor dataN/imuK.csv", "copy the list again")
                 here = [walk for walk in walks if walk.scene == scene and walk.folder == match[1]
                         and (match[2] is None or walk.number == int(match[2]))]
                 absent += not here

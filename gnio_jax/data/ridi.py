@@ -110,8 +110,8 @@ def read_sequence(folder: str | os.PathLike[str]) -> Sequence:
     folder = Path(folder)
     source = folder / _TABLE
     native = _from_table(source) if source.is_file() else _from_text(folder)
-    source = source if source.is_file() else folder
-    piece = longest_piece(native.time, source)
+    piece = longest_piece(native.time, source if source.is_file() else folder)
+    source = source if source.is_file() else f"{folder / 'gyro.txt'}, acce.txt, pose.txt"
     start = float(native.time[piece.start])
     valid = native.valid[piece]
     if not valid.any():
@@ -183,8 +183,8 @@ def _from_text(folder: Path) -> _Native:
     upright = Rotation.identity() if upright is None else upright
     start = gyro_stamps[0]
     gyro_time, force_time, pose_time = ((stamps - start) * 1e-9 for stamps in (gyro_stamps, force_stamps, pose_stamps))
-    for time, path in ((gyro_time, folder / "gyro.txt"), (force_time, folder / "acce.txt")):
-        rate = 1.0 / float(np.median(np.diff(time)))
+    for stamps, path in ((gyro_stamps, folder / "gyro.txt"), (force_stamps, folder / "acce.txt")):
+        rate = 1e9 / float(np.median(np.diff(stamps)))
         if not RAW_RATES[0] <= rate <= RAW_RATES[1]:
             raise InputError(path, f"field 'time' runs at {rate:.4g} Hz, expected {RAW_RATES[0]:g} to {RAW_RATES[1]:g} Hz",
                              "check the unit of the stamps: they are ns")
@@ -193,6 +193,10 @@ def _from_text(folder: Path) -> _Native:
     # in a world of its own (23° turned, in one recording): such a gap ends a piece as one of the IMU does.
     whole = (_interval(force_time, gyro_time) <= MAX_GAP) & (_interval(pose_time, gyro_time) <= WINDOW_SECONDS)
     inside = (gyro_time >= max(force_time[0], pose_time[0])) & (gyro_time <= min(force_time[-1], pose_time[-1]))
+    if not (force_time[0] < gyro_time[-1] and gyro_time[0] < force_time[-1]):
+        raise InputError(folder / "acce.txt", f"field 'time' ({force_time[0]:.1f} to {force_time[-1]:.1f} s after the gyro's first stamp) "
+                                              f"shares nothing with that of gyro.txt (0.0 to {gyro_time[-1]:.1f} s)",
+                         "check that the files are of one recording")
     if (inside & whole).sum() < 2:
         raise InputError(pose_path, f"its stamps ({pose_time[0]:.1f} to {pose_time[-1]:.1f} s after the gyro's first) share nothing with "
                                     f"the IMU's ({gyro_time[0]:.1f} to {gyro_time[-1]:.1f} s)", "check that the files are of one recording")

@@ -38,7 +38,7 @@ from gnio_jax.data.sequence import (
     rotations,
     validate,
 )
-from gnio_jax.data.text import listed
+from gnio_jax.data.text import listed, shortened
 from gnio_jax.types import InputError, Sequence
 
 RATE = 200.0
@@ -108,7 +108,7 @@ def read_sequence(folder: str | os.PathLike[str], choose: bool = False) -> Seque
         "dataset": "ronin",
         "group": folder.name.partition("_")[0],
         "subject": folder.name.partition("_")[0],
-        "device": str(info.get("device", "unknown")),
+        "device": shortened(info.get("device", "unknown")),
         "placement": "free",
         "truth": "tango on the chest (positions)",
         "position_of": "chest",
@@ -117,7 +117,7 @@ def read_sequence(folder: str | os.PathLike[str], choose: bool = False) -> Seque
         "licence": DATASET.licence,
         "start_time": float(time[int(start)]),
     }
-    if isinstance(error, int | float):
+    if isinstance(error, int | float) and abs(error) <= 360.0:
         attributes["orientation_error_degrees"] = float(error)
     sequence = Sequence(
         name=folder.name,
@@ -147,16 +147,18 @@ def _tables(path: Path) -> tuple[Float[np.ndarray, "n"], dict[str, Float[np.ndar
     try:
         with h5py.File(path, "r") as file:
             for name in ("synced/time", *_FIELDS, "pose/ekf_ori"):
-                if isinstance(file.get(name), h5py.Dataset):
-                    fields[name] = np.asarray(file[name], dtype=np.float64)
+                if isinstance(node := file.get(name), h5py.Dataset):
+                    if node.dtype.kind not in "fiu":
+                        raise InputError(path, f"field '{name}' holds {node.dtype}, expected numbers", "copy it again")
+                    fields[name] = np.asarray(node, dtype=np.float64)
                 elif name != "pose/ekf_ori":
                     parent = file.get(name.partition("/")[0])
                     known = ", ".join(parent) if isinstance(parent, h5py.Group) else "nothing"
                     raise InputError(path, f"field '{name}' is missing", f"found in '{name.partition('/')[0]}': {known}")
     except InputError:
         raise
-    except (OSError, KeyError, ValueError, TypeError, RuntimeError) as error:
-        raise InputError(path, f"cannot be read as HDF5, it may be cut short ({error})", "copy it again") from None
+    except Exception as error:  # a damaged file makes the parser fail in any way
+        raise InputError(path, f"cannot be read as HDF5, it may be cut short ({shortened(error, 200)})", "copy it again") from None
     time = fields.pop("synced/time")
     if time.ndim != 1 or len(time) < 2:
         raise InputError(path, f"field 'synced/time' has shape {time.shape}, expected at least two stamps", "copy it again")
@@ -176,7 +178,7 @@ def _info(path: Path) -> dict[str, Any]:
         info = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise InputError(path, f"cannot be read ({error.strerror})", f"it belongs beside {_TABLE}") from None
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise InputError(path, f"is no JSON ({error})", "copy it again") from None
     if not isinstance(info, dict):
         raise InputError(path, "is no JSON object", "copy it again")
@@ -188,7 +190,7 @@ def _vector(info: dict[str, Any], name: str, length: int, folder: Path) -> Float
         values = np.asarray(info[name], dtype=np.float64)
     except KeyError:
         raise InputError(folder / _INFO, f"field '{name}' is missing", "copy it again") from None
-    except (ValueError, TypeError):
+    except (ValueError, TypeError, OverflowError):
         values = np.empty(0)
     if values.shape != (length,) or not np.isfinite(values).all():
         raise InputError(folder / _INFO, f"field '{name}' does not hold {length} numbers", "copy it again")
@@ -197,9 +199,13 @@ def _vector(info: dict[str, Any], name: str, length: int, folder: Path) -> Float
 
 def _number(info: dict[str, Any], name: str, folder: Path) -> float:
     value = info.get(name)
-    if not isinstance(value, int | float) or isinstance(value, bool) or not np.isfinite(value):
+    try:
+        number = float(value) if isinstance(value, int | float) and not isinstance(value, bool) else np.nan
+    except OverflowError:  # JSON's integers have no end
+        number = np.nan
+    if not np.isfinite(number):
         raise InputError(folder / _INFO, f"field '{name}' is {'missing' if value is None else 'no number'}", "copy it again")
-    return float(value)
+    return number
 
 
 DATASET = Dataset(

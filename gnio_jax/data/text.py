@@ -13,6 +13,12 @@ import pandas as pd
 from gnio_jax.types import InputError
 
 
+def shortened(text: object, most: int = 80) -> str:
+    """What a file says, as far as a message can quote it: one line of printable characters, at most `most` of them."""
+    line = "".join(character if character.isprintable() else "\ufffd" for character in str(text)[: 4 * most])
+    return line if len(str(text)) <= most else line[: most - 3] + "..."
+
+
 def read_csv(path: str | os.PathLike[str], separator: str = ",", header: bool = True) -> pd.DataFrame:
     """The columns of a text file by their names (stripped of blanks and of a leading '#'), or by their places from 0 without a header.
 
@@ -22,7 +28,7 @@ def read_csv(path: str | os.PathLike[str], separator: str = ",", header: bool = 
     path = Path(path)
     names, skip = None, 0
     try:
-        with path.open(encoding="utf-8") as file:
+        with path.open(encoding="utf-8-sig") as file:
             for line in file:
                 if not line.startswith("#") and line.strip():
                     break
@@ -42,7 +48,7 @@ def read_csv(path: str | os.PathLike[str], separator: str = ",", header: bool = 
     except (UnicodeDecodeError, pd.errors.ParserError, ValueError) as error:
         if isinstance(error, InputError):
             raise
-        raise InputError(path, f"is no table of text ({error})", "it may be cut short or damaged: copy it again") from None
+        raise InputError(path, f"is no table of text ({shortened(error, 200)})", "it may be cut short or damaged: copy it again") from None
     if header and names is not None:
         labels = [name.strip() for name in names.lstrip("#").strip().split(None if separator == " " else separator)]
         if len(labels) == table.shape[1] + 1 and not labels[-1]:
@@ -59,16 +65,16 @@ def numbers(table: pd.DataFrame, columns: Iterable[object], path: object) -> np.
     for name in columns:
         if name not in table.columns:
             known = ", ".join(str(column) for column in table.columns)
-            raise InputError(path, f"column '{name}' is missing", f"found: {known}")
+            raise InputError(path, f"column '{name}' is missing", f"found: {shortened(known, 600)}")
         values = table[name]
         if isinstance(values, pd.DataFrame):
             raise InputError(path, f"column '{name}' is there {values.shape[1]} times", "leave one")
         try:
             out.append(values.to_numpy(dtype=np.float64, na_value=np.nan))
         except (TypeError, ValueError):
-            as_number = pd.to_numeric(values, errors="coerce")
+            as_number = pd.Series(pd.to_numeric(values, errors="coerce"))
             row = int(np.argmax((as_number.isna() & values.notna()).to_numpy()))
-            raise InputError(path, f"column '{name}' holds {str(values.iloc[row])!r} in its row {row + 1}, no number") from None
+            raise InputError(path, f"column '{name}' holds '{shortened(values.iloc[row])}' in its row {row + 1}, no number") from None
     return np.stack(out, axis=1)
 
 
@@ -79,17 +85,24 @@ def listed(path: str | os.PathLike[str], find: Callable[[str], Path | None], roo
     """
     path = Path(path)
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or error
         raise InputError(path, f"the list cannot be read ({reason})", f"expected layout: {layout}") from None
     entries = list(dict.fromkeys(line.strip() for line in lines if line.strip() and not line.startswith("#")))
-    found = {entry: find(entry) for entry in entries}
+    found = {entry: _found(find, entry) for entry in entries}
     present = [place for place in found.values() if place is not None]
     absent = [entry for entry, place in found.items() if place is None]
     if not present:
         raise InputError(path, f"none of its {len(entries)} sequences is below {root}", f"expected layout: {layout}")
     if absent:
-        warnings.warn(f"{path}: {len(absent)} of {len(entries)} listed sequences are absent: {', '.join(absent[:3])}"
+        warnings.warn(f"{path}: {len(absent)} of {len(entries)} listed sequences are absent: {', '.join(map(shortened, absent[:3]))}"
                       f"{', ...' if len(absent) > 3 else ''}", stacklevel=3)
     return present
+
+
+def _found(find: Callable[[str], Path | None], entry: str) -> Path | None:
+    try:
+        return find(entry)
+    except OSError:  # too long for a name, for one
+        return None
