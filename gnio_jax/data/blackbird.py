@@ -22,11 +22,13 @@ from scipy.spatial.transform import Rotation
 
 from gnio_jax.data.recordings import read_all, single
 from gnio_jax.data.sequence import (
+    FASTEST,
     Dataset,
     Recording,
     check_finite,
     check_gaps,
     check_increasing,
+    check_motion,
     check_rate,
     check_unit_norm,
     quaternions,
@@ -34,7 +36,7 @@ from gnio_jax.data.sequence import (
     rotations,
     validate,
 )
-from gnio_jax.data.text import listed, numbers, read_csv
+from gnio_jax.data.text import listed, numbers, read_csv, shortened
 from gnio_jax.types import InputError, Sequence
 
 RATE = 100.0
@@ -90,7 +92,9 @@ def read_sequence(folder: str | os.PathLike[str], name: str | None = None) -> Se
                     "body": "front-right-down", "native_world": world, "truth": "motion capture", "imu_compensated": "constant bias",
                     "start_time": float(stamps[0]), "licence": DATASET.licence},
     )
-    return resample(validate(sequence, path), RATE)
+    sequence = validate(sequence, path)
+    check_motion(sequence, path)
+    return resample(sequence, RATE)
 
 
 def _fields(path: Path) -> dict[str, np.ndarray]:
@@ -108,8 +112,8 @@ def _fields(path: Path) -> dict[str, np.ndarray]:
                 fields[field] = value.astype(np.float64)
     except InputError:
         raise
-    except (OSError, KeyError, ValueError, TypeError, RuntimeError) as error:
-        raise InputError(path, f"cannot be read as HDF5, it may be cut short ({error})", "copy it again") from None
+    except Exception as error:  # a damaged file makes the parser fail in any way
+        raise InputError(path, f"cannot be read as HDF5, it may be cut short ({shortened(error, 200)})", "copy it again") from None
     return fields
 
 
@@ -127,6 +131,8 @@ def _velocity(path: Path, stamps: Float[np.ndarray, " n"]) -> Float[np.ndarray, 
     if len(values) != len(stamps) or np.abs(values[:, 0] - stamps).max() > 1e-3:
         raise InputError(path, f"field 'ts' is not that of {_TABLE} beside it ({len(values)} and {len(stamps)} rows)", "copy both again")
     check_finite(values[:, 8:], "velocity", path)
+    if np.abs(values[:, 8:]).max() > FASTEST:
+        raise InputError(path, f"field 'velocity' is beyond {FASTEST:g} m/s", "copy it again")
     return values[:, 8:]
 
 

@@ -29,6 +29,7 @@ from gnio_jax.data.sequence import (
     check_finite,
     check_gaps,
     check_increasing,
+    check_motion,
     read_hdf5,
     resample,
     validate,
@@ -70,6 +71,9 @@ def read_recording(path: str | os.PathLike[str]) -> Sequence:
     path = Path(path)
     if path.suffix.lower() in (".h5", ".hdf5"):
         sequence = read_hdf5(path)
+        _check_seconds(sequence.time, path)
+        check_gaps(sequence.time, path)
+        check_motion(sequence, path)
         return resample(sequence, _rate(sequence.time))
     table = read_csv(path)
     for field, columns in _REFERENCE.items():
@@ -93,7 +97,9 @@ def read_recording(path: str | os.PathLike[str]) -> Sequence:
     valid &= np.isfinite(reference["velocity"]).all(axis=1)
     sequence = Sequence(name=path.stem, time=time, gyro=gyro, accel=accel, valid=valid,
                         attributes={"dataset": "csv", "group": path.stem, "truth": "given" if valid.any() else "none"}, **reference)
-    return resample(validate(sequence, path), _rate(time))
+    sequence = validate(sequence, path)
+    check_motion(sequence, path)
+    return resample(sequence, _rate(time))
 
 
 def in_order(

@@ -26,7 +26,6 @@ import itertools
 import os
 import re
 import warnings
-import zipfile
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
@@ -40,6 +39,9 @@ from scipy.spatial.transform import Rotation
 from gnio_jax.data.csv import in_order
 from gnio_jax.data.recordings import read_all, single
 from gnio_jax.data.sequence import (
+    FASTEST,
+    FASTEST_TURN,
+    STRONGEST_FORCE,
     Dataset,
     Recording,
     check_finite,
@@ -50,6 +52,7 @@ from gnio_jax.data.sequence import (
     resample,
     validate,
 )
+from gnio_jax.data.text import shortened
 from gnio_jax.types import InputError, Sequence
 
 RATE = 100.0
@@ -66,9 +69,12 @@ SHORTEST_PIECE = 3.0
 LARGEST_JUMP = 0.5
 """m within a second by which position and integrated velocity may disagree."""
 
+_STAMP = re.compile(r"\d{4}-\d\d-\d\d[ T]\d\d:\d\d:\d\d(\.\d+)?")
 _DRIVE = re.compile(r"\d{4}_\d{2}_\d{2}_drive_\d{4}")
 _VALUES = ("lat", "lon", "alt", "roll", "pitch", "yaw", "vn", "ve", "vf", "vl", "vu", "ax", "ay", "az", "af", "al", "au", "wx", "wy", "wz",
            "wf", "wl", "wu", "pos_accuracy", "vel_accuracy", "navstat", "numsats", "posmode", "velmode", "orimode")
+_MOST = np.array([85.0, 180.0, 1e5, *[10.0] * 3, *[FASTEST] * 5, *[STRONGEST_FORCE] * 6, *[FASTEST_TURN] * 3])
+"""Magnitudes of the values up to `wz` beyond which a packet is damaged; the rest is not used."""
 _ARRAYS = {"t": None, "p_gt": 3, "ang_gt": 3, "v_gt": 3, "u": 6}
 
 
@@ -153,8 +159,6 @@ def read_packets(oxts: str | os.PathLike[str]) -> list[Sequence]:
     if known.sum() < 2:
         raise InputError(oxts / "timestamps.txt", f"gives {known.sum()} packets a stamp", "copy the drive again")
     stamps, packets = stamps[rows][known], packets[known]
-    for index in range(_VALUES.index("wz") + 1):  # the rest is not used
-        check_finite(packets[:, index], _VALUES[index], oxts / "data")
     start = stamps.min()
     time, packets, repairs = in_order((stamps - start).astype(np.int64) * 1e-9, packets, oxts / "timestamps.txt", repeats="first")
     if np.median(np.diff(time)) > 0.05:
@@ -207,7 +211,12 @@ def _packets(folder: Path) -> tuple[np.ndarray, np.ndarray]:
         except InputError:
             raise
         except ValueError as error:
-            raise InputError(path, f"holds what is no number ({error})", "copy it again") from None
+            raise InputError(path, f"holds what is no number ({shortened(error, 200)})", "copy it again") from None
+    absurd = ~(np.abs(table[:, : len(_MOST)]) <= _MOST)  # NaN, too
+    if absurd.any():
+        row, index = np.argwhere(absurd)[0]
+        raise InputError(paths[row], f"field '{_VALUES[index]}' is {table[row, index]:g}, expected within ±{_MOST[index]:g}",
+                         "copy it again")
     return np.array([int(path.stem) for path in paths]), table
 
 
@@ -221,9 +230,11 @@ def _stamps(path: Path) -> np.ndarray:
     for row, line in enumerate(lines):
         if line.strip():
             try:
+                if not _STAMP.fullmatch(line.strip()):  # NumPy takes "now" for a stamp, too
+                    raise ValueError
                 stamps[row] = np.datetime64(line.strip(), "ns")
             except ValueError:
-                raise InputError(path, f"line {row + 1} ({line.strip()!r}) is no stamp",
+                raise InputError(path, f"line {row + 1} ('{shortened(line.strip())}') is no stamp",
                                  "stamps look like 2011-09-26 14:02:22.484109563") from None
     return stamps
 
@@ -253,8 +264,8 @@ def read_piece(path: str | os.PathLike[str]) -> Sequence:
                 values[field] = value.astype(np.float64)
     except InputError:
         raise
-    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
-        raise InputError(path, f"cannot be read as npz, it may be cut short ({error})", "copy it again") from None
+    except Exception as error:  # a damaged file makes the parser fail in any way
+        raise InputError(path, f"cannot be read as npz, it may be cut short ({shortened(error, 200)})", "copy it again") from None
     for field, value in values.items():
         check_finite(value, field, path)
     time = values["t"]

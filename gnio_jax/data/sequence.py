@@ -22,6 +22,12 @@ from scipy.spatial.transform import Rotation
 from gnio_jax.files import replacing
 from gnio_jax.types import GRAVITY, InputError, Sequence
 
+FASTEST_TURN, STRONGEST_FORCE = 100.0, 1000.0
+"""rad/s and m/s²: beyond the range of any gyro or accelerometer one navigates with."""
+FASTEST, LARGEST_STEP, FARTHEST = 300.0, 10.0, 1e8
+"""m/s that nothing exceeds that carries such an IMU; m by which positions held for a while, or corrected, may jump all the same; m from
+the world's origin, of which a float still has digits enough."""
+
 WINDOW_SECONDS = 1.0
 """A hole in the IMU longer than the network's window is no jitter: loaders refuse it."""
 
@@ -181,6 +187,30 @@ def check_units(gyro: Float[np.ndarray, "n 3"], accel: Float[np.ndarray, "n 3"],
     turn = float(np.median(np.linalg.norm(gyro, axis=1)))
     if turn > 20.0:
         raise InputError(source, f"field 'gyro' looks like deg/s (median magnitude {turn:.3g})", "convert it to rad/s (× π/180)")
+    for field, values, most, unit in (("gyro", gyro, FASTEST_TURN, "rad/s"), ("accel", accel, STRONGEST_FORCE, "m/s²")):
+        beyond = (np.abs(values) > most).any(axis=1)
+        if beyond.any():
+            raise InputError(source, f"field '{field}' is beyond {most:g} {unit} in {beyond.sum()} rows, first in row {np.argmax(beyond)}",
+                             "no such sensor measures that: repair or cut the recording there")
+
+
+def check_motion(sequence: Sequence, source: object) -> None:
+    """Raise `InputError` where the reference, as far as it is valid, moves as nothing does: for datasets whose truth is taken as it is."""
+    speed = np.abs(sequence.velocity).max(axis=1)
+    fast = sequence.valid & (speed > FASTEST)
+    if fast.any():
+        raise InputError(source, f"field 'velocity' is beyond {FASTEST:g} m/s in {fast.sum()} rows, first in row {np.argmax(fast)}",
+                         "repair these rows or mark them invalid")
+    far = sequence.valid & (np.abs(sequence.position).max(axis=1) > FARTHEST)
+    if far.any():
+        raise InputError(source, f"field 'position' is beyond {FARTHEST:g} m in {far.sum()} rows, first in row {np.argmax(far)}",
+                         "give metres in a local world, or mark these rows invalid")
+    step = np.abs(np.diff(sequence.position, axis=0)).max(axis=1)
+    jump = sequence.valid[1:] & sequence.valid[:-1] & (step > np.maximum(FASTEST * np.diff(sequence.time), LARGEST_STEP))
+    if jump.any():
+        row = int(np.argmax(jump)) + 1
+        raise InputError(source, f"field 'position' jumps in {jump.sum()} rows, first in row {row} (by {step[row - 1]:.3g} m)",
+                         "repair these rows or mark them invalid")
 
 
 def check_unit_norm(
@@ -393,7 +423,7 @@ def gyro_windows(sequence: Sequence, window_seconds: float = 10.0) -> tuple[Floa
     time, valid = sequence.time, sequence.valid
     step = float(np.median(np.diff(time)))
     n = len(time)
-    length = min(round(window_seconds / step), n - 1)
+    length = max(min(round(window_seconds / step), n - 1), 1)
     starts = np.arange(0, n - length, max(length // 2, 1))
     starts = starts[valid[starts] & valid[starts + length]]
     if not starts.size:
@@ -531,8 +561,12 @@ def read_hdf5(path: str | os.PathLike[str]) -> Sequence:
                 if not isinstance(value, np.ndarray) or value.dtype.kind != ("b" if field == "valid" else "f"):
                     raise InputError(path, f"field '{field}' is not an array of {'booleans' if field == 'valid' else 'numbers'}",
                                      "convert the recording again")
-                values[field] = value
+                values[field] = value.astype(np.float64, copy=False) if value.dtype.kind == "f" else value
             device: Any = file["device_orientation"][()] if "device_orientation" in file else None  # pyright: ignore[reportIndexIssue]
+            if device is not None:
+                if not isinstance(device, np.ndarray) or device.dtype.kind != "f":
+                    raise InputError(path, "field 'device_orientation' is not an array of numbers", "convert the recording again")
+                device = device.astype(np.float64, copy=False)
             stored = file["attributes"].attrs if "attributes" in file else {}
             attributes = {key: value.item() if isinstance(value, np.generic) else value for key, value in stored.items()}
             name = str(file.attrs.get("name", path.stem))
@@ -540,6 +574,6 @@ def read_hdf5(path: str | os.PathLike[str]) -> Sequence:
         raise InputError(path, "no such file") from None
     except InputError:
         raise
-    except (OSError, KeyError, ValueError, TypeError, RuntimeError) as error:
+    except Exception as error:  # a damaged file makes the parser fail in any way
         raise InputError(path, f"cannot be read as HDF5, it may be cut short ({error})", "convert or copy it again") from None
     return validate(Sequence(name=name, device_orientation=device, attributes=attributes, **values), path)

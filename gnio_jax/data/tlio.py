@@ -23,12 +23,13 @@ from gnio_jax.data.sequence import (
     check_finite,
     check_gaps,
     check_increasing,
+    check_motion,
     check_rate,
     check_unit_norm,
     rotations,
     validate,
 )
-from gnio_jax.data.text import listed
+from gnio_jax.data.text import listed, shortened
 from gnio_jax.types import InputError, Sequence
 
 RATE = 200.0
@@ -74,7 +75,7 @@ def read_sequence(folder: str | os.PathLike[str]) -> Sequence:
     everywhere = np.ones(len(time), dtype=bool)
     quaternion = check_unit_norm(quaternion, everywhere, "qxyzw_World_Device", path)
     body = rotations(quaternion).inv()
-    return validate(
+    sequence = validate(
         Sequence(
             name=folder.name,
             time=time,
@@ -89,6 +90,8 @@ def read_sequence(folder: str | os.PathLike[str]) -> Sequence:
         ),
         path,
     )
+    check_motion(sequence, path)
+    return sequence
 
 
 def _listed(root: Path, split: str) -> list[Path]:
@@ -104,7 +107,7 @@ def _columns(path: Path) -> tuple[dict[str, slice], int]:
         parsed = [re.fullmatch(r"\s*(.+?)\s*\((\d+)\)\s*", entry) for entry in entries]
     except OSError as error:
         raise InputError(path, f"cannot be read ({error.strerror})", "it names the columns of the table beside it") from None
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise InputError(path, f"field 'columns_name(width)' cannot be read ({type(error).__name__}: {error})",
                          "it lists entries like \"ts_us(1)\"") from None
     columns, start = {}, 0
@@ -124,8 +127,8 @@ def _columns(path: Path) -> tuple[dict[str, slice], int]:
 def _table(path: Path, width: int) -> Float[np.ndarray, "n w"]:
     try:
         table = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise InputError(path, f"cannot be read as a NumPy array, it may be cut short ({error})", "copy it again") from None
+    except Exception as error:  # a damaged file makes the parser fail in any way
+        raise InputError(path, f"cannot be read as a NumPy array, it may be cut short ({shortened(error, 200)})", "copy it again") from None
     if table.ndim != 2 or table.shape[1] != width or table.dtype.kind != "f" or len(table) < 2:
         raise InputError(path, f"holds {table.dtype} of shape {table.shape}, expected floats (N, {width})", f"see {_DESCRIPTION} beside it")
     return table.astype(np.float64)
