@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from PIL import Image
 
 from gnio_jax.data.sequence import SelfCheck, gyro_windows
 from gnio_jax.files import replacing
@@ -18,21 +19,28 @@ UNTRUSTED = "#F3D9CC"
 POINTS = 3000
 """A line of more points than the picture has pixels only makes the file larger."""
 WINDOW_SECONDS = 10.0
+COLOURS = 96
 
 
 def save(path: Path, figure: Figure) -> None:
-    """Write one figure as PNG, whole or not at all."""
-    FigureCanvasAgg(figure)
+    """Write one figure as PNG, whole or not at all. A few colours make a third of the file: there may be hundreds of them."""
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    picture = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB").quantize(COLOURS, dither=Image.Dither.NONE)
     with replacing(path) as temporary:
-        figure.savefig(temporary, dpi=90, format="png")
+        picture.save(temporary, format="PNG", optimize=True)
 
 
 def overview(sequence: Sequence, check: SelfCheck) -> Figure:
     """Trajectory from above, and over time: speed, |accel|, angle between integrated gyro and reference. Shaded: not valid."""
-    figure = Figure(figsize=(11.0, 5.4), layout="constrained")
-    plan, right = figure.subfigures(1, 2, width_ratios=(1.0, 1.25))
-    _plan(plan.add_subplot(), sequence)
-    panels = right.subplots(3, 1, sharex=True)
+    figure = Figure(figsize=(11.0, 5.4), dpi=90, layout="constrained")
+    grid = figure.add_gridspec(3, 2, width_ratios=(1.0, 1.25))
+    _plan(figure.add_subplot(grid[:, 0]), sequence)
+    panels: list[Axes] = []
+    for row in range(3):
+        panels.append(figure.add_subplot(grid[row, 1], sharex=panels[0] if panels else None))
+    for panel in panels[:-1]:
+        panel.tick_params(labelbottom=False)
     time = sequence.time - sequence.time[0]
     every = max(len(time) // POINTS, 1)
     for panel in panels:
