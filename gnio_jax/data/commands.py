@@ -199,10 +199,10 @@ def file_name(name: str) -> str:
 
 def show_list(_: ListOptions) -> None:
     """Two tables: what there is and what of it is here, and where it is had."""
-    here = Table(title="Datasets", title_justify="left")
+    here = Table(title="Datasets", title_justify="left", show_lines=True)
     for column in ("dataset", "Hz", "splits", "licence", "found here"):
         here.add_column(column, overflow="fold", justify="right" if column == "Hz" else "left")
-    had = Table(title="Where they are had, and the layout that is expected", title_justify="left")
+    had = Table(title="Where they are had, and the layout that is expected", title_justify="left", show_lines=True)
     for column in ("dataset", "where", "layout"):
         had.add_column(column, overflow="fold")
     for name in registry.names():
@@ -332,7 +332,7 @@ def _spell_splits(name: str, splits: dict[str, tuple[str, ...]]) -> str:
     return ", ".join(split for split in own if split != "all" or len(own) == 1)
 
 
-_COLUMNS = ("sequence", "split", "s", "Hz", "mean of R·accel m/s²", "gyro °/10 s", "speed m/s", "accel corr.", "valid", "")
+_COLUMNS = ("sequence", "split", "s", "Hz", "mean of R·accel\nm/s²", "gyro\n°/10 s", "speed\nm/s", "accel\ncorr.", "valid", "")
 
 
 def _cells(row: Row) -> list[str]:
@@ -352,14 +352,16 @@ def _number(value: float, style: str) -> str:
 def _table(rows: list[Row], title: str) -> Table:
     table = Table(title=title, title_justify="left")
     for column in _COLUMNS:
-        table.add_column(column, overflow="fold", justify="left" if column in ("sequence", "split", "") else "right")
+        text = column in ("sequence", "split", "")
+        table.add_column(column, overflow="fold", justify="left" if text else "right", no_wrap=not text,
+                         min_width=14 if column == "sequence" else None)
     for row in rows:
         table.add_row(*_cells(row), style="red" if row.reason else None)
     return table
 
 
 def _markdown(rows: list[Row]) -> str:
-    lines = [list(_COLUMNS), ["---", "---", *["--:"] * 7, "---"], *(_cells(row) for row in rows)]
+    lines = [[column.replace("\n", " ") for column in _COLUMNS], ["---", "---", *["--:"] * 7, "---"], *(_cells(row) for row in rows)]
     return "".join(f"| {' | '.join(cell.replace('|', '¦') for cell in line)} |\n" for line in lines)
 
 
@@ -418,6 +420,10 @@ def convert(options: ConvertOptions) -> None:
     if dataset.needs_root and out.resolve() == root.resolve():
         raise InputError(out, "is the folder that is read", "choose another one for the result")
     found, splits, notes = in_splits(dataset, root, options.split)
+    files: dict[str, str] = {}
+    for name in found:
+        if (other := files.setdefault(file_name(name), name)) != name:
+            raise InputError(root, f"'{other}' and '{name}' would be one file, {file_name(name)}.h5", "rename one of them")
     _claim(out, {"dataset": dataset.name, "rate": options.rate})
     results = {name: done for name in found if (done := _done(_journal(out, name), out)) is not None}
     missing = [name for name in found if name not in results]

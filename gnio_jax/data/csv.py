@@ -56,8 +56,12 @@ def read(root: Path, split: str) -> list[Sequence]:
 
 
 def recordings(root: Path, split: str) -> list[Recording]:
-    """The recordings of a split."""
-    return [single(path.stem, read_recording, path) for path in _files(Path(root), split)]
+    """The recordings of a split. Raises `InputError` where two files would go by the same name."""
+    named: dict[str, Path] = {}
+    for path in _files(Path(root), split):
+        if named.setdefault(path.stem, path) != path:
+            raise InputError(path, f"has the name of {named[path.stem]}", "rename or remove one of them")
+    return [single(name, read_recording, path) for name, path in named.items()]
 
 
 def list_splits(root: Path) -> tuple[str, ...]:

@@ -131,6 +131,7 @@ def test_check_shows_every_recording_with_its_figures_and_reasons(root, capsys):
     assert [cell.strip() for cell in lines[3].strip("|").split("|")] == tilted
     pictures = {path.stem: image.imread(path) for path in (root.parent / "pictures").iterdir()}
     assert set(pictures) == {"fair", "tilted", "mirrored", "also"}  # also those that are left out, if they can be drawn
+    assert all(path.stat().st_size < 150_000 for path in (root.parent / "pictures").iterdir())
     assert all(picture.shape[1] > picture.shape[0] > 300 and picture[..., :3].std() > 0.05 for picture in pictures.values())
 
 
@@ -283,6 +284,20 @@ def test_what_a_dataset_asks_of_its_recordings_goes_with_them(root, monkeypatch)
     data.write_hdf5(path, sequence._replace(velocity=sequence.velocity * 5))
     with pytest.warns(UserWarning, match="mirrored: left out by the self-check: .*too fast for a pedestrian"), pytest.raises(InputError):
         data.load("csv", path.parent, "test")
+
+
+def test_two_recordings_never_become_one_file(root, place):
+    for name in ("a b", "a_b"):
+        write_sequence(place / "more" / name)
+    (place / "more" / "test_list.txt").write_text("a b\na_b\n")
+    with pytest.raises(InputError, match=r"more: 'a b' and 'a_b' would be one file, a_b\.h5"):
+        main(["convert", "tlio", "more", "converted"])
+    assert not (place / "converted").exists()
+    main(["convert", "tlio", str(root), "own", "--split", "test"])
+    (place / "own" / "test.txt").unlink()
+    (place / "own" / "also.csv").write_text("")
+    with pytest.raises(InputError, match=r"also\.h5: has the name of .*also\.csv; rename or remove one"):
+        data.load("csv", place / "own")
 
 
 def test_splits_of_other_names_are_read_by_their_lists(root):
