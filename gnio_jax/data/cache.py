@@ -8,12 +8,16 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import warnings
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from gnio_jax.data.sequence import read_hdf5, write_hdf5
 from gnio_jax.files import replacing
 from gnio_jax.types import InputError, Sequence
+
+_NOTES = "warnings of the loader"
+"""The attribute, in the cache alone."""
 
 
 class Refusal(InputError):
@@ -36,9 +40,10 @@ def cached(sources: Iterable[str | os.PathLike[str]], version: str, build: Calla
     """The sequence that `build` makes of the files `sources`, made only once per state of these files.
 
     The key is each file's absolute path, size and modification time, and `version`, which the loader changes whenever it
-    would make another sequence of the same files (name it after the loader and its options: "oxiod 3"). A `Refusal` that
-    `build` raises is kept, too, and raised again; any other exception is not. A damaged entry is made anew, and where
-    nothing can be written the sequence is just made every time. Raises `InputError` when a source is missing.
+    would make another sequence of the same files (name it after the loader and its options: "oxiod 3"). What `build` warns of
+    is kept and said again. A `Refusal` that `build` raises is kept, too, and raised again; any other exception is not. A damaged
+    entry is made anew, and where nothing can be written the sequence is just made every time. Raises `InputError` when a source is
+    missing.
     """
     states = []
     for source in sources:
@@ -53,7 +58,7 @@ def cached(sources: Iterable[str | os.PathLike[str]], version: str, build: Calla
 
     try:
         if entry.is_file():
-            return read_hdf5(entry)
+            return _said_again(read_hdf5(entry))
         if refused.is_file():
             where, problem, remedy = json.loads(refused.read_text(encoding="utf-8"))
             raise Refusal(where, problem, remedy)
@@ -62,8 +67,11 @@ def cached(sources: Iterable[str | os.PathLike[str]], version: str, build: Calla
     except (OSError, ValueError, TypeError):  # InputError is a ValueError: a damaged entry
         pass
 
+    caught: list[warnings.WarningMessage] = []
     try:
-        sequence = build()
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            sequence = build()
     except Refusal as refusal:
         try:
             with replacing(refused) as temporary:
@@ -71,8 +79,19 @@ def cached(sources: Iterable[str | os.PathLike[str]], version: str, build: Calla
         except OSError:
             pass
         raise
+    finally:
+        for warning in caught:
+            warnings.warn_explicit(warning.message, warning.category, warning.filename, warning.lineno)
+    notes = [str(warning.message) for warning in caught if warning.category is UserWarning]
     try:
-        write_hdf5(entry, sequence)
+        write_hdf5(entry, sequence._replace(attributes=sequence.attributes | ({_NOTES: json.dumps(notes)} if notes else {})))
     except OSError:
         pass
     return sequence
+
+
+def _said_again(sequence: Sequence) -> Sequence:
+    """Without the attribute that keeps the warnings, which are given."""
+    for note in json.loads(sequence.attributes.get(_NOTES, "[]")):
+        warnings.warn(note, stacklevel=3)
+    return sequence._replace(attributes={name: value for name, value in sequence.attributes.items() if name != _NOTES})

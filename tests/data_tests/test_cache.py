@@ -1,6 +1,7 @@
 """The cache rebuilds when, and only when, the files or the loader changed."""
 
 import os
+import warnings
 
 import numpy as np
 import pytest
@@ -84,6 +85,20 @@ def test_a_refusal_is_remembered_and_other_errors_are_not(source):
         with pytest.raises(InputError):
             cached([source], "v2", broken)
     assert broken.calls == 2
+
+
+def test_what_the_loader_warned_of_is_said_again(source):
+    def build():
+        warnings.warn("imu.csv: a gap was cut off", stacklevel=2)
+        return Builder()()
+
+    for _ in range(2):
+        with pytest.warns(UserWarning, match="a gap was cut off") as said:
+            sequence = cached([source], "v1", build)
+        assert len(said) == 1 and sequence.attributes == {}
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        cached([source], "v2", Builder())
 
 
 def test_a_cache_that_cannot_be_written_is_no_error(source, tmp_path, monkeypatch):
