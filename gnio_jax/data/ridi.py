@@ -23,6 +23,7 @@ from jaxtyping import Bool, Float
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
+from gnio_jax.data.cache import cached
 from gnio_jax.data.phones import find_folders, find_list, held_out, longest_piece, poses_at, with_velocity
 from gnio_jax.data.recordings import read_all, single
 from gnio_jax.data.sequence import (
@@ -41,6 +42,8 @@ from gnio_jax.data.text import listed, numbers, read_csv
 from gnio_jax.types import InputError, Sequence
 
 RATE = 200.0
+VERSION = "ridi 1"
+"""Changes whenever other sequences would come of the same files: it is part of the cache's key."""
 NATIVE_RATE = 202.3
 """Hz, of data.csv."""
 RAW_RATES = (90.0, 1100.0)
@@ -75,7 +78,7 @@ def recordings(root: Path, split: str) -> list[Recording]:
     if split == "all":
         if not folders:
             raise InputError(root, "holds no recording of RIDI", f"expected layout: {DATASET.layout}")
-        return [single(name, read_sequence, folder) for name, folder in sorted(folders.items())]
+        return [single(name, _cached, folder, {}) for name, folder in sorted(folders.items())]
     path = find_list(root, _LISTS[split])
     chosen = listed(path, lambda entry: folders.get(_name(entry)), root, DATASET.layout)
     held: set[str] = set()
@@ -86,11 +89,13 @@ def recordings(root: Path, split: str) -> list[Recording]:
             raise InputError(path, f"split '{split}' would be empty: {len(held)} sequences of this list are held out for validation",
                              "complete the data, or choose another split")
     note = {"held_out": ", ".join(sorted({_subject(name) for name in held}))} if split in ("train", "val") else {}
-    return [single(folder.name, _with_note, folder, note) for folder in chosen]
+    return [single(folder.name, _cached, folder, note) for folder in chosen]
 
 
-def _with_note(folder: Path, note: dict[str, str]) -> Sequence:
-    sequence = read_sequence(folder)
+def _cached(folder: Path, note: dict[str, str]) -> Sequence:
+    texts = (folder / name for name in ("gyro.txt", "acce.txt", "orientation.txt", *(name for name, _ in _POSES)))
+    sources = [folder / _TABLE] if (folder / _TABLE).is_file() else [path for path in texts if path.is_file()]
+    sequence = cached(sources, VERSION, lambda: read_sequence(folder))
     return sequence._replace(attributes=sequence.attributes | note)
 
 

@@ -22,6 +22,11 @@ HEADER = ("", "time", "gyro_x", "gyro_y", "gyro_z", "acce_x", "acce_y", "acce_z"
           "rv_y", "rv_z")
 
 
+@pytest.fixture(autouse=True)
+def own_cache(tmp_path_factory, monkeypatch):
+    monkeypatch.setenv("GNIO_CACHE", str(tmp_path_factory.mktemp("cache")))
+
+
 def wxyz(rotation):
     return rotation.as_quat()[:, [3, 0, 1, 2]]
 
@@ -137,6 +142,24 @@ def test_of_a_recording_with_a_gap_the_longer_piece_is_kept(tmp_path):
     time = compare(sequence)
     check_device(sequence, begin=13.4)
     assert sequence.valid.all() and sequence.time[0] == 0.0 and len(time) == pytest.approx(22.6 * 200, abs=3)
+
+
+def test_the_cache_is_used_and_keyed_by_the_files_that_are_read(tmp_path, monkeypatch):
+    folder = write_text(tmp_path, "hang_leg1", "android_sensor_pose.txt")
+    first = data.load("ridi", tmp_path, "all")[0]
+    calls = []
+    monkeypatch.setattr(ridi, "read_sequence", lambda folder: calls.append(folder) or first)
+    np.testing.assert_array_equal(data.load("ridi", tmp_path, "all")[0].gyro, first.gyro)
+    assert not calls
+    for number, name in enumerate(("acce.txt", "gyro.txt", "orientation.txt", "pose.txt", "android_sensor_pose.txt"), 1):
+        path = folder / name
+        path.write_text(path.read_text() + "\n")
+        data.load("ridi", tmp_path, "all")
+        data.load("ridi", tmp_path, "all")
+        assert len(calls) == number, name
+    write_table(tmp_path, "hang_leg1").touch()  # the table, once it is there, is what is read
+    data.load("ridi", tmp_path, "all")
+    assert len(calls) == 6
 
 
 def test_a_short_gap_is_marked(tmp_path):
