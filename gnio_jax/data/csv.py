@@ -132,7 +132,7 @@ def _files(root: Path, split: str) -> list[Path]:
         raise InputError(root, f"unknown split '{split}'", f"known splits: {', '.join(SPLITS)}, or that of a list {split}.txt there")
     if split not in SPLITS or any((root / f"{name}.txt").is_file() for name in SPLITS):
         return listed(root / f"{split}.txt", lambda entry: _find(root, entry), root, DATASET.layout)
-    paths = sorted(path for path in root.glob("*") if path.suffix.lower() in _FILES and path.is_file())
+    paths = sorted(path for path in root.glob("[!.]*") if path.suffix.lower() in _FILES and path.is_file())
     if not paths:
         raise InputError(root, "holds no recording (*.csv, *.h5, *.hdf5)", f"expected layout: {DATASET.layout}")
     if split != "test":
