@@ -4,9 +4,10 @@ Needs only JAX and the geometry: the network is any function from windows to a `
 """
 
 from gnio_jax.filtering.scekf import FilterHistory, run_filter, run_odometry
+from gnio_jax.filtering.smoother import SmoothedHistory, smooth
 from gnio_jax.filtering.state import FilterConfig, FilterState, GateState, InitialStd, NoiseModel, initial_state, level_state
 
 __all__ = [
-    "FilterConfig", "FilterHistory", "FilterState", "GateState", "InitialStd", "NoiseModel", "initial_state", "level_state",
-    "run_filter", "run_odometry",
+    "FilterConfig", "FilterHistory", "FilterState", "GateState", "InitialStd", "NoiseModel", "SmoothedHistory", "initial_state",
+    "level_state", "run_filter", "run_odometry", "smooth",
 ]
