@@ -6,12 +6,12 @@ import dataclasses
 from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import jax
 
 from gnio_jax import config as configuration
-from gnio_jax import data
+from gnio_jax import data, models
 from gnio_jax.config import EvaluateConfig, TrainConfig
 from gnio_jax.evaluation import odometry, report
 from gnio_jax.evaluation.odometry import Network, Setup
@@ -112,7 +112,7 @@ def _load(workdir: Path, config: EvaluateConfig) -> tuple[TrainConfig, Network |
 
     run = checkpoint.load_run(workdir, config.checkpoint)
     provenance = {"model": run.config.model.name, "checkpoint": config.checkpoint, "epoch": run.epoch, "step": run.step}
-    return run.config, Network(cast(Any, run.model.apply), run.variables), provenance
+    return run.config, Network(models.Inference(run.model), models.freeze(run.model, run.variables)), provenance
 
 
 def _group(sequence: Sequence) -> str:

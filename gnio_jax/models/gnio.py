@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -30,14 +30,22 @@ class GNIO(nn.Module):
     scale: Literal["softplus", "pos_elu", "abs", "exp", "linear"] = "softplus"
 
     @nn.compact
-    def __call__(self, windows: Float[jax.Array, "b n 6"], train: bool = False) -> Prediction:
+    def __call__(self, windows: Float[jax.Array, "b n 6"], train: bool = False, memory: Any = None) -> Prediction:
         features = ResNet18(self.width, name="encoder")(windows.astype(jnp.float32), train)
         h = features.mean(axis=1)
         diagnostics = {}
         if self.bank_size:
-            context, diagnostics["attention"] = MotionBank(self.bank_size, self.bank_heads, name="bank")(h)
+            context, diagnostics["attention"] = MotionBank(self.bank_size, self.bank_heads, 8 * self.width, name="bank")(h, memory)
             h = h + context
         head = GatedHead(self.gate, self.scale, name="head") if self.head == "gated" else LinearHead(name="head")
         displacement, seen = head(h)
         log_std = UncertaintyHead(name="uncertainty")(h)
         return Prediction(displacement, log_std, diagnostics | seen)
+
+    @nn.nowrap
+    def constants(self, variables: Any) -> dict[str, Any]:
+        """Arguments of `apply` that depend on the variables alone: the bank's keys and values."""
+        if not self.bank_size:
+            return {}
+        bank = MotionBank(self.bank_size, self.bank_heads, 8 * self.width)
+        return {"memory": bank.apply({"params": variables["params"]["bank"]}, method="memory")}

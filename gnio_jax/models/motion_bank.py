@@ -17,19 +17,23 @@ class MotionBank(nn.Module):
 
     size: int = 64
     heads: int = 8
+    width: int = 512
 
-    @nn.compact
-    def __call__(self, feature: Float[jax.Array, "b d"]) -> tuple[Float[jax.Array, "b d"], Float[jax.Array, "b h m"]]:
-        """Context (b, d) and attention weights (b, heads, m) of each feature."""
-        width = feature.shape[-1]
-        bank = self.param("prototypes", nn.initializers.normal(width**-0.5), (self.size, width), jnp.float32)
+    def setup(self) -> None:
+        shape = (self.heads, self.width // self.heads)
+        self.prototypes = self.param("prototypes", nn.initializers.normal(self.width**-0.5), (self.size, self.width), jnp.float32)
+        self.query, self.key, self.value = (nn.DenseGeneral(shape, dtype=jnp.float32, param_dtype=jnp.float32) for _ in range(3))
+        self.output = nn.DenseGeneral(self.width, axis=(-2, -1), dtype=jnp.float32, param_dtype=jnp.float32)
 
-        def project(name: str, x: jax.Array) -> jax.Array:
-            return nn.DenseGeneral((self.heads, width // self.heads), dtype=jnp.float32, param_dtype=jnp.float32, name=name)(x)
-
-        query, key, value = project("query", feature), project("key", bank), project("value", bank)
-        scores = jnp.einsum("bhd,mhd->bhm", query, key) / jnp.sqrt(jnp.float32(width // self.heads))
+    def __call__(self, feature: Float[jax.Array, "b d"],
+                 memory: tuple[Float[jax.Array, "m h k"], Float[jax.Array, "m h k"]] | None = None
+                 ) -> tuple[Float[jax.Array, "b d"], Float[jax.Array, "b h m"]]:
+        """Context (b, d) and attention weights (b, heads, m) of each feature; `memory` is that of an earlier call, if there was one."""
+        query, (key, value) = self.query(feature), self.memory() if memory is None else memory
+        scores = jnp.einsum("bhd,mhd->bhm", query, key) / jnp.sqrt(jnp.float32(self.width // self.heads))
         attention = nn.softmax(scores, axis=-1)
-        context = jnp.einsum("bhm,mhd->bhd", attention, value)
-        context = nn.DenseGeneral(width, axis=(-2, -1), dtype=jnp.float32, param_dtype=jnp.float32, name="output")(context)
-        return context, attention
+        return self.output(jnp.einsum("bhm,mhd->bhd", attention, value)), attention
+
+    def memory(self) -> tuple[Float[jax.Array, "m h k"], Float[jax.Array, "m h k"]]:
+        """Keys and values of the prototypes, each (m, heads, d / heads)."""
+        return self.key(self.prototypes), self.value(self.prototypes)

@@ -125,7 +125,8 @@ def random_state(config, seed=0):
     rng = np.random.default_rng(seed)
     clones = config.clones_per_window + 1
     rotations = Rotation.from_rotvec(0.8 * rng.normal(size=(clones, 3))).as_matrix()
-    state = filtering.initial_state(config, rotations[-1], rng.normal(size=3), rng.normal(size=3), 0.1 * rng.normal(size=3), rng.normal(size=3))
+    velocity, position, gyro_bias, accel_bias = rng.normal(size=(4, 3))
+    state = filtering.initial_state(config, rotations[-1], velocity, position, 0.1 * gyro_bias, accel_bias)
     offsets = rng.normal(size=(clones, 3))
     return state._replace(clone_rotation=jnp.asarray(rotations), clone_offset=jnp.asarray(offsets), offset=jnp.asarray(offsets[-1]),
                           move=jnp.asarray(rng.normal(size=3)), step=jnp.int32(clones))

@@ -142,50 +142,6 @@ def central(function, x, step):
 WEIGHTS = np.random.default_rng(3).standard_normal((INTERVALS, 3))
 
 
-@jax.jit
-@jax.value_and_grad
-def loss_and_gradient(x):
-    """One program for both tests below, since compiling it is most of their time; the gate never closes (10 s are not reached)."""
-    config = filtering.FilterConfig(DT, N, CLONES)
-    noise = filtering.NoiseModel(*(jnp.asarray([1e-2, 1e-1, 1e-2, 1e-1]) * jnp.exp(x["noise"])))
-    state = filtering.initial_state(config, x["rotation"], x["velocity"], jnp.zeros(3), x["gyro_bias"])
-    state = state._replace(core_covariance=state.core_covariance * jnp.exp(x["covariance"]))
-    measured, scaled = x["measured"] + x["offset"][None], 0.01 * jnp.exp(x["scale"]) * jnp.tile(jnp.eye(3)[None], (INTERVALS, 1, 1))
-    _, history = filtering.run_filter(state, x["gyro"], x["accel"], measured, scaled, config, noise)
-    return (jnp.sum(WEIGHTS * history.position) + jnp.sum(history.rotation[-1, 0]) + jnp.nansum(history.nis) * 0.01
-            + jnp.log(history.covariance_diagonal[-1]).sum())
-
-
-NEUTRAL = dict(noise=np.zeros(4), covariance=np.zeros(()), offset=np.zeros(3), scale=np.zeros(()))
-
-
-def test_gradients_of_the_filter_against_differences():
-    """With respect to noise, initial state and measurements at once, over a run with missing rows."""
-    gyro, accel = recording(2)
-    measured = 0.1 * np.random.default_rng(4).standard_normal((INTERVALS, 3))
-    measured[[7, 8]] = np.nan
-    x = dict(NEUTRAL, rotation=np.asarray(start().rotation), velocity=np.array([0.5, 0, 0]), gyro_bias=np.array([0.02, -0.01, 0.03]),
-             gyro=gyro, accel=accel, measured=measured)
-    found = loss_and_gradient(x)[1]
-    for name in ("noise", "covariance", "offset", "scale", "velocity", "gyro_bias"):
-        step = 1e-4 if name == "noise" else 1e-5
-        expected = central(lambda value, name=name: float(loss_and_gradient({**x, name: value})[0]), x[name], step)
-        np.testing.assert_allclose(found[name], expected, rtol=1e-5, atol=1e-6 * np.abs(expected).max(), err_msg=name)
-        assert np.all(np.abs(expected) > 0)
-
-
-def test_gradients_are_finite_at_rest():
-    """Nothing turns, nothing moves, every innovation is zero: each norm in the filter is at its singular point."""
-    x = dict(NEUTRAL, rotation=np.eye(3), velocity=np.zeros(3), gyro_bias=np.zeros(3), gyro=np.zeros((N * INTERVALS, 3)),
-             accel=np.tile([0.0, 0.0, 9.81], (N * INTERVALS, 1)), measured=np.zeros((INTERVALS, 3)))
-    value, found = loss_and_gradient(x)
-    assert np.isfinite(value)
-    for name, gradient in found.items():
-        assert np.isfinite(gradient).all(), name
-    for name in ("rotation", "velocity", "gyro_bias", "gyro", "accel", "measured"):
-        assert np.abs(found[name]).max() > 0, name
-
-
 def test_gradient_reaches_the_network_through_the_loop():
     """Against differences of the same program, whose network is given in float64 so that differences mean something."""
     gyro, accel = recording(0)

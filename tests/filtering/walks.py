@@ -53,10 +53,11 @@ def simulate(seed, runs, intervals, n, clones, dt, noise, std, measurement_std):
     rotation = Rotation.from_euler("ZYX", rng.uniform(-1, 1, (runs, 3)) * [3.0, 0.3, 0.5]).as_matrix()
     velocity, position = np.tile([1.0, 0.5, 0.0], (runs, 1)), rng.normal(size=(runs, 3))
     start = rng.normal(size=(runs, 9)) * np.repeat([std.tilt, std.yaw, std.velocity, std.position], [2, 1, 3, 3])
-    first = (np.swapaxes(Rotation.from_rotvec(start[:, :3]).as_matrix(), 1, 2) @ rotation, velocity - start[:, 3:6], position - start[:, 6:9])
+    first = (Rotation.from_rotvec(-start[:, :3]).as_matrix() @ rotation, velocity - start[:, 3:6], position - start[:, 6:9])
     gyro_bias, accel_bias = std.gyro_bias * rng.normal(size=(runs, 3)), std.accel_bias * rng.normal(size=(runs, 3))
-    walk = np.sqrt(dt) * rng.normal(size=(2, runs, samples, 3)) * np.array([noise.gyro_bias_walk, noise.accel_bias_walk])[:, None, None, None]
-    white = rng.normal(size=(2, runs, samples, 3)) * np.array([noise.gyro_density, noise.accel_density])[:, None, None, None] / np.sqrt(dt)
+    walk, white = (np.reshape(pair, (2, 1, 1, 1)) * rng.normal(size=(2, runs, samples, 3))
+                   for pair in ((noise.gyro_bias_walk, noise.accel_bias_walk), (noise.gyro_density, noise.accel_density)))
+    walk, white = walk * np.sqrt(dt), white / np.sqrt(dt)
     gyro, accel, ends = np.empty((runs, samples, 3)), np.empty((runs, samples, 3)), []
     for k in range(samples):
         gyro[:, k] = rate[:, k] + gyro_bias + white[0, :, k]
@@ -76,7 +77,7 @@ def simulate(seed, runs, intervals, n, clones, dt, noise, std, measurement_std):
 
 def errors(runs, history):
     """(r, K, 15): the truth's θ, v, p, b_g, b_a minus the filter's, θ such that truth = exp(θ) estimate."""
-    shape = runs.velocity.shape
-    turn = Rotation.from_matrix((runs.rotation @ np.swapaxes(np.asarray(history.rotation), 2, 3)).reshape(-1, 3, 3)).as_rotvec().reshape(shape)
+    turn = runs.rotation @ np.swapaxes(np.asarray(history.rotation), 2, 3)
+    turn = Rotation.from_matrix(turn.reshape(-1, 3, 3)).as_rotvec().reshape(runs.velocity.shape)
     rest = [getattr(runs, name) - np.asarray(getattr(history, name)) for name in ("velocity", "position", "gyro_bias", "accel_bias")]
     return np.concatenate([turn, *rest], axis=-1)

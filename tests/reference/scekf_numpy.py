@@ -64,7 +64,8 @@ def run(gyro, accel, displacement, covariance, R, v, p, *, dt, n, clones, sigma_
         pick = np.concatenate([np.eye(len(P)), np.eye(len(P))[[0, 1, 2, 6, 7, 8]]])
         P = pick @ P @ pick.T
 
-        row = dict(accepted=np.nan, gate_passed=np.nan, nis=np.nan, innovation=np.full(3, np.nan), displacement=np.full(3, np.nan))
+        row = dict(accepted=np.nan, gate_passed=np.nan, nis=np.nan, innovation=np.full(3, np.nan), displacement=np.full(3, np.nan),
+                   innovation_covariance=np.full((3, 3), np.nan))
         if len(ring) == clones + 1:
             d, C = (displacement[k], covariance[k]) if measure is None else measure(k, ring[0][0], bg, ba)
             if np.isfinite(d).all() and np.isfinite(C).all():
@@ -79,7 +80,7 @@ def run(gyro, accel, displacement, covariance, R, v, p, *, dt, n, clones, sigma_
                 r = d - Ry.T @ (p - pi)
                 S = H @ P @ H.T + scale * C
                 nis = r @ np.linalg.solve(S, r)
-                row.update(nis=nis, innovation=r, displacement=d, accepted=0.0, gate_passed=0.0)
+                row.update(nis=nis, innovation=r, innovation_covariance=S, displacement=d, accepted=0.0, gate_passed=0.0)
                 if not gimbal:
                     now, oldest = (k + 1) * n, (k + 1 - clones) * n  # samples since the start
                     converged = converged or oldest > round(convergence / dt)

@@ -1,0 +1,61 @@
+"""What of a network depends on its parameters alone, computed once per run instead of once per window.
+
+With one window a call, as in the filter's loop, the Motion Bank's keys and values cost as many products as the whole encoder.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from flax import linen as nn
+
+from gnio_jax.types import Prediction
+
+NORMALISED = {"stem_bn": "stem_conv", "bn1": "conv1", "bn2": "conv2", "shortcut_bn": "shortcut_conv"}
+"""Which convolution each batch normalisation of the encoder follows."""
+EPSILON = 1e-5
+
+
+class Frozen(NamedTuple):
+    """A network's variables made ready for inference."""
+
+    variables: Any
+    constants: dict[str, Any]
+    """Further arguments of its `apply`."""
+
+
+@dataclass(frozen=True)
+class Inference:
+    """`Inference(model)(frozen, windows)` is `model.apply(variables, windows)` to rounding. Hashable, so a static argument of `jit`."""
+
+    model: nn.Module
+
+    def __call__(self, frozen: Frozen, windows: jax.Array) -> Prediction:
+        return self.model.apply(frozen.variables, windows, **frozen.constants)  # type: ignore[return-value]
+
+
+def freeze(model: nn.Module, variables: Any) -> Frozen:
+    """Variables with every batch normalisation folded into its convolution, and what `model.constants` makes of them, if it has that."""
+    folded = {**variables, **_folded(variables["params"], variables.get("batch_stats", {}))}
+    constants = getattr(model, "constants", None)
+    return Frozen(folded, constants(folded) if constants else {})
+
+
+def _folded(params: Any, statistics: Any) -> dict[str, Any]:
+    """w ← w·a and, in the place of the normalisation, a shift: (x − μ)/√(σ² + ε)·γ + β = a x + (β − a μ), a = γ/√(σ² + ε)."""
+    params, statistics = dict(params), dict(statistics)
+    for name, found in list(statistics.items()):
+        if "mean" not in found:
+            inner = _folded(params[name], found)
+            params[name], statistics[name] = inner["params"], inner["batch_stats"]
+        elif name in NORMALISED:
+            norm, convolution = params[name], dict(params[NORMALISED[name]])
+            factor = norm["scale"] / jnp.sqrt(found["var"] + EPSILON)
+            convolution["kernel"] = convolution["kernel"] * factor[None, None]
+            params[NORMALISED[name]] = convolution
+            params[name] = {"scale": jnp.ones_like(factor), "bias": norm["bias"] - factor * found["mean"]}
+            statistics[name] = {"mean": jnp.zeros_like(factor), "var": jnp.full_like(factor, 1 - EPSILON)}
+    return {"params": params, "batch_stats": statistics}

@@ -1,0 +1,175 @@
+"""Derivatives of the history: forward, reverse, batched, checkpointed, behind a gate with a slope; finite where input is hostile."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from test_run_odometry import CLONES, DT, INTERVALS, PARAMETERS, WEIGHTS, N, central, recording, start
+
+from gnio_jax import filtering
+from gnio_jax.types import Prediction
+
+MEASURED = 0.1 * np.random.default_rng(4).standard_normal((INTERVALS, 3))
+PLAIN = filtering.FilterConfig(DT, N, CLONES)
+
+
+def of_history(history):
+    """A scalar that feels every part of the history."""
+    return (jnp.sum(WEIGHTS * history.position) + jnp.sum(history.rotation[-1, 0]) + 0.01 * jnp.nansum(history.nis)
+            + jnp.sum(history.velocity[-1]) + 10 * jnp.sum(history.gyro_bias[-1] + history.accel_bias[-1])
+            + 0.1 * jnp.nansum(history.log_likelihood) + jnp.sum(jnp.log(history.covariance_diagonal[-1])))
+
+
+def loss(x, config=PLAIN):
+    """x: noise (4,) log factors, std (6,) log factors of the start's, state (12,) added to the start, measured (K, 3), gyro, accel."""
+    noise = filtering.NoiseModel(*(jnp.array([1e-2, 1e-1, 1e-2, 1e-1]) * jnp.exp(x["noise"])))
+    std = filtering.InitialStd(*(jnp.array(filtering.InitialStd()) * jnp.exp(x["std"])))
+    first = start()
+    state = filtering.initial_state(config, first.rotation, first.velocity + x["state"][:3], first.position + x["state"][3:6],
+                                    first.gyro_bias + x["state"][6:9], first.accel_bias + x["state"][9:], std)
+    spread = jnp.tile(0.01 * jnp.eye(3)[None], (INTERVALS, 1, 1))
+    _, history = filtering.run_filter(state, x["gyro"], x["accel"], x["measured"], spread, config, noise)
+    return of_history(history)
+
+
+def point(measured=MEASURED):
+    gyro, accel = recording(2)
+    return dict(noise=np.zeros(4), std=np.zeros(6), state=np.zeros(12), measured=measured, gyro=gyro, accel=accel)
+
+
+GRADIENT = jax.jit(jax.value_and_grad(loss))
+
+
+def test_gradient_against_differences():
+    """Over a run with missing rows, with respect to everything but the network."""
+    measured = MEASURED.copy()
+    measured[[7, 8]] = np.nan
+    found = GRADIENT(point(measured))[1]
+    for name in ("noise", "std", "state"):
+        expected = central(lambda value, name=name: float(GRADIENT({**point(measured), name: value})[0]), point()[name], 1e-4)
+        np.testing.assert_allclose(found[name], expected, rtol=1e-5, atol=1e-6 * np.abs(expected).max(), err_msg=name)
+        assert (np.abs(expected) > 0).all()
+    for name, k in (("measured", CLONES), ("measured", INTERVALS - 1), ("gyro", 3), ("accel", 3), ("accel", -1)):
+        def at(value, name=name, k=k):
+            rows = point(measured)[name].copy()
+            rows[k] = value
+            return float(GRADIENT({**point(measured), name: rows})[0])
+
+        np.testing.assert_allclose(found[name][k], central(at, point(measured)[name][k], 1e-5), rtol=1e-5, atol=1e-8)
+
+
+def test_jvp_equals_grad_and_vmap_of_grad_equals_each():
+    rng = np.random.default_rng(0)
+    direction = jax.tree.map(lambda x: rng.standard_normal(x.shape), point())
+    value, slope = jax.jit(lambda x, d: jax.jvp(loss, (x,), (d,)))(point(), direction)
+    wanted, gradient = GRADIENT(point())
+    np.testing.assert_allclose(value, wanted, rtol=1e-12)
+    inner = sum(np.sum(g * d) for g, d in zip(jax.tree.leaves(gradient), jax.tree.leaves(direction), strict=True))
+    np.testing.assert_allclose(slope, inner, rtol=1e-9)
+
+    points = [point(), point(MEASURED + 0.02), point(-MEASURED)]
+    many = jax.jit(jax.vmap(jax.grad(loss)))(jax.tree.map(lambda *leaves: np.stack(leaves), *points))
+    for index, one in enumerate(points):
+        alone = GRADIENT(one)[1]
+        jax.tree.map(lambda a, b, index=index: np.testing.assert_allclose(a[index], b, rtol=1e-8, atol=1e-8), many, alone)
+
+
+def test_checkpoints_change_nothing():
+    config = filtering.FilterConfig(DT, N, CLONES, checkpoint_every=8)  # three blocks, and two steps more
+    value, gradient = jax.jit(jax.value_and_grad(functools.partial(loss, config=config)))(point())
+    wanted = GRADIENT(point())
+    np.testing.assert_allclose(value, wanted[0], rtol=1e-12)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9), gradient, wanted[1])
+
+
+def test_checkpoints_bound_the_memory():
+    def temporary(every):
+        config = filtering.FilterConfig(DT, N, CLONES, checkpoint_every=every)
+        gyro, accel = (jnp.tile(x, (40, 1)) for x in recording(2))
+
+        def value(x):
+            spread = jnp.tile(0.01 * jnp.eye(3)[None], (40 * INTERVALS, 1, 1))
+            return of_history(jax.tree.map(lambda h: h[:INTERVALS] if h is not None else h, filtering.run_filter(
+                start(), gyro, accel, jnp.tile(MEASURED, (40, 1)) + x, spread, config, filtering.NoiseModel())[1]))
+
+        return jax.jit(jax.grad(value)).lower(0.0).compile().memory_analysis().temp_size_in_bytes
+
+    assert temporary(32) < temporary(0) / 4
+
+
+HOSTILE = jax.jit(jax.value_and_grad(functools.partial(
+    loss, config=filtering.FilterConfig(DT, N, CLONES, convergence_seconds=0.1, zero_velocity_std=0.01, rest_seconds=0.1))))
+
+
+@pytest.mark.parametrize("kind", ["rest", "rejected", "missing", "gimbal"])
+def test_gradients_are_finite_for_hostile_input(kind):
+    x = point(MEASURED.copy())
+    if kind == "rest":  # nothing turns, nothing moves, every innovation is small: each norm in the filter is at its singular point
+        x |= dict(gyro=np.zeros_like(x["gyro"]), accel=np.tile([0.0, 0.0, 9.81], (len(x["gyro"]), 1)), measured=np.zeros_like(MEASURED))
+    elif kind == "rejected":
+        x["measured"][12:18] = 50.0
+    elif kind == "missing":
+        x["measured"][10:14] = np.nan
+    else:
+        x["gyro"] = np.tile([0.0, np.pi / (len(x["gyro"]) * DT), 0.0], (len(x["gyro"]), 1))
+    value, gradient = HOSTILE(x)
+    assert np.isfinite(value)
+    for name, leaf in gradient.items():
+        assert np.isfinite(leaf).all(), name
+        assert np.abs(leaf).max() > 0, name
+
+
+def test_a_gate_with_a_slope_lets_the_gradient_through():
+    measured = MEASURED.copy()
+    measured[14, 0] += 1.2
+    config = filtering.FilterConfig(DT, N, CLONES, convergence_seconds=0.1, gate_softness=2.0, gate_threshold=8.0)
+    value = jax.jit(jax.value_and_grad(lambda x: loss(point() | {"measured": jnp.asarray(measured).at[14, 0].add(x)}, config)))
+    slope = float(value(0.0)[1])
+    np.testing.assert_allclose(slope, central(lambda x: float(value(float(x))[0]), np.zeros(()), 1e-5), rtol=1e-5)
+    assert abs(slope) > 0  # behind the hard gate it would be zero where the row is rejected
+
+    def history(softness):
+        config = filtering.FilterConfig(DT, N, CLONES, convergence_seconds=0.1, gate_softness=softness, gate_threshold=8.0)
+        spread = np.tile(0.01 * np.eye(3), (INTERVALS, 1, 1))
+        return filtering.run_filter(start(config), *recording(2), measured, spread, config, filtering.NoiseModel(1e-2, 1e-1, 1e-2, 1e-1))[1]
+
+    hard, soft = history(0.0), history(2.0)
+    weights, nis = np.asarray(soft.gate_passed), np.asarray(soft.nis)
+    watched = np.asarray(soft.gate_passed) < 1
+    np.testing.assert_allclose(weights[watched], 1 / (1 + np.exp((nis[watched] - 8.0) / 2.0)), rtol=1e-9)
+    assert (np.asarray(soft.accepted)[CLONES:] == 1).all() and watched.sum() > 5 and (np.asarray(hard.accepted) == 0).any()
+
+
+def test_softness_has_a_limit():
+    """As the slope steepens, the soft gate becomes the hard one."""
+    measured = MEASURED.copy()
+    measured[14, 0] += 2.5
+
+    def positions(softness):
+        config = filtering.FilterConfig(DT, N, CLONES, convergence_seconds=0.1, gate_softness=softness)
+        spread = np.tile(0.01 * np.eye(3), (INTERVALS, 1, 1))
+        return np.asarray(filtering.run_filter(start(config), *recording(2), measured, spread, config, filtering.NoiseModel())[1].position)
+
+    np.testing.assert_allclose(positions(1e-3), positions(0.0), atol=1e-4)
+    assert np.abs(positions(3.0) - positions(0.0)).max() > 1e-3
+
+
+def test_gradient_reaches_the_network_to_1e_5():
+    """The window is cut in float32; a network that does not look at it, but at its own parameters, leaves only the filter's float64."""
+    gyro, accel = recording(0)
+    config = filtering.FilterConfig(DT, N, CLONES, checkpoint_every=8)
+
+    @jax.jit
+    @jax.value_and_grad
+    def value(parameters):
+        def network(windows):
+            pooled = jnp.tanh(parameters.sum(0))[None] * (1 + 0 * windows[:, 0, :1].astype(jnp.float64))
+            return Prediction(pooled, -2.0 + 0.1 * pooled)
+
+        _, history = filtering.run_odometry(network, start(config), gyro, accel, config, filtering.NoiseModel())
+        return of_history(history)
+
+    expected = central(lambda p: float(value(jnp.asarray(p))[0]), PARAMETERS, 1e-4)
+    np.testing.assert_allclose(value(jnp.asarray(PARAMETERS))[1], expected, rtol=1e-5, atol=1e-7)
