@@ -3,11 +3,13 @@
 Needs only JAX and the geometry: the network is any function from windows to a `Prediction`.
 """
 
+from gnio_jax.filtering.online import Pose, Tracker, TrackerState
 from gnio_jax.filtering.scekf import FilterHistory, run_filter, run_odometry
 from gnio_jax.filtering.smoother import SmoothedHistory, smooth
 from gnio_jax.filtering.state import FilterConfig, FilterState, GateState, InitialStd, NoiseModel, initial_state, level_state
 
 __all__ = [
-    "FilterConfig", "FilterHistory", "FilterState", "GateState", "InitialStd", "NoiseModel", "SmoothedHistory", "initial_state",
-    "level_state", "run_filter", "run_odometry", "smooth",
+    "FilterConfig", "FilterHistory", "FilterState", "GateState", "InitialStd", "NoiseModel", "Pose",
+    "SmoothedHistory", "Tracker", "TrackerState", "initial_state", "level_state", "run_filter", "run_odometry",
+    "smooth",
 ]
