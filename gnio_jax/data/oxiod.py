@@ -176,7 +176,7 @@ def _table(path: Path, columns: Iterable[int]) -> np.ndarray:
         raise Refusal(path, f"has {table.shape[1]} columns, expected {' or '.join(str(count) for count in columns)}", "copy it again")
     try:
         return table.to_numpy(dtype=np.float64)
-    except ValueError as error:
+    except (ValueError, OverflowError) as error:
         raise Refusal(path, f"holds what is no number ({shortened(error, 200)})", "copy it again") from None
 
 

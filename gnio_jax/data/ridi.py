@@ -31,6 +31,7 @@ from gnio_jax.data.sequence import (
     Dataset,
     Recording,
     check_finite,
+    check_increasing,
     check_rate,
     check_unit_norm,
     quaternions,
@@ -188,6 +189,7 @@ def _from_text(folder: Path) -> _Native:
     upright = Rotation.identity() if upright is None else upright
     start = gyro_stamps[0]
     gyro_time, force_time, pose_time = ((stamps - start) * 1e-9 for stamps in (gyro_stamps, force_stamps, pose_stamps))
+    check_increasing(pose_time, pose_path)  # stamps of another unit may fall together
     for stamps, path in ((gyro_stamps, folder / "gyro.txt"), (force_stamps, folder / "acce.txt")):
         rate = 1e9 / float(np.median(np.diff(stamps)))
         if not RAW_RATES[0] <= rate <= RAW_RATES[1]:
@@ -213,6 +215,7 @@ def _from_text(folder: Path) -> _Native:
     if (folder / "orientation.txt").is_file():
         device_stamps, quaternion = _text(folder / "orientation.txt", 4)
         device_time = (device_stamps - start) * 1e-9
+        check_increasing(device_time, folder / "orientation.txt")
         known = _unit(quaternion[:, [3, 0, 1, 2]], "qx qy qz qw", folder / "orientation.txt")
         _, device, _ = poses_at(device_time, np.zeros((len(known), 3)), known, time, MAX_GAP)
     truth = "Tango VIO of the phone itself" if pose_path.name == "pose.txt" else "ARCore VIO of the phone itself"

@@ -71,9 +71,9 @@ def numbers(table: pd.DataFrame, columns: Iterable[object], path: object) -> np.
             raise InputError(path, f"column '{name}' is there {values.shape[1]} times", "leave one")
         try:
             out.append(values.to_numpy(dtype=np.float64, na_value=np.nan))
-        except (TypeError, ValueError):
-            as_number = pd.Series(pd.to_numeric(values, errors="coerce"))
-            row = int(np.argmax((as_number.isna() & values.notna()).to_numpy()))
+        except (TypeError, ValueError, OverflowError):  # Python's integers have no end
+            as_number = pd.Series(pd.to_numeric(values.astype(str), errors="coerce"), dtype=np.float64)
+            row = int(np.argmax(~np.isfinite(as_number.to_numpy()) & values.notna().to_numpy()))
             raise InputError(path, f"column '{name}' holds '{shortened(values.iloc[row])}' in its row {row + 1}, no number") from None
     return np.stack(out, axis=1)
 

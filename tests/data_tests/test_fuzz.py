@@ -585,6 +585,12 @@ ONCE_WRONG = {
     "single precision": ("hdf5", [Damage("walk.h5", "type", 0.28, token="<f4")], None),
     "hours as seconds": ("hdf5", [Damage("walk.h5", "scale field", 0.7, token=1e9)], "walk.h5: field 'time' is not in seconds"),
     "stamps of no clock": ("ridi text", [Damage("hang_leg1/acce.txt", "scale column", 0.0, 0.0, 1e-9)], "acce.txt: field 'time' runs at"),
+    "attitudes of no clock": ("ridi text", [Damage("hang_leg1/orientation.txt", "scale column", 0.0, 0.0, 1e-9)],
+        "orientation.txt: field 'time' does not increase"),
+    "poses of no clock": ("ridi text", [Damage("hang_leg1/pose.txt", "scale column", 0.0, 0.0, 1e-9)], "pose.txt: its stamps"),
+    "position without end": ("csv", [Damage("walk.csv", "cell", 0.5, 0.5, "9" * 400)], None),  # infinite, hence not valid
+    "row without end": ("euroc", [Damage(f"{_EURO}/data.csv", "stray line", 0.5, 0.5, "9" * 400)], f"{_EURO}/data.csv: "),
+    "cell without end, oxiod": ("oxiod Tango", [Damage("large scale/floor1/syn/imu1.csv", "cell", 0.5, 0.5, "9" * 400)], "imu1.csv: "),
     "another recording": ("ridi text", [Damage("hang_leg1/acce.txt", "scale column", 0.0, 0.0, 0.5)], "acce.txt: field 'time'"),
 }
 
