@@ -64,6 +64,7 @@ def main() -> None:
     path = Path(options.csv)
     stamps, gyro, accel = read(path)
 
+    from gnio_jax import models
     from gnio_jax.evaluation import odometry, plots
     from gnio_jax.evaluation.metrics import Trajectory
     from gnio_jax.evaluation.report import write_tum
@@ -81,8 +82,10 @@ def main() -> None:
         raise InputError(path, "holds a single sample", "record a walk of some seconds")
     hole = 1.5 * max(config.dt, float(np.median(np.diff(stamps))))
 
+    frozen = models.freeze(run.model, run.variables)  # what depends on the weights alone is computed once
+
     def predict(windows):
-        return run.model.apply(run.variables, windows)
+        return models.Inference(run.model)(frozen, windows)
 
     with cli.progress() as progress:
         progress("compiling", 0.0)

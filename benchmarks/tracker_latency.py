@@ -1,0 +1,96 @@
+"""Latency of the online filter with the full-width network: clone steps and ordinary samples, garbage collection on and off.
+
+    python benchmarks/tracker_latency.py [--steps 1500] [--width 64]
+
+200 Hz IMU, a window of 200 samples, 20 Hz clones: a step has 50 ms. The weights are random, since time does not depend on them. Beside
+the time on the wall stands the processor time of the whole process, which other programs on the machine disturb less.
+"""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import time
+
+import baseline
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+jax.config.update("jax_enable_x64", True)
+
+from gnio_jax import filtering, models  # noqa: E402
+
+RATE, PER_CLONE, CLONES = 200, 10, 20
+WARM_UP = 100
+
+
+def network(width: int):
+    """A network whose random weights give displacements of a sensible size."""
+    model = models.create("gnio", width=width)
+    shapes = jax.eval_shape(model.init, jax.random.key(0), jax.ShapeDtypeStruct((1, PER_CLONE * CLONES, 6), jnp.float32))
+    random = np.random.default_rng(0)
+
+    def drawn(leaf: jax.ShapeDtypeStruct) -> jax.Array:
+        fan_in = max(1, int(np.prod(leaf.shape[:-1])))
+        return jnp.asarray(random.normal(0, fan_in**-0.5, leaf.shape) if leaf.ndim > 1 else np.ones(leaf.shape), jnp.float32)
+
+    variables = jax.tree.map(drawn, shapes)
+    print(f"{sum(leaf.size for leaf in jax.tree.leaves(variables['params'])):,} parameters")
+    frozen = models.freeze(model, variables)
+    return lambda windows: models.Inference(model)(frozen, windows)
+
+
+def measure(tracker: filtering.Tracker, first: int, steps: int, collect: bool) -> dict[str, np.ndarray]:
+    """Milliseconds on the wall and of the processor of each push, with a clone step and without."""
+    random = np.random.default_rng(first)
+    samples = steps * PER_CLONE
+    gyro = 0.02 * random.standard_normal((samples, 3))
+    accel = 0.3 * random.standard_normal((samples, 3)) + [0.0, 0.0, 9.81]
+    found: dict[str, list[float]] = {"step": [], "step, cpu": [], "sample": [], "sample, cpu": []}
+    gc.collect()
+    if not collect:
+        gc.disable()
+    try:
+        for k in range(samples):
+            spent, begin = time.process_time(), time.perf_counter()
+            pose = tracker.push((first + k) / RATE, gyro[k], accel[k])
+            wall, cpu = time.perf_counter() - begin, time.process_time() - spent
+            kind = "sample" if pose is None else "step"
+            found[kind].append(1e3 * wall)
+            found[f"{kind}, cpu"].append(1e3 * cpu)
+    finally:
+        gc.enable()
+    return {kind: np.array(values) for kind, values in found.items()}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--steps", type=int, default=1500, help="clone steps measured, with garbage collection and without")
+    parser.add_argument("--width", type=int, default=64, help="of the network; 64 is the paper's")
+    arguments = parser.parse_args()
+    config = filtering.FilterConfig(1 / RATE, PER_CLONE, CLONES)
+    state = filtering.initial_state(config, np.eye(3), np.zeros(3), np.zeros(3))
+    print(f"{jax.devices()[0].device_kind}, jax {jax.__version__}, {RATE} Hz IMU, {RATE / PER_CLONE:.0f} Hz clones")
+    predict = network(arguments.width)
+    begin = time.perf_counter()
+    tracker = filtering.Tracker(predict, state, config, filtering.NoiseModel())
+    print(f"compiled in {time.perf_counter() - begin:.1f} s\n")
+    measure(tracker, 0, WARM_UP, True)
+    figures, pushed, period = {}, WARM_UP * PER_CLONE, 1e3 * PER_CLONE / RATE
+    print(f"{'':>22} {'collector':>9} {'p50 ms':>8} {'p99 ms':>8} {'max ms':>8} {'p99/period':>10}")
+    for collect in (True, False):
+        found = measure(tracker, pushed, arguments.steps, collect)
+        pushed += arguments.steps * PER_CLONE
+        for kind, values in found.items():
+            p50, p99, most = np.percentile(values, [50, 99, 100])
+            print(f"{kind:>22} {'on' if collect else 'off':>9} {p50:8.3f} {p99:8.3f} {most:8.3f} {p99 / period:10.4f}", flush=True)
+            figures |= {f"{kind}, p50 ms, collector {'on' if collect else 'off'}": float(p50),
+                        f"{kind}, p99 ms, collector {'on' if collect else 'off'}": float(p99)}
+    pose = tracker.pose()
+    assert pose is not None and np.isfinite(pose.position).all(), "the filter diverged: the timing would mean nothing"
+    baseline.compare("tracker_latency", figures)
+
+
+if __name__ == "__main__":
+    main()
