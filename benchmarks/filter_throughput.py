@@ -1,9 +1,10 @@
 """IMU samples per second of the stochastic-cloning EKF: alone and vmapped, beside a plain NumPy filter, over rates of cloning and windows.
 
-    python benchmarks/filter_throughput.py [--seconds 60] [--repeats 7]
+    python benchmarks/filter_throughput.py [--seconds 180] [--repeats 5] [--only batch|window|length|precision|gradient]
 
-Compilation is timed apart; every timing waits for the result. Reported is the best and the median of the repeats, and the samples per
-second of processor time, which other programs on the machine disturb less.
+Compilation is timed apart; every timing waits for the result. Reported is the best and the median of the repeats, the samples per
+second of processor time, which other programs on the machine disturb less, and the memory of the program: its arguments, results and
+temporaries. Last comes what derivatives cost: value and gradient over value, in time and memory, with and without checkpoints.
 """
 
 from __future__ import annotations
@@ -18,6 +19,8 @@ import jax
 import numpy as np
 
 jax.config.update("jax_enable_x64", True)
+
+import jax.numpy as jnp  # noqa: E402
 
 from gnio_jax import filtering  # noqa: E402
 
@@ -40,8 +43,9 @@ def walk(seconds: float, config: filtering.FilterConfig) -> tuple[np.ndarray, ..
 
 
 def measure(config: filtering.FilterConfig, batch: int, seconds: float, repeats: int) -> dict[str, float]:
-    signals = walk(seconds, config)
-    state = filtering.initial_state(config, np.eye(3), np.array([1.2, 0.0, 0.0]), np.zeros(3))
+    dtype = np.float32 if config.allow_float32 else np.float64
+    signals = tuple(signal.astype(dtype) for signal in walk(seconds, config))
+    state = filtering.initial_state(config, np.eye(3, dtype=dtype), np.array([1.2, 0.0, 0.0], dtype), np.zeros(3, dtype))
     noise = filtering.NoiseModel.per_sample(1e-2, 3.16e-2, config.dt)
 
     def run(*signals):
@@ -79,23 +83,71 @@ def measure_numpy(config: filtering.FilterConfig, seconds: float) -> float:
     return len(gyro) / (time.perf_counter() - begin)
 
 
+def measure_gradient(config: filtering.FilterConfig, seconds: float, repeats: int) -> tuple[float, float]:
+    """Seconds and MiB of the value and gradient of a function of the history, with respect to noise, start and every measurement."""
+    gyro, accel, displacement, covariance = jax.device_put(walk(seconds, config))
+
+    def value(logarithms, velocity, displacement):
+        state = filtering.initial_state(config, np.eye(3), velocity, np.zeros(3))
+        noise = filtering.NoiseModel(*jnp.exp(logarithms))
+        _, history = filtering.run_filter(state, gyro, accel, displacement, covariance, config, noise)
+        return jnp.sum(history.position**2) + jnp.nansum(history.nis)
+
+    arguments = jnp.log(jnp.array(filtering.NoiseModel.per_sample(1e-2, 3.16e-2, DT))), jnp.array([1.2, 0.0, 0.0]), displacement
+    out = []
+    for function in (value, jax.value_and_grad(value, argnums=(0, 1, 2))):
+        program = jax.jit(function).lower(*arguments).compile()
+        result = jax.block_until_ready(program(*arguments))
+        assert all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves(result))
+        times = []
+        for _ in range(repeats):
+            begin = time.perf_counter()
+            jax.block_until_ready(program(*arguments))
+            times.append(time.perf_counter() - begin)
+        out += [min(times), program.memory_analysis().temp_size_in_bytes / 2**20]
+    return out[2] / out[0], out[3]
+
+
+CASES = {  # clone interval in samples, clones in a window, sequences, share of --seconds, float32
+    "batch": [(10, 20, 1, 1, False), (10, 20, 16, 1, False), (10, 20, 64, 1, False)],
+    "window": [(20, 10, 1, 1, False), (20, 10, 16, 1, False), (20, 20, 1, 1, False), (10, 40, 1, 1, False)],
+    "length": [(10, 20, 1, 1 / 4, False), (10, 20, 1, 4, False)],
+    "precision": [(10, 20, 1, 1, True), (10, 20, 16, 1, True)],
+}
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--seconds", type=float, default=60.0, help="length of the simulated walk")
-    parser.add_argument("--repeats", type=int, default=7)
+    parser.add_argument("--seconds", type=float, default=180.0, help="length of the simulated walk")
+    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--only", choices=[*CASES, "gradient"], help="one part of the table")
     arguments = parser.parse_args()
-    print(f"{jax.devices()[0].device_kind}, jax {jax.__version__}, 200 Hz IMU, float64; samples per second\n")
-    print(f"{'clones':>8} {'window':>8} {'batch':>6} {'best':>10} {'median':>10} {'per cpu-s':>10} {'compile s':>10} {'MiB':>7}")
-    rows: dict[str, dict[str, float]] = {}
-    for n, clones, batch in [(10, 20, 1), (10, 20, 16), (10, 20, 64), (20, 10, 1), (20, 10, 16), (10, 40, 1), (20, 20, 1)]:
-        config = filtering.FilterConfig(DT, n, clones)
-        row = measure(config, batch, arguments.seconds if batch < 64 else arguments.seconds / 4, arguments.repeats)
-        rows[f"samples/s, {1 / (n * DT):.0f} Hz clones, {n * clones * DT:.0f} s window, batch {batch}"] = row
-        print(f"{1 / (n * DT):5.0f} Hz {n * clones * DT:6.1f} s {batch:6} {row['best']:10,.0f} {row['median']:10,.0f} {row['cpu']:10,.0f} "
-              f"{row['compile']:10.1f} {row['memory']:7.1f}", flush=True)
-    rate = measure_numpy(filtering.FilterConfig(DT, 10, 20), min(arguments.seconds, 10.0))
-    print(f"\nplain NumPy filter, 20 Hz clones, 1 s window, one sequence: {rate:,.0f}")
-    baseline.compare("filter_throughput", {name: row["best"] for name, row in rows.items()})
+    print(f"{jax.devices()[0].device_kind}, jax {jax.__version__}, 200 Hz IMU; samples per second\n")
+    print(f"{'clones':>8} {'window':>8} {'seconds':>8} {'batch':>6} {'':>8} {'best':>10} {'median':>10} {'per cpu-s':>10} "
+          f"{'compile s':>10} {'MiB':>7}")
+    figures: dict[str, float] = {}
+    for part in [arguments.only] if arguments.only in CASES else [] if arguments.only else CASES:
+        for n, clones, batch, share, single in CASES[part]:
+            config, seconds = filtering.FilterConfig(DT, n, clones, allow_float32=single), arguments.seconds * share
+            row = measure(config, batch, seconds, arguments.repeats if batch < 64 else min(arguments.repeats, 3))
+            name = f"samples/s, {1 / (n * DT):.0f} Hz clones, {n * clones * DT:.0f} s window, batch {batch}{', float32' * single}"
+            figures[name + ("" if share == 1 else f", {seconds:.0f} s")] = row["best"]
+            print(f"{1 / (n * DT):5.0f} Hz {n * clones * DT:6.1f} s {seconds:8.0f} {batch:6} {'float32' if single else 'float64':>8} "
+                  f"{row['best']:10,.0f} {row['median']:10,.0f} {row['cpu']:10,.0f} {row['compile']:10.1f} {row['memory']:7.1f}",
+                  flush=True)
+    if arguments.only in (None, "batch"):
+        rate = measure_numpy(filtering.FilterConfig(DT, 10, 20), 10.0)
+        print(f"\nplain NumPy filter, 20 Hz clones, 1 s window, one sequence: {rate:,.0f}")
+        figures["this filter / plain NumPy"] = figures["samples/s, 20 Hz clones, 1 s window, batch 1"] / rate
+    if arguments.only in (None, "gradient"):
+        print("\nvalue and gradient, 20 Hz clones, 1 s window, one sequence, float64:")
+        for seconds, every in [(60, 0), (60, 32), (600, 128)]:
+            ratio, memory = measure_gradient(filtering.FilterConfig(DT, 10, 20, checkpoint_every=every), seconds, 2)
+            print(f"  {seconds:4} s, checkpoint_every {every:4}: {ratio:5.1f} × the value's time, {memory:7.0f} MiB of temporaries",
+                  flush=True)
+            figures[f"gradient / value, {seconds} s, checkpoint_every {every}"] = ratio
+            figures[f"MiB of the gradient, {seconds} s, checkpoint_every {every}"] = memory
+    baseline.compare("filter_throughput", figures)
 
 
 if __name__ == "__main__":

@@ -84,21 +84,6 @@ def test_checkpoints_change_nothing():
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9), gradient, wanted[1])
 
 
-def test_checkpoints_bound_the_memory():
-    def temporary(every):
-        config = filtering.FilterConfig(DT, N, CLONES, checkpoint_every=every)
-        gyro, accel = (jnp.tile(x, (40, 1)) for x in recording(2))
-
-        def value(x):
-            spread = jnp.tile(0.01 * jnp.eye(3)[None], (40 * INTERVALS, 1, 1))
-            return of_history(jax.tree.map(lambda h: h[:INTERVALS] if h is not None else h, filtering.run_filter(
-                start(), gyro, accel, jnp.tile(MEASURED, (40, 1)) + x, spread, config, filtering.NoiseModel())[1]))
-
-        return jax.jit(jax.grad(value)).lower(0.0).compile().memory_analysis().temp_size_in_bytes
-
-    assert temporary(32) < temporary(0) / 4
-
-
 HOSTILE = jax.jit(jax.value_and_grad(functools.partial(
     loss, config=filtering.FilterConfig(DT, N, CLONES, convergence_seconds=0.1, zero_velocity_std=0.01, rest_seconds=0.1))))
 
