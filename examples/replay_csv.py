@@ -55,7 +55,8 @@ def read(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     if not np.isfinite(stamps).all():
         raise InputError(path, f"field 'time' is empty in row {int(np.argmin(np.isfinite(stamps))) + 1}", "every sample needs a time")
     check_increasing(stamps, path)
-    return stamps, *(numbers(table, [f"{sensor}_{axis}" for axis in "xyz"], path) for sensor in ("gyro", "accel"))
+    gyro, accel = (numbers(table, [f"{sensor}_{axis}" for axis in "xyz"], path) for sensor in ("gyro", "accel"))
+    return stamps, gyro, accel
 
 
 def main() -> None:

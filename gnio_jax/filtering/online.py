@@ -401,9 +401,9 @@ class Tracker:
 
     def _pose(self, vector: np.ndarray, count: int | float) -> Pose:
         time = math.nan if self._clock is None else self._clock.origin + count * self._config.dt
-        arrays = [vector[_SLICES[name]].reshape(_PARTS[name]) for name in _MOMENTS]
+        parts = {name: vector[_SLICES[name]].reshape(_PARTS[name]) for name in _MOMENTS}
         accepted, nis, healthy = vector[-3:].tolist()
-        return Pose(time, *arrays, accepted, nis, healthy > 0)
+        return Pose(time, **parts, accepted=accepted, nis=nis, healthy=healthy > 0)
 
 
 def _three(name: str, value: Any) -> tuple[float, ...]:
