@@ -26,7 +26,7 @@ from gnio_jax.config import DataConfig, FilterOptions
 from gnio_jax.data.sequence import cumulative_rotation
 from gnio_jax.data.windows import WindowSource, gather
 from gnio_jax.evaluation.metrics import Trajectory, finite_rows, rotation_z
-from gnio_jax.filtering import FilterConfig, FilterHistory, InitialStd, NoiseModel, initial_state, run_filter, run_odometry
+from gnio_jax.filtering import FilterConfig, FilterHistory, InitialStd, NoiseModel, initial_state, level_state, run_filter, run_odometry
 from gnio_jax.types import Array, InputError, Prediction, Sequence
 
 Estimator = Literal["ekf", "integrate", "imu_only"]
@@ -89,6 +89,8 @@ class Recording(NamedTuple):
     """First estimate, rad/s."""
     notes: tuple[str, ...]
     """What a reader of the result should know."""
+    start_std: tuple[float, float] | None = None
+    """Of the start's tilt, rad, and velocity, m/s, where it was made without a reference; None: the filter's options say."""
 
 
 class Estimate(NamedTuple):
@@ -166,16 +168,21 @@ def prepare(sequences: Iterable[Sequence], config: DataConfig, setup: Setup = DE
         uncut = sequence._replace(valid=trusted)
         cut = uncut._replace(**{name: value[rows] for name, value in uncut._asdict().items() if isinstance(value, np.ndarray)})
         bias, notes = _gyro_bias(cut, config.rate, setup.gyro_bias)
+        start_std = None
         if setup.init == "reference":
             rotation = Rotation.from_quat(cut.orientation[0], scalar_first=True).as_matrix()
             velocity = cut.velocity[0] if np.isfinite(cut.velocity[0]).all() else np.zeros(3)
             position = cut.position[0]
         else:
-            second = cut.accel[:round(config.rate)]
-            if second.std(0).max() > 0.5:
-                notes = (*notes, f"start: not standing still (accel varies by {second.std(0).max():.1f} m/s²), so its tilt is rough")
-            rotation, velocity, position = _level(second.mean(0)), np.zeros(3), np.zeros(3)
-        recordings.append(Recording(cut, rotation, velocity, position, bias, notes))
+            second = slice(round(config.rate))
+            spread = cut.accel[second].std(0).max()
+            if spread > 0.5:
+                notes = (*notes, f"start: not standing still (accel varies by {spread:.1f} m/s²), so its tilt is rough")
+            level = level_state(filter_config(config, FilterOptions()), cut.gyro[second], cut.accel[second])
+            rotation, velocity, position = np.asarray(level.rotation), np.zeros(3), np.zeros(3)
+            variance = np.diag(level.core_covariance)
+            start_std = float(np.sqrt(variance[0])), float(np.sqrt(variance[3]))
+        recordings.append(Recording(cut, rotation, velocity, position, bias, notes, start_std))
     return recordings, left_out
 
 
@@ -301,6 +308,14 @@ class _Start(NamedTuple):
     velocity: Any
     position: Any
     gyro_bias: Any
+    std: InitialStd
+
+
+def _start(recording: Recording, options: FilterOptions) -> _Start:
+    tilt, velocity = recording.start_std or (math.radians(options.tilt_std_degrees), options.velocity_std)
+    std = InitialStd(tilt, math.radians(options.yaw_std_degrees), velocity, options.position_std, options.gyro_bias_std,
+                     options.accel_bias_std)
+    return _Start(recording.rotation, recording.velocity, recording.position, recording.gyro_bias, std)
 
 
 @functools.partial(jax.jit, static_argnames=("apply", "length"))
@@ -309,21 +324,21 @@ def _predict(apply: Callable, variables: Any, source: WindowSource, which: Any, 
 
 
 @functools.partial(jax.jit, static_argnames=("apply", "config"))
-def _run_tight(apply: Callable, variables: Any, start: _Start, gyro: Any, accel: Any, config: FilterConfig, noise: NoiseModel,
-               std: InitialStd) -> FilterHistory:
+def _run_tight(apply: Callable, variables: Any, start: _Start, gyro: Any, accel: Any, config: FilterConfig,
+               noise: NoiseModel) -> FilterHistory:
     def one(start: _Start, gyro: Any, accel: Any) -> FilterHistory:
-        state = initial_state(config, *start, std=std)
+        state = initial_state(config, **start._asdict())
         return _lean_history(run_odometry(lambda windows: _lean(apply(variables, windows)), state, gyro, accel, config, noise)[1])
 
     return jax.vmap(one)(start, gyro, accel)
 
 
 @functools.partial(jax.jit, static_argnames="config")
-def _run_given(start: _Start, gyro: Any, accel: Any, displacement: Any, std_of_it: Any, config: FilterConfig, noise: NoiseModel,
-               std: InitialStd) -> FilterHistory:
+def _run_given(start: _Start, gyro: Any, accel: Any, displacement: Any, std_of_it: Any, config: FilterConfig,
+               noise: NoiseModel) -> FilterHistory:
     def one(start: _Start, gyro: Any, accel: Any, displacement: Any, std_of_it: Any) -> FilterHistory:
         covariance = jax.vmap(jnp.diag)(std_of_it**2)
-        return _lean_history(run_filter(initial_state(config, *start, std=std), gyro, accel, displacement, covariance, config, noise)[1])
+        return _lean_history(run_filter(initial_state(config, **start._asdict()), gyro, accel, displacement, covariance, config, noise)[1])
 
     return jax.vmap(one)(start, gyro, accel, displacement, std_of_it)
 
@@ -343,8 +358,6 @@ def _filtered(recordings: list[Recording], config: DataConfig, options: FilterOp
     """Run the filter with the network in the loop, or with measurements (displacement (K, 3), std (K, 3)) per recording."""
     n, compiled = config.stride, filter_config(config, options)
     noise = NoiseModel(options.gyro_density, options.accel_density, options.gyro_bias_walk, options.accel_bias_walk)
-    std = InitialStd(math.radians(options.tilt_std_degrees), math.radians(options.yaw_std_degrees), options.velocity_std,
-                     options.position_std, options.gyro_bias_std, options.accel_bias_std)
     strides = [(len(r.sequence.time) - 1) // n for r in recordings]
     order = sorted(range(len(recordings)), key=lambda i: -strides[i])  # alike lengths together: little padding
     batches = -(-len(order) // batch_size)
@@ -357,15 +370,15 @@ def _filtered(recordings: list[Recording], config: DataConfig, options: FilterOp
         # Few distinct lengths, so few compilations: each is at most a quarter longer than it need be.
         while 0.8 * longest >= strides[members[0]] and longest > 16:
             longest = math.ceil(0.8 * longest)
-        start = _Start(*(np.stack([getattr(recordings[i], field) for i in members]) for field in _Start._fields))
+        start = jax.tree.map(lambda *leaves: np.stack(leaves), *(_start(recordings[i], options) for i in members))
         gyro = np.stack([_extended(recordings[i].sequence.gyro[:-1], longest * n, 0.0) for i in members])
         accel = np.stack([_extended(recordings[i].sequence.accel[:-1], longest * n, None) for i in members])
         if network is not None:
-            history = _run_tight(network.apply, network.variables, start, gyro, accel, compiled, noise, std)
+            history = _run_tight(network.apply, network.variables, start, gyro, accel, compiled, noise)
         else:
             assert measurements is not None
             given = [np.stack([_extended(measurements[i][part], longest, np.nan) for i in members]) for part in (0, 1)]
-            history = _run_given(start, gyro, accel, *given, compiled, noise, std)
+            history = _run_given(start, gyro, accel, *given, compiled, noise)
         history = jax.device_get(history)
         for place, i in enumerate(members):
             if i not in results:
@@ -380,8 +393,7 @@ def _from_filter(recording: Recording, history: FilterHistory, options: FilterOp
     def rows(first: Any, rest: Any) -> np.ndarray:
         return np.concatenate([np.broadcast_to(np.asarray(first, float), rest.shape[1:])[None], rest])
 
-    tilt, yaw = math.radians(options.tilt_std_degrees), math.radians(options.yaw_std_degrees)
-    std = np.repeat([options.velocity_std, options.position_std, options.gyro_bias_std, options.accel_bias_std], 3)
+    std = np.repeat(np.array(_start(recording, options).std), [2, 1, 3, 3, 3, 3])
     rotation = rows(recording.rotation, history.rotation)
     assert history.covariance is not None
     return Estimate(
@@ -392,7 +404,7 @@ def _from_filter(recording: Recording, history: FilterHistory, options: FilterOp
         diagnostics={key: rows(np.nan, value) for key, value in history.diagnostics.items()},
         velocity=rows(recording.velocity, history.velocity), gyro_bias=rows(recording.gyro_bias, history.gyro_bias),
         accel_bias=rows(0.0, history.accel_bias),
-        std=rows(np.concatenate([[tilt, tilt, yaw], std]), np.sqrt(np.maximum(history.covariance_diagonal, 0.0))),
+        std=rows(std, np.sqrt(np.maximum(history.covariance_diagonal, 0.0))),
         position_covariance=rows(np.eye(3) * options.position_std**2, history.covariance),
         accepted=rows(np.nan, history.accepted), nis=rows(np.nan, history.nis), notes=recording.notes)
 
@@ -463,13 +475,6 @@ def _gyro_bias(sequence: Sequence, rate: float, how: str) -> tuple[Float[np.ndar
         turned = (before.inv() * after).as_rotvec() * rate
         return (sequence.gyro[rows] - turned).mean(0), (f"gyro bias: {len(rows) / rate:g} s against the reference orientation",)
     return np.zeros(3), ()
-
-
-def _level(accel: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
-    """The rotation of zero yaw that turns a specific force (at rest) upright."""
-    up = accel / np.linalg.norm(accel)
-    rotation = Rotation.align_vectors([[0.0, 0.0, 1.0]], [up])[0].as_matrix()
-    return _yaw_rotation(rotation[None])[0].T @ rotation
 
 
 def _yaw_rotation(rotation: Float[np.ndarray, "m 3 3"]) -> Float[np.ndarray, "m 3 3"]:
