@@ -36,7 +36,8 @@ def mistake(monkeypatch, capsys, tmp_path, *arguments):
     (["--dataset", "tlio"], "github.com/CathIAS/TLIO"),
     (["--dataset", "tlio", "--data-root", "nowhere"], "nowhere"),
     (["--dataset", "oxiod"], "deepio.cs.ox.ac.uk"),
-    (["--dataset", "oxoid"], "did you mean 'oxiod'? known datasets: blackbird, csv, euroc, idol, kitti, oxiod, ridi, ronin, synthetic, tlio, tumvi"),
+    (["--dataset", "oxoid"], "did you mean 'oxiod'? known datasets: blackbird, csv, euroc, idol, kitti, oxiod, ridi, ronin, synthetic, "
+                             "tlio, tumvi"),
     (["--datset", "tlio"], "--datset: unknown option; did you mean --dataset?"),
     (["--optim.epoch", "3"], "--optim.epoch: unknown option; did you mean --optim.epochs?"),
     (["--optim.epochs", "three"], "--optim.epochs: must be a whole number, found 'three'"),

@@ -7,6 +7,8 @@ import jax.numpy as jnp
 from flax import linen as nn
 from jaxtyping import Float
 
+from gnio_jax.types import Array
+
 BLOCKS_PER_GROUP = 2
 GROUP_STRIDES = (1, 2, 2, 2)
 
@@ -34,6 +36,29 @@ def convolve(
     return (columns @ kernel.reshape(size * channels, features)).reshape(-1, length, features)
 
 
+def convolve_forward(
+    x: Float[jax.Array, "b n c"],
+    kernel: Float[jax.Array, "k c d"],
+    window_strides: tuple[int],
+    padding: list[tuple[int, int]],
+    **_: object,
+) -> Float[jax.Array, "b m d"]:
+    """The same convolution where nothing is trained: XLA's own, which takes half the time for a single window.
+
+    Its derivatives, where somebody wants them, are those of the product.
+    """
+
+    @jax.custom_jvp
+    def native(x: Array, kernel: Array) -> Array:
+        return jax.lax.conv_general_dilated(x, kernel, window_strides, padding, dimension_numbers=("NWC", "WIO", "NWC"))
+
+    @native.defjvp
+    def derivative(primals: tuple, tangents: tuple) -> tuple:
+        return native(*primals), jax.jvp(lambda x, kernel: convolve(x, kernel, window_strides, padding), primals, tangents)[1]
+
+    return native(x, kernel)
+
+
 def max_pool(x: Float[jax.Array, "b n c"]) -> Float[jax.Array, "b m c"]:
     """Maximum over 3 samples, stride 2, padded by one −∞ on both sides.
 
@@ -44,7 +69,7 @@ def max_pool(x: Float[jax.Array, "b n c"]) -> Float[jax.Array, "b m c"]:
     return jnp.maximum(jnp.maximum(x[:, 0 : 2 * length : 2], x[:, 1 : 2 * length + 1 : 2]), x[:, 2 : 2 * length + 2 : 2])
 
 
-def conv(features: int, size: int, stride: int, name: str) -> nn.Conv:
+def conv(features: int, size: int, stride: int, train: bool, name: str) -> nn.Conv:
     """A convolution without bias and with explicit symmetric padding ("SAME" pads differently at stride 2)."""
     return nn.Conv(
         features,
@@ -55,7 +80,7 @@ def conv(features: int, size: int, stride: int, name: str) -> nn.Conv:
         kernel_init=he_normal_fan_out,
         dtype=jnp.float32,
         param_dtype=jnp.float32,
-        conv_general_dilated=convolve,
+        conv_general_dilated=convolve if train else convolve_forward,
         name=name,
     )
 
@@ -73,12 +98,12 @@ class BasicBlock(nn.Module):
 
     @nn.compact
     def __call__(self, x: Float[jax.Array, "b n c"], train: bool) -> Float[jax.Array, "b m d"]:
-        y = conv(self.features, 3, self.stride, "conv1")(x)
+        y = conv(self.features, 3, self.stride, train, "conv1")(x)
         y = nn.relu(batch_norm(train, "bn1")(y))
-        y = conv(self.features, 3, 1, "conv2")(y)
+        y = conv(self.features, 3, 1, train, "conv2")(y)
         y = batch_norm(train, "bn2")(y)
         if self.stride != 1 or x.shape[-1] != self.features:
-            x = conv(self.features, 1, self.stride, "shortcut_conv")(x)
+            x = conv(self.features, 1, self.stride, train, "shortcut_conv")(x)
             x = batch_norm(train, "shortcut_bn")(x)
         return nn.relu(x + y)
 
@@ -90,7 +115,7 @@ class ResNet18(nn.Module):
 
     @nn.compact
     def __call__(self, windows: Float[jax.Array, "b n 6"], train: bool = False) -> Float[jax.Array, "b m d"]:
-        x = conv(self.width, 7, 2, "stem_conv")(windows)
+        x = conv(self.width, 7, 2, train, "stem_conv")(windows)
         x = max_pool(nn.relu(batch_norm(train, "stem_bn")(x)))
         for group, stride in enumerate(GROUP_STRIDES):
             for block in range(BLOCKS_PER_GROUP):
