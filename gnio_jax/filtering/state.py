@@ -84,8 +84,8 @@ class FilterConfig:
     jacobians: Literal["latest", "first"] = "latest"
     """Where the filter is linearised: at the latest estimates, as TLIO's, or at the first of each velocity and position."""
     allow_float32: bool = False
-    """Run in float32 where the state is. Variances of position grow without bound while measurements are of their
-    differences: after some minutes float32 has no digits left for those, and the filter diverges."""
+    """Run in float32 where the state is, to about four digits of every standard deviation over an hour. Without it float32 is an error,
+    not a surprise; smoothing and derivatives want float64 anyway."""
 
     def __post_init__(self) -> None:
         def require(condition: bool, name: str, problem: str) -> None:
