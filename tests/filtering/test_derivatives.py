@@ -84,8 +84,9 @@ def test_checkpoints_change_nothing():
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9), gradient, wanted[1])
 
 
-HOSTILE = jax.jit(jax.value_and_grad(functools.partial(
-    loss, config=filtering.FilterConfig(DT, N, CLONES, convergence_seconds=0.1, zero_velocity_std=0.01, rest_seconds=0.1))))
+# One program for all of it, since compiling is what these tests cost; the hard gate's rejection is tested with the update.
+HOSTILE = jax.jit(jax.value_and_grad(functools.partial(loss, config=filtering.FilterConfig(
+    DT, N, CLONES, convergence_seconds=0.1, zero_velocity_std=0.01, rest_seconds=0.1, gate_softness=2.0, gate_threshold=8.0))))
 
 
 @pytest.mark.parametrize("kind", ["rest", "rejected", "missing", "gimbal"])
@@ -109,10 +110,14 @@ def test_gradients_are_finite_for_hostile_input(kind):
 def test_a_gate_with_a_slope_lets_the_gradient_through():
     measured = MEASURED.copy()
     measured[14, 0] += 1.2
-    config = filtering.FilterConfig(DT, N, CLONES, convergence_seconds=0.1, gate_softness=2.0, gate_threshold=8.0)
-    value = jax.jit(jax.value_and_grad(lambda x: loss(point() | {"measured": jnp.asarray(measured).at[14, 0].add(x)}, config)))
-    slope = float(value(0.0)[1])
-    np.testing.assert_allclose(slope, central(lambda x: float(value(float(x))[0]), np.zeros(()), 1e-5), rtol=1e-5)
+
+    def at(value):
+        rows = measured.copy()
+        rows[14, 0] += float(value)
+        return HOSTILE(point(rows))
+
+    slope = float(at(0.0)[1]["measured"][14, 0])
+    np.testing.assert_allclose(slope, central(lambda x: float(at(x)[0]), np.zeros(()), 1e-5), rtol=1e-5)
     assert abs(slope) > 0  # behind the hard gate it would be zero where the row is rejected
 
     def history(softness):
@@ -141,20 +146,26 @@ def test_softness_has_a_limit():
     assert np.abs(positions(3.0) - positions(0.0)).max() > 1e-3
 
 
-def test_gradient_reaches_the_network_to_1e_5():
-    """The window is cut in float32; a network that does not look at it, but at its own parameters, leaves only the filter's float64."""
+def test_gradient_reaches_the_network():
+    """Of its own parameters to 1e-5; through the windows, which are cut with the state, as far as differences can say, since the
+    window is rounded to float32. One program for both: `share` is that of what the network makes of its window."""
     gyro, accel = recording(0)
     config = filtering.FilterConfig(DT, N, CLONES, checkpoint_every=8)
 
     @jax.jit
     @jax.value_and_grad
-    def value(parameters):
+    def value(parameters, share):
         def network(windows):
-            pooled = jnp.tanh(parameters.sum(0))[None] * (1 + 0 * windows[:, 0, :1].astype(jnp.float64))
+            ramp = jnp.linspace(0.5, 1.5, N * CLONES)[None, :, None]
+            seen = jnp.mean(ramp * windows.astype(jnp.float64), axis=1) @ parameters
+            pooled = share * seen + (1 - share) * jnp.tanh(parameters.sum(0))[None]
             return Prediction(pooled, -2.0 + 0.1 * pooled)
 
         _, history = filtering.run_odometry(network, start(config), gyro, accel, config, filtering.NoiseModel())
         return of_history(history)
 
-    expected = central(lambda p: float(value(jnp.asarray(p))[0]), PARAMETERS, 1e-4)
-    np.testing.assert_allclose(value(jnp.asarray(PARAMETERS))[1], expected, rtol=1e-5, atol=1e-7)
+    expected = central(lambda p: float(value(jnp.asarray(p), 0.0)[0]), PARAMETERS, 1e-4)
+    np.testing.assert_allclose(value(jnp.asarray(PARAMETERS), 0.0)[1], expected, rtol=1e-5, atol=1e-7)
+    coarse, fine = (central(lambda p: float(value(jnp.asarray(p), 1.0)[0]), PARAMETERS, step) for step in (1e-2, 5e-3))
+    expected = (4 * fine - coarse) / 3
+    np.testing.assert_allclose(value(jnp.asarray(PARAMETERS), 1.0)[1], expected, rtol=2e-3, atol=2e-3 * np.abs(expected).max())
