@@ -52,3 +52,21 @@ class UncertaintyHead(nn.Module):
     @nn.compact
     def __call__(self, h: Float[jax.Array, "b d"]) -> Float[jax.Array, "b 3"]:
         return dense("log_std")(h)
+
+
+class ConstantUncertainty(nn.Module):
+    """The log standard deviation of a network that has none of its own: one constant per axis, the same for every window.
+
+    Not a parameter: it lies among the `batch_stats` and is set to the errors on the validation split after every epoch
+    (`training.losses.calibrated`).
+    """
+
+    @nn.compact
+    def __call__(self, windows: int) -> Float[jax.Array, "b 3"]:
+        constant = self.variable("batch_stats", "log_std", jnp.zeros, (3,), jnp.float32)
+        return jnp.broadcast_to(constant.value[None], (windows, 3))
+
+
+def to_axes(output: Float[jax.Array, "b k"]) -> Float[jax.Array, "b 3"]:
+    """The displacement of a head with two or three outputs: one that is horizontal only says 0 of the vertical."""
+    return jnp.pad(output, ((0, 0), (0, 3 - output.shape[-1])))

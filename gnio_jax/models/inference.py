@@ -14,8 +14,6 @@ from flax import linen as nn
 
 from gnio_jax.types import Prediction
 
-NORMALISED = {"stem_bn": "stem_conv", "bn1": "conv1", "bn2": "conv2", "shortcut_bn": "shortcut_conv"}
-"""Which convolution each batch normalisation of the encoder follows."""
 EPSILON = 1e-5
 
 
@@ -45,17 +43,23 @@ def freeze(model: nn.Module, variables: Any) -> Frozen:
 
 
 def _folded(params: Any, statistics: Any) -> dict[str, Any]:
-    """w ← w·a and, in the place of the normalisation, a shift: (x − μ)/√(σ² + ε)·γ + β = a x + (β − a μ), a = γ/√(σ² + ε)."""
+    """w ← w·a and, in the place of the normalisation, a shift: (x − μ)/√(σ² + ε)·γ + β = a x + (β − a μ), a = γ/√(σ² + ε).
+
+    A normalisation `…bn…` follows the convolution `…conv…` (without bias) of the same module; one that has none is left as it is.
+    """
     params, statistics = dict(params), dict(statistics)
     for name, found in list(statistics.items()):
+        if name not in params:
+            continue  # a constant uncertainty, not a normalisation
+        convolves = name.replace("bn", "conv")
         if "mean" not in found:
             inner = _folded(params[name], found)
             params[name], statistics[name] = inner["params"], inner["batch_stats"]
-        elif name in NORMALISED:
-            norm, convolution = params[name], dict(params[NORMALISED[name]])
+        elif convolves != name and convolves in params:
+            norm, convolution = params[name], dict(params[convolves])
             factor = norm["scale"] / jnp.sqrt(found["var"] + EPSILON)
             convolution["kernel"] = convolution["kernel"] * factor[None, None]
-            params[NORMALISED[name]] = convolution
+            params[convolves] = convolution
             params[name] = {"scale": jnp.ones_like(factor), "bias": norm["bias"] - factor * found["mean"]}
             statistics[name] = {"mean": jnp.zeros_like(factor), "var": jnp.full_like(factor, 1 - EPSILON)}
     return {"params": params, "batch_stats": statistics}
