@@ -103,8 +103,9 @@ class Core(NamedTuple):
 
     filter: FilterState
     """After the last clone step; its clones are a ring, the next of which to be written is `intervals` mod W + 1."""
-    window: Float[Array, "N 7"]
-    """The last N = n·W grid samples before it, holes bridged: gyro rad/s, accel m/s², raw, and whether the filter used the sample."""
+    window: Float[Array, "r 7"]
+    """The last `FilterConfig.reach` grid samples before it, holes bridged: gyro rad/s, accel m/s², raw, and whether the filter used the
+    sample."""
     intervals: Int[Array, ""]
     """Clone steps so far."""
 
@@ -334,7 +335,7 @@ class Tracker:
 
         def begin() -> Core:
             state = initial_state(config, jnp.eye(3, dtype=dtype), jnp.zeros(3, dtype), jnp.zeros(3, dtype))
-            return Core(state, jnp.zeros((config.window, 7), dtype), jnp.int32(0))
+            return Core(state, jnp.zeros((config.reach, 7), dtype), jnp.int32(0))
 
         self._shapes = jax.eval_shape(begin)
         rows = jax.ShapeDtypeStruct((config.samples_per_clone, 7), dtype)
@@ -346,7 +347,7 @@ class Tracker:
 
     def _start(self, state: FilterState) -> None:
         # Copies: the first step is given their memory, and it may not be shared, not even between two fields.
-        self._core = _copied(Core(state, jnp.zeros((self._config.window, 7), self._dtype), jnp.int32(0)))
+        self._core = _copied(Core(state, jnp.zeros((self._config.reach, 7), self._dtype), jnp.int32(0)))
         mean = (state.rotation, state.velocity, state.position, state.gyro_bias, state.accel_bias, core_covariance(state.core_covariance))
         self._latest = np.concatenate([*(np.asarray(part).reshape(-1) for part in mean), [math.nan, math.nan, 1.0]], dtype=self._dtype)
 

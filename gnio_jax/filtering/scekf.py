@@ -105,7 +105,8 @@ def run_odometry(predict: Callable[[Any], Prediction], state: FilterState, gyro:
 
     predict maps windows (1, N, 6) float32, N = n·W, channels [accel m/s², gyro rad/s], to a `Prediction` with the same leading axis.
     A window spans the samples between its two clones i and j; the filter's present biases are subtracted and the samples rotated by
-    R_γ(R_i)ᵀ R_j, R_j being the present estimate of clone i advanced by integrating gyro − b_g (paper eq. 1; TLIO). The measurement's
+    R_γ(R_i)ᵀ R_j, R_j being the present estimate of clone i advanced by integrating gyro − b_g (paper eq. 1), unless
+    `FilterConfig.window_rotation` says otherwise. The measurement's
     covariance is diag(exp 2u), u raised to `log_std_min`. The network is not called in the first W intervals, which have no window, and
     a window in which the filter coasted through a gap is no measurement.
     gyro, accel and imu_valid as in `run_filter`. Jit it from outside; differentiable in whatever `predict` closes over, too.
@@ -115,11 +116,11 @@ def run_odometry(predict: Callable[[Any], Prediction], state: FilterState, gyro:
     dtype, expected = gyro.dtype, expect(predict, config)
 
     def infer(k: Array, state: FilterState, oldest: Array, imu: Imu) -> Prediction:
-        start = (k - config.clones_per_window + 1) * config.samples_per_clone
-        gyro, accel = (jax.lax.dynamic_slice_in_dim(signal, start, config.window) for signal in (imu.gyro, imu.accel))
+        start = (k - config.clones_per_window + 1) * config.samples_per_clone - config.cut.lead
+        gyro, accel = (jax.lax.dynamic_slice_in_dim(signal, start, config.reach) for signal in (imu.gyro, imu.accel))
         prediction = infer_window(predict, state, state.clone_rotation[oldest], gyro, accel, config)
         if imu.gap is not None:
-            whole = jnp.all(jax.lax.dynamic_slice_in_dim(imu.gap.used, start, config.window) > 0)
+            whole = jnp.all(jax.lax.dynamic_slice_in_dim(imu.gap.used, start, config.reach) > 0)
             prediction = prediction._replace(displacement=jnp.where(whole, prediction.displacement, jnp.nan))
         return prediction
 
@@ -148,10 +149,12 @@ def expect(predict: Callable[[Any], Prediction], config: FilterConfig) -> Predic
     return expected
 
 
-def infer_window(predict: Callable[[Any], Prediction], state: FilterState, rotation: Float[Array, "3 3"], gyro: Float[Array, "n 3"],
-                 accel: Float[Array, "n 3"], config: FilterConfig) -> Prediction:
-    """What the network says of one window of raw samples whose first has this attitude; the leading axis of one is gone."""
-    imu = network_window(rotation, gyro - state.gyro_bias[None], accel - state.accel_bias[None], config)
+def infer_window(predict: Callable[[Any], Prediction], state: FilterState, rotation: Float[Array, "3 3"], gyro: Float[Array, "r 3"],
+                 accel: Float[Array, "r 3"], config: FilterConfig) -> Prediction:
+    """What the network says of one window, of which the last `config.reach` raw samples up to its newer clone are given and the attitude
+    of its older clone; the leading axis of one is gone."""
+    gyro, accel = gyro[: config.window], accel[: config.window]
+    imu = network_window(rotation, gyro, accel, state.gyro_bias, state.accel_bias, config)
     return jax.tree.map(lambda leaf: _floating(leaf[0]), predict(imu[None].astype(jnp.float32)))
 
 
@@ -166,14 +169,17 @@ def measured(prediction: Prediction, config: FilterConfig, dtype: Any) -> Measur
     return _measurement(prediction.displacement.astype(dtype), jnp.diag(jnp.exp(2 * log_std)), config)
 
 
-def network_window(rotation: Float[Array, "3 3"], gyro: Float[Array, "n 3"], accel: Float[Array, "n 3"],
-                   config: FilterConfig) -> Float[Array, "n 6"]:
-    """[accel, gyro], biases already subtracted, of a window whose first sample has this attitude, rotated by R_γ(R_i)ᵀ R_j (eq. 1)."""
-    level = geometry.yaw_rotation(rotation).T @ rotation
-    if config.window_rotation == "single":
-        return jnp.concatenate([accel @ level.T, gyro @ level.T], axis=1)
-    rotations = geometry.cumulative_rotation(level, jax.vmap(geometry.exp, out_axes=2)(gyro[:-1] * config.dt))
-    return geometry.matmul(rotations, jnp.stack([accel.T, gyro.T], axis=1)).transpose(2, 1, 0).reshape(-1, 6)
+def network_window(rotation: Float[Array, "3 3"], gyro: Float[Array, "n 3"], accel: Float[Array, "n 3"], gyro_bias: Float[Array, "3"],
+                   accel_bias: Float[Array, "3"], config: FilterConfig) -> Float[Array, "n 6"]:
+    """[accel, gyro] of a window of raw samples whose first has this attitude, rotated by R_γ(R_i)ᵀ R_j (eq. 1) as `config.cut` says."""
+    rates = gyro - gyro_bias[None]
+    if config.cut.corrected:
+        gyro, accel = rates, accel - accel_bias[None]
+    turns = jax.vmap(geometry.exp, out_axes=2)(rates[config.cut.turns] * config.dt)
+    rotations = geometry.cumulative_rotation(geometry.yaw_rotation(rotation).T @ rotation, turns)
+    signals = jnp.stack([accel.T, gyro.T], axis=1)
+    # Without turns the first rotation serves for all.
+    return geometry.matmul(jnp.broadcast_to(rotations, (3, 3, len(gyro))), signals).transpose(2, 1, 0).reshape(-1, 6)
 
 
 class Row(NamedTuple):

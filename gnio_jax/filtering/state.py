@@ -33,6 +33,26 @@ THETA, VELOCITY, OFFSET, GYRO_BIAS, ACCEL_BIAS, ANCHOR, MOVE = (slice(3 * i, 3 *
 _NEVER = -1
 
 
+class WindowCut(NamedTuple):
+    """How the network's window from clone i to clone j is cut from the stream; the first of its samples gets the attitude of clone i."""
+
+    lead: int
+    """Samples by which it begins before the first that drove the filter on from clone i."""
+    corrected: bool
+    """Whether the network sees the samples without the filter's biases."""
+    turns: slice
+    """Those of the window's samples, as rates without bias, each of which turns the attitude of one sample into that of the next."""
+
+
+WINDOW_CUTS = {
+    "per_sample": WindowCut(0, True, slice(-1)),
+    "single": WindowCut(0, True, slice(0)),
+    # TLIO's sample stamped t drove the filter from t − dt to t, and turned the attitude that it is rotated with itself.
+    "tlio": WindowCut(1, False, slice(1, None)),
+}
+"""By `FilterConfig.window_rotation`."""
+
+
 @no_type_check  # by the tests' run-time checker, that is: __post_init__ says what is wrong, and takes 0-d arrays
 @dataclass(frozen=True)
 class FilterConfig:
@@ -79,8 +99,9 @@ class FilterConfig:
     """The same of the acceleration, m/s²."""
     checkpoint_every: int = 0
     """Clone intervals between the states kept for the backward pass, all else being computed again: memory for time. 0 keeps everything."""
-    window_rotation: Literal["per_sample", "single"] = "per_sample"
-    """Rotate each sample of the network's window with its own attitude, or all with that of the start (paper eq. 1 read literally)."""
+    window_rotation: Literal["per_sample", "single", "tlio"] = "per_sample"
+    """Rotate each sample of the network's window with its own attitude, or all with that of the start (paper eq. 1 read literally), or
+    cut and rotate it as TLIO's tracker does: one sample earlier, the network's input with the biases that the IMU comes with."""
     jacobians: Literal["latest", "first"] = "latest"
     """Where the filter is linearised: at the latest estimates, as TLIO's, or at the first of each velocity and position."""
     allow_float32: bool = False
@@ -110,7 +131,7 @@ class FilterConfig:
                 object.__setattr__(self, field.name, int(value))
         require(isinstance(self.allow_float32, bool), "allow_float32", "must be True or False")
         require(self.history in ("diagonal", "core"), "history", "must be 'diagonal' or 'core'")
-        require(self.window_rotation in ("per_sample", "single"), "window_rotation", "must be 'per_sample' or 'single'")
+        require(self.window_rotation in tuple(WINDOW_CUTS), "window_rotation", "must be 'per_sample', 'single' or 'tlio'")
         require(self.jacobians in ("latest", "first"), "jacobians", "must be 'latest' or 'first'")
         for name in ("dt", "measurement_scale", "gate_threshold"):
             require(getattr(self, name) > 0, name, "must be positive")
@@ -124,6 +145,16 @@ class FilterConfig:
     def window(self) -> int:
         """IMU samples N = n·W in the network's window."""
         return self.samples_per_clone * self.clones_per_window
+
+    @property
+    def cut(self) -> WindowCut:
+        """Of `window_rotation`."""
+        return WINDOW_CUTS[self.window_rotation]
+
+    @property
+    def reach(self) -> int:
+        """IMU samples, the newest included, that a measurement depends on."""
+        return self.window + self.cut.lead
 
 
 class NoiseModel(NamedTuple):
