@@ -8,9 +8,15 @@ import difflib
 from flax import linen as nn
 
 from gnio_jax.models.gnio import GNIO
+from gnio_jax.models.ronin import RoNINResNet
+from gnio_jax.models.tlio import TLIO
 from gnio_jax.types import InputError
 
-_MODELS: dict[str, type[nn.Module]] = {"gnio": GNIO}
+_MODELS: dict[str, type[nn.Module]] = {
+    "gnio": GNIO,
+    "ronin_resnet": RoNINResNet,
+    "tlio": TLIO,
+}
 
 
 def names() -> list[str]:

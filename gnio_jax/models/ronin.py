@@ -1,0 +1,38 @@
+"""RoNIN's ResNet (Herath, Yan and Furukawa, "RoNIN: Robust Neural Inertial Navigation in the Wild", ICRA 2020)."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from flax import linen as nn
+from jaxtyping import Float
+
+from gnio_jax.models.heads import ConstantUncertainty, to_axes
+from gnio_jax.models.resnet import ResNet18
+from gnio_jax.models.tlio import FullyConnectedHead, check_dropout
+from gnio_jax.types import Prediction
+
+
+class RoNINResNet(nn.Module):
+    """Windows [accel, gyro] in the gravity-aligned frame to displacement; the uncertainty is a constant.
+
+    Encoder and head as TLIO's, which took them from here. Published: the mean horizontal velocity over the window, `output_dim = 2`
+    (4,634,882 parameters for windows of 200 samples), from [gyro, accel]. Ours: the displacement, which is that velocity in a window of
+    1 s, along three axes (4,635,395) unless two are asked for; then the vertical one is 0. Training needs the random stream `dropout`.
+    """
+
+    width: int = 64
+    dropout: float = 0.5
+    output_dim: int = 3
+
+    def __post_init__(self) -> None:
+        check_dropout(self.dropout)
+        if self.output_dim not in (2, 3):
+            raise ValueError(f"output_dim must be 2 or 3, found {self.output_dim!r}")
+        super().__post_init__()
+
+    @nn.compact
+    def __call__(self, windows: Float[jax.Array, "b n 6"], train: bool = False) -> Prediction:
+        features = ResNet18(self.width, name="encoder")(windows.astype(jnp.float32), train)
+        output = FullyConnectedHead(self.width, self.output_dim, self.dropout, name="displacement")(features, train)
+        return Prediction(to_axes(output), ConstantUncertainty(name="uncertainty")(windows.shape[0]))

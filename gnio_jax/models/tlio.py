@@ -1,0 +1,67 @@
+"""TLIO's network (Liu et al., "TLIO: Tight Learned Inertial Odometry", IEEE RA-L 2020), and the fully connected head that it shares."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from flax import linen as nn
+from jaxtyping import Float
+
+from gnio_jax.models.resnet import ResNet18, batch_norm, conv
+from gnio_jax.types import Prediction
+
+
+class FullyConnectedHead(nn.Module):
+    """Feature maps (b, m, 8·width) to `outputs` numbers a window: 1×1 convolution and normalisation, flattened, three linear layers.
+
+    TLIO's and RoNIN's, whose sizes (128 channels, 512 features) the papers leave to their code; other widths than 64 scale both, for small
+    machines. Flattened channel by channel, as PyTorch does, so that weights trained there fit. Linear kernels start at N(0, 0.01), biases
+    at 0. The number of parameters depends on m, and so on the length of the window.
+    """
+
+    width: int
+    outputs: int
+    dropout: float
+
+    @nn.compact
+    def __call__(self, features: Float[jax.Array, "b m d"], train: bool) -> Float[jax.Array, "b k"]:
+        x = batch_norm(train, "neck_bn")(conv(2 * self.width, 1, 1, train, "neck_conv")(features))
+        x = x.transpose(0, 2, 1).reshape(x.shape[0], -1)
+        for name in ("fc1", "fc2"):
+            x = nn.relu(_linear(8 * self.width, name)(x))
+            x = nn.Dropout(self.dropout, deterministic=not train)(x)
+        return _linear(self.outputs, "fc3")(x)
+
+
+class TLIO(nn.Module):
+    """Windows [accel, gyro] in the gravity-aligned frame to displacement and log standard deviation, each by a head of its own.
+
+    The encoder of `gnio_jax.models.resnet`, not pooled. 5,424,646 parameters for windows of 200 samples, 5,031,430 for 100. Training needs
+    the random stream `dropout`. TLIO's own channel order is [gyro, accel]; `gnio_jax.interop` reads its weights.
+    """
+
+    width: int = 64
+    dropout: float = 0.5
+
+    def __post_init__(self) -> None:
+        check_dropout(self.dropout)
+        super().__post_init__()
+
+    @nn.compact
+    def __call__(self, windows: Float[jax.Array, "b n 6"], train: bool = False) -> Prediction:
+        features = ResNet18(self.width, name="encoder")(windows.astype(jnp.float32), train)
+        displacement, log_std = (FullyConnectedHead(self.width, 3, self.dropout, name=name)(features, train)
+                                 for name in ("displacement", "log_std"))
+        return Prediction(displacement, log_std)
+
+
+def check_dropout(share: Any) -> None:
+    """`ValueError` unless it is a share that leaves something."""
+    if not 0 <= share < 1:
+        raise ValueError(f"dropout must be at least 0 and below 1, found {share!r}")
+
+
+def _linear(features: int, name: str) -> nn.Dense:
+    return nn.Dense(features, kernel_init=nn.initializers.normal(0.01), dtype=jnp.float32, param_dtype=jnp.float32, name=name)

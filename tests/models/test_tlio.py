@@ -1,0 +1,151 @@
+"""TLIO's network: its sizes, its output against the recorded one, and how it trains."""
+
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import linen as nn
+
+from gnio_jax import interop, models
+from gnio_jax.models.tlio import FullyConnectedHead
+from gnio_jax.types import InputError
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "reference"))
+import tlio_weights
+
+RECORDED = Path(__file__).parents[1] / "data" / "tlio_tracker" / "pipeline.npz"
+ENCODER = 3_846_144
+
+
+def count(tree):
+    return sum(int(np.prod(leaf.shape)) for leaf in jax.tree.leaves(tree))
+
+
+def shapes(model, samples):
+    return jax.eval_shape(model.init, jax.random.key(0), jax.ShapeDtypeStruct((1, samples, 6), jnp.float32))
+
+
+def drawn(model, samples, seed=0):
+    """Variables away from every neutral start, without compiling the initialisation."""
+    rng = np.random.default_rng(seed)
+
+    def one(path, leaf):
+        if path[-1].key in ("scale", "var"):
+            return jnp.asarray(rng.uniform(0.5, 1.5, leaf.shape), jnp.float32)
+        return jnp.asarray(rng.normal(0, 0.2, leaf.shape), jnp.float32)
+
+    return jax.tree_util.tree_map_with_path(one, shapes(model, samples))
+
+
+@pytest.mark.parametrize("samples, rows, total", [(200, 7, 5_424_646), (100, 4, 5_031_430)])
+def test_parameters_of_the_published_network_block_by_block(samples, rows, total):
+    params = shapes(models.create("tlio"), samples)["params"]
+    assert count(params) == total
+    assert params.keys() == {"encoder", "displacement", "log_std"}
+    assert count(params["encoder"]) == ENCODER
+    for head in (params["displacement"], params["log_std"]):
+        assert {name: count(part) for name, part in head.items()} == {
+            "neck_conv": 512 * 128, "neck_bn": 2 * 128, "fc1": 128 * rows * 512 + 512, "fc2": 512 * 512 + 512, "fc3": 512 * 3 + 3}
+
+
+def test_other_widths_scale_the_heads_too():
+    params = shapes(models.create("tlio", width=8), 200)["params"]["log_std"]
+    assert {name: part["kernel"].shape for name, part in params.items() if name != "neck_bn"} == {
+        "neck_conv": (1, 64, 16), "fc1": (7 * 16, 64), "fc2": (64, 64), "fc3": (64, 3)}
+
+
+def test_output_is_the_recorded_one():
+    recorded = np.load(RECORDED, allow_pickle=False)
+    gyro, accel = np.split(recorded["net_input_gyro_accel"], 2, axis=-1)
+    variables = interop.load_tlio_state_dict(tlio_weights.weights())
+    apply = jax.jit(models.create("tlio").apply)
+    found = apply(variables, np.concatenate([accel, gyro], axis=-1))
+    np.testing.assert_allclose(found.displacement, recorded["net_displacement"], atol=1e-5)
+    np.testing.assert_allclose(found.log_std, recorded["net_log_std"], atol=1e-5)
+    assert found.displacement.dtype == found.log_std.dtype == jnp.float32
+    swapped = apply(variables, np.concatenate([gyro, accel], axis=-1))  # what the comparison would say of channels in the other order
+    assert np.abs(swapped.displacement - recorded["net_displacement"]).max() > 1e-3
+
+
+def test_a_frozen_network_gives_the_same_numbers():
+    model = models.create("tlio", width=4)
+    variables = drawn(model, 64)
+    windows = jax.random.normal(jax.random.key(1), (3, 64, 6), jnp.float32)
+    frozen = models.freeze(model, variables)
+    apply = jax.jit(models.Inference(model).__call__)
+    wanted, found = apply(models.Frozen(variables, {}), windows), apply(frozen, windows)
+    for one, other in [(found.displacement, wanted.displacement), (found.log_std, wanted.log_std)]:
+        assert np.abs(other).max() > 1e-2
+        np.testing.assert_allclose(one, other, rtol=2e-4, atol=2e-5)
+    for head in ("displacement", "log_std"):  # the normalisation is in the convolution now
+        assert (np.asarray(frozen.variables["params"][head]["neck_bn"]["scale"]) == 1).all()
+        assert (np.asarray(variables["params"][head]["neck_bn"]["scale"]) != 1).any()
+
+
+def test_dropout_keeps_its_share_in_training_alone():
+    features = jax.random.normal(jax.random.key(1), (64, 2, 64), jnp.float32)
+    heads = {share: FullyConnectedHead(8, 3, share) for share in (0.0, 0.25)}
+    shape = jax.eval_shape(lambda: heads[0.0].init(jax.random.key(0), features, False))
+    rng = np.random.default_rng(0)
+    variables = jax.tree.map(lambda leaf: jnp.asarray(rng.uniform(0.1, 0.4, leaf.shape) * rng.choice([-1, 1], leaf.shape), jnp.float32),
+                             shape)
+    variables["batch_stats"] = jax.tree.map(jnp.abs, variables["batch_stats"])
+
+    def hidden(share, train, seed=0):
+        _, seen = heads[share].apply(variables, features, train, rngs={"dropout": jax.random.key(seed)},
+                                     mutable=["intermediates", "batch_stats"],
+                                     capture_intermediates=lambda module, _: isinstance(module, nn.Dropout))
+        return [np.asarray(seen["intermediates"][f"Dropout_{i}"]["__call__"][0]) for i in range(2)]
+
+    whole, dropped, other = hidden(0.0, True)[0], hidden(0.25, True)[0], hidden(0.25, True, 1)[0]
+    active, kept = whole > 1e-3, dropped != 0
+    assert active.sum() > 1000 and abs(kept[active].mean() - 0.75) < 0.05
+    np.testing.assert_allclose(dropped[kept], whole[kept] / 0.75, rtol=1e-5)
+    assert (kept != (other != 0)).any()
+    second = hidden(0.25, True)[1]
+    assert 0.15 < (second == 0).mean()
+    for one, two in zip(hidden(0.0, False), hidden(0.25, False), strict=True):
+        np.testing.assert_array_equal(one, two)
+
+
+def test_a_new_head_predicts_next_to_nothing_and_learns_every_parameter():
+    features = jax.random.normal(jax.random.key(1), (8, 2, 64), jnp.float32)
+    head = FullyConnectedHead(8, 3, 0.5)
+    variables = jax.jit(lambda key: head.init(key, features, False))(jax.random.key(0))
+    assert abs(np.asarray(variables["params"]["fc1"]["kernel"]).std() - 0.01) < 0.001
+    assert all((np.asarray(variables["params"][layer]["bias"]) == 0).all() for layer in ("fc1", "fc2", "fc3"))
+
+    @jax.jit
+    def gradient(variables):
+        def loss(params):
+            output, _ = head.apply({**variables, "params": params}, features, True, rngs={"dropout": jax.random.key(2)},
+                                   mutable=["batch_stats"])
+            return jnp.sum((output - 1) ** 2), output
+
+        return jax.grad(loss, has_aux=True)(variables["params"])
+
+    found, output = gradient(variables)
+    assert float(jnp.abs(output).max()) < 0.1
+    assert all(np.isfinite(leaf).all() and np.abs(leaf).max() > 0 for leaf in jax.tree.leaves(found))
+
+
+@pytest.mark.parametrize("name", ["tlio", "ronin_resnet"])
+def test_parameters_and_outputs_are_float32_whatever_comes_in(name):
+    model, windows = models.create(name, width=4), jax.ShapeDtypeStruct((2, 64, 6), jnp.float64)
+    variables = jax.eval_shape(model.init, jax.random.key(0), windows)
+    assert {leaf.dtype for leaf in jax.tree.leaves(variables)} == {jnp.dtype("float32")}
+    found, changed = jax.eval_shape(lambda variables, windows, key: model.apply(
+        variables, windows, train=True, rngs={"dropout": key}, mutable=["batch_stats"]), variables, windows, jax.random.key(0))
+    for leaf in (found.displacement, found.log_std):
+        assert (leaf.shape, leaf.dtype) == ((2, 3), jnp.dtype("float32"))
+    assert changed["batch_stats"] == variables["batch_stats"]  # shapes and dtypes: nothing comes or goes
+
+
+@pytest.mark.parametrize("share", [1.0, -0.1, float("nan")])
+def test_a_share_that_leaves_nothing_is_refused(share):
+    for name in ("tlio", "ronin_resnet"):
+        with pytest.raises(InputError, match=f"model '{name}': dropout must be at least 0 and below 1"):
+            models.create(name, dropout=share)
