@@ -7,13 +7,20 @@ import difflib
 
 from flax import linen as nn
 
+from gnio_jax.models.ctin import CTIN
+from gnio_jax.models.deepils import DeepILS
 from gnio_jax.models.gnio import GNIO
+from gnio_jax.models.imot import IMoT, IMoTText
 from gnio_jax.models.ronin import RoNINResNet
 from gnio_jax.models.tlio import TLIO
 from gnio_jax.types import InputError
 
 _MODELS: dict[str, type[nn.Module]] = {
+    "ctin": CTIN,
+    "deepils": DeepILS,
     "gnio": GNIO,
+    "imot": IMoT,
+    "imot_text": IMoTText,
     "ronin_resnet": RoNINResNet,
     "tlio": TLIO,
 }

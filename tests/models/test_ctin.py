@@ -1,0 +1,235 @@
+"""CTIN against its description: sizes block by block, a plain NumPy forward pass of the whole network, causality."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from gnio_jax import models
+from gnio_jax.models import ctin
+from gnio_jax.types import InputError
+
+SMALL = {"width": 12, "encoder_width": 8, "ffn": 10, "heads": 2, "decoder_layers": 2}
+
+
+def count(tree):
+    return sum(int(np.prod(leaf.shape)) for leaf in jax.tree.leaves(tree))
+
+
+def shapes(samples=200, **options):
+    model = models.create("ctin", **options)
+    return jax.eval_shape(model.init, jax.random.key(0), jax.ShapeDtypeStruct((1, samples, 6), jnp.float32))
+
+
+def compiled(function):
+    """Compiled without optimising, which is what takes the time here."""
+    return jax.jit(function, compiler_options={"xla_backend_optimization_level": 0})
+
+
+def drawn(tree, seed=3):
+    """Variables far from their neutral start, statistics and biases too, so that nothing can be left out unnoticed."""
+    rng = np.random.default_rng(seed)
+
+    def draw(path, leaf):
+        if path[-1].key in ("var", "scale"):
+            return jnp.asarray(rng.uniform(0.5, 1.5, leaf.shape), jnp.float32)
+        return jnp.asarray(rng.standard_normal(leaf.shape) * (1.0 if path[-1].key == "positions" else 0.4), jnp.float32)
+
+    return jax.tree.map_with_path(draw, tree)
+
+
+def test_parameters_block_by_block():
+    params = shapes(output_dim=2)["params"]
+    attention = lambda d: 4 * (d * d + d)  # noqa: E731
+    assert count(params) - count(params["task_log_std"]) == 555_364
+    assert abs(count(params) / 557_100 - 1) < 0.01  # what the publication's size allows
+    assert count(params["spatial_embedding"]) == 3 * 6 * 96 + 2 * 96 + 96 * 96 + 96
+    assert count(params["encoder"]["local"]) == (
+        3 * 16 * 64 + 2 * 64 + 64 * 64 + 2 * 64 + 128 * 16 + 2 * 16 + (16 + 1) * 3 * 64 + 64 * 16 + (16 + 1) * 2 * 64
+    )
+    assert count(params["encoder"]["global"]) == attention(64)
+    assert count(params["encoder"]) == 2 * 96 * 64 + 2 * 64 + 2 * 96 + count(params["encoder"]["local"]) + attention(64)
+    assert count(params["temporal_embedding"]) == 2 * 4 * 48 * (6 + 48 + 1) + 200 * 96
+    for layer in range(1, 5):
+        assert count(params[f"decoder_{layer}"]) == 2 * attention(96) + 96 * 192 + 192 + 192 * 96 + 96 + 3 * 2 * 96
+    for head in ("velocity", "log_std"):
+        assert count(params[head]) == 96 * 48 + 48 + 2 * 48 + 48 * 2 + 2
+    assert len(params) == 1 + 1 + 1 + 4 + 2 + 1
+
+
+def test_parameters_follow_the_options_and_the_window():
+    whole = count(shapes(output_dim=2)["params"])
+    assert count(shapes()["params"]) == whole + 2 * 49
+    assert count(shapes(100, output_dim=2)["params"]) == whole - 100 * 96
+    assert count(shapes(output_dim=2, decoder_layers=3)["params"]) == whole - 112_224
+
+
+def softmax(x, axis):
+    e = np.exp(x - x.max(axis=axis, keepdims=True))
+    return e / e.sum(axis=axis, keepdims=True)
+
+
+def linear(x, q):
+    return x @ q["kernel"] + q.get("bias", 0)
+
+
+def layer_norm(x, q):
+    return (x - x.mean(-1, keepdims=True)) / np.sqrt(x.var(-1, keepdims=True) + 1e-5) * q["scale"] + q["bias"]
+
+
+def attention(x, memory, q, causal=False):
+    """Step by step, head by head; causal: a step sees no later one."""
+    out = np.zeros((len(x), q["out"]["kernel"].shape[-1])) + q["out"]["bias"]
+    for h in range(q["query"]["kernel"].shape[1]):
+        query, key, value = (source @ q[name]["kernel"][:, h] + q[name]["bias"][h]
+                             for name, source in (("query", x), ("key", memory), ("value", memory)))
+        for i in range(len(x)):
+            seen = i + 1 if causal else len(memory)
+            weights = softmax(key[:seen] @ query[i] / np.sqrt(query.shape[1]), 0)
+            out[i] += weights @ value[:seen] @ q["out"]["kernel"][h]
+    return out
+
+
+def lstm(x, q):
+    sigmoid = lambda z: 1 / (1 + np.exp(-z))  # noqa: E731
+    h = c = np.zeros(q["hi"]["bias"].shape)
+    states = []
+    for step in x:
+        i, f, g, o = (step @ q[f"i{gate}"]["kernel"] + h @ q[f"h{gate}"]["kernel"] + q[f"h{gate}"]["bias"] for gate in "ifgo")
+        c = sigmoid(f) * c + sigmoid(i) * np.tanh(g)
+        h = sigmoid(o) * np.tanh(c)
+        states.append(h)
+    return np.array(states)
+
+
+def local_attention(x, q, norm, groups=4):
+    n, channels = x.shape
+    padded, each = np.vstack([np.zeros(channels), x, np.zeros(channels)]), channels // groups
+    key = np.zeros((n, channels))
+    for t in range(n):
+        for out in range(channels):
+            first = out // each * each
+            key[t, out] = sum(padded[t + k, first: first + each] @ q["key_conv"]["kernel"][k, :, out] for k in range(3))
+    key = np.maximum(norm(key, "key_bn"), 0)
+    value = norm(x @ q["value_conv"]["kernel"][0], "value_bn")
+    hidden = np.maximum(norm(np.hstack([x, key]) @ q["hidden_conv"]["kernel"][0], "hidden_bn"), 0)
+    scores = linear(hidden, q["weights"])
+    context = np.zeros((n, channels))
+    for t in range(n):
+        for c in range(channels):
+            weights = softmax(scores[t, c::channels], 0)
+            context[t, c] = sum(weights[k] * value[t + k - 1, c] for k in range(3) if 0 <= t + k - 1 < n)
+    pooled = (context + key).mean(axis=0)
+    shares = softmax(linear(np.maximum(linear(pooled, q["squeeze"]), 0), q["excite"]).reshape(2, channels), 0)
+    return shares[0] * context + shares[1] * key
+
+
+def numpy_forward(variables, windows):
+    """Float64, one window at a time: velocities and log standard deviations of every step."""
+    p, s = (jax.tree.map(lambda x: np.asarray(x, np.float64), variables[name]) for name in ("params", "batch_stats"))
+
+    def norm_of(params, stats):
+        return lambda x, name: ((x - stats[name]["mean"]) / np.sqrt(stats[name]["var"] + 1e-5) * params[name]["scale"]
+                                + params[name]["bias"])
+
+    velocity, log_std = [], []
+    for window in np.asarray(windows, np.float64):
+        e, n = p["spatial_embedding"], len(window)
+        padded = np.vstack([np.zeros(6), window, np.zeros(6)])
+        x = np.array([sum(padded[t + k] @ e["conv"]["kernel"][k] for k in range(3)) for t in range(n)])
+        x = linear(norm_of(e, s["spatial_embedding"])(x, "bn"), e["linear"])
+        e = p["encoder"]
+        norm = norm_of(e, s["encoder"])
+        y = np.maximum(norm(x @ e["reduce_conv"]["kernel"][0], "reduce_bn"), 0)
+        y = local_attention(y, e["local"], norm_of(e["local"], s["encoder"]["local"]))
+        y = attention(y, y, e["global"])
+        memory = np.maximum(x + norm(y @ e["expand_conv"]["kernel"][0], "expand_bn"), 0)
+        t = p["temporal_embedding"]
+        x = np.hstack([lstm(window, t["lstm_forward"]), lstm(window[::-1], t["lstm_backward"])[::-1]]) + t["positions"]
+        for layer in (1, 2):
+            q = p[f"decoder_{layer}"]
+            x = layer_norm(x + attention(x, x, q["self"], causal=True), q["self_norm"])
+            x = layer_norm(x + attention(x, memory, q["cross"]), q["cross_norm"])
+            x = layer_norm(x + linear(np.maximum(linear(x, q["expand"]), 0), q["contract"]), q["ffn_norm"])
+        for head, values in (("velocity", velocity), ("log_std", log_std)):
+            values.append(linear(layer_norm(linear(x, p[head]["hidden"]), p[head]["norm"]), p[head]["output"]))
+    return np.array(velocity), np.array(log_std)
+
+
+@pytest.mark.parametrize("samples, output_dim", [(20, 3), (11, 2)])
+def test_forward_against_numpy_frozen_or_not(samples, output_dim):
+    model = models.create("ctin", output_dim=output_dim, **SMALL)
+    variables = drawn(shapes(samples, output_dim=output_dim, **SMALL))
+    windows = jax.random.normal(jax.random.key(1), (2, samples, 6), jnp.float32)
+    apply, (velocity, log_std) = compiled(model.apply), numpy_forward(variables, windows)
+    missing = ((0, 0), (0, 0), (0, 3 - output_dim))
+    velocity, log_std = np.pad(velocity, missing), np.pad(log_std, missing)
+    for values in (velocity, log_std):  # windows and steps are told apart
+        assert np.ptp(values[..., :output_dim], axis=0).max() > 0.1 and np.ptp(values[..., :output_dim], axis=1).min() > 0.05
+    frozen = models.freeze(model, variables)
+    assert not frozen.constants
+    assert all((x == 0).all() for path, x in jax.tree.leaves_with_path(frozen.variables["batch_stats"]) if path[-1].key == "mean")
+    for given in (variables, frozen.variables):
+        found = apply(given, windows)
+        np.testing.assert_allclose(found.diagnostics["velocity"], velocity, rtol=1e-3, atol=1e-4)
+        np.testing.assert_allclose(found.diagnostics["velocity_log_std"], log_std, rtol=1e-3, atol=1e-4)
+        np.testing.assert_allclose(found.displacement, velocity.mean(axis=1), rtol=1e-3, atol=1e-4)
+        np.testing.assert_allclose(found.log_std, np.log(np.sqrt(np.mean(np.exp(log_std) ** 2, axis=1))), rtol=1e-3, atol=1e-4)
+        task = variables["params"]["task_log_std"]
+        np.testing.assert_array_equal(found.diagnostics["task_log_std"], np.stack([task, task]))
+
+
+def test_a_decoded_step_depends_on_no_later_one():
+    layer = ctin.DecoderLayer(2, 10, 0.0)
+    keys = jax.random.split(jax.random.key(0), 4)
+    x, memory = (jax.random.normal(key, (1, 9, 12), jnp.float32) for key in keys[:2])
+    apply = compiled(lambda v, x, memory: layer.apply(v, x, memory, False))
+    variables = drawn(jax.eval_shape(lambda k: layer.init(k, x, memory, False), keys[2]))
+    still, changed = apply(variables, x, memory), apply(variables, x.at[:, 5].add(1.0), memory)
+    np.testing.assert_array_equal(still[:, :5], changed[:, :5])
+    assert (jnp.abs(still - changed)[:, 5:].max(axis=-1) > 1e-4).all()  # and every later one does
+    assert (jnp.abs(still - apply(variables, x, memory.at[:, 8].add(1.0))).max(axis=-1) > 1e-5).all()  # the encoder is seen whole
+
+
+def test_no_step_is_surer_than_the_window_says():
+    found = ctin._root_mean_square(jnp.array([[[-2.0, 0.0, 90.0], [1.0, 0.0, -90.0]]], jnp.float32))
+    np.testing.assert_allclose(found, [[0.5 * np.log((np.exp(-4) + np.exp(2)) / 2), 0, 90 - 0.5 * np.log(2)]], rtol=1e-6)
+
+
+def test_every_parameter_is_trained_in_float32_and_dropout_is_drawn():
+    model, variables = models.create("ctin", **SMALL), drawn(shapes(12, **SMALL))
+    windows = jax.random.normal(jax.random.key(1), (4, 12, 6), jnp.float32)
+    assert {leaf.dtype for leaf in jax.tree.leaves(shapes())} == {jnp.dtype("float32")}
+    still = jax.eval_shape(model.apply, variables, jnp.ones((1, 12, 6), jnp.float64))
+    assert {leaf.dtype for leaf in jax.tree.leaves(still)} == {jnp.dtype("float32")}
+
+    def loss(params, key):
+        given = {"params": params, "batch_stats": variables["batch_stats"]}
+        prediction, _ = model.apply(given, windows, train=True, mutable=["batch_stats"], rngs={"dropout": key})
+        d, task = prediction.diagnostics, prediction.diagnostics["task_log_std"]
+        velocity = jnp.sum((d["velocity"] - 1) ** 2, axis=(1, 2)) * jnp.exp(-2 * task[:, 0])
+        return jnp.sum(prediction.log_std) + jnp.sum(velocity) + jnp.sum(task), prediction.displacement
+
+    gradient = compiled(jax.grad(loss, has_aux=True))
+    (grads, one), (others, other) = (gradient(variables["params"], jax.random.key(seed)) for seed in (0, 1))
+    for (path, leaf), another in zip(jax.tree.leaves_with_path(grads), jax.tree.leaves(others), strict=True):
+        assert leaf.dtype == jnp.float32 and bool(jnp.isfinite(leaf).all()), path
+        if [key.key for key in path[-2:]] == ["key", "bias"]:
+            continue  # one number added to all scores: a softmax does not see it
+        trained = float(jnp.abs(leaf).max() + jnp.abs(another).max())
+        if path[-1].key == "task_log_std":
+            assert abs(float(leaf[0])) > 0 and leaf[1] == len(windows)  # the second is but a summand of this loss
+        assert trained > 1e-6, path
+    assert float(jnp.abs(one - other).max()) > 1e-3
+
+
+@pytest.mark.parametrize("options, problem", [
+    ({"heads": 0}, "heads must be at least 1, found 0"),
+    ({"width": 90}, "width must be even and a multiple of the 8 heads, found 90"),
+    ({"encoder_width": 20}, "encoder_width must be a multiple of the 8 heads and of 4, found 20"),
+    ({"encoder_dropout": -0.1}, "dropout must be at least 0 and below 1, found -0.1"),
+    ({"output_dim": 4}, "output_dim must be 2 or 3, found 4"),
+])
+def test_options_that_cannot_be_are_refused(options, problem):
+    with pytest.raises(InputError, match=f"model 'ctin': {problem}"):
+        models.create("ctin", **options)

@@ -1,0 +1,234 @@
+"""iMoT against its description: sizes block by block, a plain NumPy forward pass of the whole network, its decoupler."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.special import erf
+
+from gnio_jax import models
+from gnio_jax.models import imot
+from gnio_jax.types import InputError
+
+SMALL = {"encoder_layers": 2, "decoder_layers": 2, "ffn_ratio": 1.5, "heads": 4, "particles": 5}
+
+
+def count(tree):
+    return sum(int(np.prod(leaf.shape)) for leaf in jax.tree.leaves(tree))
+
+
+def shapes(samples=200, name="imot", **options):
+    model = models.create(name, **options)
+    return jax.eval_shape(model.init, jax.random.key(0), jax.ShapeDtypeStruct((1, samples, 6), jnp.float32))
+
+
+def compiled(function):
+    """Compiled without optimising, which is what takes the time here."""
+    return jax.jit(function, compiler_options={"xla_backend_optimization_level": 0})
+
+
+def drawn(tree, seed=3):
+    """Variables far from their neutral start, biases too, so that nothing can be left out unnoticed."""
+    rng = np.random.default_rng(seed)
+
+    def draw(path, leaf):
+        if path[-1].key == "scale":
+            return jnp.asarray(rng.uniform(0.5, 1.5, leaf.shape), jnp.float32)
+        return jnp.asarray(rng.standard_normal(leaf.shape) * (1.0 if path[-1].key == "particles" else 0.3), jnp.float32)
+
+    return jax.tree.map_with_path(draw, tree)
+
+
+def layer_sizes(t, ffn):
+    """An encoder and a decoder layer: every matrix with its bias, every normalisation with two numbers a feature."""
+    full = lambda i, o: i * o + o  # noqa: E731
+    spatial = full(3 * 2 * t, 2 * t) + full(2 * t, 2 * t)
+    encoder = 4 * full(t, t) + 2 * full(t, t) + full(t, ffn) + full(ffn, t) + 2 * spatial + 2 * 2 * t
+    conditional = 2 * full(2 * t, 2 * t) + full(t, 2 * t) + full(2 * t, t)
+    fusion = full(2 * t, t) + full(t, t)
+    return encoder, 6 * full(t, t) + 2 * conditional + fusion + full(t, ffn) + full(ffn, t) + 4 * 2 * t
+
+
+@pytest.mark.parametrize("name, layers, ffn, total", [("imot", 4, 916, 14_492_810), ("imot_text", 2, 800, 7_137_482)])
+def test_parameters_of_the_publication_and_of_its_text(name, layers, ffn, total):
+    params = shapes(name=name, output_dim=2)["params"]
+    assert count(params) == total
+    encoder, decoder = layer_sizes(200, ffn)
+    for layer in range(1, layers + 1):
+        assert count(params[f"encoder_{layer}"]) == encoder
+        assert count(params[f"decoder_{layer}"]) == decoder
+    assert len([name for name in params if "coder" in name]) == 2 * layers
+    assert params["particles"].shape == (128, 2)
+    assert count(params["particle_positions"]) == 2 * (200 * 200 + 200)
+    assert count(params["refinement"]) == 200 * 200 + 200 + 200 * 2 + 2
+    assert count(params["scores"]) == 2 * (128 * 128 + 128)
+    assert count(shapes(name=name)["params"]) == total + 128 + 201  # a third axis
+
+
+def test_a_window_of_100_samples_has_heads_that_divide_it():
+    params = shapes(100)["params"]
+    encoder, decoder = layer_sizes(100, 458)
+    assert count(params["encoder_1"]) == encoder and count(params["decoder_4"]) == decoder
+    assert params["encoder_1"]["attention"]["query"]["kernel"].shape == (100, 5, 20)
+    assert params["decoder_1"]["gyro"]["key"]["kernel"].shape == (200, 5, 40)
+    assert shapes(200)["params"]["encoder_1"]["attention"]["query"]["kernel"].shape == (200, 8, 25)
+    assert [imot.head_count(t, most) for t, most in ((200, 8), (100, 8), (100, 4), (97, 8))] == [8, 5, 4, 1]
+
+
+def decoupled(channels):
+    """Sample by sample: the six series (6, n) to acceleration's nine and angular rate's nine."""
+    n = channels.shape[1]
+    at = lambda x, i: x[min(max(i, 0), n - 1)]  # noqa: E731
+    rows = []
+    for modality in (channels[:3], channels[3:]):
+        trends = []
+        for x in modality:
+            nine = [sum(at(x, t + k) for k in range(-4, 5)) / 9 for t in range(n)]
+            trends.append([(at(nine, t - 1) + nine[t] + at(nine, t + 1)) / 3 for t in range(n)])
+        rows += [*modality, *trends, *(modality - np.array(trends))]
+    return np.array(rows)
+
+
+def test_a_series_is_its_trend_and_its_season():
+    x = np.random.default_rng(0).normal(size=(2, 6, 25)).astype(np.float32)
+    found = imot.decouple(jnp.asarray(x))
+    np.testing.assert_allclose(found, np.stack([decoupled(each.astype(np.float64)) for each in x]), atol=1e-5)
+    parts = np.asarray(found).reshape(2, 2, 3, 3, 25)
+    np.testing.assert_allclose(parts[:, :, 1] + parts[:, :, 2], parts[:, :, 0], atol=1e-6)
+    ramp = jnp.broadcast_to(jnp.arange(25, dtype=jnp.float32)[None, None], (1, 6, 25))
+    np.testing.assert_allclose(imot.decouple(ramp)[0, 6, 5:-5], 0, atol=1e-5)  # a steady change is trend alone, away from the ends
+
+
+def softmax(x):
+    e = np.exp(x - x.max())
+    return e / e.sum()
+
+
+def linear(x, q):
+    return x @ q["kernel"] + q["bias"]
+
+
+def perceptron(x, q):
+    return linear(np.maximum(linear(x, q["hidden"]), 0), q["output"])
+
+
+def layer_norm(x, q):
+    return (x - x.mean(-1, keepdims=True)) / np.sqrt(x.var(-1, keepdims=True) + 1e-5) * q["scale"] + q["bias"]
+
+
+def attention(query, key, value, q):
+    out = np.zeros((len(query), q["out"]["kernel"].shape[-1])) + q["out"]["bias"]
+    for h in range(q["query"]["kernel"].shape[1]):
+        a, b, c = (x @ q[name]["kernel"][:, h] + q[name]["bias"][h] for name, x in (("query", query), ("key", key), ("value", value)))
+        for i in range(len(a)):
+            out[i] += softmax(b @ a[i] / np.sqrt(a.shape[1])) @ c @ q["out"]["kernel"][h]
+    return out
+
+
+def waves(x, features):
+    half = features // 2
+    angles = [x / 10_000 ** (i / half) for i in range(half)]
+    return [np.sin(a) for a in angles] + [np.cos(a) for a in angles]
+
+
+def spatial(x, q):
+    y = np.hstack([x[:9], x[9:]])
+    rows = np.vstack([0 * y[:1], y, 0 * y[:1]])
+    y = np.array([linear(np.concatenate([rows[i], rows[i + 1], rows[i + 2]]), q["conv3"]) for i in range(9)])
+    y = linear(y / (1 + np.exp(-y.mean(axis=0))), q["conv1"])
+    y = y * 0.5 * (1 + erf(y / np.sqrt(2)))
+    return np.vstack([y[:, : x.shape[1]], y[:, x.shape[1]:]])
+
+
+def among_particles(content, where, q, heads):
+    query, key = (linear(content, q[f"{name}_content"]) + linear(where, q[f"{name}_position"]) for name in ("query", "key"))
+    value = linear(content, q["value"])
+    size = content.shape[1] // heads
+    out = np.zeros_like(content)
+    for h in range(heads):
+        part = slice(h * size, (h + 1) * size)
+        for i in range(len(content)):
+            out[i, part] = softmax(key[:, part] @ query[i, part] / np.sqrt(size)) @ value[:, part]
+    return linear(out, q["output"])
+
+
+def numpy_forward(variables, windows, heads):
+    """Float64, one window at a time: velocity, particles, weights."""
+    p = jax.tree.map(lambda x: np.asarray(x, np.float64), variables["params"])
+    results = []
+    for window in np.asarray(windows, np.float64):
+        t = len(window)
+        channels = window.T
+        for layer in (1, 2):
+            q = p[f"encoder_{layer}"]
+            x = decoupled(channels)
+            e = perceptron(x, q["positions"]) * np.array([waves(i, t) for i in range(18)])
+            x = layer_norm(spatial(x, q["attention_spatial"]) + attention(x + e, x + e, x, q["attention"]), q["attention_norm"])
+            x = layer_norm(spatial(x, q["ffn_spatial"]) + perceptron(x, q["ffn"]), q["ffn_norm"])
+            channels = np.vstack([(x[i: i + 3] + x[i + 3: i + 6] + x[i + 6: i + 9]) / 2 for i in (0, 9)])
+        particles = p["particles"]
+        content = np.zeros((len(particles), t))
+        each = 2 * (t // (2 * particles.shape[1]))
+        for layer in (1, 2):
+            q = p[f"decoder_{layer}"]
+            located = [[wave for c in particle for wave in waves(2 * np.pi * c, each)] for particle in particles]
+            where = perceptron(np.array([row + [0] * (t - len(row)) for row in located]), p["particle_positions"])
+            content = layer_norm(content + among_particles(content, where, q["self"], heads), q["self_norm"])
+            found = [layer_norm(content + attention(np.hstack([content, where]), np.hstack([x[rows], e[rows]]), x[rows], q[name]),
+                                q[f"{name}_norm"]) for name, rows in (("accel", slice(0, 9)), ("gyro", slice(9, 18)))]
+            content = perceptron(np.hstack(found), q["fusion"])
+            content = layer_norm(content + perceptron(content, q["ffn"]), q["ffn_norm"])
+            particles = particles + perceptron(content, p["refinement"])
+        weights = softmax(np.mean([perceptron(content[:, feature], p["scores"]["mlp"]) for feature in range(t)], axis=0))
+        results.append((weights @ particles, particles, weights))
+    return tuple(map(np.array, zip(*results, strict=True)))
+
+
+@pytest.mark.parametrize("samples, output_dim", [(20, 3), (14, 2)])
+def test_forward_against_numpy(samples, output_dim):
+    model = models.create("imot", output_dim=output_dim, **SMALL)
+    variables = drawn(shapes(samples, output_dim=output_dim, **SMALL))
+    windows = jax.random.normal(jax.random.key(1), (2, samples, 6), jnp.float32)
+    found = compiled(model.apply)(variables, windows)
+    velocity, particles, weights = numpy_forward(variables, windows, heads=4 if samples == 20 else 2)
+    assert np.ptp(velocity, axis=0).min() > 0.02 and np.ptp(weights, axis=0).max() > 1e-3  # the windows are told apart
+    np.testing.assert_allclose(found.diagnostics["particles"], particles, rtol=1e-3, atol=2e-4)
+    np.testing.assert_allclose(found.diagnostics["particle_weights"], weights, rtol=1e-3, atol=1e-5)
+    np.testing.assert_allclose(found.displacement, np.pad(velocity, ((0, 0), (0, 3 - output_dim))), rtol=1e-3, atol=2e-4)
+    constant = variables["batch_stats"]["uncertainty"]["log_std"]
+    np.testing.assert_array_equal(found.log_std, np.stack([constant, constant]))
+
+
+def test_every_parameter_that_can_be_is_trained_in_float32_and_dropout_is_drawn():
+    model, variables = models.create("imot", **SMALL), drawn(shapes(12, **SMALL))
+    windows = jax.random.normal(jax.random.key(1), (4, 12, 6), jnp.float32)
+    assert {leaf.dtype for leaf in jax.tree.leaves(shapes())} == {jnp.dtype("float32")}
+    still = jax.eval_shape(model.apply, variables, jnp.ones((1, 12, 6), jnp.float64))
+    assert {leaf.dtype for leaf in jax.tree.leaves(still)} == {jnp.dtype("float32")}
+
+    def loss(params, key):
+        given = {"params": params, "batch_stats": variables["batch_stats"]}
+        prediction, _ = model.apply(given, windows, train=True, mutable=["batch_stats"], rngs={"dropout": key})
+        return jnp.sum((prediction.displacement - 1) ** 2), prediction.displacement
+
+    gradient = compiled(jax.grad(loss, has_aux=True))
+    (grads, one), (others, other) = (gradient(variables["params"], jax.random.key(seed)) for seed in (0, 1))
+    for (path, leaf), another in zip(jax.tree.leaves_with_path(grads), jax.tree.leaves(others), strict=True):
+        assert leaf.dtype == jnp.float32 and bool(jnp.isfinite(leaf).all()), path
+        names = [key.key for key in path]
+        trained = float(jnp.abs(leaf).max() + jnp.abs(another).max())
+        if names[:2] == ["decoder_1", "self"] and names[2:] not in (["value", "bias"], ["output", "bias"], ["output", "kernel"]):
+            assert trained < 1e-5, path  # all contents are zero at first: whom a particle attends to makes no difference
+        elif names[-2:] != ["key", "bias"] and names[-2:] not in (["key_content", "bias"], ["key_position", "bias"]):
+            assert trained > 1e-6, path  # but for one number added to all scores, which a softmax does not see
+    assert float(jnp.abs(one - other).max()) > 1e-3
+
+
+@pytest.mark.parametrize("options, problem", [({"particles": 0}, "particles must be at least 1, found 0"),
+                                              ({"heads": 0}, "heads must be at least 1, found 0"),
+                                              ({"ffn_ratio": 0.0}, "ffn_ratio must be positive, found 0.0"),
+                                              ({"dropout": 1.0}, "dropout must be at least 0 and below 1, found 1.0"),
+                                              ({"output_dim": 1}, "output_dim must be 2 or 3, found 1")])
+def test_options_that_cannot_be_are_refused(options, problem):
+    with pytest.raises(InputError, match=f"model 'imot_text': {problem}"):
+        models.create("imot_text", **options)
