@@ -20,7 +20,7 @@ from gnio_jax.config import DataConfig, ModelConfig, OptimConfig, TrainConfig
 from gnio_jax.data.windows import WindowSource, gather
 from gnio_jax.training import optimizer as optimizers
 from gnio_jax.training.checkpoint import create_model
-from gnio_jax.training.losses import losses
+from gnio_jax.training.losses import losses, stage
 from gnio_jax.training.step import create_state, train_steps
 
 STEPS = 4
@@ -35,6 +35,7 @@ def recordings(samples: int, batch: int) -> WindowSource:
     return jax.device_put(WindowSource(
         imu=rng.standard_normal((rows, 6), np.float32), start=(np.arange(count) * (samples // 10)).astype(np.int32),
         rotation=np.tile(np.eye(3, dtype=np.float32), (count, 1, 1)), displacement=rng.standard_normal((count, 3), np.float32),
+        step=np.zeros((rows, 3), np.float32), unyaw=np.tile(np.float32([1, 0]), (count, 1)), visited=np.arange(count, dtype=np.int32),
     ))  # fmt: skip
 
 
@@ -48,14 +49,14 @@ def ours(config: TrainConfig):
     fixed = jax.jit(gather, static_argnums=2)(source, order[:size], samples)
 
     def whole():
-        holder[0], progress = train_steps(holder[0], source, order, jnp.int32(0), jnp.int32(STEPS), jnp.float32(1e-4), key,
+        holder[0], progress = train_steps(holder[0], source, order, jnp.int32(0), jnp.int32(STEPS), stage(config.loss, 0), key,
                                           model=model, optimizer=optimizer, config=config)  # fmt: skip
         jax.block_until_ready(progress)
         return STEPS
 
     def objective(params, batch_stats, windows):
         prediction, changed = model.apply({"params": params, "batch_stats": batch_stats}, windows.imu, train=True, mutable=["batch_stats"])
-        return losses(prediction, windows.displacement, config.loss, config.loss.nll_weight).total, changed
+        return losses(prediction, windows, config.loss, stage(config.loss, 0)).total, changed
 
     gradient = jax.jit(jax.grad(objective, has_aux=True))
     params, batch_stats = jax.tree.map(jnp.copy, (holder[0].params, holder[0].batch_stats))

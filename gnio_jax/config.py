@@ -71,46 +71,62 @@ class AugmentConfig:
     """Standard deviation of white gyro noise, rad/s."""
     accel_noise: float = 0.0
     """Standard deviation of white accelerometer noise, m/s²."""
+    shift_samples: int = 0
+    """Shift a training window by up to this many samples either way, where the recording allows it (RoNIN, DeepILS)."""
 
 
 @dataclass(frozen=True)
 class ModelConfig:
-    """The network (paper §III-B..E) and its ablation switches."""
+    """The network and its options. An option that is not given is the network's own, which is the published one; one that it
+    does not have is refused."""
 
     name: str = "gnio"
     """Network in the registry of `gnio_jax.models`."""
-    width: int = 64
-    """Channels of the first encoder group; features are 8 × width (paper: 64)."""
-    bank_size: int = 64
-    """Prototypes in the Motion Bank; 0 leaves the bank out (paper: 64)."""
-    bank_heads: int = 8
-    """Attention heads of the bank's query."""
-    head: Literal["gated", "linear"] = "gated"
-    """Displacement as scale × gate, or a plain linear layer."""
-    gate: Literal["tanh", "sigmoid"] = "tanh"
-    """Activation of the gate."""
-    scale: Literal["softplus", "pos_elu", "abs", "exp", "linear"] = "softplus"
-    """Activation of the scale."""
+    width: int | None = None
+    """Channels of the first encoder group; the others follow (gnio, tlio, ronin_resnet, deepils: 64)."""
+    bank_size: int | None = None
+    """Prototypes in the Motion Bank; 0 leaves the bank out (gnio: 64)."""
+    bank_heads: int | None = None
+    """Attention heads of the bank's query (gnio: 8)."""
+    head: Literal["gated", "linear"] | None = None
+    """Displacement as scale × gate, or a plain linear layer (gnio: gated)."""
+    gate: Literal["tanh", "sigmoid"] | None = None
+    """Activation of the gate (gnio: tanh)."""
+    scale: Literal["softplus", "pos_elu", "abs", "exp", "linear"] | None = None
+    """Activation of the scale (gnio: softplus)."""
+    output_dim: int | None = None
+    """3, or 2 for a network that says nothing of the vertical, as published (ronin_resnet, deepils, ctin, imot)."""
+    dropout: float | None = None
+    """Share of the activations that training drops (tlio, ronin_resnet, deepils: 0.5)."""
 
 
 @dataclass(frozen=True)
 class LossConfig:
-    """Weighted sum of squared error and Gaussian negative log-likelihood (paper §III-F)."""
+    """What training minimises (paper §III-F), and the terms of the networks that it is compared with."""
 
+    name: Literal["weighted_sum", "velocity_and_covariance"] = "weighted_sum"
+    """The weights below times squared error, absolute error and negative log-likelihood of the displacement; or CTIN's: errors of
+    velocity and position and the likelihood of each sample's velocity, weighted by two parameters that are learnt."""
     mse_weight: float = 1e2
     """λ_MSE."""
+    mae_weight: float = 0.0
+    """Weight of the absolute error, summed over the axes (DeepILS: that of the squared one)."""
     nll_weight: float = 1e-4
     """λ_NLL."""
     nll_from_epoch: int = 0
     """First epoch in which the likelihood counts: above 0 the two-stage reading of the paper's text."""
+    log_std_from_epoch: int = 0
+    """First epoch in which the likelihood moves the uncertainty; before it only the displacement learns from it (TLIO: 10)."""
     log_std_floor: float | None = None
     """Smallest log standard deviation the likelihood sees (TLIO: log 1e-3); none by default."""
 
 
 @dataclass(frozen=True)
 class OptimConfig:
-    """Adam with linear warm-up and cosine decay (paper §IV-A)."""
+    """Adam with linear warm-up and cosine decay (paper §IV-A), or the schedules of the networks that it is compared with."""
 
+    schedule: Literal["cosine", "constant", "plateau"] = "cosine"
+    """After the warm-up: a cosine to the end, no change, or smaller steps whenever the validation error no longer falls."""
     epochs: int = 200
     """Passes over the training windows."""
     batch_size: int = 1024
@@ -125,6 +141,12 @@ class OptimConfig:
     """Epochs of linear warm-up; a run shorter than twice this warms up for its first half."""
     clip_norm: float | None = None
     """Largest global norm of the gradient; none by default."""
+    weight_decay: float = 0.0
+    """Added to the gradient, times the parameter, before Adam (CTIN: 1e-6)."""
+    plateau_epochs: int = 10
+    """Of the plateau: epochs without a smaller squared error on the validation split before the learning rate falls (RoNIN, DeepILS)."""
+    plateau_factor: float = 0.1
+    """Of the plateau: the learning rate falls to this share of itself."""
 
 
 @dataclass(frozen=True)
@@ -222,7 +244,8 @@ def _build(kind: type, content: Any, source: str, prefix: str) -> Any:
 def _value(hint: Any, value: Any, source: str, name: str) -> Any:
     if dataclasses.is_dataclass(hint):
         return _build(typing.cast(type, hint), value, source, name + ".")
-    options = typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
+    # `Literal[...] | None` is a typing.Union, `int | None` is not
+    options = typing.get_args(hint) if isinstance(hint, types.UnionType) or typing.get_origin(hint) is typing.Union else (hint,)
     if value is None and type(None) in options:
         return None
     for option in options:
@@ -266,8 +289,8 @@ def validate(config: TrainConfig, source: str = "config") -> TrainConfig:
     for name, value in positive.items():
         require(value > 0, name, f"must be positive, found {value!r}")
     for name, value in [("optim.epochs", optim.epochs), ("optim.batch_size", optim.batch_size), ("model.width", model.width),
-                        ("model.bank_heads", model.bank_heads)]:
-        require(value >= 1, name, f"must be at least 1, found {value!r}")
+                        ("model.bank_heads", model.bank_heads), ("optim.plateau_epochs", optim.plateau_epochs)]:
+        require(value is None or value >= 1, name, f"must be at least 1, found {value!r}")
     for section in ("augment", "filter"):
         for key, value in dataclasses.asdict(getattr(config, section)).items():
             require(value >= 0, f"{section}.{key}", f"must not be negative, found {value!r}")
@@ -276,8 +299,11 @@ def validate(config: TrainConfig, source: str = "config") -> TrainConfig:
         samples = seconds * data.rate
         require(abs(samples - round(samples)) < 1e-6, name, f"is not a whole number of samples at {data.rate:g} Hz ({samples:g})")
     require(data.window % data.stride == 0, "data.stride_seconds", f"must divide the window of {data.window_seconds:g} s")
-    require(model.bank_size >= 0, "model.bank_size", f"must not be negative, found {model.bank_size!r}")
-    require((8 * model.width) % model.bank_heads == 0, "model.bank_heads", f"must divide the {8 * model.width} features")
+    require(model.bank_size is None or model.bank_size >= 0, "model.bank_size", f"must not be negative, found {model.bank_size!r}")
+    require(model.output_dim in (None, 2, 3), "model.output_dim", f"must be 2 or 3, found {model.output_dim!r}")
+    require(model.dropout is None or 0 <= model.dropout < 1, "model.dropout", f"must be at least 0 and below 1, found {model.dropout!r}")
+    require(0 < optim.plateau_factor < 1, "optim.plateau_factor", f"must be between 0 and 1, found {optim.plateau_factor!r}")
+    require(optim.weight_decay >= 0, "optim.weight_decay", f"must not be negative, found {optim.weight_decay!r}")
     require(optim.warmup_epochs >= 0, "optim.warmup_epochs", f"must not be negative, found {optim.warmup_epochs!r}")
     require(optim.clip_norm is None or optim.clip_norm > 0, "optim.clip_norm", "must be positive or null")
     return config

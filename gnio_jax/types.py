@@ -65,6 +65,8 @@ class Windows(NamedTuple):
     """[accel m/s², gyro rad/s], the paper's channel order (eq. 1)."""
     displacement: Float[Array, "b 3"]
     """Displacement over the window in the same frame, m."""
+    steps: Float[Array, "b n 3"]
+    """Its parts, from each sample's stamp to the next, m: what a network that predicts a velocity for every sample learns from."""
 
 
 class Prediction(NamedTuple):

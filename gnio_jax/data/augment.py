@@ -46,7 +46,7 @@ def yaw(key: PRNGKeyArray, windows: Windows) -> Windows:
     c, s, zero, one = jnp.cos(angle), jnp.sin(angle), jnp.zeros(count, jnp.float32), jnp.ones(count, jnp.float32)
     rotation = jnp.stack([c, -s, zero, s, c, zero, zero, zero, one], axis=-1).reshape(count, 3, 3)
     target = jnp.einsum("bij,bj->bi", rotation, windows.displacement, precision=jax.lax.Precision.HIGHEST)
-    return Windows(_rotate_imu(rotation, windows.imu), target)
+    return Windows(_rotate_imu(rotation, windows.imu), target, rotate(rotation, windows.steps[:, :, None])[:, :, 0])
 
 
 def noise(key: PRNGKeyArray, windows: Windows, gyro: float, accel: float) -> Windows:

@@ -288,7 +288,8 @@ def predict_windows(network: Network, recordings: list[Recording], attitudes: li
         counts.append(len(start))
         offset += len(imu)
     imu, start, level = (jnp.asarray(np.concatenate(part)) for part in zip(*parts, strict=True))
-    source = WindowSource(imu, start, level, jnp.zeros((len(start), 3), jnp.float32))
+    nothing = jnp.zeros((len(start), 3), jnp.float32)  # no targets here
+    source = WindowSource(imu, start, level, nothing, jnp.zeros_like(imu[:, :3]), nothing[:, :2], start)
     total, size, found = len(start), min(_WINDOWS_AT_ONCE, len(start)), []
     for begin in range(0, total, size):
         which = np.minimum(np.arange(begin, begin + size), total - 1).astype(np.int32)  # the last batch is filled up: one compilation

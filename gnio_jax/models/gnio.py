@@ -29,6 +29,11 @@ class GNIO(nn.Module):
     gate: Literal["tanh", "sigmoid"] = "tanh"
     scale: Literal["softplus", "pos_elu", "abs", "exp", "linear"] = "softplus"
 
+    def __post_init__(self) -> None:
+        if self.bank_size and (8 * self.width) % self.bank_heads:
+            raise ValueError(f"bank_heads must divide the {8 * self.width} features, found {self.bank_heads}")
+        super().__post_init__()
+
     @nn.compact
     def __call__(self, windows: Float[jax.Array, "b n 6"], train: bool = False, memory: Any = None) -> Prediction:
         features = ResNet18(self.width, name="encoder")(windows.astype(jnp.float32), train)

@@ -34,7 +34,7 @@ def names() -> list[str]:
 def create(name: str, **options: object) -> nn.Module:
     """The network `name` with its options set; its `apply(variables, windows)` returns a `Prediction`.
 
-    Raises `InputError` for an unknown name or option, naming the known ones.
+    Raises `InputError` for an unknown name or option, naming the known ones, or options that do not fit together.
     """
     if name not in _MODELS:
         raise InputError(f"model '{name}'", "unknown", f"known models: {', '.join(names())}")
@@ -44,4 +44,7 @@ def create(name: str, **options: object) -> nn.Module:
             close = difflib.get_close_matches(option, known, n=1)
             raise InputError(f"model '{name}'", f"unknown option '{option}'",
                              (f"did you mean '{close[0]}'? " if close else "") + f"known options: {', '.join(known)}")
-    return _MODELS[name](**options)
+    try:
+        return _MODELS[name](**options)
+    except ValueError as error:
+        raise InputError(f"model '{name}'", str(error)) from None

@@ -17,6 +17,7 @@ from flax import linen as nn
 from gnio_jax import config as configuration
 from gnio_jax import models
 from gnio_jax.config import TrainConfig
+from gnio_jax.training.optimizer import Plateau
 from gnio_jax.training.step import TrainState
 from gnio_jax.types import InputError
 
@@ -37,6 +38,7 @@ class Position(NamedTuple):
     """Training losses summed over the steps of the epoch in progress."""
     seconds: float
     """Time spent training so far."""
+    plateau: Plateau = Plateau()
 
 
 class Run(NamedTuple):
@@ -50,8 +52,8 @@ class Run(NamedTuple):
 
 
 def create_model(config: TrainConfig) -> nn.Module:
-    """The network that `config.model` describes."""
-    options = {key: value for key, value in vars(config.model).items() if key != "name"}
+    """The network that `config.model` describes; what that leaves open is the network's own."""
+    options = {key: value for key, value in vars(config.model).items() if key != "name" and value is not None}
     return models.create(config.model.name, **options)
 
 
@@ -99,7 +101,7 @@ class Checkpoints:
         restored = manager.restore(step, args=ocp.args.Composite(
             variables=ocp.args.StandardRestore(variables), optimizer=ocp.args.StandardRestore(template.opt_state)))  # fmt: skip
         found = meta["position"]
-        position = Position(**(found | {"loss_sums": tuple(found["loss_sums"])}))
+        position = Position(**(found | {"loss_sums": tuple(found["loss_sums"]), "plateau": Plateau(*found.get("plateau", ()))}))
         state = TrainState(jnp.int32(step), restored["variables"]["params"], restored["variables"]["batch_stats"], restored["optimizer"])
         # Orbax hands out arrays that are committed to a device; a plain copy keeps one compiled step for both cases.
         return jax.tree.map(lambda x: jnp.array(jax.device_get(x)), state), position

@@ -28,8 +28,8 @@ from gnio_jax.data import windows
 from gnio_jax.files import replacing
 from gnio_jax.training import optimizer as optimizers
 from gnio_jax.training.checkpoint import Checkpoints, Position, create_model, exists
-from gnio_jax.training.losses import Losses
-from gnio_jax.training.step import TrainState, create_state, epoch_order, train_steps, validate
+from gnio_jax.training.losses import Losses, Stage, stage
+from gnio_jax.training.step import TrainState, calibrated, create_state, epoch_order, train_steps, validate
 from gnio_jax.types import InputError
 
 DISPATCH_SECONDS = 0.5
@@ -105,17 +105,19 @@ def _train(config: TrainConfig, resume: bool, console: Console) -> Outcome:
         rows = _kept_rows(workdir / "metrics.jsonl", position.epoch)
         board = SummaryWriter(str(workdir / "tensorboard"), purge_step=position.step)
         for epoch in range(position.epoch, config.optim.epochs):
-            nll_weight = jnp.float32(config.loss.nll_weight if epoch >= config.loss.nll_from_epoch else 0.0)
-            state, position, rate = _run_epoch(run, epoch, nll_weight, state, position, checkpoints, stop, bar)
+            now = stage(config.loss, epoch, position.plateau.factor)
+            state, position, rate = _run_epoch(run, epoch, now, state, position, checkpoints, stop, bar)
             if position.step < (epoch + 1) * run.steps_per_epoch:
                 break  # stopped on the way, and saved
 
-            held_out = validate(state, run.held_out, nll_weight, model=run.model, config=config)
+            held_out, axis_mse = validate(state, run.held_out, now, model=run.model, config=config)
+            state = calibrated(state, axis_mse)
             row = _row(run, epoch, position, held_out, rate)
             improved = position.best_loss is None or row["val_loss"] < position.best_loss
             best_loss = row["val_loss"] if improved else position.best_loss
             # The position of a finished epoch is the start of the next one.
-            position = position._replace(epoch=epoch + 1, best_loss=best_loss, loss_sums=(0.0, 0.0, 0.0))
+            position = position._replace(epoch=epoch + 1, best_loss=best_loss, loss_sums=(0.0, 0.0, 0.0),
+                                         plateau=optimizers.watch(position.plateau, row["val_mse"], config.optim))
             rows.append(row)
             _write_rows(workdir / "metrics.jsonl", rows)
             for name, value in row.items():
@@ -152,10 +154,10 @@ class _Run(NamedTuple):
 def _prepare(config: TrainConfig, console: Console) -> _Run:
     model = create_model(config)  # a mistake in its options should not wait for the data
     console.print(f"reading {config.dataset}: {config.data.train_split} and {config.data.val_split}")
-    source, learnt_from = _load_windows(config, config.data.train_split, config.data.train_stride, console)
-    held_out, validated_with = _load_windows(config, config.data.val_split, config.data.stride, console)
+    source, learnt_from = _load_windows(config, config.data.train_split, config.data.train_stride, config.augment.shift_samples, console)
+    held_out, validated_with = _load_windows(config, config.data.val_split, config.data.stride, 0, console)
     splits = {config.data.train_split: learnt_from, config.data.val_split: validated_with}
-    count, size = source.start.shape[0], config.optim.batch_size
+    count, size = source.visited.shape[0], config.optim.batch_size
     if count < size:
         raise InputError("optim.batch_size", f"is {size}, but there are only {count} windows", "lower it")
     steps_per_epoch = count // size
@@ -165,34 +167,34 @@ def _prepare(config: TrainConfig, console: Console) -> _Run:
 
 
 def _run_epoch(
-    run: _Run, epoch: int, nll_weight: jax.Array, state: TrainState, position: Position, checkpoints: Checkpoints, stop: _Stop,
+    run: _Run, epoch: int, now: Stage, state: TrainState, position: Position, checkpoints: Checkpoints, stop: _Stop,
     bar: Callable[[int, int, float, float, float], None],
 ) -> tuple[TrainState, Position, float]:
     """Finish epoch `epoch` from `position` on, or save and return when asked to stop; with the windows/s of these steps."""
     size = run.config.optim.batch_size
-    order = epoch_order(run.order_key, epoch, run.source.start.shape[0])
+    order = epoch_order(run.order_key, epoch, run.source)
     began = saved = time.perf_counter()
     before, first = position.seconds, position.step - epoch * run.steps_per_epoch
     done, dispatch, rate = first, 1, 0.0
     while done < run.steps_per_epoch:
         count = min(dispatch, run.steps_per_epoch - done)
         tick = time.perf_counter()
-        state, progress = train_steps(state, run.source, order, jnp.int32(done), jnp.int32(count), nll_weight, run.step_key,
+        state, progress = train_steps(state, run.source, order, jnp.int32(done), jnp.int32(count), now, run.step_key,
                                       model=run.model, optimizer=run.optimizer, config=run.config)  # fmt: skip
         failed_step = int(progress.failed_step)  # waits for the device
         if failed_step >= 0:
             raise FloatingPointError(f"the loss is not finite at step {failed_step} (epoch {epoch}); lower optim.learning_rate, "
                                      "set optim.clip_norm, or look at the data")
-        now = time.perf_counter()
-        dispatch = max(1, min(2 * dispatch, round(DISPATCH_SECONDS * count / (now - tick))))
+        clock = time.perf_counter()
+        dispatch = max(1, min(2 * dispatch, round(DISPATCH_SECONDS * count / (clock - tick))))
         done += count
         sums = tuple(a + float(b) for a, b in zip(position.loss_sums, progress.sums, strict=True))
-        position = Position(epoch, epoch * run.steps_per_epoch + done, position.best_loss, sums, before + now - began)
-        rate = (done - first) * size / (now - began)
-        bar(position.step, epoch, sums[0] / done, float(run.learning_rate(position.step)), rate)
-        if done < run.steps_per_epoch and (stop.signum or now - saved > run.config.checkpoint_every_seconds):
+        position = position._replace(step=epoch * run.steps_per_epoch + done, loss_sums=sums, seconds=before + clock - began)
+        rate = (done - first) * size / (clock - began)
+        bar(position.step, epoch, sums[0] / done, _learning_rate(run, position), rate)
+        if done < run.steps_per_epoch and (stop.signum or clock - saved > run.config.checkpoint_every_seconds):
             checkpoints.save("latest", state, position)
-            saved = now
+            saved = clock
             if stop.signum:
                 break
     return state, position, rate
@@ -205,16 +207,20 @@ def _row(run: _Run, epoch: int, position: Position, held_out: Losses, rate: floa
     return {
         "epoch": epoch, "step": position.step, "loss": loss, "mse": mse, "nll": nll,
         "val_loss": val_loss, "val_mse": val_mse, "val_nll": val_nll, "val_rmse": math.sqrt(val_mse),
-        "learning_rate": float(run.learning_rate(position.step)), "windows_per_second": rate, "seconds": position.seconds,
+        "learning_rate": _learning_rate(run, position), "windows_per_second": rate, "seconds": position.seconds,
     }  # fmt: skip
 
 
-def _load_windows(config: TrainConfig, split: str, stride: int, console: Console) -> tuple[windows.WindowSource, list[str]]:
+def _learning_rate(run: _Run, position: Position) -> float:
+    return float(run.learning_rate(position.step)) * position.plateau.factor
+
+
+def _load_windows(config: TrainConfig, split: str, stride: int, shift: int, console: Console) -> tuple[windows.WindowSource, list[str]]:
     """The windows of a split on the device, and the names of its recordings."""
     sequences = [data.resample(s, config.data.rate) for s in data.load(config.dataset, config.data_root, split)]
-    source = windows.index(sequences, config.data, stride)
+    source = windows.index(sequences, config.data, stride, shift)
     hours = sum(len(s.time) for s in sequences) / config.data.rate / 3600
-    console.print(f"  {split}: {len(sequences)} sequences, {hours:.2f} h, {source.start.shape[0]:,} windows")
+    console.print(f"  {split}: {len(sequences)} sequences, {hours:.2f} h, {source.visited.shape[0]:,} windows")
     return jax.device_put(source), [s.name for s in sequences]
 
 

@@ -1,4 +1,4 @@
-"""The training objective (paper §III-F): squared error plus Gaussian negative log-likelihood, one weighted sum."""
+"""Training objectives: GNIO's weighted sum of squared error and likelihood (paper §III-F), and those of the networks beside it."""
 
 from __future__ import annotations
 
@@ -9,28 +9,78 @@ import jax.numpy as jnp
 from jaxtyping import Float
 
 from gnio_jax.config import LossConfig
-from gnio_jax.types import Prediction
+from gnio_jax.types import Prediction, Windows
 
 
 class Losses(NamedTuple):
     """Means over a batch."""
 
     total: Float[jax.Array, ""]
-    """λ_MSE · mse + λ_NLL · nll."""
+    """What training minimises."""
     mse: Float[jax.Array, ""]
     """‖d − d̂‖², summed over the axes, m²."""
     nll: Float[jax.Array, ""]
     """½ (d − d̂)ᵀ Σ̂⁻¹ (d − d̂) + ½ log det Σ̂, without the constant."""
 
 
-def losses(
-    prediction: Prediction, displacement: Float[jax.Array, "b 3"], config: LossConfig, nll_weight: Float[jax.Array, ""] | float
-) -> Losses:
-    """The losses of a batch. `nll_weight` is λ_NLL as the epoch has it (zero before `config.nll_from_epoch`)."""
-    error = displacement - prediction.displacement
-    log_std = prediction.log_std
+class Stage(NamedTuple):
+    """What of the objective an epoch decides."""
+
+    nll_weight: Float[jax.Array, ""]
+    """λ_NLL, or zero before `LossConfig.nll_from_epoch`."""
+    log_std_gradient: Float[jax.Array, ""]
+    """1, or 0 before `LossConfig.log_std_from_epoch`."""
+    learning_rate_factor: Float[jax.Array, ""]
+    """Share of the schedule's learning rate (see `optimizer.Plateau`)."""
+
+
+def stage(config: LossConfig, epoch: int, learning_rate_factor: float = 1.0) -> Stage:
+    """The stage of an epoch."""
+    nll_weight = config.nll_weight if epoch >= config.nll_from_epoch else 0.0
+    return Stage(jnp.float32(nll_weight), jnp.float32(epoch >= config.log_std_from_epoch), jnp.float32(learning_rate_factor))
+
+
+def losses(prediction: Prediction, windows: Windows, config: LossConfig, stage: Stage) -> Losses:
+    """The losses of a batch.
+
+    Raises `ValueError` if the loss wants more than the network says (a velocity for every sample).
+    """
+    error = windows.displacement - prediction.displacement
+    log_std = _held(prediction.log_std, stage)
+    mse = jnp.mean(jnp.sum(error**2, axis=-1))
+    nll = _nll(error, log_std, config)
+    if config.name == "velocity_and_covariance":
+        return Losses(_velocity_and_covariance(prediction, windows, config, stage), mse, nll)
+    total = config.mse_weight * mse + stage.nll_weight * nll
+    if config.mae_weight:
+        total = total + config.mae_weight * jnp.mean(jnp.sum(jnp.abs(error), axis=-1))
+    return Losses(total, mse, nll)
+
+
+def _velocity_and_covariance(prediction: Prediction, windows: Windows, config: LossConfig, stage: Stage) -> Float[jax.Array, ""]:
+    """CTIN's L_v / 2δ_v² + L_c / 2δ_c² + log δ_v δ_c (its eq. 9–11), δ being learnt.
+
+    L_v is the squared error of each sample's velocity plus that of the position to which they add up, L_c the likelihood of the velocities.
+    Velocities are metres per window. Ours: means over the samples, sums over the axes.
+    """
+    said = prediction.diagnostics
+    if not {"velocity", "velocity_log_std", "task_log_std"} <= said.keys():
+        raise ValueError("loss 'velocity_and_covariance' wants a velocity for every sample, which only the network 'ctin' gives")
+    error = windows.steps * windows.steps.shape[1] - said["velocity"]
+    position = windows.displacement - prediction.displacement
+    velocity_loss = jnp.mean(jnp.sum(error**2, axis=-1)) + jnp.mean(jnp.sum(position**2, axis=-1))
+    covariance_loss = _nll(error, _held(said["velocity_log_std"], stage), config)
+    log_v, log_c = said["task_log_std"][0]
+    return 0.5 * jnp.exp(-2 * log_v) * velocity_loss + 0.5 * jnp.exp(-2 * log_c) * covariance_loss + log_v + log_c
+
+
+def _nll(error: Float[jax.Array, "*b 3"], log_std: Float[jax.Array, "*b 3"], config: LossConfig) -> Float[jax.Array, ""]:
     if config.log_std_floor is not None:
         log_std = jnp.maximum(log_std, config.log_std_floor)
-    mse = jnp.mean(jnp.sum(error**2, axis=-1))
-    nll = jnp.mean(jnp.sum(0.5 * error**2 * jnp.exp(-2 * log_std) + log_std, axis=-1))
-    return Losses(config.mse_weight * mse + nll_weight * nll, mse, nll)
+    return jnp.mean(jnp.sum(0.5 * error**2 * jnp.exp(-2 * log_std) + log_std, axis=-1))
+
+
+def _held(log_std: Float[jax.Array, "*b 3"], stage: Stage) -> Float[jax.Array, "*b 3"]:
+    """The same values, with a gradient only where the stage lets the uncertainty learn."""
+    held = jax.lax.stop_gradient(log_std)
+    return held + stage.log_std_gradient * (log_std - held)

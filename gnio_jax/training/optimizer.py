@@ -1,6 +1,8 @@
-"""Adam with linear warm-up and cosine decay (paper §IV-A)."""
+"""Adam with linear warm-up and cosine decay (paper §IV-A), and the schedules of the networks that GNIO is compared with."""
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import optax
 
@@ -8,21 +10,51 @@ from gnio_jax.config import OptimConfig
 
 
 def schedule(config: OptimConfig, steps_per_epoch: int) -> optax.Schedule:
-    """Learning rate of a step: linear from start to peak over the warm-up, then a cosine to the end of the last epoch.
+    """Learning rate of a step: linear from start to peak over the warm-up, then a cosine to the end of the last epoch, or no change.
 
     Ours: a run too short for its warm-up warms up for its first half.
     """
-    warmup_epochs = min(config.warmup_epochs, config.epochs / 2)
+    warmup_steps = round(min(config.warmup_epochs, config.epochs / 2) * steps_per_epoch)
+    if config.schedule != "cosine":
+        warmup = optax.linear_schedule(config.start_learning_rate, config.learning_rate, max(warmup_steps, 1))
+        return optax.join_schedules([warmup, optax.constant_schedule(config.learning_rate)], [warmup_steps])
     return optax.warmup_cosine_decay_schedule(
         init_value=config.start_learning_rate,
         peak_value=config.learning_rate,
-        warmup_steps=round(warmup_epochs * steps_per_epoch),
+        warmup_steps=warmup_steps,
         decay_steps=config.epochs * steps_per_epoch,  # Optax counts the warm-up in
         end_value=config.end_learning_rate,
     )
 
 
 def create(config: OptimConfig, steps_per_epoch: int) -> optax.GradientTransformation:
-    """Adam, β = (0.9, 0.999), with the schedule; the gradient's global norm is clipped first where that is asked for."""
-    adam = optax.adam(schedule(config, steps_per_epoch), b1=0.9, b2=0.999)
-    return adam if config.clip_norm is None else optax.chain(optax.clip_by_global_norm(config.clip_norm), adam)
+    """Adam, β = (0.9, 0.999), with the schedule; before it, where that is asked for, the gradient's global norm is clipped and the
+    parameters decay."""
+    parts = [optax.adam(schedule(config, steps_per_epoch), b1=0.9, b2=0.999)]
+    if config.weight_decay:
+        parts.insert(0, optax.add_decayed_weights(config.weight_decay))
+    if config.clip_norm is not None:
+        parts.insert(0, optax.clip_by_global_norm(config.clip_norm))
+    return optax.chain(*parts) if len(parts) > 1 else parts[0]
+
+
+class Plateau(NamedTuple):
+    """How the validation error has fared (RoNIN, DeepILS: PyTorch's ReduceLROnPlateau)."""
+
+    factor: float = 1.0
+    """Share of the schedule's learning rate that is in force."""
+    best: float | None = None
+    """Smallest squared error so far, m²."""
+    idle_epochs: int = 0
+    """Epochs since it, or since the learning rate fell."""
+
+
+def watch(plateau: Plateau, mse: float, config: OptimConfig) -> Plateau:
+    """After an epoch with this squared error on the validation split. Better means by a ten-thousandth, as in PyTorch."""
+    if config.schedule != "plateau":
+        return plateau
+    if plateau.best is None or mse < plateau.best * (1 - 1e-4):
+        return plateau._replace(best=mse, idle_epochs=0)
+    if plateau.idle_epochs < config.plateau_epochs:
+        return plateau._replace(idle_epochs=plateau.idle_epochs + 1)
+    return plateau._replace(factor=plateau.factor * config.plateau_factor, idle_epochs=0)

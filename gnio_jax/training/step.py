@@ -13,8 +13,9 @@ from jaxtyping import Float, Int, PRNGKeyArray
 
 from gnio_jax.config import TrainConfig
 from gnio_jax.data.augment import augment
-from gnio_jax.data.windows import WindowSource, gather
-from gnio_jax.training.losses import Losses, losses
+from gnio_jax.data.windows import WindowSource, gather, shifted
+from gnio_jax.training.losses import Losses, Stage, losses
+from gnio_jax.types import Prediction, Windows
 
 
 class TrainState(NamedTuple):
@@ -37,14 +38,16 @@ class Progress(NamedTuple):
 
 def create_state(model: nn.Module, optimizer: optax.GradientTransformation, key: PRNGKeyArray, window: int) -> TrainState:
     """Fresh parameters for windows of `window` samples, at step 0."""
-    variables = jax.jit(model.init)(key, jnp.zeros((1, window, 6), jnp.float32))
+    # Run once: what the optimiser of the compiler would save is a fraction of the seconds that it takes.
+    init = jax.jit(model.init, compiler_options={"xla_backend_optimization_level": 1})
+    variables = init(key, jnp.zeros((1, window, 6), jnp.float32))
     params = variables["params"]
     return TrainState(jnp.int32(0), params, variables.get("batch_stats", {}), optimizer.init(params))
 
 
-def epoch_order(key: PRNGKeyArray, epoch: int, count: int) -> Int[jax.Array, "m"]:
+def epoch_order(key: PRNGKeyArray, epoch: int, source: WindowSource) -> Int[jax.Array, "m"]:
     """The order in which epoch `epoch` visits the windows: a permutation that depends on nothing else."""
-    return jax.random.permutation(jax.random.fold_in(key, epoch), jnp.arange(count, dtype=jnp.int32))
+    return jax.random.permutation(jax.random.fold_in(key, epoch), jnp.asarray(source.visited))
 
 
 @functools.partial(jax.jit, static_argnames=("model", "optimizer", "config"), donate_argnames="state")
@@ -54,7 +57,7 @@ def train_steps(
     order: Int[jax.Array, "m"],
     first: Int[jax.Array, ""],
     count: Int[jax.Array, ""],
-    nll_weight: Float[jax.Array, ""],
+    stage: Stage,
     key: PRNGKeyArray,
     *,
     model: nn.Module,
@@ -71,7 +74,8 @@ def train_steps(
     def one_step(i: jax.Array, carry: tuple[TrainState, Progress]) -> tuple[TrainState, Progress]:
         state, progress = carry
         which = jax.lax.dynamic_slice(order, ((first + i) * size,), (size,))
-        augment_key, dropout_key = jax.random.split(jax.random.fold_in(key, state.step))
+        augment_key, dropout_key, shift_key = jax.random.split(jax.random.fold_in(key, state.step), 3)
+        which = shifted(shift_key, source, which, config.augment.shift_samples)
         windows = augment(augment_key, gather(source, which, config.data.window), config.augment)
 
         def objective(params: Any) -> tuple[jax.Array, tuple[Losses, Any]]:
@@ -79,11 +83,12 @@ def train_steps(
                 {"params": params, "batch_stats": state.batch_stats}, windows.imu, train=True,
                 mutable=["batch_stats"], rngs={"dropout": dropout_key},
             )  # fmt: skip
-            loss = losses(prediction, windows.displacement, config.loss, nll_weight)
+            loss = losses(prediction, windows, config.loss, stage)
             return loss.total, (loss, changed.get("batch_stats", {}))
 
         gradient, (loss, batch_stats) = jax.grad(objective, has_aux=True)(state.params)
         update, opt_state = optimizer.update(gradient, state.opt_state, state.params)
+        update = jax.tree.map(lambda x: x * stage.learning_rate_factor, update)
         failed = jnp.where((progress.failed_step < 0) & ~jnp.isfinite(loss.total), state.step, progress.failed_step)
         state = TrainState(state.step + 1, optax.apply_updates(state.params, update), batch_stats, opt_state)
         return state, Progress(jax.tree.map(jnp.add, progress.sums, loss), failed)
@@ -94,22 +99,33 @@ def train_steps(
 
 @functools.partial(jax.jit, static_argnames=("model", "config"))
 def validate(
-    state: TrainState, source: WindowSource, nll_weight: Float[jax.Array, ""], *, model: nn.Module, config: TrainConfig
-) -> Losses:
-    """Mean losses over every window of `source`, without augmentation and with the running batch statistics."""
-    count = source.start.shape[0]
+    state: TrainState, source: WindowSource, stage: Stage, *, model: nn.Module, config: TrainConfig
+) -> tuple[Losses, Float[jax.Array, "3"]]:
+    """Mean losses over every window of `source`, without augmentation and with the running batch statistics; and the mean
+    squared error of each axis, m²."""
+    count = source.visited.shape[0]
     size = min(config.optim.batch_size, count)
     batches = -(-count // size)
     # The last batch is filled up with windows of weight zero.
-    which = jnp.minimum(jnp.arange(batches * size, dtype=jnp.int32), count - 1).reshape(batches, size)
+    which = source.visited[jnp.minimum(jnp.arange(batches * size, dtype=jnp.int32), count - 1)].reshape(batches, size)
     weight = (jnp.arange(batches * size) < count).astype(jnp.float32).reshape(batches, size)
 
-    def one_batch(which_weight: tuple[jax.Array, jax.Array]) -> Losses:
+    def one_window(prediction: Prediction, windows: Windows) -> tuple[Losses, jax.Array]:
+        alone = jax.tree.map(lambda x: x[None], (prediction, windows))
+        return losses(*alone, config.loss, stage), (windows.displacement - prediction.displacement) ** 2
+
+    def one_batch(which_weight: tuple[jax.Array, jax.Array]) -> tuple[Losses, jax.Array]:
         windows = gather(source, which_weight[0], config.data.window)
         prediction: Any = model.apply({"params": state.params, "batch_stats": state.batch_stats}, windows.imu)
-        each = jax.vmap(lambda p, d: losses(jax.tree.map(lambda x: x[None], p), d[None], config.loss, nll_weight))(
-            prediction._replace(diagnostics={}), windows.displacement
-        )
-        return jax.tree.map(lambda x: jnp.sum(x * which_weight[1]), each)
+        each = jax.vmap(one_window)(prediction, windows)
+        return jax.tree.map(lambda x: jnp.tensordot(which_weight[1], x, 1), each)
 
-    return jax.tree.map(lambda x: jnp.sum(x) / count, jax.lax.map(one_batch, (which, weight)))
+    return jax.tree.map(lambda x: jnp.sum(x, axis=0) / count, jax.lax.map(one_batch, (which, weight)))
+
+
+def calibrated(state: TrainState, axis_mse: Float[jax.Array, "3"]) -> TrainState:
+    """The state with every constant uncertainty (`models.heads.ConstantUncertainty`) set to these squared errors, m²."""
+    def constant(path: tuple, leaf: jax.Array) -> jax.Array:
+        return 0.5 * jnp.log(axis_mse) if path[-1] == jax.tree_util.DictKey("log_std") else leaf
+
+    return state._replace(batch_stats=jax.tree_util.tree_map_with_path(constant, state.batch_stats))

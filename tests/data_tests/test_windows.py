@@ -10,6 +10,7 @@ from gnio_jax.config import AugmentConfig, DataConfig
 from gnio_jax.data import augment, windows
 from gnio_jax.types import InputError, Sequence, Windows
 
+KEY = jax.random.key(3)
 CONFIG = DataConfig(rate=20.0, window_seconds=1.0, stride_seconds=0.1)
 
 
@@ -25,7 +26,7 @@ def tumbling(count, seed, invalid=()):
 
 
 def cut(sequences, rotation, stride):
-    imu, target = [], []
+    imu, target, steps = [], [], []
     for s in sequences:
         for i in range(0, len(s.time), stride):
             if i + 20 >= len(s.time) or not all(s.valid[j] for j in range(i, i + 21)):
@@ -39,20 +40,39 @@ def cut(sequences, rotation, stride):
                 rows.append(np.concatenate([(back * attitude).apply(s.accel[j]), (back * attitude).apply(s.gyro[j])]))
             imu.append(rows)
             target.append(back.apply(s.position[i + 20] - s.position[i]))
-    return np.array(imu), np.array(target)
+            steps.append([back.apply(s.position[j + 1] - s.position[j]) for j in range(i, i + 20)])
+    return np.array(imu), np.array(target), np.array(steps)
 
 
 @pytest.mark.parametrize("rotation, stride", [("per_sample", 2), ("single", 2), ("per_sample", 1)])
 def test_gather_against_a_brute_force_cutter(rotation, stride):
     sequences = [tumbling(57, 1), tumbling(61, 2, invalid=[0, 33]), tumbling(15, 3), tumbling(21, 4), tumbling(20, 5)]
     source = windows.index(sequences, DataConfig(rate=20.0, window_rotation=rotation), stride)
-    imu, target = cut(sequences, rotation, stride)
+    imu, target, steps = cut(sequences, rotation, stride)
     assert source.start.shape == (len(target),)
     order = np.random.default_rng(0).permutation(len(target)).astype(np.int32)
     found = jax.jit(windows.gather, static_argnums=2)(jax.device_put(source), jnp.asarray(order), 20)
     np.testing.assert_allclose(found.imu, imu[order], atol=1e-5)
     np.testing.assert_allclose(found.displacement, target[order], atol=1e-5)
-    assert found.imu.dtype == found.displacement.dtype == jnp.float32
+    np.testing.assert_allclose(found.steps, steps[order], atol=1e-5)
+    assert found.imu.dtype == found.displacement.dtype == found.steps.dtype == jnp.float32
+    np.testing.assert_array_equal(source.visited, np.arange(len(target)))
+
+
+def test_shifted_windows_are_those_of_the_neighbouring_samples_in_the_same_recording():
+    sequences = [tumbling(57, 1), tumbling(61, 2, invalid=[33]), tumbling(31, 3)]
+    source = jax.device_put(windows.index(sequences, CONFIG, 4, shift=3))
+    plain = windows.index(sequences, CONFIG, 4)
+    np.testing.assert_array_equal(source.start[source.visited], plain.start)
+    which = jnp.tile(jnp.asarray(source.visited), 200)
+    there = np.asarray(windows.shifted(KEY, source, which, 3))
+    moved = np.asarray(source.start[there] - source.start[which])
+    assert set(moved) == set(range(-3, 4))
+    recording = np.searchsorted([57, 118], source.start, side="right")
+    np.testing.assert_array_equal(recording[there], recording[which])
+    first = np.asarray(which) == 0  # the first window of all cannot begin earlier: 3 of 7 draws leave it where it is
+    assert moved[first].min() == 0 and np.mean(moved[first] == 0) == pytest.approx(4 / 7, abs=0.12)
+    np.testing.assert_array_equal(windows.shifted(KEY, source, which, 0), which)
 
 
 def test_a_window_of_exactly_its_length_lacks_the_pose_after_it():
@@ -67,16 +87,14 @@ def test_samples_without_a_reference_may_hold_nan():
         field[25:30] = np.nan
     source = windows.index([sequence], CONFIG, 2)
     found = windows.gather(jax.device_put(source), jnp.arange(source.start.shape[0], dtype=jnp.int32), 20)
-    assert bool(jnp.isfinite(found.imu).all() & jnp.isfinite(found.displacement).all())
+    assert all(bool(jnp.isfinite(field).all()) for field in found)
 
 
 def batch(count=4000, length=5):
     rng = np.random.default_rng(7)
     draw = lambda *shape: jnp.asarray(rng.standard_normal(shape), jnp.float32)  # noqa: E731
-    return Windows(draw(count, length, 6), draw(count, 3))
+    return Windows(draw(count, length, 6), draw(count, 3), draw(count, length, 3))
 
-
-KEY = jax.random.key(3)
 
 
 def test_bias_is_constant_in_a_window_uniform_over_windows_and_spares_the_target():
@@ -117,6 +135,7 @@ def test_yaw_turns_window_and_target_by_the_same_angle_about_the_vertical():
     vectors = np.array([recovered(before, after, i) for i in range(300)])
     assert np.abs(vectors[:, :2]).max() < 2e-3
     np.testing.assert_allclose(Rotation.from_rotvec(vectors).apply(before.displacement), after.displacement, atol=2e-3)
+    np.testing.assert_allclose(Rotation.from_rotvec(vectors).apply(before.steps[:, 2]), after.steps[:, 2], atol=2e-3)
     assert abs(np.exp(1j * vectors[:, 2]).mean()) < 0.15
 
 

@@ -11,6 +11,8 @@ from test_run_odometry import CLONES, DT, INTERVALS, PARAMETERS, WEIGHTS, N, cen
 from gnio_jax import filtering
 from gnio_jax.types import Prediction
 
+# Compiling is what these tests cost: without the optimiser it takes half the time, and a short run is as quick.
+jit = functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
 MEASURED = 0.1 * np.random.default_rng(4).standard_normal((INTERVALS, 3))
 PLAIN = filtering.FilterConfig(DT, N, CLONES)
 
@@ -39,7 +41,8 @@ def point(measured=MEASURED):
     return dict(noise=np.zeros(4), std=np.zeros(6), state=np.zeros(12), measured=measured, gyro=gyro, accel=accel)
 
 
-GRADIENT = jax.jit(jax.value_and_grad(loss))
+GRADIENT = jit(jax.value_and_grad(loss))
+RUN = jit(filtering.run_filter, static_argnums=5)
 
 
 def test_gradient_against_differences():
@@ -63,14 +66,14 @@ def test_gradient_against_differences():
 def test_jvp_equals_grad_and_vmap_of_grad_equals_each():
     rng = np.random.default_rng(0)
     direction = jax.tree.map(lambda x: rng.standard_normal(x.shape), point())
-    value, slope = jax.jit(lambda x, d: jax.jvp(loss, (x,), (d,)))(point(), direction)
+    value, slope = jit(lambda x, d: jax.jvp(loss, (x,), (d,)))(point(), direction)
     wanted, gradient = GRADIENT(point())
     np.testing.assert_allclose(value, wanted, rtol=1e-12)
     inner = sum(np.sum(g * d) for g, d in zip(jax.tree.leaves(gradient), jax.tree.leaves(direction), strict=True))
     np.testing.assert_allclose(slope, inner, rtol=1e-9)
 
     points = [point(), point(MEASURED + 0.02), point(-MEASURED)]
-    many = jax.jit(jax.vmap(jax.grad(loss)))(jax.tree.map(lambda *leaves: np.stack(leaves), *points))
+    many = jit(jax.vmap(jax.grad(loss)))(jax.tree.map(lambda *leaves: np.stack(leaves), *points))
     for index, one in enumerate(points):
         alone = GRADIENT(one)[1]
         jax.tree.map(lambda a, b, index=index: np.testing.assert_allclose(a[index], b, rtol=1e-8, atol=1e-8), many, alone)
@@ -78,14 +81,14 @@ def test_jvp_equals_grad_and_vmap_of_grad_equals_each():
 
 def test_checkpoints_change_nothing():
     config = filtering.FilterConfig(DT, N, CLONES, checkpoint_every=8)  # three blocks, and two steps more
-    value, gradient = jax.jit(jax.value_and_grad(functools.partial(loss, config=config)))(point())
+    value, gradient = jit(jax.value_and_grad(functools.partial(loss, config=config)))(point())
     wanted = GRADIENT(point())
     np.testing.assert_allclose(value, wanted[0], rtol=1e-12)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9), gradient, wanted[1])
 
 
 # One program for all of it, since compiling is what these tests cost; the hard gate's rejection is tested with the update.
-HOSTILE = jax.jit(jax.value_and_grad(functools.partial(loss, config=filtering.FilterConfig(
+HOSTILE = jit(jax.value_and_grad(functools.partial(loss, config=filtering.FilterConfig(
     DT, N, CLONES, convergence_seconds=0.1, zero_velocity_std=0.01, rest_seconds=0.1, gate_softness=2.0, gate_threshold=8.0))))
 
 
@@ -123,7 +126,8 @@ def test_a_gate_with_a_slope_lets_the_gradient_through():
     def history(softness):
         config = filtering.FilterConfig(DT, N, CLONES, convergence_seconds=0.1, gate_softness=softness, gate_threshold=8.0)
         spread = np.tile(0.01 * np.eye(3), (INTERVALS, 1, 1))
-        return filtering.run_filter(start(config), *recording(2), measured, spread, config, filtering.NoiseModel(1e-2, 1e-1, 1e-2, 1e-1))[1]
+        noise = filtering.NoiseModel(1e-2, 1e-1, 1e-2, 1e-1)
+        return RUN(start(config), *recording(2), measured, spread, config, noise)[1]
 
     hard, soft = history(0.0), history(2.0)
     weights, nis = np.asarray(soft.gate_passed), np.asarray(soft.nis)
@@ -140,7 +144,7 @@ def test_softness_has_a_limit():
     def positions(softness):
         config = filtering.FilterConfig(DT, N, CLONES, convergence_seconds=0.1, gate_softness=softness)
         spread = np.tile(0.01 * np.eye(3), (INTERVALS, 1, 1))
-        return np.asarray(filtering.run_filter(start(config), *recording(2), measured, spread, config, filtering.NoiseModel())[1].position)
+        return np.asarray(RUN(start(config), *recording(2), measured, spread, config, filtering.NoiseModel())[1].position)
 
     np.testing.assert_allclose(positions(1e-3), positions(0.0), atol=1e-4)
     assert np.abs(positions(3.0) - positions(0.0)).max() > 1e-3
@@ -152,7 +156,7 @@ def test_gradient_reaches_the_network():
     gyro, accel = recording(0)
     config = filtering.FilterConfig(DT, N, CLONES, checkpoint_every=8)
 
-    @jax.jit
+    @jit
     @jax.value_and_grad
     def value(parameters, share):
         def network(windows):

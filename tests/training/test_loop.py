@@ -149,11 +149,11 @@ ENVIRONMENT = {**os.environ, "JAX_PLATFORMS": "cpu"}
 
 
 def test_killed_at_any_moment_and_resumed_gives_the_same_bits(recording, tmp_path):
-    """SIGKILL at three moments, one of them while a checkpoint is being written, against a run left alone."""
-    epochs = ["--optim.epochs", "12"]
-    subprocess.run(command(recording, tmp_path / "alone", *epochs), cwd=ROOT, check=True, capture_output=True, env=ENVIRONMENT)
-    run = tmp_path / "killed"
-    for kill in range(3):
+    """SIGKILL at two moments, one of them while a checkpoint is being written, against a run left alone."""
+    config = tiny(recording, tmp_path / "alone")
+    loop.train(dataclasses.replace(config, optim=dataclasses.replace(config.optim, epochs=12)))
+    epochs, run = ["--optim.epochs", "12"], tmp_path / "killed"
+    for kill in range(2):
         process = subprocess.Popen(command(recording, run, *epochs, *(["--resume"] if kill else [])), cwd=ROOT, env=ENVIRONMENT,
                                    stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)  # fmt: skip
         seen = (run / "metrics.jsonl").read_text().count("\n") if kill else 0
@@ -177,18 +177,20 @@ def test_killed_at_any_moment_and_resumed_gives_the_same_bits(recording, tmp_pat
 
 
 def test_a_loss_that_is_not_finite_stops_with_its_step(recording, tmp_path, monkeypatch):
-    real = windows.index
+    real, found = windows.index, []
 
-    def spoiled(sequences, config, stride):
-        source = real(sequences, config, stride)
+    def spoiled(*arguments):
+        source = real(*arguments)
+        found.append(source)
         return source._replace(displacement=np.where(np.arange(len(source.start))[:, None] == 77, np.float32(np.inf), source.displacement))
 
     monkeypatch.setattr(windows, "index", spoiled)
     config = tiny(recording, tmp_path / "run")
-    order_key = jax.random.split(jax.random.key(config.seed), 3)[1]
-    expected = int(np.flatnonzero(np.asarray(step.epoch_order(order_key, 0, 220)) == 77)[0]) // 16
-    with pytest.raises(FloatingPointError, match=rf"not finite at step {expected} \(epoch 0\)"):
+    with pytest.raises(FloatingPointError, match=r"not finite at step \d+ \(epoch 0\)") as raised:
         loop.train(config)
+    order_key = jax.random.split(jax.random.key(config.seed), 3)[1]
+    expected = int(np.flatnonzero(np.asarray(step.epoch_order(order_key, 0, found[0])) == 77)[0]) // 16
+    assert f"at step {expected} " in str(raised.value)
 
 
 def test_two_stage_loss_leaves_the_uncertainty_head_alone_until_its_epoch(recording, tmp_path):

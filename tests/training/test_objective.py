@@ -1,5 +1,6 @@
 """Losses by hand, the schedule by its formula, Adam against a plain NumPy loop."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
@@ -7,24 +8,77 @@ import pytest
 
 from gnio_jax.config import LossConfig, OptimConfig
 from gnio_jax.training import losses, optimizer
-from gnio_jax.types import Prediction
+from gnio_jax.training.step import TrainState, calibrated
+from gnio_jax.types import Prediction, Windows
+
+
+def target(displacement, steps=4):
+    """Windows of which only the target matters, walked at constant velocity."""
+    displacement = jnp.asarray(displacement, jnp.float32)
+    count = len(displacement)
+    return Windows(jnp.zeros((count, steps, 6), jnp.float32), displacement,
+                   jnp.broadcast_to(displacement[:, None] / steps, (count, steps, 3)))
+
+
+def found_losses(prediction, windows, config, epoch=0):
+    return losses.losses(prediction, windows, config, losses.stage(config, epoch))
 
 
 def test_losses_by_hand():
     prediction = Prediction(jnp.array([[1.0, 0, 0], [0, 0, 0]], jnp.float32), jnp.array([[0, 0, 0], [np.log(2), 0, -1]], jnp.float32))
-    target = jnp.array([[0.0, 0, 0], [2, 1, 0]], jnp.float32)
+    walked = target([[0.0, 0, 0], [2, 1, 0]])
     # First window: error 1 on x. Second: errors 2 and 1, standard deviations 2, 1, 1/e.
     mse = (1 + (4 + 1)) / 2
     nll = ((0.5) + (0.5 * 4 / 4 + 0.5 * 1 + np.log(2) - 1)) / 2
-    found = losses.losses(prediction, target, LossConfig(), 1e-4)
+    found = found_losses(prediction, walked, LossConfig())
     np.testing.assert_allclose([found.mse, found.nll, found.total], [mse, nll, 100 * mse + 1e-4 * nll], rtol=1e-6)
+    found = found_losses(prediction, walked, LossConfig(mse_weight=1.0, mae_weight=1.0, nll_weight=0.0))
+    np.testing.assert_allclose(found.total, mse + (1 + (2 + 1)) / 2, rtol=1e-6)
+    found = found_losses(prediction, walked, LossConfig(nll_from_epoch=3), epoch=2)
+    np.testing.assert_allclose([found.nll, found.total], [nll, 100 * mse], rtol=1e-6)
+
+
+def test_uncertainty_learns_from_its_epoch_on():
+    walked, config = target([[0.3, -0.2, 0.1]]), LossConfig(mse_weight=0.0, nll_weight=1.0, log_std_from_epoch=10)
+
+    def slopes(epoch):
+        value = lambda d, u: found_losses(Prediction(d, u), walked, config, epoch).total  # noqa: E731
+        return jax.value_and_grad(value, (0, 1))(jnp.zeros((1, 3), jnp.float32), jnp.full((1, 3), -1.0, jnp.float32))
+
+    (before, (d_before, u_before)), (after, (d_after, u_after)) = slopes(9), slopes(10)
+    assert before == after
+    np.testing.assert_array_equal(u_before, 0)
+    np.testing.assert_allclose(u_after, 1 - np.square([[0.3, -0.2, 0.1]]) * np.exp(2), rtol=1e-5)
+    np.testing.assert_array_equal(d_before, d_after)
+    assert (d_before != 0).all()
+
+
+def test_velocity_and_covariance_by_hand():
+    rng = np.random.default_rng(0)
+    steps, velocity, log_std = 0.1 * rng.standard_normal((2, 5, 3)), rng.standard_normal((2, 5, 3)), rng.standard_normal((2, 5, 3))
+    windows = Windows(jnp.zeros((2, 5, 6), jnp.float32), jnp.asarray(steps.sum(1), jnp.float32), jnp.asarray(steps, jnp.float32))
+    single = lambda x: jnp.asarray(x, jnp.float32)  # noqa: E731
+    said = {"velocity": single(velocity), "velocity_log_std": single(log_std), "task_log_std": single([[0.3, -0.4]] * 2)}
+    prediction = Prediction(single(velocity.mean(1)), single(np.zeros((2, 3))), said)
+    speed = covariance = place = 0.0
+    for b in range(2):
+        for t in range(5):
+            for axis in range(3):
+                error = 5 * steps[b, t, axis] - velocity[b, t, axis]
+                speed += error**2 / 10
+                covariance += (error**2 / np.exp(2 * log_std[b, t, axis]) / 2 + log_std[b, t, axis]) / 10
+        place += ((steps[b].sum(0) - velocity[b].mean(0)) ** 2).sum() / 2
+    expected = (speed + place) / (2 * np.exp(0.6)) + covariance / (2 * np.exp(-0.8)) + 0.3 - 0.4
+    config = LossConfig(name="velocity_and_covariance")
+    np.testing.assert_allclose(found_losses(prediction, windows, config).total, expected, rtol=1e-5)
+    with pytest.raises(ValueError, match="velocity for every sample"):
+        found_losses(prediction._replace(diagnostics={}), windows, config)
 
 
 def test_floor_limits_what_the_likelihood_sees():
     prediction = Prediction(jnp.zeros((1, 3), jnp.float32), jnp.full((1, 3), -20.0, jnp.float32))
-    target = jnp.array([[0.1, 0, 0]], jnp.float32)
     floor = float(np.log(1e-3))
-    found = losses.losses(prediction, target, LossConfig(log_std_floor=floor), 1.0)
+    found = found_losses(prediction, target([[0.1, 0, 0]]), LossConfig(log_std_floor=floor))
     np.testing.assert_allclose(found.nll, 0.5 * 0.1**2 / 1e-6 + 3 * floor, rtol=1e-5)
 
 
@@ -43,9 +97,49 @@ def test_schedule_of_the_paper(epochs, warmup):
         assert float(rate(step)) == pytest.approx(by_formula(step, 7, warmup, epochs), rel=1e-4), step
 
 
-@pytest.mark.parametrize("clip", [None, 0.5])
-def test_adam_against_numpy(clip):
-    config = OptimConfig(epochs=10, clip_norm=clip)
+def test_no_decay_after_the_warm_up():
+    rate = optimizer.schedule(OptimConfig(schedule="constant", epochs=20, warmup_epochs=2), 5)
+    np.testing.assert_allclose([rate(0), rate(5), rate(10), rate(100)], [1e-6, (1e-6 + 1e-4) / 2, 1e-4, 1e-4], rtol=1e-4)
+    assert float(optimizer.schedule(OptimConfig(schedule="plateau", warmup_epochs=0), 5)(0)) == pytest.approx(1e-4)
+
+
+def test_plateau_waits_for_its_epochs_and_starts_counting_anew():
+    config = OptimConfig(schedule="plateau", plateau_epochs=2, plateau_factor=0.5)
+    # a fall by less than a ten-thousandth is none
+    errors = [1.0, 0.9, 0.9, 0.89999, 0.95, 0.8, 0.8, 0.8, 0.8, 0.8, 0.8, 0.8]
+    factors, plateau = [], optimizer.Plateau()
+    for error in errors:
+        plateau = optimizer.watch(plateau, error, config)
+        factors.append(plateau.factor)
+    assert factors == [1, 1, 1, 1, 0.5, 0.5, 0.5, 0.5, 0.25, 0.25, 0.25, 0.125]
+    assert optimizer.watch(optimizer.Plateau(), 1.0, OptimConfig()) == optimizer.Plateau()
+
+
+def test_plateau_is_that_of_pytorch():
+    torch = pytest.importorskip("torch")
+    rng = np.random.default_rng(1)
+    errors = np.cumprod(1 + 0.05 * rng.standard_normal(120) - 0.002)
+    theirs = torch.optim.SGD([torch.nn.Parameter(torch.zeros(1))], lr=1.0)
+    scheduler = torch.optim.lr_scheduler.ReduceLROnPlateau(theirs, "min", factor=0.1, patience=10)
+    plateau = optimizer.Plateau()
+    for error in errors:
+        scheduler.step(error)
+        plateau = optimizer.watch(plateau, float(error), OptimConfig(schedule="plateau"))
+        assert plateau.factor == pytest.approx(theirs.param_groups[0]["lr"])
+    assert plateau.factor < 0.1
+
+
+def test_a_constant_uncertainty_takes_the_errors_of_the_validation():
+    constant, other = jnp.zeros(3, jnp.float32), jnp.ones(3, jnp.float32)
+    state = TrainState(jnp.int32(0), {}, {"uncertainty": {"log_std": constant}, "bn": {"mean": other}}, ())
+    found = calibrated(state, jnp.array([0.04, 1.0, 4.0], jnp.float32)).batch_stats
+    np.testing.assert_allclose(np.exp(found["uncertainty"]["log_std"]), [0.2, 1, 2], rtol=1e-6)
+    assert found["bn"]["mean"] is other
+
+
+@pytest.mark.parametrize("clip, decay", [(None, 0.0), (0.5, 0.0), (0.5, 0.03)])
+def test_adam_against_numpy(clip, decay):
+    config = OptimConfig(epochs=10, clip_norm=clip, weight_decay=decay)
     tx = optimizer.create(config, 3)
     params = {"w": jnp.array([1.0, -2.0, 3.0], jnp.float32)}
     state = tx.init(params)
@@ -57,6 +151,7 @@ def test_adam_against_numpy(clip):
         params = optax.apply_updates(params, update)
         if clip:
             gradient = gradient * min(1, clip / np.linalg.norm(gradient))
+        gradient = gradient + decay * w
         m, v = 0.9 * m + 0.1 * gradient, 0.999 * v + 0.001 * gradient**2
         rate = by_formula(step, 3, 5, 10)
         w = w - rate * (m / (1 - 0.9 ** (step + 1))) / (np.sqrt(v / (1 - 0.999 ** (step + 1))) + 1e-8)
