@@ -151,8 +151,8 @@ ENVIRONMENT = {**os.environ, "JAX_PLATFORMS": "cpu"}
 def test_killed_at_any_moment_and_resumed_gives_the_same_bits(recording, tmp_path):
     """SIGKILL at two moments, one of them while a checkpoint is being written, against a run left alone."""
     config = tiny(recording, tmp_path / "alone")
-    loop.train(dataclasses.replace(config, optim=dataclasses.replace(config.optim, epochs=12)))
-    epochs, run = ["--optim.epochs", "12"], tmp_path / "killed"
+    loop.train(dataclasses.replace(config, optim=dataclasses.replace(config.optim, epochs=6)))
+    epochs, run = ["--optim.epochs", "6"], tmp_path / "killed"
     for kill in range(2):
         process = subprocess.Popen(command(recording, run, *epochs, *(["--resume"] if kill else [])), cwd=ROOT, env=ENVIRONMENT,
                                    stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)  # fmt: skip
@@ -173,7 +173,7 @@ def test_killed_at_any_moment_and_resumed_gives_the_same_bits(recording, tmp_pat
     for which in ("latest", "best"):
         assert same(parameters(run, which), parameters(tmp_path / "alone", which))
     epochs_logged = [json.loads(line)["epoch"] for line in (run / "metrics.jsonl").read_text().splitlines()]
-    assert epochs_logged == list(range(12))
+    assert epochs_logged == list(range(6))
 
 
 def test_a_loss_that_is_not_finite_stops_with_its_step(recording, tmp_path, monkeypatch):
