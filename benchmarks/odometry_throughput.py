@@ -40,7 +40,7 @@ def measure(clone_rate: int, batch: int, seconds: float, repeats: int) -> dict[s
     state = filtering.initial_state(config, np.eye(3), np.array([1.2, 0.0, 0.0]), np.zeros(3))
     noise = filtering.NoiseModel.per_sample(1e-2, 3.16e-2, config.dt)
     model = models.create("gnio")
-    variables = model.init(jax.random.key(0), jnp.zeros((1, config.window, 6), jnp.float32))
+    variables = models.initialise(model, jax.random.key(0), config.window)
     apply, frozen = models.Inference(model), models.freeze(model, variables)
 
     def with_network(frozen, gyro, accel):

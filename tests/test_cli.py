@@ -51,7 +51,7 @@ def test_wrong_types_say_what_is_wanted_and_found():
     assert mistake("--optim.epochs", "abc") == "--optim.epochs: must be a whole number, found 'abc'"
     assert mistake("--optim.batch_size=3.5") == "--optim.batch-size: must be a whole number, found '3.5'"
     assert mistake("--optim.clip-norm", "a") == "--optim.clip-norm: must be a number or None, found 'a'"
-    assert mistake("--model.head", "foo") == "--model.head: must be one of gated, linear, found 'foo'"
+    assert mistake("--model.head", "foo") == "--model.head: must be one of gated, linear or None, found 'foo'"
 
 
 def test_missing_values_and_stray_words():

@@ -272,8 +272,10 @@ def attitude(recording: Recording, config: DataConfig, source: Orientation) -> F
 
 
 def predict_windows(network: Network, recordings: list[Recording], attitudes: list[Float[np.ndarray, "_ 3 3"]], config: DataConfig,
-                    progress: Progress | None = None) -> list[Prediction]:
-    """What the network says of every window of the recordings, cut with the given attitudes, in large batches over all of them."""
+                    progress: Progress | None = None, keep: tuple[str, ...] = _KEPT) -> list[Prediction]:
+    """What the network says of every window of the recordings, cut with the given attitudes, in large batches over all of them.
+
+    Of its diagnostics only those named in `keep`, if it has them."""
     parts, counts, offset = [], [], 0
     for recording, rotation in zip(recordings, attitudes, strict=True):
         sequence = recording.sequence
@@ -293,7 +295,7 @@ def predict_windows(network: Network, recordings: list[Recording], attitudes: li
     total, size, found = len(start), min(_WINDOWS_AT_ONCE, len(start)), []
     for begin in range(0, total, size):
         which = np.minimum(np.arange(begin, begin + size), total - 1).astype(np.int32)  # the last batch is filled up: one compilation
-        found.append(jax.device_get(_predict(network.apply, network.variables, source, which, config.window)))
+        found.append(jax.device_get(_predict(network.apply, network.variables, source, which, config.window, keep)))
         if progress:
             progress(min(1.0, (begin + size) / total))
     whole = jax.tree.map(lambda *leaves: np.concatenate(leaves)[:total].astype(np.float64), *found)
@@ -319,9 +321,9 @@ def _start(recording: Recording, options: FilterOptions) -> _Start:
     return _Start(recording.rotation, recording.velocity, recording.position, recording.gyro_bias, std)
 
 
-@functools.partial(jax.jit, static_argnames=("apply", "length"))
-def _predict(apply: Callable, variables: Any, source: WindowSource, which: Any, length: int) -> Prediction:
-    return _lean(apply(variables, gather(source, which, length).imu))
+@functools.partial(jax.jit, static_argnames=("apply", "length", "keep"))
+def _predict(apply: Callable, variables: Any, source: WindowSource, which: Any, length: int, keep: tuple[str, ...]) -> Prediction:
+    return _lean(apply(variables, gather(source, which, length).imu), keep)
 
 
 @functools.partial(jax.jit, static_argnames=("apply", "config"))
@@ -344,9 +346,9 @@ def _run_given(start: _Start, gyro: Any, accel: Any, displacement: Any, std_of_i
     return jax.vmap(one)(start, gyro, accel, displacement, std_of_it)
 
 
-def _lean(prediction: Prediction) -> Prediction:
-    """Without the attention, which is too large to keep for every window."""
-    return prediction._replace(diagnostics={key: value for key, value in prediction.diagnostics.items() if key in _KEPT})
+def _lean(prediction: Prediction, keep: tuple[str, ...] = _KEPT) -> Prediction:
+    """With these diagnostics only: attention and the like are too large to keep for every window."""
+    return prediction._replace(diagnostics={key: value for key, value in prediction.diagnostics.items() if key in keep})
 
 
 def _lean_history(history: FilterHistory) -> FilterHistory:

@@ -31,7 +31,7 @@ def save_all(folder: Path, estimates: list[Estimate], report: Report, window_sec
     """Every figure as a PNG in `folder`: three for each sequence (`<name>_trajectory`, `_error`, `_displacement`) and `error_cdf`."""
     folder.mkdir(parents=True, exist_ok=True)
     alignment = report.settings["alignment"]
-    for done, (stem, estimate) in enumerate(zip(file_names(estimates), estimates, strict=True)):
+    for done, (stem, estimate) in enumerate(zip(file_names([e.name for e in estimates]), estimates, strict=True)):
         if progress:
             progress(done / len(estimates))
         values = report.scores.sequences[estimate.name].values

@@ -167,7 +167,7 @@ def write(folder: Path, report: Report, estimates: list[Estimate]) -> None:
             rows.writerow([name, *("" if m.values.get(column) is None else repr(m.values[column]) for column in columns)])
     for kind in ("trajectories", "references"):
         (folder / kind).mkdir()
-    for stem, e in zip(file_names(estimates), estimates, strict=True):
+    for stem, e in zip(file_names([e.name for e in estimates]), estimates, strict=True):
         write_tum(folder / "trajectories" / f"{stem}.txt", e.trajectory)
         if np.isfinite(e.reference.position).any():
             write_tum(folder / "references" / f"{stem}.txt", e.reference)
@@ -179,11 +179,11 @@ def write_tum(path: Path, trajectory: Trajectory) -> None:
     np.savetxt(path, rows[np.isfinite(rows).all(1)], fmt="%.9f", header="t x y z qx qy qz qw")
 
 
-def file_names(estimates: list[Estimate]) -> list[str]:
-    """A distinct file name for each estimate: its sequence's name with anything a file system could mind as `_`."""
+def file_names(names: list[str]) -> list[str]:
+    """A distinct file name for each sequence: its name with anything a file system could mind as `_`."""
     stems: list[str] = []
-    for e in estimates:
-        stem = re.sub(r"[^\w.=+-]+", "_", e.name).strip("._") or "sequence"
+    for name in names:
+        stem = re.sub(r"[^\w.=+-]+", "_", name).strip("._") or "sequence"
         while stem in stems:
             stem += "_"
         stems.append(stem)

@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+from typing import Any
 
+import jax
+import jax.numpy as jnp
 from flax import linen as nn
+from jaxtyping import PRNGKeyArray
 
 from gnio_jax.models.ctin import CTIN
 from gnio_jax.models.deepils import DeepILS
@@ -48,3 +52,12 @@ def create(name: str, **options: object) -> nn.Module:
         return _MODELS[name](**options)
     except ValueError as error:
         raise InputError(f"model '{name}'", str(error)) from None
+
+
+def initialise(model: nn.Module, key: PRNGKeyArray, window: int = 200) -> Any:
+    """Fresh variables of `model` for windows of `window` samples.
+
+    `model.init` gives the same; here it is compiled for one use, as the optimiser of the compiler takes more seconds than it saves.
+    """
+    init = jax.jit(model.init, compiler_options={"xla_backend_optimization_level": 1})
+    return init(key, jnp.zeros((1, window, 6), jnp.float32))

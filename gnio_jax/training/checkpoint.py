@@ -39,6 +39,8 @@ class Position(NamedTuple):
     seconds: float
     """Time spent training so far."""
     plateau: Plateau = Plateau()
+    gradient_norms: dict[str, float] = {}
+    """Norms of the gradient by part of the network, summed over the steps of the epoch in progress."""
 
 
 class Run(NamedTuple):

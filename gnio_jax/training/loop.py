@@ -116,7 +116,7 @@ def _train(config: TrainConfig, resume: bool, console: Console) -> Outcome:
             improved = position.best_loss is None or row["val_loss"] < position.best_loss
             best_loss = row["val_loss"] if improved else position.best_loss
             # The position of a finished epoch is the start of the next one.
-            position = position._replace(epoch=epoch + 1, best_loss=best_loss, loss_sums=(0.0, 0.0, 0.0),
+            position = position._replace(epoch=epoch + 1, best_loss=best_loss, loss_sums=(0.0, 0.0, 0.0), gradient_norms={},
                                          plateau=optimizers.watch(position.plateau, row["val_mse"], config.optim))
             rows.append(row)
             _write_rows(workdir / "metrics.jsonl", rows)
@@ -189,7 +189,9 @@ def _run_epoch(
         dispatch = max(1, min(2 * dispatch, round(DISPATCH_SECONDS * count / (clock - tick))))
         done += count
         sums = tuple(a + float(b) for a, b in zip(position.loss_sums, progress.sums, strict=True))
-        position = position._replace(step=epoch * run.steps_per_epoch + done, loss_sums=sums, seconds=before + clock - began)
+        norms = {part: position.gradient_norms.get(part, 0.0) + float(norm) for part, norm in progress.gradient_norms.items()}
+        position = position._replace(step=epoch * run.steps_per_epoch + done, loss_sums=sums, gradient_norms=norms,
+                                     seconds=before + clock - began)
         rate = (done - first) * size / (clock - began)
         bar(position.step, epoch, sums[0] / done, _learning_rate(run, position), rate)
         if done < run.steps_per_epoch and (stop.signum or clock - saved > run.config.checkpoint_every_seconds):
@@ -208,6 +210,7 @@ def _row(run: _Run, epoch: int, position: Position, held_out: Losses, rate: floa
         "epoch": epoch, "step": position.step, "loss": loss, "mse": mse, "nll": nll,
         "val_loss": val_loss, "val_mse": val_mse, "val_nll": val_nll, "val_rmse": math.sqrt(val_mse),
         "learning_rate": _learning_rate(run, position), "windows_per_second": rate, "seconds": position.seconds,
+        **{f"gradient_norm/{part}": norm / run.steps_per_epoch for part, norm in position.gradient_norms.items()},
     }  # fmt: skip
 
 

@@ -14,6 +14,7 @@ from jaxtyping import Float, Int, PRNGKeyArray
 from gnio_jax.config import TrainConfig
 from gnio_jax.data.augment import augment
 from gnio_jax.data.windows import WindowSource, gather, shifted
+from gnio_jax.models import initialise
 from gnio_jax.training.losses import Losses, Stage, losses
 from gnio_jax.types import Prediction, Windows
 
@@ -32,15 +33,15 @@ class Progress(NamedTuple):
 
     sums: Losses
     """Losses summed over the steps."""
+    gradient_norms: dict[str, Float[jax.Array, ""]]
+    """Norms of the gradient by part of the network (`gradient_norms`), summed over the steps."""
     failed_step: Int[jax.Array, ""]
     """First step whose loss was not finite; −1 when all were."""
 
 
 def create_state(model: nn.Module, optimizer: optax.GradientTransformation, key: PRNGKeyArray, window: int) -> TrainState:
     """Fresh parameters for windows of `window` samples, at step 0."""
-    # Run once: what the optimiser of the compiler would save is a fraction of the seconds that it takes.
-    init = jax.jit(model.init, compiler_options={"xla_backend_optimization_level": 1})
-    variables = init(key, jnp.zeros((1, window, 6), jnp.float32))
+    variables = initialise(model, key, window)
     params = variables["params"]
     return TrainState(jnp.int32(0), params, variables.get("batch_stats", {}), optimizer.init(params))
 
@@ -91,10 +92,21 @@ def train_steps(
         update = jax.tree.map(lambda x: x * stage.learning_rate_factor, update)
         failed = jnp.where((progress.failed_step < 0) & ~jnp.isfinite(loss.total), state.step, progress.failed_step)
         state = TrainState(state.step + 1, optax.apply_updates(state.params, update), batch_stats, opt_state)
-        return state, Progress(jax.tree.map(jnp.add, progress.sums, loss), failed)
+        sums = jax.tree.map(jnp.add, (progress.sums, progress.gradient_norms), (loss, gradient_norms(gradient)))
+        return state, Progress(*sums, failed)
 
-    zero = jnp.float32(0)
-    return jax.lax.fori_loop(jnp.int32(0), count, one_step, (state, Progress(Losses(zero, zero, zero), jnp.int32(-1))))
+    nothing = Progress(Losses(*[jnp.float32(0)] * 3), jax.tree.map(jnp.zeros_like, gradient_norms(state.params)), jnp.int32(-1))
+    return jax.lax.fori_loop(jnp.int32(0), count, one_step, (state, nothing))
+
+
+def gradient_norms(gradient: Any) -> dict[str, Float[jax.Array, ""]]:
+    """Norm of the gradient with respect to each part of the network: its modules, and of a head its layers (`head/scale`)."""
+    squares: dict[str, jax.Array] = {}
+    for path, leaf in jax.tree_util.tree_leaves_with_path(gradient):
+        names = [str(entry.key) for entry in path]
+        part = "/".join(names[: 2 if names[0] == "head" else 1])
+        squares[part] = squares.get(part, jnp.float32(0)) + jnp.sum(leaf**2)
+    return {part: jnp.sqrt(square) for part, square in squares.items()}
 
 
 @functools.partial(jax.jit, static_argnames=("model", "config"))

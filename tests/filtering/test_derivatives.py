@@ -9,6 +9,7 @@ import pytest
 from test_run_odometry import CLONES, DT, INTERVALS, PARAMETERS, WEIGHTS, N, central, recording, start
 
 from gnio_jax import filtering
+from gnio_jax.filtering.scekf import checkpointed_scan
 from gnio_jax.types import Prediction
 
 # Compiling is what these tests cost: without the optimiser it takes half the time, and a short run is as quick.
@@ -79,12 +80,24 @@ def test_jvp_equals_grad_and_vmap_of_grad_equals_each():
         jax.tree.map(lambda a, b, index=index: np.testing.assert_allclose(a[index], b, rtol=1e-8, atol=1e-8), many, alone)
 
 
-def test_checkpoints_change_nothing():
-    config = filtering.FilterConfig(DT, N, CLONES, checkpoint_every=8)  # three blocks, and two steps more
-    value, gradient = jit(jax.value_and_grad(functools.partial(loss, config=config)))(point())
-    wanted = GRADIENT(point())
-    np.testing.assert_allclose(value, wanted[0], rtol=1e-12)
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9), gradient, wanted[1])
+@pytest.mark.parametrize("every", [0, 4, 5, 13, 50])
+def test_checkpoints_change_nothing(every):
+    """Of any scan, whole blocks or not; the filter's own is differentiated through checkpoints with the network below."""
+    def step(carry, x):
+        carry = jnp.tanh(carry @ (jnp.eye(2) + x["turn"])) + x["push"]
+        return carry, {"square": carry**2, "first": carry[0]}
+
+    def value(scan, start, inputs):
+        carry, out = scan(step, start, inputs)
+        return jnp.sum(carry) + jnp.sum(jnp.arange(1.0, 14)[:, None] * out["square"]) + jnp.sum(out["first"])
+
+    rng = np.random.default_rng(2)
+    arguments = jnp.array([0.3, -0.2]), {"turn": 0.3 * rng.standard_normal((13, 2, 2)), "push": 0.3 * rng.standard_normal((13, 2))}
+    ours = functools.partial(value, functools.partial(checkpointed_scan, every=every))
+    found, wanted = (jit(jax.value_and_grad(function, (0, 1)))(*arguments) for function in (ours, functools.partial(value, jax.lax.scan)))
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12), found, wanted)
+    text = str(jax.make_jaxpr(jax.grad(ours))(*arguments))
+    assert ("remat" in text or "checkpoint" in text) == (0 < every < 13)
 
 
 # One program for all of it, since compiling is what these tests cost; the hard gate's rejection is tested with the update.
@@ -92,8 +105,7 @@ HOSTILE = jit(jax.value_and_grad(functools.partial(loss, config=filtering.Filter
     DT, N, CLONES, convergence_seconds=0.1, zero_velocity_std=0.01, rest_seconds=0.1, gate_softness=2.0, gate_threshold=8.0))))
 
 
-@pytest.mark.parametrize("kind", ["rest", "rejected", "missing", "gimbal"])
-def test_gradients_are_finite_for_hostile_input(kind):
+def hostile(kind):
     x = point(MEASURED.copy())
     if kind == "rest":  # nothing turns, nothing moves, every innovation is small: each norm in the filter is at its singular point
         x |= dict(gyro=np.zeros_like(x["gyro"]), accel=np.tile([0.0, 0.0, 9.81], (len(x["gyro"]), 1)), measured=np.zeros_like(MEASURED))
@@ -103,11 +115,16 @@ def test_gradients_are_finite_for_hostile_input(kind):
         x["measured"][10:14] = np.nan
     else:
         x["gyro"] = np.tile([0.0, np.pi / (len(x["gyro"]) * DT), 0.0], (len(x["gyro"]), 1))
-    value, gradient = HOSTILE(x)
-    assert np.isfinite(value)
-    for name, leaf in gradient.items():
-        assert np.isfinite(leaf).all(), name
-        assert np.abs(leaf).max() > 0, name
+    return x
+
+
+def test_gradients_are_finite_for_hostile_input():
+    for kind in ("rest", "rejected", "missing", "gimbal"):
+        value, gradient = HOSTILE(hostile(kind))
+        assert np.isfinite(value), kind
+        for name, leaf in gradient.items():
+            assert np.isfinite(leaf).all(), (kind, name)
+            assert np.abs(leaf).max() > 0, (kind, name)
 
 
 def test_a_gate_with_a_slope_lets_the_gradient_through():
@@ -154,7 +171,8 @@ def test_gradient_reaches_the_network():
     """Of its own parameters to 1e-5; through the windows, which are cut with the state, as far as differences can say, since the
     window is rounded to float32. One program for both: `share` is that of what the network makes of its window."""
     gyro, accel = recording(0)
-    config = filtering.FilterConfig(DT, N, CLONES, checkpoint_every=8)
+    config = filtering.FilterConfig(DT, N, CLONES, checkpoint_every=INTERVALS // 2)
+    assert INTERVALS % 2 == 0  # no step is left over, which would be compiled once more
 
     @jit
     @jax.value_and_grad

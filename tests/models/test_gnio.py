@@ -101,7 +101,7 @@ def numpy_forward(variables, windows):
 def test_forward_against_numpy(samples):
     model = models.create("gnio", width=8, bank_size=5, bank_heads=4)
     windows = jax.random.normal(jax.random.key(1), (2, samples, 6), jnp.float32)
-    variables = jax.jit(model.init)(jax.random.key(0), windows)
+    variables = models.initialise(model, jax.random.key(0), windows.shape[1])
     # Statistics and gate away from their neutral start, so that none can be left out unnoticed.
     rng = np.random.default_rng(3)
     variables = jax.tree.map(lambda x: x + 0.1 * rng.random(x.shape, np.float32) if x.ndim == 1 else x, variables)
@@ -158,7 +158,7 @@ def test_gates_and_scales(gate, scale):
 def test_a_new_network_predicts_that_it_stands_still():
     model = models.create("gnio", width=8)
     windows = jax.random.normal(jax.random.key(1), (4, 100, 6), jnp.float32)
-    variables = jax.jit(model.init)(jax.random.key(0), windows)
+    variables = models.initialise(model, jax.random.key(0), windows.shape[1])
     prediction, _ = jax.jit(lambda v, w: model.apply(v, w, train=True, mutable=["batch_stats"]))(variables, windows)
     assert float(jnp.abs(prediction.displacement).max()) < 0.1
 
@@ -176,7 +176,7 @@ def test_gradient_is_finite_where_everything_is_zero(options):
 def test_training_mode_updates_the_statistics_with_momentum():
     model = models.create("gnio", width=8)
     windows = 3 + jax.random.normal(jax.random.key(1), (16, 100, 6), jnp.float32)
-    variables = jax.jit(model.init)(jax.random.key(0), windows)
+    variables = models.initialise(model, jax.random.key(0), windows.shape[1])
     _, changed = jax.jit(lambda v, w: model.apply(v, w, train=True, mutable=["batch_stats"]))(variables, windows)
     stem = resnet.convolve(windows, variables["params"]["encoder"]["stem_conv"]["kernel"], (2,), [(3, 3)])
     expected = 0.1 * np.asarray(stem).mean(axis=(0, 1))
@@ -186,7 +186,7 @@ def test_training_mode_updates_the_statistics_with_momentum():
 def test_parameters_and_outputs_are_float32_whatever_comes_in():
     model = models.create("gnio", width=8)
     windows = jnp.ones((1, 100, 6), jnp.float64)
-    variables = jax.jit(model.init)(jax.random.key(0), windows)
+    variables = models.initialise(model, jax.random.key(0), windows.shape[1])
     assert {leaf.dtype for leaf in jax.tree.leaves(variables)} == {jnp.dtype("float32")}
     prediction = jax.eval_shape(model.apply, variables, windows)
     assert prediction.displacement.dtype == prediction.log_std.dtype == jnp.float32

@@ -10,7 +10,7 @@ from gnio_jax import models
 
 def trained_like(model, seed=0):
     """Variables with statistics and affine parameters that are not the initial ones."""
-    variables = model.init(jax.random.key(seed), jnp.zeros((1, 64, 6), jnp.float32))
+    variables = models.initialise(model, jax.random.key(seed), 64)
     leaves, tree = jax.tree.flatten_with_path(variables)
     rng = np.random.default_rng(seed)
 

@@ -98,9 +98,9 @@ def test_schedule_of_the_paper(epochs, warmup):
 
 
 def test_no_decay_after_the_warm_up():
-    rate = optimizer.schedule(OptimConfig(schedule="constant", epochs=20, warmup_epochs=2), 5)
+    rate = optimizer.schedule(OptimConfig(schedule="constant", epochs=20, warmup_epochs=2.0), 5)
     np.testing.assert_allclose([rate(0), rate(5), rate(10), rate(100)], [1e-6, (1e-6 + 1e-4) / 2, 1e-4, 1e-4], rtol=1e-4)
-    assert float(optimizer.schedule(OptimConfig(schedule="plateau", warmup_epochs=0), 5)(0)) == pytest.approx(1e-4)
+    assert float(optimizer.schedule(OptimConfig(schedule="plateau", warmup_epochs=0.0), 5)(0)) == pytest.approx(1e-4)
 
 
 def test_plateau_waits_for_its_epochs_and_starts_counting_anew():

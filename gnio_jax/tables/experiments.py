@@ -1,0 +1,119 @@
+"""What the paper's tables vary, as configurations, and the figures it prints for them."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import NamedTuple
+
+from gnio_jax.config import LossConfig, TrainConfig
+
+SCALED = ("gnio", "tlio", "ronin_resnet", "deepils")
+"""Networks whose `width` means channels of the first group: an experiment at half the width halves all of them."""
+
+TLIO_SHARE = 10 / 200
+"""TLIO's uncertainty does not learn in its first 10 epochs; of a run of another length the same share (ours, of 200)."""
+
+
+class Cell(NamedTuple):
+    """One row of a table before it is run."""
+
+    name: str
+    """Also of its folder, shared by the tables it is in."""
+    label: str
+    config: TrainConfig
+    published: float | None = None
+    """The paper's figure, m."""
+
+
+class Experiment(NamedTuple):
+    """A table of the paper: rows, the first of which is what the others are compared with."""
+
+    title: str
+    source: str
+    """Where the published figures are and what they were measured on."""
+    cells: list[Cell]
+
+
+def loss(network: str, epochs: int, base: LossConfig) -> LossConfig:
+    """The published loss of a network; GNIO's is that of the experiment."""
+    match network:
+        case "gnio":
+            return base
+        case "tlio":
+            learns = max(1, round(TLIO_SHARE * epochs))
+            return LossConfig(mse_weight=0.0, nll_weight=1.0, log_std_from_epoch=learns, log_std_floor=-6.907755)
+        case "deepils":
+            return LossConfig(mse_weight=1.0, mae_weight=1.0, nll_weight=0.0)
+        case "ctin":
+            return LossConfig(name="velocity_and_covariance")
+        case _:
+            return LossConfig(mse_weight=1.0, nll_weight=0.0)
+
+
+def method(network: str, base: TrainConfig) -> TrainConfig:
+    """`base` with another network and its loss: the same recordings, augmentation, batches, epochs and learning rate."""
+    model = dataclasses.replace(type(base.model)(), name=network, width=base.model.width if network in SCALED else None)
+    return dataclasses.replace(base, model=model, loss=loss(network, base.optim.epochs, base.loss))
+
+
+def variant(base: TrainConfig, **options: object) -> TrainConfig:
+    """GNIO with other options."""
+    config = method("gnio", base)
+    return dataclasses.replace(config, model=dataclasses.replace(config.model, **options))
+
+
+# Published ATE, m (paper, table II), by network, dataset and split.
+PUBLISHED = {
+    ("oxiod", "seen"): {"tlio": 2.67, "ctin": 2.32, "imot": 1.86, "gnio": 0.74},
+    ("oxiod", "unseen"): {"tlio": 2.54, "ctin": 3.34, "imot": 0.90, "gnio": 0.71},
+    ("ridi", "seen"): {"tlio": 1.58, "ctin": 1.39, "imot": 1.68, "deepils": 1.56, "gnio": 1.22},
+    ("ridi", "unseen"): {"tlio": 1.49, "ctin": 1.86, "imot": 1.49, "deepils": 1.48, "gnio": 1.19},
+    ("ronin", "seen"): {"tlio": 5.95, "ctin": 4.62, "imot": 3.78, "deepils": 4.80, "gnio": 4.31},
+    ("ronin", "unseen"): {"tlio": 7.10, "ctin": 5.61, "imot": 5.31, "deepils": 6.80, "gnio": 5.02},
+    ("idol", "seen"): {"tlio": 5.89, "ctin": 2.90, "imot": 2.22, "gnio": 3.45},
+    ("idol", "unseen"): {"tlio": 5.34, "ctin": 3.69, "imot": 3.00, "gnio": 3.89},
+}
+METHODS = ("tlio", "ronin_resnet", "deepils", "ctin", "imot", "gnio")
+
+
+def comparison(base: TrainConfig, split: str, networks: tuple[str, ...] = METHODS) -> Experiment:
+    """The networks of table II, and RoNIN's, which it leaves out; compared with the first."""
+    published = PUBLISHED.get((base.dataset, split), {})
+    cells = [Cell(network, network, method(network, base), published.get(network)) for network in networks]
+    return Experiment("Networks", f"paper, table II: ATE on {base.dataset} {split}" if published else "no published figure for this split",
+                      cells)
+
+
+def components(base: TrainConfig) -> Experiment:
+    """Bank and gated head apart and together. The paper's baseline is TLIO's own network; the plain linear head on GNIO's pooled
+    features is printed beside it."""
+    return Experiment("Components", "paper, component ablation: RMSE on TLIO's set", [
+        Cell("tlio", "baseline (TLIO)", method("tlio", base), 2.40),
+        Cell("gnio_bank-0_linear", "encoder + linear head", variant(base, bank_size=0, head="linear")),
+        Cell("gnio_linear", "+ bank", variant(base, head="linear"), 1.98),
+        Cell("gnio_bank-0", "+ gated head", variant(base, bank_size=0), 1.84),
+        Cell("gnio", "+ bank + gated head", method("gnio", base), 1.66),
+    ])
+
+
+def gates(base: TrainConfig) -> Experiment:
+    """Activations of gate and scale, without the bank: the paper's best row equals its gate-only row."""
+    rows = [("sigmoid", "linear", 2.05), ("tanh", "linear", 2.00), ("tanh", "exp", 1.94), ("tanh", "abs", 1.92), ("tanh", "pos_elu", 1.85),
+            ("tanh", "softplus", 1.84)]
+    cells = []
+    for gate, scale, published in rows:
+        usual = (gate, scale) == ("tanh", "softplus")
+        name = "gnio_bank-0" if usual else f"gnio_bank-0_{gate}_{scale}"
+        config = variant(base, bank_size=0) if usual else variant(base, bank_size=0, gate=gate, scale=scale)
+        cells.append(Cell(name, f"{gate} × {scale}", config, published))
+    return Experiment("Gate and scale", "paper, gate and scale functions: RMSE on TLIO's set, without the bank", cells)
+
+
+def bank_sizes(base: TrainConfig) -> Experiment:
+    """Prototypes in the bank, with the linear head: the paper's m = 64 equals its bank-only row."""
+    cells = [Cell("gnio_bank-0_linear", "no bank", variant(base, bank_size=0, head="linear"))]
+    for size, published in [(16, 2.07), (32, None), (64, 1.98), (128, 2.07)]:
+        name = "gnio_linear" if size == 64 else f"gnio_bank-{size}_linear"
+        config = variant(base, head="linear") if size == 64 else variant(base, head="linear", bank_size=size)
+        cells.append(Cell(name, f"m = {size}", config, published))
+    return Experiment("Bank size", "paper, size of the bank: RMSE on TLIO's set, with the linear head", cells)

@@ -1,0 +1,111 @@
+"""Configurations × seeds: trained and evaluated one after the other, restartable, nothing done twice."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from rich.console import Console
+
+from gnio_jax import config as configuration
+from gnio_jax import evaluation
+from gnio_jax.config import EvaluateConfig
+from gnio_jax.evaluation import metrics, report
+from gnio_jax.evaluation.metrics import Trajectory
+from gnio_jax.evaluation.run import folder_name
+from gnio_jax.tables.experiments import Cell
+from gnio_jax.training import loop
+
+
+class Interrupted(Exception):
+    """A signal asked a training run to stop; it is saved, and the same command goes on from there."""
+
+    def __init__(self, signum: int):
+        super().__init__(signum)
+        self.signum = signum
+
+
+class Result(NamedTuple):
+    """A cell after all its seeds."""
+
+    cell: Cell
+    figures: list[dict[str, Any]]
+    """metrics.json of each seed."""
+    runs: list[Path]
+    """Their work folders."""
+
+
+def run_cell(cell: Cell, seeds: int, folder: Path, split: str, estimator: str, console: Console) -> Result:
+    """Train and evaluate a cell with seeds 0 … seeds−1 below `folder`.
+
+    A run that is finished is not trained again, one that was interrupted goes on, an evaluation that is there is read. Raises
+    `InputError` if a folder holds a run with other settings, and `Interrupted` after a signal.
+    """
+    figures, runs = [], []
+    for seed in range(seeds):
+        workdir = folder / f"{cell.name}_s{seed}"
+        config = dataclasses.replace(cell.config, seed=seed, workdir=str(workdir))
+        train(config, console)
+        figures.append(evaluated(workdir, split, estimator, console))
+        runs.append(workdir)
+    return Result(cell, figures, runs)
+
+
+def train(config: configuration.TrainConfig, console: Console) -> None:
+    """Train the run of `config` to its end, if it is not there yet."""
+    workdir = Path(config.workdir or "")
+    begun = (workdir / "config.yaml").exists()
+    if begun:
+        loop.prepare_workdir(config, resume=True)  # refuses other settings
+        log = workdir / "metrics.jsonl"
+        if log.exists() and log.read_text(encoding="utf-8").count("\n") >= config.optim.epochs:
+            return
+    console.rule(f"[bold]{workdir.name}[/bold]", align="left")
+    outcome = loop.train(config, resume=begun, console=console)
+    if outcome.stopped_by:
+        raise Interrupted(outcome.stopped_by)
+
+
+def evaluated(workdir: Path, split: str, estimator: str, console: Console) -> dict[str, Any]:
+    """The figures of the run's best checkpoint on a split: those that are there if they are of that checkpoint, else new ones."""
+    trained = configuration.load(workdir / "config.yaml")
+    config = EvaluateConfig(str(workdir), split=split, estimator=estimator, plots=False, filter=trained.filter)  # type: ignore[arg-type]
+    path = evaluation_folder(workdir, split, estimator) / "metrics.json"
+    best = workdir / "checkpoints" / "best"
+    if path.exists():
+        found = json.loads(path.read_text(encoding="utf-8"))
+        if (best / str(found["settings"]["step"])).is_dir():
+            return found
+    console.print(f"evaluating {workdir.name} on {split} ({estimator})")
+    evaluation.evaluate(config)
+    return json.loads(path.read_text(encoding="utf-8"))
+
+
+def evaluation_folder(workdir: Path, split: str, estimator: str) -> Path:
+    """Where `evaluated` leaves its files."""
+    trained = configuration.load(workdir / "config.yaml")
+    config = EvaluateConfig(str(workdir), split=split, estimator=estimator, filter=trained.filter)  # type: ignore[arg-type]
+    return workdir / "eval" / folder_name(config, trained.dataset, trained)
+
+
+def paths(result: Result, split: str, estimator: str) -> dict[str, tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]]]:
+    """Reference and the first seed's estimate of each sequence seen from above, m, the estimate laid on by start position and yaw."""
+    folder = evaluation_folder(result.runs[0], split, estimator)
+    names = list(result.figures[0]["sequences"])
+    found = {}
+    for name, stem in zip(names, report.file_names(names), strict=True):
+        if (folder / "references" / f"{stem}.txt").exists():
+            estimate, reference = (_trajectory(folder / kind / f"{stem}.txt") for kind in ("trajectories", "references"))
+            rows = np.searchsorted(estimate.time, reference.time - 1e-6)  # the reference has no row where it cannot be trusted
+            estimate = metrics.align(Trajectory(*(field[rows] for field in estimate)), reference)
+            found[name] = reference.position[:, :2], estimate.position[:, :2]
+    return found
+
+
+def _trajectory(path: Path) -> Trajectory:
+    rows = np.loadtxt(path, ndmin=2)
+    return Trajectory(rows[:, 0], rows[:, 1:4], rows[:, [7, 4, 5, 6]])

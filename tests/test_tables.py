@@ -1,0 +1,253 @@
+"""The tables: what they vary, their statistics by hand, and one made from nothing to its pictures, then again without training."""
+
+import csv
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+import yaml
+from test_tlio_layout import write_sequence
+
+from gnio_jax import config as configuration
+from gnio_jax import models
+from gnio_jax.config import DataConfig, ModelConfig, OptimConfig, TrainConfig
+from gnio_jax.tables import commands, complexity, experiments, matrix, summary, windows
+from gnio_jax.tables.experiments import Cell, Experiment
+from gnio_jax.tables.matrix import Result
+from gnio_jax.training import loop
+from gnio_jax.training.checkpoint import create_model
+from gnio_jax.types import InputError
+
+BASE = TrainConfig(dataset="tlio", model=ModelConfig(width=4), optim=OptimConfig(epochs=40))
+
+
+def result(name, ate, published=None):
+    """`ate`: (seeds, sequences); the other metrics are the same number."""
+    figures = [{"sequences": {f"s{k}": {"ate": value} for k, value in enumerate(row)},
+                "mean": {metric: float(np.mean(row)) for metric in ("ate", "rpe_1s")} | {"stationary_drift": None}} for row in ate]
+    return Result(Cell(name, name.upper(), BASE, published), figures, [])
+
+
+def test_statistics_by_hand():
+    first = result("a", [[1.0, 2.0, 6.0], [3.0, 2.0, 4.0]], 2.4)
+    second = result("b", [[1.0, 1.0, 1.0], [2.0, 2.0, 2.0]], 1.8)
+    experiment = Experiment("Title", "source", [first.cell, second.cell])
+    one, two = summary.rows(experiment, [first, second], {"b": {"more": 0.5}})
+    assert one.seeds["ate"] == [3.0, 3.0] and one.gain == 0 and one.difference == 0 and one.interval is None
+    assert two.gain == pytest.approx(50.0) and two.difference == pytest.approx(-1.5) and two.published_gain == pytest.approx(25.0)
+    assert "stationary_drift" not in one.seeds
+    # Differences of the sequences: −0.5, −0.5, −3.5. Of 27 equally likely draws of three, the mean's extremes have 1/27 (3.7 %) and 8/27.
+    assert two.interval == pytest.approx((-3.5, -0.5))
+    text = summary.markdown(experiment, [one, two], ["a note"])
+    assert "| B | 1.50 ± 0.71 | 1.50 ± 0.71 | 0.5 | ↓ 50.0 % | -1.50 (-3.50 to -0.50) | 1.80 | ↓ 25.0 % |" in text
+    assert "| A | 3.00 ± 0.00 | 3.00 ± 0.00 | – |  |  | 2.40 |  |" in text and "a note" in text
+
+
+def test_only_sequences_that_all_seeds_measured_count():
+    whole = result("a", [[1.0, 2.0], [3.0, 4.0]])
+    whole.figures[1]["sequences"]["s0"]["ate"] = None
+    np.testing.assert_array_equal(summary.errors(whole), [[2.0], [4.0]])
+    assert summary.bootstrap(np.array([1.0])) is None
+
+
+def test_arrows_point_as_the_error_goes():
+    assert [summary.arrow(x) for x in (12.34, -5.0, 0.01, None)] == ["↓ 12.3 %", "↑ 5.0 %", "0 %", ""]
+
+
+@pytest.mark.parametrize("make", [experiments.components, experiments.gates, experiments.bank_sizes,
+                                  lambda base: experiments.comparison(base, "test")])
+def test_rows_differ_in_the_network_alone(make):
+    """Every row can be built, two rows are never the same, rows of the same name are; loss apart, only the network differs."""
+    seen = {}
+    for cell in make(BASE).cells:
+        assert create_model(cell.config) is not None
+        assert seen.setdefault(cell.name, cell.config) == cell.config
+        assert dataclasses.replace(cell.config, model=BASE.model, loss=BASE.loss) == BASE
+        assert cell.config.model.name != "gnio" or cell.config.loss == BASE.loss
+    assert len(set(map(str, seen.values()))) == len(seen)
+
+
+def test_cells_of_one_name_are_one_run_in_every_table():
+    made = [cell for table in (experiments.components(BASE), experiments.gates(BASE), experiments.bank_sizes(BASE),
+                               experiments.comparison(BASE, "test")) for cell in table.cells]
+    by_name = {}
+    for cell in made:
+        assert by_name.setdefault(cell.name, cell.config) == cell.config
+    assert len(by_name) < len(made)
+
+
+def test_rows_are_the_published_configurations():
+    gates = {cell.label: cell.config.model for cell in experiments.gates(BASE).cells}
+    assert all(model.bank_size == 0 for model in gates.values()) and gates["tanh × exp"].scale == "exp"
+    banks = {cell.label: cell.config.model for cell in experiments.bank_sizes(BASE).cells}
+    assert all(model.head == "linear" for model in banks.values())
+    assert [create_model(cell.config).bank_size for cell in experiments.bank_sizes(BASE).cells] == [0, 16, 32, 64, 128]
+    parts = [(cell.config.model.name, cell.published) for cell in experiments.components(BASE).cells]
+    assert parts == [("tlio", 2.40), ("gnio", None), ("gnio", 1.98), ("gnio", 1.84), ("gnio", 1.66)]
+
+
+@pytest.mark.parametrize("network", [*experiments.METHODS, "imot_text"])
+def test_losses_are_those_of_the_published_recipes(network):
+    if network == "gnio":
+        assert experiments.loss(network, 200, BASE.loss) is BASE.loss
+        return
+    recipe = configuration.validate(configuration.load(f"configs/baselines/{network}.yaml"))
+    assert recipe.model.name == network
+    assert experiments.loss(network, 200, BASE.loss) == recipe.loss
+    assert create_model(recipe) is not None
+
+
+# Windows by activity --------------------------------------------------------------------------------------------------
+
+
+def test_activities_by_speed():
+    truth = np.array([[0.01, 0, 0], [0.3, 0.4, 0], [1.3, 0, 0.02], [0, 2.5, 0], [0.4, 0, 0.3], [0, 0, 0.08]])
+    names = [windows.ACTIVITIES[k] for k in windows.activity(truth, 1.0)]
+    assert names == ["standing", "slow", "walking", "running", "stairs", "slow"]
+    assert [windows.ACTIVITIES[k] for k in windows.activity(truth, 2.0)[[1, 3]]] == ["slow", "walking"]  # the same way in twice the time
+
+
+def test_figures_of_windows_by_hand():
+    attention = np.array([[[1.0, 0.0], [0.5, 0.5]], [[0.0, 1.0], [0.5, 0.5]]])
+    said = windows.Said(np.zeros((2, 3)), np.array([[0.3, 0, 0.4], [0.0, 0.1, 0]]), np.full((2, 3), np.log(0.1)),
+                        {"gate": np.array([[-0.2, 0.4, 9.0], [1.0, 1.0, 9.0]]), "attention": attention}, np.array([0, 2]))
+    found = windows.by_activity(said)
+    assert set(found) == {"standing", "walking"}
+    assert found["standing"]["error"] == pytest.approx(0.5) and found["standing"]["gate"] == pytest.approx(0.3)
+    assert found["standing"]["normalised"] == pytest.approx(np.sqrt((9 + 16) / 3)) and found["walking"]["length"] == pytest.approx(0.1)
+    # First head certain and different, second undecided: half the entropy in a window, all of it in their mean.
+    assert windows.entropy(attention) == pytest.approx((0.5, 1.0))
+
+
+def test_information_of_prototypes():
+    rng = np.random.default_rng(0)
+    activity = rng.integers(0, 4, 4000)
+    attention = np.full((4000, 2, 8), 0.05)
+    attention[np.arange(4000), :, activity] = 0.65
+    said = windows.Said(*[np.zeros((4000, 3))] * 3, {"attention": attention}, activity)
+    told, chance = windows.information(said)
+    assert told == pytest.approx(2.0, abs=0.01) and chance < 0.01  # four equally frequent activities: two bits
+    names, lifts = windows.attention_by_activity(said)
+    assert names == ["standing", "slow", "walking", "running"]
+    np.testing.assert_array_equal(lifts.argmax(1), [0, 1, 2, 3])
+    np.testing.assert_allclose(lifts[:, 4:], 1.0)
+
+
+# Complexity -----------------------------------------------------------------------------------------------------------
+
+
+def multiply_adds(convolutions, dense, padding):
+    """By hand: every output of a convolution costs its kernel, with or without its taps in the padding, every dense layer its matrix."""
+    total = sum(i * o for i, o in dense)
+    for length, stride, size, i, o in convolutions:
+        for output in range(-(-length // stride)):
+            first = output * stride - size // 2
+            total += sum(padding or 0 <= first + tap < length for tap in range(size)) * i * o
+    return total
+
+
+def encoder():
+    """(length of the input, stride, kernel, channels in, out) of each convolution, for 200 samples."""
+    layers, before, length = [(200, 2, 7, 6, 64)], 64, 50
+    for group, width in enumerate((64, 128, 256, 512)):
+        stride = 2 if group else 1
+        layers.append((length, stride, 3, before, width))
+        if group:
+            layers.append((length, stride, 1, before, width))
+        length = -(-length // stride)
+        layers += [(length, 1, 3, width, width)] * 3
+        before = width
+    return layers
+
+
+HEADS = {"tlio": ([(7, 1, 1, 512, 128)] * 2, [(896, 512), (512, 512), (512, 3)] * 2),
+         "gnio": ([], [(512, 512), (512, 64), (512, 64), (512, 512), *[(512, 3)] * 3])}
+
+
+@pytest.mark.parametrize("network, parameters, published", [("tlio", 5_424_646, 39.15e6), ("gnio", 4_934_153, 37.4e6)])
+def test_complexity_against_a_hand_count(network, parameters, published):
+    convolutions, dense = HEADS[network]
+    assert multiply_adds([*encoder(), *convolutions], dense, padding=True) == pytest.approx(published, rel=2e-3)
+    by_hand = multiply_adds([*encoder(), *convolutions], dense, padding=False)
+    found = complexity.measure(network, batches=(1,), seconds=0.05)
+    assert found.parameters == parameters
+    assert 1e9 * found.gflops == pytest.approx(2 * by_hand, rel=0.02)  # additions, ReLUs and the like besides
+    assert found.latency[1] > 0
+    assert network in complexity.markdown([found], "a machine")
+
+
+# From nothing to the pictures -----------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A folder with recordings, a base config and the arguments that all tables share."""
+    root = tmp_path_factory.mktemp("tables")
+    for name in "abc":
+        write_sequence(root / "data" / name)
+    for split, names in [("train", "a\nb\n"), ("val", "c\n"), ("test", "b\nc\n")]:
+        (root / "data" / f"{split}_list.txt").write_text(names)
+    base = TrainConfig(dataset="tlio", data=DataConfig(rate=50.0), model=ModelConfig(width=2, bank_size=3, bank_heads=2),
+                       optim=OptimConfig(epochs=2, batch_size=16, learning_rate=1e-3))
+    configuration.save(root / "base.yaml", base)
+    return root, ["--base", str(root / "base.yaml"), "--data-root", str(root / "data"), "--out", str(root / "out"), "--seeds", "2",
+                  "--methods", "gnio", "--split", "test", "--estimator", "integrate"]
+
+
+def test_a_table_from_nothing_and_again_without_training(made, monkeypatch, capsys):
+    root, arguments = made
+    commands.main(["comparison", *arguments])
+    text = (root / "out" / "comparison_test_integrate.md").read_text(encoding="utf-8")
+    assert "2 seeds" in text and "| gnio |" in text and text in capsys.readouterr().out
+    table = list(csv.DictReader((root / "out" / "comparison_test_integrate.csv").open(encoding="utf-8")))
+    seeds = [json.loads((root / "out" / "runs" / f"gnio_s{seed}" / "eval" / "tlio_test_integrate" / "metrics.json").read_text())
+             for seed in range(2)]
+    assert float(table[0]["ate"]) == pytest.approx(np.mean([seed["mean"]["ate"] for seed in seeds]))
+    assert float(table[0]["ate_std"]) == pytest.approx(np.std([seed["mean"]["ate"] for seed in seeds], ddof=1))
+    assert seeds[0]["mean"]["ate"] != seeds[1]["mean"]["ate"]
+    assert (root / "out" / "comparison_test_integrate.png").read_bytes()[:4] == b"\x89PNG"
+
+    def never(*_, **__):
+        raise AssertionError("done already")
+
+    monkeypatch.setattr(loop, "train", never)
+    monkeypatch.setattr(matrix.evaluation, "evaluate", never)
+    (root / "out" / "comparison_test_integrate.md").unlink()
+    commands.main(["comparison", *arguments])
+    assert (root / "out" / "comparison_test_integrate.md").read_text(encoding="utf-8") == text
+    commands.main(["standing", *arguments])
+    text = (root / "out" / "standing_test_integrate.md").read_text(encoding="utf-8")
+    assert "most attended prototype tells" in text and "| gnio | walking |" in text
+    commands.main(["trajectories", *arguments, "--sequences", "c"])
+    for name in ("standing_test_integrate", "standing_test_integrate_gnio_gate", "standing_test_integrate_gnio_attention",
+                 "trajectories_test_integrate"):
+        assert (root / "out" / f"{name}.png").read_bytes()[:4] == b"\x89PNG", name
+    with pytest.raises(InputError, match="no sequence 'x' in split 'test'; there are: b, c"):
+        commands.main(["trajectories", *arguments, "--sequences", "x"])
+    changed = yaml.safe_load((root / "base.yaml").read_text())
+    changed["optim"]["learning_rate"] = 2e-3
+    (root / "other.yaml").write_text(yaml.safe_dump(changed))
+    with pytest.raises(InputError, match=r"'optim' was .* and is now"):
+        commands.main(["comparison", *arguments, "--base", str(root / "other.yaml")])
+
+
+def test_a_signal_ends_the_table_and_says_how_to_go_on(made, monkeypatch, capsys):
+    root, arguments = made
+    monkeypatch.setattr(loop, "train", lambda config, *_, **__: loop.Outcome(root, None, 15))
+    with pytest.raises(SystemExit) as left:
+        commands.main(["gates", *arguments, "--out", str(root / "elsewhere")])
+    assert left.value.code == 128 + 15 and "goes on from here" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("more, words", [
+    (["--seeds", "0"], "--seeds: must be at least 1"), (["--methods", "gnio,nosuch"], "no network 'nosuch'; known: ctin"),
+    (["--methods", " , "], "names no network"), (["--base", "nosuch.yaml"], "no such config file"),
+    (["--base", "configs/baselines/tlio.yaml"], "is of the network 'tlio'")])
+def test_mistakes_are_named(made, more, words):
+    with pytest.raises(InputError, match=words):
+        commands.main(["comparison", *made[1], *more])
+
+
+def test_every_network_has_a_colour_and_a_place_in_the_tables():
+    assert set(complexity.NETWORKS) == set(models.names())
