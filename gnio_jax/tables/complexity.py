@@ -14,9 +14,9 @@ from gnio_jax import models
 # Parameters in millions and the column "GFLOPs" as the paper prints them.
 PUBLISHED = {"tlio": (5.42, 0.08), "deepils": (2.29, 0.03), "ctin": (0.56, 7.27), "imot": (14.49, 7.79), "gnio": (4.90, 0.08)}
 NETWORKS = ("tlio", "ronin_resnet", "deepils", "ctin", "imot", "imot_text", "gnio")
-NOTE = ("The paper's CNN rows are 2 × multiply-adds of one window of 200 samples, as is the measured column, which leaves out the taps in "
-        "the padding. Its transformer rows repeat those papers' own \"GFLOPs/s\", another quantity; compare the measured column. Its GNIO has no bank: 4,901,385 parameters, "
-        "4,934,153 with it. DeepILS and RoNIN are counted with three outputs.")
+NOTE = ("The paper's CNN rows are 2 × multiply-adds of one window of 200 samples, as is the measured column, which leaves out the taps "
+        "in the padding. Its transformer rows repeat those papers' own \"GFLOPs/s\", another quantity; compare the measured column. Its "
+        "GNIO has no bank: 4,901,385 parameters, 4,934,153 with it. DeepILS and RoNIN are counted with three outputs.")
 
 
 class Complexity(NamedTuple):
