@@ -122,7 +122,7 @@ def move_anchor(state: FilterState, wanted: Bool[Array, ""]) -> FilterState:
 
 def transition(state: FilterState, motion: Interval, anchored: Bool[Array, ""]) -> Float[Array, "9 15"]:
     """Of θ, v, o from those and the biases over an interval that begins from `state`, its anchor's move (`anchored`) included."""
-    turned = motion.transition[:9].at[:, OFFSET].multiply(1 - anchored.astype(motion.offset.dtype))
+    turned = jnp.asarray(motion.transition)[:9].at[:, OFFSET].multiply(1 - anchored.astype(motion.offset.dtype))
     first = state.first
     if first is not None:
         # Φ[v, θ] = −hat(v' − v − g T), Φ[p, θ] = −hat(p' − p − v T − ½ g T²), with the first v and p in the place of the latest

@@ -155,7 +155,8 @@ def _smooth(state, gyro, accel, valid, displacement, covariance, config, noise):
 def _forward(state: FilterState, slot: Int[Array, ""], imu: Imu, measurement: Measurement, config: FilterConfig,
              noise: NoiseModel) -> tuple[FilterState, Kept]:
     state, row, trace = traced_step(state, imu, lambda _state, _oldest: (measurement, {}), slot, config, noise)
-    core, clones = (part[: ANCHOR.start].at[OFFSET].add(part[ANCHOR]) for part in (state.core_covariance, state.cross_covariance))
+    parts = map(jnp.asarray, (state.core_covariance, state.cross_covariance))
+    core, clones = (part[: ANCHOR.start].at[OFFSET].add(part[ANCHOR]) for part in parts)
     return state, Kept(row.state, row.covariance, jnp.concatenate([_local(core), clones], axis=1), trace)
 
 

@@ -21,6 +21,7 @@ from typing import Any, Literal, NamedTuple, no_type_check
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Bool, Float, Int
 
 from gnio_jax import geometry
@@ -315,7 +316,7 @@ def check(name: str, value: Any, shape: tuple[int, ...], config: FilterConfig) -
 
 def check_finite(name: str, value: jax.Array, remedy: str = "") -> None:
     """`ValueError` naming the first row of `value` that is not finite; nothing inside `jit`, where values are not known."""
-    if isinstance(value, jax.core.Tracer):
+    if isinstance(value, Tracer):
         return
     bad = ~np.isfinite(np.asarray(value)).reshape(len(value), -1).all(1)
     if bad.any():
@@ -325,7 +326,7 @@ def check_finite(name: str, value: jax.Array, remedy: str = "") -> None:
 
 def check_rotation(name: str, value: jax.Array) -> None:
     """`ValueError` unless `value` is a rotation matrix, to what rounding and text files leave; nothing inside `jit`."""
-    if not isinstance(value, jax.core.Tracer):
+    if not isinstance(value, Tracer):
         matrix = np.asarray(value, np.float64)
         if not (np.abs(matrix @ matrix.T - np.eye(3)).max() < 1e-3 and np.linalg.det(matrix) > 0):
             raise ValueError(f"{name}: is not a rotation matrix")
@@ -333,7 +334,7 @@ def check_rotation(name: str, value: jax.Array) -> None:
 
 def check_not_negative(name: str, value: Any) -> None:
     """`ValueError` unless the number is finite and not negative; nothing inside `jit`."""
-    if not isinstance(value, jax.core.Tracer):
+    if not isinstance(value, Tracer):
         number = float(np.asarray(value))
         if not (math.isfinite(number) and number >= 0):
             raise ValueError(f"{name}: must be a number that is not negative, found {number}")
@@ -341,10 +342,10 @@ def check_not_negative(name: str, value: Any) -> None:
 
 def check_positive(name: str, value: jax.Array) -> None:
     """`ValueError` naming the first of the matrices (k, d, d) that is not symmetric and positive definite; those with a NaN pass."""
-    if isinstance(value, jax.core.Tracer):
+    if isinstance(value, Tracer):
         return
     matrices = np.asarray(value, np.float64)
-    known = np.isfinite(matrices).all((1, 2))
+    known = np.asarray(np.isfinite(matrices).all((1, 2)))
     clean = np.where(known[:, None, None], matrices, np.eye(matrices.shape[1]))
     asymmetric = np.abs(clean - clean.transpose(0, 2, 1)).max((1, 2)) > 1e-6 * np.abs(clean).max((1, 2))
     bad = asymmetric | (np.linalg.eigvalsh(clean)[:, 0] <= 0)
@@ -435,7 +436,7 @@ def admit_state(state: FilterState, config: FilterConfig) -> FilterState:
 
 
 def _check_state(state: FilterState) -> None:
-    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(state)):
+    if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(state)):
         return
     for name in ("velocity", "offset", "gyro_bias", "accel_bias", "anchor", "core_covariance", "cross_covariance",
                  "clone_covariance"):

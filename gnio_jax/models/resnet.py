@@ -7,8 +7,6 @@ import jax.numpy as jnp
 from flax import linen as nn
 from jaxtyping import Float
 
-from gnio_jax.types import Array
-
 BLOCKS_PER_GROUP = 2
 GROUP_STRIDES = (1, 2, 2, 2)
 
@@ -49,7 +47,7 @@ def convolve_forward(
     """
 
     @jax.custom_jvp
-    def native(x: Array, kernel: Array) -> Array:
+    def native(x: jax.Array, kernel: jax.Array) -> jax.Array:
         return jax.lax.conv_general_dilated(x, kernel, window_strides, padding, dimension_numbers=("NWC", "WIO", "NWC"))
 
     @native.defjvp

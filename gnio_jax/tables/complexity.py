@@ -40,7 +40,7 @@ def measure(network: str, samples: int = 200, batches: tuple[int, ...] = (1, 128
         windows = jnp.asarray(np.random.default_rng(0).standard_normal((batch, samples, 6)), jnp.float32)
         compiled = jax.jit(inference).lower(frozen, windows).compile()
         if batch == batches[0]:
-            operations = compiled.cost_analysis()["flops"] / batch
+            operations = (compiled.cost_analysis() or {})["flops"] / batch
         jax.block_until_ready(compiled(frozen, windows))
         times = []
         while sum(times) < seconds and len(times) < 500:

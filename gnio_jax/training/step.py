@@ -89,11 +89,11 @@ def train_steps(
 
         gradient, (loss, batch_stats) = jax.grad(objective, has_aux=True)(state.params)
         update, opt_state = optimizer.update(gradient, state.opt_state, state.params)
-        update = jax.tree.map(lambda x: x * stage.learning_rate_factor, update)
+        update = optax.tree.scale(stage.learning_rate_factor, update)
         failed = jnp.where((progress.failed_step < 0) & ~jnp.isfinite(loss.total), state.step, progress.failed_step)
-        state = TrainState(state.step + 1, optax.apply_updates(state.params, update), batch_stats, opt_state)
+        state = TrainState(jnp.add(state.step, 1), optax.apply_updates(state.params, update), batch_stats, opt_state)
         sums = jax.tree.map(jnp.add, (progress.sums, progress.gradient_norms), (loss, gradient_norms(gradient)))
-        return state, Progress(*sums, failed)
+        return state, Progress(sums[0], sums[1], failed)
 
     nothing = Progress(Losses(*[jnp.float32(0)] * 3), jax.tree.map(jnp.zeros_like, gradient_norms(state.params)), jnp.int32(-1))
     return jax.lax.fori_loop(jnp.int32(0), count, one_step, (state, nothing))
@@ -123,8 +123,8 @@ def validate(
     weight = (jnp.arange(batches * size) < count).astype(jnp.float32).reshape(batches, size)
 
     def one_window(prediction: Prediction, windows: Windows) -> tuple[Losses, jax.Array]:
-        alone = jax.tree.map(lambda x: x[None], (prediction, windows))
-        return losses(*alone, config.loss, stage), (windows.displacement - prediction.displacement) ** 2
+        prediction, windows = jax.tree.map(lambda x: x[None], (prediction, windows))
+        return losses(prediction, windows, config.loss, stage), jnp.square(windows.displacement - prediction.displacement)[0]
 
     def one_batch(which_weight: tuple[jax.Array, jax.Array]) -> tuple[Losses, jax.Array]:
         windows = gather(source, which_weight[0], config.data.window)
