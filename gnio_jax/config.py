@@ -97,7 +97,7 @@ class ModelConfig:
     output_dim: int | None = None
     """3, or 2 for a network that says nothing of the vertical, as published (ronin_resnet, deepils, ctin, imot)."""
     dropout: float | None = None
-    """Share of the activations that training drops (tlio, ronin_resnet, deepils: 0.5)."""
+    """Share of the activations that training drops (tlio, ronin_resnet, deepils: 0.5; imot: 0.1)."""
 
 
 @dataclass(frozen=True)
@@ -177,6 +177,9 @@ class FilterOptions:
     """The network's covariance is multiplied by this before the update."""
     mahalanobis_fail_scale: float = 0.0
     """0 skips a rejected update; above 0 its covariance is multiplied by this and it is applied."""
+    window_rotation: Literal["per_sample", "single", "tlio"] | None = None
+    """Of the tight coupling: how the network's windows are cut and rotated; without it as in training. `tlio` is as TLIO's tracker does it,
+    a sample earlier and without the filter's biases: for weights that were trained there."""
 
 
 @dataclass(frozen=True)
@@ -293,7 +296,7 @@ def validate(config: TrainConfig, source: str = "config") -> TrainConfig:
         require(value is None or value >= 1, name, f"must be at least 1, found {value!r}")
     for section in ("augment", "filter"):
         for key, value in dataclasses.asdict(getattr(config, section)).items():
-            require(value >= 0, f"{section}.{key}", f"must not be negative, found {value!r}")
+            require(isinstance(value, str | None) or value >= 0, f"{section}.{key}", f"must not be negative, found {value!r}")
     for name, seconds in [("data.window_seconds", data.window_seconds), ("data.stride_seconds", data.stride_seconds),
                           ("data.train_stride_seconds", data.train_stride_seconds)]:  # fmt: skip
         samples = seconds * data.rate

@@ -19,7 +19,7 @@ import tyro
 
 from gnio_jax import cli, models
 from gnio_jax import config as configuration
-from gnio_jax.config import DataConfig, ModelConfig, TrainConfig
+from gnio_jax.config import DataConfig, FilterOptions, ModelConfig, TrainConfig
 from gnio_jax.types import InputError
 
 PROGRAM = "python -m gnio_jax.interop"
@@ -30,8 +30,8 @@ DESCRIPTION = f"""Make a run of TLIO's trained weights, which evaluate.py reads 
   {PROGRAM} model_torchscript.pt runs/tlio_public --stride-seconds 0.1
   python evaluate.py --workdir runs/tlio_public --dataset tlio --data-root ~/tlio
 
-CHECKPOINT is a checkpoint of TLIO's training, its model_torchscript.pt, or an .npz of its state dict. Files of PyTorch need
-pip install gnio-jax[torch]."""
+The run's filter cuts the network's windows as TLIO's tracker does (filter.window_rotation). CHECKPOINT is a checkpoint of TLIO's training,
+its model_torchscript.pt, or an .npz of its state dict. Files of PyTorch need pip install gnio-jax[torch]."""
 
 _CHANNELS = np.array([3, 4, 5, 0, 1, 2])
 """Where our channels, [accel, gyro], are among TLIO's, [gyro, accel]."""
@@ -161,7 +161,8 @@ def write_run(options: ImportOptions) -> None:
     from gnio_jax.training.step import TrainState
 
     data = DataConfig(rate=options.rate, window_seconds=options.window_seconds, stride_seconds=options.stride_seconds)
-    config = configuration.validate(TrainConfig(dataset=options.dataset, data=data, model=ModelConfig(name="tlio")), PROGRAM)
+    config = TrainConfig(dataset=options.dataset, data=data, model=ModelConfig(name="tlio"), filter=FilterOptions(window_rotation="tlio"))
+    configuration.validate(config, PROGRAM)
     if (options.workdir / "config.yaml").exists() or (options.workdir / "checkpoints").exists():
         raise InputError(options.workdir, "holds a run already", "name another folder")
     variables = load_tlio_state_dict(options.checkpoint)

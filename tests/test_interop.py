@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 
 from gnio_jax import cli, interop, models
+from gnio_jax.config import FilterOptions
+from gnio_jax.evaluation import odometry
 from gnio_jax.training import checkpoint
 from gnio_jax.types import InputError
 
@@ -219,6 +221,8 @@ def test_a_run_is_made_of_them(file, tmp_path, monkeypatch, capsys, loaded):
     assert (run.config.model.name, run.config.dataset) == ("tlio", "tlio")
     assert (run.config.data.rate, run.config.data.window, run.config.data.stride) == (200.0, 200, 20)
     assert run.model == models.create("tlio")
+    assert odometry.filter_config(run.config.data, run.config.filter).window_rotation == "tlio"
+    assert odometry.filter_config(run.config.data, FilterOptions()).window_rotation == "per_sample"
     equal(run.variables, loaded)
     with pytest.raises(SystemExit) as left:  # a second time
         command(monkeypatch, file, tmp_path / "run")

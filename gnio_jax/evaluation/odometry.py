@@ -138,7 +138,7 @@ def filter_config(config: DataConfig, options: FilterOptions) -> FilterConfig:
     return FilterConfig(
         dt=1.0 / config.rate, samples_per_clone=config.stride, clones_per_window=config.window // config.stride,
         mahalanobis_fail_scale=options.mahalanobis_fail_scale, measurement_scale=options.measurement_scale, history="core",
-        window_rotation=config.window_rotation)
+        window_rotation=options.window_rotation or config.window_rotation)
 
 
 def prepare(sequences: Iterable[Sequence], config: DataConfig, setup: Setup = DEFAULT_SETUP) -> tuple[list[Recording], dict[str, str]]:

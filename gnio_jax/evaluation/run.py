@@ -100,7 +100,8 @@ def folder_name(config: EvaluateConfig, dataset: str, trained: TrainConfig) -> s
         parts.append(config.checkpoint)
     if config.estimator != "integrate":
         own = dataclasses.asdict(trained.filter)
-        parts += [f"{key}-{value:g}" for key, value in dataclasses.asdict(config.filter).items() if value != own[key]]
+        changed = {key: value for key, value in dataclasses.asdict(config.filter).items() if value != own[key]}
+        parts += [f"{key}-{value}" if isinstance(value, str | None) else f"{key}-{value:g}" for key, value in changed.items()]
     return "_".join(parts)
 
 

@@ -101,6 +101,7 @@ def test_folders_tell_choices_apart():
     assert name(estimator="integrate", orientation="filter", gyro_bias="rest") == "tlio_test_integrate_filter-orientation_rest-bias"
     assert name(filter=dataclasses.replace(TRAINED.filter, velocity_std=0.5), alignment="se3", checkpoint="latest") \
         == "tlio_test_ekf_se3-alignment_latest_velocity_std-0.5"
+    assert name(filter=dataclasses.replace(TRAINED.filter, window_rotation="tlio")) == "tlio_test_ekf_window_rotation-tlio"
 
 
 @pytest.mark.parametrize("arguments, words", [
