@@ -16,9 +16,10 @@ demo: $(VENV)/.package
 	$(BIN)/python evaluate.py --workdir $(DEMO) --estimator imu_only
 	$(BIN)/python evaluate.py --workdir $(DEMO)
 
-# The compiled programs of the tests are kept between runs; the first run compiles them all.
+# The compiled programs of the tests are kept between runs; the first run compiles them all, which is most of what it does: hence the
+# compiler's lower level of optimisation.
 test: $(VENV)/.tests
-	JAX_PLATFORMS=cpu JAX_COMPILATION_CACHE_DIR=$(CURDIR)/.jax_cache $(BIN)/python -m pytest -n $(JOBS) --dist worksteal $(PYTEST_ARGS)
+	JAX_PLATFORMS=cpu JAX_COMPILATION_CACHE_DIR=$(CURDIR)/.jax_cache XLA_FLAGS="$(XLA_FLAGS) --xla_backend_optimization_level=1" $(BIN)/python -m pytest -n $(JOBS) --dist worksteal $(PYTEST_ARGS)
 
 lint: $(VENV)/.dev
 	$(BIN)/ruff check .
