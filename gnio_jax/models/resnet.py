@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 from flax import linen as nn
@@ -47,7 +49,7 @@ def convolve_forward(
     """
 
     @jax.custom_jvp
-    def native(x: jax.Array, kernel: jax.Array) -> jax.Array:
+    def native(x: Any, kernel: Any) -> jax.Array:
         return jax.lax.conv_general_dilated(x, kernel, window_strides, padding, dimension_numbers=("NWC", "WIO", "NWC"))
 
     @native.defjvp
