@@ -170,7 +170,7 @@ def make_complexity(options: TablesConfig, console: Console) -> None:
     for network in complexity.NETWORKS:
         console.print(f"timing {network}")
         found.append(complexity.measure(network))
-    text = complexity.markdown(found, jax.devices()[0].device_kind)
+    text = complexity.markdown(found, complexity.hardware())
     path = Path(options.out) / "complexity.md"
     with replacing(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
@@ -243,7 +243,7 @@ def notes(base: TrainConfig, options: TablesConfig, experiment: Experiment) -> l
     """What a reader must know of the figures."""
     budget = (f"{base.optim.epochs} epochs of batches of {base.optim.batch_size}, learning rate {base.optim.learning_rate:g}, "
               f"width {base.model.width or 64}, {base.data.rate:g} Hz, {options.seeds} seeds")
-    return [f"{base.dataset} {options.split}, {options.estimator}; every row: {budget}; on {jax.devices()[0].device_kind}. "
+    return [f"{base.dataset} {options.split}, {options.estimator}; every row: {budget}; on {complexity.hardware()}. "
             "± is the standard deviation over seeds; the interval of the difference to the first row is over sequences.",
             "", f"Published: {experiment.source}; the paper does not define its ATE."]
 

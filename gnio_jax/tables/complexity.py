@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from typing import NamedTuple
 
@@ -49,6 +50,12 @@ def measure(network: str, samples: int = 200, batches: tuple[int, ...] = (1, 128
             times.append(time.perf_counter() - began)
         latency[batch] = 1e3 * float(np.median(times)) / batch
     return Complexity(network, sum(x.size for x in jax.tree.leaves(variables["params"])), operations / 1e9, latency)
+
+
+def hardware() -> str:
+    """What it runs on, for the notes of a table."""
+    device = jax.devices()[0]
+    return f"{os.cpu_count()} CPU cores" if device.platform == "cpu" else device.device_kind
 
 
 def markdown(found: list[Complexity], device: str) -> str:
