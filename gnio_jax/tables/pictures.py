@@ -105,7 +105,7 @@ def trajectories(sequences: dict[str, tuple[Float[np.ndarray, "n 2"], list[Track
     for axes in panels[len(sequences):]:
         axes.set_visible(False)
     handles = {label: handle for axes in panels[: len(sequences)] for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
-    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=min(8, len(handles)), fontsize=9, frameon=False)
+    figure.legend(handles.values(), handles.keys(), loc="outside upper center", ncols=min(8, len(handles)), fontsize=9, frameon=False)
     figure.supxlabel("x (m)", fontsize=9)
     figure.supylabel("y (m)", fontsize=9)
     return figure
