@@ -94,6 +94,8 @@ class ModelConfig:
     """Activation of the gate (gnio: tanh)."""
     scale: Literal["softplus", "pos_elu", "abs", "exp", "linear"] | None = None
     """Activation of the scale (gnio: softplus)."""
+    uncertainty: Literal["head", "constant"] | None = None
+    """Standard deviation from a head (paper), or one per axis, that of the errors on the validation split (gnio: head)."""
     output_dim: int | None = None
     """3, or 2 for a network that says nothing of the vertical, as published (ronin_resnet, deepils, ctin, imot)."""
     dropout: float | None = None

@@ -48,7 +48,7 @@ def table(experiment: Experiment, results: list[Result], found: list[Row]) -> Fi
     ours.invert_yaxis()
     ours.set(xlabel="ate, here (m)", title=experiment.title)
     ours.set_xlim(left=0)
-    ours.legend(fontsize=8, frameon=False, loc="lower right")
+    figure.legend(*ours.get_legend_handles_labels(), fontsize=8, frameon=False, loc="outside lower center", ncols=2)
     if beside:
         for place, value in enumerate(published):
             if value is not None:

@@ -248,3 +248,18 @@ def test_both_convolutions_are_one_function(size, stride):
                                jnp.asarray(x), jnp.asarray(kernel)))
     for one, other in zip(*found.values(), strict=True):
         np.testing.assert_allclose(one, other, atol=1e-12)
+
+
+def test_constant_uncertainty_leaves_the_displacement_as_it_is():
+    plain, constant = (models.create("gnio", width=2, bank_size=4, bank_heads=2, uncertainty=kind) for kind in ("head", "constant"))
+    variables = models.initialise(plain, jax.random.key(0), 64)
+    params = {name: part for name, part in variables["params"].items() if name != "uncertainty"}
+    log_std = jnp.array([-1.0, -2.0, -3.0], jnp.float32)
+    given = {"params": params, "batch_stats": variables["batch_stats"] | {"uncertainty": {"log_std": log_std}}}
+    assert jax.tree.structure(given) == jax.tree.structure(jax.eval_shape(constant.init, jax.random.key(0), jnp.zeros((1, 64, 6))))
+    windows = jax.random.normal(jax.random.key(1), (2, 64, 6), jnp.float32)
+    found = constant.apply(given, windows)
+    np.testing.assert_array_equal(found.displacement, plain.apply(variables, windows).displacement)
+    np.testing.assert_array_equal(found.log_std, [log_std, log_std])
+    frozen = models.freeze(constant, given)
+    np.testing.assert_allclose(models.Inference(constant)(frozen, windows).displacement, found.displacement, atol=1e-6)
