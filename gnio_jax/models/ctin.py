@@ -7,10 +7,9 @@ import jax.numpy as jnp
 from flax import linen as nn
 from jaxtyping import Bool, Float
 
-from gnio_jax.models.deepils import check_output_dim
 from gnio_jax.models.heads import to_axes
+from gnio_jax.models.layers import check_dropout, check_output_dim, layer_norm, linear
 from gnio_jax.models.resnet import batch_norm, conv, he_normal_fan_out
-from gnio_jax.models.tlio import check_dropout
 from gnio_jax.types import Prediction
 
 SPAN = 3
@@ -88,7 +87,7 @@ class SpatialEmbedding(nn.Module):
     @nn.compact
     def __call__(self, windows: Float[jax.Array, "b n c"], train: bool) -> Float[jax.Array, "b n d"]:
         x = batch_norm(train, "bn")(conv(self.width, 3, 1, train, "conv")(windows))
-        return _linear(self.width, "linear")(x)
+        return linear(self.width, "linear")(x)
 
 
 class SpatialEncoder(nn.Module):
@@ -125,13 +124,13 @@ class LocalAttention(nn.Module):
         key = nn.relu(batch_norm(train, "key_bn")(key_conv(x)))
         value = batch_norm(train, "value_bn")(conv(channels, 1, 1, train, "value_conv")(x))
         hidden = conv(channels // SQUEEZE, 1, 1, train, "hidden_conv")(jnp.concatenate([x, key], axis=-1))
-        scores = _linear(SPAN * channels, "weights")(nn.relu(batch_norm(train, "hidden_bn")(hidden)))
+        scores = linear(SPAN * channels, "weights")(nn.relu(batch_norm(train, "hidden_bn")(hidden)))
         weights = nn.softmax(scores.reshape(batch, samples, SPAN, channels), axis=2)
         context = jnp.sum(weights * _neighbours(value, SPAN), axis=2)
 
         both = jnp.stack([context, key], axis=1)
-        pooled = nn.relu(_linear(channels // SQUEEZE, "squeeze", use_bias=False)(both.sum(axis=1).mean(axis=1)))
-        shares = nn.softmax(_linear(2 * channels, "excite")(pooled).reshape(batch, 2, 1, channels), axis=1)
+        pooled = nn.relu(linear(channels // SQUEEZE, "squeeze", use_bias=False)(both.sum(axis=1).mean(axis=1)))
+        shares = nn.softmax(linear(2 * channels, "excite")(pooled).reshape(batch, 2, 1, channels), axis=1)
         return jnp.sum(shares * both, axis=1)
 
 
@@ -161,10 +160,10 @@ class DecoderLayer(nn.Module):
     def __call__(self, x: Float[jax.Array, "b n d"], memory: Float[jax.Array, "b n d"], train: bool) -> Float[jax.Array, "b n d"]:
         drop = nn.Dropout(self.dropout, deterministic=not train)
         causal = jnp.tril(jnp.ones((x.shape[1], x.shape[1]), bool))[None, None]
-        x = _layer_norm("self_norm")(x + drop(_attention(self.heads, "self")(x, mask=causal)))
-        x = _layer_norm("cross_norm")(x + drop(_attention(self.heads, "cross")(x, memory)))
-        y = _linear(x.shape[-1], "contract")(drop(nn.relu(_linear(self.ffn, "expand")(x))))
-        return _layer_norm("ffn_norm")(x + drop(y))
+        x = layer_norm("self_norm")(x + drop(_attention(self.heads, "self")(x, mask=causal)))
+        x = layer_norm("cross_norm")(x + drop(_attention(self.heads, "cross")(x, memory)))
+        y = linear(x.shape[-1], "contract")(drop(nn.relu(linear(self.ffn, "expand")(x))))
+        return layer_norm("ffn_norm")(x + drop(y))
 
 
 class SampleHead(nn.Module):
@@ -177,7 +176,7 @@ class SampleHead(nn.Module):
 
     @nn.compact
     def __call__(self, x: Float[jax.Array, "b n d"]) -> Float[jax.Array, "b n k"]:
-        return _linear(self.outputs, "output")(_layer_norm("norm")(_linear(x.shape[-1] // 2, "hidden")(x)))
+        return linear(self.outputs, "output")(layer_norm("norm")(linear(x.shape[-1] // 2, "hidden")(x)))
 
 
 def _root_mean_square(log_std: Float[jax.Array, "b n 3"]) -> Float[jax.Array, "b 3"]:
@@ -229,11 +228,3 @@ def _attend(
 
 def _attention(heads: int, name: str) -> nn.MultiHeadDotProductAttention:
     return nn.MultiHeadDotProductAttention(heads, dtype=jnp.float32, param_dtype=jnp.float32, attention_fn=_attend, name=name)
-
-
-def _layer_norm(name: str) -> nn.LayerNorm:
-    return nn.LayerNorm(epsilon=1e-5, dtype=jnp.float32, param_dtype=jnp.float32, name=name)
-
-
-def _linear(features: int, name: str, use_bias: bool = True) -> nn.Dense:
-    return nn.Dense(features, use_bias=use_bias, dtype=jnp.float32, param_dtype=jnp.float32, name=name)

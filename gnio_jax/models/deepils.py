@@ -8,8 +8,9 @@ from flax import linen as nn
 from jaxtyping import Float
 
 from gnio_jax.models.heads import ConstantUncertainty, to_axes
+from gnio_jax.models.layers import check_dropout, check_output_dim, linear
 from gnio_jax.models.resnet import BLOCKS_PER_GROUP, GROUP_STRIDES, batch_norm, conv, max_pool
-from gnio_jax.models.tlio import FullyConnectedHead, check_dropout
+from gnio_jax.models.tlio import FullyConnectedHead
 from gnio_jax.types import Prediction
 
 REDUCTION = 16
@@ -74,8 +75,8 @@ class ChannelAttention(nn.Module):
     def __call__(self, x: Float[jax.Array, "b n c"]) -> Float[jax.Array, "b n c"]:
         channels = x.shape[-1]
         pooled = jnp.stack([x.mean(axis=1), _maximum(x, 1)], axis=1)
-        hidden = nn.relu(_linear(max(channels // REDUCTION, 1), "squeeze")(pooled))
-        return x * nn.sigmoid(_linear(channels, "excite")(hidden).sum(axis=1, keepdims=True))
+        hidden = nn.relu(linear(max(channels // REDUCTION, 1), "squeeze", use_bias=False)(pooled))
+        return x * nn.sigmoid(linear(channels, "excite", use_bias=False)(hidden).sum(axis=1, keepdims=True))
 
 
 class TimeAttention(nn.Module):
@@ -85,12 +86,6 @@ class TimeAttention(nn.Module):
     def __call__(self, x: Float[jax.Array, "b n c"], train: bool) -> Float[jax.Array, "b n c"]:
         pooled = jnp.stack([x.mean(axis=-1), _maximum(x, 2)], axis=-1)
         return x * nn.sigmoid(conv(1, 7, 1, train, "conv")(pooled))
-
-
-def check_output_dim(output_dim: object) -> None:
-    """`ValueError` unless the network is asked for two axes or three."""
-    if output_dim not in (2, 3):
-        raise ValueError(f"output_dim must be 2 or 3, found {output_dim!r}")
 
 
 def _maximum(x: Float[jax.Array, "b n c"], axis: int) -> Float[jax.Array, "b k"]:
@@ -125,7 +120,3 @@ def _depthwise(channels: int, stride: int, name: str) -> nn.Conv:
         kernel_init=nn.initializers.variance_scaling(2.0, "fan_in", "normal"), dtype=jnp.float32, param_dtype=jnp.float32,
         conv_general_dilated=_convolve_depthwise, name=name,
     )
-
-
-def _linear(features: int, name: str) -> nn.Dense:
-    return nn.Dense(features, use_bias=False, dtype=jnp.float32, param_dtype=jnp.float32, name=name)

@@ -7,6 +7,8 @@ import jax.numpy as jnp
 from flax import linen as nn
 from jaxtyping import Float
 
+from gnio_jax.models.layers import linear
+
 GATES = {"tanh": jnp.tanh, "sigmoid": nn.sigmoid}
 SCALES = {
     "softplus": nn.softplus,
@@ -15,11 +17,6 @@ SCALES = {
     "exp": jnp.exp,
     "linear": lambda x: x,
 }
-
-
-def dense(name: str, **options: object) -> nn.Dense:
-    """A linear layer to three axes, in float32."""
-    return nn.Dense(3, dtype=jnp.float32, param_dtype=jnp.float32, name=name, **options)
 
 
 class GatedHead(nn.Module):
@@ -33,8 +30,8 @@ class GatedHead(nn.Module):
 
     @nn.compact
     def __call__(self, h: Float[jax.Array, "b d"]) -> tuple[Float[jax.Array, "b 3"], dict[str, jax.Array]]:
-        scale = SCALES[self.scale](dense("scale")(h))
-        gate = GATES[self.gate](dense("gate", kernel_init=nn.initializers.normal(1e-3))(h))
+        scale = SCALES[self.scale](linear(3, "scale")(h))
+        gate = GATES[self.gate](linear(3, "gate", kernel_init=nn.initializers.normal(1e-3))(h))
         return scale * gate, {"scale": scale, "gate": gate}
 
 
@@ -43,7 +40,7 @@ class LinearHead(nn.Module):
 
     @nn.compact
     def __call__(self, h: Float[jax.Array, "b d"]) -> tuple[Float[jax.Array, "b 3"], dict[str, jax.Array]]:
-        return dense("displacement")(h), {}
+        return linear(3, "displacement")(h), {}
 
 
 class UncertaintyHead(nn.Module):
@@ -51,7 +48,7 @@ class UncertaintyHead(nn.Module):
 
     @nn.compact
     def __call__(self, h: Float[jax.Array, "b d"]) -> Float[jax.Array, "b 3"]:
-        return dense("log_std")(h)
+        return linear(3, "log_std")(h)
 
 
 class ConstantUncertainty(nn.Module):

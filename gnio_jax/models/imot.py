@@ -7,9 +7,8 @@ import jax.numpy as jnp
 from flax import linen as nn
 from jaxtyping import Float
 
-from gnio_jax.models.deepils import check_output_dim
 from gnio_jax.models.heads import ConstantUncertainty, to_axes
-from gnio_jax.models.tlio import check_dropout
+from gnio_jax.models.layers import check_dropout, check_output_dim, layer_norm, linear
 from gnio_jax.types import Prediction
 
 TREND_SPANS = (9, 3)
@@ -110,9 +109,9 @@ class EncoderLayer(nn.Module):
         samples = x.shape[-1]
         e = Perceptron((samples, samples), name="positions")(x) * sinusoids(jnp.arange(x.shape[1], dtype=jnp.float32), samples)[None]
         y = _attention(self.heads, samples, samples, "attention")(x + e, x + e, x)
-        x = _layer_norm("attention_norm")(SpatialBlock(name="attention_spatial")(x) + drop(y))
+        x = layer_norm("attention_norm")(SpatialBlock(name="attention_spatial")(x) + drop(y))
         y = Perceptron((self.ffn, samples), name="ffn")(x)
-        return _layer_norm("ffn_norm")(SpatialBlock(name="ffn_spatial")(x) + drop(y)), e
+        return layer_norm("ffn_norm")(SpatialBlock(name="ffn_spatial")(x) + drop(y)), e
 
 
 class SpatialBlock(nn.Module):
@@ -126,9 +125,9 @@ class SpatialBlock(nn.Module):
         batch, tokens, samples = x.shape
         y = jnp.concatenate(jnp.split(x, MODALITIES, axis=1), axis=2)
         padded = jnp.pad(y, ((0, 0), (1, 1), (0, 0)))
-        y = _linear(2 * samples, "conv3")(jnp.concatenate([padded[:, :-2], y, padded[:, 2:]], axis=2))
+        y = linear(2 * samples, "conv3")(jnp.concatenate([padded[:, :-2], y, padded[:, 2:]], axis=2))
         y = y * nn.sigmoid(y.mean(axis=1, keepdims=True))
-        y = nn.gelu(_linear(2 * samples, "conv1")(y), approximate=False)
+        y = nn.gelu(linear(2 * samples, "conv1")(y), approximate=False)
         return jnp.concatenate(jnp.split(y, MODALITIES, axis=2), axis=1).reshape(batch, tokens, samples)
 
 
@@ -148,15 +147,15 @@ class DecoderLayer(nn.Module):
                  positions: Float[jax.Array, "b k n"], train: bool) -> Float[jax.Array, "b p n"]:
         drop = nn.Dropout(self.dropout, deterministic=not train)
         samples = content.shape[-1]
-        x = _layer_norm("self_norm")(content + drop(ParticleAttention(self.heads, name="self")(content, where)))
+        x = layer_norm("self_norm")(content + drop(ParticleAttention(self.heads, name="self")(content, where)))
         found = []
         for name, token, position in zip(("accel", "gyro"), jnp.split(tokens, MODALITIES, axis=1), jnp.split(positions, MODALITIES, axis=1),
                                          strict=True):
             attend = _attention(self.heads, 2 * samples, samples, name)
             y = attend(jnp.concatenate([x, where], axis=-1), jnp.concatenate([token, position], axis=-1), token)
-            found.append(_layer_norm(f"{name}_norm")(x + drop(y)))
+            found.append(layer_norm(f"{name}_norm")(x + drop(y)))
         x = Perceptron((samples, samples), name="fusion")(jnp.concatenate(found, axis=-1))
-        return _layer_norm("ffn_norm")(x + drop(Perceptron((self.ffn, samples), name="ffn")(x)))
+        return layer_norm("ffn_norm")(x + drop(Perceptron((self.ffn, samples), name="ffn")(x)))
 
 
 class ParticleAttention(nn.Module):
@@ -167,11 +166,11 @@ class ParticleAttention(nn.Module):
     @nn.compact
     def __call__(self, content: Float[jax.Array, "b p n"], where: Float[jax.Array, "b p n"]) -> Float[jax.Array, "b p n"]:
         features = content.shape[-1]
-        query, key = (_linear(features, f"{name}_content")(content) + _linear(features, f"{name}_position")(where)
+        query, key = (linear(features, f"{name}_content")(content) + linear(features, f"{name}_position")(where)
                       for name in ("query", "key"))
-        query, key, value = (x.reshape(*x.shape[:2], self.heads, -1) for x in (query, key, _linear(features, "value")(content)))
+        query, key, value = (x.reshape(*x.shape[:2], self.heads, -1) for x in (query, key, linear(features, "value")(content)))
         weights = nn.softmax(jnp.einsum("bphd,bqhd->bhpq", query, key) / jnp.sqrt(jnp.float32(features // self.heads)), axis=-1)
-        return _linear(features, "output")(jnp.einsum("bhpq,bqhd->bphd", weights, value).reshape(content.shape))
+        return linear(features, "output")(jnp.einsum("bhpq,bqhd->bphd", weights, value).reshape(content.shape))
 
 
 class Scores(nn.Module):
@@ -191,7 +190,7 @@ class Perceptron(nn.Module):
 
     @nn.compact
     def __call__(self, x: Float[jax.Array, "*b n"]) -> Float[jax.Array, "*b d"]:
-        return _linear(self.features[1], "output")(nn.relu(_linear(self.features[0], "hidden")(x)))
+        return linear(self.features[1], "output")(nn.relu(linear(self.features[0], "hidden")(x)))
 
 
 def decouple(channels: Float[jax.Array, "b c n"]) -> Float[jax.Array, "b k n"]:
@@ -239,11 +238,3 @@ def _attention(heads: int, inner: int, outer: int, name: str) -> nn.MultiHeadDot
     return nn.MultiHeadDotProductAttention(
         heads, qkv_features=inner, out_features=outer, dtype=jnp.float32, param_dtype=jnp.float32, name=name
     )
-
-
-def _layer_norm(name: str) -> nn.LayerNorm:
-    return nn.LayerNorm(epsilon=1e-5, dtype=jnp.float32, param_dtype=jnp.float32, name=name)
-
-
-def _linear(features: int, name: str) -> nn.Dense:
-    return nn.Dense(features, dtype=jnp.float32, param_dtype=jnp.float32, name=name)

@@ -8,8 +8,9 @@ from flax import linen as nn
 from jaxtyping import Float
 
 from gnio_jax.models.heads import ConstantUncertainty, to_axes
+from gnio_jax.models.layers import check_dropout, check_output_dim
 from gnio_jax.models.resnet import ResNet18
-from gnio_jax.models.tlio import FullyConnectedHead, check_dropout
+from gnio_jax.models.tlio import FullyConnectedHead
 from gnio_jax.types import Prediction
 
 
@@ -27,8 +28,7 @@ class RoNINResNet(nn.Module):
 
     def __post_init__(self) -> None:
         check_dropout(self.dropout)
-        if self.output_dim not in (2, 3):
-            raise ValueError(f"output_dim must be 2 or 3, found {self.output_dim!r}")
+        check_output_dim(self.output_dim)
         super().__post_init__()
 
     @nn.compact

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 from flax import linen as nn
 from jaxtyping import Float
 
+from gnio_jax.models.layers import check_dropout, linear
 from gnio_jax.models.resnet import ResNet18, batch_norm, conv
 from gnio_jax.types import Prediction
+
+SMALL = nn.initializers.normal(0.01)
 
 
 class FullyConnectedHead(nn.Module):
@@ -30,9 +31,9 @@ class FullyConnectedHead(nn.Module):
         x = batch_norm(train, "neck_bn")(conv(2 * self.width, 1, 1, train, "neck_conv")(features))
         x = x.transpose(0, 2, 1).reshape(x.shape[0], -1)
         for name in ("fc1", "fc2"):
-            x = nn.relu(_linear(8 * self.width, name)(x))
+            x = nn.relu(linear(8 * self.width, name, kernel_init=SMALL)(x))
             x = nn.Dropout(self.dropout, deterministic=not train)(x)
-        return _linear(self.outputs, "fc3")(x)
+        return linear(self.outputs, "fc3", kernel_init=SMALL)(x)
 
 
 class TLIO(nn.Module):
@@ -55,13 +56,3 @@ class TLIO(nn.Module):
         displacement, log_std = (FullyConnectedHead(self.width, 3, self.dropout, name=name)(features, train)
                                  for name in ("displacement", "log_std"))
         return Prediction(displacement, log_std)
-
-
-def check_dropout(share: Any) -> None:
-    """`ValueError` unless it is a share that leaves something."""
-    if not 0 <= share < 1:
-        raise ValueError(f"dropout must be at least 0 and below 1, found {share!r}")
-
-
-def _linear(features: int, name: str) -> nn.Dense:
-    return nn.Dense(features, kernel_init=nn.initializers.normal(0.01), dtype=jnp.float32, param_dtype=jnp.float32, name=name)

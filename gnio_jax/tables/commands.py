@@ -230,13 +230,12 @@ def make_standing(options: TablesConfig, console: Console) -> None:
 
 def _activities(by_method: dict[str, dict[str, dict[str, float]]]) -> str:
     header = ["network", "windows of", "n", "rms error m", "error / σ, rms", "median length m", "median gate", "median scale"]
-    lines = ["| " + " | ".join(header) + " |", "|" + " --- |" * len(header)]
+    table = []
     for method, found in by_method.items():
         for activity, figures in found.items():
-            cells = [method, activity, f"{figures['windows']:.0f}", *(f"{figures[key]:.3f}" if key in figures else "–"
-                                                                       for key in ("error", "normalised", "length", "gate", "scale"))]
-            lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join(lines) + "\n"
+            numbers = (f"{figures[key]:.3f}" if key in figures else "–" for key in ("error", "normalised", "length", "gate", "scale"))
+            table.append([method, activity, f"{figures['windows']:.0f}", *numbers])
+    return summary.grid(header, table)
 
 
 def notes(base: TrainConfig, options: TablesConfig, experiment: Experiment) -> list[str]:

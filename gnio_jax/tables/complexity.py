@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gnio_jax import models
+from gnio_jax.tables.summary import grid
 
 # Parameters in millions and the column "GFLOPs" as the paper prints them.
 PUBLISHED = {"tlio": (5.42, 0.08), "deepils": (2.29, 0.03), "ctin": (0.56, 7.27), "imot": (14.49, 7.79), "gnio": (4.90, 0.08)}
@@ -63,11 +64,9 @@ def markdown(found: list[Complexity], device: str) -> str:
     batches = list(found[0].latency)
     header = ["", "parameters", "GFLOP / window", *(f"ms / window, batch {batch}" for batch in batches), "paper: parameters",
               "paper: \"GFLOPs\""]
-    lines = ["## Complexity", "", f"One window of 200 samples, float32, on {device}. {NOTE}", "",
-             "| " + " | ".join(header) + " |", "|" + " --- |" * len(header)]
+    table = []
     for row in found:
         published = PUBLISHED.get(row.network)
-        cells = [row.network, f"{row.parameters:,}", f"{row.gflops:.3f}", *(f"{row.latency[batch]:.2f}" for batch in batches),
-                 f"{published[0]:.2f} M" if published else "–", f"{published[1]:.2f}" if published else "–"]
-        lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join(lines) + "\n"
+        table.append([row.network, f"{row.parameters:,}", f"{row.gflops:.3f}", *(f"{row.latency[batch]:.2f}" for batch in batches),
+                      f"{published[0]:.2f} M" if published else "–", f"{published[1]:.2f}" if published else "–"])
+    return f"## Complexity\n\nOne window of 200 samples, float32, on {device}. {NOTE}\n\n" + grid(header, table)

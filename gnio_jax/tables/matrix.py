@@ -72,9 +72,8 @@ def train(config: configuration.TrainConfig, console: Console) -> None:
 
 def evaluated(workdir: Path, split: str, estimator: str, console: Console) -> dict[str, Any]:
     """The figures of the run's best checkpoint on a split: those that are there if they are of that checkpoint, else new ones."""
-    trained = configuration.load(workdir / "config.yaml")
-    config = EvaluateConfig(str(workdir), split=split, estimator=estimator, plots=False, filter=trained.filter)  # type: ignore[arg-type]
-    path = evaluation_folder(workdir, split, estimator) / "metrics.json"
+    config, folder = _evaluation(workdir, split, estimator)
+    path = folder / "metrics.json"
     best = workdir / "checkpoints" / "best"
     if path.exists():
         found = json.loads(path.read_text(encoding="utf-8"))
@@ -85,16 +84,16 @@ def evaluated(workdir: Path, split: str, estimator: str, console: Console) -> di
     return json.loads(path.read_text(encoding="utf-8"))
 
 
-def evaluation_folder(workdir: Path, split: str, estimator: str) -> Path:
-    """Where `evaluated` leaves its files."""
+def _evaluation(workdir: Path, split: str, estimator: str) -> tuple[EvaluateConfig, Path]:
+    """How `evaluated` evaluates a run, and the folder where that leaves its files."""
     trained = configuration.load(workdir / "config.yaml")
-    config = EvaluateConfig(str(workdir), split=split, estimator=estimator, filter=trained.filter)  # type: ignore[arg-type]
-    return workdir / "eval" / folder_name(config, trained.dataset, trained)
+    config = EvaluateConfig(str(workdir), split=split, estimator=estimator, plots=False, filter=trained.filter)  # type: ignore[arg-type]
+    return config, workdir / "eval" / folder_name(config, trained.dataset, trained)
 
 
 def paths(result: Result, split: str, estimator: str) -> dict[str, tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]]]:
     """Reference and the first seed's estimate of each sequence seen from above, m, the estimate laid on by start position and yaw."""
-    folder = evaluation_folder(result.runs[0], split, estimator)
+    _, folder = _evaluation(result.runs[0], split, estimator)
     names = list(result.figures[0]["sequences"])
     found = {}
     for name, stem in zip(names, report.file_names(names), strict=True):

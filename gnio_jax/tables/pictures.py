@@ -9,16 +9,16 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from gnio_jax.evaluation import plots
+from gnio_jax.evaluation.plots import BLUE, GREEN, GREY, VERMILION
 from gnio_jax.files import replacing
 from gnio_jax.tables.experiments import Experiment
 from gnio_jax.tables.matrix import Result
 from gnio_jax.tables.summary import Row, errors
 from gnio_jax.tables.windows import ACTIVITIES, Said
 
-BLUE, VERMILION, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#8C8C8C"
 COLOURS = {"tlio": BLUE, "gnio": GREEN, "ronin_resnet": "#E69F00", "deepils": "#CC79A7", "ctin": VERMILION, "imot": "#56B4E9",
            "imot_text": "#F0E442"}
 """TLIO blue and GNIO green, as in the paper's figure."""
@@ -27,9 +27,8 @@ OTHERS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 
 def save(path: Path, figure: Figure) -> None:
     """Write one figure as PNG, whole or not at all."""
-    FigureCanvasAgg(figure)
     with replacing(path) as temporary:
-        figure.savefig(temporary, dpi=120, format="png")
+        plots.save(temporary, figure)
 
 
 def table(experiment: Experiment, results: list[Result], found: list[Row]) -> Figure:

@@ -91,7 +91,7 @@ def markdown(experiment: Experiment, found: list[Row], notes: list[str]) -> str:
     extra = list(dict.fromkeys(name for row in found for name in row.extra))
     metrics = [metric for metric in COLUMNS if any(metric in row.seeds for row in found)]
     header = ["", *(COLUMNS[metric] for metric in metrics), *extra, "gain", "difference of ate, m (95 %)", "published m", "its gain"]
-    lines = [f"## {experiment.title}", "", *notes, "", _line(header), _line(["---"] * len(header))]
+    table = []
     for row in found:
         cells = [_with_spread(row.seeds[metric]) if metric in row.seeds else "–" for metric in metrics]
         cells += [f"{row.extra[name]:.3g}" if name in row.extra else "–" for name in extra]
@@ -99,12 +99,13 @@ def markdown(experiment: Experiment, found: list[Row], notes: list[str]) -> str:
         between = f" ({row.interval[0]:+.2f} to {row.interval[1]:+.2f})" if row.interval else ""
         cells += [arrow(row.gain) if compared else "", f"{row.difference:+.2f}{between}" if compared else "",
                   "–" if row.published is None else f"{row.published:.2f}", arrow(row.published_gain) if compared else ""]
-        lines.append(_line([row.label, *cells]))
-    return "\n".join(lines) + "\n"
+        table.append([row.label, *cells])
+    return "\n".join([f"## {experiment.title}", "", *notes, ""]) + "\n" + grid(header, table)
 
 
-def _line(cells: list[str]) -> str:
-    return "| " + " | ".join(cells) + " |"
+def grid(header: list[str], table: list[list[str]]) -> str:
+    """Cells as a Markdown table."""
+    return "".join(f"| {' | '.join(cells)} |\n" for cells in [header, ["---"] * len(header), *table])
 
 
 def _with_spread(values: list[float]) -> str:

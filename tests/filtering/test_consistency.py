@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiling import quick
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 from walks import errors, simulate
@@ -16,7 +17,6 @@ from gnio_jax.filtering.propagation import interval
 from gnio_jax.filtering.state import CLONE, MOVE, OFFSET, THETA, VELOCITY, covariance
 from gnio_jax.filtering.update import displacement_residual, retract
 
-quick = functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})  # for what runs once
 RUNS, INTERVALS, N, CLONES, DT, SIGMA = 64, 600, 10, 10, 0.01, 0.03
 NOISE = filtering.NoiseModel(5e-4, 5e-3, 1e-6, 2e-5)
 PARTS = {"tilt": [0, 1], "yaw": [2], "velocity": [3, 4, 5], "position": [6, 7, 8], "gyro bias": [9, 10, 11], "accel bias": [12, 13, 14]}

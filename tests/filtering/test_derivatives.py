@@ -6,14 +6,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiling import quick
 from test_run_odometry import CLONES, DT, INTERVALS, PARAMETERS, WEIGHTS, N, central, recording, start
 
 from gnio_jax import filtering
 from gnio_jax.filtering.scekf import checkpointed_scan
 from gnio_jax.types import Prediction
 
-# Compiling is what these tests cost: without the optimiser it takes half the time, and a short run is as quick.
-jit = functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
 MEASURED = 0.1 * np.random.default_rng(4).standard_normal((INTERVALS, 3))
 PLAIN = filtering.FilterConfig(DT, N, CLONES)
 
@@ -42,8 +41,8 @@ def point(measured=MEASURED):
     return dict(noise=np.zeros(4), std=np.zeros(6), state=np.zeros(12), measured=measured, gyro=gyro, accel=accel)
 
 
-GRADIENT = jit(jax.value_and_grad(loss))
-RUN = jit(filtering.run_filter, static_argnums=5)
+GRADIENT = quick(jax.value_and_grad(loss))
+RUN = quick(filtering.run_filter, static_argnums=5)
 
 
 def test_gradient_against_differences():
@@ -67,13 +66,13 @@ def test_gradient_against_differences():
 def test_jvp_against_differences_and_vmap_of_grad_against_jvp():
     rng = np.random.default_rng(0)
     direction = jax.tree.map(lambda x: rng.standard_normal(x.shape), point())
-    along = jit(lambda x, d: jax.jvp(loss, (x,), (d,)))
+    along = quick(lambda x, d: jax.jvp(loss, (x,), (d,)))
     step = 1e-6
     ahead, behind = (float(along(jax.tree.map(lambda x, d, h=h: x + h * d, point(), direction), direction)[0]) for h in (step, -step))
     np.testing.assert_allclose(along(point(), direction)[1], (ahead - behind) / (2 * step), rtol=1e-5)
 
     points = [point(), point(MEASURED + 0.02), point(-MEASURED)]
-    many = jit(jax.vmap(jax.grad(loss)))(jax.tree.map(lambda *leaves: np.stack(leaves), *points))
+    many = quick(jax.vmap(jax.grad(loss)))(jax.tree.map(lambda *leaves: np.stack(leaves), *points))
     for index, one in enumerate(points):
         inner = sum(np.sum(g[index] * d) for g, d in zip(jax.tree.leaves(many), jax.tree.leaves(direction), strict=True))
         np.testing.assert_allclose(inner, along(one, direction)[1], rtol=1e-8)
@@ -93,14 +92,25 @@ def test_checkpoints_change_nothing(every):
     rng = np.random.default_rng(2)
     arguments = jnp.array([0.3, -0.2]), {"turn": 0.3 * rng.standard_normal((13, 2, 2)), "push": 0.3 * rng.standard_normal((13, 2))}
     ours = functools.partial(value, functools.partial(checkpointed_scan, every=every))
-    found, wanted = (jit(jax.value_and_grad(function, (0, 1)))(*arguments) for function in (ours, functools.partial(value, jax.lax.scan)))
+    found, wanted = (quick(jax.value_and_grad(function, (0, 1)))(*arguments) for function in (ours, functools.partial(value, jax.lax.scan)))
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12), found, wanted)
     text = str(jax.make_jaxpr(jax.grad(ours))(*arguments))
     assert ("remat" in text or "checkpoint" in text) == (0 < every < 13)
 
 
+def test_checkpoints_bound_the_memory():
+    def temporary(every):
+        def value(start):
+            carry, out = checkpointed_scan(lambda x, push: (jnp.tanh(x @ x) + push, x[0, 0]), start, jnp.ones(1040), every)
+            return jnp.sum(carry) + jnp.sum(out)
+
+        return jax.jit(jax.grad(value)).lower(jnp.zeros((20, 20))).compile().memory_analysis().temp_size_in_bytes
+
+    assert temporary(32) < temporary(0) / 4
+
+
 # One program for all of it, since compiling is what these tests cost; the hard gate's rejection is tested with the update.
-HOSTILE = jit(jax.value_and_grad(functools.partial(loss, config=filtering.FilterConfig(
+HOSTILE = quick(jax.value_and_grad(functools.partial(loss, config=filtering.FilterConfig(
     DT, N, CLONES, convergence_seconds=0.1, zero_velocity_std=0.01, rest_seconds=0.1, gate_softness=2.0, gate_threshold=8.0))))
 
 
@@ -173,7 +183,7 @@ def test_gradient_reaches_the_network():
     config = filtering.FilterConfig(DT, N, CLONES, checkpoint_every=INTERVALS // 2)
     assert INTERVALS % 2 == 0  # no step is left over, which would be compiled once more
 
-    @jit
+    @quick
     @jax.value_and_grad
     def value(parameters, share):
         def network(windows):

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiling import quick
 from scipy.spatial.transform import Rotation
 from walks import errors, simulate
 
@@ -113,11 +114,6 @@ def most_probable(start, gyro, accel, measurements, stops):
     return x[1:], np.stack([blocks[k, :, k] for k in range(1, len(x))])
 
 
-def quickly(function, *arguments):
-    """`jax.jit` of it, in half the time of compiling, which is longer than that of running."""
-    return jax.jit(function).lower(*arguments).compile({"xla_backend_optimization_level": 0})
-
-
 def rows_of(history):
     return [tuple(np.asarray(part)[k] for part in history[:5]) for k in range(len(history.position))]
 
@@ -146,7 +142,7 @@ def test_equals_least_squares_over_all_states(case):
         return filtering.run_filter(*arguments, config, NOISE)[1], filtering.smooth(*arguments, config, NOISE)
 
     # What "rejected" compiles serves the tests below, too.
-    filtered, smoothed = (both if case == "rejected" else quickly(both, *arguments))(*arguments)
+    filtered, smoothed = (both if case == "rejected" else quick(both))(*arguments)
 
     weight = np.asarray(filtered.gate_passed)
     present, stops = np.flatnonzero(np.isfinite(weight)), np.flatnonzero(filtered.at_rest)
@@ -267,7 +263,7 @@ def test_gradient():
         return (smoothed.position[5, 0] - start[2][0]) / SMALL + smoothed.covariance_diagonal[6, 4] / SMALL**2
 
     x = np.array([0.1, 0.2])
-    loss = quickly(jax.value_and_grad(loss), x)
+    loss = quick(jax.value_and_grad(loss))
     value, gradient = loss(x)
     assert np.isfinite(value) and (np.abs(gradient) > 1e-3).all()
     steps = 1e-3 * np.eye(2)

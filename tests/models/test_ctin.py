@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiling import quick
 
 from gnio_jax import models
 from gnio_jax.models import ctin
@@ -19,11 +20,6 @@ def count(tree):
 def shapes(samples=200, **options):
     model = models.create("ctin", **options)
     return jax.eval_shape(model.init, jax.random.key(0), jax.ShapeDtypeStruct((1, samples, 6), jnp.float32))
-
-
-def compiled(function):
-    """Compiled without optimising, which is what takes the time here."""
-    return jax.jit(function, compiler_options={"xla_backend_optimization_level": 0})
 
 
 def drawn(tree, seed=3):
@@ -161,7 +157,7 @@ def test_forward_against_numpy_frozen_or_not(samples, output_dim):
     model = models.create("ctin", output_dim=output_dim, **SMALL)
     variables = drawn(shapes(samples, output_dim=output_dim, **SMALL))
     windows = jax.random.normal(jax.random.key(1), (2, samples, 6), jnp.float32)
-    apply, (velocity, log_std) = compiled(model.apply), numpy_forward(variables, windows)
+    apply, (velocity, log_std) = quick(model.apply), numpy_forward(variables, windows)
     missing = ((0, 0), (0, 0), (0, 3 - output_dim))
     velocity, log_std = np.pad(velocity, missing), np.pad(log_std, missing)
     for values in (velocity, log_std):  # windows and steps are told apart
@@ -202,7 +198,7 @@ def test_a_decoded_step_depends_on_no_later_one():
     layer = ctin.DecoderLayer(2, 10, 0.0)
     keys = jax.random.split(jax.random.key(0), 4)
     x, memory = (jax.random.normal(key, (1, 9, 12), jnp.float32) for key in keys[:2])
-    apply = compiled(lambda v, x, memory: layer.apply(v, x, memory, False))
+    apply = quick(lambda v, x, memory: layer.apply(v, x, memory, False))
     variables = drawn(jax.eval_shape(lambda k: layer.init(k, x, memory, False), keys[2]))
     still, changed = apply(variables, x, memory), apply(variables, x.at[:, 5].add(1.0), memory)
     np.testing.assert_array_equal(still[:, :5], changed[:, :5])
@@ -229,7 +225,7 @@ def test_every_parameter_is_trained_in_float32_and_dropout_is_drawn():
         velocity = jnp.sum((d["velocity"] - 1) ** 2, axis=(1, 2)) * jnp.exp(-2 * task[:, 0])
         return jnp.sum(prediction.log_std) + jnp.sum(velocity) + jnp.sum(task), prediction.displacement
 
-    gradient = compiled(jax.grad(loss, has_aux=True))
+    gradient = quick(jax.grad(loss, has_aux=True))
     (grads, one), (others, other) = (gradient(variables["params"], jax.random.key(seed)) for seed in (0, 1))
     for (path, leaf), another in zip(jax.tree.leaves_with_path(grads), jax.tree.leaves(others), strict=True):
         assert leaf.dtype == jnp.float32 and bool(jnp.isfinite(leaf).all()), path

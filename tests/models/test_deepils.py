@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiling import quick
 
 from gnio_jax import models
 from gnio_jax.models import deepils
@@ -17,11 +18,6 @@ def count(tree):
 def shapes(samples=200, **options):
     model = models.create("deepils", **options)
     return jax.eval_shape(model.init, jax.random.key(0), jax.ShapeDtypeStruct((1, samples, 6), jnp.float32))
-
-
-def compiled(function):
-    """Compiled without optimising, which is what takes the time here."""
-    return jax.jit(function, compiler_options={"xla_backend_optimization_level": 0})
 
 
 def drawn(samples, seed=3, **options):
@@ -118,7 +114,7 @@ def test_forward_against_numpy_frozen_or_not(samples, output_dim):
     model = models.create("deepils", width=8, output_dim=output_dim)
     variables = drawn(samples, width=8, output_dim=output_dim)
     windows = jax.random.normal(jax.random.key(1), (2, samples, 6), jnp.float32)
-    apply, wanted = compiled(model.apply), numpy_forward(variables, windows)
+    apply, wanted = quick(model.apply), numpy_forward(variables, windows)
     found = apply(variables, windows)
     assert np.ptp(wanted, axis=0).min() > 1e-2  # the windows are told apart
     np.testing.assert_allclose(found.displacement[:, :output_dim], wanted, rtol=2e-4, atol=2e-5)
@@ -145,7 +141,7 @@ def test_every_parameter_is_trained_in_float32_and_dropout_is_drawn():
         prediction, changed = model.apply(given, windows, train=True, mutable=["batch_stats"], rngs={"dropout": key})
         return jnp.sum(prediction.displacement**2), (prediction.displacement, changed)
 
-    gradient = compiled(jax.grad(loss, has_aux=True))
+    gradient = quick(jax.grad(loss, has_aux=True))
     (grads, (one, changed)), (others, (other, _)) = (gradient(variables["params"], jax.random.key(seed)) for seed in (0, 1))
     for (path, leaf), another in zip(jax.tree.leaves_with_path(grads), jax.tree.leaves(others), strict=True):
         assert leaf.dtype == jnp.float32 and bool(jnp.isfinite(leaf).all()), path

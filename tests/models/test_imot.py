@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiling import quick
 from scipy.special import erf
 
 from gnio_jax import models
@@ -20,11 +21,6 @@ def count(tree):
 def shapes(samples=200, name="imot", **options):
     model = models.create(name, **options)
     return jax.eval_shape(model.init, jax.random.key(0), jax.ShapeDtypeStruct((1, samples, 6), jnp.float32))
-
-
-def compiled(function):
-    """Compiled without optimising, which is what takes the time here."""
-    return jax.jit(function, compiler_options={"xla_backend_optimization_level": 0})
 
 
 def drawn(tree, seed=3):
@@ -189,7 +185,7 @@ def test_forward_against_numpy(samples, output_dim):
     model = models.create("imot", output_dim=output_dim, **SMALL)
     variables = drawn(shapes(samples, output_dim=output_dim, **SMALL))
     windows = jax.random.normal(jax.random.key(1), (2, samples, 6), jnp.float32)
-    found = compiled(model.apply)(variables, windows)
+    found = quick(model.apply)(variables, windows)
     velocity, particles, weights = numpy_forward(variables, windows, heads=4 if samples == 20 else 2)
     assert np.ptp(velocity, axis=0).min() > 0.02 and np.ptp(weights, axis=0).max() > 1e-3  # the windows are told apart
     np.testing.assert_allclose(found.diagnostics["particles"], particles, rtol=1e-3, atol=2e-4)
@@ -211,7 +207,7 @@ def test_every_parameter_that_can_be_is_trained_in_float32_and_dropout_is_drawn(
         prediction, _ = model.apply(given, windows, train=True, mutable=["batch_stats"], rngs={"dropout": key})
         return jnp.sum((prediction.displacement - 1) ** 2), prediction.displacement
 
-    gradient = compiled(jax.grad(loss, has_aux=True))
+    gradient = quick(jax.grad(loss, has_aux=True))
     (grads, one), (others, other) = (gradient(variables["params"], jax.random.key(seed)) for seed in (0, 1))
     for (path, leaf), another in zip(jax.tree.leaves_with_path(grads), jax.tree.leaves(others), strict=True):
         assert leaf.dtype == jnp.float32 and bool(jnp.isfinite(leaf).all()), path
