@@ -35,9 +35,10 @@ def main() -> None:
 
     from rich.console import Console
 
-    from gnio_jax import evaluation  # after the options: --help and mistakes should not wait for the imports
+    from gnio_jax import evaluation, filtering  # after the options: --help and mistakes should not wait for the imports
     from gnio_jax.evaluation import report
 
+    filtering.cores_as_devices()
     with cli.progress() as progress:
         found, folder = evaluation.evaluate(config, progress)
     console = Console(highlight=False)

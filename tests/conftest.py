@@ -13,6 +13,7 @@ import pytest  # noqa: E402
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
+jax.config.update("jax_num_cpu_devices", 2)  # what is shared out among devices is so on every machine
 
 
 @pytest.fixture(scope="session")

@@ -68,9 +68,17 @@ def test_rows_differ_in_the_network_alone(make):
     assert len(set(map(str, seen.values()))) == len(seen)
 
 
+def test_remedies_change_the_uncertainty_alone():
+    published, likelihood, constant = (cell.config for cell in experiments.remedies(BASE).cells)
+    assert (published.loss.nll_weight, likelihood.loss.nll_weight) == (1e-4, 1.0)
+    assert dataclasses.replace(likelihood, loss=published.loss) == published
+    assert constant.model.uncertainty == "constant" and create_model(constant) is not None
+    assert dataclasses.replace(constant, model=published.model) == published
+
+
 def test_cells_of_one_name_are_one_run_in_every_table():
     made = [cell for table in (experiments.components(BASE), experiments.gates(BASE), experiments.bank_sizes(BASE),
-                               experiments.comparison(BASE, "test")) for cell in table.cells]
+                               experiments.remedies(BASE), experiments.comparison(BASE, "test")) for cell in table.cells]
     by_name = {}
     for cell in made:
         assert by_name.setdefault(cell.name, cell.config) == cell.config

@@ -26,7 +26,17 @@ from gnio_jax.config import DataConfig, FilterOptions
 from gnio_jax.data.sequence import cumulative_rotation
 from gnio_jax.data.windows import WindowSource, gather
 from gnio_jax.evaluation.metrics import Trajectory, finite_rows, rotation_z
-from gnio_jax.filtering import FilterConfig, FilterHistory, InitialStd, NoiseModel, initial_state, level_state, run_filter, run_odometry
+from gnio_jax.filtering import (
+    FilterConfig,
+    FilterHistory,
+    InitialStd,
+    NoiseModel,
+    initial_state,
+    level_state,
+    over_sequences,
+    run_filter,
+    run_odometry,
+)
 from gnio_jax.types import Array, InputError, Prediction, Sequence
 
 Estimator = Literal["ekf", "integrate", "imu_only"]
@@ -333,7 +343,7 @@ def _run_tight(apply: Callable, variables: Any, start: _Start, gyro: Any, accel:
         state = initial_state(config, **start._asdict())
         return _lean_history(run_odometry(lambda windows: _lean(apply(variables, windows)), state, gyro, accel, config, noise)[1])
 
-    return jax.vmap(one)(start, gyro, accel)
+    return over_sequences(one)(start, gyro, accel)
 
 
 @functools.partial(jax.jit, static_argnames="config")
@@ -343,7 +353,7 @@ def _run_given(start: _Start, gyro: Any, accel: Any, displacement: Any, std_of_i
         covariance = jax.vmap(jnp.diag)(std_of_it**2)
         return _lean_history(run_filter(initial_state(config, **start._asdict()), gyro, accel, displacement, covariance, config, noise)[1])
 
-    return jax.vmap(one)(start, gyro, accel, displacement, std_of_it)
+    return over_sequences(one)(start, gyro, accel, displacement, std_of_it)
 
 
 def _lean(prediction: Prediction, keep: tuple[str, ...] = _KEPT) -> Prediction:

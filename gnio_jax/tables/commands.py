@@ -18,6 +18,7 @@ from gnio_jax import cli, models
 from gnio_jax import config as configuration
 from gnio_jax.config import TrainConfig
 from gnio_jax.files import replacing
+from gnio_jax.filtering import cores_as_devices
 from gnio_jax.tables import complexity, experiments, matrix, summary, windows
 from gnio_jax.tables.experiments import Experiment
 from gnio_jax.tables.matrix import Interrupted, Result
@@ -31,13 +32,14 @@ rate and augmentation, each network with its own published loss.
   python -m gnio_jax.tables components --base configs/gnio_oxiod_small.yaml --data-root DIR --split sessions_test
   python -m gnio_jax.tables gates --base ... [--epochs 3]                    gate and scale functions, norms of their gradients
   python -m gnio_jax.tables bank-size --base ...                             size of the Motion Bank, entropy of its attention
+  python -m gnio_jax.tables uncertainty --base ...                           what makes GNIO's uncertainty fit for the filter
   python -m gnio_jax.tables trajectories --base ... [--sequences A,B]        all methods over the reference, in one picture
   python -m gnio_jax.tables standing --base ...                              errors at rest and in slow walking, gate and attention
 
 Runs are kept below OUT/runs and shared by the tables: a command that was interrupted goes on where it stopped, one that is
 finished only writes its summary anew. Results: OUT/<table>_<split>_<estimator>.md, .csv and .png."""
 
-Table = Literal["complexity", "comparison", "components", "gates", "bank-size", "trajectories", "standing"]
+Table = Literal["complexity", "comparison", "components", "gates", "bank-size", "uncertainty", "trajectories", "standing"]
 
 
 @dataclass(frozen=True)
@@ -45,7 +47,7 @@ class TablesConfig:
     """What `python -m gnio_jax.tables` is asked for."""
 
     table: tyro.conf.Positional[Table]
-    """complexity, comparison, components, gates, bank-size, trajectories or standing."""
+    """complexity, comparison, components, gates, bank-size, uncertainty, trajectories or standing."""
     base: str = "configs/quickstart.yaml"
     """Config whose recordings, budget and augmentation every row has (not for complexity)."""
     data_root: str | None = None
@@ -72,6 +74,7 @@ def main(argv: Arguments[str] | None = None) -> None:
     """Parse the options and make the table."""
     jax.config.update("jax_enable_x64", True)  # for the filter; training and the networks state their float32
     options = cli.parse(TablesConfig, description=DESCRIPTION, argv=argv, prog="python -m gnio_jax.tables")
+    cores_as_devices()
     console = Console(highlight=False, soft_wrap=True)
     try:
         {"complexity": make_complexity, "trajectories": make_trajectories, "standing": make_standing}.get(options.table, make_table)(
@@ -115,6 +118,8 @@ def experiment_of(options: TablesConfig, base: TrainConfig) -> Experiment:
             return experiments.gates(base)
         case "bank-size":
             return experiments.bank_sizes(base)
+        case "uncertainty":
+            return experiments.remedies(base)
         case _:
             return experiments.comparison(base, options.split, networks(options))
 
@@ -126,7 +131,7 @@ def results_of(experiment: Experiment, options: TablesConfig, console: Console) 
 
 
 def make_table(options: TablesConfig, console: Console) -> None:
-    """comparison, components, gates, bank-size."""
+    """comparison, components, gates, bank-size, uncertainty."""
     from gnio_jax.tables import pictures
 
     base = base_config(options)

@@ -117,3 +117,14 @@ def bank_sizes(base: TrainConfig) -> Experiment:
         config = variant(base, head="linear") if size == 64 else variant(base, head="linear", bank_size=size)
         cells.append(Cell(name, f"m = {size}", config, published))
     return Experiment("Bank size", "paper, size of the bank: RMSE on TLIO's set, with the linear head", cells)
+
+
+def remedies(base: TrainConfig) -> Experiment:
+    """What makes GNIO's uncertainty fit for the filter: the likelihood weighted like the squared error from the start, or one constant
+    per axis from the validation split in place of the head."""
+    usual = method("gnio", base)
+    return Experiment("Uncertainty", "no published figure: the paper has its own head alone, at λ_NLL = 1e-4", [
+        Cell("gnio", "gnio, as published", usual),
+        Cell("gnio_nll-1", "likelihood weighted by 1", dataclasses.replace(usual, loss=dataclasses.replace(usual.loss, nll_weight=1.0))),
+        Cell("gnio_constant", "one constant per axis", variant(base, uncertainty="constant")),
+    ])

@@ -105,7 +105,8 @@ def gradient_norms(gradient: Any) -> dict[str, Float[jax.Array, ""]]:
     for path, leaf in jax.tree_util.tree_leaves_with_path(gradient):
         names = [str(entry.key) for entry in path]
         part = "/".join(names[: 2 if names[0] == "head" else 1])
-        squares[part] = squares.get(part, jnp.float32(0)) + jnp.sum(leaf**2)
+        square = jnp.sum(leaf**2)
+        squares[part] = squares[part] + square if part in squares else square
     return {part: jnp.sqrt(square) for part, square in squares.items()}
 
 

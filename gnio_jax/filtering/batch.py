@@ -1,0 +1,56 @@
+"""Many sequences at once: vmapped, and the batch shared out among the devices of the machine."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from typing import TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, PartitionSpec
+
+T = TypeVar("T")
+
+
+def over_sequences(function: Callable[..., T], shared: int = 0) -> Callable[..., T]:
+    """`jax.vmap(function)` whose sequences are shared out among all devices; to be jitted, and differentiable like it.
+
+    The first `shared` arguments (parameters, noise) are the same for every sequence; the leaves of all others, and of the
+    result, have the sequences as their leading axis. A number of sequences that does not divide evenly is filled up with the
+    last one, whose additional results are dropped. With one device, or one sequence, it is `jax.vmap`. Arguments must not be bound
+    to a device by `jax.device_put(x, device)`: JAX refuses those (ValueError).
+
+    On a machine without a GPU JAX sees one device however many cores there are, and the filter's operations are too small for
+    XLA to split each among cores: call `cores_as_devices` first.
+    """
+
+    def mapped(*arguments: object) -> T:
+        own = arguments[shared:]
+        count = jax.tree.leaves(own)[0].shape[0]
+        devices = jax.devices()[:count]
+        batched = jax.vmap(function, in_axes=(None,) * shared + (0,) * len(own))
+        if len(devices) == 1:
+            return batched(*arguments)
+        filling = -count % len(devices)
+        filled = jax.tree.map(lambda x: jnp.concatenate([jnp.asarray(x), jnp.repeat(x[-1:], filling, axis=0)]) if filling else x, own)
+        every, each = PartitionSpec(), PartitionSpec("sequence")
+        spread = jax.shard_map(batched, mesh=Mesh(np.array(devices), ("sequence",)), in_specs=(every,) * shared + (each,) * len(own),
+                               out_specs=each, check_vma=False)  # fmt: skip
+        return jax.tree.map(lambda x: x[:count], spread(*arguments[:shared], *filled))
+
+    return mapped
+
+
+def cores_as_devices() -> None:
+    """Let JAX see every core that this process may use as a device of its own, unless a number of CPU devices is set already.
+
+    Programs that do not spread anything go on running on the first device, with all cores. Raises RuntimeError after JAX's
+    first computation, when the devices are settled.
+    """
+    given = jax.config.jax_num_cpu_devices  # pyright: ignore[reportAttributeAccessIssue] — JAX makes its settings when it is imported
+    if given >= 0 or "xla_force_host_platform_device_count" in os.environ.get("XLA_FLAGS", ""):
+        return
+    count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    jax.config.update("jax_num_cpu_devices", count or 1)
