@@ -1,10 +1,12 @@
-"""IMU samples per second of the stochastic-cloning EKF: alone and vmapped, beside a plain NumPy filter, over rates of cloning and windows.
+"""IMU samples per second of the stochastic-cloning EKF: alone, vmapped and over all cores, beside a plain NumPy filter.
 
     python benchmarks/filter_throughput.py [--seconds 180] [--repeats 5] [--only batch|window|length|precision|gradient]
 
-Compilation is timed apart; every timing waits for the result. Reported is the best and the median of the repeats, the samples per
-second of processor time, which other programs on the machine disturb less, and the memory of the program: its arguments, results and
-temporaries. Last comes what derivatives cost: value and gradient over value, in time and memory, with and without checkpoints.
+Over rates of cloning, windows, lengths and precisions. A batch runs under `vmap` on one device, and shared out among the cores
+(`filtering.over_sequences`). Compilation is timed apart; every timing waits for the result. Reported is the best and the median of the
+repeats, the samples per second of processor time, which other programs on the machine disturb less, and the memory of the program: its
+arguments, results and temporaries. Last comes what derivatives cost: value and gradient over value, in time and memory, with and without
+checkpoints.
 """
 
 from __future__ import annotations
@@ -42,7 +44,7 @@ def walk(seconds: float, config: filtering.FilterConfig) -> tuple[np.ndarray, ..
     return gyro, accel, displacement, np.tile(0.02**2 * np.eye(3), (intervals, 1, 1))
 
 
-def measure(config: filtering.FilterConfig, batch: int, seconds: float, repeats: int) -> dict[str, float]:
+def measure(config: filtering.FilterConfig, batch: int, spread: bool, seconds: float, repeats: int) -> dict[str, float]:
     dtype = np.float32 if config.allow_float32 else np.float64
     signals = tuple(signal.astype(dtype) for signal in walk(seconds, config))
     state = filtering.initial_state(config, np.eye(3, dtype=dtype), np.array([1.2, 0.0, 0.0], dtype), np.zeros(3, dtype))
@@ -53,7 +55,7 @@ def measure(config: filtering.FilterConfig, batch: int, seconds: float, repeats:
 
     if batch > 1:
         signals = tuple(np.tile(signal[None], (batch, *[1] * signal.ndim)) for signal in signals)
-        run = jax.vmap(run)
+        run = filtering.over_sequences(run) if spread else jax.vmap(run)
     signals = jax.device_put(signals)
     begin = time.perf_counter()
     program = jax.jit(run).lower(*signals).compile()
@@ -69,7 +71,8 @@ def measure(config: filtering.FilterConfig, batch: int, seconds: float, repeats:
     samples = signals[0].size // 3
     memory = program.memory_analysis()
     return {"compile": compiled, "best": samples / min(wall), "median": samples / np.median(wall), "cpu": samples / min(cpu),
-            "memory": (memory.temp_size_in_bytes + memory.argument_size_in_bytes + memory.output_size_in_bytes) / 2**20}
+            "memory": (jax.device_count() if spread else 1) / 2**20  # of one device, which all are alike
+            * (memory.temp_size_in_bytes + memory.argument_size_in_bytes + memory.output_size_in_bytes)}
 
 
 def measure_numpy(config: filtering.FilterConfig, seconds: float) -> float:
@@ -108,11 +111,11 @@ def measure_gradient(config: filtering.FilterConfig, seconds: float, repeats: in
     return out[2] / out[0], out[3]
 
 
-CASES = {  # clone interval in samples, clones in a window, sequences, share of --seconds, float32
-    "batch": [(10, 20, 1, 1, False), (10, 20, 16, 1, False), (10, 20, 64, 1, False)],
-    "window": [(20, 10, 1, 1, False), (20, 10, 16, 1, False), (20, 20, 1, 1, False), (10, 40, 1, 1, False)],
-    "length": [(10, 20, 1, 1 / 4, False), (10, 20, 1, 4, False)],
-    "precision": [(10, 20, 1, 1, True), (10, 20, 16, 1, True)],
+CASES = {  # clone interval in samples, clones in a window, sequences, over all cores, share of --seconds, float32
+    "batch": [(10, 20, 1, False, 1, False), (10, 20, 16, False, 1, False), (10, 20, 16, True, 1, False), (10, 20, 64, True, 1, False)],
+    "window": [(20, 10, 1, False, 1, False), (20, 10, 16, True, 1, False), (20, 20, 1, False, 1, False), (10, 40, 1, False, 1, False)],
+    "length": [(10, 20, 1, False, 1 / 4, False), (10, 20, 1, False, 4, False)],
+    "precision": [(10, 20, 1, False, 1, True), (10, 20, 16, True, 1, True)],
 }
 
 
@@ -122,19 +125,21 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--only", choices=[*CASES, "gradient"], help="one part of the table")
     arguments = parser.parse_args()
+    filtering.cores_as_devices()
     print(f"{jax.devices()[0].device_kind}, jax {jax.__version__}, 200 Hz IMU; samples per second\n")
-    print(f"{'clones':>8} {'window':>8} {'seconds':>8} {'batch':>6} {'':>8} {'best':>10} {'median':>10} {'per cpu-s':>10} "
+    print(f"{'clones':>8} {'window':>8} {'seconds':>8} {'batch':>6} {'devices':>7} {'':>8} {'best':>10} {'median':>10} {'per cpu-s':>10} "
           f"{'compile s':>10} {'MiB':>7}")
     figures: dict[str, float] = {}
     for part in [arguments.only] if arguments.only in CASES else [] if arguments.only else CASES:
-        for n, clones, batch, share, single in CASES[part]:
+        for n, clones, batch, spread, share, single in CASES[part]:
             config, seconds = filtering.FilterConfig(DT, n, clones, allow_float32=single), arguments.seconds * share
-            row = measure(config, batch, seconds, arguments.repeats if batch < 64 else min(arguments.repeats, 3))
-            name = f"samples/s, {1 / (n * DT):.0f} Hz clones, {n * clones * DT:.0f} s window, batch {batch}{', float32' * single}"
-            figures[name + ("" if share == 1 else f", {seconds:.0f} s")] = row["best"]
-            print(f"{1 / (n * DT):5.0f} Hz {n * clones * DT:6.1f} s {seconds:8.0f} {batch:6} {'float32' if single else 'float64':>8} "
-                  f"{row['best']:10,.0f} {row['median']:10,.0f} {row['cpu']:10,.0f} {row['compile']:10.1f} {row['memory']:7.1f}",
-                  flush=True)
+            row = measure(config, batch, spread, seconds, arguments.repeats if batch < 64 else min(arguments.repeats, 3))
+            name = f"samples/s, {1 / (n * DT):.0f} Hz clones, {n * clones * DT:.0f} s window, batch {batch}"
+            name += ", all cores" * spread + ", float32" * single + f", {seconds:.0f} s" * (share != 1)
+            figures[name] = row["best"]
+            print(f"{1 / (n * DT):5.0f} Hz {n * clones * DT:6.1f} s {seconds:8.0f} {batch:6} {jax.device_count() if spread else 1:7} "
+                  f"{'float32' if single else 'float64':>8} {row['best']:10,.0f} {row['median']:10,.0f} {row['cpu']:10,.0f} "
+                  f"{row['compile']:10.1f} {row['memory']:7.1f}", flush=True)
     if arguments.only in (None, "batch"):
         rate = measure_numpy(filtering.FilterConfig(DT, 10, 20), 10.0)
         print(f"\nplain NumPy filter, 20 Hz clones, 1 s window, one sequence: {rate:,.0f}")

@@ -52,19 +52,19 @@ def measure(clone_rate: int, batch: int, seconds: float, repeats: int) -> dict[s
     def given(gyro, accel, displacement, covariance):
         return filtering.run_filter(state, gyro, accel, displacement, covariance, config, noise)[1].position
 
-    def for_all(function, shared: int, count: int):
+    def for_all(function, shared: int):
         # A batch of one is the plain program: what a single recording costs.
         if batch == 1:
             return lambda *a: function(*a[:shared], *(x[0] for x in a[shared:]))
-        return jax.vmap(function, in_axes=(None,) * shared + (0,) * count)
+        return filtering.over_sequences(function, shared)
 
     signals = jax.device_put((gyro, accel))
     begin = time.perf_counter()
-    program = jax.jit(for_all(with_network, 1, 2)).lower(frozen, *signals).compile()
+    program = jax.jit(for_all(with_network, 1)).lower(frozen, *signals).compile()
     compiled = time.perf_counter() - begin
     assert bool(jnp.isfinite(program(frozen, *signals)).all())
     whole = best(program, (frozen, *signals), repeats)
-    alone = best(jax.jit(for_all(given, 0, 4)), (*signals, displacement, covariance), repeats)
+    alone = best(jax.jit(for_all(given, 0)), (*signals, displacement, covariance), repeats)
     duration, windows = batch * gyro.shape[1] * DT, batch * (gyro.shape[1] // config.samples_per_clone - config.clones_per_window)
     return {"whole": duration / whole, "filter": duration / alone, "ms a window": (whole - alone) / windows * 1e3, "compile": compiled,
             "seconds": whole, "windows": windows}
@@ -96,6 +96,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=20.0, help="length of the simulated walk")
     parser.add_argument("--repeats", type=int, default=3)
     arguments = parser.parse_args()
+    filtering.cores_as_devices()
     print(f"{jax.devices()[0].device_kind}, jax {jax.__version__}, 200 Hz IMU, network of full width; times real time\n")
     print(f"{'clones':>7} {'batch':>6} {'whole':>9} {'filter':>9} {'ms/window':>10} {'compile s':>10} {'TLIO in PyTorch, forward':>25}")
     figures = {}
