@@ -88,6 +88,8 @@ class ModelConfig:
     """Prototypes in the Motion Bank; 0 leaves the bank out (gnio: 64)."""
     bank_heads: int | None = None
     """Attention heads of the bank's query (gnio: 8)."""
+    bank_std: float | None = None
+    """Standard deviation of the prototypes before training (gnio: 1/√d of their d features)."""
     head: Literal["gated", "linear"] | None = None
     """Displacement as scale × gate, or a plain linear layer (gnio: gated)."""
     gate: Literal["tanh", "sigmoid"] | None = None
@@ -296,6 +298,7 @@ def validate(config: TrainConfig, source: str = "config") -> TrainConfig:
     for name, value in [("optim.epochs", optim.epochs), ("optim.batch_size", optim.batch_size), ("model.width", model.width),
                         ("model.bank_heads", model.bank_heads), ("optim.plateau_epochs", optim.plateau_epochs)]:
         require(value is None or value >= 1, name, f"must be at least 1, found {value!r}")
+    require(model.bank_std is None or model.bank_std > 0, "model.bank_std", f"must be positive, found {model.bank_std!r}")
     for section in ("augment", "filter"):
         for key, value in dataclasses.asdict(getattr(config, section)).items():
             require(isinstance(value, str | None) or value >= 0, f"{section}.{key}", f"must not be negative, found {value!r}")

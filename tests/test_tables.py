@@ -55,7 +55,7 @@ def test_arrows_point_as_the_error_goes():
     assert [summary.arrow(x) for x in (12.34, -5.0, 0.01, None)] == ["↓ 12.3 %", "↑ 5.0 %", "0 %", ""]
 
 
-@pytest.mark.parametrize("make", [experiments.components, experiments.gates, experiments.bank_sizes,
+@pytest.mark.parametrize("make", [experiments.components, experiments.gates, experiments.bank_sizes, experiments.bank_spread,
                                   lambda base: experiments.comparison(base, "test")])
 def test_rows_differ_in_the_network_alone(make):
     """Every row can be built, two rows are never the same, rows of the same name are; loss apart, only the network differs."""
@@ -77,8 +77,9 @@ def test_remedies_change_the_uncertainty_alone():
 
 
 def test_cells_of_one_name_are_one_run_in_every_table():
-    made = [cell for table in (experiments.components(BASE), experiments.gates(BASE), experiments.bank_sizes(BASE),
-                               experiments.remedies(BASE), experiments.comparison(BASE, "test")) for cell in table.cells]
+    tables = [make(BASE) for make in (experiments.components, experiments.gates, experiments.bank_sizes, experiments.bank_spread,
+                                      experiments.remedies)]
+    made = [cell for table in (*tables, experiments.comparison(BASE, "test")) for cell in table.cells]
     by_name = {}
     for cell in made:
         assert by_name.setdefault(cell.name, cell.config) == cell.config

@@ -26,6 +26,7 @@ class GNIO(nn.Module):
     width: int = 64
     bank_size: int = 64
     bank_heads: int = 8
+    bank_std: float | None = None
     head: Literal["gated", "linear"] = "gated"
     gate: Literal["tanh", "sigmoid"] = "tanh"
     scale: Literal["softplus", "pos_elu", "abs", "exp", "linear"] = "softplus"
@@ -42,7 +43,7 @@ class GNIO(nn.Module):
         h = features.mean(axis=1)
         diagnostics = {}
         if self.bank_size:
-            context, diagnostics["attention"] = MotionBank(self.bank_size, self.bank_heads, 8 * self.width, name="bank")(h, memory)
+            context, diagnostics["attention"] = self._bank(name="bank")(h, memory)
             h = h + context
         head = GatedHead(self.gate, self.scale, name="head") if self.head == "gated" else LinearHead(name="head")
         displacement, seen = head(h)
@@ -53,9 +54,12 @@ class GNIO(nn.Module):
         return Prediction(displacement, log_std, diagnostics | seen)
 
     @nn.nowrap
+    def _bank(self, name: str | None = None) -> MotionBank:
+        return MotionBank(self.bank_size, self.bank_heads, 8 * self.width, self.bank_std, name=name)
+
+    @nn.nowrap
     def constants(self, variables: Any) -> dict[str, Any]:
         """Arguments of `apply` that depend on the variables alone: the bank's keys and values."""
         if not self.bank_size:
             return {}
-        bank = MotionBank(self.bank_size, self.bank_heads, 8 * self.width)
-        return {"memory": bank.apply({"params": variables["params"]["bank"]}, method="memory")}
+        return {"memory": self._bank().apply({"params": variables["params"]["bank"]}, method="memory")}

@@ -12,16 +12,18 @@ class MotionBank(nn.Module):
     """c = MultiHeadAttention(query f, keys M, values M), with M ∈ R^{m×d} a parameter; h = f + c is left to the caller.
 
     The bank is the same for every window, so its keys and values are projected once per call and not once per window.
-    Ours, where the paper is silent: 8 heads, projections with bias, M ~ N(0, 1/√d).
+    Ours, where the paper is silent: 8 heads, projections with bias, M ~ N(0, 1/√d), or of another standard deviation `std`.
     """
 
     size: int = 64
     heads: int = 8
     width: int = 512
+    std: float | None = None
 
     def setup(self) -> None:
         shape = (self.heads, self.width // self.heads)
-        self.prototypes = self.param("prototypes", nn.initializers.normal(self.width**-0.5), (self.size, self.width), jnp.float32)
+        std = self.width**-0.5 if self.std is None else self.std
+        self.prototypes = self.param("prototypes", nn.initializers.normal(std), (self.size, self.width), jnp.float32)
         self.query, self.key, self.value = (nn.DenseGeneral(shape, dtype=jnp.float32, param_dtype=jnp.float32) for _ in range(3))
         self.output = nn.DenseGeneral(self.width, axis=(-2, -1), dtype=jnp.float32, param_dtype=jnp.float32)
 

@@ -1,4 +1,4 @@
-"""`python -m gnio_jax.tables complexity | comparison | components | gates | bank-size | uncertainty | trajectories | standing`."""
+"""`python -m gnio_jax.tables TABLE`: complexity, comparison, components and the others that `--help` lists."""
 
 import os
 

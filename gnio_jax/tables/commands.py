@@ -32,6 +32,7 @@ rate and augmentation, each network with its own published loss.
   python -m gnio_jax.tables components --base configs/gnio_oxiod_small.yaml --data-root DIR --split sessions_test
   python -m gnio_jax.tables gates --base ... [--epochs 3]                    gate and scale functions, norms of their gradients
   python -m gnio_jax.tables bank-size --base ...                             size of the Motion Bank, entropy of its attention
+  python -m gnio_jax.tables bank-spread --base ...                           how far apart its prototypes start
   python -m gnio_jax.tables uncertainty --base ...                           what makes GNIO's uncertainty fit for the filter
   python -m gnio_jax.tables trajectories --base ... [--sequences A,B]        all methods over the reference, in one picture
   python -m gnio_jax.tables standing --base ...                              errors at rest and in slow walking, gate and attention
@@ -39,7 +40,7 @@ rate and augmentation, each network with its own published loss.
 Runs are kept below OUT/runs and shared by the tables: a command that was interrupted goes on where it stopped, one that is
 finished only writes its summary anew. Results: OUT/<table>_<split>_<estimator>.md, .csv and .png."""
 
-Table = Literal["complexity", "comparison", "components", "gates", "bank-size", "uncertainty", "trajectories", "standing"]
+Table = Literal["complexity", "comparison", "components", "gates", "bank-size", "bank-spread", "uncertainty", "trajectories", "standing"]
 
 
 @dataclass(frozen=True)
@@ -47,7 +48,7 @@ class TablesConfig:
     """What `python -m gnio_jax.tables` is asked for."""
 
     table: tyro.conf.Positional[Table]
-    """complexity, comparison, components, gates, bank-size, uncertainty, trajectories or standing."""
+    """complexity, comparison, components, gates, bank-size, bank-spread, uncertainty, trajectories or standing."""
     base: str = "configs/quickstart.yaml"
     """Config whose recordings, budget and augmentation every row has (not for complexity)."""
     data_root: str | None = None
@@ -118,6 +119,8 @@ def experiment_of(options: TablesConfig, base: TrainConfig) -> Experiment:
             return experiments.gates(base)
         case "bank-size":
             return experiments.bank_sizes(base)
+        case "bank-spread":
+            return experiments.bank_spread(base)
         case "uncertainty":
             return experiments.remedies(base)
         case _:
@@ -131,7 +134,7 @@ def results_of(experiment: Experiment, options: TablesConfig, console: Console) 
 
 
 def make_table(options: TablesConfig, console: Console) -> None:
-    """comparison, components, gates, bank-size, uncertainty."""
+    """comparison, components, gates, bank-size, bank-spread, uncertainty."""
     from gnio_jax.tables import pictures
 
     base = base_config(options)
@@ -143,7 +146,7 @@ def make_table(options: TablesConfig, console: Console) -> None:
             norms = np.array([pictures.scale_gradients(run) for run in result.runs])
             extra[result.cell.name] = {"gradient of the scale, mean": float(norms.mean()), "largest epoch": float(norms.max())}
         pictures.save(path.with_name(path.name + "_gradients.png"), pictures.gradients(results))
-    if options.table == "bank-size":
+    if options.table in ("bank-size", "bank-spread"):
         extra = _entropies(path, options, results)
     found = summary.rows(experiment, results, extra)
     summary.write(path, experiment, found, notes(base, options, experiment))
@@ -156,16 +159,16 @@ def _entropies(path: Path, options: TablesConfig, results: list[Result]) -> dict
     """Entropy of the attention of the rows with a bank, with its picture."""
     from gnio_jax.tables import pictures
 
-    sizes, each, mean, extra = [], [], [], {}
+    labels, each, mean, extra = [], [], [], {}
     for result in results:
         if result.cell.config.model.bank_size == 0:
             continue
         found = [windows.entropy(windows.said(run, options.split).diagnostics["attention"]) for run in result.runs]
-        sizes.append(result.cell.config.model.bank_size or 64)
+        labels.append(result.cell.label)
         each.append([a for a, _ in found])
         mean.append([b for _, b in found])
         extra[result.cell.name] = {"entropy of a window": float(np.mean(each[-1])), "of their mean": float(np.mean(mean[-1]))}
-    pictures.save(path.with_name(path.name + "_entropy.png"), pictures.entropies(sizes, each, mean))
+    pictures.save(path.with_name(path.name + "_entropy.png"), pictures.entropies(labels, each, mean))
     return extra
 
 

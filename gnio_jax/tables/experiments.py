@@ -119,6 +119,15 @@ def bank_sizes(base: TrainConfig) -> Experiment:
     return Experiment("Bank size", "paper, size of the bank: RMSE on TLIO's set, with the linear head", cells)
 
 
+def bank_spread(base: TrainConfig) -> Experiment:
+    """How far apart the prototypes start, with the linear head: the paper does not say, and near each other all are attended to alike."""
+    return Experiment("Prototypes before training", "no published figure: the paper does not say how its bank starts", [
+        Cell("gnio_bank-0_linear", "no bank", variant(base, bank_size=0, head="linear")),
+        Cell("gnio_linear", "N(0, 1/√d)", variant(base, head="linear")),
+        Cell("gnio_bank-std-1_linear", "N(0, 1)", variant(base, head="linear", bank_std=1.0)),
+    ])
+
+
 def remedies(base: TrainConfig) -> Experiment:
     """What makes GNIO's uncertainty fit for the filter: the likelihood weighted like the squared error from the start, or one constant
     per axis from the validation split in place of the head."""

@@ -53,7 +53,7 @@ def table(experiment: Experiment, results: list[Result], found: list[Row]) -> Fi
             if value is not None:
                 panels[1].barh(place, value, color=BLUE, alpha=0.35, height=0.6)
                 panels[1].text(value, place, f" {value:.2f}", va="center", fontsize=8)
-        panels[1].set(xlabel="published (m), other data and definition", title="paper")
+        panels[1].set(xlabel="published m, on other data", title="paper")
         panels[1].margins(x=0.2)
     for axes in panels:
         _finish(axes)
@@ -142,17 +142,16 @@ def attention(names: list[str], lifts: Float[np.ndarray, "a p"], words: str) -> 
     return figure
 
 
-def entropies(sizes: list[int], each: list[list[float]], mean: list[list[float]]) -> Figure:
-    """Entropy of the attention against the size of the bank, as a share of that of a uniform one; a dot for each seed."""
+def entropies(rows: list[str], each: list[list[float]], mean: list[list[float]]) -> Figure:
+    """Entropy of the attention of each row, as a share of that of a uniform one; a dot for each seed."""
     figure = Figure(figsize=(5.6, 3.8), layout="constrained")
     axes = figure.add_subplot()
     for values, colour, label in [(each, GREEN, "of one window"), (mean, GREY, "of the mean over windows")]:
-        axes.plot(sizes, [np.mean(v) for v in values], color=colour, label=label)
-        for size, seeds in zip(sizes, values, strict=True):
-            axes.plot(np.full(len(seeds), size), seeds, "o", color=colour, ms=4)
-    axes.set_xscale("log", base=2)
-    axes.set_xticks(sizes, [str(size) for size in sizes])
-    axes.set(xlabel="prototypes in the bank", ylabel="entropy / log m", ylim=(0, 1.05), title="How the attention spreads over the bank")
+        axes.plot([np.mean(seeds) for seeds in values], color=colour, label=label)
+        for place, seeds in enumerate(values):
+            axes.plot(np.full(len(seeds), place), seeds, "o", color=colour, ms=4)
+    axes.set_xticks(range(len(rows)), rows)
+    axes.set(xlabel="bank", ylabel="entropy / log m", ylim=(0, 1.05), title="How the attention spreads over the bank")
     axes.legend(fontsize=8, frameon=False)
     _finish(axes)
     return figure

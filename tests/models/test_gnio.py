@@ -40,6 +40,13 @@ def test_bank_sizes(size, total):
     assert count(shapes(bank_size=size)["params"]) == total
 
 
+def test_prototypes_start_as_far_apart_as_asked():
+    for options, std in (({}, 64**-0.5), ({"bank_std": 1.0}, 1.0)):
+        model = models.create("gnio", width=8, bank_size=400, **options)
+        prototypes = models.initialise(model, jax.random.key(0), 50)["params"]["bank"]["prototypes"]
+        np.testing.assert_allclose(np.std(prototypes), std, rtol=0.03)
+
+
 def test_without_a_bank_the_attention_goes_with_it():
     params = shapes(bank_size=0)["params"]
     assert "bank" not in params
