@@ -70,6 +70,8 @@ def gradients(results: list[Result]) -> Figure:
         axes.semilogy(epochs, norms.mean(0), color=colour, label=result.cell.label)
         axes.fill_between(epochs, norms.min(0), norms.max(0), color=colour, alpha=0.15, lw=0)
     axes.set(xlabel="epoch", ylabel="norm of the gradient of the scale's layer", title="How steadily the scale learns")
+    axes.yaxis.set_major_formatter("{x:g}")
+    axes.yaxis.set_minor_formatter("{x:g}")
     axes.legend(fontsize=8, frameon=False)
     _finish(axes)
     return figure
