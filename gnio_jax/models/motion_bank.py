@@ -28,14 +28,14 @@ class MotionBank(nn.Module):
         self.output = nn.DenseGeneral(self.width, axis=(-2, -1), dtype=jnp.float32, param_dtype=jnp.float32)
 
     def __call__(self, feature: Float[jax.Array, "b d"],
-                 memory: tuple[Float[jax.Array, "m h k"], Float[jax.Array, "m h k"]] | None = None
+                 memory: tuple[Float[jax.Array, "h m k"], Float[jax.Array, "h k m"]] | None = None
                  ) -> tuple[Float[jax.Array, "b d"], Float[jax.Array, "b h m"]]:
         """Context (b, d) and attention weights (b, heads, m) of each feature; `memory` is that of an earlier call, if there was one."""
         query, (key, value) = self.query(feature), self.memory() if memory is None else memory
-        scores = jnp.einsum("bhd,mhd->bhm", query, key) / jnp.sqrt(jnp.float32(self.width // self.heads))
+        scores = jnp.einsum("bhk,hmk->bhm", query, key) / jnp.sqrt(jnp.float32(self.width // self.heads))
         attention = nn.softmax(scores, axis=-1)
-        return self.output(jnp.einsum("bhm,mhd->bhd", attention, value)), attention
+        return self.output(jnp.einsum("bhm,hkm->bhk", attention, value)), attention
 
-    def memory(self) -> tuple[Float[jax.Array, "m h k"], Float[jax.Array, "m h k"]]:
-        """Keys and values of the prototypes, each (m, heads, d / heads)."""
-        return self.key(self.prototypes), self.value(self.prototypes)
+    def memory(self) -> tuple[Float[jax.Array, "h m k"], Float[jax.Array, "h k m"]]:
+        """Keys (heads, m, d / heads) and values (heads, d / heads, m) of the prototypes: as the products with one window read them."""
+        return self.key(self.prototypes).transpose(1, 0, 2), self.value(self.prototypes).transpose(1, 2, 0)
