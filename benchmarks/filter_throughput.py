@@ -69,10 +69,10 @@ def measure(config: filtering.FilterConfig, batch: int, spread: bool, seconds: f
         wall.append(time.perf_counter() - begin)
         cpu.append(time.process_time() - spent)
     samples = signals[0].size // 3
-    memory = program.memory_analysis()
+    memory, devices = program.memory_analysis(), jax.device_count() if spread else 1
     return {"compile": compiled, "best": samples / min(wall), "median": samples / np.median(wall), "cpu": samples / min(cpu),
-            "memory": (jax.device_count() if spread else 1) / 2**20  # of one device, which all are alike
-            * (memory.temp_size_in_bytes + memory.argument_size_in_bytes + memory.output_size_in_bytes)}
+            "devices": devices,  # the analysis is that of one of them
+            "memory": devices * (memory.temp_size_in_bytes + memory.argument_size_in_bytes + memory.output_size_in_bytes) / 2**20}
 
 
 def measure_numpy(config: filtering.FilterConfig, seconds: float) -> float:
@@ -137,7 +137,7 @@ def main() -> None:
             name = f"samples/s, {1 / (n * DT):.0f} Hz clones, {n * clones * DT:.0f} s window, batch {batch}"
             name += ", all cores" * spread + ", float32" * single + f", {seconds:.0f} s" * (share != 1)
             figures[name] = row["best"]
-            print(f"{1 / (n * DT):5.0f} Hz {n * clones * DT:6.1f} s {seconds:8.0f} {batch:6} {jax.device_count() if spread else 1:7} "
+            print(f"{1 / (n * DT):5.0f} Hz {n * clones * DT:6.1f} s {seconds:8.0f} {batch:6} {row['devices']:7} "
                   f"{'float32' if single else 'float64':>8} {row['best']:10,.0f} {row['median']:10,.0f} {row['cpu']:10,.0f} "
                   f"{row['compile']:10.1f} {row['memory']:7.1f}", flush=True)
     if arguments.only in (None, "batch"):

@@ -22,7 +22,7 @@ from gnio_jax.tables.windows import ACTIVITIES, Said
 COLOURS = {"tlio": BLUE, "gnio": GREEN, "ronin_resnet": "#E69F00", "deepils": "#CC79A7", "ctin": VERMILION, "imot": "#56B4E9",
            "imot_text": "#F0E442"}
 """TLIO blue and GNIO green, as in the paper's figure."""
-OTHERS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+OTHERS = (BLUE, VERMILION, GREEN, "#CC79A7", "#E69F00", "#56B4E9")
 
 
 def save(path: Path, figure: Figure) -> None:

@@ -101,13 +101,12 @@ def train_steps(
 
 def gradient_norms(gradient: Any) -> dict[str, Float[jax.Array, ""]]:
     """Norm of the gradient with respect to each part of the network: its modules, and of a head its layers (`head/scale`)."""
-    squares: dict[str, jax.Array] = {}
+    squares: dict[str, list[jax.Array]] = {}
     for path, leaf in jax.tree_util.tree_leaves_with_path(gradient):
         names = [str(entry.key) for entry in path]
         part = "/".join(names[: 2 if names[0] == "head" else 1])
-        square = jnp.sum(leaf**2)
-        squares[part] = squares[part] + square if part in squares else square
-    return {part: jnp.sqrt(square) for part, square in squares.items()}
+        squares.setdefault(part, []).append(jnp.sum(leaf**2))
+    return {part: jnp.sqrt(sum(found)) for part, found in squares.items()}
 
 
 @functools.partial(jax.jit, static_argnames=("model", "config"))

@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiling import quick
 
 from gnio_jax import filtering
-from tests.compiling import quick
 
 CONFIG = filtering.FilterConfig(dt=0.01, samples_per_clone=5, clones_per_window=2)
 NOISE = filtering.NoiseModel.per_sample(1e-2, 3e-2, CONFIG.dt)
