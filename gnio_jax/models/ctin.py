@@ -5,10 +5,10 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 from flax import linen as nn
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from gnio_jax.models.heads import to_axes
-from gnio_jax.models.layers import check_dropout, check_output_dim, layer_norm, linear
+from gnio_jax.models.layers import attention, check_dropout, check_output_dim, layer_norm, linear
 from gnio_jax.models.resnet import batch_norm, conv, he_normal_fan_out
 from gnio_jax.types import Prediction
 
@@ -101,7 +101,7 @@ class SpatialEncoder(nn.Module):
     def __call__(self, x: Float[jax.Array, "b n d"], train: bool) -> Float[jax.Array, "b n d"]:
         y = nn.relu(batch_norm(train, "reduce_bn")(conv(self.width, 1, 1, train, "reduce_conv")(x)))
         y = LocalAttention(name="local")(y, train)
-        y = nn.Dropout(self.dropout, deterministic=not train)(_attention(self.heads, "global")(y))
+        y = nn.Dropout(self.dropout, deterministic=not train)(attention(self.heads, "global")(y))
         y = batch_norm(train, "expand_bn")(conv(x.shape[-1], 1, 1, train, "expand_conv")(y))
         return nn.relu(x + y)
 
@@ -160,8 +160,8 @@ class DecoderLayer(nn.Module):
     def __call__(self, x: Float[jax.Array, "b n d"], memory: Float[jax.Array, "b n d"], train: bool) -> Float[jax.Array, "b n d"]:
         drop = nn.Dropout(self.dropout, deterministic=not train)
         causal = jnp.tril(jnp.ones((x.shape[1], x.shape[1]), bool))[None, None]
-        x = layer_norm("self_norm")(x + drop(_attention(self.heads, "self")(x, mask=causal)))
-        x = layer_norm("cross_norm")(x + drop(_attention(self.heads, "cross")(x, memory)))
+        x = layer_norm("self_norm")(x + drop(attention(self.heads, "self")(x, mask=causal)))
+        x = layer_norm("cross_norm")(x + drop(attention(self.heads, "cross")(x, memory)))
         y = linear(x.shape[-1], "contract")(drop(nn.relu(linear(self.ffn, "expand")(x))))
         return layer_norm("ffn_norm")(x + drop(y))
 
@@ -203,28 +203,3 @@ def _convolve_groups(
     shifted = _neighbours(x, size).reshape(batch, samples, size, feature_group_count, channels)
     kernel = kernel.reshape(size, channels, feature_group_count, features // feature_group_count)
     return jnp.einsum("bnkgc,kcgd->bngd", shifted, kernel).reshape(batch, samples, features)
-
-
-def _attend(
-    query: Float[jax.Array, "b n h d"],
-    key: Float[jax.Array, "b m h d"],
-    value: Float[jax.Array, "b m h d"],
-    mask: Bool[jax.Array, "1 1 n m"] | None = None,
-    **_: object,
-) -> Float[jax.Array, "b n h d"]:
-    """Scaled dot-product attention in the place of Flax's: with few features a head, passes over the scores cost more than products.
-
-    So there are fewer: the softmax divides by its sum after meeting the values, and heads lie beside windows.
-    """
-    batch, samples, heads, size = query.shape
-    query, key, value = (x.swapaxes(1, 2).reshape(batch * heads, -1, size) for x in (query, key, value))
-    scores = jnp.einsum("bnd,bmd->bnm", query / jnp.sqrt(jnp.float32(size)), key)
-    if mask is not None:
-        scores = jnp.where(mask[0], scores, -jnp.inf)
-    weights = jnp.exp(scores - jax.lax.stop_gradient(scores.max(axis=-1, keepdims=True)))
-    context = jnp.einsum("bnm,bmd->bnd", weights, value) / weights.sum(axis=-1, keepdims=True)
-    return context.reshape(batch, heads, samples, size).swapaxes(1, 2)
-
-
-def _attention(heads: int, name: str) -> nn.MultiHeadDotProductAttention:
-    return nn.MultiHeadDotProductAttention(heads, dtype=jnp.float32, param_dtype=jnp.float32, attention_fn=_attend, name=name)

@@ -8,7 +8,7 @@ from flax import linen as nn
 from jaxtyping import Float
 
 from gnio_jax.models.heads import ConstantUncertainty, to_axes
-from gnio_jax.models.layers import check_dropout, check_output_dim, layer_norm, linear
+from gnio_jax.models.layers import attend, attention, check_dropout, check_output_dim, layer_norm, linear
 from gnio_jax.types import Prediction
 
 TREND_SPANS = (9, 3)
@@ -108,7 +108,7 @@ class EncoderLayer(nn.Module):
         x = decouple(channels)
         samples = x.shape[-1]
         e = Perceptron((samples, samples), name="positions")(x) * sinusoids(jnp.arange(x.shape[1], dtype=jnp.float32), samples)[None]
-        y = _attention(self.heads, samples, samples, "attention")(x + e, x + e, x)
+        y = attention(self.heads, "attention")(x + e, x + e, x)
         x = layer_norm("attention_norm")(SpatialBlock(name="attention_spatial")(x) + drop(y))
         y = Perceptron((self.ffn, samples), name="ffn")(x)
         return layer_norm("ffn_norm")(SpatialBlock(name="ffn_spatial")(x) + drop(y)), e
@@ -151,8 +151,8 @@ class DecoderLayer(nn.Module):
         found = []
         for name, token, position in zip(("accel", "gyro"), jnp.split(tokens, MODALITIES, axis=1), jnp.split(positions, MODALITIES, axis=1),
                                          strict=True):
-            attend = _attention(self.heads, 2 * samples, samples, name)
-            y = attend(jnp.concatenate([x, where], axis=-1), jnp.concatenate([token, position], axis=-1), token)
+            attend_to = attention(self.heads, name, 2 * samples, samples)
+            y = attend_to(jnp.concatenate([x, where], axis=-1), jnp.concatenate([token, position], axis=-1), token)
             found.append(layer_norm(f"{name}_norm")(x + drop(y)))
         x = Perceptron((samples, samples), name="fusion")(jnp.concatenate(found, axis=-1))
         return layer_norm("ffn_norm")(x + drop(Perceptron((self.ffn, samples), name="ffn")(x)))
@@ -169,8 +169,7 @@ class ParticleAttention(nn.Module):
         query, key = (linear(features, f"{name}_content")(content) + linear(features, f"{name}_position")(where)
                       for name in ("query", "key"))
         query, key, value = (x.reshape(*x.shape[:2], self.heads, -1) for x in (query, key, linear(features, "value")(content)))
-        weights = nn.softmax(jnp.einsum("bphd,bqhd->bhpq", query, key) / jnp.sqrt(jnp.float32(features // self.heads)), axis=-1)
-        return linear(features, "output")(jnp.einsum("bhpq,bqhd->bphd", weights, value).reshape(content.shape))
+        return linear(features, "output")(attend(query, key, value).reshape(content.shape))
 
 
 class Scores(nn.Module):
@@ -232,9 +231,3 @@ def head_count(features: int, most: int) -> int:
 
 def _padded(x: Float[jax.Array, "*b k"], features: int) -> Float[jax.Array, "*b d"]:
     return jnp.pad(x, [(0, 0)] * (x.ndim - 1) + [(0, features - x.shape[-1])])
-
-
-def _attention(heads: int, inner: int, outer: int, name: str) -> nn.MultiHeadDotProductAttention:
-    return nn.MultiHeadDotProductAttention(
-        heads, qkv_features=inner, out_features=outer, dtype=jnp.float32, param_dtype=jnp.float32, name=name
-    )
