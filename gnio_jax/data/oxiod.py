@@ -23,7 +23,6 @@ orientation is integrated gyro, corrected slowly until R·accel + g agrees with 
 from __future__ import annotations
 
 import multiprocessing
-import os
 import re
 import warnings
 from collections.abc import Callable, Iterable
@@ -41,6 +40,7 @@ from scipy.interpolate import CubicSpline
 from scipy.ndimage import binary_dilation, binary_erosion
 from scipy.spatial.transform import Rotation, Slerp
 
+from gnio_jax.cores import usable_cores
 from gnio_jax.data.alignment import Track, align, align_heading, follow, follow_acceleration, integrate_gyro, smooth_positions
 from gnio_jax.data.cache import Refusal, cached
 from gnio_jax.data.recordings import single
@@ -689,7 +689,7 @@ def _build_all(walks: list[Walk]) -> list[Sequence]:
         except _NotCached:
             continue
     missing = [index for index in range(len(walks)) if index not in results]
-    workers = min(os.cpu_count() or 1, len(missing))
+    workers = min(usable_cores(), len(missing))
     console = Console(stderr=True)
     with Progress(console=console, transient=True, disable=len(missing) < 2 or not console.is_terminal) as progress:
         task = progress.add_task("OxIOD: aligning phones and Vicon", total=len(missing))

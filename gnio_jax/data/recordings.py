@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import multiprocessing
-import os
 import signal
 import warnings
 from collections.abc import Callable, Iterator
@@ -13,6 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
+from gnio_jax.cores import usable_cores
 from gnio_jax.data.cache import Refusal
 from gnio_jax.data.sequence import Dataset, Recording, SelfCheck, judge, keep_plausible
 from gnio_jax.types import InputError, Sequence
@@ -118,7 +118,7 @@ def each(
 
     `done` is told the share that is finished. Function and items must survive pickling when there is more than one process.
     """
-    count = (os.cpu_count() or 1) if workers is None else workers
+    count = usable_cores() if workers is None else workers
     count = 1 if workers is None and len(items) <= FEW else min(count, len(items))
     if count <= 1:
         for index, item in enumerate(items):

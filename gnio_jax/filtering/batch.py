@@ -11,6 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 
+from gnio_jax.cores import usable_cores
+
 T = TypeVar("T")
 
 
@@ -52,5 +54,4 @@ def cores_as_devices() -> None:
     given = jax.config.jax_num_cpu_devices  # pyright: ignore[reportAttributeAccessIssue] — JAX makes its settings when it is imported
     if given >= 0 or "xla_force_host_platform_device_count" in os.environ.get("XLA_FLAGS", ""):
         return
-    count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    jax.config.update("jax_num_cpu_devices", count or 1)
+    jax.config.update("jax_num_cpu_devices", usable_cores())

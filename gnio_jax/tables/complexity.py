@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 from typing import NamedTuple
 
@@ -11,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gnio_jax import models
+from gnio_jax.cores import usable_cores
 from gnio_jax.tables.summary import grid
 
 # Parameters in millions and the column "GFLOPs" as the paper prints them.
@@ -56,7 +56,7 @@ def measure(network: str, samples: int = 200, batches: tuple[int, ...] = (1, 128
 def hardware() -> str:
     """What it runs on, for the notes of a table."""
     device = jax.devices()[0]
-    return f"{os.cpu_count()} CPU cores" if device.platform == "cpu" else device.device_kind
+    return f"{usable_cores()} CPU cores" if device.platform == "cpu" else device.device_kind
 
 
 def markdown(found: list[Complexity], device: str) -> str:

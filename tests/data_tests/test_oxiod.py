@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import warnings
 
 import numpy as np
@@ -18,7 +17,7 @@ from gnio_jax.types import InputError
 @pytest.fixture(autouse=True)
 def quiet(tmp_path, monkeypatch):
     monkeypatch.setenv("GNIO_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr(os, "cpu_count", lambda: 1)  # spawning costs more than these small files
+    monkeypatch.setattr(oxiod, "usable_cores", lambda: 1)  # spawning costs more than these small files
 
 
 def dataset(tmp_path, scene, folder):
@@ -324,7 +323,7 @@ def test_reading_again_uses_the_cache_and_spawned_workers_agree(copy, monkeypatc
         again = oxiod.read(copy, "test")
     assert all(np.array_equal(a.position, b.position, equal_nan=True) for a, b in zip(alone, again, strict=True))
     monkeypatch.setenv("GNIO_CACHE", str(copy / "other"))
-    monkeypatch.setattr(os, "cpu_count", lambda: 2)
+    monkeypatch.setattr(oxiod, "usable_cores", lambda: 2)
     spawned = oxiod.read(copy, "test")
     assert all(np.allclose(a.position, b.position, atol=1e-9) for a, b in zip(alone, spawned, strict=True))
 
