@@ -58,13 +58,14 @@ def test_arrows_point_as_the_error_goes():
 @pytest.mark.parametrize("make", [experiments.components, experiments.gates, experiments.bank_sizes, experiments.bank_spread,
                                   lambda base: experiments.comparison(base, "test")])
 def test_rows_differ_in_the_network_alone(make):
-    """Every row can be built, two rows are never the same, rows of the same name are; loss apart, only the network differs."""
+    """Every row can be built, two are never the same, those of a name are; loss and regularisation apart, only the network differs."""
     seen = {}
     for cell in make(BASE).cells:
         assert create_model(cell.config) is not None
         assert seen.setdefault(cell.name, cell.config) == cell.config
-        assert dataclasses.replace(cell.config, model=BASE.model, loss=BASE.loss) == BASE
-        assert cell.config.model.name != "gnio" or cell.config.loss == BASE.loss
+        optim = dataclasses.replace(cell.config.optim, clip_norm=BASE.optim.clip_norm, weight_decay=BASE.optim.weight_decay)
+        assert dataclasses.replace(cell.config, model=BASE.model, loss=BASE.loss, optim=optim) == BASE
+        assert cell.config.model.name != "gnio" or (cell.config.loss, cell.config.optim) == (BASE.loss, BASE.optim)
     assert len(set(map(str, seen.values()))) == len(seen)
 
 
@@ -97,13 +98,17 @@ def test_rows_are_the_published_configurations():
 
 
 @pytest.mark.parametrize("network", [*experiments.METHODS, "imot_text"])
-def test_losses_are_those_of_the_published_recipes(network):
+def test_losses_and_regularisation_are_those_of_the_published_recipes(network):
+    row = experiments.method(network, BASE)
+    budget = dataclasses.replace(row.optim, clip_norm=BASE.optim.clip_norm, weight_decay=BASE.optim.weight_decay)
+    assert budget == BASE.optim and (row.data, row.augment) == (BASE.data, BASE.augment)
     if network == "gnio":
-        assert experiments.loss(network, 200, BASE.loss) is BASE.loss
+        assert experiments.loss(network, 200, BASE.loss) is BASE.loss and row.optim == BASE.optim
         return
     recipe = configuration.validate(configuration.load(f"configs/baselines/{network}.yaml"))
     assert recipe.model.name == network
     assert experiments.loss(network, 200, BASE.loss) == recipe.loss
+    assert (row.optim.clip_norm, row.optim.weight_decay) == (recipe.optim.clip_norm, recipe.optim.weight_decay)
     assert create_model(recipe) is not None
 
 

@@ -25,7 +25,7 @@ from gnio_jax.tables.matrix import Interrupted, Result
 from gnio_jax.types import InputError
 
 DESCRIPTION = """The paper's tables, made anew with this package: every row is trained with the same recordings, batches, epochs, learning
-rate and augmentation, each network with its own published loss.
+rate and augmentation, each network with its own published loss, clipping and weight decay.
 
   python -m gnio_jax.tables complexity                                       parameters, operations, latency
   python -m gnio_jax.tables comparison --base configs/quickstart.yaml        the networks side by side

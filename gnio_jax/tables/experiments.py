@@ -13,6 +13,10 @@ SCALED = ("gnio", "tlio", "ronin_resnet", "deepils")
 TLIO_SHARE = 10 / 200
 """TLIO's uncertainty does not learn in its first 10 epochs; of a run of another length the same share (ours, of 200)."""
 
+REGULARISATION: dict[str, dict[str, float]] = {"tlio": {"clip_norm": 0.1}, "ctin": {"weight_decay": 1e-6}}
+"""Of the published recipes, what is neither loss nor budget. TLIO needs its clip: where its uncertainty begins to learn, the gradients
+of the likelihood are so large that they undo what its displacements have learnt."""
+
 
 class Cell(NamedTuple):
     """One row of a table before it is run."""
@@ -51,9 +55,10 @@ def loss(network: str, epochs: int, base: LossConfig) -> LossConfig:
 
 
 def method(network: str, base: TrainConfig) -> TrainConfig:
-    """`base` with another network and its loss: the same recordings, augmentation, batches, epochs and learning rate."""
+    """`base` with another network, its loss and regularisation: the same recordings, augmentation, batches, epochs and learning rate."""
     model = dataclasses.replace(type(base.model)(), name=network, width=base.model.width if network in SCALED else None)
-    return dataclasses.replace(base, model=model, loss=loss(network, base.optim.epochs, base.loss))
+    optim = dataclasses.replace(base.optim, **REGULARISATION.get(network, {}))
+    return dataclasses.replace(base, model=model, loss=loss(network, base.optim.epochs, base.loss), optim=optim)
 
 
 def variant(base: TrainConfig, **options: object) -> TrainConfig:
