@@ -55,8 +55,8 @@ def measure(network: str, samples: int = 200, batches: tuple[int, ...] = (1, 128
 
 def hardware() -> str:
     """What it runs on, for the notes of a table."""
-    device = jax.devices()[0]
-    return f"{usable_cores()} CPU cores" if device.platform == "cpu" else device.device_kind
+    device, cores = jax.devices()[0], usable_cores()
+    return f"{cores} CPU core{'s' if cores > 1 else ''}" if device.platform == "cpu" else device.device_kind
 
 
 def markdown(found: list[Complexity], device: str) -> str:
