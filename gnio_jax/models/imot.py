@@ -151,8 +151,8 @@ class DecoderLayer(nn.Module):
         found = []
         for name, token, position in zip(("accel", "gyro"), jnp.split(tokens, MODALITIES, axis=1), jnp.split(positions, MODALITIES, axis=1),
                                          strict=True):
-            attend_to = attention(self.heads, name, 2 * samples, samples)
-            y = attend_to(jnp.concatenate([x, where], axis=-1), jnp.concatenate([token, position], axis=-1), token)
+            query, key = jnp.concatenate([x, where], axis=-1), jnp.concatenate([token, position], axis=-1)
+            y = attention(self.heads, name, samples)(query, key, token)
             found.append(layer_norm(f"{name}_norm")(x + drop(y)))
         x = Perceptron((samples, samples), name="fusion")(jnp.concatenate(found, axis=-1))
         return layer_norm("ffn_norm")(x + drop(Perceptron((self.ffn, samples), name="ffn")(x)))

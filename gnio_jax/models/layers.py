@@ -41,10 +41,10 @@ def attend(
     return context.reshape(batch, heads, samples, size).swapaxes(1, 2)
 
 
-def attention(heads: int, name: str, inner: int | None = None, outer: int | None = None) -> nn.MultiHeadDotProductAttention:
-    """Multi-head attention by `attend`; `inner` and `outer` features, the query's where they are None."""
+def attention(heads: int, name: str, features: int | None = None) -> nn.MultiHeadDotProductAttention:
+    """Multi-head attention by `attend`, as wide inside as its query; `features` come out, the query's number of them where it is None."""
     return nn.MultiHeadDotProductAttention(
-        heads, qkv_features=inner, out_features=outer, dtype=jnp.float32, param_dtype=jnp.float32, attention_fn=attend, name=name
+        heads, out_features=features, dtype=jnp.float32, param_dtype=jnp.float32, attention_fn=attend, name=name
     )
 
 
