@@ -37,7 +37,7 @@ def main() -> None:
     if outcome.stopped_by:
         print(f"stopped and saved; continue with: python train.py --workdir {outcome.workdir} --resume", file=sys.stderr)
         sys.exit(128 + outcome.stopped_by)
-    print(f"best validation loss {outcome.best_loss:.4g}; look at it with: python evaluate.py --workdir {outcome.workdir}")
+    print(f"best on validation {outcome.best_loss:.4g}; look at it with: python evaluate.py --workdir {outcome.workdir}")
 
 
 if __name__ == "__main__":

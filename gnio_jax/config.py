@@ -89,15 +89,16 @@ class ModelConfig:
     bank_heads: int | None = None
     """Attention heads of the bank's query (gnio: 8)."""
     bank_std: float | None = None
-    """Standard deviation of the prototypes before training (gnio: 1/√d of their d features)."""
+    """Standard deviation of the prototypes before training (gnio: 1). Near 1/√d of their d features all are attended to alike."""
     head: Literal["gated", "linear"] | None = None
     """Displacement as scale × gate, or a plain linear layer (gnio: gated)."""
     gate: Literal["tanh", "sigmoid"] | None = None
     """Activation of the gate (gnio: tanh)."""
     scale: Literal["softplus", "pos_elu", "abs", "exp", "linear"] | None = None
     """Activation of the scale (gnio: softplus)."""
-    uncertainty: Literal["head", "constant"] | None = None
-    """Standard deviation from a head (paper), or one per axis, that of the errors on the validation split (gnio: head)."""
+    uncertainty: Literal["head", "calibrated", "constant"] | None = None
+    """Standard deviation from a head (paper); from a head and multiplied by one factor per axis; or one constant per axis. Factor
+    and constant are those of the errors on the validation split (gnio: head)."""
     output_dim: int | None = None
     """3, or 2 for a network that says nothing of the vertical, as published (ronin_resnet, deepils, ctin, imot)."""
     dropout: float | None = None
@@ -117,10 +118,10 @@ class LossConfig:
     """Weight of the absolute error, summed over the axes (DeepILS: that of the squared one)."""
     nll_weight: float = 1e-4
     """λ_NLL."""
-    nll_from_epoch: int = 0
-    """First epoch in which the likelihood counts: above 0 the two-stage reading of the paper's text."""
-    log_std_from_epoch: int = 0
-    """First epoch in which the likelihood moves the uncertainty; before it only the displacement learns from it (TLIO: 10)."""
+    nll_from_epoch: float = 0.0
+    """Epochs before the likelihood counts: above 0 the two-stage reading of the paper's text."""
+    log_std_from_epoch: float = 0.0
+    """Epochs before the likelihood moves the uncertainty; until then only the displacement learns from it (TLIO: 10)."""
     log_std_floor: float | None = None
     """Smallest log standard deviation the likelihood sees (TLIO: log 1e-3); none by default."""
 
@@ -150,7 +151,13 @@ class OptimConfig:
     plateau_epochs: int = 10
     """Of the plateau: epochs without a smaller squared error on the validation split before the learning rate falls (RoNIN, DeepILS)."""
     plateau_factor: float = 0.1
-    """Of the plateau: the learning rate falls to this share of itself."""
+    """Of the plateau: factor applied to the learning rate when it falls."""
+    best_by: Literal["loss", "squared_error"] = "loss"
+    """Which mean over the validation split chooses the best checkpoint: the loss, or the squared error of the displacement. The
+    choice begins anew where `loss.nll_from_epoch` or `loss.log_std_from_epoch` changes what is trained."""
+    statistics_windows: int = 16384
+    """Augmented training windows over which the statistics of batch normalisation are estimated before every validation and
+    checkpoint (ours); 0 keeps the running averages of the last steps."""
 
 
 @dataclass(frozen=True)
@@ -312,7 +319,9 @@ def validate(config: TrainConfig, source: str = "config") -> TrainConfig:
     require(model.dropout is None or 0 <= model.dropout < 1, "model.dropout", f"must be at least 0 and below 1, found {model.dropout!r}")
     require(0 < optim.plateau_factor < 1, "optim.plateau_factor", f"must be between 0 and 1, found {optim.plateau_factor!r}")
     require(optim.weight_decay >= 0, "optim.weight_decay", f"must not be negative, found {optim.weight_decay!r}")
-    require(optim.warmup_epochs >= 0, "optim.warmup_epochs", f"must not be negative, found {optim.warmup_epochs!r}")
+    for name, number in [("optim.warmup_epochs", optim.warmup_epochs), ("optim.statistics_windows", optim.statistics_windows),
+                         ("loss.nll_from_epoch", config.loss.nll_from_epoch), ("loss.log_std_from_epoch", config.loss.log_std_from_epoch)]:
+        require(number >= 0, name, f"must not be negative, found {number!r}")
     require(optim.clip_norm is None or optim.clip_norm > 0, "optim.clip_norm", "must be positive or null")
     return config
 

@@ -70,7 +70,9 @@ class CTIN(nn.Module):
         x = TemporalEmbedding(self.width, name="temporal_embedding")(windows)
         for layer in range(self.decoder_layers):
             x = DecoderLayer(self.heads, self.ffn, self.decoder_dropout, name=f"decoder_{layer + 1}")(x, memory, train)
-        velocity, log_std = (jax.vmap(to_axes)(SampleHead(self.output_dim, name=name)(x)) for name in ("velocity", "log_std"))
+        # The uncertainty starts at σ = 1 (ours), as in `heads.UncertaintyHead` and for its reason.
+        starts = {"velocity": nn.initializers.lecun_normal(), "log_std": nn.initializers.zeros}
+        velocity, log_std = (jax.vmap(to_axes)(SampleHead(self.output_dim, start, name=name)(x)) for name, start in starts.items())
         task_log_std = self.param("task_log_std", nn.initializers.zeros, (2,), jnp.float32)
         return Prediction(velocity.mean(axis=1), _root_mean_square(log_std), {
             "velocity": velocity,
@@ -173,10 +175,11 @@ class SampleHead(nn.Module):
     """
 
     outputs: int
+    output_init: nn.initializers.Initializer
 
     @nn.compact
     def __call__(self, x: Float[jax.Array, "b n d"]) -> Float[jax.Array, "b n k"]:
-        return linear(self.outputs, "output")(layer_norm("norm")(linear(x.shape[-1] // 2, "hidden")(x)))
+        return linear(self.outputs, "output", kernel_init=self.output_init)(layer_norm("norm")(linear(x.shape[-1] // 2, "hidden")(x)))
 
 
 def _root_mean_square(log_std: Float[jax.Array, "b n 3"]) -> Float[jax.Array, "b 3"]:

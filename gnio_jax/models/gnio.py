@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from flax import linen as nn
 from jaxtyping import Float
 
-from gnio_jax.models.heads import ConstantUncertainty, GatedHead, LinearHead, UncertaintyHead
+from gnio_jax.models.heads import CalibratedUncertainty, ConstantUncertainty, GatedHead, LinearHead, UncertaintyHead
 from gnio_jax.models.motion_bank import MotionBank
 from gnio_jax.models.resnet import ResNet18
 from gnio_jax.types import Prediction
@@ -19,18 +19,19 @@ class GNIO(nn.Module):
     """Windows [accel, gyro] in the gravity-aligned frame to displacement, its uncertainty, gate and attention.
 
     The defaults are the paper's: 4,934,153 parameters, 32,768 of them the bank. `bank_size = 0` leaves the bank out
-    (h = f). Widths other than 64 scale every layer, for machines without an accelerator. `uncertainty = "constant"` is ours: one
-    standard deviation per axis, that of the errors on the validation split, in the place of the head's.
+    (h = f). Widths other than 64 scale every layer, for machines without an accelerator. Two kinds of `uncertainty` are ours:
+    "calibrated" multiplies the head's standard deviation by one factor per axis, "constant" puts one standard deviation per
+    axis in its place; both make it fit the errors on the validation split.
     """
 
     width: int = 64
     bank_size: int = 64
     bank_heads: int = 8
-    bank_std: float | None = None
+    bank_std: float = 1.0
     head: Literal["gated", "linear"] = "gated"
     gate: Literal["tanh", "sigmoid"] = "tanh"
     scale: Literal["softplus", "pos_elu", "abs", "exp", "linear"] = "softplus"
-    uncertainty: Literal["head", "constant"] = "head"
+    uncertainty: Literal["head", "calibrated", "constant"] = "head"
 
     def __post_init__(self) -> None:
         if self.bank_size and (8 * self.width) % self.bank_heads:
@@ -47,10 +48,13 @@ class GNIO(nn.Module):
             h = h + context
         head = GatedHead(self.gate, self.scale, name="head") if self.head == "gated" else LinearHead(name="head")
         displacement, seen = head(h)
-        if self.uncertainty == "head":
-            log_std = UncertaintyHead(name="uncertainty")(h)
-        else:
-            log_std = ConstantUncertainty(name="uncertainty")(windows.shape[0])
+        match self.uncertainty:
+            case "head":
+                log_std = UncertaintyHead(name="uncertainty")(h)
+            case "calibrated":
+                log_std = CalibratedUncertainty(name="uncertainty")(h, train)
+            case "constant":
+                log_std = ConstantUncertainty(name="uncertainty")(windows.shape[0])
         return Prediction(displacement, log_std, diagnostics | seen)
 
     @nn.nowrap

@@ -44,18 +44,40 @@ class LinearHead(nn.Module):
 
 
 class UncertaintyHead(nn.Module):
-    """u = W_u h + b_u, the log standard deviation per axis: Σ̂ = diag(exp 2u)."""
+    """u = W_u h + b_u, the log standard deviation per axis: Σ̂ = diag(exp 2u).
+
+    Ours: kernel and bias start at zero, σ = 1 m. The likelihood's gradient holds e² exp(−2u), which no bound limits where a
+    random kernel says a small σ; one such step stays in Adam's second moment for thousands of steps.
+    """
 
     @nn.compact
     def __call__(self, h: Float[jax.Array, "b d"]) -> Float[jax.Array, "b 3"]:
-        return linear(3, "log_std")(h)
+        return _log_std()(h)
+
+
+class CalibratedUncertainty(nn.Module):
+    """The head's standard deviation times one factor per axis, which inference applies and training does not see.
+
+    The factor (ours) lies among the `batch_stats` as its logarithm. It is set after every validation, so that the squared
+    errors on the validation split are those that the standard deviations announce (`training.step.calibrated`).
+    """
+
+    @nn.compact
+    def __call__(self, h: Float[jax.Array, "b d"], train: bool) -> Float[jax.Array, "b 3"]:
+        log_std = _log_std()(h)
+        factor = self.variable("batch_stats", "log_factor", jnp.zeros, (3,), jnp.float32)
+        return log_std if train else log_std + factor.value[None]
+
+
+def _log_std() -> nn.Dense:
+    return linear(3, "log_std", kernel_init=nn.initializers.zeros)
 
 
 class ConstantUncertainty(nn.Module):
     """The log standard deviation of a network that has none of its own: one constant per axis, the same for every window.
 
     Not a parameter: it lies among the `batch_stats` and is set to the errors on the validation split after every epoch
-    (`training.losses.calibrated`).
+    (`training.step.calibrated`).
     """
 
     @nn.compact

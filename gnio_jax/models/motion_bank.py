@@ -7,25 +7,33 @@ import jax.numpy as jnp
 from flax import linen as nn
 from jaxtyping import Float
 
+# PyTorch's `MultiheadAttention`: query, key and value are one (3d, d) matrix to its Xavier-uniform start, so that their bound
+# is √(6 / 4d) = √(3 · 0.5 / d), and the output is a linear layer with its usual bound 1/√d.
+stacked_xavier = nn.initializers.variance_scaling(0.5, "fan_in", "uniform")
+fan_in_uniform = nn.initializers.variance_scaling(1 / 3, "fan_in", "uniform")
+
 
 class MotionBank(nn.Module):
     """c = MultiHeadAttention(query f, keys M, values M), with M ∈ R^{m×d} a parameter; h = f + c is left to the caller.
 
     The bank is the same for every window, so its keys and values are projected once per call and not once per window.
-    Ours, where the paper is silent: 8 heads, projections with bias, M ~ N(0, 1/√d), or of another standard deviation `std`.
+    Ours, where the paper is silent: 8 heads, projections with bias that start as PyTorch's attention starts them, and
+    M ~ N(0, std²), std = 1. Prototypes that start near each other (std = 1/√d) are attended to alike, and stay so.
     """
 
     size: int = 64
     heads: int = 8
     width: int = 512
-    std: float | None = None
+    std: float = 1.0
 
     def setup(self) -> None:
         shape = (self.heads, self.width // self.heads)
-        std = self.width**-0.5 if self.std is None else self.std
-        self.prototypes = self.param("prototypes", nn.initializers.normal(std), (self.size, self.width), jnp.float32)
-        self.query, self.key, self.value = (nn.DenseGeneral(shape, dtype=jnp.float32, param_dtype=jnp.float32) for _ in range(3))
-        self.output = nn.DenseGeneral(self.width, axis=(-2, -1), dtype=jnp.float32, param_dtype=jnp.float32)
+        self.prototypes = self.param("prototypes", nn.initializers.normal(self.std), (self.size, self.width), jnp.float32)
+        self.query, self.key, self.value = (
+            nn.DenseGeneral(shape, kernel_init=stacked_xavier, dtype=jnp.float32, param_dtype=jnp.float32) for _ in range(3)
+        )
+        self.output = nn.DenseGeneral(self.width, axis=(-2, -1), kernel_init=fan_in_uniform,
+                                      dtype=jnp.float32, param_dtype=jnp.float32)
 
     def __call__(self, feature: Float[jax.Array, "b d"],
                  memory: tuple[Float[jax.Array, "h m k"], Float[jax.Array, "h k m"]] | None = None

@@ -12,6 +12,9 @@ from jaxtyping import Float
 BLOCKS_PER_GROUP = 2
 GROUP_STRIDES = (1, 2, 2, 2)
 
+MOMENTUM = 0.9
+"""Share of batch normalisation's running statistics that a training step keeps (PyTorch's momentum 0.1 is its complement)."""
+
 he_normal_fan_out = nn.initializers.variance_scaling(2.0, "fan_out", "normal")
 
 
@@ -86,8 +89,9 @@ def conv(features: int, size: int, stride: int, train: bool, name: str) -> nn.Co
 
 
 def batch_norm(train: bool, name: str) -> nn.BatchNorm:
-    """Batch normalisation with PyTorch's constants (its momentum 0.1 is Flax's 0.9)."""
-    return nn.BatchNorm(use_running_average=not train, momentum=0.9, epsilon=1e-5, dtype=jnp.float32, param_dtype=jnp.float32, name=name)
+    """Batch normalisation with PyTorch's constants."""
+    return nn.BatchNorm(use_running_average=not train, momentum=MOMENTUM, epsilon=1e-5,
+                        dtype=jnp.float32, param_dtype=jnp.float32, name=name)
 
 
 class BasicBlock(nn.Module):

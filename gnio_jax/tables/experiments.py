@@ -5,13 +5,13 @@ from __future__ import annotations
 import dataclasses
 from typing import NamedTuple
 
-from gnio_jax.config import LossConfig, TrainConfig
+from gnio_jax.config import LossConfig, OptimConfig, TrainConfig
 
 SCALED = ("gnio", "tlio", "ronin_resnet", "deepils")
 """Networks whose `width` means channels of the first group: an experiment at half the width halves all of them."""
 
-TLIO_SHARE = 10 / 200
-"""TLIO's uncertainty does not learn in its first 10 epochs; of a run of another length the same share (ours, of 200)."""
+TLIO_HELD, TLIO_BATCH, PAPER_EPOCHS = 10, 1024, 200
+"""TLIO's uncertainty does not learn in its first 10 epochs of batches of 1,024; the paper trains every network for 200 epochs."""
 
 REGULARISATION: dict[str, dict[str, float]] = {"tlio": {"clip_norm": 0.1}, "ctin": {"weight_decay": 1e-6}}
 """Of the published recipes, what is neither loss nor budget. TLIO needs its clip: where its uncertainty begins to learn, the gradients
@@ -38,14 +38,22 @@ class Experiment(NamedTuple):
     cells: list[Cell]
 
 
-def loss(network: str, epochs: int, base: LossConfig) -> LossConfig:
+def held_epochs(optim: OptimConfig) -> float:
+    """Epochs in which TLIO's uncertainty does not learn: the published ones. Ours: a shorter run holds it for the number of
+    steps that those take with the published batches, and at most for half of itself."""
+    if optim.epochs >= PAPER_EPOCHS:
+        return TLIO_HELD
+    return min(TLIO_HELD * optim.batch_size / TLIO_BATCH, optim.epochs / 2)
+
+
+def loss(network: str, base: TrainConfig) -> LossConfig:
     """The published loss of a network; GNIO's is that of the experiment."""
     match network:
         case "gnio":
-            return base
+            return base.loss
         case "tlio":
-            learns = max(1, round(TLIO_SHARE * epochs))
-            return LossConfig(mse_weight=0.0, nll_weight=1.0, log_std_from_epoch=learns, log_std_floor=-6.907755)
+            return LossConfig(mse_weight=0.0, nll_weight=1.0, log_std_from_epoch=held_epochs(base.optim),
+                              log_std_floor=-6.907755)
         case "deepils":
             return LossConfig(mse_weight=1.0, mae_weight=1.0, nll_weight=0.0)
         case "ctin":
@@ -55,10 +63,11 @@ def loss(network: str, epochs: int, base: LossConfig) -> LossConfig:
 
 
 def method(network: str, base: TrainConfig) -> TrainConfig:
-    """`base` with another network, its loss and regularisation: the same recordings, augmentation, batches, epochs and learning rate."""
+    """`base` with another network, its loss and regularisation: the same recordings, augmentation, batches, epochs and learning
+    rate. Losses differ, so every row's checkpoint is the one with the smallest squared error on the validation split."""
     model = dataclasses.replace(type(base.model)(), name=network, width=base.model.width if network in SCALED else None)
-    optim = dataclasses.replace(base.optim, **REGULARISATION.get(network, {}))
-    return dataclasses.replace(base, model=model, loss=loss(network, base.optim.epochs, base.loss), optim=optim)
+    optim = dataclasses.replace(base.optim, best_by="squared_error", **REGULARISATION.get(network, {}))
+    return dataclasses.replace(base, model=model, loss=loss(network, base), optim=optim)
 
 
 def variant(base: TrainConfig, **options: object) -> TrainConfig:
@@ -126,19 +135,23 @@ def bank_sizes(base: TrainConfig) -> Experiment:
 
 def bank_spread(base: TrainConfig) -> Experiment:
     """How far apart the prototypes start, with the linear head: the paper does not say, and near each other all are attended to alike."""
+    near = (8 * (base.model.width or 64)) ** -0.5
     return Experiment("Prototypes before training", "no published figure: the paper does not say how its bank starts", [
         Cell("gnio_bank-0_linear", "no bank", variant(base, bank_size=0, head="linear")),
-        Cell("gnio_linear", "N(0, 1/√d)", variant(base, head="linear")),
-        Cell("gnio_bank-std-1_linear", "N(0, 1)", variant(base, head="linear", bank_std=1.0)),
+        Cell("gnio_bank-near_linear", "N(0, 1/√d)", variant(base, head="linear", bank_std=near)),
+        Cell("gnio_linear", "N(0, 1)", variant(base, head="linear")),
     ])
 
 
 def remedies(base: TrainConfig) -> Experiment:
-    """What makes GNIO's uncertainty fit for the filter: the likelihood weighted like the squared error from the start, or one constant
-    per axis from the validation split in place of the head."""
-    usual = method("gnio", base)
+    """What makes GNIO's uncertainty fit for the filter. One constant per axis, which is that of the errors on the validation
+    split, is compared with heads that are calibrated on the same windows, with the published weight of the likelihood and with 1;
+    the published head as it comes from training stands beside them."""
+    calibrated = variant(base, uncertainty="calibrated")
     return Experiment("Uncertainty", "no published figure: the paper has its own head alone, at λ_NLL = 1e-4", [
-        Cell("gnio", "gnio, as published", usual),
-        Cell("gnio_nll-1", "likelihood weighted by 1", dataclasses.replace(usual, loss=dataclasses.replace(usual.loss, nll_weight=1.0))),
         Cell("gnio_constant", "one constant per axis", variant(base, uncertainty="constant")),
+        Cell("gnio_calibrated", "head, calibrated", calibrated),
+        Cell("gnio_calibrated_nll-1", "head, likelihood weighted by 1, calibrated",
+             dataclasses.replace(calibrated, loss=dataclasses.replace(calibrated.loss, nll_weight=1.0))),
+        Cell("gnio", "head, as published: not calibrated", method("gnio", base)),
     ])

@@ -33,7 +33,7 @@ class Position(NamedTuple):
     """Epoch in progress, or finished if `step` is a multiple of the steps per epoch."""
     step: int
     best_loss: float | None
-    """Smallest validation loss so far."""
+    """Smallest value on the validation split, since the last switch of what is trained, of what `optim.best_by` names."""
     loss_sums: tuple[float, float, float]
     """Training losses summed over the steps of the epoch in progress."""
     seconds: float

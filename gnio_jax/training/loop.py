@@ -28,8 +28,18 @@ from gnio_jax.data import windows
 from gnio_jax.files import replacing
 from gnio_jax.training import optimizer as optimizers
 from gnio_jax.training.checkpoint import Checkpoints, Position, create_model, exists
-from gnio_jax.training.losses import Losses, Stage, stage
-from gnio_jax.training.step import TrainState, calibrated, create_state, epoch_order, train_steps, validate
+from gnio_jax.training.losses import stage, switches
+from gnio_jax.training.step import (
+    TrainState,
+    Validation,
+    calibrated,
+    create_state,
+    epoch_order,
+    estimate_statistics,
+    normalises,
+    train_steps,
+    validate,
+)
 from gnio_jax.types import InputError
 
 DISPATCH_SECONDS = 0.5
@@ -41,7 +51,7 @@ class Outcome(NamedTuple):
 
     workdir: Path
     best_loss: float | None
-    """Smallest validation loss."""
+    """Smallest value on the validation split of what `optim.best_by` names."""
     stopped_by: int | None
     """Signal that ended it early; its state is saved."""
 
@@ -92,6 +102,9 @@ def _train(config: TrainConfig, resume: bool, console: Console) -> Outcome:
     state = create_state(run.model, run.optimizer, run.init_key, config.data.window)
     console.print(f"{config.model.name}: {sum(x.size for x in jax.tree.leaves(state.params)):,} parameters on {jax.devices()[0].platform}, "
                   f"{run.steps_per_epoch} steps of {config.optim.batch_size} windows an epoch, {config.optim.epochs} epochs → {workdir}")
+    for what, step in zip(("the likelihood counts", "the uncertainty learns"), switches(config.loss, run.steps_per_epoch), strict=True):
+        if step > 0:
+            console.print(f"{what} from step {step:,} of {config.optim.epochs * run.steps_per_epoch:,}")
 
     workdir.mkdir(parents=True, exist_ok=True)
     if not resume:
@@ -105,16 +118,18 @@ def _train(config: TrainConfig, resume: bool, console: Console) -> Outcome:
         rows = _kept_rows(workdir / "metrics.jsonl", position.epoch)
         board = SummaryWriter(str(workdir / "tensorboard"), purge_step=position.step)
         for epoch in range(position.epoch, config.optim.epochs):
-            now = stage(config.loss, epoch, position.plateau.factor)
-            state, position, rate = _run_epoch(run, epoch, now, state, position, checkpoints, stop, bar)
+            state, position, rate = _run_epoch(run, epoch, state, position, checkpoints, stop, bar)
             if position.step < (epoch + 1) * run.steps_per_epoch:
                 break  # stopped on the way, and saved
 
-            held_out, axis_mse = validate(state, run.held_out, now, model=run.model, config=config)
-            state = calibrated(state, axis_mse)
+            state = run.estimated(state)
+            now = stage(config.loss, position.step - 1, run.steps_per_epoch)
+            held_out = validate(state, run.held_out, now, model=run.model, config=config)
+            state = calibrated(state, held_out)
             row = _row(run, epoch, position, held_out, rate)
-            improved = position.best_loss is None or row["val_loss"] < position.best_loss
-            best_loss = row["val_loss"] if improved else position.best_loss
+            merit = row["val_loss" if config.optim.best_by == "loss" else "val_mse"]
+            improved = position.best_loss is None or _switched(run, position.step) or merit < position.best_loss
+            best_loss = merit if improved else position.best_loss
             # The position of a finished epoch is the start of the next one.
             position = position._replace(epoch=epoch + 1, best_loss=best_loss, loss_sums=(0.0, 0.0, 0.0), gradient_norms={},
                                          plateau=optimizers.watch(position.plateau, row["val_mse"], config.optim))
@@ -149,6 +164,13 @@ class _Run(NamedTuple):
     init_key: jax.Array
     order_key: jax.Array
     step_key: jax.Array
+    statistics_key: jax.Array
+
+    def estimated(self, state: TrainState) -> TrainState:
+        """The state as it is validated and kept: with the statistics of its batch normalisations estimated anew, if asked for."""
+        if not self.config.optim.statistics_windows or not normalises(state):
+            return state
+        return estimate_statistics(state, self.source, self.statistics_key, model=self.model, config=self.config)
 
 
 def _prepare(config: TrainConfig, console: Console) -> _Run:
@@ -161,13 +183,14 @@ def _prepare(config: TrainConfig, console: Console) -> _Run:
     if count < size:
         raise InputError("optim.batch_size", f"is {size}, but there are only {count} windows", "lower it")
     steps_per_epoch = count // size
-    init_key, order_key, step_key = jax.random.split(jax.random.key(config.seed), 3)
-    return _Run(config, model, optimizers.create(config.optim, steps_per_epoch), optimizers.schedule(config.optim, steps_per_epoch),
-                source, held_out, splits, steps_per_epoch, init_key, order_key, step_key)  # fmt: skip
+    key = jax.random.key(config.seed)
+    return _Run(config, model, optimizers.create(config.optim, config.loss, steps_per_epoch),
+                optimizers.schedule(config.optim, steps_per_epoch), source, held_out, splits, steps_per_epoch,
+                *jax.random.split(key, 3), jax.random.fold_in(key, 3))  # fmt: skip
 
 
 def _run_epoch(
-    run: _Run, epoch: int, now: Stage, state: TrainState, position: Position, checkpoints: Checkpoints, stop: _Stop,
+    run: _Run, epoch: int, state: TrainState, position: Position, checkpoints: Checkpoints, stop: _Stop,
     bar: Callable[[int, int, float, float, float], None],
 ) -> tuple[TrainState, Position, float]:
     """Finish epoch `epoch` from `position` on, or save and return when asked to stop; with the windows/s of these steps."""
@@ -179,7 +202,8 @@ def _run_epoch(
     while done < run.steps_per_epoch:
         count = min(dispatch, run.steps_per_epoch - done)
         tick = time.perf_counter()
-        state, progress = train_steps(state, run.source, order, jnp.int32(done), jnp.int32(count), now, run.step_key,
+        state, progress = train_steps(state, run.source, order, jnp.int32(done), jnp.int32(count),
+                                      jnp.float32(position.plateau.factor), run.step_key,
                                       model=run.model, optimizer=run.optimizer, config=run.config)  # fmt: skip
         failed_step = int(progress.failed_step)  # waits for the device
         if failed_step >= 0:
@@ -195,20 +219,26 @@ def _run_epoch(
         rate = (done - first) * size / (clock - began)
         bar(position.step, epoch, sums[0] / done, _learning_rate(run, position), rate)
         if done < run.steps_per_epoch and (stop.signum or clock - saved > run.config.checkpoint_every_seconds):
-            checkpoints.save("latest", state, position)
-            saved = clock
+            checkpoints.save("latest", run.estimated(state), position)
+            saved = time.perf_counter()
             if stop.signum:
                 break
     return state, position, rate
 
 
-def _row(run: _Run, epoch: int, position: Position, held_out: Losses, rate: float) -> dict[str, int | float]:
+def _switched(run: _Run, step: int) -> bool:
+    """Whether the epoch that ends at `step` changed what is trained: losses before and after it do not compare."""
+    return any(step - run.steps_per_epoch <= switch < step for switch in switches(run.config.loss, run.steps_per_epoch))
+
+
+def _row(run: _Run, epoch: int, position: Position, held_out: Validation, rate: float) -> dict[str, int | float]:
     """The log's line of a finished epoch: mean losses of training (as its steps met them) and of validation."""
     loss, mse, nll = (x / run.steps_per_epoch for x in position.loss_sums)
-    val_loss, val_mse, val_nll = (float(x) for x in held_out)
+    val_loss, val_mse, val_nll = (float(x) for x in held_out.losses)
     return {
         "epoch": epoch, "step": position.step, "loss": loss, "mse": mse, "nll": nll,
         "val_loss": val_loss, "val_mse": val_mse, "val_nll": val_nll, "val_rmse": math.sqrt(val_mse),
+        **{f"val_normalised/{axis}": float(x) for axis, x in zip("xyz", held_out.axis_normalised, strict=True)},
         "learning_rate": _learning_rate(run, position), "windows_per_second": rate, "seconds": position.seconds,
         **{f"gradient_norm/{part}": norm / run.steps_per_epoch for part, norm in position.gradient_norms.items()},
     }  # fmt: skip

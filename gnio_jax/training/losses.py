@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 
 from gnio_jax.config import LossConfig
 from gnio_jax.types import Prediction, Windows
@@ -24,20 +25,29 @@ class Losses(NamedTuple):
 
 
 class Stage(NamedTuple):
-    """What of the objective an epoch decides."""
+    """What of the objective the progress of training decides."""
 
     nll_weight: Float[jax.Array, ""]
     """λ_NLL, or zero before `LossConfig.nll_from_epoch`."""
-    log_std_gradient: Float[jax.Array, ""]
-    """1, or 0 before `LossConfig.log_std_from_epoch`."""
-    learning_rate_factor: Float[jax.Array, ""]
-    """Share of the schedule's learning rate (see `optimizer.Plateau`)."""
+    log_std_learns: Bool[jax.Array, ""]
+    """False before `LossConfig.log_std_from_epoch`."""
 
 
-def stage(config: LossConfig, epoch: int, learning_rate_factor: float = 1.0) -> Stage:
-    """The stage of an epoch."""
-    nll_weight = config.nll_weight if epoch >= config.nll_from_epoch else 0.0
-    return Stage(jnp.float32(nll_weight), jnp.float32(epoch >= config.log_std_from_epoch), jnp.float32(learning_rate_factor))
+def switches(config: LossConfig, steps_per_epoch: int) -> tuple[int, int]:
+    """First steps of the likelihood and of the uncertainty, from the fractions of an epoch that the config gives."""
+    likelihood, uncertainty = (
+        math.ceil(epochs * steps_per_epoch - 1e-6)
+        for epochs in (config.nll_from_epoch, config.log_std_from_epoch)
+    )
+    return likelihood, uncertainty
+
+
+def stage(config: LossConfig, step: Int[jax.Array, ""] | int, steps_per_epoch: int) -> Stage:
+    """The stage at a step."""
+    likelihood, uncertainty = switches(config, steps_per_epoch)
+    step = jnp.asarray(step)
+    nll_weight = jnp.where(step >= likelihood, jnp.float32(config.nll_weight), jnp.float32(0))
+    return Stage(nll_weight, step >= uncertainty)
 
 
 def losses(prediction: Prediction, windows: Windows, config: LossConfig, stage: Stage) -> Losses:
@@ -83,4 +93,4 @@ def _nll(error: Float[jax.Array, "*b 3"], log_std: Float[jax.Array, "*b 3"], con
 def _held(log_std: Float[jax.Array, "*b 3"], stage: Stage) -> Float[jax.Array, "*b 3"]:
     """The same values, with a gradient only where the stage lets the uncertainty learn."""
     held = jax.lax.stop_gradient(log_std)
-    return held + stage.log_std_gradient * (log_std - held)
+    return held + jnp.where(stage.log_std_learns, log_std - held, 0.0)

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import jax
 import optax
 
-from gnio_jax.config import OptimConfig
+from gnio_jax.config import LossConfig, OptimConfig
+
+UNCERTAINTY = ("uncertainty", "log_std")
+"""Names of the networks' parts from which nothing but the uncertainty comes."""
 
 
 def schedule(config: OptimConfig, steps_per_epoch: int) -> optax.Schedule:
@@ -27,15 +31,33 @@ def schedule(config: OptimConfig, steps_per_epoch: int) -> optax.Schedule:
     )
 
 
-def create(config: OptimConfig, steps_per_epoch: int) -> optax.GradientTransformation:
-    """Adam, β = (0.9, 0.999), with the schedule; before it, where that is asked for, the gradient's global norm is clipped and the
-    parameters decay."""
-    parts = [optax.adam(schedule(config, steps_per_epoch), b1=0.9, b2=0.999)]
+def create(config: OptimConfig, loss: LossConfig, steps_per_epoch: int) -> optax.GradientTransformationExtraArgs:
+    """Adam, β = (0.9, 0.999), with the schedule; before it, where that is asked for, the gradient's global norm is clipped and
+    the parameters decay. `update` takes `log_std_learns` (see `losses.Stage`).
+
+    Where the uncertainty is held at first, it has a state of its own that does not count those steps, as PyTorch's Adam does
+    not count steps without a gradient. In one state the zero gradients would be counted: at the release the bias correction of
+    the moments would be gone, and the first steps 3.7 times as long as the learning rate allows.
+    """
+    rate = schedule(config, steps_per_epoch)
+    adam = optax.adam(rate, b1=0.9, b2=0.999)
+    if loss.log_std_from_epoch > 0:
+        moments = optax.scale_by_adam(b1=0.9, b2=0.999)
+        held = optax.conditionally_mask(moments, lambda step, log_std_learns: log_std_learns, forward_extra_args=True)
+        adam = optax.chain(optax.partition({"learns": moments, "held": held}, _kinds), optax.scale_by_learning_rate(rate))
+    parts = [adam]
     if config.weight_decay:
         parts.insert(0, optax.add_decayed_weights(config.weight_decay))
     if config.clip_norm is not None:
         parts.insert(0, optax.clip_by_global_norm(config.clip_norm))
-    return optax.chain(*parts) if len(parts) > 1 else parts[0]
+    return optax.with_extra_args_support(optax.chain(*parts) if len(parts) > 1 else parts[0])
+
+
+def _kinds(params: Any) -> Any:
+    def kind(path: tuple, _: jax.Array) -> str:
+        return "held" if path[0].key in UNCERTAINTY else "learns"
+
+    return jax.tree_util.tree_map_with_path(kind, params)
 
 
 class Plateau(NamedTuple):

@@ -15,7 +15,8 @@ from gnio_jax.config import TrainConfig
 from gnio_jax.data.augment import augment
 from gnio_jax.data.windows import WindowSource, gather, shifted
 from gnio_jax.models import initialise
-from gnio_jax.training.losses import Losses, Stage, losses
+from gnio_jax.models.resnet import MOMENTUM
+from gnio_jax.training.losses import Losses, Stage, losses, stage
 from gnio_jax.types import Prediction, Windows
 
 
@@ -26,6 +27,16 @@ class TrainState(NamedTuple):
     params: Any
     batch_stats: Any
     opt_state: Any
+
+
+class Validation(NamedTuple):
+    """Means over every window of a split."""
+
+    losses: Losses
+    axis_mse: Float[jax.Array, "3"]
+    """Squared error of each axis, m²."""
+    axis_normalised: Float[jax.Array, "3"]
+    """(e/σ)² of each axis: 1 where the standard deviations are those of the errors."""
 
 
 class Progress(NamedTuple):
@@ -58,38 +69,39 @@ def train_steps(
     order: Int[jax.Array, "m"],
     first: Int[jax.Array, ""],
     count: Int[jax.Array, ""],
-    stage: Stage,
+    learning_rate_factor: Float[jax.Array, ""],
     key: PRNGKeyArray,
     *,
     model: nn.Module,
     optimizer: optax.GradientTransformation,
     config: TrainConfig,
 ) -> tuple[TrainState, Progress]:
-    """Take `count` steps of an epoch from its step number `first` on, in one dispatch.
+    """Take `count` steps of an epoch from its step number `first` on, in one dispatch; `learning_rate_factor` is
+    `optimizer.Plateau.factor`.
 
     `count` is not static: however an epoch is cut into dispatches it is the same program, so a run that was
     interrupted and resumed has the same parameters to the bit.
     """
     size = config.optim.batch_size
+    steps_per_epoch = order.shape[0] // size
 
     def one_step(i: jax.Array, carry: tuple[TrainState, Progress]) -> tuple[TrainState, Progress]:
         state, progress = carry
         which = jax.lax.dynamic_slice(order, ((first + i) * size,), (size,))
-        augment_key, dropout_key, shift_key = jax.random.split(jax.random.fold_in(key, state.step), 3)
-        which = shifted(shift_key, source, which, config.augment.shift_samples)
-        windows = augment(augment_key, gather(source, which, config.data.window), config.augment)
+        windows, dropout_key = drawn(jax.random.fold_in(key, state.step), source, which, config)
+        now = stage(config.loss, state.step, steps_per_epoch)
 
         def objective(params: Any) -> tuple[jax.Array, tuple[Losses, Any]]:
             prediction, changed = model.apply(
                 {"params": params, "batch_stats": state.batch_stats}, windows.imu, train=True,
                 mutable=["batch_stats"], rngs={"dropout": dropout_key},
             )  # fmt: skip
-            loss = losses(prediction, windows, config.loss, stage)
+            loss = losses(prediction, windows, config.loss, now)
             return loss.total, (loss, changed.get("batch_stats", {}))
 
         gradient, (loss, batch_stats) = jax.grad(objective, has_aux=True)(state.params)
-        update, opt_state = optimizer.update(gradient, state.opt_state, state.params)
-        update = optax.tree.scale(stage.learning_rate_factor, update)
+        update, opt_state = optimizer.update(gradient, state.opt_state, state.params, log_std_learns=now.log_std_learns)
+        update = optax.tree.scale(learning_rate_factor, update)
         failed = jnp.where((progress.failed_step < 0) & ~jnp.isfinite(loss.total), state.step, progress.failed_step)
         state = TrainState(jnp.add(state.step, 1), optax.apply_updates(state.params, update), batch_stats, opt_state)
         sums = jax.tree.map(jnp.add, (progress.sums, progress.gradient_norms), (loss, gradient_norms(gradient)))
@@ -97,6 +109,56 @@ def train_steps(
 
     nothing = Progress(Losses(*[jnp.float32(0)] * 3), jax.tree.map(jnp.zeros_like, gradient_norms(state.params)), jnp.int32(-1))
     return jax.lax.fori_loop(jnp.int32(0), count, one_step, (state, nothing))
+
+
+def drawn(key: PRNGKeyArray, source: WindowSource, which: Int[jax.Array, "b"],
+          config: TrainConfig) -> tuple[Windows, PRNGKeyArray]:
+    """The windows `which`, shifted and augmented by draws from `key`, and the key of the network's dropout."""
+    augment_key, dropout_key, shift_key = jax.random.split(key, 3)
+    which = shifted(shift_key, source, which, config.augment.shift_samples)
+    return augment(augment_key, gather(source, which, config.data.window), config.augment), dropout_key
+
+
+def normalises(state: TrainState) -> bool:
+    """Whether the network has batch normalisations."""
+    return any(path[-1].key == "mean" for path, _ in jax.tree_util.tree_leaves_with_path(state.batch_stats))
+
+
+def statistics_batches(source: WindowSource, config: TrainConfig) -> int:
+    """Batches of `estimate_statistics`: those of `optim.statistics_windows`, but no more than an epoch has."""
+    size = config.optim.batch_size
+    return min(-(-config.optim.statistics_windows // size), source.visited.shape[0] // size)
+
+
+@functools.partial(jax.jit, static_argnames=("model", "config"))
+def estimate_statistics(
+    state: TrainState, source: WindowSource, key: PRNGKeyArray, *, model: nn.Module, config: TrainConfig
+) -> TrainState:
+    """The state with the statistics of every batch normalisation estimated anew for its parameters.
+
+    Means over batches of augmented training windows that depend on `key` alone, in training mode. The running averages remember
+    ten steps, and what those miss is an offset of the displacement (ours; Wu and Johnson 2021, "Rethinking 'Batch' in
+    BatchNorm"). Nothing else of `batch_stats` changes.
+    """
+    size, batches = config.optim.batch_size, statistics_batches(source, config)
+    order_key, draw_key = jax.random.split(key)
+    order = jax.random.permutation(order_key, source.visited)[: batches * size].reshape(batches, size)
+    # A normalisation adds 1 − MOMENTUM of the batch's statistics to the MOMENTUM-fold of its own: of zeros, that alone is left.
+    zeros = jax.tree.map(jnp.zeros_like, state.batch_stats)
+
+    def add_batch(total: Any, number_which: tuple[jax.Array, jax.Array]) -> tuple[Any, None]:
+        number, which = number_which
+        windows, dropout_key = drawn(jax.random.fold_in(draw_key, number), source, which, config)
+        _, changed = model.apply({"params": state.params, "batch_stats": zeros}, windows.imu, train=True,
+                                 mutable=["batch_stats"], rngs={"dropout": dropout_key})  # fmt: skip
+        return jax.tree.map(jnp.add, total, changed["batch_stats"]), None
+
+    total, _ = jax.lax.scan(add_batch, zeros, (jnp.arange(batches), order))
+
+    def statistic(path: tuple, total: jax.Array, before: jax.Array) -> jax.Array:
+        return total / (batches * (1 - MOMENTUM)) if path[-1].key in ("mean", "var") else before
+
+    return state._replace(batch_stats=jax.tree_util.tree_map_with_path(statistic, total, state.batch_stats))
 
 
 def gradient_norms(gradient: Any) -> dict[str, Float[jax.Array, ""]]:
@@ -111,10 +173,9 @@ def gradient_norms(gradient: Any) -> dict[str, Float[jax.Array, ""]]:
 
 @functools.partial(jax.jit, static_argnames=("model", "config"))
 def validate(
-    state: TrainState, source: WindowSource, stage: Stage, *, model: nn.Module, config: TrainConfig
-) -> tuple[Losses, Float[jax.Array, "3"]]:
-    """Mean losses over every window of `source`, without augmentation and with the running batch statistics; and the mean
-    squared error of each axis, m²."""
+    state: TrainState, source: WindowSource, now: Stage, *, model: nn.Module, config: TrainConfig
+) -> Validation:
+    """Mean losses and errors over every window of `source`, without augmentation and in inference mode."""
     count = source.visited.shape[0]
     size = min(config.optim.batch_size, count)
     batches = -(-count // size)
@@ -122,11 +183,13 @@ def validate(
     which = source.visited[jnp.minimum(jnp.arange(batches * size, dtype=jnp.int32), count - 1)].reshape(batches, size)
     weight = (jnp.arange(batches * size) < count).astype(jnp.float32).reshape(batches, size)
 
-    def one_window(prediction: Prediction, windows: Windows) -> tuple[Losses, jax.Array]:
+    def one_window(prediction: Prediction, windows: Windows) -> Validation:
         prediction, windows = jax.tree.map(lambda x: x[None], (prediction, windows))
-        return losses(prediction, windows, config.loss, stage), jnp.square(windows.displacement - prediction.displacement)[0]
+        error = windows.displacement - prediction.displacement
+        return Validation(losses(prediction, windows, config.loss, now), error[0] ** 2,
+                          error[0] ** 2 * jnp.exp(-2 * prediction.log_std[0]))
 
-    def one_batch(which_weight: tuple[jax.Array, jax.Array]) -> tuple[Losses, jax.Array]:
+    def one_batch(which_weight: tuple[jax.Array, jax.Array]) -> Validation:
         windows = gather(source, which_weight[0], config.data.window)
         prediction: Any = model.apply({"params": state.params, "batch_stats": state.batch_stats}, windows.imu)
         each = jax.vmap(one_window)(prediction, windows)
@@ -135,9 +198,16 @@ def validate(
     return jax.tree.map(lambda x: jnp.sum(x, axis=0) / count, jax.lax.map(one_batch, (which, weight)))
 
 
-def calibrated(state: TrainState, axis_mse: Float[jax.Array, "3"]) -> TrainState:
-    """The state with every constant uncertainty (`models.heads.ConstantUncertainty`) set to these squared errors, m²."""
-    def constant(path: tuple, leaf: jax.Array) -> jax.Array:
-        return 0.5 * jnp.log(axis_mse) if path[-1] == jax.tree_util.DictKey("log_std") else leaf
+def calibrated(state: TrainState, found: Validation) -> TrainState:
+    """The state whose constants and factors of the uncertainty (`models.heads`) fit the errors that validation found with it."""
 
-    return state._replace(batch_stats=jax.tree_util.tree_map_with_path(constant, state.batch_stats))
+    def fitted(path: tuple, leaf: jax.Array) -> jax.Array:
+        match path[-1].key:
+            case "log_std":
+                return 0.5 * jnp.log(found.axis_mse)
+            case "log_factor":
+                return leaf + 0.5 * jnp.log(found.axis_normalised)
+            case _:
+                return leaf
+
+    return state._replace(batch_stats=jax.tree_util.tree_map_with_path(fitted, state.batch_stats))

@@ -8,6 +8,7 @@ from jax import lax
 
 from gnio_jax import models
 from gnio_jax.models import resnet
+from gnio_jax.models.motion_bank import MotionBank
 from gnio_jax.types import InputError
 
 
@@ -41,10 +42,34 @@ def test_bank_sizes(size, total):
 
 
 def test_prototypes_start_as_far_apart_as_asked():
-    for options, std in (({}, 64**-0.5), ({"bank_std": 1.0}, 1.0)):
+    for options, std in (({}, 1.0), ({"bank_std": 64**-0.5}, 64**-0.5)):
         model = models.create("gnio", width=8, bank_size=400, **options)
         prototypes = models.initialise(model, jax.random.key(0), 50)["params"]["bank"]["prototypes"]
         np.testing.assert_allclose(np.std(prototypes), std, rtol=0.03)
+
+
+def test_the_bank_starts_alive():
+    """Windows attend to different prototypes before training, and their contexts differ; near each other the prototypes are a saddle."""
+    rng = np.random.default_rng(0)
+    features = jnp.asarray(np.maximum(rng.normal(0.4, 1.0, (200, 512)), 0), jnp.float32)
+    entropy, spread = {}, {}
+    for std in (1.0, 512**-0.5):
+        bank = MotionBank(std=std)
+        context, attention = jax.jit(lambda key, bank=bank: bank.init_with_output(key, features)[0])(jax.random.key(1))
+        entropy[std] = -np.mean(np.sum(attention * np.log(attention), axis=-1)) / np.log(64)
+        spread[std] = np.mean(np.std(context, axis=0)) / np.mean(np.std(features, axis=0))
+    assert entropy[1.0] < 0.98 and entropy[512**-0.5] > 0.999
+    assert spread[1.0] > 100 * spread[512**-0.5]
+
+
+def test_the_projections_start_as_those_of_pytorch():
+    """Xavier-uniform over query, key and value as one (3d, d) matrix, a linear layer's bound for the output, biases zero."""
+    params = MotionBank(size=3, heads=2, width=64).init(jax.random.key(0), jnp.zeros((1, 64), jnp.float32))["params"]
+    for name, bound in [("query", (6 / (64 + 192)) ** 0.5), ("key", (6 / (64 + 192)) ** 0.5), ("value", (6 / (64 + 192)) ** 0.5),
+                        ("output", 64**-0.5)]:
+        kernel = np.abs(params[name]["kernel"])
+        assert 0.99 * bound < kernel.max() <= bound and abs(kernel.mean() - bound / 2) < 0.02 * bound
+        np.testing.assert_array_equal(params[name]["bias"], 0)
 
 
 def test_without_a_bank_the_attention_goes_with_it():

@@ -21,6 +21,7 @@ from gnio_jax import config as configuration
 from gnio_jax.config import DataConfig, LossConfig, ModelConfig, OptimConfig, TrainConfig
 from gnio_jax.data import windows
 from gnio_jax.training import checkpoint, loop, optimizer, step
+from gnio_jax.training.losses import Losses
 from gnio_jax.types import InputError
 
 ROOT = Path(__file__).parents[2]
@@ -203,7 +204,7 @@ def test_two_stage_loss_without_float64(recording, tmp_path, monkeypatch):
     monkeypatch.setattr(loop, "train_steps", spy(step.train_steps))
     monkeypatch.setattr(loop, "validate", spy(step.validate))
     loop.train(tiny(recording, tmp_path / "run", loss=LossConfig(nll_from_epoch=99), optim=OptimConfig(epochs=1, batch_size=16)))
-    template = step.create_state(checkpoint.create_model(tiny(recording, "")), optimizer.create(OptimConfig(), 1),
+    template = step.create_state(checkpoint.create_model(tiny(recording, "")), optimizer.create(OptimConfig(), LossConfig(), 1),
                                  jax.random.split(jax.random.key(0), 3)[0], 50)  # fmt: skip
     trained = parameters(tmp_path / "run")["params"]
     assert same(trained["uncertainty"], jax.tree.map(np.asarray, template.params["uncertainty"]))
@@ -249,3 +250,21 @@ def test_runs_that_cannot_be_loaded(finished, tmp_path):
     configuration.save(other / "config.yaml", config)
     with pytest.raises(InputError, match="cannot be read"):
         checkpoint.load_run(other)
+
+
+def test_the_best_checkpoint_begins_anew_where_what_is_trained_changes(recording, tmp_path, monkeypatch):
+    """Losses before and after a switch do not compare: the first epoch's would win for ever."""
+    said = iter([(-100.0, 1.0), (7.0, 4.0), (6.0, 5.0)])
+
+    def validated(*_, **__):
+        loss, mse = next(said)
+        one = jnp.ones(3, jnp.float32)
+        return step.Validation(Losses(jnp.float32(loss), jnp.float32(mse), jnp.float32(0)), one, one)
+
+    monkeypatch.setattr(loop, "validate", validated)
+    for criterion, best, epoch in (("loss", 6.0, 3), ("squared_error", 4.0, 2)):
+        said = iter([(-100.0, 1.0), (7.0, 4.0), (6.0, 5.0)])
+        config = tiny(recording, tmp_path / criterion, loss=LossConfig(nll_weight=1.0, nll_from_epoch=1.5))
+        config = dataclasses.replace(config, optim=dataclasses.replace(config.optim, best_by=criterion))
+        assert loop.train(config).best_loss == best
+        assert checkpoint.load_run(tmp_path / criterion).epoch == epoch

@@ -7,8 +7,10 @@ import optax
 import pytest
 
 from gnio_jax.config import LossConfig, OptimConfig
+from gnio_jax.models.heads import CalibratedUncertainty
 from gnio_jax.training import losses, optimizer
-from gnio_jax.training.step import TrainState, calibrated
+from gnio_jax.training.losses import Losses
+from gnio_jax.training.step import TrainState, Validation, calibrated
 from gnio_jax.types import Prediction, Windows
 
 
@@ -20,8 +22,11 @@ def target(displacement, steps=4):
                    jnp.broadcast_to(displacement[:, None] / steps, (count, steps, 3)))
 
 
+STEPS_PER_EPOCH = 7
+
+
 def found_losses(prediction, windows, config, epoch=0):
-    return losses.losses(prediction, windows, config, losses.stage(config, epoch))
+    return losses.losses(prediction, windows, config, losses.stage(config, epoch * STEPS_PER_EPOCH, STEPS_PER_EPOCH))
 
 
 def test_losses_by_hand():
@@ -51,6 +56,16 @@ def test_uncertainty_learns_from_its_epoch_on():
     np.testing.assert_allclose(u_after, 1 - np.square([[0.3, -0.2, 0.1]]) * np.exp(2), rtol=1e-5)
     np.testing.assert_array_equal(d_before, d_after)
     assert (d_before != 0).all()
+
+
+def test_switches_are_steps():
+    config = LossConfig(nll_from_epoch=0.5, log_std_from_epoch=1.25)
+    assert losses.switches(config, 8) == (4, 10)
+    assert losses.switches(config, 7) == (4, 9)  # the first whole step after the fraction
+    assert losses.switches(LossConfig(nll_from_epoch=3), 7) == (21, 0)
+    seen = [losses.stage(config, step, 8) for step in range(12)]
+    assert [float(stage.nll_weight) > 0 for stage in seen] == [step >= 4 for step in range(12)]
+    assert [bool(stage.log_std_learns) for stage in seen] == [step >= 10 for step in range(12)]
 
 
 def test_velocity_and_covariance_by_hand():
@@ -132,15 +147,56 @@ def test_plateau_is_that_of_pytorch():
 def test_a_constant_uncertainty_takes_the_errors_of_the_validation():
     constant, other = jnp.zeros(3, jnp.float32), jnp.ones(3, jnp.float32)
     state = TrainState(jnp.int32(0), {}, {"uncertainty": {"log_std": constant}, "bn": {"mean": other}}, ())
-    found = calibrated(state, jnp.array([0.04, 1.0, 4.0], jnp.float32)).batch_stats
+    nothing = Losses(*[jnp.float32(0)] * 3)
+    found = calibrated(state, Validation(nothing, jnp.array([0.04, 1.0, 4.0], jnp.float32), jnp.ones(3, jnp.float32))).batch_stats
     np.testing.assert_allclose(np.exp(found["uncertainty"]["log_std"]), [0.2, 1, 2], rtol=1e-6)
     assert found["bn"]["mean"] is other
+
+
+def test_a_calibrated_head_announces_the_errors_of_the_validation():
+    """Errors twice and half as large as announced: the factors follow, from whatever they were; and training does not see them."""
+    head, rng = CalibratedUncertainty(), np.random.default_rng(0)
+    h = jnp.asarray(rng.standard_normal((4, 5)), jnp.float32)
+    variables = head.init(jax.random.key(0), h, False)
+    stats = {"uncertainty": {"log_factor": jnp.log(jnp.array([3.0, 1.0, 1.0], jnp.float32))}}
+    nothing = Losses(*[jnp.float32(0)] * 3)
+    seen = Validation(nothing, jnp.ones(3, jnp.float32), jnp.array([4.0, 0.25, 1.0], jnp.float32))
+    found = calibrated(TrainState(jnp.int32(0), {}, stats, ()), seen).batch_stats["uncertainty"]
+    np.testing.assert_allclose(np.exp(found["log_factor"]), [6.0, 0.5, 1.0], rtol=1e-6)
+    variables = {"params": variables["params"], "batch_stats": found}
+    np.testing.assert_allclose(head.apply(variables, h, False), np.log([[6.0, 0.5, 1.0]] * 4), rtol=1e-6, atol=1e-7)
+    np.testing.assert_array_equal(head.apply(variables, h, True), 0.0)
+
+
+def test_a_held_uncertainty_is_not_counted():
+    """PyTorch's Adam does not count steps in which a parameter has no gradient: at the release the moments are those of a first step."""
+    config = OptimConfig(epochs=10)
+    tx = optimizer.create(config, LossConfig(log_std_from_epoch=2.0), 3)
+    params = {part: {"w": jnp.array([1.0, -2.0, 3.0], jnp.float32)} for part in ("encoder", "log_std")}
+    state, update = tx.init(params), jax.jit(tx.update)
+    expected = {part: [np.array([1.0, -2.0, 3.0]), np.zeros(3), np.zeros(3), 0] for part in params}
+    rng = np.random.default_rng(0)
+    for step in range(12):
+        held = step < 6
+        gradient = {part: np.zeros(3) if held and part == "log_std" else rng.standard_normal(3) for part in params}
+        change, state = update(jax.tree.map(lambda g: {"w": jnp.asarray(g, jnp.float32)}, gradient), state, params,
+                               log_std_learns=jnp.bool_(not held))  # fmt: skip
+        params = optax.apply_updates(params, change)
+        for part, (w, m, v, count) in expected.items():
+            if held and part == "log_std":
+                continue
+            m, v = 0.9 * m + 0.1 * gradient[part], 0.999 * v + 0.001 * gradient[part] ** 2
+            count += 1
+            w = w - by_formula(step, 3, 5, 10) * (m / (1 - 0.9**count)) / (np.sqrt(v / (1 - 0.999**count)) + 1e-8)
+            expected[part] = [w, m, v, count]
+        for part in params:
+            np.testing.assert_allclose(params[part]["w"], expected[part][0], rtol=1e-6, atol=2e-7)
 
 
 @pytest.mark.parametrize("clip, decay", [(None, 0.0), (0.5, 0.0), (0.5, 0.03)])
 def test_adam_against_numpy(clip, decay):
     config = OptimConfig(epochs=10, clip_norm=clip, weight_decay=decay)
-    tx = optimizer.create(config, 3)
+    tx = optimizer.create(config, LossConfig(), 3)
     params = {"w": jnp.array([1.0, -2.0, 3.0], jnp.float32)}
     state = tx.init(params)
     w, m, v = np.array([1.0, -2.0, 3.0]), np.zeros(3), np.zeros(3)

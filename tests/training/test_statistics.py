@@ -1,0 +1,164 @@
+"""The statistics of batch normalisation, the start of the uncertainty, and what training makes of both on synthetic walks."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from gnio_jax import data, models
+from gnio_jax.config import DataConfig, LossConfig, ModelConfig, OptimConfig, TrainConfig
+from gnio_jax.data import windows
+from gnio_jax.training import losses, optimizer, step
+from gnio_jax.training.checkpoint import create_model
+
+CONFIG = TrainConfig(
+    data=DataConfig(rate=50.0), model=ModelConfig(width=8), loss=LossConfig(nll_weight=1.0),
+    optim=OptimConfig(schedule="constant", epochs=4, batch_size=64, learning_rate=3e-3, start_learning_rate=1e-4,
+                      warmup_epochs=0.5),
+)  # fmt: skip
+
+
+@functools.cache
+def source_of(split, stride):
+    sequences = [data.resample(s, CONFIG.data.rate) for s in data.load("synthetic", split=split)]
+    return jax.device_put(windows.index(sequences, CONFIG.data, stride))
+
+
+def trainer(config, source, seed=0):
+    """State, and a function that takes `count` of its steps, from a fresh network."""
+    with jax.enable_x64(False):
+        model, key = create_model(config), jax.random.key(seed)
+        steps = source.visited.shape[0] // config.optim.batch_size
+        tx = optimizer.create(config.optim, config.loss, steps)
+        state = step.create_state(model, tx, key, config.data.window)
+
+    def take(state, epoch, first, count):
+        with jax.enable_x64(False):
+            order = step.epoch_order(key, epoch, source)
+            return step.train_steps(state, source, order, jnp.int32(first), jnp.int32(count), jnp.float32(1), key,
+                                    model=model, optimizer=tx, config=config)  # fmt: skip
+
+    return model, state, take, steps
+
+
+@pytest.fixture(scope="module")
+def trained():
+    source = source_of("val", 2)
+    model, state, take, steps = trainer(CONFIG, source)
+    for epoch in range(CONFIG.optim.epochs):
+        state, _ = take(state, epoch, 0, steps)
+    return model, state, source
+
+
+def estimated(model, state, source, config=CONFIG, key=0):
+    with jax.enable_x64(False):
+        return step.estimate_statistics(state, source, jax.random.key(key), model=model, config=config)
+
+
+def squared_errors(model, state, source, config=CONFIG):
+    """Of augmented training windows, which no estimate drew: with the statistics of their batches, and in inference mode."""
+    batches = np.random.default_rng(5).permutation(np.asarray(source.visited))[: 48 * 64].reshape(-1, 64)
+
+    @jax.jit
+    def one(state, key, which):
+        drawn, dropout = step.drawn(key, source, which, config)
+        variables = {"params": state.params, "batch_stats": state.batch_stats}
+        training, _ = model.apply(variables, drawn.imu, train=True, mutable=["batch_stats"], rngs={"dropout": dropout})
+        inference = model.apply(variables, drawn.imu)
+        return [jnp.mean(jnp.sum((p.displacement - drawn.displacement) ** 2, axis=-1)) for p in (training, inference)]
+
+    with jax.enable_x64(False):
+        found = [one(state, jax.random.key(1000 + k), jnp.asarray(which)) for k, which in enumerate(batches)]
+    return np.mean(found, axis=0)
+
+
+def test_training_windows_err_in_inference_mode_as_in_training_mode(trained):
+    """Within 3 %. While the network still changes, the running averages miss by more than that."""
+    model, state, source = trained
+    training, inference = squared_errors(model, estimated(model, state, source), source)
+    assert abs(inference / training - 1) < 0.03
+    training, inference = squared_errors(model, state, source)
+    assert abs(inference / training - 1) > 0.03, "running averages would do: the test shows nothing"
+
+
+def test_statistics_are_means_over_batches(trained):
+    """Of the first normalisation, against NumPy: its input is a convolution of the drawn windows."""
+    model, state, source = trained
+    few = dataclasses.replace(CONFIG, optim=dataclasses.replace(CONFIG.optim, statistics_windows=3 * 64))
+    assert step.statistics_batches(source, few) == 3
+    found = estimated(model, state, source, few, key=7).batch_stats["encoder"]["stem_bn"]
+    kernel = np.asarray(state.params["encoder"]["stem_conv"]["kernel"], np.float64)
+    order_key, draw_key = jax.random.split(jax.random.key(7))
+    order = np.asarray(jax.random.permutation(order_key, source.visited))[: 3 * 64].reshape(3, 64)
+    means, variances = [], []
+    for number, which in enumerate(order):
+        with jax.enable_x64(False):
+            imu = np.asarray(step.drawn(jax.random.fold_in(draw_key, number), source, jnp.asarray(which), few)[0].imu, np.float64)
+        padded = np.pad(imu, ((0, 0), (3, 3), (0, 0)))
+        out = np.stack([np.einsum("bkc,kcd->bd", padded[:, i : i + 7], kernel) for i in range(0, 50, 2)], axis=1)
+        means.append(out.mean((0, 1)))
+        variances.append(out.var((0, 1)))
+    np.testing.assert_allclose(found["mean"], np.mean(means, 0), rtol=1e-3, atol=1e-5)
+    np.testing.assert_allclose(found["var"], np.mean(variances, 0), rtol=1e-3)
+
+
+def test_an_estimate_depends_on_parameters_and_key_alone(trained):
+    model, state, source = trained
+    few = dataclasses.replace(CONFIG, optim=dataclasses.replace(CONFIG.optim, statistics_windows=128))
+    one = estimated(model, state, source, few)
+    other = estimated(model, state._replace(batch_stats=jax.tree.map(lambda x: x + 3, state.batch_stats), step=jnp.int32(5)), source, few)
+    assert all(jax.tree.leaves(jax.tree.map(np.array_equal, one.batch_stats, other.batch_stats)))
+    third = estimated(model, state, source, few, key=1)
+    assert not np.array_equal(one.batch_stats["encoder"]["stem_bn"]["mean"], third.batch_stats["encoder"]["stem_bn"]["mean"])
+    assert step.statistics_batches(source, dataclasses.replace(few, optim=dataclasses.replace(few.optim, statistics_windows=10**9))) \
+        == source.visited.shape[0] // 64
+
+
+def test_constants_of_the_uncertainty_are_left_alone():
+    config = dataclasses.replace(CONFIG, model=ModelConfig(width=2, uncertainty="calibrated", bank_size=0),
+                                 optim=dataclasses.replace(CONFIG.optim, statistics_windows=64))  # fmt: skip
+    source = source_of("val", 25)
+    model, state, _, _ = trainer(config, source)
+    state.batch_stats["uncertainty"]["log_factor"] = jnp.array([0.5, -1.0, 2.0], jnp.float32)
+    found = estimated(model, state, source, config).batch_stats
+    np.testing.assert_array_equal(found["uncertainty"]["log_factor"], [0.5, -1.0, 2.0])
+    assert not np.array_equal(found["encoder"]["stem_bn"]["mean"], state.batch_stats["encoder"]["stem_bn"]["mean"])
+    assert step.normalises(state) and not step.normalises(state._replace(batch_stats={"uncertainty": found["uncertainty"]}))
+
+
+def test_the_uncertainty_fits_the_errors_after_training(trained):
+    """(e/σ)² per axis on the validation split: with the start that poisons Adam one axis comes out at a hundredth."""
+    model, state, source = trained
+    held_out = source_of("test", 10)
+    with jax.enable_x64(False):
+        found = step.validate(estimated(model, state, source), held_out, losses.stage(CONFIG.loss, 0, 1), model=model, config=CONFIG)
+    assert np.all((found.axis_normalised > 0.5) & (found.axis_normalised < 2.5)), found.axis_normalised
+
+
+@pytest.mark.parametrize("width, seeds", [(16, range(10)), (64, range(1))])
+def test_no_spike_in_the_gradient_of_the_uncertainty(width, seeds):
+    """In the first 200 steps the largest norm of the gradient of the head stays within 100 times the median."""
+    config = dataclasses.replace(CONFIG, model=ModelConfig(width=width), loss=LossConfig(),
+                                 optim=dataclasses.replace(CONFIG.optim, batch_size=8))  # fmt: skip
+    source = source_of("val", 10)
+    for seed in seeds:
+        _, state, take, _ = trainer(config, source, seed)
+        norms = []
+        for number in range(200):
+            state, progress = take(state, 0, number, 1)
+            norms.append(float(progress.gradient_norms["uncertainty"]))
+        assert max(norms) < 100 * np.median(norms), (seed, max(norms), np.median(norms))
+
+
+@pytest.mark.parametrize("name", ["gnio", "tlio", "ctin"])
+def test_networks_with_a_head_begin_with_a_standard_deviation_near_one(name):
+    model = models.create(name, **({"width": 16} if name != "ctin" else {}))
+    rng = np.random.default_rng(0)
+    imu = np.float32([0, 0, 9.81, 0, 0, 0]) + rng.normal(0, [3, 3, 3, 2, 2, 2], (8, 50, 6)).astype(np.float32)
+    for seed in range(3):
+        variables = models.initialise(model, jax.random.key(seed), 50)
+        said, _ = model.apply(variables, imu, train=True, mutable=["batch_stats"], rngs={"dropout": jax.random.key(1)})
+        assert np.abs(said.log_std).max() < 0.1
