@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy.stats import chi2
 
 Alignment = Literal["origin", "none", "yaw_position", "se3"]
@@ -54,9 +54,25 @@ class Measures(NamedTuple):
 
 
 def yaw(orientation: Quaternions) -> Angles:
-    """Yaw atan2(R[1,0], R[0,0]) of quaternions wxyz, rad."""
+    """Yaw atan2(R[1,0], R[0,0]) of quaternions wxyz, rad: that of the body's x axis, which has none
+    where it is vertical. It is the frame of the network's windows. Two attitudes are compared with
+    `relative_yaw`."""
     w, x, y, z = orientation.T
     return np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+
+
+def relative_yaw(estimate: Quaternions, reference: Quaternions) -> Angles:
+    """Yaw error of attitudes R̂ against R, rad in (−π, π]: the turn about the vertical that takes R nearest to R̂.
+
+    ψ minimises ‖R̂ − R_z(ψ) R‖. With E = R̂ Rᵀ that norm is 6 − 2 tr(R_z(ψ)ᵀ E), and the trace is
+    cos ψ (E00 + E11) + sin ψ (E10 − E01) + E22, so ψ = atan2(E10 − E01, E00 + E11), whatever the
+    attitude of the phone: the twist of E about z. With both attitudes level it is the difference of
+    their `yaw`. It has no value only where E is half a turn about a horizontal axis, when every ψ is
+    as near: 0 there (ours). NaN stays NaN.
+    """
+    (a, b, c, d), (w, x, y, z) = estimate.T, reference.T
+    scalar, vertical = a * w + b * x + c * y + d * z, d * w - a * z + c * x - b * y  # of E, as a quaternion
+    return np.arctan2(2 * scalar * vertical, scalar**2 - vertical**2)
 
 
 def rotation_matrices(orientation: Quaternions) -> Float[np.ndarray, "n 3 3"]:
@@ -92,7 +108,7 @@ def _quaternion(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "4"]:
 def align(estimate: Trajectory, reference: Trajectory, how: Alignment = "origin") -> Trajectory:
     """The estimate moved into the reference's frame by one rigid motion, fitted over the trusted rows.
 
-    `origin` matches position and yaw at the first trusted row (what a user of odometry knows); `none` changes nothing;
+    `origin` matches position and yaw (`relative_yaw`) at the first trusted row (what a user of odometry knows); `none` changes nothing;
     `yaw_position` is the least-squares motion of four degrees of freedom (the unobservable ones of inertial odometry;
     VIO benchmarks); `se3` the least-squares motion of six (Horn/Kabsch, no scale; TUM, evo). Raises `Undefined` without
     a trusted row, or for `se3` with fewer than three.
@@ -104,7 +120,7 @@ def align(estimate: Trajectory, reference: Trajectory, how: Alignment = "origin"
         raise Undefined("no trusted reference")
     if how == "origin":
         first = rows[0]
-        turn = rotation_z((yaw(reference.orientation[first:first + 1]) - yaw(estimate.orientation[first:first + 1]))[0])
+        turn = rotation_z(-relative_yaw(estimate.orientation[first:first + 1], reference.orientation[first:first + 1])[0])
         source, target = estimate.position[first], reference.position[first]
     else:
         source, target = estimate.position[rows].mean(0), reference.position[rows].mean(0)
@@ -190,18 +206,17 @@ def rte_distance(estimate: Positions, reference: Positions, metres: float) -> fl
     return _rms(found, np.ones(len(found), bool), f"no unbroken reference of {metres:g} m")
 
 
-def rpe(estimate: Positions, reference: Positions, estimate_yaw: Angles, reference_yaw: Angles, step: float, seconds: float) -> float:
+def rpe(estimate: Positions, reference: Positions, yaw_error: Angles, step: float, seconds: float) -> float:
     """Relative pose error: RMS norm of the error of displacements over `seconds` with the yaw at their start aligned, m (TLIO).
 
-    error_i = R_z(yaw_i − yaŵ_i)(p̂_j − p̂_i) − (p_j − p_i), from every row i, so that a wrong heading of the whole
-    trajectory costs nothing.
+    error_i = R_z(−ψ_i)(p̂_j − p̂_i) − (p_j − p_i), from every row i, with ψ the `relative_yaw` of the
+    estimate's attitude, rad, so that a wrong heading of the whole trajectory costs nothing.
     """
     rows_apart = round(seconds / step)
     reason = f"no two trusted rows {seconds:g} s apart"
     if rows_apart >= len(estimate):
         raise Undefined(reason)
-    angle = (reference_yaw - estimate_yaw)[:-rows_apart]
-    turn = rotation_z(angle)[:, :estimate.shape[1], :estimate.shape[1]]
+    turn = rotation_z(-yaw_error[:-rows_apart])[:, :estimate.shape[1], :estimate.shape[1]]
     moved = np.einsum("nij,nj->ni", turn, estimate[rows_apart:] - estimate[:-rows_apart])
     return _rms(moved - (reference[rows_apart:] - reference[:-rows_apart]), _pairs(reference, rows_apart), reason)
 
@@ -225,19 +240,19 @@ def rpe_se3(estimate: Trajectory, reference: Trajectory, step: float, seconds: f
 # Heading --------------------------------------------------------------------------------------------------------------
 
 
-def yaw_rmse(estimate_yaw: Angles, reference_yaw: Angles) -> float:
-    """Root mean square of the yaw error, wrapped to ±180°, degrees (TLIO). The angles are rad."""
-    error = _yaw_errors(estimate_yaw, reference_yaw)
+def yaw_rmse(yaw_error: Angles) -> float:
+    """Root mean square of the yaw error (`relative_yaw`, rad), wrapped to ±180°, degrees (TLIO)."""
+    error = yaw_error[_trusted(yaw_error)]
     return float(np.degrees(np.sqrt(np.mean(((error + np.pi) % (2 * np.pi) - np.pi) ** 2))))
 
 
-def yaw_drift(estimate_yaw: Angles, reference_yaw: Angles, step: float) -> float:
-    """Size of the change of the unwrapped yaw error from the first to the last trusted row, degrees per hour (TLIO).
+def yaw_drift(yaw_error: Angles, step: float) -> float:
+    """Size of the change of the unwrapped yaw error (`relative_yaw`, rad) from the first to the last trusted row, degrees per hour (TLIO).
 
     Undefined for less than 10 s, which an hour cannot be told from.
     """
-    rows = np.flatnonzero(np.isfinite(reference_yaw))
-    error = np.unwrap(_yaw_errors(estimate_yaw, reference_yaw))
+    rows = _trusted(yaw_error)
+    error = np.unwrap(yaw_error[rows])
     hours = (rows[-1] - rows[0]) * step / 3600
     if hours < 10 / 3600:
         raise Undefined("trusted for less than 10 s")
@@ -346,7 +361,7 @@ def measure(estimate: Trajectory, reference: Trajectory, alignment: Alignment = 
         aligned, origin = align(estimate, reference, alignment), align(estimate, reference, "origin")
     except Undefined as reason:
         missing = str(reason)
-    a_yaw, e_yaw, r_yaw = yaw(aligned.orientation), yaw(estimate.orientation), yaw(reference.orientation)
+    turned, turned_aligned = (relative_yaw(path.orientation, reference.orientation) for path in (estimate, aligned))
     for dims in (3, 2):
         a, e, r = aligned.position[:, :dims], estimate.position[:, :dims], reference.position[:, :dims]
         tag = "" if dims == 3 else "_2d"
@@ -358,8 +373,8 @@ def measure(estimate: Trajectory, reference: Trajectory, alignment: Alignment = 
             f"rte_60s_ronin{tag}": lambda a=a, r=r: rte_ronin(a, r, step),
             f"rte_1m{tag}": lambda a=a, r=r: rte_distance(a, r, 1.0),
             f"rte_10m{tag}": lambda a=a, r=r: rte_distance(a, r, 10.0),
-            f"rpe_1s{tag}": lambda e=e, r=r: rpe(e, r, e_yaw, r_yaw, step, 1.0),
-            f"rpe_10s{tag}": lambda e=e, r=r: rpe(e, r, e_yaw, r_yaw, step, 10.0),
+            f"rpe_1s{tag}": lambda e=e, r=r: rpe(e, r, turned, step, 1.0),
+            f"rpe_10s{tag}": lambda e=e, r=r: rpe(e, r, turned, step, 10.0),
             f"rpe_se3{tag}": lambda dims=dims: rpe_se3(estimate, reference, step, 1.0, dims),
             f"drift{tag}": lambda a=a, r=r: drift(a, r, step),
             f"path_length_ratio{tag}": lambda e=e, r=r: path_length_ratio(e, r, step),
@@ -369,7 +384,7 @@ def measure(estimate: Trajectory, reference: Trajectory, alignment: Alignment = 
             squared = lambda dims=dims: position_nees(origin, estimate, reference, position_covariance, dims)  # noqa: E731
             metrics |= {f"nees{tag}": lambda s=squared, dims=dims: mean_normalised(s(), dims),
                         f"nees_coverage{tag}": lambda s=squared, dims=dims: coverage(s(), dims)}
-    metrics |= {"yaw_rmse": lambda: yaw_rmse(a_yaw, r_yaw), "yaw_drift": lambda: yaw_drift(e_yaw, r_yaw, step),
+    metrics |= {"yaw_rmse": lambda: yaw_rmse(turned_aligned), "yaw_drift": lambda: yaw_drift(turned, step),
                 "path_length": lambda: path_length(reference.position, step)}
     free_of_truth = {}
     if nis is not None:
@@ -393,7 +408,7 @@ def position_nees(aligned: Trajectory, estimate: Trajectory, reference: Trajecto
                   dims: int = 3) -> Float[np.ndarray, "n"]:
     """eᵀ P⁻¹ e of the position, NaN where there is no reference: the error of the start-aligned estimate, turned back into
     the filter's own frame, in which its covariance is."""
-    turn = rotation_z((yaw(estimate.orientation[:1]) - yaw(aligned.orientation[:1]))[0])
+    turn = rotation_z(relative_yaw(estimate.orientation[:1], aligned.orientation[:1])[0])
     error = (aligned.position - reference.position) @ turn.T
     good = finite_rows(error) & (np.einsum("nii->ni", covariance) > 0).all(1)  # a start given as exact has nothing to be normalised by
     squared = np.full(len(error), np.nan)
@@ -452,11 +467,11 @@ def _errors(estimate: Positions, reference: Positions) -> Float[np.ndarray, "m d
     return (estimate - reference)[good]
 
 
-def _yaw_errors(estimate_yaw: Angles, reference_yaw: Angles) -> Float[np.ndarray, "m"]:
-    good = np.isfinite(reference_yaw)
-    if not good.any():
+def _trusted(yaw_error: Angles) -> Int[np.ndarray, "m"]:
+    rows = np.flatnonzero(np.isfinite(yaw_error))
+    if not len(rows):
         raise Undefined("no trusted reference")
-    return (estimate_yaw - reference_yaw)[good]
+    return rows
 
 
 def _pairs(reference: Positions, rows_apart: int) -> Bool[np.ndarray, "m"]:

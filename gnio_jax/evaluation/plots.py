@@ -82,7 +82,7 @@ def position_error(estimate: Estimate) -> Figure:
     panels = figure.subplots(3, 1, sharex=True)
     time = estimate.trajectory.time - estimate.trajectory.time[0]
     aligned = metrics.align(estimate.trajectory, estimate.reference, "origin")
-    turn = metrics.rotation_z(float((metrics.yaw(estimate.trajectory.orientation[:1]) - metrics.yaw(aligned.orientation[:1]))[0]))
+    turn = metrics.rotation_z(metrics.relative_yaw(estimate.trajectory.orientation[:1], aligned.orientation[:1])[0])
     error = (aligned.position - estimate.reference.position) @ turn.T  # in the filter's own frame, as its covariance is
     still = metrics.standing(estimate.reference.position, float(np.median(np.diff(time))))
     for k, (panel, (name, colour)) in enumerate(zip(panels, AXES.items(), strict=True)):
