@@ -3,12 +3,14 @@
 Positions are (n, d) arrays in metres, rows a constant `step` (s) apart, d = 3 or, for the horizontal metrics, 2. A row of
 the reference that cannot be trusted is NaN and counts nowhere, nor does a displacement that starts or ends there.
 A metric without a value (no reference, too short, never standing) raises `Undefined` with the reason; `measure` turns
-that into None and keeps the reason. Everything is NumPy in float64 and pure.
+that into None and keeps the reason. An estimate that is not finite has diverged: its errors are infinite, which is not the
+same as no value, and no summary leaves them out in silence. Everything is NumPy in float64 and pure.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import math
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -24,6 +26,10 @@ STANDING_SPEED = 0.05
 """Mean speed over one second below which the reference stands still, m/s."""
 STANDING_SECONDS = 2.0
 """Shortest stretch that counts as standing still, s."""
+COVERAGES = frozenset({"nees_coverage", "nees_coverage_2d", "nis_coverage"})
+"""Metrics that are small when they are bad: 0 for an estimate that diverged, where errors are infinite."""
+NOT_FINITE, TOO_LARGE = "the estimate is not finite", "the error is too large for a number"
+"""How the reasons of an infinite metric begin."""
 
 
 class Undefined(ValueError):
@@ -45,9 +51,9 @@ class Measures(NamedTuple):
     """The metrics of one sequence."""
 
     values: dict[str, float | None]
-    """Metric -> value; None where it is not defined."""
+    """Metric -> value; None where it is not defined, infinite where the estimate diverged."""
     undefined: dict[str, str]
-    """Metric -> reason, for those without a value."""
+    """Metric -> reason, for those without a value and those of an estimate that diverged."""
 
 
 # Rotations ------------------------------------------------------------------------------------------------------------
@@ -106,18 +112,21 @@ def _quaternion(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "4"]:
 
 
 def align(estimate: Trajectory, reference: Trajectory, how: Alignment = "origin") -> Trajectory:
-    """The estimate moved into the reference's frame by one rigid motion, fitted over the trusted rows.
+    """The estimate moved into the reference's frame by one rigid motion, fitted over the rows that are trusted and finite.
 
     `origin` matches position and yaw (`relative_yaw`) at the first trusted row (what a user of odometry knows); `none` changes nothing;
     `yaw_position` is the least-squares motion of four degrees of freedom (the unobservable ones of inertial odometry;
     VIO benchmarks); `se3` the least-squares motion of six (Horn/Kabsch, no scale; TUM, evo). Raises `Undefined` without
-    a trusted row, or for `se3` with fewer than three.
+    such a row, or for `se3` with fewer than three.
     """
     if how == "none":
         return estimate
-    rows = np.flatnonzero(finite_rows(reference.position))
-    if not len(rows):
+    trusted = finite_rows(reference.position)
+    if not trusted.any():
         raise Undefined("no trusted reference")
+    rows = np.flatnonzero(trusted & _finite(estimate))
+    if not len(rows):
+        raise Undefined(f"{NOT_FINITE} in any trusted row")
     if how == "origin":
         first = rows[0]
         turn = rotation_z(-relative_yaw(estimate.orientation[first:first + 1], reference.orientation[first:first + 1])[0])
@@ -348,16 +357,21 @@ def measure(estimate: Trajectory, reference: Trajectory, alignment: Alignment = 
     `reference` has the estimate's stamps and NaN where it cannot be trusted. The absolute metrics, `rte_*` and `yaw_rmse`
     see the estimate under `alignment`; `se3` is fitted in 3-D for the horizontal ones too. `nees` is taken in the frame
     of the filter, whose covariance is relative to its start, so with the start aligned whatever `alignment` is.
+
+    An estimate with a row that is not finite has diverged. Every metric that a finite one would have is then infinite (a
+    coverage 0), with the reason in `undefined`; so is one that is too large for a number.
     """
     reference = Trajectory(reference.time, np.where(finite_rows(reference.position)[:, None], reference.position, np.nan),
                            np.where(finite_rows(reference.position)[:, None], reference.orientation, np.nan))
     step = float(np.median(np.diff(estimate.time))) if len(estimate.time) > 1 else 1.0
     metrics: dict[str, Callable[[], float]] = {}
+    finite, diverged = _finite(estimate), ""
+    if not finite.all():
+        diverged = f"{NOT_FINITE} from {estimate.time[np.argmin(finite)] - estimate.time[0]:.1f} s on"
+        # Which metrics there would be depends on the reference: a finite stand-in finds out.
+        estimate = Trajectory(estimate.time, np.zeros_like(estimate.position), np.tile([1.0, 0, 0, 0], (len(estimate.time), 1)))
     aligned, origin, missing = estimate, estimate, ""
-    finite = finite_rows(estimate.position) & finite_rows(estimate.orientation)
     try:
-        if not finite.all():
-            raise Undefined(f"the estimate is not finite from {estimate.time[np.argmin(finite)] - estimate.time[0]:.1f} s on")
         aligned, origin = align(estimate, reference, alignment), align(estimate, reference, "origin")
     except Undefined as reason:
         missing = str(reason)
@@ -384,34 +398,44 @@ def measure(estimate: Trajectory, reference: Trajectory, alignment: Alignment = 
             squared = lambda dims=dims: position_nees(origin, estimate, reference, position_covariance, dims)  # noqa: E731
             metrics |= {f"nees{tag}": lambda s=squared, dims=dims: mean_normalised(s(), dims),
                         f"nees_coverage{tag}": lambda s=squared, dims=dims: coverage(s(), dims)}
-    metrics |= {"yaw_rmse": lambda: yaw_rmse(turned_aligned), "yaw_drift": lambda: yaw_drift(turned, step),
-                "path_length": lambda: path_length(reference.position, step)}
+    metrics |= {"yaw_rmse": lambda: yaw_rmse(turned_aligned), "yaw_drift": lambda: yaw_drift(turned, step)}
+    free_of_estimate = {"path_length": lambda: path_length(reference.position, step)}
     free_of_truth = {}
     if nis is not None:
         free_of_truth = {"nis": lambda: mean_normalised(nis, 3), "nis_coverage": lambda: coverage(nis, 3)}
     values: dict[str, float | None] = {"duration": float(estimate.time[-1] - estimate.time[0])}
     undefined: dict[str, str] = {}
-    for name, compute in (metrics | free_of_truth).items():
+    for name, compute in (metrics | free_of_estimate | free_of_truth).items():
         try:
-            if missing and name in metrics:
+            if missing and name not in free_of_truth:
                 raise Undefined(missing)
-            value = compute()
-            if not np.isfinite(value):
-                raise Undefined("the error is too large for a number")
-            values[name] = value
+            with np.errstate(over="ignore", invalid="ignore"):  # too large for a number: said below
+                value = compute()
         except Undefined as reason:
             values[name], undefined[name] = None, str(reason)
+            continue
+        infinite = (diverged if name not in free_of_estimate else "") or ("" if np.isfinite(value) else TOO_LARGE)
+        values[name] = value if not infinite else 0.0 if name in COVERAGES else math.inf
+        if infinite:
+            undefined[name] = infinite
     return Measures(values, undefined)
+
+
+def is_divergence(reason: str) -> bool:
+    """Whether a reason of `Measures.undefined` says that the estimate diverged, not that the metric is not defined."""
+    return reason.startswith((NOT_FINITE, TOO_LARGE))
 
 
 def position_nees(aligned: Trajectory, estimate: Trajectory, reference: Trajectory, covariance: Float[np.ndarray, "n 3 3"],
                   dims: int = 3) -> Float[np.ndarray, "n"]:
     """eᵀ P⁻¹ e of the position, NaN where there is no reference: the error of the start-aligned estimate, turned back into
-    the filter's own frame, in which its covariance is."""
+    the filter's own frame, in which its covariance is. Infinite where the covariance is not finite."""
     turn = rotation_z(relative_yaw(estimate.orientation[:1], aligned.orientation[:1])[0])
     error = (aligned.position - reference.position) @ turn.T
-    good = finite_rows(error) & (np.einsum("nii->ni", covariance) > 0).all(1)  # a start given as exact has nothing to be normalised by
-    squared = np.full(len(error), np.nan)
+    variance = np.einsum("nii->ni", covariance)
+    known = np.isfinite(covariance).all((1, 2))
+    squared = np.where(finite_rows(error) & ~known, np.inf, np.nan)
+    good = finite_rows(error) & known & (variance > 0).all(1)  # a start given as exact has nothing to be normalised by
     squared[good] = normalised_squared(error[good, :dims], covariance[good, :dims, :dims])
     return squared
 
@@ -420,44 +444,58 @@ class Summary(NamedTuple):
     """Metrics over the sequences of a set. None where no sequence has the metric, or (interval) it has fewer than two groups."""
 
     mean: dict[str, float | None]
+    """Over the sequences that did not diverge: of no worth without `diverged` beside it."""
     median: dict[str, float | None]
+    """Over all that have the metric: infinite where half of them diverged."""
     interval: dict[str, tuple[float, float] | None]
     """Bootstrap 95 % interval of the mean, groups (people, sessions) drawn with replacement."""
     count: dict[str, int]
-    """Sequences that have the metric."""
+    """Sequences in the mean."""
+    diverged: dict[str, int]
+    """Sequences whose value is infinite."""
 
 
 def summarise(measures: Mapping[str, Mapping[str, float | None]], groups: Mapping[str, Any], seed: int = 0, draws: int = 2000) -> Summary:
     """Mean, median and bootstrap 95 % interval of every metric over sequences, each sequence counted once.
 
-    `measures` is sequence -> metric -> value, `groups` sequence -> the person or session it belongs to: recordings of one
-    are not independent, so whole groups are drawn. The same seed gives the same interval.
+    `measures` is sequence -> metric -> value (infinite: diverged), `groups` sequence -> the person or session it belongs to:
+    recordings of one are not independent, so whole groups are drawn. The same seed gives the same interval.
     """
     names = list(dict.fromkeys(metric for values in measures.values() for metric in values))
-    mean: dict[str, float | None] = {}
-    median: dict[str, float | None] = {}
-    interval: dict[str, tuple[float, float] | None] = {}
-    count: dict[str, int] = {}
+    summary = Summary({}, {}, {}, {}, {})
     for metric in names:
-        present = [(groups[name], value) for name, values in measures.items() if (value := values.get(metric)) is not None]
-        count[metric] = len(present)
-        mean[metric] = median[metric] = interval[metric] = None
-        if not present:
-            continue
-        numbers = np.array([value for _, value in present])
-        mean[metric], median[metric] = float(numbers.mean()), float(np.median(numbers))
-        members, index = np.unique([str(group) for group, _ in present], return_inverse=True)
-        if len(members) > 1:
-            sums, sizes = np.bincount(index, numbers), np.bincount(index)
-            drawn = np.random.default_rng(seed).integers(0, len(members), (draws, len(members)))
-            low, high = np.percentile(sums[drawn].sum(1) / sizes[drawn].sum(1), [2.5, 97.5])
-            interval[metric] = (float(low), float(high))
-    return Summary(mean, median, interval, count)
+        present = [name for name, values in measures.items() if values.get(metric) is not None]
+        numbers = np.array([measures[name][metric] for name in present], float)
+        finite = np.isfinite(numbers)
+        summary.count[metric], summary.diverged[metric] = int(finite.sum()), int((~finite).sum())
+        summary.mean[metric] = float(numbers[finite].mean()) if finite.any() else None
+        summary.median[metric] = float(np.median(numbers)) if present else None
+        kept = [groups[name] for name, good in zip(present, finite, strict=True) if good]
+        summary.interval[metric] = bootstrap(numbers[finite], kept, seed, draws)
+    return summary
+
+
+def bootstrap(values: Float[np.ndarray, "n"], groups: Iterable[Any], seed: int = 0, draws: int = 2000) -> tuple[float, float] | None:
+    """95 % interval of the mean of `values`, whole groups drawn with replacement; None of fewer than two groups.
+
+    `groups` holds the group of each value. A draw's mean is over its values, so a large group weighs more than a small one.
+    """
+    members, index = np.unique([str(group) for group in groups], return_inverse=True)
+    if len(members) < 2:
+        return None
+    sums, sizes = np.bincount(index, values), np.bincount(index)
+    drawn = np.random.default_rng(seed).integers(0, len(members), (draws, len(members)))
+    low, high = np.percentile(sums[drawn].sum(1) / sizes[drawn].sum(1), [2.5, 97.5])
+    return float(low), float(high)
 
 
 def finite_rows(rows: Float[np.ndarray, "n d"]) -> Bool[np.ndarray, "n"]:
     """Which rows hold neither NaN nor Inf."""
     return np.asarray(np.isfinite(rows).all(1))
+
+
+def _finite(trajectory: Trajectory) -> Bool[np.ndarray, "n"]:
+    return finite_rows(trajectory.position) & finite_rows(trajectory.orientation)
 
 
 def _errors(estimate: Positions, reference: Positions) -> Float[np.ndarray, "m d"]:

@@ -148,7 +148,7 @@ def error_cdf(estimates: list[Estimate], report: Report) -> Figure:
     samples = []
     for e in estimates:
         error = np.linalg.norm((_aligned(e, report.settings["alignment"]) - e.reference.position)[:, :2], axis=1)
-        error = error[np.isfinite(error)]
+        error = error[metrics.finite_rows(e.reference.position)]
         if len(error):
             _step(left, error, BLUE, 0.7, alpha=0.25)
             samples.append(error)
@@ -202,8 +202,9 @@ def _shade(axes: Axes, time: Float[np.ndarray, "k"], still: np.ndarray) -> None:
 
 
 def _step(axes: Axes, values: Float[np.ndarray, "k"], colour: str, width: float, **style: Any) -> None:
-    x = np.sort(values)
-    axes.step(np.concatenate([[0.0], x]), np.arange(len(x) + 1) / len(x), where="post", color=colour, lw=width, **style)
+    """What is not finite has diverged: it counts, and the line ends below 1."""
+    x = np.sort(values[np.isfinite(values)])
+    axes.step(np.concatenate([[0.0], x]), np.arange(len(x) + 1) / len(values), where="post", color=colour, lw=width, **style)
 
 
 def _legend(axes: Axes) -> None:

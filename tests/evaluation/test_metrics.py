@@ -377,6 +377,81 @@ def test_measure_names_and_reasons():
     assert metrics.measure(broken, truth).undefined["rpe_1s"] == "the estimate is not finite from 10.0 s on"
 
 
+def lost(trajectory, row):
+    """The trajectory, not finite from a row on."""
+    return Trajectory(trajectory.time, *(np.where(np.arange(len(field))[:, None] < row, field, np.nan) for field in trajectory[1:]))
+
+
+def test_a_diverged_estimate_has_infinite_errors():
+    truth = walk()
+    covariance = np.broadcast_to(np.eye(3), (900, 3, 3))
+    arguments = {"position_covariance": covariance, "nis": np.full(900, 3.0)}
+    whole, broken = (metrics.measure(e, truth, **arguments) for e in (perturbed(truth), lost(perturbed(truth), 500)))
+    given = {"duration", "path_length"}
+    coverages = {"nees_coverage", "nees_coverage_2d", "nis_coverage"}
+    assert broken.values.keys() == whole.values.keys() and not whole.undefined
+    assert {name for name, value in broken.values.items() if value == np.inf} == whole.values.keys() - given - coverages
+    assert {name: broken.values[name] for name in coverages} == dict.fromkeys(coverages, 0.0)
+    assert {name: broken.values[name] for name in given} == {name: whole.values[name] for name in given}
+    assert set(broken.undefined.values()) == {"the estimate is not finite from 50.0 s on"}
+    assert metrics.is_divergence(broken.undefined["ate"])
+    far = perturbed(truth)._replace(position=np.full((900, 3), 1e300))
+    far.position[0] = 0
+    assert metrics.measure(far, truth).values["ate"] == np.inf and metrics.is_divergence(metrics.measure(far, truth).undefined["ate"])
+
+
+def test_what_is_not_defined_has_not_diverged():
+    """Without a reference, too short or never standing there is no error that could be infinite."""
+    truth = walk()
+    blind = metrics.measure(lost(truth, 500), masked(truth, slice(None)))
+    assert blind.values["ate"] is None and blind.undefined["ate"] == "no trusted reference"
+    short = metrics.measure(*(Trajectory(*(field[:5] for field in t)) for t in (lost(truth, 3), truth)))
+    assert short.values["ate"] == np.inf and short.values["rpe_1s"] is None
+    assert not metrics.is_divergence(short.undefined["rpe_1s"])
+
+
+def test_a_covariance_that_is_not_finite_is_no_consistent_one():
+    truth = walk()
+    covariance = np.broadcast_to(np.eye(3), (900, 3, 3)).copy()
+    covariance[100:] = np.nan
+    found = metrics.measure(perturbed(truth, scale=0), truth, position_covariance=covariance).values
+    assert found["nees"] == np.inf and found["nees_coverage"] == pytest.approx(100 / 9) and np.isfinite(found["ate"])
+
+
+@pytest.mark.parametrize("how", ["origin", "yaw_position", "se3"])
+def test_alignment_sees_finite_rows_alone(how):
+    truth = walk(tilt=0.3)
+    estimate = moved_by(truth, Rotation.from_euler("z", 1.2), [5.0, -3.0, 1.0])
+    found = metrics.align(lost(estimate, 500), truth, how)
+    np.testing.assert_allclose(found.position[:500], truth.position[:500], atol=1e-9)
+    assert np.isnan(found.position[500:]).all()
+    with pytest.raises(Undefined, match="not finite in any trusted row"):
+        metrics.align(lost(estimate, 500), masked(truth, slice(0, 500)), how)
+
+
+def test_divergence_never_improves_a_summary():
+    """Of six errors the worst diverges: the mean is of the others and says so, the median gets no smaller, infinite with half."""
+    errors = [1.0, 2.0, 3.0, 4.0, 5.0, 60.0]
+    names = [f"{group}{k}" for group in "ab" for k in range(3)]
+    summaries = []
+    for bad in (0, 1, 3, 6):
+        values = errors[:6 - bad] + [np.inf] * bad
+        measures = {name: {"ate": value, "rte": None} for name, value in zip(names, values, strict=True)}
+        summaries.append(metrics.summarise(measures, {name: name[0] for name in names}))
+    assert [s.diverged for s in summaries] == [{"ate": n, "rte": 0} for n in (0, 1, 3, 6)]
+    assert [s.count["ate"] for s in summaries] == [6, 5, 3, 0]
+    assert [s.median["ate"] for s in summaries] == [3.5, 3.5, np.inf, np.inf]
+    assert [s.mean["ate"] for s in summaries] == [12.5, 3.0, 2.0, None]
+    assert summaries[1].interval["ate"] == pytest.approx((2.0, 4.5))
+    assert summaries[2].interval["ate"] is None and summaries[3].interval["ate"] is None  # one group is left, or none
+
+
+def test_bootstrap_draws_groups_whatever_their_order():
+    values = np.array([1.0, 5.0, 1.2, 5.2])
+    assert metrics.bootstrap(values, ["x", "y", "x", "y"]) == pytest.approx((1.1, 5.1))
+    assert metrics.bootstrap(values, ["x"] * 4) is None and metrics.bootstrap(values[:0], []) is None
+
+
 def test_summary_draws_whole_groups():
     measures = {f"{group}{k}": {"ate": value + 0.001 * k, "rte": None} for group, value in [("a", 1.0), ("b", 3.0)] for k in range(5)}
     groups = {name: name[0] for name in measures}
