@@ -3,8 +3,9 @@
 Positions are (n, d) arrays in metres, rows a constant `step` (s) apart, d = 3 or, for the horizontal metrics, 2. A row of
 the reference that cannot be trusted is NaN and counts nowhere, nor does a displacement that starts or ends there.
 A metric without a value (no reference, too short, never standing) raises `Undefined` with the reason; `measure` turns
-that into None and keeps the reason. An estimate that is not finite has diverged: its errors are infinite, which is not the
-same as no value, and no summary leaves them out in silence. Everything is NumPy in float64 and pure.
+that into None and keeps the reason. An estimate that is not finite has diverged: its errors are
+infinite, which is not the same as no value, and no summary leaves them out in silence. Everything
+is NumPy in float64 and pure.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ STANDING_SPEED = 0.05
 STANDING_SECONDS = 2.0
 """Shortest stretch that counts as standing still, s."""
 COVERAGES = frozenset({"nees_coverage", "nees_coverage_2d", "nis_coverage"})
-"""Metrics that are small when they are bad: 0 for an estimate that diverged, where errors are infinite."""
+"""Metrics that are small when they are bad: 0 for an estimate that diverged."""
 NOT_FINITE, TOO_LARGE = "the estimate is not finite", "the error is too large for a number"
 """How the reasons of an infinite metric begin."""
 
@@ -68,16 +69,18 @@ def yaw(orientation: Quaternions) -> Angles:
 
 
 def relative_yaw(estimate: Quaternions, reference: Quaternions) -> Angles:
-    """Yaw error of attitudes R̂ against R, rad in (−π, π]: the turn about the vertical that takes R nearest to R̂.
+    """Yaw error of attitudes R̂ against R, rad in (−π, π].
 
-    ψ minimises ‖R̂ − R_z(ψ) R‖. With E = R̂ Rᵀ that norm is 6 − 2 tr(R_z(ψ)ᵀ E), and the trace is
+    It is the turn about the vertical that takes R nearest to R̂: ψ minimises ‖R̂ − R_z(ψ) R‖. With
+    E = R̂ Rᵀ the square of that norm is 6 − 2 tr(R_z(ψ)ᵀ E), and the trace is
     cos ψ (E00 + E11) + sin ψ (E10 − E01) + E22, so ψ = atan2(E10 − E01, E00 + E11), whatever the
     attitude of the phone: the twist of E about z. With both attitudes level it is the difference of
-    their `yaw`. It has no value only where E is half a turn about a horizontal axis, when every ψ is
+    their `yaw`. It has no value only where E is half a turn about a horizontal axis and every ψ is
     as near: 0 there (ours). NaN stays NaN.
     """
     (a, b, c, d), (w, x, y, z) = estimate.T, reference.T
-    scalar, vertical = a * w + b * x + c * y + d * z, d * w - a * z + c * x - b * y  # of E, as a quaternion
+    # Of the quaternion of E.
+    scalar, vertical = a * w + b * x + c * y + d * z, d * w - a * z + c * x - b * y
     return np.arctan2(2 * scalar * vertical, scalar**2 - vertical**2)
 
 
@@ -112,12 +115,13 @@ def _quaternion(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "4"]:
 
 
 def align(estimate: Trajectory, reference: Trajectory, how: Alignment = "origin") -> Trajectory:
-    """The estimate moved into the reference's frame by one rigid motion, fitted over the rows that are trusted and finite.
+    """The estimate moved into the reference's frame by one rigid motion.
 
-    `origin` matches position and yaw (`relative_yaw`) at the first trusted row (what a user of odometry knows); `none` changes nothing;
-    `yaw_position` is the least-squares motion of four degrees of freedom (the unobservable ones of inertial odometry;
-    VIO benchmarks); `se3` the least-squares motion of six (Horn/Kabsch, no scale; TUM, evo). Raises `Undefined` without
-    such a row, or for `se3` with fewer than three.
+    It is fitted over the rows that are trusted and where the estimate is finite. `origin` matches
+    position and yaw (`relative_yaw`) at the first (what a user of odometry knows); `none` changes
+    nothing; `yaw_position` is the least-squares motion of four degrees of freedom (the unobservable
+    ones of inertial odometry; VIO benchmarks); `se3` the least-squares motion of six (Horn/Kabsch,
+    no scale; TUM, evo). Raises `Undefined` without such a row, or for `se3` with fewer than three.
     """
     if how == "none":
         return estimate
@@ -129,7 +133,8 @@ def align(estimate: Trajectory, reference: Trajectory, how: Alignment = "origin"
         raise Undefined(f"{NOT_FINITE} in any trusted row")
     if how == "origin":
         first = rows[0]
-        turn = rotation_z(-relative_yaw(estimate.orientation[first:first + 1], reference.orientation[first:first + 1])[0])
+        starts = (path.orientation[first:first + 1] for path in (reference, estimate))
+        turn = rotation_z(relative_yaw(*starts)[0])
         source, target = estimate.position[first], reference.position[first]
     else:
         source, target = estimate.position[rows].mean(0), reference.position[rows].mean(0)
@@ -215,11 +220,12 @@ def rte_distance(estimate: Positions, reference: Positions, metres: float) -> fl
     return _rms(found, np.ones(len(found), bool), f"no unbroken reference of {metres:g} m")
 
 
-def rpe(estimate: Positions, reference: Positions, yaw_error: Angles, step: float, seconds: float) -> float:
+def rpe(estimate: Positions, reference: Positions, yaw_error: Angles, step: float,
+        seconds: float) -> float:
     """Relative pose error: RMS norm of the error of displacements over `seconds` with the yaw at their start aligned, m (TLIO).
 
-    error_i = R_z(−ψ_i)(p̂_j − p̂_i) − (p_j − p_i), from every row i, with ψ the `relative_yaw` of the
-    estimate's attitude, rad, so that a wrong heading of the whole trajectory costs nothing.
+    error_i = R_z(−ψ_i)(p̂_j − p̂_i) − (p_j − p_i), from every row i, with ψ the `relative_yaw` of
+    the estimate's attitude, rad, so that a wrong heading of the whole trajectory costs nothing.
     """
     rows_apart = round(seconds / step)
     reason = f"no two trusted rows {seconds:g} s apart"
@@ -256,9 +262,10 @@ def yaw_rmse(yaw_error: Angles) -> float:
 
 
 def yaw_drift(yaw_error: Angles, step: float) -> float:
-    """Size of the change of the unwrapped yaw error (`relative_yaw`, rad) from the first to the last trusted row, degrees per hour (TLIO).
+    """Size of the change of the yaw error from the first to the last trusted row, degrees per hour.
 
-    Undefined for less than 10 s, which an hour cannot be told from.
+    Of the unwrapped `relative_yaw`, rad (TLIO). Undefined for less than 10 s, which an hour cannot
+    be told from.
     """
     rows = _trusted(yaw_error)
     error = np.unwrap(yaw_error[rows])
@@ -358,8 +365,9 @@ def measure(estimate: Trajectory, reference: Trajectory, alignment: Alignment = 
     see the estimate under `alignment`; `se3` is fitted in 3-D for the horizontal ones too. `nees` is taken in the frame
     of the filter, whose covariance is relative to its start, so with the start aligned whatever `alignment` is.
 
-    An estimate with a row that is not finite has diverged. Every metric that a finite one would have is then infinite (a
-    coverage 0), with the reason in `undefined`; so is one that is too large for a number.
+    An estimate with a row that is not finite has diverged. Every metric that a finite one would
+    have is then infinite (a coverage 0), with the reason in `undefined`; so is one that is too
+    large for a number.
     """
     reference = Trajectory(reference.time, np.where(finite_rows(reference.position)[:, None], reference.position, np.nan),
                            np.where(finite_rows(reference.position)[:, None], reference.orientation, np.nan))
@@ -367,15 +375,18 @@ def measure(estimate: Trajectory, reference: Trajectory, alignment: Alignment = 
     metrics: dict[str, Callable[[], float]] = {}
     finite, diverged = _finite(estimate), ""
     if not finite.all():
-        diverged = f"{NOT_FINITE} from {estimate.time[np.argmin(finite)] - estimate.time[0]:.1f} s on"
+        since = estimate.time[np.argmin(finite)] - estimate.time[0]
+        diverged = f"{NOT_FINITE} from {since:.1f} s on"
         # Which metrics there would be depends on the reference: a finite stand-in finds out.
-        estimate = Trajectory(estimate.time, np.zeros_like(estimate.position), np.tile([1.0, 0, 0, 0], (len(estimate.time), 1)))
+        level = np.tile([1.0, 0, 0, 0], (len(finite), 1))
+        estimate = Trajectory(estimate.time, np.zeros_like(estimate.position), level)
     aligned, origin, missing = estimate, estimate, ""
     try:
         aligned, origin = align(estimate, reference, alignment), align(estimate, reference, "origin")
     except Undefined as reason:
         missing = str(reason)
-    turned, turned_aligned = (relative_yaw(path.orientation, reference.orientation) for path in (estimate, aligned))
+    turned, turned_aligned = (relative_yaw(path.orientation, reference.orientation)
+                              for path in (estimate, aligned))
     for dims in (3, 2):
         a, e, r = aligned.position[:, :dims], estimate.position[:, :dims], reference.position[:, :dims]
         tag = "" if dims == 3 else "_2d"
@@ -398,7 +409,8 @@ def measure(estimate: Trajectory, reference: Trajectory, alignment: Alignment = 
             squared = lambda dims=dims: position_nees(origin, estimate, reference, position_covariance, dims)  # noqa: E731
             metrics |= {f"nees{tag}": lambda s=squared, dims=dims: mean_normalised(s(), dims),
                         f"nees_coverage{tag}": lambda s=squared, dims=dims: coverage(s(), dims)}
-    metrics |= {"yaw_rmse": lambda: yaw_rmse(turned_aligned), "yaw_drift": lambda: yaw_drift(turned, step)}
+    metrics |= {"yaw_rmse": lambda: yaw_rmse(turned_aligned),
+                "yaw_drift": lambda: yaw_drift(turned, step)}
     free_of_estimate = {"path_length": lambda: path_length(reference.position, step)}
     free_of_truth = {}
     if nis is not None:
@@ -414,7 +426,9 @@ def measure(estimate: Trajectory, reference: Trajectory, alignment: Alignment = 
         except Undefined as reason:
             values[name], undefined[name] = None, str(reason)
             continue
-        infinite = (diverged if name not in free_of_estimate else "") or ("" if np.isfinite(value) else TOO_LARGE)
+        infinite = diverged if name not in free_of_estimate else ""
+        if not np.isfinite(value):
+            infinite = infinite or TOO_LARGE
         values[name] = value if not infinite else 0.0 if name in COVERAGES else math.inf
         if infinite:
             undefined[name] = infinite
@@ -422,20 +436,21 @@ def measure(estimate: Trajectory, reference: Trajectory, alignment: Alignment = 
 
 
 def is_divergence(reason: str) -> bool:
-    """Whether a reason of `Measures.undefined` says that the estimate diverged, not that the metric is not defined."""
+    """Whether a reason in `Measures.undefined` says that the estimate diverged."""
     return reason.startswith((NOT_FINITE, TOO_LARGE))
 
 
 def position_nees(aligned: Trajectory, estimate: Trajectory, reference: Trajectory, covariance: Float[np.ndarray, "n 3 3"],
                   dims: int = 3) -> Float[np.ndarray, "n"]:
     """eᵀ P⁻¹ e of the position, NaN where there is no reference: the error of the start-aligned estimate, turned back into
-    the filter's own frame, in which its covariance is. Infinite where the covariance is not finite."""
+    the filter's own frame, in which its covariance is. Infinite where the covariance is not."""
     turn = rotation_z(relative_yaw(estimate.orientation[:1], aligned.orientation[:1])[0])
     error = (aligned.position - reference.position) @ turn.T
     variance = np.einsum("nii->ni", covariance)
     known = np.isfinite(covariance).all((1, 2))
     squared = np.where(finite_rows(error) & ~known, np.inf, np.nan)
-    good = finite_rows(error) & known & (variance > 0).all(1)  # a start given as exact has nothing to be normalised by
+    # A start given as exact has nothing to be normalised by.
+    good = finite_rows(error) & known & (variance > 0).all(1)
     squared[good] = normalised_squared(error[good, :dims], covariance[good, :dims, :dims])
     return squared
 
@@ -458,8 +473,9 @@ class Summary(NamedTuple):
 def summarise(measures: Mapping[str, Mapping[str, float | None]], groups: Mapping[str, Any], seed: int = 0, draws: int = 2000) -> Summary:
     """Mean, median and bootstrap 95 % interval of every metric over sequences, each sequence counted once.
 
-    `measures` is sequence -> metric -> value (infinite: diverged), `groups` sequence -> the person or session it belongs to:
-    recordings of one are not independent, so whole groups are drawn. The same seed gives the same interval.
+    `measures` is sequence -> metric -> value (infinite: diverged), `groups` sequence -> the person
+    or session it belongs to: recordings of one are not independent, so whole groups are drawn
+    (`bootstrap`). The same seed gives the same interval.
     """
     names = list(dict.fromkeys(metric for values in measures.values() for metric in values))
     summary = Summary({}, {}, {}, {}, {})
@@ -475,10 +491,12 @@ def summarise(measures: Mapping[str, Mapping[str, float | None]], groups: Mappin
     return summary
 
 
-def bootstrap(values: Float[np.ndarray, "n"], groups: Iterable[Any], seed: int = 0, draws: int = 2000) -> tuple[float, float] | None:
-    """95 % interval of the mean of `values`, whole groups drawn with replacement; None of fewer than two groups.
+def bootstrap(values: Float[np.ndarray, "n"], groups: Iterable[Any], seed: int = 0,
+              draws: int = 2000) -> tuple[float, float] | None:
+    """95 % interval of the mean of `values`, whole groups drawn with replacement.
 
-    `groups` holds the group of each value. A draw's mean is over its values, so a large group weighs more than a small one.
+    `groups` holds the group of each value. A draw's mean is over its values, so a large group
+    weighs more than a small one. None of fewer than two groups.
     """
     members, index = np.unique([str(group) for group in groups], return_inverse=True)
     if len(members) < 2:

@@ -51,7 +51,8 @@ class Scores(NamedTuple):
     @property
     def diverged(self) -> list[str]:
         """Sequences whose estimate diverged, or has an error too large for a number."""
-        return [name for name, m in self.sequences.items() if any(map(metrics.is_divergence, m.undefined.values()))]
+        return [name for name, m in self.sequences.items()
+                if any(map(metrics.is_divergence, m.undefined.values()))]
 
 
 class Report(NamedTuple):
@@ -109,18 +110,21 @@ def table(report: Report) -> Group:
     add("median", summary.median)
     add("95 % interval", summary.interval)
     if report.scores.diverged:
-        grid.add_row("diverged", *(str(summary.diverged.get(name, 0)) for name in shown), style="bold red")
+        counts = (str(summary.diverged.get(name, 0)) for name in shown)
+        grid.add_row("diverged", *counts, style="bold red")
     grid.add_row("n", *(str(summary.count.get(name, 0)) for name in shown), style="dim", end_section=True)
     for label, scores in report.reference_rows.items():
-        add(f"{label} ({_mean_of(scores)})" if scores.diverged else label, scores.summary.mean, "italic")
+        label = f"{label} ({_mean_of(scores)})" if scores.diverged else label
+        add(label, scores.summary.mean, "italic")
     words = [f"window orientation: {settings['orientation_source']}", f"initial state: {settings['initial_state']}",
              f"gyro bias: {settings['gyro_bias']}", f"IMU compensated: {settings['imu_compensated']}",
              f"alignment: {settings['alignment']}"]
     lines = [Text("; ".join(words), style="dim"),
              Text("reference rows are means; – is not defined (the reason is in metrics.json)", style="dim")]
     if any(scores.diverged for scores in (report.scores, *report.reference_rows.values())):
-        lines.append(Text("∞: the estimate diverged. It counts as infinite in medians; means, intervals and n are of the others alone, "
-                          "so they cannot be compared with those of another run", style="yellow"))
+        lines.append(Text("∞: the estimate diverged. It counts as infinite in medians; means, "
+                          "intervals and n are of the others alone, so they cannot be compared "
+                          "with those of another run", style="yellow"))
     said: dict[str, list[str]] = {}
     for name, notes in report.notes.items():
         for note in notes:
@@ -149,9 +153,10 @@ def _cell(value: Any, digits: int) -> str:
 
 
 def as_json(report: Report) -> dict[str, Any]:
-    """The whole report as plain values; a metric without a finite value is None, its reason under `undefined`.
+    """The whole report as plain values; a metric without a finite value is None, with a reason.
 
-    `mean` is over the sequences that did not diverge; its `diverged` counts those that did, the report's `diverged` by metric.
+    `mean` is over the sequences that did not diverge; its `diverged` counts those that did, the
+    report's `diverged` by metric.
     """
     nowhere = {name: next(m.undefined[name] for m in report.scores.sequences.values() if name in m.undefined)
                for name, value in report.scores.summary.mean.items() if value is None}
@@ -172,12 +177,13 @@ def as_json(report: Report) -> dict[str, Any]:
 
 
 def _sequences(scores: Scores) -> dict[str, dict[str, Any]]:
-    return {name: {**_finite(m.values), **({"undefined": m.undefined} if m.undefined else {})} for name, m in scores.sequences.items()}
+    return {name: {**_finite(m.values), **({"undefined": m.undefined} if m.undefined else {})}
+            for name, m in scores.sequences.items()}
 
 
 def read_metric(sequence: Mapping[str, Any], metric: str) -> float | None:
-    """A metric of one of the `sequences` of metrics.json, as `Measures` has it: None where it is not defined, infinite where the
-    estimate diverged."""
+    """A metric of one of the `sequences` of metrics.json, as `Measures` has it: None where it is
+    not defined, infinite where the estimate diverged."""
     value = sequence.get(metric)
     reason = sequence.get("undefined", {}).get(metric, "")
     return math.inf if value is None and metrics.is_divergence(reason) else value
@@ -186,8 +192,9 @@ def read_metric(sequence: Mapping[str, Any], metric: str) -> float | None:
 def _summary(scores: Scores) -> dict[str, Any]:
     summary = scores.summary
     interval = {name: None if value is None else list(value) for name, value in summary.interval.items()}
-    return {"mean": {**summary.mean, "diverged": len(scores.diverged)}, "median": _finite(summary.median), "interval": interval,
-            "n": summary.count, "diverged": summary.diverged}
+    return {"mean": {**summary.mean, "diverged": len(scores.diverged)},
+            "median": _finite(summary.median), "interval": interval, "n": summary.count,
+            "diverged": summary.diverged}
 
 
 def _finite(values: Mapping[str, float | None]) -> dict[str, float | None]:
