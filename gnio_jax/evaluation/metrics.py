@@ -125,7 +125,7 @@ def align(estimate: Trajectory, reference: Trajectory, how: Alignment = "origin"
     """
     if how == "none":
         return estimate
-    trusted = finite_rows(reference.position)
+    trusted = _finite(reference) if how == "origin" else finite_rows(reference.position)
     if not trusted.any():
         raise Undefined("no trusted reference")
     rows = np.flatnonzero(trusted & _finite(estimate))
@@ -220,20 +220,25 @@ def rte_distance(estimate: Positions, reference: Positions, metres: float) -> fl
     return _rms(found, np.ones(len(found), bool), f"no unbroken reference of {metres:g} m")
 
 
-def rpe(estimate: Positions, reference: Positions, yaw_error: Angles, step: float,
-        seconds: float) -> float:
+def rpe(estimate: Trajectory, reference: Trajectory, step: float, seconds: float,
+        dims: int = 3) -> float:
     """Relative pose error: RMS norm of the error of displacements over `seconds` with the yaw at their start aligned, m (TLIO).
 
     error_i = R_z(−ψ_i)(p̂_j − p̂_i) − (p_j − p_i), from every row i, with ψ the `relative_yaw` of
-    the estimate's attitude, rad, so that a wrong heading of the whole trajectory costs nothing.
+    the estimate's attitude, so that a wrong heading of the whole trajectory costs nothing; with
+    `dims` 2 its horizontal part.
     """
     rows_apart = round(seconds / step)
     reason = f"no two trusted rows {seconds:g} s apart"
-    if rows_apart >= len(estimate):
+    if rows_apart >= len(estimate.time):
         raise Undefined(reason)
-    turn = rotation_z(-yaw_error[:-rows_apart])[:, :estimate.shape[1], :estimate.shape[1]]
-    moved = np.einsum("nij,nj->ni", turn, estimate[rows_apart:] - estimate[:-rows_apart])
-    return _rms(moved - (reference[rows_apart:] - reference[:-rows_apart]), _pairs(reference, rows_apart), reason)
+    start, start_true = (path.orientation[:-rows_apart] for path in (estimate, reference))
+    turn = rotation_z(-relative_yaw(start, start_true))
+    moved, moved_true = (path.position[rows_apart:] - path.position[:-rows_apart]
+                         for path in (estimate, reference))
+    error = np.einsum("nij,nj->ni", turn, moved) - moved_true
+    trusted = _pairs(reference.position, rows_apart) & finite_rows(start_true)
+    return _rms(error[:, :dims], trusted, reason)
 
 
 def rpe_se3(estimate: Trajectory, reference: Trajectory, step: float, seconds: float = 1.0, dims: int = 3) -> float:
@@ -249,26 +254,28 @@ def rpe_se3(estimate: Trajectory, reference: Trajectory, step: float, seconds: f
     start, start_true = (rotation_matrices(trajectory.orientation[:-rows_apart]) for trajectory in (estimate, reference))
     moved, moved_true = (trajectory.position[rows_apart:] - trajectory.position[:-rows_apart] for trajectory in (estimate, reference))
     error = np.einsum("nij,nkj,nk->ni", start_true, start, moved) - moved_true
-    return _rms(error[:, :dims], _pairs(reference.position, rows_apart), reason)
+    oriented = finite_rows(reference.orientation[:-rows_apart])
+    trusted = _pairs(reference.position, rows_apart) & oriented
+    return _rms(error[:, :dims], trusted, reason)
 
 
 # Heading --------------------------------------------------------------------------------------------------------------
 
 
-def yaw_rmse(yaw_error: Angles) -> float:
-    """Root mean square of the yaw error (`relative_yaw`, rad), wrapped to ±180°, degrees (TLIO)."""
-    error = yaw_error[_trusted(yaw_error)]
-    return float(np.degrees(np.sqrt(np.mean(((error + np.pi) % (2 * np.pi) - np.pi) ** 2))))
+def yaw_rmse(estimate: Quaternions, reference: Quaternions) -> float:
+    """Root mean square of the yaw error (`relative_yaw`), degrees (TLIO)."""
+    error = relative_yaw(estimate, reference)[_oriented(reference)]
+    return float(np.degrees(np.sqrt(np.mean(error**2))))
 
 
-def yaw_drift(yaw_error: Angles, step: float) -> float:
+def yaw_drift(estimate: Quaternions, reference: Quaternions, step: float) -> float:
     """Size of the change of the yaw error from the first to the last trusted row, degrees per hour.
 
-    Of the unwrapped `relative_yaw`, rad (TLIO). Undefined for less than 10 s, which an hour cannot
-    be told from.
+    Of the unwrapped `relative_yaw` (TLIO). Undefined for less than 10 s, which an hour cannot be
+    told from.
     """
-    rows = _trusted(yaw_error)
-    error = np.unwrap(yaw_error[rows])
+    rows = _oriented(reference)
+    error = np.unwrap(relative_yaw(estimate, reference)[rows])
     hours = (rows[-1] - rows[0]) * step / 3600
     if hours < 10 / 3600:
         raise Undefined("trusted for less than 10 s")
@@ -385,8 +392,6 @@ def measure(estimate: Trajectory, reference: Trajectory, alignment: Alignment = 
         aligned, origin = align(estimate, reference, alignment), align(estimate, reference, "origin")
     except Undefined as reason:
         missing = str(reason)
-    turned, turned_aligned = (relative_yaw(path.orientation, reference.orientation)
-                              for path in (estimate, aligned))
     for dims in (3, 2):
         a, e, r = aligned.position[:, :dims], estimate.position[:, :dims], reference.position[:, :dims]
         tag = "" if dims == 3 else "_2d"
@@ -398,8 +403,8 @@ def measure(estimate: Trajectory, reference: Trajectory, alignment: Alignment = 
             f"rte_60s_ronin{tag}": lambda a=a, r=r: rte_ronin(a, r, step),
             f"rte_1m{tag}": lambda a=a, r=r: rte_distance(a, r, 1.0),
             f"rte_10m{tag}": lambda a=a, r=r: rte_distance(a, r, 10.0),
-            f"rpe_1s{tag}": lambda e=e, r=r: rpe(e, r, turned, step, 1.0),
-            f"rpe_10s{tag}": lambda e=e, r=r: rpe(e, r, turned, step, 10.0),
+            f"rpe_1s{tag}": lambda dims=dims: rpe(estimate, reference, step, 1.0, dims),
+            f"rpe_10s{tag}": lambda dims=dims: rpe(estimate, reference, step, 10.0, dims),
             f"rpe_se3{tag}": lambda dims=dims: rpe_se3(estimate, reference, step, 1.0, dims),
             f"drift{tag}": lambda a=a, r=r: drift(a, r, step),
             f"path_length_ratio{tag}": lambda e=e, r=r: path_length_ratio(e, r, step),
@@ -409,8 +414,9 @@ def measure(estimate: Trajectory, reference: Trajectory, alignment: Alignment = 
             squared = lambda dims=dims: position_nees(origin, estimate, reference, position_covariance, dims)  # noqa: E731
             metrics |= {f"nees{tag}": lambda s=squared, dims=dims: mean_normalised(s(), dims),
                         f"nees_coverage{tag}": lambda s=squared, dims=dims: coverage(s(), dims)}
-    metrics |= {"yaw_rmse": lambda: yaw_rmse(turned_aligned),
-                "yaw_drift": lambda: yaw_drift(turned, step)}
+    attitude = reference.orientation
+    metrics |= {"yaw_rmse": lambda: yaw_rmse(aligned.orientation, attitude),
+                "yaw_drift": lambda: yaw_drift(estimate.orientation, attitude, step)}
     free_of_estimate = {"path_length": lambda: path_length(reference.position, step)}
     free_of_truth = {}
     if nis is not None:
@@ -523,8 +529,8 @@ def _errors(estimate: Positions, reference: Positions) -> Float[np.ndarray, "m d
     return (estimate - reference)[good]
 
 
-def _trusted(yaw_error: Angles) -> Int[np.ndarray, "m"]:
-    rows = np.flatnonzero(np.isfinite(yaw_error))
+def _oriented(reference: Quaternions) -> Int[np.ndarray, "m"]:
+    rows = np.flatnonzero(finite_rows(reference))
     if not len(rows):
         raise Undefined("no trusted reference")
     return rows

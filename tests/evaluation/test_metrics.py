@@ -143,9 +143,8 @@ def test_rte_distance_of_a_scaled_line():
 def test_rpe_forgives_a_wrong_heading_and_rte_does_not():
     truth = walk(tilt=0.3)
     estimate = moved_by(truth, Rotation.from_euler("z", 1.2), [5.0, -3.0, 1.0])
-    arguments = metrics.relative_yaw(estimate.orientation, truth.orientation), STEP
-    assert metrics.rpe(estimate.position, truth.position, *arguments, 1.0) == pytest.approx(0.0, abs=1e-12)
-    assert metrics.rpe(estimate.position[:, :2], truth.position[:, :2], *arguments, 10.0) == pytest.approx(0.0, abs=1e-11)
+    assert metrics.rpe(estimate, truth, STEP, 1.0) == pytest.approx(0.0, abs=1e-12)
+    assert metrics.rpe(estimate, truth, STEP, 10.0, dims=2) == pytest.approx(0.0, abs=1e-11)
     assert metrics.rpe_se3(estimate, truth, STEP) == pytest.approx(0.0, abs=1e-12)
     assert metrics.rte(estimate.position, truth.position, STEP, 10.0) > 1.0
 
@@ -154,18 +153,20 @@ def test_rpe_forgives_a_wrong_heading_and_rte_does_not():
 def test_rpe_against_a_loop(seconds):
     truth = walk(tilt=0.3)
     estimate = perturbed(truth)
-    apart, errors, errors_se3 = round(seconds / STEP), [], []
+    apart, errors, errors_2d, errors_se3 = round(seconds / STEP), [], [], []
     turns, turns_true = (Rotation.from_quat(np.roll(t.orientation, -1, 1)) for t in (estimate, truth))
     for i in range(len(truth.time) - apart):
         between = turns[i] * turns_true[i].inv()
         _, _, z, w = between.as_quat()
         angle = -2 * np.arctan(z / w)  # the twist about z, turned back
         moved, moved_true = estimate.position[i + apart] - estimate.position[i], truth.position[i + apart] - truth.position[i]
-        errors.append(np.sum((Rotation.from_euler("z", angle).apply(moved) - moved_true) ** 2))
+        error = Rotation.from_euler("z", angle).apply(moved) - moved_true
+        errors.append(np.sum(error**2))
+        errors_2d.append(np.sum(error[:2] ** 2))
         errors_se3.append(np.sum((turns[i].inv().apply(moved) - turns_true[i].inv().apply(moved_true)) ** 2))
-    turned = metrics.relative_yaw(estimate.orientation, truth.orientation)
-    found = metrics.rpe(estimate.position, truth.position, turned, STEP, seconds)
-    assert found == pytest.approx(np.sqrt(np.mean(errors)), rel=1e-9)
+    for dims, squares in ((3, errors), (2, errors_2d)):
+        found = metrics.rpe(estimate, truth, STEP, seconds, dims)
+        assert found == pytest.approx(np.sqrt(np.mean(squares)), rel=1e-9)
     assert metrics.rpe_se3(estimate, truth, STEP, seconds) == pytest.approx(np.sqrt(np.mean(errors_se3)), rel=1e-9)
 
 
@@ -212,14 +213,33 @@ def test_yaw_position_is_the_least_over_yaw():
 
 
 def test_yaw_errors_wrap():
+    def level(yaw):
+        return quaternions(Rotation.from_euler("z", yaw[:, None]))
+
     yaw_true = np.linspace(0, 20, 601)
-    wrapped = (yaw_true + np.radians(10) + np.pi) % (2 * np.pi) - np.pi
-    assert metrics.yaw_rmse(wrapped - yaw_true) == pytest.approx(10.0)
+    truth = level(yaw_true)
+    assert metrics.yaw_rmse(level(yaw_true + np.radians(10)), truth) == pytest.approx(10.0)
     growing = yaw_true + np.radians(5) * np.linspace(0, 100, 601)  # 500° in 60 s, several turns
-    wrapped = (growing + np.pi) % (2 * np.pi) - np.pi
-    assert metrics.yaw_drift(wrapped - yaw_true, STEP) == pytest.approx(500 * 60, rel=1e-9)
+    assert metrics.yaw_drift(level(growing), truth, STEP) == pytest.approx(500 * 60, rel=1e-9)
     with pytest.raises(Undefined, match="10 s"):
-        metrics.yaw_drift(np.zeros(50), STEP)
+        metrics.yaw_drift(truth[:50], truth[:50], STEP)
+
+
+def test_a_reference_without_orientation_is_no_divergence():
+    """Its rows count where no attitude is needed; the first that has one aligns the estimate."""
+    truth = walk()
+    reference = truth._replace(orientation=truth.orientation.copy())
+    reference.orientation[:50] = np.nan
+    estimate = moved_by(truth, Rotation.from_euler("z", 1.0), [5.0, -3.0, 1.0])
+    found = metrics.measure(estimate, reference)
+    assert not found.undefined
+    for name in ("ate", "rpe_10s", "rpe_se3", "yaw_rmse"):
+        assert found.values[name] == pytest.approx(0, abs=1e-6)
+    broken = estimate._replace(orientation=estimate.orientation.copy())
+    broken.orientation[-50:] = np.nan  # of the estimate it is
+    for value in (metrics.yaw_rmse(broken.orientation, reference.orientation),
+                  metrics.rpe(broken, reference, STEP, 1.0)):
+        assert np.isnan(value)
 
 
 PITCHES = [0, 45, 84, 90]
@@ -521,8 +541,7 @@ def test_agreement_with_evo():
         assert metrics.rpe_se3(estimate, truth, STEP, seconds) == pytest.approx(metric.get_statistic(evo.StatisticsType.rmse), rel=1e-9)
     yaw_only = moved_by(perturbed(truth)._replace(orientation=truth.orientation), Rotation.from_euler("z", 1.0), [1.0, 2.0, 3.0])
     metric.process_data((paths[0], PoseTrajectory3D(yaw_only.position.copy(), yaw_only.orientation.copy(), yaw_only.time)))
-    turned = metrics.relative_yaw(yaw_only.orientation, truth.orientation)
-    ours = metrics.rpe(yaw_only.position, truth.position, turned, STEP, 10.0)
+    ours = metrics.rpe(yaw_only, truth, STEP, 10.0)
     assert ours == pytest.approx(metric.get_statistic(evo.StatisticsType.rmse), rel=1e-9)
     paths[1].align(paths[0])
     assert metrics.ate(metrics.align(estimate, truth, "se3").position, truth.position) == pytest.approx(ape(*paths), rel=1e-9)
