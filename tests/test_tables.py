@@ -12,7 +12,9 @@ from test_tlio_layout import write_sequence
 from gnio_jax import config as configuration
 from gnio_jax import models
 from gnio_jax.config import DataConfig, ModelConfig, OptimConfig, TrainConfig
-from gnio_jax.tables import commands, complexity, experiments, matrix, summary, windows
+from gnio_jax.evaluation import report
+from gnio_jax.evaluation.metrics import Trajectory
+from gnio_jax.tables import commands, complexity, experiments, matrix, pictures, summary, windows
 from gnio_jax.tables.experiments import Cell, Experiment
 from gnio_jax.tables.matrix import Result
 from gnio_jax.training import loop
@@ -22,11 +24,32 @@ from gnio_jax.types import InputError
 BASE = TrainConfig(dataset="tlio", model=ModelConfig(width=4), optim=OptimConfig(epochs=40))
 
 
-def result(name, ate, published=None):
-    """`ate`: (seeds, sequences); the other metrics are the same number."""
-    figures = [{"sequences": {f"s{k}": {"ate": value} for k, value in enumerate(row)},
-                "mean": {metric: float(np.mean(row)) for metric in ("ate", "rpe_1s")} | {"stationary_drift": None}} for row in ate]
+LOST = np.inf
+"""An `ate` of an estimate that diverged."""
+
+
+def result(name, ate, published=None, groups=None):
+    """`ate`: (seeds, sequences); the other metrics are the same number. `groups`: of each sequence,
+    if the files say it."""
+    lost = {"ate": None, "undefined": {"ate": "the estimate is not finite from 2.0 s on"}}
+    figures = []
+    for row in ate:
+        sequences = {f"s{k}": {"ate": value} if np.isfinite(value) else dict(lost)
+                     for k, value in enumerate(row)}
+        for sequence, group in zip(sequences.values(), groups or (), strict=groups is not None):
+            sequence["group"] = group
+        finite = [value for value in row if np.isfinite(value)]
+        mean = float(np.mean(finite)) if finite else None
+        means = {"ate": mean, "rpe_1s": mean, "stationary_drift": None}
+        figures.append({"sequences": sequences, "mean": means})
     return Result(Cell(name, name.upper(), BASE, published), figures, [])
+
+
+def compared(first, second):
+    """The rows of a table of two results, and its text."""
+    experiment = Experiment("Title", "source", [first.cell, second.cell])
+    found = summary.rows(experiment, [first, second])
+    return *found, summary.markdown(experiment, found, [])
 
 
 def test_statistics_by_hand():
@@ -40,15 +63,134 @@ def test_statistics_by_hand():
     # Differences of the sequences: −0.5, −0.5, −3.5. Of 27 equally likely draws of three, the mean's extremes have 1/27 (3.7 %) and 8/27.
     assert two.interval == pytest.approx((-3.5, -0.5))
     text = summary.markdown(experiment, [one, two], ["a note"])
-    assert "| B | 1.50 ± 0.71 | 1.50 ± 0.71 | 0.5 | ↓ 50.0 % | -1.50 (-3.50 to -0.50) | 1.80 | ↓ 25.0 % |" in text
-    assert "| A | 3.00 ± 0.00 | 3.00 ± 0.00 | – |  |  | 2.40 |  |" in text and "a note" in text
+    assert ("| B | 1.50 ± 0.71 | 1.50 | 1.50 ± 0.71 | 0.5 | ↓ 50.0 % | -1.50 (-3.50 to -0.50) "
+            "| 1.80 | ↓ 25.0 % |") in text
+    assert "| A | 3.00 ± 0.00 | 2.50 | 3.00 ± 0.00 | – |  |  | 2.40 |  |" in text
+    assert "a note" in text
+    assert "diverge" not in text and "†" not in text
 
 
 def test_only_sequences_that_all_seeds_measured_count():
     whole = result("a", [[1.0, 2.0], [3.0, 4.0]])
     whole.figures[1]["sequences"]["s0"]["ate"] = None
-    np.testing.assert_array_equal(summary.errors(whole), [[2.0], [4.0]])
-    assert summary.bootstrap(np.array([1.0])) is None
+    assert {name: list(ates) for name, ates in summary.errors(whole).items()} == {"s1": [2.0, 4.0]}
+
+
+def test_sequences_are_paired_by_name():
+    """The second row lacks a sequence and has another: what both have is compared, in any order."""
+    first, second = result("a", [[9.0, 2.0, 4.0]]), result("b", [[9.0, 1.0, 2.0]])
+    second.figures[0]["sequences"] = {"s9": {"ate": 50.0}, "s2": {"ate": 2.0}, "s1": {"ate": 1.0}}
+    *_, row, text = compared(first, second)
+    assert (row.compared, row.sequences) == (2, 4)
+    assert row.difference == pytest.approx(-1.5) and row.gain == pytest.approx(50.0)
+    assert row.interval == pytest.approx((-2.0, -1.0))
+    assert "↓ 50.0 % | -1.50 (-2.00 to -1.00) over 2 of 4 |" in text
+    second.figures[0]["sequences"] = {"other": {"ate": 1.0}}
+    *_, row, text = compared(first, second)
+    assert (row.gain, row.difference, row.interval) == (None, None, None)
+    assert "| 4.00 | – | – | – |" in text
+
+
+def test_rows_that_diverged_in_other_sequences_are_no_better_than_each_other():
+    """Equal errors in every sequence that both finished."""
+    first, second = result("a", [[LOST, 2.0, 9.0, 4.0]]), result("b", [[1.0, 2.0, LOST, 4.0]])
+    for pair in ((first, second), (second, first)):
+        one, two, text = compared(*pair)
+        assert (one.diverged, two.diverged, two.estimates) == (1, 1, 4)
+        assert (two.compared, two.sequences) == (2, 4)
+        assert two.gain == 0 and two.difference == 0 and two.interval == (0, 0)
+        assert "| 1 of 4 | 0 % | +0.00 (+0.00 to +0.00) over 2 of 4 |" in text
+        assert "† Over the estimates that did not diverge" in text
+
+
+@pytest.mark.parametrize("seeds", [1, 3])
+@pytest.mark.parametrize("share", [1.0, 0.5])
+def test_a_row_is_never_better_for_having_diverged(seeds, share):
+    """Its hardest sequence diverges with one seed; its other errors are as small or smaller."""
+    ates = np.array([1.0, 2.0, 3.0, 40.0])
+    wrong = np.tile(share * ates, (seeds, 1))
+    wrong[0, 3] = LOST
+    first = result("a", [list(ates)] * seeds)
+    _, row, text = compared(first, result("b", wrong.tolist()))
+    assert row.diverged == 1 and row.estimates == 4 * seeds
+    assert row.gain == (0 if share == 1 else None) and "↓" not in text
+    assert row.difference == pytest.approx((share - 1) * 2)
+    assert f"| 1 of {4 * seeds} |" in text and "over 3 of 4 |" in text
+    whole, back, _ = compared(result("b", wrong.tolist()), first)  # the other way about it may lose
+    assert (whole.diverged, back.diverged) == (1, 0)
+    assert back.gain == pytest.approx(100 * (1 - 1 / share))
+
+
+def test_the_median_is_infinite_where_half_diverged():
+    first = result("a", [[1.0, 2.0], [3.0, 5.0]])
+    for ates, median, cells in [
+            ([[1.0, 2.0], [3.0, LOST]], 2.5, "| B | 2.25 ± 1.06 † | 2.50 |"),
+            ([[1.0, LOST], [3.0, LOST]], np.inf, "| B | 2.00 ± 1.41 † | ∞ |"),
+            # A seed without any has no mean to spread.
+            ([[LOST, LOST], [1.0, 1.0]], np.inf, "| B | – | ∞ | – | 2 of 4 | – | – |"),
+            ([[LOST, LOST], [LOST, LOST]], np.inf, "| B | – | ∞ | – | 4 of 4 | – | – |")]:
+        _, row, text = compared(first, result("b", ates))
+        assert row.median == median and cells in text
+
+
+def test_intervals_draw_groups():
+    """Two sessions of three walks: a draw is one session twice or both, whatever their walks."""
+    def row_and_text(first_groups, second_groups):
+        first = result("a", [[5.0] * 6], groups=first_groups)
+        second = result("b", [[4.0, 4.1, 4.2, 2.0, 2.1, 2.2]], groups=second_groups)
+        return compared(first, second)[1:]
+
+    row, text = row_and_text("xxxyyy", "xxxyyy")
+    assert row.groups == 2 and row.interval == pytest.approx((-2.9, -0.9))
+    assert "there are 2." in text
+    row, text = row_and_text("xxxxxx", "xxxxxx")
+    assert row.groups == 1 and row.interval is None
+    assert "↓ 38.0 % | -1.90 | –" in text and "interval draws" not in text
+    alone, _ = row_and_text(None, None)
+    assert alone.groups == 6 and -2.9 < alone.interval[0] < alone.interval[1] < -0.9
+    mixed, _ = row_and_text("xxxyyy", None)  # the files of one row are older
+    assert mixed.interval == pytest.approx((-2.9, -0.9))
+
+
+def test_divergence_is_in_the_files_and_the_picture(tmp_path):
+    first = result("a", [[1.0, 2.0, 4.0]], groups="xyz")
+    second = result("b", [[LOST, LOST, 8.0]], groups="xyz")
+    third = result("c", [[LOST, LOST, LOST]], groups="xyz")
+    experiment = Experiment("Title", "source", [each.cell for each in (first, second, third)])
+    found = summary.rows(experiment, [first, second, third])
+    summary.write(tmp_path / "table", experiment, found, [])
+    with open(tmp_path / "table.csv", newline="", encoding="utf-8") as file:
+        one, two, three = csv.DictReader(file)
+    assert (one["ate_median"], one["diverged"], one["estimates"]) == ("2.0", "0", "3")
+    assert (two["ate"], two["ate_median"], two["diverged"]) == ("8.0", "inf", "2")
+    assert (two["compared"], two["sequences"], two["groups"]) == ("1", "3", "1")
+    assert float(two["gain_percent"]) == -100
+    assert (two["difference"], two["difference_low"]) == ("4.0", "")
+    assert (three["ate"], three["gain_percent"], three["difference"]) == ("", "", "")
+    assert three["diverged"] == "3"
+    axes = pictures.table(experiment, [first, second, third], found).axes[0]
+    labels = [label.get_text() for label in axes.get_yticklabels()]
+    assert labels == ["A", "B\n(2 of 3 diverged)", "C\n(3 of 3 diverged)"]
+    assert [bar.get_width() for bar in axes.patches] == [pytest.approx(7 / 3), 8.0, 0.0]
+
+
+def test_paths_end_where_the_estimate_diverged(tmp_path):
+    configuration.save(tmp_path / "config.yaml", BASE)
+    time = np.arange(50) * 0.1
+    position, level = np.column_stack([time, np.zeros((50, 2))]), np.tile([1.0, 0, 0, 0], (50, 1))
+    seen, moved = position.copy(), position + np.array([3.0, 2.0, 1.0])
+    seen[10:15] = np.nan
+    moved[30:] = np.nan
+    folder = tmp_path / "eval" / "tlio_test_ekf"
+    for kind, path in (("references", seen), ("trajectories", moved)):
+        (folder / kind).mkdir(parents=True)
+        report.write_tum(folder / kind / "walk.txt", Trajectory(time, path, level))
+    made = Result(Cell("a", "A", BASE), [{"sequences": {"walk": {}}}], [tmp_path])
+    (reference, estimate), = matrix.paths(made, "test", "ekf").values()
+    kept = np.r_[0:10, 15:50]
+    np.testing.assert_allclose(reference, position[kept, :2], atol=1e-8)
+    expected = np.where(kept[:, None] < 30, position[kept, :2], np.nan)
+    np.testing.assert_allclose(estimate, expected, atol=1e-8)
 
 
 def test_arrows_point_as_the_error_goes():

@@ -3,16 +3,19 @@
 Positions are (n, d) arrays in metres, rows a constant `step` (s) apart, d = 3 or, for the horizontal metrics, 2. A row of
 the reference that cannot be trusted is NaN and counts nowhere, nor does a displacement that starts or ends there.
 A metric without a value (no reference, too short, never standing) raises `Undefined` with the reason; `measure` turns
-that into None and keeps the reason. Everything is NumPy in float64 and pure.
+that into None and keeps the reason. An estimate that is not finite has diverged: its errors are
+infinite, which is not the same as no value, and no summary leaves them out in silence. Everything
+is NumPy in float64 and pure.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import math
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy.stats import chi2
 
 Alignment = Literal["origin", "none", "yaw_position", "se3"]
@@ -24,6 +27,10 @@ STANDING_SPEED = 0.05
 """Mean speed over one second below which the reference stands still, m/s."""
 STANDING_SECONDS = 2.0
 """Shortest stretch that counts as standing still, s."""
+COVERAGES = frozenset({"nees_coverage", "nees_coverage_2d", "nis_coverage"})
+"""Metrics that are small when they are bad: 0 for an estimate that diverged."""
+NOT_FINITE, TOO_LARGE = "the estimate is not finite", "the error is too large for a number"
+"""How the reasons of an infinite metric begin."""
 
 
 class Undefined(ValueError):
@@ -45,18 +52,36 @@ class Measures(NamedTuple):
     """The metrics of one sequence."""
 
     values: dict[str, float | None]
-    """Metric -> value; None where it is not defined."""
+    """Metric -> value; None where it is not defined, infinite where the estimate diverged."""
     undefined: dict[str, str]
-    """Metric -> reason, for those without a value."""
+    """Metric -> reason, for those without a value and those of an estimate that diverged."""
 
 
 # Rotations ------------------------------------------------------------------------------------------------------------
 
 
 def yaw(orientation: Quaternions) -> Angles:
-    """Yaw atan2(R[1,0], R[0,0]) of quaternions wxyz, rad."""
+    """Yaw atan2(R[1,0], R[0,0]) of quaternions wxyz, rad: that of the body's x axis, which has none
+    where it is vertical. It is the frame of the network's windows. Two attitudes are compared with
+    `relative_yaw`."""
     w, x, y, z = orientation.T
     return np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+
+
+def relative_yaw(estimate: Quaternions, reference: Quaternions) -> Angles:
+    """Yaw error of attitudes R̂ against R, rad in (−π, π].
+
+    It is the turn about the vertical that takes R nearest to R̂: ψ minimises ‖R̂ − R_z(ψ) R‖. With
+    E = R̂ Rᵀ the square of that norm is 6 − 2 tr(R_z(ψ)ᵀ E), and the trace is
+    cos ψ (E00 + E11) + sin ψ (E10 − E01) + E22, so ψ = atan2(E10 − E01, E00 + E11), whatever the
+    attitude of the phone: the twist of E about z. With both attitudes level it is the difference of
+    their `yaw`. It has no value only where E is half a turn about a horizontal axis and every ψ is
+    as near: 0 there (ours). NaN stays NaN.
+    """
+    (a, b, c, d), (w, x, y, z) = estimate.T, reference.T
+    # Of the quaternion of E.
+    scalar, vertical = a * w + b * x + c * y + d * z, d * w - a * z + c * x - b * y
+    return np.arctan2(2 * scalar * vertical, scalar**2 - vertical**2)
 
 
 def rotation_matrices(orientation: Quaternions) -> Float[np.ndarray, "n 3 3"]:
@@ -90,21 +115,26 @@ def _quaternion(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "4"]:
 
 
 def align(estimate: Trajectory, reference: Trajectory, how: Alignment = "origin") -> Trajectory:
-    """The estimate moved into the reference's frame by one rigid motion, fitted over the trusted rows.
+    """The estimate moved into the reference's frame by one rigid motion.
 
-    `origin` matches position and yaw at the first trusted row (what a user of odometry knows); `none` changes nothing;
-    `yaw_position` is the least-squares motion of four degrees of freedom (the unobservable ones of inertial odometry;
-    VIO benchmarks); `se3` the least-squares motion of six (Horn/Kabsch, no scale; TUM, evo). Raises `Undefined` without
-    a trusted row, or for `se3` with fewer than three.
+    It is fitted over the rows that are trusted and where the estimate is finite. `origin` matches
+    position and yaw (`relative_yaw`) at the first (what a user of odometry knows); `none` changes
+    nothing; `yaw_position` is the least-squares motion of four degrees of freedom (the unobservable
+    ones of inertial odometry; VIO benchmarks); `se3` the least-squares motion of six (Horn/Kabsch,
+    no scale; TUM, evo). Raises `Undefined` without such a row, or for `se3` with fewer than three.
     """
     if how == "none":
         return estimate
-    rows = np.flatnonzero(finite_rows(reference.position))
-    if not len(rows):
+    trusted = _finite(reference) if how == "origin" else finite_rows(reference.position)
+    if not trusted.any():
         raise Undefined("no trusted reference")
+    rows = np.flatnonzero(trusted & _finite(estimate))
+    if not len(rows):
+        raise Undefined(f"{NOT_FINITE} in any trusted row")
     if how == "origin":
         first = rows[0]
-        turn = rotation_z((yaw(reference.orientation[first:first + 1]) - yaw(estimate.orientation[first:first + 1]))[0])
+        starts = (path.orientation[first:first + 1] for path in (reference, estimate))
+        turn = rotation_z(relative_yaw(*starts)[0])
         source, target = estimate.position[first], reference.position[first]
     else:
         source, target = estimate.position[rows].mean(0), reference.position[rows].mean(0)
@@ -190,20 +220,25 @@ def rte_distance(estimate: Positions, reference: Positions, metres: float) -> fl
     return _rms(found, np.ones(len(found), bool), f"no unbroken reference of {metres:g} m")
 
 
-def rpe(estimate: Positions, reference: Positions, estimate_yaw: Angles, reference_yaw: Angles, step: float, seconds: float) -> float:
+def rpe(estimate: Trajectory, reference: Trajectory, step: float, seconds: float,
+        dims: int = 3) -> float:
     """Relative pose error: RMS norm of the error of displacements over `seconds` with the yaw at their start aligned, m (TLIO).
 
-    error_i = R_z(yaw_i − yaŵ_i)(p̂_j − p̂_i) − (p_j − p_i), from every row i, so that a wrong heading of the whole
-    trajectory costs nothing.
+    error_i = R_z(−ψ_i)(p̂_j − p̂_i) − (p_j − p_i), from every row i, with ψ the `relative_yaw` of
+    the estimate's attitude, so that a wrong heading of the whole trajectory costs nothing; with
+    `dims` 2 its horizontal part.
     """
     rows_apart = round(seconds / step)
     reason = f"no two trusted rows {seconds:g} s apart"
-    if rows_apart >= len(estimate):
+    if rows_apart >= len(estimate.time):
         raise Undefined(reason)
-    angle = (reference_yaw - estimate_yaw)[:-rows_apart]
-    turn = rotation_z(angle)[:, :estimate.shape[1], :estimate.shape[1]]
-    moved = np.einsum("nij,nj->ni", turn, estimate[rows_apart:] - estimate[:-rows_apart])
-    return _rms(moved - (reference[rows_apart:] - reference[:-rows_apart]), _pairs(reference, rows_apart), reason)
+    start, start_true = (path.orientation[:-rows_apart] for path in (estimate, reference))
+    turn = rotation_z(-relative_yaw(start, start_true))
+    moved, moved_true = (path.position[rows_apart:] - path.position[:-rows_apart]
+                         for path in (estimate, reference))
+    error = np.einsum("nij,nj->ni", turn, moved) - moved_true
+    trusted = _pairs(reference.position, rows_apart) & finite_rows(start_true)
+    return _rms(error[:, :dims], trusted, reason)
 
 
 def rpe_se3(estimate: Trajectory, reference: Trajectory, step: float, seconds: float = 1.0, dims: int = 3) -> float:
@@ -219,25 +254,28 @@ def rpe_se3(estimate: Trajectory, reference: Trajectory, step: float, seconds: f
     start, start_true = (rotation_matrices(trajectory.orientation[:-rows_apart]) for trajectory in (estimate, reference))
     moved, moved_true = (trajectory.position[rows_apart:] - trajectory.position[:-rows_apart] for trajectory in (estimate, reference))
     error = np.einsum("nij,nkj,nk->ni", start_true, start, moved) - moved_true
-    return _rms(error[:, :dims], _pairs(reference.position, rows_apart), reason)
+    oriented = finite_rows(reference.orientation[:-rows_apart])
+    trusted = _pairs(reference.position, rows_apart) & oriented
+    return _rms(error[:, :dims], trusted, reason)
 
 
 # Heading --------------------------------------------------------------------------------------------------------------
 
 
-def yaw_rmse(estimate_yaw: Angles, reference_yaw: Angles) -> float:
-    """Root mean square of the yaw error, wrapped to ±180°, degrees (TLIO). The angles are rad."""
-    error = _yaw_errors(estimate_yaw, reference_yaw)
-    return float(np.degrees(np.sqrt(np.mean(((error + np.pi) % (2 * np.pi) - np.pi) ** 2))))
+def yaw_rmse(estimate: Quaternions, reference: Quaternions) -> float:
+    """Root mean square of the yaw error (`relative_yaw`), degrees (TLIO)."""
+    error = relative_yaw(estimate, reference)[_oriented(reference)]
+    return float(np.degrees(np.sqrt(np.mean(error**2))))
 
 
-def yaw_drift(estimate_yaw: Angles, reference_yaw: Angles, step: float) -> float:
-    """Size of the change of the unwrapped yaw error from the first to the last trusted row, degrees per hour (TLIO).
+def yaw_drift(estimate: Quaternions, reference: Quaternions, step: float) -> float:
+    """Size of the change of the yaw error from the first to the last trusted row, degrees per hour.
 
-    Undefined for less than 10 s, which an hour cannot be told from.
+    Of the unwrapped `relative_yaw` (TLIO). Undefined for less than 10 s, which an hour cannot be
+    told from.
     """
-    rows = np.flatnonzero(np.isfinite(reference_yaw))
-    error = np.unwrap(_yaw_errors(estimate_yaw, reference_yaw))
+    rows = _oriented(reference)
+    error = np.unwrap(relative_yaw(estimate, reference)[rows])
     hours = (rows[-1] - rows[0]) * step / 3600
     if hours < 10 / 3600:
         raise Undefined("trusted for less than 10 s")
@@ -333,20 +371,27 @@ def measure(estimate: Trajectory, reference: Trajectory, alignment: Alignment = 
     `reference` has the estimate's stamps and NaN where it cannot be trusted. The absolute metrics, `rte_*` and `yaw_rmse`
     see the estimate under `alignment`; `se3` is fitted in 3-D for the horizontal ones too. `nees` is taken in the frame
     of the filter, whose covariance is relative to its start, so with the start aligned whatever `alignment` is.
+
+    An estimate with a row that is not finite has diverged. Every metric that a finite one would
+    have is then infinite (a coverage 0), with the reason in `undefined`; so is one that is too
+    large for a number.
     """
     reference = Trajectory(reference.time, np.where(finite_rows(reference.position)[:, None], reference.position, np.nan),
                            np.where(finite_rows(reference.position)[:, None], reference.orientation, np.nan))
     step = float(np.median(np.diff(estimate.time))) if len(estimate.time) > 1 else 1.0
     metrics: dict[str, Callable[[], float]] = {}
+    finite, diverged = _finite(estimate), ""
+    if not finite.all():
+        since = estimate.time[np.argmin(finite)] - estimate.time[0]
+        diverged = f"{NOT_FINITE} from {since:.1f} s on"
+        # Which metrics there would be depends on the reference: a finite stand-in finds out.
+        level = np.tile([1.0, 0, 0, 0], (len(finite), 1))
+        estimate = Trajectory(estimate.time, np.zeros_like(estimate.position), level)
     aligned, origin, missing = estimate, estimate, ""
-    finite = finite_rows(estimate.position) & finite_rows(estimate.orientation)
     try:
-        if not finite.all():
-            raise Undefined(f"the estimate is not finite from {estimate.time[np.argmin(finite)] - estimate.time[0]:.1f} s on")
         aligned, origin = align(estimate, reference, alignment), align(estimate, reference, "origin")
     except Undefined as reason:
         missing = str(reason)
-    a_yaw, e_yaw, r_yaw = yaw(aligned.orientation), yaw(estimate.orientation), yaw(reference.orientation)
     for dims in (3, 2):
         a, e, r = aligned.position[:, :dims], estimate.position[:, :dims], reference.position[:, :dims]
         tag = "" if dims == 3 else "_2d"
@@ -358,8 +403,8 @@ def measure(estimate: Trajectory, reference: Trajectory, alignment: Alignment = 
             f"rte_60s_ronin{tag}": lambda a=a, r=r: rte_ronin(a, r, step),
             f"rte_1m{tag}": lambda a=a, r=r: rte_distance(a, r, 1.0),
             f"rte_10m{tag}": lambda a=a, r=r: rte_distance(a, r, 10.0),
-            f"rpe_1s{tag}": lambda e=e, r=r: rpe(e, r, e_yaw, r_yaw, step, 1.0),
-            f"rpe_10s{tag}": lambda e=e, r=r: rpe(e, r, e_yaw, r_yaw, step, 10.0),
+            f"rpe_1s{tag}": lambda dims=dims: rpe(estimate, reference, step, 1.0, dims),
+            f"rpe_10s{tag}": lambda dims=dims: rpe(estimate, reference, step, 10.0, dims),
             f"rpe_se3{tag}": lambda dims=dims: rpe_se3(estimate, reference, step, 1.0, dims),
             f"drift{tag}": lambda a=a, r=r: drift(a, r, step),
             f"path_length_ratio{tag}": lambda e=e, r=r: path_length_ratio(e, r, step),
@@ -369,34 +414,49 @@ def measure(estimate: Trajectory, reference: Trajectory, alignment: Alignment = 
             squared = lambda dims=dims: position_nees(origin, estimate, reference, position_covariance, dims)  # noqa: E731
             metrics |= {f"nees{tag}": lambda s=squared, dims=dims: mean_normalised(s(), dims),
                         f"nees_coverage{tag}": lambda s=squared, dims=dims: coverage(s(), dims)}
-    metrics |= {"yaw_rmse": lambda: yaw_rmse(a_yaw, r_yaw), "yaw_drift": lambda: yaw_drift(e_yaw, r_yaw, step),
-                "path_length": lambda: path_length(reference.position, step)}
+    attitude = reference.orientation
+    metrics |= {"yaw_rmse": lambda: yaw_rmse(aligned.orientation, attitude),
+                "yaw_drift": lambda: yaw_drift(estimate.orientation, attitude, step)}
+    free_of_estimate = {"path_length": lambda: path_length(reference.position, step)}
     free_of_truth = {}
     if nis is not None:
         free_of_truth = {"nis": lambda: mean_normalised(nis, 3), "nis_coverage": lambda: coverage(nis, 3)}
     values: dict[str, float | None] = {"duration": float(estimate.time[-1] - estimate.time[0])}
     undefined: dict[str, str] = {}
-    for name, compute in (metrics | free_of_truth).items():
+    for name, compute in (metrics | free_of_estimate | free_of_truth).items():
         try:
-            if missing and name in metrics:
+            if missing and name not in free_of_truth:
                 raise Undefined(missing)
-            value = compute()
-            if not np.isfinite(value):
-                raise Undefined("the error is too large for a number")
-            values[name] = value
+            with np.errstate(over="ignore", invalid="ignore"):  # too large for a number: said below
+                value = compute()
         except Undefined as reason:
             values[name], undefined[name] = None, str(reason)
+            continue
+        infinite = diverged if name not in free_of_estimate else ""
+        if not np.isfinite(value):
+            infinite = infinite or TOO_LARGE
+        values[name] = value if not infinite else 0.0 if name in COVERAGES else math.inf
+        if infinite:
+            undefined[name] = infinite
     return Measures(values, undefined)
+
+
+def is_divergence(reason: str) -> bool:
+    """Whether a reason in `Measures.undefined` says that the estimate diverged."""
+    return reason.startswith((NOT_FINITE, TOO_LARGE))
 
 
 def position_nees(aligned: Trajectory, estimate: Trajectory, reference: Trajectory, covariance: Float[np.ndarray, "n 3 3"],
                   dims: int = 3) -> Float[np.ndarray, "n"]:
     """eᵀ P⁻¹ e of the position, NaN where there is no reference: the error of the start-aligned estimate, turned back into
-    the filter's own frame, in which its covariance is."""
-    turn = rotation_z((yaw(estimate.orientation[:1]) - yaw(aligned.orientation[:1]))[0])
+    the filter's own frame, in which its covariance is. Infinite where the covariance is not."""
+    turn = rotation_z(relative_yaw(estimate.orientation[:1], aligned.orientation[:1])[0])
     error = (aligned.position - reference.position) @ turn.T
-    good = finite_rows(error) & (np.einsum("nii->ni", covariance) > 0).all(1)  # a start given as exact has nothing to be normalised by
-    squared = np.full(len(error), np.nan)
+    variance = np.einsum("nii->ni", covariance)
+    known = np.isfinite(covariance).all((1, 2))
+    squared = np.where(finite_rows(error) & ~known, np.inf, np.nan)
+    # A start given as exact has nothing to be normalised by.
+    good = finite_rows(error) & known & (variance > 0).all(1)
     squared[good] = normalised_squared(error[good, :dims], covariance[good, :dims, :dims])
     return squared
 
@@ -405,44 +465,61 @@ class Summary(NamedTuple):
     """Metrics over the sequences of a set. None where no sequence has the metric, or (interval) it has fewer than two groups."""
 
     mean: dict[str, float | None]
+    """Over the sequences that did not diverge: of no worth without `diverged` beside it."""
     median: dict[str, float | None]
+    """Over all that have the metric: infinite where half of them diverged."""
     interval: dict[str, tuple[float, float] | None]
     """Bootstrap 95 % interval of the mean, groups (people, sessions) drawn with replacement."""
     count: dict[str, int]
-    """Sequences that have the metric."""
+    """Sequences in the mean."""
+    diverged: dict[str, int]
+    """Sequences whose value is infinite."""
 
 
 def summarise(measures: Mapping[str, Mapping[str, float | None]], groups: Mapping[str, Any], seed: int = 0, draws: int = 2000) -> Summary:
     """Mean, median and bootstrap 95 % interval of every metric over sequences, each sequence counted once.
 
-    `measures` is sequence -> metric -> value, `groups` sequence -> the person or session it belongs to: recordings of one
-    are not independent, so whole groups are drawn. The same seed gives the same interval.
+    `measures` is sequence -> metric -> value (infinite: diverged), `groups` sequence -> the person
+    or session it belongs to: recordings of one are not independent, so whole groups are drawn
+    (`bootstrap`). The same seed gives the same interval.
     """
     names = list(dict.fromkeys(metric for values in measures.values() for metric in values))
-    mean: dict[str, float | None] = {}
-    median: dict[str, float | None] = {}
-    interval: dict[str, tuple[float, float] | None] = {}
-    count: dict[str, int] = {}
+    summary = Summary({}, {}, {}, {}, {})
     for metric in names:
-        present = [(groups[name], value) for name, values in measures.items() if (value := values.get(metric)) is not None]
-        count[metric] = len(present)
-        mean[metric] = median[metric] = interval[metric] = None
-        if not present:
-            continue
-        numbers = np.array([value for _, value in present])
-        mean[metric], median[metric] = float(numbers.mean()), float(np.median(numbers))
-        members, index = np.unique([str(group) for group, _ in present], return_inverse=True)
-        if len(members) > 1:
-            sums, sizes = np.bincount(index, numbers), np.bincount(index)
-            drawn = np.random.default_rng(seed).integers(0, len(members), (draws, len(members)))
-            low, high = np.percentile(sums[drawn].sum(1) / sizes[drawn].sum(1), [2.5, 97.5])
-            interval[metric] = (float(low), float(high))
-    return Summary(mean, median, interval, count)
+        present = [name for name, values in measures.items() if values.get(metric) is not None]
+        numbers = np.array([measures[name][metric] for name in present], float)
+        finite = np.isfinite(numbers)
+        summary.count[metric], summary.diverged[metric] = int(finite.sum()), int((~finite).sum())
+        summary.mean[metric] = float(numbers[finite].mean()) if finite.any() else None
+        summary.median[metric] = float(np.median(numbers)) if present else None
+        kept = [groups[name] for name, good in zip(present, finite, strict=True) if good]
+        summary.interval[metric] = bootstrap(numbers[finite], kept, seed, draws)
+    return summary
+
+
+def bootstrap(values: Float[np.ndarray, "n"], groups: Iterable[Any], seed: int = 0,
+              draws: int = 2000) -> tuple[float, float] | None:
+    """95 % interval of the mean of `values`, whole groups drawn with replacement.
+
+    `groups` holds the group of each value. A draw's mean is over its values, so a large group
+    weighs more than a small one. None of fewer than two groups.
+    """
+    members, index = np.unique([str(group) for group in groups], return_inverse=True)
+    if len(members) < 2:
+        return None
+    sums, sizes = np.bincount(index, values), np.bincount(index)
+    drawn = np.random.default_rng(seed).integers(0, len(members), (draws, len(members)))
+    low, high = np.percentile(sums[drawn].sum(1) / sizes[drawn].sum(1), [2.5, 97.5])
+    return float(low), float(high)
 
 
 def finite_rows(rows: Float[np.ndarray, "n d"]) -> Bool[np.ndarray, "n"]:
     """Which rows hold neither NaN nor Inf."""
     return np.asarray(np.isfinite(rows).all(1))
+
+
+def _finite(trajectory: Trajectory) -> Bool[np.ndarray, "n"]:
+    return finite_rows(trajectory.position) & finite_rows(trajectory.orientation)
 
 
 def _errors(estimate: Positions, reference: Positions) -> Float[np.ndarray, "m d"]:
@@ -452,11 +529,11 @@ def _errors(estimate: Positions, reference: Positions) -> Float[np.ndarray, "m d
     return (estimate - reference)[good]
 
 
-def _yaw_errors(estimate_yaw: Angles, reference_yaw: Angles) -> Float[np.ndarray, "m"]:
-    good = np.isfinite(reference_yaw)
-    if not good.any():
+def _oriented(reference: Quaternions) -> Int[np.ndarray, "m"]:
+    rows = np.flatnonzero(finite_rows(reference))
+    if not len(rows):
         raise Undefined("no trusted reference")
-    return (estimate_yaw - reference_yaw)[good]
+    return rows
 
 
 def _pairs(reference: Positions, rows_apart: int) -> Bool[np.ndarray, "m"]:

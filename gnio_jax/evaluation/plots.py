@@ -82,7 +82,8 @@ def position_error(estimate: Estimate) -> Figure:
     panels = figure.subplots(3, 1, sharex=True)
     time = estimate.trajectory.time - estimate.trajectory.time[0]
     aligned = metrics.align(estimate.trajectory, estimate.reference, "origin")
-    turn = metrics.rotation_z(float((metrics.yaw(estimate.trajectory.orientation[:1]) - metrics.yaw(aligned.orientation[:1]))[0]))
+    start, start_aligned = (path.orientation[:1] for path in (estimate.trajectory, aligned))
+    turn = metrics.rotation_z(metrics.relative_yaw(start, start_aligned)[0])
     error = (aligned.position - estimate.reference.position) @ turn.T  # in the filter's own frame, as its covariance is
     still = metrics.standing(estimate.reference.position, float(np.median(np.diff(time))))
     for k, (panel, (name, colour)) in enumerate(zip(panels, AXES.items(), strict=True)):
@@ -148,7 +149,7 @@ def error_cdf(estimates: list[Estimate], report: Report) -> Figure:
     samples = []
     for e in estimates:
         error = np.linalg.norm((_aligned(e, report.settings["alignment"]) - e.reference.position)[:, :2], axis=1)
-        error = error[np.isfinite(error)]
+        error = error[metrics.finite_rows(e.reference.position)]
         if len(error):
             _step(left, error, BLUE, 0.7, alpha=0.25)
             samples.append(error)
@@ -202,8 +203,10 @@ def _shade(axes: Axes, time: Float[np.ndarray, "k"], still: np.ndarray) -> None:
 
 
 def _step(axes: Axes, values: Float[np.ndarray, "k"], colour: str, width: float, **style: Any) -> None:
-    x = np.sort(values)
-    axes.step(np.concatenate([[0.0], x]), np.arange(len(x) + 1) / len(x), where="post", color=colour, lw=width, **style)
+    """What is not finite has diverged: it counts, and the line ends below 1."""
+    x = np.sort(values[np.isfinite(values)])
+    share = np.arange(len(x) + 1) / len(values)
+    axes.step(np.concatenate([[0.0], x]), share, where="post", color=colour, lw=width, **style)
 
 
 def _legend(axes: Axes) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import math
 import re
 import shutil
 import tempfile
@@ -44,6 +45,14 @@ class Scores(NamedTuple):
 
     sequences: dict[str, Measures]
     summary: Summary
+    groups: dict[str, str]
+    """Sequence -> person or session, as the intervals draw them."""
+
+    @property
+    def diverged(self) -> list[str]:
+        """Sequences whose estimate diverged, or has an error too large for a number."""
+        return [name for name, m in self.sequences.items()
+                if any(map(metrics.is_divergence, m.undefined.values()))]
 
 
 class Report(NamedTuple):
@@ -70,7 +79,8 @@ def score(estimates: list[Estimate], groups: Mapping[str, Any], alignment: metri
             share = float(100 * tried.mean()) if len(tried) else None
             found = Measures(found.values | {"accepted": share}, found.undefined | ({} if len(tried) else {"accepted": "no measurement"}))
         sequences[e.name] = found
-    return Scores(sequences, metrics.summarise({name: m.values for name, m in sequences.items()}, groups))
+    summary = metrics.summarise({name: m.values for name, m in sequences.items()}, groups)
+    return Scores(sequences, summary, {name: str(groups[name]) for name in sequences})
 
 
 # On the screen --------------------------------------------------------------------------------------------------------
@@ -96,17 +106,25 @@ def table(report: Report) -> Group:
     for name in names:
         add(name, report.scores.sequences[name].values, last=name == names[-1])
     summary = report.scores.summary
-    add("mean", summary.mean, "bold")
+    add(_mean_of(report.scores), summary.mean, "bold")
     add("median", summary.median)
     add("95 % interval", summary.interval)
+    if report.scores.diverged:
+        counts = (str(summary.diverged.get(name, 0)) for name in shown)
+        grid.add_row("diverged", *counts, style="bold red")
     grid.add_row("n", *(str(summary.count.get(name, 0)) for name in shown), style="dim", end_section=True)
     for label, scores in report.reference_rows.items():
+        label = f"{label} ({_mean_of(scores)})" if scores.diverged else label
         add(label, scores.summary.mean, "italic")
     words = [f"window orientation: {settings['orientation_source']}", f"initial state: {settings['initial_state']}",
              f"gyro bias: {settings['gyro_bias']}", f"IMU compensated: {settings['imu_compensated']}",
              f"alignment: {settings['alignment']}"]
     lines = [Text("; ".join(words), style="dim"),
              Text("reference rows are means; – is not defined (the reason is in metrics.json)", style="dim")]
+    if any(scores.diverged for scores in (report.scores, *report.reference_rows.values())):
+        lines.append(Text("∞: the estimate diverged. It counts as infinite in medians; means, "
+                          "intervals and n are of the others alone, so they cannot be compared "
+                          "with those of another run", style="yellow"))
     said: dict[str, list[str]] = {}
     for name, notes in report.notes.items():
         for note in notes:
@@ -117,9 +135,15 @@ def table(report: Report) -> Group:
     return Group(grid, *lines)
 
 
+def _mean_of(scores: Scores) -> str:
+    return f"mean without {len(scores.diverged)} diverged" if scores.diverged else "mean"
+
+
 def _cell(value: Any, digits: int) -> str:
     if value is None:
         return "–"
+    if value == math.inf:
+        return "∞"
     if isinstance(value, tuple):
         return f"{_cell(value[0], digits)}–{_cell(value[1], digits)}"
     return f"{value:.{digits}f}" if abs(value) < 10 ** (7 - digits) else f"{value:.1e}"
@@ -129,30 +153,53 @@ def _cell(value: Any, digits: int) -> str:
 
 
 def as_json(report: Report) -> dict[str, Any]:
-    """The whole report as plain values; a metric without a value is None, its reason under `undefined`."""
+    """The whole report as plain values; a metric without a finite value is None, with a reason.
+
+    `mean` is over the sequences that did not diverge; its `diverged` counts those that did, the
+    report's `diverged` by metric.
+    """
     nowhere = {name: next(m.undefined[name] for m in report.scores.sequences.values() if name in m.undefined)
                for name, value in report.scores.summary.mean.items() if value is None}
     sequences = _sequences(report.scores)
+    for name, group in report.scores.groups.items():
+        sequences[name]["group"] = group
     for name, notes in report.notes.items():
         sequences[name]["notes"] = notes
     return {
         "settings": report.settings,
         "sequences": sequences,
-        **_summary(report.scores.summary),
+        **_summary(report.scores),
         "undefined": nowhere,
-        "reference_rows": {label: {"sequences": _sequences(scores), **_summary(scores.summary)}
+        "reference_rows": {label: {"sequences": _sequences(scores), **_summary(scores)}
                            for label, scores in report.reference_rows.items()},
         "left_out": report.left_out,
     }
 
 
 def _sequences(scores: Scores) -> dict[str, dict[str, Any]]:
-    return {name: {**m.values, **({"undefined": m.undefined} if m.undefined else {})} for name, m in scores.sequences.items()}
+    return {name: {**_finite(m.values), **({"undefined": m.undefined} if m.undefined else {})}
+            for name, m in scores.sequences.items()}
 
 
-def _summary(summary: Summary) -> dict[str, Any]:
+def read_metric(sequence: Mapping[str, Any], metric: str) -> float | None:
+    """A metric of one of the `sequences` of metrics.json, as `Measures` has it: None where it is
+    not defined, infinite where the estimate diverged."""
+    value = sequence.get(metric)
+    reason = sequence.get("undefined", {}).get(metric, "")
+    return math.inf if value is None and metrics.is_divergence(reason) else value
+
+
+def _summary(scores: Scores) -> dict[str, Any]:
+    summary = scores.summary
     interval = {name: None if value is None else list(value) for name, value in summary.interval.items()}
-    return {"mean": summary.mean, "median": summary.median, "interval": interval, "n": summary.count}
+    return {"mean": {**summary.mean, "diverged": len(scores.diverged)},
+            "median": _finite(summary.median), "interval": interval, "n": summary.count,
+            "diverged": summary.diverged}
+
+
+def _finite(values: Mapping[str, float | None]) -> dict[str, float | None]:
+    """JSON has no infinity."""
+    return {name: None if value == math.inf else value for name, value in values.items()}
 
 
 def write(folder: Path, report: Report, estimates: list[Estimate]) -> None:

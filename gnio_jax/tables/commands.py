@@ -251,7 +251,8 @@ def notes(base: TrainConfig, options: TablesConfig, experiment: Experiment) -> l
     budget = (f"{base.optim.epochs} epochs of batches of {base.optim.batch_size}, learning rate {base.optim.learning_rate:g}, "
               f"width {base.model.width or 64}, {base.data.rate:g} Hz, {options.seeds} seeds")
     return [f"{base.dataset} {options.split}, {options.estimator}; every row: {budget}; on {complexity.hardware()}. "
-            "± is the standard deviation over seeds; the interval of the difference to the first row is over sequences.",
+            "± is the standard deviation over seeds; the difference to the first row is over "
+            "sequences.",
             "", f"Published: {experiment.source}; the paper does not define its ATE."]
 
 

@@ -92,15 +92,22 @@ def _evaluation(workdir: Path, split: str, estimator: str) -> tuple[EvaluateConf
 
 
 def paths(result: Result, split: str, estimator: str) -> dict[str, tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]]]:
-    """Reference and the first seed's estimate of each sequence seen from above, m, the estimate laid on by start position and yaw."""
+    """Reference and the first seed's estimate of each sequence seen from above, m.
+
+    The estimate is laid on by start position and yaw; it is NaN from where it diverged.
+    """
     _, folder = _evaluation(result.runs[0], split, estimator)
     names = list(result.figures[0]["sequences"])
     found = {}
     for name, stem in zip(names, report.file_names(names), strict=True):
         if (folder / "references" / f"{stem}.txt").exists():
             estimate, reference = (_trajectory(folder / kind / f"{stem}.txt") for kind in ("trajectories", "references"))
-            rows = np.searchsorted(estimate.time, reference.time - 1e-6)  # the reference has no row where it cannot be trusted
-            estimate = metrics.align(Trajectory(*(field[rows] for field in estimate)), reference)
+            # The reference has no row where it is not trusted, the estimate none where not finite.
+            rows = np.searchsorted(estimate.time, reference.time - 1e-6)
+            rows = np.minimum(rows, len(estimate.time) - 1)
+            there = np.abs(estimate.time[rows] - reference.time) <= 1e-6
+            poses = (np.where(there[:, None], field[rows], np.nan) for field in estimate[1:])
+            estimate = metrics.align(Trajectory(reference.time, *poses), reference)
             found[name] = reference.position[:, :2], estimate.position[:, :2]
     return found
 

@@ -32,18 +32,23 @@ def save(path: Path, figure: Figure) -> None:
 
 
 def table(experiment: Experiment, results: list[Result], found: list[Row]) -> Figure:
-    """`ate` of each row: every seed a dot, their mean a bar, sequences behind it; beside it what the paper printed."""
+    """`ate` of each row: every seed a dot, their mean a bar, sequences behind it; beside it what
+    the paper printed. Of what diverged there is no dot: the row's label says how many."""
     published = [row.published for row in found]
     beside = any(value is not None for value in published)
     figure = Figure(figsize=(9.0 if beside else 6.4, 1.4 + 0.45 * len(found)), layout="constrained")
     panels = np.atleast_1d(figure.subplots(1, 2 if beside else 1, sharey=True, width_ratios=(2, 1) if beside else (1,)))
     ours = panels[0]
     for place, (result, row) in enumerate(zip(results, found, strict=True)):
-        seeds, sequences = row.seeds["ate"], errors(result).mean(0)
-        ours.barh(place, np.mean(seeds), color=GREEN, alpha=0.35, height=0.6)
+        seeds = row.seeds.get("ate", [])
+        sequences = [each.mean() for each in errors(result).values() if np.isfinite(each).all()]
+        ours.barh(place, np.mean(seeds) if seeds else 0.0, color=GREEN, alpha=0.35, height=0.6)
         ours.plot(sequences, np.full(len(sequences), place) + 0.2, "|", color=GREY, ms=7, label="sequence" if place == 0 else None)
         ours.plot(seeds, np.full(len(seeds), place), "o", color="black", ms=4, label="seed, mean over sequences" if place == 0 else None)
-    ours.set_yticks(range(len(found)), [row.label for row in found])
+    lost = [f"\n({row.diverged} of {row.estimates} diverged)" if row.diverged else ""
+            for row in found]
+    labels = [row.label + words for row, words in zip(found, lost, strict=True)]
+    ours.set_yticks(range(len(found)), labels)
     ours.invert_yaxis()
     ours.set(xlabel="ate, here (m)", title=experiment.title)
     ours.set_xlim(left=0)

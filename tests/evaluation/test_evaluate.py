@@ -77,6 +77,8 @@ def test_end_to_end(workdir, command, capsys):
     assert list(found["sequences"]) == ["synthetic_1_handheld", "synthetic_2_handheld"] and "synthetic_3_handheld" in found["left_out"]
     assert found["settings"]["coupling"] == "tight" and found["settings"]["epoch"] == 1
     assert found["settings"]["filter"]["velocity_std"] == 0.7
+    # Nothing says whose these walks are, so each is on its own.
+    assert [one["group"] for one in found["sequences"].values()] == list(found["sequences"])
     assert found["mean"]["ate"] > 0 and found["reference_rows"]["perfect_displacements"]["mean"]["ate"] < 0.1
     assert len(np.loadtxt(folder / "trajectories" / "synthetic_1_handheld.txt")) == 150
     assert len(list((folder / "plots").iterdir())) == 7

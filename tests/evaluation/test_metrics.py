@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation
 
 from gnio_jax.evaluation import metrics
@@ -142,9 +143,8 @@ def test_rte_distance_of_a_scaled_line():
 def test_rpe_forgives_a_wrong_heading_and_rte_does_not():
     truth = walk(tilt=0.3)
     estimate = moved_by(truth, Rotation.from_euler("z", 1.2), [5.0, -3.0, 1.0])
-    arguments = metrics.yaw(estimate.orientation), metrics.yaw(truth.orientation), STEP
-    assert metrics.rpe(estimate.position, truth.position, *arguments, 1.0) == pytest.approx(0.0, abs=1e-12)
-    assert metrics.rpe(estimate.position[:, :2], truth.position[:, :2], *arguments, 10.0) == pytest.approx(0.0, abs=1e-11)
+    assert metrics.rpe(estimate, truth, STEP, 1.0) == pytest.approx(0.0, abs=1e-12)
+    assert metrics.rpe(estimate, truth, STEP, 10.0, dims=2) == pytest.approx(0.0, abs=1e-11)
     assert metrics.rpe_se3(estimate, truth, STEP) == pytest.approx(0.0, abs=1e-12)
     assert metrics.rte(estimate.position, truth.position, STEP, 10.0) > 1.0
 
@@ -153,16 +153,20 @@ def test_rpe_forgives_a_wrong_heading_and_rte_does_not():
 def test_rpe_against_a_loop(seconds):
     truth = walk(tilt=0.3)
     estimate = perturbed(truth)
-    apart, errors, errors_se3 = round(seconds / STEP), [], []
+    apart, errors, errors_2d, errors_se3 = round(seconds / STEP), [], [], []
     turns, turns_true = (Rotation.from_quat(np.roll(t.orientation, -1, 1)) for t in (estimate, truth))
     for i in range(len(truth.time) - apart):
-        m, m_true = turns[i].as_matrix(), turns_true[i].as_matrix()
-        angle = np.arctan2(m_true[1, 0], m_true[0, 0]) - np.arctan2(m[1, 0], m[0, 0])
+        between = turns[i] * turns_true[i].inv()
+        _, _, z, w = between.as_quat()
+        angle = -2 * np.arctan(z / w)  # the twist about z, turned back
         moved, moved_true = estimate.position[i + apart] - estimate.position[i], truth.position[i + apart] - truth.position[i]
-        errors.append(np.sum((Rotation.from_euler("z", angle).apply(moved) - moved_true) ** 2))
+        error = Rotation.from_euler("z", angle).apply(moved) - moved_true
+        errors.append(np.sum(error**2))
+        errors_2d.append(np.sum(error[:2] ** 2))
         errors_se3.append(np.sum((turns[i].inv().apply(moved) - turns_true[i].inv().apply(moved_true)) ** 2))
-    found = metrics.rpe(estimate.position, truth.position, metrics.yaw(estimate.orientation), metrics.yaw(truth.orientation), STEP, seconds)
-    assert found == pytest.approx(np.sqrt(np.mean(errors)), rel=1e-9)
+    for dims, squares in ((3, errors), (2, errors_2d)):
+        found = metrics.rpe(estimate, truth, STEP, seconds, dims)
+        assert found == pytest.approx(np.sqrt(np.mean(squares)), rel=1e-9)
     assert metrics.rpe_se3(estimate, truth, STEP, seconds) == pytest.approx(np.sqrt(np.mean(errors_se3)), rel=1e-9)
 
 
@@ -209,13 +213,109 @@ def test_yaw_position_is_the_least_over_yaw():
 
 
 def test_yaw_errors_wrap():
+    def level(yaw):
+        return quaternions(Rotation.from_euler("z", yaw[:, None]))
+
     yaw_true = np.linspace(0, 20, 601)
-    wrapped = (yaw_true + np.radians(10) + np.pi) % (2 * np.pi) - np.pi
-    assert metrics.yaw_rmse(wrapped, yaw_true) == pytest.approx(10.0)
+    truth = level(yaw_true)
+    assert metrics.yaw_rmse(level(yaw_true + np.radians(10)), truth) == pytest.approx(10.0)
     growing = yaw_true + np.radians(5) * np.linspace(0, 100, 601)  # 500° in 60 s, several turns
-    assert metrics.yaw_drift((growing + np.pi) % (2 * np.pi) - np.pi, yaw_true, STEP) == pytest.approx(500 * 60, rel=1e-9)
+    assert metrics.yaw_drift(level(growing), truth, STEP) == pytest.approx(500 * 60, rel=1e-9)
     with pytest.raises(Undefined, match="10 s"):
-        metrics.yaw_drift(yaw_true[:50], yaw_true[:50], STEP)
+        metrics.yaw_drift(truth[:50], truth[:50], STEP)
+
+
+def test_a_reference_without_orientation_is_no_divergence():
+    """Its rows count where no attitude is needed; the first that has one aligns the estimate."""
+    truth = walk()
+    reference = truth._replace(orientation=truth.orientation.copy())
+    reference.orientation[:50] = np.nan
+    estimate = moved_by(truth, Rotation.from_euler("z", 1.0), [5.0, -3.0, 1.0])
+    found = metrics.measure(estimate, reference)
+    assert not found.undefined
+    for name in ("ate", "rpe_10s", "rpe_se3", "yaw_rmse"):
+        assert found.values[name] == pytest.approx(0, abs=1e-6)
+    broken = estimate._replace(orientation=estimate.orientation.copy())
+    broken.orientation[-50:] = np.nan  # of the estimate it is
+    for value in (metrics.yaw_rmse(broken.orientation, reference.orientation),
+                  metrics.rpe(broken, reference, STEP, 1.0)):
+        assert np.isnan(value)
+
+
+PITCHES = [0, 45, 84, 90]
+
+
+def pitched(pitch, n=900):
+    """A walk whose phone is held at a constant pitch (°), its body x axis vertical at 90."""
+    path = walk(n=n)
+    held = Rotation.from_euler("y", pitch, degrees=True)
+    heading = Rotation.from_quat(np.roll(path.orientation, -1, 1))
+    return path._replace(orientation=quaternions(heading * held))
+
+
+@pytest.mark.parametrize("pitch", PITCHES)
+def test_yaw_of_a_tilted_phone_is_the_turn_about_the_vertical(pitch):
+    """Against SciPy's minimum of ‖R̂ − R_z(ψ) R‖, with half a degree of tilt error too."""
+    random = np.random.default_rng(pitch)
+    headings = random.uniform(-3, 3, 12)
+    truth = Rotation.from_euler("ZY", np.column_stack([headings, np.full(12, np.radians(pitch))]))
+    yaws = np.concatenate([random.uniform(-3, 3, 10), [0.0, np.pi]])
+    tilt = Rotation.from_rotvec(np.column_stack([random.normal(0, 0.01, (12, 2)), np.zeros(12)]))
+    estimate = Rotation.from_euler("z", yaws[:, None]) * tilt * truth
+
+    def nearest(r_hat, r):
+        def cost(angle):
+            return np.linalg.norm(r_hat - Rotation.from_euler("z", angle).as_matrix() @ r) ** 2
+
+        start = min(np.linspace(-np.pi, np.pi, 73), key=cost)
+        return minimize_scalar(cost, (start - 0.1, start, start + 0.1), tol=1e-9).x
+
+    pairs = zip(estimate.as_matrix(), truth.as_matrix(), strict=True)
+    expected = [nearest(*pair) for pair in pairs]
+    found = metrics.relative_yaw(quaternions(estimate), quaternions(truth))
+    assert np.abs(found).max() <= np.pi
+    np.testing.assert_allclose(np.exp(1j * found), np.exp(1j * np.array(expected)), atol=1e-6)
+    np.testing.assert_allclose(np.exp(1j * found), np.exp(1j * yaws), atol=1e-12)
+
+
+def test_yaw_of_level_phones_is_the_difference_of_their_yaws():
+    angles = np.random.default_rng(0).uniform(-np.pi, np.pi, (2, 50))
+    level = (quaternions(Rotation.from_euler("z", of_one[:, None])) for of_one in angles)
+    found = metrics.relative_yaw(*level)
+    np.testing.assert_allclose(np.exp(1j * found), np.exp(1j * (angles[0] - angles[1])), atol=1e-12)
+
+
+def test_yaw_is_finite_where_it_has_no_value():
+    """Half a turn about a horizontal axis: no yaw is nearer than another. NaN stays NaN."""
+    level, over = np.array([[1.0, 0, 0, 0]]), np.array([[0.0, np.sqrt(0.5), np.sqrt(0.5), 0]])
+    np.testing.assert_array_equal(metrics.relative_yaw(over, level), 0.0)
+    assert np.isnan(metrics.relative_yaw(level, level * np.nan)).all()
+
+
+@pytest.mark.parametrize("pitch", PITCHES)
+def test_a_little_tilt_is_no_yaw_error(pitch):
+    """0.1° of noise about both horizontal axes on a perfect path, on whose phone the body's x axis
+    may be vertical."""
+    truth = pitched(pitch)
+    noise = np.zeros((900, 3))
+    noise[:, :2] = np.random.default_rng(1).normal(0, np.radians(0.1), (900, 2))
+    turn = Rotation.from_rotvec(noise) * Rotation.from_quat(np.roll(truth.orientation, -1, 1))
+    found = metrics.measure(truth._replace(orientation=quaternions(turn)), truth).values
+    assert found["yaw_rmse"] < 0.01 and found["yaw_drift"] < 1.0
+    assert found["rpe_1s"] < 1e-4 and found["rpe_10s"] < 1e-3 and found["ate"] < 1e-3
+
+
+@pytest.mark.parametrize("pitch", PITCHES)
+def test_a_wrong_heading_of_a_tilted_phone_is_measured_and_undone(pitch):
+    truth = pitched(pitch)
+    turn = Rotation.from_euler("z", 40, degrees=True)
+    estimate = moved_by(truth, turn, [5.0, -3.0, 1.0])
+    assert metrics.measure(estimate, truth, "none").values["yaw_rmse"] == pytest.approx(40.0)
+    covariance = np.broadcast_to(np.eye(3), (900, 3, 3))
+    found = metrics.measure(estimate, truth, position_covariance=covariance).values
+    for name in ("rpe_10s", "ate", "nees"):
+        assert found[name] == pytest.approx(0, abs=1e-9)
+    assert found["yaw_rmse"] == pytest.approx(0, abs=1e-6)
 
 
 # Movement
@@ -310,6 +410,91 @@ def test_measure_names_and_reasons():
     assert metrics.measure(broken, truth).undefined["rpe_1s"] == "the estimate is not finite from 10.0 s on"
 
 
+def lost(trajectory, row):
+    """The trajectory, not finite from a row on."""
+    there = np.arange(len(trajectory.time))[:, None] < row
+    return Trajectory(trajectory.time, *(np.where(there, part, np.nan) for part in trajectory[1:]))
+
+
+def test_a_diverged_estimate_has_infinite_errors():
+    truth = walk()
+    covariance = np.broadcast_to(np.eye(3), (900, 3, 3))
+    arguments = {"position_covariance": covariance, "nis": np.full(900, 3.0)}
+    estimate = perturbed(truth)
+    whole = metrics.measure(estimate, truth, **arguments)
+    broken = metrics.measure(lost(estimate, 500), truth, **arguments)
+    given = {"duration", "path_length"}
+    coverages = {"nees_coverage", "nees_coverage_2d", "nis_coverage"}
+    assert broken.values.keys() == whole.values.keys() and not whole.undefined
+    infinite = {name for name, value in broken.values.items() if value == np.inf}
+    assert infinite == whole.values.keys() - given - coverages
+    assert all(broken.values[name] == 0 for name in coverages)
+    assert all(broken.values[name] == whole.values[name] for name in given)
+    assert set(broken.undefined.values()) == {"the estimate is not finite from 50.0 s on"}
+    assert metrics.is_divergence(broken.undefined["ate"])
+    far = estimate._replace(position=np.full((900, 3), 1e300))
+    far.position[0] = 0
+    found = metrics.measure(far, truth)
+    assert found.values["ate"] == np.inf and metrics.is_divergence(found.undefined["ate"])
+
+
+def test_what_is_not_defined_has_not_diverged():
+    """Without a reference, too short or never standing there is no error that could be infinite."""
+    truth = walk()
+    blind = metrics.measure(lost(truth, 500), masked(truth, slice(None)))
+    assert blind.values["ate"] is None and blind.undefined["ate"] == "no trusted reference"
+    pair = (Trajectory(*(part[:5] for part in path)) for path in (lost(truth, 3), truth))
+    short = metrics.measure(*pair)
+    assert short.values["ate"] == np.inf and short.values["rpe_1s"] is None
+    assert not metrics.is_divergence(short.undefined["rpe_1s"])
+
+
+def test_a_covariance_that_is_not_finite_is_no_consistent_one():
+    truth = walk()
+    covariance = np.broadcast_to(np.eye(3), (900, 3, 3)).copy()
+    covariance[100:] = np.nan
+    found = metrics.measure(perturbed(truth, scale=0), truth, position_covariance=covariance).values
+    assert found["nees"] == np.inf and found["nees_coverage"] == pytest.approx(100 / 9)
+    assert np.isfinite(found["ate"])
+
+
+@pytest.mark.parametrize("how", ["origin", "yaw_position", "se3"])
+def test_alignment_sees_finite_rows_alone(how):
+    truth = walk(tilt=0.3)
+    estimate = moved_by(truth, Rotation.from_euler("z", 1.2), [5.0, -3.0, 1.0])
+    found = metrics.align(lost(estimate, 500), truth, how)
+    np.testing.assert_allclose(found.position[:500], truth.position[:500], atol=1e-9)
+    assert np.isnan(found.position[500:]).all()
+    with pytest.raises(Undefined, match="not finite in any trusted row"):
+        metrics.align(lost(estimate, 500), masked(truth, slice(0, 500)), how)
+
+
+def test_divergence_never_improves_a_summary():
+    """The worst of six errors diverge: the mean is of the others and counts them, the median gets
+    no smaller, and is infinite with half."""
+    errors = [1.0, 2.0, 3.0, 4.0, 5.0, 60.0]
+    names = [f"{group}{k}" for group in "ab" for k in range(3)]
+    summaries = []
+    for bad in (0, 1, 3, 6):
+        values = errors[:6 - bad] + [np.inf] * bad
+        measures = {name: {"ate": value, "rte": None}
+                    for name, value in zip(names, values, strict=True)}
+        summaries.append(metrics.summarise(measures, {name: name[0] for name in names}))
+    assert [s.diverged for s in summaries] == [{"ate": n, "rte": 0} for n in (0, 1, 3, 6)]
+    assert [s.count["ate"] for s in summaries] == [6, 5, 3, 0]
+    assert [s.median["ate"] for s in summaries] == [3.5, 3.5, np.inf, np.inf]
+    assert [s.mean["ate"] for s in summaries] == [12.5, 3.0, 2.0, None]
+    assert summaries[1].interval["ate"] == pytest.approx((2.0, 4.5))
+    assert [s.interval["ate"] for s in summaries[2:]] == [None, None]  # one group is left, or none
+
+
+def test_bootstrap_draws_groups_whatever_their_order():
+    values = np.array([1.0, 5.0, 1.2, 5.2])
+    assert metrics.bootstrap(values, ["x", "y", "x", "y"]) == pytest.approx((1.1, 5.1))
+    assert metrics.bootstrap(values, ["x"] * 4) is None
+    assert metrics.bootstrap(values[:0], []) is None
+
+
 def test_summary_draws_whole_groups():
     measures = {f"{group}{k}": {"ate": value + 0.001 * k, "rte": None} for group, value in [("a", 1.0), ("b", 3.0)] for k in range(5)}
     groups = {name: name[0] for name in measures}
@@ -356,7 +541,7 @@ def test_agreement_with_evo():
         assert metrics.rpe_se3(estimate, truth, STEP, seconds) == pytest.approx(metric.get_statistic(evo.StatisticsType.rmse), rel=1e-9)
     yaw_only = moved_by(perturbed(truth)._replace(orientation=truth.orientation), Rotation.from_euler("z", 1.0), [1.0, 2.0, 3.0])
     metric.process_data((paths[0], PoseTrajectory3D(yaw_only.position.copy(), yaw_only.orientation.copy(), yaw_only.time)))
-    ours = metrics.rpe(yaw_only.position, truth.position, metrics.yaw(yaw_only.orientation), metrics.yaw(truth.orientation), STEP, 10.0)
+    ours = metrics.rpe(yaw_only, truth, STEP, 10.0)
     assert ours == pytest.approx(metric.get_statistic(evo.StatisticsType.rmse), rel=1e-9)
     paths[1].align(paths[0])
     assert metrics.ate(metrics.align(estimate, truth, "se3").position, truth.position) == pytest.approx(ape(*paths), rel=1e-9)

@@ -111,6 +111,66 @@ def test_table_says_what_matters(made):
     assert f"{made.scores.summary.mean['ate']:.2f}" in text
 
 
+@pytest.fixture(scope="module")
+def with_divergence(estimates):
+    """The walks again, the second lost after 20 s, and a third that is whole."""
+    lost = estimates[1].trajectory
+    there = np.arange(400)[:, None] < 200
+    lost = Trajectory(lost.time, *(np.where(there, part, np.nan) for part in lost[1:]))
+    of = [estimates[0], estimates[1]._replace(trajectory=lost), estimates[2], estimate("room 3", 3)]
+    groups = {"room 1/walk": "A", "room 1:walk": "B", "blind": "C", "room 3": "D"}
+    still = {"never_moves": report.score(never_moves(of), groups)}
+    return of, report.Report(SETTINGS, report.score(of, groups), still, {}, {})
+
+
+def test_divergence_is_in_the_files(tmp_path, with_divergence):
+    of, found = with_divergence
+    report.write(tmp_path, found, of)
+    read = json.loads((tmp_path / "metrics.json").read_text())
+    lost = read["sequences"]["room 1:walk"]
+    assert lost["ate"] is None
+    assert lost["undefined"]["ate"] == "the estimate is not finite from 20.0 s on"
+    assert {name: one["group"] for name, one in read["sequences"].items()} == found.scores.groups
+    assert read["mean"]["diverged"] == 1 and read["diverged"]["ate"] == 1 and read["n"]["ate"] == 2
+    ates = [read["sequences"][name]["ate"] for name in ("room 1/walk", "room 3")]
+    assert read["mean"]["ate"] == pytest.approx(np.mean(ates))
+    assert read["median"]["ate"] == max(ates)  # of two finite and an infinite one
+    assert read["interval"]["ate"] == pytest.approx(sorted(ates))
+    values = {name: report.read_metric(one, "ate") for name, one in read["sequences"].items()}
+    assert values == {name: m.values["ate"] for name, m in found.scores.sequences.items()}
+    assert values["room 1:walk"] == np.inf and values["blind"] is None
+    with open(tmp_path / "metrics.csv", newline="") as file:
+        assert [row["ate"] for row in csv.DictReader(file)][1:3] == ["inf", ""]
+    assert read["reference_rows"]["never_moves"]["mean"]["diverged"] == 0
+
+
+def test_divergence_is_in_the_table(made, with_divergence):
+    def text(of):
+        console = Console(width=180, record=True, file=open("/dev/null", "w"))
+        console.print(report.table(of))
+        return console.export_text().splitlines()
+
+    lines = text(with_divergence[1])
+    cells = {line.split("  ")[1].strip(): line.split() for line in lines if line.startswith("  ")}
+    assert "mean without 1 diverged" in cells and "mean" not in cells
+    assert "1" in cells["diverged"] and cells["room 1:walk"].count("∞") >= 6
+    assert any("∞: the estimate diverged" in line for line in lines)
+    assert not any("diverged" in line for line in text(made))
+
+
+@pytest.mark.parametrize("alignment", ["origin", "yaw_position", "se3"])
+def test_the_distribution_of_errors_counts_what_diverged(tmp_path, with_divergence, alignment):
+    of, found = with_divergence
+    figure = plots.error_cdf(of, found._replace(settings=SETTINGS | {"alignment": alignment}))
+    left, right = figure.axes
+    of_one, of_all = left.get_lines()[1], left.get_lines()[3]
+    assert of_one.get_ydata()[-1] == pytest.approx(0.5)  # the lost walk: 200 of 400 samples
+    assert of_all.get_label() == "all samples"
+    assert of_all.get_ydata()[-1] == pytest.approx(1000 / 1200)
+    assert right.get_lines()[0].get_ydata()[-1] == pytest.approx(2 / 3)
+    plots.save_all(tmp_path, of, found, 1.0)
+
+
 def test_a_folder_is_replaced_whole_or_not_at_all(tmp_path):
     folder = tmp_path / "eval" / "result"
     with report.replacing_folder(folder) as new:
