@@ -84,7 +84,8 @@ def built(monkeypatch):
     """Trackers take their programs from `compiled`."""
     ready = compiled()
     monkeypatch.setattr(Tracker, "_build", lambda self, *_: vars(self).update(
-        vars(ready), _core=None, _latest=None, _clock=None, _ahead=None, _filled=0, _rest=0, _std=filtering.InitialStd()))
+        vars(ready), _core=None, _latest=None, _clock=None, _intake=None, _ahead=None, _filled=0,
+        _rest=0, _std=filtering.InitialStd()))
 
 
 @pytest.fixture
