@@ -151,7 +151,8 @@ def test_an_imu_that_is_no_faster_is_left_alone(rate):
 
 def test_two_stamps_almost_alike_do_no_harm():
     """A spline through the noise of both would swing by thousands of its size."""
-    stamps = np.sort(np.append(stamps_of(400, 1.0), stamps_of(400, 1.0)[100:300:20] + 1e-6))
+    stamps = stamps_of(400, 1.0, 0.2)
+    stamps = np.sort(np.append(stamps, stamps[100:300:20] + 1e-6))
     values = np.random.default_rng(0).standard_normal((len(stamps), 6))
     rows, _ = through(stamps, values, 400)
     assert len(rows) == 178 and np.abs(rows[:, :6]).max() < 4
