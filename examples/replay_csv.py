@@ -81,7 +81,8 @@ def main() -> None:
                      chosen.gyro_bias_std, chosen.accel_bias_std)
     if len(stamps) < 2:
         raise InputError(path, "holds a single sample", "record a walk of some seconds")
-    hole = 1.5 * max(config.dt, float(np.median(np.diff(stamps))))
+    interval = float(np.median(np.diff(stamps)))
+    hole = 1.5 * max(config.dt, interval)
 
     frozen = models.freeze(run.model, run.variables)  # what depends on the weights alone is computed once
 
@@ -92,7 +93,8 @@ def main() -> None:
         progress("compiling", 0.0)
         begin = time.perf_counter()
         try:
-            tracker = Tracker.from_rest(predict, config, noise, options.rest_seconds, std, hole)
+            tracker = Tracker.from_rest(predict, config, noise, options.rest_seconds, std, hole,
+                                        imu_rate=1 / interval)
         except ValueError as error:
             raise InputError("--rest-seconds", str(error)) from None
         compiled = time.perf_counter() - begin
@@ -138,6 +140,9 @@ def main() -> None:
         if seconds:
             p50, p99, most = 1e3 * np.percentile(seconds, [50, 99, 100])
             print(f"latency of a push with a {what}: p50 {p50:.3f} ms, p99 {p99:.3f} ms, max {most:.3f} ms")
+    if tracker.delay:
+        print(f"low-pass from {1 / interval:.4g} Hz to {1 / config.dt:.4g} Hz: "
+              f"poses come {1e3 * tracker.delay:.0f} ms later")
     print(f"trajectory: {out}\npicture: {picture}")
 
 

@@ -16,9 +16,10 @@ import h5py
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.interpolate import CubicSpline
-from scipy.signal import fftconvolve, kaiserord
+from scipy.signal import fftconvolve
 from scipy.spatial.transform import Rotation
 
+from gnio_jax.decimation import decimation_factor, low_pass
 from gnio_jax.files import replacing
 from gnio_jax.types import GRAVITY, InputError, Sequence
 
@@ -273,7 +274,7 @@ def resample(sequence: Sequence, rate: float, max_gap: float = 0.1) -> Sequence:
     everywhere = np.ones(len(time), dtype=bool)
 
     imu = np.concatenate([sequence.gyro, sequence.accel], axis=1)
-    factor = int(np.ceil(native / rate - 0.05))
+    factor = decimation_factor(native, rate)
     if factor > 1:
         fine = np.minimum(time[0] + np.arange((count - 1) * factor + 1) / (rate * factor), time[-1])
         imu = _low_pass(_interpolate(time, imu, everywhere, fine, max_gap), factor)[::factor]
@@ -340,11 +341,9 @@ def _slerp(time: np.ndarray, wxyz: np.ndarray, clock: np.ndarray) -> np.ndarray:
 
 
 def _low_pass(values: np.ndarray, factor: int) -> np.ndarray:
-    """Zero-phase FIR that keeps what `factor` times fewer samples can carry; 70 dB in the stop band."""
-    count, beta = kaiserord(70.0, 0.2 / factor)
-    half = int(count) // 2
-    taps = np.sinc(0.9 / factor * np.arange(-half, half + 1)) * np.kaiser(2 * half + 1, beta)
-    taps = taps / taps.sum()
+    """The FIR `low_pass` with zero phase, ends filled by odd reflection."""
+    taps = low_pass(factor)
+    half = len(taps) // 2
     padded = np.pad(values, ((half, half), (0, 0)), mode="reflect", reflect_type="odd")
     return fftconvolve(padded, taps[:, None], mode="valid", axes=0)
 

@@ -154,6 +154,14 @@ def test_a_vibration_above_the_new_nyquist_frequency_does_not_fold_into_the_gait
     assert np.abs(result.gyro[edge] - truth.gyro[edge]).max() < 5e-3
 
 
+def test_at_no_multiple_of_the_rate_images_of_the_spline_do_not_fold_back():
+    """The spline's image of 205 Hz, at 621 Hz, would alias to 21 Hz at 600 Hz."""
+    sequence = circle(416.0, 4.0)
+    tone = np.sin(2 * np.pi * 205.0 * sequence.time[:, None] + [0.0, 1.0, 2.0])
+    result = seq.resample(sequence._replace(gyro=tone), 200.0)
+    assert np.abs(result.gyro[50:-50]).max() < 1e-3
+
+
 def test_what_the_new_rate_can_carry_is_kept_up_to_the_ends():
     sequence = circle(200.0, 10.0)
     time = sequence.time

@@ -1,0 +1,151 @@
+"""The low-pass of a stream: what the filter's rate cannot carry of a faster IMU would alias.
+
+It is what `data.resample` does to a recording: a cubic spline through the samples is read at
+`factor` points per grid sample, and a symmetric FIR makes one sample of them. The FIR of the grid
+sample at t reaches up to t + delay, so that it is known that much later; its stamp stays t. A hole
+ends a run of samples: the FIR is drained, odd reflection stands for what lies beyond the end, and
+it starts anew behind the hole. On the host; nothing older than the FIR's reach is kept.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from scipy.interpolate import CubicSpline
+
+from gnio_jax.decimation import decimation_factor, low_pass
+
+_CLOSEST = 0.25
+"""Of the IMU's interval: a sample that comes sooner after another is left out (ours), or noise
+would make the spline swing."""
+_BEFORE = 4
+"""Samples kept before the FIR's reach, so that the spline's new end is not felt within it."""
+
+
+class Design(NamedTuple):
+    """What is fixed when a tracker is made."""
+
+    dt: float
+    """Of the filter's grid, s."""
+    hole: float
+    """Samples further apart belong to two runs, s."""
+    imu_rate: float
+    """Hz, nominal."""
+    factor: int
+    """Points of the fine grid per grid sample; 1: there is no low-pass."""
+    taps: Float[np.ndarray, "taps"]
+    """Of the FIR, on the fine grid; (1,) where there is none."""
+
+    @property
+    def delay(self) -> float:
+        """By how much the FIR of a grid sample reaches beyond its stamp, s."""
+        return len(self.taps) // 2 * self.dt / self.factor
+
+    @property
+    def fastest(self) -> float:
+        """Above this rate of the IMU, Hz, vibrations alias all the same."""
+        return 1.5 * self.imu_rate if self.factor > 1 else 1 / self.dt
+
+
+class Run(NamedTuple):
+    """Samples without a hole between them, as far as they are still needed."""
+
+    first: int
+    """Point of the fine grid with which the run began: origin + first·dt/factor."""
+    stamps: Float[np.ndarray, "n"]
+    """s since the origin."""
+    samples: Float[np.ndarray, "n 6"]
+    """gyro rad/s, accel m/s²."""
+
+
+class Intake(NamedTuple):
+    """Where the stream stands."""
+
+    origin: float
+    """The first stamp, s."""
+    newest: float
+    """The newest stamp, s."""
+    samples: int
+    """How many there have been, missing ones included."""
+    count: int
+    """Grid samples made or passed over by the low-pass."""
+    run: Run | None
+    """None before the first sample, in a hole, and where there is no low-pass."""
+
+
+Event = tuple[float, tuple[float, ...]]
+"""Stamp in s and sample: gyro, accel; NaN says that there is none and that time goes by."""
+
+
+def design(dt: float, hole: float, imu_rate: float) -> Design:
+    """For an IMU of `imu_rate` Hz and a filter with a sample every `dt` s."""
+    factor = decimation_factor(imu_rate, 1 / dt)
+    return Design(dt, hole, imu_rate, factor, low_pass(factor) if factor > 1 else np.ones(1))
+
+
+def rounding(dt: float, time: float, origin: float) -> float:
+    """What rounding leaves of the stamps, s: this close is the same time."""
+    return 1e-6 * dt + 4 * math.ulp(max(abs(time), abs(origin)))
+
+
+def take(intake: Intake | None, time: float, sample: tuple[float, ...],
+         design: Design) -> tuple[Intake, list[Event]]:
+    """The stream after one sample, and what the filter's clock is to be told.
+
+    Without a low-pass that is the sample itself. With one it is grid samples with their own stamps,
+    in order, each as soon as the FIR's reach is there. In holes there are none.
+    """
+    intake = Intake(time, time, 0, 0, None) if intake is None else intake
+    intake = intake._replace(newest=time, samples=intake.samples + 1)
+    if design.factor == 1:
+        return intake, [(time, sample)]
+    elapsed, slack = time - intake.origin, rounding(design.dt, time, intake.origin)
+    there, run, count, events = all(map(math.isfinite, sample)), intake.run, intake.count, []
+    if run is not None and elapsed - run.stamps[-1] > design.hole:
+        last = _last(run, slack, design)
+        while count * design.factor <= last:
+            events.append((intake.origin + count * design.dt, _filtered(run, count, last, design)))
+            count += 1
+        run = None
+    if run is None and there:
+        first = math.ceil((elapsed - slack) * design.factor / design.dt)
+        run = Run(first, np.array([elapsed]), np.array([sample]))
+        count = max(count, -(-first // design.factor))
+    elif run is None:
+        events.append((time, sample))
+    elif there and elapsed - run.stamps[-1] >= _CLOSEST / design.imu_rate:
+        run = run._replace(stamps=np.append(run.stamps, elapsed),
+                           samples=np.concatenate([run.samples, [sample]]))
+    if run is not None:
+        last = _last(run, slack, design)
+        while count * design.factor + len(design.taps) // 2 <= last:
+            events.append((intake.origin + count * design.dt, _filtered(run, count, last, design)))
+            count += 1
+        reach = count * design.dt - design.delay
+        needed = int(np.searchsorted(run.stamps, reach, side="right")) - 1 - _BEFORE
+        if needed > 0:
+            run = run._replace(stamps=run.stamps[needed:], samples=run.samples[needed:])
+    return intake._replace(count=count, run=run), events
+
+
+def _last(run: Run, slack: float, design: Design) -> int:
+    """The last point of the fine grid that the run has reached."""
+    return math.floor((run.stamps[-1] + slack) * design.factor / design.dt)
+
+
+def _filtered(run: Run, count: int, last: int, design: Design) -> tuple[float, ...]:
+    """Grid sample `count` of a run that has come to point `last` of the fine grid."""
+    half, centre = len(design.taps) // 2, count * design.factor
+    low, high = max(centre - half, run.first), min(centre + half, last)
+    points = np.arange(low, high + 1) * (design.dt / design.factor)
+    points = np.clip(points, run.stamps[0], run.stamps[-1])
+    if len(run.stamps) < 4:
+        fine = np.stack([np.interp(points, run.stamps, column) for column in run.samples.T], axis=1)
+    else:
+        fine = CubicSpline(run.stamps, run.samples)(points)
+    beyond = (low - centre + half, centre + half - high)
+    fine = np.pad(fine, (beyond, (0, 0)), mode="reflect", reflect_type="odd")
+    return tuple((design.taps @ fine).tolist())

@@ -1,0 +1,274 @@
+"""The low-pass of a stream: pure tones, a slow resampler of SciPy's parts, the trajectory of the
+batch path, save and restore."""
+
+import functools
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.interpolate import CubicSpline
+from scipy.signal import firwin
+
+from gnio_jax import filtering, geometry
+from gnio_jax.data import sequence, synthetic
+from gnio_jax.filtering import Tracker, intake, online
+from gnio_jax.types import InputError, Prediction
+
+DT = 0.005
+CONFIG = filtering.FilterConfig(DT, samples_per_clone=20, clones_per_window=10)
+NOISE = filtering.NoiseModel()
+WEIGHTS = np.random.default_rng(5).standard_normal((6, 3)) * 0.02
+
+
+def through(stamps, values, imu_rate, dt=DT):
+    """The rows (gyro, accel, valid) that the filter gets, and the newest stamp when each came."""
+    design = intake.design(dt, 1.5 * dt, float(imu_rate))
+    stream, clock, rows, known = None, None, [], []
+    for time, row in zip(stamps.tolist(), values.tolist(), strict=True):
+        stream, events = intake.take(stream, time, tuple(row), design)
+        for event in events:
+            clock, new = online.resample(clock, *event, dt, 1.5 * dt)
+            rows += new
+            known += [time] * len(new)
+    return np.array(rows).reshape(-1, 7), np.array(known)
+
+
+def linear(stamps, values, dt=DT):
+    """The grid by interpolation alone, without a low-pass: gyro, accel."""
+    grid = np.arange(int((stamps[-1] - stamps[0]) / dt)) * dt
+    return np.stack([np.interp(grid, stamps - stamps[0], column) for column in values.T], axis=1)
+
+
+def stamps_of(rate, seconds, jitter=0.0):
+    """As a phone gives them, s; jitter in intervals."""
+    count = np.arange(round(rate * seconds))
+    off = jitter * np.random.default_rng(3).uniform(-1, 1, len(count)) * (count > 0)
+    return 1.7e9 + (count + off) / rate
+
+
+def tones(frequency, time):
+    """(n, 6): one frequency in six phases, of amplitude 1."""
+    return np.sin(2 * np.pi * frequency * time[:, None] + np.arange(6))
+
+
+@pytest.mark.parametrize("rate, dt, jitter, highest", [
+    (400, 0.005, 0, 80), (416, 0.005, 0, 80), (1000, 0.005, 0, 80), (250, 0.005, 0, 55),
+    (208, 0.01, 0, 40), (400, 0.01, 0.2, 40)])
+def test_pure_tones(rate, dt, jitter, highest):
+    """The pass band within 1 %, without delay against the stamps; the stop band 40 dB down."""
+    stamps = stamps_of(rate, 2.0, jitter)
+    delay = intake.design(dt, 1.5 * dt, float(rate)).delay
+    assert 21 * dt < delay < 22.01 * dt
+    inside = slice(round(0.3 / dt), None)  # at the start the FIR's reach is filled by reflection
+    for frequency in (0.0, 1.0, highest / 2, highest):
+        rows, known = through(stamps, tones(frequency, stamps - stamps[0]), rate, dt)
+        grid = np.arange(len(rows)) * dt
+        np.testing.assert_allclose(rows[inside, :6], tones(frequency, grid)[inside], atol=0.01)
+        np.testing.assert_array_equal(rows[:, 6], 1.0)
+        late = known - stamps[0] - grid - delay
+        assert -1e-6 < late.min() and late.max() < 1.5 / rate
+    # Where stamps jitter, no interpolation can read tones near the IMU's own Nyquist frequency.
+    for frequency in np.linspace(0.5 / dt, (0.2 if jitter else 0.49) * rate, 6):
+        vibration = tones(frequency, stamps - stamps[0])
+        rows, _ = through(stamps, vibration, rate, dt)
+        assert np.abs(rows[inside, :6]).max() < 0.01, frequency
+        assert np.abs(linear(stamps, vibration, dt)[inside]).max() > 0.1
+
+
+def slow(stamps, values, factor, half):
+    """The rows by definition, each run with SciPy's spline and FIR on the whole of it."""
+    taps = firwin(2 * half + 1, 0.9 / factor, window=("kaiser", 6.75526))
+    step, elapsed, there = DT / factor, stamps - stamps[0], np.isfinite(values).all(axis=1)
+    grid = np.arange(int(np.floor(elapsed[-1] / DT + 1e-6)) + 1)
+    rows = np.tile([*[np.nan] * 6, 0.0], (len(grid), 1))
+    elapsed, values = elapsed[there], values[there]
+    for run in np.split(np.arange(len(elapsed)), np.flatnonzero(np.diff(elapsed) > 1.5 * DT) + 1):
+        time, samples = elapsed[run], values[run]
+        first, last = int(np.ceil(time[0] / step - 1e-4)), int(np.floor(time[-1] / step + 1e-4))
+        points = np.clip(np.arange(first, last + 1) * step, time[0], time[-1])
+        if len(run) >= 4:
+            fine = CubicSpline(time, samples)(points)
+        else:
+            fine = np.stack([np.interp(points, time, column) for column in samples.T], axis=1)
+        for k in grid[(grid * factor >= first) & (grid * factor <= last)]:
+            near = [reflected(fine, k * factor - first + j) for j in range(-half, half + 1)]
+            rows[k] = [*(taps @ np.array(near)), 1.0]
+    return rows
+
+
+def reflected(fine, j):
+    """Point j of a run that goes on beyond its ends by odd reflection."""
+    end = len(fine) - 1
+    if end == 0 or 0 <= j <= end:
+        return fine[j if end else 0]
+    turn = 0 if j < 0 else end
+    return 2 * fine[turn] - reflected(fine, 2 * turn - j)
+
+
+@pytest.mark.parametrize("kind", ["multiple", "no multiple", "jitter", "holes", "missing",
+                                  "missing at first", "short runs"])
+def test_against_a_slow_resampler(kind):
+    """Holes, ends and starts of runs, grid samples that are missing, and when each is known."""
+    rate, factor, half = (416, 6, 131) if kind == "no multiple" else (400, 2, 44)
+    stamps = stamps_of(rate, 1.5, 0.3 if kind in ("jitter", "short runs") else 0.0)
+    random = np.random.default_rng(2)
+    values = random.normal([0, 0, 0, 0, 0, 9.81], 1.0, (len(stamps), 6))
+    keep = np.ones(len(stamps), bool)
+    if kind == "holes":
+        # Gaps of 5, 7.5, 15 and 152.5 ms, of which the last two are holes.
+        keep[[100, 200, 201, *range(300, 305), *range(400, 460)]] = False
+    elif kind == "short runs":
+        for first in range(100, 500, 20):
+            keep[first : first + 19 - (first // 20) % 8] = False  # runs of one to eight samples
+    elif kind.startswith("missing"):
+        values[300:340, 1] = np.nan
+        values[random.integers(0, len(stamps), 20), 4] = np.inf
+        if kind == "missing at first":
+            values[:31] = np.nan
+    stamps, values = stamps[keep], values[keep]
+    rows, known = through(stamps, values, rate)
+    wanted = slow(stamps, values, factor, half)
+    assert 20 < len(wanted) - len(rows) < 25  # the last wait for the FIR's reach
+    wanted = wanted[: len(rows)]
+    np.testing.assert_array_equal(rows[:, 6], wanted[:, 6])
+    # Between samples the end of the spline is felt: the taps are 1e-4 there, the noise up to 4.
+    np.testing.assert_allclose(rows, wanted, rtol=0, atol=1e-6 if kind == "multiple" else 2e-3)
+    assert (wanted[:, 6] == 0).any() == (kind not in ("multiple", "no multiple", "jitter"))
+    late = known - stamps[0] - np.arange(len(rows)) * DT
+    assert late.min() > -1e-6 and late[rows[:, 6] == 1].max() < 0.11 + 0.16
+
+
+@pytest.mark.parametrize("rate", [100, 200, 209])
+def test_an_imu_that_is_no_faster_is_left_alone(rate):
+    stamps, design, stream = stamps_of(rate, 1.0), intake.design(DT, 2 / rate, float(rate)), None
+    assert design.delay == 0
+    for k, time in enumerate(stamps.tolist()):
+        stream, events = intake.take(stream, time, (float(k),) * 6, design)
+        assert events == [(time, (float(k),) * 6)]
+
+
+def test_two_stamps_almost_alike_do_no_harm():
+    """A spline through the noise of both would swing by thousands of its size."""
+    stamps = stamps_of(400, 1.0, 0.2)
+    stamps = np.sort(np.append(stamps, stamps[100:300:20] + 1e-6))
+    values = np.random.default_rng(0).standard_normal((len(stamps), 6))
+    rows, _ = through(stamps, values, 400)
+    assert len(rows) == 178 and np.abs(rows[:, :6]).max() < 4
+
+
+# The tracker --------------------------------------------------------------------------------------
+
+
+def predict(windows):
+    pooled = jnp.mean(windows, axis=1) @ jnp.asarray(WEIGHTS, jnp.float32)
+    return Prediction(pooled, -2.0 + 0.1 * pooled, {})
+
+
+@functools.cache
+def walk(rate):
+    """32 s on foot, shaken at 180, 188 and 199 Hz: at 200 Hz aliases to 20, 12 and 1 Hz."""
+    made = synthetic.pedestrian(4, synthetic.person(4), seconds=32.0, rate=float(rate))
+    shake = np.sin(2 * np.pi * made.time[:, None] * [188.0, 199.0, 180.0] + [1.0, 2.0, 0.5])
+    return made._replace(gyro=made.gyro + 2.0 * shake, accel=made.accel + 15.0 * shake[:, ::-1])
+
+
+def start(walked):
+    rotation = geometry.matrix_from_quaternion(jnp.asarray(walked.orientation[0]))
+    return filtering.initial_state(CONFIG, rotation, walked.velocity[0], walked.position[0])
+
+
+@functools.cache
+def program():
+    def history(state, gyro, accel):
+        return filtering.run_odometry(predict, state, gyro, accel, CONFIG, NOISE)[1]
+
+    return jax.jit(history)
+
+
+def feed(tracker, walked, rows=slice(None)):
+    """(stamp with which it came, pose)"""
+    columns = walked.time[rows], walked.gyro[rows], walked.accel[rows]
+    pushed = [(sample[0], tracker.push(*sample)) for sample in zip(*columns, strict=True)]
+    return [(time, pose) for time, pose in pushed if pose is not None]
+
+
+@functools.cache
+def compiled():
+    return Tracker(predict, start(walk(400)), CONFIG, NOISE, imu_rate=400.0)
+
+
+@pytest.fixture
+def built(monkeypatch):
+    """Trackers take their programs and settings from `compiled`, which is never fed."""
+    ready = compiled()
+    monkeypatch.setattr(Tracker, "_build", lambda self, *_: vars(self).update(vars(ready)))
+
+
+@pytest.mark.parametrize("rate", [400, 416])
+def test_a_faster_imu_gives_the_trajectory_of_the_batch_path(rate):
+    """To 1 µm at a multiple of the filter's rate, else 1 mm; mere interpolation is 10 cm off."""
+    walked, state, n = walk(rate), start(walk(rate)), 6000
+    even = sequence.resample(walked, 200.0)
+    wanted = np.asarray(program()(state, even.gyro[:n], even.accel[:n]).position)
+    tracker = Tracker(predict, state, CONFIG, NOISE, imu_rate=float(rate))
+    found = feed(tracker, walked)
+    assert 0.105 < tracker.delay < 0.1101
+    times = [pose.time for _, pose in found[:300]]
+    np.testing.assert_allclose(times, np.arange(1, 301) * 0.1, atol=1e-9)
+    for stamp, pose in found:  # the last sample of its interval is stamped DT before its time
+        assert -1e-6 < stamp - (pose.time - DT) - tracker.delay < 1.01 / rate
+    off = np.abs(np.array([pose.position for _, pose in found[:300]]) - wanted).max()
+    assert off < (1e-6 if rate == 400 else 1e-3)
+    rows = linear(walked.time, np.concatenate([walked.gyro, walked.accel], axis=1))[:n]
+    aliased = np.asarray(program()(state, rows[:, :3], rows[:, 3:]).position)
+    assert np.linalg.norm(aliased - wanted, axis=1).max() > 0.1
+
+
+@pytest.mark.parametrize("split", [0, 1, 30, 2001, 5005, 5030])
+def test_restored_in_mid_stream_it_goes_on_to_the_bit(built, tmp_path, split):
+    """Before the first grid sample, in the middle, in a hole and after it while the FIR fills."""
+    walked = walk(400)._replace(gyro=walk(400).gyro.copy())
+    walked.gyro[5000:5010] = np.nan
+    one = Tracker(predict, start(walked), CONFIG, NOISE, imu_rate=400.0)
+    before = feed(one, walked, slice(split))
+    one.save(tmp_path / "state.npz")
+    again = Tracker.restore(tmp_path / "state.npz", predict, CONFIG, NOISE)
+    assert again.delay == one.delay and (split > 30) == (len(before) > 0)
+    jax.tree.map(np.testing.assert_array_equal, again.state, one.state)
+    rest = [feed(each, walked, slice(split, 5600)) for each in (one, again)]
+    assert len(rest[0]) > 10
+    jax.tree.map(np.testing.assert_array_equal, *rest)
+
+
+def test_a_file_without_the_low_passes_samples_is_damaged(built, tmp_path):
+    path = tmp_path / "state.npz"
+    tracker = Tracker(predict, start(walk(400)), CONFIG, NOISE, imu_rate=400.0)
+    feed(tracker, walk(400), slice(10))
+    tracker.save(path)
+    with np.load(path) as file:
+        arrays = {name: file[name] for name in file.files}
+    assert arrays["stamps"].shape == (10,) and json.loads(str(arrays["about"]))["imu_rate"] == 400
+    stamps, samples = arrays["stamps"], arrays["samples"]
+    for broken in ({"samples": samples[:-1]}, {"stamps": stamps.astype(np.float32)}):
+        np.savez(path, **(arrays | broken))
+        with pytest.raises(InputError, match=r"array 's.*' is missing or not float64 .* damaged"):
+            Tracker.restore(path, predict, CONFIG, NOISE)
+
+
+def test_an_imu_faster_than_told_is_refused_before_it_aliases_for_long():
+    tracker = Tracker(predict, start(walk(400)), CONFIG, NOISE)
+    feed(tracker, walk(400), slice(200))
+    before = tracker.state
+    words = r"^imu_rate: the samples come at 400 Hz, .* for 200 Hz: .* make it with imu_rate=400"
+    for _ in range(2):
+        with pytest.raises(ValueError, match=words):
+            tracker.push(0.5, np.zeros(3), np.zeros(3))
+        jax.tree.map(np.testing.assert_array_equal, tracker.state, before)
+
+
+@pytest.mark.parametrize("rate", [0.0, -1.0, float("nan")])
+def test_a_rate_that_is_none_is_refused(rate):
+    with pytest.raises(ValueError, match=r"^imu_rate: must be a rate in Hz"):
+        Tracker(predict, start(walk(400)), CONFIG, NOISE, imu_rate=float(rate))
