@@ -82,7 +82,8 @@ LONGEST_BRIDGE = 0.2
 # What a fit of phone and Vicon may say. In brackets: the largest figure of the 57 real pairs, raw
 # and syn, that were at hand.
 MOST_TURNING_UNEXPLAINED = 0.1
-"""Share of the turning's power that a fit may leave (0.010). Another walk's Vicon leaves all of it."""
+"""Share of the turning's power that a fit may leave (0.010). Another walk's Vicon leaves
+0.6 and more."""
 MOST_ACCELERATION_UNEXPLAINED = 0.5
 """The same of the acceleration (0.17, on a trolley, which shakes more than it accelerates)."""
 CLOSEST_RUNNER_UP = 0.5
