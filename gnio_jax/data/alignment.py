@@ -8,22 +8,26 @@ somewhere else on that body, turned against it, on another clock. `align` estima
 
 with the extrinsic rotation Rx (IMU → marker body), lever arm l, biases b_g and b_a, the direction of gravity g in the tracker's
 world, a lag that is piecewise linear in time and a delay δ of the accelerometer against the gyro (phones filter it: 10 to 50 ms).
-A first guess comes from Wahba's problem on the angular rates (people turn about one axis, so alone it errs by degrees about that
-axis) and a cross-correlation of their magnitudes; a robust Gauss-Newton fit of gyro and accel together settles the rest. Both
-sides of each equation pass the same Gaussian filter, so that filtering removes noise but biases nothing.
+First guesses of the lag are the peaks of the cross-correlation of the magnitudes of the angular
+rates: whoever walks in rounds or in figures of eight has several, and the highest need not be the
+right one. Wahba's problem on the angular rates (people turn about one axis, so alone it errs by
+degrees about that axis) ranks them. A robust Gauss-Newton fit of gyro and accel together starts from
+each of the best few, and the one that leaves least unexplained is carried on. Both sides of each
+equation pass the same Gaussian filter, so that filtering removes noise but biases nothing.
 
 Quaternions never appear here: attitudes are SciPy rotations, body→world.
 """
 
 from __future__ import annotations
 
+from contextlib import suppress
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.linalg import solveh_banded
 from scipy.ndimage import gaussian_filter1d, maximum_filter1d
-from scipy.signal import correlate, correlation_lags
+from scipy.signal import correlate, correlation_lags, find_peaks
 from scipy.spatial.transform import Rotation, Slerp
 
 from gnio_jax.data.sequence import cumulative_rotation
@@ -34,6 +38,21 @@ FILTER_SECONDS = 0.03
 
 BLOCK_SECONDS = 2.0
 """Errors within this time share an offset."""
+
+SHORTEST_OVERLAP = 10.0
+"""s of usable poses below which nothing is fitted."""
+
+FITS = 4
+"""Peaks of the correlation from which a fit starts."""
+
+FIRST_ITERATIONS = 8
+"""Of these fits; the best one is then repeated to its end, with all its knots."""
+
+SAME_LAG = 0.15
+"""s by which two fits may differ in lag and be one: less than half a step of a runner."""
+
+TRUSTED_SHARE = 0.9
+"""Share of the samples by whose residuals a fit is judged; the worst are the tracker's flips."""
 
 
 class Track(NamedTuple):
@@ -47,6 +66,10 @@ class Track(NamedTuple):
     """n rotations, marker body → tracker's world."""
     good: Bool[np.ndarray, " n"]
     """False where the tracker had no pose, or one that cannot be."""
+
+
+class TooLittle(ValueError):
+    """Too little of the track overlaps the IMU's recording."""
 
 
 class Alignment(NamedTuple):
@@ -70,8 +93,21 @@ class Alignment(NamedTuple):
     """Robust standard deviation of the filtered angular rate's residual, rad/s."""
     accel_residual: float
     """Robust standard deviation of the filtered acceleration's residual, m/s²."""
+    gyro_unexplained: float
+    """Power of the filtered angular rate's residual over that of the tracker's angular rate; 0 is a
+    perfect fit, 1 explains nothing."""
+    accel_unexplained: float
+    """The same of the acceleration, gravity apart."""
+    runner_up: float
+    """What this fit leaves unexplained over what the best fit with another lag does; 0 where there is
+    no other, 1 where both are as good."""
     mismatch: Bool[np.ndarray, " n"]
     """Samples of the track whose acceleration contradicts the IMU grossly: the tracker jumped."""
+
+    @property
+    def unexplained(self) -> float:
+        """Geometric mean of both shares: the noise of both being unknown, the least is likeliest."""
+        return float(np.sqrt(self.gyro_unexplained * self.accel_unexplained))
 
     def track_time(self, imu_time: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
         """Tracker's time of the events that the IMU stamped `imu_time`."""
@@ -101,37 +137,87 @@ def align(
     """Estimate extrinsic rotation, lever arm, gravity, biases and lag (module's docstring).
 
     `time` s is the IMU's uniform clock, `gyro` rad/s, `accel` m/s² specific force. `knot_seconds` is the spacing of
-    the lag's knots, `search_seconds` bounds its first guess. Raises `ValueError` when too little of the track is usable.
+    the lag's knots, `search_seconds` bounds its first guesses. Raises `TooLittle` when too little of
+    the track is usable. Whether the best fit is a good one is the caller's to judge, by
+    `gyro_unexplained`, `accel_unexplained` and `runner_up`.
     """
+    seen = _seen(track)
+    felt = _smooth(gyro, FILTER_SECONDS / float(np.median(np.diff(time))))
+    turn, seen_turn = np.linalg.norm(felt, axis=1), np.linalg.norm(seen.rate, axis=1)
+    trusted_turn = np.where(seen.bad, 0.0, seen_turn)
+    peaks = _correlation_peaks(track.time, trusted_turn, time, turn, search_seconds)
+    peaks = sorted(peaks, key=lambda lag: _turn_residual(time, felt, track.time, seen, lag))
+    coarse, knots = _knots(track.time, 30.0), _knots(track.time, knot_seconds)
+    fits = []
+    for guess in peaks[:FITS]:
+        lag = _refine_by_segment(track.time, seen_turn, seen.bad, time, turn, coarse, guess)
+        with suppress(TooLittle):
+            fits.append(_fit(time, gyro, accel, track, seen, coarse, lag, FIRST_ITERATIONS))
+    if not fits:
+        raise TooLittle(f"less than {SHORTEST_OVERLAP:g} s of the track overlap the IMU's samples")
+    best = min(fits, key=lambda fit: fit.unexplained)
+    others = [fit.unexplained for fit in fits if abs(float(np.mean(fit.lag - best.lag))) > SAME_LAG]
+    runner_up = best.unexplained / min(others) if others else 0.0
+    lag = np.interp(knots, coarse, best.lag)
+    fit = _fit(time, gyro, accel, track, seen, knots, lag, iterations)
+    return fit._replace(runner_up=runner_up)
+
+
+class _Seen(NamedTuple):
+    """What the tracker saw, filtered: the left sides, which do not depend on the unknowns."""
+
+    sigma: float
+    """Of the filter, samples."""
+    attitude: Float[np.ndarray, "n 3 3"]
+    rate: Float[np.ndarray, "n 3"]
+    """In the marker body, rad/s."""
+    acceleration: Float[np.ndarray, "n 3"]
+    """In the tracker's world, m/s²."""
+    turning: Float[np.ndarray, "n 3 3"]
+    """d²/dt² [R l] = turning @ l."""
+    bad: Bool[np.ndarray, " n"]
+    """Within the filter's reach of a sample that is not good."""
+
+
+def _seen(track: Track) -> _Seen:
     step = float(np.median(np.diff(track.time)))
     sigma = FILTER_SECONDS / step
-
-    # Left sides: what the tracker saw. They do not depend on the unknowns and are filtered once.
     attitude = track.attitude.as_matrix()
     rate = (track.attitude[:-1].inv() * track.attitude[1:]).as_rotvec() / step
     rate = np.concatenate([rate[:1], 0.5 * (rate[:-1] + rate[1:]), rate[-1:]])
-    rate = _smooth(rate, sigma)
-    acceleration = _smooth(_second_difference(track.position, step), sigma)
-    turning = _smooth(_second_difference(attitude, step), sigma)  # d²/dt² [R l] = turning @ l
-    # A bad sample spoils everything within the filter's reach.
-    bad = _within(~track.good, 3 * sigma)
+    return _Seen(
+        sigma=sigma,
+        attitude=attitude,
+        rate=_smooth(rate, sigma),
+        acceleration=_smooth(_second_difference(track.position, step), sigma),
+        turning=_smooth(_second_difference(attitude, step), sigma),
+        bad=_within(~track.good, 3 * sigma),
+    )
 
-    # Right sides are the IMU's, filtered after they have been turned into the same frame; interpolated at each guess of the lag.
+
+def _fit(
+    time: Float[np.ndarray, " m"],
+    gyro: Float[np.ndarray, "m 3"],
+    accel: Float[np.ndarray, "m 3"],
+    track: Track,
+    seen: _Seen,
+    knots: Float[np.ndarray, " k"],
+    lag: Float[np.ndarray, " k"],
+    iterations: int,
+) -> Alignment:
+    """The robust fit that starts from `lag` at `knots`. Raises `TooLittle`."""
+    step = float(np.median(np.diff(track.time)))
+    sigma, attitude, rate, acceleration, turning, bad = seen
+    hats = _hat_functions(track.time, knots)
+    # Right sides are the IMU's, interpolated at each guess of the lag, and filtered after they have
+    # been turned into the same frame.
     imu_step = float(np.median(np.diff(time)))
     slope = np.gradient(np.concatenate([gyro, accel], axis=1), imu_step, axis=0)
-    turn = np.linalg.norm(_smooth(gyro, FILTER_SECONDS / imu_step), axis=1)
-
-    lag_guess = _correlate_turns(track.time, np.where(bad, 0.0, np.linalg.norm(rate, axis=1)), time, turn, search_seconds)
-    coarse = _knots(track.time, 30.0)
-    knots = _knots(track.time, knot_seconds)
-    lag = _refine_by_segment(track.time, np.linalg.norm(rate, axis=1), bad, time, turn, coarse, lag_guess)
-    lag = np.interp(knots, coarse, lag)
-    hats = _hat_functions(track.time, knots)
 
     inside = _covered(track.time + hats @ lag, time, margin=4 * FILTER_SECONDS)
     usable = ~bad & inside
-    if usable.sum() * step < 10.0:
-        raise ValueError(f"only {usable.sum() * step:.1f} s of the tracker's poses overlap the IMU's")
+    if usable.sum() * step < SHORTEST_OVERLAP:
+        raise TooLittle(f"only {usable.sum() * step:.1f} s of the track overlap the IMU's samples")
     gyro_there = _smooth(_at(time, gyro, track.time + hats @ lag), sigma)
     extrinsic = Rotation.align_vectors(rate[usable], gyro_there[usable])[0]
     gyro_bias, accel_bias, lever, tilt, delay = np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(2), 0.0
@@ -214,6 +300,9 @@ def align(
         accel_delay=delay,
         gyro_residual=_robust_std(gyro_error[usable]),
         accel_residual=_robust_std(accel_error[usable]),
+        gyro_unexplained=_unexplained(gyro_error[usable], rate[usable]),
+        accel_unexplained=_unexplained(accel_error[usable], acceleration[usable]),
+        runner_up=0.0,
         mismatch=usable & (np.linalg.norm(accel_error, axis=1) > limit),
     )
 
@@ -229,6 +318,9 @@ class Heading(NamedTuple):
     """To be added to the IMU's heading, at the knots, rad."""
     correlation: float
     """Median over stretches of the correlation of the horizontal accelerations."""
+    runner_up: float
+    """What the best constant lag leaves unexplained over what the second best does; 1 where both are
+    as good."""
 
 
 def align_heading(
@@ -276,7 +368,11 @@ def align_heading(
     for offset in offsets:
         cross, power = products(track_time + offset)
         scores.append(float(np.mean(np.abs(cross / power) ** 2)))
-    lag = np.full(len(knots), offsets[int(np.argmax(scores))])
+    best = int(np.argmax(scores))
+    lag = np.full(len(knots), offsets[best])
+    peaks, _ = find_peaks(np.pad(scores, 1, constant_values=-np.inf))
+    others = [scores[i] for i in peaks - 1 if abs(offsets[i] - offsets[best]) > SAME_LAG]
+    runner_up = (1.0 - scores[best]) / (1.0 - max(others)) if others else 0.0
     cross, _ = products(track_time + hats @ lag)
     centres = np.array([track_time[stretches == j].mean() for j in range(stretches.max() + 1)])
     # The mean of neighbouring stretches starts the fit on the right turn.
@@ -302,7 +398,7 @@ def align_heading(
         yaw = yaw + np.clip(change[:count], -0.3, 0.3)
         lag = lag + np.clip(change[count:], -0.03, 0.03)
     cross, power = products(track_time + hats @ lag)
-    return Heading(knots, lag, yaw, float(np.median(np.abs(cross / power))))
+    return Heading(knots, lag, yaw, float(np.median(np.abs(cross / power))), runner_up)
 
 
 def follow_acceleration(
@@ -499,8 +595,18 @@ def _cauchy(error: np.ndarray, scale: float) -> np.ndarray:
     return 1.0 / scale**2 / (1.0 + (error**2).sum(axis=1) / (3.0 * scale) ** 2)
 
 
-def _correlate_turns(track_time: np.ndarray, track_turn: np.ndarray, time: np.ndarray, turn: np.ndarray, search: float) -> float:
-    """Lag (s) at the peak of the cross-correlation of two magnitudes of angular rate, within ± `search`."""
+def _unexplained(error: np.ndarray, signal: np.ndarray) -> float:
+    """Power of the errors over that of the signal, (n, 3) both, on the `TRUSTED_SHARE` of the rows
+    with the smallest errors."""
+    square = (error**2).sum(axis=1)
+    trusted = square <= np.quantile(square, TRUSTED_SHARE)
+    return float(max(square[trusted].sum(), 1e-12) / max((signal[trusted] ** 2).sum(), 1e-12))
+
+
+def _correlation_peaks(
+    track_time: np.ndarray, track_turn: np.ndarray, time: np.ndarray, turn: np.ndarray, search: float
+) -> list[float]:
+    """Lags (s) within ± `search` at which two magnitudes of angular rate correlate best nearby."""
     step = float(np.median(np.diff(track_time)))
     start = min(track_time[0], time[0])
     grid = np.arange(start, max(track_time[-1], time[-1]) + step, step)
@@ -510,8 +616,24 @@ def _correlate_turns(track_time: np.ndarray, track_turn: np.ndarray, time: np.nd
     first, second = first - first.mean(), second - second.mean()
     score = correlate(second, first, method="fft")
     lags = correlation_lags(len(second), len(first)) * step
-    score = np.where(np.abs(lags) <= search, score, -np.inf)
-    return float(lags[np.argmax(score)])
+    score, lags = score[np.abs(lags) <= search], lags[np.abs(lags) <= search]
+    # A peak may lie at the end of the search.
+    padded = np.pad(score, 1, constant_values=-np.inf)
+    peaks, _ = find_peaks(padded, distance=max(round(SAME_LAG / step), 1))
+    return [float(lags[index]) for index in peaks - 1]
+
+
+def _turn_residual(
+    time: np.ndarray, felt: np.ndarray, track_time: np.ndarray, seen: _Seen, lag: float
+) -> float:
+    """What the best rotation of the IMU's filtered angular rates onto the tracker's leaves unexplained
+    at a constant lag."""
+    rows = np.arange(0, len(track_time), max(int(seen.sigma), 1))
+    rows = rows[~seen.bad[rows] & _covered(track_time[rows] + lag, time, margin=4 * FILTER_SECONDS)]
+    if len(rows) < 10:
+        return np.inf
+    there, rate = _at(time, felt, track_time[rows] + lag), seen.rate[rows]
+    return _unexplained(rate - Rotation.align_vectors(rate, there)[0].apply(there), rate)
 
 
 def _refine_by_segment(

@@ -17,6 +17,7 @@ from __future__ import annotations
 import json
 import os
 import warnings
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -27,9 +28,9 @@ from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
-from gnio_jax.data.cache import Refusal, cached
-from gnio_jax.data.phones import held_out, longest_piece, poses_at, with_velocity
-from gnio_jax.data.recordings import read_all, single
+from gnio_jax.data.cache import Refusal, cached_pieces
+from gnio_jax.data.phones import held_out, poses_at, with_velocity
+from gnio_jax.data.recordings import divide, read_all
 from gnio_jax.data.sequence import (
     Dataset,
     Recording,
@@ -45,7 +46,7 @@ from gnio_jax.data.text import numbers, shortened
 from gnio_jax.types import STANDARD_G, InputError, Sequence
 
 RATE = 100.0
-VERSION = "idol 1"
+VERSION = "idol 2"
 """Changes whenever other sequences would come of the same files: it is part of the cache's key."""
 
 PHONE_TO_RIG = Rotation.from_rotvec([-0.01853, 0.02801, 3.12916])
@@ -81,7 +82,7 @@ def recordings(root: Path, split: str) -> list[Recording]:
         if not chosen:
             raise InputError(root, f"split '{split}' would be empty: {len(held)} recordings are held out for validation",
                              "complete the data, or choose another split")
-    return [single(walk.name, _cached, walk, note) for walk in chosen]
+    return [Recording(walk.name, partial(_cached, walk, note)) for walk in chosen]
 
 
 class Walk(NamedTuple):
@@ -98,10 +99,10 @@ class Walk(NamedTuple):
         return _name(self.path)
 
 
-def _cached(walk: Walk, note: dict[str, Any]) -> Sequence:
-    sequence = cached([walk.path], VERSION, lambda: read_sequence(walk.path))
+def _cached(walk: Walk, note: dict[str, Any]) -> list[Sequence]:
+    sequences = cached_pieces([walk.path], VERSION, lambda: read_pieces(walk.path))
     about = {"subject": walk.subject, "group": walk.subject, "calibration": walk.calibration, **note}
-    return sequence._replace(attributes=sequence.attributes | about)
+    return [sequence._replace(attributes=sequence.attributes | about) for sequence in sequences]
 
 
 def find_walks(root: Path, folder: str) -> list[Walk]:
@@ -127,11 +128,12 @@ def find_walks(root: Path, folder: str) -> list[Walk]:
     return walks
 
 
-def read_sequence(path: str | os.PathLike[str]) -> Sequence:
+def read_pieces(path: str | os.PathLike[str]) -> list[Sequence]:
     """One walk at 100 Hz: levelled, the reference turned to the phone and shifted onto its clock.
 
-    Of a recording with a gap longer than a window the longest piece is kept, with a warning. Raises `InputError` naming file and
-    column, and `Refusal` when its reference cannot be that of the phone.
+    Level and lag are those of the whole walk; where a gap is longer than a window it is divided
+    (`divide`). Raises `InputError` naming file and column, and `Refusal` when its reference cannot be
+    that of the phone.
     """
     path = Path(path)
     table = _table(path)
@@ -151,9 +153,6 @@ def read_sequence(path: str | os.PathLike[str]) -> Sequence:
     if not 0.5 < pull < 2.0:
         raise InputError(path, f"columns 'iphoneAcc' have a median length of {pull:.3g}, expected about 1 (G)", "copy it again")
 
-    piece = longest_piece(time, path)
-    time = time[piece]
-    columns = {name: values[piece] for name, values in columns.items()}
     gyro, accel = columns["iphoneGyro"], -STANDARD_G * columns["iphoneAcc"]
     # A quaternion of zeros is no attitude, as little as NaN is.
     known = columns["orient"].any(axis=1) & np.isfinite(columns["orient"]).all(axis=1) & np.isfinite(columns["processedPos"]).all(axis=1)
@@ -178,7 +177,7 @@ def read_sequence(path: str | os.PathLike[str]) -> Sequence:
         position=position[inside],
         velocity=np.zeros_like(position[inside]),
         valid=valid[inside],
-        device_orientation=None if device is None else device[piece][inside],
+        device_orientation=None if device is None else device[inside],
         attributes={
             "dataset": "idol",
             "group": _name(path),
@@ -195,7 +194,8 @@ def read_sequence(path: str | os.PathLike[str]) -> Sequence:
             "tilt_degrees": tilt,
         },
     )
-    return validate(with_velocity(resample(validate(sequence, path), RATE, MAX_GAP)), path)
+    pieces = divide(validate(sequence, path), path)
+    return [validate(with_velocity(resample(piece, RATE, MAX_GAP)), path) for piece in pieces]
 
 
 class Lag(NamedTuple):

@@ -22,11 +22,9 @@ always falls into the same split whatever else a copy holds, and pieces of one d
 from __future__ import annotations
 
 import hashlib
-import itertools
 import os
 import re
 import warnings
-from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -50,6 +48,7 @@ from gnio_jax.data.sequence import (
     check_rate,
     quaternions,
     resample,
+    stretches,
     validate,
 )
 from gnio_jax.data.text import shortened
@@ -174,7 +173,7 @@ def read_packets(oxts: str | os.PathLike[str]) -> list[Sequence]:
     attitude = Rotation.from_euler("ZYX", np.stack([yaw, pitch, roll], axis=1))
     name = _drive_of(oxts)
     sequences, short = [], 0
-    for piece, inside in enumerate(_unbroken(time)):
+    for piece, inside in enumerate(stretches(time, LONGEST_BRIDGE)):
         if time[inside][-1] - time[inside][0] < SHORTEST_PIECE:
             short += 1
             continue
@@ -240,11 +239,6 @@ def _stamps(path: Path) -> np.ndarray:
                 raise InputError(path, f"line {row + 1} ('{shortened(line.strip())}') is no stamp",
                                  "stamps look like 2011-09-26 14:02:22.484109563") from None
     return stamps
-
-
-def _unbroken(time: np.ndarray) -> Iterator[slice]:
-    edges = [0, *(np.flatnonzero(np.diff(time) > LONGEST_BRIDGE) + 1), len(time)]
-    yield from itertools.starmap(slice, itertools.pairwise(edges))
 
 
 # --- npz -------------------------------------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""What the loaders of phone recordings share: finding them, cutting at gaps, poses from another clock, holding people out."""
+"""What the loaders of phone recordings share: finding them, poses from another clock, holding people out."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ from scipy.ndimage import binary_dilation
 from scipy.spatial.transform import Rotation, RotationSpline, Slerp
 
 from gnio_jax.data.alignment import smooth_positions
-from gnio_jax.data.sequence import WINDOW_SECONDS
 from gnio_jax.types import Sequence
 
 JUMP_SPEED = 6.0
@@ -74,18 +73,6 @@ def held_out(people: Mapping[str, str], share: float = 0.1, most: float = 0.25) 
         if held:
             return {name for name, person in owner.items() if person in held}
     return set()
-
-
-def longest_piece(time: Float[np.ndarray, "n"], source: object, longest: float = WINDOW_SECONDS) -> slice:
-    """The longest stretch of `time` (s, increasing) without a gap above `longest`; warns of what is cut off."""
-    gaps = np.diff(time)
-    edges = np.concatenate([[0], np.flatnonzero(gaps > longest) + 1, [len(time)]])
-    seconds = time[edges[1:] - 1] - time[edges[:-1]]
-    best = int(np.argmax(seconds))
-    if len(seconds) > 1:
-        warnings.warn(f"{source}: field 'time' has gaps longer than {longest:g} s ({len(seconds) - 1}, up to {gaps.max():.1f} s); the "
-                      f"longest piece is kept, {seconds[best]:.1f} of {time[-1] - time[0]:.1f} s", stacklevel=2)
-    return slice(int(edges[best]), int(edges[best + 1]))
 
 
 def poses_at(

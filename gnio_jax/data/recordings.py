@@ -12,9 +12,19 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
+import numpy as np
+
 from gnio_jax.cores import usable_cores
 from gnio_jax.data.cache import Refusal
-from gnio_jax.data.sequence import Dataset, Recording, SelfCheck, judge, keep_plausible
+from gnio_jax.data.sequence import (
+    WINDOW_SECONDS,
+    Dataset,
+    Recording,
+    SelfCheck,
+    judge,
+    keep_plausible,
+    stretches,
+)
 from gnio_jax.types import InputError, Sequence
 
 Result = TypeVar("Result")
@@ -30,6 +40,58 @@ def single(name: str, read: Callable[..., Sequence], *arguments: Any, **options:
 
 def _alone(read: Callable[[], Sequence]) -> list[Sequence]:
     return [read()]
+
+
+def divide(sequence: Sequence, source: object) -> list[Sequence]:
+    """The pieces of a recording (on its native stamps) between gaps longer than a window.
+
+    Each piece is a sequence of its own, since a filter integrates whatever lies between its first
+    and its last sample. They share `group`, so that splits and intervals take them as one. A piece
+    that holds no window with a valid reference is lost; a warning names what was kept and what was
+    lost. Where one piece is left it keeps the recording's name, of several each has a number. Raises
+    `Refusal` when none is left.
+    """
+    time, parts = sequence.time, stretches(sequence.time)
+    if len(parts) == 1:
+        return [sequence]
+    first = np.array([time[part.start] for part in parts])
+    last = np.array([time[part.stop - 1] for part in parts])
+    gaps, seconds = first[1:] - last[:-1], last - first
+    whole = [_longest_valid(time[part], sequence.valid[part]) for part in parts]
+    kept = [k for k, longest in enumerate(whole) if longest >= WINDOW_SECONDS]
+    problem = (f"field 'time' has gaps longer than {WINDOW_SECONDS:g} s ({len(gaps)}, "
+               f"up to {gaps.max():.1f} s)")
+    if not kept:
+        raise Refusal(source, f"{problem}, and no piece between them holds a window with a reference",
+                      "leave it out")
+    names = {k: f"{sequence.name}_piece{number}" for number, k in enumerate(kept, 1)}
+    if len(kept) == 1:
+        names[kept[0]] = sequence.name
+    held = ", ".join(f"{name} ({first[k]:.1f} to {last[k]:.1f} s)" for k, name in names.items())
+    short = seconds.sum() - seconds[kept].sum()
+    lost = f"{gaps.sum():.1f} s in gaps"
+    if len(kept) < len(parts):
+        lost += f", {short:.1f} s in pieces without a whole window"
+    warnings.warn(f"{source}: {problem}; kept: {seconds[kept].sum():.1f} of {last[-1] - first[0]:.1f} s, "
+                  f"{held}; lost: {lost}", stacklevel=2)
+    return [_piece(sequence, names[k], parts[k]) for k in kept]
+
+
+def _piece(sequence: Sequence, name: str, part: slice) -> Sequence:
+    fields = {field: value[part] for field, value in sequence._asdict().items()
+              if isinstance(value, np.ndarray)}
+    begin = float(sequence.time[part.start])
+    attributes = dict(sequence.attributes)
+    if "start_time" in attributes:
+        attributes["start_time"] += begin
+    return sequence._replace(**fields | {"name": name, "time": fields["time"] - begin, "attributes": attributes})
+
+
+def _longest_valid(time: np.ndarray, valid: np.ndarray) -> float:
+    """Seconds of the longest run of valid samples."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], valid, [False]])))
+    runs = time[edges[1::2] - 1] - time[edges[::2]]
+    return float(runs.max()) if runs.size else 0.0
 
 
 def read_all(dataset: Dataset, root: Path, split: str) -> list[Sequence]:

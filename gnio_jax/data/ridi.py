@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import os
 import re
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -23,9 +24,9 @@ from jaxtyping import Bool, Float
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
-from gnio_jax.data.cache import cached
-from gnio_jax.data.phones import find_folders, find_list, held_out, longest_piece, poses_at, with_velocity
-from gnio_jax.data.recordings import read_all, single
+from gnio_jax.data.cache import cached_pieces
+from gnio_jax.data.phones import find_folders, find_list, held_out, poses_at, with_velocity
+from gnio_jax.data.recordings import divide, read_all
 from gnio_jax.data.sequence import (
     WINDOW_SECONDS,
     Dataset,
@@ -43,7 +44,7 @@ from gnio_jax.data.text import listed, numbers, read_csv
 from gnio_jax.types import InputError, Sequence
 
 RATE = 200.0
-VERSION = "ridi 1"
+VERSION = "ridi 2"
 """Changes whenever other sequences would come of the same files: it is part of the cache's key."""
 NATIVE_RATE = 202.3
 """Hz, of data.csv."""
@@ -79,7 +80,7 @@ def recordings(root: Path, split: str) -> list[Recording]:
     if split == "all":
         if not folders:
             raise InputError(root, "holds no recording of RIDI", f"expected layout: {DATASET.layout}")
-        return [single(name, _cached, folder, {}) for name, folder in sorted(folders.items())]
+        return [Recording(name, partial(_cached, folder, {})) for name, folder in sorted(folders.items())]
     path = find_list(root, _LISTS[split])
     chosen = listed(path, lambda entry: folders.get(_name(entry)), root, DATASET.layout)
     held: set[str] = set()
@@ -90,14 +91,14 @@ def recordings(root: Path, split: str) -> list[Recording]:
             raise InputError(path, f"split '{split}' would be empty: {len(held)} sequences of this list are held out for validation",
                              "complete the data, or choose another split")
     note = {"held_out": ", ".join(sorted({_subject(name) for name in held}))} if split in ("train", "val") else {}
-    return [single(folder.name, _cached, folder, note) for folder in chosen]
+    return [Recording(folder.name, partial(_cached, folder, note)) for folder in chosen]
 
 
-def _cached(folder: Path, note: dict[str, str]) -> Sequence:
+def _cached(folder: Path, note: dict[str, str]) -> list[Sequence]:
     texts = (folder / name for name in ("gyro.txt", "acce.txt", "orientation.txt", *(name for name, _ in _POSES)))
     sources = [folder / _TABLE] if (folder / _TABLE).is_file() else [path for path in texts if path.is_file()]
-    sequence = cached(sources, VERSION, lambda: read_sequence(folder))
-    return sequence._replace(attributes=sequence.attributes | note)
+    sequences = cached_pieces(sources, VERSION, lambda: read_pieces(folder))
+    return [sequence._replace(attributes=sequence.attributes | note) for sequence in sequences]
 
 
 def held_out_of_train(path: str | os.PathLike[str]) -> set[str]:
@@ -106,34 +107,32 @@ def held_out_of_train(path: str | os.PathLike[str]) -> set[str]:
     return held_out({name: _subject(name) for name in names})
 
 
-def read_sequence(folder: str | os.PathLike[str]) -> Sequence:
+def read_pieces(folder: str | os.PathLike[str]) -> list[Sequence]:
     """One recording of its folder, at 200 Hz, from its table or else from the recorder's text files.
 
-    Rows out of order are sorted and repeated ones dropped. Of a recording whose IMU or odometry has a gap longer than a window the
-    longest piece is kept, with a warning. `device_orientation` is the game rotation vector, turned to begin at the reference's
-    attitude. Raises `InputError` naming file and field.
+    Rows out of order are sorted and repeated ones dropped. Where its IMU or odometry has a gap longer
+    than a window it is divided (`divide`). `device_orientation` is the game rotation vector, turned
+    to begin at the reference's attitude. Raises `InputError` naming file and field.
     """
     folder = Path(folder)
     source = folder / _TABLE
     native = _from_table(source) if source.is_file() else _from_text(folder)
-    piece = longest_piece(native.time, source if source.is_file() else folder)
+    place = source if source.is_file() else folder
     source = source if source.is_file() else f"{folder / 'gyro.txt'}, acce.txt, pose.txt"
-    start = float(native.time[piece.start])
-    valid = native.valid[piece]
-    if not valid.any():
-        raise InputError(source, "no IMU sample of its longest piece has a pose", "leave it out")
+    if not native.valid.any():
+        raise InputError(source, "no IMU sample has a pose", "leave it out")
     device = native.device
     if device is not None:
-        device = quaternions((native.attitude[0] * device[0].inv() * device)[piece])
+        device = quaternions(native.attitude[0] * device[0].inv() * device)
     sequence = Sequence(
         name=folder.name,
-        time=native.time[piece] - start,
-        gyro=native.gyro[piece],
-        accel=native.accel[piece],
-        orientation=quaternions(native.attitude[piece]),
-        position=native.position[piece],
-        velocity=np.zeros_like(native.position[piece]),
-        valid=valid,
+        time=native.time - native.time[0],
+        gyro=native.gyro,
+        accel=native.accel,
+        orientation=quaternions(native.attitude),
+        position=native.position,
+        velocity=np.zeros_like(native.position),
+        valid=native.valid,
         device_orientation=device,
         attributes={
             "dataset": "ridi",
@@ -144,10 +143,11 @@ def read_sequence(folder: str | os.PathLike[str]) -> Sequence:
             "truth": native.truth,
             "imu_compensated": "no",
             "licence": DATASET.licence,
-            "start_time": native.start + start,
+            "start_time": native.start + float(native.time[0]),
         },
     )
-    return validate(with_velocity(resample(validate(sequence, source), RATE, MAX_GAP)), source)
+    pieces = divide(validate(sequence, source), place)
+    return [validate(with_velocity(resample(piece, RATE, MAX_GAP)), source) for piece in pieces]
 
 
 class _Native(NamedTuple):

@@ -5,6 +5,7 @@ Quaternions are wxyz here and everywhere in the package; SciPy's xyzw never leav
 
 from __future__ import annotations
 
+import itertools
 import os
 import warnings
 from collections.abc import Callable
@@ -30,7 +31,8 @@ FASTEST, LARGEST_STEP, FARTHEST = 300.0, 10.0, 1e8
 the world's origin, of which a float still has digits enough."""
 
 WINDOW_SECONDS = 1.0
-"""A hole in the IMU longer than the network's window is no jitter: loaders refuse it."""
+"""A hole in the IMU longer than the network's window is no jitter: loaders divide the recording there
+(`recordings.divide`), or refuse it."""
 
 
 class Recording(NamedTuple):
@@ -245,6 +247,12 @@ def check_gaps(time: Float[np.ndarray, "n"], source: object, longest: float = WI
         row = int(np.argmax(gaps))
         raise InputError(source, f"field 'time' has a gap of {gaps[row]:.3f} s after row {row}, longer than {longest:g} s",
                          "cut the recording there")
+
+
+def stretches(time: Float[np.ndarray, "n"], longest: float = WINDOW_SECONDS) -> list[slice]:
+    """The rows between gaps of the increasing stamps that are longer than `longest` (s)."""
+    edges = [0, *(np.flatnonzero(np.diff(time) > longest) + 1).tolist(), len(time)]
+    return [slice(first, last) for first, last in itertools.pairwise(edges)]
 
 
 # --- one uniform clock -----------------------------------------------------------------------------------------------

@@ -33,11 +33,19 @@ class Truth(NamedTuple):
     lag_rows: float = -7.0
     """In syn files Vicon's row i is the phone's row i + lag."""
     pace: float = 1.0
+    eight: float = 0.0
+    """s; where it is not 0 the walk is a figure of eight of this period: after half of it one turns as
+    fast, to the other side."""
 
 
 def position(time: np.ndarray, truth: Truth) -> np.ndarray:
-    """The phone's, in a level world, m: figures of eight and rounds in a room of 3 × 6 m, with the bounce and sway of a gait."""
+    """The phone's, in a level world, m: rounds (and eights) in a room of 3 × 6 m, with the bounce and
+    sway of a gait."""
     t = np.asarray(time) * truth.pace
+    if truth.eight:
+        x = 1.2 * np.sin(4 * np.pi * t / truth.eight) + 0.02 * np.sin(2 * np.pi * 0.9 * t)
+        y = 2.0 * np.sin(2 * np.pi * t / truth.eight) + 0.02 * np.sin(2 * np.pi * 1.8 * t + 1.0)
+        return np.stack([x, y, 1.2 + 0.025 * np.sin(2 * np.pi * 1.8 * t)], axis=-1)
     x = 1.2 * np.sin(2 * np.pi * t / 17.0) + 0.3 * np.sin(2 * np.pi * t / 6.1) + 0.02 * np.sin(2 * np.pi * 0.9 * t)
     y = 2.0 * np.cos(2 * np.pi * t / 17.0) + 0.4 * np.sin(2 * np.pi * t / 9.3) + 0.02 * np.sin(2 * np.pi * 1.8 * t + 1.0)
     z = 1.2 + 0.025 * np.sin(2 * np.pi * 1.8 * t)
@@ -47,6 +55,11 @@ def position(time: np.ndarray, truth: Truth) -> np.ndarray:
 def attitude(time: np.ndarray, truth: Truth) -> Rotation:
     """Phone → level world."""
     t = np.asarray(time) * truth.pace
+    if truth.eight:
+        yaw = 2.2 * np.sin(2 * np.pi * t / truth.eight) + 0.06 * np.sin(2 * np.pi * 0.9 * t)
+        pitch = 0.5 + 0.05 * np.sin(2 * np.pi * 1.8 * t)
+        roll = 0.05 * np.sin(2 * np.pi * 0.9 * t + 0.4)
+        return Rotation.from_euler("ZXY", np.stack([yaw, pitch, roll], axis=-1))
     yaw = 2 * np.pi * t / 17.0 + 0.5 * np.sin(2 * np.pi * t / 6.1) + 0.06 * np.sin(2 * np.pi * 0.9 * t)
     pitch = 0.5 + 0.05 * np.sin(2 * np.pi * 1.8 * t) + 0.05 * np.sin(2 * np.pi * t / 7.7)
     roll = 0.05 * np.sin(2 * np.pi * 0.9 * t + 0.4) + 0.04 * np.sin(2 * np.pi * t / 5.3)

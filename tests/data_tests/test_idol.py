@@ -66,15 +66,21 @@ def write(root, table, place="building1/known", number=3, subject=7):
     return folder / f"{number}.feather"
 
 
-def compare(sequence):
-    """What is measured to 1e-3, what is estimated to 0.5° and 1 cm + 1 % of the way."""
+def read_whole(path):
+    """A recording that is not divided."""
+    (sequence,) = idol.read_pieces(path)
+    return sequence
+
+
+def compare(sequence, degrees=0.5):
+    """What is measured to 1e-3, what is estimated to `degrees` and 1 cm + 1 % of the way."""
     time = sequence.time + (sequence.attributes["start_time"] - EPOCH)
     inner, valid = slice(20, -20), sequence.valid
     np.testing.assert_allclose(np.diff(sequence.time), 0.01, rtol=1e-4)  # unix seconds hold 0.2 µs
     np.testing.assert_allclose((sequence.gyro - BIAS)[inner], walk.rate(time)[inner], atol=1e-3)
     np.testing.assert_allclose(sequence.accel[inner], walk.force(time)[inner], atol=1e-3)
     error = rotations(sequence.orientation) * walk.attitude(time).inv()
-    assert np.degrees(error.magnitude())[valid].max() < 0.5
+    assert np.degrees(error.magnitude())[valid].max() < degrees
     known = walk.position(time)
     gone = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(known, axis=0), axis=1))])
     off = np.linalg.norm((sequence.position - sequence.position[0]) - (known - known[0]), axis=1)
@@ -91,7 +97,7 @@ def compare(sequence):
 )
 def test_a_walk_comes_back_level_in_the_phones_frame_and_on_its_clock(tmp_path, lag, degrees):
     tilt = Rotation.from_rotvec(np.radians(degrees) * np.array([0.8, -0.6, 0.0]))
-    sequence = idol.read_sequence(write(tmp_path, frame(lag=lag, tilt=tilt)))
+    sequence = read_whole(write(tmp_path, frame(lag=lag, tilt=tilt)))
     compare(sequence)
     a = sequence.attributes
     assert a["lag"] == pytest.approx(lag, abs=3e-3) and a["rate_correlation"] > 0.99
@@ -102,7 +108,7 @@ def test_a_walk_comes_back_level_in_the_phones_frame_and_on_its_clock(tmp_path, 
 
 def test_the_rig_is_not_the_phone(tmp_path):
     """Half a turn apart: the rig's attitude in place of the phone's makes the same numbers implausible."""
-    sequence = idol.read_sequence(write(tmp_path, frame()))
+    sequence = read_whole(write(tmp_path, frame()))
     time = sequence.time + (sequence.attributes["start_time"] - EPOCH)
     rig = walk.attitude(time) * RIG_OF_PHONE.inv()
     assert np.degrees((rotations(sequence.orientation) * rig.inv()).magnitude()).min() > 170
@@ -110,7 +116,7 @@ def test_the_rig_is_not_the_phone(tmp_path):
     assert data.self_check(mistaken).failures
     # A file whose attitude already is the phone's turns the other way about x and y.
     with pytest.raises(Refusal, match=r"3\.feather: columns 'orient' do not turn as 'iphoneGyro' does"):
-        idol.read_sequence(write(tmp_path, frame(mount=Rotation.identity())))
+        read_whole(write(tmp_path, frame(mount=Rotation.identity())))
 
 
 def test_columns_are_found_by_name_among_strays_and_rows_put_in_order(tmp_path):
@@ -119,14 +125,14 @@ def test_columns_are_found_by_name_among_strays_and_rows_put_in_order(tmp_path):
     table = table[list(np.random.default_rng(0).permutation(table.columns))]
     rows = np.arange(len(table))
     rows[[100, 101]] = rows[[101, 100]]
-    compare(idol.read_sequence(write(tmp_path, table.iloc[np.insert(rows, 500, [500, 500])])))
+    compare(read_whole(write(tmp_path, table.iloc[np.insert(rows, 500, [500, 500])])))
 
 
 def test_an_accelerometer_that_reads_high_is_left_as_it_is(tmp_path):
     table = frame()
     for axis in "XYZ":
         table[f"iphoneAcc{axis}"] *= 1.019
-    sequence = idol.read_sequence(write(tmp_path, table))
+    sequence = read_whole(write(tmp_path, table))
     compare(sequence._replace(accel=sequence.accel / 1.019))
 
 
@@ -134,19 +140,56 @@ def test_an_accelerometer_that_reads_high_is_left_as_it_is(tmp_path):
 def test_a_gap_is_marked(tmp_path):
     table = frame(lag=0.06)
     time = table["timestamp"] - EPOCH
-    sequence = idol.read_sequence(write(tmp_path, table[(time < 20.0) | (time > 20.5)]))
+    sequence = read_whole(write(tmp_path, table[(time < 20.0) | (time > 20.5)]))
     hole = np.abs(sequence.time - 20.25) < 0.2
     assert not sequence.valid[hole].any() and sequence.valid[np.abs(sequence.time - 20.25) > 0.45].all()
     assert sequence.attributes["lag"] == pytest.approx(0.06, abs=3e-3)
 
 
-def test_of_a_recording_with_a_long_gap_the_longest_piece_is_kept(tmp_path):
+def test_a_piece_shorter_than_a_window_is_lost_and_the_other_keeps_the_name(tmp_path):
     table = frame(seconds=12.0, lag=0.1).iloc[:13]
     table = pd.concat([table, frame(seconds=walk.SECONDS, lag=0.1, start=16.02)])
-    with pytest.warns(UserWarning, match=r"14\.feather: field 'time' has gaps longer than 1 s \(1, up to 15\.9 s\).* 36\.0 of 52\.0 s"):
-        sequence = idol.read_sequence(write(tmp_path, table, "building3/known", 14))
+    message = (r"14\.feather: field 'time' has gaps longer than 1 s \(1, up to 15\.9 s\); kept: 35\.9 of "
+               r"51\.9 s, building3_known_14 \(16\.0 to 51\.9 s\); lost: 15\.9 s in gaps, 0\.1 s in pieces "
+               r"without a whole window")
+    with pytest.warns(UserWarning, match=message):
+        sequence = read_whole(write(tmp_path, table, "building3/known", 14))
     time = compare(sequence)
     assert sequence.attributes["start_time"] - EPOCH == pytest.approx(16.02, abs=0.02) and len(time) > 3550
+    assert sequence.name == "building3_known_14"
+
+
+@pytest.mark.parametrize("lag", [0.0, 0.15])
+def test_a_hole_of_two_seconds_costs_two_seconds(tmp_path, lag):
+    """Nothing of the hole is left for a filter to integrate, and what was divided is cached divided."""
+    table = frame(seconds=38.0, lag=lag)
+    time = table["timestamp"] - EPOCH
+    write(tmp_path, table[(time < 19.0) | (time > 21.3)])
+    for _ in range(2):
+        with pytest.warns(UserWarning) as caught:
+            pieces = data.load("idol", tmp_path, "known")
+        (warning,) = [str(warning.message) for warning in caught]
+        assert "field 'time' has gaps longer than 1 s (1, up to 2.3 s); kept: 35." in warning
+        assert "building1_known_3_piece1 (0.0 to 19.0 s), building1_known_3_piece2 (" in warning
+        assert warning.endswith("lost: 2.3 s in gaps")
+        assert sum(piece.valid.sum() for piece in pieces) / 100.0 >= 35.0
+        assert [piece.name for piece in pieces] == [f"building1_known_3_piece{k}" for k in (1, 2)]
+        assert {piece.attributes["group"] for piece in pieces} == {"subject7"}
+        for piece in pieces:
+            # The level is the mean of R·accel, of which what was gained in speed in the hole is missing.
+            compare(piece, degrees=0.8)
+            assert piece.attributes["lag"] == pytest.approx(lag, abs=3e-3)
+        assert pieces[1].attributes["start_time"] - EPOCH == pytest.approx(21.3, abs=0.02)
+
+
+def test_pieces_shorter_than_a_window_leave_nothing(tmp_path):
+    table = frame()
+    time = table["timestamp"] - EPOCH
+    path = write(tmp_path, table[time % 2.5 < 0.9])
+    with pytest.raises(Refusal) as caught:
+        idol.read_pieces(path)
+    text = str(caught.value)
+    assert text.startswith(f"{path}: field 'time' has gaps longer than 1 s (14, up to 1.6 s), and no piece")
 
 
 def test_rows_without_a_pose_are_marked(tmp_path):
@@ -154,7 +197,7 @@ def test_rows_without_a_pose_are_marked(tmp_path):
     table.loc[1000:1049, "processedPosY"] = np.nan
     table.loc[2000:2049, ["orientW", "orientX"]] = np.nan
     table.loc[3000:3049, ["orientW", "orientX", "orientY", "orientZ"]] = 0.0
-    sequence = idol.read_sequence(write(tmp_path, table))
+    sequence = read_whole(write(tmp_path, table))
     for middle in (10.25, 20.25, 30.25):
         assert not sequence.valid[np.abs(sequence.time - middle) < 0.2].any()
     assert sequence.valid.mean() > 0.95 and np.isfinite(sequence.position).all()
@@ -174,9 +217,9 @@ def test_smoothed_positions_are_no_reason_to_leave_a_walk_out(tmp_path):
 def test_without_core_motion_there_is_no_device_orientation(tmp_path):
     table = frame()
     path = write(tmp_path, table.drop(columns="iphoneOrientX"))
-    assert idol.read_sequence(path).device_orientation is None
+    assert read_whole(path).device_orientation is None
     table.loc[100, "iphoneOrientX"] = np.nan
-    assert idol.read_sequence(write(tmp_path, table)).device_orientation is None
+    assert read_whole(write(tmp_path, table)).device_orientation is None
 
 
 # --- splits ----------------------------------------------------------------------------------------------------------
@@ -216,7 +259,7 @@ def test_splits(copy, monkeypatch):
     with pytest.raises(InputError, match="known splits: train, val, seen, known"):
         idol.read(copy, "tests")
     # What was aligned once is not aligned again.
-    monkeypatch.setattr(idol, "read_sequence", lambda path: pytest.fail("built again"))
+    monkeypatch.setattr(idol, "read_pieces", lambda path: pytest.fail("built again"))
     again = data.load("idol", copy, "val")
     assert names(again) == names(val) and all(np.array_equal(a.position, b.position) for a, b in zip(again, val, strict=True))
     assert again[0].attributes == val[0].attributes
@@ -294,10 +337,10 @@ def scaling(prefix, factor):
 def test_a_bad_table_is_refused_by_file_and_column(tmp_path, change, problem):
     path = write(tmp_path, change(frame(seconds=15.0)))
     if problem is None:  # the wrong sign is no matter of one column: gravity tells
-        assert any("mean of R·accel" in failure for failure in data.self_check(idol.read_sequence(path)).failures)
+        assert any("mean of R·accel" in failure for failure in data.self_check(read_whole(path)).failures)
         return
     with pytest.raises(InputError) as caught:
-        idol.read_sequence(path)
+        read_whole(path)
     text = str(caught.value)
     assert text.startswith(f"{path}: ") and problem in text and "\n" not in text
 
@@ -308,17 +351,17 @@ def test_damaged_files_are_refused(tmp_path):
     for size in (0, 6, 100, len(whole) // 2, len(whole) - 8):
         path.write_bytes(whole[:size])
         with pytest.raises(InputError, match=r"3\.feather: cannot be read as feather, it may be cut short"):
-            idol.read_sequence(path)
+            read_whole(path)
     path.unlink()
     with pytest.raises(InputError, match=r"3\.feather: no such file"):
-        idol.read_sequence(path)
+        read_whole(path)
 
 
 def test_without_pyarrow_it_says_what_to_install(tmp_path, monkeypatch):
     path = write(tmp_path, frame(seconds=15.0))
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     with pytest.raises(InputError, match=r"3\.feather: feather files need pyarrow.*pip install 'gnio-jax\[idol\]'"):
-        idol.read_sequence(path)
+        read_whole(path)
 
 
 # --- the lag alone ---------------------------------------------------------------------------------------------------

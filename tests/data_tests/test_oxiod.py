@@ -10,6 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from gnio_jax.data import alignment, oxiod
+from gnio_jax.data.cache import Refusal
 from gnio_jax.data.sequence import rotations, self_check
 from gnio_jax.types import InputError
 
@@ -51,7 +52,7 @@ def imu_error(values, known, time, truth):
 
 def check_estimates(sequence, truth, extrinsic_degrees=0.5):
     a = sequence.attributes
-    assert a["accel_delay"] == pytest.approx(truth.accel_delay, abs=3e-3)
+    assert a["accel_delay_removed"] == pytest.approx(truth.accel_delay, abs=3e-3)
     assert [a["lever_x"], a["lever_y"], a["lever_z"]] == pytest.approx(truth.lever, abs=0.01)
     assert [a["gyro_bias_x"], a["gyro_bias_y"], a["gyro_bias_z"]] == pytest.approx(truth.gyro_bias, abs=1e-3)
     assert [a["tilt_x"], a["tilt_y"]] == pytest.approx(truth.up[:2] / truth.up[2], abs=2e-3)
@@ -88,12 +89,102 @@ def test_raw_walk_comes_back(tmp_path, skew):
 
     rms, shift = imu_error(sequence.gyro - truth.gyro_bias, files.rate, time, truth)
     assert rms < 1e-3 and shift < 1e-3
-    rms, shift = imu_error(sequence.accel, files.force, time - truth.accel_delay, truth)
+    rms, shift = imu_error(sequence.accel, files.force, time, truth)
     assert rms < 1e-3 and shift < 1e-3
     # The device's own attitude is right but for its yaw.
     turn = rotations(sequence.device_orientation) * files.attitude(time, truth).inv()
     assert turn.as_rotvec()[50:-50] == pytest.approx(np.broadcast_to([0, 0, 1.1], (len(time) - 100, 3)), abs=5e-3)
     assert self_check(sequence).failures == ()
+
+
+@pytest.mark.parametrize("kind", ["raw", "syn"])
+@pytest.mark.parametrize("delay", [0.02, 0.05, -0.03])
+def test_the_accelerometers_delay_is_taken_out(tmp_path, kind, delay):
+    truth = files.Truth(accel_delay=delay)
+    write = files.write_raw if kind == "raw" else files.write_syn
+    write(dataset(tmp_path, "handheld", "data1"), 1, truth, seconds=40)
+    (walk,) = oxiod.find_walks(tmp_path)
+    sequence = oxiod.build(walk, kind)
+    assert sequence.attributes["accel_delay_removed"] == pytest.approx(delay, abs=1e-3)
+    start = sequence.attributes["start_time"]
+    time = sequence.time + start - (files.EPOCH if kind == "raw" else 0.0)
+    gyro = sequence.gyro - truth.gyro_bias
+    for measured, known in ((gyro, files.rate), (sequence.accel, files.force)):
+        error = np.abs(measured - known(time, truth))  # at the stamps, first and last row too
+        slope = np.abs(known(time + 1e-3, truth) - known(time - 1e-3, truth)) / 2e-3
+        assert (error < 3e-3 + 3e-3 * slope).all()
+    # The rows that the accelerometer had not yet, or no longer, measured are gone.
+    imu = oxiod.read_imu(walk.files[kind][0], kind)
+    first, last = start - imu.epoch, start - imu.epoch + sequence.time[-1]
+    assert first + delay > imu.time[0] - 2e-3 and last + delay < imu.time[-1] + 2e-3
+
+
+@pytest.mark.parametrize("offset", [1.2, 1.9])
+def test_a_walk_that_repeats_its_turns_comes_back(tmp_path, offset):
+    # Rates of turning correlate best five seconds off, where every turn goes to the other side.
+    truth = files.Truth(eight=9.66, offset=offset)
+    files.write_raw(dataset(tmp_path, "handheld", "data2"), 1, truth, seconds=38)
+    (walk,) = oxiod.find_walks(tmp_path)
+    sequence = oxiod.build(walk, "raw")
+    assert sequence.attributes["lag"] == pytest.approx(-offset, abs=3e-3)
+    check_estimates(sequence, truth)
+    time = sequence.time + (sequence.attributes["start_time"] - files.EPOCH)
+    position, attitude, walked = compare(sequence, truth, time)
+    assert position.max() < 0.01 + 0.01 * walked and np.median(position) < 0.01
+    assert attitude.max() < 0.5
+    # The flip and the jump of the tracker are found out.
+    assert 0.97 < sequence.valid.mean() < 1.0
+    assert sequence.attributes["gyro_unexplained"] < 1e-3
+    assert sequence.attributes["accel_unexplained"] < 1e-2
+    assert sequence.attributes["runner_up"] < 0.05
+
+
+def refused(tmp_path, kind="raw"):
+    """The one line with which the walk 'handheld/data1/1' is refused."""
+    (walk,) = oxiod.find_walks(tmp_path)
+    with pytest.raises(Refusal) as caught:
+        oxiod.build(walk, kind)
+    assert str(caught.value).startswith(str(walk.files[kind][1])) and "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+def test_the_truth_of_another_walk_is_refused_by_name(tmp_path):
+    truth = files.Truth()
+    folder = dataset(tmp_path, "handheld", "data1")
+    files.write_raw(folder, 1, truth._replace(pace=1.3))
+    other = (folder / "raw" / "vi1.csv").read_text()
+    files.write_raw(folder, 1, truth)
+    (folder / "raw" / "vi1.csv").write_text(other)
+    message = refused(tmp_path)
+    assert "does not move as the phone does" in message
+    assert "check that both files are of one walk" in message
+
+
+def test_a_walk_that_fits_at_two_lags_is_refused_by_name(tmp_path):
+    truth = files.Truth(eight=40 / 9)  # gait and rounds repeat together
+    files.write_raw(dataset(tmp_path, "handheld", "data1"), 1, truth, seconds=40)
+    assert "fits the phone at two lags alike" in refused(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"lever": np.array([0.1, 0.5, -0.2])}, "the lever arm would be 0.5"),
+        ({"accel_delay": 0.2}, "the accel's delay would be 0.2 s"),
+        ({"up": np.array([np.sin(0.15), 0.0, np.cos(0.15)])}, "the world's tilt would be 8.5"),
+        ({"gyro_bias": np.array([0.1, -0.1, 0.1])}, "the gyro's bias would be 0.17"),
+    ],
+    ids=["lever", "delay", "tilt", "bias"],
+)
+def test_what_no_phone_on_a_marker_body_can_be_is_refused_by_name(tmp_path, change, message):
+    files.write_raw(dataset(tmp_path, "handheld", "data1"), 1, files.Truth(**change), seconds=40)
+    assert message in refused(tmp_path)
+
+
+def test_rows_that_the_authors_cannot_have_matched_are_refused_by_name(tmp_path):
+    truth = files.Truth(lag_rows=-250.0)
+    files.write_syn(dataset(tmp_path, "handheld", "data1"), 1, truth, seconds=40)
+    assert "the lag would be 2.5 s, at most 1 s is plausible" in refused(tmp_path, "syn")
 
 
 def test_syn_walk_comes_back(tmp_path):

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from gnio_jax import data
 from gnio_jax.data import ridi
+from gnio_jax.data.cache import Refusal
 from gnio_jax.data.sequence import rotations, self_check
 from gnio_jax.types import InputError
 
@@ -88,6 +89,12 @@ def write_text(root, name, poses="pose.txt", pose_time=None, gyro_time=None, spo
     return folder
 
 
+def read_whole(path):
+    """A recording that is not divided."""
+    (sequence,) = ridi.read_pieces(path)
+    return sequence
+
+
 def compare(sequence, edge=20):
     """The sequence against the walk at its own stamps; splines err more at the first and last samples, which have one neighbour."""
     time = sequence.time + (sequence.attributes["start_time"] - BOOT * 1e-9)
@@ -117,7 +124,7 @@ SHUFFLED = ["rv_z", "pos_z", "ori_y", "time", "acce_x", "gyro_z", "ori_w", "rv_w
 
 @pytest.mark.parametrize("order", [None, SHUFFLED], ids=["native", "shuffled"])
 def test_table_comes_back(tmp_path, order):
-    sequence = ridi.read_sequence(write_table(tmp_path, "dan_bag1", order=order).parent.parent)
+    sequence = read_whole(write_table(tmp_path, "dan_bag1", order=order).parent.parent)
     compare(sequence)
     check_device(sequence)
     assert sequence.valid.all() and sequence.name == "dan_bag1"
@@ -131,24 +138,58 @@ def test_rows_late_or_twice_are_put_in_order(tmp_path):
     rows[[100, 101]] = rows[[101, 100]]
     rows[2000:2010] = rows[2000:2010][::-1]
     rows = np.insert(rows, 500, [500, 500])
-    compare(ridi.read_sequence(write_table(tmp_path, "dan_bag1", rows=rows).parent.parent))
+    compare(read_whole(write_table(tmp_path, "dan_bag1", rows=rows).parent.parent))
 
 
-def test_of_a_recording_with_a_gap_the_longer_piece_is_kept(tmp_path):
+def test_of_a_recording_with_a_gap_both_pieces_are_kept(tmp_path):
     time = np.arange(int(walk.SECONDS * 202.3)) / 202.3
     path = write_table(tmp_path, "huayi_bag2", time=time[(time < 9.0) | (time > 13.4)])
-    with pytest.warns(UserWarning, match=r"data\.csv: field 'time' has gaps longer than 1 s \(1, up to 4\.4 s\).* 22\.6 of 36\.0 s"):
-        sequence = ridi.read_sequence(path.parent.parent)
-    time = compare(sequence)
-    check_device(sequence, begin=13.4)
-    assert sequence.valid.all() and sequence.time[0] == 0.0 and len(time) == pytest.approx(22.6 * 200, abs=3)
+    with pytest.warns(UserWarning) as caught:
+        pieces = ridi.read_pieces(path.parent.parent)
+    (warning,) = caught
+    assert str(warning.message) == (
+        f"{path}: field 'time' has gaps longer than 1 s (1, up to 4.4 s); kept: 31.6 of 36.0 s, "
+        "huayi_bag2_piece1 (0.0 to 9.0 s), huayi_bag2_piece2 (13.4 to 36.0 s); lost: 4.4 s in gaps")
+    for sequence, begin, seconds in zip(pieces, (0.0, 13.4), (9.0, 22.6), strict=True):
+        time = compare(sequence)
+        check_device(sequence, begin=begin)
+        assert sequence.valid.all() and sequence.time[0] == 0.0
+        assert len(time) == pytest.approx(seconds * 200, abs=3)
+    assert [piece.name for piece in pieces] == ["huayi_bag2_piece1", "huayi_bag2_piece2"]
+    assert {piece.attributes["group"] for piece in pieces} == {"huayi"}
+
+
+def test_a_hole_of_two_seconds_costs_two_seconds(tmp_path):
+    """Nothing of the hole is left for a filter to integrate, and what was divided is cached divided."""
+    time = np.arange(int(38.0 * 202.3)) / 202.3
+    write_table(tmp_path, "dan_bag1", time=time[(time < 19.0) | (time > 21.3)])
+    for _ in range(2):
+        with pytest.warns(UserWarning, match=r"kept: 35\.7 of 38\.0 s, .*; lost: 2\.3 s in gaps"):
+            pieces = data.load("ridi", tmp_path, "all")
+        assert sum(piece.valid.sum() for piece in pieces) / 200.0 >= 35.0
+        for piece in pieces:
+            compare(piece)
+
+
+def test_pieces_shorter_than_a_window_leave_nothing(tmp_path):
+    time = np.arange(int(walk.SECONDS * 202.3)) / 202.3
+    path = write_table(tmp_path, "dan_bag1", time=time[time % 2.5 < 0.9])
+    with pytest.raises(Refusal) as caught:
+        ridi.read_pieces(path.parent.parent)
+    assert str(caught.value) == (
+        f"{path}: field 'time' has gaps longer than 1 s (14, up to 1.6 s), and no piece between them "
+        "holds a window with a reference; leave it out")
+    # Others are read all the same.
+    write_table(tmp_path, "dan_bag2")
+    with pytest.warns(UserWarning, match="dan_bag1: left out: .*no piece between them holds a window"):
+        assert [sequence.name for sequence in data.load("ridi", tmp_path, "all")] == ["dan_bag2"]
 
 
 def test_the_cache_is_used_and_keyed_by_the_files_that_are_read(tmp_path, monkeypatch):
     folder = write_text(tmp_path, "hang_leg1", "android_sensor_pose.txt")
     first = data.load("ridi", tmp_path, "all")[0]
     calls = []
-    monkeypatch.setattr(ridi, "read_sequence", lambda folder: calls.append(folder) or first)
+    monkeypatch.setattr(ridi, "read_pieces", lambda folder: calls.append(folder) or [first])
     np.testing.assert_array_equal(data.load("ridi", tmp_path, "all")[0].gyro, first.gyro)
     assert not calls
     for number, name in enumerate(("acce.txt", "gyro.txt", "orientation.txt", "pose.txt", "android_sensor_pose.txt"), 1):
@@ -167,7 +208,7 @@ def test_a_short_gap_is_marked(tmp_path):
     path = write_table(tmp_path, "dan_leg1", time=time[(time < 20.0) | (time > 20.5)])
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        sequence = ridi.read_sequence(path.parent.parent)
+        sequence = read_whole(path.parent.parent)
     hole = (sequence.time > 20.02) & (sequence.time < 20.48)
     assert not sequence.valid[hole].any() and sequence.valid[(sequence.time < 19.9) | (sequence.time > 20.6)].all()
     assert sequence.attributes["placement"] == "pocket"
@@ -176,7 +217,7 @@ def test_a_short_gap_is_marked(tmp_path):
 
 @pytest.mark.parametrize("poses", ["pose.txt", "android_sensor_pose.txt"])
 def test_text_files_come_back(tmp_path, poses):
-    sequence = ridi.read_sequence(write_text(tmp_path, "hang_leg_new3", poses))
+    sequence = read_whole(write_text(tmp_path, "hang_leg_new3", poses))
     compare(sequence)
     check_device(sequence)
     assert sequence.valid.mean() > 0.999
@@ -187,8 +228,10 @@ def test_a_lost_odometry_ends_a_piece_and_a_short_loss_is_marked(tmp_path):
     pose_time = np.arange(0.0, walk.SECONDS - 0.4, 1 / 30.0)
     pose_time = pose_time[((pose_time < 24.0) | (pose_time > 25.6)) & ((pose_time < 10.0) | (pose_time > 10.4))]
     with pytest.warns(UserWarning, match=r"hang_leg1: field 'time' has gaps longer than 1 s \(1, up to 1\.7 s\)"):
-        sequence = ridi.read_sequence(write_text(tmp_path, "hang_leg1", pose_time=pose_time))
+        sequence, later = ridi.read_pieces(write_text(tmp_path, "hang_leg1", pose_time=pose_time))
     compare(sequence)
+    compare(later)
+    assert later.time[-1] == pytest.approx(walk.SECONDS - 0.4 - 25.6, abs=0.1) and later.valid.mean() > 0.99
     assert sequence.time[-1] == pytest.approx(24.0, abs=0.05)
     assert not sequence.valid[(sequence.time > 10.01) & (sequence.time < 10.39)].any()
     assert sequence.valid[(sequence.time < 9.9) | (sequence.time > 10.5)].all()
@@ -198,7 +241,7 @@ def test_a_jump_of_the_odometry_is_marked(tmp_path):
     def jump(columns):
         columns["pos_x"][3000:] += 0.5
 
-    sequence = ridi.read_sequence(write_table(tmp_path, "dan_body1", spoil=jump).parent.parent)
+    sequence = read_whole(write_table(tmp_path, "dan_body1", spoil=jump).parent.parent)
     when = 3000 / 202.3
     assert not sequence.valid[np.abs(sequence.time - when) < 0.08].any()
     assert sequence.valid[np.abs(sequence.time - when) > 0.2].all()
@@ -332,7 +375,7 @@ def scaling(prefix, factor):
 def test_a_bad_table_is_refused_by_file_and_field(tmp_path, change, field, problem):
     path = write_table(tmp_path, "dan_bag1", time=np.arange(1000) / 202.3, spoil=change)
     with pytest.raises(InputError) as caught:
-        ridi.read_sequence(path.parent.parent)
+        read_whole(path.parent.parent)
     text = str(caught.value)
     assert text.startswith(f"{path}: ") and field in text and problem in text and "\n" not in text
 
@@ -342,15 +385,15 @@ def test_a_table_cut_short_or_with_words_is_refused(tmp_path):
     whole = path.read_text()
     path.write_text(whole[: len(whole) // 2])
     with pytest.raises(InputError, match=r"data\.csv: field '\w+' is NaN or Inf in 1 rows"):
-        ridi.read_sequence(path.parent.parent)
+        read_whole(path.parent.parent)
     lines = whole.splitlines()
     lines[300] = lines[300].replace(lines[300].split(",")[3], "none")
     path.write_text("\n".join(lines))
     with pytest.raises(InputError, match=r"data\.csv: column 'gyro_y' holds 'none' in its row 300"):
-        ridi.read_sequence(path.parent.parent)
+        read_whole(path.parent.parent)
     path.write_text("")
     with pytest.raises(InputError, match=r"data\.csv: holds no row"):
-        ridi.read_sequence(path.parent.parent)
+        read_whole(path.parent.parent)
 
 
 def columns_of(file, change):
@@ -381,13 +424,13 @@ def with_value(time, values, row, column, value):
 def test_bad_text_files_are_refused_by_name(tmp_path, change, file, problem):
     folder = write_text(tmp_path, "dan_bag1", spoil=change)
     with pytest.raises(InputError) as caught:
-        ridi.read_sequence(folder)
+        read_whole(folder)
     text = str(caught.value)
     assert text.startswith(f"{folder / file}: ") and problem in text and "\n" not in text
 
 
 def test_without_the_phones_own_filter_there_is_no_device_orientation(tmp_path):
-    sequence = ridi.read_sequence(write_text(tmp_path, "dan_bag1", spoil=lambda files: files.pop("orientation.txt")))
+    sequence = read_whole(write_text(tmp_path, "dan_bag1", spoil=lambda files: files.pop("orientation.txt")))
     assert sequence.device_orientation is None
     compare(sequence)
 
@@ -400,10 +443,12 @@ def test_real_recording_is_plausible(recordings):
     folder = recordings / "kiod" / "01"
     if not folder.is_dir():
         pytest.skip("no kiod below GNIO_DATA")
-    with pytest.warns(UserWarning, match=r"kiod/01: field 'time' has gaps longer than 1 s \(1, up to 1\.5 s\).*54\.8 of 105\.2 s"):
-        sequence = ridi.read_sequence(folder)
+    with pytest.warns(UserWarning, match=r"kiod/01: field 'time' has gaps longer than 1 s \(1, up to 1\.5 s\).*103\.\d of 105\.2 s"):
+        pieces = ridi.read_pieces(folder)
+    assert [self_check(piece).failures for piece in pieces] == [(), ()]
+    sequence = max(pieces, key=lambda piece: len(piece.time))
     check = self_check(sequence)
-    assert check.failures == () and check.share_valid > 0.99
+    assert check.share_valid > 0.99
     assert check.duration == pytest.approx(54.8, abs=0.1) and check.rate == pytest.approx(200.0)
     np.testing.assert_allclose(check.gravity_mean, [0, 0, 9.81], atol=0.1)
     assert check.gyro_consistency_degrees < 2.0 and 1.2 < check.median_speed < 1.6
