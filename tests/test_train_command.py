@@ -80,6 +80,15 @@ def test_every_config_of_the_repository_is_valid_and_names_its_command():
         assert f"python train.py --config configs/{file.name}" in file.read_text()
 
 
+def test_the_budgets_of_the_tables_are_valid_and_name_their_command():
+    files = sorted((ROOT / "configs" / "tables").glob("*.yaml"))
+    assert [file.stem for file in files] == ["oxiod_lists", "oxiod_sessions", "synthetic", "tlio_layout"]
+    for file in files:
+        config = configuration.validate(configuration.load(file), str(file))
+        assert (config.model.name, config.model.width, config.optim.batch_size) == ("gnio", 16, 128)
+        assert f"python -m gnio_jax.tables comparison --base configs/tables/{file.name}" in file.read_text()
+
+
 def test_the_papers_configs_are_the_papers():
     for name in ("gnio_tlio", "gnio_oxiod"):
         config = configuration.load(ROOT / "configs" / f"{name}.yaml")
