@@ -103,7 +103,7 @@ LARGEST_TILT = 5.0
 LARGEST_GYRO_BIAS = 0.1
 """rad/s: a phone's gyro that nothing has calibrated (0.02)."""
 LARGEST_ACCEL_BIAS = 0.6
-"""m/s²: 60 mG, a bad accelerometer (0.16)."""
+"""m/s²: 60 mG, a bad accelerometer (0.17)."""
 
 
 # --- 1. walks --------------------------------------------------------------------------------------------------------

@@ -6,7 +6,7 @@ import warnings
 import numpy as np
 import pytest
 
-from gnio_jax.data.cache import Refusal, cached, folder
+from gnio_jax.data.cache import Refusal, cached, cached_pieces, folder
 from gnio_jax.types import InputError, Sequence
 
 
@@ -123,3 +123,25 @@ def test_where_the_cache_lies(monkeypatch, tmp_path):
     monkeypatch.delenv("XDG_CACHE_HOME")
     monkeypatch.setenv("HOME", "/home/walker")
     assert str(folder()) == "/home/walker/.cache/gnio-jax"
+
+
+def test_several_sequences_of_one_recording_come_back_in_order(source):
+    build = Builder()
+
+    def pieces():
+        warnings.warn("divided", stacklevel=1)
+        return [build()._replace(name=f"walk_piece{k}") for k in (1, 2, 3)]
+
+    for calls in (3, 3):
+        with pytest.warns(UserWarning, match="divided") as caught:
+            found = cached_pieces([source], "v1", pieces)
+        assert [sequence.name for sequence in found] == ["walk_piece1", "walk_piece2", "walk_piece3"]
+        assert [sequence.position[0, 0] for sequence in found] == [1, 2, 3] and build.calls == calls
+        assert len(caught) == 1 and all(sequence.attributes == {} for sequence in found)
+    # One of them lost or damaged: all are made anew.
+    for spoil in (lambda entry: entry.unlink(), lambda entry: entry.write_bytes(b"HDF")):
+        before = build.calls
+        spoil(sorted(folder().iterdir())[1])
+        with pytest.warns(UserWarning, match="divided"):
+            assert len(cached_pieces([source], "v1", pieces)) == 3
+        assert build.calls == before + 3
