@@ -22,17 +22,23 @@ CONFIG = TrainConfig(
 
 
 @functools.cache
-def source_of(split, stride):
-    sequences = [data.resample(s, CONFIG.data.rate) for s in data.load("synthetic", split=split)]
-    return jax.device_put(windows.index(sequences, CONFIG.data, stride))
+def source_of(split, stride, rate=CONFIG.data.rate):
+    sequences = [data.resample(s, rate) for s in data.load("synthetic", split=split)]
+    return jax.device_put(windows.index(sequences, dataclasses.replace(CONFIG.data, rate=rate), stride))
+
+
+@functools.cache
+def model_and_optimizer(config, steps):
+    """The same objects for every seed: they are static in the compiled step."""
+    return create_model(config), optimizer.create(config.optim, config.loss, steps)
 
 
 def trainer(config, source, seed=0):
-    """State, and a function that takes `count` of its steps, from a fresh network."""
+    """Network, fresh state, a function that takes `count` of its steps, and the number of steps in an epoch."""
+    steps = source.visited.shape[0] // config.optim.batch_size
+    model, tx = model_and_optimizer(config, steps)
     with jax.enable_x64(False):
-        model, key = create_model(config), jax.random.key(seed)
-        steps = source.visited.shape[0] // config.optim.batch_size
-        tx = optimizer.create(config.optim, config.loss, steps)
+        key = jax.random.key(seed)
         state = step.create_state(model, tx, key, config.data.window)
 
     def take(state, epoch, first, count):
@@ -59,8 +65,11 @@ def estimated(model, state, source, config=CONFIG, key=0):
 
 
 def squared_errors(model, state, source, config=CONFIG):
-    """Of augmented training windows, which no estimate drew: with the statistics of their batches, and in inference mode."""
-    batches = np.random.default_rng(5).permutation(np.asarray(source.visited))[: 48 * 64].reshape(-1, 64)
+    """Of augmented training windows, which no estimate drew: with the statistics of their batches, and in inference mode.
+
+    In batches of 512: those of a small batch are themselves noisy, which costs training mode a part of its error.
+    """
+    batches = np.random.default_rng(5).permutation(np.asarray(source.visited))[: 10 * 512].reshape(-1, 512)
 
     @jax.jit
     def one(state, key, which):
@@ -81,7 +90,7 @@ def test_training_windows_err_in_inference_mode_as_in_training_mode(trained):
     training, inference = squared_errors(model, estimated(model, state, source), source)
     assert abs(inference / training - 1) < 0.03
     training, inference = squared_errors(model, state, source)
-    assert abs(inference / training - 1) > 0.03, "running averages would do: the test shows nothing"
+    assert abs(inference / training - 1) > 0.06, "running averages would do: the test shows nothing"
 
 
 def test_statistics_are_means_over_batches(trained):
@@ -141,9 +150,9 @@ def test_the_uncertainty_fits_the_errors_after_training(trained):
 @pytest.mark.parametrize("width, seeds", [(16, range(10)), (64, range(1))])
 def test_no_spike_in_the_gradient_of_the_uncertainty(width, seeds):
     """In the first 200 steps the largest norm of the gradient of the head stays within 100 times the median."""
-    config = dataclasses.replace(CONFIG, model=ModelConfig(width=width), loss=LossConfig(),
-                                 optim=dataclasses.replace(CONFIG.optim, batch_size=8))  # fmt: skip
-    source = source_of("val", 10)
+    config = dataclasses.replace(CONFIG, data=DataConfig(rate=20.0), model=ModelConfig(width=width), loss=LossConfig(),
+                                 optim=dataclasses.replace(CONFIG.optim, batch_size=32, learning_rate=1e-3))  # fmt: skip
+    source = source_of("val", 2, 20.0)
     for seed in seeds:
         _, state, take, _ = trainer(config, source, seed)
         norms = []
@@ -158,7 +167,9 @@ def test_networks_with_a_head_begin_with_a_standard_deviation_near_one(name):
     model = models.create(name, **({"width": 16} if name != "ctin" else {}))
     rng = np.random.default_rng(0)
     imu = np.float32([0, 0, 9.81, 0, 0, 0]) + rng.normal(0, [3, 3, 3, 2, 2, 2], (8, 50, 6)).astype(np.float32)
+    apply = jax.jit(lambda variables: model.apply(
+        variables, jnp.asarray(imu), train=True, mutable=["batch_stats"], rngs={"dropout": jax.random.key(1)}))  # fmt: skip
     for seed in range(3):
         variables = models.initialise(model, jax.random.key(seed), 50)
-        said, _ = model.apply(variables, imu, train=True, mutable=["batch_stats"], rngs={"dropout": jax.random.key(1)})
+        said, _ = apply(variables)
         assert np.abs(said.log_std).max() < 0.1
