@@ -97,7 +97,8 @@ def gate(memory: GateState, config: FilterConfig, now: Array, oldest: Array, nis
          tried: Array) -> tuple[GateState, Float[Array, ""]]:
     """TLIO's gate: the weight of the measurement, 1 if it passes as it is and 0 if not, and the gate's memory after it.
 
-    `now` and `oldest` are the samples of the newest and the oldest clone; where `tried` is False nothing changes.
+    `now` and `oldest` are the samples of the newest and the oldest clone. Where `tried` is False, an earlier last success moves along
+    (ours): absence is not staleness, or the first second after any hole would pass unchecked. TLIO has a measurement at every clone.
     Comparisons are strict, as "more than" and "older" say; at the very end of a pause the gate is active again.
     With `gate_softness` the active gate weighs instead (ours); its memory still takes what is above the threshold for a failure.
     """
@@ -114,9 +115,11 @@ def gate(memory: GateState, config: FilterConfig, now: Array, oldest: Array, nis
     if config.gate_softness > 0:
         slope = jax.nn.sigmoid((config.gate_threshold - nis) / config.gate_softness)
         weight = jnp.where(tried, jnp.where(active, slope, 1.0), 0.0)
+    waited = ~tried & (memory.last_success >= 0)
+    last_success = memory.last_success + jnp.where(waited, config.samples_per_clone, 0).astype(memory.last_success.dtype)
     return GateState(
         converged=converged,
-        last_success=jnp.where(passed, now, memory.last_success),
+        last_success=jnp.where(passed, now, last_success),
         pause_end=jnp.where(tried & stale, now + pause, memory.pause_end)), weight
 
 

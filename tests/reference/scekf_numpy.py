@@ -64,6 +64,7 @@ def run(gyro, accel, displacement, covariance, R, v, p, *, dt, n, clones, sigma_
         pick = np.concatenate([np.eye(len(P)), np.eye(len(P))[[0, 1, 2, 6, 7, 8]]])
         P = pick @ P @ pick.T
 
+        tried = False
         row = dict(accepted=np.nan, gate_passed=np.nan, nis=np.nan, innovation=np.full(3, np.nan), displacement=np.full(3, np.nan),
                    innovation_covariance=np.full((3, 3), np.nan))
         if len(ring) == clones + 1:
@@ -73,6 +74,7 @@ def run(gyro, accel, displacement, covariance, R, v, p, *, dt, n, clones, sigma_
                 Ry = yaw_matrix(Ri)
                 q, y = Rotation.from_matrix(Ri).as_euler("xyz")[1:]
                 gimbal = abs(np.cos(q)) < 1e-5
+                tried = not gimbal
                 Hz = np.zeros((3, 3))
                 Hz[2] = [np.cos(y) * np.tan(q), np.sin(y) * np.tan(q), 1] if not gimbal else [0, 0, 1]
                 H = np.zeros((3, len(P)))
@@ -106,6 +108,8 @@ def run(gyro, accel, displacement, covariance, R, v, p, *, dt, n, clones, sigma_
             ring.pop(0)
             keep = np.r_[0:15, 21 : len(P)]
             P = P[np.ix_(keep, keep)]
+        if not tried and last_success is not None:  # absence is not staleness
+            last_success += n
         row.update(rotation=R, velocity=v, position=p, gyro_bias=bg, accel_bias=ba)
         row.update(covariance=P[:15, :15], covariance_diagonal=np.diag(P)[:15])
         for name, value in row.items():
