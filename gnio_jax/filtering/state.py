@@ -221,7 +221,8 @@ class GateState(NamedTuple):
     converged: Bool[Array, ""]
     """Latched by the first update whose oldest clone is old enough."""
     last_success: Int[Array, ""]
-    """Sample of the last measurement that was not rejected; −1 for none."""
+    """Sample of the last measurement that was not rejected, and by as much later as there was none
+    since; −1 before the first."""
     pause_end: Int[Array, ""]
     """First sample at which the gate may be active again."""
 
