@@ -87,7 +87,8 @@ class Pose(NamedTuple):
     nis: float
     """Of the last clone step: rᵀ S⁻¹ r of its measurement; NaN where there was none."""
     healthy: bool
-    """False where the state is not finite or a variance negative: all since is void."""
+    """False once a clone step left a state that is not finite, a negative variance or a speed
+    above `FilterConfig.speed_limit`: all since is void."""
 
 
 class Clock(NamedTuple):
@@ -182,9 +183,10 @@ def advance(core: Core, rows: Float[Array, "n 7"], predict: Callable[[Any], Pred
     def measure(state: FilterState, oldest: Array | int) -> tuple[Measurement, dict]:
         return measured(jax.lax.cond(complete, infer, nothing, state, jnp.asarray(oldest)), config, rows.dtype), {}
 
-    state, row = clone_step(core.filter, stream, measure, core.intervals % clones, config, noise)
-    state = state._replace(imu=memory._replace(quiet=state.imu.quiet))
-    seen = history(jax.tree.map(lambda x: x[None], row), jnp.max(age)[None], config)
+    slot = core.intervals % clones
+    state, row = clone_step(core.filter, stream, measure, slot, config, noise, config.cut.frame)
+    seen = history(jax.tree.map(lambda x: x[None], row), jnp.max(age)[None], state.healthy, config)
+    state = state._replace(imu=memory._replace(quiet=state.imu.quiet), healthy=seen.healthy[-1] > 0)
     return Core(state, window, core.intervals + 1), jnp.concatenate([getattr(seen, name).reshape(-1) for name in _PARTS])
 
 
@@ -394,7 +396,9 @@ class Tracker:
         # Copies: the first step is given their memory, and it may not be shared, not even between two fields.
         self._core = _copied(Core(state, jnp.zeros((self._config.reach, 7), self._dtype), jnp.int32(0)))
         mean = (state.rotation, state.velocity, state.position, state.gyro_bias, state.accel_bias, core_covariance(state.core_covariance))
-        self._latest = np.concatenate([*(np.asarray(part).reshape(-1) for part in mean), [math.nan, math.nan, 1.0]], dtype=self._dtype)
+        flags = [math.nan, math.nan, float(state.healthy)]
+        parts = [*(np.asarray(part).reshape(-1) for part in mean), flags]
+        self._latest = np.concatenate(parts, dtype=self._dtype)
 
     def _empty(self, rows: int) -> np.ndarray:
         return np.zeros((rows, 7), self._dtype)

@@ -20,6 +20,7 @@ from gnio_jax.filtering.state import (
     MOVE,
     FilterConfig,
     FilterState,
+    Frame,
     NoiseModel,
     admit_noise,
     admit_state,
@@ -28,7 +29,15 @@ from gnio_jax.filtering.state import (
     check_positive,
     core_covariance,
 )
-from gnio_jax.filtering.update import Correction, Measurement, Outcome, correct, rest, zero_velocity
+from gnio_jax.filtering.update import (
+    Correction,
+    Measurement,
+    Outcome,
+    Rest,
+    correct,
+    rest,
+    zero_velocity,
+)
 from gnio_jax.types import Array, Prediction
 
 
@@ -64,11 +73,16 @@ class FilterHistory(NamedTuple):
     log_likelihood: Float[Array, "k"]
     """ln N(r; 0, S) of the innovation, r in m; NaN where no measurement. Their sum is the evidence for the noise model."""
     at_rest: Float[Array, "k"]
-    """1 the velocity was measured as zero (`zero_velocity_std`), else 0."""
+    """1 the velocity was measured as zero (`zero_velocity_std`), else 0, also where the gate
+    refused that."""
+    rest_nis: Float[Array, "k"]
+    """Normalised innovation squared of the velocity at rest; NaN where the IMU was not quiet."""
     imu_gap: Float[Array, "k"]
     """Age of the oldest held IMU sample of the interval, s; 0 where none was missing. Above `bridge_seconds` the filter coasted."""
     healthy: Float[Array, "k"]
-    """0 where the state is not finite or a variance is negative: bad input that could not be seen before, and all after it is void."""
+    """0 from the first row on where the state is not finite, a variance is negative or the speed
+    above `FilterConfig.speed_limit`: bad input that could not be seen before, and all after it is
+    void. The final state remembers it, and a later run from that begins with 0."""
     diagnostics: dict[str, Array]
     """The network's diagnostics stacked over K, NaN where it had no window; empty without a network."""
 
@@ -77,10 +91,12 @@ def run_filter(state: FilterState, gyro: Any, accel: Any, displacement: Any, cov
                noise: NoiseModel, imu_valid: Any = None) -> tuple[FilterState, FilterHistory]:
     """Filter K clone intervals of IMU samples with given displacement measurements.
 
-    gyro rad/s and accel m/s² (K·n, 3), raw, in the body frame: the filter's biases are subtracted inside; displacement (K, 3), m, row k
-    from clone k−W to clone k in the yaw frame of clone k−W; covariance (K, 3, 3), m², before `measurement_scale`. A row with a NaN, or
-    before there are W + 1 clones, is no measurement. imu_valid (K·n,) says which IMU samples are there; the others, and with it those
-    that are not finite, are bridged (see `gaps`). Returns the final state, from which a later call goes on (clone numbers k then count
+    gyro rad/s and accel m/s² (K·n, 3), raw, in the body frame: the filter's biases are subtracted
+    inside; displacement (K, 3), m, row k from clone k−W to clone k in the yaw frame of clone k−W,
+    by another attitude than the filter's; covariance (K, 3, 3), m², before `measurement_scale`. A
+    row with a NaN, or before there are W + 1 clones, is no measurement. imu_valid (K·n,) says which
+    IMU samples are there; the others, and with it those that are not finite, are bridged (see
+    `gaps`). Returns the final state, from which a later call goes on (clone numbers k then count
     on, too), and the history. Works under `jax.jit`, `jax.vmap` and `jax.grad`.
     Raises `ValueError` naming an argument of wrong shape or precision, with values that are not finite, or a covariance that is not
     positive definite; of values that only exist inside `jit`, `FilterHistory.healthy` tells.
@@ -96,7 +112,8 @@ def run_filter(state: FilterState, gyro: Any, accel: Any, displacement: Any, cov
 @functools.partial(jax.jit, static_argnames="config")
 def _run_filter(state, gyro, accel, valid, displacement, covariance, config, noise):
     measurements = jax.vmap(functools.partial(_measurement, config=config))(displacement, covariance)
-    return _scan(lambda k, _state, _oldest, _imu, given: (given, {}), state, gyro, accel, valid, config, noise, measurements)
+    return _scan(lambda k, _state, _oldest, _imu, given: (given, {}), state, gyro, accel, valid,
+                 config, noise, measurements, "given")
 
 
 def run_odometry(predict: Callable[[Any], Prediction], state: FilterState, gyro: Any, accel: Any, config: FilterConfig,
@@ -106,7 +123,8 @@ def run_odometry(predict: Callable[[Any], Prediction], state: FilterState, gyro:
     predict maps windows (1, N, 6) float32, N = n·W, channels [accel m/s², gyro rad/s], to a `Prediction` with the same leading axis.
     A window spans the samples between its two clones i and j; the filter's present biases are subtracted and the samples rotated by
     R_γ(R_i)ᵀ R_j, R_j being the present estimate of clone i advanced by integrating gyro − b_g (paper eq. 1), unless
-    `FilterConfig.window_rotation` says otherwise. The measurement's
+    `FilterConfig.window_rotation` says otherwise. Its displacement is told in the filter's own yaw
+    frame, and taken so (`update.displacement_residual`), but with "tlio". The measurement's
     covariance is diag(exp 2u), u raised to `log_std_min`. The network is not called in the first W intervals, which have no window, and
     a window in which the filter coasted through a gap is no measurement.
     gyro, accel and imu_valid as in `run_filter`. Jit it from outside; differentiable in whatever `predict` closes over, too.
@@ -132,7 +150,7 @@ def run_odometry(predict: Callable[[Any], Prediction], state: FilterState, gyro:
         prediction = jax.lax.cond(k >= config.clones_per_window, infer, nothing, k, state, oldest, imu)
         return measured(prediction, config, dtype), prediction.diagnostics
 
-    return _scan(measure, state, gyro, accel, valid, config, noise, None)
+    return _scan(measure, state, gyro, accel, valid, config, noise, None, config.cut.frame)
 
 
 def expect(predict: Callable[[Any], Prediction], config: FilterConfig) -> Prediction:
@@ -191,14 +209,17 @@ class Row(NamedTuple):
     """Of θ, v, p, b_g, b_a, or its diagonal."""
     measurement: Measurement
     outcome: Outcome
-    at_rest: Bool[Array, ""]
+    rest: Rest
     diagnostics: dict[str, Array]
 
 
 def clone_step(state: FilterState, imu: Imu, measure: Callable[[FilterState, Array | int], tuple[Measurement, dict]], slot: Array | int,
-               config: FilterConfig, noise: NoiseModel) -> tuple[FilterState, Row]:
-    """One clone interval: propagate, clone into `slot` of the ring, measure, update. `measure` is given the state and the oldest slot."""
-    state, row, _ = traced_step(state, imu, measure, slot, config, noise)
+               config: FilterConfig, noise: NoiseModel, frame: Frame) -> tuple[FilterState, Row]:
+    """One clone interval: propagate, clone into `slot` of the ring, measure, update.
+
+    `measure` is given the state and the oldest slot; its displacement is told in `frame`.
+    """
+    state, row, _ = traced_step(state, imu, measure, slot, config, noise, frame)
     return state, row
 
 
@@ -212,7 +233,8 @@ class Trace(NamedTuple):
 
 
 def traced_step(state: FilterState, imu: Imu, measure: Callable[[FilterState, Array | int], tuple[Measurement, dict]], slot: Array | int,
-                config: FilterConfig, noise: NoiseModel) -> tuple[FilterState, Row, Trace]:
+                config: FilterConfig, noise: NoiseModel,
+                frame: Frame) -> tuple[FilterState, Row, Trace]:
     """`clone_step` and its trace."""
     # A ring of clones: the newest takes the place of the one that has served as oldest, and the next slot is the oldest now.
     newest, oldest = slot, (slot + 1) % (config.clones_per_window + 1)
@@ -221,32 +243,35 @@ def traced_step(state: FilterState, imu: Imu, measure: Callable[[FilterState, Ar
     turned = transition(state, motion, newest == 0)
     state = propagate(state, motion, newest == 0, newest)
     measurement, diagnostics = measure(state, oldest)
-    state, outcome, *corrections = correct(state, measurement, newest, oldest, config)
-    at_rest = jnp.bool_(False)
+    state, outcome, *corrections = correct(state, measurement, newest, oldest, config, frame)
+    resting = Rest(jnp.bool_(False), jnp.zeros_like(outcome.nis), jnp.bool_(False))
     if config.zero_velocity_std > 0:
-        state, at_rest = rest(state, imu, config)
-        state, correction = zero_velocity(state, at_rest, newest, config)
+        state, quiet = rest(state, imu, config)
+        state, resting, correction = zero_velocity(state, quiet, newest, config)
         corrections.append(correction)
     kept = core_covariance(state.core_covariance)
     mean = (state.rotation, state.velocity, state.position, state.gyro_bias, state.accel_bias)
-    row = Row(mean, kept if config.history == "core" else jnp.diagonal(kept), measurement, outcome, at_rest, diagnostics)
+    kept = kept if config.history == "core" else jnp.diagonal(kept)
+    row = Row(mean, kept, measurement, outcome, resting, diagnostics)
     return state, row, Trace(turned, tuple(corrections))
 
 
 def _scan(measure: Callable, state: FilterState, gyro: Array, accel: Array, valid: Array | None, config: FilterConfig, noise: NoiseModel,
-          measurements: Any) -> tuple[FilterState, FilterHistory]:
+          measurements: Any, frame: Frame) -> tuple[FilterState, FilterHistory]:
     n, clones = config.samples_per_clone, config.clones_per_window + 1
     intervals = gyro.shape[0] // n
     stream, age, memory = bridge(gyro, accel, valid, state.imu, config)
 
     def step(state: FilterState, inputs: tuple) -> tuple[FilterState, Row]:
         k, imu, given = inputs
-        return clone_step(state, imu, lambda state, oldest: measure(k, state, oldest, stream, given), k % clones, config, noise)
+        now = lambda state, oldest: measure(k, state, oldest, stream, given)  # noqa: E731
+        return clone_step(state, imu, now, k % clones, config, noise, frame)
 
     by_interval = jax.tree.map(lambda x: x.reshape(intervals, n, *x.shape[1:]), stream)
     state, rows = checkpointed_scan(step, state, (jnp.arange(intervals), by_interval, measurements), config.checkpoint_every)
-    state = state._replace(imu=memory._replace(quiet=state.imu.quiet))
-    return settled(state, intervals % clones), history(rows, age.reshape(intervals, n).max(1), config)
+    seen = history(rows, age.reshape(intervals, n).max(1), state.healthy, config)
+    state = state._replace(imu=memory._replace(quiet=state.imu.quiet), healthy=seen.healthy[-1] > 0)
+    return settled(state, intervals % clones), seen
 
 
 def checkpointed_scan(step: Callable, carry: Any, inputs: Any, every: int) -> tuple[Any, Any]:
@@ -264,8 +289,9 @@ def checkpointed_scan(step: Callable, carry: Any, inputs: Any, every: int) -> tu
     return carry, out
 
 
-def history(rows: Row, imu_gap: Float[Array, "k"], config: FilterConfig) -> FilterHistory:
-    """The history of the rows stacked over K steps."""
+def history(rows: Row, imu_gap: Float[Array, "k"], healthy: Bool[Array, ""],
+            config: FilterConfig) -> FilterHistory:
+    """The history of the rows stacked over K steps from a state that was `healthy` or not."""
     outcome, kept = rows.outcome, rows.covariance
 
     def where_present(value: Array) -> Array:
@@ -277,12 +303,16 @@ def history(rows: Row, imu_gap: Float[Array, "k"], config: FilterConfig) -> Filt
     std = jnp.sqrt(jnp.diagonal(rows.measurement.covariance, axis1=1, axis2=2))
     diagonal = jnp.diagonal(kept, axis1=1, axis2=2) if config.history == "core" else kept
     finite = [jnp.all(jnp.isfinite(part.reshape(len(part), -1)), axis=1) for part in (*rows.state, kept)]
-    healthy = jnp.all(jnp.stack(finite), axis=0) & jnp.all(diagonal >= 0, axis=1)
+    plausible = jnp.sum(rows.state[1] ** 2, axis=1) <= config.speed_limit**2
+    sound = jnp.all(jnp.stack(finite), axis=0) & jnp.all(diagonal >= 0, axis=1) & plausible
+    healthy = healthy & (jax.lax.cummin(sound.astype(jnp.int32)) > 0)
     return FilterHistory(
         *rows.state, displacement=where_present(rows.measurement.displacement), measurement_std=where_present(std),
         innovation=where_present(outcome.innovation), covariance_diagonal=diagonal, covariance=kept if config.history == "core" else None,
         accepted=where_present(outcome.accepted), gate_passed=where_present(outcome.gate_passed), nis=where_present(outcome.nis),
-        log_likelihood=where_present(log_likelihood), at_rest=rows.at_rest.astype(kept.dtype), imu_gap=imu_gap.astype(kept.dtype),
+        log_likelihood=where_present(log_likelihood), at_rest=rows.rest.accepted.astype(kept.dtype),
+        rest_nis=jnp.where(rows.rest.quiet, rows.rest.nis, jnp.nan).astype(kept.dtype),
+        imu_gap=imu_gap.astype(kept.dtype),
         healthy=healthy.astype(kept.dtype), diagnostics=rows.diagnostics)
 
 

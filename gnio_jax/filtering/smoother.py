@@ -34,7 +34,7 @@ from jaxtyping import Float, Int
 
 from gnio_jax import geometry
 from gnio_jax.filtering.gaps import Imu, bridge
-from gnio_jax.filtering.scekf import Trace, _admit, _measurement, traced_step
+from gnio_jax.filtering.scekf import FilterHistory, Trace, _admit, _measurement, traced_step
 from gnio_jax.filtering.state import (
     ACCEL_BIAS,
     ANCHOR,
@@ -46,6 +46,7 @@ from gnio_jax.filtering.state import (
     VELOCITY,
     FilterConfig,
     FilterState,
+    Frame,
     NoiseModel,
     check,
     check_positive,
@@ -102,8 +103,7 @@ def smooth(state: FilterState, gyro: Any, accel: Any, displacement: Any, covaria
 
     Arguments and `ValueError`s as of `run_filter`, whose updates are smoothed exactly as they were made: gate, scaled or weighted
     covariances, zero velocity and bridged samples included. `state` is the prior, and what was measured before it is not touched.
-    After `run_odometry`, give its measurements: `history.displacement` and the squares of `history.measurement_std`, on a diagonal, divided
-    by `config.measurement_scale`. Works under `jax.jit`, `jax.vmap` and `jax.grad`.
+    After `run_odometry`, use `smooth_odometry`. Works under `jax.jit`, `jax.vmap` and `jax.grad`.
 
     Memory: about K · (18 m + 500) numbers, m = 18 + 6 (W + 1): 26 kB for each interval at W = 20, in float64. With
     `config.checkpoint_every` = E the filter's states, m² numbers each, are kept at every E-th interval only, and E intervals at a time
@@ -115,11 +115,30 @@ def smooth(state: FilterState, gyro: Any, accel: Any, displacement: Any, covaria
     displacement = check("displacement", displacement, (intervals, 3), config).astype(gyro.dtype)
     covariance = check("covariance", covariance, (intervals, 3, 3), config).astype(gyro.dtype)
     check_positive("covariance", covariance)
-    return _smooth(state, gyro, accel, valid, displacement, covariance, config, noise)
+    return _smooth(state, gyro, accel, valid, displacement, covariance, config, noise, "given")
 
 
-@functools.partial(jax.jit, static_argnames="config")
-def _smooth(state, gyro, accel, valid, displacement, covariance, config, noise):
+def smooth_odometry(state: FilterState, gyro: Any, accel: Any, history: FilterHistory,
+                    config: FilterConfig, noise: NoiseModel,
+                    imu_valid: Any = None) -> SmoothedHistory:
+    """Smooth a run of `run_odometry`, whose arguments these are, with the `history` that it left.
+
+    The network is not called again: the filter's updates are repeated with the displacements of
+    the history, which are told in the filter's own yaw frame. All else as in `smooth`. Raises
+    `ValueError` as `run_odometry` does, or if the history is not as long as the signals.
+    """
+    state, gyro, accel, valid, noise = _admit(state, gyro, accel, imu_valid, config, noise)
+    intervals = gyro.shape[0] // config.samples_per_clone
+    displacement, std = (
+        check(f"history.{name}", getattr(history, name), (intervals, 3), config).astype(gyro.dtype)
+        for name in ("displacement", "measurement_std"))
+    covariance = jax.vmap(jnp.diag)(std**2 / config.measurement_scale)
+    frame = config.cut.frame
+    return _smooth(state, gyro, accel, valid, displacement, covariance, config, noise, frame)
+
+
+@functools.partial(jax.jit, static_argnames=("config", "frame"))
+def _smooth(state, gyro, accel, valid, displacement, covariance, config, noise, frame):
     n, clones = config.samples_per_clone, config.clones_per_window + 1
     intervals = len(displacement)
     measurements = jax.vmap(functools.partial(_measurement, config=config))(displacement, covariance)
@@ -127,7 +146,7 @@ def _smooth(state, gyro, accel, valid, displacement, covariance, config, noise):
     inputs = (jnp.arange(intervals) % clones, jax.tree.map(lambda x: x.reshape(intervals, n, *x.shape[1:]), stream), measurements)
 
     def forward(state: FilterState, given: tuple) -> tuple[FilterState, Kept]:
-        return _forward(state, *given, config=config, noise=noise)
+        return _forward(state, *given, config=config, noise=noise, frame=frame)
 
     def there_and_back(state: FilterState, adjoint: Adjoint, inputs: tuple) -> tuple[Adjoint, tuple]:
         _, kept = jax.lax.scan(forward, state, inputs)
@@ -153,8 +172,9 @@ def _smooth(state, gyro, accel, valid, displacement, covariance, config, noise):
 
 
 def _forward(state: FilterState, slot: Int[Array, ""], imu: Imu, measurement: Measurement, config: FilterConfig,
-             noise: NoiseModel) -> tuple[FilterState, Kept]:
-    state, row, trace = traced_step(state, imu, lambda _state, _oldest: (measurement, {}), slot, config, noise)
+             noise: NoiseModel, frame: Frame) -> tuple[FilterState, Kept]:
+    given = lambda _state, _oldest: (measurement, {})  # noqa: E731
+    state, row, trace = traced_step(state, imu, given, slot, config, noise, frame)
     parts = map(jnp.asarray, (state.core_covariance, state.cross_covariance))
     core, clones = (part[: ANCHOR.start].at[OFFSET].add(part[ANCHOR]) for part in parts)
     return state, Kept(row.state, row.covariance, jnp.concatenate([_local(core), clones], axis=1), trace)

@@ -34,6 +34,11 @@ THETA, VELOCITY, OFFSET, GYRO_BIAS, ACCEL_BIAS, ANCHOR, MOVE = (slice(3 * i, 3 *
 _NEVER = -1
 
 
+Frame = Literal["own", "given"]
+"""Whose yaw frame a displacement is told in: that of the filter's own attitude of the oldest clone,
+with which the network's window was cut, or that of another attitude."""
+
+
 class WindowCut(NamedTuple):
     """How the network's window from clone i to clone j is cut from the stream; the first of its samples gets the attitude of clone i."""
 
@@ -43,13 +48,16 @@ class WindowCut(NamedTuple):
     """Whether the network sees the samples without the filter's biases."""
     turns: slice
     """Those of the window's samples, as rates without bias, each of which turns the attitude of one sample into that of the next."""
+    frame: Frame
+    """Of the network's displacement, as the measurement's Jacobian takes it."""
 
 
 WINDOW_CUTS = {
-    "per_sample": WindowCut(0, True, slice(-1)),
-    "single": WindowCut(0, True, slice(0)),
+    "per_sample": WindowCut(0, True, slice(-1), "own"),
+    "single": WindowCut(0, True, slice(0), "own"),
     # TLIO's sample stamped t drove the filter from t − dt to t, and turned the attitude that it is rotated with itself.
-    "tlio": WindowCut(1, False, slice(1, None)),
+    # Its Jacobian takes the frame for a given one, though it is the filter's own.
+    "tlio": WindowCut(1, False, slice(1, None), "given"),
 }
 """By `FilterConfig.window_rotation`."""
 
@@ -74,7 +82,8 @@ class FilterConfig:
     log_std_min: float = -4.0
     """The network's log standard deviation is raised to at least this (`run_odometry` only)."""
     gate_threshold: float = 11.345
-    """Largest rᵀ S⁻¹ r that passes: 99 % of χ² with three degrees of freedom."""
+    """Largest rᵀ S⁻¹ r that passes, of a displacement and of a velocity at rest: 99 % of χ² with
+    three degrees of freedom."""
     convergence_seconds: float = 10.0
     """The gate stays open until the oldest clone is more than this after initialisation, s."""
     success_seconds: float = 0.5
@@ -85,7 +94,9 @@ class FilterConfig:
     """0 accepts or rejects; above 0 the gate has a slope, for training: a measurement's information is weighted by the logistic
     function of (gate_threshold − rᵀ S⁻¹ r) / gate_softness."""
     zero_velocity_std: float = 0.0
-    """Standard deviation of the velocity at rest, m/s, used as a measurement while the IMU is quiet; 0 for no such update."""
+    """Standard deviation of the velocity at rest, m/s, used as a measurement while the IMU is
+    quiet; 0 for no such update. Where the gate of the displacements is active, a rest that does not
+    fit is refused, whatever `mahalanobis_fail_scale` and `gate_softness`."""
     rest_gyro: float = 0.05
     """Quiet: no |gyro − b_g| above this, rad/s …"""
     rest_accel: float = 0.3
@@ -104,7 +115,11 @@ class FilterConfig:
     """Rotate each sample of the network's window with its own attitude, or all with that of the start (paper eq. 1 read literally), or
     cut and rotate it as TLIO's tracker does: one sample earlier, the network's input with the biases that the IMU comes with."""
     jacobians: Literal["latest", "first"] = "latest"
-    """Where the filter is linearised: at the latest estimates, as TLIO's, or at the first of each velocity and position."""
+    """Where the filter is linearised: at the latest estimates, as TLIO's, or at the first of each
+    velocity and position; these are taken anew after an update above `gate_threshold`."""
+    speed_limit: float = 100.0
+    """No carrier is faster, m/s: an estimate that is has diverged, and is not `healthy` from then
+    on (ours)."""
     allow_float32: bool = False
     """Run in float32 where the state is, to about four digits of every standard deviation over an hour. Without it float32 is an error,
     not a surprise; smoothing and derivatives want float64 anyway."""
@@ -134,7 +149,7 @@ class FilterConfig:
         require(self.history in ("diagonal", "core"), "history", "must be 'diagonal' or 'core'")
         require(self.window_rotation in tuple(WINDOW_CUTS), "window_rotation", "must be 'per_sample', 'single' or 'tlio'")
         require(self.jacobians in ("latest", "first"), "jacobians", "must be 'latest' or 'first'")
-        for name in ("dt", "measurement_scale", "gate_threshold"):
+        for name in ("dt", "measurement_scale", "gate_threshold", "speed_limit"):
             require(getattr(self, name) > 0, name, "must be positive")
         for name in ("mahalanobis_fail_scale", "convergence_seconds", "success_seconds", "pause_seconds", "gate_softness",
                      "zero_velocity_std", "rest_gyro", "rest_accel", "rest_seconds", "bridge_seconds", "gap_gyro_std", "gap_accel_std"):
@@ -206,7 +221,8 @@ class GateState(NamedTuple):
     converged: Bool[Array, ""]
     """Latched by the first update whose oldest clone is old enough."""
     last_success: Int[Array, ""]
-    """Sample of the last measurement that was not rejected; −1 for none."""
+    """Sample of the last measurement that was not rejected, and by as much later as there was none
+    since; −1 before the first."""
     pause_end: Int[Array, ""]
     """First sample at which the gate may be active again."""
 
@@ -229,6 +245,11 @@ class FirstEstimates(NamedTuple):
 
     Jacobians at these values leave the yaw of the whole trajectory as unobservable to the filter as it is (Huang, Mourikis and
     Roumeliotis 2010); at the latest values an update learns something of it that the measurement does not tell.
+
+    That is for small corrections: Φ[v, θ] holds −hat(v − v_first), the last correction. Below the
+    χ² threshold it is bounded by the filter's own standard deviations, as δᵀ P⁻¹ δ ≤ rᵀ S⁻¹ r;
+    above it, it feeds itself: a larger Φ[v, θ], a larger variance, a larger gain, a larger
+    correction. So an update above the threshold sets all of them to the latest estimates (ours).
     """
 
     velocity: Float[Array, "3"]
@@ -268,6 +289,8 @@ class FilterState(NamedTuple):
     """Clone intervals since initialisation."""
     gate: GateState
     imu: ImuMemory
+    healthy: Bool[Array, ""]
+    """Never False again where it once was: see `FilterHistory.healthy`."""
     first: FirstEstimates | None
     """Where `FilterConfig.jacobians` is "first"."""
 
@@ -388,6 +411,7 @@ def initial_state(config: FilterConfig, rotation: Any, velocity: Any, position: 
         clone_covariance=jnp.zeros((CLONE * clones, CLONE * clones), dtype), step=jnp.int32(0),
         gate=GateState(converged=jnp.bool_(False), last_success=jnp.int32(_NEVER), pause_end=jnp.int32(0)),
         imu=ImuMemory(jnp.full(3, jnp.nan, dtype), jnp.full(3, jnp.nan, dtype), jnp.int32(0), jnp.int32(0)),
+        healthy=jnp.bool_(True),
         first=None if config.jacobians == "latest" else FirstEstimates(
             velocity.astype(dtype), jnp.zeros(3, dtype), jnp.zeros(3, dtype), jnp.zeros((clones, 3), dtype)))
 

@@ -22,6 +22,8 @@ from gnio_jax.filtering.state import (
     VELOCITY,
     FilterConfig,
     FilterState,
+    FirstEstimates,
+    Frame,
     GateState,
 )
 from gnio_jax.geometry import matmul
@@ -30,7 +32,8 @@ from gnio_jax.types import GRAVITY, Array
 LEAST_WEIGHT = 1e-6
 """Of a measurement behind a gate with a slope: its covariance grows no further."""
 GIMBAL = 1e-5
-"""Below this |cos pitch| the yaw of the oldest clone has no derivative and the measurement is not used."""
+"""Below this |cos pitch| the yaw of the oldest clone has no derivative, and a displacement that is
+told in a given frame is not used."""
 
 
 class Measurement(NamedTuple):
@@ -73,22 +76,35 @@ class Outcome(NamedTuple):
 
 
 def displacement_residual(rotation_i: Float[Array, "3 3"], moved: Float[Array, "3"], displacement: Float[Array, "3"],
-                          turning: Float[Array, "3"]) -> tuple[Float[Array, "3"], Float[Array, "3 9"], Bool[Array, ""]]:
+                          turning: Float[Array, "3"], frame: Frame = "given",
+                          ) -> tuple[Float[Array, "3"], Float[Array, "3 9"], Bool[Array, ""]]:
     """r = d − R_γ(R_i)ᵀ (p_j − p_i), its prediction's Jacobian H over (θ_i, p_i, p_j), and whether H exists (no gimbal lock).
 
     `moved` is p_j − p_i; `turning` the same where H[θ_i] is to be taken.
 
-    H[θ_i] = R_γᵀ hat(p_j − p_i) Hz, where only the last row of Hz, (cos y tan q, sin y tan q, 1), is not zero: the change of the yaw y
-    of exp(δθ) R_i, q being its pitch (R = Rz(y) Ry(q) Rx).  At gimbal lock tan q is taken as 0.
+    H[θ_i] = R_γᵀ hat(p_j − p_i) Hz, where only the last row of Hz is not zero. With d in a given
+    frame it is TLIO's, (cos y tan q, sin y tan q, 1): the change of the yaw y of exp(δθ) R_i, q
+    being its pitch (R = Rz(y) Ry(q) Rx). At gimbal lock tan q is taken as 0.
+
+    In the filter's own frame it is (0, 0, 1) (ours). The window is cut with the yaw of the estimate
+    R̂_i = exp(−δθ) R_i, and the network answers in that frame. If it is equivariant to yaw and a
+    small tilt changes nothing, d = R_γ(R̂_i)ᵀ exp(−δθ_z e_z) (p_j − p_i): however the error turns
+    the frame, it turns d and the prediction alike, and r feels δθ_z alone. The yaw is not
+    differentiated, so there is no gimbal lock.
     """
     unyaw = geometry.yaw_rotation(rotation_i).T
     predicted, levered = unyaw @ moved, unyaw @ turning
-    cosine_squared = rotation_i[0, 0] ** 2 + rotation_i[1, 0] ** 2
-    defined = cosine_squared >= GIMBAL**2
-    scale = jnp.where(defined, -rotation_i[2, 0] / jnp.where(defined, cosine_squared, 1.0), 0.0)  # tan q / cos q
-    yaw_row = jnp.stack([scale * rotation_i[0, 0], scale * rotation_i[1, 0], jnp.ones_like(scale)])
+    nothing, one = jnp.zeros_like(moved[0]), jnp.ones_like(moved[0])
+    if frame == "own":
+        defined, yaw_row = jnp.bool_(True), jnp.stack([nothing, nothing, one])
+    else:
+        cosine_squared = rotation_i[0, 0] ** 2 + rotation_i[1, 0] ** 2
+        defined = cosine_squared >= GIMBAL**2
+        divisor = jnp.where(defined, cosine_squared, 1.0)
+        scale = jnp.where(defined, -rotation_i[2, 0] / divisor, 0.0)  # tan q / cos q
+        yaw_row = jnp.stack([scale * rotation_i[0, 0], scale * rotation_i[1, 0], one])
     # hat(d) Hz is a single outer product, (d × z) ⊗ yaw_row, and the yaw leaves z alone.
-    turned = jnp.stack([levered[1], -levered[0], jnp.zeros_like(scale)])
+    turned = jnp.stack([levered[1], -levered[0], nothing])
     jacobian = jnp.concatenate([turned[:, None] * yaw_row[None, :], -unyaw, unyaw], axis=1)
     return displacement - predicted, jacobian, defined
 
@@ -97,38 +113,53 @@ def gate(memory: GateState, config: FilterConfig, now: Array, oldest: Array, nis
          tried: Array) -> tuple[GateState, Float[Array, ""]]:
     """TLIO's gate: the weight of the measurement, 1 if it passes as it is and 0 if not, and the gate's memory after it.
 
-    `now` and `oldest` are the samples of the newest and the oldest clone; where `tried` is False nothing changes.
+    `now` and `oldest` are the samples of the newest and the oldest clone. Where `tried` is False,
+    an earlier last success moves along (ours): absence is not staleness, or the first second after
+    any hole would pass unchecked. TLIO has a measurement at every clone.
     Comparisons are strict, as "more than" and "older" say; at the very end of a pause the gate is active again.
     With `gate_softness` the active gate weighs instead (ours); its memory still takes what is above the threshold for a failure.
     """
-    def whole(seconds: float) -> int:  # t·dt > seconds  ⇔  t > whole(seconds), whatever the last bit of seconds / dt
-        return int(np.floor(seconds / config.dt + 1e-6))
-
-    converged = memory.converged | (tried & (oldest > whole(config.convergence_seconds)))
-    watching = converged & (now >= memory.pause_end)
-    stale = watching & (memory.last_success >= 0) & (now - memory.last_success > whole(config.success_seconds))
-    active, fits = watching & ~stale, nis <= config.gate_threshold
+    old_enough = oldest > _whole(config.convergence_seconds, config)
+    memory = memory._replace(converged=memory.converged | (tried & old_enough))
+    active, stale = _watching(memory, config, now)
+    fits = nis <= config.gate_threshold
     passed = tried & (~active | fits)
     pause = -int(np.floor(-config.pause_seconds / config.dt + 1e-6))
     weight = passed.astype(nis.dtype)
     if config.gate_softness > 0:
         slope = jax.nn.sigmoid((config.gate_threshold - nis) / config.gate_softness)
         weight = jnp.where(tried, jnp.where(active, slope, 1.0), 0.0)
+    waited = ~tried & (memory.last_success >= 0)
+    last_success = memory.last_success + config.samples_per_clone * waited.astype(jnp.int32)
     return GateState(
-        converged=converged,
-        last_success=jnp.where(passed, now, memory.last_success),
+        converged=memory.converged,
+        last_success=jnp.where(passed, now, last_success),
         pause_end=jnp.where(tried & stale, now + pause, memory.pause_end)), weight
 
 
+def _whole(seconds: float, config: FilterConfig) -> int:
+    """In samples: t·dt > seconds  ⇔  t > _whole(seconds), whatever the last bit of seconds / dt."""
+    return int(np.floor(seconds / config.dt + 1e-6))
+
+
+def _watching(memory: GateState, config: FilterConfig,
+              now: Array) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
+    """Whether the gate is active at sample `now`, and whether only an old success hinders it."""
+    watching = memory.converged & (now >= memory.pause_end)
+    old = now - memory.last_success > _whole(config.success_seconds, config)
+    stale = watching & (memory.last_success >= 0) & old
+    return watching & ~stale, stale
+
+
 def update(state: FilterState, measurement: Measurement, newest: Array | int, oldest: Array | int,
-           config: FilterConfig) -> tuple[FilterState, Outcome]:
+           config: FilterConfig, frame: Frame = "given") -> tuple[FilterState, Outcome]:
     """`correct` for those who do not smooth."""
-    state, outcome, _ = correct(state, measurement, newest, oldest, config)
+    state, outcome, _ = correct(state, measurement, newest, oldest, config, frame)
     return state, outcome
 
 
 def correct(state: FilterState, measurement: Measurement, newest: Array | int, oldest: Array | int,
-            config: FilterConfig) -> tuple[FilterState, Outcome, Correction]:
+            config: FilterConfig, frame: Frame) -> tuple[FilterState, Outcome, Correction]:
     """One EKF update with the displacement between the clones in slots `oldest` and `newest` of the ring, once it is full.
 
     H touches twelve rows of the covariance P, so H P is three rows. With S = H P Hᵀ + R = L Lᵀ and Y = L⁻¹ H P the gain is Yᵀ L⁻¹ and
@@ -140,7 +171,8 @@ def correct(state: FilterState, measurement: Measurement, newest: Array | int, o
     moved = state.offset + apart * state.move - state.clone_offset[oldest]
     first = state.first
     turning = moved if first is None else first.offset + apart * first.move - first.clone_offset[oldest]
-    innovation, jacobian, defined = displacement_residual(state.clone_rotation[oldest], moved, measurement.displacement, turning)
+    innovation, jacobian, defined = displacement_residual(
+        state.clone_rotation[oldest], moved, measurement.displacement, turning, frame)
 
     # The newest clone is the core's own pose: its rows of P are the core's.
     old = CLONE * oldest
@@ -173,7 +205,18 @@ def correct(state: FilterState, measurement: Measurement, newest: Array | int, o
     of_new = jnp.zeros_like(over_core).at[:, OFFSET].set(jacobian[:, 6:]).at[:, MOVE].set(apart * jacobian[:, 6:])
     correction = Correction(whitened, over_core, over_clones, of_new, jacobian[:, :CLONE])
     outcome = Outcome(present=present, innovation=innovation, nis=nis, volume=volume, gate_passed=weight, accepted=accepted)
-    return _apply(state, correction, newest)._replace(gate=memory), outcome, correction
+    large = accepted & (nis > config.gate_threshold)
+    state = _relinearized(_apply(state, correction, newest), large)
+    return state._replace(gate=memory), outcome, correction
+
+
+def _relinearized(state: FilterState, wanted: Bool[Array, ""]) -> FilterState:
+    """With the latest estimates in the place of the first, if `wanted`: see `FirstEstimates`."""
+    if state.first is None:
+        return state
+    latest = FirstEstimates(state.velocity, state.offset, state.move, state.clone_offset)
+    first = jax.tree.map(lambda new, old: jnp.where(wanted, new, old), latest, state.first)
+    return state._replace(first=first)
 
 
 def rest(state: FilterState, imu: Imu, config: FilterConfig) -> tuple[FilterState, Bool[Array, ""]]:
@@ -188,17 +231,40 @@ def rest(state: FilterState, imu: Imu, config: FilterConfig) -> tuple[FilterStat
     return state._replace(imu=state.imu._replace(quiet=count)), count >= max(enough, 1)
 
 
-def zero_velocity(state: FilterState, wanted: Bool[Array, ""], newest: Array | int,
-                  config: FilterConfig) -> tuple[FilterState, Correction]:
-    """One EKF update with the velocity measured as zero, if `wanted` (ours; the paper's gate makes displacements small instead)."""
+class Rest(NamedTuple):
+    """What became of the velocity measured as zero; False and zero where it was not."""
+
+    quiet: Bool[Array, ""]
+    """Whether the IMU was quiet for long enough."""
+    nis: Float[Array, ""]
+    """vᵀ S⁻¹ v."""
+    accepted: Bool[Array, ""]
+
+
+def zero_velocity(state: FilterState, quiet: Bool[Array, ""], newest: Array | int,
+                  config: FilterConfig) -> tuple[FilterState, Rest, Correction]:
+    """One EKF update with the velocity measured as zero, if `quiet` (ours).
+
+    The paper's gated head makes displacements small at rest instead. A quiet IMU may also glide at
+    constant velocity, so where the gate of the displacements is active this measurement has to pass
+    the same χ² test. Elsewhere, after the start and after a series of rejections, the filter may be
+    wrong about its velocity, and rest is what can tell it. The gate's memory is that of the
+    displacements alone: a false rest must not open their gate, nor keep it shut.
+    """
     noise = config.zero_velocity_std**2 * np.eye(3, dtype=state.velocity.dtype)
-    root = cholesky(jnp.where(wanted, state.core_covariance[VELOCITY, VELOCITY], 0.0) + noise)
+    root = cholesky(jnp.where(quiet, state.core_covariance[VELOCITY, VELOCITY], 0.0) + noise)
     whitened = -root.solve(state.velocity[:, None])[:, 0]
+    nis = jnp.dot(whitened, whitened)
+    fits = nis <= config.gate_threshold
+    active, _ = _watching(state.gate, config, state.step * config.samples_per_clone)
+    accepted = quiet & (~active | fits)
     picked = np.eye(CORE, dtype=state.velocity.dtype)[VELOCITY]
     rows = (state.core_covariance[VELOCITY], state.cross_covariance[VELOCITY], picked)
-    correction = Correction(whitened, *(jnp.where(wanted, root.solve(part), 0.0) for part in rows),
+    core, clones, jacobian = (jnp.where(accepted, root.solve(part), 0.0) for part in rows)
+    correction = Correction(whitened, core, clones, jacobian,
                             oldest_jacobian=jnp.zeros((3, CLONE), state.velocity.dtype))
-    return _apply(state, correction, newest), correction
+    state = _relinearized(_apply(state, correction, newest), accepted & ~fits)
+    return state, Rest(quiet, jnp.where(quiet, nis, 0.0), accepted), correction
 
 
 class Cholesky(NamedTuple):

@@ -14,8 +14,10 @@ from walks import errors, simulate
 from gnio_jax import filtering, geometry
 from gnio_jax.filtering.gaps import Imu
 from gnio_jax.filtering.propagation import interval
+from gnio_jax.filtering.scekf import network_window
 from gnio_jax.filtering.state import CLONE, MOVE, OFFSET, THETA, VELOCITY, covariance
 from gnio_jax.filtering.update import displacement_residual, retract
+from gnio_jax.types import Prediction
 
 RUNS, INTERVALS, N, CLONES, DT, SIGMA = 64, 600, 10, 10, 0.01, 0.03
 NOISE = filtering.NoiseModel(5e-4, 5e-3, 1e-6, 2e-5)
@@ -166,3 +168,120 @@ def test_measurement_jacobian_is_the_derivative_of_the_retraction():
     expected = np.zeros((3, 4 * CLONE + 3))
     expected[:, :6], expected[:, -6:-3], expected[:, -3:] = jacobian[:, :6], jacobian[:, 6:], jacobian[:, 6:]
     np.testing.assert_allclose(expected, quick(jax.jacfwd(predicted))(jnp.zeros(4 * CLONE + 3)), atol=1e-6)
+
+
+# The network in the loop --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("angles", [
+    (0.0, 0.0, 0.0), (0.3, 0.9, -2.0), (-2.0, -1.4, 3.1), (0.4, np.pi / 2, 1.0),
+    (0.1, -np.pi / 2, 0.0)])
+def test_own_frame_jacobian_is_that_of_an_equivariant_network(angles):
+    """Autodiff through the window as it is cut and a network that turns with it, at any attitude,
+    on the nose too. It levels its window by the mean specific force: small tilts change nothing."""
+    config = filtering.FilterConfig(0.02, 4, 3)
+    rng = np.random.default_rng(4)
+    R, n = Rotation.from_euler("xyz", angles).as_matrix(), config.window
+    gyro, bias = rng.normal(size=(n, 3)), 0.1 * rng.normal(size=3)
+    attitudes = [R]
+    for w in gyro[:-1]:
+        attitudes.append(attitudes[-1] @ Rotation.from_rotvec(w * config.dt).as_matrix())
+    force = rng.normal(size=(n, 3))
+    force = force - force.mean(0) + [0, 0, 9.81]  # on average the device does not accelerate
+    accel = np.einsum("kji,kj->ki", attitudes, force) + bias
+    weights = 0.2 * rng.normal(size=n)
+
+    def network(window):
+        up = jnp.mean(window[:, :3], axis=0)
+        up = up / jnp.linalg.norm(up)
+        axis = jnp.stack([up[1], -up[0], jnp.zeros_like(up[0])])  # up × z
+        turn = geometry.hat(axis)
+        return (jnp.eye(3) + turn + turn @ turn / (1 + up[2])) @ window[:, :3].T @ weights
+
+    def cut(theta):
+        return geometry.exp(-theta) @ jnp.asarray(R)
+
+    def said(theta):
+        signals = jnp.asarray(gyro), jnp.asarray(accel), jnp.zeros(3), jnp.asarray(bias)
+        return network(network_window(cut(theta), *signals, config))
+
+    nothing = jnp.zeros(3)
+    seen = weights @ force  # in the world
+    frame = geometry.yaw_rotation(jnp.asarray(R))
+    np.testing.assert_allclose(frame @ said(nothing), seen, atol=1e-9)
+
+    def innovation(theta):
+        return said(theta) - geometry.yaw_rotation(cut(theta)).T @ seen
+
+    given = jnp.asarray(R), jnp.asarray(seen), nothing, jnp.asarray(seen)
+    _, jacobian, defined = displacement_residual(*given, "own")
+    assert bool(defined)
+    np.testing.assert_allclose(jacobian[:, :3], quick(jax.jacfwd(innovation))(nothing), atol=1e-7)
+    assert np.abs(jacobian[:, 2]).max() > 0.5
+
+
+PITCHES, TIGHT_RUNS, TIGHT_INTERVALS = (0.0, 45.0, 70.0, 84.0, 90.0), 32, 200
+
+
+@functools.cache
+def tight():
+    """(tables, start, gyro, accel) -> history of `run_odometry`, batched over runs, with a network
+    that knows the truth, but for its noise, and tells it in the frame of its window, which it finds
+    out from the window alone."""
+    config = filtering.FilterConfig(DT, N, CLONES, measurement_scale=1.0, gate_threshold=1e9,
+                                    history="core")
+    length = N * CLONES
+
+    @jax.jit
+    @jax.vmap
+    def run(world, norms, displacement, noise, rotation, velocity, position, gyro, accel):
+        def predict(windows):
+            seen = windows[0, :, :3].astype(jnp.float64)
+            size = jnp.linalg.norm(seen, axis=1)  # no rotation changes it: which window is this?
+            k = jnp.argmin(jnp.sum((size[None] - norms) ** 2, axis=1))
+            truth = jax.lax.dynamic_slice(world, (k * N, 0), (length, 3))
+            seen, truth = seen - seen.mean(0)[None], truth - truth.mean(0)[None]
+            # seen = turn · truth, and the part of the turn about z is the frame's
+            turn = jnp.linalg.solve(truth.T @ truth, truth.T @ seen).T
+            angle = jnp.arctan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1])
+            said = geometry.rotation_z(angle) @ displacement[k] + noise[k]
+            return Prediction(said[None], jnp.full((1, 3), np.log(SIGMA)))
+
+        state = filtering.initial_state(config, rotation, velocity, position)
+        return filtering.run_odometry(predict, state, gyro, accel, config, NOISE)[1]
+
+    return run
+
+
+def tight_runs(pitch):
+    runs = simulate(7, TIGHT_RUNS, TIGHT_INTERVALS, N, CLONES, DT, NOISE, filtering.InitialStd(),
+                    SIGMA, np.radians(pitch))
+    # window k ends with interval k + CLONES; its first sample is the first after interval k
+    turns = Rotation.from_rotvec((runs.rate * DT).reshape(-1, 3)).as_matrix()
+    turns = turns.reshape(*runs.rate.shape, 3)
+    attitude, world = runs.attitude0, np.empty_like(runs.accel)
+    for j in range(runs.accel.shape[1]):
+        world[:, j] = np.einsum("rij,rj->ri", attitude, runs.accel[:, j])
+        attitude = attitude @ turns[:, j]
+    np.testing.assert_allclose(attitude, runs.rotation[:, -1], atol=1e-9)
+    size = np.linalg.norm(runs.accel[:, N:], axis=2)
+    windows = range(TIGHT_INTERVALS - CLONES)
+    norms = np.stack([size[:, N * k : N * (k + CLONES)] for k in windows], 1)
+    moved = runs.position[:, CLONES:] - runs.position[:, :-CLONES]
+    noise = SIGMA * np.random.default_rng(8).normal(size=moved.shape)
+    history = tight()(world[:, N:], norms, moved, noise, *runs[:5])
+    assert (np.asarray(history.healthy) == 1).all()
+    assert (np.asarray(history.accepted)[:, CLONES:] == 1).all()
+    return errors(runs, history), np.asarray(history.covariance)
+
+
+@pytest.mark.parametrize("pitch", PITCHES)
+def test_attitude_is_consistent_whatever_the_pitch(pitch):
+    """NEES(θ)/3 in the 99 % bounds of the average over runs at one time, level or on the nose."""
+    error, spread = tight_runs(pitch)
+    found = nees(error[..., :3], spread[..., :3, :3])[20:]
+    low, high = bounds(3 * TIGHT_RUNS, 0.99)
+    tilt = np.degrees(np.sqrt((error[:, 20:, :2] ** 2).sum(-1).mean()))
+    print(f"\npitch {pitch:.0f}°: NEES(θ)/3 {found.mean():.2f}, tilt {tilt:.3f}° rms")
+    assert low < found.mean() < high
+    assert tilt < 0.25

@@ -1,5 +1,6 @@
 """What is not as it should be: drop-outs of the IMU, rest, starts without a reference, values that cannot be."""
 
+import dataclasses
 import sys
 from pathlib import Path
 
@@ -11,7 +12,8 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import multivariate_normal
 
 from gnio_jax import filtering, geometry
-from gnio_jax.filtering.gaps import bridge
+from gnio_jax.filtering.gaps import Gap, Imu, bridge
+from gnio_jax.filtering.update import rest, zero_velocity
 from gnio_jax.types import Prediction
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "reference"))
@@ -178,6 +180,85 @@ def test_rest_is_a_measurement_if_wanted():
     np.testing.assert_allclose(found[0.02].velocity[k], v - gain[3:6] @ v, atol=1e-12)
     np.testing.assert_allclose(found[0.02].covariance[k], P - gain @ P[3:6], atol=1e-12)
     np.testing.assert_allclose(found[0.02].accel_bias[k], np.asarray(h.accel_bias)[k] - gain[12:] @ v, atol=1e-12)
+
+
+@pytest.mark.parametrize("seconds, intervals", [(0.0, 1), (0.1, 1), (0.11, 2), (0.3, 3), (0.35, 4)])
+def test_rest_counts_only_after_its_time(seconds, intervals):
+    """Intervals of 0.1 s: as many as `rest_seconds` needs, and anew after each that is not quiet,
+    in one of three ways."""
+    config = filtering.FilterConfig(DT, N, CLONES, zero_velocity_std=0.02, rest_seconds=seconds)
+    still = Imu(jnp.zeros((N, 3)), jnp.tile(jnp.array([[0.0, 0.0, 9.81]]), (N, 1)), None)
+    turning = still._replace(gyro=still.gyro.at[2, 1].set(1.01 * config.rest_gyro))
+    shaken = still._replace(accel=still.accel.at[3, 2].add(-1.01 * config.rest_accel))
+    held = still._replace(gap=Gap(jnp.zeros(N).at[-1].set(1e-6), jnp.zeros(N), jnp.ones(N)))
+    state, found, expected, count = start(config), [], [], 0
+    for imu in [*5 * [still], turning, *5 * [still], shaken, *5 * [still], held, *5 * [still]]:
+        state, quiet = rest(state, imu, config)
+        count = count + 1 if imu is still else 0
+        found.append(bool(quiet))
+        expected.append(count >= intervals)
+    assert found == expected and sum(found) == 4 * (6 - intervals)
+
+
+def resting(now, converged=True, last_success=100, pause_end=0, speed=1.0, config=CONFIG):
+    """The state before and after the IMU is quiet at sample `now`, with a velocity of `speed` known
+    to 0.1 m/s per axis, and what the filter made of it."""
+    config = dataclasses.replace(config, zero_velocity_std=0.05)
+    (R, _, p), *_ = WALK
+    std = filtering.InitialStd(velocity=0.1)
+    state = filtering.initial_state(config, R, speed * np.array([0.6, 0.0, -0.8]), p, std=std)
+    gate = filtering.GateState(jnp.bool_(converged), jnp.int32(last_success), jnp.int32(pause_end))
+    state = state._replace(gate=gate, step=jnp.int32(now // N))
+    new, found, _ = zero_velocity(state, jnp.bool_(True), 0, config)
+    return state, new, found
+
+
+EDGE = np.sqrt(CONFIG.gate_threshold * (0.1**2 + 0.05**2))
+"""Speed at which the χ² test is just passed, m/s."""
+
+
+@pytest.mark.parametrize("gate, speed, accepted", [
+    (dict(now=110), 1.001 * EDGE, False), (dict(now=110), 0.999 * EDGE, True),
+    (dict(now=125), 3.0, False), (dict(now=130), 3.0, True),  # the last success is 0.5 s old, older
+    (dict(now=110, converged=False), 3.0, True), (dict(now=110, last_success=-1), 3.0, False),
+    (dict(now=110, pause_end=115), 3.0, True), (dict(now=115, pause_end=115), 3.0, False),
+])
+def test_rest_passes_a_chi_square_test_where_the_gate_is_active(gate, speed, accepted):
+    state, new, found = resting(speed=speed, **gate)
+    np.testing.assert_allclose(found.nis, speed**2 / (0.1**2 + 0.05**2), rtol=1e-12)
+    assert bool(found.accepted) == accepted and new.gate == state.gate
+    wanted = np.asarray(state.velocity) * (0.05**2 / (0.1**2 + 0.05**2) if accepted else 1.0)
+    np.testing.assert_allclose(new.velocity, wanted, rtol=1e-12)
+    variance = 1 / (1 / 0.1**2 + accepted / 0.05**2)
+    np.testing.assert_allclose(np.diag(new.core_covariance)[3:6], variance, rtol=1e-12)
+
+
+def test_a_quiet_ride_is_no_rest_and_a_wrong_start_is_corrected_by_rest():
+    """A carriage that glides at 1 m/s, as the filter knows by displacements; and a device at rest
+    that starts with 3 m/s, so sure of it that it would not pass the test."""
+    config = filtering.FilterConfig(DT, N, CLONES, measurement_scale=1.0, zero_velocity_std=0.02,
+                                    rest_seconds=0.3, convergence_seconds=1.0)
+    gliding, samples = 30, N * INTERVALS
+    gyro, accel = np.zeros((samples, 3)), np.tile([0, 0, 9.81], (samples, 1))
+    accel[: N * gliding : 2, 2] += 1.0  # rattles before
+    accel[1 : N * gliding : 2, 2] -= 1.0
+    spread = np.tile(0.02**2 * np.eye(3), (INTERVALS, 1, 1))
+
+    def go(speed, accel, displacement):
+        state = filtering.initial_state(config, np.eye(3), np.array([speed, 0.0, 0.0]), np.zeros(3),
+                                        std=filtering.InitialStd(velocity=0.05))
+        return filtering.run_filter(state, gyro, accel, displacement, spread, config, NOISE)[1]
+
+    history = go(1.0, accel, np.tile([CLONES * N * DT, 0.0, 0.0], (INTERVALS, 1)))
+    quiet = np.arange(INTERVALS) >= gliding + 2
+    np.testing.assert_array_equal(np.isfinite(history.rest_nis), quiet)
+    assert (np.asarray(history.rest_nis)[quiet] > 100).all()
+    assert (np.asarray(history.at_rest) == 0).all()
+    np.testing.assert_allclose(history.velocity[:, 0], 1.0, atol=0.02)
+
+    history = go(3.0, np.tile([0, 0, 9.81], (samples, 1)), np.full((INTERVALS, 3), np.nan))
+    assert history.rest_nis[2] > 1000 and (np.asarray(history.at_rest)[2:] == 1).all()
+    assert np.abs(history.velocity[2:, 0]).max() < 0.5 and abs(history.velocity[-1, 0]) < 0.02
 
 
 @pytest.mark.parametrize("pitch", [0.0, 0.7, -np.pi / 2, np.pi / 2])

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiling import quick
 from scipy.spatial.transform import Rotation
 
 from gnio_jax import filtering
@@ -115,10 +116,11 @@ def at_singularity(kind):
     return state, displacement
 
 
-@jax.jit
+@functools.partial(quick, static_argnums=3)
 @functools.partial(jax.grad, argnums=(0, 1, 2), allow_int=True, has_aux=True)
-def update_gradient(state, displacement, covariance):
-    new, outcome = update(state, _measurement(displacement, covariance, CONFIG), 2, 0, CONFIG)
+def update_gradient(state, displacement, covariance, frame="given"):
+    measurement = _measurement(displacement, covariance, CONFIG)
+    new, outcome = update(state, measurement, 2, 0, CONFIG, frame)
     leaves = [leaf for leaf in jax.tree.leaves((new, outcome)) if jnp.issubdtype(leaf.dtype, jnp.floating)]
     return sum(jnp.sum(leaf * (1 + jnp.arange(leaf.size).reshape(leaf.shape))) for leaf in leaves), (new, outcome)
 
@@ -136,6 +138,18 @@ def test_update_has_finite_derivatives_everywhere(kind):
     if not outcome.accepted:
         for name in state._fields[:12]:
             np.testing.assert_array_equal(getattr(new, name), getattr(state, name))
+
+
+def test_in_its_own_frame_there_is_no_gimbal_lock():
+    """On the nose the displacement is used as it is anywhere else, with finite derivatives."""
+    for kind in ("gimbal", "plain"):
+        state, displacement = at_singularity(kind)
+        state = state._replace(clone_covariance=0.1 * jnp.eye(18))
+        gradients, (new, outcome) = update_gradient(state, displacement, 0.01 * jnp.eye(3), "own")
+        floats = [leaf for leaf in jax.tree.leaves(gradients) if leaf.dtype == jnp.float64]
+        assert len(floats) == 16 and all(np.isfinite(leaf).all() for leaf in floats)
+        assert bool(outcome.accepted) and outcome.gate_passed == 1
+        assert np.abs(gradients[1]).max() > 0 and (new.clone_offset != state.clone_offset).any()
 
 
 def test_an_update_needs_both_clones():
@@ -174,7 +188,7 @@ def test_initial_state():
     ("clones_per_window", 0), ("clones_per_window", True), ("mahalanobis_fail_scale", -1.0), ("history", "all"),
     ("measurement_scale", 0.0),
     ("log_std_min", float("-inf")), ("gate_threshold", 0.0), ("convergence_seconds", -1.0), ("success_seconds", -1.0),
-    ("pause_seconds", -1.0),
+    ("pause_seconds", -1.0), ("speed_limit", 0.0), ("speed_limit", float("inf")),
     ("window_rotation", "none"), ("allow_float32", 1)])
 def test_config_names_the_field_that_makes_no_sense(name, value):
     with pytest.raises(ValueError, match=f"^{name} "):

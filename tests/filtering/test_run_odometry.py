@@ -1,5 +1,6 @@
 """The network in the loop against windows cut by brute force, and derivatives of the whole filter against central differences."""
 
+import dataclasses
 import sys
 from pathlib import Path
 
@@ -17,6 +18,7 @@ import scekf_numpy
 
 N, CLONES, INTERVALS, DT = 4, 4, 26, 0.02
 CONFIG = filtering.FilterConfig(DT, N, CLONES, convergence_seconds=0.6, measurement_scale=2.0)
+NOISE = filtering.NoiseModel()
 PARAMETERS = np.random.default_rng(5).standard_normal((6, 3)) * 0.02
 
 
@@ -67,7 +69,8 @@ def test_windows_are_cut_with_the_state_of_the_filter(window_rotation):
     wanted = scekf_numpy.run(
         gyro, accel, None, None, *[np.asarray(value) for value in state[:3]], dt=DT, n=N, clones=CLONES,
         bg=np.asarray(state.gyro_bias), ba=np.asarray(state.accel_bias), sigma_gyro=noise.gyro_density / np.sqrt(DT),
-        sigma_accel=noise.accel_density / np.sqrt(DT), convergence=0.6, scale=2.0, measure=measure)
+        sigma_accel=noise.accel_density / np.sqrt(DT), convergence=0.6, scale=2.0, measure=measure,
+        frame="own")
     assert np.nansum(wanted["accepted"]) > 5
     for name in ("accepted", "gate_passed"):
         np.testing.assert_array_equal(getattr(history, name), wanted[name])
@@ -81,10 +84,14 @@ def test_windows_are_cut_with_the_state_of_the_filter(window_rotation):
 
 
 def test_given_its_own_measurements_the_filter_repeats_itself():
+    """Where its measurements count as given, as TLIO's do."""
     gyro, accel = recording(1)
-    final, history = jax.jit(lambda s: filtering.run_odometry(predict, s, gyro, accel, CONFIG, filtering.NoiseModel()))(start())
-    covariance = jax.vmap(jnp.diag)(history.measurement_std**2 / CONFIG.measurement_scale)
-    again_final, again = filtering.run_filter(start(), gyro, accel, history.displacement, covariance, CONFIG, filtering.NoiseModel())
+    config = dataclasses.replace(CONFIG, window_rotation="tlio")
+    run = jax.jit(lambda state: filtering.run_odometry(predict, state, gyro, accel, config, NOISE))
+    final, history = run(start())
+    covariance = jax.vmap(jnp.diag)(history.measurement_std**2 / config.measurement_scale)
+    measured = history.displacement, covariance
+    again_final, again = filtering.run_filter(start(), gyro, accel, *measured, config, NOISE)
     assert again.diagnostics == {}
     for wanted, found in [(history._replace(diagnostics={}), again), (final, again_final)]:
         jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-9), wanted, found)

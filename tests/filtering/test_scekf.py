@@ -188,7 +188,9 @@ def test_gate_boundaries_count_samples():
     assert step((True, 18, 30), 29) == ((1, 29, 30), True)  # inside the pause
     assert step((True, 29, 30), 30) == ((1, 29, 30), False)  # exactly at its end
     assert step((True, 29, 30), 30, nis=11.3) == ((1, 30, 30), True)
-    assert step((True, 10, 0), 40, tried=False) == ((1, 10, 0), False)  # no measurement: untouched
+    # no measurement: the last success moves along, if there was one
+    assert step((True, 10, 0), 40, tried=False) == ((1, 11, 0), False)
+    assert step((True, -1, 0), 40, tried=False) == ((1, -1, 0), False)
     assert step((True, -1, 0), 40) == ((1, -1, 0), False)
 
 

@@ -202,8 +202,7 @@ def test_smooths_the_network_in_the_loop():
         return Prediction(displacement=0.1 * mean[:, :3], log_std=-1.0 + 0.1 * mean[:, 3:], diagnostics={})
 
     final, history = filtering.run_odometry(predict, state, gyro, accel, config, NOISE)
-    covariance = np.asarray(history.measurement_std)[:, :, None] ** 2 * np.eye(3) / config.measurement_scale
-    smoothed = filtering.smooth(state, gyro, accel, history.displacement, covariance, config, NOISE)
+    smoothed = filtering.smooth_odometry(state, gyro, accel, history, config, NOISE)
     np.testing.assert_allclose(smoothed.position[-1], final.position, atol=1e-10)
     np.testing.assert_allclose(smoothed.covariance[-1], history.covariance[-1], rtol=1e-6, atol=1e-18)
     assert np.nansum(np.asarray(history.accepted)) > 0

@@ -36,8 +36,11 @@ def yaw_matrix(R):
 
 def run(gyro, accel, displacement, covariance, R, v, p, *, dt, n, clones, sigma_gyro, sigma_accel, walk_gyro=1e-6, walk_accel=1e-4,
         bg=None, ba=None, std=TLIO_STD, scale=10.0, fail_scale=0.0, threshold=11.345, convergence=10.0, success=0.5, pause=1.0,
-        measure=None):
-    """Returns a dict of histories. `measure(k, clone_rotation, bg, ba)`, where given, supplies (displacement, covariance) at step k."""
+        measure=None, frame="given"):
+    """Returns a dict of histories.
+
+    measure(k, clone_rotation, bg, ba), where given, supplies displacement and covariance at step k.
+    frame "own": the displacement turns with the filter's own attitude, whose yaw then cancels."""
     bg, ba = np.zeros(3) if bg is None else bg, np.zeros(3) if ba is None else ba
     P = np.diag(np.repeat([std["tilt"], std["yaw"], std["velocity"], std["position"], std["gyro_bias"], std["accel_bias"]],
                           [2, 1, 3, 3, 3, 3]) ** 2)
@@ -64,6 +67,7 @@ def run(gyro, accel, displacement, covariance, R, v, p, *, dt, n, clones, sigma_
         pick = np.concatenate([np.eye(len(P)), np.eye(len(P))[[0, 1, 2, 6, 7, 8]]])
         P = pick @ P @ pick.T
 
+        tried = False
         row = dict(accepted=np.nan, gate_passed=np.nan, nis=np.nan, innovation=np.full(3, np.nan), displacement=np.full(3, np.nan),
                    innovation_covariance=np.full((3, 3), np.nan))
         if len(ring) == clones + 1:
@@ -72,9 +76,12 @@ def run(gyro, accel, displacement, covariance, R, v, p, *, dt, n, clones, sigma_
                 Ri, pi = ring[0]
                 Ry = yaw_matrix(Ri)
                 q, y = Rotation.from_matrix(Ri).as_euler("xyz")[1:]
-                gimbal = abs(np.cos(q)) < 1e-5
+                gimbal = frame == "given" and abs(np.cos(q)) < 1e-5
+                tried = not gimbal
                 Hz = np.zeros((3, 3))
-                Hz[2] = [np.cos(y) * np.tan(q), np.sin(y) * np.tan(q), 1] if not gimbal else [0, 0, 1]
+                Hz[2, 2] = 1
+                if frame == "given" and not gimbal:
+                    Hz[2, :2] = np.cos(y) * np.tan(q), np.sin(y) * np.tan(q)
                 H = np.zeros((3, len(P)))
                 H[:, 15:18], H[:, 18:21], H[:, -3:] = Ry.T @ skew(p - pi) @ Hz, -Ry.T, Ry.T
                 r = d - Ry.T @ (p - pi)
@@ -106,6 +113,8 @@ def run(gyro, accel, displacement, covariance, R, v, p, *, dt, n, clones, sigma_
             ring.pop(0)
             keep = np.r_[0:15, 21 : len(P)]
             P = P[np.ix_(keep, keep)]
+        if not tried and last_success is not None:  # absence is not staleness
+            last_success += n
         row.update(rotation=R, velocity=v, position=p, gyro_bias=bg, accel_bias=ba)
         row.update(covariance=P[:15, :15], covariance_diagonal=np.diag(P)[:15])
         for name, value in row.items():

@@ -1,0 +1,297 @@
+"""What a stream may bring: holes, knocks, wrong units; and what the filter says of itself."""
+
+import dataclasses
+import functools
+
+import jax.numpy as jnp
+import numpy as np
+from compiling import quick
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+from test_scekf import random_walk
+
+from gnio_jax import filtering
+from gnio_jax.filtering import Tracker
+from gnio_jax.types import Prediction
+
+N, CLONES, DT = 4, 4, 0.02
+CONFIG = filtering.FilterConfig(
+    DT, N, CLONES, convergence_seconds=0.6, success_seconds=0.35, measurement_scale=2.0
+)
+"""A window is 0.32 s, and so a knock spoils no more than 0.35 s; a gap takes longer."""
+NOISE = filtering.NoiseModel(2e-3, 2e-2)
+HIT = slice(180, 184)
+"""Samples of the knock."""
+
+
+def start():
+    return filtering.initial_state(CONFIG, np.eye(3), np.array([1.0, 0.0, 0.0]), np.zeros(3))
+
+
+def predict(windows):
+    """1 m/s, and 40 m where there is a knock."""
+    leap = jnp.where(jnp.max(jnp.abs(windows)) > 50, 40.0, 0.0).astype(jnp.float32)
+    said = jnp.asarray([[N * CLONES * DT, 0.0, 0.0]], jnp.float32) + 0.01 * (
+        jnp.mean(windows, axis=1)[:, :3] - jnp.asarray([[0, 0, 9.81]])
+    )
+    return Prediction((said + leap).astype(jnp.float32), jnp.full((1, 3), -4.0, jnp.float32))
+
+
+@functools.cache
+def recording(knock=60.0):
+    """Straight on at 1 m/s, and a knock of so many m/s²."""
+    rng = np.random.default_rng(0)
+    gyro, accel = (
+        0.01 * rng.standard_normal((280, 3)),
+        [0.0, 0.0, 9.81] + 0.1 * rng.standard_normal((280, 3)),
+    )
+    accel[HIT] += [knock, 0.0, 0.0]
+    return gyro, accel
+
+
+@functools.cache
+def program():
+    return quick(
+        lambda state, gyro, accel, valid: filtering.run_odometry(
+            predict, state, gyro, accel, CONFIG, NOISE, valid
+        )
+    )
+
+
+def run(gyro, accel, valid=None, state=None):
+    final, history = program()(
+        start() if state is None else state,
+        gyro,
+        accel,
+        np.ones(len(gyro), bool) if valid is None else valid,
+    )
+    return final, history, np.linalg.norm(history.velocity, axis=1)
+
+
+def intervals_of(samples):
+    """Clone intervals whose windows reach one of the samples."""
+    return np.unique([samples.start // N + i for i in range(CLONES)])
+
+
+# The gate's memory --------------------------------------------------------------------------------
+
+
+def test_a_gap_does_not_open_the_gate_for_the_knock_after_it():
+    """0.8 s are missing, then comes a knock of 60 m/s²: 4.8 m/s by itself, 40 m to the network."""
+    gyro, accel = recording()
+    valid = ~np.isin(np.arange(len(gyro)), range(130, 170))
+    _, history, speed = run(gyro, accel, valid)
+    gate, nis = np.asarray(history.gate_passed), np.asarray(history.nis)
+    first = np.flatnonzero(np.isnan(gate[CLONES:]))[-1] + CLONES + 1
+    assert first in intervals_of(HIT)  # no measurement comes between gap and knock
+    assert (nis[first] > 1000) and (gate[first : intervals_of(HIT)[-1] + 1] == 0).all()
+    assert speed.max() < 8.0  # 194 where the gap opens the gate
+
+
+def test_a_state_that_is_carried_on_keeps_its_gate():
+    """The second run has no window in its first intervals, and a knock in its first window."""
+    state, history, _ = run(*recording(0.0))
+    assert history.gate_passed[-1] == 1 and bool(state.gate.converged)
+    knock = slice(12, 16)
+    gyro, accel = (np.roll(signal, knock.start - HIT.start, axis=0) for signal in recording())
+    _, history, speed = run(gyro, accel, state=state)
+    hit = [k for k in intervals_of(knock) if k >= CLONES]
+    assert len(hit) == 3 and (np.asarray(history.nis)[hit] > 1000).all()
+    np.testing.assert_array_equal(np.asarray(history.gate_passed)[hit], 0)
+    assert speed.max() < 8.0
+
+
+# Health -------------------------------------------------------------------------------------------
+
+
+def leap():
+    """The recording with a leap to some 400 m/s and back, long before its end."""
+    gyro, accel = recording(0.0)
+    accel = accel.copy()
+    accel[100] += [2e4, 0, 0]
+    accel[108] -= [2e4, 0, 0]
+    return gyro, accel
+
+
+def test_unhealthy_once_is_unhealthy_for_good():
+    gyro, accel = leap()
+    final, history, speed = run(gyro, accel)
+    plausible = speed <= CONFIG.speed_limit
+    bad = int(np.argmin(plausible))
+    assert (
+        bad == 100 // N and plausible[-1] and np.isfinite(speed).all()
+    )  # it comes back, so nothing but memory can tell
+    np.testing.assert_array_equal(history.healthy, np.arange(len(speed)) < bad)
+    assert not final.healthy
+    _, history, speed = run(*recording(0.0), state=final)
+    assert (speed <= CONFIG.speed_limit).all() and (np.asarray(history.healthy) == 0).all()
+    state, history, _ = run(*recording(0.0))
+    assert bool(state.healthy) and (np.asarray(history.healthy) == 1).all()
+
+
+def test_online_too_and_across_a_file(tmp_path, monkeypatch):
+    gyro, accel = leap()
+    _, history, _ = run(gyro, accel)
+    tracker = Tracker(predict, start(), CONFIG, NOISE)
+    compiled, found, half = dict(vars(tracker)), [], 130
+    monkeypatch.setattr(
+        Tracker, "_build", lambda self, *_: vars(self).update(compiled)
+    )  # compiled once, for the one from the file too
+    for k in range(half):
+        found.append(tracker.push(k * DT, gyro[k], accel[k]))
+    assert tracker.pose().healthy is False and not tracker.filter_state().healthy
+    tracker.save(tmp_path / "state.npz")
+    again = Tracker.restore(tmp_path / "state.npz", predict, CONFIG, NOISE)
+    assert again.pose().healthy is False
+    for k in range(half, len(gyro)):
+        found.append(again.push(k * DT, gyro[k], accel[k]))
+    np.testing.assert_array_equal(
+        [pose.healthy for pose in found if pose is not None], np.asarray(history.healthy) > 0
+    )
+    again._start(again.filter_state())  # another one, from what this one left
+    assert again.pose().healthy is False
+
+
+# Any input ----------------------------------------------------------------------------------------
+
+ROWS = 60
+PLAIN = filtering.FilterConfig(
+    DT, 5, 4, measurement_scale=2.0, convergence_seconds=1.0, rest_seconds=0.2
+)
+CONFIGS = [
+    dataclasses.replace(PLAIN, jacobians="first", zero_velocity_std=0.02),
+    dataclasses.replace(PLAIN, jacobians="latest"),
+    dataclasses.replace(PLAIN, jacobians="first", allow_float32=True),
+    dataclasses.replace(PLAIN, jacobians="latest", zero_velocity_std=0.02, allow_float32=True),
+]
+"""Every two of Jacobians, rest and precision together once."""
+WALK = random_walk(21, n=5, clones=4, intervals=ROWS, dt=DT, bias=False)
+FILTER = quick(filtering.run_filter, static_argnums=5)
+
+
+def disturbed(
+    config,
+    gap=(0, 0),
+    knock=(0, 0),
+    size=(0.0, 0.0, 0.0),
+    leap=(0, 0),
+    away=0.0,
+    missing=True,
+    units=(1.0, 1.0, 1.0),
+    still=0,
+):
+    """A run over the walk with a gap, a knock of `size` m/s² and displacements wrong by `away` m,
+    each (first, how many); and its speeds.
+
+    `missing`: the gap's windows are no measurements. `units` are factors on gyro, accel and
+    displacement. The last `still` samples are at rest."""
+    begin, gyro, accel, displacement, covariance = WALK
+    gyro, accel, displacement = gyro.copy(), accel.copy(), displacement.copy()
+    if still:
+        gyro[-still:], accel[-still:] = 0.0, [0.0, 0.0, 9.81]
+    valid = ~np.isin(np.arange(len(gyro)), range(gap[0], sum(gap)))
+    accel[knock[0] : sum(knock)] += size
+    displacement[leap[0] : sum(leap)] += [0.6 * away, -0.7 * away, 0.4 * away]
+    if missing:
+        whole = [valid[5 * (k - 3) : 5 * (k + 1)].all() for k in range(4, ROWS)]
+        displacement[4:][np.logical_not(whole)] = np.nan
+    dtype = np.float32 if config.allow_float32 else np.float64
+    state = filtering.initial_state(config, *(part.astype(dtype) for part in begin))
+    signals = [
+        (signal * unit).astype(dtype)
+        for signal, unit in zip((gyro, accel, displacement), units, strict=True)
+    ]
+    final, history = FILTER(
+        state, *signals, covariance.astype(dtype), config, filtering.NoiseModel(2e-3, 2e-2), valid
+    )
+    return final, history, np.linalg.norm(np.asarray(history.velocity, np.float64), axis=1)
+
+
+def span(end, longest):
+    return st.tuples(st.integers(0, end - 1), st.integers(0, longest))
+
+
+def runs(**more):
+    return given(
+        config=st.sampled_from(CONFIGS),
+        gap=span(5 * ROWS, 80),
+        knock=span(5 * ROWS, 4),
+        size=st.tuples(*3 * [st.floats(-100, 100)]),
+        leap=span(ROWS, 4),
+        away=st.floats(0, 100),
+        missing=st.booleans(),
+        still=st.integers(0, 200),
+        **more,
+    )
+
+
+RUN_AWAY = dict(
+    config=CONFIGS[0],
+    gap=(88, 15),
+    knock=(36, 3),
+    size=(15.6, 15.6, 15.6),
+    leap=(20, 3),
+    away=84.0,
+    missing=True,
+    still=0,
+)
+"""1e94 m/s, then NaN, where first estimates are kept whatever the correction."""
+
+
+@settings(max_examples=60, deadline=None, derandomize=True, database=None)
+@example(**RUN_AWAY)
+@example(**{**RUN_AWAY, "config": CONFIGS[2]})
+@runs()
+def test_errors_do_not_feed_themselves(**disturbances):
+    """What is put in is up to 100 m wrong in a window of 0.4 s; what comes out is of that order."""
+    _, history, speed = disturbed(**disturbances)
+    assert np.isfinite(speed).all() and speed.max() < 5000, speed.max()
+    said(history, speed)
+
+
+@settings(max_examples=60, deadline=None, derandomize=True, database=None)
+@example(**RUN_AWAY, units=(1.0, 1.0, 1e30))
+@runs(units=st.tuples(*3 * [st.sampled_from([1.0, 1.0, 1e-3, 9.81, 1 / 9.81, 57.3, 1e3, 1e30])]))
+def test_what_is_implausible_is_never_called_healthy(**disturbances):
+    final, history, speed = disturbed(**disturbances)
+    said(history, speed)
+    assert bool(final.healthy) == (history.healthy[-1] == 1)
+
+
+def said(history, speed):
+    plausible = np.isfinite(speed) & (speed <= 100.0)
+    healthy = np.asarray(history.healthy) == 1
+    assert not healthy[~plausible].any()
+    np.testing.assert_array_equal(healthy, np.logical_and.accumulate(healthy))
+
+
+def test_first_estimates_are_taken_anew_only_above_the_threshold():
+    """Without such an update they are what was estimated first: before the update."""
+    config = CONFIGS[0]
+    begin, gyro, accel, displacement, covariance = WALK
+    displacement = displacement.copy()
+    displacement[8] += 5.0
+    state, found = filtering.initial_state(config, *begin), []
+    step = quick(
+        lambda state, *given: filtering.run_filter(
+            state, *given, config, filtering.NoiseModel(2e-3, 2e-2)
+        )
+    )
+    for k in range(12):
+        rows = slice(5 * k, 5 * (k + 1))
+        state, history = step(
+            state, gyro[rows], accel[rows], displacement[k : k + 1], covariance[k : k + 1]
+        )
+        found.append(
+            (
+                float(history.nis[0]),
+                float(np.abs(state.first.velocity - state.velocity).max()),
+                float(np.abs(state.first.clone_offset - state.clone_offset).max()),
+            )
+        )
+    nis, of_velocity, of_clones = np.array(found).T
+    updated = np.arange(12) >= 4  # the ring of five clones is full in the fifth interval
+    large = nis > config.gate_threshold
+    assert large[8] and large[updated].sum() < 6
+    assert (of_velocity[large] == 0).all() and (of_clones[large] == 0).all()
+    assert (of_velocity[updated & ~large] > 0).all() and (of_clones[updated & ~large] > 0).all()
