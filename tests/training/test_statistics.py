@@ -151,7 +151,7 @@ def test_the_uncertainty_fits_the_errors_after_training(trained):
 def test_no_spike_in_the_gradient_of_the_uncertainty(width, seeds):
     """In the first 200 steps the largest norm of the gradient of the head stays within 100 times the median."""
     config = dataclasses.replace(CONFIG, data=DataConfig(rate=20.0), model=ModelConfig(width=width), loss=LossConfig(),
-                                 optim=dataclasses.replace(CONFIG.optim, batch_size=32, learning_rate=1e-3))  # fmt: skip
+                                 optim=dataclasses.replace(CONFIG.optim, batch_size=16, learning_rate=1e-3))  # fmt: skip
     source = source_of("val", 2, 20.0)
     for seed in seeds:
         _, state, take, _ = trainer(config, source, seed)
