@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import math
 import types
 import typing
 from dataclasses import dataclass, field
@@ -321,7 +322,7 @@ def validate(config: TrainConfig, source: str = "config") -> TrainConfig:
     require(optim.weight_decay >= 0, "optim.weight_decay", f"must not be negative, found {optim.weight_decay!r}")
     for name, number in [("optim.warmup_epochs", optim.warmup_epochs), ("optim.statistics_windows", optim.statistics_windows),
                          ("loss.nll_from_epoch", config.loss.nll_from_epoch), ("loss.log_std_from_epoch", config.loss.log_std_from_epoch)]:
-        require(number >= 0, name, f"must not be negative, found {number!r}")
+        require(0 <= number < math.inf, name, f"must be finite and not negative, found {number!r}")
     require(optim.clip_norm is None or optim.clip_norm > 0, "optim.clip_norm", "must be positive or null")
     return config
 

@@ -32,6 +32,7 @@ from gnio_jax.data.cache import Refusal, cached_pieces
 from gnio_jax.data.phones import held_out, poses_at, with_velocity
 from gnio_jax.data.recordings import divide, read_all
 from gnio_jax.data.sequence import (
+    WINDOW_SECONDS,
     Dataset,
     Recording,
     check_finite,
@@ -161,7 +162,9 @@ def read_pieces(path: str | os.PathLike[str]) -> list[Sequence]:
     rig = rotations(check_unit_norm(columns["orient"], known, "orient", path)[known])
     level, tilt = _leveling(rig, columns["stencilAcc"][known], path)
     attitude = level * rig * PHONE_TO_RIG
-    fit = pose_lag(time, gyro, time[known], attitude)
+    # A gap tells nothing of the lag, however long it is: here it lasts as long as a window.
+    closed = np.concatenate([[0.0], np.cumsum(np.minimum(np.diff(time), WINDOW_SECONDS))])
+    fit = pose_lag(closed, gyro, closed[known], attitude)
     if not fit.correlation >= 0.5:  # NaN when the poses do not turn at all
         raise Refusal(path, f"columns 'orient' do not turn as 'iphoneGyro' does (they correlate by {fit.correlation:.2f})", "leave it out")
     position, attitude, valid = poses_at(time[known] - fit.lag, level.apply(columns["processedPos"][known]), attitude, time, MAX_GAP)

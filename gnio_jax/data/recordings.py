@@ -17,6 +17,7 @@ import numpy as np
 from gnio_jax.cores import usable_cores
 from gnio_jax.data.cache import Refusal
 from gnio_jax.data.sequence import (
+    LONGEST_BRIDGE,
     WINDOW_SECONDS,
     Dataset,
     Recording,
@@ -42,6 +43,10 @@ def _alone(read: Callable[[], Sequence]) -> list[Sequence]:
     return [read()]
 
 
+STAMP_ROUNDING = 1e-6
+"""s: what float64 leaves of differences of unix stamps, and more."""
+
+
 def divide(sequence: Sequence, source: object) -> list[Sequence]:
     """The pieces of a recording (on its native stamps) between gaps longer than a window.
 
@@ -58,7 +63,7 @@ def divide(sequence: Sequence, source: object) -> list[Sequence]:
     last = np.array([time[part.stop - 1] for part in parts])
     gaps, seconds = first[1:] - last[:-1], last - first
     whole = [_longest_valid(time[part], sequence.valid[part]) for part in parts]
-    kept = [k for k, longest in enumerate(whole) if longest >= WINDOW_SECONDS]
+    kept = [k for k, longest in enumerate(whole) if longest >= WINDOW_SECONDS - STAMP_ROUNDING]
     problem = (f"field 'time' has gaps longer than {WINDOW_SECONDS:g} s ({len(gaps)}, "
                f"up to {gaps.max():.1f} s)")
     if not kept:
@@ -88,9 +93,10 @@ def _piece(sequence: Sequence, name: str, part: slice) -> Sequence:
 
 
 def _longest_valid(time: np.ndarray, valid: np.ndarray) -> float:
-    """Seconds of the longest run of valid samples."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], valid, [False]])))
-    runs = time[edges[1::2] - 1] - time[edges[::2]]
+    """Seconds of the longest run of valid samples, as `resample` will leave it."""
+    joined = valid[1:] & valid[:-1] & (np.diff(time) <= LONGEST_BRIDGE)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], joined, [False]])))
+    runs = time[edges[1::2]] - time[edges[::2]]
     return float(runs.max()) if runs.size else 0.0
 
 

@@ -30,6 +30,9 @@ FASTEST, LARGEST_STEP, FARTHEST = 300.0, 10.0, 1e8
 """m/s that nothing exceeds that carries such an IMU; m by which positions held for a while, or corrected, may jump all the same; m from
 the world's origin, of which a float still has digits enough."""
 
+LONGEST_BRIDGE = 0.1
+"""s between samples within which `resample` trusts what it interpolates."""
+
 WINDOW_SECONDS = 1.0
 """A hole in the IMU longer than the network's window is no jitter: loaders divide the recording there
 (`recordings.divide`), or refuse it."""
@@ -264,7 +267,7 @@ def is_uniform(time: Float[np.ndarray, "n"], rate: float) -> bool:
     return bool(np.abs(intervals - 1.0).max() < 1e-3 and abs(intervals.mean() - 1.0) < 1e-4)
 
 
-def resample(sequence: Sequence, rate: float, max_gap: float = 0.1) -> Sequence:
+def resample(sequence: Sequence, rate: float, max_gap: float = LONGEST_BRIDGE) -> Sequence:
     """`sequence` on a uniform clock of `rate` Hz that starts at its first stamp; unchanged if it is on one already.
 
     IMU, position and velocity follow cubic splines, attitudes slerp along the shorter arc. Going to a lower rate the

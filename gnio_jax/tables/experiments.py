@@ -10,7 +10,7 @@ from gnio_jax.config import LossConfig, OptimConfig, TrainConfig
 SCALED = ("gnio", "tlio", "ronin_resnet", "deepils")
 """Networks whose `width` means channels of the first group: an experiment at half the width halves all of them."""
 
-TLIO_HELD, TLIO_BATCH, PAPER_EPOCHS = 10, 1024, 200
+TLIO_HELD, TLIO_BATCH, PAPER_EPOCHS = 10.0, 1024, 200
 """TLIO's uncertainty does not learn in its first 10 epochs of batches of 1,024; the paper trains every network for 200 epochs."""
 
 REGULARISATION: dict[str, dict[str, float]] = {"tlio": {"clip_norm": 0.1}, "ctin": {"weight_decay": 1e-6}}

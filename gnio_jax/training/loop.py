@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
 import math
 import signal
@@ -33,6 +34,7 @@ from gnio_jax.training.step import (
     TrainState,
     Validation,
     calibrated,
+    calibrates,
     create_state,
     epoch_order,
     estimate_statistics,
@@ -123,9 +125,7 @@ def _train(config: TrainConfig, resume: bool, console: Console) -> Outcome:
                 break  # stopped on the way, and saved
 
             state = run.estimated(state)
-            now = stage(config.loss, position.step - 1, run.steps_per_epoch)
-            held_out = validate(state, run.held_out, now, model=run.model, config=config)
-            state = calibrated(state, held_out)
+            state, held_out = _validated(run, state, position.step)
             row = _row(run, epoch, position, held_out, rate)
             merit = row["val_loss" if config.optim.best_by == "loss" else "val_mse"]
             improved = position.best_loss is None or _switched(run, position.step) or merit < position.best_loss
@@ -226,9 +226,21 @@ def _run_epoch(
     return state, position, rate
 
 
+def _validated(run: _Run, state: TrainState, step: int) -> tuple[TrainState, Validation]:
+    """The state as it is kept, its uncertainty calibrated where it has constants for that, and the losses of that state."""
+    validated = functools.partial(validate, source=run.held_out, now=stage(run.config.loss, step - 1, run.steps_per_epoch),
+                                  model=run.model, config=run.config)  # fmt: skip
+    found = validated(state)
+    if not calibrates(state):
+        return state, found
+    state = calibrated(state, found)
+    return state, validated(state)
+
+
 def _switched(run: _Run, step: int) -> bool:
-    """Whether the epoch that ends at `step` changed what is trained: losses before and after it do not compare."""
-    return any(step - run.steps_per_epoch <= switch < step for switch in switches(run.config.loss, run.steps_per_epoch))
+    """Whether the epoch that ends at `step` changed what is trained, or is the first whole one after such a change: losses
+    before and after do not compare, and what has just begun to learn has learnt little."""
+    return any(step - 2 * run.steps_per_epoch < switch < step for switch in switches(run.config.loss, run.steps_per_epoch))
 
 
 def _row(run: _Run, epoch: int, position: Position, held_out: Validation, rate: float) -> dict[str, int | float]:

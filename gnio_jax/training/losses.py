@@ -12,6 +12,8 @@ from jaxtyping import Bool, Float, Int
 from gnio_jax.config import LossConfig
 from gnio_jax.types import Prediction, Windows
 
+_NEVER = 2**31 - 1
+
 
 class Losses(NamedTuple):
     """Means over a batch."""
@@ -30,16 +32,18 @@ class Stage(NamedTuple):
     nll_weight: Float[jax.Array, ""]
     """λ_NLL, or zero before `LossConfig.nll_from_epoch`."""
     log_std_learns: Bool[jax.Array, ""]
-    """False before `LossConfig.log_std_from_epoch`."""
+    """False before `LossConfig.log_std_from_epoch`, and as long as there is no likelihood."""
 
 
 def switches(config: LossConfig, steps_per_epoch: int) -> tuple[int, int]:
     """First steps of the likelihood and of the uncertainty, from the fractions of an epoch that the config gives."""
     likelihood, uncertainty = (
-        math.ceil(epochs * steps_per_epoch - 1e-6)
+        min(math.ceil(epochs * steps_per_epoch - 1e-6), _NEVER)
         for epochs in (config.nll_from_epoch, config.log_std_from_epoch)
     )
-    return likelihood, uncertainty
+    # CTIN's loss has a likelihood of its own from the start.
+    weighted = config.name == "weighted_sum"
+    return likelihood, max(likelihood, uncertainty) if weighted else uncertainty
 
 
 def stage(config: LossConfig, step: Int[jax.Array, ""] | int, steps_per_epoch: int) -> Stage:

@@ -8,6 +8,7 @@ import jax
 import optax
 
 from gnio_jax.config import LossConfig, OptimConfig
+from gnio_jax.training.losses import switches
 
 UNCERTAINTY = ("uncertainty", "log_std")
 """Names of the networks' parts from which nothing but the uncertainty comes."""
@@ -41,7 +42,7 @@ def create(config: OptimConfig, loss: LossConfig, steps_per_epoch: int) -> optax
     """
     rate = schedule(config, steps_per_epoch)
     adam = optax.adam(rate, b1=0.9, b2=0.999)
-    if loss.log_std_from_epoch > 0:
+    if max(switches(loss, steps_per_epoch)) > 0:
         moments = optax.scale_by_adam(b1=0.9, b2=0.999)
         held = optax.conditionally_mask(moments, lambda step, log_std_learns: log_std_learns, forward_extra_args=True)
         adam = optax.chain(optax.partition({"learns": moments, "held": held}, _kinds), optax.scale_by_learning_rate(rate))

@@ -124,6 +124,12 @@ def normalises(state: TrainState) -> bool:
     return any(path[-1].key == "mean" for path, _ in jax.tree_util.tree_leaves_with_path(state.batch_stats))
 
 
+def calibrates(state: TrainState) -> bool:
+    """Whether the network has constants or factors of the uncertainty that validation sets."""
+    found = jax.tree_util.tree_leaves_with_path(state.batch_stats)
+    return any(path[-1].key in ("log_std", "log_factor") for path, _ in found)
+
+
 def statistics_batches(source: WindowSource, config: TrainConfig) -> int:
     """Batches of `estimate_statistics`: those of `optim.statistics_windows`, but no more than an epoch has."""
     size = config.optim.batch_size
@@ -199,14 +205,17 @@ def validate(
 
 
 def calibrated(state: TrainState, found: Validation) -> TrainState:
-    """The state whose constants and factors of the uncertainty (`models.heads`) fit the errors that validation found with it."""
+    """The state whose constants and factors of the uncertainty (`models.heads`) fit the errors that validation found with it.
+
+    Errors below 0.1 mm, and σ wrong by more than a factor of 1000 at once, are taken for that: nothing becomes infinite.
+    """
 
     def fitted(path: tuple, leaf: jax.Array) -> jax.Array:
         match path[-1].key:
             case "log_std":
-                return 0.5 * jnp.log(found.axis_mse)
+                return 0.5 * jnp.log(jnp.maximum(found.axis_mse, 1e-8))
             case "log_factor":
-                return leaf + 0.5 * jnp.log(found.axis_normalised)
+                return leaf + 0.5 * jnp.log(jnp.clip(found.axis_normalised, 1e-6, 1e6))
             case _:
                 return leaf
 

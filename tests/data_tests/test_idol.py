@@ -383,3 +383,14 @@ def test_what_stands_still_has_no_lag():
     time = np.arange(0, 20, 0.01)
     gyro = np.full((len(time), 3), 0.01) + np.random.default_rng(0).normal(0, 0.005, (len(time), 3))
     assert idol.pose_lag(time, gyro, time, Rotation.identity(len(time))) == idol.Lag(0.0, 1.0)
+
+
+def test_one_wild_stamp_costs_one_row(tmp_path):
+    """A stamp of 0 among unix seconds is a gap of decades, which nothing may span."""
+    table = frame()
+    first = table.iloc[:1].assign(timestamp=0.0)
+    write(tmp_path, pd.concat([first, table], ignore_index=True))
+    with pytest.warns(UserWarning, match="field 'time' has gaps longer than 1 s"):
+        (piece,) = data.load("idol", tmp_path, "known")
+    compare(piece)
+    assert piece.attributes["lag"] == pytest.approx(0.0, abs=3e-3)

@@ -64,3 +64,10 @@ def test_a_recording_of_which_nothing_is_left_is_refused():
     with warnings.catch_warnings(), pytest.raises(Refusal, match=r"^walk\.csv: .*\(2, up to 1\.7 s\), and no piece"):
         warnings.simplefilter("error")
         divide(walk(stamps((0, 0.9), (2.5, 3.3), (5, 5.5))), "walk.csv")
+
+
+def test_a_piece_whose_valid_runs_are_cut_by_short_gaps_holds_no_window():
+    """What `resample` will not bridge, 0.9 s here, parts a window as a long gap does."""
+    with pytest.warns(UserWarning, match=r"kept: 4\.0 of 9\.0 s, walk \(5\.0 to 9\.0 s\); lost: 2\.9 s in gaps, 2\.1 s in pieces"):
+        (piece,) = divide(walk(stamps((0, 0.6), (1.5, 2.1), (5, 9))), "walk.csv")
+    assert piece.name == "walk" and len(piece.time) == 401

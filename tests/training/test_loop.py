@@ -203,7 +203,7 @@ def test_two_stage_loss_without_float64(recording, tmp_path, monkeypatch):
 
     monkeypatch.setattr(loop, "train_steps", spy(step.train_steps))
     monkeypatch.setattr(loop, "validate", spy(step.validate))
-    loop.train(tiny(recording, tmp_path / "run", loss=LossConfig(nll_from_epoch=99), optim=OptimConfig(epochs=1, batch_size=16)))
+    loop.train(tiny(recording, tmp_path / "run", loss=LossConfig(nll_from_epoch=99.0), optim=OptimConfig(epochs=1, batch_size=16)))
     template = step.create_state(checkpoint.create_model(tiny(recording, "")), optimizer.create(OptimConfig(), LossConfig(), 1),
                                  jax.random.split(jax.random.key(0), 3)[0], 50)  # fmt: skip
     trained = parameters(tmp_path / "run")["params"]
@@ -254,7 +254,7 @@ def test_runs_that_cannot_be_loaded(finished, tmp_path):
 
 def test_the_best_checkpoint_begins_anew_where_what_is_trained_changes(recording, tmp_path, monkeypatch):
     """Losses before and after a switch do not compare: the first epoch's would win for ever."""
-    said = iter([(-100.0, 1.0), (7.0, 4.0), (6.0, 5.0)])
+    said = iter([])
 
     def validated(*_, **__):
         loss, mse = next(said)
@@ -262,9 +262,10 @@ def test_the_best_checkpoint_begins_anew_where_what_is_trained_changes(recording
         return step.Validation(Losses(jnp.float32(loss), jnp.float32(mse), jnp.float32(0)), one, one)
 
     monkeypatch.setattr(loop, "validate", validated)
-    for criterion, best, epoch in (("loss", 6.0, 3), ("squared_error", 4.0, 2)):
-        said = iter([(-100.0, 1.0), (7.0, 4.0), (6.0, 5.0)])
+    for criterion, best, epoch in (("loss", 6.0, 4), ("squared_error", 4.0, 3)):
+        # before, with the switch, the first whole epoch, one more
+        said = iter([(-100.0, 1.0), (-50.0, 2.0), (7.0, 4.0), (6.0, 5.0)])
         config = tiny(recording, tmp_path / criterion, loss=LossConfig(nll_weight=1.0, nll_from_epoch=1.5))
-        config = dataclasses.replace(config, optim=dataclasses.replace(config.optim, best_by=criterion))
+        config = dataclasses.replace(config, optim=dataclasses.replace(config.optim, epochs=4, best_by=criterion))
         assert loop.train(config).best_loss == best
         assert checkpoint.load_run(tmp_path / criterion).epoch == epoch

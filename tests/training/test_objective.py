@@ -39,12 +39,12 @@ def test_losses_by_hand():
     np.testing.assert_allclose([found.mse, found.nll, found.total], [mse, nll, 100 * mse + 1e-4 * nll], rtol=1e-6)
     found = found_losses(prediction, walked, LossConfig(mse_weight=1.0, mae_weight=1.0, nll_weight=0.0))
     np.testing.assert_allclose(found.total, mse + (1 + (2 + 1)) / 2, rtol=1e-6)
-    found = found_losses(prediction, walked, LossConfig(nll_from_epoch=3), epoch=2)
+    found = found_losses(prediction, walked, LossConfig(nll_from_epoch=3.0), epoch=2)
     np.testing.assert_allclose([found.nll, found.total], [nll, 100 * mse], rtol=1e-6)
 
 
 def test_uncertainty_learns_from_its_epoch_on():
-    walked, config = target([[0.3, -0.2, 0.1]]), LossConfig(mse_weight=0.0, nll_weight=1.0, log_std_from_epoch=10)
+    walked, config = target([[0.3, -0.2, 0.1]]), LossConfig(mse_weight=0.0, nll_weight=1.0, log_std_from_epoch=10.0)
 
     def slopes(epoch):
         value = lambda d, u: found_losses(Prediction(d, u), walked, config, epoch).total  # noqa: E731
@@ -62,7 +62,9 @@ def test_switches_are_steps():
     config = LossConfig(nll_from_epoch=0.5, log_std_from_epoch=1.25)
     assert losses.switches(config, 8) == (4, 10)
     assert losses.switches(config, 7) == (4, 9)  # the first whole step after the fraction
-    assert losses.switches(LossConfig(nll_from_epoch=3), 7) == (21, 0)
+    assert losses.switches(LossConfig(nll_from_epoch=3.0), 7) == (21, 21)  # without a likelihood it has nothing to learn from
+    assert losses.switches(LossConfig(name="velocity_and_covariance", nll_from_epoch=3.0), 7) == (21, 0)
+    assert losses.switches(LossConfig(log_std_from_epoch=1e9), 300) == (0, 2**31 - 1)
     seen = [losses.stage(config, step, 8) for step in range(12)]
     assert [float(stage.nll_weight) > 0 for stage in seen] == [step >= 4 for step in range(12)]
     assert [bool(stage.log_std_learns) for stage in seen] == [step >= 10 for step in range(12)]
@@ -161,6 +163,8 @@ def test_a_calibrated_head_announces_the_errors_of_the_validation():
     stats = {"uncertainty": {"log_factor": jnp.log(jnp.array([3.0, 1.0, 1.0], jnp.float32))}}
     nothing = Losses(*[jnp.float32(0)] * 3)
     seen = Validation(nothing, jnp.ones(3, jnp.float32), jnp.array([4.0, 0.25, 1.0], jnp.float32))
+    lost = calibrated(TrainState(jnp.int32(0), {}, stats, ()), seen._replace(axis_normalised=jnp.array([jnp.inf, 0, 1], jnp.float32)))
+    assert np.isfinite(lost.batch_stats["uncertainty"]["log_factor"]).all()
     found = calibrated(TrainState(jnp.int32(0), {}, stats, ()), seen).batch_stats["uncertainty"]
     np.testing.assert_allclose(np.exp(found["log_factor"]), [6.0, 0.5, 1.0], rtol=1e-6)
     variables = {"params": variables["params"], "batch_stats": found}
@@ -168,16 +172,18 @@ def test_a_calibrated_head_announces_the_errors_of_the_validation():
     np.testing.assert_array_equal(head.apply(variables, h, True), 0.0)
 
 
-def test_a_held_uncertainty_is_not_counted():
+@pytest.mark.parametrize("held_loss", [LossConfig(log_std_from_epoch=2.0), LossConfig(nll_from_epoch=2.0)])
+def test_a_held_uncertainty_is_not_counted(held_loss):
     """PyTorch's Adam does not count steps in which a parameter has no gradient: at the release the moments are those of a first step."""
     config = OptimConfig(epochs=10)
-    tx = optimizer.create(config, LossConfig(log_std_from_epoch=2.0), 3)
+    tx = optimizer.create(config, held_loss, 3)
     params = {part: {"w": jnp.array([1.0, -2.0, 3.0], jnp.float32)} for part in ("encoder", "log_std")}
     state, update = tx.init(params), jax.jit(tx.update)
     expected = {part: [np.array([1.0, -2.0, 3.0]), np.zeros(3), np.zeros(3), 0] for part in params}
     rng = np.random.default_rng(0)
     for step in range(12):
-        held = step < 6
+        held = not bool(losses.stage(held_loss, step, 3).log_std_learns)
+        assert held == (step < 6)
         gradient = {part: np.zeros(3) if held and part == "log_std" else rng.standard_normal(3) for part in params}
         change, state = update(jax.tree.map(lambda g: {"w": jnp.asarray(g, jnp.float32)}, gradient), state, params,
                                log_std_learns=jnp.bool_(not held))  # fmt: skip
