@@ -344,8 +344,20 @@ def stationary_drift(estimate: Positions, reference: Positions, step: float) -> 
 
 
 def normalised_squared(error: Float[np.ndarray, "n d"], covariance: Float[np.ndarray, "n d d"]) -> Float[np.ndarray, "n"]:
-    """eᵀ P⁻¹ e of each row."""
-    return np.einsum("ni,ni->n", error, np.linalg.solve(covariance, error[..., None])[..., 0])
+    """eᵀ P⁻¹ e of each row, infinite where P is not finite and positive definite.
+
+    Such a P claims to know some direction exactly, which no error agrees with. It is judged to the
+    rounding of float64, after scaling to unit variances, so that units do not matter (ours).
+    """
+    variance = np.einsum("nii->ni", covariance)
+    sound = np.isfinite(covariance).all((1, 2)) & (variance > 0).all(1)
+    std = np.sqrt(variance[sound])
+    value, vector = np.linalg.eigh(covariance[sound] / (std[:, :, None] * std[:, None, :]))
+    definite = value[:, 0] > value.shape[1] * np.finfo(float).eps * value[:, -1]
+    projected = np.einsum("nji,nj->ni", vector, error[sound] / std)
+    squared = np.full(len(error), np.inf)
+    squared[sound] = np.where(definite, (projected**2 / np.where(definite[:, None], value, 1)).sum(1), np.inf)
+    return squared
 
 
 def mean_normalised(squared: Float[np.ndarray, "n"], dims: int) -> float:
@@ -449,14 +461,14 @@ def is_divergence(reason: str) -> bool:
 def position_nees(aligned: Trajectory, estimate: Trajectory, reference: Trajectory, covariance: Float[np.ndarray, "n 3 3"],
                   dims: int = 3) -> Float[np.ndarray, "n"]:
     """eᵀ P⁻¹ e of the position, NaN where there is no reference: the error of the start-aligned estimate, turned back into
-    the filter's own frame, in which its covariance is. Infinite where the covariance is not."""
+    the filter's own frame, in which its covariance is. Infinite where the covariance is not finite
+    and positive definite."""
     turn = rotation_z(relative_yaw(estimate.orientation[:1], aligned.orientation[:1])[0])
     error = (aligned.position - reference.position) @ turn.T
     variance = np.einsum("nii->ni", covariance)
-    known = np.isfinite(covariance).all((1, 2))
-    squared = np.where(finite_rows(error) & ~known, np.inf, np.nan)
+    squared = np.full(len(error), np.nan)
     # A start given as exact has nothing to be normalised by.
-    good = finite_rows(error) & known & (variance > 0).all(1)
+    good = finite_rows(error) & (variance != 0).all(1)
     squared[good] = normalised_squared(error[good, :dims], covariance[good, :dims, :dims])
     return squared
 

@@ -458,6 +458,30 @@ def test_a_covariance_that_is_not_finite_is_no_consistent_one():
     assert np.isfinite(found["ate"])
 
 
+@pytest.mark.parametrize("row", [150, 900])  # lost in the middle, or whole
+@pytest.mark.parametrize("bad", [np.full((3, 3), 1e30), np.eye(3) + 1e40 * np.outer([1, 2, 3], [1, 2, 3]),
+                                 np.diag([1.0, -1.0, 1.0]), [[1, 2, 0], [2, 1, 0], [0, 0, 1]]])
+def test_a_singular_or_indefinite_covariance_is_no_consistent_one(bad, row):
+    truth = walk()
+    covariance = np.broadcast_to(np.eye(3), (900, 3, 3)).copy()
+    covariance[150:] = bad
+    estimate = lost(perturbed(truth, scale=0), row)
+    found = metrics.measure(estimate, truth, position_covariance=covariance).values
+    share = pytest.approx(100 / 6) if row == 900 else 0
+    for tag in ("", "_2d"):
+        assert found[f"nees{tag}"] == np.inf and found[f"nees_coverage{tag}"] == share
+
+
+def test_normalised_errors_against_the_inverse_whatever_the_units():
+    random = np.random.default_rng(4)
+    root, error = random.normal(size=(50, 3, 3)), random.normal(size=(50, 3))
+    unit = np.array([1e-9, 1.0, 1e9])
+    covariance = root @ root.transpose(0, 2, 1) + 0.1 * np.eye(3)
+    expected = [e @ np.linalg.inv(p) @ e for e, p in zip(error, covariance, strict=True)]
+    found = metrics.normalised_squared(unit * error, unit[:, None] * covariance * unit)
+    np.testing.assert_allclose(found, expected, rtol=1e-9)
+
+
 @pytest.mark.parametrize("how", ["origin", "yaw_position", "se3"])
 def test_alignment_sees_finite_rows_alone(how):
     truth = walk(tilt=0.3)
