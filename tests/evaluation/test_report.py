@@ -171,6 +171,17 @@ def test_the_distribution_of_errors_counts_what_diverged(tmp_path, with_divergen
     plots.save_all(tmp_path, of, found, 1.0)
 
 
+def test_an_estimate_lost_before_the_reference_begins_is_drawn(estimates):
+    """No row has both, so nothing aligns it: the error is not there, its bounds are."""
+    whole, rows = estimates[0], np.arange(400)[:, None]
+    path, reference = (Trajectory(of.time, *(np.where(there, part, np.nan) for part in of[1:]))
+                       for of, there in ((whole.trajectory, rows < 5), (whole.reference, rows >= 10)))
+    figure = plots.position_error(whole._replace(trajectory=path, reference=reference))
+    for axes in figure.axes:
+        assert np.isnan(axes.get_lines()[0].get_ydata()).all()
+        assert np.isfinite(axes.collections[0].get_paths()[0].vertices).all()
+
+
 def test_a_folder_is_replaced_whole_or_not_at_all(tmp_path):
     folder = tmp_path / "eval" / "result"
     with report.replacing_folder(folder) as new:
