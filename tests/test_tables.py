@@ -114,11 +114,13 @@ def test_a_row_is_never_better_for_having_diverged(seeds, share):
     _, row, text = compared(first, result("b", wrong.tolist()))
     assert row.diverged == 1 and row.estimates == 4 * seeds
     assert row.gain == (0 if share == 1 else None) and "↓" not in text
-    assert row.difference == pytest.approx((share - 1) * 2)
-    assert f"| 1 of {4 * seeds} |" in text and "over 3 of 4 |" in text
+    cells = "0 % | +0.00 (+0.00 to +0.00) over 3 of 4" if share == 1 else "– | –"
+    assert f"| 1 of {4 * seeds} | {cells} |" in text and row.compared == 3
+    assert (row.difference, row.interval) == ((0, (0, 0)) if share == 1 else (None, None))
     whole, back, _ = compared(result("b", wrong.tolist()), first)  # the other way about it may lose
     assert (whole.diverged, back.diverged) == (1, 0)
     assert back.gain == pytest.approx(100 * (1 - 1 / share))
+    assert back.difference == pytest.approx((1 - share) * 2)
 
 
 def test_the_median_is_infinite_where_half_diverged():
@@ -156,11 +158,13 @@ def test_divergence_is_in_the_files_and_the_picture(tmp_path):
     first = result("a", [[1.0, 2.0, 4.0]], groups="xyz")
     second = result("b", [[LOST, LOST, 8.0]], groups="xyz")
     third = result("c", [[LOST, LOST, LOST]], groups="xyz")
-    experiment = Experiment("Title", "source", [each.cell for each in (first, second, third)])
-    found = summary.rows(experiment, [first, second, third])
+    fourth = result("d", [[0.5, 1.0, LOST]], groups="xyz")
+    results = [first, second, third, fourth]
+    experiment = Experiment("Title", "source", [each.cell for each in results])
+    found = summary.rows(experiment, results)
     summary.write(tmp_path / "table", experiment, found, [])
     with open(tmp_path / "table.csv", newline="", encoding="utf-8") as file:
-        one, two, three = csv.DictReader(file)
+        one, two, three, four = csv.DictReader(file)
     assert (one["ate_median"], one["diverged"], one["estimates"]) == ("2.0", "0", "3")
     assert (two["ate"], two["ate_median"], two["diverged"]) == ("8.0", "inf", "2")
     assert (two["compared"], two["sequences"], two["groups"]) == ("1", "3", "1")
@@ -168,7 +172,9 @@ def test_divergence_is_in_the_files_and_the_picture(tmp_path):
     assert (two["difference"], two["difference_low"]) == ("4.0", "")
     assert (three["ate"], three["gain_percent"], three["difference"]) == ("", "", "")
     assert three["diverged"] == "3"
-    axes = pictures.table(experiment, [first, second, third], found).axes[0]
+    withheld = ("gain_percent", "difference", "difference_low", "difference_high")
+    assert [four[name] for name in withheld] == [""] * 4 and four["compared"] == "2"
+    axes = pictures.table(experiment, results[:3], found[:3]).axes[0]
     labels = [label.get_text() for label in axes.get_yticklabels()]
     assert labels == ["A", "B\n(2 of 3 diverged)", "C\n(3 of 3 diverged)"]
     assert [bar.get_width() for bar in axes.patches] == [pytest.approx(7 / 3), 8.0, 0.0]
