@@ -50,9 +50,8 @@ class Scores(NamedTuple):
 
     @property
     def diverged(self) -> list[str]:
-        """Sequences whose estimate diverged, or has an error too large for a number."""
-        return [name for name, m in self.sequences.items()
-                if any(map(metrics.is_divergence, m.undefined.values()))]
+        """Sequences whose estimate diverged (`metrics.diverged`)."""
+        return [name for name, m in self.sequences.items() if metrics.diverged(m.values)]
 
 
 class Report(NamedTuple):
@@ -122,9 +121,10 @@ def table(report: Report) -> Group:
     lines = [Text("; ".join(words), style="dim"),
              Text("reference rows are means; – is not defined (the reason is in metrics.json)", style="dim")]
     if any(scores.diverged for scores in (report.scores, *report.reference_rows.values())):
-        lines.append(Text("∞: the estimate diverged. It counts as infinite in medians; means, "
-                          "intervals and n are of the others alone, so they cannot be compared "
-                          "with those of another run", style="yellow"))
+        lines.append(Text("∞: the estimate diverged. It counts in medians, with infinite errors "
+                          "and coverages of 0; means, intervals and n are in every column of the "
+                          "others alone, so they cannot be compared with those of another run",
+                          style="yellow"))
     said: dict[str, list[str]] = {}
     for name, notes in report.notes.items():
         for note in notes:
@@ -158,8 +158,9 @@ def as_json(report: Report) -> dict[str, Any]:
     `mean` is over the sequences that did not diverge; its `diverged` counts those that did, the
     report's `diverged` by metric.
     """
-    nowhere = {name: next(m.undefined[name] for m in report.scores.sequences.values() if name in m.undefined)
-               for name, value in report.scores.summary.mean.items() if value is None}
+    nowhere = {name: next((m.undefined[name] for m in report.scores.sequences.values() if name in m.undefined),
+                          "no estimate that did not diverge")
+               for name, value in _finite(report.scores.summary.mean).items() if value is None}
     sequences = _sequences(report.scores)
     for name, group in report.scores.groups.items():
         sequences[name]["group"] = group
@@ -183,16 +184,16 @@ def _sequences(scores: Scores) -> dict[str, dict[str, Any]]:
 
 def read_metric(sequence: Mapping[str, Any], metric: str) -> float | None:
     """A metric of one of the `sequences` of metrics.json, as `Measures` has it: None where it is
-    not defined, infinite where the estimate diverged."""
+    not defined, infinite where its reason says so."""
     value = sequence.get(metric)
     reason = sequence.get("undefined", {}).get(metric, "")
-    return math.inf if value is None and metrics.is_divergence(reason) else value
+    return math.inf if value is None and metrics.is_infinite(reason) else value
 
 
 def _summary(scores: Scores) -> dict[str, Any]:
     summary = scores.summary
     interval = {name: None if value is None else list(value) for name, value in summary.interval.items()}
-    return {"mean": {**summary.mean, "diverged": len(scores.diverged)},
+    return {"mean": {**_finite(summary.mean), "diverged": len(scores.diverged)},
             "median": _finite(summary.median), "interval": interval, "n": summary.count,
             "diverged": summary.diverged}
 
