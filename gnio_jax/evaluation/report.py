@@ -23,6 +23,12 @@ from gnio_jax.evaluation import metrics
 from gnio_jax.evaluation.metrics import Measures, Summary, Trajectory
 from gnio_jax.evaluation.odometry import Estimate
 
+DEFINITIONS = 2
+"""What the figures of metrics.json mean, in its `settings`. Raise it with every change after which
+a file's figures cannot stand beside newer ones: another definition of a metric, of who counts as
+diverged or of a mean, or something in the file that tables need. Those of 1 have no groups, and
+yaw errors that are differences of Euler yaws."""
+
 COLUMNS = {
     "duration": ("time", "s", 0),
     "path_length": ("path", "m", 0),
@@ -63,7 +69,7 @@ class Report(NamedTuple):
     reference_rows: dict[str, Scores]
     """`never_moves` and `perfect_displacements`."""
     notes: dict[str, list[str]]
-    """Sequence -> what a reader should know of its start."""
+    """Sequence -> what a reader should know of its start and of its filter."""
     left_out: dict[str, str]
     """Sequence -> why it has no figures."""
 
@@ -188,6 +194,12 @@ def read_metric(sequence: Mapping[str, Any], metric: str) -> float | None:
     value = sequence.get(metric)
     reason = sequence.get("undefined", {}).get(metric, "")
     return math.inf if value is None and metrics.is_infinite(reason) else value
+
+
+def definitions(figures: Mapping[str, Any]) -> int:
+    """`DEFINITIONS` of a metrics.json. Before files said it, those of 2 were the ones with groups."""
+    grouped = all("group" in sequence for sequence in figures["sequences"].values())
+    return figures["settings"].get("definitions", 2 if grouped else 1)
 
 
 def _summary(scores: Scores) -> dict[str, Any]:

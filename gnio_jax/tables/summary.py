@@ -75,7 +75,7 @@ def rows(experiment: Experiment, results: list[Result], extra: dict[str, dict[st
         pairs = [name for name in own
                  if name in first and np.isfinite([*own[name], *first[name]]).all()]
         ours, theirs = (np.array([table[name].mean() for name in pairs]) for table in (own, first))
-        drawn = [group.get(name, name) for name in pairs]
+        drawn = [group[name] for name in pairs]
         gain = 100 * (1 - float(ours.mean() / theirs.mean())) if pairs else None
         difference = float((ours - theirs).mean()) if pairs else None
         interval = metrics.bootstrap(ours - theirs, drawn) if found else None
@@ -112,9 +112,9 @@ def _ates(figures: dict[str, Any]) -> dict[str, float]:
 
 
 def groups(results: list[Result]) -> dict[str, str]:
-    """Sequence -> the person or session it belongs to, where a metrics.json says it."""
+    """Sequence -> the person or session it belongs to."""
     return {name: one["group"] for result in results for figures in result.figures
-            for name, one in figures["sequences"].items() if "group" in one}
+            for name, one in figures["sequences"].items()}
 
 
 def _seeds(result: Result) -> dict[str, list[float]]:
