@@ -358,7 +358,8 @@ def normalised_squared(error: Float[np.ndarray, "n d"], covariance: Float[np.nda
     definite = value[:, 0] > value.shape[1] * np.finfo(float).eps * value[:, -1]
     projected = np.einsum("nji,nj->ni", vector, error[sound] / std)
     squared = np.full(len(error), np.inf)
-    squared[sound] = np.where(definite, (projected**2 / np.where(definite[:, None], value, 1)).sum(1), np.inf)
+    value = np.where(definite[:, None], value, 1.0)
+    squared[sound] = np.where(definite, (projected**2 / value).sum(1), np.inf)
     return squared
 
 

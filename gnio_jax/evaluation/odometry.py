@@ -413,11 +413,12 @@ def _from_filter(recording: Recording, history: FilterHistory, options: FilterOp
     if not healthy.all():
         since = time[np.argmin(healthy)] - time[0]
         notes = (*notes, f"filter: not healthy from {since:.1f} s on, and all after it is void")
-    position, rotation = (rows(getattr(recording, name), getattr(history, name)) for name in ("position", "rotation"))
-    trajectory = Trajectory(time, *(np.where(healthy[:, None], part, np.nan) for part in (position, _quaternions(rotation))))
+    position = rows(recording.position, history.position)
+    orientation = _quaternions(rows(recording.rotation, history.rotation))
+    poses = (np.where(healthy[:, None], part, np.nan) for part in (position, orientation))
     assert history.covariance is not None
     return Estimate(
-        recording.sequence.name, trajectory, _reference(recording, n),
+        recording.sequence.name, Trajectory(time, *poses), _reference(recording, n),
         displacement=rows(np.nan, history.displacement), displacement_std=rows(np.nan, history.measurement_std),
         diagnostics={key: rows(np.nan, value) for key, value in history.diagnostics.items()},
         velocity=rows(recording.velocity, history.velocity), gyro_bias=rows(recording.gyro_bias, history.gyro_bias),

@@ -164,7 +164,8 @@ def as_json(report: Report) -> dict[str, Any]:
     `mean` is over the sequences that did not diverge; its `diverged` counts those that did, the
     report's `diverged` by metric.
     """
-    nowhere = {name: next((m.undefined[name] for m in report.scores.sequences.values() if name in m.undefined),
+    measured = report.scores.sequences.values()
+    nowhere = {name: next((m.undefined[name] for m in measured if name in m.undefined),
                           "no estimate that did not diverge")
                for name, value in _finite(report.scores.summary.mean).items() if value is None}
     sequences = _sequences(report.scores)

@@ -63,7 +63,8 @@ def evaluate(config: EvaluateConfig, progress: Progress = lambda stage, share: N
         "rate": trained.data.rate, "window_seconds": trained.data.window_seconds, "stride_seconds": trained.data.stride_seconds,
         "window_rotation": trained.data.window_rotation, "filter": dataclasses.asdict(options),
         "perfect_displacements_std": odometry.PERFECT_STD if setup.estimator != "integrate" else None,
-        "definitions": report.DEFINITIONS, "device": jax.devices()[0].device_kind, "version": version("gnio-jax"),
+        "definitions": report.DEFINITIONS,
+        "device": jax.devices()[0].device_kind, "version": version("gnio-jax"),
     }
     found = Report(
         settings, report.score(estimates, groups, config.alignment),
