@@ -7,6 +7,7 @@ import json
 import numpy as np
 import pytest
 import yaml
+from rich.console import Console
 from test_tlio_layout import write_sequence
 
 from gnio_jax import config as configuration
@@ -30,13 +31,13 @@ LOST = np.inf
 
 def result(name, ate, published=None, groups=None):
     """`ate`: (seeds, sequences); the other metrics are the same number. `groups`: of each sequence,
-    if the files say it."""
+    else each is one."""
     lost = {"ate": None, "undefined": {"ate": "the estimate is not finite from 2.0 s on"}}
     figures = []
     for row in ate:
         sequences = {f"s{k}": {"ate": value} if np.isfinite(value) else dict(lost)
                      for k, value in enumerate(row)}
-        for sequence, group in zip(sequences.values(), groups or (), strict=groups is not None):
+        for sequence, group in zip(sequences.values(), groups or sequences, strict=True):
             sequence["group"] = group
         finite = [value for value in row if np.isfinite(value)]
         mean = float(np.mean(finite)) if finite else None
@@ -79,13 +80,14 @@ def test_only_sequences_that_all_seeds_measured_count():
 def test_sequences_are_paired_by_name():
     """The second row lacks a sequence and has another: what both have is compared, in any order."""
     first, second = result("a", [[9.0, 2.0, 4.0]]), result("b", [[9.0, 1.0, 2.0]])
-    second.figures[0]["sequences"] = {"s9": {"ate": 50.0}, "s2": {"ate": 2.0}, "s1": {"ate": 1.0}}
+    second.figures[0]["sequences"] = {
+        name: {"ate": ate, "group": name} for name, ate in [("s9", 50.0), ("s2", 2.0), ("s1", 1.0)]}
     *_, row, text = compared(first, second)
     assert (row.compared, row.sequences) == (2, 4)
     assert row.difference == pytest.approx(-1.5) and row.gain == pytest.approx(50.0)
     assert row.interval == pytest.approx((-2.0, -1.0))
     assert "↓ 50.0 % | -1.50 (-2.00 to -1.00) over 2 of 4 |" in text
-    second.figures[0]["sequences"] = {"other": {"ate": 1.0}}
+    second.figures[0]["sequences"] = {"other": {"ate": 1.0, "group": "other"}}
     *_, row, text = compared(first, second)
     assert (row.gain, row.difference, row.interval) == (None, None, None)
     assert "| 4.00 | – | – | – |" in text
@@ -114,11 +116,13 @@ def test_a_row_is_never_better_for_having_diverged(seeds, share):
     _, row, text = compared(first, result("b", wrong.tolist()))
     assert row.diverged == 1 and row.estimates == 4 * seeds
     assert row.gain == (0 if share == 1 else None) and "↓" not in text
-    assert row.difference == pytest.approx((share - 1) * 2)
-    assert f"| 1 of {4 * seeds} |" in text and "over 3 of 4 |" in text
+    cells = "0 % | +0.00 (+0.00 to +0.00) over 3 of 4" if share == 1 else "– | –"
+    assert f"| 1 of {4 * seeds} | {cells} |" in text and row.compared == 3
+    assert (row.difference, row.interval) == ((0, (0, 0)) if share == 1 else (None, None))
     whole, back, _ = compared(result("b", wrong.tolist()), first)  # the other way about it may lose
     assert (whole.diverged, back.diverged) == (1, 0)
     assert back.gain == pytest.approx(100 * (1 - 1 / share))
+    assert back.difference == pytest.approx((1 - share) * 2)
 
 
 def test_the_median_is_infinite_where_half_diverged():
@@ -146,21 +150,37 @@ def test_intervals_draw_groups():
     row, text = row_and_text("xxxxxx", "xxxxxx")
     assert row.groups == 1 and row.interval is None
     assert "↓ 38.0 % | -1.90 | –" in text and "interval draws" not in text
-    alone, _ = row_and_text(None, None)
+    alone, _ = row_and_text("abcdef", "abcdef")
     assert alone.groups == 6 and -2.9 < alone.interval[0] < alone.interval[1] < -0.9
-    mixed, _ = row_and_text("xxxyyy", None)  # the files of one row are older
-    assert mixed.interval == pytest.approx((-2.9, -0.9))
+
+
+@pytest.mark.parametrize("definitions, group, step, kept", [
+    (report.DEFINITIONS, True, 7, True), (1, True, 7, False), (report.DEFINITIONS + 1, True, 7, False),
+    (None, True, 7, report.DEFINITIONS == 2), (None, False, 7, False), (report.DEFINITIONS, True, 6, False)])
+def test_figures_of_other_definitions_or_steps_are_made_anew(tmp_path, monkeypatch, definitions, group, step, kept):
+    configuration.save(tmp_path / "config.yaml", BASE)
+    (tmp_path / "checkpoints" / "best" / "7").mkdir(parents=True)
+    path = tmp_path / "eval" / "tlio_test_ekf" / "metrics.json"
+    path.parent.mkdir(parents=True)
+    settings = {"step": step} | ({} if definitions is None else {"definitions": definitions})
+    sequences = {"a": {"ate": 1.0, "group": "x"}, "b": {"ate": 1.0} | ({"group": "y"} if group else {})}
+    path.write_text(json.dumps({"settings": settings, "sequences": sequences}))
+    monkeypatch.setattr(matrix.evaluation, "evaluate", lambda config: path.write_text('{}'))
+    found = matrix.evaluated(tmp_path, "test", "ekf", Console(quiet=True))
+    assert (found != {}) == kept
 
 
 def test_divergence_is_in_the_files_and_the_picture(tmp_path):
     first = result("a", [[1.0, 2.0, 4.0]], groups="xyz")
     second = result("b", [[LOST, LOST, 8.0]], groups="xyz")
     third = result("c", [[LOST, LOST, LOST]], groups="xyz")
-    experiment = Experiment("Title", "source", [each.cell for each in (first, second, third)])
-    found = summary.rows(experiment, [first, second, third])
+    fourth = result("d", [[0.5, 1.0, LOST]], groups="xyz")
+    results = [first, second, third, fourth]
+    experiment = Experiment("Title", "source", [each.cell for each in results])
+    found = summary.rows(experiment, results)
     summary.write(tmp_path / "table", experiment, found, [])
     with open(tmp_path / "table.csv", newline="", encoding="utf-8") as file:
-        one, two, three = csv.DictReader(file)
+        one, two, three, four = csv.DictReader(file)
     assert (one["ate_median"], one["diverged"], one["estimates"]) == ("2.0", "0", "3")
     assert (two["ate"], two["ate_median"], two["diverged"]) == ("8.0", "inf", "2")
     assert (two["compared"], two["sequences"], two["groups"]) == ("1", "3", "1")
@@ -168,7 +188,9 @@ def test_divergence_is_in_the_files_and_the_picture(tmp_path):
     assert (two["difference"], two["difference_low"]) == ("4.0", "")
     assert (three["ate"], three["gain_percent"], three["difference"]) == ("", "", "")
     assert three["diverged"] == "3"
-    axes = pictures.table(experiment, [first, second, third], found).axes[0]
+    withheld = ("gain_percent", "difference", "difference_low", "difference_high")
+    assert [four[name] for name in withheld] == [""] * 4 and four["compared"] == "2"
+    axes = pictures.table(experiment, results[:3], found[:3]).axes[0]
     labels = [label.get_text() for label in axes.get_yticklabels()]
     assert labels == ["A", "B\n(2 of 3 diverged)", "C\n(3 of 3 diverged)"]
     assert [bar.get_width() for bar in axes.patches] == [pytest.approx(7 / 3), 8.0, 0.0]

@@ -52,9 +52,11 @@ class Measures(NamedTuple):
     """The metrics of one sequence."""
 
     values: dict[str, float | None]
-    """Metric -> value; None where it is not defined, infinite where the estimate diverged."""
+    """Metric -> value; None where it is not defined; errors are infinite where the estimate
+    diverged (`diverged`)."""
     undefined: dict[str, str]
-    """Metric -> reason, for those without a value and those of an estimate that diverged."""
+    """Metric -> reason, for those without a value and those that are infinite or, of an estimate
+    that diverged, a coverage of 0."""
 
 
 # Rotations ------------------------------------------------------------------------------------------------------------
@@ -344,8 +346,21 @@ def stationary_drift(estimate: Positions, reference: Positions, step: float) -> 
 
 
 def normalised_squared(error: Float[np.ndarray, "n d"], covariance: Float[np.ndarray, "n d d"]) -> Float[np.ndarray, "n"]:
-    """eᵀ P⁻¹ e of each row."""
-    return np.einsum("ni,ni->n", error, np.linalg.solve(covariance, error[..., None])[..., 0])
+    """eᵀ P⁻¹ e of each row, infinite where P is not finite and positive definite.
+
+    Such a P claims to know some direction exactly, which no error agrees with. It is judged to the
+    rounding of float64, after scaling to unit variances, so that units do not matter (ours).
+    """
+    variance = np.einsum("nii->ni", covariance)
+    sound = np.isfinite(covariance).all((1, 2)) & (variance > 0).all(1)
+    std = np.sqrt(variance[sound])
+    value, vector = np.linalg.eigh(covariance[sound] / (std[:, :, None] * std[:, None, :]))
+    definite = value[:, 0] > value.shape[1] * np.finfo(float).eps * value[:, -1]
+    projected = np.einsum("nji,nj->ni", vector, error[sound] / std)
+    squared = np.full(len(error), np.inf)
+    value = np.where(definite[:, None], value, 1.0)
+    squared[sound] = np.where(definite, (projected**2 / value).sum(1), np.inf)
+    return squared
 
 
 def mean_normalised(squared: Float[np.ndarray, "n"], dims: int) -> float:
@@ -441,22 +456,29 @@ def measure(estimate: Trajectory, reference: Trajectory, alignment: Alignment = 
     return Measures(values, undefined)
 
 
-def is_divergence(reason: str) -> bool:
-    """Whether a reason in `Measures.undefined` says that the estimate diverged."""
+def is_infinite(reason: str) -> bool:
+    """Whether a reason in `Measures.undefined` is that of an infinite value."""
     return reason.startswith((NOT_FINITE, TOO_LARGE))
+
+
+def diverged(values: Mapping[str, float | None]) -> bool:
+    """Whether the estimate of a sequence diverged: its `ate` is infinite or, where there is none
+    for want of a reference, anything else is. An infinite NEES alone is a bad covariance."""
+    ate = values.get("ate")
+    return math.inf in values.values() if ate is None else math.isinf(ate)
 
 
 def position_nees(aligned: Trajectory, estimate: Trajectory, reference: Trajectory, covariance: Float[np.ndarray, "n 3 3"],
                   dims: int = 3) -> Float[np.ndarray, "n"]:
     """eᵀ P⁻¹ e of the position, NaN where there is no reference: the error of the start-aligned estimate, turned back into
-    the filter's own frame, in which its covariance is. Infinite where the covariance is not."""
+    the filter's own frame, in which its covariance is. Infinite where the covariance is not finite
+    and positive definite."""
     turn = rotation_z(relative_yaw(estimate.orientation[:1], aligned.orientation[:1])[0])
     error = (aligned.position - reference.position) @ turn.T
     variance = np.einsum("nii->ni", covariance)
-    known = np.isfinite(covariance).all((1, 2))
-    squared = np.where(finite_rows(error) & ~known, np.inf, np.nan)
+    squared = np.full(len(error), np.nan)
     # A start given as exact has nothing to be normalised by.
-    good = finite_rows(error) & known & (variance > 0).all(1)
+    good = finite_rows(error) & (variance != 0).all(1)
     squared[good] = normalised_squared(error[good, :dims], covariance[good, :dims, :dims])
     return squared
 
@@ -465,35 +487,39 @@ class Summary(NamedTuple):
     """Metrics over the sequences of a set. None where no sequence has the metric, or (interval) it has fewer than two groups."""
 
     mean: dict[str, float | None]
-    """Over the sequences that did not diverge: of no worth without `diverged` beside it."""
+    """Over the sequences that did not diverge: of no worth without `diverged` beside it. Infinite
+    where one of them is (NEES, with a covariance that is not positive definite)."""
     median: dict[str, float | None]
-    """Over all that have the metric: infinite where half of them diverged."""
+    """Over all that have the metric: of an error, infinite where half of them diverged."""
     interval: dict[str, tuple[float, float] | None]
-    """Bootstrap 95 % interval of the mean, groups (people, sessions) drawn with replacement."""
+    """Bootstrap 95 % interval of a finite mean, groups (people, sessions) drawn with replacement."""
     count: dict[str, int]
     """Sequences in the mean."""
     diverged: dict[str, int]
-    """Sequences whose value is infinite."""
+    """Sequences that have the metric and are in no mean, because their estimate diverged."""
 
 
 def summarise(measures: Mapping[str, Mapping[str, float | None]], groups: Mapping[str, Any], seed: int = 0, draws: int = 2000) -> Summary:
     """Mean, median and bootstrap 95 % interval of every metric over sequences, each sequence counted once.
 
-    `measures` is sequence -> metric -> value (infinite: diverged), `groups` sequence -> the person
-    or session it belongs to: recordings of one are not independent, so whole groups are drawn
-    (`bootstrap`). The same seed gives the same interval.
+    `measures` is sequence -> metric -> value, `groups` sequence -> the person or session it belongs
+    to: recordings of one are not independent, so whole groups are drawn (`bootstrap`). A sequence
+    that `diverged` is left out of the mean, interval and count of every metric alike. The same seed
+    gives the same interval.
     """
+    lost = {name for name, values in measures.items() if diverged(values)}
     names = list(dict.fromkeys(metric for values in measures.values() for metric in values))
     summary = Summary({}, {}, {}, {}, {})
     for metric in names:
         present = [name for name, values in measures.items() if values.get(metric) is not None]
         numbers = np.array([measures[name][metric] for name in present], float)
-        finite = np.isfinite(numbers)
-        summary.count[metric], summary.diverged[metric] = int(finite.sum()), int((~finite).sum())
-        summary.mean[metric] = float(numbers[finite].mean()) if finite.any() else None
+        kept = np.array([name not in lost for name in present], bool)
+        summary.count[metric], summary.diverged[metric] = int(kept.sum()), int((~kept).sum())
+        mean = summary.mean[metric] = float(numbers[kept].mean()) if kept.any() else None
         summary.median[metric] = float(np.median(numbers)) if present else None
-        kept = [groups[name] for name, good in zip(present, finite, strict=True) if good]
-        summary.interval[metric] = bootstrap(numbers[finite], kept, seed, draws)
+        drawn = [groups[name] for name in present if name not in lost]
+        interval = bootstrap(numbers[kept], drawn, seed, draws) if mean != math.inf else None
+        summary.interval[metric] = interval
     return summary
 
 

@@ -108,6 +108,7 @@ class Estimate(NamedTuple):
 
     name: str
     trajectory: Trajectory
+    """NaN from where the filter was no longer healthy (`FilterHistory.healthy`): it has diverged."""
     reference: Trajectory
     """At the same rows, NaN where it cannot be trusted."""
     displacement: Float[np.ndarray, "k 3"] | None = None
@@ -407,19 +408,24 @@ def _from_filter(recording: Recording, history: FilterHistory, options: FilterOp
         return np.concatenate([np.broadcast_to(np.asarray(first, float), rest.shape[1:])[None], rest])
 
     std = np.repeat(np.array(_start(recording, options).std), [2, 1, 3, 3, 3, 3])
-    rotation = rows(recording.rotation, history.rotation)
+    time, notes = recording.sequence.time[::n], recording.notes
+    healthy = rows(1.0, history.healthy) > 0
+    if not healthy.all():
+        since = time[np.argmin(healthy)] - time[0]
+        notes = (*notes, f"filter: not healthy from {since:.1f} s on, and all after it is void")
+    position = rows(recording.position, history.position)
+    orientation = _quaternions(rows(recording.rotation, history.rotation))
+    poses = (np.where(healthy[:, None], part, np.nan) for part in (position, orientation))
     assert history.covariance is not None
     return Estimate(
-        recording.sequence.name,
-        Trajectory(recording.sequence.time[::n], rows(recording.position, history.position), _quaternions(rotation)),
-        _reference(recording, n),
+        recording.sequence.name, Trajectory(time, *poses), _reference(recording, n),
         displacement=rows(np.nan, history.displacement), displacement_std=rows(np.nan, history.measurement_std),
         diagnostics={key: rows(np.nan, value) for key, value in history.diagnostics.items()},
         velocity=rows(recording.velocity, history.velocity), gyro_bias=rows(recording.gyro_bias, history.gyro_bias),
         accel_bias=rows(0.0, history.accel_bias),
         std=rows(std, np.sqrt(np.maximum(history.covariance_diagonal, 0.0))),
         position_covariance=rows(np.eye(3) * options.position_std**2, history.covariance),
-        accepted=rows(np.nan, history.accepted), nis=rows(np.nan, history.nis), notes=recording.notes)
+        accepted=rows(np.nan, history.accepted), nis=rows(np.nan, history.nis), notes=notes)
 
 
 def _measurements(recording: Recording, displacement: Float[Array, "m 3"], std: Float[Array, "m 3"], config: DataConfig) -> tuple:

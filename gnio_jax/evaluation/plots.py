@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 
 from gnio_jax.evaluation import metrics
-from gnio_jax.evaluation.metrics import Undefined
+from gnio_jax.evaluation.metrics import Trajectory, Undefined
 from gnio_jax.evaluation.odometry import Estimate, Progress
 from gnio_jax.evaluation.report import Report, file_names
 
@@ -55,7 +55,7 @@ def trajectory(estimate: Estimate, ate: float | None = None, ate_2d: float | Non
     """Plan view of the estimate over the reference, both axes to the same scale."""
     figure = Figure(figsize=(6.4, 6.4), layout="constrained")
     axes = figure.add_subplot()
-    path, reference = _aligned(estimate, alignment), estimate.reference.position
+    path, reference = _aligned(estimate, alignment).position, estimate.reference.position
     axes.plot(reference[:, 0], reference[:, 1], color=REFERENCE, lw=1.6, label="reference")
     axes.plot(path[:, 0], path[:, 1], color=BLUE, lw=1.4, label="estimate")
     for track, colour in ((reference, REFERENCE), (path, BLUE)):
@@ -81,7 +81,7 @@ def position_error(estimate: Estimate) -> Figure:
     figure = Figure(figsize=(8.4, 6.0), layout="constrained")
     panels = figure.subplots(3, 1, sharex=True)
     time = estimate.trajectory.time - estimate.trajectory.time[0]
-    aligned = metrics.align(estimate.trajectory, estimate.reference, "origin")
+    aligned = _aligned(estimate, "origin")
     start, start_aligned = (path.orientation[:1] for path in (estimate.trajectory, aligned))
     turn = metrics.rotation_z(metrics.relative_yaw(start, start_aligned)[0])
     error = (aligned.position - estimate.reference.position) @ turn.T  # in the filter's own frame, as its covariance is
@@ -148,7 +148,8 @@ def error_cdf(estimates: list[Estimate], report: Report) -> Figure:
     left, right = figure.subplots(1, 2, sharey=True)
     samples = []
     for e in estimates:
-        error = np.linalg.norm((_aligned(e, report.settings["alignment"]) - e.reference.position)[:, :2], axis=1)
+        path = _aligned(e, report.settings["alignment"]).position
+        error = np.linalg.norm((path - e.reference.position)[:, :2], axis=1)
         error = error[metrics.finite_rows(e.reference.position)]
         if len(error):
             _step(left, error, BLUE, 0.7, alpha=0.25)
@@ -188,11 +189,12 @@ def _true_displacement(estimate: Estimate, rows: int) -> Float[np.ndarray, "k 3"
     return result
 
 
-def _aligned(estimate: Estimate, alignment: metrics.Alignment) -> Float[np.ndarray, "k 3"]:
+def _aligned(estimate: Estimate, alignment: metrics.Alignment) -> Trajectory:
+    """As it is where nothing says how to align it."""
     try:
-        return metrics.align(estimate.trajectory, estimate.reference, alignment).position
+        return metrics.align(estimate.trajectory, estimate.reference, alignment)
     except Undefined:
-        return estimate.trajectory.position
+        return estimate.trajectory
 
 
 def _shade(axes: Axes, time: Float[np.ndarray, "k"], still: np.ndarray) -> None:

@@ -23,6 +23,12 @@ from gnio_jax.evaluation import metrics
 from gnio_jax.evaluation.metrics import Measures, Summary, Trajectory
 from gnio_jax.evaluation.odometry import Estimate
 
+DEFINITIONS = 2
+"""What the figures of metrics.json mean, in its `settings`. Raise it with every change after which
+a file's figures cannot stand beside newer ones: another definition of a metric, of who counts as
+diverged or of a mean, or something in the file that tables need. Those of 1 have no groups, and
+yaw errors that are differences of Euler yaws."""
+
 COLUMNS = {
     "duration": ("time", "s", 0),
     "path_length": ("path", "m", 0),
@@ -50,9 +56,8 @@ class Scores(NamedTuple):
 
     @property
     def diverged(self) -> list[str]:
-        """Sequences whose estimate diverged, or has an error too large for a number."""
-        return [name for name, m in self.sequences.items()
-                if any(map(metrics.is_divergence, m.undefined.values()))]
+        """Sequences whose estimate diverged (`metrics.diverged`)."""
+        return [name for name, m in self.sequences.items() if metrics.diverged(m.values)]
 
 
 class Report(NamedTuple):
@@ -64,7 +69,7 @@ class Report(NamedTuple):
     reference_rows: dict[str, Scores]
     """`never_moves` and `perfect_displacements`."""
     notes: dict[str, list[str]]
-    """Sequence -> what a reader should know of its start."""
+    """Sequence -> what a reader should know of its start and of its filter."""
     left_out: dict[str, str]
     """Sequence -> why it has no figures."""
 
@@ -122,9 +127,10 @@ def table(report: Report) -> Group:
     lines = [Text("; ".join(words), style="dim"),
              Text("reference rows are means; – is not defined (the reason is in metrics.json)", style="dim")]
     if any(scores.diverged for scores in (report.scores, *report.reference_rows.values())):
-        lines.append(Text("∞: the estimate diverged. It counts as infinite in medians; means, "
-                          "intervals and n are of the others alone, so they cannot be compared "
-                          "with those of another run", style="yellow"))
+        lines.append(Text("∞: the estimate diverged. It counts in medians, with infinite errors "
+                          "and coverages of 0; means, intervals and n are in every column of the "
+                          "others alone, so they cannot be compared with those of another run",
+                          style="yellow"))
     said: dict[str, list[str]] = {}
     for name, notes in report.notes.items():
         for note in notes:
@@ -158,8 +164,10 @@ def as_json(report: Report) -> dict[str, Any]:
     `mean` is over the sequences that did not diverge; its `diverged` counts those that did, the
     report's `diverged` by metric.
     """
-    nowhere = {name: next(m.undefined[name] for m in report.scores.sequences.values() if name in m.undefined)
-               for name, value in report.scores.summary.mean.items() if value is None}
+    measured = report.scores.sequences.values()
+    nowhere = {name: next((m.undefined[name] for m in measured if name in m.undefined),
+                          "no estimate that did not diverge")
+               for name, value in _finite(report.scores.summary.mean).items() if value is None}
     sequences = _sequences(report.scores)
     for name, group in report.scores.groups.items():
         sequences[name]["group"] = group
@@ -183,16 +191,22 @@ def _sequences(scores: Scores) -> dict[str, dict[str, Any]]:
 
 def read_metric(sequence: Mapping[str, Any], metric: str) -> float | None:
     """A metric of one of the `sequences` of metrics.json, as `Measures` has it: None where it is
-    not defined, infinite where the estimate diverged."""
+    not defined, infinite where its reason says so."""
     value = sequence.get(metric)
     reason = sequence.get("undefined", {}).get(metric, "")
-    return math.inf if value is None and metrics.is_divergence(reason) else value
+    return math.inf if value is None and metrics.is_infinite(reason) else value
+
+
+def definitions(figures: Mapping[str, Any]) -> int:
+    """`DEFINITIONS` of a metrics.json. Before files said it, those of 2 were the ones with groups."""
+    grouped = all("group" in sequence for sequence in figures["sequences"].values())
+    return figures["settings"].get("definitions", 2 if grouped else 1)
 
 
 def _summary(scores: Scores) -> dict[str, Any]:
     summary = scores.summary
     interval = {name: None if value is None else list(value) for name, value in summary.interval.items()}
-    return {"mean": {**summary.mean, "diverged": len(scores.diverged)},
+    return {"mean": {**_finite(summary.mean), "diverged": len(scores.diverged)},
             "median": _finite(summary.median), "interval": interval, "n": summary.count,
             "diverged": summary.diverged}
 

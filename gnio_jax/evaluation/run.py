@@ -63,13 +63,14 @@ def evaluate(config: EvaluateConfig, progress: Progress = lambda stage, share: N
         "rate": trained.data.rate, "window_seconds": trained.data.window_seconds, "stride_seconds": trained.data.stride_seconds,
         "window_rotation": trained.data.window_rotation, "filter": dataclasses.asdict(options),
         "perfect_displacements_std": odometry.PERFECT_STD if setup.estimator != "integrate" else None,
+        "definitions": report.DEFINITIONS,
         "device": jax.devices()[0].device_kind, "version": version("gnio-jax"),
     }
     found = Report(
         settings, report.score(estimates, groups, config.alignment),
         {"never_moves": report.score(odometry.never_moves(estimates), groups, config.alignment),
          "perfect_displacements": report.score(floor, groups, config.alignment)},
-        {r.sequence.name: list(r.notes) for r in recordings if r.notes}, left_out)
+        {e.name: list(e.notes) for e in estimates if e.notes}, left_out)
 
     folder = workdir / "eval" / folder_name(config, name, trained)
     with report.replacing_folder(folder) as new:

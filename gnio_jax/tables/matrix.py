@@ -71,13 +71,15 @@ def train(config: configuration.TrainConfig, console: Console) -> None:
 
 
 def evaluated(workdir: Path, split: str, estimator: str, console: Console) -> dict[str, Any]:
-    """The figures of the run's best checkpoint on a split: those that are there if they are of that checkpoint, else new ones."""
+    """The figures of the run's best checkpoint on a split: those that are there if they are of that
+    checkpoint and mean the same (`report.DEFINITIONS`), else new ones."""
     config, folder = _evaluation(workdir, split, estimator)
     path = folder / "metrics.json"
     best = workdir / "checkpoints" / "best"
     if path.exists():
         found = json.loads(path.read_text(encoding="utf-8"))
-        if (best / str(found["settings"]["step"])).is_dir():
+        same = report.definitions(found) == report.DEFINITIONS
+        if same and (best / str(found["settings"]["step"])).is_dir():
             return found
     console.print(f"evaluating {workdir.name} on {split} ({estimator})")
     evaluation.evaluate(config)

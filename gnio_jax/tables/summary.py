@@ -49,8 +49,9 @@ class Row(NamedTuple):
     groups: int
     """People or sessions that the compared sequences belong to."""
     gain: float | None
-    """% by which `ate` is smaller than the first row's. None without a sequence to compare, and for
-    a row that would gain but diverged more often than the first: where it did, it is not better."""
+    """% by which `ate` is smaller than the first row's. None, as are difference and interval,
+    without a sequence to compare, and for a row that would gain but diverged more often than the
+    first: where it did, it is not better."""
     difference: float | None
     """Of `ate` to the first row: mean over sequences of the means over seeds, m."""
     interval: tuple[float, float] | None
@@ -74,23 +75,23 @@ def rows(experiment: Experiment, results: list[Result], extra: dict[str, dict[st
         pairs = [name for name in own
                  if name in first and np.isfinite([*own[name], *first[name]]).all()]
         ours, theirs = (np.array([table[name].mean() for name in pairs]) for table in (own, first))
+        drawn = [group[name] for name in pairs]
         gain = 100 * (1 - float(ours.mean() / theirs.mean())) if pairs else None
+        difference = float((ours - theirs).mean()) if pairs else None
+        interval = metrics.bootstrap(ours - theirs, drawn) if found else None
         more_often = found and diverged * found[0].estimates > found[0].diverged * len(every)
         if more_often and gain is not None and gain > 0:
-            gain = None
+            gain = difference = interval = None
         published_gain = None
         if cell.published is not None and published is not None:
             published_gain = 100 * (1 - cell.published / published)
-        drawn = [group.get(name, name) for name in pairs]
         found.append(Row(
             name=cell.name, label=cell.label, published=cell.published,
             published_gain=published_gain, seeds=_seeds(result),
             median=float(np.median(every)) if len(every) else None,
             diverged=diverged, estimates=len(every), compared=len(pairs),
             sequences=len(own.keys() | first.keys()), groups=len(set(drawn)), gain=gain,
-            difference=float((ours - theirs).mean()) if pairs else None,
-            interval=metrics.bootstrap(ours - theirs, drawn) if found else None,
-            extra=(extra or {}).get(cell.name, {})))
+            difference=difference, interval=interval, extra=(extra or {}).get(cell.name, {})))
     return found
 
 
@@ -111,9 +112,9 @@ def _ates(figures: dict[str, Any]) -> dict[str, float]:
 
 
 def groups(results: list[Result]) -> dict[str, str]:
-    """Sequence -> the person or session it belongs to, where a metrics.json says it."""
+    """Sequence -> the person or session it belongs to."""
     return {name: one["group"] for result in results for figures in result.figures
-            for name, one in figures["sequences"].items() if "group" in one}
+            for name, one in figures["sequences"].items()}
 
 
 def _seeds(result: Result) -> dict[str, list[float]]:
@@ -187,7 +188,8 @@ def _explained(found: list[Row]) -> list[str]:
     if any(row.diverged for row in found):
         lines.append("† Over the estimates that did not diverge. The median counts a diverged one "
                      "as infinite. Gain and difference are over the sequences in which neither row "
-                     "diverged, and a row that diverged more often than the first has no gain.")
+                     "diverged. A row that would be better there but diverged more often than "
+                     "the first has neither.")
     return lines
 
 

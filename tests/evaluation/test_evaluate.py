@@ -16,7 +16,7 @@ import pytest
 from gnio_jax import cli, config, data
 from gnio_jax.config import DataConfig, EvaluateConfig, FilterOptions, ModelConfig, TrainConfig
 from gnio_jax.data import synthetic
-from gnio_jax.evaluation import run
+from gnio_jax.evaluation import report, run
 from gnio_jax.training import checkpoint
 from gnio_jax.training.step import TrainState
 
@@ -91,6 +91,22 @@ def test_end_to_end(workdir, command, capsys):
     found = json.loads((workdir / "eval" / "synthetic_test_integrate" / "metrics.json").read_text())
     assert found["settings"]["orientation_source"] == "reference" and found["settings"]["coupling"] is None
     assert "nis" not in found["mean"] and not (workdir / "eval" / "synthetic_test_integrate" / "plots").exists()
+
+
+def test_a_void_filter_is_in_the_files(workdir, monkeypatch):
+    """Accelerations in the wrong unit: the sequence says so, and no figure is of it."""
+    walks = [synthetic.pedestrian(seed, synthetic.person(seed), "handheld", 14.0, 50.0) for seed in (1, 2)]
+    walks[0] = walks[0]._replace(accel=1e3 * walks[0].accel)
+    monkeypatch.setattr(data, "load", lambda *_: walks)
+    _, folder = run.evaluate(EvaluateConfig(str(workdir), estimator="imu_only", plots=False, filter=TRAINED.filter))
+    found = json.loads((folder / "metrics.json").read_text())
+    void, whole = found["sequences"].values()
+    assert void["notes"] == ["filter: not healthy from 0.1 s on, and all after it is void"]
+    assert void["ate"] is None and "not finite from 0.1 s on" in void["undefined"]["ate"]
+    assert found["mean"]["diverged"] == 1 and found["mean"]["ate"] == whole["ate"]
+    assert found["settings"]["definitions"] == report.DEFINITIONS
+    rows = [np.loadtxt(path, ndmin=2) for path in sorted((folder / "trajectories").iterdir())]
+    assert [len(each) for each in rows] == [1, 140]
 
 
 def test_folders_tell_choices_apart():

@@ -431,11 +431,11 @@ def test_a_diverged_estimate_has_infinite_errors():
     assert all(broken.values[name] == 0 for name in coverages)
     assert all(broken.values[name] == whole.values[name] for name in given)
     assert set(broken.undefined.values()) == {"the estimate is not finite from 50.0 s on"}
-    assert metrics.is_divergence(broken.undefined["ate"])
+    assert metrics.is_infinite(broken.undefined["ate"])
     far = estimate._replace(position=np.full((900, 3), 1e300))
     far.position[0] = 0
     found = metrics.measure(far, truth)
-    assert found.values["ate"] == np.inf and metrics.is_divergence(found.undefined["ate"])
+    assert found.values["ate"] == np.inf and metrics.is_infinite(found.undefined["ate"])
 
 
 def test_what_is_not_defined_has_not_diverged():
@@ -446,7 +446,7 @@ def test_what_is_not_defined_has_not_diverged():
     pair = (Trajectory(*(part[:5] for part in path)) for path in (lost(truth, 3), truth))
     short = metrics.measure(*pair)
     assert short.values["ate"] == np.inf and short.values["rpe_1s"] is None
-    assert not metrics.is_divergence(short.undefined["rpe_1s"])
+    assert not metrics.is_infinite(short.undefined["rpe_1s"])
 
 
 def test_a_covariance_that_is_not_finite_is_no_consistent_one():
@@ -456,6 +456,30 @@ def test_a_covariance_that_is_not_finite_is_no_consistent_one():
     found = metrics.measure(perturbed(truth, scale=0), truth, position_covariance=covariance).values
     assert found["nees"] == np.inf and found["nees_coverage"] == pytest.approx(100 / 9)
     assert np.isfinite(found["ate"])
+
+
+@pytest.mark.parametrize("row", [150, 900])  # lost in the middle, or whole
+@pytest.mark.parametrize("bad", [np.full((3, 3), 1e30), np.eye(3) + 1e40 * np.outer([1, 2, 3], [1, 2, 3]),
+                                 np.diag([1.0, -1.0, 1.0]), [[1, 2, 0], [2, 1, 0], [0, 0, 1]]])
+def test_a_singular_or_indefinite_covariance_is_no_consistent_one(bad, row):
+    truth = walk()
+    covariance = np.broadcast_to(np.eye(3), (900, 3, 3)).copy()
+    covariance[150:] = bad
+    estimate = lost(perturbed(truth, scale=0), row)
+    found = metrics.measure(estimate, truth, position_covariance=covariance).values
+    share = pytest.approx(100 / 6) if row == 900 else 0
+    for tag in ("", "_2d"):
+        assert found[f"nees{tag}"] == np.inf and found[f"nees_coverage{tag}"] == share
+
+
+def test_normalised_errors_against_the_inverse_whatever_the_units():
+    random = np.random.default_rng(4)
+    root, error = random.normal(size=(50, 3, 3)), random.normal(size=(50, 3))
+    unit = np.array([1e-9, 1.0, 1e9])
+    covariance = root @ root.transpose(0, 2, 1) + 0.1 * np.eye(3)
+    expected = [e @ np.linalg.inv(p) @ e for e, p in zip(error, covariance, strict=True)]
+    found = metrics.normalised_squared(unit * error, unit[:, None] * covariance * unit)
+    np.testing.assert_allclose(found, expected, rtol=1e-9)
 
 
 @pytest.mark.parametrize("how", ["origin", "yaw_position", "se3"])
@@ -486,6 +510,23 @@ def test_divergence_never_improves_a_summary():
     assert [s.mean["ate"] for s in summaries] == [12.5, 3.0, 2.0, None]
     assert summaries[1].interval["ate"] == pytest.approx((2.0, 4.5))
     assert [s.interval["ate"] for s in summaries[2:]] == [None, None]  # one group is left, or none
+
+
+def test_divergence_is_of_the_sequence_and_leaves_every_mean():
+    """Of four: whole, lost, whole with a bad covariance, without a reference and lost."""
+    fields = ("ate", "nees", "nees_coverage", "accepted", "path_length")
+    rows = {"a": (1.0, 2.0, 90.0, 80.0, 10.0), "b": (np.inf, np.inf, 0.0, 5.0, 500.0),
+            "c": (3.0, np.inf, 0.0, 70.0, 20.0)}
+    measures = {name: dict(zip(fields, row, strict=True)) for name, row in rows.items()}
+    measures["d"] = {"ate": None, "nis": np.inf, "accepted": 3.0}
+    assert [name for name, values in measures.items() if metrics.diverged(values)] == ["b", "d"]
+    summary = metrics.summarise(measures, {name: name for name in measures})
+    means = {"ate": 2.0, "nees": np.inf, "nees_coverage": 45.0, "accepted": 75.0, "path_length": 15.0}
+    assert summary.mean == means | {"nis": None}
+    assert summary.count == dict.fromkeys(fields, 2) | {"nis": 0}
+    assert summary.diverged == dict.fromkeys(fields, 1) | {"nis": 1, "accepted": 2}
+    assert summary.interval["nees"] is None and summary.interval["accepted"] == (70, 80)
+    assert summary.median["ate"] == 3.0 and summary.median["nees"] == np.inf
 
 
 def test_bootstrap_draws_groups_whatever_their_order():

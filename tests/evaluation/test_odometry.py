@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from gnio_jax.config import DataConfig, FilterOptions
 from gnio_jax.data import synthetic
-from gnio_jax.evaluation import metrics, odometry
+from gnio_jax.evaluation import metrics, odometry, report
 from gnio_jax.evaluation.odometry import Network, Setup
 from gnio_jax.types import InputError, Prediction
 
@@ -145,6 +145,24 @@ def test_batches_change_nothing(walks):
         same(alone, in_batch, 1e-5)
         np.testing.assert_allclose(alone.trajectory.position, in_batch.trajectory.position, atol=1e-6)
         np.testing.assert_allclose(alone.diagnostics["gate"], in_batch.diagnostics["gate"], atol=1e-6)
+
+
+@pytest.mark.parametrize("disturbed, factor, row", [(slice(450, 451), 1e5, 91), (slice(None), 1e3, 1)])
+def test_what_the_filter_calls_void_has_diverged(walks, disturbed, factor, row):
+    """One leap of the accelerometer, or a wrong unit: all numbers stay finite."""
+    accel = walks[0].accel.copy()
+    accel[disturbed] *= factor
+    recordings, _ = odometry.prepare([walks[0]._replace(accel=accel), walks[2]], CONFIG)
+    void, whole = odometry.estimate(recordings, NETWORK, CONFIG, OPTIONS)
+    assert np.isfinite(void.velocity).all()
+    assert np.argmax(np.linalg.norm(void.velocity, axis=1) > 100) == row
+    for field in void.trajectory[1:]:
+        assert np.isfinite(field[:row]).all() and np.isnan(field[row:]).all()
+    words = f"filter: not healthy from {row / 10:.1f} s on, and all after it is void"
+    assert void.notes == (words,) and whole.notes == ()
+    scores = report.score([void, whole], {e.name: e.name for e in (void, whole)})
+    assert scores.diverged == [void.name]
+    assert scores.summary.mean["ate"] == scores.sequences[whole.name].values["ate"]
 
 
 def test_many_batches_of_unlike_lengths(walks):

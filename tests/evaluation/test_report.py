@@ -144,6 +144,40 @@ def test_divergence_is_in_the_files(tmp_path, with_divergence):
     assert read["reference_rows"]["never_moves"]["mean"]["diverged"] == 0
 
 
+def test_every_column_is_of_the_same_sequences(with_divergence):
+    """The lost walk is in no mean, not even with its coverage, what was accepted or its path."""
+    _, found = with_divergence
+    summary, sequences = found.scores.summary, found.scores.sequences
+    for name in ("nees_coverage", "nis_coverage", "accepted", "path_length", "duration", "ate"):
+        values = [sequences[walk].values[name] for walk in ("room 1/walk", "blind", "room 3")]
+        there = [value for value in values if value is not None]
+        assert summary.mean[name] == pytest.approx(np.mean(there)) and summary.count[name] == len(there)
+        assert summary.diverged[name] == 1
+
+
+def test_every_estimate_lost_has_a_reason_for_every_mean(tmp_path, with_divergence):
+    lost = [with_divergence[0][1]]
+    found = report.Report(SETTINGS, report.score(lost, {lost[0].name: "B"}), {}, {}, {})
+    report.write(tmp_path, found, lost)
+    read = json.loads((tmp_path / "metrics.json").read_text())
+    assert all(value is None for name, value in read["mean"].items() if name != "diverged")
+    assert read["undefined"].keys() == read["mean"].keys() - {"diverged"}
+    assert read["undefined"]["path_length"] == "no estimate that did not diverge"
+
+
+def test_a_bad_covariance_is_no_divergence(tmp_path, estimates):
+    """Its trajectory stays in the means; only its NEES is infinite."""
+    bad = estimates[0].position_covariance.copy()
+    bad[200:] = np.nan
+    of = [estimates[0]._replace(position_covariance=bad), estimates[1]]
+    found = report.Report(SETTINGS, report.score(of, {e.name: e.name for e in of}), {}, {}, {})
+    assert found.scores.diverged == [] and found.scores.summary.count["ate"] == 2
+    report.write(tmp_path, found, of)
+    read = json.loads((tmp_path / "metrics.json").read_text())
+    assert read["mean"]["diverged"] == 0 and read["mean"]["ate"] > 0
+    assert read["mean"]["nees"] is None and "too large" in read["undefined"]["nees"]
+
+
 def test_divergence_is_in_the_table(made, with_divergence):
     def text(of):
         console = Console(width=180, record=True, file=open("/dev/null", "w"))
@@ -169,6 +203,17 @@ def test_the_distribution_of_errors_counts_what_diverged(tmp_path, with_divergen
     assert of_all.get_ydata()[-1] == pytest.approx(1000 / 1200)
     assert right.get_lines()[0].get_ydata()[-1] == pytest.approx(2 / 3)
     plots.save_all(tmp_path, of, found, 1.0)
+
+
+def test_an_estimate_lost_before_the_reference_begins_is_drawn(estimates):
+    """No row has both, so nothing aligns it: the error is not there, its bounds are."""
+    whole, rows = estimates[0], np.arange(400)[:, None]
+    path, reference = (Trajectory(of.time, *(np.where(there, part, np.nan) for part in of[1:]))
+                       for of, there in ((whole.trajectory, rows < 5), (whole.reference, rows >= 10)))
+    figure = plots.position_error(whole._replace(trajectory=path, reference=reference))
+    for axes in figure.axes:
+        assert np.isnan(axes.get_lines()[0].get_ydata()).all()
+        assert np.isfinite(axes.collections[0].get_paths()[0].vertices).all()
 
 
 def test_a_folder_is_replaced_whole_or_not_at_all(tmp_path):
