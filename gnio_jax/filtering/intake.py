@@ -173,7 +173,7 @@ def _filtered(run: Run, count: int, last: int, design: Design) -> tuple[float, .
     fine = _interpolated(run, np.clip(points, run.stamps[0], run.stamps[-1]), design)
     # As far as there is something to reflect: a shorter run is truncated on both sides.
     reflected = min(low - centre + half, high - low) if run.first == 0 else 0
-    fine = np.pad(fine, ((reflected, 0), (0, 0)), mode="reflect", reflect_type="odd")
+    fine = np.concatenate([2 * fine[0] - fine[reflected:0:-1], fine])
     skipped = low - reflected - centre + half
     taps = design.taps[skipped : skipped + len(fine)]
     # From the centre on to either side the taps never sum to less than half the middle one.
@@ -189,6 +189,7 @@ def _interpolated(run: Run, points: Float[np.ndarray, "p"],
         fine = CubicSpline(run.stamps, run.samples)(points)
         wide = np.diff(run.stamps) > _LINE / design.imu_rate
         lines = wide[np.searchsorted(run.stamps[1:-1], points, side="right")]
-    for row, column in zip(fine.T, run.samples.T, strict=True):
-        row[lines] = np.interp(points[lines], run.stamps, column)
+    if lines.any():
+        for row, column in zip(fine.T, run.samples.T, strict=True):
+            row[lines] = np.interp(points[lines], run.stamps, column)
     return fine
