@@ -2,9 +2,12 @@
 
 It is what `data.resample` does to a recording: a cubic spline through the samples is read at
 `factor` points per grid sample, and a symmetric FIR makes one sample of them. The FIR of the grid
-sample at t reaches up to t + delay, so that it is known that much later; its stamp stays t. A hole
-ends a run of samples: the FIR is drained, odd reflection stands for what lies beyond the end, and
-it starts anew behind the hole. On the host; nothing older than the FIR's reach is kept.
+sample at t reaches up to t + delay, so that it is known that much later; its stamp stays t. At the
+start of the stream odd reflection stands for what was before it, as in a recording. A hole ends a
+run of samples: the FIR is drained and starts anew behind the hole, in both with the weights of what
+is there, divided by their sum. Odd reflection would hand over the last sample before the hole as
+raw as it is, with all its vibration, and the filter would hold that. A single lost sample is no
+hole. On the host; nothing older than the FIR's reach is kept.
 """
 
 from __future__ import annotations
@@ -21,6 +24,15 @@ from gnio_jax.decimation import decimation_factor, low_pass
 _CLOSEST = 0.25
 """Of the IMU's interval: a sample that comes sooner after another is left out (ours), or noise
 would make the spline swing."""
+_LINE = 1.75
+"""Of the IMU's interval: samples further apart are joined by a line (ours). There the spline has no
+hold, and swings the higher the wider the gap; a lost sample of a vibration is enough for that."""
+_LOST = 2.5
+"""Of the IMU's interval: samples no further apart belong to one run (ours), so that the loss of a
+single one does not end it."""
+_STOP = 5.0
+"""Of the grid's interval: what is longer is a stop of the IMU and says nothing of its rate (ours).
+Shorter ones may be jitter."""
 _BEFORE = 4
 """Samples kept before the FIR's reach, so that the spline's new end is not felt within it."""
 
@@ -31,13 +43,18 @@ class Design(NamedTuple):
     dt: float
     """Of the filter's grid, s."""
     hole: float
-    """Samples further apart belong to two runs, s."""
+    """The clock takes grid samples as missing between stamps further apart, s."""
     imu_rate: float
     """Hz, nominal."""
     factor: int
     """Points of the fine grid per grid sample; 1: there is no low-pass."""
     taps: Float[np.ndarray, "taps"]
     """Of the FIR, on the fine grid; (1,) where there is none."""
+
+    @property
+    def longest(self) -> float:
+        """Samples further apart belong to two runs, s. Never less than `hole`."""
+        return max(self.hole, _LOST / self.imu_rate)
 
     @property
     def delay(self) -> float:
@@ -68,8 +85,10 @@ class Intake(NamedTuple):
     """The first stamp, s."""
     newest: float
     """The newest stamp, s."""
-    samples: int
-    """How many there have been, missing ones included."""
+    intervals: int
+    """Between stamps, missing samples included, without those in which the IMU stopped."""
+    covered: float
+    """Their sum, s."""
     count: int
     """Grid samples made or passed over by the low-pass."""
     run: Run | None
@@ -91,6 +110,14 @@ def rounding(dt: float, time: float, origin: float) -> float:
     return 1e-6 * dt + 4 * math.ulp(max(abs(time), abs(origin)))
 
 
+def measure_rate(intake: Intake, time: float, design: Design) -> Intake:
+    """With the interval up to `time` counted, unless the IMU stopped in it."""
+    interval = time - intake.newest
+    if interval > max(design.hole, _STOP * design.dt):
+        return intake
+    return intake._replace(intervals=intake.intervals + 1, covered=intake.covered + interval)
+
+
 def take(intake: Intake | None, time: float, sample: tuple[float, ...],
          design: Design) -> tuple[Intake, list[Event]]:
     """The stream after one sample, and what the filter's clock is to be told.
@@ -98,13 +125,15 @@ def take(intake: Intake | None, time: float, sample: tuple[float, ...],
     Without a low-pass that is the sample itself. With one it is grid samples with their own stamps,
     in order, each as soon as the FIR's reach is there. In holes there are none.
     """
-    intake = Intake(time, time, 0, 0, None) if intake is None else intake
-    intake = intake._replace(newest=time, samples=intake.samples + 1)
+    if intake is None:
+        intake = Intake(time, time, 0, 0.0, 0, None)
+    else:
+        intake = measure_rate(intake, time, design)._replace(newest=time)
     if design.factor == 1:
         return intake, [(time, sample)]
     elapsed, slack = time - intake.origin, rounding(design.dt, time, intake.origin)
     there, run, count, events = all(map(math.isfinite, sample)), intake.run, intake.count, []
-    if run is not None and elapsed - run.stamps[-1] > design.hole:
+    if run is not None and elapsed - run.stamps[-1] > design.longest:
         last = _last(run, slack, design)
         while count * design.factor <= last:
             events.append((intake.origin + count * design.dt, _filtered(run, count, last, design)))
@@ -141,11 +170,26 @@ def _filtered(run: Run, count: int, last: int, design: Design) -> tuple[float, .
     half, centre = len(design.taps) // 2, count * design.factor
     low, high = max(centre - half, run.first), min(centre + half, last)
     points = np.arange(low, high + 1) * (design.dt / design.factor)
-    points = np.clip(points, run.stamps[0], run.stamps[-1])
+    fine = _interpolated(run, np.clip(points, run.stamps[0], run.stamps[-1]), design)
+    # As far as there is something to reflect: a shorter run is truncated on both sides.
+    reflected = min(low - centre + half, high - low) if run.first == 0 else 0
+    fine = np.concatenate([2 * fine[0] - fine[reflected:0:-1], fine])
+    skipped = low - reflected - centre + half
+    taps = design.taps[skipped : skipped + len(fine)]
+    # From the centre on to either side the taps never sum to less than half the middle one.
+    return tuple((taps @ fine / taps.sum()).tolist())
+
+
+def _interpolated(run: Run, points: Float[np.ndarray, "p"],
+                  design: Design) -> Float[np.ndarray, "p 6"]:
+    """The samples at some points of the run: a spline, and lines where they are far apart."""
     if len(run.stamps) < 4:
-        fine = np.stack([np.interp(points, run.stamps, column) for column in run.samples.T], axis=1)
+        fine, lines = np.empty((len(points), 6)), np.ones(len(points), bool)
     else:
         fine = CubicSpline(run.stamps, run.samples)(points)
-    beyond = (low - centre + half, centre + half - high)
-    fine = np.pad(fine, (beyond, (0, 0)), mode="reflect", reflect_type="odd")
-    return tuple((design.taps @ fine).tolist())
+        wide = np.diff(run.stamps) > _LINE / design.imu_rate
+        lines = wide[np.searchsorted(run.stamps[1:-1], points, side="right")]
+    if lines.any():
+        for row, column in zip(fine.T, run.samples.T, strict=True):
+            row[lines] = np.interp(points[lines], run.stamps, column)
+    return fine

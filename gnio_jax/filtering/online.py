@@ -29,7 +29,7 @@ from jaxtyping import Float, Int
 
 from gnio_jax.files import replacing
 from gnio_jax.filtering.gaps import bridge
-from gnio_jax.filtering.intake import Intake, Run, design, rounding, take
+from gnio_jax.filtering.intake import Intake, Run, design, measure_rate, rounding, take
 from gnio_jax.filtering.propagation import interval
 from gnio_jax.filtering.scekf import clone_step, expect, history, infer_window, measured, no_prediction, settled
 from gnio_jax.filtering.state import (
@@ -51,10 +51,10 @@ from gnio_jax.types import Array, InputError, Prediction
 LONGEST_GAP = 60.0
 """A stamp further than this from the one before is taken for a mistake (of its unit, most often), s."""
 
-_FORMAT = "gnio-jax tracker 2"
+_FORMAT = "gnio-jax tracker 3"
 _TRIAL = 100
-"""Grid samples after which the IMU's rate is held against `imu_rate`: by the number of stamps till
-then, which jitter hardly changes."""
+"""Every so many grid samples the IMU's rate is held against `imu_rate`: by the number of stamps
+till then, which jitter hardly changes. The time in which the IMU stopped does not count."""
 _MISSING = (math.nan,) * 6 + (0.0,)
 _PARTS = {"rotation": (3, 3), "velocity": (3,), "position": (3,), "gyro_bias": (3,), "accel_bias": (3,), "covariance": (15, 15),
           "accepted": (), "nis": (), "healthy": ()}
@@ -249,7 +249,7 @@ class Tracker:
         Returns the pose of a clone step, if one was made (of the last, after a gap), else None: then `pose()` has the newest.
         Raises `ValueError` naming the argument if the time does not increase, or by more than `LONGEST_GAP`, or a shape is wrong; then
         nothing has changed. So does an IMU that is so much faster than `imu_rate` that it would
-        alias; the first hundred grid samples show it.
+        alias; every hundred grid samples that is looked at.
         """
         stamp, sample = self._stamp(time), (*_three("gyro", gyro), *_three("accel", accel))
         self._intake, events = take(self._intake, stamp, sample, self._design)
@@ -417,9 +417,12 @@ class Tracker:
             if stamp - before > LONGEST_GAP:
                 raise ValueError(f"time: {stamp!r} is {stamp - before:g} s after the sample before, more than {LONGEST_GAP:g} s; "
                                  "stamps are in seconds, and after a long stop a new tracker starts better")
-            elapsed = stamp - self._intake.origin
-            if before - self._intake.origin < _TRIAL * self._config.dt <= elapsed:
-                found = self._intake.samples / elapsed
+            counted, slack = measure_rate(self._intake, stamp, self._design), rounding(
+                self._config.dt, stamp, self._intake.origin)
+            trials, now = ((each.covered + slack) // (_TRIAL * self._config.dt)
+                           for each in (self._intake, counted))
+            if now > trials:
+                found = counted.intervals / counted.covered
                 if found > 1.05 * self._design.fastest:
                     raise ValueError(f"imu_rate: the samples come at {found:.4g} Hz, the tracker "
                                      f"was made for {self._design.imu_rate:.4g} Hz: vibrations "

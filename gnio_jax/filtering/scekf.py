@@ -247,7 +247,7 @@ def traced_step(state: FilterState, imu: Imu, measure: Callable[[FilterState, Ar
     resting = Rest(jnp.bool_(False), jnp.zeros_like(outcome.nis), jnp.bool_(False))
     if config.zero_velocity_std > 0:
         state, quiet = rest(state, imu, config)
-        state, resting, correction = zero_velocity(state, quiet, newest, config)
+        state, resting, correction = zero_velocity(state, quiet, outcome.tried, newest, config)
         corrections.append(correction)
     kept = core_covariance(state.core_covariance)
     mean = (state.rotation, state.velocity, state.position, state.gyro_bias, state.accel_bias)

@@ -95,8 +95,8 @@ class FilterConfig:
     function of (gate_threshold − rᵀ S⁻¹ r) / gate_softness."""
     zero_velocity_std: float = 0.0
     """Standard deviation of the velocity at rest, m/s, used as a measurement while the IMU is
-    quiet; 0 for no such update. Where the gate of the displacements is active, a rest that does not
-    fit is refused, whatever `mahalanobis_fail_scale` and `gate_softness`."""
+    quiet; 0 for no such update. Where a displacement is tried in the same interval and its gate is
+    active, a rest that does not fit is refused, whatever `mahalanobis_fail_scale` and `gate_softness`."""
     rest_gyro: float = 0.05
     """Quiet: no |gyro − b_g| above this, rad/s …"""
     rest_accel: float = 0.3
@@ -250,6 +250,7 @@ class FirstEstimates(NamedTuple):
     χ² threshold it is bounded by the filter's own standard deviations, as δᵀ P⁻¹ δ ≤ rᵀ S⁻¹ r;
     above it, it feeds itself: a larger Φ[v, θ], a larger variance, a larger gain, a larger
     correction. So an update above the threshold sets all of them to the latest estimates (ours).
+    S is that of the update: a measurement with a weight or a scaled covariance corrects less.
     """
 
     velocity: Float[Array, "3"]

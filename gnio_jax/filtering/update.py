@@ -64,6 +64,8 @@ class Outcome(NamedTuple):
     """What became of a measurement; zeros and False where there was none."""
 
     present: Bool[Array, ""]
+    tried: Bool[Array, ""]
+    """Present, and not at gimbal lock: the gate judged it."""
     innovation: Float[Array, "3"]
     """r, m."""
     nis: Float[Array, ""]
@@ -204,8 +206,9 @@ def correct(state: FilterState, measurement: Measurement, newest: Array | int, o
     over_core, over_clones, jacobian = (jnp.where(accepted, root.solve(rows), 0.0) for rows in (over_core, over_clones, jacobian))
     of_new = jnp.zeros_like(over_core).at[:, OFFSET].set(jacobian[:, 6:]).at[:, MOVE].set(apart * jacobian[:, 6:])
     correction = Correction(whitened, over_core, over_clones, of_new, jacobian[:, :CLONE])
-    outcome = Outcome(present=present, innovation=innovation, nis=nis, volume=volume, gate_passed=weight, accepted=accepted)
-    large = accepted & (nis > config.gate_threshold)
+    outcome = Outcome(present=present, tried=tried, innovation=innovation, nis=nis, volume=volume, gate_passed=weight, accepted=accepted)
+    # What bounds the correction is rᵀ S⁻¹ r with the S of the update, that is after any scaling.
+    large = accepted & (jnp.dot(whitened, whitened) > config.gate_threshold)
     state = _relinearized(_apply(state, correction, newest), large)
     return state._replace(gate=memory), outcome, correction
 
@@ -241,15 +244,18 @@ class Rest(NamedTuple):
     accepted: Bool[Array, ""]
 
 
-def zero_velocity(state: FilterState, quiet: Bool[Array, ""], newest: Array | int,
+def zero_velocity(state: FilterState, quiet: Bool[Array, ""], tried: Bool[Array, ""],
+                  newest: Array | int,
                   config: FilterConfig) -> tuple[FilterState, Rest, Correction]:
     """One EKF update with the velocity measured as zero, if `quiet` (ours).
 
     The paper's gated head makes displacements small at rest instead. A quiet IMU may also glide at
-    constant velocity, so where the gate of the displacements is active this measurement has to pass
-    the same χ² test. Elsewhere, after the start and after a series of rejections, the filter may be
-    wrong about its velocity, and rest is what can tell it. The gate's memory is that of the
-    displacements alone: a false rest must not open their gate, nor keep it shut.
+    constant velocity, and a displacement of the same interval can tell. So where one was `tried`
+    and the gate is active, this measurement has to pass the same χ² test. Elsewhere the filter may
+    be wrong about its velocity, and rest is what can tell it: after the start, after a series of
+    rejections, and where there are no displacements. Without them the gate never becomes stale, and
+    a rest refused once would be refused for ever. The gate's memory is that of the displacements
+    alone: a false rest must not open their gate, nor keep it shut.
     """
     noise = config.zero_velocity_std**2 * np.eye(3, dtype=state.velocity.dtype)
     root = cholesky(jnp.where(quiet, state.core_covariance[VELOCITY, VELOCITY], 0.0) + noise)
@@ -257,7 +263,7 @@ def zero_velocity(state: FilterState, quiet: Bool[Array, ""], newest: Array | in
     nis = jnp.dot(whitened, whitened)
     fits = nis <= config.gate_threshold
     active, _ = _watching(state.gate, config, state.step * config.samples_per_clone)
-    accepted = quiet & (~active | fits)
+    accepted = quiet & (~(active & tried) | fits)
     picked = np.eye(CORE, dtype=state.velocity.dtype)[VELOCITY]
     rows = (state.core_covariance[VELOCITY], state.cross_covariance[VELOCITY], picked)
     core, clones, jacobian = (jnp.where(accepted, root.solve(part), 0.0) for part in rows)

@@ -200,16 +200,19 @@ def test_rest_counts_only_after_its_time(seconds, intervals):
     assert found == expected and sum(found) == 4 * (6 - intervals)
 
 
-def resting(now, converged=True, last_success=100, pause_end=0, speed=1.0, config=CONFIG):
+def resting(now, converged=True, last_success=100, pause_end=0, tried=True, speed=1.0,
+            config=CONFIG):
     """The state before and after the IMU is quiet at sample `now`, with a velocity of `speed` known
-    to 0.1 m/s per axis, and what the filter made of it."""
+    to 0.1 m/s per axis, and what the filter made of it. `tried`: there was a displacement, too."""
     config = dataclasses.replace(config, zero_velocity_std=0.05)
     (R, _, p), *_ = WALK
     std = filtering.InitialStd(velocity=0.1)
     state = filtering.initial_state(config, R, speed * np.array([0.6, 0.0, -0.8]), p, std=std)
     gate = filtering.GateState(jnp.bool_(converged), jnp.int32(last_success), jnp.int32(pause_end))
     state = state._replace(gate=gate, step=jnp.int32(now // N))
-    new, found, _ = zero_velocity(state, jnp.bool_(True), 0, config)
+    if state.first is not None:
+        state = state._replace(first=jax.tree.map(lambda part: part + 0.25, state.first))
+    new, found, _ = zero_velocity(state, jnp.bool_(True), jnp.bool_(tried), 0, config)
     return state, new, found
 
 
@@ -222,6 +225,7 @@ EDGE = np.sqrt(CONFIG.gate_threshold * (0.1**2 + 0.05**2))
     (dict(now=125), 3.0, False), (dict(now=130), 3.0, True),  # the last success is 0.5 s old, older
     (dict(now=110, converged=False), 3.0, True), (dict(now=110, last_success=-1), 3.0, False),
     (dict(now=110, pause_end=115), 3.0, True), (dict(now=115, pause_end=115), 3.0, False),
+    (dict(now=110, tried=False), 3.0, True), (dict(now=110, tried=False), 0.999 * EDGE, True),
 ])
 def test_rest_passes_a_chi_square_test_where_the_gate_is_active(gate, speed, accepted):
     state, new, found = resting(speed=speed, **gate)
@@ -231,6 +235,39 @@ def test_rest_passes_a_chi_square_test_where_the_gate_is_active(gate, speed, acc
     np.testing.assert_allclose(new.velocity, wanted, rtol=1e-12)
     variance = 1 / (1 / 0.1**2 + accepted / 0.05**2)
     np.testing.assert_allclose(np.diag(new.core_covariance)[3:6], variance, rtol=1e-12)
+
+
+@pytest.mark.parametrize("gate, speed, anew", [
+    (dict(now=110, converged=False), 3.0, True), (dict(now=110, converged=False), 0.1, False),
+    (dict(now=110), 3.0, False), (dict(now=110, tried=False), 3.0, True)])
+def test_rest_takes_first_estimates_anew_where_it_corrects_much(gate, speed, anew):
+    """Not where it was refused, and not where it fits."""
+    state, new, found = resting(speed=speed, config=filtering.FilterConfig(
+        DT, N, CLONES, jacobians="first"), **gate)
+    assert bool(found.accepted) == (speed == 0.1 or anew)
+    wanted = state.first
+    if anew:
+        wanted = wanted._replace(velocity=new.velocity, offset=new.offset, move=new.move,
+                                 clone_offset=new.clone_offset)
+        assert np.abs(new.velocity).max() < 1.0
+    jax.tree.map(np.testing.assert_array_equal, new.first, wanted)
+
+
+def test_rest_without_displacements_corrects_a_wrong_velocity():
+    """Displacements until interval 38 and then none; a false knock of 4 m/s; then 36 s at rest."""
+    config = filtering.FilterConfig(DT, N, CLONES, measurement_scale=1.0, zero_velocity_std=0.02,
+                                    rest_seconds=0.3, convergence_seconds=1.0)
+    intervals, last, knock = 400, 38, 39 * N
+    gyro, accel = np.zeros((N * intervals, 3)), np.tile([0, 0, 9.81], (N * intervals, 1))
+    accel[knock, 0] += 4.0 / DT
+    displacement = np.where(np.arange(intervals)[:, None] <= last, np.zeros(3), np.nan)
+    spread = np.tile(0.02**2 * np.eye(3), (intervals, 1, 1))
+    state = filtering.initial_state(config, np.eye(3), np.zeros(3), np.zeros(3))
+    final, history = filtering.run_filter(state, gyro, accel, displacement, spread, config, NOISE)
+    assert bool(final.gate.converged) and int(final.gate.pause_end) <= 0  # it never became stale
+    np.testing.assert_allclose(np.asarray(history.velocity)[39:41, 0], 4.0, atol=0.05)
+    assert history.rest_nis[42] > 100 and (np.asarray(history.at_rest)[42:] == 1).all()
+    assert np.linalg.norm(history.velocity[42]) < 1.0 and np.linalg.norm(final.velocity) < 0.05
 
 
 def test_a_quiet_ride_is_no_rest_and_a_wrong_start_is_corrected_by_rest():

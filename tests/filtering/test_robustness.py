@@ -3,15 +3,18 @@
 import dataclasses
 import functools
 
+import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from compiling import quick
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from test_scekf import random_walk
 
 from gnio_jax import filtering
-from gnio_jax.filtering import Tracker
+from gnio_jax.filtering import Tracker, update
+from gnio_jax.filtering.state import OFFSET
 from gnio_jax.types import Prediction
 
 N, CLONES, DT = 4, 4, 0.02
@@ -295,3 +298,42 @@ def test_first_estimates_are_taken_anew_only_above_the_threshold():
     assert large[8] and large[updated].sum() < 6
     assert (of_velocity[large] == 0).all() and (of_clones[large] == 0).all()
     assert (of_velocity[updated & ~large] > 0).all() and (of_clones[updated & ~large] > 0).all()
+
+
+@pytest.mark.parametrize(
+    "options, converged, accepted, anew",
+    [
+        (dict(), True, False, False),
+        (dict(), False, True, True),
+        (dict(mahalanobis_fail_scale=2.0), True, True, True),
+        (dict(mahalanobis_fail_scale=1e6), True, True, False),
+        (dict(gate_softness=1.0), False, True, True),
+        (dict(gate_softness=1.0), True, True, False),
+    ],
+    ids=["rejected", "gate open", "scaled", "scaled away", "weighted 1", "weighted 1e-6"],
+)
+def test_a_displacement_takes_first_estimates_anew_where_it_corrects_much(
+    options, converged, accepted, anew
+):
+    """Five metres of which the filter takes all, half, or nothing to speak of."""
+    config = dataclasses.replace(PLAIN, jacobians="first", convergence_seconds=10.0, **options)
+    state = filtering.initial_state(config, *WALK[0])
+    known = state.core_covariance.at[OFFSET, OFFSET].set(0.01 * jnp.eye(3))
+    state = state._replace(core_covariance=known)
+    gate = filtering.GateState(jnp.bool_(converged), jnp.int32(95), jnp.int32(0))
+    state = state._replace(step=jnp.int32(20), gate=gate)
+    state = state._replace(first=jax.tree.map(lambda part: part + 0.25, state.first))
+    measurement = update.Measurement(jnp.array([3.0, -4.0, 0.0]), 0.01 * jnp.eye(3), jnp.bool_(True))
+    new, outcome, made = update.correct(state, measurement, 0, 1, config, "given")
+    assert float(outcome.nis) > 50 and bool(outcome.accepted) == accepted
+    moved = float(jnp.linalg.norm((made.whitened @ made.core_rows)[OFFSET]))
+    assert bool(outcome.tried) and (moved > 1.0 if anew else moved < 0.01)
+    wanted = state.first
+    if anew:
+        wanted = wanted._replace(
+            velocity=new.velocity,
+            offset=new.offset,
+            move=new.move,
+            clone_offset=new.clone_offset,
+        )
+    jax.tree.map(np.testing.assert_array_equal, new.first, wanted)
