@@ -54,13 +54,16 @@ def trainer(config, source, seed=0):
 def trained():
     """Network, its state half way through training and at the end, and the windows it learns from: many walkers, or one window of a
     stranger decides a mean of (e/σ)²."""
-    source = source_of("train", 20)
-    model, state, take, steps = trainer(CONFIG, source)
+    return *run(0), source_of("train", 20)
+
+
+def run(seed):
+    model, state, take, steps = trainer(CONFIG, source_of("train", 20), seed)
     for epoch in range(CONFIG.optim.epochs):
         if epoch == CONFIG.optim.epochs // 2:
             midway = jax.tree.map(jnp.copy, state)  # the next step is given the arrays of the last
         state, _ = take(state, epoch, 0, steps)
-    return model, midway, state, source
+    return model, midway, state
 
 
 def estimated(model, state, source, config=CONFIG, key=0):
@@ -141,26 +144,33 @@ def test_constants_of_the_uncertainty_are_left_alone():
 
 
 def test_the_uncertainty_fits_the_errors_after_training(trained):
-    """(e/σ)² per axis on the validation split: with the start that poisons Adam one axis comes out at a hundredth."""
-    model, _, state, source = trained
-    held_out = source_of("val", 10)
-    with jax.enable_x64(False):
-        found = step.validate(estimated(model, state, source), held_out, losses.stage(CONFIG.loss, 0, 1), model=model, config=CONFIG)
-    print(found.axis_normalised)
-    assert np.all((found.axis_normalised > 0.5) & (found.axis_normalised < 2.5)), found.axis_normalised
+    """(e/σ)² per axis on the validation split, over two seeds: with a start that poisons Adam one axis comes out at a tenth."""
+    model, _, first, source = trained
+    held_out, found = source_of("val", 10), []
+    for state in (first, run(1)[-1]):
+        with jax.enable_x64(False):
+            state = estimated(model, state, source)
+            said = step.validate(state, held_out, losses.stage(CONFIG.loss, 0, 1), model=model, config=CONFIG)
+        found.append(said.axis_normalised)
+    typical = np.exp(np.mean(np.log(found), axis=0))
+    assert np.all((typical > 0.5) & (typical < 2.5)), found
 
 
-@pytest.mark.parametrize("width, seeds", [(16, range(10)), (64, range(1))])
+@pytest.mark.parametrize("width, seeds", [(16, range(10)), (32, range(1)), (64, range(1))])
 def test_no_spike_in_the_gradient_of_the_uncertainty(width, seeds):
-    """In the first 200 steps the largest norm of the gradient of the head stays within 100 times the median."""
-    config = dataclasses.replace(CONFIG, data=DataConfig(rate=20.0), model=ModelConfig(width=width), loss=LossConfig(),
-                                 optim=dataclasses.replace(CONFIG.optim, batch_size=16, learning_rate=1e-3))  # fmt: skip
+    """In the first 200 steps the largest norm of the gradient of the head stays within 100 times the median.
+
+    With the learning rates of configs/quickstart.yaml, whose warm-up these steps are.
+    """
     source = source_of("val", 2, 20.0)
+    warmup = 223 / (source.visited.shape[0] // 64)
+    optim = OptimConfig(epochs=24, batch_size=64, learning_rate=2e-3, start_learning_rate=1e-4, warmup_epochs=warmup)
+    config = dataclasses.replace(CONFIG, data=DataConfig(rate=20.0), model=ModelConfig(width=width), loss=LossConfig(), optim=optim)
     for seed in seeds:
-        _, state, take, _ = trainer(config, source, seed)
+        _, state, take, steps = trainer(config, source, seed)
         norms = []
         for number in range(200):
-            state, progress = take(state, 0, number, 1)
+            state, progress = take(state, number // steps, number % steps, 1)
             norms.append(float(progress.gradient_norms["uncertainty"]))
         assert max(norms) < 100 * np.median(norms), (seed, max(norms), np.median(norms))
 
