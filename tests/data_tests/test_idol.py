@@ -390,7 +390,6 @@ def test_one_wild_stamp_costs_one_row(tmp_path):
     table = frame()
     first = table.iloc[:1].assign(timestamp=0.0)
     write(tmp_path, pd.concat([first, table], ignore_index=True))
-    with pytest.warns(UserWarning, match="field 'time' has gaps longer than 1 s"):
-        (piece,) = data.load("idol", tmp_path, "known")
+    (piece,) = data.load("idol", tmp_path, "known")  # the row has no pose near it, and is cut off as such
     compare(piece)
     assert piece.attributes["lag"] == pytest.approx(0.0, abs=3e-3)

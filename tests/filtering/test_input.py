@@ -267,7 +267,9 @@ def test_rest_without_displacements_corrects_a_wrong_velocity():
     assert bool(final.gate.converged) and int(final.gate.pause_end) <= 0  # it never became stale
     np.testing.assert_allclose(np.asarray(history.velocity)[39:41, 0], 4.0, atol=0.05)
     assert history.rest_nis[42] > 100 and (np.asarray(history.at_rest)[42:] == 1).all()
-    assert np.linalg.norm(history.velocity[42]) < 1.0 and np.linalg.norm(final.velocity) < 0.05
+    speed = np.linalg.norm(history.velocity, axis=1)
+    # The filter was sure of its velocity: each interval at rest takes a part of the error away.
+    assert (np.diff(speed[41:52]) < -0.1).all() and speed[52] < 1.0 and speed[-1] < 0.05
 
 
 def test_a_quiet_ride_is_no_rest_and_a_wrong_start_is_corrected_by_rest():
