@@ -154,7 +154,7 @@ class _Run(NamedTuple):
 
     config: TrainConfig
     model: nn.Module
-    optimizer: optax.GradientTransformation
+    optimizer: optax.GradientTransformationExtraArgs
     learning_rate: optax.Schedule
     source: windows.WindowSource
     held_out: windows.WindowSource
@@ -184,9 +184,11 @@ def _prepare(config: TrainConfig, console: Console) -> _Run:
         raise InputError("optim.batch_size", f"is {size}, but there are only {count} windows", "lower it")
     steps_per_epoch = count // size
     key = jax.random.key(config.seed)
+    init_key, order_key, step_key = jax.random.split(key, 3)
+    statistics_key = jax.random.fold_in(key, 3)
     return _Run(config, model, optimizers.create(config.optim, config.loss, steps_per_epoch),
                 optimizers.schedule(config.optim, steps_per_epoch), source, held_out, splits, steps_per_epoch,
-                *jax.random.split(key, 3), jax.random.fold_in(key, 3))  # fmt: skip
+                init_key, order_key, step_key, statistics_key)  # fmt: skip
 
 
 def _run_epoch(

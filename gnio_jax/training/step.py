@@ -73,7 +73,7 @@ def train_steps(
     key: PRNGKeyArray,
     *,
     model: nn.Module,
-    optimizer: optax.GradientTransformation,
+    optimizer: optax.GradientTransformationExtraArgs,
     config: TrainConfig,
 ) -> tuple[TrainState, Progress]:
     """Take `count` steps of an epoch from its step number `first` on, in one dispatch; `learning_rate_factor` is
