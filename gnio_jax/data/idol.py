@@ -32,6 +32,7 @@ from gnio_jax.data.cache import Refusal, cached_pieces
 from gnio_jax.data.phones import held_out, poses_at, with_velocity
 from gnio_jax.data.recordings import divide, read_all
 from gnio_jax.data.sequence import (
+    LONGEST_BRIDGE,
     WINDOW_SECONDS,
     Dataset,
     Recording,
@@ -52,8 +53,6 @@ VERSION = "idol 2"
 
 PHONE_TO_RIG = Rotation.from_rotvec([-0.01853, 0.02801, 3.12916])
 """How the phone is bolted on, from gyro and reference of the whole set; the authors' own words are x → −x, y → −y."""
-MAX_GAP = 0.1
-"""s without a row that splines bridge."""
 MAX_TILT = 20.0
 """Degrees by which the map may be tilted; beyond, the attitude is not what it should be."""
 MAX_LAG = 0.4
@@ -167,7 +166,7 @@ def read_pieces(path: str | os.PathLike[str]) -> list[Sequence]:
     fit = pose_lag(closed, gyro, closed[known], attitude)
     if not fit.correlation >= 0.5:  # NaN when the poses do not turn at all
         raise Refusal(path, f"columns 'orient' do not turn as 'iphoneGyro' does (they correlate by {fit.correlation:.2f})", "leave it out")
-    position, attitude, valid = poses_at(time[known] - fit.lag, level.apply(columns["processedPos"][known]), attitude, time, MAX_GAP)
+    position, attitude, valid = poses_at(time[known] - fit.lag, level.apply(columns["processedPos"][known]), attitude, time, LONGEST_BRIDGE)
 
     inside = slice(int(np.argmax(valid)), len(valid) - int(np.argmax(valid[::-1])))
     device = _device(table, order, path)
@@ -198,7 +197,7 @@ def read_pieces(path: str | os.PathLike[str]) -> list[Sequence]:
         },
     )
     pieces = divide(validate(sequence, path), path)
-    return [validate(with_velocity(resample(piece, RATE, MAX_GAP)), path) for piece in pieces]
+    return [validate(with_velocity(resample(piece, RATE)), path) for piece in pieces]
 
 
 class Lag(NamedTuple):

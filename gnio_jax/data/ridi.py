@@ -28,6 +28,7 @@ from gnio_jax.data.cache import cached_pieces
 from gnio_jax.data.phones import find_folders, find_list, held_out, poses_at, with_velocity
 from gnio_jax.data.recordings import divide, read_all
 from gnio_jax.data.sequence import (
+    LONGEST_BRIDGE,
     WINDOW_SECONDS,
     Dataset,
     Recording,
@@ -50,8 +51,6 @@ NATIVE_RATE = 202.3
 """Hz, of data.csv."""
 RAW_RATES = (90.0, 1100.0)
 """Hz, of the text files: 200 in the set itself, more in what newer phones wrote."""
-MAX_GAP = 0.1
-"""s without an IMU sample or a pose that splines bridge."""
 
 _TABLE = Path("processed") / "data.csv"
 _LISTS = {"train": "list_train_publish_v2.txt", "val": "list_train_publish_v2.txt", "test": "list_test_publish_v2.txt",
@@ -147,7 +146,7 @@ def read_pieces(folder: str | os.PathLike[str]) -> list[Sequence]:
         },
     )
     pieces = divide(validate(sequence, source), place)
-    return [validate(with_velocity(resample(piece, RATE, MAX_GAP)), source) for piece in pieces]
+    return [validate(with_velocity(resample(piece, RATE)), source) for piece in pieces]
 
 
 class _Native(NamedTuple):
@@ -198,7 +197,7 @@ def _from_text(folder: Path) -> _Native:
 
     # Where the accelerometer is silent there is no IMU sample, whatever the gyro says. An odometry that was lost for long comes back
     # in a world of its own (23° turned, in one recording): such a gap ends a piece as one of the IMU does.
-    whole = (_interval(force_time, gyro_time) <= MAX_GAP) & (_interval(pose_time, gyro_time) <= WINDOW_SECONDS)
+    whole = (_interval(force_time, gyro_time) <= LONGEST_BRIDGE) & (_interval(pose_time, gyro_time) <= WINDOW_SECONDS)
     inside = (gyro_time >= max(force_time[0], pose_time[0])) & (gyro_time <= min(force_time[-1], pose_time[-1]))
     if not (force_time[0] < gyro_time[-1] and gyro_time[0] < force_time[-1]):
         raise InputError(folder / "acce.txt", f"field 'time' ({force_time[0]:.1f} to {force_time[-1]:.1f} s after the gyro's first stamp) "
@@ -209,7 +208,7 @@ def _from_text(folder: Path) -> _Native:
                                     f"the IMU's ({gyro_time[0]:.1f} to {gyro_time[-1]:.1f} s)", "check that the files are of one recording")
     time, gyro = gyro_time[inside & whole], gyro[inside & whole]
     attitude = _unit(pose[:, [6, 3, 4, 5]], "qx qy qz qw", pose_path)
-    position, turned, valid = poses_at(pose_time, pose[:, :3], attitude, time, MAX_GAP)
+    position, turned, valid = poses_at(pose_time, pose[:, :3], attitude, time, LONGEST_BRIDGE)
 
     device = None
     if (folder / "orientation.txt").is_file():
@@ -217,7 +216,7 @@ def _from_text(folder: Path) -> _Native:
         device_time = (device_stamps - start) * 1e-9
         check_increasing(device_time, folder / "orientation.txt")
         known = _unit(quaternion[:, [3, 0, 1, 2]], "qx qy qz qw", folder / "orientation.txt")
-        _, device, _ = poses_at(device_time, np.zeros((len(known), 3)), known, time, MAX_GAP)
+        _, device, _ = poses_at(device_time, np.zeros((len(known), 3)), known, time, LONGEST_BRIDGE)
     truth = "Tango VIO of the phone itself" if pose_path.name == "pose.txt" else "ARCore VIO of the phone itself"
     return _Native(time, float(start * 1e-9), gyro, CubicSpline(force_time, force, axis=0)(time), upright.apply(position),
                    upright * turned, device, valid, truth)
