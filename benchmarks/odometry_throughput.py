@@ -1,10 +1,12 @@
-"""Real-time factor of the whole odometry, the full-width network inside the filter's loop, for one sequence and for many side by side.
+"""Real-time factor of the whole odometry, the full-width network inside the filter's loop, for one
+sequence and for many side by side.
 
-    python benchmarks/odometry_throughput.py [--batches 1 8 32] [--seconds 20] [--repeats 3]
+    python -m benchmarks.odometry_throughput [--batches 1 8 32] [--seconds 20] [--repeats 3]
 
-Seconds of recording per second of computing, compilation apart; the best of the repeats. Beside it the same filter with measurements
-given, which tells the network's share, and, where PyTorch is installed, the forward pass of TLIO's network over the same number of
-windows at once (a bound for any filter that uses it).
+Seconds of recording per second of computing, compilation apart; the best of the repeats. Beside it
+the same filter with measurements given, which tells the network's share, and, where PyTorch is
+installed, the forward pass of TLIO's network over the same number of windows at once (a bound for
+any filter that uses it).
 """
 
 from __future__ import annotations
@@ -12,15 +14,16 @@ from __future__ import annotations
 import argparse
 import time
 
-import baseline
 import jax
 import numpy as np
+
+from benchmarks import baseline
 
 jax.config.update("jax_enable_x64", True)
 
 import jax.numpy as jnp  # noqa: E402
-from filter_throughput import DT, walk  # noqa: E402
 
+from benchmarks.filter_throughput import DT, walk  # noqa: E402
 from gnio_jax import filtering, models  # noqa: E402
 
 
@@ -36,7 +39,9 @@ def best(program, arguments, repeats: int) -> float:
 
 def measure(clone_rate: int, batch: int, seconds: float, repeats: int) -> dict[str, float]:
     config = filtering.FilterConfig(DT, round(1 / DT) // clone_rate, clone_rate)
-    gyro, accel, displacement, covariance = (np.tile(signal[None], (batch, *[1] * signal.ndim)) for signal in walk(seconds, config))
+    gyro, accel, displacement, covariance = (
+        np.tile(signal[None], (batch, *[1] * signal.ndim)) for signal in walk(seconds, config)
+    )
     state = filtering.initial_state(config, np.eye(3), np.array([1.2, 0.0, 0.0]), np.zeros(3))
     noise = filtering.NoiseModel.per_sample(1e-2, 3.16e-2, config.dt)
     model = models.create("gnio")
@@ -50,7 +55,9 @@ def measure(clone_rate: int, batch: int, seconds: float, repeats: int) -> dict[s
         return filtering.run_odometry(lean, state, gyro, accel, config, noise)[1].position
 
     def given(gyro, accel, displacement, covariance):
-        return filtering.run_filter(state, gyro, accel, displacement, covariance, config, noise)[1].position
+        return filtering.run_filter(state, gyro, accel, displacement, covariance, config, noise)[
+            1
+        ].position
 
     def for_all(function, shared: int):
         # A batch of one is the plain program: what a single recording costs.
@@ -65,16 +72,26 @@ def measure(clone_rate: int, batch: int, seconds: float, repeats: int) -> dict[s
     assert bool(jnp.isfinite(program(frozen, *signals)).all())
     whole = best(program, (frozen, *signals), repeats)
     alone = best(jax.jit(for_all(given, 0)), (*signals, displacement, covariance), repeats)
-    duration, windows = batch * gyro.shape[1] * DT, batch * (gyro.shape[1] // config.samples_per_clone - config.clones_per_window)
-    return {"whole": duration / whole, "filter": duration / alone, "ms a window": (whole - alone) / windows * 1e3, "compile": compiled,
-            "seconds": whole, "windows": windows}
+    duration, windows = (
+        batch * gyro.shape[1] * DT,
+        batch * (gyro.shape[1] // config.samples_per_clone - config.clones_per_window),
+    )
+    return {
+        "whole": duration / whole,
+        "filter": duration / alone,
+        "ms a window": (whole - alone) / windows * 1e3,
+        "compile": compiled,
+        "seconds": whole,
+        "windows": windows,
+    }
 
 
 def torch_forward(windows: int, batch: int, repeats: int) -> float | None:
     """Seconds that PyTorch needs for so many windows, `batch` at once, with TLIO's network."""
     try:
         import torch
-        from tlio_torch import TlioNetwork
+
+        from benchmarks.tlio_torch import TlioNetwork
     except ImportError:
         return None
     network, x = TlioNetwork(200).eval(), torch.randn(batch, 6, 200)
@@ -92,24 +109,41 @@ def torch_forward(windows: int, batch: int, repeats: int) -> float | None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--batches", type=int, nargs="+", default=[1, 8, 32])
-    parser.add_argument("--clone-rates", type=int, nargs="+", default=[20], help="clones per second; the network runs once for each")
+    parser.add_argument(
+        "--clone-rates",
+        type=int,
+        nargs="+",
+        default=[20],
+        help="clones per second; the network runs once for each",
+    )
     parser.add_argument("--seconds", type=float, default=20.0, help="length of the simulated walk")
     parser.add_argument("--repeats", type=int, default=3)
     arguments = parser.parse_args()
     filtering.cores_as_devices()
-    print(f"{jax.devices()[0].device_kind}, jax {jax.__version__}, 200 Hz IMU, network of full width; times real time\n")
-    print(f"{'clones':>7} {'batch':>6} {'whole':>9} {'filter':>9} {'ms/window':>10} {'compile s':>10} {'TLIO in PyTorch, forward':>25}")
+    print(
+        f"{jax.devices()[0].device_kind}, jax {jax.__version__}, 200 Hz IMU, network of full width; times real time\n"
+    )
+    print(
+        f"{'clones':>7} {'batch':>6} {'whole':>9} {'filter':>9} {'ms/window':>10} {'compile s':>10} {'TLIO in PyTorch, forward':>25}"
+    )
     figures = {}
     for rate in arguments.clone_rates:
         for batch in arguments.batches:
             row = measure(rate, batch, arguments.seconds, arguments.repeats)
             torch_seconds = torch_forward(int(row["windows"]), batch, arguments.repeats)
-            ratio = "" if torch_seconds is None else f"{torch_seconds / row['seconds']:.2f} of its time"
-            print(f"{rate:4} Hz {batch:6} {row['whole']:9.1f} {row['filter']:9.0f} {row['ms a window']:10.2f} {row['compile']:10.1f} "
-                  f"{ratio:>25}", flush=True)
+            ratio = (
+                "" if torch_seconds is None else f"{torch_seconds / row['seconds']:.2f} of its time"
+            )
+            print(
+                f"{rate:4} Hz {batch:6} {row['whole']:9.1f} {row['filter']:9.0f} {row['ms a window']:10.2f} {row['compile']:10.1f} "
+                f"{ratio:>25}",
+                flush=True,
+            )
             figures[f"times real time, {rate} Hz clones, batch {batch}"] = row["whole"]
             if torch_seconds is not None:
-                figures[f"PyTorch forward / whole odometry, {rate} Hz clones, batch {batch}"] = torch_seconds / row["seconds"]
+                figures[f"PyTorch forward / whole odometry, {rate} Hz clones, batch {batch}"] = (
+                    torch_seconds / row["seconds"]
+                )
     baseline.compare("odometry_throughput", figures)
 
 

@@ -1,4 +1,5 @@
-"""TLIO's network in PyTorch, written from its description, so that its gradient can be timed beside ours."""
+"""TLIO's network in PyTorch, written from its description, so that its gradient can be timed beside
+ours."""
 
 import torch
 from torch import nn
@@ -13,7 +14,9 @@ class _Block(nn.Module):
         )  # fmt: skip
         self.shortcut = nn.Identity()
         if stride != 1 or channels != features:
-            self.shortcut = nn.Sequential(nn.Conv1d(channels, features, 1, stride, bias=False), nn.BatchNorm1d(features))
+            self.shortcut = nn.Sequential(
+                nn.Conv1d(channels, features, 1, stride, bias=False), nn.BatchNorm1d(features)
+            )
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         return torch.relu(self.body(x) + self.shortcut(x))
@@ -27,15 +30,24 @@ def _head(positions: int) -> nn.Module:
 
 
 class TlioNetwork(nn.Module):
-    """Windows (b, 6, n) to displacement and log standard deviation (b, 3) each; 5,424,646 parameters at n = 200."""
+    """Windows (b, 6, n) to displacement and log standard deviation (b, 3) each; 5,424,646
+    parameters at n = 200."""
 
     def __init__(self, samples: int):
         super().__init__()
-        layers: list[nn.Module] = [nn.Conv1d(6, 64, 7, 2, 3, bias=False), nn.BatchNorm1d(64), nn.ReLU(), nn.MaxPool1d(3, 2, 1)]
+        layers: list[nn.Module] = [
+            nn.Conv1d(6, 64, 7, 2, 3, bias=False),
+            nn.BatchNorm1d(64),
+            nn.ReLU(),
+            nn.MaxPool1d(3, 2, 1),
+        ]
         channels = 64
         for group in range(4):
             features = 64 * 2**group
-            layers += [_Block(channels, features, 1 if group == 0 else 2), _Block(features, features, 1)]
+            layers += [
+                _Block(channels, features, 1 if group == 0 else 2),
+                _Block(features, features, 1),
+            ]
             channels = features
         self.encoder = nn.Sequential(*layers)
         self.mean, self.log_std = _head(-(-samples // 32)), _head(-(-samples // 32))

@@ -1,10 +1,12 @@
-"""Latency of the online filter with the full-width network: clone steps and ordinary samples, garbage collection on and off.
+"""Latency of the online filter with the full-width network: clone steps and ordinary samples,
+garbage collection on and off.
 
-    python benchmarks/tracker_latency.py [--steps 1500] [--width 64] [--imu-rate 200]
+    python -m benchmarks.tracker_latency [--steps 1500] [--width 64] [--imu-rate 200]
 
-200 Hz IMU, or a faster one through the low-pass to 200 Hz, a window of 200 samples, 20 Hz clones: a step
-has 50 ms. The weights are random, since time does not depend on them. Beside the time on the wall stands
-the processor time of the whole process, which other programs on the machine disturb less.
+200 Hz IMU, or a faster one through the low-pass to 200 Hz, a window of 200 samples, 20 Hz clones: a
+step has 50 ms. The weights are random, since time does not depend on them. Beside the time on the
+wall stands the processor time of the whole process, which other programs on the machine disturb
+less.
 """
 
 from __future__ import annotations
@@ -13,10 +15,11 @@ import argparse
 import gc
 import time
 
-import baseline
 import jax
 import jax.numpy as jnp
 import numpy as np
+
+from benchmarks import baseline
 
 jax.config.update("jax_enable_x64", True)
 
@@ -29,12 +32,17 @@ WARM_UP = 100
 def network(width: int):
     """A network whose random weights give displacements of a sensible size."""
     model = models.create("gnio", width=width)
-    shapes = jax.eval_shape(model.init, jax.random.key(0), jax.ShapeDtypeStruct((1, PER_CLONE * CLONES, 6), jnp.float32))
+    shapes = jax.eval_shape(
+        model.init, jax.random.key(0), jax.ShapeDtypeStruct((1, PER_CLONE * CLONES, 6), jnp.float32)
+    )
     random = np.random.default_rng(0)
 
     def drawn(leaf: jax.ShapeDtypeStruct) -> jax.Array:
         fan_in = max(1, int(np.prod(leaf.shape[:-1])))
-        return jnp.asarray(random.normal(0, fan_in**-0.5, leaf.shape) if leaf.ndim > 1 else np.ones(leaf.shape), jnp.float32)
+        return jnp.asarray(
+            random.normal(0, fan_in**-0.5, leaf.shape) if leaf.ndim > 1 else np.ones(leaf.shape),
+            jnp.float32,
+        )
 
     variables = jax.tree.map(drawn, shapes)
     print(f"{sum(leaf.size for leaf in jax.tree.leaves(variables['params'])):,} parameters")
@@ -42,8 +50,9 @@ def network(width: int):
     return lambda windows: models.Inference(model)(frozen, windows)
 
 
-def measure(tracker: filtering.Tracker, first: int, samples: int, imu_rate: float,
-            collect: bool) -> dict[str, np.ndarray]:
+def measure(
+    tracker: filtering.Tracker, first: int, samples: int, imu_rate: float, collect: bool
+) -> dict[str, np.ndarray]:
     """Milliseconds on the wall and of the processor of each push, with a clone step and without."""
     random = np.random.default_rng(first)
     gyro = 0.02 * random.standard_normal((samples, 3))
@@ -67,14 +76,21 @@ def measure(tracker: filtering.Tracker, first: int, samples: int, imu_rate: floa
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--steps", type=int, default=1500, help="clone steps measured, with garbage collection and without")
+    parser.add_argument(
+        "--steps",
+        type=int,
+        default=1500,
+        help="clone steps measured, with garbage collection and without",
+    )
     parser.add_argument("--width", type=int, default=64, help="of the network; 64 is the paper's")
     parser.add_argument("--imu-rate", type=float, default=RATE, help="of the samples pushed, Hz")
     arguments = parser.parse_args()
     imu_rate, per_step = arguments.imu_rate, round(PER_CLONE * arguments.imu_rate / RATE)
     config = filtering.FilterConfig(1 / RATE, PER_CLONE, CLONES)
     state = filtering.initial_state(config, np.eye(3), np.zeros(3), np.zeros(3))
-    print(f"{jax.devices()[0].device_kind}, jax {jax.__version__}, {imu_rate:g} Hz IMU, {RATE} Hz filter, {RATE / PER_CLONE:.0f} Hz clones")
+    print(
+        f"{jax.devices()[0].device_kind}, jax {jax.__version__}, {imu_rate:g} Hz IMU, {RATE} Hz filter, {RATE / PER_CLONE:.0f} Hz clones"
+    )
     predict = network(arguments.width)
     begin = time.perf_counter()
     tracker = filtering.Tracker(predict, state, config, filtering.NoiseModel(), imu_rate=imu_rate)
@@ -88,11 +104,18 @@ def main() -> None:
         pushed += arguments.steps * per_step
         for kind, values in found.items():
             p50, p99, most = np.percentile(values, [50, 99, 100])
-            print(f"{kind:>22} {'on' if collect else 'off':>9} {p50:8.3f} {p99:8.3f} {most:8.3f} {p99 / period:10.4f}", flush=True)
-            figures |= {f"{kind}, p50 ms, collector {'on' if collect else 'off'}": float(p50),
-                        f"{kind}, p99 ms, collector {'on' if collect else 'off'}": float(p99)}
+            print(
+                f"{kind:>22} {'on' if collect else 'off':>9} {p50:8.3f} {p99:8.3f} {most:8.3f} {p99 / period:10.4f}",
+                flush=True,
+            )
+            figures |= {
+                f"{kind}, p50 ms, collector {'on' if collect else 'off'}": float(p50),
+                f"{kind}, p99 ms, collector {'on' if collect else 'off'}": float(p99),
+            }
     pose = tracker.pose()
-    assert pose is not None and np.isfinite(pose.position).all(), "the filter diverged: the timing would mean nothing"
+    assert pose is not None and np.isfinite(pose.position).all(), (
+        "the filter diverged: the timing would mean nothing"
+    )
     if imu_rate == RATE:
         baseline.compare("tracker_latency", figures)
 

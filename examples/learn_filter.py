@@ -1,4 +1,5 @@
-"""Learn the filter of a trained run: python examples/learn_filter.py --workdir runs/mine. Network and filter are one program."""
+"""Learn the filter of a trained run: python examples/learn_filter.py --workdir runs/mine. Network
+and filter are one program."""
 
 import dataclasses
 import os
@@ -14,8 +15,8 @@ import numpy as np
 import optax
 from scipy.spatial.transform import Rotation
 
-from gnio_jax import cli
 from gnio_jax import config as configuration
+from gnio_jax.commands import console as cli
 from gnio_jax.types import InputError
 
 DESCRIPTION = """Fit the noise model and the uncertainty head of a trained run through its own filter.
@@ -70,22 +71,40 @@ class Pieces(NamedTuple):
 
 
 def cut(recordings: list, intervals: int, stride: int) -> Pieces:
-    """All pieces of `intervals` strides, one after the other, in which the reference can be trusted throughout."""
+    """All pieces of `intervals` strides, one after the other, in which the reference can be trusted
+    throughout."""
     length, found = intervals * stride, []
     for recording in recordings:
         s = recording.sequence
         for begin in range(0, len(s.time) - length, length):
             ends = begin + stride * np.arange(1, intervals + 1)
-            if s.valid[begin : begin + length + 1].all() and np.isfinite(s.velocity[begin : begin + length + 1]).all():
+            if (
+                s.valid[begin : begin + length + 1].all()
+                and np.isfinite(s.velocity[begin : begin + length + 1]).all()
+            ):
                 rotation = Rotation.from_quat(s.orientation[begin], scalar_first=True).as_matrix()
                 samples = slice(begin, begin + length)
-                found.append(Pieces(rotation, s.velocity[begin], s.position[begin], s.gyro[samples], s.accel[samples],
-                                    s.velocity[ends], s.position[ends]))
-    return Pieces(*(np.stack(column) for column in zip(*found, strict=True))) if found else Pieces(*[np.zeros((0,))] * 7)
+                found.append(
+                    Pieces(
+                        rotation,
+                        s.velocity[begin],
+                        s.position[begin],
+                        s.gyro[samples],
+                        s.accel[samples],
+                        s.velocity[ends],
+                        s.position[ends],
+                    )
+                )
+    return (
+        Pieces(*(np.stack(column) for column in zip(*found, strict=True)))
+        if found
+        else Pieces(*[np.zeros((0,))] * 7)
+    )
 
 
 def objective(model, filter_config, std, variables):
-    """The loss of (learnt, pieces): learnt holds the logarithms of the noise densities and the uncertainty head's parameters."""
+    """The loss of (learnt, pieces): learnt holds the logarithms of the noise densities and the
+    uncertainty head's parameters."""
     from gnio_jax import filtering, models
 
     def loss(learnt, pieces):
@@ -94,13 +113,29 @@ def objective(model, filter_config, std, variables):
         noise = filtering.NoiseModel(*jnp.exp(learnt["noise"]))
 
         def one(piece):
-            state = filtering.initial_state(filter_config, piece.rotation, piece.velocity, piece.position, std=std)
-            _, history = filtering.run_odometry(lambda windows: apply(frozen, windows)._replace(diagnostics={}), state, piece.gyro,
-                                                piece.accel, filter_config, noise)
-            error = jnp.concatenate([piece.true_velocity - history.velocity, piece.true_position - history.position], axis=1)
+            state = filtering.initial_state(
+                filter_config, piece.rotation, piece.velocity, piece.position, std=std
+            )
+            _, history = filtering.run_odometry(
+                lambda windows: apply(frozen, windows)._replace(diagnostics={}),
+                state,
+                piece.gyro,
+                piece.accel,
+                filter_config,
+                noise,
+            )
+            error = jnp.concatenate(
+                [piece.true_velocity - history.velocity, piece.true_position - history.position],
+                axis=1,
+            )
             root = jnp.linalg.cholesky(history.covariance[:, 3:9, 3:9])
-            white = jax.vmap(lambda r, e: jax.scipy.linalg.solve_triangular(r, e, lower=True))(root, error)
-            return jnp.mean(0.5 * jnp.sum(white**2, axis=1) + jnp.sum(jnp.log(jnp.diagonal(root, axis1=1, axis2=2)), axis=1))
+            white = jax.vmap(lambda r, e: jax.scipy.linalg.solve_triangular(r, e, lower=True))(
+                root, error
+            )
+            return jnp.mean(
+                0.5 * jnp.sum(white**2, axis=1)
+                + jnp.sum(jnp.log(jnp.diagonal(root, axis1=1, axis2=2)), axis=1)
+            )
 
         return jnp.mean(jax.vmap(one)(pieces))
 
@@ -113,9 +148,14 @@ def scored(model, variables, options, recordings, config, groups, progress, what
     from gnio_jax.evaluation import report
 
     network = evaluation.Network(models.Inference(model), models.freeze(model, variables))
-    estimates = evaluation.estimate(recordings, network, config.data, options, progress=lambda share: progress(what, share))
+    estimates = evaluation.estimate(
+        recordings, network, config.data, options, progress=lambda share: progress(what, share)
+    )
     sequences = report.score(estimates, groups).sequences.values()
-    return {name: float(np.mean([m.values[name] for m in sequences if m.values.get(name) is not None])) for name in ("ate", "nis", "nees")}
+    return {
+        name: float(np.mean([m.values[name] for m in sequences if m.values.get(name) is not None]))
+        for name in ("ate", "nis", "nees")
+    }
 
 
 def main() -> None:
@@ -135,22 +175,50 @@ def main() -> None:
     parts = {}
     for split in (options.train_split or config.data.train_split, options.test_split):
         sequences = data.load(config.dataset, root, split)
-        parts[split] = evaluation.prepare(sequences, config.data)[0], {s.name: str(s.attributes.get("group", s.name)) for s in sequences}
-    (learning, _), (testing, groups) = parts[options.train_split or config.data.train_split], parts[options.test_split]
+        parts[split] = (
+            evaluation.prepare(sequences, config.data)[0],
+            {s.name: str(s.attributes.get("group", s.name)) for s in sequences},
+        )
+    (learning, _), (testing, groups) = (
+        parts[options.train_split or config.data.train_split],
+        parts[options.test_split],
+    )
 
-    setup = dataclasses.replace(filter_config(config.data, config.filter), gate_softness=2.0, checkpoint_every=20)
+    setup = dataclasses.replace(
+        filter_config(config.data, config.filter), gate_softness=2.0, checkpoint_every=20
+    )
     intervals = round(options.seconds / config.data.stride_seconds)
     pieces = cut(learning, intervals, config.data.stride)
     if len(pieces.rotation) < options.batch_size:
-        raise InputError("--seconds", f"gives {len(pieces.rotation)} pieces, fewer than --batch-size {options.batch_size}",
-                         "make them shorter")
+        raise InputError(
+            "--seconds",
+            f"gives {len(pieces.rotation)} pieces, fewer than --batch-size {options.batch_size}",
+            "make them shorter",
+        )
     f = config.filter
-    std = filtering.InitialStd(np.radians(f.tilt_std_degrees), np.radians(f.yaw_std_degrees), f.velocity_std, f.position_std,
-                               f.gyro_bias_std, f.accel_bias_std)
+    std = filtering.InitialStd(
+        np.radians(f.tilt_std_degrees),
+        np.radians(f.yaw_std_degrees),
+        f.velocity_std,
+        f.position_std,
+        f.gyro_bias_std,
+        f.accel_bias_std,
+    )
     names = ("gyro_density", "accel_density", "gyro_bias_walk", "accel_bias_walk")
-    learnt = {"noise": jnp.log(jnp.array([getattr(f, name) for name in names])), "head": run.variables["params"]["uncertainty"]}
-    optimizer = optax.chain(optax.clip_by_global_norm(10.0), optax.multi_transform(
-        {"noise": optax.adam(options.learning_rate), "head": optax.adam(0.1 * options.learning_rate)}, {"noise": "noise", "head": "head"}))
+    learnt = {
+        "noise": jnp.log(jnp.array([getattr(f, name) for name in names])),
+        "head": run.variables["params"]["uncertainty"],
+    }
+    optimizer = optax.chain(
+        optax.clip_by_global_norm(10.0),
+        optax.multi_transform(
+            {
+                "noise": optax.adam(options.learning_rate),
+                "head": optax.adam(0.1 * options.learning_rate),
+            },
+            {"noise": "noise", "head": "head"},
+        ),
+    )
     loss = objective(run.model, setup, std, run.variables)
 
     @jax.jit
@@ -161,27 +229,55 @@ def main() -> None:
 
     rng, state, values = np.random.default_rng(options.seed), optimizer.init(learnt), []
     with cli.progress() as progress:
-        before = scored(run.model, run.variables, f, testing, config, groups, progress, "estimating as it was")
+        before = scored(
+            run.model, run.variables, f, testing, config, groups, progress, "estimating as it was"
+        )
         for index in range(options.steps):
             chosen = rng.choice(len(pieces.rotation), options.batch_size, replace=False)
             batch = Pieces(*(part[chosen] for part in pieces))
             learnt, state, value = step(learnt, state, batch)
             values.append(float(value))
             if not np.isfinite(values[-1]):
-                raise InputError(workdir, f"the loss is not finite at step {index}", "give a smaller --learning-rate")
+                raise InputError(
+                    workdir,
+                    f"the loss is not finite at step {index}",
+                    "give a smaller --learning-rate",
+                )
             progress(f"learning, loss {np.mean(values[-10:]):.2f}", (index + 1) / options.steps)
         found = dict(zip(names, np.exp(np.asarray(learnt["noise"])).tolist(), strict=True))
-        variables = {**run.variables, "params": {**run.variables["params"], "uncertainty": learnt["head"]}}
-        after = scored(run.model, variables, dataclasses.replace(f, **found), testing, config, groups, progress, "estimating as learnt")
+        variables = {
+            **run.variables,
+            "params": {**run.variables["params"], "uncertainty": learnt["head"]},
+        }
+        after = scored(
+            run.model,
+            variables,
+            dataclasses.replace(f, **found),
+            testing,
+            config,
+            groups,
+            progress,
+            "estimating as learnt",
+        )
 
     rows = [f"| {name} | {before[name]:.3g} | {after[name]:.3g} |" for name in before]
     rows += [f"| {name} | {getattr(f, name):.3g} | {found[name]:.3g} |" for name in names]
-    table = "\n".join([f"| {config.dataset} {options.test_split}, n = {len(testing)} | before | after |", "|---|---|---|", *rows])
+    table = "\n".join(
+        [
+            f"| {config.dataset} {options.test_split}, n = {len(testing)} | before | after |",
+            "|---|---|---|",
+            *rows,
+        ]
+    )
     tenth = max(1, len(values) // 10)
     print(table)
-    print(f"loss: {np.mean(values[:tenth]):.3f} at first, {np.mean(values[-tenth:]):.3f} at last ({len(pieces.rotation)} pieces)")
-    head = {"uncertainty" + jax.tree_util.keystr(path, simple=True, separator="."): np.asarray(leaf)
-            for path, leaf in jax.tree.leaves_with_path({"": learnt["head"]})}
+    print(
+        f"loss: {np.mean(values[:tenth]):.3f} at first, {np.mean(values[-tenth:]):.3f} at last ({len(pieces.rotation)} pieces)"
+    )
+    head = {
+        "uncertainty" + jax.tree_util.keystr(path, simple=True, separator="."): np.asarray(leaf)
+        for path, leaf in jax.tree.leaves_with_path({"": learnt["head"]})
+    }
     with replacing(workdir / "learnt_filter.npz") as temporary, open(temporary, "wb") as file:
         np.savez(file, **found, **head)
     print(f"kept: {workdir / 'learnt_filter.npz'}")

@@ -1,4 +1,5 @@
-"""Replay a recording through the online filter: python examples/replay_csv.py --workdir runs/mine --csv walk.csv."""
+"""Replay a recording through the online filter: python examples/replay_csv.py --workdir runs/mine
+--csv walk.csv."""
 
 import gc
 import os
@@ -11,8 +12,8 @@ os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
 import jax
 import numpy as np
 
-from gnio_jax import cli
 from gnio_jax import config as configuration
+from gnio_jax.commands import console as cli
 from gnio_jax.types import InputError
 
 DESCRIPTION = """Feed a recording to gnio_jax.filtering.Tracker sample by sample, as an app on a phone would.
@@ -44,8 +45,8 @@ class Replay:
 
 def read(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Stamps (n,), gyro (n, 3) and accel (n, 3) as they were recorded, not yet resampled."""
+    from gnio_jax.data.readers.text import numbers, read_csv
     from gnio_jax.data.sequence import check_increasing, read_hdf5
-    from gnio_jax.data.text import numbers, read_csv
 
     if path.suffix.lower() in (".h5", ".hdf5"):
         sequence = read_hdf5(path)
@@ -53,14 +54,22 @@ def read(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     table = read_csv(path)
     stamps = numbers(table, ["time"], path)[:, 0]
     if not np.isfinite(stamps).all():
-        raise InputError(path, f"field 'time' is empty in row {int(np.argmin(np.isfinite(stamps))) + 1}", "every sample needs a time")
+        raise InputError(
+            path,
+            f"field 'time' is empty in row {int(np.argmin(np.isfinite(stamps))) + 1}",
+            "every sample needs a time",
+        )
     check_increasing(stamps, path)
-    gyro, accel = (numbers(table, [f"{sensor}_{axis}" for axis in "xyz"], path) for sensor in ("gyro", "accel"))
+    gyro, accel = (
+        numbers(table, [f"{sensor}_{axis}" for axis in "xyz"], path) for sensor in ("gyro", "accel")
+    )
     return stamps, gyro, accel
 
 
 def main() -> None:
-    jax.config.update("jax_enable_x64", True)  # the filter needs float64; the network states its float32 everywhere
+    jax.config.update(
+        "jax_enable_x64", True
+    )  # the filter needs float64; the network states its float32 everywhere
     options = cli.parse(Replay, description=DESCRIPTION)
     path = Path(options.csv)
     stamps, gyro, accel = read(path)
@@ -73,18 +82,30 @@ def main() -> None:
     from gnio_jax.filtering import InitialStd, NoiseModel, Tracker
     from gnio_jax.training import checkpoint
 
-    run = checkpoint.load_run(Path(options.workdir) if options.workdir else configuration.newest_run())
+    run = checkpoint.load_run(
+        Path(options.workdir) if options.workdir else configuration.newest_run()
+    )
     chosen = run.config.filter
     config = odometry.filter_config(run.config.data, chosen)
-    noise = NoiseModel(chosen.gyro_density, chosen.accel_density, chosen.gyro_bias_walk, chosen.accel_bias_walk)
-    std = InitialStd(np.radians(chosen.tilt_std_degrees), np.radians(chosen.yaw_std_degrees), chosen.velocity_std, chosen.position_std,
-                     chosen.gyro_bias_std, chosen.accel_bias_std)
+    noise = NoiseModel(
+        chosen.gyro_density, chosen.accel_density, chosen.gyro_bias_walk, chosen.accel_bias_walk
+    )
+    std = InitialStd(
+        np.radians(chosen.tilt_std_degrees),
+        np.radians(chosen.yaw_std_degrees),
+        chosen.velocity_std,
+        chosen.position_std,
+        chosen.gyro_bias_std,
+        chosen.accel_bias_std,
+    )
     if len(stamps) < 2:
         raise InputError(path, "holds a single sample", "record a walk of some seconds")
     interval = float(np.median(np.diff(stamps)))
     hole = 1.5 * max(config.dt, interval)
 
-    frozen = models.freeze(run.model, run.variables)  # what depends on the weights alone is computed once
+    frozen = models.freeze(
+        run.model, run.variables
+    )  # what depends on the weights alone is computed once
 
     def predict(windows):
         return models.Inference(run.model)(frozen, windows)
@@ -93,8 +114,9 @@ def main() -> None:
         progress("compiling", 0.0)
         begin = time.perf_counter()
         try:
-            tracker = Tracker.from_rest(predict, config, noise, options.rest_seconds, std, hole,
-                                        imu_rate=1 / interval)
+            tracker = Tracker.from_rest(
+                predict, config, noise, options.rest_seconds, std, hole, imu_rate=1 / interval
+            )
         except ValueError as error:
             raise InputError("--rest-seconds", str(error)) from None
         compiled = time.perf_counter() - begin
@@ -116,33 +138,58 @@ def main() -> None:
             if k % 100 == 0:
                 progress(f"replaying {stamp - stamps[0]:.0f} s", (k + 1) / len(stamps))
     if not poses:
-        raise InputError(path, f"ends before the device was still for {options.rest_seconds:g} s without a missing sample",
-                         "record longer, or give a smaller --rest-seconds")
+        raise InputError(
+            path,
+            f"ends before the device was still for {options.rest_seconds:g} s without a missing sample",
+            "record longer, or give a smaller --rest-seconds",
+        )
 
-    estimated = Trajectory(*(np.array(column) for column in zip(*[(pose.time, pose.position, quaternion(pose.rotation)) for pose in poses],
-                                                                 strict=True)))
+    estimated = Trajectory(
+        *(
+            np.array(column)
+            for column in zip(
+                *[(pose.time, pose.position, quaternion(pose.rotation)) for pose in poses],
+                strict=True,
+            )
+        )
+    )
     out = Path(options.out or f"{path.stem}_trajectory.txt")
     with replacing(out) as temporary:
         write_tum(temporary, estimated)
-    unknown = Trajectory(estimated.time, np.full_like(estimated.position, np.nan), np.full_like(estimated.orientation, np.nan))
+    unknown = Trajectory(
+        estimated.time,
+        np.full_like(estimated.position, np.nan),
+        np.full_like(estimated.orientation, np.nan),
+    )
     picture = out.with_suffix(".png")
     with replacing(picture) as temporary:
-        plots.save(temporary, plots.trajectory(odometry.Estimate(path.stem, estimated, unknown), alignment="none"))
+        plots.save(
+            temporary,
+            plots.trajectory(odometry.Estimate(path.stem, estimated, unknown), alignment="none"),
+        )
 
     length = float(np.linalg.norm(np.diff(estimated.position, axis=0), axis=1).sum())
     rejected = sum(pose.accepted == 0 for pose in poses)
     worked = sum(of_step) + sum(of_push)
     lasted = stamps[-1] - stamps[0]
-    print(f"{lasted:.1f} s, {len(poses)} poses, {length:.1f} m walked, {rejected} measurements rejected"
-          + ("" if poses[-1].healthy else "; the filter DIVERGED"))
-    print(f"real-time factor {lasted / worked:.1f} (computing took {worked:.2f} s), compiled in {compiled:.1f} s")
+    print(
+        f"{lasted:.1f} s, {len(poses)} poses, {length:.1f} m walked, {rejected} measurements rejected"
+        + ("" if poses[-1].healthy else "; the filter DIVERGED")
+    )
+    print(
+        f"real-time factor {lasted / worked:.1f} (computing took {worked:.2f} s), compiled in {compiled:.1f} s"
+    )
     for what, seconds in (("clone step", of_step), ("other sample", of_push)):
         if seconds:
             p50, p99, most = 1e3 * np.percentile(seconds, [50, 99, 100])
-            print(f"latency of a push with a {what}: p50 {p50:.3f} ms, p99 {p99:.3f} ms, max {most:.3f} ms")
+            print(
+                f"latency of a push with a {what}: p50 {p50:.3f} ms, p99 {p99:.3f} ms, max {most:.3f} ms"
+            )
     if tracker.delay:
-        print(f"low-pass from {1 / interval:.4g} Hz to {1 / config.dt:.4g} Hz: "
-              f"poses come {1e3 * tracker.delay:.0f} ms later")
+        print(
+            f"low-pass from {1 / interval:.4g} Hz to {1 / config.dt:.4g} Hz: "
+            f"poses come {1e3 * tracker.delay:.0f} ms later"
+        )
     print(f"trajectory: {out}\npicture: {picture}")
 
 
@@ -150,7 +197,11 @@ def quaternion(rotation: np.ndarray) -> np.ndarray:
     """wxyz of a rotation matrix; NaN of one that is not finite."""
     from scipy.spatial.transform import Rotation
 
-    return Rotation.from_matrix(rotation).as_quat(scalar_first=True) if np.isfinite(rotation).all() else np.full(4, np.nan)
+    return (
+        Rotation.from_matrix(rotation).as_quat(scalar_first=True)
+        if np.isfinite(rotation).all()
+        else np.full(4, np.nan)
+    )
 
 
 if __name__ == "__main__":

@@ -11,7 +11,8 @@ from pathlib import Path
 
 @contextmanager
 def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Yield a temporary path beside `path`; on success it takes the place of `path`, on failure it is removed.
+    """Yield a temporary path beside `path`; on success it takes the place of `path`, on failure it
+    is removed.
 
     The folder is created when missing. A reader sees the old file or the whole new one.
     """
@@ -24,7 +25,9 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
         yield temporary
         umask = os.umask(0)
         os.umask(umask)
-        temporary.chmod(0o666 & ~umask)  # mkstemp makes it private; give it the mode any other new file would have
+        temporary.chmod(
+            0o666 & ~umask
+        )  # mkstemp makes it private; give it the mode any other new file would have
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)

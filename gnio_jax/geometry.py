@@ -1,7 +1,8 @@
-"""Rotations of the method: gravity and yaw frames, quaternions, the right Jacobian, on top of jaxlie.
+"""Rotations of the method: gravity and yaw frames, quaternions, the right Jacobian, on top of
+jaxlie.
 
-Every function acts on one element (use `jax.vmap` for more) unless its shape says otherwise, keeps the
-dtype of its input and has finite derivatives at its singular points.
+Every function acts on one element (use `jax.vmap` for more) unless its shape says otherwise, keeps
+the dtype of its input and has finite derivatives at its singular points.
 """
 
 from __future__ import annotations
@@ -20,19 +21,31 @@ Matrix = Float[jax.Array, "3 3"]
 Quaternion = Float[jax.Array, "4"]
 
 
-_GENERATORS = np.array([[[0, 0, 0], [0, 0, -1], [0, 1, 0]], [[0, 0, 1], [0, 0, 0], [-1, 0, 0]], [[0, -1, 0], [1, 0, 0], [0, 0, 0]]])
-"""hat of the unit vectors. Sums over three are spelt out in this file: XLA fuses them, while a reduction can end as a library call."""
+_GENERATORS = np.array(
+    [
+        [[0, 0, 0], [0, 0, -1], [0, 1, 0]],
+        [[0, 0, 1], [0, 0, 0], [-1, 0, 0]],
+        [[0, -1, 0], [1, 0, 0], [0, 0, 0]],
+    ]
+)
+"""hat of the unit vectors. Sums over three are spelt out in this file: XLA fuses them, while a
+reduction can end as a library call."""
 
 
 def hat(v: Vector) -> Matrix:
     """The cross-product matrix: hat(v) w = v × w."""
-    return v[0] * _GENERATORS[0].astype(v.dtype) + v[1] * _GENERATORS[1].astype(v.dtype) + v[2] * _GENERATORS[2].astype(v.dtype)
+    return (
+        v[0] * _GENERATORS[0].astype(v.dtype)
+        + v[1] * _GENERATORS[1].astype(v.dtype)
+        + v[2] * _GENERATORS[2].astype(v.dtype)
+    )
 
 
 def _series(squared: Scalar) -> tuple[Scalar, Scalar, Scalar]:
     """sin θ/θ, (1 − cos θ)/θ² and (θ − sin θ)/θ³ from θ².
 
-    The quotients lose digits as θ → 0 and have no derivative there, so below θ² = 1e-2 the power series takes over, to the last bit.
+    The quotients lose digits as θ → 0 and have no derivative there, so below θ² = 1e-2 the power
+    series takes over, to the last bit.
     """
     small = squared < 1e-2
     x = jnp.where(small, squared, 0.0)
@@ -40,9 +53,15 @@ def _series(squared: Scalar) -> tuple[Scalar, Scalar, Scalar]:
     half = 0.5 * jnp.sqrt(safe)
     sine, cosine = jnp.sin(half), jnp.cos(half)
     first = sine * cosine / half
-    return (jnp.where(small, 1 - x / 6 * (1 - x / 20 * (1 - x / 42 * (1 - x / 72))), first),
-            jnp.where(small, 0.5 - x / 24 * (1 - x / 30 * (1 - x / 56 * (1 - x / 90))), 2 * sine**2 / safe),
-            jnp.where(small, 1 / 6 - x / 120 * (1 - x / 42 * (1 - x / 72 * (1 - x / 110))), (1 - first) / safe))
+    return (
+        jnp.where(small, 1 - x / 6 * (1 - x / 20 * (1 - x / 42 * (1 - x / 72))), first),
+        jnp.where(
+            small, 0.5 - x / 24 * (1 - x / 30 * (1 - x / 56 * (1 - x / 90))), 2 * sine**2 / safe
+        ),
+        jnp.where(
+            small, 1 / 6 - x / 120 * (1 - x / 42 * (1 - x / 72 * (1 - x / 110))), (1 - first) / safe
+        ),
+    )
 
 
 def _polynomial(phi: Vector, squared: Scalar, first: Scalar, second: Scalar) -> Matrix:
@@ -63,37 +82,54 @@ def log(rotation: Matrix) -> Vector:
     return jaxlie.SO3.from_matrix(rotation).log()
 
 
-def matmul(a: Float[jax.Array, "p k *n"], b: Float[jax.Array, "k q *n"]) -> Float[jax.Array, "p q *n"]:
-    """a b for small matrices stacked along trailing axes, as a sum that XLA fuses with its neighbours, where a dot is a library call."""
+def matmul(
+    a: Float[jax.Array, "p k *n"], b: Float[jax.Array, "k q *n"]
+) -> Float[jax.Array, "p q *n"]:
+    """a b for small matrices stacked along trailing axes, as a sum that XLA fuses with its
+    neighbours, where a dot is a library call."""
     return functools.reduce(jnp.add, [a[:, None, k] * b[None, k] for k in range(b.shape[0])])
 
 
 def orthonormalize(rotation: Matrix) -> Matrix:
-    """The rotation nearest to a matrix that is one but for rounding: one Newton step R (3 I − RᵀR)/2 of the polar decomposition."""
-    return matmul(rotation, 1.5 * np.eye(3, dtype=rotation.dtype) - 0.5 * matmul(rotation.T, rotation))
+    """The rotation nearest to a matrix that is one but for rounding: one Newton step R (3 I −
+    RᵀR)/2 of the polar decomposition."""
+    return matmul(
+        rotation, 1.5 * np.eye(3, dtype=rotation.dtype) - 0.5 * matmul(rotation.T, rotation)
+    )
 
 
 def level(up: Vector) -> Matrix:
-    """The rotation body → world of yaw 0 (as `yaw` has it) that turns `up`, a direction in the body, to the world's z.
+    """The rotation body → world of yaw 0 (as `yaw` has it) that turns `up`, a direction in the
+    body, to the world's z.
 
-    Where the body's x axis is vertical, and its yaw with it undefined, the body's y axis takes the world's y.
+    Where the body's x axis is vertical, and its yaw with it undefined, the body's y axis takes the
+    world's y.
     """
     z = up / jnp.sqrt(jnp.sum(up * up))
     along = jnp.array([1.0, 0.0, 0.0], up.dtype) - z[0] * z  # the body's x axis, made horizontal
     squared = jnp.sum(along * along)
     vertical = squared < 1e-12
-    x = jnp.where(vertical, jnp.array([0.0, 0.0, 1.0], up.dtype) - z[2] * z, along) / jnp.sqrt(jnp.where(vertical, 1.0, squared))
+    x = jnp.where(vertical, jnp.array([0.0, 0.0, 1.0], up.dtype) - z[2] * z, along) / jnp.sqrt(
+        jnp.where(vertical, 1.0, squared)
+    )
     return jnp.stack([x, hat(z) @ x, z])
 
 
-def cumulative_rotation(start: Matrix, turns: Float[jax.Array, "3 3 n"]) -> Float[jax.Array, "3 3 n+1"]:
-    """R_0 = start, R_{j+1} = R_j turns_j: the rotation before each of n steps and after the last, along the last axis.
+def cumulative_rotation(
+    start: Matrix, turns: Float[jax.Array, "3 3 n"]
+) -> Float[jax.Array, "3 3 n+1"]:
+    """R_0 = start, R_{j+1} = R_j turns_j: the rotation before each of n steps and after the last,
+    along the last axis.
 
-    The products are formed in about log2(n) rounds over the whole array; each doubles the reach of every product.
+    The products are formed in about log2(n) rounds over the whole array; each doubles the reach of
+    every product.
     """
     products, reach = jnp.concatenate([start[:, :, None], turns], axis=2), 1
     while reach < products.shape[2]:
-        products = jnp.concatenate([products[:, :, :reach], matmul(products[:, :, :-reach], products[:, :, reach:])], axis=2)
+        products = jnp.concatenate(
+            [products[:, :, :reach], matmul(products[:, :, :-reach], products[:, :, reach:])],
+            axis=2,
+        )
         reach *= 2
     return products
 
@@ -109,7 +145,8 @@ def quaternion_from_matrix(rotation: Matrix) -> Quaternion:
 
 
 def right_jacobian(phi: Vector) -> Matrix:
-    """J_r(φ): exp(φ + δ) ≈ exp(φ) exp(J_r(φ) δ).  J_r = I − (1 − cos θ)/θ² hat(φ) + (θ − sin θ)/θ³ hat(φ)²."""
+    """J_r(φ): exp(φ + δ) ≈ exp(φ) exp(J_r(φ) δ).  J_r = I − (1 − cos θ)/θ² hat(φ) + (θ − sin θ)/θ³
+    hat(φ)²."""
     squared = jnp.sum(phi * phi)
     _, versine, excess = _series(squared)
     return _polynomial(phi, squared, -versine, excess)
@@ -118,7 +155,8 @@ def right_jacobian(phi: Vector) -> Matrix:
 def yaw_direction(rotation: Matrix) -> tuple[Scalar, Scalar]:
     """(cos, sin) of the yaw of `rotation`, yaw = atan2(R[1,0], R[0,0]).
 
-    At gimbal lock (both entries zero) the yaw is undefined: (1, 0) is returned, with zero derivative.
+    At gimbal lock (both entries zero) the yaw is undefined: (1, 0) is returned, with zero
+    derivative.
     """
     x, y = rotation[0, 0], rotation[1, 0]
     squared = x * x + y * y

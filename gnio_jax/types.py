@@ -55,7 +55,8 @@ class Sequence(NamedTuple):
     device_orientation: Float[np.ndarray, "n 4"] | None = None
     """The device's own body→world estimate (its yaw is arbitrary), where it gives one."""
     attributes: dict[str, Any] = {}
-    """Where it comes from: dataset, session, group, subject, device, placement, truth, licence, ... (str/float/bool)."""
+    """Where it comes from: dataset, session, group, subject, device, placement, truth, licence, ...
+    (str/float/bool)."""
 
 
 class Windows(NamedTuple):
@@ -66,7 +67,8 @@ class Windows(NamedTuple):
     displacement: Float[Array, "b 3"]
     """Displacement over the window in the same frame, m."""
     steps: Float[Array, "b n 3"]
-    """Its parts, from each sample's stamp to the next, m: what a network that predicts a velocity for every sample learns from."""
+    """Its parts, from each sample's stamp to the next, m: what a network that predicts a velocity
+    for every sample learns from."""
 
 
 class Prediction(NamedTuple):
@@ -77,4 +79,5 @@ class Prediction(NamedTuple):
     log_std: Float[Array, "*b 3"]
     """Logarithm of the standard deviation of `displacement`, per axis."""
     diagnostics: dict[str, Array] = {}
-    """What people want to look at: `gate`, `scale` (b, 3), `attention` (b, heads, m), where a model has them."""
+    """What people want to look at: `gate`, `scale` (b, 3), `attention` (b, heads, m), where a model
+    has them."""

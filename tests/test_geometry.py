@@ -14,7 +14,13 @@ AXIS = np.array([0.36, -0.48, 0.8])
 
 
 def differences(function, x, step=1e-6):
-    return np.stack([(np.asarray(function(x + step * e)) - np.asarray(function(x - step * e))) / (2 * step) for e in np.eye(x.size)], -1)
+    return np.stack(
+        [
+            (np.asarray(function(x + step * e)) - np.asarray(function(x - step * e))) / (2 * step)
+            for e in np.eye(x.size)
+        ],
+        -1,
+    )
 
 
 def test_hat_is_the_cross_product():
@@ -25,7 +31,9 @@ def test_hat_is_the_cross_product():
 @pytest.mark.parametrize("angle", ANGLES)
 def test_exp_and_its_derivative(angle):
     phi = jnp.asarray(angle * AXIS)
-    np.testing.assert_allclose(geometry.exp(phi), Rotation.from_rotvec(angle * AXIS).as_matrix(), atol=2e-15)
+    np.testing.assert_allclose(
+        geometry.exp(phi), Rotation.from_rotvec(angle * AXIS).as_matrix(), atol=2e-15
+    )
     expected = differences(lambda x: Rotation.from_rotvec(x).as_matrix(), angle * AXIS)
     np.testing.assert_allclose(jax.jacrev(geometry.exp)(phi), expected, atol=1e-9)
 
@@ -33,6 +41,7 @@ def test_exp_and_its_derivative(angle):
 @pytest.mark.parametrize("angle", ANGLES)
 def test_right_jacobian_and_its_derivative(angle):
     """J_r = ∫₀¹ exp(−s φ) ds, the upper right block of exp([−hat φ, I; 0, 0])."""
+
     def oracle(phi):
         block = np.zeros((6, 6))
         block[:3, :3], block[:3, 3:] = -np.cross(np.eye(3), phi), np.eye(3)
@@ -40,21 +49,31 @@ def test_right_jacobian_and_its_derivative(angle):
 
     phi = jnp.asarray(angle * AXIS)
     np.testing.assert_allclose(geometry.right_jacobian(phi), oracle(angle * AXIS), atol=3e-15)
-    np.testing.assert_allclose(jax.jacrev(geometry.right_jacobian)(phi), differences(oracle, angle * AXIS), atol=1e-8)
+    np.testing.assert_allclose(
+        jax.jacrev(geometry.right_jacobian)(phi), differences(oracle, angle * AXIS), atol=1e-8
+    )
 
 
 def test_right_jacobian_by_its_definition():
     phi, delta = np.array([0.5, -1.2, 0.8]), 1e-6 * np.array([1.0, -2.0, 0.5])
     turned = geometry.exp(jnp.asarray(phi)).T @ geometry.exp(jnp.asarray(phi + delta))
     wanted = geometry.right_jacobian(jnp.asarray(phi)) @ delta
-    np.testing.assert_allclose(Rotation.from_matrix(np.array(turned)).as_rotvec(), wanted, atol=1e-11)
+    np.testing.assert_allclose(
+        Rotation.from_matrix(np.array(turned)).as_rotvec(), wanted, atol=1e-11
+    )
 
 
 @pytest.mark.parametrize("dtype,tolerance", [(jnp.float64, 1e-14), (jnp.float32, 1e-6)])
 def test_dtype_is_kept(dtype, tolerance):
     phi = jnp.asarray([0.02, 0.01, -0.03], dtype)
-    for function in (geometry.exp, geometry.right_jacobian, geometry.hat, lambda v: geometry.log(geometry.exp(v)),
-                     lambda v: geometry.yaw_rotation(geometry.exp(v)), lambda v: geometry.quaternion_from_matrix(geometry.exp(v))):
+    for function in (
+        geometry.exp,
+        geometry.right_jacobian,
+        geometry.hat,
+        lambda v: geometry.log(geometry.exp(v)),
+        lambda v: geometry.yaw_rotation(geometry.exp(v)),
+        lambda v: geometry.quaternion_from_matrix(geometry.exp(v)),
+    ):
         assert function(phi).dtype == dtype
     np.testing.assert_allclose(geometry.exp(phi) @ geometry.exp(-phi), np.eye(3), atol=tolerance)
 
@@ -67,20 +86,28 @@ def test_cumulative_rotation(n):
     expected = [start]
     for step in phi:
         expected.append(expected[-1] * Rotation.from_rotvec(step))
-    found = geometry.cumulative_rotation(jnp.asarray(start.as_matrix()), jax.vmap(geometry.exp, out_axes=2)(jnp.asarray(phi)))
-    np.testing.assert_allclose(np.moveaxis(found, 2, 0), [rotation.as_matrix() for rotation in expected], atol=1e-14)
+    found = geometry.cumulative_rotation(
+        jnp.asarray(start.as_matrix()), jax.vmap(geometry.exp, out_axes=2)(jnp.asarray(phi))
+    )
+    np.testing.assert_allclose(
+        np.moveaxis(found, 2, 0), [rotation.as_matrix() for rotation in expected], atol=1e-14
+    )
 
 
 def test_matmul_is_a_stack_of_products():
     rng = np.random.default_rng(0)
     a, b = rng.standard_normal((3, 4, 5)), rng.standard_normal((4, 2, 5))
-    np.testing.assert_allclose(geometry.matmul(jnp.asarray(a), jnp.asarray(b)), np.einsum("pkn,kqn->pqn", a, b), rtol=1e-13)
+    np.testing.assert_allclose(
+        geometry.matmul(jnp.asarray(a), jnp.asarray(b)), np.einsum("pkn,kqn->pqn", a, b), rtol=1e-13
+    )
 
 
 @pytest.mark.parametrize("angle", [1e-9, 1e-3, 1.0, 3.0, np.pi - 1e-4])
 def test_log_inverts_exp(angle):
     phi = angle * AXIS
-    np.testing.assert_allclose(geometry.log(jnp.asarray(Rotation.from_rotvec(phi).as_matrix())), phi, atol=1e-12)
+    np.testing.assert_allclose(
+        geometry.log(jnp.asarray(Rotation.from_rotvec(phi).as_matrix())), phi, atol=1e-12
+    )
     jacobian = jax.jacrev(lambda x: geometry.log(geometry.exp(x)))(jnp.asarray(phi))
     np.testing.assert_allclose(jacobian, np.eye(3), atol=1e-6)
 
@@ -94,20 +121,32 @@ def test_log_and_quaternion_have_finite_derivatives_at_the_identity():
 def test_quaternions_are_wxyz():
     rotation = Rotation.from_euler("xyz", [0.4, -1.0, 2.0])
     wxyz = np.roll(rotation.as_quat(), 1)
-    np.testing.assert_allclose(geometry.matrix_from_quaternion(jnp.asarray(wxyz)), rotation.as_matrix(), atol=1e-15)
+    np.testing.assert_allclose(
+        geometry.matrix_from_quaternion(jnp.asarray(wxyz)), rotation.as_matrix(), atol=1e-15
+    )
     found = np.asarray(geometry.quaternion_from_matrix(jnp.asarray(rotation.as_matrix())))
     np.testing.assert_allclose(found * np.sign(found @ wxyz), wxyz, atol=1e-15)
 
 
-@pytest.mark.parametrize("angles", [(0.0, 0.0, 0.0), (0.5, -0.3, 2.0), (-2.5, 1.2, -3.0), (1.0, 0.1, np.pi)])
+@pytest.mark.parametrize(
+    "angles", [(0.0, 0.0, 0.0), (0.5, -0.3, 2.0), (-2.5, 1.2, -3.0), (1.0, 0.1, np.pi)]
+)
 def test_yaw_is_the_last_extrinsic_euler_angle(angles):
     rotation = Rotation.from_euler("xyz", angles)
     yaw = rotation.as_euler("xyz")[2]
     matrix = jnp.asarray(rotation.as_matrix())
-    np.testing.assert_allclose(np.exp(1j * float(geometry.yaw(matrix))), np.exp(1j * yaw), atol=1e-14)
-    np.testing.assert_allclose(geometry.yaw_rotation(matrix), Rotation.from_euler("z", yaw).as_matrix(), atol=1e-14)
-    np.testing.assert_allclose(geometry.rotation_z(jnp.asarray(yaw)), Rotation.from_euler("z", yaw).as_matrix(), atol=1e-14)
-    slope = jax.grad(lambda angle: geometry.yaw(geometry.rotation_z(angle) @ matrix))(jnp.asarray(0.01))
+    np.testing.assert_allclose(
+        np.exp(1j * float(geometry.yaw(matrix))), np.exp(1j * yaw), atol=1e-14
+    )
+    np.testing.assert_allclose(
+        geometry.yaw_rotation(matrix), Rotation.from_euler("z", yaw).as_matrix(), atol=1e-14
+    )
+    np.testing.assert_allclose(
+        geometry.rotation_z(jnp.asarray(yaw)), Rotation.from_euler("z", yaw).as_matrix(), atol=1e-14
+    )
+    slope = jax.grad(lambda angle: geometry.yaw(geometry.rotation_z(angle) @ matrix))(
+        jnp.asarray(0.01)
+    )
     np.testing.assert_allclose(slope, 1.0, atol=1e-12)
 
 

@@ -1,6 +1,8 @@
-"""Sequences that are slow to make (parsing text, aligning clocks) are kept as HDF5 beside the user's other caches.
+"""Sequences that are slow to make (parsing text, aligning clocks) are kept as HDF5 beside the
+user's other caches.
 
-The folder is $GNIO_CACHE, else $XDG_CACHE_HOME/gnio-jax, else ~/.cache/gnio-jax; it may be deleted at any time.
+The folder is $GNIO_CACHE, else $XDG_CACHE_HOME/gnio-jax, else ~/.cache/gnio-jax; it may be deleted
+at any time.
 """
 
 from __future__ import annotations
@@ -21,7 +23,8 @@ _NOTES, _COUNT = "warnings of the loader", "number of sequences"
 
 
 class Refusal(InputError):
-    """A recording that a loader has looked at and cannot use (ruined clock, implausible reference): worth remembering."""
+    """A recording that a loader has looked at and cannot use (ruined clock, implausible reference):
+    worth remembering."""
 
     def __init__(self, where: object, problem: str, remedy: str = ""):
         super().__init__(where, problem, remedy)
@@ -46,13 +49,15 @@ def cached(
 def cached_pieces(
     sources: Iterable[str | os.PathLike[str]], version: str, build: Callable[[], list[Sequence]]
 ) -> list[Sequence]:
-    """The sequences that `build` makes of the files `sources`, made only once per state of these files: one or more.
+    """The sequences that `build` makes of the files `sources`, made only once per state of these
+    files: one or more.
 
-    The key is each file's absolute path, size and modification time, and `version`, which the loader changes whenever it
-    would make other sequences of the same files (name it after the loader and its options: "oxiod 3"). What `build` warns of
-    is kept and said again. A `Refusal` that `build` raises is kept, too, and raised again; any other exception is not. A damaged
-    entry is made anew, and where nothing can be written the sequences are just made every time. Raises `InputError` when a source is
-    missing.
+    The key is each file's absolute path, size and modification time, and `version`, which the
+    loader changes whenever it would make other sequences of the same files (name it after the
+    loader and its options: "oxiod 3"). What `build` warns of is kept and said again. A `Refusal`
+    that `build` raises is kept, too, and raised again; any other exception is not. A damaged entry
+    is made anew, and where nothing can be written the sequences are just made every time. Raises
+    `InputError` when a source is missing.
     """
     states = []
     for source in sources:
@@ -75,7 +80,12 @@ def cached_pieces(
             raise Refusal(where, problem, remedy)
     except Refusal:
         raise
-    except (OSError, ValueError, TypeError, KeyError):  # InputError is a ValueError: a damaged entry
+    except (
+        OSError,
+        ValueError,
+        TypeError,
+        KeyError,
+    ):  # InputError is a ValueError: a damaged entry
         pass
 
     caught: list[warnings.WarningMessage] = []
@@ -92,13 +102,17 @@ def cached_pieces(
         raise
     finally:
         for warning in caught:
-            warnings.warn_explicit(warning.message, warning.category, warning.filename, warning.lineno)
+            warnings.warn_explicit(
+                warning.message, warning.category, warning.filename, warning.lineno
+            )
     notes = [str(warning.message) for warning in caught if warning.category is UserWarning]
     about = {_COUNT: len(sequences), _NOTES: json.dumps(notes)}
     try:
         # The first is written last: while it is absent there is no entry.
         for piece, sequence in reversed(list(enumerate(sequences))):
-            write_hdf5(_entry(key, piece), sequence._replace(attributes=sequence.attributes | about))
+            write_hdf5(
+                _entry(key, piece), sequence._replace(attributes=sequence.attributes | about)
+            )
     except OSError:
         pass
     return sequences
@@ -113,6 +127,12 @@ def _said_again(sequences: list[Sequence]) -> list[Sequence]:
     for note in json.loads(sequences[0].attributes[_NOTES]):
         warnings.warn(note, stacklevel=4)
     return [
-        sequence._replace(attributes={name: value for name, value in sequence.attributes.items() if name not in (_NOTES, _COUNT)})
+        sequence._replace(
+            attributes={
+                name: value
+                for name, value in sequence.attributes.items()
+                if name not in (_NOTES, _COUNT)
+            }
+        )
         for sequence in sequences
     ]

@@ -1,4 +1,5 @@
-"""One picture of a recording, by which an eye sees what the self-check's figures cannot say. Only imported when one is asked for."""
+"""One picture of a recording, by which an eye sees what the self-check's figures cannot say. Only
+imported when one is asked for."""
 
 from __future__ import annotations
 
@@ -23,16 +24,22 @@ COLOURS = 96
 
 
 def save(path: Path, figure: Figure) -> None:
-    """Write one figure as PNG, whole or not at all. A few colours make a third of the file: there may be hundreds of them."""
+    """Write one figure as PNG, whole or not at all. A few colours make a third of the file: there
+    may be hundreds of them."""
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
-    picture = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB").quantize(COLOURS, dither=Image.Dither.NONE)
+    picture = (
+        Image.fromarray(np.asarray(canvas.buffer_rgba()))
+        .convert("RGB")
+        .quantize(COLOURS, dither=Image.Dither.NONE)
+    )
     with replacing(path) as temporary:
         picture.save(temporary, format="PNG", optimize=True)
 
 
 def overview(sequence: Sequence, check: SelfCheck) -> Figure:
-    """Trajectory from above, and over time: speed, |accel|, angle between integrated gyro and reference. Shaded: not valid."""
+    """Trajectory from above, and over time: speed, |accel|, angle between integrated gyro and
+    reference. Shaded: not valid."""
     figure = Figure(figsize=(11.0, 5.4), dpi=90, layout="constrained")
     grid = figure.add_gridspec(3, 2, width_ratios=(1.0, 1.25))
     _plan(figure.add_subplot(grid[:, 0]), sequence)
@@ -50,11 +57,15 @@ def overview(sequence: Sequence, check: SelfCheck) -> Figure:
     panels[0].plot(time[::every], speed[::every], color=BLUE, lw=0.9)
     panels[0].set_ylabel("speed (m/s)")
     panels[0].set_ylim(bottom=0.0)
-    panels[1].plot(time[::every], np.linalg.norm(sequence.accel, axis=1)[::every], color=VERMILION, lw=0.5)
+    panels[1].plot(
+        time[::every], np.linalg.norm(sequence.accel, axis=1)[::every], color=VERMILION, lw=0.5
+    )
     panels[1].set_ylabel("|accel| (m/s²)")
     window = min(WINDOW_SECONDS, (time[-1] - time[0]) / 4)
     starts, degrees = gyro_windows(sequence, window)
-    panels[2].plot(starts - sequence.time[0] + window / 2, degrees, "o-", color=GREEN, ms=2.5, lw=0.7)
+    panels[2].plot(
+        starts - sequence.time[0] + window / 2, degrees, "o-", color=GREEN, ms=2.5, lw=0.7
+    )
     panels[2].set_ylabel(f"gyro vs. reference\nover {window:.3g} s (°)")
     panels[2].set_ylim(bottom=0.0)
     panels[2].set_xlabel("time (s)")
@@ -64,9 +75,14 @@ def overview(sequence: Sequence, check: SelfCheck) -> Figure:
         panels[0].legend(loc="upper right", fontsize=8, framealpha=0.9)
     for panel in panels:
         _finish(panel)
-    verdict = f"left out: {check.failures[0]}" if check.failures else f"{check.share_valid:.1%} valid"
-    figure.suptitle(f"{_short(str(sequence.attributes.get('dataset', '')))} {_short(sequence.name)}: {check.duration:.0f} s at "
-                    f"{check.rate:.4g} Hz, {verdict}".strip(), fontsize=10)
+    verdict = (
+        f"left out: {check.failures[0]}" if check.failures else f"{check.share_valid:.1%} valid"
+    )
+    figure.suptitle(
+        f"{_short(str(sequence.attributes.get('dataset', '')))} {_short(sequence.name)}: {check.duration:.0f} s at "
+        f"{check.rate:.4g} Hz, {verdict}".strip(),
+        fontsize=10,
+    )
     return figure
 
 
@@ -76,7 +92,17 @@ def _plan(axes: Axes, sequence: Sequence) -> None:
     if rows.size:
         every = max(len(place) // POINTS, 1)
         axes.plot(place[::every, 0], place[::every, 1], color=BLUE, lw=0.9)
-        axes.plot(*place[rows[0]], "o", color=GREY, mfc="white", ms=8, mew=1.8, zorder=4, label="start", ls="none")
+        axes.plot(
+            *place[rows[0]],
+            "o",
+            color=GREY,
+            mfc="white",
+            ms=8,
+            mew=1.8,
+            zorder=4,
+            label="start",
+            ls="none",
+        )
         axes.plot(*place[rows[-1]], "s", color=GREY, ms=7, zorder=4, label="end", ls="none")
         axes.legend(loc="best", fontsize=8, framealpha=0.9)
         axes.margins(0.08)

@@ -1,4 +1,5 @@
-"""From recordings that were found to sequences: what every loader's `read` shares, and work on many recordings by many processes."""
+"""From recordings that were found to sequences: what every loader's `read` shares, and work on many
+recordings by many processes."""
 
 from __future__ import annotations
 
@@ -53,8 +54,8 @@ def divide(sequence: Sequence, source: object) -> list[Sequence]:
     Each piece is a sequence of its own, since a filter integrates whatever lies between its first
     and its last sample. They share `group`, so that splits and intervals take them as one. A piece
     that holds no window with a valid reference is lost; a warning names what was kept and what was
-    lost. Where one piece is left it keeps the recording's name, of several each has a number. Raises
-    `Refusal` when none is left.
+    lost. Where one piece is left it keeps the recording's name, of several each has a number.
+    Raises `Refusal` when none is left.
     """
     time, parts = sequence.time, stretches(sequence.time)
     if len(parts) == 1:
@@ -64,11 +65,16 @@ def divide(sequence: Sequence, source: object) -> list[Sequence]:
     gaps, seconds = first[1:] - last[:-1], last - first
     whole = [_longest_valid(time[part], sequence.valid[part]) for part in parts]
     kept = [k for k, longest in enumerate(whole) if longest >= WINDOW_SECONDS - STAMP_ROUNDING]
-    problem = (f"field 'time' has gaps longer than {WINDOW_SECONDS:g} s ({len(gaps)}, "
-               f"up to {gaps.max():.1f} s)")
+    problem = (
+        f"field 'time' has gaps longer than {WINDOW_SECONDS:g} s ({len(gaps)}, "
+        f"up to {gaps.max():.1f} s)"
+    )
     if not kept:
-        raise Refusal(source, f"{problem}, and no piece between them holds a window with a reference",
-                      "leave it out")
+        raise Refusal(
+            source,
+            f"{problem}, and no piece between them holds a window with a reference",
+            "leave it out",
+        )
     names = {k: f"{sequence.name}_piece{number}" for number, k in enumerate(kept, 1)}
     if len(kept) == 1:
         names[kept[0]] = sequence.name
@@ -77,19 +83,27 @@ def divide(sequence: Sequence, source: object) -> list[Sequence]:
     lost = f"{gaps.sum():.1f} s in gaps"
     if len(kept) < len(parts):
         lost += f", {short:.1f} s in pieces without a whole window"
-    warnings.warn(f"{source}: {problem}; kept: {seconds[kept].sum():.1f} of {last[-1] - first[0]:.1f} s, "
-                  f"{held}; lost: {lost}", stacklevel=2)
+    warnings.warn(
+        f"{source}: {problem}; kept: {seconds[kept].sum():.1f} of {last[-1] - first[0]:.1f} s, "
+        f"{held}; lost: {lost}",
+        stacklevel=2,
+    )
     return [_piece(sequence, names[k], parts[k]) for k in kept]
 
 
 def _piece(sequence: Sequence, name: str, part: slice) -> Sequence:
-    fields = {field: value[part] for field, value in sequence._asdict().items()
-              if isinstance(value, np.ndarray)}
+    fields = {
+        field: value[part]
+        for field, value in sequence._asdict().items()
+        if isinstance(value, np.ndarray)
+    }
     begin = float(sequence.time[part.start])
     attributes = dict(sequence.attributes)
     if "start_time" in attributes:
         attributes["start_time"] += begin
-    return sequence._replace(**fields | {"name": name, "time": fields["time"] - begin, "attributes": attributes})
+    return sequence._replace(
+        **fields | {"name": name, "time": fields["time"] - begin, "attributes": attributes}
+    )
 
 
 def _longest_valid(time: np.ndarray, valid: np.ndarray) -> float:
@@ -101,7 +115,8 @@ def _longest_valid(time: np.ndarray, valid: np.ndarray) -> float:
 
 
 def read_all(dataset: Dataset, root: Path, split: str) -> list[Sequence]:
-    """The sequences of a split; those that are of no use or fail the physical self-check are named in a warning and left out.
+    """The sequences of a split; those that are of no use or fail the physical self-check are named
+    in a warning and left out.
 
     Raises `InputError` when a file is damaged or no sequence is left.
     """
@@ -113,19 +128,32 @@ def read_all(dataset: Dataset, root: Path, split: str) -> list[Sequence]:
         except Refusal as refusal:
             warnings.warn(f"{recording.name}: left out: {refusal}", stacklevel=2)
     if not sequences:
-        raise InputError(root, f"none of the {len(found)} recordings of split '{split}' can be used", "see the warnings above")
-    return keep_plausible(sequences, dataset.pedestrian, dataset.min_correlation, dataset.needs_reference)
+        raise InputError(
+            root,
+            f"none of the {len(found)} recordings of split '{split}' can be used",
+            "see the warnings above",
+        )
+    return keep_plausible(
+        sequences, dataset.pedestrian, dataset.min_correlation, dataset.needs_reference
+    )
 
 
-def in_splits(dataset: Dataset, root: Path, wanted: str) -> tuple[dict[str, Recording], dict[str, tuple[str, ...]], list[str]]:
-    """(recordings by name, the names of each split, what could not be found and was warned of) of a split, or of every split: "all".
+def in_splits(
+    dataset: Dataset, root: Path, wanted: str
+) -> tuple[dict[str, Recording], dict[str, tuple[str, ...]], list[str]]:
+    """(recordings by name, the names of each split, what could not be found and was warned of) of a
+    split, or of every split: "all".
 
-    A dataset's own split of that name is every recording below the root. Raises `InputError` on an unknown split, or when none of the
-    splits holds a recording.
+    A dataset's own split of that name is every recording below the root. Raises `InputError` on an
+    unknown split, or when none of the splits holds a recording.
     """
     known = dataset.splits_at(root)
     if wanted != "all" and wanted not in known:
-        raise InputError(f"dataset {dataset.name}", f"unknown split '{wanted}'", f"known splits: {', '.join(known)}, all")
+        raise InputError(
+            f"dataset {dataset.name}",
+            f"unknown split '{wanted}'",
+            f"known splits: {', '.join(known)}, all",
+        )
     found: dict[str, Recording] = {}
     splits: dict[str, tuple[str, ...]] = {}
     notes: list[str] = []
@@ -146,10 +174,26 @@ def in_splits(dataset: Dataset, root: Path, wanted: str) -> tuple[dict[str, Reco
         for recording in here:
             found.setdefault(recording.name, recording)
     if not found and mistakes:
-        raise mistakes[-1 if "all" in known else 0]  # where a split takes everything, it says best why there is nothing
+        raise mistakes[
+            -1 if "all" in known else 0
+        ]  # where a split takes everything, it says best why there is nothing
     if not found:
-        raise InputError(root, f"split '{wanted}' of dataset '{dataset.name}' holds no recording", f"expected layout: {dataset.layout}")
-    return found, splits, [*notes, *(f"nothing in split {', '.join(empty)}: {reason}" for reason, empty in reasons.items())]
+        raise InputError(
+            root,
+            f"split '{wanted}' of dataset '{dataset.name}' holds no recording",
+            f"expected layout: {dataset.layout}",
+        )
+    return (
+        found,
+        splits,
+        [
+            *notes,
+            *(
+                f"nothing in split {', '.join(empty)}: {reason}"
+                for reason, empty in reasons.items()
+            ),
+        ],
+    )
 
 
 class Examined(NamedTuple):
@@ -174,17 +218,31 @@ def examine(recording: Recording, dataset: Dataset) -> Examined:
                 problem = "no piece of it is long enough"
         except InputError as error:
             problem = str(error).removeprefix(f"{recording.name}: ")
-        checked = [(sequence, judge(sequence, dataset.pedestrian, dataset.min_correlation, dataset.needs_reference))
-                   for sequence in sequences]
-    return Examined(checked, problem, tuple(dict.fromkeys(str(warning.message) for warning in caught)))
+        checked = [
+            (
+                sequence,
+                judge(
+                    sequence, dataset.pedestrian, dataset.min_correlation, dataset.needs_reference
+                ),
+            )
+            for sequence in sequences
+        ]
+    return Examined(
+        checked, problem, tuple(dict.fromkeys(str(warning.message) for warning in caught))
+    )
 
 
 def each(
-    function: Callable[..., Result], items: list[tuple], workers: int | None = None, done: Callable[[float], None] = lambda share: None
+    function: Callable[..., Result],
+    items: list[tuple],
+    workers: int | None = None,
+    done: Callable[[float], None] = lambda share: None,
 ) -> Iterator[Result]:
-    """`function(*item)` of every item, in their order, by `workers` processes (None: as many as there are cores, if it is worth it).
+    """`function(*item)` of every item, in their order, by `workers` processes (None: as many as
+    there are cores, if it is worth it).
 
-    `done` is told the share that is finished. Function and items must survive pickling when there is more than one process.
+    `done` is told the share that is finished. Function and items must survive pickling when there
+    is more than one process.
     """
     count = usable_cores() if workers is None else workers
     count = 1 if workers is None and len(items) <= FEW else min(count, len(items))
@@ -196,7 +254,12 @@ def each(
     # Processes are spawned: a fork after JAX has started its threads can hang.
     context = multiprocessing.get_context("spawn")
     # Ctrl-C is this process's to answer.
-    with ProcessPoolExecutor(count, mp_context=context, initializer=signal.signal, initargs=(signal.SIGINT, signal.SIG_IGN)) as pool:
+    with ProcessPoolExecutor(
+        count,
+        mp_context=context,
+        initializer=signal.signal,
+        initargs=(signal.SIGINT, signal.SIG_IGN),
+    ) as pool:
         futures = [pool.submit(function, *item) for item in items]
         try:
             for finished, _ in enumerate(as_completed(futures), 1):
@@ -204,6 +267,8 @@ def each(
             for future in futures:
                 yield future.result()
         except BrokenProcessPool:
-            raise InputError("--workers", "a process died, perhaps for want of memory", "try --workers 1") from None
+            raise InputError(
+                "--workers", "a process died, perhaps for want of memory", "try --workers 1"
+            ) from None
         finally:
             pool.shutdown(wait=False, cancel_futures=True)

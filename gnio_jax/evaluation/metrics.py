@@ -1,11 +1,11 @@
 """Errors of a trajectory, each under a name that says which of the field's definitions it is.
 
-Positions are (n, d) arrays in metres, rows a constant `step` (s) apart, d = 3 or, for the horizontal metrics, 2. A row of
-the reference that cannot be trusted is NaN and counts nowhere, nor does a displacement that starts or ends there.
-A metric without a value (no reference, too short, never standing) raises `Undefined` with the reason; `measure` turns
-that into None and keeps the reason. An estimate that is not finite has diverged: its errors are
-infinite, which is not the same as no value, and no summary leaves them out in silence. Everything
-is NumPy in float64 and pure.
+Positions are (n, d) arrays in metres, rows a constant `step` (s) apart, d = 3 or, for the
+horizontal metrics, 2. A row of the reference that cannot be trusted is NaN and counts nowhere, nor
+does a displacement that starts or ends there. A metric without a value (no reference, too short,
+never standing) raises `Undefined` with the reason; `measure` turns that into None and keeps the
+reason. An estimate that is not finite has diverged: its errors are infinite, which is not the same
+as no value, and no summary leaves them out in silence. Everything is NumPy in float64 and pure.
 """
 
 from __future__ import annotations
@@ -59,7 +59,8 @@ class Measures(NamedTuple):
     that diverged, a coverage of 0."""
 
 
-# Rotations ------------------------------------------------------------------------------------------------------------
+# Rotations
+# ------------------------------------------------------------------------------------------------------------
 
 
 def yaw(orientation: Quaternions) -> Angles:
@@ -89,9 +90,14 @@ def relative_yaw(estimate: Quaternions, reference: Quaternions) -> Angles:
 def rotation_matrices(orientation: Quaternions) -> Float[np.ndarray, "n 3 3"]:
     """Rotation matrices of unit quaternions wxyz; NaN stays NaN."""
     w, x, y, z = orientation.T
-    return np.stack([np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], -1),
-                     np.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], -1),
-                     np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], -1)], -2)
+    return np.stack(
+        [
+            np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], -1),
+            np.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], -1),
+            np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], -1),
+        ],
+        -2,
+    )
 
 
 def _multiply(left: Float[np.ndarray, "4"], right: Quaternions) -> Quaternions:
@@ -104,7 +110,14 @@ def rotation_z(angle: Float[np.ndarray, "*k"] | float) -> Float[np.ndarray, "*k 
     """Rotation by an angle (rad) about the world's z axis."""
     cosine, sine = np.cos(angle), np.sin(angle)
     zero, one = np.zeros_like(cosine), np.ones_like(cosine)
-    return np.stack([np.stack([cosine, -sine, zero], -1), np.stack([sine, cosine, zero], -1), np.stack([zero, zero, one], -1)], -2)
+    return np.stack(
+        [
+            np.stack([cosine, -sine, zero], -1),
+            np.stack([sine, cosine, zero], -1),
+            np.stack([zero, zero, one], -1),
+        ],
+        -2,
+    )
 
 
 def _quaternion(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "4"]:
@@ -113,7 +126,8 @@ def _quaternion(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "4"]:
     return np.roll(Rotation.from_matrix(rotation).as_quat(), 1)
 
 
-# Alignment ------------------------------------------------------------------------------------------------------------
+# Alignment
+# ------------------------------------------------------------------------------------------------------------
 
 
 def align(estimate: Trajectory, reference: Trajectory, how: Alignment = "origin") -> Trajectory:
@@ -135,23 +149,32 @@ def align(estimate: Trajectory, reference: Trajectory, how: Alignment = "origin"
         raise Undefined(f"{NOT_FINITE} in any trusted row")
     if how == "origin":
         first = rows[0]
-        starts = (path.orientation[first:first + 1] for path in (reference, estimate))
+        starts = (path.orientation[first : first + 1] for path in (reference, estimate))
         turn = rotation_z(relative_yaw(*starts)[0])
         source, target = estimate.position[first], reference.position[first]
     else:
         source, target = estimate.position[rows].mean(0), reference.position[rows].mean(0)
         a, b = estimate.position[rows] - source, reference.position[rows] - target
         if how == "yaw_position":
-            turn = rotation_z(np.arctan2(a[:, 0] @ b[:, 1] - a[:, 1] @ b[:, 0], a[:, 0] @ b[:, 0] + a[:, 1] @ b[:, 1]))
+            turn = rotation_z(
+                np.arctan2(
+                    a[:, 0] @ b[:, 1] - a[:, 1] @ b[:, 0], a[:, 0] @ b[:, 0] + a[:, 1] @ b[:, 1]
+                )
+            )
         else:
             if len(rows) < 3:
                 raise Undefined("fewer than three trusted rows to align")
             u, _, vt = np.linalg.svd(b.T @ a)
             turn = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
-    return Trajectory(estimate.time, (estimate.position - source) @ turn.T + target, _multiply(_quaternion(turn), estimate.orientation))
+    return Trajectory(
+        estimate.time,
+        (estimate.position - source) @ turn.T + target,
+        _multiply(_quaternion(turn), estimate.orientation),
+    )
 
 
-# Absolute errors ------------------------------------------------------------------------------------------------------
+# Absolute errors
+# ------------------------------------------------------------------------------------------------------
 
 
 def ate(estimate: Positions, reference: Positions) -> float:
@@ -160,7 +183,8 @@ def ate(estimate: Positions, reference: Positions) -> float:
 
 
 def ate_ronin(estimate: Positions, reference: Positions) -> float:
-    """sqrt of the mean over rows and components of (p̂ − p)², m: `ate`/√d (the code of RoNIN and DeepILS)."""
+    """sqrt of the mean over rows and components of (p̂ − p)², m: `ate`/√d (the code of RoNIN and
+    DeepILS)."""
     return float(np.sqrt(np.mean(_errors(estimate, reference) ** 2)))
 
 
@@ -170,7 +194,8 @@ def ate_mean(estimate: Positions, reference: Positions) -> float:
 
 
 def drift(estimate: Positions, reference: Positions, step: float) -> float:
-    """Error at the last trusted row over the length of the reference path (`path_length`), % (position drift error, PDE).
+    """Error at the last trusted row over the length of the reference path (`path_length`), %
+    (position drift error, PDE).
 
     Undefined for a path below 1 m, where it says nothing.
     """
@@ -180,14 +205,17 @@ def drift(estimate: Positions, reference: Positions, step: float) -> float:
     return float(100 * np.linalg.norm(_errors(estimate, reference)[-1]) / length)
 
 
-# Relative errors ------------------------------------------------------------------------------------------------------
+# Relative errors
+# ------------------------------------------------------------------------------------------------------
 
 
 def rte(estimate: Positions, reference: Positions, step: float, seconds: float = 60.0) -> float:
-    """Relative trajectory error: RMS norm of the error of displacements over `seconds`, from every row, m (RoNIN's T-RTE, RNIN).
+    """Relative trajectory error: RMS norm of the error of displacements over `seconds`, from every
+    row, m (RoNIN's T-RTE, RNIN).
 
-    Displacements are compared in the world, without turning the start. Where the trusted rows span less than `seconds`,
-    the error at their end relative to their start, times `seconds` over that span (RoNIN's rule).
+    Displacements are compared in the world, without turning the start. Where the trusted rows span
+    less than `seconds`, the error at their end relative to their start, times `seconds` over that
+    span (RoNIN's rule).
     """
     error = estimate - reference
     rows = np.flatnonzero(finite_rows(reference))
@@ -196,23 +224,33 @@ def rte(estimate: Positions, reference: Positions, step: float, seconds: float =
     rows_apart, span = round(seconds / step), int(rows[-1] - rows[0])
     if span < rows_apart:
         return float(np.linalg.norm(error[rows[-1]] - error[rows[0]]) * rows_apart / span)
-    return _rms(error[rows_apart:] - error[:-rows_apart], _pairs(reference, rows_apart), f"no two trusted rows {seconds:g} s apart")
+    return _rms(
+        error[rows_apart:] - error[:-rows_apart],
+        _pairs(reference, rows_apart),
+        f"no two trusted rows {seconds:g} s apart",
+    )
 
 
-def rte_ronin(estimate: Positions, reference: Positions, step: float, seconds: float = 60.0) -> float:
+def rte_ronin(
+    estimate: Positions, reference: Positions, step: float, seconds: float = 60.0
+) -> float:
     """`rte` over √d, m: the mean is over components too, as RoNIN's code has it."""
     return rte(estimate, reference, step, seconds) / float(np.sqrt(estimate.shape[1]))
 
 
 def rte_distance(estimate: Positions, reference: Positions, metres: float) -> float:
-    """RMS norm of the error of displacements over `metres` walked, from every row, m (D-RTE of CTIN and iMoT, with 1 m).
+    """RMS norm of the error of displacements over `metres` walked, from every row, m (D-RTE of CTIN
+    and iMoT, with 1 m).
 
-    The end of a displacement is the first row by which the reference has walked `metres`, its path summed row by row.
+    The end of a displacement is the first row by which the reference has walked `metres`, its path
+    summed row by row.
     """
     good = finite_rows(reference)
     edges = np.flatnonzero(np.diff(np.concatenate([[0], good.astype(int), [0]])))
     errors = [np.zeros((0, estimate.shape[1]))]
-    for start, stop in zip(edges[::2], edges[1::2], strict=True):  # a path is known within an unbroken stretch only
+    for start, stop in zip(
+        edges[::2], edges[1::2], strict=True
+    ):  # a path is known within an unbroken stretch only
         truth, error = reference[start:stop], (estimate - reference)[start:stop]
         walked = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(truth, axis=0), axis=1))])
         end = np.searchsorted(walked, walked + metres - 1e-9)
@@ -222,9 +260,11 @@ def rte_distance(estimate: Positions, reference: Positions, metres: float) -> fl
     return _rms(found, np.ones(len(found), bool), f"no unbroken reference of {metres:g} m")
 
 
-def rpe(estimate: Trajectory, reference: Trajectory, step: float, seconds: float,
-        dims: int = 3) -> float:
-    """Relative pose error: RMS norm of the error of displacements over `seconds` with the yaw at their start aligned, m (TLIO).
+def rpe(
+    estimate: Trajectory, reference: Trajectory, step: float, seconds: float, dims: int = 3
+) -> float:
+    """Relative pose error: RMS norm of the error of displacements over `seconds` with the yaw at
+    their start aligned, m (TLIO).
 
     error_i = R_z(−ψ_i)(p̂_j − p̂_i) − (p_j − p_i), from every row i, with ψ the `relative_yaw` of
     the estimate's attitude, so that a wrong heading of the whole trajectory costs nothing; with
@@ -236,32 +276,43 @@ def rpe(estimate: Trajectory, reference: Trajectory, step: float, seconds: float
         raise Undefined(reason)
     start, start_true = (path.orientation[:-rows_apart] for path in (estimate, reference))
     turn = rotation_z(-relative_yaw(start, start_true))
-    moved, moved_true = (path.position[rows_apart:] - path.position[:-rows_apart]
-                         for path in (estimate, reference))
+    moved, moved_true = (
+        path.position[rows_apart:] - path.position[:-rows_apart] for path in (estimate, reference)
+    )
     error = np.einsum("nij,nj->ni", turn, moved) - moved_true
     trusted = _pairs(reference.position, rows_apart) & finite_rows(start_true)
     return _rms(error[:, :dims], trusted, reason)
 
 
-def rpe_se3(estimate: Trajectory, reference: Trajectory, step: float, seconds: float = 1.0, dims: int = 3) -> float:
-    """RMS of the translation part of the relative pose error with the full orientation at the start, all pairs, m (TUM, evo).
+def rpe_se3(
+    estimate: Trajectory, reference: Trajectory, step: float, seconds: float = 1.0, dims: int = 3
+) -> float:
+    """RMS of the translation part of the relative pose error with the full orientation at the
+    start, all pairs, m (TUM, evo).
 
-    error_i = R_i R̂_iᵀ (p̂_j − p̂_i) − (p_j − p_i) in the reference's world (its norm is evo's); with `dims` 2 its
-    horizontal part.
+    error_i = R_i R̂_iᵀ (p̂_j − p̂_i) − (p_j − p_i) in the reference's world (its norm is evo's);
+    with `dims` 2 its horizontal part.
     """
     rows_apart = round(seconds / step)
     reason = f"no two trusted rows {seconds:g} s apart"
     if rows_apart >= len(estimate.time):
         raise Undefined(reason)
-    start, start_true = (rotation_matrices(trajectory.orientation[:-rows_apart]) for trajectory in (estimate, reference))
-    moved, moved_true = (trajectory.position[rows_apart:] - trajectory.position[:-rows_apart] for trajectory in (estimate, reference))
+    start, start_true = (
+        rotation_matrices(trajectory.orientation[:-rows_apart])
+        for trajectory in (estimate, reference)
+    )
+    moved, moved_true = (
+        trajectory.position[rows_apart:] - trajectory.position[:-rows_apart]
+        for trajectory in (estimate, reference)
+    )
     error = np.einsum("nij,nkj,nk->ni", start_true, start, moved) - moved_true
     oriented = finite_rows(reference.orientation[:-rows_apart])
     trusted = _pairs(reference.position, rows_apart) & oriented
     return _rms(error[:, :dims], trusted, reason)
 
 
-# Heading --------------------------------------------------------------------------------------------------------------
+# Heading
+# --------------------------------------------------------------------------------------------------------------
 
 
 def yaw_rmse(estimate: Quaternions, reference: Quaternions) -> float:
@@ -284,22 +335,29 @@ def yaw_drift(estimate: Quaternions, reference: Quaternions, step: float) -> flo
     return float(abs(np.degrees(error[-1] - error[0])) / hours)
 
 
-# Movement -------------------------------------------------------------------------------------------------------------
+# Movement
+# -------------------------------------------------------------------------------------------------------------
 
 
 def path_length(position: Positions, step: float, seconds: float = 1.0) -> float:
-    """Length of the polygon through the rows `seconds` apart (and the last row), m; what touches an untrusted row is left out.
+    """Length of the polygon through the rows `seconds` apart (and the last row), m; what touches an
+    untrusted row is left out.
 
     Summing row by row would count the noise of positions as walking: 5 mm at 10 Hz is 3 m a minute.
     """
     if len(position) < 2:
         raise Undefined("a single row")
-    corners = position[np.unique(np.append(np.arange(0, len(position), max(1, round(seconds / step))), len(position) - 1))]
+    corners = position[
+        np.unique(
+            np.append(np.arange(0, len(position), max(1, round(seconds / step))), len(position) - 1)
+        )
+    ]
     return float(np.nansum(np.linalg.norm(np.diff(corners, axis=0), axis=1)))
 
 
 def path_length_ratio(estimate: Positions, reference: Positions, step: float) -> float:
-    """Estimated over true `path_length` (through points 1 s apart), over the stretches that are trusted: 1 is right, 0 never moved."""
+    """Estimated over true `path_length` (through points 1 s apart), over the stretches that are
+    trusted: 1 is right, 0 never moved."""
     length = path_length(reference, step)
     if length < 1.0:
         raise Undefined(f"the reference path is {length:.2f} m long, under 1 m")
@@ -309,26 +367,31 @@ def path_length_ratio(estimate: Positions, reference: Positions, step: float) ->
 def standing(reference: Positions, step: float) -> Bool[np.ndarray, "n"]:
     """Rows of the stretches of at least 2 s in which every displacement over 1 s is below 0.05 m.
 
-    One second, because that is what the network is asked for, and because it forgives the noise of the reference and the
-    swaying of a person who stands.
+    One second, because that is what the network is asked for, and because it forgives the noise of
+    the reference and the swaying of a person who stands.
     """
     apart = max(1, round(1.0 / step))
     still = np.zeros(len(reference), bool)
     if len(reference) <= apart:
         return still
     with np.errstate(invalid="ignore"):
-        slow = np.linalg.norm(reference[apart:] - reference[:-apart], axis=1) < STANDING_SPEED * apart * step
+        slow = (
+            np.linalg.norm(reference[apart:] - reference[:-apart], axis=1)
+            < STANDING_SPEED * apart * step
+        )
     edges = np.flatnonzero(np.diff(np.concatenate([[0], slow.astype(int), [0]])))
     for start, stop in zip(edges[::2], edges[1::2], strict=True):
         if (stop - 1 - start + apart) * step >= STANDING_SECONDS - 1e-9:
-            still[start:stop + apart] = True
+            still[start : stop + apart] = True
     return still & finite_rows(reference)
 
 
 def stationary_drift(estimate: Positions, reference: Positions, step: float) -> float:
-    """Metres the estimate walks per minute in which the reference stands (`standing`); the path is through points 1 s apart.
+    """Metres the estimate walks per minute in which the reference stands (`standing`); the path is
+    through points 1 s apart.
 
-    What a gate on the displacement is for (GNIO). Undefined where the reference never stands for 2 s.
+    What a gate on the displacement is for (GNIO). Undefined where the reference never stands for 2
+    s.
     """
     still = standing(reference, step)
     edges = np.flatnonzero(np.diff(np.concatenate([[0], still.astype(int), [0]])))
@@ -342,10 +405,13 @@ def stationary_drift(estimate: Positions, reference: Positions, step: float) -> 
     return float(walked / (seconds / 60))
 
 
-# Consistency ----------------------------------------------------------------------------------------------------------
+# Consistency
+# ----------------------------------------------------------------------------------------------------------
 
 
-def normalised_squared(error: Float[np.ndarray, "n d"], covariance: Float[np.ndarray, "n d d"]) -> Float[np.ndarray, "n"]:
+def normalised_squared(
+    error: Float[np.ndarray, "n d"], covariance: Float[np.ndarray, "n d d"]
+) -> Float[np.ndarray, "n"]:
     """eᵀ P⁻¹ e of each row, infinite where P is not finite and positive definite.
 
     Such a P claims to know some direction exactly, which no error agrees with. It is judged to the
@@ -364,35 +430,48 @@ def normalised_squared(error: Float[np.ndarray, "n d"], covariance: Float[np.nda
 
 
 def mean_normalised(squared: Float[np.ndarray, "n"], dims: int) -> float:
-    """Mean of normalised squared errors over their expectation d: 1 is consistent, above it the filter is overconfident.
+    """Mean of normalised squared errors over their expectation d: 1 is consistent, above it the
+    filter is overconfident.
 
-    With eᵀ P⁻¹ e of the position it is `nees`, with rᵀ S⁻¹ r of the measurements `nis` (Bar-Shalom). NaN counts nowhere.
+    With eᵀ P⁻¹ e of the position it is `nees`, with rᵀ S⁻¹ r of the measurements `nis`
+    (Bar-Shalom). NaN counts nowhere.
     """
     return float(np.mean(_present(squared)) / dims)
 
 
 def coverage(squared: Float[np.ndarray, "n"], dims: int, level: float = 0.95) -> float:
-    """Share of rows whose normalised squared error lies inside the χ² region of probability `level`, %: 95 is consistent."""
+    """Share of rows whose normalised squared error lies inside the χ² region of probability
+    `level`, %: 95 is consistent."""
     return float(100 * np.mean(_present(squared) <= chi2.ppf(level, dims)))
 
 
-# All of them ----------------------------------------------------------------------------------------------------------
+# All of them
+# ----------------------------------------------------------------------------------------------------------
 
 
-def measure(estimate: Trajectory, reference: Trajectory, alignment: Alignment = "origin",
-            position_covariance: Float[np.ndarray, "n 3 3"] | None = None, nis: Float[np.ndarray, "k"] | None = None) -> Measures:
+def measure(
+    estimate: Trajectory,
+    reference: Trajectory,
+    alignment: Alignment = "origin",
+    position_covariance: Float[np.ndarray, "n 3 3"] | None = None,
+    nis: Float[np.ndarray, "k"] | None = None,
+) -> Measures:
     """Every metric of one sequence, in 3-D under its plain name and horizontally as `<name>_2d`.
 
-    `reference` has the estimate's stamps and NaN where it cannot be trusted. The absolute metrics, `rte_*` and `yaw_rmse`
-    see the estimate under `alignment`; `se3` is fitted in 3-D for the horizontal ones too. `nees` is taken in the frame
-    of the filter, whose covariance is relative to its start, so with the start aligned whatever `alignment` is.
+    `reference` has the estimate's stamps and NaN where it cannot be trusted. The absolute metrics,
+    `rte_*` and `yaw_rmse` see the estimate under `alignment`; `se3` is fitted in 3-D for the
+    horizontal ones too. `nees` is taken in the frame of the filter, whose covariance is relative to
+    its start, so with the start aligned whatever `alignment` is.
 
     An estimate with a row that is not finite has diverged. Every metric that a finite one would
     have is then infinite (a coverage 0), with the reason in `undefined`; so is one that is too
     large for a number.
     """
-    reference = Trajectory(reference.time, np.where(finite_rows(reference.position)[:, None], reference.position, np.nan),
-                           np.where(finite_rows(reference.position)[:, None], reference.orientation, np.nan))
+    reference = Trajectory(
+        reference.time,
+        np.where(finite_rows(reference.position)[:, None], reference.position, np.nan),
+        np.where(finite_rows(reference.position)[:, None], reference.orientation, np.nan),
+    )
     step = float(np.median(np.diff(estimate.time))) if len(estimate.time) > 1 else 1.0
     metrics: dict[str, Callable[[], float]] = {}
     finite, diverged = _finite(estimate), ""
@@ -404,11 +483,18 @@ def measure(estimate: Trajectory, reference: Trajectory, alignment: Alignment = 
         estimate = Trajectory(estimate.time, np.zeros_like(estimate.position), level)
     aligned, origin, missing = estimate, estimate, ""
     try:
-        aligned, origin = align(estimate, reference, alignment), align(estimate, reference, "origin")
+        aligned, origin = (
+            align(estimate, reference, alignment),
+            align(estimate, reference, "origin"),
+        )
     except Undefined as reason:
         missing = str(reason)
     for dims in (3, 2):
-        a, e, r = aligned.position[:, :dims], estimate.position[:, :dims], reference.position[:, :dims]
+        a, e, r = (
+            aligned.position[:, :dims],
+            estimate.position[:, :dims],
+            reference.position[:, :dims],
+        )
         tag = "" if dims == 3 else "_2d"
         metrics |= {
             f"ate{tag}": lambda a=a, r=r: ate(a, r),
@@ -426,16 +512,25 @@ def measure(estimate: Trajectory, reference: Trajectory, alignment: Alignment = 
             f"stationary_drift{tag}": lambda e=e, r=r: stationary_drift(e, r, step),
         }
         if position_covariance is not None:
-            squared = lambda dims=dims: position_nees(origin, estimate, reference, position_covariance, dims)  # noqa: E731
-            metrics |= {f"nees{tag}": lambda s=squared, dims=dims: mean_normalised(s(), dims),
-                        f"nees_coverage{tag}": lambda s=squared, dims=dims: coverage(s(), dims)}
+            squared = lambda dims=dims: position_nees(
+                origin, estimate, reference, position_covariance, dims
+            )
+            metrics |= {
+                f"nees{tag}": lambda s=squared, dims=dims: mean_normalised(s(), dims),
+                f"nees_coverage{tag}": lambda s=squared, dims=dims: coverage(s(), dims),
+            }
     attitude = reference.orientation
-    metrics |= {"yaw_rmse": lambda: yaw_rmse(aligned.orientation, attitude),
-                "yaw_drift": lambda: yaw_drift(estimate.orientation, attitude, step)}
+    metrics |= {
+        "yaw_rmse": lambda: yaw_rmse(aligned.orientation, attitude),
+        "yaw_drift": lambda: yaw_drift(estimate.orientation, attitude, step),
+    }
     free_of_estimate = {"path_length": lambda: path_length(reference.position, step)}
     free_of_truth = {}
     if nis is not None:
-        free_of_truth = {"nis": lambda: mean_normalised(nis, 3), "nis_coverage": lambda: coverage(nis, 3)}
+        free_of_truth = {
+            "nis": lambda: mean_normalised(nis, 3),
+            "nis_coverage": lambda: coverage(nis, 3),
+        }
     values: dict[str, float | None] = {"duration": float(estimate.time[-1] - estimate.time[0])}
     undefined: dict[str, str] = {}
     for name, compute in (metrics | free_of_estimate | free_of_truth).items():
@@ -468,11 +563,16 @@ def diverged(values: Mapping[str, float | None]) -> bool:
     return math.inf in values.values() if ate is None else math.isinf(ate)
 
 
-def position_nees(aligned: Trajectory, estimate: Trajectory, reference: Trajectory, covariance: Float[np.ndarray, "n 3 3"],
-                  dims: int = 3) -> Float[np.ndarray, "n"]:
-    """eᵀ P⁻¹ e of the position, NaN where there is no reference: the error of the start-aligned estimate, turned back into
-    the filter's own frame, in which its covariance is. Infinite where the covariance is not finite
-    and positive definite."""
+def position_nees(
+    aligned: Trajectory,
+    estimate: Trajectory,
+    reference: Trajectory,
+    covariance: Float[np.ndarray, "n 3 3"],
+    dims: int = 3,
+) -> Float[np.ndarray, "n"]:
+    """eᵀ P⁻¹ e of the position, NaN where there is no reference: the error of the start-aligned
+    estimate, turned back into the filter's own frame, in which its covariance is. Infinite where
+    the covariance is not finite and positive definite."""
     turn = rotation_z(relative_yaw(estimate.orientation[:1], aligned.orientation[:1])[0])
     error = (aligned.position - reference.position) @ turn.T
     variance = np.einsum("nii->ni", covariance)
@@ -484,7 +584,8 @@ def position_nees(aligned: Trajectory, estimate: Trajectory, reference: Trajecto
 
 
 class Summary(NamedTuple):
-    """Metrics over the sequences of a set. None where no sequence has the metric, or (interval) it has fewer than two groups."""
+    """Metrics over the sequences of a set. None where no sequence has the metric, or (interval) it
+    has fewer than two groups."""
 
     mean: dict[str, float | None]
     """Over the sequences that did not diverge: of no worth without `diverged` beside it. Infinite
@@ -492,15 +593,22 @@ class Summary(NamedTuple):
     median: dict[str, float | None]
     """Over all that have the metric: of an error, infinite where half of them diverged."""
     interval: dict[str, tuple[float, float] | None]
-    """Bootstrap 95 % interval of a finite mean, groups (people, sessions) drawn with replacement."""
+    """Bootstrap 95 % interval of a finite mean, groups (people, sessions) drawn with replacement.
+    """
     count: dict[str, int]
     """Sequences in the mean."""
     diverged: dict[str, int]
     """Sequences that have the metric and are in no mean, because their estimate diverged."""
 
 
-def summarise(measures: Mapping[str, Mapping[str, float | None]], groups: Mapping[str, Any], seed: int = 0, draws: int = 2000) -> Summary:
-    """Mean, median and bootstrap 95 % interval of every metric over sequences, each sequence counted once.
+def summarise(
+    measures: Mapping[str, Mapping[str, float | None]],
+    groups: Mapping[str, Any],
+    seed: int = 0,
+    draws: int = 2000,
+) -> Summary:
+    """Mean, median and bootstrap 95 % interval of every metric over sequences, each sequence
+    counted once.
 
     `measures` is sequence -> metric -> value, `groups` sequence -> the person or session it belongs
     to: recordings of one are not independent, so whole groups are drawn (`bootstrap`). A sequence
@@ -523,8 +631,9 @@ def summarise(measures: Mapping[str, Mapping[str, float | None]], groups: Mappin
     return summary
 
 
-def bootstrap(values: Float[np.ndarray, "n"], groups: Iterable[Any], seed: int = 0,
-              draws: int = 2000) -> tuple[float, float] | None:
+def bootstrap(
+    values: Float[np.ndarray, "n"], groups: Iterable[Any], seed: int = 0, draws: int = 2000
+) -> tuple[float, float] | None:
     """95 % interval of the mean of `values`, whole groups drawn with replacement.
 
     `groups` holds the group of each value. A draw's mean is over its values, so a large group

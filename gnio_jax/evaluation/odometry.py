@@ -1,11 +1,12 @@
 """From recordings to trajectories: the network with an estimator around it, batched over sequences.
 
-`ekf` filters (`tight`: the network inside the filter, its windows cut with the filter's own state; `loose`: the network
-over all windows first, with a given orientation); `integrate` sums displacements, as RoNIN-type baselines do; `imu_only`
-integrates the IMU alone. The filter runs in float64 (JAX's x64 must be on), the network in float32.
+`ekf` filters (`tight`: the network inside the filter, its windows cut with the filter's own state;
+`loose`: the network over all windows first, with a given orientation); `integrate` sums
+displacements, as RoNIN-type baselines do; `imu_only` integrates the IMU alone. The filter runs in
+float64 (JAX's x64 must be on), the network in float32.
 
-A trajectory has a row at the start and one at the end of every stride (clone interval): row k is at sample k·n after the
-start, which is the first sample with a trusted reference.
+A trajectory has a row at the start and one at the end of every stride (clone interval): row k is at
+sample k·n after the start, which is the first sample with a trusted reference.
 """
 
 from __future__ import annotations
@@ -45,9 +46,11 @@ Progress = Callable[[float], None]
 """Told the share of the work that is done, from 0 to 1."""
 
 PERFECT_STD = 0.01
-"""Standard deviation given to the filter with true displacements, m per axis, before `measurement_scale`."""
+"""Standard deviation given to the filter with true displacements, m per axis, before
+`measurement_scale`."""
 REST_GYRO_STD = 0.01
-"""Largest standard deviation of each gyro axis at rest, rad/s: a phone on a table, not in a hand."""
+"""Largest standard deviation of each gyro axis at rest, rad/s: a phone on a table, not in a hand.
+"""
 REST_ACCEL_STD = 0.1
 """Largest standard deviation of each accelerometer axis at rest, m/s²."""
 REST_SECONDS = 1.0
@@ -66,11 +69,14 @@ class Setup(NamedTuple):
     coupling: Literal["tight", "loose"] = "tight"
     """Of the ekf."""
     orientation: Orientation | None = None
-    """Whose attitude rotates the network's windows; None: the filter's where it is in the loop, else the reference's."""
+    """Whose attitude rotates the network's windows; None: the filter's where it is in the loop,
+    else the reference's."""
     init: Literal["reference", "static"] = "reference"
-    """Start from the reference's pose and velocity, or from the gravity of the first second, yaw, velocity and position zero."""
+    """Start from the reference's pose and velocity, or from the gravity of the first second, yaw,
+    velocity and position zero."""
     gyro_bias: Literal["zero", "rest", "reference"] = "zero"
-    """First estimate of the gyro bias: none, the mean of a rest at the start, or the first 10 s against the reference."""
+    """First estimate of the gyro bias: none, the mean of a rest at the start, or the first 10 s
+    against the reference."""
 
 
 DEFAULT_SETUP = Setup()
@@ -80,12 +86,14 @@ class Network(NamedTuple):
     """A network with its parameters."""
 
     apply: Callable[[Any, Any], Prediction]
-    """(variables, windows (b, N, 6) float32) -> `Prediction`; hashable, as a Flax module's `apply` is."""
+    """(variables, windows (b, N, 6) float32) -> `Prediction`; hashable, as a Flax module's `apply`
+    is."""
     variables: Any
 
 
 class Recording(NamedTuple):
-    """A sequence ready for an estimator: at the network's rate, cut to whole strides from its start."""
+    """A sequence ready for an estimator: at the network's rate, cut to whole strides from its
+    start."""
 
     sequence: Sequence
     """K·n + 1 samples: K strides and the stamp at the end of the last."""
@@ -100,15 +108,18 @@ class Recording(NamedTuple):
     notes: tuple[str, ...]
     """What a reader of the result should know."""
     start_std: tuple[float, float] | None = None
-    """Of the start's tilt, rad, and velocity, m/s, where it was made without a reference; None: the filter's options say."""
+    """Of the start's tilt, rad, and velocity, m/s, where it was made without a reference; None: the
+    filter's options say."""
 
 
 class Estimate(NamedTuple):
-    """A trajectory with what the estimator knows beside it: K + 1 rows for K strides, a measurement in the row where its window ends."""
+    """A trajectory with what the estimator knows beside it: K + 1 rows for K strides, a measurement
+    in the row where its window ends."""
 
     name: str
     trajectory: Trajectory
-    """NaN from where the filter was no longer healthy (`FilterHistory.healthy`): it has diverged."""
+    """NaN from where the filter was no longer healthy (`FilterHistory.healthy`): it has diverged.
+    """
     reference: Trajectory
     """At the same rows, NaN where it cannot be trusted."""
     displacement: Float[np.ndarray, "k 3"] | None = None
@@ -135,49 +146,78 @@ class Estimate(NamedTuple):
 
 
 def resolve(setup: Setup) -> Setup:
-    """`setup` with its orientation filled in. Raises `InputError` for an orientation that the estimator cannot use."""
-    inside = setup.estimator == "imu_only" or (setup.estimator == "ekf" and setup.coupling == "tight")
+    """`setup` with its orientation filled in. Raises `InputError` for an orientation that the
+    estimator cannot use."""
+    inside = setup.estimator == "imu_only" or (
+        setup.estimator == "ekf" and setup.coupling == "tight"
+    )
     if inside and setup.orientation not in (None, "filter"):
         what = "the tight coupling" if setup.estimator == "ekf" else "imu_only"
-        raise InputError(f"--orientation {setup.orientation}", f"{what} uses the filter's own attitude",
-                         "leave it out, or choose --coupling loose or --estimator integrate")
+        raise InputError(
+            f"--orientation {setup.orientation}",
+            f"{what} uses the filter's own attitude",
+            "leave it out, or choose --coupling loose or --estimator integrate",
+        )
     return setup._replace(orientation=setup.orientation or ("filter" if inside else "reference"))
 
 
 def filter_config(config: DataConfig, options: FilterOptions) -> FilterConfig:
     """The filter for windows and strides of `config`."""
     return FilterConfig(
-        dt=1.0 / config.rate, samples_per_clone=config.stride, clones_per_window=config.window // config.stride,
-        mahalanobis_fail_scale=options.mahalanobis_fail_scale, measurement_scale=options.measurement_scale, history="core",
-        window_rotation=options.window_rotation or config.window_rotation)
+        dt=1.0 / config.rate,
+        samples_per_clone=config.stride,
+        clones_per_window=config.window // config.stride,
+        mahalanobis_fail_scale=options.mahalanobis_fail_scale,
+        measurement_scale=options.measurement_scale,
+        history="core",
+        window_rotation=options.window_rotation or config.window_rotation,
+    )
 
 
-def prepare(sequences: Iterable[Sequence], config: DataConfig, setup: Setup = DEFAULT_SETUP) -> tuple[list[Recording], dict[str, str]]:
-    """Recordings to estimate, and the names of those left out with the reason (shorter than a window and a stride).
+def prepare(
+    sequences: Iterable[Sequence], config: DataConfig, setup: Setup = DEFAULT_SETUP
+) -> tuple[list[Recording], dict[str, str]]:
+    """Recordings to estimate, and the names of those left out with the reason (shorter than a
+    window and a stride).
 
-    Raises `InputError` if `setup` needs a reference, a device orientation or more data where a sequence has none.
+    Raises `InputError` if `setup` needs a reference, a device orientation or more data where a
+    sequence has none.
     """
     setup = resolve(setup)
     recordings, left_out = [], {}
     for sequence in sequences:
         sequence = data.resample(sequence, config.rate)
-        trusted = sequence.valid & finite_rows(sequence.position) & finite_rows(sequence.orientation)
+        trusted = (
+            sequence.valid & finite_rows(sequence.position) & finite_rows(sequence.orientation)
+        )
         if not trusted.any() and (setup.init == "reference" or setup.gyro_bias == "reference"):
             wanted = "--init static" if setup.init == "reference" else "--gyro-bias zero"
             raise InputError(sequence.name, "has no reference to start from", f"give {wanted}")
         if setup.orientation == "reference" and not trusted.any():
-            raise InputError(sequence.name, "has no reference orientation", "give --orientation filter or device")
+            raise InputError(
+                sequence.name, "has no reference orientation", "give --orientation filter or device"
+            )
         if setup.orientation == "device" and sequence.device_orientation is None:
-            raise InputError(sequence.name, "has no device orientation", "give --orientation filter or reference")
+            raise InputError(
+                sequence.name, "has no device orientation", "give --orientation filter or reference"
+            )
         first = int(np.argmax(trusted)) if trusted.any() else 0
         strides = (len(sequence.time) - 1 - first) // config.stride
         if strides <= config.window // config.stride:
             seconds = max(0, len(sequence.time) - first) / config.rate
-            left_out[sequence.name] = f"{seconds:.2f} s from its first trusted sample on, too short for a window and a stride"
+            left_out[sequence.name] = (
+                f"{seconds:.2f} s from its first trusted sample on, too short for a window and a stride"
+            )
             continue
         rows = slice(first, first + strides * config.stride + 1)
         uncut = sequence._replace(valid=trusted)
-        cut = uncut._replace(**{name: value[rows] for name, value in uncut._asdict().items() if isinstance(value, np.ndarray)})
+        cut = uncut._replace(
+            **{
+                name: value[rows]
+                for name, value in uncut._asdict().items()
+                if isinstance(value, np.ndarray)
+            }
+        )
         bias, notes = _gyro_bias(cut, config.rate, setup.gyro_bias)
         start_std = None
         if setup.init == "reference":
@@ -188,8 +228,13 @@ def prepare(sequences: Iterable[Sequence], config: DataConfig, setup: Setup = DE
             second = slice(round(config.rate))
             spread = cut.accel[second].std(0).max()
             if spread > 0.5:
-                notes = (*notes, f"start: not standing still (accel varies by {spread:.1f} m/s²), so its tilt is rough")
-            level = level_state(filter_config(config, FilterOptions()), cut.gyro[second], cut.accel[second])
+                notes = (
+                    *notes,
+                    f"start: not standing still (accel varies by {spread:.1f} m/s²), so its tilt is rough",
+                )
+            level = level_state(
+                filter_config(config, FilterOptions()), cut.gyro[second], cut.accel[second]
+            )
             rotation, velocity, position = np.asarray(level.rotation), np.zeros(3), np.zeros(3)
             variance = np.diag(level.core_covariance)
             start_std = float(np.sqrt(variance[0])), float(np.sqrt(variance[3]))
@@ -197,45 +242,92 @@ def prepare(sequences: Iterable[Sequence], config: DataConfig, setup: Setup = DE
     return recordings, left_out
 
 
-def estimate(recordings: list[Recording], network: Network | None, config: DataConfig, options: FilterOptions, setup: Setup = DEFAULT_SETUP,
-             batch_size: int = 16, progress: Progress | None = None) -> list[Estimate]:
+def estimate(
+    recordings: list[Recording],
+    network: Network | None,
+    config: DataConfig,
+    options: FilterOptions,
+    setup: Setup = DEFAULT_SETUP,
+    batch_size: int = 16,
+    progress: Progress | None = None,
+) -> list[Estimate]:
     """Trajectories of the recordings, `batch_size` of them side by side.
 
-    `network` may be None for `imu_only`. A run of the same recordings in other batches gives the same trajectories to rounding.
+    `network` may be None for `imu_only`. A run of the same recordings in other batches gives the
+    same trajectories to rounding.
     """
     setup = resolve(setup)
     if setup.estimator == "imu_only":
         nothing = np.zeros((0, 3))
-        return _filtered(recordings, config, options, batch_size, progress,
-                         measurements=[_measurements(r, nothing, nothing, config) for r in recordings])
+        return _filtered(
+            recordings,
+            config,
+            options,
+            batch_size,
+            progress,
+            measurements=[_measurements(r, nothing, nothing, config) for r in recordings],
+        )
     if network is None:
         raise ValueError(f"estimator '{setup.estimator}' needs a network")
     if setup.estimator == "ekf" and setup.coupling == "tight":
         return _filtered(recordings, config, options, batch_size, progress, network=network)
     attitudes = [attitude(r, config, setup.orientation or "reference") for r in recordings]
-    predictions = predict_windows(network, recordings, attitudes, config, progress if setup.estimator == "integrate" else None)
+    predictions = predict_windows(
+        network, recordings, attitudes, config, progress if setup.estimator == "integrate" else None
+    )
     if setup.estimator == "integrate":
-        return [_integrated(*of_one, config) for of_one in zip(recordings, attitudes, predictions, strict=True)]
+        return [
+            _integrated(*of_one, config)
+            for of_one in zip(recordings, attitudes, predictions, strict=True)
+        ]
     lowest = filter_config(config, options).log_std_min
-    measurements = [_measurements(r, p.displacement, np.exp(np.maximum(p.log_std, lowest)), config)
-                    for r, p in zip(recordings, predictions, strict=True)]
-    estimates = _filtered(recordings, config, options, batch_size, progress, measurements=measurements)
-    return [e._replace(diagnostics={key: _at_window_end(value, len(e.trajectory.time)) for key, value in p.diagnostics.items()})
-            for e, p in zip(estimates, predictions, strict=True)]
+    measurements = [
+        _measurements(r, p.displacement, np.exp(np.maximum(p.log_std, lowest)), config)
+        for r, p in zip(recordings, predictions, strict=True)
+    ]
+    estimates = _filtered(
+        recordings, config, options, batch_size, progress, measurements=measurements
+    )
+    return [
+        e._replace(
+            diagnostics={
+                key: _at_window_end(value, len(e.trajectory.time))
+                for key, value in p.diagnostics.items()
+            }
+        )
+        for e, p in zip(estimates, predictions, strict=True)
+    ]
 
 
-def perfect_displacements(recordings: list[Recording], config: DataConfig, options: FilterOptions, setup: Setup = DEFAULT_SETUP,
-                          batch_size: int = 16, progress: Progress | None = None) -> list[Estimate]:
-    """The same estimator fed with the reference's displacements: the error that no network can take away.
+def perfect_displacements(
+    recordings: list[Recording],
+    config: DataConfig,
+    options: FilterOptions,
+    setup: Setup = DEFAULT_SETUP,
+    batch_size: int = 16,
+    progress: Progress | None = None,
+) -> list[Estimate]:
+    """The same estimator fed with the reference's displacements: the error that no network can take
+    away.
 
     The filter (also in the place of `imu_only`) is told a standard deviation of 1 cm per axis.
     """
     setup = resolve(setup)
     truths = [true_displacements(r, config) for r in recordings]
     if setup.estimator == "integrate":
-        return [_integrated(r, attitude(r, config, setup.orientation or "reference"), Prediction(d, np.zeros_like(d)), config)
-                for r, d in zip(recordings, truths, strict=True)]
-    measurements = [_measurements(r, d, np.full_like(d, PERFECT_STD), config) for r, d in zip(recordings, truths, strict=True)]
+        return [
+            _integrated(
+                r,
+                attitude(r, config, setup.orientation or "reference"),
+                Prediction(d, np.zeros_like(d)),
+                config,
+            )
+            for r, d in zip(recordings, truths, strict=True)
+        ]
+    measurements = [
+        _measurements(r, d, np.full_like(d, PERFECT_STD), config)
+        for r, d in zip(recordings, truths, strict=True)
+    ]
     return _filtered(recordings, config, options, batch_size, progress, measurements=measurements)
 
 
@@ -243,28 +335,40 @@ def never_moves(estimates: list[Estimate]) -> list[Estimate]:
     """The start pose throughout: what an estimator must beat, above all in a small room."""
     still = []
     for e in estimates:
-        path = Trajectory(e.trajectory.time, *(np.repeat(field[:1], len(field), 0) for field in e.trajectory[1:]))
+        path = Trajectory(
+            e.trajectory.time, *(np.repeat(field[:1], len(field), 0) for field in e.trajectory[1:])
+        )
         still.append(Estimate(e.name, path, e.reference))
     return still
 
 
 def true_displacements(recording: Recording, config: DataConfig) -> Float[np.ndarray, "m 3"]:
-    """Reference displacement of every window, m, in the yaw frame of the reference at its start; NaN where it cannot be trusted."""
+    """Reference displacement of every window, m, in the yaw frame of the reference at its start;
+    NaN where it cannot be trusted."""
     sequence, n, length = recording.sequence, config.stride, config.window
     start = np.arange(0, len(sequence.time) - length, n)
     moved = sequence.position[start + length] - sequence.position[start]
     good = np.asarray(sequence.valid[start] & sequence.valid[start + length])
     result = np.full_like(moved, np.nan)
-    turn = Rotation.from_quat(sequence.orientation[start[good]], scalar_first=True).as_matrix() if good.any() else np.zeros((0, 3, 3))
+    turn = (
+        Rotation.from_quat(sequence.orientation[start[good]], scalar_first=True).as_matrix()
+        if good.any()
+        else np.zeros((0, 3, 3))
+    )
     result[good] = np.einsum("mji,mj->mi", _yaw_rotation(turn), moved[good])
     return result
 
 
-def attitude(recording: Recording, config: DataConfig, source: Orientation) -> Float[np.ndarray, "t 3 3"]:
-    """Body→world at every sample: the gyro integrated from the start (`filter`), the reference, or the device's own estimate
-    turned about z to the start's yaw. Where the latter two are missing, the gyro carries on from the last known attitude."""
+def attitude(
+    recording: Recording, config: DataConfig, source: Orientation
+) -> Float[np.ndarray, "t 3 3"]:
+    """Body→world at every sample: the gyro integrated from the start (`filter`), the reference, or
+    the device's own estimate turned about z to the start's yaw. Where the latter two are missing,
+    the gyro carries on from the last known attitude."""
     sequence = recording.sequence
-    turned = cumulative_rotation(Rotation.from_rotvec((sequence.gyro[:-1] - recording.gyro_bias) / config.rate)).as_matrix()
+    turned = cumulative_rotation(
+        Rotation.from_rotvec((sequence.gyro[:-1] - recording.gyro_bias) / config.rate)
+    ).as_matrix()
     integrated = recording.rotation @ np.concatenate([np.eye(3)[None], turned])
     if source == "filter":
         return integrated
@@ -272,8 +376,12 @@ def attitude(recording: Recording, config: DataConfig, source: Orientation) -> F
     assert given is not None  # `prepare` has seen to it
     known = finite_rows(given) & (sequence.valid if source == "reference" else True)
     if not known[0]:
-        raise InputError(sequence.name, f"has no {source} orientation at its start", "give --orientation filter")
-    matrices = Rotation.from_quat(np.where(known[:, None], given, [1.0, 0, 0, 0]), scalar_first=True).as_matrix()
+        raise InputError(
+            sequence.name, f"has no {source} orientation at its start", "give --orientation filter"
+        )
+    matrices = Rotation.from_quat(
+        np.where(known[:, None], given, [1.0, 0, 0, 0]), scalar_first=True
+    ).as_matrix()
     if source == "device":
         start = _yaw_rotation(np.stack([recording.rotation, matrices[0]]))
         matrices = start[0] @ start[1].T @ matrices
@@ -282,9 +390,16 @@ def attitude(recording: Recording, config: DataConfig, source: Orientation) -> F
     return np.where(known[:, None, None], matrices, bridged)
 
 
-def predict_windows(network: Network, recordings: list[Recording], attitudes: list[Float[np.ndarray, "_ 3 3"]], config: DataConfig,
-                    progress: Progress | None = None, keep: tuple[str, ...] = _KEPT) -> list[Prediction]:
-    """What the network says of every window of the recordings, cut with the given attitudes, in large batches over all of them.
+def predict_windows(
+    network: Network,
+    recordings: list[Recording],
+    attitudes: list[Float[np.ndarray, "_ 3 3"]],
+    config: DataConfig,
+    progress: Progress | None = None,
+    keep: tuple[str, ...] = _KEPT,
+) -> list[Prediction]:
+    """What the network says of every window of the recordings, cut with the given attitudes, in
+    large batches over all of them.
 
     Of its diagnostics only those named in `keep`, if it has them."""
     parts, counts, offset = [], [], 0
@@ -297,24 +412,42 @@ def predict_windows(network: Network, recordings: list[Recording], attitudes: li
             imu = np.einsum("tij,tkj->tki", rotation, imu)
         else:
             level = level @ rotation[start]
-        parts.append((imu.reshape(-1, 6).astype(np.float32), (start + offset).astype(np.int32), level.astype(np.float32)))
+        parts.append(
+            (
+                imu.reshape(-1, 6).astype(np.float32),
+                (start + offset).astype(np.int32),
+                level.astype(np.float32),
+            )
+        )
         counts.append(len(start))
         offset += len(imu)
     imu, start, level = (jnp.asarray(np.concatenate(part)) for part in zip(*parts, strict=True))
     nothing = jnp.zeros((len(start), 3), jnp.float32)  # no targets here
-    source = WindowSource(imu, start, level, nothing, jnp.zeros_like(imu[:, :3]), nothing[:, :2], start)
+    source = WindowSource(
+        imu, start, level, nothing, jnp.zeros_like(imu[:, :3]), nothing[:, :2], start
+    )
     total, size, found = len(start), min(_WINDOWS_AT_ONCE, len(start)), []
     for begin in range(0, total, size):
-        which = np.minimum(np.arange(begin, begin + size), total - 1).astype(np.int32)  # the last batch is filled up: one compilation
-        found.append(jax.device_get(_predict(network.apply, network.variables, source, which, config.window, keep)))
+        which = np.minimum(np.arange(begin, begin + size), total - 1).astype(
+            np.int32
+        )  # the last batch is filled up: one compilation
+        found.append(
+            jax.device_get(
+                _predict(network.apply, network.variables, source, which, config.window, keep)
+            )
+        )
         if progress:
             progress(min(1.0, (begin + size) / total))
     whole = jax.tree.map(lambda *leaves: np.concatenate(leaves)[:total].astype(np.float64), *found)
     ends = np.cumsum(counts)
-    return [jax.tree.map(lambda leaf, a=end - count, b=end: leaf[a:b], whole) for end, count in zip(ends, counts, strict=True)]
+    return [
+        jax.tree.map(lambda leaf, a=end - count, b=end: leaf[a:b], whole)
+        for end, count in zip(ends, counts, strict=True)
+    ]
 
 
-# The filter -----------------------------------------------------------------------------------------------------------
+# The filter
+# -----------------------------------------------------------------------------------------------------------
 
 
 class _Start(NamedTuple):
@@ -326,40 +459,90 @@ class _Start(NamedTuple):
 
 
 def _start(recording: Recording, options: FilterOptions) -> _Start:
-    tilt, velocity = recording.start_std or (math.radians(options.tilt_std_degrees), options.velocity_std)
-    std = InitialStd(tilt, math.radians(options.yaw_std_degrees), velocity, options.position_std, options.gyro_bias_std,
-                     options.accel_bias_std)
-    return _Start(recording.rotation, recording.velocity, recording.position, recording.gyro_bias, std)
+    tilt, velocity = recording.start_std or (
+        math.radians(options.tilt_std_degrees),
+        options.velocity_std,
+    )
+    std = InitialStd(
+        tilt,
+        math.radians(options.yaw_std_degrees),
+        velocity,
+        options.position_std,
+        options.gyro_bias_std,
+        options.accel_bias_std,
+    )
+    return _Start(
+        recording.rotation, recording.velocity, recording.position, recording.gyro_bias, std
+    )
 
 
 @functools.partial(jax.jit, static_argnames=("apply", "length", "keep"))
-def _predict(apply: Callable, variables: Any, source: WindowSource, which: Any, length: int, keep: tuple[str, ...]) -> Prediction:
+def _predict(
+    apply: Callable,
+    variables: Any,
+    source: WindowSource,
+    which: Any,
+    length: int,
+    keep: tuple[str, ...],
+) -> Prediction:
     return _lean(apply(variables, gather(source, which, length).imu), keep)
 
 
 @functools.partial(jax.jit, static_argnames=("apply", "config"))
-def _run_tight(apply: Callable, variables: Any, start: _Start, gyro: Any, accel: Any, config: FilterConfig,
-               noise: NoiseModel) -> FilterHistory:
+def _run_tight(
+    apply: Callable,
+    variables: Any,
+    start: _Start,
+    gyro: Any,
+    accel: Any,
+    config: FilterConfig,
+    noise: NoiseModel,
+) -> FilterHistory:
     def one(start: _Start, gyro: Any, accel: Any) -> FilterHistory:
         state = initial_state(config, **start._asdict())
-        return _lean_history(run_odometry(lambda windows: _lean(apply(variables, windows)), state, gyro, accel, config, noise)[1])
+        return _lean_history(
+            run_odometry(
+                lambda windows: _lean(apply(variables, windows)), state, gyro, accel, config, noise
+            )[1]
+        )
 
     return over_sequences(one)(start, gyro, accel)
 
 
 @functools.partial(jax.jit, static_argnames="config")
-def _run_given(start: _Start, gyro: Any, accel: Any, displacement: Any, std_of_it: Any, config: FilterConfig,
-               noise: NoiseModel) -> FilterHistory:
-    def one(start: _Start, gyro: Any, accel: Any, displacement: Any, std_of_it: Any) -> FilterHistory:
+def _run_given(
+    start: _Start,
+    gyro: Any,
+    accel: Any,
+    displacement: Any,
+    std_of_it: Any,
+    config: FilterConfig,
+    noise: NoiseModel,
+) -> FilterHistory:
+    def one(
+        start: _Start, gyro: Any, accel: Any, displacement: Any, std_of_it: Any
+    ) -> FilterHistory:
         covariance = jax.vmap(jnp.diag)(std_of_it**2)
-        return _lean_history(run_filter(initial_state(config, **start._asdict()), gyro, accel, displacement, covariance, config, noise)[1])
+        return _lean_history(
+            run_filter(
+                initial_state(config, **start._asdict()),
+                gyro,
+                accel,
+                displacement,
+                covariance,
+                config,
+                noise,
+            )[1]
+        )
 
     return over_sequences(one)(start, gyro, accel, displacement, std_of_it)
 
 
 def _lean(prediction: Prediction, keep: tuple[str, ...] = _KEPT) -> Prediction:
     """With these diagnostics only: attention and the like are too large to keep for every window."""
-    return prediction._replace(diagnostics={key: value for key, value in prediction.diagnostics.items() if key in keep})
+    return prediction._replace(
+        diagnostics={key: value for key, value in prediction.diagnostics.items() if key in keep}
+    )
 
 
 def _lean_history(history: FilterHistory) -> FilterHistory:
@@ -367,45 +550,78 @@ def _lean_history(history: FilterHistory) -> FilterHistory:
     return history._replace(covariance=history.covariance[:, 6:9, 6:9])
 
 
-def _filtered(recordings: list[Recording], config: DataConfig, options: FilterOptions, batch_size: int, progress: Progress | None,
-              network: Network | None = None, measurements: list[tuple] | None = None) -> list[Estimate]:
-    """Run the filter with the network in the loop, or with measurements (displacement (K, 3), std (K, 3)) per recording."""
+def _filtered(
+    recordings: list[Recording],
+    config: DataConfig,
+    options: FilterOptions,
+    batch_size: int,
+    progress: Progress | None,
+    network: Network | None = None,
+    measurements: list[tuple] | None = None,
+) -> list[Estimate]:
+    """Run the filter with the network in the loop, or with measurements (displacement (K, 3), std
+    (K, 3)) per recording."""
     n, compiled = config.stride, filter_config(config, options)
-    noise = NoiseModel(options.gyro_density, options.accel_density, options.gyro_bias_walk, options.accel_bias_walk)
+    noise = NoiseModel(
+        options.gyro_density, options.accel_density, options.gyro_bias_walk, options.accel_bias_walk
+    )
     strides = [(len(r.sequence.time) - 1) // n for r in recordings]
-    order = sorted(range(len(recordings)), key=lambda i: -strides[i])  # alike lengths together: little padding
+    order = sorted(
+        range(len(recordings)), key=lambda i: -strides[i]
+    )  # alike lengths together: little padding
     batches = -(-len(order) // batch_size)
     size = -(-len(order) // max(1, batches))
     results: dict[int, Estimate] = {}
     longest, done = max(strides, default=0), 0
     for begin in range(0, len(order), size):
-        members = order[begin:begin + size]
+        members = order[begin : begin + size]
         members = members + members[-1:] * (size - len(members))
-        # Few distinct lengths, so few compilations: each is at most a quarter longer than it need be.
+        # Few distinct lengths, so few compilations: each is at most a quarter longer than it need
+        # be.
         while 0.8 * longest >= strides[members[0]] and longest > 16:
             longest = math.ceil(0.8 * longest)
-        start = jax.tree.map(lambda *leaves: np.stack(leaves), *(_start(recordings[i], options) for i in members))
-        gyro = np.stack([_extended(recordings[i].sequence.gyro[:-1], longest * n, 0.0) for i in members])
-        accel = np.stack([_extended(recordings[i].sequence.accel[:-1], longest * n, None) for i in members])
+        start = jax.tree.map(
+            lambda *leaves: np.stack(leaves), *(_start(recordings[i], options) for i in members)
+        )
+        gyro = np.stack(
+            [_extended(recordings[i].sequence.gyro[:-1], longest * n, 0.0) for i in members]
+        )
+        accel = np.stack(
+            [_extended(recordings[i].sequence.accel[:-1], longest * n, None) for i in members]
+        )
         if network is not None:
-            history = _run_tight(network.apply, network.variables, start, gyro, accel, compiled, noise)
+            history = _run_tight(
+                network.apply, network.variables, start, gyro, accel, compiled, noise
+            )
         else:
             assert measurements is not None
-            given = [np.stack([_extended(measurements[i][part], longest, np.nan) for i in members]) for part in (0, 1)]
+            given = [
+                np.stack([_extended(measurements[i][part], longest, np.nan) for i in members])
+                for part in (0, 1)
+            ]
             history = _run_given(start, gyro, accel, *given, compiled, noise)
         history = jax.device_get(history)
         for place, i in enumerate(members):
             if i not in results:
-                results[i] = _from_filter(recordings[i], jax.tree.map(lambda x, p=place, k=strides[i]: x[p, :k], history), options, n)
+                results[i] = _from_filter(
+                    recordings[i],
+                    jax.tree.map(lambda x, p=place, k=strides[i]: x[p, :k], history),
+                    options,
+                    n,
+                )
                 done += strides[i]
         if progress:
             progress(done / sum(strides))
     return [results[i] for i in range(len(recordings))]
 
 
-def _from_filter(recording: Recording, history: FilterHistory, options: FilterOptions, n: int) -> Estimate:
+def _from_filter(
+    recording: Recording, history: FilterHistory, options: FilterOptions, n: int
+) -> Estimate:
     def rows(first: Any, rest: Any) -> np.ndarray:
-        return np.concatenate([np.broadcast_to(np.asarray(first, float), rest.shape[1:])[None], rest])
+        return np.concatenate(
+            [np.broadcast_to(np.asarray(first, float), rest.shape[1:])[None], rest]
+        )
 
     std = np.repeat(np.array(_start(recording, options).std), [2, 1, 3, 3, 3, 3])
     time, notes = recording.sequence.time[::n], recording.notes
@@ -418,47 +634,87 @@ def _from_filter(recording: Recording, history: FilterHistory, options: FilterOp
     poses = (np.where(healthy[:, None], part, np.nan) for part in (position, orientation))
     assert history.covariance is not None
     return Estimate(
-        recording.sequence.name, Trajectory(time, *poses), _reference(recording, n),
-        displacement=rows(np.nan, history.displacement), displacement_std=rows(np.nan, history.measurement_std),
+        recording.sequence.name,
+        Trajectory(time, *poses),
+        _reference(recording, n),
+        displacement=rows(np.nan, history.displacement),
+        displacement_std=rows(np.nan, history.measurement_std),
         diagnostics={key: rows(np.nan, value) for key, value in history.diagnostics.items()},
-        velocity=rows(recording.velocity, history.velocity), gyro_bias=rows(recording.gyro_bias, history.gyro_bias),
+        velocity=rows(recording.velocity, history.velocity),
+        gyro_bias=rows(recording.gyro_bias, history.gyro_bias),
         accel_bias=rows(0.0, history.accel_bias),
         std=rows(std, np.sqrt(np.maximum(history.covariance_diagonal, 0.0))),
         position_covariance=rows(np.eye(3) * options.position_std**2, history.covariance),
-        accepted=rows(np.nan, history.accepted), nis=rows(np.nan, history.nis), notes=notes)
+        accepted=rows(np.nan, history.accepted),
+        nis=rows(np.nan, history.nis),
+        notes=notes,
+    )
 
 
-def _measurements(recording: Recording, displacement: Float[Array, "m 3"], std: Float[Array, "m 3"], config: DataConfig) -> tuple:
-    """Of all windows, as `run_filter` takes them, a row per stride. It has no clone at its start, so the first window is of no use."""
+def _measurements(
+    recording: Recording,
+    displacement: Float[Array, "m 3"],
+    std: Float[Array, "m 3"],
+    config: DataConfig,
+) -> tuple:
+    """Of all windows, as `run_filter` takes them, a row per stride. It has no clone at its start,
+    so the first window is of no use."""
     strides = (len(recording.sequence.time) - 1) // config.stride
     return _at_window_end(displacement[1:], strides), _at_window_end(std[1:], strides)
 
 
 def _extended(values: np.ndarray, rows: int, filling: float | None) -> np.ndarray:
-    """`values` with rows added at the end, of `filling` or (None) of the last one; what is added changes nothing before it."""
+    """`values` with rows added at the end, of `filling` or (None) of the last one; what is added
+    changes nothing before it."""
     added = values[-1:] if filling is None else np.full((1, *values.shape[1:]), filling)
     return np.concatenate([values, np.repeat(added, rows - len(values), 0)])
 
 
-# Summing displacements ------------------------------------------------------------------------------------------------
+# Summing displacements
+# ------------------------------------------------------------------------------------------------
 
 
-def _integrated(recording: Recording, rotation: Float[np.ndarray, "t 3 3"], prediction: Prediction, config: DataConfig) -> Estimate:
+def _integrated(
+    recording: Recording,
+    rotation: Float[np.ndarray, "t 3 3"],
+    prediction: Prediction,
+    config: DataConfig,
+) -> Estimate:
     n, window = config.stride, config.window // config.stride
     k = (len(recording.sequence.time) - 1) // n
-    steps = np.einsum("mij,mj->mi", _yaw_rotation(rotation[np.arange(len(prediction.displacement)) * n]), prediction.displacement) / window
-    path = recording.position + np.concatenate([np.zeros((1, 3)), np.cumsum(_mean_over_cover(steps, k, window), 0)])
+    steps = (
+        np.einsum(
+            "mij,mj->mi",
+            _yaw_rotation(rotation[np.arange(len(prediction.displacement)) * n]),
+            prediction.displacement,
+        )
+        / window
+    )
+    path = recording.position + np.concatenate(
+        [np.zeros((1, 3)), np.cumsum(_mean_over_cover(steps, k, window), 0)]
+    )
     return Estimate(
-        recording.sequence.name, Trajectory(recording.sequence.time[::n], path, _quaternions(rotation[::n])), _reference(recording, n),
-        displacement=_at_window_end(prediction.displacement, k + 1), displacement_std=_at_window_end(np.exp(prediction.log_std), k + 1),
-        diagnostics={key: _at_window_end(value, k + 1) for key, value in prediction.diagnostics.items()}, notes=recording.notes)
+        recording.sequence.name,
+        Trajectory(recording.sequence.time[::n], path, _quaternions(rotation[::n])),
+        _reference(recording, n),
+        displacement=_at_window_end(prediction.displacement, k + 1),
+        displacement_std=_at_window_end(np.exp(prediction.log_std), k + 1),
+        diagnostics={
+            key: _at_window_end(value, k + 1) for key, value in prediction.diagnostics.items()
+        },
+        notes=recording.notes,
+    )
 
 
-def _mean_over_cover(steps: Float[np.ndarray, "m 3"], strides: int, window: int) -> Float[np.ndarray, "k 3"]:
-    """Movement in each stride: the mean of displacement × stride/window (`steps`) over the windows that cover it.
+def _mean_over_cover(
+    steps: Float[np.ndarray, "m 3"], strides: int, window: int
+) -> Float[np.ndarray, "k 3"]:
+    """Movement in each stride: the mean of displacement × stride/window (`steps`) over the windows
+    that cover it.
 
-    Taking the one window that starts (or ends) at the stride instead puts the whole trajectory half a window ahead of (or
-    behind) its time: 0.6 m at walking speed. A stride without any window keeps the movement of the one before.
+    Taking the one window that starts (or ends) at the stride instead puts the whole trajectory half
+    a window ahead of (or behind) its time: 0.6 m at walking speed. A stride without any window
+    keeps the movement of the one before.
     """
     good = finite_rows(steps)
     sums = np.concatenate([np.zeros((1, 3)), np.cumsum(np.where(good[:, None], steps, 0.0), 0)])
@@ -466,33 +722,52 @@ def _mean_over_cover(steps: Float[np.ndarray, "m 3"], strides: int, window: int)
     stride = np.arange(strides)
     first, last = np.clip(stride - window + 1, 0, len(steps)), np.minimum(stride + 1, len(steps))
     covering = counts[last] - counts[first]
-    moved = np.divide(sums[last] - sums[first], covering[:, None], out=np.zeros((strides, 3)), where=covering[:, None] > 0)
+    moved = np.divide(
+        sums[last] - sums[first],
+        covering[:, None],
+        out=np.zeros((strides, 3)),
+        where=covering[:, None] > 0,
+    )
     return moved[np.maximum.accumulate(np.where(covering > 0, stride, 0))]
 
 
-# Shared ---------------------------------------------------------------------------------------------------------------
+# Shared
+# ---------------------------------------------------------------------------------------------------------------
 
 
-def _gyro_bias(sequence: Sequence, rate: float, how: str) -> tuple[Float[np.ndarray, "3"], tuple[str, ...]]:
+def _gyro_bias(
+    sequence: Sequence, rate: float, how: str
+) -> tuple[Float[np.ndarray, "3"], tuple[str, ...]]:
     if how == "rest":
         second = round(REST_SECONDS * rate)
         rest = 0
         while rest + second <= len(sequence.time):
             upto = slice(rest, rest + second)
-            if sequence.gyro[upto].std(0).max() > REST_GYRO_STD or sequence.accel[upto].std(0).max() > REST_ACCEL_STD:
+            if (
+                sequence.gyro[upto].std(0).max() > REST_GYRO_STD
+                or sequence.accel[upto].std(0).max() > REST_ACCEL_STD
+            ):
                 break
             rest += second
         if not rest:
             return np.zeros(3), ("gyro bias: no rest at the start, so it starts from zero",)
-        return sequence.gyro[:rest].mean(0), (f"gyro bias: mean of {rest / rate:g} s of rest at the start",)
+        return sequence.gyro[:rest].mean(0), (
+            f"gyro bias: mean of {rest / rate:g} s of rest at the start",
+        )
     if how == "reference":
         rows = np.arange(min(round(REFERENCE_BIAS_SECONDS * rate), len(sequence.time) - 1))
         rows = rows[sequence.valid[rows] & sequence.valid[rows + 1]]
         if len(rows) < rate:
-            return np.zeros(3), ("gyro bias: under 1 s of reference at the start, so it starts from zero",)
-        before, after = (Rotation.from_quat(sequence.orientation[r], scalar_first=True) for r in (rows, rows + 1))
+            return np.zeros(3), (
+                "gyro bias: under 1 s of reference at the start, so it starts from zero",
+            )
+        before, after = (
+            Rotation.from_quat(sequence.orientation[r], scalar_first=True) for r in (rows, rows + 1)
+        )
         turned = (before.inv() * after).as_rotvec() * rate
-        return (sequence.gyro[rows] - turned).mean(0), (f"gyro bias: {len(rows) / rate:g} s against the reference orientation",)
+        return (sequence.gyro[rows] - turned).mean(0), (
+            f"gyro bias: {len(rows) / rate:g} s against the reference orientation",
+        )
     return np.zeros(3), ()
 
 
@@ -503,14 +778,20 @@ def _yaw_rotation(rotation: Float[np.ndarray, "m 3 3"]) -> Float[np.ndarray, "m 
 
 def _quaternions(rotation: Float[np.ndarray, "k 3 3"]) -> Float[np.ndarray, "k 4"]:
     finite = finite_rows(rotation.reshape(-1, 9))
-    wxyz = Rotation.from_matrix(np.where(finite[:, None, None], rotation, np.eye(3))).as_quat(scalar_first=True)
+    wxyz = Rotation.from_matrix(np.where(finite[:, None, None], rotation, np.eye(3))).as_quat(
+        scalar_first=True
+    )
     return np.where(finite[:, None], wxyz, np.nan)
 
 
 def _reference(recording: Recording, n: int) -> Trajectory:
     sequence = recording.sequence
     good = sequence.valid[::n, None]
-    return Trajectory(sequence.time[::n], np.where(good, sequence.position[::n], np.nan), np.where(good, sequence.orientation[::n], np.nan))
+    return Trajectory(
+        sequence.time[::n],
+        np.where(good, sequence.position[::n], np.nan),
+        np.where(good, sequence.orientation[::n], np.nan),
+    )
 
 
 def _at_window_end(values: Float[Array, "m 3"], rows: int) -> Float[np.ndarray, "k 3"]:

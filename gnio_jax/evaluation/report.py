@@ -1,4 +1,5 @@
-"""The figures of an evaluation: a table for the screen, JSON and CSV for programs, TUM trajectories for evo."""
+"""The figures of an evaluation: a table for the screen, JSON and CSV for programs, TUM trajectories
+for evo."""
 
 from __future__ import annotations
 
@@ -74,30 +75,43 @@ class Report(NamedTuple):
     """Sequence -> why it has no figures."""
 
 
-def score(estimates: list[Estimate], groups: Mapping[str, Any], alignment: metrics.Alignment = "origin") -> Scores:
-    """Every metric of every estimate, and over all of them; `groups` says which sequences belong together (`metrics.summarise`)."""
+def score(
+    estimates: list[Estimate], groups: Mapping[str, Any], alignment: metrics.Alignment = "origin"
+) -> Scores:
+    """Every metric of every estimate, and over all of them; `groups` says which sequences belong
+    together (`metrics.summarise`)."""
     sequences = {}
     for e in estimates:
         found = metrics.measure(e.trajectory, e.reference, alignment, e.position_covariance, e.nis)
         if e.accepted is not None:
             tried = e.accepted[~np.isnan(e.accepted)]
             share = float(100 * tried.mean()) if len(tried) else None
-            found = Measures(found.values | {"accepted": share}, found.undefined | ({} if len(tried) else {"accepted": "no measurement"}))
+            found = Measures(
+                found.values | {"accepted": share},
+                found.undefined | ({} if len(tried) else {"accepted": "no measurement"}),
+            )
         sequences[e.name] = found
     summary = metrics.summarise({name: m.values for name, m in sequences.items()}, groups)
     return Scores(sequences, summary, {name: str(groups[name]) for name in sequences})
 
 
-# On the screen --------------------------------------------------------------------------------------------------------
+# On the screen
+# --------------------------------------------------------------------------------------------------------
 
 
 def table(report: Report) -> Group:
     """The table and what belongs under it, for `rich.console.Console.print`."""
-    shown = [name for name in COLUMNS if any(name in m.values for m in report.scores.sequences.values())]
+    shown = [
+        name for name in COLUMNS if any(name in m.values for m in report.scores.sequences.values())
+    ]
     settings = report.settings
     coupling = f", {settings['coupling']} coupling" if settings["estimator"] == "ekf" else ""
-    grid = Table(title=f"{settings['dataset']} {settings['split']}: {settings['estimator']}{coupling}", title_style="bold",
-                 title_justify="left", box=box.SIMPLE_HEAD)
+    grid = Table(
+        title=f"{settings['dataset']} {settings['split']}: {settings['estimator']}{coupling}",
+        title_style="bold",
+        title_justify="left",
+        box=box.SIMPLE_HEAD,
+    )
     labels = [*report.scores.sequences, *report.reference_rows]
     grid.add_column("sequence", overflow="fold", min_width=min(40, max(map(len, labels))))
     for name in shown:
@@ -105,7 +119,12 @@ def table(report: Report) -> Group:
         grid.add_column(f"{heading}\n[dim]{unit}[/dim]", justify="right", no_wrap=True)
 
     def add(label: str, values: Mapping[str, Any], style: str = "", last: bool = False) -> None:
-        grid.add_row(Text(label), *(_cell(values.get(name), COLUMNS[name][2]) for name in shown), style=style, end_section=last)
+        grid.add_row(
+            Text(label),
+            *(_cell(values.get(name), COLUMNS[name][2]) for name in shown),
+            style=style,
+            end_section=last,
+        )
 
     names = list(report.scores.sequences)
     for name in names:
@@ -117,27 +136,50 @@ def table(report: Report) -> Group:
     if report.scores.diverged:
         counts = (str(summary.diverged.get(name, 0)) for name in shown)
         grid.add_row("diverged", *counts, style="bold red")
-    grid.add_row("n", *(str(summary.count.get(name, 0)) for name in shown), style="dim", end_section=True)
+    grid.add_row(
+        "n", *(str(summary.count.get(name, 0)) for name in shown), style="dim", end_section=True
+    )
     for label, scores in report.reference_rows.items():
         label = f"{label} ({_mean_of(scores)})" if scores.diverged else label
         add(label, scores.summary.mean, "italic")
-    words = [f"window orientation: {settings['orientation_source']}", f"initial state: {settings['initial_state']}",
-             f"gyro bias: {settings['gyro_bias']}", f"IMU compensated: {settings['imu_compensated']}",
-             f"alignment: {settings['alignment']}"]
-    lines = [Text("; ".join(words), style="dim"),
-             Text("reference rows are means; – is not defined (the reason is in metrics.json)", style="dim")]
+    words = [
+        f"window orientation: {settings['orientation_source']}",
+        f"initial state: {settings['initial_state']}",
+        f"gyro bias: {settings['gyro_bias']}",
+        f"IMU compensated: {settings['imu_compensated']}",
+        f"alignment: {settings['alignment']}",
+    ]
+    lines = [
+        Text("; ".join(words), style="dim"),
+        Text(
+            "reference rows are means; – is not defined (the reason is in metrics.json)",
+            style="dim",
+        ),
+    ]
     if any(scores.diverged for scores in (report.scores, *report.reference_rows.values())):
-        lines.append(Text("∞: the estimate diverged. It counts in medians, with infinite errors "
-                          "and coverages of 0; means, intervals and n are in every column of the "
-                          "others alone, so they cannot be compared with those of another run",
-                          style="yellow"))
+        lines.append(
+            Text(
+                "∞: the estimate diverged. It counts in medians, with infinite errors "
+                "and coverages of 0; means, intervals and n are in every column of the "
+                "others alone, so they cannot be compared with those of another run",
+                style="yellow",
+            )
+        )
     said: dict[str, list[str]] = {}
     for name, notes in report.notes.items():
         for note in notes:
             said.setdefault(note, []).append(name)
     for note, names in said.items():
-        lines.append(Text(f"{', '.join(names) if len(names) < 4 else f'{len(names)} sequences'}: {note}", style="yellow"))
-    lines += [Text(f"left out: {name}: {reason}", style="yellow") for name, reason in report.left_out.items()]
+        lines.append(
+            Text(
+                f"{', '.join(names) if len(names) < 4 else f'{len(names)} sequences'}: {note}",
+                style="yellow",
+            )
+        )
+    lines += [
+        Text(f"left out: {name}: {reason}", style="yellow")
+        for name, reason in report.left_out.items()
+    ]
     return Group(grid, *lines)
 
 
@@ -155,7 +197,8 @@ def _cell(value: Any, digits: int) -> str:
     return f"{value:.{digits}f}" if abs(value) < 10 ** (7 - digits) else f"{value:.1e}"
 
 
-# Files ----------------------------------------------------------------------------------------------------------------
+# Files
+# ----------------------------------------------------------------------------------------------------------------
 
 
 def as_json(report: Report) -> dict[str, Any]:
@@ -165,9 +208,14 @@ def as_json(report: Report) -> dict[str, Any]:
     report's `diverged` by metric.
     """
     measured = report.scores.sequences.values()
-    nowhere = {name: next((m.undefined[name] for m in measured if name in m.undefined),
-                          "no estimate that did not diverge")
-               for name, value in _finite(report.scores.summary.mean).items() if value is None}
+    nowhere = {
+        name: next(
+            (m.undefined[name] for m in measured if name in m.undefined),
+            "no estimate that did not diverge",
+        )
+        for name, value in _finite(report.scores.summary.mean).items()
+        if value is None
+    }
     sequences = _sequences(report.scores)
     for name, group in report.scores.groups.items():
         sequences[name]["group"] = group
@@ -178,15 +226,19 @@ def as_json(report: Report) -> dict[str, Any]:
         "sequences": sequences,
         **_summary(report.scores),
         "undefined": nowhere,
-        "reference_rows": {label: {"sequences": _sequences(scores), **_summary(scores)}
-                           for label, scores in report.reference_rows.items()},
+        "reference_rows": {
+            label: {"sequences": _sequences(scores), **_summary(scores)}
+            for label, scores in report.reference_rows.items()
+        },
         "left_out": report.left_out,
     }
 
 
 def _sequences(scores: Scores) -> dict[str, dict[str, Any]]:
-    return {name: {**_finite(m.values), **({"undefined": m.undefined} if m.undefined else {})}
-            for name, m in scores.sequences.items()}
+    return {
+        name: {**_finite(m.values), **({"undefined": m.undefined} if m.undefined else {})}
+        for name, m in scores.sequences.items()
+    }
 
 
 def read_metric(sequence: Mapping[str, Any], metric: str) -> float | None:
@@ -205,10 +257,16 @@ def definitions(figures: Mapping[str, Any]) -> int:
 
 def _summary(scores: Scores) -> dict[str, Any]:
     summary = scores.summary
-    interval = {name: None if value is None else list(value) for name, value in summary.interval.items()}
-    return {"mean": {**_finite(summary.mean), "diverged": len(scores.diverged)},
-            "median": _finite(summary.median), "interval": interval, "n": summary.count,
-            "diverged": summary.diverged}
+    interval = {
+        name: None if value is None else list(value) for name, value in summary.interval.items()
+    }
+    return {
+        "mean": {**_finite(summary.mean), "diverged": len(scores.diverged)},
+        "median": _finite(summary.median),
+        "interval": interval,
+        "n": summary.count,
+        "diverged": summary.diverged,
+    }
 
 
 def _finite(values: Mapping[str, float | None]) -> dict[str, float | None]:
@@ -217,15 +275,26 @@ def _finite(values: Mapping[str, float | None]) -> dict[str, float | None]:
 
 
 def write(folder: Path, report: Report, estimates: list[Estimate]) -> None:
-    """metrics.json, metrics.csv, trajectories/ and references/ (TUM format) into an empty folder (see `replacing_folder`)."""
+    """metrics.json, metrics.csv, trajectories/ and references/ (TUM format) into an empty folder
+    (see `replacing_folder`)."""
     text = json.dumps(as_json(report), indent=2, allow_nan=False, ensure_ascii=False)
     (folder / "metrics.json").write_text(text + "\n", encoding="utf-8")
-    columns = list(dict.fromkeys(metric for m in report.scores.sequences.values() for metric in m.values))
+    columns = list(
+        dict.fromkeys(metric for m in report.scores.sequences.values() for metric in m.values)
+    )
     with open(folder / "metrics.csv", "w", newline="", encoding="utf-8") as file:
         rows = csv.writer(file)
         rows.writerow(["sequence", *columns])
         for name, m in report.scores.sequences.items():
-            rows.writerow([name, *("" if m.values.get(column) is None else repr(m.values[column]) for column in columns)])
+            rows.writerow(
+                [
+                    name,
+                    *(
+                        "" if m.values.get(column) is None else repr(m.values[column])
+                        for column in columns
+                    ),
+                ]
+            )
     for kind in ("trajectories", "references"):
         (folder / kind).mkdir()
     for stem, e in zip(file_names([e.name for e in estimates]), estimates, strict=True):
@@ -236,12 +305,15 @@ def write(folder: Path, report: Report, estimates: list[Estimate]) -> None:
 
 def write_tum(path: Path, trajectory: Trajectory) -> None:
     """`t x y z qx qy qz qw` a line, s and m, body→world; rows that are not finite are left out."""
-    rows = np.column_stack([trajectory.time, trajectory.position, trajectory.orientation[:, [1, 2, 3, 0]]])
+    rows = np.column_stack(
+        [trajectory.time, trajectory.position, trajectory.orientation[:, [1, 2, 3, 0]]]
+    )
     np.savetxt(path, rows[np.isfinite(rows).all(1)], fmt="%.9f", header="t x y z qx qy qz qw")
 
 
 def file_names(names: list[str]) -> list[str]:
-    """A distinct file name for each sequence: its name with anything a file system could mind as `_`."""
+    """A distinct file name for each sequence: its name with anything a file system could mind as
+    `_`."""
     stems: list[str] = []
     for name in names:
         stem = re.sub(r"[^\w.=+-]+", "_", name).strip("._") or "sequence"
@@ -253,7 +325,8 @@ def file_names(names: list[str]) -> list[str]:
 
 @contextmanager
 def replacing_folder(path: Path) -> Iterator[Path]:
-    """Yield an empty folder beside `path`; on success it takes the place of `path`, on failure it is removed and `path` stays."""
+    """Yield an empty folder beside `path`; on success it takes the place of `path`, on failure it
+    is removed and `path` stays."""
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
     try:

@@ -17,15 +17,17 @@ T = TypeVar("T")
 
 
 def over_sequences(function: Callable[..., T], shared: int = 0) -> Callable[..., T]:
-    """`jax.vmap(function)` whose sequences are shared out among all devices; to be jitted, and differentiable like it.
+    """`jax.vmap(function)` whose sequences are shared out among all devices; to be jitted, and
+    differentiable like it.
 
-    The first `shared` arguments (parameters, noise) are the same for every sequence; the leaves of all others, and of the
-    result, have the sequences as their leading axis. A number of sequences that does not divide evenly is filled up with the
-    last one, whose additional results are dropped. With one device, or one sequence, it is `jax.vmap`. Arguments must not be bound
-    to a device by `jax.device_put(x, device)`: JAX refuses those (ValueError).
+    The first `shared` arguments (parameters, noise) are the same for every sequence; the leaves of
+    all others, and of the result, have the sequences as their leading axis. A number of sequences
+    that does not divide evenly is filled up with the last one, whose additional results are
+    dropped. With one device, or one sequence, it is `jax.vmap`. Arguments must not be bound to a
+    device by `jax.device_put(x, device)`: JAX refuses those (ValueError).
 
-    On a machine without a GPU JAX sees one device however many cores there are, and the filter's operations are too small for
-    XLA to split each among cores: call `cores_as_devices` first.
+    On a machine without a GPU JAX sees one device however many cores there are, and the filter's
+    operations are too small for XLA to split each among cores: call `cores_as_devices` first.
     """
 
     def mapped(*arguments: object) -> T:
@@ -36,7 +38,14 @@ def over_sequences(function: Callable[..., T], shared: int = 0) -> Callable[...,
         if len(devices) == 1:
             return batched(*arguments)
         filling = -count % len(devices)
-        filled = jax.tree.map(lambda x: jnp.concatenate([jnp.asarray(x), jnp.repeat(x[-1:], filling, axis=0)]) if filling else x, own)
+        filled = jax.tree.map(
+            lambda x: (
+                jnp.concatenate([jnp.asarray(x), jnp.repeat(x[-1:], filling, axis=0)])
+                if filling
+                else x
+            ),
+            own,
+        )
         every, each = PartitionSpec(), PartitionSpec("sequence")
         spread = jax.shard_map(batched, mesh=Mesh(np.array(devices), ("sequence",)), in_specs=(every,) * shared + (each,) * len(own),
                                out_specs=each, check_vma=False)  # fmt: skip
@@ -46,10 +55,11 @@ def over_sequences(function: Callable[..., T], shared: int = 0) -> Callable[...,
 
 
 def cores_as_devices() -> None:
-    """Let JAX see every core that this process may use as a device of its own, unless a number of CPU devices is set already.
+    """Let JAX see every core that this process may use as a device of its own, unless a number of
+    CPU devices is set already.
 
-    Programs that do not spread anything go on running on the first device, with all cores. Raises RuntimeError after JAX's
-    first computation, when the devices are settled.
+    Programs that do not spread anything go on running on the first device, with all cores. Raises
+    RuntimeError after JAX's first computation, when the devices are settled.
     """
     given = jax.config.jax_num_cpu_devices  # pyright: ignore[reportAttributeAccessIssue] — JAX makes its settings when it is imported
     if given >= 0 or "xla_force_host_platform_device_count" in os.environ.get("XLA_FLAGS", ""):

@@ -1,8 +1,10 @@
-"""Drop-outs of the IMU: short ones are bridged with the last sample, long ones coasted through, and both cost certainty.
+"""Drop-outs of the IMU: short ones are bridged with the last sample, long ones coasted through, and
+both cost certainty.
 
-All of this file is ours; the paper and TLIO take a complete stream for granted. A held sample is wrong by something that grows with
-its age and stays of one sign over a gap, so its error is taken as fully correlated: a gap's samples get variances that add up to the
-square of the summed standard deviations. Beyond `bridge_seconds` nothing is held: attitude and velocity stay as they are.
+All of this file is ours; the paper and TLIO take a complete stream for granted. A held sample is
+wrong by something that grows with its age and stays of one sign over a gap, so its error is taken
+as fully correlated: a gap's samples get variances that add up to the square of the summed standard
+deviations. Beyond `bridge_seconds` nothing is held: attitude and velocity stay as they are.
 """
 
 from __future__ import annotations
@@ -39,18 +41,28 @@ class Imu(NamedTuple):
     """None where the stream is complete."""
 
 
-def bridge(gyro: Float[Array, "n 3"], accel: Float[Array, "n 3"], valid: Bool[Array, "n"] | None, memory: ImuMemory,
-           config: FilterConfig) -> tuple[Imu, Float[Array, "n"], ImuMemory]:
-    """The stream with its holes filled, the age of each held sample in s (0 for one's own), and the memory after it.
+def bridge(
+    gyro: Float[Array, "n 3"],
+    accel: Float[Array, "n 3"],
+    valid: Bool[Array, "n"] | None,
+    memory: ImuMemory,
+    config: FilterConfig,
+) -> tuple[Imu, Float[Array, "n"], ImuMemory]:
+    """The stream with its holes filled, the age of each held sample in s (0 for one's own), and the
+    memory after it.
 
-    A sample is missing where `valid` is False or a value is not finite. Without `valid` the stream is taken to be complete.
+    A sample is missing where `valid` is False or a value is not finite. Without `valid` the stream
+    is taken to be complete.
     """
     n = gyro.shape[0]
     if valid is None:
-        after = memory._replace(gyro=gyro[-1], accel=accel[-1], missing=jnp.zeros_like(memory.missing))
+        after = memory._replace(
+            gyro=gyro[-1], accel=accel[-1], missing=jnp.zeros_like(memory.missing)
+        )
         return Imu(gyro, accel, None), jnp.zeros(n, gyro.dtype), after
     valid = valid & jnp.all(jnp.isfinite(gyro), axis=1) & jnp.all(jnp.isfinite(accel), axis=1)
-    # The stream with what is remembered before it, as sample 0; every sample points to the last that is there.
+    # The stream with what is remembered before it, as sample 0; every sample points to the last
+    # that is there.
     last = jax.lax.cummax(jnp.where(valid, jnp.arange(1, n + 1), 0))
     age = jnp.where(last == 0, memory.missing + jnp.arange(1, n + 1), jnp.arange(1, n + 1) - last)
     known = jnp.all(jnp.isfinite(memory.gyro)) | (last > 0)
@@ -63,16 +75,24 @@ def bridge(gyro: Float[Array, "n 3"], accel: Float[Array, "n 3"], valid: Bool[Ar
     coasting = (age > limit) | ~known
     variance = _variance(jnp.where(known, age, limit + 1), limit).astype(gyro.dtype)
     gyro, accel = held(memory.gyro, gyro), held(memory.accel, accel)
-    gap = Gap(variance * config.gap_gyro_std**2, variance * config.gap_accel_std**2, jnp.where(coasting, 0.0, 1.0).astype(gyro.dtype))
+    gap = Gap(
+        variance * config.gap_gyro_std**2,
+        variance * config.gap_accel_std**2,
+        jnp.where(coasting, 0.0, 1.0).astype(gyro.dtype),
+    )
     any_yet = known[-1]
-    after = memory._replace(gyro=jnp.where(any_yet, gyro[-1], jnp.nan), accel=jnp.where(any_yet, accel[-1], jnp.nan),
-                            missing=age[-1].astype(memory.missing.dtype))
+    after = memory._replace(
+        gyro=jnp.where(any_yet, gyro[-1], jnp.nan),
+        accel=jnp.where(any_yet, accel[-1], jnp.nan),
+        missing=age[-1].astype(memory.missing.dtype),
+    )
     return Imu(gyro, accel, gap), (age * config.dt).astype(gyro.dtype), after
 
 
 def _variance(age: Int[Array, "n"], limit: int) -> Float[Array, "n"]:
-    """Of a sample held for `age` samples, in units of the gap's own, so that sums over a gap have the standard deviation Σ e_j, where
-    e_j = min(j / limit, 1) is the error of the j-th."""
+    """Of a sample held for `age` samples, in units of the gap's own, so that sums over a gap have
+    the standard deviation Σ e_j, where e_j = min(j / limit, 1) is the error of the j-th."""
+
     def total(j: Array) -> Array:
         ramp = jnp.minimum(j, limit)
         return ramp * (ramp + 1) / (2 * limit) + (j - ramp)

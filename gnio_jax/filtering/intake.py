@@ -118,8 +118,9 @@ def measure_rate(intake: Intake, time: float, design: Design) -> Intake:
     return intake._replace(intervals=intake.intervals + 1, covered=intake.covered + interval)
 
 
-def take(intake: Intake | None, time: float, sample: tuple[float, ...],
-         design: Design) -> tuple[Intake, list[Event]]:
+def take(
+    intake: Intake | None, time: float, sample: tuple[float, ...], design: Design
+) -> tuple[Intake, list[Event]]:
     """The stream after one sample, and what the filter's clock is to be told.
 
     Without a low-pass that is the sample itself. With one it is grid samples with their own stamps,
@@ -146,8 +147,9 @@ def take(intake: Intake | None, time: float, sample: tuple[float, ...],
     elif run is None:
         events.append((time, sample))
     elif there and elapsed - run.stamps[-1] >= _CLOSEST / design.imu_rate:
-        run = run._replace(stamps=np.append(run.stamps, elapsed),
-                           samples=np.concatenate([run.samples, [sample]]))
+        run = run._replace(
+            stamps=np.append(run.stamps, elapsed), samples=np.concatenate([run.samples, [sample]])
+        )
     if run is not None:
         last = _last(run, slack, design)
         while count * design.factor + len(design.taps) // 2 <= last:
@@ -180,8 +182,9 @@ def _filtered(run: Run, count: int, last: int, design: Design) -> tuple[float, .
     return tuple((taps @ fine / taps.sum()).tolist())
 
 
-def _interpolated(run: Run, points: Float[np.ndarray, "p"],
-                  design: Design) -> Float[np.ndarray, "p 6"]:
+def _interpolated(
+    run: Run, points: Float[np.ndarray, "p"], design: Design
+) -> Float[np.ndarray, "p 6"]:
     """The samples at some points of the run: a spline, and lines where they are far apart."""
     if len(run.stamps) < 4:
         fine, lines = np.empty((len(points), 6)), np.ones(len(points), bool)

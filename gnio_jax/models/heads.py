@@ -1,4 +1,5 @@
-"""Prediction heads: the gated displacement with its ablations, and the uncertainty (paper §III-D, §III-E)."""
+"""Prediction heads: the gated displacement with its ablations, and the uncertainty (paper §III-D,
+§III-E)."""
 
 from __future__ import annotations
 
@@ -20,16 +21,20 @@ SCALES = {
 
 
 class GatedHead(nn.Module):
-    """d̂ = s ⊙ γ: a scale s = softplus(W_s h + b_s) and a gate γ = tanh(W_g h + b_g) that closes at rest.
+    """d̂ = s ⊙ γ: a scale s = softplus(W_s h + b_s) and a gate γ = tanh(W_g h + b_g) that closes at
+    rest.
 
-    Ours: the gate starts with zero bias and a small kernel, so that an untrained network predicts d̂ ≈ 0.
+    Ours: the gate starts with zero bias and a small kernel, so that an untrained network predicts
+    d̂ ≈ 0.
     """
 
     gate: str = "tanh"
     scale: str = "softplus"
 
     @nn.compact
-    def __call__(self, h: Float[jax.Array, "b d"]) -> tuple[Float[jax.Array, "b 3"], dict[str, jax.Array]]:
+    def __call__(
+        self, h: Float[jax.Array, "b d"]
+    ) -> tuple[Float[jax.Array, "b 3"], dict[str, jax.Array]]:
         scale = SCALES[self.scale](linear(3, "scale")(h))
         gate = GATES[self.gate](linear(3, "gate", kernel_init=nn.initializers.normal(1e-3))(h))
         return scale * gate, {"scale": scale, "gate": gate}
@@ -39,15 +44,18 @@ class LinearHead(nn.Module):
     """d̂ = W h + b: the ablation without a gate."""
 
     @nn.compact
-    def __call__(self, h: Float[jax.Array, "b d"]) -> tuple[Float[jax.Array, "b 3"], dict[str, jax.Array]]:
+    def __call__(
+        self, h: Float[jax.Array, "b d"]
+    ) -> tuple[Float[jax.Array, "b 3"], dict[str, jax.Array]]:
         return linear(3, "displacement")(h), {}
 
 
 class UncertaintyHead(nn.Module):
     """u = W_u h + b_u, the log standard deviation per axis: Σ̂ = diag(exp 2u).
 
-    Ours: kernel and bias start at zero, σ = 1 m. The likelihood's gradient holds e² exp(−2u), which no bound limits where a
-    random kernel says a small σ; one such step stays in Adam's second moment for thousands of steps.
+    Ours: kernel and bias start at zero, σ = 1 m. The likelihood's gradient holds e² exp(−2u), which
+    no bound limits where a random kernel says a small σ; one such step stays in Adam's second
+    moment for thousands of steps.
     """
 
     @nn.compact
@@ -56,10 +64,12 @@ class UncertaintyHead(nn.Module):
 
 
 class CalibratedUncertainty(nn.Module):
-    """The head's standard deviation times one factor per axis, which inference applies and training does not see.
+    """The head's standard deviation times one factor per axis, which inference applies and training
+    does not see.
 
-    The factor (ours) lies among the `batch_stats` as its logarithm. It is set after every validation, so that the squared
-    errors on the validation split are those that the standard deviations announce (`training.step.calibrated`).
+    The factor (ours) lies among the `batch_stats` as its logarithm. It is set after every
+    validation, so that the squared errors on the validation split are those that the standard
+    deviations announce (`training.step.calibrated`).
     """
 
     @nn.compact
@@ -74,10 +84,11 @@ def _log_std() -> nn.Dense:
 
 
 class ConstantUncertainty(nn.Module):
-    """The log standard deviation of a network that has none of its own: one constant per axis, the same for every window.
+    """The log standard deviation of a network that has none of its own: one constant per axis, the
+    same for every window.
 
-    Not a parameter: it lies among the `batch_stats` and is set to the errors on the validation split after every epoch
-    (`training.step.calibrated`).
+    Not a parameter: it lies among the `batch_stats` and is set to the errors on the validation
+    split after every epoch (`training.step.calibrated`).
     """
 
     @nn.compact
@@ -87,5 +98,6 @@ class ConstantUncertainty(nn.Module):
 
 
 def to_axes(output: Float[jax.Array, "b k"]) -> Float[jax.Array, "b 3"]:
-    """The displacement of a head with two or three outputs: one that is horizontal only says 0 of the vertical."""
+    """The displacement of a head with two or three outputs: one that is horizontal only says 0 of
+    the vertical."""
     return jnp.pad(output, ((0, 0), (0, 3 - output.shape[-1])))

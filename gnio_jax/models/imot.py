@@ -1,4 +1,5 @@
-"""iMoT (Nguyen et al., "iMoT: Inertial Motion Transformer for Inertial Navigation", AAAI 2025, arXiv 2412.12190), from its text."""
+"""iMoT (Nguyen et al., "iMoT: Inertial Motion Transformer for Inertial Navigation", AAAI 2025,
+arXiv 2412.12190), from its text."""
 
 from __future__ import annotations
 
@@ -8,7 +9,14 @@ from flax import linen as nn
 from jaxtyping import Float
 
 from gnio_jax.models.heads import ConstantUncertainty, to_axes
-from gnio_jax.models.layers import attend, attention, check_dropout, check_output_dim, layer_norm, linear
+from gnio_jax.models.layers import (
+    attend,
+    attention,
+    check_dropout,
+    check_output_dim,
+    layer_norm,
+    linear,
+)
 from gnio_jax.types import Prediction
 
 TREND_SPANS = (9, 3)
@@ -20,23 +28,31 @@ PARTS = 3
 
 
 class IMoT(nn.Module):
-    """Windows [accel, gyro] in the gravity-aligned frame to displacement, the weighted sum of particles; the uncertainty is a constant.
+    """Windows [accel, gyro] in the gravity-aligned frame to displacement, the weighted sum of
+    particles; the uncertainty is a constant.
 
-    A token is the whole series of a channel, T samples in a window of T. The encoder lets the six channels, their trends and their
-    seasons attend to one another; the decoder moves particles, velocities that start as parameters, by what they find there. Published:
-    horizontal velocities, `output_dim = 2`. Ours: velocities are in metres per duration of the window (m/s for the publication's 1 s), so
-    that their sum is the displacement, m, along three axes unless two are asked for; then the vertical one is 0.
+    A token is the whole series of a channel, T samples in a window of T. The encoder lets the six
+    channels, their trends and their seasons attend to one another; the decoder moves particles,
+    velocities that start as parameters, by what they find there. Published: horizontal velocities,
+    `output_dim = 2`. Ours: velocities are in metres per duration of the window (m/s for the
+    publication's 1 s), so that their sum is the displacement, m, along three axes unless two are
+    asked for; then the vertical one is 0.
 
-    The publication's 14.49 M parameters and its two encoder and two decoder layers cannot both hold: this class has four and four, with
-    4.58 T hidden units in the feed-forward parts, which is 14,492,810 for T = 200 and two axes; `IMoTText` has the layers of the text
-    and 7,137,482. Three axes cost 329 more at T = 200, which is what the particles and their last layer hold.
+    The publication's 14.49 M parameters and its two encoder and two decoder layers cannot both
+    hold: this class has four and four, with
+    4.58 T hidden units in the feed-forward parts, which is 14,492,810 for T = 200 and two axes;
+    `IMoTText` has the layers of the text and 7,137,482. Three axes cost 329 more at T = 200, which
+    is what the particles and their last layer hold.
 
-    Ours, where the publication is silent, chosen among what gives these numbers: T features everywhere, 2 T inside the attentions to the
-    tokens; GELU in the spatial blocks, else ReLU; sums normalised after every part; dropout 0.1 before every sum; positions by sinusoids
-    over the tokens' numbers, or over a particle's coordinates. `heads` is the most that there may be: the largest number up to it that
-    divides T is taken, 8 for 200 samples and 5 for 100. Training needs the random stream `dropout`.
+    Ours, where the publication is silent, chosen among what gives these numbers: T features
+    everywhere, 2 T inside the attentions to the tokens; GELU in the spatial blocks, else ReLU; sums
+    normalised after every part; dropout 0.1 before every sum; positions by sinusoids over the
+    tokens' numbers, or over a particle's coordinates. `heads` is the most that there may be: the
+    largest number up to it that divides T is taken, 8 for 200 samples and 5 for 100. Training needs
+    the random stream `dropout`.
 
-    Diagnostics: `particles` (b, p, output_dim), metres per duration of the window, and `particle_weights` (b, p), which sum to 1.
+    Diagnostics: `particles` (b, p, output_dim), metres per duration of the window, and
+    `particle_weights` (b, p), which sum to 1.
     """
 
     encoder_layers: int = 4
@@ -63,29 +79,48 @@ class IMoT(nn.Module):
         heads, ffn = head_count(samples, self.heads), max(round(self.ffn_ratio * samples), 1)
         tokens, positions = windows.astype(jnp.float32).transpose(0, 2, 1), None
         for layer in range(self.encoder_layers):
-            # The three parts of a channel become one series again, which a layer that changes nothing leaves as it was.
-            channels = tokens if layer == 0 else tokens.reshape(batch, MODALITIES, PARTS, 3, samples).sum(axis=2).reshape(batch, 6, -1) / 2
-            tokens, positions = EncoderLayer(heads, ffn, self.dropout, name=f"encoder_{layer + 1}")(channels, train)
+            # The three parts of a channel become one series again, which a layer that changes
+            # nothing leaves as it was.
+            channels = (
+                tokens
+                if layer == 0
+                else tokens.reshape(batch, MODALITIES, PARTS, 3, samples)
+                .sum(axis=2)
+                .reshape(batch, 6, -1)
+                / 2
+            )
+            tokens, positions = EncoderLayer(heads, ffn, self.dropout, name=f"encoder_{layer + 1}")(
+                channels, train
+            )
 
-        start = self.param("particles", nn.initializers.normal(1.0), (self.particles, self.output_dim), jnp.float32)
+        start = self.param(
+            "particles", nn.initializers.normal(1.0), (self.particles, self.output_dim), jnp.float32
+        )
         particles = jnp.broadcast_to(start[None], (batch, *start.shape))
         content = jnp.zeros((batch, self.particles, samples), jnp.float32)
         locate = Perceptron((samples, samples), name="particle_positions")
         refine = Perceptron((samples, self.output_dim), name="refinement")
         for layer in range(self.decoder_layers):
             where = locate(sinusoids_of(particles, samples))
-            content = DecoderLayer(heads, ffn, self.dropout, name=f"decoder_{layer + 1}")(content, where, tokens, positions, train)
+            content = DecoderLayer(heads, ffn, self.dropout, name=f"decoder_{layer + 1}")(
+                content, where, tokens, positions, train
+            )
             particles = particles + refine(content)
         weights = Scores(name="scores")(content)
         velocity = jnp.einsum("bp,bpk->bk", weights, particles)
-        return Prediction(to_axes(velocity), ConstantUncertainty(name="uncertainty")(batch), {
-            "particles": particles,
-            "particle_weights": weights,
-        })
+        return Prediction(
+            to_axes(velocity),
+            ConstantUncertainty(name="uncertainty")(batch),
+            {
+                "particles": particles,
+                "particle_weights": weights,
+            },
+        )
 
 
 class IMoTText(IMoT):
-    """iMoT by its text: two encoder and two decoder layers, 4 T hidden units. 7,137,482 parameters for T = 200 and two axes."""
+    """iMoT by its text: two encoder and two decoder layers, 4 T hidden units. 7,137,482 parameters
+    for T = 200 and two axes."""
 
     encoder_layers: int = 2
     decoder_layers: int = 2
@@ -93,9 +128,11 @@ class IMoTText(IMoT):
 
 
 class EncoderLayer(nn.Module):
-    """Six channels to their eighteen tokens, acceleration's nine first, and the tokens' adaptive positions.
+    """Six channels to their eighteen tokens, acceleration's nine first, and the tokens' adaptive
+    positions.
 
-    Attention with queries and keys x + e and values x, then a feed-forward part; what each is added to passes a spatial block first.
+    Attention with queries and keys x + e and values x, then a feed-forward part; what each is added
+    to passes a spatial block first.
     """
 
     heads: int
@@ -103,11 +140,16 @@ class EncoderLayer(nn.Module):
     dropout: float
 
     @nn.compact
-    def __call__(self, channels: Float[jax.Array, "b c n"], train: bool) -> tuple[Float[jax.Array, "b k n"], Float[jax.Array, "b k n"]]:
+    def __call__(
+        self, channels: Float[jax.Array, "b c n"], train: bool
+    ) -> tuple[Float[jax.Array, "b k n"], Float[jax.Array, "b k n"]]:
         drop = nn.Dropout(self.dropout, deterministic=not train)
         x = decouple(channels)
         samples = x.shape[-1]
-        e = Perceptron((samples, samples), name="positions")(x) * sinusoids(jnp.arange(x.shape[1], dtype=jnp.float32), samples)[None]
+        e = (
+            Perceptron((samples, samples), name="positions")(x)
+            * sinusoids(jnp.arange(x.shape[1], dtype=jnp.float32), samples)[None]
+        )
         y = attention(self.heads, "attention")(x + e, x + e, x)
         x = layer_norm("attention_norm")(SpatialBlock(name="attention_spatial")(x) + drop(y))
         y = Perceptron((self.ffn, samples), name="ffn")(x)
@@ -115,9 +157,11 @@ class EncoderLayer(nn.Module):
 
 
 class SpatialBlock(nn.Module):
-    """Acceleration's and angular rate's tokens side by side in time, mixed over three neighbouring tokens, gated, and mixed again.
+    """Acceleration's and angular rate's tokens side by side in time, mixed over three neighbouring
+    tokens, gated, and mixed again.
 
-    k3 convolution over the tokens with 2 T channels, times the sigmoid of its mean over the tokens, 1×1 convolution, GELU.
+    k3 convolution over the tokens with 2 T channels, times the sigmoid of its mean over the tokens,
+    1×1 convolution, GELU.
     """
 
     @nn.compact
@@ -125,17 +169,23 @@ class SpatialBlock(nn.Module):
         batch, tokens, samples = x.shape
         y = jnp.concatenate(jnp.split(x, MODALITIES, axis=1), axis=2)
         padded = jnp.pad(y, ((0, 0), (1, 1), (0, 0)))
-        y = linear(2 * samples, "conv3")(jnp.concatenate([padded[:, :-2], y, padded[:, 2:]], axis=2))
+        y = linear(2 * samples, "conv3")(
+            jnp.concatenate([padded[:, :-2], y, padded[:, 2:]], axis=2)
+        )
         y = y * nn.sigmoid(y.mean(axis=1, keepdims=True))
         y = nn.gelu(linear(2 * samples, "conv1")(y), approximate=False)
-        return jnp.concatenate(jnp.split(y, MODALITIES, axis=2), axis=1).reshape(batch, tokens, samples)
+        return jnp.concatenate(jnp.split(y, MODALITIES, axis=2), axis=1).reshape(
+            batch, tokens, samples
+        )
 
 
 class DecoderLayer(nn.Module):
-    """Content of the particles: attention to one another, to acceleration's tokens and to angular rate's, both fused, feed-forward.
+    """Content of the particles: attention to one another, to acceleration's tokens and to angular
+    rate's, both fused, feed-forward.
 
-    Among themselves queries and keys are the sum of a projected content and a projected position; towards the tokens they are content
-    and position side by side (conditional attention), while values are contents alone.
+    Among themselves queries and keys are the sum of a projected content and a projected position;
+    towards the tokens they are content and position side by side (conditional attention), while
+    values are contents alone.
     """
 
     heads: int
@@ -143,15 +193,30 @@ class DecoderLayer(nn.Module):
     dropout: float
 
     @nn.compact
-    def __call__(self, content: Float[jax.Array, "b p n"], where: Float[jax.Array, "b p n"], tokens: Float[jax.Array, "b k n"],
-                 positions: Float[jax.Array, "b k n"], train: bool) -> Float[jax.Array, "b p n"]:
+    def __call__(
+        self,
+        content: Float[jax.Array, "b p n"],
+        where: Float[jax.Array, "b p n"],
+        tokens: Float[jax.Array, "b k n"],
+        positions: Float[jax.Array, "b k n"],
+        train: bool,
+    ) -> Float[jax.Array, "b p n"]:
         drop = nn.Dropout(self.dropout, deterministic=not train)
         samples = content.shape[-1]
-        x = layer_norm("self_norm")(content + drop(ParticleAttention(self.heads, name="self")(content, where)))
+        x = layer_norm("self_norm")(
+            content + drop(ParticleAttention(self.heads, name="self")(content, where))
+        )
         found = []
-        for name, token, position in zip(("accel", "gyro"), jnp.split(tokens, MODALITIES, axis=1), jnp.split(positions, MODALITIES, axis=1),
-                                         strict=True):
-            query, key = jnp.concatenate([x, where], axis=-1), jnp.concatenate([token, position], axis=-1)
+        for name, token, position in zip(
+            ("accel", "gyro"),
+            jnp.split(tokens, MODALITIES, axis=1),
+            jnp.split(positions, MODALITIES, axis=1),
+            strict=True,
+        ):
+            query, key = (
+                jnp.concatenate([x, where], axis=-1),
+                jnp.concatenate([token, position], axis=-1),
+            )
             y = attention(self.heads, name, samples)(query, key, token)
             found.append(layer_norm(f"{name}_norm")(x + drop(y)))
         x = Perceptron((samples, samples), name="fusion")(jnp.concatenate(found, axis=-1))
@@ -159,21 +224,31 @@ class DecoderLayer(nn.Module):
 
 
 class ParticleAttention(nn.Module):
-    """Self-attention whose queries and keys are W_c content + W_p position, and whose values are projected contents."""
+    """Self-attention whose queries and keys are W_c content + W_p position, and whose values are
+    projected contents."""
 
     heads: int
 
     @nn.compact
-    def __call__(self, content: Float[jax.Array, "b p n"], where: Float[jax.Array, "b p n"]) -> Float[jax.Array, "b p n"]:
+    def __call__(
+        self, content: Float[jax.Array, "b p n"], where: Float[jax.Array, "b p n"]
+    ) -> Float[jax.Array, "b p n"]:
         features = content.shape[-1]
-        query, key = (linear(features, f"{name}_content")(content) + linear(features, f"{name}_position")(where)
-                      for name in ("query", "key"))
-        query, key, value = (x.reshape(*x.shape[:2], self.heads, -1) for x in (query, key, linear(features, "value")(content)))
+        query, key = (
+            linear(features, f"{name}_content")(content)
+            + linear(features, f"{name}_position")(where)
+            for name in ("query", "key")
+        )
+        query, key, value = (
+            x.reshape(*x.shape[:2], self.heads, -1)
+            for x in (query, key, linear(features, "value")(content))
+        )
         return linear(features, "output")(attend(query, key, value).reshape(content.shape))
 
 
 class Scores(nn.Module):
-    """Weights of the particles: for every feature two linear layers from all particles to all, the mean over features, softmax."""
+    """Weights of the particles: for every feature two linear layers from all particles to all, the
+    mean over features, softmax."""
 
     @nn.compact
     def __call__(self, content: Float[jax.Array, "b p n"]) -> Float[jax.Array, "b p"]:
@@ -193,24 +268,31 @@ class Perceptron(nn.Module):
 
 
 def decouple(channels: Float[jax.Array, "b c n"]) -> Float[jax.Array, "b k n"]:
-    """Per modality its three channels, their trends MA3(MA9(x)) and their seasons x − trend: (b, 6, n) to (b, 18, n)."""
+    """Per modality its three channels, their trends MA3(MA9(x)) and their seasons x − trend: (b, 6,
+    n) to (b, 18, n)."""
     trend = channels
     for span in TREND_SPANS:
         trend = moving_average(trend, span)
     parts = jnp.stack([channels, trend, channels - trend], axis=1)
     batch, _, _, samples = parts.shape
-    return parts.reshape(batch, PARTS, MODALITIES, 3, samples).swapaxes(1, 2).reshape(batch, PARTS * MODALITIES * 3, samples)
+    return (
+        parts.reshape(batch, PARTS, MODALITIES, 3, samples)
+        .swapaxes(1, 2)
+        .reshape(batch, PARTS * MODALITIES * 3, samples)
+    )
 
 
 def moving_average(x: Float[jax.Array, "b c n"], span: int) -> Float[jax.Array, "b c n"]:
-    """Centred mean over an odd number of samples; the first and the last sample go on beyond the ends (ours)."""
+    """Centred mean over an odd number of samples; the first and the last sample go on beyond the
+    ends (ours)."""
     padded = jnp.pad(x, ((0, 0), (0, 0), (span // 2, span // 2)), mode="edge")
     terms = [padded[..., i : i + x.shape[-1]] for i in range(span)]
     return sum(terms[1:], terms[0]) / span
 
 
 def sinusoids(x: Float[jax.Array, "*b"], features: int) -> Float[jax.Array, "*b d"]:
-    """sin(x ω_i), then cos(x ω_i), ω from 1 down towards 1e-4 in equal ratios; an odd last feature is 0."""
+    """sin(x ω_i), then cos(x ω_i), ω from 1 down towards 1e-4 in equal ratios; an odd last feature
+    is 0."""
     half = features // 2
     frequencies = jnp.exp(-jnp.log(jnp.float32(1e4)) * jnp.arange(half, dtype=jnp.float32) / half)
     angles = jnp.einsum("...,i->...i", x, frequencies)
@@ -218,7 +300,8 @@ def sinusoids(x: Float[jax.Array, "*b"], features: int) -> Float[jax.Array, "*b 
 
 
 def sinusoids_of(points: Float[jax.Array, "b p k"], features: int) -> Float[jax.Array, "b p d"]:
-    """Every coordinate's sinusoids side by side, 2π times the coordinate; features that do not divide evenly are 0."""
+    """Every coordinate's sinusoids side by side, 2π times the coordinate; features that do not
+    divide evenly are 0."""
     each = 2 * (features // (2 * points.shape[-1]))
     values = sinusoids(2 * jnp.pi * points, each)
     return _padded(values.reshape(*points.shape[:2], -1), features)

@@ -1,6 +1,8 @@
-"""What of a network depends on its parameters alone, computed once per run instead of once per window.
+"""What of a network depends on its parameters alone, computed once per run instead of once per
+window.
 
-With one window a call, as in the filter's loop, the Motion Bank's keys and values cost as many products as the whole encoder.
+With one window a call, as in the filter's loop, the Motion Bank's keys and values cost as many
+products as the whole encoder.
 """
 
 from __future__ import annotations
@@ -27,7 +29,8 @@ class Frozen(NamedTuple):
 
 @dataclass(frozen=True)
 class Inference:
-    """`Inference(model)(frozen, windows)` is `model.apply(variables, windows)` to rounding. Hashable, so a static argument of `jit`."""
+    """`Inference(model)(frozen, windows)` is `model.apply(variables, windows)` to rounding.
+    Hashable, so a static argument of `jit`."""
 
     model: nn.Module
 
@@ -36,16 +39,19 @@ class Inference:
 
 
 def freeze(model: nn.Module, variables: Any) -> Frozen:
-    """Variables with every batch normalisation folded into its convolution, and what `model.constants` makes of them, if it has that."""
+    """Variables with every batch normalisation folded into its convolution, and what
+    `model.constants` makes of them, if it has that."""
     folded = {**variables, **_folded(variables["params"], variables.get("batch_stats", {}))}
     constants = getattr(model, "constants", None)
     return Frozen(folded, constants(folded) if constants else {})
 
 
 def _folded(params: Any, statistics: Any) -> dict[str, Any]:
-    """w ← w·a and, in the place of the normalisation, a shift: (x − μ)/√(σ² + ε)·γ + β = a x + (β − a μ), a = γ/√(σ² + ε).
+    """w ← w·a and, in the place of the normalisation, a shift: (x − μ)/√(σ² + ε)·γ + β = a x + (β −
+    a μ), a = γ/√(σ² + ε).
 
-    A normalisation `…bn…` follows the convolution `…conv…` (without bias) of the same module; one that has none is left as it is.
+    A normalisation `…bn…` follows the convolution `…conv…` (without bias) of the same module; one
+    that has none is left as it is.
     """
     params, statistics = dict(params), dict(statistics)
     for name, found in list(statistics.items()):
@@ -60,6 +66,12 @@ def _folded(params: Any, statistics: Any) -> dict[str, Any]:
             factor = norm["scale"] / jnp.sqrt(found["var"] + EPSILON)
             convolution["kernel"] = convolution["kernel"] * factor[None, None]
             params[convolves] = convolution
-            params[name] = {"scale": jnp.ones_like(factor), "bias": norm["bias"] - factor * found["mean"]}
-            statistics[name] = {"mean": jnp.zeros_like(factor), "var": jnp.full_like(factor, 1 - EPSILON)}
+            params[name] = {
+                "scale": jnp.ones_like(factor),
+                "bias": norm["bias"] - factor * found["mean"],
+            }
+            statistics[name] = {
+                "mean": jnp.zeros_like(factor),
+                "var": jnp.full_like(factor, 1 - EPSILON),
+            }
     return {"params": params, "batch_stats": statistics}

@@ -27,12 +27,16 @@ def attend(
     mask: Bool[jax.Array, "1 1 n m"] | None = None,
     **_: object,
 ) -> Float[jax.Array, "b n h d"]:
-    """Scaled dot-product attention in the place of Flax's: with few features a head, passes over the scores cost more than products.
+    """Scaled dot-product attention in the place of Flax's: with few features a head, passes over
+    the scores cost more than products.
 
-    So there are fewer: the softmax divides by its sum after meeting the values, and heads lie beside windows.
+    So there are fewer: the softmax divides by its sum after meeting the values, and heads lie
+    beside windows.
     """
     batch, samples, heads, size = query.shape
-    query, key, value = (x.swapaxes(1, 2).reshape(batch * heads, -1, size) for x in (query, key, value))
+    query, key, value = (
+        x.swapaxes(1, 2).reshape(batch * heads, -1, size) for x in (query, key, value)
+    )
     scores = jnp.einsum("bnd,bmd->bnm", query / jnp.sqrt(jnp.float32(size)), key)
     if mask is not None:
         scores = jnp.where(mask[0], scores, -jnp.inf)
@@ -41,10 +45,18 @@ def attend(
     return context.reshape(batch, heads, samples, size).swapaxes(1, 2)
 
 
-def attention(heads: int, name: str, features: int | None = None) -> nn.MultiHeadDotProductAttention:
-    """Multi-head attention by `attend`, as wide inside as its query; `features` come out, the query's number of them where it is None."""
+def attention(
+    heads: int, name: str, features: int | None = None
+) -> nn.MultiHeadDotProductAttention:
+    """Multi-head attention by `attend`, as wide inside as its query; `features` come out, the
+    query's number of them where it is None."""
     return nn.MultiHeadDotProductAttention(
-        heads, out_features=features, dtype=jnp.float32, param_dtype=jnp.float32, attention_fn=attend, name=name
+        heads,
+        out_features=features,
+        dtype=jnp.float32,
+        param_dtype=jnp.float32,
+        attention_fn=attend,
+        name=name,
     )
 
 

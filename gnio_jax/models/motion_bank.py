@@ -1,4 +1,5 @@
-"""The Motion Bank: a learnt matrix of motion prototypes that each window's feature queries (paper §III-C)."""
+"""The Motion Bank: a learnt matrix of motion prototypes that each window's feature queries (paper
+§III-C)."""
 
 from __future__ import annotations
 
@@ -7,18 +8,21 @@ import jax.numpy as jnp
 from flax import linen as nn
 from jaxtyping import Float
 
-# PyTorch's `MultiheadAttention`: query, key and value are one (3d, d) matrix to its Xavier-uniform start, so that their bound
-# is √(6 / 4d) = √(3 · 0.5 / d), and the output is a linear layer with its usual bound 1/√d.
+# PyTorch's `MultiheadAttention`: query, key and value are one (3d, d) matrix to its Xavier-uniform
+# start, so that their bound is √(6 / 4d) = √(3 · 0.5 / d), and the output is a linear layer with
+# its usual bound 1/√d.
 stacked_xavier = nn.initializers.variance_scaling(0.5, "fan_in", "uniform")
 fan_in_uniform = nn.initializers.variance_scaling(1 / 3, "fan_in", "uniform")
 
 
 class MotionBank(nn.Module):
-    """c = MultiHeadAttention(query f, keys M, values M), with M ∈ R^{m×d} a parameter; h = f + c is left to the caller.
+    """c = MultiHeadAttention(query f, keys M, values M), with M ∈ R^{m×d} a parameter; h = f + c is
+    left to the caller.
 
-    The bank is the same for every window, so its keys and values are projected once per call and not once per window.
-    Ours, where the paper is silent: 8 heads, projections with bias that start as PyTorch's attention starts them, and
-    M ~ N(0, std²), std = 1. Prototypes that start near each other (std = 1/√d) are attended to alike, and stay so.
+    The bank is the same for every window, so its keys and values are projected once per call and
+    not once per window. Ours, where the paper is silent: 8 heads, projections with bias that start
+    as PyTorch's attention starts them, and M ~ N(0, std²), std = 1. Prototypes that start near each
+    other (std = 1/√d) are attended to alike, and stay so.
     """
 
     size: int = 64
@@ -28,22 +32,40 @@ class MotionBank(nn.Module):
 
     def setup(self) -> None:
         shape = (self.heads, self.width // self.heads)
-        self.prototypes = self.param("prototypes", nn.initializers.normal(self.std), (self.size, self.width), jnp.float32)
-        self.query, self.key, self.value = (
-            nn.DenseGeneral(shape, kernel_init=stacked_xavier, dtype=jnp.float32, param_dtype=jnp.float32) for _ in range(3)
+        self.prototypes = self.param(
+            "prototypes", nn.initializers.normal(self.std), (self.size, self.width), jnp.float32
         )
-        self.output = nn.DenseGeneral(self.width, axis=(-2, -1), kernel_init=fan_in_uniform,
-                                      dtype=jnp.float32, param_dtype=jnp.float32)
+        self.query, self.key, self.value = (
+            nn.DenseGeneral(
+                shape, kernel_init=stacked_xavier, dtype=jnp.float32, param_dtype=jnp.float32
+            )
+            for _ in range(3)
+        )
+        self.output = nn.DenseGeneral(
+            self.width,
+            axis=(-2, -1),
+            kernel_init=fan_in_uniform,
+            dtype=jnp.float32,
+            param_dtype=jnp.float32,
+        )
 
-    def __call__(self, feature: Float[jax.Array, "b d"],
-                 memory: tuple[Float[jax.Array, "h m k"], Float[jax.Array, "h k m"]] | None = None
-                 ) -> tuple[Float[jax.Array, "b d"], Float[jax.Array, "b h m"]]:
-        """Context (b, d) and attention weights (b, heads, m) of each feature; `memory` is that of an earlier call, if there was one."""
+    def __call__(
+        self,
+        feature: Float[jax.Array, "b d"],
+        memory: tuple[Float[jax.Array, "h m k"], Float[jax.Array, "h k m"]] | None = None,
+    ) -> tuple[Float[jax.Array, "b d"], Float[jax.Array, "b h m"]]:
+        """Context (b, d) and attention weights (b, heads, m) of each feature; `memory` is that of
+        an earlier call, if there was one."""
         query, (key, value) = self.query(feature), self.memory() if memory is None else memory
-        scores = jnp.einsum("bhk,hmk->bhm", query, key) / jnp.sqrt(jnp.float32(self.width // self.heads))
+        scores = jnp.einsum("bhk,hmk->bhm", query, key) / jnp.sqrt(
+            jnp.float32(self.width // self.heads)
+        )
         attention = nn.softmax(scores, axis=-1)
         return self.output(jnp.einsum("bhm,hkm->bhk", attention, value)), attention
 
     def memory(self) -> tuple[Float[jax.Array, "h m k"], Float[jax.Array, "h k m"]]:
-        """Keys (heads, m, d / heads) and values (heads, d / heads, m) of the prototypes: as the products with one window read them."""
-        return self.key(self.prototypes).transpose(1, 0, 2), self.value(self.prototypes).transpose(1, 2, 0)
+        """Keys (heads, m, d / heads) and values (heads, d / heads, m) of the prototypes: as the
+        products with one window read them."""
+        return self.key(self.prototypes).transpose(1, 0, 2), self.value(self.prototypes).transpose(
+            1, 2, 0
+        )

@@ -36,18 +36,28 @@ def names() -> list[str]:
 
 
 def create(name: str, **options: object) -> nn.Module:
-    """The network `name` with its options set; its `apply(variables, windows)` returns a `Prediction`.
+    """The network `name` with its options set; its `apply(variables, windows)` returns a
+    `Prediction`.
 
-    Raises `InputError` for an unknown name or option, naming the known ones, or options that do not fit together.
+    Raises `InputError` for an unknown name or option, naming the known ones, or options that do not
+    fit together.
     """
     if name not in _MODELS:
         raise InputError(f"model '{name}'", "unknown", f"known models: {', '.join(names())}")
-    known = [field.name for field in dataclasses.fields(_MODELS[name]) if field.name not in ("parent", "name")]
+    known = [
+        field.name
+        for field in dataclasses.fields(_MODELS[name])
+        if field.name not in ("parent", "name")
+    ]
     for option in options:
         if option not in known:
             close = difflib.get_close_matches(option, known, n=1)
-            raise InputError(f"model '{name}'", f"unknown option '{option}'",
-                             (f"did you mean '{close[0]}'? " if close else "") + f"known options: {', '.join(known)}")
+            raise InputError(
+                f"model '{name}'",
+                f"unknown option '{option}'",
+                (f"did you mean '{close[0]}'? " if close else "")
+                + f"known options: {', '.join(known)}",
+            )
     try:
         return _MODELS[name](**options)
     except ValueError as error:
@@ -57,7 +67,8 @@ def create(name: str, **options: object) -> nn.Module:
 def initialise(model: nn.Module, key: PRNGKeyArray, window: int = 200) -> Any:
     """Fresh variables of `model` for windows of `window` samples.
 
-    `model.init` gives the same; here it is compiled for one use, as the optimiser of the compiler takes more seconds than it saves.
+    `model.init` gives the same; here it is compiled for one use, as the optimiser of the compiler
+    takes more seconds than it saves.
     """
     init = jax.jit(model.init, compiler_options={"xla_backend_optimization_level": 1})
     return init(key, jnp.zeros((1, window, 6), jnp.float32))

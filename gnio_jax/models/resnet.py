@@ -1,4 +1,5 @@
-"""The encoder: a 1-D ResNet-18 over a window of IMU samples (paper §III-B; the shape TLIO and RoNIN share)."""
+"""The encoder: a 1-D ResNet-18 over a window of IMU samples (paper §III-B; the shape TLIO and RoNIN
+share)."""
 
 from __future__ import annotations
 
@@ -13,7 +14,8 @@ BLOCKS_PER_GROUP = 2
 GROUP_STRIDES = (1, 2, 2, 2)
 
 MOMENTUM = 0.9
-"""Share of batch normalisation's running statistics that a training step keeps (PyTorch's momentum 0.1 is its complement)."""
+"""Share of batch normalisation's running statistics that a training step keeps (PyTorch's momentum
+0.1 is its complement)."""
 
 he_normal_fan_out = nn.initializers.variance_scaling(2.0, "fan_out", "normal")
 
@@ -27,8 +29,9 @@ def convolve(
 ) -> Float[jax.Array, "b m d"]:
     """A 1-D convolution written as one matrix product of the k shifted inputs with the kernel.
 
-    Same numbers as `lax.conv_general_dilated`, whose place in `flax.linen.Conv` it takes: on CPUs XLA runs the
-    gradients of strided convolutions through a generic loop, while both gradients of a product are products again.
+    Same numbers as `lax.conv_general_dilated`, whose place in `flax.linen.Conv` it takes: on CPUs
+    XLA runs the gradients of strided convolutions through a generic loop, while both gradients of a
+    product are products again.
     """
     size, channels, features = kernel.shape
     stride, (before, after) = window_strides[0], padding[0]
@@ -46,18 +49,23 @@ def convolve_forward(
     padding: list[tuple[int, int]],
     **_: object,
 ) -> Float[jax.Array, "b m d"]:
-    """The same convolution where nothing is trained: XLA's own, which takes half the time for a single window.
+    """The same convolution where nothing is trained: XLA's own, which takes half the time for a
+    single window.
 
     Its derivatives, where somebody wants them, are those of the product.
     """
 
     @jax.custom_jvp
     def native(x: Any, kernel: Any) -> jax.Array:
-        return jax.lax.conv_general_dilated(x, kernel, window_strides, padding, dimension_numbers=("NWC", "WIO", "NWC"))
+        return jax.lax.conv_general_dilated(
+            x, kernel, window_strides, padding, dimension_numbers=("NWC", "WIO", "NWC")
+        )
 
     @native.defjvp
     def derivative(primals: tuple, tangents: tuple) -> tuple:
-        return native(*primals), jax.jvp(lambda x, kernel: convolve(x, kernel, window_strides, padding), primals, tangents)[1]
+        return native(*primals), jax.jvp(
+            lambda x, kernel: convolve(x, kernel, window_strides, padding), primals, tangents
+        )[1]
 
     return native(x, kernel)
 
@@ -69,11 +77,15 @@ def max_pool(x: Float[jax.Array, "b n c"]) -> Float[jax.Array, "b m c"]:
     """
     length = (x.shape[1] - 1) // 2 + 1
     x = jnp.pad(x, ((0, 0), (1, 2), (0, 0)), constant_values=-jnp.inf)
-    return jnp.maximum(jnp.maximum(x[:, 0 : 2 * length : 2], x[:, 1 : 2 * length + 1 : 2]), x[:, 2 : 2 * length + 2 : 2])
+    return jnp.maximum(
+        jnp.maximum(x[:, 0 : 2 * length : 2], x[:, 1 : 2 * length + 1 : 2]),
+        x[:, 2 : 2 * length + 2 : 2],
+    )
 
 
 def conv(features: int, size: int, stride: int, train: bool, name: str) -> nn.Conv:
-    """A convolution without bias and with explicit symmetric padding ("SAME" pads differently at stride 2)."""
+    """A convolution without bias and with explicit symmetric padding ("SAME" pads differently at
+    stride 2)."""
     return nn.Conv(
         features,
         kernel_size=(size,),
@@ -90,12 +102,19 @@ def conv(features: int, size: int, stride: int, train: bool, name: str) -> nn.Co
 
 def batch_norm(train: bool, name: str) -> nn.BatchNorm:
     """Batch normalisation with PyTorch's constants."""
-    return nn.BatchNorm(use_running_average=not train, momentum=MOMENTUM, epsilon=1e-5,
-                        dtype=jnp.float32, param_dtype=jnp.float32, name=name)
+    return nn.BatchNorm(
+        use_running_average=not train,
+        momentum=MOMENTUM,
+        epsilon=1e-5,
+        dtype=jnp.float32,
+        param_dtype=jnp.float32,
+        name=name,
+    )
 
 
 class BasicBlock(nn.Module):
-    """Two 3-sample convolutions and a shortcut, projected by a 1×1 convolution where the shape changes."""
+    """Two 3-sample convolutions and a shortcut, projected by a 1×1 convolution where the shape
+    changes."""
 
     features: int
     stride: int
@@ -113,18 +132,21 @@ class BasicBlock(nn.Module):
 
 
 class ResNet18(nn.Module):
-    """Windows (b, n, 6) to feature maps (b, ⌈n/32⌉, 8·width): stem, max-pool, four groups of two basic blocks."""
+    """Windows (b, n, 6) to feature maps (b, ⌈n/32⌉, 8·width): stem, max-pool, four groups of two
+    basic blocks."""
 
     width: int = 64
 
     @nn.compact
-    def __call__(self, windows: Float[jax.Array, "b n 6"], train: bool = False) -> Float[jax.Array, "b m d"]:
+    def __call__(
+        self, windows: Float[jax.Array, "b n 6"], train: bool = False
+    ) -> Float[jax.Array, "b m d"]:
         x = conv(self.width, 7, 2, train, "stem_conv")(windows)
         x = max_pool(nn.relu(batch_norm(train, "stem_bn")(x)))
         for group, stride in enumerate(GROUP_STRIDES):
             for block in range(BLOCKS_PER_GROUP):
                 name = f"group{group + 1}_block{block + 1}"
-                x = BasicBlock(self.width * 2**group, stride if block == 0 else 1, name=name)(x, train)
+                x = BasicBlock(self.width * 2**group, stride if block == 0 else 1, name=name)(
+                    x, train
+                )
         return x
-
-

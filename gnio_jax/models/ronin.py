@@ -1,4 +1,5 @@
-"""RoNIN's ResNet (Herath, Yan and Furukawa, "RoNIN: Robust Neural Inertial Navigation in the Wild", ICRA 2020)."""
+"""RoNIN's ResNet (Herath, Yan and Furukawa, "RoNIN: Robust Neural Inertial Navigation in the Wild",
+ICRA 2020)."""
 
 from __future__ import annotations
 
@@ -15,11 +16,14 @@ from gnio_jax.types import Prediction
 
 
 class RoNINResNet(nn.Module):
-    """Windows [accel, gyro] in the gravity-aligned frame to displacement; the uncertainty is a constant.
+    """Windows [accel, gyro] in the gravity-aligned frame to displacement; the uncertainty is a
+    constant.
 
-    Encoder and head as TLIO's, which took them from here. Published: the mean horizontal velocity over the window, `output_dim = 2`
-    (4,634,882 parameters for windows of 200 samples), from [gyro, accel]. Ours: the displacement, which is that velocity in a window of
-    1 s, along three axes (4,635,395) unless two are asked for; then the vertical one is 0. Training needs the random stream `dropout`.
+    Encoder and head as TLIO's, which took them from here. Published: the mean horizontal velocity
+    over the window, `output_dim = 2` (4,634,882 parameters for windows of 200 samples), from [gyro,
+    accel]. Ours: the displacement, which is that velocity in a window of 1 s, along three axes
+    (4,635,395) unless two are asked for; then the vertical one is 0. Training needs the random
+    stream `dropout`.
     """
 
     width: int = 64
@@ -34,5 +38,9 @@ class RoNINResNet(nn.Module):
     @nn.compact
     def __call__(self, windows: Float[jax.Array, "b n 6"], train: bool = False) -> Prediction:
         features = ResNet18(self.width, name="encoder")(windows.astype(jnp.float32), train)
-        output = FullyConnectedHead(self.width, self.output_dim, self.dropout, name="displacement")(features, train)
-        return Prediction(to_axes(output), ConstantUncertainty(name="uncertainty")(windows.shape[0]))
+        output = FullyConnectedHead(self.width, self.output_dim, self.dropout, name="displacement")(
+            features, train
+        )
+        return Prediction(
+            to_axes(output), ConstantUncertainty(name="uncertainty")(windows.shape[0])
+        )

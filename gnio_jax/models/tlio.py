@@ -1,4 +1,5 @@
-"""TLIO's network (Liu et al., "TLIO: Tight Learned Inertial Odometry", IEEE RA-L 2020), and the fully connected head that it shares."""
+"""TLIO's network (Liu et al., "TLIO: Tight Learned Inertial Odometry", IEEE RA-L 2020), and the
+fully connected head that it shares."""
 
 from __future__ import annotations
 
@@ -15,11 +16,13 @@ SMALL = nn.initializers.normal(0.01)
 
 
 class FullyConnectedHead(nn.Module):
-    """Feature maps (b, m, 8·width) to `outputs` numbers a window: 1×1 convolution and normalisation, flattened, three linear layers.
+    """Feature maps (b, m, 8·width) to `outputs` numbers a window: 1×1 convolution and
+    normalisation, flattened, three linear layers.
 
-    TLIO's and RoNIN's, whose sizes (128 channels, 512 features) the papers leave to their code; other widths than 64 scale both, for small
-    machines. Flattened channel by channel, as PyTorch does, so that weights trained there fit. Linear kernels start at N(0, 0.01), biases
-    at 0. The number of parameters depends on m, and so on the length of the window.
+    TLIO's and RoNIN's, whose sizes (128 channels, 512 features) the papers leave to their code;
+    other widths than 64 scale both, for small machines. Flattened channel by channel, as PyTorch
+    does, so that weights trained there fit. Linear kernels start at N(0, 0.01), biases at 0. The
+    number of parameters depends on m, and so on the length of the window.
     """
 
     width: int
@@ -37,10 +40,12 @@ class FullyConnectedHead(nn.Module):
 
 
 class TLIO(nn.Module):
-    """Windows [accel, gyro] in the gravity-aligned frame to displacement and log standard deviation, each by a head of its own.
+    """Windows [accel, gyro] in the gravity-aligned frame to displacement and log standard
+    deviation, each by a head of its own.
 
-    The encoder of `gnio_jax.models.resnet`, not pooled. 5,424,646 parameters for windows of 200 samples, 5,031,430 for 100. Training needs
-    the random stream `dropout`. TLIO's own channel order is [gyro, accel]; `gnio_jax.interop` reads its weights.
+    The encoder of `gnio_jax.models.resnet`, not pooled. 5,424,646 parameters for windows of 200
+    samples, 5,031,430 for 100. Training needs the random stream `dropout`. TLIO's own channel order
+    is [gyro, accel]; `gnio_jax.interop` reads its weights.
     """
 
     width: int = 64
@@ -53,6 +58,8 @@ class TLIO(nn.Module):
     @nn.compact
     def __call__(self, windows: Float[jax.Array, "b n 6"], train: bool = False) -> Prediction:
         features = ResNet18(self.width, name="encoder")(windows.astype(jnp.float32), train)
-        displacement, log_std = (FullyConnectedHead(self.width, 3, self.dropout, name=name)(features, train)
-                                 for name in ("displacement", "log_std"))
+        displacement, log_std = (
+            FullyConnectedHead(self.width, 3, self.dropout, name=name)(features, train)
+            for name in ("displacement", "log_std")
+        )
         return Prediction(displacement, log_std)

@@ -14,11 +14,19 @@ from gnio_jax.cores import usable_cores
 from gnio_jax.tables.summary import grid
 
 # Parameters in millions and the column "GFLOPs" as the paper prints them.
-PUBLISHED = {"tlio": (5.42, 0.08), "deepils": (2.29, 0.03), "ctin": (0.56, 7.27), "imot": (14.49, 7.79), "gnio": (4.90, 0.08)}
+PUBLISHED = {
+    "tlio": (5.42, 0.08),
+    "deepils": (2.29, 0.03),
+    "ctin": (0.56, 7.27),
+    "imot": (14.49, 7.79),
+    "gnio": (4.90, 0.08),
+}
 NETWORKS = ("tlio", "ronin_resnet", "deepils", "ctin", "imot", "imot_text", "gnio")
-NOTE = ("The paper's CNN rows are 2 × multiply-adds of one window of 200 samples, as is the measured column, which leaves out the taps "
-        "in the padding. Its transformer rows repeat those papers' own \"GFLOPs/s\", another quantity; compare the measured column. Its "
-        "GNIO has no bank: 4,901,385 parameters, 4,934,153 with it. DeepILS and RoNIN are counted with three outputs.")
+NOTE = (
+    "The paper's CNN rows are 2 × multiply-adds of one window of 200 samples, as is the measured column, which leaves out the taps "
+    'in the padding. Its transformer rows repeat those papers\' own "GFLOPs/s", another quantity; compare the measured column. Its '
+    "GNIO has no bank: 4,901,385 parameters, 4,934,153 with it. DeepILS and RoNIN are counted with three outputs."
+)
 
 
 class Complexity(NamedTuple):
@@ -32,14 +40,19 @@ class Complexity(NamedTuple):
     """Batch -> time per window, ms, median."""
 
 
-def measure(network: str, samples: int = 200, batches: tuple[int, ...] = (1, 128), seconds: float = 3.0) -> Complexity:
-    """Cost of a network's inference, batch norms folded, on this machine; each latency is timed for about `seconds`."""
+def measure(
+    network: str, samples: int = 200, batches: tuple[int, ...] = (1, 128), seconds: float = 3.0
+) -> Complexity:
+    """Cost of a network's inference, batch norms folded, on this machine; each latency is timed for
+    about `seconds`."""
     model = models.create(network)
     variables = models.initialise(model, jax.random.key(0), samples)
     frozen, inference = models.freeze(model, variables), models.Inference(model)
     latency, operations = {}, 0.0
     for batch in batches:
-        windows = jnp.asarray(np.random.default_rng(0).standard_normal((batch, samples, 6)), jnp.float32)
+        windows = jnp.asarray(
+            np.random.default_rng(0).standard_normal((batch, samples, 6)), jnp.float32
+        )
         compiled = jax.jit(inference).lower(frozen, windows).compile()
         if batch == batches[0]:
             operations = (compiled.cost_analysis() or {})["flops"] / batch
@@ -50,23 +63,48 @@ def measure(network: str, samples: int = 200, batches: tuple[int, ...] = (1, 128
             jax.block_until_ready(compiled(frozen, windows))
             times.append(time.perf_counter() - began)
         latency[batch] = 1e3 * float(np.median(times)) / batch
-    return Complexity(network, sum(x.size for x in jax.tree.leaves(variables["params"])), operations / 1e9, latency)
+    return Complexity(
+        network,
+        sum(x.size for x in jax.tree.leaves(variables["params"])),
+        operations / 1e9,
+        latency,
+    )
 
 
 def hardware() -> str:
     """What it runs on, for the notes of a table."""
     device, cores = jax.devices()[0], usable_cores()
-    return f"{cores} CPU core{'s' if cores > 1 else ''}" if device.platform == "cpu" else device.device_kind
+    return (
+        f"{cores} CPU core{'s' if cores > 1 else ''}"
+        if device.platform == "cpu"
+        else device.device_kind
+    )
 
 
 def markdown(found: list[Complexity], device: str) -> str:
     """The table."""
     batches = list(found[0].latency)
-    header = ["", "parameters", "GFLOP / window", *(f"ms / window, batch {batch}" for batch in batches), "paper: parameters",
-              "paper: \"GFLOPs\""]
+    header = [
+        "",
+        "parameters",
+        "GFLOP / window",
+        *(f"ms / window, batch {batch}" for batch in batches),
+        "paper: parameters",
+        'paper: "GFLOPs"',
+    ]
     table = []
     for row in found:
         published = PUBLISHED.get(row.network)
-        table.append([row.network, f"{row.parameters:,}", f"{row.gflops:.3f}", *(f"{row.latency[batch]:.2f}" for batch in batches),
-                      f"{published[0]:.2f} M" if published else "–", f"{published[1]:.2f}" if published else "–"])
-    return f"## Complexity\n\nOne window of 200 samples, float32, on {device}. {NOTE}\n\n" + grid(header, table)
+        table.append(
+            [
+                row.network,
+                f"{row.parameters:,}",
+                f"{row.gflops:.3f}",
+                *(f"{row.latency[batch]:.2f}" for batch in batches),
+                f"{published[0]:.2f} M" if published else "–",
+                f"{published[1]:.2f}" if published else "–",
+            ]
+        )
+    return f"## Complexity\n\nOne window of 200 samples, float32, on {device}. {NOTE}\n\n" + grid(
+        header, table
+    )

@@ -8,14 +8,20 @@ from typing import NamedTuple
 from gnio_jax.config import LossConfig, OptimConfig, TrainConfig
 
 SCALED = ("gnio", "tlio", "ronin_resnet", "deepils")
-"""Networks whose `width` means channels of the first group: an experiment at half the width halves all of them."""
+"""Networks whose `width` means channels of the first group: an experiment at half the width halves
+all of them."""
 
 TLIO_HELD, TLIO_BATCH, PAPER_EPOCHS = 10.0, 1024, 200
-"""TLIO's uncertainty does not learn in its first 10 epochs of batches of 1,024; the paper trains every network for 200 epochs."""
+"""TLIO's uncertainty does not learn in its first 10 epochs of batches of 1,024; the paper trains
+every network for 200 epochs."""
 
-REGULARISATION: dict[str, dict[str, float]] = {"tlio": {"clip_norm": 0.1}, "ctin": {"weight_decay": 1e-6}}
-"""Of the published recipes, what is neither loss nor budget. TLIO needs its clip: where its uncertainty begins to learn, the gradients
-of the likelihood are so large that they undo what its displacements have learnt."""
+REGULARISATION: dict[str, dict[str, float]] = {
+    "tlio": {"clip_norm": 0.1},
+    "ctin": {"weight_decay": 1e-6},
+}
+"""Of the published recipes, what is neither loss nor budget. TLIO needs its clip: where its
+uncertainty begins to learn, the gradients of the likelihood are so large that they undo what its
+displacements have learnt."""
 
 
 class Cell(NamedTuple):
@@ -39,8 +45,9 @@ class Experiment(NamedTuple):
 
 
 def held_epochs(optim: OptimConfig) -> float:
-    """Epochs in which TLIO's uncertainty does not learn: the published ones. Ours: a shorter run holds it for the number of
-    steps that those take with the published batches, and at most for half of itself."""
+    """Epochs in which TLIO's uncertainty does not learn: the published ones. Ours: a shorter run
+    holds it for the number of steps that those take with the published batches, and at most for
+    half of itself."""
     if optim.epochs >= PAPER_EPOCHS:
         return TLIO_HELD
     return min(TLIO_HELD * optim.batch_size / TLIO_BATCH, optim.epochs / 2)
@@ -52,8 +59,12 @@ def loss(network: str, base: TrainConfig) -> LossConfig:
         case "gnio":
             return base.loss
         case "tlio":
-            return LossConfig(mse_weight=0.0, nll_weight=1.0, log_std_from_epoch=held_epochs(base.optim),
-                              log_std_floor=-6.907755)
+            return LossConfig(
+                mse_weight=0.0,
+                nll_weight=1.0,
+                log_std_from_epoch=held_epochs(base.optim),
+                log_std_floor=-6.907755,
+            )
         case "deepils":
             return LossConfig(mse_weight=1.0, mae_weight=1.0, nll_weight=0.0)
         case "ctin":
@@ -63,10 +74,15 @@ def loss(network: str, base: TrainConfig) -> LossConfig:
 
 
 def method(network: str, base: TrainConfig) -> TrainConfig:
-    """`base` with another network, its loss and regularisation: the same recordings, augmentation, batches, epochs and learning
-    rate. Losses differ, so every row's checkpoint is the one with the smallest squared error on the validation split."""
-    model = dataclasses.replace(type(base.model)(), name=network, width=base.model.width if network in SCALED else None)
-    optim = dataclasses.replace(base.optim, best_by="squared_error", **REGULARISATION.get(network, {}))
+    """`base` with another network, its loss and regularisation: the same recordings, augmentation,
+    batches, epochs and learning rate. Losses differ, so every row's checkpoint is the one with the
+    smallest squared error on the validation split."""
+    model = dataclasses.replace(
+        type(base.model)(), name=network, width=base.model.width if network in SCALED else None
+    )
+    optim = dataclasses.replace(
+        base.optim, best_by="squared_error", **REGULARISATION.get(network, {})
+    )
     return dataclasses.replace(base, model=model, loss=loss(network, base), optim=optim)
 
 
@@ -93,34 +109,65 @@ METHODS = ("tlio", "ronin_resnet", "deepils", "ctin", "imot", "gnio")
 def comparison(base: TrainConfig, split: str, networks: tuple[str, ...] = METHODS) -> Experiment:
     """The networks of table II, and RoNIN's, which it leaves out; compared with the first."""
     published = PUBLISHED.get((base.dataset, split), {})
-    cells = [Cell(network, network, method(network, base), published.get(network)) for network in networks]
-    return Experiment("Networks", f"paper, table II: ATE on {base.dataset} {split}" if published else "no published figure for this split",
-                      cells)
+    cells = [
+        Cell(network, network, method(network, base), published.get(network))
+        for network in networks
+    ]
+    return Experiment(
+        "Networks",
+        f"paper, table II: ATE on {base.dataset} {split}"
+        if published
+        else "no published figure for this split",
+        cells,
+    )
 
 
 def components(base: TrainConfig) -> Experiment:
-    """Bank and gated head apart and together. The paper's baseline is TLIO's own network; the plain linear head on GNIO's pooled
-    features is printed beside it."""
-    return Experiment("Components", "paper, component ablation: RMSE on TLIO's set", [
-        Cell("tlio", "baseline (TLIO)", method("tlio", base), 2.40),
-        Cell("gnio_bank-0_linear", "encoder + linear head", variant(base, bank_size=0, head="linear")),
-        Cell("gnio_linear", "+ bank", variant(base, head="linear"), 1.98),
-        Cell("gnio_bank-0", "+ gated head", variant(base, bank_size=0), 1.84),
-        Cell("gnio", "+ bank + gated head", method("gnio", base), 1.66),
-    ])
+    """Bank and gated head apart and together. The paper's baseline is TLIO's own network; the plain
+    linear head on GNIO's pooled features is printed beside it."""
+    return Experiment(
+        "Components",
+        "paper, component ablation: RMSE on TLIO's set",
+        [
+            Cell("tlio", "baseline (TLIO)", method("tlio", base), 2.40),
+            Cell(
+                "gnio_bank-0_linear",
+                "encoder + linear head",
+                variant(base, bank_size=0, head="linear"),
+            ),
+            Cell("gnio_linear", "+ bank", variant(base, head="linear"), 1.98),
+            Cell("gnio_bank-0", "+ gated head", variant(base, bank_size=0), 1.84),
+            Cell("gnio", "+ bank + gated head", method("gnio", base), 1.66),
+        ],
+    )
 
 
 def gates(base: TrainConfig) -> Experiment:
-    """Activations of gate and scale, without the bank: the paper's best row equals its gate-only row."""
-    rows = [("sigmoid", "linear", 2.05), ("tanh", "linear", 2.00), ("tanh", "exp", 1.94), ("tanh", "abs", 1.92), ("tanh", "pos_elu", 1.85),
-            ("tanh", "softplus", 1.84)]
+    """Activations of gate and scale, without the bank: the paper's best row equals its gate-only
+    row."""
+    rows = [
+        ("sigmoid", "linear", 2.05),
+        ("tanh", "linear", 2.00),
+        ("tanh", "exp", 1.94),
+        ("tanh", "abs", 1.92),
+        ("tanh", "pos_elu", 1.85),
+        ("tanh", "softplus", 1.84),
+    ]
     cells = []
     for gate, scale, published in rows:
         usual = (gate, scale) == ("tanh", "softplus")
         name = "gnio_bank-0" if usual else f"gnio_bank-0_{gate}_{scale}"
-        config = variant(base, bank_size=0) if usual else variant(base, bank_size=0, gate=gate, scale=scale)
+        config = (
+            variant(base, bank_size=0)
+            if usual
+            else variant(base, bank_size=0, gate=gate, scale=scale)
+        )
         cells.append(Cell(name, f"{gate} × {scale}", config, published))
-    return Experiment("Gate and scale", "paper, gate and scale functions: RMSE on TLIO's set, without the bank", cells)
+    return Experiment(
+        "Gate and scale",
+        "paper, gate and scale functions: RMSE on TLIO's set, without the bank",
+        cells,
+    )
 
 
 def bank_sizes(base: TrainConfig) -> Experiment:
@@ -128,30 +175,53 @@ def bank_sizes(base: TrainConfig) -> Experiment:
     cells = [Cell("gnio_bank-0_linear", "no bank", variant(base, bank_size=0, head="linear"))]
     for size, published in [(16, 2.07), (32, None), (64, 1.98), (128, 2.07)]:
         name = "gnio_linear" if size == 64 else f"gnio_bank-{size}_linear"
-        config = variant(base, head="linear") if size == 64 else variant(base, head="linear", bank_size=size)
+        config = (
+            variant(base, head="linear")
+            if size == 64
+            else variant(base, head="linear", bank_size=size)
+        )
         cells.append(Cell(name, f"m = {size}", config, published))
-    return Experiment("Bank size", "paper, size of the bank: RMSE on TLIO's set, with the linear head", cells)
+    return Experiment(
+        "Bank size", "paper, size of the bank: RMSE on TLIO's set, with the linear head", cells
+    )
 
 
 def bank_spread(base: TrainConfig) -> Experiment:
-    """How far apart the prototypes start, with the linear head: the paper does not say, and near each other all are attended to alike."""
+    """How far apart the prototypes start, with the linear head: the paper does not say, and near
+    each other all are attended to alike."""
     near = (8 * (base.model.width or 64)) ** -0.5
-    return Experiment("Prototypes before training", "no published figure: the paper does not say how its bank starts", [
-        Cell("gnio_bank-0_linear", "no bank", variant(base, bank_size=0, head="linear")),
-        Cell("gnio_bank-near_linear", "N(0, 1/√d)", variant(base, head="linear", bank_std=near)),
-        Cell("gnio_linear", "N(0, 1)", variant(base, head="linear")),
-    ])
+    return Experiment(
+        "Prototypes before training",
+        "no published figure: the paper does not say how its bank starts",
+        [
+            Cell("gnio_bank-0_linear", "no bank", variant(base, bank_size=0, head="linear")),
+            Cell(
+                "gnio_bank-near_linear", "N(0, 1/√d)", variant(base, head="linear", bank_std=near)
+            ),
+            Cell("gnio_linear", "N(0, 1)", variant(base, head="linear")),
+        ],
+    )
 
 
 def remedies(base: TrainConfig) -> Experiment:
-    """What makes GNIO's uncertainty fit for the filter. One constant per axis, which is that of the errors on the validation
-    split, is compared with heads that are calibrated on the same windows, with the published weight of the likelihood and with 1;
-    the published head as it comes from training stands beside them."""
+    """What makes GNIO's uncertainty fit for the filter. One constant per axis, which is that of the
+    errors on the validation split, is compared with heads that are calibrated on the same windows,
+    with the published weight of the likelihood and with 1; the published head as it comes from
+    training stands beside them."""
     calibrated = variant(base, uncertainty="calibrated")
-    return Experiment("Uncertainty", "no published figure: the paper has its own head alone, at λ_NLL = 1e-4", [
-        Cell("gnio_constant", "one constant per axis", variant(base, uncertainty="constant")),
-        Cell("gnio_calibrated", "head, calibrated", calibrated),
-        Cell("gnio_calibrated_nll-1", "head, likelihood weighted by 1, calibrated",
-             dataclasses.replace(calibrated, loss=dataclasses.replace(calibrated.loss, nll_weight=1.0))),
-        Cell("gnio", "head, as published: not calibrated", method("gnio", base)),
-    ])
+    return Experiment(
+        "Uncertainty",
+        "no published figure: the paper has its own head alone, at λ_NLL = 1e-4",
+        [
+            Cell("gnio_constant", "one constant per axis", variant(base, uncertainty="constant")),
+            Cell("gnio_calibrated", "head, calibrated", calibrated),
+            Cell(
+                "gnio_calibrated_nll-1",
+                "head, likelihood weighted by 1, calibrated",
+                dataclasses.replace(
+                    calibrated, loss=dataclasses.replace(calibrated.loss, nll_weight=1.0)
+                ),
+            ),
+            Cell("gnio", "head, as published: not calibrated", method("gnio", base)),
+        ],
+    )

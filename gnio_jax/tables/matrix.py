@@ -1,4 +1,5 @@
-"""Configurations × seeds: trained and evaluated one after the other, restartable, nothing done twice."""
+"""Configurations × seeds: trained and evaluated one after the other, restartable, nothing done
+twice."""
 
 from __future__ import annotations
 
@@ -39,11 +40,14 @@ class Result(NamedTuple):
     """Their work folders."""
 
 
-def run_cell(cell: Cell, seeds: int, folder: Path, split: str, estimator: str, console: Console) -> Result:
+def run_cell(
+    cell: Cell, seeds: int, folder: Path, split: str, estimator: str, console: Console
+) -> Result:
     """Train and evaluate a cell with seeds 0 … seeds−1 below `folder`.
 
-    A run that is finished is not trained again, one that was interrupted goes on, an evaluation that is there is read. Raises
-    `InputError` if a folder holds a run with other settings, and `Interrupted` after a signal.
+    A run that is finished is not trained again, one that was interrupted goes on, an evaluation
+    that is there is read. Raises `InputError` if a folder holds a run with other settings, and
+    `Interrupted` after a signal.
     """
     figures, runs = [], []
     for seed in range(seeds):
@@ -89,11 +93,15 @@ def evaluated(workdir: Path, split: str, estimator: str, console: Console) -> di
 def _evaluation(workdir: Path, split: str, estimator: str) -> tuple[EvaluateConfig, Path]:
     """How `evaluated` evaluates a run, and the folder where that leaves its files."""
     trained = configuration.load(workdir / "config.yaml")
-    config = EvaluateConfig(str(workdir), split=split, estimator=estimator, plots=False, filter=trained.filter)  # type: ignore[arg-type]
+    config = EvaluateConfig(
+        str(workdir), split=split, estimator=estimator, plots=False, filter=trained.filter
+    )  # type: ignore[arg-type]
     return config, workdir / "eval" / folder_name(config, trained.dataset, trained)
 
 
-def paths(result: Result, split: str, estimator: str) -> dict[str, tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]]]:
+def paths(
+    result: Result, split: str, estimator: str
+) -> dict[str, tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]]]:
     """Reference and the first seed's estimate of each sequence seen from above, m.
 
     The estimate is laid on by start position and yaw; it is NaN from where it diverged.
@@ -103,7 +111,10 @@ def paths(result: Result, split: str, estimator: str) -> dict[str, tuple[Float[n
     found = {}
     for name, stem in zip(names, report.file_names(names), strict=True):
         if (folder / "references" / f"{stem}.txt").exists():
-            estimate, reference = (_trajectory(folder / kind / f"{stem}.txt") for kind in ("trajectories", "references"))
+            estimate, reference = (
+                _trajectory(folder / kind / f"{stem}.txt")
+                for kind in ("trajectories", "references")
+            )
             # The reference has no row where it is not trusted, the estimate none where not finite.
             rows = np.searchsorted(estimate.time, reference.time - 1e-6)
             rows = np.minimum(rows, len(estimate.time) - 1)

@@ -1,4 +1,5 @@
-"""Pictures of the tables. Only imported when one is drawn; colours are those of Okabe and Ito, the reference is black."""
+"""Pictures of the tables. Only imported when one is drawn; colours are those of Okabe and Ito, the
+reference is black."""
 
 from __future__ import annotations
 
@@ -19,8 +20,15 @@ from gnio_jax.tables.matrix import Result
 from gnio_jax.tables.summary import Row, errors
 from gnio_jax.tables.windows import ACTIVITIES, Said
 
-COLOURS = {"tlio": BLUE, "gnio": GREEN, "ronin_resnet": "#E69F00", "deepils": "#CC79A7", "ctin": VERMILION, "imot": "#56B4E9",
-           "imot_text": "#F0E442"}
+COLOURS = {
+    "tlio": BLUE,
+    "gnio": GREEN,
+    "ronin_resnet": "#E69F00",
+    "deepils": "#CC79A7",
+    "ctin": VERMILION,
+    "imot": "#56B4E9",
+    "imot_text": "#F0E442",
+}
 """TLIO blue and GNIO green, as in the paper's figure."""
 OTHERS = (BLUE, VERMILION, GREEN, "#CC79A7", "#E69F00", "#56B4E9")
 
@@ -37,22 +45,45 @@ def table(experiment: Experiment, results: list[Result], found: list[Row]) -> Fi
     published = [row.published for row in found]
     beside = any(value is not None for value in published)
     figure = Figure(figsize=(9.0 if beside else 6.4, 1.4 + 0.45 * len(found)), layout="constrained")
-    panels = np.atleast_1d(figure.subplots(1, 2 if beside else 1, sharey=True, width_ratios=(2, 1) if beside else (1,)))
+    panels = np.atleast_1d(
+        figure.subplots(1, 2 if beside else 1, sharey=True, width_ratios=(2, 1) if beside else (1,))
+    )
     ours = panels[0]
     for place, (result, row) in enumerate(zip(results, found, strict=True)):
         seeds = row.seeds.get("ate", [])
         sequences = [each.mean() for each in errors(result).values() if np.isfinite(each).all()]
         ours.barh(place, np.mean(seeds) if seeds else 0.0, color=GREEN, alpha=0.35, height=0.6)
-        ours.plot(sequences, np.full(len(sequences), place) + 0.2, "|", color=GREY, ms=7, label="sequence" if place == 0 else None)
-        ours.plot(seeds, np.full(len(seeds), place), "o", color="black", ms=4, label="seed, mean over sequences" if place == 0 else None)
-    lost = [f"\n({row.diverged} of {row.estimates} diverged)" if row.diverged else ""
-            for row in found]
+        ours.plot(
+            sequences,
+            np.full(len(sequences), place) + 0.2,
+            "|",
+            color=GREY,
+            ms=7,
+            label="sequence" if place == 0 else None,
+        )
+        ours.plot(
+            seeds,
+            np.full(len(seeds), place),
+            "o",
+            color="black",
+            ms=4,
+            label="seed, mean over sequences" if place == 0 else None,
+        )
+    lost = [
+        f"\n({row.diverged} of {row.estimates} diverged)" if row.diverged else "" for row in found
+    ]
     labels = [row.label + words for row, words in zip(found, lost, strict=True)]
     ours.set_yticks(range(len(found)), labels)
     ours.invert_yaxis()
     ours.set(xlabel="ate, here (m)", title=experiment.title)
     ours.set_xlim(left=0)
-    figure.legend(*ours.get_legend_handles_labels(), fontsize=8, frameon=False, loc="outside lower center", ncols=2)
+    figure.legend(
+        *ours.get_legend_handles_labels(),
+        fontsize=8,
+        frameon=False,
+        loc="outside lower center",
+        ncols=2,
+    )
     if beside:
         for place, value in enumerate(published):
             if value is not None:
@@ -66,7 +97,8 @@ def table(experiment: Experiment, results: list[Result], found: list[Row]) -> Fi
 
 
 def gradients(results: list[Result]) -> Figure:
-    """Norm of the gradient of the scale's layer over training, one line per row: the mean over seeds, their range shaded."""
+    """Norm of the gradient of the scale's layer over training, one line per row: the mean over
+    seeds, their range shaded."""
     figure = Figure(figsize=(6.8, 4.2), layout="constrained")
     axes = figure.add_subplot()
     for result, colour in zip(results, OTHERS, strict=False):
@@ -74,7 +106,11 @@ def gradients(results: list[Result]) -> Figure:
         epochs = np.arange(1, norms.shape[1] + 1)
         axes.semilogy(epochs, norms.mean(0), color=colour, label=result.cell.label)
         axes.fill_between(epochs, norms.min(0), norms.max(0), color=colour, alpha=0.15, lw=0)
-    axes.set(xlabel="epoch", ylabel="norm of the gradient of the scale's layer", title="How steadily the scale learns")
+    axes.set(
+        xlabel="epoch",
+        ylabel="norm of the gradient of the scale's layer",
+        title="How steadily the scale learns",
+    )
     axes.yaxis.set_major_formatter("{x:g}")
     axes.yaxis.set_minor_formatter("{x:g}")
     axes.legend(fontsize=8, frameon=False)
@@ -84,7 +120,10 @@ def gradients(results: list[Result]) -> Figure:
 
 def scale_gradients(run: Path) -> list[float]:
     """Norm of the gradient of the scale's layer in every epoch of a run, a mean over its steps."""
-    return [json.loads(line)["gradient_norm/head/scale"] for line in (run / "metrics.jsonl").read_text(encoding="utf-8").splitlines()]
+    return [
+        json.loads(line)["gradient_norm/head/scale"]
+        for line in (run / "metrics.jsonl").read_text(encoding="utf-8").splitlines()
+    ]
 
 
 class Track(NamedTuple):
@@ -94,7 +133,9 @@ class Track(NamedTuple):
     path: Float[np.ndarray, "n 2"]
 
 
-def trajectories(sequences: dict[str, tuple[Float[np.ndarray, "n 2"], list[Track]]], columns: int = 4) -> Figure:
+def trajectories(
+    sequences: dict[str, tuple[Float[np.ndarray, "n 2"], list[Track]]], columns: int = 4
+) -> Figure:
     """All methods over the reference, a panel for each sequence."""
     columns = min(columns, len(sequences))
     lines = -(-len(sequences) // columns)
@@ -103,28 +144,56 @@ def trajectories(sequences: dict[str, tuple[Float[np.ndarray, "n 2"], list[Track
     for axes, (name, (reference, tracks)) in zip(panels, sequences.items(), strict=False):
         axes.plot(*reference.T, color="black", lw=1.8, label="reference")
         for number, track in enumerate(tracks):
-            axes.plot(*track.path.T, color=COLOURS.get(track.method, OTHERS[number % len(OTHERS)]), lw=1.1, label=track.method)
+            axes.plot(
+                *track.path.T,
+                color=COLOURS.get(track.method, OTHERS[number % len(OTHERS)]),
+                lw=1.1,
+                label=track.method,
+            )
         axes.plot(*reference[0], "o", color="black", mfc="white", ms=6, zorder=4)
         axes.set_aspect("equal", adjustable="datalim")
         axes.set_title(name, fontsize=9)
         _finish(axes)
-    for axes in panels[len(sequences):]:
+    for axes in panels[len(sequences) :]:
         axes.set_visible(False)
-    handles = {label: handle for axes in panels[: len(sequences)] for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
-    figure.legend(handles.values(), handles.keys(), loc="outside upper center", ncols=min(8, len(handles)), fontsize=9, frameon=False)
+    handles = {
+        label: handle
+        for axes in panels[: len(sequences)]
+        for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)
+    }
+    figure.legend(
+        handles.values(),
+        handles.keys(),
+        loc="outside upper center",
+        ncols=min(8, len(handles)),
+        fontsize=9,
+        frameon=False,
+    )
     figure.supxlabel("x (m)", fontsize=9)
     figure.supylabel("y (m)", fontsize=9)
     return figure
 
 
 def gate(windows: Said) -> Figure:
-    """Distribution of the gate, the scale and their product, horizontal axes, at rest and in motion."""
+    """Distribution of the gate, the scale and their product, horizontal axes, at rest and in
+    motion."""
     figure = Figure(figsize=(10.0, 3.4), layout="constrained")
-    quantities = {"|gate|": np.abs(windows.diagnostics["gate"]), "scale (m)": np.abs(windows.diagnostics["scale"]),
-                  "|scale × gate| (m)": np.abs(windows.displacement)}
-    groups = {"standing": (windows.activity == 0, VERMILION), "slow": (windows.activity == 1, GREY), "moving": (windows.activity > 1, BLUE)}
+    quantities = {
+        "|gate|": np.abs(windows.diagnostics["gate"]),
+        "scale (m)": np.abs(windows.diagnostics["scale"]),
+        "|scale × gate| (m)": np.abs(windows.displacement),
+    }
+    groups = {
+        "standing": (windows.activity == 0, VERMILION),
+        "slow": (windows.activity == 1, GREY),
+        "moving": (windows.activity > 1, BLUE),
+    }
     for axes, (name, values) in zip(figure.subplots(1, 3), quantities.items(), strict=True):
-        edges = np.linspace(0, 1, 41) if name == "|gate|" else np.linspace(0, max(np.percentile(values[:, :2], 99), 1e-3), 41)
+        edges = (
+            np.linspace(0, 1, 41)
+            if name == "|gate|"
+            else np.linspace(0, max(np.percentile(values[:, :2], 99), 1e-3), 41)
+        )
         for label, (those, colour) in groups.items():
             if those.any():
                 share = np.histogram(values[those, :2], edges)[0] / (2 * those.sum())
@@ -136,12 +205,19 @@ def gate(windows: Said) -> Figure:
 
 
 def attention(names: list[str], lifts: Float[np.ndarray, "a p"], words: str) -> Figure:
-    """How much more attention each prototype gets in each activity than on average; prototypes in the order of the activity they favour."""
+    """How much more attention each prototype gets in each activity than on average; prototypes in
+    the order of the activity they favour."""
     order = np.lexsort((-lifts.max(0), lifts.argmax(0)))
     figure = Figure(figsize=(9.0, 1.6 + 0.4 * len(names)), layout="constrained")
     axes = figure.add_subplot()
     limit = max(abs(np.log2(np.clip(lifts, 0.25, 4))).max(), 1e-3)
-    image = axes.imshow(np.log2(np.maximum(lifts[:, order], 1e-6)), aspect="auto", cmap="RdBu_r", vmin=-limit, vmax=limit)
+    image = axes.imshow(
+        np.log2(np.maximum(lifts[:, order], 1e-6)),
+        aspect="auto",
+        cmap="RdBu_r",
+        vmin=-limit,
+        vmax=limit,
+    )
     axes.set_yticks(range(len(names)), names)
     axes.set(xlabel="prototype, sorted by the activity it favours", title=words)
     axes.title.set_fontsize(9)
@@ -150,15 +226,24 @@ def attention(names: list[str], lifts: Float[np.ndarray, "a p"], words: str) -> 
 
 
 def entropies(rows: list[str], each: list[list[float]], mean: list[list[float]]) -> Figure:
-    """Entropy of the attention of each row, as a share of that of a uniform one; a dot for each seed."""
+    """Entropy of the attention of each row, as a share of that of a uniform one; a dot for each
+    seed."""
     figure = Figure(figsize=(5.6, 3.8), layout="constrained")
     axes = figure.add_subplot()
-    for values, colour, label in [(each, GREEN, "of one window"), (mean, GREY, "of the mean over windows")]:
+    for values, colour, label in [
+        (each, GREEN, "of one window"),
+        (mean, GREY, "of the mean over windows"),
+    ]:
         axes.plot([np.mean(seeds) for seeds in values], color=colour, label=label)
         for place, seeds in enumerate(values):
             axes.plot(np.full(len(seeds), place), seeds, "o", color=colour, ms=4)
     axes.set_xticks(range(len(rows)), rows)
-    axes.set(xlabel="bank", ylabel="entropy / log m", ylim=(0, 1.05), title="How the attention spreads over the bank")
+    axes.set(
+        xlabel="bank",
+        ylabel="entropy / log m",
+        ylim=(0, 1.05),
+        title="How the attention spreads over the bank",
+    )
     axes.legend(fontsize=8, frameon=False)
     _finish(axes)
     return figure
@@ -171,8 +256,13 @@ def standing(by_method: dict[str, dict[str, dict[str, float]]]) -> Figure:
     axes = figure.add_subplot()
     for number, (method, found) in enumerate(by_method.items()):
         places = np.arange(len(names)) + 0.1 * (number - (len(by_method) - 1) / 2)
-        axes.semilogy(places, [found.get(name, {}).get("error", np.nan) for name in names], "o",
-                      color=COLOURS.get(method, OTHERS[number % len(OTHERS)]), label=method)
+        axes.semilogy(
+            places,
+            [found.get(name, {}).get("error", np.nan) for name in names],
+            "o",
+            color=COLOURS.get(method, OTHERS[number % len(OTHERS)]),
+            label=method,
+        )
     axes.set_xticks(range(len(names)), names)
     axes.set(ylabel="rms error of a window's displacement (m)", title="By what the walker did")
     axes.legend(fontsize=8, frameon=False)

@@ -1,4 +1,5 @@
-"""What networks say of single windows, sorted by what the walker did: errors, gate and attention at rest and in motion."""
+"""What networks say of single windows, sorted by what the walker did: errors, gate and attention at
+rest and in motion."""
 
 from __future__ import annotations
 
@@ -15,8 +16,8 @@ from gnio_jax.training import checkpoint
 
 ACTIVITIES = ("standing", "slow", "walking", "running", "stairs")
 STANDING, SLOW, RUNNING, CLIMBING = 0.05, 0.8, 1.9, 0.12
-"""Limits of the mean speed over a window, m/s: standing below the first, slow walking below the second, running above the third;
-on stairs where the vertical part is above the last."""
+"""Limits of the mean speed over a window, m/s: standing below the first, slow walking below the
+second, running above the third; on stairs where the vertical part is above the last."""
 
 
 class Said(NamedTuple):
@@ -37,28 +38,53 @@ def said(workdir: Path, split: str) -> Said:
     run = checkpoint.load_run(workdir)
     config = run.config.data
     setup = Setup("integrate", orientation="reference")
-    recordings, _ = odometry.prepare(data.load(run.config.dataset, run.config.data_root, split), config, setup)
+    recordings, _ = odometry.prepare(
+        data.load(run.config.dataset, run.config.data_root, split), config, setup
+    )
     network = Network(models.Inference(run.model), models.freeze(run.model, run.variables))
     attitudes = [odometry.attitude(r, config, "reference") for r in recordings]
-    found = odometry.predict_windows(network, recordings, attitudes, config, keep=("gate", "scale", "attention"))
+    found = odometry.predict_windows(
+        network, recordings, attitudes, config, keep=("gate", "scale", "attention")
+    )
     truth = np.concatenate([odometry.true_displacements(r, config) for r in recordings])
     good = np.isfinite(truth).all(1)
-    diagnostics = {key: np.concatenate([p.diagnostics[key] for p in found])[good] for key in found[0].diagnostics}
-    displacement, log_std = (np.concatenate([np.asarray(getattr(p, name)) for p in found])[good] for name in ("displacement", "log_std"))
-    return Said(truth[good], displacement, log_std, diagnostics, activity(truth[good], config.window_seconds))
+    diagnostics = {
+        key: np.concatenate([p.diagnostics[key] for p in found])[good]
+        for key in found[0].diagnostics
+    }
+    displacement, log_std = (
+        np.concatenate([np.asarray(getattr(p, name)) for p in found])[good]
+        for name in ("displacement", "log_std")
+    )
+    return Said(
+        truth[good],
+        displacement,
+        log_std,
+        diagnostics,
+        activity(truth[good], config.window_seconds),
+    )
 
 
 def activity(displacement: Float[np.ndarray, "m 3"], seconds: float) -> Int[np.ndarray, "m"]:
     """What the walker does, by the reference's displacement of a window, m. Ours: the limits above."""
-    speed, climb = np.linalg.norm(displacement[:, :2], axis=1) / seconds, np.abs(displacement[:, 2]) / seconds
-    conditions = [climb > CLIMBING, np.hypot(speed, climb) < STANDING, speed < SLOW, speed > RUNNING]
+    speed, climb = (
+        np.linalg.norm(displacement[:, :2], axis=1) / seconds,
+        np.abs(displacement[:, 2]) / seconds,
+    )
+    conditions = [
+        climb > CLIMBING,
+        np.hypot(speed, climb) < STANDING,
+        speed < SLOW,
+        speed > RUNNING,
+    ]
     numbers = [ACTIVITIES.index(name) for name in ("stairs", "standing", "slow", "running")]
     return np.select(conditions, numbers, ACTIVITIES.index("walking"))
 
 
 def by_activity(windows: Said) -> dict[str, dict[str, float]]:
-    """For each activity that occurs: windows, rms error of the displacement, m, rms of the error over its standard deviation, median
-    length of the displacement, m, and the median |gate| and scale of the horizontal axes, where there is a gate."""
+    """For each activity that occurs: windows, rms error of the displacement, m, rms of the error
+    over its standard deviation, median length of the displacement, m, and the median |gate| and
+    scale of the horizontal axes, where there is a gate."""
     found = {}
     for number, name in enumerate(ACTIVITIES):
         those = windows.activity == number
@@ -78,17 +104,23 @@ def by_activity(windows: Said) -> dict[str, dict[str, float]]:
 
 
 def entropy(attention: Float[np.ndarray, "m h p"]) -> tuple[float, float]:
-    """Mean entropy of the attention, and that of its mean over the windows, each a share of that of a uniform one, log p.
+    """Mean entropy of the attention, and that of its mean over the windows, each a share of that of
+    a uniform one, log p.
 
-    Both near 1: every window sees all prototypes alike. The first small, the second large: windows choose, and choose differently.
+    Both near 1: every window sees all prototypes alike. The first small, the second large: windows
+    choose, and choose differently.
     """
     largest = np.log(attention.shape[-1])
-    each, mean = (-(a * np.log(np.maximum(a, 1e-12))).sum(-1).mean() / largest for a in (attention, attention.mean(0)))
+    each, mean = (
+        -(a * np.log(np.maximum(a, 1e-12))).sum(-1).mean() / largest
+        for a in (attention, attention.mean(0))
+    )
     return float(each), float(mean)
 
 
 def attention_by_activity(windows: Said) -> tuple[list[str], Float[np.ndarray, "a p"]]:
-    """Activities that occur, and for each how much more attention each prototype gets than on average (1: as on average)."""
+    """Activities that occur, and for each how much more attention each prototype gets than on
+    average (1: as on average)."""
     attention = windows.diagnostics["attention"].mean(1)
     usual = attention.mean(0)
     names, lifts = [], []
@@ -101,8 +133,9 @@ def attention_by_activity(windows: Said) -> tuple[list[str], Float[np.ndarray, "
 
 
 def information(windows: Said, draws: int = 20) -> tuple[float, float]:
-    """Mutual information, bits, of the activity and the prototype most attended to (over the mean of the heads), and the same with the
-    activities shuffled, which is what chance alone makes of so few windows."""
+    """Mutual information, bits, of the activity and the prototype most attended to (over the mean
+    of the heads), and the same with the activities shuffled, which is what chance alone makes of so
+    few windows."""
     strongest = windows.diagnostics["attention"].mean(1).argmax(1)
     rng = np.random.default_rng(0)
     chance = np.mean([_mutual(rng.permutation(windows.activity), strongest) for _ in range(draws)])

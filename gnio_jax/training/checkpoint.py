@@ -1,6 +1,8 @@
-"""Checkpoints of a run: `checkpoints/latest` to resume from and `checkpoints/best` to evaluate. The only importer of Orbax.
+"""Checkpoints of a run: `checkpoints/latest` to resume from and `checkpoints/best` to evaluate. The
+only importer of Orbax.
 
-Orbax writes a checkpoint into a temporary folder and renames it, so a killed process leaves the previous one whole.
+Orbax writes a checkpoint into a temporary folder and renames it, so a killed process leaves the
+previous one whole.
 """
 
 from __future__ import annotations
@@ -33,14 +35,16 @@ class Position(NamedTuple):
     """Epoch in progress, or finished if `step` is a multiple of the steps per epoch."""
     step: int
     best_loss: float | None
-    """Smallest value on the validation split, since the last switch of what is trained, of what `optim.best_by` names."""
+    """Smallest value on the validation split, since the last switch of what is trained, of what
+    `optim.best_by` names."""
     loss_sums: tuple[float, float, float]
     """Training losses summed over the steps of the epoch in progress."""
     seconds: float
     """Time spent training so far."""
     plateau: Plateau = Plateau()
     gradient_norms: dict[str, float] = {}
-    """Norms of the gradient by part of the network, summed over the steps of the epoch in progress."""
+    """Norms of the gradient by part of the network, summed over the steps of the epoch in progress.
+    """
 
 
 class Run(NamedTuple):
@@ -55,7 +59,11 @@ class Run(NamedTuple):
 
 def create_model(config: TrainConfig) -> nn.Module:
     """The network that `config.model` describes; what that leaves open is the network's own."""
-    options = {key: value for key, value in vars(config.model).items() if key != "name" and value is not None}
+    options = {
+        key: value
+        for key, value in vars(config.model).items()
+        if key != "name" and value is not None
+    }
     return models.create(config.model.name, **options)
 
 
@@ -70,7 +78,10 @@ class Checkpoints:
 
     def __init__(self, workdir: Path):
         self._workdir = workdir
-        self._managers = {which: _manager(workdir / "checkpoints" / which, create=True) for which in ("latest", "best")}
+        self._managers = {
+            which: _manager(workdir / "checkpoints" / which, create=True)
+            for which in ("latest", "best")
+        }
 
     def __enter__(self) -> Checkpoints:
         return self
@@ -80,7 +91,8 @@ class Checkpoints:
             manager.close()
 
     def save(self, which: Which, state: TrainState, position: Position) -> None:
-        """Write a checkpoint at `position.step`; one that is already there for this step is the same and stays."""
+        """Write a checkpoint at `position.step`; one that is already there for this step is the
+        same and stays."""
         manager = self._managers[which]
         if position.step in manager.all_steps():
             return
@@ -103,39 +115,80 @@ class Checkpoints:
         restored = manager.restore(step, args=ocp.args.Composite(
             variables=ocp.args.StandardRestore(variables), optimizer=ocp.args.StandardRestore(template.opt_state)))  # fmt: skip
         found = meta["position"]
-        position = Position(**(found | {"loss_sums": tuple(found["loss_sums"]), "plateau": Plateau(*found.get("plateau", ()))}))
-        state = TrainState(jnp.int32(step), restored["variables"]["params"], restored["variables"]["batch_stats"], restored["optimizer"])
-        # Orbax hands out arrays that are committed to a device; a plain copy keeps one compiled step for both cases.
+        position = Position(
+            **(
+                found
+                | {
+                    "loss_sums": tuple(found["loss_sums"]),
+                    "plateau": Plateau(*found.get("plateau", ())),
+                }
+            )
+        )
+        state = TrainState(
+            jnp.int32(step),
+            restored["variables"]["params"],
+            restored["variables"]["batch_stats"],
+            restored["optimizer"],
+        )
+        # Orbax hands out arrays that are committed to a device; a plain copy keeps one compiled
+        # step for both cases.
         return jax.tree.map(lambda x: jnp.array(jax.device_get(x)), state), position
 
 
 def load_run(workdir: Path, which: Which = "best") -> Run:
     """The network of a run with its trained variables.
 
-    Raises `InputError` for a folder without a run or checkpoint, or one whose arrays do not fit the run's config.yaml.
+    Raises `InputError` for a folder without a run or checkpoint, or one whose arrays do not fit the
+    run's config.yaml.
     """
     workdir = Path(workdir)
     if not (workdir / "config.yaml").is_file():
-        raise InputError(workdir, "holds no run (config.yaml is missing)", "train one with python train.py --workdir ...")
-    config = configuration.validate(configuration.load(workdir / "config.yaml"), str(workdir / "config.yaml"))
+        raise InputError(
+            workdir,
+            "holds no run (config.yaml is missing)",
+            "train one with python train.py --workdir ...",
+        )
+    config = configuration.validate(
+        configuration.load(workdir / "config.yaml"), str(workdir / "config.yaml")
+    )
     where = workdir / "checkpoints" / which
     if not exists(workdir, which):
-        raise InputError(where, "holds no checkpoint", "let python train.py finish its first epoch, or give another --workdir")
+        raise InputError(
+            where,
+            "holds no checkpoint",
+            "let python train.py finish its first epoch, or give another --workdir",
+        )
     model = create_model(config)
-    template = jax.eval_shape(model.init, jax.random.key(0), jax.ShapeDtypeStruct((1, config.data.window, 6), jnp.float32))
+    template = jax.eval_shape(
+        model.init, jax.random.key(0), jax.ShapeDtypeStruct((1, config.data.window, 6), jnp.float32)
+    )
     template = {"params": template["params"], "batch_stats": template.get("batch_stats", {})}
     with _manager(where, create=False) as manager:
         step = manager.latest_step()
         meta = _checked_meta(manager, step, template, where)
         try:
-            variables = manager.restore(step, args=ocp.args.Composite(variables=ocp.args.StandardRestore(template)))["variables"]
+            variables = manager.restore(
+                step, args=ocp.args.Composite(variables=ocp.args.StandardRestore(template))
+            )["variables"]
         except (OSError, ValueError, KeyError) as error:
-            raise InputError(where / str(step), f"cannot be read ({str(error)[:120]})", "the checkpoint is damaged") from None
-    return Run(config, model, jax.tree.map(lambda x: jnp.array(jax.device_get(x)), variables), meta["position"]["epoch"], step)
+            raise InputError(
+                where / str(step),
+                f"cannot be read ({str(error)[:120]})",
+                "the checkpoint is damaged",
+            ) from None
+    return Run(
+        config,
+        model,
+        jax.tree.map(lambda x: jnp.array(jax.device_get(x)), variables),
+        meta["position"]["epoch"],
+        step,
+    )
 
 
 def _manager(folder: Path, create: bool) -> ocp.CheckpointManager:
-    options = ocp.CheckpointManagerOptions(max_to_keep=1, enable_async_checkpointing=False, create=create)
+    options = ocp.CheckpointManagerOptions(
+        max_to_keep=1, enable_async_checkpointing=False, create=create
+    )
     return ocp.CheckpointManager(folder.absolute(), options=options)
 
 
@@ -144,12 +197,16 @@ def _shapes(variables: Any) -> dict[str, list[int]]:
             for path, leaf in jax.tree_util.tree_leaves_with_path(variables)}  # fmt: skip
 
 
-def _checked_meta(manager: ocp.CheckpointManager, step: int, variables: Any, where: Path) -> dict[str, Any]:
+def _checked_meta(
+    manager: ocp.CheckpointManager, step: int, variables: Any, where: Path
+) -> dict[str, Any]:
     try:
         meta = manager.restore(step, args=ocp.args.Composite(meta=ocp.args.JsonRestore()))["meta"]
         found = meta["shapes"]
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(where / str(step), f"cannot be read ({str(error)[:120]})", "the checkpoint is damaged") from None
+        raise InputError(
+            where / str(step), f"cannot be read ({str(error)[:120]})", "the checkpoint is damaged"
+        ) from None
     wanted = _shapes(variables)
     for name in sorted(wanted.keys() | found.keys()):
         if wanted.get(name) != found.get(name):

@@ -1,4 +1,5 @@
-"""The training loop, top to bottom: data, state, epochs of dispatches, validation, logs, checkpoints."""
+"""The training loop, top to bottom: data, state, epochs of dispatches, validation, logs,
+checkpoints."""
 
 from __future__ import annotations
 
@@ -19,7 +20,14 @@ import optax
 import yaml
 from flax import linen as nn
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 from tensorboardX import SummaryWriter
 
 from gnio_jax import config as configuration
@@ -45,7 +53,8 @@ from gnio_jax.training.step import (
 from gnio_jax.types import InputError
 
 DISPATCH_SECONDS = 0.5
-"""Steps are dispatched in runs of about this long: few round trips, and still a lively progress bar and a quick stop."""
+"""Steps are dispatched in runs of about this long: few round trips, and still a lively progress bar
+and a quick stop."""
 
 
 class Outcome(NamedTuple):
@@ -72,28 +81,45 @@ def prepare_workdir(config: TrainConfig, resume: bool) -> Path:
     kept = workdir / "config.yaml"
     if not resume:
         if kept.exists():
-            raise InputError(workdir, "already holds a run", "continue it with --resume, or choose another --workdir")
+            raise InputError(
+                workdir,
+                "already holds a run",
+                "continue it with --resume, or choose another --workdir",
+            )
         return workdir
     if not kept.exists():
-        raise InputError(workdir, "holds no run to resume (config.yaml is missing)", "start it without --resume")
+        raise InputError(
+            workdir, "holds no run to resume (config.yaml is missing)", "start it without --resume"
+        )
     ours, theirs = (dataclasses.asdict(c) for c in (config, configuration.load(kept)))
-    for name in ("workdir", "data_root", "checkpoint_every_seconds"):  # where things lie may change, what is computed may not
+    for name in (
+        "workdir",
+        "data_root",
+        "checkpoint_every_seconds",
+    ):  # where things lie may change, what is computed may not
         del ours[name], theirs[name]
     for name in ours:
         if ours[name] != theirs[name]:
-            raise InputError(kept, f"'{name}' was {theirs[name]} and is now {ours[name]}", "resume with the same settings")
+            raise InputError(
+                kept,
+                f"'{name}' was {theirs[name]} and is now {ours[name]}",
+                "resume with the same settings",
+            )
     return workdir
 
 
 def train(config: TrainConfig, resume: bool = False, console: Console | None = None) -> Outcome:
     """Train the network of `config` and leave checkpoints and logs in its work folder.
 
-    With `resume` the run goes on from its latest checkpoint as if it had never stopped: parameters, optimizer, order of
-    the windows and random draws are functions of the seed and the step. Resume rules, in order: the settings must be
-    those of config.yaml; without a checkpoint yet the run starts over; log rows after the checkpoint are dropped.
-    SIGTERM and Ctrl-C save and return; a loss that is not finite raises `FloatingPointError` naming the step.
+    With `resume` the run goes on from its latest checkpoint as if it had never stopped: parameters,
+    optimizer, order of the windows and random draws are functions of the seed and the step. Resume
+    rules, in order: the settings must be those of config.yaml; without a checkpoint yet the run
+    starts over; log rows after the checkpoint are dropped. SIGTERM and Ctrl-C save and return; a
+    loss that is not finite raises `FloatingPointError` naming the step.
     """
-    with jax.enable_x64(False):  # whatever the process has: no float64 in the step, and the same random draws
+    with jax.enable_x64(
+        False
+    ):  # whatever the process has: no float64 in the step, and the same random draws
         return _train(config, resume, console or Console(stderr=True, soft_wrap=True))
 
 
@@ -102,18 +128,30 @@ def _train(config: TrainConfig, resume: bool, console: Console) -> Outcome:
     workdir = prepare_workdir(config, resume)
     run = _prepare(config, console)
     state = create_state(run.model, run.optimizer, run.init_key, config.data.window)
-    console.print(f"{config.model.name}: {sum(x.size for x in jax.tree.leaves(state.params)):,} parameters on {jax.devices()[0].platform}, "
-                  f"{run.steps_per_epoch} steps of {config.optim.batch_size} windows an epoch, {config.optim.epochs} epochs → {workdir}")
-    for what, step in zip(("the likelihood counts", "the uncertainty learns"), switches(config.loss, run.steps_per_epoch), strict=True):
+    console.print(
+        f"{config.model.name}: {sum(x.size for x in jax.tree.leaves(state.params)):,} parameters on {jax.devices()[0].platform}, "
+        f"{run.steps_per_epoch} steps of {config.optim.batch_size} windows an epoch, {config.optim.epochs} epochs → {workdir}"
+    )
+    for what, step in zip(
+        ("the likelihood counts", "the uncertainty learns"),
+        switches(config.loss, run.steps_per_epoch),
+        strict=True,
+    ):
         if step > 0:
-            console.print(f"{what} from step {step:,} of {config.optim.epochs * run.steps_per_epoch:,}")
+            console.print(
+                f"{what} from step {step:,} of {config.optim.epochs * run.steps_per_epoch:,}"
+            )
 
     workdir.mkdir(parents=True, exist_ok=True)
     if not resume:
         configuration.save(workdir / "config.yaml", config)
     _keep_splits(workdir / "splits.yaml", run.splits)
     position = Position(epoch=0, step=0, best_loss=None, loss_sums=(0.0, 0.0, 0.0), seconds=0.0)
-    with Checkpoints(workdir) as checkpoints, _stop_signals() as stop, _progress(console, config.optim.epochs * run.steps_per_epoch) as bar:
+    with (
+        Checkpoints(workdir) as checkpoints,
+        _stop_signals() as stop,
+        _progress(console, config.optim.epochs * run.steps_per_epoch) as bar,
+    ):
         if resume and exists(workdir):
             state, position = checkpoints.restore(state)
             console.print(f"resuming at step {position.step}")
@@ -128,18 +166,28 @@ def _train(config: TrainConfig, resume: bool, console: Console) -> Outcome:
             state, held_out = _validated(run, state, position.step)
             row = _row(run, epoch, position, held_out, rate)
             merit = row["val_loss" if config.optim.best_by == "loss" else "val_mse"]
-            improved = position.best_loss is None or _switched(run, position.step) or merit < position.best_loss
+            improved = (
+                position.best_loss is None
+                or _switched(run, position.step)
+                or merit < position.best_loss
+            )
             best_loss = merit if improved else position.best_loss
             # The position of a finished epoch is the start of the next one.
-            position = position._replace(epoch=epoch + 1, best_loss=best_loss, loss_sums=(0.0, 0.0, 0.0), gradient_norms={},
-                                         plateau=optimizers.watch(position.plateau, row["val_mse"], config.optim))
+            position = position._replace(
+                epoch=epoch + 1,
+                best_loss=best_loss,
+                loss_sums=(0.0, 0.0, 0.0),
+                gradient_norms={},
+                plateau=optimizers.watch(position.plateau, row["val_mse"], config.optim),
+            )
             rows.append(row)
             _write_rows(workdir / "metrics.jsonl", rows)
             for name, value in row.items():
                 board.add_scalar(name, value, position.step)
             console.print(
                 f"epoch {epoch + 1:4d}/{config.optim.epochs}  loss {row['loss']:.4g}  val {row['val_loss']:.4g}  "
-                f"val rmse {row['val_rmse']:.4f} m  lr {row['learning_rate']:.2e}  {rate:,.0f} windows/s{'  best' if improved else ''}")
+                f"val rmse {row['val_rmse']:.4f} m  lr {row['learning_rate']:.2e}  {rate:,.0f} windows/s{'  best' if improved else ''}"
+            )
             if improved:
                 checkpoints.save("best", state, position)
             checkpoints.save("latest", state, position)
@@ -167,21 +215,36 @@ class _Run(NamedTuple):
     statistics_key: jax.Array
 
     def estimated(self, state: TrainState) -> TrainState:
-        """The state as it is validated and kept: with the statistics of its batch normalisations estimated anew, if asked for."""
+        """The state as it is validated and kept: with the statistics of its batch normalisations
+        estimated anew, if asked for."""
         if not self.config.optim.statistics_windows or not normalises(state):
             return state
-        return estimate_statistics(state, self.source, self.statistics_key, model=self.model, config=self.config)
+        return estimate_statistics(
+            state, self.source, self.statistics_key, model=self.model, config=self.config
+        )
 
 
 def _prepare(config: TrainConfig, console: Console) -> _Run:
     model = create_model(config)  # a mistake in its options should not wait for the data
-    console.print(f"reading {config.dataset}: {config.data.train_split} and {config.data.val_split}")
-    source, learnt_from = _load_windows(config, config.data.train_split, config.data.train_stride, config.augment.shift_samples, console)
-    held_out, validated_with = _load_windows(config, config.data.val_split, config.data.stride, 0, console)
+    console.print(
+        f"reading {config.dataset}: {config.data.train_split} and {config.data.val_split}"
+    )
+    source, learnt_from = _load_windows(
+        config,
+        config.data.train_split,
+        config.data.train_stride,
+        config.augment.shift_samples,
+        console,
+    )
+    held_out, validated_with = _load_windows(
+        config, config.data.val_split, config.data.stride, 0, console
+    )
     splits = {config.data.train_split: learnt_from, config.data.val_split: validated_with}
     count, size = source.visited.shape[0], config.optim.batch_size
     if count < size:
-        raise InputError("optim.batch_size", f"is {size}, but there are only {count} windows", "lower it")
+        raise InputError(
+            "optim.batch_size", f"is {size}, but there are only {count} windows", "lower it"
+        )
     steps_per_epoch = count // size
     key = jax.random.key(config.seed)
     init_key, order_key, step_key = jax.random.split(key, 3)
@@ -192,10 +255,16 @@ def _prepare(config: TrainConfig, console: Console) -> _Run:
 
 
 def _run_epoch(
-    run: _Run, epoch: int, state: TrainState, position: Position, checkpoints: Checkpoints, stop: _Stop,
+    run: _Run,
+    epoch: int,
+    state: TrainState,
+    position: Position,
+    checkpoints: Checkpoints,
+    stop: _Stop,
     bar: Callable[[int, int, float, float, float], None],
 ) -> tuple[TrainState, Position, float]:
-    """Finish epoch `epoch` from `position` on, or save and return when asked to stop; with the windows/s of these steps."""
+    """Finish epoch `epoch` from `position` on, or save and return when asked to stop; with the
+    windows/s of these steps."""
     size = run.config.optim.batch_size
     order = epoch_order(run.order_key, epoch, run.source)
     began = saved = time.perf_counter()
@@ -209,18 +278,29 @@ def _run_epoch(
                                       model=run.model, optimizer=run.optimizer, config=run.config)  # fmt: skip
         failed_step = int(progress.failed_step)  # waits for the device
         if failed_step >= 0:
-            raise FloatingPointError(f"the loss is not finite at step {failed_step} (epoch {epoch}); lower optim.learning_rate, "
-                                     "set optim.clip_norm, or look at the data")
+            raise FloatingPointError(
+                f"the loss is not finite at step {failed_step} (epoch {epoch}); lower optim.learning_rate, "
+                "set optim.clip_norm, or look at the data"
+            )
         clock = time.perf_counter()
         dispatch = max(1, min(2 * dispatch, round(DISPATCH_SECONDS * count / (clock - tick))))
         done += count
         sums = tuple(a + float(b) for a, b in zip(position.loss_sums, progress.sums, strict=True))
-        norms = {part: position.gradient_norms.get(part, 0.0) + float(norm) for part, norm in progress.gradient_norms.items()}
-        position = position._replace(step=epoch * run.steps_per_epoch + done, loss_sums=sums, gradient_norms=norms,
-                                     seconds=before + clock - began)
+        norms = {
+            part: position.gradient_norms.get(part, 0.0) + float(norm)
+            for part, norm in progress.gradient_norms.items()
+        }
+        position = position._replace(
+            step=epoch * run.steps_per_epoch + done,
+            loss_sums=sums,
+            gradient_norms=norms,
+            seconds=before + clock - began,
+        )
         rate = (done - first) * size / (clock - began)
         bar(position.step, epoch, sums[0] / done, _learning_rate(run, position), rate)
-        if done < run.steps_per_epoch and (stop.signum or clock - saved > run.config.checkpoint_every_seconds):
+        if done < run.steps_per_epoch and (
+            stop.signum or clock - saved > run.config.checkpoint_every_seconds
+        ):
             checkpoints.save("latest", run.estimated(state), position)
             saved = time.perf_counter()
             if stop.signum:
@@ -229,7 +309,8 @@ def _run_epoch(
 
 
 def _validated(run: _Run, state: TrainState, step: int) -> tuple[TrainState, Validation]:
-    """The state as it is kept, its uncertainty calibrated where it has constants for that, and the losses of that state."""
+    """The state as it is kept, its uncertainty calibrated where it has constants for that, and the
+    losses of that state."""
     validated = functools.partial(validate, source=run.held_out, now=stage(run.config.loss, step - 1, run.steps_per_epoch),
                                   model=run.model, config=run.config)  # fmt: skip
     found = validated(state)
@@ -240,13 +321,20 @@ def _validated(run: _Run, state: TrainState, step: int) -> tuple[TrainState, Val
 
 
 def _switched(run: _Run, step: int) -> bool:
-    """Whether the epoch that ends at `step` changed what is trained, or is the first whole one after such a change: losses
-    before and after do not compare, and what has just begun to learn has learnt little."""
-    return any(step - 2 * run.steps_per_epoch < switch < step for switch in switches(run.config.loss, run.steps_per_epoch))
+    """Whether the epoch that ends at `step` changed what is trained, or is the first whole one
+    after such a change: losses before and after do not compare, and what has just begun to learn
+    has learnt little."""
+    return any(
+        step - 2 * run.steps_per_epoch < switch < step
+        for switch in switches(run.config.loss, run.steps_per_epoch)
+    )
 
 
-def _row(run: _Run, epoch: int, position: Position, held_out: Validation, rate: float) -> dict[str, int | float]:
-    """The log's line of a finished epoch: mean losses of training (as its steps met them) and of validation."""
+def _row(
+    run: _Run, epoch: int, position: Position, held_out: Validation, rate: float
+) -> dict[str, int | float]:
+    """The log's line of a finished epoch: mean losses of training (as its steps met them) and of
+    validation."""
     loss, mse, nll = (x / run.steps_per_epoch for x in position.loss_sums)
     val_loss, val_mse, val_nll = (float(x) for x in held_out.losses)
     return {
@@ -262,34 +350,52 @@ def _learning_rate(run: _Run, position: Position) -> float:
     return float(run.learning_rate(position.step)) * position.plateau.factor
 
 
-def _load_windows(config: TrainConfig, split: str, stride: int, shift: int, console: Console) -> tuple[windows.WindowSource, list[str]]:
+def _load_windows(
+    config: TrainConfig, split: str, stride: int, shift: int, console: Console
+) -> tuple[windows.WindowSource, list[str]]:
     """The windows of a split on the device, and the names of its recordings."""
-    sequences = [data.resample(s, config.data.rate) for s in data.load(config.dataset, config.data_root, split)]
+    sequences = [
+        data.resample(s, config.data.rate)
+        for s in data.load(config.dataset, config.data_root, split)
+    ]
     source = windows.index(sequences, config.data, stride, shift)
     hours = sum(len(s.time) for s in sequences) / config.data.rate / 3600
-    console.print(f"  {split}: {len(sequences)} sequences, {hours:.2f} h, {source.visited.shape[0]:,} windows")
+    console.print(
+        f"  {split}: {len(sequences)} sequences, {hours:.2f} h, {source.visited.shape[0]:,} windows"
+    )
     return jax.device_put(source), [s.name for s in sequences]
 
 
 def _keep_splits(path: Path, splits: dict[str, list[str]]) -> None:
-    """Note which recordings the network learns from and is chosen by: hold-outs are drawn from what a copy of the data holds.
+    """Note which recordings the network learns from and is chosen by: hold-outs are drawn from what
+    a copy of the data holds.
 
     Raises `InputError` when the run was begun with others.
     """
     if not path.exists():
         with replacing(path) as temporary:
-            temporary.write_text(yaml.safe_dump(splits, sort_keys=False, allow_unicode=True), encoding="utf-8")
+            temporary.write_text(
+                yaml.safe_dump(splits, sort_keys=False, allow_unicode=True), encoding="utf-8"
+            )
         return
     try:
         before = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise InputError(path, f"cannot be read ({' '.join(str(error).split())})", "remove it, and the recordings are noted anew") from None
+        raise InputError(
+            path,
+            f"cannot be read ({' '.join(str(error).split())})",
+            "remove it, and the recordings are noted anew",
+        ) from None
     for split, names in splits.items():
         theirs = before.get(split) if isinstance(before, dict) else None
         if names != theirs:
             changed = sorted(set(names) ^ set(theirs if isinstance(theirs, list) else []))
-            raise InputError(path, f"the run was begun with other recordings in split '{split}' ({len(changed)} differ"
-                                   f"{f', e.g. {changed[0]}' if changed else ', their order does'})", "resume with the same data")
+            raise InputError(
+                path,
+                f"the run was begun with other recordings in split '{split}' ({len(changed)} differ"
+                f"{f', e.g. {changed[0]}' if changed else ', their order does'})",
+                "resume with the same data",
+            )
 
 
 def _kept_rows(path: Path, epoch: int) -> list[dict]:
@@ -327,10 +433,17 @@ def _stop_signals() -> Iterator[_Stop]:
 
 @contextmanager
 def _progress(console: Console, total_steps: int):
-    """A bar with losses, learning rate, windows/s and the time left; on a log file only the epoch lines remain."""
+    """A bar with losses, learning rate, windows/s and the time left; on a log file only the epoch
+    lines remain."""
     columns = ("{task.description}", BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[numbers]}"), TimeElapsedColumn(),
                TimeRemainingColumn(elapsed_when_finished=True))  # fmt: skip
-    with Progress(*columns, console=console, disable=not console.is_terminal, transient=True, speed_estimate_period=120) as progress:
+    with Progress(
+        *columns,
+        console=console,
+        disable=not console.is_terminal,
+        transient=True,
+        speed_estimate_period=120,
+    ) as progress:
         task = progress.add_task("training", total=total_steps, numbers="compiling")
 
         def update(step: int, epoch: int, loss: float, learning_rate: float, rate: float) -> None:

@@ -1,4 +1,5 @@
-"""Training objectives: GNIO's weighted sum of squared error and likelihood (paper §III-F), and those of the networks beside it."""
+"""Training objectives: GNIO's weighted sum of squared error and likelihood (paper §III-F), and
+those of the networks beside it."""
 
 from __future__ import annotations
 
@@ -36,7 +37,8 @@ class Stage(NamedTuple):
 
 
 def switches(config: LossConfig, steps_per_epoch: int) -> tuple[int, int]:
-    """First steps of the likelihood and of the uncertainty, from the fractions of an epoch that the config gives."""
+    """First steps of the likelihood and of the uncertainty, from the fractions of an epoch that the
+    config gives."""
     likelihood, uncertainty = (
         min(math.ceil(epochs * steps_per_epoch - 1e-6), _NEVER)
         for epochs in (config.nll_from_epoch, config.log_std_from_epoch)
@@ -71,24 +73,36 @@ def losses(prediction: Prediction, windows: Windows, config: LossConfig, stage: 
     return Losses(total, mse, nll)
 
 
-def _velocity_and_covariance(prediction: Prediction, windows: Windows, config: LossConfig, stage: Stage) -> Float[jax.Array, ""]:
+def _velocity_and_covariance(
+    prediction: Prediction, windows: Windows, config: LossConfig, stage: Stage
+) -> Float[jax.Array, ""]:
     """CTIN's L_v / 2δ_v² + L_c / 2δ_c² + log δ_v δ_c (its eq. 9–11), δ being learnt.
 
-    L_v is the squared error of each sample's velocity plus that of the position to which they add up, L_c the likelihood of the velocities.
-    Velocities are metres per window. Ours: means over the samples, sums over the axes.
+    L_v is the squared error of each sample's velocity plus that of the position to which they add
+    up, L_c the likelihood of the velocities. Velocities are metres per window. Ours: means over the
+    samples, sums over the axes.
     """
     said = prediction.diagnostics
     if not {"velocity", "velocity_log_std", "task_log_std"} <= said.keys():
-        raise ValueError("loss 'velocity_and_covariance' wants a velocity for every sample, which only the network 'ctin' gives")
+        raise ValueError(
+            "loss 'velocity_and_covariance' wants a velocity for every sample, which only the network 'ctin' gives"
+        )
     error = windows.steps * windows.steps.shape[1] - said["velocity"]
     position = windows.displacement - prediction.displacement
     velocity_loss = jnp.mean(jnp.sum(error**2, axis=-1)) + jnp.mean(jnp.sum(position**2, axis=-1))
     covariance_loss = _nll(error, _held(said["velocity_log_std"], stage), config)
     log_v, log_c = said["task_log_std"][0]
-    return 0.5 * jnp.exp(-2 * log_v) * velocity_loss + 0.5 * jnp.exp(-2 * log_c) * covariance_loss + log_v + log_c
+    return (
+        0.5 * jnp.exp(-2 * log_v) * velocity_loss
+        + 0.5 * jnp.exp(-2 * log_c) * covariance_loss
+        + log_v
+        + log_c
+    )
 
 
-def _nll(error: Float[jax.Array, "*b 3"], log_std: Float[jax.Array, "*b 3"], config: LossConfig) -> Float[jax.Array, ""]:
+def _nll(
+    error: Float[jax.Array, "*b 3"], log_std: Float[jax.Array, "*b 3"], config: LossConfig
+) -> Float[jax.Array, ""]:
     if config.log_std_floor is not None:
         log_std = jnp.maximum(log_std, config.log_std_floor)
     return jnp.mean(jnp.sum(0.5 * error**2 * jnp.exp(-2 * log_std) + log_std, axis=-1))

@@ -1,4 +1,5 @@
-"""Adam with linear warm-up and cosine decay (paper §IV-A), and the schedules of the networks that GNIO is compared with."""
+"""Adam with linear warm-up and cosine decay (paper §IV-A), and the schedules of the networks that
+GNIO is compared with."""
 
 from __future__ import annotations
 
@@ -15,14 +16,19 @@ UNCERTAINTY = ("uncertainty", "log_std")
 
 
 def schedule(config: OptimConfig, steps_per_epoch: int) -> optax.Schedule:
-    """Learning rate of a step: linear from start to peak over the warm-up, then a cosine to the end of the last epoch, or no change.
+    """Learning rate of a step: linear from start to peak over the warm-up, then a cosine to the end
+    of the last epoch, or no change.
 
     Ours: a run too short for its warm-up warms up for its first half.
     """
     warmup_steps = round(min(config.warmup_epochs, config.epochs / 2) * steps_per_epoch)
     if config.schedule != "cosine":
-        warmup = optax.linear_schedule(config.start_learning_rate, config.learning_rate, max(warmup_steps, 1))
-        return optax.join_schedules([warmup, optax.constant_schedule(config.learning_rate)], [warmup_steps])
+        warmup = optax.linear_schedule(
+            config.start_learning_rate, config.learning_rate, max(warmup_steps, 1)
+        )
+        return optax.join_schedules(
+            [warmup, optax.constant_schedule(config.learning_rate)], [warmup_steps]
+        )
     return optax.warmup_cosine_decay_schedule(
         init_value=config.start_learning_rate,
         peak_value=config.learning_rate,
@@ -32,20 +38,29 @@ def schedule(config: OptimConfig, steps_per_epoch: int) -> optax.Schedule:
     )
 
 
-def create(config: OptimConfig, loss: LossConfig, steps_per_epoch: int) -> optax.GradientTransformationExtraArgs:
-    """Adam, β = (0.9, 0.999), with the schedule; before it, where that is asked for, the gradient's global norm is clipped and
-    the parameters decay. `update` takes `log_std_learns` (see `losses.Stage`).
+def create(
+    config: OptimConfig, loss: LossConfig, steps_per_epoch: int
+) -> optax.GradientTransformationExtraArgs:
+    """Adam, β = (0.9, 0.999), with the schedule; before it, where that is asked for, the gradient's
+    global norm is clipped and the parameters decay. `update` takes `log_std_learns` (see
+    `losses.Stage`).
 
-    Where the uncertainty is held at first, it has a state of its own that does not count those steps, as PyTorch's Adam does
-    not count steps without a gradient. In one state the zero gradients would be counted: at the release the bias correction of
-    the moments would be gone, and the first steps 3.7 times as long as the learning rate allows.
+    Where the uncertainty is held at first, it has a state of its own that does not count those
+    steps, as PyTorch's Adam does not count steps without a gradient. In one state the zero
+    gradients would be counted: at the release the bias correction of the moments would be gone, and
+    the first steps 3.7 times as long as the learning rate allows.
     """
     rate = schedule(config, steps_per_epoch)
     adam = optax.adam(rate, b1=0.9, b2=0.999)
     if max(switches(loss, steps_per_epoch)) > 0:
         moments = optax.scale_by_adam(b1=0.9, b2=0.999)
-        held = optax.conditionally_mask(moments, lambda step, log_std_learns: log_std_learns, forward_extra_args=True)
-        adam = optax.chain(optax.partition({"learns": moments, "held": held}, _kinds), optax.scale_by_learning_rate(rate))
+        held = optax.conditionally_mask(
+            moments, lambda step, log_std_learns: log_std_learns, forward_extra_args=True
+        )
+        adam = optax.chain(
+            optax.partition({"learns": moments, "held": held}, _kinds),
+            optax.scale_by_learning_rate(rate),
+        )
     parts = [adam]
     if config.weight_decay:
         parts.insert(0, optax.add_decayed_weights(config.weight_decay))
@@ -73,7 +88,8 @@ class Plateau(NamedTuple):
 
 
 def watch(plateau: Plateau, mse: float, config: OptimConfig) -> Plateau:
-    """After an epoch with this squared error on the validation split. Better means by a ten-thousandth, as in PyTorch."""
+    """After an epoch with this squared error on the validation split. Better means by a
+    ten-thousandth, as in PyTorch."""
     if config.schedule != "plateau":
         return plateau
     if plateau.best is None or mse < plateau.best * (1 - 1e-4):

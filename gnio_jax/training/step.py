@@ -1,4 +1,5 @@
-"""The jitted training and validation steps: gather, rotate, augment, forward, backward, update, all on the device."""
+"""The jitted training and validation steps: gather, rotate, augment, forward, backward, update, all
+on the device."""
 
 from __future__ import annotations
 
@@ -12,7 +13,7 @@ from flax import linen as nn
 from jaxtyping import Float, Int, PRNGKeyArray
 
 from gnio_jax.config import TrainConfig
-from gnio_jax.data.augment import augment
+from gnio_jax.data.augmentation import augment
 from gnio_jax.data.windows import WindowSource, gather, shifted
 from gnio_jax.models import initialise
 from gnio_jax.models.resnet import MOMENTUM
@@ -50,19 +51,26 @@ class Progress(NamedTuple):
     """First step whose loss was not finite; −1 when all were."""
 
 
-def create_state(model: nn.Module, optimizer: optax.GradientTransformation, key: PRNGKeyArray, window: int) -> TrainState:
+def create_state(
+    model: nn.Module, optimizer: optax.GradientTransformation, key: PRNGKeyArray, window: int
+) -> TrainState:
     """Fresh parameters for windows of `window` samples, at step 0."""
     variables = initialise(model, key, window)
     params = variables["params"]
-    return TrainState(jnp.int32(0), params, variables.get("batch_stats", {}), optimizer.init(params))
+    return TrainState(
+        jnp.int32(0), params, variables.get("batch_stats", {}), optimizer.init(params)
+    )
 
 
 def epoch_order(key: PRNGKeyArray, epoch: int, source: WindowSource) -> Int[jax.Array, "m"]:
-    """The order in which epoch `epoch` visits the windows: a permutation that depends on nothing else."""
+    """The order in which epoch `epoch` visits the windows: a permutation that depends on nothing
+    else."""
     return jax.random.permutation(jax.random.fold_in(key, epoch), jnp.asarray(source.visited))
 
 
-@functools.partial(jax.jit, static_argnames=("model", "optimizer", "config"), donate_argnames="state")
+@functools.partial(
+    jax.jit, static_argnames=("model", "optimizer", "config"), donate_argnames="state"
+)
 def train_steps(
     state: TrainState,
     source: WindowSource,
@@ -76,11 +84,11 @@ def train_steps(
     optimizer: optax.GradientTransformationExtraArgs,
     config: TrainConfig,
 ) -> tuple[TrainState, Progress]:
-    """Take `count` steps of an epoch from its step number `first` on, in one dispatch; `learning_rate_factor` is
-    `optimizer.Plateau.factor`.
+    """Take `count` steps of an epoch from its step number `first` on, in one dispatch;
+    `learning_rate_factor` is `optimizer.Plateau.factor`.
 
-    `count` is not static: however an epoch is cut into dispatches it is the same program, so a run that was
-    interrupted and resumed has the same parameters to the bit.
+    `count` is not static: however an epoch is cut into dispatches it is the same program, so a run
+    that was interrupted and resumed has the same parameters to the bit.
     """
     size = config.optim.batch_size
     steps_per_epoch = order.shape[0] // size
@@ -100,28 +108,49 @@ def train_steps(
             return loss.total, (loss, changed.get("batch_stats", {}))
 
         gradient, (loss, batch_stats) = jax.grad(objective, has_aux=True)(state.params)
-        update, opt_state = optimizer.update(gradient, state.opt_state, state.params, log_std_learns=now.log_std_learns)
+        update, opt_state = optimizer.update(
+            gradient, state.opt_state, state.params, log_std_learns=now.log_std_learns
+        )
         update = optax.tree.scale(learning_rate_factor, update)
-        failed = jnp.where((progress.failed_step < 0) & ~jnp.isfinite(loss.total), state.step, progress.failed_step)
-        state = TrainState(jnp.add(state.step, 1), optax.apply_updates(state.params, update), batch_stats, opt_state)
-        sums = jax.tree.map(jnp.add, (progress.sums, progress.gradient_norms), (loss, gradient_norms(gradient)))
+        failed = jnp.where(
+            (progress.failed_step < 0) & ~jnp.isfinite(loss.total), state.step, progress.failed_step
+        )
+        state = TrainState(
+            jnp.add(state.step, 1),
+            optax.apply_updates(state.params, update),
+            batch_stats,
+            opt_state,
+        )
+        sums = jax.tree.map(
+            jnp.add, (progress.sums, progress.gradient_norms), (loss, gradient_norms(gradient))
+        )
         return state, Progress(sums[0], sums[1], failed)
 
-    nothing = Progress(Losses(*[jnp.float32(0)] * 3), jax.tree.map(jnp.zeros_like, gradient_norms(state.params)), jnp.int32(-1))
+    nothing = Progress(
+        Losses(*[jnp.float32(0)] * 3),
+        jax.tree.map(jnp.zeros_like, gradient_norms(state.params)),
+        jnp.int32(-1),
+    )
     return jax.lax.fori_loop(jnp.int32(0), count, one_step, (state, nothing))
 
 
-def drawn(key: PRNGKeyArray, source: WindowSource, which: Int[jax.Array, "b"],
-          config: TrainConfig) -> tuple[Windows, PRNGKeyArray]:
-    """The windows `which`, shifted and augmented by draws from `key`, and the key of the network's dropout."""
+def drawn(
+    key: PRNGKeyArray, source: WindowSource, which: Int[jax.Array, "b"], config: TrainConfig
+) -> tuple[Windows, PRNGKeyArray]:
+    """The windows `which`, shifted and augmented by draws from `key`, and the key of the network's
+    dropout."""
     augment_key, dropout_key, shift_key = jax.random.split(key, 3)
     which = shifted(shift_key, source, which, config.augment.shift_samples)
-    return augment(augment_key, gather(source, which, config.data.window), config.augment), dropout_key
+    return augment(
+        augment_key, gather(source, which, config.data.window), config.augment
+    ), dropout_key
 
 
 def normalises(state: TrainState) -> bool:
     """Whether the network has batch normalisations."""
-    return any(path[-1].key == "mean" for path, _ in jax.tree_util.tree_leaves_with_path(state.batch_stats))
+    return any(
+        path[-1].key == "mean" for path, _ in jax.tree_util.tree_leaves_with_path(state.batch_stats)
+    )
 
 
 def calibrates(state: TrainState) -> bool:
@@ -131,25 +160,35 @@ def calibrates(state: TrainState) -> bool:
 
 
 def statistics_batches(source: WindowSource, config: TrainConfig) -> int:
-    """Batches of `estimate_statistics`: those of `optim.statistics_windows`, but no more than an epoch has."""
+    """Batches of `estimate_statistics`: those of `optim.statistics_windows`, but no more than an
+    epoch has."""
     size = config.optim.batch_size
     return min(-(-config.optim.statistics_windows // size), source.visited.shape[0] // size)
 
 
 @functools.partial(jax.jit, static_argnames=("model", "config"))
 def estimate_statistics(
-    state: TrainState, source: WindowSource, key: PRNGKeyArray, *, model: nn.Module, config: TrainConfig
+    state: TrainState,
+    source: WindowSource,
+    key: PRNGKeyArray,
+    *,
+    model: nn.Module,
+    config: TrainConfig,
 ) -> TrainState:
     """The state with the statistics of every batch normalisation estimated anew for its parameters.
 
-    Means over batches of augmented training windows that depend on `key` alone, in training mode. The running averages remember
-    ten steps, and what those miss is an offset of the displacement (ours; Wu and Johnson 2021, "Rethinking 'Batch' in
-    BatchNorm"). Nothing else of `batch_stats` changes.
+    Means over batches of augmented training windows that depend on `key` alone, in training mode.
+    The running averages remember ten steps, and what those miss is an offset of the displacement
+    (ours; Wu and Johnson 2021, "Rethinking 'Batch' in BatchNorm"). Nothing else of `batch_stats`
+    changes.
     """
     size, batches = config.optim.batch_size, statistics_batches(source, config)
     order_key, draw_key = jax.random.split(key)
-    order = jax.random.permutation(order_key, source.visited)[: batches * size].reshape(batches, size)
-    # A normalisation adds 1 − MOMENTUM of the batch's statistics to the MOMENTUM-fold of its own: of zeros, that alone is left.
+    order = jax.random.permutation(order_key, source.visited)[: batches * size].reshape(
+        batches, size
+    )
+    # A normalisation adds 1 − MOMENTUM of the batch's statistics to the MOMENTUM-fold of its own:
+    # of zeros, that alone is left.
     zeros = jax.tree.map(jnp.zeros_like, state.batch_stats)
 
     def add_batch(total: Any, number_which: tuple[jax.Array, jax.Array]) -> tuple[Any, None]:
@@ -164,11 +203,14 @@ def estimate_statistics(
     def statistic(path: tuple, total: jax.Array, before: jax.Array) -> jax.Array:
         return total / (batches * (1 - MOMENTUM)) if path[-1].key in ("mean", "var") else before
 
-    return state._replace(batch_stats=jax.tree_util.tree_map_with_path(statistic, total, state.batch_stats))
+    return state._replace(
+        batch_stats=jax.tree_util.tree_map_with_path(statistic, total, state.batch_stats)
+    )
 
 
 def gradient_norms(gradient: Any) -> dict[str, Float[jax.Array, ""]]:
-    """Norm of the gradient with respect to each part of the network: its modules, and of a head its layers (`head/scale`)."""
+    """Norm of the gradient with respect to each part of the network: its modules, and of a head its
+    layers (`head/scale`)."""
     squares: dict[str, list[jax.Array]] = {}
     for path, leaf in jax.tree_util.tree_leaves_with_path(gradient):
         names = [str(entry.key) for entry in path]
@@ -181,33 +223,45 @@ def gradient_norms(gradient: Any) -> dict[str, Float[jax.Array, ""]]:
 def validate(
     state: TrainState, source: WindowSource, now: Stage, *, model: nn.Module, config: TrainConfig
 ) -> Validation:
-    """Mean losses and errors over every window of `source`, without augmentation and in inference mode."""
+    """Mean losses and errors over every window of `source`, without augmentation and in inference
+    mode."""
     count = source.visited.shape[0]
     size = min(config.optim.batch_size, count)
     batches = -(-count // size)
     # The last batch is filled up with windows of weight zero.
-    which = source.visited[jnp.minimum(jnp.arange(batches * size, dtype=jnp.int32), count - 1)].reshape(batches, size)
+    which = source.visited[
+        jnp.minimum(jnp.arange(batches * size, dtype=jnp.int32), count - 1)
+    ].reshape(batches, size)
     weight = (jnp.arange(batches * size) < count).astype(jnp.float32).reshape(batches, size)
 
     def one_window(prediction: Prediction, windows: Windows) -> Validation:
         prediction, windows = jax.tree.map(lambda x: x[None], (prediction, windows))
         error = windows.displacement - prediction.displacement
-        return Validation(losses(prediction, windows, config.loss, now), error[0] ** 2,
-                          error[0] ** 2 * jnp.exp(-2 * prediction.log_std[0]))
+        return Validation(
+            losses(prediction, windows, config.loss, now),
+            error[0] ** 2,
+            error[0] ** 2 * jnp.exp(-2 * prediction.log_std[0]),
+        )
 
     def one_batch(which_weight: tuple[jax.Array, jax.Array]) -> Validation:
         windows = gather(source, which_weight[0], config.data.window)
-        prediction: Any = model.apply({"params": state.params, "batch_stats": state.batch_stats}, windows.imu)
+        prediction: Any = model.apply(
+            {"params": state.params, "batch_stats": state.batch_stats}, windows.imu
+        )
         each = jax.vmap(one_window)(prediction, windows)
         return jax.tree.map(lambda x: jnp.tensordot(which_weight[1], x, 1), each)
 
-    return jax.tree.map(lambda x: jnp.sum(x, axis=0) / count, jax.lax.map(one_batch, (which, weight)))
+    return jax.tree.map(
+        lambda x: jnp.sum(x, axis=0) / count, jax.lax.map(one_batch, (which, weight))
+    )
 
 
 def calibrated(state: TrainState, found: Validation) -> TrainState:
-    """The state whose constants and factors of the uncertainty (`models.heads`) fit the errors that validation found with it.
+    """The state whose constants and factors of the uncertainty (`models.heads`) fit the errors that
+    validation found with it.
 
-    Errors below 0.1 mm, and σ wrong by more than a factor of 1000 at once, are taken for that: nothing becomes infinite.
+    Errors below 0.1 mm, and σ wrong by more than a factor of 1000 at once, are taken for that:
+    nothing becomes infinite.
     """
 
     def fitted(path: tuple, leaf: jax.Array) -> jax.Array:

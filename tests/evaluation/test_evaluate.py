@@ -13,16 +13,20 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gnio_jax import cli, config, data
+from gnio_jax import config, data
+from gnio_jax.commands import console as cli
 from gnio_jax.config import DataConfig, EvaluateConfig, FilterOptions, ModelConfig, TrainConfig
-from gnio_jax.data import synthetic
+from gnio_jax.data.readers import synthetic
 from gnio_jax.evaluation import report, run
 from gnio_jax.training import checkpoint
 from gnio_jax.training.step import TrainState
 
 ROOT = Path(__file__).parents[2]
-TRAINED = TrainConfig(data=DataConfig(rate=50.0), model=ModelConfig(width=2, bank_size=4, bank_heads=2),
-                      filter=FilterOptions(velocity_std=0.7))
+TRAINED = TrainConfig(
+    data=DataConfig(rate=50.0),
+    model=ModelConfig(width=2, bank_size=4, bank_heads=2),
+    filter=FilterOptions(velocity_std=0.7),
+)
 
 
 @pytest.fixture(scope="module")
@@ -30,11 +34,24 @@ def trained(tmp_path_factory):
     folder = tmp_path_factory.mktemp("trained") / "run"
     config.save(folder / "config.yaml", TRAINED)
     random, model = np.random.default_rng(0), checkpoint.create_model(TRAINED)
-    shapes = jax.eval_shape(model.init, jax.random.key(0), jax.ShapeDtypeStruct((1, TRAINED.data.window, 6), jnp.float32))
+    shapes = jax.eval_shape(
+        model.init,
+        jax.random.key(0),
+        jax.ShapeDtypeStruct((1, TRAINED.data.window, 6), jnp.float32),
+    )
     # Drawn by NumPy: compiling the initialisation would take longer than all the tests.
-    variables = {key: jax.tree.map(lambda leaf, key=key: jnp.asarray(random.uniform(0.9, 1.1, leaf.shape) if key == "batch_stats" else
-                                                                     random.normal(0, 0.2, leaf.shape), jnp.float32), value)
-                 for key, value in shapes.items()}
+    variables = {
+        key: jax.tree.map(
+            lambda leaf, key=key: jnp.asarray(
+                random.uniform(0.9, 1.1, leaf.shape)
+                if key == "batch_stats"
+                else random.normal(0, 0.2, leaf.shape),
+                jnp.float32,
+            ),
+            value,
+        )
+        for key, value in shapes.items()
+    }
     state = TrainState(jnp.int32(0), variables["params"], variables["batch_stats"], {})
     with checkpoint.Checkpoints(folder) as checkpoints:
         checkpoints.save("best", state, checkpoint.Position(1, 0, 1.0, (0.0, 0.0, 0.0), 1.0))
@@ -50,7 +67,10 @@ def workdir(trained, tmp_path):
 def command(monkeypatch):
     """evaluate.py's own main on short walks: (arguments) -> None."""
     lengths = {1: 15.0, 2: 14.0, 3: 0.5}
-    walks = [synthetic.pedestrian(seed, synthetic.person(seed), "handheld", seconds, 50.0) for seed, seconds in lengths.items()]
+    walks = [
+        synthetic.pedestrian(seed, synthetic.person(seed), "handheld", seconds, 50.0)
+        for seed, seconds in lengths.items()
+    ]
     load = data.load
 
     def short(name, root=None, split="test"):
@@ -72,14 +92,22 @@ def test_end_to_end(workdir, command, capsys):
     command("--workdir", workdir)
     printed = capsys.readouterr()
     folder = workdir / "eval" / "synthetic_test_ekf"
-    assert f"results: {folder}" in printed.out and "never_moves" in printed.out and printed.err == ""
+    assert (
+        f"results: {folder}" in printed.out and "never_moves" in printed.out and printed.err == ""
+    )
     found = json.loads((folder / "metrics.json").read_text())
-    assert list(found["sequences"]) == ["synthetic_1_handheld", "synthetic_2_handheld"] and "synthetic_3_handheld" in found["left_out"]
+    assert (
+        list(found["sequences"]) == ["synthetic_1_handheld", "synthetic_2_handheld"]
+        and "synthetic_3_handheld" in found["left_out"]
+    )
     assert found["settings"]["coupling"] == "tight" and found["settings"]["epoch"] == 1
     assert found["settings"]["filter"]["velocity_std"] == 0.7
     # Nothing says whose these walks are, so each is on its own.
     assert [one["group"] for one in found["sequences"].values()] == list(found["sequences"])
-    assert found["mean"]["ate"] > 0 and found["reference_rows"]["perfect_displacements"]["mean"]["ate"] < 0.1
+    assert (
+        found["mean"]["ate"] > 0
+        and found["reference_rows"]["perfect_displacements"]["mean"]["ate"] < 0.1
+    )
     assert len(np.loadtxt(folder / "trajectories" / "synthetic_1_handheld.txt")) == 150
     assert len(list((folder / "plots").iterdir())) == 7
     assert [p.name for p in (workdir / "eval").iterdir()] == ["synthetic_test_ekf"]
@@ -87,18 +115,33 @@ def test_end_to_end(workdir, command, capsys):
     command("--workdir", workdir, "--estimator", "integrate", "--no-plots")
     command("--workdir", workdir, "--estimator", "imu_only", "--init", "static", "--no-plots")
     names = {p.name for p in (workdir / "eval").iterdir()}
-    assert names == {"synthetic_test_ekf", "synthetic_test_integrate", "synthetic_test_imu_only_static-init"}
+    assert names == {
+        "synthetic_test_ekf",
+        "synthetic_test_integrate",
+        "synthetic_test_imu_only_static-init",
+    }
     found = json.loads((workdir / "eval" / "synthetic_test_integrate" / "metrics.json").read_text())
-    assert found["settings"]["orientation_source"] == "reference" and found["settings"]["coupling"] is None
-    assert "nis" not in found["mean"] and not (workdir / "eval" / "synthetic_test_integrate" / "plots").exists()
+    assert (
+        found["settings"]["orientation_source"] == "reference"
+        and found["settings"]["coupling"] is None
+    )
+    assert (
+        "nis" not in found["mean"]
+        and not (workdir / "eval" / "synthetic_test_integrate" / "plots").exists()
+    )
 
 
 def test_a_void_filter_is_in_the_files(workdir, monkeypatch):
     """Accelerations in the wrong unit: the sequence says so, and no figure is of it."""
-    walks = [synthetic.pedestrian(seed, synthetic.person(seed), "handheld", 14.0, 50.0) for seed in (1, 2)]
+    walks = [
+        synthetic.pedestrian(seed, synthetic.person(seed), "handheld", 14.0, 50.0)
+        for seed in (1, 2)
+    ]
     walks[0] = walks[0]._replace(accel=1e3 * walks[0].accel)
     monkeypatch.setattr(data, "load", lambda *_: walks)
-    _, folder = run.evaluate(EvaluateConfig(str(workdir), estimator="imu_only", plots=False, filter=TRAINED.filter))
+    _, folder = run.evaluate(
+        EvaluateConfig(str(workdir), estimator="imu_only", plots=False, filter=TRAINED.filter)
+    )
     found = json.loads((folder / "metrics.json").read_text())
     void, whole = found["sequences"].values()
     assert void["notes"] == ["filter: not healthy from 0.1 s on, and all after it is void"]
@@ -111,29 +154,52 @@ def test_a_void_filter_is_in_the_files(workdir, monkeypatch):
 
 def test_folders_tell_choices_apart():
     def name(**options):
-        return run.folder_name(EvaluateConfig("w", **({"filter": TRAINED.filter} | options)), "tlio", TRAINED)
+        return run.folder_name(
+            EvaluateConfig("w", **({"filter": TRAINED.filter} | options)), "tlio", TRAINED
+        )
 
     assert name() == "tlio_test_ekf" == name(orientation="filter")
     assert name(coupling="loose", orientation="reference") == "tlio_test_ekf_loose"
-    assert name(coupling="loose", orientation="device", init="static") == "tlio_test_ekf_loose_device-orientation_static-init"
-    assert name(estimator="integrate", orientation="filter", gyro_bias="rest") == "tlio_test_integrate_filter-orientation_rest-bias"
-    assert name(filter=dataclasses.replace(TRAINED.filter, velocity_std=0.5), alignment="se3", checkpoint="latest") \
+    assert (
+        name(coupling="loose", orientation="device", init="static")
+        == "tlio_test_ekf_loose_device-orientation_static-init"
+    )
+    assert (
+        name(estimator="integrate", orientation="filter", gyro_bias="rest")
+        == "tlio_test_integrate_filter-orientation_rest-bias"
+    )
+    assert (
+        name(
+            filter=dataclasses.replace(TRAINED.filter, velocity_std=0.5),
+            alignment="se3",
+            checkpoint="latest",
+        )
         == "tlio_test_ekf_se3-alignment_latest_velocity_std-0.5"
-    assert name(filter=dataclasses.replace(TRAINED.filter, window_rotation="tlio")) == "tlio_test_ekf_window_rotation-tlio"
+    )
+    assert (
+        name(filter=dataclasses.replace(TRAINED.filter, window_rotation="tlio"))
+        == "tlio_test_ekf_window_rotation-tlio"
+    )
 
 
-@pytest.mark.parametrize("arguments, words", [
-    (["--dataset", "synthetik"], "did you mean 'synthetic'?"),
-    (["--split", "tset"], "unknown split 'tset'"),
-    (["--estimater", "ekf"], "--estimater: unknown option; did you mean --estimator?"),
-    (["--estimator", "kalman"], "--estimator: must be one of ekf, integrate, imu_only, found 'kalman'"),
-    (["--filter.gyro-density", "-1"], "'filter.gyro_density' must be positive"),
-    (["--filter.gyro-densty", "1"], "did you mean --filter.gyro-density?"),
-    (["--batch-size", "0"], "--batch-size: must be at least 1"),
-    (["--orientation", "device"], "leave it out"),
-    (["--checkpoint", "latest"], "holds no checkpoint"),
-    (["--dataset", "tlio", "--data-root", "/nowhere"], "/nowhere"),
-])
+@pytest.mark.parametrize(
+    "arguments, words",
+    [
+        (["--dataset", "synthetik"], "did you mean 'synthetic'?"),
+        (["--split", "tset"], "unknown split 'tset'"),
+        (["--estimater", "ekf"], "--estimater: unknown option; did you mean --estimator?"),
+        (
+            ["--estimator", "kalman"],
+            "--estimator: must be one of ekf, integrate, imu_only, found 'kalman'",
+        ),
+        (["--filter.gyro-density", "-1"], "'filter.gyro_density' must be positive"),
+        (["--filter.gyro-densty", "1"], "did you mean --filter.gyro-density?"),
+        (["--batch-size", "0"], "--batch-size: must be at least 1"),
+        (["--orientation", "device"], "leave it out"),
+        (["--checkpoint", "latest"], "holds no checkpoint"),
+        (["--dataset", "tlio", "--data-root", "/nowhere"], "/nowhere"),
+    ],
+)
 def test_mistakes_are_one_line_and_leave_nothing(workdir, command, capsys, arguments, words):
     with pytest.raises(SystemExit) as leaving:
         command("--workdir", workdir, *arguments)

@@ -19,10 +19,23 @@ def walk(seed=0, n=900, tilt=0.0):
     """A wandering path at about 1.2 m/s whose yaw follows it, with a stop in the middle."""
     random = np.random.default_rng(seed)
     heading = np.cumsum(random.normal(0, 0.08, n))
-    speed = np.where((np.arange(n) > 400) & (np.arange(n) < 480), 0.0, 1.2 + 0.2 * np.sin(np.arange(n) * 0.3))
-    steps = np.stack([speed * np.cos(heading), speed * np.sin(heading), 0.1 * np.sin(np.arange(n) * 0.05)], 1) * STEP
-    angles = np.stack([heading, tilt * np.sin(np.arange(n) * 0.07), tilt * np.cos(np.arange(n) * 0.11)], 1)
-    return Trajectory(np.arange(n) * STEP + 5.0, np.cumsum(steps, 0), quaternions(Rotation.from_euler("ZYX", angles)))
+    speed = np.where(
+        (np.arange(n) > 400) & (np.arange(n) < 480), 0.0, 1.2 + 0.2 * np.sin(np.arange(n) * 0.3)
+    )
+    steps = (
+        np.stack(
+            [speed * np.cos(heading), speed * np.sin(heading), 0.1 * np.sin(np.arange(n) * 0.05)], 1
+        )
+        * STEP
+    )
+    angles = np.stack(
+        [heading, tilt * np.sin(np.arange(n) * 0.07), tilt * np.cos(np.arange(n) * 0.11)], 1
+    )
+    return Trajectory(
+        np.arange(n) * STEP + 5.0,
+        np.cumsum(steps, 0),
+        quaternions(Rotation.from_euler("ZYX", angles)),
+    )
 
 
 def perturbed(truth, seed=1, scale=0.05):
@@ -30,12 +43,17 @@ def perturbed(truth, seed=1, scale=0.05):
     n = len(truth.time)
     turn = Rotation.from_rotvec(np.cumsum(random.normal(0, 0.004, (n, 3)), 0))
     moved = truth.position + np.cumsum(random.normal(0, scale, (n, 3)), 0)
-    return Trajectory(truth.time, moved, quaternions(turn * Rotation.from_quat(np.roll(truth.orientation, -1, 1))))
+    return Trajectory(
+        truth.time, moved, quaternions(turn * Rotation.from_quat(np.roll(truth.orientation, -1, 1)))
+    )
 
 
 def moved_by(trajectory, rotation, shift):
-    return Trajectory(trajectory.time, rotation.apply(trajectory.position) + shift,
-                      quaternions(rotation * Rotation.from_quat(np.roll(trajectory.orientation, -1, 1))))
+    return Trajectory(
+        trajectory.time,
+        rotation.apply(trajectory.position) + shift,
+        quaternions(rotation * Rotation.from_quat(np.roll(trajectory.orientation, -1, 1))),
+    )
 
 
 def masked(trajectory, rows):
@@ -72,7 +90,9 @@ def test_untrusted_rows_count_nowhere():
     wrong.position[100:150] += 1e3
     reference = masked(truth, slice(100, 150))
     kept = np.r_[0:100, 150:900]
-    assert metrics.ate(wrong.position, reference.position) == pytest.approx(metrics.ate(estimate.position[kept], truth.position[kept]))
+    assert metrics.ate(wrong.position, reference.position) == pytest.approx(
+        metrics.ate(estimate.position[kept], truth.position[kept])
+    )
     a, b = metrics.measure(wrong, reference), metrics.measure(estimate, reference)
     assert a == b and not a.undefined
 
@@ -99,9 +119,13 @@ def test_rte_against_a_loop_and_with_a_gap():
         if np.isfinite(reference[i]).all() and np.isfinite(reference[j]).all():
             errors.append(np.sum((estimate[j] - estimate[i] - reference[j] + reference[i]) ** 2))
     assert len(errors) == 280
-    assert metrics.rte(estimate, reference, STEP) == pytest.approx(np.sqrt(np.mean(errors)), rel=1e-12)
+    assert metrics.rte(estimate, reference, STEP) == pytest.approx(
+        np.sqrt(np.mean(errors)), rel=1e-12
+    )
     flat = metrics.rte(estimate[:, :2], reference[:, :2], STEP)
-    assert metrics.rte_ronin(estimate[:, :2], reference[:, :2], STEP) == pytest.approx(flat / np.sqrt(2))
+    assert metrics.rte_ronin(estimate[:, :2], reference[:, :2], STEP) == pytest.approx(
+        flat / np.sqrt(2)
+    )
 
 
 def test_rte_of_a_short_sequence_is_scaled():
@@ -128,7 +152,9 @@ def test_rte_distance_against_a_loop(metres):
                 j += 1
             if walked >= metres - 1e-9:
                 errors.append(np.sum((estimate[j] - estimate[i] - truth[j] + truth[i]) ** 2))
-    assert metrics.rte_distance(estimate, reference, metres) == pytest.approx(np.sqrt(np.mean(errors)), rel=1e-9)
+    assert metrics.rte_distance(estimate, reference, metres) == pytest.approx(
+        np.sqrt(np.mean(errors)), rel=1e-9
+    )
 
 
 def test_rte_distance_of_a_scaled_line():
@@ -154,20 +180,29 @@ def test_rpe_against_a_loop(seconds):
     truth = walk(tilt=0.3)
     estimate = perturbed(truth)
     apart, errors, errors_2d, errors_se3 = round(seconds / STEP), [], [], []
-    turns, turns_true = (Rotation.from_quat(np.roll(t.orientation, -1, 1)) for t in (estimate, truth))
+    turns, turns_true = (
+        Rotation.from_quat(np.roll(t.orientation, -1, 1)) for t in (estimate, truth)
+    )
     for i in range(len(truth.time) - apart):
         between = turns[i] * turns_true[i].inv()
         _, _, z, w = between.as_quat()
         angle = -2 * np.arctan(z / w)  # the twist about z, turned back
-        moved, moved_true = estimate.position[i + apart] - estimate.position[i], truth.position[i + apart] - truth.position[i]
+        moved, moved_true = (
+            estimate.position[i + apart] - estimate.position[i],
+            truth.position[i + apart] - truth.position[i],
+        )
         error = Rotation.from_euler("z", angle).apply(moved) - moved_true
         errors.append(np.sum(error**2))
         errors_2d.append(np.sum(error[:2] ** 2))
-        errors_se3.append(np.sum((turns[i].inv().apply(moved) - turns_true[i].inv().apply(moved_true)) ** 2))
+        errors_se3.append(
+            np.sum((turns[i].inv().apply(moved) - turns_true[i].inv().apply(moved_true)) ** 2)
+        )
     for dims, squares in ((3, errors), (2, errors_2d)):
         found = metrics.rpe(estimate, truth, STEP, seconds, dims)
         assert found == pytest.approx(np.sqrt(np.mean(squares)), rel=1e-9)
-    assert metrics.rpe_se3(estimate, truth, STEP, seconds) == pytest.approx(np.sqrt(np.mean(errors_se3)), rel=1e-9)
+    assert metrics.rpe_se3(estimate, truth, STEP, seconds) == pytest.approx(
+        np.sqrt(np.mean(errors_se3)), rel=1e-9
+    )
 
 
 # Alignment
@@ -178,7 +213,11 @@ def test_origin_undoes_a_yaw_and_a_shift():
     estimate = moved_by(truth, Rotation.from_euler("z", -2.0), [5.0, -3.0, 1.0])
     aligned = metrics.align(estimate, masked(truth, slice(0, 7)), "origin")
     np.testing.assert_allclose(aligned.position, truth.position, atol=1e-9)
-    np.testing.assert_allclose(metrics.rotation_matrices(aligned.orientation), metrics.rotation_matrices(truth.orientation), atol=1e-9)
+    np.testing.assert_allclose(
+        metrics.rotation_matrices(aligned.orientation),
+        metrics.rotation_matrices(truth.orientation),
+        atol=1e-9,
+    )
     assert metrics.align(estimate, truth, "none") is estimate
 
 
@@ -187,7 +226,11 @@ def test_se3_against_scipy():
     estimate = moved_by(perturbed(truth), Rotation.from_rotvec([0.4, -0.9, 1.7]), [5.0, -3.0, 1.0])
     a, b = estimate.position - estimate.position.mean(0), truth.position - truth.position.mean(0)
     best, _ = Rotation.align_vectors(b, a)
-    np.testing.assert_allclose(metrics.align(estimate, truth, "se3").position, best.apply(a) + truth.position.mean(0), atol=1e-8)
+    np.testing.assert_allclose(
+        metrics.align(estimate, truth, "se3").position,
+        best.apply(a) + truth.position.mean(0),
+        atol=1e-8,
+    )
 
 
 def test_se3_never_mirrors():
@@ -196,15 +239,25 @@ def test_se3_never_mirrors():
     estimate = truth._replace(position=truth.position * [1, 1, -1])
     a, b = estimate.position - estimate.position.mean(0), truth.position - truth.position.mean(0)
     best, _ = Rotation.align_vectors(b, a)
-    np.testing.assert_allclose(metrics.align(estimate, truth, "se3").position, best.apply(a) + truth.position.mean(0), atol=1e-8)
+    np.testing.assert_allclose(
+        metrics.align(estimate, truth, "se3").position,
+        best.apply(a) + truth.position.mean(0),
+        atol=1e-8,
+    )
 
 
 def test_yaw_position_is_the_least_over_yaw():
     truth = walk(tilt=0.3)
     estimate = moved_by(perturbed(truth), Rotation.from_euler("z", 2.5), [5.0, -3.0, 1.0])
     found = metrics.ate(metrics.align(estimate, truth, "yaw_position").position, truth.position)
-    centred, target = estimate.position - estimate.position.mean(0), truth.position - truth.position.mean(0)
-    costs = [metrics.ate(Rotation.from_euler("z", angle).apply(centred), target) for angle in np.linspace(-np.pi, np.pi, 3001)]
+    centred, target = (
+        estimate.position - estimate.position.mean(0),
+        truth.position - truth.position.mean(0),
+    )
+    costs = [
+        metrics.ate(Rotation.from_euler("z", angle).apply(centred), target)
+        for angle in np.linspace(-np.pi, np.pi, 3001)
+    ]
     assert found == pytest.approx(min(costs), rel=1e-3) and found <= min(costs) + 1e-12
     assert metrics.ate(metrics.align(estimate, truth, "se3").position, truth.position) <= found
 
@@ -237,8 +290,10 @@ def test_a_reference_without_orientation_is_no_divergence():
         assert found.values[name] == pytest.approx(0, abs=1e-6)
     broken = estimate._replace(orientation=estimate.orientation.copy())
     broken.orientation[-50:] = np.nan  # of the estimate it is
-    for value in (metrics.yaw_rmse(broken.orientation, reference.orientation),
-                  metrics.rpe(broken, reference, STEP, 1.0)):
+    for value in (
+        metrics.yaw_rmse(broken.orientation, reference.orientation),
+        metrics.rpe(broken, reference, STEP, 1.0),
+    ):
         assert np.isnan(value)
 
 
@@ -324,7 +379,9 @@ def test_a_wrong_heading_of_a_tilted_phone_is_measured_and_undone(pitch):
 def test_path_length_of_a_scaled_circle():
     angle = np.linspace(0, 2 * np.pi, 1201)
     circle = 10 * np.stack([np.cos(angle), np.sin(angle), 0 * angle], 1)  # 62.8 m in 120 s
-    assert metrics.path_length(circle, STEP) == pytest.approx(120 * 20 * np.sin(np.pi / 120), rel=1e-12)
+    assert metrics.path_length(circle, STEP) == pytest.approx(
+        120 * 20 * np.sin(np.pi / 120), rel=1e-12
+    )
     assert metrics.path_length_ratio(circle * 0.8, circle, STEP) == pytest.approx(0.8)
     assert metrics.path_length_ratio(circle * 0, circle, STEP) == 0.0
     holes = circle.copy()
@@ -336,7 +393,9 @@ def test_path_length_is_hardly_inflated_by_noise():
     truth = np.zeros((1201, 3))
     truth[:, 0] = np.arange(1201) * STEP
     noisy = truth + np.random.default_rng(0).normal(0, 0.02, truth.shape)
-    assert metrics.path_length(truth[:996], STEP) == pytest.approx(99.5)  # the odd rows at the end count too
+    assert metrics.path_length(truth[:996], STEP) == pytest.approx(
+        99.5
+    )  # the odd rows at the end count too
     assert metrics.path_length_ratio(noisy, truth, STEP) == pytest.approx(1.0, abs=2e-3)
     assert np.linalg.norm(np.diff(noisy, axis=0), axis=1).sum() > 1.05 * 120
 
@@ -395,19 +454,46 @@ def test_measure_names_and_reasons():
     truth = walk()
     found = metrics.measure(perturbed(truth), truth, nis=np.array([np.nan, 3.0, 3.0]))
     assert not found.undefined
-    assert {"ate", "ate_2d", "ate_ronin_2d", "ate_mean", "rte_60s", "rte_60s_ronin_2d", "rte_1m", "rte_10m_2d", "rpe_1s",
-            "rpe_10s_2d", "rpe_se3", "drift", "yaw_rmse", "yaw_drift", "path_length_ratio", "stationary_drift", "nis", "nis_coverage",
-            "duration", "path_length",
-            } <= found.values.keys()
-    assert found.values["nis"] == pytest.approx(1.0) and found.values["duration"] == pytest.approx(89.9)
+    assert {
+        "ate",
+        "ate_2d",
+        "ate_ronin_2d",
+        "ate_mean",
+        "rte_60s",
+        "rte_60s_ronin_2d",
+        "rte_1m",
+        "rte_10m_2d",
+        "rpe_1s",
+        "rpe_10s_2d",
+        "rpe_se3",
+        "drift",
+        "yaw_rmse",
+        "yaw_drift",
+        "path_length_ratio",
+        "stationary_drift",
+        "nis",
+        "nis_coverage",
+        "duration",
+        "path_length",
+    } <= found.values.keys()
+    assert found.values["nis"] == pytest.approx(1.0) and found.values["duration"] == pytest.approx(
+        89.9
+    )
     without = metrics.measure(truth, masked(truth, slice(None)))
     assert without.values["ate"] is None and without.undefined["ate"] == "no trusted reference"
     assert without.values["duration"] == pytest.approx(89.9)
     short = metrics.measure(*(Trajectory(*(field[:5] for field in truth)) for _ in range(2)))
-    assert short.values["ate"] == 0.0 and short.values["rpe_1s"] is None and "1 s" in short.undefined["rpe_1s"]
+    assert (
+        short.values["ate"] == 0.0
+        and short.values["rpe_1s"] is None
+        and "1 s" in short.undefined["rpe_1s"]
+    )
     broken = truth._replace(position=truth.position.copy())
     broken.position[100:] = np.nan
-    assert metrics.measure(broken, truth).undefined["rpe_1s"] == "the estimate is not finite from 10.0 s on"
+    assert (
+        metrics.measure(broken, truth).undefined["rpe_1s"]
+        == "the estimate is not finite from 10.0 s on"
+    )
 
 
 def lost(trajectory, row):
@@ -459,8 +545,15 @@ def test_a_covariance_that_is_not_finite_is_no_consistent_one():
 
 
 @pytest.mark.parametrize("row", [150, 900])  # lost in the middle, or whole
-@pytest.mark.parametrize("bad", [np.full((3, 3), 1e30), np.eye(3) + 1e40 * np.outer([1, 2, 3], [1, 2, 3]),
-                                 np.diag([1.0, -1.0, 1.0]), [[1, 2, 0], [2, 1, 0], [0, 0, 1]]])
+@pytest.mark.parametrize(
+    "bad",
+    [
+        np.full((3, 3), 1e30),
+        np.eye(3) + 1e40 * np.outer([1, 2, 3], [1, 2, 3]),
+        np.diag([1.0, -1.0, 1.0]),
+        [[1, 2, 0], [2, 1, 0], [0, 0, 1]],
+    ],
+)
 def test_a_singular_or_indefinite_covariance_is_no_consistent_one(bad, row):
     truth = walk()
     covariance = np.broadcast_to(np.eye(3), (900, 3, 3)).copy()
@@ -500,9 +593,10 @@ def test_divergence_never_improves_a_summary():
     names = [f"{group}{k}" for group in "ab" for k in range(3)]
     summaries = []
     for bad in (0, 1, 3, 6):
-        values = errors[:6 - bad] + [np.inf] * bad
-        measures = {name: {"ate": value, "rte": None}
-                    for name, value in zip(names, values, strict=True)}
+        values = errors[: 6 - bad] + [np.inf] * bad
+        measures = {
+            name: {"ate": value, "rte": None} for name, value in zip(names, values, strict=True)
+        }
         summaries.append(metrics.summarise(measures, {name: name[0] for name in names}))
     assert [s.diverged for s in summaries] == [{"ate": n, "rte": 0} for n in (0, 1, 3, 6)]
     assert [s.count["ate"] for s in summaries] == [6, 5, 3, 0]
@@ -515,13 +609,22 @@ def test_divergence_never_improves_a_summary():
 def test_divergence_is_of_the_sequence_and_leaves_every_mean():
     """Of four: whole, lost, whole with a bad covariance, without a reference and lost."""
     fields = ("ate", "nees", "nees_coverage", "accepted", "path_length")
-    rows = {"a": (1.0, 2.0, 90.0, 80.0, 10.0), "b": (np.inf, np.inf, 0.0, 5.0, 500.0),
-            "c": (3.0, np.inf, 0.0, 70.0, 20.0)}
+    rows = {
+        "a": (1.0, 2.0, 90.0, 80.0, 10.0),
+        "b": (np.inf, np.inf, 0.0, 5.0, 500.0),
+        "c": (3.0, np.inf, 0.0, 70.0, 20.0),
+    }
     measures = {name: dict(zip(fields, row, strict=True)) for name, row in rows.items()}
     measures["d"] = {"ate": None, "nis": np.inf, "accepted": 3.0}
     assert [name for name, values in measures.items() if metrics.diverged(values)] == ["b", "d"]
     summary = metrics.summarise(measures, {name: name for name in measures})
-    means = {"ate": 2.0, "nees": np.inf, "nees_coverage": 45.0, "accepted": 75.0, "path_length": 15.0}
+    means = {
+        "ate": 2.0,
+        "nees": np.inf,
+        "nees_coverage": 45.0,
+        "accepted": 75.0,
+        "path_length": 15.0,
+    }
     assert summary.mean == means | {"nis": None}
     assert summary.count == dict.fromkeys(fields, 2) | {"nis": 0}
     assert summary.diverged == dict.fromkeys(fields, 1) | {"nis": 1, "accepted": 2}
@@ -537,12 +640,24 @@ def test_bootstrap_draws_groups_whatever_their_order():
 
 
 def test_summary_draws_whole_groups():
-    measures = {f"{group}{k}": {"ate": value + 0.001 * k, "rte": None} for group, value in [("a", 1.0), ("b", 3.0)] for k in range(5)}
+    measures = {
+        f"{group}{k}": {"ate": value + 0.001 * k, "rte": None}
+        for group, value in [("a", 1.0), ("b", 3.0)]
+        for k in range(5)
+    }
     groups = {name: name[0] for name in measures}
     summary = metrics.summarise(measures, groups)
-    assert summary.mean["ate"] == pytest.approx(2.002) and summary.median["ate"] == pytest.approx(2.002)
-    assert summary.interval["ate"] == pytest.approx((1.002, 3.002))  # with two groups a draw is all a, all b or one of each
-    assert summary.count == {"ate": 10, "rte": 0} and summary.mean["rte"] is None and summary.interval["rte"] is None
+    assert summary.mean["ate"] == pytest.approx(2.002) and summary.median["ate"] == pytest.approx(
+        2.002
+    )
+    assert summary.interval["ate"] == pytest.approx(
+        (1.002, 3.002)
+    )  # with two groups a draw is all a, all b or one of each
+    assert (
+        summary.count == {"ate": 10, "rte": 0}
+        and summary.mean["rte"] is None
+        and summary.interval["rte"] is None
+    )
     assert metrics.summarise(measures, dict.fromkeys(measures, "one")).interval["ate"] is None
     assert metrics.summarise(measures, groups) == summary
 
@@ -552,7 +667,10 @@ def test_summary_interval_covers_the_mean():
     hits = 0
     for trial in range(60):
         values = random.normal(5.0, 1.0, 25)
-        measures, groups = {str(k): {"ate": v} for k, v in enumerate(values)}, {str(k): k for k in range(25)}
+        measures, groups = (
+            {str(k): {"ate": v} for k, v in enumerate(values)},
+            {str(k): k for k in range(25)},
+        )
         low, high = metrics.summarise(measures, groups, trial, 400).interval["ate"]
         hits += low <= 5.0 <= high
     assert hits >= 50
@@ -568,7 +686,9 @@ def test_agreement_with_evo():
 
     truth = walk(tilt=0.3)
     estimate = moved_by(perturbed(truth), Rotation.from_rotvec([0.1, -0.2, 0.7]), [5.0, -3.0, 1.0])
-    paths = [PoseTrajectory3D(t.position.copy(), t.orientation.copy(), t.time) for t in (truth, estimate)]
+    paths = [
+        PoseTrajectory3D(t.position.copy(), t.orientation.copy(), t.time) for t in (truth, estimate)
+    ]
 
     def ape(reference, other):
         metric = evo.APE(evo.PoseRelation.translation_part)
@@ -577,12 +697,30 @@ def test_agreement_with_evo():
 
     assert metrics.ate(estimate.position, truth.position) == pytest.approx(ape(*paths), rel=1e-9)
     for seconds in (1.0, 10.0):
-        metric = evo.RPE(evo.PoseRelation.translation_part, delta=round(seconds / STEP), delta_unit=evo.Unit.frames, all_pairs=True)
+        metric = evo.RPE(
+            evo.PoseRelation.translation_part,
+            delta=round(seconds / STEP),
+            delta_unit=evo.Unit.frames,
+            all_pairs=True,
+        )
         metric.process_data(tuple(paths))
-        assert metrics.rpe_se3(estimate, truth, STEP, seconds) == pytest.approx(metric.get_statistic(evo.StatisticsType.rmse), rel=1e-9)
-    yaw_only = moved_by(perturbed(truth)._replace(orientation=truth.orientation), Rotation.from_euler("z", 1.0), [1.0, 2.0, 3.0])
-    metric.process_data((paths[0], PoseTrajectory3D(yaw_only.position.copy(), yaw_only.orientation.copy(), yaw_only.time)))
+        assert metrics.rpe_se3(estimate, truth, STEP, seconds) == pytest.approx(
+            metric.get_statistic(evo.StatisticsType.rmse), rel=1e-9
+        )
+    yaw_only = moved_by(
+        perturbed(truth)._replace(orientation=truth.orientation),
+        Rotation.from_euler("z", 1.0),
+        [1.0, 2.0, 3.0],
+    )
+    metric.process_data(
+        (
+            paths[0],
+            PoseTrajectory3D(yaw_only.position.copy(), yaw_only.orientation.copy(), yaw_only.time),
+        )
+    )
     ours = metrics.rpe(yaw_only, truth, STEP, 10.0)
     assert ours == pytest.approx(metric.get_statistic(evo.StatisticsType.rmse), rel=1e-9)
     paths[1].align(paths[0])
-    assert metrics.ate(metrics.align(estimate, truth, "se3").position, truth.position) == pytest.approx(ape(*paths), rel=1e-9)
+    assert metrics.ate(
+        metrics.align(estimate, truth, "se3").position, truth.position
+    ) == pytest.approx(ape(*paths), rel=1e-9)

@@ -1,4 +1,5 @@
-"""Estimators against plain loops over samples and windows, and against what they must give with perfect inputs."""
+"""Estimators against plain loops over samples and windows, and against what they must give with
+perfect inputs."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -6,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from gnio_jax.config import DataConfig, FilterOptions
-from gnio_jax.data import synthetic
+from gnio_jax.data.readers import synthetic
 from gnio_jax.evaluation import metrics, odometry, report
 from gnio_jax.evaluation.odometry import Network, Setup
 from gnio_jax.types import InputError, Prediction
@@ -21,8 +22,13 @@ LOOSE = Setup(coupling="loose")
 def sensed(variables, windows):
     """A "network" that shows what it was given: the means of its channels."""
     means = windows.mean(axis=1)
-    diagnostics = {"gate": jnp.tanh(means[:, 3:]), "attention": jnp.zeros((windows.shape[0], 8, 64))}
-    return Prediction(variables["gain"] * means[:, :3], means[:, 3:] + variables["log_std"], diagnostics)
+    diagnostics = {
+        "gate": jnp.tanh(means[:, 3:]),
+        "attention": jnp.zeros((windows.shape[0], 8, 64)),
+    }
+    return Prediction(
+        variables["gain"] * means[:, :3], means[:, 3:] + variables["log_std"], diagnostics
+    )
 
 
 NETWORK = Network(sensed, {"gain": jnp.float32(0.05), "log_std": jnp.float32(-3.0)})
@@ -30,9 +36,13 @@ NETWORK = Network(sensed, {"gain": jnp.float32(0.05), "log_std": jnp.float32(-3.
 
 @pytest.fixture(scope="module")
 def walks():
-    # Lengths that share one compiled filter (a fifth is the most that is padded), but for the shortest.
+    # Lengths that share one compiled filter (a fifth is the most that is padded), but for the
+    # shortest.
     lengths = {1: 18.0, 2: 11.3, 3: 16.0}
-    return [synthetic.pedestrian(seed, synthetic.person(seed), "handheld", seconds, RATE) for seed, seconds in lengths.items()]
+    return [
+        synthetic.pedestrian(seed, synthetic.person(seed), "handheld", seconds, RATE)
+        for seed, seconds in lengths.items()
+    ]
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +62,11 @@ def unyaw(matrix):
 def test_imu_only_is_strap_down_integration(walks):
     (recording,), _ = odometry.prepare(walks[:1], CONFIG, Setup("imu_only"))
     (found,) = odometry.estimate([recording], None, CONFIG, OPTIONS, Setup("imu_only"))
-    rotation, velocity, position = rotations(walks[0].orientation[0]).as_matrix(), walks[0].velocity[0], walks[0].position[0]
+    rotation, velocity, position = (
+        rotations(walks[0].orientation[0]).as_matrix(),
+        walks[0].velocity[0],
+        walks[0].position[0],
+    )
     dt, gravity, path, attitudes = 1 / RATE, np.array([0, 0, -9.81]), [position], [rotation]
     for k in range(len(recording.sequence.time) - 1):
         step = rotation @ walks[0].accel[k] * dt
@@ -63,9 +77,15 @@ def test_imu_only_is_strap_down_integration(walks):
             path.append(position)
             attitudes.append(rotation)
     np.testing.assert_allclose(found.trajectory.position, path, atol=1e-9)
-    np.testing.assert_allclose(rotations(found.trajectory.orientation).as_matrix(), attitudes, atol=1e-10)
-    np.testing.assert_array_equal(found.trajectory.time, walks[0].time[::CONFIG.stride][:len(path)])
-    np.testing.assert_array_equal(found.reference.position, walks[0].position[::CONFIG.stride][:len(path)])
+    np.testing.assert_allclose(
+        rotations(found.trajectory.orientation).as_matrix(), attitudes, atol=1e-10
+    )
+    np.testing.assert_array_equal(
+        found.trajectory.time, walks[0].time[:: CONFIG.stride][: len(path)]
+    )
+    np.testing.assert_array_equal(
+        found.reference.position, walks[0].position[:: CONFIG.stride][: len(path)]
+    )
     assert np.isnan(found.accepted).all() and found.std.shape == (len(path), 15)
 
 
@@ -81,8 +101,16 @@ def test_windows_are_cut_with_the_given_attitude(walks, reading):
         assert len(prediction.displacement) == len(starts)
         for row, i in list(enumerate(starts))[::17]:
             rows = range(i, i + config.window)
-            means = [np.mean([unyaw(turns[i]) @ turns[j if reading == "per_sample" else i] @ signal[j] for j in rows], axis=0)
-                     for signal in (walk.accel, walk.gyro)]
+            means = [
+                np.mean(
+                    [
+                        unyaw(turns[i]) @ turns[j if reading == "per_sample" else i] @ signal[j]
+                        for j in rows
+                    ],
+                    axis=0,
+                )
+                for signal in (walk.accel, walk.gyro)
+            ]
             np.testing.assert_allclose(prediction.displacement[row], 0.05 * means[0], atol=2e-6)
             np.testing.assert_allclose(prediction.log_std[row], means[1] - 3, atol=1e-5)
         assert set(prediction.diagnostics) == {"gate"}
@@ -92,12 +120,20 @@ def test_integration_against_a_loop(walks):
     (recording,), _ = odometry.prepare(walks[:1], CONFIG, INTEGRATE)
     (found,) = odometry.estimate([recording], NETWORK, CONFIG, OPTIONS, INTEGRATE)
     turns = rotations(walks[0].orientation).as_matrix()
-    (prediction,) = odometry.predict_windows(NETWORK, [recording], [turns[:len(recording.sequence.time)]], CONFIG)
+    (prediction,) = odometry.predict_windows(
+        NETWORK, [recording], [turns[: len(recording.sequence.time)]], CONFIG
+    )
     strides = (len(recording.sequence.time) - 1) // CONFIG.stride
     position, path = walks[0].position[0], [walks[0].position[0]]
     for stride in range(strides):
         covering = [i for i in range(len(prediction.displacement)) if i <= stride < i + 10]
-        moves = [unyaw(turns[i * CONFIG.stride]).T @ prediction.displacement[i] * CONFIG.stride / CONFIG.window for i in covering]
+        moves = [
+            unyaw(turns[i * CONFIG.stride]).T
+            @ prediction.displacement[i]
+            * CONFIG.stride
+            / CONFIG.window
+            for i in covering
+        ]
         position = position + np.mean(moves, axis=0)
         path.append(position)
     np.testing.assert_allclose(found.trajectory.position, path, atol=1e-9)
@@ -106,15 +142,25 @@ def test_integration_against_a_loop(walks):
 
 
 def test_a_stride_without_a_window_goes_on_as_before():
-    steps = np.array([[1.0, 0, 0], [1.0, 0, 0], [np.nan] * 3, [np.nan] * 3, [np.nan] * 3, [2.0, 0, 0]])
+    steps = np.array(
+        [[1.0, 0, 0], [1.0, 0, 0], [np.nan] * 3, [np.nan] * 3, [np.nan] * 3, [2.0, 0, 0]]
+    )
     moved = odometry._mean_over_cover(steps, 7, 2)[:, 0]
     np.testing.assert_allclose(moved, [1, 1, 1, 1, 1, 2, 2])
 
 
-@pytest.mark.parametrize("setup, ate", [
-    (Setup(), 0.03), (LOOSE, 0.03), (INTEGRATE, 0.1), (Setup("integrate", orientation="filter"), 0.1), (Setup("imu_only"), 0.03),
-    (Setup(init="static"), 0.1), (Setup("integrate", orientation="device"), 0.3),
-])
+@pytest.mark.parametrize(
+    "setup, ate",
+    [
+        (Setup(), 0.03),
+        (LOOSE, 0.03),
+        (INTEGRATE, 0.1),
+        (Setup("integrate", orientation="filter"), 0.1),
+        (Setup("imu_only"), 0.03),
+        (Setup(init="static"), 0.1),
+        (Setup("integrate", orientation="device"), 0.3),
+    ],
+)
 def test_perfect_displacements_leave_little_error(walks, setup, ate):
     recordings, _ = odometry.prepare(walks[::2], CONFIG, setup._replace(gyro_bias="reference"))
     for found in odometry.perfect_displacements(recordings, CONFIG, OPTIONS, setup):
@@ -126,7 +172,10 @@ def test_integration_is_neither_ahead_nor_behind(clean):
     (recording,), _ = odometry.prepare([clean], CONFIG, INTEGRATE)
     (found,) = odometry.perfect_displacements([recording], CONFIG, OPTIONS, INTEGRATE)
     path, truth = found.trajectory.position, found.reference.position
-    errors = {shift: metrics.ate(path[10:-10], truth[10 + shift:len(truth) - 10 + shift]) for shift in range(-3, 4)}
+    errors = {
+        shift: metrics.ate(path[10:-10], truth[10 + shift : len(truth) - 10 + shift])
+        for shift in range(-3, 4)
+    }
     assert min(errors, key=errors.get) == 0
 
 
@@ -143,11 +192,17 @@ def test_batches_change_nothing(walks):
     for recording, in_batch in zip(recordings, together, strict=True):
         (alone,) = odometry.estimate([recording], NETWORK, CONFIG, OPTIONS, batch_size=1)
         same(alone, in_batch, 1e-5)
-        np.testing.assert_allclose(alone.trajectory.position, in_batch.trajectory.position, atol=1e-6)
-        np.testing.assert_allclose(alone.diagnostics["gate"], in_batch.diagnostics["gate"], atol=1e-6)
+        np.testing.assert_allclose(
+            alone.trajectory.position, in_batch.trajectory.position, atol=1e-6
+        )
+        np.testing.assert_allclose(
+            alone.diagnostics["gate"], in_batch.diagnostics["gate"], atol=1e-6
+        )
 
 
-@pytest.mark.parametrize("disturbed, factor, row", [(slice(450, 451), 1e5, 91), (slice(None), 1e3, 1)])
+@pytest.mark.parametrize(
+    "disturbed, factor, row", [(slice(450, 451), 1e5, 91), (slice(None), 1e3, 1)]
+)
 def test_what_the_filter_calls_void_has_diverged(walks, disturbed, factor, row):
     """One leap of the accelerometer, or a wrong unit: all numbers stay finite."""
     accel = walks[0].accel.copy()
@@ -166,18 +221,24 @@ def test_what_the_filter_calls_void_has_diverged(walks, disturbed, factor, row):
 
 
 def test_many_batches_of_unlike_lengths(walks):
-    """The ladder of padded lengths, a batch that is filled up, the order of the answers, the progress."""
+    """The ladder of padded lengths, a batch that is filled up, the order of the answers, the
+    progress."""
     recordings, _ = odometry.prepare(walks, CONFIG)
     together, told = odometry.perfect_displacements(recordings, CONFIG, OPTIONS), []
-    pairs = odometry.perfect_displacements(recordings, CONFIG, OPTIONS, batch_size=2, progress=told.append)
+    pairs = odometry.perfect_displacements(
+        recordings, CONFIG, OPTIONS, batch_size=2, progress=told.append
+    )
     for recording, a, b in zip(recordings, together, pairs, strict=True):
-        assert a.name == recording.sequence.name and len(a.trajectory.time) == len(recording.sequence.time[::CONFIG.stride])
+        assert a.name == recording.sequence.name and len(a.trajectory.time) == len(
+            recording.sequence.time[:: CONFIG.stride]
+        )
         same(a, b, 1e-9)
     assert told == sorted(told) and len(told) == 2 and told[-1] == 1.0
 
 
 def test_tight_and_loose_see_the_same_windows(clean):
-    """With an exact IMU the filter's attitude is the reference's, as long as no measurement disturbs it."""
+    """With an exact IMU the filter's attitude is the reference's, as long as no measurement
+    disturbs it."""
     network = Network(sensed, {"gain": jnp.float32(0.05), "log_std": jnp.float32(4.0)})
     found = []
     for setup in (Setup(), LOOSE):
@@ -188,9 +249,13 @@ def test_tight_and_loose_see_the_same_windows(clean):
     np.testing.assert_array_equal(np.isnan(tight.displacement), np.isnan(loose.displacement))
     np.testing.assert_allclose(tight.displacement[11:], loose.displacement[11:], atol=2e-3)
     np.testing.assert_allclose(tight.displacement_std[11:], loose.displacement_std[11:], rtol=2e-2)
-    np.testing.assert_allclose(tight.diagnostics["gate"][11:], loose.diagnostics["gate"][11:], atol=2e-2)
+    np.testing.assert_allclose(
+        tight.diagnostics["gate"][11:], loose.diagnostics["gate"][11:], atol=2e-2
+    )
     np.testing.assert_allclose(tight.trajectory.position, loose.trajectory.position, atol=2e-2)
-    assert np.std(tight.displacement[11:], axis=0).max() > 0.01  # else the agreement would say nothing
+    assert (
+        np.std(tight.displacement[11:], axis=0).max() > 0.01
+    )  # else the agreement would say nothing
 
 
 def test_loose_measurements_have_the_same_least_std(clean):
@@ -203,7 +268,9 @@ def test_loose_measurements_have_the_same_least_std(clean):
 def test_the_first_gyro_bias_is_taken_off_the_windows_and_the_attitude(clean):
     (recording,), _ = odometry.prepare([clean], CONFIG, INTEGRATE)
     bias = np.array([0.1, -0.05, 0.02])
-    biased = recording._replace(sequence=recording.sequence._replace(gyro=recording.sequence.gyro + bias), gyro_bias=bias)
+    biased = recording._replace(
+        sequence=recording.sequence._replace(gyro=recording.sequence.gyro + bias), gyro_bias=bias
+    )
     attitudes = [odometry.attitude(r, CONFIG, "filter") for r in (recording, biased)]
     np.testing.assert_allclose(*attitudes, atol=1e-9)
     a, b = odometry.predict_windows(NETWORK, [recording, biased], attitudes, CONFIG)
@@ -215,7 +282,9 @@ def test_start_is_the_first_trusted_sample(walks):
     (recording,), _ = odometry.prepare([hidden], CONFIG)
     assert recording.sequence.time[0] == walks[0].time[137]
     np.testing.assert_array_equal(recording.position, walks[0].position[137])
-    np.testing.assert_allclose(recording.rotation, rotations(walks[0].orientation[137]).as_matrix(), atol=1e-12)
+    np.testing.assert_allclose(
+        recording.rotation, rotations(walks[0].orientation[137]).as_matrix(), atol=1e-12
+    )
     assert (len(recording.sequence.time) - 1) % CONFIG.stride == 0
 
 
@@ -234,7 +303,9 @@ def test_gyro_bias_from_reference_and_from_rest(walks, clean):
     true = np.array([walks[0].attributes[f"gyro_bias_{axis}"] for axis in "xyz"])
     biased = walks[0]._replace(gyro=walks[0].gyro + np.array([0.004, -0.02, 0.01]))
     (recording,), _ = odometry.prepare([biased], CONFIG, Setup(gyro_bias="reference"))
-    np.testing.assert_allclose(recording.gyro_bias, true + np.array([0.004, -0.02, 0.01]), atol=1e-4)
+    np.testing.assert_allclose(
+        recording.gyro_bias, true + np.array([0.004, -0.02, 0.01]), atol=1e-4
+    )
     assert "10 s against the reference" in recording.notes[0]
 
     (recording,), _ = odometry.prepare([clean], CONFIG, Setup(gyro_bias="rest"))
@@ -259,8 +330,15 @@ def test_attitudes(walks):
     np.testing.assert_allclose(turn[2], [0, 0, 1], atol=1e-12)
     np.testing.assert_allclose(device, turn @ own, atol=1e-12)
     start = walks[0].orientation[:1]
-    np.testing.assert_allclose(metrics.yaw(rotations(Rotation.from_matrix(device[:1]).as_quat(scalar_first=True)).as_quat(scalar_first=True)),
-                               metrics.yaw(start), atol=1e-12)
+    np.testing.assert_allclose(
+        metrics.yaw(
+            rotations(Rotation.from_matrix(device[:1]).as_quat(scalar_first=True)).as_quat(
+                scalar_first=True
+            )
+        ),
+        metrics.yaw(start),
+        atol=1e-12,
+    )
 
     gap = walks[0]._replace(orientation=walks[0].orientation.copy(), valid=walks[0].valid.copy())
     gap.orientation[200:260], gap.valid[190:260] = np.nan, False
@@ -269,18 +347,26 @@ def test_attitudes(walks):
     truth = rotations(walks[0].orientation[:count]).as_matrix()
     np.testing.assert_allclose(bridged[:190], truth[:190], atol=1e-12)
     np.testing.assert_allclose(bridged[260:], truth[260:], atol=1e-12)
-    np.testing.assert_allclose(bridged[190:260], truth[190:260], atol=0.03)  # 1.4 s of gyro with its bias
+    np.testing.assert_allclose(
+        bridged[190:260], truth[190:260], atol=0.03
+    )  # 1.4 s of gyro with its bias
 
 
 def test_no_reference_is_fine_with_a_static_start(walks):
-    nowhere = walks[0]._replace(valid=np.zeros(len(walks[0].time), bool), position=np.full_like(walks[0].position, np.nan),
-                                orientation=np.full_like(walks[0].orientation, np.nan))
+    nowhere = walks[0]._replace(
+        valid=np.zeros(len(walks[0].time), bool),
+        position=np.full_like(walks[0].position, np.nan),
+        orientation=np.full_like(walks[0].orientation, np.nan),
+    )
     setup = Setup("integrate", orientation="filter", init="static")
     recordings, _ = odometry.prepare([nowhere], CONFIG, setup)
     (found,) = odometry.estimate(recordings, NETWORK, CONFIG, OPTIONS, setup)
     assert np.isfinite(found.trajectory.position).all() and np.isnan(found.reference.position).all()
-    for bad, remedy in [(Setup(), "--init static"), (Setup(init="static", gyro_bias="reference"), "--gyro-bias zero"),
-                        (Setup("integrate", init="static"), "--orientation filter")]:
+    for bad, remedy in [
+        (Setup(), "--init static"),
+        (Setup(init="static", gyro_bias="reference"), "--gyro-bias zero"),
+        (Setup("integrate", init="static"), "--orientation filter"),
+    ]:
         with pytest.raises(InputError, match=remedy):
             odometry.prepare([nowhere], CONFIG, bad)
 
@@ -289,21 +375,34 @@ def test_setups_that_make_no_sense(walks):
     for setup in (Setup(orientation="reference"), Setup("imu_only", orientation="device")):
         with pytest.raises(InputError, match="leave it out"):
             odometry.resolve(setup)
-    assert odometry.resolve(Setup()).orientation == "filter" and odometry.resolve(LOOSE).orientation == "reference"
+    assert (
+        odometry.resolve(Setup()).orientation == "filter"
+        and odometry.resolve(LOOSE).orientation == "reference"
+    )
     with pytest.raises(InputError, match="no device orientation"):
-        odometry.prepare([walks[0]._replace(device_orientation=None)], CONFIG, Setup("integrate", orientation="device"))
+        odometry.prepare(
+            [walks[0]._replace(device_orientation=None)],
+            CONFIG,
+            Setup("integrate", orientation="device"),
+        )
 
 
 def test_short_sequences_are_left_out_by_name(walks):
-    short = walks[0]._replace(name="short", valid=np.arange(len(walks[0].time)) > len(walks[0].time) - 52)
+    short = walks[0]._replace(
+        name="short", valid=np.arange(len(walks[0].time)) > len(walks[0].time) - 52
+    )
     recordings, left_out = odometry.prepare([short, walks[1]], CONFIG)
     assert [r.sequence.name for r in recordings] == [walks[1].name]
-    assert left_out == {"short": "1.02 s from its first trusted sample on, too short for a window and a stride"}
+    assert left_out == {
+        "short": "1.02 s from its first trusted sample on, too short for a window and a stride"
+    }
 
 
 def test_never_moves(walks):
     recordings, _ = odometry.prepare(walks[:1], CONFIG, INTEGRATE)
-    (still,) = odometry.never_moves(odometry.perfect_displacements(recordings, CONFIG, OPTIONS, INTEGRATE))
+    (still,) = odometry.never_moves(
+        odometry.perfect_displacements(recordings, CONFIG, OPTIONS, INTEGRATE)
+    )
     assert (still.trajectory.position == walks[0].position[0]).all() and still.displacement is None
     assert metrics.measure(still.trajectory, still.reference).values["path_length_ratio"] == 0
 

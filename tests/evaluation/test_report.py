@@ -12,8 +12,17 @@ from gnio_jax.evaluation import plots, report
 from gnio_jax.evaluation.metrics import Trajectory
 from gnio_jax.evaluation.odometry import Estimate, never_moves
 
-SETTINGS = {"dataset": "made", "split": "test", "estimator": "ekf", "coupling": "tight", "orientation_source": "filter",
-            "initial_state": "reference", "gyro_bias": "zero", "imu_compensated": "no", "alignment": "origin"}
+SETTINGS = {
+    "dataset": "made",
+    "split": "test",
+    "estimator": "ekf",
+    "coupling": "tight",
+    "orientation_source": "filter",
+    "initial_state": "reference",
+    "gyro_bias": "zero",
+    "imu_compensated": "no",
+    "alignment": "origin",
+}
 
 
 def estimate(name, seed, n=400, truth=True):
@@ -30,22 +39,39 @@ def estimate(name, seed, n=400, truth=True):
     displacement[11:] = np.array([1.6, 0, 0]) + random.normal(0, 0.1, (n - 11, 3))
     spread = 0.03 * np.sqrt(np.arange(n) + 1)
     accepted = np.where(np.arange(n) < 11, np.nan, (np.arange(n) % 10 > 0).astype(float))
-    return Estimate(name, Trajectory(time, moved, orientation), reference, displacement, np.full((n, 3), 0.3),
-                    {"gate": np.tanh(displacement)}, std=np.repeat(spread[:, None], 15, 1),
-                    position_covariance=spread[:, None, None] ** 2 * np.eye(3), accepted=accepted,
-                    nis=np.where(np.isnan(accepted), np.nan, 3.0))
+    return Estimate(
+        name,
+        Trajectory(time, moved, orientation),
+        reference,
+        displacement,
+        np.full((n, 3), 0.3),
+        {"gate": np.tanh(displacement)},
+        std=np.repeat(spread[:, None], 15, 1),
+        position_covariance=spread[:, None, None] ** 2 * np.eye(3),
+        accepted=accepted,
+        nis=np.where(np.isnan(accepted), np.nan, 3.0),
+    )
 
 
 @pytest.fixture(scope="module")
 def estimates():
-    return [estimate("room 1/walk", 0), estimate("room 1:walk", 1), estimate("blind", 2, truth=False)]
+    return [
+        estimate("room 1/walk", 0),
+        estimate("room 1:walk", 1),
+        estimate("blind", 2, truth=False),
+    ]
 
 
 @pytest.fixture(scope="module")
 def made(estimates):
     groups = {e.name: e.name[:4] for e in estimates}
-    return report.Report(SETTINGS, report.score(estimates, groups), {"never_moves": report.score(never_moves(estimates), groups)},
-                         {"blind": ["start: rough"]}, {"short": "0.5 s"})
+    return report.Report(
+        SETTINGS,
+        report.score(estimates, groups),
+        {"never_moves": report.score(never_moves(estimates), groups)},
+        {"blind": ["start: rough"]},
+        {"short": "0.5 s"},
+    )
 
 
 def test_files_parse_back(tmp_path, estimates, made):
@@ -57,19 +83,38 @@ def test_files_parse_back(tmp_path, estimates, made):
     found = json.loads((tmp_path / "metrics.json").read_text(), parse_constant=strict)
     assert found["sequences"].keys() == {"room 1/walk", "room 1:walk", "blind"}
     first = found["sequences"]["room 1/walk"]
-    assert first["ate"] == made.scores.sequences["room 1/walk"].values["ate"] and "undefined" not in first
+    assert (
+        first["ate"] == made.scores.sequences["room 1/walk"].values["ate"]
+        and "undefined" not in first
+    )
     assert first["accepted"] == pytest.approx(90, abs=0.5) and first["nis"] == 1.0
     blind = found["sequences"]["blind"]
-    assert blind["ate"] is None and blind["undefined"]["ate"] == "no trusted reference" and blind["notes"] == ["start: rough"]
+    assert (
+        blind["ate"] is None
+        and blind["undefined"]["ate"] == "no trusted reference"
+        and blind["notes"] == ["start: rough"]
+    )
     assert blind["nis"] == 1.0
-    assert found["mean"]["ate"] == pytest.approx(np.mean([found["sequences"][f"room 1{c}walk"]["ate"] for c in "/:"]))
-    assert found["n"]["ate"] == 2 and found["interval"]["ate"] is None and len(found["interval"]["nis"]) == 2
-    assert found["settings"]["orientation_source"] == "filter" and found["left_out"] == {"short": "0.5 s"}
+    assert found["mean"]["ate"] == pytest.approx(
+        np.mean([found["sequences"][f"room 1{c}walk"]["ate"] for c in "/:"])
+    )
+    assert (
+        found["n"]["ate"] == 2
+        and found["interval"]["ate"] is None
+        and len(found["interval"]["nis"]) == 2
+    )
+    assert found["settings"]["orientation_source"] == "filter" and found["left_out"] == {
+        "short": "0.5 s"
+    }
     assert found["reference_rows"]["never_moves"]["mean"]["path_length_ratio"] == 0
 
     with open(tmp_path / "metrics.csv", newline="") as file:
         rows = list(csv.DictReader(file))
-    assert float(rows[0]["ate"]) == first["ate"] and rows[2]["ate"] == "" and rows[2]["sequence"] == "blind"
+    assert (
+        float(rows[0]["ate"]) == first["ate"]
+        and rows[2]["ate"] == ""
+        and rows[2]["sequence"] == "blind"
+    )
 
 
 def test_tum_files(tmp_path, estimates, made):
@@ -94,10 +139,17 @@ def test_evo_reads_the_trajectories(tmp_path, estimates, made):
     from evo.tools import file_interface
 
     report.write(tmp_path, made, estimates)
-    pair = [file_interface.read_tum_trajectory_file(tmp_path / kind / "room_1_walk.txt") for kind in ("references", "trajectories")]
+    pair = [
+        file_interface.read_tum_trajectory_file(tmp_path / kind / "room_1_walk.txt")
+        for kind in ("references", "trajectories")
+    ]
     metric = evo.APE(evo.PoseRelation.translation_part)
     metric.process_data(tuple(pair))
-    ours = report.score(estimates[:1], {"room 1/walk": 0}, "none").sequences["room 1/walk"].values["ate"]
+    ours = (
+        report.score(estimates[:1], {"room 1/walk": 0}, "none")
+        .sequences["room 1/walk"]
+        .values["ate"]
+    )
     assert ours == pytest.approx(metric.get_statistic(evo.StatisticsType.rmse), rel=1e-7)
 
 
@@ -105,8 +157,20 @@ def test_table_says_what_matters(made):
     console = Console(width=160, record=True, file=open("/dev/null", "w"))
     console.print(report.table(made))
     text = console.export_text()
-    for words in ("room 1/walk", "ATE 2-D", "mean", "95 % interval", "never_moves", "window orientation: filter",
-                  "initial state: reference", "gyro bias: zero", "IMU compensated: no", "blind: start: rough", "left out: short", "–"):
+    for words in (
+        "room 1/walk",
+        "ATE 2-D",
+        "mean",
+        "95 % interval",
+        "never_moves",
+        "window orientation: filter",
+        "initial state: reference",
+        "gyro bias: zero",
+        "IMU compensated: no",
+        "blind: start: rough",
+        "left out: short",
+        "–",
+    ):
         assert words in text
     assert f"{made.scores.summary.mean['ate']:.2f}" in text
 
@@ -151,7 +215,9 @@ def test_every_column_is_of_the_same_sequences(with_divergence):
     for name in ("nees_coverage", "nis_coverage", "accepted", "path_length", "duration", "ate"):
         values = [sequences[walk].values[name] for walk in ("room 1/walk", "blind", "room 3")]
         there = [value for value in values if value is not None]
-        assert summary.mean[name] == pytest.approx(np.mean(there)) and summary.count[name] == len(there)
+        assert summary.mean[name] == pytest.approx(np.mean(there)) and summary.count[name] == len(
+            there
+        )
         assert summary.diverged[name] == 1
 
 
@@ -208,8 +274,10 @@ def test_the_distribution_of_errors_counts_what_diverged(tmp_path, with_divergen
 def test_an_estimate_lost_before_the_reference_begins_is_drawn(estimates):
     """No row has both, so nothing aligns it: the error is not there, its bounds are."""
     whole, rows = estimates[0], np.arange(400)[:, None]
-    path, reference = (Trajectory(of.time, *(np.where(there, part, np.nan) for part in of[1:]))
-                       for of, there in ((whole.trajectory, rows < 5), (whole.reference, rows >= 10)))
+    path, reference = (
+        Trajectory(of.time, *(np.where(there, part, np.nan) for part in of[1:]))
+        for of, there in ((whole.trajectory, rows < 5), (whole.reference, rows >= 10))
+    )
     figure = plots.position_error(whole._replace(trajectory=path, reference=reference))
     for axes in figure.axes:
         assert np.isnan(axes.get_lines()[0].get_ydata()).all()
@@ -223,36 +291,59 @@ def test_a_folder_is_replaced_whole_or_not_at_all(tmp_path):
     with pytest.raises(RuntimeError), report.replacing_folder(folder) as new:
         (new / "a").write_text("2")
         raise RuntimeError
-    assert (folder / "a").read_text() == "1" and [p.name for p in folder.parent.iterdir()] == ["result"]
+    assert (folder / "a").read_text() == "1" and [p.name for p in folder.parent.iterdir()] == [
+        "result"
+    ]
     with report.replacing_folder(folder) as new:
         (new / "b").write_text("3")
-    assert [p.name for p in folder.iterdir()] == ["b"] and [p.name for p in folder.parent.iterdir()] == ["result"]
+    assert [p.name for p in folder.iterdir()] == ["b"] and [
+        p.name for p in folder.parent.iterdir()
+    ] == ["result"]
 
 
 def test_plots_are_drawn(tmp_path, estimates, made):
     plots.save_all(tmp_path, estimates, made, 1.0)
     names = {path.name for path in tmp_path.iterdir()}
-    assert names == {"error_cdf.png", *(f"{stem}_{kind}.png" for stem in ("room_1_walk", "room_1_walk_")
-                                        for kind in ("trajectory", "error", "displacement")),
-                     "blind_trajectory.png", "blind_displacement.png"}
+    assert names == {
+        "error_cdf.png",
+        *(
+            f"{stem}_{kind}.png"
+            for stem in ("room_1_walk", "room_1_walk_")
+            for kind in ("trajectory", "error", "displacement")
+        ),
+        "blind_trajectory.png",
+        "blind_displacement.png",
+    }
     assert all((tmp_path / name).read_bytes()[:4] == b"\x89PNG" for name in names)
 
 
 def test_plots_say_what_they_show(estimates):
     figure = plots.trajectory(estimates[0], 1.234, 1.1)
     (axes,) = figure.axes
-    assert "1.23 m" in axes.get_title() and axes.get_aspect() == 1.0 and axes.get_xlabel() == "x (m)"
+    assert (
+        "1.23 m" in axes.get_title() and axes.get_aspect() == 1.0 and axes.get_xlabel() == "x (m)"
+    )
     reference, path = axes.get_lines()[:2]
     np.testing.assert_array_equal(reference.get_xydata(), estimates[0].reference.position[:, :2])
-    np.testing.assert_allclose(path.get_xydata()[0], estimates[0].reference.position[0, :2], atol=1e-12)
+    np.testing.assert_allclose(
+        path.get_xydata()[0], estimates[0].reference.position[0, :2], atol=1e-12
+    )
 
     figure = plots.displacement(estimates[0], 1.0)
-    assert [a.get_ylabel() for a in figure.axes] == ["speed (m/s)", "displacement (m)", "gate γ (–)"]
+    assert [a.get_ylabel() for a in figure.axes] == [
+        "speed (m/s)",
+        "displacement (m)",
+        "gate γ (–)",
+    ]
     truth, speed = figure.axes[0].get_lines()[:2]
     assert np.nanmax(truth.get_ydata()) == pytest.approx(1.6, abs=0.02)
     np.testing.assert_allclose(speed.get_xdata(), np.arange(400) * 0.1 - 0.5, atol=1e-6)
     shaded = figure.axes[0].patches
-    assert len(shaded) == 1 and shaded[0].get_x() == pytest.approx(15, abs=0.5) and shaded[0].get_width() == pytest.approx(7, abs=1)
+    assert (
+        len(shaded) == 1
+        and shaded[0].get_x() == pytest.approx(15, abs=0.5)
+        and shaded[0].get_width() == pytest.approx(7, abs=1)
+    )
 
     error = plots.position_error(estimates[0])
     band = error.axes[0].collections[0].get_paths()[0].vertices

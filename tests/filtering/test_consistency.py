@@ -1,4 +1,5 @@
-"""Is the filter as certain as it may be? Monte Carlo with noises as it assumes them, what is unobservable, Jacobians by autodiff."""
+"""Is the filter as certain as it may be? Monte Carlo with noises as it assumes them, what is
+unobservable, Jacobians by autodiff."""
 
 import functools
 
@@ -6,45 +7,75 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from compiling import quick
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
-from walks import errors, simulate
 
 from gnio_jax import filtering, geometry
 from gnio_jax.filtering.gaps import Imu
+from gnio_jax.filtering.measurement import displacement_residual, retract
 from gnio_jax.filtering.propagation import interval
-from gnio_jax.filtering.scekf import network_window
+from gnio_jax.filtering.scan import network_window
 from gnio_jax.filtering.state import CLONE, MOVE, OFFSET, THETA, VELOCITY, covariance
-from gnio_jax.filtering.update import displacement_residual, retract
 from gnio_jax.types import Prediction
+from tests.support.compiling import quick
+from tests.support.walks import errors, simulate
 
 RUNS, INTERVALS, N, CLONES, DT, SIGMA = 64, 600, 10, 10, 0.01, 0.03
 NOISE = filtering.NoiseModel(5e-4, 5e-3, 1e-6, 2e-5)
-PARTS = {"tilt": [0, 1], "yaw": [2], "velocity": [3, 4, 5], "position": [6, 7, 8], "gyro bias": [9, 10, 11], "accel bias": [12, 13, 14]}
+PARTS = {
+    "tilt": [0, 1],
+    "yaw": [2],
+    "velocity": [3, 4, 5],
+    "position": [6, 7, 8],
+    "gyro bias": [9, 10, 11],
+    "accel bias": [12, 13, 14],
+}
 
 
 @functools.cache
 def monte_carlo(std, jacobians="latest", intervals=INTERVALS, sigma=SIGMA):
-    """Errors (r, K, 15), covariances (r, K, 15, 15), NIS (r, K) and the final states of simulated runs from the prior."""
+    """Errors (r, K, 15), covariances (r, K, 15, 15), NIS (r, K) and the final states of simulated
+    runs from the prior."""
     runs = simulate(1, RUNS, intervals, N, CLONES, DT, NOISE, std, sigma)
-    config = filtering.FilterConfig(DT, N, CLONES, measurement_scale=1.0, gate_threshold=1e9, history="core", jacobians=jacobians)
+    config = filtering.FilterConfig(
+        DT,
+        N,
+        CLONES,
+        measurement_scale=1.0,
+        gate_threshold=1e9,
+        history="core",
+        jacobians=jacobians,
+    )
     spread = np.tile(sigma**2 * np.eye(3), (intervals, 1, 1))
 
     @jax.jit
     @jax.vmap
     def run(rotation, velocity, position, *signals):
-        return filtering.run_filter(filtering.initial_state(config, rotation, velocity, position, std=std), *signals, spread, config, NOISE)
+        return filtering.run_filter(
+            filtering.initial_state(config, rotation, velocity, position, std=std),
+            *signals,
+            spread,
+            config,
+            NOISE,
+        )
 
     final, history = run(*runs[:6])
     assert (np.asarray(history.healthy) == 1).all()
-    return runs, errors(runs, history), np.asarray(history.covariance), np.asarray(history.nis), final
+    return (
+        runs,
+        errors(runs, history),
+        np.asarray(history.covariance),
+        np.asarray(history.nis),
+        final,
+    )
 
 
 def nees(error, spread):
     """Average over runs, by degree of freedom: 1 for a consistent filter."""
     d = error.shape[-1]
-    return (np.einsum("...i,...i", error, np.linalg.solve(spread, error[..., None])[..., 0]) / d).mean(0)
+    return (
+        np.einsum("...i,...i", error, np.linalg.solve(spread, error[..., None])[..., 0]) / d
+    ).mean(0)
 
 
 def bounds(freedoms, level=0.95):
@@ -57,7 +88,10 @@ def test_certainty_agrees_with_the_errors():
     for name, index in PARTS.items():
         found = nees(error[..., index], spread[:, :, index][..., index])
         low, high = bounds(len(index) * RUNS)
-        assert low < found[20:].mean() < high, (name, found[20:].mean())  # of single times one in twenty is outside
+        assert low < found[20:].mean() < high, (
+            name,
+            found[20:].mean(),
+        )  # of single times one in twenty is outside
         assert np.mean((found[20:] > low) & (found[20:] < high)) > 0.75, name
     low, high = bounds(3 * RUNS)
     by_time = nis[:, CLONES:].mean(0) / 3
@@ -68,7 +102,12 @@ def test_certainty_agrees_with_the_errors():
     whole = np.asarray(jax.vmap(covariance)(final))
     last = np.s_[15 + CLONE * CLONES + 3 : 15 + CLONE * (CLONES + 1)]
     first = np.s_[18:21]
-    moved = whole[:, last, last] + whole[:, first, first] - whole[:, last, first] - whole[:, first, last]
+    moved = (
+        whole[:, last, last]
+        + whole[:, first, first]
+        - whole[:, last, first]
+        - whole[:, first, last]
+    )
     offsets = np.asarray(final.clone_offset)
     wrong = runs.position[:, -1] - runs.position[:, -1 - CLONES] - (offsets[:, -1] - offsets[:, 0])
     low, high = bounds(3 * RUNS)
@@ -76,9 +115,11 @@ def test_certainty_agrees_with_the_errors():
 
 
 def test_biases_converge_from_a_wide_prior():
-    """From σ(b_g) = 1e-2: horizontal gyro and accelerometer biases to a tenth of their prior σ, in the filter's word and in truth.
+    """From σ(b_g) = 1e-2: horizontal gyro and accelerometer biases to a tenth of their prior σ, in
+    the filter's word and in truth.
 
-    z takes longer where it is the gyro's, since yaw is seen by turning only; the whole run moves in every direction here."""
+    z takes longer where it is the gyro's, since yaw is seen by turning only; the whole run moves in
+    every direction here."""
     prior = filtering.InitialStd(gyro_bias=1e-2, accel_bias=0.1)
     _, error, spread, _, _ = monte_carlo(prior, intervals=900, sigma=0.02)
     sigma = np.sqrt(spread[:, -1].diagonal(axis1=1, axis2=2)).mean(0)
@@ -91,7 +132,8 @@ def test_biases_converge_from_a_wide_prior():
 
 
 def test_yaw_is_consistent_only_with_first_estimates():
-    """With a wide prior the latest-estimate filter becomes too sure of its yaw; with the first ones it does not."""
+    """With a wide prior the latest-estimate filter becomes too sure of its yaw; with the first ones
+    it does not."""
     prior = filtering.InitialStd(gyro_bias=1e-2)
     by_yaw = {}
     for jacobians in ("latest", "first"):
@@ -105,18 +147,29 @@ def test_yaw_is_consistent_only_with_first_estimates():
 
 @pytest.mark.parametrize("jacobians", ["latest", "first"])
 def test_measurements_tell_nothing_of_the_yaw(jacobians):
-    """With a perfect gyro, no displacement in the body's yaw frame can say where north is, if the start does not either: its
-    velocity is as uncertain about z as its yaw."""
+    """With a perfect gyro, no displacement in the body's yaw frame can say where north is, if the
+    start does not either: its velocity is as uncertain about z as its yaw."""
     prior = filtering.InitialStd(tilt=0.01, yaw=0.0, velocity=0.5, gyro_bias=0.0, accel_bias=0.05)
     noise = filtering.NoiseModel(0.0, 5e-3, 0.0, 2e-5)
     runs = simulate(3, 1, 120, N, CLONES, DT, noise, prior, 0.05)
-    config = filtering.FilterConfig(DT, N, CLONES, measurement_scale=1.0, gate_threshold=1e9, jacobians=jacobians)
+    config = filtering.FilterConfig(
+        DT, N, CLONES, measurement_scale=1.0, gate_threshold=1e9, jacobians=jacobians
+    )
     state = filtering.initial_state(config, *[runs[i][0] for i in range(3)], std=prior)
     turning = np.zeros(21)
     turning[2], turning[3:6] = 1.0, np.cross([0.0, 0, 1], state.velocity)
-    state = state._replace(core_covariance=state.core_covariance + 0.01 * np.outer(turning, turning))
-    _, history = filtering.run_filter(state, runs.gyro[0], runs.accel[0], runs.displacement[0],
-                                      np.tile(0.05**2 * np.eye(3), (120, 1, 1)), config, noise)
+    state = state._replace(
+        core_covariance=state.core_covariance + 0.01 * np.outer(turning, turning)
+    )
+    _, history = filtering.run_filter(
+        state,
+        runs.gyro[0],
+        runs.accel[0],
+        runs.displacement[0],
+        np.tile(0.05**2 * np.eye(3), (120, 1, 1)),
+        config,
+        noise,
+    )
     left = np.asarray(history.covariance_diagonal)[:, 2] / 0.01
     if jacobians == "first":
         np.testing.assert_allclose(left, 1.0, rtol=1e-6)
@@ -129,28 +182,50 @@ def random_state(config, seed=0):
     clones = config.clones_per_window + 1
     rotations = Rotation.from_rotvec(0.8 * rng.normal(size=(clones, 3))).as_matrix()
     velocity, position, gyro_bias, accel_bias = rng.normal(size=(4, 3))
-    state = filtering.initial_state(config, rotations[-1], velocity, position, 0.1 * gyro_bias, accel_bias)
+    state = filtering.initial_state(
+        config, rotations[-1], velocity, position, 0.1 * gyro_bias, accel_bias
+    )
     offsets = rng.normal(size=(clones, 3))
-    return state._replace(clone_rotation=jnp.asarray(rotations), clone_offset=jnp.asarray(offsets), offset=jnp.asarray(offsets[-1]),
-                          move=jnp.asarray(rng.normal(size=3)), step=jnp.int32(clones))
+    return state._replace(
+        clone_rotation=jnp.asarray(rotations),
+        clone_offset=jnp.asarray(offsets),
+        offset=jnp.asarray(offsets[-1]),
+        move=jnp.asarray(rng.normal(size=3)),
+        step=jnp.int32(clones),
+    )
 
 
 def test_transition_is_the_derivative_of_the_retraction():
     config = filtering.FilterConfig(0.05, 6, 3)
     state = random_state(config)
     rng = np.random.default_rng(1)
-    imu = Imu(jnp.asarray(4 * rng.normal(size=(6, 3))), jnp.asarray(8 * rng.normal(size=(6, 3))), None)
+    imu = Imu(
+        jnp.asarray(4 * rng.normal(size=(6, 3))), jnp.asarray(8 * rng.normal(size=(6, 3))), None
+    )
 
     def end(error):
-        moved = state._replace(rotation=geometry.exp(error[THETA]) @ state.rotation, velocity=state.velocity + error[VELOCITY],
-                               offset=state.offset + error[OFFSET], gyro_bias=state.gyro_bias + error[9:12],
-                               accel_bias=state.accel_bias + error[12:15])
+        moved = state._replace(
+            rotation=geometry.exp(error[THETA]) @ state.rotation,
+            velocity=state.velocity + error[VELOCITY],
+            offset=state.offset + error[OFFSET],
+            gyro_bias=state.gyro_bias + error[9:12],
+            accel_bias=state.accel_bias + error[12:15],
+        )
         motion = interval(moved, imu, filtering.NoiseModel(), config.dt)
-        return jnp.concatenate([geometry.log(motion.rotation @ reference.rotation.T), motion.velocity, motion.offset,
-                                moved.gyro_bias, moved.accel_bias])
+        return jnp.concatenate(
+            [
+                geometry.log(motion.rotation @ reference.rotation.T),
+                motion.velocity,
+                motion.offset,
+                moved.gyro_bias,
+                moved.accel_bias,
+            ]
+        )
 
     reference = quick(lambda: interval(state, imu, filtering.NoiseModel(), config.dt))()
-    np.testing.assert_allclose(reference.transition, quick(jax.jacfwd(end))(jnp.zeros(15)), atol=1e-6)
+    np.testing.assert_allclose(
+        reference.transition, quick(jax.jacfwd(end))(jnp.zeros(15)), atol=1e-6
+    )
 
 
 def test_measurement_jacobian_is_the_derivative_of_the_retraction():
@@ -161,21 +236,38 @@ def test_measurement_jacobian_is_the_derivative_of_the_retraction():
     def predicted(errors):
         core = jnp.zeros(21).at[MOVE].set(errors[-3:])
         moved = retract(state, core, errors[:-3].reshape(-1, CLONE), newest)
-        return geometry.yaw_rotation(moved.clone_rotation[oldest]).T @ (moved.offset + moved.move - moved.clone_offset[oldest])
+        return geometry.yaw_rotation(moved.clone_rotation[oldest]).T @ (
+            moved.offset + moved.move - moved.clone_offset[oldest]
+        )
 
     moved = state.offset + state.move - state.clone_offset[oldest]
-    _, jacobian, _ = quick(displacement_residual)(state.clone_rotation[oldest], moved, jnp.zeros(3), moved)
+    _, jacobian, _ = quick(displacement_residual)(
+        state.clone_rotation[oldest], moved, jnp.zeros(3), moved
+    )
     expected = np.zeros((3, 4 * CLONE + 3))
-    expected[:, :6], expected[:, -6:-3], expected[:, -3:] = jacobian[:, :6], jacobian[:, 6:], jacobian[:, 6:]
-    np.testing.assert_allclose(expected, quick(jax.jacfwd(predicted))(jnp.zeros(4 * CLONE + 3)), atol=1e-6)
+    expected[:, :6], expected[:, -6:-3], expected[:, -3:] = (
+        jacobian[:, :6],
+        jacobian[:, 6:],
+        jacobian[:, 6:],
+    )
+    np.testing.assert_allclose(
+        expected, quick(jax.jacfwd(predicted))(jnp.zeros(4 * CLONE + 3)), atol=1e-6
+    )
 
 
 # The network in the loop --------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("angles", [
-    (0.0, 0.0, 0.0), (0.3, 0.9, -2.0), (-2.0, -1.4, 3.1), (0.4, np.pi / 2, 1.0),
-    (0.1, -np.pi / 2, 0.0)])
+@pytest.mark.parametrize(
+    "angles",
+    [
+        (0.0, 0.0, 0.0),
+        (0.3, 0.9, -2.0),
+        (-2.0, -1.4, 3.1),
+        (0.4, np.pi / 2, 1.0),
+        (0.1, -np.pi / 2, 0.0),
+    ],
+)
 def test_own_frame_jacobian_is_that_of_an_equivariant_network(angles):
     """Autodiff through the window as it is cut and a network that turns with it, at any attitude,
     on the nose too. It levels its window by the mean specific force: small tilts change nothing."""
@@ -228,8 +320,9 @@ def tight():
     """(tables, start, gyro, accel) -> history of `run_odometry`, batched over runs, with a network
     that knows the truth, but for its noise, and tells it in the frame of its window, which it finds
     out from the window alone."""
-    config = filtering.FilterConfig(DT, N, CLONES, measurement_scale=1.0, gate_threshold=1e9,
-                                    history="core")
+    config = filtering.FilterConfig(
+        DT, N, CLONES, measurement_scale=1.0, gate_threshold=1e9, history="core"
+    )
     length = N * CLONES
 
     @jax.jit
@@ -254,8 +347,18 @@ def tight():
 
 
 def tight_runs(pitch):
-    runs = simulate(7, TIGHT_RUNS, TIGHT_INTERVALS, N, CLONES, DT, NOISE, filtering.InitialStd(),
-                    SIGMA, np.radians(pitch))
+    runs = simulate(
+        7,
+        TIGHT_RUNS,
+        TIGHT_INTERVALS,
+        N,
+        CLONES,
+        DT,
+        NOISE,
+        filtering.InitialStd(),
+        SIGMA,
+        np.radians(pitch),
+    )
     # window k ends with interval k + CLONES; its first sample is the first after interval k
     turns = Rotation.from_rotvec((runs.rate * DT).reshape(-1, 3)).as_matrix()
     turns = turns.reshape(*runs.rate.shape, 3)

@@ -1,4 +1,5 @@
-"""Derivatives of the history: forward, reverse, batched, checkpointed, behind a gate with a slope; finite where input is hostile."""
+"""Derivatives of the history: forward, reverse, batched, checkpointed, behind a gate with a slope;
+finite where input is hostile."""
 
 import functools
 
@@ -6,12 +7,22 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from compiling import quick
-from test_run_odometry import CLONES, DT, INTERVALS, PARAMETERS, WEIGHTS, N, central, recording, start
 
 from gnio_jax import filtering
-from gnio_jax.filtering.scekf import checkpointed_scan
+from gnio_jax.filtering.scan import checkpointed_scan
 from gnio_jax.types import Prediction
+from tests.support.compiling import quick
+from tests.support.odometry import (
+    CLONES,
+    DT,
+    INTERVALS,
+    PARAMETERS,
+    WEIGHTS,
+    N,
+    central,
+    recording,
+    start,
+)
 
 MEASURED = 0.1 * np.random.default_rng(4).standard_normal((INTERVALS, 3))
 PLAIN = filtering.FilterConfig(DT, N, CLONES)
@@ -19,26 +30,49 @@ PLAIN = filtering.FilterConfig(DT, N, CLONES)
 
 def of_history(history):
     """A scalar that feels every part of the history."""
-    return (jnp.sum(WEIGHTS * history.position) + jnp.sum(history.rotation[-1, 0]) + 0.01 * jnp.nansum(history.nis)
-            + jnp.sum(history.velocity[-1]) + 10 * jnp.sum(history.gyro_bias[-1] + history.accel_bias[-1])
-            + 0.1 * jnp.nansum(history.log_likelihood) + jnp.sum(jnp.log(history.covariance_diagonal[-1])))
+    return (
+        jnp.sum(WEIGHTS * history.position)
+        + jnp.sum(history.rotation[-1, 0])
+        + 0.01 * jnp.nansum(history.nis)
+        + jnp.sum(history.velocity[-1])
+        + 10 * jnp.sum(history.gyro_bias[-1] + history.accel_bias[-1])
+        + 0.1 * jnp.nansum(history.log_likelihood)
+        + jnp.sum(jnp.log(history.covariance_diagonal[-1]))
+    )
 
 
 def loss(x, config=PLAIN):
-    """x: noise (4,) log factors, std (6,) log factors of the start's, state (12,) added to the start, measured (K, 3), gyro, accel."""
+    """x: noise (4,) log factors, std (6,) log factors of the start's, state (12,) added to the
+    start, measured (K, 3), gyro, accel."""
     noise = filtering.NoiseModel(*(jnp.array([1e-2, 1e-1, 1e-2, 1e-1]) * jnp.exp(x["noise"])))
     std = filtering.InitialStd(*(jnp.array(filtering.InitialStd()) * jnp.exp(x["std"])))
     first = start()
-    state = filtering.initial_state(config, first.rotation, first.velocity + x["state"][:3], first.position + x["state"][3:6],
-                                    first.gyro_bias + x["state"][6:9], first.accel_bias + x["state"][9:], std)
+    state = filtering.initial_state(
+        config,
+        first.rotation,
+        first.velocity + x["state"][:3],
+        first.position + x["state"][3:6],
+        first.gyro_bias + x["state"][6:9],
+        first.accel_bias + x["state"][9:],
+        std,
+    )
     spread = jnp.tile(0.01 * jnp.eye(3)[None], (INTERVALS, 1, 1))
-    _, history = filtering.run_filter(state, x["gyro"], x["accel"], x["measured"], spread, config, noise)
+    _, history = filtering.run_filter(
+        state, x["gyro"], x["accel"], x["measured"], spread, config, noise
+    )
     return of_history(history)
 
 
 def point(measured=MEASURED):
     gyro, accel = recording(2)
-    return dict(noise=np.zeros(4), std=np.zeros(6), state=np.zeros(12), measured=measured, gyro=gyro, accel=accel)
+    return dict(
+        noise=np.zeros(4),
+        std=np.zeros(6),
+        state=np.zeros(12),
+        measured=measured,
+        gyro=gyro,
+        accel=accel,
+    )
 
 
 GRADIENT = quick(jax.value_and_grad(loss))
@@ -51,16 +85,31 @@ def test_gradient_against_differences():
     measured[[7, 8]] = np.nan
     found = GRADIENT(point(measured))[1]
     for name in ("noise", "std", "state"):
-        expected = central(lambda value, name=name: float(GRADIENT({**point(measured), name: value})[0]), point()[name], 1e-4)
-        np.testing.assert_allclose(found[name], expected, rtol=1e-5, atol=1e-6 * np.abs(expected).max(), err_msg=name)
+        expected = central(
+            lambda value, name=name: float(GRADIENT({**point(measured), name: value})[0]),
+            point()[name],
+            1e-4,
+        )
+        np.testing.assert_allclose(
+            found[name], expected, rtol=1e-5, atol=1e-6 * np.abs(expected).max(), err_msg=name
+        )
         assert (np.abs(expected) > 0).all()
-    for name, k in (("measured", CLONES), ("measured", INTERVALS - 1), ("gyro", 3), ("accel", 3), ("accel", -1)):
+    for name, k in (
+        ("measured", CLONES),
+        ("measured", INTERVALS - 1),
+        ("gyro", 3),
+        ("accel", 3),
+        ("accel", -1),
+    ):
+
         def at(value, name=name, k=k):
             rows = point(measured)[name].copy()
             rows[k] = value
             return float(GRADIENT({**point(measured), name: rows})[0])
 
-        np.testing.assert_allclose(found[name][k], central(at, point(measured)[name][k], 1e-5), rtol=1e-5, atol=1e-8)
+        np.testing.assert_allclose(
+            found[name][k], central(at, point(measured)[name][k], 1e-5), rtol=1e-5, atol=1e-8
+        )
 
 
 def test_jvp_against_differences_and_vmap_of_grad_against_jvp():
@@ -68,32 +117,54 @@ def test_jvp_against_differences_and_vmap_of_grad_against_jvp():
     direction = jax.tree.map(lambda x: rng.standard_normal(x.shape), point())
     along = quick(lambda x, d: jax.jvp(loss, (x,), (d,)))
     step = 1e-6
-    ahead, behind = (float(along(jax.tree.map(lambda x, d, h=h: x + h * d, point(), direction), direction)[0]) for h in (step, -step))
-    np.testing.assert_allclose(along(point(), direction)[1], (ahead - behind) / (2 * step), rtol=1e-5)
+    ahead, behind = (
+        float(along(jax.tree.map(lambda x, d, h=h: x + h * d, point(), direction), direction)[0])
+        for h in (step, -step)
+    )
+    np.testing.assert_allclose(
+        along(point(), direction)[1], (ahead - behind) / (2 * step), rtol=1e-5
+    )
 
     points = [point(), point(MEASURED + 0.02), point(-MEASURED)]
     many = quick(jax.vmap(jax.grad(loss)))(jax.tree.map(lambda *leaves: np.stack(leaves), *points))
     for index, one in enumerate(points):
-        inner = sum(np.sum(g[index] * d) for g, d in zip(jax.tree.leaves(many), jax.tree.leaves(direction), strict=True))
+        inner = sum(
+            np.sum(g[index] * d)
+            for g, d in zip(jax.tree.leaves(many), jax.tree.leaves(direction), strict=True)
+        )
         np.testing.assert_allclose(inner, along(one, direction)[1], rtol=1e-8)
 
 
 @pytest.mark.parametrize("every", [0, 4, 5, 13, 50])
 def test_checkpoints_change_nothing(every):
-    """Of any scan, whole blocks or not; the filter's own is differentiated through checkpoints with the network below."""
+    """Of any scan, whole blocks or not; the filter's own is differentiated through checkpoints with
+    the network below."""
+
     def step(carry, x):
         carry = jnp.tanh(carry @ (jnp.eye(2) + x["turn"])) + x["push"]
         return carry, {"square": carry**2, "first": carry[0]}
 
     def value(scan, start, inputs):
         carry, out = scan(step, start, inputs)
-        return jnp.sum(carry) + jnp.sum(jnp.arange(1.0, 14)[:, None] * out["square"]) + jnp.sum(out["first"])
+        return (
+            jnp.sum(carry)
+            + jnp.sum(jnp.arange(1.0, 14)[:, None] * out["square"])
+            + jnp.sum(out["first"])
+        )
 
     rng = np.random.default_rng(2)
-    arguments = jnp.array([0.3, -0.2]), {"turn": 0.3 * rng.standard_normal((13, 2, 2)), "push": 0.3 * rng.standard_normal((13, 2))}
+    arguments = (
+        jnp.array([0.3, -0.2]),
+        {"turn": 0.3 * rng.standard_normal((13, 2, 2)), "push": 0.3 * rng.standard_normal((13, 2))},
+    )
     ours = functools.partial(value, functools.partial(checkpointed_scan, every=every))
-    found, wanted = (quick(jax.value_and_grad(function, (0, 1)))(*arguments) for function in (ours, functools.partial(value, jax.lax.scan)))
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12), found, wanted)
+    found, wanted = (
+        quick(jax.value_and_grad(function, (0, 1)))(*arguments)
+        for function in (ours, functools.partial(value, jax.lax.scan))
+    )
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12), found, wanted
+    )
     text = str(jax.make_jaxpr(jax.grad(ours))(*arguments))
     assert ("remat" in text or "checkpoint" in text) == (0 < every < 13)
 
@@ -101,23 +172,53 @@ def test_checkpoints_change_nothing(every):
 def test_checkpoints_bound_the_memory():
     def temporary(every):
         def value(start):
-            carry, out = checkpointed_scan(lambda x, push: (jnp.tanh(x @ x) + push, x[0, 0]), start, jnp.ones(1040), every)
+            carry, out = checkpointed_scan(
+                lambda x, push: (jnp.tanh(x @ x) + push, x[0, 0]), start, jnp.ones(1040), every
+            )
             return jnp.sum(carry) + jnp.sum(out)
 
-        return jax.jit(jax.grad(value)).lower(jnp.zeros((20, 20))).compile().memory_analysis().temp_size_in_bytes
+        return (
+            jax.jit(jax.grad(value))
+            .lower(jnp.zeros((20, 20)))
+            .compile()
+            .memory_analysis()
+            .temp_size_in_bytes
+        )
 
     assert temporary(32) < temporary(0) / 4
 
 
-# One program for all of it, since compiling is what these tests cost; the hard gate's rejection is tested with the update.
-HOSTILE = quick(jax.value_and_grad(functools.partial(loss, config=filtering.FilterConfig(
-    DT, N, CLONES, convergence_seconds=0.1, zero_velocity_std=0.01, rest_seconds=0.1, gate_softness=2.0, gate_threshold=8.0))))
+# One program for all of it, since compiling is what these tests cost; the hard gate's rejection is
+# tested with the update.
+HOSTILE = quick(
+    jax.value_and_grad(
+        functools.partial(
+            loss,
+            config=filtering.FilterConfig(
+                DT,
+                N,
+                CLONES,
+                convergence_seconds=0.1,
+                zero_velocity_std=0.01,
+                rest_seconds=0.1,
+                gate_softness=2.0,
+                gate_threshold=8.0,
+            ),
+        )
+    )
+)
 
 
 def hostile(kind):
     x = point(MEASURED.copy())
-    if kind == "rest":  # nothing turns, nothing moves, every innovation is small: each norm in the filter is at its singular point
-        x |= dict(gyro=np.zeros_like(x["gyro"]), accel=np.tile([0.0, 0.0, 9.81], (len(x["gyro"]), 1)), measured=np.zeros_like(MEASURED))
+    if (
+        kind == "rest"
+    ):  # nothing turns, nothing moves, every innovation is small: each norm in the filter is at its singular point
+        x |= dict(
+            gyro=np.zeros_like(x["gyro"]),
+            accel=np.tile([0.0, 0.0, 9.81], (len(x["gyro"]), 1)),
+            measured=np.zeros_like(MEASURED),
+        )
     elif kind == "rejected":
         x["measured"][12:18] = 50.0
     elif kind == "missing":
@@ -146,11 +247,15 @@ def test_a_gate_with_a_slope_lets_the_gradient_through():
         return HOSTILE(point(rows))
 
     slope = float(at(0.0)[1]["measured"][14, 0])
-    np.testing.assert_allclose(slope, central(lambda x: float(at(x)[0]), np.zeros(()), 1e-5), rtol=1e-5)
+    np.testing.assert_allclose(
+        slope, central(lambda x: float(at(x)[0]), np.zeros(()), 1e-5), rtol=1e-5
+    )
     assert abs(slope) > 0  # behind the hard gate it would be zero where the row is rejected
 
     def history(softness):
-        config = filtering.FilterConfig(DT, N, CLONES, convergence_seconds=0.1, gate_softness=softness, gate_threshold=8.0)
+        config = filtering.FilterConfig(
+            DT, N, CLONES, convergence_seconds=0.1, gate_softness=softness, gate_threshold=8.0
+        )
         spread = np.tile(0.01 * np.eye(3), (INTERVALS, 1, 1))
         noise = filtering.NoiseModel(1e-2, 1e-1, 1e-2, 1e-1)
         return RUN(start(config), *recording(2), measured, spread, config, noise)[1]
@@ -158,8 +263,14 @@ def test_a_gate_with_a_slope_lets_the_gradient_through():
     hard, soft = history(0.0), history(2.0)
     weights, nis = np.asarray(soft.gate_passed), np.asarray(soft.nis)
     watched = np.asarray(soft.gate_passed) < 1
-    np.testing.assert_allclose(weights[watched], 1 / (1 + np.exp((nis[watched] - 8.0) / 2.0)), rtol=1e-9)
-    assert (np.asarray(soft.accepted)[CLONES:] == 1).all() and watched.sum() > 5 and (np.asarray(hard.accepted) == 0).any()
+    np.testing.assert_allclose(
+        weights[watched], 1 / (1 + np.exp((nis[watched] - 8.0) / 2.0)), rtol=1e-9
+    )
+    assert (
+        (np.asarray(soft.accepted)[CLONES:] == 1).all()
+        and watched.sum() > 5
+        and (np.asarray(hard.accepted) == 0).any()
+    )
 
 
 def test_softness_has_a_limit():
@@ -168,17 +279,24 @@ def test_softness_has_a_limit():
     measured[14, 0] += 2.5
 
     def positions(softness):
-        config = filtering.FilterConfig(DT, N, CLONES, convergence_seconds=0.1, gate_softness=softness)
+        config = filtering.FilterConfig(
+            DT, N, CLONES, convergence_seconds=0.1, gate_softness=softness
+        )
         spread = np.tile(0.01 * np.eye(3), (INTERVALS, 1, 1))
-        return np.asarray(RUN(start(config), *recording(2), measured, spread, config, filtering.NoiseModel())[1].position)
+        return np.asarray(
+            RUN(start(config), *recording(2), measured, spread, config, filtering.NoiseModel())[
+                1
+            ].position
+        )
 
     np.testing.assert_allclose(positions(1e-3), positions(0.0), atol=1e-4)
     assert np.abs(positions(3.0) - positions(0.0)).max() > 1e-3
 
 
 def test_gradient_reaches_the_network():
-    """Of its own parameters to 1e-5; through the windows, which are cut with the state, as far as differences can say, since the
-    window is rounded to float32. One program for both: `share` is that of what the network makes of its window."""
+    """Of its own parameters to 1e-5; through the windows, which are cut with the state, as far as
+    differences can say, since the window is rounded to float32. One program for both: `share` is
+    that of what the network makes of its window."""
     gyro, accel = recording(0)
     config = filtering.FilterConfig(DT, N, CLONES, checkpoint_every=INTERVALS // 2)
     assert INTERVALS % 2 == 0  # no step is left over, which would be compiled once more
@@ -192,11 +310,23 @@ def test_gradient_reaches_the_network():
             pooled = share * seen + (1 - share) * jnp.tanh(parameters.sum(0))[None]
             return Prediction(pooled, -2.0 + 0.1 * pooled)
 
-        _, history = filtering.run_odometry(network, start(config), gyro, accel, config, filtering.NoiseModel())
+        _, history = filtering.run_odometry(
+            network, start(config), gyro, accel, config, filtering.NoiseModel()
+        )
         return of_history(history)
 
     expected = central(lambda p: float(value(jnp.asarray(p), 0.0)[0]), PARAMETERS, 1e-4)
-    np.testing.assert_allclose(value(jnp.asarray(PARAMETERS), 0.0)[1], expected, rtol=1e-5, atol=1e-7)
-    coarse, fine = (central(lambda p: float(value(jnp.asarray(p), 1.0)[0]), PARAMETERS, step) for step in (1e-2, 5e-3))
+    np.testing.assert_allclose(
+        value(jnp.asarray(PARAMETERS), 0.0)[1], expected, rtol=1e-5, atol=1e-7
+    )
+    coarse, fine = (
+        central(lambda p: float(value(jnp.asarray(p), 1.0)[0]), PARAMETERS, step)
+        for step in (1e-2, 5e-3)
+    )
     expected = (4 * fine - coarse) / 3
-    np.testing.assert_allclose(value(jnp.asarray(PARAMETERS), 1.0)[1], expected, rtol=2e-3, atol=2e-3 * np.abs(expected).max())
+    np.testing.assert_allclose(
+        value(jnp.asarray(PARAMETERS), 1.0)[1],
+        expected,
+        rtol=2e-3,
+        atol=2e-3 * np.abs(expected).max(),
+    )

@@ -1,8 +1,7 @@
-"""What is not as it should be: drop-outs of the IMU, rest, starts without a reference, values that cannot be."""
+"""What is not as it should be: drop-outs of the IMU, rest, starts without a reference, values that
+cannot be."""
 
 import dataclasses
-import sys
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -13,15 +12,15 @@ from scipy.stats import multivariate_normal
 
 from gnio_jax import filtering, geometry
 from gnio_jax.filtering.gaps import Gap, Imu, bridge
-from gnio_jax.filtering.update import rest, zero_velocity
+from gnio_jax.filtering.measurement import rest, zero_velocity
 from gnio_jax.types import Prediction
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "reference"))
-import scekf_numpy
-from test_scekf import random_walk
+from tests.support import scekf_numpy
+from tests.support.random_walk import random_walk
 
 N, CLONES, DT, INTERVALS = 5, 4, 0.02, 60
-CONFIG = filtering.FilterConfig(DT, N, CLONES, measurement_scale=2.0, bridge_seconds=0.06, history="core")
+CONFIG = filtering.FilterConfig(
+    DT, N, CLONES, measurement_scale=2.0, bridge_seconds=0.06, history="core"
+)
 NOISE = filtering.NoiseModel()
 
 
@@ -35,15 +34,33 @@ WALK = random_walk(11, n=N, clones=CLONES, intervals=INTERVALS, dt=DT, bias=Fals
 
 def run(config=CONFIG, valid=None, gyro=None, accel=None, walk=WALK, state=None, rows=slice(None)):
     _, g, a, d, c = walk
-    samples = slice(None if rows.start is None else rows.start * N, None if rows.stop is None else rows.stop * N)
+    samples = slice(
+        None if rows.start is None else rows.start * N, None if rows.stop is None else rows.stop * N
+    )
     state = start(config, walk) if state is None else state
-    return filtering.run_filter(state, (g if gyro is None else gyro)[samples], (a if accel is None else accel)[samples], d[rows], c[rows],
-                                config, NOISE, None if valid is None else valid[samples])
+    return filtering.run_filter(
+        state,
+        (g if gyro is None else gyro)[samples],
+        (a if accel is None else accel)[samples],
+        d[rows],
+        c[rows],
+        config,
+        NOISE,
+        None if valid is None else valid[samples],
+    )
 
 
 def gap_of(valid, memory, limit):
-    """By hand, one sample after the other: age, index held (−1 the memory, None nothing), the extra variance in units of the gap's."""
-    ages, held, variances, age, last, before = [], [], [], memory[0], (-1 if memory[1] else None), 0.0
+    """By hand, one sample after the other: age, index held (−1 the memory, None nothing), the extra
+    variance in units of the gap's."""
+    ages, held, variances, age, last, before = (
+        [],
+        [],
+        [],
+        memory[0],
+        (-1 if memory[1] else None),
+        0.0,
+    )
     for j, good in enumerate(valid):
         age = 0 if good else age + 1
         last = j if good else last
@@ -66,23 +83,39 @@ def test_holes_are_filled_with_the_last_sample(missing_before):
     gyro[22, 1], accel[23, 0] = np.nan, np.inf  # not named, but not finite either
     good = valid.copy()
     good[[22, 23]] = False
-    memory = start().imu._replace(gyro=jnp.full(3, 5.0), accel=jnp.full(3, 6.0), missing=jnp.int32(missing_before))
-    imu, age, after = bridge(jnp.asarray(gyro), jnp.asarray(accel), jnp.asarray(valid), memory, CONFIG)
+    memory = start().imu._replace(
+        gyro=jnp.full(3, 5.0), accel=jnp.full(3, 6.0), missing=jnp.int32(missing_before)
+    )
+    imu, age, after = bridge(
+        jnp.asarray(gyro), jnp.asarray(accel), jnp.asarray(valid), memory, CONFIG
+    )
     ages, held, variances = gap_of(good, (missing_before, True), 3)
     np.testing.assert_allclose(age, np.array(ages) * DT)
     for found, signal, remembered in ((imu.gyro, gyro, 5.0), (imu.accel, accel, 6.0)):
-        np.testing.assert_array_equal(found, [signal[j] if j >= 0 else np.full(3, remembered) for j in held])
+        np.testing.assert_array_equal(
+            found, [signal[j] if j >= 0 else np.full(3, remembered) for j in held]
+        )
     np.testing.assert_allclose(imu.gap.gyro_variance, np.array(variances) * CONFIG.gap_gyro_std**2)
-    np.testing.assert_allclose(imu.gap.accel_variance, np.array(variances) * CONFIG.gap_accel_std**2)
+    np.testing.assert_allclose(
+        imu.gap.accel_variance, np.array(variances) * CONFIG.gap_accel_std**2
+    )
     np.testing.assert_array_equal(imu.gap.used, np.array(ages) <= 3)
     assert after.missing == 1 and (after.gyro == gyro[28]).all()
 
 
 def test_nothing_held_before_the_first_sample():
-    imu, _, after = bridge(jnp.ones((4, 3)), jnp.ones((4, 3)), jnp.array([False, False, True, False]), start().imu, CONFIG)
+    imu, _, after = bridge(
+        jnp.ones((4, 3)),
+        jnp.ones((4, 3)),
+        jnp.array([False, False, True, False]),
+        start().imu,
+        CONFIG,
+    )
     np.testing.assert_array_equal(imu.gap.used, [0, 0, 1, 1])
     assert np.isfinite(after.gyro).all()
-    _, _, never = bridge(jnp.ones((4, 3)), jnp.ones((4, 3)), jnp.zeros(4, bool), start().imu, CONFIG)
+    _, _, never = bridge(
+        jnp.ones((4, 3)), jnp.ones((4, 3)), jnp.zeros(4, bool), start().imu, CONFIG
+    )
     assert np.isnan(never.gyro).all() and never.missing == 4
 
 
@@ -100,7 +133,9 @@ def test_a_short_hole_is_bridged_a_long_one_costs_certainty():
     valid[200:240] = False
     broken = gyro.copy()
     broken[~valid] = np.nan
-    config = filtering.FilterConfig(DT, N, CLONES, measurement_scale=2.0, bridge_seconds=0.06, history="core")
+    config = filtering.FilterConfig(
+        DT, N, CLONES, measurement_scale=2.0, bridge_seconds=0.06, history="core"
+    )
     _, whole = run(config)
     _, found = run(config, valid, gyro=broken)
     gap = np.asarray(found.imu_gap)
@@ -109,22 +144,31 @@ def test_a_short_hole_is_bridged_a_long_one_costs_certainty():
     sigma, before = (np.sqrt(np.asarray(h.covariance_diagonal)) for h in (found, whole))
     assert (sigma[20, :6] > before[20, :6]).all() and (sigma[47, :6] > 5 * before[47, :6]).all()
     assert (np.asarray(found.healthy) == 1).all() and np.isfinite(found.position).all()
-    # what it says of itself holds: off by no more than four of its own sigmas in the gap and after it
+    # what it says of itself holds: off by no more than four of its own sigmas in the gap and after
+    # it
     off = np.abs(np.asarray(found.velocity) - np.asarray(whole.velocity))
     assert (off[39:] < 4 * np.sqrt(sigma[39:, 3:6] ** 2 + before[39:, 3:6] ** 2)).all()
 
 
 def test_the_filter_coasts_where_nothing_is_known():
-    """No turn, no change of velocity: constant velocity for the whole gap, whatever the attitude is believed to be."""
+    """No turn, no change of velocity: constant velocity for the whole gap, whatever the attitude is
+    believed to be."""
     (R, v, p), gyro, accel, _, c = WALK
     valid = np.zeros(N * 6, bool)
-    _, history = filtering.run_filter(start(), gyro[: N * 6], accel[: N * 6], np.full((6, 3), np.nan), c[:6], CONFIG, NOISE, valid)
+    _, history = filtering.run_filter(
+        start(), gyro[: N * 6], accel[: N * 6], np.full((6, 3), np.nan), c[:6], CONFIG, NOISE, valid
+    )
     np.testing.assert_allclose(history.velocity, np.tile(v, (6, 1)), atol=1e-12)
     np.testing.assert_allclose(history.rotation, np.tile(R, (6, 1, 1)), atol=1e-12)
     np.testing.assert_allclose(history.position[-1], p + v * 6 * N * DT, atol=1e-12)
-    # Nothing was there to hold, so every sample has the variance of one just beyond the limit: e_4 = 1, Σ e = 3, of which 3² − 2² is its.
+    # Nothing was there to hold, so every sample has the variance of one just beyond the limit: e_4
+    # = 1, Σ e = 3, of which 3² − 2² is its.
     growth = np.asarray(history.covariance_diagonal)[-1, 0] - np.radians(1.0) ** 2
-    np.testing.assert_allclose(growth, 30 * DT**2 * ((3**2 - 2**2) * CONFIG.gap_gyro_std**2 + NOISE.gyro_density**2 / DT), rtol=1e-6)
+    np.testing.assert_allclose(
+        growth,
+        30 * DT**2 * ((3**2 - 2**2) * CONFIG.gap_gyro_std**2 + NOISE.gyro_density**2 / DT),
+        rtol=1e-6,
+    )
 
 
 def test_a_gap_across_two_runs_is_one_gap():
@@ -135,7 +179,9 @@ def test_a_gap_across_two_runs_is_one_gap():
     _, second = run(valid=valid, rows=slice(20, INTERVALS), state=state)
     for name in ("position", "velocity", "covariance_diagonal", "imu_gap"):
         both = np.concatenate([getattr(first, name), getattr(second, name)])
-        np.testing.assert_allclose(both, getattr(together, name), atol=1e-9, rtol=1e-8, err_msg=name)
+        np.testing.assert_allclose(
+            both, getattr(together, name), atol=1e-9, rtol=1e-8, err_msg=name
+        )
 
 
 def test_windows_with_a_long_hole_are_no_measurements():
@@ -144,11 +190,14 @@ def test_windows_with_a_long_hole_are_no_measurements():
     valid[150:160], valid[220:222] = False, False
 
     def predict(windows):
-        return Prediction(jnp.mean(windows[:, :, :3], axis=1) * 0.01, jnp.full((1, 3), -1.0, jnp.float32))
+        return Prediction(
+            jnp.mean(windows[:, :, :3], axis=1) * 0.01, jnp.full((1, 3), -1.0, jnp.float32)
+        )
 
     _, history = filtering.run_odometry(predict, start(), gyro, accel, CONFIG, NOISE, valid)
     missing = np.isnan(np.asarray(history.accepted))
-    # Coasting are samples 153 … 159, in intervals 30 and 31: in the windows that end with intervals 30 … 34. The short hole is bridged.
+    # Coasting are samples 153 … 159, in intervals 30 and 31: in the windows that end with intervals
+    # 30 … 34. The short hole is bridged.
     np.testing.assert_array_equal(np.flatnonzero(missing), [0, 1, 2, 3, 30, 31, 32, 33, 34])
     assert np.isfinite(history.position).all()
 
@@ -159,17 +208,23 @@ def test_rest_is_a_measurement_if_wanted():
     R = Rotation.from_euler("xyz", [0.2, -0.1, 1.0]).as_matrix()
     samples = N * INTERVALS
     gyro = 1e-3 * rng.standard_normal((samples, 3))
-    accel = np.tile(R.T @ [0, 0, 9.81], (samples, 1)) + 0.05 + 1e-2 * rng.standard_normal((samples, 3))
+    accel = (
+        np.tile(R.T @ [0, 0, 9.81], (samples, 1)) + 0.05 + 1e-2 * rng.standard_normal((samples, 3))
+    )
     accel[150:160] += R.T @ [0, 0, 0.5]  # a knock
     nothing = np.full((INTERVALS, 3), np.nan), np.tile(np.eye(3), (INTERVALS, 1, 1))
     found = {}
     for std in (0.0, 0.02):
-        config = filtering.FilterConfig(DT, N, CLONES, zero_velocity_std=std, rest_seconds=0.3, history="core")
+        config = filtering.FilterConfig(
+            DT, N, CLONES, zero_velocity_std=std, rest_seconds=0.3, history="core"
+        )
         state = filtering.initial_state(config, R, np.zeros(3), np.zeros(3))
         _, found[std] = filtering.run_filter(state, gyro, accel, *nothing, config, NOISE)
     assert (np.asarray(found[0.0].at_rest) == 0).all()
     expected = np.ones(INTERVALS)
-    expected[[0, 1, 30, 31, 32, 33]] = 0  # three intervals of 0.1 s until it counts, and again after the knock
+    expected[[0, 1, 30, 31, 32, 33]] = (
+        0  # three intervals of 0.1 s until it counts, and again after the knock
+    )
     np.testing.assert_array_equal(found[0.02].at_rest, expected)
     speed = {std: np.linalg.norm(h.velocity, axis=1) for std, h in found.items()}
     assert speed[0.0][-1] > 0.3 and speed[0.02][-1] < 0.02
@@ -179,7 +234,9 @@ def test_rest_is_a_measurement_if_wanted():
     gain = P[:, 3:6] @ np.linalg.inv(P[3:6, 3:6] + 0.02**2 * np.eye(3))
     np.testing.assert_allclose(found[0.02].velocity[k], v - gain[3:6] @ v, atol=1e-12)
     np.testing.assert_allclose(found[0.02].covariance[k], P - gain @ P[3:6], atol=1e-12)
-    np.testing.assert_allclose(found[0.02].accel_bias[k], np.asarray(h.accel_bias)[k] - gain[12:] @ v, atol=1e-12)
+    np.testing.assert_allclose(
+        found[0.02].accel_bias[k], np.asarray(h.accel_bias)[k] - gain[12:] @ v, atol=1e-12
+    )
 
 
 @pytest.mark.parametrize("seconds, intervals", [(0.0, 1), (0.1, 1), (0.11, 2), (0.3, 3), (0.35, 4)])
@@ -200,8 +257,9 @@ def test_rest_counts_only_after_its_time(seconds, intervals):
     assert found == expected and sum(found) == 4 * (6 - intervals)
 
 
-def resting(now, converged=True, last_success=100, pause_end=0, tried=True, speed=1.0,
-            config=CONFIG):
+def resting(
+    now, converged=True, last_success=100, pause_end=0, tried=True, speed=1.0, config=CONFIG
+):
     """The state before and after the IMU is quiet at sample `now`, with a velocity of `speed` known
     to 0.1 m/s per axis, and what the filter made of it. `tried`: there was a displacement, too."""
     config = dataclasses.replace(config, zero_velocity_std=0.05)
@@ -220,13 +278,21 @@ EDGE = np.sqrt(CONFIG.gate_threshold * (0.1**2 + 0.05**2))
 """Speed at which the χ² test is just passed, m/s."""
 
 
-@pytest.mark.parametrize("gate, speed, accepted", [
-    (dict(now=110), 1.001 * EDGE, False), (dict(now=110), 0.999 * EDGE, True),
-    (dict(now=125), 3.0, False), (dict(now=130), 3.0, True),  # the last success is 0.5 s old, older
-    (dict(now=110, converged=False), 3.0, True), (dict(now=110, last_success=-1), 3.0, False),
-    (dict(now=110, pause_end=115), 3.0, True), (dict(now=115, pause_end=115), 3.0, False),
-    (dict(now=110, tried=False), 3.0, True), (dict(now=110, tried=False), 0.999 * EDGE, True),
-])
+@pytest.mark.parametrize(
+    "gate, speed, accepted",
+    [
+        (dict(now=110), 1.001 * EDGE, False),
+        (dict(now=110), 0.999 * EDGE, True),
+        (dict(now=125), 3.0, False),
+        (dict(now=130), 3.0, True),  # the last success is 0.5 s old, older
+        (dict(now=110, converged=False), 3.0, True),
+        (dict(now=110, last_success=-1), 3.0, False),
+        (dict(now=110, pause_end=115), 3.0, True),
+        (dict(now=115, pause_end=115), 3.0, False),
+        (dict(now=110, tried=False), 3.0, True),
+        (dict(now=110, tried=False), 0.999 * EDGE, True),
+    ],
+)
 def test_rest_passes_a_chi_square_test_where_the_gate_is_active(gate, speed, accepted):
     state, new, found = resting(speed=speed, **gate)
     np.testing.assert_allclose(found.nis, speed**2 / (0.1**2 + 0.05**2), rtol=1e-12)
@@ -237,26 +303,41 @@ def test_rest_passes_a_chi_square_test_where_the_gate_is_active(gate, speed, acc
     np.testing.assert_allclose(np.diag(new.core_covariance)[3:6], variance, rtol=1e-12)
 
 
-@pytest.mark.parametrize("gate, speed, anew", [
-    (dict(now=110, converged=False), 3.0, True), (dict(now=110, converged=False), 0.1, False),
-    (dict(now=110), 3.0, False), (dict(now=110, tried=False), 3.0, True)])
+@pytest.mark.parametrize(
+    "gate, speed, anew",
+    [
+        (dict(now=110, converged=False), 3.0, True),
+        (dict(now=110, converged=False), 0.1, False),
+        (dict(now=110), 3.0, False),
+        (dict(now=110, tried=False), 3.0, True),
+    ],
+)
 def test_rest_takes_first_estimates_anew_where_it_corrects_much(gate, speed, anew):
     """Not where it was refused, and not where it fits."""
-    state, new, found = resting(speed=speed, config=filtering.FilterConfig(
-        DT, N, CLONES, jacobians="first"), **gate)
+    state, new, found = resting(
+        speed=speed, config=filtering.FilterConfig(DT, N, CLONES, jacobians="first"), **gate
+    )
     assert bool(found.accepted) == (speed == 0.1 or anew)
     wanted = state.first
     if anew:
-        wanted = wanted._replace(velocity=new.velocity, offset=new.offset, move=new.move,
-                                 clone_offset=new.clone_offset)
+        wanted = wanted._replace(
+            velocity=new.velocity, offset=new.offset, move=new.move, clone_offset=new.clone_offset
+        )
         assert np.abs(new.velocity).max() < 1.0
     jax.tree.map(np.testing.assert_array_equal, new.first, wanted)
 
 
 def test_rest_without_displacements_corrects_a_wrong_velocity():
     """Displacements until interval 38 and then none; a false knock of 4 m/s; then 36 s at rest."""
-    config = filtering.FilterConfig(DT, N, CLONES, measurement_scale=1.0, zero_velocity_std=0.02,
-                                    rest_seconds=0.3, convergence_seconds=1.0)
+    config = filtering.FilterConfig(
+        DT,
+        N,
+        CLONES,
+        measurement_scale=1.0,
+        zero_velocity_std=0.02,
+        rest_seconds=0.3,
+        convergence_seconds=1.0,
+    )
     intervals, last, knock = 400, 38, 39 * N
     gyro, accel = np.zeros((N * intervals, 3)), np.tile([0, 0, 9.81], (N * intervals, 1))
     accel[knock, 0] += 4.0 / DT
@@ -275,8 +356,15 @@ def test_rest_without_displacements_corrects_a_wrong_velocity():
 def test_a_quiet_ride_is_no_rest_and_a_wrong_start_is_corrected_by_rest():
     """A carriage that glides at 1 m/s, as the filter knows by displacements; and a device at rest
     that starts with 3 m/s, so sure of it that it would not pass the test."""
-    config = filtering.FilterConfig(DT, N, CLONES, measurement_scale=1.0, zero_velocity_std=0.02,
-                                    rest_seconds=0.3, convergence_seconds=1.0)
+    config = filtering.FilterConfig(
+        DT,
+        N,
+        CLONES,
+        measurement_scale=1.0,
+        zero_velocity_std=0.02,
+        rest_seconds=0.3,
+        convergence_seconds=1.0,
+    )
     gliding, samples = 30, N * INTERVALS
     gyro, accel = np.zeros((samples, 3)), np.tile([0, 0, 9.81], (samples, 1))
     accel[: N * gliding : 2, 2] += 1.0  # rattles before
@@ -284,8 +372,13 @@ def test_a_quiet_ride_is_no_rest_and_a_wrong_start_is_corrected_by_rest():
     spread = np.tile(0.02**2 * np.eye(3), (INTERVALS, 1, 1))
 
     def go(speed, accel, displacement):
-        state = filtering.initial_state(config, np.eye(3), np.array([speed, 0.0, 0.0]), np.zeros(3),
-                                        std=filtering.InitialStd(velocity=0.05))
+        state = filtering.initial_state(
+            config,
+            np.eye(3),
+            np.array([speed, 0.0, 0.0]),
+            np.zeros(3),
+            std=filtering.InitialStd(velocity=0.05),
+        )
         return filtering.run_filter(state, gyro, accel, displacement, spread, config, NOISE)[1]
 
     history = go(1.0, accel, np.tile([CLONES * N * DT, 0.0, 0.0], (INTERVALS, 1)))
@@ -306,20 +399,33 @@ def test_level_state(pitch):
     R = Rotation.from_euler("ZYX", [0.0, pitch, 0.4]).as_matrix()
     accel = R.T @ [0, 0, 9.81] + 0.01 * rng.standard_normal((50, 3))
     state = filtering.level_state(CONFIG, 0.01 * rng.standard_normal((50, 3)), accel)
-    np.testing.assert_allclose(state.rotation @ accel.mean(0) / np.linalg.norm(accel.mean(0)), [0, 0, 1], atol=1e-12)
+    np.testing.assert_allclose(
+        state.rotation @ accel.mean(0) / np.linalg.norm(accel.mean(0)), [0, 0, 1], atol=1e-12
+    )
     if abs(pitch) < 1:
         np.testing.assert_allclose(state.rotation, R, atol=2e-3)
-    np.testing.assert_allclose(np.asarray(state.rotation) @ np.asarray(state.rotation).T, np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(
+        np.asarray(state.rotation) @ np.asarray(state.rotation).T, np.eye(3), atol=1e-12
+    )
     assert np.linalg.det(state.rotation) > 0
     sigma = np.sqrt(np.diag(state.core_covariance))
     spread = np.sqrt(accel.var(0).sum())
-    np.testing.assert_allclose(sigma[0], np.sqrt(0.02**2 + spread**2 / 2.0) / 9.81, rtol=1e-9)  # one second, two half seconds
+    np.testing.assert_allclose(
+        sigma[0], np.sqrt(0.02**2 + spread**2 / 2.0) / 9.81, rtol=1e-9
+    )  # one second, two half seconds
     np.testing.assert_allclose(sigma[3:6], 0.05)
-    shaken = filtering.level_state(CONFIG, np.zeros((50, 3)), accel + np.sin(np.arange(50))[:, None])
-    assert np.sqrt(shaken.core_covariance[3, 3]) == 1.0 and shaken.core_covariance[0, 0] > state.core_covariance[0, 0]
+    shaken = filtering.level_state(
+        CONFIG, np.zeros((50, 3)), accel + np.sin(np.arange(50))[:, None]
+    )
+    assert (
+        np.sqrt(shaken.core_covariance[3, 3]) == 1.0
+        and shaken.core_covariance[0, 0] > state.core_covariance[0, 0]
+    )
 
 
-@pytest.mark.parametrize("up", [[0.0, 0, 1], [0, 0, -1], [1, 0, 0], [-1, 0, 0], [0, 1, 0], [0.3, -0.2, 0.9]])
+@pytest.mark.parametrize(
+    "up", [[0.0, 0, 1], [0, 0, -1], [1, 0, 0], [-1, 0, 0], [0, 1, 0], [0.3, -0.2, 0.9]]
+)
 def test_level_is_a_rotation_with_derivatives(up):
     up = jnp.asarray(up, float)
     rotation = geometry.level(up)
@@ -340,7 +446,15 @@ def test_orthonormalize_is_the_nearest_rotation():
 
 def spoilt(name):
     _, gyro, accel, d, c = WALK
-    given = dict(state=start(), gyro=gyro.copy(), accel=accel.copy(), displacement=d, covariance=c.copy(), config=CONFIG, noise=NOISE)
+    given = dict(
+        state=start(),
+        gyro=gyro.copy(),
+        accel=accel.copy(),
+        displacement=d,
+        covariance=c.copy(),
+        config=CONFIG,
+        noise=NOISE,
+    )
     if name == "gyro":
         given["gyro"][7, 1] = np.nan
     elif name == "accel":
@@ -368,18 +482,43 @@ def spoilt(name):
     return given
 
 
-@pytest.mark.parametrize("name", [
-    "gyro", "accel", "covariance", "covariance skew", "imu_valid", "imu_valid length", "state.core_covariance", "state.rotation",
-    "state.velocity", "state: was made", "noise.accel_density", "noise.gyro_bias_walk"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "gyro",
+        "accel",
+        "covariance",
+        "covariance skew",
+        "imu_valid",
+        "imu_valid length",
+        "state.core_covariance",
+        "state.rotation",
+        "state.velocity",
+        "state: was made",
+        "noise.accel_density",
+        "noise.gyro_bias_walk",
+    ],
+)
 def test_impossible_values_are_refused_by_name(name):
     with pytest.raises(ValueError, match=f"^{name.split(' skew')[0].split(' length')[0]}"):
         filtering.run_filter(**spoilt(name))
 
 
-@pytest.mark.parametrize("field,value", [("velocity", np.nan), ("position", np.inf), ("gyro_bias", np.nan), ("rotation", 2 * np.eye(3)),
-                                         ("std.tilt", -1.0), ("std.yaw", np.nan)])
+@pytest.mark.parametrize(
+    "field,value",
+    [
+        ("velocity", np.nan),
+        ("position", np.inf),
+        ("gyro_bias", np.nan),
+        ("rotation", 2 * np.eye(3)),
+        ("std.tilt", -1.0),
+        ("std.yaw", np.nan),
+    ],
+)
 def test_an_impossible_start_is_refused_by_name(field, value):
-    given = dict(rotation=np.eye(3), velocity=np.zeros(3), position=np.zeros(3), gyro_bias=np.zeros(3))
+    given = dict(
+        rotation=np.eye(3), velocity=np.zeros(3), position=np.zeros(3), gyro_bias=np.zeros(3)
+    )
     if field.startswith("std."):
         given["std"] = filtering.InitialStd(**{field[4:]: value})
     else:
@@ -402,10 +541,25 @@ def test_log_likelihood_is_that_of_the_innovation():
     (R, v, p), gyro, accel, d, c = WALK
     _, history = run()
     noise = filtering.NoiseModel()
-    wanted = scekf_numpy.run(gyro, accel, d, c, R, v, p, dt=DT, n=N, clones=CLONES, sigma_gyro=noise.gyro_density / np.sqrt(DT),
-                             sigma_accel=noise.accel_density / np.sqrt(DT), scale=2.0)
+    wanted = scekf_numpy.run(
+        gyro,
+        accel,
+        d,
+        c,
+        R,
+        v,
+        p,
+        dt=DT,
+        n=N,
+        clones=CLONES,
+        sigma_gyro=noise.gyro_density / np.sqrt(DT),
+        sigma_accel=noise.accel_density / np.sqrt(DT),
+        scale=2.0,
+    )
     found = np.asarray(history.log_likelihood)
     assert np.isnan(found[:CLONES]).all()
     for k in range(CLONES, INTERVALS):
-        expected = multivariate_normal.logpdf(wanted["innovation"][k], cov=wanted["innovation_covariance"][k])
+        expected = multivariate_normal.logpdf(
+            wanted["innovation"][k], cov=wanted["innovation_covariance"][k]
+        )
         np.testing.assert_allclose(found[k], expected, rtol=1e-7)

@@ -13,8 +13,10 @@ from scipy.interpolate import CubicSpline
 from scipy.signal import firwin
 
 from gnio_jax import filtering, geometry
-from gnio_jax.data import sequence, synthetic
-from gnio_jax.filtering import Tracker, intake, online
+from gnio_jax.data import sequence
+from gnio_jax.data.readers import synthetic
+from gnio_jax.filtering import Tracker, intake
+from gnio_jax.filtering import tracker as online
 from gnio_jax.types import InputError, Prediction
 
 DT = 0.005
@@ -55,9 +57,17 @@ def tones(frequency, time):
     return np.sin(2 * np.pi * frequency * time[:, None] + np.arange(6))
 
 
-@pytest.mark.parametrize("rate, dt, jitter, highest", [
-    (400, 0.005, 0, 80), (416, 0.005, 0, 80), (1000, 0.005, 0, 80), (250, 0.005, 0, 55),
-    (208, 0.01, 0, 40), (400, 0.01, 0.2, 40)])
+@pytest.mark.parametrize(
+    "rate, dt, jitter, highest",
+    [
+        (400, 0.005, 0, 80),
+        (416, 0.005, 0, 80),
+        (1000, 0.005, 0, 80),
+        (250, 0.005, 0, 55),
+        (208, 0.01, 0, 40),
+        (400, 0.01, 0.2, 40),
+    ],
+)
 def test_pure_tones(rate, dt, jitter, highest):
     """The pass band within 1 %, without delay against the stamps; the stop band 40 dB down."""
     stamps = stamps_of(rate, 2.0, jitter)
@@ -103,15 +113,20 @@ def slow(stamps, values, rate, factor, half):
         if first == 0:
             known |= {-j: 2 * fine[0] - fine[j] for j in range(1, len(fine))}
         for k in grid[(grid * factor >= first) & (grid * factor <= last)]:
-            near = [(tap, known[k * factor + j]) for tap, j in
-                    zip(taps, range(-half, half + 1), strict=True) if k * factor + j in known]
+            near = [
+                (tap, known[k * factor + j])
+                for tap, j in zip(taps, range(-half, half + 1), strict=True)
+                if k * factor + j in known
+            ]
             weights, around = (np.array(part) for part in zip(*near, strict=True))
             rows[k] = [*(weights @ around / weights.sum()), 1.0]
     return rows
 
 
-@pytest.mark.parametrize("kind", ["multiple", "no multiple", "jitter", "holes", "missing",
-                                  "missing at first", "short runs"])
+@pytest.mark.parametrize(
+    "kind",
+    ["multiple", "no multiple", "jitter", "holes", "missing", "missing at first", "short runs"],
+)
 def test_against_a_slow_resampler(kind):
     """Holes, ends and starts of runs, grid samples that are missing, and when each is known."""
     rate, factor, half = (416, 6, 131) if kind == "no multiple" else (400, 2, 44)

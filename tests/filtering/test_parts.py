@@ -1,69 +1,95 @@
-"""Propagation and update against central differences of an independent mean; the doors; safe branches."""
+"""Propagation and update against central differences of an independent mean; the doors; safe
+branches."""
 
 import functools
-import sys
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from compiling import quick
 from scipy.spatial.transform import Rotation
 
 from gnio_jax import filtering
 from gnio_jax.filtering.gaps import Imu
+from gnio_jax.filtering.measurement import Measurement, displacement_residual, update
 from gnio_jax.filtering.propagation import interval
-from gnio_jax.filtering.scekf import _measurement
+from gnio_jax.filtering.scan import _measurement
 from gnio_jax.filtering.state import covariance
-from gnio_jax.filtering.update import Measurement, displacement_residual, update
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "reference"))
-import scekf_numpy
+from tests.support import scekf_numpy
+from tests.support.compiling import quick
 
 CONFIG = filtering.FilterConfig(0.01, 6, 2)
-POSE = (Rotation.from_euler("xyz", [0.4, -0.7, 2.5]).as_matrix(), np.array([1.0, 0.2, -0.3]), np.array([3.0, -2.0, 0.5]),
-        np.array([0.02, -0.01, 0.03]), np.array([0.1, -0.2, 0.05]))
+POSE = (
+    Rotation.from_euler("xyz", [0.4, -0.7, 2.5]).as_matrix(),
+    np.array([1.0, 0.2, -0.3]),
+    np.array([3.0, -2.0, 0.5]),
+    np.array([0.02, -0.01, 0.03]),
+    np.array([0.1, -0.2, 0.05]),
+)
 
 
 def plus(mean, delta):
     """exp(δθ) R, the rest adds."""
     R, *rest = mean
-    return (Rotation.from_rotvec(delta[:3]).as_matrix() @ R, *[x + d for x, d in zip(rest, delta[3:].reshape(-1, 3), strict=True)])
+    return (
+        Rotation.from_rotvec(delta[:3]).as_matrix() @ R,
+        *[x + d for x, d in zip(rest, delta[3:].reshape(-1, 3), strict=True)],
+    )
 
 
 def minus(a, b):
-    return np.concatenate([Rotation.from_matrix(a[0] @ b[0].T).as_rotvec(), *[x - y for x, y in zip(a[1:], b[1:], strict=True)]])
+    return np.concatenate(
+        [
+            Rotation.from_matrix(a[0] @ b[0].T).as_rotvec(),
+            *[x - y for x, y in zip(a[1:], b[1:], strict=True)],
+        ]
+    )
 
 
 def integrate(mean, gyro, accel, dt, gyro_noise=None, accel_noise=None):
     R, v, p, bg, ba = mean
     for k in range(len(gyro)):
-        w, a = (0 if gyro_noise is None else gyro_noise[k]), (0 if accel_noise is None else accel_noise[k])
+        w, a = (
+            (0 if gyro_noise is None else gyro_noise[k]),
+            (0 if accel_noise is None else accel_noise[k]),
+        )
         R, v, p = scekf_numpy.step_mean(R, v, p, bg, ba, gyro[k] + w, accel[k] + a, dt)
     return R, v, p, bg, ba
 
 
 def differences(function, size, step=1e-5):
-    return np.stack([(function(step * e) - function(-step * e)) / (2 * step) for e in np.eye(size)], axis=1)
+    return np.stack(
+        [(function(step * e) - function(-step * e)) / (2 * step) for e in np.eye(size)], axis=1
+    )
 
 
 def test_interval_against_differences_of_the_mean():
-    """Φ by differences in the state at the start, Q by differences in every sample's noise and every step of the biases."""
+    """Φ by differences in the state at the start, Q by differences in every sample's noise and
+    every step of the biases."""
     rng = np.random.default_rng(0)
-    n, dt = CONFIG.samples_per_clone, 0.05  # long steps and fast turns, so that J_r is far from the identity
+    n, dt = (
+        CONFIG.samples_per_clone,
+        0.05,
+    )  # long steps and fast turns, so that J_r is far from the identity
     gyro, accel = 8 * rng.standard_normal((n, 3)), 10 * rng.standard_normal((n, 3))
     noise = filtering.NoiseModel(0.03, 0.2, 0.04, 0.5)
     state = filtering.initial_state(CONFIG, *POSE)
-    motion = jax.jit(interval, static_argnames="dt")(state, Imu(jnp.asarray(gyro), jnp.asarray(accel), None), noise, dt=dt)
+    motion = jax.jit(interval, static_argnames="dt")(
+        state, Imu(jnp.asarray(gyro), jnp.asarray(accel), None), noise, dt=dt
+    )
 
     end = integrate(POSE, gyro, accel, dt)
-    np.testing.assert_allclose(minus((motion.rotation, motion.velocity, state.anchor + motion.offset, *POSE[3:]), end), 0, atol=1e-13)
+    np.testing.assert_allclose(
+        minus((motion.rotation, motion.velocity, state.anchor + motion.offset, *POSE[3:]), end),
+        0,
+        atol=1e-13,
+    )
     transition = differences(lambda d: minus(integrate(plus(POSE, d), gyro, accel, dt), end), 15)
     np.testing.assert_allclose(motion.transition, transition, atol=2e-8)
 
     expected = np.zeros((15, 15))
     for k in range(n):
+
         def with_noise(d, k=k):
             w, a = np.zeros((n, 3)), np.zeros((n, 3))
             w[k], a[k] = d[:3], d[3:]
@@ -81,7 +107,9 @@ def test_interval_against_differences_of_the_mean():
     np.testing.assert_allclose(motion.noise, motion.noise.T, atol=1e-15)
 
 
-@pytest.mark.parametrize("angles", [(0.0, 0.0, 0.0), (0.3, 0.9, -2.0), (-2.0, -1.4, 3.1), (0.1, 1.5706, 1.0)])
+@pytest.mark.parametrize(
+    "angles", [(0.0, 0.0, 0.0), (0.3, 0.9, -2.0), (-2.0, -1.4, 3.1), (0.1, 1.5706, 1.0)]
+)
 def test_measurement_jacobian_against_differences(angles):
     Ri = Rotation.from_euler("xyz", angles).as_matrix()
     pi, pj, d = np.array([1.0, 2.0, 3.0]), np.array([2.5, 1.2, 3.3]), np.array([1.0, 0.3, 0.1])
@@ -95,7 +123,9 @@ def test_measurement_jacobian_against_differences(angles):
     np.testing.assert_allclose(found, residual(np.zeros(9)), atol=1e-12)
     assert bool(defined)
     expected = -differences(residual, 9, 1e-7 if angles[1] > 1.5 else 1e-5)
-    np.testing.assert_allclose(jacobian, expected, rtol=1e-5, atol=1e-7 if angles[1] < 1.5 else 1e-2)
+    np.testing.assert_allclose(
+        jacobian, expected, rtol=1e-5, atol=1e-7 if angles[1] < 1.5 else 1e-2
+    )
 
 
 def test_gimbal_lock_begins_at_its_limit():
@@ -105,14 +135,24 @@ def test_gimbal_lock_begins_at_its_limit():
 
 
 def at_singularity(kind):
-    """A state with clones, and a measurement, at a point where a careless branch has no finite derivative."""
-    rotation = Rotation.from_euler("y", 90, degrees=True).as_matrix() if kind == "gimbal" else np.eye(3)
+    """A state with clones, and a measurement, at a point where a careless branch has no finite
+    derivative."""
+    rotation = (
+        Rotation.from_euler("y", 90, degrees=True).as_matrix() if kind == "gimbal" else np.eye(3)
+    )
     state = filtering.initial_state(CONFIG, rotation, np.zeros(3), np.zeros(3))
     apart = 0.0 if kind == "coincident clones" else 1.0
-    state = state._replace(clone_rotation=jnp.tile(jnp.asarray(rotation)[None], (3, 1, 1)), step=jnp.int32(5),
-                           clone_offset=jnp.asarray([[-apart, 0, 0], [0, 0, 0], [0, 0, 0]]),
-                           gate=filtering.GateState(jnp.bool_(True), jnp.int32(25), jnp.int32(0)))
-    displacement = jnp.asarray([np.nan, 0, 0] if kind == "missing" else [apart + (90.0 if kind == "rejected" else 0.1), 0, 0])
+    state = state._replace(
+        clone_rotation=jnp.tile(jnp.asarray(rotation)[None], (3, 1, 1)),
+        step=jnp.int32(5),
+        clone_offset=jnp.asarray([[-apart, 0, 0], [0, 0, 0], [0, 0, 0]]),
+        gate=filtering.GateState(jnp.bool_(True), jnp.int32(25), jnp.int32(0)),
+    )
+    displacement = jnp.asarray(
+        [np.nan, 0, 0]
+        if kind == "missing"
+        else [apart + (90.0 if kind == "rejected" else 0.1), 0, 0]
+    )
     return state, displacement
 
 
@@ -121,11 +161,17 @@ def at_singularity(kind):
 def update_gradient(state, displacement, covariance, frame="given"):
     measurement = _measurement(displacement, covariance, CONFIG)
     new, outcome = update(state, measurement, 2, 0, CONFIG, frame)
-    leaves = [leaf for leaf in jax.tree.leaves((new, outcome)) if jnp.issubdtype(leaf.dtype, jnp.floating)]
-    return sum(jnp.sum(leaf * (1 + jnp.arange(leaf.size).reshape(leaf.shape))) for leaf in leaves), (new, outcome)
+    leaves = [
+        leaf for leaf in jax.tree.leaves((new, outcome)) if jnp.issubdtype(leaf.dtype, jnp.floating)
+    ]
+    return sum(
+        jnp.sum(leaf * (1 + jnp.arange(leaf.size).reshape(leaf.shape))) for leaf in leaves
+    ), (new, outcome)
 
 
-@pytest.mark.parametrize("kind", ["plain", "gimbal", "missing", "rejected", "coincident clones", "no innovation"])
+@pytest.mark.parametrize(
+    "kind", ["plain", "gimbal", "missing", "rejected", "coincident clones", "no innovation"]
+)
 def test_update_has_finite_derivatives_everywhere(kind):
     state, displacement = at_singularity(kind)
     if kind == "no innovation":
@@ -155,7 +201,9 @@ def test_in_its_own_frame_there_is_no_gimbal_lock():
 def test_an_update_needs_both_clones():
     state, displacement = at_singularity("plain")
     state = state._replace(step=jnp.int32(2))
-    new, outcome = update(state, Measurement(displacement, 0.1 * jnp.eye(3), jnp.bool_(True)), 2, 0, CONFIG)
+    new, outcome = update(
+        state, Measurement(displacement, 0.1 * jnp.eye(3), jnp.bool_(True)), 2, 0, CONFIG
+    )
     assert not outcome.present and not outcome.accepted
     np.testing.assert_array_equal(new.position, state.position)
 
@@ -167,51 +215,104 @@ def test_noise_densities():
     state = filtering.initial_state(CONFIG, *POSE)
     gyro, accel = jnp.zeros((6, 3)), jnp.zeros((6, 3))
     sigmas = filtering.NoiseModel.per_sample(0.1, 0.2, 0.5)
-    once = jax.jit(interval, static_argnames="dt")(state, Imu(gyro[:1], accel[:1], None), sigmas, dt=0.5).noise
+    once = jax.jit(interval, static_argnames="dt")(
+        state, Imu(gyro[:1], accel[:1], None), sigmas, dt=0.5
+    ).noise
     np.testing.assert_allclose(np.diag(once)[3:6], 0.2**2 * 0.5**2, rtol=1e-6)
 
 
 def test_initial_state():
     state = filtering.initial_state(CONFIG, *POSE, std=filtering.InitialStd(*np.arange(1.0, 7.0)))
     core = np.asarray(covariance(state))[:15, :15]
-    np.testing.assert_array_equal(np.diag(core), np.array([1, 1, 2, 3, 3, 3, 4, 4, 4, 5, 5, 5, 6, 6, 6.0]) ** 2)
+    np.testing.assert_array_equal(
+        np.diag(core), np.array([1, 1, 2, 3, 3, 3, 4, 4, 4, 5, 5, 5, 6, 6, 6.0]) ** 2
+    )
     assert np.count_nonzero(core) == 15
     for found, wanted in zip((*state[:2], state.position, *state[3:5]), POSE, strict=True):
         np.testing.assert_array_equal(found, wanted)
-    np.testing.assert_array_equal(filtering.initial_state(CONFIG, *POSE[:3], gyro_bias=0.5).gyro_bias, np.full(3, 0.5))
-    defaults = np.sqrt(np.diag(covariance(filtering.initial_state(CONFIG, *POSE))))[[0, 2, 3, 6, 9, 12]]
+    np.testing.assert_array_equal(
+        filtering.initial_state(CONFIG, *POSE[:3], gyro_bias=0.5).gyro_bias, np.full(3, 0.5)
+    )
+    defaults = np.sqrt(np.diag(covariance(filtering.initial_state(CONFIG, *POSE))))[
+        [0, 2, 3, 6, 9, 12]
+    ]
     np.testing.assert_allclose(defaults, [np.pi / 180, np.pi / 1800, 1.0, 1e-3, 1e-4, 0.02])
 
 
-@pytest.mark.parametrize("name,value", [
-    ("dt", 0.0), ("dt", -0.01), ("dt", float("nan")), ("dt", "0.01"), ("dt", True), ("samples_per_clone", 0), ("samples_per_clone", 2.5),
-    ("clones_per_window", 0), ("clones_per_window", True), ("mahalanobis_fail_scale", -1.0), ("history", "all"),
-    ("measurement_scale", 0.0),
-    ("log_std_min", float("-inf")), ("gate_threshold", 0.0), ("convergence_seconds", -1.0), ("success_seconds", -1.0),
-    ("pause_seconds", -1.0), ("speed_limit", 0.0), ("speed_limit", float("inf")),
-    ("window_rotation", "none"), ("allow_float32", 1)])
+@pytest.mark.parametrize(
+    "name,value",
+    [
+        ("dt", 0.0),
+        ("dt", -0.01),
+        ("dt", float("nan")),
+        ("dt", "0.01"),
+        ("dt", True),
+        ("samples_per_clone", 0),
+        ("samples_per_clone", 2.5),
+        ("clones_per_window", 0),
+        ("clones_per_window", True),
+        ("mahalanobis_fail_scale", -1.0),
+        ("history", "all"),
+        ("measurement_scale", 0.0),
+        ("log_std_min", float("-inf")),
+        ("gate_threshold", 0.0),
+        ("convergence_seconds", -1.0),
+        ("success_seconds", -1.0),
+        ("pause_seconds", -1.0),
+        ("speed_limit", 0.0),
+        ("speed_limit", float("inf")),
+        ("window_rotation", "none"),
+        ("allow_float32", 1),
+    ],
+)
 def test_config_names_the_field_that_makes_no_sense(name, value):
     with pytest.raises(ValueError, match=f"^{name} "):
-        filtering.FilterConfig(**{"dt": 0.01, "samples_per_clone": 2, "clones_per_window": 3, name: value})
+        filtering.FilterConfig(
+            **{"dt": 0.01, "samples_per_clone": 2, "clones_per_window": 3, name: value}
+        )
 
 
 def test_config_is_static():
-    config = filtering.FilterConfig(np.array(0.01), np.array(6), np.int64(2), mahalanobis_fail_scale=0)
+    config = filtering.FilterConfig(
+        np.array(0.01), np.array(6), np.int64(2), mahalanobis_fail_scale=0
+    )
     assert config == CONFIG and hash(config) == hash(CONFIG) and config.window == 12
-    assert type(config.dt) is float and type(config.samples_per_clone) is int and type(config.mahalanobis_fail_scale) is float
+    assert (
+        type(config.dt) is float
+        and type(config.samples_per_clone) is int
+        and type(config.mahalanobis_fail_scale) is float
+    )
 
 
 def arguments():
-    return dict(state=filtering.initial_state(CONFIG, *POSE), gyro=np.zeros((24, 3)), accel=np.zeros((24, 3)),
-                displacement=np.zeros((4, 3)), covariance=np.tile(np.eye(3), (4, 1, 1)), config=CONFIG, noise=filtering.NoiseModel())
+    return dict(
+        state=filtering.initial_state(CONFIG, *POSE),
+        gyro=np.zeros((24, 3)),
+        accel=np.zeros((24, 3)),
+        displacement=np.zeros((4, 3)),
+        covariance=np.tile(np.eye(3), (4, 1, 1)),
+        config=CONFIG,
+        noise=filtering.NoiseModel(),
+    )
 
 
-@pytest.mark.parametrize("name,value", [
-    ("gyro", np.zeros((23, 3))), ("gyro", np.zeros((0, 3))), ("gyro", np.zeros(24)), ("gyro", np.zeros((24, 4))),
-    ("gyro", np.zeros((24, 3), np.float32)), ("gyro", np.zeros((24, 3), int)), ("accel", np.zeros((18, 3))),
-    ("accel", np.zeros((2, 24, 3))),
-    ("displacement", np.zeros((3, 3))), ("displacement", np.zeros((4, 3), np.float32)), ("covariance", np.zeros((4, 3))),
-    ("noise.gyro_density", filtering.NoiseModel(np.zeros(3)))])
+@pytest.mark.parametrize(
+    "name,value",
+    [
+        ("gyro", np.zeros((23, 3))),
+        ("gyro", np.zeros((0, 3))),
+        ("gyro", np.zeros(24)),
+        ("gyro", np.zeros((24, 4))),
+        ("gyro", np.zeros((24, 3), np.float32)),
+        ("gyro", np.zeros((24, 3), int)),
+        ("accel", np.zeros((18, 3))),
+        ("accel", np.zeros((2, 24, 3))),
+        ("displacement", np.zeros((3, 3))),
+        ("displacement", np.zeros((4, 3), np.float32)),
+        ("covariance", np.zeros((4, 3))),
+        ("noise.gyro_density", filtering.NoiseModel(np.zeros(3))),
+    ],
+)
 def test_run_filter_names_the_bad_argument(name, value):
     with pytest.raises(ValueError, match=f"^{name}:"):
         filtering.run_filter(**{**arguments(), name.split(".")[0]: value})
@@ -223,9 +324,18 @@ def test_state_of_another_window_is_refused():
         filtering.run_filter(**{**arguments(), "state": other})
 
 
-@pytest.mark.parametrize("name,value", [
-    ("rotation", np.eye(4)), ("rotation", np.eye(3, dtype=np.float32)), ("velocity", np.zeros(2)), ("position", np.zeros((1, 3))),
-    ("gyro_bias", np.zeros(4)), ("accel_bias", np.zeros((3, 1))), ("std.yaw", filtering.InitialStd(yaw=np.zeros(3)))])
+@pytest.mark.parametrize(
+    "name,value",
+    [
+        ("rotation", np.eye(4)),
+        ("rotation", np.eye(3, dtype=np.float32)),
+        ("velocity", np.zeros(2)),
+        ("position", np.zeros((1, 3))),
+        ("gyro_bias", np.zeros(4)),
+        ("accel_bias", np.zeros((3, 1))),
+        ("std.yaw", filtering.InitialStd(yaw=np.zeros(3))),
+    ],
+)
 def test_initial_state_names_the_bad_argument(name, value):
     good = dict(rotation=POSE[0], velocity=POSE[1], position=POSE[2])
     with pytest.raises(ValueError, match=f"^{name}:"):
@@ -234,13 +344,19 @@ def test_initial_state_names_the_bad_argument(name, value):
 
 def test_float32_only_when_asked():
     single = lambda value: np.asarray(value, np.float32)  # noqa: E731
-    with pytest.raises(ValueError, match=r"^rotation: the filter runs in float64, found float32.*allow_float32"):
+    with pytest.raises(
+        ValueError, match=r"^rotation: the filter runs in float64, found float32.*allow_float32"
+    ):
         filtering.initial_state(CONFIG, single(POSE[0]), single(POSE[1]), single(POSE[2]))
     config = filtering.FilterConfig(0.01, 6, 2, allow_float32=True)
     state = filtering.initial_state(config, *map(single, POSE))
     given = {**arguments(), "state": state, "config": config}
     final, history = filtering.run_filter(**given)
-    leaves = [leaf for leaf in jax.tree.leaves((final, history)) if jnp.issubdtype(leaf.dtype, jnp.floating)]
+    leaves = [
+        leaf
+        for leaf in jax.tree.leaves((final, history))
+        if jnp.issubdtype(leaf.dtype, jnp.floating)
+    ]
     assert all(leaf.dtype == jnp.float32 for leaf in leaves)
 
 

@@ -19,18 +19,28 @@ def hour():
     pitch, roll = 0.2 * np.sin(2 * np.pi * t / 3.1), 0.3 + 0.15 * np.sin(2 * np.pi * t / 2.3)
     attitude = Rotation.from_euler("ZYX", np.stack([yaw, pitch, roll], 1))
     speed = 1.2 + 0.3 * np.sin(2 * np.pi * t / 53)
-    velocity = np.stack([speed * np.cos(yaw), speed * np.sin(yaw), 0.1 * np.sin(2 * np.pi * 1.8 * t)], 1)
-    position = np.concatenate([np.zeros((1, 3)), np.cumsum(0.5 * (velocity[1:] + velocity[:-1]) * DT, 0)])
+    velocity = np.stack(
+        [speed * np.cos(yaw), speed * np.sin(yaw), 0.1 * np.sin(2 * np.pi * 1.8 * t)], 1
+    )
+    position = np.concatenate(
+        [np.zeros((1, 3)), np.cumsum(0.5 * (velocity[1:] + velocity[:-1]) * DT, 0)]
+    )
     back, forth = attitude[:-1].inv(), attitude[1:]
     noise = filtering.NoiseModel()
     gyro = (back * forth).as_rotvec() / DT + 1e-4 * np.array([1, -1, 0.5])
-    accel = back.apply((velocity[1:] - velocity[:-1]) / DT + [0, 0, 9.81]) + 0.02 * np.array([1, -1, 0.5])
+    accel = back.apply((velocity[1:] - velocity[:-1]) / DT + [0, 0, 9.81]) + 0.02 * np.array(
+        [1, -1, 0.5]
+    )
     gyro += noise.gyro_density / np.sqrt(DT) * rng.standard_normal(gyro.shape)
     accel += noise.accel_density / np.sqrt(DT) * rng.standard_normal(accel.shape)
     ends = np.arange(1, MEASUREMENTS + 1) * N
     displacement = np.full((MEASUREMENTS, 3), np.nan)
     start = ends[CLONES:] - CLONES * N
-    displacement[CLONES:] = Rotation.from_euler("z", yaw[start][:, None]).inv().apply(position[ends[CLONES:]] - position[start])
+    displacement[CLONES:] = (
+        Rotation.from_euler("z", yaw[start][:, None])
+        .inv()
+        .apply(position[ends[CLONES:]] - position[start])
+    )
     displacement += SIGMA * rng.standard_normal(displacement.shape)
     return attitude[0].as_matrix(), velocity[0], gyro, accel, displacement, position[ends]
 
@@ -39,11 +49,19 @@ def test_float32_holds_for_an_hour():
     rotation, velocity, gyro, accel, displacement, truth = hour()
     found = {}
     for dtype in (np.float64, np.float32):
-        config = filtering.FilterConfig(DT, N, CLONES, history="core", allow_float32=dtype == np.float32)
+        config = filtering.FilterConfig(
+            DT, N, CLONES, history="core", allow_float32=dtype == np.float32
+        )
         given = [jnp.asarray(x, dtype) for x in (rotation, velocity, np.zeros(3))]
         spread = jnp.tile(jnp.asarray(SIGMA**2 * np.eye(3), dtype)[None], (len(truth), 1, 1))
         signals = [jnp.asarray(x, dtype) for x in (gyro, accel, displacement)]
-        final, history = filtering.run_filter(filtering.initial_state(config, *given), *signals, spread, config, filtering.NoiseModel())
+        final, history = filtering.run_filter(
+            filtering.initial_state(config, *given),
+            *signals,
+            spread,
+            config,
+            filtering.NoiseModel(),
+        )
         history = jax.tree.map(np.asarray, history)
         assert history.position.dtype == dtype and (history.healthy == 1).all()
         found[dtype] = (history, np.sqrt(((history.position - truth) ** 2).sum(1).mean()))

@@ -7,15 +7,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from compiling import quick
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from test_scekf import random_walk
 
 from gnio_jax import filtering
-from gnio_jax.filtering import Tracker, update
+from gnio_jax.filtering import Tracker
+from gnio_jax.filtering import measurement as update
 from gnio_jax.filtering.state import OFFSET
 from gnio_jax.types import Prediction
+from tests.support.compiling import quick
+from tests.support.random_walk import random_walk
 
 N, CLONES, DT = 4, 4, 0.02
 CONFIG = filtering.FilterConfig(
@@ -323,7 +324,9 @@ def test_a_displacement_takes_first_estimates_anew_where_it_corrects_much(
     gate = filtering.GateState(jnp.bool_(converged), jnp.int32(95), jnp.int32(0))
     state = state._replace(step=jnp.int32(20), gate=gate)
     state = state._replace(first=jax.tree.map(lambda part: part + 0.25, state.first))
-    measurement = update.Measurement(jnp.array([3.0, -4.0, 0.0]), 0.01 * jnp.eye(3), jnp.bool_(True))
+    measurement = update.Measurement(
+        jnp.array([3.0, -4.0, 0.0]), 0.01 * jnp.eye(3), jnp.bool_(True)
+    )
     new, outcome, made = update.correct(state, measurement, 0, 1, config, "given")
     assert float(outcome.nis) > 50 and bool(outcome.accepted) == accepted
     moved = float(jnp.linalg.norm((made.whitened @ made.core_rows)[OFFSET]))

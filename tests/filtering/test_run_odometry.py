@@ -1,8 +1,7 @@
-"""The network in the loop against windows cut by brute force, and derivatives of the whole filter against central differences."""
+"""The network in the loop against windows cut by brute force, and derivatives of the whole filter
+against central differences."""
 
 import dataclasses
-import sys
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -12,27 +11,19 @@ from scipy.spatial.transform import Rotation
 
 from gnio_jax import filtering
 from gnio_jax.types import Prediction
+from tests.support import scekf_numpy
+from tests.support.odometry import (
+    CLONES,
+    CONFIG,
+    DT,
+    INTERVALS,
+    PARAMETERS,
+    N,
+    recording,
+    start,
+)
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "reference"))
-import scekf_numpy
-
-N, CLONES, INTERVALS, DT = 4, 4, 26, 0.02
-CONFIG = filtering.FilterConfig(DT, N, CLONES, convergence_seconds=0.6, measurement_scale=2.0)
 NOISE = filtering.NoiseModel()
-PARAMETERS = np.random.default_rng(5).standard_normal((6, 3)) * 0.02
-
-
-def recording(seed):
-    rng = np.random.default_rng(seed)
-    t = np.arange(N * INTERVALS) * DT
-    gyro = np.sin(t[:, None] * rng.uniform(2, 5, 3) + rng.uniform(0, 6, 3))
-    accel = np.cos(t[:, None] * rng.uniform(2, 5, 3)) + Rotation.from_euler("xyz", [0.3, -0.2, 1.0]).inv().apply([0, 0, 9.81])
-    return gyro, accel
-
-
-def start(config=CONFIG):
-    rotation = Rotation.from_euler("xyz", [0.3, -0.2, 1.0]).as_matrix()
-    return filtering.initial_state(config, rotation, np.array([0.5, 0.0, 0.0]), np.zeros(3), np.array([0.02, -0.01, 0.03]), 0.1)
 
 
 def predict(windows, parameters=PARAMETERS):
@@ -40,7 +31,11 @@ def predict(windows, parameters=PARAMETERS):
     assert windows.shape == (1, N * CLONES, 6) and windows.dtype == jnp.float32
     ramp = jnp.linspace(0.5, 1.5, N * CLONES, dtype=jnp.float32)[None, :, None]
     pooled = jnp.mean(ramp * windows, axis=1) @ jnp.asarray(parameters, jnp.float32)
-    return Prediction(pooled, -2.0 + 0.1 * pooled, {"gate": jnp.tanh(pooled), "attention": jnp.ones((1, 2, 3), jnp.float32)})
+    return Prediction(
+        pooled,
+        -2.0 + 0.1 * pooled,
+        {"gate": jnp.tanh(pooled), "attention": jnp.ones((1, 2, 3), jnp.float32)},
+    )
 
 
 def predict_numpy(window):
@@ -51,7 +46,14 @@ def predict_numpy(window):
 @pytest.mark.parametrize("window_rotation", ["per_sample", "single"])
 def test_windows_are_cut_with_the_state_of_the_filter(window_rotation):
     gyro, accel = recording(0)
-    config = filtering.FilterConfig(DT, N, CLONES, convergence_seconds=0.6, measurement_scale=2.0, window_rotation=window_rotation)
+    config = filtering.FilterConfig(
+        DT,
+        N,
+        CLONES,
+        convergence_seconds=0.6,
+        measurement_scale=2.0,
+        window_rotation=window_rotation,
+    )
 
     def measure(k, clone_rotation, gyro_bias, accel_bias):
         cut = slice((k - CLONES + 1) * N, (k + 1) * N)
@@ -64,23 +66,55 @@ def test_windows_are_cut_with_the_state_of_the_filter(window_rotation):
         return predict_numpy(np.array(rows))
 
     state = start(config)
-    _, history = jax.jit(lambda state: filtering.run_odometry(predict, state, gyro, accel, config, filtering.NoiseModel()))(state)
+    _, history = jax.jit(
+        lambda state: filtering.run_odometry(
+            predict, state, gyro, accel, config, filtering.NoiseModel()
+        )
+    )(state)
     noise = filtering.NoiseModel()
     wanted = scekf_numpy.run(
-        gyro, accel, None, None, *[np.asarray(value) for value in state[:3]], dt=DT, n=N, clones=CLONES,
-        bg=np.asarray(state.gyro_bias), ba=np.asarray(state.accel_bias), sigma_gyro=noise.gyro_density / np.sqrt(DT),
-        sigma_accel=noise.accel_density / np.sqrt(DT), convergence=0.6, scale=2.0, measure=measure,
-        frame="own")
+        gyro,
+        accel,
+        None,
+        None,
+        *[np.asarray(value) for value in state[:3]],
+        dt=DT,
+        n=N,
+        clones=CLONES,
+        bg=np.asarray(state.gyro_bias),
+        ba=np.asarray(state.accel_bias),
+        sigma_gyro=noise.gyro_density / np.sqrt(DT),
+        sigma_accel=noise.accel_density / np.sqrt(DT),
+        convergence=0.6,
+        scale=2.0,
+        measure=measure,
+        frame="own",
+    )
     assert np.nansum(wanted["accepted"]) > 5
     for name in ("accepted", "gate_passed"):
         np.testing.assert_array_equal(getattr(history, name), wanted[name])
-    for name in ("displacement", "position", "velocity", "rotation", "gyro_bias", "accel_bias", "innovation"):
-        np.testing.assert_allclose(getattr(history, name), wanted[name], atol=3e-6, err_msg=name)  # the network is float32
+    for name in (
+        "displacement",
+        "position",
+        "velocity",
+        "rotation",
+        "gyro_bias",
+        "accel_bias",
+        "innovation",
+    ):
+        np.testing.assert_allclose(
+            getattr(history, name), wanted[name], atol=3e-6, err_msg=name
+        )  # the network is float32
     std = np.sqrt(2.0) * np.exp(np.maximum(-2.0 + 0.1 * wanted["displacement"], -4.0))
     np.testing.assert_allclose(history.measurement_std, std, rtol=1e-5)
-    np.testing.assert_allclose(history.diagnostics["gate"], np.tanh(wanted["displacement"]), atol=3e-6)
+    np.testing.assert_allclose(
+        history.diagnostics["gate"], np.tanh(wanted["displacement"]), atol=3e-6
+    )
     assert history.diagnostics["attention"].shape == (INTERVALS, 2, 3)
-    assert np.isnan(history.diagnostics["attention"][:CLONES]).all() and (history.diagnostics["attention"][CLONES:] == 1).all()
+    assert (
+        np.isnan(history.diagnostics["attention"][:CLONES]).all()
+        and (history.diagnostics["attention"][CLONES:] == 1).all()
+    )
 
 
 def test_given_its_own_measurements_the_filter_repeats_itself():
@@ -101,10 +135,16 @@ def test_log_std_is_raised_to_its_floor():
     gyro, accel = recording(1)
 
     def sure(windows):
-        return Prediction(jnp.zeros((1, 3), jnp.float32), jnp.asarray([[-9.0, -4.5, 1.0]], jnp.float32))
+        return Prediction(
+            jnp.zeros((1, 3), jnp.float32), jnp.asarray([[-9.0, -4.5, 1.0]], jnp.float32)
+        )
 
-    _, history = jax.jit(lambda s: filtering.run_odometry(sure, s, gyro, accel, CONFIG, filtering.NoiseModel()))(start())
-    np.testing.assert_allclose(history.measurement_std[-1], np.sqrt(2.0) * np.exp([-4.0, -4.0, 1.0]), rtol=1e-12)
+    _, history = jax.jit(
+        lambda s: filtering.run_odometry(sure, s, gyro, accel, CONFIG, filtering.NoiseModel())
+    )(start())
+    np.testing.assert_allclose(
+        history.measurement_std[-1], np.sqrt(2.0) * np.exp([-4.0, -4.0, 1.0]), rtol=1e-12
+    )
 
 
 def test_vmap_keeps_the_branch_and_equals_single():
@@ -120,30 +160,28 @@ def test_vmap_keeps_the_branch_and_equals_single():
 
     many = jax.jit(jax.vmap(lambda *given: run(counting, *given)))(*signals)
     jax.effects_barrier()
-    assert len(calls) in (INTERVALS - CLONES, 2 * (INTERVALS - CLONES))  # once a step (or once a sequence), never before there is a window
+    assert len(calls) in (
+        INTERVALS - CLONES,
+        2 * (INTERVALS - CLONES),
+    )  # once a step (or once a sequence), never before there is a window
     alone = jax.jit(lambda *given: run(predict, *given))
     for index in range(2):
         one = alone(*[signal[index] for signal in signals])
-        jax.tree.map(lambda a, b, index=index: np.testing.assert_allclose(a[index], b, atol=3e-6), many, one)
+        jax.tree.map(
+            lambda a, b, index=index: np.testing.assert_allclose(a[index], b, atol=3e-6), many, one
+        )
 
 
 def test_predict_is_asked_for_what_it_must_return():
     gyro, accel = recording(0)
     good = predict(jnp.zeros((1, N * CLONES, 6), jnp.float32))
-    for bad in ((good.displacement, good.log_std), good._replace(displacement=good.displacement[0]),
-                good._replace(log_std=jnp.zeros((1, 2))), good._replace(diagnostics={"gate": jnp.zeros(3)})):
+    for bad in (
+        (good.displacement, good.log_std),
+        good._replace(displacement=good.displacement[0]),
+        good._replace(log_std=jnp.zeros((1, 2))),
+        good._replace(diagnostics={"gate": jnp.zeros(3)}),
+    ):
         with pytest.raises(ValueError, match=r"^predict: "):
-            filtering.run_odometry(lambda _, bad=bad: bad, start(), gyro, accel, CONFIG, filtering.NoiseModel())
-
-
-def central(function, x, step):
-    x = np.asarray(x, float)
-    out = np.empty(x.size)
-    for i in range(x.size):
-        e = np.zeros(x.size)
-        e[i] = step
-        out[i] = (function(x + e.reshape(x.shape)) - function(x - e.reshape(x.shape))) / (2 * step)
-    return out.reshape(x.shape)
-
-
-WEIGHTS = np.random.default_rng(3).standard_normal((INTERVALS, 3))
+            filtering.run_odometry(
+                lambda _, bad=bad: bad, start(), gyro, accel, CONFIG, filtering.NoiseModel()
+            )

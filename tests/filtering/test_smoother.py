@@ -1,40 +1,49 @@
-"""Smoothing against batch least squares over all states at once, and against the truth of many simulated walks."""
+"""Smoothing against batch least squares over all states at once, and against the truth of many
+simulated walks."""
 
 import functools
-import sys
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from compiling import quick
 from scipy.spatial.transform import Rotation
-from walks import errors, simulate
 
 from gnio_jax import filtering
 from gnio_jax.types import Prediction
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "reference"))
-import scekf_numpy
+from tests.support import scekf_numpy
+from tests.support.compiling import quick
+from tests.support.walks import errors, simulate
 
 N, CLONES, INTERVALS, DT = 4, 3, 14, 0.05
 SMALL = 3e-5  # of all noises together, so that what is not linear hardly counts: the deviations below shrink in proportion
 STD = filtering.InitialStd(*(SMALL * np.array([2.0, 1.0, 10.0, 1.0, 1.0, 10.0])))
 WHITE, WALK = SMALL * np.array([0.5, 2.0]), SMALL * np.array([0.3, 1.0])  # of a sample; of a second
-PRIOR = np.repeat([STD.tilt, STD.yaw, STD.velocity, STD.position, STD.gyro_bias, STD.accel_bias], [2, 1, 3, 3, 3, 3])
+PRIOR = np.repeat(
+    [STD.tilt, STD.yaw, STD.velocity, STD.position, STD.gyro_bias, STD.accel_bias],
+    [2, 1, 3, 3, 3, 3],
+)
 
 
 def plus(x, delta):
-    return (Rotation.from_rotvec(delta[:3]).as_matrix() @ x[0], *[part + d for part, d in zip(x[1:], delta[3:].reshape(4, 3), strict=True)])
+    return (
+        Rotation.from_rotvec(delta[:3]).as_matrix() @ x[0],
+        *[part + d for part, d in zip(x[1:], delta[3:].reshape(4, 3), strict=True)],
+    )
 
 
 def minus(x, y):
-    return np.concatenate([Rotation.from_matrix(x[0] @ y[0].T).as_rotvec(), *[a - b for a, b in zip(x[1:], y[1:], strict=True)]])
+    return np.concatenate(
+        [
+            Rotation.from_matrix(x[0] @ y[0].T).as_rotvec(),
+            *[a - b for a, b in zip(x[1:], y[1:], strict=True)],
+        ]
+    )
 
 
 def integrate(x, gyro, accel, disturbance=None):
-    """x = (R, v, p, b_g, b_a) over some samples; disturbance (samples, 12) of the readings and of the steps of the biases."""
+    """x = (R, v, p, b_g, b_a) over some samples; disturbance (samples, 12) of the readings and of
+    the steps of the biases."""
     R, v, p, bg, ba = x
     for j in range(len(gyro)):
         w, a, wg, wa = np.zeros((4, 3)) if disturbance is None else disturbance[j].reshape(4, 3)
@@ -44,19 +53,30 @@ def integrate(x, gyro, accel, disturbance=None):
 
 
 def differences(function, size, step=1e-6):
-    return np.stack([(function(step * e) - function(-step * e)) / (2 * step) for e in np.eye(size)], axis=1)
+    return np.stack(
+        [(function(step * e) - function(-step * e)) / (2 * step) for e in np.eye(size)], axis=1
+    )
 
 
 def walk(seed, still=0, intervals=INTERVALS):
-    """The truth (start and the end of every interval), the filter's start, gyro, accel, displacements and their covariances.
+    """The truth (start and the end of every interval), the filter's start, gyro, accel,
+    displacements and their covariances.
 
     The first `still` intervals are at rest."""
     rng = np.random.default_rng(seed)
     samples = N * intervals
     moving = (np.arange(samples) >= still * N)[:, None]
-    rate, force = moving * rng.normal(0, 1.0, (samples, 3)), moving * rng.normal(0, 2.0, (samples, 3))
-    x = (Rotation.from_euler("xyz", [0.3, -0.4, 2.0]).as_matrix(), np.array([1.0, -0.5, 0.2]) * (still == 0), np.array([3.0, -2.0, 1.0]),
-         np.array([0.01, -0.02, 0.015]), np.array([0.1, 0.05, -0.08]))
+    rate, force = (
+        moving * rng.normal(0, 1.0, (samples, 3)),
+        moving * rng.normal(0, 2.0, (samples, 3)),
+    )
+    x = (
+        Rotation.from_euler("xyz", [0.3, -0.4, 2.0]).as_matrix(),
+        np.array([1.0, -0.5, 0.2]) * (still == 0),
+        np.array([3.0, -2.0, 1.0]),
+        np.array([0.01, -0.02, 0.015]),
+        np.array([0.1, 0.05, -0.08]),
+    )
     truth, gyro, accel = [x], np.empty((samples, 3)), np.empty((samples, 3))
     for j in range(samples):
         gyro[j], accel[j] = rate[j] + x[3], x[0].T @ (force[j] - scekf_numpy.G) + x[4]
@@ -64,12 +84,17 @@ def walk(seed, still=0, intervals=INTERVALS):
         x = integrate(x, gyro[j : j + 1], accel[j : j + 1], steps[None])
         if (j + 1) % N == 0:
             truth.append(x)
-    gyro, accel = gyro + WHITE[0] * rng.normal(size=gyro.shape), accel + WHITE[1] * rng.normal(size=gyro.shape)
+    gyro, accel = (
+        gyro + WHITE[0] * rng.normal(size=gyro.shape),
+        accel + WHITE[1] * rng.normal(size=gyro.shape),
+    )
     displacement, covariance = np.full((intervals, 3), np.nan), np.full((intervals, 3, 3), np.nan)
     for k in range(CLONES, intervals):
         root = SMALL * (np.eye(3) + 0.3 * rng.normal(size=(3, 3)))
         past, now = truth[k + 1 - CLONES], truth[k + 1]
-        displacement[k] = scekf_numpy.yaw_matrix(past[0]).T @ (now[2] - past[2]) + root @ rng.normal(size=3)
+        displacement[k] = scekf_numpy.yaw_matrix(past[0]).T @ (
+            now[2] - past[2]
+        ) + root @ rng.normal(size=3)
         covariance[k] = root @ root.T
     start = plus(truth[0], PRIOR * rng.normal(size=15))
     return truth, start, gyro, accel, displacement, covariance
@@ -78,7 +103,8 @@ def walk(seed, still=0, intervals=INTERVALS):
 def most_probable(start, gyro, accel, measurements, stops):
     """Gauss-Newton over all states: those at the end of every interval, and their covariances.
 
-    measurements: {k: (displacement, covariance)} as they are to be applied; stops: {k: standard deviation of a velocity of zero}.
+    measurements: {k: (displacement, covariance)} as they are to be applied; stops: {k: standard
+    deviation of a velocity of zero}.
     """
     x = [start]
     for k in range(INTERVALS):
@@ -87,12 +113,26 @@ def most_probable(start, gyro, accel, measurements, stops):
     for k in range(INTERVALS):
         signals = gyro[k * N : (k + 1) * N], accel[k * N : (k + 1) * N]
         ideal = integrate(x[k], *signals)
-        reach = differences(lambda w, x=x[k], s=signals, i=ideal: minus(integrate(x, *s, w.reshape(N, 12)), i), 12 * N)
+        reach = differences(
+            lambda w, x=x[k], s=signals, i=ideal: minus(integrate(x, *s, w.reshape(N, 12)), i),
+            12 * N,
+        )
         spread = np.tile(np.repeat([*WHITE, *(WALK * np.sqrt(DT))], 3), N)
-        factors.append(((k, k + 1), lambda past, now, s=signals: minus(now, integrate(past, *s)), (reach * spread**2) @ reach.T))
+        factors.append(
+            (
+                (k, k + 1),
+                lambda past, now, s=signals: minus(now, integrate(past, *s)),
+                (reach * spread**2) @ reach.T,
+            )
+        )
     for k, (d, R) in measurements.items():
-        factors.append(((k + 1 - CLONES, k + 1),
-                        lambda past, now, d=d: d - scekf_numpy.yaw_matrix(past[0]).T @ (now[2] - past[2]), R))
+        factors.append(
+            (
+                (k + 1 - CLONES, k + 1),
+                lambda past, now, d=d: d - scekf_numpy.yaw_matrix(past[0]).T @ (now[2] - past[2]),
+                R,
+            )
+        )
     for k, std in stops.items():
         factors.append(((k + 1,), lambda now: now[1], std**2 * np.eye(3)))
 
@@ -100,7 +140,9 @@ def most_probable(start, gyro, accel, measurements, stops):
         information, gradient = np.zeros((15 * len(x), 15 * len(x))), np.zeros(15 * len(x))
         for index, residual, spread in factors:
             here = [x[i] for i in index]
-            slope = differences(lambda e, r=residual, h=here: r(*map(plus, h, e.reshape(-1, 15))), 15 * len(index))
+            slope = differences(
+                lambda e, r=residual, h=here: r(*map(plus, h, e.reshape(-1, 15))), 15 * len(index)
+            )
             at = np.concatenate([np.arange(15 * i, 15 * i + 15) for i in index])
             weighted = np.linalg.solve(spread, slope).T
             information[np.ix_(at, at)] += weighted @ slope
@@ -115,21 +157,40 @@ def most_probable(start, gyro, accel, measurements, stops):
 
 
 def rows_of(history):
-    return [tuple(np.asarray(part)[k] for part in history[:5]) for k in range(len(history.position))]
+    return [
+        tuple(np.asarray(part)[k] for part in history[:5]) for k in range(len(history.position))
+    ]
 
 
 REJECTED, MISSING = 9, (6, 7)
-CONFIG = functools.partial(filtering.FilterConfig, DT, N, CLONES, convergence_seconds=0.0, success_seconds=5.0, measurement_scale=2.0)
+CONFIG = functools.partial(
+    filtering.FilterConfig,
+    DT,
+    N,
+    CLONES,
+    convergence_seconds=0.0,
+    success_seconds=5.0,
+    measurement_scale=2.0,
+)
 NOISE = filtering.NoiseModel.per_sample(*WHITE, DT, *WALK)
 
 
 @pytest.mark.parametrize("case", ["rejected", "scaled", "weighted"])
 def test_equals_least_squares_over_all_states(case):
-    """Missing rows in all cases; a rejected row; one applied with scaled covariance; a gate with a slope, rest, and first estimates."""
+    """Missing rows in all cases; a rejected row; one applied with scaled covariance; a gate with a
+    slope, rest, and first estimates."""
     options = {
-        "rejected": dict(history="core"), "scaled": dict(history="core", mahalanobis_fail_scale=7.0),
-        "weighted": dict(gate_softness=3.0, gate_threshold=4.0, zero_velocity_std=5 * SMALL, rest_seconds=0.5, jacobians="first",
-                         checkpoint_every=4)}[case]
+        "rejected": dict(history="core"),
+        "scaled": dict(history="core", mahalanobis_fail_scale=7.0),
+        "weighted": dict(
+            gate_softness=3.0,
+            gate_threshold=4.0,
+            zero_velocity_std=5 * SMALL,
+            rest_seconds=0.5,
+            jacobians="first",
+            checkpoint_every=4,
+        ),
+    }[case]
     config = CONFIG(**options)
     _, start, gyro, accel, displacement, covariance = walk(3, still=5 if case == "weighted" else 0)
     displacement[list(MISSING), 1] = np.nan
@@ -139,7 +200,9 @@ def test_equals_least_squares_over_all_states(case):
     arguments = state, gyro, accel, displacement, covariance
 
     def both(*arguments):
-        return filtering.run_filter(*arguments, config, NOISE)[1], filtering.smooth(*arguments, config, NOISE)
+        return filtering.run_filter(*arguments, config, NOISE)[1], filtering.smooth(
+            *arguments, config, NOISE
+        )
 
     # What "rejected" compiles serves the tests below, too.
     filtered, smoothed = (both if case == "rejected" else quick(both))(*arguments)
@@ -153,8 +216,14 @@ def test_equals_least_squares_over_all_states(case):
     else:
         assert [k for k in present if not weight[k]] == [REJECTED]
         factor = np.where(weight > 0, 1.0, {"rejected": np.inf, "scaled": 7.0}[case])
-    measurements = {k: (displacement[k], 2.0 * factor[k] * covariance[k]) for k in present if np.isfinite(factor[k])}
-    wanted, spread = most_probable(start, gyro, accel, measurements, {k: config.zero_velocity_std for k in stops})
+    measurements = {
+        k: (displacement[k], 2.0 * factor[k] * covariance[k])
+        for k in present
+        if np.isfinite(factor[k])
+    }
+    wanted, spread = most_probable(
+        start, gyro, accel, measurements, {k: config.zero_velocity_std for k in stops}
+    )
 
     sigma = np.sqrt(np.diagonal(spread, axis1=1, axis2=2))
     found = np.stack([minus(x, y) for x, y in zip(rows_of(smoothed), wanted, strict=True)]) / sigma
@@ -173,38 +242,66 @@ def test_equals_least_squares_over_all_states(case):
     assert (smoothed.covariance_diagonal <= filtered.covariance_diagonal * (1 + 1e-9)).all()
     for name in smoothed._fields:
         if getattr(smoothed, name) is not None:
-            np.testing.assert_allclose(getattr(smoothed, name)[-1], getattr(filtered, name)[-1], rtol=1e-10, atol=1e-20)
+            np.testing.assert_allclose(
+                getattr(smoothed, name)[-1], getattr(filtered, name)[-1], rtol=1e-10, atol=1e-20
+            )
 
 
 def test_goes_on_from_a_state_with_clones():
-    """What is known of the second half of a run does not depend on where the filter was stopped before it."""
+    """What is known of the second half of a run does not depend on where the filter was stopped
+    before it."""
     _, start, gyro, accel, displacement, covariance = walk(5, intervals=2 * INTERVALS)
     config, half = CONFIG(history="core"), N * INTERVALS
     state = filtering.initial_state(config, *start, STD)
     wanted = filtering.smooth(state, gyro, accel, displacement, covariance, config, NOISE)
-    state, _ = filtering.run_filter(state, gyro[:half], accel[:half], displacement[:INTERVALS], covariance[:INTERVALS], config, NOISE)
-    found = filtering.smooth(state, gyro[half:], accel[half:], displacement[INTERVALS:], covariance[INTERVALS:], config, NOISE)
+    state, _ = filtering.run_filter(
+        state,
+        gyro[:half],
+        accel[:half],
+        displacement[:INTERVALS],
+        covariance[:INTERVALS],
+        config,
+        NOISE,
+    )
+    found = filtering.smooth(
+        state,
+        gyro[half:],
+        accel[half:],
+        displacement[INTERVALS:],
+        covariance[INTERVALS:],
+        config,
+        NOISE,
+    )
     sigma = np.sqrt(np.asarray(wanted.covariance_diagonal)[INTERVALS:])
     for name in wanted._fields[:5]:
-        np.testing.assert_allclose(getattr(found, name), getattr(wanted, name)[INTERVALS:], atol=1e-7 * SMALL)
+        np.testing.assert_allclose(
+            getattr(found, name), getattr(wanted, name)[INTERVALS:], atol=1e-7 * SMALL
+        )
     scale = sigma[:, :, None] * sigma[:, None, :]
-    np.testing.assert_allclose(found.covariance / scale, wanted.covariance[INTERVALS:] / scale, atol=1e-8)
+    np.testing.assert_allclose(
+        found.covariance / scale, wanted.covariance[INTERVALS:] / scale, atol=1e-8
+    )
 
 
 def test_smooths_the_network_in_the_loop():
-    """The measurements that an odometry run leaves behind make the filter, and so the smoother, repeat its updates."""
+    """The measurements that an odometry run leaves behind make the filter, and so the smoother,
+    repeat its updates."""
     _, start, gyro, accel, _, _ = walk(6)
     config = CONFIG(history="core")
     state = filtering.initial_state(config, *start, STD)
 
     def predict(windows):  # about right, and different from window to window
         mean = jnp.mean(windows, axis=1)
-        return Prediction(displacement=0.1 * mean[:, :3], log_std=-1.0 + 0.1 * mean[:, 3:], diagnostics={})
+        return Prediction(
+            displacement=0.1 * mean[:, :3], log_std=-1.0 + 0.1 * mean[:, 3:], diagnostics={}
+        )
 
     final, history = filtering.run_odometry(predict, state, gyro, accel, config, NOISE)
     smoothed = filtering.smooth_odometry(state, gyro, accel, history, config, NOISE)
     np.testing.assert_allclose(smoothed.position[-1], final.position, atol=1e-10)
-    np.testing.assert_allclose(smoothed.covariance[-1], history.covariance[-1], rtol=1e-6, atol=1e-18)
+    np.testing.assert_allclose(
+        smoothed.covariance[-1], history.covariance[-1], rtol=1e-6, atol=1e-18
+    )
     assert np.nansum(np.asarray(history.accepted)) > 0
     assert np.abs(smoothed.position[CLONES] - history.position[CLONES]).max() > 1e-6
 
@@ -218,8 +315,16 @@ def test_long_walks_come_closer_to_the_truth_and_say_by_how_much():
     std = filtering.InitialStd()
     runs = simulate(2, RUNS, LONG, STEP, WINDOW, RATE, DENSITIES, std, SIGMA)
     runs.displacement[:, 100:108] = np.nan
-    config = filtering.FilterConfig(RATE, STEP, WINDOW, measurement_scale=1.0, gate_threshold=1e9, history="core", gap_gyro_std=0.5,
-                                    gap_accel_std=2.0)
+    config = filtering.FilterConfig(
+        RATE,
+        STEP,
+        WINDOW,
+        measurement_scale=1.0,
+        gate_threshold=1e9,
+        history="core",
+        gap_gyro_std=0.5,
+        gap_accel_std=2.0,
+    )
     valid = np.ones((RUNS, LONG * STEP), bool)
     valid[1, 1000:1005] = valid[2, 1500:1530] = False
     spread = np.tile(SIGMA**2 * np.eye(3), (LONG, 1, 1))
@@ -233,14 +338,24 @@ def test_long_walks_come_closer_to_the_truth_and_say_by_how_much():
 
     filtered, smoothed = both(*runs[:6], valid)
     before, after = errors(runs, filtered), errors(runs, smoothed)
-    rms = {name: [float(np.sqrt((e[:, :, part] ** 2).mean())) for e in (before, after)]
-           for name, part in {"tilt": slice(0, 2), "velocity": slice(3, 6), "position": slice(6, 9), "accel bias": slice(12, 15)}.items()}
+    rms = {
+        name: [float(np.sqrt((e[:, :, part] ** 2).mean())) for e in (before, after)]
+        for name, part in {
+            "tilt": slice(0, 2),
+            "velocity": slice(3, 6),
+            "position": slice(6, 9),
+            "accel bias": slice(12, 15),
+        }.items()
+    }
     for name, (filter_rms, smoother_rms) in rms.items():
         assert smoother_rms < 0.9 * filter_rms, (name, rms)
     variances = np.asarray(smoothed.covariance_diagonal)
-    assert (variances > 0).all() and (variances <= np.asarray(filtered.covariance_diagonal) * (1 + 1e-9)).all()
+    assert (variances > 0).all() and (
+        variances <= np.asarray(filtered.covariance_diagonal) * (1 + 1e-9)
+    ).all()
     assert np.linalg.eigvalsh(smoothed.covariance).min() > -1e-12
-    # Without the gaps, whose errors are no white noise, the covariances are what they say; over 14 runs and all times.
+    # Without the gaps, whose errors are no white noise, the covariances are what they say; over 14
+    # runs and all times.
     whole = np.r_[0, 3:RUNS]
     for part in ([0, 1], [3, 4, 5], [6, 7, 8], [9, 10, 11], [12, 13, 14]):
         block = np.asarray(smoothed.covariance)[whole][:, :, part][..., part]
@@ -250,7 +365,8 @@ def test_long_walks_come_closer_to_the_truth_and_say_by_how_much():
 
 
 def test_gradient():
-    """Of a smoothed position and variance in a measurement and in a noise, against central differences."""
+    """Of a smoothed position and variance in a measurement and in a noise, against central
+    differences."""
     _, start, gyro, accel, displacement, covariance = walk(7)
     config = CONFIG()
 
@@ -259,30 +375,49 @@ def test_gradient():
         moved = jnp.asarray(displacement).at[8, 0].add(x[0] * SMALL)
         noise = NOISE._replace(accel_density=NOISE.accel_density * (1 + x[1]))
         smoothed = filtering.smooth(state, gyro, accel, moved, covariance, config, noise)
-        return (smoothed.position[5, 0] - start[2][0]) / SMALL + smoothed.covariance_diagonal[6, 4] / SMALL**2
+        return (smoothed.position[5, 0] - start[2][0]) / SMALL + smoothed.covariance_diagonal[
+            6, 4
+        ] / SMALL**2
 
     x = np.array([0.1, 0.2])
     loss = quick(jax.value_and_grad(loss))
     value, gradient = loss(x)
     assert np.isfinite(value) and (np.abs(gradient) > 1e-3).all()
     steps = 1e-3 * np.eye(2)
-    np.testing.assert_allclose(gradient, [(loss(x + e)[0] - loss(x - e)[0]) / 2e-3 for e in steps], rtol=1e-4)
+    np.testing.assert_allclose(
+        gradient, [(loss(x + e)[0] - loss(x - e)[0]) / 2e-3 for e in steps], rtol=1e-4
+    )
 
 
 def test_refuses_at_the_door():
     _, start, gyro, accel, displacement, covariance = walk(8)
     config = CONFIG()
     state = filtering.initial_state(config, *start, STD)
-    good = dict(state=state, gyro=gyro, accel=accel, displacement=displacement, covariance=covariance, config=config, noise=NOISE)
+    good = dict(
+        state=state,
+        gyro=gyro,
+        accel=accel,
+        displacement=displacement,
+        covariance=covariance,
+        config=config,
+        noise=NOISE,
+    )
     not_positive = np.where(np.arange(INTERVALS)[:, None, None] == 5, -np.eye(3), covariance)
     for wrong, message in [
-        (dict(gyro=gyro[:-1]), "gyro: the samples must be a multiple"), (dict(accel=accel[1:]), "accel: the shape"),
-        (dict(displacement=displacement[1:]), "displacement: the shape"), (dict(covariance=covariance[:, :2]), "covariance: the shape"),
-        (dict(covariance=not_positive), "covariance: 1 of 14"), (dict(gyro=gyro.astype(np.float32)), "gyro: the filter runs in float64"),
-        (dict(accel=np.where(np.arange(len(accel))[:, None] == 7, np.nan, accel)), "accel: 1 of 56 rows"),
+        (dict(gyro=gyro[:-1]), "gyro: the samples must be a multiple"),
+        (dict(accel=accel[1:]), "accel: the shape"),
+        (dict(displacement=displacement[1:]), "displacement: the shape"),
+        (dict(covariance=covariance[:, :2]), "covariance: the shape"),
+        (dict(covariance=not_positive), "covariance: 1 of 14"),
+        (dict(gyro=gyro.astype(np.float32)), "gyro: the filter runs in float64"),
+        (
+            dict(accel=np.where(np.arange(len(accel))[:, None] == 7, np.nan, accel)),
+            "accel: 1 of 56 rows",
+        ),
         (dict(imu_valid=np.ones(3, bool)), "imu_valid: must be 56 booleans"),
         (dict(noise=NOISE._replace(gyro_density=-1.0)), "noise.gyro_density"),
-        (dict(state=state._replace(velocity=np.zeros(2))), "state.velocity"), (dict(config=CONFIG(jacobians="first")), "state: was made"),
+        (dict(state=state._replace(velocity=np.zeros(2))), "state.velocity"),
+        (dict(config=CONFIG(jacobians="first")), "state: was made"),
     ]:
         with pytest.raises(ValueError, match=message):
             filtering.smooth(**{**good, **wrong})

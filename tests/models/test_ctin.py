@@ -1,14 +1,15 @@
-"""CTIN against its description: sizes block by block, a plain NumPy forward pass of the whole network, causality."""
+"""CTIN against its description: sizes block by block, a plain NumPy forward pass of the whole
+network, causality."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from compiling import quick
 
 from gnio_jax import models
 from gnio_jax.models import ctin
 from gnio_jax.types import InputError
+from tests.support.compiling import quick
 
 SMALL = {"width": 12, "encoder_width": 8, "ffn": 10, "heads": 2, "decoder_layers": 2}
 
@@ -19,17 +20,23 @@ def count(tree):
 
 def shapes(samples=200, **options):
     model = models.create("ctin", **options)
-    return jax.eval_shape(model.init, jax.random.key(0), jax.ShapeDtypeStruct((1, samples, 6), jnp.float32))
+    return jax.eval_shape(
+        model.init, jax.random.key(0), jax.ShapeDtypeStruct((1, samples, 6), jnp.float32)
+    )
 
 
 def drawn(tree, seed=3):
-    """Variables far from their neutral start, statistics and biases too, so that nothing can be left out unnoticed."""
+    """Variables far from their neutral start, statistics and biases too, so that nothing can be
+    left out unnoticed."""
     rng = np.random.default_rng(seed)
 
     def draw(path, leaf):
         if path[-1].key in ("var", "scale"):
             return jnp.asarray(rng.uniform(0.5, 1.5, leaf.shape), jnp.float32)
-        return jnp.asarray(rng.standard_normal(leaf.shape) * (1.0 if path[-1].key == "positions" else 0.4), jnp.float32)
+        return jnp.asarray(
+            rng.standard_normal(leaf.shape) * (1.0 if path[-1].key == "positions" else 0.4),
+            jnp.float32,
+        )
 
     return jax.tree.map_with_path(draw, tree)
 
@@ -41,13 +48,26 @@ def test_parameters_block_by_block():
     assert abs(count(params) / 557_100 - 1) < 0.01  # what the publication's size allows
     assert count(params["spatial_embedding"]) == 3 * 6 * 96 + 2 * 96 + 96 * 96 + 96
     assert count(params["encoder"]["local"]) == (
-        3 * 16 * 64 + 2 * 64 + 64 * 64 + 2 * 64 + 128 * 16 + 2 * 16 + (16 + 1) * 3 * 64 + 64 * 16 + (16 + 1) * 2 * 64
+        3 * 16 * 64
+        + 2 * 64
+        + 64 * 64
+        + 2 * 64
+        + 128 * 16
+        + 2 * 16
+        + (16 + 1) * 3 * 64
+        + 64 * 16
+        + (16 + 1) * 2 * 64
     )
     assert count(params["encoder"]["global"]) == attention(64)
-    assert count(params["encoder"]) == 2 * 96 * 64 + 2 * 64 + 2 * 96 + count(params["encoder"]["local"]) + attention(64)
+    assert count(params["encoder"]) == 2 * 96 * 64 + 2 * 64 + 2 * 96 + count(
+        params["encoder"]["local"]
+    ) + attention(64)
     assert count(params["temporal_embedding"]) == 2 * 4 * 48 * (6 + 48 + 1) + 200 * 96
     for layer in range(1, 5):
-        assert count(params[f"decoder_{layer}"]) == 2 * attention(96) + 96 * 192 + 192 + 192 * 96 + 96 + 3 * 2 * 96
+        assert (
+            count(params[f"decoder_{layer}"])
+            == 2 * attention(96) + 96 * 192 + 192 + 192 * 96 + 96 + 3 * 2 * 96
+        )
     for head in ("velocity", "log_std"):
         assert count(params[head]) == 96 * 48 + 48 + 2 * 48 + 48 * 2 + 2
     assert len(params) == 1 + 1 + 1 + 4 + 2 + 1
@@ -70,15 +90,19 @@ def linear(x, q):
 
 
 def layer_norm(x, q):
-    return (x - x.mean(-1, keepdims=True)) / np.sqrt(x.var(-1, keepdims=True) + 1e-5) * q["scale"] + q["bias"]
+    return (x - x.mean(-1, keepdims=True)) / np.sqrt(x.var(-1, keepdims=True) + 1e-5) * q[
+        "scale"
+    ] + q["bias"]
 
 
 def attention(x, memory, q, causal=False):
     """Step by step, head by head; causal: a step sees no later one."""
     out = np.zeros((len(x), q["out"]["kernel"].shape[-1])) + q["out"]["bias"]
     for h in range(q["query"]["kernel"].shape[1]):
-        query, key, value = (source @ q[name]["kernel"][:, h] + q[name]["bias"][h]
-                             for name, source in (("query", x), ("key", memory), ("value", memory)))
+        query, key, value = (
+            source @ q[name]["kernel"][:, h] + q[name]["bias"][h]
+            for name, source in (("query", x), ("key", memory), ("value", memory))
+        )
         for i in range(len(x)):
             seen = i + 1 if causal else len(memory)
             weights = softmax(key[:seen] @ query[i] / np.sqrt(query.shape[1]), 0)
@@ -91,7 +115,10 @@ def lstm(x, q):
     h = c = np.zeros(q["hi"]["bias"].shape)
     states = []
     for step in x:
-        i, f, g, o = (step @ q[f"i{gate}"]["kernel"] + h @ q[f"h{gate}"]["kernel"] + q[f"h{gate}"]["bias"] for gate in "ifgo")
+        i, f, g, o = (
+            step @ q[f"i{gate}"]["kernel"] + h @ q[f"h{gate}"]["kernel"] + q[f"h{gate}"]["bias"]
+            for gate in "ifgo"
+        )
         c = sigmoid(f) * c + sigmoid(i) * np.tanh(g)
         h = sigmoid(o) * np.tanh(c)
         states.append(h)
@@ -105,7 +132,10 @@ def local_attention(x, q, norm, groups=4):
     for t in range(n):
         for out in range(channels):
             first = out // each * each
-            key[t, out] = sum(padded[t + k, first: first + each] @ q["key_conv"]["kernel"][k, :, out] for k in range(3))
+            key[t, out] = sum(
+                padded[t + k, first : first + each] @ q["key_conv"]["kernel"][k, :, out]
+                for k in range(3)
+            )
     key = np.maximum(norm(key, "key_bn"), 0)
     value = norm(x @ q["value_conv"]["kernel"][0], "value_bn")
     hidden = np.maximum(norm(np.hstack([x, key]) @ q["hidden_conv"]["kernel"][0], "hidden_bn"), 0)
@@ -114,25 +144,36 @@ def local_attention(x, q, norm, groups=4):
     for t in range(n):
         for c in range(channels):
             weights = softmax(scores[t, c::channels], 0)
-            context[t, c] = sum(weights[k] * value[t + k - 1, c] for k in range(3) if 0 <= t + k - 1 < n)
+            context[t, c] = sum(
+                weights[k] * value[t + k - 1, c] for k in range(3) if 0 <= t + k - 1 < n
+            )
     pooled = (context + key).mean(axis=0)
-    shares = softmax(linear(np.maximum(linear(pooled, q["squeeze"]), 0), q["excite"]).reshape(2, channels), 0)
+    shares = softmax(
+        linear(np.maximum(linear(pooled, q["squeeze"]), 0), q["excite"]).reshape(2, channels), 0
+    )
     return shares[0] * context + shares[1] * key
 
 
 def numpy_forward(variables, windows):
     """Float64, one window at a time: velocities and log standard deviations of every step."""
-    p, s = (jax.tree.map(lambda x: np.asarray(x, np.float64), variables[name]) for name in ("params", "batch_stats"))
+    p, s = (
+        jax.tree.map(lambda x: np.asarray(x, np.float64), variables[name])
+        for name in ("params", "batch_stats")
+    )
 
     def norm_of(params, stats):
-        return lambda x, name: ((x - stats[name]["mean"]) / np.sqrt(stats[name]["var"] + 1e-5) * params[name]["scale"]
-                                + params[name]["bias"])
+        return lambda x, name: (
+            (x - stats[name]["mean"]) / np.sqrt(stats[name]["var"] + 1e-5) * params[name]["scale"]
+            + params[name]["bias"]
+        )
 
     velocity, log_std = [], []
     for window in np.asarray(windows, np.float64):
         e, n = p["spatial_embedding"], len(window)
         padded = np.vstack([np.zeros(6), window, np.zeros(6)])
-        x = np.array([sum(padded[t + k] @ e["conv"]["kernel"][k] for k in range(3)) for t in range(n)])
+        x = np.array(
+            [sum(padded[t + k] @ e["conv"]["kernel"][k] for k in range(3)) for t in range(n)]
+        )
         x = linear(norm_of(e, s["spatial_embedding"])(x, "bn"), e["linear"])
         e = p["encoder"]
         norm = norm_of(e, s["encoder"])
@@ -141,14 +182,23 @@ def numpy_forward(variables, windows):
         y = attention(y, y, e["global"])
         memory = np.maximum(x + norm(y @ e["expand_conv"]["kernel"][0], "expand_bn"), 0)
         t = p["temporal_embedding"]
-        x = np.hstack([lstm(window, t["lstm_forward"]), lstm(window[::-1], t["lstm_backward"])[::-1]]) + t["positions"]
+        x = (
+            np.hstack(
+                [lstm(window, t["lstm_forward"]), lstm(window[::-1], t["lstm_backward"])[::-1]]
+            )
+            + t["positions"]
+        )
         for layer in (1, 2):
             q = p[f"decoder_{layer}"]
             x = layer_norm(x + attention(x, x, q["self"], causal=True), q["self_norm"])
             x = layer_norm(x + attention(x, memory, q["cross"]), q["cross_norm"])
-            x = layer_norm(x + linear(np.maximum(linear(x, q["expand"]), 0), q["contract"]), q["ffn_norm"])
+            x = layer_norm(
+                x + linear(np.maximum(linear(x, q["expand"]), 0), q["contract"]), q["ffn_norm"]
+            )
         for head, values in (("velocity", velocity), ("log_std", log_std)):
-            values.append(linear(layer_norm(linear(x, p[head]["hidden"]), p[head]["norm"]), p[head]["output"]))
+            values.append(
+                linear(layer_norm(linear(x, p[head]["hidden"]), p[head]["norm"]), p[head]["output"])
+            )
     return np.array(velocity), np.array(log_std)
 
 
@@ -161,16 +211,30 @@ def test_forward_against_numpy_frozen_or_not(samples, output_dim):
     missing = ((0, 0), (0, 0), (0, 3 - output_dim))
     velocity, log_std = np.pad(velocity, missing), np.pad(log_std, missing)
     for values in (velocity, log_std):  # windows and steps are told apart
-        assert np.ptp(values[..., :output_dim], axis=0).max() > 0.1 and np.ptp(values[..., :output_dim], axis=1).min() > 0.05
+        assert (
+            np.ptp(values[..., :output_dim], axis=0).max() > 0.1
+            and np.ptp(values[..., :output_dim], axis=1).min() > 0.05
+        )
     frozen = models.freeze(model, variables)
     assert not frozen.constants
-    assert all((x == 0).all() for path, x in jax.tree.leaves_with_path(frozen.variables["batch_stats"]) if path[-1].key == "mean")
+    assert all(
+        (x == 0).all()
+        for path, x in jax.tree.leaves_with_path(frozen.variables["batch_stats"])
+        if path[-1].key == "mean"
+    )
     for given in (variables, frozen.variables):
         found = apply(given, windows)
         np.testing.assert_allclose(found.diagnostics["velocity"], velocity, rtol=1e-3, atol=1e-4)
-        np.testing.assert_allclose(found.diagnostics["velocity_log_std"], log_std, rtol=1e-3, atol=1e-4)
+        np.testing.assert_allclose(
+            found.diagnostics["velocity_log_std"], log_std, rtol=1e-3, atol=1e-4
+        )
         np.testing.assert_allclose(found.displacement, velocity.mean(axis=1), rtol=1e-3, atol=1e-4)
-        np.testing.assert_allclose(found.log_std, np.log(np.sqrt(np.mean(np.exp(log_std) ** 2, axis=1))), rtol=1e-3, atol=1e-4)
+        np.testing.assert_allclose(
+            found.log_std,
+            np.log(np.sqrt(np.mean(np.exp(log_std) ** 2, axis=1))),
+            rtol=1e-3,
+            atol=1e-4,
+        )
         task = variables["params"]["task_log_std"]
         np.testing.assert_array_equal(found.diagnostics["task_log_std"], np.stack([task, task]))
 
@@ -184,12 +248,16 @@ def test_a_decoded_step_depends_on_no_later_one():
     still, changed = apply(variables, x, memory), apply(variables, x.at[:, 5].add(1.0), memory)
     np.testing.assert_array_equal(still[:, :5], changed[:, :5])
     assert (jnp.abs(still - changed)[:, 5:].max(axis=-1) > 1e-4).all()  # and every later one does
-    assert (jnp.abs(still - apply(variables, x, memory.at[:, 8].add(1.0))).max(axis=-1) > 1e-5).all()  # the encoder is seen whole
+    assert (
+        jnp.abs(still - apply(variables, x, memory.at[:, 8].add(1.0))).max(axis=-1) > 1e-5
+    ).all()  # the encoder is seen whole
 
 
 def test_no_step_is_surer_than_the_window_says():
     found = ctin._root_mean_square(jnp.array([[[-2.0, 0.0, 90.0], [1.0, 0.0, -90.0]]], jnp.float32))
-    np.testing.assert_allclose(found, [[0.5 * np.log((np.exp(-4) + np.exp(2)) / 2), 0, 90 - 0.5 * np.log(2)]], rtol=1e-6)
+    np.testing.assert_allclose(
+        found, [[0.5 * np.log((np.exp(-4) + np.exp(2)) / 2), 0, 90 - 0.5 * np.log(2)]], rtol=1e-6
+    )
 
 
 def test_every_parameter_is_trained_in_float32_and_dropout_is_drawn():
@@ -201,31 +269,47 @@ def test_every_parameter_is_trained_in_float32_and_dropout_is_drawn():
 
     def loss(params, key):
         given = {"params": params, "batch_stats": variables["batch_stats"]}
-        prediction, _ = model.apply(given, windows, train=True, mutable=["batch_stats"], rngs={"dropout": key})
+        prediction, _ = model.apply(
+            given, windows, train=True, mutable=["batch_stats"], rngs={"dropout": key}
+        )
         d, task = prediction.diagnostics, prediction.diagnostics["task_log_std"]
         velocity = jnp.sum((d["velocity"] - 1) ** 2, axis=(1, 2)) * jnp.exp(-2 * task[:, 0])
-        return jnp.sum(prediction.log_std) + jnp.sum(velocity) + jnp.sum(task), prediction.displacement
+        return jnp.sum(prediction.log_std) + jnp.sum(velocity) + jnp.sum(
+            task
+        ), prediction.displacement
 
     gradient = quick(jax.grad(loss, has_aux=True))
-    (grads, one), (others, other) = (gradient(variables["params"], jax.random.key(seed)) for seed in (0, 1))
-    for (path, leaf), another in zip(jax.tree.leaves_with_path(grads), jax.tree.leaves(others), strict=True):
+    (grads, one), (others, other) = (
+        gradient(variables["params"], jax.random.key(seed)) for seed in (0, 1)
+    )
+    for (path, leaf), another in zip(
+        jax.tree.leaves_with_path(grads), jax.tree.leaves(others), strict=True
+    ):
         assert leaf.dtype == jnp.float32 and bool(jnp.isfinite(leaf).all()), path
         if [key.key for key in path[-2:]] == ["key", "bias"]:
             continue  # one number added to all scores: a softmax does not see it
         trained = float(jnp.abs(leaf).max() + jnp.abs(another).max())
         if path[-1].key == "task_log_std":
-            assert abs(float(leaf[0])) > 0 and leaf[1] == len(windows)  # the second is but a summand of this loss
+            assert abs(float(leaf[0])) > 0 and leaf[1] == len(
+                windows
+            )  # the second is but a summand of this loss
         assert trained > 1e-6, path
     assert float(jnp.abs(one - other).max()) > 1e-3
 
 
-@pytest.mark.parametrize("options, problem", [
-    ({"heads": 0}, "heads must be at least 1, found 0"),
-    ({"width": 90}, "width must be even and a multiple of the 8 heads, found 90"),
-    ({"encoder_width": 20}, "encoder_width must be a multiple of the 8 heads and of 4, found 20"),
-    ({"encoder_dropout": -0.1}, "dropout must be at least 0 and below 1, found -0.1"),
-    ({"output_dim": 4}, "output_dim must be 2 or 3, found 4"),
-])
+@pytest.mark.parametrize(
+    "options, problem",
+    [
+        ({"heads": 0}, "heads must be at least 1, found 0"),
+        ({"width": 90}, "width must be even and a multiple of the 8 heads, found 90"),
+        (
+            {"encoder_width": 20},
+            "encoder_width must be a multiple of the 8 heads and of 4, found 20",
+        ),
+        ({"encoder_dropout": -0.1}, "dropout must be at least 0 and below 1, found -0.1"),
+        ({"output_dim": 4}, "output_dim must be 2 or 3, found 4"),
+    ],
+)
 def test_options_that_cannot_be_are_refused(options, problem):
     with pytest.raises(InputError, match=f"model 'ctin': {problem}"):
         models.create("ctin", **options)

@@ -1,14 +1,15 @@
-"""DeepILS against its description: sizes block by block, and a plain NumPy forward pass of the whole network."""
+"""DeepILS against its description: sizes block by block, and a plain NumPy forward pass of the
+whole network."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from compiling import quick
 
 from gnio_jax import models
 from gnio_jax.models import deepils
 from gnio_jax.types import InputError
+from tests.support.compiling import quick
 
 
 def count(tree):
@@ -17,11 +18,14 @@ def count(tree):
 
 def shapes(samples=200, **options):
     model = models.create("deepils", **options)
-    return jax.eval_shape(model.init, jax.random.key(0), jax.ShapeDtypeStruct((1, samples, 6), jnp.float32))
+    return jax.eval_shape(
+        model.init, jax.random.key(0), jax.ShapeDtypeStruct((1, samples, 6), jnp.float32)
+    )
 
 
 def drawn(samples, seed=3, **options):
-    """Variables far from their neutral start, statistics and biases too, so that nothing can be left out unnoticed."""
+    """Variables far from their neutral start, statistics and biases too, so that nothing can be
+    left out unnoticed."""
     rng = np.random.default_rng(seed)
 
     def draw(path, leaf):
@@ -30,7 +34,9 @@ def drawn(samples, seed=3, **options):
             return jnp.asarray(rng.uniform(0.5, 1.5, leaf.shape), jnp.float32)
         if name in ("mean", "bias", "log_std"):
             return jnp.asarray(0.3 * rng.standard_normal(leaf.shape), jnp.float32)
-        return jnp.asarray(rng.standard_normal(leaf.shape) * np.prod(leaf.shape[:-1]) ** -0.5, leaf.dtype)
+        return jnp.asarray(
+            rng.standard_normal(leaf.shape) * np.prod(leaf.shape[:-1]) ** -0.5, leaf.dtype
+        )
 
     return jax.tree.map_with_path(draw, shapes(samples, **options))
 
@@ -44,7 +50,14 @@ def test_parameters_of_the_publication_block_by_block(output_dim, total):
     for group, features in enumerate((64, 128, 256, 512), 1):
         for block in (1, 2):
             found = params[f"group{group}_block{block}"]
-            separable = 3 * channels + channels * features + 2 * features + 3 * features + features**2 + 2 * features
+            separable = (
+                3 * channels
+                + channels * features
+                + 2 * features
+                + 3 * features
+                + features**2
+                + 2 * features
+            )
             shortcut = channels * features + 2 * features if channels != features else 0
             assert ("shortcut_conv" in found) == (channels != features)
             assert count(found["channel_attention"]) == 2 * features * features // 16
@@ -52,21 +65,34 @@ def test_parameters_of_the_publication_block_by_block(output_dim, total):
             assert count(found) == separable + shortcut + features**2 // 8 + 14
             channels = features
     neck = 512 * 128 + 2 * 128
-    assert count(params["displacement"]) == neck + (896 * 512 + 512) + (512 * 512 + 512) + (512 + 1) * output_dim
+    assert (
+        count(params["displacement"])
+        == neck + (896 * 512 + 512) + (512 * 512 + 512) + (512 + 1) * output_dim
+    )
 
 
 def test_parameters_follow_the_window():
-    assert count(shapes(100)["params"]) == 2_290_739 - 3 * 128 * 512  # four time steps are left instead of seven
+    assert (
+        count(shapes(100)["params"]) == 2_290_739 - 3 * 128 * 512
+    )  # four time steps are left instead of seven
 
 
 def numpy_forward(variables, windows):
     """Float64, one window at a time; sums over taps and channels written out."""
-    p, s = (jax.tree.map(lambda x: np.asarray(x, np.float64), variables[name]) for name in ("params", "batch_stats"))
+    p, s = (
+        jax.tree.map(lambda x: np.asarray(x, np.float64), variables[name])
+        for name in ("params", "batch_stats")
+    )
     relu, sigmoid = (lambda x: np.maximum(x, 0)), (lambda x: 1 / (1 + np.exp(-x)))
 
     def conv(x, kernel, stride, padding):
         x = np.pad(x, ((padding, padding), (0, 0)))
-        return np.array([sum(x[r + k] @ kernel[k] for k in range(len(kernel))) for r in range(0, len(x) - len(kernel) + 1, stride)])
+        return np.array(
+            [
+                sum(x[r + k] @ kernel[k] for k in range(len(kernel)))
+                for r in range(0, len(x) - len(kernel) + 1, stride)
+            ]
+        )
 
     def depthwise(x, kernel, stride):
         out = np.zeros((-(-len(x) // stride), x.shape[1]))
@@ -77,14 +103,23 @@ def numpy_forward(variables, windows):
         return out
 
     def norm(x, name, params, stats):
-        return (x - stats[name]["mean"]) / np.sqrt(stats[name]["var"] + 1e-5) * params[name]["scale"] + params[name]["bias"]
+        return (x - stats[name]["mean"]) / np.sqrt(stats[name]["var"] + 1e-5) * params[name][
+            "scale"
+        ] + params[name]["bias"]
 
     def block(x, q, t, stride):
         y = conv(depthwise(x, q["depthwise1"]["kernel"], stride), q["conv1"]["kernel"], 1, 0)
         y = relu(norm(y, "bn1", q, t))
-        y = norm(conv(depthwise(y, q["depthwise2"]["kernel"], 1), q["conv2"]["kernel"], 1, 0), "bn2", q, t)
+        y = norm(
+            conv(depthwise(y, q["depthwise2"]["kernel"], 1), q["conv2"]["kernel"], 1, 0),
+            "bn2",
+            q,
+            t,
+        )
         squeeze, excite = (q["channel_attention"][name]["kernel"] for name in ("squeeze", "excite"))
-        y = y * sigmoid(sum(relu(pooled @ squeeze) @ excite for pooled in (y.mean(axis=0), y.max(axis=0))))
+        y = y * sigmoid(
+            sum(relu(pooled @ squeeze) @ excite for pooled in (y.mean(axis=0), y.max(axis=0)))
+        )
         over_channels = np.array([[step.mean(), step.max()] for step in y])
         y = y * sigmoid(conv(over_channels, q["time_attention"]["conv"]["kernel"], 1, 3))
         if "shortcut_conv" in q:
@@ -94,7 +129,7 @@ def numpy_forward(variables, windows):
     outputs = []
     for x in np.asarray(windows, np.float64):
         x = relu(norm(conv(x, p["stem_conv"]["kernel"], 2, 3), "stem_bn", p, s))
-        x = np.array([x[max(0, r - 1): r + 2].max(axis=0) for r in range(0, len(x), 2)])
+        x = np.array([x[max(0, r - 1) : r + 2].max(axis=0) for r in range(0, len(x), 2)])
         for group in range(4):
             for b in range(2):
                 name = f"group{group + 1}_block{b + 1}"
@@ -123,10 +158,18 @@ def test_forward_against_numpy_frozen_or_not(samples, output_dim):
     np.testing.assert_array_equal(found.log_std, np.stack([constant, constant]))
 
     frozen = models.freeze(model, variables)
-    blocks = [x for x in jax.tree.leaves(frozen.variables["batch_stats"], is_leaf=lambda x: "mean" in x or "log_std" in x) if "mean" in x]
+    blocks = [
+        x
+        for x in jax.tree.leaves(
+            frozen.variables["batch_stats"], is_leaf=lambda x: "mean" in x or "log_std" in x
+        )
+        if "mean" in x
+    ]
     assert len(blocks) == 1 + 16 + 3 + 1 and all((block["mean"] == 0).all() for block in blocks)
     assert not frozen.constants
-    np.testing.assert_allclose(apply(frozen.variables, windows).displacement[:, :output_dim], wanted, rtol=2e-4, atol=2e-5)
+    np.testing.assert_allclose(
+        apply(frozen.variables, windows).displacement[:, :output_dim], wanted, rtol=2e-4, atol=2e-5
+    )
 
 
 def test_every_parameter_is_trained_in_float32_and_dropout_is_drawn():
@@ -138,12 +181,18 @@ def test_every_parameter_is_trained_in_float32_and_dropout_is_drawn():
 
     def loss(params, key):
         given = {"params": params, "batch_stats": variables["batch_stats"]}
-        prediction, changed = model.apply(given, windows, train=True, mutable=["batch_stats"], rngs={"dropout": key})
+        prediction, changed = model.apply(
+            given, windows, train=True, mutable=["batch_stats"], rngs={"dropout": key}
+        )
         return jnp.sum(prediction.displacement**2), (prediction.displacement, changed)
 
     gradient = quick(jax.grad(loss, has_aux=True))
-    (grads, (one, changed)), (others, (other, _)) = (gradient(variables["params"], jax.random.key(seed)) for seed in (0, 1))
-    for (path, leaf), another in zip(jax.tree.leaves_with_path(grads), jax.tree.leaves(others), strict=True):
+    (grads, (one, changed)), (others, (other, _)) = (
+        gradient(variables["params"], jax.random.key(seed)) for seed in (0, 1)
+    )
+    for (path, leaf), another in zip(
+        jax.tree.leaves_with_path(grads), jax.tree.leaves(others), strict=True
+    ):
         assert leaf.dtype == jnp.float32 and bool(jnp.isfinite(leaf).all()), path
         assert float(jnp.abs(leaf).max() + jnp.abs(another).max()) > 1e-6, path
     assert float(jnp.abs(one - other).max()) > 1e-3
@@ -156,11 +205,18 @@ def test_the_gradient_of_a_maximum_goes_to_one_place():
     x = jnp.asarray([[[1.0, -4.0], [3.0, -2.0], [3.0, -5.0]]], jnp.float32)
     for axis, first in ((1, [[0, 0], [1, 1], [0, 0]]), (2, [[1, 0], [1, 0], [1, 0]])):
         np.testing.assert_array_equal(deepils._maximum(x, axis), np.max(x, axis=axis))
-        np.testing.assert_array_equal(jax.grad(lambda x, axis=axis: jnp.sum(deepils._maximum(x, axis)))(x)[0], first)
+        np.testing.assert_array_equal(
+            jax.grad(lambda x, axis=axis: jnp.sum(deepils._maximum(x, axis)))(x)[0], first
+        )
 
 
-@pytest.mark.parametrize("options, problem", [({"output_dim": 1}, "output_dim must be 2 or 3, found 1"),
-                                              ({"dropout": 1.0}, "dropout must be at least 0 and below 1, found 1.0")])
+@pytest.mark.parametrize(
+    "options, problem",
+    [
+        ({"output_dim": 1}, "output_dim must be 2 or 3, found 1"),
+        ({"dropout": 1.0}, "dropout must be at least 0 and below 1, found 1.0"),
+    ],
+)
 def test_options_that_cannot_be_are_refused(options, problem):
     with pytest.raises(InputError, match=f"model 'deepils': {problem}"):
         models.create("deepils", **options)

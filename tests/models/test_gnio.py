@@ -18,7 +18,9 @@ def count(tree):
 
 def shapes(**options):
     model = models.create("gnio", **options)
-    return jax.eval_shape(model.init, jax.random.key(0), jax.ShapeDtypeStruct((1, 200, 6), jnp.float32))
+    return jax.eval_shape(
+        model.init, jax.random.key(0), jax.ShapeDtypeStruct((1, 200, 6), jnp.float32)
+    )
 
 
 def test_parameters_of_the_paper_block_by_block():
@@ -33,10 +35,14 @@ def test_parameters_of_the_paper_block_by_block():
     assert count(params["bank"]) == 32_768 + 4 * (512 * 512 + 512)
     assert count(params["head"]) == 2 * (512 * 3 + 3)
     assert count(params["uncertainty"]) == 512 * 3 + 3
-    assert count(params["encoder"]["group2_block1"]) == conv_bn(3, 64, 128) + conv_bn(3, 128, 128) + conv_bn(1, 64, 128)
+    assert count(params["encoder"]["group2_block1"]) == conv_bn(3, 64, 128) + conv_bn(
+        3, 128, 128
+    ) + conv_bn(1, 64, 128)
 
 
-@pytest.mark.parametrize("size, total", [(16, 4_909_577), (32, 4_917_769), (64, 4_934_153), (128, 4_966_921)])
+@pytest.mark.parametrize(
+    "size, total", [(16, 4_909_577), (32, 4_917_769), (64, 4_934_153), (128, 4_966_921)]
+)
 def test_bank_sizes(size, total):
     assert count(shapes(bank_size=size)["params"]) == total
 
@@ -49,13 +55,16 @@ def test_prototypes_start_as_far_apart_as_asked():
 
 
 def test_the_bank_starts_alive():
-    """Windows attend to different prototypes before training, and their contexts differ; near each other the prototypes are a saddle."""
+    """Windows attend to different prototypes before training, and their contexts differ; near each
+    other the prototypes are a saddle."""
     rng = np.random.default_rng(0)
     features = jnp.asarray(np.maximum(rng.normal(0.4, 1.0, (200, 512)), 0), jnp.float32)
     entropy, spread = {}, {}
     for std in (1.0, 512**-0.5):
         bank = MotionBank(std=std)
-        context, attention = jax.jit(lambda key, bank=bank: bank.init_with_output(key, features)[0])(jax.random.key(1))
+        context, attention = jax.jit(
+            lambda key, bank=bank: bank.init_with_output(key, features)[0]
+        )(jax.random.key(1))
         entropy[std] = -np.mean(np.sum(attention * np.log(attention), axis=-1)) / np.log(64)
         spread[std] = np.mean(np.std(context, axis=0)) / np.mean(np.std(features, axis=0))
     assert entropy[1.0] < 0.98 and entropy[512**-0.5] > 0.999
@@ -63,12 +72,21 @@ def test_the_bank_starts_alive():
 
 
 def test_the_projections_start_as_those_of_pytorch():
-    """Xavier-uniform over query, key and value as one (3d, d) matrix, a linear layer's bound for the output, biases zero."""
-    params = MotionBank(size=3, heads=2, width=64).init(jax.random.key(0), jnp.zeros((1, 64), jnp.float32))["params"]
-    for name, bound in [("query", (6 / (64 + 192)) ** 0.5), ("key", (6 / (64 + 192)) ** 0.5), ("value", (6 / (64 + 192)) ** 0.5),
-                        ("output", 64**-0.5)]:
+    """Xavier-uniform over query, key and value as one (3d, d) matrix, a linear layer's bound for
+    the output, biases zero."""
+    params = MotionBank(size=3, heads=2, width=64).init(
+        jax.random.key(0), jnp.zeros((1, 64), jnp.float32)
+    )["params"]
+    for name, bound in [
+        ("query", (6 / (64 + 192)) ** 0.5),
+        ("key", (6 / (64 + 192)) ** 0.5),
+        ("value", (6 / (64 + 192)) ** 0.5),
+        ("output", 64**-0.5),
+    ]:
         kernel = np.abs(params[name]["kernel"])
-        assert 0.99 * bound < kernel.max() <= bound and abs(kernel.mean() - bound / 2) < 0.02 * bound
+        assert (
+            0.99 * bound < kernel.max() <= bound and abs(kernel.mean() - bound / 2) < 0.02 * bound
+        )
         np.testing.assert_array_equal(params[name]["bias"], 0)
 
 
@@ -93,17 +111,23 @@ def numpy_forward(variables, windows):
         return (x - stats["mean"]) / np.sqrt(stats["var"] + 1e-5) * scale["scale"] + scale["bias"]
 
     def block(x, params, stats, stride):
-        y = np.maximum(bn(conv(x, params["conv1"]["kernel"], stride, 1), params["bn1"], stats["bn1"]), 0)
+        y = np.maximum(
+            bn(conv(x, params["conv1"]["kernel"], stride, 1), params["bn1"], stats["bn1"]), 0
+        )
         y = bn(conv(y, params["conv2"]["kernel"], 1, 1), params["bn2"], stats["bn2"])
         if "shortcut_conv" in params:
-            x = bn(conv(x, params["shortcut_conv"]["kernel"], stride, 0), params["shortcut_bn"], stats["shortcut_bn"])
+            x = bn(
+                conv(x, params["shortcut_conv"]["kernel"], stride, 0),
+                params["shortcut_bn"],
+                stats["shortcut_bn"],
+            )
         return np.maximum(x + y, 0)
 
     e, t = p["encoder"], s["encoder"]
     displacement, log_std, gates, attention = [], [], [], []
     for x in np.asarray(windows, np.float64):
         x = np.maximum(bn(conv(x, e["stem_conv"]["kernel"], 2, 3), e["stem_bn"], t["stem_bn"]), 0)
-        x = np.stack([x[max(0, r - 1): r + 2].max(axis=0) for r in range(0, len(x), 2)])
+        x = np.stack([x[max(0, r - 1) : r + 2].max(axis=0) for r in range(0, len(x), 2)])
         for group in range(4):
             for b in range(2):
                 name = f"group{group + 1}_block{b + 1}"
@@ -119,7 +143,11 @@ def numpy_forward(variables, windows):
             a = np.exp(k @ q / np.sqrt(len(q)))
             weights.append(a / a.sum())
             heads.append(weights[-1] @ v)
-        h = f + np.concatenate(heads) @ bank["output"]["kernel"].reshape(len(f), len(f)) + bank["output"]["bias"]
+        h = (
+            f
+            + np.concatenate(heads) @ bank["output"]["kernel"].reshape(len(f), len(f))
+            + bank["output"]["bias"]
+        )
         linear = lambda q, h=h: h @ q["kernel"] + q["bias"]  # noqa: E731
         gate = np.tanh(linear(p["head"]["gate"]))
         displacement.append(np.log1p(np.exp(linear(p["head"]["scale"]))) * gate)
@@ -136,7 +164,9 @@ def test_forward_against_numpy(samples):
     variables = models.initialise(model, jax.random.key(0), windows.shape[1])
     # Statistics and gate away from their neutral start, so that none can be left out unnoticed.
     rng = np.random.default_rng(3)
-    variables = jax.tree.map(lambda x: x + 0.1 * rng.random(x.shape, np.float32) if x.ndim == 1 else x, variables)
+    variables = jax.tree.map(
+        lambda x: x + 0.1 * rng.random(x.shape, np.float32) if x.ndim == 1 else x, variables
+    )
     found = jax.jit(model.apply)(variables, windows)
     displacement, log_std, gate, attention = numpy_forward(variables, windows)
     np.testing.assert_allclose(found.displacement, displacement, rtol=2e-4, atol=2e-5)
@@ -145,29 +175,49 @@ def test_forward_against_numpy(samples):
     np.testing.assert_allclose(found.diagnostics["attention"], attention, rtol=2e-4, atol=2e-6)
 
 
-@pytest.mark.parametrize("size, stride, length", [(7, 2, 200), (3, 1, 25), (3, 2, 25), (1, 2, 13), (3, 2, 50)])
+@pytest.mark.parametrize(
+    "size, stride, length", [(7, 2, 200), (3, 1, 25), (3, 2, 25), (1, 2, 13), (3, 2, 50)]
+)
 def test_convolution_and_its_gradients_against_xla(size, stride, length):
     x = jax.random.normal(jax.random.key(0), (3, length, 4), jnp.float32)
     kernel = jax.random.normal(jax.random.key(1), (size, 4, 5), jnp.float32)
     padding = [((size - 1) // 2, (size - 1) // 2)]
-    oracle = lambda x, k: lax.conv_general_dilated(x, k, (stride,), padding, dimension_numbers=("NWC", "WIO", "NWC"))  # noqa: E731
+    oracle = lambda x, k: lax.conv_general_dilated(
+        x, k, (stride,), padding, dimension_numbers=("NWC", "WIO", "NWC")
+    )
     ours = lambda x, k: resnet.convolve(x, k, (stride,), padding)  # noqa: E731
     np.testing.assert_allclose(ours(x, kernel), oracle(x, kernel), rtol=1e-5, atol=1e-5)
     weight = jax.random.normal(jax.random.key(2), oracle(x, kernel).shape, jnp.float32)
-    for a, b in zip(*(jax.grad(lambda x, k, f=f: jnp.sum(f(x, k) * weight), (0, 1))(x, kernel) for f in (ours, oracle)), strict=True):
+    for a, b in zip(
+        *(
+            jax.grad(lambda x, k, f=f: jnp.sum(f(x, k) * weight), (0, 1))(x, kernel)
+            for f in (ours, oracle)
+        ),
+        strict=True,
+    ):
         np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4)
 
 
 @pytest.mark.parametrize("length", [100, 50, 25, 13])
 def test_max_pool_against_torch_convention(length):
-    x = -1 - np.random.default_rng(0).random((2, length, 3)).astype(np.float32)  # negative: a zero padding would show
+    x = -1 - np.random.default_rng(0).random((2, length, 3)).astype(
+        np.float32
+    )  # negative: a zero padding would show
     rows = range(0, length + 2 - 3 + 1, 2)
     padded = np.pad(x, ((0, 0), (1, 1), (0, 0)), constant_values=-np.inf)
-    np.testing.assert_array_equal(resnet.max_pool(jnp.asarray(x)), np.stack([padded[:, r: r + 3].max(axis=1) for r in rows], axis=1))
+    np.testing.assert_array_equal(
+        resnet.max_pool(jnp.asarray(x)),
+        np.stack([padded[:, r : r + 3].max(axis=1) for r in rows], axis=1),
+    )
 
 
-SCALES = {"softplus": lambda x: np.log1p(np.exp(x)), "pos_elu": lambda x: np.where(x > 0, x + 1, np.exp(np.minimum(x, 0))),
-          "abs": np.abs, "exp": np.exp, "linear": lambda x: x}
+SCALES = {
+    "softplus": lambda x: np.log1p(np.exp(x)),
+    "pos_elu": lambda x: np.where(x > 0, x + 1, np.exp(np.minimum(x, 0))),
+    "abs": np.abs,
+    "exp": np.exp,
+    "linear": lambda x: x,
+}
 GATES = {"tanh": np.tanh, "sigmoid": lambda x: 1 / (1 + np.exp(-x))}
 
 
@@ -179,10 +229,15 @@ def test_gates_and_scales(gate, scale):
     head = GatedHead(gate, scale)
     h = jax.random.normal(jax.random.key(0), (4, 16), jnp.float32)
     variables = head.init(jax.random.key(1), h)
-    variables = jax.tree.map(lambda x: x + 0.3 * jax.random.normal(jax.random.key(7), x.shape, x.dtype), variables)
+    variables = jax.tree.map(
+        lambda x: x + 0.3 * jax.random.normal(jax.random.key(7), x.shape, x.dtype), variables
+    )
     displacement, seen = head.apply(variables, h)
     linear = lambda q: np.asarray(h, np.float64) @ np.asarray(q["kernel"]) + np.asarray(q["bias"])  # noqa: E731
-    s, g = SCALES[scale](linear(variables["params"]["scale"])), GATES[gate](linear(variables["params"]["gate"]))
+    s, g = (
+        SCALES[scale](linear(variables["params"]["scale"])),
+        GATES[gate](linear(variables["params"]["gate"])),
+    )
     np.testing.assert_allclose(displacement, s * g, rtol=1e-4, atol=1e-5)
     np.testing.assert_allclose(seen["gate"], g, rtol=1e-4, atol=1e-5)
 
@@ -191,11 +246,15 @@ def test_a_new_network_predicts_that_it_stands_still():
     model = models.create("gnio", width=8)
     windows = jax.random.normal(jax.random.key(1), (4, 100, 6), jnp.float32)
     variables = models.initialise(model, jax.random.key(0), windows.shape[1])
-    prediction, _ = jax.jit(lambda v, w: model.apply(v, w, train=True, mutable=["batch_stats"]))(variables, windows)
+    prediction, _ = jax.jit(lambda v, w: model.apply(v, w, train=True, mutable=["batch_stats"]))(
+        variables, windows
+    )
     assert float(jnp.abs(prediction.displacement).max()) < 0.1
 
 
-@pytest.mark.parametrize("options", [{}, {"scale": "abs"}, {"head": "linear", "bank_size": 0}], ids=str)
+@pytest.mark.parametrize(
+    "options", [{}, {"scale": "abs"}, {"head": "linear", "bank_size": 0}], ids=str
+)
 def test_gradient_is_finite_where_everything_is_zero(options):
     """Zero input, zero parameters, zero gate, |0| as scale."""
     model = models.create("gnio", width=8, **options)
@@ -209,10 +268,16 @@ def test_training_mode_updates_the_statistics_with_momentum():
     model = models.create("gnio", width=8)
     windows = 3 + jax.random.normal(jax.random.key(1), (16, 100, 6), jnp.float32)
     variables = models.initialise(model, jax.random.key(0), windows.shape[1])
-    _, changed = jax.jit(lambda v, w: model.apply(v, w, train=True, mutable=["batch_stats"]))(variables, windows)
-    stem = resnet.convolve(windows, variables["params"]["encoder"]["stem_conv"]["kernel"], (2,), [(3, 3)])
+    _, changed = jax.jit(lambda v, w: model.apply(v, w, train=True, mutable=["batch_stats"]))(
+        variables, windows
+    )
+    stem = resnet.convolve(
+        windows, variables["params"]["encoder"]["stem_conv"]["kernel"], (2,), [(3, 3)]
+    )
     expected = 0.1 * np.asarray(stem).mean(axis=(0, 1))
-    np.testing.assert_allclose(changed["batch_stats"]["encoder"]["stem_bn"]["mean"], expected, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(
+        changed["batch_stats"]["encoder"]["stem_bn"]["mean"], expected, rtol=1e-4, atol=1e-5
+    )
 
 
 def test_parameters_and_outputs_are_float32_whatever_comes_in():
@@ -225,11 +290,15 @@ def test_parameters_and_outputs_are_float32_whatever_comes_in():
 
 
 def test_keys_and_values_are_projected_once_per_call():
-    """Cost of the compiled program: the multiply-adds of a window counted by hand, the bank's projections not repeated per window."""
+    """Cost of the compiled program: the multiply-adds of a window counted by hand, the bank's
+    projections not repeated per window."""
+
     def products(length, size, stride, channels, features):  # those that do not meet the padding
         before = (size - 1) // 2
         outputs = (length + 2 * before - size) // stride + 1
-        inside = sum(0 <= i * stride + j - before < length for i in range(outputs) for j in range(size))
+        inside = sum(
+            0 <= i * stride + j - before < length for i in range(outputs) for j in range(size)
+        )
         return inside * channels * features, outputs
 
     total, length = products(200, 7, 2, 6, 64)
@@ -239,12 +308,16 @@ def test_keys_and_values_are_projected_once_per_call():
         first, length = products(length, 3, stride, channels, features)
         total += first + shortcut + 3 * products(length, 3, 1, features, features)[0]
         channels = features
-    total += 2 * 512 * 512 + 2 * 64 * 512 + 3 * 3 * 512  # the bank's query, output, scores and context, and the heads
+    total += (
+        2 * 512 * 512 + 2 * 64 * 512 + 3 * 3 * 512
+    )  # the bank's query, output, scores and context, and the heads
     model = models.create("gnio")
     variables = shapes()
 
     def flops(batch):
-        lowered = jax.jit(model.apply).lower(variables, jax.ShapeDtypeStruct((batch, 200, 6), jnp.float32))
+        lowered = jax.jit(model.apply).lower(
+            variables, jax.ShapeDtypeStruct((batch, 200, 6), jnp.float32)
+        )
         return lowered.cost_analysis()["flops"]
 
     per_window = (flops(65) - flops(1)) / 64
@@ -266,32 +339,52 @@ def test_both_convolutions_are_one_function(size, stride):
     x, kernel = rng.normal(size=(2, 11, 3)), rng.normal(size=(size, 3, 4))
     padding = [((size - 1) // 2,) * 2]
     padded = np.pad(x, ((0, 0), padding[0], (0, 0)))
-    wanted = np.stack([np.einsum("bkc,kcd->bd", padded[:, i : i + size], kernel)
-                       for i in range(0, padded.shape[1] - size + 1, stride)], axis=1)
+    wanted = np.stack(
+        [
+            np.einsum("bkc,kcd->bd", padded[:, i : i + size], kernel)
+            for i in range(0, padded.shape[1] - size + 1, stride)
+        ],
+        axis=1,
+    )
     found = {}
     for function in (resnet.convolve, resnet.convolve_forward):
+
         def apply(x, kernel, function=function):
             return function(x, kernel, (stride,), padding)
 
         np.testing.assert_allclose(apply(jnp.asarray(x), jnp.asarray(kernel)), wanted, atol=1e-12)
         weights = np.random.default_rng(1).normal(size=wanted.shape)
-        found[function] = (jax.jvp(apply, (x, kernel), (x[::-1], kernel[::-1]))[1],
-                           *jax.grad(lambda x, kernel, apply=apply, weights=weights: jnp.sum(weights * apply(x, kernel)), (0, 1))(
-                               jnp.asarray(x), jnp.asarray(kernel)))
+        found[function] = (
+            jax.jvp(apply, (x, kernel), (x[::-1], kernel[::-1]))[1],
+            *jax.grad(
+                lambda x, kernel, apply=apply, weights=weights: jnp.sum(weights * apply(x, kernel)),
+                (0, 1),
+            )(jnp.asarray(x), jnp.asarray(kernel)),
+        )
     for one, other in zip(*found.values(), strict=True):
         np.testing.assert_allclose(one, other, atol=1e-12)
 
 
 def test_constant_uncertainty_leaves_the_displacement_as_it_is():
-    plain, constant = (models.create("gnio", width=2, bank_size=4, bank_heads=2, uncertainty=kind) for kind in ("head", "constant"))
+    plain, constant = (
+        models.create("gnio", width=2, bank_size=4, bank_heads=2, uncertainty=kind)
+        for kind in ("head", "constant")
+    )
     variables = models.initialise(plain, jax.random.key(0), 64)
     params = {name: part for name, part in variables["params"].items() if name != "uncertainty"}
     log_std = jnp.array([-1.0, -2.0, -3.0], jnp.float32)
-    given = {"params": params, "batch_stats": variables["batch_stats"] | {"uncertainty": {"log_std": log_std}}}
-    assert jax.tree.structure(given) == jax.tree.structure(jax.eval_shape(constant.init, jax.random.key(0), jnp.zeros((1, 64, 6))))
+    given = {
+        "params": params,
+        "batch_stats": variables["batch_stats"] | {"uncertainty": {"log_std": log_std}},
+    }
+    assert jax.tree.structure(given) == jax.tree.structure(
+        jax.eval_shape(constant.init, jax.random.key(0), jnp.zeros((1, 64, 6)))
+    )
     windows = jax.random.normal(jax.random.key(1), (2, 64, 6), jnp.float32)
     found = constant.apply(given, windows)
     np.testing.assert_array_equal(found.displacement, plain.apply(variables, windows).displacement)
     np.testing.assert_array_equal(found.log_std, [log_std, log_std])
     frozen = models.freeze(constant, given)
-    np.testing.assert_allclose(models.Inference(constant)(frozen, windows).displacement, found.displacement, atol=1e-6)
+    np.testing.assert_allclose(
+        models.Inference(constant)(frozen, windows).displacement, found.displacement, atol=1e-6
+    )

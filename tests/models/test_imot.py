@@ -1,15 +1,16 @@
-"""iMoT against its description: sizes block by block, a plain NumPy forward pass of the whole network, its decoupler."""
+"""iMoT against its description: sizes block by block, a plain NumPy forward pass of the whole
+network, its decoupler."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from compiling import quick
 from scipy.special import erf
 
 from gnio_jax import models
 from gnio_jax.models import imot
 from gnio_jax.types import InputError
+from tests.support.compiling import quick
 
 SMALL = {"encoder_layers": 2, "decoder_layers": 2, "ffn_ratio": 1.5, "heads": 4, "particles": 5}
 
@@ -20,32 +21,45 @@ def count(tree):
 
 def shapes(samples=200, name="imot", **options):
     model = models.create(name, **options)
-    return jax.eval_shape(model.init, jax.random.key(0), jax.ShapeDtypeStruct((1, samples, 6), jnp.float32))
+    return jax.eval_shape(
+        model.init, jax.random.key(0), jax.ShapeDtypeStruct((1, samples, 6), jnp.float32)
+    )
 
 
 def drawn(tree, seed=3):
-    """Variables far from their neutral start, biases too, so that nothing can be left out unnoticed."""
+    """Variables far from their neutral start, biases too, so that nothing can be left out
+    unnoticed."""
     rng = np.random.default_rng(seed)
 
     def draw(path, leaf):
         if path[-1].key == "scale":
             return jnp.asarray(rng.uniform(0.5, 1.5, leaf.shape), jnp.float32)
-        return jnp.asarray(rng.standard_normal(leaf.shape) * (1.0 if path[-1].key == "particles" else 0.3), jnp.float32)
+        return jnp.asarray(
+            rng.standard_normal(leaf.shape) * (1.0 if path[-1].key == "particles" else 0.3),
+            jnp.float32,
+        )
 
     return jax.tree.map_with_path(draw, tree)
 
 
 def layer_sizes(t, ffn):
-    """An encoder and a decoder layer: every matrix with its bias, every normalisation with two numbers a feature."""
+    """An encoder and a decoder layer: every matrix with its bias, every normalisation with two
+    numbers a feature."""
     full = lambda i, o: i * o + o  # noqa: E731
     spatial = full(3 * 2 * t, 2 * t) + full(2 * t, 2 * t)
-    encoder = 4 * full(t, t) + 2 * full(t, t) + full(t, ffn) + full(ffn, t) + 2 * spatial + 2 * 2 * t
+    encoder = (
+        4 * full(t, t) + 2 * full(t, t) + full(t, ffn) + full(ffn, t) + 2 * spatial + 2 * 2 * t
+    )
     conditional = 2 * full(2 * t, 2 * t) + full(t, 2 * t) + full(2 * t, t)
     fusion = full(2 * t, t) + full(t, t)
-    return encoder, 6 * full(t, t) + 2 * conditional + fusion + full(t, ffn) + full(ffn, t) + 4 * 2 * t
+    return encoder, 6 * full(t, t) + 2 * conditional + fusion + full(t, ffn) + full(
+        ffn, t
+    ) + 4 * 2 * t
 
 
-@pytest.mark.parametrize("name, layers, ffn, total", [("imot", 4, 916, 14_492_810), ("imot_text", 2, 800, 7_137_482)])
+@pytest.mark.parametrize(
+    "name, layers, ffn, total", [("imot", 4, 916, 14_492_810), ("imot_text", 2, 800, 7_137_482)]
+)
 def test_parameters_of_the_publication_and_of_its_text(name, layers, ffn, total):
     params = shapes(name=name, output_dim=2)["params"]
     assert count(params) == total
@@ -68,7 +82,12 @@ def test_a_window_of_100_samples_has_heads_that_divide_it():
     assert params["encoder_1"]["attention"]["query"]["kernel"].shape == (100, 5, 20)
     assert params["decoder_1"]["gyro"]["key"]["kernel"].shape == (200, 5, 40)
     assert shapes(200)["params"]["encoder_1"]["attention"]["query"]["kernel"].shape == (200, 8, 25)
-    assert [imot.head_count(t, most) for t, most in ((200, 8), (100, 8), (100, 4), (97, 8))] == [8, 5, 4, 1]
+    assert [imot.head_count(t, most) for t, most in ((200, 8), (100, 8), (100, 4), (97, 8))] == [
+        8,
+        5,
+        4,
+        1,
+    ]
 
 
 def decoupled(channels):
@@ -88,11 +107,15 @@ def decoupled(channels):
 def test_a_series_is_its_trend_and_its_season():
     x = np.random.default_rng(0).normal(size=(2, 6, 25)).astype(np.float32)
     found = imot.decouple(jnp.asarray(x))
-    np.testing.assert_allclose(found, np.stack([decoupled(each.astype(np.float64)) for each in x]), atol=1e-5)
+    np.testing.assert_allclose(
+        found, np.stack([decoupled(each.astype(np.float64)) for each in x]), atol=1e-5
+    )
     parts = np.asarray(found).reshape(2, 2, 3, 3, 25)
     np.testing.assert_allclose(parts[:, :, 1] + parts[:, :, 2], parts[:, :, 0], atol=1e-6)
     ramp = jnp.broadcast_to(jnp.arange(25, dtype=jnp.float32)[None, None], (1, 6, 25))
-    np.testing.assert_allclose(imot.decouple(ramp)[0, 6, 5:-5], 0, atol=1e-5)  # a steady change is trend alone, away from the ends
+    np.testing.assert_allclose(
+        imot.decouple(ramp)[0, 6, 5:-5], 0, atol=1e-5
+    )  # a steady change is trend alone, away from the ends
 
 
 def softmax(x):
@@ -109,13 +132,18 @@ def perceptron(x, q):
 
 
 def layer_norm(x, q):
-    return (x - x.mean(-1, keepdims=True)) / np.sqrt(x.var(-1, keepdims=True) + 1e-5) * q["scale"] + q["bias"]
+    return (x - x.mean(-1, keepdims=True)) / np.sqrt(x.var(-1, keepdims=True) + 1e-5) * q[
+        "scale"
+    ] + q["bias"]
 
 
 def attention(query, key, value, q):
     out = np.zeros((len(query), q["out"]["kernel"].shape[-1])) + q["out"]["bias"]
     for h in range(q["query"]["kernel"].shape[1]):
-        a, b, c = (x @ q[name]["kernel"][:, h] + q[name]["bias"][h] for name, x in (("query", query), ("key", key), ("value", value)))
+        a, b, c = (
+            x @ q[name]["kernel"][:, h] + q[name]["bias"][h]
+            for name, x in (("query", query), ("key", key), ("value", value))
+        )
         for i in range(len(a)):
             out[i] += softmax(b @ a[i] / np.sqrt(a.shape[1])) @ c @ q["out"]["kernel"][h]
     return out
@@ -130,14 +158,19 @@ def waves(x, features):
 def spatial(x, q):
     y = np.hstack([x[:9], x[9:]])
     rows = np.vstack([0 * y[:1], y, 0 * y[:1]])
-    y = np.array([linear(np.concatenate([rows[i], rows[i + 1], rows[i + 2]]), q["conv3"]) for i in range(9)])
+    y = np.array(
+        [linear(np.concatenate([rows[i], rows[i + 1], rows[i + 2]]), q["conv3"]) for i in range(9)]
+    )
     y = linear(y / (1 + np.exp(-y.mean(axis=0))), q["conv1"])
     y = y * 0.5 * (1 + erf(y / np.sqrt(2)))
-    return np.vstack([y[:, : x.shape[1]], y[:, x.shape[1]:]])
+    return np.vstack([y[:, : x.shape[1]], y[:, x.shape[1] :]])
 
 
 def among_particles(content, where, q, heads):
-    query, key = (linear(content, q[f"{name}_content"]) + linear(where, q[f"{name}_position"]) for name in ("query", "key"))
+    query, key = (
+        linear(content, q[f"{name}_content"]) + linear(where, q[f"{name}_position"])
+        for name in ("query", "key")
+    )
     value = linear(content, q["value"])
     size = content.shape[1] // heads
     out = np.zeros_like(content)
@@ -159,23 +192,48 @@ def numpy_forward(variables, windows, heads):
             q = p[f"encoder_{layer}"]
             x = decoupled(channels)
             e = perceptron(x, q["positions"]) * np.array([waves(i, t) for i in range(18)])
-            x = layer_norm(spatial(x, q["attention_spatial"]) + attention(x + e, x + e, x, q["attention"]), q["attention_norm"])
+            x = layer_norm(
+                spatial(x, q["attention_spatial"]) + attention(x + e, x + e, x, q["attention"]),
+                q["attention_norm"],
+            )
             x = layer_norm(spatial(x, q["ffn_spatial"]) + perceptron(x, q["ffn"]), q["ffn_norm"])
-            channels = np.vstack([(x[i: i + 3] + x[i + 3: i + 6] + x[i + 6: i + 9]) / 2 for i in (0, 9)])
+            channels = np.vstack(
+                [(x[i : i + 3] + x[i + 3 : i + 6] + x[i + 6 : i + 9]) / 2 for i in (0, 9)]
+            )
         particles = p["particles"]
         content = np.zeros((len(particles), t))
         each = 2 * (t // (2 * particles.shape[1]))
         for layer in (1, 2):
             q = p[f"decoder_{layer}"]
-            located = [[wave for c in particle for wave in waves(2 * np.pi * c, each)] for particle in particles]
-            where = perceptron(np.array([row + [0] * (t - len(row)) for row in located]), p["particle_positions"])
-            content = layer_norm(content + among_particles(content, where, q["self"], heads), q["self_norm"])
-            found = [layer_norm(content + attention(np.hstack([content, where]), np.hstack([x[rows], e[rows]]), x[rows], q[name]),
-                                q[f"{name}_norm"]) for name, rows in (("accel", slice(0, 9)), ("gyro", slice(9, 18)))]
+            located = [
+                [wave for c in particle for wave in waves(2 * np.pi * c, each)]
+                for particle in particles
+            ]
+            where = perceptron(
+                np.array([row + [0] * (t - len(row)) for row in located]), p["particle_positions"]
+            )
+            content = layer_norm(
+                content + among_particles(content, where, q["self"], heads), q["self_norm"]
+            )
+            found = [
+                layer_norm(
+                    content
+                    + attention(
+                        np.hstack([content, where]), np.hstack([x[rows], e[rows]]), x[rows], q[name]
+                    ),
+                    q[f"{name}_norm"],
+                )
+                for name, rows in (("accel", slice(0, 9)), ("gyro", slice(9, 18)))
+            ]
             content = perceptron(np.hstack(found), q["fusion"])
             content = layer_norm(content + perceptron(content, q["ffn"]), q["ffn_norm"])
             particles = particles + perceptron(content, p["refinement"])
-        weights = softmax(np.mean([perceptron(content[:, feature], p["scores"]["mlp"]) for feature in range(t)], axis=0))
+        weights = softmax(
+            np.mean(
+                [perceptron(content[:, feature], p["scores"]["mlp"]) for feature in range(t)],
+                axis=0,
+            )
+        )
         results.append((weights @ particles, particles, weights))
     return tuple(map(np.array, zip(*results, strict=True)))
 
@@ -186,11 +244,17 @@ def test_forward_against_numpy(samples, output_dim):
     variables = drawn(shapes(samples, output_dim=output_dim, **SMALL))
     windows = jax.random.normal(jax.random.key(1), (2, samples, 6), jnp.float32)
     found = quick(model.apply)(variables, windows)
-    velocity, particles, weights = numpy_forward(variables, windows, heads=4 if samples == 20 else 2)
-    assert np.ptp(velocity, axis=0).min() > 0.02 and np.ptp(weights, axis=0).max() > 1e-3  # the windows are told apart
+    velocity, particles, weights = numpy_forward(
+        variables, windows, heads=4 if samples == 20 else 2
+    )
+    assert (
+        np.ptp(velocity, axis=0).min() > 0.02 and np.ptp(weights, axis=0).max() > 1e-3
+    )  # the windows are told apart
     np.testing.assert_allclose(found.diagnostics["particles"], particles, rtol=1e-3, atol=2e-4)
     np.testing.assert_allclose(found.diagnostics["particle_weights"], weights, rtol=1e-3, atol=1e-5)
-    np.testing.assert_allclose(found.displacement, np.pad(velocity, ((0, 0), (0, 3 - output_dim))), rtol=1e-3, atol=2e-4)
+    np.testing.assert_allclose(
+        found.displacement, np.pad(velocity, ((0, 0), (0, 3 - output_dim))), rtol=1e-3, atol=2e-4
+    )
     constant = variables["batch_stats"]["uncertainty"]["log_std"]
     np.testing.assert_array_equal(found.log_std, np.stack([constant, constant]))
 
@@ -204,27 +268,49 @@ def test_every_parameter_that_can_be_is_trained_in_float32_and_dropout_is_drawn(
 
     def loss(params, key):
         given = {"params": params, "batch_stats": variables["batch_stats"]}
-        prediction, _ = model.apply(given, windows, train=True, mutable=["batch_stats"], rngs={"dropout": key})
+        prediction, _ = model.apply(
+            given, windows, train=True, mutable=["batch_stats"], rngs={"dropout": key}
+        )
         return jnp.sum((prediction.displacement - 1) ** 2), prediction.displacement
 
     gradient = quick(jax.grad(loss, has_aux=True))
-    (grads, one), (others, other) = (gradient(variables["params"], jax.random.key(seed)) for seed in (0, 1))
-    for (path, leaf), another in zip(jax.tree.leaves_with_path(grads), jax.tree.leaves(others), strict=True):
+    (grads, one), (others, other) = (
+        gradient(variables["params"], jax.random.key(seed)) for seed in (0, 1)
+    )
+    for (path, leaf), another in zip(
+        jax.tree.leaves_with_path(grads), jax.tree.leaves(others), strict=True
+    ):
         assert leaf.dtype == jnp.float32 and bool(jnp.isfinite(leaf).all()), path
         names = [key.key for key in path]
         trained = float(jnp.abs(leaf).max() + jnp.abs(another).max())
-        if names[:2] == ["decoder_1", "self"] and names[2:] not in (["value", "bias"], ["output", "bias"], ["output", "kernel"]):
-            assert trained < 1e-5, path  # all contents are zero at first: whom a particle attends to makes no difference
-        elif names[-2:] != ["key", "bias"] and names[-2:] not in (["key_content", "bias"], ["key_position", "bias"]):
-            assert trained > 1e-6, path  # but for one number added to all scores, which a softmax does not see
+        if names[:2] == ["decoder_1", "self"] and names[2:] not in (
+            ["value", "bias"],
+            ["output", "bias"],
+            ["output", "kernel"],
+        ):
+            assert trained < 1e-5, (
+                path
+            )  # all contents are zero at first: whom a particle attends to makes no difference
+        elif names[-2:] != ["key", "bias"] and names[-2:] not in (
+            ["key_content", "bias"],
+            ["key_position", "bias"],
+        ):
+            assert trained > 1e-6, (
+                path
+            )  # but for one number added to all scores, which a softmax does not see
     assert float(jnp.abs(one - other).max()) > 1e-3
 
 
-@pytest.mark.parametrize("options, problem", [({"particles": 0}, "particles must be at least 1, found 0"),
-                                              ({"heads": 0}, "heads must be at least 1, found 0"),
-                                              ({"ffn_ratio": 0.0}, "ffn_ratio must be positive, found 0.0"),
-                                              ({"dropout": 1.0}, "dropout must be at least 0 and below 1, found 1.0"),
-                                              ({"output_dim": 1}, "output_dim must be 2 or 3, found 1")])
+@pytest.mark.parametrize(
+    "options, problem",
+    [
+        ({"particles": 0}, "particles must be at least 1, found 0"),
+        ({"heads": 0}, "heads must be at least 1, found 0"),
+        ({"ffn_ratio": 0.0}, "ffn_ratio must be positive, found 0.0"),
+        ({"dropout": 1.0}, "dropout must be at least 0 and below 1, found 1.0"),
+        ({"output_dim": 1}, "output_dim must be 2 or 3, found 1"),
+    ],
+)
 def test_options_that_cannot_be_are_refused(options, problem):
     with pytest.raises(InputError, match=f"model 'imot_text': {problem}"):
         models.create("imot_text", **options)

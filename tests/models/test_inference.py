@@ -25,7 +25,9 @@ def trained_like(model, seed=0):
     return jax.tree.unflatten(tree, [shaken(path, leaf) for path, leaf in leaves])
 
 
-@pytest.mark.parametrize("options", [{"bank_size": 8, "bank_heads": 2}, {"bank_size": 0, "head": "linear"}])
+@pytest.mark.parametrize(
+    "options", [{"bank_size": 8, "bank_heads": 2}, {"bank_size": 0, "head": "linear"}]
+)
 def test_a_frozen_network_gives_the_same_numbers(options):
     model = models.create("gnio", width=4, **options)
     variables = trained_like(model)
@@ -46,5 +48,7 @@ def test_keys_and_values_are_not_computed_again():
     def operations(apply, given):
         return jax.jit(apply).lower(given, windows).compile().cost_analysis()["flops"]
 
-    saved = operations(model.apply, variables) - operations(models.Inference(model), models.freeze(model, variables))
+    saved = operations(model.apply, variables) - operations(
+        models.Inference(model), models.freeze(model, variables)
+    )
     assert saved >= 2 * 2 * 16 * 32 * 32  # two projections of 16 prototypes of 32 features

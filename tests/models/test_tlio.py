@@ -1,6 +1,5 @@
 """TLIO's network: its sizes, its output against the recorded one, and how it trains."""
 
-import sys
 from pathlib import Path
 
 import jax
@@ -12,11 +11,9 @@ from flax import linen as nn
 from gnio_jax import interop, models
 from gnio_jax.models.tlio import FullyConnectedHead
 from gnio_jax.types import InputError
+from tests.support import tlio_weights
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "reference"))
-import tlio_weights
-
-RECORDED = Path(__file__).parents[1] / "data" / "tlio_tracker" / "pipeline.npz"
+RECORDED = Path(__file__).parents[1] / "recorded" / "tlio_tracker" / "pipeline.npz"
 ENCODER = 3_846_144
 
 
@@ -25,7 +22,9 @@ def count(tree):
 
 
 def shapes(model, samples):
-    return jax.eval_shape(model.init, jax.random.key(0), jax.ShapeDtypeStruct((1, samples, 6), jnp.float32))
+    return jax.eval_shape(
+        model.init, jax.random.key(0), jax.ShapeDtypeStruct((1, samples, 6), jnp.float32)
+    )
 
 
 def drawn(model, samples, seed=0):
@@ -48,13 +47,22 @@ def test_parameters_of_the_published_network_block_by_block(samples, rows, total
     assert count(params["encoder"]) == ENCODER
     for head in (params["displacement"], params["log_std"]):
         assert {name: count(part) for name, part in head.items()} == {
-            "neck_conv": 512 * 128, "neck_bn": 2 * 128, "fc1": 128 * rows * 512 + 512, "fc2": 512 * 512 + 512, "fc3": 512 * 3 + 3}
+            "neck_conv": 512 * 128,
+            "neck_bn": 2 * 128,
+            "fc1": 128 * rows * 512 + 512,
+            "fc2": 512 * 512 + 512,
+            "fc3": 512 * 3 + 3,
+        }
 
 
 def test_other_widths_scale_the_heads_too():
     params = shapes(models.create("tlio", width=8), 200)["params"]["log_std"]
     assert {name: part["kernel"].shape for name, part in params.items() if name != "neck_bn"} == {
-        "neck_conv": (1, 64, 16), "fc1": (7 * 16, 64), "fc2": (64, 64), "fc3": (64, 3)}
+        "neck_conv": (1, 64, 16),
+        "fc1": (7 * 16, 64),
+        "fc2": (64, 64),
+        "fc3": (64, 3),
+    }
 
 
 def test_output_is_the_recorded_one():
@@ -66,7 +74,9 @@ def test_output_is_the_recorded_one():
     np.testing.assert_allclose(found.displacement, recorded["net_displacement"], atol=1e-5)
     np.testing.assert_allclose(found.log_std, recorded["net_log_std"], atol=1e-5)
     assert found.displacement.dtype == found.log_std.dtype == jnp.float32
-    swapped = apply(variables, np.concatenate([gyro, accel], axis=-1))  # what the comparison would say of channels in the other order
+    swapped = apply(
+        variables, np.concatenate([gyro, accel], axis=-1)
+    )  # what the comparison would say of channels in the other order
     assert np.abs(swapped.displacement - recorded["net_displacement"]).max() > 1e-3
 
 
@@ -90,14 +100,23 @@ def test_dropout_keeps_its_share_in_training_alone():
     heads = {share: FullyConnectedHead(8, 3, share) for share in (0.0, 0.25)}
     shape = jax.eval_shape(lambda: heads[0.0].init(jax.random.key(0), features, False))
     rng = np.random.default_rng(0)
-    variables = jax.tree.map(lambda leaf: jnp.asarray(rng.uniform(0.1, 0.4, leaf.shape) * rng.choice([-1, 1], leaf.shape), jnp.float32),
-                             shape)
+    variables = jax.tree.map(
+        lambda leaf: jnp.asarray(
+            rng.uniform(0.1, 0.4, leaf.shape) * rng.choice([-1, 1], leaf.shape), jnp.float32
+        ),
+        shape,
+    )
     variables["batch_stats"] = jax.tree.map(jnp.abs, variables["batch_stats"])
 
     def hidden(share, train, seed=0):
-        _, seen = heads[share].apply(variables, features, train, rngs={"dropout": jax.random.key(seed)},
-                                     mutable=["intermediates", "batch_stats"],
-                                     capture_intermediates=lambda module, _: isinstance(module, nn.Dropout))
+        _, seen = heads[share].apply(
+            variables,
+            features,
+            train,
+            rngs={"dropout": jax.random.key(seed)},
+            mutable=["intermediates", "batch_stats"],
+            capture_intermediates=lambda module, _: isinstance(module, nn.Dropout),
+        )
         return [np.asarray(seen["intermediates"][f"Dropout_{i}"]["__call__"][0]) for i in range(2)]
 
     whole, dropped, other = hidden(0.0, True)[0], hidden(0.25, True)[0], hidden(0.25, True, 1)[0]
@@ -116,20 +135,30 @@ def test_a_new_head_predicts_next_to_nothing_and_learns_every_parameter():
     head = FullyConnectedHead(8, 3, 0.5)
     variables = jax.jit(lambda key: head.init(key, features, False))(jax.random.key(0))
     assert abs(np.asarray(variables["params"]["fc1"]["kernel"]).std() - 0.01) < 0.001
-    assert all((np.asarray(variables["params"][layer]["bias"]) == 0).all() for layer in ("fc1", "fc2", "fc3"))
+    assert all(
+        (np.asarray(variables["params"][layer]["bias"]) == 0).all()
+        for layer in ("fc1", "fc2", "fc3")
+    )
 
     @jax.jit
     def gradient(variables):
         def loss(params):
-            output, _ = head.apply({**variables, "params": params}, features, True, rngs={"dropout": jax.random.key(2)},
-                                   mutable=["batch_stats"])
+            output, _ = head.apply(
+                {**variables, "params": params},
+                features,
+                True,
+                rngs={"dropout": jax.random.key(2)},
+                mutable=["batch_stats"],
+            )
             return jnp.sum((output - 1) ** 2), output
 
         return jax.grad(loss, has_aux=True)(variables["params"])
 
     found, output = gradient(variables)
     assert float(jnp.abs(output).max()) < 0.1
-    assert all(np.isfinite(leaf).all() and np.abs(leaf).max() > 0 for leaf in jax.tree.leaves(found))
+    assert all(
+        np.isfinite(leaf).all() and np.abs(leaf).max() > 0 for leaf in jax.tree.leaves(found)
+    )
 
 
 @pytest.mark.parametrize("name", ["tlio", "ronin_resnet"])
@@ -137,15 +166,25 @@ def test_parameters_and_outputs_are_float32_whatever_comes_in(name):
     model, windows = models.create(name, width=4), jax.ShapeDtypeStruct((2, 64, 6), jnp.float64)
     variables = jax.eval_shape(model.init, jax.random.key(0), windows)
     assert {leaf.dtype for leaf in jax.tree.leaves(variables)} == {jnp.dtype("float32")}
-    found, changed = jax.eval_shape(lambda variables, windows, key: model.apply(
-        variables, windows, train=True, rngs={"dropout": key}, mutable=["batch_stats"]), variables, windows, jax.random.key(0))
+    found, changed = jax.eval_shape(
+        lambda variables, windows, key: model.apply(
+            variables, windows, train=True, rngs={"dropout": key}, mutable=["batch_stats"]
+        ),
+        variables,
+        windows,
+        jax.random.key(0),
+    )
     for leaf in (found.displacement, found.log_std):
         assert (leaf.shape, leaf.dtype) == ((2, 3), jnp.dtype("float32"))
-    assert changed["batch_stats"] == variables["batch_stats"]  # shapes and dtypes: nothing comes or goes
+    assert (
+        changed["batch_stats"] == variables["batch_stats"]
+    )  # shapes and dtypes: nothing comes or goes
 
 
 @pytest.mark.parametrize("share", [1.0, -0.1, float("nan")])
 def test_a_share_that_leaves_nothing_is_refused(share):
     for name in ("tlio", "ronin_resnet"):
-        with pytest.raises(InputError, match=f"model '{name}': dropout must be at least 0 and below 1"):
+        with pytest.raises(
+            InputError, match=f"model '{name}': dropout must be at least 0 and below 1"
+        ):
             models.create(name, dropout=share)

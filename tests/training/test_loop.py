@@ -1,4 +1,5 @@
-"""Runs of a tiny network on a tiny recording: what is logged, resumed, refused; whole processes where signals matter."""
+"""Runs of a tiny network on a tiny recording: what is logged, resumed, refused; whole processes
+where signals matter."""
 
 import dataclasses
 import json
@@ -15,7 +16,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import yaml
-from test_tlio_layout import write_sequence
 
 from gnio_jax import config as configuration
 from gnio_jax.config import DataConfig, LossConfig, ModelConfig, OptimConfig, TrainConfig
@@ -23,6 +23,7 @@ from gnio_jax.data import windows
 from gnio_jax.training import checkpoint, loop, optimizer, step
 from gnio_jax.training.losses import Losses
 from gnio_jax.types import InputError
+from tests.support.tlio_files import write_sequence
 
 ROOT = Path(__file__).parents[2]
 
@@ -69,12 +70,19 @@ def test_a_run_leaves_its_config_log_events_and_checkpoints(recording, finished)
     assert configuration.load(workdir / "config.yaml") == tiny(recording, workdir)
     rows = [json.loads(line) for line in (workdir / "metrics.jsonl").read_text().splitlines()]
     assert [row["epoch"] for row in rows] == [0, 1, 2]
-    windows_per_epoch = 2 * len(range(0, 600 - 50, 5))  # 12 s at 50 Hz, a window of 1 s every 0.1 s, two recordings
+    windows_per_epoch = 2 * len(
+        range(0, 600 - 50, 5)
+    )  # 12 s at 50 Hz, a window of 1 s every 0.1 s, two recordings
     assert [row["step"] for row in rows] == [windows_per_epoch // 16 * (i + 1) for i in range(3)]
     assert outcome.best_loss == min(row["val_loss"] for row in rows)
     assert rows[-1]["loss"] < rows[0]["loss"]
-    assert rows[-1]["loss"] == pytest.approx(100 * rows[-1]["mse"] + 1e-4 * rows[-1]["nll"], rel=1e-5)
-    assert yaml.safe_load((workdir / "splits.yaml").read_text()) == {"train": ["a", "b"], "val": ["c"]}
+    assert rows[-1]["loss"] == pytest.approx(
+        100 * rows[-1]["mse"] + 1e-4 * rows[-1]["nll"], rel=1e-5
+    )
+    assert yaml.safe_load((workdir / "splits.yaml").read_text()) == {
+        "train": ["a", "b"],
+        "val": ["c"],
+    }
     assert list((workdir / "tensorboard").glob("events*"))
     best = min(rows, key=lambda row: row["val_loss"])
     assert checkpoint.load_run(workdir, "best").step == best["step"]
@@ -86,11 +94,18 @@ def test_validation_is_the_plain_mean_over_every_window(recording, finished):
     run = checkpoint.load_run(workdir, "latest")
     from gnio_jax import data
 
-    source = windows.index([data.resample(s, 50.0) for s in data.load("tlio", recording, "val")], run.config.data, 5)
+    source = windows.index(
+        [data.resample(s, 50.0) for s in data.load("tlio", recording, "val")], run.config.data, 5
+    )
     source = jax.device_put(source)
     every = windows.gather(source, jnp.arange(source.start.shape[0], dtype=jnp.int32), 50)
     prediction = jax.jit(run.model.apply)(run.variables, every.imu)
-    mse = np.mean(np.sum((np.asarray(prediction.displacement, np.float64) - np.asarray(every.displacement)) ** 2, axis=1))
+    mse = np.mean(
+        np.sum(
+            (np.asarray(prediction.displacement, np.float64) - np.asarray(every.displacement)) ** 2,
+            axis=1,
+        )
+    )
     row = json.loads((workdir / "metrics.jsonl").read_text().splitlines()[-1])
     assert row["val_mse"] == pytest.approx(mse, rel=1e-4)
     assert len(every.displacement) % 16 != 0  # so that the filled-up last batch is part of the test
@@ -102,7 +117,10 @@ def test_a_run_is_not_resumed_with_other_recordings(recording, finished, tmp_pat
     (tmp_path / "data" / "train_list.txt").write_text("b\na\n")
     config = tiny(recording, tmp_path / "run", data_root=str(tmp_path / "data"))
     before = (tmp_path / "run" / "splits.yaml").read_bytes()
-    with pytest.raises(InputError, match=r"splits\.yaml: .*split 'train' \(0 differ, their order does\); resume with the same data"):
+    with pytest.raises(
+        InputError,
+        match=r"splits\.yaml: .*split 'train' \(0 differ, their order does\); resume with the same data",
+    ):
         loop.train(config, resume=True)
     (tmp_path / "data" / "train_list.txt").write_text("b\n")
     with pytest.raises(InputError, match=r"split 'train' \(1 differ, e\.g\. a\)"):
@@ -114,7 +132,9 @@ def test_a_run_is_not_resumed_with_other_recordings(recording, finished, tmp_pat
 
 
 @pytest.mark.parametrize("dispatches", [1, 4, 9])
-def test_stopping_within_an_epoch_and_resuming_gives_the_same_bits(recording, finished, tmp_path, monkeypatch, dispatches):
+def test_stopping_within_an_epoch_and_resuming_gives_the_same_bits(
+    recording, finished, tmp_path, monkeypatch, dispatches
+):
     calls = []
     real = step.train_steps
 
@@ -128,7 +148,10 @@ def test_stopping_within_an_epoch_and_resuming_gives_the_same_bits(recording, fi
     monkeypatch.setattr(loop, "DISPATCH_SECONDS", 0.01)
     outcome = loop.train(tiny(recording, tmp_path / "run"))
     assert outcome.stopped_by == signal.SIGTERM
-    assert checkpoint.load_run(tmp_path / "run", "latest").step < checkpoint.load_run(finished[0], "latest").step
+    assert (
+        checkpoint.load_run(tmp_path / "run", "latest").step
+        < checkpoint.load_run(finished[0], "latest").step
+    )
     monkeypatch.setattr(loop, "DISPATCH_SECONDS", 0.5)
     assert loop.train(tiny(recording, tmp_path / "run"), resume=True).stopped_by is None
     for which in ("latest", "best"):
@@ -136,7 +159,9 @@ def test_stopping_within_an_epoch_and_resuming_gives_the_same_bits(recording, fi
     kept = ("epoch", "step", "loss", "mse", "nll", "val_loss", "learning_rate")
     rows = [[{key: row[key] for key in kept} for row in map(json.loads, (folder / "metrics.jsonl").read_text().splitlines())]
             for folder in (tmp_path / "run", finished[0])]  # fmt: skip
-    for ours, theirs in zip(*rows, strict=True):  # sums over an epoch are made of fewer or more parts: equal but for rounding
+    for ours, theirs in zip(
+        *rows, strict=True
+    ):  # sums over an epoch are made of fewer or more parts: equal but for rounding
         assert ours == pytest.approx(theirs, rel=1e-6)
 
 
@@ -150,24 +175,37 @@ ENVIRONMENT = {**os.environ, "JAX_PLATFORMS": "cpu"}
 
 
 def test_killed_at_any_moment_and_resumed_gives_the_same_bits(recording, tmp_path):
-    """SIGKILL while a checkpoint is being written, or right before or after, against a run left alone."""
+    """SIGKILL while a checkpoint is being written, or right before or after, against a run left
+    alone."""
     config = tiny(recording, tmp_path / "alone")
     loop.train(dataclasses.replace(config, optim=dataclasses.replace(config.optim, epochs=6)))
     epochs, run = ["--optim.epochs", "6"], tmp_path / "killed"
     process = subprocess.Popen(command(recording, run, *epochs), cwd=ROOT, env=ENVIRONMENT, stdout=subprocess.DEVNULL,
                                stderr=subprocess.PIPE, text=True)  # fmt: skip
     log, deadline = run / "metrics.jsonl", time.time() + 120
-    while time.time() < deadline and process.poll() is None and not (log.exists() and log.read_text().count("\n") >= 2):
+    while (
+        time.time() < deadline
+        and process.poll() is None
+        and not (log.exists() and log.read_text().count("\n") >= 2)
+    ):
         time.sleep(0.002)
     time.sleep(0.03)  # the log's row comes right before the checkpoints
     process.send_signal(signal.SIGKILL)
     _, errors = process.communicate()
     assert process.returncode == -signal.SIGKILL, errors
-    final = subprocess.run(command(recording, run, *epochs, "--resume"), cwd=ROOT, capture_output=True, text=True, env=ENVIRONMENT)
+    final = subprocess.run(
+        command(recording, run, *epochs, "--resume"),
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        env=ENVIRONMENT,
+    )
     assert final.returncode == 0, final.stderr
     for which in ("latest", "best"):
         assert same(parameters(run, which), parameters(tmp_path / "alone", which))
-    epochs_logged = [json.loads(line)["epoch"] for line in (run / "metrics.jsonl").read_text().splitlines()]
+    epochs_logged = [
+        json.loads(line)["epoch"] for line in (run / "metrics.jsonl").read_text().splitlines()
+    ]
     assert epochs_logged == list(range(6))
 
 
@@ -177,20 +215,27 @@ def test_a_loss_that_is_not_finite_stops_with_its_step(recording, tmp_path, monk
     def spoiled(*arguments):
         source = real(*arguments)
         found.append(source)
-        return source._replace(displacement=np.where(np.arange(len(source.start))[:, None] == 77, np.float32(np.inf), source.displacement))
+        return source._replace(
+            displacement=np.where(
+                np.arange(len(source.start))[:, None] == 77, np.float32(np.inf), source.displacement
+            )
+        )
 
     monkeypatch.setattr(windows, "index", spoiled)
     config = tiny(recording, tmp_path / "run")
     with pytest.raises(FloatingPointError, match=r"not finite at step \d+ \(epoch 0\)") as raised:
         loop.train(config)
     order_key = jax.random.split(jax.random.key(config.seed), 3)[1]
-    expected = int(np.flatnonzero(np.asarray(step.epoch_order(order_key, 0, found[0])) == 77)[0]) // 16
+    expected = (
+        int(np.flatnonzero(np.asarray(step.epoch_order(order_key, 0, found[0])) == 77)[0]) // 16
+    )
     assert f"at step {expected} " in str(raised.value)
 
 
 def test_two_stage_loss_without_float64(recording, tmp_path, monkeypatch):
-    """Before its epoch the likelihood leaves the uncertainty's head alone. And, in the same run, as it takes long to compile: the step
-    holds no float64 in a process with 64-bit types switched on, as the command lines switch them."""
+    """Before its epoch the likelihood leaves the uncertainty's head alone. And, in the same run, as
+    it takes long to compile: the step holds no float64 in a process with 64-bit types switched on,
+    as the command lines switch them."""
     assert jax.config.jax_enable_x64
     texts = []
 
@@ -203,7 +248,14 @@ def test_two_stage_loss_without_float64(recording, tmp_path, monkeypatch):
 
     monkeypatch.setattr(loop, "train_steps", spy(step.train_steps))
     monkeypatch.setattr(loop, "validate", spy(step.validate))
-    loop.train(tiny(recording, tmp_path / "run", loss=LossConfig(nll_from_epoch=99.0), optim=OptimConfig(epochs=1, batch_size=16)))
+    loop.train(
+        tiny(
+            recording,
+            tmp_path / "run",
+            loss=LossConfig(nll_from_epoch=99.0),
+            optim=OptimConfig(epochs=1, batch_size=16),
+        )
+    )
     template = step.create_state(checkpoint.create_model(tiny(recording, "")), optimizer.create(OptimConfig(), LossConfig(), 1),
                                  jax.random.split(jax.random.key(0), 3)[0], 50)  # fmt: skip
     trained = parameters(tmp_path / "run")["params"]
@@ -215,7 +267,9 @@ def test_two_stage_loss_without_float64(recording, tmp_path, monkeypatch):
     assert {leaf.dtype for leaf in jax.tree.leaves(trained)} == {np.dtype("float32")}
 
 
-def test_a_run_is_never_overwritten_nor_continued_with_other_settings(recording, finished, tmp_path):
+def test_a_run_is_never_overwritten_nor_continued_with_other_settings(
+    recording, finished, tmp_path
+):
     workdir, _ = finished
     with pytest.raises(InputError, match="already holds a run; continue it with --resume"):
         loop.train(tiny(recording, workdir))
@@ -227,7 +281,9 @@ def test_a_run_is_never_overwritten_nor_continued_with_other_settings(recording,
 
 
 def test_a_batch_larger_than_the_data_is_refused_before_anything_is_written(recording, tmp_path):
-    with pytest.raises(InputError, match=r"optim\.batch_size: is 4096, but there are only 220 windows"):
+    with pytest.raises(
+        InputError, match=r"optim\.batch_size: is 4096, but there are only 220 windows"
+    ):
         loop.train(tiny(recording, tmp_path / "run", optim=OptimConfig(batch_size=4096)))
     assert not (tmp_path / "run").exists()
 
@@ -242,8 +298,13 @@ def test_runs_that_cannot_be_loaded(finished, tmp_path):
     other = tmp_path / "other"
     subprocess.run(["cp", "-r", workdir, other], check=True)
     config = configuration.load(other / "config.yaml")
-    configuration.save(other / "config.yaml", dataclasses.replace(config, model=dataclasses.replace(config.model, width=4)))
-    with pytest.raises(InputError, match=r"has shape \[.*\] in the checkpoint and \[.*\] in the configured model"):
+    configuration.save(
+        other / "config.yaml",
+        dataclasses.replace(config, model=dataclasses.replace(config.model, width=4)),
+    )
+    with pytest.raises(
+        InputError, match=r"has shape \[.*\] in the checkpoint and \[.*\] in the configured model"
+    ):
         checkpoint.load_run(other)
     for damaged in (other / "checkpoints" / "best").glob("*/variables/**/d/*"):
         damaged.write_bytes(damaged.read_bytes()[:10])
@@ -252,20 +313,28 @@ def test_runs_that_cannot_be_loaded(finished, tmp_path):
         checkpoint.load_run(other)
 
 
-def test_the_best_checkpoint_begins_anew_where_what_is_trained_changes(recording, tmp_path, monkeypatch):
+def test_the_best_checkpoint_begins_anew_where_what_is_trained_changes(
+    recording, tmp_path, monkeypatch
+):
     """Losses before and after a switch do not compare: the first epoch's would win for ever."""
     said = iter([])
 
     def validated(*_, **__):
         loss, mse = next(said)
         one = jnp.ones(3, jnp.float32)
-        return step.Validation(Losses(jnp.float32(loss), jnp.float32(mse), jnp.float32(0)), one, one)
+        return step.Validation(
+            Losses(jnp.float32(loss), jnp.float32(mse), jnp.float32(0)), one, one
+        )
 
     monkeypatch.setattr(loop, "validate", validated)
     for criterion, best, epoch in (("loss", 6.0, 4), ("squared_error", 4.0, 3)):
         # before, with the switch, the first whole epoch, one more
         said = iter([(-100.0, 1.0), (-50.0, 2.0), (7.0, 4.0), (6.0, 5.0)])
-        config = tiny(recording, tmp_path / criterion, loss=LossConfig(nll_weight=1.0, nll_from_epoch=1.5))
-        config = dataclasses.replace(config, optim=dataclasses.replace(config.optim, epochs=4, best_by=criterion))
+        config = tiny(
+            recording, tmp_path / criterion, loss=LossConfig(nll_weight=1.0, nll_from_epoch=1.5)
+        )
+        config = dataclasses.replace(
+            config, optim=dataclasses.replace(config.optim, epochs=4, best_by=criterion)
+        )
         assert loop.train(config).best_loss == best
         assert checkpoint.load_run(tmp_path / criterion).epoch == epoch

@@ -18,37 +18,54 @@ def target(displacement, steps=4):
     """Windows of which only the target matters, walked at constant velocity."""
     displacement = jnp.asarray(displacement, jnp.float32)
     count = len(displacement)
-    return Windows(jnp.zeros((count, steps, 6), jnp.float32), displacement,
-                   jnp.broadcast_to(displacement[:, None] / steps, (count, steps, 3)))
+    return Windows(
+        jnp.zeros((count, steps, 6), jnp.float32),
+        displacement,
+        jnp.broadcast_to(displacement[:, None] / steps, (count, steps, 3)),
+    )
 
 
 STEPS_PER_EPOCH = 7
 
 
 def found_losses(prediction, windows, config, epoch=0):
-    return losses.losses(prediction, windows, config, losses.stage(config, epoch * STEPS_PER_EPOCH, STEPS_PER_EPOCH))
+    return losses.losses(
+        prediction, windows, config, losses.stage(config, epoch * STEPS_PER_EPOCH, STEPS_PER_EPOCH)
+    )
 
 
 def test_losses_by_hand():
-    prediction = Prediction(jnp.array([[1.0, 0, 0], [0, 0, 0]], jnp.float32), jnp.array([[0, 0, 0], [np.log(2), 0, -1]], jnp.float32))
+    prediction = Prediction(
+        jnp.array([[1.0, 0, 0], [0, 0, 0]], jnp.float32),
+        jnp.array([[0, 0, 0], [np.log(2), 0, -1]], jnp.float32),
+    )
     walked = target([[0.0, 0, 0], [2, 1, 0]])
     # First window: error 1 on x. Second: errors 2 and 1, standard deviations 2, 1, 1/e.
     mse = (1 + (4 + 1)) / 2
     nll = ((0.5) + (0.5 * 4 / 4 + 0.5 * 1 + np.log(2) - 1)) / 2
     found = found_losses(prediction, walked, LossConfig())
-    np.testing.assert_allclose([found.mse, found.nll, found.total], [mse, nll, 100 * mse + 1e-4 * nll], rtol=1e-6)
-    found = found_losses(prediction, walked, LossConfig(mse_weight=1.0, mae_weight=1.0, nll_weight=0.0))
+    np.testing.assert_allclose(
+        [found.mse, found.nll, found.total], [mse, nll, 100 * mse + 1e-4 * nll], rtol=1e-6
+    )
+    found = found_losses(
+        prediction, walked, LossConfig(mse_weight=1.0, mae_weight=1.0, nll_weight=0.0)
+    )
     np.testing.assert_allclose(found.total, mse + (1 + (2 + 1)) / 2, rtol=1e-6)
     found = found_losses(prediction, walked, LossConfig(nll_from_epoch=3.0), epoch=2)
     np.testing.assert_allclose([found.nll, found.total], [nll, 100 * mse], rtol=1e-6)
 
 
 def test_uncertainty_learns_from_its_epoch_on():
-    walked, config = target([[0.3, -0.2, 0.1]]), LossConfig(mse_weight=0.0, nll_weight=1.0, log_std_from_epoch=10.0)
+    walked, config = (
+        target([[0.3, -0.2, 0.1]]),
+        LossConfig(mse_weight=0.0, nll_weight=1.0, log_std_from_epoch=10.0),
+    )
 
     def slopes(epoch):
         value = lambda d, u: found_losses(Prediction(d, u), walked, config, epoch).total  # noqa: E731
-        return jax.value_and_grad(value, (0, 1))(jnp.zeros((1, 3), jnp.float32), jnp.full((1, 3), -1.0, jnp.float32))
+        return jax.value_and_grad(value, (0, 1))(
+            jnp.zeros((1, 3), jnp.float32), jnp.full((1, 3), -1.0, jnp.float32)
+        )
 
     (before, (d_before, u_before)), (after, (d_after, u_after)) = slopes(9), slopes(10)
     assert before == after
@@ -62,8 +79,14 @@ def test_switches_are_steps():
     config = LossConfig(nll_from_epoch=0.5, log_std_from_epoch=1.25)
     assert losses.switches(config, 8) == (4, 10)
     assert losses.switches(config, 7) == (4, 9)  # the first whole step after the fraction
-    assert losses.switches(LossConfig(nll_from_epoch=3.0), 7) == (21, 21)  # without a likelihood it has nothing to learn from
-    assert losses.switches(LossConfig(name="velocity_and_covariance", nll_from_epoch=3.0), 7) == (21, 0)
+    assert losses.switches(LossConfig(nll_from_epoch=3.0), 7) == (
+        21,
+        21,
+    )  # without a likelihood it has nothing to learn from
+    assert losses.switches(LossConfig(name="velocity_and_covariance", nll_from_epoch=3.0), 7) == (
+        21,
+        0,
+    )
     assert losses.switches(LossConfig(log_std_from_epoch=1e9), 300) == (0, 2**31 - 1)
     seen = [losses.stage(config, step, 8) for step in range(12)]
     assert [float(stage.nll_weight) > 0 for stage in seen] == [step >= 4 for step in range(12)]
@@ -72,10 +95,22 @@ def test_switches_are_steps():
 
 def test_velocity_and_covariance_by_hand():
     rng = np.random.default_rng(0)
-    steps, velocity, log_std = 0.1 * rng.standard_normal((2, 5, 3)), rng.standard_normal((2, 5, 3)), rng.standard_normal((2, 5, 3))
-    windows = Windows(jnp.zeros((2, 5, 6), jnp.float32), jnp.asarray(steps.sum(1), jnp.float32), jnp.asarray(steps, jnp.float32))
+    steps, velocity, log_std = (
+        0.1 * rng.standard_normal((2, 5, 3)),
+        rng.standard_normal((2, 5, 3)),
+        rng.standard_normal((2, 5, 3)),
+    )
+    windows = Windows(
+        jnp.zeros((2, 5, 6), jnp.float32),
+        jnp.asarray(steps.sum(1), jnp.float32),
+        jnp.asarray(steps, jnp.float32),
+    )
     single = lambda x: jnp.asarray(x, jnp.float32)  # noqa: E731
-    said = {"velocity": single(velocity), "velocity_log_std": single(log_std), "task_log_std": single([[0.3, -0.4]] * 2)}
+    said = {
+        "velocity": single(velocity),
+        "velocity_log_std": single(log_std),
+        "task_log_std": single([[0.3, -0.4]] * 2),
+    }
     prediction = Prediction(single(velocity.mean(1)), single(np.zeros((2, 3))), said)
     speed = covariance = place = 0.0
     for b in range(2):
@@ -83,7 +118,9 @@ def test_velocity_and_covariance_by_hand():
             for axis in range(3):
                 error = 5 * steps[b, t, axis] - velocity[b, t, axis]
                 speed += error**2 / 10
-                covariance += (error**2 / np.exp(2 * log_std[b, t, axis]) / 2 + log_std[b, t, axis]) / 10
+                covariance += (
+                    error**2 / np.exp(2 * log_std[b, t, axis]) / 2 + log_std[b, t, axis]
+                ) / 10
         place += ((steps[b].sum(0) - velocity[b].mean(0)) ** 2).sum() / 2
     expected = (speed + place) / (2 * np.exp(0.6)) + covariance / (2 * np.exp(-0.8)) + 0.3 - 0.4
     config = LossConfig(name="velocity_and_covariance")
@@ -111,13 +148,19 @@ def test_schedule_of_the_paper(epochs, warmup):
     """Short runs (4 epochs for a warm-up of 5) warm up for their first half."""
     rate = optimizer.schedule(OptimConfig(epochs=epochs), 7)
     for step in range(0, 7 * epochs + 1):
-        assert float(rate(step)) == pytest.approx(by_formula(step, 7, warmup, epochs), rel=1e-4), step
+        assert float(rate(step)) == pytest.approx(by_formula(step, 7, warmup, epochs), rel=1e-4), (
+            step
+        )
 
 
 def test_no_decay_after_the_warm_up():
     rate = optimizer.schedule(OptimConfig(schedule="constant", epochs=20, warmup_epochs=2.0), 5)
-    np.testing.assert_allclose([rate(0), rate(5), rate(10), rate(100)], [1e-6, (1e-6 + 1e-4) / 2, 1e-4, 1e-4], rtol=1e-4)
-    assert float(optimizer.schedule(OptimConfig(schedule="plateau", warmup_epochs=0.0), 5)(0)) == pytest.approx(1e-4)
+    np.testing.assert_allclose(
+        [rate(0), rate(5), rate(10), rate(100)], [1e-6, (1e-6 + 1e-4) / 2, 1e-4, 1e-4], rtol=1e-4
+    )
+    assert float(
+        optimizer.schedule(OptimConfig(schedule="plateau", warmup_epochs=0.0), 5)(0)
+    ) == pytest.approx(1e-4)
 
 
 def test_plateau_waits_for_its_epochs_and_starts_counting_anew():
@@ -148,43 +191,62 @@ def test_plateau_is_that_of_pytorch():
 
 def test_a_constant_uncertainty_takes_the_errors_of_the_validation():
     constant, other = jnp.zeros(3, jnp.float32), jnp.ones(3, jnp.float32)
-    state = TrainState(jnp.int32(0), {}, {"uncertainty": {"log_std": constant}, "bn": {"mean": other}}, ())
+    state = TrainState(
+        jnp.int32(0), {}, {"uncertainty": {"log_std": constant}, "bn": {"mean": other}}, ()
+    )
     nothing = Losses(*[jnp.float32(0)] * 3)
-    found = calibrated(state, Validation(nothing, jnp.array([0.04, 1.0, 4.0], jnp.float32), jnp.ones(3, jnp.float32))).batch_stats
+    found = calibrated(
+        state,
+        Validation(nothing, jnp.array([0.04, 1.0, 4.0], jnp.float32), jnp.ones(3, jnp.float32)),
+    ).batch_stats
     np.testing.assert_allclose(np.exp(found["uncertainty"]["log_std"]), [0.2, 1, 2], rtol=1e-6)
     assert found["bn"]["mean"] is other
 
 
 def test_a_calibrated_head_announces_the_errors_of_the_validation():
-    """Errors twice and half as large as announced: the factors follow, from whatever they were; and training does not see them."""
+    """Errors twice and half as large as announced: the factors follow, from whatever they were; and
+    training does not see them."""
     head, rng = CalibratedUncertainty(), np.random.default_rng(0)
     h = jnp.asarray(rng.standard_normal((4, 5)), jnp.float32)
     variables = head.init(jax.random.key(0), h, False)
     stats = {"uncertainty": {"log_factor": jnp.log(jnp.array([3.0, 1.0, 1.0], jnp.float32))}}
     nothing = Losses(*[jnp.float32(0)] * 3)
     seen = Validation(nothing, jnp.ones(3, jnp.float32), jnp.array([4.0, 0.25, 1.0], jnp.float32))
-    lost = calibrated(TrainState(jnp.int32(0), {}, stats, ()), seen._replace(axis_normalised=jnp.array([jnp.inf, 0, 1], jnp.float32)))
+    lost = calibrated(
+        TrainState(jnp.int32(0), {}, stats, ()),
+        seen._replace(axis_normalised=jnp.array([jnp.inf, 0, 1], jnp.float32)),
+    )
     assert np.isfinite(lost.batch_stats["uncertainty"]["log_factor"]).all()
     found = calibrated(TrainState(jnp.int32(0), {}, stats, ()), seen).batch_stats["uncertainty"]
     np.testing.assert_allclose(np.exp(found["log_factor"]), [6.0, 0.5, 1.0], rtol=1e-6)
     variables = {"params": variables["params"], "batch_stats": found}
-    np.testing.assert_allclose(head.apply(variables, h, False), np.log([[6.0, 0.5, 1.0]] * 4), rtol=1e-6, atol=1e-7)
+    np.testing.assert_allclose(
+        head.apply(variables, h, False), np.log([[6.0, 0.5, 1.0]] * 4), rtol=1e-6, atol=1e-7
+    )
     np.testing.assert_array_equal(head.apply(variables, h, True), 0.0)
 
 
-@pytest.mark.parametrize("held_loss", [LossConfig(log_std_from_epoch=2.0), LossConfig(nll_from_epoch=2.0)])
+@pytest.mark.parametrize(
+    "held_loss", [LossConfig(log_std_from_epoch=2.0), LossConfig(nll_from_epoch=2.0)]
+)
 def test_a_held_uncertainty_is_not_counted(held_loss):
-    """PyTorch's Adam does not count steps in which a parameter has no gradient: at the release the moments are those of a first step."""
+    """PyTorch's Adam does not count steps in which a parameter has no gradient: at the release the
+    moments are those of a first step."""
     config = OptimConfig(epochs=10)
     tx = optimizer.create(config, held_loss, 3)
-    params = {part: {"w": jnp.array([1.0, -2.0, 3.0], jnp.float32)} for part in ("encoder", "log_std")}
+    params = {
+        part: {"w": jnp.array([1.0, -2.0, 3.0], jnp.float32)} for part in ("encoder", "log_std")
+    }
     state, update = tx.init(params), jax.jit(tx.update)
     expected = {part: [np.array([1.0, -2.0, 3.0]), np.zeros(3), np.zeros(3), 0] for part in params}
     rng = np.random.default_rng(0)
     for step in range(12):
         held = not bool(losses.stage(held_loss, step, 3).log_std_learns)
         assert held == (step < 6)
-        gradient = {part: np.zeros(3) if held and part == "log_std" else rng.standard_normal(3) for part in params}
+        gradient = {
+            part: np.zeros(3) if held and part == "log_std" else rng.standard_normal(3)
+            for part in params
+        }
         change, state = update(jax.tree.map(lambda g: {"w": jnp.asarray(g, jnp.float32)}, gradient), state, params,
                                log_std_learns=jnp.bool_(not held))  # fmt: skip
         params = optax.apply_updates(params, change)
@@ -193,7 +255,9 @@ def test_a_held_uncertainty_is_not_counted(held_loss):
                 continue
             m, v = 0.9 * m + 0.1 * gradient[part], 0.999 * v + 0.001 * gradient[part] ** 2
             count += 1
-            w = w - by_formula(step, 3, 5, 10) * (m / (1 - 0.9**count)) / (np.sqrt(v / (1 - 0.999**count)) + 1e-8)
+            w = w - by_formula(step, 3, 5, 10) * (m / (1 - 0.9**count)) / (
+                np.sqrt(v / (1 - 0.999**count)) + 1e-8
+            )
             expected[part] = [w, m, v, count]
         for part in params:
             np.testing.assert_allclose(params[part]["w"], expected[part][0], rtol=1e-6, atol=2e-7)
@@ -216,5 +280,7 @@ def test_adam_against_numpy(clip, decay):
         gradient = gradient + decay * w
         m, v = 0.9 * m + 0.1 * gradient, 0.999 * v + 0.001 * gradient**2
         rate = by_formula(step, 3, 5, 10)
-        w = w - rate * (m / (1 - 0.9 ** (step + 1))) / (np.sqrt(v / (1 - 0.999 ** (step + 1))) + 1e-8)
+        w = w - rate * (m / (1 - 0.9 ** (step + 1))) / (
+            np.sqrt(v / (1 - 0.999 ** (step + 1))) + 1e-8
+        )
     np.testing.assert_allclose(params["w"], w, atol=1e-6)

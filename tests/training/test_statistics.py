@@ -1,4 +1,5 @@
-"""The statistics of batch normalisation, the start of the uncertainty, and what training makes of both on synthetic walks."""
+"""The statistics of batch normalisation, the start of the uncertainty, and what training makes of
+both on synthetic walks."""
 
 import dataclasses
 import functools
@@ -24,7 +25,9 @@ CONFIG = TrainConfig(
 @functools.cache
 def source_of(split, stride, rate=CONFIG.data.rate):
     sequences = [data.resample(s, rate) for s in data.load("synthetic", split=split)]
-    return jax.device_put(windows.index(sequences, dataclasses.replace(CONFIG.data, rate=rate), stride))
+    return jax.device_put(
+        windows.index(sequences, dataclasses.replace(CONFIG.data, rate=rate), stride)
+    )
 
 
 @functools.cache
@@ -34,7 +37,8 @@ def model_and_optimizer(config, steps):
 
 
 def trainer(config, source, seed=0):
-    """Network, fresh state, a function that takes `count` of its steps, and the number of steps in an epoch."""
+    """Network, fresh state, a function that takes `count` of its steps, and the number of steps in
+    an epoch."""
     steps = source.visited.shape[0] // config.optim.batch_size
     model, tx = model_and_optimizer(config, steps)
     with jax.enable_x64(False):
@@ -52,8 +56,8 @@ def trainer(config, source, seed=0):
 
 @pytest.fixture(scope="module")
 def trained():
-    """Network, its state half way through training and at the end, and the windows it learns from: many walkers, or one window of a
-    stranger decides a mean of (e/σ)²."""
+    """Network, its state half way through training and at the end, and the windows it learns from:
+    many walkers, or one window of a stranger decides a mean of (e/σ)²."""
     return *run(0), source_of("train", 20)
 
 
@@ -68,26 +72,42 @@ def run(seed):
 
 def estimated(model, state, source, config=CONFIG, key=0):
     with jax.enable_x64(False):
-        return step.estimate_statistics(state, source, jax.random.key(key), model=model, config=config)
+        return step.estimate_statistics(
+            state, source, jax.random.key(key), model=model, config=config
+        )
 
 
 def squared_errors(model, state, source, config=CONFIG):
-    """Of augmented training windows, which no estimate drew: with the statistics of their batches, and in inference mode.
+    """Of augmented training windows, which no estimate drew: with the statistics of their batches,
+    and in inference mode.
 
-    In batches of 512: those of a small batch are themselves noisy, which costs training mode a part of its error.
+    In batches of 512: those of a small batch are themselves noisy, which costs training mode a part
+    of its error.
     """
-    batches = np.random.default_rng(5).permutation(np.asarray(source.visited))[: 10 * 512].reshape(-1, 512)
+    batches = (
+        np.random.default_rng(5)
+        .permutation(np.asarray(source.visited))[: 10 * 512]
+        .reshape(-1, 512)
+    )
 
     @jax.jit
     def one(state, key, which):
         drawn, dropout = step.drawn(key, source, which, config)
         variables = {"params": state.params, "batch_stats": state.batch_stats}
-        training, _ = model.apply(variables, drawn.imu, train=True, mutable=["batch_stats"], rngs={"dropout": dropout})
+        training, _ = model.apply(
+            variables, drawn.imu, train=True, mutable=["batch_stats"], rngs={"dropout": dropout}
+        )
         inference = model.apply(variables, drawn.imu)
-        return [jnp.mean(jnp.sum((p.displacement - drawn.displacement) ** 2, axis=-1)) for p in (training, inference)]
+        return [
+            jnp.mean(jnp.sum((p.displacement - drawn.displacement) ** 2, axis=-1))
+            for p in (training, inference)
+        ]
 
     with jax.enable_x64(False):
-        found = [one(state, jax.random.key(1000 + k), jnp.asarray(which)) for k, which in enumerate(batches)]
+        found = [
+            one(state, jax.random.key(1000 + k), jnp.asarray(which))
+            for k, which in enumerate(batches)
+        ]
     return np.mean(found, axis=0)
 
 
@@ -101,7 +121,9 @@ def test_training_windows_err_in_inference_mode_as_in_training_mode(trained):
 def test_statistics_are_means_over_batches(trained):
     """Of the first normalisation, against NumPy: its input is a convolution of the drawn windows."""
     model, _, state, source = trained
-    few = dataclasses.replace(CONFIG, optim=dataclasses.replace(CONFIG.optim, statistics_windows=3 * 64))
+    few = dataclasses.replace(
+        CONFIG, optim=dataclasses.replace(CONFIG.optim, statistics_windows=3 * 64)
+    )
     assert step.statistics_batches(source, few) == 3
     found = estimated(model, state, source, few, key=7).batch_stats["encoder"]["stem_bn"]
     kernel = np.asarray(state.params["encoder"]["stem_conv"]["kernel"], np.float64)
@@ -110,9 +132,17 @@ def test_statistics_are_means_over_batches(trained):
     means, variances = [], []
     for number, which in enumerate(order):
         with jax.enable_x64(False):
-            imu = np.asarray(step.drawn(jax.random.fold_in(draw_key, number), source, jnp.asarray(which), few)[0].imu, np.float64)
+            imu = np.asarray(
+                step.drawn(jax.random.fold_in(draw_key, number), source, jnp.asarray(which), few)[
+                    0
+                ].imu,
+                np.float64,
+            )
         padded = np.pad(imu, ((0, 0), (3, 3), (0, 0)))
-        out = np.stack([np.einsum("bkc,kcd->bd", padded[:, i : i + 7], kernel) for i in range(0, 50, 2)], axis=1)
+        out = np.stack(
+            [np.einsum("bkc,kcd->bd", padded[:, i : i + 7], kernel) for i in range(0, 50, 2)],
+            axis=1,
+        )
         means.append(out.mean((0, 1)))
         variances.append(out.var((0, 1)))
     np.testing.assert_allclose(found["mean"], np.mean(means, 0), rtol=1e-3, atol=1e-5)
@@ -121,14 +151,33 @@ def test_statistics_are_means_over_batches(trained):
 
 def test_an_estimate_depends_on_parameters_and_key_alone(trained):
     model, _, state, source = trained
-    few = dataclasses.replace(CONFIG, optim=dataclasses.replace(CONFIG.optim, statistics_windows=128))
+    few = dataclasses.replace(
+        CONFIG, optim=dataclasses.replace(CONFIG.optim, statistics_windows=128)
+    )
     one = estimated(model, state, source, few)
-    other = estimated(model, state._replace(batch_stats=jax.tree.map(lambda x: x + 3, state.batch_stats), step=jnp.int32(5)), source, few)
+    other = estimated(
+        model,
+        state._replace(
+            batch_stats=jax.tree.map(lambda x: x + 3, state.batch_stats), step=jnp.int32(5)
+        ),
+        source,
+        few,
+    )
     assert all(jax.tree.leaves(jax.tree.map(np.array_equal, one.batch_stats, other.batch_stats)))
     third = estimated(model, state, source, few, key=1)
-    assert not np.array_equal(one.batch_stats["encoder"]["stem_bn"]["mean"], third.batch_stats["encoder"]["stem_bn"]["mean"])
-    assert step.statistics_batches(source, dataclasses.replace(few, optim=dataclasses.replace(few.optim, statistics_windows=10**9))) \
+    assert not np.array_equal(
+        one.batch_stats["encoder"]["stem_bn"]["mean"],
+        third.batch_stats["encoder"]["stem_bn"]["mean"],
+    )
+    assert (
+        step.statistics_batches(
+            source,
+            dataclasses.replace(
+                few, optim=dataclasses.replace(few.optim, statistics_windows=10**9)
+            ),
+        )
         == source.visited.shape[0] // 64
+    )
 
 
 def test_constants_of_the_uncertainty_are_left_alone():
@@ -139,18 +188,25 @@ def test_constants_of_the_uncertainty_are_left_alone():
     state.batch_stats["uncertainty"]["log_factor"] = jnp.array([0.5, -1.0, 2.0], jnp.float32)
     found = estimated(model, state, source, config).batch_stats
     np.testing.assert_array_equal(found["uncertainty"]["log_factor"], [0.5, -1.0, 2.0])
-    assert not np.array_equal(found["encoder"]["stem_bn"]["mean"], state.batch_stats["encoder"]["stem_bn"]["mean"])
-    assert step.normalises(state) and not step.normalises(state._replace(batch_stats={"uncertainty": found["uncertainty"]}))
+    assert not np.array_equal(
+        found["encoder"]["stem_bn"]["mean"], state.batch_stats["encoder"]["stem_bn"]["mean"]
+    )
+    assert step.normalises(state) and not step.normalises(
+        state._replace(batch_stats={"uncertainty": found["uncertainty"]})
+    )
 
 
 def test_the_uncertainty_fits_the_errors_after_training(trained):
-    """(e/σ)² per axis on the validation split, over two seeds: with a start that poisons Adam one axis comes out at a tenth."""
+    """(e/σ)² per axis on the validation split, over two seeds: with a start that poisons Adam one
+    axis comes out at a tenth."""
     model, _, first, source = trained
     held_out, found = source_of("val", 10), []
     for state in (first, run(1)[-1]):
         with jax.enable_x64(False):
             state = estimated(model, state, source)
-            said = step.validate(state, held_out, losses.stage(CONFIG.loss, 0, 1), model=model, config=CONFIG)
+            said = step.validate(
+                state, held_out, losses.stage(CONFIG.loss, 0, 1), model=model, config=CONFIG
+            )
         found.append(said.axis_normalised)
     typical = np.exp(np.mean(np.log(found), axis=0))
     assert np.all((typical > 0.5) & (typical < 2.5)), found
@@ -158,14 +214,23 @@ def test_the_uncertainty_fits_the_errors_after_training(trained):
 
 @pytest.mark.parametrize("width, seeds", [(16, range(10)), (32, range(1)), (64, range(1))])
 def test_no_spike_in_the_gradient_of_the_uncertainty(width, seeds):
-    """In the first 200 steps the largest norm of the gradient of the head stays within 100 times the median.
+    """In the first 200 steps the largest norm of the gradient of the head stays within 100 times
+    the median.
 
     With the learning rates of configs/quickstart.yaml, whose warm-up these steps are.
     """
     source = source_of("val", 2, 20.0)
     warmup = 223 / (source.visited.shape[0] // 64)
-    optim = OptimConfig(epochs=24, batch_size=64, learning_rate=2e-3, start_learning_rate=1e-4, warmup_epochs=warmup)
-    config = dataclasses.replace(CONFIG, data=DataConfig(rate=20.0), model=ModelConfig(width=width), loss=LossConfig(), optim=optim)
+    optim = OptimConfig(
+        epochs=24, batch_size=64, learning_rate=2e-3, start_learning_rate=1e-4, warmup_epochs=warmup
+    )
+    config = dataclasses.replace(
+        CONFIG,
+        data=DataConfig(rate=20.0),
+        model=ModelConfig(width=width),
+        loss=LossConfig(),
+        optim=optim,
+    )
     for seed in seeds:
         _, state, take, steps = trainer(config, source, seed)
         norms = []
@@ -179,7 +244,9 @@ def test_no_spike_in_the_gradient_of_the_uncertainty(width, seeds):
 def test_networks_with_a_head_begin_with_a_standard_deviation_near_one(name):
     model = models.create(name, **({"width": 16} if name != "ctin" else {}))
     rng = np.random.default_rng(0)
-    imu = np.float32([0, 0, 9.81, 0, 0, 0]) + rng.normal(0, [3, 3, 3, 2, 2, 2], (8, 50, 6)).astype(np.float32)
+    imu = np.float32([0, 0, 9.81, 0, 0, 0]) + rng.normal(0, [3, 3, 3, 2, 2, 2], (8, 50, 6)).astype(
+        np.float32
+    )
     apply = jax.jit(lambda variables: model.apply(
         variables, jnp.asarray(imu), train=True, mutable=["batch_stats"], rngs={"dropout": jax.random.key(1)}))  # fmt: skip
     for seed in range(3):

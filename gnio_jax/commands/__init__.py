@@ -1,0 +1,1 @@
+"""The command lines: typed options in, one call into the package."""

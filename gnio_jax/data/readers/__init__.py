@@ -1,0 +1,1 @@
+"""Published layouts, one per file: which recordings there are, and how one is read."""

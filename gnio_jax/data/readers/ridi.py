@@ -1,0 +1,381 @@
+"""RIDI: a Tango phone in the hand, the bag, the leg pocket or on the body, whose own VIO is the
+truth (Yan, Shan, Furukawa, ECCV 2018).
+
+Layout: folders <name>/ with processed/data.csv (one table on the pose's clock, about 202.3 Hz, ns,
+quaternions wxyz, an index column without a name), or with the recorder's text files alone:
+acce.txt, gyro.txt (`t x y z`), pose.txt (`t px py pz qx qy qz qw`) and orientation.txt (`t qx qy qz
+qw`, the game rotation vector), each on its own clock, ns, quaternions xyzw. The table is taken
+where there is one. IMU and pose are of one rigid body; nothing is calibrated, and the accelerometer
+reads 1–3 % high.
+
+Recorders that followed use ARCore, whose world is y-up, and whose pose.txt is the camera's: their
+android_sensor_pose.txt is the IMU's, and it is taken, turned to z-up, where it is there.
+
+Everything comes back at 200 Hz. The lists name train and test; for validation whole people are held
+out of train (`held_out_of_train`).
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation
+
+from gnio_jax.data.cache import cached_pieces
+from gnio_jax.data.readers.phones import find_folders, find_list, held_out, poses_at, with_velocity
+from gnio_jax.data.readers.text import listed, numbers, read_csv
+from gnio_jax.data.recordings import divide, read_all
+from gnio_jax.data.sequence import (
+    LONGEST_BRIDGE,
+    WINDOW_SECONDS,
+    Dataset,
+    Recording,
+    check_finite,
+    check_increasing,
+    check_rate,
+    check_unit_norm,
+    quaternions,
+    resample,
+    rotations,
+    validate,
+)
+from gnio_jax.types import InputError, Sequence
+
+RATE = 200.0
+VERSION = "ridi 2"
+"""Changes whenever other sequences would come of the same files: it is part of the cache's key."""
+NATIVE_RATE = 202.3
+"""Hz, of data.csv."""
+RAW_RATES = (90.0, 1100.0)
+"""Hz, of the text files: 200 in the set itself, more in what newer phones wrote."""
+
+_TABLE = Path("processed") / "data.csv"
+_LISTS = {
+    "train": "list_train_publish_v2.txt",
+    "val": "list_train_publish_v2.txt",
+    "test": "list_test_publish_v2.txt",
+    "seen": "list_test_publish_v2.txt",
+    "unseen": "list_crosssubject.txt",
+}
+SPLITS = (*_LISTS, "all")
+_PLACEMENTS = {"handheld": "handheld", "leg": "pocket", "bag": "bag", "body": "body"}
+_Y_UP = Rotation.from_matrix([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+_POSES = (("android_sensor_pose.txt", _Y_UP), ("pose.txt", Rotation.identity()))
+
+
+def read(root: Path, split: str) -> list[Sequence]:
+    """The sequences of a split (`seen` is `test`), those that fail the physical self-check named
+    and left out. Raises `InputError`.
+
+    `unseen` is the authors' cross-subject list. Recordings that are in no list are in no split but
+    `all`, every recording below the root, which needs no list.
+    """
+    return read_all(DATASET, Path(root), split)
+
+
+def recordings(root: Path, split: str) -> list[Recording]:
+    """The recordings of a split that are present, wherever below the root."""
+    root = Path(root)
+    if split not in SPLITS:
+        raise InputError(root, f"unknown split '{split}'", f"known splits: {', '.join(SPLITS)}")
+    folders = find_folders(root, _is_recording)
+    if split == "all":
+        if not folders:
+            raise InputError(
+                root, "holds no recording of RIDI", f"expected layout: {DATASET.layout}"
+            )
+        return [
+            Recording(name, partial(_cached, folder, {}))
+            for name, folder in sorted(folders.items())
+        ]
+    path = find_list(root, _LISTS[split])
+    chosen = listed(path, lambda entry: folders.get(_name(entry)), root, DATASET.layout)
+    held: set[str] = set()
+    if split in ("train", "val"):
+        held = held_out_of_train(path)
+        chosen = [folder for folder in chosen if (folder.name in held) == (split == "val")]
+        if not chosen:
+            raise InputError(
+                path,
+                f"split '{split}' would be empty: {len(held)} sequences of this list are held out for validation",
+                "complete the data, or choose another split",
+            )
+    note = (
+        {"held_out": ", ".join(sorted({_subject(name) for name in held}))}
+        if split in ("train", "val")
+        else {}
+    )
+    return [Recording(folder.name, partial(_cached, folder, note)) for folder in chosen]
+
+
+def _cached(folder: Path, note: dict[str, str]) -> list[Sequence]:
+    texts = (
+        folder / name
+        for name in ("gyro.txt", "acce.txt", "orientation.txt", *(name for name, _ in _POSES))
+    )
+    sources = (
+        [folder / _TABLE]
+        if (folder / _TABLE).is_file()
+        else [path for path in texts if path.is_file()]
+    )
+    sequences = cached_pieces(sources, VERSION, lambda: read_pieces(folder))
+    return [sequence._replace(attributes=sequence.attributes | note) for sequence in sequences]
+
+
+def held_out_of_train(path: str | os.PathLike[str]) -> set[str]:
+    """Names in the training list that validate: whole people, about a tenth of the list, the same
+    in every copy of the data."""
+    names = [
+        folder.name
+        for folder in listed(
+            path, lambda entry: Path(_name(entry)), Path(path).parent, DATASET.layout
+        )
+    ]
+    return held_out({name: _subject(name) for name in names})
+
+
+def read_pieces(folder: str | os.PathLike[str]) -> list[Sequence]:
+    """One recording of its folder, at 200 Hz, from its table or else from the recorder's text
+    files.
+
+    Rows out of order are sorted and repeated ones dropped. Where its IMU or odometry has a gap
+    longer than a window it is divided (`divide`). `device_orientation` is the game rotation vector,
+    turned to begin at the reference's attitude. Raises `InputError` naming file and field.
+    """
+    folder = Path(folder)
+    source = folder / _TABLE
+    native = _from_table(source) if source.is_file() else _from_text(folder)
+    place = source if source.is_file() else folder
+    source = source if source.is_file() else f"{folder / 'gyro.txt'}, acce.txt, pose.txt"
+    if not native.valid.any():
+        raise InputError(source, "no IMU sample has a pose", "leave it out")
+    device = native.device
+    if device is not None:
+        device = quaternions(native.attitude[0] * device[0].inv() * device)
+    sequence = Sequence(
+        name=folder.name,
+        time=native.time - native.time[0],
+        gyro=native.gyro,
+        accel=native.accel,
+        orientation=quaternions(native.attitude),
+        position=native.position,
+        velocity=np.zeros_like(native.position),
+        valid=native.valid,
+        device_orientation=device,
+        attributes={
+            "dataset": "ridi",
+            "group": _subject(folder.name),
+            "subject": _subject(folder.name),
+            "device": "Tango phone" if native.truth.startswith("Tango") else "Android phone",
+            "placement": next(
+                (_PLACEMENTS[word] for word in re.findall("|".join(_PLACEMENTS), folder.name)),
+                "unknown",
+            ),
+            "truth": native.truth,
+            "imu_compensated": "no",
+            "licence": DATASET.licence,
+            "start_time": native.start + float(native.time[0]),
+        },
+    )
+    pieces = divide(validate(sequence, source), place)
+    return [validate(with_velocity(resample(piece, RATE)), source) for piece in pieces]
+
+
+class _Native(NamedTuple):
+    """A recording on one clock of its own."""
+
+    time: Float[np.ndarray, "n"]
+    """s since `start`, increasing, gaps and all."""
+    start: float
+    """s on the phone's clock."""
+    gyro: Float[np.ndarray, "n 3"]
+    accel: Float[np.ndarray, "n 3"]
+    position: Float[np.ndarray, "n 3"]
+    attitude: Rotation
+    device: Rotation | None
+    valid: Bool[np.ndarray, "n"]
+    truth: str
+
+
+def _from_table(path: Path) -> _Native:
+    table = read_csv(path)
+    stamps, order = _in_order(numbers(table, ["time"], path)[:, 0], path)
+    columns = {
+        name: numbers(table, [f"{name}_{axis}" for axis in axes], path)[order]
+        for name, axes in (
+            ("gyro", "xyz"),
+            ("acce", "xyz"),
+            ("pos", "xyz"),
+            ("ori", "wxyz"),
+            ("rv", "wxyz"),
+        )
+    }
+    for name, values in columns.items():
+        check_finite(values, name, path)
+    time = (stamps - stamps[0]) * 1e-9
+    check_rate(time, NATIVE_RATE, path)
+    attitude, device = (_unit(columns[name], name, path) for name in ("ori", "rv"))
+    return _Native(
+        time,
+        float(stamps[0] * 1e-9),
+        columns["gyro"],
+        columns["acce"],
+        columns["pos"],
+        attitude,
+        device,
+        np.ones(len(time), dtype=bool),
+        "Tango VIO of the phone itself",
+    )
+
+
+def _from_text(folder: Path) -> _Native:
+    """The text files on the gyro's clock, from the first pose to the last."""
+    pose_path, upright = next(
+        ((folder / name, turn) for name, turn in _POSES if (folder / name).is_file()),
+        (folder / "pose.txt", None),
+    )
+    gyro_stamps, gyro = _text(folder / "gyro.txt", 3)
+    force_stamps, force = _text(folder / "acce.txt", 3)
+    pose_stamps, pose = _text(pose_path, 7)
+    upright = Rotation.identity() if upright is None else upright
+    start = gyro_stamps[0]
+    gyro_time, force_time, pose_time = (
+        (stamps - start) * 1e-9 for stamps in (gyro_stamps, force_stamps, pose_stamps)
+    )
+    check_increasing(pose_time, pose_path)  # stamps of another unit may fall together
+    for stamps, path in ((gyro_stamps, folder / "gyro.txt"), (force_stamps, folder / "acce.txt")):
+        rate = 1e9 / float(np.median(np.diff(stamps)))
+        if not RAW_RATES[0] <= rate <= RAW_RATES[1]:
+            raise InputError(
+                path,
+                f"field 'time' runs at {rate:.4g} Hz, expected {RAW_RATES[0]:g} to {RAW_RATES[1]:g} Hz",
+                "check the unit of the stamps: they are ns",
+            )
+
+    # Where the accelerometer is silent there is no IMU sample, whatever the gyro says. An odometry
+    # that was lost for long comes back in a world of its own (23° turned, in one recording): such a
+    # gap ends a piece as one of the IMU does.
+    whole = (_interval(force_time, gyro_time) <= LONGEST_BRIDGE) & (
+        _interval(pose_time, gyro_time) <= WINDOW_SECONDS
+    )
+    inside = (gyro_time >= max(force_time[0], pose_time[0])) & (
+        gyro_time <= min(force_time[-1], pose_time[-1])
+    )
+    if not (force_time[0] < gyro_time[-1] and gyro_time[0] < force_time[-1]):
+        raise InputError(
+            folder / "acce.txt",
+            f"field 'time' ({force_time[0]:.1f} to {force_time[-1]:.1f} s after the gyro's first stamp) "
+            f"shares nothing with that of gyro.txt (0.0 to {gyro_time[-1]:.1f} s)",
+            "check that the files are of one recording",
+        )
+    if (inside & whole).sum() < 2:
+        raise InputError(
+            pose_path,
+            f"its stamps ({pose_time[0]:.1f} to {pose_time[-1]:.1f} s after the gyro's first) share nothing with "
+            f"the IMU's ({gyro_time[0]:.1f} to {gyro_time[-1]:.1f} s)",
+            "check that the files are of one recording",
+        )
+    time, gyro = gyro_time[inside & whole], gyro[inside & whole]
+    attitude = _unit(pose[:, [6, 3, 4, 5]], "qx qy qz qw", pose_path)
+    position, turned, valid = poses_at(pose_time, pose[:, :3], attitude, time, LONGEST_BRIDGE)
+
+    device = None
+    if (folder / "orientation.txt").is_file():
+        device_stamps, quaternion = _text(folder / "orientation.txt", 4)
+        device_time = (device_stamps - start) * 1e-9
+        check_increasing(device_time, folder / "orientation.txt")
+        known = _unit(quaternion[:, [3, 0, 1, 2]], "qx qy qz qw", folder / "orientation.txt")
+        _, device, _ = poses_at(device_time, np.zeros((len(known), 3)), known, time, LONGEST_BRIDGE)
+    truth = (
+        "Tango VIO of the phone itself"
+        if pose_path.name == "pose.txt"
+        else "ARCore VIO of the phone itself"
+    )
+    return _Native(
+        time,
+        float(start * 1e-9),
+        gyro,
+        CubicSpline(force_time, force, axis=0)(time),
+        upright.apply(position),
+        upright * turned,
+        device,
+        valid,
+        truth,
+    )
+
+
+def _interval(
+    stamps: Float[np.ndarray, "n"], time: Float[np.ndarray, "m"]
+) -> Float[np.ndarray, "m"]:
+    """Length of the interval between two stamps in which each of `time` lies."""
+    right = np.clip(np.searchsorted(stamps, time), 1, len(stamps) - 1)
+    return stamps[right] - stamps[right - 1]
+
+
+def _text(path: Path, width: int) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n w"]]:
+    """Stamps (ns) and values of a text file, in order."""
+    table = read_csv(path, separator=" ", header=False)
+    if table.shape[1] < width + 1:
+        raise InputError(
+            path,
+            f"has {table.shape[1]} columns, expected the time and {width} values",
+            "copy it again",
+        )
+    stamps, order = _in_order(numbers(table, [0], path)[:, 0], path)
+    values = numbers(table, range(1, width + 1), path)[order]
+    check_finite(values, "values", path)
+    return stamps, values
+
+
+def _in_order(
+    stamps: Float[np.ndarray, "n"], path: Path
+) -> tuple[Float[np.ndarray, "m"], np.ndarray]:
+    """Increasing stamps, and the rows they are of: the recorder writes some late and some twice."""
+    check_finite(stamps, "time", path)
+    increasing, order = np.unique(stamps, return_index=True)
+    if len(increasing) < max(100, 0.5 * len(stamps)):
+        raise InputError(
+            path,
+            f"field 'time' holds only {len(increasing)} different stamps in {len(stamps)} rows",
+            "copy it again",
+        )
+    return increasing, order
+
+
+def _unit(wxyz: np.ndarray, field: str, path: Path) -> Rotation:
+    return rotations(check_unit_norm(wxyz, np.ones(len(wxyz), dtype=bool), field, path))
+
+
+def _is_recording(folder: Path) -> bool:
+    return (folder / _TABLE).is_file() or (
+        (folder / "acce.txt").is_file() and (folder / "gyro.txt").is_file()
+    )
+
+
+def _name(entry: str) -> str:
+    """Lines of the lists are `name,placement` or `name`."""
+    return entry.partition(",")[0].strip()
+
+
+def _subject(name: str) -> str:
+    return name.partition("_")[0]
+
+
+DATASET = Dataset(
+    name="ridi",
+    read=read,
+    recordings=recordings,
+    splits=SPLITS,
+    rate=RATE,
+    source="https://github.com/higerra/ridi_imu (its README links the data, ridi_data_publish_v2.zip)",
+    layout="<root>/**/<sequence>/{processed/data.csv or acce.txt,gyro.txt,pose.txt,orientation.txt} and "
+    "<root>/**/{list_train_publish_v2,list_test_publish_v2,list_crosssubject}.txt",
+    licence="not stated by the authors; cite Yan, Shan, Furukawa, RIDI, ECCV 2018",
+)

@@ -1,0 +1,156 @@
+"""Text files as data sets publish them: columns of numbers, and lists of sequences. A parser that
+is quick over millions of rows."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from gnio_jax.types import InputError
+
+
+def shortened(text: object, most: int = 80) -> str:
+    """What a file says, as far as a message can quote it: one line of printable characters, at most
+    `most` of them."""
+    line = "".join(
+        character if character.isprintable() else "\ufffd" for character in str(text)[: 4 * most]
+    )
+    return line if len(str(text)) <= most else line[: most - 3] + "..."
+
+
+def read_csv(
+    path: str | os.PathLike[str], separator: str = ",", header: bool = True
+) -> pd.DataFrame:
+    """The columns of a text file by their names (stripped of blanks and of a leading '#'), or by
+    their places from 0 without a header.
+
+    Lines that begin with '#' are no data; the last of them before the data names the columns if
+    `header`, or else the first line does. `separator` " " stands for any run of blanks. Raises
+    `InputError` naming the file when it is missing, empty or no table.
+    """
+    path = Path(path)
+    names, skip = None, 0
+    try:
+        with path.open(encoding="utf-8-sig") as file:
+            for line in file:
+                if not line.startswith("#") and line.strip():
+                    break
+                skip += 1
+                if line.startswith("#"):
+                    names = line
+            else:
+                raise InputError(path, "holds no row", "copy it again")
+        if header and names is None:
+            names, skip = line, skip + 1
+        table = pd.read_csv(
+            path,
+            header=None,
+            skiprows=skip,
+            comment="#",
+            sep=r"\s+" if separator == " " else separator,
+            skipinitialspace=True,
+            skip_blank_lines=True,
+            low_memory=False,
+        )
+    except OSError as error:
+        raise InputError(path, f"cannot be read ({error.strerror})") from None
+    except pd.errors.EmptyDataError:
+        raise InputError(path, "holds no row", "copy it again") from None
+    except (UnicodeDecodeError, pd.errors.ParserError, ValueError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(
+            path,
+            f"is no table of text ({shortened(error, 200)})",
+            "it may be cut short or damaged: copy it again",
+        ) from None
+    if header and names is not None:
+        labels = [
+            name.strip()
+            for name in names.lstrip("#").strip().split(None if separator == " " else separator)
+        ]
+        if len(labels) == table.shape[1] + 1 and not labels[-1]:
+            labels = labels[:-1]
+        if len(labels) != table.shape[1]:
+            raise InputError(
+                path,
+                f"its header names {len(labels)} columns, its rows have {table.shape[1]}",
+                "copy it again",
+            )
+        table.columns = labels
+    return table
+
+
+def numbers(table: pd.DataFrame, columns: Iterable[object], path: object) -> np.ndarray:
+    """(rows, columns) float64 of the named columns; NaN stays. Raises `InputError` for a column
+    that is missing or holds text."""
+    out = []
+    for name in columns:
+        if name not in table.columns:
+            known = ", ".join(str(column) for column in table.columns)
+            raise InputError(path, f"column '{name}' is missing", f"found: {shortened(known, 600)}")
+        values = table[name]
+        if isinstance(values, pd.DataFrame):
+            raise InputError(path, f"column '{name}' is there {values.shape[1]} times", "leave one")
+        try:
+            out.append(values.to_numpy(dtype=np.float64, na_value=np.nan))
+        except (TypeError, ValueError, OverflowError):  # Python's integers have no end
+            as_number = pd.Series(
+                pd.to_numeric(values.astype(str), errors="coerce"), dtype=np.float64
+            )
+            row = int(np.argmax(~np.isfinite(as_number.to_numpy()) & values.notna().to_numpy()))
+            raise InputError(
+                path,
+                f"column '{name}' holds '{shortened(values.iloc[row])}' in its row {row + 1}, no number",
+            ) from None
+    return np.stack(out, axis=1)
+
+
+def listed(
+    path: str | os.PathLike[str], find: Callable[[str], Path | None], root: Path, layout: str
+) -> list[Path]:
+    """What `find` says of the entries of a list file, one a line: the place of a recording, or None
+    where this copy lacks it.
+
+    Absent entries are warned of with their count. Raises `InputError` when the list cannot be read
+    or names nothing that is present.
+    """
+    path = Path(path)
+    try:
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise InputError(
+            path, f"the list cannot be read ({reason})", f"expected layout: {layout}"
+        ) from None
+    entries = list(
+        dict.fromkeys(line.strip() for line in lines if line.strip() and not line.startswith("#"))
+    )
+    found = {entry: _found(find, entry) for entry in entries}
+    present = [place for place in found.values() if place is not None]
+    absent = [entry for entry, place in found.items() if place is None]
+    if not present:
+        raise InputError(
+            path,
+            f"none of its {len(entries)} sequences is below {root}",
+            f"expected layout: {layout}",
+        )
+    if absent:
+        warnings.warn(
+            f"{path}: {len(absent)} of {len(entries)} listed sequences are absent: {', '.join(map(shortened, absent[:3]))}"
+            f"{', ...' if len(absent) > 3 else ''}",
+            stacklevel=3,
+        )
+    return present
+
+
+def _found(find: Callable[[str], Path | None], entry: str) -> Path | None:
+    try:
+        return find(entry)
+    except OSError:  # too long for a name, for one
+        return None

@@ -1,0 +1,187 @@
+"""TLIO's "golden" set: head-mounted IMU with visual-inertial truth (Liu et al., RA-L 2020).
+
+Layout: <root>/{train,val,test}_list.txt with one folder name per line;
+<root>/<name>/imu0_resampled.npy, float64 (N, 17) at 200 Hz, whose columns
+imu0_resampled_description.json names. Its gyro and accel are given in the world; the body frame is
+Rᵀ of them. They were compensated with the biases of the reference system, which is kinder than any
+filter will find it in the field: `imu_compensated` among the attributes says so.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from gnio_jax.data.readers.text import listed, shortened
+from gnio_jax.data.recordings import read_all, single
+from gnio_jax.data.sequence import (
+    Dataset,
+    Recording,
+    check_finite,
+    check_gaps,
+    check_increasing,
+    check_motion,
+    check_rate,
+    check_unit_norm,
+    rotations,
+    validate,
+)
+from gnio_jax.types import InputError, Sequence
+
+RATE = 200.0
+_TABLE = "imu0_resampled.npy"
+_DESCRIPTION = "imu0_resampled_description.json"
+_LISTS = {"train": "train_list.txt", "val": "val_list.txt", "test": "test_list.txt"}
+_COLUMNS = {
+    "ts_us": 1,
+    "gyr_compensated_rotated_in_World": 3,
+    "acc_compensated_rotated_in_World": 3,
+    "qxyzw_World_Device": 4,
+    "pos_World_Device": 3,
+    "vel_World": 3,
+}
+
+
+def read(root: Path, split: str) -> list[Sequence]:
+    """The sequences of a split, those that fail the physical self-check named and left out."""
+    return read_all(DATASET, Path(root), split)
+
+
+def recordings(root: Path, split: str) -> list[Recording]:
+    """The recordings of a split's list that are present."""
+    return [single(folder.name, read_sequence, folder) for folder in _listed(Path(root), split)]
+
+
+def read_sequence(folder: str | os.PathLike[str]) -> Sequence:
+    """One sequence of its folder. Raises `InputError` naming file and field."""
+    folder = Path(folder)
+    path = folder / _TABLE
+    column, width = _columns(folder / _DESCRIPTION)
+    table = _table(path, width)
+    time = table[:, column["ts_us"]][:, 0] * 1e-6
+    quaternion = table[:, column["qxyzw_World_Device"]][:, [3, 0, 1, 2]]
+    force, rate = (
+        table[:, column[f"{name}_compensated_rotated_in_World"]] for name in ("acc", "gyr")
+    )
+    # The table's own fields first: behind the rotation into the body a mistake would carry another
+    # name.
+    for field, values in (
+        ("ts_us", time),
+        ("qxyzw_World_Device", quaternion),
+        ("gyr_compensated_rotated_in_World", rate),
+        ("acc_compensated_rotated_in_World", force),
+    ):
+        check_finite(values, field, path)
+    check_increasing(time, path)
+    check_rate(time, RATE, path)
+    check_gaps(time, path)
+    everywhere = np.ones(len(time), dtype=bool)
+    quaternion = check_unit_norm(quaternion, everywhere, "qxyzw_World_Device", path)
+    body = rotations(quaternion).inv()
+    sequence = validate(
+        Sequence(
+            name=folder.name,
+            time=time,
+            gyro=body.apply(rate),
+            accel=body.apply(force),
+            orientation=quaternion,
+            position=table[:, column["pos_World_Device"]],
+            velocity=table[:, column["vel_World"]],
+            valid=everywhere,
+            attributes={
+                "dataset": "tlio",
+                "group": folder.name,
+                "placement": "head",
+                "truth": "visual-inertial (VIO or motion capture)",
+                "imu_compensated": "reference",
+                "licence": DATASET.licence,
+            },
+        ),
+        path,
+    )
+    check_motion(sequence, path)
+    return sequence
+
+
+def _listed(root: Path, split: str) -> list[Path]:
+    if split not in _LISTS:
+        raise InputError(root, f"unknown split '{split}'", f"known splits: {', '.join(_LISTS)}")
+    return listed(
+        root / _LISTS[split],
+        lambda entry: root / entry if (root / entry / _TABLE).is_file() else None,
+        root,
+        DATASET.layout,
+    )
+
+
+def _columns(path: Path) -> tuple[dict[str, slice], int]:
+    """Columns of the table by name, and its width: the description lists them in their order."""
+    try:
+        entries = json.loads(path.read_text(encoding="utf-8"))["columns_name(width)"]
+        parsed = [re.fullmatch(r"\s*(.+?)\s*\((\d+)\)\s*", entry) for entry in entries]
+    except OSError as error:
+        raise InputError(
+            path,
+            f"cannot be read ({error.strerror})",
+            "it names the columns of the table beside it",
+        ) from None
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        raise InputError(
+            path,
+            f"field 'columns_name(width)' cannot be read ({type(error).__name__}: {error})",
+            'it lists entries like "ts_us(1)"',
+        ) from None
+    columns, start = {}, 0
+    for entry, match in zip(entries, parsed, strict=True):
+        if match is None:
+            raise InputError(
+                path,
+                f"field 'columns_name(width)' has the entry {entry!r}",
+                'entries look like "ts_us(1)"',
+            )
+        columns[match[1]] = slice(start, start + int(match[2]))
+        start += int(match[2])
+    for name, width in _COLUMNS.items():
+        if name not in columns:
+            raise InputError(path, f"column '{name}' is missing", f"found: {', '.join(columns)}")
+        if columns[name].stop - columns[name].start != width:
+            raise InputError(
+                path,
+                f"column '{name}' has width {columns[name].stop - columns[name].start}, expected {width}",
+            )
+    return columns, start
+
+
+def _table(path: Path, width: int) -> Float[np.ndarray, "n w"]:
+    try:
+        table = np.load(path, allow_pickle=False)
+    except Exception as error:  # a damaged file makes the parser fail in any way
+        raise InputError(
+            path,
+            f"cannot be read as a NumPy array, it may be cut short ({shortened(error, 200)})",
+            "copy it again",
+        ) from None
+    if table.ndim != 2 or table.shape[1] != width or table.dtype.kind != "f" or len(table) < 2:
+        raise InputError(
+            path,
+            f"holds {table.dtype} of shape {table.shape}, expected floats (N, {width})",
+            f"see {_DESCRIPTION} beside it",
+        )
+    return table.astype(np.float64)
+
+
+DATASET = Dataset(
+    name="tlio",
+    read=read,
+    recordings=recordings,
+    splits=tuple(_LISTS),
+    rate=RATE,
+    source="https://github.com/CathIAS/TLIO (its README links the data)",
+    layout="<root>/{train,val,test}_list.txt and <root>/<sequence>/{imu0_resampled.npy,imu0_resampled_description.json}",
+    licence="CC BY-NC 4.0",
+)

@@ -1,0 +1,231 @@
+"""Other people's checkpoints: TLIO's weights for the model `tlio`, and `python -m gnio_jax.interop`
+to make a run of them.
+
+PyTorch is needed for its own files alone (`pip install gnio-jax[torch]`); a mapping of arrays or an
+.npz needs nothing.
+"""
+
+from __future__ import annotations
+
+import math
+import zipfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tyro
+
+from gnio_jax import config as configuration
+from gnio_jax import models
+from gnio_jax.config import DataConfig, FilterOptions, ModelConfig, TrainConfig
+from gnio_jax.types import InputError
+
+PROGRAM = "python -m gnio_jax.interop"
+
+_CHANNELS = np.array([3, 4, 5, 0, 1, 2])
+"""Where our channels, [accel, gyro], are among TLIO's, [gyro, accel]."""
+
+_REMEDY = "the weights must be those of TLIO's network 'resnet', as its training saves them"
+
+
+@dataclass(frozen=True)
+class ImportOptions:
+    """What is made of a checkpoint."""
+
+    checkpoint: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="CHECKPOINT")]]
+    """File of the weights."""
+    workdir: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="WORKDIR")]]
+    """Folder of the run; must not hold one."""
+    rate: float = 200.0
+    """Samples per second that the network was trained with, Hz (imu_freq in TLIO's
+    parameters.json)."""
+    window_seconds: float = 1.0
+    """Length of its window, s (past_time + window_time there)."""
+    stride_seconds: float = 0.05
+    """Distance of window starts, and of the filter's clones, s (TLIO's filter: 0.05; the paper:
+    0.1)."""
+    dataset: str = "tlio"
+    """Dataset that evaluate.py takes where none is named."""
+
+
+def load_tlio_state_dict(mapping_or_path: Mapping[str, Any] | str | Path) -> Any:
+    """Variables of the model `tlio` (width 64) from the weights of TLIO's ResNet.
+
+    Takes the state dict itself (arrays or tensors), an .npz of it, a checkpoint (.pt, .pth), or a
+    TorchScript archive. The checkpoint may hold it as `model_state_dict`, and its keys may begin
+    with `module.`. The window's length follows from the first linear layer: any of N samples with
+    ⌈N/32⌉ the same. The first convolution's channels are permuted: the network takes our windows
+    [accel, gyro]. Raises `InputError` naming the file and the key that is missing, unexpected, of
+    another shape or not finite.
+    """
+    where, given = _opened(mapping_or_path)
+    given = given.get("model_state_dict", given)
+    if not isinstance(given, Mapping):
+        raise InputError(where, "its model_state_dict is not a mapping of arrays", _REMEDY)
+    given = {str(key).removeprefix("module."): value for key, value in given.items()}
+    given = {key: value for key, value in given.items() if not key.endswith("num_batches_tracked")}
+    template = _template(where, given)
+    wanted = {_source(path): leaf for path, leaf in jax.tree_util.tree_leaves_with_path(template)}
+    for name, problem in [
+        (wanted.keys() - given.keys(), "is missing"),
+        (given.keys() - wanted.keys(), "is unexpected"),
+    ]:
+        if name:
+            raise InputError(
+                where,
+                f"'{min(name)}' {problem}"
+                + (f" (and {len(name) - 1} more)" if len(name) > 1 else ""),
+                _REMEDY,
+            )
+    arrays = {key: _turned(where, key, given[key], leaf.shape) for key, leaf in wanted.items()}
+    arrays[_STEM] = arrays[_STEM][:, _CHANNELS]
+    return jax.tree.unflatten(
+        jax.tree.structure(template), [jnp.asarray(arrays[key], jnp.float32) for key in wanted]
+    )
+
+
+_STEM = "input_block.0.weight"
+_FLATTENED = "output_block1.fc1.weight"
+_PREP_CHANNELS = 128
+_PARTS = {
+    "encoder": "",
+    "displacement": "output_block1.",
+    "log_std": "output_block2.",
+    "stem_conv": "input_block.0.",
+    "stem_bn": "input_block.1.",
+    "shortcut_conv": "downsample.0.",
+    "shortcut_bn": "downsample.1.",
+    "neck_conv": "prep1.",
+    "neck_bn": "bn1.",
+    "kernel": "weight",
+    "scale": "weight",
+    "mean": "running_mean",
+    "var": "running_var",
+    "bias": "bias",
+    **{
+        f"group{g + 1}_block{b + 1}": f"residual_groups.{g}.{b}."
+        for g in range(4)
+        for b in range(2)
+    },
+}
+"""Names of ours, and what TLIO's keys have in their place; those that are not here are the same,
+and a dot."""
+
+
+def _source(path: tuple[Any, ...]) -> str:
+    """TLIO's key of the array at this place of our variables."""
+    return "".join(_PARTS.get(step.key, f"{step.key}.") for step in path[1:])
+
+
+def _template(where: str, given: Mapping[str, Any]) -> Any:
+    """Shapes of the variables for the window's length that the weights have."""
+    if _FLATTENED not in given:
+        raise InputError(where, f"'{_FLATTENED}' is missing", _REMEDY)
+    shape = np.shape(given[_FLATTENED])
+    if len(shape) != 2 or shape[1] % _PREP_CHANNELS or not shape[1]:
+        raise InputError(
+            where,
+            f"'{_FLATTENED}' must have shape (512, {_PREP_CHANNELS}·⌈N/32⌉) for windows of N samples, found {shape}",
+            _REMEDY,
+        )
+    windows = jax.ShapeDtypeStruct((1, 32 * (shape[1] // _PREP_CHANNELS), 6), jnp.float32)
+    return jax.eval_shape(models.create("tlio").init, jax.random.key(0), windows)
+
+
+def _turned(where: str, key: str, value: Any, wanted: tuple[int, ...]) -> np.ndarray:
+    """The array with PyTorch's (out, in, size) turned to our (size, in, out)."""
+    array = np.asarray(value.detach().cpu().float() if hasattr(value, "detach") else value)
+    if array.shape != wanted[::-1]:
+        raise InputError(
+            where, f"'{key}' must have shape {wanted[::-1]}, found {array.shape}", _REMEDY
+        )
+    if not np.issubdtype(array.dtype, np.floating) or not np.isfinite(array).all():
+        raise InputError(
+            where, f"'{key}' holds values that are not finite numbers", "the weights are damaged"
+        )
+    return array.T
+
+
+def _opened(given: Mapping[str, Any] | str | Path) -> tuple[str, Mapping[str, Any]]:
+    """What to call it in messages, and what it holds."""
+    if isinstance(given, Mapping):
+        return "state dict", given
+    path = Path(given)
+    if not path.is_file():
+        raise InputError(
+            path,
+            "no such file",
+            "give a checkpoint of TLIO's training, a TorchScript archive or an .npz of the state dict",
+        )
+    try:
+        content = _arrays(path) if path.suffix == ".npz" else _torch(path)
+    except InputError:
+        raise
+    except Exception as error:  # torch and zipfile tell damage by half a dozen types
+        raise InputError(
+            path,
+            f"cannot be read ({str(error).partition(chr(10))[0][:160]})",
+            "it must be an .npz of arrays, or a file of PyTorch that holds tensors and plain values only",
+        ) from None
+    if not isinstance(content, Mapping):
+        raise InputError(path, f"holds no mapping of arrays but {type(content).__name__}", _REMEDY)
+    return str(path), content
+
+
+def _arrays(path: Path) -> dict[str, np.ndarray]:
+    with np.load(path, allow_pickle=False) as file:
+        return {name: file[name] for name in file.files}
+
+
+def _torch(path: Path) -> Any:
+    try:
+        import torch
+    except ImportError:
+        raise InputError(
+            path, "reading a file of PyTorch needs PyTorch", "pip install 'gnio-jax[torch]'"
+        ) from None
+    if zipfile.is_zipfile(path):
+        with zipfile.ZipFile(path) as archive:
+            script = any(name.endswith("/constants.pkl") for name in archive.namelist())
+        if script:
+            return torch.jit.load(path, map_location="cpu").state_dict()
+    return torch.load(path, map_location="cpu", weights_only=True)
+
+
+def write_run(options: ImportOptions) -> None:
+    """Write the run folder: config.yaml and checkpoints/best. Raises `InputError` for weights that
+    do not fit, or a folder that is one."""
+    from gnio_jax.training import checkpoint  # here, for Orbax takes longer to import than all else
+    from gnio_jax.training.step import TrainState
+
+    data = DataConfig(
+        rate=options.rate,
+        window_seconds=options.window_seconds,
+        stride_seconds=options.stride_seconds,
+    )
+    config = TrainConfig(
+        dataset=options.dataset,
+        data=data,
+        model=ModelConfig(name="tlio"),
+        filter=FilterOptions(window_rotation="tlio"),
+    )
+    configuration.validate(config, PROGRAM)
+    if (options.workdir / "config.yaml").exists() or (options.workdir / "checkpoints").exists():
+        raise InputError(options.workdir, "holds a run already", "name another folder")
+    variables = load_tlio_state_dict(options.checkpoint)
+    rows = variables["params"]["displacement"]["fc1"]["kernel"].shape[0] // _PREP_CHANNELS
+    if rows != math.ceil(data.window / 32):
+        raise InputError(
+            options.checkpoint,
+            f"is for windows of {32 * rows - 31} to {32 * rows} samples, not {data.window}",
+            "give the --rate and --window-seconds that it was trained with",
+        )
+    options.workdir.mkdir(parents=True, exist_ok=True)
+    with checkpoint.Checkpoints(options.workdir) as checkpoints:
+        state = TrainState(jnp.int32(0), variables["params"], variables["batch_stats"], {})
+        checkpoints.save("best", state, checkpoint.Position(0, 0, None, (0.0, 0.0, 0.0), 0.0))
+    configuration.save(options.workdir / "config.yaml", config)

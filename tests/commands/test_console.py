@@ -1,0 +1,145 @@
+"""The command lines' shared handling: mistakes in one line, help that teaches, files under options."""
+
+import subprocess
+import sys
+
+import pytest
+
+from gnio_jax import config
+from gnio_jax.commands import console as cli
+from gnio_jax.config import TrainConfig
+from gnio_jax.types import InputError
+
+
+def parse(*arguments, default=None):
+    return cli.parse(TrainConfig, default or TrainConfig(), "Train.", list(arguments))
+
+
+def mistake(*arguments):
+    with pytest.raises(InputError) as caught:
+        parse(*arguments)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+def test_nothing_given_is_the_default():
+    assert parse() == TrainConfig()
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [["--optim.batch-size", "3"], ["--optim.batch_size", "3"], ["--optim.batch-size=3"]],
+)
+def test_spellings_of_a_nested_option(arguments):
+    assert parse(*arguments).optim.batch_size == 3
+
+
+def test_flags_and_optional_values():
+    parsed = parse("--augment.no-yaw", "--optim.clip-norm", "1", "--data-root", "None")
+    assert (
+        parsed.augment.yaw is False and parsed.optim.clip_norm == 1.0 and parsed.data_root is None
+    )
+
+
+def test_negative_numbers_are_values():
+    assert parse("--seed", "-1").seed == -1
+    assert parse("--loss.log-std-floor", "-6.9").loss.log_std_floor == -6.9
+
+
+def test_misspelt_option_names_the_closest():
+    assert (
+        mistake("--optim.epoch", "3")
+        == "--optim.epoch: unknown option; did you mean --optim.epochs?"
+    )
+    assert mistake("--epochs", "3") == "--epochs: unknown option; did you mean --optim.epochs?"
+    assert mistake("--qqqq=3") == "--qqqq: unknown option; --help lists the known ones"
+    assert "unknown option" in mistake("-x")
+
+
+def test_wrong_types_say_what_is_wanted_and_found():
+    assert mistake("--optim.epochs", "abc") == "--optim.epochs: must be a whole number, found 'abc'"
+    assert (
+        mistake("--optim.batch_size=3.5")
+        == "--optim.batch-size: must be a whole number, found '3.5'"
+    )
+    assert (
+        mistake("--optim.clip-norm", "a")
+        == "--optim.clip-norm: must be a number or None, found 'a'"
+    )
+    assert (
+        mistake("--model.head", "foo")
+        == "--model.head: must be one of gated, linear or None, found 'foo'"
+    )
+
+
+def test_missing_values_and_stray_words():
+    assert (
+        mistake("--optim.epochs") == "--optim.epochs: needs a value, which must be a whole number"
+    )
+    assert (
+        mistake("--data-root", "--seed", "1")
+        == "--data-root: needs a value, which must be text or None"
+    )
+    assert mistake("stray").startswith("'stray': is not an option")
+    assert mistake("--augment.yaw", "True").startswith("'True': is not an option")
+    assert mistake("--config") == "--config: needs a value"
+
+
+def test_options_win_over_the_file_and_the_file_over_the_default(tmp_path):
+    path = tmp_path / "experiment.yaml"
+    path.write_text("dataset: tlio\noptim: {epochs: 7, batch_size: 5}\n")
+    for arguments in (
+        ["--config", str(path), "--optim.epochs", "3"],
+        ["--optim.epochs", "3", f"--config={path}"],
+    ):
+        parsed = parse(*arguments)
+        assert (parsed.dataset, parsed.optim.epochs, parsed.optim.batch_size) == ("tlio", 3, 5)
+        assert parsed.data == config.DataConfig()
+
+
+def test_file_mistakes_are_input_errors(tmp_path):
+    path = tmp_path / "experiment.yaml"
+    path.write_text("optim: {epoch: 7}\n")
+    assert "did you mean 'optim.epochs'?" in mistake("--config", str(path))
+    assert "no such config file" in mistake("--config", str(tmp_path / "missing.yaml"))
+
+
+def test_help_teaches(capsys):
+    with pytest.raises(SystemExit) as leaving:
+        parse("--help")
+    assert leaving.value.code == 0
+    text = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    assert "Train." in text and "--config FILE" in text
+    assert "--optim.epochs INT Passes over the training windows. (default: 200)" in text
+
+
+def outcome(body):
+    program = f"from gnio_jax import cli\nfrom gnio_jax.types import InputError\ndef main():\n    {body}\ncli.run(main)\n"
+    return subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=60
+    )
+
+
+@pytest.mark.parametrize(
+    "body, status, line",
+    [
+        (
+            "raise InputError('file.csv', 'has no column x', 'add\\nit')",
+            2,
+            "file.csv: has no column x; add it\n",
+        ),
+        ("raise KeyboardInterrupt", 130, "interrupted\n"),
+        ("open('/dev/null/x', 'w')", 2, "/dev/null/x: Not a directory\n"),
+        ("import os; os.kill(os.getpid(), 15)", 143, ""),
+        ("import warnings; warnings.warn('two\\nlines')", 0, "warning: two lines\n"),
+        ("print('fine')", 0, ""),
+    ],
+)
+def test_run_ends_in_one_line_and_a_status(body, status, line):
+    result = outcome(body)
+    assert (result.returncode, result.stderr) == (status, line)
+
+
+def test_faults_of_the_program_keep_their_traceback():
+    result = outcome("1 / 0")
+    assert result.returncode == 1 and "Traceback" in result.stderr

@@ -1,0 +1,623 @@
+"""`python -m gnio_jax.data` as a person types it: what the tables say, what is written, and one
+line with status 2 for each mistake."""
+
+import dataclasses
+import json
+import subprocess
+import sys
+import warnings
+
+import numpy as np
+import pytest
+from matplotlib import image
+
+from gnio_jax import data
+from gnio_jax.commands import console as cli
+from gnio_jax.commands import data as commands
+from gnio_jax.commands.data import main
+from gnio_jax.data import registry
+from gnio_jax.data.readers import csv_files as csv
+from gnio_jax.data.readers import tlio
+from gnio_jax.types import InputError
+from tests.support import known_walk as walk
+from tests.support.tlio_files import write_sequence
+
+FIELDS = ("time", "gyro", "accel", "orientation", "position", "velocity", "valid")
+LISTS = {"train": "fair\ntilted\nmirrored\nabsent\n", "val": "cut\n", "test": "also\n"}
+
+
+def tilt(parts):
+    parts["acc_compensated_rotated_in_World"] = parts["acc_compensated_rotated_in_World"] + [
+        3.0,
+        0,
+        0,
+    ]
+
+
+def mirror(parts):
+    parts["pos_World_Device"] = parts["pos_World_Device"] * [1, -1, 1]
+
+
+@pytest.fixture
+def place(tmp_path, monkeypatch):
+    """An empty working folder, and no data anywhere else."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("GNIO_DATA", raising=False)
+    return tmp_path
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    """A folder in TLIO's layout: two good recordings, two implausible ones, one that is cut short,
+    one that is absent."""
+    root = tmp_path_factory.mktemp("recordings") / "heads"
+    for name, spoil in (
+        ("fair", None),
+        ("tilted", tilt),
+        ("mirrored", mirror),
+        ("cut", None),
+        ("also", None),
+    ):
+        write_sequence(root / name, spoil=spoil)
+    table = root / "cut" / "imu0_resampled.npy"
+    table.write_bytes(table.read_bytes()[:1000])
+    for split, names in LISTS.items():
+        (root / f"{split}_list.txt").write_text(names)
+    return root
+
+
+@pytest.fixture
+def root(written, place):
+    """A copy of it that a test may change."""
+    (place / "heads").mkdir()
+    for path in written.rglob("*"):
+        copy = place / "heads" / path.relative_to(written)
+        copy.mkdir() if path.is_dir() else copy.write_bytes(path.read_bytes())
+    return place / "heads"
+
+
+def row(out, name):
+    """The cells of the table's line that begins with this name."""
+    (line,) = [line for line in out.splitlines() if line.replace("│", "|").startswith(f"| {name} ")]
+    return [cell.strip() for cell in line.replace("│", "|").strip("|").split("|")]
+
+
+def same(a, b):
+    for field in FIELDS:
+        np.testing.assert_array_equal(getattr(a, field), getattr(b, field))
+    assert (a.device_orientation is None) == (b.device_orientation is None)
+
+
+# --- list
+# ------------------------------------------------------------------------------------------------------------
+
+
+def test_list_tells_everything_and_reads_nothing(root, monkeypatch, capsys):
+    for table in root.rglob("*.npy"):
+        table.write_bytes(b"")
+    root.rename(root.parent / "tlio")
+    monkeypatch.setenv("GNIO_DATA", str(root.parent))
+    (root.parent / "kitti").mkdir()
+    main(["list"])
+    out = capsys.readouterr().out
+    text = " ".join(out.replace("│", " ").split())
+    for name in data.names():
+        dataset = data.get(name)
+        cells = row(out.split("Where they are had")[0], name)
+        assert cells[1] == f"{dataset.rate:g}" and all(split in text for split in dataset.splits)
+        assert dataset.licence.split()[0] in cells[3]
+        assert dataset.source.split()[0] in out
+        assert not dataset.needs_root or dataset.layout.split()[0] in out
+    assert "/tlio: 5 recordings (train 3, val 1, test 1)" in text.replace(" /tlio", "/tlio")
+    assert "computed: 34 recordings (train 24, val 4, test 6)" in text
+    assert row(out.split("Where")[0], "ronin")[-1] == "not found"
+    assert "no recording (" in text and "holds no drive of KITTI" in text
+    assert f"looked in {root.parent} and data" in out
+
+
+# --- check
+# -----------------------------------------------------------------------------------------------------------
+
+
+def test_check_shows_every_recording_with_its_figures_and_reasons(root, capsys):
+    files = ["--plots", "pictures", "--json", "out/figures.json", "--markdown", "table.md"]
+    main(["check", str(root), *files])
+    out = capsys.readouterr().out
+    assert out.startswith(f"tlio at {root}, split all")
+    fair = data.self_check(tlio.read_sequence(root / "fair"))
+    assert row(out, "fair") == [
+        "fair",
+        "train",
+        f"{fair.duration:.1f}",
+        "200.0",
+        "0.00 0.00 9.81",
+        "–",
+        f"{fair.median_speed:.2f}",
+        "1.00",
+        "100.0%",
+        "used",
+    ]
+    tilted, mirrored, cut = row(out, "tilted"), row(out, "mirrored"), row(out, "cut")
+    assert tilted[4] == "3.00 0.00 9.81" and tilted[-1] == mirrored[-1] == "left out"
+    assert float(mirrored[7]) < 0.3 and mirrored[4] == "0.00 0.00 9.81"
+    assert cut == ["cut", "val", *["–"] * 7, "left out"]
+    assert (
+        "left out: tilted: mean of R·accel is (3.00, 0.00, 9.81) m/s², off (0, 0, 9.81) by 3.00"
+        in out
+    )
+    assert "left out: mirrored: horizontal acceleration of the positions correlates by only" in out
+    assert (
+        f"left out: cut: {root / 'cut' / 'imu0_resampled.npy'}: cannot be read as a NumPy array, it may be cut short"
+        in out
+    )
+    assert f"note: {root / 'train_list.txt'}: 1 of 4 listed sequences are absent: absent" in out
+    assert "2 of 5 sequences are used, 0.01 h" in out
+
+    figures = json.loads((root.parent / "out" / "figures.json").read_text())
+    assert (figures["dataset"], figures["root"], figures["split"]) == (
+        "tlio",
+        str(root),
+        "all",
+    ) and len(figures["notes"]) == 1
+    assert list(figures["sequences"]) == ["fair", "tilted", "mirrored", "cut", "also"]
+    ours = figures["sequences"]["fair"]
+    assert (
+        ours["used"]
+        and ours["gravity_mean"] == fair.gravity_mean.tolist()
+        and ours["gyro_consistency_degrees"] is None
+    )
+    assert (
+        ours["accel_correlation_horizontal"] == fair.accel_correlation_horizontal
+        and ours["failures"] == []
+    )
+    assert (
+        not figures["sequences"]["cut"]["used"]
+        and "cut short" in figures["sequences"]["cut"]["reason"]
+    )
+    lines = (root.parent / "table.md").read_text().splitlines()
+    assert len(lines) == 7 and all(line.count("|") == 11 for line in lines)
+    assert [cell.strip() for cell in lines[3].strip("|").split("|")] == tilted
+    pictures = {path.stem: image.imread(path) for path in (root.parent / "pictures").iterdir()}
+    assert set(pictures) == {
+        "fair",
+        "tilted",
+        "mirrored",
+        "also",
+    }  # also those that are left out, if they can be drawn
+    assert all(path.stat().st_size < 150_000 for path in (root.parent / "pictures").iterdir())
+    assert all(
+        picture.shape[1] > picture.shape[0] > 300 and picture[..., :3].std() > 0.05
+        for picture in pictures.values()
+    )
+
+
+def test_check_of_one_split_of_a_computed_set(place, capsys):
+    main(["check", "synthetic", "--split", "val"])
+    out = capsys.readouterr().out
+    assert "4 of 4 sequences are used, 0.07 h" in out and out.count("│ val") == 4
+    for sequence in data.load("synthetic", split="val"):
+        assert (
+            row(out, sequence.name)[5]
+            == f"{data.self_check(sequence).gyro_consistency_degrees:.2f}"
+        )
+
+
+def test_check_knows_a_layout_by_what_it_finds_there(root, place, capsys):
+    assert commands.resolve(str(root), None) == (data.get("tlio"), root)
+    asl = place / "walks" / "mine" / "mav0" / "imu0"
+    asl.mkdir(parents=True)
+    (asl / "data.csv").write_text("")
+    with pytest.raises(
+        InputError,
+        match="walks: has the layout of euroc and of tumvi; say which it is: --dataset NAME",
+    ):
+        commands.resolve("./walks", None)
+    assert commands.resolve("walks", "tumvi")[0].name == "tumvi"
+    (place / "walks").rename(place / "EuRoC")
+    assert commands.resolve("./EuRoC", None)[0].name == "euroc"
+
+
+def test_check_of_recordings_without_a_reference_draws_them_all_the_same(place, capsys):
+    write_phone(place / "own" / "bare.csv", names=csv._GYRO + csv._ACCEL)
+    main(["check", "own", "--dataset", "csv", "--plots", "pictures"])
+    out = capsys.readouterr().out
+    assert row(out, "bare")[4:] == ["–", "–", "–", "–", "0.0%", "used"]
+    assert image.imread(place / "pictures" / "bare.png")[..., :3].std() > 0.03
+
+
+def test_nothing_usable_is_a_failure_that_still_shows_the_table(root, capsys):
+    with pytest.raises(SystemExit) as left:
+        cli.run(lambda: main(["check", str(root), "--split", "val"]))
+    out, err = capsys.readouterr()
+    assert left.value.code == 2 and "left out: cut: " in out
+    assert err == f"{root}: none of 1 sequences can be used; see the reasons above\n"
+
+
+def test_the_module_runs_and_draws_nothing_unasked(root):
+    program = (
+        "import runpy, sys\nsys.argv = ['data', 'check', sys.argv[1], '--split', 'test']\n"
+        "runpy.run_module('gnio_jax.data', run_name='__main__')\nassert 'matplotlib' not in sys.modules\n"
+    )
+    shown = subprocess.run(
+        [sys.executable, "-c", program, str(root)], capture_output=True, text=True, timeout=100
+    )
+    assert (shown.returncode, shown.stderr) == (
+        0,
+        "",
+    ) and "1 of 1 sequences are used" in shown.stdout
+
+
+# --- convert
+# ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def reads(monkeypatch):
+    """Names of the recordings that were read, in their order."""
+    names, real = [], tlio.read_sequence
+
+    def read_sequence(folder):
+        names.append(folder.name)
+        return real(folder)
+
+    monkeypatch.setattr(tlio, "read_sequence", read_sequence)
+    return names
+
+
+def test_convert_keeps_every_figure_and_the_splits(root, capsys):
+    main(["convert", "tlio", str(root), "converted"])
+    out = capsys.readouterr().out
+    assert (
+        "left out: tilted: mean of R·accel" in out and "left out: cut: " in out and "absent" in out
+    )
+    assert "note: split 'val' has no list: none of its 1 recordings can be used" in out
+    assert "converted: 2 sequences, 0.01 h (train 1, val 0, test 1)" in out
+    converted = root.parent / "converted"
+    assert sorted(path.name for path in converted.iterdir()) == [
+        ".converted",
+        "also.h5",
+        "fair.h5",
+        "test.txt",
+        "train.txt",
+    ]
+    for split, name in (("train", "fair"), ("test", "also")):
+        (ours,), theirs = data.load("csv", converted, split), tlio.read_sequence(root / name)
+        same(ours, theirs)
+        assert ours.name == name and theirs.attributes.items() <= ours.attributes.items()
+    with pytest.raises(InputError, match=r"val\.txt: the list cannot be read"):
+        data.load("csv", converted, "val")
+
+
+def test_convert_to_another_rate(root):
+    main(["convert", "tlio", str(root), "slow", "--split", "test", "--rate", "50"])
+    (ours,) = data.load("csv", root.parent / "slow", "test")
+    same(ours, data.resample(tlio.read_sequence(root / "also"), 50.0))
+
+
+def test_convert_goes_on_where_it_was_stopped(root, reads, monkeypatch, capsys):
+    (root / "train_list.txt").write_text("fair\ntilted\nalso\n")
+    (root / "val_list.txt").write_text("fair\n")
+    real = commands.write_hdf5
+
+    def stopped(path, sequence):
+        if sequence.name == "also":
+            raise KeyboardInterrupt
+        real(path, sequence)
+
+    monkeypatch.setattr(commands, "write_hdf5", stopped)
+    with pytest.raises(SystemExit) as left:
+        cli.run(lambda: main(["convert", "tlio", str(root), "converted"]))
+    assert left.value.code == 130 and reads == ["fair", "tilted", "also"]
+    converted = root.parent / "converted"
+    assert sorted(path.name for path in converted.iterdir()) == [".converted", "fair.h5"]
+    monkeypatch.setattr(commands, "write_hdf5", real)
+    reads.clear()
+    main(["convert", "tlio", str(root), "converted"])
+    assert reads == ["also"]  # what failed the check is known to have failed
+    out = capsys.readouterr().out
+    assert "left out: tilted: mean of R·accel" in out
+    assert "2 sequences, 0.01 h (train 2, val 1, test 1); 1 of them were there already" in out
+
+    whole = {path: path.read_bytes() for path in converted.glob("[!.]*")}
+    (converted / "fair.h5").write_bytes(whole[converted / "fair.h5"][:5000])
+    (converted / "also.h5").unlink()
+    (converted / "train.txt").unlink()
+    reads.clear()
+    main(["convert", "tlio", str(root), "converted", "--split", "train"])
+    assert reads == ["fair", "also"]
+    assert sorted(whole) == sorted(converted.glob("[!.]*"))
+    assert (converted / "train.txt").read_text() == "fair\nalso\n"
+    assert [sequence.name for sequence in data.load("csv", converted, "train")] == ["also", "fair"]
+    reads.clear()
+    main(["convert", "tlio", str(root), "converted"])
+    assert reads == []
+
+
+def test_what_could_not_be_read_is_tried_again(root, reads):
+    main(["convert", "tlio", str(root), "converted"])
+    assert not (root.parent / "converted" / "val.txt").exists()
+    (root / "cut" / "imu0_resampled.npy").write_bytes(
+        (root / "fair" / "imu0_resampled.npy").read_bytes()
+    )
+    reads.clear()
+    main(["convert", "tlio", str(root), "converted"])
+    assert reads == ["cut"] and (root.parent / "converted" / "val.txt").read_text() == "cut\n"
+
+
+def test_processes_convert_the_same(root):
+    (root / "train_list.txt").write_text("fair\nalso\n")
+    for workers in ("1", "2"):
+        main(
+            ["convert", "tlio", str(root), f"by{workers}", "--split", "train", "--workers", workers]
+        )
+    for one, two in zip(
+        data.load("csv", root.parent / "by1", "train"),
+        data.load("csv", root.parent / "by2", "train"),
+        strict=True,
+    ):
+        same(one, two)
+        assert one.attributes == two.attributes
+
+
+def test_what_a_dataset_asks_of_its_recordings_goes_with_them(root, monkeypatch):
+    """Positions of another body do not correlate; the converted ones must not be refused for it,
+    nor let pass who runs too fast."""
+    monkeypatch.setitem(
+        registry._DATASETS, "tlio", dataclasses.replace(data.get("tlio"), min_correlation=None)
+    )
+    (root / "test_list.txt").write_text("mirrored\n")
+    main(["convert", "tlio", str(root), "converted", "--split", "test"])
+    path = root.parent / "converted" / "mirrored.h5"
+    assert [sequence.name for sequence in data.load("csv", path.parent, "test")] == ["mirrored"]
+    sequence = data.read_hdf5(path)
+    data.write_hdf5(path, sequence._replace(velocity=sequence.velocity * 5))
+    with (
+        pytest.warns(
+            UserWarning, match="mirrored: left out by the self-check: .*too fast for a pedestrian"
+        ),
+        pytest.raises(InputError),
+    ):
+        data.load("csv", path.parent, "test")
+
+
+def test_two_recordings_never_become_one_file(root, place):
+    for name in ("a b", "a_b"):
+        write_sequence(place / "more" / name)
+    (place / "more" / "test_list.txt").write_text("a b\na_b\n")
+    with pytest.raises(InputError, match=r"more: 'a b' and 'a_b' would be one file, a_b\.h5"):
+        main(["convert", "tlio", "more", "converted"])
+    assert not (place / "converted").exists()
+    main(["convert", "tlio", str(root), "own", "--split", "test"])
+    (place / "own" / "test.txt").unlink()
+    (place / "own" / "also.csv").write_text("")
+    with pytest.raises(
+        InputError, match=r"also\.h5: has the name of .*also\.csv; rename or remove one"
+    ):
+        data.load("csv", place / "own")
+
+
+def test_splits_of_other_names_are_read_by_their_lists(root):
+    main(["convert", "tlio", str(root), "converted"])
+    converted = root.parent / "converted"
+    (converted / "unseen.txt").write_text("also\n")
+    (converted / "README.txt").write_text("also nothing\n")
+    assert csv.list_splits(converted) == ("train", "test", "unseen")
+    assert [sequence.name for sequence in data.load("csv", converted, "unseen")] == ["also"]
+    with pytest.raises(
+        InputError,
+        match=r"unknown split 'seen'; known splits: train, val, test, or that of a list seen\.txt there",
+    ):
+        data.load("csv", converted, "seen")
+
+
+# --- import
+# ----------------------------------------------------------------------------------------------------------
+
+
+def write_phone(path, names, time=None, gyro=1.0, accel=1.0, per_second=1.0, separator=","):
+    """A logger's file of the known walk: columns time, gyro and accel under other names, scaled,
+    some of them."""
+    time = np.arange(2000) / 100 if time is None else time
+    values = dict(
+        zip(
+            (*csv._GYRO, *csv._ACCEL),
+            [*walk.rate(time).T * gyro, *walk.force(time).T * accel],
+            strict=True,
+        )
+    )
+    names = names if isinstance(names, dict) else {name: name for name in names}
+    lines = [separator.join(["time", *names.values()])]
+    for row, stamp in enumerate(time):
+        lines.append(
+            separator.join(
+                [
+                    repr(float(stamp * per_second)),
+                    *(repr(float(values[name][row])) for name in names),
+                ]
+            )
+        )
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text("\n".join(lines) + "\n")
+    return time
+
+
+def test_import_of_a_phones_file_returns_the_walk(place, capsys):
+    names = {
+        "gyro_x": "wx",
+        "gyro_y": "wy",
+        "gyro_z": "wz",
+        "accel_x": "ax",
+        "accel_y": "ay",
+        "accel_z": "az",
+    }
+    time = write_phone(
+        place / "ios.csv",
+        names,
+        gyro=180 / np.pi,
+        accel=-1 / 9.80665,
+        per_second=1e3,
+        separator=";",
+    )
+    columns = [
+        word
+        for name, column in names.items()
+        for word in (f"--columns.{name.replace('_', '-')}", column)
+    ]
+    main(
+        [
+            "import",
+            "ios.csv",
+            "--out",
+            "own/walk.h5",
+            *columns,
+            "--accel-sign",
+            "ios",
+            "--gyro-unit",
+            "deg/s",
+        ]
+    )
+    out = capsys.readouterr().out
+    for words in (
+        "time of gyro taken as ms, by which it runs at 100 Hz",
+        "accel taken as g",
+        "accel negated (iOS's sign)",
+        "20.0 s at 100 Hz",
+        "in the quietest second accel reads",
+        "|gyro| ",
+        "it rests 0% of the time",
+    ):
+        assert words in out
+    assert (
+        out.splitlines()[-1]
+        == "next: python evaluate.py --dataset csv --data-root own --split test --init static"
+    )
+    (sequence,) = data.load("csv", place / "own", "test")
+    assert sequence.name == "walk" and not sequence.valid.any()
+    np.testing.assert_allclose(sequence.time, time, atol=1e-9)
+    np.testing.assert_allclose(sequence.gyro, walk.rate(time), atol=1e-9)
+    np.testing.assert_allclose(sequence.accel, walk.force(time), atol=1e-9)
+
+    (place / "own" / "test.txt").write_text("walk\n")
+    main(
+        [
+            "import",
+            "ios.csv",
+            "--out",
+            "own/again.h5",
+            *columns,
+            "--accel-sign",
+            "ios",
+            "--gyro-unit",
+            "deg/s",
+            "--rate",
+            "50",
+        ]
+    )
+    assert (
+        "own has lists: add the line again to test.txt, or it is not read"
+        in capsys.readouterr().out
+    )
+    assert data.read_hdf5(place / "own" / "again.h5").time.shape == (1000,)
+
+
+def test_import_of_a_file_for_each_sensor(place, capsys):
+    time = write_phone(place / "gyro.csv", csv._GYRO)
+    write_phone(place / "accel.csv", csv._ACCEL, time=time[:-100] + 0.004)
+    units = ["--gyro-unit", "rad/s", "--time-unit", "s"]
+    main(
+        [
+            "import",
+            "gyro.csv",
+            "--accel-path",
+            "accel.csv",
+            "--out",
+            "own/two.h5",
+            *units,
+            "--name",
+            "walk 2",
+        ]
+    )
+    assert "gyro and accel have stamps of their own: accel interpolated" in capsys.readouterr().out
+    (sequence,) = data.load("csv", place / "own", "test")
+    assert sequence.name == "walk 2" and len(sequence.time) == 1899
+    inner = slice(20, -20)
+    np.testing.assert_allclose(
+        sequence.accel[inner], walk.force(sequence.time + 0.01)[inner], atol=2e-3
+    )
+
+
+# --- mistakes
+# --------------------------------------------------------------------------------------------------------
+
+OUT = ["--out", "x.h5"]
+
+
+@pytest.mark.parametrize(("arguments", "expected"), [
+    ([], "command: is missing; give one of list, check, convert, import"),
+    (["chek"], "command: unknown 'chek'; did you mean 'check'?"),
+    (["list", "tlio"], "'tlio': is not an option"),
+    (["check"], "DATASET_OR_ROOT: is missing"),
+    (["check", "tloi"], "dataset: unknown name 'tloi'; did you mean 'tlio'?"),
+    (["check", "tlio"], "data/tlio, data/tlio_layout: no folder of dataset 'tlio'; give its folder with --dataset tlio"),
+    (["check", "./nowhere"], "./nowhere: no such folder"),
+    (["check", "heads", "--dataset", "tilo"], "dataset: unknown name 'tilo'; did you mean 'tlio'?"),
+    (["check", "heads", "--split", "tset"], "dataset tlio: unknown split 'tset'; known splits: train, val, test, all"),
+    (["check", "heads", "--dataset", "ridi"], "heads: holds no recording of RIDI"),
+    (["check", "folder.h5"], "folder.h5: has the layout of no dataset; say which it is: --dataset NAME"),
+    (["check", "heads", "--plot", "x"], "--plot: unknown option; did you mean --plots?"),
+    (["check", "heads", "--workers", "0"], "--workers: must be at least 1, found 0"),
+    (["check", "heads", "--workers", "two"], "--workers: must be a whole number or None, found 'two'"),
+    (["check", "heads", "--json", "heads"], "--json: heads is a folder"),
+    (["check", "heads", "--plots", "heads/test_list.txt"], "--plots: heads/test_list.txt is a file"),
+    (["check", "heads", "tlio"], "'tlio': is not an option"),
+    (["convert", "tlio", "heads"], "OUT: is missing"),
+    (["convert", "tlio", "nowhere", "x"], "nowhere: no folder of dataset 'tlio'"),
+    (["convert", "tlio", "heads", "heads"], "heads: is the folder that is read"),
+    (["convert", "tlio", "heads", "x", "--rate", "0"], "--rate: 0 Hz is no rate to resample to"),
+    (["convert", "tlio", "heads", "x", "--rate"], "--rate: needs a value, which must be a number or None"),
+    (["convert", "tlio", "heads", "x", "--split", "tset"], "dataset tlio: unknown split 'tset'"),
+    (["convert", "tlio", "heads", "heads/test_list.txt"], "heads/test_list.txt: is a file"),
+    (["convert", "tlio", "heads", "taken"], "taken: holds recordings or lists that no conversion has written; choose another folder"),
+    (["convert", "tlio", "heads", "ours", "--rate", "100"], "ours: holds tlio at 50 Hz, not tlio at 100 Hz; choose another folder"),
+    (["convert", "tlio", "heads", "ours"], "ours: holds tlio at 50 Hz, not tlio at its own rate"),
+    (["import", *OUT], "FILE: is missing"),
+    (["import", "walk.csv"], "--out: is missing; give --out OUT"),
+    (["import", "none.csv", *OUT], "none.csv: cannot be read (No such file or directory)"),
+    (["import", "walk.csv", "--out", "x.csv"], "--out: 'x.csv' is no name of an HDF5 file; name it NAME.h5"),
+    (["import", "walk.csv", "--out", "folder.h5"], "--out: 'folder.h5' is a folder"),
+    (["import", "walk.csv", *OUT, "--columns.gyro-x", "wx"], "walk.csv: column 'wx' is missing; found: time, gyro_x"),
+    (["import", "walk.csv", *OUT, "--columns.gyr-x", "wx"], "--columns.gyr-x: unknown option; did you mean --columns.gyro-x?"),
+    (["import", "walk.csv", *OUT, "--gyro-unit", "rpm"], "--gyro-unit: must be one of rad/s, deg/s or None, found 'rpm'"),
+    (["import", "walk.csv", *OUT, "--rate", "1e9"], "rate: 1e+09 Hz is no rate to resample to"),
+])  # fmt: skip
+def test_a_mistake_is_one_line_and_status_2(root, place, capsys, arguments, expected):
+    write_phone(place / "walk.csv", csv._GYRO + csv._ACCEL)
+    (place / "taken").mkdir()
+    (place / "taken" / "train.txt").write_text("a\n")
+    (place / "folder.h5").mkdir()
+    (place / "ours" / ".converted").mkdir(parents=True)
+    (place / "ours" / ".converted" / "settings.json").write_text(
+        '{"dataset": "tlio", "rate": 50.0}'
+    )
+    before = sorted(place.rglob("*"))
+    with pytest.raises(SystemExit) as left, warnings.catch_warnings():
+        cli.run(lambda: main(arguments))
+    out, err = capsys.readouterr()
+    assert (left.value.code, out) == (2, "") and err.count("\n") == 1 and expected in err, err
+    assert sorted(place.rglob("*")) == before
+
+
+@pytest.mark.parametrize(("arguments", "words"), [
+    (["--help"], ["list", "check", "convert", "import"]),
+    (["list", "--help"], ["GNIO_DATA"]),
+    (["check", "--help"], ["check oxiod", "--plots", "DATASET_OR_ROOT", "--split", "figures"]),
+    (["convert", "--help"], ["convert tlio ~/tlio", "DATASET ROOT OUT", "--rate", "--workers", "--dataset csv"]),
+    (["import", "--help"], ["--columns.gyro-x", "--accel-sign {android,ios,detect}", "Accelerometer.csv", "--accel-path"]),
+])  # fmt: skip
+def test_help_teaches_with_examples(capsys, arguments, words):
+    try:
+        main(arguments)
+    except SystemExit as leaving:
+        assert leaving.code == 0
+    text = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    assert all(word in text for word in words) and "python -m gnio_jax.data" in text

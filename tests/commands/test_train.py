@@ -1,0 +1,161 @@
+"""The training command as a person types it: one line on stderr and status 2 for every mistake,
+nothing left behind."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import train
+from gnio_jax import config as configuration
+from gnio_jax.commands import console as cli
+from gnio_jax.config import TrainConfig
+from gnio_jax.types import InputError
+
+ROOT = Path(__file__).parents[2]
+
+
+def mistake(monkeypatch, capsys, tmp_path, *arguments):
+    """The one line that the command answers with."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("GNIO_DATA", raising=False)
+    monkeypatch.setattr(sys, "argv", ["train.py", *arguments])
+    before = sorted(tmp_path.rglob("*"))
+    with pytest.raises(SystemExit) as left:
+        cli.run(train.main)
+    assert left.value.code == 2
+    out, err = capsys.readouterr()
+    lines = [line for line in err.splitlines() if not line.startswith("reading ")]
+    assert out == "" and len(lines) == 1, (out, err)
+    assert sorted(tmp_path.rglob("*")) == before
+    return lines[0]
+
+
+@pytest.mark.parametrize("arguments, expected", [
+    (["--dataset", "tlio"], "github.com/CathIAS/TLIO"),
+    (["--dataset", "tlio", "--data-root", "nowhere"], "nowhere"),
+    (["--dataset", "oxiod"], "deepio.cs.ox.ac.uk"),
+    (["--dataset", "oxoid"], "did you mean 'oxiod'? known datasets: blackbird, csv, euroc, idol, kitti, oxiod, ridi, ronin, synthetic, "
+                             "tlio, tumvi"),
+    (["--datset", "tlio"], "--datset: unknown option; did you mean --dataset?"),
+    (["--optim.epoch", "3"], "--optim.epoch: unknown option; did you mean --optim.epochs?"),
+    (["--optim.epochs", "three"], "--optim.epochs: must be a whole number, found 'three'"),
+    (["--model.gate", "relu"], "--model.gate: must be one of tanh, sigmoid or None, found 'relu'"),
+    (["--model.name", "gnoi"], "model 'gnoi': unknown; known models: ctin, deepils, gnio"),
+    (["--model.bank-heads", "7"], "model 'gnio': bank_heads must divide the 512 features, found 7"),
+    (["--data.rate", "0"], "field 'data.rate' must be positive"),
+    (["--data.stride-seconds", "0.3"], "field 'data.stride_seconds' must divide the window"),
+    (["--data.train-split", "trian"], "trian"),
+    (["--config", "none.yaml"], "none.yaml: no such config file"),
+    (["--resume", "--workdir", "none"], "none: holds no run to resume"),
+])  # fmt: skip
+def test_mistakes(monkeypatch, capsys, tmp_path, arguments, expected):
+    assert expected in mistake(monkeypatch, capsys, tmp_path, *arguments)
+
+
+@pytest.mark.parametrize("content, expected", [
+    ("optim: {epohcs: 3}", "unknown field 'optim.epohcs'; did you mean 'optim.epochs'?"),
+    ("optim: {learning_rate: 1e-4}", "field 'optim.learning_rate' must be a number, found '1e-4'; YAML reads '1e-4' as text"),
+    ("optim: {epochs: '3'}", "field 'optim.epochs' must be a whole number, found '3'"),
+    ("optim: {epochs: 2.5}", "field 'optim.epochs' must be a whole number, found 2.5"),
+    ("augment: {yaw: 1}", "field 'augment.yaw' must be true or false, found 1"),
+    ("model: {head: gatd}", "field 'model.head' must be one of gated, linear or null, found 'gatd'"),
+    ("optim: 3", "optim must be a mapping"),
+    ("- 1", "must be a mapping"),
+    ("a: [", "is not YAML"),
+    ("!!python/object/apply:os.system ['true']", "is not YAML"),
+])  # fmt: skip
+def test_configs(monkeypatch, capsys, tmp_path, content, expected):
+    (tmp_path / "my.yaml").write_text(content)
+    line = mistake(monkeypatch, capsys, tmp_path, "--config", "my.yaml")
+    assert line.startswith("my.yaml: ") and expected in line
+
+
+def test_every_config_of_the_repository_is_valid_and_names_its_command():
+    files = sorted((ROOT / "configs").glob("*.yaml"))
+    assert {"quickstart.yaml", "gnio_tlio.yaml", "gnio_oxiod.yaml", "gnio_oxiod_small.yaml"} <= {
+        file.name for file in files
+    }
+    for file in files:
+        configuration.validate(configuration.load(file), str(file))
+        assert f"python train.py --config configs/{file.name}" in file.read_text()
+
+
+def test_the_budgets_of_the_tables_are_valid_and_name_their_command():
+    files = sorted((ROOT / "configs" / "tables").glob("*.yaml"))
+    assert [file.stem for file in files] == [
+        "oxiod_lists",
+        "oxiod_sessions",
+        "synthetic",
+        "tlio_layout",
+    ]
+    for file in files:
+        config = configuration.validate(configuration.load(file), str(file))
+        assert (config.model.name, config.model.width, config.optim.batch_size) == ("gnio", 16, 128)
+        assert (
+            f"python -m gnio_jax.tables comparison --base configs/tables/{file.name}"
+            in file.read_text()
+        )
+
+
+def test_the_papers_configs_are_the_papers():
+    for name in ("gnio_tlio", "gnio_oxiod"):
+        config = configuration.load(ROOT / "configs" / f"{name}.yaml")
+        defaults = TrainConfig()
+        assert (config.model, config.loss, config.optim) == (
+            defaults.model,
+            defaults.loss,
+            defaults.optim,
+        )
+        assert (
+            config.optim.batch_size == 1024
+            and config.optim.epochs == 200
+            and config.optim.warmup_epochs == 5
+        )
+        assert (
+            config.optim.start_learning_rate,
+            config.optim.learning_rate,
+            config.optim.end_learning_rate,
+        ) == (1e-6, 1e-4, 1e-6)
+        assert (config.loss.mse_weight, config.loss.nll_weight) == (1e2, 1e-4)
+        assert config.data.stride * 10 == config.data.window == config.data.rate
+
+
+def test_a_config_survives_its_file(tmp_path):
+    config = configuration.load(ROOT / "configs" / "gnio_oxiod_small.yaml")
+    configuration.save(tmp_path / "kept.yaml", config)
+    assert configuration.load(tmp_path / "kept.yaml") == config
+
+
+def test_help_teaches():
+    shown = subprocess.run(
+        [sys.executable, "train.py", "--help"], cwd=ROOT, capture_output=True, text=True, check=True
+    ).stdout
+    for word in (
+        "--dataset",
+        "--resume",
+        "--config",
+        "--optim.epochs",
+        "--data.window-rotation",
+        "linear warm-up",
+        "Prototypes in the",
+    ):
+        assert word in " ".join(shown.split()), word
+
+
+def test_the_newest_run_is_the_one_trained_last(tmp_path):
+    with pytest.raises(
+        InputError,
+        match=r"holds no run; train one with python train\.py, or name its folder with --workdir",
+    ):
+        configuration.newest_run(tmp_path)
+    for age, name in [(30, "old"), (10, "new"), (20, "middle")]:
+        configuration.save(tmp_path / name / "config.yaml", TrainConfig())
+        (tmp_path / name / "metrics.jsonl").write_text("")
+        for path in (tmp_path / name).iterdir():
+            os.utime(path, (1e9 - age, 1e9 - age))
+    assert configuration.newest_run(tmp_path).name == "new"
+    os.utime(tmp_path / "old" / "metrics.jsonl")  # trained on
+    assert configuration.newest_run(tmp_path).name == "old"

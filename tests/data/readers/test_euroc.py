@@ -1,0 +1,472 @@
+"""EuRoC and TUM-VI: a known motion written in the ASL layout, traps included, must come back; real
+recordings must be physical."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from gnio_jax import data
+from gnio_jax.data.readers import euroc
+from gnio_jax.data.sequence import rotations, self_check
+from gnio_jax.types import InputError
+from tests.support import asl_files as files
+from tests.support import known_walk
+
+
+@pytest.fixture(autouse=True)
+def own_cache(tmp_path_factory, monkeypatch):
+    monkeypatch.setenv("GNIO_CACHE", str(tmp_path_factory.mktemp("cache")))
+
+
+def known_time(sequence):
+    """s on the known walk's clock; unix seconds alone would lose the nanoseconds' digits."""
+    return sequence.time + (sequence.attributes["start_time"] - files.EPOCH * 1e-9)
+
+
+def compare(sequence, degrees=0.1, metres=1e-3, speed=2e-3, bias=0.0):
+    time, valid = known_time(sequence), sequence.valid
+    turn = (
+        rotations(sequence.orientation[valid]).inv() * known_walk.attitude(time[valid])
+    ).magnitude()
+    assert np.degrees(turn).max() < degrees
+    assert (
+        np.linalg.norm(sequence.position - known_walk.position(time), axis=1)[valid].max() < metres
+    )
+    assert np.abs(sequence.velocity - known_walk.velocity(time))[valid].max() < speed
+    np.testing.assert_allclose(sequence.gyro - bias, known_walk.rate(time), atol=1e-3)
+    np.testing.assert_allclose(sequence.accel, known_walk.force(time), atol=1e-3)
+    np.testing.assert_allclose(np.diff(sequence.time), 0.005, atol=1e-9)
+    assert (
+        np.isnan(sequence.position[~valid]).all() and np.isnan(sequence.orientation[~valid]).all()
+    )
+
+
+@pytest.mark.parametrize(
+    ("header", "step", "shuffle"),
+    [
+        (files.LONG_HEADER, 0.005, False),
+        (files.SHORT_HEADER, 0.05, False),
+        (files.LONG_HEADER, 0.005, True),
+    ],
+    ids=["published", "20 Hz with short names", "shuffled"],
+)
+def test_an_estimate_comes_back_at_the_stamps_of_the_imu(tmp_path, header, step, shuffle):
+    mav = tmp_path / "V1_01_easy" / "mav0"
+    files.write_imu(mav, shuffle=shuffle)
+    files.write_estimate(mav, header=header, step=step, shuffle=shuffle)
+    sequence = euroc.read_sequence(mav.parent)
+    compare(sequence)
+    time = known_time(sequence)
+    # What the reference does not cover is cut off.
+    assert time[0] == pytest.approx(1.005, abs=1e-6) and time[-1] == pytest.approx(
+        11.0 - step, abs=step + 0.005
+    )
+    assert (
+        sequence.valid.all()
+        and sequence.name == "V1_01_easy"
+        and sequence.attributes["dataset"] == "euroc"
+    )
+    assert self_check(sequence, pedestrian=False).failures == ()
+
+
+def test_rows_out_of_order_and_repeated_are_put_right(tmp_path):
+    def shake(stamps, values):
+        order = np.arange(len(stamps))
+        order[[100, 103]] = order[[103, 100]]
+        order = np.insert(order, 500, order[500])
+        return stamps[order], values[order]
+
+    mav = tmp_path / "V1_01_easy" / "mav0"
+    files.write_imu(mav, spoil=shake)
+    files.write_estimate(mav, spoil=shake)
+    sequence = euroc.read_sequence(mav.parent)
+    compare(sequence)
+    assert (
+        sequence.valid.all()
+        and sequence.attributes["rows_repeated"] == 1
+        and sequence.attributes["rows_sorted"] == 2
+    )
+
+
+@pytest.mark.parametrize("step", [0.005, 0.05])
+def test_extrinsics_move_the_reference_to_the_imu(tmp_path, step):
+    mount = files.Mount(
+        Rotation.from_euler("ZXY", [100, 20, -30], degrees=True), np.array([0.07, -0.13, 0.11])
+    )
+    imu_mount = files.Mount(
+        Rotation.from_euler("ZXY", [-40, 5, 170], degrees=True), np.array([-0.02, 0.05, 0.01])
+    )
+    mav = tmp_path / "V1_01_easy" / "mav0"
+    files.write_imu(mav)
+    files.write_yaml(mav / "imu0" / "sensor.yaml", imu_mount)
+    files.write_estimate(mav, step=step, mount=mount, imu_mount=imu_mount)
+    sequence = euroc.read_sequence(mav.parent)
+    # 20 Hz cannot carry the bounce of a lever to the millimetre.
+    compare(sequence, metres=1e-3 if step < 0.01 else 2e-3, speed=5e-3 if step < 0.01 else 0.05)
+    assert sequence.valid.all()
+
+
+def test_gaps_and_jumps_of_an_estimate_are_not_valid(tmp_path):
+    def spoil(stamps, values):
+        time = (stamps - files.EPOCH) * 1e-9
+        values[time > 6.0, :3] += 0.1  # batches that do not meet
+        values[400:404, 4] = np.nan  # poses that are none
+        keep = ~((time > 8.0) & (time < 8.5)) & ~((time > 9.0) & (time < 9.08))
+        return stamps[keep], values[keep]
+
+    mav = tmp_path / "MH_04_difficult" / "mav0"
+    files.write_imu(mav)
+    files.write_estimate(mav, spoil=spoil)
+    sequence = euroc.read_sequence(mav.parent)
+    time, valid = known_time(sequence), sequence.valid
+    broken = (time > 7.994) & (time < 8.506)
+    np.testing.assert_array_equal(valid[~broken & (np.abs(time - 6.0) > 0.006)], True)
+    assert (
+        not valid[(time > 8.005) & (time < 8.495)].any()
+        and 1 <= (~valid[np.abs(time - 6.0) < 0.006]).sum() <= 2
+    )
+    shift = np.where(time > 6.0, 0.1, 0.0)[:, None]
+    compare(sequence._replace(position=sequence.position - shift), metres=2e-3)
+
+
+def test_a_gap_of_the_imu_is_not_valid(tmp_path):
+    keep = np.delete(np.arange(2400), np.arange(1000, 1060))
+    mav = tmp_path / "V1_01_easy" / "mav0"
+    files.write_imu(mav, spoil=lambda stamps, values: (stamps[keep], values[keep]))
+    files.write_estimate(mav)
+    sequence = euroc.read_sequence(mav.parent)
+    time = known_time(sequence)
+    hole = (time > 4.996) & (time < 5.299)
+    assert not sequence.valid[hole].any() and sequence.valid[~hole].mean() > 0.999
+
+
+def test_a_cached_sequence_is_the_same_and_follows_its_files(tmp_path):
+    mav = tmp_path / "MH_04_difficult" / "mav0"
+    files.write_imu(mav)
+    files.write_estimate(mav)
+    (first,), (again,) = data.load("euroc", tmp_path, "test"), data.load("euroc", tmp_path, "test")
+    for field in ("time", "gyro", "accel", "orientation", "position", "velocity", "valid"):
+        np.testing.assert_array_equal(getattr(first, field), getattr(again, field))
+    assert first.attributes == again.attributes
+    files.write_yaml(
+        mav / "imu0" / "sensor.yaml", files.Mount(translation=np.array([0.5, 0.0, 0.0]))
+    )
+    (moved,) = data.load("euroc", tmp_path, "test")
+    # Half a metre along the body's x.
+    np.testing.assert_allclose(
+        moved.position,
+        first.position + rotations(first.orientation).apply([0.5, 0.0, 0.0]),
+        atol=1e-6,
+    )
+
+
+def test_a_trackers_gaps_are_not_valid_and_its_attitudes_come_back(tmp_path):
+    mav = tmp_path / "dataset-room1_512_16" / "mav0"
+    files.write_imu(mav, seconds=24.0, step=0.005016, bias=0.02)
+    files.write_mocap(mav, last=23.0, gaps=((5.0, 8.2), (12.0, 12.07), (15.0, 15.3)))
+    sequence = euroc.read_sequence(mav.parent, euroc.TUMVI)
+    compare(
+        sequence, speed=0.02, bias=0.02
+    )  # at the ends of a stretch the smoother has poses on one side alone
+    time = known_time(sequence)
+    for start, end in ((5.0, 8.2), (15.0, 15.3)):
+        assert not sequence.valid[(time > start + 0.01) & (time < end - 0.01)].any()
+    gap = (time > 4.98) & (time < 8.22) | (time > 14.98) & (time < 15.32)
+    assert (
+        sequence.valid[~gap].mean() > 0.995 and sequence.valid[(time > 12.0) & (time < 12.07)].all()
+    )
+    assert sequence.name == "room1" and sequence.attributes["dataset"] == "tumvi"
+    assert self_check(sequence).failures == ()
+
+
+def test_a_noisy_tracker_is_smoothed_and_its_flips_are_masked(tmp_path):
+    mav = tmp_path / "dataset-room2_512_16" / "mav0"
+    mount = files.Mount(
+        Rotation.from_euler("ZXY", [80, -10, 15], degrees=True), np.array([0.03, 0.06, -0.04])
+    )
+    files.write_imu(mav, seconds=24.0, step=0.005016, bias=-0.01)
+    flips = (4.0, 10.0, 10.3, 17.5)
+    files.write_mocap(
+        mav, last=23.0, gaps=((12.0, 14.1), (18.0, 18.13)), noise=1.0, flips=flips, mount=mount
+    )
+    sequence = euroc.read_sequence(mav.parent, euroc.TUMVI)
+    time, valid = known_time(sequence), sequence.valid
+    assert valid[(time < 11.9) | (time > 14.2)].mean() > 0.97
+    turn = np.degrees(
+        (
+            rotations(sequence.orientation[valid]).inv() * known_walk.attitude(time[valid])
+        ).magnitude()
+    )
+    assert turn.max() < 0.5 and np.median(turn) < 0.1
+    place = np.linalg.norm(sequence.position - known_walk.position(time), axis=1)[valid]
+    assert place.max() < 0.01 and np.median(place) < 2e-3
+    speed = np.abs(sequence.velocity - known_walk.velocity(time))[valid]
+    assert np.sqrt((speed**2).mean()) < 0.02  # differences of neighbours would make 0.07
+    for flip in flips:
+        assert not valid[np.argmin(np.abs(time - flip))]
+    assert self_check(sequence).failures == ()
+
+
+def test_a_few_doubtful_poses_between_gaps_make_no_swing(tmp_path):
+    """For a second pairs of poses alone, 90 ms apart, one of each off by 3 cm: a spline through
+    them would swing by more."""
+
+    def thin(stamps, values):
+        time = (stamps - files.EPOCH) * 1e-9
+        sparse = (time > 6.0) & (time < 7.0)
+        place = np.arange(len(time)) % 11
+        values[sparse & (place == 1), :3] += 0.03
+        keep = ~sparse | (place < 2)
+        return stamps[keep], values[keep]
+
+    mav = tmp_path / "dataset-room1_512_16" / "mav0"
+    files.write_imu(mav, seconds=14.0, step=0.005016)
+    files.write_mocap(mav, last=13.0, spoil=thin)
+    sequence = euroc.read_sequence(mav.parent, euroc.TUMVI)
+    time, valid = known_time(sequence), sequence.valid
+    assert np.linalg.norm(sequence.position - known_walk.position(time), axis=1)[valid].max() < 0.03
+    assert np.abs(sequence.velocity - known_walk.velocity(time))[valid].max() < 0.5
+    assert valid[(time < 5.9) | (time > 7.1)].all()
+
+
+def test_truth_at_both_ends_alone_is_kept(tmp_path):
+    """TUM-VI's corridors: minutes without a pose in the middle."""
+    mav = tmp_path / "dataset-corridor1_512_16" / "mav0"
+    files.write_imu(mav, seconds=60.0, step=0.005016)
+    files.write_mocap(mav, last=59.0, gaps=((14.0, 46.0),))
+    (sequence,) = data.load("tumvi", tmp_path, "unseen")
+    time = known_time(sequence)
+    assert (
+        not sequence.valid[(time > 14.02) & (time < 45.98)].any()
+        and sequence.valid[(time < 13.9) | (time > 46.1)].mean() > 0.99
+    )
+    assert time[-1] > 58.9
+    compare(sequence, speed=0.02)
+
+
+def write(root, *names, mocap=False):
+    for name in names:
+        mav = root / name / "mav0"
+        files.write_imu(mav)
+        files.write_mocap(mav) if mocap else files.write_estimate(mav, step=0.02)
+
+
+def names(sequences):
+    return [sequence.name for sequence in sequences]
+
+
+def test_splits_hold_whole_environments_out(tmp_path):
+    write(
+        tmp_path,
+        "machine_hall/MH_01_easy",
+        "machine_hall/MH_05_difficult",
+        "V1_02_medium",
+        "V2_03_difficult",
+        "my_flight",
+    )
+    (tmp_path / "MH_05_notes").mkdir()
+    assert names(data.load("euroc", tmp_path, "train")) == ["MH_01_easy"]
+    assert names(data.load("euroc", tmp_path, "val")) == ["V1_02_medium"]
+    assert (
+        names(data.load("euroc", tmp_path, "test"))
+        == names(data.load("euroc", tmp_path, "seen"))
+        == ["MH_05_difficult", "my_flight"]
+    )
+    assert names(data.load("euroc", tmp_path, "unseen")) == ["V2_03_difficult"]
+    for splits in (euroc.EUROC_SPLITS, euroc.TUMVI_SPLITS):
+        every = [name for chosen in splits.values() for name in chosen]
+        assert len(every) == len(set(every)) == {"V2_01_easy": 11}.get(splits["unseen"][0], 28)
+    rooms = {
+        name.split("_")[0]
+        for split in ("train", "val", "test")
+        for name in euroc.EUROC_SPLITS[split]
+    }
+    assert not rooms & {name.split("_")[0] for name in euroc.EUROC_SPLITS["unseen"]}
+
+
+def test_a_walk_published_in_two_sizes_is_taken_once(tmp_path):
+    write(
+        tmp_path,
+        "dataset-room1_512_16",
+        "dataset-room1_1024_16",
+        "dataset-room2_1024_16",
+        mocap=True,
+    )
+    write(tmp_path, "dataset-calib-imu1_512_16", mocap=True)
+    assert names(data.load("tumvi", tmp_path, "train")) == ["room1", "room2"]
+    with pytest.raises(InputError, match="holds no sequence of split 'test'"):
+        data.load("tumvi", tmp_path, "test")
+    with pytest.raises(
+        InputError, match=r"holds no sequence of split 'val'; its sequences are room3"
+    ):
+        data.load("tumvi", tmp_path, "val")
+
+
+def test_a_turned_imu_is_left_out_by_name(tmp_path):
+    write(tmp_path, "MH_04_difficult")
+    mav = tmp_path / "MH_05_difficult" / "mav0"
+    files.write_imu(mav)
+    files.write_estimate(mav)
+    files.write_yaml(
+        mav / "imu0" / "sensor.yaml", files.Mount(Rotation.from_euler("x", 90, degrees=True))
+    )
+    with pytest.warns(
+        UserWarning, match=r"MH_05_difficult: left out by the self-check: mean of R·accel"
+    ):
+        assert names(data.load("euroc", tmp_path, "test")) == ["MH_04_difficult"]
+
+
+# --- errors
+# ----------------------------------------------------------------------------------------------------------
+
+
+def refused(folder, place, *words):
+    with pytest.raises(InputError) as error:
+        euroc.read_sequence(folder)
+    text = str(error.value)
+    assert (
+        text.startswith(f"{place}: ") and "\n" not in text and all(word in text for word in words)
+    ), text
+
+
+def set_value(row, column, value):
+    def change(stamps, values):
+        values[row, column] = value
+        return stamps, values
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (set_value(5, 1, np.nan), ("'gyro and accel'", "row 5")),
+        (
+            lambda s, v: (np.where(np.arange(len(s)) == 9, s[8], s), v),
+            ("field 'time'", "stamp of another row"),
+        ),
+        (
+            lambda s, v: (files.EPOCH + (s - files.EPOCH) // 1000, v),
+            ("field 'time'", "expected about 200 Hz"),
+        ),
+        (
+            lambda s, v: (files.EPOCH + (s - files.EPOCH) * 2, v),
+            ("field 'time'", "100 Hz, expected about 200 Hz"),
+        ),
+        (
+            lambda s, v: (np.where(np.arange(len(s)) < 1000, s, s + 2 * 10**9), v),
+            ("field 'time'", "gap of 2.005"),
+        ),
+        (lambda s, v: (s, v / [1, 1, 1, 9.81, 9.81, 9.81]), ("field 'accel'", "looks like G")),
+        (lambda s, v: (s, v * [57.3, 57.3, 57.3, 1, 1, 1]), ("field 'gyro'", "looks like deg/s")),
+    ],
+)
+def test_a_bad_imu_is_refused_by_file_and_field(tmp_path, change, words):
+    mav = tmp_path / "V1_01_easy" / "mav0"
+    files.write_imu(mav, spoil=change)
+    files.write_estimate(mav)
+    refused(mav.parent, mav / "imu0" / "data.csv", *words)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (set_value(slice(3, None), 2, np.nan), ("holds 3 poses",)),
+        (set_value(7, slice(3, 7), 0.0), ("field 'q_rs'", "not a unit quaternion", "row 7")),
+        (lambda s, v: (s[::40], v[::40]), ("field 'time'", "5 Hz, too slow for a reference")),
+        (lambda s, v: (s + 3600 * 10**9, v), ("field 'time'", "does not overlap the IMU's")),
+        (
+            lambda s, v: (np.where(np.arange(len(s)) == 9, s[8], s), v),
+            ("field 'time'", "stamp of another row"),
+        ),
+    ],
+)
+def test_a_bad_reference_is_refused_by_file_and_field(tmp_path, change, words):
+    mav = tmp_path / "V1_01_easy" / "mav0"
+    files.write_imu(mav)
+    files.write_estimate(mav, spoil=change)
+    refused(mav.parent, mav / "state_groundtruth_estimate0" / "data.csv", *words)
+
+
+def test_damaged_files_are_refused(tmp_path):
+    folder = tmp_path / "V1_01_easy"
+    mav = folder / "mav0"
+    files.write_imu(mav)
+    files.write_estimate(mav)
+    imu, truth, mount = (
+        mav / "imu0" / "data.csv",
+        mav / "state_groundtruth_estimate0" / "data.csv",
+        mav / "imu0" / "sensor.yaml",
+    )
+    whole = imu.read_text()
+    imu.write_text(whole.replace("w_RS_S_y", "w_RS_S_q", 1))
+    refused(folder, imu, "column 'w_rs_s_y' is missing", "w_RS_S_q")
+    imu.write_text(whole.replace("#timestamp [ns]", "#when", 1))
+    refused(folder, imu, "column 'stamp' is missing")
+    imu.write_text(whole.replace("0.", "zero", 1))
+    refused(folder, imu, "no number")
+    imu.write_text("")
+    refused(folder, imu, "holds no row")
+    imu.write_text(whole)
+
+    no_rotation = f"T_BS: [{', '.join(['0.5'] * 16)}]\n"
+    for text, word in (
+        ("T_BS:\n  data: [1, 2, 3]\n", "'T_BS' is no pose"),
+        ("T_BS:\n  cols: 4\n", "'T_BS' is no pose"),
+        (no_rotation, "its rotation is none"),
+        ("a: [\n", "cannot be read as YAML"),
+    ):
+        mount.write_text(text)
+        refused(folder, mount, word)
+    mount.write_text("sensor_type: imu\n")  # names no pose
+    compare(euroc.read_sequence(folder))
+    truth.unlink()
+    refused(folder, mav, "has no reference", "csv")
+    with pytest.raises(InputError, match=r"holds no mav0/imu0/data\.csv; expected layout"):
+        data.load("tumvi", mav, "test")
+    with pytest.raises(InputError, match="unknown split 'all'"):
+        euroc.read(tmp_path, "all")
+
+
+# --- real recordings
+# -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.recordings
+@pytest.mark.parametrize(
+    ("name", "split", "expected", "correlation"),
+    [
+        ("euroc", "train", "V1_01_easy", 0.9),
+        ("euroc", "val", "V1_02_medium", 0.98),
+        ("euroc", "test", "MH_04_difficult", 0.6),
+        ("euroc", "unseen", "V2_01_easy", 0.9),
+        ("tumvi", "val", "room3", 0.98),
+        ("tumvi", "test", "room4", 0.98),
+    ],
+)
+def test_real_recordings_are_physical(recordings, name, split, expected, correlation):
+    if not (recordings / name).is_dir():
+        pytest.skip(f"real recordings: no {name}/")
+    (sequence,) = data.load(name, recordings / name, split)
+    check = self_check(sequence, pedestrian=name == "tumvi")
+    assert (
+        sequence.name == expected
+        and check.rate == pytest.approx(200.0, rel=1e-4)
+        and 80 < check.duration < 150
+    )
+    np.testing.assert_allclose(check.gravity_mean, [0, 0, 9.81], atol=0.15)
+    assert (
+        check.gyro_consistency_degrees < 1.0
+        and check.accel_correlation_horizontal > correlation
+        and 0.3 < check.median_speed < 1.3
+    )
+    assert check.share_valid > 0.88
+    # The velocities are those of the positions.
+    whole = sequence.valid[2:] & sequence.valid[1:-1] & sequence.valid[:-2]
+    differenced = (sequence.position[2:] - sequence.position[:-2]) / 0.01
+    assert (
+        np.percentile(np.linalg.norm(differenced - sequence.velocity[1:-1], axis=1)[whole], 99)
+        < 0.05
+    )

@@ -1,0 +1,439 @@
+"""IDOL: a known walk written in the authors' layout, traps included, must come back as the phone's,
+not the rig's."""
+
+from __future__ import annotations
+
+import sys
+import warnings
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy.spatial.transform import Rotation
+
+from gnio_jax import data
+from gnio_jax.data.cache import Refusal
+from gnio_jax.data.readers import idol
+from gnio_jax.data.sequence import rotations
+from gnio_jax.types import InputError
+from tests.support import known_walk as walk
+from tests.support.idol_files import BIAS, EPOCH, RIG_OF_PHONE, frame, write
+
+
+@pytest.fixture(autouse=True)
+def own_cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("GNIO_CACHE", str(tmp_path / "cache"))
+
+
+def read_whole(path):
+    """A recording that is not divided."""
+    (sequence,) = idol.read_pieces(path)
+    return sequence
+
+
+def compare(sequence, degrees=0.5):
+    """What is measured to 1e-3, what is estimated to `degrees` and 1 cm + 1 % of the way."""
+    time = sequence.time + (sequence.attributes["start_time"] - EPOCH)
+    inner, valid = slice(20, -20), sequence.valid
+    np.testing.assert_allclose(np.diff(sequence.time), 0.01, rtol=1e-4)  # unix seconds hold 0.2 µs
+    np.testing.assert_allclose((sequence.gyro - BIAS)[inner], walk.rate(time)[inner], atol=1e-3)
+    np.testing.assert_allclose(sequence.accel[inner], walk.force(time)[inner], atol=1e-3)
+    error = rotations(sequence.orientation) * walk.attitude(time).inv()
+    assert np.degrees(error.magnitude())[valid].max() < degrees
+    known = walk.position(time)
+    gone = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(known, axis=0), axis=1))])
+    off = np.linalg.norm((sequence.position - sequence.position[0]) - (known - known[0]), axis=1)
+    assert (off < 0.01 + 0.01 * gone)[valid].all()
+    np.testing.assert_allclose(
+        sequence.velocity[inner][valid[inner]], walk.velocity(time)[inner][valid[inner]], atol=0.05
+    )
+    apart = (rotations(sequence.device_orientation) * walk.attitude(time).inv()).as_rotvec()
+    np.testing.assert_allclose(apart, np.broadcast_to([0, 0, 0.9], (len(time), 3)), atol=1e-3)
+    assert data.self_check(sequence).failures == ()
+    return time
+
+
+@pytest.mark.parametrize(
+    ("lag", "degrees"),
+    [(0.0, 0.0), (0.0, 6.0), (0.034, 0.3), (0.19, 8.4), (-0.05, 3.0)],
+    ids=lambda value: f"{value:g}",
+)
+def test_a_walk_comes_back_level_in_the_phones_frame_and_on_its_clock(tmp_path, lag, degrees):
+    tilt = Rotation.from_rotvec(np.radians(degrees) * np.array([0.8, -0.6, 0.0]))
+    sequence = read_whole(write(tmp_path, frame(lag=lag, tilt=tilt)))
+    compare(sequence)
+    a = sequence.attributes
+    assert a["lag"] == pytest.approx(lag, abs=3e-3) and a["rate_correlation"] > 0.99
+    assert a["tilt_degrees"] == pytest.approx(degrees, abs=0.5)
+    assert sequence.valid.all() and sequence.name == "building1_known_3"
+    assert (a["building"], a["imu_compensated"], a["licence"]) == ("building1", "no", "CC BY 4.0")
+
+
+def test_the_rig_is_not_the_phone(tmp_path):
+    """Half a turn apart: the rig's attitude in place of the phone's makes the same numbers
+    implausible."""
+    sequence = read_whole(write(tmp_path, frame()))
+    time = sequence.time + (sequence.attributes["start_time"] - EPOCH)
+    rig = walk.attitude(time) * RIG_OF_PHONE.inv()
+    assert np.degrees((rotations(sequence.orientation) * rig.inv()).magnitude()).min() > 170
+    mistaken = sequence._replace(orientation=np.roll(rig.as_quat(), 1, axis=1))
+    assert data.self_check(mistaken).failures
+    # A file whose attitude already is the phone's turns the other way about x and y.
+    with pytest.raises(
+        Refusal, match=r"3\.feather: columns 'orient' do not turn as 'iphoneGyro' does"
+    ):
+        read_whole(write(tmp_path, frame(mount=Rotation.identity())))
+
+
+def test_columns_are_found_by_name_among_strays_and_rows_put_in_order(tmp_path):
+    table = frame()
+    table.insert(3, "level_0", np.arange(len(table))[::-1])
+    table = table[list(np.random.default_rng(0).permutation(table.columns))]
+    rows = np.arange(len(table))
+    rows[[100, 101]] = rows[[101, 100]]
+    compare(read_whole(write(tmp_path, table.iloc[np.insert(rows, 500, [500, 500])])))
+
+
+def test_an_accelerometer_that_reads_high_is_left_as_it_is(tmp_path):
+    table = frame()
+    for axis in "XYZ":
+        table[f"iphoneAcc{axis}"] *= 1.019
+    sequence = read_whole(write(tmp_path, table))
+    compare(sequence._replace(accel=sequence.accel / 1.019))
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_gap_is_marked(tmp_path):
+    table = frame(lag=0.06)
+    time = table["timestamp"] - EPOCH
+    sequence = read_whole(write(tmp_path, table[(time < 20.0) | (time > 20.5)]))
+    hole = np.abs(sequence.time - 20.25) < 0.2
+    assert (
+        not sequence.valid[hole].any()
+        and sequence.valid[np.abs(sequence.time - 20.25) > 0.45].all()
+    )
+    assert sequence.attributes["lag"] == pytest.approx(0.06, abs=3e-3)
+
+
+def test_a_piece_shorter_than_a_window_is_lost_and_the_other_keeps_the_name(tmp_path):
+    table = frame(seconds=12.0, lag=0.1).iloc[:13]
+    table = pd.concat([table, frame(seconds=walk.SECONDS, lag=0.1, start=16.02)])
+    message = (
+        r"14\.feather: field 'time' has gaps longer than 1 s \(1, up to 15\.9 s\); kept: 35\.9 of "
+        r"51\.9 s, building3_known_14 \(16\.0 to 51\.9 s\); lost: 15\.9 s in gaps, 0\.1 s in pieces "
+        r"without a whole window"
+    )
+    with pytest.warns(UserWarning, match=message):
+        sequence = read_whole(write(tmp_path, table, "building3/known", 14))
+    time = compare(sequence)
+    assert (
+        sequence.attributes["start_time"] - EPOCH == pytest.approx(16.02, abs=0.02)
+        and len(time) > 3550
+    )
+    assert sequence.name == "building3_known_14"
+
+
+@pytest.mark.parametrize("lag", [0.0, 0.15])
+def test_a_hole_of_two_seconds_costs_two_seconds(tmp_path, lag):
+    """Nothing of the hole is left for a filter to integrate, and what was divided is cached
+    divided."""
+    table = frame(seconds=38.0, lag=lag)
+    time = table["timestamp"] - EPOCH
+    write(tmp_path, table[(time < 19.0) | (time > 21.3)])
+    for _ in range(2):
+        with pytest.warns(UserWarning) as caught:
+            pieces = data.load("idol", tmp_path, "known")
+        (warning,) = [str(warning.message) for warning in caught]
+        assert "field 'time' has gaps longer than 1 s (1, up to 2.3 s); kept: 35." in warning
+        assert "building1_known_3_piece1 (0.0 to 19.0 s), building1_known_3_piece2 (" in warning
+        assert warning.endswith("lost: 2.3 s in gaps")
+        assert sum(piece.valid.sum() for piece in pieces) / 100.0 >= 35.0
+        assert [piece.name for piece in pieces] == [f"building1_known_3_piece{k}" for k in (1, 2)]
+        assert {piece.attributes["group"] for piece in pieces} == {"subject7"}
+        for piece in pieces:
+            # The level is the mean of R·accel, of which what was gained in speed in the hole is
+            # missing.
+            compare(piece, degrees=0.8)
+            assert piece.attributes["lag"] == pytest.approx(lag, abs=3e-3)
+        assert pieces[1].attributes["start_time"] - EPOCH == pytest.approx(21.3, abs=0.02)
+
+
+def test_pieces_shorter_than_a_window_leave_nothing(tmp_path):
+    table = frame()
+    time = table["timestamp"] - EPOCH
+    path = write(tmp_path, table[time % 2.5 < 0.9])
+    with pytest.raises(Refusal) as caught:
+        idol.read_pieces(path)
+    text = str(caught.value)
+    assert text.startswith(
+        f"{path}: field 'time' has gaps longer than 1 s (14, up to 1.6 s), and no piece"
+    )
+
+
+def test_rows_without_a_pose_are_marked(tmp_path):
+    table = frame()
+    table.loc[1000:1049, "processedPosY"] = np.nan
+    table.loc[2000:2049, ["orientW", "orientX"]] = np.nan
+    table.loc[3000:3049, ["orientW", "orientX", "orientY", "orientZ"]] = 0.0
+    sequence = read_whole(write(tmp_path, table))
+    for middle in (10.25, 20.25, 30.25):
+        assert not sequence.valid[np.abs(sequence.time - middle) < 0.2].any()
+    assert sequence.valid.mean() > 0.95 and np.isfinite(sequence.position).all()
+    compare(sequence)
+
+
+def test_smoothed_positions_are_no_reason_to_leave_a_walk_out(tmp_path):
+    """The authors' positions hold no gait: they do not correlate with the accelerometer, as little
+    as a wrong time would."""
+    table = frame()
+    time = table["timestamp"] - EPOCH
+    table["processedPosX"], table["processedPosY"], table["processedPosZ"] = (
+        0.9 * time,
+        0.3 * np.sin(time / 4.0),
+        1.0,
+    )
+    write(tmp_path, table)
+    (sequence,) = idol.read(tmp_path, "known")
+    assert data.self_check(sequence).accel_correlation_horizontal < 0.3
+
+
+def test_without_core_motion_there_is_no_device_orientation(tmp_path):
+    table = frame()
+    path = write(tmp_path, table.drop(columns="iphoneOrientX"))
+    assert read_whole(path).device_orientation is None
+    table.loc[100, "iphoneOrientX"] = np.nan
+    assert read_whole(write(tmp_path, table)).device_orientation is None
+
+
+# --- splits
+# ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def copy(tmp_path):
+    root = tmp_path / "downloaded" / "IDOL"
+    table = frame(seconds=14.0)
+    for number in range(10):
+        write(root, table, "building1/train", number, subject=number // 2)
+    write(root, table, "building1/known", 0, subject=1)
+    write(root, table, "building2/known", 10, subject=2)
+    write(root, table, "building2/known", 9, subject=2)
+    write(root, table, "building3/unknown", 0, subject=14)
+    return tmp_path
+
+
+def names(sequences):
+    return [sequence.name for sequence in sequences]
+
+
+def test_splits(copy, monkeypatch):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        splits = {split: data.load("idol", copy, split) for split in idol.DATASET.splits}
+    known = ["building1_known_0", "building2_known_9", "building2_known_10"]
+    assert names(splits["known"]) == names(splits["seen"]) == names(splits["test"]) == known
+    assert names(splits["unknown"]) == names(splits["unseen"]) == ["building3_unknown_0"]
+    assert (
+        splits["unseen"][0].attributes["subject"]
+        == splits["unseen"][0].attributes["group"]
+        == "subject14"
+    )
+    train, val = splits["train"], splits["val"]
+    assert sorted(names(train) + names(val)) == [
+        f"building1_train_{number}" for number in range(10)
+    ]
+    people = {sequence.attributes["subject"] for sequence in val}
+    assert (
+        len(val) == 2
+        and len(people) == 1
+        and not people & {sequence.attributes["subject"] for sequence in train}
+    )
+    assert {sequence.attributes["held_out"] for sequence in [*train, *val]} == people
+    assert {sequence.attributes["calibration"] for sequence in train} == {"start"}
+    with pytest.raises(InputError, match="known splits: train, val, seen, known"):
+        idol.read(copy, "tests")
+    # What was aligned once is not aligned again.
+    monkeypatch.setattr(idol, "read_pieces", lambda path: pytest.fail("built again"))
+    again = data.load("idol", copy, "val")
+    assert names(again) == names(val) and all(
+        np.array_equal(a.position, b.position) for a, b in zip(again, val, strict=True)
+    )
+    assert again[0].attributes == val[0].attributes
+
+
+def test_recordings_without_a_named_subject_count_as_people_of_their_own(copy):
+    (copy / "downloaded" / "IDOL" / "building1" / "train" / "metadata.json").unlink()
+    with pytest.warns(
+        UserWarning,
+        match=r"metadata\.json does not name the subject of 10 recordings, e\.g\. .*0\.feather",
+    ):
+        val = idol.read(copy, "val")
+    assert len(val) == 1 and val[0].attributes["subject"] == val[0].name
+
+
+def test_a_recording_that_is_of_no_use_is_left_out(copy):
+    root = copy / "downloaded" / "IDOL"
+    write(root, frame(seconds=14.0, mount=Rotation.identity()), "building3/known", 2)
+    write(
+        root,
+        frame(seconds=14.0, tilt=Rotation.from_euler("x", 40, degrees=True)),
+        "building3/known",
+        3,
+    )
+    with pytest.warns(UserWarning) as caught:
+        assert len(idol.read(copy, "known")) == 3
+    texts = [str(warning.message) for warning in caught]
+    assert any(
+        text.startswith("building3_known_2: left out:") and "do not turn as" in text
+        for text in texts
+    )
+    assert any(
+        text.startswith("building3_known_3: left out:") and "40° off the vertical" in text
+        for text in texts
+    )
+
+
+def test_copies_gone_wrong(copy):
+    root = copy / "downloaded" / "IDOL"
+    for path in sorted((root / "building1" / "train").glob("*.feather"))[2:]:
+        path.unlink()
+    with pytest.raises(InputError, match="split 'val' would be empty"):
+        idol.read(copy, "val")
+    (root / "building3" / "unknown" / "metadata.json").write_text("{")
+    with pytest.raises(InputError, match=r"metadata\.json: is no JSON"):
+        idol.read(copy, "unseen")
+    with pytest.raises(
+        InputError, match=r"holds no recording in building\*/known; get it from .*expected layout"
+    ):
+        idol.read(root / "building3", "known")
+
+
+# --- mistakes
+# --------------------------------------------------------------------------------------------------------
+
+
+def setting(name, row, value):
+    def change(table):
+        table.loc[row, name] = value
+        return table
+
+    return change
+
+
+def scaling(prefix, factor):
+    def change(table):
+        return table.assign(
+            **{name: table[name] * factor for name in table if name.startswith(prefix)}
+        )
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "problem"),
+    [
+        (
+            lambda table: table.drop(columns="iphoneAccY"),
+            "column 'iphoneAccY' is missing; found: index, timestamp",
+        ),
+        (lambda table: table.drop(columns="stencilAccZ"), "column 'stencilAccZ' is missing"),
+        (lambda table: table.drop(columns="timestamp"), "column 'timestamp' is missing"),
+        (lambda table: table.assign(orientW="one"), "column 'orientW' holds 'one'"),
+        (
+            setting("iphoneGyroX", 50, np.nan),
+            "field 'iphoneGyro' is NaN or Inf in 1 rows, first in row 50",
+        ),
+        (
+            setting("iphoneAccX", 50, np.inf),
+            "field 'iphoneAcc' is NaN or Inf in 1 rows, first in row 50",
+        ),
+        (setting("timestamp", 50, np.nan), "field 'timestamp' is NaN"),
+        (
+            lambda table: table.assign(timestamp=EPOCH),
+            "column 'timestamp' holds only 1 different stamps",
+        ),
+        (
+            lambda table: table.assign(timestamp=EPOCH + 1e3 * (table["timestamp"] - EPOCH)),
+            "expected about 100 Hz",
+        ),
+        (
+            scaling("iphoneAcc", 9.8),
+            "columns 'iphoneAcc' have a median length of 9.94, expected about 1 (G)",
+        ),
+        (scaling("iphoneGyro", 57.3), "field 'gyro' looks like deg/s"),
+        (setting("orientW", 60, 3.0), "field 'orient' is not a unit quaternion in 1 rows"),
+        (scaling("processedPosX", np.nan), "hold a pose in only 0 of 1500 rows"),
+        (scaling("stencilAcc", np.nan), "columns 'stencilAcc' hold numbers in only 0 rows"),
+        (scaling("iphoneAcc", -1.0), None),
+    ],
+)
+def test_a_bad_table_is_refused_by_file_and_column(tmp_path, change, problem):
+    path = write(tmp_path, change(frame(seconds=15.0)))
+    if problem is None:  # the wrong sign is no matter of one column: gravity tells
+        assert any(
+            "mean of R·accel" in failure for failure in data.self_check(read_whole(path)).failures
+        )
+        return
+    with pytest.raises(InputError) as caught:
+        read_whole(path)
+    text = str(caught.value)
+    assert text.startswith(f"{path}: ") and problem in text and "\n" not in text
+
+
+def test_damaged_files_are_refused(tmp_path):
+    path = write(tmp_path, frame(seconds=15.0))
+    whole = path.read_bytes()
+    for size in (0, 6, 100, len(whole) // 2, len(whole) - 8):
+        path.write_bytes(whole[:size])
+        with pytest.raises(
+            InputError, match=r"3\.feather: cannot be read as feather, it may be cut short"
+        ):
+            read_whole(path)
+    path.unlink()
+    with pytest.raises(InputError, match=r"3\.feather: no such file"):
+        read_whole(path)
+
+
+def test_without_pyarrow_it_says_what_to_install(tmp_path, monkeypatch):
+    path = write(tmp_path, frame(seconds=15.0))
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    with pytest.raises(
+        InputError, match=r"3\.feather: feather files need pyarrow.*pip install 'gnio-jax\[idol\]'"
+    ):
+        read_whole(path)
+
+
+# --- the lag alone
+# ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("lag", [-0.12, 0.0, 0.033, 0.187])
+def test_lag_from_noisy_rates_with_a_bias(lag):
+    noise = np.random.default_rng(1)
+    time = np.arange(0, 60, 0.01)
+    gyro = walk.rate(time) + BIAS + noise.normal(0, 0.02, (len(time), 3))
+    gyro[2000:2020] += 8.0  # a knock
+    poses = walk.attitude(time - lag) * Rotation.from_rotvec(
+        noise.normal(0, np.radians(0.05), (len(time), 3))
+    )
+    keep = (time < 30) | (time > 30.4)
+    fit = idol.pose_lag(time, gyro, time[keep], poses[keep])
+    assert fit.lag == pytest.approx(lag, abs=3e-3) and fit.correlation > 0.5
+
+
+def test_what_stands_still_has_no_lag():
+    time = np.arange(0, 20, 0.01)
+    gyro = np.full((len(time), 3), 0.01) + np.random.default_rng(0).normal(0, 0.005, (len(time), 3))
+    assert idol.pose_lag(time, gyro, time, Rotation.identity(len(time))) == idol.Lag(0.0, 1.0)
+
+
+def test_one_wild_stamp_costs_one_row(tmp_path):
+    """A stamp of 0 among unix seconds is a gap of decades, which nothing may span."""
+    table = frame()
+    first = table.iloc[:1].assign(timestamp=0.0)
+    write(tmp_path, pd.concat([first, table], ignore_index=True))
+    (piece,) = data.load(
+        "idol", tmp_path, "known"
+    )  # the row has no pose near it, and is cut off as such
+    compare(piece)
+    assert piece.attributes["lag"] == pytest.approx(0.0, abs=3e-3)

@@ -1,0 +1,310 @@
+"""KITTI: a known motion written as OXTS packets and as npz pieces, traps included, must come back;
+real drives must be physical."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+import pytest
+
+from gnio_jax import data
+from gnio_jax.data.readers import kitti
+from gnio_jax.data.sequence import rotations, self_check
+from gnio_jax.types import InputError
+from tests.support import kitti_files as files
+from tests.support import known_walk
+
+TRAIN, VAL, TEST = "2011_09_26_drive_0014", "2011_09_26_drive_0009", "2011_09_26_drive_0018"
+
+
+def compare(sequence, time, origin, tolerance=1.0):
+    """The sequence tells of the known walk at `time` s, its positions from the walk's `origin`."""
+    turn = (rotations(sequence.orientation).inv() * known_walk.attitude(time)).magnitude()
+    assert np.degrees(turn).max() < 0.1 * tolerance
+    assert (
+        np.linalg.norm(sequence.position - (known_walk.position(time) - origin), axis=1).max()
+        < 1e-3 * tolerance
+    )
+    np.testing.assert_allclose(sequence.velocity, known_walk.velocity(time), atol=2e-3 * tolerance)
+    np.testing.assert_allclose(sequence.gyro, known_walk.rate(time), atol=1e-3 * tolerance)
+    np.testing.assert_allclose(sequence.accel, known_walk.force(time), atol=1e-3 * tolerance)
+
+
+def test_packets_with_every_trap_come_back(tmp_path):
+    oxts, pieces = files.write_published(tmp_path, TRAIN)
+    with pytest.warns(
+        UserWarning, match="1 pieces between missing packets are shorter than 3 s; left out"
+    ):
+        first, second = kitti.read_packets(oxts)
+    assert [first.name, second.name] == [f"{TRAIN}_extract0", f"{TRAIN}_extract1"]
+    for sequence, start, end in ((first, *pieces[:2]), (second, *pieces[2:])):
+        assert sequence.time[0] == pytest.approx(start, abs=1e-8) and sequence.time[
+            -1
+        ] == pytest.approx(end, abs=0.011)
+        np.testing.assert_allclose(np.diff(sequence.time), 0.01, atol=1e-9)
+        # Both pieces are of one world: from the drive's first packet.
+        compare(sequence, sequence.time, known_walk.position(np.zeros(1)))
+        assert sequence.valid.all() and self_check(sequence, pedestrian=False).failures == ()
+    a = first.attributes
+    assert (
+        a["group"] == TRAIN
+        and a["imu_compensated"] == "reference"
+        and a["rows_repeated"] == 2
+        and a["rows_sorted"] > 10
+    )
+    assert a["start_time"] == pytest.approx(1317042145.594360375, abs=1e-6)
+
+
+def test_npz_pieces_come_back(tmp_path):
+    path = files.write_piece(tmp_path / f"train__{TRAIN}_extract2.npz")
+    sequence = kitti.read_piece(path)
+    assert (
+        sequence.name == f"{TRAIN}_extract2"
+        and sequence.time.dtype == np.float64
+        and sequence.attributes["group"] == TRAIN
+    )
+    compare(sequence, sequence.time, np.zeros(3))
+
+
+def test_a_drive_in_both_layouts_is_read_once_and_the_slow_export_is_named(tmp_path):
+    files.write_drive(tmp_path, TRAIN)
+    files.write_piece(tmp_path / f"train__{TRAIN}_extract0.npz")
+    files.write_piece(tmp_path / f"train__{VAL}_extract0.npz")
+    files.write_drive(tmp_path, TRAIN, export="sync", rate=10.0)
+    files.write_drive(tmp_path, TEST, export="sync", rate=10.0)
+    with pytest.warns(
+        UserWarning,
+        match=rf"1 drives are there only as the 10 Hz export \(_sync\) and are left out: {TEST}",
+    ):
+        (sequence,) = data.load("kitti", tmp_path, "train")
+    assert "start_time" in sequence.attributes  # of the packets
+    with (
+        pytest.warns(UserWarning, match="10 Hz"),
+        pytest.raises(InputError, match="none of its drives falls into split 'test'"),
+    ):
+        data.load("kitti", tmp_path, "test")
+
+
+def test_splits_are_by_name_alone_and_never_divide_a_drive(tmp_path):
+    for name in (f"{TRAIN}_extract0", f"{TRAIN}_extract1", f"{VAL}_extract0", f"{TEST}_extract3"):
+        files.write_piece(tmp_path / f"train__{name}.npz")
+    assert [s.name for s in data.load("kitti", tmp_path, "train")] == [
+        f"{TRAIN}_extract0",
+        f"{TRAIN}_extract1",
+    ]
+    assert [s.name for s in data.load("kitti", tmp_path, "val")] == [f"{VAL}_extract0"]
+    assert [s.name for s in data.load("kitti", tmp_path, "test")] == [f"{TEST}_extract3"]
+    names = [
+        f"2011_{month:02d}_26_drive_{number:04d}" for month in (9, 10) for number in range(500)
+    ]
+    shares = [kitti.share_of(name) for name in names]
+    for split, share in (("train", 0.7), ("val", 0.1), ("test", 0.2)):
+        assert shares.count(split) / len(names) == pytest.approx(share, abs=0.04)
+    with pytest.raises(InputError, match="unknown split 'seen'"):
+        kitti.read(tmp_path, "seen")
+
+
+def test_positions_that_jump_are_not_valid(tmp_path):
+    def jump(arrays):
+        arrays["p_gt"][700:] += np.float32([1.5, -1.0, 0.0])
+
+    sequence = kitti.read_piece(files.write_piece(tmp_path / f"train__{TRAIN}_extract0.npz", jump))
+    assert not sequence.valid[650:750].any()
+    assert sequence.valid[:590].all() and sequence.valid[810:].all()
+
+
+def test_a_car_that_speeds_up_is_no_tilt_but_a_tilt_is(tmp_path):
+    """From 0 to 12 m/s in 12 s: the specific force has 1 m/s² forward in the mean, more than a tilt
+    of 5° would make."""
+
+    def accelerate(arrays, roll=0.0):
+        time = np.arange(1200) / 100
+        arrays["p_gt"][:] = np.stack([0.5 * time**2, 0 * time, 0 * time], axis=1)
+        arrays["v_gt"][:] = np.stack([time, 0 * time, 0 * time], axis=1)
+        arrays["ang_gt"][:] = [roll, 0.0, 0.0]
+        arrays["u"][:] = [0.0, 0.0, 0.0, 1.0, 0.0, 9.81]
+
+    files.write_piece(tmp_path / f"train__{TRAIN}_extract0.npz", accelerate)
+    files.write_piece(
+        tmp_path / f"train__{TRAIN}_extract1.npz",
+        lambda arrays: accelerate(arrays, np.radians(5.0)),
+    )
+    with pytest.warns(
+        UserWarning, match=rf"{TRAIN}_extract1: left out by the self-check: mean of R·accel"
+    ):
+        (sequence,) = data.load("kitti", tmp_path, "train")
+    assert sequence.name == f"{TRAIN}_extract0"
+    np.testing.assert_allclose(
+        sequence.accel, np.tile([1.0, 0.0, 9.81], (1200, 1)), atol=1e-6
+    )  # what is given is what was read
+
+
+# --- errors
+# ----------------------------------------------------------------------------------------------------------
+
+
+def refused(call, place, *words):
+    with pytest.raises(InputError) as error:
+        call()
+    text = str(error.value)
+    assert (
+        text.startswith(f"{place}: ") and "\n" not in text and all(word in text for word in words)
+    ), text
+
+
+def test_damaged_packets_are_refused_by_file_and_field(tmp_path):
+    def spoil(column, value, row=5):
+        def change(time, values):
+            values[row, column] = value
+
+        return change
+
+    for number, (change, field) in enumerate(
+        [(spoil(17, np.nan), "'wx'"), (spoil(13, np.inf), "'az'"), (spoil(0, np.nan), "'lat'")]
+    ):
+        oxts = files.write_drive(tmp_path / str(number), TRAIN, change, seconds=4.0)
+        refused(lambda oxts=oxts: kitti.read_packets(oxts), oxts / "data" / "0000000005.txt", field)
+    unused = files.write_drive(tmp_path / "unused", TRAIN, spoil(25, np.nan), seconds=4.0)
+    assert len(kitti.read_packets(unused)) == 1
+
+    oxts = files.write_drive(tmp_path / "files", TRAIN, seconds=4.0)
+    packet = oxts / "data" / "0000000007.txt"
+    whole = packet.read_text()
+    packet.write_text(whole[: len(whole) // 2])
+    refused(lambda: kitti.read_packets(oxts), packet, "expected 30", "cut short")
+    packet.write_text(whole.replace(" ", " x", 1))
+    refused(lambda: kitti.read_packets(oxts), packet, "no number")
+    packet.write_text(whole)
+    stamps = oxts / "timestamps.txt"
+    lines = stamps.read_text().splitlines()
+    stamps.write_text("\n".join(lines[:-3]))
+    refused(lambda: kitti.read_packets(oxts), stamps, "holds 397 stamps, but there is a packet 399")
+    stamps.write_text("\n".join([*lines[:4], "26.9.2011 13:02", *lines[5:]]))
+    refused(lambda: kitti.read_packets(oxts), stamps, "line 5", "no stamp")
+    stamps.write_text("\n" * 399 + lines[0])
+    refused(lambda: kitti.read_packets(oxts), stamps, "gives 1 packets a stamp")
+    stamps.unlink()
+    refused(lambda: kitti.read_packets(oxts), stamps, "cannot be read")
+    (tmp_path / "empty" / "data").mkdir(parents=True)
+    refused(
+        lambda: kitti.read_packets(tmp_path / "empty"),
+        tmp_path / "empty" / "data",
+        "holds no packets",
+    )
+
+
+def test_wrong_rates_and_units_are_refused(tmp_path):
+    slow = files.write_drive(tmp_path / "slow", TRAIN, rate=10.0)
+    refused(
+        lambda: kitti.read_packets(slow), slow / "timestamps.txt", "'time'", "10 Hz", "_extract"
+    )
+    odd = files.write_drive(tmp_path / "odd", TRAIN, rate=50.0)
+    refused(
+        lambda: kitti.read_packets(odd),
+        odd / "timestamps.txt",
+        "'time'",
+        "50 Hz, expected about 100 Hz",
+    )
+
+    def scaled(columns, factor):
+        def change(time, values):
+            values[:, columns] *= factor
+
+        return change
+
+    in_g = files.write_drive(tmp_path / "g", TRAIN, scaled(slice(11, 14), 1 / 9.81), seconds=4.0)
+    refused(lambda: kitti.read_packets(in_g), in_g, "'accel'", "looks like G")
+    degrees = files.write_drive(
+        tmp_path / "deg", TRAIN, scaled(slice(17, 20), 180 / np.pi), seconds=4.0
+    )
+    refused(lambda: kitti.read_packets(degrees), degrees, "'gyro'", "looks like deg/s")
+
+
+def put(name, value):
+    def change(arrays):
+        arrays[name] = value(arrays[name])
+
+    return change
+
+
+def one(row, value):
+    def change(values):
+        values[row] = value
+        return values
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda arrays: arrays.pop("v_gt"), ("field 'v_gt' is missing", "found: t, p_gt")),
+        (put("u", lambda u: u[:, :5]), ("field 'u'", "shape (1200, 5)", "(1200, 6)")),
+        (put("p_gt", lambda p: p[:-1]), ("field 'p_gt'", "(1199, 3)")),
+        (put("t", lambda t: np.round(t).astype(int)), ("field 't'", "int64")),
+        (put("u", one((3, 1), np.nan)), ("field 'u'", "row 3")),
+        (put("ang_gt", one((4, 1), np.inf)), ("field 'ang_gt'", "row 4")),
+        (put("t", one(9, 0.0)), ("field 'time'", "does not increase", "row 9")),
+        (put("t", lambda t: t * 2), ("field 'time'", "50 Hz")),
+        (
+            put("t", lambda t: np.where(np.arange(1200) < 600, t, t + 2)),
+            ("field 'time'", "gap of 2.01"),
+        ),
+        (put("t", lambda t: t.astype(object)), ("cannot be read as npz",)),
+    ],
+)
+def test_a_bad_piece_is_refused_by_file_and_field(tmp_path, change, words):
+    path = files.write_piece(tmp_path / f"train__{TRAIN}_extract0.npz", change)
+    refused(lambda: kitti.read_piece(path), path, *words)
+
+
+def test_a_cut_short_piece_and_an_empty_root_are_refused(tmp_path):
+    path = files.write_piece(tmp_path / f"train__{TRAIN}_extract0.npz")
+    whole = path.read_bytes()
+    for size in (0, 100, len(whole) // 2, len(whole) - 10):
+        path.write_bytes(whole[:size])
+        refused(lambda: kitti.read_piece(path), path, "cut short")
+    path.unlink()
+    refused(lambda: kitti.read_piece(path), path, "cannot be read")
+    refused(
+        lambda: kitti.find_drives(tmp_path), tmp_path, "holds no drive of KITTI", "expected layout"
+    )
+    files.write_drive(tmp_path, TRAIN, export="sync", rate=10.0)
+    refused(
+        lambda: data.load("kitti", tmp_path, "train"),
+        tmp_path,
+        "only the 10 Hz export (_sync)",
+        TRAIN,
+        "_extract",
+    )
+
+
+# --- real recordings
+# -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.recordings
+def test_real_drives_are_physical(recordings):
+    root = recordings / "kitti"
+    if not root.is_dir():
+        pytest.skip("real recordings: no kitti/")
+    seen: dict[str, str] = {}
+    for split in kitti.SPLITS:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            sequences = data.load("kitti", root, split)
+        for sequence in sequences:
+            assert seen.setdefault(sequence.attributes["group"], split) == split
+            check = self_check(sequence, pedestrian=False)
+            assert check.rate == pytest.approx(100.0, rel=1e-3)
+            assert (
+                check.gyro_consistency_degrees < 1.0 or check.duration < 15.0
+            )  # one window of 10 s says nothing
+            # A strapdown of a good INS: what is left of R·accel is what the velocity changed by.
+            first, last = sequence.velocity[0], sequence.velocity[-1]
+            mean = rotations(sequence.orientation).apply(sequence.accel).mean(axis=0)
+            np.testing.assert_allclose(
+                mean, [0, 0, 9.81] + (last - first) / check.duration, atol=0.03
+            )
+    assert len(seen) >= 15

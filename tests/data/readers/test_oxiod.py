@@ -1,0 +1,627 @@
+"""OxIOD: known walks written as native files, traps included, must come back; real recordings must
+be physically plausible."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from gnio_jax.data import alignment
+from gnio_jax.data.cache import Refusal
+from gnio_jax.data.readers import oxiod
+from gnio_jax.data.sequence import rotations, self_check
+from gnio_jax.types import InputError
+from tests.support import oxiod_files as files
+
+
+@pytest.fixture(autouse=True)
+def quiet(tmp_path, monkeypatch):
+    monkeypatch.setenv("GNIO_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr(
+        oxiod, "usable_cores", lambda: 1
+    )  # spawning costs more than these small files
+
+
+def dataset(tmp_path, scene, folder):
+    return tmp_path / "downloaded" / "Oxford Inertial Odometry Dataset" / scene / folder
+
+
+def compare(sequence, truth, time):
+    """(position error m, attitude error deg, m walked) where valid; the world's yaw and origin are
+    Vicon's own."""
+    keep = sequence.valid
+    position = np.linalg.norm(sequence.position - files.position(time, truth), axis=1)[keep]
+    attitude = np.degrees(
+        (rotations(sequence.orientation) * files.attitude(time, truth).inv()).magnitude()
+    )[keep]
+    walked = np.linalg.norm(np.diff(files.position(time, truth), axis=0), axis=1).sum()
+    return position, attitude, walked
+
+
+def imu_error(values, known, time, truth):
+    """(rms after the best shift in time, the shift): stamps of 10 ms place the clock to a fraction
+    of a millisecond only.
+
+    The shift is piecewise linear in three knots, as the restored clock is.
+    """
+    expected = known(time, truth)
+    slope = (known(time + 1e-3, truth) - known(time - 1e-3, truth)) / 2e-3
+    inner = slice(50, -50)
+    difference, slope = (values - expected)[inner], slope[inner]
+    place = np.linspace(0, 2, len(slope))
+    basis = np.stack([np.clip(1 - np.abs(place - knot), 0, 1) for knot in range(3)], axis=1)
+    columns = (slope[:, :, None] * basis[:, None, :]).reshape(-1, 3)
+    shift, *_ = np.linalg.lstsq(columns, difference.reshape(-1), rcond=None)
+    return float(np.sqrt(((difference.reshape(-1) - columns @ shift) ** 2).mean())), float(
+        np.abs(shift).max()
+    )
+
+
+def check_estimates(sequence, truth, extrinsic_degrees=0.5):
+    a = sequence.attributes
+    assert a["accel_delay_removed"] == pytest.approx(truth.accel_delay, abs=3e-3)
+    assert [a["lever_x"], a["lever_y"], a["lever_z"]] == pytest.approx(truth.lever, abs=0.01)
+    assert [a["gyro_bias_x"], a["gyro_bias_y"], a["gyro_bias_z"]] == pytest.approx(
+        truth.gyro_bias, abs=1e-3
+    )
+    assert [a["tilt_x"], a["tilt_y"]] == pytest.approx(truth.up[:2] / truth.up[2], abs=2e-3)
+    expected = truth.extrinsic.as_euler("ZXY", degrees=True)[0]
+    assert (a["extrinsic_yaw_degrees"] - expected + 180) % 360 - 180 == pytest.approx(
+        0, abs=extrinsic_degrees
+    )
+
+
+@pytest.mark.parametrize("skew", [0.0, -480e-6])
+def test_raw_walk_comes_back(tmp_path, skew):
+    truth = files.Truth(skew=skew)
+    files.write_raw(dataset(tmp_path, "handheld", "data1"), 3, truth)
+    (walk,) = oxiod.find_walks(tmp_path)
+    sequence = oxiod.build(walk, "raw")
+    a = sequence.attributes
+    time = sequence.time + (a["start_time"] - files.EPOCH)
+
+    assert np.allclose(np.diff(sequence.time), 0.01)
+    # Vicon stamps an event at offset + (1 + skew) t.
+    middle = 0.5 * (time[0] + time[-1])
+    assert a["lag"] == pytest.approx(-truth.offset - skew * middle, abs=3e-3 + abs(skew) * 2)
+    assert a["lag_drift"] == pytest.approx(abs(skew) * 65, abs=6e-3)
+    check_estimates(sequence, truth)
+    position, attitude, walked = compare(sequence, truth, time)
+    assert position.max() < 0.01 + 0.01 * walked and np.median(position) < 0.01
+    assert attitude.max() < 0.5
+    # Over one second, what a network learns from.
+    step = sequence.position[100:] - sequence.position[:-100]
+    known = files.position(time[100:], truth) - files.position(time[:-100], truth)
+    whole = sequence.valid[100:] & sequence.valid[:-100]
+    assert np.linalg.norm(step - known, axis=1)[whole].max() < 0.015
+    assert np.abs(sequence.velocity - files.velocity(time, truth))[sequence.valid].max() < 0.06
+    assert np.median(np.abs(sequence.velocity - files.velocity(time, truth))) < 0.01
+    assert sequence.valid.mean() > 0.97
+
+    rms, shift = imu_error(sequence.gyro - truth.gyro_bias, files.rate, time, truth)
+    assert rms < 1e-3 and shift < 1e-3
+    rms, shift = imu_error(sequence.accel, files.force, time, truth)
+    assert rms < 1e-3 and shift < 1e-3
+    # The device's own attitude is right but for its yaw.
+    turn = rotations(sequence.device_orientation) * files.attitude(time, truth).inv()
+    assert turn.as_rotvec()[50:-50] == pytest.approx(
+        np.broadcast_to([0, 0, 1.1], (len(time) - 100, 3)), abs=5e-3
+    )
+    assert self_check(sequence).failures == ()
+
+
+@pytest.mark.parametrize("kind", ["raw", "syn"])
+@pytest.mark.parametrize("delay", [0.02, 0.05, -0.03])
+def test_the_accelerometers_delay_is_taken_out(tmp_path, kind, delay):
+    truth = files.Truth(accel_delay=delay)
+    write = files.write_raw if kind == "raw" else files.write_syn
+    write(dataset(tmp_path, "handheld", "data1"), 1, truth, seconds=40)
+    (walk,) = oxiod.find_walks(tmp_path)
+    sequence = oxiod.build(walk, kind)
+    assert sequence.attributes["accel_delay_removed"] == pytest.approx(delay, abs=1e-3)
+    start = sequence.attributes["start_time"]
+    time = sequence.time + start - (files.EPOCH if kind == "raw" else 0.0)
+    gyro = sequence.gyro - truth.gyro_bias
+    for measured, known in ((gyro, files.rate), (sequence.accel, files.force)):
+        error = np.abs(measured - known(time, truth))  # at the stamps, first and last row too
+        slope = np.abs(known(time + 1e-3, truth) - known(time - 1e-3, truth)) / 2e-3
+        assert (error < 3e-3 + 3e-3 * slope).all()
+    # The rows that the accelerometer had not yet, or no longer, measured are gone.
+    imu = oxiod.read_imu(walk.files[kind][0], kind)
+    first, last = start - imu.epoch, start - imu.epoch + sequence.time[-1]
+    assert first + delay > imu.time[0] - 2e-3 and last + delay < imu.time[-1] + 2e-3
+
+
+@pytest.mark.parametrize("offset", [1.2, 1.9])
+def test_a_walk_that_repeats_its_turns_comes_back(tmp_path, offset):
+    # Rates of turning correlate best five seconds off, where every turn goes to the other side.
+    truth = files.Truth(eight=9.66, offset=offset)
+    files.write_raw(dataset(tmp_path, "handheld", "data2"), 1, truth, seconds=38)
+    (walk,) = oxiod.find_walks(tmp_path)
+    sequence = oxiod.build(walk, "raw")
+    assert sequence.attributes["lag"] == pytest.approx(-offset, abs=3e-3)
+    check_estimates(sequence, truth)
+    time = sequence.time + (sequence.attributes["start_time"] - files.EPOCH)
+    position, attitude, walked = compare(sequence, truth, time)
+    assert position.max() < 0.01 + 0.01 * walked and np.median(position) < 0.01
+    assert attitude.max() < 0.5
+    # The flip and the jump of the tracker are found out.
+    assert 0.97 < sequence.valid.mean() < 1.0
+    assert sequence.attributes["gyro_unexplained"] < 1e-3
+    assert sequence.attributes["accel_unexplained"] < 1e-2
+    assert sequence.attributes["runner_up"] < 0.05
+
+
+def refused(tmp_path, kind="raw"):
+    """The one line with which the walk 'handheld/data1/1' is refused."""
+    (walk,) = oxiod.find_walks(tmp_path)
+    with pytest.raises(Refusal) as caught:
+        oxiod.build(walk, kind)
+    assert str(caught.value).startswith(str(walk.files[kind][1])) and "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+def test_the_truth_of_another_walk_is_refused_by_name(tmp_path):
+    truth = files.Truth()
+    folder = dataset(tmp_path, "handheld", "data1")
+    files.write_raw(folder, 1, truth._replace(pace=1.3))
+    other = (folder / "raw" / "vi1.csv").read_text()
+    files.write_raw(folder, 1, truth)
+    (folder / "raw" / "vi1.csv").write_text(other)
+    message = refused(tmp_path)
+    assert "does not move as the phone does" in message
+    assert "check that both files are of one walk" in message
+
+
+def test_a_walk_that_fits_at_two_lags_is_refused_by_name(tmp_path):
+    truth = files.Truth(eight=40 / 9)  # gait and rounds repeat together
+    files.write_raw(dataset(tmp_path, "handheld", "data1"), 1, truth, seconds=40)
+    assert "fits the phone at two lags alike" in refused(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"lever": np.array([0.1, 0.5, -0.2])}, "the lever arm would be 0.5"),
+        ({"accel_delay": 0.2}, "the accel's delay would be 0.2 s"),
+        ({"up": np.array([np.sin(0.15), 0.0, np.cos(0.15)])}, "the world's tilt would be 8.5"),
+        ({"gyro_bias": np.array([0.1, -0.1, 0.1])}, "the gyro's bias would be 0.17"),
+    ],
+    ids=["lever", "delay", "tilt", "bias"],
+)
+def test_what_no_phone_on_a_marker_body_can_be_is_refused_by_name(tmp_path, change, message):
+    files.write_raw(dataset(tmp_path, "handheld", "data1"), 1, files.Truth(**change), seconds=40)
+    assert message in refused(tmp_path)
+
+
+def test_rows_that_the_authors_cannot_have_matched_are_refused_by_name(tmp_path):
+    truth = files.Truth(lag_rows=-250.0)
+    files.write_syn(dataset(tmp_path, "handheld", "data1"), 1, truth, seconds=40)
+    assert "the lag would be 2.5 s, at most 1 s is plausible" in refused(tmp_path, "syn")
+
+
+def test_syn_walk_comes_back(tmp_path):
+    truth = files.Truth(lag_rows=-12.4)
+    files.write_syn(dataset(tmp_path, "pocket", "data1"), 1, truth)
+    (walk,) = oxiod.find_walks(tmp_path)
+    sequence = oxiod.build(walk, "syn")
+    time = sequence.time + sequence.attributes["start_time"]
+    # Vicon's row i shows what the phone's row i + lag does.
+    assert sequence.attributes["lag"] * 100 == pytest.approx(truth.lag_rows, abs=0.3)
+    check_estimates(sequence, truth)
+    position, attitude, walked = compare(sequence, truth, time)
+    assert position.max() < 0.01 + 0.01 * walked and np.median(position) < 0.01
+    assert attitude.max() < 0.5
+    rms, shift = imu_error(sequence.gyro - truth.gyro_bias, files.rate, time, truth)
+    assert rms < 1e-3 and shift < 2e-3
+    assert (
+        sequence.attributes["placement"] == "pocket"
+        and sequence.attributes["session"] == "pocket/data1"
+    )
+
+
+def test_nexus_events_come_back(tmp_path):
+    truth = files.Truth(
+        accel_delay=0.0, extrinsic=Rotation.from_euler("ZXY", [-173, 2, 1], degrees=True)
+    )
+    files.write_nexus_raw(dataset(tmp_path, "multi devices", "nexus 5"), 7, truth)
+    (sequence,) = oxiod.read(tmp_path, "unseen")
+    time = sequence.time + (sequence.attributes["start_time"] - files.EPOCH)
+    position, attitude, walked = compare(sequence, truth, time)
+    assert position.max() < 0.01 + 0.01 * walked
+    assert attitude.max() < 0.5
+    rms, shift = imu_error(sequence.accel, files.force, time, truth)
+    assert rms < 1e-3 and shift < 2e-4
+    assert sequence.device_orientation is None and sequence.attributes["device"] == "nexus 5"
+    check_estimates(sequence, truth)
+
+
+def test_large_scale_takes_positions_of_tango_and_attitude_of_gyro(tmp_path):
+    truth = files.Truth()
+    folder = dataset(tmp_path, "large scale", "floor1")
+    files.write_large_scale(folder, 1, truth, offset=0.2)
+    files.write_large_scale(folder, 2, truth, broken=True)
+    with pytest.warns(UserWarning, match=r"floor1_2: left out.*out of step"):
+        (sequence,) = oxiod.read(tmp_path, "large_scale")
+    assert sequence.attributes["truth"] == "tango"
+    # Without a second sensor on the tablet the accelerometer's own delay cannot be told from the
+    # lag.
+    assert sequence.attributes["lag"] == pytest.approx(truth.accel_delay - 0.2, abs=0.03)
+    time = sequence.time + (sequence.attributes["start_time"] - files.EPOCH)
+    turned = Rotation.from_euler("z", 40, degrees=True) * files.attitude(time, truth)
+    error = np.degrees((rotations(sequence.orientation) * turned.inv()).magnitude())
+    assert np.median(error) < 1.5 and error.max() < 4
+    known = Rotation.from_euler("z", 40, degrees=True).apply(files.position(time, truth))
+    assert np.median(np.linalg.norm(sequence.position - known, axis=1)) < 0.04
+
+
+def test_same_walk_twice_counts_once_and_a_ruined_raw_file_leaves_syn(tmp_path):
+    truth = files.Truth()
+    folder = dataset(tmp_path, "handheld", "data1")
+    files.write_raw(folder, 1, truth, seconds=40)
+    files.write_syn(folder, 1, truth, seconds=40)
+    (walk,) = oxiod.find_walks(tmp_path)
+    assert set(walk.files) == {"raw", "syn"}
+    assert oxiod.build_walk(walk)[0].attributes["kind"] == "raw"
+    # Some published stamps are rounded to 1e4 s.
+    path = walk.files["raw"][0]
+    rows = [line.split(",", 1) for line in path.read_text().splitlines()]
+    path.write_text(
+        "\n".join(f"{round(float(stamp), -4):.2f},{rest}" for stamp, rest in rows) + "\n"
+    )
+    sequence, reasons = oxiod.build_walk(walk)
+    assert sequence.attributes["kind"] == "syn"
+    assert len(reasons) == 1 and "imu1.csv" in reasons[0] and "'time' is ruined" in reasons[0]
+
+
+@pytest.fixture
+def copy(tmp_path):
+    """Three walks of two scenes, and lists as published: no newline at the end, and naming what is
+    not there."""
+    truth = files.Truth()
+    for scene, folder, number in (
+        ("handheld", "data1", 2),
+        ("handheld", "data5", 1),
+        ("running", "data1", 7),
+    ):
+        files.write_syn(dataset(tmp_path, scene, folder), number, truth, seconds=30)
+    for scene, train, test in (
+        ("handheld", "data1\ndata2", "data5"),
+        ("running", "data1/imu1.csv", "data1/imu7.csv"),
+    ):
+        place = dataset(tmp_path, scene, "data1").parent
+        (place / "Train.txt").write_text(train)
+        (place / "Test.txt").write_text(test)
+    return tmp_path
+
+
+def test_lists(copy):
+    with pytest.warns(UserWarning, match="2 entries of the lists Train.txt are not in this copy"):
+        train = oxiod.read(copy, "train")
+    assert [sequence.name for sequence in train] == ["handheld_data1_2"]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        test = oxiod.read(copy, "test")
+        assert [sequence.name for sequence in oxiod.read(copy, "seen")] == [
+            sequence.name for sequence in test
+        ]
+    assert [sequence.name for sequence in test] == ["handheld_data5_1", "running_data1_7"]
+    with pytest.raises(InputError, match="no recording of split 'unseen'"):
+        oxiod.read(copy, "unseen")
+    with pytest.raises(InputError, match="it has train, val, test"):
+        oxiod.read(copy, "testing")
+
+
+def test_lists_gone_wrong(copy):
+    place = dataset(copy, "handheld", "data1").parent
+    (place / "Train.txt").write_text("data1/vi3.csv")
+    with pytest.raises(InputError, match=r"Train.txt: entry 'data1/vi3.csv'"):
+        oxiod.read(copy, "train")
+    (place / "Train.txt").write_text("\n")
+    with pytest.raises(InputError, match=r"Train.txt: the list is empty"):
+        oxiod.read(copy, "train")
+    for scene in ("handheld", "running"):
+        (dataset(copy, scene, "data1").parent / "Test.txt").unlink()
+    with pytest.raises(InputError, match=r"no scene has its list Test.txt"):
+        oxiod.read(copy, "test")
+
+
+def walks(tmp_path, counts):
+    """Walks without contents: {"scene/dataN": minutes of each}."""
+    made = []
+    for session, minutes in counts.items():
+        scene, folder = session.split("/")
+        for number, length in enumerate(minutes, start=1):
+            path = tmp_path / scene / folder / f"imu{number}.csv"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with path.open("wb") as file:
+                file.truncate(int(length * 60 * 100 * 140))
+            made.append(oxiod.Walk(scene, folder, number, {"syn": (path, path)}, scene))
+    return made
+
+
+def test_sessions_are_shared_out_whole(tmp_path):
+    made = walks(
+        tmp_path,
+        {
+            **{f"handheld/data{n}": [4, 4, 3] for n in range(1, 6)},
+            "pocket/data1": [4],
+            "running/data1": [5, 5],
+            "trolley/data1": [4, 4],
+            "trolley/data2": [3, 3, 3],
+            "multi users/user2": [4, 4],
+            "multi users/user3": [4],
+            "multi users/user4": [4],
+        },
+    )
+    shares = oxiod.share_out(made)
+    assert shares == oxiod.share_out(made)
+    assert set(shares) == {walk.session for walk in made}
+    total = sum(walk.minutes for walk in made)
+    for split, share in (("train", 0.7), ("val", 0.1), ("test", 0.2)):
+        here = [walk for walk in made if shares[walk.session] == split]
+        assert sum(walk.minutes for walk in here) / total == pytest.approx(share, abs=0.1)
+        assert {"handheld", "multi users"} <= {walk.scene for walk in here}
+        assert {walk.name for walk in oxiod.select(made, f"sessions_{split}", tmp_path)} == {
+            walk.name for walk in here
+        }
+    assert (
+        shares["pocket/data1"] == shares["running/data1"] == "train"
+    )  # the only session of its scene
+    assert {shares["trolley/data1"], shares["trolley/data2"]} == {"train", "test"}
+
+
+def test_validation_holds_out_whole_sessions_but_no_scene(tmp_path):
+    made = walks(
+        tmp_path,
+        {
+            "handheld/data1": [4, 4],
+            "handheld/data2": [4],
+            "pocket/data1": [4],
+            "running/data1": [5, 5],
+        },
+    )
+    held = oxiod.held_out_sessions(made)
+    assert held and held < {"handheld/data1", "handheld/data2"}
+    assert oxiod.held_out_sessions(made[2:]) == set()
+
+
+def damaged(path, how):
+    lines = path.read_text().splitlines()
+    if how == "column missing":
+        lines = [line.rsplit(",", 1)[0] for line in lines]
+    elif how == "NaN":
+        cells = lines[1000].split(",")
+        cells[5] = "nan"
+        lines[1000] = ",".join(cells)
+    elif how == "cut short":
+        lines[-1] = lines[-1][:20]
+    elif how == "m/s²":
+        lines = [
+            ",".join(
+                [
+                    *line.split(",")[:7],
+                    *(f"{float(v) * 9.8:.5f}" for v in line.split(",")[7:13]),
+                    *line.split(",")[13:],
+                ]
+            )
+            for line in lines
+        ]
+    elif how == "deg/s":
+        lines = [
+            ",".join(
+                [
+                    *line.split(",")[:4],
+                    *(f"{float(v) * 57.3:.5f}" for v in line.split(",")[4:7]),
+                    *line.split(",")[7:],
+                ]
+            )
+            for line in lines
+        ]
+    elif how == "short":
+        lines = lines[:300]
+    elif how == "words":
+        lines[500] = lines[500].replace(lines[500].split(",")[4], "none")
+    path.write_text("\n".join(lines) + "\n")
+
+
+@pytest.mark.parametrize(
+    ("how", "message"),
+    [
+        ("column missing", "has 15 columns, expected 16"),
+        ("NaN", "'rotation_rate_y' is NaN"),
+        ("cut short", "cut short in 1 rows, first in row 1300"),
+        ("m/s²", "'gravity' has length 9.8, expected 1 G"),
+        ("deg/s", "'gyro' looks like deg/s"),
+        ("short", "holds 300 rows"),
+        ("words", "holds what is no number"),
+    ],
+)
+def test_damaged_phone_files_are_refused_by_name_and_reason(tmp_path, how, message):
+    files.write_syn(dataset(tmp_path, "pocket", "data1"), 1, files.Truth(), seconds=13)
+    path = dataset(tmp_path, "pocket", "data1") / "syn" / "imu1.csv"
+    damaged(path, how)
+    with pytest.raises(InputError) as caught:
+        oxiod.read_imu(path, "syn")
+    assert (
+        str(path) in str(caught.value)
+        and message in str(caught.value)
+        and "\n" not in str(caught.value)
+    )
+
+
+def test_damaged_truth_is_refused_and_one_bad_recording_is_left_out(copy):
+    path = dataset(copy, "handheld", "data5") / "syn" / "vi1.csv"
+    rows = np.loadtxt(path, delimiter=",")
+    np.savetxt(path, rows[:, :8], delimiter=",")
+    with pytest.warns(
+        UserWarning, match=r"handheld_data5_1: left out: .*vi1.csv: has 8 columns, expected 9"
+    ):
+        sequences = oxiod.read(copy, "test")
+    assert [sequence.name for sequence in sequences] == ["running_data1_7"]
+
+    for column, value, message in (
+        (2, 1e3 * rows[:, 2], "looks like mm"),
+        (8, 0.3 * rows[:, 8], "hold a pose"),
+    ):
+        wrong = rows.copy()
+        wrong[:, column] = value
+        np.savetxt(path, wrong, delimiter=",")
+        with pytest.raises(InputError, match=message):
+            oxiod.read_vicon(path, "syn", 0.0)
+    # Another walk's truth fits nothing.
+    files.write_rows(
+        path,
+        ["1.5e11"] * 3000,
+        np.concatenate(
+            [
+                np.zeros((3000, 1)),
+                files.vicon_columns(np.arange(3000) / -100, files.Truth(pace=1.3)),
+            ],
+            axis=1,
+        ),
+        "%.6f",
+    )
+    with pytest.warns(UserWarning, match="handheld_data5_1: left out"):
+        oxiod.read(copy, "test")
+
+
+def test_a_root_without_recordings(tmp_path):
+    with pytest.raises(InputError, match=r"no such folder.*deepio"):
+        oxiod.read(tmp_path / "nowhere", "train")
+    with pytest.raises(InputError, match="holds no recording of OxIOD"):
+        oxiod.read(tmp_path, "train")
+
+
+def test_reading_again_uses_the_cache_and_spawned_workers_agree(copy, monkeypatch):
+    alone = oxiod.read(copy, "test")
+    with monkeypatch.context() as patch:
+        patch.setattr(oxiod, "build", lambda *_: pytest.fail("built again"))
+        again = oxiod.read(copy, "test")
+    assert all(
+        np.array_equal(a.position, b.position, equal_nan=True)
+        for a, b in zip(alone, again, strict=True)
+    )
+    monkeypatch.setenv("GNIO_CACHE", str(copy / "other"))
+    monkeypatch.setattr(oxiod, "usable_cores", lambda: 2)
+    spawned = oxiod.read(copy, "test")
+    assert all(
+        np.allclose(a.position, b.position, atol=1e-9) for a, b in zip(alone, spawned, strict=True)
+    )
+
+
+# --- parts
+# -----------------------------------------------------------------------------------------------------------
+
+
+def test_follow_ignores_flips_and_bridges_gaps():
+    n, step = 4000, 0.01
+    time = np.arange(n) * step
+    truth = files.Truth()
+    known = files.attitude(time, truth)
+    integrated = alignment.integrate_gyro(
+        files.rate(time, truth) + np.array([0.01, -0.005, 0.012]), step
+    )
+    measured = known * Rotation.from_rotvec(np.random.default_rng(0).normal(0, 0.002, (n, 3)))
+    quaternion = measured.as_quat()
+    quaternion[500:600] = (
+        measured[500:600] * Rotation.from_euler("x", 120, degrees=True)
+    ).as_quat()
+    good = np.ones(n, dtype=bool)
+    good[2000:2150] = False
+    quaternion[2000:2150] = [0, 0, 0, 1]
+    found, believed = alignment.follow(integrated, Rotation.from_quat(quaternion), good, step)
+    assert np.degrees((found * known.inv()).magnitude()).max() < 0.5
+    assert not believed[500:600].any() and believed[:490].all() and not believed[2000:2150].any()
+
+
+def test_smooth_positions_keeps_a_gait_and_drops_jumps():
+    step = 0.01
+    time = np.arange(3000) * step
+    truth = files.Truth()
+    known = files.position(time, truth)
+    measured = known + np.random.default_rng(0).normal(0, 2e-4, known.shape)
+    good = np.ones(len(time), dtype=bool)
+    measured[1000:1002] += 0.3
+    good[2000:2015] = False
+    measured[2000:2015] = 0
+    found, velocity, believed = alignment.smooth_positions(measured, good, step)
+    assert np.abs(found - known).max() < 2e-3
+    assert np.abs(velocity - files.velocity(time, truth))[5:-5].max() < 0.03
+    assert not believed[1000:1002].any() and not believed[2000:2015].any() and believed[:950].all()
+
+
+# --- real recordings
+# -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.recordings
+@pytest.mark.parametrize(
+    ("name", "kind", "yaw", "lever_y"),
+    [
+        ("handheld_data1_7", "raw", -169, 0.062),
+        ("multi-users_user3_5", "syn", -174.7, 0.106),
+        ("multi-devices_nexus-5_7", "raw", -173.6, 0.056),
+    ],
+)
+def test_real_recordings_are_plausible(recordings, name, kind, yaw, lever_y):
+    if not (recordings / "oxiod").is_dir():
+        pytest.skip("no oxiod below GNIO_DATA")
+    (walk,) = [walk for walk in oxiod.find_walks(recordings / "oxiod") if walk.name == name]
+    sequence = oxiod.build(walk, kind)
+    check = self_check(sequence)
+    assert check.failures == ()
+    assert check.gravity_mean == pytest.approx([0, 0, 9.81], abs=0.12)
+    assert check.gyro_consistency_degrees < 1.8
+    assert check.accel_correlation_horizontal > 0.92
+    assert 0.5 < check.median_speed < 1.2 and check.share_valid > 0.95
+    assert sequence.attributes["extrinsic_yaw_degrees"] == pytest.approx(yaw, abs=1)
+    assert sequence.attributes["lever_y"] == pytest.approx(lever_y, abs=0.01)
+    assert sequence.attributes["accel_residual"] < 0.12
+    # Delayed or mirrored truth would show here: the phone's gravity is that of the reference.
+    own, reference = (
+        rotations(
+            sequence.device_orientation
+            if sequence.device_orientation is not None
+            else sequence.orientation
+        ),
+        rotations(sequence.orientation),
+    )
+    up = np.array([0.0, 0.0, 1.0])
+    angle = np.degrees(
+        np.arccos(np.clip((own.inv().apply(up) * reference.inv().apply(up)).sum(axis=1), -1, 1))
+    )
+    assert np.median(angle) < 4
+
+
+@pytest.mark.recordings
+def test_real_splits_share_no_walk(recordings):
+    if not (recordings / "oxiod").is_dir():
+        pytest.skip("no oxiod below GNIO_DATA")
+    root = recordings / "oxiod"
+    found = oxiod.find_walks(root)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        splits = {
+            split: {walk.name for walk in oxiod.select(found, split, root)}
+            for split in oxiod.SPLITS
+        }
+    for protocol in (
+        ("train", "val", "test", "unseen", "large_scale"),
+        ("sessions_train", "sessions_val", "sessions_test", "large_scale"),
+    ):
+        for first in protocol:
+            assert splits[first]
+            assert all(not splits[first] & splits[other] for other in protocol if other != first)
+    sessions = {
+        split: {walk.session for walk in found if walk.name in splits[f"sessions_{split}"]}
+        for split in ("train", "val", "test")
+    }
+    assert (
+        not sessions["train"] & (sessions["val"] | sessions["test"])
+        and not sessions["val"] & sessions["test"]
+    )
+    assert splits["test"] == {"running_data1_7", "trolley_data2_6"}

@@ -1,0 +1,498 @@
+"""RIDI: a known walk written in both of its layouts, traps included, must come back; a real
+recording must be physically plausible."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+import pytest
+
+from gnio_jax import data
+from gnio_jax.data.cache import Refusal
+from gnio_jax.data.readers import ridi
+from gnio_jax.data.sequence import rotations, self_check
+from gnio_jax.types import InputError
+from tests.support import known_walk as walk
+from tests.support.ridi_files import (
+    BOOT,
+    names,
+    write_table,
+    write_text,
+)
+
+
+@pytest.fixture(autouse=True)
+def own_cache(tmp_path_factory, monkeypatch):
+    monkeypatch.setenv("GNIO_CACHE", str(tmp_path_factory.mktemp("cache")))
+
+
+def read_whole(path):
+    """A recording that is not divided."""
+    (sequence,) = ridi.read_pieces(path)
+    return sequence
+
+
+def compare(sequence, edge=20):
+    """The sequence against the walk at its own stamps; splines err more at the first and last
+    samples, which have one neighbour."""
+    time = sequence.time + (sequence.attributes["start_time"] - BOOT * 1e-9)
+    inner, valid = slice(edge, -edge), sequence.valid
+    np.testing.assert_allclose(np.diff(sequence.time), 1 / 200, rtol=1e-6)
+    np.testing.assert_allclose(sequence.gyro[inner], walk.rate(time)[inner], atol=1e-3)
+    np.testing.assert_allclose(sequence.accel[inner], walk.force(time)[inner], atol=1e-3)
+    np.testing.assert_allclose(sequence.position[valid], walk.position(time)[valid], atol=1e-3)
+    error = rotations(sequence.orientation) * walk.attitude(time).inv()
+    assert np.degrees(error.magnitude())[valid].max() < 0.1
+    np.testing.assert_allclose(
+        sequence.velocity[inner][valid[inner]], walk.velocity(time)[inner][valid[inner]], atol=0.02
+    )
+    assert data.self_check(sequence).failures == ()
+    return time
+
+
+def check_device(sequence, begin=0.0):
+    """The game rotation vector is right but for its yaw, and it begins as the reference does."""
+    time = sequence.time + (sequence.attributes["start_time"] - BOOT * 1e-9)
+    error = rotations(sequence.device_orientation) * walk.attitude(time).inv()
+    assert np.degrees(error.magnitude()).max() < 0.1
+    assert begin == pytest.approx(time[0], abs=0.02)
+
+
+SHUFFLED = [
+    "rv_z",
+    "pos_z",
+    "ori_y",
+    "time",
+    "acce_x",
+    "gyro_z",
+    "ori_w",
+    "rv_w",
+    "pos_x",
+    "gyro_x",
+    "acce_z",
+    "acce_y",
+    "gyro_y",
+    "rv_x",
+    "rv_y",
+    "pos_y",
+    "ori_x",
+    "ori_z",
+]
+
+
+@pytest.mark.parametrize("order", [None, SHUFFLED], ids=["native", "shuffled"])
+def test_table_comes_back(tmp_path, order):
+    sequence = read_whole(write_table(tmp_path, "dan_bag1", order=order).parent.parent)
+    compare(sequence)
+    check_device(sequence)
+    assert sequence.valid.all() and sequence.name == "dan_bag1"
+    a = sequence.attributes
+    assert (a["subject"], a["group"], a["placement"], a["imu_compensated"]) == (
+        "dan",
+        "dan",
+        "bag",
+        "no",
+    )
+    assert a["truth"] == "Tango VIO of the phone itself" and "not stated" in a["licence"]
+
+
+def test_rows_late_or_twice_are_put_in_order(tmp_path):
+    rows = np.arange(int(walk.SECONDS * 202.3))
+    rows[[100, 101]] = rows[[101, 100]]
+    rows[2000:2010] = rows[2000:2010][::-1]
+    rows = np.insert(rows, 500, [500, 500])
+    compare(read_whole(write_table(tmp_path, "dan_bag1", rows=rows).parent.parent))
+
+
+def test_of_a_recording_with_a_gap_both_pieces_are_kept(tmp_path):
+    time = np.arange(int(walk.SECONDS * 202.3)) / 202.3
+    path = write_table(tmp_path, "huayi_bag2", time=time[(time < 9.0) | (time > 13.4)])
+    with pytest.warns(UserWarning) as caught:
+        pieces = ridi.read_pieces(path.parent.parent)
+    (warning,) = caught
+    assert str(warning.message) == (
+        f"{path}: field 'time' has gaps longer than 1 s (1, up to 4.4 s); kept: 31.6 of 36.0 s, "
+        "huayi_bag2_piece1 (0.0 to 9.0 s), huayi_bag2_piece2 (13.4 to 36.0 s); lost: 4.4 s in gaps"
+    )
+    for sequence, begin, seconds in zip(pieces, (0.0, 13.4), (9.0, 22.6), strict=True):
+        time = compare(sequence)
+        check_device(sequence, begin=begin)
+        assert sequence.valid.all() and sequence.time[0] == 0.0
+        assert len(time) == pytest.approx(seconds * 200, abs=3)
+    assert [piece.name for piece in pieces] == ["huayi_bag2_piece1", "huayi_bag2_piece2"]
+    assert {piece.attributes["group"] for piece in pieces} == {"huayi"}
+
+
+def test_a_hole_of_two_seconds_costs_two_seconds(tmp_path):
+    """Nothing of the hole is left for a filter to integrate, and what was divided is cached
+    divided."""
+    time = np.arange(int(38.0 * 202.3)) / 202.3
+    write_table(tmp_path, "dan_bag1", time=time[(time < 19.0) | (time > 21.3)])
+    for _ in range(2):
+        with pytest.warns(UserWarning, match=r"kept: 35\.7 of 38\.0 s, .*; lost: 2\.3 s in gaps"):
+            pieces = data.load("ridi", tmp_path, "all")
+        assert sum(piece.valid.sum() for piece in pieces) / 200.0 >= 35.0
+        for piece in pieces:
+            compare(piece)
+
+
+def test_pieces_shorter_than_a_window_leave_nothing(tmp_path):
+    time = np.arange(int(walk.SECONDS * 202.3)) / 202.3
+    path = write_table(tmp_path, "dan_bag1", time=time[time % 2.5 < 0.9])
+    with pytest.raises(Refusal) as caught:
+        ridi.read_pieces(path.parent.parent)
+    assert str(caught.value) == (
+        f"{path}: field 'time' has gaps longer than 1 s (14, up to 1.6 s), and no piece between them "
+        "holds a window with a reference; leave it out"
+    )
+    # Others are read all the same.
+    write_table(tmp_path, "dan_bag2")
+    with pytest.warns(
+        UserWarning, match="dan_bag1: left out: .*no piece between them holds a window"
+    ):
+        assert [sequence.name for sequence in data.load("ridi", tmp_path, "all")] == ["dan_bag2"]
+
+
+def test_the_cache_is_used_and_keyed_by_the_files_that_are_read(tmp_path, monkeypatch):
+    folder = write_text(tmp_path, "hang_leg1", "android_sensor_pose.txt")
+    first = data.load("ridi", tmp_path, "all")[0]
+    calls = []
+    monkeypatch.setattr(ridi, "read_pieces", lambda folder: calls.append(folder) or [first])
+    np.testing.assert_array_equal(data.load("ridi", tmp_path, "all")[0].gyro, first.gyro)
+    assert not calls
+    for number, name in enumerate(
+        ("acce.txt", "gyro.txt", "orientation.txt", "pose.txt", "android_sensor_pose.txt"), 1
+    ):
+        path = folder / name
+        path.write_text(path.read_text() + "\n")
+        data.load("ridi", tmp_path, "all")
+        data.load("ridi", tmp_path, "all")
+        assert len(calls) == number, name
+    write_table(tmp_path, "hang_leg1").touch()  # the table, once it is there, is what is read
+    data.load("ridi", tmp_path, "all")
+    assert len(calls) == 6
+
+
+def test_a_short_gap_is_marked(tmp_path):
+    time = np.arange(int(walk.SECONDS * 202.3)) / 202.3
+    path = write_table(tmp_path, "dan_leg1", time=time[(time < 20.0) | (time > 20.5)])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        sequence = read_whole(path.parent.parent)
+    hole = (sequence.time > 20.02) & (sequence.time < 20.48)
+    assert (
+        not sequence.valid[hole].any()
+        and sequence.valid[(sequence.time < 19.9) | (sequence.time > 20.6)].all()
+    )
+    assert sequence.attributes["placement"] == "pocket"
+    np.testing.assert_allclose(
+        sequence.position[sequence.valid], walk.position(sequence.time)[sequence.valid], atol=1e-3
+    )
+
+
+@pytest.mark.parametrize("poses", ["pose.txt", "android_sensor_pose.txt"])
+def test_text_files_come_back(tmp_path, poses):
+    sequence = read_whole(write_text(tmp_path, "hang_leg_new3", poses))
+    compare(sequence)
+    check_device(sequence)
+    assert sequence.valid.mean() > 0.999
+    assert sequence.attributes["truth"].startswith(
+        "ARCore" if poses.startswith("android") else "Tango"
+    )
+
+
+def test_a_lost_odometry_ends_a_piece_and_a_short_loss_is_marked(tmp_path):
+    pose_time = np.arange(0.0, walk.SECONDS - 0.4, 1 / 30.0)
+    pose_time = pose_time[
+        ((pose_time < 24.0) | (pose_time > 25.6)) & ((pose_time < 10.0) | (pose_time > 10.4))
+    ]
+    with pytest.warns(
+        UserWarning, match=r"hang_leg1: field 'time' has gaps longer than 1 s \(1, up to 1\.7 s\)"
+    ):
+        sequence, later = ridi.read_pieces(write_text(tmp_path, "hang_leg1", pose_time=pose_time))
+    compare(sequence)
+    compare(later)
+    assert (
+        later.time[-1] == pytest.approx(walk.SECONDS - 0.4 - 25.6, abs=0.1)
+        and later.valid.mean() > 0.99
+    )
+    assert sequence.time[-1] == pytest.approx(24.0, abs=0.05)
+    assert not sequence.valid[(sequence.time > 10.01) & (sequence.time < 10.39)].any()
+    assert sequence.valid[(sequence.time < 9.9) | (sequence.time > 10.5)].all()
+
+
+def test_a_jump_of_the_odometry_is_marked(tmp_path):
+    def jump(columns):
+        columns["pos_x"][3000:] += 0.5
+
+    sequence = read_whole(write_table(tmp_path, "dan_body1", spoil=jump).parent.parent)
+    when = 3000 / 202.3
+    assert not sequence.valid[np.abs(sequence.time - when) < 0.08].any()
+    assert sequence.valid[np.abs(sequence.time - when) > 0.2].all()
+
+
+# --- splits
+# ----------------------------------------------------------------------------------------------------------
+
+TRAIN = [
+    "dan_bag1",
+    "dan_body1",
+    "dan_leg2",
+    "hang_bag1",
+    "hang_handheld1",
+    "hao_bag1",
+    "hao_body1",
+    "ma_bag1",
+    "yajie_leg1",
+    "zhicheng_bag1",
+]
+
+
+@pytest.fixture
+def copy(tmp_path):
+    """A copy whose lists have no newline at the end, name what is not there, and leave out what is
+    (`dan_bag9`)."""
+    root = tmp_path / "downloaded" / "data_publish_v2"
+    time = np.arange(int(11 * 202.3)) / 202.3
+    for name in [*TRAIN[:-1], "hang_leg7", "shali_bag1", "dan_bag9"]:
+        write_table(root, name, time=time)
+    (root / "list_train_publish_v2.txt").write_text(
+        "\n".join(f"{name},{name.split('_')[1][:-1]}" for name in TRAIN)
+    )
+    (root / "list_test_publish_v2.txt").write_text(
+        "hang_leg7,leg\nhang_leg_new3,leg\nhuayi_handheld_test1,handheld"
+    )
+    (root / "list_crosssubject.txt").write_text("# others\nshali_bag1\nruixuan_bag1")
+    return tmp_path
+
+
+def test_splits(copy):
+    with pytest.warns(
+        UserWarning,
+        match=r"list_train_publish_v2\.txt: 1 of 10 listed sequences are absent: zhicheng_bag1,bag",
+    ):
+        train = data.load("ridi", copy, "train")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        val, test, seen, unseen = (
+            data.load("ridi", copy, split) for split in ("val", "test", "seen", "unseen")
+        )
+    assert names(test) == names(seen) == {"hang_leg7"} and names(unseen) == {"shali_bag1"}
+    assert names(train) | names(val) == set(TRAIN[:-1]) and val and not names(train) & names(val)
+    # Whole people are held out, and every sequence says which.
+    people = {sequence.attributes["subject"] for sequence in val}
+    assert not people & {sequence.attributes["subject"] for sequence in train}
+    assert {sequence.attributes["held_out"] for sequence in [*train, *val]} == {
+        ", ".join(sorted(people))
+    }
+    with pytest.raises(InputError, match="known splits: train, val"):
+        ridi.read(copy, "tset")
+
+
+def test_the_hold_out_depends_on_the_list_alone(tmp_path):
+    path = tmp_path / "list_train_publish_v2.txt"
+    path.write_text("\n".join(f"{name},bag" for name in TRAIN))
+    held = ridi.held_out_of_train(path)
+    path.write_text("\n".join(reversed(TRAIN)) + "\n\n")
+    assert ridi.held_out_of_train(path) == held
+    subjects = {name.split("_")[0] for name in held}
+    assert (
+        held == {name for name in TRAIN if name.split("_")[0] in subjects} and 1 <= len(held) <= 2
+    )
+    # One person, many walks: whole walks then; too few to part with: none.
+    path.write_text("\n".join(f"dan_bag{n}" for n in range(20)))
+    assert len(ridi.held_out_of_train(path)) == 2
+    path.write_text("dan_bag1\ndan_bag2\nhang_bag1")
+    assert ridi.held_out_of_train(path) == set()
+
+
+def test_lists_gone_wrong(copy):
+    root = copy / "downloaded" / "data_publish_v2"
+    (root / "list_crosssubject.txt").write_text("ruixuan_bag1\n")
+    with pytest.raises(
+        InputError,
+        match=r"list_crosssubject\.txt: none of its 1 sequences is below .*expected layout",
+    ):
+        ridi.read(copy, "unseen")
+    (root / "list_crosssubject.txt").unlink()
+    with pytest.raises(InputError, match=r"list_crosssubject\.txt: the list cannot be read"):
+        ridi.read(copy, "unseen")
+    (root / "list_train_publish_v2.txt").write_text("dan_bag1,bag\n")
+    with pytest.raises(InputError, match="split 'val' would be empty"):
+        ridi.read(copy, "val")
+
+
+def test_every_recording_below_the_root_needs_no_list(copy):
+    listed = {*TRAIN[:-1], "hang_leg7", "shali_bag1"}
+    for _ in range(2):
+        assert names(ridi.read(copy, "all")) == {*listed, "dan_bag9"}
+        for path in copy.rglob("list_*.txt"):
+            path.unlink()
+    with pytest.raises(InputError, match=r"list_test_publish_v2\.txt: the list cannot be read"):
+        ridi.read(copy, "test")
+    (copy / "elsewhere").mkdir()
+    with pytest.raises(InputError, match="elsewhere: holds no recording of RIDI; expected layout"):
+        ridi.read(copy / "elsewhere", "all")
+
+
+def test_an_implausible_recording_is_left_out_by_name(copy):
+    def drift(columns):
+        columns["acce_x"] += 3.0
+
+    root = copy / "downloaded" / "data_publish_v2"
+    write_table(root, "ruixuan_bag1", time=np.arange(2300) / 202.3, spoil=drift)
+    with pytest.warns(
+        UserWarning, match="ruixuan_bag1: left out by the self-check: mean of R·accel"
+    ):
+        assert names(ridi.read(copy, "unseen")) == {"shali_bag1"}
+
+
+# --- mistakes
+# --------------------------------------------------------------------------------------------------------
+
+
+def setting(name, row, value):
+    def change(columns):
+        columns[name][row] = value
+
+    return change
+
+
+def scaling(prefix, factor):
+    def change(columns):
+        for name in columns:
+            if name.startswith(prefix):
+                columns[name] = columns[name] * factor
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "field", "problem"),
+    [
+        (lambda columns: columns.pop("gyro_y"), "'gyro_y'", "is missing"),
+        (lambda columns: columns.pop("time"), "'time'", "is missing"),
+        (setting("acce_x", 50, np.nan), "'acce'", "row 50"),
+        (setting("pos_y", 50, np.inf), "'pos'", "row 50"),
+        (setting("time", 50, np.nan), "'time'", "row 50"),
+        (setting("time", slice(None), 7.0), "'time'", "only 1 different stamps"),
+        (setting("ori_w", 60, 3.0), "'ori'", "not a unit quaternion"),
+        (setting("rv_x", 60, 3.0), "'rv'", "not a unit quaternion"),
+        (scaling("acce", 1 / 9.81), "'accel'", "looks like G"),
+        (scaling("gyro", 100.0), "'gyro'", "looks like deg/s"),
+        (scaling("time", 1e-6), "'time'", "expected about 202.3 Hz"),
+    ],
+)
+def test_a_bad_table_is_refused_by_file_and_field(tmp_path, change, field, problem):
+    path = write_table(tmp_path, "dan_bag1", time=np.arange(1000) / 202.3, spoil=change)
+    with pytest.raises(InputError) as caught:
+        read_whole(path.parent.parent)
+    text = str(caught.value)
+    assert text.startswith(f"{path}: ") and field in text and problem in text and "\n" not in text
+
+
+def test_a_table_cut_short_or_with_words_is_refused(tmp_path):
+    path = write_table(tmp_path, "dan_bag1", time=np.arange(1000) / 202.3)
+    whole = path.read_text()
+    path.write_text(whole[: len(whole) // 2])
+    with pytest.raises(InputError, match=r"data\.csv: field '\w+' is NaN or Inf in 1 rows"):
+        read_whole(path.parent.parent)
+    lines = whole.splitlines()
+    lines[300] = lines[300].replace(lines[300].split(",")[3], "none")
+    path.write_text("\n".join(lines))
+    with pytest.raises(InputError, match=r"data\.csv: column 'gyro_y' holds 'none' in its row 300"):
+        read_whole(path.parent.parent)
+    path.write_text("")
+    with pytest.raises(InputError, match=r"data\.csv: holds no row"):
+        read_whole(path.parent.parent)
+
+
+def columns_of(file, change):
+    def apply(files):
+        files[file] = change(*files[file])
+
+    return apply
+
+
+def with_value(time, values, row, column, value):
+    values = values.copy()
+    values[row, column] = value
+    return [time, values]
+
+
+@pytest.mark.parametrize(
+    ("change", "file", "problem"),
+    [
+        (
+            columns_of("gyro.txt", lambda time, values: with_value(time, values, 90, 1, np.nan)),
+            "gyro.txt",
+            "is NaN or Inf in 1 rows",
+        ),
+        (
+            columns_of("acce.txt", lambda time, values: [time, values[:, :2]]),
+            "acce.txt",
+            "has 3 columns, expected the time and 3 values",
+        ),
+        (
+            columns_of("pose.txt", lambda time, values: with_value(time, values, 90, 6, 2.0)),
+            "pose.txt",
+            "not a unit quaternion",
+        ),
+        (
+            columns_of("pose.txt", lambda time, values: [time + 1000.0, values]),
+            "pose.txt",
+            "share nothing with",
+        ),
+        (
+            columns_of("gyro.txt", lambda time, values: [time * 1e-3, values]),
+            "gyro.txt",
+            "check the unit of the stamps",
+        ),
+        (lambda files: files.pop("acce.txt"), "acce.txt", "cannot be read"),
+        (lambda files: files.pop("pose.txt"), "pose.txt", "cannot be read"),
+    ],
+)
+def test_bad_text_files_are_refused_by_name(tmp_path, change, file, problem):
+    folder = write_text(tmp_path, "dan_bag1", spoil=change)
+    with pytest.raises(InputError) as caught:
+        read_whole(folder)
+    text = str(caught.value)
+    assert text.startswith(f"{folder / file}: ") and problem in text and "\n" not in text
+
+
+def test_without_the_phones_own_filter_there_is_no_device_orientation(tmp_path):
+    sequence = read_whole(
+        write_text(tmp_path, "dan_bag1", spoil=lambda files: files.pop("orientation.txt"))
+    )
+    assert sequence.device_orientation is None
+    compare(sequence)
+
+
+# --- a real recording
+# ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.recordings
+def test_real_recording_is_plausible(recordings):
+    folder = recordings / "kiod" / "01"
+    if not folder.is_dir():
+        pytest.skip("no kiod below GNIO_DATA")
+    with pytest.warns(
+        UserWarning,
+        match=r"kiod/01: field 'time' has gaps longer than 1 s \(1, up to 1\.5 s\).*103\.\d of 105\.2 s",
+    ):
+        pieces = ridi.read_pieces(folder)
+    assert [self_check(piece).failures for piece in pieces] == [(), ()]
+    sequence = max(pieces, key=lambda piece: len(piece.time))
+    check = self_check(sequence)
+    assert check.share_valid > 0.99
+    assert check.duration == pytest.approx(54.8, abs=0.1) and check.rate == pytest.approx(200.0)
+    np.testing.assert_allclose(check.gravity_mean, [0, 0, 9.81], atol=0.1)
+    assert check.gyro_consistency_degrees < 2.0 and 1.2 < check.median_speed < 1.6
+    assert check.accel_correlation_horizontal > 0.55
+    # The phone's own filter, laid on the reference at the first row, stays near it.
+    apart = (
+        rotations(sequence.device_orientation) * rotations(sequence.orientation).inv()
+    ).magnitude()
+    assert np.degrees(np.median(apart)) < 5.0

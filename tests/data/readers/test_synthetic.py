@@ -1,0 +1,209 @@
+"""The computed pedestrians obey physics, and show in their IMU what a network shall learn."""
+
+import numpy as np
+import pytest
+
+from gnio_jax import data
+from gnio_jax.data.readers import synthetic
+from gnio_jax.types import InputError
+
+
+@pytest.fixture(scope="module")
+def val():
+    return synthetic.read(None, "val")
+
+
+def matrices(wxyz):
+    w, x, y, z = np.moveaxis(wxyz, -1, 0)
+    return np.stack(
+        [
+            np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], -1),
+            np.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], -1),
+            np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], -1),
+        ],
+        -2,
+    )
+
+
+def strap_down(sequence):
+    """Positions from integrating the IMU alone, sample by sample: R exp((gyro) dt), v + (R accel +
+    g) dt."""
+    dt, gravity = 1 / 200, np.array([0, 0, -9.81])
+    rotation, velocity, position = (
+        matrices(sequence.orientation[0]),
+        sequence.velocity[0],
+        sequence.position[0],
+    )
+    positions = np.empty_like(sequence.position)
+    for k in range(len(sequence.time)):
+        positions[k] = position
+        change = rotation @ sequence.accel[k] * dt
+        position = position + velocity * dt + 0.5 * change * dt + 0.5 * gravity * dt**2
+        velocity = velocity + change + gravity * dt
+        angle = np.linalg.norm(sequence.gyro[k]) * dt
+        x, y, z = sequence.gyro[k] * dt
+        cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+        rotation = rotation @ (
+            np.eye(3)
+            + np.sinc(angle / np.pi) * cross
+            + 0.5 * np.sinc(angle / 2 / np.pi) ** 2 * cross @ cross
+        )
+    return positions
+
+
+@pytest.mark.parametrize("placement", list(synthetic.PLACEMENTS))
+def test_the_error_free_imu_integrates_to_the_trajectory(placement):
+    sequence = synthetic.pedestrian(5, synthetic.person(3), placement, 60.0, imu_errors=False)
+    assert np.abs(strap_down(sequence) - sequence.position).max() < 1e-3
+
+
+def test_the_imu_of_a_phone_alone_is_lost_within_two_minutes():
+    sequence = synthetic.read(None, "test")[0]
+    assert np.linalg.norm(strap_down(sequence)[-1] - sequence.position[-1]) > 100.0
+
+
+def test_velocity_is_the_derivative_of_the_position(val):
+    for sequence in val:
+        dt = sequence.time[1] - sequence.time[0]
+        difference = (sequence.position[2:] - sequence.position[:-2]) / (2 * dt)
+        np.testing.assert_allclose(difference, sequence.velocity[1:-1], atol=0.02)
+
+
+def test_every_sequence_passes_the_self_check_by_far(val):
+    for sequence in val:
+        data.validate(sequence, sequence.name)
+        check = data.self_check(sequence)
+        assert check.failures == () and check.rate == pytest.approx(200.0)
+        np.testing.assert_allclose(check.gravity_mean, [0, 0, 9.81], atol=0.15)
+        assert (
+            check.gyro_consistency_degrees < 1.0
+            and check.accel_correlation_horizontal > 0.99
+            and 0.5 < check.median_speed < 2.0
+        )
+
+
+def test_the_stated_biases_and_noise_are_the_true_ones():
+    walker = synthetic.person(1)
+    ideal = synthetic.pedestrian(11, walker, "bag", 60.0, imu_errors=False)
+    sequence = synthetic.pedestrian(11, walker, "bag", 60.0)
+    np.testing.assert_array_equal(ideal.position, sequence.position)
+    for field, density, bounds in (
+        ("gyro", synthetic.GYRO_DENSITY, synthetic.GYRO_BIAS),
+        ("accel", synthetic.ACCEL_DENSITY, synthetic.ACCEL_BIAS),
+    ):
+        error = getattr(sequence, field) - getattr(ideal, field)
+        stated = np.array([sequence.attributes[f"{field}_bias_{axis}"] for axis in "xyz"])
+        sigma = density * np.sqrt(200.0)
+        np.testing.assert_allclose(
+            error.mean(axis=0), stated, atol=5 * sigma / np.sqrt(len(error)) + 5e-3 * bounds[1]
+        )
+        np.testing.assert_allclose(
+            np.diff(error, axis=0).std(axis=0) / np.sqrt(2), sigma, rtol=0.05
+        )
+        assert bounds[0] <= np.linalg.norm(stated) <= bounds[1]
+
+
+def test_a_seed_is_a_walk_and_splits_share_neither_seeds_nor_people(val):
+    for once, again in zip(val, synthetic.read(None, "val"), strict=True):
+        np.testing.assert_array_equal(once.accel, again.accel)
+        assert once.attributes == again.attributes
+    used = {
+        split: [
+            (s.attributes["seed"], s.attributes["subject"]) for s in synthetic.read(None, split)
+        ]
+        for split in ("val", "test")
+    }
+    assert not {seed for seed, _ in used["val"]} & {seed for seed, _ in used["test"]}
+    assert all(len({seed for seed, _ in pairs}) == len(pairs) for pairs in used.values())
+    assert not {subject for _, subject in used["val"]} & {subject for _, subject in used["test"]}
+    assert len({s.attributes["placement"] for s in val}) == len(synthetic.PLACEMENTS)
+    with pytest.raises(InputError, match="unknown split 'dev'; known splits: train, val, test"):
+        synthetic.read(None, "dev")
+
+
+def test_walks_hold_stops_strolls_runs_turns_and_stairs():
+    speeds, climbs, turned = [], [], 0.0
+    for sequence in synthetic.read(None, "test"):
+        second = sequence.position[200::200] - sequence.position[:-200:200]
+        speeds.append(np.linalg.norm(second[:, :2], axis=1))
+        climbs.append(second[:, 2])
+        heading = np.unwrap(np.arctan2(second[:, 1], second[:, 0]))
+        turned += np.abs(np.diff(heading[speeds[-1] > 0.4])).sum()
+    speed, climb = np.concatenate(speeds), np.concatenate(climbs)
+    assert (speed < 0.03).mean() > 0.02 and ((speed > 0.4) & (speed < 0.8)).mean() > 0.1
+    assert ((speed > 1.0) & (speed < 1.7)).mean() > 0.3 and (speed > 2.2).mean() > 0.02
+    assert (climb > 0.2).sum() > 10 and (climb < -0.2).sum() > 10 and turned > 10 * np.pi
+
+
+def test_standing_is_standing_still(val):
+    for sequence in val:
+        start = sequence.time < 1.5
+        assert np.linalg.norm(sequence.velocity[start], axis=1).max() < 0.03
+        assert np.ptp(sequence.position[start], axis=0).max() < 0.03
+
+
+def test_cadence_and_bounce_grow_with_the_speed():
+    """Measured from the IMU: the strongest line of the vertical acceleration, and its strength."""
+    walker, found = synthetic.person(4), {}
+    for seed in range(20, 26):
+        sequence = synthetic.pedestrian(seed, walker, "chest", 60.0)
+        vertical = (
+            np.einsum("nj,nj->n", matrices(sequence.orientation)[:, 2], sequence.accel) - 9.81
+        )
+        for start in range(1000, len(vertical) - 800, 400):
+            window = slice(start, start + 800)
+            second = (
+                sequence.position[start + 200 : start + 801 : 200]
+                - sequence.position[start : start + 601 : 200]
+            )
+            speed = np.linalg.norm(second[:, :2], axis=1)
+            if np.ptp(speed) < 0.15 and abs(second[:, 2]).max() < 0.1 and speed.mean() > 0.4:
+                spectrum = np.abs(np.fft.rfft(vertical[window] * np.hanning(800), 8192))
+                found[speed.mean()] = (np.argmax(spectrum) * 200 / 8192, vertical[window].std())
+    speed = np.array(sorted(found))
+    cadence, bounce = np.array([found[value] for value in speed]).T
+    assert len(speed) > 20 and np.ptp(speed) > 0.9
+    assert np.corrcoef(speed, cadence)[0, 1] > 0.95 and np.corrcoef(speed, bounce)[0, 1] > 0.9
+    np.testing.assert_allclose(cadence, synthetic.step_frequency(speed, walker.cadence), rtol=0.08)
+
+
+def test_the_sign_of_the_direction_of_travel_shows_in_the_imu():
+    """The walker surges while bouncing up, whoever walks and wherever the phone is: forward is not
+    backward."""
+    correlations = []
+    for sequence in synthetic.read(None, "test"):
+        force = np.einsum("nij,nj->ni", matrices(sequence.orientation), sequence.accel)
+        surge = np.cumsum(force[:, :2], axis=0) / 200
+        surge = surge - np.apply_along_axis(np.convolve, 0, surge, np.ones(201) / 201, mode="same")
+        travel = (sequence.position[200:] - sequence.position[:-200])[:, :2]
+        speed = np.linalg.norm(travel, axis=1)
+        walking = (speed > 0.9) & (speed < 1.8)
+        forward = np.einsum("ni,ni->n", surge[100:-100], travel / np.maximum(speed, 1e-6)[:, None])
+        correlations.append(np.corrcoef(forward[walking], force[100:-100, 2][walking])[0, 1])
+    assert min(correlations) > 0.3
+
+
+def test_the_phone_points_anywhere_and_its_own_attitude_drifts(val):
+    offsets = []
+    for sequence in val:
+        rotation, own = matrices(sequence.orientation), matrices(sequence.device_orientation)
+        yaw = np.unwrap(
+            np.arctan2(own[:, 1, 0], own[:, 0, 0])
+            - np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0])
+        )
+        assert np.degrees(np.ptp(yaw)) > 0.5
+        tilt = np.degrees(
+            np.arccos(np.clip(np.einsum("nj,nj->n", rotation[:, 2], own[:, 2]), -1, 1))
+        )
+        assert tilt.max() < 5.0
+        travel = (sequence.position[200:] - sequence.position[:-200])[:, :2]
+        moving = np.linalg.norm(travel, axis=1) > 0.5
+        heading = np.exp(
+            1j
+            * (
+                np.arctan2(rotation[:-200, 1, 0], rotation[:-200, 0, 0])
+                - np.arctan2(travel[:, 1], travel[:, 0])
+            )
+        )[moving]
+        offsets.append(np.angle(heading.mean()))
+    assert np.ptp(offsets) > 0.5

@@ -1,0 +1,57 @@
+"""Every layout that is read is found, checked and converted; what comes back is what its own loader
+gives, to the bit."""
+
+import json
+import warnings
+
+import numpy as np
+import pytest
+
+from gnio_jax import data
+from gnio_jax.commands.data import main, resolve
+from tests.support.layouts import LAYOUTS
+
+
+@pytest.mark.parametrize("name", LAYOUTS)
+def test_a_layout_survives_its_conversion(name, tmp_path, monkeypatch, capsys):
+    layout = LAYOUTS[name]
+    monkeypatch.setenv("GNIO_CACHE", str(tmp_path / "cache"))
+    root, out = tmp_path / "native", tmp_path / "converted"
+    layout.write(root, max(layout.shortest, 12.0))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        expected = data.load(layout.dataset, root, layout.split)
+
+    if layout.dataset not in ("euroc", "tumvi"):  # these two share a layout
+        assert resolve(str(root), None)[0].name == layout.dataset
+    main(
+        ["check", str(root), "--dataset", layout.dataset, "--json", str(tmp_path / "figures.json")]
+    )
+    rows = json.loads((tmp_path / "figures.json").read_text())["sequences"]
+    assert set(rows) == {sequence.name for sequence in expected} and all(
+        row["used"] for row in rows.values()
+    )
+    for sequence in expected:
+        assert rows[sequence.name]["split"].split(", ").count(layout.split) == 1
+        assert rows[sequence.name]["duration"] == sequence.time[-1] - sequence.time[0]
+
+    main(["convert", layout.dataset, str(root), str(out)])
+    assert f"{len(expected)} sequences" in capsys.readouterr().out
+    found = data.load("csv", out, layout.split)
+    for ours, theirs in zip(
+        found, sorted(expected, key=lambda sequence: sequence.name), strict=True
+    ):
+        assert ours.name == theirs.name and theirs.attributes.items() <= ours.attributes.items()
+        for field in (
+            "time",
+            "gyro",
+            "accel",
+            "orientation",
+            "position",
+            "velocity",
+            "valid",
+            "device_orientation",
+        ):
+            np.testing.assert_array_equal(
+                getattr(ours, field), getattr(theirs, field), err_msg=field
+            )

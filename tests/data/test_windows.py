@@ -1,0 +1,185 @@
+"""The gather against a brute-force window cutter that walks sample by sample with scipy rotations."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from gnio_jax.config import AugmentConfig, DataConfig
+from gnio_jax.data import augmentation as augment
+from gnio_jax.data import windows
+from gnio_jax.types import InputError, Sequence, Windows
+
+KEY = jax.random.key(3)
+CONFIG = DataConfig(rate=20.0, window_seconds=1.0, stride_seconds=0.1)
+
+
+def tumbling(count, seed, invalid=()):
+    rng = np.random.default_rng(seed)
+    valid = np.ones(count, bool)
+    valid[list(invalid)] = False
+    position = (
+        np.cumsum(rng.standard_normal((count, 3)), axis=0) + 1e4
+    )  # far away: float32 positions would lose millimetres
+    return Sequence(
+        f"s{seed}", np.arange(count) / 20.0, rng.standard_normal((count, 3)), rng.standard_normal((count, 3)),
+        Rotation.random(count, random_state=seed).as_quat(scalar_first=True), position, rng.standard_normal((count, 3)), valid,
+    )  # fmt: skip
+
+
+def cut(sequences, rotation, stride):
+    imu, target, steps = [], [], []
+    for s in sequences:
+        for i in range(0, len(s.time), stride):
+            if i + 20 >= len(s.time) or not all(s.valid[j] for j in range(i, i + 21)):
+                continue
+            start = Rotation.from_quat(s.orientation[i], scalar_first=True)
+            heading = np.arctan2(start.as_matrix()[1, 0], start.as_matrix()[0, 0])
+            back = Rotation.from_euler("z", -heading)
+            rows = []
+            for j in range(i, i + 20):
+                attitude = (
+                    Rotation.from_quat(s.orientation[j], scalar_first=True)
+                    if rotation == "per_sample"
+                    else start
+                )
+                rows.append(
+                    np.concatenate(
+                        [(back * attitude).apply(s.accel[j]), (back * attitude).apply(s.gyro[j])]
+                    )
+                )
+            imu.append(rows)
+            target.append(back.apply(s.position[i + 20] - s.position[i]))
+            steps.append([back.apply(s.position[j + 1] - s.position[j]) for j in range(i, i + 20)])
+    return np.array(imu), np.array(target), np.array(steps)
+
+
+@pytest.mark.parametrize("rotation, stride", [("per_sample", 2), ("single", 2), ("per_sample", 1)])
+def test_gather_against_a_brute_force_cutter(rotation, stride):
+    sequences = [
+        tumbling(57, 1),
+        tumbling(61, 2, invalid=[0, 33]),
+        tumbling(15, 3),
+        tumbling(21, 4),
+        tumbling(20, 5),
+    ]
+    source = windows.index(sequences, DataConfig(rate=20.0, window_rotation=rotation), stride)
+    imu, target, steps = cut(sequences, rotation, stride)
+    assert source.start.shape == (len(target),)
+    order = np.random.default_rng(0).permutation(len(target)).astype(np.int32)
+    found = jax.jit(windows.gather, static_argnums=2)(
+        jax.device_put(source), jnp.asarray(order), 20
+    )
+    np.testing.assert_allclose(found.imu, imu[order], atol=1e-5)
+    np.testing.assert_allclose(found.displacement, target[order], atol=1e-5)
+    np.testing.assert_allclose(found.steps, steps[order], atol=1e-5)
+    assert found.imu.dtype == found.displacement.dtype == found.steps.dtype == jnp.float32
+    np.testing.assert_array_equal(source.visited, np.arange(len(target)))
+
+
+def test_shifted_windows_are_those_of_the_neighbouring_samples_in_the_same_recording():
+    sequences = [tumbling(57, 1), tumbling(61, 2, invalid=[33]), tumbling(31, 3)]
+    source = jax.device_put(windows.index(sequences, CONFIG, 4, shift=3))
+    plain = windows.index(sequences, CONFIG, 4)
+    np.testing.assert_array_equal(source.start[source.visited], plain.start)
+    which = jnp.tile(jnp.asarray(source.visited), 200)
+    there = np.asarray(windows.shifted(KEY, source, which, 3))
+    moved = np.asarray(source.start[there] - source.start[which])
+    assert set(moved) == set(range(-3, 4))
+    recording = np.searchsorted([57, 118], source.start, side="right")
+    np.testing.assert_array_equal(recording[there], recording[which])
+    first = (
+        np.asarray(which) == 0
+    )  # the first window of all cannot begin earlier: 3 of 7 draws leave it where it is
+    assert moved[first].min() == 0 and np.mean(moved[first] == 0) == pytest.approx(4 / 7, abs=0.12)
+    np.testing.assert_array_equal(windows.shifted(KEY, source, which, 0), which)
+
+
+def test_a_window_of_exactly_its_length_lacks_the_pose_after_it():
+    with pytest.raises(InputError, match="no window of 1 s"):
+        windows.index([tumbling(20, 0)], CONFIG, 2)
+    assert windows.index([tumbling(21, 0)], CONFIG, 2).start.shape == (1,)
+
+
+def test_samples_without_a_reference_may_hold_nan():
+    sequence = tumbling(60, 0, invalid=range(25, 30))
+    for field in (sequence.orientation, sequence.position):
+        field[25:30] = np.nan
+    source = windows.index([sequence], CONFIG, 2)
+    found = windows.gather(
+        jax.device_put(source), jnp.arange(source.start.shape[0], dtype=jnp.int32), 20
+    )
+    assert all(bool(jnp.isfinite(field).all()) for field in found)
+
+
+def batch(count=4000, length=5):
+    rng = np.random.default_rng(7)
+    draw = lambda *shape: jnp.asarray(rng.standard_normal(shape), jnp.float32)  # noqa: E731
+    return Windows(draw(count, length, 6), draw(count, 3), draw(count, length, 3))
+
+
+def test_bias_is_constant_in_a_window_uniform_over_windows_and_spares_the_target():
+    before = batch()
+    after = augment.bias(KEY, before, gyro=0.05, accel=0.2)
+    offset = np.asarray(after.imu - before.imu)
+    np.testing.assert_allclose(offset, np.broadcast_to(offset[:, :1], offset.shape), atol=1e-6)
+    for channels, half_width in [(slice(0, 3), 0.2), (slice(3, 6), 0.05)]:
+        drawn = offset[:, 0, channels]
+        assert np.abs(drawn).max() <= half_width + 1e-6
+        np.testing.assert_allclose(drawn.std(axis=0), half_width / np.sqrt(3), rtol=0.05)
+        np.testing.assert_allclose(drawn.mean(axis=0), 0, atol=0.05 * half_width)
+    np.testing.assert_array_equal(after.displacement, before.displacement)
+
+
+def recovered(before, after, index):
+    """The rotation between two sets of vectors, by scipy's Wahba solution."""
+    rotation, residual = Rotation.align_vectors(
+        np.asarray(after.imu[index]).reshape(-1, 3), np.asarray(before.imu[index]).reshape(-1, 3)
+    )
+    assert residual < 1e-4
+    return rotation.as_rotvec()
+
+
+def test_tilt_turns_accel_and_gyro_about_a_horizontal_axis_by_at_most_its_angle():
+    before = batch(300)
+    after = augment.tilt(KEY, before, degrees=5.0)
+    vectors = np.array([recovered(before, after, i) for i in range(300)])
+    angle = np.degrees(np.linalg.norm(vectors, axis=1))
+    assert np.abs(vectors[:, 2]).max() < 1e-4 and angle.max() <= 5.01
+    assert angle.mean() == pytest.approx(2.5, abs=0.3)
+    heading = np.arctan2(vectors[:, 1], vectors[:, 0])
+    assert abs(np.exp(1j * heading).mean()) < 0.15
+    np.testing.assert_array_equal(after.displacement, before.displacement)
+
+
+def test_yaw_turns_window_and_target_by_the_same_angle_about_the_vertical():
+    before = batch(300)
+    after = augment.yaw(KEY, before)
+    vectors = np.array([recovered(before, after, i) for i in range(300)])
+    assert np.abs(vectors[:, :2]).max() < 2e-3
+    np.testing.assert_allclose(
+        Rotation.from_rotvec(vectors).apply(before.displacement), after.displacement, atol=2e-3
+    )
+    np.testing.assert_allclose(
+        Rotation.from_rotvec(vectors).apply(before.steps[:, 2]), after.steps[:, 2], atol=2e-3
+    )
+    assert abs(np.exp(1j * vectors[:, 2]).mean()) < 0.15
+
+
+def test_noise_has_the_stated_deviation():
+    before = batch()
+    difference = np.asarray(augment.noise(KEY, before, gyro=0.01, accel=0.1).imu - before.imu)
+    np.testing.assert_allclose(difference.std(axis=(0, 1)), [0.1] * 3 + [0.01] * 3, rtol=0.02)
+
+
+def test_switched_off_augmentation_changes_nothing_and_draws_depend_on_the_key_alone():
+    before = batch(10)
+    off = AugmentConfig(gyro_bias=0.0, accel_bias=0.0, tilt_degrees=0.0, yaw=False)
+    after = augment.augment(KEY, before, off)
+    np.testing.assert_array_equal(after.imu, before.imu)
+    first, again, other = (
+        augment.augment(k, before, AugmentConfig()) for k in (KEY, KEY, jax.random.key(4))
+    )
+    np.testing.assert_array_equal(first.imu, again.imu)
+    assert not np.allclose(first.imu, other.imu, atol=1e-3)

@@ -1,0 +1,345 @@
+"""TLIO's weights from every form they come in, against PyTorch where it is installed; mistakes; and
+the run made of them."""
+
+import re
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from gnio_jax import interop, models
+from gnio_jax.commands import console as cli
+from gnio_jax.config import FilterOptions
+from gnio_jax.evaluation import odometry
+from gnio_jax.training import checkpoint
+from gnio_jax.types import InputError
+from tests.support import tlio_weights
+
+WEIGHTS = tlio_weights.weights()
+
+
+def equal(found, wanted):
+    assert jax.tree.structure(found) == jax.tree.structure(wanted)
+    jax.tree.map(np.testing.assert_array_equal, found, wanted)
+
+
+@pytest.fixture(scope="module")
+def loaded():
+    return interop.load_tlio_state_dict(WEIGHTS)
+
+
+def test_every_array_has_its_place(loaded):
+    """Each array by its name in both worlds, spelled out; that the names mean the same the recorded
+    outputs show elsewhere."""
+    params, statistics = loaded["params"], loaded["batch_stats"]
+    stem = WEIGHTS["input_block.0.weight"]
+    for ours, theirs in enumerate([3, 4, 5, 0, 1, 2]):  # accel first, then gyro
+        np.testing.assert_array_equal(
+            params["encoder"]["stem_conv"]["kernel"][:, ours], stem[:, theirs].T
+        )
+    np.testing.assert_array_equal(
+        params["encoder"]["group3_block1"]["shortcut_conv"]["kernel"][0],
+        WEIGHTS["residual_groups.2.0.downsample.0.weight"][..., 0].T,
+    )
+    np.testing.assert_array_equal(
+        statistics["encoder"]["group4_block2"]["bn2"]["var"],
+        WEIGHTS["residual_groups.3.1.bn2.running_var"],
+    )
+    np.testing.assert_array_equal(
+        params["displacement"]["fc1"]["kernel"], WEIGHTS["output_block1.fc1.weight"].T
+    )
+    np.testing.assert_array_equal(
+        params["log_std"]["neck_bn"]["scale"], WEIGHTS["output_block2.bn1.weight"]
+    )
+    assert sum(leaf.size for leaf in jax.tree.leaves(params)) == 5_424_646
+    assert {leaf.dtype for leaf in jax.tree.leaves(loaded)} == {jnp.dtype("float32")}
+
+
+def test_an_npz_holds_the_same(tmp_path, loaded):
+    doubled = {
+        f"module.{key}": value.astype(np.float64) if value.shape else value
+        for key, value in WEIGHTS.items()
+    }
+    np.savez(tmp_path / "weights.npz", **doubled)
+    equal(interop.load_tlio_state_dict(tmp_path / "weights.npz"), loaded)
+    equal(interop.load_tlio_state_dict({"model_state_dict": WEIGHTS, "epoch": 3}), loaded)
+
+
+# PyTorch
+# --------------------------------------------------------------------------------------------------------------
+
+
+def torch_network(weights, samples):
+    """TLIO's network in PyTorch with these weights, in evaluation mode."""
+    torch = pytest.importorskip("torch")
+    nn = torch.nn
+
+    class Block(nn.Module):
+        def __init__(self, inputs, channels, stride):
+            super().__init__()
+            self.conv1, self.bn1 = (
+                nn.Conv1d(inputs, channels, 3, stride, 1, bias=False),
+                nn.BatchNorm1d(channels),
+            )
+            self.conv2, self.bn2 = (
+                nn.Conv1d(channels, channels, 3, 1, 1, bias=False),
+                nn.BatchNorm1d(channels),
+            )
+            self.downsample = None
+            if inputs != channels:
+                self.downsample = nn.Sequential(
+                    nn.Conv1d(inputs, channels, 1, stride, bias=False), nn.BatchNorm1d(channels)
+                )
+
+        def forward(self, x):
+            y = self.bn2(self.conv2(torch.relu(self.bn1(self.conv1(x)))))
+            return torch.relu(y + (x if self.downsample is None else self.downsample(x)))
+
+    class Head(nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.prep1, self.bn1 = nn.Conv1d(512, 128, 1, bias=False), nn.BatchNorm1d(128)
+            self.fc1, self.fc2, self.fc3 = (
+                nn.Linear(128 * -(-samples // 32), 512),
+                nn.Linear(512, 512),
+                nn.Linear(512, 3),
+            )
+
+        def forward(self, x):
+            return self.fc3(
+                torch.relu(self.fc2(torch.relu(self.fc1(self.bn1(self.prep1(x)).flatten(1)))))
+            )
+
+    class Network(nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.input_block = nn.Sequential(
+                nn.Conv1d(6, 64, 7, 2, 3, bias=False),
+                nn.BatchNorm1d(64),
+                nn.ReLU(),
+                nn.MaxPool1d(3, 2, 1),
+            )
+            sizes = [(64, 64, 1), (64, 128, 2), (128, 256, 2), (256, 512, 2)]
+            self.residual_groups = nn.Sequential(
+                *(nn.Sequential(Block(*size), Block(size[1], size[1], 1)) for size in sizes)
+            )
+            self.output_block1, self.output_block2 = Head(), Head()
+
+        def forward(self, x):
+            features = self.residual_groups(self.input_block(x))
+            return self.output_block1(features), self.output_block2(features)
+
+    network = Network()
+    network.load_state_dict(
+        {key: torch.from_numpy(np.array(value)) for key, value in weights.items()}
+    )  # strict: all keys, no others
+    return torch, network.eval()
+
+
+@pytest.mark.parametrize("samples", [100, 200])
+def test_it_says_what_pytorch_says(samples):
+    weights = tlio_weights.weights(samples, seed=samples)
+    torch, network = torch_network(weights, samples)
+    windows = (
+        np.random.default_rng(samples).normal(0, 3, (5, samples, 6)).astype(np.float32)
+    )  # [gyro, accel]
+    with torch.no_grad():
+        displacement, log_std = network(torch.from_numpy(windows.transpose(0, 2, 1).copy()))
+    variables = interop.load_tlio_state_dict(network.state_dict())
+    found = jax.jit(models.create("tlio").apply)(
+        variables, np.concatenate([windows[..., 3:], windows[..., :3]], -1)
+    )
+    np.testing.assert_allclose(found.displacement, displacement.numpy(), atol=1e-5)
+    np.testing.assert_allclose(found.log_std, log_std.numpy(), atol=1e-5)
+    assert displacement.std(0).min() > 1e-3
+
+
+@pytest.mark.parametrize("form", ["checkpoint", "bare", "old format", "parallel", "half precision"])
+def test_a_checkpoint_of_pytorch(tmp_path, loaded, form):
+    torch, network = torch_network(WEIGHTS, 200)
+    state = network.state_dict()
+    if form == "checkpoint":
+        optimizer = torch.optim.Adam(network.parameters(), 1e-4)
+        state = {
+            "model_state_dict": state,
+            "epoch": 7,
+            "optimizer_state_dict": optimizer.state_dict(),
+            "args": {"imu_freq": 200.0},
+        }
+    elif form == "parallel":
+        state = {"model_state_dict": {f"module.{key}": value for key, value in state.items()}}
+    elif form == "half precision":
+        state = {
+            key: value.bfloat16() if value.is_floating_point() else value
+            for key, value in state.items()
+        }
+    torch.save(
+        state, tmp_path / "checkpoint_7.pt", _use_new_zipfile_serialization=form != "old format"
+    )
+    found = interop.load_tlio_state_dict(tmp_path / "checkpoint_7.pt")
+    if form == "half precision":
+        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=2**-8), found, loaded)
+    else:
+        equal(found, loaded)
+
+
+def test_a_torchscript_archive(tmp_path, loaded):
+    torch, network = torch_network(WEIGHTS, 200)
+    torch.jit.trace(network, torch.zeros(1, 6, 200)).save(str(tmp_path / "model_torchscript.pt"))
+    equal(interop.load_tlio_state_dict(str(tmp_path / "model_torchscript.pt")), loaded)
+
+
+class Stranger:
+    """Something that only a pickle can hold."""
+
+
+def test_a_checkpoint_with_more_than_tensors_is_not_run(tmp_path):
+    torch = pytest.importorskip("torch")
+    torch.save({"model_state_dict": {}, "args": Stranger()}, tmp_path / "checkpoint.pt")
+    with pytest.raises(
+        InputError, match=r"checkpoint\.pt: cannot be read .*tensors and plain values only"
+    ):
+        interop.load_tlio_state_dict(tmp_path / "checkpoint.pt")
+
+
+def test_without_pytorch_it_says_how_to_get_it(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "torch", None)
+    (tmp_path / "a.pth").write_bytes(b"weights")
+    with pytest.raises(
+        InputError,
+        match=r"a\.pth: reading a file of PyTorch needs PyTorch; pip install 'gnio-jax\[torch\]'$",
+    ):
+        interop.load_tlio_state_dict(tmp_path / "a.pth")
+
+
+# Mistakes
+# -------------------------------------------------------------------------------------------------------------
+
+
+def changed(**parts):
+    """The weights with some replaced (their names with __ for dots), or left out by None."""
+    given = WEIGHTS | {key.replace("__", "."): value for key, value in parts.items()}
+    return {key: value for key, value in given.items() if value is not None}
+
+
+BAD_BIAS = np.array([0, np.nan, 0], np.float32)
+
+
+@pytest.mark.parametrize(
+    "given, problem",
+    [
+        (
+            changed(residual_groups__1__0__downsample__0__weight=None),
+            "'residual_groups.1.0.downsample.0.weight' is missing;",
+        ),
+        (changed(output_block1__fc1__weight=None), "'output_block1.fc1.weight' is missing;"),
+        ({}, "'output_block1.fc1.weight' is missing;"),
+        (
+            changed(output_block3__fc1__weight=np.zeros(3)),
+            "'output_block3.fc1.weight' is unexpected;",
+        ),
+        (changed(zzz=np.zeros(3), yyy=np.zeros(3)), "'yyy' is unexpected (and 1 more);"),
+        (
+            changed(input_block__0__weight=np.zeros((64, 9, 7), np.float32)),
+            "'input_block.0.weight' must have shape (64, 6, 7), found (64, 9, 7);",
+        ),
+        (
+            changed(output_block2__fc1__weight=np.zeros((512, 512), np.float32)),
+            "'output_block2.fc1.weight' must have shape (512, 896), found (512, 512);",
+        ),
+        (
+            changed(output_block1__fc1__weight=np.zeros((512, 900), np.float32)),
+            "'output_block1.fc1.weight' must have shape (512, 128·⌈N/32⌉) for windows of N samples, found (512, 900);",
+        ),
+        (
+            changed(output_block1__fc3__bias=BAD_BIAS),
+            "'output_block1.fc3.bias' holds values that are not finite numbers;",
+        ),
+        (
+            changed(output_block1__fc3__bias=np.array(["a", "b", "c"])),
+            "'output_block1.fc3.bias' holds values that are not finite numbers;",
+        ),
+        ({"model_state_dict": 3}, "its model_state_dict is not a mapping"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_weights_that_do_not_fit(given, problem):
+    with pytest.raises(InputError, match=f"^state dict: {re.escape(problem)}"):
+        interop.load_tlio_state_dict(given)
+
+
+def test_files_that_are_none(tmp_path):
+    with pytest.raises(InputError, match=r"none\.npz: no such file; give"):
+        interop.load_tlio_state_dict(tmp_path / "none.npz")
+    (tmp_path / "damaged.npz").write_bytes(b"PK\x03\x04 and no more")
+    np.savez(tmp_path / "objects.npz", **{"output_block1.fc1.weight": np.array([{}], object)})
+    np.savez(tmp_path / "other.npz", weights=np.zeros(3))
+    for name, problem in [
+        ("damaged", "cannot be read"),
+        ("objects", "cannot be read"),
+        ("other", "'output_block1.fc1.weight' is missing"),
+    ]:
+        with pytest.raises(InputError, match=f"{name}.npz: {problem}") as told:
+            interop.load_tlio_state_dict(tmp_path / f"{name}.npz")
+        assert "\n" not in str(told.value)
+
+
+# The command line
+# -----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory):
+    path = tmp_path_factory.mktemp("weights") / "weights.npz"
+    np.savez(path, **WEIGHTS)
+    return path
+
+
+def command(monkeypatch, *arguments):
+    monkeypatch.setattr(sys, "argv", ["interop", *map(str, arguments)])
+    cli.run(interop.main)
+
+
+def test_a_run_is_made_of_them(file, tmp_path, monkeypatch, capsys, loaded):
+    command(monkeypatch, file, tmp_path / "run", "--stride-seconds", "0.1")
+    assert f"python evaluate.py --workdir {tmp_path / 'run'}" in capsys.readouterr().out
+    run = checkpoint.load_run(tmp_path / "run")
+    assert (run.config.model.name, run.config.dataset) == ("tlio", "tlio")
+    assert (run.config.data.rate, run.config.data.window, run.config.data.stride) == (
+        200.0,
+        200,
+        20,
+    )
+    assert run.model == models.create("tlio")
+    assert odometry.filter_config(run.config.data, run.config.filter).window_rotation == "tlio"
+    assert odometry.filter_config(run.config.data, FilterOptions()).window_rotation == "per_sample"
+    equal(run.variables, loaded)
+    with pytest.raises(SystemExit) as left:  # a second time
+        command(monkeypatch, file, tmp_path / "run")
+    assert left.value.code == 2
+    assert (
+        capsys.readouterr().err == f"{tmp_path / 'run'}: holds a run already; name another folder\n"
+    )
+
+
+@pytest.mark.parametrize(
+    "options, problem",
+    [
+        (
+            ["--rate", "100"],
+            "is for windows of 193 to 224 samples, not 100; give the --rate and --window-seconds that it was trained with",
+        ),
+        (["--stride-seconds", "0.3"], "data.stride_seconds"),
+        (["--rates", "100"], "rate"),
+    ],
+)
+def test_options_that_do_not_fit_leave_nothing_behind(
+    file, tmp_path, monkeypatch, capsys, options, problem
+):
+    with pytest.raises(SystemExit) as left:
+        command(monkeypatch, file, tmp_path / "run", *options)
+    told = capsys.readouterr().err
+    assert left.value.code == 2 and problem in told and told.count("\n") == 1
+    assert not (tmp_path / "run").exists()

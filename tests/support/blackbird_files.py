@@ -1,0 +1,56 @@
+"""Files in Blackbird's layout."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import h5py
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from tests.support import known_walk
+
+START = 1_525_745_865.0016553
+
+FLIP = np.diag([1.0, -1.0, -1.0])  # forward-left-up to forward-right-down, and z-up to z-down
+
+
+def write(
+    folder: Path, down: bool = False, text: int = 11, spoil=None, seconds: float = 12.0
+) -> Path:
+    """One flight: body front-right-down, world z-up or z-down; the text beside it has `text`
+    columns (0: none)."""
+    time = np.arange(round(seconds * 100)) / 100
+    body = known_walk.attitude(time).as_matrix() @ FLIP
+    place, speed = known_walk.position(time), known_walk.velocity(time)
+    if down:
+        body, place, speed = FLIP @ body, place @ FLIP, speed @ FLIP
+    pose = np.concatenate([place, Rotation.from_matrix(body).as_quat()], axis=1)
+    gyro, accel = known_walk.rate(time) @ FLIP, known_walk.force(time) @ FLIP
+    bias = np.array([0.01, -0.02, 0.005])
+    fields = {
+        "ts": START + time,
+        "gyro_calib": gyro,
+        "accel_calib": accel,
+        "traj_target": pose,
+        "gyro_raw": gyro + bias,
+        "accel_raw": accel + bias,
+        "gyro_bias": bias,
+        "accel_bias": bias,
+        "thrust": 0 * gyro,
+        "i_thrust": 0 * gyro,
+        "traj_target_oris_from_imu": np.ones((1, 10)),
+    }
+    if spoil:
+        spoil(fields)
+    folder.mkdir(parents=True, exist_ok=True)
+    with h5py.File(folder / "data.hdf5", "w") as file:
+        for name, values in fields.items():
+            file.create_dataset(name, data=values)
+    if text:
+        table = np.concatenate([(START + time)[:, None], pose, speed], axis=1)[:, :text]
+        rows = [" ".join(f"{value:.12f}" for value in row) for row in table]
+        (folder / "stamped_groundtruth_imu.txt").write_text(
+            "\n".join(["# ts x y z qx qy qz qw", *rows]) + "\n"
+        )
+    return folder

@@ -1,0 +1,134 @@
+"""Writes the known walk as KITTI's native files: OXTS packets with the traps of the published
+drives, and npz pieces.
+
+The earth is the sphere of KITTI's own projection; a few metres from the origin east and north are
+arcs on it to a micrometre, whatever the projection.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from tests.support import known_walk
+
+RADIUS = 6378137.0
+HOME = (49.015, 8.434, 116.4)
+START = np.datetime64("2011-09-26T13:02:25.594360375", "ns")
+
+
+def packets(time: np.ndarray) -> np.ndarray:
+    """(n, 30) values of the packets at times (s)."""
+    place = known_walk.position(time)
+    latitude = HOME[0] + np.degrees(place[:, 1] / RADIUS)
+    longitude = HOME[1] + np.degrees(place[:, 0] / (RADIUS * np.cos(np.radians(HOME[0]))))
+    yaw, pitch, roll = known_walk.attitude(time).as_euler("ZYX").T
+    east, north, up = known_walk.velocity(time).T
+    heading = np.stack([np.cos(yaw), np.sin(yaw)])
+    forward, left = heading[0] * east + heading[1] * north, heading[0] * north - heading[1] * east
+    level = np.full(
+        (3, len(time)), 7.7
+    )  # accelerations and rates in the level frame: not what is asked for
+    return np.stack(
+        [
+            latitude,
+            longitude,
+            HOME[2] + place[:, 2],
+            roll,
+            pitch,
+            yaw,
+            north,
+            east,
+            forward,
+            left,
+            up,
+            *known_walk.force(time).T,
+            *level,
+            *known_walk.rate(time).T,
+            *level,
+            *np.tile([[0.05], [0.01], [4], [9], [4], [4], [0]], len(time)),
+        ],
+        axis=1,
+    )
+
+
+def stamp(seconds: float) -> str:
+    return str(START + np.timedelta64(round(seconds * 1e9), "ns")).replace("T", " ")
+
+
+def write_rows(oxts: Path, stamps: list[str], values: np.ndarray) -> Path:
+    (oxts / "data").mkdir(parents=True)
+    (oxts / "timestamps.txt").write_text("\n".join(stamps) + "\n")
+    (oxts / "dataformat.txt").write_text("lat: latitude of the oxts-unit (deg)\n")
+    for row, line in enumerate(values):
+        (oxts / "data" / f"{row:010d}.txt").write_text(
+            " ".join(f"{value:.15g}" for value in line) + "\n"
+        )
+    return oxts
+
+
+def write_drive(
+    root: Path,
+    drive: str,
+    spoil=None,
+    seconds: float = 12.0,
+    export: str = "extract",
+    rate: float = 100.0,
+) -> Path:
+    """A drive without traps. `spoil(time, values)` may damage the rows."""
+    time = np.arange(round(seconds * rate)) / rate
+    values = packets(time)
+    if spoil:
+        spoil(time, values)
+    return write_rows(
+        root / drive[:10] / f"{drive}_{export}" / "oxts", [stamp(t) for t in time], values
+    )
+
+
+def write_published(root: Path, drive: str) -> tuple[Path, np.ndarray]:
+    """A drive of 16 s with every trap; returns its folder and the times at which its two pieces
+    begin and end.
+
+    Stamps jitter by a millisecond; rows change places; one row is there twice; one carries the
+    stamp of its predecessor; single packets are lost; one packet has no stamp; 0.3 s are missing
+    after 6 s, and 0.2 s before a last piece of 1.5 s.
+    """
+    noise = np.random.default_rng(5)
+    time = np.arange(1600) / 100 + noise.uniform(-1e-3, 1e-3, 1600)
+    time[0] = 0.0
+    time = np.delete(time, [*range(600, 630), 200, 900, *range(1430, 1450)])
+    pieces = np.array(
+        [time[0], time[time < 5.995].max(), time[time > 6.1].min(), time[time < 14.295].max()]
+    )
+    written = time.copy()
+    written[301] = written[300]  # its values are its own, its stamp is not
+    order = np.arange(len(time))
+    for row in range(50, len(time) - 5, 110):
+        order[[row, row + 3]] = order[[row + 3, row]]
+    order = np.insert(order, 400, order[400])
+    stamps = [stamp(t) for t in written[order]]
+    stamps[700] = ""
+    return write_rows(
+        root / drive[:10] / f"{drive}_extract" / "oxts", stamps, packets(time[order])
+    ), pieces
+
+
+def write_piece(path: Path, spoil=None, first: float = 25.0, seconds: float = 12.0) -> Path:
+    """An npz piece in single precision; `spoil(arrays)` may damage the arrays."""
+    time = first + np.arange(round(seconds * 100)) / 100
+    yaw, pitch, roll = known_walk.attitude(time).as_euler("ZYX").T
+    arrays = {
+        "t": time,
+        "p_gt": known_walk.position(time),
+        "ang_gt": np.stack([roll, pitch, yaw], axis=1),
+        "v_gt": known_walk.velocity(time),
+        "u": np.concatenate([known_walk.rate(time), known_walk.force(time)], axis=1),
+        "t0": np.array(first),
+    }
+    arrays = {name: values.astype(np.float32) for name, values in arrays.items()}
+    if spoil:
+        spoil(arrays)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    np.savez(path, allow_pickle=True, **arrays)
+    return path
