@@ -16,7 +16,8 @@ import optax
 from scipy.spatial.transform import Rotation
 
 from gnio_jax import config as configuration
-from gnio_jax.commands import console as cli
+from gnio_jax.commands import console
+from gnio_jax.commands.options import parse
 from gnio_jax.types import InputError
 
 DESCRIPTION = """Fit the noise model and the uncertainty head of a trained run through its own filter.
@@ -109,7 +110,7 @@ def objective(model, filter_config, std, variables):
 
     def loss(learnt, pieces):
         with_head = {**variables, "params": {**variables["params"], "uncertainty": learnt["head"]}}
-        frozen, apply = models.freeze(model, with_head), models.Inference(model)
+        frozen, apply = models.inference_variables(model, with_head), models.Inference(model)
         noise = filtering.NoiseModel(*jnp.exp(learnt["noise"]))
 
         def one(piece):
@@ -147,7 +148,9 @@ def scored(model, variables, options, recordings, config, groups, progress, what
     from gnio_jax import evaluation, models
     from gnio_jax.evaluation import report
 
-    network = evaluation.Network(models.Inference(model), models.freeze(model, variables))
+    network = evaluation.Network(
+        models.Inference(model), models.inference_variables(model, variables)
+    )
     estimates = evaluation.estimate(
         recordings, network, config.data, options, progress=lambda share: progress(what, share)
     )
@@ -160,7 +163,7 @@ def scored(model, variables, options, recordings, config, groups, progress, what
 
 def main() -> None:
     jax.config.update("jax_enable_x64", True)
-    options = cli.parse(Learn, description=DESCRIPTION)
+    options = parse(Learn, description=DESCRIPTION)
     if options.steps < 1 or options.batch_size < 1:
         raise InputError("--steps and --batch-size", "must be at least 1")
 
@@ -228,7 +231,8 @@ def main() -> None:
         return optax.apply_updates(learnt, updates), state, value
 
     rng, state, values = np.random.default_rng(options.seed), optimizer.init(learnt), []
-    with cli.progress() as progress:
+    with console.terminal() as terminal:
+        progress = terminal.progress
         before = scored(
             run.model, run.variables, f, testing, config, groups, progress, "estimating as it was"
         )
@@ -287,4 +291,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    cli.run(main)
+    console.run(main)

@@ -13,7 +13,8 @@ import jax
 import numpy as np
 
 from gnio_jax import config as configuration
-from gnio_jax.commands import console as cli
+from gnio_jax.commands import console
+from gnio_jax.commands.options import parse
 from gnio_jax.types import InputError
 
 DESCRIPTION = """Feed a recording to gnio_jax.filtering.Tracker sample by sample, as an app on a phone would.
@@ -70,7 +71,7 @@ def main() -> None:
     jax.config.update(
         "jax_enable_x64", True
     )  # the filter needs float64; the network states its float32 everywhere
-    options = cli.parse(Replay, description=DESCRIPTION)
+    options = parse(Replay, description=DESCRIPTION)
     path = Path(options.csv)
     stamps, gyro, accel = read(path)
 
@@ -103,14 +104,15 @@ def main() -> None:
     interval = float(np.median(np.diff(stamps)))
     hole = 1.5 * max(config.dt, interval)
 
-    frozen = models.freeze(
+    frozen = models.inference_variables(
         run.model, run.variables
     )  # what depends on the weights alone is computed once
 
     def predict(windows):
         return models.Inference(run.model)(frozen, windows)
 
-    with cli.progress() as progress:
+    with console.terminal() as terminal:
+        progress = terminal.progress
         progress("compiling", 0.0)
         begin = time.perf_counter()
         try:
@@ -205,4 +207,4 @@ def quaternion(rotation: np.ndarray) -> np.ndarray:
 
 
 if __name__ == "__main__":
-    cli.run(main)
+    console.run(main)

@@ -183,7 +183,7 @@ def _load(
     }
     return (
         run.config,
-        Network(models.Inference(run.model), models.freeze(run.model, run.variables)),
+        Network(models.Inference(run.model), models.inference_variables(run.model, run.variables)),
         provenance,
     )
 

@@ -47,7 +47,7 @@ def measure(
     about `seconds`."""
     model = models.create(network)
     variables = models.initialise(model, jax.random.key(0), samples)
-    frozen, inference = models.freeze(model, variables), models.Inference(model)
+    frozen, inference = models.inference_variables(model, variables), models.Inference(model)
     latency, operations = {}, 0.0
     for batch in batches:
         windows = jnp.asarray(

@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from rich.console import Console
 
 from gnio_jax import config as configuration
 from gnio_jax import evaluation
@@ -18,8 +17,9 @@ from gnio_jax.config import EvaluateConfig
 from gnio_jax.evaluation import metrics, report
 from gnio_jax.evaluation.metrics import Trajectory
 from gnio_jax.evaluation.run import folder_name
+from gnio_jax.reporting import Reporter
 from gnio_jax.tables.experiments import Cell
-from gnio_jax.training import loop
+from gnio_jax.training import loop, run_folder
 
 
 class Interrupted(Exception):
@@ -41,7 +41,7 @@ class Result(NamedTuple):
 
 
 def run_cell(
-    cell: Cell, seeds: int, folder: Path, split: str, estimator: str, console: Console
+    cell: Cell, seeds: int, folder: Path, split: str, estimator: str, reporter: Reporter
 ) -> Result:
     """Train and evaluate a cell with seeds 0 … seeds−1 below `folder`.
 
@@ -53,28 +53,28 @@ def run_cell(
     for seed in range(seeds):
         workdir = folder / f"{cell.name}_s{seed}"
         config = dataclasses.replace(cell.config, seed=seed, workdir=str(workdir))
-        train(config, console)
-        figures.append(evaluated(workdir, split, estimator, console))
+        train(config, reporter)
+        figures.append(evaluated(workdir, split, estimator, reporter))
         runs.append(workdir)
     return Result(cell, figures, runs)
 
 
-def train(config: configuration.TrainConfig, console: Console) -> None:
+def train(config: configuration.TrainConfig, reporter: Reporter) -> None:
     """Train the run of `config` to its end, if it is not there yet."""
     workdir = Path(config.workdir or "")
     begun = (workdir / "config.yaml").exists()
     if begun:
-        loop.prepare_workdir(config, resume=True)  # refuses other settings
+        run_folder.prepare(config, resume=True)  # refuses other settings
         log = workdir / "metrics.jsonl"
         if log.exists() and log.read_text(encoding="utf-8").count("\n") >= config.optim.epochs:
             return
-    console.rule(f"[bold]{workdir.name}[/bold]", align="left")
-    outcome = loop.train(config, resume=begun, console=console)
+    reporter.line(f"── {workdir.name}")
+    outcome = loop.train(config, resume=begun, reporter=reporter)
     if outcome.stopped_by:
         raise Interrupted(outcome.stopped_by)
 
 
-def evaluated(workdir: Path, split: str, estimator: str, console: Console) -> dict[str, Any]:
+def evaluated(workdir: Path, split: str, estimator: str, reporter: Reporter) -> dict[str, Any]:
     """The figures of the run's best checkpoint on a split: those that are there if they are of that
     checkpoint and mean the same (`report.DEFINITIONS`), else new ones."""
     config, folder = _evaluation(workdir, split, estimator)
@@ -85,7 +85,7 @@ def evaluated(workdir: Path, split: str, estimator: str, console: Console) -> di
         same = report.definitions(found) == report.DEFINITIONS
         if same and (best / str(found["settings"]["step"])).is_dir():
             return found
-    console.print(f"evaluating {workdir.name} on {split} ({estimator})")
+    reporter.line(f"evaluating {workdir.name} on {split} ({estimator})")
     evaluation.evaluate(config)
     return json.loads(path.read_text(encoding="utf-8"))
 

@@ -41,7 +41,7 @@ def said(workdir: Path, split: str) -> Said:
     recordings, _ = odometry.prepare(
         data.load(run.config.dataset, run.config.data_root, split), config, setup
     )
-    network = Network(models.Inference(run.model), models.freeze(run.model, run.variables))
+    network = Network(models.Inference(run.model), models.inference_variables(run.model, run.variables))
     attitudes = [odometry.attitude(r, config, "reference") for r in recordings]
     found = odometry.predict_windows(
         network, recordings, attitudes, config, keep=("gate", "scale", "attention")

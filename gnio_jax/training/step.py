@@ -22,7 +22,7 @@ from gnio_jax.types import Prediction, Windows
 
 
 class TrainState(NamedTuple):
-    """All that changes from step to step. Random draws are functions of the seed and `step` alone."""
+    """All that changes from step to step. Random draws depend on the seed and `step` alone."""
 
     step: Int[jax.Array, ""]
     params: Any
@@ -100,10 +100,8 @@ def train_steps(
         now = stage(config.loss, state.step, steps_per_epoch)
 
         def objective(params: Any) -> tuple[jax.Array, tuple[Losses, Any]]:
-            prediction, changed = model.apply(
-                {"params": params, "batch_stats": state.batch_stats}, windows.imu, train=True,
-                mutable=["batch_stats"], rngs={"dropout": dropout_key},
-            )  # fmt: skip
+            variables = {"params": params, "batch_stats": state.batch_stats}
+            prediction, changed = _apply_training(model, variables, windows, dropout_key)
             loss = losses(prediction, windows, config.loss, now)
             return loss.total, (loss, changed.get("batch_stats", {}))
 
@@ -132,6 +130,19 @@ def train_steps(
         jnp.int32(-1),
     )
     return jax.lax.fori_loop(jnp.int32(0), count, one_step, (state, nothing))
+
+
+def _apply_training(
+    model: nn.Module, variables: Any, windows: Windows, dropout_key: PRNGKeyArray
+) -> tuple[Prediction, Any]:
+    """The prediction in training mode, and the variables that changed: statistics of the batch."""
+    return model.apply(
+        variables,
+        windows.imu,
+        train=True,
+        mutable=["batch_stats"],
+        rngs={"dropout": dropout_key},
+    )  # type: ignore[return-value]
 
 
 def drawn(
@@ -194,8 +205,8 @@ def estimate_statistics(
     def add_batch(total: Any, number_which: tuple[jax.Array, jax.Array]) -> tuple[Any, None]:
         number, which = number_which
         windows, dropout_key = drawn(jax.random.fold_in(draw_key, number), source, which, config)
-        _, changed = model.apply({"params": state.params, "batch_stats": zeros}, windows.imu, train=True,
-                                 mutable=["batch_stats"], rngs={"dropout": dropout_key})  # fmt: skip
+        variables = {"params": state.params, "batch_stats": zeros}
+        _, changed = _apply_training(model, variables, windows, dropout_key)
         return jax.tree.map(jnp.add, total, changed["batch_stats"]), None
 
     total, _ = jax.lax.scan(add_batch, zeros, (jnp.arange(batches), order))

@@ -6,13 +6,17 @@ import sys
 import pytest
 
 from gnio_jax import config
-from gnio_jax.commands import console as cli
+from gnio_jax.commands import options, train
 from gnio_jax.config import TrainConfig
 from gnio_jax.types import InputError
 
 
-def parse(*arguments, default=None):
-    return cli.parse(TrainConfig, default or TrainConfig(), "Train.", list(arguments))
+def parse(*arguments):
+    """The experiment that `train` reads from these options."""
+    found = []
+    command = train.COMMAND._replace(run=lambda read, _prog: found.append(read.experiment()))
+    options.execute(command, arguments, "train.py")
+    return found[0]
 
 
 def mistake(*arguments):
@@ -82,7 +86,7 @@ def test_missing_values_and_stray_words():
     )
     assert mistake("stray").startswith("'stray': is not an option")
     assert mistake("--augment.yaw", "True").startswith("'True': is not an option")
-    assert mistake("--config") == "--config: needs a value"
+    assert mistake("--config") == "--config: needs a value, which must be text or None"
 
 
 def test_options_win_over_the_file_and_the_file_over_the_default(tmp_path):
@@ -109,12 +113,15 @@ def test_help_teaches(capsys):
         parse("--help")
     assert leaving.value.code == 0
     text = " ".join(capsys.readouterr().out.replace("│", " ").split())
-    assert "Train." in text and "--config FILE" in text
+    assert "Train a network" in text and "--config FILE" in text
     assert "--optim.epochs INT Passes over the training windows. (default: 200)" in text
 
 
 def outcome(body):
-    program = f"from gnio_jax import cli\nfrom gnio_jax.types import InputError\ndef main():\n    {body}\ncli.run(main)\n"
+    program = (
+        "from gnio_jax.commands import console\nfrom gnio_jax.types import InputError\n"
+        f"def main():\n    {body}\nconsole.run(main)\n"
+    )
     return subprocess.run(
         [sys.executable, "-c", program], capture_output=True, text=True, timeout=60
     )

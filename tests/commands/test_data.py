@@ -12,10 +12,10 @@ import pytest
 from matplotlib import image
 
 from gnio_jax import data
-from gnio_jax.commands import console as cli
-from gnio_jax.commands import data as commands
+from gnio_jax.commands import console
 from gnio_jax.commands.data import main
-from gnio_jax.data import registry
+from gnio_jax.data import conversion, registry
+from gnio_jax.data.checking import resolve
 from gnio_jax.data.readers import csv_files as csv
 from gnio_jax.data.readers import tlio
 from gnio_jax.types import InputError
@@ -203,7 +203,7 @@ def test_check_of_one_split_of_a_computed_set(place, capsys):
 
 
 def test_check_knows_a_layout_by_what_it_finds_there(root, place, capsys):
-    assert commands.resolve(str(root), None) == (data.get("tlio"), root)
+    assert resolve(str(root), None) == (data.get("tlio"), root)
     asl = place / "walks" / "mine" / "mav0" / "imu0"
     asl.mkdir(parents=True)
     (asl / "data.csv").write_text("")
@@ -211,10 +211,10 @@ def test_check_knows_a_layout_by_what_it_finds_there(root, place, capsys):
         InputError,
         match="walks: has the layout of euroc and of tumvi; say which it is: --dataset NAME",
     ):
-        commands.resolve("./walks", None)
-    assert commands.resolve("walks", "tumvi")[0].name == "tumvi"
+        resolve("./walks", None)
+    assert resolve("walks", "tumvi")[0].name == "tumvi"
     (place / "walks").rename(place / "EuRoC")
-    assert commands.resolve("./EuRoC", None)[0].name == "euroc"
+    assert resolve("./EuRoC", None)[0].name == "euroc"
 
 
 def test_check_of_recordings_without_a_reference_draws_them_all_the_same(place, capsys):
@@ -227,7 +227,7 @@ def test_check_of_recordings_without_a_reference_draws_them_all_the_same(place, 
 
 def test_nothing_usable_is_a_failure_that_still_shows_the_table(root, capsys):
     with pytest.raises(SystemExit) as left:
-        cli.run(lambda: main(["check", str(root), "--split", "val"]))
+        console.run(lambda: main(["check", str(root), "--split", "val"]))
     out, err = capsys.readouterr()
     assert left.value.code == 2 and "left out: cut: " in out
     assert err == f"{root}: none of 1 sequences can be used; see the reasons above\n"
@@ -297,20 +297,20 @@ def test_convert_to_another_rate(root):
 def test_convert_goes_on_where_it_was_stopped(root, reads, monkeypatch, capsys):
     (root / "train_list.txt").write_text("fair\ntilted\nalso\n")
     (root / "val_list.txt").write_text("fair\n")
-    real = commands.write_hdf5
+    real = conversion.write_hdf5
 
     def stopped(path, sequence):
         if sequence.name == "also":
             raise KeyboardInterrupt
         real(path, sequence)
 
-    monkeypatch.setattr(commands, "write_hdf5", stopped)
+    monkeypatch.setattr(conversion, "write_hdf5", stopped)
     with pytest.raises(SystemExit) as left:
-        cli.run(lambda: main(["convert", "tlio", str(root), "converted"]))
+        console.run(lambda: main(["convert", "tlio", str(root), "converted"]))
     assert left.value.code == 130 and reads == ["fair", "tilted", "also"]
     converted = root.parent / "converted"
     assert sorted(path.name for path in converted.iterdir()) == [".converted", "fair.h5"]
-    monkeypatch.setattr(commands, "write_hdf5", real)
+    monkeypatch.setattr(conversion, "write_hdf5", real)
     reads.clear()
     main(["convert", "tlio", str(root), "converted"])
     assert reads == ["also"]  # what failed the check is known to have failed
@@ -601,7 +601,7 @@ def test_a_mistake_is_one_line_and_status_2(root, place, capsys, arguments, expe
     )
     before = sorted(place.rglob("*"))
     with pytest.raises(SystemExit) as left, warnings.catch_warnings():
-        cli.run(lambda: main(arguments))
+        console.run(lambda: main(arguments))
     out, err = capsys.readouterr()
     assert (left.value.code, out) == (2, "") and err.count("\n") == 1 and expected in err, err
     assert sorted(place.rglob("*")) == before

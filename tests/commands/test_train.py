@@ -10,7 +10,7 @@ import pytest
 
 import train
 from gnio_jax import config as configuration
-from gnio_jax.commands import console as cli
+from gnio_jax.commands import console
 from gnio_jax.config import TrainConfig
 from gnio_jax.types import InputError
 
@@ -24,7 +24,7 @@ def mistake(monkeypatch, capsys, tmp_path, *arguments):
     monkeypatch.setattr(sys, "argv", ["train.py", *arguments])
     before = sorted(tmp_path.rglob("*"))
     with pytest.raises(SystemExit) as left:
-        cli.run(train.main)
+        console.run(train.main)
     assert left.value.code == 2
     out, err = capsys.readouterr()
     lines = [line for line in err.splitlines() if not line.startswith("reading ")]
@@ -148,7 +148,7 @@ def test_help_teaches():
 def test_the_newest_run_is_the_one_trained_last(tmp_path):
     with pytest.raises(
         InputError,
-        match=r"holds no run; train one with python train\.py, or name its folder with --workdir",
+        match=r"holds no run; train one with gnio train, or name its folder with --workdir",
     ):
         configuration.newest_run(tmp_path)
     for age, name in [(30, "old"), (10, "new"), (20, "middle")]:

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from gnio_jax import interop, models
-from gnio_jax.commands import console as cli
+from gnio_jax.commands import console
+from gnio_jax.commands import interop as interop_command
 from gnio_jax.config import FilterOptions
 from gnio_jax.evaluation import odometry
 from gnio_jax.training import checkpoint
@@ -299,7 +300,7 @@ def file(tmp_path_factory):
 
 def command(monkeypatch, *arguments):
     monkeypatch.setattr(sys, "argv", ["interop", *map(str, arguments)])
-    cli.run(interop.main)
+    console.run(interop_command.main)
 
 
 def test_a_run_is_made_of_them(file, tmp_path, monkeypatch, capsys, loaded):

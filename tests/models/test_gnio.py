@@ -384,7 +384,7 @@ def test_constant_uncertainty_leaves_the_displacement_as_it_is():
     found = constant.apply(given, windows)
     np.testing.assert_array_equal(found.displacement, plain.apply(variables, windows).displacement)
     np.testing.assert_array_equal(found.log_std, [log_std, log_std])
-    frozen = models.freeze(constant, given)
+    frozen = models.inference_variables(constant, given)
     np.testing.assert_allclose(
         models.Inference(constant)(frozen, windows).displacement, found.displacement, atol=1e-6
     )

@@ -8,7 +8,6 @@ import json
 import numpy as np
 import pytest
 import yaml
-from rich.console import Console
 
 from gnio_jax import config as configuration
 from gnio_jax import models
@@ -16,6 +15,7 @@ from gnio_jax.commands import tables as commands
 from gnio_jax.config import DataConfig, ModelConfig, OptimConfig, TrainConfig
 from gnio_jax.evaluation import report
 from gnio_jax.evaluation.metrics import Trajectory
+from gnio_jax.reporting import Lines
 from gnio_jax.tables import complexity, experiments, matrix, pictures, summary, windows
 from gnio_jax.tables.experiments import Cell, Experiment
 from gnio_jax.tables.matrix import Result
@@ -198,7 +198,7 @@ def test_figures_of_other_definitions_or_steps_are_made_anew(
     }
     path.write_text(json.dumps({"settings": settings, "sequences": sequences}))
     monkeypatch.setattr(matrix.evaluation, "evaluate", lambda config: path.write_text("{}"))
-    found = matrix.evaluated(tmp_path, "test", "ekf", Console(quiet=True))
+    found = matrix.evaluated(tmp_path, "test", "ekf", Lines())
     assert (found != {}) == kept
 
 
