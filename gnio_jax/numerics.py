@@ -10,7 +10,7 @@ from __future__ import annotations
 import itertools
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Real
 from scipy.ndimage import maximum_filter1d
 from scipy.spatial.transform import Rotation, Slerp
 
@@ -173,7 +173,7 @@ def midpoints(values: Float[np.ndarray, "n *w"]) -> Float[np.ndarray, "m *w"]:
 
 
 def neighbours(
-    stamps: Float[np.ndarray, " n"], time: Float[np.ndarray, " m"]
+    stamps: Real[np.ndarray, " n"], time: Real[np.ndarray, " m"]
 ) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"]]:
     """Rows (left, right = left + 1) of increasing stamps between which each time lies; beyond the
     ends the outermost pair. A time that equals a stamp has it on its right, but the first stamp."""
@@ -182,14 +182,14 @@ def neighbours(
 
 
 def interpolate(
-    time: Float[np.ndarray, " m"], stamps: Float[np.ndarray, " n"], values: Float[np.ndarray, "n w"]
+    time: Real[np.ndarray, " m"], stamps: Real[np.ndarray, " n"], values: Float[np.ndarray, "n w"]
 ) -> Float[np.ndarray, "m w"]:
     """`np.interp` of each column: linear between increasing stamps; the ends are held."""
     return np.stack([np.interp(time, stamps, column) for column in values.T], axis=1)
 
 
 def slerp(
-    time: Float[np.ndarray, " m"], stamps: Float[np.ndarray, " n"], attitude: Rotation
+    time: Real[np.ndarray, " m"], stamps: Real[np.ndarray, " n"], attitude: Rotation
 ) -> Rotation:
     """Attitudes on the shorter arc between increasing stamps; the ends are held."""
     return Slerp(stamps, attitude)(np.clip(time, stamps[0], stamps[-1]))
