@@ -166,9 +166,10 @@ def impressions(sequence: Sequence) -> list[str]:
     time = sequence.time
     step = float(np.median(np.diff(time)))
     accel, gyro = (np.linalg.norm(field, axis=1) for field in (sequence.accel, sequence.gyro))
+    pull = f"{np.median(accel):.2f} m/s² in the median, {accel.min():.2f} to {accel.max():.2f}"
     lines = [
         f"{time[-1] - time[0]:.1f} s at {1.0 / step:.4g} Hz",
-        f"|accel| {np.median(accel):.2f} m/s² in the median, {accel.min():.2f} to {accel.max():.2f}",
+        f"|accel| {pull}",
         f"|gyro| {np.median(gyro):.2f} rad/s in the median, up to {gyro.max():.2f}",
     ]
     span = max(round(0.5 / step), 1)

@@ -216,8 +216,8 @@ def notes(base: TrainConfig, options: TablesConfig, experiment: Experiment) -> l
     )
     return [
         f"{base.dataset} {options.split}, {options.estimator}; every row: {budget}; "
-        f"on {complexity.hardware()}. ± is the standard deviation over seeds; the difference to the "
-        "first row is over sequences.",
+        f"on {complexity.hardware()}. ± is the standard deviation over seeds; "
+        "the difference to the first row is over sequences.",
         "",
         f"Published: {experiment.source}; the paper does not define its ATE.",
     ]

@@ -92,7 +92,7 @@ def _windows(
         data.resample(sequence, config.data.rate)
         for sequence in data.load(config.dataset, config.data_root, split)
     ]
-    source = windows.index(sequences, config.data, stride, shift)
+    source = windows.window_source(sequences, config.data, stride, shift)
     hours = sum(len(sequence.time) for sequence in sequences) / config.data.rate / 3600
     count = source.visited.shape[0]
     reporter.line(f"  {split}: {len(sequences)} sequences, {hours:.2f} h, {count:,} windows")
