@@ -70,7 +70,7 @@ def execute(program: Command | Group, argv: Sequence[str] | None = None, prog: s
     for word in words:
         found = found.commands[word]
     known = option_names(found.options) if isinstance(found, Command) else list(found.commands)
-    with _one_line_errors(argv, known, isinstance(found, Group)):
+    with _one_line_errors(argv[len(words) :], known, isinstance(found, Group)):
         options = _read(program, argv, prog, words)
         start = found.defaults and found.defaults(options)
         if start is not None:
@@ -200,11 +200,11 @@ def _explain(event: Any, argv: list[str], known: list[str], subcommands: bool) -
             return _missing_option(event.missing_arguments[0].arg)
         case "BadValue":
             problem = f"needs a value, which must be {_spell(event.argument.field.type)}"
-            return InputError(event.argument.display_name(), problem)
+            return InputError(_label(event.argument), problem)
         case "InvalidChoice":
-            return _wrong_value(event.argument, argv)
+            return _wrong_value(event.argument, event.value)
         case "InstantiationFailure" if event.argument is not None:
-            return _wrong_value(event.argument, argv)
+            return _wrong_value(event.argument, _value_given(event.argument, argv))
         case "InstantiationFailure":
             return InputError("command line", event.message)
     return None
@@ -232,20 +232,31 @@ def _unknown_option(token: str, known: list[str]) -> InputError:
 
 
 def _missing_option(argument: Any) -> InputError:
+    label = _label(argument)
     if argument.is_positional():
         remedy = "give it as a word of its own; --help explains it"
-        return InputError(argument.lowered.metavar, "is missing", remedy)
-    option = argument.display_name()
+        return InputError(label, "is missing", remedy)
     value = argument.field.intern_name.upper()
-    return InputError(option, "is missing", f"give {option} {value}; --help explains it")
+    return InputError(label, "is missing", f"give {label} {value}; --help explains it")
 
 
-def _wrong_value(argument: Any, argv: list[str]) -> InputError:
-    option, found = argument.display_name(), ""
+def _wrong_value(argument: Any, value: str) -> InputError:
+    problem = f"must be {_spell(argument.field.type)}, found '{value}'"
+    return InputError(_label(argument), problem)
+
+
+def _label(argument: Any) -> str:
+    """What help calls an option: `--optim.epochs`, or the word in its place."""
+    return argument.lowered.metavar if argument.is_positional() else argument.display_name()
+
+
+def _value_given(argument: Any, argv: list[str]) -> str:
+    """The last value that was given for an option."""
+    value = ""
     for token, following in zip(argv, [*argv[1:], ""], strict=True):
-        if _spelling(token) == option:
-            found = token.partition("=")[2] if "=" in token else following
-    return InputError(option, f"must be {_spell(argument.field.type)}, found '{found}'")
+        if _spelling(token) == argument.display_name():
+            value = token.partition("=")[2] if "=" in token else following
+    return value
 
 
 def _spelling(token: str) -> str:

@@ -7,7 +7,7 @@ A section that relates several fields to each other checks them in `check`.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Annotated, Literal
 
 import tyro
 
@@ -305,8 +305,9 @@ class EvaluateConfig:
 class TablesConfig:
     """What `gnio tables` is asked for."""
 
-    table: tyro.conf.Positional[Table]
-    """Which of the paper's tables."""
+    table: tyro.conf.Positional[Annotated[Table, tyro.conf.arg(metavar="TABLE")]]
+    """complexity, comparison, components, gates, bank-size, bank-spread, uncertainty, trajectories
+    or standing."""
     base: str = "quickstart"
     """Config whose recordings, budget and augmentation every row has (not for complexity)."""
     data_root: str | None = None

@@ -1,4 +1,4 @@
-"""RoNIN's network: its sizes, its head against plain NumPy, and the uncertainty that it is given."""
+"""RoNIN's network: its sizes, its head against plain NumPy, and its uncertainty."""
 
 import jax
 import jax.numpy as jnp
