@@ -100,31 +100,14 @@ def train_steps(
             jax.random.fold_in(key, state.step), source, which, config
         )
         now = stage(config.loss, state.step, steps_per_epoch)
-
-        def objective(params: Any) -> tuple[jax.Array, tuple[Losses, Any]]:
-            variables = {"params": params, "batch_stats": state.batch_stats}
-            prediction, changed = _apply_training(model, variables, windows, dropout_key)
-            loss = losses(prediction, windows, config.loss, now)
-            return loss.total, (loss, changed.get("batch_stats", {}))
-
-        gradient, (loss, batch_stats) = jax.grad(objective, has_aux=True)(state.params)
+        gradient, loss, batch_stats = _gradient(state, windows, dropout_key, now, model, config)
         update, opt_state = optimizer.update(
             gradient, state.opt_state, state.params, log_std_learns=now.log_std_learns
         )
         update = optax.tree.scale(learning_rate_factor, update)
-        failed = jnp.where(
-            (progress.failed_step < 0) & ~jnp.isfinite(loss.total), state.step, progress.failed_step
-        )
-        state = TrainState(
-            jnp.add(state.step, 1),
-            optax.apply_updates(state.params, update),
-            batch_stats,
-            opt_state,
-        )
-        sums = jax.tree.map(
-            jnp.add, (progress.sums, progress.gradient_norms), (loss, gradient_norms(gradient))
-        )
-        return state, Progress(sums[0], sums[1], failed)
+        params = optax.apply_updates(state.params, update)
+        progress = _add_step(progress, state.step, loss, gradient)
+        return TrainState(jnp.add(state.step, 1), params, batch_stats, opt_state), progress
 
     nothing = Progress(
         Losses(*[jnp.float32(0)] * 3),
@@ -132,6 +115,35 @@ def train_steps(
         jnp.int32(-1),
     )
     return jax.lax.fori_loop(jnp.int32(0), count, one_step, (state, nothing))
+
+
+def _gradient(
+    state: TrainState,
+    windows: Windows,
+    dropout_key: PRNGKeyArray,
+    now: Stage,
+    model: nn.Module,
+    config: TrainConfig,
+) -> tuple[Any, Losses, Any]:
+    """Gradient of the loss of a batch, the losses, and the statistics of batch normalisation."""
+
+    def objective(params: Any) -> tuple[jax.Array, tuple[Losses, Any]]:
+        variables = {"params": params, "batch_stats": state.batch_stats}
+        prediction, changed = _apply_training(model, variables, windows, dropout_key)
+        loss = losses(prediction, windows, config.loss, now)
+        return loss.total, (loss, changed.get("batch_stats", {}))
+
+    gradient, (loss, batch_stats) = jax.grad(objective, has_aux=True)(state.params)
+    return gradient, loss, batch_stats
+
+
+def _add_step(progress: Progress, step: jax.Array, loss: Losses, gradient: Any) -> Progress:
+    """The progress with the losses and norms of one more step."""
+    failed = (progress.failed_step < 0) & ~jnp.isfinite(loss.total)
+    sums, norms = jax.tree.map(
+        jnp.add, (progress.sums, progress.gradient_norms), (loss, gradient_norms(gradient))
+    )
+    return Progress(sums, norms, jnp.where(failed, step, progress.failed_step))
 
 
 def _apply_training(
