@@ -45,8 +45,9 @@ class Replay:
 
 def read(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Stamps (n,), gyro (n, 3) and accel (n, 3) as they were recorded, not yet resampled."""
+    from gnio_jax.data.hdf5 import read_hdf5
     from gnio_jax.data.readers.text import numbers, read_csv
-    from gnio_jax.data.sequence import check_increasing, read_hdf5
+    from gnio_jax.data.validation import check_increasing
 
     if path.suffix.lower() in (".h5", ".hdf5"):
         sequence = read_hdf5(path)

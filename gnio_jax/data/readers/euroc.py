@@ -41,22 +41,12 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline, Slerp
 
 from gnio_jax.data.alignment import follow, integrate_gyro, smooth_positions
-from gnio_jax.data.cache import cached
+from gnio_jax.data.dataset import Dataset, Recording, single
 from gnio_jax.data.readers.csv_files import in_order
 from gnio_jax.data.readers.text import numbers, read_csv, shortened
-from gnio_jax.data.recordings import read_all, single
-from gnio_jax.data.sequence import (
-    Dataset,
-    Recording,
-    check_finite,
-    check_gaps,
-    check_rate,
-    check_unit_norm,
-    quaternions,
-    resample,
-    rotations,
-    validate,
-)
+from gnio_jax.data.resampling import resample
+from gnio_jax.data.sequence import quaternions, rotations
+from gnio_jax.data.validation import check_finite, check_gaps, check_rate, check_unit_norm, validate
 from gnio_jax.types import InputError, Sequence
 
 RATE = 200.0
@@ -106,15 +96,8 @@ _AXES = {
 """Our names of the columns, and the authors' without unit, in small letters."""
 
 
-def read(root: Path, split: str, dataset: str = "euroc") -> list[Sequence]:
-    """The sequences of a split, those that fail the physical self-check named and left out."""
-    return read_all(_about(dataset), Path(root), split)
-
-
 def recordings(root: Path, split: str, dataset: str = "euroc") -> list[Recording]:
     """The recordings of a split."""
-    if split not in SPLITS:
-        raise InputError(root, f"unknown split '{split}'", f"known splits: {', '.join(SPLITS)}")
     about = _about(dataset)
     known = EUROC_SPLITS if dataset == "euroc" else TUMVI_SPLITS
     wanted = "test" if split == "seen" else split
@@ -129,23 +112,24 @@ def recordings(root: Path, split: str, dataset: str = "euroc") -> list[Recording
             f"holds no sequence of split '{split}'",
             f"its sequences are {', '.join(known[wanted])}",
         )
-    return [single(short_name(folder.name), _cached, folder, dataset) for folder in chosen]
+    return [_recording(folder, about) for folder in chosen]
 
 
 def _about(dataset: str) -> Dataset:
     return next(entry for entry in DATASETS if entry.name == dataset)
 
 
-def _cached(folder: Path, dataset: str) -> Sequence:
-    about = _about(dataset)
+def _recording(folder: Path, about: Dataset) -> Recording:
     sensors = [folder / "mav0" / sensor for sensor in ("imu0", *_REFERENCES)]
-    sources = [
-        path
-        for sensor in sensors
-        for path in (sensor / "data.csv", sensor / "sensor.yaml")
-        if path.is_file()
-    ]
-    return cached(sources, f"{VERSION} {about.name}", lambda: read_sequence(folder, about))
+    files = [sensor / name for sensor in sensors for name in ("data.csv", "sensor.yaml")]
+    return single(short_name(folder.name), _read_by_name, folder, about.name)._replace(
+        files=tuple(path for path in files if path.is_file()), version=f"{VERSION} {about.name}"
+    )
+
+
+def _read_by_name(folder: Path, dataset: str) -> Sequence:
+    """Another process has a `Dataset` of its own: only the name goes there."""
+    return read_sequence(folder, _about(dataset))
 
 
 def find_sequences(root: Path, about: Dataset) -> dict[str, Path]:
@@ -488,7 +472,6 @@ def _splined(
 
 EUROC = Dataset(
     name="euroc",
-    read=partial(read, dataset="euroc"),
     recordings=partial(recordings, dataset="euroc"),
     splits=SPLITS,
     rate=RATE,
@@ -499,7 +482,6 @@ EUROC = Dataset(
 )
 TUMVI = Dataset(
     name="tumvi",
-    read=partial(read, dataset="tumvi"),
     recordings=partial(recordings, dataset="tumvi"),
     splits=SPLITS,
     rate=RATE,

@@ -41,22 +41,20 @@ from jaxtyping import Float
 from scipy.ndimage import binary_dilation
 from scipy.spatial.transform import Rotation
 
+from gnio_jax.data.dataset import Dataset, Recording, single
+from gnio_jax.data.gaps import stretches
 from gnio_jax.data.readers.csv_files import in_order
 from gnio_jax.data.readers.text import shortened
-from gnio_jax.data.recordings import read_all, single
-from gnio_jax.data.sequence import (
+from gnio_jax.data.resampling import resample
+from gnio_jax.data.sequence import quaternions
+from gnio_jax.data.validation import (
     FASTEST,
     FASTEST_TURN,
     STRONGEST_FORCE,
-    Dataset,
-    Recording,
     check_finite,
     check_gaps,
     check_increasing,
     check_rate,
-    quaternions,
-    resample,
-    stretches,
     validate,
 )
 from gnio_jax.types import InputError, Sequence
@@ -129,15 +127,8 @@ class Drive(NamedTuple):
     """Its npz files; not read where there are packets."""
 
 
-def read(root: Path, split: str) -> list[Sequence]:
-    """The sequences of a split, those that fail the physical self-check named and left out."""
-    return read_all(DATASET, Path(root), split)
-
-
 def recordings(root: Path, split: str) -> list[Recording]:
     """The drives of a split, or their pieces where these are files of their own."""
-    if split not in SPLITS:
-        raise InputError(root, f"unknown split '{split}'", f"known splits: {', '.join(SPLITS)}")
     found = []
     for drive in find_drives(Path(root)):
         if share_of(drive.name) == split and drive.oxts:
@@ -463,7 +454,6 @@ def _jumps(sequence: Sequence) -> np.ndarray:
 
 DATASET = Dataset(
     name="kitti",
-    read=read,
     recordings=recordings,
     splits=SPLITS,
     rate=RATE,

@@ -24,9 +24,9 @@ from scipy.interpolate import make_interp_spline
 from scipy.signal import fftconvolve
 from scipy.spatial.transform import Rotation
 
-from gnio_jax.data.recordings import single
-from gnio_jax.data.sequence import Dataset, Recording, quaternions
-from gnio_jax.types import GRAVITY, InputError, Sequence
+from gnio_jax.data.dataset import Dataset, Recording, single
+from gnio_jax.data.sequence import quaternions
+from gnio_jax.types import GRAVITY, Sequence
 
 
 class Person(NamedTuple):
@@ -232,18 +232,9 @@ def pedestrian(
     )
 
 
-def read(root: Path | None, split: str) -> list[Sequence]:
-    """The sequences of a split, always the same ones; `root` is not used."""
-    return [sequence for recording in recordings(root, split) for sequence in recording.read()]
-
-
 def recordings(root: Path | None, split: str) -> list[Recording]:
     """The walks of a split, not yet computed."""
     del root
-    if split not in _SPLITS:
-        raise InputError(
-            "synthetic", f"unknown split '{split}'", f"known splits: {', '.join(_SPLITS)}"
-        )
     seed, first_person, people, count, seconds = _SPLITS[split]
     placements = list(PLACEMENTS)
     walks = []
@@ -406,7 +397,6 @@ def _integral(time: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 DATASET = Dataset(
     name="synthetic",
-    read=read,
     recordings=recordings,
     splits=tuple(_SPLITS),
     rate=200.0,

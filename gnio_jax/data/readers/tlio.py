@@ -17,18 +17,16 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from gnio_jax.data.dataset import Dataset, Recording, single
 from gnio_jax.data.readers.text import listed, shortened
-from gnio_jax.data.recordings import read_all, single
-from gnio_jax.data.sequence import (
-    Dataset,
-    Recording,
+from gnio_jax.data.sequence import rotations
+from gnio_jax.data.validation import (
     check_finite,
     check_gaps,
     check_increasing,
     check_motion,
     check_rate,
     check_unit_norm,
-    rotations,
     validate,
 )
 from gnio_jax.types import InputError, Sequence
@@ -45,11 +43,6 @@ _COLUMNS = {
     "pos_World_Device": 3,
     "vel_World": 3,
 }
-
-
-def read(root: Path, split: str) -> list[Sequence]:
-    """The sequences of a split, those that fail the physical self-check named and left out."""
-    return read_all(DATASET, Path(root), split)
 
 
 def recordings(root: Path, split: str) -> list[Recording]:
@@ -109,8 +102,6 @@ def read_sequence(folder: str | os.PathLike[str]) -> Sequence:
 
 
 def _listed(root: Path, split: str) -> list[Path]:
-    if split not in _LISTS:
-        raise InputError(root, f"unknown split '{split}'", f"known splits: {', '.join(_LISTS)}")
     return listed(
         root / _LISTS[split],
         lambda entry: root / entry if (root / entry / _TABLE).is_file() else None,
@@ -177,7 +168,6 @@ def _table(path: Path, width: int) -> Float[np.ndarray, "n w"]:
 
 DATASET = Dataset(
     name="tlio",
-    read=read,
     recordings=recordings,
     splits=tuple(_LISTS),
     rate=RATE,
