@@ -1,5 +1,7 @@
 """The error a user can mend. It imports nothing, so that options are checked without JAX."""
 
+from __future__ import annotations
+
 
 class InputError(ValueError):
     """A mistake a user can mend: its text is one line naming the place, the problem and the remedy.
@@ -10,3 +12,7 @@ class InputError(ValueError):
     def __init__(self, where: object, problem: str, remedy: str = ""):
         parts = [f"{where}: {problem}", remedy]
         super().__init__("; ".join(part for part in parts if part).replace("\n", " "))
+        self.parts = (str(where), problem, remedy)
+
+    def __reduce__(self) -> tuple[type[InputError], tuple[str, str, str]]:
+        return type(self), self.parts  # so that it can come from another process

@@ -10,8 +10,8 @@ from rich.table import Table
 
 from gnio_jax.data import registry
 from gnio_jax.data.checking import CheckedSequence
-from gnio_jax.data.recordings import in_splits
-from gnio_jax.data.sequence import Dataset
+from gnio_jax.data.dataset import Dataset
+from gnio_jax.data.reading import find_recordings
 from gnio_jax.errors import InputError
 
 _CHECK_COLUMNS = (
@@ -53,7 +53,7 @@ def _found_here(dataset: Dataset) -> str:
         return "not found"
     place = f"{root}: " if dataset.needs_root else "computed: "
     try:
-        found, splits, _ = in_splits(dataset, root, "all")
+        found, splits, _ = find_recordings(dataset, root, "all")
     except InputError as error:
         return f"{place}no recording ({error})"
     counts = ", ".join(f"{split} {len(names)}" for split, names in splits.items())

@@ -10,6 +10,7 @@ from gnio_jax import config as configuration
 from gnio_jax.commands import console
 from gnio_jax.commands.options import Command, execute
 from gnio_jax.config import EvaluateConfig
+from gnio_jax.cores import usable_cores
 
 DESCRIPTION = """Estimate the trajectories of a split with a trained network and report the errors.
 
@@ -45,7 +46,7 @@ def evaluate(config: EvaluateConfig, _prog: str) -> None:
     jax.config.update("jax_enable_x64", True)  # for the filter; the network states its float32
     filtering.cores_as_devices()
     with console.terminal() as terminal:
-        found, folder = evaluation.evaluate(config, terminal.progress)
+        found, folder = evaluation.evaluate(config, terminal.progress, usable_cores())
     console.stdout().print(report.table(found))
     print(f"results: {folder}")
     if config.plots:

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from gnio_jax.commands import console
 from gnio_jax.commands.options import Command, execute
 from gnio_jax.config import TablesConfig
+from gnio_jax.cores import usable_cores
 
 DESCRIPTION = """Make one of the paper's tables anew: train and evaluate its rows, side by side.
 
@@ -40,7 +41,7 @@ def make(options: TablesConfig, _prog: str) -> None:
     filtering.cores_as_devices()
     try:
         with console.terminal() as terminal:
-            text = making.make(options, terminal)
+            text = making.make(options, terminal, usable_cores())
     except matrix.Interrupted as stopped:
         print("stopped and saved; the same command goes on from here", file=sys.stderr)
         sys.exit(128 + stopped.signum)

@@ -13,6 +13,7 @@ from gnio_jax import config as configuration
 from gnio_jax.commands import console
 from gnio_jax.commands.options import Command, execute, sibling
 from gnio_jax.config import TrainConfig
+from gnio_jax.cores import usable_cores
 
 DESCRIPTION = """Train a network and leave a run: config.yaml, checkpoints, logs in its work folder.
 
@@ -61,7 +62,7 @@ def train(options: TrainOptions, prog: str) -> None:
 
     with console.terminal() as terminal:
         try:
-            outcome = loop.train(options.experiment(), options.resume, terminal)
+            outcome = loop.train(options.experiment(), options.resume, terminal, usable_cores())
         except FloatingPointError as error:
             terminal.line(str(error))
             sys.exit(1)

@@ -11,8 +11,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gnio_jax.data import registry
-from gnio_jax.data.recordings import each, examine, in_splits
-from gnio_jax.data.sequence import Dataset, Recording, SelfCheck
+from gnio_jax.data.dataset import Dataset, Recording
+from gnio_jax.data.plausibility import SelfCheck
+from gnio_jax.data.processes import map_in_processes, suggested_workers
+from gnio_jax.data.reading import check_recording, find_recordings
 from gnio_jax.errors import InputError
 from gnio_jax.files import file_stem
 from gnio_jax.types import Sequence
@@ -47,14 +49,18 @@ def check(
     root: Path,
     split: str = "all",
     pictures: Path | None = None,
-    workers: int | None = None,
+    workers: int | None = 1,
     progress: Callable[[float], None] = lambda share: None,
 ) -> Checked:
-    """Read every recording of a split (or of all) and check it; `pictures` is a folder for a picture
-    of each. `progress` is told the share that is done."""
-    found, splits, notes = in_splits(dataset, root, split)
+    """Read every recording of a split (or of all) and check it.
+
+    `pictures` is a folder for a picture of each. `workers` processes share the work (None: as
+    many as are worth starting), and `progress` is told the share that is done.
+    """
+    found, splits, notes = find_recordings(dataset, root, split)
     items = [(recording, dataset, pictures) for recording in found.values()]
-    results = list(each(_check_recording, items, workers, progress))
+    count = workers or suggested_workers(len(items))
+    results = list(map_in_processes(_figures_of, items, count, progress))
     rows = []
     for name, (checks, problem, warned) in zip(found, results, strict=True):
         own = _splits_of(name, splits)
@@ -68,12 +74,12 @@ def check(
     return Checked(rows, notes)
 
 
-def _check_recording(
+def _figures_of(
     recording: Recording, dataset: Dataset, pictures: Path | None
 ) -> tuple[list[tuple[str, SelfCheck]], str, tuple[str, ...]]:
     """The figures of one recording, why there are none, and the notes; without the sequences, which
     are large."""
-    found = examine(recording, dataset)
+    found = check_recording(recording, dataset)
     if pictures is not None and found.sequences:
         from gnio_jax.data import pictures as draw  # Matplotlib takes a second to import
 
@@ -130,7 +136,7 @@ def _dataset_of(root: Path) -> Dataset:
 
 def _fits(dataset: Dataset, root: Path) -> bool:
     try:
-        in_splits(dataset, root, "all")
+        find_recordings(dataset, root, "all")
     except InputError:
         return False
     return True

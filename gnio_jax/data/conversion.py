@@ -8,8 +8,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from gnio_jax.data.recordings import each, examine, in_splits
-from gnio_jax.data.sequence import Dataset, Recording, read_hdf5, resample, write_hdf5
+from gnio_jax.data.dataset import Dataset, Recording
+from gnio_jax.data.hdf5 import read_hdf5, write_hdf5
+from gnio_jax.data.processes import map_in_processes, suggested_workers
+from gnio_jax.data.reading import check_recording, find_recordings
+from gnio_jax.data.resampling import resample
 from gnio_jax.errors import InputError
 from gnio_jax.files import file_stem, write_text
 
@@ -51,24 +54,27 @@ def convert(
     out: Path,
     split: str = "all",
     rate: float | None = None,
-    workers: int | None = None,
+    workers: int | None = 1,
     progress: Callable[[float], None] = lambda share: None,
 ) -> Conversion:
     """Write the sequences that pass the self-check below `out`, and the list of each split.
 
     What is there already, whole and with the same settings, is not written again. `rate`: Hz, None
-    keeps each recording's own. `progress` is told the share that is done. Raises `InputError` when
+    keeps each recording's own. `workers` processes share the work (None: as
+    many as are worth starting), and `progress` is told the share that is done. Raises `InputError` when
     `out` is the folder of another conversion, or two recordings would be one file.
     """
     if dataset.needs_root and out.resolve() == root.resolve():
         raise InputError(out, "is the folder that is read", "choose another one for the result")
-    found, splits, notes = in_splits(dataset, root, split)
+    found, splits, notes = find_recordings(dataset, root, split)
     _refuse_same_files(root, list(found))
     _claim(out, {"dataset": dataset.name, "rate": rate})
     done = {name: entry for name in found if (entry := _journal_entry(out, name)) is not None}
     missing = [name for name in found if name not in done]
     items = [(found[name], dataset, out, rate) for name in missing]
-    done |= zip(missing, each(_convert_recording, items, workers, progress), strict=True)
+    count = workers or suggested_workers(len(items))
+    converted = map_in_processes(_convert_recording, items, count, progress)
+    done |= zip(missing, converted, strict=True)
     conversion = Conversion({name: done[name] for name in found}, splits, notes)
     _write_lists(out, conversion)
     return conversion
@@ -120,7 +126,7 @@ def _convert_recording(
     recording: Recording, dataset: Dataset, out: Path, rate: float | None
 ) -> Converted:
     """Write the sequences of a recording that pass the self-check."""
-    found = examine(recording, dataset)
+    found = check_recording(recording, dataset)
     if found.problem:  # not noted as done: it may be mended
         return Converted((), {recording.name: found.problem}, 0.0, found.notes, False)
     kept, left_out, seconds = [], {}, 0.0

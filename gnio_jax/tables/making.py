@@ -21,21 +21,22 @@ Extra = dict[str, dict[str, float]]
 """Figures of a table beside the common ones: row -> heading -> value."""
 
 
-def make(options: TablesConfig, reporter: Reporter | None = None) -> str:
+def make(options: TablesConfig, reporter: Reporter | None = None, workers: int = 1) -> str:
     """Make a table: train and evaluate what is missing, write the files, return what to show.
 
-    Raises `InputError` for options that make no sense, and `matrix.Interrupted` after a signal.
+    `workers` processes read recordings that are slow to read. Raises `InputError` for options that
+    make no sense, and `matrix.Interrupted` after a signal.
     """
     reporter = reporter or Lines()
     match options.table:
         case "complexity":
             return make_complexity(options, reporter)
         case "trajectories":
-            return make_trajectories(options, reporter)
+            return make_trajectories(options, reporter, workers)
         case "standing":
-            return make_standing(options, reporter)
+            return make_standing(options, reporter, workers)
         case _:
-            return make_table(options, reporter)
+            return make_table(options, reporter, workers)
 
 
 def base_config(options: TablesConfig) -> TrainConfig:
@@ -89,20 +90,18 @@ def experiment_of(options: TablesConfig, base: TrainConfig) -> Experiment:
             return experiments.comparison(base, options.split, networks(options))
 
 
-def results_of(experiment: Experiment, options: TablesConfig, reporter: Reporter) -> list[Result]:
+def results_of(
+    experiment: Experiment, options: TablesConfig, reporter: Reporter, workers: int
+) -> list[Result]:
     """Every row trained and evaluated."""
-    folder, split, estimator = Path(options.out) / "runs", options.split, options.estimator
-    return [
-        matrix.run_cell(cell, options.seeds, folder, split, estimator, reporter)
-        for cell in experiment.cells
-    ]
+    return [matrix.run_cell(cell, options, reporter, workers) for cell in experiment.cells]
 
 
-def make_table(options: TablesConfig, reporter: Reporter) -> str:
+def make_table(options: TablesConfig, reporter: Reporter, workers: int) -> str:
     """comparison, components, gates, bank-size, bank-spread, uncertainty."""
     base = base_config(options)
     experiment = experiment_of(options, base)
-    results = results_of(experiment, options, reporter)
+    results = results_of(experiment, options, reporter, workers)
     path, extra = _path(options), {}
     if options.table == "gates":
         extra = _gradient_norms(results)
@@ -162,10 +161,10 @@ def make_complexity(options: TablesConfig, reporter: Reporter) -> str:
     return f"{text}\nresults: {path}"
 
 
-def make_trajectories(options: TablesConfig, reporter: Reporter) -> str:
+def make_trajectories(options: TablesConfig, reporter: Reporter, workers: int) -> str:
     """All methods over the reference in one picture, with the first seed of each."""
     experiment = experiment_of(options, base_config(options))
-    results = results_of(experiment, dataclasses.replace(options, seeds=1), reporter)
+    results = results_of(experiment, dataclasses.replace(options, seeds=1), reporter, workers)
     paths = {
         result.cell.name: matrix.paths(result, options.split, options.estimator)
         for result in results
@@ -188,11 +187,11 @@ def make_trajectories(options: TablesConfig, reporter: Reporter) -> str:
     return f"picture: {path}"
 
 
-def make_standing(options: TablesConfig, reporter: Reporter) -> str:
+def make_standing(options: TablesConfig, reporter: Reporter, workers: int) -> str:
     """Errors at rest and in slow walking, gate and attention: where the gate's claim stands."""
     base = base_config(options)
     experiment = experiment_of(options, base)
-    results = results_of(experiment, options, reporter)
+    results = results_of(experiment, options, reporter, workers)
     path, lines, by_method = _path(options), [], {}
     for result in results:
         seeds = [windows.said(run, options.split) for run in result.runs]

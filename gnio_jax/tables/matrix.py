@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from gnio_jax import config as configuration
 from gnio_jax import evaluation
-from gnio_jax.config import EvaluateConfig
+from gnio_jax.config import EvaluateConfig, TablesConfig
 from gnio_jax.evaluation import metrics, report
 from gnio_jax.evaluation.metrics import Trajectory
 from gnio_jax.evaluation.run import folder_name
@@ -40,26 +40,24 @@ class Result(NamedTuple):
     """Their work folders."""
 
 
-def run_cell(
-    cell: Cell, seeds: int, folder: Path, split: str, estimator: str, reporter: Reporter
-) -> Result:
-    """Train and evaluate a cell with seeds 0 … seeds−1 below `folder`.
+def run_cell(cell: Cell, options: TablesConfig, reporter: Reporter, workers: int = 1) -> Result:
+    """Train and evaluate a cell with seeds 0 … seeds−1 below OUT/runs.
 
     A run that is finished is not trained again, one that was interrupted goes on, an evaluation
     that is there is read. Raises `InputError` if a folder holds a run with other settings, and
-    `Interrupted` after a signal.
+    `Interrupted` after a signal. `workers` processes read recordings that are slow to read.
     """
     figures, runs = [], []
-    for seed in range(seeds):
-        workdir = folder / f"{cell.name}_s{seed}"
+    for seed in range(options.seeds):
+        workdir = Path(options.out) / "runs" / f"{cell.name}_s{seed}"
         config = dataclasses.replace(cell.config, seed=seed, workdir=str(workdir))
-        train(config, reporter)
-        figures.append(evaluated(workdir, split, estimator, reporter))
+        train(config, reporter, workers)
+        figures.append(evaluated(workdir, options.split, options.estimator, reporter, workers))
         runs.append(workdir)
     return Result(cell, figures, runs)
 
 
-def train(config: configuration.TrainConfig, reporter: Reporter) -> None:
+def train(config: configuration.TrainConfig, reporter: Reporter, workers: int = 1) -> None:
     """Train the run of `config` to its end, if it is not there yet."""
     workdir = Path(config.workdir or "")
     begun = (workdir / "config.yaml").exists()
@@ -69,12 +67,14 @@ def train(config: configuration.TrainConfig, reporter: Reporter) -> None:
         if log.exists() and log.read_text(encoding="utf-8").count("\n") >= config.optim.epochs:
             return
     reporter.line(f"── {workdir.name}")
-    outcome = loop.train(config, resume=begun, reporter=reporter)
+    outcome = loop.train(config, resume=begun, reporter=reporter, workers=workers)
     if outcome.stopped_by:
         raise Interrupted(outcome.stopped_by)
 
 
-def evaluated(workdir: Path, split: str, estimator: str, reporter: Reporter) -> dict[str, Any]:
+def evaluated(
+    workdir: Path, split: str, estimator: str, reporter: Reporter, workers: int = 1
+) -> dict[str, Any]:
     """The figures of the run's best checkpoint on a split: those that are there if they are of that
     checkpoint and mean the same (`report.DEFINITIONS`), else new ones."""
     config, folder = _evaluation(workdir, split, estimator)
@@ -86,7 +86,7 @@ def evaluated(workdir: Path, split: str, estimator: str, reporter: Reporter) -> 
         if same and (best / str(found["settings"]["step"])).is_dir():
             return found
     reporter.line(f"evaluating {workdir.name} on {split} ({estimator})")
-    evaluation.evaluate(config)
+    evaluation.evaluate(config, workers=workers)
     return json.loads(path.read_text(encoding="utf-8"))
 
 

@@ -48,24 +48,30 @@ class Outcome(NamedTuple):
     """Signal that ended it early; its state is saved."""
 
 
-def train(config: TrainConfig, resume: bool = False, reporter: Reporter | None = None) -> Outcome:
+def train(
+    config: TrainConfig,
+    resume: bool = False,
+    reporter: Reporter | None = None,
+    workers: int = 1,
+) -> Outcome:
     """Train the network of `config` and leave checkpoints and logs in its work folder.
 
     With `resume` the run goes on from its latest checkpoint as if it had never stopped: parameters,
     optimizer, order of the windows and random draws are functions of the seed and the step. Resume
     rules, in order: the settings must be those of config.yaml; without a checkpoint yet the run
     starts over; log rows after the checkpoint are dropped. SIGTERM and Ctrl-C save and return; a
-    loss that is not finite raises `FloatingPointError` naming the step.
+    loss that is not finite raises `FloatingPointError` naming the step. `workers` processes read
+    recordings that are slow to read (`data.load`).
     """
     # Whatever the process has: no float64 in the step, and the same random draws.
     with jax.enable_x64(False):
-        return _train(config, resume, reporter or Lines())
+        return _train(config, resume, reporter or Lines(), workers)
 
 
-def _train(config: TrainConfig, resume: bool, reporter: Reporter) -> Outcome:
+def _train(config: TrainConfig, resume: bool, reporter: Reporter, workers: int) -> Outcome:
     configuration.validate(config)
     workdir = run_folder.prepare(config, resume)
-    run = set_up(config, reporter)
+    run = set_up(config, reporter, workers)
     state = create_state(run.model, run.optimizer, run.keys.init, config.data.window)
     describe(run, sum(x.size for x in jax.tree.leaves(state.params)), workdir, reporter)
     run_folder.write_settings(workdir, config, run.splits, resume)

@@ -49,18 +49,20 @@ class Run(NamedTuple):
         return self.config.optim.epochs * self.steps_per_epoch
 
 
-def set_up(config: TrainConfig, reporter: Reporter) -> Run:
+def set_up(config: TrainConfig, reporter: Reporter, workers: int = 1) -> Run:
     """Load the recordings and make everything of a run but its state.
 
     Raises `InputError` for options that the network does not have, missing data, and a batch that
-    is larger than the split.
+    is larger than the split. `workers` processes read recordings that are slow to read.
     """
     model = create_model(config)  # a mistake in its options should not wait for the data
     train, val = config.data.train_split, config.data.val_split
     reporter.line(f"reading {config.dataset}: {train} and {val}")
     shift = config.augment.shift_samples
-    source, learnt_from = _windows(config, train, config.data.train_stride, shift, reporter)
-    held_out, validated_with = _windows(config, val, config.data.stride, 0, reporter)
+    source, learnt_from = _windows(
+        config, train, config.data.train_stride, shift, reporter, workers
+    )
+    held_out, validated_with = _windows(config, val, config.data.stride, 0, reporter, workers)
     count, size = source.visited.shape[0], config.optim.batch_size
     if count < size:
         problem = f"is {size}, but there are only {count} windows"
@@ -85,13 +87,17 @@ def _keys(seed: int) -> Keys:
 
 
 def _windows(
-    config: TrainConfig, split: str, stride: int, shift: int, reporter: Reporter
+    config: TrainConfig, split: str, stride: int, shift: int, reporter: Reporter, workers: int
 ) -> tuple[windows.WindowSource, list[str]]:
     """The windows of a split on the device, and the names of its recordings."""
-    sequences = [
-        data.resample(sequence, config.data.rate)
-        for sequence in data.load(config.dataset, config.data_root, split)
-    ]
+    loaded = data.load(
+        config.dataset,
+        config.data_root,
+        split,
+        workers,
+        lambda share: reporter.progress(f"reading {split}", share),
+    )
+    sequences = [data.resample(sequence, config.data.rate) for sequence in loaded]
     source = windows.window_source(sequences, config.data, stride, shift)
     hours = sum(len(sequence.time) for sequence in sequences) / config.data.rate / 3600
     count = source.visited.shape[0]
