@@ -279,8 +279,8 @@ def convert(options: ConvertOptions, prog: str) -> None:
 def import_file(options: ImportOptions, prog: str) -> None:
     """Write the file, say what was assumed and what it looks like, and what to do with it."""
     from gnio_jax.data.checking import impressions
-    from gnio_jax.data.readers import csv_files
     from gnio_jax.data.hdf5 import write_hdf5
+    from gnio_jax.data.readers import csv_files
 
     if options.out.suffix.lower() not in (".h5", ".hdf5"):
         raise InputError("--out", f"'{options.out}' is no name of an HDF5 file", "name it NAME.h5")

@@ -60,9 +60,9 @@ def convert(
     """Write the sequences that pass the self-check below `out`, and the list of each split.
 
     What is there already, whole and with the same settings, is not written again. `rate`: Hz, None
-    keeps each recording's own. `workers` processes share the work (None: as
-    many as are worth starting), and `progress` is told the share that is done. Raises `InputError` when
-    `out` is the folder of another conversion, or two recordings would be one file.
+    keeps each recording's own. `workers` processes share the work (None: as many as are worth
+    starting), and `progress` is told the share that is done. Raises `InputError` when `out` is the
+    folder of another conversion, or two recordings would be one file.
     """
     if dataset.needs_root and out.resolve() == root.resolve():
         raise InputError(out, "is the folder that is read", "choose another one for the result")

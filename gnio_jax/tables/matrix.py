@@ -23,7 +23,7 @@ from gnio_jax.training import loop, run_folder
 
 
 class Interrupted(Exception):
-    """A signal asked a training run to stop; it is saved, and the same command goes on from there."""
+    """A signal has stopped a training run; it is saved, and the same command continues it."""
 
     def __init__(self, signum: int):
         super().__init__(signum)
