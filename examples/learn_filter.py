@@ -70,12 +70,12 @@ class Pieces(NamedTuple):
     true_position: Any
 
 
-def cut(recordings: list, intervals: int, stride: int) -> Pieces:
+def cut(prepared: list, intervals: int, stride: int) -> Pieces:
     """All pieces of `intervals` strides, one after the other, in which the reference can be trusted
     throughout."""
     length, found = intervals * stride, []
-    for recording in recordings:
-        s = recording.sequence
+    for each in prepared:
+        s = each.sequence
         for begin in range(0, len(s.time) - length, length):
             ends = begin + stride * np.arange(1, intervals + 1)
             if (
@@ -142,16 +142,15 @@ def objective(model, filter_config, std, variables):
     return loss
 
 
-def scored(model, variables, options, recordings, config, groups, progress, what):
+def scored(model, variables, options, prepared, config, groups, progress, what):
     """ate, NIS and NEES of the test split, averaged over its sequences."""
     from gnio_jax import evaluation, models
-    from gnio_jax.evaluation import report
 
     network = evaluation.Network(models.Inference(model), models.freeze(model, variables))
     estimates = evaluation.estimate(
-        recordings, network, config.data, options, progress=lambda share: progress(what, share)
+        prepared, network, config.data, options, progress=lambda share: progress(what, share)
     )
-    sequences = report.score(estimates, groups).sequences.values()
+    sequences = evaluation.score(estimates, groups).sequences.values()
     return {
         name: float(np.mean([m.values[name] for m in sequences if m.values.get(name) is not None]))
         for name in ("ate", "nis", "nees")
@@ -164,8 +163,7 @@ def main() -> None:
     if options.steps < 1 or options.batch_size < 1:
         raise InputError("--steps and --batch-size", "must be at least 1")
 
-    from gnio_jax import data, evaluation, filtering
-    from gnio_jax.evaluation.odometry import filter_config
+    from gnio_jax import data, evaluation
     from gnio_jax.files import replacing
     from gnio_jax.training import checkpoint
 
@@ -184,9 +182,8 @@ def main() -> None:
         parts[options.test_split],
     )
 
-    setup = dataclasses.replace(
-        filter_config(config.data, config.filter), gate_softness=2.0, checkpoint_every=20
-    )
+    the_filter = evaluation.filter_setup(config.data, config.filter)
+    soft = dataclasses.replace(the_filter.config, gate_softness=2.0, checkpoint_every=20)
     intervals = round(options.seconds / config.data.stride_seconds)
     pieces = cut(learning, intervals, config.data.stride)
     if len(pieces.rotation) < options.batch_size:
@@ -195,18 +192,9 @@ def main() -> None:
             f"gives {len(pieces.rotation)} pieces, fewer than --batch-size {options.batch_size}",
             "make them shorter",
         )
-    f = config.filter
-    std = filtering.InitialStd(
-        np.radians(f.tilt_std_degrees),
-        np.radians(f.yaw_std_degrees),
-        f.velocity_std,
-        f.position_std,
-        f.gyro_bias_std,
-        f.accel_bias_std,
-    )
-    names = ("gyro_density", "accel_density", "gyro_bias_walk", "accel_bias_walk")
+    names = the_filter.noise._fields
     learnt = {
-        "noise": jnp.log(jnp.array([getattr(f, name) for name in names])),
+        "noise": jnp.log(jnp.array(the_filter.noise)),
         "head": run.variables["params"]["uncertainty"],
     }
     optimizer = optax.chain(
@@ -219,7 +207,7 @@ def main() -> None:
             {"noise": "noise", "head": "head"},
         ),
     )
-    loss = objective(run.model, setup, std, run.variables)
+    loss = objective(run.model, soft, the_filter.initial_std, run.variables)
 
     @jax.jit
     def step(learnt, state, batch):
@@ -230,7 +218,14 @@ def main() -> None:
     rng, state, values = np.random.default_rng(options.seed), optimizer.init(learnt), []
     with cli.progress() as progress:
         before = scored(
-            run.model, run.variables, f, testing, config, groups, progress, "estimating as it was"
+            run.model,
+            run.variables,
+            config.filter,
+            testing,
+            config,
+            groups,
+            progress,
+            "estimating as it was",
         )
         for index in range(options.steps):
             chosen = rng.choice(len(pieces.rotation), options.batch_size, replace=False)
@@ -252,7 +247,7 @@ def main() -> None:
         after = scored(
             run.model,
             variables,
-            dataclasses.replace(f, **found),
+            dataclasses.replace(config.filter, **found),
             testing,
             config,
             groups,
@@ -261,7 +256,9 @@ def main() -> None:
         )
 
     rows = [f"| {name} | {before[name]:.3g} | {after[name]:.3g} |" for name in before]
-    rows += [f"| {name} | {getattr(f, name):.3g} | {found[name]:.3g} |" for name in names]
+    rows += [
+        f"| {name} | {getattr(the_filter.noise, name):.3g} | {found[name]:.3g} |" for name in names
+    ]
     table = "\n".join(
         [
             f"| {config.dataset} {options.test_split}, n = {len(testing)} | before | after |",

@@ -75,29 +75,16 @@ def main() -> None:
     stamps, gyro, accel = read(path)
 
     from gnio_jax import models
-    from gnio_jax.evaluation import odometry, plots
-    from gnio_jax.evaluation.metrics import Trajectory
-    from gnio_jax.evaluation.report import write_tum
+    from gnio_jax.evaluation import Estimate, Trajectory, filter_setup, plots
+    from gnio_jax.evaluation.tum import write_tum
     from gnio_jax.files import replacing
-    from gnio_jax.filtering import InitialStd, NoiseModel, Tracker
+    from gnio_jax.filtering import Tracker
     from gnio_jax.training import checkpoint
 
     run = checkpoint.load_run(
         Path(options.workdir) if options.workdir else configuration.newest_run()
     )
-    chosen = run.config.filter
-    config = odometry.filter_config(run.config.data, chosen)
-    noise = NoiseModel(
-        chosen.gyro_density, chosen.accel_density, chosen.gyro_bias_walk, chosen.accel_bias_walk
-    )
-    std = InitialStd(
-        np.radians(chosen.tilt_std_degrees),
-        np.radians(chosen.yaw_std_degrees),
-        chosen.velocity_std,
-        chosen.position_std,
-        chosen.gyro_bias_std,
-        chosen.accel_bias_std,
-    )
+    config, noise, std = filter_setup(run.config.data, run.config.filter)
     if len(stamps) < 2:
         raise InputError(path, "holds a single sample", "record a walk of some seconds")
     interval = float(np.median(np.diff(stamps)))
@@ -165,7 +152,7 @@ def main() -> None:
     with replacing(picture) as temporary:
         plots.save(
             temporary,
-            plots.trajectory(odometry.Estimate(path.stem, estimated, unknown), alignment="none"),
+            plots.trajectory(Estimate(path.stem, estimated, unknown), alignment="none"),
         )
 
     length = float(np.linalg.norm(np.diff(estimated.position, axis=0), axis=1).sum())
