@@ -13,11 +13,15 @@ from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
 from gnio_jax.config import DataConfig
-from gnio_jax.data.sequence import cumulative_rotation
 from gnio_jax.data.windows import WindowSource, gather
-from gnio_jax.evaluation.metrics import finite_rows, rotation_z
 from gnio_jax.evaluation.preparation import Prepared
 from gnio_jax.evaluation.setup import OnShare, Orientation, no_progress
+from gnio_jax.numerics import (
+    cumulative_rotation,
+    finite_rows,
+    matrix_from_quaternion,
+    yaw_rotation,
+)
 from gnio_jax.types import InputError, Prediction
 
 WINDOWS_PER_CALL = 512
@@ -62,19 +66,13 @@ def attitude(
         raise InputError(
             sequence.name, f"has no {source} orientation at its start", "give --orientation filter"
         )
-    given = np.where(known[:, None], given, [1.0, 0, 0, 0])
-    rotation = Rotation.from_quat(given, scalar_first=True).as_matrix()
+    rotation = matrix_from_quaternion(given)
     if source == "device":
         start, device_start = yaw_rotation(np.stack([prepared.start.rotation, rotation[0]]))
         rotation = start @ device_start.T @ rotation
     last_known = np.maximum.accumulate(np.where(known, np.arange(len(known)), 0))
     turned_since = np.einsum("tji,tjk->tik", integrated[last_known], integrated)
     return np.where(known[:, None, None], rotation, rotation[last_known] @ turned_since)
-
-
-def yaw_rotation(rotation: Float[np.ndarray, "m 3 3"]) -> Float[np.ndarray, "m 3 3"]:
-    """R_γ: the rotation about z by the yaw atan2(R[1,0], R[0,0])."""
-    return rotation_z(np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0]))
 
 
 def predict_windows(
@@ -154,8 +152,8 @@ def _windows(
 def _integrated_gyro(prepared: Prepared, config: DataConfig) -> Float[np.ndarray, "t 3 3"]:
     """Body→world from the gyro without its bias, from the start."""
     rates = prepared.sequence.gyro[:-1] - prepared.gyro_bias
-    turned = cumulative_rotation(Rotation.from_rotvec(rates / config.rate)).as_matrix()
-    return prepared.start.rotation @ np.concatenate([np.eye(3)[None], turned])
+    turned = cumulative_rotation(Rotation.from_rotvec(rates / config.rate))
+    return prepared.start.rotation @ turned.as_matrix()
 
 
 def true_displacements(prepared: Prepared, config: DataConfig) -> Float[np.ndarray, "m 3"]:
@@ -166,10 +164,6 @@ def true_displacements(prepared: Prepared, config: DataConfig) -> Float[np.ndarr
     moved = sequence.position[start + length] - sequence.position[start]
     good = np.asarray(sequence.valid[start] & sequence.valid[start + length])
     result = np.full_like(moved, np.nan)
-    turn = (
-        Rotation.from_quat(sequence.orientation[start[good]], scalar_first=True).as_matrix()
-        if good.any()
-        else np.zeros((0, 3, 3))
-    )
+    turn = matrix_from_quaternion(sequence.orientation[start[good]])
     result[good] = np.einsum("mji,mj->mi", yaw_rotation(turn), moved[good])
     return result

@@ -19,9 +19,9 @@ from matplotlib.ticker import PercentFormatter
 from gnio_jax.evaluation import metrics
 from gnio_jax.evaluation.estimators.result import Estimate
 from gnio_jax.evaluation.metrics import AlignmentMethod, Trajectory, Undefined
-from gnio_jax.evaluation.metrics.rotations import spans
 from gnio_jax.evaluation.report import Report, file_names
 from gnio_jax.evaluation.setup import OnShare, no_progress
+from gnio_jax.numerics import finite_rows, rotation_z, spans, yaw_from_quaternion
 
 BLUE, VERMILION, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#8C8C8C"
 AXES = {"x": BLUE, "y": VERMILION, "z": GREEN}
@@ -214,7 +214,7 @@ def _draw_sample_errors(axes: Axes, estimates: list[Estimate], alignment: Alignm
     for e in estimates:
         path = _aligned(e, alignment).position
         error = np.linalg.norm((path - e.reference.position)[:, :2], axis=1)
-        error = error[metrics.finite_rows(e.reference.position)]
+        error = error[finite_rows(e.reference.position)]
         if len(error):
             _step(axes, error, color=BLUE, lw=0.7, alpha=0.25)
             samples.append(error)
@@ -287,7 +287,7 @@ def _error_in_filter_frame(estimate: Estimate) -> Float[np.ndarray, "k 3"]:
     """Position error of the start-aligned estimate, m, in the frame of the filter's covariance."""
     aligned = _aligned(estimate, "origin")
     start, aligned_start = (path.orientation[:1] for path in (estimate.trajectory, aligned))
-    turn = metrics.rotation_z(metrics.relative_yaw(start, aligned_start)[0])
+    turn = rotation_z(metrics.relative_yaw(start, aligned_start)[0])
     return (aligned.position - estimate.reference.position) @ turn.T
 
 
@@ -296,7 +296,7 @@ def _true_displacement(estimate: Estimate, rows: int) -> Float[np.ndarray, "k 3"
     reference = estimate.reference
     found = np.full_like(reference.position, np.nan)
     if rows < len(found):
-        unyaw = metrics.rotation_z(-metrics.yaw(reference.orientation[:-rows]))
+        unyaw = rotation_z(-yaw_from_quaternion(reference.orientation[:-rows]))
         moved = reference.position[rows:] - reference.position[:-rows]
         found[rows:] = np.einsum("kij,kj->ki", unyaw, moved)
     return found

@@ -7,13 +7,13 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation
 
 from gnio_jax import data
 from gnio_jax.config import DataConfig, FilterOptions
-from gnio_jax.evaluation.metrics import Trajectory, finite_rows
+from gnio_jax.evaluation.metrics import Trajectory
 from gnio_jax.evaluation.setup import DEFAULT_SETUP, Setup, filter_setup, resolve
 from gnio_jax.filtering import level_state
+from gnio_jax.numerics import finite_rows, matrix_from_quaternion, rotations
 from gnio_jax.types import InputError, Sequence
 
 REST_GYRO_STD = 0.01
@@ -141,7 +141,7 @@ def _start(sequence: Sequence, config: DataConfig, setup: Setup) -> tuple[Start,
     """The start that `setup.init` asks for, with what a reader should know of it."""
     if setup.init == "static":
         return _static_start(sequence, config)
-    rotation = Rotation.from_quat(sequence.orientation[0], scalar_first=True).as_matrix()
+    rotation = matrix_from_quaternion(sequence.orientation[0])
     velocity = sequence.velocity[0]
     velocity = velocity if np.isfinite(velocity).all() else np.zeros(3)
     return Start(rotation, velocity, sequence.position[0]), ""
@@ -204,9 +204,7 @@ def _gyro_bias_from_reference(sequence: Sequence, rate: float) -> GyroBias:
     if len(rows) < rate:
         note = "gyro bias: under 1 s of reference at the start, so it starts from zero"
         return GyroBias(np.zeros(3), note)
-    before, after = (
-        Rotation.from_quat(sequence.orientation[r], scalar_first=True) for r in (rows, rows + 1)
-    )
+    before, after = (rotations(sequence.orientation[each]) for each in (rows, rows + 1))
     true_rate = (before.inv() * after).as_rotvec() * rate
     note = f"gyro bias: {len(rows) / rate:g} s against the reference orientation"
     return GyroBias((sequence.gyro[rows] - true_rate).mean(0), note)

@@ -6,7 +6,8 @@ from scipy.spatial.transform import Rotation
 
 from gnio_jax import evaluation
 from gnio_jax.config import DataConfig
-from gnio_jax.evaluation import Setup, metrics
+from gnio_jax.evaluation import Setup
+from gnio_jax.numerics import yaw_from_quaternion
 from tests.support.estimators import CONFIG, INTEGRATE, NETWORK, RATE, rotations, unyaw
 
 
@@ -59,12 +60,12 @@ def test_attitudes(walks):
     np.testing.assert_allclose(device, turn @ own, atol=1e-12)
     start = walks[0].orientation[:1]
     np.testing.assert_allclose(
-        metrics.yaw(
+        yaw_from_quaternion(
             rotations(Rotation.from_matrix(device[:1]).as_quat(scalar_first=True)).as_quat(
                 scalar_first=True
             )
         ),
-        metrics.yaw(start),
+        yaw_from_quaternion(start),
         atol=1e-12,
     )
 

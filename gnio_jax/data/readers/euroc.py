@@ -40,7 +40,7 @@ from jaxtyping import Float
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline, Slerp
 
-from gnio_jax.data.alignment import follow, integrate_gyro, smooth_positions
+from gnio_jax.data.alignment import fuse_attitude, smooth_positions
 from gnio_jax.data.cache import cached
 from gnio_jax.data.readers.csv_files import in_order
 from gnio_jax.data.readers.text import numbers, read_csv, shortened
@@ -57,6 +57,7 @@ from gnio_jax.data.sequence import (
     rotations,
     validate,
 )
+from gnio_jax.numerics import integrate_gyro
 from gnio_jax.types import InputError, Sequence
 
 RATE = 200.0
@@ -459,7 +460,9 @@ def _fuse(
         if both.any()
         else np.zeros(3)
     )
-    fused, believed_turn = follow(integrate_gyro(clocked.gyro - bias, step), turned, measured, step)
+    fused, believed_turn = fuse_attitude(
+        integrate_gyro(clocked.gyro - bias, step), turned, measured, step
+    )
     smooth, speed, believed_place = smooth_positions(
         _splined(at, seen, position, straight, usual), measured, step
     )

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from gnio_jax.evaluation.estimators.result import Estimate, quaternions
+from gnio_jax.evaluation.estimators.result import Estimate
 from gnio_jax.evaluation.inference import Network, keep_diagnostics
 from gnio_jax.evaluation.metrics import Trajectory
 from gnio_jax.evaluation.preparation import Prepared
@@ -30,6 +30,7 @@ from gnio_jax.filtering import (
     run_filter,
     run_odometry,
 )
+from gnio_jax.numerics import quaternion_from_matrix
 from gnio_jax.types import Array
 
 POSITION = slice(6, 9)
@@ -199,7 +200,7 @@ def _estimate(prepared: Prepared, history: FilterHistory, setup: FilterSetup) ->
         since = time[np.argmin(healthy)] - time[0]
         notes = (*notes, f"filter: not healthy from {since:.1f} s on, and all after it is void")
     position = _after(start.position, history.position)
-    orientation = quaternions(_after(start.rotation, history.rotation))
+    orientation = quaternion_from_matrix(_after(start.rotation, history.rotation))
     poses = (np.where(healthy[:, None], part, np.nan) for part in (position, orientation))
     start_std = np.repeat(np.array(start.std), [2, 1, 3, 3, 3, 3])
     start_covariance = np.eye(3) * setup.initial_std.position**2

@@ -6,10 +6,10 @@ import numpy as np
 from jaxtyping import Float
 
 from gnio_jax.config import DataConfig
-from gnio_jax.evaluation.estimators.result import Estimate, at_window_ends, quaternions
-from gnio_jax.evaluation.inference import yaw_rotation
-from gnio_jax.evaluation.metrics import Trajectory, finite_rows
+from gnio_jax.evaluation.estimators.result import Estimate, at_window_ends
+from gnio_jax.evaluation.metrics import Trajectory
 from gnio_jax.evaluation.preparation import Prepared
+from gnio_jax.numerics import finite_rows, quaternion_from_matrix, yaw_rotation
 from gnio_jax.types import Prediction
 
 
@@ -33,7 +33,7 @@ def integrate(
     path = prepared.start.position + np.concatenate([np.zeros((1, 3)), moved])
     return Estimate(
         prepared.sequence.name,
-        Trajectory(prepared.sequence.time[::n], path, quaternions(rotation[::n])),
+        Trajectory(prepared.sequence.time[::n], path, quaternion_from_matrix(rotation[::n])),
         prepared.reference(n),
         displacement=at_window_ends(prediction.displacement, strides + 1),
         displacement_std=at_window_ends(np.exp(prediction.log_std), strides + 1),

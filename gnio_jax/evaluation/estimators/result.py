@@ -6,9 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation
 
-from gnio_jax.evaluation.metrics import Trajectory, finite_rows
+from gnio_jax.evaluation.metrics import Trajectory
 from gnio_jax.types import Array
 
 
@@ -47,15 +46,6 @@ class Estimate(NamedTuple):
     """Normalised innovation squared; NaN where no measurement."""
     notes: tuple[str, ...] = ()
     """What a reader of the result should know."""
-
-
-def quaternions(rotation: Float[np.ndarray, "k 3 3"]) -> Float[np.ndarray, "k 4"]:
-    """Quaternions wxyz of rotation matrices; NaN of those that are not finite."""
-    finite = finite_rows(rotation.reshape(-1, 9))
-    wxyz = Rotation.from_matrix(np.where(finite[:, None, None], rotation, np.eye(3))).as_quat(
-        scalar_first=True
-    )
-    return np.where(finite[:, None], wxyz, np.nan)
 
 
 def at_window_ends(values: Float[Array, "m 3"], rows: int) -> Float[np.ndarray, "k 3"]:

@@ -14,7 +14,7 @@ from gnio_jax.evaluation.metrics.consistency import (
     normalised_squared,
     position_nees,
 )
-from gnio_jax.evaluation.metrics.heading import relative_yaw, yaw, yaw_drift, yaw_rmse
+from gnio_jax.evaluation.metrics.heading import relative_yaw, yaw_drift, yaw_rmse
 from gnio_jax.evaluation.metrics.measures import Measures, diverged, is_infinite, measure
 from gnio_jax.evaluation.metrics.movement import (
     path_length,
@@ -23,9 +23,8 @@ from gnio_jax.evaluation.metrics.movement import (
     stationary_drift,
 )
 from gnio_jax.evaluation.metrics.relative import rpe, rpe_se3, rte, rte_distance, rte_ronin
-from gnio_jax.evaluation.metrics.rotations import rotation_matrices, rotation_z
 from gnio_jax.evaluation.metrics.summary import Summary, bootstrap, summarise
-from gnio_jax.evaluation.metrics.trajectory import Trajectory, Undefined, finite_rows
+from gnio_jax.evaluation.metrics.trajectory import Trajectory, Undefined
 
 __all__ = [
     "AlignmentMethod",
@@ -41,7 +40,6 @@ __all__ = [
     "coverage",
     "diverged",
     "drift",
-    "finite_rows",
     "is_infinite",
     "mean_normalised",
     "measure",
@@ -50,8 +48,6 @@ __all__ = [
     "path_length_ratio",
     "position_nees",
     "relative_yaw",
-    "rotation_matrices",
-    "rotation_z",
     "rpe",
     "rpe_se3",
     "rte",
@@ -60,7 +56,6 @@ __all__ = [
     "standing",
     "stationary_drift",
     "summarise",
-    "yaw",
     "yaw_drift",
     "yaw_rmse",
 ]

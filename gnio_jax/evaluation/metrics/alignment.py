@@ -8,13 +8,12 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from gnio_jax.evaluation.metrics.heading import relative_yaw
-from gnio_jax.evaluation.metrics.rotations import multiply, quaternion, rotation_z
 from gnio_jax.evaluation.metrics.trajectory import (
     Trajectory,
     Undefined,
     finite_poses,
-    finite_rows,
 )
+from gnio_jax.numerics import finite_rows, quaternion_from_matrix, quaternion_product, rotation_z
 
 AlignmentMethod = Literal["origin", "none", "yaw_position", "se3"]
 NOT_FINITE = "the estimate is not finite"
@@ -56,7 +55,7 @@ def align(
     return Trajectory(
         estimate.time,
         (estimate.position - motion.source) @ motion.turn.T + motion.target,
-        multiply(quaternion(motion.turn), estimate.orientation),
+        quaternion_product(quaternion_from_matrix(motion.turn), estimate.orientation),
     )
 
 

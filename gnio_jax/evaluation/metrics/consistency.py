@@ -7,8 +7,8 @@ from jaxtyping import Float
 from scipy.stats import chi2
 
 from gnio_jax.evaluation.metrics.heading import relative_yaw
-from gnio_jax.evaluation.metrics.rotations import rotation_z
-from gnio_jax.evaluation.metrics.trajectory import Trajectory, Undefined, finite_rows
+from gnio_jax.evaluation.metrics.trajectory import Trajectory, Undefined
+from gnio_jax.numerics import finite_rows, rotation_z
 
 COVERAGES = frozenset({"nees_coverage", "nees_coverage_2d", "nis_coverage"})
 """Metrics that are small when they are bad: 0 for an estimate that diverged."""

@@ -5,19 +5,10 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float, Int
 
-from gnio_jax.evaluation.metrics.trajectory import Quaternions, Undefined, finite_rows
+from gnio_jax.evaluation.metrics.trajectory import Quaternions, Undefined
+from gnio_jax.numerics import finite_rows
 
 Angles = Float[np.ndarray, "n"]
-
-
-def yaw(orientation: Quaternions) -> Angles:
-    """Yaw atan2(R[1,0], R[0,0]) of quaternions wxyz, rad.
-
-    It is the yaw of the body's x axis, which has none where that axis is vertical, and the frame of
-    the network's windows. Two attitudes are compared with `relative_yaw`.
-    """
-    w, x, y, z = orientation.T
-    return np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
 
 
 def relative_yaw(estimate: Quaternions, reference: Quaternions) -> Angles:
@@ -27,7 +18,7 @@ def relative_yaw(estimate: Quaternions, reference: Quaternions) -> Angles:
     E = R̂ Rᵀ the square of that norm is 6 − 2 tr(R_z(ψ)ᵀ E), and the trace is
     cos ψ (E00 + E11) + sin ψ (E10 − E01) + E22, so ψ = atan2(E10 − E01, E00 + E11), whatever the
     attitude of the phone: the twist of E about z. With both attitudes level it is the difference of
-    their `yaw`. It has no value only where E is half a turn about a horizontal axis and every ψ is
+    their yaws. It has no value only where E is half a turn about a horizontal axis and every ψ is
     as near: 0 there (ours). NaN stays NaN.
     """
     (a, b, c, d), (w, x, y, z) = estimate.T, reference.T

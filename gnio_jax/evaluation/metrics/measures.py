@@ -25,8 +25,8 @@ from gnio_jax.evaluation.metrics.trajectory import (
     Trajectory,
     Undefined,
     finite_poses,
-    finite_rows,
 )
+from gnio_jax.numerics import finite_rows
 
 TOO_LARGE = "the error is too large for a number"
 """How the reason of a metric begins that no float64 holds."""

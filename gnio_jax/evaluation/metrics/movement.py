@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool
 
-from gnio_jax.evaluation.metrics.rotations import spans
-from gnio_jax.evaluation.metrics.trajectory import Positions, Undefined, finite_rows
+from gnio_jax.evaluation.metrics.trajectory import Positions, Undefined
+from gnio_jax.numerics import finite_rows, spans
 
 STANDING_SPEED = 0.05
 """Mean speed over one second below which the reference stands still, m/s."""

@@ -5,15 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 from gnio_jax.evaluation.metrics.heading import relative_yaw
-from gnio_jax.evaluation.metrics.rotations import rotation_matrices, rotation_z, spans
 from gnio_jax.evaluation.metrics.trajectory import (
     Positions,
     Trajectory,
     Undefined,
-    finite_rows,
     rms,
     trusted_pairs,
 )
+from gnio_jax.numerics import finite_rows, matrix_from_quaternion, rotation_z, spans
 
 
 def rte(estimate: Positions, reference: Positions, step: float, seconds: float = 60.0) -> float:
@@ -93,7 +92,7 @@ def rpe_se3(
     """
     rows_apart = _rows_apart(estimate, step, seconds)
     start, start_true = (
-        rotation_matrices(path.orientation[:-rows_apart]) for path in (estimate, reference)
+        matrix_from_quaternion(path.orientation[:-rows_apart]) for path in (estimate, reference)
     )
     moved, moved_true = (_displacements(path, rows_apart) for path in (estimate, reference))
     error = np.einsum("nij,nkj,nk->ni", start_true, start, moved) - moved_true

@@ -12,6 +12,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
+from gnio_jax.numerics import finite_rows
+
 Positions = Float[np.ndarray, "n d"]
 Quaternions = Float[np.ndarray, "n 4"]
 
@@ -29,11 +31,6 @@ class Trajectory(NamedTuple):
     """In the world (z up), m."""
     orientation: Quaternions
     """Body→world, unit quaternion wxyz."""
-
-
-def finite_rows(rows: Float[np.ndarray, "n d"]) -> Bool[np.ndarray, "n"]:
-    """Which rows hold neither NaN nor Inf."""
-    return np.asarray(np.isfinite(rows).all(1))
 
 
 def finite_poses(trajectory: Trajectory) -> Bool[np.ndarray, "n"]:
