@@ -271,9 +271,9 @@ def prepare(options: Learn, run) -> tuple[Callable, Pieces, TestSplit]:
             "make them shorter",
         )
     # The soft gate gives the χ² test a slope; the checkpoints bound the gradient's memory.
-    the_filter = filter_setup(config.data, config.filter)
-    differentiable = dataclasses.replace(the_filter.config, gate_softness=2.0, checkpoint_every=20)
-    loss = objective(run.model, differentiable, the_filter.initial_std, run.variables)
+    ekf = filter_setup(config.data, config.filter)
+    differentiable = dataclasses.replace(ekf.config, gate_softness=2.0, checkpoint_every=20)
+    loss = objective(run.model, differentiable, ekf.initial_std, run.variables)
     return loss, pieces, test
 
 

@@ -53,14 +53,14 @@ def estimate(
     `network` may be None for `imu_only`. A run of the same recordings in other batches gives the
     same trajectories to rounding.
     """
-    setup, the_filter = resolve(setup), filter_setup(config, options)
+    setup, ekf = resolve(setup), filter_setup(config, options)
     if setup.estimator == "imu_only":
         none = [_no_measurements(each, config) for each in prepared]
-        return run_filters(prepared, none, the_filter, batch_size, progress)
+        return run_filters(prepared, none, ekf, batch_size, progress)
     if network is None:
         raise ValueError(f"estimator '{setup.estimator}' needs a network")
-    if setup.uses_filter_attitude:
-        return run_filters(prepared, network, the_filter, batch_size, progress)
+    if setup.tightly_coupled:
+        return run_filters(prepared, network, ekf, batch_size, progress)
     attitudes = [attitude(each, config, setup.orientation or "reference") for each in prepared]
     if setup.estimator == "integrate":
         predictions = predict_windows(network, prepared, attitudes, config, progress)
@@ -69,7 +69,7 @@ def estimate(
             for each, rotation, prediction in zip(prepared, attitudes, predictions, strict=True)
         ]
     predictions = predict_windows(network, prepared, attitudes, config)
-    return _filter_predictions(prepared, predictions, the_filter, batch_size, progress)
+    return _filter_predictions(prepared, predictions, ekf, batch_size, progress)
 
 
 def perfect_displacements(
@@ -85,7 +85,7 @@ def perfect_displacements(
 
     The filter (also in the place of `imu_only`) is told a standard deviation of 1 cm per axis.
     """
-    setup, the_filter = resolve(setup), filter_setup(config, options)
+    setup, ekf = resolve(setup), filter_setup(config, options)
     truths = [true_displacements(each, config) for each in prepared]
     if setup.estimator == "integrate":
         return [
@@ -101,7 +101,7 @@ def perfect_displacements(
         _measurements(each, truth, np.full_like(truth, PERFECT_STD), config.stride)
         for each, truth in zip(prepared, truths, strict=True)
     ]
-    return run_filters(prepared, measurements, the_filter, batch_size, progress)
+    return run_filters(prepared, measurements, ekf, batch_size, progress)
 
 
 def never_moves(estimates: list[Estimate]) -> list[Estimate]:
@@ -117,17 +117,17 @@ def _held_start(path: Trajectory) -> Trajectory:
 def _filter_predictions(
     prepared: list[Prepared],
     predictions: list[Prediction],
-    the_filter: FilterSetup,
+    ekf: FilterSetup,
     batch_size: int,
     progress: OnShare,
 ) -> list[Estimate]:
     """The loose coupling: predictions of all windows as measurements, and as diagnostics."""
-    lowest, n = the_filter.config.log_std_min, the_filter.config.samples_per_clone
+    lowest, n = ekf.config.log_std_min, ekf.config.samples_per_clone
     measurements = [
         _measurements(each, p.displacement, np.exp(np.maximum(p.log_std, lowest)), n)
         for each, p in zip(prepared, predictions, strict=True)
     ]
-    estimates = run_filters(prepared, measurements, the_filter, batch_size, progress)
+    estimates = run_filters(prepared, measurements, ekf, batch_size, progress)
     return [
         e._replace(
             diagnostics={

@@ -37,10 +37,9 @@ class Setup(NamedTuple):
     against the reference."""
 
     @property
-    def uses_filter_attitude(self) -> bool:
-        """Whether the filter's own attitude is the only one there is."""
-        tight = self.estimator == "ekf" and self.coupling == "tight"
-        return tight or self.estimator == "imu_only"
+    def tightly_coupled(self) -> bool:
+        """Whether the network is in the filter's loop."""
+        return self.estimator == "ekf" and self.coupling == "tight"
 
 
 DEFAULT_SETUP = Setup()
@@ -49,7 +48,7 @@ DEFAULT_SETUP = Setup()
 def resolve(setup: Setup) -> Setup:
     """`setup` with its orientation filled in. Raises `InputError` for an orientation that the
     estimator cannot use."""
-    if not setup.uses_filter_attitude:
+    if not (setup.tightly_coupled or setup.estimator == "imu_only"):
         return setup._replace(orientation=setup.orientation or "reference")
     if setup.orientation not in (None, "filter"):
         what = "the tight coupling" if setup.estimator == "ekf" else "imu_only"

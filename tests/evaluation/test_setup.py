@@ -1,8 +1,11 @@
-"""Choices that make no sense together are refused."""
+"""Choices of an evaluation, and the filter they give."""
+
+import dataclasses
 
 import pytest
 
-from gnio_jax import evaluation
+from gnio_jax import evaluation, filtering
+from gnio_jax.config import DataConfig, FilterOptions
 from gnio_jax.evaluation import Setup
 from gnio_jax.types import InputError
 from tests.support.estimators import CONFIG, LOOSE
@@ -22,3 +25,10 @@ def test_setups_that_make_no_sense(walks):
             CONFIG,
             Setup("integrate", orientation="device"),
         )
+
+
+def test_the_options_defaults_are_those_of_the_filter():
+    config, noise, initial_std = evaluation.filter_setup(DataConfig(), FilterOptions())
+    usual = filtering.FilterConfig(config.dt, config.samples_per_clone, config.clones_per_window)
+    assert config == dataclasses.replace(usual, history="core")
+    assert noise == filtering.NoiseModel() and initial_std == filtering.InitialStd()

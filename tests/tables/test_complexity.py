@@ -17,7 +17,7 @@ def multiply_adds(convolutions, dense, padding):
 
 
 def encoder():
-    """(length of the input, stride, kernel, channels in, out) of each convolution, for 200 samples."""
+    """(length of the input, stride, kernel, channels in, out) of each convolution; 200 samples."""
     layers, before, length = [(200, 2, 7, 6, 64)], 64, 50
     for group, width in enumerate((64, 128, 256, 512)):
         stride = 2 if group else 1
