@@ -13,7 +13,6 @@ from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
 from gnio_jax.config import DataConfig
-from gnio_jax.data.windows import WindowSource, gather
 from gnio_jax.evaluation.preparation import Prepared
 from gnio_jax.evaluation.setup import OnShare, Orientation, no_progress
 from gnio_jax.numerics import (
@@ -22,7 +21,13 @@ from gnio_jax.numerics import (
     matrix_from_quaternion,
     yaw_rotation,
 )
-from gnio_jax.types import InputError, Prediction
+from gnio_jax.types import Array, InputError, Prediction
+from gnio_jax.windows import (
+    align_recording,
+    cut_windows,
+    true_displacement,
+    window_starts,
+)
 
 WINDOWS_PER_CALL = 512
 KEPT_DIAGNOSTICS = ("gate", "scale")
@@ -88,65 +93,74 @@ def predict_windows(
 
     Of its diagnostics only those named, if it has them. Float64 on the host.
     """
-    source, counts = _windows(prepared, attitudes, config)
-    total = len(source.start)
+    parts = [
+        _align(each, rotation, config) for each, rotation in zip(prepared, attitudes, strict=True)
+    ]
+    windows = _end_to_end(parts)
+    total = len(windows.start)
     size, found = min(WINDOWS_PER_CALL, total), []
     for begin in range(0, total, size):
         # The last batch is filled up with the last window: one compilation.
-        which = np.minimum(np.arange(begin, begin + size), total - 1).astype(np.int32)
+        rows = np.minimum(np.arange(begin, begin + size), total - 1)
+        batch = windows._replace(start=windows.start[rows], rotation=windows.rotation[rows])
         prediction = _predict(
-            network.apply, network.variables, source, which, config.window, diagnostics
+            network.apply, network.variables, batch, length=config.window, diagnostics=diagnostics
         )
         found.append(jax.device_get(prediction))
         progress(min(1.0, (begin + size) / total))
     whole = jax.tree.map(lambda *parts: np.concatenate(parts)[:total].astype(np.float64), *found)
-    ends = np.cumsum(counts)
-    rows = [slice(end - count, end) for end, count in zip(ends, counts, strict=True)]
+    ends = np.cumsum([len(part.start) for part in parts])
+    rows = [slice(end - len(part.start), end) for end, part in zip(ends, parts, strict=True)]
     return [jax.tree.map(lambda leaf, own=own: leaf[own], whole) for own in rows]
+
+
+def true_displacements(prepared: Prepared, config: DataConfig) -> Float[np.ndarray, "m 3"]:
+    """Reference displacement of every window, m, in the yaw frame of the reference at its start;
+    NaN where it cannot be trusted."""
+    every_sample = prepared.reference(1)
+    start = window_starts(len(every_sample.time), config.window, config.stride)
+    return true_displacement(every_sample.orientation, every_sample.position, start, config.window)
+
+
+class _Windows(NamedTuple):
+    """Windows of recordings that lie end to end. float32."""
+
+    imu: Float[Array, "t 6"]
+    """[accel m/s², gyro rad/s], as `AlignedRecording` has it."""
+    start: Int[Array, "m"]
+    """Row of `imu` at which each window begins."""
+    rotation: Float[Array, "m 3 3"]
+    """From the frame of `imu` to the gravity-aligned frame of each window."""
+
+
+def _align(
+    prepared: Prepared, rotation: Float[np.ndarray, "t 3 3"], config: DataConfig
+) -> _Windows:
+    """Every window of one recording, without the first gyro bias."""
+    sequence = prepared.sequence
+    start = window_starts(len(sequence.time), config.window, config.stride)
+    gyro = sequence.gyro - prepared.gyro_bias
+    imu, to_window = align_recording(sequence.accel, gyro, rotation, start, config.window_rotation)
+    return _Windows(imu, start, to_window)
+
+
+def _end_to_end(parts: list[_Windows]) -> _Windows:
+    """The recordings' windows on the device, those of the first recording first."""
+    offsets = np.cumsum([0, *(len(part.imu) for part in parts[:-1])])
+    starts = [part.start + offset for part, offset in zip(parts, offsets, strict=True)]
+    return _Windows(
+        jnp.asarray(np.concatenate([part.imu for part in parts])),
+        np.concatenate(starts).astype(np.int32),
+        np.concatenate([part.rotation for part in parts]),
+    )
 
 
 @functools.partial(jax.jit, static_argnames=("apply", "length", "diagnostics"))
 def _predict(
-    apply: Callable,
-    variables: Any,
-    source: WindowSource,
-    which: Int[np.ndarray, "b"],
-    length: int,
-    diagnostics: tuple[str, ...],
+    apply: Callable, variables: Any, windows: _Windows, length: int, diagnostics: tuple[str, ...]
 ) -> Prediction:
-    return keep_diagnostics(apply(variables, gather(source, which, length).imu), diagnostics)
-
-
-def _windows(
-    prepared: list[Prepared], attitudes: list[Float[np.ndarray, "_ 3 3"]], config: DataConfig
-) -> tuple[WindowSource, list[int]]:
-    """All windows of the recordings, end to end and without targets, and how many each has."""
-    parts, counts, offset = [], [], 0
-    for each, rotation in zip(prepared, attitudes, strict=True):
-        sequence = each.sequence
-        imu = np.stack([sequence.accel, sequence.gyro - each.gyro_bias], 1)
-        start = np.arange(0, len(sequence.time) - config.window, config.stride)
-        to_window = np.swapaxes(yaw_rotation(rotation[start]), 1, 2)
-        if config.window_rotation == "per_sample":
-            imu = np.einsum("tij,tkj->tki", rotation, imu)
-        else:
-            to_window = to_window @ rotation[start]
-        rows = (start + offset).astype(np.int32)
-        parts.append((imu.reshape(-1, 6).astype(np.float32), rows, to_window.astype(np.float32)))
-        counts.append(len(start))
-        offset += len(imu)
-    imu, start, to_window = (jnp.asarray(np.concatenate(part)) for part in zip(*parts, strict=True))
-    no_target = jnp.zeros((len(start), 3), jnp.float32)
-    source = WindowSource(
-        imu=imu,
-        start=start,
-        rotation=to_window,
-        displacement=no_target,
-        step=jnp.zeros_like(imu[:, :3]),
-        unyaw=no_target[:, :2],
-        visited=start,
-    )
-    return source, counts
+    imu = cut_windows(windows.imu, windows.start, windows.rotation, length)
+    return keep_diagnostics(apply(variables, imu), diagnostics)
 
 
 def _integrated_gyro(prepared: Prepared, config: DataConfig) -> Float[np.ndarray, "t 3 3"]:
@@ -154,16 +168,3 @@ def _integrated_gyro(prepared: Prepared, config: DataConfig) -> Float[np.ndarray
     rates = prepared.sequence.gyro[:-1] - prepared.gyro_bias
     turned = cumulative_rotation(Rotation.from_rotvec(rates / config.rate))
     return prepared.start.rotation @ turned.as_matrix()
-
-
-def true_displacements(prepared: Prepared, config: DataConfig) -> Float[np.ndarray, "m 3"]:
-    """Reference displacement of every window, m, in the yaw frame of the reference at its start;
-    NaN where it cannot be trusted."""
-    sequence, n, length = prepared.sequence, config.stride, config.window
-    start = np.arange(0, len(sequence.time) - length, n)
-    moved = sequence.position[start + length] - sequence.position[start]
-    good = np.asarray(sequence.valid[start] & sequence.valid[start + length])
-    result = np.full_like(moved, np.nan)
-    turn = matrix_from_quaternion(sequence.orientation[start[good]])
-    result[good] = np.einsum("mji,mj->mi", yaw_rotation(turn), moved[good])
-    return result

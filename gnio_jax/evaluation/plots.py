@@ -21,7 +21,8 @@ from gnio_jax.evaluation.estimators.result import Estimate
 from gnio_jax.evaluation.metrics import AlignmentMethod, Trajectory, Undefined
 from gnio_jax.evaluation.report import Report, file_names
 from gnio_jax.evaluation.setup import OnShare, no_progress
-from gnio_jax.numerics import finite_rows, rotation_z, spans, yaw_from_quaternion
+from gnio_jax.numerics import finite_rows, rotation_z, spans
+from gnio_jax.windows import true_displacement
 
 BLUE, VERMILION, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#8C8C8C"
 AXES = {"x": BLUE, "y": VERMILION, "z": GREEN}
@@ -296,9 +297,8 @@ def _true_displacement(estimate: Estimate, rows: int) -> Float[np.ndarray, "k 3"
     reference = estimate.reference
     found = np.full_like(reference.position, np.nan)
     if rows < len(found):
-        unyaw = rotation_z(-yaw_from_quaternion(reference.orientation[:-rows]))
-        moved = reference.position[rows:] - reference.position[:-rows]
-        found[rows:] = np.einsum("kij,kj->ki", unyaw, moved)
+        start = np.arange(len(found) - rows)
+        found[rows:] = true_displacement(reference.orientation, reference.position, start, rows)
     return found
 
 
