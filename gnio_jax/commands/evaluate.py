@@ -44,7 +44,7 @@ def main() -> None:
         evaluation,
         filtering,
     )
-    from gnio_jax.evaluation import report
+    from gnio_jax.evaluation import table
 
     filtering.cores_as_devices()
     with cli.progress() as progress:
@@ -54,7 +54,7 @@ def main() -> None:
         console = Console(
             highlight=False, width=200
         )  # into a file or a pipe: no line is cut to a terminal's width
-    console.print(report.table(found))
+    console.print(table.render(found))
     print(f"results: {folder}")
     if config.plots:
         print(
