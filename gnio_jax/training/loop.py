@@ -358,7 +358,7 @@ def _load_windows(
         data.resample(s, config.data.rate)
         for s in data.load(config.dataset, config.data_root, split)
     ]
-    source = windows.index(sequences, config.data, stride, shift)
+    source = windows.window_source(sequences, config.data, stride, shift)
     hours = sum(len(s.time) for s in sequences) / config.data.rate / 3600
     console.print(
         f"  {split}: {len(sequences)} sequences, {hours:.2f} h, {source.visited.shape[0]:,} windows"

@@ -57,7 +57,7 @@ def test_every_piece_with_a_window_is_kept_and_named():
         assert piece.attributes == {"group": "someone", "start_time": pytest.approx(100.0 + first)}
     # Each holds at least the one window it was kept for, and no estimate runs through a hole.
     config = DataConfig(rate=100.0)
-    assert all(len(windows.index([piece], config, stride=10).start) >= 1 for piece in pieces)
+    assert all(len(windows.window_source([piece], config, stride=10).start) >= 1 for piece in pieces)
     recordings, short = odometry.prepare(pieces, config)
     assert [recording.sequence.name for recording in recordings] == ["walk_piece1", "walk_piece3"]
     assert list(short) == ["walk_piece2"]
