@@ -29,12 +29,17 @@ class Evaluation(NamedTuple):
     folder: Path
 
 
-def evaluate(config: EvaluateConfig, progress: Progress = lambda stage, share: None) -> Evaluation:
+def evaluate(
+    config: EvaluateConfig,
+    progress: Progress = lambda stage, share: None,
+    workers: int = 1,
+) -> Evaluation:
     """Estimate every sequence of a split with a run's network, measure, and leave the results in a
     folder of the run.
 
     The folder is written whole or not at all, and takes the place of the one an earlier evaluation
-    with the same options left. Raises `InputError` for options that do not fit together, a workdir
+    with the same options left. `workers` processes read what is slow to read (`data.load`). Raises
+    `InputError` for options that do not fit together, a workdir
     without the checkpoint, unknown or missing data, or sequences that cannot be estimated this way.
     """
     setup = odometry.resolve(
@@ -49,7 +54,9 @@ def evaluate(config: EvaluateConfig, progress: Progress = lambda stage, share: N
     ).filter
     name = config.dataset or trained.dataset
     root = config.data_root or (trained.data_root if name == trained.dataset else None)
-    sequences = data.load(name, root, config.split)
+    sequences = data.load(
+        name, root, config.split, workers, lambda share: progress("reading", share)
+    )
 
     recordings, left_out = odometry.prepare(sequences, trained.data, setup)
     if not recordings:
