@@ -89,11 +89,11 @@ class Pieces(NamedTuple):
     """(p, k, 3) m, at the end of each clone interval"""
 
 
-def cut(recordings: list, intervals: int, stride: int) -> Pieces:
+def cut(prepared: list, intervals: int, stride: int) -> Pieces:
     """Consecutive pieces of `intervals` strides. The reference is valid throughout each."""
     length, found = intervals * stride, []
-    for recording in recordings:
-        s = recording.sequence
+    for each in prepared:
+        s = each.sequence
         for begin in range(0, len(s.time) - length, length):
             with_end = slice(begin, begin + length + 1)
             if not (s.valid[with_end].all() and np.isfinite(s.velocity[with_end]).all()):
@@ -170,7 +170,7 @@ def objective(model, filter_config, std, variables) -> Callable[[dict, Pieces], 
 class TestSplit(NamedTuple):
     """Recordings to report on, and the group of each sequence."""
 
-    recordings: list
+    prepared: list
     groups: dict[str, str]
 
 
@@ -179,34 +179,19 @@ def score(
 ) -> dict[str, float]:
     """ate, NIS and NEES of the test split, averaged over its sequences."""
     from gnio_jax import evaluation, models
-    from gnio_jax.evaluation import report
 
     network = evaluation.Network(
         models.Inference(model), models.inference_variables(model, variables)
     )
     estimates = evaluation.estimate(
-        test.recordings, network, data_config, filter_options, progress=progress
+        test.prepared, network, data_config, filter_options, progress=progress
     )
-    sequences = report.score(estimates, test.groups).sequences.values()
+    sequences = evaluation.score(estimates, test.groups).sequences.values()
     means = {}
     for name in ("ate", "nis", "nees"):
         values = [m.values[name] for m in sequences if m.values.get(name) is not None]
         means[name] = float(np.mean(values))
     return means
-
-
-def initial_std(options):
-    """The filter's initial standard deviations from the run's options."""
-    from gnio_jax import filtering
-
-    return filtering.InitialStd(
-        np.radians(options.tilt_std_degrees),
-        np.radians(options.yaw_std_degrees),
-        options.velocity_std,
-        options.position_std,
-        options.gyro_bias_std,
-        options.accel_bias_std,
-    )
 
 
 def create_optimizer(learning_rate: float) -> optax.GradientTransformation:
@@ -276,12 +261,12 @@ def render(title: str, before: dict[str, float], after: dict[str, float]) -> str
 
 def prepare(options: Learn, run) -> tuple[Callable, Pieces, TestSplit]:
     """The loss, the pieces to learn from and the test split."""
-    from gnio_jax.evaluation.odometry import filter_config
+    from gnio_jax.evaluation import filter_setup
 
     config = run.config
-    recordings, test = load(options, run)
+    prepared, test = load(options, run)
     intervals = round(options.seconds / config.data.stride_seconds)
-    pieces = cut(recordings, intervals, config.data.stride)
+    pieces = cut(prepared, intervals, config.data.stride)
     if len(pieces.rotation) < options.batch_size:
         raise InputError(
             "--seconds",
@@ -289,10 +274,9 @@ def prepare(options: Learn, run) -> tuple[Callable, Pieces, TestSplit]:
             "make them shorter",
         )
     # The soft gate gives the χ² test a slope; the checkpoints bound the gradient's memory.
-    differentiable = dataclasses.replace(
-        filter_config(config.data, config.filter), gate_softness=2.0, checkpoint_every=20
-    )
-    loss = objective(run.model, differentiable, initial_std(config.filter), run.variables)
+    ekf = filter_setup(config.data, config.filter)
+    differentiable = dataclasses.replace(ekf.config, gate_softness=2.0, checkpoint_every=20)
+    loss = objective(run.model, differentiable, ekf.initial_std, run.variables)
     return loss, pieces, test
 
 
@@ -328,7 +312,7 @@ def main() -> None:
         filter_options = dataclasses.replace(config.filter, **noise)
         after = estimate("estimating as learnt", variables, filter_options) | noise
 
-    title = f"{config.dataset} {options.test_split}, n = {len(test.recordings)}"
+    title = f"{config.dataset} {options.test_split}, n = {len(test.prepared)}"
     table = render(title, before, after)
     print(table)
     tenth = max(1, len(values) // 10)

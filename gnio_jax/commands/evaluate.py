@@ -41,13 +41,13 @@ def evaluate(config: EvaluateConfig, _prog: str) -> None:
     import jax
 
     from gnio_jax import evaluation, filtering
-    from gnio_jax.evaluation import report
+    from gnio_jax.evaluation import table
 
     jax.config.update("jax_enable_x64", True)  # for the filter; the network states its float32
     filtering.cores_as_devices()
     with console.terminal() as terminal:
         found, folder = evaluation.evaluate(config, terminal.progress, usable_cores())
-    console.stdout().print(report.table(found))
+    console.stdout().print(table.render(found))
     print(f"results: {folder}")
     if config.plots:
         names = "<name>_{trajectory,error,displacement}.png"

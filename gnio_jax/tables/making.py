@@ -13,7 +13,16 @@ from gnio_jax.config import TablesConfig, TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.files import write_text
 from gnio_jax.reporting import Lines, Reporter
-from gnio_jax.tables import complexity, experiments, matrix, pictures, standing, summary, windows
+from gnio_jax.tables import (
+    activities,
+    complexity,
+    experiments,
+    markdown,
+    matrix,
+    pictures,
+    standing,
+    summary,
+)
 from gnio_jax.tables.experiments import Experiment
 from gnio_jax.tables.matrix import Result
 
@@ -109,7 +118,7 @@ def make_table(options: TablesConfig, reporter: Reporter, workers: int) -> str:
     if options.table in ("bank-size", "bank-spread"):
         extra = _entropies(path, options, results)
     found = summary.rows(experiment, results, extra)
-    summary.write(path, experiment, found, notes(base, options, experiment))
+    markdown.write(path, experiment, found, notes(base, options, experiment))
     pictures.save(path.with_suffix(".png"), pictures.table(experiment, results, found))
     text = path.with_suffix(".md").read_text(encoding="utf-8")
     return f"{text}\nresults: {path}.md, .csv, .png"
@@ -134,7 +143,9 @@ def _entropies(path: Path, options: TablesConfig, results: list[Result]) -> Extr
         if result.cell.config.model.bank_size == 0:
             continue
         found = [
-            windows.entropy(windows.said(run, options.split).diagnostics["attention"])
+            activities.entropy(
+                activities.predict_split(run, options.split).diagnostics["attention"]
+            )
             for run in result.runs
         ]
         labels.append(result.cell.label)
@@ -177,8 +188,11 @@ def make_trajectories(options: TablesConfig, reporter: Reporter, workers: int) -
             raise InputError("--sequences", problem, f"there are: {', '.join(first)}")
     drawn = {
         name: (
-            first[name][0],
-            [pictures.Track(method, of_method[name][1]) for method, of_method in paths.items()],
+            first[name].reference,
+            [
+                pictures.Track(method, of_method[name].estimate)
+                for method, of_method in paths.items()
+            ],
         )
         for name in wanted
     }
@@ -194,14 +208,14 @@ def make_standing(options: TablesConfig, reporter: Reporter, workers: int) -> st
     results = results_of(experiment, options, reporter, workers)
     path, lines, by_method = _path(options), [], {}
     for result in results:
-        seeds = [windows.said(run, options.split) for run in result.runs]
+        seeds = [activities.predict_split(run, options.split) for run in result.runs]
         by_method[result.cell.name] = standing.mean_over_seeds(seeds)
         lines += standing.draw(result.cell, seeds, path)
     pictures.save(path.with_suffix(".png"), pictures.standing(by_method))
     found = summary.rows(experiment, results)
     remarks = [*notes(base, options, experiment), *lines]
-    table = summary.markdown(experiment, found, remarks)
-    text = f"{table}\n{standing.markdown(by_method)}"
+    table = markdown.render(experiment, found, remarks)
+    text = f"{table}\n{standing.render(by_method)}"
     write_text(path.with_suffix(".md"), text)
     return f"{text}\nresults: {path}.md, .png and the pictures beside them"
 

@@ -17,13 +17,14 @@ from gnio_jax.config import EvaluateConfig, TablesConfig
 from gnio_jax.evaluation import metrics, report
 from gnio_jax.evaluation.metrics import Trajectory
 from gnio_jax.evaluation.run import folder_name
+from gnio_jax.evaluation.tum import read_tum
 from gnio_jax.reporting import Reporter
 from gnio_jax.tables.experiments import Cell
 from gnio_jax.training import loop, run_folder
 
 
 class Interrupted(Exception):
-    """A signal has stopped a training run; it is saved, and the same command continues it."""
+    """A signal asked a training run to stop; it is saved, and the same command continues it."""
 
     def __init__(self, signum: int):
         super().__init__(signum)
@@ -99,32 +100,36 @@ def _evaluation(workdir: Path, split: str, estimator: str) -> tuple[EvaluateConf
     return config, workdir / "eval" / folder_name(config, trained.dataset, trained)
 
 
-def paths(
-    result: Result, split: str, estimator: str
-) -> dict[str, tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]]]:
-    """Reference and the first seed's estimate of each sequence seen from above, m.
+class PlanView(NamedTuple):
+    """Paths of one sequence seen from above, m."""
 
-    The estimate is laid on by start position and yaw; it is NaN from where it diverged.
-    """
+    reference: Float[np.ndarray, "n 2"]
+    estimate: Float[np.ndarray, "n 2"]
+    """Laid on by start position and yaw; NaN from where it diverged."""
+
+
+def paths(result: Result, split: str, estimator: str) -> dict[str, PlanView]:
+    """Reference and the first seed's estimate of each sequence that has a reference."""
     _, folder = _evaluation(result.runs[0], split, estimator)
     names = list(result.figures[0]["sequences"])
     found = {}
     for name, stem in zip(names, report.file_names(names), strict=True):
-        if (folder / "references" / f"{stem}.txt").exists():
-            estimate, reference = (
-                _trajectory(folder / kind / f"{stem}.txt")
-                for kind in ("trajectories", "references")
-            )
-            # The reference has no row where it is not trusted, the estimate none where not finite.
-            rows = np.searchsorted(estimate.time, reference.time - 1e-6)
-            rows = np.minimum(rows, len(estimate.time) - 1)
-            there = np.abs(estimate.time[rows] - reference.time) <= 1e-6
-            poses = (np.where(there[:, None], field[rows], np.nan) for field in estimate[1:])
-            estimate = metrics.align(Trajectory(reference.time, *poses), reference)
-            found[name] = reference.position[:, :2], estimate.position[:, :2]
+        reference, estimate = (
+            folder / kind / f"{stem}.txt" for kind in ("references", "trajectories")
+        )
+        if reference.exists():
+            found[name] = _plan_view(read_tum(estimate), read_tum(reference))
     return found
 
 
-def _trajectory(path: Path) -> Trajectory:
-    rows = np.loadtxt(path, ndmin=2)
-    return Trajectory(rows[:, 0], rows[:, 1:4], rows[:, [7, 4, 5, 6]])
+def _plan_view(estimate: Trajectory, reference: Trajectory) -> PlanView:
+    """Files have no row where the reference is not trusted or the estimate not finite."""
+    rows = np.searchsorted(estimate.time, reference.time - 1e-6)
+    rows = np.minimum(rows, len(estimate.time) - 1)
+    present = np.abs(estimate.time[rows] - reference.time) <= 1e-6
+    poses = (
+        np.where(present[:, None], part[rows], np.nan)
+        for part in (estimate.position, estimate.orientation)
+    )
+    aligned = metrics.align(Trajectory(reference.time, *poses), reference)
+    return PlanView(reference.position[:, :2], aligned.position[:, :2])

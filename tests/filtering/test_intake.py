@@ -13,8 +13,8 @@ from scipy.interpolate import CubicSpline
 from scipy.signal import firwin
 
 from gnio_jax import filtering, geometry
-from gnio_jax.data.resampling import resample
 from gnio_jax.data.readers import synthetic
+from gnio_jax.data.resampling import resample
 from gnio_jax.filtering import Tracker, intake
 from gnio_jax.filtering import tracker as online
 from gnio_jax.types import InputError, Prediction
