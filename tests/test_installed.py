@@ -22,6 +22,7 @@ SMALL = [
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory):
     """The wheel, built from a copy of what the build reads."""
+    pytest.importorskip("pip")
     source, folder = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("wheel")
     for name in ("pyproject.toml", "setup.py", "README.md", "LICENSE", "configs", "gnio_jax"):
         (source / name).symlink_to(ROOT / name)
@@ -36,7 +37,7 @@ def wheel(tmp_path_factory):
 def installed(wheel, tmp_path_factory):
     """A fresh environment with the wheel, which borrows the dependencies of this one: its `bin`."""
     folder = tmp_path_factory.mktemp("environment")
-    venv.create(folder, with_pip=False)
+    venv.create(folder, symlinks=True)
     purelib = next((folder / "lib").glob("python*/site-packages"))
     pip = [sys.executable, "-m", "pip", "--python", folder / "bin" / "python"]
     install = ["install", "--quiet", "--no-deps", "--no-index", wheel]
