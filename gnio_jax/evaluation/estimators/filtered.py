@@ -42,9 +42,9 @@ SHORTEST = 16
 class Measurements(NamedTuple):
     """Displacements given to the filter, a row per stride; NaN where there is none."""
 
-    displacement: Float[np.ndarray, "k 3"]
+    displacement: Float[Array, "k 3"]
     """m, in the yaw frame of the window's start."""
-    std: Float[np.ndarray, "k 3"]
+    std: Float[Array, "k 3"]
     """m."""
 
 
