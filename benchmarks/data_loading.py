@@ -26,8 +26,10 @@ import numpy as np
 
 from benchmarks import baseline
 from gnio_jax import data
+from gnio_jax.data.dataset import Recording
+from gnio_jax.data.hdf5 import read_hdf5, write_hdf5
 from gnio_jax.data.readers.text import numbers, read_csv
-from gnio_jax.data.sequence import Recording, read_hdf5, write_hdf5
+from gnio_jax.data.reading import read_recording
 from gnio_jax.types import Sequence
 from tests.support.layouts import LAYOUTS
 
@@ -77,7 +79,9 @@ def measure(
     sequences: list[Sequence] = []
 
     def read() -> None:
-        sequences[:] = [sequence for recording in recordings for sequence in recording.read()]
+        sequences[:] = [
+            sequence for recording in recordings for sequence in read_recording(recording).sequences
+        ]
 
     cold = best(read, repeats, before=lambda: shutil.rmtree(cache, ignore_errors=True))
     cached = best(read, repeats) if cache.is_dir() else None

@@ -76,8 +76,9 @@ class Replayed:
 
 def read(path: Path) -> Recorded:
     """Read a CSV or HDF5. Raises `InputError` if a stamp is missing or does not increase."""
+    from gnio_jax.data.hdf5 import read_hdf5
     from gnio_jax.data.readers.text import numbers, read_csv
-    from gnio_jax.data.sequence import check_increasing, read_hdf5
+    from gnio_jax.data.validation import check_increasing
 
     if path.suffix.lower() in (".h5", ".hdf5"):
         sequence = read_hdf5(path)

@@ -11,6 +11,7 @@ import jax
 from gnio_jax import config as configuration
 from gnio_jax.commands import console as cli
 from gnio_jax.config import EvaluateConfig
+from gnio_jax.cores import usable_cores
 
 DESCRIPTION = """Estimate the trajectories of a split with the network of a run, and report their errors.
 
@@ -47,7 +48,7 @@ def main() -> None:
 
     filtering.cores_as_devices()
     with cli.progress() as progress:
-        found, folder = evaluation.evaluate(config, progress)
+        found, folder = evaluation.evaluate(config, progress, workers=usable_cores())
     console = Console(highlight=False)
     if not console.is_terminal:
         console = Console(

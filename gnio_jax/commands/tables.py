@@ -19,6 +19,7 @@ from gnio_jax import config as configuration
 from gnio_jax import models
 from gnio_jax.commands import console as cli
 from gnio_jax.config import TrainConfig
+from gnio_jax.cores import usable_cores
 from gnio_jax.files import replacing
 from gnio_jax.filtering import cores_as_devices
 from gnio_jax.tables import activities, complexity, experiments, markdown, matrix, summary
@@ -167,6 +168,7 @@ def results_of(experiment: Experiment, options: TablesConfig, console: Console) 
             options.split,
             options.estimator,
             console,
+            usable_cores(),
         )
         for cell in experiment.cells
     ]

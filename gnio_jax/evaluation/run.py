@@ -51,19 +51,25 @@ class Job(NamedTuple):
     options: FilterOptions
     setup: Setup
     dataset: str
+    data_root: str | None
 
 
-def evaluate(config: EvaluateConfig, progress: OnStage = lambda stage, share: None) -> Evaluation:
+def evaluate(
+    config: EvaluateConfig, progress: OnStage = lambda stage, share: None, workers: int = 1
+) -> Evaluation:
     """Estimate every sequence of a split with a run's network, measure, and leave the results in a
     folder of the run.
 
     The folder is written whole or not at all, and takes the place of the one an earlier evaluation
-    with the same options left. Raises `InputError` for options that do not fit together, a workdir
-    without the checkpoint, unknown or missing data, or sequences that cannot be estimated this way.
+    with the same options left. `workers` processes read what is slow to read (`data.load`). Raises
+    `InputError` for options that do not fit together, a workdir without the checkpoint, unknown or
+    missing data, or sequences that cannot be estimated this way.
     """
     job = _set_up(config)
     trained, setup = job.trained, job.setup
-    sequences = _load_sequences(config, job)
+    sequences = data.load(
+        job.dataset, job.data_root, config.split, workers, lambda x: progress("reading", x)
+    )
 
     prepared, left_out = prepare(sequences, trained.data, setup)
     if not prepared:
@@ -145,7 +151,9 @@ def _set_up(config: EvaluateConfig) -> Job:
         dataclasses.replace(trained, filter=config.filter), "command line"
     )
     dataset = config.dataset or trained.dataset
-    return Job(workdir, trained, network, provenance, checked.filter, setup, dataset)
+    own_root = trained.data_root if dataset == trained.dataset else None
+    root = config.data_root or own_root
+    return Job(workdir, trained, network, provenance, checked.filter, setup, dataset, root)
 
 
 def _load_run(
@@ -168,11 +176,6 @@ def _load_run(
     }
     network = Network(models.Inference(run.model), models.freeze(run.model, run.variables))
     return run.config, network, provenance
-
-
-def _load_sequences(config: EvaluateConfig, job: Job) -> list[Sequence]:
-    own = job.trained.data_root if job.dataset == job.trained.dataset else None
-    return data.load(job.dataset, config.data_root or own, config.split)
 
 
 def _group(sequence: Sequence) -> str:

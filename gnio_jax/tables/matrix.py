@@ -42,25 +42,31 @@ class Result(NamedTuple):
 
 
 def run_cell(
-    cell: Cell, seeds: int, folder: Path, split: str, estimator: str, console: Console
+    cell: Cell,
+    seeds: int,
+    folder: Path,
+    split: str,
+    estimator: str,
+    console: Console,
+    workers: int = 1,
 ) -> Result:
     """Train and evaluate a cell with seeds 0 … seeds−1 below `folder`.
 
     A run that is finished is not trained again, one that was interrupted goes on, an evaluation
     that is there is read. Raises `InputError` if a folder holds a run with other settings, and
-    `Interrupted` after a signal.
+    `Interrupted` after a signal. `workers` processes read recordings that are slow to read.
     """
     figures, runs = [], []
     for seed in range(seeds):
         workdir = folder / f"{cell.name}_s{seed}"
         config = dataclasses.replace(cell.config, seed=seed, workdir=str(workdir))
-        train(config, console)
-        figures.append(evaluated(workdir, split, estimator, console))
+        train(config, console, workers)
+        figures.append(evaluated(workdir, split, estimator, console, workers))
         runs.append(workdir)
     return Result(cell, figures, runs)
 
 
-def train(config: configuration.TrainConfig, console: Console) -> None:
+def train(config: configuration.TrainConfig, console: Console, workers: int = 1) -> None:
     """Train the run of `config` to its end, if it is not there yet."""
     workdir = Path(config.workdir or "")
     begun = (workdir / "config.yaml").exists()
@@ -70,12 +76,14 @@ def train(config: configuration.TrainConfig, console: Console) -> None:
         if log.exists() and log.read_text(encoding="utf-8").count("\n") >= config.optim.epochs:
             return
     console.rule(f"[bold]{workdir.name}[/bold]", align="left")
-    outcome = loop.train(config, resume=begun, console=console)
+    outcome = loop.train(config, resume=begun, console=console, workers=workers)
     if outcome.stopped_by:
         raise Interrupted(outcome.stopped_by)
 
 
-def evaluated(workdir: Path, split: str, estimator: str, console: Console) -> dict[str, Any]:
+def evaluated(
+    workdir: Path, split: str, estimator: str, console: Console, workers: int = 1
+) -> dict[str, Any]:
     """The figures of the run's best checkpoint on a split: those that are there if they are of that
     checkpoint and mean the same (`report.DEFINITIONS`), else new ones."""
     config, folder = _evaluation(workdir, split, estimator)
@@ -87,7 +95,7 @@ def evaluated(workdir: Path, split: str, estimator: str, console: Console) -> di
         if same and (best / str(found["settings"]["step"])).is_dir():
             return found
     console.print(f"evaluating {workdir.name} on {split} ({estimator})")
-    evaluation.evaluate(config)
+    evaluation.evaluate(config, workers=workers)
     return json.loads(path.read_text(encoding="utf-8"))
 
 

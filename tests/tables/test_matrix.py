@@ -40,7 +40,7 @@ def test_figures_of_other_definitions_or_steps_are_made_anew(
         "b": {"ate": 1.0} | ({"group": "y"} if group else {}),
     }
     path.write_text(json.dumps({"settings": settings, "sequences": sequences}))
-    monkeypatch.setattr(matrix.evaluation, "evaluate", lambda config: path.write_text("{}"))
+    monkeypatch.setattr(matrix.evaluation, "evaluate", lambda config, **_: path.write_text("{}"))
     found = matrix.evaluated(tmp_path, "test", "ekf", Console(quiet=True))
     assert (found != {}) == kept
 
