@@ -163,7 +163,7 @@ def _load_run(
     where that is from."""
     kept = workdir / "config.yaml"
     if config.estimator == "imu_only" and kept.is_file():
-        nothing = dict.fromkeys(("model", "checkpoint", "epoch", "step"))
+        nothing: dict[str, Any] = dict.fromkeys(("model", "checkpoint", "epoch", "step"))
         return configuration.load(kept), None, nothing
     from gnio_jax.training import checkpoint  # Orbax takes seconds to import
 

@@ -81,9 +81,9 @@ def run_filters(
     found: dict[int, Estimate] = {}
     for batch in batches(strides, batch_size):
         history = _run_batch([prepared[i] for i in batch.members], batch, source, setup)
-        for place, i in enumerate(batch.members):
+        for place, i in enumerate(dict.fromkeys(batch.members)):
             own = jax.tree.map(lambda leaf, p=place, k=strides[i]: leaf[p, :k], history)
-            found.setdefault(i, _estimate(prepared[i], own, setup))
+            found[i] = _estimate(prepared[i], own, setup)
         progress(sum(strides[i] for i in found) / sum(strides))
     return [found[i] for i in range(len(prepared))]
 
