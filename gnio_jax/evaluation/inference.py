@@ -108,7 +108,7 @@ def predict_windows(
         )
         found.append(jax.device_get(prediction))
         progress(min(1.0, (begin + size) / total))
-    whole = jax.tree.map(lambda *parts: np.concatenate(parts)[:total].astype(np.float64), *found)
+    whole = jax.tree.map(lambda *leaves: np.concatenate(leaves)[:total].astype(np.float64), *found)
     ends = np.cumsum([len(part.start) for part in parts])
     rows = [slice(end - len(part.start), end) for end, part in zip(ends, parts, strict=True)]
     return [jax.tree.map(lambda leaf, own=own: leaf[own], whole) for own in rows]
