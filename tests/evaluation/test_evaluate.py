@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from gnio_jax import config, data
-from gnio_jax.commands import console as cli
+from gnio_jax.commands import console
 from gnio_jax.config import DataConfig, EvaluateConfig, FilterOptions, ModelConfig, TrainConfig
 from gnio_jax.data.readers import synthetic
 from gnio_jax.evaluation import report, run
@@ -73,7 +73,7 @@ def command(monkeypatch):
     ]
     load = data.load
 
-    def short(name, root=None, split="test"):
+    def short(name, root=None, split="test", workers=1, progress=None):
         return walks if (name, split) == ("synthetic", "test") else load(name, root, split)
 
     monkeypatch.setattr(data, "load", short)
@@ -83,7 +83,7 @@ def command(monkeypatch):
 
     def call(*arguments):
         monkeypatch.setattr(sys, "argv", ["evaluate.py", *map(str, arguments)])
-        cli.run(module.main)
+        console.run(module.main)
 
     return call
 

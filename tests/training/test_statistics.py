@@ -16,10 +16,13 @@ from gnio_jax.training import losses, optimizer, step
 from gnio_jax.training.checkpoint import create_model
 
 CONFIG = TrainConfig(
-    data=DataConfig(rate=50.0), model=ModelConfig(width=8), loss=LossConfig(nll_weight=1.0),
-    optim=OptimConfig(epochs=4, batch_size=64, learning_rate=3e-3, start_learning_rate=1e-4,
-                      warmup_epochs=0.5),
-)  # fmt: skip
+    data=DataConfig(rate=50.0),
+    model=ModelConfig(width=8),
+    loss=LossConfig(nll_weight=1.0),
+    optim=OptimConfig(
+        epochs=4, batch_size=64, learning_rate=3e-3, start_learning_rate=1e-4, warmup_epochs=0.5
+    ),
+)
 
 
 @functools.cache
@@ -48,8 +51,18 @@ def trainer(config, source, seed=0):
     def take(state, epoch, first, count):
         with jax.enable_x64(False):
             order = step.epoch_order(key, epoch, source)
-            return step.train_steps(state, source, order, jnp.int32(first), jnp.int32(count), jnp.float32(1), key,
-                                    model=model, optimizer=tx, config=config)  # fmt: skip
+            return step.train_steps(
+                state,
+                source,
+                order,
+                jnp.int32(first),
+                jnp.int32(count),
+                jnp.float32(1),
+                key,
+                model=model,
+                optimizer=tx,
+                config=config,
+            )
 
     return model, state, take, steps
 
@@ -119,7 +132,7 @@ def test_training_windows_err_in_inference_mode_as_in_training_mode(trained):
 
 
 def test_statistics_are_means_over_batches(trained):
-    """Of the first normalisation, against NumPy: its input is a convolution of the drawn windows."""
+    """Of the first normalisation, against NumPy: its input is a convolution of drawn windows."""
     model, _, state, source = trained
     few = dataclasses.replace(
         CONFIG, optim=dataclasses.replace(CONFIG.optim, statistics_windows=3 * 64)
@@ -181,8 +194,11 @@ def test_an_estimate_depends_on_parameters_and_key_alone(trained):
 
 
 def test_constants_of_the_uncertainty_are_left_alone():
-    config = dataclasses.replace(CONFIG, model=ModelConfig(width=2, uncertainty="calibrated", bank_size=0),
-                                 optim=dataclasses.replace(CONFIG.optim, statistics_windows=64))  # fmt: skip
+    config = dataclasses.replace(
+        CONFIG,
+        model=ModelConfig(width=2, uncertainty="calibrated", bank_size=0),
+        optim=dataclasses.replace(CONFIG.optim, statistics_windows=64),
+    )
     source = source_of("val", 25)
     model, state, _, _ = trainer(config, source)
     state.batch_stats["uncertainty"]["log_factor"] = jnp.array([0.5, -1.0, 2.0], jnp.float32)
@@ -247,8 +263,15 @@ def test_networks_with_a_head_begin_with_a_standard_deviation_near_one(name):
     imu = np.float32([0, 0, 9.81, 0, 0, 0]) + rng.normal(0, [3, 3, 3, 2, 2, 2], (8, 50, 6)).astype(
         np.float32
     )
-    apply = jax.jit(lambda variables: model.apply(
-        variables, jnp.asarray(imu), train=True, mutable=["batch_stats"], rngs={"dropout": jax.random.key(1)}))  # fmt: skip
+    apply = jax.jit(
+        lambda variables: model.apply(
+            variables,
+            jnp.asarray(imu),
+            train=True,
+            mutable=["batch_stats"],
+            rngs={"dropout": jax.random.key(1)},
+        )
+    )
     for seed in range(3):
         variables = models.initialise(model, jax.random.key(seed), 50)
         said, _ = apply(variables)

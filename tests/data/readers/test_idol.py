@@ -12,9 +12,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from gnio_jax import data
-from gnio_jax.data.cache import Refusal
+from gnio_jax.data import alignment
+from gnio_jax.data.dataset import Refusal
 from gnio_jax.data.readers import idol
-from gnio_jax.data.sequence import rotations
+from gnio_jax.numerics import rotations
 from gnio_jax.types import InputError
 from tests.support import known_walk as walk
 from tests.support.idol_files import BIAS, EPOCH, RIG_OF_PHONE, frame, write
@@ -193,7 +194,7 @@ def test_smoothed_positions_are_no_reason_to_leave_a_walk_out(tmp_path):
         1.0,
     )
     write(tmp_path, table)
-    (sequence,) = idol.read(tmp_path, "known")
+    (sequence,) = data.load("idol", tmp_path, "known")
     assert data.self_check(sequence).accel_correlation_horizontal < 0.3
 
 
@@ -251,7 +252,7 @@ def test_splits(copy, monkeypatch):
     assert {sequence.attributes["held_out"] for sequence in [*train, *val]} == people
     assert {sequence.attributes["calibration"] for sequence in train} == {"start"}
     with pytest.raises(InputError, match="known splits: train, val, seen, known"):
-        idol.read(copy, "tests")
+        data.load("idol", copy, "tests")
     # What was aligned once is not aligned again.
     monkeypatch.setattr(idol, "read_pieces", lambda path: pytest.fail("built again"))
     again = data.load("idol", copy, "val")
@@ -267,7 +268,7 @@ def test_recordings_without_a_named_subject_count_as_people_of_their_own(copy):
         UserWarning,
         match=r"metadata\.json does not name the subject of 10 recordings, e\.g\. .*0\.feather",
     ):
-        val = idol.read(copy, "val")
+        val = data.load("idol", copy, "val")
     assert len(val) == 1 and val[0].attributes["subject"] == val[0].name
 
 
@@ -281,7 +282,7 @@ def test_a_recording_that_is_of_no_use_is_left_out(copy):
         3,
     )
     with pytest.warns(UserWarning) as caught:
-        assert len(idol.read(copy, "known")) == 3
+        assert len(data.load("idol", copy, "known")) == 3
     texts = [str(warning.message) for warning in caught]
     assert any(
         text.startswith("building3_known_2: left out:") and "do not turn as" in text
@@ -298,14 +299,14 @@ def test_copies_gone_wrong(copy):
     for path in sorted((root / "building1" / "train").glob("*.feather"))[2:]:
         path.unlink()
     with pytest.raises(InputError, match="split 'val' would be empty"):
-        idol.read(copy, "val")
+        data.load("idol", copy, "val")
     (root / "building3" / "unknown" / "metadata.json").write_text("{")
     with pytest.raises(InputError, match=r"metadata\.json: is no JSON"):
-        idol.read(copy, "unseen")
+        data.load("idol", copy, "unseen")
     with pytest.raises(
         InputError, match=r"holds no recording in building\*/known; get it from .*expected layout"
     ):
-        idol.read(root / "building3", "known")
+        data.load("idol", root / "building3", "known")
 
 
 # --- mistakes
@@ -417,14 +418,16 @@ def test_lag_from_noisy_rates_with_a_bias(lag):
         noise.normal(0, np.radians(0.05), (len(time), 3))
     )
     keep = (time < 30) | (time > 30.4)
-    fit = idol.pose_lag(time, gyro, time[keep], poses[keep])
+    fit = alignment.pose_lag(time, gyro, time[keep], poses[keep])
     assert fit.lag == pytest.approx(lag, abs=3e-3) and fit.correlation > 0.5
 
 
 def test_what_stands_still_has_no_lag():
     time = np.arange(0, 20, 0.01)
     gyro = np.full((len(time), 3), 0.01) + np.random.default_rng(0).normal(0, 0.005, (len(time), 3))
-    assert idol.pose_lag(time, gyro, time, Rotation.identity(len(time))) == idol.Lag(0.0, 1.0)
+    assert alignment.pose_lag(time, gyro, time, Rotation.identity(len(time))) == alignment.PoseLag(
+        0.0, 1.0
+    )
 
 
 def test_one_wild_stamp_costs_one_row(tmp_path):
