@@ -29,6 +29,10 @@ class InputError(ValueError):
     def __init__(self, where: object, problem: str, remedy: str = ""):
         parts = [f"{where}: {problem}", remedy]
         super().__init__("; ".join(part for part in parts if part).replace("\n", " "))
+        self.parts = (str(where), problem, remedy)
+
+    def __reduce__(self) -> tuple[type[InputError], tuple[str, str, str]]:
+        return type(self), self.parts  # so that it can come from another process
 
 
 class Sequence(NamedTuple):

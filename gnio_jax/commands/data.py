@@ -23,9 +23,13 @@ from rich.table import Table
 
 from gnio_jax.commands import console as cli
 from gnio_jax.data import registry
+from gnio_jax.data.dataset import Dataset, Recording
+from gnio_jax.data.hdf5 import read_hdf5, write_hdf5
+from gnio_jax.data.plausibility import SelfCheck
+from gnio_jax.data.processes import map_in_processes, suggested_workers
 from gnio_jax.data.readers import csv_files as csv
-from gnio_jax.data.recordings import each, examine, in_splits
-from gnio_jax.data.sequence import Dataset, Recording, SelfCheck, read_hdf5, resample, write_hdf5
+from gnio_jax.data.reading import check_recording, find_recordings
+from gnio_jax.data.resampling import resample
 from gnio_jax.files import replacing
 from gnio_jax.types import InputError
 
@@ -251,7 +255,7 @@ def _found_here(dataset: Dataset) -> str:
         return "not found"
     place = f"{root}: " if dataset.needs_root else "computed: "
     try:
-        found, splits, _ = in_splits(dataset, root, "all")
+        found, splits, _ = find_recordings(dataset, root, "all")
     except InputError as error:
         return f"{place}no recording ({error})"
     return f"{place}{len(found)} recordings ({', '.join(f'{split} {len(names)}' for split, names in splits.items())})"
@@ -281,11 +285,16 @@ def check(options: CheckOptions) -> None:
     if options.plots is not None and options.plots.exists() and not options.plots.is_dir():
         raise InputError("--plots", f"{options.plots} is a file", "name a folder")
     dataset, root = resolve(options.dataset_or_root, options.dataset)
-    found, splits, notes = in_splits(dataset, root, options.split)
+    found, splits, notes = find_recordings(dataset, root, options.split)
     items = [(recording, dataset, options.plots) for recording in found.values()]
     with cli.progress() as progress:
         results = list(
-            each(_checked, items, options.workers, lambda share: progress("checking", share))
+            map_in_processes(
+                _checked,
+                items,
+                options.workers or suggested_workers(len(items)),
+                lambda share: progress("checking", share),
+            )
         )
 
     rows = []
@@ -367,7 +376,7 @@ def resolve(what: str, name: str | None) -> tuple[Dataset, Path]:
 
 def _fits(dataset: Dataset, root: Path) -> bool:
     try:
-        in_splits(dataset, root, "all")
+        find_recordings(dataset, root, "all")
     except InputError:
         return False
     return True
@@ -378,7 +387,7 @@ def _checked(
 ) -> tuple[list[tuple[str, SelfCheck]], str, tuple[str, ...]]:
     """The figures of one recording, why there are none, and the notes; without the sequences, which
     are large."""
-    found = examine(recording, dataset)
+    found = check_recording(recording, dataset)
     if plots is not None and found.sequences:
         from gnio_jax.data import pictures  # Matplotlib takes a second to import
 
@@ -543,7 +552,7 @@ def convert(options: ConvertOptions) -> None:
     out = options.out
     if dataset.needs_root and out.resolve() == root.resolve():
         raise InputError(out, "is the folder that is read", "choose another one for the result")
-    found, splits, notes = in_splits(dataset, root, options.split)
+    found, splits, notes = find_recordings(dataset, root, options.split)
     files: dict[str, str] = {}
     for name in found:
         if (other := files.setdefault(file_name(name), name)) != name:
@@ -561,7 +570,12 @@ def convert(options: ConvertOptions) -> None:
     with cli.progress() as progress:
         results |= zip(
             missing,
-            each(_convert_one, items, options.workers, lambda share: progress("converting", share)),
+            map_in_processes(
+                _convert_one,
+                items,
+                options.workers or suggested_workers(len(items)),
+                lambda share: progress("converting", share),
+            ),
             strict=True,
         )
     results = {name: results[name] for name in found}
@@ -636,7 +650,7 @@ def _convert_one(
     recording: Recording, dataset: Dataset, out: Path, rate: float | None
 ) -> Converted:
     """Write the sequences of a recording that pass the self-check."""
-    found = examine(recording, dataset)
+    found = check_recording(recording, dataset)
     if found.problem:  # not noted as done: it may be mended
         return Converted((), {recording.name: found.problem}, 0.0, found.notes, False)
     kept, left_out, seconds = [], {}, 0.0

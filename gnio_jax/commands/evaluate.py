@@ -11,6 +11,7 @@ import jax
 from gnio_jax import config as configuration
 from gnio_jax.commands import console as cli
 from gnio_jax.config import EvaluateConfig
+from gnio_jax.cores import usable_cores
 
 DESCRIPTION = """Estimate the trajectories of a split with the network of a run, and report their errors.
 
@@ -43,17 +44,17 @@ def main() -> None:
         evaluation,
         filtering,
     )
-    from gnio_jax.evaluation import report
+    from gnio_jax.evaluation import table
 
     filtering.cores_as_devices()
     with cli.progress() as progress:
-        found, folder = evaluation.evaluate(config, progress)
+        found, folder = evaluation.evaluate(config, progress, workers=usable_cores())
     console = Console(highlight=False)
     if not console.is_terminal:
         console = Console(
             highlight=False, width=200
         )  # into a file or a pipe: no line is cut to a terminal's width
-    console.print(report.table(found))
+    console.print(table.render(found))
     print(f"results: {folder}")
     if config.plots:
         print(

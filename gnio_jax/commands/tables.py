@@ -19,9 +19,10 @@ from gnio_jax import config as configuration
 from gnio_jax import models
 from gnio_jax.commands import console as cli
 from gnio_jax.config import TrainConfig
+from gnio_jax.cores import usable_cores
 from gnio_jax.files import replacing
 from gnio_jax.filtering import cores_as_devices
-from gnio_jax.tables import complexity, experiments, matrix, summary, windows
+from gnio_jax.tables import activities, complexity, experiments, markdown, matrix, summary
 from gnio_jax.tables.experiments import Experiment
 from gnio_jax.tables.matrix import Interrupted, Result
 from gnio_jax.types import InputError
@@ -167,6 +168,7 @@ def results_of(experiment: Experiment, options: TablesConfig, console: Console) 
             options.split,
             options.estimator,
             console,
+            usable_cores(),
         )
         for cell in experiment.cells
     ]
@@ -191,7 +193,7 @@ def make_table(options: TablesConfig, console: Console) -> None:
     if options.table in ("bank-size", "bank-spread"):
         extra = _entropies(path, options, results)
     found = summary.rows(experiment, results, extra)
-    summary.write(path, experiment, found, notes(base, options, experiment))
+    markdown.write(path, experiment, found, notes(base, options, experiment))
     pictures.save(path.with_suffix(".png"), pictures.table(experiment, results, found))
     console.print(path.with_suffix(".md").read_text(encoding="utf-8"), markup=False)
     console.print(f"results: {path}.md, .csv, .png")
@@ -208,7 +210,9 @@ def _entropies(
         if result.cell.config.model.bank_size == 0:
             continue
         found = [
-            windows.entropy(windows.said(run, options.split).diagnostics["attention"])
+            activities.entropy(
+                activities.predict_split(run, options.split).diagnostics["attention"]
+            )
             for run in result.runs
         ]
         labels.append(result.cell.label)
@@ -281,8 +285,8 @@ def make_standing(options: TablesConfig, console: Console) -> None:
     path, lines = _path(options), []
     by_method = {}
     for result in results:
-        seeds = [windows.said(run, options.split) for run in result.runs]
-        figures = [windows.by_activity(one) for one in seeds]
+        seeds = [activities.predict_split(run, options.split) for run in result.runs]
+        figures = [activities.by_activity(one) for one in seeds]
         by_method[result.cell.name] = {
             activity: {
                 key: float(np.mean([f[activity][key] for f in figures]))
@@ -295,17 +299,17 @@ def make_standing(options: TablesConfig, console: Console) -> None:
                 path.with_name(f"{path.name}_{result.cell.name}_gate.png"), pictures.gate(seeds[0])
             )
         if "attention" in seeds[0].diagnostics:
-            told, chance = np.mean([windows.information(one) for one in seeds], axis=0)
+            told, chance = np.mean([activities.information(one) for one in seeds], axis=0)
             words = f"the most attended prototype tells {told:.2f} bits of the activity, by chance it would be {chance:.2f}"
             lines.append(f"{result.cell.label}: {words}.")
             pictures.save(
                 path.with_name(f"{path.name}_{result.cell.name}_attention.png"),
-                pictures.attention(*windows.attention_by_activity(seeds[0]), words),
+                pictures.attention(*activities.attention_by_activity(seeds[0]), words),
             )
     pictures.save(path.with_suffix(".png"), pictures.standing(by_method))
     found = summary.rows(experiment, results)
     text = (
-        summary.markdown(experiment, found, [*notes(base, options, experiment), *lines])
+        markdown.render(experiment, found, [*notes(base, options, experiment), *lines])
         + "\n"
         + _activities(by_method)
     )
@@ -334,7 +338,7 @@ def _activities(by_method: dict[str, dict[str, dict[str, float]]]) -> str:
                 for key in ("error", "normalised", "length", "gate", "scale")
             )
             table.append([method, activity, f"{figures['windows']:.0f}", *numbers])
-    return summary.grid(header, table)
+    return markdown.grid(header, table)
 
 
 def notes(base: TrainConfig, options: TablesConfig, experiment: Experiment) -> list[str]:

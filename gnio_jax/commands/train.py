@@ -8,6 +8,7 @@ os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
 from gnio_jax import config as configuration
 from gnio_jax.commands import console as cli
 from gnio_jax.config import TrainConfig
+from gnio_jax.cores import usable_cores
 
 DESCRIPTION = """Train GNIO and leave a run: config.yaml, checkpoints/, metrics.jsonl and TensorBoard events in its work folder.
 
@@ -38,7 +39,7 @@ def main() -> None:
             TrainConfig, default=configuration.load(kept), description=DESCRIPTION, argv=arguments
         )
     try:
-        outcome = loop.train(config, resume)
+        outcome = loop.train(config, resume, workers=usable_cores())
     except FloatingPointError as error:
         print(error, file=sys.stderr)
         sys.exit(1)

@@ -1,15 +1,11 @@
 """Every dataset as a list of `Sequence`: `load(name, root, split)`, `names()`."""
 
+from gnio_jax.data.dataset import Dataset
+from gnio_jax.data.hdf5 import read_hdf5, write_hdf5
+from gnio_jax.data.plausibility import SelfCheck, self_check
 from gnio_jax.data.registry import find_root, get, load, names
-from gnio_jax.data.sequence import (
-    Dataset,
-    SelfCheck,
-    read_hdf5,
-    resample,
-    self_check,
-    validate,
-    write_hdf5,
-)
+from gnio_jax.data.resampling import resample
+from gnio_jax.data.validation import validate
 from gnio_jax.types import Sequence
 
 __all__ = [

@@ -11,7 +11,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
 
-from gnio_jax.data.sequence import SelfCheck, gyro_windows
+from gnio_jax.data.plausibility import SelfCheck, gyro_windows
 from gnio_jax.files import replacing
 from gnio_jax.types import Sequence
 

@@ -1,5 +1,5 @@
-"""From a dataset's name to its sequences. A new dataset is one module with a `DATASET`, imported
-and listed here.
+"""From a dataset's name to its sequences. A new dataset is one module in `readers` with a
+`DATASET`, imported and listed here.
 
 A module that reads several sets of one layout has `DATASETS`, a tuple, besides.
 """
@@ -8,14 +8,26 @@ from __future__ import annotations
 
 import difflib
 import os
+from collections.abc import Callable
 from pathlib import Path
 
-from gnio_jax.data.readers import blackbird, euroc, idol, kitti, oxiod, ridi, ronin, synthetic, tlio
-from gnio_jax.data.readers import csv_files as csv
-from gnio_jax.data.sequence import Dataset
+from gnio_jax.data.dataset import Dataset
+from gnio_jax.data.readers import (
+    blackbird,
+    csv_files,
+    euroc,
+    idol,
+    kitti,
+    oxiod,
+    ridi,
+    ronin,
+    synthetic,
+    tlio,
+)
+from gnio_jax.data.reading import read_split
 from gnio_jax.types import InputError, Sequence
 
-_MODULES = (blackbird, csv, euroc, idol, kitti, oxiod, ridi, ronin, synthetic, tlio)
+_MODULES = (blackbird, csv_files, euroc, idol, kitti, oxiod, ridi, ronin, synthetic, tlio)
 _DATASETS: dict[str, Dataset] = {
     dataset.name: dataset
     for module in _MODULES
@@ -35,10 +47,10 @@ def names() -> list[str]:
 def get(name: str) -> Dataset:
     """The dataset of that name; raises `InputError` that lists the known ones."""
     if name not in _DATASETS:
-        close = difflib.get_close_matches(name, names(), n=1)
-        hint = f"did you mean '{close[0]}'? " if close else ""
         raise InputError(
-            "dataset", f"unknown name '{name}'", f"{hint}known datasets: {', '.join(names())}"
+            "dataset",
+            f"unknown name '{name}'",
+            f"{_did_you_mean(name, names())}known datasets: {', '.join(names())}",
         )
     return _DATASETS[name]
 
@@ -56,11 +68,8 @@ def find_root(
         candidates = [Path(root)]
     else:
         bases = [Path(os.environ["GNIO_DATA"])] if os.environ.get("GNIO_DATA") else []
-        candidates = [
-            base / folder
-            for base in [*bases, Path("data")]
-            for folder in _FOLDERS.get(name, (name,))
-        ]
+        folders = _FOLDERS.get(name, (name,))
+        candidates = [base / folder for base in [*bases, Path("data")] for folder in folders]
     for candidate in candidates:
         if candidate.is_dir():
             return candidate
@@ -68,34 +77,39 @@ def find_root(
     raise InputError(
         looked,
         f"no folder of dataset '{name}'",
-        f"{hint}, or set GNIO_DATA to its parent; get it from {dataset.source}; expected layout: {dataset.layout}",
+        f"{hint}, or set GNIO_DATA to its parent; get it from {dataset.source}; "
+        f"expected layout: {dataset.layout}",
     )
 
 
 def load(
-    name: str, root: str | os.PathLike[str] | None = None, split: str = "test"
+    name: str,
+    root: str | os.PathLike[str] | None = None,
+    split: str = "test",
+    workers: int = 1,
+    progress: Callable[[float], None] = lambda share: None,
 ) -> list[Sequence]:
-    """The sequences of a split of a dataset, validated, at its native rate (`resample` changes
-    that).
+    """The sequences of a split of a dataset, validated and self-checked, at its native rate
+    (`resample` changes that).
 
-    Raises `InputError` on an unknown name or split, a missing folder, or a split without a
-    sequence.
+    Recordings that cannot be used are left out with a warning. With `workers` > 1 that many
+    processes read the recordings that are slow to read and not in the cache yet; a script that asks
+    for them needs its `if __name__ == "__main__"`. `progress` is told the share of these recordings
+    that is read. Raises `InputError` on an unknown name or split, a missing folder, a damaged file,
+    or a split without a sequence.
     """
     dataset = get(name)
+    # Where lists at the root name the splits, the reader knows them.
     if split not in dataset.splits and dataset.list_splits is None:
-        close = difflib.get_close_matches(split, dataset.splits, n=1)
-        hint = f"did you mean '{close[0]}'? " if close else ""
         raise InputError(
             f"dataset {name}",
             f"unknown split '{split}'",
-            f"{hint}known splits: {', '.join(dataset.splits)}",
+            f"{_did_you_mean(split, dataset.splits)}known splits: {', '.join(dataset.splits)}",
         )
     folder = find_root(name, root) if dataset.needs_root else Path(root or ".")
-    sequences = dataset.read(folder, split)
-    if not sequences:
-        raise InputError(
-            folder,
-            f"split '{split}' of dataset '{name}' holds no sequence",
-            f"expected layout: {dataset.layout}",
-        )
-    return sequences
+    return read_split(dataset, folder, split, workers, progress)
+
+
+def _did_you_mean(word: str, known: list[str] | tuple[str, ...]) -> str:
+    close = difflib.get_close_matches(word, known, n=1)
+    return f"did you mean '{close[0]}'? " if close else ""

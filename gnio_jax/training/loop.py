@@ -108,25 +108,31 @@ def prepare_workdir(config: TrainConfig, resume: bool) -> Path:
     return workdir
 
 
-def train(config: TrainConfig, resume: bool = False, console: Console | None = None) -> Outcome:
+def train(
+    config: TrainConfig,
+    resume: bool = False,
+    console: Console | None = None,
+    workers: int = 1,
+) -> Outcome:
     """Train the network of `config` and leave checkpoints and logs in its work folder.
 
     With `resume` the run goes on from its latest checkpoint as if it had never stopped: parameters,
     optimizer, order of the windows and random draws are functions of the seed and the step. Resume
     rules, in order: the settings must be those of config.yaml; without a checkpoint yet the run
     starts over; log rows after the checkpoint are dropped. SIGTERM and Ctrl-C save and return; a
-    loss that is not finite raises `FloatingPointError` naming the step.
+    loss that is not finite raises `FloatingPointError` naming the step. `workers` processes read
+    recordings that are slow to read (`data.load`).
     """
     with jax.enable_x64(
         False
     ):  # whatever the process has: no float64 in the step, and the same random draws
-        return _train(config, resume, console or Console(stderr=True, soft_wrap=True))
+        return _train(config, resume, console or Console(stderr=True, soft_wrap=True), workers)
 
 
-def _train(config: TrainConfig, resume: bool, console: Console) -> Outcome:
+def _train(config: TrainConfig, resume: bool, console: Console, workers: int) -> Outcome:
     configuration.validate(config)
     workdir = prepare_workdir(config, resume)
-    run = _prepare(config, console)
+    run = _prepare(config, console, workers)
     state = create_state(run.model, run.optimizer, run.init_key, config.data.window)
     console.print(
         f"{config.model.name}: {sum(x.size for x in jax.tree.leaves(state.params)):,} parameters on {jax.devices()[0].platform}, "
@@ -224,7 +230,7 @@ class _Run(NamedTuple):
         )
 
 
-def _prepare(config: TrainConfig, console: Console) -> _Run:
+def _prepare(config: TrainConfig, console: Console, workers: int) -> _Run:
     model = create_model(config)  # a mistake in its options should not wait for the data
     console.print(
         f"reading {config.dataset}: {config.data.train_split} and {config.data.val_split}"
@@ -235,9 +241,10 @@ def _prepare(config: TrainConfig, console: Console) -> _Run:
         config.data.train_stride,
         config.augment.shift_samples,
         console,
+        workers,
     )
     held_out, validated_with = _load_windows(
-        config, config.data.val_split, config.data.stride, 0, console
+        config, config.data.val_split, config.data.stride, 0, console, workers
     )
     splits = {config.data.train_split: learnt_from, config.data.val_split: validated_with}
     count, size = source.visited.shape[0], config.optim.batch_size
@@ -351,14 +358,14 @@ def _learning_rate(run: _Run, position: Position) -> float:
 
 
 def _load_windows(
-    config: TrainConfig, split: str, stride: int, shift: int, console: Console
+    config: TrainConfig, split: str, stride: int, shift: int, console: Console, workers: int
 ) -> tuple[windows.WindowSource, list[str]]:
     """The windows of a split on the device, and the names of its recordings."""
     sequences = [
         data.resample(s, config.data.rate)
-        for s in data.load(config.dataset, config.data_root, split)
+        for s in data.load(config.dataset, config.data_root, split, workers)
     ]
-    source = windows.index(sequences, config.data, stride, shift)
+    source = windows.window_source(sequences, config.data, stride, shift)
     hours = sum(len(s.time) for s in sequences) / config.data.rate / 3600
     console.print(
         f"  {split}: {len(sequences)} sequences, {hours:.2f} h, {source.visited.shape[0]:,} windows"

@@ -14,7 +14,7 @@ from jaxtyping import Float, Int, PRNGKeyArray
 
 from gnio_jax.config import TrainConfig
 from gnio_jax.data.augmentation import augment
-from gnio_jax.data.windows import WindowSource, gather, shifted
+from gnio_jax.data.windows import WindowSource, gather, shift_windows
 from gnio_jax.models import initialise
 from gnio_jax.models.resnet import MOMENTUM
 from gnio_jax.training.losses import Losses, Stage, losses, stage
@@ -96,7 +96,9 @@ def train_steps(
     def one_step(i: jax.Array, carry: tuple[TrainState, Progress]) -> tuple[TrainState, Progress]:
         state, progress = carry
         which = jax.lax.dynamic_slice(order, ((first + i) * size,), (size,))
-        windows, dropout_key = drawn(jax.random.fold_in(key, state.step), source, which, config)
+        windows, dropout_key = draw_windows(
+            jax.random.fold_in(key, state.step), source, which, config
+        )
         now = stage(config.loss, state.step, steps_per_epoch)
 
         def objective(params: Any) -> tuple[jax.Array, tuple[Losses, Any]]:
@@ -134,13 +136,13 @@ def train_steps(
     return jax.lax.fori_loop(jnp.int32(0), count, one_step, (state, nothing))
 
 
-def drawn(
+def draw_windows(
     key: PRNGKeyArray, source: WindowSource, which: Int[jax.Array, "b"], config: TrainConfig
 ) -> tuple[Windows, PRNGKeyArray]:
     """The windows `which`, shifted and augmented by draws from `key`, and the key of the network's
     dropout."""
     augment_key, dropout_key, shift_key = jax.random.split(key, 3)
-    which = shifted(shift_key, source, which, config.augment.shift_samples)
+    which = shift_windows(shift_key, source, which, config.augment.shift_samples)
     return augment(
         augment_key, gather(source, which, config.data.window), config.augment
     ), dropout_key
@@ -193,7 +195,9 @@ def estimate_statistics(
 
     def add_batch(total: Any, number_which: tuple[jax.Array, jax.Array]) -> tuple[Any, None]:
         number, which = number_which
-        windows, dropout_key = drawn(jax.random.fold_in(draw_key, number), source, which, config)
+        windows, dropout_key = draw_windows(
+            jax.random.fold_in(draw_key, number), source, which, config
+        )
         _, changed = model.apply({"params": state.params, "batch_stats": zeros}, windows.imu, train=True,
                                  mutable=["batch_stats"], rngs={"dropout": dropout_key})  # fmt: skip
         return jax.tree.map(jnp.add, total, changed["batch_stats"]), None

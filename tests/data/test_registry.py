@@ -15,9 +15,8 @@ def test_every_dataset_says_what_a_user_must_know():
     )
     for name in data.names():
         dataset = data.get(name)
-        assert (
-            dataset.name == name and dataset.splits and dataset.rate > 0 and callable(dataset.read)
-        )
+        assert dataset.name == name and dataset.splits and dataset.rate > 0
+        assert callable(dataset.recordings)
         assert dataset.source and dataset.layout and dataset.licence
 
 
@@ -65,7 +64,7 @@ def test_the_root_is_the_argument_then_the_environment_then_the_working_folder(
 
 
 def test_a_split_without_a_sequence_is_an_error(tmp_path, monkeypatch):
-    empty = dataclasses.replace(data.get("tlio"), read=lambda root, split: [])
+    empty = dataclasses.replace(data.get("tlio"), recordings=lambda root, split: [])
     monkeypatch.setitem(registry._DATASETS, "tlio", empty)
     with pytest.raises(InputError, match="split 'test' of dataset 'tlio' holds no sequence"):
         data.load("tlio", tmp_path)

@@ -73,7 +73,7 @@ def command(monkeypatch):
     ]
     load = data.load
 
-    def short(name, root=None, split="test"):
+    def short(name, root=None, split="test", workers=1, progress=None):
         return walks if (name, split) == ("synthetic", "test") else load(name, root, split)
 
     monkeypatch.setattr(data, "load", short)

@@ -12,7 +12,7 @@ import pytest
 from gnio_jax import interop, models
 from gnio_jax.commands import console as cli
 from gnio_jax.config import FilterOptions
-from gnio_jax.evaluation import odometry
+from gnio_jax.evaluation import filter_setup
 from gnio_jax.training import checkpoint
 from gnio_jax.types import InputError
 from tests.support import tlio_weights
@@ -313,8 +313,8 @@ def test_a_run_is_made_of_them(file, tmp_path, monkeypatch, capsys, loaded):
         20,
     )
     assert run.model == models.create("tlio")
-    assert odometry.filter_config(run.config.data, run.config.filter).window_rotation == "tlio"
-    assert odometry.filter_config(run.config.data, FilterOptions()).window_rotation == "per_sample"
+    assert filter_setup(run.config.data, run.config.filter).config.window_rotation == "tlio"
+    assert filter_setup(run.config.data, FilterOptions()).config.window_rotation == "per_sample"
     equal(run.variables, loaded)
     with pytest.raises(SystemExit) as left:  # a second time
         command(monkeypatch, file, tmp_path / "run")

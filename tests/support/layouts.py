@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gnio_jax.data.sequence import write_hdf5
+from gnio_jax.data.hdf5 import write_hdf5
 from gnio_jax.types import Sequence
 from tests.support import (
     asl_files,

@@ -94,7 +94,7 @@ def test_validation_is_the_plain_mean_over_every_window(recording, finished):
     run = checkpoint.load_run(workdir, "latest")
     from gnio_jax import data
 
-    source = windows.index(
+    source = windows.window_source(
         [data.resample(s, 50.0) for s in data.load("tlio", recording, "val")], run.config.data, 5
     )
     source = jax.device_put(source)
@@ -210,7 +210,7 @@ def test_killed_at_any_moment_and_resumed_gives_the_same_bits(recording, tmp_pat
 
 
 def test_a_loss_that_is_not_finite_stops_with_its_step(recording, tmp_path, monkeypatch):
-    real, found = windows.index, []
+    real, found = windows.window_source, []
 
     def spoiled(*arguments):
         source = real(*arguments)
@@ -221,7 +221,7 @@ def test_a_loss_that_is_not_finite_stops_with_its_step(recording, tmp_path, monk
             )
         )
 
-    monkeypatch.setattr(windows, "index", spoiled)
+    monkeypatch.setattr(windows, "window_source", spoiled)
     config = tiny(recording, tmp_path / "run")
     with pytest.raises(FloatingPointError, match=r"not finite at step \d+ \(epoch 0\)") as raised:
         loop.train(config)

@@ -26,7 +26,7 @@ CONFIG = TrainConfig(
 def source_of(split, stride, rate=CONFIG.data.rate):
     sequences = [data.resample(s, rate) for s in data.load("synthetic", split=split)]
     return jax.device_put(
-        windows.index(sequences, dataclasses.replace(CONFIG.data, rate=rate), stride)
+        windows.window_source(sequences, dataclasses.replace(CONFIG.data, rate=rate), stride)
     )
 
 
@@ -92,7 +92,7 @@ def squared_errors(model, state, source, config=CONFIG):
 
     @jax.jit
     def one(state, key, which):
-        drawn, dropout = step.drawn(key, source, which, config)
+        drawn, dropout = step.draw_windows(key, source, which, config)
         variables = {"params": state.params, "batch_stats": state.batch_stats}
         training, _ = model.apply(
             variables, drawn.imu, train=True, mutable=["batch_stats"], rngs={"dropout": dropout}
@@ -133,9 +133,9 @@ def test_statistics_are_means_over_batches(trained):
     for number, which in enumerate(order):
         with jax.enable_x64(False):
             imu = np.asarray(
-                step.drawn(jax.random.fold_in(draw_key, number), source, jnp.asarray(which), few)[
-                    0
-                ].imu,
+                step.draw_windows(
+                    jax.random.fold_in(draw_key, number), source, jnp.asarray(which), few
+                )[0].imu,
                 np.float64,
             )
         padded = np.pad(imu, ((0, 0), (3, 3), (0, 0)))

@@ -23,19 +23,17 @@ from jaxtyping import Float
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
+from gnio_jax.data.dataset import Dataset, Recording, single
 from gnio_jax.data.readers.parsing import float_columns, parsed_as, unit_rotations
 from gnio_jax.data.readers.text import listed, numbers, read_csv
-from gnio_jax.data.recordings import read_all, single
-from gnio_jax.data.sequence import (
+from gnio_jax.data.resampling import resample
+from gnio_jax.data.validation import (
     FASTEST,
-    Dataset,
-    Recording,
     check_finite,
     check_gaps,
     check_increasing,
     check_motion,
     check_rate,
-    resample,
     validate,
 )
 from gnio_jax.numerics import quaternions, wxyz_from_xyzw
@@ -48,16 +46,9 @@ _TRUTH = "stamped_groundtruth_imu.txt"
 _FIELDS = {"ts": None, "gyro_calib": 3, "accel_calib": 3, "traj_target": 7}
 
 
-def read(root: Path, split: str) -> list[Sequence]:
-    """The sequences of a split, those that fail the physical self-check named and left out."""
-    return read_all(DATASET, Path(root), split)
-
-
 def recordings(root: Path, split: str) -> list[Recording]:
     """The recordings of a split's list that are present."""
     root = Path(root)
-    if split not in SPLITS:
-        raise InputError(root, f"unknown split '{split}'", f"known splits: {', '.join(SPLITS)}")
     folders = listed(
         root / f"{split}.txt",
         lambda entry: root / entry if (root / entry / _TABLE).is_file() else None,
@@ -147,7 +138,6 @@ def _velocity(path: Path, stamps: Float[np.ndarray, " n"]) -> Float[np.ndarray, 
 
 DATASET = Dataset(
     name="blackbird",
-    read=read,
     recordings=recordings,
     splits=SPLITS,
     rate=RATE,

@@ -25,17 +25,15 @@ from jaxtyping import Float
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d
 
+from gnio_jax.data.dataset import Dataset, Recording, single
+from gnio_jax.data.hdf5 import read_hdf5
 from gnio_jax.data.readers.text import listed, numbers, read_csv
-from gnio_jax.data.recordings import read_all, single
-from gnio_jax.data.sequence import (
-    Dataset,
-    Recording,
+from gnio_jax.data.resampling import resample
+from gnio_jax.data.validation import (
     check_finite,
     check_gaps,
     check_increasing,
     check_motion,
-    read_hdf5,
-    resample,
     validate,
 )
 from gnio_jax.types import GRAVITY, STANDARD_G, InputError, Sequence
@@ -54,24 +52,19 @@ _REFERENCE = {
 _FILES = (".csv", ".h5", ".hdf5")
 
 
-def read(root: Path, split: str) -> list[Sequence]:
-    """The recordings of a split: those that <root>/<split>.txt lists, or all as `test` where there
-    is no list.
-
-    Those that have a reference pass the physical self-check or are named and left out.
-    """
-    return sorted(read_all(DATASET, Path(root), split), key=lambda sequence: sequence.name)
-
-
 def recordings(root: Path, split: str) -> list[Recording]:
-    """The recordings of a split. Raises `InputError` where two files would go by the same name."""
+    """The recordings of a split, in the order of their names: those that <root>/<split>.txt lists,
+    or all as `test` where there is no list.
+
+    Raises `InputError` where two files would go by the same name.
+    """
     named: dict[str, Path] = {}
     for path in _files(Path(root), split):
         if named.setdefault(path.stem, path) != path:
             raise InputError(
                 path, f"has the name of {named[path.stem]}", "rename or remove one of them"
             )
-    return [single(name, read_recording, path) for name, path in named.items()]
+    return [single(name, read_recording, path) for name, path in sorted(named.items())]
 
 
 def list_splits(root: Path) -> tuple[str, ...]:
@@ -666,7 +659,6 @@ def _note_gravity(time: np.ndarray, accel: np.ndarray, path: Path, notes: list[s
 
 DATASET = Dataset(
     name="csv",
-    read=read,
     recordings=recordings,
     splits=SPLITS,
     rate=100.0,

@@ -34,11 +34,11 @@ from pathlib import Path
 
 import numpy as np
 
-from gnio_jax.data.cache import cached
+from gnio_jax.data.dataset import Dataset, Recording, single
 from gnio_jax.data.readers.asl import Imu, SensorPose, read_imu, read_poses, sensor_pose
 from gnio_jax.data.readers.reference import Poses, fused, interpolated
-from gnio_jax.data.recordings import read_all, single
-from gnio_jax.data.sequence import Dataset, Recording, resample, validate
+from gnio_jax.data.resampling import resample
+from gnio_jax.data.validation import validate
 from gnio_jax.types import InputError, Sequence
 
 RATE = 200.0
@@ -66,15 +66,8 @@ TUMVI_SPLITS = {
 _REFERENCES = ("state_groundtruth_estimate0", "mocap0")
 
 
-def read(root: Path, split: str, dataset: str = "euroc") -> list[Sequence]:
-    """The sequences of a split, those that fail the physical self-check named and left out."""
-    return read_all(_about(dataset), Path(root), split)
-
-
 def recordings(root: Path, split: str, dataset: str = "euroc") -> list[Recording]:
     """The recordings of a split."""
-    if split not in SPLITS:
-        raise InputError(root, f"unknown split '{split}'", f"known splits: {', '.join(SPLITS)}")
     about = _about(dataset)
     known = EUROC_SPLITS if dataset == "euroc" else TUMVI_SPLITS
     wanted = "test" if split == "seen" else split
@@ -89,23 +82,24 @@ def recordings(root: Path, split: str, dataset: str = "euroc") -> list[Recording
             f"holds no sequence of split '{split}'",
             f"its sequences are {', '.join(known[wanted])}",
         )
-    return [single(short_name(folder.name), _cached, folder, dataset) for folder in chosen]
+    return [_recording(folder, about) for folder in chosen]
 
 
 def _about(dataset: str) -> Dataset:
     return next(entry for entry in DATASETS if entry.name == dataset)
 
 
-def _cached(folder: Path, dataset: str) -> Sequence:
-    about = _about(dataset)
+def _recording(folder: Path, about: Dataset) -> Recording:
     sensors = [folder / "mav0" / sensor for sensor in ("imu0", *_REFERENCES)]
-    sources = [
-        path
-        for sensor in sensors
-        for path in (sensor / "data.csv", sensor / "sensor.yaml")
-        if path.is_file()
-    ]
-    return cached(sources, f"{VERSION} {about.name}", lambda: read_sequence(folder, about))
+    files = [sensor / name for sensor in sensors for name in ("data.csv", "sensor.yaml")]
+    return single(short_name(folder.name), _read_by_name, folder, about.name)._replace(
+        files=tuple(path for path in files if path.is_file()), version=f"{VERSION} {about.name}"
+    )
+
+
+def _read_by_name(folder: Path, dataset: str) -> Sequence:
+    """Another process has a `Dataset` of its own: only the name goes there."""
+    return read_sequence(folder, _about(dataset))
 
 
 def find_sequences(root: Path, about: Dataset) -> dict[str, Path]:
@@ -232,7 +226,6 @@ def _on_clock(time: np.ndarray, samples: np.ndarray, path: Path) -> Sequence:
 
 EUROC = Dataset(
     name="euroc",
-    read=partial(read, dataset="euroc"),
     recordings=partial(recordings, dataset="euroc"),
     splits=SPLITS,
     rate=RATE,
@@ -244,7 +237,6 @@ EUROC = Dataset(
 )
 TUMVI = Dataset(
     name="tumvi",
-    read=partial(read, dataset="tumvi"),
     recordings=partial(recordings, dataset="tumvi"),
     splits=SPLITS,
     rate=RATE,

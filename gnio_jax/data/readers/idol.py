@@ -30,21 +30,18 @@ from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
 from gnio_jax.data.alignment import PoseLag, pose_lag
-from gnio_jax.data.cache import Refusal, cached_pieces
+from gnio_jax.data.dataset import Dataset, Recording, Refusal
+from gnio_jax.data.gaps import divide_at_gaps
 from gnio_jax.data.readers.parsing import json_object, parsed_as
 from gnio_jax.data.readers.phones import held_out, with_velocity
 from gnio_jax.data.readers.reference import Poses, poses_at
 from gnio_jax.data.readers.text import numbers, shortened
-from gnio_jax.data.recordings import divide, read_all
-from gnio_jax.data.sequence import (
-    LONGEST_BRIDGE,
+from gnio_jax.data.resampling import LONGEST_BRIDGE, resample
+from gnio_jax.data.validation import (
     WINDOW_SECONDS,
-    Dataset,
-    Recording,
     check_finite,
     check_rate,
     check_unit_norm,
-    resample,
     validate,
 )
 from gnio_jax.numerics import finite_rows, levelling, outer_span, quaternions, rotations
@@ -72,17 +69,9 @@ _SPLITS = {
 _BUILDINGS = ("building1", "building2", "building3")
 
 
-def read(root: Path, split: str) -> list[Sequence]:
-    """The sequences of a split; those that are of no use or fail the physical self-check are named
-    and left out. Raises `InputError`."""
-    return read_all(DATASET, Path(root), split)
-
-
 def recordings(root: Path, split: str) -> list[Recording]:
     """The walks of a split."""
     root = Path(root)
-    if split not in _SPLITS:
-        raise InputError(root, f"unknown split '{split}'", f"known splits: {', '.join(_SPLITS)}")
     chosen = find_walks(root, _SPLITS[split])
     note: dict[str, Any] = {}
     if split in ("train", "val"):
@@ -97,7 +86,7 @@ def recordings(root: Path, split: str) -> list[Recording]:
                 f"split '{split}' would be empty: {len(held)} recordings are held out for validation",
                 "complete the data, or choose another split",
             )
-    return [Recording(walk.name, partial(_cached, walk, note)) for walk in chosen]
+    return [_recording(walk, note) for walk in chosen]
 
 
 class Walk(NamedTuple):
@@ -114,15 +103,15 @@ class Walk(NamedTuple):
         return _name(self.path)
 
 
-def _cached(walk: Walk, note: dict[str, Any]) -> list[Sequence]:
-    sequences = cached_pieces([walk.path], VERSION, lambda: read_pieces(walk.path))
-    about = {
-        "subject": walk.subject,
-        "group": walk.subject,
-        "calibration": walk.calibration,
-        **note,
-    }
-    return [sequence._replace(attributes=sequence.attributes | about) for sequence in sequences]
+def _recording(walk: Walk, note: dict[str, Any]) -> Recording:
+    person = {"subject": walk.subject, "group": walk.subject, "calibration": walk.calibration}
+    return Recording(
+        walk.name,
+        partial(read_pieces, walk.path),
+        files=(walk.path,),
+        version=VERSION,
+        attributes=person | note,
+    )
 
 
 def find_walks(root: Path, folder: str) -> list[Walk]:
@@ -164,7 +153,7 @@ def read_pieces(path: str | os.PathLike[str]) -> list[Sequence]:
     """One walk at 100 Hz: levelled, the reference turned to the phone and shifted onto its clock.
 
     Level and lag are those of the whole walk; where a gap is longer than a window it is divided
-    (`divide`). Raises `InputError` naming file and column, and `Refusal` when its reference cannot
+    (`divide_at_gaps`). Raises `InputError` naming file and column, and `Refusal` when its reference cannot
     be that of the phone.
     """
     path = Path(path)
@@ -201,7 +190,7 @@ def read_pieces(path: str | os.PathLike[str]) -> list[Sequence]:
             "tilt_degrees": float(np.degrees(level.magnitude())),
         },
     )
-    pieces = divide(validate(sequence, path), path)
+    pieces = divide_at_gaps(validate(sequence, path), path)
     return [validate(with_velocity(resample(piece, RATE)), path) for piece in pieces]
 
 
@@ -357,7 +346,6 @@ def _name(path: Path) -> str:
 
 DATASET = Dataset(
     name="idol",
-    read=read,
     recordings=recordings,
     splits=tuple(_SPLITS),
     rate=RATE,

@@ -40,20 +40,19 @@ import numpy as np
 from jaxtyping import Bool
 from scipy.spatial.transform import Rotation
 
+from gnio_jax.data.dataset import Dataset, Recording, single
+from gnio_jax.data.gaps import stretches
 from gnio_jax.data.readers.oxts import Motion, read_oxts
 from gnio_jax.data.readers.parsing import float_columns, parsed_as
-from gnio_jax.data.recordings import read_all, single
-from gnio_jax.data.sequence import (
-    Dataset,
-    Recording,
+from gnio_jax.data.resampling import resample
+from gnio_jax.data.validation import (
     check_finite,
     check_gaps,
     check_increasing,
     check_rate,
-    resample,
     validate,
 )
-from gnio_jax.numerics import midpoints, quaternions, stretches, within
+from gnio_jax.numerics import midpoints, quaternions, within
 from gnio_jax.types import InputError, Sequence
 
 RATE = 100.0
@@ -84,15 +83,8 @@ class Drive(NamedTuple):
     """Its npz files; not read where there are packets."""
 
 
-def read(root: Path, split: str) -> list[Sequence]:
-    """The sequences of a split, those that fail the physical self-check named and left out."""
-    return read_all(DATASET, Path(root), split)
-
-
 def recordings(root: Path, split: str) -> list[Recording]:
     """The drives of a split, or their pieces where these are files of their own."""
-    if split not in SPLITS:
-        raise InputError(root, f"unknown split '{split}'", f"known splits: {', '.join(SPLITS)}")
     found = []
     for drive in find_drives(Path(root)):
         if share_of(drive.name) == split and drive.oxts:
@@ -242,7 +234,6 @@ def _jumps(sequence: Sequence) -> Bool[np.ndarray, " n"]:
 
 DATASET = Dataset(
     name="kitti",
-    read=read,
     recordings=recordings,
     splits=SPLITS,
     rate=RATE,

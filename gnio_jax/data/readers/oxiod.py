@@ -36,25 +36,19 @@ with the second difference of the positions.
 
 from __future__ import annotations
 
-import multiprocessing
 import re
 import warnings
 from collections.abc import Callable, Iterable
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
 from jaxtyping import Bool, Float
-from rich.console import Console
-from rich.progress import Progress
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import binary_dilation, binary_erosion
 from scipy.spatial.transform import Rotation, Slerp
 
-from gnio_jax.cores import usable_cores
 from gnio_jax.data.alignment import (
     Alignment,
     TooLittle,
@@ -65,18 +59,10 @@ from gnio_jax.data.alignment import (
     fuse_attitude,
     smooth_positions,
 )
-from gnio_jax.data.cache import Refusal, cached
+from gnio_jax.data.dataset import Dataset, Recording, Refusal, single
 from gnio_jax.data.readers.text import shortened
-from gnio_jax.data.recordings import single
-from gnio_jax.data.sequence import (
-    Dataset,
-    Recording,
-    check_units,
-    keep_plausible,
-    quaternions,
-    validate,
-)
-from gnio_jax.numerics import integrate_gyro
+from gnio_jax.data.validation import check_units, validate
+from gnio_jax.numerics import integrate_gyro, quaternions
 from gnio_jax.types import STANDARD_G, InputError, Sequence
 
 RATE = 100.0
@@ -852,55 +838,24 @@ def _with_tango(walk: Walk, kind: str, imu: Imu, path: Path) -> Sequence:
 # -------------------------------------------------------------------------------------------------------
 
 
-def read(root: Path, split: str) -> list[Sequence]:
-    """The sequences of `split` below `root`, at 100 Hz.
-
-    `train`, `test` (also called `seen`)
-        the authors' lists of the single-user scenes; whole sessions (`dataN`) are taken from
-        `train` for `val`.
-    `unseen`
-        other users and other devices: in no list and in no training.
-    `large_scale`
-        the floors with Tango, in no list either.
-    `sessions_train`, `sessions_val`, `sessions_test`
-        every walk of the Vicon room, other users and devices among them, shared out by a seeded
-        hold-out of whole sessions (`dataN`, `userN`, the device), about 70/10/20 of the time: the
-        lists alone leave little to train on in a partial copy. A network trained on these has seen
-        users and devices of `unseen`: judge it by `sessions_test` alone.
-
-    Recordings that are ruined or fail the self-check are left out with a warning. Raises
-    `InputError` when the split is unknown or empty, or the root holds no recording.
-    """
-    chosen = _chosen(Path(root), split)
-    sequences = _build_all(chosen)
-    if not sequences:
-        raise InputError(
-            root,
-            f"none of the {len(chosen)} recordings of split '{split}' can be used",
-            "see the warnings above",
-        )
-    return keep_plausible(sequences, DATASET.pedestrian, DATASET.min_correlation)
-
-
 def recordings(root: Path, split: str) -> list[Recording]:
     """The walks of a split."""
-    return [single(walk.name, _build_one, walk) for walk in _chosen(Path(root), split)]
+    return [recording_of(walk) for walk in _chosen(Path(root), split)]
 
 
-def _build_one(walk: Walk) -> Sequence:
-    sequence, reasons = build_walk(walk)
-    if sequence is None:
-        raise Refusal(walk.name, "; ".join(reasons))
-    for reason in reasons:
-        warnings.warn(f"{walk.name}: syn is used: {reason}", stacklevel=2)
-    return sequence
+def recording_of(walk: Walk) -> Recording:
+    """`raw` before `syn`, which is read where `raw` is refused."""
+    forms = [
+        single(walk.name, build, walk, kind)._replace(
+            files=walk.files[kind], version=VERSION, form=kind
+        )
+        for kind in ("raw", "syn")
+        if kind in walk.files
+    ]
+    return forms[0]._replace(fallback=forms[1]) if len(forms) == 2 else forms[0]
 
 
 def _chosen(root: Path, split: str) -> list[Walk]:
-    if split not in SPLITS:
-        raise InputError(
-            f"split '{split}'", "OxIOD has no such split", f"it has {', '.join(SPLITS)}"
-        )
     chosen = select(find_walks(root), split, root)
     if not chosen:
         raise InputError(
@@ -1028,88 +983,8 @@ def share_out(walks: list[Walk]) -> dict[str, str]:
     return best
 
 
-# --- many files
-# ------------------------------------------------------------------------------------------------------
-
-
-class _NotCached(Exception):
-    pass
-
-
-def _cached_build(walk: Walk, kind: str, only_cached: bool = False) -> Sequence:
-    def build_it() -> Sequence:
-        if only_cached:
-            raise _NotCached
-        return build(walk, kind)
-
-    return cached(walk.files[kind], VERSION, build_it)
-
-
-def build_walk(walk: Walk, only_cached: bool = False) -> tuple[Sequence | None, list[str]]:
-    """The walk's sequence, `raw` before `syn`, and why what was tried before is of no use."""
-    reasons = []
-    for kind in ("raw", "syn"):
-        if kind in walk.files:
-            try:
-                return _cached_build(walk, kind, only_cached), reasons
-            except Refusal as refusal:
-                reasons.append(str(refusal))
-    return None, reasons
-
-
-def _build_all(walks: list[Walk]) -> list[Sequence]:
-    """Sequences of the walks that can be used; those not cached yet are made by as many processes
-    as there are cores."""
-    results: dict[int, tuple[Sequence | None, list[str]]] = {}
-    for index, walk in enumerate(walks):
-        try:
-            results[index] = build_walk(walk, only_cached=True)
-        except _NotCached:
-            continue
-    missing = [index for index in range(len(walks)) if index not in results]
-    workers = min(usable_cores(), len(missing))
-    console = Console(stderr=True)
-    with Progress(
-        console=console, transient=True, disable=len(missing) < 2 or not console.is_terminal
-    ) as progress:
-        task = progress.add_task("OxIOD: aligning phones and Vicon", total=len(missing))
-        if workers > 1:
-            try:
-                # Processes are spawned: a fork after JAX has started its threads can hang.
-                with ProcessPoolExecutor(
-                    workers, mp_context=multiprocessing.get_context("spawn")
-                ) as pool:
-                    for index, result in zip(
-                        missing,
-                        pool.map(build_walk, [walks[index] for index in missing]),
-                        strict=True,
-                    ):
-                        results[index] = result
-                        progress.advance(task)
-            except BrokenProcessPool:
-                pass  # a script without `if __name__ == "__main__":` cannot spawn, as it is told on stderr; go on alone
-        for index in missing:
-            if index not in results:
-                results[index] = build_walk(walks[index])
-                progress.advance(task)
-    sequences = []
-    for index, walk in enumerate(walks):
-        sequence, reasons = results[index]
-        for reason in reasons:
-            warnings.warn(
-                f"{walk.name}: left out: {reason}"
-                if sequence is None
-                else f"{walk.name}: syn is used: {reason}",
-                stacklevel=3,
-            )
-        if sequence is not None:
-            sequences.append(sequence)
-    return sequences
-
-
 DATASET = Dataset(
     name="oxiod",
-    read=read,
     recordings=recordings,
     splits=SPLITS,
     rate=RATE,

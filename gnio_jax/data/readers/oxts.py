@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from gnio_jax.data.readers.csv_files import in_order
 from gnio_jax.data.readers.text import shortened
-from gnio_jax.data.sequence import FASTEST, FASTEST_TURN, STRONGEST_FORCE, check_rate
+from gnio_jax.data.validation import FASTEST, FASTEST_TURN, STRONGEST_FORCE, check_rate
 from gnio_jax.types import InputError
 
 EARTH_RADIUS = 6378137.0

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from gnio_jax.data.readers.text import shortened
-from gnio_jax.data.sequence import check_unit_norm
+from gnio_jax.data.validation import check_unit_norm
 from gnio_jax.numerics import rotations
 from gnio_jax.types import InputError
 

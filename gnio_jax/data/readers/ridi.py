@@ -28,21 +28,18 @@ from jaxtyping import Bool, Float
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
-from gnio_jax.data.cache import cached_pieces
+from gnio_jax.data.dataset import Dataset, Recording
+from gnio_jax.data.gaps import divide_at_gaps
 from gnio_jax.data.readers.parsing import unit_rotations
 from gnio_jax.data.readers.phones import find_folders, find_list, held_out, with_velocity
 from gnio_jax.data.readers.reference import Poses, poses_at
 from gnio_jax.data.readers.text import listed, numbers, read_csv
-from gnio_jax.data.recordings import divide, read_all
-from gnio_jax.data.sequence import (
-    LONGEST_BRIDGE,
+from gnio_jax.data.resampling import LONGEST_BRIDGE, resample
+from gnio_jax.data.validation import (
     WINDOW_SECONDS,
-    Dataset,
-    Recording,
     check_finite,
     check_increasing,
     check_rate,
-    resample,
     validate,
 )
 from gnio_jax.numerics import neighbours, quaternions, wxyz_from_xyzw
@@ -71,63 +68,48 @@ TANGO, ARCORE = "Tango VIO of the phone itself", "ARCore VIO of the phone itself
 _POSES = (("android_sensor_pose.txt", _Y_UP), ("pose.txt", Rotation.identity()))
 
 
-def read(root: Path, split: str) -> list[Sequence]:
-    """The sequences of a split (`seen` is `test`), those that fail the physical self-check named
-    and left out. Raises `InputError`.
+def recordings(root: Path, split: str) -> list[Recording]:
+    """The recordings of a split that are present, wherever below the root; `seen` is `test`.
 
     `unseen` is the authors' cross-subject list. Recordings that are in no list are in no split but
     `all`, every recording below the root, which needs no list.
     """
-    return read_all(DATASET, Path(root), split)
-
-
-def recordings(root: Path, split: str) -> list[Recording]:
-    """The recordings of a split that are present, wherever below the root."""
     root = Path(root)
-    if split not in SPLITS:
-        raise InputError(root, f"unknown split '{split}'", f"known splits: {', '.join(SPLITS)}")
     folders = find_folders(root, _is_recording)
     if split == "all":
         if not folders:
             raise InputError(
                 root, "holds no recording of RIDI", f"expected layout: {DATASET.layout}"
             )
-        return [
-            Recording(name, partial(_cached, folder, {}))
-            for name, folder in sorted(folders.items())
-        ]
+        return [_recording(folder, {}) for _, folder in sorted(folders.items())]
     path = find_list(root, _LISTS[split])
     chosen = listed(path, lambda entry: folders.get(_name(entry)), root, DATASET.layout)
-    held: set[str] = set()
-    if split in ("train", "val"):
-        held = held_out_of_train(path)
-        chosen = [folder for folder in chosen if (folder.name in held) == (split == "val")]
-        if not chosen:
-            raise InputError(
-                path,
-                f"split '{split}' would be empty: {len(held)} sequences of this list are held out for validation",
-                "complete the data, or choose another split",
-            )
-    note = (
-        {"held_out": ", ".join(sorted({_subject(name) for name in held}))}
-        if split in ("train", "val")
-        else {}
-    )
-    return [Recording(folder.name, partial(_cached, folder, note)) for folder in chosen]
+    if split not in ("train", "val"):
+        return [_recording(folder, {}) for folder in chosen]
+    held = held_out_of_train(path)
+    chosen = [folder for folder in chosen if (folder.name in held) == (split == "val")]
+    if not chosen:
+        raise InputError(
+            path,
+            f"split '{split}' would be empty: {len(held)} sequences of this list are held out "
+            "for validation",
+            "complete the data, or choose another split",
+        )
+    subjects = ", ".join(sorted({_subject(name) for name in held}))
+    return [_recording(folder, {"held_out": subjects}) for folder in chosen]
 
 
-def _cached(folder: Path, note: dict[str, str]) -> list[Sequence]:
-    texts = (
-        folder / name
-        for name in ("gyro.txt", "acce.txt", "orientation.txt", *(name for name, _ in _POSES))
+def _recording(folder: Path, attributes: dict[str, str]) -> Recording:
+    table = folder / _TABLE
+    texts = ("gyro.txt", "acce.txt", "orientation.txt", *(name for name, _ in _POSES))
+    files = [table] if table.is_file() else [folder / name for name in texts]
+    return Recording(
+        folder.name,
+        partial(read_pieces, folder),
+        files=tuple(path for path in files if path.is_file()),
+        version=VERSION,
+        attributes=attributes,
     )
-    sources = (
-        [folder / _TABLE]
-        if (folder / _TABLE).is_file()
-        else [path for path in texts if path.is_file()]
-    )
-    sequences = cached_pieces(sources, VERSION, lambda: read_pieces(folder))
-    return [sequence._replace(attributes=sequence.attributes | note) for sequence in sequences]
 
 
 def held_out_of_train(path: str | os.PathLike[str]) -> set[str]:
@@ -147,7 +129,7 @@ def read_pieces(folder: str | os.PathLike[str]) -> list[Sequence]:
     files.
 
     Rows out of order are sorted and repeated ones dropped. Where its IMU or odometry has a gap
-    longer than a window it is divided (`divide`). `device_orientation` is the game rotation vector,
+    longer than a window it is divided (`divide_at_gaps`). `device_orientation` is the game rotation vector,
     turned to begin at the reference's attitude. Raises `InputError` naming file and field.
     """
     folder = Path(folder)
@@ -174,7 +156,7 @@ def read_pieces(folder: str | os.PathLike[str]) -> list[Sequence]:
         device_orientation=device,
         attributes=_attributes(folder.name, native),
     )
-    pieces = divide(validate(sequence, source), place)
+    pieces = divide_at_gaps(validate(sequence, source), place)
     return [validate(with_velocity(resample(piece, RATE)), source) for piece in pieces]
 
 
@@ -392,7 +374,6 @@ def _subject(name: str) -> str:
 
 DATASET = Dataset(
     name="ridi",
-    read=read,
     recordings=recordings,
     splits=SPLITS,
     rate=RATE,

@@ -26,18 +26,16 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
+from gnio_jax.data.dataset import Dataset, Recording, single
 from gnio_jax.data.readers.parsing import json_object, parsed_as, unit_rotations
 from gnio_jax.data.readers.phones import find_folders, find_list, with_velocity
 from gnio_jax.data.readers.text import listed, shortened
-from gnio_jax.data.recordings import read_all, single
-from gnio_jax.data.sequence import (
-    Dataset,
-    Recording,
+from gnio_jax.data.resampling import resample
+from gnio_jax.data.validation import (
     check_finite,
     check_gaps,
     check_increasing,
     check_rate,
-    resample,
     validate,
 )
 from gnio_jax.numerics import integrate_gyro, quaternions
@@ -72,17 +70,10 @@ _ERRORS = {
 }
 
 
-def read(root: Path, split: str) -> list[Sequence]:
-    """The sequences of a split (`test` is `seen`), those that fail the physical self-check named
-    and left out. Raises `InputError`."""
-    return read_all(DATASET, Path(root), split)
-
-
 def recordings(root: Path, split: str) -> list[Recording]:
-    """The recordings of a split's list that are present, wherever below the root."""
+    """The recordings of a split's list that are present, wherever below the root; `test` is
+    `seen`."""
     root = Path(root)
-    if split not in _LISTS:
-        raise InputError(root, f"unknown split '{split}'", f"known splits: {', '.join(_LISTS)}")
     folders = find_folders(root, lambda folder: (folder / _TABLE).is_file())
     chosen = listed(find_list(root, _LISTS[split]), folders.get, root, DATASET.layout)
     return [
@@ -300,7 +291,6 @@ def _number(info: dict[str, Any], name: str, folder: Path) -> float:
 
 DATASET = Dataset(
     name="ronin",
-    read=read,
     recordings=recordings,
     splits=tuple(_LISTS),
     rate=RATE,

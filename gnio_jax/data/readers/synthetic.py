@@ -19,6 +19,7 @@ from jaxtyping import Float
 from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
 
+from gnio_jax.data.dataset import Dataset, Recording, single
 from gnio_jax.data.readers.gait import (
     PLACEMENTS,
     Person,
@@ -30,10 +31,8 @@ from gnio_jax.data.readers.gait import (
     step_frequency,
     wander,
 )
-from gnio_jax.data.recordings import single
-from gnio_jax.data.sequence import Dataset, Recording
 from gnio_jax.numerics import about_z, quaternions, turns_between
-from gnio_jax.types import GRAVITY, InputError, Sequence
+from gnio_jax.types import GRAVITY, Sequence
 
 # A phone's IMU: white noise and random walk as densities, constant biases by their length.
 GYRO_DENSITY = 9e-5
@@ -192,18 +191,9 @@ def _device_attitude(rng: np.random.Generator, walk: _Motion, dt: float) -> Rota
     return about_z(drift) * Rotation.from_rotvec(tilt_error) * walk.attitude[:-1]
 
 
-def read(root: Path | None, split: str) -> list[Sequence]:
-    """The sequences of a split, always the same ones; `root` is not used."""
-    return [sequence for recording in recordings(root, split) for sequence in recording.read()]
-
-
 def recordings(root: Path | None, split: str) -> list[Recording]:
     """The walks of a split, not yet computed."""
     del root
-    if split not in _SPLITS:
-        raise InputError(
-            "synthetic", f"unknown split '{split}'", f"known splits: {', '.join(_SPLITS)}"
-        )
     seed, first_person, people, count, seconds = _SPLITS[split]
     placements = list(PLACEMENTS)
     walks = []
@@ -226,7 +216,6 @@ def _walk(seed: int, who: int, where: str, seconds: float) -> Sequence:
 
 DATASET = Dataset(
     name="synthetic",
-    read=read,
     recordings=recordings,
     splits=tuple(_SPLITS),
     rate=200.0,

@@ -17,12 +17,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from gnio_jax.data.dataset import Dataset, Recording, single
 from gnio_jax.data.readers.parsing import parsed_as
 from gnio_jax.data.readers.text import listed
-from gnio_jax.data.recordings import read_all, single
-from gnio_jax.data.sequence import (
-    Dataset,
-    Recording,
+from gnio_jax.data.validation import (
     check_finite,
     check_gaps,
     check_increasing,
@@ -43,11 +41,6 @@ _GYRO, _ACCEL = "gyr_compensated_rotated_in_World", "acc_compensated_rotated_in_
 _POSITION, _VELOCITY = "pos_World_Device", "vel_World"
 _WIDTHS = {_STAMPS: 1, _GYRO: 3, _ACCEL: 3, _ORIENTATION: 4, _POSITION: 3, _VELOCITY: 3}
 """Width of each column that is read."""
-
-
-def read(root: Path, split: str) -> list[Sequence]:
-    """The sequences of a split, those that fail the physical self-check named and left out."""
-    return read_all(DATASET, Path(root), split)
 
 
 def recordings(root: Path, split: str) -> list[Recording]:
@@ -99,8 +92,6 @@ def read_sequence(folder: str | os.PathLike[str]) -> Sequence:
 
 
 def _listed(root: Path, split: str) -> list[Path]:
-    if split not in _LISTS:
-        raise InputError(root, f"unknown split '{split}'", f"known splits: {', '.join(_LISTS)}")
     return listed(
         root / _LISTS[split],
         lambda entry: root / entry if (root / entry / _TABLE).is_file() else None,
@@ -168,7 +159,6 @@ def _table(path: Path, width: int) -> Float[np.ndarray, "n w"]:
 
 DATASET = Dataset(
     name="tlio",
-    read=read,
     recordings=recordings,
     splits=tuple(_LISTS),
     rate=RATE,

@@ -8,8 +8,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from gnio_jax import data
+from gnio_jax.data.plausibility import self_check
 from gnio_jax.data.readers import blackbird
-from gnio_jax.data.sequence import rotations, self_check
+from gnio_jax.numerics import rotations
 from gnio_jax.types import InputError
 from tests.support import known_walk
 from tests.support.blackbird_files import FLIP, START, write
@@ -58,7 +59,7 @@ def test_lists_with_comments_absent_entries_and_no_last_newline(tmp_path):
     with pytest.raises(InputError, match=r"val\.txt: none of its 1 sequences is below"):
         data.load("blackbird", tmp_path, "val")
     with pytest.raises(InputError, match="unknown split 'unseen'"):
-        blackbird.read(tmp_path, "unseen")
+        data.load("blackbird", tmp_path, "unseen")
 
 
 def test_a_flight_that_contradicts_itself_is_left_out(tmp_path):

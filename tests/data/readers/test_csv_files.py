@@ -8,8 +8,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from gnio_jax import data
+from gnio_jax.data.hdf5 import write_hdf5
+from gnio_jax.data.plausibility import self_check
 from gnio_jax.data.readers import csv_files as csv
-from gnio_jax.data.sequence import rotations, self_check, write_hdf5
+from gnio_jax.numerics import rotations
 from gnio_jax.types import InputError
 from tests.support import known_walk
 from tests.support.csv_writers import AXES, SECONDS, imu, write, write_native
@@ -108,7 +110,7 @@ def test_lists_name_files_with_or_without_suffix(tmp_path):
     with pytest.raises(InputError, match=r"val\.txt: the list cannot be read"):
         data.load("csv", tmp_path, "val")
     with pytest.raises(InputError, match="unknown split 'seen'"):
-        csv.read(tmp_path, "seen")
+        data.load("csv", tmp_path, "seen")
 
 
 def test_a_reference_that_contradicts_the_imu_is_left_out(tmp_path):

@@ -8,8 +8,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from gnio_jax import data
+from gnio_jax.data.plausibility import self_check
 from gnio_jax.data.readers import euroc
-from gnio_jax.data.sequence import rotations, self_check
+from gnio_jax.numerics import rotations
 from gnio_jax.types import InputError
 from tests.support import asl_files as files
 from tests.support import known_walk
@@ -427,7 +428,7 @@ def test_damaged_files_are_refused(tmp_path):
     with pytest.raises(InputError, match=r"holds no mav0/imu0/data\.csv; expected layout"):
         data.load("tumvi", mav, "test")
     with pytest.raises(InputError, match="unknown split 'all'"):
-        euroc.read(tmp_path, "all")
+        data.load("euroc", tmp_path, "all")
 
 
 # --- real recordings

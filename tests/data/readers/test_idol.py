@@ -13,9 +13,9 @@ from scipy.spatial.transform import Rotation
 
 from gnio_jax import data
 from gnio_jax.data import alignment
-from gnio_jax.data.cache import Refusal
+from gnio_jax.data.dataset import Refusal
 from gnio_jax.data.readers import idol
-from gnio_jax.data.sequence import rotations
+from gnio_jax.numerics import rotations
 from gnio_jax.types import InputError
 from tests.support import known_walk as walk
 from tests.support.idol_files import BIAS, EPOCH, RIG_OF_PHONE, frame, write
@@ -194,7 +194,7 @@ def test_smoothed_positions_are_no_reason_to_leave_a_walk_out(tmp_path):
         1.0,
     )
     write(tmp_path, table)
-    (sequence,) = idol.read(tmp_path, "known")
+    (sequence,) = data.load("idol", tmp_path, "known")
     assert data.self_check(sequence).accel_correlation_horizontal < 0.3
 
 
@@ -252,7 +252,7 @@ def test_splits(copy, monkeypatch):
     assert {sequence.attributes["held_out"] for sequence in [*train, *val]} == people
     assert {sequence.attributes["calibration"] for sequence in train} == {"start"}
     with pytest.raises(InputError, match="known splits: train, val, seen, known"):
-        idol.read(copy, "tests")
+        data.load("idol", copy, "tests")
     # What was aligned once is not aligned again.
     monkeypatch.setattr(idol, "read_pieces", lambda path: pytest.fail("built again"))
     again = data.load("idol", copy, "val")
@@ -268,7 +268,7 @@ def test_recordings_without_a_named_subject_count_as_people_of_their_own(copy):
         UserWarning,
         match=r"metadata\.json does not name the subject of 10 recordings, e\.g\. .*0\.feather",
     ):
-        val = idol.read(copy, "val")
+        val = data.load("idol", copy, "val")
     assert len(val) == 1 and val[0].attributes["subject"] == val[0].name
 
 
@@ -282,7 +282,7 @@ def test_a_recording_that_is_of_no_use_is_left_out(copy):
         3,
     )
     with pytest.warns(UserWarning) as caught:
-        assert len(idol.read(copy, "known")) == 3
+        assert len(data.load("idol", copy, "known")) == 3
     texts = [str(warning.message) for warning in caught]
     assert any(
         text.startswith("building3_known_2: left out:") and "do not turn as" in text
@@ -299,14 +299,14 @@ def test_copies_gone_wrong(copy):
     for path in sorted((root / "building1" / "train").glob("*.feather"))[2:]:
         path.unlink()
     with pytest.raises(InputError, match="split 'val' would be empty"):
-        idol.read(copy, "val")
+        data.load("idol", copy, "val")
     (root / "building3" / "unknown" / "metadata.json").write_text("{")
     with pytest.raises(InputError, match=r"metadata\.json: is no JSON"):
-        idol.read(copy, "unseen")
+        data.load("idol", copy, "unseen")
     with pytest.raises(
         InputError, match=r"holds no recording in building\*/known; get it from .*expected layout"
     ):
-        idol.read(root / "building3", "known")
+        data.load("idol", root / "building3", "known")
 
 
 # --- mistakes

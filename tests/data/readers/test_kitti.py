@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from gnio_jax import data
+from gnio_jax.data.plausibility import self_check
 from gnio_jax.data.readers import kitti
-from gnio_jax.data.sequence import rotations, self_check
+from gnio_jax.numerics import rotations
 from gnio_jax.types import InputError
 from tests.support import kitti_files as files
 from tests.support import known_walk
@@ -102,7 +103,7 @@ def test_splits_are_by_name_alone_and_never_divide_a_drive(tmp_path):
     for split, share in (("train", 0.7), ("val", 0.1), ("test", 0.2)):
         assert shares.count(split) / len(names) == pytest.approx(share, abs=0.04)
     with pytest.raises(InputError, match="unknown split 'seen'"):
-        kitti.read(tmp_path, "seen")
+        data.load("kitti", tmp_path, "seen")
 
 
 def test_positions_that_jump_are_not_valid(tmp_path):

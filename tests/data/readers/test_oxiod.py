@@ -3,17 +3,23 @@ be physically plausible."""
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 import warnings
+from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from gnio_jax import numerics
+from gnio_jax import data, numerics
 from gnio_jax.data import alignment
-from gnio_jax.data.cache import Refusal
+from gnio_jax.data.dataset import Refusal
+from gnio_jax.data.plausibility import self_check
 from gnio_jax.data.readers import oxiod
-from gnio_jax.data.sequence import rotations, self_check
+from gnio_jax.data.reading import read_recording
+from gnio_jax.numerics import rotations
 from gnio_jax.types import InputError
 from tests.support import oxiod_files as files
 
@@ -21,9 +27,6 @@ from tests.support import oxiod_files as files
 @pytest.fixture(autouse=True)
 def quiet(tmp_path, monkeypatch):
     monkeypatch.setenv("GNIO_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr(
-        oxiod, "usable_cores", lambda: 1
-    )  # spawning costs more than these small files
 
 
 def dataset(tmp_path, scene, folder):
@@ -229,7 +232,7 @@ def test_nexus_events_come_back(tmp_path):
         accel_delay=0.0, extrinsic=Rotation.from_euler("ZXY", [-173, 2, 1], degrees=True)
     )
     files.write_nexus_raw(dataset(tmp_path, "multi devices", "nexus 5"), 7, truth)
-    (sequence,) = oxiod.read(tmp_path, "unseen")
+    (sequence,) = data.load("oxiod", tmp_path, "unseen")
     time = sequence.time + (sequence.attributes["start_time"] - files.EPOCH)
     position, attitude, walked = compare(sequence, truth, time)
     assert position.max() < 0.01 + 0.01 * walked
@@ -246,7 +249,7 @@ def test_large_scale_takes_positions_of_tango_and_attitude_of_gyro(tmp_path):
     files.write_large_scale(folder, 1, truth, offset=0.2)
     files.write_large_scale(folder, 2, truth, broken=True)
     with pytest.warns(UserWarning, match=r"floor1_2: left out.*out of step"):
-        (sequence,) = oxiod.read(tmp_path, "large_scale")
+        (sequence,) = data.load("oxiod", tmp_path, "large_scale")
     assert sequence.attributes["truth"] == "tango"
     # Without a second sensor on the tablet the accelerometer's own delay cannot be told from the
     # lag.
@@ -266,16 +269,19 @@ def test_same_walk_twice_counts_once_and_a_ruined_raw_file_leaves_syn(tmp_path):
     files.write_syn(folder, 1, truth, seconds=40)
     (walk,) = oxiod.find_walks(tmp_path)
     assert set(walk.files) == {"raw", "syn"}
-    assert oxiod.build_walk(walk)[0].attributes["kind"] == "raw"
+    (sequence,) = read_recording(oxiod.recording_of(walk)).sequences
+    assert sequence.attributes["kind"] == "raw"
     # Some published stamps are rounded to 1e4 s.
     path = walk.files["raw"][0]
     rows = [line.split(",", 1) for line in path.read_text().splitlines()]
     path.write_text(
         "\n".join(f"{round(float(stamp), -4):.2f},{rest}" for stamp, rest in rows) + "\n"
     )
-    sequence, reasons = oxiod.build_walk(walk)
-    assert sequence.attributes["kind"] == "syn"
-    assert len(reasons) == 1 and "imu1.csv" in reasons[0] and "'time' is ruined" in reasons[0]
+    reading = read_recording(oxiod.recording_of(walk))
+    assert reading.sequences[0].attributes["kind"] == "syn" and reading.refusals == ()
+    (note,) = map(str, reading.notes)
+    assert note.startswith("handheld_data1_1: syn is used: ")
+    assert "imu1.csv" in note and "'time' is ruined" in note
 
 
 @pytest.fixture
@@ -301,33 +307,33 @@ def copy(tmp_path):
 
 def test_lists(copy):
     with pytest.warns(UserWarning, match="2 entries of the lists Train.txt are not in this copy"):
-        train = oxiod.read(copy, "train")
+        train = data.load("oxiod", copy, "train")
     assert [sequence.name for sequence in train] == ["handheld_data1_2"]
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        test = oxiod.read(copy, "test")
-        assert [sequence.name for sequence in oxiod.read(copy, "seen")] == [
+        test = data.load("oxiod", copy, "test")
+        assert [sequence.name for sequence in data.load("oxiod", copy, "seen")] == [
             sequence.name for sequence in test
         ]
     assert [sequence.name for sequence in test] == ["handheld_data5_1", "running_data1_7"]
     with pytest.raises(InputError, match="no recording of split 'unseen'"):
-        oxiod.read(copy, "unseen")
-    with pytest.raises(InputError, match="it has train, val, test"):
-        oxiod.read(copy, "testing")
+        data.load("oxiod", copy, "unseen")
+    with pytest.raises(InputError, match="known splits: train, val, test"):
+        data.load("oxiod", copy, "testing")
 
 
 def test_lists_gone_wrong(copy):
     place = dataset(copy, "handheld", "data1").parent
     (place / "Train.txt").write_text("data1/vi3.csv")
     with pytest.raises(InputError, match=r"Train.txt: entry 'data1/vi3.csv'"):
-        oxiod.read(copy, "train")
+        data.load("oxiod", copy, "train")
     (place / "Train.txt").write_text("\n")
     with pytest.raises(InputError, match=r"Train.txt: the list is empty"):
-        oxiod.read(copy, "train")
+        data.load("oxiod", copy, "train")
     for scene in ("handheld", "running"):
         (dataset(copy, scene, "data1").parent / "Test.txt").unlink()
     with pytest.raises(InputError, match=r"no scene has its list Test.txt"):
-        oxiod.read(copy, "test")
+        data.load("oxiod", copy, "test")
 
 
 def walks(tmp_path, counts):
@@ -461,7 +467,7 @@ def test_damaged_truth_is_refused_and_one_bad_recording_is_left_out(copy):
     with pytest.warns(
         UserWarning, match=r"handheld_data5_1: left out: .*vi1.csv: has 8 columns, expected 9"
     ):
-        sequences = oxiod.read(copy, "test")
+        sequences = data.load("oxiod", copy, "test")
     assert [sequence.name for sequence in sequences] == ["running_data1_7"]
 
     for column, value, message in (
@@ -487,31 +493,53 @@ def test_damaged_truth_is_refused_and_one_bad_recording_is_left_out(copy):
         "%.6f",
     )
     with pytest.warns(UserWarning, match="handheld_data5_1: left out"):
-        oxiod.read(copy, "test")
+        data.load("oxiod", copy, "test")
 
 
 def test_a_root_without_recordings(tmp_path):
-    with pytest.raises(InputError, match=r"no such folder.*deepio"):
-        oxiod.read(tmp_path / "nowhere", "train")
+    with pytest.raises(InputError, match=r"no folder of dataset 'oxiod'.*deepio"):
+        data.load("oxiod", tmp_path / "nowhere", "train")
     with pytest.raises(InputError, match="holds no recording of OxIOD"):
-        oxiod.read(tmp_path, "train")
+        data.load("oxiod", tmp_path, "train")
 
 
 def test_reading_again_uses_the_cache_and_spawned_workers_agree(copy, monkeypatch):
-    alone = oxiod.read(copy, "test")
+    alone = data.load("oxiod", copy, "test")
     with monkeypatch.context() as patch:
         patch.setattr(oxiod, "build", lambda *_: pytest.fail("built again"))
-        again = oxiod.read(copy, "test")
+        again = data.load("oxiod", copy, "test")
     assert all(
         np.array_equal(a.position, b.position, equal_nan=True)
         for a, b in zip(alone, again, strict=True)
     )
     monkeypatch.setenv("GNIO_CACHE", str(copy / "other"))
-    monkeypatch.setattr(oxiod, "usable_cores", lambda: 2)
-    spawned = oxiod.read(copy, "test")
+    shares = []
+    spawned = data.load("oxiod", copy, "test", workers=2, progress=shares.append)
+    assert shares == [0.5, 1.0]
     assert all(
         np.allclose(a.position, b.position, atol=1e-9) for a, b in zip(alone, spawned, strict=True)
     )
+
+
+SCRIPT = """
+import sys
+from gnio_jax import data
+
+for sequence in data.load("oxiod", sys.argv[1], "test"):
+    print(sequence.name)
+"""
+
+
+def test_a_plain_script_starts_no_processes(copy, tmp_path):
+    """A script without a main guard, which a spawned process would run again."""
+    script = tmp_path / "plain.py"
+    script.write_text(SCRIPT)
+    environment = os.environ | {"PYTHONPATH": str(Path(data.__file__).parents[2])}
+    done = subprocess.run(
+        [sys.executable, str(script), str(copy)], env=environment, capture_output=True, text=True
+    )
+    assert done.stderr == "" and done.returncode == 0
+    assert done.stdout.split() == ["handheld_data5_1", "running_data1_7"]
 
 
 # --- parts

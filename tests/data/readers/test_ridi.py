@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from gnio_jax import data
-from gnio_jax.data.cache import Refusal
+from gnio_jax.data.dataset import Refusal
+from gnio_jax.data.plausibility import self_check
 from gnio_jax.data.readers import ridi
-from gnio_jax.data.sequence import rotations, self_check
+from gnio_jax.numerics import rotations
 from gnio_jax.types import InputError
 from tests.support import known_walk as walk
 from tests.support.ridi_files import (
@@ -287,7 +288,7 @@ def test_splits(copy):
         ", ".join(sorted(people))
     }
     with pytest.raises(InputError, match="known splits: train, val"):
-        ridi.read(copy, "tset")
+        data.load("ridi", copy, "tset")
 
 
 def test_the_hold_out_depends_on_the_list_alone(tmp_path):
@@ -314,26 +315,26 @@ def test_lists_gone_wrong(copy):
         InputError,
         match=r"list_crosssubject\.txt: none of its 1 sequences is below .*expected layout",
     ):
-        ridi.read(copy, "unseen")
+        data.load("ridi", copy, "unseen")
     (root / "list_crosssubject.txt").unlink()
     with pytest.raises(InputError, match=r"list_crosssubject\.txt: the list cannot be read"):
-        ridi.read(copy, "unseen")
+        data.load("ridi", copy, "unseen")
     (root / "list_train_publish_v2.txt").write_text("dan_bag1,bag\n")
     with pytest.raises(InputError, match="split 'val' would be empty"):
-        ridi.read(copy, "val")
+        data.load("ridi", copy, "val")
 
 
 def test_every_recording_below_the_root_needs_no_list(copy):
     listed = {*TRAIN[:-1], "hang_leg7", "shali_bag1"}
     for _ in range(2):
-        assert names(ridi.read(copy, "all")) == {*listed, "dan_bag9"}
+        assert names(data.load("ridi", copy, "all")) == {*listed, "dan_bag9"}
         for path in copy.rglob("list_*.txt"):
             path.unlink()
     with pytest.raises(InputError, match=r"list_test_publish_v2\.txt: the list cannot be read"):
-        ridi.read(copy, "test")
+        data.load("ridi", copy, "test")
     (copy / "elsewhere").mkdir()
     with pytest.raises(InputError, match="elsewhere: holds no recording of RIDI; expected layout"):
-        ridi.read(copy / "elsewhere", "all")
+        data.load("ridi", copy / "elsewhere", "all")
 
 
 def test_an_implausible_recording_is_left_out_by_name(copy):
@@ -345,7 +346,7 @@ def test_an_implausible_recording_is_left_out_by_name(copy):
     with pytest.warns(
         UserWarning, match="ruixuan_bag1: left out by the self-check: mean of R·accel"
     ):
-        assert names(ridi.read(copy, "unseen")) == {"shali_bag1"}
+        assert names(data.load("ridi", copy, "unseen")) == {"shali_bag1"}
 
 
 # --- mistakes

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from gnio_jax import data
 from gnio_jax.data.readers import ronin
-from gnio_jax.data.sequence import rotations
+from gnio_jax.numerics import rotations
 from gnio_jax.types import InputError
 from tests.support import known_walk as walk
 from tests.support.ronin_files import (
@@ -168,7 +168,7 @@ def test_splits(copy):
         for s in others[split]
     } == {"game_rv"}
     with pytest.raises(InputError, match="known splits: train, val, seen, unseen, test"):
-        ronin.read(copy, "tests")
+        data.load("ronin", copy, "tests")
 
 
 def test_lists_and_copies_gone_wrong(copy):
@@ -177,16 +177,16 @@ def test_lists_and_copies_gone_wrong(copy):
     with pytest.raises(
         InputError, match=r"list_val\.txt: none of its 1 sequences is below .*expected layout"
     ):
-        ronin.read(copy, "val")
+        data.load("ronin", copy, "val")
     (lists / "list_val.txt").unlink()
     with pytest.raises(InputError, match=r"list_val\.txt: the list cannot be read .*lists/list_"):
-        ronin.read(copy, "val")
+        data.load("ronin", copy, "val")
     write(copy / "train_dataset_2" / "a006_2", seconds=20.0)
     with pytest.warns(
         UserWarning,
         match=r"1 recordings are there twice, e\.g\. .*unseen_subjects_test_set/deeper/a006_2",
     ):
-        assert [sequence.name for sequence in ronin.read(copy, "unseen")] == ["a006_2"]
+        assert [sequence.name for sequence in data.load("ronin", copy, "unseen")] == ["a006_2"]
 
 
 def test_links_to_archives_elsewhere_are_followed(copy, tmp_path):
@@ -195,7 +195,7 @@ def test_links_to_archives_elsewhere_are_followed(copy, tmp_path):
     (root / "unseen").symlink_to(copy / "unseen_subjects_test_set")
     (root / "unseen" / "round").symlink_to(root)  # a circle must not hang it
     (root / "list_test_unseen.txt").write_text("a006_2")
-    assert [sequence.name for sequence in ronin.read(root, "unseen")] == ["a006_2"]
+    assert [sequence.name for sequence in data.load("ronin", root, "unseen")] == ["a006_2"]
 
 
 def test_a_tilted_reference_is_left_out_by_name(copy):
@@ -208,7 +208,7 @@ def test_a_tilted_reference_is_left_out_by_name(copy):
     write(copy / "more" / "a019_3", seconds=20.0, start_frame=0, spoil_info=tilt)
     (copy / "ronin" / "lists" / "list_test_unseen.txt").write_text("a006_2\na019_3")
     with pytest.warns(UserWarning, match=r"a019_3: left out by the self-check: mean of R·accel"):
-        assert [sequence.name for sequence in ronin.read(copy, "unseen")] == ["a006_2"]
+        assert [sequence.name for sequence in data.load("ronin", copy, "unseen")] == ["a006_2"]
 
 
 def test_the_chest_may_move_as_the_phone_does_not(copy):
@@ -223,7 +223,7 @@ def test_the_chest_may_move_as_the_phone_does_not(copy):
 
     write(copy / "more" / "a019_3", seconds=20.0, start_frame=0, spoil=steady)
     (copy / "ronin" / "lists" / "list_test_unseen.txt").write_text("a019_3")
-    (sequence,) = ronin.read(copy, "unseen")
+    (sequence,) = data.load("ronin", copy, "unseen")
     assert data.self_check(sequence).accel_correlation_horizontal < 0.3
 
 

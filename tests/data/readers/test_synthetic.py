@@ -10,7 +10,7 @@ from gnio_jax.types import InputError
 
 @pytest.fixture(scope="module")
 def val():
-    return synthetic.read(None, "val")
+    return data.load("synthetic", split="val")
 
 
 def matrices(wxyz):
@@ -58,7 +58,7 @@ def test_the_error_free_imu_integrates_to_the_trajectory(placement):
 
 
 def test_the_imu_of_a_phone_alone_is_lost_within_two_minutes():
-    sequence = synthetic.read(None, "test")[0]
+    sequence = data.load("synthetic", split="test")[0]
     assert np.linalg.norm(strap_down(sequence)[-1] - sequence.position[-1]) > 100.0
 
 
@@ -104,12 +104,13 @@ def test_the_stated_biases_and_noise_are_the_true_ones():
 
 
 def test_a_seed_is_a_walk_and_splits_share_neither_seeds_nor_people(val):
-    for once, again in zip(val, synthetic.read(None, "val"), strict=True):
+    for once, again in zip(val, data.load("synthetic", split="val"), strict=True):
         np.testing.assert_array_equal(once.accel, again.accel)
         assert once.attributes == again.attributes
     used = {
         split: [
-            (s.attributes["seed"], s.attributes["subject"]) for s in synthetic.read(None, split)
+            (s.attributes["seed"], s.attributes["subject"])
+            for s in data.load("synthetic", split=split)
         ]
         for split in ("val", "test")
     }
@@ -118,12 +119,12 @@ def test_a_seed_is_a_walk_and_splits_share_neither_seeds_nor_people(val):
     assert not {subject for _, subject in used["val"]} & {subject for _, subject in used["test"]}
     assert len({s.attributes["placement"] for s in val}) == len(synthetic.PLACEMENTS)
     with pytest.raises(InputError, match="unknown split 'dev'; known splits: train, val, test"):
-        synthetic.read(None, "dev")
+        data.load("synthetic", split="dev")
 
 
 def test_walks_hold_stops_strolls_runs_turns_and_stairs():
     speeds, climbs, turned = [], [], 0.0
-    for sequence in synthetic.read(None, "test"):
+    for sequence in data.load("synthetic", split="test"):
         second = sequence.position[200::200] - sequence.position[:-200:200]
         speeds.append(np.linalg.norm(second[:, :2], axis=1))
         climbs.append(second[:, 2])
@@ -171,7 +172,7 @@ def test_the_sign_of_the_direction_of_travel_shows_in_the_imu():
     """The walker surges while bouncing up, whoever walks and wherever the phone is: forward is not
     backward."""
     correlations = []
-    for sequence in synthetic.read(None, "test"):
+    for sequence in data.load("synthetic", split="test"):
         force = np.einsum("nij,nj->ni", matrices(sequence.orientation), sequence.accel)
         surge = np.cumsum(force[:, :2], axis=0) / 200
         surge = surge - np.apply_along_axis(np.convolve, 0, surge, np.ones(201) / 201, mode="same")

@@ -8,11 +8,11 @@ import warnings
 import numpy as np
 import pytest
 
+from gnio_jax import evaluation
 from gnio_jax.config import DataConfig
 from gnio_jax.data import windows
-from gnio_jax.data.cache import Refusal
-from gnio_jax.data.recordings import divide
-from gnio_jax.evaluation import odometry
+from gnio_jax.data.dataset import Refusal
+from gnio_jax.data.gaps import divide_at_gaps
 from gnio_jax.types import Sequence
 
 
@@ -42,7 +42,7 @@ def test_every_piece_with_a_window_is_kept_and_named():
     time = stamps((0, 5), (7, 7.5), (9, 10), (12, 20), (30, 34))
     valid = (time < 30) | (time % 0.5 > 0.01)  # no whole window of the last piece has a reference
     with pytest.warns(UserWarning) as caught:
-        pieces = divide(walk(time, valid), "walk.csv")
+        pieces = divide_at_gaps(walk(time, valid), "walk.csv")
     (warning,) = caught
     assert str(warning.message) == (
         "walk.csv: field 'time' has gaps longer than 1 s (4, up to 10.0 s); kept: 14.0 of 34.0 s, walk_piece1 (0.0 to 5.0 s), "
@@ -57,17 +57,19 @@ def test_every_piece_with_a_window_is_kept_and_named():
         assert piece.attributes == {"group": "someone", "start_time": pytest.approx(100.0 + first)}
     # Each holds at least the one window it was kept for, and no estimate runs through a hole.
     config = DataConfig(rate=100.0)
-    assert all(len(windows.index([piece], config, stride=10).start) >= 1 for piece in pieces)
-    recordings, short = odometry.prepare(pieces, config)
-    assert [recording.sequence.name for recording in recordings] == ["walk_piece1", "walk_piece3"]
+    assert all(
+        len(windows.window_source([piece], config, stride=10).start) >= 1 for piece in pieces
+    )
+    prepared, short = evaluation.prepare(pieces, config)
+    assert [each.sequence.name for each in prepared] == ["walk_piece1", "walk_piece3"]
     assert list(short) == ["walk_piece2"]
-    assert all(np.diff(recording.sequence.time).max() < 0.011 for recording in recordings)
+    assert all(np.diff(each.sequence.time).max() < 0.011 for each in prepared)
 
 
 @pytest.mark.filterwarnings("error")
 def test_a_recording_without_a_long_gap_stays_as_it_is():
     sequence = walk(stamps((0, 5), (5.9, 9)))
-    (same,) = divide(sequence, "walk.csv")
+    (same,) = divide_at_gaps(sequence, "walk.csv")
     assert same is sequence
 
 
@@ -77,7 +79,7 @@ def test_a_recording_of_which_nothing_is_left_is_refused():
         pytest.raises(Refusal, match=r"^walk\.csv: .*\(2, up to 1\.7 s\), and no piece"),
     ):
         warnings.simplefilter("error")
-        divide(walk(stamps((0, 0.9), (2.5, 3.3), (5, 5.5))), "walk.csv")
+        divide_at_gaps(walk(stamps((0, 0.9), (2.5, 3.3), (5, 5.5))), "walk.csv")
 
 
 def test_a_piece_whose_valid_runs_are_cut_by_short_gaps_holds_no_window():
@@ -86,5 +88,5 @@ def test_a_piece_whose_valid_runs_are_cut_by_short_gaps_holds_no_window():
         UserWarning,
         match=r"kept: 4\.0 of 9\.0 s, walk \(5\.0 to 9\.0 s\); lost: 2\.9 s in gaps, 2\.1 s in pieces",
     ):
-        (piece,) = divide(walk(stamps((0, 0.6), (1.5, 2.1), (5, 9))), "walk.csv")
+        (piece,) = divide_at_gaps(walk(stamps((0, 0.6), (1.5, 2.1), (5, 9))), "walk.csv")
     assert piece.name == "walk" and len(piece.time) == 401

@@ -1,0 +1,302 @@
+"""The physical self-check: do IMU and reference of a recording describe the same motion?"""
+
+from __future__ import annotations
+
+import warnings
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from scipy.signal import fftconvolve
+from scipy.spatial.transform import Rotation
+
+from gnio_jax.data.dataset import Dataset
+from gnio_jax.numerics import rotations
+from gnio_jax.types import GRAVITY, InputError, Sequence
+
+WINDOW_SECONDS = 10.0
+"""s over which the gyro is integrated."""
+LIVELY = 0.2
+"""m/s² rms of horizontal acceleration, above which the positions must show it, too."""
+TRIANGLE_SECONDS = 0.1
+"""Half the width of the triangles over which accelerations are compared, s."""
+
+
+class SelfCheck(NamedTuple):
+    """Figures by which IMU and reference of one sequence vouch for each other; NaN where they
+    cannot be computed."""
+
+    duration: float
+    """s."""
+    rate: float
+    """Hz, from the median interval."""
+    gravity_mean: Float[np.ndarray, "3"]
+    """Mean of R·accel in the world less the mean acceleration of the reference, (v_end −
+    v_start)/T, m/s²: (0, 0, 9.81)."""
+    gyro_consistency_degrees: float
+    """Median angle between gyro-integrated and reference rotation over 10 s windows, one constant
+    bias removed. NaN for what is shorter than two windows: the bias would take up whatever is
+    wrong."""
+    median_speed: float
+    """m/s."""
+    accel_correlation_horizontal: float
+    """Correlation of the second difference of the position with R·accel + g, x and y together."""
+    share_valid: float
+    """Share of the samples whose reference can be trusted."""
+    failures: tuple[str, ...]
+    """What is implausible, one sentence each; empty when the sequence may be used."""
+
+
+def self_check(
+    sequence: Sequence,
+    pedestrian: bool = True,
+    window_seconds: float = WINDOW_SECONDS,
+    max_gravity_error: float = 0.5,
+    max_gyro_degrees: float = 5.0,
+    max_speed: float = 3.0,
+    min_correlation: float | None = 0.3,
+) -> SelfCheck:
+    """Do IMU and reference describe the same motion? `sequence` must be on a uniform clock.
+
+    Fails: mean of R·accel off (0, 0, 9.81) and the reference's own mean acceleration by
+    `max_gravity_error` m/s²; gyro off the reference orientation by more than `max_gyro_degrees` in
+    the median window; a pedestrian whose median speed exceeds `max_speed` m/s; a horizontal
+    acceleration above 0.2 m/s² rms that correlates with that of the positions by less than
+    `min_correlation` (None asks for nothing). Standing still is no failure: it is what the gate is
+    for. Neither is being too short for the gyro's windows.
+    """
+    if not sequence.valid.any():
+        return _without_reference(sequence)
+    check, strength, has_windows = _measure(sequence, window_seconds)
+    gravity_error = float(np.linalg.norm(check.gravity_mean - [0.0, 0.0, GRAVITY]))
+    correlation = check.accel_correlation_horizontal
+    failures = []
+    if not gravity_error <= max_gravity_error:
+        mean = ", ".join(f"{value:.2f}" for value in check.gravity_mean)
+        failures.append(
+            f"mean of R·accel is ({mean}) m/s², off (0, 0, 9.81) by {gravity_error:.2f}"
+        )
+    if not has_windows and check.duration >= 2.0 * window_seconds:
+        failures.append(f"no window of {window_seconds:g} s has a valid reference at its ends")
+    elif check.gyro_consistency_degrees > max_gyro_degrees:
+        failures.append(
+            f"gyro is off the reference orientation by {check.gyro_consistency_degrees:.1f}° "
+            f"in the median window of {window_seconds:g} s"
+        )
+    if pedestrian and check.median_speed > max_speed:
+        failures.append(f"median speed is {check.median_speed:.1f} m/s, too fast for a pedestrian")
+    # The correlation is NaN when the positions do not move at all.
+    if min_correlation is not None and strength > LIVELY and not correlation >= min_correlation:
+        failures.append(
+            f"horizontal acceleration of the positions correlates by only {correlation:.2f} "
+            "with R·accel"
+        )
+    return check._replace(failures=tuple(failures))
+
+
+class _Measured(NamedTuple):
+    check: SelfCheck
+    """The figures, without failures."""
+    strength: float
+    """Horizontal acceleration by the accelerometer, m/s² rms."""
+    has_windows: bool
+    """True if the gyro could be integrated over at least one window."""
+
+
+def _measure(sequence: Sequence, window_seconds: float) -> _Measured:
+    time, valid = sequence.time, sequence.valid
+    step = float(np.median(np.diff(time)))
+    force = rotations(_held_attitude(sequence)).apply(sequence.accel)
+    starts, gyro_errors = gyro_windows(sequence, window_seconds)
+    # Windows that overlap throughout are one window, and one bias explains one window whatever it
+    # holds.
+    apart = starts.size > 0 and float(np.ptp(starts)) > window_seconds - 0.5 * step
+    correlation, strength = _accel_correlation(sequence, force, step)
+    check = SelfCheck(
+        duration=float(time[-1] - time[0]),
+        rate=1.0 / step,
+        gravity_mean=force[valid].mean(axis=0) - _mean_acceleration(sequence, step),
+        gyro_consistency_degrees=float(np.median(gyro_errors)) if apart else float("nan"),
+        median_speed=float(np.median(np.linalg.norm(sequence.velocity[valid], axis=1))),
+        accel_correlation_horizontal=correlation,
+        share_valid=float(valid.mean()),
+        failures=(),
+    )
+    return _Measured(check, strength, starts.size > 0)
+
+
+def _without_reference(sequence: Sequence) -> SelfCheck:
+    return SelfCheck(
+        duration=float(sequence.time[-1] - sequence.time[0]),
+        rate=1.0 / float(np.median(np.diff(sequence.time))),
+        gravity_mean=np.full(3, np.nan),
+        gyro_consistency_degrees=np.nan,
+        median_speed=np.nan,
+        accel_correlation_horizontal=np.nan,
+        share_valid=0.0,
+        failures=("no sample has a valid reference",),
+    )
+
+
+def check_sequence(sequence: Sequence, dataset: Dataset) -> SelfCheck:
+    """`self_check` with what the dataset asks.
+
+    What a converted recording brings along as `check_pedestrian` and `check_min_correlation` wins:
+    its own dataset asked it.
+    """
+    pedestrian = bool(sequence.attributes.get("check_pedestrian", dataset.pedestrian))
+    asked = sequence.attributes.get("check_min_correlation", dataset.min_correlation)
+    min_correlation = None if asked is None or asked <= -1.0 else float(asked)
+    check = self_check(sequence, pedestrian, min_correlation=min_correlation)
+    needed = dataset.needs_reference or sequence.valid.any()
+    return check if needed else check._replace(failures=())
+
+
+def keep_plausible(sequences: list[Sequence], dataset: Dataset) -> list[Sequence]:
+    """The sequences that pass the self-check of their dataset; a warning names each other one with
+    the reason.
+
+    Raises `InputError` when none is left.
+    """
+    kept, refused = [], []
+    for sequence in sequences:
+        failures = check_sequence(sequence, dataset).failures
+        if failures:
+            reasons = "; ".join(failures)
+            warnings.warn(f"{sequence.name}: left out by the self-check: {reasons}", stacklevel=2)
+            refused.append(sequence.name)
+        else:
+            kept.append(sequence)
+    if not kept:
+        raise InputError(
+            ", ".join(refused[:3]) or "no sequence",
+            f"none of {len(refused)} sequences passes the physical self-check",
+            "see the warnings above; check units, frames and time offset of the recordings",
+        )
+    return kept
+
+
+def _held_attitude(sequence: Sequence) -> Float[np.ndarray, "n 4"]:
+    """The last valid attitude of each sample.
+
+    Invalid rows are left out of every mean and only bridge the gyro's windows.
+    """
+    valid = sequence.valid
+    rows = np.where(valid, np.arange(len(valid)), int(np.argmax(valid)))
+    return sequence.orientation[np.maximum.accumulate(rows)]
+
+
+def _mean_acceleration(sequence: Sequence, step: float) -> Float[np.ndarray, "3"]:
+    """Of the reference over its valid stretches, by the velocities at their ends, m/s²."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], sequence.valid, [False]])))
+    first, last = edges[::2], edges[1::2] - 1
+    seconds = float((last - first).sum()) * step
+    gained = (sequence.velocity[last] - sequence.velocity[first]).sum(axis=0)
+    return gained / seconds if seconds > 0 else np.zeros(3)
+
+
+# --- gyro
+
+
+def gyro_windows(
+    sequence: Sequence, window_seconds: float = WINDOW_SECONDS
+) -> tuple[Float[np.ndarray, "w"], Float[np.ndarray, "w"]]:
+    """(start s, degrees) of windows that start every half window.
+
+    The degrees are the angle between the rotation integrated from the gyro and the reference's,
+    after the one constant bias that explains most of them. A recording shorter than a window is
+    one.
+    """
+    time, valid = sequence.time, sequence.valid
+    step = float(np.median(np.diff(time)))
+    length = max(min(round(window_seconds / step), len(time) - 1), 1)
+    starts = np.arange(0, len(time) - length, max(length // 2, 1))
+    starts = starts[valid[starts] & valid[starts + length]]
+    if not starts.size:
+        return np.zeros(0), np.zeros(0)
+    attitude = _held_attitude(sequence)
+    rotation = rotations(attitude).as_matrix()
+    reference = rotations(attitude[starts]).inv() * rotations(attitude[starts + length])
+    # exp(J b) R ≈ rotation integrated from gyro + b, J = R_startᵀ Σ R_k dt
+    summed = np.concatenate([np.zeros((1, 3, 3)), np.cumsum(rotation * step, axis=0)])
+    jacobian = np.einsum("wji,wjk->wik", rotation[starts], summed[starts + length] - summed[starts])
+    samples = starts[:, None] + np.arange(length)
+    # A rate sampled at the stamps is worth most at the middle of the interval it drives.
+    middle = 0.5 * (sequence.gyro[:-1] + sequence.gyro[1:])
+
+    def error(bias: np.ndarray) -> np.ndarray:
+        integrated = _product_of_rows((middle - bias) * step, samples)
+        return (integrated * reference.inv()).as_rotvec()
+
+    bias = np.zeros(3)
+    for _ in range(2):
+        bias = bias + _bias_correction(error(bias), jacobian)
+    return time[starts], np.degrees(np.linalg.norm(error(bias), axis=1))
+
+
+def _bias_correction(
+    error: Float[np.ndarray, "w 3"], jacobian: Float[np.ndarray, "w 3 3"]
+) -> Float[np.ndarray, "3"]:
+    """The bias b of least Σ|error − J b|: one broken window must not bend it."""
+    correction = np.zeros(3)
+    for _ in range(10):
+        weight = 1.0 / np.maximum(np.linalg.norm(error - jacobian @ correction, axis=1), 1e-3)
+        normal = np.einsum("w,wji,wjk->ik", weight, jacobian, jacobian)
+        moment = np.einsum("w,wji,wj->i", weight, jacobian, error)
+        correction = np.linalg.lstsq(normal, moment, rcond=1e-9)[0]
+    return correction
+
+
+def _product_of_rows(angles: Float[np.ndarray, "n 3"], samples: np.ndarray) -> Rotation:
+    """Product over each row of `samples` of the rotations by the vectors `angles`.
+
+    Neighbours are multiplied until one rotation a row is left.
+    """
+    # (xyzw, rows, length): long inner loops
+    factors = Rotation.from_rotvec(angles).as_quat().T[:, samples]
+    while factors.shape[2] > 1:
+        if factors.shape[2] % 2:
+            identity = np.zeros((4, len(samples), 1))
+            identity[3] = 1.0
+            factors = np.concatenate([factors, identity], axis=2)
+        x1, y1, z1, w1 = factors[:, :, 0::2]
+        x2, y2, z2, w2 = factors[:, :, 1::2]
+        factors = np.stack(
+            [
+                w1 * x2 + x1 * w2 + y1 * z2 - z1 * y2,
+                w1 * y2 - x1 * z2 + y1 * w2 + z1 * x2,
+                w1 * z2 + x1 * y2 - y1 * x2 + z1 * w2,
+                w1 * w2 - x1 * x2 - y1 * y2 - z1 * z2,
+            ]
+        )
+    return Rotation.from_quat(factors[:, :, 0].T)
+
+
+# --- accelerometer
+
+
+def _accel_correlation(sequence: Sequence, force: np.ndarray, step: float) -> tuple[float, float]:
+    """(correlation, rms m/s² of the inertial side) of horizontal accelerations over triangles of
+    ± `TRIANGLE_SECONDS`.
+
+    The second difference of the position over ± h is the acceleration weighted by the triangle of
+    that width, exactly.
+    """
+    h = max(round(TRIANGLE_SECONDS / step), 1)
+    if len(sequence.time) < 4 * h:
+        return float("nan"), 0.0
+    position = sequence.position[:, :2]
+    geometric = (position[2 * h :] - 2.0 * position[h:-h] + position[: -2 * h]) / (h * step) ** 2
+    triangle = 1.0 - np.abs(np.arange(-h, h + 1)) / h
+    inertial = fftconvolve(force[:, :2], (triangle / triangle.sum())[:, None], mode="valid", axes=0)
+    broken = np.concatenate([[0], np.cumsum(~sequence.valid)])
+    whole = broken[2 * h + 1 :] == broken[: -2 * h - 1]
+    if whole.sum() < 2 * h:
+        return float("nan"), 0.0
+    geometric, inertial = geometric[whole], inertial[whole]
+    geometric, inertial = geometric - geometric.mean(axis=0), inertial - inertial.mean(axis=0)
+    strength = float(np.sqrt((inertial**2).sum(axis=1).mean()))
+    scale = float(np.sqrt((geometric**2).sum() * (inertial**2).sum()))
+    if scale == 0:
+        return float("nan"), strength
+    return float((geometric * inertial).sum()) / scale, strength

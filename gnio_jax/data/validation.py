@@ -1,0 +1,233 @@
+"""What every sequence must satisfy before anything uses it."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from gnio_jax.types import InputError, Sequence
+
+FASTEST_TURN, STRONGEST_FORCE = 100.0, 1000.0
+"""rad/s and m/s²: beyond the range of any gyro or accelerometer one navigates with."""
+FASTEST = 300.0
+"""m/s: faster than anything that carries such an IMU."""
+LARGEST_STEP = 10.0
+"""m by which positions that were held for a while, or corrected, may jump all the same."""
+FARTHEST = 1e8
+"""m from the world's origin, up to which a float64 has digits enough."""
+WINDOW_SECONDS = 1.0
+"""The network's window, s. A longer hole in the IMU is no jitter: readers divide the recording
+there (`gaps.divide_at_gaps`), or refuse it."""
+UNIT_NORM_TOLERANCE = 1e-3
+"""Rounding in text files moves the norm of a quaternion by less."""
+
+
+def validate(sequence: Sequence, source: object) -> Sequence:
+    """Return `sequence` if every consumer can rely on it.
+
+    Quaternions whose norm is off by no more than `UNIT_NORM_TOLERANCE` come back normalized. Raises
+    `InputError` naming `source`, the field and the remedy.
+    """
+    _check_shapes(sequence, source)
+    for field in ("time", "gyro", "accel"):
+        check_finite(getattr(sequence, field), field, source)
+    check_increasing(sequence.time, source)
+    check_units(sequence.gyro, sequence.accel, source)
+    for field in ("orientation", "position", "velocity"):
+        bad = sequence.valid & ~np.isfinite(getattr(sequence, field)).all(axis=1)
+        if bad.any():
+            raise InputError(
+                source,
+                f"field '{field}' is NaN or Inf in {bad.sum()} rows marked valid, "
+                f"first in row {np.argmax(bad)}",
+                "mark these rows invalid",
+            )
+    orientation = check_unit_norm(sequence.orientation, sequence.valid, "orientation", source)
+    device = sequence.device_orientation
+    if device is not None:
+        known = np.asarray(np.isfinite(device).all(axis=1))
+        device = check_unit_norm(device, known, "device_orientation", source)
+    return sequence._replace(orientation=orientation, device_orientation=device)
+
+
+def _check_shapes(sequence: Sequence, source: object) -> None:
+    """Files give these shapes, so that a wrong one is a user's error."""
+    time, valid = sequence.time, sequence.valid
+    count = time.shape[0] if time.ndim == 1 else -1
+    if count < 2:
+        raise InputError(
+            source, f"field 'time' must hold at least two stamps, found shape {time.shape}"
+        )
+    widths = {"gyro": 3, "accel": 3, "orientation": 4, "position": 3, "velocity": 3}
+    if sequence.device_orientation is not None:
+        widths["device_orientation"] = 4
+    for field, width in widths.items():
+        shape = getattr(sequence, field).shape
+        if shape != (count, width):
+            raise InputError(
+                source,
+                f"field '{field}' has shape {shape}, expected {(count, width)} "
+                f"as field 'time' has {count} stamps",
+            )
+    if valid.shape != (count,) or valid.dtype != np.bool_:
+        raise InputError(
+            source,
+            f"field 'valid' must be {count} booleans, found {valid.dtype} of shape {valid.shape}",
+        )
+
+
+def check_finite(values: Float[np.ndarray, "n ..."], field: str, source: object) -> None:
+    """Raise `InputError` where a column that must be complete holds NaN or Inf."""
+    bad = ~np.isfinite(values).reshape(len(values), -1).all(axis=1)
+    if bad.any():
+        raise InputError(
+            source,
+            f"field '{field}' is NaN or Inf in {bad.sum()} rows, first in row {np.argmax(bad)}",
+            "repair or cut the recording there",
+        )
+
+
+def check_increasing(time: Float[np.ndarray, "n"], source: object) -> None:
+    """Raise `InputError` where the stamps (s) do not increase."""
+    backward = np.flatnonzero(np.diff(time) <= 0)
+    if backward.size:
+        row = int(backward[0]) + 1
+        raise InputError(
+            source,
+            f"field 'time' does not increase in {backward.size} rows, first in row {row} "
+            f"({time[row - 1]:.6f} s, then {time[row]:.6f} s)",
+            "sort the rows and drop repeated ones",
+        )
+
+
+def check_units(
+    gyro: Float[np.ndarray, "n 3"], accel: Float[np.ndarray, "n 3"], source: object
+) -> None:
+    """Raise `InputError` when the magnitudes say that the IMU is not in rad/s and m/s²."""
+    force = float(np.median(np.linalg.norm(accel, axis=1)))
+    problem, remedy = "", ""
+    if 0.5 < force < 2.0:
+        problem = f"looks like G (median magnitude {force:.3g})"
+        remedy = "convert it to m/s² (× 9.80665)"
+    elif force < 5.0:  # a walker's linear acceleration is 1–4 m/s²
+        problem = f"has no gravity in it (median magnitude {force:.3g} m/s²)"
+        remedy = "give the specific force, gravity included"
+    elif force > 50.0:
+        problem = f"is not in m/s² (median magnitude {force:.3g})"
+        remedy = "convert it to m/s²"
+    if problem:
+        raise InputError(source, f"field 'accel' {problem}", remedy)
+    turn = float(np.median(np.linalg.norm(gyro, axis=1)))
+    if turn > 20.0:
+        raise InputError(
+            source,
+            f"field 'gyro' looks like deg/s (median magnitude {turn:.3g})",
+            "convert it to rad/s (× π/180)",
+        )
+    _check_range("gyro", gyro, FASTEST_TURN, "rad/s", source)
+    _check_range("accel", accel, STRONGEST_FORCE, "m/s²", source)
+
+
+def _check_range(field: str, values: np.ndarray, most: float, unit: str, source: object) -> None:
+    beyond = (np.abs(values) > most).any(axis=1)
+    if beyond.any():
+        raise InputError(
+            source,
+            f"field '{field}' is beyond {most:g} {unit} in {beyond.sum()} rows, "
+            f"first in row {np.argmax(beyond)}",
+            "no such sensor measures that: repair or cut the recording there",
+        )
+
+
+def check_motion(sequence: Sequence, source: object) -> None:
+    """Raise `InputError` where the valid reference moves as nothing does.
+
+    For datasets whose reference is taken as it is.
+    """
+    valid, position = sequence.valid, sequence.position
+    fast = valid & (np.abs(sequence.velocity).max(axis=1) > FASTEST)
+    if fast.any():
+        raise InputError(
+            source,
+            f"field 'velocity' is beyond {FASTEST:g} m/s in {fast.sum()} rows, "
+            f"first in row {np.argmax(fast)}",
+            "repair these rows or mark them invalid",
+        )
+    far = valid & (np.abs(position).max(axis=1) > FARTHEST)
+    if far.any():
+        raise InputError(
+            source,
+            f"field 'position' is beyond {FARTHEST:g} m in {far.sum()} rows, "
+            f"first in row {np.argmax(far)}",
+            "give metres in a local world, or mark these rows invalid",
+        )
+    step = np.abs(np.diff(position, axis=0)).max(axis=1)
+    farthest_step = np.maximum(FASTEST * np.diff(sequence.time), LARGEST_STEP)
+    jump = valid[1:] & valid[:-1] & (step > farthest_step)
+    if jump.any():
+        row = int(np.argmax(jump)) + 1
+        raise InputError(
+            source,
+            f"field 'position' jumps in {jump.sum()} rows, first in row {row} "
+            f"(by {step[row - 1]:.3g} m)",
+            "repair these rows or mark them invalid",
+        )
+
+
+def check_unit_norm(
+    wxyz: Float[np.ndarray, "n 4"], where: Bool[np.ndarray, "n"], field: str, source: object
+) -> Float[np.ndarray, "n 4"]:
+    """Quaternions, normalized where `where` holds.
+
+    Raises `InputError` if the norm of one of these is off by more than `UNIT_NORM_TOLERANCE`.
+    """
+    norm = np.linalg.norm(wxyz, axis=1)
+    error = np.where(where, np.abs(norm - 1.0), 0.0)
+    bad = error > UNIT_NORM_TOLERANCE
+    if bad.any():
+        row = int(np.argmax(bad))
+        raise InputError(
+            source,
+            f"field '{field}' is not a unit quaternion in {bad.sum()} rows, first in row {row} "
+            f"(norm {norm[row]:.4g})",
+            "check the column order and normalize, or mark the rows invalid",
+        )
+    # What is exact to rounding stays bit for bit, so that writing and reading again changes
+    # nothing.
+    rounded = error > 1e-12
+    if not rounded.any():
+        return wxyz
+    normalized = wxyz / np.where(norm > 0, norm, 1.0)[:, None]
+    return np.where(rounded[:, None], normalized, wxyz)
+
+
+def check_rate(
+    time: Float[np.ndarray, "n"], nominal: float, source: object, tolerance: float = 0.05
+) -> float:
+    """Rate (Hz) of the stamps (s) by their median interval.
+
+    Raises `InputError` when it is off `nominal` by more than the share `tolerance`.
+    """
+    rate = float(1.0 / np.median(np.diff(time)))
+    if not abs(rate / nominal - 1.0) <= tolerance:
+        raise InputError(
+            source,
+            f"field 'time' runs at {rate:.4g} Hz, expected about {nominal:g} Hz",
+            "check the unit of the stamps, or resample the recording",
+        )
+    return rate
+
+
+def check_gaps(
+    time: Float[np.ndarray, "n"], source: object, longest: float = WINDOW_SECONDS
+) -> None:
+    """Raise `InputError` when two stamps lie further apart than `longest` (s)."""
+    gaps = np.diff(time)
+    if gaps.size and gaps.max() > longest:
+        row = int(np.argmax(gaps))
+        raise InputError(
+            source,
+            f"field 'time' has a gap of {gaps[row]:.3f} s after row {row}, "
+            f"longer than {longest:g} s",
+            "cut the recording there",
+        )

@@ -1,0 +1,83 @@
+"""What is written comes back to the bit; what is damaged is named."""
+
+import h5py
+import numpy as np
+import pytest
+
+from gnio_jax.data.hdf5 import read_hdf5, write_hdf5
+from gnio_jax.types import InputError
+from tests.support.circle import changed, circle
+
+
+@pytest.mark.parametrize("device", [True, False])
+def test_hdf5_returns_every_bit(tmp_path, device):
+    sequence = changed(circle(), "valid", 3, False)
+    sequence = changed(sequence, "position", 3, np.nan)._replace(
+        device_orientation=circle().orientation if device else None,
+        attributes={"truth": "Vicon", "rows": 7, "bias": 0.25, "calibrated": True, "person": "Ö"},
+    )
+    path = tmp_path / "deep" / "walk.h5"
+    write_hdf5(path, sequence)
+    back = read_hdf5(path)
+    assert back.name == "circle" and back.attributes == sequence.attributes
+    assert {key: type(value) for key, value in back.attributes.items()} == {
+        key: type(value) for key, value in sequence.attributes.items()
+    }
+    for field in (
+        "time",
+        "gyro",
+        "accel",
+        "orientation",
+        "position",
+        "velocity",
+        "valid",
+        "device_orientation",
+    ):
+        np.testing.assert_array_equal(getattr(back, field), getattr(sequence, field))
+
+
+def test_hdf5_that_is_cut_short_or_foreign_is_named(tmp_path):
+    path = tmp_path / "walk.h5"
+    write_hdf5(path, circle())
+    whole = path.read_bytes()
+
+    def fails(*words):
+        with pytest.raises(InputError) as error:
+            read_hdf5(path)
+        assert str(error.value).startswith(f"{path}: ") and all(
+            word in str(error.value) for word in words
+        )
+        assert "cut short" in words or "cut short" not in str(error.value)
+
+    for share in (0.9, 0.5, 0.01, 0.0):
+        path.write_bytes(whole[: int(len(whole) * share)])
+        fails("cut short")
+    path.write_text("time,gyro_x\n0,1\n")
+    fails("cut short")
+    path.write_bytes(whole)
+    with h5py.File(path, "a") as file:
+        del file["accel"]
+    fails("field 'accel' is missing")
+    path.write_bytes(whole)
+    with h5py.File(path, "a") as file:
+        file["gyro"][4] = np.nan
+    fails("'gyro'", "row 4")
+    path.write_bytes(whole)
+    with h5py.File(path, "a") as file:
+        del file["velocity"]
+        file["velocity"] = "fast"
+    fails("'velocity'", "not an array of numbers")
+    with h5py.File(path, "w") as file:
+        file["synced"] = 1.0
+    fails("format")
+    path.unlink()
+    fails("no such file")
+
+
+def test_a_failed_write_leaves_the_old_file(tmp_path):
+    path = tmp_path / "walk.h5"
+    write_hdf5(path, circle())
+    before = path.read_bytes()
+    with pytest.raises(InputError, match="'shape' is list"):
+        write_hdf5(path, circle()._replace(attributes={"shape": [1, 2]}))
+    assert path.read_bytes() == before and list(tmp_path.iterdir()) == [path]

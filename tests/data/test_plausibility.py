@@ -1,0 +1,230 @@
+"""The self-check against walks whose figures are known in closed form."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from gnio_jax import data
+from gnio_jax.data.plausibility import check_sequence, gyro_windows, keep_plausible, self_check
+from gnio_jax.types import InputError
+from tests.support.circle import changed, circle
+
+
+def asking(**options):
+    """A dataset that asks this of the self-check."""
+    return dataclasses.replace(data.get("tlio"), **options)
+
+
+def test_self_check_of_a_consistent_walk():
+    check = self_check(circle())
+    assert check.failures == ()
+    np.testing.assert_allclose(check.gravity_mean, [0, 0, 9.81], atol=0.05)
+    assert (
+        check.duration == pytest.approx(29.99)
+        and check.rate == pytest.approx(100.0)
+        and check.share_valid == 1.0
+    )
+    assert check.gyro_consistency_degrees < 1e-6
+    assert check.median_speed == pytest.approx(1.2, abs=0.1)
+    assert check.accel_correlation_horizontal > 0.999
+
+
+def test_self_check_removes_one_constant_gyro_bias():
+    sequence = circle()
+    assert (
+        self_check(
+            sequence._replace(gyro=sequence.gyro + np.array([0.02, -0.03, 0.05]))
+        ).gyro_consistency_degrees
+        < 0.1
+    )
+
+
+def test_self_check_judges_gyro_by_the_median_window():
+    sequence = circle(seconds=100.0)
+    spoilt = changed(sequence, "gyro", slice(3000, 4000), [1.0, 0.5, 0.0])
+    assert self_check(spoilt).gyro_consistency_degrees < 0.1
+    drifting = sequence._replace(gyro=sequence.gyro + 0.1 * np.sin(0.3 * sequence.time)[:, None])
+    assert any("gyro" in failure for failure in self_check(drifting).failures)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "reason"),
+    [
+        (lambda s: s._replace(accel=s.accel * 1.1), "mean of R·accel"),
+        (lambda s: s._replace(accel=s.accel[:, [1, 2, 0]]), "mean of R·accel"),
+        (lambda s: s._replace(accel=-s.accel), "mean of R·accel"),
+        (lambda s: s._replace(gyro=s.gyro[:, [2, 0, 1]] * np.sin(s.time)[:, None]), "gyro"),
+        (lambda s: s._replace(position=s.position * [-1, 1, 1]), "correlates"),
+        (lambda s: s._replace(velocity=s.velocity * 4), "too fast for a pedestrian"),
+        (lambda s: s._replace(valid=np.zeros_like(s.valid)), "no sample has a valid reference"),
+        (lambda s: s._replace(valid=(np.arange(len(s.time)) % 700) < 100), "no window"),
+    ],
+    ids=["scale", "axes", "sign", "gyro", "mirrored", "speed", "nothing-valid", "no-window"],
+)
+def test_self_check_says_what_is_implausible(spoil, reason):
+    failures = self_check(spoil(circle())).failures
+    assert any(reason in failure for failure in failures)
+
+
+def test_self_check_spares_the_fast_who_do_not_walk_and_those_who_stand():
+    sequence = circle()
+    assert (
+        self_check(sequence._replace(velocity=sequence.velocity * 4), pedestrian=False).failures
+        == ()
+    )
+    still = sequence._replace(
+        gyro=0 * sequence.gyro,
+        accel=0 * sequence.accel + [0, 0, 9.81],
+        velocity=0 * sequence.velocity,
+        position=0 * sequence.position,
+        orientation=0 * sequence.orientation + [1, 0, 0, 0],
+    )
+    assert self_check(still).failures == ()
+    rng = np.random.default_rng(2)
+    noisy = still._replace(
+        accel=still.accel + 0.1 * rng.standard_normal(still.accel.shape),
+        position=1e-4 * rng.standard_normal(still.position.shape),
+    )
+    check = self_check(noisy)
+    assert check.failures == () and abs(check.accel_correlation_horizontal) < 0.2
+    pinned = sequence._replace(
+        position=0 * sequence.position, accel=sequence.accel + np.sin(3 * sequence.time)[:, None]
+    )
+    assert any("correlates" in failure for failure in self_check(pinned).failures)
+
+
+def test_self_check_looks_at_valid_samples_only():
+    sequence = circle()
+    for field, value in (
+        ("position", np.nan),
+        ("velocity", np.nan),
+        ("orientation", np.nan),
+        ("accel", 90.0),
+        ("valid", False),
+    ):
+        sequence = changed(sequence, field, slice(700, 760), value)
+    check = self_check(sequence)
+    assert (
+        check.failures == ()
+        and check.share_valid == pytest.approx(0.98)
+        and check.accel_correlation_horizontal > 0.99
+    )
+    np.testing.assert_allclose(check.gravity_mean, [0, 0, 9.81], atol=0.05)
+
+
+def speeding(seconds=4.0, start=5.0, push=1.5):
+    """Straight ahead, ever faster, as a car leaves a crossing."""
+    sequence = circle(seconds=seconds, turn=0.01)
+    time, zero = sequence.time, 0 * sequence.time
+    still = np.tile([1.0, 0, 0, 0], (len(time), 1))
+    return sequence._replace(
+        orientation=still,
+        gyro=np.zeros((len(time), 3)),
+        accel=np.stack([zero + push, zero, zero + 9.81], axis=1),
+        velocity=np.stack([start + push * time, zero, zero], axis=1),
+        position=np.stack([start * time + push * time**2 / 2, zero, zero], axis=1),
+    )
+
+
+def test_who_ends_faster_than_he_began_is_not_tilted():
+    check = self_check(speeding(), pedestrian=False)
+    np.testing.assert_allclose(check.gravity_mean, [0, 0, 9.81], atol=1e-9)
+    assert check.failures == ()
+    steady = speeding(push=0.0)  # the same force without the gain in speed is a tilt
+    tilted = steady._replace(accel=steady.accel + np.array([1.5, 0, 0]))
+    np.testing.assert_allclose(
+        self_check(tilted, pedestrian=False).gravity_mean, [1.5, 0, 9.81], atol=1e-9
+    )
+    assert (
+        "mean of R·accel is (1.50, 0.00, 9.81)" in self_check(tilted, pedestrian=False).failures[0]
+    )
+
+
+def test_the_gain_in_speed_is_that_of_the_valid_stretches():
+    sequence = speeding(seconds=12.0, push=0.5)
+    # A stop and start in the middle that nobody has seen: speeds before and after say nothing of
+    # each other.
+    velocity = np.where(
+        sequence.time[:, None] >= 6.0, sequence.velocity - [4.0, 0, 0], sequence.velocity
+    )
+    sequence = sequence._replace(
+        velocity=velocity, valid=(sequence.time < 5.0) | (sequence.time >= 7.0)
+    )
+    np.testing.assert_allclose(
+        self_check(sequence, pedestrian=False).gravity_mean, [0, 0, 9.81], atol=1e-9
+    )
+
+
+@pytest.mark.parametrize(
+    ("seconds", "judged"), [(4.0, False), (15.0, False), (19.9, False), (20.1, True), (30.0, True)]
+)
+def test_one_window_says_nothing_of_the_gyro_since_a_bias_explains_it(seconds, judged):
+    sequence = circle(seconds=seconds)
+    wrong = sequence._replace(gyro=sequence.gyro[:, [1, 2, 0]] * np.sin(sequence.time)[:, None])
+    check = self_check(wrong)
+    assert np.isnan(check.gyro_consistency_degrees) != judged
+    assert any("gyro" in failure for failure in check.failures) == judged
+    assert not any("no window" in failure for failure in check.failures)
+    assert self_check(sequence).failures == ()
+
+
+def test_one_valid_window_of_a_long_recording_says_nothing_either():
+    sequence = circle(seconds=60.0)
+    check = self_check(sequence._replace(valid=(sequence.time >= 20.0) & (sequence.time < 31.0)))
+    assert np.isnan(check.gyro_consistency_degrees) and check.failures == ()
+
+
+def test_windows_of_the_gyro_tell_when_it_is_off():
+    sequence = circle(seconds=100.0)
+    starts, degrees = gyro_windows(changed(sequence, "gyro", slice(4000, 4100), [0.5, 0.0, 0.4]))
+    np.testing.assert_allclose(starts, np.arange(0, 86, 5.0))
+    # Half a radian about x in the second from 40 to 41 s, which the windows that begin at 35 and 40
+    # s see.
+    touched = np.isin(starts, [35.0, 40.0])
+    np.testing.assert_allclose(degrees[touched], np.degrees(0.5), atol=0.5)
+    assert degrees[~touched].max() < 0.2  # one ends between two samples of which one is touched
+
+
+def test_positions_of_another_body_need_not_correlate():
+    sequence = circle()
+    mirrored = sequence._replace(position=sequence.position * [-1, 1, 1])
+    assert self_check(mirrored, min_correlation=None).failures == ()
+    assert keep_plausible([mirrored], asking(min_correlation=None)) == [mirrored]
+    with (
+        pytest.warns(UserWarning, match="correlates by only"),
+        pytest.raises(InputError, match="none of 1"),
+    ):
+        keep_plausible([mirrored], asking())
+    # A converted recording brings along what its own dataset asks.
+    chest = mirrored._replace(attributes={"check_min_correlation": -1.0, "check_pedestrian": True})
+    assert keep_plausible([chest], asking()) == [chest]
+    running = chest._replace(velocity=chest.velocity * 4)
+    assert any(
+        "too fast" in failure
+        for failure in check_sequence(running, asking(pedestrian=False)).failures
+    )
+
+
+def test_a_recording_without_a_reference_is_kept_where_none_is_needed():
+    sequence = circle()
+    bare = sequence._replace(
+        valid=np.zeros_like(sequence.valid), position=sequence.position * np.nan
+    )
+    assert keep_plausible([bare], asking(needs_reference=False)) == [bare]
+    assert check_sequence(bare, asking()).failures == ("no sample has a valid reference",)
+
+
+def test_keep_plausible_names_what_it_leaves_out():
+    good = circle()
+    upside = good._replace(name="upside", accel=-good.accel)
+    with pytest.warns(UserWarning, match=r"upside: left out .* mean of R·accel") as caught:
+        assert keep_plausible([upside, good], asking()) == [good]
+    assert len(caught) == 1
+    with (
+        pytest.warns(UserWarning, match="upside"),
+        pytest.raises(InputError, match="upside: none of 1 sequences"),
+    ):
+        keep_plausible([upside], asking())
+    fast = good._replace(velocity=good.velocity * 4)
+    assert keep_plausible([fast], asking(pedestrian=False)) == [fast]

@@ -1,0 +1,153 @@
+"""Resampling against signals whose values are known in closed form."""
+
+import numpy as np
+import pytest
+
+from gnio_jax.data.resampling import resample
+from gnio_jax.data.validation import validate
+from tests.support.circle import changed, circle
+
+
+def test_resampling_what_is_uniform_already_changes_nothing():
+    sequence = circle(200.0, 2.0)
+    assert resample(sequence, 200.0) is sequence
+    stamped = sequence._replace(
+        time=np.round(sequence.time * 0.99999, 6)
+    )  # µs stamps of a clock off by 10 ppm, as TLIO's
+    assert resample(stamped, 200.0) is stamped
+    slow = sequence._replace(time=sequence.time * 1.0005)  # half a per mille of every displacement
+    assert resample(slow, 200.0) is not slow
+
+
+@pytest.mark.parametrize(
+    ("native", "rate"), [(202.3, 200.0), (100.0, 200.0), (200.0, 100.0), (250.0, 100.0)]
+)
+def test_resampling_returns_the_signal_at_the_new_stamps(native, rate):
+    sequence = circle(native, 4.0)
+    start = 12.5  # stamps need not start at zero
+    result = resample(sequence._replace(time=sequence.time + start), rate)
+    np.testing.assert_allclose(np.diff(result.time), 1 / rate, rtol=1e-9)
+    assert (
+        result.time[0] == start
+        and result.time[-1] <= sequence.time[-1] + start < result.time[-1] + 1 / rate + 1e-9
+    )
+    truth = circle(stamps=result.time - start)
+    edge = slice(round(0.3 * rate), -round(0.3 * rate))  # the FIR mirrors the signal at its ends
+    np.testing.assert_allclose(result.accel[edge], truth.accel[edge], atol=3e-3)
+    np.testing.assert_allclose(result.gyro[edge], truth.gyro[edge], atol=1e-4)
+    for field, tolerance in (("position", 1e-6), ("velocity", 1e-4), ("orientation", 1e-12)):
+        np.testing.assert_allclose(getattr(result, field), getattr(truth, field), atol=tolerance)
+    assert (
+        result.valid.all() and result.name == "circle" and result.attributes == sequence.attributes
+    )
+
+
+def test_resampling_accepts_uneven_stamps():
+    rng = np.random.default_rng(0)
+    stamps = np.arange(400) / 100
+    stamps[1:-1] += rng.uniform(-0.003, 0.003, 398)
+    result = resample(circle(stamps=stamps), 100.0)
+    np.testing.assert_allclose(np.diff(result.time), 0.01, rtol=1e-9)
+    truth = circle(stamps=result.time)
+    np.testing.assert_allclose(result.position, truth.position, atol=1e-6)
+    np.testing.assert_allclose(result.accel, truth.accel, atol=5e-3)
+    assert result.valid.all()
+
+
+def test_a_vibration_above_the_new_nyquist_frequency_does_not_fold_into_the_gait_band():
+    sequence = circle(200.0, 10.0)
+    vibration = (
+        5.0 * np.sin(2 * np.pi * 70.0 * sequence.time)[:, None]
+    )  # taken at 100 Hz it would look like 30 Hz
+    result = resample(
+        sequence._replace(accel=sequence.accel + vibration, gyro=sequence.gyro + vibration), 100.0
+    )
+    truth = circle(stamps=result.time)
+    edge = slice(50, -50)
+    assert (
+        np.abs(result.accel[edge] - truth.accel[edge]).max() < 5e-3
+    )  # 60 dB down, and no delay of the gait
+    assert np.abs(result.gyro[edge] - truth.gyro[edge]).max() < 5e-3
+
+
+def test_at_no_multiple_of_the_rate_images_of_the_spline_do_not_fold_back():
+    """The spline's image of 205 Hz, at 621 Hz, would alias to 21 Hz at 600 Hz."""
+    sequence = circle(416.0, 4.0)
+    tone = np.sin(2 * np.pi * 205.0 * sequence.time[:, None] + [0.0, 1.0, 2.0])
+    result = resample(sequence._replace(gyro=tone), 200.0)
+    assert np.abs(result.gyro[50:-50]).max() < 1e-3
+
+
+def test_what_the_new_rate_can_carry_is_kept_up_to_the_ends():
+    sequence = circle(200.0, 10.0)
+    time = sequence.time
+    tone = np.stack([np.sin(2 * np.pi * 35.0 * time), 0.1 * time, 1.0 + 0.02 * time], axis=1)
+    result = resample(sequence._replace(gyro=tone), 100.0)
+    kept = np.stack(
+        [np.sin(2 * np.pi * 35.0 * result.time), 0.1 * result.time, 1.0 + 0.02 * result.time],
+        axis=1,
+    )
+    np.testing.assert_allclose(result.gyro[50:-50, 0], kept[50:-50, 0], atol=5e-3)
+    np.testing.assert_allclose(result.gyro[:, 1:], kept[:, 1:], atol=1e-4)
+
+
+def test_attitudes_are_slerped_whatever_the_signs_of_the_quaternions():
+    rng = np.random.default_rng(1)
+    time = np.arange(300) / 100
+    axis = np.array([1.0, 2.0, -2.0]) / 3.0
+
+    def attitude(t):
+        angle = 3.0 * t[:, None]
+        return np.concatenate([np.cos(angle / 2), np.sin(angle / 2) * axis], axis=1)
+
+    flipped = attitude(time) * rng.choice([-1.0, 1.0], size=(300, 1))
+    sequence = circle(stamps=time)._replace(orientation=flipped, device_orientation=flipped)
+    result = resample(sequence, 330.0)
+    for got in (result.orientation, result.device_orientation):
+        np.testing.assert_allclose(
+            np.abs((got * attitude(result.time)).sum(axis=1)), 1.0, atol=1e-12
+        )
+
+
+def test_a_hole_is_bridged_in_the_imu_and_marked_in_the_reference():
+    time = np.arange(400) / 100
+    time = time[(time <= 1.0) | (time >= 1.5)]
+    result = resample(circle(stamps=time), 100.0)
+    inside = (result.time > 1.0 + 1e-6) & (result.time < 1.5 - 1e-6)
+    np.testing.assert_array_equal(result.valid, ~inside)
+    ends = circle(stamps=np.array([1.0, 1.5])).accel
+    line = ends[0] + (result.time[inside, None] - 1.0) / 0.5 * (ends[1] - ends[0])
+    np.testing.assert_allclose(result.accel[inside], line, atol=1e-9)
+    short = resample(circle(stamps=np.delete(np.arange(400) / 100, [100, 101])), 100.0)
+    assert short.valid.all()  # two lost samples are jitter
+
+
+def test_an_outlier_marked_invalid_does_not_reach_its_valid_neighbours():
+    sequence = circle(100.0, 4.0)
+    rows = slice(200, 210)
+    for field, value in (("position", 1e4), ("velocity", 1e4), ("valid", False)):
+        sequence = changed(sequence, field, rows, value)
+    result = resample(sequence, 130.0)
+    truth = circle(stamps=result.time)
+    near = (result.time > 1.99 + 1e-6) & (result.time < 2.10 - 1e-6)
+    np.testing.assert_array_equal(result.valid, ~near)
+    np.testing.assert_allclose(
+        result.position[result.valid], truth.position[result.valid], atol=1e-5
+    )
+
+
+@pytest.mark.parametrize("rows", [2, 20])
+def test_a_missing_reference_stays_missing(rows):
+    sequence = circle(100.0, 4.0)
+    for field, value in (
+        ("position", np.nan),
+        ("velocity", np.nan),
+        ("orientation", np.nan),
+        ("valid", False),
+    ):
+        sequence = changed(sequence, field, slice(200, 200 + rows), value)
+    result = resample(sequence, 130.0)
+    for field in ("position", "velocity", "orientation"):
+        np.testing.assert_array_equal(np.isfinite(getattr(result, field)).all(axis=1), result.valid)
+    assert np.isfinite(result.accel).all()
+    validate(result, "walk")
