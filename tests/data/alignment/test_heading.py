@@ -12,9 +12,8 @@ from tests.support import known_walk as walk
 def test_lag_and_a_drifting_yaw_are_found_and_a_relocalisation_does_not_matter():
     time = np.arange(0.0, 125.0, 0.01)
     yaw = 0.5 + 0.003 * time
-    turned = (walk.acceleration(time)[:, 0] + 1j * walk.acceleration(time)[:, 1]) * np.exp(
-        -1j * yaw
-    )
+    known = walk.acceleration(time)
+    turned = (known[:, 0] + 1j * known[:, 1]) * np.exp(-1j * yaw)
     felt = np.stack([turned.real, turned.imag], axis=1)
     track_time = np.arange(0.0, 120.0, 0.01)
     position = walk.position(track_time + 1.3)
