@@ -142,7 +142,8 @@ DATASET = Dataset(
     splits=SPLITS,
     rate=RATE,
     source="https://github.com/mit-aera/Blackbird-Dataset",
-    layout="<root>/{train,val,test}.txt and <root>/<trajectory>/<yaw>/<speed>/<split>/{data.hdf5,stamped_groundtruth_imu.txt}",
+    layout="<root>/{train,val,test}.txt and "
+    "<root>/<trajectory>/<yaw>/<speed>/<split>/{data.hdf5,stamped_groundtruth_imu.txt}",
     licence="as stated by the authors (github.com/mit-aera/Blackbird-Dataset)",
     pedestrian=False,
 )

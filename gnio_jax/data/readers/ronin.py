@@ -295,7 +295,8 @@ DATASET = Dataset(
     splits=tuple(_LISTS),
     rate=RATE,
     source="https://ronin.cs.sfu.ca (half of it is public; the lists are in https://github.com/Sachini/ronin)",
-    layout="<root>/**/<sequence>/{data.hdf5,info.json} and <root>/lists/list_{train,val,test_seen,test_unseen}.txt",
+    layout="<root>/**/<sequence>/{data.hdf5,info.json} and "
+    "<root>/lists/list_{train,val,test_seen,test_unseen}.txt",
     licence="RoNIN data licence: non-commercial research only",
     min_correlation=None,  # the chest's accelerations are not the phone's
 )

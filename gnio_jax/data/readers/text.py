@@ -34,56 +34,62 @@ def read_csv(
     `InputError` naming the file when it is missing, empty or no table.
     """
     path = Path(path)
-    names, skip = None, 0
+    blanks = separator == " "
     try:
-        with path.open(encoding="utf-8-sig") as file:
-            for line in file:
-                if not line.startswith("#") and line.strip():
-                    break
-                skip += 1
-                if line.startswith("#"):
-                    names = line
-            else:
-                raise InputError(path, "holds no row", "copy it again")
-        if header and names is None:
-            names, skip = line, skip + 1
+        names, skip = _header(path, header)
         table = pd.read_csv(
             path,
             header=None,
             skiprows=skip,
             comment="#",
-            sep=r"\s+" if separator == " " else separator,
+            sep=r"\s+" if blanks else separator,
             skipinitialspace=True,
             skip_blank_lines=True,
             low_memory=False,
         )
     except OSError as error:
         raise InputError(path, f"cannot be read ({error.strerror})") from None
+    except InputError:
+        raise
     except pd.errors.EmptyDataError:
         raise InputError(path, "holds no row", "copy it again") from None
     except (UnicodeDecodeError, pd.errors.ParserError, ValueError) as error:
-        if isinstance(error, InputError):
-            raise
         raise InputError(
             path,
             f"is no table of text ({shortened(error, 200)})",
             "it may be cut short or damaged: copy it again",
         ) from None
-    if header and names is not None:
-        labels = [
-            name.strip()
-            for name in names.lstrip("#").strip().split(None if separator == " " else separator)
-        ]
-        if len(labels) == table.shape[1] + 1 and not labels[-1]:
-            labels = labels[:-1]
-        if len(labels) != table.shape[1]:
-            raise InputError(
-                path,
-                f"its header names {len(labels)} columns, its rows have {table.shape[1]}",
-                "copy it again",
-            )
-        table.columns = labels
+    if header:
+        labels = names.lstrip("#").strip().split(None if blanks else separator)
+        table.columns = _labels(labels, table.shape[1], path)
     return table
+
+
+def _header(path: Path, header: bool) -> tuple[str, int]:
+    """(the line that names the columns, number of lines before the data)."""
+    names, skip = "", 0
+    with path.open(encoding="utf-8-sig") as file:
+        for line in file:
+            if not line.startswith("#") and line.strip():
+                return (names, skip) if names or not header else (line, skip + 1)
+            skip += 1
+            if line.startswith("#"):
+                names = line
+    raise InputError(path, "holds no row", "copy it again")
+
+
+def _labels(names: list[str], columns: int, path: Path) -> list[str]:
+    """Names without blanks, one for each column; a separator at the end names none."""
+    labels = [name.strip() for name in names]
+    if len(labels) == columns + 1 and not labels[-1]:
+        labels = labels[:-1]
+    if len(labels) != columns:
+        raise InputError(
+            path,
+            f"its header names {len(labels)} columns, its rows have {columns}",
+            "copy it again",
+        )
+    return labels
 
 
 def numbers(table: pd.DataFrame, columns: Iterable[object], path: object) -> np.ndarray:
@@ -106,7 +112,8 @@ def numbers(table: pd.DataFrame, columns: Iterable[object], path: object) -> np.
             row = int(np.argmax(~np.isfinite(as_number.to_numpy()) & values.notna().to_numpy()))
             raise InputError(
                 path,
-                f"column '{name}' holds '{shortened(values.iloc[row])}' in its row {row + 1}, no number",
+                f"column '{name}' holds '{shortened(values.iloc[row])}' in its row {row + 1}, "
+                "no number",
             ) from None
     return np.stack(out, axis=1)
 
@@ -142,8 +149,8 @@ def listed(
         )
     if absent:
         warnings.warn(
-            f"{path}: {len(absent)} of {len(entries)} listed sequences are absent: {', '.join(map(shortened, absent[:3]))}"
-            f"{', ...' if len(absent) > 3 else ''}",
+            f"{path}: {len(absent)} of {len(entries)} listed sequences are absent: "
+            f"{', '.join(map(shortened, absent[:3]))}{', ...' if len(absent) > 3 else ''}",
             stacklevel=3,
         )
     return present

@@ -163,6 +163,7 @@ DATASET = Dataset(
     splits=tuple(_LISTS),
     rate=RATE,
     source="https://github.com/CathIAS/TLIO (its README links the data)",
-    layout="<root>/{train,val,test}_list.txt and <root>/<sequence>/{imu0_resampled.npy,imu0_resampled_description.json}",
+    layout="<root>/{train,val,test}_list.txt and "
+    "<root>/<sequence>/{imu0_resampled.npy,imu0_resampled_description.json}",
     licence="CC BY-NC 4.0",
 )
