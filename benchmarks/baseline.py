@@ -1,5 +1,8 @@
-"""The figures that benchmarks are held against: `baseline.json`, each with the limit beyond which
-it counts as worse."""
+"""The recorded figures of the benchmarks, and the comparison with a new run.
+
+`baseline.json` holds for each figure the value that was measured and a limit. A value beyond the
+limit counts as worse.
+"""
 
 import json
 from pathlib import Path
@@ -8,19 +11,21 @@ FILE = Path(__file__).with_name("baseline.json")
 
 
 def compare(benchmark: str, figures: dict[str, float]) -> bool:
-    """Print each figure beside its baseline; True if none is worse than its limit ("at most" or "at
-    least")."""
+    """Print each figure beside its baseline. Return True if every figure is within its limit.
+
+    A limit is "at most" or "at least". Figures without a baseline are not printed.
+    """
     recorded = json.loads(FILE.read_text())[benchmark]
-    fine = True
+    all_fine = True
     print(f"\n{benchmark} against {FILE.name} ({recorded['machine']}):")
     for name, value in figures.items():
         if name not in recorded["figures"]:
             continue
         entry = recorded["figures"][name]
-        good = value <= entry["at most"] if "at most" in entry else value >= entry["at least"]
         limit = "at most" if "at most" in entry else "at least"
-        print(
-            f"  {name}: {value:,.3g}, was {entry['was']:,.3g}, {limit} {entry[limit]:,.3g}: {'fine' if good else 'WORSE'}"
-        )
-        fine &= good
-    return fine
+        fine = value <= entry[limit] if limit == "at most" else value >= entry[limit]
+        verdict = "fine" if fine else "WORSE"
+        bounds = f"was {entry['was']:,.3g}, {limit} {entry[limit]:,.3g}"
+        print(f"  {name}: {value:,.3g}, {bounds}: {verdict}")
+        all_fine &= fine
+    return all_fine

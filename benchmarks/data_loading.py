@@ -1,14 +1,14 @@
-"""Hours of recording read per second: from the published files, from the cache, and from the
-package's own HDF5.
+"""Hours of recording read per second, from each published layout.
 
-    python -m benchmarks.data_loading [--minutes 10] [--recordings 3] [--repeats 3] [--layouts tlio "ridi text" ...]
+    python -m benchmarks.data_loading [--minutes 10] [--recordings 3] [--repeats 3]
+        [--layouts tlio "ridi text" ...]
 
-Real recordings count where $GNIO_DATA has them, else a known walk of `--minutes` written by the
-tests' own writers; the table says which. `cold` reads the published files with an empty cache,
-`cached` what a loader that keeps its sequences left there, `HDF5` what `python -m gnio_jax.data
-convert` writes. All are validated on the way. Files are in the system's cache of the disk: this
-measures the loaders, not the disk. One process; best of the repeats. At last the parser of text is
-timed in turn with `np.loadtxt` on one file.
+Real recordings are used where $GNIO_DATA has them. Elsewhere the tests' writers write a known walk
+of `--minutes`. The table says which. `cold` reads the published files with an empty cache. `cached`
+reads what a loader with a cache kept there. `HDF5` reads the files of `gnio data convert`. All
+sequences are validated on the way. The files are in the system's disk cache: this measures the
+loaders, not the disk. One process reads; the best of the repeats counts. At the end the text parser
+and `np.loadtxt` read one file in turn.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ REAL = {
 def best(
     function: Callable[[], object], repeats: int, before: Callable[[], object] = lambda: None
 ) -> float:
-    """Seconds of the quickest call; `before` each of them is not counted."""
+    """Seconds of the quickest call. `before` runs ahead of each and is not counted."""
     seconds = []
     for _ in range(repeats):
         before()
@@ -59,7 +59,7 @@ def best(
 
 
 def find(layout: str, folder: Path, minutes: float, most: int) -> tuple[list[Recording], str]:
-    """(recordings, "real" or "written") of a layout; what is written goes to `folder`."""
+    """(recordings, "real" or "written") of a layout. Written files go to `folder`."""
     dataset = data.get(LAYOUTS[layout].dataset)
     base, (name, split) = os.environ.get("GNIO_DATA"), REAL.get(layout, ("", ""))
     if base and name and (Path(base) / name).is_dir():
@@ -72,7 +72,7 @@ def find(layout: str, folder: Path, minutes: float, most: int) -> tuple[list[Rec
 def measure(
     layout: str, folder: Path, minutes: float, most: int, repeats: int
 ) -> dict[str, float | str]:
-    """Hours per second of the three ways."""
+    """Hours per second from the published files, from the cache and from our HDF5."""
     cache = folder / "cache"
     os.environ["GNIO_CACHE"] = str(cache)
     recordings, source = find(layout, folder / "files", minutes, most)
@@ -101,16 +101,15 @@ def measure(
 
 
 def parser_ratio(folder: Path, minutes: float, repeats: int) -> tuple[float, float, str]:
-    """(seconds of our parser, of np.loadtxt, which file) on EuRoC's imu0/data.csv, the numbers of
-    both being equal."""
+    """(seconds of our parser, of np.loadtxt, which file) on EuRoC's imu0/data.csv.
+
+    Both must return the same numbers.
+    """
     base = os.environ.get("GNIO_DATA")
-    path = (
-        next(iter(sorted((Path(base) / "euroc").glob("*/mav0/imu0/data.csv"))), None)
-        if base
-        else None
-    )
-    source = "real"
-    if path is None:
+    real = sorted((Path(base) / "euroc").glob("*/mav0/imu0/data.csv")) if base else []
+    if real:
+        path, source = real[0], "real"
+    else:
         folder.mkdir()
         LAYOUTS["euroc"].write(folder, 60.0 * minutes)
         path, source = next(folder.glob("*/mav0/imu0/data.csv")), "written"
@@ -123,11 +122,32 @@ def parser_ratio(folder: Path, minutes: float, repeats: int) -> tuple[float, flo
         return np.loadtxt(path, delimiter=",", comments="#")
 
     np.testing.assert_allclose(ours(), theirs(), rtol=1e-15)
-    times = [
-        (best(ours, 1), best(theirs, 1)) for _ in range(repeats)
-    ]  # in turn: a busy machine slows both
-    about = f"{path.relative_to(path.parents[3])}, {source}, {path.stat().st_size / 2**20:.1f} MiB"
+    # In turn, so that a busy machine slows both.
+    times = [(best(ours, 1), best(theirs, 1)) for _ in range(repeats)]
+    size = path.stat().st_size / 2**20
+    about = f"{path.relative_to(path.parents[3])}, {source}, {size:.1f} MiB"
     return min(first for first, _ in times), min(second for _, second in times), about
+
+
+def report_layout(layout: str, minutes: float, most: int, repeats: int) -> dict[str, float]:
+    """Measure and print one layout; its figures by their names in the baseline."""
+    with tempfile.TemporaryDirectory() as folder:
+        row = measure(layout, Path(folder), minutes, most, repeats)
+    cached = f"{row['cached']:8.3f}" if "cached" in row else f"{'':8}"
+    about = f"{layout:>14} {row['source']:>8} {row['recordings']:3} {row['hours']:6.2f}"
+    print(f"{about} {row['cold']:8.3f} {cached} {row['HDF5']:8.3f}", flush=True)
+    ways = [way for way in ("cold", "cached", "HDF5") if way in row]
+    return {f"h/s, {layout}, {way}": float(row[way]) for way in ways}
+
+
+def report_parser(minutes: float, repeats: int) -> float:
+    """Measure and print our text parser beside np.loadtxt; the ratio of their times."""
+    with tempfile.TemporaryDirectory() as folder:
+        ours, theirs, about = parser_ratio(Path(folder) / "files", minutes, repeats)
+    ratio = theirs / ours
+    times = f"{1e3 * ours:.0f} ms, np.loadtxt {1e3 * theirs:.0f} ms"
+    print(f"\ntext ({about}): {times}: {ratio:.1f} times as long")
+    return ratio
 
 
 def main() -> None:
@@ -138,45 +158,22 @@ def main() -> None:
         "--minutes",
         type=float,
         default=10.0,
-        help="length of what is written where nothing real is there",
+        help="length of the written walk, where no real recording is found",
     )
-    parser.add_argument(
-        "--recordings", type=int, default=3, help="of the real ones, how many at most"
-    )
+    parser.add_argument("--recordings", type=int, default=3, help="real recordings to read at most")
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--layouts", nargs="+", choices=LAYOUTS, default=list(LAYOUTS))
     arguments = parser.parse_args()
-    warnings.simplefilter(
-        "ignore"
-    )  # cut gaps, missing entries of lists: known, and not what is measured
-    figures: dict[str, float] = {}
+    # The warnings name cut gaps and entries of lists that are missing. They are known and not
+    # what is measured.
+    warnings.simplefilter("ignore")
     print(f"hours of recording per second, best of {arguments.repeats}\n")
-    print(
-        f"{'layout':>14} {'source':>8} {'n':>3} {'hours':>6} {'cold':>8} {'cached':>8} {'HDF5':>8}"
-    )
+    columns = f"{'layout':>14} {'source':>8} {'n':>3} {'hours':>6}"
+    print(f"{columns} {'cold':>8} {'cached':>8} {'HDF5':>8}")
+    figures: dict[str, float] = {}
     for layout in arguments.layouts:
-        with tempfile.TemporaryDirectory() as folder:
-            row = measure(
-                layout, Path(folder), arguments.minutes, arguments.recordings, arguments.repeats
-            )
-        cached = f"{row['cached']:8.3f}" if "cached" in row else f"{'':8}"
-        print(
-            f"{layout:>14} {row['source']:>8} {row['recordings']:3} {row['hours']:6.2f} {row['cold']:8.3f} {cached} {row['HDF5']:8.3f}",
-            flush=True,
-        )
-        figures |= {
-            f"h/s, {layout}, {way}": float(row[way])
-            for way in ("cold", "cached", "HDF5")
-            if way in row
-        }
-    with tempfile.TemporaryDirectory() as folder:
-        ours, theirs, about = parser_ratio(
-            Path(folder) / "files", arguments.minutes, arguments.repeats
-        )
-    print(
-        f"\ntext ({about}): {1e3 * ours:.0f} ms, np.loadtxt {1e3 * theirs:.0f} ms: {theirs / ours:.1f} times as long"
-    )
-    figures["np.loadtxt / our parser"] = theirs / ours
+        figures |= report_layout(layout, arguments.minutes, arguments.recordings, arguments.repeats)
+    figures["np.loadtxt / our parser"] = report_parser(arguments.minutes, arguments.repeats)
     baseline.compare("data_loading", figures)
 
 

@@ -1,20 +1,22 @@
-"""IMU samples per second of the stochastic-cloning EKF: alone, vmapped and over all cores, beside a
-plain NumPy filter.
+"""IMU samples per second of the stochastic-cloning EKF, beside a plain NumPy filter.
 
-    python -m benchmarks.filter_throughput [--seconds 180] [--repeats 5] [--only batch|window|length|precision|gradient]
+    python -m benchmarks.filter_throughput [--seconds 180] [--repeats 5]
+        [--only batch|window|length|precision|gradient]
 
-Over rates of cloning, windows, lengths and precisions. A batch runs under `vmap` on one device, and
-shared out among the cores (`filtering.over_sequences`). Compilation is timed apart; every timing
-waits for the result. Reported is the best and the median of the repeats, the samples per second of
-processor time, which other programs on the machine disturb less, and the memory of the program: its
-arguments, results and temporaries. Last comes what derivatives cost: value and gradient over value,
-in time and memory, with and without checkpoints.
+The table covers batch sizes, clone rates, window lengths, recording lengths and precisions. A batch
+runs under `vmap` on one device, or is shared out among the cores (`filtering.over_sequences`).
+Compile time is measured apart, and every timing waits for its result. A row gives the best and the
+median of the repeats, the samples per second of processor time (which other programs on the machine
+disturb less), and the memory of the program: arguments, results and temporaries. The last part
+gives the cost of derivatives: value and gradient over the value, in time and memory, with and
+without checkpoints.
 """
 
 from __future__ import annotations
 
 import argparse
 import time
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -31,23 +33,24 @@ DT = 1 / 200
 
 
 def walk(seconds: float, config: filtering.FilterConfig) -> tuple[np.ndarray, ...]:
-    """A level walk at 1.2 m/s along a circle of 5 m radius with a bobbing phone: noisy gyro and
-    accel, exact displacements."""
+    """Signals of a level walk at 1.2 m/s along a circle of 5 m radius, with a bobbing phone.
+
+    Returns gyro (rad/s) and accel (m/s²), (k·n, 3) each, with noise; displacements (k, 3) with 2 cm
+    of noise; their covariances (k, 3, 3).
+    """
     rng = np.random.default_rng(0)
     n, window = config.samples_per_clone, config.clones_per_window
     intervals = int(seconds / DT) // n
     t = np.arange(intervals * n) * DT
     speed, rate = 1.2, 0.24
-    gyro = np.stack([0 * t, 0 * t, np.full_like(t, rate)], 1) + 1e-3 * rng.standard_normal(
-        (len(t), 3)
-    )
-    accel = np.stack(
-        [0 * t, np.full_like(t, speed * rate), 9.81 + 2 * np.sin(4 * np.pi * t)], 1
-    ) + 1e-2 * rng.standard_normal((len(t), 3))
+    bobbing = 9.81 + 2 * np.sin(4 * np.pi * t)
+    gyro = np.stack([0 * t, 0 * t, np.full_like(t, rate)], 1)
+    gyro += 1e-3 * rng.standard_normal((len(t), 3))
+    accel = np.stack([0 * t, np.full_like(t, speed * rate), bobbing], 1)
+    accel += 1e-2 * rng.standard_normal((len(t), 3))
     turned = rate * window * n * DT
-    displacement = np.tile(
-        speed / rate * np.array([np.sin(turned), 1 - np.cos(turned), 0.0]), (intervals, 1)
-    )
+    chord = speed / rate * np.array([np.sin(turned), 1 - np.cos(turned), 0.0])
+    displacement = np.tile(chord, (intervals, 1))
     displacement += 0.02 * rng.standard_normal(displacement.shape)
     return gyro, accel, displacement, np.tile(0.02**2 * np.eye(3), (intervals, 1, 1))
 
@@ -55,11 +58,14 @@ def walk(seconds: float, config: filtering.FilterConfig) -> tuple[np.ndarray, ..
 def measure(
     config: filtering.FilterConfig, batch: int, spread: bool, seconds: float, repeats: int
 ) -> dict[str, float]:
+    """Samples per second (best, median, per processor second), compile time in s, memory in MiB.
+
+    `spread` shares the batch out among all cores.
+    """
     dtype = np.float32 if config.allow_float32 else np.float64
     signals = tuple(signal.astype(dtype) for signal in walk(seconds, config))
-    state = filtering.initial_state(
-        config, np.eye(3, dtype=dtype), np.array([1.2, 0.0, 0.0], dtype), np.zeros(3, dtype)
-    )
+    start = (np.eye(3, dtype=dtype), np.array([1.2, 0.0, 0.0], dtype), np.zeros(3, dtype))
+    state = filtering.initial_state(config, *start)
     noise = filtering.NoiseModel.per_sample(1e-2, 3.16e-2, config.dt)
 
     def run(*signals):
@@ -73,9 +79,8 @@ def measure(
     program = jax.jit(run).lower(*signals).compile()
     compiled = time.perf_counter() - begin
     final, _ = jax.block_until_ready(program(*signals))
-    assert bool(np.isfinite(final.core_covariance).all()), (
-        "the filter diverged: the timing would mean nothing"
-    )
+    finite = bool(np.isfinite(final.core_covariance).all())
+    assert finite, "the filter diverged: the timing would mean nothing"
     wall, cpu = [], []
     for _ in range(repeats):
         begin, spent = time.perf_counter(), time.process_time()
@@ -83,20 +88,26 @@ def measure(
         wall.append(time.perf_counter() - begin)
         cpu.append(time.process_time() - spent)
     samples = signals[0].size // 3
-    memory, devices = program.memory_analysis(), jax.device_count() if spread else 1
+    devices = jax.device_count() if spread else 1
     return {
         "compile": compiled,
         "best": samples / min(wall),
         "median": samples / np.median(wall),
         "cpu": samples / min(cpu),
-        "devices": devices,  # the analysis is that of one of them
-        "memory": devices
-        * (memory.temp_size_in_bytes + memory.argument_size_in_bytes + memory.output_size_in_bytes)
-        / 2**20,
+        "devices": devices,
+        "memory": devices * mebibytes(program),
     }
 
 
+def mebibytes(program) -> float:
+    """Memory of a compiled program on one device: temporaries, arguments and results."""
+    memory = program.memory_analysis()
+    held = memory.argument_size_in_bytes + memory.output_size_in_bytes
+    return (memory.temp_size_in_bytes + held) / 2**20
+
+
 def measure_numpy(config: filtering.FilterConfig, seconds: float) -> float:
+    """Samples per second of the tests' plain NumPy filter."""
     from tests.support.scekf_numpy import run
 
     gyro, accel, displacement, covariance = walk(seconds, config)
@@ -121,8 +132,11 @@ def measure_numpy(config: filtering.FilterConfig, seconds: float) -> float:
 def measure_gradient(
     config: filtering.FilterConfig, seconds: float, repeats: int
 ) -> tuple[float, float]:
-    """Seconds and MiB of the value and gradient of a function of the history, with respect to
-    noise, start and every measurement."""
+    """(time of value and gradient over time of the value, MiB of temporaries of the former).
+
+    The value is a function of the history. The gradient is with respect to the noise model, the
+    initial velocity and every measurement.
+    """
     gyro, accel, displacement, covariance = jax.device_put(walk(seconds, config))
 
     def value(logarithms, velocity, displacement):
@@ -152,22 +166,82 @@ def measure_gradient(
     return out[2] / out[0], out[3]
 
 
-CASES = {  # clone interval in samples, clones in a window, sequences, over all cores, share of --seconds, float32
+class Case(NamedTuple):
+    """One row of the table."""
+
+    per_clone: int
+    """Samples between two clones."""
+    clones: int
+    """Clones in a window."""
+    batch: int
+    """Sequences side by side."""
+    spread: bool = False
+    """Share the batch out among all cores."""
+    share: float = 1
+    """Length of the walk as a share of --seconds."""
+    float32: bool = False
+
+
+CASES = {
     "batch": [
-        (10, 20, 1, False, 1, False),
-        (10, 20, 16, False, 1, False),
-        (10, 20, 16, True, 1, False),
-        (10, 20, 64, True, 1, False),
+        Case(10, 20, 1),
+        Case(10, 20, 16),
+        Case(10, 20, 16, spread=True),
+        Case(10, 20, 64, spread=True),
     ],
     "window": [
-        (20, 10, 1, False, 1, False),
-        (20, 10, 16, True, 1, False),
-        (20, 20, 1, False, 1, False),
-        (10, 40, 1, False, 1, False),
+        Case(20, 10, 1),
+        Case(20, 10, 16, spread=True),
+        Case(20, 20, 1),
+        Case(10, 40, 1),
     ],
-    "length": [(10, 20, 1, False, 1 / 4, False), (10, 20, 1, False, 4, False)],
-    "precision": [(10, 20, 1, False, 1, True), (10, 20, 16, True, 1, True)],
+    "length": [
+        Case(10, 20, 1, share=1 / 4),
+        Case(10, 20, 1, share=4),
+    ],
+    "precision": [
+        Case(10, 20, 1, float32=True),
+        Case(10, 20, 16, spread=True, float32=True),
+    ],
 }
+GRADIENTS = [(60, 0), (60, 32), (600, 128)]
+"""(seconds, checkpoint_every)."""
+
+
+def report_case(case: Case, length: float, repeats: int) -> tuple[str, float]:
+    """Measure one row, print it, and return its name in the baseline and its best speed."""
+    seconds = length * case.share
+    rate, window = 1 / (case.per_clone * DT), case.per_clone * case.clones * DT
+    config = filtering.FilterConfig(DT, case.per_clone, case.clones, allow_float32=case.float32)
+    repeats = repeats if case.batch < 64 else min(repeats, 3)
+    row = measure(config, case.batch, case.spread, seconds, repeats)
+    precision = "float32" if case.float32 else "float64"
+    setting = f"{rate:5.0f} Hz {window:6.1f} s {seconds:8.0f} {case.batch:6} {row['devices']:7}"
+    speeds = f"{row['best']:10,.0f} {row['median']:10,.0f} {row['cpu']:10,.0f}"
+    cost = f"{row['compile']:10.1f} {row['memory']:7.1f}"
+    print(f"{setting} {precision:>8} {speeds} {cost}", flush=True)
+    name = f"samples/s, {rate:.0f} Hz clones, {window:.0f} s window, batch {case.batch}"
+    name += ", all cores" if case.spread else ""
+    name += ", float32" if case.float32 else ""
+    name += f", {seconds:.0f} s" if case.share != 1 else ""
+    return name, row["best"]
+
+
+def report_gradients() -> dict[str, float]:
+    """Measure and print the cost of derivatives."""
+    figures = {}
+    print("\nvalue and gradient, 20 Hz clones, 1 s window, one sequence, float64:")
+    for seconds, every in GRADIENTS:
+        config = filtering.FilterConfig(DT, 10, 20, checkpoint_every=every)
+        ratio, memory = measure_gradient(config, seconds, 2)
+        print(
+            f"  {seconds:4} s, checkpoint_every {every:4}: {ratio:5.1f} × the value's time, "
+            f"{memory:7.0f} MiB of temporaries",
+            flush=True,
+        )
+        figures[f"gradient / value, {seconds} s, checkpoint_every {every}"] = ratio
+        figures[f"MiB of the gradient, {seconds} s, checkpoint_every {every}"] = memory
+    return figures
 
 
 def main() -> None:
@@ -177,56 +251,25 @@ def main() -> None:
     parser.add_argument("--only", choices=[*CASES, "gradient"], help="one part of the table")
     arguments = parser.parse_args()
     filtering.cores_as_devices()
-    print(
-        f"{jax.devices()[0].device_kind}, jax {jax.__version__}, 200 Hz IMU; samples per second\n"
-    )
-    print(
-        f"{'clones':>8} {'window':>8} {'seconds':>8} {'batch':>6} {'devices':>7} {'':>8} {'best':>10} {'median':>10} {'per cpu-s':>10} "
-        f"{'compile s':>10} {'MiB':>7}"
-    )
+    device = jax.devices()[0].device_kind
+    print(f"{device}, jax {jax.__version__}, 200 Hz IMU; samples per second\n")
+    setting = f"{'clones':>8} {'window':>8} {'seconds':>8} {'batch':>6} {'devices':>7}"
+    speeds = f"{'best':>10} {'median':>10} {'per cpu-s':>10}"
+    print(f"{setting} {'':>8} {speeds} {'compile s':>10} {'MiB':>7}")
+
     figures: dict[str, float] = {}
-    for part in [arguments.only] if arguments.only in CASES else [] if arguments.only else CASES:
-        for n, clones, batch, spread, share, single in CASES[part]:
-            config, seconds = (
-                filtering.FilterConfig(DT, n, clones, allow_float32=single),
-                arguments.seconds * share,
-            )
-            row = measure(
-                config,
-                batch,
-                spread,
-                seconds,
-                arguments.repeats if batch < 64 else min(arguments.repeats, 3),
-            )
-            name = f"samples/s, {1 / (n * DT):.0f} Hz clones, {n * clones * DT:.0f} s window, batch {batch}"
-            name += (
-                ", all cores" * spread + ", float32" * single + f", {seconds:.0f} s" * (share != 1)
-            )
-            figures[name] = row["best"]
-            print(
-                f"{1 / (n * DT):5.0f} Hz {n * clones * DT:6.1f} s {seconds:8.0f} {batch:6} {row['devices']:7} "
-                f"{'float32' if single else 'float64':>8} {row['best']:10,.0f} {row['median']:10,.0f} {row['cpu']:10,.0f} "
-                f"{row['compile']:10.1f} {row['memory']:7.1f}",
-                flush=True,
-            )
+    for part, cases in CASES.items():
+        if arguments.only in (None, part):
+            for case in cases:
+                name, speed = report_case(case, arguments.seconds, arguments.repeats)
+                figures[name] = speed
     if arguments.only in (None, "batch"):
         rate = measure_numpy(filtering.FilterConfig(DT, 10, 20), 10.0)
         print(f"\nplain NumPy filter, 20 Hz clones, 1 s window, one sequence: {rate:,.0f}")
-        figures["this filter / plain NumPy"] = (
-            figures["samples/s, 20 Hz clones, 1 s window, batch 1"] / rate
-        )
+        ours = figures["samples/s, 20 Hz clones, 1 s window, batch 1"]
+        figures["this filter / plain NumPy"] = ours / rate
     if arguments.only in (None, "gradient"):
-        print("\nvalue and gradient, 20 Hz clones, 1 s window, one sequence, float64:")
-        for seconds, every in [(60, 0), (60, 32), (600, 128)]:
-            ratio, memory = measure_gradient(
-                filtering.FilterConfig(DT, 10, 20, checkpoint_every=every), seconds, 2
-            )
-            print(
-                f"  {seconds:4} s, checkpoint_every {every:4}: {ratio:5.1f} × the value's time, {memory:7.0f} MiB of temporaries",
-                flush=True,
-            )
-            figures[f"gradient / value, {seconds} s, checkpoint_every {every}"] = ratio
-            figures[f"MiB of the gradient, {seconds} s, checkpoint_every {every}"] = memory
+        figures |= report_gradients()
     baseline.compare("filter_throughput", figures)
 
 

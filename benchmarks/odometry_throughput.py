@@ -1,12 +1,12 @@
-"""Real-time factor of the whole odometry, the full-width network inside the filter's loop, for one
-sequence and for many side by side.
+"""Speed of the whole odometry: the full-width network inside the filter's loop.
 
     python -m benchmarks.odometry_throughput [--batches 1 8 32] [--seconds 20] [--repeats 3]
 
-Seconds of recording per second of computing, compilation apart; the best of the repeats. Beside it
-the same filter with measurements given, which tells the network's share, and, where PyTorch is
-installed, the forward pass of TLIO's network over the same number of windows at once (a bound for
-any filter that uses it).
+The figure is seconds of recording per second of computing, for one sequence and for many side by
+side. Compile time is measured apart, and the best of the repeats counts. The same filter with given
+measurements is timed too: the difference is the network's share. Where PyTorch is installed, the
+forward pass of TLIO's network over the same number of windows at once is timed as well. It bounds
+any filter that uses that network.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ from gnio_jax import filtering, models  # noqa: E402
 
 
 def best(program, arguments, repeats: int) -> float:
+    """Seconds of the quickest call after a first one that is not counted."""
     jax.block_until_ready(program(*arguments))
     times = []
     for _ in range(repeats):
@@ -38,6 +39,7 @@ def best(program, arguments, repeats: int) -> float:
 
 
 def measure(clone_rate: int, batch: int, seconds: float, repeats: int) -> dict[str, float]:
+    """Times real time of the whole odometry and of the filter alone, and the network's share."""
     config = filtering.FilterConfig(DT, round(1 / DT) // clone_rate, clone_rate)
     gyro, accel, displacement, covariance = (
         np.tile(signal[None], (batch, *[1] * signal.ndim)) for signal in walk(seconds, config)
@@ -55,12 +57,12 @@ def measure(clone_rate: int, batch: int, seconds: float, repeats: int) -> dict[s
         return filtering.run_odometry(lean, state, gyro, accel, config, noise)[1].position
 
     def given(gyro, accel, displacement, covariance):
-        return filtering.run_filter(state, gyro, accel, displacement, covariance, config, noise)[
-            1
-        ].position
+        signals = (gyro, accel, displacement, covariance)
+        _, history = filtering.run_filter(state, *signals, config, noise)
+        return history.position
 
     def for_all(function, shared: int):
-        # A batch of one is the plain program: what a single recording costs.
+        # A batch of one runs the plain program, so that the figure is that of a single recording.
         if batch == 1:
             return lambda *a: function(*a[:shared], *(x[0] for x in a[shared:]))
         return filtering.over_sequences(function, shared)
@@ -72,10 +74,9 @@ def measure(clone_rate: int, batch: int, seconds: float, repeats: int) -> dict[s
     assert bool(jnp.isfinite(program(frozen, *signals)).all())
     whole = best(program, (frozen, *signals), repeats)
     alone = best(jax.jit(for_all(given, 0)), (*signals, displacement, covariance), repeats)
-    duration, windows = (
-        batch * gyro.shape[1] * DT,
-        batch * (gyro.shape[1] // config.samples_per_clone - config.clones_per_window),
-    )
+    samples = gyro.shape[1]
+    duration = batch * samples * DT
+    windows = batch * (samples // config.samples_per_clone - config.clones_per_window)
     return {
         "whole": duration / whole,
         "filter": duration / alone,
@@ -87,7 +88,10 @@ def measure(clone_rate: int, batch: int, seconds: float, repeats: int) -> dict[s
 
 
 def torch_forward(windows: int, batch: int, repeats: int) -> float | None:
-    """Seconds that PyTorch needs for so many windows, `batch` at once, with TLIO's network."""
+    """Seconds of PyTorch's forward pass of TLIO's network over `windows` windows, `batch` at once.
+
+    None where PyTorch is not installed.
+    """
     try:
         import torch
 
@@ -106,6 +110,25 @@ def torch_forward(windows: int, batch: int, repeats: int) -> float | None:
     return min(times) / (calls * batch) * windows
 
 
+def report_row(rate: int, batch: int, seconds: float, repeats: int) -> dict[str, float]:
+    """Measure and print one row; its figures by their names in the baseline."""
+    row = measure(rate, batch, seconds, repeats)
+    torch_seconds = torch_forward(int(row["windows"]), batch, repeats)
+    name = f"{rate} Hz clones, batch {batch}"
+    figures = {f"times real time, {name}": row["whole"]}
+    share = ""
+    if torch_seconds is not None:
+        ratio = torch_seconds / row["seconds"]
+        share = f"{ratio:.2f} of its time"
+        figures[f"PyTorch forward / whole odometry, {name}"] = ratio
+    print(
+        f"{rate:4} Hz {batch:6} {row['whole']:9.1f} {row['filter']:9.0f} "
+        f"{row['ms a window']:10.2f} {row['compile']:10.1f} {share:>25}",
+        flush=True,
+    )
+    return figures
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--batches", type=int, nargs="+", default=[1, 8, 32])
@@ -120,30 +143,16 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=3)
     arguments = parser.parse_args()
     filtering.cores_as_devices()
+    device = jax.devices()[0].device_kind
+    print(f"{device}, jax {jax.__version__}, 200 Hz IMU, network of full width; times real time\n")
     print(
-        f"{jax.devices()[0].device_kind}, jax {jax.__version__}, 200 Hz IMU, network of full width; times real time\n"
+        f"{'clones':>7} {'batch':>6} {'whole':>9} {'filter':>9} "
+        f"{'ms/window':>10} {'compile s':>10} {'TLIO in PyTorch, forward':>25}"
     )
-    print(
-        f"{'clones':>7} {'batch':>6} {'whole':>9} {'filter':>9} {'ms/window':>10} {'compile s':>10} {'TLIO in PyTorch, forward':>25}"
-    )
-    figures = {}
+    figures: dict[str, float] = {}
     for rate in arguments.clone_rates:
         for batch in arguments.batches:
-            row = measure(rate, batch, arguments.seconds, arguments.repeats)
-            torch_seconds = torch_forward(int(row["windows"]), batch, arguments.repeats)
-            ratio = (
-                "" if torch_seconds is None else f"{torch_seconds / row['seconds']:.2f} of its time"
-            )
-            print(
-                f"{rate:4} Hz {batch:6} {row['whole']:9.1f} {row['filter']:9.0f} {row['ms a window']:10.2f} {row['compile']:10.1f} "
-                f"{ratio:>25}",
-                flush=True,
-            )
-            figures[f"times real time, {rate} Hz clones, batch {batch}"] = row["whole"]
-            if torch_seconds is not None:
-                figures[f"PyTorch forward / whole odometry, {rate} Hz clones, batch {batch}"] = (
-                    torch_seconds / row["seconds"]
-                )
+            figures |= report_row(rate, batch, arguments.seconds, arguments.repeats)
     baseline.compare("odometry_throughput", figures)
 
 

@@ -1,5 +1,4 @@
-"""TLIO's network in PyTorch, written from its description, so that its gradient can be timed beside
-ours."""
+"""TLIO's network in PyTorch, written from its description. Its gradient is timed beside ours."""
 
 import torch
 from torch import nn
@@ -9,9 +8,12 @@ class _Block(nn.Module):
     def __init__(self, channels: int, features: int, stride: int):
         super().__init__()
         self.body = nn.Sequential(
-            nn.Conv1d(channels, features, 3, stride, 1, bias=False), nn.BatchNorm1d(features), nn.ReLU(),
-            nn.Conv1d(features, features, 3, 1, 1, bias=False), nn.BatchNorm1d(features),
-        )  # fmt: skip
+            nn.Conv1d(channels, features, 3, stride, 1, bias=False),
+            nn.BatchNorm1d(features),
+            nn.ReLU(),
+            nn.Conv1d(features, features, 3, 1, 1, bias=False),
+            nn.BatchNorm1d(features),
+        )
         self.shortcut = nn.Identity()
         if stride != 1 or channels != features:
             self.shortcut = nn.Sequential(
@@ -24,14 +26,24 @@ class _Block(nn.Module):
 
 def _head(positions: int) -> nn.Module:
     return nn.Sequential(
-        nn.Conv1d(512, 128, 1, bias=False), nn.BatchNorm1d(128), nn.Flatten(),
-        nn.Linear(128 * positions, 512), nn.ReLU(), nn.Dropout(0.5), nn.Linear(512, 512), nn.ReLU(), nn.Dropout(0.5), nn.Linear(512, 3),
-    )  # fmt: skip
+        nn.Conv1d(512, 128, 1, bias=False),
+        nn.BatchNorm1d(128),
+        nn.Flatten(),
+        nn.Linear(128 * positions, 512),
+        nn.ReLU(),
+        nn.Dropout(0.5),
+        nn.Linear(512, 512),
+        nn.ReLU(),
+        nn.Dropout(0.5),
+        nn.Linear(512, 3),
+    )
 
 
 class TlioNetwork(nn.Module):
-    """Windows (b, 6, n) to displacement and log standard deviation (b, 3) each; 5,424,646
-    parameters at n = 200."""
+    """From windows (b, 6, n) to displacement (b, 3) and log standard deviation (b, 3).
+
+    5,424,646 parameters at n = 200.
+    """
 
     def __init__(self, samples: int):
         super().__init__()

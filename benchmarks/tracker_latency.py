@@ -1,12 +1,12 @@
-"""Latency of the online filter with the full-width network: clone steps and ordinary samples,
-garbage collection on and off.
+"""Latency of the online filter with the full-width network.
 
     python -m benchmarks.tracker_latency [--steps 1500] [--width 64] [--imu-rate 200]
 
-200 Hz IMU, or a faster one through the low-pass to 200 Hz, a window of 200 samples, 20 Hz clones: a
-step has 50 ms. The weights are random, since time does not depend on them. Beside the time on the
-wall stands the processor time of the whole process, which other programs on the machine disturb
-less.
+It times pushes with a clone step and without, with garbage collection on and off. The filter runs
+at 200 Hz with windows of 200 samples and 20 Hz clones, so that a step has 50 ms. A faster IMU goes
+through the low-pass to 200 Hz. The weights are random: time does not depend on them. The table
+gives wall time and the processor time of the whole process. Other programs on the machine disturb
+processor time less.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ WARM_UP = 100
 
 
 def network(width: int):
-    """A network whose random weights give displacements of a sensible size."""
+    """A network with random weights that give displacements of a sensible size."""
     model = models.create("gnio", width=width)
     shapes = jax.eval_shape(
         model.init, jax.random.key(0), jax.ShapeDtypeStruct((1, PER_CLONE * CLONES, 6), jnp.float32)
@@ -53,7 +53,7 @@ def network(width: int):
 def measure(
     tracker: filtering.Tracker, first: int, samples: int, imu_rate: float, collect: bool
 ) -> dict[str, np.ndarray]:
-    """Milliseconds on the wall and of the processor of each push, with a clone step and without."""
+    """Wall and processor time of each push in ms, for pushes with and without a clone step."""
     random = np.random.default_rng(first)
     gyro = 0.02 * random.standard_normal((samples, 3))
     accel = 0.3 * random.standard_normal((samples, 3)) + [0.0, 0.0, 9.81]
@@ -80,16 +80,17 @@ def main() -> None:
         "--steps",
         type=int,
         default=1500,
-        help="clone steps measured, with garbage collection and without",
+        help="clone steps to measure, each with garbage collection on and off",
     )
-    parser.add_argument("--width", type=int, default=64, help="of the network; 64 is the paper's")
-    parser.add_argument("--imu-rate", type=float, default=RATE, help="of the samples pushed, Hz")
+    parser.add_argument("--width", type=int, default=64, help="network width; 64 is the paper's")
+    parser.add_argument("--imu-rate", type=float, default=RATE, help="rate of the IMU, Hz")
     arguments = parser.parse_args()
     imu_rate, per_step = arguments.imu_rate, round(PER_CLONE * arguments.imu_rate / RATE)
     config = filtering.FilterConfig(1 / RATE, PER_CLONE, CLONES)
     state = filtering.initial_state(config, np.eye(3), np.zeros(3), np.zeros(3))
     print(
-        f"{jax.devices()[0].device_kind}, jax {jax.__version__}, {imu_rate:g} Hz IMU, {RATE} Hz filter, {RATE / PER_CLONE:.0f} Hz clones"
+        f"{jax.devices()[0].device_kind}, jax {jax.__version__}, {imu_rate:g} Hz IMU, "
+        f"{RATE} Hz filter, {RATE / PER_CLONE:.0f} Hz clones"
     )
     predict = network(arguments.width)
     begin = time.perf_counter()
@@ -100,18 +101,15 @@ def main() -> None:
     figures, period = {}, 1e3 * PER_CLONE / RATE
     print(f"{'':>22} {'collector':>9} {'p50 ms':>8} {'p99 ms':>8} {'max ms':>8} {'p99/period':>10}")
     for collect in (True, False):
+        collector = "on" if collect else "off"
         found = measure(tracker, pushed, arguments.steps * per_step, imu_rate, collect)
         pushed += arguments.steps * per_step
         for kind, values in found.items():
             p50, p99, most = np.percentile(values, [50, 99, 100])
-            print(
-                f"{kind:>22} {'on' if collect else 'off':>9} {p50:8.3f} {p99:8.3f} {most:8.3f} {p99 / period:10.4f}",
-                flush=True,
-            )
-            figures |= {
-                f"{kind}, p50 ms, collector {'on' if collect else 'off'}": float(p50),
-                f"{kind}, p99 ms, collector {'on' if collect else 'off'}": float(p99),
-            }
+            row = f"{kind:>22} {collector:>9} {p50:8.3f} {p99:8.3f} {most:8.3f}"
+            print(f"{row} {p99 / period:10.4f}", flush=True)
+            figures[f"{kind}, p50 ms, collector {collector}"] = float(p50)
+            figures[f"{kind}, p99 ms, collector {collector}"] = float(p99)
     pose = tracker.pose()
     assert pose is not None and np.isfinite(pose.position).all(), (
         "the filter diverged: the timing would mean nothing"

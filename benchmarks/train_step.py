@@ -1,15 +1,16 @@
-"""Windows/s of the whole training step beside the bare gradient of its loss, and beside PyTorch's
-gradient of TLIO's network.
+"""Windows per second of the whole training step, beside two gradients of the same size.
 
     python -m benchmarks.train_step [--width 64] [--samples 200] [--batches 128 1024] [--repeats 5]
 
-The whole step gathers, rotates and augments its windows, runs forward and backward and updates the
-parameters; the bare gradient has its batch given. A batch of statistics is what the estimate of the
-batch normalisations takes for each of its batches, once an epoch. Claims: the whole step costs at
-most 10 % more than the bare gradient, it is no slower than PyTorch, and a batch of statistics costs
-less than half a step. They are timed in turn, round after round, so that a busy machine slows them
-alike; compile time is apart. The best round counts (noise only ever adds), medians are printed
-beside it.
+The whole step gathers, rotates and augments its windows, runs forward and backward, and updates the
+parameters. The first comparison is the bare gradient of its loss on a fixed batch, the second
+PyTorch's gradient of TLIO's network. A "batch of statistics" is one batch of the pass that
+estimates the statistics of batch normalisation once an epoch.
+
+Claims: the whole step costs at most 10 % more than the bare gradient; it is no slower than PyTorch;
+a batch of statistics costs less than half a step. All are timed in turn, round after round, so that
+a busy machine slows them alike. Compile time is measured apart. The best round counts, since noise
+only ever adds; the median is printed beside it.
 """
 
 import argparse
@@ -33,25 +34,31 @@ from gnio_jax.training.step import (
 )
 
 STEPS = 4
-"""Steps per dispatch, as the training loop has them."""
+"""Steps per dispatch, as in the training loop."""
 
 
 def recordings(samples: int, batch: int) -> WindowSource:
-    """Random numbers in the shape of ten minutes of recording; speed does not depend on what they
-    say."""
+    """Random numbers in the shape of ten minutes of recording. Speed does not depend on them."""
     rng = np.random.default_rng(0)
-    count = max(6000, STEPS * batch)
-    rows = count * samples // 10 + samples
-    return jax.device_put(WindowSource(
-        imu=rng.standard_normal((rows, 6), np.float32), start=(np.arange(count) * (samples // 10)).astype(np.int32),
-        rotation=np.tile(np.eye(3, dtype=np.float32), (count, 1, 1)), displacement=rng.standard_normal((count, 3), np.float32),
-        step=np.zeros((rows, 3), np.float32), unyaw=np.tile(np.float32([1, 0]), (count, 1)), visited=np.arange(count, dtype=np.int32),
-    ))  # fmt: skip
+    count, stride = max(6000, STEPS * batch), samples // 10
+    rows = count * stride + samples
+    source = WindowSource(
+        imu=rng.standard_normal((rows, 6), np.float32),
+        start=(np.arange(count) * stride).astype(np.int32),
+        rotation=np.tile(np.eye(3, dtype=np.float32), (count, 1, 1)),
+        displacement=rng.standard_normal((count, 3), np.float32),
+        step=np.zeros((rows, 3), np.float32),
+        unyaw=np.tile(np.float32([1, 0]), (count, 1)),
+        visited=np.arange(count, dtype=np.int32),
+    )
+    return jax.device_put(source)
 
 
 def ours(config: TrainConfig):
-    """Two functions that run one step's work and wait for it: the whole step (amortised over STEPS)
-    and the bare gradient."""
+    """Functions that run the work, wait for it and return how many steps or batches it was.
+
+    The whole step runs STEPS steps in one dispatch, as the training loop does.
+    """
     size, samples = config.optim.batch_size, config.data.window
     source, model = recordings(samples, size), create_model(config)
     optimizer = optimizers.create(config.optim, config.loss, 1000)
@@ -60,8 +67,19 @@ def ours(config: TrainConfig):
     fixed = jax.jit(gather, static_argnums=2)(source, order[:size], samples)
 
     def whole():
-        holder[0], progress = train_steps(holder[0], source, order, jnp.int32(0), jnp.int32(STEPS), jnp.float32(1), key,
-                                          model=model, optimizer=optimizer, config=config)  # fmt: skip
+        first, count, factor = jnp.int32(0), jnp.int32(STEPS), jnp.float32(1)
+        holder[0], progress = train_steps(
+            holder[0],
+            source,
+            order,
+            first,
+            count,
+            factor,
+            key,
+            model=model,
+            optimizer=optimizer,
+            config=config,
+        )
         jax.block_until_ready(progress)
         return STEPS
 
@@ -90,8 +108,7 @@ def ours(config: TrainConfig):
 
 
 def theirs(samples: int, size: int):
-    """The gradient of TLIO's network in PyTorch on a fixed batch, or nothing where torch is not
-    installed."""
+    """The gradient of TLIO's network in PyTorch on a fixed batch; empty without torch."""
     try:
         import torch
 
@@ -99,11 +116,8 @@ def theirs(samples: int, size: int):
     except ImportError:
         return {}
     torch.manual_seed(0)
-    network, windows, target = (
-        TlioNetwork(samples),
-        torch.randn(size, 6, samples),
-        torch.randn(size, 3),
-    )
+    network = TlioNetwork(samples)
+    windows, target = torch.randn(size, 6, samples), torch.randn(size, 3)
 
     def gradient():
         network.zero_grad(set_to_none=True)
@@ -112,6 +126,41 @@ def theirs(samples: int, size: int):
         return 1
 
     return {"PyTorch, TLIO": gradient}
+
+
+def measure(programs: dict, size: int, repeats: int) -> dict[str, list[float]]:
+    """Seconds per step of each program and round; prints what it measures."""
+    for name, program in programs.items():
+        began = time.perf_counter()
+        program()
+        first = time.perf_counter() - began
+        print(f"  batch {size}: {name:19s} first call {first:6.1f} s (compiled)", flush=True)
+    times: dict[str, list[float]] = {name: [] for name in programs}
+    for _ in range(repeats):
+        for name, program in programs.items():
+            began = time.perf_counter()
+            steps = program()
+            times[name].append((time.perf_counter() - began) / steps)
+    for name, seconds in times.items():
+        best, median = min(seconds), float(np.median(seconds))
+        print(
+            f"  batch {size}: {name:19s} {1e3 * best:8.1f} ms (median {1e3 * median:8.1f})"
+            f"   {size / best:8,.0f} windows/s"
+        )
+    return times
+
+
+def ratios(times: dict[str, list[float]], size: int) -> dict[str, float]:
+    """The figures of a batch size by their names in the baseline."""
+    best = {name: min(seconds) for name, seconds in times.items()}
+    whole = best["whole step"]
+    figures = {
+        f"batch of statistics / whole step, batch {size}": best["batch of statistics"] / whole,
+        f"whole step / bare gradient, batch {size}": whole / best["bare gradient"],
+    }
+    if "PyTorch, TLIO" in best:
+        figures[f"PyTorch / whole step, batch {size}"] = best["PyTorch, TLIO"] / whole
+    return figures
 
 
 def main() -> None:
@@ -123,43 +172,21 @@ def main() -> None:
     parser.add_argument("--batches", type=int, nargs="+", default=[128, 1024])
     parser.add_argument("--repeats", type=int, default=5)
     arguments = parser.parse_args()
+    width, samples = arguments.width, arguments.samples
     print(
-        f"{jax.devices()[0].device_kind}, jax {jax.__version__}, width {arguments.width}, windows of {arguments.samples} samples"
+        f"{jax.devices()[0].device_kind}, jax {jax.__version__}, "
+        f"width {width}, windows of {samples} samples"
     )
     figures: dict[str, float] = {}
     for size in arguments.batches:
-        config = TrainConfig(data=DataConfig(rate=float(arguments.samples)), model=ModelConfig(width=arguments.width),
-                             optim=OptimConfig(batch_size=size))  # fmt: skip
-        programs = ours(config) | (theirs(arguments.samples, size) if arguments.width == 64 else {})
-        times: dict[str, list[float]] = {name: [] for name in programs}
-        for name, program in programs.items():
-            began = time.perf_counter()
-            program()
-            print(
-                f"  batch {size}: {name:19s} first call {time.perf_counter() - began:6.1f} s (compiled)",
-                flush=True,
-            )
-        for _ in range(arguments.repeats):
-            for name, program in programs.items():
-                began = time.perf_counter()
-                steps = program()
-                times[name].append((time.perf_counter() - began) / steps)
-        for name, seconds in times.items():
-            best, median = min(seconds), float(np.median(seconds))
-            print(
-                f"  batch {size}: {name:19s} {1e3 * best:8.1f} ms (median {1e3 * median:8.1f})   {size / best:8,.0f} windows/s"
-            )
-        figures[f"batch of statistics / whole step, batch {size}"] = min(
-            times["batch of statistics"]
-        ) / min(times["whole step"])
-        figures[f"whole step / bare gradient, batch {size}"] = min(times["whole step"]) / min(
-            times["bare gradient"]
+        config = TrainConfig(
+            data=DataConfig(rate=float(samples)),
+            model=ModelConfig(width=width),
+            optim=OptimConfig(batch_size=size),
         )
-        if "PyTorch, TLIO" in times:
-            figures[f"PyTorch / whole step, batch {size}"] = min(times["PyTorch, TLIO"]) / min(
-                times["whole step"]
-            )
-    if (arguments.width, arguments.samples) == (64, 200):
+        programs = ours(config) | (theirs(samples, size) if width == 64 else {})
+        figures |= ratios(measure(programs, size, arguments.repeats), size)
+    if (width, samples) == (64, 200):
         baseline.compare("train_step", figures)
 
 

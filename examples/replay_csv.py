@@ -1,11 +1,14 @@
-"""Replay a recording through the online filter: python examples/replay_csv.py --workdir runs/mine
---csv walk.csv."""
+"""Replay a recording through the online filter.
+
+python examples/replay_csv.py --workdir runs/mine --csv walk.csv
+"""
 
 import gc
 import os
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
 
@@ -16,17 +19,20 @@ from gnio_jax import config as configuration
 from gnio_jax.commands import console as cli
 from gnio_jax.types import InputError
 
-DESCRIPTION = """Feed a recording to gnio_jax.filtering.Tracker sample by sample, as an app on a phone would.
+DESCRIPTION = """Feed a recording to gnio_jax.filtering.Tracker sample by sample, like an app on a
+phone.
 
   python examples/replay_csv.py --csv walk.csv                       (the newest run below runs/)
   python examples/replay_csv.py --workdir runs/mine --csv walk.csv --out walk.txt
   python examples/replay_csv.py --workdir runs/mine --csv walk.h5 --realtime
 
-The CSV has a header with time (s), gyro_x..z (rad/s) and accel_x..z (m/s2, +9.81 upwards at rest); .h5 is the package's own
-format. python -m gnio_jax.data import brings a phone logger's file into either. The stamps may be irregular; empty cells are
-missing samples. The device should lie or be held still for the first second, from which the tilt is taken.
+The CSV has a header with time (s), gyro_x..z (rad/s) and accel_x..z (m/s2, +9.81 upwards at rest).
+A file named .h5 is read as the package's own format. `gnio data import` converts the file of a
+phone's logger into either. The stamps may be irregular; empty cells are missing samples. Keep the
+device still for the first second: the tilt is taken from it.
 
-Left behind are the trajectory in TUM format, a pose every clone step, and beside it its picture (.png)."""
+The results are the trajectory in TUM format, one pose for each clone step, and a picture of it
+(.png) beside it."""
 
 
 @dataclass(frozen=True)
@@ -34,175 +40,216 @@ class Replay:
     csv: str
     """The recording: a CSV, or the package's HDF5 (.h5)."""
     workdir: str | None = None
-    """Folder of the run whose network is used; without it the newest below runs/."""
+    """Folder of the run whose network is used. Default: the newest below runs/."""
     out: str | None = None
-    """Where the trajectory goes; without it <recording>_trajectory.txt in the present folder."""
+    """File of the trajectory. Default: <recording>_trajectory.txt in the current folder."""
     realtime: bool = False
-    """Wait for each sample's time, as if the recording happened now."""
+    """Push each sample at its own time, as if the recording happened now."""
     rest_seconds: float = 1.0
     """How long the device is still at the start, s."""
 
 
-def read(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Stamps (n,), gyro (n, 3) and accel (n, 3) as they were recorded, not yet resampled."""
+class Recorded(NamedTuple):
+    """Samples as they were recorded, not resampled. A missing sample is NaN."""
+
+    time: np.ndarray
+    """(n,) s"""
+    gyro: np.ndarray
+    """(n, 3) rad/s"""
+    accel: np.ndarray
+    """(n, 3) m/s²"""
+
+    @property
+    def interval(self) -> float:
+        """Median time between two samples, s."""
+        return float(np.median(np.diff(self.time)))
+
+
+@dataclass
+class Replayed:
+    """Poses of a replay, and how long each push took in s."""
+
+    poses: list = field(default_factory=list)
+    clone_steps: list[float] = field(default_factory=list)
+    other_samples: list[float] = field(default_factory=list)
+
+
+def read(path: Path) -> Recorded:
+    """Read a CSV or HDF5. Raises `InputError` if a stamp is missing or does not increase."""
     from gnio_jax.data.hdf5 import read_hdf5
     from gnio_jax.data.readers.text import numbers, read_csv
     from gnio_jax.data.validation import check_increasing
 
     if path.suffix.lower() in (".h5", ".hdf5"):
         sequence = read_hdf5(path)
-        return sequence.time, sequence.gyro, sequence.accel
+        return Recorded(sequence.time, sequence.gyro, sequence.accel)
     table = read_csv(path)
     stamps = numbers(table, ["time"], path)[:, 0]
-    if not np.isfinite(stamps).all():
-        raise InputError(
-            path,
-            f"field 'time' is empty in row {int(np.argmin(np.isfinite(stamps))) + 1}",
-            "every sample needs a time",
-        )
+    present = np.isfinite(stamps)
+    if not present.all():
+        row = int(np.argmin(present)) + 1
+        raise InputError(path, f"field 'time' is empty in row {row}", "every sample needs a time")
     check_increasing(stamps, path)
-    gyro, accel = (
-        numbers(table, [f"{sensor}_{axis}" for axis in "xyz"], path) for sensor in ("gyro", "accel")
-    )
-    return stamps, gyro, accel
+    gyro = numbers(table, [f"gyro_{axis}" for axis in "xyz"], path)
+    accel = numbers(table, [f"accel_{axis}" for axis in "xyz"], path)
+    return Recorded(stamps, gyro, accel)
 
 
-def main() -> None:
-    jax.config.update(
-        "jax_enable_x64", True
-    )  # the filter needs float64; the network states its float32 everywhere
-    options = cli.parse(Replay, description=DESCRIPTION)
-    path = Path(options.csv)
-    stamps, gyro, accel = read(path)
-
+def create_tracker(run, recorded: Recorded, rest_seconds: float):
+    """The compiled tracker of a trained run, which starts from rest."""
     from gnio_jax import models
-    from gnio_jax.evaluation import odometry, plots
-    from gnio_jax.evaluation.metrics import Trajectory
-    from gnio_jax.evaluation.report import write_tum
-    from gnio_jax.files import replacing
+    from gnio_jax.evaluation import odometry
     from gnio_jax.filtering import InitialStd, NoiseModel, Tracker
-    from gnio_jax.training import checkpoint
 
-    run = checkpoint.load_run(
-        Path(options.workdir) if options.workdir else configuration.newest_run()
-    )
-    chosen = run.config.filter
-    config = odometry.filter_config(run.config.data, chosen)
+    options = run.config.filter
+    config = odometry.filter_config(run.config.data, options)
     noise = NoiseModel(
-        chosen.gyro_density, chosen.accel_density, chosen.gyro_bias_walk, chosen.accel_bias_walk
+        options.gyro_density, options.accel_density, options.gyro_bias_walk, options.accel_bias_walk
     )
     std = InitialStd(
-        np.radians(chosen.tilt_std_degrees),
-        np.radians(chosen.yaw_std_degrees),
-        chosen.velocity_std,
-        chosen.position_std,
-        chosen.gyro_bias_std,
-        chosen.accel_bias_std,
+        np.radians(options.tilt_std_degrees),
+        np.radians(options.yaw_std_degrees),
+        options.velocity_std,
+        options.position_std,
+        options.gyro_bias_std,
+        options.accel_bias_std,
     )
-    if len(stamps) < 2:
-        raise InputError(path, "holds a single sample", "record a walk of some seconds")
-    interval = float(np.median(np.diff(stamps)))
-    hole = 1.5 * max(config.dt, interval)
-
-    frozen = models.freeze(
-        run.model, run.variables
-    )  # what depends on the weights alone is computed once
+    # What depends on the weights alone is computed once.
+    frozen = models.freeze(run.model, run.variables)
 
     def predict(windows):
         return models.Inference(run.model)(frozen, windows)
 
-    with cli.progress() as progress:
-        progress("compiling", 0.0)
-        begin = time.perf_counter()
-        try:
-            tracker = Tracker.from_rest(
-                predict, config, noise, options.rest_seconds, std, hole, imu_rate=1 / interval
-            )
-        except ValueError as error:
-            raise InputError("--rest-seconds", str(error)) from None
-        compiled = time.perf_counter() - begin
-        poses, of_step, of_push = [], [], []
-        gc.collect()
-        gc.freeze()  # the collector need not look at what is there already
-        begin = time.perf_counter()
-        for k, stamp in enumerate(stamps):
-            if options.realtime:
-                time.sleep(max(0.0, stamp - stamps[0] - (time.perf_counter() - begin)))
-            before = time.perf_counter()
-            try:
-                pose = tracker.push(stamp, gyro[k], accel[k])
-            except ValueError as error:
-                raise InputError(f"{path} row {k + 1}", str(error)) from None
-            (of_push if pose is None else of_step).append(time.perf_counter() - before)
-            if pose is not None:
-                poses.append(pose)
-            if k % 100 == 0:
-                progress(f"replaying {stamp - stamps[0]:.0f} s", (k + 1) / len(stamps))
-    if not poses:
-        raise InputError(
-            path,
-            f"ends before the device was still for {options.rest_seconds:g} s without a missing sample",
-            "record longer, or give a smaller --rest-seconds",
+    longest_gap = 1.5 * max(config.dt, recorded.interval)
+    imu_rate = 1 / recorded.interval
+    try:
+        return Tracker.from_rest(
+            predict, config, noise, rest_seconds, std, longest_gap, imu_rate=imu_rate
         )
+    except ValueError as error:
+        raise InputError("--rest-seconds", str(error)) from None
 
-    estimated = Trajectory(
-        *(
-            np.array(column)
-            for column in zip(
-                *[(pose.time, pose.position, quaternion(pose.rotation)) for pose in poses],
-                strict=True,
-            )
-        )
+
+def replay(tracker, recorded: Recorded, path: Path, realtime: bool, progress) -> Replayed:
+    """Push every sample and time each push."""
+    replayed, start = Replayed(), recorded.time[0]
+    gc.collect()
+    gc.freeze()  # existing objects need no further look by the collector
+    begin = time.perf_counter()
+    for k, stamp in enumerate(recorded.time):
+        if realtime:
+            time.sleep(max(0.0, stamp - start - (time.perf_counter() - begin)))
+        before = time.perf_counter()
+        try:
+            pose = tracker.push(stamp, recorded.gyro[k], recorded.accel[k])
+        except ValueError as error:
+            raise InputError(f"{path} row {k + 1}", str(error)) from None
+        seconds = time.perf_counter() - before
+        if pose is None:
+            replayed.other_samples.append(seconds)
+        else:
+            replayed.clone_steps.append(seconds)
+            replayed.poses.append(pose)
+        if k % 100 == 0:
+            progress(f"replaying {stamp - start:.0f} s", (k + 1) / len(recorded.time))
+    return replayed
+
+
+def write_trajectory(out: Path, name: str, poses: list) -> np.ndarray:
+    """Write the TUM file and the picture; returns the positions (poses, 3)."""
+    from gnio_jax.evaluation import odometry, plots
+    from gnio_jax.evaluation.metrics import Trajectory
+    from gnio_jax.evaluation.report import write_tum
+    from gnio_jax.files import replacing
+
+    position = np.array([pose.position for pose in poses])
+    orientation = np.array([quaternion(pose.rotation) for pose in poses])
+    estimated = Trajectory(np.array([pose.time for pose in poses]), position, orientation)
+    no_reference = Trajectory(
+        estimated.time, np.full_like(position, np.nan), np.full_like(orientation, np.nan)
     )
-    out = Path(options.out or f"{path.stem}_trajectory.txt")
     with replacing(out) as temporary:
         write_tum(temporary, estimated)
-    unknown = Trajectory(
-        estimated.time,
-        np.full_like(estimated.position, np.nan),
-        np.full_like(estimated.orientation, np.nan),
-    )
-    picture = out.with_suffix(".png")
-    with replacing(picture) as temporary:
-        plots.save(
-            temporary,
-            plots.trajectory(odometry.Estimate(path.stem, estimated, unknown), alignment="none"),
-        )
-
-    length = float(np.linalg.norm(np.diff(estimated.position, axis=0), axis=1).sum())
-    rejected = sum(pose.accepted == 0 for pose in poses)
-    worked = sum(of_step) + sum(of_push)
-    lasted = stamps[-1] - stamps[0]
-    print(
-        f"{lasted:.1f} s, {len(poses)} poses, {length:.1f} m walked, {rejected} measurements rejected"
-        + ("" if poses[-1].healthy else "; the filter DIVERGED")
-    )
-    print(
-        f"real-time factor {lasted / worked:.1f} (computing took {worked:.2f} s), compiled in {compiled:.1f} s"
-    )
-    for what, seconds in (("clone step", of_step), ("other sample", of_push)):
-        if seconds:
-            p50, p99, most = 1e3 * np.percentile(seconds, [50, 99, 100])
-            print(
-                f"latency of a push with a {what}: p50 {p50:.3f} ms, p99 {p99:.3f} ms, max {most:.3f} ms"
-            )
-    if tracker.delay:
-        print(
-            f"low-pass from {1 / interval:.4g} Hz to {1 / config.dt:.4g} Hz: "
-            f"poses come {1e3 * tracker.delay:.0f} ms later"
-        )
-    print(f"trajectory: {out}\npicture: {picture}")
+    estimate = odometry.Estimate(name, estimated, no_reference)
+    with replacing(out.with_suffix(".png")) as temporary:
+        plots.save(temporary, plots.trajectory(estimate, alignment="none"))
+    return position
 
 
 def quaternion(rotation: np.ndarray) -> np.ndarray:
-    """wxyz of a rotation matrix; NaN of one that is not finite."""
+    """wxyz of a rotation matrix; NaN if the matrix is not finite."""
     from scipy.spatial.transform import Rotation
 
-    return (
-        Rotation.from_matrix(rotation).as_quat(scalar_first=True)
-        if np.isfinite(rotation).all()
-        else np.full(4, np.nan)
+    if not np.isfinite(rotation).all():
+        return np.full(4, np.nan)
+    return Rotation.from_matrix(rotation).as_quat(scalar_first=True)
+
+
+def summarise(
+    replayed: Replayed, recorded: Recorded, position: np.ndarray, compiled: float
+) -> None:
+    """Print the length of the walk, the speed and the latencies."""
+    poses = replayed.poses
+    length = float(np.linalg.norm(np.diff(position, axis=0), axis=1).sum())
+    rejected = sum(pose.accepted == 0 for pose in poses)
+    worked = sum(replayed.clone_steps) + sum(replayed.other_samples)
+    lasted = recorded.time[-1] - recorded.time[0]
+    verdict = "" if poses[-1].healthy else "; the filter DIVERGED"
+    print(
+        f"{lasted:.1f} s, {len(poses)} poses, {length:.1f} m walked, "
+        f"{rejected} measurements rejected{verdict}"
     )
+    print(
+        f"real-time factor {lasted / worked:.1f} (computing took {worked:.2f} s), "
+        f"compiled in {compiled:.1f} s"
+    )
+    kinds = {"clone step": replayed.clone_steps, "other sample": replayed.other_samples}
+    for kind, seconds in kinds.items():
+        if seconds:
+            p50, p99, most = 1e3 * np.percentile(seconds, [50, 99, 100])
+            print(
+                f"latency of a push with a {kind}: "
+                f"p50 {p50:.3f} ms, p99 {p99:.3f} ms, max {most:.3f} ms"
+            )
+
+
+def main() -> None:
+    # The filter needs float64. The network states its float32 everywhere.
+    jax.config.update("jax_enable_x64", True)
+    options = cli.parse(Replay, description=DESCRIPTION)
+    path = Path(options.csv)
+    recorded = read(path)
+
+    from gnio_jax.training import checkpoint
+
+    workdir = Path(options.workdir) if options.workdir else configuration.newest_run()
+    run = checkpoint.load_run(workdir)
+    if len(recorded.time) < 2:
+        raise InputError(path, "holds a single sample", "record a walk of some seconds")
+    with cli.progress() as progress:
+        progress("compiling", 0.0)
+        begin = time.perf_counter()
+        tracker = create_tracker(run, recorded, options.rest_seconds)
+        compiled = time.perf_counter() - begin
+        replayed = replay(tracker, recorded, path, options.realtime, progress)
+    if not replayed.poses:
+        raise InputError(
+            path,
+            f"ends before the device was still for {options.rest_seconds:g} s "
+            "without a missing sample",
+            "record longer, or give a smaller --rest-seconds",
+        )
+
+    out = Path(options.out or f"{path.stem}_trajectory.txt")
+    position = write_trajectory(out, path.stem, replayed.poses)
+    summarise(replayed, recorded, position, compiled)
+    if tracker.delay:
+        rate = run.config.data.rate
+        print(
+            f"low-pass from {1 / recorded.interval:.4g} Hz to {rate:.4g} Hz: "
+            f"poses come {1e3 * tracker.delay:.0f} ms later"
+        )
+    print(f"trajectory: {out}\npicture: {out.with_suffix('.png')}")
 
 
 if __name__ == "__main__":

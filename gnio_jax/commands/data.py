@@ -25,10 +25,10 @@ from gnio_jax.commands import console as cli
 from gnio_jax.data import registry
 from gnio_jax.data.dataset import Dataset, Recording
 from gnio_jax.data.hdf5 import read_hdf5, write_hdf5
-from gnio_jax.data.processes import map_in_processes, suggested_workers
-from gnio_jax.data.reading import check_recording, find_recordings
 from gnio_jax.data.plausibility import SelfCheck
+from gnio_jax.data.processes import map_in_processes, suggested_workers
 from gnio_jax.data.readers import csv_files as csv
+from gnio_jax.data.reading import check_recording, find_recordings
 from gnio_jax.data.resampling import resample
 from gnio_jax.files import replacing
 from gnio_jax.types import InputError

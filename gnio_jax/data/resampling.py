@@ -10,8 +10,8 @@ from scipy.interpolate import CubicSpline
 from scipy.signal import fftconvolve
 from scipy.spatial.transform import Rotation
 
-from gnio_jax.data.sequence import quaternions, rotations
 from gnio_jax.decimation import decimation_factor, low_pass
+from gnio_jax.numerics import quaternions, rotations
 from gnio_jax.types import Sequence
 
 LONGEST_BRIDGE = 0.1

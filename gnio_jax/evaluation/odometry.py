@@ -24,7 +24,6 @@ from scipy.spatial.transform import Rotation
 
 from gnio_jax import data
 from gnio_jax.config import DataConfig, FilterOptions
-from gnio_jax.data.sequence import cumulative_rotation
 from gnio_jax.data.windows import WindowSource, gather
 from gnio_jax.evaluation.metrics import Trajectory, finite_rows, rotation_z
 from gnio_jax.filtering import (
@@ -38,6 +37,7 @@ from gnio_jax.filtering import (
     run_filter,
     run_odometry,
 )
+from gnio_jax.numerics import cumulative_rotation
 from gnio_jax.types import Array, InputError, Prediction, Sequence
 
 Estimator = Literal["ekf", "integrate", "imu_only"]
@@ -369,7 +369,7 @@ def attitude(
     turned = cumulative_rotation(
         Rotation.from_rotvec((sequence.gyro[:-1] - recording.gyro_bias) / config.rate)
     ).as_matrix()
-    integrated = recording.rotation @ np.concatenate([np.eye(3)[None], turned])
+    integrated = recording.rotation @ turned
     if source == "filter":
         return integrated
     given = sequence.orientation if source == "reference" else sequence.device_orientation

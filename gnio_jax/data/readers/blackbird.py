@@ -26,7 +26,6 @@ from scipy.spatial.transform import Rotation
 from gnio_jax.data.dataset import Dataset, Recording, single
 from gnio_jax.data.readers.text import listed, numbers, read_csv, shortened
 from gnio_jax.data.resampling import resample
-from gnio_jax.data.sequence import quaternions, rotations
 from gnio_jax.data.validation import (
     FASTEST,
     check_finite,
@@ -37,6 +36,7 @@ from gnio_jax.data.validation import (
     check_unit_norm,
     validate,
 )
+from gnio_jax.numerics import quaternions, rotations
 from gnio_jax.types import InputError, Sequence
 
 RATE = 100.0

@@ -40,13 +40,13 @@ from jaxtyping import Float
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline, Slerp
 
-from gnio_jax.data.alignment import follow, integrate_gyro, smooth_positions
+from gnio_jax.data.alignment import fuse_attitude, smooth_positions
 from gnio_jax.data.dataset import Dataset, Recording, single
 from gnio_jax.data.readers.csv_files import in_order
 from gnio_jax.data.readers.text import numbers, read_csv, shortened
 from gnio_jax.data.resampling import resample
-from gnio_jax.data.sequence import quaternions, rotations
 from gnio_jax.data.validation import check_finite, check_gaps, check_rate, check_unit_norm, validate
+from gnio_jax.numerics import integrate_gyro, quaternions, rotations
 from gnio_jax.types import InputError, Sequence
 
 RATE = 200.0
@@ -443,7 +443,9 @@ def _fuse(
         if both.any()
         else np.zeros(3)
     )
-    fused, believed_turn = follow(integrate_gyro(clocked.gyro - bias, step), turned, measured, step)
+    fused, believed_turn = fuse_attitude(
+        integrate_gyro(clocked.gyro - bias, step), turned, measured, step
+    )
     smooth, speed, believed_place = smooth_positions(
         _splined(at, seen, position, straight, usual), measured, step
     )

@@ -37,7 +37,6 @@ from gnio_jax.data.gaps import divide_at_gaps
 from gnio_jax.data.readers.phones import held_out, poses_at, with_velocity
 from gnio_jax.data.readers.text import numbers, shortened
 from gnio_jax.data.resampling import LONGEST_BRIDGE, resample
-from gnio_jax.data.sequence import quaternions, rotations
 from gnio_jax.data.validation import (
     WINDOW_SECONDS,
     check_finite,
@@ -45,6 +44,7 @@ from gnio_jax.data.validation import (
     check_unit_norm,
     validate,
 )
+from gnio_jax.numerics import quaternions, rotations
 from gnio_jax.types import STANDARD_G, InputError, Sequence
 
 RATE = 100.0

@@ -42,11 +42,9 @@ from scipy.ndimage import binary_dilation
 from scipy.spatial.transform import Rotation
 
 from gnio_jax.data.dataset import Dataset, Recording, single
-from gnio_jax.data.gaps import stretches
 from gnio_jax.data.readers.csv_files import in_order
 from gnio_jax.data.readers.text import shortened
 from gnio_jax.data.resampling import resample
-from gnio_jax.data.sequence import quaternions
 from gnio_jax.data.validation import (
     FASTEST,
     FASTEST_TURN,
@@ -57,6 +55,7 @@ from gnio_jax.data.validation import (
     check_rate,
     validate,
 )
+from gnio_jax.numerics import quaternions, stretches
 from gnio_jax.types import InputError, Sequence
 
 RATE = 100.0
@@ -229,7 +228,7 @@ def read_packets(oxts: str | os.PathLike[str]) -> list[Sequence]:
     attitude = Rotation.from_euler("ZYX", np.stack([yaw, pitch, roll], axis=1))
     name = _drive_of(oxts)
     sequences, short = [], 0
-    for piece, inside in enumerate(stretches(time, LONGEST_BRIDGE)):
+    for piece, inside in enumerate(stretches(np.diff(time) > LONGEST_BRIDGE)):
         if time[inside][-1] - time[inside][0] < SHORTEST_PIECE:
             short += 1
             continue

@@ -55,15 +55,14 @@ from gnio_jax.data.alignment import (
     Track,
     align,
     align_heading,
-    follow,
-    follow_acceleration,
-    integrate_gyro,
+    attitude_from_acceleration,
+    fuse_attitude,
     smooth_positions,
 )
 from gnio_jax.data.dataset import Dataset, Recording, Refusal, single
 from gnio_jax.data.readers.text import shortened
-from gnio_jax.data.sequence import quaternions
 from gnio_jax.data.validation import check_units, validate
+from gnio_jax.numerics import integrate_gyro, quaternions
 from gnio_jax.types import STANDARD_G, InputError, Sequence
 
 RATE = 100.0
@@ -549,10 +548,10 @@ def build(walk: Walk, kind: str) -> Sequence:
     right = np.clip(np.searchsorted(track.time, inside), 1, len(track.time) - 1)
     seen = good[right] & good[right - 1]
 
-    level = fit.leveling()
+    level = fit.levelling()
     pose = level * Slerp(track.time, track.attitude)(inside) * fit.extrinsic
     integrated = integrate_gyro(gyro - fit.gyro_bias, 1.0 / RATE)
-    orientation, believed = follow(integrated, pose, seen, 1.0 / RATE)
+    orientation, believed = fuse_attitude(integrated, pose, seen, 1.0 / RATE)
     lever = fit.extrinsic.inv().apply(fit.lever)
     marker = level.apply(
         np.stack([np.interp(inside, track.time, column) for column in track.position.T], axis=1)
@@ -808,7 +807,7 @@ def _with_tango(walk: Walk, kind: str, imu: Imu, path: Path) -> Sequence:
     bias = (
         0.5 * (gyro[1:] + gyro[:-1]) - (device[:-1].inv() * device[1:]).as_rotvec() * RATE
     ).mean(axis=0)
-    orientation = follow_acceleration(
+    orientation = attitude_from_acceleration(
         integrate_gyro(gyro - bias, 1.0 / RATE), turned, accel, position, kept, 1.0 / RATE
     )
     attributes = _attributes(walk, kind, "tango") | {

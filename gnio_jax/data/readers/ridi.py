@@ -33,7 +33,6 @@ from gnio_jax.data.gaps import divide_at_gaps
 from gnio_jax.data.readers.phones import find_folders, find_list, held_out, poses_at, with_velocity
 from gnio_jax.data.readers.text import listed, numbers, read_csv
 from gnio_jax.data.resampling import LONGEST_BRIDGE, resample
-from gnio_jax.data.sequence import quaternions, rotations
 from gnio_jax.data.validation import (
     WINDOW_SECONDS,
     check_finite,
@@ -42,6 +41,7 @@ from gnio_jax.data.validation import (
     check_unit_norm,
     validate,
 )
+from gnio_jax.numerics import quaternions, rotations
 from gnio_jax.types import InputError, Sequence
 
 RATE = 200.0

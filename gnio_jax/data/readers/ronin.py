@@ -30,7 +30,6 @@ from gnio_jax.data.dataset import Dataset, Recording, single
 from gnio_jax.data.readers.phones import find_folders, find_list, with_velocity
 from gnio_jax.data.readers.text import listed, shortened
 from gnio_jax.data.resampling import resample
-from gnio_jax.data.sequence import cumulative_rotation, quaternions, rotations
 from gnio_jax.data.validation import (
     check_finite,
     check_gaps,
@@ -39,6 +38,7 @@ from gnio_jax.data.validation import (
     check_unit_norm,
     validate,
 )
+from gnio_jax.numerics import integrate_gyro, quaternions, rotations
 from gnio_jax.types import InputError, Sequence
 
 RATE = 200.0
@@ -122,10 +122,7 @@ def read_sequence(folder: str | os.PathLike[str], choose: bool = False) -> Seque
     if source == "ekf":
         followed = _unit(fields["pose/ekf_ori"], "pose/ekf_ori", path)
     elif source == "gyro_integration":
-        turns = Rotation.from_rotvec(0.5 * (gyro[:-1] + gyro[1:]) * np.diff(time)[:, None])
-        followed = game[0] * cumulative_rotation(
-            Rotation.concatenate([Rotation.identity(1), turns])
-        )
+        followed = game[0] * integrate_gyro(gyro, np.diff(time))
     else:
         followed = game
     chest = _unit(fields["pose/tango_ori"][:1], "pose/tango_ori", path)

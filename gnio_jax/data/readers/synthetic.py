@@ -25,7 +25,7 @@ from scipy.signal import fftconvolve
 from scipy.spatial.transform import Rotation
 
 from gnio_jax.data.dataset import Dataset, Recording, single
-from gnio_jax.data.sequence import quaternions
+from gnio_jax.numerics import quaternions
 from gnio_jax.types import GRAVITY, Sequence
 
 

@@ -19,7 +19,6 @@ from jaxtyping import Float
 
 from gnio_jax.data.dataset import Dataset, Recording, single
 from gnio_jax.data.readers.text import listed, shortened
-from gnio_jax.data.sequence import rotations
 from gnio_jax.data.validation import (
     check_finite,
     check_gaps,
@@ -29,6 +28,7 @@ from gnio_jax.data.validation import (
     check_unit_norm,
     validate,
 )
+from gnio_jax.numerics import rotations
 from gnio_jax.types import InputError, Sequence
 
 RATE = 200.0

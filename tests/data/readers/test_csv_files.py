@@ -11,7 +11,7 @@ from gnio_jax import data
 from gnio_jax.data.hdf5 import write_hdf5
 from gnio_jax.data.plausibility import self_check
 from gnio_jax.data.readers import csv_files as csv
-from gnio_jax.data.sequence import rotations
+from gnio_jax.numerics import rotations
 from gnio_jax.types import InputError
 from tests.support import known_walk
 from tests.support.csv_writers import AXES, SECONDS, imu, write, write_native

@@ -13,13 +13,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from gnio_jax import data
+from gnio_jax import data, numerics
 from gnio_jax.data import alignment
 from gnio_jax.data.dataset import Refusal
 from gnio_jax.data.plausibility import self_check
-from gnio_jax.data.reading import read_recording
 from gnio_jax.data.readers import oxiod
-from gnio_jax.data.sequence import rotations
+from gnio_jax.data.reading import read_recording
+from gnio_jax.numerics import rotations
 from gnio_jax.types import InputError
 from tests.support import oxiod_files as files
 
@@ -551,7 +551,7 @@ def test_follow_ignores_flips_and_bridges_gaps():
     time = np.arange(n) * step
     truth = files.Truth()
     known = files.attitude(time, truth)
-    integrated = alignment.integrate_gyro(
+    integrated = numerics.integrate_gyro(
         files.rate(time, truth) + np.array([0.01, -0.005, 0.012]), step
     )
     measured = known * Rotation.from_rotvec(np.random.default_rng(0).normal(0, 0.002, (n, 3)))
@@ -562,7 +562,9 @@ def test_follow_ignores_flips_and_bridges_gaps():
     good = np.ones(n, dtype=bool)
     good[2000:2150] = False
     quaternion[2000:2150] = [0, 0, 0, 1]
-    found, believed = alignment.follow(integrated, Rotation.from_quat(quaternion), good, step)
+    found, believed = alignment.fuse_attitude(
+        integrated, Rotation.from_quat(quaternion), good, step
+    )
     assert np.degrees((found * known.inv()).magnitude()).max() < 0.5
     assert not believed[500:600].any() and believed[:490].all() and not believed[2000:2150].any()
 

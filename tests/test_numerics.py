@@ -1,0 +1,225 @@
+"""Host numerics against SciPy, closed forms and plain loops, singular cases included."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.ndimage import binary_dilation
+from scipy.spatial.transform import Rotation
+
+from gnio_jax import geometry, numerics
+
+
+def some(count, seed=0):
+    return Rotation.random(count, rng=np.random.default_rng(seed))
+
+
+# --- quaternions and matrices
+
+
+def test_the_scalar_comes_first():
+    half_turn = Rotation.from_rotvec([0.0, 0.0, np.pi / 2])
+    expected = np.array([np.cos(np.pi / 4), 0.0, 0.0, np.sin(np.pi / 4)])
+    np.testing.assert_allclose(numerics.quaternions(half_turn), expected, atol=1e-15)
+    np.testing.assert_allclose(
+        numerics.rotations(expected).as_matrix(), half_turn.as_matrix(), atol=1e-15
+    )
+    order = np.array([1.0, 2.0, 3.0, 4.0])  # w x y z
+    np.testing.assert_array_equal(numerics.xyzw_from_wxyz(order), [2.0, 3.0, 4.0, 1.0])
+    np.testing.assert_array_equal(numerics.wxyz_from_xyzw(numerics.xyzw_from_wxyz(order)), order)
+
+
+def test_product_and_conjugate_are_those_of_rotations():
+    first, second = some(20), some(20, 1)
+    left, right = numerics.quaternions(first), numerics.quaternions(second)
+    expected = (first * second).as_matrix()
+    product = numerics.quaternion_product(left, right)
+    np.testing.assert_allclose(numerics.matrix_from_quaternion(product), expected, atol=1e-14)
+    np.testing.assert_array_equal(
+        numerics.quaternion_product(left.T, right.T, axis=0), product.T
+    )  # the other layout
+    np.testing.assert_array_equal(
+        numerics.quaternion_product(left[0], right)[0], product[0]
+    )  # one on many
+    nothing = numerics.quaternion_product(numerics.quaternion_conjugate(left), left)
+    np.testing.assert_allclose(nothing, np.tile([1.0, 0.0, 0.0, 0.0], (20, 1)), atol=1e-15)
+
+
+def test_matrices_of_quaternions_and_back_keep_what_is_not_finite():
+    rotation = some(6)
+    wxyz = numerics.quaternions(rotation).reshape(2, 3, 4)
+    wxyz[1, 0, 2] = np.nan
+    matrices = numerics.matrix_from_quaternion(wxyz)
+    assert matrices.shape == (2, 3, 3, 3)
+    known = np.isfinite(wxyz).all(axis=-1)
+    np.testing.assert_allclose(
+        matrices[known], rotation[known.ravel()].as_matrix(), atol=1e-15, rtol=0
+    )
+    assert np.isnan(matrices[1, 0]).all()
+    again = numerics.quaternion_from_matrix(matrices)
+    sign = np.sign((again * wxyz).sum(axis=-1, keepdims=True))
+    np.testing.assert_allclose((again * sign)[known], wxyz[known], atol=1e-15)
+    assert np.isnan(again[1, 0]).all()
+    assert np.isnan(numerics.matrix_from_quaternion(np.full((2, 4), np.nan))).all()
+    np.testing.assert_allclose(
+        numerics.matrix_from_quaternion(np.array([2.0, 0.0, 0.0, 0.0])), np.eye(3)
+    )
+
+
+def test_hat_is_the_cross_product():
+    v, w = np.random.default_rng(0).standard_normal((2, 5, 3))
+    np.testing.assert_allclose((numerics.hat(v) @ w[..., None])[..., 0], np.cross(v, w))
+    np.testing.assert_array_equal(numerics.hat(v[0]), geometry.hat(jnp.asarray(v[0])))
+
+
+def test_yaw_is_the_azimuth_of_the_body_axis_and_that_of_geometry():
+    rotation = some(50)
+    along = rotation.apply([1.0, 0.0, 0.0])
+    expected = np.arctan2(along[:, 1], along[:, 0])
+    matrices = rotation.as_matrix()
+    np.testing.assert_allclose(numerics.yaw(matrices), expected, atol=1e-14)
+    np.testing.assert_allclose(
+        numerics.yaw_from_quaternion(numerics.quaternions(rotation)), expected, atol=1e-13
+    )
+    twins = np.stack([geometry.yaw_rotation(jnp.asarray(matrix)) for matrix in matrices])
+    np.testing.assert_allclose(numerics.yaw_rotation(matrices), twins, atol=1e-14)
+    vertical = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
+    assert numerics.yaw(vertical) == 0.0
+    np.testing.assert_array_equal(numerics.yaw_rotation(vertical), np.eye(3))
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 0.3, np.pi / 2, np.pi, -2.0, 7.0])
+def test_rotations_about_z(angle):
+    expected = Rotation.from_euler("z", angle).as_matrix()
+    np.testing.assert_allclose(numerics.rotation_z(angle), expected, atol=1e-15)
+    np.testing.assert_allclose(
+        numerics.about_z(np.array([angle, angle]))[1].as_matrix(), expected, atol=1e-15
+    )
+
+
+# --- stacks
+
+
+@pytest.mark.parametrize(
+    "up",
+    [[0.1, -0.2, 9.7], [0.0, 0.0, 3.0], [1e-9, 0.0, 1.0], [2.0, 0.0, 0.0], [0.3, 0.4, -1.0]],
+)
+def test_levelling_turns_up_onto_z_about_a_horizontal_axis_by_the_angle_between(up):
+    up = np.array(up)
+    turn = numerics.levelling(up)
+    length = np.linalg.norm(up)
+    np.testing.assert_allclose(turn.apply(up), [0.0, 0.0, length], atol=1e-14 * length)
+    assert turn.as_rotvec()[2] == 0.0
+    np.testing.assert_allclose(turn.magnitude(), np.arctan2(np.hypot(*up[:2]), up[2]), atol=1e-15)
+
+
+def test_levelling_of_a_direction_that_points_down_is_a_half_turn():
+    np.testing.assert_allclose(
+        numerics.levelling(np.array([0.0, 0.0, -2.0])).apply([0.0, 0.0, -2.0]),
+        [0.0, 0.0, 2.0],
+        atol=1e-15,
+    )
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 17, 64])
+def test_cumulative_rotation_is_the_running_product_from_the_identity(count):
+    turns = some(count)
+    expected = [np.eye(3)]
+    for turn in turns.as_matrix():
+        expected.append(expected[-1] @ turn)
+    found = numerics.cumulative_rotation(turns)
+    assert len(found) == count + 1
+    np.testing.assert_allclose(found.as_matrix(), expected, atol=1e-13)
+
+
+def test_integrate_gyro_returns_the_attitude_of_a_steady_turn_on_any_clock():
+    rate = np.array([0.3, -0.5, 0.9])
+    time = np.cumsum(np.random.default_rng(0).uniform(0.005, 0.02, 40))
+    expected = Rotation.from_rotvec((time - time[0])[:, None] * rate).as_matrix()
+    gyro = np.tile(rate, (40, 1))
+    found = numerics.integrate_gyro(gyro, np.diff(time))
+    np.testing.assert_allclose(found.as_matrix(), expected, atol=1e-13)
+    np.testing.assert_allclose(numerics.turns_between(found) / np.diff(time)[:, None], gyro[1:])
+    steady = numerics.integrate_gyro(gyro, 0.01)
+    np.testing.assert_allclose(steady[-1].as_rotvec(), 0.39 * rate, atol=1e-13)
+
+
+# --- series
+
+
+def test_interpolation_is_linear_per_column_and_holds_its_ends():
+    stamps = np.array([0.0, 1.0, 3.0])
+    values = np.array([[0.0, 10.0], [2.0, 20.0], [4.0, 0.0]])
+    found = numerics.interpolate(np.array([-1.0, 0.5, 1.0, 2.0, 9.0]), stamps, values)
+    np.testing.assert_array_equal(
+        found, [[0.0, 10.0], [1.0, 15.0], [2.0, 20.0], [3.0, 10.0], [4.0, 0.0]]
+    )
+    np.testing.assert_array_equal(numerics.midpoints(values), [[1.0, 15.0], [3.0, 10.0]])
+
+
+def test_slerp_turns_evenly_on_the_shorter_arc_and_holds_its_ends():
+    stamps = np.array([0.0, 1.0, 2.0])
+    attitude = Rotation.from_rotvec([[0, 0, 0.0], [0, 0, 1.0], [0, 0, 1.0 + 1.5 * np.pi]])
+    found = numerics.slerp(np.array([-3.0, 0.25, 1.5, 2.5]), stamps, attitude)
+    expected = [0.0, 0.25, 1.0 - 0.25 * np.pi, 1.0 - 0.5 * np.pi]
+    np.testing.assert_allclose(found.as_rotvec()[:, 2], expected, atol=1e-14)
+
+
+def test_neighbours_bracket_every_time():
+    stamps = np.array([0.0, 1.0, 2.0, 5.0])
+    left, right = numerics.neighbours(stamps, np.array([-1.0, 0.0, 0.5, 1.0, 4.0, 5.0, 9.0]))
+    np.testing.assert_array_equal(right, [1, 1, 1, 1, 3, 3, 3])
+    np.testing.assert_array_equal(left, right - 1)
+
+
+def test_robust_std_is_that_of_normal_noise_and_ignores_a_few_flips():
+    noise = 0.3 * np.random.default_rng(0).standard_normal((20000, 3))
+    noise[:100] = 50.0
+    assert numerics.robust_std(noise) == pytest.approx(0.3, rel=0.02)
+
+
+def test_finite_rows():
+    rows = np.array([[1.0, 2.0], [np.nan, 0.0], [0.0, np.inf]])
+    np.testing.assert_array_equal(numerics.finite_rows(rows), [True, False, False])
+
+
+# --- masks
+
+MASKS = [[], [0], [1], [0, 1, 1, 0, 1], [1, 1, 0, 0, 0, 1, 0], [0, 0, 0]]
+
+
+@pytest.mark.parametrize("mask", MASKS)
+def test_spans_are_the_runs_of_true(mask):
+    mask = np.array(mask, dtype=bool)
+    found = numerics.spans(mask)
+    assert found.shape[1:] == (2,)
+    again = np.zeros_like(mask)
+    for start, stop in found:
+        assert stop > start and mask[start:stop].all()
+        assert (start == 0 or not mask[start - 1]) and (stop == len(mask) or not mask[stop])
+        again[start:stop] = True
+    np.testing.assert_array_equal(again, mask)
+    rows = np.flatnonzero(mask)
+    outer = numerics.outer_span(mask)
+    expected = (rows[0], rows[-1] + 1) if rows.size else (0, 0)
+    assert (outer.start, outer.stop) == expected
+
+
+def test_stretches_are_the_rows_between_breaks():
+    broken = np.array([False, True, False, True])
+    assert numerics.stretches(broken) == [slice(0, 2), slice(2, 4), slice(4, 5)]
+    assert numerics.stretches(np.zeros(0, dtype=bool)) == [slice(0, 1)]
+
+
+@pytest.mark.parametrize("reach", [1, 2, 5])
+def test_within_is_dilation(reach):
+    mask = np.random.default_rng(0).uniform(size=100) < 0.05
+    mask[[0, -1]] = True, False
+    np.testing.assert_array_equal(
+        numerics.within(mask, reach), binary_dilation(mask, iterations=reach)
+    )
+    np.testing.assert_array_equal(numerics.within(mask, 0), mask)
+
+
+def test_last_true_holds_and_reaches_back_to_the_first():
+    mask = np.array([False, True, False, False, True, False])
+    np.testing.assert_array_equal(numerics.last_true(mask), [1, 1, 1, 1, 4, 4])
