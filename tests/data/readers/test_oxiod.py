@@ -543,7 +543,6 @@ def test_a_plain_script_starts_no_processes(copy, tmp_path):
 
 
 # --- parts
-# -----------------------------------------------------------------------------------------------------------
 
 
 def test_follow_ignores_flips_and_bridges_gaps():
@@ -586,7 +585,6 @@ def test_smooth_positions_keeps_a_gait_and_drops_jumps():
 
 
 # --- real recordings
-# -------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.recordings
