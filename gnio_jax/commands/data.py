@@ -22,7 +22,7 @@ from rich.console import Console
 from rich.table import Table
 
 from gnio_jax.commands import console as cli
-from gnio_jax.data import registry
+from gnio_jax.data import importing, registry
 from gnio_jax.data.dataset import Dataset, Recording
 from gnio_jax.data.hdf5 import read_hdf5, write_hdf5
 from gnio_jax.data.plausibility import SelfCheck
@@ -715,7 +715,7 @@ def import_file(options: ImportOptions) -> None:
     }
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        sequence, notes = csv.import_recording(
+        sequence, notes = importing.import_recording(
             options.file,
             columns,
             accel_path=options.accel_path,

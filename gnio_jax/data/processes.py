@@ -38,8 +38,9 @@ def map_in_processes(
     workers = min(workers, len(items))
     if workers <= 1:
         for index, item in enumerate(items):
-            yield function(*item)
+            result = function(*item)
             done((index + 1) / len(items))
+            yield result
         return
     # Processes are spawned: a fork after JAX has started its threads can hang. Ctrl-C is this
     # process's to answer.

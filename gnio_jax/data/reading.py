@@ -112,9 +112,9 @@ def read_split(
     readings = _read_all(recordings, workers, progress)
     for recording, reading in zip(recordings, readings, strict=True):
         for note in reading.notes:
-            warnings.warn(note, stacklevel=2)
+            warnings.warn(note, stacklevel=3)  # where `load` was called
         for reason in reading.refusals:
-            warnings.warn(f"{recording.name}: left out: {reason}", stacklevel=2)
+            warnings.warn(f"{recording.name}: left out: {reason}", stacklevel=3)
         if reading.damage is not None:
             raise reading.damage
         sequences += reading.sequences

@@ -42,7 +42,7 @@ from scipy.spatial.transform import Rotation, RotationSpline, Slerp
 
 from gnio_jax.data.alignment import fuse_attitude, smooth_positions
 from gnio_jax.data.dataset import Dataset, Recording, single
-from gnio_jax.data.readers.csv_files import in_order
+from gnio_jax.data.readers.stamps import in_order
 from gnio_jax.data.readers.text import numbers, read_csv, shortened
 from gnio_jax.data.resampling import resample
 from gnio_jax.data.validation import check_finite, check_gaps, check_rate, check_unit_norm, validate

@@ -42,7 +42,7 @@ from scipy.ndimage import binary_dilation
 from scipy.spatial.transform import Rotation
 
 from gnio_jax.data.dataset import Dataset, Recording, single
-from gnio_jax.data.readers.csv_files import in_order
+from gnio_jax.data.readers.stamps import in_order
 from gnio_jax.data.readers.text import shortened
 from gnio_jax.data.resampling import resample
 from gnio_jax.data.validation import (
