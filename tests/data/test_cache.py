@@ -12,7 +12,7 @@ from gnio_jax.types import InputError, Sequence
 
 
 class Builder:
-    """Counts how often it is asked; makes a sequence whose first position tells which time it was."""
+    """Counts its calls; makes a sequence whose first position tells which one it was."""
 
     def __init__(self, error=None):
         self.calls, self.error = 0, error

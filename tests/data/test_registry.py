@@ -28,7 +28,8 @@ def test_unknown_names_and_splits_list_the_known_ones():
         data.load("tloi")
     with pytest.raises(
         InputError,
-        match=r"dataset tlio: unknown split 'vel'; did you mean 'val'\? known splits: train, val, test",
+        match=r"dataset tlio: unknown split 'vel'; "
+        r"did you mean 'val'\? known splits: train, val, test",
     ):
         data.load("tlio", split="vel")
 
