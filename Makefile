@@ -1,45 +1,51 @@
-# make demo   train on the embedded synthetic pedestrians, evaluate, show the table and where the pictures are
+# make demo   train on the embedded synthetic pedestrians, evaluate, show the table and the pictures
 # make test   install everything the tests need, and run them on every core
-# Each makes its own virtual environment in .venv first; PYTHON chooses the interpreter (3.11 or newer).
+# make lint   ruff and pyright
+#
+# Each makes its own virtual environment in .venv first. PYTHON chooses the interpreter (3.11 or
+# newer). EXTRAS=test,reference adds evo and PyTorch, which some tests compare with.
 
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 DEMO ?= runs/demo
 JOBS ?= $(shell nproc 2>/dev/null || sysctl -n hw.ncpu)
+EXTRAS ?= test
+PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
+NEEDS := gnio-jax needs Python 3.11 or newer: make PYTHON=python3.11 ...
+
+# The compiled programs of the tests are kept between runs. The first run compiles them all, which
+# is most of what it does: hence the compiler's lower level of optimisation.
+TEST_ENVIRONMENT := JAX_PLATFORMS=cpu JAX_COMPILATION_CACHE_DIR=$(CURDIR)/.jax_cache \
+	XLA_FLAGS="$(XLA_FLAGS) --xla_backend_optimization_level=1"
 
 .PHONY: demo test lint clean
 
 demo: $(VENV)/.package
 	rm -rf $(DEMO)
-	$(BIN)/python train.py --config configs/quickstart.yaml --workdir $(DEMO)
-	$(BIN)/python evaluate.py --workdir $(DEMO) --estimator imu_only
-	$(BIN)/python evaluate.py --workdir $(DEMO)
+	$(BIN)/gnio train --config quickstart --workdir $(DEMO)
+	$(BIN)/gnio evaluate --workdir $(DEMO) --estimator imu_only
+	$(BIN)/gnio evaluate --workdir $(DEMO)
 
-# The compiled programs of the tests are kept between runs; the first run compiles them all, which is most of what it does: hence the
-# compiler's lower level of optimisation.
-test: $(VENV)/.tests
-	JAX_PLATFORMS=cpu JAX_COMPILATION_CACHE_DIR=$(CURDIR)/.jax_cache XLA_FLAGS="$(XLA_FLAGS) --xla_backend_optimization_level=1" $(BIN)/python -m pytest -n $(JOBS) --dist worksteal $(PYTEST_ARGS)
+test: $(VENV)/.$(EXTRAS)
+	$(TEST_ENVIRONMENT) $(BIN)/python -m pytest -n $(JOBS) --dist worksteal $(PYTEST_ARGS)
 
-lint: $(VENV)/.dev
+lint: $(VENV)/.test,dev
 	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
 clean:
 	rm -rf $(VENV) .jax_cache .pytest_cache build *.egg-info
 
-$(VENV)/bin/python:
-	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "gnio-jax needs Python 3.11 or newer: make PYTHON=python3.11 ...")'
+$(BIN)/python:
+	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "$(NEEDS)")'
 	$(PYTHON) -m venv $(VENV)
 
-$(VENV)/.package: $(VENV)/bin/python pyproject.toml
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e .
+$(VENV)/.package: $(BIN)/python pyproject.toml setup.py
+	$(PIP) -e .
 	touch $@
 
-$(VENV)/.tests: $(VENV)/bin/python pyproject.toml
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[test]'
-	touch $@
-
-$(VENV)/.dev: $(VENV)/bin/python pyproject.toml
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[test,dev]'
+$(VENV)/.test%: $(BIN)/python pyproject.toml setup.py
+	$(PIP) -e '.[test$*]'
 	touch $@

@@ -1,11 +1,7 @@
 """The command `gnio evaluate`, for those who cloned the repository."""
 
-import os
-
-os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
-
-from gnio_jax.commands import console as cli
+from gnio_jax.commands import console
 from gnio_jax.commands.evaluate import main
 
-if __name__ == "__main__":
-    cli.run(main)
+if __name__ == "__main__":  # processes that read recordings in parallel import this file again
+    console.run(main)

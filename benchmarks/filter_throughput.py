@@ -68,7 +68,8 @@ def measure(
     state = filtering.initial_state(config, *start)
     noise = filtering.NoiseModel.per_sample(1e-2, 3.16e-2, config.dt)
 
-    def run(*signals):
+    def run(gyro, accel, displacement, covariance):
+        signals = (gyro, accel, displacement, covariance)
         return filtering.run_filter(state, *signals, config, noise)
 
     if batch > 1:

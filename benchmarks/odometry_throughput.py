@@ -48,7 +48,7 @@ def measure(clone_rate: int, batch: int, seconds: float, repeats: int) -> dict[s
     noise = filtering.NoiseModel.per_sample(1e-2, 3.16e-2, config.dt)
     model = models.create("gnio")
     variables = models.initialise(model, jax.random.key(0), config.window)
-    apply, frozen = models.Inference(model), models.freeze(model, variables)
+    apply, frozen = models.Inference(model), models.inference_variables(model, variables)
 
     def with_network(frozen, gyro, accel):
         def lean(windows):

@@ -46,7 +46,7 @@ def network(width: int):
 
     variables = jax.tree.map(drawn, shapes)
     print(f"{sum(leaf.size for leaf in jax.tree.leaves(variables['params'])):,} parameters")
-    frozen = models.freeze(model, variables)
+    frozen = models.inference_variables(model, variables)
     return lambda windows: models.Inference(model)(frozen, windows)
 
 

@@ -20,7 +20,8 @@ import optax
 from scipy.spatial.transform import Rotation
 
 from gnio_jax import config as configuration
-from gnio_jax.commands import console as cli
+from gnio_jax.commands import console
+from gnio_jax.commands.options import parse
 from gnio_jax.types import InputError
 
 DESCRIPTION = """Fit the noise model and the uncertainty head of a trained run through its own
@@ -88,11 +89,11 @@ class Pieces(NamedTuple):
     """(p, k, 3) m, at the end of each clone interval"""
 
 
-def cut(recordings: list, intervals: int, stride: int) -> Pieces:
+def cut(prepared: list, intervals: int, stride: int) -> Pieces:
     """Consecutive pieces of `intervals` strides. The reference is valid throughout each."""
     length, found = intervals * stride, []
-    for recording in recordings:
-        s = recording.sequence
+    for each in prepared:
+        s = each.sequence
         for begin in range(0, len(s.time) - length, length):
             with_end = slice(begin, begin + length + 1)
             if not (s.valid[with_end].all() and np.isfinite(s.velocity[with_end]).all()):
@@ -143,7 +144,7 @@ def objective(model, filter_config, std, variables) -> Callable[[dict, Pieces], 
     apply = models.Inference(model)
 
     def loss(learnt, pieces):
-        frozen = models.freeze(model, with_head(variables, learnt["head"]))
+        frozen = models.inference_variables(model, with_head(variables, learnt["head"]))
         noise = filtering.NoiseModel(*jnp.exp(learnt["noise"]))
 
         def predict(windows):
@@ -169,7 +170,7 @@ def objective(model, filter_config, std, variables) -> Callable[[dict, Pieces], 
 class TestSplit(NamedTuple):
     """Recordings to report on, and the group of each sequence."""
 
-    recordings: list
+    prepared: list
     groups: dict[str, str]
 
 
@@ -178,32 +179,19 @@ def score(
 ) -> dict[str, float]:
     """ate, NIS and NEES of the test split, averaged over its sequences."""
     from gnio_jax import evaluation, models
-    from gnio_jax.evaluation import report
 
-    network = evaluation.Network(models.Inference(model), models.freeze(model, variables))
-    estimates = evaluation.estimate(
-        test.recordings, network, data_config, filter_options, progress=progress
+    network = evaluation.Network(
+        models.Inference(model), models.inference_variables(model, variables)
     )
-    sequences = report.score(estimates, test.groups).sequences.values()
+    estimates = evaluation.estimate(
+        test.prepared, network, data_config, filter_options, progress=progress
+    )
+    sequences = evaluation.score(estimates, test.groups).sequences.values()
     means = {}
     for name in ("ate", "nis", "nees"):
         values = [m.values[name] for m in sequences if m.values.get(name) is not None]
         means[name] = float(np.mean(values))
     return means
-
-
-def initial_std(options):
-    """The filter's initial standard deviations from the run's options."""
-    from gnio_jax import filtering
-
-    return filtering.InitialStd(
-        np.radians(options.tilt_std_degrees),
-        np.radians(options.yaw_std_degrees),
-        options.velocity_std,
-        options.position_std,
-        options.gyro_bias_std,
-        options.accel_bias_std,
-    )
 
 
 def create_optimizer(learning_rate: float) -> optax.GradientTransformation:
@@ -273,12 +261,12 @@ def render(title: str, before: dict[str, float], after: dict[str, float]) -> str
 
 def prepare(options: Learn, run) -> tuple[Callable, Pieces, TestSplit]:
     """The loss, the pieces to learn from and the test split."""
-    from gnio_jax.evaluation.odometry import filter_config
+    from gnio_jax.evaluation import filter_setup
 
     config = run.config
-    recordings, test = load(options, run)
+    prepared, test = load(options, run)
     intervals = round(options.seconds / config.data.stride_seconds)
-    pieces = cut(recordings, intervals, config.data.stride)
+    pieces = cut(prepared, intervals, config.data.stride)
     if len(pieces.rotation) < options.batch_size:
         raise InputError(
             "--seconds",
@@ -286,16 +274,15 @@ def prepare(options: Learn, run) -> tuple[Callable, Pieces, TestSplit]:
             "make them shorter",
         )
     # The soft gate gives the χ² test a slope; the checkpoints bound the gradient's memory.
-    differentiable = dataclasses.replace(
-        filter_config(config.data, config.filter), gate_softness=2.0, checkpoint_every=20
-    )
-    loss = objective(run.model, differentiable, initial_std(config.filter), run.variables)
+    ekf = filter_setup(config.data, config.filter)
+    differentiable = dataclasses.replace(ekf.config, gate_softness=2.0, checkpoint_every=20)
+    loss = objective(run.model, differentiable, ekf.initial_std, run.variables)
     return loss, pieces, test
 
 
 def main() -> None:
     jax.config.update("jax_enable_x64", True)
-    options = cli.parse(Learn, description=DESCRIPTION)
+    options = parse(Learn, description=DESCRIPTION)
     if options.steps < 1 or options.batch_size < 1:
         raise InputError("--steps and --batch-size", "must be at least 1")
 
@@ -311,7 +298,8 @@ def main() -> None:
         "noise": jnp.log(jnp.array(list(noise.values()))),
         "head": run.variables["params"]["uncertainty"],
     }
-    with cli.progress() as progress:
+    with console.terminal() as terminal:
+        progress = terminal.progress
 
         def estimate(what, variables, filter_options):
             tell = partial(progress, what)
@@ -324,7 +312,7 @@ def main() -> None:
         filter_options = dataclasses.replace(config.filter, **noise)
         after = estimate("estimating as learnt", variables, filter_options) | noise
 
-    title = f"{config.dataset} {options.test_split}, n = {len(test.recordings)}"
+    title = f"{config.dataset} {options.test_split}, n = {len(test.prepared)}"
     table = render(title, before, after)
     print(table)
     tenth = max(1, len(values) // 10)
@@ -338,4 +326,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    cli.run(main)
+    console.run(main)

@@ -16,7 +16,8 @@ import jax
 import numpy as np
 
 from gnio_jax import config as configuration
-from gnio_jax.commands import console as cli
+from gnio_jax.commands import console
+from gnio_jax.commands.options import parse
 from gnio_jax.types import InputError
 
 DESCRIPTION = """Feed a recording to gnio_jax.filtering.Tracker sample by sample, like an app on a
@@ -98,24 +99,12 @@ def read(path: Path) -> Recorded:
 def create_tracker(run, recorded: Recorded, rest_seconds: float):
     """The compiled tracker of a trained run, which starts from rest."""
     from gnio_jax import models
-    from gnio_jax.evaluation import odometry
-    from gnio_jax.filtering import InitialStd, NoiseModel, Tracker
+    from gnio_jax.evaluation import filter_setup
+    from gnio_jax.filtering import Tracker
 
-    options = run.config.filter
-    config = odometry.filter_config(run.config.data, options)
-    noise = NoiseModel(
-        options.gyro_density, options.accel_density, options.gyro_bias_walk, options.accel_bias_walk
-    )
-    std = InitialStd(
-        np.radians(options.tilt_std_degrees),
-        np.radians(options.yaw_std_degrees),
-        options.velocity_std,
-        options.position_std,
-        options.gyro_bias_std,
-        options.accel_bias_std,
-    )
+    config, noise, initial_std = filter_setup(run.config.data, run.config.filter)
     # What depends on the weights alone is computed once.
-    frozen = models.freeze(run.model, run.variables)
+    frozen = models.inference_variables(run.model, run.variables)
 
     def predict(windows):
         return models.Inference(run.model)(frozen, windows)
@@ -124,7 +113,7 @@ def create_tracker(run, recorded: Recorded, rest_seconds: float):
     imu_rate = 1 / recorded.interval
     try:
         return Tracker.from_rest(
-            predict, config, noise, rest_seconds, std, longest_gap, imu_rate=imu_rate
+            predict, config, noise, rest_seconds, initial_std, longest_gap, imu_rate=imu_rate
         )
     except ValueError as error:
         raise InputError("--rest-seconds", str(error)) from None
@@ -157,9 +146,8 @@ def replay(tracker, recorded: Recorded, path: Path, realtime: bool, progress) ->
 
 def write_trajectory(out: Path, name: str, poses: list) -> np.ndarray:
     """Write the TUM file and the picture; returns the positions (poses, 3)."""
-    from gnio_jax.evaluation import odometry, plots
-    from gnio_jax.evaluation.metrics import Trajectory
-    from gnio_jax.evaluation.report import write_tum
+    from gnio_jax.evaluation import Estimate, Trajectory, plots
+    from gnio_jax.evaluation.tum import write_tum
     from gnio_jax.files import replacing
 
     position = np.array([pose.position for pose in poses])
@@ -170,7 +158,7 @@ def write_trajectory(out: Path, name: str, poses: list) -> np.ndarray:
     )
     with replacing(out) as temporary:
         write_tum(temporary, estimated)
-    estimate = odometry.Estimate(name, estimated, no_reference)
+    estimate = Estimate(name, estimated, no_reference)
     with replacing(out.with_suffix(".png")) as temporary:
         plots.save(temporary, plots.trajectory(estimate, alignment="none"))
     return position
@@ -216,7 +204,7 @@ def summarise(
 def main() -> None:
     # The filter needs float64. The network states its float32 everywhere.
     jax.config.update("jax_enable_x64", True)
-    options = cli.parse(Replay, description=DESCRIPTION)
+    options = parse(Replay, description=DESCRIPTION)
     path = Path(options.csv)
     recorded = read(path)
 
@@ -226,7 +214,8 @@ def main() -> None:
     run = checkpoint.load_run(workdir)
     if len(recorded.time) < 2:
         raise InputError(path, "holds a single sample", "record a walk of some seconds")
-    with cli.progress() as progress:
+    with console.terminal() as terminal:
+        progress = terminal.progress
         progress("compiling", 0.0)
         begin = time.perf_counter()
         tracker = create_tracker(run, recorded, options.rest_seconds)
@@ -253,4 +242,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    cli.run(main)
+    console.run(main)

@@ -1,1 +1,35 @@
-"""gnio-jax: Gated Neural Inertial Odometry in JAX. See README.md."""
+"""gnio-jax: Gated Neural Inertial Odometry in JAX. See README.md.
+
+The rooms are imported when they are first used: `from gnio_jax import data, filtering, models`.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.metadata
+from typing import Any
+
+__all__ = [
+    "__version__",
+    "config",
+    "data",
+    "evaluation",
+    "filtering",
+    "geometry",
+    "interop",
+    "models",
+    "tables",
+    "training",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        return importlib.metadata.version("gnio-jax")
+    if name in __all__:
+        return importlib.import_module(f"gnio_jax.{name}")
+    raise AttributeError(f"module 'gnio_jax' has no attribute '{name}'")
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

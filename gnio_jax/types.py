@@ -11,6 +11,8 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
+from gnio_jax.errors import InputError as InputError
+
 Array = jax.Array | np.ndarray
 
 GRAVITY = 9.81
@@ -18,21 +20,6 @@ GRAVITY = 9.81
 
 STANDARD_G = 9.80665
 """The unit "G" in which phones report acceleration, m/s²."""
-
-
-class InputError(ValueError):
-    """A mistake a user can mend: its text is one line naming the place, the problem and the remedy.
-
-    The command lines print it on stderr and leave with exit status 2.
-    """
-
-    def __init__(self, where: object, problem: str, remedy: str = ""):
-        parts = [f"{where}: {problem}", remedy]
-        super().__init__("; ".join(part for part in parts if part).replace("\n", " "))
-        self.parts = (str(where), problem, remedy)
-
-    def __reduce__(self) -> tuple[type[InputError], tuple[str, str, str]]:
-        return type(self), self.parts  # so that it can come from another process
 
 
 class Sequence(NamedTuple):

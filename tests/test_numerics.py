@@ -153,6 +153,8 @@ def test_interpolation_is_linear_per_column_and_holds_its_ends():
     np.testing.assert_array_equal(
         found, [[0.0, 10.0], [1.0, 15.0], [2.0, 20.0], [3.0, 10.0], [4.0, 0.0]]
     )
+    by_row = numerics.interpolate(np.arange(3), np.array([0, 2]), values[:2])
+    np.testing.assert_array_equal(by_row, [[0.0, 10.0], [1.0, 15.0], [2.0, 20.0]])
     np.testing.assert_array_equal(numerics.midpoints(values), [[1.0, 15.0], [3.0, 10.0]])
 
 

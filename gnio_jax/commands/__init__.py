@@ -1,1 +1,5 @@
 """The command lines: typed options in, one call into the package."""
+
+import os
+
+os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")  # before JAX is imported

@@ -1,62 +1,62 @@
-"""Evaluate a trained network: python evaluate.py --workdir runs/synthetic_gnio. Everything it does is in gnio_jax.evaluation."""
+"""`gnio evaluate`: trajectories and errors of a trained network."""
+
+from __future__ import annotations
 
 import dataclasses
-import os
+from collections.abc import Sequence
 from pathlib import Path
 
-os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
-
-import jax
-
 from gnio_jax import config as configuration
-from gnio_jax.commands import console as cli
+from gnio_jax.commands import console
+from gnio_jax.commands.options import Command, execute
 from gnio_jax.config import EvaluateConfig
 from gnio_jax.cores import usable_cores
 
-DESCRIPTION = """Estimate the trajectories of a split with the network of a run, and report their errors.
+DESCRIPTION = """Estimate the trajectories of a split with a trained network and report the errors.
 
-  python evaluate.py                       (the newest run below runs/)
-  python evaluate.py --workdir runs/tlio
-  python evaluate.py --workdir runs/tlio --dataset oxiod --data-root ~/oxiod --split unseen
-  python evaluate.py --workdir runs/tlio --estimator integrate --orientation device
+  {prog}                       (the newest run below runs/)
+  {prog} --workdir runs/tlio
+  {prog} --workdir runs/tlio --dataset oxiod --data-root ~/oxiod --split unseen
+  {prog} --workdir runs/tlio --estimator integrate --orientation device
 
-Results go to <workdir>/eval/<dataset>_<split>_<estimator>/: metrics.json, metrics.csv, trajectories/ and references/ in TUM
-format (for evo), plots/. Every table has two rows to compare with: never_moves, the start pose throughout, and
-perfect_displacements, the same estimator fed with the reference's displacements."""
+Results go to <workdir>/eval/<dataset>_<split>_<estimator>/: metrics.json, metrics.csv,
+trajectories/ and references/ in TUM format (for evo), plots/. Every table has two rows to compare
+with: never_moves, the start pose throughout, and perfect_displacements, the same estimator fed with
+the reference's displacements."""
 
 
-def main() -> None:
-    jax.config.update(
-        "jax_enable_x64", True
-    )  # the filter needs float64; the network states its float32 everywhere
-    workdir = cli.parse(EvaluateConfig, description=DESCRIPTION).workdir or str(
-        configuration.newest_run()
-    )
-    default = EvaluateConfig(workdir)
-    kept = Path(workdir) / "config.yaml"
-    if kept.is_file():  # the run's own filter options are the defaults of those that are not given
-        default = dataclasses.replace(default, filter=configuration.load(kept).filter)
-    config = cli.parse(EvaluateConfig, default, DESCRIPTION)
+def defaults(options: EvaluateConfig) -> EvaluateConfig:
+    """The newest run, where none is named, and the filter options of the run."""
+    workdir = Path(options.workdir or configuration.newest_run())
+    default = EvaluateConfig(workdir=str(workdir))
+    kept = workdir / "config.yaml"
+    if not kept.is_file():
+        return default
+    return dataclasses.replace(default, filter=configuration.load(kept).filter)
 
-    from rich.console import Console
 
-    from gnio_jax import (  # after the options: --help and mistakes should not wait for the imports
-        evaluation,
-        filtering,
-    )
-    from gnio_jax.evaluation import report
+def evaluate(config: EvaluateConfig, _prog: str) -> None:
+    """Evaluate, and show the table."""
+    # After the options: --help and mistakes do not wait for these imports.
+    import jax
 
+    from gnio_jax import evaluation, filtering
+    from gnio_jax.evaluation import table
+
+    jax.config.update("jax_enable_x64", True)  # for the filter; the network states its float32
     filtering.cores_as_devices()
-    with cli.progress() as progress:
-        found, folder = evaluation.evaluate(config, progress, workers=usable_cores())
-    console = Console(highlight=False)
-    if not console.is_terminal:
-        console = Console(
-            highlight=False, width=200
-        )  # into a file or a pipe: no line is cut to a terminal's width
-    console.print(report.table(found))
+    with console.terminal() as terminal:
+        found, folder = evaluation.evaluate(config, terminal.progress, usable_cores())
+    console.stdout().print(table.render(found))
     print(f"results: {folder}")
     if config.plots:
-        print(
-            f"pictures: {folder / 'plots' / 'error_cdf.png'}, and there of each sequence <name>_{{trajectory,error,displacement}}.png"
-        )
+        names = "<name>_{trajectory,error,displacement}.png"
+        print(f"pictures: {folder / 'plots' / 'error_cdf.png'}, and there of each sequence {names}")
+
+
+COMMAND = Command(EvaluateConfig, evaluate, DESCRIPTION, defaults)
+
+
+def main(argv: Sequence[str] | None = None, prog: str = "evaluate.py") -> None:
+    """Read the options and evaluate."""
+    execute(COMMAND, argv, prog)

@@ -1,8 +1,7 @@
-"""`python -m gnio_jax.data list | check | convert | import`: what there is, whether it is sound,
-and how it comes into one form."""
+"""`python -m gnio_jax.data`: the same as `gnio data`."""
 
-from gnio_jax.commands import console as cli
+from gnio_jax.commands import console
 from gnio_jax.commands.data import main
 
-if __name__ == "__main__":  # the processes that `convert` starts import this file again
-    cli.run(main)
+if __name__ == "__main__":  # processes that read recordings in parallel import this file again
+    console.run(main)

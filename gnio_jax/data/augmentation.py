@@ -11,13 +11,11 @@ import math
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Float, PRNGKeyArray
+from jaxtyping import PRNGKeyArray
 
 from gnio_jax.config import AugmentConfig
-from gnio_jax.data.windows import rotate
 from gnio_jax.types import Windows
-
-ACCEL, GYRO = slice(0, 3), slice(3, 6)
+from gnio_jax.windows import rotate_channels, rotate_vectors
 
 
 def bias(key: PRNGKeyArray, windows: Windows, gyro: float, accel: float) -> Windows:
@@ -50,7 +48,7 @@ def tilt(key: PRNGKeyArray, windows: Windows, degrees: float) -> Windows:
         ],
         axis=-1,
     ).reshape(count, 3, 3)
-    return windows._replace(imu=_rotate_imu(rotation, windows.imu))
+    return windows._replace(imu=rotate_channels(rotation, windows.imu))
 
 
 def yaw(key: PRNGKeyArray, windows: Windows) -> Windows:
@@ -69,9 +67,9 @@ def yaw(key: PRNGKeyArray, windows: Windows) -> Windows:
         "bij,bj->bi", rotation, windows.displacement, precision=jax.lax.Precision.HIGHEST
     )
     return Windows(
-        _rotate_imu(rotation, windows.imu),
+        rotate_channels(rotation, windows.imu),
         target,
-        rotate(rotation, windows.steps[:, :, None])[:, :, 0],
+        rotate_vectors(rotation, windows.steps[:, :, None])[:, :, 0],
     )
 
 
@@ -101,10 +99,3 @@ def augment(key: PRNGKeyArray, windows: Windows, config: AugmentConfig) -> Windo
 def _uniform(key: PRNGKeyArray, shape: tuple[int, ...], low: float, high: float) -> jax.Array:
     # Plain numbers as limits would be float64 inside where that is switched on.
     return jax.random.uniform(key, shape, jnp.float32, jnp.float32(low), jnp.float32(high))
-
-
-def _rotate_imu(
-    rotation: Float[jax.Array, "b 3 3"], imu: Float[jax.Array, "b n 6"]
-) -> Float[jax.Array, "b n 6"]:
-    count, length, _ = imu.shape
-    return rotate(rotation, imu.reshape(count, length, 2, 3)).reshape(count, length, 6)

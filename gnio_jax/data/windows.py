@@ -1,7 +1,7 @@
-"""Training windows: an index over recordings that lie on the device once, gathered and rotated
-inside the jitted step.
+"""Training windows: recordings that lie on the device once, and an index of where windows start.
 
 Overlapping windows are never copied: a second of IMU belongs to ten windows and is stored once.
+Windows are cut and rotated inside the jitted step (`gnio_jax.windows.cut_windows`).
 """
 
 from __future__ import annotations
@@ -17,19 +17,22 @@ from scipy.spatial.transform import Rotation
 
 from gnio_jax.config import DataConfig
 from gnio_jax.types import Array, InputError, Sequence, Windows
+from gnio_jax.windows import (
+    Starts,
+    align_recording,
+    cut_windows,
+    true_displacement,
+    window_rows,
+    window_starts,
+    yaw_of,
+)
 
 
 class WindowSource(NamedTuple):
-    """All recordings of a split, end to end, and where windows may start in them. float32.
-
-    What does not depend on the augmentation is done here, once: with `window_rotation="per_sample"`
-    the samples are stored in the world frame and a window needs only its start's yaw removed; with
-    `"single"` they stay in the body frame and a window is rotated by its start's attitude without
-    yaw. Either way it is one rotation per window.
-    """
+    """All recordings of a split, end to end, and where windows may start in them. float32."""
 
     imu: Float[Array, "t 6"]
-    """[accel m/s², gyro rad/s]."""
+    """[accel m/s², gyro rad/s], as `gnio_jax.windows.AlignedRecording` has it."""
     start: Int[Array, "m"]
     """Row of `imu` at which each window begins."""
     rotation: Float[Array, "m 3 3"]
@@ -45,55 +48,29 @@ class WindowSource(NamedTuple):
     """Cosine and sine of each window start's yaw: from the world to the window's frame."""
     visited: Int[Array, "v"]
     """Numbers of the windows an epoch visits: all of them, unless they are to be shifted (see
-    `shifted`)."""
+    `shift_windows`)."""
 
 
-def index(
+def window_source(
     sequences: Iterable[Sequence], config: DataConfig, stride: int, shift: int = 0
 ) -> WindowSource:
-    """Cut `sequences` (all at `config.rate`) into windows every `stride` samples; with `shift`, at
-    every sample, for those to shift to.
+    """Cut `sequences` (all at `config.rate`) into windows every `stride` samples.
 
-    A window of N samples from i needs the reference at i … i+N, all of it valid. Attitude and
-    biases come from the reference (biases zero). Differences of positions are taken in float64,
-    before they are stored in float32. Raises `InputError` when not a single window fits.
+    With `shift` there is a window at every sample, for those of an epoch to be shifted to. A window
+    of N samples from i needs the reference at i … i+N, all of it valid. Attitude and biases come
+    from the reference (biases zero). Differences of positions are taken in float64, before they are
+    stored in float32. Raises `InputError` when not a single window fits.
     """
-    length = config.window
     parts: list[WindowSource] = []
-    offset = count = 0
+    rows = windows = 0
     for sequence in sequences:
-        start = np.arange(0, len(sequence.time) - length, 1 if shift else stride)
-        bad = np.concatenate([[0], np.cumsum(~sequence.valid)])
-        start = start[bad[start + length + 1] == bad[start]]
+        start = _valid_starts(sequence, config.window, 1 if shift else stride)
         if start.size == 0:
             continue
-        # An invalid row may hold NaN; no window touches it, so any rotation will do there.
-        body = Rotation.from_quat(
-            np.where(sequence.valid[:, None], sequence.orientation, [1.0, 0, 0, 0]),
-            scalar_first=True,
-        )
-        first = body[start].as_matrix()
-        yaw = np.arctan2(first[:, 1, 0], first[:, 0, 0])
-        unyaw = Rotation.from_rotvec(np.outer(yaw, [0, 0, -1])).as_matrix()
-        imu = np.hstack([sequence.accel, sequence.gyro])
-        if config.window_rotation == "per_sample":
-            imu = np.hstack([body.apply(sequence.accel), body.apply(sequence.gyro)])
-        moved = sequence.position[start + length] - sequence.position[start]
-        parts.append(
-            WindowSource(
-                imu=imu.astype(np.float32),
-                start=(start + offset).astype(np.int32),
-                rotation=(
-                    unyaw if config.window_rotation == "per_sample" else unyaw @ first
-                ).astype(np.float32),
-                displacement=np.einsum("mij,mj->mi", unyaw, moved).astype(np.float32),
-                step=np.diff(sequence.position, axis=0, append=np.nan).astype(np.float32),
-                unyaw=np.column_stack([np.cos(yaw), np.sin(yaw)]).astype(np.float32),
-                visited=(np.flatnonzero(start % stride == 0) + count).astype(np.int32),
-            )
-        )
-        offset += len(sequence.time)
-        count += start.size
+        part = _source_of(sequence, start, config, stride)
+        parts.append(part._replace(start=part.start + rows, visited=part.visited + windows))
+        rows += len(part.imu)
+        windows += len(part.start)
     if not parts:
         raise InputError(
             "data",
@@ -102,37 +79,57 @@ def index(
     return WindowSource(*(np.concatenate(field) for field in zip(*parts, strict=True)))
 
 
-def gather(source: WindowSource, which: Int[jax.Array, "b"], length: int) -> Windows:
-    """The windows number `which` of `source`, each `length` samples, rotated to their own frames.
-    Jittable."""
-    rows = source.start[which][:, None] + jnp.arange(length, dtype=jnp.int32)[None, :]
-    imu = source.imu[rows].reshape(which.shape[0], length, 2, 3)
-    imu = rotate(source.rotation[which], imu).reshape(which.shape[0], length, 6)
-    cosine, sine = source.unyaw[which][:, :, None].swapaxes(0, 1)
-    x, y, z = jnp.moveaxis(
-        source.step[rows], -1, 0
-    )  # dropped by the compiler where nobody looks at it
-    return Windows(
-        imu,
-        source.displacement[which],
-        jnp.stack([cosine * x + sine * y, cosine * y - sine * x, z], axis=-1),
+def _valid_starts(sequence: Sequence, length: int, stride: int) -> Starts:
+    """Starts of the windows whose reference is valid throughout and at the sample after them."""
+    start = window_starts(len(sequence.time), length, stride)
+    invalid_before = np.concatenate([[0], np.cumsum(~sequence.valid)])
+    return start[invalid_before[start + length + 1] == invalid_before[start]]
+
+
+def _source_of(sequence: Sequence, start: Starts, config: DataConfig, stride: int) -> WindowSource:
+    """One recording's windows, rows and numbers counted from 0."""
+    # An invalid row may hold NaN; no window touches it, so any rotation will do there.
+    orientation = np.where(sequence.valid[:, None], sequence.orientation, [1.0, 0.0, 0.0, 0.0])
+    attitude = Rotation.from_quat(orientation, scalar_first=True).as_matrix()
+    imu, rotation = align_recording(
+        sequence.accel, sequence.gyro, attitude, start, config.window_rotation
+    )
+    displacement = true_displacement(orientation, sequence.position, start, config.window)
+    yaw = yaw_of(attitude[start])
+    return WindowSource(
+        imu=imu,
+        start=start.astype(np.int32),
+        rotation=rotation,
+        displacement=displacement.astype(np.float32),
+        step=np.diff(sequence.position, axis=0, append=np.nan).astype(np.float32),
+        unyaw=np.column_stack([np.cos(yaw), np.sin(yaw)]).astype(np.float32),
+        visited=np.flatnonzero(start % stride == 0).astype(np.int32),
     )
 
 
-def shifted(
+def gather(source: WindowSource, which: Int[jax.Array, "b"], length: int) -> Windows:
+    """The windows number `which` of `source`, each `length` samples, in their own frames. Jittable."""
+    start = source.start[which]
+    cosine, sine = source.unyaw[which][:, :, None].swapaxes(0, 1)
+    # The compiler drops the steps where nobody looks at them.
+    x, y, z = jnp.moveaxis(source.step[window_rows(start, length)], -1, 0)
+    return Windows(
+        imu=cut_windows(source.imu, start, source.rotation[which], length),
+        displacement=source.displacement[which],
+        steps=jnp.stack([cosine * x + sine * y, cosine * y - sine * x, z], axis=-1),
+    )
+
+
+def shift_windows(
     key: PRNGKeyArray, source: WindowSource, which: Int[jax.Array, "b"], samples: int
 ) -> Int[jax.Array, "b"]:
-    """The numbers of windows up to `samples` later or earlier than `which`, which stay where the
-    recording has none there."""
+    """Numbers of the windows up to `samples` later or earlier than `which`.
+
+    A window stays where the recording has none at the drawn distance.
+    """
     if samples == 0:
         return which
     shift = jax.random.randint(key, which.shape, -samples, samples + 1, jnp.int32)
-    there = jnp.clip(which + shift, 0, source.start.shape[0] - 1)
-    return jnp.where(source.start[there] - source.start[which] == shift, there, which)
-
-
-def rotate(
-    rotation: Float[jax.Array, "b 3 3"], vectors: Float[jax.Array, "b n k 3"]
-) -> Float[jax.Array, "b n k 3"]:
-    """Rotate the vectors of each window, in full float32 on every kind of device."""
-    return jnp.einsum("bij,bnkj->bnki", rotation, vectors, precision=jax.lax.Precision.HIGHEST)
+    candidate = jnp.clip(which + shift, 0, source.start.shape[0] - 1)
+    in_recording = source.start[candidate] - source.start[which] == shift
+    return jnp.where(in_recording, candidate, which)

@@ -1,5 +1,13 @@
-"""Trajectories out of recordings, their errors, and the reports about them."""
+"""Trajectories out of recordings, their errors, and the reports about them.
 
+The way through, a file each: `setup` (the choices) → `preparation` (sequences cut and started) →
+`inference` (the network's displacements) → `estimation` (trajectories) → `scores` (metrics) →
+`report`, `table`, `plots`. `run` walks it.
+"""
+
+from gnio_jax.evaluation.estimation import estimate, never_moves, perfect_displacements
+from gnio_jax.evaluation.estimators.result import Estimate
+from gnio_jax.evaluation.inference import Network, attitude, predict_windows, true_displacements
 from gnio_jax.evaluation.metrics import (
     Measures,
     Summary,
@@ -9,25 +17,19 @@ from gnio_jax.evaluation.metrics import (
     measure,
     summarise,
 )
-from gnio_jax.evaluation.odometry import (
-    Estimate,
-    Network,
-    Recording,
-    Setup,
-    estimate,
-    never_moves,
-    perfect_displacements,
-    prepare,
-)
-from gnio_jax.evaluation.report import Report, Scores, score
+from gnio_jax.evaluation.preparation import Prepared, prepare
+from gnio_jax.evaluation.report import Report
 from gnio_jax.evaluation.run import Evaluation, evaluate
+from gnio_jax.evaluation.scores import Scores, score
+from gnio_jax.evaluation.setup import FilterSetup, Setup, filter_setup, resolve
 
 __all__ = [
     "Estimate",
     "Evaluation",
+    "FilterSetup",
     "Measures",
     "Network",
-    "Recording",
+    "Prepared",
     "Report",
     "Scores",
     "Setup",
@@ -35,12 +37,17 @@ __all__ = [
     "Trajectory",
     "Undefined",
     "align",
+    "attitude",
     "estimate",
     "evaluate",
+    "filter_setup",
     "measure",
     "never_moves",
     "perfect_displacements",
+    "predict_windows",
     "prepare",
+    "resolve",
     "score",
     "summarise",
+    "true_displacements",
 ]

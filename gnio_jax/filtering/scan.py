@@ -13,7 +13,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
-from gnio_jax import geometry
 from gnio_jax.filtering.gaps import Imu, bridge
 from gnio_jax.filtering.measurement import (
     Correction,
@@ -40,6 +39,7 @@ from gnio_jax.filtering.state import (
     core_covariance,
 )
 from gnio_jax.types import Array, Prediction
+from gnio_jax.windows import cut_window
 
 
 class FilterHistory(NamedTuple):
@@ -196,7 +196,7 @@ def run_odometry(
         )
         return measured(prediction, config, dtype), prediction.diagnostics
 
-    return _scan(measure, state, gyro, accel, valid, config, noise, None, config.cut.frame)
+    return _scan(measure, state, gyro, accel, valid, config, noise, None, config.displacement_frame)
 
 
 def expect(predict: Callable[[Any], Prediction], config: FilterConfig) -> Prediction:
@@ -229,7 +229,9 @@ def infer_window(
     """What the network says of one window, of which the last `config.reach` raw samples up to its
     newer clone are given and the attitude of its older clone; the leading axis of one is gone."""
     gyro, accel = gyro[: config.window], accel[: config.window]
-    imu = network_window(rotation, gyro, accel, state.gyro_bias, state.accel_bias, config)
+    imu = cut_window(
+        rotation, gyro, accel, state.gyro_bias, state.accel_bias, config.cut, config.dt
+    )
     return jax.tree.map(lambda leaf: _floating(leaf[0]), predict(imu[None].astype(jnp.float32)))
 
 
@@ -245,30 +247,6 @@ def measured(prediction: Prediction, config: FilterConfig, dtype: Any) -> Measur
     log_std = jnp.maximum(prediction.log_std.astype(dtype), config.log_std_min)
     return _measurement(
         prediction.displacement.astype(dtype), jnp.diag(jnp.exp(2 * log_std)), config
-    )
-
-
-def network_window(
-    rotation: Float[Array, "3 3"],
-    gyro: Float[Array, "n 3"],
-    accel: Float[Array, "n 3"],
-    gyro_bias: Float[Array, "3"],
-    accel_bias: Float[Array, "3"],
-    config: FilterConfig,
-) -> Float[Array, "n 6"]:
-    """[accel, gyro] of a window of raw samples whose first has this attitude, rotated by R_γ(R_i)ᵀ
-    R_j (eq. 1) as `config.cut` says."""
-    rates = gyro - gyro_bias[None]
-    if config.cut.corrected:
-        gyro, accel = rates, accel - accel_bias[None]
-    turns = jax.vmap(geometry.exp, out_axes=2)(rates[config.cut.turns] * config.dt)
-    rotations = geometry.cumulative_rotation(geometry.yaw_rotation(rotation).T @ rotation, turns)
-    signals = jnp.stack([accel.T, gyro.T], axis=1)
-    # Without turns the first rotation serves for all.
-    return (
-        geometry.matmul(jnp.broadcast_to(rotations, (3, 3, len(gyro))), signals)
-        .transpose(2, 1, 0)
-        .reshape(-1, 6)
     )
 
 

@@ -158,7 +158,7 @@ def smooth_odometry(
         for name in ("displacement", "measurement_std")
     )
     covariance = jax.vmap(jnp.diag)(std**2 / config.measurement_scale)
-    frame = config.cut.frame
+    frame = config.displacement_frame
     return _smooth(state, gyro, accel, valid, displacement, covariance, config, noise, frame)
 
 

@@ -29,6 +29,7 @@ from jaxtyping import Bool, Float, Int
 
 from gnio_jax import geometry
 from gnio_jax.types import GRAVITY, Array
+from gnio_jax.windows import WINDOW_CUTS, WindowCut
 
 CORE, CLONE = 21, 6
 THETA, VELOCITY, OFFSET, GYRO_BIAS, ACCEL_BIAS, ANCHOR, MOVE = (
@@ -42,32 +43,6 @@ _NEVER = -1
 Frame = Literal["own", "given"]
 """Whose yaw frame a displacement is told in: that of the filter's own attitude of the oldest clone,
 with which the network's window was cut, or that of another attitude."""
-
-
-class WindowCut(NamedTuple):
-    """How the network's window from clone i to clone j is cut from the stream; the first of its
-    samples gets the attitude of clone i."""
-
-    lead: int
-    """Samples by which it begins before the first that drove the filter on from clone i."""
-    corrected: bool
-    """Whether the network sees the samples without the filter's biases."""
-    turns: slice
-    """Those of the window's samples, as rates without bias, each of which turns the attitude of one
-    sample into that of the next."""
-    frame: Frame
-    """Of the network's displacement, as the measurement's Jacobian takes it."""
-
-
-WINDOW_CUTS = {
-    "per_sample": WindowCut(0, True, slice(-1), "own"),
-    "single": WindowCut(0, True, slice(0), "own"),
-    # TLIO's sample stamped t drove the filter from t − dt to t, and turned the attitude that it is
-    # rotated with itself. Its Jacobian takes the frame for a given one, though it is the filter's
-    # own.
-    "tlio": WindowCut(1, False, slice(1, None), "given"),
-}
-"""By `FilterConfig.window_rotation`."""
 
 
 @no_type_check  # by the tests' run-time checker, that is: __post_init__ says what is wrong, and takes 0-d arrays
@@ -207,6 +182,14 @@ class FilterConfig:
     def cut(self) -> WindowCut:
         """Of `window_rotation`."""
         return WINDOW_CUTS[self.window_rotation]
+
+    @property
+    def displacement_frame(self) -> Frame:
+        """Frame in which the network's displacement is told, as the measurement's Jacobian takes it.
+
+        TLIO's Jacobian takes a given frame, though it is the filter's own.
+        """
+        return "given" if self.window_rotation == "tlio" else "own"
 
     @property
     def reach(self) -> int:

@@ -225,7 +225,9 @@ def advance(
         ), {}
 
     slot = core.intervals % clones
-    state, row = clone_step(core.filter, stream, measure, slot, config, noise, config.cut.frame)
+    state, row = clone_step(
+        core.filter, stream, measure, slot, config, noise, config.displacement_frame
+    )
     seen = history(jax.tree.map(lambda x: x[None], row), jnp.max(age)[None], state.healthy, config)
     state = state._replace(imu=memory._replace(quiet=state.imu.quiet), healthy=seen.healthy[-1] > 0)
     return Core(state, window, core.intervals + 1), jnp.concatenate(

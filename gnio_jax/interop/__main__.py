@@ -1,7 +1,7 @@
-"""`python -m gnio_jax.interop CHECKPOINT WORKDIR`: a run of TLIO's published weights."""
+"""`python -m gnio_jax.interop`: the same as `gnio interop`."""
 
-from gnio_jax.commands import console as cli
+from gnio_jax.commands import console
 from gnio_jax.commands.interop import main
 
-if __name__ == "__main__":
-    cli.run(main)
+if __name__ == "__main__":  # processes that read recordings in parallel import this file again
+    console.run(main)

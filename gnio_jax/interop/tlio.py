@@ -1,5 +1,4 @@
-"""Other people's checkpoints: TLIO's weights for the model `tlio`, and `python -m gnio_jax.interop`
-to make a run of them.
+"""TLIO's weights for the model `tlio`, and a run made of them for `gnio evaluate`.
 
 PyTorch is needed for its own files alone (`pip install gnio-jax[torch]`); a mapping of arrays or an
 .npz needs nothing.
@@ -10,46 +9,22 @@ from __future__ import annotations
 import math
 import zipfile
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import tyro
 
 from gnio_jax import config as configuration
 from gnio_jax import models
 from gnio_jax.config import DataConfig, FilterOptions, ModelConfig, TrainConfig
 from gnio_jax.types import InputError
 
-PROGRAM = "python -m gnio_jax.interop"
-
 _CHANNELS = np.array([3, 4, 5, 0, 1, 2])
 """Where our channels, [accel, gyro], are among TLIO's, [gyro, accel]."""
 
 _REMEDY = "the weights must be those of TLIO's network 'resnet', as its training saves them"
-
-
-@dataclass(frozen=True)
-class ImportOptions:
-    """What is made of a checkpoint."""
-
-    checkpoint: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="CHECKPOINT")]]
-    """File of the weights."""
-    workdir: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="WORKDIR")]]
-    """Folder of the run; must not hold one."""
-    rate: float = 200.0
-    """Samples per second that the network was trained with, Hz (imu_freq in TLIO's
-    parameters.json)."""
-    window_seconds: float = 1.0
-    """Length of its window, s (past_time + window_time there)."""
-    stride_seconds: float = 0.05
-    """Distance of window starts, and of the filter's clones, s (TLIO's filter: 0.05; the paper:
-    0.1)."""
-    dataset: str = "tlio"
-    """Dataset that evaluate.py takes where none is named."""
 
 
 def load_tlio_state_dict(mapping_or_path: Mapping[str, Any] | str | Path) -> Any:
@@ -127,11 +102,8 @@ def _template(where: str, given: Mapping[str, Any]) -> Any:
         raise InputError(where, f"'{_FLATTENED}' is missing", _REMEDY)
     shape = np.shape(given[_FLATTENED])
     if len(shape) != 2 or shape[1] % _PREP_CHANNELS or not shape[1]:
-        raise InputError(
-            where,
-            f"'{_FLATTENED}' must have shape (512, {_PREP_CHANNELS}·⌈N/32⌉) for windows of N samples, found {shape}",
-            _REMEDY,
-        )
+        wanted = f"(512, {_PREP_CHANNELS}·⌈N/32⌉) for windows of N samples"
+        raise InputError(where, f"'{_FLATTENED}' must have shape {wanted}, found {shape}", _REMEDY)
     windows = jax.ShapeDtypeStruct((1, 32 * (shape[1] // _PREP_CHANNELS), 6), jnp.float32)
     return jax.eval_shape(models.create("tlio").init, jax.random.key(0), windows)
 
@@ -156,21 +128,18 @@ def _opened(given: Mapping[str, Any] | str | Path) -> tuple[str, Mapping[str, An
         return "state dict", given
     path = Path(given)
     if not path.is_file():
-        raise InputError(
-            path,
-            "no such file",
-            "give a checkpoint of TLIO's training, a TorchScript archive or an .npz of the state dict",
+        known = (
+            "a checkpoint of TLIO's training, a TorchScript archive or an .npz of the state dict"
         )
+        raise InputError(path, "no such file", f"give {known}")
     try:
         content = _arrays(path) if path.suffix == ".npz" else _torch(path)
     except InputError:
         raise
     except Exception as error:  # torch and zipfile tell damage by half a dozen types
-        raise InputError(
-            path,
-            f"cannot be read ({str(error).partition(chr(10))[0][:160]})",
-            "it must be an .npz of arrays, or a file of PyTorch that holds tensors and plain values only",
-        ) from None
+        problem = f"cannot be read ({str(error).partition(chr(10))[0][:160]})"
+        known = "an .npz of arrays, or a file of PyTorch that holds tensors and plain values only"
+        raise InputError(path, problem, f"it must be {known}") from None
     if not isinstance(content, Mapping):
         raise InputError(path, f"holds no mapping of arrays but {type(content).__name__}", _REMEDY)
     return str(path), content
@@ -196,36 +165,38 @@ def _torch(path: Path) -> Any:
     return torch.load(path, map_location="cpu", weights_only=True)
 
 
-def write_run(options: ImportOptions) -> None:
-    """Write the run folder: config.yaml and checkpoints/best. Raises `InputError` for weights that
-    do not fit, or a folder that is one."""
-    from gnio_jax.training import checkpoint  # here, for Orbax takes longer to import than all else
+def write_run(checkpoint: Path, workdir: Path, data: DataConfig, dataset: str = "tlio") -> None:
+    """Make a run of TLIO's weights that `evaluate` reads: config.yaml and checkpoints/best.
+
+    `data` gives rate, window and stride that the network was trained with. Raises `InputError` for
+    weights that do not fit them, or a folder that holds a run already.
+    """
+    # Orbax takes longer to import than all else.
+    from gnio_jax.training.checkpoint import Checkpoints, Position
     from gnio_jax.training.step import TrainState
 
-    data = DataConfig(
-        rate=options.rate,
-        window_seconds=options.window_seconds,
-        stride_seconds=options.stride_seconds,
-    )
     config = TrainConfig(
-        dataset=options.dataset,
+        dataset=dataset,
         data=data,
         model=ModelConfig(name="tlio"),
         filter=FilterOptions(window_rotation="tlio"),
     )
-    configuration.validate(config, PROGRAM)
-    if (options.workdir / "config.yaml").exists() or (options.workdir / "checkpoints").exists():
-        raise InputError(options.workdir, "holds a run already", "name another folder")
-    variables = load_tlio_state_dict(options.checkpoint)
-    rows = variables["params"]["displacement"]["fc1"]["kernel"].shape[0] // _PREP_CHANNELS
-    if rows != math.ceil(data.window / 32):
-        raise InputError(
-            options.checkpoint,
-            f"is for windows of {32 * rows - 31} to {32 * rows} samples, not {data.window}",
-            "give the --rate and --window-seconds that it was trained with",
-        )
-    options.workdir.mkdir(parents=True, exist_ok=True)
-    with checkpoint.Checkpoints(options.workdir) as checkpoints:
+    configuration.validate(config, "gnio interop")
+    if (workdir / "config.yaml").exists() or (workdir / "checkpoints").exists():
+        raise InputError(workdir, "holds a run already", "name another folder")
+    variables = load_tlio_state_dict(checkpoint)
+    _check_window(checkpoint, variables, data.window)
+    workdir.mkdir(parents=True, exist_ok=True)
+    with Checkpoints(workdir) as checkpoints:
         state = TrainState(jnp.int32(0), variables["params"], variables["batch_stats"], {})
-        checkpoints.save("best", state, checkpoint.Position(0, 0, None, (0.0, 0.0, 0.0), 0.0))
-    configuration.save(options.workdir / "config.yaml", config)
+        checkpoints.save("best", state, Position(0, 0, None, (0.0, 0.0, 0.0), 0.0))
+    configuration.save(workdir / "config.yaml", config)
+
+
+def _check_window(checkpoint: Path, variables: Any, window: int) -> None:
+    """Refuse a window length that the weights do not have: they tell ⌈N/32⌉ of N samples."""
+    features = variables["params"]["displacement"]["fc1"]["kernel"].shape[0] // _PREP_CHANNELS
+    if features != math.ceil(window / 32):
+        problem = f"is for windows of {32 * features - 31} to {32 * features} samples, not {window}"
+        remedy = "give the --rate and --window-seconds that it was trained with"
+        raise InputError(checkpoint, problem, remedy)

@@ -70,7 +70,8 @@ class CTIN(nn.Module):
             )
         if self.encoder_width % self.heads or self.encoder_width % KEY_GROUPS:
             raise ValueError(
-                f"encoder_width must be a multiple of the {self.heads} heads and of {KEY_GROUPS}, found {self.encoder_width}"
+                f"encoder_width must be a multiple of the {self.heads} heads and of {KEY_GROUPS}, "
+                f"found {self.encoder_width}"
             )
         super().__post_init__()
 
@@ -180,7 +181,7 @@ class LocalAttention(nn.Module):
 
 
 class TemporalEmbedding(nn.Module):
-    """A bidirectional LSTM over the samples, plus a trained vector for every place in the window."""
+    """A bidirectional LSTM over the samples, plus a learnt vector for each place in the window."""
 
     width: int
 

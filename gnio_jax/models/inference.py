@@ -1,7 +1,7 @@
-"""What of a network depends on its parameters alone, computed once per run instead of once per
-window.
+"""Variables made ready for inference: what depends on the parameters alone is computed once per run
+instead of once per window.
 
-With one window a call, as in the filter's loop, the Motion Bank's keys and values cost as many
+With one window per call, as in the filter's loop, the Motion Bank's keys and values cost as many
 products as the whole encoder.
 """
 
@@ -19,8 +19,8 @@ from gnio_jax.types import Prediction
 EPSILON = 1e-5
 
 
-class Frozen(NamedTuple):
-    """A network's variables made ready for inference."""
+class InferenceVariables(NamedTuple):
+    """A network's variables with batch normalisations folded into the convolutions."""
 
     variables: Any
     constants: dict[str, Any]
@@ -29,29 +29,29 @@ class Frozen(NamedTuple):
 
 @dataclass(frozen=True)
 class Inference:
-    """`Inference(model)(frozen, windows)` is `model.apply(variables, windows)` to rounding.
+    """`Inference(model)(ready, windows)` is `model.apply(variables, windows)` to rounding.
     Hashable, so a static argument of `jit`."""
 
     model: nn.Module
 
-    def __call__(self, frozen: Frozen, windows: jax.Array) -> Prediction:
-        return self.model.apply(frozen.variables, windows, **frozen.constants)  # type: ignore[return-value]
+    def __call__(self, ready: InferenceVariables, windows: jax.Array) -> Prediction:
+        return self.model.apply(ready.variables, windows, **ready.constants)  # type: ignore[return-value]
 
 
-def freeze(model: nn.Module, variables: Any) -> Frozen:
+def inference_variables(model: nn.Module, variables: Any) -> InferenceVariables:
     """Variables with every batch normalisation folded into its convolution, and what
     `model.constants` makes of them, if it has that."""
     folded = {**variables, **_folded(variables["params"], variables.get("batch_stats", {}))}
     constants = getattr(model, "constants", None)
-    return Frozen(folded, constants(folded) if constants else {})
+    return InferenceVariables(folded, constants(folded) if constants else {})
 
 
 def _folded(params: Any, statistics: Any) -> dict[str, Any]:
-    """w ← w·a and, in the place of the normalisation, a shift: (x − μ)/√(σ² + ε)·γ + β = a x + (β −
-    a μ), a = γ/√(σ² + ε).
+    """Fold each normalisation into the convolution before it.
 
-    A normalisation `…bn…` follows the convolution `…conv…` (without bias) of the same module; one
-    that has none is left as it is.
+    (x − μ)/√(σ² + ε)·γ + β = a x + (β − a μ) with a = γ/√(σ² + ε): the kernel becomes w·a, and the
+    normalisation becomes a shift. A normalisation `…bn…` follows the convolution `…conv…` (without
+    bias) of the same module; one without such a convolution stays as it is.
     """
     params, statistics = dict(params), dict(statistics)
     for name, found in list(statistics.items()):

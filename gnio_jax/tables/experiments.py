@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from gnio_jax.config import LossConfig, OptimConfig, TrainConfig
+
+METHODS = ("tlio", "ronin_resnet", "deepils", "ctin", "imot", "gnio")
+"""The networks of table II, and RoNIN's, which it leaves out."""
 
 SCALED = ("gnio", "tlio", "ronin_resnet", "deepils")
 """Networks whose `width` means channels of the first group: an experiment at half the width halves
@@ -22,6 +25,18 @@ REGULARISATION: dict[str, dict[str, float]] = {
 """Of the published recipes, what is neither loss nor budget. TLIO needs its clip: where its
 uncertainty begins to learn, the gradients of the likelihood are so large that they undo what its
 displacements have learnt."""
+
+PUBLISHED = {
+    ("oxiod", "seen"): {"tlio": 2.67, "ctin": 2.32, "imot": 1.86, "gnio": 0.74},
+    ("oxiod", "unseen"): {"tlio": 2.54, "ctin": 3.34, "imot": 0.90, "gnio": 0.71},
+    ("ridi", "seen"): {"tlio": 1.58, "ctin": 1.39, "imot": 1.68, "deepils": 1.56, "gnio": 1.22},
+    ("ridi", "unseen"): {"tlio": 1.49, "ctin": 1.86, "imot": 1.49, "deepils": 1.48, "gnio": 1.19},
+    ("ronin", "seen"): {"tlio": 5.95, "ctin": 4.62, "imot": 3.78, "deepils": 4.80, "gnio": 4.31},
+    ("ronin", "unseen"): {"tlio": 7.10, "ctin": 5.61, "imot": 5.31, "deepils": 6.80, "gnio": 5.02},
+    ("idol", "seen"): {"tlio": 5.89, "ctin": 2.90, "imot": 2.22, "gnio": 3.45},
+    ("idol", "unseen"): {"tlio": 5.34, "ctin": 3.69, "imot": 3.00, "gnio": 3.89},
+}
+"""Published ATE, m (paper, table II), by dataset and split, then by network."""
 
 
 class Cell(NamedTuple):
@@ -44,13 +59,19 @@ class Experiment(NamedTuple):
     cells: list[Cell]
 
 
-def held_epochs(optim: OptimConfig) -> float:
-    """Epochs in which TLIO's uncertainty does not learn: the published ones. Ours: a shorter run
-    holds it for the number of steps that those take with the published batches, and at most for
-    half of itself."""
-    if optim.epochs >= PAPER_EPOCHS:
-        return TLIO_HELD
-    return min(TLIO_HELD * optim.batch_size / TLIO_BATCH, optim.epochs / 2)
+# One row
+# --------------------------------------------------------------------------------------------------
+
+
+def method(network: str, base: TrainConfig) -> TrainConfig:
+    """`base` with another network, its loss and regularisation: the same recordings, augmentation,
+    batches, epochs and learning rate. Losses differ, so every row's checkpoint is the one with the
+    smallest squared error on the validation split."""
+    width = base.model.width if network in SCALED else None
+    model = dataclasses.replace(type(base.model)(), name=network, width=width)
+    regularisation = REGULARISATION.get(network, {})
+    optim = dataclasses.replace(base.optim, best_by="squared_error", **regularisation)
+    return dataclasses.replace(base, model=model, loss=loss(network, base), optim=optim)
 
 
 def loss(network: str, base: TrainConfig) -> LossConfig:
@@ -73,70 +94,48 @@ def loss(network: str, base: TrainConfig) -> LossConfig:
             return LossConfig(mse_weight=1.0, nll_weight=0.0)
 
 
-def method(network: str, base: TrainConfig) -> TrainConfig:
-    """`base` with another network, its loss and regularisation: the same recordings, augmentation,
-    batches, epochs and learning rate. Losses differ, so every row's checkpoint is the one with the
-    smallest squared error on the validation split."""
-    model = dataclasses.replace(
-        type(base.model)(), name=network, width=base.model.width if network in SCALED else None
-    )
-    optim = dataclasses.replace(
-        base.optim, best_by="squared_error", **REGULARISATION.get(network, {})
-    )
-    return dataclasses.replace(base, model=model, loss=loss(network, base), optim=optim)
+def held_epochs(optim: OptimConfig) -> float:
+    """Epochs in which TLIO's uncertainty does not learn: the published ones. Ours: a shorter run
+    holds it for the number of steps that those take with the published batches, and at most for
+    half of itself."""
+    if optim.epochs >= PAPER_EPOCHS:
+        return TLIO_HELD
+    return min(TLIO_HELD * optim.batch_size / TLIO_BATCH, optim.epochs / 2)
 
 
-def variant(base: TrainConfig, **options: object) -> TrainConfig:
-    """GNIO with other options."""
+def variant(base: TrainConfig, **options: Any) -> TrainConfig:
+    """GNIO with other options of the model."""
     config = method("gnio", base)
     return dataclasses.replace(config, model=dataclasses.replace(config.model, **options))
 
 
-# Published ATE, m (paper, table II), by network, dataset and split.
-PUBLISHED = {
-    ("oxiod", "seen"): {"tlio": 2.67, "ctin": 2.32, "imot": 1.86, "gnio": 0.74},
-    ("oxiod", "unseen"): {"tlio": 2.54, "ctin": 3.34, "imot": 0.90, "gnio": 0.71},
-    ("ridi", "seen"): {"tlio": 1.58, "ctin": 1.39, "imot": 1.68, "deepils": 1.56, "gnio": 1.22},
-    ("ridi", "unseen"): {"tlio": 1.49, "ctin": 1.86, "imot": 1.49, "deepils": 1.48, "gnio": 1.19},
-    ("ronin", "seen"): {"tlio": 5.95, "ctin": 4.62, "imot": 3.78, "deepils": 4.80, "gnio": 4.31},
-    ("ronin", "unseen"): {"tlio": 7.10, "ctin": 5.61, "imot": 5.31, "deepils": 6.80, "gnio": 5.02},
-    ("idol", "seen"): {"tlio": 5.89, "ctin": 2.90, "imot": 2.22, "gnio": 3.45},
-    ("idol", "unseen"): {"tlio": 5.34, "ctin": 3.69, "imot": 3.00, "gnio": 3.89},
-}
-METHODS = ("tlio", "ronin_resnet", "deepils", "ctin", "imot", "gnio")
+# The tables
+# --------------------------------------------------------------------------------------------------
 
 
 def comparison(base: TrainConfig, split: str, networks: tuple[str, ...] = METHODS) -> Experiment:
-    """The networks of table II, and RoNIN's, which it leaves out; compared with the first."""
+    """The networks side by side; compared with the first."""
     published = PUBLISHED.get((base.dataset, split), {})
-    cells = [
-        Cell(network, network, method(network, base), published.get(network))
-        for network in networks
-    ]
-    return Experiment(
-        "Networks",
-        f"paper, table II: ATE on {base.dataset} {split}"
-        if published
-        else "no published figure for this split",
-        cells,
-    )
+    source = "no published figure for this split"
+    if published:
+        source = f"paper, table II: ATE on {base.dataset} {split}"
+    cells = [Cell(name, name, method(name, base), published.get(name)) for name in networks]
+    return Experiment("Networks", source, cells)
 
 
 def components(base: TrainConfig) -> Experiment:
     """Bank and gated head apart and together. The paper's baseline is TLIO's own network; the plain
     linear head on GNIO's pooled features is printed beside it."""
+    plain = variant(base, bank_size=0, head="linear")
+    bank, gated = variant(base, head="linear"), variant(base, bank_size=0)
     return Experiment(
         "Components",
         "paper, component ablation: RMSE on TLIO's set",
         [
             Cell("tlio", "baseline (TLIO)", method("tlio", base), 2.40),
-            Cell(
-                "gnio_bank-0_linear",
-                "encoder + linear head",
-                variant(base, bank_size=0, head="linear"),
-            ),
-            Cell("gnio_linear", "+ bank", variant(base, head="linear"), 1.98),
-            Cell("gnio_bank-0", "+ gated head", variant(base, bank_size=0), 1.84),
+            Cell("gnio_bank-0_linear", "encoder + linear head", plain),
+            Cell("gnio_linear", "+ bank", bank, 1.98),
+            Cell("gnio_bank-0", "+ gated head", gated, 1.84),
             Cell("gnio", "+ bank + gated head", method("gnio", base), 1.66),
         ],
     )
@@ -145,59 +144,60 @@ def components(base: TrainConfig) -> Experiment:
 def gates(base: TrainConfig) -> Experiment:
     """Activations of gate and scale, without the bank: the paper's best row equals its gate-only
     row."""
-    rows = [
-        ("sigmoid", "linear", 2.05),
-        ("tanh", "linear", 2.00),
-        ("tanh", "exp", 1.94),
-        ("tanh", "abs", 1.92),
-        ("tanh", "pos_elu", 1.85),
-        ("tanh", "softplus", 1.84),
-    ]
-    cells = []
-    for gate, scale, published in rows:
-        usual = (gate, scale) == ("tanh", "softplus")
-        name = "gnio_bank-0" if usual else f"gnio_bank-0_{gate}_{scale}"
-        config = (
-            variant(base, bank_size=0)
-            if usual
-            else variant(base, bank_size=0, gate=gate, scale=scale)
-        )
-        cells.append(Cell(name, f"{gate} × {scale}", config, published))
+
+    def row(gate: str, scale: str, published: float) -> Cell:
+        name, options = f"gnio_bank-0_{gate}_{scale}", {"gate": gate, "scale": scale}
+        if (gate, scale) == ("tanh", "softplus"):  # the defaults: the row of `components`
+            name, options = "gnio_bank-0", {}
+        config = variant(base, bank_size=0, **options)
+        return Cell(name, f"{gate} × {scale}", config, published)
+
     return Experiment(
         "Gate and scale",
         "paper, gate and scale functions: RMSE on TLIO's set, without the bank",
-        cells,
+        [
+            row("sigmoid", "linear", 2.05),
+            row("tanh", "linear", 2.00),
+            row("tanh", "exp", 1.94),
+            row("tanh", "abs", 1.92),
+            row("tanh", "pos_elu", 1.85),
+            row("tanh", "softplus", 1.84),
+        ],
     )
 
 
 def bank_sizes(base: TrainConfig) -> Experiment:
     """Prototypes in the bank, with the linear head: the paper's m = 64 equals its bank-only row."""
-    cells = [Cell("gnio_bank-0_linear", "no bank", variant(base, bank_size=0, head="linear"))]
-    for size, published in [(16, 2.07), (32, None), (64, 1.98), (128, 2.07)]:
-        name = "gnio_linear" if size == 64 else f"gnio_bank-{size}_linear"
-        config = (
-            variant(base, head="linear")
-            if size == 64
-            else variant(base, head="linear", bank_size=size)
-        )
-        cells.append(Cell(name, f"m = {size}", config, published))
+
+    def row(size: int, published: float | None) -> Cell:
+        config = variant(base, head="linear", bank_size=size)
+        return Cell(f"gnio_bank-{size}_linear", f"m = {size}", config, published)
+
     return Experiment(
-        "Bank size", "paper, size of the bank: RMSE on TLIO's set, with the linear head", cells
+        "Bank size",
+        "paper, size of the bank: RMSE on TLIO's set, with the linear head",
+        [
+            Cell("gnio_bank-0_linear", "no bank", variant(base, bank_size=0, head="linear")),
+            row(16, 2.07),
+            row(32, None),
+            # The default size: the row of `components`.
+            Cell("gnio_linear", "m = 64", variant(base, head="linear"), 1.98),
+            row(128, 2.07),
+        ],
     )
 
 
 def bank_spread(base: TrainConfig) -> Experiment:
     """How far apart the prototypes start, with the linear head: the paper does not say, and near
     each other all are attended to alike."""
-    near = (8 * (base.model.width or 64)) ** -0.5
+    features = 8 * (base.model.width or 64)
+    near = variant(base, head="linear", bank_std=features**-0.5)
     return Experiment(
         "Prototypes before training",
         "no published figure: the paper does not say how its bank starts",
         [
             Cell("gnio_bank-0_linear", "no bank", variant(base, bank_size=0, head="linear")),
-            Cell(
-                "gnio_bank-near_linear", "N(0, 1/√d)", variant(base, head="linear", bank_std=near)
-            ),
+            Cell("gnio_bank-near_linear", "N(0, 1/√d)", near),
             Cell("gnio_linear", "N(0, 1)", variant(base, head="linear")),
         ],
     )
@@ -208,20 +208,19 @@ def remedies(base: TrainConfig) -> Experiment:
     errors on the validation split, is compared with heads that are calibrated on the same windows,
     with the published weight of the likelihood and with 1; the published head as it comes from
     training stands beside them."""
+    constant = variant(base, uncertainty="constant")
     calibrated = variant(base, uncertainty="calibrated")
+    likelihood = dataclasses.replace(
+        calibrated, loss=dataclasses.replace(calibrated.loss, nll_weight=1.0)
+    )
+    label = "head, likelihood weighted by 1, calibrated"
     return Experiment(
         "Uncertainty",
         "no published figure: the paper has its own head alone, at λ_NLL = 1e-4",
         [
-            Cell("gnio_constant", "one constant per axis", variant(base, uncertainty="constant")),
+            Cell("gnio_constant", "one constant per axis", constant),
             Cell("gnio_calibrated", "head, calibrated", calibrated),
-            Cell(
-                "gnio_calibrated_nll-1",
-                "head, likelihood weighted by 1, calibrated",
-                dataclasses.replace(
-                    calibrated, loss=dataclasses.replace(calibrated.loss, nll_weight=1.0)
-                ),
-            ),
+            Cell("gnio_calibrated_nll-1", label, likelihood),
             Cell("gnio", "head, as published: not calibrated", method("gnio", base)),
         ],
     )

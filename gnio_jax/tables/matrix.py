@@ -10,20 +10,21 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from rich.console import Console
 
 from gnio_jax import config as configuration
 from gnio_jax import evaluation
-from gnio_jax.config import EvaluateConfig
+from gnio_jax.config import EvaluateConfig, TablesConfig
 from gnio_jax.evaluation import metrics, report
 from gnio_jax.evaluation.metrics import Trajectory
 from gnio_jax.evaluation.run import folder_name
+from gnio_jax.evaluation.tum import read_tum
+from gnio_jax.reporting import Reporter
 from gnio_jax.tables.experiments import Cell
-from gnio_jax.training import loop
+from gnio_jax.training import loop, run_folder
 
 
 class Interrupted(Exception):
-    """A signal asked a training run to stop; it is saved, and the same command goes on from there."""
+    """A signal asked a training run to stop; it is saved, and the same command continues it."""
 
     def __init__(self, signum: int):
         super().__init__(signum)
@@ -40,48 +41,40 @@ class Result(NamedTuple):
     """Their work folders."""
 
 
-def run_cell(
-    cell: Cell,
-    seeds: int,
-    folder: Path,
-    split: str,
-    estimator: str,
-    console: Console,
-    workers: int = 1,
-) -> Result:
-    """Train and evaluate a cell with seeds 0 … seeds−1 below `folder`.
+def run_cell(cell: Cell, options: TablesConfig, reporter: Reporter, workers: int = 1) -> Result:
+    """Train and evaluate a cell with seeds 0 … seeds−1 below OUT/runs.
 
     A run that is finished is not trained again, one that was interrupted goes on, an evaluation
     that is there is read. Raises `InputError` if a folder holds a run with other settings, and
     `Interrupted` after a signal. `workers` processes read recordings that are slow to read.
     """
     figures, runs = [], []
-    for seed in range(seeds):
-        workdir = folder / f"{cell.name}_s{seed}"
+    for seed in range(options.seeds):
+        workdir = Path(options.out) / "runs" / f"{cell.name}_s{seed}"
         config = dataclasses.replace(cell.config, seed=seed, workdir=str(workdir))
-        train(config, console, workers)
-        figures.append(evaluated(workdir, split, estimator, console, workers))
+        train(config, reporter, workers)
+        figures.append(evaluated(workdir, options.split, options.estimator, reporter, workers))
         runs.append(workdir)
     return Result(cell, figures, runs)
 
 
-def train(config: configuration.TrainConfig, console: Console, workers: int = 1) -> None:
+def train(config: configuration.TrainConfig, reporter: Reporter, workers: int = 1) -> None:
     """Train the run of `config` to its end, if it is not there yet."""
     workdir = Path(config.workdir or "")
     begun = (workdir / "config.yaml").exists()
     if begun:
-        loop.prepare_workdir(config, resume=True)  # refuses other settings
+        run_folder.prepare(config, resume=True)  # refuses other settings
         log = workdir / "metrics.jsonl"
         if log.exists() and log.read_text(encoding="utf-8").count("\n") >= config.optim.epochs:
             return
-    console.rule(f"[bold]{workdir.name}[/bold]", align="left")
-    outcome = loop.train(config, resume=begun, console=console, workers=workers)
+    reporter.line(f"── {workdir.name}")
+    outcome = loop.train(config, resume=begun, reporter=reporter, workers=workers)
     if outcome.stopped_by:
         raise Interrupted(outcome.stopped_by)
 
 
 def evaluated(
-    workdir: Path, split: str, estimator: str, console: Console, workers: int = 1
+    workdir: Path, split: str, estimator: str, reporter: Reporter, workers: int = 1
 ) -> dict[str, Any]:
     """The figures of the run's best checkpoint on a split: those that are there if they are of that
     checkpoint and mean the same (`report.DEFINITIONS`), else new ones."""
@@ -93,7 +86,7 @@ def evaluated(
         same = report.definitions(found) == report.DEFINITIONS
         if same and (best / str(found["settings"]["step"])).is_dir():
             return found
-    console.print(f"evaluating {workdir.name} on {split} ({estimator})")
+    reporter.line(f"evaluating {workdir.name} on {split} ({estimator})")
     evaluation.evaluate(config, workers=workers)
     return json.loads(path.read_text(encoding="utf-8"))
 
@@ -107,32 +100,36 @@ def _evaluation(workdir: Path, split: str, estimator: str) -> tuple[EvaluateConf
     return config, workdir / "eval" / folder_name(config, trained.dataset, trained)
 
 
-def paths(
-    result: Result, split: str, estimator: str
-) -> dict[str, tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]]]:
-    """Reference and the first seed's estimate of each sequence seen from above, m.
+class PlanView(NamedTuple):
+    """Paths of one sequence seen from above, m."""
 
-    The estimate is laid on by start position and yaw; it is NaN from where it diverged.
-    """
+    reference: Float[np.ndarray, "n 2"]
+    estimate: Float[np.ndarray, "n 2"]
+    """Laid on by start position and yaw; NaN from where it diverged."""
+
+
+def paths(result: Result, split: str, estimator: str) -> dict[str, PlanView]:
+    """Reference and the first seed's estimate of each sequence that has a reference."""
     _, folder = _evaluation(result.runs[0], split, estimator)
     names = list(result.figures[0]["sequences"])
     found = {}
     for name, stem in zip(names, report.file_names(names), strict=True):
-        if (folder / "references" / f"{stem}.txt").exists():
-            estimate, reference = (
-                _trajectory(folder / kind / f"{stem}.txt")
-                for kind in ("trajectories", "references")
-            )
-            # The reference has no row where it is not trusted, the estimate none where not finite.
-            rows = np.searchsorted(estimate.time, reference.time - 1e-6)
-            rows = np.minimum(rows, len(estimate.time) - 1)
-            there = np.abs(estimate.time[rows] - reference.time) <= 1e-6
-            poses = (np.where(there[:, None], field[rows], np.nan) for field in estimate[1:])
-            estimate = metrics.align(Trajectory(reference.time, *poses), reference)
-            found[name] = reference.position[:, :2], estimate.position[:, :2]
+        reference, estimate = (
+            folder / kind / f"{stem}.txt" for kind in ("references", "trajectories")
+        )
+        if reference.exists():
+            found[name] = _plan_view(read_tum(estimate), read_tum(reference))
     return found
 
 
-def _trajectory(path: Path) -> Trajectory:
-    rows = np.loadtxt(path, ndmin=2)
-    return Trajectory(rows[:, 0], rows[:, 1:4], rows[:, [7, 4, 5, 6]])
+def _plan_view(estimate: Trajectory, reference: Trajectory) -> PlanView:
+    """Files have no row where the reference is not trusted or the estimate not finite."""
+    rows = np.searchsorted(estimate.time, reference.time - 1e-6)
+    rows = np.minimum(rows, len(estimate.time) - 1)
+    present = np.abs(estimate.time[rows] - reference.time) <= 1e-6
+    poses = (
+        np.where(present[:, None], part[rows], np.nan)
+        for part in (estimate.position, estimate.orientation)
+    )
+    aligned = metrics.align(Trajectory(reference.time, *poses), reference)
+    return PlanView(reference.position[:, :2], aligned.position[:, :2])

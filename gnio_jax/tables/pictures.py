@@ -1,5 +1,5 @@
-"""Pictures of the tables. Only imported when one is drawn; colours are those of Okabe and Ito, the
-reference is black."""
+"""Pictures of the tables. Import it only where one is drawn (Matplotlib); colours are those of
+Okabe and Ito, the reference is black."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from matplotlib.figure import Figure
 from gnio_jax.evaluation import plots
 from gnio_jax.evaluation.plots import BLUE, GREEN, GREY, VERMILION
 from gnio_jax.files import replacing
+from gnio_jax.tables.activities import ACTIVITIES, HORIZONTAL, PredictedWindows
 from gnio_jax.tables.experiments import Experiment
 from gnio_jax.tables.matrix import Result
-from gnio_jax.tables.summary import Row, errors
-from gnio_jax.tables.windows import ACTIVITIES, Said
+from gnio_jax.tables.summary import TableRow, errors
 
 COLOURS = {
     "tlio": BLUE,
@@ -31,6 +31,7 @@ COLOURS = {
 }
 """TLIO blue and GNIO green, as in the paper's figure."""
 OTHERS = (BLUE, VERMILION, GREEN, "#CC79A7", "#E69F00", "#56B4E9")
+LIGHT_GRID = "#E5E5E5"
 
 
 def save(path: Path, figure: Figure) -> None:
@@ -39,42 +40,20 @@ def save(path: Path, figure: Figure) -> None:
         plots.save(temporary, figure)
 
 
-def table(experiment: Experiment, results: list[Result], found: list[Row]) -> Figure:
+# Errors of the rows
+# --------------------------------------------------------------------------------------------------
+
+
+def table(experiment: Experiment, results: list[Result], found: list[TableRow]) -> Figure:
     """`ate` of each row: every seed a dot, their mean a bar, sequences behind it; beside it what
     the paper printed. Of what diverged there is no dot: the row's label says how many."""
     published = [row.published for row in found]
     beside = any(value is not None for value in published)
     figure = Figure(figsize=(9.0 if beside else 6.4, 1.4 + 0.45 * len(found)), layout="constrained")
-    panels = np.atleast_1d(
-        figure.subplots(1, 2 if beside else 1, sharey=True, width_ratios=(2, 1) if beside else (1,))
-    )
+    ratios = (2, 1) if beside else (1,)
+    panels = np.atleast_1d(figure.subplots(1, len(ratios), sharey=True, width_ratios=ratios))
     ours = panels[0]
-    for place, (result, row) in enumerate(zip(results, found, strict=True)):
-        seeds = row.seeds.get("ate", [])
-        sequences = [each.mean() for each in errors(result).values() if np.isfinite(each).all()]
-        ours.barh(place, np.mean(seeds) if seeds else 0.0, color=GREEN, alpha=0.35, height=0.6)
-        ours.plot(
-            sequences,
-            np.full(len(sequences), place) + 0.2,
-            "|",
-            color=GREY,
-            ms=7,
-            label="sequence" if place == 0 else None,
-        )
-        ours.plot(
-            seeds,
-            np.full(len(seeds), place),
-            "o",
-            color="black",
-            ms=4,
-            label="seed, mean over sequences" if place == 0 else None,
-        )
-    lost = [
-        f"\n({row.diverged} of {row.estimates} diverged)" if row.diverged else "" for row in found
-    ]
-    labels = [row.label + words for row, words in zip(found, lost, strict=True)]
-    ours.set_yticks(range(len(found)), labels)
-    ours.invert_yaxis()
+    _draw_ours(ours, results, found)
     ours.set(xlabel="ate, here (m)", title=experiment.title)
     ours.set_xlim(left=0)
     figure.legend(
@@ -85,15 +64,40 @@ def table(experiment: Experiment, results: list[Result], found: list[Row]) -> Fi
         ncols=2,
     )
     if beside:
-        for place, value in enumerate(published):
-            if value is not None:
-                panels[1].barh(place, value, color=BLUE, alpha=0.35, height=0.6)
-                panels[1].text(value, place, f" {value:.2f}", va="center", fontsize=8)
-        panels[1].set(xlabel="published m, on other data", title="paper")
-        panels[1].margins(x=0.2)
+        _draw_published(panels[1], published)
     for axes in panels:
-        _finish(axes)
+        plots.finish(axes, LIGHT_GRID)
     return figure
+
+
+def _draw_ours(axes: Axes, results: list[Result], found: list[TableRow]) -> None:
+    for place, (result, row) in enumerate(zip(results, found, strict=True)):
+        seeds = row.seeds.get("ate", [])
+        sequences = [ates.mean() for ates in errors(result).values() if np.isfinite(ates).all()]
+        labels = ("sequence", "seed, mean over sequences") if place == 0 else (None, None)
+        axes.barh(place, np.mean(seeds) if seeds else 0.0, color=GREEN, alpha=0.35, height=0.6)
+        above = np.full(len(sequences), place) + 0.2
+        axes.plot(sequences, above, "|", color=GREY, ms=7, label=labels[0])
+        axes.plot(seeds, np.full(len(seeds), place), "o", color="black", ms=4, label=labels[1])
+    lost = [
+        f"\n({row.diverged} of {row.estimates} diverged)" if row.diverged else "" for row in found
+    ]
+    names = [row.label + words for row, words in zip(found, lost, strict=True)]
+    axes.set_yticks(range(len(found)), names)
+    axes.invert_yaxis()
+
+
+def _draw_published(axes: Axes, published: list[float | None]) -> None:
+    for place, value in enumerate(published):
+        if value is not None:
+            axes.barh(place, value, color=BLUE, alpha=0.35, height=0.6)
+            axes.text(value, place, f" {value:.2f}", va="center", fontsize=8)
+    axes.set(xlabel="published m, on other data", title="paper")
+    axes.margins(x=0.2)
+
+
+# Training
+# --------------------------------------------------------------------------------------------------
 
 
 def gradients(results: list[Result]) -> Figure:
@@ -114,16 +118,18 @@ def gradients(results: list[Result]) -> Figure:
     axes.yaxis.set_major_formatter("{x:g}")
     axes.yaxis.set_minor_formatter("{x:g}")
     axes.legend(fontsize=8, frameon=False)
-    _finish(axes)
+    plots.finish(axes, LIGHT_GRID)
     return figure
 
 
 def scale_gradients(run: Path) -> list[float]:
     """Norm of the gradient of the scale's layer in every epoch of a run, a mean over its steps."""
-    return [
-        json.loads(line)["gradient_norm/head/scale"]
-        for line in (run / "metrics.jsonl").read_text(encoding="utf-8").splitlines()
-    ]
+    lines = (run / "metrics.jsonl").read_text(encoding="utf-8").splitlines()
+    return [json.loads(line)["gradient_norm/head/scale"] for line in lines]
+
+
+# Trajectories
+# --------------------------------------------------------------------------------------------------
 
 
 class Track(NamedTuple):
@@ -141,24 +147,16 @@ def trajectories(
     lines = -(-len(sequences) // columns)
     figure = Figure(figsize=(3.6 * columns, 3.6 * lines + 0.5), layout="constrained")
     panels = np.atleast_1d(figure.subplots(lines, columns)).ravel()
-    for axes, (name, (reference, tracks)) in zip(panels, sequences.items(), strict=False):
-        axes.plot(*reference.T, color="black", lw=1.8, label="reference")
-        for number, track in enumerate(tracks):
-            axes.plot(
-                *track.path.T,
-                color=COLOURS.get(track.method, OTHERS[number % len(OTHERS)]),
-                lw=1.1,
-                label=track.method,
-            )
-        axes.plot(*reference[0], "o", color="black", mfc="white", ms=6, zorder=4)
-        axes.set_aspect("equal", adjustable="datalim")
+    used, unused = panels[: len(sequences)], panels[len(sequences) :]
+    for axes, (name, (reference, tracks)) in zip(used, sequences.items(), strict=True):
+        _draw_tracks(axes, reference, tracks)
         axes.set_title(name, fontsize=9)
-        _finish(axes)
-    for axes in panels[len(sequences) :]:
+        plots.finish(axes, LIGHT_GRID)
+    for axes in unused:
         axes.set_visible(False)
     handles = {
         label: handle
-        for axes in panels[: len(sequences)]
+        for axes in used
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)
     }
     figure.legend(
@@ -174,7 +172,19 @@ def trajectories(
     return figure
 
 
-def gate(windows: Said) -> Figure:
+def _draw_tracks(axes: Axes, reference: Float[np.ndarray, "n 2"], tracks: list[Track]) -> None:
+    axes.plot(*reference.T, color="black", lw=1.8, label="reference")
+    for number, track in enumerate(tracks):
+        axes.plot(*track.path.T, color=_colour(track.method, number), lw=1.1, label=track.method)
+    axes.plot(*reference[0], "o", color="black", mfc="white", ms=6, zorder=4)
+    axes.set_aspect("equal", adjustable="datalim")
+
+
+# Windows at rest and in motion
+# --------------------------------------------------------------------------------------------------
+
+
+def gate(windows: PredictedWindows) -> Figure:
     """Distribution of the gate, the scale and their product, horizontal axes, at rest and in
     motion."""
     figure = Figure(figsize=(10.0, 3.4), layout="constrained")
@@ -183,23 +193,23 @@ def gate(windows: Said) -> Figure:
         "scale (m)": np.abs(windows.diagnostics["scale"]),
         "|scale × gate| (m)": np.abs(windows.displacement),
     }
-    groups = {
-        "standing": (windows.activity == 0, VERMILION),
-        "slow": (windows.activity == 1, GREY),
-        "moving": (windows.activity > 1, BLUE),
+    standing_still, slow = (ACTIVITIES.index(name) for name in ("standing", "slow"))
+    rows = {
+        "standing": (windows.activity == standing_still, VERMILION),
+        "slow": (windows.activity == slow, GREY),
+        "moving": (windows.activity > slow, BLUE),
     }
     for axes, (name, values) in zip(figure.subplots(1, 3), quantities.items(), strict=True):
-        edges = (
-            np.linspace(0, 1, 41)
-            if name == "|gate|"
-            else np.linspace(0, max(np.percentile(values[:, :2], 99), 1e-3), 41)
-        )
-        for label, (those, colour) in groups.items():
-            if those.any():
-                share = np.histogram(values[those, :2], edges)[0] / (2 * those.sum())
-                axes.stairs(share, edges, color=colour, lw=1.6, label=f"{label} ({those.sum():,})")
+        horizontal = values[:, HORIZONTAL]
+        largest = 1.0 if name == "|gate|" else max(np.percentile(horizontal, 99), 1e-3)
+        edges = np.linspace(0, largest, 41)
+        for label, (chosen, colour) in rows.items():
+            if chosen.any():
+                share = np.histogram(horizontal[chosen], edges)[0] / (2 * chosen.sum())
+                count = f"{label} ({chosen.sum():,})"
+                axes.stairs(share, edges, color=colour, lw=1.6, label=count)
         axes.set(xlabel=name, ylabel="share of windows and axes")
-        _finish(axes)
+        plots.finish(axes, LIGHT_GRID)
     figure.axes[0].legend(fontsize=8, frameon=False)
     return figure
 
@@ -225,14 +235,14 @@ def attention(names: list[str], lifts: Float[np.ndarray, "a p"], words: str) -> 
     return figure
 
 
-def entropies(rows: list[str], each: list[list[float]], mean: list[list[float]]) -> Figure:
+def entropies(rows: list[str], of_window: list[list[float]], of_mean: list[list[float]]) -> Figure:
     """Entropy of the attention of each row, as a share of that of a uniform one; a dot for each
     seed."""
     figure = Figure(figsize=(5.6, 3.8), layout="constrained")
     axes = figure.add_subplot()
     for values, colour, label in [
-        (each, GREEN, "of one window"),
-        (mean, GREY, "of the mean over windows"),
+        (of_window, GREEN, "of one window"),
+        (of_mean, GREY, "of the mean over windows"),
     ]:
         axes.plot([np.mean(seeds) for seeds in values], color=colour, label=label)
         for place, seeds in enumerate(values):
@@ -245,32 +255,25 @@ def entropies(rows: list[str], each: list[list[float]], mean: list[list[float]])
         title="How the attention spreads over the bank",
     )
     axes.legend(fontsize=8, frameon=False)
-    _finish(axes)
+    plots.finish(axes, LIGHT_GRID)
     return figure
 
 
 def standing(by_method: dict[str, dict[str, dict[str, float]]]) -> Figure:
     """Error of a window's displacement by what the walker did, one line of dots per method."""
-    names = [name for name in ACTIVITIES if any(name in found for found in by_method.values())]
+    names = [name for name in ACTIVITIES if any(name in figures for figures in by_method.values())]
     figure = Figure(figsize=(7.2, 4.0), layout="constrained")
     axes = figure.add_subplot()
-    for number, (method, found) in enumerate(by_method.items()):
+    for number, (method, figures) in enumerate(by_method.items()):
         places = np.arange(len(names)) + 0.1 * (number - (len(by_method) - 1) / 2)
-        axes.semilogy(
-            places,
-            [found.get(name, {}).get("error", np.nan) for name in names],
-            "o",
-            color=COLOURS.get(method, OTHERS[number % len(OTHERS)]),
-            label=method,
-        )
+        values = [figures.get(name, {}).get("error", np.nan) for name in names]
+        axes.semilogy(places, values, "o", color=_colour(method, number), label=method)
     axes.set_xticks(range(len(names)), names)
     axes.set(ylabel="rms error of a window's displacement (m)", title="By what the walker did")
     axes.legend(fontsize=8, frameon=False)
-    _finish(axes)
+    plots.finish(axes, LIGHT_GRID)
     return figure
 
 
-def _finish(axes: Axes) -> None:
-    axes.grid(True, color="#E5E5E5", lw=0.6)
-    axes.set_axisbelow(True)
-    axes.spines[["top", "right"]].set_visible(False)
+def _colour(method: str, number: int) -> str:
+    return COLOURS.get(method, OTHERS[number % len(OTHERS)])

@@ -1,17 +1,13 @@
-"""Means and spread over seeds, differences over pairs of sequences, and the files of a table."""
+"""Means over seeds, and differences of rows over pairs of sequences."""
 
 from __future__ import annotations
 
-import csv
-import math
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from gnio_jax.evaluation import metrics, report
-from gnio_jax.files import replacing
 from gnio_jax.tables.experiments import Experiment
 from gnio_jax.tables.matrix import Result
 
@@ -27,7 +23,7 @@ COLUMNS = {
 """Metrics of every table: name in metrics.json, heading."""
 
 
-class Row(NamedTuple):
+class TableRow(NamedTuple):
     """One configuration over its seeds.
 
     An estimate that diverged has an infinite `ate`. It is in `diverged` and `median`; means leave
@@ -68,269 +64,135 @@ class Row(NamedTuple):
     """Figures that belong to this table alone."""
 
 
-def rows(
-    experiment: Experiment, results: list[Result], extra: dict[str, dict[str, float]] | None = None
-) -> list[Row]:
-    """The table of an experiment; `extra` holds more figures by the name of a cell.
+Figures = dict[str, Any]
+"""One metrics.json."""
+Extra = dict[str, dict[str, float]]
+"""Figures that belong to one table alone: name of a cell -> heading -> value."""
 
-    Sequences are paired by name.
-    """
-    first, published, group = errors(results[0]), experiment.cells[0].published, groups(results)
-    found: list[Row] = []
+
+class Difference(NamedTuple):
+    """Of `ate` between a row and the first, over the sequences that both have and in which neither
+    diverged with any seed. None, all three, without such a sequence."""
+
+    gain: float | None
+    """% by which the row's is smaller."""
+    mean: float | None
+    """Row minus first, over sequences, of the means over seeds, m."""
+    interval: tuple[float, float] | None
+    """95 % of the mean, groups drawn anew; None for a single group."""
+
+
+def rows(
+    experiment: Experiment, results: list[Result], extra: Extra | None = None
+) -> list[TableRow]:
+    """The table of an experiment. Sequences are paired by name."""
+    first, published = errors(results[0]), experiment.cells[0].published
+    group_of, found = groups(results), []
     for result in results:
-        cell, own = result.cell, errors(result)
-        every = np.array([ate for one in result.figures for ate in _ates(one).values()], float)
-        diverged = int(np.isinf(every).sum())
-        pairs = [
-            name for name in own if name in first and np.isfinite([*own[name], *first[name]]).all()
-        ]
-        ours, theirs = (np.array([table[name].mean() for name in pairs]) for table in (own, first))
-        drawn = [group[name] for name in pairs]
-        gain = 100 * (1 - float(ours.mean() / theirs.mean())) if pairs else None
-        difference = float((ours - theirs).mean()) if pairs else None
-        interval = metrics.bootstrap(ours - theirs, drawn) if found else None
-        more_often = found and diverged * found[0].estimates > found[0].diverged * len(every)
-        if more_often and gain is not None and gain > 0:
-            gain = difference = interval = None
-        published_gain = None
-        if cell.published is not None and published is not None:
-            published_gain = 100 * (1 - cell.published / published)
-        found.append(
-            Row(
-                name=cell.name,
-                label=cell.label,
-                published=cell.published,
-                published_gain=published_gain,
-                seeds=_seeds(result),
-                median=float(np.median(every)) if len(every) else None,
-                diverged=diverged,
-                estimates=len(every),
-                compared=len(pairs),
-                sequences=len(own.keys() | first.keys()),
-                groups=len(set(drawn)),
-                gain=gain,
-                difference=difference,
-                interval=interval,
-                extra=(extra or {}).get(cell.name, {}),
-            )
+        cell, own, every = result.cell, errors(result), _every_ate(result)
+        pairs = _pairs(own, first)
+        difference = _difference(own, first, pairs, group_of)
+        row = TableRow(
+            name=cell.name,
+            label=cell.label,
+            published=cell.published,
+            published_gain=_published_gain(cell.published, published),
+            seeds=_means_of_seeds(result),
+            median=float(np.median(every)) if len(every) else None,
+            diverged=int(np.isinf(every).sum()),
+            estimates=len(every),
+            compared=len(pairs),
+            sequences=len(own.keys() | first.keys()),
+            groups=len({group_of[name] for name in pairs}),
+            gain=difference.gain,
+            difference=difference.mean,
+            interval=difference.interval,
+            extra=(extra or {}).get(cell.name, {}),
         )
+        found.append(_withheld(row, found[0]) if found else row._replace(interval=None))
     return found
 
 
 def errors(result: Result) -> dict[str, Float[np.ndarray, "seeds"]]:
     """Sequence -> `ate` with every seed, m, infinite where the estimate diverged.
 
-    Of the sequences that have one with every seed.
+    Only sequences that have one with every seed.
     """
-    each = [_ates(figures) for figures in result.figures]
+    seeds = [_ates(figures) for figures in result.figures]
     return {
-        name: np.array([one[name] for one in each], float)
-        for name in sorted(each[0])
-        if all(name in one for one in each)
-    }
-
-
-def _ates(figures: dict[str, Any]) -> dict[str, float]:
-    """Of the sequences of one metrics.json, those that have one."""
-    return {
-        name: ate
-        for name, one in figures["sequences"].items()
-        if (ate := report.read_metric(one, "ate")) is not None
+        name: np.array([ates[name] for ates in seeds], float)
+        for name in sorted(seeds[0])
+        if all(name in ates for ates in seeds)
     }
 
 
 def groups(results: list[Result]) -> dict[str, str]:
     """Sequence -> the person or session it belongs to."""
     return {
-        name: one["group"]
+        name: sequence["group"]
         for result in results
         for figures in result.figures
-        for name, one in figures["sequences"].items()
+        for name, sequence in figures["sequences"].items()
     }
 
 
-def _seeds(result: Result) -> dict[str, list[float]]:
-    values = {
+def _ates(figures: Figures) -> dict[str, float]:
+    """Sequence -> `ate`, m, of the sequences that have one."""
+    ates = {
+        name: report.read_metric(sequence, "ate") for name, sequence in figures["sequences"].items()
+    }
+    return {name: ate for name, ate in ates.items() if ate is not None}
+
+
+def _every_ate(result: Result) -> Float[np.ndarray, "estimates"]:
+    """Over seeds × sequences, m."""
+    return np.array([ate for seed in result.figures for ate in _ates(seed).values()], float)
+
+
+def _means_of_seeds(result: Result) -> dict[str, list[float]]:
+    """Metric -> mean over sequences with each seed; only metrics that have one with every seed."""
+    means = {
         metric: [figures["mean"].get(metric) for figures in result.figures] for metric in COLUMNS
     }
     return {
-        metric: [float(v) for v in each]
-        for metric, each in values.items()
-        if all(v is not None for v in each)
+        metric: [float(value) for value in values]
+        for metric, values in means.items()
+        if all(value is not None for value in values)
     }
 
 
-def spread(values: list[float]) -> float:
-    """Standard deviation over seeds; NaN of one."""
-    return float(np.std(values, ddof=1)) if len(values) > 1 else math.nan
+def _pairs(own: dict[str, np.ndarray], first: dict[str, np.ndarray]) -> list[str]:
+    """Sequences that both rows have and in which neither diverged with any seed."""
+    return [name for name in own if name in first and np.isfinite([*own[name], *first[name]]).all()]
 
 
-def arrow(gain: float | None) -> str:
-    """As the paper prints gains: ↓ and the share by which the error is smaller, ↑ by which it is
-    larger."""
-    return (
-        ""
-        if gain is None
-        else "0 %"
-        if round(gain, 1) == 0
-        else f"{'↓' if gain > 0 else '↑'} {abs(gain):.1f} %"
+def _difference(
+    own: dict[str, np.ndarray],
+    first: dict[str, np.ndarray],
+    pairs: list[str],
+    group_of: dict[str, str],
+) -> Difference:
+    if not pairs:
+        return Difference(None, None, None)
+    ours, theirs = (np.array([table[name].mean() for name in pairs]) for table in (own, first))
+    return Difference(
+        gain=100 * (1 - float(ours.mean() / theirs.mean())),
+        mean=float((ours - theirs).mean()),
+        interval=metrics.bootstrap(ours - theirs, [group_of[name] for name in pairs]),
     )
 
 
-def markdown(experiment: Experiment, found: list[Row], notes: list[str]) -> str:
-    """The table as Markdown: means ± standard deviations over seeds, then what its marks say."""
-    extra = list(dict.fromkeys(name for row in found for name in row.extra))
-    others = [
-        metric
-        for metric in COLUMNS
-        if metric != "ate" and any(metric in row.seeds for row in found)
-    ]
-    any_diverged = any(row.diverged for row in found)
-    header = [
-        "",
-        COLUMNS["ate"],
-        "median",
-        *(COLUMNS[metric] for metric in others),
-        *(["diverged"] if any_diverged else []),
-        *extra,
-        "gain",
-        "difference of ate, m (95 %)",
-        "published m",
-        "its gain",
-    ]
-    table = []
-    for row in found:
-        cells = [_mean(row, "ate"), _median(row), *(_mean(row, metric) for metric in others)]
-        if any_diverged:
-            cells.append(f"{row.diverged} of {row.estimates}")
-        cells += [f"{row.extra[name]:.3g}" if name in row.extra else "–" for name in extra]
-        compared = row is not found[0]
-        cells += [
-            _gain(row) if compared else "",
-            _difference(row) if compared else "",
-            "–" if row.published is None else f"{row.published:.2f}",
-            arrow(row.published_gain) if compared else "",
-        ]
-        table.append([row.label, *cells])
-    text = "\n".join([f"## {experiment.title}", "", *notes, ""]) + "\n" + grid(header, table)
-    return text + "".join(f"\n{line}\n" for line in _explained(found))
+def _published_gain(published: float | None, first: float | None) -> float | None:
+    """% by which the paper's figure is smaller than its first row's."""
+    if published is None or first is None:
+        return None
+    return 100 * (1 - published / first)
 
 
-def _mean(row: Row, metric: str) -> str:
-    if metric not in row.seeds:
-        return "–"
-    return _with_spread(row.seeds[metric]) + (" †" if row.diverged else "")
-
-
-def _median(row: Row) -> str:
-    if row.median is None:
-        return "–"
-    return "∞" if math.isinf(row.median) else f"{row.median:.{_digits(row.median)}f}"
-
-
-def _gain(row: Row) -> str:
-    return "–" if row.gain is None else arrow(row.gain)
-
-
-def _difference(row: Row) -> str:
-    if row.difference is None:
-        return "–"
-    between = f" ({row.interval[0]:+.2f} to {row.interval[1]:+.2f})" if row.interval else ""
-    over = f" over {row.compared} of {row.sequences}" if row.compared < row.sequences else ""
-    return f"{row.difference:+.2f}{between}{over}"
-
-
-def _explained(found: list[Row]) -> list[str]:
-    lines = []
-    if any(row.interval for row in found):
-        drawn = " or ".join(str(n) for n in sorted({row.groups for row in found if row.interval}))
-        lines.append(
-            "The interval draws whole groups of sequences (people or sessions) anew; "
-            f"there are {drawn}."
-        )
-    if any(row.diverged for row in found):
-        lines.append(
-            "† Over the estimates that did not diverge. The median counts a diverged one "
-            "as infinite. Gain and difference are over the sequences in which neither row "
-            "diverged. A row that would be better there but diverged more often than "
-            "the first has neither."
-        )
-    return lines
-
-
-def grid(header: list[str], table: list[list[str]]) -> str:
-    """Cells as a Markdown table."""
-    return "".join(
-        f"| {' | '.join(cells)} |\n" for cells in [header, ["---"] * len(header), *table]
-    )
-
-
-def _with_spread(values: list[float]) -> str:
-    digits = _digits(float(np.mean(values)))
-    return f"{np.mean(values):.{digits}f}" + (
-        f" ± {spread(values):.{digits}f}" if len(values) > 1 else ""
-    )
-
-
-def _digits(value: float) -> int:
-    return 3 if abs(value) < 1 else 2
-
-
-def write(path: Path, experiment: Experiment, found: list[Row], notes: list[str]) -> None:
-    """`path`.md and `path`.csv."""
-    with replacing(path.with_suffix(".md")) as temporary:
-        temporary.write_text(markdown(experiment, found, notes), encoding="utf-8")
-    columns = list(COLUMNS)
-    extra = list(dict.fromkeys(name for row in found for name in row.extra))
-    with (
-        replacing(path.with_suffix(".csv")) as temporary,
-        open(temporary, "w", newline="", encoding="utf-8") as file,
-    ):
-        table = csv.writer(file)
-        table.writerow(
-            [
-                "name",
-                "label",
-                "seeds",
-                *columns,
-                *(f"{metric}_std" for metric in columns),
-                *extra,
-                "gain_percent",
-                "difference",
-                "difference_low",
-                "difference_high",
-                "published",
-                "published_gain_percent",
-                "ate_median",
-                "diverged",
-                "estimates",
-                "compared",
-                "sequences",
-                "groups",
-            ]
-        )
-        for row in found:
-            means = [np.mean(row.seeds[m]) if m in row.seeds else "" for m in columns]
-            spreads = [
-                spread(row.seeds[m]) if len(row.seeds.get(m, [])) > 1 else "" for m in columns
-            ]
-            low, high = row.interval or ("", "")
-            seeds, more = (
-                len(next(iter(row.seeds.values()), [])),
-                [row.extra.get(name, "") for name in extra],
-            )
-            values = [
-                *means,
-                *spreads,
-                *more,
-                row.gain,
-                row.difference,
-                low,
-                high,
-                row.published,
-                row.published_gain,
-                row.median,
-            ]
-            counts = [row.diverged, row.estimates, row.compared, row.sequences, row.groups]
-            texts = ("" if value is None or value == "" else repr(float(value)) for value in values)
-            table.writerow([row.name, row.label, seeds, *texts, *counts])
+def _withheld(row: TableRow, first: TableRow) -> TableRow:
+    """Without gain and difference where the row would gain but diverged more often than the first:
+    where it did, it is not better."""
+    more_often = row.diverged * first.estimates > first.diverged * row.estimates
+    if more_often and row.gain is not None and row.gain > 0:
+        return row._replace(gain=None, difference=None, interval=None)
+    return row

@@ -1,5 +1,6 @@
-"""Checkpoints of a run: `checkpoints/latest` to resume from and `checkpoints/best` to evaluate. The
-only importer of Orbax.
+"""Checkpoints of a run: `checkpoints/latest` to resume from, `checkpoints/best` to evaluate.
+
+The only importer of Orbax.
 
 Orbax writes a checkpoint into a temporary folder and renames it, so a killed process leaves the
 previous one whole.
@@ -104,7 +105,10 @@ class Checkpoints:
         manager.save(position.step, args=ocp.args.Composite(**items))
 
     def restore(self, template: TrainState) -> tuple[TrainState, Position]:
-        """The latest state, in the structure of `template`. Raises `InputError` if it does not fit."""
+        """The latest state, in the structure of `template`.
+
+        Raises `InputError` if it does not fit.
+        """
         manager = self._managers["latest"]
         step = manager.latest_step()
         where = self._workdir / "checkpoints" / "latest"
@@ -112,27 +116,16 @@ class Checkpoints:
             raise InputError(where, "holds no checkpoint", "start the run without --resume")
         variables = {"params": template.params, "batch_stats": template.batch_stats}
         meta = _checked_meta(manager, step, variables, where)
-        restored = manager.restore(step, args=ocp.args.Composite(
-            variables=ocp.args.StandardRestore(variables), optimizer=ocp.args.StandardRestore(template.opt_state)))  # fmt: skip
-        found = meta["position"]
-        position = Position(
-            **(
-                found
-                | {
-                    "loss_sums": tuple(found["loss_sums"]),
-                    "plateau": Plateau(*found.get("plateau", ())),
-                }
-            )
+        items = ocp.args.Composite(
+            variables=ocp.args.StandardRestore(variables),
+            optimizer=ocp.args.StandardRestore(template.opt_state),
         )
+        restored = manager.restore(step, args=items)
+        variables = restored["variables"]
         state = TrainState(
-            jnp.int32(step),
-            restored["variables"]["params"],
-            restored["variables"]["batch_stats"],
-            restored["optimizer"],
+            jnp.int32(step), variables["params"], variables["batch_stats"], restored["optimizer"]
         )
-        # Orbax hands out arrays that are committed to a device; a plain copy keeps one compiled
-        # step for both cases.
-        return jax.tree.map(lambda x: jnp.array(jax.device_get(x)), state), position
+        return _uncommitted(state), _position(meta["position"])
 
 
 def load_run(workdir: Path, which: Which = "best") -> Run:
@@ -146,7 +139,7 @@ def load_run(workdir: Path, which: Which = "best") -> Run:
         raise InputError(
             workdir,
             "holds no run (config.yaml is missing)",
-            "train one with python train.py --workdir ...",
+            "train one with gnio train --workdir ...",
         )
     config = configuration.validate(
         configuration.load(workdir / "config.yaml"), str(workdir / "config.yaml")
@@ -156,7 +149,7 @@ def load_run(workdir: Path, which: Which = "best") -> Run:
         raise InputError(
             where,
             "holds no checkpoint",
-            "let python train.py finish its first epoch, or give another --workdir",
+            "let gnio train finish its first epoch, or give another --workdir",
         )
     model = create_model(config)
     template = jax.eval_shape(
@@ -176,13 +169,7 @@ def load_run(workdir: Path, which: Which = "best") -> Run:
                 f"cannot be read ({str(error)[:120]})",
                 "the checkpoint is damaged",
             ) from None
-    return Run(
-        config,
-        model,
-        jax.tree.map(lambda x: jnp.array(jax.device_get(x)), variables),
-        meta["position"]["epoch"],
-        step,
-    )
+    return Run(config, model, _uncommitted(variables), meta["position"]["epoch"], step)
 
 
 def _manager(folder: Path, create: bool) -> ocp.CheckpointManager:
@@ -192,9 +179,24 @@ def _manager(folder: Path, create: bool) -> ocp.CheckpointManager:
     return ocp.CheckpointManager(folder.absolute(), options=options)
 
 
+def _uncommitted(tree: Any) -> Any:
+    """Plain copies of arrays that Orbax has committed to a device: one compiled step for both."""
+    return jax.tree.map(lambda x: jnp.array(jax.device_get(x)), tree)
+
+
+def _position(found: dict[str, Any]) -> Position:
+    """A position as JSON keeps it; older checkpoints have no plateau."""
+    tuples = {
+        "loss_sums": tuple(found["loss_sums"]),
+        "plateau": Plateau(*found.get("plateau", ())),
+    }
+    return Position(**(found | tuples))
+
+
 def _shapes(variables: Any) -> dict[str, list[int]]:
-    return {jax.tree_util.keystr(path, simple=True, separator="/"): list(leaf.shape)
-            for path, leaf in jax.tree_util.tree_leaves_with_path(variables)}  # fmt: skip
+    leaves = jax.tree_util.tree_leaves_with_path(variables)
+    names = {path: jax.tree_util.keystr(path, simple=True, separator="/") for path, _ in leaves}
+    return {names[path]: list(leaf.shape) for path, leaf in leaves}
 
 
 def _checked_meta(
@@ -210,8 +212,10 @@ def _checked_meta(
     wanted = _shapes(variables)
     for name in sorted(wanted.keys() | found.keys()):
         if wanted.get(name) != found.get(name):
-            raise InputError(
-                where, f"'{name}' has shape {found.get(name)} in the checkpoint and {wanted.get(name)} in the configured model",
-                "model.width and the other model fields must be those of the run",
-            )  # fmt: skip
+            problem = (
+                f"'{name}' has shape {found.get(name)} in the checkpoint "
+                f"and {wanted.get(name)} in the configured model"
+            )
+            remedy = "model.width and the other model fields must be those of the run"
+            raise InputError(where, problem, remedy)
     return meta

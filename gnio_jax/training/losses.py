@@ -85,7 +85,8 @@ def _velocity_and_covariance(
     said = prediction.diagnostics
     if not {"velocity", "velocity_log_std", "task_log_std"} <= said.keys():
         raise ValueError(
-            "loss 'velocity_and_covariance' wants a velocity for every sample, which only the network 'ctin' gives"
+            "loss 'velocity_and_covariance' wants a velocity for every sample, "
+            "which only the network 'ctin' gives"
         )
     error = windows.steps * windows.steps.shape[1] - said["velocity"]
     position = windows.displacement - prediction.displacement

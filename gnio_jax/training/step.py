@@ -14,7 +14,7 @@ from jaxtyping import Float, Int, PRNGKeyArray
 
 from gnio_jax.config import TrainConfig
 from gnio_jax.data.augmentation import augment
-from gnio_jax.data.windows import WindowSource, gather, shifted
+from gnio_jax.data.windows import WindowSource, gather, shift_windows
 from gnio_jax.models import initialise
 from gnio_jax.models.resnet import MOMENTUM
 from gnio_jax.training.losses import Losses, Stage, losses, stage
@@ -22,7 +22,7 @@ from gnio_jax.types import Prediction, Windows
 
 
 class TrainState(NamedTuple):
-    """All that changes from step to step. Random draws are functions of the seed and `step` alone."""
+    """All that changes from step to step. Random draws depend on the seed and `step` alone."""
 
     step: Int[jax.Array, ""]
     params: Any
@@ -96,35 +96,18 @@ def train_steps(
     def one_step(i: jax.Array, carry: tuple[TrainState, Progress]) -> tuple[TrainState, Progress]:
         state, progress = carry
         which = jax.lax.dynamic_slice(order, ((first + i) * size,), (size,))
-        windows, dropout_key = drawn(jax.random.fold_in(key, state.step), source, which, config)
+        windows, dropout_key = draw_windows(
+            jax.random.fold_in(key, state.step), source, which, config
+        )
         now = stage(config.loss, state.step, steps_per_epoch)
-
-        def objective(params: Any) -> tuple[jax.Array, tuple[Losses, Any]]:
-            prediction, changed = model.apply(
-                {"params": params, "batch_stats": state.batch_stats}, windows.imu, train=True,
-                mutable=["batch_stats"], rngs={"dropout": dropout_key},
-            )  # fmt: skip
-            loss = losses(prediction, windows, config.loss, now)
-            return loss.total, (loss, changed.get("batch_stats", {}))
-
-        gradient, (loss, batch_stats) = jax.grad(objective, has_aux=True)(state.params)
+        gradient, loss, batch_stats = _gradient(state, windows, dropout_key, now, model, config)
         update, opt_state = optimizer.update(
             gradient, state.opt_state, state.params, log_std_learns=now.log_std_learns
         )
         update = optax.tree.scale(learning_rate_factor, update)
-        failed = jnp.where(
-            (progress.failed_step < 0) & ~jnp.isfinite(loss.total), state.step, progress.failed_step
-        )
-        state = TrainState(
-            jnp.add(state.step, 1),
-            optax.apply_updates(state.params, update),
-            batch_stats,
-            opt_state,
-        )
-        sums = jax.tree.map(
-            jnp.add, (progress.sums, progress.gradient_norms), (loss, gradient_norms(gradient))
-        )
-        return state, Progress(sums[0], sums[1], failed)
+        params = optax.apply_updates(state.params, update)
+        progress = _add_step(progress, state.step, loss, gradient)
+        return TrainState(jnp.add(state.step, 1), params, batch_stats, opt_state), progress
 
     nothing = Progress(
         Losses(*[jnp.float32(0)] * 3),
@@ -134,13 +117,55 @@ def train_steps(
     return jax.lax.fori_loop(jnp.int32(0), count, one_step, (state, nothing))
 
 
-def drawn(
+def _gradient(
+    state: TrainState,
+    windows: Windows,
+    dropout_key: PRNGKeyArray,
+    now: Stage,
+    model: nn.Module,
+    config: TrainConfig,
+) -> tuple[Any, Losses, Any]:
+    """Gradient of the loss of a batch, the losses, and the statistics of batch normalisation."""
+
+    def objective(params: Any) -> tuple[jax.Array, tuple[Losses, Any]]:
+        variables = {"params": params, "batch_stats": state.batch_stats}
+        prediction, changed = _apply_training(model, variables, windows, dropout_key)
+        loss = losses(prediction, windows, config.loss, now)
+        return loss.total, (loss, changed.get("batch_stats", {}))
+
+    gradient, (loss, batch_stats) = jax.grad(objective, has_aux=True)(state.params)
+    return gradient, loss, batch_stats
+
+
+def _add_step(progress: Progress, step: jax.Array, loss: Losses, gradient: Any) -> Progress:
+    """The progress with the losses and norms of one more step."""
+    failed = (progress.failed_step < 0) & ~jnp.isfinite(loss.total)
+    sums, norms = jax.tree.map(
+        jnp.add, (progress.sums, progress.gradient_norms), (loss, gradient_norms(gradient))
+    )
+    return Progress(sums, norms, jnp.where(failed, step, progress.failed_step))
+
+
+def _apply_training(
+    model: nn.Module, variables: Any, windows: Windows, dropout_key: PRNGKeyArray
+) -> tuple[Prediction, Any]:
+    """The prediction in training mode, and the variables that changed: statistics of the batch."""
+    return model.apply(
+        variables,
+        windows.imu,
+        train=True,
+        mutable=["batch_stats"],
+        rngs={"dropout": dropout_key},
+    )  # type: ignore[return-value]
+
+
+def draw_windows(
     key: PRNGKeyArray, source: WindowSource, which: Int[jax.Array, "b"], config: TrainConfig
 ) -> tuple[Windows, PRNGKeyArray]:
     """The windows `which`, shifted and augmented by draws from `key`, and the key of the network's
     dropout."""
     augment_key, dropout_key, shift_key = jax.random.split(key, 3)
-    which = shifted(shift_key, source, which, config.augment.shift_samples)
+    which = shift_windows(shift_key, source, which, config.augment.shift_samples)
     return augment(
         augment_key, gather(source, which, config.data.window), config.augment
     ), dropout_key
@@ -193,9 +218,11 @@ def estimate_statistics(
 
     def add_batch(total: Any, number_which: tuple[jax.Array, jax.Array]) -> tuple[Any, None]:
         number, which = number_which
-        windows, dropout_key = drawn(jax.random.fold_in(draw_key, number), source, which, config)
-        _, changed = model.apply({"params": state.params, "batch_stats": zeros}, windows.imu, train=True,
-                                 mutable=["batch_stats"], rngs={"dropout": dropout_key})  # fmt: skip
+        windows, dropout_key = draw_windows(
+            jax.random.fold_in(draw_key, number), source, which, config
+        )
+        variables = {"params": state.params, "batch_stats": zeros}
+        _, changed = _apply_training(model, variables, windows, dropout_key)
         return jax.tree.map(jnp.add, total, changed["batch_stats"]), None
 
     total, _ = jax.lax.scan(add_batch, zeros, (jnp.arange(batches), order))

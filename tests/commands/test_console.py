@@ -1,4 +1,4 @@
-"""The command lines' shared handling: mistakes in one line, help that teaches, files under options."""
+"""The command lines' shared handling: mistakes in one line, help that teaches, configs."""
 
 import subprocess
 import sys
@@ -6,13 +6,17 @@ import sys
 import pytest
 
 from gnio_jax import config
-from gnio_jax.commands import console as cli
+from gnio_jax.commands import app, options, train
 from gnio_jax.config import TrainConfig
 from gnio_jax.types import InputError
 
 
-def parse(*arguments, default=None):
-    return cli.parse(TrainConfig, default or TrainConfig(), "Train.", list(arguments))
+def parse(*arguments):
+    """The experiment that `train` reads from these options."""
+    found = []
+    command = train.COMMAND._replace(run=lambda read, _prog: found.append(read.experiment()))
+    options.execute(command, arguments, "train.py")
+    return found[0]
 
 
 def mistake(*arguments):
@@ -82,7 +86,7 @@ def test_missing_values_and_stray_words():
     )
     assert mistake("stray").startswith("'stray': is not an option")
     assert mistake("--augment.yaw", "True").startswith("'True': is not an option")
-    assert mistake("--config") == "--config: needs a value"
+    assert mistake("--config") == "--config: needs a value, which must be text or None"
 
 
 def test_options_win_over_the_file_and_the_file_over_the_default(tmp_path):
@@ -109,12 +113,15 @@ def test_help_teaches(capsys):
         parse("--help")
     assert leaving.value.code == 0
     text = " ".join(capsys.readouterr().out.replace("│", " ").split())
-    assert "Train." in text and "--config FILE" in text
+    assert "Train a network" in text and "--config FILE" in text
     assert "--optim.epochs INT Passes over the training windows. (default: 200)" in text
 
 
 def outcome(body):
-    program = f"from gnio_jax import cli\nfrom gnio_jax.types import InputError\ndef main():\n    {body}\ncli.run(main)\n"
+    program = (
+        "from gnio_jax.commands import console\nfrom gnio_jax.types import InputError\n"
+        f"def main():\n    {body}\nconsole.run(main)\n"
+    )
     return subprocess.run(
         [sys.executable, "-c", program], capture_output=True, text=True, timeout=60
     )
@@ -143,3 +150,64 @@ def test_run_ends_in_one_line_and_a_status(body, status, line):
 def test_faults_of_the_program_keep_their_traceback():
     result = outcome("1 / 0")
     assert result.returncode == 1 and "Traceback" in result.stderr
+
+
+def test_a_config_is_found_by_its_name_from_anywhere(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert parse("--config", "quickstart").model.width == 16
+    assert parse("--config", "baselines/tlio").model.name == "tlio"
+    for wrong, hint in (("quickstrat", "quickstart"), ("configs/tlio.yaml", "baselines/tlio")):
+        assert f"{wrong}: no such config file; did you mean '{hint}'?" in mistake("--config", wrong)
+    (tmp_path / "quickstart").mkdir()
+    assert parse("--config", "quickstart").model.width == 16
+    assert set(config.names()) >= {"gnio_tlio", "gnio_oxiod", "gnio_oxiod_small", "quickstart"}
+
+
+@pytest.mark.parametrize(
+    "arguments, expected",
+    [
+        ([], "command: is missing; give one of train, evaluate, data, tables, interop"),
+        (["trian"], "command: unknown 'trian'; did you mean 'train'?"),
+        (["--verbose"], "command: unknown '--verbose'; give one of train, evaluate"),
+        (["data"], "command: is missing; give one of list, check, convert, import"),
+        (["data", "chek"], "command: unknown 'chek'; did you mean 'check'?"),
+        (["data", "check", "tlio", "--splt", "a"], "--splt: unknown option; did you mean --split?"),
+        (["evaluate", "--estimater", "ekf"], "unknown option; did you mean --estimator?"),
+        (["tables", "gatse"], "TABLE: must be one of complexity, comparison"),
+        (["tables", "gates", "--seeds", "x"], "--seeds: must be a whole number, found 'x'"),
+        (["interop", "weights.npz"], "WORKDIR: is missing"),
+    ],
+)
+def test_subcommands_and_their_mistakes(arguments, expected):
+    with pytest.raises(InputError) as caught:
+        options.execute(app.GNIO, arguments, "gnio")
+    assert str(caught.value).startswith(expected) or expected in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "arguments, words",
+    [
+        (["--help"], ["usage: gnio [-h]", "• train", "gnio data list"]),
+        (["train", "--help"], ["usage: gnio train", "gnio train --config quickstart", "--resume"]),
+        (["data", "--help"], ["usage: gnio data", "• check", "gnio data COMMAND --help"]),
+        (["data", "convert", "--help"], ["usage: gnio data convert", "gnio data convert oxiod"]),
+        (["tables", "--help"], ["gnio tables complexity", "Width of the convolutional networks"]),
+    ],
+)
+def test_help_of_the_subcommands(arguments, words, capsys):
+    with pytest.raises(SystemExit) as leaving:
+        options.execute(app.GNIO, arguments, "gnio")
+    assert leaving.value.code == 0
+    text = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    for word in words:
+        assert word in text, word
+
+
+def test_events_of_another_tyro_fall_through():
+    """A version of tyro with other mistakes shows its own box."""
+
+    class Unheard:
+        pass
+
+    assert options._explain(Unheard(), [], [], subcommands=False) is None

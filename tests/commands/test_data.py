@@ -12,10 +12,10 @@ import pytest
 from matplotlib import image
 
 from gnio_jax import data
-from gnio_jax.commands import console as cli
-from gnio_jax.commands import data as commands
+from gnio_jax.commands import console
 from gnio_jax.commands.data import main
-from gnio_jax.data import registry
+from gnio_jax.data import conversion, registry
+from gnio_jax.data.checking import resolve
 from gnio_jax.data.readers import csv_files as csv
 from gnio_jax.data.readers import tlio
 from gnio_jax.types import InputError
@@ -89,7 +89,6 @@ def same(a, b):
 
 
 # --- list
-# ------------------------------------------------------------------------------------------------------------
 
 
 def test_list_tells_everything_and_reads_nothing(root, monkeypatch, capsys):
@@ -116,7 +115,6 @@ def test_list_tells_everything_and_reads_nothing(root, monkeypatch, capsys):
 
 
 # --- check
-# -----------------------------------------------------------------------------------------------------------
 
 
 def test_check_shows_every_recording_with_its_figures_and_reasons(root, capsys):
@@ -147,9 +145,9 @@ def test_check_shows_every_recording_with_its_figures_and_reasons(root, capsys):
     )
     assert "left out: mirrored: horizontal acceleration of the positions correlates by only" in out
     assert (
-        f"left out: cut: {root / 'cut' / 'imu0_resampled.npy'}: cannot be read as a NumPy array, it may be cut short"
-        in out
-    )
+        f"left out: cut: {root / 'cut' / 'imu0_resampled.npy'}: cannot be read as a "
+        "NumPy array, it may be cut short"
+    ) in out
     assert f"note: {root / 'train_list.txt'}: 1 of 4 listed sequences are absent: absent" in out
     assert "2 of 5 sequences are used, 0.01 h" in out
 
@@ -203,7 +201,7 @@ def test_check_of_one_split_of_a_computed_set(place, capsys):
 
 
 def test_check_knows_a_layout_by_what_it_finds_there(root, place, capsys):
-    assert commands.resolve(str(root), None) == (data.get("tlio"), root)
+    assert resolve(str(root), None) == (data.get("tlio"), root)
     asl = place / "walks" / "mine" / "mav0" / "imu0"
     asl.mkdir(parents=True)
     (asl / "data.csv").write_text("")
@@ -211,10 +209,10 @@ def test_check_knows_a_layout_by_what_it_finds_there(root, place, capsys):
         InputError,
         match="walks: has the layout of euroc and of tumvi; say which it is: --dataset NAME",
     ):
-        commands.resolve("./walks", None)
-    assert commands.resolve("walks", "tumvi")[0].name == "tumvi"
+        resolve("./walks", None)
+    assert resolve("walks", "tumvi")[0].name == "tumvi"
     (place / "walks").rename(place / "EuRoC")
-    assert commands.resolve("./EuRoC", None)[0].name == "euroc"
+    assert resolve("./EuRoC", None)[0].name == "euroc"
 
 
 def test_check_of_recordings_without_a_reference_draws_them_all_the_same(place, capsys):
@@ -227,16 +225,16 @@ def test_check_of_recordings_without_a_reference_draws_them_all_the_same(place, 
 
 def test_nothing_usable_is_a_failure_that_still_shows_the_table(root, capsys):
     with pytest.raises(SystemExit) as left:
-        cli.run(lambda: main(["check", str(root), "--split", "val"]))
+        console.run(lambda: main(["check", str(root), "--split", "val"]))
     out, err = capsys.readouterr()
     assert left.value.code == 2 and "left out: cut: " in out
     assert err == f"{root}: none of 1 sequences can be used; see the reasons above\n"
 
 
 def test_the_module_runs_and_draws_nothing_unasked(root):
-    program = (
-        "import runpy, sys\nsys.argv = ['data', 'check', sys.argv[1], '--split', 'test']\n"
-        "runpy.run_module('gnio_jax.data', run_name='__main__')\nassert 'matplotlib' not in sys.modules\n"
+    program = "import runpy, sys\nsys.argv = ['data', 'check', sys.argv[1], '--split', 'test']\n"(
+        "runpy.run_module('gnio_jax.data', run_name='__main__')\nassert 'matplotlib' not "
+        "in sys.modules\n"
     )
     shown = subprocess.run(
         [sys.executable, "-c", program, str(root)], capture_output=True, text=True, timeout=100
@@ -248,7 +246,6 @@ def test_the_module_runs_and_draws_nothing_unasked(root):
 
 
 # --- convert
-# ---------------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -297,20 +294,20 @@ def test_convert_to_another_rate(root):
 def test_convert_goes_on_where_it_was_stopped(root, reads, monkeypatch, capsys):
     (root / "train_list.txt").write_text("fair\ntilted\nalso\n")
     (root / "val_list.txt").write_text("fair\n")
-    real = commands.write_hdf5
+    real = conversion.write_hdf5
 
     def stopped(path, sequence):
         if sequence.name == "also":
             raise KeyboardInterrupt
         real(path, sequence)
 
-    monkeypatch.setattr(commands, "write_hdf5", stopped)
+    monkeypatch.setattr(conversion, "write_hdf5", stopped)
     with pytest.raises(SystemExit) as left:
-        cli.run(lambda: main(["convert", "tlio", str(root), "converted"]))
+        console.run(lambda: main(["convert", "tlio", str(root), "converted"]))
     assert left.value.code == 130 and reads == ["fair", "tilted", "also"]
     converted = root.parent / "converted"
     assert sorted(path.name for path in converted.iterdir()) == [".converted", "fair.h5"]
-    monkeypatch.setattr(commands, "write_hdf5", real)
+    monkeypatch.setattr(conversion, "write_hdf5", real)
     reads.clear()
     main(["convert", "tlio", str(root), "converted"])
     assert reads == ["also"]  # what failed the check is known to have failed
@@ -405,13 +402,15 @@ def test_splits_of_other_names_are_read_by_their_lists(root):
     assert [sequence.name for sequence in data.load("csv", converted, "unseen")] == ["also"]
     with pytest.raises(
         InputError,
-        match=r"unknown split 'seen'; known splits: train, val, test, or that of a list seen\.txt there",
+        match=(
+            r"unknown split 'seen'; known splits: train, val, test, or that of a list "
+            r"seen\.txt there"
+        ),
     ):
         data.load("csv", converted, "seen")
 
 
 # --- import
-# ----------------------------------------------------------------------------------------------------------
 
 
 def write_phone(path, names, time=None, gyro=1.0, accel=1.0, per_second=1.0, separator=","):
@@ -547,49 +546,105 @@ def test_import_of_a_file_for_each_sensor(place, capsys):
 
 
 # --- mistakes
-# --------------------------------------------------------------------------------------------------------
 
 OUT = ["--out", "x.h5"]
 
 
-@pytest.mark.parametrize(("arguments", "expected"), [
-    ([], "command: is missing; give one of list, check, convert, import"),
-    (["chek"], "command: unknown 'chek'; did you mean 'check'?"),
-    (["list", "tlio"], "'tlio': is not an option"),
-    (["check"], "DATASET_OR_ROOT: is missing"),
-    (["check", "tloi"], "dataset: unknown name 'tloi'; did you mean 'tlio'?"),
-    (["check", "tlio"], "data/tlio, data/tlio_layout: no folder of dataset 'tlio'; give its folder with --dataset tlio"),
-    (["check", "./nowhere"], "./nowhere: no such folder"),
-    (["check", "heads", "--dataset", "tilo"], "dataset: unknown name 'tilo'; did you mean 'tlio'?"),
-    (["check", "heads", "--split", "tset"], "dataset tlio: unknown split 'tset'; known splits: train, val, test, all"),
-    (["check", "heads", "--dataset", "ridi"], "heads: holds no recording of RIDI"),
-    (["check", "folder.h5"], "folder.h5: has the layout of no dataset; say which it is: --dataset NAME"),
-    (["check", "heads", "--plot", "x"], "--plot: unknown option; did you mean --plots?"),
-    (["check", "heads", "--workers", "0"], "--workers: must be at least 1, found 0"),
-    (["check", "heads", "--workers", "two"], "--workers: must be a whole number or None, found 'two'"),
-    (["check", "heads", "--json", "heads"], "--json: heads is a folder"),
-    (["check", "heads", "--plots", "heads/test_list.txt"], "--plots: heads/test_list.txt is a file"),
-    (["check", "heads", "tlio"], "'tlio': is not an option"),
-    (["convert", "tlio", "heads"], "OUT: is missing"),
-    (["convert", "tlio", "nowhere", "x"], "nowhere: no folder of dataset 'tlio'"),
-    (["convert", "tlio", "heads", "heads"], "heads: is the folder that is read"),
-    (["convert", "tlio", "heads", "x", "--rate", "0"], "--rate: 0 Hz is no rate to resample to"),
-    (["convert", "tlio", "heads", "x", "--rate"], "--rate: needs a value, which must be a number or None"),
-    (["convert", "tlio", "heads", "x", "--split", "tset"], "dataset tlio: unknown split 'tset'"),
-    (["convert", "tlio", "heads", "heads/test_list.txt"], "heads/test_list.txt: is a file"),
-    (["convert", "tlio", "heads", "taken"], "taken: holds recordings or lists that no conversion has written; choose another folder"),
-    (["convert", "tlio", "heads", "ours", "--rate", "100"], "ours: holds tlio at 50 Hz, not tlio at 100 Hz; choose another folder"),
-    (["convert", "tlio", "heads", "ours"], "ours: holds tlio at 50 Hz, not tlio at its own rate"),
-    (["import", *OUT], "FILE: is missing"),
-    (["import", "walk.csv"], "--out: is missing; give --out OUT"),
-    (["import", "none.csv", *OUT], "none.csv: cannot be read (No such file or directory)"),
-    (["import", "walk.csv", "--out", "x.csv"], "--out: 'x.csv' is no name of an HDF5 file; name it NAME.h5"),
-    (["import", "walk.csv", "--out", "folder.h5"], "--out: 'folder.h5' is a folder"),
-    (["import", "walk.csv", *OUT, "--columns.gyro-x", "wx"], "walk.csv: column 'wx' is missing; found: time, gyro_x"),
-    (["import", "walk.csv", *OUT, "--columns.gyr-x", "wx"], "--columns.gyr-x: unknown option; did you mean --columns.gyro-x?"),
-    (["import", "walk.csv", *OUT, "--gyro-unit", "rpm"], "--gyro-unit: must be one of rad/s, deg/s or None, found 'rpm'"),
-    (["import", "walk.csv", *OUT, "--rate", "1e9"], "rate: 1e+09 Hz is no rate to resample to"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        ([], "command: is missing; give one of list, check, convert, import"),
+        (["chek"], "command: unknown 'chek'; did you mean 'check'?"),
+        (["list", "tlio"], "'tlio': is not an option"),
+        (["check"], "DATASET_OR_ROOT: is missing"),
+        (["check", "tloi"], "dataset: unknown name 'tloi'; did you mean 'tlio'?"),
+        (
+            ["check", "tlio"],
+            (
+                "data/tlio, data/tlio_layout: no folder of dataset 'tlio'; give its folder "
+                "with --dataset tlio"
+            ),
+        ),
+        (["check", "./nowhere"], "./nowhere: no such folder"),
+        (
+            ["check", "heads", "--dataset", "tilo"],
+            "dataset: unknown name 'tilo'; did you mean 'tlio'?",
+        ),
+        (
+            ["check", "heads", "--split", "tset"],
+            "dataset tlio: unknown split 'tset'; known splits: train, val, test, all",
+        ),
+        (["check", "heads", "--dataset", "ridi"], "heads: holds no recording of RIDI"),
+        (
+            ["check", "folder.h5"],
+            "folder.h5: has the layout of no dataset; say which it is: --dataset NAME",
+        ),
+        (["check", "heads", "--plot", "x"], "--plot: unknown option; did you mean --plots?"),
+        (["check", "heads", "--workers", "0"], "--workers: must be at least 1, found 0"),
+        (
+            ["check", "heads", "--workers", "two"],
+            "--workers: must be a whole number or None, found 'two'",
+        ),
+        (["check", "heads", "--json", "heads"], "--json: heads is a folder"),
+        (
+            ["check", "heads", "--plots", "heads/test_list.txt"],
+            "--plots: heads/test_list.txt is a file",
+        ),
+        (["check", "heads", "tlio"], "'tlio': is not an option"),
+        (["convert", "tlio", "heads"], "OUT: is missing"),
+        (["convert", "tlio", "nowhere", "x"], "nowhere: no folder of dataset 'tlio'"),
+        (["convert", "tlio", "heads", "heads"], "heads: is the folder that is read"),
+        (
+            ["convert", "tlio", "heads", "x", "--rate", "0"],
+            "--rate: 0 Hz is no rate to resample to",
+        ),
+        (
+            ["convert", "tlio", "heads", "x", "--rate"],
+            "--rate: needs a value, which must be a number or None",
+        ),
+        (
+            ["convert", "tlio", "heads", "x", "--split", "tset"],
+            "dataset tlio: unknown split 'tset'",
+        ),
+        (["convert", "tlio", "heads", "heads/test_list.txt"], "heads/test_list.txt: is a file"),
+        (
+            ["convert", "tlio", "heads", "taken"],
+            (
+                "taken: holds recordings or lists that no conversion has written; choose "
+                "another folder"
+            ),
+        ),
+        (
+            ["convert", "tlio", "heads", "ours", "--rate", "100"],
+            "ours: holds tlio at 50 Hz, not tlio at 100 Hz; choose another folder",
+        ),
+        (
+            ["convert", "tlio", "heads", "ours"],
+            "ours: holds tlio at 50 Hz, not tlio at its own rate",
+        ),
+        (["import", *OUT], "FILE: is missing"),
+        (["import", "walk.csv"], "--out: is missing; give --out OUT"),
+        (["import", "none.csv", *OUT], "none.csv: cannot be read (No such file or directory)"),
+        (
+            ["import", "walk.csv", "--out", "x.csv"],
+            "--out: 'x.csv' is no name of an HDF5 file; name it NAME.h5",
+        ),
+        (["import", "walk.csv", "--out", "folder.h5"], "--out: 'folder.h5' is a folder"),
+        (
+            ["import", "walk.csv", *OUT, "--columns.gyro-x", "wx"],
+            "walk.csv: column 'wx' is missing; found: time, gyro_x",
+        ),
+        (
+            ["import", "walk.csv", *OUT, "--columns.gyr-x", "wx"],
+            "--columns.gyr-x: unknown option; did you mean --columns.gyro-x?",
+        ),
+        (
+            ["import", "walk.csv", *OUT, "--gyro-unit", "rpm"],
+            "--gyro-unit: must be one of rad/s, deg/s or None, found 'rpm'",
+        ),
+        (["import", "walk.csv", *OUT, "--rate", "1e9"], "rate: 1e+09 Hz is no rate to resample to"),
+    ],
+)
 def test_a_mistake_is_one_line_and_status_2(root, place, capsys, arguments, expected):
     write_phone(place / "walk.csv", csv._GYRO + csv._ACCEL)
     (place / "taken").mkdir()
@@ -601,19 +656,33 @@ def test_a_mistake_is_one_line_and_status_2(root, place, capsys, arguments, expe
     )
     before = sorted(place.rglob("*"))
     with pytest.raises(SystemExit) as left, warnings.catch_warnings():
-        cli.run(lambda: main(arguments))
+        console.run(lambda: main(arguments))
     out, err = capsys.readouterr()
     assert (left.value.code, out) == (2, "") and err.count("\n") == 1 and expected in err, err
     assert sorted(place.rglob("*")) == before
 
 
-@pytest.mark.parametrize(("arguments", "words"), [
-    (["--help"], ["list", "check", "convert", "import"]),
-    (["list", "--help"], ["GNIO_DATA"]),
-    (["check", "--help"], ["check oxiod", "--plots", "DATASET_OR_ROOT", "--split", "figures"]),
-    (["convert", "--help"], ["convert tlio ~/tlio", "DATASET ROOT OUT", "--rate", "--workers", "--dataset csv"]),
-    (["import", "--help"], ["--columns.gyro-x", "--accel-sign {android,ios,detect}", "Accelerometer.csv", "--accel-path"]),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--help"], ["list", "check", "convert", "import"]),
+        (["list", "--help"], ["GNIO_DATA"]),
+        (["check", "--help"], ["check oxiod", "--plots", "DATASET_OR_ROOT", "--split", "figures"]),
+        (
+            ["convert", "--help"],
+            ["convert tlio ~/tlio", "DATASET ROOT OUT", "--rate", "--workers", "--dataset csv"],
+        ),
+        (
+            ["import", "--help"],
+            [
+                "--columns.gyro-x",
+                "--accel-sign {android,ios,detect}",
+                "Accelerometer.csv",
+                "--accel-path",
+            ],
+        ),
+    ],
+)
 def test_help_teaches_with_examples(capsys, arguments, words):
     try:
         main(arguments)

@@ -10,7 +10,7 @@ import pytest
 
 import train
 from gnio_jax import config as configuration
-from gnio_jax.commands import console as cli
+from gnio_jax.commands import console
 from gnio_jax.config import TrainConfig
 from gnio_jax.types import InputError
 
@@ -24,7 +24,7 @@ def mistake(monkeypatch, capsys, tmp_path, *arguments):
     monkeypatch.setattr(sys, "argv", ["train.py", *arguments])
     before = sorted(tmp_path.rglob("*"))
     with pytest.raises(SystemExit) as left:
-        cli.run(train.main)
+        console.run(train.main)
     assert left.value.code == 2
     out, err = capsys.readouterr()
     lines = [line for line in err.splitlines() if not line.startswith("reading ")]
@@ -33,40 +33,63 @@ def mistake(monkeypatch, capsys, tmp_path, *arguments):
     return lines[0]
 
 
-@pytest.mark.parametrize("arguments, expected", [
-    (["--dataset", "tlio"], "github.com/CathIAS/TLIO"),
-    (["--dataset", "tlio", "--data-root", "nowhere"], "nowhere"),
-    (["--dataset", "oxiod"], "deepio.cs.ox.ac.uk"),
-    (["--dataset", "oxoid"], "did you mean 'oxiod'? known datasets: blackbird, csv, euroc, idol, kitti, oxiod, ridi, ronin, synthetic, "
-                             "tlio, tumvi"),
-    (["--datset", "tlio"], "--datset: unknown option; did you mean --dataset?"),
-    (["--optim.epoch", "3"], "--optim.epoch: unknown option; did you mean --optim.epochs?"),
-    (["--optim.epochs", "three"], "--optim.epochs: must be a whole number, found 'three'"),
-    (["--model.gate", "relu"], "--model.gate: must be one of tanh, sigmoid or None, found 'relu'"),
-    (["--model.name", "gnoi"], "model 'gnoi': unknown; known models: ctin, deepils, gnio"),
-    (["--model.bank-heads", "7"], "model 'gnio': bank_heads must divide the 512 features, found 7"),
-    (["--data.rate", "0"], "field 'data.rate' must be positive"),
-    (["--data.stride-seconds", "0.3"], "field 'data.stride_seconds' must divide the window"),
-    (["--data.train-split", "trian"], "trian"),
-    (["--config", "none.yaml"], "none.yaml: no such config file"),
-    (["--resume", "--workdir", "none"], "none: holds no run to resume"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "arguments, expected",
+    [
+        (["--dataset", "tlio"], "github.com/CathIAS/TLIO"),
+        (["--dataset", "tlio", "--data-root", "nowhere"], "nowhere"),
+        (["--dataset", "oxiod"], "deepio.cs.ox.ac.uk"),
+        (
+            ["--dataset", "oxoid"],
+            (
+                "did you mean 'oxiod'? known datasets: blackbird, csv, euroc, idol, kitti, "
+                "oxiod, ridi, ronin, synthetic, tlio, tumvi"
+            ),
+        ),
+        (["--datset", "tlio"], "--datset: unknown option; did you mean --dataset?"),
+        (["--optim.epoch", "3"], "--optim.epoch: unknown option; did you mean --optim.epochs?"),
+        (["--optim.epochs", "three"], "--optim.epochs: must be a whole number, found 'three'"),
+        (
+            ["--model.gate", "relu"],
+            "--model.gate: must be one of tanh, sigmoid or None, found 'relu'",
+        ),
+        (["--model.name", "gnoi"], "model 'gnoi': unknown; known models: ctin, deepils, gnio"),
+        (
+            ["--model.bank-heads", "7"],
+            "model 'gnio': bank_heads must divide the 512 features, found 7",
+        ),
+        (["--data.rate", "0"], "field 'data.rate' must be positive"),
+        (["--data.stride-seconds", "0.3"], "field 'data.stride_seconds' must divide the window"),
+        (["--data.train-split", "trian"], "trian"),
+        (["--config", "none.yaml"], "none.yaml: no such config file"),
+        (["--resume", "--workdir", "none"], "none: holds no run to resume"),
+    ],
+)
 def test_mistakes(monkeypatch, capsys, tmp_path, arguments, expected):
     assert expected in mistake(monkeypatch, capsys, tmp_path, *arguments)
 
 
-@pytest.mark.parametrize("content, expected", [
-    ("optim: {epohcs: 3}", "unknown field 'optim.epohcs'; did you mean 'optim.epochs'?"),
-    ("optim: {learning_rate: 1e-4}", "field 'optim.learning_rate' must be a number, found '1e-4'; YAML reads '1e-4' as text"),
-    ("optim: {epochs: '3'}", "field 'optim.epochs' must be a whole number, found '3'"),
-    ("optim: {epochs: 2.5}", "field 'optim.epochs' must be a whole number, found 2.5"),
-    ("augment: {yaw: 1}", "field 'augment.yaw' must be true or false, found 1"),
-    ("model: {head: gatd}", "field 'model.head' must be one of gated, linear or null, found 'gatd'"),
-    ("optim: 3", "optim must be a mapping"),
-    ("- 1", "must be a mapping"),
-    ("a: [", "is not YAML"),
-    ("!!python/object/apply:os.system ['true']", "is not YAML"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "content, expected",
+    [
+        ("optim: {epohcs: 3}", "unknown field 'optim.epohcs'; did you mean 'optim.epochs'?"),
+        (
+            "optim: {learning_rate: 1e-4}",
+            "field 'optim.learning_rate' must be a number, found '1e-4'; YAML reads '1e-4' as text",
+        ),
+        ("optim: {epochs: '3'}", "field 'optim.epochs' must be a whole number, found '3'"),
+        ("optim: {epochs: 2.5}", "field 'optim.epochs' must be a whole number, found 2.5"),
+        ("augment: {yaw: 1}", "field 'augment.yaw' must be true or false, found 1"),
+        (
+            "model: {head: gatd}",
+            "field 'model.head' must be one of gated, linear or null, found 'gatd'",
+        ),
+        ("optim: 3", "optim must be a mapping"),
+        ("- 1", "must be a mapping"),
+        ("a: [", "is not YAML"),
+        ("!!python/object/apply:os.system ['true']", "is not YAML"),
+    ],
+)
 def test_configs(monkeypatch, capsys, tmp_path, content, expected):
     (tmp_path / "my.yaml").write_text(content)
     line = mistake(monkeypatch, capsys, tmp_path, "--config", "my.yaml")
@@ -145,7 +168,7 @@ def test_help_teaches():
 def test_the_newest_run_is_the_one_trained_last(tmp_path):
     with pytest.raises(
         InputError,
-        match=r"holds no run; train one with python train\.py, or name its folder with --workdir",
+        match=r"holds no run; train one with gnio train, or name its folder with --workdir",
     ):
         configuration.newest_run(tmp_path)
     for age, name in [(30, "old"), (10, "new"), (20, "middle")]:

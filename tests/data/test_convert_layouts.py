@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from gnio_jax import data
-from gnio_jax.commands.data import main, resolve
+from gnio_jax.commands.data import main
+from gnio_jax.data.checking import resolve
 from tests.support.layouts import LAYOUTS
 
 

@@ -8,11 +8,11 @@ import warnings
 import numpy as np
 import pytest
 
+from gnio_jax import evaluation
 from gnio_jax.config import DataConfig
 from gnio_jax.data import windows
 from gnio_jax.data.dataset import Refusal
 from gnio_jax.data.gaps import divide_at_gaps
-from gnio_jax.evaluation import odometry
 from gnio_jax.types import Sequence
 
 
@@ -59,11 +59,13 @@ def test_every_piece_with_a_window_is_kept_and_named():
         assert piece.attributes == {"group": "someone", "start_time": pytest.approx(100.0 + first)}
     # Each holds at least the one window it was kept for, and no estimate runs through a hole.
     config = DataConfig(rate=100.0)
-    assert all(len(windows.index([piece], config, stride=10).start) >= 1 for piece in pieces)
-    recordings, short = odometry.prepare(pieces, config)
-    assert [recording.sequence.name for recording in recordings] == ["walk_piece1", "walk_piece3"]
+    assert all(
+        len(windows.window_source([piece], config, stride=10).start) >= 1 for piece in pieces
+    )
+    prepared, short = evaluation.prepare(pieces, config)
+    assert [each.sequence.name for each in prepared] == ["walk_piece1", "walk_piece3"]
     assert list(short) == ["walk_piece2"]
-    assert all(np.diff(recording.sequence.time).max() < 0.011 for recording in recordings)
+    assert all(np.diff(each.sequence.time).max() < 0.011 for each in prepared)
 
 
 @pytest.mark.filterwarnings("error")

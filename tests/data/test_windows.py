@@ -64,7 +64,9 @@ def test_gather_against_a_brute_force_cutter(rotation, stride):
         tumbling(21, 4),
         tumbling(20, 5),
     ]
-    source = windows.index(sequences, DataConfig(rate=20.0, window_rotation=rotation), stride)
+    source = windows.window_source(
+        sequences, DataConfig(rate=20.0, window_rotation=rotation), stride
+    )
     imu, target, steps = cut(sequences, rotation, stride)
     assert source.start.shape == (len(target),)
     order = np.random.default_rng(0).permutation(len(target)).astype(np.int32)
@@ -80,11 +82,11 @@ def test_gather_against_a_brute_force_cutter(rotation, stride):
 
 def test_shifted_windows_are_those_of_the_neighbouring_samples_in_the_same_recording():
     sequences = [tumbling(57, 1), tumbling(61, 2, invalid=[33]), tumbling(31, 3)]
-    source = jax.device_put(windows.index(sequences, CONFIG, 4, shift=3))
-    plain = windows.index(sequences, CONFIG, 4)
+    source = jax.device_put(windows.window_source(sequences, CONFIG, 4, shift=3))
+    plain = windows.window_source(sequences, CONFIG, 4)
     np.testing.assert_array_equal(source.start[source.visited], plain.start)
     which = jnp.tile(jnp.asarray(source.visited), 200)
-    there = np.asarray(windows.shifted(KEY, source, which, 3))
+    there = np.asarray(windows.shift_windows(KEY, source, which, 3))
     moved = np.asarray(source.start[there] - source.start[which])
     assert set(moved) == set(range(-3, 4))
     recording = np.searchsorted([57, 118], source.start, side="right")
@@ -93,20 +95,20 @@ def test_shifted_windows_are_those_of_the_neighbouring_samples_in_the_same_recor
         np.asarray(which) == 0
     )  # the first window of all cannot begin earlier: 3 of 7 draws leave it where it is
     assert moved[first].min() == 0 and np.mean(moved[first] == 0) == pytest.approx(4 / 7, abs=0.12)
-    np.testing.assert_array_equal(windows.shifted(KEY, source, which, 0), which)
+    np.testing.assert_array_equal(windows.shift_windows(KEY, source, which, 0), which)
 
 
 def test_a_window_of_exactly_its_length_lacks_the_pose_after_it():
     with pytest.raises(InputError, match="no window of 1 s"):
-        windows.index([tumbling(20, 0)], CONFIG, 2)
-    assert windows.index([tumbling(21, 0)], CONFIG, 2).start.shape == (1,)
+        windows.window_source([tumbling(20, 0)], CONFIG, 2)
+    assert windows.window_source([tumbling(21, 0)], CONFIG, 2).start.shape == (1,)
 
 
 def test_samples_without_a_reference_may_hold_nan():
     sequence = tumbling(60, 0, invalid=range(25, 30))
     for field in (sequence.orientation, sequence.position):
         field[25:30] = np.nan
-    source = windows.index([sequence], CONFIG, 2)
+    source = windows.window_source([sequence], CONFIG, 2)
     found = windows.gather(
         jax.device_put(source), jnp.arange(source.start.shape[0], dtype=jnp.int32), 20
     )

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from gnio_jax import config, data
-from gnio_jax.commands import console as cli
+from gnio_jax.commands import console
 from gnio_jax.config import DataConfig, EvaluateConfig, FilterOptions, ModelConfig, TrainConfig
 from gnio_jax.data.readers import synthetic
 from gnio_jax.evaluation import report, run
@@ -83,7 +83,7 @@ def command(monkeypatch):
 
     def call(*arguments):
         monkeypatch.setattr(sys, "argv", ["evaluate.py", *map(str, arguments)])
-        cli.run(module.main)
+        console.run(module.main)
 
     return call
 

@@ -14,9 +14,9 @@ from gnio_jax import filtering, geometry
 from gnio_jax.filtering.gaps import Imu
 from gnio_jax.filtering.measurement import displacement_residual, retract
 from gnio_jax.filtering.propagation import interval
-from gnio_jax.filtering.scan import network_window
 from gnio_jax.filtering.state import CLONE, MOVE, OFFSET, THETA, VELOCITY, covariance
 from gnio_jax.types import Prediction
+from gnio_jax.windows import cut_window
 from tests.support.compiling import quick
 from tests.support.walks import errors, simulate
 
@@ -295,7 +295,7 @@ def test_own_frame_jacobian_is_that_of_an_equivariant_network(angles):
 
     def said(theta):
         signals = jnp.asarray(gyro), jnp.asarray(accel), jnp.zeros(3), jnp.asarray(bias)
-        return network(network_window(cut(theta), *signals, config))
+        return network(cut_window(cut(theta), *signals, config.cut, config.dt))
 
     nothing = jnp.zeros(3)
     seen = weights @ force  # in the world

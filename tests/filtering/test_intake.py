@@ -13,8 +13,8 @@ from scipy.interpolate import CubicSpline
 from scipy.signal import firwin
 
 from gnio_jax import filtering, geometry
-from gnio_jax.data import sequence
 from gnio_jax.data.readers import synthetic
+from gnio_jax.data.resampling import resample
 from gnio_jax.filtering import Tracker, intake
 from gnio_jax.filtering import tracker as online
 from gnio_jax.types import InputError, Prediction
@@ -283,7 +283,7 @@ def built(monkeypatch):
 def test_a_faster_imu_gives_the_trajectory_of_the_batch_path(rate):
     """To 1 µm at a multiple of the filter's rate, else 1 mm; mere interpolation is 10 cm off."""
     walked, state, n = walk(rate), start(walk(rate)), 6000
-    even = sequence.resample(walked, 200.0)
+    even = resample(walked, 200.0)
     wanted = np.asarray(program()(state, even.gyro[:n], even.accel[:n]).position)
     tracker = Tracker(predict, state, CONFIG, NOISE, imu_rate=float(rate))
     found = feed(tracker, walked)

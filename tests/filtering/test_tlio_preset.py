@@ -55,7 +55,7 @@ def recorded():
     return Recorded(
         wanted,
         interop.load_tlio_state_dict(tlio_weights.weights()),
-        lambda variables, late=0: filtered(models.freeze(model, variables), late),
+        lambda variables, late=0: filtered(models.inference_variables(model, variables), late),
     )
 
 

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from gnio_jax import config as configuration
 from gnio_jax import filtering
-from gnio_jax.commands import console as cli
+from gnio_jax.commands import console
 from gnio_jax.filtering import Tracker
 from gnio_jax.filtering import tracker as online
 from gnio_jax.training import checkpoint
@@ -514,7 +514,7 @@ def replay(monkeypatch, tmp_path):
 
     def call(*arguments):
         monkeypatch.setattr(sys, "argv", ["replay_csv.py", *map(str, arguments)])
-        cli.run(module.main)
+        console.run(module.main)
 
     return call
 

@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 from gnio_jax import interop, models
-from gnio_jax.commands import console as cli
+from gnio_jax.commands import console
+from gnio_jax.commands import interop as interop_command
 from gnio_jax.config import FilterOptions
-from gnio_jax.evaluation import odometry
+from gnio_jax.evaluation import filter_setup
 from gnio_jax.training import checkpoint
 from gnio_jax.types import InputError
 from tests.support import tlio_weights
@@ -67,8 +68,7 @@ def test_an_npz_holds_the_same(tmp_path, loaded):
     equal(interop.load_tlio_state_dict({"model_state_dict": WEIGHTS, "epoch": 3}), loaded)
 
 
-# PyTorch
-# --------------------------------------------------------------------------------------------------------------
+# --- PyTorch
 
 
 def torch_network(weights, samples):
@@ -214,8 +214,7 @@ def test_without_pytorch_it_says_how_to_get_it(tmp_path, monkeypatch):
         interop.load_tlio_state_dict(tmp_path / "a.pth")
 
 
-# Mistakes
-# -------------------------------------------------------------------------------------------------------------
+# --- Mistakes
 
 
 def changed(**parts):
@@ -251,7 +250,10 @@ BAD_BIAS = np.array([0, np.nan, 0], np.float32)
         ),
         (
             changed(output_block1__fc1__weight=np.zeros((512, 900), np.float32)),
-            "'output_block1.fc1.weight' must have shape (512, 128·⌈N/32⌉) for windows of N samples, found (512, 900);",
+            (
+                "'output_block1.fc1.weight' must have shape (512, 128·⌈N/32⌉) for windows of "
+                "N samples, found (512, 900);"
+            ),
         ),
         (
             changed(output_block1__fc3__bias=BAD_BIAS),
@@ -286,8 +288,7 @@ def test_files_that_are_none(tmp_path):
         assert "\n" not in str(told.value)
 
 
-# The command line
-# -----------------------------------------------------------------------------------------------------
+# --- The command line
 
 
 @pytest.fixture(scope="module")
@@ -299,7 +300,7 @@ def file(tmp_path_factory):
 
 def command(monkeypatch, *arguments):
     monkeypatch.setattr(sys, "argv", ["interop", *map(str, arguments)])
-    cli.run(interop.main)
+    console.run(interop_command.main)
 
 
 def test_a_run_is_made_of_them(file, tmp_path, monkeypatch, capsys, loaded):
@@ -313,8 +314,8 @@ def test_a_run_is_made_of_them(file, tmp_path, monkeypatch, capsys, loaded):
         20,
     )
     assert run.model == models.create("tlio")
-    assert odometry.filter_config(run.config.data, run.config.filter).window_rotation == "tlio"
-    assert odometry.filter_config(run.config.data, FilterOptions()).window_rotation == "per_sample"
+    assert filter_setup(run.config.data, run.config.filter).config.window_rotation == "tlio"
+    assert filter_setup(run.config.data, FilterOptions()).config.window_rotation == "per_sample"
     equal(run.variables, loaded)
     with pytest.raises(SystemExit) as left:  # a second time
         command(monkeypatch, file, tmp_path / "run")
@@ -329,7 +330,10 @@ def test_a_run_is_made_of_them(file, tmp_path, monkeypatch, capsys, loaded):
     [
         (
             ["--rate", "100"],
-            "is for windows of 193 to 224 samples, not 100; give the --rate and --window-seconds that it was trained with",
+            (
+                "is for windows of 193 to 224 samples, not 100; give the --rate and "
+                "--window-seconds that it was trained with"
+            ),
         ),
         (["--stride-seconds", "0.3"], "data.stride_seconds"),
         (["--rates", "100"], "rate"),

@@ -215,7 +215,7 @@ def test_forward_against_numpy_frozen_or_not(samples, output_dim):
             np.ptp(values[..., :output_dim], axis=0).max() > 0.1
             and np.ptp(values[..., :output_dim], axis=1).min() > 0.05
         )
-    frozen = models.freeze(model, variables)
+    frozen = models.inference_variables(model, variables)
     assert not frozen.constants
     assert all(
         (x == 0).all()

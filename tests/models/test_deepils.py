@@ -157,7 +157,7 @@ def test_forward_against_numpy_frozen_or_not(samples, output_dim):
     constant = variables["batch_stats"]["uncertainty"]["log_std"]
     np.testing.assert_array_equal(found.log_std, np.stack([constant, constant]))
 
-    frozen = models.freeze(model, variables)
+    frozen = models.inference_variables(model, variables)
     blocks = [
         x
         for x in jax.tree.leaves(

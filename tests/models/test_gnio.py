@@ -182,10 +182,14 @@ def test_convolution_and_its_gradients_against_xla(size, stride, length):
     x = jax.random.normal(jax.random.key(0), (3, length, 4), jnp.float32)
     kernel = jax.random.normal(jax.random.key(1), (size, 4, 5), jnp.float32)
     padding = [((size - 1) // 2, (size - 1) // 2)]
-    oracle = lambda x, k: lax.conv_general_dilated(
-        x, k, (stride,), padding, dimension_numbers=("NWC", "WIO", "NWC")
-    )
-    ours = lambda x, k: resnet.convolve(x, k, (stride,), padding)  # noqa: E731
+    axes = ("NWC", "WIO", "NWC")
+
+    def oracle(x, k):
+        return lax.conv_general_dilated(x, k, (stride,), padding, dimension_numbers=axes)
+
+    def ours(x, k):
+        return resnet.convolve(x, k, (stride,), padding)
+
     np.testing.assert_allclose(ours(x, kernel), oracle(x, kernel), rtol=1e-5, atol=1e-5)
     weight = jax.random.normal(jax.random.key(2), oracle(x, kernel).shape, jnp.float32)
     for a, b in zip(
@@ -384,7 +388,7 @@ def test_constant_uncertainty_leaves_the_displacement_as_it_is():
     found = constant.apply(given, windows)
     np.testing.assert_array_equal(found.displacement, plain.apply(variables, windows).displacement)
     np.testing.assert_array_equal(found.log_std, [log_std, log_std])
-    frozen = models.freeze(constant, given)
+    frozen = models.inference_variables(constant, given)
     np.testing.assert_allclose(
         models.Inference(constant)(frozen, windows).displacement, found.displacement, atol=1e-6
     )

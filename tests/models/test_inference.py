@@ -32,7 +32,7 @@ def test_a_frozen_network_gives_the_same_numbers(options):
     model = models.create("gnio", width=4, **options)
     variables = trained_like(model)
     windows = jax.random.normal(jax.random.key(1), (3, 64, 6), jnp.float32)
-    frozen, apply = models.freeze(model, variables), models.Inference(model)
+    frozen, apply = models.inference_variables(model, variables), models.Inference(model)
     wanted, found = model.apply(variables, windows), apply(frozen, windows)
     assert float(jnp.abs(wanted.displacement).max()) > 1e-3
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5), found, wanted)
@@ -49,6 +49,6 @@ def test_keys_and_values_are_not_computed_again():
         return jax.jit(apply).lower(given, windows).compile().cost_analysis()["flops"]
 
     saved = operations(model.apply, variables) - operations(
-        models.Inference(model), models.freeze(model, variables)
+        models.Inference(model), models.inference_variables(model, variables)
     )
     assert saved >= 2 * 2 * 16 * 32 * 32  # two projections of 16 prototypes of 32 features

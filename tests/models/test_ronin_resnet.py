@@ -1,4 +1,4 @@
-"""RoNIN's network: its sizes, its head against plain NumPy, and the uncertainty that it is given."""
+"""RoNIN's network: its sizes, its head against plain NumPy, and its uncertainty."""
 
 import jax
 import jax.numpy as jnp
@@ -91,9 +91,9 @@ def test_output_against_numpy(output_dim):
 
 def test_a_frozen_network_gives_the_same_numbers():
     model, variables, windows = prepared(3)
-    frozen = models.freeze(model, variables)
+    frozen = models.inference_variables(model, variables)
     apply = jax.jit(models.Inference(model).__call__)
-    wanted, found = apply(models.Frozen(variables, {}), windows), apply(frozen, windows)
+    wanted, found = apply(models.InferenceVariables(variables, {}), windows), apply(frozen, windows)
     np.testing.assert_allclose(found.displacement, wanted.displacement, rtol=2e-4, atol=2e-5)
     np.testing.assert_array_equal(found.log_std, wanted.log_std)
     assert (np.asarray(frozen.variables["params"]["displacement"]["neck_bn"]["scale"]) == 1).all()

@@ -84,9 +84,9 @@ def test_a_frozen_network_gives_the_same_numbers():
     model = models.create("tlio", width=4)
     variables = drawn(model, 64)
     windows = jax.random.normal(jax.random.key(1), (3, 64, 6), jnp.float32)
-    frozen = models.freeze(model, variables)
+    frozen = models.inference_variables(model, variables)
     apply = jax.jit(models.Inference(model).__call__)
-    wanted, found = apply(models.Frozen(variables, {}), windows), apply(frozen, windows)
+    wanted, found = apply(models.InferenceVariables(variables, {}), windows), apply(frozen, windows)
     for one, other in [(found.displacement, wanted.displacement), (found.log_std, wanted.log_std)]:
         assert np.abs(other).max() > 1e-2
         np.testing.assert_allclose(one, other, rtol=2e-4, atol=2e-5)

@@ -42,10 +42,13 @@ def recording(tmp_path_factory):
 
 def tiny(recording, workdir, **changes):
     config = TrainConfig(
-        dataset="tlio", data_root=str(recording), workdir=str(workdir), data=DataConfig(rate=50.0),
+        dataset="tlio",
+        data_root=str(recording),
+        workdir=str(workdir),
+        data=DataConfig(rate=50.0),
         model=ModelConfig(width=2, bank_size=3, bank_heads=2),
         optim=OptimConfig(epochs=3, batch_size=16, learning_rate=1e-3, warmup_epochs=1.0),
-    )  # fmt: skip
+    )
     return dataclasses.replace(config, **changes)
 
 
@@ -94,7 +97,7 @@ def test_validation_is_the_plain_mean_over_every_window(recording, finished):
     run = checkpoint.load_run(workdir, "latest")
     from gnio_jax import data
 
-    source = windows.index(
+    source = windows.window_source(
         [data.resample(s, 50.0) for s in data.load("tlio", recording, "val")], run.config.data, 5
     )
     source = jax.device_put(source)
@@ -119,7 +122,10 @@ def test_a_run_is_not_resumed_with_other_recordings(recording, finished, tmp_pat
     before = (tmp_path / "run" / "splits.yaml").read_bytes()
     with pytest.raises(
         InputError,
-        match=r"splits\.yaml: .*split 'train' \(0 differ, their order does\); resume with the same data",
+        match=(
+            r"splits\.yaml: .*split 'train' \(0 differ, their order does\); resume with the "
+            r"same data"
+        ),
     ):
         loop.train(config, resume=True)
     (tmp_path / "data" / "train_list.txt").write_text("b\n")
@@ -157,8 +163,13 @@ def test_stopping_within_an_epoch_and_resuming_gives_the_same_bits(
     for which in ("latest", "best"):
         assert same(parameters(tmp_path / "run", which), parameters(finished[0], which))
     kept = ("epoch", "step", "loss", "mse", "nll", "val_loss", "learning_rate")
-    rows = [[{key: row[key] for key in kept} for row in map(json.loads, (folder / "metrics.jsonl").read_text().splitlines())]
-            for folder in (tmp_path / "run", finished[0])]  # fmt: skip
+    rows = [
+        [
+            {key: row[key] for key in kept}
+            for row in map(json.loads, (folder / "metrics.jsonl").read_text().splitlines())
+        ]
+        for folder in (tmp_path / "run", finished[0])
+    ]
     for ours, theirs in zip(
         *rows, strict=True
     ):  # sums over an epoch are made of fewer or more parts: equal but for rounding
@@ -166,9 +177,31 @@ def test_stopping_within_an_epoch_and_resuming_gives_the_same_bits(
 
 
 def command(recording, workdir, *more):
-    return [sys.executable, "train.py", "--dataset", "tlio", "--data-root", str(recording), "--workdir", str(workdir), "--data.rate", "50",
-            "--model.width", "2", "--model.bank-size", "3", "--model.bank-heads", "2", "--optim.batch-size", "16",
-            "--optim.learning-rate", "1e-3", "--optim.warmup-epochs", "1", *more]  # fmt: skip
+    return [
+        sys.executable,
+        "train.py",
+        "--dataset",
+        "tlio",
+        "--data-root",
+        str(recording),
+        "--workdir",
+        str(workdir),
+        "--data.rate",
+        "50",
+        "--model.width",
+        "2",
+        "--model.bank-size",
+        "3",
+        "--model.bank-heads",
+        "2",
+        "--optim.batch-size",
+        "16",
+        "--optim.learning-rate",
+        "1e-3",
+        "--optim.warmup-epochs",
+        "1",
+        *more,
+    ]
 
 
 ENVIRONMENT = {**os.environ, "JAX_PLATFORMS": "cpu"}
@@ -180,8 +213,14 @@ def test_killed_at_any_moment_and_resumed_gives_the_same_bits(recording, tmp_pat
     config = tiny(recording, tmp_path / "alone")
     loop.train(dataclasses.replace(config, optim=dataclasses.replace(config.optim, epochs=6)))
     epochs, run = ["--optim.epochs", "6"], tmp_path / "killed"
-    process = subprocess.Popen(command(recording, run, *epochs), cwd=ROOT, env=ENVIRONMENT, stdout=subprocess.DEVNULL,
-                               stderr=subprocess.PIPE, text=True)  # fmt: skip
+    process = subprocess.Popen(
+        command(recording, run, *epochs),
+        cwd=ROOT,
+        env=ENVIRONMENT,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
     log, deadline = run / "metrics.jsonl", time.time() + 120
     while (
         time.time() < deadline
@@ -210,7 +249,7 @@ def test_killed_at_any_moment_and_resumed_gives_the_same_bits(recording, tmp_pat
 
 
 def test_a_loss_that_is_not_finite_stops_with_its_step(recording, tmp_path, monkeypatch):
-    real, found = windows.index, []
+    real, found = windows.window_source, []
 
     def spoiled(*arguments):
         source = real(*arguments)
@@ -221,7 +260,7 @@ def test_a_loss_that_is_not_finite_stops_with_its_step(recording, tmp_path, monk
             )
         )
 
-    monkeypatch.setattr(windows, "index", spoiled)
+    monkeypatch.setattr(windows, "window_source", spoiled)
     config = tiny(recording, tmp_path / "run")
     with pytest.raises(FloatingPointError, match=r"not finite at step \d+ \(epoch 0\)") as raised:
         loop.train(config)
@@ -256,8 +295,12 @@ def test_two_stage_loss_without_float64(recording, tmp_path, monkeypatch):
             optim=OptimConfig(epochs=1, batch_size=16),
         )
     )
-    template = step.create_state(checkpoint.create_model(tiny(recording, "")), optimizer.create(OptimConfig(), LossConfig(), 1),
-                                 jax.random.split(jax.random.key(0), 3)[0], 50)  # fmt: skip
+    template = step.create_state(
+        checkpoint.create_model(tiny(recording, "")),
+        optimizer.create(OptimConfig(), LossConfig(), 1),
+        jax.random.split(jax.random.key(0), 3)[0],
+        50,
+    )
     trained = parameters(tmp_path / "run")["params"]
     assert same(trained["uncertainty"], jax.tree.map(np.asarray, template.params["uncertainty"]))
     assert not same(trained["head"], jax.tree.map(np.asarray, template.params["head"]))

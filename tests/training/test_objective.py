@@ -247,8 +247,12 @@ def test_a_held_uncertainty_is_not_counted(held_loss):
             part: np.zeros(3) if held and part == "log_std" else rng.standard_normal(3)
             for part in params
         }
-        change, state = update(jax.tree.map(lambda g: {"w": jnp.asarray(g, jnp.float32)}, gradient), state, params,
-                               log_std_learns=jnp.bool_(not held))  # fmt: skip
+        change, state = update(
+            jax.tree.map(lambda g: {"w": jnp.asarray(g, jnp.float32)}, gradient),
+            state,
+            params,
+            log_std_learns=jnp.bool_(not held),
+        )
         params = optax.apply_updates(params, change)
         for part, (w, m, v, count) in expected.items():
             if held and part == "log_std":

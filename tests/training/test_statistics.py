@@ -16,17 +16,20 @@ from gnio_jax.training import losses, optimizer, step
 from gnio_jax.training.checkpoint import create_model
 
 CONFIG = TrainConfig(
-    data=DataConfig(rate=50.0), model=ModelConfig(width=8), loss=LossConfig(nll_weight=1.0),
-    optim=OptimConfig(epochs=4, batch_size=64, learning_rate=3e-3, start_learning_rate=1e-4,
-                      warmup_epochs=0.5),
-)  # fmt: skip
+    data=DataConfig(rate=50.0),
+    model=ModelConfig(width=8),
+    loss=LossConfig(nll_weight=1.0),
+    optim=OptimConfig(
+        epochs=4, batch_size=64, learning_rate=3e-3, start_learning_rate=1e-4, warmup_epochs=0.5
+    ),
+)
 
 
 @functools.cache
 def source_of(split, stride, rate=CONFIG.data.rate):
     sequences = [data.resample(s, rate) for s in data.load("synthetic", split=split)]
     return jax.device_put(
-        windows.index(sequences, dataclasses.replace(CONFIG.data, rate=rate), stride)
+        windows.window_source(sequences, dataclasses.replace(CONFIG.data, rate=rate), stride)
     )
 
 
@@ -48,8 +51,18 @@ def trainer(config, source, seed=0):
     def take(state, epoch, first, count):
         with jax.enable_x64(False):
             order = step.epoch_order(key, epoch, source)
-            return step.train_steps(state, source, order, jnp.int32(first), jnp.int32(count), jnp.float32(1), key,
-                                    model=model, optimizer=tx, config=config)  # fmt: skip
+            return step.train_steps(
+                state,
+                source,
+                order,
+                jnp.int32(first),
+                jnp.int32(count),
+                jnp.float32(1),
+                key,
+                model=model,
+                optimizer=tx,
+                config=config,
+            )
 
     return model, state, take, steps
 
@@ -92,7 +105,7 @@ def squared_errors(model, state, source, config=CONFIG):
 
     @jax.jit
     def one(state, key, which):
-        drawn, dropout = step.drawn(key, source, which, config)
+        drawn, dropout = step.draw_windows(key, source, which, config)
         variables = {"params": state.params, "batch_stats": state.batch_stats}
         training, _ = model.apply(
             variables, drawn.imu, train=True, mutable=["batch_stats"], rngs={"dropout": dropout}
@@ -119,7 +132,7 @@ def test_training_windows_err_in_inference_mode_as_in_training_mode(trained):
 
 
 def test_statistics_are_means_over_batches(trained):
-    """Of the first normalisation, against NumPy: its input is a convolution of the drawn windows."""
+    """Of the first normalisation, against NumPy: its input is a convolution of drawn windows."""
     model, _, state, source = trained
     few = dataclasses.replace(
         CONFIG, optim=dataclasses.replace(CONFIG.optim, statistics_windows=3 * 64)
@@ -133,9 +146,9 @@ def test_statistics_are_means_over_batches(trained):
     for number, which in enumerate(order):
         with jax.enable_x64(False):
             imu = np.asarray(
-                step.drawn(jax.random.fold_in(draw_key, number), source, jnp.asarray(which), few)[
-                    0
-                ].imu,
+                step.draw_windows(
+                    jax.random.fold_in(draw_key, number), source, jnp.asarray(which), few
+                )[0].imu,
                 np.float64,
             )
         padded = np.pad(imu, ((0, 0), (3, 3), (0, 0)))
@@ -181,8 +194,11 @@ def test_an_estimate_depends_on_parameters_and_key_alone(trained):
 
 
 def test_constants_of_the_uncertainty_are_left_alone():
-    config = dataclasses.replace(CONFIG, model=ModelConfig(width=2, uncertainty="calibrated", bank_size=0),
-                                 optim=dataclasses.replace(CONFIG.optim, statistics_windows=64))  # fmt: skip
+    config = dataclasses.replace(
+        CONFIG,
+        model=ModelConfig(width=2, uncertainty="calibrated", bank_size=0),
+        optim=dataclasses.replace(CONFIG.optim, statistics_windows=64),
+    )
     source = source_of("val", 25)
     model, state, _, _ = trainer(config, source)
     state.batch_stats["uncertainty"]["log_factor"] = jnp.array([0.5, -1.0, 2.0], jnp.float32)
@@ -247,8 +263,15 @@ def test_networks_with_a_head_begin_with_a_standard_deviation_near_one(name):
     imu = np.float32([0, 0, 9.81, 0, 0, 0]) + rng.normal(0, [3, 3, 3, 2, 2, 2], (8, 50, 6)).astype(
         np.float32
     )
-    apply = jax.jit(lambda variables: model.apply(
-        variables, jnp.asarray(imu), train=True, mutable=["batch_stats"], rngs={"dropout": jax.random.key(1)}))  # fmt: skip
+    apply = jax.jit(
+        lambda variables: model.apply(
+            variables,
+            jnp.asarray(imu),
+            train=True,
+            mutable=["batch_stats"],
+            rngs={"dropout": jax.random.key(1)},
+        )
+    )
     for seed in range(3):
         variables = models.initialise(model, jax.random.key(seed), 50)
         said, _ = apply(variables)

@@ -17,11 +17,13 @@ The steps, a file each: filtered motion of the tracked body (`track`), first gue
 (`fit`), and the choice of the fit that leaves least unexplained (`mounting`). Both sides of each
 equation pass the same Gaussian filter, so that filtering removes noise but biases nothing.
 
-`heading` aligns a tracker that says nothing of the IMU's attitude, `attitude` corrects the gyro's
-drift, `smoothing` gives positions and velocities. Attitudes are SciPy rotations, body→world.
+`heading` aligns a tracker that says nothing of the IMU's attitude; `clocks` finds the lag of poses
+that are the IMU's own. `attitude` corrects the gyro's drift, `smoothing` gives positions and
+velocities. Attitudes are SciPy rotations, body→world.
 """
 
 from gnio_jax.data.alignment.attitude import attitude_from_acceleration, fuse_attitude
+from gnio_jax.data.alignment.clocks import PoseLag, pose_lag
 from gnio_jax.data.alignment.heading import Heading, align_heading
 from gnio_jax.data.alignment.mounting import Alignment, align
 from gnio_jax.data.alignment.smoothing import smooth_positions
@@ -30,11 +32,13 @@ from gnio_jax.data.alignment.track import TooLittle, Track
 __all__ = [
     "Alignment",
     "Heading",
+    "PoseLag",
     "TooLittle",
     "Track",
     "align",
     "align_heading",
     "attitude_from_acceleration",
     "fuse_attitude",
+    "pose_lag",
     "smooth_positions",
 ]

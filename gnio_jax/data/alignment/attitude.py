@@ -25,8 +25,8 @@ from gnio_jax.numerics import (
 from gnio_jax.types import GRAVITY
 
 COURSE_SECONDS, FLIP_DEGREES = 3.0, 15.0
-"""Filter (standard deviation, s) of the correction's median course, and how far off it a sample is a
-flip of the tracker."""
+"""Filter (standard deviation, s) of the correction's median course, and how far off it a sample
+is a flip of the tracker."""
 
 TILT_DRIFT_STD, YAW_DRIFT_STD = 0.05, 0.02
 """rad by which the gyro's drift may change from one interval of 10 s to the next: 0.005 rad/s in

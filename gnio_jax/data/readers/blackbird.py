@@ -24,7 +24,8 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from gnio_jax.data.dataset import Dataset, Recording, single
-from gnio_jax.data.readers.text import listed, numbers, read_csv, shortened
+from gnio_jax.data.readers.parsing import float_columns, parsed_as, unit_rotations
+from gnio_jax.data.readers.text import listed, numbers, read_csv
 from gnio_jax.data.resampling import resample
 from gnio_jax.data.validation import (
     FASTEST,
@@ -33,10 +34,9 @@ from gnio_jax.data.validation import (
     check_increasing,
     check_motion,
     check_rate,
-    check_unit_norm,
     validate,
 )
-from gnio_jax.numerics import quaternions, rotations
+from gnio_jax.numerics import quaternions, wxyz_from_xyzw
 from gnio_jax.types import InputError, Sequence
 
 RATE = 100.0
@@ -66,47 +66,38 @@ def read_sequence(folder: str | os.PathLike[str], name: str | None = None) -> Se
     """One sequence of its folder, in a z-up world. Raises `InputError` naming file and field."""
     folder = Path(folder)
     path = folder / _TABLE
-    fields = _fields(path)
+    with parsed_as(path, "HDF5"), h5py.File(path, "r") as file:
+        fields = float_columns(file, _FIELDS, path)
     for field, values in fields.items():
         check_finite(values, field, path)
     stamps, gyro, accel, pose = (fields[field] for field in _FIELDS)
     check_increasing(stamps, path)
     check_rate(stamps, RATE, path)
     check_gaps(stamps, path)
-    everywhere = np.ones(len(stamps), dtype=bool)
-    quaternion = check_unit_norm(pose[:, [6, 3, 4, 5]], everywhere, "traj_target", path)
     time, position = stamps - stamps[0], pose[:, :3]
+    attitude = unit_rotations(wxyz_from_xyzw(pose[:, 3:]), "traj_target", path)
     velocity = _velocity(folder / _TRUTH, stamps)
     if velocity is None:
         velocity = CubicSpline(time, position, axis=0)(time, 1)
 
-    attitude = rotations(quaternion)
-    up = float(attitude.apply(accel).mean(axis=0)[2])
-    world = "z-up"
-    if up < 0:
-        turn = Rotation.from_rotvec([np.pi, 0.0, 0.0])
-        attitude, position, velocity, world = (
-            turn * attitude,
-            turn.apply(position),
-            turn.apply(velocity),
-            "z-down, turned",
-        )
+    upside_down = attitude.apply(accel).mean(axis=0)[2] < 0
+    turn = Rotation.from_rotvec([np.pi if upside_down else 0.0, 0.0, 0.0])
     sequence = Sequence(
         name=name or folder.name,
         time=time,
         gyro=gyro,
         accel=accel,
-        orientation=quaternions(attitude),
-        position=position,
-        velocity=velocity,
-        valid=everywhere,
+        orientation=quaternions(turn * attitude),
+        position=turn.apply(position),
+        velocity=turn.apply(velocity),
+        valid=np.ones(len(stamps), dtype=bool),
         attributes={
             "dataset": "blackbird",
             "group": folder.parent.name,
             "session": "/".join(folder.parts[-4:-1]),
             "placement": "quadrotor",
             "body": "front-right-down",
-            "native_world": world,
+            "native_world": "z-down, turned" if upside_down else "z-up",
             "truth": "motion capture",
             "imu_compensated": "constant bias",
             "start_time": float(stamps[0]),
@@ -118,35 +109,6 @@ def read_sequence(folder: str | os.PathLike[str], name: str | None = None) -> Se
     return resample(sequence, RATE)
 
 
-def _fields(path: Path) -> dict[str, np.ndarray]:
-    fields: dict[str, np.ndarray] = {}
-    try:
-        with h5py.File(path, "r") as file:
-            for field, width in _FIELDS.items():
-                if field not in file:
-                    raise InputError(
-                        path, f"field '{field}' is missing", f"found: {', '.join(file)}"
-                    )
-                value = np.asarray(file[field])
-                rows = len(fields["ts"]) if fields else value.size
-                wanted = (rows,) if width is None else (rows, width)
-                if value.dtype.kind != "f" or value.shape != wanted or rows < 2:
-                    raise InputError(
-                        path,
-                        f"field '{field}' is {value.dtype} of shape {value.shape}, expected floats {wanted}",
-                    )
-                fields[field] = value.astype(np.float64)
-    except InputError:
-        raise
-    except Exception as error:  # a damaged file makes the parser fail in any way
-        raise InputError(
-            path,
-            f"cannot be read as HDF5, it may be cut short ({shortened(error, 200)})",
-            "copy it again",
-        ) from None
-    return fields
-
-
 def _velocity(path: Path, stamps: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"] | None:
     """The velocities of the text beside the table; None where there is no text or it has none."""
     if not path.is_file():
@@ -155,7 +117,8 @@ def _velocity(path: Path, stamps: Float[np.ndarray, " n"]) -> Float[np.ndarray, 
     if table.shape[1] not in (8, 11):
         raise InputError(
             path,
-            f"has {table.shape[1]} columns, expected 8 (stamp, position, quaternion) or 11 (and velocity)",
+            f"has {table.shape[1]} columns, expected 8 (stamp, position, quaternion) or 11 "
+            "(and velocity)",
             "copy it again",
         )
     if table.shape[1] == 8:

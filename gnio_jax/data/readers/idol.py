@@ -18,7 +18,6 @@ The folders are the splits: `known` (also `seen`, `test`) are people of `train`,
 
 from __future__ import annotations
 
-import json
 import os
 import warnings
 from functools import partial
@@ -28,13 +27,14 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 from jaxtyping import Bool, Float
-from scipy.interpolate import CubicSpline
-from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
+from gnio_jax.data.alignment import PoseLag, pose_lag
 from gnio_jax.data.dataset import Dataset, Recording, Refusal
 from gnio_jax.data.gaps import divide_at_gaps
-from gnio_jax.data.readers.phones import held_out, poses_at, with_velocity
+from gnio_jax.data.readers.parsing import json_object, parsed_as
+from gnio_jax.data.readers.phones import held_out, with_velocity
+from gnio_jax.data.readers.reference import Poses, poses_at
 from gnio_jax.data.readers.text import numbers, shortened
 from gnio_jax.data.resampling import LONGEST_BRIDGE, resample
 from gnio_jax.data.validation import (
@@ -44,7 +44,7 @@ from gnio_jax.data.validation import (
     check_unit_norm,
     validate,
 )
-from gnio_jax.numerics import quaternions, rotations
+from gnio_jax.numerics import finite_rows, levelling, outer_span, quaternions, rotations
 from gnio_jax.types import STANDARD_G, InputError, Sequence
 
 RATE = 100.0
@@ -56,8 +56,6 @@ PHONE_TO_RIG = Rotation.from_rotvec([-0.01853, 0.02801, 3.12916])
 x → −x, y → −y."""
 MAX_TILT = 20.0
 """Degrees by which the map may be tilted; beyond, the attitude is not what it should be."""
-MAX_LAG = 0.4
-"""s, to either side."""
 
 _SPLITS = {
     "train": "train",
@@ -69,7 +67,6 @@ _SPLITS = {
     "unknown": "unknown",
 }
 _BUILDINGS = ("building1", "building2", "building3")
-_FILTER_SECONDS = 0.05
 
 
 def recordings(root: Path, split: str) -> list[Recording]:
@@ -120,31 +117,23 @@ def _recording(walk: Walk, note: dict[str, Any]) -> Recording:
 def find_walks(root: Path, folder: str) -> list[Walk]:
     """The recordings in `folder` ("train", "known", "unknown") of every building; the buildings may
     lie a folder or two deeper."""
-    walks, nameless = [], []
+    walks: list[Walk] = []
+    nameless: list[Path] = []
     for building in _BUILDINGS:
-        places = next(
-            (
-                found
-                for depth in ("", "*/", "*/*/")
-                if (found := sorted(root.glob(f"{depth}{building}/{folder}")))
-            ),
-            [],
-        )
-        for place in places[:1]:
-            about = _metadata(place / "metadata.json")
-            for path in sorted(
-                place.glob("*.feather"), key=lambda path: (len(path.stem), path.stem)
-            ):
-                entry = about.get(path.stem)
-                entry = entry if isinstance(entry, dict) else {}
-                if entry.get("subjectID") is None:
-                    nameless.append(path)
-                subject = (
-                    _name(path)
-                    if entry.get("subjectID") is None
-                    else shortened(f"subject{entry['subjectID']}")
-                )
-                walks.append(Walk(path, subject, shortened(entry.get("calibration", "unknown"))))
+        places = (sorted(root.glob(f"{depth}{building}/{folder}")) for depth in ("", "*/", "*/*/"))
+        place = next((found[0] for found in places if found), None)
+        if place is None:
+            continue
+        metadata = place / "metadata.json"
+        about = json_object(metadata) if metadata.is_file() else {}
+        for path in sorted(place.glob("*.feather"), key=lambda path: (len(path.stem), path.stem)):
+            entry = about.get(path.stem)
+            entry = entry if isinstance(entry, dict) else {}
+            subject = entry.get("subjectID")
+            if subject is None:
+                nameless.append(path)
+            person = _name(path) if subject is None else shortened(f"subject{subject}")
+            walks.append(Walk(path, person, shortened(entry.get("calibration", "unknown"))))
     if not walks:
         raise InputError(
             root,
@@ -153,8 +142,8 @@ def find_walks(root: Path, folder: str) -> list[Walk]:
         )
     if nameless:
         warnings.warn(
-            f"{root}: metadata.json does not name the subject of {len(nameless)} recordings, e.g. {nameless[0]}; each counts as "
-            "a person of its own",
+            f"{root}: metadata.json does not name the subject of {len(nameless)} recordings, "
+            f"e.g. {nameless[0]}; each counts as a person of its own",
             stacklevel=3,
         )
     return walks
@@ -164,92 +153,30 @@ def read_pieces(path: str | os.PathLike[str]) -> list[Sequence]:
     """One walk at 100 Hz: levelled, the reference turned to the phone and shifted onto its clock.
 
     Level and lag are those of the whole walk; where a gap is longer than a window it is divided
-    (`divide_at_gaps`). Raises `InputError` naming file and column, and `Refusal` when its reference cannot
-    be that of the phone.
+    (`divide_at_gaps`). Raises `InputError` naming file and column, and `Refusal` when its reference
+    cannot be that of the phone.
     """
     path = Path(path)
-    table = _table(path)
-    stamps = numbers(table, ["timestamp"], path)[:, 0]
-    check_finite(stamps, "timestamp", path)
-    stamps, order = np.unique(stamps, return_index=True)  # sorted, repeated rows dropped
-    if len(stamps) < max(10 * RATE, 0.5 * len(table)):
-        raise Refusal(
-            path,
-            f"column 'timestamp' holds only {len(stamps)} different stamps in {len(table)} rows",
-            "leave it out",
-        )
-    names = {
-        "iphoneAcc": "XYZ",
-        "iphoneGyro": "XYZ",
-        "stencilAcc": "XYZ",
-        "orient": "WXYZ",
-        "processedPos": "XYZ",
-    }
-    columns = {
-        name: numbers(table, [name + axis for axis in axes], path)[order]
-        for name, axes in names.items()
-    }
-    start = float(stamps[0])
-    time = stamps - start
-    check_rate(time, RATE, path)
-    for name in ("iphoneAcc", "iphoneGyro"):
-        check_finite(columns[name], name, path)
-    pull = float(np.median(np.linalg.norm(columns["iphoneAcc"], axis=1)))
-    if not 0.5 < pull < 2.0:
-        raise InputError(
-            path,
-            f"columns 'iphoneAcc' have a median length of {pull:.3g}, expected about 1 (G)",
-            "copy it again",
-        )
-
-    gyro, accel = columns["iphoneGyro"], -STANDARD_G * columns["iphoneAcc"]
-    # A quaternion of zeros is no attitude, as little as NaN is.
-    known = (
-        columns["orient"].any(axis=1)
-        & np.isfinite(columns["orient"]).all(axis=1)
-        & np.isfinite(columns["processedPos"]).all(axis=1)
-    )
-    if known.sum() < max(10 * RATE, 0.5 * len(time)):
-        raise Refusal(
-            path,
-            f"columns 'orient', 'processedPos' hold a pose in only {known.sum()} of {len(time)} rows",
-            "leave it out",
-        )
-    rig = rotations(check_unit_norm(columns["orient"], known, "orient", path)[known])
-    level, tilt = _leveling(rig, columns["stencilAcc"][known], path)
-    attitude = level * rig * PHONE_TO_RIG
-    # A gap tells nothing of the lag, however long it is: here it lasts as long as a window.
-    closed = np.concatenate([[0.0], np.cumsum(np.minimum(np.diff(time), WINDOW_SECONDS))])
-    fit = pose_lag(closed, gyro, closed[known], attitude)
-    if not fit.correlation >= 0.5:  # NaN when the poses do not turn at all
-        raise Refusal(
-            path,
-            f"columns 'orient' do not turn as 'iphoneGyro' does (they correlate by {fit.correlation:.2f})",
-            "leave it out",
-        )
-    position, attitude, valid = poses_at(
-        time[known] - fit.lag,
-        level.apply(columns["processedPos"][known]),
-        attitude,
-        time,
-        LONGEST_BRIDGE,
-    )
-
-    inside = slice(int(np.argmax(valid)), len(valid) - int(np.argmax(valid[::-1])))
-    device = _device(table, order, path)
+    rows = _rows(path)
+    level, attitude, position = _levelled_poses(rows, path)
+    fit = _lag(rows, attitude, path)
+    poses = Poses(rows.time[rows.known] - fit.lag, attitude, position)
+    place, turned, valid = poses_at(rows.time, poses, LONGEST_BRIDGE)
+    inside = outer_span(valid)
+    name = _name(path)
     sequence = Sequence(
-        name=_name(path),
-        time=time[inside] - time[inside.start],
-        gyro=gyro[inside],
-        accel=accel[inside],
-        orientation=quaternions(attitude[inside]),
-        position=position[inside],
-        velocity=np.zeros_like(position[inside]),
+        name=name,
+        time=rows.time[inside] - rows.time[inside.start],
+        gyro=rows.gyro[inside],
+        accel=rows.accel[inside],
+        orientation=quaternions(turned[inside]),
+        position=place[inside],
+        velocity=np.zeros_like(place[inside]),
         valid=valid[inside],
-        device_orientation=None if device is None else device[inside],
+        device_orientation=None if rows.device is None else rows.device[inside],
         attributes={
             "dataset": "idol",
-            "group": _name(path),
+            "group": name,
             "subject": "unknown",
             "building": path.parent.parent.name,
             "device": "iPhone 8",
@@ -257,99 +184,97 @@ def read_pieces(path: str | os.PathLike[str]) -> list[Sequence]:
             "truth": "lidar-visual-inertial odometry (Kaarta Stencil)",
             "imu_compensated": "no",
             "licence": DATASET.licence,
-            "start_time": start + float(time[inside.start]),
+            "start_time": rows.start + float(rows.time[inside.start]),
             "lag": fit.lag,
             "rate_correlation": fit.correlation,
-            "tilt_degrees": tilt,
+            "tilt_degrees": float(np.degrees(level.magnitude())),
         },
     )
     pieces = divide_at_gaps(validate(sequence, path), path)
     return [validate(with_velocity(resample(piece, RATE)), path) for piece in pieces]
 
 
-class Lag(NamedTuple):
-    """What `pose_lag` estimates."""
-
-    lag: float
-    """By how much a pose is stamped later than the IMU's sample of the same event, s."""
-    correlation: float
-    """Of the angular rates once the lag is taken out, all axes together; 1 where nothing turns and
-    nothing can be told."""
+# --- one table
 
 
-def pose_lag(
-    time: Float[np.ndarray, "n"],
-    gyro: Float[np.ndarray, "n 3"],
-    stamps: Float[np.ndarray, "m"],
-    attitude: Rotation,
-) -> Lag:
-    """By how much the poses are late, from the angular rates of both in the same body.
+class _Rows(NamedTuple):
+    """A walk's table: rows sorted by their stamps, repeated ones dropped."""
 
-    `time`, `stamps` s; `gyro` rad/s; `attitude` m rotations body→world. The lag that lets gyro(t) −
-    bias and rate(t + lag) differ least, in a robust sense, both smoothed over 0.05 s (σ); among
-    multiples of 10 ms first, then by Gauss-Newton.
-    """
-    steps = np.diff(stamps)
-    turning = (attitude[:-1].inv() * attitude[1:]).as_rotvec() / steps[:, None]
-    middle = 0.5 * (stamps[:-1] + stamps[1:])
-    near = steps <= 2.5 / RATE
-    clock = np.arange(max(time[0], middle[0]), min(time[-1], middle[-1]), 1.0 / RATE)
-    sigma = _FILTER_SECONDS * RATE
-    felt = gaussian_filter1d(
-        np.stack([np.interp(clock, time, column) for column in gyro.T], axis=1), sigma, axis=0
-    )
-    seen = gaussian_filter1d(
-        np.stack([np.interp(clock, middle[near], column) for column in turning[near].T], axis=1),
-        sigma,
-        axis=0,
-    )
-    spline = CubicSpline(clock, seen, axis=0)
-    slope = spline.derivative()
-    inner = clock[(clock > clock[0] + MAX_LAG + 0.1) & (clock < clock[-1] - MAX_LAG - 0.1)]
-    felt = np.stack([np.interp(inner, clock, column) for column in felt.T], axis=1)
-    if (
-        len(inner) < 5 * RATE
-        or np.median(np.linalg.norm(felt - np.median(felt, axis=0), axis=1)) < 0.02
-    ):
-        return Lag(0.0, 1.0)
-
-    def difference(lag: float) -> np.ndarray:
-        error = felt - spline(inner + lag)
-        return error - np.median(error, axis=0)
-
-    candidates = np.arange(-round(MAX_LAG * 100), round(MAX_LAG * 100) + 1) / 100.0
-    lag = float(min(candidates, key=lambda lag: np.abs(difference(lag)).mean()))
-    for _ in range(8):
-        error, gradient = difference(lag), slope(inner + lag)
-        scale = max(3.0 * 1.4826 * float(np.median(np.abs(error))), 1e-6)
-        weight = 1.0 / (1.0 + (error / scale) ** 2)
-        change = float((weight * gradient * error).sum() / max((weight * gradient**2).sum(), 1e-12))
-        lag = float(np.clip(lag + np.clip(change, -0.02, 0.02), -MAX_LAG - 0.05, MAX_LAG + 0.05))
-    there, felt = spline(inner + lag), felt - felt.mean(axis=0)
-    there = there - there.mean(axis=0)
-    return Lag(lag, float((there * felt).sum() / np.sqrt((there**2).sum() * (felt**2).sum())))
+    start: float
+    """First stamp, s."""
+    time: Float[np.ndarray, " n"]
+    """s since `start`, increasing."""
+    gyro: Float[np.ndarray, "n 3"]
+    """The phone's, rad/s."""
+    accel: Float[np.ndarray, "n 3"]
+    """The phone's specific force, m/s²."""
+    rig_accel: Float[np.ndarray, "n 3"]
+    """The rig's own accelerometer, in the rig's frame, along the specific force."""
+    orientation: Float[np.ndarray, "n 4"]
+    """Rig → map."""
+    position: Float[np.ndarray, "n 3"]
+    """Of the rig in the map, m."""
+    known: Bool[np.ndarray, " n"]
+    """Rows that hold a pose."""
+    device: Float[np.ndarray, "n 4"] | None
+    """CoreMotion's attitude, where the table gives it in every row."""
 
 
-def _leveling(rig: Rotation, accel: np.ndarray, path: Path) -> tuple[Rotation, float]:
-    """The smallest rotation that turns the mean of R·accel upright, and its angle in degrees."""
-    measured = np.isfinite(accel).all(axis=1)
-    if measured.sum() < 10 * RATE:
-        raise Refusal(
-            path, f"columns 'stencilAcc' hold numbers in only {measured.sum()} rows", "leave it out"
+def _rows(path: Path) -> _Rows:
+    table = _table(path)
+    stamps, order = _stamps(table, path)
+
+    def columns(name: str, axes: str) -> Float[np.ndarray, "n w"]:
+        return numbers(table, [name + axis for axis in axes], path)[order]
+
+    accel, gyro = columns("iphoneAcc", "XYZ"), columns("iphoneGyro", "XYZ")
+    rig_accel = columns("stencilAcc", "XYZ")
+    orientation, position = columns("orient", "WXYZ"), columns("processedPos", "XYZ")
+    check_rate(stamps - stamps[0], RATE, path)
+    check_finite(accel, "iphoneAcc", path)
+    check_finite(gyro, "iphoneGyro", path)
+    pull = float(np.median(np.linalg.norm(accel, axis=1)))
+    if not 0.5 < pull < 2.0:
+        raise InputError(
+            path,
+            f"columns 'iphoneAcc' have a median length of {pull:.3g}, expected about 1 (G)",
+            "copy it again",
         )
-    up = rig[measured].apply(accel[measured]).mean(axis=0)
-    axis = np.cross(up, [0.0, 0.0, 1.0])
-    sine = float(np.linalg.norm(axis))
-    angle = float(np.arctan2(sine, up[2]))
-    if np.degrees(angle) > MAX_TILT:
+    # A quaternion of zeros is no attitude, as little as NaN is.
+    known = orientation.any(axis=1) & finite_rows(orientation) & finite_rows(position)
+    if known.sum() < max(10 * RATE, 0.5 * len(stamps)):
         raise Refusal(
             path,
-            f"gravity by 'orient' and 'stencilAcc' is {np.degrees(angle):.0f}° off the vertical",
+            f"columns 'orient', 'processedPos' hold a pose in only {known.sum()} of "
+            f"{len(stamps)} rows",
             "leave it out",
         )
-    return Rotation.from_rotvec(axis / sine * angle if sine > 0 else np.zeros(3)), float(
-        np.degrees(angle)
+    return _Rows(
+        start=float(stamps[0]),
+        time=stamps - stamps[0],
+        gyro=gyro,
+        accel=-STANDARD_G * accel,
+        rig_accel=rig_accel,
+        orientation=check_unit_norm(orientation, known, "orient", path),
+        position=position,
+        known=known,
+        device=_device(table, order, path),
     )
+
+
+def _stamps(table: pd.DataFrame, path: Path) -> tuple[Float[np.ndarray, " n"], np.ndarray]:
+    """Increasing stamps (s), and the rows that they are of."""
+    stamps = numbers(table, ["timestamp"], path)[:, 0]
+    check_finite(stamps, "timestamp", path)
+    increasing, order = np.unique(stamps, return_index=True)
+    if len(increasing) < max(10 * RATE, 0.5 * len(stamps)):
+        raise Refusal(
+            path,
+            f"column 'timestamp' holds only {len(increasing)} different stamps in "
+            f"{len(stamps)} rows",
+            "leave it out",
+        )
+    return increasing, order
 
 
 def _device(table: pd.DataFrame, order: np.ndarray, path: Path) -> Float[np.ndarray, "n 4"] | None:
@@ -360,8 +285,43 @@ def _device(table: pd.DataFrame, order: np.ndarray, path: Path) -> Float[np.ndar
     values = numbers(table, names, path)[order]
     if not np.isfinite(values).all():
         return None
-    everywhere: Bool[np.ndarray, "n"] = np.ones(len(values), dtype=bool)
-    return check_unit_norm(values, everywhere, "iphoneOrient", path)
+    return check_unit_norm(values, np.ones(len(values), dtype=bool), "iphoneOrient", path)
+
+
+def _levelled_poses(rows: _Rows, path: Path) -> tuple[Rotation, Rotation, Float[np.ndarray, "k 3"]]:
+    """(levelling of the map, attitudes of the phone, positions of the rig) of the rows that hold a
+    pose, in the levelled map."""
+    rig = rotations(rows.orientation[rows.known])
+    accel = rows.rig_accel[rows.known]
+    measured = finite_rows(accel)
+    if measured.sum() < 10 * RATE:
+        raise Refusal(
+            path, f"columns 'stencilAcc' hold numbers in only {measured.sum()} rows", "leave it out"
+        )
+    level = levelling(rig[measured].apply(accel[measured]).mean(axis=0))
+    tilt = np.degrees(level.magnitude())
+    if tilt > MAX_TILT:
+        raise Refusal(
+            path,
+            f"gravity by 'orient' and 'stencilAcc' is {tilt:.0f}° off the vertical",
+            "leave it out",
+        )
+    return level, level * rig * PHONE_TO_RIG, level.apply(rows.position[rows.known])
+
+
+def _lag(rows: _Rows, attitude: Rotation, path: Path) -> PoseLag:
+    # A gap tells nothing of the lag, however long it is: here it lasts as long as a window.
+    steps = np.minimum(np.diff(rows.time), WINDOW_SECONDS)
+    closed = np.concatenate([[0.0], np.cumsum(steps)])
+    fit = pose_lag(closed, rows.gyro, closed[rows.known], attitude)
+    if not fit.correlation >= 0.5:  # NaN when the poses do not turn at all
+        raise Refusal(
+            path,
+            f"columns 'orient' do not turn as 'iphoneGyro' does (they correlate by "
+            f"{fit.correlation:.2f})",
+            "leave it out",
+        )
+    return fit
 
 
 def _table(path: Path) -> pd.DataFrame:
@@ -373,29 +333,11 @@ def _table(path: Path) -> pd.DataFrame:
             "feather files need pyarrow, which is not installed",
             "pip install 'gnio-jax[idol]'",
         ) from None
-    try:
+    if not path.exists():
+        raise InputError(path, "no such file")
+    with parsed_as(path, "feather"):
         # What pandas noted of its own index when it wrote the file is of no use here.
         return feather.read_table(str(path)).to_pandas(ignore_metadata=True)
-    except FileNotFoundError:
-        raise InputError(path, "no such file") from None
-    except Exception as error:  # a damaged file makes the parser fail in any way
-        raise InputError(
-            path,
-            f"cannot be read as feather, it may be cut short ({shortened(error, 200)})",
-            "copy it again",
-        ) from None
-
-
-def _metadata(path: Path) -> dict[str, Any]:
-    if not path.is_file():
-        return {}
-    try:
-        about = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
-        raise InputError(path, f"is no JSON ({error})", "copy it again") from None
-    if not isinstance(about, dict):
-        raise InputError(path, "is no JSON object", "copy it again")
-    return about
 
 
 def _name(path: Path) -> str:

@@ -1,5 +1,4 @@
-"""What the loaders of phone recordings share: finding them, poses from another clock, holding
-people out."""
+"""What the readers of phone recordings share: finding them, holding people out, velocities."""
 
 from __future__ import annotations
 
@@ -10,12 +9,9 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float
-from scipy.interpolate import CubicSpline
-from scipy.ndimage import binary_dilation
-from scipy.spatial.transform import Rotation, RotationSpline, Slerp
 
 from gnio_jax.data.alignment import smooth_positions
+from gnio_jax.numerics import within
 from gnio_jax.types import Sequence
 
 JUMP_SPEED = 6.0
@@ -47,7 +43,8 @@ def find_folders(root: Path, is_recording: Callable[[Path], bool]) -> dict[str, 
         seen.add(real)
     if again:
         warnings.warn(
-            f"{root}: {len(again)} recordings are there twice, e.g. {again[0]}; {found[again[0].name]} is used",
+            f"{root}: {len(again)} recordings are there twice, e.g. {again[0]}; "
+            f"{found[again[0].name]} is used",
             stacklevel=3,
         )
     return found
@@ -83,49 +80,12 @@ def held_out(people: Mapping[str, str], share: float = 0.1, most: float = 0.25) 
     return set()
 
 
-def poses_at(
-    stamps: Float[np.ndarray, "n"],
-    position: Float[np.ndarray, "n 3"],
-    attitude: Rotation,
-    time: Float[np.ndarray, "m"],
-    max_gap: float,
-) -> tuple[Float[np.ndarray, "m 3"], Rotation, Bool[np.ndarray, "m"]]:
-    """Tracked poses at the increasing stamps `time` (s), and where they can be trusted.
-
-    Cubic splines, of attitudes too: at 30 Hz the shorter arc between two of them errs by half a
-    degree in a walker's hand. Across gaps longer than `max_gap` (s) and beyond the ends the
-    straight line, or the last pose, stands in and is not to be trusted.
-    """
-    right = np.clip(np.searchsorted(stamps, time), 1, len(stamps) - 1)
-    valid = (
-        (stamps[right] - stamps[right - 1] <= max_gap) & (time >= stamps[0]) & (time <= stamps[-1])
-    )
-    inside = np.clip(time, stamps[0], stamps[-1])
-    there = np.stack([np.interp(inside, stamps, column) for column in position.T], axis=1)
-    turned = Slerp(stamps, attitude)(inside).as_quat()
-    breaks = np.flatnonzero(np.diff(stamps) > max_gap) + 1
-    for run in np.split(np.arange(len(stamps)), breaks):
-        within = slice(
-            int(np.searchsorted(time, stamps[run[0]])),
-            int(np.searchsorted(time, stamps[run[-1]], side="right")),
-        )
-        if len(run) >= 4 and within.stop > within.start:
-            # Both splines start at 0, or large stamps would cost their coefficients digits.
-            own, wanted = stamps[run] - stamps[run[0]], time[within] - stamps[run[0]]
-            there[within] = CubicSpline(own, position[run], axis=0)(wanted)
-            turned[within] = RotationSpline(own, attitude[run])(wanted).as_quat()
-    return there, Rotation.from_quat(turned), valid
-
-
 def with_velocity(sequence: Sequence) -> Sequence:
     """`sequence` (on a uniform clock) with the velocity of its smoothed positions; around jumps of
     these it is no longer valid."""
     step = float(np.median(np.diff(sequence.time)))
     fast = np.linalg.norm(np.diff(sequence.position, axis=0), axis=1) > JUMP_SPEED * step
     jumps = np.concatenate([fast, [False]]) | np.concatenate([[False], fast])
-    good = sequence.valid & np.logical_not(
-        binary_dilation(jumps, iterations=max(round(0.1 / step), 1))
-    )
-    return sequence._replace(
-        velocity=smooth_positions(sequence.position, good, step)[1], valid=good
-    )
+    good = sequence.valid & ~within(jumps, max(round(0.1 / step), 1))
+    _, velocity, _ = smooth_positions(sequence.position, good, step)
+    return sequence._replace(velocity=velocity, valid=good)

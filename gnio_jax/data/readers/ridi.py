@@ -21,7 +21,7 @@ import os
 import re
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -30,7 +30,9 @@ from scipy.spatial.transform import Rotation
 
 from gnio_jax.data.dataset import Dataset, Recording
 from gnio_jax.data.gaps import divide_at_gaps
-from gnio_jax.data.readers.phones import find_folders, find_list, held_out, poses_at, with_velocity
+from gnio_jax.data.readers.parsing import unit_rotations
+from gnio_jax.data.readers.phones import find_folders, find_list, held_out, with_velocity
+from gnio_jax.data.readers.reference import Poses, poses_at
 from gnio_jax.data.readers.text import listed, numbers, read_csv
 from gnio_jax.data.resampling import LONGEST_BRIDGE, resample
 from gnio_jax.data.validation import (
@@ -38,10 +40,9 @@ from gnio_jax.data.validation import (
     check_finite,
     check_increasing,
     check_rate,
-    check_unit_norm,
     validate,
 )
-from gnio_jax.numerics import quaternions, rotations
+from gnio_jax.numerics import neighbours, quaternions, wxyz_from_xyzw
 from gnio_jax.types import InputError, Sequence
 
 RATE = 200.0
@@ -63,6 +64,7 @@ _LISTS = {
 SPLITS = (*_LISTS, "all")
 _PLACEMENTS = {"handheld": "handheld", "leg": "pocket", "bag": "bag", "body": "body"}
 _Y_UP = Rotation.from_matrix([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+TANGO, ARCORE = "Tango VIO of the phone itself", "ARCore VIO of the phone itself"
 _POSES = (("android_sensor_pose.txt", _Y_UP), ("pose.txt", Rotation.identity()))
 
 
@@ -127,14 +129,16 @@ def read_pieces(folder: str | os.PathLike[str]) -> list[Sequence]:
     files.
 
     Rows out of order are sorted and repeated ones dropped. Where its IMU or odometry has a gap
-    longer than a window it is divided (`divide_at_gaps`). `device_orientation` is the game rotation vector,
-    turned to begin at the reference's attitude. Raises `InputError` naming file and field.
+    longer than a window it is divided (`divide_at_gaps`). `device_orientation` is the game rotation
+    vector, turned to begin at the reference's attitude. Raises `InputError` naming file and field.
     """
     folder = Path(folder)
-    source = folder / _TABLE
-    native = _from_table(source) if source.is_file() else _from_text(folder)
-    place = source if source.is_file() else folder
-    source = source if source.is_file() else f"{folder / 'gyro.txt'}, acce.txt, pose.txt"
+    table = folder / _TABLE
+    if table.is_file():
+        native, source, place = _from_table(table), table, table
+    else:
+        native, source = _from_text(folder), f"{folder / 'gyro.txt'}, acce.txt, pose.txt"
+        place = folder
     if not native.valid.any():
         raise InputError(source, "no IMU sample has a pose", "leave it out")
     device = native.device
@@ -150,154 +154,177 @@ def read_pieces(folder: str | os.PathLike[str]) -> list[Sequence]:
         velocity=np.zeros_like(native.position),
         valid=native.valid,
         device_orientation=device,
-        attributes={
-            "dataset": "ridi",
-            "group": _subject(folder.name),
-            "subject": _subject(folder.name),
-            "device": "Tango phone" if native.truth.startswith("Tango") else "Android phone",
-            "placement": next(
-                (_PLACEMENTS[word] for word in re.findall("|".join(_PLACEMENTS), folder.name)),
-                "unknown",
-            ),
-            "truth": native.truth,
-            "imu_compensated": "no",
-            "licence": DATASET.licence,
-            "start_time": native.start + float(native.time[0]),
-        },
+        attributes=_attributes(folder.name, native),
     )
     pieces = divide_at_gaps(validate(sequence, source), place)
     return [validate(with_velocity(resample(piece, RATE)), source) for piece in pieces]
 
 
+def _attributes(name: str, native: _Native) -> dict[str, Any]:
+    words = re.findall("|".join(_PLACEMENTS), name)
+    return {
+        "dataset": "ridi",
+        "group": _subject(name),
+        "subject": _subject(name),
+        "device": "Tango phone" if native.truth == TANGO else "Android phone",
+        "placement": _PLACEMENTS[words[0]] if words else "unknown",
+        "truth": native.truth,
+        "imu_compensated": "no",
+        "licence": DATASET.licence,
+        "start_time": native.start + float(native.time[0]),
+    }
+
+
 class _Native(NamedTuple):
     """A recording on one clock of its own."""
 
-    time: Float[np.ndarray, "n"]
+    time: Float[np.ndarray, " n"]
     """s since `start`, increasing, gaps and all."""
     start: float
     """s on the phone's clock."""
     gyro: Float[np.ndarray, "n 3"]
+    """rad/s."""
     accel: Float[np.ndarray, "n 3"]
+    """m/s²."""
     position: Float[np.ndarray, "n 3"]
+    """m."""
     attitude: Rotation
+    """Body → world."""
     device: Rotation | None
-    valid: Bool[np.ndarray, "n"]
+    """The phone's game rotation vector."""
+    valid: Bool[np.ndarray, " n"]
     truth: str
+
+
+# --- the table
 
 
 def _from_table(path: Path) -> _Native:
     table = read_csv(path)
     stamps, order = _in_order(numbers(table, ["time"], path)[:, 0], path)
-    columns = {
-        name: numbers(table, [f"{name}_{axis}" for axis in axes], path)[order]
-        for name, axes in (
-            ("gyro", "xyz"),
-            ("acce", "xyz"),
-            ("pos", "xyz"),
-            ("ori", "wxyz"),
-            ("rv", "wxyz"),
-        )
-    }
-    for name, values in columns.items():
+
+    def columns(name: str, axes: str) -> Float[np.ndarray, "n w"]:
+        return numbers(table, [f"{name}_{axis}" for axis in axes], path)[order]
+
+    vectors = {name: columns(name, "xyz") for name in ("gyro", "acce", "pos")}
+    quaternion = {name: columns(name, "wxyz") for name in ("ori", "rv")}
+    for name, values in (vectors | quaternion).items():
         check_finite(values, name, path)
     time = (stamps - stamps[0]) * 1e-9
     check_rate(time, NATIVE_RATE, path)
-    attitude, device = (_unit(columns[name], name, path) for name in ("ori", "rv"))
     return _Native(
-        time,
-        float(stamps[0] * 1e-9),
-        columns["gyro"],
-        columns["acce"],
-        columns["pos"],
-        attitude,
-        device,
-        np.ones(len(time), dtype=bool),
-        "Tango VIO of the phone itself",
+        time=time,
+        start=float(stamps[0] * 1e-9),
+        gyro=vectors["gyro"],
+        accel=vectors["acce"],
+        position=vectors["pos"],
+        attitude=unit_rotations(quaternion["ori"], "ori", path),
+        device=unit_rotations(quaternion["rv"], "rv", path),
+        valid=np.ones(len(time), dtype=bool),
+        truth=TANGO,
     )
+
+
+# --- the recorder's text files
 
 
 def _from_text(folder: Path) -> _Native:
     """The text files on the gyro's clock, from the first pose to the last."""
-    pose_path, upright = next(
-        ((folder / name, turn) for name, turn in _POSES if (folder / name).is_file()),
-        (folder / "pose.txt", None),
-    )
-    gyro_stamps, gyro = _text(folder / "gyro.txt", 3)
-    force_stamps, force = _text(folder / "acce.txt", 3)
+    pose_path, upright = _pose_file(folder)
+    gyro_path, force_path = folder / "gyro.txt", folder / "acce.txt"
+    gyro_stamps, gyro = _text(gyro_path, 3)
+    force_stamps, force = _text(force_path, 3)
     pose_stamps, pose = _text(pose_path, 7)
-    upright = Rotation.identity() if upright is None else upright
     start = gyro_stamps[0]
     gyro_time, force_time, pose_time = (
         (stamps - start) * 1e-9 for stamps in (gyro_stamps, force_stamps, pose_stamps)
     )
     check_increasing(pose_time, pose_path)  # stamps of another unit may fall together
-    for stamps, path in ((gyro_stamps, folder / "gyro.txt"), (force_stamps, folder / "acce.txt")):
-        rate = 1e9 / float(np.median(np.diff(stamps)))
-        if not RAW_RATES[0] <= rate <= RAW_RATES[1]:
-            raise InputError(
-                path,
-                f"field 'time' runs at {rate:.4g} Hz, expected {RAW_RATES[0]:g} to {RAW_RATES[1]:g} Hz",
-                "check the unit of the stamps: they are ns",
-            )
+    _check_raw_rate(gyro_stamps, gyro_path)
+    _check_raw_rate(force_stamps, force_path)
+    rows = _shared(gyro_time, force_time, pose_time, force_path, pose_path)
+    time = gyro_time[rows]
+    attitude = unit_rotations(wxyz_from_xyzw(pose[:, 3:]), "qx qy qz qw", pose_path)
+    place, turned, valid = poses_at(time, Poses(pose_time, attitude, pose[:, :3]), LONGEST_BRIDGE)
+    return _Native(
+        time=time,
+        start=float(start * 1e-9),
+        gyro=gyro[rows],
+        accel=CubicSpline(force_time, force, axis=0)(time),
+        position=upright.apply(place),
+        attitude=upright * turned,
+        device=_game_rotation(folder / "orientation.txt", start, time),
+        valid=valid,
+        truth=TANGO if pose_path.name == "pose.txt" else ARCORE,
+    )
 
-    # Where the accelerometer is silent there is no IMU sample, whatever the gyro says. An odometry
-    # that was lost for long comes back in a world of its own (23° turned, in one recording): such a
-    # gap ends a piece as one of the IMU does.
-    whole = (_interval(force_time, gyro_time) <= LONGEST_BRIDGE) & (
-        _interval(pose_time, gyro_time) <= WINDOW_SECONDS
-    )
-    inside = (gyro_time >= max(force_time[0], pose_time[0])) & (
-        gyro_time <= min(force_time[-1], pose_time[-1])
-    )
+
+def _pose_file(folder: Path) -> tuple[Path, Rotation]:
+    """The file of the IMU's poses, and what turns their world to z-up."""
+    for name, upright in _POSES:
+        if (folder / name).is_file():
+            return folder / name, upright
+    return folder / "pose.txt", Rotation.identity()
+
+
+def _check_raw_rate(stamps: Float[np.ndarray, " n"], path: Path) -> None:
+    rate = 1e9 / float(np.median(np.diff(stamps)))
+    slowest, fastest = RAW_RATES
+    if not slowest <= rate <= fastest:
+        raise InputError(
+            path,
+            f"field 'time' runs at {rate:.4g} Hz, expected {slowest:g} to {fastest:g} Hz",
+            "check the unit of the stamps: they are ns",
+        )
+
+
+def _shared(
+    gyro_time: Float[np.ndarray, " n"],
+    force_time: Float[np.ndarray, " m"],
+    pose_time: Float[np.ndarray, " k"],
+    force_path: Path,
+    pose_path: Path,
+) -> Bool[np.ndarray, " n"]:
+    """Which rows of the gyro the accelerometer and the odometry cover.
+
+    Where the accelerometer is silent there is no IMU sample, whatever the gyro says. An odometry
+    that was lost for long comes back in a world of its own (23° turned, in one recording): such a
+    gap ends a piece as one of the IMU does.
+    """
+    remedy = "check that the files are of one recording"
     if not (force_time[0] < gyro_time[-1] and gyro_time[0] < force_time[-1]):
         raise InputError(
-            folder / "acce.txt",
-            f"field 'time' ({force_time[0]:.1f} to {force_time[-1]:.1f} s after the gyro's first stamp) "
-            f"shares nothing with that of gyro.txt (0.0 to {gyro_time[-1]:.1f} s)",
-            "check that the files are of one recording",
+            force_path,
+            f"field 'time' ({force_time[0]:.1f} to {force_time[-1]:.1f} s after the gyro's first "
+            f"stamp) shares nothing with that of gyro.txt (0.0 to {gyro_time[-1]:.1f} s)",
+            remedy,
         )
-    if (inside & whole).sum() < 2:
+    first, last = max(force_time[0], pose_time[0]), min(force_time[-1], pose_time[-1])
+    rows = (gyro_time >= first) & (gyro_time <= last)
+    for stamps, longest in ((force_time, LONGEST_BRIDGE), (pose_time, WINDOW_SECONDS)):
+        left, right = neighbours(stamps, gyro_time)
+        rows &= stamps[right] - stamps[left] <= longest
+    if rows.sum() < 2:
         raise InputError(
             pose_path,
-            f"its stamps ({pose_time[0]:.1f} to {pose_time[-1]:.1f} s after the gyro's first) share nothing with "
-            f"the IMU's ({gyro_time[0]:.1f} to {gyro_time[-1]:.1f} s)",
-            "check that the files are of one recording",
+            f"its stamps ({pose_time[0]:.1f} to {pose_time[-1]:.1f} s after the gyro's first) "
+            f"share nothing with the IMU's ({gyro_time[0]:.1f} to {gyro_time[-1]:.1f} s)",
+            remedy,
         )
-    time, gyro = gyro_time[inside & whole], gyro[inside & whole]
-    attitude = _unit(pose[:, [6, 3, 4, 5]], "qx qy qz qw", pose_path)
-    position, turned, valid = poses_at(pose_time, pose[:, :3], attitude, time, LONGEST_BRIDGE)
-
-    device = None
-    if (folder / "orientation.txt").is_file():
-        device_stamps, quaternion = _text(folder / "orientation.txt", 4)
-        device_time = (device_stamps - start) * 1e-9
-        check_increasing(device_time, folder / "orientation.txt")
-        known = _unit(quaternion[:, [3, 0, 1, 2]], "qx qy qz qw", folder / "orientation.txt")
-        _, device, _ = poses_at(device_time, np.zeros((len(known), 3)), known, time, LONGEST_BRIDGE)
-    truth = (
-        "Tango VIO of the phone itself"
-        if pose_path.name == "pose.txt"
-        else "ARCore VIO of the phone itself"
-    )
-    return _Native(
-        time,
-        float(start * 1e-9),
-        gyro,
-        CubicSpline(force_time, force, axis=0)(time),
-        upright.apply(position),
-        upright * turned,
-        device,
-        valid,
-        truth,
-    )
+    return rows
 
 
-def _interval(
-    stamps: Float[np.ndarray, "n"], time: Float[np.ndarray, "m"]
-) -> Float[np.ndarray, "m"]:
-    """Length of the interval between two stamps in which each of `time` lies."""
-    right = np.clip(np.searchsorted(stamps, time), 1, len(stamps) - 1)
-    return stamps[right] - stamps[right - 1]
+def _game_rotation(path: Path, start: float, time: Float[np.ndarray, " n"]) -> Rotation | None:
+    """The game rotation vector at times (s) after the stamp `start` (ns), if the recorder wrote
+    it."""
+    if not path.is_file():
+        return None
+    stamps, xyzw = _text(path, 4)
+    own_time = (stamps - start) * 1e-9
+    check_increasing(own_time, path)
+    known = unit_rotations(wxyz_from_xyzw(xyzw), "qx qy qz qw", path)
+    _, device, _ = poses_at(time, Poses(own_time, known, np.zeros((len(known), 3))), LONGEST_BRIDGE)
+    return device
 
 
 def _text(path: Path, width: int) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n w"]]:
@@ -328,10 +355,6 @@ def _in_order(
             "copy it again",
         )
     return increasing, order
-
-
-def _unit(wxyz: np.ndarray, field: str, path: Path) -> Rotation:
-    return rotations(check_unit_norm(wxyz, np.ones(len(wxyz), dtype=bool), field, path))
 
 
 def _is_recording(folder: Path) -> bool:

@@ -16,10 +16,10 @@ the game rotation vector. The position is the chest's.
 
 from __future__ import annotations
 
-import json
 import os
+from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import h5py
 import numpy as np
@@ -27,6 +27,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from gnio_jax.data.dataset import Dataset, Recording, single
+from gnio_jax.data.readers.parsing import json_object, parsed_as, unit_rotations
 from gnio_jax.data.readers.phones import find_folders, find_list, with_velocity
 from gnio_jax.data.readers.text import listed, shortened
 from gnio_jax.data.resampling import resample
@@ -35,10 +36,9 @@ from gnio_jax.data.validation import (
     check_gaps,
     check_increasing,
     check_rate,
-    check_unit_norm,
     validate,
 )
-from gnio_jax.numerics import integrate_gyro, quaternions, rotations
+from gnio_jax.numerics import integrate_gyro, quaternions
 from gnio_jax.types import InputError, Sequence
 
 RATE = 200.0
@@ -61,6 +61,8 @@ _FIELDS = {
     "pose/tango_pos": 3,
     "pose/tango_ori": 4,
 }
+_EKF = "pose/ekf_ori"
+"""Attitudes of the authors' filter, which not every recording has."""
 _ERRORS = {
     "gyro_integration": "gyro_integration_error",
     "game_rv": "grv_ori_error",
@@ -89,51 +91,44 @@ def read_sequence(folder: str | os.PathLike[str], choose: bool = False) -> Seque
     """
     folder = Path(folder)
     path = folder / _TABLE
-    info = _info(folder / _INFO)
-    bias, force_bias, scale = (
-        _vector(info, name, 3, folder)
-        for name in ("imu_init_gyro_bias", "imu_acce_bias", "imu_acce_scale")
-    )
-    start_calibration = _unit(
-        _vector(info, "start_calibration", 4, folder)[None], "start_calibration", folder / _INFO
-    )
-    time, fields = _tables(path)
-    check_finite(time, "synced/time", path)
-    check_increasing(time, path)
-    check_rate(time, RATE, path)
-    check_gaps(time, path)
-    for name, values in fields.items():
-        check_finite(values, name, path)
-    start = _number(info, "start_frame", folder) if "start_frame" in info else 0.0
-    if not 0 <= start < len(time) - 1 or start != int(start):
-        raise InputError(
-            folder / _INFO,
-            f"field 'start_frame' is {start:g}, the recording has {len(time)} rows",
-            "copy it again",
-        )
+    info = json_object(folder / _INFO, f"it belongs beside {_TABLE}")
+    calibration = _calibration(info, folder)
+    time, fields = _fields(path)
+    start = _start_frame(info, len(time), folder)
+    gyro = fields["synced/gyro_uncalib"] - calibration.gyro_bias
+    accel = calibration.accel_scale * (fields["synced/acce"] - calibration.accel_bias)
+    game = unit_rotations(fields["synced/game_rv"], "synced/game_rv", path)
+    source, error = "game_rv", info.get(_ERRORS["game_rv"])
+    if choose:
+        source, error = _choice(info, _EKF in fields, folder)
+    followed = _followed(source, time, gyro, game, fields, path)
+    chest = unit_rotations(fields["pose/tango_ori"][:1], "pose/tango_ori", path)
+    orientation = chest[0] * calibration.start * followed[0].inv() * followed
 
-    gyro = fields["synced/gyro_uncalib"] - bias
-    game = _unit(fields["synced/game_rv"], "synced/game_rv", path)
-    source, error = (
-        _choice(info, "pose/ekf_ori" in fields, folder)
-        if choose
-        else ("game_rv", info.get(_ERRORS["game_rv"]))
-    )
-    if source == "ekf":
-        followed = _unit(fields["pose/ekf_ori"], "pose/ekf_ori", path)
-    elif source == "gyro_integration":
-        followed = game[0] * integrate_gyro(gyro, np.diff(time))
-    else:
-        followed = game
-    chest = _unit(fields["pose/tango_ori"][:1], "pose/tango_ori", path)
-    orientation = chest[0] * start_calibration[0] * followed[0].inv() * followed
-
-    kept = slice(int(start), None)
+    kept = slice(start, None)
     position = fields["pose/tango_pos"][kept]
-    attributes: dict[str, Any] = {
+    sequence = Sequence(
+        name=folder.name,
+        time=time[kept] - time[start],
+        gyro=gyro[kept],
+        accel=accel[kept],
+        orientation=quaternions(orientation[kept]),
+        position=position,
+        velocity=np.zeros_like(position),
+        valid=np.ones(len(position), dtype=bool),
+        device_orientation=quaternions(game[kept]),
+        attributes=_attributes(folder.name, info, source, error, float(time[start])),
+    )
+    return validate(with_velocity(resample(validate(sequence, path), RATE)), path)
+
+
+def _attributes(
+    name: str, info: dict[str, Any], source: str, error: Any, start_time: float
+) -> dict[str, Any]:
+    attributes = {
         "dataset": "ronin",
-        "group": folder.name.partition("_")[0],
-        "subject": folder.name.partition("_")[0],
+        "group": name.partition("_")[0],
+        "subject": name.partition("_")[0],
         "device": shortened(info.get("device", "unknown")),
         "placement": "free",
         "truth": "tango on the chest (positions)",
@@ -141,23 +136,14 @@ def read_sequence(folder: str | os.PathLike[str], choose: bool = False) -> Seque
         "orientation_source": source,
         "imu_compensated": "calibration of the recording's start",
         "licence": DATASET.licence,
-        "start_time": float(time[int(start)]),
+        "start_time": start_time,
     }
     if isinstance(error, int | float) and abs(error) <= 360.0:
         attributes["orientation_error_degrees"] = float(error)
-    sequence = Sequence(
-        name=folder.name,
-        time=time[kept] - time[int(start)],
-        gyro=gyro[kept],
-        accel=scale * (fields["synced/acce"][kept] - force_bias),
-        orientation=quaternions(orientation[kept]),
-        position=position,
-        velocity=np.zeros_like(position),
-        valid=np.ones(len(position), dtype=bool),
-        device_orientation=quaternions(game[kept]),
-        attributes=attributes,
-    )
-    return validate(with_velocity(resample(validate(sequence, path), RATE)), path)
+    return attributes
+
+
+# --- orientation
 
 
 def _choice(info: dict[str, Any], has_ekf: bool, folder: Path) -> tuple[str, float]:
@@ -167,44 +153,39 @@ def _choice(info: dict[str, Any], has_ekf: bool, folder: Path) -> tuple[str, flo
         for name, field in _ERRORS.items()
         if name != "ekf" or has_ekf
     }
-    best = (
-        "game_rv"
-        if errors["game_rv"] < MAX_GAME_ERROR
-        else min(errors, key=lambda name: errors[name])
-    )
+    best = min(errors, key=lambda name: errors[name])
+    if errors["game_rv"] < MAX_GAME_ERROR:
+        best = "game_rv"
     return best, errors[best]
 
 
-def _tables(path: Path) -> tuple[Float[np.ndarray, "n"], dict[str, Float[np.ndarray, "n _"]]]:
-    """The stamps and the columns that are needed, each as long as the stamps."""
+def _followed(
+    source: str,
+    time: Float[np.ndarray, " n"],
+    gyro: Float[np.ndarray, "n 3"],
+    game: Rotation,
+    fields: dict[str, Float[np.ndarray, "n _"]],
+    path: Path,
+) -> Rotation:
+    """n attitudes of the phone by one of the sources of `_ERRORS`, each in a world of its own."""
+    if source == "ekf":
+        return unit_rotations(fields[_EKF], _EKF, path)
+    if source == "gyro_integration":
+        return game[0] * integrate_gyro(gyro, np.diff(time))
+    return game
+
+
+# --- data.hdf5
+
+
+def _fields(path: Path) -> tuple[Float[np.ndarray, " n"], dict[str, Float[np.ndarray, "n _"]]]:
+    """The stamps and the columns that are needed, complete and each as long as the stamps."""
     fields: dict[str, np.ndarray] = {}
-    try:
-        with h5py.File(path, "r") as file:
-            for name in ("synced/time", *_FIELDS, "pose/ekf_ori"):
-                if isinstance(node := file.get(name), h5py.Dataset):
-                    if node.dtype.kind not in "fiu":
-                        raise InputError(
-                            path,
-                            f"field '{name}' holds {node.dtype}, expected numbers",
-                            "copy it again",
-                        )
-                    fields[name] = np.asarray(node, dtype=np.float64)
-                elif name != "pose/ekf_ori":
-                    parent = file.get(name.partition("/")[0])
-                    known = ", ".join(parent) if isinstance(parent, h5py.Group) else "nothing"
-                    raise InputError(
-                        path,
-                        f"field '{name}' is missing",
-                        f"found in '{name.partition('/')[0]}': {known}",
-                    )
-    except InputError:
-        raise
-    except Exception as error:  # a damaged file makes the parser fail in any way
-        raise InputError(
-            path,
-            f"cannot be read as HDF5, it may be cut short ({shortened(error, 200)})",
-            "copy it again",
-        ) from None
+    with parsed_as(path, "HDF5"), h5py.File(path, "r") as file:
+        for name in ("synced/time", *_FIELDS):
+            fields[name] = _numbers(file, name, path)
+        if isinstance(file.get(_EKF), h5py.Dataset):
+            fields[_EKF] = _numbers(file, _EKF, path)
     time = fields.pop("synced/time")
     if time.ndim != 1 or len(time) < 2:
         raise InputError(
@@ -220,25 +201,63 @@ def _tables(path: Path) -> tuple[Float[np.ndarray, "n"], dict[str, Float[np.ndar
                 f"field '{name}' has shape {values.shape}, expected {expected}",
                 "copy it again",
             )
+    check_finite(time, "synced/time", path)
+    check_increasing(time, path)
+    check_rate(time, RATE, path)
+    check_gaps(time, path)
+    for name, values in fields.items():
+        check_finite(values, name, path)
     return time, fields
 
 
-def _unit(wxyz: np.ndarray, field: str, path: Path) -> Rotation:
-    return rotations(check_unit_norm(wxyz, np.ones(len(wxyz), dtype=bool), field, path))
-
-
-def _info(path: Path) -> dict[str, Any]:
-    try:
-        info = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
+def _numbers(file: h5py.File, name: str, path: Path) -> Float[np.ndarray, "..."]:
+    node = file.get(name)
+    if not isinstance(node, h5py.Dataset):
+        group = name.partition("/")[0]
+        parent = file.get(group)
+        known = ", ".join(parent) if isinstance(parent, h5py.Group) else "nothing"
+        raise InputError(path, f"field '{name}' is missing", f"found in '{group}': {known}")
+    if node.dtype.kind not in "fiu":
         raise InputError(
-            path, f"cannot be read ({error.strerror})", f"it belongs beside {_TABLE}"
-        ) from None
-    except (ValueError, RecursionError) as error:
-        raise InputError(path, f"is no JSON ({error})", "copy it again") from None
-    if not isinstance(info, dict):
-        raise InputError(path, "is no JSON object", "copy it again")
-    return info
+            path, f"field '{name}' holds {node.dtype}, expected numbers", "copy it again"
+        )
+    return np.asarray(node, dtype=np.float64)
+
+
+# --- info.json
+
+
+class _Calibration(NamedTuple):
+    """What info.json says of the phone's sensors and of its place on the chest."""
+
+    gyro_bias: Float[np.ndarray, "3"]
+    """rad/s."""
+    accel_bias: Float[np.ndarray, "3"]
+    """m/s²."""
+    accel_scale: Float[np.ndarray, "3"]
+    start: Rotation
+    """Phone → chest device at the first row."""
+
+
+def _calibration(info: dict[str, Any], folder: Path) -> _Calibration:
+    gyro_bias, accel_bias, accel_scale = (
+        _vector(info, name, 3, folder)
+        for name in ("imu_init_gyro_bias", "imu_acce_bias", "imu_acce_scale")
+    )
+    quaternion = _vector(info, "start_calibration", 4, folder)[None]
+    start = unit_rotations(quaternion, "start_calibration", folder / _INFO)[0]
+    return _Calibration(gyro_bias, accel_bias, accel_scale, start)
+
+
+def _start_frame(info: dict[str, Any], rows: int, folder: Path) -> int:
+    start = _number(info, "start_frame", folder) if "start_frame" in info else 0.0
+    if not 0 <= start < rows - 1 or start != int(start):
+        raise InputError(
+            folder / _INFO,
+            f"field 'start_frame' is {start:g}, the recording has {rows} rows",
+            "copy it again",
+        )
+    return int(start)
 
 
 def _vector(info: dict[str, Any], name: str, length: int, folder: Path) -> Float[np.ndarray, "d"]:
@@ -256,15 +275,11 @@ def _vector(info: dict[str, Any], name: str, length: int, folder: Path) -> Float
 
 
 def _number(info: dict[str, Any], name: str, folder: Path) -> float:
-    value = info.get(name)
-    try:
-        number = (
-            float(value)
-            if isinstance(value, int | float) and not isinstance(value, bool)
-            else np.nan
-        )
-    except OverflowError:  # JSON's integers have no end
-        number = np.nan
+    value, number = info.get(name), np.nan
+    # JSON's integers have no end.
+    with suppress(OverflowError):
+        if isinstance(value, int | float) and not isinstance(value, bool):
+            number = float(value)
     if not np.isfinite(number):
         raise InputError(
             folder / _INFO,

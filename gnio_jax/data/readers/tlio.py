@@ -18,7 +18,8 @@ import numpy as np
 from jaxtyping import Float
 
 from gnio_jax.data.dataset import Dataset, Recording, single
-from gnio_jax.data.readers.text import listed, shortened
+from gnio_jax.data.readers.parsing import parsed_as
+from gnio_jax.data.readers.text import listed
 from gnio_jax.data.validation import (
     check_finite,
     check_gaps,
@@ -28,21 +29,18 @@ from gnio_jax.data.validation import (
     check_unit_norm,
     validate,
 )
-from gnio_jax.numerics import rotations
+from gnio_jax.numerics import rotations, wxyz_from_xyzw
 from gnio_jax.types import InputError, Sequence
 
 RATE = 200.0
 _TABLE = "imu0_resampled.npy"
 _DESCRIPTION = "imu0_resampled_description.json"
 _LISTS = {"train": "train_list.txt", "val": "val_list.txt", "test": "test_list.txt"}
-_COLUMNS = {
-    "ts_us": 1,
-    "gyr_compensated_rotated_in_World": 3,
-    "acc_compensated_rotated_in_World": 3,
-    "qxyzw_World_Device": 4,
-    "pos_World_Device": 3,
-    "vel_World": 3,
-}
+_STAMPS, _ORIENTATION = "ts_us", "qxyzw_World_Device"
+_GYRO, _ACCEL = "gyr_compensated_rotated_in_World", "acc_compensated_rotated_in_World"
+_POSITION, _VELOCITY = "pos_World_Device", "vel_World"
+_WIDTHS = {_STAMPS: 1, _GYRO: 3, _ACCEL: 3, _ORIENTATION: 4, _POSITION: 3, _VELOCITY: 3}
+"""Width of each column that is read."""
 
 
 def recordings(root: Path, split: str) -> list[Recording]:
@@ -54,49 +52,41 @@ def read_sequence(folder: str | os.PathLike[str]) -> Sequence:
     """One sequence of its folder. Raises `InputError` naming file and field."""
     folder = Path(folder)
     path = folder / _TABLE
-    column, width = _columns(folder / _DESCRIPTION)
+    columns, width = _columns(folder / _DESCRIPTION)
     table = _table(path, width)
-    time = table[:, column["ts_us"]][:, 0] * 1e-6
-    quaternion = table[:, column["qxyzw_World_Device"]][:, [3, 0, 1, 2]]
-    force, rate = (
-        table[:, column[f"{name}_compensated_rotated_in_World"]] for name in ("acc", "gyr")
-    )
+    fields = {name: table[:, columns[name]] for name in _WIDTHS}
+    time = fields[_STAMPS][:, 0] * 1e-6
+    quaternion = wxyz_from_xyzw(fields[_ORIENTATION])
+    rate, force = fields[_GYRO], fields[_ACCEL]
     # The table's own fields first: behind the rotation into the body a mistake would carry another
     # name.
-    for field, values in (
-        ("ts_us", time),
-        ("qxyzw_World_Device", quaternion),
-        ("gyr_compensated_rotated_in_World", rate),
-        ("acc_compensated_rotated_in_World", force),
-    ):
-        check_finite(values, field, path)
+    for name in (_STAMPS, _ORIENTATION, _GYRO, _ACCEL):
+        check_finite(fields[name], name, path)
     check_increasing(time, path)
     check_rate(time, RATE, path)
     check_gaps(time, path)
     everywhere = np.ones(len(time), dtype=bool)
-    quaternion = check_unit_norm(quaternion, everywhere, "qxyzw_World_Device", path)
+    quaternion = check_unit_norm(quaternion, everywhere, _ORIENTATION, path)
     body = rotations(quaternion).inv()
-    sequence = validate(
-        Sequence(
-            name=folder.name,
-            time=time,
-            gyro=body.apply(rate),
-            accel=body.apply(force),
-            orientation=quaternion,
-            position=table[:, column["pos_World_Device"]],
-            velocity=table[:, column["vel_World"]],
-            valid=everywhere,
-            attributes={
-                "dataset": "tlio",
-                "group": folder.name,
-                "placement": "head",
-                "truth": "visual-inertial (VIO or motion capture)",
-                "imu_compensated": "reference",
-                "licence": DATASET.licence,
-            },
-        ),
-        path,
+    sequence = Sequence(
+        name=folder.name,
+        time=time,
+        gyro=body.apply(rate),
+        accel=body.apply(force),
+        orientation=quaternion,
+        position=fields[_POSITION],
+        velocity=fields[_VELOCITY],
+        valid=everywhere,
+        attributes={
+            "dataset": "tlio",
+            "group": folder.name,
+            "placement": "head",
+            "truth": "visual-inertial (VIO or motion capture)",
+            "imu_compensated": "reference",
+            "licence": DATASET.licence,
+        },
     )
+    sequence = validate(sequence, path)
     check_motion(sequence, path)
     return sequence
 
@@ -112,6 +102,28 @@ def _listed(root: Path, split: str) -> list[Path]:
 
 def _columns(path: Path) -> tuple[dict[str, slice], int]:
     """Columns of the table by name, and its width: the description lists them in their order."""
+    columns, start = {}, 0
+    for entry, name, width in _entries(path):
+        if name is None:
+            raise InputError(
+                path,
+                f"field 'columns_name(width)' has the entry {entry!r}",
+                'entries look like "ts_us(1)"',
+            )
+        columns[name] = slice(start, start + width)
+        start += width
+    for name, expected in _WIDTHS.items():
+        if name not in columns:
+            raise InputError(path, f"column '{name}' is missing", f"found: {', '.join(columns)}")
+        width = columns[name].stop - columns[name].start
+        if width != expected:
+            raise InputError(path, f"column '{name}' has width {width}, expected {expected}")
+    return columns, start
+
+
+def _entries(path: Path) -> list[tuple[str, str | None, int]]:
+    """(entry, name, width) of each entry of the description, None and 0 where it is not of that
+    form."""
     try:
         entries = json.loads(path.read_text(encoding="utf-8"))["columns_name(width)"]
         parsed = [re.fullmatch(r"\s*(.+?)\s*\((\d+)\)\s*", entry) for entry in entries]
@@ -127,36 +139,15 @@ def _columns(path: Path) -> tuple[dict[str, slice], int]:
             f"field 'columns_name(width)' cannot be read ({type(error).__name__}: {error})",
             'it lists entries like "ts_us(1)"',
         ) from None
-    columns, start = {}, 0
-    for entry, match in zip(entries, parsed, strict=True):
-        if match is None:
-            raise InputError(
-                path,
-                f"field 'columns_name(width)' has the entry {entry!r}",
-                'entries look like "ts_us(1)"',
-            )
-        columns[match[1]] = slice(start, start + int(match[2]))
-        start += int(match[2])
-    for name, width in _COLUMNS.items():
-        if name not in columns:
-            raise InputError(path, f"column '{name}' is missing", f"found: {', '.join(columns)}")
-        if columns[name].stop - columns[name].start != width:
-            raise InputError(
-                path,
-                f"column '{name}' has width {columns[name].stop - columns[name].start}, expected {width}",
-            )
-    return columns, start
+    return [
+        (entry, match[1], int(match[2])) if match else (entry, None, 0)
+        for entry, match in zip(entries, parsed, strict=True)
+    ]
 
 
 def _table(path: Path, width: int) -> Float[np.ndarray, "n w"]:
-    try:
+    with parsed_as(path, "a NumPy array"):
         table = np.load(path, allow_pickle=False)
-    except Exception as error:  # a damaged file makes the parser fail in any way
-        raise InputError(
-            path,
-            f"cannot be read as a NumPy array, it may be cut short ({shortened(error, 200)})",
-            "copy it again",
-        ) from None
     if table.ndim != 2 or table.shape[1] != width or table.dtype.kind != "f" or len(table) < 2:
         raise InputError(
             path,

@@ -12,6 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from gnio_jax import data
+from gnio_jax.data import alignment
 from gnio_jax.data.dataset import Refusal
 from gnio_jax.data.readers import idol
 from gnio_jax.numerics import rotations
@@ -417,14 +418,16 @@ def test_lag_from_noisy_rates_with_a_bias(lag):
         noise.normal(0, np.radians(0.05), (len(time), 3))
     )
     keep = (time < 30) | (time > 30.4)
-    fit = idol.pose_lag(time, gyro, time[keep], poses[keep])
+    fit = alignment.pose_lag(time, gyro, time[keep], poses[keep])
     assert fit.lag == pytest.approx(lag, abs=3e-3) and fit.correlation > 0.5
 
 
 def test_what_stands_still_has_no_lag():
     time = np.arange(0, 20, 0.01)
     gyro = np.full((len(time), 3), 0.01) + np.random.default_rng(0).normal(0, 0.005, (len(time), 3))
-    assert idol.pose_lag(time, gyro, time, Rotation.identity(len(time))) == idol.Lag(0.0, 1.0)
+    assert alignment.pose_lag(time, gyro, time, Rotation.identity(len(time))) == alignment.PoseLag(
+        0.0, 1.0
+    )
 
 
 def test_one_wild_stamp_costs_one_row(tmp_path):

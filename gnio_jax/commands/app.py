@@ -1,0 +1,29 @@
+"""`gnio`: the one program, with its subcommands."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from gnio_jax.commands import console, data, evaluate, interop, options, tables, train
+
+GNIO = options.Group(
+    {
+        "train": train.COMMAND,
+        "evaluate": evaluate.COMMAND,
+        "data": data.COMMANDS,
+        "tables": tables.COMMAND,
+        "interop": interop.COMMAND,
+    },
+    """Gated Neural Inertial Odometry: where has a person walked, from the IMU of a phone alone?
+
+  {prog} train --config quickstart --workdir runs/demo     (a first network, without a download)
+  {prog} evaluate --workdir runs/demo                      (its trajectories, errors and pictures)
+  {prog} data list                                         (the datasets, and where they are had)
+
+{prog} COMMAND --help explains each command with examples.""",
+)
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Run one subcommand and leave with its exit status."""
+    console.run(lambda: options.execute(GNIO, argv, "gnio"))

@@ -1,0 +1,27 @@
+"""Where runs lie."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from gnio_jax.config.schema import TrainConfig
+from gnio_jax.errors import InputError
+
+
+def default_workdir(config: TrainConfig) -> Path:
+    """Where a run goes: its `workdir`, else runs/<dataset>_<model>."""
+    return Path(config.workdir or f"runs/{config.dataset}_{config.model.name}")
+
+
+def newest_run(folder: str | Path = "runs") -> Path:
+    """The run below `folder` that was trained last. Raises `InputError` when there is none."""
+    runs = [path.parent for path in Path(folder).glob("*/config.yaml")]
+    if not runs:
+        remedy = "train one with gnio train, or name its folder with --workdir"
+        raise InputError(folder, "holds no run", remedy)
+    return max(runs, key=_last_trained)
+
+
+def _last_trained(run: Path) -> float:
+    files = (run / "config.yaml", run / "metrics.jsonl")
+    return max(path.stat().st_mtime for path in files if path.exists())

@@ -1,0 +1,331 @@
+"""The sections of an experiment's configuration: frozen dataclasses whose field comments are the
+text of `--help` and whose types carry the bounds of the values.
+
+A section that relates several fields to each other checks them in `check`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Annotated, Literal
+
+import tyro
+
+from gnio_jax.config.bounds import (
+    Count,
+    FiniteNonNegative,
+    Fraction,
+    NonNegative,
+    NonNegativeCount,
+    Positive,
+    Probability,
+    TwoOrThree,
+)
+from gnio_jax.errors import InputError
+
+Table = Literal[
+    "complexity",
+    "comparison",
+    "components",
+    "gates",
+    "bank-size",
+    "bank-spread",
+    "uncertainty",
+    "trajectories",
+    "standing",
+]
+
+
+@dataclass(frozen=True)
+class DataConfig:
+    """Which recordings are read, and how windows are cut from them."""
+
+    rate: Positive = 200.0
+    """Samples per second to which every recording is resampled, Hz."""
+    window_seconds: Positive = 1.0
+    """Length of the network's window, s (paper: 1 s)."""
+    stride_seconds: Positive = 0.1
+    """Distance between window starts, and between the filter's clones, s (paper: 0.1 s)."""
+    train_stride_seconds: Positive = 0.1
+    """Distance between window starts in training, s (paper: 0.1 s). A shorter one shows more phases
+    of the same steps."""
+    window_rotation: Literal["per_sample", "single"] = "per_sample"
+    """Rotate each sample with its own attitude, or the whole window with the attitude at its start
+    (eq. 1 read literally)."""
+    train_split: str = "train"
+    """Split of the dataset for training."""
+    val_split: str = "val"
+    """Split of the dataset for validation, which chooses the best checkpoint."""
+
+    @property
+    def window(self) -> int:
+        """Samples in a window."""
+        return round(self.window_seconds * self.rate)
+
+    @property
+    def stride(self) -> int:
+        """Samples between window starts, which is also one clone interval of the filter."""
+        return round(self.stride_seconds * self.rate)
+
+    @property
+    def train_stride(self) -> int:
+        """Samples between window starts in training."""
+        return round(self.train_stride_seconds * self.rate)
+
+    def check(self, prefix: str, source: str) -> None:
+        """Window and strides are whole samples, and strides fill the window exactly."""
+        for name in ("window_seconds", "stride_seconds", "train_stride_seconds"):
+            samples = getattr(self, name) * self.rate
+            if abs(samples - round(samples)) >= 1e-6:
+                problem = f"is not a whole number of samples at {self.rate:g} Hz ({samples:g})"
+                raise InputError(source, f"field '{prefix}{name}' {problem}")
+        if self.window % self.stride:
+            problem = f"must divide the window of {self.window_seconds:g} s"
+            raise InputError(source, f"field '{prefix}stride_seconds' {problem}")
+
+
+@dataclass(frozen=True)
+class AugmentConfig:
+    """Random changes of a training window (TLIO's; the paper is silent). Zero or false switches one
+    off."""
+
+    gyro_bias: NonNegative = 0.05
+    """Half-width of the uniform constant gyro bias, rad/s."""
+    accel_bias: NonNegative = 0.2
+    """Half-width of the uniform constant accelerometer bias, m/s²."""
+    tilt_degrees: NonNegative = 5.0
+    """Largest tilt of gravity about a random horizontal axis, degrees."""
+    yaw: bool = True
+    """Turn window and target by a random yaw."""
+    gyro_noise: NonNegative = 0.0
+    """Standard deviation of white gyro noise, rad/s."""
+    accel_noise: NonNegative = 0.0
+    """Standard deviation of white accelerometer noise, m/s²."""
+    shift_samples: NonNegativeCount = 0
+    """Shift a training window by up to this many samples either way, where the recording allows it
+    (RoNIN, DeepILS)."""
+
+
+@dataclass(frozen=True)
+class ModelConfig:
+    """The network and its options. An option that is not given takes the network's own default,
+    which is the published one. An option that the network does not have is refused."""
+
+    name: str = "gnio"
+    """Network in the registry of `gnio_jax.models`."""
+    width: Count | None = None
+    """Channels of the first encoder group; the others follow (gnio, tlio, ronin_resnet, deepils:
+    64)."""
+    bank_size: NonNegativeCount | None = None
+    """Prototypes in the Motion Bank; 0 leaves the bank out (gnio: 64)."""
+    bank_heads: Count | None = None
+    """Attention heads of the bank's query (gnio: 8)."""
+    bank_std: Positive | None = None
+    """Standard deviation of the prototypes before training (gnio: 1). Near 1/√d, for d features,
+    all prototypes receive the same attention."""
+    head: Literal["gated", "linear"] | None = None
+    """Displacement as scale × gate, or a plain linear layer (gnio: gated)."""
+    gate: Literal["tanh", "sigmoid"] | None = None
+    """Activation of the gate (gnio: tanh)."""
+    scale: Literal["softplus", "pos_elu", "abs", "exp", "linear"] | None = None
+    """Activation of the scale (gnio: softplus)."""
+    uncertainty: Literal["head", "calibrated", "constant"] | None = None
+    """Source of the standard deviation: a head (paper), a head times one factor per axis, or one
+    constant per axis. Factor and constant are fitted to the errors on the validation split
+    (gnio: head)."""
+    output_dim: TwoOrThree | None = None
+    """Dimensions of the displacement: 3, or 2 without the vertical, as published (ronin_resnet,
+    deepils, ctin, imot)."""
+    dropout: Probability | None = None
+    """Fraction of activations dropped in training (tlio, ronin_resnet, deepils: 0.5; imot: 0.1)."""
+
+
+@dataclass(frozen=True)
+class LossConfig:
+    """The training loss (paper §III-F), and the extra terms of the other networks."""
+
+    name: Literal["weighted_sum", "velocity_and_covariance"] = "weighted_sum"
+    """Weighted sum of squared error, absolute error and negative log-likelihood of the
+    displacement, with the weights below; or CTIN's loss: errors of velocity and position and the
+    likelihood of each sample's velocity, weighted by two learnt parameters."""
+    mse_weight: float = 1e2
+    """λ_MSE."""
+    mae_weight: float = 0.0
+    """Weight of the absolute error, summed over the axes (DeepILS: equal to λ_MSE)."""
+    nll_weight: float = 1e-4
+    """λ_NLL."""
+    nll_from_epoch: FiniteNonNegative = 0.0
+    """Epochs before the likelihood counts. Above 0: the two-stage reading of the paper's text."""
+    log_std_from_epoch: FiniteNonNegative = 0.0
+    """Epochs before the likelihood trains the uncertainty; until then it trains the displacement
+    alone (TLIO: 10)."""
+    log_std_floor: float | None = None
+    """Smallest log standard deviation in the likelihood (TLIO: log 1e-3); none by default."""
+
+
+@dataclass(frozen=True)
+class OptimConfig:
+    """Adam with linear warm-up and cosine decay (paper §IV-A), or the schedules of the other
+    networks."""
+
+    schedule: Literal["cosine", "constant", "plateau"] = "cosine"
+    """Learning rate after the warm-up: cosine decay to the last step, constant, or reduced whenever
+    the validation error no longer falls."""
+    epochs: Count = 200
+    """Passes over the training windows."""
+    batch_size: Count = 1024
+    """Windows per step."""
+    learning_rate: Positive = 1e-4
+    """Peak learning rate, reached after the warm-up."""
+    start_learning_rate: float = 1e-6
+    """Learning rate at the first step."""
+    end_learning_rate: float = 1e-6
+    """Learning rate at the last step."""
+    warmup_epochs: FiniteNonNegative = 5.0
+    """Epochs of linear warm-up; a run shorter than twice this warms up for its first half."""
+    clip_norm: Positive | None = None
+    """Largest global norm of the gradient; none by default."""
+    weight_decay: NonNegative = 0.0
+    """Factor of the parameter that is added to its gradient, before Adam (CTIN: 1e-6)."""
+    plateau_epochs: Count = 10
+    """Epochs without a smaller squared error on the validation split before the learning rate falls
+    (RoNIN, DeepILS); for the plateau schedule."""
+    plateau_factor: Fraction = 0.1
+    """Factor applied to the learning rate on a plateau; for the plateau schedule."""
+    best_by: Literal["loss", "squared_error"] = "loss"
+    """Mean over the validation split that chooses the best checkpoint: the loss, or the squared
+    error of the displacement. The choice begins anew where `loss.nll_from_epoch` or
+    `loss.log_std_from_epoch` changes what is trained."""
+    statistics_windows: NonNegativeCount = 16384
+    """Augmented training windows from which the statistics of batch normalisation are estimated
+    before every validation and checkpoint (ours); 0 keeps the running averages of the last
+    steps."""
+
+
+@dataclass(frozen=True)
+class FilterOptions:
+    """Noise and initial uncertainty of the stochastic-cloning EKF (paper §III-G; TLIO's values)."""
+
+    gyro_density: Positive = 3.16e-4
+    """White gyro noise, rad/s/√Hz."""
+    accel_density: Positive = 1.0e-3
+    """White accelerometer noise, m/s²/√Hz."""
+    gyro_bias_walk: NonNegative = 1e-6
+    """Random walk of the gyro bias, rad/s/√s."""
+    accel_bias_walk: NonNegative = 1e-4
+    """Random walk of the accelerometer bias, m/s²/√s."""
+    tilt_std_degrees: NonNegative = 1.0
+    """Initial standard deviation of roll and pitch."""
+    yaw_std_degrees: NonNegative = 0.1
+    """Initial standard deviation of yaw."""
+    velocity_std: NonNegative = 1.0
+    """Initial standard deviation of the velocity, m/s."""
+    position_std: NonNegative = 1e-3
+    """Initial standard deviation of the position, m."""
+    gyro_bias_std: NonNegative = 1e-4
+    """Initial standard deviation of the gyro bias, rad/s."""
+    accel_bias_std: NonNegative = 0.02
+    """Initial standard deviation of the accelerometer bias, m/s²."""
+    measurement_scale: Positive = 10.0
+    """Factor of the network's covariance in the update."""
+    mahalanobis_fail_scale: NonNegative = 0.0
+    """0 skips an update that the χ² gate rejects; above 0 the update is applied with its covariance
+    multiplied by this."""
+    window_rotation: Literal["per_sample", "single", "tlio"] | None = None
+    """How the tight coupling cuts and rotates the network's windows; by default as in training.
+    `tlio` does it as TLIO's tracker: a sample earlier and without the filter's biases, for weights
+    trained that way."""
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """One experiment: everything `gnio train` needs, kept with the run as config.yaml."""
+
+    dataset: str = "synthetic"
+    """Dataset to learn from; `gnio data list` shows the known ones."""
+    data_root: str | None = None
+    """Folder of the dataset; by default $GNIO_DATA/<dataset>, then data/<dataset>."""
+    workdir: str | None = None
+    """Folder for checkpoints and logs; by default runs/<dataset>_<model>."""
+    seed: int = 0
+    """Seed of the initial parameters, the shuffling and the augmentation."""
+    data: DataConfig = field(default_factory=DataConfig)
+    augment: AugmentConfig = field(default_factory=AugmentConfig)
+    model: ModelConfig = field(default_factory=ModelConfig)
+    loss: LossConfig = field(default_factory=LossConfig)
+    optim: OptimConfig = field(default_factory=OptimConfig)
+    filter: FilterOptions = field(default_factory=FilterOptions)
+    checkpoint_every_seconds: float = 600.0
+    """Longest time between checkpoints within an epoch, s; every epoch ends with one anyway."""
+
+
+@dataclass(frozen=True)
+class EvaluateConfig:
+    """What `gnio evaluate` is asked for."""
+
+    workdir: str | None = None
+    """Folder of the run, with its config.yaml and checkpoints; by default the newest below runs/.
+    Results go to its folder eval/."""
+    dataset: str | None = None
+    """Dataset to evaluate on; by default the run's own."""
+    data_root: str | None = None
+    """Folder of the dataset; by default the run's (for its own dataset), $GNIO_DATA/<dataset>, or
+    data/<dataset>."""
+    split: str = "test"
+    """Split of the dataset."""
+    estimator: Literal["ekf", "integrate", "imu_only"] = "ekf"
+    """The paper's filter, the sum of the displacements, or the IMU integrated without the network.
+    """
+    coupling: Literal["tight", "loose"] = "tight"
+    """For the ekf: the network runs inside the filter, or over all windows before it with a given
+    orientation."""
+    orientation: Literal["filter", "device", "reference"] | None = None
+    """Attitude that rotates the network's windows; by default the filter's for the tight coupling,
+    else the reference's. Without a filter, `filter` is the gyro integrated from the start."""
+    init: Literal["reference", "static"] = "reference"
+    """Start from the reference's pose and velocity, or from gravity with yaw, velocity and position
+    zero."""
+    gyro_bias: Literal["zero", "rest", "reference"] = "zero"
+    """Initial gyro bias: zero, the mean of a rest at the start, or the first 10 s against the
+    reference orientation."""
+    alignment: Literal["origin", "none", "yaw_position", "se3"] = "origin"
+    """How an estimate is aligned with the reference before absolute errors: start position and yaw,
+    not at all, or least squares."""
+    checkpoint: Literal["best", "latest"] = "best"
+    """Which checkpoint of the run."""
+    batch_size: int = 16
+    """Recordings estimated side by side."""
+    plots: bool = True
+    """Draw the trajectories, errors, displacements and the errors' distribution."""
+    filter: FilterOptions = field(default_factory=FilterOptions)
+    """Noise and start of the filter; by default the run's own."""
+
+
+@dataclass(frozen=True)
+class TablesConfig:
+    """What `gnio tables` is asked for."""
+
+    table: tyro.conf.Positional[Annotated[Table, tyro.conf.arg(metavar="TABLE")]]
+    """complexity, comparison, components, gates, bank-size, bank-spread, uncertainty, trajectories
+    or standing."""
+    base: str = "quickstart"
+    """Config whose recordings, budget and augmentation every row has (not for complexity)."""
+    data_root: str | None = None
+    """Folder of the dataset; by default the config's, $GNIO_DATA/<dataset>, or data/<dataset>."""
+    split: str = "test"
+    """Split that is measured."""
+    estimator: Literal["ekf", "integrate"] = "ekf"
+    """The paper's filter, or the sum of the displacements with the reference's orientation."""
+    seeds: int = 3
+    """Runs of every row: seeds 0, 1, 2, ..."""
+    epochs: int | None = None
+    """Epochs of every run, instead of the config's."""
+    width: int | None = None
+    """Width of the convolutional networks, instead of the config's model.width."""
+    methods: str = "tlio,ronin_resnet,deepils,ctin,imot,gnio"
+    """Networks of comparison, trajectories and standing, separated by commas; the first is the one
+    that the others are compared with."""
+    sequences: str | None = None
+    """Sequences that trajectories draws, separated by commas; by default the first eight."""
+    out: str = "runs/tables"
+    """Folder of the runs and the tables."""

@@ -1,0 +1,239 @@
+"""Recordings through the filter, many side by side.
+
+The filter runs in float64 (JAX's x64 must be on), the network in float32.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from gnio_jax.evaluation.estimators.result import Estimate
+from gnio_jax.evaluation.inference import Network, keep_diagnostics
+from gnio_jax.evaluation.metrics import Trajectory
+from gnio_jax.evaluation.preparation import Prepared
+from gnio_jax.evaluation.setup import FilterSetup, OnShare, no_progress
+from gnio_jax.filtering import (
+    FilterConfig,
+    FilterHistory,
+    InitialStd,
+    NoiseModel,
+    initial_state,
+    over_sequences,
+    run_filter,
+    run_odometry,
+)
+from gnio_jax.numerics import quaternion_from_matrix
+from gnio_jax.types import Array
+
+POSITION = slice(6, 9)
+"""Of the core error θ, v, p, b_g, b_a."""
+SHORTEST = 16
+"""No batch is padded to less than about this many strides."""
+
+
+class Measurements(NamedTuple):
+    """Displacements given to the filter, a row per stride; NaN where there is none."""
+
+    displacement: Float[np.ndarray, "k 3"]
+    """m, in the yaw frame of the window's start."""
+    std: Float[np.ndarray, "k 3"]
+    """m."""
+
+
+class Batch(NamedTuple):
+    """Recordings that are filtered side by side."""
+
+    members: list[int]
+    """Which; the last one repeated where they do not fill the batch."""
+    strides: int
+    """Length that all are padded to."""
+
+
+class FilterStart(NamedTuple):
+    """Arguments of `initial_state`."""
+
+    rotation: Any
+    velocity: Any
+    position: Any
+    gyro_bias: Any
+    std: InitialStd
+
+
+def run_filters(
+    prepared: list[Prepared],
+    source: Network | list[Measurements],
+    setup: FilterSetup,
+    batch_size: int,
+    progress: OnShare = no_progress,
+) -> list[Estimate]:
+    """The filter over every recording, with the network in its loop or with the measurements of
+    each recording."""
+    n = setup.config.samples_per_clone
+    strides = [each.strides(n) for each in prepared]
+    found: dict[int, Estimate] = {}
+    for batch in batches(strides, batch_size):
+        history = _run_batch([prepared[i] for i in batch.members], batch, source, setup)
+        for place, i in enumerate(batch.members):
+            own = jax.tree.map(lambda leaf, p=place, k=strides[i]: leaf[p, :k], history)
+            found.setdefault(i, _estimate(prepared[i], own, setup))
+        progress(sum(strides[i] for i in found) / sum(strides))
+    return [found[i] for i in range(len(prepared))]
+
+
+def batches(strides: list[int], batch_size: int) -> list[Batch]:
+    """Recordings of like lengths together, which need little padding, the longest first.
+
+    All batches have one size and their lengths are few (the longest recording's times powers of
+    0.8), so there are few compilations, and none is padded by more than a quarter.
+    """
+    longest_first = sorted(range(len(strides)), key=lambda i: -strides[i])
+    count = max(1, math.ceil(len(strides) / batch_size))
+    size = max(1, math.ceil(len(strides) / count))
+    length, found = max(strides, default=0), []
+    for begin in range(0, len(strides), size):
+        members = longest_first[begin : begin + size]
+        while 0.8 * length >= strides[members[0]] and length > SHORTEST:
+            length = math.ceil(0.8 * length)
+        found.append(Batch(members + members[-1:] * (size - len(members)), length))
+    return found
+
+
+def _run_batch(
+    members: list[Prepared],
+    batch: Batch,
+    source: Network | list[Measurements],
+    setup: FilterSetup,
+) -> FilterHistory:
+    """One compiled run; leading axis: the members."""
+    samples = batch.strides * setup.config.samples_per_clone
+    start = _stacked([_filter_start(each, setup) for each in members])
+    # What is appended comes after the recording and changes nothing before it.
+    gyro = np.stack([_extended(each.sequence.gyro[:-1], samples, 0.0) for each in members])
+    accel = np.stack([_extended(each.sequence.accel[:-1], samples, None) for each in members])
+    if isinstance(source, Network):
+        history = _run_with_network(
+            source.apply, source.variables, start, gyro, accel, setup.config, setup.noise
+        )
+    else:
+        given = [
+            Measurements(*(_extended(part, batch.strides, np.nan) for part in source[i]))
+            for i in batch.members
+        ]
+        history = _run_with_measurements(
+            start, gyro, accel, _stacked(given), setup.config, setup.noise
+        )
+    return jax.device_get(history)
+
+
+@functools.partial(jax.jit, static_argnames=("apply", "config"))
+def _run_with_network(
+    apply: Callable,
+    variables: Any,
+    start: FilterStart,
+    gyro: Array,
+    accel: Array,
+    config: FilterConfig,
+    noise: NoiseModel,
+) -> FilterHistory:
+    def predict(windows: Array) -> Any:
+        return keep_diagnostics(apply(variables, windows))
+
+    def run(start: FilterStart, gyro: Array, accel: Array) -> FilterHistory:
+        state = initial_state(config, **start._asdict())
+        return _lean(run_odometry(predict, state, gyro, accel, config, noise)[1])
+
+    return over_sequences(run)(start, gyro, accel)
+
+
+@functools.partial(jax.jit, static_argnames="config")
+def _run_with_measurements(
+    start: FilterStart,
+    gyro: Array,
+    accel: Array,
+    measurements: Measurements,
+    config: FilterConfig,
+    noise: NoiseModel,
+) -> FilterHistory:
+    def run(
+        start: FilterStart, gyro: Array, accel: Array, measurements: Measurements
+    ) -> FilterHistory:
+        state = initial_state(config, **start._asdict())
+        covariance = jax.vmap(jnp.diag)(measurements.std**2)
+        return _lean(
+            run_filter(state, gyro, accel, measurements.displacement, covariance, config, noise)[1]
+        )
+
+    return over_sequences(run)(start, gyro, accel, measurements)
+
+
+def _lean(history: FilterHistory) -> FilterHistory:
+    """With the covariance of the position alone."""
+    assert history.covariance is not None
+    return history._replace(covariance=history.covariance[:, POSITION, POSITION])
+
+
+def _filter_start(prepared: Prepared, setup: FilterSetup) -> FilterStart:
+    """The recording's own start, as certain as it says or else as the options say."""
+    start, std = prepared.start, setup.initial_std
+    if start.tilt_std is not None:
+        std = std._replace(tilt=start.tilt_std)
+    if start.velocity_std is not None:
+        std = std._replace(velocity=start.velocity_std)
+    return FilterStart(start.rotation, start.velocity, start.position, prepared.gyro_bias, std)
+
+
+def _estimate(prepared: Prepared, history: FilterHistory, setup: FilterSetup) -> Estimate:
+    """The history of one recording behind a row for its start; void where not healthy."""
+    n, start = setup.config.samples_per_clone, _filter_start(prepared, setup)
+    assert history.covariance is not None
+    time, notes = prepared.sequence.time[::n], prepared.notes
+    healthy = _after(1.0, history.healthy) > 0
+    if not healthy.all():
+        since = time[np.argmin(healthy)] - time[0]
+        notes = (*notes, f"filter: not healthy from {since:.1f} s on, and all after it is void")
+    position = _after(start.position, history.position)
+    orientation = quaternion_from_matrix(_after(start.rotation, history.rotation))
+    poses = (np.where(healthy[:, None], part, np.nan) for part in (position, orientation))
+    start_std = np.repeat(np.array(start.std), [2, 1, 3, 3, 3, 3])
+    start_covariance = np.eye(3) * setup.initial_std.position**2
+    return Estimate(
+        prepared.sequence.name,
+        Trajectory(time, *poses),
+        prepared.reference(n),
+        displacement=_after(np.nan, history.displacement),
+        displacement_std=_after(np.nan, history.measurement_std),
+        diagnostics={key: _after(np.nan, value) for key, value in history.diagnostics.items()},
+        velocity=_after(start.velocity, history.velocity),
+        gyro_bias=_after(start.gyro_bias, history.gyro_bias),
+        accel_bias=_after(0.0, history.accel_bias),
+        std=_after(start_std, np.sqrt(np.maximum(history.covariance_diagonal, 0.0))),
+        position_covariance=_after(start_covariance, history.covariance),
+        accepted=_after(np.nan, history.accepted),
+        nis=_after(np.nan, history.nis),
+        notes=notes,
+    )
+
+
+def _after(first: Any, rest: Any) -> np.ndarray:
+    """`rest` behind a row of `first`."""
+    row = np.broadcast_to(np.asarray(first, float), rest.shape[1:])
+    return np.concatenate([row[None], rest])
+
+
+def _extended(values: np.ndarray, rows: int, filling: float | None) -> np.ndarray:
+    """`values` with rows of `filling` or (None) of the last one added at the end, up to `rows`."""
+    added = values[-1:] if filling is None else np.full((1, *values.shape[1:]), filling)
+    return np.concatenate([values, np.repeat(added, rows - len(values), 0)])
+
+
+def _stacked(trees: list[Any]) -> Any:
+    """One tree of arrays with a leading axis."""
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *trees)

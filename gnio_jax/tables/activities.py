@@ -1,0 +1,152 @@
+"""What networks predict for single windows, sorted by what the walker did: errors, gate and
+attention at rest and in motion."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from gnio_jax import data, evaluation, models
+from gnio_jax.evaluation import Network, Setup
+from gnio_jax.training import checkpoint
+
+ACTIVITIES = ("standing", "slow", "walking", "running", "stairs")
+STANDING, SLOW, RUNNING, CLIMBING = 0.05, 0.8, 1.9, 0.12
+"""Limits of the mean speed over a window, m/s: standing below the first, slow walking below the
+second, running above the third; on stairs where the vertical part is above the last (ours)."""
+HORIZONTAL = slice(0, 2)
+DIAGNOSTICS = ("gate", "scale", "attention")
+
+
+class PredictedWindows(NamedTuple):
+    """Every window of a split with a trusted reference, cut with the reference's attitude."""
+
+    truth: Float[np.ndarray, "m 3"]
+    """Displacement, m."""
+    displacement: Float[np.ndarray, "m 3"]
+    """The network's, m."""
+    log_std: Float[np.ndarray, "m 3"]
+    diagnostics: dict[str, np.ndarray]
+    """`gate`, `scale` (m, 3) and `attention` (m, heads, prototypes), where the network has them."""
+    activity: Int[np.ndarray, "m"]
+    """Number in ACTIVITIES."""
+
+
+def predict_split(workdir: Path, split: str) -> PredictedWindows:
+    """What the best checkpoint of a run predicts for the windows of a split of its dataset."""
+    run = checkpoint.load_run(workdir)
+    config = run.config.data
+    sequences = data.load(run.config.dataset, run.config.data_root, split)
+    setup = Setup("integrate", orientation="reference")
+    prepared, _ = evaluation.prepare(sequences, config, setup)
+    network = Network(
+        models.Inference(run.model), models.inference_variables(run.model, run.variables)
+    )
+    attitudes = [evaluation.attitude(each, config, "reference") for each in prepared]
+    predictions = evaluation.predict_windows(
+        network, prepared, attitudes, config, diagnostics=DIAGNOSTICS
+    )
+    truth = np.concatenate([evaluation.true_displacements(each, config) for each in prepared])
+    trusted = np.isfinite(truth).all(1)
+    return PredictedWindows(
+        truth[trusted],
+        np.concatenate([p.displacement for p in predictions])[trusted],
+        np.concatenate([p.log_std for p in predictions])[trusted],
+        {
+            name: np.concatenate([p.diagnostics[name] for p in predictions])[trusted]
+            for name in predictions[0].diagnostics
+        },
+        activity(truth[trusted], config.window_seconds),
+    )
+
+
+def activity(displacement: Float[np.ndarray, "m 3"], seconds: float) -> Int[np.ndarray, "m"]:
+    """What the walker does, by the reference's displacement of a window, m. Ours: the limits."""
+    speed = np.linalg.norm(displacement[:, HORIZONTAL], axis=1) / seconds
+    climb = np.abs(displacement[:, 2]) / seconds
+    conditions = {
+        "stairs": climb > CLIMBING,
+        "standing": np.hypot(speed, climb) < STANDING,
+        "slow": speed < SLOW,
+        "running": speed > RUNNING,
+    }
+    numbers = [ACTIVITIES.index(name) for name in conditions]
+    return np.select(list(conditions.values()), numbers, ACTIVITIES.index("walking"))
+
+
+def by_activity(windows: PredictedWindows) -> dict[str, dict[str, float]]:
+    """For each activity that occurs: windows, rms error of the displacement, m, rms of the error
+    over its standard deviation, median length of the displacement, m, and the median |gate| and
+    scale of the horizontal axes, where there is a gate."""
+    figures = {}
+    for number, name in enumerate(ACTIVITIES):
+        rows = windows.activity == number
+        if not rows.any():
+            continue
+        error = windows.displacement[rows] - windows.truth[rows]
+        normalised = error / np.exp(windows.log_std[rows])
+        figures[name] = {
+            "windows": float(rows.sum()),
+            "error": float(np.sqrt((error**2).sum(1).mean())),
+            "normalised": float(np.sqrt((normalised**2).mean())),
+            "length": float(np.median(np.linalg.norm(windows.displacement[rows], axis=1))),
+        }
+        for key in ("gate", "scale"):
+            if key in windows.diagnostics:
+                values = windows.diagnostics[key][rows, HORIZONTAL]
+                figures[name][key] = float(np.median(np.abs(values)))
+    return figures
+
+
+def entropy(attention: Float[np.ndarray, "m h p"]) -> tuple[float, float]:
+    """Mean entropy of the attention, and that of its mean over the windows, each a share of that of
+    a uniform one, log p.
+
+    Both near 1: every window sees all prototypes alike. The first small, the second large: windows
+    choose, and choose differently.
+    """
+    largest = np.log(attention.shape[-1])
+    of_window, of_mean = (
+        -(weights * np.log(np.maximum(weights, 1e-12))).sum(-1).mean() / largest
+        for weights in (attention, attention.mean(0))
+    )
+    return float(of_window), float(of_mean)
+
+
+def attention_by_activity(
+    windows: PredictedWindows,
+) -> tuple[list[str], Float[np.ndarray, "a p"]]:
+    """Activities that occur in at least five windows, and for each how much more attention each
+    prototype gets than on average (1: as on average)."""
+    attention = windows.diagnostics["attention"].mean(1)
+    usual = attention.mean(0)
+    names, lifts = [], []
+    for number, name in enumerate(ACTIVITIES):
+        rows = windows.activity == number
+        if rows.sum() >= 5:
+            names.append(name)
+            lifts.append(attention[rows].mean(0) / usual)
+    return names, np.array(lifts)
+
+
+def information(windows: PredictedWindows, draws: int = 20) -> tuple[float, float]:
+    """Mutual information, bits, of the activity and the prototype most attended to (over the mean
+    of the heads), and the same with the activities shuffled, which is what chance alone makes of so
+    few windows."""
+    strongest = windows.diagnostics["attention"].mean(1).argmax(1)
+    rng = np.random.default_rng(0)
+    shuffled = [
+        _mutual_information(rng.permutation(windows.activity), strongest) for _ in range(draws)
+    ]
+    return _mutual_information(windows.activity, strongest), float(np.mean(shuffled))
+
+
+def _mutual_information(a: Int[np.ndarray, "m"], b: Int[np.ndarray, "m"]) -> float:
+    joint = np.zeros((a.max() + 1, b.max() + 1))
+    np.add.at(joint, (a, b), 1 / len(a))
+    independent = joint.sum(1, keepdims=True) * joint.sum(0, keepdims=True)
+    occurs = joint > 0
+    return float((joint[occurs] * np.log2(joint[occurs] / independent[occurs])).sum())

@@ -1,0 +1,200 @@
+"""The network's window: samples cut from an IMU stream, rotated to the gravity-aligned frame.
+
+Sample j of the window that starts at sample i is (paper eq. 1)
+
+    x_j = R_γ(R_i)ᵀ R_j [accel_j − b_a, gyro_j − b_g],
+
+where R_j is the attitude at sample j (body → world) and R_γ(R_i) the rotation about z by the yaw
+of R_i. So gravity stays on z, the start has zero yaw, and the channels are [accel, gyro]. The
+network answers with the displacement over the window in this same frame.
+
+The attitudes R_j have two sources:
+
+- A recording has one for every sample. `align_recording` rotates it once, on the host, and
+  `cut_windows` then cuts any number of windows on the device: training and batch inference.
+- The filter has one for the start alone and integrates the gyro from there: `cut_window`.
+
+`true_displacement` is the answer that the reference gives.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.spatial.transform import Rotation
+
+from gnio_jax import geometry
+from gnio_jax.types import Array
+
+Rotations = Float[np.ndarray, "m 3 3"]
+Starts = Int[np.ndarray, "m"]
+
+
+# Recordings: an attitude for every sample
+# ------------------------------------------------------------------------------------------------
+
+
+class AlignedRecording(NamedTuple):
+    """A recording of which windows need one rotation each. float32, host or device arrays."""
+
+    imu: Float[Array, "t 6"]
+    """[accel m/s², gyro rad/s]: in the world for `per_sample`, in the body for `single`."""
+    rotation: Float[Array, "m 3 3"]
+    """From the frame of `imu` to the gravity-aligned frame of each window."""
+
+
+def window_starts(samples: int, length: int, stride: int) -> Starts:
+    """First samples of all windows of `length` samples in a recording, `stride` samples apart.
+
+    The last window still has the sample after it, at whose stamp its displacement ends.
+    """
+    return np.arange(0, samples - length, stride)
+
+
+def align_recording(
+    accel: Float[np.ndarray, "t 3"],
+    gyro: Float[np.ndarray, "t 3"],
+    attitude: Float[np.ndarray, "t 3 3"],
+    start: Starts,
+    window_rotation: str,
+) -> AlignedRecording:
+    """Do once for a recording what all its windows have in common, in float64.
+
+    accel m/s² and gyro rad/s, biases subtracted, in the body frame; attitude body → world; start
+    the first samples of the windows. With `window_rotation="per_sample"` every sample is rotated to
+    the world by its own attitude, and a window needs only its start's yaw removed. With `"single"`
+    the samples stay in the body, and a window is rotated by its start's attitude without yaw.
+    """
+    signals = np.stack([accel, gyro], axis=2)
+    rotation = remove_yaw(attitude[start])
+    if window_rotation == "per_sample":
+        signals = attitude @ signals
+    else:
+        rotation = rotation @ attitude[start]
+    imu = signals.transpose(0, 2, 1).reshape(-1, 6)
+    return AlignedRecording(imu.astype(np.float32), rotation.astype(np.float32))
+
+
+def window_rows(start: Int[Array, "b"], length: int) -> Int[jax.Array, "b n"]:
+    """Rows of a recording that each window of `length` samples takes. Jittable."""
+    return start[:, None] + jnp.arange(length, dtype=jnp.int32)[None, :]
+
+
+def cut_windows(
+    imu: Float[Array, "t 6"],
+    start: Int[Array, "b"],
+    rotation: Float[Array, "b 3 3"],
+    length: int,
+) -> Float[jax.Array, "b n 6"]:
+    """The windows of `length` samples that start at rows `start` of an aligned recording. Jittable.
+
+    imu and rotation as in `AlignedRecording`, one rotation per window.
+    """
+    return rotate_channels(rotation, imu[window_rows(start, length)])
+
+
+def rotate_channels(
+    rotation: Float[jax.Array, "b 3 3"], imu: Float[jax.Array, "b n 6"]
+) -> Float[jax.Array, "b n 6"]:
+    """Rotate accel and gyro of every sample of each window."""
+    windows, length, _ = imu.shape
+    vectors = imu.reshape(windows, length, 2, 3)
+    return rotate_vectors(rotation, vectors).reshape(windows, length, 6)
+
+
+def rotate_vectors(
+    rotation: Float[jax.Array, "b 3 3"], vectors: Float[jax.Array, "b n k 3"]
+) -> Float[jax.Array, "b n k 3"]:
+    """Rotate the vectors of each window, in full float32 on every kind of device."""
+    return jnp.einsum("bij,bnkj->bnki", rotation, vectors, precision=jax.lax.Precision.HIGHEST)
+
+
+# The filter: an attitude for the start alone
+# ------------------------------------------------------------------------------------------------
+
+
+class WindowCut(NamedTuple):
+    """How the filter cuts its window between clone i and clone j from the stream.
+
+    The window's first sample gets the attitude of clone i.
+    """
+
+    lead: int
+    """Samples by which the window begins before the first that drove the filter on from clone i."""
+    subtract_biases: bool
+    """Whether the network sees the samples without the filter's biases."""
+    propagating: slice
+    """Slice of the window's bias-corrected rates that propagate attitude between its samples."""
+
+
+WINDOW_CUTS = {
+    "per_sample": WindowCut(0, True, slice(-1)),
+    # No rate propagates: all samples keep the attitude of the first.
+    "single": WindowCut(0, True, slice(0)),
+    # In TLIO's tracker a sample stamped t drives the filter from t − dt to t, and its own rate
+    # leads to its own attitude. The network sees the IMU with the filter's biases in it.
+    "tlio": WindowCut(1, False, slice(1, None)),
+}
+"""The values of `FilterConfig.window_rotation`."""
+
+
+def cut_window(
+    rotation: Float[Array, "3 3"],
+    gyro: Float[Array, "n 3"],
+    accel: Float[Array, "n 3"],
+    gyro_bias: Float[Array, "3"],
+    accel_bias: Float[Array, "3"],
+    cut: WindowCut,
+    dt: float,
+) -> Float[jax.Array, "n 6"]:
+    """The window of n raw samples, `dt` seconds apart, whose first has the attitude `rotation`.
+
+    gyro rad/s and accel m/s² in the body frame. Attitudes are propagated by R_{j+1} = R_j exp(φ_j),
+    φ the bias-corrected rate times dt, as `cut` says. Jittable and differentiable.
+    """
+    rates = gyro - gyro_bias[None]
+    if cut.subtract_biases:
+        gyro, accel = rates, accel - accel_bias[None]
+    turns = jax.vmap(geometry.exp, out_axes=2)(rates[cut.propagating] * dt)
+    first = geometry.yaw_rotation(rotation).T @ rotation
+    rotations = geometry.cumulative_rotation(first, turns)
+    # Samples lie along the last axis: sums over three that XLA fuses, as everywhere in the filter.
+    rotations = jnp.broadcast_to(rotations, (3, 3, len(gyro)))
+    signals = geometry.matmul(rotations, jnp.stack([accel.T, gyro.T], axis=1))
+    return signals.transpose(2, 1, 0).reshape(-1, 6)
+
+
+# The reference's answer
+# ------------------------------------------------------------------------------------------------
+
+
+def true_displacement(
+    orientation: Float[np.ndarray, "t 4"],
+    position: Float[np.ndarray, "t 3"],
+    start: Starts,
+    length: int,
+) -> Float[np.ndarray, "m 3"]:
+    """Displacement R_γ(R_i)ᵀ (p[i + length] − p[i]) of windows that start at i, m.
+
+    orientation quaternions wxyz, body → world; position m, in the world. NaN where either is NaN.
+    """
+    moved = position[start + length] - position[start]
+    known = np.isfinite(orientation[start]).all(axis=1)
+    quaternions = np.where(known[:, None], orientation[start], [1.0, 0.0, 0.0, 0.0])
+    attitude = Rotation.from_quat(quaternions, scalar_first=True).as_matrix()
+    local = np.einsum("mij,mj->mi", remove_yaw(attitude), moved)
+    return np.where(known[:, None], local, np.nan)
+
+
+def yaw_of(rotation: Rotations) -> Float[np.ndarray, "m"]:
+    """Yaw of body → world rotations, rad: atan2(R[1,0], R[0,0])."""
+    return np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0])
+
+
+def remove_yaw(rotation: Rotations) -> Rotations:
+    """R_γ(R)ᵀ: from the world to the frame in which `rotation` has zero yaw."""
+    return Rotation.from_rotvec(np.outer(yaw_of(rotation), [0, 0, -1])).as_matrix()

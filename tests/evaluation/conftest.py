@@ -1,0 +1,58 @@
+"""Walks, estimates and reports that the tests of evaluation share."""
+
+import numpy as np
+import pytest
+
+from gnio_jax.data.readers import synthetic
+from gnio_jax.evaluation import Trajectory, never_moves, report, score
+from tests.support.estimates import SETTINGS, estimate
+from tests.support.estimators import RATE
+
+
+@pytest.fixture(scope="module")
+def walks():
+    # Lengths that share one compiled filter (a fifth is the most that is padded), but for the
+    # shortest.
+    lengths = {1: 18.0, 2: 11.3, 3: 16.0}
+    return [
+        synthetic.pedestrian(seed, synthetic.person(seed), "handheld", seconds, RATE)
+        for seed, seconds in lengths.items()
+    ]
+
+
+@pytest.fixture(scope="module")
+def clean():
+    return synthetic.pedestrian(5, synthetic.person(5), "pocket", 18.0, RATE, imu_errors=False)
+
+
+@pytest.fixture(scope="module")
+def estimates():
+    return [
+        estimate("room 1/walk", 0),
+        estimate("room 1:walk", 1),
+        estimate("blind", 2, truth=False),
+    ]
+
+
+@pytest.fixture(scope="module")
+def made(estimates):
+    groups = {e.name: e.name[:4] for e in estimates}
+    return report.Report(
+        SETTINGS,
+        score(estimates, groups),
+        {"never_moves": score(never_moves(estimates), groups)},
+        {"blind": ["start: rough"]},
+        {"short": "0.5 s"},
+    )
+
+
+@pytest.fixture(scope="module")
+def with_divergence(estimates):
+    """The walks again, the second lost after 20 s, and a third that is whole."""
+    lost = estimates[1].trajectory
+    there = np.arange(400)[:, None] < 200
+    lost = Trajectory(lost.time, *(np.where(there, part, np.nan) for part in lost[1:]))
+    of = [estimates[0], estimates[1]._replace(trajectory=lost), estimates[2], estimate("room 3", 3)]
+    groups = {"room 1/walk": "A", "room 1:walk": "B", "blind": "C", "room 3": "D"}
+    still = {"never_moves": score(never_moves(of), groups)}
+    return of, report.Report(SETTINGS, score(of, groups), still, {}, {})

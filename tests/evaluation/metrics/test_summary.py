@@ -1,0 +1,96 @@
+"""Summaries over sequences and their intervals."""
+
+import numpy as np
+import pytest
+
+from gnio_jax.evaluation import metrics
+
+
+def test_divergence_never_improves_a_summary():
+    """The worst of six errors diverge: the mean is of the others and counts them, the median gets
+    no smaller, and is infinite with half."""
+    errors = [1.0, 2.0, 3.0, 4.0, 5.0, 60.0]
+    names = [f"{group}{k}" for group in "ab" for k in range(3)]
+    summaries = []
+    for bad in (0, 1, 3, 6):
+        values = errors[: 6 - bad] + [np.inf] * bad
+        measures = {
+            name: {"ate": value, "rte": None} for name, value in zip(names, values, strict=True)
+        }
+        summaries.append(metrics.summarise(measures, {name: name[0] for name in names}))
+    assert [s.diverged for s in summaries] == [{"ate": n, "rte": 0} for n in (0, 1, 3, 6)]
+    assert [s.count["ate"] for s in summaries] == [6, 5, 3, 0]
+    assert [s.median["ate"] for s in summaries] == [3.5, 3.5, np.inf, np.inf]
+    assert [s.mean["ate"] for s in summaries] == [12.5, 3.0, 2.0, None]
+    assert summaries[1].interval["ate"] == pytest.approx((2.0, 4.5))
+    assert [s.interval["ate"] for s in summaries[2:]] == [None, None]  # one group is left, or none
+
+
+def test_divergence_is_of_the_sequence_and_leaves_every_mean():
+    """Of four: whole, lost, whole with a bad covariance, without a reference and lost."""
+    fields = ("ate", "nees", "nees_coverage", "accepted", "path_length")
+    rows = {
+        "a": (1.0, 2.0, 90.0, 80.0, 10.0),
+        "b": (np.inf, np.inf, 0.0, 5.0, 500.0),
+        "c": (3.0, np.inf, 0.0, 70.0, 20.0),
+    }
+    measures = {name: dict(zip(fields, row, strict=True)) for name, row in rows.items()}
+    measures["d"] = {"ate": None, "nis": np.inf, "accepted": 3.0}
+    assert [name for name, values in measures.items() if metrics.diverged(values)] == ["b", "d"]
+    summary = metrics.summarise(measures, {name: name for name in measures})
+    means = {
+        "ate": 2.0,
+        "nees": np.inf,
+        "nees_coverage": 45.0,
+        "accepted": 75.0,
+        "path_length": 15.0,
+    }
+    assert summary.mean == means | {"nis": None}
+    assert summary.count == dict.fromkeys(fields, 2) | {"nis": 0}
+    assert summary.diverged == dict.fromkeys(fields, 1) | {"nis": 1, "accepted": 2}
+    assert summary.interval["nees"] is None and summary.interval["accepted"] == (70, 80)
+    assert summary.median["ate"] == 3.0 and summary.median["nees"] == np.inf
+
+
+def test_bootstrap_draws_groups_whatever_their_order():
+    values = np.array([1.0, 5.0, 1.2, 5.2])
+    assert metrics.bootstrap(values, ["x", "y", "x", "y"]) == pytest.approx((1.1, 5.1))
+    assert metrics.bootstrap(values, ["x"] * 4) is None
+    assert metrics.bootstrap(values[:0], []) is None
+
+
+def test_summary_draws_whole_groups():
+    measures = {
+        f"{group}{k}": {"ate": value + 0.001 * k, "rte": None}
+        for group, value in [("a", 1.0), ("b", 3.0)]
+        for k in range(5)
+    }
+    groups = {name: name[0] for name in measures}
+    summary = metrics.summarise(measures, groups)
+    assert summary.mean["ate"] == pytest.approx(2.002) and summary.median["ate"] == pytest.approx(
+        2.002
+    )
+    assert summary.interval["ate"] == pytest.approx(
+        (1.002, 3.002)
+    )  # with two groups a draw is all a, all b or one of each
+    assert (
+        summary.count == {"ate": 10, "rte": 0}
+        and summary.mean["rte"] is None
+        and summary.interval["rte"] is None
+    )
+    assert metrics.summarise(measures, dict.fromkeys(measures, "one")).interval["ate"] is None
+    assert metrics.summarise(measures, groups) == summary
+
+
+def test_summary_interval_covers_the_mean():
+    random = np.random.default_rng(0)
+    hits = 0
+    for trial in range(60):
+        values = random.normal(5.0, 1.0, 25)
+        measures, groups = (
+            {str(k): {"ate": v} for k, v in enumerate(values)},
+            {str(k): k for k in range(25)},
+        )
+        low, high = metrics.summarise(measures, groups, trial, 400).interval["ate"]
+        hits += low <= 5.0 <= high
+    assert hits >= 50

@@ -1,0 +1,72 @@
+"""Starts, biases and cuts of recordings against what is known of them."""
+
+import numpy as np
+import pytest
+
+from gnio_jax import evaluation
+from gnio_jax.data.readers import synthetic
+from gnio_jax.evaluation import Setup
+from tests.support.estimators import CONFIG, OPTIONS, RATE, rotations
+
+
+def test_start_is_the_first_trusted_sample(walks):
+    hidden = walks[0]._replace(valid=np.arange(len(walks[0].time)) >= 137)
+    (prepared,), _ = evaluation.prepare([hidden], CONFIG)
+    assert prepared.sequence.time[0] == walks[0].time[137]
+    np.testing.assert_array_equal(prepared.start.position, walks[0].position[137])
+    np.testing.assert_allclose(
+        prepared.start.rotation, rotations(walks[0].orientation[137]).as_matrix(), atol=1e-12
+    )
+    assert (len(prepared.sequence.time) - 1) % CONFIG.stride == 0
+
+
+def test_static_start_is_level(clean):
+    (prepared,), _ = evaluation.prepare([clean], CONFIG, Setup(init="static"))
+    truth = rotations(clean.orientation[0]).as_matrix()
+    assert np.degrees(np.arccos(prepared.start.rotation[2] @ truth[2])) < 3.0  # it sways
+    assert abs(np.arctan2(prepared.start.rotation[1, 0], prepared.start.rotation[0, 0])) < 1e-12
+    assert (
+        not prepared.start.velocity.any()
+        and not prepared.start.position.any()
+        and not prepared.notes
+    )
+    moving = clean._replace(valid=np.arange(len(clean.time)) > 300)
+    (prepared,), _ = evaluation.prepare([moving], CONFIG, Setup(init="static"))
+    assert "not standing still" in prepared.notes[0]
+
+
+def test_gyro_bias_from_reference_and_from_rest(walks, clean):
+    true = np.array([walks[0].attributes[f"gyro_bias_{axis}"] for axis in "xyz"])
+    biased = walks[0]._replace(gyro=walks[0].gyro + np.array([0.004, -0.02, 0.01]))
+    (prepared,), _ = evaluation.prepare([biased], CONFIG, Setup(gyro_bias="reference"))
+    np.testing.assert_allclose(prepared.gyro_bias, true + np.array([0.004, -0.02, 0.01]), atol=1e-4)
+    assert "10 s against the reference" in prepared.notes[0]
+
+    (prepared,), _ = evaluation.prepare([clean], CONFIG, Setup(gyro_bias="rest"))
+    assert not prepared.gyro_bias.any() and "no rest" in prepared.notes[0]
+    random, bias = np.random.default_rng(0), np.array([0.01, -0.02, 0.005])
+    resting = clean._replace(gyro=clean.gyro.copy(), accel=clean.accel.copy())
+    resting.gyro[:120] = bias + random.normal(0, 1e-3, (120, 3))
+    resting.accel[:120] = clean.accel[:120].mean(0) + random.normal(0, 0.01, (120, 3))
+    (prepared,), _ = evaluation.prepare([resting], CONFIG, Setup(gyro_bias="rest"))
+    np.testing.assert_allclose(prepared.gyro_bias, bias, atol=5e-4)
+    assert "2 s of rest" in prepared.notes[0]
+    (found,) = evaluation.perfect_displacements([prepared], CONFIG, OPTIONS, batch_size=1)
+    np.testing.assert_allclose(found.gyro_bias[0], prepared.gyro_bias)
+
+
+def test_short_sequences_are_left_out_by_name(walks):
+    short = walks[0]._replace(
+        name="short", valid=np.arange(len(walks[0].time)) > len(walks[0].time) - 52
+    )
+    prepared, left_out = evaluation.prepare([short, walks[1]], CONFIG)
+    assert [r.sequence.name for r in prepared] == [walks[1].name]
+    assert left_out == {
+        "short": "1.02 s from its first trusted sample on, too short for a window and a stride"
+    }
+
+
+def test_other_rates_are_resampled():
+    walk = synthetic.pedestrian(1, synthetic.person(1), "handheld", 6.0, 200.0)
+    (prepared,), _ = evaluation.prepare([walk], CONFIG)
+    assert np.median(np.diff(prepared.sequence.time)) == pytest.approx(1 / RATE)

@@ -1,0 +1,46 @@
+"""Made-up estimates and reports about them."""
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from gnio_jax.evaluation import Estimate, Trajectory
+
+SETTINGS = {
+    "dataset": "made",
+    "split": "test",
+    "estimator": "ekf",
+    "coupling": "tight",
+    "orientation_source": "filter",
+    "initial_state": "reference",
+    "gyro_bias": "zero",
+    "imu_compensated": "no",
+    "alignment": "origin",
+}
+
+
+def estimate(name, seed, n=400, truth=True):
+    random = np.random.default_rng(seed)
+    angle = np.arange(n) * 0.02
+    angle[150:220] = angle[150]
+    angle[220:] -= angle[220] - angle[150]
+    position = np.stack([8 * np.cos(angle), 8 * np.sin(angle), 0.1 * angle], 1)
+    orientation = Rotation.from_euler("z", angle[:, None]).as_quat(scalar_first=True)
+    time = 1.5e9 + np.arange(n) * 0.1
+    reference = Trajectory(time, position if truth else position * np.nan, orientation)
+    moved = position + np.cumsum(random.normal(0, 0.03, (n, 3)), 0)
+    displacement = np.full((n, 3), np.nan)
+    displacement[11:] = np.array([1.6, 0, 0]) + random.normal(0, 0.1, (n - 11, 3))
+    spread = 0.03 * np.sqrt(np.arange(n) + 1)
+    accepted = np.where(np.arange(n) < 11, np.nan, (np.arange(n) % 10 > 0).astype(float))
+    return Estimate(
+        name,
+        Trajectory(time, moved, orientation),
+        reference,
+        displacement,
+        np.full((n, 3), 0.3),
+        {"gate": np.tanh(displacement)},
+        std=np.repeat(spread[:, None], 15, 1),
+        position_covariance=spread[:, None, None] ** 2 * np.eye(3),
+        accepted=accepted,
+        nis=np.where(np.isnan(accepted), np.nan, 3.0),
+    )

@@ -1,0 +1,58 @@
+"""Windows by activity, by hand."""
+
+import numpy as np
+import pytest
+
+from gnio_jax.tables import activities
+
+
+def test_activities_by_speed():
+    truth = np.array(
+        [[0.01, 0, 0], [0.3, 0.4, 0], [1.3, 0, 0.02], [0, 2.5, 0], [0.4, 0, 0.3], [0, 0, 0.08]]
+    )
+    names = [activities.ACTIVITIES[k] for k in activities.activity(truth, 1.0)]
+    assert names == ["standing", "slow", "walking", "running", "stairs", "slow"]
+    assert [activities.ACTIVITIES[k] for k in activities.activity(truth, 2.0)[[1, 3]]] == [
+        "slow",
+        "walking",
+    ]  # the same way in twice the time
+
+
+def test_figures_of_windows_by_hand():
+    attention = np.array([[[1.0, 0.0], [0.5, 0.5]], [[0.0, 1.0], [0.5, 0.5]]])
+    said = activities.PredictedWindows(
+        np.zeros((2, 3)),
+        np.array([[0.3, 0, 0.4], [0.0, 0.1, 0]]),
+        np.full((2, 3), np.log(0.1)),
+        {"gate": np.array([[-0.2, 0.4, 9.0], [1.0, 1.0, 9.0]]), "attention": attention},
+        np.array([0, 2]),
+    )
+    found = activities.by_activity(said)
+    assert set(found) == {"standing", "walking"}
+    assert found["standing"]["error"] == pytest.approx(0.5) and found["standing"][
+        "gate"
+    ] == pytest.approx(0.3)
+    assert found["standing"]["normalised"] == pytest.approx(np.sqrt((9 + 16) / 3)) and found[
+        "walking"
+    ]["length"] == pytest.approx(0.1)
+    # First head certain and different, second undecided: half the entropy in a window, all of it in
+    # their mean.
+    assert activities.entropy(attention) == pytest.approx((0.5, 1.0))
+
+
+def test_information_of_prototypes():
+    rng = np.random.default_rng(0)
+    activity = rng.integers(0, 4, 4000)
+    attention = np.full((4000, 2, 8), 0.05)
+    attention[np.arange(4000), :, activity] = 0.65
+    said = activities.PredictedWindows(
+        *[np.zeros((4000, 3))] * 3, {"attention": attention}, activity
+    )
+    told, chance = activities.information(said)
+    assert (
+        told == pytest.approx(2.0, abs=0.01) and chance < 0.01
+    )  # four equally frequent activities: two bits
+    names, lifts = activities.attention_by_activity(said)
+    assert names == ["standing", "slow", "walking", "running"]
+    np.testing.assert_array_equal(lifts.argmax(1), [0, 1, 2, 3])
+    np.testing.assert_allclose(lifts[:, 4:], 1.0)

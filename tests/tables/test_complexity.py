@@ -1,0 +1,54 @@
+"""Operations of the networks against a count by hand."""
+
+import pytest
+
+from gnio_jax.tables import complexity
+
+
+def multiply_adds(convolutions, dense, padding):
+    """By hand: every output of a convolution costs its kernel, with or without its taps in the
+    padding, every dense layer its matrix."""
+    total = sum(i * o for i, o in dense)
+    for length, stride, size, i, o in convolutions:
+        for output in range(-(-length // stride)):
+            first = output * stride - size // 2
+            total += sum(padding or 0 <= first + tap < length for tap in range(size)) * i * o
+    return total
+
+
+def encoder():
+    """(length of the input, stride, kernel, channels in, out) of each convolution; 200 samples."""
+    layers, before, length = [(200, 2, 7, 6, 64)], 64, 50
+    for group, width in enumerate((64, 128, 256, 512)):
+        stride = 2 if group else 1
+        layers.append((length, stride, 3, before, width))
+        if group:
+            layers.append((length, stride, 1, before, width))
+        length = -(-length // stride)
+        layers += [(length, 1, 3, width, width)] * 3
+        before = width
+    return layers
+
+
+HEADS = {
+    "tlio": ([(7, 1, 1, 512, 128)] * 2, [(896, 512), (512, 512), (512, 3)] * 2),
+    "gnio": ([], [(512, 512), (512, 64), (512, 64), (512, 512), *[(512, 3)] * 3]),
+}
+
+
+@pytest.mark.parametrize(
+    "network, parameters, published", [("tlio", 5_424_646, 39.15e6), ("gnio", 4_934_153, 37.4e6)]
+)
+def test_complexity_against_a_hand_count(network, parameters, published):
+    convolutions, dense = HEADS[network]
+    assert multiply_adds([*encoder(), *convolutions], dense, padding=True) == pytest.approx(
+        published, rel=2e-3
+    )
+    by_hand = multiply_adds([*encoder(), *convolutions], dense, padding=False)
+    found = complexity.measure(network, batches=(1,), seconds=0.05)
+    assert found.parameters == parameters
+    assert 1e9 * found.gflops == pytest.approx(
+        2 * by_hand, rel=0.02
+    )  # additions, ReLUs and the like besides
+    assert found.latency[1] > 0
+    assert network in complexity.markdown([found], "a machine")

@@ -1,0 +1,140 @@
+"""What the tables vary, and what they do not."""
+
+import dataclasses
+
+import pytest
+
+from gnio_jax import config as configuration
+from gnio_jax.tables import experiments
+from gnio_jax.training.checkpoint import create_model
+from tests.support.tables import BASE
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        experiments.components,
+        experiments.gates,
+        experiments.bank_sizes,
+        experiments.bank_spread,
+        lambda base: experiments.comparison(base, "test"),
+    ],
+)
+def test_rows_differ_in_the_network_alone(make):
+    """Every row can be built, two are never the same, those of a name are; loss and regularisation
+    apart, only the network differs. Every checkpoint is chosen by one criterion."""
+    seen = {}
+    for cell in make(BASE).cells:
+        assert create_model(cell.config) is not None
+        assert seen.setdefault(cell.name, cell.config) == cell.config
+        optim = dataclasses.replace(
+            cell.config.optim, clip_norm=BASE.optim.clip_norm, weight_decay=BASE.optim.weight_decay
+        )
+        assert optim.best_by == "squared_error"
+        same = dataclasses.replace(
+            BASE, optim=dataclasses.replace(BASE.optim, best_by="squared_error")
+        )
+        assert (
+            dataclasses.replace(cell.config, model=BASE.model, loss=BASE.loss, optim=optim) == same
+        )
+        assert cell.config.model.name != "gnio" or (cell.config.loss, cell.config.optim) == (
+            same.loss,
+            same.optim,
+        )
+    assert len(set(map(str, seen.values()))) == len(seen)
+
+
+def test_remedies_change_the_uncertainty_alone():
+    """The constant comes from the validation split: the heads beside it are calibrated there too,
+    but for the published one."""
+    constant, calibrated, likelihood, published = (
+        cell.config for cell in experiments.remedies(BASE).cells
+    )
+    assert [c.model.uncertainty for c in (constant, calibrated, likelihood)] == [
+        "constant",
+        "calibrated",
+        "calibrated",
+    ]
+    assert create_model(published).uncertainty == "head"
+    assert (published.loss.nll_weight, likelihood.loss.nll_weight) == (1e-4, 1.0)
+    assert dataclasses.replace(likelihood, loss=published.loss) == calibrated
+    for row in (constant, calibrated):
+        assert create_model(row) is not None
+        assert dataclasses.replace(row, model=published.model) == published
+
+
+@pytest.mark.parametrize(
+    "epochs, batch, held",
+    [(200, 128, 10), (200, 1024, 10), (24, 1024, 10), (24, 128, 1.25), (8, 1024, 4), (2, 512, 1)],
+)
+def test_tlio_is_held_for_the_published_steps_or_half_of_the_run(epochs, batch, held):
+    base = dataclasses.replace(
+        BASE, optim=dataclasses.replace(BASE.optim, epochs=epochs, batch_size=batch)
+    )
+    assert experiments.method("tlio", base).loss.log_std_from_epoch == held
+
+
+def test_cells_of_one_name_are_one_run_in_every_table():
+    tables = [
+        make(BASE)
+        for make in (
+            experiments.components,
+            experiments.gates,
+            experiments.bank_sizes,
+            experiments.bank_spread,
+            experiments.remedies,
+        )
+    ]
+    made = [
+        cell for table in (*tables, experiments.comparison(BASE, "test")) for cell in table.cells
+    ]
+    by_name = {}
+    for cell in made:
+        assert by_name.setdefault(cell.name, cell.config) == cell.config
+    assert len(by_name) < len(made)
+
+
+def test_rows_are_the_published_configurations():
+    gates = {cell.label: cell.config.model for cell in experiments.gates(BASE).cells}
+    assert (
+        all(model.bank_size == 0 for model in gates.values()) and gates["tanh × exp"].scale == "exp"
+    )
+    banks = {cell.label: cell.config.model for cell in experiments.bank_sizes(BASE).cells}
+    assert all(model.head == "linear" for model in banks.values())
+    assert [create_model(cell.config).bank_size for cell in experiments.bank_sizes(BASE).cells] == [
+        0,
+        16,
+        32,
+        64,
+        128,
+    ]
+    parts = [
+        (cell.config.model.name, cell.published) for cell in experiments.components(BASE).cells
+    ]
+    assert parts == [("tlio", 2.40), ("gnio", None), ("gnio", 1.98), ("gnio", 1.84), ("gnio", 1.66)]
+
+
+@pytest.mark.parametrize("network", [*experiments.METHODS, "imot_text"])
+def test_losses_and_regularisation_are_those_of_the_published_recipes(network):
+    row = experiments.method(network, BASE)
+    budget = dataclasses.replace(
+        row.optim,
+        clip_norm=BASE.optim.clip_norm,
+        weight_decay=BASE.optim.weight_decay,
+        best_by="loss",
+    )
+    assert budget == BASE.optim and (row.data, row.augment) == (BASE.data, BASE.augment)
+    if network == "gnio":
+        assert row.loss is BASE.loss and row.optim == dataclasses.replace(
+            BASE.optim, best_by="squared_error"
+        )
+        return
+    recipe = configuration.validate(configuration.load(f"configs/baselines/{network}.yaml"))
+    assert recipe.model.name == network
+    published = dataclasses.replace(BASE, optim=dataclasses.replace(BASE.optim, epochs=200))
+    assert experiments.loss(network, published) == recipe.loss
+    assert (row.optim.clip_norm, row.optim.weight_decay) == (
+        recipe.optim.clip_norm,
+        recipe.optim.weight_decay,
+    )
+    assert create_model(recipe) is not None

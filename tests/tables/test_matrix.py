@@ -1,0 +1,64 @@
+"""Figures and paths of runs that are there already."""
+
+import json
+
+import numpy as np
+import pytest
+
+from gnio_jax import config as configuration
+from gnio_jax.evaluation import report
+from gnio_jax.evaluation.metrics import Trajectory
+from gnio_jax.evaluation.tum import write_tum
+from gnio_jax.reporting import Lines
+from gnio_jax.tables import matrix
+from gnio_jax.tables.experiments import Cell
+from gnio_jax.tables.matrix import Result
+from tests.support.tables import BASE
+
+
+@pytest.mark.parametrize(
+    "definitions, group, step, kept",
+    [
+        (report.DEFINITIONS, True, 7, True),
+        (1, True, 7, False),
+        (report.DEFINITIONS + 1, True, 7, False),
+        (None, True, 7, report.DEFINITIONS == 2),
+        (None, False, 7, False),
+        (report.DEFINITIONS, True, 6, False),
+    ],
+)
+def test_figures_of_other_definitions_or_steps_are_made_anew(
+    tmp_path, monkeypatch, definitions, group, step, kept
+):
+    configuration.save(tmp_path / "config.yaml", BASE)
+    (tmp_path / "checkpoints" / "best" / "7").mkdir(parents=True)
+    path = tmp_path / "eval" / "tlio_test_ekf" / "metrics.json"
+    path.parent.mkdir(parents=True)
+    settings = {"step": step} | ({} if definitions is None else {"definitions": definitions})
+    sequences = {
+        "a": {"ate": 1.0, "group": "x"},
+        "b": {"ate": 1.0} | ({"group": "y"} if group else {}),
+    }
+    path.write_text(json.dumps({"settings": settings, "sequences": sequences}))
+    monkeypatch.setattr(matrix.evaluation, "evaluate", lambda config, **_: path.write_text("{}"))
+    found = matrix.evaluated(tmp_path, "test", "ekf", Lines())
+    assert (found != {}) == kept
+
+
+def test_paths_end_where_the_estimate_diverged(tmp_path):
+    configuration.save(tmp_path / "config.yaml", BASE)
+    time = np.arange(50) * 0.1
+    position, level = np.column_stack([time, np.zeros((50, 2))]), np.tile([1.0, 0, 0, 0], (50, 1))
+    seen, moved = position.copy(), position + np.array([3.0, 2.0, 1.0])
+    seen[10:15] = np.nan
+    moved[30:] = np.nan
+    folder = tmp_path / "eval" / "tlio_test_ekf"
+    for kind, path in (("references", seen), ("trajectories", moved)):
+        (folder / kind).mkdir(parents=True)
+        write_tum(folder / kind / "walk.txt", Trajectory(time, path, level))
+    made = Result(Cell("a", "A", BASE), [{"sequences": {"walk": {}}}], [tmp_path])
+    ((reference, estimate),) = matrix.paths(made, "test", "ekf").values()
+    kept = np.r_[0:10, 15:50]
+    np.testing.assert_allclose(reference, position[kept, :2], atol=1e-8)
+    expected = np.where(kept[:, None] < 30, position[kept, :2], np.nan)
+    np.testing.assert_allclose(estimate, expected, atol=1e-8)

@@ -1,0 +1,70 @@
+"""What each room may import: the arrow of docs/architecture.md, read from the sources."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).parents[1] / "gnio_jax"
+
+BASE = {"config", "cores", "decimation", "errors", "files", "geometry", "numerics", "reporting"}
+BASE |= {"types", "windows"}
+ROOMS = {
+    "data": BASE,
+    "models": BASE,
+    "filtering": BASE,
+    "training": BASE | {"data", "models"},
+    "evaluation": BASE | {"data", "models", "filtering", "training"},
+    "interop": BASE | {"models", "training"},
+    "tables": BASE | {"data", "models", "filtering", "training", "evaluation"},
+    "commands": BASE | {"data", "filtering", "training", "evaluation", "interop", "tables"},
+    **{name: BASE for name in BASE},
+}
+"""Rooms and top-level modules, and what each may import of the package besides itself."""
+
+LIBRARIES = {
+    "flax": {"models", "training", "evaluation", "interop"},
+    "matplotlib": {"data", "evaluation", "tables"},
+    "optax": {"training"},
+    "orbax": {"training.checkpoint"},
+    "rich.console.Console": {"commands"},
+    "rich.progress": {"commands"},
+    "tensorboardX": {"training.log"},
+    "tyro": {"commands", "config"},
+}
+"""Libraries that only these rooms or modules import."""
+
+
+def imports():
+    """(module without the package's name, what it imports) of every import of the package."""
+    for path in sorted(PACKAGE.rglob("*.py")):
+        module = ".".join(path.relative_to(PACKAGE).with_suffix("").parts)
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Import):
+                yield from ((module, alias.name) for alias in node.names)
+            elif isinstance(node, ast.ImportFrom):
+                assert node.level == 0, f"{module}: relative import"
+                yield from ((module, f"{node.module}.{alias.name}") for alias in node.names)
+
+
+@pytest.mark.parametrize("room", ROOMS)
+def test_a_room_imports_only_what_stands_before_it(room):
+    for module, name in imports():
+        if module.split(".")[0] == room and name.startswith("gnio_jax."):
+            other = name.split(".")[1]
+            # `python -m gnio_jax.data` is the command of that name.
+            allowed = {"commands"} if module.endswith("__main__") else ROOMS[room] | {room}
+            assert other in allowed, f"gnio_jax/{module} imports {name}"
+
+
+@pytest.mark.parametrize("library", LIBRARIES)
+def test_a_library_stays_in_its_rooms(library):
+    for module, name in imports():
+        if f"{name}.".startswith(f"{library}."):
+            places = {module, module.split(".")[0]}
+            assert places & LIBRARIES[library], f"gnio_jax/{module} imports {name}"
+
+
+def test_every_module_has_a_room():
+    rooms = {module.split(".")[0] for module, _ in imports()}
+    assert rooms - {"__init__", "__main__"} <= ROOMS.keys()
