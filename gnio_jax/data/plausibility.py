@@ -11,6 +11,7 @@ from scipy.signal import fftconvolve
 from scipy.spatial.transform import Rotation
 
 from gnio_jax.data.dataset import Dataset
+from gnio_jax.errors import InputError
 from gnio_jax.numerics import (
     last_true,
     midpoints,
@@ -19,7 +20,7 @@ from gnio_jax.numerics import (
     rotations,
     spans,
 )
-from gnio_jax.types import GRAVITY, InputError, Sequence
+from gnio_jax.types import GRAVITY, Sequence
 
 WINDOW_SECONDS = 10.0
 """s over which the gyro is integrated."""

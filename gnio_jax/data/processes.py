@@ -10,7 +10,7 @@ from concurrent.futures.process import BrokenProcessPool
 from typing import TypeVar
 
 from gnio_jax.cores import usable_cores
-from gnio_jax.types import InputError
+from gnio_jax.errors import InputError
 
 Result = TypeVar("Result")
 

@@ -11,7 +11,8 @@ from gnio_jax.data.cache import cached, is_cached, is_refused
 from gnio_jax.data.dataset import Dataset, Recording, Refusal
 from gnio_jax.data.plausibility import SelfCheck, check_sequence, keep_plausible
 from gnio_jax.data.processes import map_in_processes
-from gnio_jax.types import InputError, Sequence
+from gnio_jax.errors import InputError
+from gnio_jax.types import Sequence
 
 # --- one recording
 

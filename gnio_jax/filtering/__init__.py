@@ -5,18 +5,16 @@ Needs only JAX and the geometry: the network is any function from windows to a `
 """
 
 from gnio_jax.filtering.batch import cores_as_devices, over_sequences
-from gnio_jax.filtering.scan import FilterHistory, run_filter, run_odometry
+from gnio_jax.filtering.config import FilterConfig
+from gnio_jax.filtering.history import FilterHistory
+from gnio_jax.filtering.noise import InitialStd, NoiseModel
+from gnio_jax.filtering.online import TrackerState
+from gnio_jax.filtering.pose import Pose
+from gnio_jax.filtering.scan import run_filter, run_odometry
 from gnio_jax.filtering.smoother import SmoothedHistory, smooth, smooth_odometry
-from gnio_jax.filtering.state import (
-    FilterConfig,
-    FilterState,
-    GateState,
-    InitialStd,
-    NoiseModel,
-    initial_state,
-    level_state,
-)
-from gnio_jax.filtering.tracker import Pose, Tracker, TrackerState
+from gnio_jax.filtering.start import initial_state, level_state
+from gnio_jax.filtering.state import FilterState, GateState
+from gnio_jax.filtering.tracker import Tracker
 
 __all__ = [
     "FilterConfig",

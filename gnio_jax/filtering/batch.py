@@ -12,6 +12,7 @@ import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 
 from gnio_jax.cores import usable_cores
+from gnio_jax.types import Array
 
 T = TypeVar("T")
 
@@ -37,21 +38,25 @@ def over_sequences(function: Callable[..., T], shared: int = 0) -> Callable[...,
         batched = jax.vmap(function, in_axes=(None,) * shared + (0,) * len(own))
         if len(devices) == 1:
             return batched(*arguments)
-        filling = -count % len(devices)
-        filled = jax.tree.map(
-            lambda x: (
-                jnp.concatenate([jnp.asarray(x), jnp.repeat(x[-1:], filling, axis=0)])
-                if filling
-                else x
-            ),
-            own,
+        filled = jax.tree.map(lambda leaf: _repeat_last(leaf, -count % len(devices)), own)
+        everywhere, shared_out = PartitionSpec(), PartitionSpec("sequence")
+        spread = jax.shard_map(
+            batched,
+            mesh=Mesh(np.array(devices), ("sequence",)),
+            in_specs=(everywhere,) * shared + (shared_out,) * len(own),
+            out_specs=shared_out,
+            check_vma=False,
         )
-        every, each = PartitionSpec(), PartitionSpec("sequence")
-        spread = jax.shard_map(batched, mesh=Mesh(np.array(devices), ("sequence",)), in_specs=(every,) * shared + (each,) * len(own),
-                               out_specs=each, check_vma=False)  # fmt: skip
-        return jax.tree.map(lambda x: x[:count], spread(*arguments[:shared], *filled))
+        return jax.tree.map(lambda leaf: leaf[:count], spread(*arguments[:shared], *filled))
 
     return mapped
+
+
+def _repeat_last(leaf: Array, times: int) -> Array:
+    """With the last row repeated `times` times behind it."""
+    if not times:
+        return leaf
+    return jnp.concatenate([jnp.asarray(leaf), jnp.repeat(leaf[-1:], times, axis=0)])
 
 
 def cores_as_devices() -> None:
@@ -61,7 +66,8 @@ def cores_as_devices() -> None:
     Programs that do not spread anything go on running on the first device, with all cores. Raises
     RuntimeError after JAX's first computation, when the devices are settled.
     """
-    given = jax.config.jax_num_cpu_devices  # pyright: ignore[reportAttributeAccessIssue] — JAX makes its settings when it is imported
+    # JAX makes its settings when it is imported, so its types do not know this one.
+    given = jax.config.jax_num_cpu_devices  # pyright: ignore[reportAttributeAccessIssue]
     if given >= 0 or "xla_force_host_platform_device_count" in os.environ.get("XLA_FLAGS", ""):
         return
     jax.config.update("jax_num_cpu_devices", usable_cores())

@@ -15,7 +15,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Bool, Float, Int
 
-from gnio_jax.filtering.state import FilterConfig, ImuMemory
+from gnio_jax.filtering.config import FilterConfig
+from gnio_jax.filtering.state import ImuMemory
 from gnio_jax.types import Array
 
 
@@ -48,53 +49,61 @@ def bridge(
     memory: ImuMemory,
     config: FilterConfig,
 ) -> tuple[Imu, Float[Array, "n"], ImuMemory]:
-    """The stream with its holes filled, the age of each held sample in s (0 for one's own), and the
-    memory after it.
+    """The stream with its holes filled, the age of each held sample in s (0 where a sample is its
+    own), and the memory after it.
 
     A sample is missing where `valid` is False or a value is not finite. Without `valid` the stream
     is taken to be complete.
     """
     n = gyro.shape[0]
     if valid is None:
-        after = memory._replace(
-            gyro=gyro[-1], accel=accel[-1], missing=jnp.zeros_like(memory.missing)
-        )
+        nothing_missing = jnp.zeros_like(memory.missing)
+        after = memory._replace(gyro=gyro[-1], accel=accel[-1], missing=nothing_missing)
         return Imu(gyro, accel, None), jnp.zeros(n, gyro.dtype), after
     valid = valid & jnp.all(jnp.isfinite(gyro), axis=1) & jnp.all(jnp.isfinite(accel), axis=1)
-    # The stream with what is remembered before it, as sample 0; every sample points to the last
-    # that is there.
-    last = jax.lax.cummax(jnp.where(valid, jnp.arange(1, n + 1), 0))
-    age = jnp.where(last == 0, memory.missing + jnp.arange(1, n + 1), jnp.arange(1, n + 1) - last)
+    # The remembered sample stands before the stream as number 0; `last` is the number of the last
+    # sample that is there.
+    number = jnp.arange(1, n + 1)
+    last = jax.lax.cummax(jnp.where(valid, number, 0))
+    age = jnp.where(last == 0, memory.missing + number, number - last)
     known = jnp.all(jnp.isfinite(memory.gyro)) | (last > 0)
 
-    def held(before: Array, samples: Array) -> Array:
-        clean = jnp.where(valid[:, None], samples, 0.0)
-        return jnp.concatenate([jnp.where(jnp.isfinite(before), before, 0.0)[None], clean])[last]
-
+    gyro = _held(gyro, memory.gyro, valid, last)
+    accel = _held(accel, memory.accel, valid, last)
     limit = max(round(config.bridge_seconds / config.dt), 1)
     coasting = (age > limit) | ~known
     variance = _variance(jnp.where(known, age, limit + 1), limit).astype(gyro.dtype)
-    gyro, accel = held(memory.gyro, gyro), held(memory.accel, accel)
     gap = Gap(
-        variance * config.gap_gyro_std**2,
-        variance * config.gap_accel_std**2,
-        jnp.where(coasting, 0.0, 1.0).astype(gyro.dtype),
+        gyro_variance=variance * config.gap_gyro_std**2,
+        accel_variance=variance * config.gap_accel_std**2,
+        used=jnp.where(coasting, 0.0, 1.0).astype(gyro.dtype),
     )
-    any_yet = known[-1]
     after = memory._replace(
-        gyro=jnp.where(any_yet, gyro[-1], jnp.nan),
-        accel=jnp.where(any_yet, accel[-1], jnp.nan),
+        gyro=jnp.where(known[-1], gyro[-1], jnp.nan),
+        accel=jnp.where(known[-1], accel[-1], jnp.nan),
         missing=age[-1].astype(memory.missing.dtype),
     )
     return Imu(gyro, accel, gap), (age * config.dt).astype(gyro.dtype), after
+
+
+def _held(
+    samples: Float[Array, "n 3"],
+    remembered: Float[Array, "3"],
+    valid: Bool[Array, "n"],
+    last: Int[Array, "n"],
+) -> Float[Array, "n 3"]:
+    """Each sample, or where it is missing the last one that is there."""
+    clean = jnp.where(valid[:, None], samples, 0.0)
+    before = jnp.where(jnp.isfinite(remembered), remembered, 0.0)
+    return jnp.concatenate([before[None], clean])[last]
 
 
 def _variance(age: Int[Array, "n"], limit: int) -> Float[Array, "n"]:
     """Of a sample held for `age` samples, in units of the gap's own, so that sums over a gap have
     the standard deviation Σ e_j, where e_j = min(j / limit, 1) is the error of the j-th."""
 
-    def total(j: Array) -> Array:
+    def summed_error(j: Array) -> Array:
         ramp = jnp.minimum(j, limit)
         return ramp * (ramp + 1) / (2 * limit) + (j - ramp)
 
-    return total(age) ** 2 - total(age - 1) ** 2
+    return summed_error(age) ** 2 - summed_error(age - 1) ** 2

@@ -33,6 +33,11 @@ single one does not end it."""
 _STOP = 5.0
 """Of the grid's interval: what is longer is a stop of the IMU and says nothing of its rate (ours).
 Shorter ones may be jitter."""
+_RATE_CHECK = 100
+"""Every so many grid samples the IMU's rate is held against `imu_rate`: by the number of stamps
+till then, which jitter hardly changes. The time in which the IMU stopped does not count."""
+_TOO_FAST = 1.05
+"""Times the fastest rate that the low-pass is made for."""
 _BEFORE = 4
 """Samples kept before the FIR's reach, so that the spline's new end is not felt within it."""
 
@@ -118,7 +123,26 @@ def measure_rate(intake: Intake, time: float, design: Design) -> Intake:
     return intake._replace(intervals=intake.intervals + 1, covered=intake.covered + interval)
 
 
-def take(
+def check_rate(intake: Intake, time: float, design: Design) -> None:
+    """`ValueError` if the stamps up to `time` come so much faster than `imu_rate` that vibrations
+    would alias."""
+    after = measure_rate(intake, time, design)
+    slack = rounding(design.dt, time, intake.origin)
+    checks_before, checks_after = (
+        (covered + slack) // (_RATE_CHECK * design.dt)
+        for covered in (intake.covered, after.covered)
+    )
+    if checks_after <= checks_before:
+        return
+    found = after.intervals / after.covered
+    if found > _TOO_FAST * design.fastest:
+        raise ValueError(
+            f"imu_rate: the samples come at {found:.4g} Hz, the tracker was made for "
+            f"{design.imu_rate:.4g} Hz: vibrations would alias; make it with imu_rate={found:.4g}"
+        )
+
+
+def low_pass_sample(
     intake: Intake | None, time: float, sample: tuple[float, ...], design: Design
 ) -> tuple[Intake, list[Event]]:
     """The stream after one sample, and what the filter's clock is to be told.
@@ -133,38 +157,65 @@ def take(
     if design.factor == 1:
         return intake, [(time, sample)]
     elapsed, slack = time - intake.origin, rounding(design.dt, time, intake.origin)
-    there, run, count, events = all(map(math.isfinite, sample)), intake.run, intake.count, []
-    if run is not None and elapsed - run.stamps[-1] > design.longest:
-        last = _last(run, slack, design)
-        while count * design.factor <= last:
-            events.append((intake.origin + count * design.dt, _filtered(run, count, last, design)))
-            count += 1
-        run = None
-    if run is None and there:
+    present, events = all(map(math.isfinite, sample)), []
+    if intake.run is not None and elapsed - intake.run.stamps[-1] > design.longest:
+        intake, events = _drain(intake, intake.run, slack, design)
+    if intake.run is None and not present:
+        return intake, [*events, (time, sample)]
+    if present:
+        intake = _append(intake, elapsed, sample, slack, design)
+    if intake.run is None:
+        return intake, events
+    intake, ready = _filter_ready(intake, intake.run, slack, design)
+    return intake, events + ready
+
+
+def _drain(intake: Intake, run: Run, slack: float, design: Design) -> tuple[Intake, list[Event]]:
+    """End a run at a hole: the grid samples up to its end, with the weights of what is there."""
+    last, count, events = _last_point(run, slack, design), intake.count, []
+    while count * design.factor <= last:
+        events.append(_grid_event(intake, run, count, last, design))
+        count += 1
+    return intake._replace(count=count, run=None), events
+
+
+def _append(
+    intake: Intake, elapsed: float, sample: tuple[float, ...], slack: float, design: Design
+) -> Intake:
+    """The sample added to the run, or the first of a new one."""
+    run = intake.run
+    if run is None:
         first = math.ceil((elapsed - slack) * design.factor / design.dt)
         run = Run(first, np.array([elapsed]), np.array([sample]))
-        count = max(count, -(-first // design.factor))
-    elif run is None:
-        events.append((time, sample))
-    elif there and elapsed - run.stamps[-1] >= _CLOSEST / design.imu_rate:
-        run = run._replace(
-            stamps=np.append(run.stamps, elapsed), samples=np.concatenate([run.samples, [sample]])
-        )
-    if run is not None:
-        last = _last(run, slack, design)
-        while count * design.factor + len(design.taps) // 2 <= last:
-            events.append((intake.origin + count * design.dt, _filtered(run, count, last, design)))
-            count += 1
-        reach = count * design.dt - design.delay
-        needed = int(np.searchsorted(run.stamps, reach, side="right")) - 1 - _BEFORE
-        if needed > 0:
-            run = run._replace(stamps=run.stamps[needed:], samples=run.samples[needed:])
+        return intake._replace(run=run, count=max(intake.count, -(-first // design.factor)))
+    if elapsed - run.stamps[-1] < _CLOSEST / design.imu_rate:
+        return intake
+    stamps, samples = np.append(run.stamps, elapsed), np.concatenate([run.samples, [sample]])
+    return intake._replace(run=run._replace(stamps=stamps, samples=samples))
+
+
+def _filter_ready(
+    intake: Intake, run: Run, slack: float, design: Design
+) -> tuple[Intake, list[Event]]:
+    """The grid samples that the FIR reaches now; what it needs no more is dropped."""
+    last, count, events = _last_point(run, slack, design), intake.count, []
+    while count * design.factor + len(design.taps) // 2 <= last:
+        events.append(_grid_event(intake, run, count, last, design))
+        count += 1
+    reach = count * design.dt - design.delay
+    unneeded = int(np.searchsorted(run.stamps, reach, side="right")) - 1 - _BEFORE
+    if unneeded > 0:
+        run = run._replace(stamps=run.stamps[unneeded:], samples=run.samples[unneeded:])
     return intake._replace(count=count, run=run), events
 
 
-def _last(run: Run, slack: float, design: Design) -> int:
+def _last_point(run: Run, slack: float, design: Design) -> int:
     """The last point of the fine grid that the run has reached."""
     return math.floor((run.stamps[-1] + slack) * design.factor / design.dt)
+
+
+def _grid_event(intake: Intake, run: Run, count: int, last: int, design: Design) -> Event:
+    return intake.origin + count * design.dt, _filtered(run, count, last, design)
 
 
 def _filtered(run: Run, count: int, last: int, design: Design) -> tuple[float, ...]:

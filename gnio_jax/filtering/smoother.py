@@ -31,6 +31,7 @@ by δθ, a second-order term, is left out as in the filter.
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -39,29 +40,35 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from gnio_jax import geometry
+from gnio_jax.filtering.checkpointing import join_blocks, split_blocks
+from gnio_jax.filtering.checks import checked_array
+from gnio_jax.filtering.config import FilterConfig, YawFrame
+from gnio_jax.filtering.displacement import Measurement, scaled_measurement
 from gnio_jax.filtering.gaps import Imu, bridge
-from gnio_jax.filtering.measurement import Correction, Measurement
-from gnio_jax.filtering.scan import FilterHistory, Trace, _admit, _measurement, traced_step
+from gnio_jax.filtering.history import FilterHistory
+from gnio_jax.filtering.inputs import Signals, checked_inputs, checked_measurements
+from gnio_jax.filtering.noise import NoiseModel
+from gnio_jax.filtering.scan import interval_inputs
 from gnio_jax.filtering.state import (
     ACCEL_BIAS,
     ANCHOR,
+    BIASES,
     CLONE,
     GYRO_BIAS,
+    LOCAL,
     MOVE,
     OFFSET,
     THETA,
     VELOCITY,
-    FilterConfig,
     FilterState,
-    Frame,
-    NoiseModel,
-    check,
-    check_positive,
+    Mean,
 )
+from gnio_jax.filtering.step import StepTrace, traced_clone_step
+from gnio_jax.filtering.update import Correction
 from gnio_jax.geometry import matmul
 from gnio_jax.types import Array
 
-LOCAL = ANCHOR.start + 3
+_ADJOINT_CORE = LOCAL.stop + 3
 """Core entries of the adjoint: θ, v, o, b_g, b_a and the anchor's last move."""
 
 
@@ -83,25 +90,6 @@ class SmoothedHistory(NamedTuple):
     """Variances of θ, v, p, b_g, b_a."""
     covariance: Float[Array, "k 15 15"] | None
     """The whole block where `FilterConfig.history` is "core", else None."""
-
-
-class Kept(NamedTuple):
-    """What the way back needs of one step forward."""
-
-    mean: tuple[Array, ...]
-    """Rotation, velocity, position, gyro bias, accel bias after the step."""
-    covariance: Array
-    """Of θ, v, p, b_g, b_a, or its diagonal."""
-    cross: Float[Array, "15 m"]
-    """P of those against all that the adjoint runs over."""
-    trace: Trace
-
-
-class Adjoint(NamedTuple):
-    """λ and Λ over θ, v, o, b_g, b_a, s and the ring of clones."""
-
-    vector: Float[Array, "m"]
-    matrix: Float[Array, "m m"]
 
 
 def smooth(
@@ -128,12 +116,9 @@ def smooth(
     E) · m² + E · (18 m + 500). Smoothed variances are differences: in float32 one that is lowered
     by many orders of magnitude, as at the start, has few digits left and can come out below zero.
     """
-    state, gyro, accel, valid, noise = _admit(state, gyro, accel, imu_valid, config, noise)
-    intervals = gyro.shape[0] // config.samples_per_clone
-    displacement = check("displacement", displacement, (intervals, 3), config).astype(gyro.dtype)
-    covariance = check("covariance", covariance, (intervals, 3, 3), config).astype(gyro.dtype)
-    check_positive("covariance", covariance)
-    return _smooth(state, gyro, accel, valid, displacement, covariance, config, noise, "given")
+    state, signals, noise = checked_inputs(state, gyro, accel, imu_valid, config, noise)
+    displacement, covariance = checked_measurements(displacement, covariance, signals, config)
+    return _smooth(state, signals, displacement, covariance, config, noise, "given")
 
 
 def smooth_odometry(
@@ -151,175 +136,236 @@ def smooth_odometry(
     the history, which are told in the filter's own yaw frame. All else as in `smooth`. Raises
     `ValueError` as `run_odometry` does, or if the history is not as long as the signals.
     """
-    state, gyro, accel, valid, noise = _admit(state, gyro, accel, imu_valid, config, noise)
-    intervals = gyro.shape[0] // config.samples_per_clone
+    state, signals, noise = checked_inputs(state, gyro, accel, imu_valid, config, noise)
+    shape = (signals.gyro.shape[0] // config.samples_per_clone, 3)
     displacement, std = (
-        check(f"history.{name}", getattr(history, name), (intervals, 3), config).astype(gyro.dtype)
-        for name in ("displacement", "measurement_std")
+        checked_array(f"history.{name}", value, shape, config).astype(signals.gyro.dtype)
+        for name, value in [
+            ("displacement", history.displacement),
+            ("measurement_std", history.measurement_std),
+        ]
     )
     covariance = jax.vmap(jnp.diag)(std**2 / config.measurement_scale)
     frame = config.displacement_frame
-    return _smooth(state, gyro, accel, valid, displacement, covariance, config, noise, frame)
+    return _smooth(state, signals, displacement, covariance, config, noise, frame)
+
+
+class _Adjoint(NamedTuple):
+    """λ and Λ over θ, v, o, b_g, b_a, s and the ring of clones."""
+
+    vector: Float[Array, "m"]
+    matrix: Float[Array, "m m"]
+
+
+class _Inputs(NamedTuple):
+    """What a step forward takes, or K of them stacked."""
+
+    slot: Int[Array, "*k"]
+    """Of the ring, for the clone at the end of the interval."""
+    imu: Imu
+    measurement: Measurement
+
+
+class _ForwardStep(NamedTuple):
+    """What the way back needs of one step forward."""
+
+    slot: Int[Array, "*k"]
+    mean: Mean
+    """After the step."""
+    covariance: Array
+    """Of θ, v, p, b_g, b_a, or its diagonal."""
+    cross: Float[Array, "*k 15 m"]
+    """P of those against all that the adjoint runs over."""
+    trace: StepTrace
+
+
+class _Smoothed(NamedTuple):
+    """The smoothed estimate after one step, or K of them stacked."""
+
+    mean: Mean
+    covariance: Array
+    """Of θ, v, p, b_g, b_a, or its diagonal."""
 
 
 @functools.partial(jax.jit, static_argnames=("config", "frame"))
-def _smooth(state, gyro, accel, valid, displacement, covariance, config, noise, frame):
-    n, clones = config.samples_per_clone, config.clones_per_window + 1
-    intervals = len(displacement)
-    measurements = jax.vmap(functools.partial(_measurement, config=config))(
-        displacement, covariance
+def _smooth(
+    state: FilterState,
+    signals: Signals,
+    displacement: Array,
+    covariance: Array,
+    config: FilterConfig,
+    noise: NoiseModel,
+    frame: YawFrame,
+) -> SmoothedHistory:
+    scale = functools.partial(scaled_measurement, config=config)
+    measurements = jax.vmap(scale)(displacement, covariance)
+    stream, _, _ = bridge(*signals, state.imu, config)
+    numbers, by_interval = interval_inputs(stream, config)
+    inputs = _Inputs(numbers % config.clones, by_interval, measurements)
+    forward = functools.partial(_forward, config=config, noise=noise, frame=frame)
+    backward = functools.partial(_backward, config=config)
+    size = _ADJOINT_CORE + CLONE * config.clones
+    nothing = _Adjoint(
+        jnp.zeros(size, displacement.dtype), jnp.zeros((size,) * 2, displacement.dtype)
     )
-    stream, _, _ = bridge(gyro, accel, valid, state.imu, config)
-    inputs = (
-        jnp.arange(intervals) % clones,
-        jax.tree.map(lambda x: x.reshape(intervals, n, *x.shape[1:]), stream),
-        measurements,
-    )
-
-    def forward(state: FilterState, given: tuple) -> tuple[FilterState, Kept]:
-        return _forward(state, *given, config=config, noise=noise, frame=frame)
 
     def there_and_back(
-        state: FilterState, adjoint: Adjoint, inputs: tuple
-    ) -> tuple[Adjoint, tuple]:
-        _, kept = jax.lax.scan(forward, state, inputs)
-        return jax.lax.scan(
-            functools.partial(_backward, config=config), adjoint, (inputs[0], kept), reverse=True
-        )
+        state: FilterState, adjoint: _Adjoint, inputs: _Inputs
+    ) -> tuple[_Adjoint, _Smoothed]:
+        _, steps = jax.lax.scan(forward, state, inputs)
+        return jax.lax.scan(backward, adjoint, steps, reverse=True)
 
-    size = LOCAL + CLONE * clones
-    nothing = Adjoint(jnp.zeros(size, gyro.dtype), jnp.zeros((size, size), gyro.dtype))
     every = config.checkpoint_every
-    if every == 0 or every >= intervals:
-        return _history(there_and_back(state, nothing, inputs)[1], config)
+    if every == 0 or every >= len(numbers):
+        _, smoothed = there_and_back(state, nothing, inputs)
+    else:
+        smoothed = _smooth_in_blocks(there_and_back, forward, state, nothing, inputs, every)
+    return _smoothed_history(smoothed, config)
 
+
+def _smooth_in_blocks(
+    there_and_back: Callable[..., tuple[_Adjoint, _Smoothed]],
+    forward: Callable,
+    state: FilterState,
+    adjoint: _Adjoint,
+    inputs: _Inputs,
+    every: int,
+) -> _Smoothed:
+    """Keep the state before every block of `every` steps, and filter each block once more on the
+    way back."""
     there_and_back = jax.checkpoint(there_and_back, prevent_cse=False)
-    blocks = intervals // every
-    whole = jax.tree.map(lambda x: x[: blocks * every].reshape(blocks, every, *x.shape[1:]), inputs)
-    last, starts = jax.lax.scan(
-        lambda state, block: (jax.lax.scan(forward, state, block)[0], state), state, whole
-    )
-    adjoint, tail = nothing, []
-    if intervals % every:
-        adjoint, rows = there_and_back(
-            last, adjoint, jax.tree.map(lambda x: x[blocks * every :], inputs)
-        )
-        tail.append(rows)
-    _, rows = jax.lax.scan(
-        lambda adjoint, block: there_and_back(block[0], adjoint, block[1]),
-        adjoint,
-        (starts, whole),
-        reverse=True,
-    )
-    rows = jax.tree.map(lambda x: x.reshape(blocks * every, *x.shape[2:]), rows)
-    return _history(jax.tree.map(lambda *parts: jnp.concatenate(parts), rows, *tail), config)
+    blocks, rest = split_blocks(inputs, every)
+
+    def filter_block(state: FilterState, block: _Inputs) -> tuple[FilterState, FilterState]:
+        return jax.lax.scan(forward, state, block)[0], state
+
+    def smooth_block(adjoint: _Adjoint, start: tuple) -> tuple[_Adjoint, _Smoothed]:
+        state, block = start
+        return there_and_back(state, adjoint, block)
+
+    last, starts = jax.lax.scan(filter_block, state, blocks)
+    smoothed_rest = None
+    if rest is not None:
+        adjoint, smoothed_rest = there_and_back(last, adjoint, rest)
+    _, smoothed = jax.lax.scan(smooth_block, adjoint, (starts, blocks), reverse=True)
+    return join_blocks(smoothed, smoothed_rest)
 
 
 def _forward(
     state: FilterState,
-    slot: Int[Array, ""],
-    imu: Imu,
-    measurement: Measurement,
+    inputs: _Inputs,
     config: FilterConfig,
     noise: NoiseModel,
-    frame: Frame,
-) -> tuple[FilterState, Kept]:
-    given = lambda _state, _oldest: (measurement, {})  # noqa: E731
-    state, row, trace = traced_step(state, imu, given, slot, config, noise, frame)
-    parts = map(jnp.asarray, (state.core_covariance, state.cross_covariance))
-    core, clones = (part[: ANCHOR.start].at[OFFSET].add(part[ANCHOR]) for part in parts)
-    return state, Kept(
-        row.state, row.covariance, jnp.concatenate([_local(core), clones], axis=1), trace
+    frame: YawFrame,
+) -> tuple[FilterState, _ForwardStep]:
+    """One step of the filter, and what the way back needs of it."""
+
+    def measure(_state: FilterState, _oldest: Array | int) -> tuple[Measurement, dict]:
+        return inputs.measurement, {}
+
+    state, record, trace = traced_clone_step(
+        state, inputs.imu, measure, inputs.slot, config, noise, frame
     )
+    core, clones = (
+        part[LOCAL].at[OFFSET].add(part[ANCHOR])
+        for part in map(jnp.asarray, (state.core_covariance, state.cross_covariance))
+    )
+    cross = jnp.concatenate([_without_anchor(core), clones], axis=1)
+    return state, _ForwardStep(inputs.slot, record.mean, record.covariance, cross, trace)
 
 
-def _local(rows: Float[Array, "r 21"]) -> Float[Array, "r 18"]:
-    """Without the columns of the anchor."""
-    return jnp.concatenate([rows[:, : ANCHOR.start], rows[:, MOVE]], axis=1)
+def _without_anchor(rows: Float[Array, "r 21"]) -> Float[Array, "r 18"]:
+    """Columns of the core that the adjoint runs over."""
+    return jnp.concatenate([rows[:, LOCAL], rows[:, MOVE]], axis=1)
 
 
-def _backward(adjoint: Adjoint, given: tuple, config: FilterConfig) -> tuple[Adjoint, tuple]:
+def _backward(
+    adjoint: _Adjoint, step: _ForwardStep, config: FilterConfig
+) -> tuple[_Adjoint, _Smoothed]:
     """The smoothed estimate after a step, and the adjoint before it."""
-    slot, kept = given
-    over = kept.cross @ adjoint.matrix
-    error = -(kept.cross @ adjoint.vector)
+    over = step.cross @ adjoint.matrix
+    error = -(step.cross @ adjoint.vector)
     if config.history == "core":
-        covariance = kept.covariance - over @ kept.cross.T
+        covariance = step.covariance - over @ step.cross.T
     else:
-        covariance = kept.covariance - jnp.sum(over * kept.cross, axis=1)
-    rotation, velocity, position, gyro_bias, accel_bias = kept.mean
-    mean = (
-        matmul(geometry.exp(error[THETA]), rotation),
-        velocity + error[VELOCITY],
-        position + error[OFFSET],
-        gyro_bias + error[GYRO_BIAS],
-        accel_bias + error[ACCEL_BIAS],
+        covariance = step.covariance - jnp.sum(over * step.cross, axis=1)
+    smoothed = _Smoothed(_corrected(step.mean, error), covariance)
+    oldest = CLONE * ((step.slot + 1) % config.clones)
+    for correction in reversed(step.trace.corrections):
+        adjoint = _before_update(adjoint, correction, oldest)
+    return _before_propagation(adjoint, step.trace.transition, step.slot), smoothed
+
+
+def _corrected(mean: Mean, error: Float[Array, "15"]) -> Mean:
+    """With an error in θ, v, p, b_g, b_a added: p takes the place of o."""
+    return Mean(
+        rotation=matmul(geometry.exp(error[THETA]), mean.rotation),
+        velocity=mean.velocity + error[VELOCITY],
+        position=mean.position + error[OFFSET],
+        gyro_bias=mean.gyro_bias + error[GYRO_BIAS],
+        accel_bias=mean.accel_bias + error[ACCEL_BIAS],
     )
 
-    oldest = CLONE * ((slot + 1) % (config.clones_per_window + 1))
-    for correction in reversed(kept.trace.corrections):
-        adjoint = _before_update(adjoint, correction, oldest)
-    return _before_propagation(adjoint, kept.trace.transition, slot), (mean, covariance)
 
-
-def _before_update(adjoint: Adjoint, correction: Correction, oldest: Int[Array, ""]) -> Adjoint:
+def _before_update(adjoint: _Adjoint, correction: Correction, oldest: Int[Array, ""]) -> _Adjoint:
     """See the head of the file; `oldest` is where the oldest clone lies among the clones."""
-    rows = jnp.concatenate([_local(correction.core_rows), correction.clone_rows], axis=1)
+    core_rows, core_jacobian = map(
+        _without_anchor, (correction.core_rows, correction.core_jacobian)
+    )
+    rows = jnp.concatenate([core_rows, correction.clone_rows], axis=1)
     jacobian = jax.lax.dynamic_update_slice_in_dim(
-        jnp.concatenate(
-            [_local(correction.core_jacobian), jnp.zeros_like(correction.clone_rows)], axis=1
-        ),
+        jnp.concatenate([core_jacobian, jnp.zeros_like(correction.clone_rows)], axis=1),
         correction.oldest_jacobian,
-        LOCAL + oldest,
+        _ADJOINT_CORE + oldest,
         1,
     )
     over = rows @ adjoint.matrix
     # Λ − Mᵀ G − Gᵀ M with G = Y Λ − ½ (Y Λ Yᵀ + I) M
     half = 0.5 * (matmul(over, rows.T) + np.eye(3, dtype=over.dtype))
     gain = over - matmul(half, jacobian)
-    return Adjoint(
+    return _Adjoint(
         adjoint.vector - jacobian.T @ (rows @ adjoint.vector + correction.whitened),
         adjoint.matrix - matmul(jacobian.T, gain) - matmul(gain.T, jacobian),
     )
 
 
 def _before_propagation(
-    adjoint: Adjoint, transition: Float[Array, "9 15"], slot: Int[Array, ""]
-) -> Adjoint:
+    adjoint: _Adjoint, transition: Float[Array, "9 15"], slot: Int[Array, ""]
+) -> _Adjoint:
     """Back over cloning into `slot`, the motion and, in slot 0, the anchor's move before it."""
-    dtype = transition.dtype
-    anchored = (slot == 0).astype(dtype)
-    eye, biases = (
-        np.eye(3, dtype=dtype),
-        np.eye(LOCAL, dtype=dtype)[GYRO_BIAS.start : ACCEL_BIAS.stop],
-    )
-    of_move = jnp.concatenate(
-        [
-            jnp.zeros((3, OFFSET.start), dtype),
-            anchored * eye,
-            jnp.zeros((3, 6), dtype),
-            (1 - anchored) * eye,
-        ],
-        axis=1,
-    )
-    core = jnp.concatenate([jnp.pad(transition, ((0, 0), (0, 3))), biases, of_move])
+    core = _core_transition(transition, slot)
     pose = jnp.concatenate([core[THETA], core[OFFSET]])  # what the clone is made of
 
     def back(rows: Float[Array, "m r"]) -> Float[Array, "m r"]:
-        clone = jax.lax.dynamic_slice_in_dim(rows, LOCAL + CLONE * slot, CLONE)
-        moved = jnp.concatenate([core, pose]).T @ jnp.concatenate([rows[:LOCAL], clone])
-        rest = jax.lax.dynamic_update_slice_in_dim(
-            rows[LOCAL:], jnp.zeros_like(clone), CLONE * slot, 0
-        )
-        return jnp.concatenate([moved, rest])
+        of_core, of_clones = rows[:_ADJOINT_CORE], rows[_ADJOINT_CORE:]
+        clone = jax.lax.dynamic_slice_in_dim(of_clones, CLONE * slot, CLONE)
+        moved = jnp.concatenate([core, pose]).T @ jnp.concatenate([of_core, clone])
+        forgotten = jnp.zeros_like(clone)
+        of_clones = jax.lax.dynamic_update_slice_in_dim(of_clones, forgotten, CLONE * slot, 0)
+        return jnp.concatenate([moved, of_clones])
 
-    return Adjoint(back(adjoint.vector[:, None])[:, 0], back(back(adjoint.matrix).T))
+    return _Adjoint(back(adjoint.vector[:, None])[:, 0], back(back(adjoint.matrix).T))
 
 
-def _history(rows: tuple, config: FilterConfig) -> SmoothedHistory:
-    mean, covariance = rows
-    whole = config.history == "core"
+def _core_transition(
+    transition: Float[Array, "9 15"], slot: Int[Array, ""]
+) -> Float[Array, "18 18"]:
+    """F of θ, v, o, b_g, b_a, s: in slot 0 the offset has become the anchor's last move."""
+    dtype = transition.dtype
+    anchored = (slot == 0).astype(dtype)
+    eye = np.eye(3, dtype=dtype)
+    of_motion = jnp.pad(transition, ((0, 0), (0, 3)))
+    of_biases = np.eye(_ADJOINT_CORE, dtype=dtype)[BIASES]
+    before_offset, between = jnp.zeros((3, OFFSET.start), dtype), jnp.zeros((3, 6), dtype)
+    of_move = jnp.concatenate(
+        [before_offset, anchored * eye, between, (1 - anchored) * eye], axis=1
+    )
+    return jnp.concatenate([of_motion, of_biases, of_move])
+
+
+def _smoothed_history(smoothed: _Smoothed, config: FilterConfig) -> SmoothedHistory:
+    covariance, whole = smoothed.covariance, config.history == "core"
     diagonal = jnp.diagonal(covariance, axis1=1, axis2=2) if whole else covariance
     return SmoothedHistory(
-        *mean, covariance_diagonal=diagonal, covariance=covariance if whole else None
+        *smoothed.mean, covariance_diagonal=diagonal, covariance=covariance if whole else None
     )

@@ -8,7 +8,8 @@ import pytest
 
 from gnio_jax.data.cache import cached, folder, is_cached, is_refused
 from gnio_jax.data.dataset import Refusal
-from gnio_jax.types import InputError, Sequence
+from gnio_jax.errors import InputError
+from gnio_jax.types import Sequence
 
 
 class Builder:

@@ -14,7 +14,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from gnio_jax.types import InputError
+from gnio_jax.errors import InputError
 from tests.support.damage import Damage, damages
 from tests.support.damage_values import YAMLS
 from tests.support.damaged_recordings import (

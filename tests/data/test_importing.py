@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from gnio_jax import data
 from gnio_jax.data.hdf5 import write_hdf5
 from gnio_jax.data.importing import import_recording
-from gnio_jax.types import InputError
+from gnio_jax.errors import InputError
 from tests.support import known_walk
 from tests.support.csv_writers import AXES, SECONDS, compare_imu, imu, write
 

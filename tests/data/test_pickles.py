@@ -13,7 +13,7 @@ import h5py
 import numpy as np
 import pytest
 
-from gnio_jax.types import InputError
+from gnio_jax.errors import InputError
 from tests.support.damage import Damage
 from tests.support.damaged_recordings import check, remove_copies, written
 

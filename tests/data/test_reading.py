@@ -14,7 +14,7 @@ from gnio_jax import data
 from gnio_jax.data.dataset import Recording, Refusal, single
 from gnio_jax.data.processes import map_in_processes
 from gnio_jax.data.reading import check_recording, find_recordings, read_recording, read_split
-from gnio_jax.types import InputError
+from gnio_jax.errors import InputError
 from tests.support.circle import circle
 
 

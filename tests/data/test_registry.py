@@ -6,7 +6,7 @@ import pytest
 
 from gnio_jax import data
 from gnio_jax.data import registry
-from gnio_jax.types import InputError
+from gnio_jax.errors import InputError
 
 
 def test_every_dataset_says_what_a_user_must_know():

@@ -11,10 +11,11 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from gnio_jax import filtering, geometry
+from gnio_jax.filtering.displacement import displacement_residual
 from gnio_jax.filtering.gaps import Imu
-from gnio_jax.filtering.measurement import displacement_residual, retract
-from gnio_jax.filtering.propagation import interval
+from gnio_jax.filtering.propagation import integrate_interval
 from gnio_jax.filtering.state import CLONE, MOVE, OFFSET, THETA, VELOCITY, covariance
+from gnio_jax.filtering.update import retract
 from gnio_jax.types import Prediction
 from gnio_jax.windows import cut_window
 from tests.support.compiling import quick
@@ -211,7 +212,7 @@ def test_transition_is_the_derivative_of_the_retraction():
             gyro_bias=state.gyro_bias + error[9:12],
             accel_bias=state.accel_bias + error[12:15],
         )
-        motion = interval(moved, imu, filtering.NoiseModel(), config.dt)
+        motion = integrate_interval(moved, imu, filtering.NoiseModel(), config.dt)
         return jnp.concatenate(
             [
                 geometry.log(motion.rotation @ reference.rotation.T),
@@ -222,7 +223,7 @@ def test_transition_is_the_derivative_of_the_retraction():
             ]
         )
 
-    reference = quick(lambda: interval(state, imu, filtering.NoiseModel(), config.dt))()
+    reference = quick(lambda: integrate_interval(state, imu, filtering.NoiseModel(), config.dt))()
     np.testing.assert_allclose(
         reference.transition, quick(jax.jacfwd(end))(jnp.zeros(15)), atol=1e-6
     )

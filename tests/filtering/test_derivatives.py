@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from gnio_jax import filtering
-from gnio_jax.filtering.scan import checkpointed_scan
+from gnio_jax.filtering.checkpointing import checkpointed_scan
 from gnio_jax.types import Prediction
 from tests.support.compiling import quick
 from tests.support.odometry import (

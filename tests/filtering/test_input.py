@@ -12,7 +12,7 @@ from scipy.stats import multivariate_normal
 
 from gnio_jax import filtering, geometry
 from gnio_jax.filtering.gaps import Gap, Imu, bridge
-from gnio_jax.filtering.measurement import rest, zero_velocity
+from gnio_jax.filtering.zero_velocity import detect_rest, update_at_rest
 from gnio_jax.types import Prediction
 from tests.support import scekf_numpy
 from tests.support.random_walk import random_walk
@@ -250,7 +250,7 @@ def test_rest_counts_only_after_its_time(seconds, intervals):
     held = still._replace(gap=Gap(jnp.zeros(N).at[-1].set(1e-6), jnp.zeros(N), jnp.ones(N)))
     state, found, expected, count = start(config), [], [], 0
     for imu in [*5 * [still], turning, *5 * [still], shaken, *5 * [still], held, *5 * [still]]:
-        state, quiet = rest(state, imu, config)
+        state, quiet = detect_rest(state, imu, config)
         count = count + 1 if imu is still else 0
         found.append(bool(quiet))
         expected.append(count >= intervals)
@@ -270,7 +270,7 @@ def resting(
     state = state._replace(gate=gate, step=jnp.int32(now // N))
     if state.first is not None:
         state = state._replace(first=jax.tree.map(lambda part: part + 0.25, state.first))
-    new, found, _ = zero_velocity(state, jnp.bool_(True), jnp.bool_(tried), 0, config)
+    new, found, _ = update_at_rest(state, jnp.bool_(True), jnp.bool_(tried), 0, config)
     return state, new, found
 
 

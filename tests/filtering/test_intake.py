@@ -15,9 +15,10 @@ from scipy.signal import firwin
 from gnio_jax import filtering, geometry
 from gnio_jax.data.readers import synthetic
 from gnio_jax.data.resampling import resample
+from gnio_jax.errors import InputError
 from gnio_jax.filtering import Tracker, intake
 from gnio_jax.filtering import tracker as online
-from gnio_jax.types import InputError, Prediction
+from gnio_jax.types import Prediction
 
 DT = 0.005
 CONFIG = filtering.FilterConfig(DT, samples_per_clone=20, clones_per_window=10)
@@ -31,9 +32,9 @@ def through(stamps, values, imu_rate, dt=DT, hole=None):
     design = intake.design(dt, hole, float(imu_rate))
     stream, clock, rows, known = None, None, [], []
     for time, row in zip(stamps.tolist(), values.tolist(), strict=True):
-        stream, events = intake.take(stream, time, tuple(row), design)
+        stream, events = intake.low_pass_sample(stream, time, tuple(row), design)
         for event in events:
-            clock, new = online.resample(clock, *event, dt, hole)
+            clock, new = resample(clock, *event, dt, hole)
             rows += new
             known += [time] * len(new)
     return np.array(rows).reshape(-1, 7), np.array(known)
@@ -163,7 +164,7 @@ def test_an_imu_that_is_no_faster_is_left_alone(rate):
     stamps, design, stream = stamps_of(rate, 1.0), intake.design(DT, 2 / rate, float(rate)), None
     assert design.delay == 0
     for k, time in enumerate(stamps.tolist()):
-        stream, events = intake.take(stream, time, (float(k),) * 6, design)
+        stream, events = intake.low_pass_sample(stream, time, (float(k),) * 6, design)
         assert events == [(time, (float(k),) * 6)]
 
 
@@ -269,14 +270,9 @@ def compiled():
 
 @pytest.fixture
 def built(monkeypatch):
-    """Trackers take their programs and settings from `compiled`, which is never fed."""
-    ready = compiled()
-
-    def build(self, predict, config, noise, hole, imu_rate, dtype):
-        designed = intake.design(DT, 1.5 * DT, imu_rate or 1 / DT)
-        vars(self).update(vars(ready), _design=designed)
-
-    monkeypatch.setattr(Tracker, "_build", build)
+    """Trackers take their programs from `compiled`."""
+    ready = compiled()._programs
+    monkeypatch.setattr(online, "compile_programs", lambda *_: ready)
 
 
 @pytest.mark.parametrize("rate", [400, 416])

@@ -10,10 +10,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from gnio_jax import filtering
+from gnio_jax.filtering.displacement import (
+    Measurement,
+    displacement_residual,
+    scaled_measurement,
+    update,
+)
 from gnio_jax.filtering.gaps import Imu
-from gnio_jax.filtering.measurement import Measurement, displacement_residual, update
-from gnio_jax.filtering.propagation import interval
-from gnio_jax.filtering.scan import _measurement
+from gnio_jax.filtering.propagation import integrate_interval
 from gnio_jax.filtering.state import covariance
 from tests.support import scekf_numpy
 from tests.support.compiling import quick
@@ -74,7 +78,7 @@ def test_interval_against_differences_of_the_mean():
     gyro, accel = 8 * rng.standard_normal((n, 3)), 10 * rng.standard_normal((n, 3))
     noise = filtering.NoiseModel(0.03, 0.2, 0.04, 0.5)
     state = filtering.initial_state(CONFIG, *POSE)
-    motion = jax.jit(interval, static_argnames="dt")(
+    motion = jax.jit(integrate_interval, static_argnames="dt")(
         state, Imu(jnp.asarray(gyro), jnp.asarray(accel), None), noise, dt=dt
     )
 
@@ -159,7 +163,7 @@ def at_singularity(kind):
 @functools.partial(quick, static_argnums=3)
 @functools.partial(jax.grad, argnums=(0, 1, 2), allow_int=True, has_aux=True)
 def update_gradient(state, displacement, covariance, frame="given"):
-    measurement = _measurement(displacement, covariance, CONFIG)
+    measurement = scaled_measurement(displacement, covariance, CONFIG)
     new, outcome = update(state, measurement, 2, 0, CONFIG, frame)
     leaves = [
         leaf for leaf in jax.tree.leaves((new, outcome)) if jnp.issubdtype(leaf.dtype, jnp.floating)
@@ -215,7 +219,7 @@ def test_noise_densities():
     state = filtering.initial_state(CONFIG, *POSE)
     gyro, accel = jnp.zeros((6, 3)), jnp.zeros((6, 3))
     sigmas = filtering.NoiseModel.per_sample(0.1, 0.2, 0.5)
-    once = jax.jit(interval, static_argnames="dt")(
+    once = jax.jit(integrate_interval, static_argnames="dt")(
         state, Imu(gyro[:1], accel[:1], None), sigmas, dt=0.5
     ).noise
     np.testing.assert_allclose(np.diag(once)[3:6], 0.2**2 * 0.5**2, rtol=1e-6)

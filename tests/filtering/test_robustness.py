@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 
 from gnio_jax import filtering
 from gnio_jax.filtering import Tracker
-from gnio_jax.filtering import measurement as update
+from gnio_jax.filtering import displacement as measured
+from gnio_jax.filtering import tracker as online
 from gnio_jax.filtering.state import OFFSET
 from gnio_jax.types import Prediction
 from tests.support.compiling import quick
@@ -137,10 +138,9 @@ def test_online_too_and_across_a_file(tmp_path, monkeypatch):
     gyro, accel = leap()
     _, history, _ = run(gyro, accel)
     tracker = Tracker(predict, start(), CONFIG, NOISE)
-    compiled, found, half = dict(vars(tracker)), [], 130
-    monkeypatch.setattr(
-        Tracker, "_build", lambda self, *_: vars(self).update(compiled)
-    )  # compiled once, for the one from the file too
+    found, half = [], 130
+    # Compiled once, for the one from the file too.
+    monkeypatch.setattr(online, "compile_programs", lambda *_: tracker._programs)
     for k in range(half):
         found.append(tracker.push(k * DT, gyro[k], accel[k]))
     assert tracker.pose().healthy is False and not tracker.filter_state().healthy
@@ -324,13 +324,13 @@ def test_a_displacement_takes_first_estimates_anew_where_it_corrects_much(
     gate = filtering.GateState(jnp.bool_(converged), jnp.int32(95), jnp.int32(0))
     state = state._replace(step=jnp.int32(20), gate=gate)
     state = state._replace(first=jax.tree.map(lambda part: part + 0.25, state.first))
-    measurement = update.Measurement(
+    measurement = measured.Measurement(
         jnp.array([3.0, -4.0, 0.0]), 0.01 * jnp.eye(3), jnp.bool_(True)
     )
-    new, outcome, made = update.correct(state, measurement, 0, 1, config, "given")
+    new, outcome, made = measured.update_with_correction(state, measurement, 0, 1, config, "given")
     assert float(outcome.nis) > 50 and bool(outcome.accepted) == accepted
     moved = float(jnp.linalg.norm((made.whitened @ made.core_rows)[OFFSET]))
-    assert bool(outcome.tried) and (moved > 1.0 if anew else moved < 0.01)
+    assert bool(outcome.tested) and (moved > 1.0 if anew else moved < 0.01)
     wanted = state.first
     if anew:
         wanted = wanted._replace(

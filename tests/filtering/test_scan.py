@@ -211,21 +211,21 @@ def test_gimbal_lock_is_no_update():
 def test_gate_boundaries_count_samples():
     """Strict comparisons at exact multiples of dt = 0.1 s, where a running sum of dt errs:
     convergence, age of success, end of pause."""
-    from gnio_jax.filtering.measurement import gate
+    from gnio_jax.filtering.gate import innovation_gate
 
     config = filtering.FilterConfig(
         0.1, 1, 1, convergence_seconds=0.3, success_seconds=0.7, pause_seconds=1.2
     )
 
-    def step(memory, now, nis=20.0, oldest=100, tried=True):
+    def step(memory, now, nis=20.0, oldest=100, tested=True):
         memory = filtering.GateState(*[jnp.asarray(value) for value in memory])
-        memory, passed = gate(
+        memory, passed = innovation_gate(
             memory,
             config,
             jnp.asarray(now),
             jnp.asarray(oldest),
             jnp.asarray(nis),
-            jnp.asarray(tried),
+            jnp.asarray(tested),
         )
         return tuple(int(value) for value in memory), passed == 1
 
@@ -240,8 +240,8 @@ def test_gate_boundaries_count_samples():
     assert step((True, 29, 30), 30) == ((1, 29, 30), False)  # exactly at its end
     assert step((True, 29, 30), 30, nis=11.3) == ((1, 30, 30), True)
     # no measurement: the last success moves along, if there was one
-    assert step((True, 10, 0), 40, tried=False) == ((1, 11, 0), False)
-    assert step((True, -1, 0), 40, tried=False) == ((1, -1, 0), False)
+    assert step((True, 10, 0), 40, tested=False) == ((1, 11, 0), False)
+    assert step((True, -1, 0), 40, tested=False) == ((1, -1, 0), False)
     assert step((True, -1, 0), 40) == ((1, -1, 0), False)
 
 

@@ -17,11 +17,13 @@ from scipy.spatial.transform import Rotation
 from gnio_jax import config as configuration
 from gnio_jax import filtering
 from gnio_jax.commands import console
+from gnio_jax.errors import InputError
 from gnio_jax.filtering import Tracker
 from gnio_jax.filtering import tracker as online
+from gnio_jax.filtering.clock import resample
 from gnio_jax.training import checkpoint
 from gnio_jax.training.step import TrainState
-from gnio_jax.types import InputError, Prediction
+from gnio_jax.types import Prediction
 from tests.support import scekf_numpy
 
 N, CLONES, INTERVALS, DT = 4, 4, 70, 0.02
@@ -100,22 +102,8 @@ def scan(state, gyro, accel, valid, config=CONFIG):
 @pytest.fixture
 def built(monkeypatch):
     """Trackers take their programs from `compiled`."""
-    ready = compiled()
-    monkeypatch.setattr(
-        Tracker,
-        "_build",
-        lambda self, *_: vars(self).update(
-            vars(ready),
-            _core=None,
-            _latest=None,
-            _clock=None,
-            _intake=None,
-            _ahead=None,
-            _filled=0,
-            _rest=0,
-            _std=filtering.InitialStd(),
-        ),
-    )
+    ready = compiled()._programs
+    monkeypatch.setattr(online, "compile_programs", lambda *_: ready)
 
 
 @pytest.fixture
@@ -223,7 +211,7 @@ def test_clock_against_a_slow_resampler(kind):
             values[:30, 2] = np.nan
     clock, rows, known = None, [], []
     for time, row in zip(stamps.tolist(), values.tolist(), strict=True):
-        clock, new = online.resample(clock, time, tuple(row), 0.01, hole)
+        clock, new = resample(clock, time, tuple(row), 0.01, hole)
         rows += new
         known.append(len(rows))
     wanted = oracle(stamps, values, 0.01, hole)

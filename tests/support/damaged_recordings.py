@@ -22,7 +22,8 @@ import numpy as np
 import pytest
 
 from gnio_jax import data
-from gnio_jax.types import InputError, Sequence
+from gnio_jax.errors import InputError
+from gnio_jax.types import Sequence
 from tests.support.damage import Damage, after
 from tests.support.damage_values import PLACES
 from tests.support.layouts import LAYOUTS

@@ -27,7 +27,8 @@ from gnio_jax.data.readers.csv_files import ACCEL, GYRO
 from gnio_jax.data.readers.stamps import PER_SECOND, RATES, rounded_rate
 from gnio_jax.data.resampling import resample
 from gnio_jax.data.validation import validate
-from gnio_jax.types import InputError, Sequence
+from gnio_jax.errors import InputError
+from gnio_jax.types import Sequence
 
 _COLUMNS = ("time", "accel_time", *GYRO, *ACCEL)
 

@@ -13,8 +13,8 @@ from scipy.interpolate import CubicSpline
 from gnio_jax.data.readers.stamps import PER_SECOND, RATES, in_order, time_unit
 from gnio_jax.data.readers.text import numbers, read_csv
 from gnio_jax.data.validation import check_finite, check_gaps, check_increasing
+from gnio_jax.errors import InputError
 from gnio_jax.numerics import interpolate, neighbours
-from gnio_jax.types import InputError
 
 LONGEST_SPLINE = 0.1
 """s between samples, beyond which a spline swings: a line is drawn."""

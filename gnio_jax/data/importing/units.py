@@ -10,8 +10,9 @@ from jaxtyping import Float
 from scipy.ndimage import gaussian_filter1d
 
 from gnio_jax.data.importing.streams import Joined
+from gnio_jax.errors import InputError
 from gnio_jax.numerics import interpolate
-from gnio_jax.types import GRAVITY, STANDARD_G, InputError
+from gnio_jax.types import GRAVITY, STANDARD_G
 
 TO_RAD_PER_SECOND = {"rad/s": 1.0, "deg/s": np.pi / 180.0}
 TO_METRES_PER_SECOND_SQUARED = {"m/s2": 1.0, "g": STANDARD_G, "mg": STANDARD_G * 1e-3}

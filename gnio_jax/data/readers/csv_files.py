@@ -32,8 +32,9 @@ from gnio_jax.data.validation import (
     check_motion,
     validate,
 )
+from gnio_jax.errors import InputError
 from gnio_jax.numerics import finite_rows, spans
-from gnio_jax.types import InputError, Sequence
+from gnio_jax.types import Sequence
 
 SPLITS = ("train", "val", "test")
 GYRO = ("gyro_x", "gyro_y", "gyro_z")

@@ -7,7 +7,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from jaxtyping import Float, Real
 
-from gnio_jax.types import InputError
+from gnio_jax.errors import InputError
 
 RATES = (10.0, 2000.0)
 """Hz; between these lies every IMU one walks with."""

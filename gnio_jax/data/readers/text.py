@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from gnio_jax.types import InputError
+from gnio_jax.errors import InputError
 
 
 def shortened(text: object, most: int = 80) -> str:

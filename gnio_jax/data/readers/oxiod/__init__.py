@@ -39,7 +39,8 @@ from gnio_jax.data.readers.oxiod.tango import build_with_tango
 from gnio_jax.data.readers.oxiod.trackers import read_vicon
 from gnio_jax.data.readers.oxiod.vicon import build_with_vicon
 from gnio_jax.data.readers.oxiod.walks import LARGE_SCALE, LAYOUT, RATE, Walk, find_walks
-from gnio_jax.types import InputError, Sequence
+from gnio_jax.errors import InputError
+from gnio_jax.types import Sequence
 
 VERSION = "oxiod 8"
 """Changes whenever other sequences would come of the same files: it is part of the cache's key."""

@@ -17,7 +17,8 @@ from gnio_jax.data.dataset import Refusal
 from gnio_jax.data.readers.oxiod.walks import RATE
 from gnio_jax.data.readers.text import shortened
 from gnio_jax.data.validation import check_units
-from gnio_jax.types import STANDARD_G, InputError
+from gnio_jax.errors import InputError
+from gnio_jax.types import STANDARD_G
 
 SHORTEST = 10.0
 """s; nothing shorter is of use."""

@@ -18,7 +18,7 @@ from gnio_jax.data.readers.oxiod.walks import (
     scene_folders,
 )
 from gnio_jax.data.readers.text import shortened
-from gnio_jax.types import InputError
+from gnio_jax.errors import InputError
 
 SPLITS = (
     "train",

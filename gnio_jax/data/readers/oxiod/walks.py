@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-from gnio_jax.types import InputError
+from gnio_jax.errors import InputError
 
 RATE = 100.0
 """Hz."""

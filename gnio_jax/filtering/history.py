@@ -1,0 +1,131 @@
+"""What a run leaves behind: the filter after each clone interval."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Bool, Float
+
+from gnio_jax.filtering.config import FilterConfig
+from gnio_jax.filtering.displacement import DisplacementUpdate, Measurement
+from gnio_jax.filtering.state import Mean
+from gnio_jax.filtering.zero_velocity import RestUpdate
+from gnio_jax.types import Array
+
+
+class FilterHistory(NamedTuple):
+    """The filter after each of K clone intervals.
+
+    Row k is at t_0 + (k + 1)·n·dt, after its update.
+    """
+
+    rotation: Float[Array, "k 3 3"]
+    """Body → world."""
+    velocity: Float[Array, "k 3"]
+    """World frame, m/s."""
+    position: Float[Array, "k 3"]
+    """World frame, m."""
+    gyro_bias: Float[Array, "k 3"]
+    """rad/s"""
+    accel_bias: Float[Array, "k 3"]
+    """m/s²"""
+    displacement: Float[Array, "k 3"]
+    """The measurement, m, in the yaw frame of the oldest clone; NaN where none."""
+    measurement_std: Float[Array, "k 3"]
+    """Its standard deviations after `FilterConfig.measurement_scale`, m; NaN where none."""
+    innovation: Float[Array, "k 3"]
+    """Measured − predicted displacement, m; NaN where no measurement."""
+    covariance_diagonal: Float[Array, "k 15"]
+    """Variances of θ, v, p, b_g, b_a."""
+    covariance: Float[Array, "k 15 15"] | None
+    """The whole core block where `FilterConfig.history` is "core", else None."""
+    accepted: Float[Array, "k"]
+    """1 an update was applied (also one with scaled covariance), 0 none was (gate or gimbal lock),
+    NaN no measurement."""
+    gate_passed: Float[Array, "k"]
+    """1 the χ² gate let the measurement through as it is, 0 it did not, between them its weight
+    (`gate_softness`), NaN no measurement."""
+    nis: Float[Array, "k"]
+    """Normalised innovation squared, rᵀ S⁻¹ r; NaN where no measurement."""
+    log_likelihood: Float[Array, "k"]
+    """ln N(r; 0, S) of the innovation, r in m; NaN where no measurement. Their sum is the evidence
+    for the noise model."""
+    at_rest: Float[Array, "k"]
+    """1 the velocity was measured as zero (`zero_velocity_std`), else 0, also where the χ² gate
+    refused that."""
+    rest_nis: Float[Array, "k"]
+    """Normalised innovation squared of the velocity at rest; NaN where the IMU was not quiet."""
+    imu_gap: Float[Array, "k"]
+    """Age of the oldest held IMU sample of the interval, s; 0 where none was missing. Above
+    `bridge_seconds` the filter coasted."""
+    healthy: Float[Array, "k"]
+    """0 from the first row on where the state is not finite, a variance is negative or the speed
+    above `FilterConfig.speed_limit`: bad input that could not be seen before, and all after it is
+    void. The final state remembers it, and a later run from that begins with 0."""
+    diagnostics: dict[str, Array]
+    """The network's diagnostics stacked over K, NaN where it had no window; empty without a
+    network."""
+
+
+class StepRecord(NamedTuple):
+    """What one clone step adds to the history, or K steps stacked."""
+
+    mean: Mean
+    covariance: Array
+    """Of θ, v, p, b_g, b_a, or its diagonal: see `FilterConfig.history`."""
+    measurement: Measurement
+    update: DisplacementUpdate
+    rest: RestUpdate
+    diagnostics: dict[str, Array]
+
+
+def stacked_history(
+    records: StepRecord,
+    imu_gap: Float[Array, "k"],
+    healthy: Bool[Array, ""],
+    config: FilterConfig,
+) -> FilterHistory:
+    """The history of K stacked records from a state that was `healthy` or not."""
+    update, covariance = records.update, records.covariance
+    dtype, whole = covariance.dtype, config.history == "core"
+
+    def where_present(value: Array) -> Array:
+        present = update.present.reshape(-1, *[1] * (value.ndim - 1))
+        return jnp.where(present, value, jnp.nan).astype(dtype)
+
+    # S is the identity where there is no measurement, so that the logarithm has a derivative there.
+    log_likelihood = -0.5 * (update.nis + 3 * math.log(2 * math.pi)) - jnp.log(update.volume)
+    std = jnp.sqrt(jnp.diagonal(records.measurement.covariance, axis1=1, axis2=2))
+    diagonal = jnp.diagonal(covariance, axis1=1, axis2=2) if whole else covariance
+    sound = _sound(records, diagonal, config)
+    healthy = healthy & (jax.lax.cummin(sound.astype(jnp.int32)) > 0)
+    return FilterHistory(
+        *records.mean,
+        displacement=where_present(records.measurement.displacement),
+        measurement_std=where_present(std),
+        innovation=where_present(update.innovation),
+        covariance_diagonal=diagonal,
+        covariance=covariance if whole else None,
+        accepted=where_present(update.accepted),
+        gate_passed=where_present(update.gate_passed),
+        nis=where_present(update.nis),
+        log_likelihood=where_present(log_likelihood),
+        at_rest=records.rest.accepted.astype(dtype),
+        rest_nis=jnp.where(records.rest.quiet, records.rest.nis, jnp.nan).astype(dtype),
+        imu_gap=imu_gap.astype(dtype),
+        healthy=healthy.astype(dtype),
+        diagnostics=records.diagnostics,
+    )
+
+
+def _sound(
+    records: StepRecord, variances: Float[Array, "k 15"], config: FilterConfig
+) -> Bool[Array, "k"]:
+    """Where everything is finite, no variance negative and the speed possible."""
+    parts = (*records.mean, records.covariance)
+    finite = [jnp.all(jnp.isfinite(part.reshape(len(part), -1)), axis=1) for part in parts]
+    possible = jnp.sum(records.mean.velocity**2, axis=1) <= config.speed_limit**2
+    return jnp.all(jnp.stack(finite), axis=0) & jnp.all(variances >= 0, axis=1) & possible

@@ -1,0 +1,153 @@
+"""Where the filter starts: from a known pose, or level from the first samples at rest."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from gnio_jax import geometry
+from gnio_jax.filtering.checks import (
+    check_finite,
+    check_not_negative,
+    check_rotation,
+    checked_array,
+)
+from gnio_jax.filtering.config import FilterConfig
+from gnio_jax.filtering.noise import TLIO_STD, InitialStd
+from gnio_jax.filtering.state import (
+    ACCEL_BIAS,
+    ANCHOR,
+    CLONE,
+    CORE,
+    GYRO_BIAS,
+    THETA,
+    VELOCITY,
+    FilterState,
+    FirstEstimates,
+    GateState,
+    ImuMemory,
+)
+from gnio_jax.types import GRAVITY
+
+_NEVER = -1
+_STILL_STD, _MOVING_STD = 0.05, 1.0
+"""Standard deviation of the velocity at a level start, m/s, where the samples are quiet and not."""
+
+
+# The arguments of the public functions carry no shapes for the run-time checker: a wrong one is the
+# user's mistake and a ValueError.
+def initial_state(
+    config: FilterConfig,
+    rotation: Any,
+    velocity: Any,
+    position: Any,
+    gyro_bias: Any = 0,
+    accel_bias: Any = 0,
+    std: InitialStd = TLIO_STD,
+) -> FilterState:
+    """Start of the filter from a known pose, without clones.
+
+    rotation (3, 3) body → world; velocity (3,) m/s and position (3,) m in the world frame;
+    gyro_bias rad/s and accel_bias m/s², each (3,) or one number for all axes; std the standard
+    deviations of their errors, independent of each other. Raises `ValueError` naming an argument of
+    wrong shape or precision.
+    """
+    rotation = checked_array("rotation", rotation, (3, 3), config)
+    dtype = rotation.dtype
+    velocity, position, gyro_bias, accel_bias = (
+        _checked_vector(name, value, dtype, config)
+        for name, value in [
+            ("velocity", velocity),
+            ("position", position),
+            ("gyro_bias", _on_all_axes(gyro_bias, dtype)),
+            ("accel_bias", _on_all_axes(accel_bias, dtype)),
+        ]
+    )
+    check_rotation("rotation", rotation)
+    for name, value in std._asdict().items():
+        check_not_negative(f"std.{name}", value)
+    clones, nothing = config.clones, jnp.zeros(3, dtype)
+    first = FirstEstimates(velocity, nothing, nothing, jnp.zeros((clones, 3), dtype))
+    return FilterState(
+        rotation=rotation,
+        velocity=velocity,
+        offset=nothing,
+        gyro_bias=gyro_bias,
+        accel_bias=accel_bias,
+        anchor=position,
+        move=nothing,
+        clone_rotation=jnp.tile(jnp.eye(3, dtype=dtype)[None], (clones, 1, 1)),
+        clone_offset=jnp.zeros((clones, 3), dtype),
+        core_covariance=jnp.diag(_core_std(std, dtype) ** 2),
+        cross_covariance=jnp.zeros((CORE, CLONE * clones), dtype),
+        clone_covariance=jnp.zeros((CLONE * clones, CLONE * clones), dtype),
+        step=jnp.int32(0),
+        gate=GateState(jnp.bool_(False), last_success=jnp.int32(_NEVER), pause_end=jnp.int32(0)),
+        imu=_no_imu(dtype),
+        healthy=jnp.bool_(True),
+        first=first if config.jacobians == "first" else None,
+    )
+
+
+def _on_all_axes(value: Any, dtype: Any) -> Any:
+    return jnp.full(3, value, dtype) if jnp.ndim(value) == 0 else value
+
+
+def _checked_vector(name: str, value: Any, dtype: Any, config: FilterConfig) -> jax.Array:
+    vector = checked_array(name, value, (3,), config).astype(dtype)
+    check_finite(name, vector)
+    return vector
+
+
+def _core_std(std: InitialStd, dtype: Any) -> jax.Array:
+    """(21,) standard deviations of the core's error: the whole uncertainty of the position is in
+    the anchor, and there is no offset and no move yet."""
+    tilt, yaw, velocity, position, gyro_bias, accel_bias = range(len(std))
+    index = np.full(CORE, len(std))  # the zero behind them
+    index[THETA] = tilt, tilt, yaw
+    index[VELOCITY], index[ANCHOR] = velocity, position
+    index[GYRO_BIAS], index[ACCEL_BIAS] = gyro_bias, accel_bias
+    values = jnp.stack([jnp.asarray(value, dtype) for value in std])
+    return jnp.append(values, 0.0)[index]
+
+
+def _no_imu(dtype: Any) -> ImuMemory:
+    unknown = jnp.full(3, jnp.nan, dtype)
+    return ImuMemory(unknown, unknown, missing=jnp.int32(0), quiet=jnp.int32(0))
+
+
+def level_state(
+    config: FilterConfig, gyro: Any, accel: Any, std: InitialStd = TLIO_STD
+) -> FilterState:
+    """Start without a reference: tilt from gravity, yaw, velocity and position zero (ours).
+
+    gyro rad/s and accel m/s² (m, 3), raw, are the first samples, of a second or so, in which the
+    device should be still. Of `std`, tilt and velocity are replaced: the tilt's is what the
+    accelerometer's bias and its spread leave of the mean, over half a second to an independent
+    sample; the velocity's is 0.05 m/s if the samples are quiet by `rest_gyro` and `rest_accel`,
+    else 1 m/s. The yaw is zero by definition, so its own is kept. Raises `ValueError` naming an
+    argument of wrong shape or precision or that is not finite.
+    """
+    samples = jnp.shape(accel)[0] if jnp.ndim(accel) else 0
+    gyro = checked_array("gyro", gyro, (samples, 3), config)
+    accel = checked_array("accel", accel, (samples, 3), config)
+    if samples < 2:
+        raise ValueError(f"accel: at least two samples are needed, found {samples}")
+    check_finite("gyro", gyro)
+    check_finite("accel", accel)
+    gyro_spread, accel_spread = _spread(gyro), _spread(accel)
+    independent = max(1.0, 2 * samples * config.dt)
+    mean_error = jnp.sqrt(jnp.asarray(std.accel_bias) ** 2 + accel_spread**2 / independent)
+    quiet = (gyro_spread < config.rest_gyro) & (accel_spread < config.rest_accel)
+    velocity = jnp.where(quiet, _STILL_STD, _MOVING_STD)
+    std = std._replace(tilt=mean_error / GRAVITY, velocity=velocity)
+    nothing = jnp.zeros(3, accel.dtype)
+    return initial_state(config, geometry.level(accel.mean(0)), nothing, nothing, std=std)
+
+
+def _spread(samples: jax.Array) -> jax.Array:
+    """Standard deviation of the samples about their mean, over all axes."""
+    return jnp.sqrt(jnp.sum(jnp.var(samples, axis=0)))

@@ -1,0 +1,67 @@
+"""Training's programs compile once per shape, whatever their values."""
+
+import functools
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from gnio_jax.config import DataConfig, ModelConfig, OptimConfig, TrainConfig
+from gnio_jax.data.windows import WindowSource
+from gnio_jax.training import optimizer, step
+from gnio_jax.training.checkpoint import create_model
+from gnio_jax.training.losses import stage
+from tests.support.compiling import quick
+
+CONFIG = TrainConfig(
+    data=DataConfig(rate=20.0),
+    model=ModelConfig(width=1, bank_size=2, bank_heads=1),
+    optim=OptimConfig(epochs=1, batch_size=2),
+)
+WINDOWS = 6
+
+
+@pytest.fixture(autouse=True)
+def trace_counts():
+    """chex counts the traces of a function over the whole process."""
+    chex.clear_trace_counter()
+
+
+def source(seed):
+    rng = np.random.default_rng(seed)
+    rows = CONFIG.data.window + WINDOWS
+    draw = lambda *shape: rng.standard_normal(shape).astype(np.float32)  # noqa: E731
+    number = np.arange(WINDOWS, dtype=np.int32)
+    rotation = np.tile(np.eye(3, dtype=np.float32), (WINDOWS, 1, 1))
+    unyaw = np.tile(np.float32([1, 0]), (WINDOWS, 1))
+    displacement, step = draw(WINDOWS, 3), draw(rows, 3)
+    windows = WindowSource(draw(rows, 6), number, rotation, displacement, step, unyaw, number)
+    return jax.device_put(windows)
+
+
+def once(function, **options):
+    """Jitted, and an AssertionError where it is traced a second time."""
+    return quick(chex.assert_max_traces(function.__wrapped__, n=1), **options)
+
+
+def test_a_step_of_training_and_a_validation():
+    """Other windows, another order, more steps, another learning rate, another stage."""
+    with jax.enable_x64(False):
+        model = create_model(CONFIG)
+        tx = optimizer.create(CONFIG.optim, CONFIG.loss, WINDOWS // 2)
+        fixed = dict(model=model, config=CONFIG)
+        train = once(step.train_steps, static_argnames=("model", "optimizer", "config"))
+        validate = once(step.validate, static_argnames=("model", "config"))
+        train = functools.partial(train, **fixed, optimizer=tx)
+        validate = functools.partial(validate, **fixed)
+        state = step.create_state(model, tx, jax.random.key(0), CONFIG.data.window)
+        for epoch, (first, count, factor) in enumerate([(0, 1, 1.0), (1, 2, 0.5)]):
+            windows = source(epoch)
+            order = step.epoch_order(jax.random.key(1), epoch, windows)
+            numbers = jnp.int32(first), jnp.int32(count), jnp.float32(factor)
+            state, progress = train(state, windows, order, *numbers, jax.random.key(2))
+            found = validate(state, windows, stage(CONFIG.loss, state.step, WINDOWS // 2))
+            chex.assert_tree_all_finite((progress.sums, found.losses))
+        assert int(state.step) == 3
