@@ -49,7 +49,8 @@ def write(
     spoil=None,
     spoil_info=None,
 ):
-    """`data.hdf5` and `info.json`; game rotation vector and EKF drift by `drifts` degrees of yaw."""
+    """`data.hdf5` and `info.json`; game rotation vector and EKF drift by `drifts`, degrees of
+    yaw."""
     time = np.arange(round(seconds * 200)) / 200
     phone = walk.attitude(time)
     # The phone's place on the chest is known for the first row alone.

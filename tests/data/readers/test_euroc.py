@@ -320,7 +320,6 @@ def test_a_turned_imu_is_left_out_by_name(tmp_path):
 
 
 # --- errors
-# ----------------------------------------------------------------------------------------------------------
 
 
 def refused(folder, place, *words):
@@ -432,7 +431,6 @@ def test_damaged_files_are_refused(tmp_path):
 
 
 # --- real recordings
-# -------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.recordings

@@ -142,7 +142,6 @@ def test_a_car_that_speeds_up_is_no_tilt_but_a_tilt_is(tmp_path):
 
 
 # --- errors
-# ----------------------------------------------------------------------------------------------------------
 
 
 def refused(call, place, *words):
@@ -282,7 +281,6 @@ def test_a_cut_short_piece_and_an_empty_root_are_refused(tmp_path):
 
 
 # --- real recordings
-# -------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.recordings

@@ -144,8 +144,8 @@ def test_pieces_shorter_than_a_window_leave_nothing(tmp_path):
     with pytest.raises(Refusal) as caught:
         ridi.read_pieces(path.parent.parent)
     assert str(caught.value) == (
-        f"{path}: field 'time' has gaps longer than 1 s (14, up to 1.6 s), and no piece between them "
-        "holds a window with a reference; leave it out"
+        f"{path}: field 'time' has gaps longer than 1 s (14, up to 1.6 s), "
+        "and no piece between them holds a window with a reference; leave it out"
     )
     # Others are read all the same.
     write_table(tmp_path, "dan_bag2")
@@ -234,7 +234,6 @@ def test_a_jump_of_the_odometry_is_marked(tmp_path):
 
 
 # --- splits
-# ----------------------------------------------------------------------------------------------------------
 
 TRAIN = [
     "dan_bag1",
@@ -350,7 +349,6 @@ def test_an_implausible_recording_is_left_out_by_name(copy):
 
 
 # --- mistakes
-# --------------------------------------------------------------------------------------------------------
 
 
 def setting(name, row, value):
@@ -471,7 +469,6 @@ def test_without_the_phones_own_filter_there_is_no_device_orientation(tmp_path):
 
 
 # --- a real recording
-# ------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.recordings
@@ -481,7 +478,8 @@ def test_real_recording_is_plausible(recordings):
         pytest.skip("no kiod below GNIO_DATA")
     with pytest.warns(
         UserWarning,
-        match=r"kiod/01: field 'time' has gaps longer than 1 s \(1, up to 1\.5 s\).*103\.\d of 105\.2 s",
+        match=r"kiod/01: field 'time' has gaps longer than 1 s \(1, up to 1\.5 s\)"
+        r".*103\.\d of 105\.2 s",
     ):
         pieces = ridi.read_pieces(folder)
     assert [self_check(piece).failures for piece in pieces] == [(), ()]

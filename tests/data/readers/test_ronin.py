@@ -228,7 +228,6 @@ def test_the_chest_may_move_as_the_phone_does_not(copy):
 
 
 # --- mistakes
-# --------------------------------------------------------------------------------------------------------
 
 
 def setting(name, rows, value):
