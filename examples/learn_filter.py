@@ -178,11 +178,9 @@ def score(
     model, variables, filter_options, data_config, test: TestSplit, progress
 ) -> dict[str, float]:
     """ate, NIS and NEES of the test split, averaged over its sequences."""
-    from gnio_jax import evaluation, models
+    from gnio_jax import evaluation
 
-    network = evaluation.Network(
-        models.Inference(model), models.inference_variables(model, variables)
-    )
+    network = evaluation.inference_network(model, variables)
     estimates = evaluation.estimate(
         test.prepared, network, data_config, filter_options, progress=progress
     )

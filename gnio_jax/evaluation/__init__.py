@@ -7,7 +7,13 @@ The way through, a file each: `setup` (the choices) → `preparation` (sequences
 
 from gnio_jax.evaluation.estimation import estimate, never_moves, perfect_displacements
 from gnio_jax.evaluation.estimators.result import Estimate
-from gnio_jax.evaluation.inference import Network, attitude, predict_windows, true_displacements
+from gnio_jax.evaluation.inference import (
+    Network,
+    attitude,
+    inference_network,
+    predict_windows,
+    true_displacements,
+)
 from gnio_jax.evaluation.metrics import (
     Measures,
     Summary,
@@ -41,6 +47,7 @@ __all__ = [
     "estimate",
     "evaluate",
     "filter_setup",
+    "inference_network",
     "measure",
     "never_moves",
     "perfect_displacements",

@@ -9,9 +9,11 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from flax import linen as nn
 from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
+from gnio_jax import models
 from gnio_jax.config import DataConfig
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation.preparation import Prepared
@@ -42,6 +44,11 @@ class Network(NamedTuple):
     """(variables, windows (b, N, 6) float32) -> `Prediction`; hashable, as a Flax module's `apply`
     is."""
     variables: Any
+
+
+def inference_network(model: nn.Module, variables: Any) -> Network:
+    """A network made ready for inference: what depends on its parameters alone is computed once."""
+    return Network(models.Inference(model), models.inference_variables(model, variables))
 
 
 def keep_diagnostics(

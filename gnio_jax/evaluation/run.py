@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import jax
 
 from gnio_jax import config as configuration
-from gnio_jax import data, models
+from gnio_jax import data
 from gnio_jax.config import EvaluateConfig, FilterOptions, TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation.estimation import (
@@ -20,7 +20,7 @@ from gnio_jax.evaluation.estimation import (
     never_moves,
     perfect_displacements,
 )
-from gnio_jax.evaluation.inference import Network
+from gnio_jax.evaluation.inference import Network, inference_network
 from gnio_jax.evaluation.preparation import Prepared, prepare
 from gnio_jax.evaluation.report import DEFINITIONS, Report, write
 from gnio_jax.evaluation.scores import score
@@ -175,10 +175,7 @@ def _load_run(
         "epoch": run.epoch,
         "step": run.step,
     }
-    network = Network(
-        models.Inference(run.model), models.inference_variables(run.model, run.variables)
-    )
-    return run.config, network, provenance
+    return run.config, inference_network(run.model, run.variables), provenance
 
 
 def _group(sequence: Sequence) -> str:

@@ -9,8 +9,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from gnio_jax import data, evaluation, models
-from gnio_jax.evaluation import Network, Setup
+from gnio_jax import data, evaluation
+from gnio_jax.evaluation import Setup
 from gnio_jax.training import checkpoint
 
 ACTIVITIES = ("standing", "slow", "walking", "running", "stairs")
@@ -42,9 +42,7 @@ def predict_split(workdir: Path, split: str) -> PredictedWindows:
     sequences = data.load(run.config.dataset, run.config.data_root, split)
     setup = Setup("integrate", orientation="reference")
     prepared, _ = evaluation.prepare(sequences, config, setup)
-    network = Network(
-        models.Inference(run.model), models.inference_variables(run.model, run.variables)
-    )
+    network = evaluation.inference_network(run.model, run.variables)
     attitudes = [evaluation.attitude(each, config, "reference") for each in prepared]
     predictions = evaluation.predict_windows(
         network, prepared, attitudes, config, diagnostics=DIAGNOSTICS
@@ -101,9 +99,17 @@ def by_activity(windows: PredictedWindows) -> dict[str, dict[str, float]]:
     return figures
 
 
-def entropy(attention: Float[np.ndarray, "m h p"]) -> tuple[float, float]:
-    """Mean entropy of the attention, and that of its mean over the windows, each a share of that of
-    a uniform one, log p.
+class AttentionEntropy(NamedTuple):
+    """Shares of the entropy of a uniform attention, log p."""
+
+    of_window: float
+    """Mean over windows and heads."""
+    of_mean: float
+    """Of the mean attention over the windows."""
+
+
+def entropy(attention: Float[np.ndarray, "m h p"]) -> AttentionEntropy:
+    """How widely the attention spreads over the prototypes.
 
     Both near 1: every window sees all prototypes alike. The first small, the second large: windows
     choose, and choose differently.
@@ -113,7 +119,7 @@ def entropy(attention: Float[np.ndarray, "m h p"]) -> tuple[float, float]:
         -(weights * np.log(np.maximum(weights, 1e-12))).sum(-1).mean() / largest
         for weights in (attention, attention.mean(0))
     )
-    return float(of_window), float(of_mean)
+    return AttentionEntropy(float(of_window), float(of_mean))
 
 
 def attention_by_activity(

@@ -138,24 +138,20 @@ def _gradient_norms(results: list[Result]) -> Extra:
 
 def _entropies(path: Path, options: TablesConfig, results: list[Result]) -> Extra:
     """Entropy of the attention of the rows with a bank, with its picture."""
-    labels, each, mean, extra = [], [], [], {}
+    labels, of_window, of_mean, extra = [], [], [], {}
     for result in results:
         if result.cell.config.model.bank_size == 0:
             continue
-        found = [
-            activities.entropy(
-                activities.predict_split(run, options.split).diagnostics["attention"]
-            )
-            for run in result.runs
-        ]
+        predicted = [activities.predict_split(run, options.split) for run in result.runs]
+        seeds = [activities.entropy(windows.diagnostics["attention"]) for windows in predicted]
         labels.append(result.cell.label)
-        each.append([of_window for of_window, _ in found])
-        mean.append([of_mean for _, of_mean in found])
+        of_window.append([entropy.of_window for entropy in seeds])
+        of_mean.append([entropy.of_mean for entropy in seeds])
         extra[result.cell.name] = {
-            "entropy of a window": float(np.mean(each[-1])),
-            "of their mean": float(np.mean(mean[-1])),
+            "entropy of a window": float(np.mean(of_window[-1])),
+            "of their mean": float(np.mean(of_mean[-1])),
         }
-    picture = pictures.entropies(labels, each, mean)
+    picture = pictures.entropies(labels, of_window, of_mean)
     pictures.save(path.with_name(path.name + "_entropy.png"), picture)
     return extra
 
@@ -190,7 +186,7 @@ def make_trajectories(options: TablesConfig, reporter: Reporter, workers: int) -
         name: (
             first[name].reference,
             [
-                pictures.Track(method, of_method[name].estimate)
+                pictures.MethodPath(method, of_method[name].estimate)
                 for method, of_method in paths.items()
             ],
         )

@@ -132,7 +132,7 @@ def scale_gradients(run: Path) -> list[float]:
 # --------------------------------------------------------------------------------------------------
 
 
-class Track(NamedTuple):
+class MethodPath(NamedTuple):
     """One method's path beside the reference's, metres, plan view."""
 
     method: str
@@ -140,7 +140,7 @@ class Track(NamedTuple):
 
 
 def trajectories(
-    sequences: dict[str, tuple[Float[np.ndarray, "n 2"], list[Track]]], columns: int = 4
+    sequences: dict[str, tuple[Float[np.ndarray, "n 2"], list[MethodPath]]], columns: int = 4
 ) -> Figure:
     """All methods over the reference, a panel for each sequence."""
     columns = min(columns, len(sequences))
@@ -172,7 +172,7 @@ def trajectories(
     return figure
 
 
-def _draw_tracks(axes: Axes, reference: Float[np.ndarray, "n 2"], tracks: list[Track]) -> None:
+def _draw_tracks(axes: Axes, reference: Float[np.ndarray, "n 2"], tracks: list[MethodPath]) -> None:
     axes.plot(*reference.T, color="black", lw=1.8, label="reference")
     for number, track in enumerate(tracks):
         axes.plot(*track.path.T, color=_colour(track.method, number), lw=1.1, label=track.method)
