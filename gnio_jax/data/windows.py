@@ -16,7 +16,8 @@ from jaxtyping import Float, Int, PRNGKeyArray
 from scipy.spatial.transform import Rotation
 
 from gnio_jax.config import DataConfig
-from gnio_jax.types import Array, InputError, Sequence, Windows
+from gnio_jax.errors import InputError
+from gnio_jax.types import Array, Sequence, Windows
 from gnio_jax.windows import (
     Starts,
     align_recording,

@@ -13,6 +13,7 @@ from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
 from gnio_jax.config import DataConfig
+from gnio_jax.errors import InputError
 from gnio_jax.evaluation.preparation import Prepared
 from gnio_jax.evaluation.setup import OnShare, Orientation, no_progress
 from gnio_jax.numerics import (
@@ -21,7 +22,7 @@ from gnio_jax.numerics import (
     matrix_from_quaternion,
     yaw_rotation,
 )
-from gnio_jax.types import Array, InputError, Prediction
+from gnio_jax.types import Array, Prediction
 from gnio_jax.windows import (
     align_recording,
     cut_windows,

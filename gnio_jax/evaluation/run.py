@@ -13,6 +13,7 @@ import jax
 from gnio_jax import config as configuration
 from gnio_jax import data, models
 from gnio_jax.config import EvaluateConfig, FilterOptions, TrainConfig
+from gnio_jax.errors import InputError
 from gnio_jax.evaluation.estimation import (
     PERFECT_STD,
     estimate,
@@ -25,7 +26,7 @@ from gnio_jax.evaluation.report import DEFINITIONS, Report, write
 from gnio_jax.evaluation.scores import score
 from gnio_jax.evaluation.setup import Setup, resolve
 from gnio_jax.files import replacing_folder
-from gnio_jax.types import InputError, Sequence
+from gnio_jax.types import Sequence
 
 OnStage = Callable[[str, float], None]
 """Called with the stage and the share of it that is done."""

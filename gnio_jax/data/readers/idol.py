@@ -44,8 +44,9 @@ from gnio_jax.data.validation import (
     check_unit_norm,
     validate,
 )
+from gnio_jax.errors import InputError
 from gnio_jax.numerics import finite_rows, levelling, outer_span, quaternions, rotations
-from gnio_jax.types import STANDARD_G, InputError, Sequence
+from gnio_jax.types import STANDARD_G, Sequence
 
 RATE = 100.0
 VERSION = "idol 2"

@@ -51,8 +51,9 @@ from gnio_jax.data.validation import (
     check_rate,
     validate,
 )
+from gnio_jax.errors import InputError
 from gnio_jax.numerics import midpoints, quaternions, stretches, within
-from gnio_jax.types import InputError, Sequence
+from gnio_jax.types import Sequence
 
 RATE = 100.0
 SPLITS = ("train", "val", "test")

@@ -20,8 +20,8 @@ from gnio_jax.data.readers.reference import Poses, poses_at
 from gnio_jax.data.readers.text import numbers, read_csv
 from gnio_jax.data.resampling import LONGEST_BRIDGE
 from gnio_jax.data.validation import WINDOW_SECONDS, check_finite, check_increasing
+from gnio_jax.errors import InputError
 from gnio_jax.numerics import neighbours, wxyz_from_xyzw
-from gnio_jax.types import InputError
 
 RATES = (90.0, 1100.0)
 """Hz: 200 in RIDI itself, more in what newer phones wrote."""

@@ -38,8 +38,9 @@ from gnio_jax.data.validation import (
     check_rate,
     validate,
 )
+from gnio_jax.errors import InputError
 from gnio_jax.numerics import quaternions
-from gnio_jax.types import InputError, Sequence
+from gnio_jax.types import Sequence
 
 RATE = 200.0
 VERSION = "ridi 2"

@@ -38,8 +38,9 @@ from gnio_jax.data.validation import (
     check_rate,
     validate,
 )
+from gnio_jax.errors import InputError
 from gnio_jax.numerics import integrate_gyro, quaternions
-from gnio_jax.types import InputError, Sequence
+from gnio_jax.types import Sequence
 
 RATE = 200.0
 MAX_GAME_ERROR = 20.0

@@ -29,8 +29,9 @@ from gnio_jax.data.validation import (
     check_unit_norm,
     validate,
 )
+from gnio_jax.errors import InputError
 from gnio_jax.numerics import rotations, wxyz_from_xyzw
-from gnio_jax.types import InputError, Sequence
+from gnio_jax.types import Sequence
 
 RATE = 200.0
 _TABLE = "imu0_resampled.npy"

@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation
 from gnio_jax import data
 from gnio_jax.data.dataset import Refusal
 from gnio_jax.data.readers import idol
+from gnio_jax.errors import InputError
 from gnio_jax.numerics import rotations
-from gnio_jax.types import InputError
 from tests.support import known_walk as walk
 from tests.support.idol_files import BIAS, EPOCH, RIG_OF_PHONE, frame, write
 

@@ -18,8 +18,8 @@ from gnio_jax.data.dataset import Refusal
 from gnio_jax.data.plausibility import self_check
 from gnio_jax.data.readers import oxiod
 from gnio_jax.data.reading import read_recording
+from gnio_jax.errors import InputError
 from gnio_jax.numerics import rotations
-from gnio_jax.types import InputError
 from tests.support import oxiod_files as files
 
 
@@ -542,7 +542,6 @@ def test_a_plain_script_starts_no_processes(copy, tmp_path):
 
 
 # --- real recordings
-# -------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.recordings
