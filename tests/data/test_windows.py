@@ -1,4 +1,4 @@
-"""The gather against a brute-force window cutter that walks sample by sample with scipy rotations."""
+"""The gather against a brute-force window cutter that walks sample by sample with SciPy."""
 
 import jax
 import jax.numpy as jnp
@@ -19,13 +19,19 @@ def tumbling(count, seed, invalid=()):
     rng = np.random.default_rng(seed)
     valid = np.ones(count, bool)
     valid[list(invalid)] = False
-    position = (
-        np.cumsum(rng.standard_normal((count, 3)), axis=0) + 1e4
-    )  # far away: float32 positions would lose millimetres
+    # Far away: float32 positions would lose millimetres.
+    position = np.cumsum(rng.standard_normal((count, 3)), axis=0) + 1e4
+    gyro, accel = rng.standard_normal((count, 3)), rng.standard_normal((count, 3))
     return Sequence(
-        f"s{seed}", np.arange(count) / 20.0, rng.standard_normal((count, 3)), rng.standard_normal((count, 3)),
-        Rotation.random(count, random_state=seed).as_quat(scalar_first=True), position, rng.standard_normal((count, 3)), valid,
-    )  # fmt: skip
+        name=f"s{seed}",
+        time=np.arange(count) / 20.0,
+        gyro=gyro,
+        accel=accel,
+        orientation=Rotation.random(count, random_state=seed).as_quat(scalar_first=True),
+        position=position,
+        velocity=rng.standard_normal((count, 3)),
+        valid=valid,
+    )
 
 
 def cut(sequences, rotation, stride):
