@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 from gnio_jax import config as configuration
 from gnio_jax.commands import console
 from gnio_jax.commands.options import parse
-from gnio_jax.types import InputError
+from gnio_jax.data.importing import InputError
 
 DESCRIPTION = """Fit the noise model and the uncertainty head of a trained run through its own
 filter.

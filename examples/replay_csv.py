@@ -18,7 +18,7 @@ import numpy as np
 from gnio_jax import config as configuration
 from gnio_jax.commands import console
 from gnio_jax.commands.options import parse
-from gnio_jax.types import InputError
+from gnio_jax.data.importing import InputError
 
 DESCRIPTION = """Feed a recording to gnio_jax.filtering.Tracker sample by sample, like an app on a
 phone.

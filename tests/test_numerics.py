@@ -128,7 +128,7 @@ def test_cumulative_rotation_is_the_running_product_from_the_identity(count):
         expected.append(expected[-1] @ turn)
     found = numerics.cumulative_rotation(turns)
     assert len(found) == count + 1
-    np.testing.assert_allclose(found.as_matrix(), expected, atol=1e-13)
+    np.testing.assert_allclose(found.as_matrix(), np.stack(expected), atol=1e-13)
 
 
 def test_integrate_gyro_returns_the_attitude_of_a_steady_turn_on_any_clock():

@@ -278,6 +278,7 @@ def convert(options: ConvertOptions, prog: str) -> None:
 
 def import_file(options: ImportOptions, prog: str) -> None:
     """Write the file, say what was assumed and what it looks like, and what to do with it."""
+    from gnio_jax.data import importing
     from gnio_jax.data.checking import impressions
     from gnio_jax.data.hdf5 import write_hdf5
     from gnio_jax.data.readers import csv_files
@@ -289,7 +290,7 @@ def import_file(options: ImportOptions, prog: str) -> None:
     columns = dataclasses.asdict(options.columns)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        sequence, notes = csv_files.import_recording(
+        sequence, notes = importing.import_recording(
             options.file,
             {name: column for name, column in columns.items() if column is not None},
             accel_path=options.accel_path,

@@ -17,8 +17,9 @@ from pathlib import Path
 
 from gnio_jax.data.dataset import Refusal
 from gnio_jax.data.hdf5 import read_hdf5, write_hdf5
+from gnio_jax.errors import InputError
 from gnio_jax.files import replacing
-from gnio_jax.types import InputError, Sequence
+from gnio_jax.types import Sequence
 
 _NOTES, _COUNT = "warnings of the loader", "number of sequences"
 """Attributes in the cache alone."""

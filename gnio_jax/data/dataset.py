@@ -11,7 +11,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from gnio_jax.types import InputError, Sequence
+from gnio_jax.errors import InputError
+from gnio_jax.types import Sequence
 
 
 class Refusal(InputError):

@@ -11,16 +11,11 @@ from jaxtyping import Bool, Float
 from gnio_jax.data.dataset import Refusal
 from gnio_jax.data.resampling import LONGEST_BRIDGE
 from gnio_jax.data.validation import WINDOW_SECONDS
+from gnio_jax.numerics import spans, stretches
 from gnio_jax.types import Sequence
 
 STAMP_ROUNDING = 1e-6
 """s: what float64 leaves of differences of unix stamps, and more."""
-
-
-def stretches(time: Float[np.ndarray, "n"], longest: float = WINDOW_SECONDS) -> list[slice]:
-    """The rows between gaps of the increasing stamps that are longer than `longest` (s)."""
-    edges = [0, *(np.flatnonzero(np.diff(time) > longest) + 1).tolist(), len(time)]
-    return [slice(first, last) for first, last in itertools.pairwise(edges)]
 
 
 def divide_at_gaps(sequence: Sequence, source: object) -> list[Sequence]:
@@ -32,7 +27,7 @@ def divide_at_gaps(sequence: Sequence, source: object) -> list[Sequence]:
     lost. Where one piece is left it keeps the recording's name, of several each has a number.
     Raises `Refusal` when none is left.
     """
-    time, pieces = sequence.time, stretches(sequence.time)
+    time, pieces = sequence.time, stretches(np.diff(sequence.time) > WINDOW_SECONDS)
     if len(pieces) == 1:
         return [sequence]
     gaps = [
@@ -98,6 +93,5 @@ def _cut(sequence: Sequence, name: str, piece: slice) -> Sequence:
 def _longest_valid(time: Float[np.ndarray, "n"], valid: Bool[np.ndarray, "n"]) -> float:
     """Seconds of the longest run of valid samples, as `resample` will leave it."""
     joined = valid[1:] & valid[:-1] & (np.diff(time) <= LONGEST_BRIDGE)
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], joined, [False]])))
-    runs = time[edges[1::2]] - time[edges[::2]]
-    return float(runs.max()) if runs.size else 0.0
+    first, last = spans(joined).T  # of the intervals: the last sample is their end
+    return float((time[last] - time[first]).max(initial=0.0))

@@ -10,8 +10,9 @@ import h5py
 import numpy as np
 
 from gnio_jax.data.validation import validate
+from gnio_jax.errors import InputError
 from gnio_jax.files import replacing
-from gnio_jax.types import InputError, Sequence
+from gnio_jax.types import Sequence
 
 _FORMAT = "gnio-jax sequence 1"
 _FIELDS = ("time", "gyro", "accel", "orientation", "position", "velocity", "valid")

@@ -4,6 +4,7 @@ imported when one is asked for."""
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -13,6 +14,7 @@ from PIL import Image
 
 from gnio_jax.data.plausibility import SelfCheck, gyro_windows
 from gnio_jax.files import replacing
+from gnio_jax.numerics import finite_rows, spans
 from gnio_jax.types import Sequence
 
 BLUE, VERMILION, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#8C8C8C"
@@ -43,67 +45,66 @@ def overview(sequence: Sequence, check: SelfCheck) -> Figure:
     figure = Figure(figsize=(11.0, 5.4), dpi=90, layout="constrained")
     grid = figure.add_gridspec(3, 2, width_ratios=(1.0, 1.25))
     _plan(figure.add_subplot(grid[:, 0]), sequence)
-    panels: list[Axes] = []
-    for row in range(3):
-        panels.append(figure.add_subplot(grid[row, 1], sharex=panels[0] if panels else None))
-    for panel in panels[:-1]:
+    speed = figure.add_subplot(grid[0, 1])
+    accel, gyro = (figure.add_subplot(grid[row, 1], sharex=speed) for row in (1, 2))
+    _speed(speed, sequence)
+    _accel(accel, sequence)
+    _gyro(gyro, sequence)
+    for panel in (speed, accel):
         panel.tick_params(labelbottom=False)
-    time = sequence.time - sequence.time[0]
-    every = max(len(time) // POINTS, 1)
-    for panel in panels:
-        _shade(panel, time, sequence.valid)
-
-    speed = np.where(sequence.valid, np.linalg.norm(sequence.velocity, axis=1), np.nan)
-    panels[0].plot(time[::every], speed[::every], color=BLUE, lw=0.9)
-    panels[0].set_ylabel("speed (m/s)")
-    panels[0].set_ylim(bottom=0.0)
-    panels[1].plot(
-        time[::every], np.linalg.norm(sequence.accel, axis=1)[::every], color=VERMILION, lw=0.5
-    )
-    panels[1].set_ylabel("|accel| (m/s²)")
-    window = min(WINDOW_SECONDS, (time[-1] - time[0]) / 4)
-    starts, degrees = gyro_windows(sequence, window)
-    panels[2].plot(
-        starts - sequence.time[0] + window / 2, degrees, "o-", color=GREEN, ms=2.5, lw=0.7
-    )
-    panels[2].set_ylabel(f"gyro vs. reference\nover {window:.3g} s (°)")
-    panels[2].set_ylim(bottom=0.0)
-    panels[2].set_xlabel("time (s)")
-    panels[2].set_xlim(time[0], time[-1])
-    if not sequence.valid.all():
-        panels[0].fill_between([], [], [], color=UNTRUSTED, lw=0, label="reference not valid")
-        panels[0].legend(loc="upper right", fontsize=8, framealpha=0.9)
-    for panel in panels:
+    for panel in (speed, accel, gyro):
+        _shade(panel, sequence)
         _finish(panel)
-    verdict = (
-        f"left out: {check.failures[0]}" if check.failures else f"{check.share_valid:.1%} valid"
-    )
-    figure.suptitle(
-        f"{_short(str(sequence.attributes.get('dataset', '')))} {_short(sequence.name)}: {check.duration:.0f} s at "
-        f"{check.rate:.4g} Hz, {verdict}".strip(),
-        fontsize=10,
-    )
+    gyro.set_xlabel("time (s)")
+    gyro.set_xlim(0.0, float(sequence.time[-1] - sequence.time[0]))
+    used = f"left out: {check.failures[0]}" if check.failures else f"{check.share_valid:.1%} valid"
+    dataset = _short(str(sequence.attributes.get("dataset", "")))
+    recorded = f"{check.duration:.0f} s at {check.rate:.4g} Hz"
+    title = f"{dataset} {_short(sequence.name)}: {recorded}, {used}".strip()
+    figure.suptitle(title, fontsize=10)
     return figure
 
 
+def _over_time(axes: Axes, sequence: Sequence, values: np.ndarray, **style: Any) -> None:
+    """One value a sample, of which as many are drawn as the picture has pixels."""
+    every = max(len(values) // POINTS, 1)
+    axes.plot((sequence.time - sequence.time[0])[::every], values[::every], **style)
+
+
+def _speed(axes: Axes, sequence: Sequence) -> None:
+    speed = np.where(sequence.valid, np.linalg.norm(sequence.velocity, axis=1), np.nan)
+    _over_time(axes, sequence, speed, color=BLUE, lw=0.9)
+    axes.set_ylabel("speed (m/s)")
+    axes.set_ylim(bottom=0.0)
+    if not sequence.valid.all():
+        axes.fill_between([], [], [], color=UNTRUSTED, lw=0, label="reference not valid")
+        axes.legend(loc="upper right", fontsize=8, framealpha=0.9)
+
+
+def _accel(axes: Axes, sequence: Sequence) -> None:
+    _over_time(axes, sequence, np.linalg.norm(sequence.accel, axis=1), color=VERMILION, lw=0.5)
+    axes.set_ylabel("|accel| (m/s²)")
+
+
+def _gyro(axes: Axes, sequence: Sequence) -> None:
+    window = min(WINDOW_SECONDS, float(sequence.time[-1] - sequence.time[0]) / 4)
+    starts, degrees = gyro_windows(sequence, window)
+    middle = starts - sequence.time[0] + window / 2
+    axes.plot(middle, degrees, "o-", color=GREEN, ms=2.5, lw=0.7)
+    axes.set_ylabel(f"gyro vs. reference\nover {window:.3g} s (°)")
+    axes.set_ylim(bottom=0.0)
+
+
 def _plan(axes: Axes, sequence: Sequence) -> None:
+    """The trajectory from above."""
     place = np.where(sequence.valid[:, None], sequence.position, np.nan)[:, :2]
-    rows = np.flatnonzero(np.isfinite(place).all(axis=1))
-    if rows.size:
+    known = place[finite_rows(place)]
+    if len(known):
         every = max(len(place) // POINTS, 1)
         axes.plot(place[::every, 0], place[::every, 1], color=BLUE, lw=0.9)
-        axes.plot(
-            *place[rows[0]],
-            "o",
-            color=GREY,
-            mfc="white",
-            ms=8,
-            mew=1.8,
-            zorder=4,
-            label="start",
-            ls="none",
-        )
-        axes.plot(*place[rows[-1]], "s", color=GREY, ms=7, zorder=4, label="end", ls="none")
+        marks: dict[str, Any] = {"color": GREY, "ls": "none", "zorder": 4}
+        axes.plot(*known[0], "o", mfc="white", ms=8, mew=1.8, label="start", **marks)
+        axes.plot(*known[-1], "s", ms=7, label="end", **marks)
         axes.legend(loc="best", fontsize=8, framealpha=0.9)
         axes.margins(0.08)
     else:
@@ -114,9 +115,9 @@ def _plan(axes: Axes, sequence: Sequence) -> None:
     _finish(axes)
 
 
-def _shade(axes: Axes, time: np.ndarray, valid: np.ndarray) -> None:
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], (~valid).astype(int), [0]])))
-    for start, stop in zip(edges[::2], edges[1::2], strict=True):
+def _shade(axes: Axes, sequence: Sequence) -> None:
+    time = sequence.time - sequence.time[0]
+    for start, stop in spans(~sequence.valid):
         axes.axvspan(float(time[start]), float(time[stop - 1]), color=UNTRUSTED, lw=0, zorder=0)
 
 

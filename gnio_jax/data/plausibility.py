@@ -11,8 +11,16 @@ from scipy.signal import fftconvolve
 from scipy.spatial.transform import Rotation
 
 from gnio_jax.data.dataset import Dataset
-from gnio_jax.numerics import rotations
-from gnio_jax.types import GRAVITY, InputError, Sequence
+from gnio_jax.errors import InputError
+from gnio_jax.numerics import (
+    last_true,
+    midpoints,
+    quaternion_product,
+    quaternions,
+    rotations,
+    spans,
+)
+from gnio_jax.types import GRAVITY, Sequence
 
 WINDOW_SECONDS = 10.0
 """s over which the gyro is integrated."""
@@ -181,15 +189,13 @@ def _held_attitude(sequence: Sequence) -> Float[np.ndarray, "n 4"]:
 
     Invalid rows are left out of every mean and only bridge the gyro's windows.
     """
-    valid = sequence.valid
-    rows = np.where(valid, np.arange(len(valid)), int(np.argmax(valid)))
-    return sequence.orientation[np.maximum.accumulate(rows)]
+    return sequence.orientation[last_true(sequence.valid)]
 
 
 def _mean_acceleration(sequence: Sequence, step: float) -> Float[np.ndarray, "3"]:
     """Of the reference over its valid stretches, by the velocities at their ends, m/s²."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], sequence.valid, [False]])))
-    first, last = edges[::2], edges[1::2] - 1
+    first, stop = spans(sequence.valid).T
+    last = stop - 1
     seconds = float((last - first).sum()) * step
     gained = (sequence.velocity[last] - sequence.velocity[first]).sum(axis=0)
     return gained / seconds if seconds > 0 else np.zeros(3)
@@ -222,7 +228,7 @@ def gyro_windows(
     jacobian = np.einsum("wji,wjk->wik", rotation[starts], summed[starts + length] - summed[starts])
     samples = starts[:, None] + np.arange(length)
     # A rate sampled at the stamps is worth most at the middle of the interval it drives.
-    middle = 0.5 * (sequence.gyro[:-1] + sequence.gyro[1:])
+    middle = midpoints(sequence.gyro)
 
     def error(bias: np.ndarray) -> np.ndarray:
         integrated = _product_of_rows((middle - bias) * step, samples)
@@ -252,24 +258,15 @@ def _product_of_rows(angles: Float[np.ndarray, "n 3"], samples: np.ndarray) -> R
 
     Neighbours are multiplied until one rotation a row is left.
     """
-    # (xyzw, rows, length): long inner loops
-    factors = Rotation.from_rotvec(angles).as_quat().T[:, samples]
+    # (wxyz, rows, length): long inner loops
+    factors = quaternions(Rotation.from_rotvec(angles)).T[:, samples]
     while factors.shape[2] > 1:
         if factors.shape[2] % 2:
             identity = np.zeros((4, len(samples), 1))
-            identity[3] = 1.0
+            identity[0] = 1.0
             factors = np.concatenate([factors, identity], axis=2)
-        x1, y1, z1, w1 = factors[:, :, 0::2]
-        x2, y2, z2, w2 = factors[:, :, 1::2]
-        factors = np.stack(
-            [
-                w1 * x2 + x1 * w2 + y1 * z2 - z1 * y2,
-                w1 * y2 - x1 * z2 + y1 * w2 + z1 * x2,
-                w1 * z2 + x1 * y2 - y1 * x2 + z1 * w2,
-                w1 * w2 - x1 * x2 - y1 * y2 - z1 * z2,
-            ]
-        )
-    return Rotation.from_quat(factors[:, :, 0].T)
+        factors = quaternion_product(factors[:, :, 0::2], factors[:, :, 1::2], axis=0)
+    return rotations(factors[:, :, 0].T)
 
 
 # --- accelerometer

@@ -10,7 +10,7 @@ from concurrent.futures.process import BrokenProcessPool
 from typing import TypeVar
 
 from gnio_jax.cores import usable_cores
-from gnio_jax.types import InputError
+from gnio_jax.errors import InputError
 
 Result = TypeVar("Result")
 
@@ -38,8 +38,9 @@ def map_in_processes(
     workers = min(workers, len(items))
     if workers <= 1:
         for index, item in enumerate(items):
-            yield function(*item)
+            result = function(*item)
             done((index + 1) / len(items))
+            yield result
         return
     # Processes are spawned: a fork after JAX has started its threads can hang. Ctrl-C is this
     # process's to answer.

@@ -11,7 +11,8 @@ from gnio_jax.data.cache import cached, is_cached, is_refused
 from gnio_jax.data.dataset import Dataset, Recording, Refusal
 from gnio_jax.data.plausibility import SelfCheck, check_sequence, keep_plausible
 from gnio_jax.data.processes import map_in_processes
-from gnio_jax.types import InputError, Sequence
+from gnio_jax.errors import InputError
+from gnio_jax.types import Sequence
 
 # --- one recording
 
@@ -112,9 +113,9 @@ def read_split(
     readings = _read_all(recordings, workers, progress)
     for recording, reading in zip(recordings, readings, strict=True):
         for note in reading.notes:
-            warnings.warn(note, stacklevel=2)
+            warnings.warn(note, stacklevel=3)  # where `load` was called
         for reason in reading.refusals:
-            warnings.warn(f"{recording.name}: left out: {reason}", stacklevel=2)
+            warnings.warn(f"{recording.name}: left out: {reason}", stacklevel=3)
         if reading.damage is not None:
             raise reading.damage
         sequences += reading.sequences

@@ -25,7 +25,8 @@ from gnio_jax.data.readers import (
     tlio,
 )
 from gnio_jax.data.reading import read_split
-from gnio_jax.types import InputError, Sequence
+from gnio_jax.errors import InputError
+from gnio_jax.types import Sequence
 
 _MODULES = (blackbird, csv_files, euroc, idol, kitti, oxiod, ridi, ronin, synthetic, tlio)
 _DATASETS: dict[str, Dataset] = {

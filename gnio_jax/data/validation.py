@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool, Float
 
-from gnio_jax.types import InputError, Sequence
+from gnio_jax.errors import InputError
+from gnio_jax.types import Sequence
 
 FASTEST_TURN, STRONGEST_FORCE = 100.0, 1000.0
 """rad/s and m/s²: beyond the range of any gyro or accelerometer one navigates with."""

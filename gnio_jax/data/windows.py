@@ -15,8 +15,9 @@ import numpy as np
 from jaxtyping import Float, Int, PRNGKeyArray
 
 from gnio_jax.config import DataConfig
+from gnio_jax.errors import InputError
 from gnio_jax.numerics import rotations, yaw
-from gnio_jax.types import Array, InputError, Sequence, Windows
+from gnio_jax.types import Array, Sequence, Windows
 from gnio_jax.windows import (
     Starts,
     align_recording,

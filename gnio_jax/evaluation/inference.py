@@ -13,6 +13,7 @@ from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
 from gnio_jax.config import DataConfig
+from gnio_jax.errors import InputError
 from gnio_jax.evaluation.preparation import Prepared
 from gnio_jax.evaluation.setup import OnShare, Orientation, no_progress
 from gnio_jax.numerics import (
@@ -21,7 +22,7 @@ from gnio_jax.numerics import (
     matrix_from_quaternion,
     yaw_rotation,
 )
-from gnio_jax.types import Array, InputError, Prediction
+from gnio_jax.types import Array, Prediction
 from gnio_jax.windows import (
     align_recording,
     cut_windows,
@@ -108,7 +109,7 @@ def predict_windows(
         )
         found.append(jax.device_get(prediction))
         progress(min(1.0, (begin + size) / total))
-    whole = jax.tree.map(lambda *parts: np.concatenate(parts)[:total].astype(np.float64), *found)
+    whole = jax.tree.map(lambda *leaves: np.concatenate(leaves)[:total].astype(np.float64), *found)
     ends = np.cumsum([len(part.start) for part in parts])
     rows = [slice(end - len(part.start), end) for end, part in zip(ends, parts, strict=True)]
     return [jax.tree.map(lambda leaf, own=own: leaf[own], whole) for own in rows]

@@ -10,11 +10,12 @@ from jaxtyping import Float
 
 from gnio_jax import data
 from gnio_jax.config import DataConfig, FilterOptions
+from gnio_jax.errors import InputError
 from gnio_jax.evaluation.metrics import Trajectory
 from gnio_jax.evaluation.setup import DEFAULT_SETUP, Setup, filter_setup, resolve
 from gnio_jax.filtering import level_state
 from gnio_jax.numerics import finite_rows, matrix_from_quaternion, rotations
-from gnio_jax.types import InputError, Sequence
+from gnio_jax.types import Sequence
 
 REST_GYRO_STD = 0.01
 """Largest standard deviation of each gyro axis at rest, rad/s: a phone on a table, not in a hand.

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,6 +13,7 @@ import jax
 from gnio_jax import config as configuration
 from gnio_jax import data, models
 from gnio_jax.config import EvaluateConfig, FilterOptions, TrainConfig
+from gnio_jax.errors import InputError
 from gnio_jax.evaluation.estimation import (
     PERFECT_STD,
     estimate,
@@ -26,7 +26,7 @@ from gnio_jax.evaluation.report import DEFINITIONS, Report, write
 from gnio_jax.evaluation.scores import score
 from gnio_jax.evaluation.setup import Setup, resolve
 from gnio_jax.files import replacing_folder
-from gnio_jax.types import InputError, Sequence
+from gnio_jax.types import Sequence
 
 OnStage = Callable[[str, float], None]
 """Called with the stage and the share of it that is done."""
@@ -52,23 +52,25 @@ class Job(NamedTuple):
     options: FilterOptions
     setup: Setup
     dataset: str
+    data_root: str | None
 
 
 def evaluate(
-    config: EvaluateConfig,
-    progress: OnStage = lambda stage, share: None,
-    workers: int = 1,
+    config: EvaluateConfig, progress: OnStage = lambda stage, share: None, workers: int = 1
 ) -> Evaluation:
     """Estimate every sequence of a split with a run's network, measure, and leave the results in a
     folder of the run.
 
     The folder is written whole or not at all, and takes the place of the one an earlier evaluation
-    with the same options left. `workers` processes read what is slow to read (`data.load`). Raises `InputError` for options that do not fit together, a workdir
-    without the checkpoint, unknown or missing data, or sequences that cannot be estimated this way.
+    with the same options left. `workers` processes read what is slow to read (`data.load`). Raises
+    `InputError` for options that do not fit together, a workdir without the checkpoint, unknown or
+    missing data, or sequences that cannot be estimated this way.
     """
     job = _set_up(config)
     trained, setup = job.trained, job.setup
-    sequences = _load_sequences(config, job, workers, progress)
+    sequences = data.load(
+        job.dataset, job.data_root, config.split, workers, lambda x: progress("reading", x)
+    )
 
     prepared, left_out = prepare(sequences, trained.data, setup)
     if not prepared:
@@ -150,7 +152,9 @@ def _set_up(config: EvaluateConfig) -> Job:
         dataclasses.replace(trained, filter=config.filter), "command line"
     )
     dataset = config.dataset or trained.dataset
-    return Job(workdir, trained, network, provenance, checked.filter, setup, dataset)
+    own_root = trained.data_root if dataset == trained.dataset else None
+    root = config.data_root or own_root
+    return Job(workdir, trained, network, provenance, checked.filter, setup, dataset, root)
 
 
 def _load_run(
@@ -160,7 +164,7 @@ def _load_run(
     where that is from."""
     kept = workdir / "config.yaml"
     if config.estimator == "imu_only" and kept.is_file():
-        nothing = dict.fromkeys(("model", "checkpoint", "epoch", "step"))
+        nothing: dict[str, Any] = dict.fromkeys(("model", "checkpoint", "epoch", "step"))
         return configuration.load(kept), None, nothing
     from gnio_jax.training import checkpoint  # Orbax takes seconds to import
 
@@ -175,15 +179,6 @@ def _load_run(
         models.Inference(run.model), models.inference_variables(run.model, run.variables)
     )
     return run.config, network, provenance
-
-
-def _load_sequences(
-    config: EvaluateConfig, job: Job, workers: int, progress: OnStage
-) -> list[Sequence]:
-    own = job.trained.data_root if job.dataset == job.trained.dataset else None
-    root = config.data_root or own
-    reading = partial(progress, "reading")
-    return data.load(job.dataset, root, config.split, workers, reading)
 
 
 def _group(sequence: Sequence) -> str:

@@ -7,8 +7,8 @@ from collections.abc import Callable
 from typing import Literal, NamedTuple
 
 from gnio_jax.config import DataConfig, FilterOptions
+from gnio_jax.errors import InputError
 from gnio_jax.filtering import FilterConfig, InitialStd, NoiseModel
-from gnio_jax.types import InputError
 
 Estimator = Literal["ekf", "integrate", "imu_only"]
 Orientation = Literal["filter", "device", "reference"]

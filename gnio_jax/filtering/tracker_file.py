@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from gnio_jax.errors import InputError
 from gnio_jax.files import replacing
 from gnio_jax.filtering.clock import Clock
 from gnio_jax.filtering.config import FilterConfig
@@ -27,7 +28,6 @@ from gnio_jax.filtering.online import (
     core_shapes,
 )
 from gnio_jax.filtering.pose import POSE_LENGTH
-from gnio_jax.types import InputError
 
 _FORMAT = "gnio-jax tracker 3"
 _DAMAGED = "it is damaged"

@@ -19,7 +19,7 @@ import numpy as np
 from gnio_jax import config as configuration
 from gnio_jax import models
 from gnio_jax.config import DataConfig, FilterOptions, ModelConfig, TrainConfig
-from gnio_jax.types import InputError
+from gnio_jax.errors import InputError
 
 _CHANNELS = np.array([3, 4, 5, 0, 1, 2])
 """Where our channels, [accel, gyro], are among TLIO's, [gyro, accel]."""

@@ -11,13 +11,13 @@ import jax.numpy as jnp
 from flax import linen as nn
 from jaxtyping import PRNGKeyArray
 
+from gnio_jax.errors import InputError
 from gnio_jax.models.ctin import CTIN
 from gnio_jax.models.deepils import DeepILS
 from gnio_jax.models.gnio import GNIO
 from gnio_jax.models.imot import IMoT, IMoTText
 from gnio_jax.models.ronin import RoNINResNet
 from gnio_jax.models.tlio import TLIO
-from gnio_jax.types import InputError
 
 _MODELS: dict[str, type[nn.Module]] = {
     "ctin": CTIN,

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from gnio_jax.tables import activities, markdown, pictures
-from gnio_jax.tables.experiments import Cell
 from gnio_jax.tables.activities import PredictedWindows
+from gnio_jax.tables.experiments import Cell
 
 Activities = dict[str, dict[str, float]]
 """Activity -> figure -> value."""

@@ -20,9 +20,9 @@ from flax import linen as nn
 from gnio_jax import config as configuration
 from gnio_jax import models
 from gnio_jax.config import TrainConfig
+from gnio_jax.errors import InputError
 from gnio_jax.training.optimizer import Plateau
 from gnio_jax.training.step import TrainState
-from gnio_jax.types import InputError
 
 Which = Literal["best", "latest"]
 

@@ -8,7 +8,7 @@ import pytest
 from gnio_jax import config
 from gnio_jax.commands import app, options, train
 from gnio_jax.config import TrainConfig
-from gnio_jax.types import InputError
+from gnio_jax.errors import InputError
 
 
 def parse(*arguments):

@@ -18,7 +18,7 @@ from gnio_jax.data import conversion, registry
 from gnio_jax.data.checking import resolve
 from gnio_jax.data.readers import csv_files as csv
 from gnio_jax.data.readers import tlio
-from gnio_jax.types import InputError
+from gnio_jax.errors import InputError
 from tests.support import known_walk as walk
 from tests.support.tlio_files import write_sequence
 

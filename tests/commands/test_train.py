@@ -12,7 +12,7 @@ import train
 from gnio_jax import config as configuration
 from gnio_jax.commands import console
 from gnio_jax.config import TrainConfig
-from gnio_jax.types import InputError
+from gnio_jax.errors import InputError
 
 ROOT = Path(__file__).parents[2]
 

@@ -8,11 +8,12 @@ import pytest
 
 from gnio_jax.data.cache import cached, folder, is_cached, is_refused
 from gnio_jax.data.dataset import Refusal
-from gnio_jax.types import InputError, Sequence
+from gnio_jax.errors import InputError
+from gnio_jax.types import Sequence
 
 
 class Builder:
-    """Counts how often it is asked; makes a sequence whose first position tells which time it was."""
+    """Counts its calls; makes a sequence whose first position tells which one it was."""
 
     def __init__(self, error=None):
         self.calls, self.error = 0, error

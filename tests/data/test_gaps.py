@@ -45,8 +45,10 @@ def test_every_piece_with_a_window_is_kept_and_named():
         pieces = divide_at_gaps(walk(time, valid), "walk.csv")
     (warning,) = caught
     assert str(warning.message) == (
-        "walk.csv: field 'time' has gaps longer than 1 s (4, up to 10.0 s); kept: 14.0 of 34.0 s, walk_piece1 (0.0 to 5.0 s), "
-        "walk_piece2 (9.0 to 10.0 s), walk_piece3 (12.0 to 20.0 s); lost: 15.5 s in gaps, 4.5 s in pieces without a whole window"
+        "walk.csv: field 'time' has gaps longer than 1 s (4, up to 10.0 s); "
+        "kept: 14.0 of 34.0 s, walk_piece1 (0.0 to 5.0 s), walk_piece2 (9.0 to 10.0 s), "
+        "walk_piece3 (12.0 to 20.0 s); "
+        "lost: 15.5 s in gaps, 4.5 s in pieces without a whole window"
     )
     assert [piece.name for piece in pieces] == ["walk_piece1", "walk_piece2", "walk_piece3"]
     for piece, first, last in zip(pieces, (0, 9, 12), (5, 10, 20), strict=True):
@@ -86,7 +88,8 @@ def test_a_piece_whose_valid_runs_are_cut_by_short_gaps_holds_no_window():
     """What `resample` will not bridge, 0.9 s here, parts a window as a long gap does."""
     with pytest.warns(
         UserWarning,
-        match=r"kept: 4\.0 of 9\.0 s, walk \(5\.0 to 9\.0 s\); lost: 2\.9 s in gaps, 2\.1 s in pieces",
+        match=r"kept: 4\.0 of 9\.0 s, walk \(5\.0 to 9\.0 s\); "
+        r"lost: 2\.9 s in gaps, 2\.1 s in pieces",
     ):
         (piece,) = divide_at_gaps(walk(stamps((0, 0.6), (1.5, 2.1), (5, 9))), "walk.csv")
     assert piece.name == "walk" and len(piece.time) == 401

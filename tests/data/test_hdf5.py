@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from gnio_jax.data.hdf5 import read_hdf5, write_hdf5
-from gnio_jax.types import InputError
+from gnio_jax.errors import InputError
 from tests.support.circle import changed, circle
 
 

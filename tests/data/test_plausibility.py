@@ -7,7 +7,7 @@ import pytest
 
 from gnio_jax import data
 from gnio_jax.data.plausibility import check_sequence, gyro_windows, keep_plausible, self_check
-from gnio_jax.types import InputError
+from gnio_jax.errors import InputError
 from tests.support.circle import changed, circle
 
 

@@ -14,7 +14,7 @@ from gnio_jax import data
 from gnio_jax.data.dataset import Recording, Refusal, single
 from gnio_jax.data.processes import map_in_processes
 from gnio_jax.data.reading import check_recording, find_recordings, read_recording, read_split
-from gnio_jax.types import InputError
+from gnio_jax.errors import InputError
 from tests.support.circle import circle
 
 
@@ -106,12 +106,16 @@ def test_only_what_is_slow_to_read_is_given_to_processes(tmp_path):
     """A function without a name elsewhere cannot be sent to a process: it was read here."""
     local = Recording("local", lambda: [walk("local")])
     shares = []
-    about = dataset(local, slow(tmp_path, "a"))
+    about = dataset(local, slow(tmp_path, "a"), slow(tmp_path, "b"))
     sequences = read_split(about, tmp_path, "test", 2, shares.append)
-    assert [sequence.name for sequence in sequences] == ["local", "a"] and shares == [1.0]
-    cached = Recording("a", lambda: pytest.fail("built"), (tmp_path / "a.csv",), "test 1")
-    assert len(read_split(dataset(local, cached), tmp_path, "test", 2, shares.append)) == 2
-    assert shares == [1.0]
+    assert [sequence.name for sequence in sequences] == ["local", "a", "b"]
+    assert shares == [0.5, 1.0]
+    kept = [
+        Recording(name, lambda: pytest.fail("built"), (tmp_path / f"{name}.csv",), "test 1")
+        for name in "ab"
+    ]
+    assert len(read_split(dataset(local, *kept), tmp_path, "test", 2, shares.append)) == 3
+    assert shares == [0.5, 1.0]
 
 
 def test_a_recording_carries_what_lists_say_of_it(tmp_path):

@@ -6,7 +6,7 @@ import pytest
 
 from gnio_jax import data
 from gnio_jax.data import registry
-from gnio_jax.types import InputError
+from gnio_jax.errors import InputError
 
 
 def test_every_dataset_says_what_a_user_must_know():
@@ -28,7 +28,8 @@ def test_unknown_names_and_splits_list_the_known_ones():
         data.load("tloi")
     with pytest.raises(
         InputError,
-        match=r"dataset tlio: unknown split 'vel'; did you mean 'val'\? known splits: train, val, test",
+        match=r"dataset tlio: unknown split 'vel'; "
+        r"did you mean 'val'\? known splits: train, val, test",
     ):
         data.load("tlio", split="vel")
 

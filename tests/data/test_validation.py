@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gnio_jax.data.validation import check_gaps, check_rate, validate
-from gnio_jax.types import InputError
+from gnio_jax.errors import InputError
 from tests.support.circle import changed, circle
 
 GOOD = circle(seconds=2.0)

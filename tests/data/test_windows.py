@@ -9,7 +9,8 @@ from scipy.spatial.transform import Rotation
 from gnio_jax.config import AugmentConfig, DataConfig
 from gnio_jax.data import augmentation as augment
 from gnio_jax.data import windows
-from gnio_jax.types import InputError, Sequence, Windows
+from gnio_jax.errors import InputError
+from gnio_jax.types import Sequence, Windows
 
 KEY = jax.random.key(3)
 CONFIG = DataConfig(rate=20.0, window_seconds=1.0, stride_seconds=0.1)

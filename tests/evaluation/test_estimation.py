@@ -7,9 +7,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from gnio_jax import evaluation
+from gnio_jax.errors import InputError
 from gnio_jax.evaluation import Network, Setup, metrics
 from gnio_jax.evaluation.estimators.integrated import mean_over_windows
-from gnio_jax.types import InputError
 from tests.support.estimators import (
     CONFIG,
     INTEGRATE,

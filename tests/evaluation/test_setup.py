@@ -6,8 +6,8 @@ import pytest
 
 from gnio_jax import evaluation, filtering
 from gnio_jax.config import DataConfig, FilterOptions
+from gnio_jax.errors import InputError
 from gnio_jax.evaluation import Setup
-from gnio_jax.types import InputError
 from tests.support.estimators import CONFIG, LOOSE
 
 

@@ -15,10 +15,11 @@ from scipy.signal import firwin
 from gnio_jax import filtering, geometry
 from gnio_jax.data.readers import synthetic
 from gnio_jax.data.resampling import resample
+from gnio_jax.errors import InputError
 from gnio_jax.filtering import Tracker, intake
 from gnio_jax.filtering import tracker as online
 from gnio_jax.filtering.clock import advance_clock
-from gnio_jax.types import InputError, Prediction
+from gnio_jax.types import Prediction
 
 DT = 0.005
 CONFIG = filtering.FilterConfig(DT, samples_per_clone=20, clones_per_window=10)

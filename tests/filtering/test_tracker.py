@@ -17,12 +17,13 @@ from scipy.spatial.transform import Rotation
 from gnio_jax import config as configuration
 from gnio_jax import filtering
 from gnio_jax.commands import console
+from gnio_jax.errors import InputError
 from gnio_jax.filtering import Tracker
 from gnio_jax.filtering import tracker as online
 from gnio_jax.filtering.clock import advance_clock
 from gnio_jax.training import checkpoint
 from gnio_jax.training.step import TrainState
-from gnio_jax.types import InputError, Prediction
+from gnio_jax.types import Prediction
 from tests.support import scekf_numpy
 
 N, CLONES, INTERVALS, DT = 4, 4, 70, 0.02

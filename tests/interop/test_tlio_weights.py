@@ -13,9 +13,9 @@ from gnio_jax import interop, models
 from gnio_jax.commands import console
 from gnio_jax.commands import interop as interop_command
 from gnio_jax.config import FilterOptions
+from gnio_jax.errors import InputError
 from gnio_jax.evaluation import filter_setup
 from gnio_jax.training import checkpoint
-from gnio_jax.types import InputError
 from tests.support import tlio_weights
 
 WEIGHTS = tlio_weights.weights()

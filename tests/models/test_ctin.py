@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from gnio_jax import models
+from gnio_jax.errors import InputError
 from gnio_jax.models import ctin
-from gnio_jax.types import InputError
 from tests.support.compiling import quick
 
 SMALL = {"width": 12, "encoder_width": 8, "ffn": 10, "heads": 2, "decoder_layers": 2}

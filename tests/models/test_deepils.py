@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from gnio_jax import models
+from gnio_jax.errors import InputError
 from gnio_jax.models import deepils
-from gnio_jax.types import InputError
 from tests.support.compiling import quick
 
 

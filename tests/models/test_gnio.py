@@ -7,9 +7,9 @@ import pytest
 from jax import lax
 
 from gnio_jax import models
+from gnio_jax.errors import InputError
 from gnio_jax.models import resnet
 from gnio_jax.models.motion_bank import MotionBank
-from gnio_jax.types import InputError
 
 
 def count(tree):

@@ -8,8 +8,8 @@ import pytest
 from scipy.special import erf
 
 from gnio_jax import models
+from gnio_jax.errors import InputError
 from gnio_jax.models import imot
-from gnio_jax.types import InputError
 from tests.support.compiling import quick
 
 SMALL = {"encoder_layers": 2, "decoder_layers": 2, "ffn_ratio": 1.5, "heads": 4, "particles": 5}

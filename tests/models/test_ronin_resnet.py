@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from gnio_jax import models
+from gnio_jax.errors import InputError
 from gnio_jax.models.resnet import ResNet18
-from gnio_jax.types import InputError
 
 
 def count(tree):

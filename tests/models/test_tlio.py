@@ -9,8 +9,8 @@ import pytest
 from flax import linen as nn
 
 from gnio_jax import interop, models
+from gnio_jax.errors import InputError
 from gnio_jax.models.tlio import FullyConnectedHead
-from gnio_jax.types import InputError
 from tests.support import tlio_weights
 
 RECORDED = Path(__file__).parents[1] / "recorded" / "tlio_tracker" / "pipeline.npz"

@@ -88,7 +88,8 @@ def write_yaml(path: Path, mount: Mount, opencv: bool = False) -> None:
     head = "%YAML:1.0\n---\n" if opencv else "#Default imu sensor yaml file\n"
     tag = " !!opencv-matrix" if opencv else ""
     path.write_text(
-        f"{head}sensor_type: imu\ncomment: VI-Sensor IMU\n\nT_BS:{tag}\n  cols: 4\n  rows: 4\n  data: [{data}]\nrate_hz: 200\n"
+        f"{head}sensor_type: imu\ncomment: VI-Sensor IMU\n\n"
+        f"T_BS:{tag}\n  cols: 4\n  rows: 4\n  data: [{data}]\nrate_hz: 200\n"
     )
 
 

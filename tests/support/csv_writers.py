@@ -58,3 +58,10 @@ def write_native(path, time=None, reference=True, spoil=None, drop=(), velocity=
         spoil(columns)
     names = [name for name in sorted(columns, reverse=True) if name not in drop]
     return write(path, names, [columns[name] for name in names])
+
+
+def compare_imu(sequence, start=0.0, atol=1e-3):
+    """The IMU is that of the known walk, which began at `start` s."""
+    known = imu(sequence.time + start)
+    np.testing.assert_allclose(sequence.gyro, known[:, :3], atol=atol)
+    np.testing.assert_allclose(sequence.accel, known[:, 3:], atol=atol)

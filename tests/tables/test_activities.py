@@ -20,14 +20,14 @@ def test_activities_by_speed():
 
 def test_figures_of_windows_by_hand():
     attention = np.array([[[1.0, 0.0], [0.5, 0.5]], [[0.0, 1.0], [0.5, 0.5]]])
-    said = activities.PredictedWindows(
+    predicted = activities.PredictedWindows(
         np.zeros((2, 3)),
         np.array([[0.3, 0, 0.4], [0.0, 0.1, 0]]),
         np.full((2, 3), np.log(0.1)),
         {"gate": np.array([[-0.2, 0.4, 9.0], [1.0, 1.0, 9.0]]), "attention": attention},
         np.array([0, 2]),
     )
-    found = activities.by_activity(said)
+    found = activities.by_activity(predicted)
     assert set(found) == {"standing", "walking"}
     assert found["standing"]["error"] == pytest.approx(0.5) and found["standing"][
         "gate"
@@ -45,14 +45,14 @@ def test_information_of_prototypes():
     activity = rng.integers(0, 4, 4000)
     attention = np.full((4000, 2, 8), 0.05)
     attention[np.arange(4000), :, activity] = 0.65
-    said = activities.PredictedWindows(
+    predicted = activities.PredictedWindows(
         *[np.zeros((4000, 3))] * 3, {"attention": attention}, activity
     )
-    told, chance = activities.information(said)
+    told, chance = activities.information(predicted)
     assert (
         told == pytest.approx(2.0, abs=0.01) and chance < 0.01
     )  # four equally frequent activities: two bits
-    names, lifts = activities.attention_by_activity(said)
+    names, lifts = activities.attention_by_activity(predicted)
     assert names == ["standing", "slow", "walking", "running"]
     np.testing.assert_array_equal(lifts.argmax(1), [0, 1, 2, 3])
     np.testing.assert_allclose(lifts[:, 4:], 1.0)

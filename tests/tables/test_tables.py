@@ -11,9 +11,9 @@ from gnio_jax import config as configuration
 from gnio_jax import models
 from gnio_jax.commands import tables as commands
 from gnio_jax.config import DataConfig, ModelConfig, OptimConfig, TrainConfig
+from gnio_jax.errors import InputError
 from gnio_jax.tables import complexity, matrix
 from gnio_jax.training import loop
-from gnio_jax.types import InputError
 from tests.support.tlio_files import write_sequence
 
 

@@ -20,9 +20,9 @@ import yaml
 from gnio_jax import config as configuration
 from gnio_jax.config import DataConfig, LossConfig, ModelConfig, OptimConfig, TrainConfig
 from gnio_jax.data import windows
+from gnio_jax.errors import InputError
 from gnio_jax.training import checkpoint, loop, optimizer, step
 from gnio_jax.training.losses import Losses
-from gnio_jax.types import InputError
 from tests.support.tlio_files import write_sequence
 
 ROOT = Path(__file__).parents[2]

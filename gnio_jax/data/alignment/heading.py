@@ -152,7 +152,7 @@ def _correlation(
     def sums(values: np.ndarray) -> np.ndarray:
         return np.bincount(signals.stretch, values)
 
-    cross = sums(both.real) + 1j * sums(both.imag)
+    cross = sums(np.real(both)) + 1j * sums(np.imag(both))
     power = sums(np.abs(felt) ** 2) * sums(np.abs(signals.tracked * inside) ** 2)
     return cross, np.sqrt(power) + 1e-9
 

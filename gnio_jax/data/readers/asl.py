@@ -12,14 +12,14 @@ import yaml
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from gnio_jax.data.readers.csv_files import in_order
 from gnio_jax.data.readers.parsing import unit_rotations
 from gnio_jax.data.readers.reference import SHORTEST_RUN, Poses
+from gnio_jax.data.readers.stamps import in_order
 from gnio_jax.data.readers.text import numbers, read_csv, shortened
 from gnio_jax.data.resampling import LONGEST_BRIDGE
 from gnio_jax.data.validation import check_finite, check_gaps, check_rate
+from gnio_jax.errors import InputError
 from gnio_jax.numerics import finite_rows
-from gnio_jax.types import InputError
 
 LONGEST_LEVER = 100.0
 """m; no sensor is further away from its body."""

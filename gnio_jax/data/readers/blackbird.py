@@ -36,8 +36,9 @@ from gnio_jax.data.validation import (
     check_rate,
     validate,
 )
+from gnio_jax.errors import InputError
 from gnio_jax.numerics import quaternions, wxyz_from_xyzw
-from gnio_jax.types import InputError, Sequence
+from gnio_jax.types import Sequence
 
 RATE = 100.0
 SPLITS = ("train", "val", "test")
@@ -142,7 +143,8 @@ DATASET = Dataset(
     splits=SPLITS,
     rate=RATE,
     source="https://github.com/mit-aera/Blackbird-Dataset",
-    layout="<root>/{train,val,test}.txt and <root>/<trajectory>/<yaw>/<speed>/<split>/{data.hdf5,stamped_groundtruth_imu.txt}",
+    layout="<root>/{train,val,test}.txt and "
+    "<root>/<trajectory>/<yaw>/<speed>/<split>/{data.hdf5,stamped_groundtruth_imu.txt}",
     licence="as stated by the authors (github.com/mit-aera/Blackbird-Dataset)",
     pedestrian=False,
 )

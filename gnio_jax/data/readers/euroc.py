@@ -39,7 +39,8 @@ from gnio_jax.data.readers.asl import Imu, SensorPose, read_imu, read_poses, sen
 from gnio_jax.data.readers.reference import Poses, fused, interpolated
 from gnio_jax.data.resampling import resample
 from gnio_jax.data.validation import validate
-from gnio_jax.types import InputError, Sequence
+from gnio_jax.errors import InputError
+from gnio_jax.types import Sequence
 
 RATE = 200.0
 VERSION = "asl 2"

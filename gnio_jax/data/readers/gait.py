@@ -188,15 +188,24 @@ def gait(
     up = up + 0.02 * stairs * np.sin(phase) + 0.006 * stairs**2 * np.cos(2 * phase)
     lever = np.array([1.0, np.cos(side), 1.0]) * carried.lever
     offset = np.stack([forward, left, up], axis=1) + lever + wander(rng, time, 3, 0.002, 0.1, 0.6)
+    swing = _swing(carried, swinging, phase, side)
+    return offset, swing + wander(rng, time, 3, np.radians(1.5), 0.05, 0.6)
 
+
+def _swing(
+    carried: Placement,
+    swinging: Float[np.ndarray, " n"],
+    phase: Float[np.ndarray, " n"],
+    side: float,
+) -> Float[np.ndarray, "n 3"]:
+    """Roll, pitch and yaw (rad) of a phone that swings with the strides of one side."""
+    stride = phase / 2.0
     roll = carried.stride_roll * swinging * np.cos(stride + side)
     pitch = swinging * (
         carried.stride_pitch * np.cos(stride + side) + carried.step_pitch * np.sin(phase + 0.5)
     )
     yaw = carried.stride_yaw * swinging * np.sin(stride + side + 0.7)
-    return offset, np.stack([roll, pitch, yaw], axis=1) + wander(
-        rng, time, 3, np.radians(1.5), 0.05, 0.6
-    )
+    return np.stack([roll, pitch, yaw], axis=1)
 
 
 def wander(

@@ -44,8 +44,9 @@ from gnio_jax.data.validation import (
     check_unit_norm,
     validate,
 )
+from gnio_jax.errors import InputError
 from gnio_jax.numerics import finite_rows, levelling, outer_span, quaternions, rotations
-from gnio_jax.types import STANDARD_G, InputError, Sequence
+from gnio_jax.types import STANDARD_G, Sequence
 
 RATE = 100.0
 VERSION = "idol 2"
@@ -83,7 +84,8 @@ def recordings(root: Path, split: str) -> list[Recording]:
         if not chosen:
             raise InputError(
                 root,
-                f"split '{split}' would be empty: {len(held)} recordings are held out for validation",
+                f"split '{split}' would be empty: {len(held)} recordings are held out for "
+                "validation",
                 "complete the data, or choose another split",
             )
     return [_recording(walk, note) for walk in chosen]
@@ -152,9 +154,9 @@ def find_walks(root: Path, folder: str) -> list[Walk]:
 def read_pieces(path: str | os.PathLike[str]) -> list[Sequence]:
     """One walk at 100 Hz: levelled, the reference turned to the phone and shifted onto its clock.
 
-    Level and lag are those of the whole walk; where a gap is longer than a window it is divided
-    (`divide_at_gaps`). Raises `InputError` naming file and column, and `Refusal` when its reference cannot
-    be that of the phone.
+    Level and lag are those of the whole walk, which is divided where a gap is longer than a window
+    (`divide_at_gaps`). Raises `InputError` naming file and column, and `Refusal` when its reference
+    cannot be that of the phone.
     """
     path = Path(path)
     rows = _rows(path)
@@ -350,7 +352,8 @@ DATASET = Dataset(
     splits=tuple(_SPLITS),
     rate=RATE,
     source="https://zenodo.org/records/4484093",
-    layout="<root>/building{1,2,3}/{train,known,unknown}/<k>.feather with metadata.json beside them",
+    layout="<root>/building{1,2,3}/{train,known,unknown}/<k>.feather "
+    "with metadata.json beside them",
     licence="CC BY 4.0",
     min_correlation=None,  # the authors' positions are smoothed: no gait is left in them
 )

@@ -41,7 +41,6 @@ from jaxtyping import Bool
 from scipy.spatial.transform import Rotation
 
 from gnio_jax.data.dataset import Dataset, Recording, single
-from gnio_jax.data.gaps import stretches
 from gnio_jax.data.readers.oxts import Motion, read_oxts
 from gnio_jax.data.readers.parsing import float_columns, parsed_as
 from gnio_jax.data.resampling import resample
@@ -52,8 +51,9 @@ from gnio_jax.data.validation import (
     check_rate,
     validate,
 )
-from gnio_jax.numerics import midpoints, quaternions, within
-from gnio_jax.types import InputError, Sequence
+from gnio_jax.errors import InputError
+from gnio_jax.numerics import midpoints, quaternions, stretches, within
+from gnio_jax.types import Sequence
 
 RATE = 100.0
 SPLITS = ("train", "val", "test")
@@ -107,7 +107,8 @@ def share_of(drive: str) -> str:
 
 
 def find_drives(root: Path) -> list[Drive]:
-    """Every drive below `root`. Raises `InputError` when there is none, or only the 10 Hz export."""
+    """Every drive below `root`. Raises `InputError` where there is none, or only the 10 Hz
+    export."""
     places = [path for depth in ("", "*/", "*/*/", "*/*/*/") for path in root.glob(f"{depth}oxts")]
     folders = _by_drive((path.parent.name, path) for path in places if path.is_dir())
     pieces = _by_drive((path.name, path) for path in root.glob("*.npz"))
@@ -237,8 +238,10 @@ DATASET = Dataset(
     recordings=recordings,
     splits=SPLITS,
     rate=RATE,
-    source="https://www.cvlibs.net/datasets/kitti/raw_data.php (the unsynced+unrectified, _extract, archives)",
-    layout="<root>/<date>/<drive>_extract/oxts/{timestamps.txt,data/*.txt} or <root>/*<drive>_extract<piece>.npz",
+    source="https://www.cvlibs.net/datasets/kitti/raw_data.php "
+    "(the unsynced+unrectified, _extract, archives)",
+    layout="<root>/<date>/<drive>_extract/oxts/{timestamps.txt,data/*.txt} or "
+    "<root>/*<drive>_extract<piece>.npz",
     licence="CC BY-NC-SA 3.0",
     pedestrian=False,
 )

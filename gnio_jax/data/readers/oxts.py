@@ -14,10 +14,10 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
-from gnio_jax.data.readers.csv_files import in_order
+from gnio_jax.data.readers.stamps import in_order
 from gnio_jax.data.readers.text import shortened
 from gnio_jax.data.validation import FASTEST, FASTEST_TURN, STRONGEST_FORCE, check_rate
-from gnio_jax.types import InputError
+from gnio_jax.errors import InputError
 
 EARTH_RADIUS = 6378137.0
 """m, of the sphere of the projection."""

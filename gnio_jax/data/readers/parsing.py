@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from gnio_jax.data.readers.text import shortened
 from gnio_jax.data.validation import check_unit_norm
+from gnio_jax.errors import InputError
 from gnio_jax.numerics import rotations
-from gnio_jax.types import InputError
 
 
 @contextmanager

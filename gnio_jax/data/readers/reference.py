@@ -128,8 +128,8 @@ def interpolated(clock: Float[np.ndarray, " m"], poses: Poses, shifted: bool) ->
     """
     assert poses.velocity is not None
     stamps, count = poses.time, len(clock)
-    nowhere = (np.full((count, width), np.nan) for width in (4, 3, 3))
-    reference = Reference(*nowhere, np.zeros(count, dtype=bool))
+    orientation, position, velocity = (np.full((count, width), np.nan) for width in (4, 3, 3))
+    reference = Reference(orientation, position, velocity, np.zeros(count, dtype=bool))
     steps = np.diff(stamps)
     broken = steps > LONGEST_BRIDGE
     if not shifted:

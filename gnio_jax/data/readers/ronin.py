@@ -38,8 +38,9 @@ from gnio_jax.data.validation import (
     check_rate,
     validate,
 )
+from gnio_jax.errors import InputError
 from gnio_jax.numerics import integrate_gyro, quaternions
-from gnio_jax.types import InputError, Sequence
+from gnio_jax.types import Sequence
 
 RATE = 200.0
 MAX_GAME_ERROR = 20.0
@@ -295,7 +296,8 @@ DATASET = Dataset(
     splits=tuple(_LISTS),
     rate=RATE,
     source="https://ronin.cs.sfu.ca (half of it is public; the lists are in https://github.com/Sachini/ronin)",
-    layout="<root>/**/<sequence>/{data.hdf5,info.json} and <root>/lists/list_{train,val,test_seen,test_unseen}.txt",
+    layout="<root>/**/<sequence>/{data.hdf5,info.json} and "
+    "<root>/lists/list_{train,val,test_seen,test_unseen}.txt",
     licence="RoNIN data licence: non-commercial research only",
     min_correlation=None,  # the chest's accelerations are not the phone's
 )

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from gnio_jax.types import InputError
+from gnio_jax.errors import InputError
 
 
 def shortened(text: object, most: int = 80) -> str:
@@ -34,19 +34,12 @@ def read_csv(
     `InputError` naming the file when it is missing, empty or no table.
     """
     path = Path(path)
-    names, skip = None, 0
     try:
-        with path.open(encoding="utf-8-sig") as file:
-            for line in file:
-                if not line.startswith("#") and line.strip():
-                    break
-                skip += 1
-                if line.startswith("#"):
-                    names = line
-            else:
-                raise InputError(path, "holds no row", "copy it again")
+        comments, first = _before_data(path)
+        names = next((line for line in reversed(comments) if line.startswith("#")), None)
+        skip = len(comments)
         if header and names is None:
-            names, skip = line, skip + 1
+            names, skip = first, skip + 1
         table = pd.read_csv(
             path,
             header=None,
@@ -59,31 +52,43 @@ def read_csv(
         )
     except OSError as error:
         raise InputError(path, f"cannot be read ({error.strerror})") from None
+    except InputError:
+        raise
     except pd.errors.EmptyDataError:
         raise InputError(path, "holds no row", "copy it again") from None
     except (UnicodeDecodeError, pd.errors.ParserError, ValueError) as error:
-        if isinstance(error, InputError):
-            raise
         raise InputError(
             path,
             f"is no table of text ({shortened(error, 200)})",
             "it may be cut short or damaged: copy it again",
         ) from None
-    if header and names is not None:
-        labels = [
-            name.strip()
-            for name in names.lstrip("#").strip().split(None if separator == " " else separator)
-        ]
-        if len(labels) == table.shape[1] + 1 and not labels[-1]:
-            labels = labels[:-1]
-        if len(labels) != table.shape[1]:
-            raise InputError(
-                path,
-                f"its header names {len(labels)} columns, its rows have {table.shape[1]}",
-                "copy it again",
-            )
-        table.columns = labels
+    if header:
+        table.columns = _labels(names or "", separator, table.shape[1], path)
     return table
+
+
+def _before_data(path: Path) -> tuple[list[str], str]:
+    """(lines of comments and blanks before the first line that is neither, that line)."""
+    before = []
+    with path.open(encoding="utf-8-sig") as file:
+        for line in file:
+            if not line.startswith("#") and line.strip():
+                return before, line
+            before.append(line)
+    raise InputError(path, "holds no row", "copy it again")
+
+
+def _labels(names: str, separator: str, width: int, path: Path) -> list[str]:
+    """The names of `width` columns."""
+    entries = names.lstrip("#").strip().split(None if separator == " " else separator)
+    labels = [entry.strip() for entry in entries]
+    if len(labels) == width + 1 and not labels[-1]:
+        labels = labels[:-1]
+    if len(labels) != width:
+        raise InputError(
+            path, f"its header names {len(labels)} columns, its rows have {width}", "copy it again"
+        )
+    return labels
 
 
 def numbers(table: pd.DataFrame, columns: Iterable[object], path: object) -> np.ndarray:
@@ -104,9 +109,9 @@ def numbers(table: pd.DataFrame, columns: Iterable[object], path: object) -> np.
                 pd.to_numeric(values.astype(str), errors="coerce"), dtype=np.float64
             )
             row = int(np.argmax(~np.isfinite(as_number.to_numpy()) & values.notna().to_numpy()))
+            cell = shortened(values.iloc[row])
             raise InputError(
-                path,
-                f"column '{name}' holds '{shortened(values.iloc[row])}' in its row {row + 1}, no number",
+                path, f"column '{name}' holds '{cell}' in its row {row + 1}, no number"
             ) from None
     return np.stack(out, axis=1)
 
@@ -141,9 +146,9 @@ def listed(
             f"expected layout: {layout}",
         )
     if absent:
+        some = ", ".join([*map(shortened, absent[:3]), *(["..."] if len(absent) > 3 else [])])
         warnings.warn(
-            f"{path}: {len(absent)} of {len(entries)} listed sequences are absent: {', '.join(map(shortened, absent[:3]))}"
-            f"{', ...' if len(absent) > 3 else ''}",
+            f"{path}: {len(absent)} of {len(entries)} listed sequences are absent: {some}",
             stacklevel=3,
         )
     return present

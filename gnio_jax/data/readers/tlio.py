@@ -29,8 +29,9 @@ from gnio_jax.data.validation import (
     check_unit_norm,
     validate,
 )
+from gnio_jax.errors import InputError
 from gnio_jax.numerics import rotations, wxyz_from_xyzw
-from gnio_jax.types import InputError, Sequence
+from gnio_jax.types import Sequence
 
 RATE = 200.0
 _TABLE = "imu0_resampled.npy"
@@ -163,6 +164,7 @@ DATASET = Dataset(
     splits=tuple(_LISTS),
     rate=RATE,
     source="https://github.com/CathIAS/TLIO (its README links the data)",
-    layout="<root>/{train,val,test}_list.txt and <root>/<sequence>/{imu0_resampled.npy,imu0_resampled_description.json}",
+    layout="<root>/{train,val,test}_list.txt and "
+    "<root>/<sequence>/{imu0_resampled.npy,imu0_resampled_description.json}",
     licence="CC BY-NC 4.0",
 )

@@ -42,9 +42,9 @@ SHORTEST = 16
 class Measurements(NamedTuple):
     """Displacements given to the filter, a row per stride; NaN where there is none."""
 
-    displacement: Float[np.ndarray, "k 3"]
+    displacement: Float[Array, "k 3"]
     """m, in the yaw frame of the window's start."""
-    std: Float[np.ndarray, "k 3"]
+    std: Float[Array, "k 3"]
     """m."""
 
 
@@ -81,9 +81,9 @@ def run_filters(
     found: dict[int, Estimate] = {}
     for batch in batches(strides, batch_size):
         history = _run_batch([prepared[i] for i in batch.members], batch, source, setup)
-        for place, i in enumerate(batch.members):
+        for place, i in enumerate(dict.fromkeys(batch.members)):
             own = jax.tree.map(lambda leaf, p=place, k=strides[i]: leaf[p, :k], history)
-            found.setdefault(i, _estimate(prepared[i], own, setup))
+            found[i] = _estimate(prepared[i], own, setup)
         progress(sum(strides[i] for i in found) / sum(strides))
     return [found[i] for i in range(len(prepared))]
 

@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 from gnio_jax import data
 from gnio_jax.data.plausibility import self_check
 from gnio_jax.data.readers import euroc
+from gnio_jax.errors import InputError
 from gnio_jax.numerics import rotations
-from gnio_jax.types import InputError
 from tests.support import asl_files as files
 from tests.support import known_walk
 

@@ -12,11 +12,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from gnio_jax import data
-from gnio_jax.data import alignment
 from gnio_jax.data.dataset import Refusal
 from gnio_jax.data.readers import idol
+from gnio_jax.errors import InputError
 from gnio_jax.numerics import rotations
-from gnio_jax.types import InputError
 from tests.support import known_walk as walk
 from tests.support.idol_files import BIAS, EPOCH, RIG_OF_PHONE, frame, write
 
@@ -121,8 +120,8 @@ def test_a_piece_shorter_than_a_window_is_lost_and_the_other_keeps_the_name(tmp_
     table = pd.concat([table, frame(seconds=walk.SECONDS, lag=0.1, start=16.02)])
     message = (
         r"14\.feather: field 'time' has gaps longer than 1 s \(1, up to 15\.9 s\); kept: 35\.9 of "
-        r"51\.9 s, building3_known_14 \(16\.0 to 51\.9 s\); lost: 15\.9 s in gaps, 0\.1 s in pieces "
-        r"without a whole window"
+        r"51\.9 s, building3_known_14 \(16\.0 to 51\.9 s\); lost: 15\.9 s in gaps, 0\.1 s in "
+        r"pieces without a whole window"
     )
     with pytest.warns(UserWarning, match=message):
         sequence = read_whole(write(tmp_path, table, "building3/known", 14))
@@ -207,7 +206,6 @@ def test_without_core_motion_there_is_no_device_orientation(tmp_path):
 
 
 # --- splits
-# ----------------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -310,7 +308,6 @@ def test_copies_gone_wrong(copy):
 
 
 # --- mistakes
-# --------------------------------------------------------------------------------------------------------
 
 
 def setting(name, row, value):
@@ -402,32 +399,6 @@ def test_without_pyarrow_it_says_what_to_install(tmp_path, monkeypatch):
         InputError, match=r"3\.feather: feather files need pyarrow.*pip install 'gnio-jax\[idol\]'"
     ):
         read_whole(path)
-
-
-# --- the lag alone
-# ---------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("lag", [-0.12, 0.0, 0.033, 0.187])
-def test_lag_from_noisy_rates_with_a_bias(lag):
-    noise = np.random.default_rng(1)
-    time = np.arange(0, 60, 0.01)
-    gyro = walk.rate(time) + BIAS + noise.normal(0, 0.02, (len(time), 3))
-    gyro[2000:2020] += 8.0  # a knock
-    poses = walk.attitude(time - lag) * Rotation.from_rotvec(
-        noise.normal(0, np.radians(0.05), (len(time), 3))
-    )
-    keep = (time < 30) | (time > 30.4)
-    fit = alignment.pose_lag(time, gyro, time[keep], poses[keep])
-    assert fit.lag == pytest.approx(lag, abs=3e-3) and fit.correlation > 0.5
-
-
-def test_what_stands_still_has_no_lag():
-    time = np.arange(0, 20, 0.01)
-    gyro = np.full((len(time), 3), 0.01) + np.random.default_rng(0).normal(0, 0.005, (len(time), 3))
-    assert alignment.pose_lag(time, gyro, time, Rotation.identity(len(time))) == alignment.PoseLag(
-        0.0, 1.0
-    )
 
 
 def test_one_wild_stamp_costs_one_row(tmp_path):

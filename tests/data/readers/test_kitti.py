@@ -11,8 +11,8 @@ import pytest
 from gnio_jax import data
 from gnio_jax.data.plausibility import self_check
 from gnio_jax.data.readers import kitti
+from gnio_jax.errors import InputError
 from gnio_jax.numerics import rotations
-from gnio_jax.types import InputError
 from tests.support import kitti_files as files
 from tests.support import known_walk
 

@@ -13,14 +13,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from gnio_jax import data, numerics
-from gnio_jax.data import alignment
+from gnio_jax import data
 from gnio_jax.data.dataset import Refusal
 from gnio_jax.data.plausibility import self_check
 from gnio_jax.data.readers import oxiod
 from gnio_jax.data.reading import read_recording
+from gnio_jax.errors import InputError
 from gnio_jax.numerics import rotations
-from gnio_jax.types import InputError
 from tests.support import oxiod_files as files
 
 
@@ -542,51 +541,7 @@ def test_a_plain_script_starts_no_processes(copy, tmp_path):
     assert done.stdout.split() == ["handheld_data5_1", "running_data1_7"]
 
 
-# --- parts
-# -----------------------------------------------------------------------------------------------------------
-
-
-def test_follow_ignores_flips_and_bridges_gaps():
-    n, step = 4000, 0.01
-    time = np.arange(n) * step
-    truth = files.Truth()
-    known = files.attitude(time, truth)
-    integrated = numerics.integrate_gyro(
-        files.rate(time, truth) + np.array([0.01, -0.005, 0.012]), step
-    )
-    measured = known * Rotation.from_rotvec(np.random.default_rng(0).normal(0, 0.002, (n, 3)))
-    quaternion = measured.as_quat()
-    quaternion[500:600] = (
-        measured[500:600] * Rotation.from_euler("x", 120, degrees=True)
-    ).as_quat()
-    good = np.ones(n, dtype=bool)
-    good[2000:2150] = False
-    quaternion[2000:2150] = [0, 0, 0, 1]
-    found, believed = alignment.fuse_attitude(
-        integrated, Rotation.from_quat(quaternion), good, step
-    )
-    assert np.degrees((found * known.inv()).magnitude()).max() < 0.5
-    assert not believed[500:600].any() and believed[:490].all() and not believed[2000:2150].any()
-
-
-def test_smooth_positions_keeps_a_gait_and_drops_jumps():
-    step = 0.01
-    time = np.arange(3000) * step
-    truth = files.Truth()
-    known = files.position(time, truth)
-    measured = known + np.random.default_rng(0).normal(0, 2e-4, known.shape)
-    good = np.ones(len(time), dtype=bool)
-    measured[1000:1002] += 0.3
-    good[2000:2015] = False
-    measured[2000:2015] = 0
-    found, velocity, believed = alignment.smooth_positions(measured, good, step)
-    assert np.abs(found - known).max() < 2e-3
-    assert np.abs(velocity - files.velocity(time, truth))[5:-5].max() < 0.03
-    assert not believed[1000:1002].any() and not believed[2000:2015].any() and believed[:950].all()
-
-
 # --- real recordings
-# -------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.recordings

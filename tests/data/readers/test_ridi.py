@@ -12,8 +12,8 @@ from gnio_jax import data
 from gnio_jax.data.dataset import Refusal
 from gnio_jax.data.plausibility import self_check
 from gnio_jax.data.readers import ridi
+from gnio_jax.errors import InputError
 from gnio_jax.numerics import rotations
-from gnio_jax.types import InputError
 from tests.support import known_walk as walk
 from tests.support.ridi_files import (
     BOOT,

@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from gnio_jax import data
 from gnio_jax.data.readers import ronin
+from gnio_jax.errors import InputError
 from gnio_jax.numerics import rotations
-from gnio_jax.types import InputError
 from tests.support import known_walk as walk
 from tests.support.ronin_files import (
     FIRST,

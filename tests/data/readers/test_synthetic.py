@@ -5,7 +5,7 @@ import pytest
 
 from gnio_jax import data
 from gnio_jax.data.readers import synthetic
-from gnio_jax.types import InputError
+from gnio_jax.errors import InputError
 
 
 @pytest.fixture(scope="module")

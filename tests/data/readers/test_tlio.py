@@ -8,7 +8,7 @@ import pytest
 
 from gnio_jax import data
 from gnio_jax.data.readers import tlio
-from gnio_jax.types import InputError
+from gnio_jax.errors import InputError
 from tests.support.tlio_files import (
     COLUMNS,
     N,

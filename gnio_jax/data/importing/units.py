@@ -1,0 +1,161 @@
+"""Units and signs that a logger's data tell, or that are refused as ambiguous."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from scipy.ndimage import gaussian_filter1d
+
+from gnio_jax.data.importing.streams import Joined
+from gnio_jax.errors import InputError
+from gnio_jax.numerics import interpolate
+from gnio_jax.types import GRAVITY, STANDARD_G
+
+TO_RAD_PER_SECOND = {"rad/s": 1.0, "deg/s": np.pi / 180.0}
+TO_METRES_PER_SECOND_SQUARED = {"m/s2": 1.0, "g": STANDARD_G, "mg": STANDARD_G * 1e-3}
+SIGNS = ("android", "ios", "detect")
+
+GRAVITY_RANGES = {"m/s2": (7.0, 13.0), "g": (0.7, 1.3), "mg": (700.0, 1300.0)}
+"""Median magnitude of the accelerometer, by which its unit is told."""
+GYRO_RANGE = 35.0
+"""rad/s: no phone's gyro measures beyond 2000 deg/s."""
+CARRIED_TURN = 10.0
+"""deg/s: what somebody carries turns faster than this at times."""
+STEPS = 1.0
+"""m/s²: steps make the magnitude of the specific force vary by more (standard deviation)."""
+
+
+def accel_scale(
+    accel: Float[np.ndarray, "n 3"], unit: str | None, path: Path, notes: list[str]
+) -> float:
+    """m/s² of one unit; None detects the unit. Raises `InputError` where it is ambiguous."""
+    if unit is not None:
+        return TO_METRES_PER_SECOND_SQUARED[unit]
+    size = float(np.median(np.linalg.norm(accel, axis=1)))
+    fitting = [name for name, (low, high) in GRAVITY_RANGES.items() if low <= size <= high]
+    if not fitting:
+        raise InputError(
+            path,
+            f"the unit of field 'accel' is ambiguous (median magnitude {size:.3g})",
+            "state it, and give the specific force, gravity included",
+        )
+    notes.append(f"{path.name}: accel taken as {fitting[0]} (median magnitude {size:.3g})")
+    return TO_METRES_PER_SECOND_SQUARED[fitting[0]]
+
+
+def gyro_scale(imu: Joined, unit: str | None, path: Path, notes: list[str]) -> float:
+    """rad/s of one unit; None detects the unit. `imu.accel` is in m/s².
+
+    Beyond `GYRO_RANGE` it is deg/s; else the turning of gravity in the accelerometer tells where
+    there is enough of it; else, if steps shake the recording, what never exceeds `CARRIED_TURN` is
+    rad/s. Raises `InputError` where it is ambiguous.
+    """
+    if unit is not None:
+        return TO_RAD_PER_SECOND[unit]
+    peak = float(np.percentile(np.linalg.norm(imu.gyro, axis=1), 99.9))
+    turning = _turning_of_gravity(imu)
+    share, degrees = turning.slope, turning.slope / TO_RAD_PER_SECOND["deg/s"]
+    if peak > GYRO_RANGE:
+        unit, reason = "deg/s", f"it reaches {peak:.3g}, beyond any phone's range in rad/s"
+    elif turning.correlation > 0.5 and 0.5 < share < 2.0:
+        unit, reason = "rad/s", f"gravity turns by {share:.2f} of it"
+    elif turning.correlation > 0.5 and 0.5 < degrees < 2.0:
+        unit, reason = "deg/s", f"gravity turns by {share:.3f} of it"
+    elif peak <= CARRIED_TURN and float(np.linalg.norm(imu.accel, axis=1).std()) > STEPS:
+        unit, reason = (
+            "rad/s",
+            f"it reaches {peak:.3g}, and what is carried turns faster than {CARRIED_TURN:g} deg/s",
+        )
+    else:
+        raise InputError(
+            path,
+            f"the unit of field 'gyro' is ambiguous (it reaches {peak:.3g})",
+            "state it: rad/s or deg/s",
+        )
+    notes.append(f"{path.name}: gyro taken as {unit} ({reason})")
+    return TO_RAD_PER_SECOND[unit]
+
+
+class _Turning(NamedTuple):
+    """The change of the smoothed specific force over a second against −∫ω × f."""
+
+    slope: float
+    """1 where ω is in rad/s; 0 where gravity does not turn."""
+    correlation: float
+
+
+def _turning_of_gravity(imu: Joined) -> _Turning:
+    step = float(np.median(np.diff(imu.time)))
+    clock = np.arange(imu.time[0], imu.time[-1], step)
+    if len(clock) < 3.0 / step:
+        return _Turning(0.0, 0.0)
+    force, rate = (
+        gaussian_filter1d(interpolate(clock, imu.time, values), 0.5 / step, axis=0)
+        for values in (imu.accel, imu.gyro)
+    )
+    # A bias turns the same way all the time; what moves about its median is motion.
+    rate = rate - np.median(rate, axis=0)
+    turned = np.cumsum(-np.cross(rate, force), axis=0) * step
+    turned = np.concatenate([np.zeros((1, 3)), turned])[:-1]
+    second = max(round(1.0 / step), 1)
+    change, expected = force[second:] - force[:-second], turned[second:] - turned[:-second]
+    power, strength = float((expected**2).sum()), float((change**2).sum())
+    # Where gravity has not moved there is only noise and vibration.
+    if power == 0.0 or strength / len(change) < 0.1**2:
+        return _Turning(0.0, 0.0)
+    both = float((change * expected).sum())
+    return _Turning(both / power, both / np.sqrt(power * strength))
+
+
+def signed(
+    accel: Float[np.ndarray, "n 3"], sign: str, path: Path, notes: list[str]
+) -> Float[np.ndarray, "n 3"]:
+    """`accel` with Android's sign: at rest, level, the up axis reads +1 g.
+
+    `sign` "ios" negates it, "detect" assumes that the screen (+z) points up more than down. Raises
+    `InputError` where that is ambiguous.
+    """
+    if sign == "detect":
+        up = float(np.median(accel[:, 2]) / np.median(np.linalg.norm(accel, axis=1)))
+        if abs(up) < 0.5:
+            raise InputError(
+                path,
+                f"the sign of field 'accel' is ambiguous (its z axis carries {up:.2f} of gravity)",
+                "state it: android or ios",
+            )
+        sign, name = ("android", "Android") if up > 0 else ("ios", "iOS")
+        notes.append(
+            f"{path.name}: accel taken with {name}'s sign, assuming that the screen points up"
+        )
+    if sign == "ios":
+        notes.append(f"{path.name}: accel negated (iOS's sign)")
+    return -accel if sign == "ios" else accel
+
+
+def note_gravity(imu: Joined, path: Path, notes: list[str]) -> None:
+    """What the quietest second says of gravity. Raises `InputError` where that is far off."""
+    accel = imu.accel
+    second = min(max(round(1.0 / float(np.median(np.diff(imu.time)))), 2), len(accel))
+    starts = range(0, len(accel) - second + 1, max(second // 2, 1))
+    seconds = [accel[start : start + second] for start in starts]
+    quietest = min(seconds, key=lambda rows: float(rows.var(axis=0).sum())).mean(axis=0)
+    axis = int(np.argmax(np.abs(quietest)))
+    force = float(np.linalg.norm(quietest))
+    upward = f"{'-' if quietest[axis] < 0 else '+'}{'xyz'[axis]}"
+    notes.append(
+        f"{path.name}: in the quietest second accel reads {force:.2f} m/s², mostly on {upward}"
+    )
+    if abs(force - GRAVITY) > 2.0:
+        raise InputError(
+            path,
+            f"field 'accel' reads {force:.2f} m/s² in its quietest second, far from gravity",
+            "check its unit, and that gravity is in it",
+        )
+    if abs(force - GRAVITY) > 0.5:
+        notes.append(
+            f"{path.name}: that is off gravity by {force - GRAVITY:+.2f} m/s²: "
+            "the accelerometer may need calibration"
+        )
