@@ -25,9 +25,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.spatial.transform import Rotation
 
 from gnio_jax import geometry
+from gnio_jax.numerics import about_z, finite_rows, rotations, yaw
 from gnio_jax.types import Array
 
 Rotations = Float[np.ndarray, "m 3 3"]
@@ -161,10 +161,10 @@ def cut_window(
         gyro, accel = rates, accel - accel_bias[None]
     turns = jax.vmap(geometry.exp, out_axes=2)(rates[cut.propagating] * dt)
     first = geometry.yaw_rotation(rotation).T @ rotation
-    rotations = geometry.cumulative_rotation(first, turns)
+    attitudes = geometry.cumulative_rotation(first, turns)
     # Samples lie along the last axis: sums over three that XLA fuses, as everywhere in the filter.
-    rotations = jnp.broadcast_to(rotations, (3, 3, len(gyro)))
-    signals = geometry.matmul(rotations, jnp.stack([accel.T, gyro.T], axis=1))
+    attitudes = jnp.broadcast_to(attitudes, (3, 3, len(gyro)))
+    signals = geometry.matmul(attitudes, jnp.stack([accel.T, gyro.T], axis=1))
     return signals.transpose(2, 1, 0).reshape(-1, 6)
 
 
@@ -183,18 +183,12 @@ def true_displacement(
     orientation quaternions wxyz, body → world; position m, in the world. NaN where either is NaN.
     """
     moved = position[start + length] - position[start]
-    known = np.isfinite(orientation[start]).all(axis=1)
-    quaternions = np.where(known[:, None], orientation[start], [1.0, 0.0, 0.0, 0.0])
-    attitude = Rotation.from_quat(quaternions, scalar_first=True).as_matrix()
-    local = np.einsum("mij,mj->mi", remove_yaw(attitude), moved)
+    known = finite_rows(orientation[start])
+    attitude = rotations(np.where(known[:, None], orientation[start], [1.0, 0.0, 0.0, 0.0]))
+    local = np.einsum("mij,mj->mi", remove_yaw(attitude.as_matrix()), moved)
     return np.where(known[:, None], local, np.nan)
-
-
-def yaw_of(rotation: Rotations) -> Float[np.ndarray, "m"]:
-    """Yaw of body → world rotations, rad: atan2(R[1,0], R[0,0])."""
-    return np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0])
 
 
 def remove_yaw(rotation: Rotations) -> Rotations:
     """R_γ(R)ᵀ: from the world to the frame in which `rotation` has zero yaw."""
-    return Rotation.from_rotvec(np.outer(yaw_of(rotation), [0, 0, -1])).as_matrix()
+    return about_z(-yaw(rotation)).as_matrix()

@@ -13,10 +13,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int, PRNGKeyArray
-from scipy.spatial.transform import Rotation
 
 from gnio_jax.config import DataConfig
 from gnio_jax.errors import InputError
+from gnio_jax.numerics import rotations, yaw
 from gnio_jax.types import Array, Sequence, Windows
 from gnio_jax.windows import (
     Starts,
@@ -25,7 +25,6 @@ from gnio_jax.windows import (
     true_displacement,
     window_rows,
     window_starts,
-    yaw_of,
 )
 
 
@@ -91,25 +90,25 @@ def _source_of(sequence: Sequence, start: Starts, config: DataConfig, stride: in
     """One recording's windows, rows and numbers counted from 0."""
     # An invalid row may hold NaN; no window touches it, so any rotation will do there.
     orientation = np.where(sequence.valid[:, None], sequence.orientation, [1.0, 0.0, 0.0, 0.0])
-    attitude = Rotation.from_quat(orientation, scalar_first=True).as_matrix()
+    attitude = rotations(orientation).as_matrix()
     imu, rotation = align_recording(
         sequence.accel, sequence.gyro, attitude, start, config.window_rotation
     )
     displacement = true_displacement(orientation, sequence.position, start, config.window)
-    yaw = yaw_of(attitude[start])
+    heading = yaw(attitude[start])
     return WindowSource(
         imu=imu,
         start=start.astype(np.int32),
         rotation=rotation,
         displacement=displacement.astype(np.float32),
         step=np.diff(sequence.position, axis=0, append=np.nan).astype(np.float32),
-        unyaw=np.column_stack([np.cos(yaw), np.sin(yaw)]).astype(np.float32),
+        unyaw=np.column_stack([np.cos(heading), np.sin(heading)]).astype(np.float32),
         visited=np.flatnonzero(start % stride == 0).astype(np.int32),
     )
 
 
 def gather(source: WindowSource, which: Int[jax.Array, "b"], length: int) -> Windows:
-    """The windows number `which` of `source`, each `length` samples, in their own frames. Jittable."""
+    """Windows number `which` of `source`, each `length` samples, in their own frames. Jittable."""
     start = source.start[which]
     cosine, sine = source.unyaw[which][:, :, None].swapaxes(0, 1)
     # The compiler drops the steps where nobody looks at them.

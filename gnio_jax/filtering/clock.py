@@ -30,7 +30,7 @@ class Clock(NamedTuple):
     """That sample: gyro rad/s, accel m/s²."""
 
 
-def resample(
+def advance_clock(
     clock: Clock | None, time: float, sample: tuple[float, ...], dt: float, hole: float
 ) -> tuple[Clock, list[GridSample]]:
     """The clock after one sample (gyro, accel; any NaN: missing), and the grid samples that are

@@ -8,20 +8,7 @@ filter's error e ~ N(0, P) after step k, what the later measurements say of it i
 
     e | all ~ N(−P λ, P − P Λ P),
 
-and the adjoint λ, Λ runs backwards from zero. Back over an update with S = L Lᵀ, M = L⁻¹ H, Y = M
-P,
-
-    λ ← λ − Mᵀ (Y λ + L⁻¹ r),   Λ ← (I − Yᵀ M)ᵀ Λ (I − Yᵀ M) + Mᵀ M,
-
-and over a propagation with the augmented transition F, which puts the core's pose into a slot of
-the ring over the oldest clone,
-
-    λ ← Fᵀ λ,   Λ ← Fᵀ Λ F:
-
-what the later measurements say of the clone goes over onto the pose, and of the clone that it
-displaced they say nothing. What the filter did not apply leaves no term, and what it weighed has
-that weight. No measurement touches the anchor, so λ and Λ are zero there and leave it out: the
-growing variance of the position meets only differences.
+and the adjoint λ, Λ runs backwards from zero over updates and propagations (see `adjoint`).
 
 Everything is linear about the filter's own estimates, as in any extended smoother: Jacobians are
 not taken anew at the smoothed ones, and that R ← exp(δθ) R turns the frame of the rotation's error
@@ -36,10 +23,16 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Float, Int
 
 from gnio_jax import geometry
+from gnio_jax.filtering.adjoint import (
+    Adjoint,
+    before_propagation,
+    before_update,
+    no_adjoint,
+    without_anchor,
+)
 from gnio_jax.filtering.checkpointing import join_blocks, split_blocks
 from gnio_jax.filtering.checks import checked_array
 from gnio_jax.filtering.config import FilterConfig, YawFrame
@@ -52,11 +45,9 @@ from gnio_jax.filtering.scan import interval_inputs
 from gnio_jax.filtering.state import (
     ACCEL_BIAS,
     ANCHOR,
-    BIASES,
     CLONE,
     GYRO_BIAS,
     LOCAL,
-    MOVE,
     OFFSET,
     THETA,
     VELOCITY,
@@ -64,12 +55,8 @@ from gnio_jax.filtering.state import (
     Mean,
 )
 from gnio_jax.filtering.step import StepTrace, traced_clone_step
-from gnio_jax.filtering.update import Correction
 from gnio_jax.geometry import matmul
 from gnio_jax.types import Array
-
-_ADJOINT_CORE = LOCAL.stop + 3
-"""Core entries of the adjoint: θ, v, o, b_g, b_a and the anchor's last move."""
 
 
 class SmoothedHistory(NamedTuple):
@@ -150,13 +137,6 @@ def smooth_odometry(
     return _smooth(state, signals, displacement, covariance, config, noise, frame)
 
 
-class _Adjoint(NamedTuple):
-    """λ and Λ over θ, v, o, b_g, b_a, s and the ring of clones."""
-
-    vector: Float[Array, "m"]
-    matrix: Float[Array, "m m"]
-
-
 class _Inputs(NamedTuple):
     """What a step forward takes, or K of them stacked."""
 
@@ -204,14 +184,11 @@ def _smooth(
     inputs = _Inputs(numbers % config.clones, by_interval, measurements)
     forward = functools.partial(_forward, config=config, noise=noise, frame=frame)
     backward = functools.partial(_backward, config=config)
-    size = _ADJOINT_CORE + CLONE * config.clones
-    nothing = _Adjoint(
-        jnp.zeros(size, displacement.dtype), jnp.zeros((size,) * 2, displacement.dtype)
-    )
+    nothing = no_adjoint(config.clones, displacement.dtype)
 
     def there_and_back(
-        state: FilterState, adjoint: _Adjoint, inputs: _Inputs
-    ) -> tuple[_Adjoint, _Smoothed]:
+        state: FilterState, adjoint: Adjoint, inputs: _Inputs
+    ) -> tuple[Adjoint, _Smoothed]:
         _, steps = jax.lax.scan(forward, state, inputs)
         return jax.lax.scan(backward, adjoint, steps, reverse=True)
 
@@ -224,10 +201,10 @@ def _smooth(
 
 
 def _smooth_in_blocks(
-    there_and_back: Callable[..., tuple[_Adjoint, _Smoothed]],
+    there_and_back: Callable[..., tuple[Adjoint, _Smoothed]],
     forward: Callable,
     state: FilterState,
-    adjoint: _Adjoint,
+    adjoint: Adjoint,
     inputs: _Inputs,
     every: int,
 ) -> _Smoothed:
@@ -239,7 +216,7 @@ def _smooth_in_blocks(
     def filter_block(state: FilterState, block: _Inputs) -> tuple[FilterState, FilterState]:
         return jax.lax.scan(forward, state, block)[0], state
 
-    def smooth_block(adjoint: _Adjoint, start: tuple) -> tuple[_Adjoint, _Smoothed]:
+    def smooth_block(adjoint: Adjoint, start: tuple) -> tuple[Adjoint, _Smoothed]:
         state, block = start
         return there_and_back(state, adjoint, block)
 
@@ -270,18 +247,13 @@ def _forward(
         part[LOCAL].at[OFFSET].add(part[ANCHOR])
         for part in map(jnp.asarray, (state.core_covariance, state.cross_covariance))
     )
-    cross = jnp.concatenate([_without_anchor(core), clones], axis=1)
+    cross = jnp.concatenate([without_anchor(core), clones], axis=1)
     return state, _ForwardStep(inputs.slot, record.mean, record.covariance, cross, trace)
 
 
-def _without_anchor(rows: Float[Array, "r 21"]) -> Float[Array, "r 18"]:
-    """Columns of the core that the adjoint runs over."""
-    return jnp.concatenate([rows[:, LOCAL], rows[:, MOVE]], axis=1)
-
-
 def _backward(
-    adjoint: _Adjoint, step: _ForwardStep, config: FilterConfig
-) -> tuple[_Adjoint, _Smoothed]:
+    adjoint: Adjoint, step: _ForwardStep, config: FilterConfig
+) -> tuple[Adjoint, _Smoothed]:
     """The smoothed estimate after a step, and the adjoint before it."""
     over = step.cross @ adjoint.matrix
     error = -(step.cross @ adjoint.vector)
@@ -292,8 +264,8 @@ def _backward(
     smoothed = _Smoothed(_corrected(step.mean, error), covariance)
     oldest = CLONE * ((step.slot + 1) % config.clones)
     for correction in reversed(step.trace.corrections):
-        adjoint = _before_update(adjoint, correction, oldest)
-    return _before_propagation(adjoint, step.trace.transition, step.slot), smoothed
+        adjoint = before_update(adjoint, correction, oldest)
+    return before_propagation(adjoint, step.trace.transition, step.slot), smoothed
 
 
 def _corrected(mean: Mean, error: Float[Array, "15"]) -> Mean:
@@ -305,62 +277,6 @@ def _corrected(mean: Mean, error: Float[Array, "15"]) -> Mean:
         gyro_bias=mean.gyro_bias + error[GYRO_BIAS],
         accel_bias=mean.accel_bias + error[ACCEL_BIAS],
     )
-
-
-def _before_update(adjoint: _Adjoint, correction: Correction, oldest: Int[Array, ""]) -> _Adjoint:
-    """See the head of the file; `oldest` is where the oldest clone lies among the clones."""
-    core_rows, core_jacobian = map(
-        _without_anchor, (correction.core_rows, correction.core_jacobian)
-    )
-    rows = jnp.concatenate([core_rows, correction.clone_rows], axis=1)
-    jacobian = jax.lax.dynamic_update_slice_in_dim(
-        jnp.concatenate([core_jacobian, jnp.zeros_like(correction.clone_rows)], axis=1),
-        correction.oldest_jacobian,
-        _ADJOINT_CORE + oldest,
-        1,
-    )
-    over = rows @ adjoint.matrix
-    # Λ − Mᵀ G − Gᵀ M with G = Y Λ − ½ (Y Λ Yᵀ + I) M
-    half = 0.5 * (matmul(over, rows.T) + np.eye(3, dtype=over.dtype))
-    gain = over - matmul(half, jacobian)
-    return _Adjoint(
-        adjoint.vector - jacobian.T @ (rows @ adjoint.vector + correction.whitened),
-        adjoint.matrix - matmul(jacobian.T, gain) - matmul(gain.T, jacobian),
-    )
-
-
-def _before_propagation(
-    adjoint: _Adjoint, transition: Float[Array, "9 15"], slot: Int[Array, ""]
-) -> _Adjoint:
-    """Back over cloning into `slot`, the motion and, in slot 0, the anchor's move before it."""
-    core = _core_transition(transition, slot)
-    pose = jnp.concatenate([core[THETA], core[OFFSET]])  # what the clone is made of
-
-    def back(rows: Float[Array, "m r"]) -> Float[Array, "m r"]:
-        of_core, of_clones = rows[:_ADJOINT_CORE], rows[_ADJOINT_CORE:]
-        clone = jax.lax.dynamic_slice_in_dim(of_clones, CLONE * slot, CLONE)
-        moved = jnp.concatenate([core, pose]).T @ jnp.concatenate([of_core, clone])
-        forgotten = jnp.zeros_like(clone)
-        of_clones = jax.lax.dynamic_update_slice_in_dim(of_clones, forgotten, CLONE * slot, 0)
-        return jnp.concatenate([moved, of_clones])
-
-    return _Adjoint(back(adjoint.vector[:, None])[:, 0], back(back(adjoint.matrix).T))
-
-
-def _core_transition(
-    transition: Float[Array, "9 15"], slot: Int[Array, ""]
-) -> Float[Array, "18 18"]:
-    """F of θ, v, o, b_g, b_a, s: in slot 0 the offset has become the anchor's last move."""
-    dtype = transition.dtype
-    anchored = (slot == 0).astype(dtype)
-    eye = np.eye(3, dtype=dtype)
-    of_motion = jnp.pad(transition, ((0, 0), (0, 3)))
-    of_biases = np.eye(_ADJOINT_CORE, dtype=dtype)[BIASES]
-    before_offset, between = jnp.zeros((3, OFFSET.start), dtype), jnp.zeros((3, 6), dtype)
-    of_move = jnp.concatenate(
-        [before_offset, anchored * eye, between, (1 - anchored) * eye], axis=1
-    )
-    return jnp.concatenate([of_motion, of_biases, of_move])
 
 
 def _smoothed_history(smoothed: _Smoothed, config: FilterConfig) -> SmoothedHistory:

@@ -22,7 +22,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gnio_jax.filtering.clock import Clock, GridSample, resample
+from gnio_jax.filtering.clock import Clock, GridSample, advance_clock
 from gnio_jax.filtering.clones import unroll_clones
 from gnio_jax.filtering.config import FilterConfig
 from gnio_jax.filtering.inputs import checked_noise, checked_state
@@ -156,7 +156,7 @@ class Tracker:
         self._intake, events = low_pass_sample(self._intake, stamp, sample, low_pass)
         newest_pose = None
         for event in events:
-            self._clock, rows = resample(self._clock, *event, low_pass.dt, low_pass.hole)
+            self._clock, rows = advance_clock(self._clock, *event, low_pass.dt, low_pass.hole)
             before = self._clock.count - len(rows)
             for number, row in enumerate(rows, start=before + 1):
                 newest_pose = self._push_grid_sample(row, number) or newest_pose

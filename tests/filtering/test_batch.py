@@ -67,7 +67,10 @@ def test_gradient_of_what_is_shared_sums_over_the_sequences():
 )
 @pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="no affinity on this system")
 def test_cores_as_devices(flags, devices):
-    script = f"import os, jax; from gnio_jax import filtering; filtering.cores_as_devices(); assert len(jax.devices()) == {devices}"
+    script = (
+        "import os, jax; from gnio_jax import filtering; filtering.cores_as_devices(); "
+        f"assert len(jax.devices()) == {devices}"
+    )
     environment = os.environ | {"JAX_PLATFORMS": "cpu", "XLA_FLAGS": flags}
     done = subprocess.run(
         [sys.executable, "-c", script], env=environment, capture_output=True, text=True

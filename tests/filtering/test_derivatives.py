@@ -211,9 +211,9 @@ HOSTILE = quick(
 
 def hostile(kind):
     x = point(MEASURED.copy())
-    if (
-        kind == "rest"
-    ):  # nothing turns, nothing moves, every innovation is small: each norm in the filter is at its singular point
+    if kind == "rest":
+        # Nothing turns, nothing moves, every innovation is small: each norm in the filter is at its
+        # singular point.
         x |= dict(
             gyro=np.zeros_like(x["gyro"]),
             accel=np.tile([0.0, 0.0, 9.81], (len(x["gyro"]), 1)),

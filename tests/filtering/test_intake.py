@@ -18,6 +18,7 @@ from gnio_jax.data.resampling import resample
 from gnio_jax.errors import InputError
 from gnio_jax.filtering import Tracker, intake
 from gnio_jax.filtering import tracker as online
+from gnio_jax.filtering.clock import advance_clock
 from gnio_jax.types import Prediction
 
 DT = 0.005
@@ -34,7 +35,7 @@ def through(stamps, values, imu_rate, dt=DT, hole=None):
     for time, row in zip(stamps.tolist(), values.tolist(), strict=True):
         stream, events = intake.low_pass_sample(stream, time, tuple(row), design)
         for event in events:
-            clock, new = resample(clock, *event, dt, hole)
+            clock, new = advance_clock(clock, *event, dt, hole)
             rows += new
             known += [time] * len(new)
     return np.array(rows).reshape(-1, 7), np.array(known)

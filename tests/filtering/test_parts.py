@@ -213,7 +213,7 @@ def test_an_update_needs_both_clones():
 
 
 def test_noise_densities():
-    """White noise of σ per sample at dt has the density σ √dt; TLIO's σ at 1 kHz are the defaults."""
+    """White noise of σ per sample at dt has the density σ √dt; the defaults are TLIO's at 1 kHz."""
     found = filtering.NoiseModel.per_sample(1e-2, 10**-1.5, 1e-3)
     np.testing.assert_allclose(found[:2], filtering.NoiseModel()[:2], rtol=1e-3)
     state = filtering.initial_state(CONFIG, *POSE)

@@ -12,7 +12,7 @@ MEASUREMENTS = 72_000
 
 
 def hour():
-    """A person walking and turning with a swinging phone, sensors as the filter's noise has them."""
+    """A person walking and turning with a swinging phone, sensors with the filter's noise."""
     rng = np.random.default_rng(0)
     t = np.arange(MEASUREMENTS * N + 1) * DT
     yaw = 0.5 * np.sin(2 * np.pi * t / 37) + 0.05 * t

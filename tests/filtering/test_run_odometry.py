@@ -27,7 +27,7 @@ NOISE = filtering.NoiseModel()
 
 
 def predict(windows, parameters=PARAMETERS):
-    """A network of one layer, whose output depends on the order of the samples and of the channels."""
+    """A network of one layer, whose output depends on the order of samples and channels."""
     assert windows.shape == (1, N * CLONES, 6) and windows.dtype == jnp.float32
     ramp = jnp.linspace(0.5, 1.5, N * CLONES, dtype=jnp.float32)[None, :, None]
     pooled = jnp.mean(ramp * windows, axis=1) @ jnp.asarray(parameters, jnp.float32)

@@ -16,7 +16,9 @@ from tests.support.compiling import quick
 from tests.support.walks import errors, simulate
 
 N, CLONES, INTERVALS, DT = 4, 3, 14, 0.05
-SMALL = 3e-5  # of all noises together, so that what is not linear hardly counts: the deviations below shrink in proportion
+SMALL = 3e-5
+"""Of all noises together, so that what is not linear hardly counts: the deviations below shrink in
+proportion."""
 STD = filtering.InitialStd(*(SMALL * np.array([2.0, 1.0, 10.0, 1.0, 1.0, 10.0])))
 WHITE, WALK = SMALL * np.array([0.5, 2.0]), SMALL * np.array([0.3, 1.0])  # of a sample; of a second
 PRIOR = np.repeat(
@@ -311,7 +313,7 @@ DENSITIES = filtering.NoiseModel(5e-4, 5e-3, 1e-6, 2e-5)
 
 
 def test_long_walks_come_closer_to_the_truth_and_say_by_how_much():
-    """Under jit and vmap; IMU samples and measurements missing, the last held and coasted through."""
+    """Under jit and vmap; IMU samples and measurements are missing, the last held or coasted."""
     std = filtering.InitialStd()
     runs = simulate(2, RUNS, LONG, STEP, WINDOW, RATE, DENSITIES, std, SIGMA)
     runs.displacement[:, 100:108] = np.nan

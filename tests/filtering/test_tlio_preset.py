@@ -16,7 +16,7 @@ from gnio_jax.types import Prediction
 from tests.support import scekf_numpy, tlio_weights
 
 # The recorded run
-# ----------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------------------------
 
 RECORDED = Path(__file__).parents[1] / "recorded" / "tlio_tracker" / "pipeline.npz"
 
@@ -93,7 +93,7 @@ def test_a_network_that_is_too_sure_is_held_to_the_floor(recorded):
 
 
 # Small networks
-# ------------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------------------------
 
 N, CLONES, INTERVALS, DT = 4, 4, 40, 0.02
 CONFIG = filtering.FilterConfig(

@@ -20,7 +20,7 @@ from gnio_jax.commands import console
 from gnio_jax.errors import InputError
 from gnio_jax.filtering import Tracker
 from gnio_jax.filtering import tracker as online
-from gnio_jax.filtering.clock import resample
+from gnio_jax.filtering.clock import advance_clock
 from gnio_jax.training import checkpoint
 from gnio_jax.training.step import TrainState
 from gnio_jax.types import Prediction
@@ -211,7 +211,7 @@ def test_clock_against_a_slow_resampler(kind):
             values[:30, 2] = np.nan
     clock, rows, known = None, [], []
     for time, row in zip(stamps.tolist(), values.tolist(), strict=True):
-        clock, new = resample(clock, time, tuple(row), 0.01, hole)
+        clock, new = advance_clock(clock, time, tuple(row), 0.01, hole)
         rows += new
         known.append(len(rows))
     wanted = oracle(stamps, values, 0.01, hole)
@@ -459,7 +459,7 @@ def test_from_rest(built, tmp_path):
 
 
 # The example
-# ----------------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------------------------
 
 ROOT = Path(__file__).parents[2]
 TRAINED = configuration.TrainConfig(
