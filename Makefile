@@ -14,10 +14,9 @@ EXTRAS ?= test
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 NEEDS := gnio-jax needs Python 3.11 or newer: make PYTHON=python3.11 ...
 
-# The compiled programs of the tests are kept between runs. The first run compiles them all, which
-# is most of what it does: hence the compiler's lower level of optimisation.
-TEST_ENVIRONMENT := JAX_PLATFORMS=cpu JAX_COMPILATION_CACHE_DIR=$(CURDIR)/.jax_cache \
-	XLA_FLAGS="$(XLA_FLAGS) --xla_backend_optimization_level=1"
+# The compiled programs of the tests are kept between runs: the first run compiles them all, which is
+# most of what it does.
+TEST_ENVIRONMENT := JAX_PLATFORMS=cpu JAX_COMPILATION_CACHE_DIR=$(CURDIR)/.jax_cache
 
 .PHONY: demo test lint clean
 

@@ -1,23 +1,33 @@
-"""Shared set-up: float64 available, rank promotion forbidden, shapes and types checked at run time."""
+"""Shared set-up: float64 available, rank promotion forbidden, shapes and types checked at run time.
+
+Compiling is most of what the tests do, and what they compile runs once on small shapes. So the
+compiler optimises nothing, here and in the processes that tests start.
+"""
 
 import os
-
-os.environ.setdefault("JAX_PLATFORMS", "cpu")
+from importlib.metadata import version
 
 from jaxtyping import install_import_hook
 
-install_import_hook(
-    "gnio_jax", "beartype.beartype"
-)  # every annotated shape and type is checked, in the tests alone
+COMPILER = ["--xla_backend_optimization_level=0"]
+if version("jax").startswith("0.10."):  # removed later, and XLA stops at a flag it does not know
+    # Fusions as LLVM's loops instead of MLIR's: a third of the time to compile a filter.
+    COMPILER.append("--xla_cpu_use_fusion_emitters=false")
+os.environ["XLA_FLAGS"] = " ".join([os.environ.get("XLA_FLAGS", ""), *COMPILER])
+os.environ.setdefault("JAX_PLATFORMS", "cpu")
+
+# Every annotated shape and type is checked, in the tests alone.
+install_import_hook("gnio_jax", "beartype.beartype")
 
 import jax  # noqa: E402
 import pytest  # noqa: E402
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
-jax.config.update(
-    "jax_num_cpu_devices", 2
-)  # what is shared out among devices is so on every machine
+# What is shared out among devices is shared out on every machine.
+jax.config.update("jax_num_cpu_devices", 2)
+# The workers share what they compile through the cache, small programs too.
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.05)
 
 
 @pytest.fixture(scope="session")
