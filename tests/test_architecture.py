@@ -1,6 +1,7 @@
 """What each room may import: the arrow of docs/architecture.md, read from the sources."""
 
 import ast
+import functools
 from pathlib import Path
 
 import pytest
@@ -35,8 +36,13 @@ LIBRARIES = {
 """Libraries that only these rooms or modules import."""
 
 
+@functools.cache
 def imports():
     """(module without the package's name, what it imports) of every import of the package."""
+    return list(read_imports())
+
+
+def read_imports():
     for path in sorted(PACKAGE.rglob("*.py")):
         module = ".".join(path.relative_to(PACKAGE).with_suffix("").parts)
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
