@@ -53,7 +53,7 @@ def read_imports():
                 yield from ((module, f"{node.module}.{alias.name}") for alias in node.names)
 
 
-@pytest.mark.parametrize("room", ROOMS)
+@pytest.mark.parametrize("room", sorted(ROOMS))
 def test_a_room_imports_only_what_stands_before_it(room):
     for module, name in imports():
         if module.split(".")[0] == room and name.startswith("gnio_jax."):
@@ -63,7 +63,7 @@ def test_a_room_imports_only_what_stands_before_it(room):
             assert other in allowed, f"gnio_jax/{module} imports {name}"
 
 
-@pytest.mark.parametrize("library", LIBRARIES)
+@pytest.mark.parametrize("library", sorted(LIBRARIES))
 def test_a_library_stays_in_its_rooms(library):
     for module, name in imports():
         if f"{name}.".startswith(f"{library}."):

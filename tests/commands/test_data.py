@@ -232,17 +232,16 @@ def test_nothing_usable_is_a_failure_that_still_shows_the_table(root, capsys):
 
 
 def test_the_module_runs_and_draws_nothing_unasked(root):
-    program = "import runpy, sys\nsys.argv = ['data', 'check', sys.argv[1], '--split', 'test']\n"(
-        "runpy.run_module('gnio_jax.data', run_name='__main__')\nassert 'matplotlib' not "
-        "in sys.modules\n"
+    program = (
+        "import runpy, sys\n"
+        "sys.argv = ['data', 'check', sys.argv[1], '--split', 'test']\n"
+        "runpy.run_module('gnio_jax.data', run_name='__main__')\n"
+        "assert 'matplotlib' not in sys.modules\n"
     )
-    shown = subprocess.run(
-        [sys.executable, "-c", program, str(root)], capture_output=True, text=True, timeout=100
-    )
-    assert (shown.returncode, shown.stderr) == (
-        0,
-        "",
-    ) and "1 of 1 sequences are used" in shown.stdout
+    command = [sys.executable, "-c", program, str(root)]
+    shown = subprocess.run(command, capture_output=True, text=True, timeout=100)
+    assert (shown.returncode, shown.stderr) == (0, "")
+    assert "1 of 1 sequences are used" in shown.stdout
 
 
 # --- convert
