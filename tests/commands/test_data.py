@@ -216,7 +216,7 @@ def test_check_knows_a_layout_by_what_it_finds_there(root, place, capsys):
 
 
 def test_check_of_recordings_without_a_reference_draws_them_all_the_same(place, capsys):
-    write_phone(place / "own" / "bare.csv", names=csv._GYRO + csv._ACCEL)
+    write_phone(place / "own" / "bare.csv", names=csv.GYRO + csv.ACCEL)
     main(["check", "own", "--dataset", "csv", "--plots", "pictures"])
     out = capsys.readouterr().out
     assert row(out, "bare")[4:] == ["–", "–", "–", "–", "0.0%", "used"]
@@ -418,7 +418,7 @@ def write_phone(path, names, time=None, gyro=1.0, accel=1.0, per_second=1.0, sep
     time = np.arange(2000) / 100 if time is None else time
     values = dict(
         zip(
-            (*csv._GYRO, *csv._ACCEL),
+            (*csv.GYRO, *csv.ACCEL),
             [*walk.rate(time).T * gyro, *walk.force(time).T * accel],
             strict=True,
         )
@@ -519,8 +519,8 @@ def test_import_of_a_phones_file_returns_the_walk(place, capsys):
 
 
 def test_import_of_a_file_for_each_sensor(place, capsys):
-    time = write_phone(place / "gyro.csv", csv._GYRO)
-    write_phone(place / "accel.csv", csv._ACCEL, time=time[:-100] + 0.004)
+    time = write_phone(place / "gyro.csv", csv.GYRO)
+    write_phone(place / "accel.csv", csv.ACCEL, time=time[:-100] + 0.004)
     units = ["--gyro-unit", "rad/s", "--time-unit", "s"]
     main(
         [
@@ -645,7 +645,7 @@ OUT = ["--out", "x.h5"]
     ],
 )
 def test_a_mistake_is_one_line_and_status_2(root, place, capsys, arguments, expected):
-    write_phone(place / "walk.csv", csv._GYRO + csv._ACCEL)
+    write_phone(place / "walk.csv", csv.GYRO + csv.ACCEL)
     (place / "taken").mkdir()
     (place / "taken" / "train.txt").write_text("a\n")
     (place / "folder.h5").mkdir()

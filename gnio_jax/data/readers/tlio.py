@@ -20,6 +20,7 @@ from jaxtyping import Float
 from gnio_jax.data.dataset import Dataset, Recording, single
 from gnio_jax.data.readers.parsing import parsed_as
 from gnio_jax.data.readers.text import listed
+from gnio_jax.data.resampling import resample
 from gnio_jax.data.validation import (
     check_finite,
     check_gaps,
@@ -89,7 +90,7 @@ def read_sequence(folder: str | os.PathLike[str]) -> Sequence:
     )
     sequence = validate(sequence, path)
     check_motion(sequence, path)
-    return sequence
+    return resample(sequence, RATE)  # changes nothing but where rows are missing
 
 
 def _listed(root: Path, split: str) -> list[Path]:

@@ -213,3 +213,16 @@ def test_real_recordings_are_physical(recordings, split, names):
         assert slower.gyro_consistency_degrees == pytest.approx(
             check.gyro_consistency_degrees, abs=0.1
         )
+
+
+def test_missing_rows_leave_a_uniform_clock_and_a_stretch_that_is_not_valid(tmp_path):
+    folder = write_sequence(tmp_path / "walk")
+    whole = tlio.read_sequence(folder)
+    table = np.load(folder / "imu0_resampled.npy")
+    first, last = N // 2, N // 2 + 40  # 0.2 s
+    np.save(folder / "imu0_resampled.npy", np.delete(table, slice(first, last), axis=0))
+    holed = tlio.read_sequence(folder)
+    np.testing.assert_allclose(holed.time, whole.time, atol=1e-9)
+    assert not holed.valid[first:last].any()
+    assert holed.valid[: first - 1].all() and holed.valid[last + 1 :].all()
+    np.testing.assert_allclose(holed.gyro[: first - 1], whole.gyro[: first - 1], atol=1e-9)
