@@ -89,7 +89,9 @@ def _empty_grid(report: Report, shown: list[str]) -> Table:
     grid.add_column("sequence", overflow="fold", min_width=min(40, longest))
     for name in shown:
         heading, unit, _ = COLUMNS[name]
-        grid.add_column(f"{heading}\n[dim]{unit}[/dim]", justify="right", no_wrap=True)
+        # Not as markup, which the console of results does not read.
+        label = Text.assemble(heading, "\n", (unit, "dim"))
+        grid.add_column(label, justify="right", no_wrap=True)
     return grid
 
 

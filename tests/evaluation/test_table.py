@@ -2,6 +2,7 @@
 
 from rich.console import Console
 
+from gnio_jax.commands.console import stdout
 from gnio_jax.evaluation import table
 
 
@@ -39,3 +40,9 @@ def test_divergence_is_in_the_table(made, with_divergence):
     assert "1" in cells["diverged"] and cells["room 1:walk"].count("∞") >= 6
     assert any("∞: the estimate diverged" in line for line in lines)
     assert not any("diverged" in line for line in text(made))
+
+
+def test_headings_are_words_on_the_console_of_results(made, capsys):
+    stdout().print(table.render(made))
+    shown = capsys.readouterr().out
+    assert "ATE" in shown and "m/min" in shown and "[dim]" not in shown
