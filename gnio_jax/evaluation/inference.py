@@ -79,7 +79,8 @@ def attitude(
         raise InputError(
             sequence.name, f"has no {source} orientation at its start", "give --orientation filter"
         )
-    rotation = matrix_from_quaternion(given)
+    # What is not trusted may hold anything, also what is no rotation.
+    rotation = matrix_from_quaternion(np.where(known[:, None], given, np.nan))
     if source == "device":
         start, device_start = yaw_rotation(np.stack([prepared.start.rotation, rotation[0]]))
         rotation = start @ device_start.T @ rotation

@@ -79,3 +79,15 @@ def test_attitudes(walks):
     np.testing.assert_allclose(
         bridged[190:260], truth[190:260], atol=0.03
     )  # 1.4 s of gyro with its bias
+
+
+def test_an_untrusted_orientation_need_be_no_rotation(walks):
+    orientation, valid = walks[0].orientation.copy(), walks[0].valid.copy()
+    orientation[200:260], valid[200:260] = 0.0, False
+    zeros = walks[0]._replace(orientation=orientation, valid=valid)
+    orientation = orientation.copy()
+    orientation[200:260] = np.nan
+    unknown = zeros._replace(orientation=orientation)
+    prepared, _ = evaluation.prepare([zeros, unknown], CONFIG, INTEGRATE)
+    bridged = [evaluation.attitude(each, CONFIG, "reference") for each in prepared]
+    np.testing.assert_array_equal(*bridged)
