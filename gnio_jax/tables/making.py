@@ -177,7 +177,9 @@ def make_trajectories(options: TablesConfig, reporter: Reporter, workers: int) -
         for result in results
     }
     first = next(iter(paths.values()))
-    wanted = _words(options.sequences) if options.sequences else list(first)[:8]
+    wanted = list(first)[:8]
+    if options.sequences:
+        wanted = [name.strip() for name in options.sequences.split(",")]
     for name in wanted:
         if name not in first:
             problem = f"no sequence '{name}' in split '{options.split}'"
