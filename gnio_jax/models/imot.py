@@ -39,10 +39,9 @@ class IMoT(nn.Module):
     asked for; then the vertical one is 0.
 
     The publication's 14.49 M parameters and its two encoder and two decoder layers cannot both
-    hold: this class has four and four, with
-    4.58 T hidden units in the feed-forward parts, which is 14,492,810 for T = 200 and two axes;
-    `IMoTText` has the layers of the text and 7,137,482. Three axes cost 329 more at T = 200, which
-    is what the particles and their last layer hold.
+    hold: this class has four and four, with 4.58 T hidden units in the feed-forward parts, which is
+    14,492,810 for T = 200 and two axes; `IMoTText` has the layers of the text and 7,137,482. Three
+    axes cost 329 more at T = 200, which is what the particles and their last layer hold.
 
     Ours, where the publication is silent, chosen among what gives these numbers: T features
     everywhere, 2 T inside the attentions to the tokens; GELU in the spatial blocks, else ReLU; sums
