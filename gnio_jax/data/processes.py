@@ -14,6 +14,11 @@ from gnio_jax.errors import InputError
 
 Result = TypeVar("Result")
 
+
+class ProcessDied(InputError):
+    """A process ended without a word; most often the system has run out of memory."""
+
+
 FEW = 8
 """Recordings up to here are quicker read than processes are started."""
 
@@ -33,7 +38,7 @@ def map_in_processes(
 
     `done` is told the share that is finished. Function and items must survive pickling when there
     is more than one process, and the script that asks for them needs its `if __name__ ==
-    "__main__"`. Raises `InputError` when a process dies.
+    "__main__"`. Raises `ProcessDied`.
     """
     workers = min(workers, len(items))
     if workers <= 1:
@@ -58,7 +63,7 @@ def map_in_processes(
             for future in futures:
                 yield future.result()
         except BrokenProcessPool:
-            raise InputError(
+            raise ProcessDied(
                 "--workers", "a process died, perhaps for want of memory", "try --workers 1"
             ) from None
         finally:

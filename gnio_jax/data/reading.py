@@ -10,7 +10,7 @@ from typing import NamedTuple
 from gnio_jax.data.cache import cached, is_cached, is_refused
 from gnio_jax.data.dataset import Dataset, Recording, Refusal
 from gnio_jax.data.plausibility import SelfCheck, check_sequence, keep_plausible
-from gnio_jax.data.processes import map_in_processes
+from gnio_jax.data.processes import ProcessDied, map_in_processes
 from gnio_jax.errors import InputError
 from gnio_jax.types import Sequence
 
@@ -133,11 +133,28 @@ def _read_all(
 ) -> Iterator[Reading]:
     """What reading each of them gave, in their order."""
     # What is quick to read is not worth a process, and the pipe that its sequences come through.
-    slow = [workers > 1 and _is_slow(recording) for recording in recordings]
-    items = [(recording,) for recording, is_slow in zip(recordings, slow, strict=True) if is_slow]
-    from_processes = map_in_processes(read_recording, items, workers, progress)
-    for recording, is_slow in zip(recordings, slow, strict=True):
-        yield next(from_processes) if is_slow else read_recording(recording)
+    is_slow = [workers > 1 and _is_slow(recording) for recording in recordings]
+    slow = [recording for recording, apart in zip(recordings, is_slow, strict=True) if apart]
+    readings = _read_slow(slow, workers, progress)
+    for recording, apart in zip(recordings, is_slow, strict=True):
+        yield next(readings) if apart else read_recording(recording)
+
+
+def _read_slow(
+    recordings: list[Recording], workers: int, progress: Callable[[float], None]
+) -> Iterator[Reading]:
+    """Readings by `workers` processes. Where one of them dies, this process reads what is left."""
+    done = 0
+    try:
+        items = [(recording,) for recording in recordings]
+        for reading in map_in_processes(read_recording, items, workers, progress):
+            done += 1
+            yield reading
+    except ProcessDied:
+        for recording in recordings[done:]:
+            done += 1
+            progress(done / len(recordings))
+            yield read_recording(recording)
 
 
 # --- finding and checking, for the command line

@@ -13,7 +13,7 @@ hole. On the host; nothing older than the FIR's reach is kept.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -108,6 +108,24 @@ def design(dt: float, hole: float, imu_rate: float) -> Design:
     """For an IMU of `imu_rate` Hz and a filter with a sample every `dt` s."""
     factor = decimation_factor(imu_rate, 1 / dt)
     return Design(dt, hole, imu_rate, factor, low_pass(factor) if factor > 1 else np.ones(1))
+
+
+def checked_design(dt: float, hole: Any = None, imu_rate: Any = None) -> Design:
+    """For an IMU of `imu_rate` Hz (default: the filter's) and a filter with a sample every `dt` s.
+
+    `hole`: the clock's longest interval, s, by default 1.5 dt. Raises `ValueError`."""
+    hole = 1.5 * dt if hole is None else hole
+    if not (is_finite_number(hole) and hole >= dt):
+        raise ValueError(f"hole: must be a time of at least dt = {dt:g} s, found {hole!r}")
+    imu_rate = 1 / dt if imu_rate is None else imu_rate
+    if not (is_finite_number(imu_rate) and imu_rate > 0):
+        raise ValueError(f"imu_rate: must be a rate in Hz, found {imu_rate!r}")
+    return design(dt, float(hole), float(imu_rate))
+
+
+def is_finite_number(value: Any) -> bool:
+    """Whether `value` is a Python number, and finite."""
+    return isinstance(value, int | float) and math.isfinite(value)
 
 
 def rounding(dt: float, time: float, origin: float) -> float:

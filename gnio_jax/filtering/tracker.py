@@ -26,7 +26,13 @@ from gnio_jax.filtering.clock import Clock, GridSample, advance_clock
 from gnio_jax.filtering.clones import unroll_clones
 from gnio_jax.filtering.config import FilterConfig
 from gnio_jax.filtering.inputs import checked_noise, checked_state
-from gnio_jax.filtering.intake import Design, Intake, check_rate, design, low_pass_sample
+from gnio_jax.filtering.intake import (
+    Intake,
+    check_rate,
+    checked_design,
+    is_finite_number,
+    low_pass_sample,
+)
 from gnio_jax.filtering.network import Predict, prediction_shapes
 from gnio_jax.filtering.noise import TLIO_STD, InitialStd, NoiseModel
 from gnio_jax.filtering.online import (
@@ -80,7 +86,7 @@ class Tracker:
     ):
         state = checked_state(state, config)
         dtype = np.dtype(state.offset.dtype)
-        low_pass = _checked_design(config, hole, imu_rate)
+        low_pass = checked_design(config.dt, hole, imu_rate)
         self._make(predict, TrackerSettings(config, checked_noise(noise, dtype), low_pass, dtype))
         self._start(state)
 
@@ -101,7 +107,7 @@ class Tracker:
         Until then there is no pose; then these samples are filtered, too. A missing sample begins
         the collection anew.
         """
-        if not (_is_finite_number(seconds) and round(seconds / config.dt) >= 2):
+        if not (is_finite_number(seconds) and round(seconds / config.dt) >= 2):
             raise ValueError(
                 f"seconds: must be a time of at least two samples of {config.dt:g} s, "
                 f"found {seconds!r}"
@@ -109,7 +115,7 @@ class Tracker:
         dtype = np.dtype(jax.dtypes.canonicalize_dtype(np.float64))
         eye, nothing = jnp.eye(3, dtype=dtype), jnp.zeros(3, dtype)
         initial_state(config, eye, nothing, nothing, std=std)  # complains of precision and std
-        low_pass = _checked_design(config, hole, imu_rate)
+        low_pass = checked_design(config.dt, hole, imu_rate)
         settings = TrackerSettings(
             config=config,
             noise=checked_noise(noise, dtype),
@@ -296,21 +302,6 @@ class Tracker:
             )
         check_rate(self._intake, stamp, self._settings.design)
         return stamp
-
-
-def _checked_design(config: FilterConfig, hole: Any, imu_rate: Any) -> Design:
-    """The low-pass for an IMU of `imu_rate` Hz, and the clock's longest interval."""
-    hole = 1.5 * config.dt if hole is None else hole
-    if not (_is_finite_number(hole) and hole >= config.dt):
-        raise ValueError(f"hole: must be a time of at least dt = {config.dt:g} s, found {hole!r}")
-    imu_rate = 1 / config.dt if imu_rate is None else imu_rate
-    if not (_is_finite_number(imu_rate) and imu_rate > 0):
-        raise ValueError(f"imu_rate: must be a rate in Hz, found {imu_rate!r}")
-    return design(config.dt, float(hole), float(imu_rate))
-
-
-def _is_finite_number(value: Any) -> bool:
-    return isinstance(value, int | float) and math.isfinite(value)
 
 
 def _three_numbers(name: str, value: Any) -> tuple[float, ...]:

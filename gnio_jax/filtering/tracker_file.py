@@ -18,7 +18,7 @@ from gnio_jax.files import replacing
 from gnio_jax.filtering.clock import Clock
 from gnio_jax.filtering.config import FilterConfig
 from gnio_jax.filtering.inputs import checked_noise
-from gnio_jax.filtering.intake import Intake, Run, design
+from gnio_jax.filtering.intake import Intake, Run, checked_design
 from gnio_jax.filtering.noise import InitialStd, NoiseModel
 from gnio_jax.filtering.online import (
     GRID_COLUMNS,
@@ -79,7 +79,7 @@ def load_tracker(
     settings = TrackerSettings(
         config=config,
         noise=checked_noise(noise, dtype),
-        design=design(config.dt, about["hole"], about["imu_rate"]),
+        design=checked_design(config.dt, about["hole"], about["imu_rate"]),
         dtype=dtype,
         rest=about["rest"],
         std=InitialStd(*about["std"]),

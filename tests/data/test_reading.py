@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import multiprocessing
+import os
 import warnings
 from functools import partial
 from pathlib import Path
@@ -190,8 +192,6 @@ def test_work_by_processes_comes_back_in_order():
 
 
 def test_a_process_that_dies_is_told_in_one_line():
-    import os
-
     items = [(partial(os._exit, 3),), (partial(int, 1),)]
     with pytest.raises(InputError, match="--workers: a process died, perhaps for want of memory"):
         list(map_in_processes(call, items, 2))
@@ -199,3 +199,17 @@ def test_a_process_that_dies_is_told_in_one_line():
 
 def call(function):
     return function()
+
+
+def die_in_a_child(name):
+    if multiprocessing.parent_process() is not None:
+        os._exit(3)
+    return walk(name)
+
+
+def test_what_a_dead_process_left_is_read_here(tmp_path):
+    recordings = [slow(tmp_path, name, die_in_a_child) for name in ("a", "b", "c")]
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        found = read_split(dataset(*recordings), tmp_path, "test", workers=2)
+    assert [sequence.name for sequence in found] == ["a", "b", "c"] and not caught
