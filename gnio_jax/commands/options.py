@@ -191,7 +191,7 @@ def _explain(event: Any, argv: list[str], known: list[str], subcommands: bool) -
         return _wrong_subcommand(argv, known)
     for token in argv:
         option = _spelling(token)
-        if option.startswith("-") and option[1:2] in "-" and option not in known:
+        if option.startswith("--") and option not in known:
             return _unknown_option(token, known)
     match type(event).__name__:
         case "UnrecognizedArgs":

@@ -171,6 +171,7 @@ def test_a_config_is_found_by_its_name_from_anywhere(tmp_path, monkeypatch):
         (["--verbose"], "command: unknown '--verbose'; give one of train, evaluate"),
         (["data"], "command: is missing; give one of list, check, convert, import"),
         (["data", "chek"], "command: unknown 'chek'; did you mean 'check'?"),
+        (["data", "convert", "oxiod", "-", "out", "--workers"], "--workers: needs a value"),
         (["data", "check", "tlio", "--splt", "a"], "--splt: unknown option; did you mean --split?"),
         (["evaluate", "--estimater", "ekf"], "unknown option; did you mean --estimator?"),
         (["tables", "gatse"], "TABLE: must be one of complexity, comparison"),
