@@ -57,6 +57,6 @@ def evaluate(config: EvaluateConfig, _prog: str) -> None:
 COMMAND = Command(EvaluateConfig, evaluate, DESCRIPTION, defaults)
 
 
-def main(argv: Sequence[str] | None = None, prog: str = "evaluate.py") -> None:
+def main(argv: Sequence[str] | None = None, prog: str = "python evaluate.py") -> None:
     """Read the options and evaluate."""
     execute(COMMAND, argv, prog)

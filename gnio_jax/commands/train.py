@@ -77,6 +77,6 @@ def train(options: TrainOptions, prog: str) -> None:
 COMMAND = Command(TrainOptions, train, DESCRIPTION, defaults)
 
 
-def main(argv: Sequence[str] | None = None, prog: str = "train.py") -> None:
+def main(argv: Sequence[str] | None = None, prog: str = "python train.py") -> None:
     """Read the options and train."""
     execute(COMMAND, argv, prog)

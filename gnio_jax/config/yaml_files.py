@@ -40,6 +40,8 @@ def find(config: str | Path) -> Path:
         return path
     if str(config) in packaged:
         return packaged[str(config)]
+    if path.exists():  # a pipe is read, a folder is told to be one
+        return path
     by_stem = {Path(name).stem: name for name in packaged}
     close = difflib.get_close_matches(path.stem, by_stem, n=1)
     hint = f"did you mean '{by_stem[close[0]]}'? " if close else ""

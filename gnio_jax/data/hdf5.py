@@ -69,7 +69,7 @@ def _sequence_of(file: h5py.File, path: Path) -> Sequence:
         raise InputError(
             path,
             f"is not a '{_FORMAT}' file (format: {file.attrs.get('format')!r})",
-            "convert the recording with python -m gnio_jax.data convert",
+            "convert the recording with gnio data convert",
         )
     values: dict[str, Any] = {}
     for field in _FIELDS:

@@ -238,9 +238,10 @@ def check_recording(recording: Recording, dataset: Dataset) -> CheckedRecording:
     reading = read_recording(recording)
     problem = ""
     if reading.damage is not None:
-        problem = str(reading.damage)
+        problem = str(reading.damage).removeprefix(f"{recording.name}: ")
     elif not reading.sequences:
-        problem = "; ".join(reading.refusals) or "no piece of it is long enough"
+        reasons = [reason.removeprefix(f"{recording.name}: ") for reason in reading.refusals]
+        problem = "; ".join(reasons) or "no piece of it is long enough"
     return CheckedRecording(
         [(sequence, check_sequence(sequence, dataset)) for sequence in reading.sequences],
         problem,

@@ -187,8 +187,7 @@ DATASET = Dataset(
     recordings=recordings,
     splits=SPLITS,
     rate=100.0,
-    source="your own recordings "
-    "(python -m gnio_jax.data import brings a logger's CSV into this form)",
+    source="your own recordings (gnio data import brings a logger's CSV into this form)",
     layout="<root>/*.csv (time, gyro_x..z, accel_x..z[, qw..qz][, px..pz][, vx..vz]) or *.h5; "
     "optionally <root>/{train,val,test}.txt",
     licence="yours",
