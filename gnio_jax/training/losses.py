@@ -16,6 +16,10 @@ from gnio_jax.types import Prediction, Windows
 _NEVER = 2**31 - 1
 
 
+OUTLIER = 10.0
+"""Standard deviations beyond which the likelihood takes an error for an outlier (ours)."""
+
+
 class Losses(NamedTuple):
     """Means over a batch."""
 
@@ -104,9 +108,17 @@ def _velocity_and_covariance(
 def _nll(
     error: Float[jax.Array, "*b 3"], log_std: Float[jax.Array, "*b 3"], config: LossConfig
 ) -> Float[jax.Array, ""]:
+    """Mean over the windows of ½ (e/σ)² + log σ, summed over the axes (paper §III-F, eq. of L_NLL).
+
+    Ours: (e/σ)² grows only with its logarithm beyond `OUTLIER`². One window with a tiny σ would
+    else have a gradient without bound, which Adam's second moment remembers for a thousand steps.
+    """
     if config.log_std_floor is not None:
         log_std = jnp.maximum(log_std, config.log_std_floor)
-    return jnp.mean(jnp.sum(0.5 * error**2 * jnp.exp(-2 * log_std) + log_std, axis=-1))
+    squared, bound = error**2 * jnp.exp(-2 * log_std), OUTLIER**2
+    beyond = bound * (1 + jnp.log(jnp.maximum(squared, bound) / bound))
+    normalised = jnp.where(squared > bound, beyond, squared)
+    return jnp.mean(jnp.sum(0.5 * normalised + log_std, axis=-1))
 
 
 def _held(log_std: Float[jax.Array, "*b 3"], stage: Stage) -> Float[jax.Array, "*b 3"]:

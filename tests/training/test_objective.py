@@ -132,8 +132,8 @@ def test_velocity_and_covariance_by_hand():
 def test_floor_limits_what_the_likelihood_sees():
     prediction = Prediction(jnp.zeros((1, 3), jnp.float32), jnp.full((1, 3), -20.0, jnp.float32))
     floor = float(np.log(1e-3))
-    found = found_losses(prediction, target([[0.1, 0, 0]]), LossConfig(log_std_floor=floor))
-    np.testing.assert_allclose(found.nll, 0.5 * 0.1**2 / 1e-6 + 3 * floor, rtol=1e-5)
+    found = found_losses(prediction, target([[0.005, 0, 0]]), LossConfig(log_std_floor=floor))
+    np.testing.assert_allclose(found.nll, 0.5 * 0.005**2 / 1e-6 + 3 * floor, rtol=1e-5)
 
 
 def by_formula(step, steps_per_epoch, warmup, epochs):
@@ -288,3 +288,20 @@ def test_adam_against_numpy(clip, decay):
             np.sqrt(v / (1 - 0.999 ** (step + 1))) + 1e-8
         )
     np.testing.assert_allclose(params["w"], w, atol=1e-6)
+
+
+@pytest.mark.parametrize("error", [0.0, 0.5, 0.999, 1.0, 1.001, 30.0])
+def test_an_outlier_pulls_at_the_uncertainty_no_more_than_ten_standard_deviations(error):
+    """σ = 0.1 m: the likelihood is the normal one up to 1 m; value and slope are steady there."""
+    log_std = np.log(0.1)
+
+    def likelihood(log_std, error):
+        prediction = Prediction(jnp.zeros((1, 3)), jnp.array([[log_std, 0, 0]]), {})
+        return found_losses(prediction, target([[error, 0, 0]]), LossConfig()).nll
+
+    squared = (error / 0.1) ** 2
+    counted = squared if squared <= 100 else 100 * (1 + np.log(squared / 100))
+    np.testing.assert_allclose(likelihood(log_std, error), 0.5 * counted + log_std, rtol=1e-5)
+    slope = jax.grad(likelihood)(log_std, error)
+    np.testing.assert_allclose(slope, 1 - min(squared, 100.0), rtol=1e-4, atol=1e-4)
+    assert np.isfinite(jax.grad(likelihood, 1)(log_std, error))
