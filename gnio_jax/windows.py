@@ -79,7 +79,7 @@ def align_recording(
     return AlignedRecording(imu.astype(np.float32), rotation.astype(np.float32))
 
 
-def window_rows(start: Int[Array, "b"], length: int) -> Int[jax.Array, "b n"]:
+def window_rows(start: Int[Array, "b"], length: int) -> Int[Array, "b n"]:
     """Rows of a recording that each window of `length` samples takes. Jittable."""
     return start[:, None] + jnp.arange(length, dtype=jnp.int32)[None, :]
 

@@ -66,7 +66,7 @@ def execute(program: Command | Group, argv: Sequence[str] | None = None, prog: s
     argv = list(sys.argv[1:] if argv is None else argv)
     prog = prog or Path(sys.argv[0]).name
     words = _subcommands(program, argv)
-    found = program
+    found: Any = program
     for word in words:
         found = found.commands[word]
     known = option_names(found.options) if isinstance(found, Command) else list(found.commands)

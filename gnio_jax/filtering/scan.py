@@ -125,8 +125,8 @@ class _Step(NamedTuple):
     """Of the clone interval, from 0."""
     stream: Imu
     """The samples of all intervals."""
-    measurement: Measurement | None
-    """The given one; None with a network."""
+    measurement: Any
+    """The given `Measurement`; None with a network."""
 
 
 def _infer(

@@ -152,7 +152,7 @@ def _arrays(path: Path) -> dict[str, np.ndarray]:
 
 def _torch(path: Path) -> Any:
     try:
-        import torch
+        import torch  # pyright: ignore[reportMissingImports]
     except ImportError:
         raise InputError(
             path, "reading a file of PyTorch needs PyTorch", "pip install 'gnio-jax[torch]'"
