@@ -53,11 +53,6 @@ def quaternion_product(left: np.ndarray, right: np.ndarray, axis: int = -1) -> n
     return np.stack(product, axis=axis)
 
 
-def quaternion_conjugate(wxyz: Float[np.ndarray, "*k 4"]) -> Float[np.ndarray, "*k 4"]:
-    """The inverse rotations of unit quaternions."""
-    return wxyz * np.array([1.0, -1.0, -1.0, -1.0])
-
-
 # --- rotation matrices
 
 

@@ -14,6 +14,7 @@ from gnio_jax.errors import InputError
 from gnio_jax.numerics import rotations
 from tests.support import known_walk
 from tests.support.blackbird_files import FLIP, START, write
+from tests.support.changes import one, put
 
 
 @pytest.mark.parametrize("text", [11, 8, 0])
@@ -73,21 +74,6 @@ def test_a_flight_that_contradicts_itself_is_left_out(tmp_path):
         UserWarning, match="bad: left out by the self-check: horizontal acceleration"
     ):
         assert [s.name for s in data.load("blackbird", tmp_path, "test")] == ["good"]
-
-
-def put(name, value):
-    def change(fields):
-        fields[name] = value(fields[name])
-
-    return change
-
-
-def one(row, value):
-    def change(values):
-        values[row] = value
-        return values
-
-    return change
 
 
 @pytest.mark.parametrize(

@@ -15,6 +15,7 @@ from gnio_jax.errors import InputError
 from gnio_jax.numerics import rotations
 from tests.support import kitti_files as files
 from tests.support import known_walk
+from tests.support.changes import one, put
 
 TRAIN, VAL, TEST = "2011_09_26_drive_0014", "2011_09_26_drive_0009", "2011_09_26_drive_0018"
 
@@ -219,21 +220,6 @@ def test_wrong_rates_and_units_are_refused(tmp_path):
         tmp_path / "deg", TRAIN, scaled(slice(17, 20), 180 / np.pi), seconds=4.0
     )
     refused(lambda: kitti.read_packets(degrees), degrees, "'gyro'", "looks like deg/s")
-
-
-def put(name, value):
-    def change(arrays):
-        arrays[name] = value(arrays[name])
-
-    return change
-
-
-def one(row, value):
-    def change(values):
-        values[row] = value
-        return values
-
-    return change
 
 
 @pytest.mark.parametrize(
