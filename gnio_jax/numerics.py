@@ -91,12 +91,6 @@ def yaw(rotation: Float[np.ndarray, "*k 3 3"]) -> Float[np.ndarray, "*k"]:
     return np.asarray(np.arctan2(rotation[..., 1, 0], rotation[..., 0, 0]))
 
 
-def yaw_from_quaternion(wxyz: Float[np.ndarray, "*k 4"]) -> Float[np.ndarray, "*k"]:
-    """`yaw` of unit quaternions, rad in (−π, π]."""
-    w, x, y, z = np.moveaxis(wxyz, -1, 0)
-    return np.asarray(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))
-
-
 def rotation_z(angle: Float[np.ndarray, "*k"] | float) -> Float[np.ndarray, "*k 3 3"]:
     """Rotations by an angle (rad) about the world's z axis."""
     cosine, sine = np.cos(angle), np.sin(angle)

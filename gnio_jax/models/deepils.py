@@ -8,17 +8,15 @@ import jax.numpy as jnp
 from flax import linen as nn
 from jaxtyping import Float
 
-from gnio_jax.models.heads import ConstantUncertainty, to_axes
-from gnio_jax.models.layers import check_dropout, check_output_dim, linear
-from gnio_jax.models.resnet import BLOCKS_PER_GROUP, GROUP_STRIDES, batch_norm, conv, max_pool
-from gnio_jax.models.tlio import FullyConnectedHead
-from gnio_jax.types import Prediction
+from gnio_jax.models.layers import linear
+from gnio_jax.models.resnet import batch_norm, conv, max_pool, residual_groups
+from gnio_jax.models.ronin import DisplacementRegressor
 
 REDUCTION = 16
 """Channels per hidden unit of the channel attention."""
 
 
-class DeepILS(nn.Module):
+class DeepILS(DisplacementRegressor):
     """Windows [accel, gyro] in the gravity-aligned frame to displacement; the uncertainty is a
     constant.
 
@@ -27,38 +25,14 @@ class DeepILS(nn.Module):
     window of 1 s, along three axes (2,290,739) unless two are asked for; then the vertical one is
     0. Ours too: the shortcut where the shape changes is an ordinary 1×1 convolution with
     normalisation (the count leaves no other), and the linear layers start as in TLIO's head. Widths
-    other than 64 scale every layer, for machines without an accelerator. Training needs the random
-    stream `dropout`.
+    other than 64 scale every layer, for machines without an accelerator.
     """
 
-    width: int = 64
-    dropout: float = 0.5
-    output_dim: int = 3
-
-    def __post_init__(self) -> None:
-        check_dropout(self.dropout)
-        check_output_dim(self.output_dim)
-        super().__post_init__()
-
-    @nn.compact
-    def __call__(self, windows: Float[jax.Array, "b n 6"], train: bool = False) -> Prediction:
-        padded = jnp.pad(
-            windows.astype(jnp.float32), ((0, 0), (1, 1), (0, 0))
-        )  # the stem has one more than its kernel asks for
+    def features(self, windows: Float[jax.Array, "b n 6"], train: bool) -> jax.Array:
+        padded = jnp.pad(windows, ((0, 0), (1, 1), (0, 0)))  # one more than its kernel asks for
         x = conv(self.width, 5, 2, train, "stem_conv")(padded)
         x = max_pool(nn.relu(batch_norm(train, "stem_bn")(x)))
-        for group, stride in enumerate(GROUP_STRIDES):
-            for block in range(BLOCKS_PER_GROUP):
-                name = f"group{group + 1}_block{block + 1}"
-                x = AttentiveBlock(self.width * 2**group, stride if block == 0 else 1, name=name)(
-                    x, train
-                )
-        output = FullyConnectedHead(self.width, self.output_dim, self.dropout, name="displacement")(
-            x, train
-        )
-        return Prediction(
-            to_axes(output), ConstantUncertainty(name="uncertainty")(windows.shape[0])
-        )
+        return residual_groups(AttentiveBlock, self.width, x, train)
 
 
 class AttentiveBlock(nn.Module):

@@ -3,6 +3,7 @@ share)."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -143,10 +144,16 @@ class ResNet18(nn.Module):
     ) -> Float[jax.Array, "b m d"]:
         x = conv(self.width, 7, 2, train, "stem_conv")(windows)
         x = max_pool(nn.relu(batch_norm(train, "stem_bn")(x)))
-        for group, stride in enumerate(GROUP_STRIDES):
-            for block in range(BLOCKS_PER_GROUP):
-                name = f"group{group + 1}_block{block + 1}"
-                x = BasicBlock(self.width * 2**group, stride if block == 0 else 1, name=name)(
-                    x, train
-                )
-        return x
+        return residual_groups(BasicBlock, self.width, x, train)
+
+
+def residual_groups(
+    block: Callable[..., nn.Module], width: int, x: Float[jax.Array, "b n c"], train: bool
+) -> Float[jax.Array, "b m d"]:
+    """Four groups of two blocks. Each group has twice the features of the one before it, and all
+    but the first halve the length. To be called from within a module."""
+    for group, stride in enumerate(GROUP_STRIDES):
+        for number in range(BLOCKS_PER_GROUP):
+            name = f"group{group + 1}_block{number + 1}"
+            x = block(width * 2**group, stride if number == 0 else 1, name=name)(x, train)
+    return x

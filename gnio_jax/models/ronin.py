@@ -15,15 +15,11 @@ from gnio_jax.models.tlio import FullyConnectedHead
 from gnio_jax.types import Prediction
 
 
-class RoNINResNet(nn.Module):
-    """Windows [accel, gyro] in the gravity-aligned frame to displacement; the uncertainty is a
-    constant.
+class DisplacementRegressor(nn.Module):
+    """Features of a window to its displacement by TLIO's fully connected head; the uncertainty is a
+    constant. A network of this kind says which `features`.
 
-    Encoder and head as TLIO's, which took them from here. Published: the mean horizontal velocity
-    over the window, `output_dim = 2` (4,634,882 parameters for windows of 200 samples), from [gyro,
-    accel]. Ours: the displacement, which is that velocity in a window of 1 s, along three axes
-    (4,635,395) unless two are asked for; then the vertical one is 0. Training needs the random
-    stream `dropout`.
+    `width` scales every layer. Training needs the random stream `dropout`.
     """
 
     width: int = 64
@@ -37,10 +33,28 @@ class RoNINResNet(nn.Module):
 
     @nn.compact
     def __call__(self, windows: Float[jax.Array, "b n 6"], train: bool = False) -> Prediction:
-        features = ResNet18(self.width, name="encoder")(windows.astype(jnp.float32), train)
+        features = self.features(windows.astype(jnp.float32), train)
         output = FullyConnectedHead(self.width, self.output_dim, self.dropout, name="displacement")(
             features, train
         )
         return Prediction(
             to_axes(output), ConstantUncertainty(name="uncertainty")(windows.shape[0])
         )
+
+    def features(self, windows: Float[jax.Array, "b n 6"], train: bool) -> jax.Array:
+        """Feature maps (b, m, 8·width)."""
+        raise NotImplementedError
+
+
+class RoNINResNet(DisplacementRegressor):
+    """Windows [accel, gyro] in the gravity-aligned frame to displacement; the uncertainty is a
+    constant.
+
+    Encoder and head as TLIO's, which took them from here. Published: the mean horizontal velocity
+    over the window, `output_dim = 2` (4,634,882 parameters for windows of 200 samples), from [gyro,
+    accel]. Ours: the displacement, which is that velocity in a window of 1 s, along three axes
+    (4,635,395) unless two are asked for; then the vertical one is 0.
+    """
+
+    def features(self, windows: Float[jax.Array, "b n 6"], train: bool) -> jax.Array:
+        return ResNet18(self.width, name="encoder")(windows, train)

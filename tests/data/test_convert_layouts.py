@@ -4,13 +4,13 @@ gives, to the bit."""
 import json
 import warnings
 
-import numpy as np
 import pytest
 
 from gnio_jax import data
 from gnio_jax.commands.data import main
 from gnio_jax.data.checking import resolve
 from tests.support.layouts import LAYOUTS
+from tests.support.sequences import assert_same_arrays
 
 
 @pytest.mark.parametrize("name", LAYOUTS)
@@ -43,16 +43,4 @@ def test_a_layout_survives_its_conversion(name, tmp_path, monkeypatch, capsys):
         found, sorted(expected, key=lambda sequence: sequence.name), strict=True
     ):
         assert ours.name == theirs.name and theirs.attributes.items() <= ours.attributes.items()
-        for field in (
-            "time",
-            "gyro",
-            "accel",
-            "orientation",
-            "position",
-            "velocity",
-            "valid",
-            "device_orientation",
-        ):
-            np.testing.assert_array_equal(
-                getattr(ours, field), getattr(theirs, field), err_msg=field
-            )
+        assert_same_arrays(ours, theirs)

@@ -7,6 +7,7 @@ import pytest
 from gnio_jax.data.hdf5 import read_hdf5, write_hdf5
 from gnio_jax.errors import InputError
 from tests.support.circle import changed, circle
+from tests.support.sequences import assert_same_arrays
 
 
 @pytest.mark.parametrize("device", [True, False])
@@ -23,17 +24,7 @@ def test_hdf5_returns_every_bit(tmp_path, device):
     assert {key: type(value) for key, value in back.attributes.items()} == {
         key: type(value) for key, value in sequence.attributes.items()
     }
-    for field in (
-        "time",
-        "gyro",
-        "accel",
-        "orientation",
-        "position",
-        "velocity",
-        "valid",
-        "device_orientation",
-    ):
-        np.testing.assert_array_equal(getattr(back, field), getattr(sequence, field))
+    assert_same_arrays(back, sequence)
 
 
 def test_hdf5_that_is_cut_short_or_foreign_is_named(tmp_path):

@@ -8,18 +8,15 @@ import subprocess
 import sys
 from pathlib import Path
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gnio_jax import config, data
+from gnio_jax import data
 from gnio_jax.commands import console
 from gnio_jax.config import DataConfig, EvaluateConfig, FilterOptions, ModelConfig, TrainConfig
 from gnio_jax.data.readers import synthetic
 from gnio_jax.evaluation import report, run
-from gnio_jax.training import checkpoint
-from gnio_jax.training.step import TrainState
+from tests.support import drawn_run
 
 ROOT = Path(__file__).parents[2]
 TRAINED = TrainConfig(
@@ -31,31 +28,11 @@ TRAINED = TrainConfig(
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("trained") / "run"
-    config.save(folder / "config.yaml", TRAINED)
-    random, model = np.random.default_rng(0), checkpoint.create_model(TRAINED)
-    shapes = jax.eval_shape(
-        model.init,
-        jax.random.key(0),
-        jax.ShapeDtypeStruct((1, TRAINED.data.window, 6), jnp.float32),
-    )
-    # Drawn by NumPy: compiling the initialisation would take longer than all the tests.
-    variables = {
-        key: jax.tree.map(
-            lambda leaf, key=key: jnp.asarray(
-                random.uniform(0.9, 1.1, leaf.shape)
-                if key == "batch_stats"
-                else random.normal(0, 0.2, leaf.shape),
-                jnp.float32,
-            ),
-            value,
-        )
-        for key, value in shapes.items()
-    }
-    state = TrainState(jnp.int32(0), variables["params"], variables["batch_stats"], {})
-    with checkpoint.Checkpoints(folder) as checkpoints:
-        checkpoints.save("best", state, checkpoint.Position(1, 0, 1.0, (0.0, 0.0, 0.0), 1.0))
-    return folder
+    def draw(random, kind, shape):
+        statistics = kind == "batch_stats"
+        return random.uniform(0.9, 1.1, shape) if statistics else random.normal(0, 0.2, shape)
+
+    return drawn_run.save(tmp_path_factory.mktemp("trained") / "run", TRAINED, draw)
 
 
 @pytest.fixture

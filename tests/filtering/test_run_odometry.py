@@ -71,20 +71,14 @@ def test_windows_are_cut_with_the_state_of_the_filter(window_rotation):
             predict, state, gyro, accel, config, filtering.NoiseModel()
         )
     )(state)
-    noise = filtering.NoiseModel()
-    wanted = scekf_numpy.run(
+    wanted = scekf_numpy.run_from(
+        state,
+        filtering.NoiseModel(),
+        DT,
         gyro,
         accel,
-        None,
-        None,
-        *[np.asarray(value) for value in state[:3]],
-        dt=DT,
         n=N,
         clones=CLONES,
-        bg=np.asarray(state.gyro_bias),
-        ba=np.asarray(state.accel_bias),
-        sigma_gyro=noise.gyro_density / np.sqrt(DT),
-        sigma_accel=noise.accel_density / np.sqrt(DT),
         convergence=0.6,
         scale=2.0,
         measure=measure,

@@ -151,24 +151,8 @@ def by_hand(gyro, accel, lead, corrected, own):
         pooled = (np.linspace(0.5, 1.5, N * CLONES)[:, None] * np.array(rows)).mean(0) @ WEIGHTS
         return pooled, np.diag(np.exp(2 * np.maximum(-2.0 + 0.1 * pooled, -4.0)))
 
-    state = start()
-    return scekf_numpy.run(
-        gyro,
-        accel,
-        None,
-        None,
-        *[np.asarray(value) for value in state[:3]],
-        dt=DT,
-        n=N,
-        clones=CLONES,
-        bg=np.asarray(state.gyro_bias),
-        ba=np.asarray(state.accel_bias),
-        sigma_gyro=NOISE.gyro_density / np.sqrt(DT),
-        sigma_accel=NOISE.accel_density / np.sqrt(DT),
-        convergence=0.6,
-        scale=2.0,
-        measure=measure,
-    )
+    options = {"n": N, "clones": CLONES, "convergence": 0.6, "scale": 2.0, "measure": measure}
+    return scekf_numpy.run_from(start(), NOISE, DT, gyro, accel, **options)
 
 
 @jax.jit

@@ -21,10 +21,8 @@ from gnio_jax.errors import InputError
 from gnio_jax.filtering import Tracker
 from gnio_jax.filtering import tracker as online
 from gnio_jax.filtering.clock import advance_clock
-from gnio_jax.training import checkpoint
-from gnio_jax.training.step import TrainState
 from gnio_jax.types import Prediction
-from tests.support import scekf_numpy
+from tests.support import drawn_run, scekf_numpy
 
 N, CLONES, INTERVALS, DT = 4, 4, 70, 0.02
 CONFIG = filtering.FilterConfig(
@@ -262,24 +260,14 @@ def test_a_stop_of_the_stream_is_caught_up_in_one_push(tracker):
 
 def test_between_clones_it_integrates_the_imu(tracker):
     gyro, accel = recording()
-    state, noise = start(), [NOISE.gyro_density / np.sqrt(DT), NOISE.accel_density / np.sqrt(DT)]
+    state = start()
     assert np.isnan(tracker.pose().time) and np.array_equal(tracker.pose().position, state.position)
     for m in range(1, N):
         assert tracker.push(m * DT, gyro[m], accel[m]) is None
         pose = tracker.pose()
-        wanted = scekf_numpy.run(
-            gyro[1 : m + 1],
-            accel[1 : m + 1],
-            np.full((1, 3), np.nan),
-            np.zeros((1, 3, 3)),
-            *[np.asarray(x) for x in (state.rotation, state.velocity, state.position)],
-            dt=DT,
-            n=m,
-            clones=9,
-            sigma_gyro=noise[0],
-            sigma_accel=noise[1],
-            bg=np.asarray(state.gyro_bias),
-            ba=np.asarray(state.accel_bias),
+        samples, none = slice(1, m + 1), (np.full((1, 3), np.nan), np.zeros((1, 3, 3)))
+        wanted = scekf_numpy.run_from(
+            state, NOISE, DT, gyro[samples], accel[samples], *none, n=m, clones=9
         )
         assert pose.time == pytest.approx((m + 1) * DT)
         for name in ("rotation", "velocity", "position", "covariance"):
@@ -470,25 +458,11 @@ TRAINED = configuration.TrainConfig(
 
 @pytest.fixture(scope="module")
 def workdir(tmp_path_factory):
-    """A run as train.py leaves it, of a tiny network whose weights NumPy has drawn."""
-    folder = tmp_path_factory.mktemp("trained") / "run"
-    configuration.save(folder / "config.yaml", TRAINED)
-    random, model = np.random.default_rng(0), checkpoint.create_model(TRAINED)
-    shapes = jax.eval_shape(
-        model.init,
-        jax.random.key(0),
-        jax.ShapeDtypeStruct((1, TRAINED.data.window, 6), jnp.float32),
+    return drawn_run.save(
+        tmp_path_factory.mktemp("trained") / "run",
+        TRAINED,
+        lambda random, kind, shape: random.uniform(0.05, 0.2, shape),
     )
-    drawn = jax.tree.map(
-        lambda leaf: jnp.asarray(random.uniform(0.05, 0.2, leaf.shape), jnp.float32), shapes
-    )
-    with checkpoint.Checkpoints(folder) as checkpoints:
-        checkpoints.save(
-            "best",
-            TrainState(jnp.int32(0), drawn["params"], drawn["batch_stats"], {}),
-            checkpoint.Position(1, 0, 1.0, (0.0, 0.0, 0.0), 1.0),
-        )
-    return folder
 
 
 @pytest.fixture

@@ -47,6 +47,23 @@ def yaw_matrix(R):
     return Rotation.from_euler("z", yaw).as_matrix()
 
 
+def run_from(state, noise, dt, gyro, accel, displacement=None, covariance=None, **options):
+    """`run` from a filter's state, with its `NoiseModel`."""
+    mean = {"R": state.rotation, "v": state.velocity, "p": state.position}
+    biases = {"bg": state.gyro_bias, "ba": state.accel_bias}
+    return run(
+        gyro,
+        accel,
+        displacement,
+        covariance,
+        **{name: np.asarray(value) for name, value in (mean | biases).items()},
+        dt=dt,
+        sigma_gyro=noise.gyro_density / np.sqrt(dt),
+        sigma_accel=noise.accel_density / np.sqrt(dt),
+        **options,
+    )
+
+
 def run(
     gyro,
     accel,
