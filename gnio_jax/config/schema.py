@@ -228,6 +228,18 @@ class FilterOptions:
     """Initial standard deviation of the accelerometer bias, m/s²."""
     measurement_scale: Positive = 10.0
     """Factor of the network's covariance in the update."""
+    window_error_share: Probability = 0.0
+    """Share of a window's standard deviation that lasts beyond the window (ours); 0: its error is
+    white."""
+    window_error_seconds: Positive = 0.5
+    """Time constant of that error, s."""
+    scale_error_std: NonNegative = 0.0
+    """Standard deviation of the walker's speed over what the network says of it, as a fraction
+    (ours); 0: the displacements have no such error."""
+    heading_error_std_degrees: NonNegative = 0.0
+    """Standard deviation of the displacements' heading (ours); 0: they have no such error."""
+    walk_error_seconds: Positive = 60.0
+    """Time constant of both, s."""
     mahalanobis_fail_scale: NonNegative = 0.0
     """0 skips an update that the χ² gate rejects; above 0 the update is applied with its covariance
     multiplied by this."""

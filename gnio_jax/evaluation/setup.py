@@ -8,7 +8,7 @@ from typing import Literal, NamedTuple
 
 from gnio_jax.config import DataConfig, FilterOptions
 from gnio_jax.errors import InputError
-from gnio_jax.filtering import FilterConfig, InitialStd, NoiseModel
+from gnio_jax.filtering import FilterConfig, InitialStd, LastingErrors, NoiseModel
 
 Estimator = Literal["ekf", "integrate", "imu_only"]
 Orientation = Literal["filter", "device", "reference"]
@@ -84,6 +84,7 @@ def filter_setup(windows: DataConfig, options: FilterOptions) -> FilterSetup:
         accel_density=options.accel_density,
         gyro_bias_walk=options.gyro_bias_walk,
         accel_bias_walk=options.accel_bias_walk,
+        displacement=_lasting_errors(options),
     )
     initial_std = InitialStd(
         tilt=math.radians(options.tilt_std_degrees),
@@ -94,3 +95,21 @@ def filter_setup(windows: DataConfig, options: FilterOptions) -> FilterSetup:
         accel_bias=options.accel_bias_std,
     )
     return FilterSetup(config, noise, initial_std)
+
+
+def _lasting_errors(options: FilterOptions) -> LastingErrors | None:
+    """None where no error of the displacements lasts."""
+    sizes = (
+        options.window_error_share,
+        options.scale_error_std,
+        options.heading_error_std_degrees,
+    )
+    if not any(sizes):
+        return None
+    return LastingErrors(
+        window_share=options.window_error_share,
+        window_seconds=options.window_error_seconds,
+        scale_std=options.scale_error_std,
+        heading_std=math.radians(options.heading_error_std_degrees),
+        walk_seconds=options.walk_error_seconds,
+    )

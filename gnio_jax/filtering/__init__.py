@@ -7,6 +7,7 @@ Needs only JAX and the geometry: the network is any function from windows to a `
 from gnio_jax.filtering.batch import cores_as_devices, over_sequences
 from gnio_jax.filtering.config import FilterConfig
 from gnio_jax.filtering.history import FilterHistory
+from gnio_jax.filtering.lasting_errors import LastingErrors
 from gnio_jax.filtering.noise import InitialStd, NoiseModel
 from gnio_jax.filtering.online import TrackerState
 from gnio_jax.filtering.pose import Pose
@@ -22,6 +23,7 @@ __all__ = [
     "FilterState",
     "GateState",
     "InitialStd",
+    "LastingErrors",
     "NoiseModel",
     "Pose",
     "SmoothedHistory",

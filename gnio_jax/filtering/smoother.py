@@ -184,7 +184,7 @@ def _smooth(
     inputs = _Inputs(numbers % config.clones, by_interval, measurements)
     forward = functools.partial(_forward, config=config, noise=noise, frame=frame)
     backward = functools.partial(_backward, config=config)
-    nothing = no_adjoint(config.clones, displacement.dtype)
+    nothing = no_adjoint(config.clones, len(state.lasting), displacement.dtype)
 
     def there_and_back(
         state: FilterState, adjoint: Adjoint, inputs: _Inputs
@@ -265,7 +265,7 @@ def _backward(
     oldest = CLONE * ((step.slot + 1) % config.clones)
     for correction in reversed(step.trace.corrections):
         adjoint = before_update(adjoint, correction, oldest)
-    return before_propagation(adjoint, step.trace.transition, step.slot), smoothed
+    return before_propagation(adjoint, step.trace.transition, step.trace.decay, step.slot), smoothed
 
 
 def _corrected(mean: Mean, error: Float[Array, "15"]) -> Mean:
