@@ -79,22 +79,35 @@ def filter_setup(windows: DataConfig, options: FilterOptions) -> FilterSetup:
         history="core",
         window_rotation=options.window_rotation or windows.window_rotation,
     )
-    noise = NoiseModel(
+    return FilterSetup(config, noise_model(options), initial_std(options))
+
+
+def noise_model(options: FilterOptions) -> NoiseModel:
+    """The filter's noises; the options may hold values that only exist inside `jit`."""
+    return NoiseModel(
         gyro_density=options.gyro_density,
         accel_density=options.accel_density,
         gyro_bias_walk=options.gyro_bias_walk,
         accel_bias_walk=options.accel_bias_walk,
+        std_factor=(options.std_factor_x, options.std_factor_y, options.std_factor_z),
         displacement=_lasting_errors(options),
     )
-    initial_std = InitialStd(
-        tilt=math.radians(options.tilt_std_degrees),
-        yaw=math.radians(options.yaw_std_degrees),
+
+
+def initial_std(options: FilterOptions) -> InitialStd:
+    """The standard deviations of the filter's start."""
+    return InitialStd(
+        tilt=_radians(options.tilt_std_degrees),
+        yaw=_radians(options.yaw_std_degrees),
         velocity=options.velocity_std,
         position=options.position_std,
         gyro_bias=options.gyro_bias_std,
         accel_bias=options.accel_bias_std,
     )
-    return FilterSetup(config, noise, initial_std)
+
+
+def _radians(degrees: float) -> float:
+    return degrees * (math.pi / 180)
 
 
 def _lasting_errors(options: FilterOptions) -> LastingErrors | None:
@@ -104,12 +117,12 @@ def _lasting_errors(options: FilterOptions) -> LastingErrors | None:
         options.scale_error_std,
         options.heading_error_std_degrees,
     )
-    if not any(sizes):
+    if all(isinstance(size, int | float) and size == 0 for size in sizes):
         return None
     return LastingErrors(
         window_share=options.window_error_share,
         window_seconds=options.window_error_seconds,
         scale_std=options.scale_error_std,
-        heading_std=math.radians(options.heading_error_std_degrees),
+        heading_std=_radians(options.heading_error_std_degrees),
         walk_seconds=options.walk_error_seconds,
     )

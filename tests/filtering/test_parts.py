@@ -163,7 +163,7 @@ def at_singularity(kind):
 @functools.partial(quick, static_argnums=3)
 @functools.partial(jax.grad, argnums=(0, 1, 2), allow_int=True, has_aux=True)
 def update_gradient(state, displacement, covariance, frame="given"):
-    measurement = scaled_measurement(displacement, covariance, CONFIG)
+    measurement = scaled_measurement(displacement, covariance, CONFIG, filtering.NoiseModel())
     new, outcome = update(state, measurement, 2, 0, CONFIG, frame)
     leaves = [
         leaf for leaf in jax.tree.leaves((new, outcome)) if jnp.issubdtype(leaf.dtype, jnp.floating)
