@@ -44,7 +44,7 @@ class Walks(NamedTuple):
     displacement: Float[np.ndarray, "w k 3"]
     """Of the network, m, in the filter's own yaw frame; NaN where there is none."""
     std: Float[np.ndarray, "w k 3"]
-    """Of the network, m."""
+    """Of the network, m; 1 where there is none."""
 
 
 class Fit(NamedTuple):

@@ -132,7 +132,8 @@ def _walks(prepared: list[Prepared], estimates: list[Estimate], stride: int) -> 
             each.start.position,
             each.gyro_bias,
             *(_filled(signal, strides * stride, signal[-1:]) for signal in signals),
-            *(_filled(part[1:], strides, np.full((1, 3), np.nan)) for part in told),
+            _filled(told[0][1:], strides, np.full((1, 3), np.nan)),
+            np.nan_to_num(_filled(told[1][1:], strides, np.ones((1, 3))), nan=1.0),
         )
 
     rows = [of_recording(*pair) for pair in zip(prepared, estimates, strict=True)]

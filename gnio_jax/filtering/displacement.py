@@ -87,9 +87,10 @@ def scaled_measurement(
     eye = jnp.eye(3, dtype=covariance.dtype)
     factor = jnp.stack(jax.tree.map(jnp.asarray, noise.std_factor)).astype(covariance.dtype)
     scale = config.measurement_scale * (factor[:, None] * factor[None])
+    known = jnp.where(present, covariance, eye)
     return Measurement(
         displacement=jnp.where(present, displacement, 0.0),
-        covariance=jnp.where(present, scale * covariance, eye),
+        covariance=jnp.where(present, scale * known, eye),
         present=present,
     )
 
