@@ -48,9 +48,11 @@ UNKNOWNS = {
         _logarithmic("accel_bias_walk"),
     ),
     "start": (_logarithmic("gyro_bias_std"), _logarithmic("accel_bias_std")),
-    "lasting": (
+    "window": (
         _share("window_error_share", 0.8),
         _logarithmic("window_error_seconds"),
+    ),
+    "walk": (
         _logarithmic("scale_error_std", 0.05),
         _logarithmic("heading_error_std_degrees", 2.0),
         _logarithmic("walk_error_seconds"),

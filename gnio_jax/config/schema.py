@@ -36,7 +36,7 @@ Table = Literal[
 ]
 
 
-CalibratedGroup = Literal["measurement", "noise", "start", "lasting"]
+CalibratedGroup = Literal["measurement", "noise", "start", "window", "walk"]
 
 
 @dataclass(frozen=True)
@@ -337,10 +337,10 @@ class CalibrateConfig:
     split: str | None = None
     """Split whose recordings are fitted: the run's validation split (default) or its training
     split. Others are refused: what is tested must not have been fitted."""
-    fit: tuple[CalibratedGroup, ...] = ("measurement", "noise", "lasting")
+    fit: tuple[CalibratedGroup, ...] = ("measurement", "noise", "start", "window")
     """What is fitted by the likelihood of the innovations: the measurement's factor, the IMU's
-    noise, the standard deviations of the initial biases, the errors of the displacements that
-    last."""
+    noise, the standard deviations of the initial biases, the part of a window's error that lasts,
+    the errors of speed and heading that last."""
     checkpoint: Literal["best", "latest"] = "best"
     """Which checkpoint of the run."""
     steps: Count = 60

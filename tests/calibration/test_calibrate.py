@@ -47,7 +47,7 @@ def two_walks(monkeypatch):
 def test_the_run_differs_in_the_filter_alone(run, two_walks, tmp_path, capsys):
     out = tmp_path / "calibrated"
     words = ["calibrate", "--workdir", str(run), "--out", str(out), "--steps", "2"]
-    app.main([*words, "--fit", "measurement", "lasting"])
+    app.main([*words, "--fit", "measurement", "window"])
     told = capsys.readouterr().out
     assert "std_factor_x" in told and f"gnio evaluate --workdir {out}" in told
     assert two_walks == ["val"]
