@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.optimize import minimize
 
-from gnio_jax.calibration.unknowns import PRIOR_STD, Unknown, from_free, to_free
+from gnio_jax.calibration.unknowns import PRIOR_STD, Unknown, from_free, to_free, written
 from gnio_jax.config import DataConfig, FilterOptions
 from gnio_jax.evaluation import filter_setup
 from gnio_jax.evaluation.setup import initial_std, noise_model
@@ -74,17 +74,17 @@ def innovation_objective(
     )
 
     def objective(free: Array) -> Array:
-        evidence = _log_likelihood(walks, config, from_free(free, options, unknowns))
+        evidence = _log_likelihood(walks, config, vars(options) | from_free(free, unknowns))
         prior = 0.5 * jnp.sum(((free - start) / PRIOR_STD) ** 2)
         return (prior - evidence) / count
 
     return objective
 
 
-def _log_likelihood(walks: Walks, config: FilterConfig, options: FilterOptions) -> Array:
-    """Of all innovations."""
+def _log_likelihood(walks: Walks, config: FilterConfig, options: Mapping[str, Any]) -> Array:
+    """Of all innovations, with options whose values may be traced."""
     noise, std = noise_model(options), initial_std(options)
-    factor = jnp.sqrt(jnp.asarray(options.measurement_scale))
+    factor = jnp.sqrt(jnp.asarray(options["measurement_scale"]))
 
     def of_walk(given: tuple[Any, Any, Any], walk: Walks) -> Array:
         factor, noise, std = given
@@ -131,5 +131,5 @@ def fit(
         method="L-BFGS-B",
         options={"maxiter": most_steps, "ftol": 1e-7},
     )
-    fitted = from_free(found.x, options, unknowns)
+    fitted = written(options, from_free(jnp.asarray(found.x), unknowns))
     return Fit(fitted, before, float(found.fun), int(found.nit))

@@ -9,13 +9,14 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 
 from gnio_jax import config as configuration
 from gnio_jax import data
 from gnio_jax.calibration.errors import std_factors
 from gnio_jax.calibration.likelihood import Fit, Walks, fit
-from gnio_jax.calibration.unknowns import chosen, rounded, with_starts
+from gnio_jax.calibration.unknowns import chosen, with_starts, written
 from gnio_jax.config import CalibrateConfig, FilterOptions, TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import Setup, estimate, inference_network, prepare, true_displacements
@@ -82,7 +83,7 @@ def calibrate(
         raise InputError(f"split '{split}'", str(error)) from None
 
     unknowns = chosen(config.fit)
-    options = dataclasses.replace(own, **dict(zip(FACTORS, factors.tolist(), strict=True)))
+    options = written(own, dict(zip(FACTORS, jnp.asarray(factors), strict=True)))
     options = with_starts(options, unknowns)
     found = fit(
         _walks(prepared, estimates, run.config.data.stride),
@@ -92,7 +93,6 @@ def calibrate(
         lambda calls: progress("fitting", min(1.0, calls / (1.3 * config.steps))),
         config.steps,
     )
-    found = found._replace(options=_written(found.options, unknowns))
     calibration = Calibration(run.config.filter, found, len(prepared), folder)
     _write(calibration, workdir, run.config, config, split)
     return calibration
@@ -142,13 +142,6 @@ def _walks(prepared: list[Prepared], estimates: list[Estimate], stride: int) -> 
 
 def _filled(values: np.ndarray, rows: int, filling: np.ndarray) -> np.ndarray:
     return np.concatenate([values, np.repeat(filling, rows - len(values), axis=0)])
-
-
-def _written(options: FilterOptions, unknowns: tuple) -> FilterOptions:
-    """As config.yaml keeps them."""
-    options = rounded(options, unknowns)
-    factors = {name: float(f"{getattr(options, name):.4g}") for name in FACTORS}
-    return dataclasses.replace(options, **factors)
 
 
 def _write(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -79,17 +79,12 @@ def to_free(options: FilterOptions, unknowns: tuple[Unknown, ...]) -> Float[np.n
     return np.array([u.to_free(getattr(options, u.field)) for u in unknowns])
 
 
-def from_free(
-    free: Float[Array, "u"], options: FilterOptions, unknowns: tuple[Unknown, ...]
-) -> FilterOptions:
-    """The options with those values; also for values that only exist inside `jit`."""
-    values: dict[str, Any] = {
-        unknown.field: unknown.from_free(free[i]) for i, unknown in enumerate(unknowns)
-    }
-    return dataclasses.replace(options, **values)
+def from_free(free: Float[Array, "u"], unknowns: tuple[Unknown, ...]) -> dict[str, Array]:
+    """The values of the fields; also of numbers that are traced."""
+    return {unknown.field: unknown.from_free(free[i]) for i, unknown in enumerate(unknowns)}
 
 
-def rounded(options: FilterOptions, unknowns: tuple[Unknown, ...]) -> FilterOptions:
-    """With plain numbers of four digits, as they are written down."""
-    values = {u.field: float(f"{float(getattr(options, u.field)):.4g}") for u in unknowns}
+def written(options: FilterOptions, fields: dict[str, Array]) -> FilterOptions:
+    """The options with these values, as four digits, which is how they are written down."""
+    values = {name: float(f"{float(value):.4g}") for name, value in fields.items()}
     return dataclasses.replace(options, **values)

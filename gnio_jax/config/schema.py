@@ -337,7 +337,7 @@ class CalibrateConfig:
     split: str | None = None
     """Split whose recordings are fitted: the run's validation split (default) or its training
     split. Others are refused: what is tested must not have been fitted."""
-    fit: tuple[CalibratedGroup, ...] = ("measurement", "noise", "start", "window")
+    fit: tuple[CalibratedGroup, ...] = ("measurement", "noise", "window")
     """What is fitted by the likelihood of the innovations: the measurement's factor, the IMU's
     noise, the standard deviations of the initial biases, the part of a window's error that lasts,
     the errors of speed and heading that last."""
