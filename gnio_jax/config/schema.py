@@ -36,6 +36,9 @@ Table = Literal[
 ]
 
 
+CalibratedGroup = Literal["measurement", "noise", "start", "window", "walk"]
+
+
 @dataclass(frozen=True)
 class DataConfig:
     """Which recordings are read, and how windows are cut from them."""
@@ -228,6 +231,25 @@ class FilterOptions:
     """Initial standard deviation of the accelerometer bias, m/s²."""
     measurement_scale: Positive = 10.0
     """Factor of the network's covariance in the update."""
+    std_factor_x: Positive = 1.0
+    """Factor of the network's standard deviation along x of the window's yaw frame (ours; what
+    `gnio calibrate` finds that it lacks)."""
+    std_factor_y: Positive = 1.0
+    """The same along y."""
+    std_factor_z: Positive = 1.0
+    """The same along z."""
+    window_error_share: Probability = 0.0
+    """Share of a window's standard deviation that lasts beyond the window (ours); 0: its error is
+    white."""
+    window_error_seconds: Positive = 0.5
+    """Time constant of that error, s."""
+    scale_error_std: NonNegative = 0.0
+    """Standard deviation of the walker's speed over what the network says of it, as a fraction
+    (ours); 0: the displacements have no such error."""
+    heading_error_std_degrees: NonNegative = 0.0
+    """Standard deviation of the displacements' heading (ours); 0: they have no such error."""
+    walk_error_seconds: Positive = 60.0
+    """Time constant of both, s."""
     mahalanobis_fail_scale: NonNegative = 0.0
     """0 skips an update that the χ² gate rejects; above 0 the update is applied with its covariance
     multiplied by this."""
@@ -299,6 +321,30 @@ class EvaluateConfig:
     """Draw the trajectories, errors, displacements and the errors' distribution."""
     filter: FilterOptions = field(default_factory=FilterOptions)
     """Noise and start of the filter; by default the run's own."""
+
+
+@dataclass(frozen=True)
+class CalibrateConfig:
+    """What `gnio calibrate` is asked for."""
+
+    workdir: str | None = None
+    """Folder of the run; by default the newest below runs/."""
+    out: str | None = None
+    """Folder of the calibrated run; by default the run's with _calibrated behind its name."""
+    data_root: str | None = None
+    """Folder of the run's dataset; by default the run's, $GNIO_DATA/<dataset>, or data/<dataset>.
+    """
+    split: str | None = None
+    """Split whose recordings are fitted: the run's validation split (default) or its training
+    split. Others are refused: what is tested must not have been fitted."""
+    fit: tuple[CalibratedGroup, ...] = ("measurement", "noise", "window")
+    """What is fitted by the likelihood of the innovations: the measurement's factor, the IMU's
+    noise, the standard deviations of the initial biases, the part of a window's error that lasts,
+    the errors of speed and heading that last."""
+    checkpoint: Literal["best", "latest"] = "best"
+    """Which checkpoint of the run."""
+    steps: Count = 60
+    """Most steps of the search (L-BFGS)."""
 
 
 @dataclass(frozen=True)

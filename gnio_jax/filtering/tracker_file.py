@@ -84,7 +84,7 @@ def load_tracker(
         rest=about["rest"],
         std=InitialStd(*about["std"]),
     )
-    shapes = core_shapes(config, dtype) if "latest" in arrays else None
+    shapes = core_shapes(config, noise, dtype) if "latest" in arrays else None
     _check_arrays(path, arrays, _wanted_arrays(about, arrays, dtype, shapes))
     _check_pending(path, arrays["pending"], settings, started=shapes is not None)
     state = TrackerState(
@@ -172,7 +172,10 @@ def _named_leaves(core: TrackerCore) -> dict[str, Any]:
 
 
 def _numbers(noise: NoiseModel) -> dict[str, float]:
-    return {name: float(value) for name, value in noise._asdict().items()}
+    return {
+        jax.tree_util.keystr(path, simple=True, separator="."): float(value)
+        for path, value in jax.tree_util.tree_leaves_with_path(noise)
+    }
 
 
 def _read(path: Path) -> tuple[dict[str, Any], Arrays]:
