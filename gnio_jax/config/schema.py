@@ -138,6 +138,10 @@ class ModelConfig:
     deepils, ctin, imot)."""
     dropout: Probability | None = None
     """Fraction of activations dropped in training (tlio, ronin_resnet, deepils: 0.5; imot: 0.1)."""
+    equivariance: Literal["none", "four_headings", "canonical_frame"] = "none"
+    """A window turned about the vertical gives the displacement turned alike, for every network:
+    the mean over four headings of the window, at inference, or a frame that a small network finds
+    in the window (EqNIO)."""
 
 
 @dataclass(frozen=True)
@@ -257,6 +261,13 @@ class TrainConfig:
     filter: FilterOptions = field(default_factory=FilterOptions)
     checkpoint_every_seconds: float = 600.0
     """Longest time between checkpoints within an epoch, s; every epoch ends with one anyway."""
+
+    def check(self, prefix: str, source: str) -> None:
+        """Four headings are averaged only if training shows windows of every heading."""
+        if self.model.equivariance == "four_headings" and not self.augment.yaw:
+            problem = f"field '{prefix}model.equivariance' is four_headings without augment.yaw"
+            remedy = "training must show every heading: set augment.yaw to true"
+            raise InputError(source, problem, remedy)
 
 
 @dataclass(frozen=True)

@@ -27,6 +27,7 @@ from gnio_jax.training.step import (
     create_state,
     epoch_order,
     estimate_statistics,
+    isotropic,
     normalises,
     train_steps,
     validate,
@@ -194,7 +195,8 @@ def _validate(run: Run, state: TrainState, step: int) -> tuple[TrainState, Valid
     validation = validate(state, source=run.held_out, now=now, **options)
     if not calibrates(state):
         return state, validation
-    state = calibrated(state, validation)
+    equivariant = run.config.model.equivariance != "none"
+    state = calibrated(state, isotropic(validation) if equivariant else validation)
     return state, validate(state, source=run.held_out, now=now, **options)
 
 

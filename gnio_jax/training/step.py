@@ -283,6 +283,18 @@ def validate(
     )
 
 
+def isotropic(found: Validation) -> Validation:
+    """The same, with the mean of the two horizontal axes in the place of each. Constants of the
+    uncertainty of an equivariant network cannot tell one from the other."""
+
+    def mean(axes: Float[jax.Array, "3"]) -> Float[jax.Array, "3"]:
+        return axes.at[:2].set(axes[:2].mean())
+
+    return found._replace(
+        axis_mse=mean(found.axis_mse), axis_normalised=mean(found.axis_normalised)
+    )
+
+
 def calibrated(state: TrainState, found: Validation) -> TrainState:
     """The state whose constants and factors of the uncertainty (`models.heads`) fit the errors that
     validation found with it.
