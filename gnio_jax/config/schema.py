@@ -204,6 +204,17 @@ class OptimConfig:
     """Augmented training windows from which the statistics of batch normalisation are estimated
     before every validation and checkpoint (ours); 0 keeps the running averages of the last
     steps."""
+    ema_decay: Probability = 0.0
+    """Share of the averaged parameters that a step keeps, e.g. 0.999 (ours): the averages are
+    validated, kept as best and evaluated, while training goes on without them. 0 averages
+    nothing."""
+
+    def check(self, prefix: str, source: str) -> None:
+        """Running statistics of batch normalisation are not those of averaged parameters."""
+        if self.ema_decay and not self.statistics_windows:
+            problem = f"field '{prefix}ema_decay' is set without {prefix}statistics_windows"
+            remedy = "averaged parameters want statistics of their own: set it, e.g. to 16384"
+            raise InputError(source, problem, remedy)
 
 
 @dataclass(frozen=True)
