@@ -141,6 +141,10 @@ class ModelConfig:
     deepils, ctin, imot)."""
     dropout: Probability | None = None
     """Fraction of activations dropped in training (tlio, ronin_resnet, deepils: 0.5; imot: 0.1)."""
+    equivariance: Literal["none", "four_headings", "canonical_frame"] = "none"
+    """A window turned about the vertical gives the displacement turned alike, for every network:
+    the mean over four headings of the window, at inference, or a frame that a small network finds
+    in the window (EqNIO)."""
 
 
 @dataclass(frozen=True)
@@ -203,6 +207,17 @@ class OptimConfig:
     """Augmented training windows from which the statistics of batch normalisation are estimated
     before every validation and checkpoint (ours); 0 keeps the running averages of the last
     steps."""
+    ema_decay: Probability = 0.0
+    """Share of the averaged parameters that a step keeps, e.g. 0.999 (ours): the averages are
+    validated, kept as best and evaluated, while training goes on without them. 0 averages
+    nothing."""
+
+    def check(self, prefix: str, source: str) -> None:
+        """Running statistics of batch normalisation are not those of averaged parameters."""
+        if self.ema_decay and not self.statistics_windows:
+            problem = f"field '{prefix}ema_decay' is set without {prefix}statistics_windows"
+            remedy = "averaged parameters want statistics of their own: set it, e.g. to 16384"
+            raise InputError(source, problem, remedy)
 
 
 @dataclass(frozen=True)
@@ -279,6 +294,13 @@ class TrainConfig:
     filter: FilterOptions = field(default_factory=FilterOptions)
     checkpoint_every_seconds: float = 600.0
     """Longest time between checkpoints within an epoch, s; every epoch ends with one anyway."""
+
+    def check(self, prefix: str, source: str) -> None:
+        """Four headings are averaged only if training shows windows of every heading."""
+        if self.model.equivariance == "four_headings" and not self.augment.yaw:
+            problem = f"field '{prefix}model.equivariance' is four_headings without augment.yaw"
+            remedy = "training must show every heading: set augment.yaw to true"
+            raise InputError(source, problem, remedy)
 
 
 @dataclass(frozen=True)
