@@ -7,10 +7,11 @@ Needs only JAX and the geometry: the network is any function from windows to a `
 from gnio_jax.filtering.batch import cores_as_devices, over_sequences
 from gnio_jax.filtering.config import FilterConfig
 from gnio_jax.filtering.history import FilterHistory
+from gnio_jax.filtering.lasting_errors import LastingErrors
 from gnio_jax.filtering.noise import InitialStd, NoiseModel
 from gnio_jax.filtering.online import TrackerState
 from gnio_jax.filtering.pose import Pose
-from gnio_jax.filtering.scan import run_filter, run_odometry
+from gnio_jax.filtering.scan import repeat_odometry, run_filter, run_odometry
 from gnio_jax.filtering.smoother import SmoothedHistory, smooth, smooth_odometry
 from gnio_jax.filtering.start import initial_state, level_state
 from gnio_jax.filtering.state import FilterState, GateState
@@ -22,6 +23,7 @@ __all__ = [
     "FilterState",
     "GateState",
     "InitialStd",
+    "LastingErrors",
     "NoiseModel",
     "Pose",
     "SmoothedHistory",
@@ -31,6 +33,7 @@ __all__ = [
     "initial_state",
     "level_state",
     "over_sequences",
+    "repeat_odometry",
     "run_filter",
     "run_odometry",
     "smooth",

@@ -25,31 +25,31 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from gnio_jax.filtering.state import BIASES, CLONE, LOCAL, MOVE, OFFSET, THETA
+from gnio_jax.filtering.state import BIASES, CLONE, LASTING, LOCAL, MOVE, OFFSET, THETA
 from gnio_jax.filtering.update import Correction
 from gnio_jax.geometry import matmul
 from gnio_jax.types import Array
 
-ADJOINT_CORE = LOCAL.stop + 3
-"""Core entries of the adjoint: θ, v, o, b_g, b_a and the anchor's last move."""
+_MOVE = slice(LOCAL.stop, LOCAL.stop + 3)
+"""Where the anchor's last move lies in the adjoint: behind θ, v, o, b_g, b_a, before e."""
 
 
 class Adjoint(NamedTuple):
-    """λ and Λ over θ, v, o, b_g, b_a, s and the ring of clones."""
+    """λ and Λ over θ, v, o, b_g, b_a, s, e and the ring of clones."""
 
     vector: Float[Array, "m"]
     matrix: Float[Array, "m m"]
 
 
-def no_adjoint(clones: int, dtype: np.dtype) -> Adjoint:
+def no_adjoint(clones: int, errors: int, dtype: np.dtype) -> Adjoint:
     """Zero: nothing is measured after the last step."""
-    size = ADJOINT_CORE + CLONE * clones
+    size = _MOVE.stop + errors + CLONE * clones
     return Adjoint(jnp.zeros(size, dtype), jnp.zeros((size, size), dtype))
 
 
-def without_anchor(rows: Float[Array, "r 21"]) -> Float[Array, "r 18"]:
+def without_anchor(rows: Float[Array, "r n"]) -> Float[Array, "r k"]:
     """Columns of the core that the adjoint runs over."""
-    return jnp.concatenate([rows[:, LOCAL], rows[:, MOVE]], axis=1)
+    return jnp.concatenate([rows[:, LOCAL], rows[:, MOVE], rows[:, LASTING]], axis=1)
 
 
 def before_update(adjoint: Adjoint, correction: Correction, oldest: Int[Array, ""]) -> Adjoint:
@@ -59,7 +59,7 @@ def before_update(adjoint: Adjoint, correction: Correction, oldest: Int[Array, "
     jacobian = jax.lax.dynamic_update_slice_in_dim(
         jnp.concatenate([core_jacobian, jnp.zeros_like(correction.clone_rows)], axis=1),
         correction.oldest_jacobian,
-        ADJOINT_CORE + oldest,
+        core_jacobian.shape[1] + oldest,
         1,
     )
     over = rows @ adjoint.matrix
@@ -73,14 +73,17 @@ def before_update(adjoint: Adjoint, correction: Correction, oldest: Int[Array, "
 
 
 def before_propagation(
-    adjoint: Adjoint, transition: Float[Array, "9 15"], slot: Int[Array, ""]
+    adjoint: Adjoint,
+    transition: Float[Array, "9 15"],
+    decay: Float[Array, "e"],
+    slot: Int[Array, ""],
 ) -> Adjoint:
     """Back over cloning into `slot`, the motion and, in slot 0, the anchor's move before it."""
-    core = _core_transition(transition, slot)
+    core = _core_transition(transition, decay, slot)
     pose = jnp.concatenate([core[THETA], core[OFFSET]])  # what the clone is made of
 
     def back(rows: Float[Array, "m r"]) -> Float[Array, "m r"]:
-        of_core, of_clones = rows[:ADJOINT_CORE], rows[ADJOINT_CORE:]
+        of_core, of_clones = rows[: len(core)], rows[len(core) :]
         clone = jax.lax.dynamic_slice_in_dim(of_clones, CLONE * slot, CLONE)
         moved = jnp.concatenate([core, pose]).T @ jnp.concatenate([of_core, clone])
         forgotten = jnp.zeros_like(clone)
@@ -91,16 +94,18 @@ def before_propagation(
 
 
 def _core_transition(
-    transition: Float[Array, "9 15"], slot: Int[Array, ""]
-) -> Float[Array, "18 18"]:
-    """F of θ, v, o, b_g, b_a, s: in slot 0 the offset has become the anchor's last move."""
+    transition: Float[Array, "9 15"], decay: Float[Array, "e"], slot: Int[Array, ""]
+) -> Float[Array, "k k"]:
+    """F of θ, v, o, b_g, b_a, s, e: in slot 0 the offset has become the anchor's last move."""
     dtype = transition.dtype
     anchored = (slot == 0).astype(dtype)
     eye = np.eye(3, dtype=dtype)
     of_motion = jnp.pad(transition, ((0, 0), (0, 3)))
-    of_biases = np.eye(ADJOINT_CORE, dtype=dtype)[BIASES]
+    of_biases = np.eye(_MOVE.stop, dtype=dtype)[BIASES]
     before_offset, between = jnp.zeros((3, OFFSET.start), dtype), jnp.zeros((3, 6), dtype)
     of_move = jnp.concatenate(
         [before_offset, anchored * eye, between, (1 - anchored) * eye], axis=1
     )
-    return jnp.concatenate([of_motion, of_biases, of_move])
+    of_rest = jnp.pad(jnp.diag(decay), ((0, 0), (_MOVE.stop, 0)))
+    whole = jnp.concatenate([of_motion, of_biases, of_move])
+    return jnp.concatenate([jnp.pad(whole, ((0, 0), (0, len(decay)))), of_rest])

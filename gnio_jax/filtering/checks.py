@@ -16,6 +16,7 @@ import numpy as np
 from jax.core import Tracer
 
 from gnio_jax.filtering.config import FilterConfig
+from gnio_jax.filtering.lasting_errors import LastingErrors
 
 BATCH_REMEDY = "for a batch of sequences use jax.vmap"
 
@@ -62,6 +63,17 @@ def check_not_negative(name: str, value: Any) -> None:
         number = float(np.asarray(value))
         if not (math.isfinite(number) and number >= 0):
             raise ValueError(f"{name}: must be a number that is not negative, found {number}")
+
+
+def check_lasting_errors(name: str, errors: LastingErrors) -> None:
+    """Refuse a share of a window's error that is all of it, and times that are zero."""
+    for field in ("window_seconds", "walk_seconds"):
+        value = getattr(errors, field)
+        if not isinstance(value, Tracer) and not float(value) > 0:
+            raise ValueError(f"{name}.{field}: must be positive, found {float(value)}")
+    share = errors.window_share
+    if not isinstance(share, Tracer) and not float(share) < 1:
+        raise ValueError(f"{name}.window_share: must be below 1, found {float(share)}")
 
 
 def check_positive_definite(name: str, value: jax.Array) -> None:

@@ -145,6 +145,11 @@ class FilterConfig:
         return self.samples_per_clone * self.clones_per_window
 
     @property
+    def clone_seconds(self) -> float:
+        """Length of a clone interval, s."""
+        return self.dt * self.samples_per_clone
+
+    @property
     def clones(self) -> int:
         """Cloned poses W + 1."""
         return self.clones_per_window + 1

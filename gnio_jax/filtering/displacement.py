@@ -12,7 +12,9 @@ from jaxtyping import Bool, Float
 from gnio_jax import geometry
 from gnio_jax.filtering.config import FilterConfig, YawFrame
 from gnio_jax.filtering.gate import innovation_gate
-from gnio_jax.filtering.state import CLONE, MOVE, OFFSET, FilterState
+from gnio_jax.filtering.lasting_errors import LastingErrors, distort
+from gnio_jax.filtering.noise import NoiseModel
+from gnio_jax.filtering.state import CLONE, LASTING, MOVE, OFFSET, FilterState
 from gnio_jax.filtering.update import (
     Cholesky,
     Correction,
@@ -49,6 +51,8 @@ class Residual(NamedTuple):
     """r, m."""
     jacobian: Float[Array, "3 9"]
     """H of the prediction over θ_i, p_i, p_j."""
+    lasting_jacobian: Float[Array, "3 e"]
+    """H over the errors that last."""
     defined: Bool[Array, ""]
     """Whether H exists: no gimbal lock."""
 
@@ -72,14 +76,21 @@ class DisplacementUpdate(NamedTuple):
 
 
 def scaled_measurement(
-    displacement: Float[Array, "3"], covariance: Float[Array, "3 3"], config: FilterConfig
+    displacement: Float[Array, "3"],
+    covariance: Float[Array, "3 3"],
+    config: FilterConfig,
+    noise: NoiseModel,
 ) -> Measurement:
-    """Scale; keep NaN out of the arithmetic, or its derivatives would be NaN too."""
+    """Scale by `measurement_scale` and `std_factor`; keep NaN out of the arithmetic, or its
+    derivatives would be NaN too."""
     present = jnp.all(jnp.isfinite(displacement)) & jnp.all(jnp.isfinite(covariance))
     eye = jnp.eye(3, dtype=covariance.dtype)
+    factor = jnp.stack(jax.tree.map(jnp.asarray, noise.std_factor)).astype(covariance.dtype)
+    scale = config.measurement_scale * (factor[:, None] * factor[None])
+    known = jnp.where(present, covariance, eye)
     return Measurement(
         displacement=jnp.where(present, displacement, 0.0),
-        covariance=jnp.where(present, config.measurement_scale * covariance, eye),
+        covariance=jnp.where(present, scale * known, eye),
         present=present,
     )
 
@@ -120,7 +131,8 @@ def displacement_residual(
     # hat(d) Hz is a single outer product, (d × z) ⊗ yaw_row, and the yaw leaves z alone.
     turned = jnp.stack([lever[1], -lever[0], zero])
     jacobian = jnp.concatenate([turned[:, None] * yaw_row[None, :], -unyaw, unyaw], axis=1)
-    return Residual(displacement - predicted, jacobian, defined)
+    no_errors = jnp.zeros((3, 0), jacobian.dtype)
+    return Residual(displacement - predicted, jacobian, no_errors, defined)
 
 
 def update(
@@ -130,9 +142,12 @@ def update(
     oldest: Array | int,
     config: FilterConfig,
     frame: YawFrame = "given",
+    errors: LastingErrors | None = None,
 ) -> tuple[FilterState, DisplacementUpdate]:
     """`update_with_correction` for those who do not smooth."""
-    state, result, _ = update_with_correction(state, measurement, newest, oldest, config, frame)
+    state, result, _ = update_with_correction(
+        state, measurement, newest, oldest, config, frame, errors
+    )
     return state, result
 
 
@@ -143,19 +158,22 @@ def update_with_correction(
     oldest: Array | int,
     config: FilterConfig,
     frame: YawFrame,
+    errors: LastingErrors | None,
 ) -> tuple[FilterState, DisplacementUpdate, Correction]:
     """One EKF update with the displacement between the clones in slots `oldest` and `newest` of the
     ring, once it is full.
 
-    H touches twelve rows of the covariance P, so H P is three rows. Nothing changes where there is
-    no measurement, or it is rejected, or at gimbal lock.
+    H touches twelve rows of the covariance P and those of the `errors` that last, so H P is three
+    rows. Nothing changes where there is no measurement, or it is rejected, or at gimbal lock.
     """
     full = state.step >= state.clone_offset.shape[0]
     measurement = measurement._replace(present=measurement.present & full)
     # Once in a round of the ring the oldest clone has the core's anchor, else the one before it.
     moves_apart = jnp.where(oldest == 0, 0.0, 1.0).astype(state.move.dtype)
     residual = _residual_of_state(state, measurement.displacement, oldest, moves_apart, frame)
-    projected = _project(state, residual.jacobian, oldest, moves_apart)
+    if errors is not None:
+        residual, measurement = _with_lasting_errors(residual, measurement, state, errors)
+    projected = _project(state, residual, oldest, moves_apart)
 
     root = _root(projected.innovation_covariance, measurement, 1.0)
     whitened = root.whiten(residual.innovation)
@@ -200,10 +218,27 @@ def _residual_of_state(
     return displacement_residual(rotation, moved, displacement, moved_first, frame)
 
 
+def _with_lasting_errors(
+    residual: Residual, measurement: Measurement, state: FilterState, errors: LastingErrors
+) -> tuple[Residual, Measurement]:
+    """The residual of a displacement with errors that last, and the measurement with what is left
+    of its covariance: that of the white noise."""
+    root = cholesky(measurement.covariance).matrix
+    moved = measurement.displacement - residual.innovation
+    expected = distort(moved, root, state.lasting, errors)
+    residual = residual._replace(
+        innovation=measurement.displacement - expected.displacement,
+        jacobian=matmul(expected.gain, residual.jacobian),
+        lasting_jacobian=expected.jacobian,
+    )
+    white = (1 - errors.window_share**2) * measurement.covariance
+    return residual, measurement._replace(covariance=white)
+
+
 class _Projected(NamedTuple):
     """The covariance as the measurement sees it."""
 
-    core_rows: Float[Array, "3 21"]
+    core_rows: Float[Array, "3 n"]
     """H P against the core."""
     clone_rows: Float[Array, "3 m"]
     """H P against the clones."""
@@ -212,7 +247,7 @@ class _Projected(NamedTuple):
 
 
 def _project(
-    state: FilterState, jacobian: Float[Array, "3 9"], oldest: Array | int, moves_apart: Array
+    state: FilterState, residual: Residual, oldest: Array | int, moves_apart: Array
 ) -> _Projected:
     """H P and H P Hᵀ. The newest clone is the core's own pose: its rows of P are the core's."""
     entry = CLONE * oldest
@@ -222,11 +257,13 @@ def _project(
         part[OFFSET] + moves_apart * part[MOVE]
         for part in (state.core_covariance, state.cross_covariance)
     )
-    core_rows = matmul(jacobian, jnp.concatenate([old_core.T, new_core]))
-    clone_rows = matmul(jacobian, jnp.concatenate([old_clones, new_clones]))
+    of_errors = state.core_covariance[LASTING], state.cross_covariance[LASTING]
+    jacobian = jnp.concatenate([residual.jacobian, residual.lasting_jacobian], axis=1)
+    core_rows = matmul(jacobian, jnp.concatenate([old_core.T, new_core, of_errors[0]]))
+    clone_rows = matmul(jacobian, jnp.concatenate([old_clones, new_clones, of_errors[1]]))
     of_old = jax.lax.dynamic_slice_in_dim(clone_rows, entry, CLONE, 1)
     of_new = core_rows[:, OFFSET] + moves_apart * core_rows[:, MOVE]
-    touched = jnp.concatenate([of_old, of_new], axis=1)
+    touched = jnp.concatenate([of_old, of_new, core_rows[:, LASTING]], axis=1)
     return _Projected(core_rows, clone_rows, matmul(touched, jacobian.T))
 
 
@@ -260,12 +297,18 @@ def _correction(
     accepted: Bool[Array, ""],
 ) -> Correction:
     """L⁻¹ r, L⁻¹ H P and L⁻¹ H; rows of zeros where the measurement is not `accepted`."""
-    core_rows, clone_rows, jacobian = (
+    core_rows, clone_rows, jacobian, of_errors = (
         jnp.where(accepted, root.solve(rows), 0.0)
-        for rows in (projected.core_rows, projected.clone_rows, residual.jacobian)
+        for rows in (
+            projected.core_rows,
+            projected.clone_rows,
+            residual.jacobian,
+            residual.lasting_jacobian,
+        )
     )
     of_new = jacobian[:, OF_NEWEST]
     core_jacobian = jnp.zeros_like(core_rows).at[:, OFFSET].set(of_new)
     core_jacobian = core_jacobian.at[:, MOVE].set(moves_apart * of_new)
+    core_jacobian = core_jacobian.at[:, LASTING].set(of_errors)
     whitened = root.whiten(residual.innovation)
     return Correction(whitened, core_rows, clone_rows, core_jacobian, jacobian[:, OF_OLDEST])

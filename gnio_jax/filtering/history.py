@@ -65,6 +65,9 @@ class FilterHistory(NamedTuple):
     """0 from the first row on where the state is not finite, a variance is negative or the speed
     above `FilterConfig.speed_limit`: bad input that could not be seen before, and all after it is
     void. The final state remembers it, and a later run from that begins with 0."""
+    lasting: Float[Array, "k e"]
+    """Errors of the displacements that last, as estimated (see `lasting_errors`): window (3), log
+    scale, heading rad; no columns where `NoiseModel.displacement` is None."""
     diagnostics: dict[str, Array]
     """The network's diagnostics stacked over K, NaN where it had no window; empty without a
     network."""
@@ -79,6 +82,8 @@ class StepRecord(NamedTuple):
     measurement: Measurement
     update: DisplacementUpdate
     rest: RestUpdate
+    lasting: Array
+    """Errors of the displacements that last."""
     diagnostics: dict[str, Array]
 
 
@@ -117,6 +122,7 @@ def stacked_history(
         rest_nis=jnp.where(records.rest.quiet, records.rest.nis, jnp.nan).astype(dtype),
         imu_gap=imu_gap.astype(dtype),
         healthy=healthy.astype(dtype),
+        lasting=records.lasting,
         diagnostics=records.diagnostics,
     )
 

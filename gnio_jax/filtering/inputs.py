@@ -12,6 +12,7 @@ from jax.core import Tracer
 from gnio_jax.filtering.checks import (
     BATCH_REMEDY,
     check_finite,
+    check_lasting_errors,
     check_not_negative,
     check_positive_definite,
     check_rotation,
@@ -19,7 +20,7 @@ from gnio_jax.filtering.checks import (
 )
 from gnio_jax.filtering.config import FilterConfig
 from gnio_jax.filtering.noise import NoiseModel
-from gnio_jax.filtering.start import initial_state
+from gnio_jax.filtering.start import initial_state, with_lasting_errors
 from gnio_jax.filtering.state import FilterState
 from gnio_jax.types import Array
 
@@ -48,14 +49,21 @@ class Signals(NamedTuple):
 
 def checked_noise(noise: NoiseModel, dtype: Any) -> NoiseModel:
     """`noise` in one precision."""
-    for name, value in noise._asdict().items():
-        check_not_negative(f"noise.{name}", value)
-    return NoiseModel(*[jnp.asarray(value, dtype) for value in noise])
+    for path, value in jax.tree_util.tree_leaves_with_path(noise):
+        check_not_negative("noise" + jax.tree_util.keystr(path), value)
+    if noise.displacement is not None:
+        check_lasting_errors("noise.displacement", noise.displacement)
+    return jax.tree.map(lambda value: jnp.asarray(value, dtype), noise)
 
 
-def checked_state(state: FilterState, config: FilterConfig) -> FilterState:
-    """`state` in one precision, with the fields and shapes that `config` wants."""
-    wanted = state_shapes(config, jnp.float32 if config.allow_float32 else jnp.float64)
+def checked_state(state: FilterState, config: FilterConfig, noise: NoiseModel) -> FilterState:
+    """`state` in one precision, with the fields and shapes that `config` and `noise` want.
+
+    A state without the errors that last gets them, as large as `noise` says.
+    """
+    if noise.displacement is not None:
+        state = with_lasting_errors(state, noise.displacement)
+    wanted = state_shapes(config, noise, jnp.float32 if config.allow_float32 else jnp.float64)
     if jax.tree.structure(state) != jax.tree.structure(wanted):
         raise ValueError(
             "state: was made for another FilterConfig than this one, "
@@ -79,10 +87,16 @@ def checked_state(state: FilterState, config: FilterConfig) -> FilterState:
     return checked
 
 
-def state_shapes(config: FilterConfig, dtype: Any) -> FilterState:
+def state_shapes(config: FilterConfig, noise: NoiseModel, dtype: Any) -> FilterState:
     """Shapes and types of the filter's state."""
-    nothing = jnp.zeros(3, dtype)
-    return jax.eval_shape(lambda: initial_state(config, jnp.eye(3, dtype=dtype), nothing, nothing))
+
+    def start() -> FilterState:
+        nothing = jnp.zeros(3, dtype)
+        state = initial_state(config, jnp.eye(3, dtype=dtype), nothing, nothing)
+        errors = noise.displacement
+        return state if errors is None else with_lasting_errors(state, errors)
+
+    return jax.eval_shape(start)
 
 
 def _check_state_values(state: FilterState) -> None:
@@ -106,7 +120,7 @@ def checked_inputs(
     noise: NoiseModel,
 ) -> tuple[FilterState, Signals, NoiseModel]:
     """What every run takes, checked and in the state's precision."""
-    state = checked_state(state, config)
+    state = checked_state(state, config, noise)
     dtype, n = state.offset.dtype, config.samples_per_clone
     samples = jnp.shape(gyro)[0] if jnp.ndim(gyro) else 0
     if samples < n or samples % n:
@@ -143,3 +157,16 @@ def checked_measurements(
     covariance = checked_array("covariance", covariance, (intervals, 3, 3), config)
     check_positive_definite("covariance", covariance.astype(dtype))
     return displacement.astype(dtype), covariance.astype(dtype)
+
+
+def checked_displacements(
+    displacement: Any, std: Any, signals: Signals, config: FilterConfig
+) -> tuple[jax.Array, jax.Array]:
+    """The displacements of a run and their standard deviations, for every clone interval of
+    `signals`, in its precision."""
+    shape = (signals.gyro.shape[0] // config.samples_per_clone, 3)
+    displacement, std = (
+        checked_array(name, value, shape, config).astype(signals.gyro.dtype)
+        for name, value in [("displacement", displacement), ("measurement_std", std)]
+    )
+    return displacement, std

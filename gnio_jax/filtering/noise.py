@@ -8,12 +8,13 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Float
 
+from gnio_jax.filtering.lasting_errors import LastingErrors
 from gnio_jax.types import Array
 
 
 class NoiseModel(NamedTuple):
     """White noise of the IMU as densities, so that it does not depend on the rate, and random walks
-    of its biases. Each a scalar.
+    of its biases, each a scalar; and the errors of the displacements that are not white.
 
     The defaults are TLIO's per-sample values, tuned at about 1 kHz, as densities.
     """
@@ -26,6 +27,12 @@ class NoiseModel(NamedTuple):
     """rad/s/√s"""
     accel_bias_walk: Float[Array, ""] | float = 1e-4
     """m/s²/√s"""
+    std_factor: tuple[Any, Any, Any] = (1.0, 1.0, 1.0)
+    """Factors of the displacements' standard deviations along x, y, z of their yaw frame (ours):
+    what calibration finds that they lack."""
+    displacement: LastingErrors | None = None
+    """Errors of the displacements that last, as entries of the filter's state; None: all of them
+    are white."""
 
     @classmethod
     def per_sample(

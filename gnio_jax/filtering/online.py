@@ -103,17 +103,19 @@ def start_core(state: FilterState, config: FilterConfig) -> TrackerCore:
     return TrackerCore(state, window, jnp.int32(0))
 
 
-def core_shapes(config: FilterConfig, dtype: Any) -> TrackerCore:
+def core_shapes(config: FilterConfig, noise: NoiseModel, dtype: Any) -> TrackerCore:
     """Shapes and types of the core."""
     window = jax.ShapeDtypeStruct((config.reach, GRID_COLUMNS), dtype)
-    return TrackerCore(state_shapes(config, dtype), window, jax.ShapeDtypeStruct((), jnp.int32))
+    return TrackerCore(
+        state_shapes(config, noise, dtype), window, jax.ShapeDtypeStruct((), jnp.int32)
+    )
 
 
 def compile_programs(
     predict: Predict, config: FilterConfig, noise: NoiseModel, dtype: Any
 ) -> Programs:
     """Compile both, so that no sample waits for a compiler."""
-    shapes = core_shapes(config, dtype)
+    shapes = core_shapes(config, noise, dtype)
     of_type = functools.partial(jax.ShapeDtypeStruct, dtype=dtype)
     rows, row = of_type((config.samples_per_clone, GRID_COLUMNS)), of_type((GRID_COLUMNS,))
     whole = dataclasses.replace(config, history="core")
@@ -154,7 +156,7 @@ def advance(
 
     def measure(state: FilterState, oldest: Array | int) -> tuple[Measurement, dict]:
         prediction = jax.lax.cond(complete, infer, nothing, state, jnp.asarray(oldest))
-        return predicted_measurement(prediction, config, rows.dtype), {}
+        return predicted_measurement(prediction, config, noise, rows.dtype), {}
 
     slot, frame = core.intervals % config.clones, config.displacement_frame
     state, record = clone_step(core.filter, stream, measure, slot, config, noise, frame)

@@ -30,11 +30,13 @@ from jaxtyping import Bool, Float
 
 from gnio_jax import geometry
 from gnio_jax.filtering.gaps import Gap, Imu
+from gnio_jax.filtering.lasting_errors import LastingMotion
 from gnio_jax.filtering.noise import NoiseModel
 from gnio_jax.filtering.state import (
     ANCHOR,
     BIASES,
     CLONE,
+    LASTING,
     LOCAL,
     MOTION,
     MOVE,
@@ -250,7 +252,11 @@ def transition(
 
 
 def propagate(
-    state: FilterState, motion: IntervalMotion, anchored: Bool[Array, ""], slot: Array | int
+    state: FilterState,
+    motion: IntervalMotion,
+    lasting: LastingMotion,
+    anchored: Bool[Array, ""],
+    slot: Array | int,
 ) -> FilterState:
     """Move mean and covariance over one interval and clone the new pose into `slot` of the ring, in
     the place of the oldest.
@@ -261,13 +267,13 @@ def propagate(
     kept = 1 - anchored.astype(motion.offset.dtype)
     moved = transition(state, motion, anchored)
 
-    def move(rows: Float[Array, "21 m"]) -> Float[Array, "21 m"]:
+    def move(rows: Float[Array, "n m"]) -> Float[Array, "n m"]:
         over = (1 - kept) * rows[OFFSET]
         anchor, last_move = rows[ANCHOR] + over, kept * rows[MOVE] + over
-        return jnp.concatenate([moved @ rows[LOCAL], rows[BIASES], anchor, last_move])
+        errors = lasting.decay[:, None] * rows[LASTING]
+        return jnp.concatenate([moved @ rows[LOCAL], rows[BIASES], anchor, last_move, errors])
 
-    noise = jnp.pad(motion.noise, (0, MOVE.stop - len(motion.noise)))
-    core = move(move(state.core_covariance).T) + noise
+    core = move(move(state.core_covariance).T) + _core_noise(motion, lasting)
     # The variance of the position grows, and with it what rounding leaves between the triangles.
     core = 0.5 * (core + core.T)
     clone = CLONE * slot
@@ -279,6 +285,7 @@ def propagate(
         rotation=motion.rotation,
         velocity=motion.velocity,
         offset=motion.offset,
+        lasting=lasting.decay * state.lasting,
         clone_rotation=_replaced(state.clone_rotation, motion.rotation, slot),
         clone_offset=_replaced(state.clone_offset, motion.offset, slot),
         core_covariance=core,
@@ -286,6 +293,15 @@ def propagate(
         clone_covariance=clones,
         step=state.step + 1,
         first=_first_estimates(state.first, motion, slot),
+    )
+
+
+def _core_noise(motion: IntervalMotion, lasting: LastingMotion) -> Float[Array, "n n"]:
+    """What an interval adds to the covariance of the core; the anchor and its move stay."""
+    of_motion, of_errors = motion.noise, jnp.diag(lasting.variance)
+    errors = len(lasting.variance)
+    return jnp.pad(of_motion, (0, MOVE.stop + errors - len(of_motion))) + jnp.pad(
+        of_errors, (MOVE.stop, 0)
     )
 
 

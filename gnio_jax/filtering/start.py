@@ -16,6 +16,7 @@ from gnio_jax.filtering.checks import (
     checked_array,
 )
 from gnio_jax.filtering.config import FilterConfig
+from gnio_jax.filtering.lasting_errors import LastingErrors, prior_variance
 from gnio_jax.filtering.noise import TLIO_STD, InitialStd
 from gnio_jax.filtering.state import (
     ACCEL_BIAS,
@@ -81,6 +82,7 @@ def initial_state(
         move=nothing,
         clone_rotation=jnp.tile(jnp.eye(3, dtype=dtype)[None], (clones, 1, 1)),
         clone_offset=jnp.zeros((clones, 3), dtype),
+        lasting=jnp.zeros(0, dtype),
         core_covariance=jnp.diag(_core_std(std, dtype) ** 2),
         cross_covariance=jnp.zeros((CORE, CLONE * clones), dtype),
         clone_covariance=jnp.zeros((CLONE * clones, CLONE * clones), dtype),
@@ -89,6 +91,21 @@ def initial_state(
         imu=_no_imu(dtype),
         healthy=jnp.bool_(True),
         first=first if config.jacobians == "first" else None,
+    )
+
+
+def with_lasting_errors(state: FilterState, errors: LastingErrors) -> FilterState:
+    """A state that knows nothing yet of the errors of the displacements that last; one that has
+    them is as it was."""
+    if len(state.lasting):
+        return state
+    variance = prior_variance(errors, state.offset.dtype)
+    count = len(variance)
+    return state._replace(
+        lasting=jnp.zeros_like(variance),
+        core_covariance=jnp.pad(state.core_covariance, (0, count))
+        + jnp.diag(jnp.pad(variance, (CORE, 0))),
+        cross_covariance=jnp.pad(state.cross_covariance, ((0, count), (0, 0))),
     )
 
 

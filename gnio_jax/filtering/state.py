@@ -1,8 +1,9 @@
 """State of the stochastic-cloning EKF (paper §III-G, after TLIO).
 
-The error state is δ = (θ, v, o, b_g, b_a, a, s | θ_0, o_0, θ_1, o_1, …): 21 core entries, then 6
-per clone, oldest clone first. Rotation errors are world-frame and left, R ← exp(δθ) R; everything
-else adds.
+The error state is δ = (θ, v, o, b_g, b_a, a, s, e | θ_0, o_0, θ_1, o_1, …): 21 core entries and
+those of e, then 6 per clone, oldest clone first. Rotation errors are world-frame and left,
+R ← exp(δθ) R; everything else adds. e are the errors of the displacements that last (see
+`lasting_errors`): none, or 5 entries.
 
 Positions are held as offsets o = p − a from an anchor a, a past position that moves up to the
 present once in a window; s is its last move. A clone keeps the anchor that it was taken with: the
@@ -24,7 +25,7 @@ from jaxtyping import Bool, Float, Int
 from gnio_jax.types import Array
 
 CORE, CLONE = 21, 6
-"""Entries of the error state: of the core, and of each clone."""
+"""Entries of the error state: of the core without e, and of each clone."""
 THETA, VELOCITY, OFFSET, GYRO_BIAS, ACCEL_BIAS, ANCHOR, MOVE = (
     slice(3 * i, 3 * i + 3) for i in range(7)
 )
@@ -34,7 +35,9 @@ MOTION = slice(THETA.start, OFFSET.stop)
 BIASES = slice(GYRO_BIAS.start, ACCEL_BIAS.stop)
 """b_g, b_a: what an interval keeps."""
 LOCAL = slice(THETA.start, ANCHOR.start)
-"""θ, v, o, b_g, b_a: all but the anchor and its move."""
+"""θ, v, o, b_g, b_a: all but the anchor, its move and e."""
+LASTING = slice(MOVE.stop, None)
+"""e: 0 or 5 entries."""
 CLONE_THETA, CLONE_OFFSET = slice(0, 3), slice(3, 6)
 """Where each part of a clone's error lies."""
 
@@ -120,14 +123,16 @@ class FilterState(NamedTuple):
     """A past position in the world frame, m."""
     move: Float[Array, "3"]
     """From the anchor before it, m."""
+    lasting: Float[Array, "e"]
+    """Errors of the displacements that last (`lasting_errors`): none, or 5."""
     clone_rotation: Float[Array, "c 3 3"]
     """Cloned rotations."""
     clone_offset: Float[Array, "c 3"]
     """Cloned positions, from the anchor they were taken with; between runs, from the present one,
     m."""
-    core_covariance: Float[Array, "21 21"]
-    """θ, v, o, b_g, b_a, a, s."""
-    cross_covariance: Float[Array, "21 6c"]
+    core_covariance: Float[Array, "n n"]
+    """θ, v, o, b_g, b_a, a, s, e: n = 21, or 26 with lasting errors."""
+    cross_covariance: Float[Array, "n 6c"]
     """Core against the clones' θ, o."""
     clone_covariance: Float[Array, "6c 6c"]
     """Among the clones."""
@@ -151,7 +156,7 @@ class FilterState(NamedTuple):
         return Mean(self.rotation, self.velocity, self.position, self.gyro_bias, self.accel_bias)
 
 
-def core_covariance(covariance: Float[Array, "21 21"]) -> Float[Array, "15 15"]:
+def core_covariance(covariance: Float[Array, "n n"]) -> Float[Array, "15 15"]:
     """Covariance of θ, v, p, b_g, b_a from that of the core's error: p = a + o."""
     both = covariance + _onto_offset(covariance[ANCHOR], 0)
     return (both + _onto_offset(both[:, ANCHOR], 1))[LOCAL, LOCAL]
@@ -160,18 +165,18 @@ def core_covariance(covariance: Float[Array, "21 21"]) -> Float[Array, "15 15"]:
 def _onto_offset(part: Array, axis: int) -> Array:
     """Padded with zeros, along `axis`, to where the offset lies."""
     around = [(0, 0), (0, 0)]
-    around[axis] = (OFFSET.start, CORE - OFFSET.stop)
+    around[axis] = (OFFSET.start, part.shape[1 - axis] - OFFSET.stop)
     return jnp.pad(part, around)
 
 
 def covariance(state: FilterState) -> Float[Array, "d d"]:
     """The whole covariance of θ, v, p, b_g, b_a and the clones' θ, p from the oldest, d = 15 + 6 (W
     + 1)."""
-    clones = state.clone_offset.shape[0]
-    world = np.eye(CORE + CLONE * clones)  # p = a + o for the core and for every clone
-    for start in [OFFSET.start, *range(CORE + CLONE_OFFSET.start, len(world), CLONE)]:
+    core, clones = len(state.core_covariance), state.clone_offset.shape[0]
+    world = np.eye(core + CLONE * clones)  # p = a + o for the core and for every clone
+    for start in [OFFSET.start, *range(core + CLONE_OFFSET.start, len(world), CLONE)]:
         world[start : start + 3, ANCHOR] = np.eye(3)
-    world = np.delete(world, np.r_[ANCHOR, MOVE], axis=0).astype(state.core_covariance.dtype)
+    world = np.delete(world, np.r_[ANCHOR.start : core], axis=0).astype(state.core_covariance.dtype)
     whole = jnp.block(
         [
             [state.core_covariance, state.cross_covariance],

@@ -13,6 +13,7 @@ from gnio_jax.filtering.config import FilterConfig, YawFrame
 from gnio_jax.filtering.displacement import Measurement, update_with_correction
 from gnio_jax.filtering.gaps import Imu
 from gnio_jax.filtering.history import StepRecord
+from gnio_jax.filtering.lasting_errors import lasting_motion
 from gnio_jax.filtering.noise import NoiseModel
 from gnio_jax.filtering.propagation import integrate_interval, propagate, transition
 from gnio_jax.filtering.state import FilterState, core_covariance
@@ -30,6 +31,8 @@ class StepTrace(NamedTuple):
 
     transition: Float[Array, "9 15"]
     """See `propagation.transition`."""
+    decay: Float[Array, "e"]
+    """See `lasting_errors.LastingMotion`."""
     corrections: tuple[Correction, ...]
     """The updates in the order in which they were made."""
 
@@ -69,11 +72,12 @@ def traced_clone_step(
     state = move_anchor(state, anchored)
     motion = integrate_interval(state, imu, noise, config.dt)
     moved = transition(state, motion, anchored)
-    state = propagate(state, motion, anchored, newest)
+    lasting = lasting_motion(noise.displacement, config.clone_seconds, state.offset.dtype)
+    state = propagate(state, motion, lasting, anchored, newest)
 
     measurement, diagnostics = measure(state, oldest)
     state, update, *corrections = update_with_correction(
-        state, measurement, newest, oldest, config, frame
+        state, measurement, newest, oldest, config, frame, noise.displacement
     )
     rest = no_rest(update.nis.dtype)
     if config.zero_velocity_std > 0:
@@ -84,5 +88,7 @@ def traced_clone_step(
     covariance = core_covariance(state.core_covariance)
     if config.history == "diagonal":
         covariance = jnp.diagonal(covariance)
-    record = StepRecord(state.mean, covariance, measurement, update, rest, diagnostics)
-    return state, record, StepTrace(moved, tuple(corrections))
+    record = StepRecord(
+        state.mean, covariance, measurement, update, rest, state.lasting, diagnostics
+    )
+    return state, record, StepTrace(moved, lasting.decay, tuple(corrections))

@@ -47,7 +47,7 @@ from gnio_jax.filtering.online import (
     start_core,
 )
 from gnio_jax.filtering.pose import Pose, pose_from_vector, start_vector
-from gnio_jax.filtering.start import initial_state, level_state
+from gnio_jax.filtering.start import initial_state, level_state, with_lasting_errors
 from gnio_jax.filtering.state import FilterState, ImuMemory
 from gnio_jax.filtering.tracker_file import load_tracker, save_tracker
 from gnio_jax.types import Prediction
@@ -84,7 +84,7 @@ class Tracker:
         hole: float | None = None,
         imu_rate: float | None = None,
     ):
-        state = checked_state(state, config)
+        state = checked_state(state, config, noise)
         dtype = np.dtype(state.offset.dtype)
         low_pass = checked_design(config.dt, hole, imu_rate)
         self._make(predict, TrackerSettings(config, checked_noise(noise, dtype), low_pass, dtype))
@@ -232,6 +232,9 @@ class Tracker:
         """How many pending samples `pose` has integrated, its vector and IMU memory after them."""
 
     def _start(self, state: FilterState) -> None:
+        errors = self._settings.noise.displacement
+        if errors is not None:
+            state = with_lasting_errors(state, errors)
         # Copies: the first step is given their memory, and it may not be shared, not even between
         # two fields.
         self._core = _copied(start_core(state, self._settings.config))

@@ -18,7 +18,7 @@ from gnio_jax.files import replacing
 from gnio_jax.filtering.clock import Clock
 from gnio_jax.filtering.config import FilterConfig
 from gnio_jax.filtering.inputs import checked_noise
-from gnio_jax.filtering.intake import Intake, Run, checked_design
+from gnio_jax.filtering.intake import Intake, SampleRun, checked_design
 from gnio_jax.filtering.noise import InitialStd, NoiseModel
 from gnio_jax.filtering.online import (
     GRID_COLUMNS,
@@ -84,7 +84,7 @@ def load_tracker(
         rest=about["rest"],
         std=InitialStd(*about["std"]),
     )
-    shapes = core_shapes(config, dtype) if "latest" in arrays else None
+    shapes = core_shapes(config, noise, dtype) if "latest" in arrays else None
     _check_arrays(path, arrays, _wanted_arrays(about, arrays, dtype, shapes))
     _check_pending(path, arrays["pending"], settings, started=shapes is not None)
     state = TrackerState(
@@ -160,7 +160,7 @@ def _intake(saved: dict[str, Any] | None, arrays: Arrays) -> Intake | None:
     if saved is None:
         return None
     first = saved["run"]
-    run = None if first is None else Run(first, arrays["stamps"], arrays["samples"])
+    run = None if first is None else SampleRun(first, arrays["stamps"], arrays["samples"])
     return Intake(**(saved | {"run": run}))
 
 
@@ -172,7 +172,10 @@ def _named_leaves(core: TrackerCore) -> dict[str, Any]:
 
 
 def _numbers(noise: NoiseModel) -> dict[str, float]:
-    return {name: float(value) for name, value in noise._asdict().items()}
+    return {
+        jax.tree_util.keystr(path, simple=True, separator="."): float(value)
+        for path, value in jax.tree_util.tree_leaves_with_path(noise)
+    }
 
 
 def _read(path: Path) -> tuple[dict[str, Any], Arrays]:

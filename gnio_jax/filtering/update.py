@@ -20,6 +20,7 @@ from gnio_jax.filtering.state import (
     CLONE_OFFSET,
     CLONE_THETA,
     GYRO_BIAS,
+    LASTING,
     MOVE,
     VELOCITY,
     FilterState,
@@ -35,11 +36,11 @@ class Correction(NamedTuple):
 
     whitened: Float[Array, "3"]
     """L⁻¹ r."""
-    core_rows: Float[Array, "3 21"]
+    core_rows: Float[Array, "3 n"]
     """Y = L⁻¹ H P against the core; zero where there was no update, and so are the other rows."""
     clone_rows: Float[Array, "3 m"]
     """Y against the clones."""
-    core_jacobian: Float[Array, "3 21"]
+    core_jacobian: Float[Array, "3 n"]
     """L⁻¹ H over the core …"""
     oldest_jacobian: Float[Array, "3 6"]
     """… and over the oldest clone; it is zero over the others."""
@@ -62,6 +63,13 @@ class Cholesky(NamedTuple):
     def whiten(self, innovation: Float[Array, "3"]) -> Float[Array, "3"]:
         """L⁻¹ r."""
         return self.solve(innovation[:, None])[:, 0]
+
+    @property
+    def matrix(self) -> Float[Array, "3 3"]:
+        """L."""
+        (a, d, f), (b, c, e) = self.diagonal, self.below
+        zero = jnp.zeros_like(a)
+        return jnp.stack([a, zero, zero, b, d, zero, c, e, f]).reshape(3, 3)
 
     @property
     def volume(self) -> Float[Array, ""]:
@@ -97,7 +105,7 @@ def apply_correction(
 
 
 def retract(
-    state: FilterState, core: Float[Array, "21"], clones: Float[Array, "c 6"], newest: Array | int
+    state: FilterState, core: Float[Array, "n"], clones: Float[Array, "c 6"], newest: Array | int
 ) -> FilterState:
     """Add an error to the mean: R ← exp(δθ) R, the rest adds. The core's pose is that of the newest
     clone."""
@@ -112,6 +120,7 @@ def retract(
         accel_bias=state.accel_bias + core[ACCEL_BIAS],
         anchor=state.anchor + core[ANCHOR],
         move=state.move + core[MOVE],
+        lasting=state.lasting + core[LASTING],
         clone_rotation=rotations,
         clone_offset=offsets,
     )

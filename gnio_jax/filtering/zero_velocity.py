@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 from gnio_jax.filtering.config import FilterConfig
 from gnio_jax.filtering.gaps import Imu
 from gnio_jax.filtering.gate import gate_activity
-from gnio_jax.filtering.state import CLONE, CORE, VELOCITY, FilterState
+from gnio_jax.filtering.state import CLONE, VELOCITY, FilterState
 from gnio_jax.filtering.update import Correction, apply_correction, cholesky, relinearize
 from gnio_jax.types import GRAVITY, Array
 
@@ -74,7 +74,7 @@ def update_at_rest(
     fits = nis <= config.gate_threshold
     active = gate_activity(state.gate, config, state.step * config.samples_per_clone).active
     accepted = quiet & (~(active & displacement_tested) | fits)
-    jacobian = np.eye(CORE, dtype=dtype)[VELOCITY]
+    jacobian = np.eye(len(state.core_covariance), dtype=dtype)[VELOCITY]
     rows = (state.core_covariance[VELOCITY], state.cross_covariance[VELOCITY], jacobian)
     core_rows, clone_rows, core_jacobian = (
         jnp.where(accepted, root.solve(part), 0.0) for part in rows

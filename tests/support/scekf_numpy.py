@@ -91,11 +91,13 @@ def run(
     pause=1.0,
     measure=None,
     frame="given",
+    lasting=None,
 ):
     """Returns a dict of histories.
 
     measure(k, clone_rotation, bg, ba), where given, supplies displacement and covariance at step k.
-    frame "own": the displacement turns with the filter's own attitude, whose yaw then cancels."""
+    frame "own": the displacement turns with the filter's own attitude, whose yaw then cancels.
+    lasting: share, window_seconds, scale_std, heading_std, walk_seconds of errors that last."""
     bg, ba = np.zeros(3) if bg is None else bg, np.zeros(3) if ba is None else ba
     P = np.diag(
         np.repeat(
@@ -110,6 +112,19 @@ def run(
             [2, 1, 3, 3, 3, 3],
         )
         ** 2
+    )
+    errors = np.zeros(0 if lasting is None else 5)
+    decay, spread = np.ones(len(errors)), np.ones(len(errors))
+    if lasting is not None:
+        spread[3:] = lasting["scale_std"], lasting["heading_std"]
+        times = np.array([lasting["window_seconds"]] * 3 + [lasting["walk_seconds"]] * 2)
+        decay = np.exp(-n * dt / times)
+    core = 15 + len(errors)
+    P = np.block(
+        [
+            [P, np.zeros((15, len(errors)))],
+            [np.zeros((len(errors), 15)), np.diag(spread**2)],
+        ]
     )
     ring, out = [], {}
     converged, last_success, pause_end = False, None, None
@@ -134,6 +149,10 @@ def run(
             full[:15, :15] = A
             P = full @ P @ full.T
             P[:15, :15] += Q
+        errors = decay * errors
+        P[15:core] *= decay[:, None]
+        P[:, 15:core] *= decay
+        P[15:core, 15:core] += np.diag((1 - decay**2) * spread**2)
         ring.append([R, p])
         pick = np.concatenate([np.eye(len(P)), np.eye(len(P))[[0, 1, 2, 6, 7, 8]]])
         P = pick @ P @ pick.T
@@ -164,9 +183,21 @@ def run(
                 if frame == "given" and not gimbal:
                     Hz[2, :2] = np.cos(y) * np.tan(q), np.sin(y) * np.tan(q)
                 H = np.zeros((3, len(P)))
-                H[:, 15:18], H[:, 18:21], H[:, -3:] = Ry.T @ skew(p - pi) @ Hz, -Ry.T, Ry.T
-                r = d - Ry.T @ (p - pi)
-                S = H @ P @ H.T + scale * C
+                of_clone = slice(core, core + 3), slice(core + 3, core + 6)
+                H[:, of_clone[0]], H[:, of_clone[1]] = Ry.T @ skew(p - pi) @ Hz, -Ry.T
+                H[:, -3:] = Ry.T
+                expected, noise = Ry.T @ (p - pi), scale * C
+                if lasting is not None:
+                    share, root = lasting["share"], np.linalg.cholesky(noise)
+                    turn = Rotation.from_euler("z", errors[4]).as_matrix()
+                    gain = np.exp(errors[3]) * turn
+                    seen = gain @ expected
+                    H = gain @ H
+                    H[:, 15:18], H[:, 18] = share * root, seen
+                    H[:, 19] = np.cross([0, 0, 1], seen)
+                    expected, noise = seen + share * root @ errors[:3], (1 - share**2) * noise
+                r = d - expected
+                S = H @ P @ H.T + noise
                 nis = r @ np.linalg.solve(S, r)
                 row.update(
                     nis=nis,
@@ -188,7 +219,7 @@ def run(
                         last_success, pause_end, active = None, now + round(pause / dt), False
                     if active and nis > threshold:
                         if fail_scale > 0:
-                            S = H @ P @ H.T + fail_scale * scale * C
+                            S = H @ P @ H.T + fail_scale * noise
                             row["accepted"] = 1.0
                     else:
                         last_success = now
@@ -207,14 +238,16 @@ def run(
                         )
                         ring = [
                             [Rotation.from_rotvec(e[:3]).as_matrix() @ Rc, pc + e[3:]]
-                            for e, (Rc, pc) in zip(delta[15:].reshape(-1, 6), ring, strict=True)
+                            for e, (Rc, pc) in zip(delta[core:].reshape(-1, 6), ring, strict=True)
                         ]
+                        errors = errors + delta[15:core]
             ring.pop(0)
-            keep = np.r_[0:15, 21 : len(P)]
+            keep = np.r_[0:core, core + 6 : len(P)]
             P = P[np.ix_(keep, keep)]
         if not tried and last_success is not None:  # absence is not staleness
             last_success += n
         row.update(rotation=R, velocity=v, position=p, gyro_bias=bg, accel_bias=ba)
+        row.update(lasting=errors, lasting_covariance=P[15:core, 15:core])
         row.update(covariance=P[:15, :15], covariance_diagonal=np.diag(P)[:15])
         for name, value in row.items():
             out.setdefault(name, []).append(value)

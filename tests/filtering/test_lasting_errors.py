@@ -1,0 +1,316 @@
+"""Errors of the displacements that last: against a plain NumPy filter, autodiff and simulated
+walks, and through smoother and tracker."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from gnio_jax import filtering
+from gnio_jax.filtering.lasting_errors import LastingErrors, distort, lasting_motion, prior_variance
+from gnio_jax.filtering.state import LASTING
+from gnio_jax.types import Prediction
+from tests.support import scekf_numpy
+from tests.support.compiling import quick
+from tests.support.random_walk import random_walk
+from tests.support.walks import errors, simulate
+
+N, CLONES, INTERVALS, DT = 4, 4, 40, 0.02
+CONFIG = filtering.FilterConfig(
+    DT, N, CLONES, convergence_seconds=0.6, measurement_scale=2.0, history="core"
+)
+ERRORS = LastingErrors(0.8, 0.3, 0.1, 0.05, 5.0)
+NOISE = filtering.NoiseModel(2e-3, 2e-2, 1e-6, 1e-4, ERRORS)
+
+
+def numpy_errors(errors):
+    named = errors._asdict()
+    return {"share": named.pop("window_share")} | named
+
+
+@functools.cache
+def walk():
+    return random_walk(
+        3, n=N, clones=CLONES, intervals=INTERVALS, dt=DT, nan_rows=[12], outliers=[25]
+    )
+
+
+@functools.cache
+def filtered(config=CONFIG, errors=ERRORS):
+    start, gyro, accel, displacement, spread = walk()
+    state = filtering.initial_state(config, *start)
+    run = quick(functools.partial(filtering.run_filter, config=config))
+    given = (state, gyro, accel, displacement, spread)
+    return run(*given, noise=NOISE._replace(displacement=errors))
+
+
+@pytest.mark.parametrize("fail_scale", [0.0, 10.0])
+def test_as_a_plain_filter_has_them(fail_scale):
+    config = dataclasses.replace(CONFIG, mahalanobis_fail_scale=fail_scale)
+    final, history = filtered(config)
+    start, gyro, accel, displacement, spread = walk()
+    wanted = scekf_numpy.run_from(
+        filtering.initial_state(config, *start),
+        NOISE,
+        DT,
+        gyro,
+        accel,
+        displacement,
+        spread,
+        n=N,
+        clones=CLONES,
+        convergence=0.6,
+        scale=2.0,
+        fail_scale=fail_scale,
+        lasting=numpy_errors(ERRORS),
+    )
+    assert np.nansum(wanted["accepted"] == 0) == (fail_scale == 0)  # the outlier
+    assert np.abs(wanted["lasting"][-1]).min() > 1e-3
+    for name in ("accepted", "gate_passed"):
+        np.testing.assert_array_equal(getattr(history, name), wanted[name])
+    for name in ("rotation", "velocity", "position", "gyro_bias", "accel_bias", "innovation"):
+        np.testing.assert_allclose(getattr(history, name), wanted[name], atol=1e-9, err_msg=name)
+    np.testing.assert_allclose(history.lasting, wanted["lasting"], atol=1e-9)
+    np.testing.assert_allclose(history.nis, wanted["nis"], rtol=1e-7)
+    np.testing.assert_allclose(history.covariance, wanted["covariance"], rtol=1e-6, atol=1e-12)
+    np.testing.assert_allclose(
+        final.core_covariance[LASTING, LASTING],
+        wanted["lasting_covariance"][-1],
+        rtol=1e-7,
+        atol=1e-12,
+    )
+
+
+def test_without_any_size_they_change_nothing():
+    _, with_none = filtered(errors=None)
+    _, with_zero = filtered(errors=LastingErrors(0.0, 0.3, 0.0, 0.0, 5.0))
+    for name in with_none._fields:
+        if name not in ("lasting", "diagnostics"):
+            np.testing.assert_allclose(
+                getattr(with_zero, name), getattr(with_none, name), atol=1e-12, err_msg=name
+            )
+    assert with_none.lasting.shape == (INTERVALS, 0) and with_zero.lasting.shape == (INTERVALS, 5)
+
+
+def test_the_jacobians_are_the_derivatives():
+    rng = np.random.default_rng(0)
+    root = np.tril(rng.normal(size=(3, 3)))
+    displacement, lasting = rng.normal(size=3), np.array([0.3, -1.2, 0.5, 0.2, -0.4])
+
+    def expected(displacement, lasting):
+        return distort(displacement, jnp.asarray(root), lasting, ERRORS).displacement
+
+    found = distort(jnp.asarray(displacement), jnp.asarray(root), jnp.asarray(lasting), ERRORS)
+    gain, jacobian = jax.jacobian(expected, (0, 1))(jnp.asarray(displacement), jnp.asarray(lasting))
+    np.testing.assert_allclose(found.gain, gain, atol=1e-14)
+    np.testing.assert_allclose(found.jacobian, jacobian, atol=1e-14)
+    by_hand = np.exp(0.2) * Rotation.from_euler("z", -0.4).apply(displacement)
+    np.testing.assert_allclose(found.displacement, by_hand + 0.8 * root @ lasting[:3], atol=1e-14)
+
+
+def test_they_are_as_large_at_all_times():
+    prior = prior_variance(ERRORS, np.dtype(float))
+    motion = lasting_motion(ERRORS, 0.7, np.dtype(float))
+    np.testing.assert_allclose(motion.decay**2 * prior + motion.variance, prior, rtol=1e-14)
+    np.testing.assert_allclose(motion.decay, np.exp(-0.7 / np.array([0.3] * 3 + [5.0] * 2)))
+
+
+RUNS, SIGMA, LONG = 48, 0.05, 500
+LASTING_WALK = LastingErrors(0.9, 0.5, 0.08, 0.05, 40.0)
+MODEL = filtering.NoiseModel(5e-4, 5e-3, 1e-6, 2e-5, LASTING_WALK)
+STD = filtering.InitialStd(0.02, 0.01, 0.3, 1e-3, 1e-3, 0.02)
+
+
+@functools.cache
+def simulated():
+    """Walks whose displacements have errors as the model has them, drawn in NumPy."""
+    runs = simulate(2, RUNS, LONG, 10, 10, 0.01, MODEL, STD, 0.0)
+    rng, (share, window_seconds, scale_std, heading_std, walk_seconds) = (
+        np.random.default_rng(3),
+        LASTING_WALK,
+    )
+    decay = np.exp(-0.1 / np.array([window_seconds] * 3 + [walk_seconds] * 2))
+    std = np.array([1.0, 1.0, 1.0, scale_std, heading_std])
+    state, seen = std * rng.normal(size=(RUNS, 5)), np.array(runs.displacement)
+    for k in range(LONG):
+        state = decay * state + np.sqrt(1 - decay**2) * std * rng.normal(size=(RUNS, 5))
+        turned = Rotation.from_rotvec(state[:, 4:] * [[0.0, 0.0, 1.0]]).apply(seen[:, k])
+        white = np.sqrt(1 - share**2) * rng.normal(size=(RUNS, 3))
+        noise = SIGMA * (share * state[:, :3] + white)
+        seen[:, k] = np.exp(state[:, 3:4]) * turned + noise
+    return runs._replace(displacement=seen)
+
+
+@functools.cache
+def estimated(modelled):
+    config = filtering.FilterConfig(
+        0.01, 10, 10, measurement_scale=1.0, gate_threshold=1e9, history="core"
+    )
+    noise = MODEL if modelled else MODEL._replace(displacement=None)
+    runs, spread = simulated(), np.tile(SIGMA**2 * np.eye(3), (LONG, 1, 1))
+
+    @jax.jit
+    @jax.vmap
+    def run(rotation, velocity, position, *signals):
+        state = filtering.initial_state(config, rotation, velocity, position, std=STD)
+        return filtering.run_filter(state, *signals, spread, config, noise)[1]
+
+    history = run(*runs[:6])
+    error, covariance = errors(runs, history), np.asarray(history.covariance)
+    return error[:, 100:], covariance[:, 100:], np.asarray(history.nis)[:, 100:]
+
+
+def normalised(error, covariance):
+    squared = np.einsum("...i,...i", error, np.linalg.solve(covariance, error[..., None])[..., 0])
+    return squared.mean() / error.shape[-1]
+
+
+def test_the_filter_is_as_certain_as_it_may_be():
+    error, covariance, nis = estimated(True)
+    assert 0.9 < nis.mean() / 3 < 1.1
+    for part in (slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12), slice(12, 15)):
+        assert 0.7 < normalised(error[..., part], covariance[..., part, part]) < 1.4, part
+
+
+def test_taken_for_white_they_make_it_too_certain():
+    error, covariance, _ = estimated(False)
+    position = slice(6, 9)
+    assert normalised(error[..., position], covariance[..., position, position]) > 4
+    with_them, _, _ = estimated(True)
+    squares = [np.mean(e[:, -1, position] ** 2) for e in (with_them, error)]
+    assert squares[0] < squares[1]
+
+
+def test_the_smoother_is_consistent_with_them():
+    config = filtering.FilterConfig(
+        0.01, 10, 10, measurement_scale=1.0, gate_threshold=1e9, history="core"
+    )
+    runs, spread = simulated(), np.tile(SIGMA**2 * np.eye(3), (LONG, 1, 1))
+
+    @jax.jit
+    @jax.vmap
+    def run(rotation, velocity, position, *signals):
+        state = filtering.initial_state(config, rotation, velocity, position, std=STD)
+        return filtering.smooth(state, *signals, spread, config, MODEL)
+
+    smoothed = run(*runs[:6])
+    error, covariance = errors(runs, smoothed), np.asarray(smoothed.covariance)
+    middle = slice(100, 400)
+    for part in (slice(0, 3), slice(3, 6), slice(6, 9)):
+        found = normalised(error[:, middle, part], covariance[:, middle, part, part])
+        assert 0.7 < found < 1.4, part
+    # at the end both are the same
+    filtered, of_filter, _ = estimated(True)
+    np.testing.assert_allclose(error[:, -1, :9], filtered[:, -1, :9], atol=1e-8)
+    np.testing.assert_allclose(covariance[:, -1], of_filter[:, -1], rtol=1e-6, atol=1e-12)
+
+
+def predict(windows):
+    pooled = jnp.mean(windows, axis=1) @ jnp.full((6, 3), 0.01, jnp.float32)
+    return Prediction(pooled, -2.0 + 0.1 * pooled)
+
+
+def test_the_tracker_has_them_too(tmp_path):
+    start, gyro, accel, _, _ = walk()
+    state = filtering.initial_state(CONFIG, *start)
+    tracker = filtering.Tracker(predict, state, CONFIG, NOISE)
+    poses = [
+        tracker.push(DT * k, *sample) for k, sample in enumerate(zip(gyro, accel, strict=True))
+    ]
+    found = [pose for pose in poses if pose is not None]
+    run = quick(lambda state: filtering.run_odometry(predict, state, gyro, accel, CONFIG, NOISE))
+    _, history = run(state)
+    np.testing.assert_allclose(
+        [pose.position for pose in found], history.position[: len(found)], atol=1e-9
+    )
+    tracker.save(tmp_path / "tracker.npz")
+    restored = filtering.Tracker.restore(tmp_path / "tracker.npz", predict, CONFIG, NOISE)
+    np.testing.assert_array_equal(restored.pose().covariance, tracker.pose().covariance)
+    other = NOISE._replace(displacement=ERRORS._replace(walk_seconds=6.0))
+    with pytest.raises(ValueError, match=r"displacement\.walk_seconds = 5\.0, not 6\.0"):
+        filtering.Tracker.restore(tmp_path / "tracker.npz", predict, CONFIG, other)
+
+
+def test_they_can_be_learnt_from_any_size_on():
+    start, gyro, accel, displacement, spread = walk()
+    displacement = displacement.copy()
+    displacement[~np.isfinite(displacement).all(1)] = np.nan
+
+    def evidence(errors):
+        noise = NOISE._replace(displacement=errors)
+        state = filtering.initial_state(CONFIG, *start)
+        given = (state, gyro, accel, displacement, spread)
+        _, history = filtering.run_filter(*given, CONFIG, noise)
+        return jnp.nansum(history.log_likelihood)
+
+    gradient = quick(jax.grad(evidence))
+    for errors_ in (ERRORS, ERRORS._replace(window_share=0.0, scale_std=0.0, heading_std=0.0)):
+        at = LastingErrors(*(jnp.float64(value) for value in errors_))
+        found = gradient(at)
+        assert all(np.isfinite(np.asarray(found)))
+        for name in ("window_share", "scale_std"):
+            step = 1e-5
+            value = getattr(errors_, name)
+            ahead, behind = (
+                float(quick(evidence)(at._replace(**{name: jnp.float64(value + change)})))
+                for change in (step, -step)
+            )
+            np.testing.assert_allclose(
+                getattr(found, name), (ahead - behind) / (2 * step), rtol=1e-4, atol=1e-4
+            )
+
+
+def test_the_factor_of_each_axis_scales_the_covariance():
+    """Its derivative is finite where there is no measurement, too."""
+    start, gyro, accel, displacement, spread = walk()
+    state = filtering.initial_state(CONFIG, *start)
+    factor = np.array([1.5, 0.7, 2.0])
+    scaled = spread * factor[:, None] * factor
+
+    @quick
+    def evidence(factor, spread):
+        noise = NOISE._replace(std_factor=tuple(factor))
+        given = (state, gyro, accel, displacement, spread)
+        return jnp.nansum(filtering.run_filter(*given, CONFIG, noise)[1].log_likelihood)
+
+    np.testing.assert_allclose(evidence(factor, spread), evidence(np.ones(3), scaled), rtol=1e-12)
+    gradient = quick(jax.grad(evidence))(jnp.asarray(factor), spread)
+    step = 1e-6 * np.eye(3)[1]
+    difference = (evidence(factor + step, spread) - evidence(factor - step, spread)) / 2e-6
+    np.testing.assert_allclose(gradient[1], difference, rtol=1e-5)
+    assert np.isfinite(gradient).all()
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "problem"),
+    [
+        ("window_share", 1.0, "must be below 1"),
+        ("window_share", -0.1, "must be a number that is not negative"),
+        ("walk_seconds", 0.0, "must be positive"),
+        ("scale_std", -1.0, "must be a number that is not negative"),
+    ],
+)
+def test_sizes_that_make_no_sense_are_refused(field, value, problem):
+    start, *signals = walk()
+    noise = NOISE._replace(displacement=ERRORS._replace(**{field: value}))
+    with pytest.raises(ValueError, match=rf"noise\.displacement\.{field}: {problem}"):
+        filtering.run_filter(filtering.initial_state(CONFIG, *start), *signals, CONFIG, noise)
+
+
+def test_a_state_that_has_them_goes_on_with_them():
+    start, gyro, accel, displacement, spread = walk()
+    config = dataclasses.replace(CONFIG, samples_per_clone=N)
+    state, rows = filtering.initial_state(config, *start), []
+    for part in (slice(0, 15), slice(15, INTERVALS)):
+        samples = slice(part.start * N, part.stop * N)
+        given = (state, gyro[samples], accel[samples], displacement[part], spread[part])
+        state, history = filtering.run_filter(*given, config, NOISE)
+        rows.append(history.position)
+    np.testing.assert_allclose(np.concatenate(rows), filtered()[1].position, atol=1e-9)
+    with pytest.raises(ValueError, match=r"state\.lasting: "):
+        given = (state, gyro, accel, displacement, spread)
+        filtering.run_filter(*given, config, NOISE._replace(displacement=None))
