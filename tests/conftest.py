@@ -6,6 +6,7 @@ compiler optimises nothing, here and in the processes that tests start.
 
 import os
 from importlib.metadata import version
+from pathlib import Path
 
 from jaxtyping import install_import_hook
 
@@ -15,6 +16,9 @@ if version("jax").startswith("0.10."):  # removed later, and XLA stops at a flag
     COMPILER.append("--xla_cpu_use_fusion_emitters=false")
 os.environ["XLA_FLAGS"] = " ".join([os.environ.get("XLA_FLAGS", ""), *COMPILER])
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
+# The workers and the processes that tests start share what they compile through the cache, small
+# programs too.
+os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.05"
 
 # Every annotated shape and type is checked, in the tests alone.
 install_import_hook("gnio_jax", "beartype.beartype")
@@ -26,16 +30,31 @@ jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 # What is shared out among devices is shared out on every machine.
 jax.config.update("jax_num_cpu_devices", 2)
-# The workers share what they compile through the cache, small programs too.
-jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.05)
+
+# The files that take longest, in this order: begun first, they leave no worker alone at the end.
+LONGEST = (
+    "training/test_loop.py",
+    "training/test_statistics.py",
+    "test_installed.py",
+    "tables/test_tables.py",
+    "filtering/test_derivatives.py",
+    "filtering/test_consistency.py",
+    "filtering/test_smoother.py",
+    "filtering/test_precision.py",
+    "filtering/test_intake.py",
+)
+
+
+def pytest_collection_modifyitems(items):
+    tests = Path(__file__).parent
+    places = {tests / name: place for place, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: places.get(item.path, len(LONGEST)))
 
 
 @pytest.fixture(scope="session")
 def recordings():
     """The folder of real recordings, $GNIO_DATA/<name>; tests that ask for it are skipped, and say
     so, without it."""
-    from pathlib import Path
-
     root = os.environ.get("GNIO_DATA")
     if not root or not Path(root).is_dir():
         pytest.skip(

@@ -18,7 +18,7 @@ from gnio_jax.filtering.state import CLONE, MOVE, OFFSET, THETA, VELOCITY, covar
 from gnio_jax.filtering.update import retract
 from gnio_jax.types import Prediction
 from gnio_jax.windows import cut_window
-from tests.support.compiling import quick
+from tests.support.compiling import optimised, quick
 from tests.support.walks import errors, simulate
 
 RUNS, INTERVALS, N, CLONES, DT, SIGMA = 64, 600, 10, 10, 0.01, 0.03
@@ -34,10 +34,9 @@ PARTS = {
 
 
 @functools.cache
-def monte_carlo(std, jacobians="latest", intervals=INTERVALS, sigma=SIGMA):
-    """Errors (r, K, 15), covariances (r, K, 15, 15), NIS (r, K) and the final states of simulated
-    runs from the prior."""
-    runs = simulate(1, RUNS, intervals, N, CLONES, DT, NOISE, std, sigma)
+def program(jacobians):
+    """(std, covariance of a measurement, start and signals of each run) -> final states and
+    histories."""
     config = filtering.FilterConfig(
         DT,
         N,
@@ -47,20 +46,21 @@ def monte_carlo(std, jacobians="latest", intervals=INTERVALS, sigma=SIGMA):
         history="core",
         jacobians=jacobians,
     )
-    spread = np.tile(sigma**2 * np.eye(3), (intervals, 1, 1))
 
-    @jax.jit
-    @jax.vmap
-    def run(rotation, velocity, position, *signals):
-        return filtering.run_filter(
-            filtering.initial_state(config, rotation, velocity, position, std=std),
-            *signals,
-            spread,
-            config,
-            NOISE,
-        )
+    def run(std, spread, rotation, velocity, position, gyro, accel, displacement):
+        start = filtering.initial_state(config, rotation, velocity, position, std=std)
+        covariance = jnp.tile(spread[None], (len(displacement), 1, 1))
+        return filtering.run_filter(start, gyro, accel, displacement, covariance, config, NOISE)
 
-    final, history = run(*runs[:6])
+    return optimised(jax.vmap(run, in_axes=(None, None, *6 * [0])))
+
+
+@functools.cache
+def monte_carlo(std, jacobians="latest", intervals=INTERVALS, sigma=SIGMA):
+    """Errors (r, K, 15), covariances (r, K, 15, 15), NIS (r, K) and the final states of simulated
+    runs from the prior."""
+    runs = simulate(1, RUNS, intervals, N, CLONES, DT, NOISE, std, sigma)
+    final, history = program(jacobians)(std, sigma**2 * np.eye(3), *runs[:6])
     assert (np.asarray(history.healthy) == 1).all()
     return (
         runs,
@@ -326,7 +326,7 @@ def tight():
     )
     length = N * CLONES
 
-    @jax.jit
+    @optimised
     @jax.vmap
     def run(world, norms, displacement, noise, rotation, velocity, position, gyro, accel):
         def predict(windows):

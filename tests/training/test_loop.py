@@ -23,6 +23,7 @@ from gnio_jax.data import windows
 from gnio_jax.errors import InputError
 from gnio_jax.training import checkpoint, loop, optimizer, step
 from gnio_jax.training.losses import Losses
+from tests.support.runs import shared_programs
 from tests.support.tlio_files import write_sequence
 
 ROOT = Path(__file__).parents[2]
@@ -47,7 +48,7 @@ def tiny(recording, workdir, **changes):
         workdir=str(workdir),
         data=DataConfig(rate=50.0),
         model=ModelConfig(width=2, bank_size=3, bank_heads=2),
-        optim=OptimConfig(epochs=3, batch_size=16, learning_rate=1e-3, warmup_epochs=1.0),
+        optim=OptimConfig(epochs=6, batch_size=16, learning_rate=1e-3, warmup_epochs=1.0),
     )
     return dataclasses.replace(config, **changes)
 
@@ -60,9 +61,15 @@ def same(a, b):
     return all(jax.tree.leaves(jax.tree.map(np.array_equal, a, b)))
 
 
+@pytest.fixture(scope="module", autouse=True)
+def one_compilation():
+    with shared_programs():
+        yield
+
+
 @pytest.fixture(scope="module")
 def finished(recording, tmp_path_factory):
-    """A run of three epochs that nothing interrupted."""
+    """A run of six epochs that nothing interrupted."""
     workdir = tmp_path_factory.mktemp("finished") / "run"
     outcome = loop.train(tiny(recording, workdir))
     return workdir, outcome
@@ -72,11 +79,11 @@ def test_a_run_leaves_its_config_log_events_and_checkpoints(recording, finished)
     workdir, outcome = finished
     assert configuration.load(workdir / "config.yaml") == tiny(recording, workdir)
     rows = [json.loads(line) for line in (workdir / "metrics.jsonl").read_text().splitlines()]
-    assert [row["epoch"] for row in rows] == [0, 1, 2]
+    assert [row["epoch"] for row in rows] == list(range(6))
     windows_per_epoch = 2 * len(
         range(0, 600 - 50, 5)
     )  # 12 s at 50 Hz, a window of 1 s every 0.1 s, two recordings
-    assert [row["step"] for row in rows] == [windows_per_epoch // 16 * (i + 1) for i in range(3)]
+    assert [row["step"] for row in rows] == [windows_per_epoch // 16 * (i + 1) for i in range(6)]
     assert outcome.best_loss == min(row["val_loss"] for row in rows)
     assert rows[-1]["loss"] < rows[0]["loss"]
     assert rows[-1]["loss"] == pytest.approx(
@@ -272,6 +279,8 @@ def command(recording, workdir, *more):
         "3",
         "--model.bank-heads",
         "2",
+        "--optim.epochs",
+        "6",
         "--optim.batch-size",
         "16",
         "--optim.learning-rate",
@@ -282,17 +291,17 @@ def command(recording, workdir, *more):
     ]
 
 
-ENVIRONMENT = {**os.environ, "JAX_PLATFORMS": "cpu"}
+# With as many devices as here, so that programs from the cache fit.
+DEVICES = str(len(jax.devices()))
+ENVIRONMENT = {**os.environ, "JAX_PLATFORMS": "cpu", "JAX_NUM_CPU_DEVICES": DEVICES}
 
 
-def test_killed_at_any_moment_and_resumed_gives_the_same_bits(recording, tmp_path):
-    """SIGKILL while a checkpoint is being written, or right before or after, against a run left
+def test_killed_at_any_moment_and_resumed_gives_the_same_bits(recording, finished, tmp_path):
+    """SIGKILL while a checkpoint is being written, or right before or after, against the run left
     alone."""
-    config = tiny(recording, tmp_path / "alone")
-    loop.train(dataclasses.replace(config, optim=dataclasses.replace(config.optim, epochs=6)))
-    epochs, run = ["--optim.epochs", "6"], tmp_path / "killed"
+    run = tmp_path / "killed"
     process = subprocess.Popen(
-        command(recording, run, *epochs),
+        command(recording, run),
         cwd=ROOT,
         env=ENVIRONMENT,
         stdout=subprocess.DEVNULL,
@@ -311,7 +320,7 @@ def test_killed_at_any_moment_and_resumed_gives_the_same_bits(recording, tmp_pat
     _, errors = process.communicate()
     assert process.returncode == -signal.SIGKILL, errors
     final = subprocess.run(
-        command(recording, run, *epochs, "--resume"),
+        command(recording, run, "--resume"),
         cwd=ROOT,
         capture_output=True,
         text=True,
@@ -319,7 +328,7 @@ def test_killed_at_any_moment_and_resumed_gives_the_same_bits(recording, tmp_pat
     )
     assert final.returncode == 0, final.stderr
     for which in ("latest", "best"):
-        assert same(parameters(run, which), parameters(tmp_path / "alone", which))
+        assert same(parameters(run, which), parameters(finished[0], which))
     epochs_logged = [
         json.loads(line)["epoch"] for line in (run / "metrics.jsonl").read_text().splitlines()
     ]
