@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Float
 
@@ -24,6 +25,11 @@ from gnio_jax.types import Array
 Measure = Callable[[FilterState, Array | int], tuple[Measurement, dict]]
 """From the state and the slot of its oldest clone to the measurement and the network's
 diagnostics."""
+
+
+_integrate_interval = jax.checkpoint(integrate_interval, static_argnums=3, prevent_cse=False)
+"""The backward pass computes it again, which takes less time than to write and read the numbers
+that it would keep."""
 
 
 class StepTrace(NamedTuple):
@@ -70,7 +76,7 @@ def traced_clone_step(
     anchored = newest == 0
 
     state = move_anchor(state, anchored)
-    motion = integrate_interval(state, imu, noise, config.dt)
+    motion = _integrate_interval(state, imu, noise, config.dt)
     moved = transition(state, motion, anchored)
     lasting = lasting_motion(noise.displacement, config.clone_seconds, state.offset.dtype)
     state = propagate(state, motion, lasting, anchored, newest)
