@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import Literal, NamedTuple
+from collections.abc import Callable, Mapping
+from typing import Any, Literal, NamedTuple
 
 from gnio_jax.config import DataConfig, FilterOptions
 from gnio_jax.errors import InputError
@@ -12,6 +12,8 @@ from gnio_jax.filtering import FilterConfig, InitialStd, LastingErrors, NoiseMod
 
 Estimator = Literal["ekf", "integrate", "imu_only"]
 Orientation = Literal["filter", "device", "reference"]
+DEGREE = math.pi / 180
+"""rad."""
 OnShare = Callable[[float], None]
 """Called with the share of the work that is done, from 0 to 1."""
 
@@ -79,37 +81,45 @@ def filter_setup(windows: DataConfig, options: FilterOptions) -> FilterSetup:
         history="core",
         window_rotation=options.window_rotation or windows.window_rotation,
     )
-    noise = NoiseModel(
-        gyro_density=options.gyro_density,
-        accel_density=options.accel_density,
-        gyro_bias_walk=options.gyro_bias_walk,
-        accel_bias_walk=options.accel_bias_walk,
+    return FilterSetup(config, noise_model(vars(options)), initial_std(vars(options)))
+
+
+def noise_model(options: Mapping[str, Any]) -> NoiseModel:
+    """The filter's noises, from the fields of its options; their values may be traced."""
+    return NoiseModel(
+        gyro_density=options["gyro_density"],
+        accel_density=options["accel_density"],
+        gyro_bias_walk=options["gyro_bias_walk"],
+        accel_bias_walk=options["accel_bias_walk"],
+        std_factor=tuple(options[f"std_factor_{axis}"] for axis in "xyz"),
         displacement=_lasting_errors(options),
     )
-    initial_std = InitialStd(
-        tilt=math.radians(options.tilt_std_degrees),
-        yaw=math.radians(options.yaw_std_degrees),
-        velocity=options.velocity_std,
-        position=options.position_std,
-        gyro_bias=options.gyro_bias_std,
-        accel_bias=options.accel_bias_std,
+
+
+def initial_std(options: Mapping[str, Any]) -> InitialStd:
+    """The standard deviations of the filter's start, as `noise_model` takes the options."""
+    return InitialStd(
+        tilt=options["tilt_std_degrees"] * DEGREE,
+        yaw=options["yaw_std_degrees"] * DEGREE,
+        velocity=options["velocity_std"],
+        position=options["position_std"],
+        gyro_bias=options["gyro_bias_std"],
+        accel_bias=options["accel_bias_std"],
     )
-    return FilterSetup(config, noise, initial_std)
 
 
-def _lasting_errors(options: FilterOptions) -> LastingErrors | None:
+def _lasting_errors(options: Mapping[str, Any]) -> LastingErrors | None:
     """None where no error of the displacements lasts."""
-    sizes = (
-        options.window_error_share,
-        options.scale_error_std,
-        options.heading_error_std_degrees,
-    )
-    if not any(sizes):
+    sizes = [
+        options[name]
+        for name in ("window_error_share", "scale_error_std", "heading_error_std_degrees")
+    ]
+    if all(isinstance(size, int | float) and size == 0 for size in sizes):
         return None
     return LastingErrors(
-        window_share=options.window_error_share,
-        window_seconds=options.window_error_seconds,
-        scale_std=options.scale_error_std,
-        heading_std=math.radians(options.heading_error_std_degrees),
-        walk_seconds=options.walk_error_seconds,
+        window_share=options["window_error_share"],
+        window_seconds=options["window_error_seconds"],
+        scale_std=options["scale_error_std"],
+        heading_std=options["heading_error_std_degrees"] * DEGREE,
+        walk_seconds=options["walk_error_seconds"],
     )

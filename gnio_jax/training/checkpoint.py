@@ -22,7 +22,7 @@ from gnio_jax import models
 from gnio_jax.config import TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.training.optimizer import Plateau
-from gnio_jax.training.step import TrainState
+from gnio_jax.training.step import TrainState, evaluated
 
 Which = Literal["best", "latest"]
 
@@ -93,15 +93,21 @@ class Checkpoints:
 
     def save(self, which: Which, state: TrainState, position: Position) -> None:
         """Write a checkpoint at `position.step`; one that is already there for this step is the
-        same and stays."""
+        same and stays.
+
+        Its variables are those that are evaluated. Where they are averages, `latest` also holds the
+        parameters that training goes on with.
+        """
         manager = self._managers[which]
         if position.step in manager.all_steps():
             return
-        variables = {"params": state.params, "batch_stats": state.batch_stats}
+        variables = _variables(state)
         meta = {"position": position._asdict(), "shapes": _shapes(variables)}
         items = {"variables": ocp.args.StandardSave(variables), "meta": ocp.args.JsonSave(meta)}
         if which == "latest":
             items["optimizer"] = ocp.args.StandardSave(state.opt_state)
+            if state.average is not None:
+                items["training"] = ocp.args.StandardSave(state.params)
         manager.save(position.step, args=ocp.args.Composite(**items))
 
     def restore(self, template: TrainState) -> tuple[TrainState, Position]:
@@ -114,17 +120,16 @@ class Checkpoints:
         where = self._workdir / "checkpoints" / "latest"
         if step is None:
             raise InputError(where, "holds no checkpoint", "start the run without --resume")
-        variables = {"params": template.params, "batch_stats": template.batch_stats}
-        meta = _checked_meta(manager, step, variables, where)
-        items = ocp.args.Composite(
-            variables=ocp.args.StandardRestore(variables),
-            optimizer=ocp.args.StandardRestore(template.opt_state),
-        )
-        restored = manager.restore(step, args=items)
-        variables = restored["variables"]
-        state = TrainState(
-            jnp.int32(step), variables["params"], variables["batch_stats"], restored["optimizer"]
-        )
+        wanted = {"variables": _variables(template), "optimizer": template.opt_state}
+        if template.average is not None:
+            wanted["training"] = template.params
+        meta = _checked_meta(manager, step, wanted["variables"], where)
+        items = {name: ocp.args.StandardRestore(tree) for name, tree in wanted.items()}
+        restored = manager.restore(step, args=ocp.args.Composite(**items))
+        params, batch_stats = (restored["variables"][name] for name in ("params", "batch_stats"))
+        state = TrainState(jnp.int32(step), params, batch_stats, restored["optimizer"])
+        if template.average is not None:
+            state = state._replace(params=restored["training"], average=params)
         return _uncommitted(state), _position(meta["position"])
 
 
@@ -170,6 +175,11 @@ def load_run(workdir: Path, which: Which = "best") -> Run:
                 "the checkpoint is damaged",
             ) from None
     return Run(config, model, _uncommitted(variables), meta["position"]["epoch"], step)
+
+
+def _variables(state: TrainState) -> dict[str, Any]:
+    """What evaluation loads."""
+    return {"params": evaluated(state).params, "batch_stats": state.batch_stats}
 
 
 def _manager(folder: Path, create: bool) -> ocp.CheckpointManager:

@@ -27,6 +27,8 @@ from gnio_jax.training.step import (
     create_state,
     epoch_order,
     estimate_statistics,
+    evaluated,
+    isotropic,
     normalises,
     train_steps,
     validate,
@@ -72,7 +74,9 @@ def _train(config: TrainConfig, resume: bool, reporter: Reporter, workers: int) 
     configuration.validate(config)
     workdir = run_folder.prepare(config, resume)
     run = set_up(config, reporter, workers)
-    state = create_state(run.model, run.optimizer, run.keys.init, config.data.window)
+    state = create_state(
+        run.model, run.optimizer, run.keys.init, config.data.window, config.optim.ema_decay
+    )
     describe(run, sum(x.size for x in jax.tree.leaves(state.params)), workdir, reporter)
     run_folder.write_settings(workdir, config, run.splits, resume)
     position = Position(epoch=0, step=0, best_loss=None, loss_sums=(0.0, 0.0, 0.0), seconds=0.0)
@@ -179,11 +183,13 @@ def _run_steps(
 
 def _with_statistics(run: Run, state: TrainState) -> TrainState:
     """The state as it is validated and kept: with the statistics of its batch normalisations
-    estimated anew, if asked for."""
+    estimated anew, for the parameters that are evaluated, if asked for."""
     if not run.config.optim.statistics_windows or not normalises(state):
         return state
-    key = run.keys.statistics
-    return estimate_statistics(state, run.source, key, model=run.model, config=run.config)
+    estimated = estimate_statistics(
+        evaluated(state), run.source, run.keys.statistics, model=run.model, config=run.config
+    )
+    return state._replace(batch_stats=estimated.batch_stats)
 
 
 def _validate(run: Run, state: TrainState, step: int) -> tuple[TrainState, Validation]:
@@ -191,11 +197,12 @@ def _validate(run: Run, state: TrainState, step: int) -> tuple[TrainState, Valid
     losses of that state."""
     now = stage(run.config.loss, step - 1, run.steps_per_epoch)
     options = {"model": run.model, "config": run.config}
-    validation = validate(state, source=run.held_out, now=now, **options)
+    validation = validate(evaluated(state), source=run.held_out, now=now, **options)
     if not calibrates(state):
         return state, validation
-    state = calibrated(state, validation)
-    return state, validate(state, source=run.held_out, now=now, **options)
+    equivariant = run.config.model.equivariance != "none"
+    state = calibrated(state, isotropic(validation) if equivariant else validation)
+    return state, validate(evaluated(state), source=run.held_out, now=now, **options)
 
 
 def _improves(run: Run, position: Position, merit: float) -> bool:
