@@ -9,7 +9,7 @@ Compile time is measured apart, and every timing waits for its result. A row giv
 median of the repeats, the samples per second of processor time (which other programs on the machine
 disturb less), and the memory of the program: arguments, results and temporaries. The last part
 gives the cost of derivatives: value and gradient over the value, in time and memory, with and
-without checkpoints.
+without checkpoints, of one piece and of several under `vmap`.
 """
 
 from __future__ import annotations
@@ -130,17 +130,28 @@ def measure_numpy(config: filtering.FilterConfig, seconds: float) -> float:
     return len(gyro) / (time.perf_counter() - begin)
 
 
+class GradientCost(NamedTuple):
+    """What value and gradient of a number of pieces cost."""
+
+    ratio: float
+    """Their time over that of the value alone."""
+    speed: float
+    """Pieces per second."""
+    memory: float
+    """MiB of temporaries."""
+
+
 def measure_gradient(
-    config: filtering.FilterConfig, seconds: float, repeats: int
-) -> tuple[float, float]:
-    """(time of value and gradient over time of the value, MiB of temporaries of the former).
+    config: filtering.FilterConfig, seconds: float, pieces: int, repeats: int
+) -> GradientCost:
+    """The cost of value and gradient of `pieces` walks side by side.
 
     The value is a function of the history. The gradient is with respect to the noise model, the
-    initial velocity and every measurement.
+    initial velocities and every measurement. Both programs run in turn.
     """
     gyro, accel, displacement, covariance = jax.device_put(walk(seconds, config))
 
-    def value(logarithms, velocity, displacement):
+    def value_of_piece(logarithms, velocity, displacement):
         state = filtering.initial_state(config, np.eye(3), velocity, np.zeros(3))
         noise = filtering.NoiseModel(*jnp.exp(logarithms))
         _, history = filtering.run_filter(
@@ -148,23 +159,33 @@ def measure_gradient(
         )
         return jnp.sum(history.position**2) + jnp.nansum(history.nis)
 
-    arguments = (
-        jnp.log(jnp.array(filtering.NoiseModel.per_sample(1e-2, 3.16e-2, DT))),
-        jnp.array([1.2, 0.0, 0.0]),
-        displacement,
-    )
-    out = []
-    for function in (value, jax.value_and_grad(value, argnums=(0, 1, 2))):
-        program = jax.jit(function).lower(*arguments).compile()
+    def value(logarithms, velocity, displacement):
+        of_pieces = jax.vmap(value_of_piece, in_axes=(None, 0, 0))
+        return jnp.sum(of_pieces(logarithms, velocity, displacement))
+
+    densities = filtering.NoiseModel.per_sample(1e-2, 3.16e-2, DT)[:4]
+    arguments = jnp.log(jnp.array(densities)), jnp.array([1.2, 0.0, 0.0]), displacement
+    if pieces == 1:
+        value = value_of_piece
+    else:
+        logarithms, *of_piece = arguments
+        arguments = logarithms, *(jnp.stack([part] * pieces) for part in of_piece)
+    both = jax.value_and_grad(value, argnums=(0, 1, 2))
+    programs = [jax.jit(function).lower(*arguments).compile() for function in (value, both)]
+    for program in programs:
         result = jax.block_until_ready(program(*arguments))
         assert all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves(result))
-        times = []
-        for _ in range(repeats):
-            begin = time.perf_counter()
-            jax.block_until_ready(program(*arguments))
-            times.append(time.perf_counter() - begin)
-        out += [min(times), program.memory_analysis().temp_size_in_bytes / 2**20]
-    return out[2] / out[0], out[3]
+    times = [[timed(program, arguments) for program in programs] for _ in range(repeats)]
+    alone, with_gradient = np.min(times, axis=0)
+    memory = programs[1].memory_analysis().temp_size_in_bytes / 2**20
+    return GradientCost(with_gradient / alone, pieces / with_gradient, memory)
+
+
+def timed(program, arguments: tuple) -> float:
+    """Seconds of one run."""
+    begin = time.perf_counter()
+    jax.block_until_ready(program(*arguments))
+    return time.perf_counter() - begin
 
 
 class Case(NamedTuple):
@@ -205,8 +226,8 @@ CASES = {
         Case(10, 20, 16, spread=True, float32=True),
     ],
 }
-GRADIENTS = [(60, 0), (60, 32), (600, 128)]
-"""(seconds, checkpoint_every)."""
+GRADIENTS = [(60, 0, 1), (60, 0, 8), (60, 0, 32), (60, 32, 1), (600, 128, 1)]
+"""(seconds, checkpoint_every, pieces)."""
 
 
 def report_case(case: Case, length: float, repeats: int) -> tuple[str, float]:
@@ -231,17 +252,20 @@ def report_case(case: Case, length: float, repeats: int) -> tuple[str, float]:
 def report_gradients() -> dict[str, float]:
     """Measure and print the cost of derivatives."""
     figures = {}
-    print("\nvalue and gradient, 20 Hz clones, 1 s window, one sequence, float64:")
-    for seconds, every in GRADIENTS:
+    print("\nvalue and gradient, 20 Hz clones, 1 s window, one device, float64:")
+    for seconds, every, pieces in GRADIENTS:
         config = filtering.FilterConfig(DT, 10, 20, checkpoint_every=every)
-        ratio, memory = measure_gradient(config, seconds, 2)
+        cost = measure_gradient(config, seconds, pieces, 3)
         print(
-            f"  {seconds:4} s, checkpoint_every {every:4}: {ratio:5.1f} × the value's time, "
-            f"{memory:7.0f} MiB of temporaries",
+            f"  {pieces:2} × {seconds:3} s, checkpoint_every {every:3}: {cost.ratio:5.1f} × the "
+            f"value's time, {cost.speed:5.2f} pieces/s, {cost.memory:5.0f} MiB of temporaries",
             flush=True,
         )
-        figures[f"gradient / value, {seconds} s, checkpoint_every {every}"] = ratio
-        figures[f"MiB of the gradient, {seconds} s, checkpoint_every {every}"] = memory
+        name = f"{seconds} s, checkpoint_every {every}"
+        name += f", {pieces} pieces" if pieces > 1 else ""
+        figures[f"gradient / value, {name}"] = cost.ratio
+        figures[f"pieces/s of value and gradient, {name}"] = cost.speed
+        figures[f"MiB of the gradient, {name}"] = cost.memory
     return figures
 
 

@@ -3,6 +3,10 @@ jaxlie.
 
 Every function acts on one element (use `jax.vmap` for more) unless its shape says otherwise, keeps
 the dtype of its input and has finite derivatives at its singular points.
+
+The functions that the filter calls most have a derivative of their own (`jax.custom_jvp`), in both
+modes. It keeps whole matrices for the backward pass, where JAX would keep every term of a sum that
+is spelt out, and it costs a few operations, where the transpose of such a sum costs dozens.
 """
 
 from __future__ import annotations
@@ -13,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
+from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Float
 
 Scalar = Float[jax.Array, ""]
@@ -32,6 +37,7 @@ _GENERATORS = np.array(
 reduction can end as a library call."""
 
 
+@jax.custom_jvp
 def hat(v: Vector) -> Matrix:
     """The cross-product matrix: hat(v) w = v × w."""
     return (
@@ -41,15 +47,20 @@ def hat(v: Vector) -> Matrix:
     )
 
 
+@hat.defjvp
+def _hat_jvp(primals: tuple, tangents: tuple) -> tuple[Matrix, Matrix]:
+    (v,), (dv,) = primals, tangents
+    return hat(v), jnp.sum(_GENERATORS.astype(v.dtype) * dv[:, None, None], axis=0)
+
+
+@jax.custom_jvp
 def _series(squared: Scalar) -> tuple[Scalar, Scalar, Scalar]:
     """sin θ/θ, (1 − cos θ)/θ² and (θ − sin θ)/θ³ from θ².
 
     The quotients lose digits as θ → 0 and have no derivative there, so below θ² = 1e-2 the power
     series takes over, to the last bit.
     """
-    small = squared < 1e-2
-    x = jnp.where(small, squared, 0.0)
-    safe = jnp.where(small, 1.0, squared)
+    small, x, safe = _small_or_safe(squared)
     half = 0.5 * jnp.sqrt(safe)
     sine, cosine = jnp.sin(half), jnp.cos(half)
     first = sine * cosine / half
@@ -62,6 +73,29 @@ def _series(squared: Scalar) -> tuple[Scalar, Scalar, Scalar]:
             small, 1 / 6 - x / 120 * (1 - x / 42 * (1 - x / 72 * (1 - x / 110))), (1 - first) / safe
         ),
     )
+
+
+def _small_or_safe(squared: Scalar) -> tuple[jax.Array, Scalar, Scalar]:
+    """Whether θ² is small; θ² where it is, else 0; θ² where it is not, else 1."""
+    small = squared < 1e-2
+    return small, jnp.where(small, squared, 0.0), jnp.where(small, 1.0, squared)
+
+
+@_series.defjvp
+def _series_jvp(primals: tuple, tangents: tuple) -> tuple[tuple, tuple]:
+    """With c_n = Σ_k (−θ²)^k / (2k + n)!, the three are c_1, c_2, c_3, and by θ² the derivative of
+    c_n is (n c_{n+2} − c_{n+1}) / 2."""
+    (squared,), (d_squared,) = primals, tangents
+    sine, versine, excess = _series(squared)
+    small, x, safe = _small_or_safe(squared)
+    fourth = jnp.where(
+        small, 1 / 24 - x / 720 * (1 - x / 56 * (1 - x / 90)), (0.5 - versine) / safe
+    )
+    fifth = jnp.where(
+        small, 1 / 120 - x / 5040 * (1 - x / 72 * (1 - x / 110)), (1 / 6 - excess) / safe
+    )
+    slopes = 0.5 * (excess - versine), fourth - 0.5 * excess, 0.5 * (3 * fifth - fourth)
+    return (sine, versine, excess), tuple(slope * d_squared for slope in slopes)
 
 
 def _polynomial(phi: Vector, squared: Scalar, first: Scalar, second: Scalar) -> Matrix:
@@ -82,12 +116,48 @@ def log(rotation: Matrix) -> Vector:
     return jaxlie.SO3.from_matrix(rotation).log()
 
 
+@jax.custom_jvp
 def matmul(
     a: Float[jax.Array, "p k *n"], b: Float[jax.Array, "k q *n"]
 ) -> Float[jax.Array, "p q *n"]:
     """a b for small matrices stacked along trailing axes, as a sum that XLA fuses with its
     neighbours, where a dot is a library call."""
     return functools.reduce(jnp.add, [a[:, None, k] * b[None, k] for k in range(b.shape[0])])
+
+
+@functools.partial(matmul.defjvp, symbolic_zeros=True)
+def _matmul_jvp(primals: tuple, tangents: tuple) -> tuple[jax.Array, jax.Array]:
+    (a, b), (da, db) = primals, tangents
+    terms = []
+    if not isinstance(da, SymbolicZero):
+        terms.append(contract_left(da, b))
+    if not isinstance(db, SymbolicZero):
+        terms.append(contract_right(a, db))
+    return matmul(a, b), functools.reduce(jnp.add, terms)
+
+
+_LONG = 16
+"""A sum over more terms than this is a dot."""
+
+
+def contract_left(
+    da: Float[jax.Array, "p k *n"], b: Float[jax.Array, "k q *n"]
+) -> Float[jax.Array, "p q *n"]:
+    """da b as one product and one sum; so is its transpose, a sum over the columns of b."""
+    return _contract(da, b, max(b.shape[:2]))
+
+
+def contract_right(
+    a: Float[jax.Array, "p k *n"], db: Float[jax.Array, "k q *n"]
+) -> Float[jax.Array, "p q *n"]:
+    """a db as one product and one sum; so is its transpose, a sum over the rows of a."""
+    return _contract(a, db, max(a.shape[:2]))
+
+
+def _contract(a: jax.Array, b: jax.Array, longest: int) -> jax.Array:
+    if a.ndim == 2 and longest > _LONG:
+        return a @ b
+    return jnp.sum(a[:, :, None] * b[None], axis=1)
 
 
 def orthonormalize(rotation: Matrix) -> Matrix:
@@ -132,6 +202,28 @@ def cumulative_rotation(
         )
         reach *= 2
     return products
+
+
+@jax.custom_jvp
+def integrate_turns(start: Matrix, turns: Float[jax.Array, "n 3"]) -> Float[jax.Array, "3 3 n+1"]:
+    """`cumulative_rotation` by rotation vectors φ_j, rad, each in the frame of the rotation before
+    it: R_{j+1} = R_j exp(φ_j)."""
+    return cumulative_rotation(start, jax.vmap(exp, out_axes=2)(turns))
+
+
+@integrate_turns.defjvp
+def _integrate_turns_jvp(primals: tuple, tangents: tuple) -> tuple[jax.Array, jax.Array]:
+    """dR_j = (dR_0 R_0ᵀ + hat(Σ_{l<j} R_{l+1} J_r(φ_l) dφ_l)) R_j."""
+    (start, turns), (d_start, d_turns) = primals, tangents
+    rotations = integrate_turns(start, turns)
+    right_jacobians = jax.vmap(right_jacobian, out_axes=2)(turns)
+    n, dtype = turns.shape[0], turns.dtype
+    reach = matmul(rotations[:, :, 1:], right_jacobians)
+    world = contract_right(reach, d_turns.T[:, None])[:, 0]
+    sums = world @ np.triu(np.ones((n, n + 1), dtype), 1)
+    skew = jnp.sum(_GENERATORS.astype(dtype)[:, :, :, None] * sums[:, None, None], axis=0)
+    d_world = contract_left(d_start, start.T)[:, :, None] + skew
+    return rotations, contract_left(d_world, rotations)
 
 
 def matrix_from_quaternion(wxyz: Quaternion) -> Matrix:

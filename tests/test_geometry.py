@@ -102,6 +102,61 @@ def test_matmul_is_a_stack_of_products():
     )
 
 
+@pytest.mark.parametrize("p,k,q,n", [(3, 4, 2, (5,)), (3, 9, 40, ()), (40, 3, 3, ())])
+def test_derivatives_of_matmul(p, k, q, n):
+    """In both modes, of short and long contractions, also where one factor is a constant."""
+    rng = np.random.default_rng(0)
+    a, da = map(jnp.asarray, rng.standard_normal((2, p, k, *n)))
+    b, db = map(jnp.asarray, rng.standard_normal((2, k, q, *n)))
+    result = rng.standard_normal((p, q, *n))
+    _, along = jax.jvp(geometry.matmul, (a, b), (da, db))
+    expected = np.einsum("pk...,kq...->pq...", da, b) + np.einsum("pk...,kq...->pq...", a, db)
+    np.testing.assert_allclose(along, expected, rtol=1e-12, atol=1e-13)
+    of_both = jax.vjp(geometry.matmul, a, b)[1](result)
+    of_first = jax.vjp(lambda a: geometry.matmul(a, b), a)[1](result)
+    of_second = jax.vjp(lambda b: geometry.matmul(a, b), b)[1](result)
+    by_first = np.einsum("pq...,kq...->pk...", result, b)
+    by_second = np.einsum("pk...,pq...->kq...", a, result)
+    for found, wanted in zip(
+        (*of_both, *of_first, *of_second), (by_first, by_second) * 2, strict=True
+    ):
+        np.testing.assert_allclose(found, wanted, rtol=1e-12, atol=1e-13)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-4, 0.7])
+def test_integrate_turns_and_its_derivative(angle):
+    """Against the product of exponentials, also off the rotations, where the start is any matrix
+    near to one."""
+    rng = np.random.default_rng(1)
+    turns = angle * rng.standard_normal((4, 3))
+    start = Rotation.from_rotvec([0.3, -0.8, 0.5]).as_matrix()
+
+    def oracle(x):
+        rotations = [x[:9].reshape(3, 3)]
+        for turn in x[9:].reshape(-1, 3):
+            rotations.append(rotations[-1] @ Rotation.from_rotvec(turn).as_matrix())
+        return np.stack(rotations, -1)
+
+    x = np.concatenate([start.ravel(), turns.ravel()])
+    given = jnp.asarray(start), jnp.asarray(turns)
+    np.testing.assert_allclose(geometry.integrate_turns(*given), oracle(x), atol=1e-14)
+    by_start, by_turns = jax.jacrev(geometry.integrate_turns, (0, 1))(*given)
+    expected = differences(oracle, x)
+    np.testing.assert_allclose(by_start.reshape(3, 3, 5, 9), expected[..., :9], atol=1e-9)
+    np.testing.assert_allclose(by_turns.reshape(3, 3, 5, 12), expected[..., 9:], atol=1e-9)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-4, 9.99e-2, 1.001e-1, 0.7, 3.0])
+def test_second_derivative_of_exp(angle):
+    """Along one direction E: the top right block of exp([X, E, 0; 0, X, E; 0, 0, X]) is half of
+    it."""
+    phi, along = jnp.asarray(angle * AXIS), jnp.asarray([0.2, 0.9, -0.4])
+    x, e = (np.cross(np.eye(3), v) for v in (phi, along))
+    blocks = np.kron(np.eye(3), x) + np.kron(np.eye(3, k=1), e)
+    _, second = jax.jvp(lambda p: jax.jvp(geometry.exp, (p,), (along,))[1], (phi,), (along,))
+    np.testing.assert_allclose(second, 2 * expm(blocks)[:3, 6:], atol=1e-11)
+
+
 @pytest.mark.parametrize("angle", [1e-9, 1e-3, 1.0, 3.0, np.pi - 1e-4])
 def test_log_inverts_exp(angle):
     phi = angle * AXIS

@@ -16,11 +16,12 @@ from gnio_jax.filtering.lasting_errors import LastingErrors, distort
 from gnio_jax.filtering.noise import NoiseModel
 from gnio_jax.filtering.state import CLONE, LASTING, MOVE, OFFSET, FilterState
 from gnio_jax.filtering.update import (
-    Cholesky,
     Correction,
+    Whitened,
     apply_correction,
     cholesky,
     relinearize,
+    whiten,
 )
 from gnio_jax.geometry import matmul
 from gnio_jax.types import Array
@@ -175,8 +176,8 @@ def update_with_correction(
         residual, measurement = _with_lasting_errors(residual, measurement, state, errors)
     projected = _project(state, residual, oldest, moves_apart)
 
-    root = _root(projected.innovation_covariance, measurement, 1.0)
-    whitened = root.whiten(residual.innovation)
+    white = _whiten(residual, projected, measurement, 1.0)
+    whitened = white.rows[0][:, 0]
     nis = jnp.dot(whitened, whitened)
     tested = measurement.present & residual.defined
     now = state.step * config.samples_per_clone
@@ -186,15 +187,15 @@ def update_with_correction(
         tested=tested,
         innovation=residual.innovation,
         nis=nis,
-        volume=root.volume,
+        volume=white.volume,
         gate_passed=weight,
         accepted=weight > 0,
     )
     scale = _covariance_scale(weight, tested, config)
     if scale is not None:
-        root = _root(projected.innovation_covariance, measurement, scale)
+        white = _whiten(residual, projected, measurement, scale)
         result = result._replace(accepted=tested)
-    correction = _correction(root, residual, projected, moves_apart, result.accepted)
+    correction = _correction(white, moves_apart, result.accepted)
     # What bounds the correction is rᵀ S⁻¹ r with the S of the update, that is after any scaling.
     whitened = correction.whitened
     large = result.accepted & (jnp.dot(whitened, whitened) > config.gate_threshold)
@@ -267,13 +268,21 @@ def _project(
     return _Projected(core_rows, clone_rows, matmul(touched, jacobian.T))
 
 
-def _root(
-    innovation_covariance: Float[Array, "3 3"], measurement: Measurement, scale: Array | float
-) -> Cholesky:
-    """L of S = H P Hᵀ + scale · R, the identity where there is no measurement."""
-    whole = innovation_covariance + scale * measurement.covariance
-    eye = jnp.eye(3, dtype=innovation_covariance.dtype)
-    return cholesky(jnp.where(measurement.present, whole, eye))
+def _whiten(
+    residual: Residual, projected: _Projected, measurement: Measurement, scale: Array | float
+) -> Whitened:
+    """L⁻¹ of r, H P (core, clones) and H (clones, errors that last), with L of S = H P Hᵀ + scale ·
+    R, the identity where there is no measurement."""
+    whole = projected.innovation_covariance + scale * measurement.covariance
+    spread = jnp.where(measurement.present, whole, jnp.eye(3, dtype=whole.dtype))
+    rows = (
+        residual.innovation[:, None],
+        projected.core_rows,
+        projected.clone_rows,
+        residual.jacobian,
+        residual.lasting_jacobian,
+    )
+    return whiten(spread, rows)
 
 
 def _covariance_scale(
@@ -290,25 +299,14 @@ def _covariance_scale(
 
 
 def _correction(
-    root: Cholesky,
-    residual: Residual,
-    projected: _Projected,
-    moves_apart: Float[Array, ""],
-    accepted: Bool[Array, ""],
+    white: Whitened, moves_apart: Float[Array, ""], accepted: Bool[Array, ""]
 ) -> Correction:
-    """L⁻¹ r, L⁻¹ H P and L⁻¹ H; rows of zeros where the measurement is not `accepted`."""
-    core_rows, clone_rows, jacobian, of_errors = (
-        jnp.where(accepted, root.solve(rows), 0.0)
-        for rows in (
-            projected.core_rows,
-            projected.clone_rows,
-            residual.jacobian,
-            residual.lasting_jacobian,
-        )
-    )
+    """Of what `_whiten` returns; rows of zeros where the measurement is not `accepted`."""
+    whitened, *rows = white.rows
+    core_rows, clone_rows, jacobian, of_errors = (jnp.where(accepted, part, 0.0) for part in rows)
     of_new = jacobian[:, OF_NEWEST]
     core_jacobian = jnp.zeros_like(core_rows).at[:, OFFSET].set(of_new)
     core_jacobian = core_jacobian.at[:, MOVE].set(moves_apart * of_new)
     core_jacobian = core_jacobian.at[:, LASTING].set(of_errors)
-    whitened = root.whiten(residual.innovation)
-    return Correction(whitened, core_rows, clone_rows, core_jacobian, jacobian[:, OF_OLDEST])
+    of_oldest = jacobian[:, OF_OLDEST]
+    return Correction(whitened[:, 0], core_rows, clone_rows, core_jacobian, of_oldest)

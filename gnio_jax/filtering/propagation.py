@@ -96,8 +96,7 @@ def integrate_interval(
     pushes = (imu.accel - state.accel_bias[None]) * dt
     if imu.gap is not None:
         turns, pushes = turns * imu.gap.used[:, None], pushes * imu.gap.used[:, None]
-    exponentials = jax.vmap(geometry.exp, out_axes=2)(turns)
-    rotations = geometry.cumulative_rotation(state.rotation, exponentials)
+    rotations = geometry.integrate_turns(state.rotation, turns)
     velocity_steps = matmul(rotations[:, :, :-1], pushes.T[:, None])[:, 0]  # Δv of every sample
 
     # Σ_{j≥m} Δv_j for m = 0 … n − 1, then Σ_{j≥m} (n − j − ½) dt Δv_j.
@@ -280,7 +279,7 @@ def propagate(
     of_pose = jnp.concatenate([core[:, THETA], core[:, OFFSET]], axis=1)
     cross = _put(move(state.cross_covariance), of_pose, 0, clone)
     rows = jnp.concatenate([cross[THETA], cross[OFFSET]])
-    clones = _put(_put(state.clone_covariance, rows, clone, 0), rows.T, 0, clone)
+    clones = _replace_clone(state.clone_covariance, rows, clone)
     return state._replace(
         rotation=motion.rotation,
         velocity=motion.velocity,
@@ -316,6 +315,27 @@ def _first_estimates(
         offset=motion.offset,
         clone_offset=_replaced(first.clone_offset, motion.offset, slot),
     )
+
+
+@jax.custom_jvp
+def _replace_clone(
+    covariance: Float[Array, "m m"], rows: Float[Array, "6 m"], entry: Array | int
+) -> Float[Array, "m m"]:
+    """The covariance of the clones with `rows`, and the columns that mirror them, from `entry`."""
+    return _put(_put(covariance, rows, entry, 0), rows.T, 0, entry)
+
+
+@_replace_clone.defjvp
+def _replace_clone_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
+    """With a mask: the transpose of overwriting would copy the whole matrix for each write."""
+    covariance, _, entry = primals
+    d_covariance, d_rows, _ = tangents
+    index = np.arange(len(covariance))
+    kept = ((index < entry) | (index >= entry + CLONE)).astype(covariance.dtype)
+    nothing = jnp.zeros_like(covariance)
+    changed = _put(nothing, d_rows * kept[None], entry, 0) + _put(nothing, d_rows.T, 0, entry)
+    d_others = d_covariance * kept[:, None] * kept[None]
+    return _replace_clone(*primals), d_others + changed
 
 
 def _replaced(ring: Array, value: Array, slot: Array | int) -> Array:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Float
 
@@ -24,6 +25,27 @@ from gnio_jax.types import Array
 Measure = Callable[[FilterState, Array | int], tuple[Measurement, dict]]
 """From the state and the slot of its oldest clone to the measurement and the network's
 diagnostics."""
+
+
+def _keep(primitive: Any, *_: Any, **__: Any) -> bool:
+    """What the backward pass keeps of a step: all but other forms of what it has."""
+    return primitive.name not in {
+        "broadcast_in_dim",
+        "convert_element_type",
+        "neg",
+        "reshape",
+        "squeeze",
+        "transpose",
+    }
+
+
+# To write, and on the way back to read, the numbers that a backward pass keeps costs more than to
+# compute the interval again.
+_integrate_interval = jax.checkpoint(integrate_interval, static_argnums=3, prevent_cse=False)
+_propagate = jax.checkpoint(propagate, policy=_keep, prevent_cse=False)
+_update_with_correction = jax.checkpoint(
+    update_with_correction, policy=_keep, static_argnums=(4, 5), prevent_cse=False
+)
 
 
 class StepTrace(NamedTuple):
@@ -70,13 +92,13 @@ def traced_clone_step(
     anchored = newest == 0
 
     state = move_anchor(state, anchored)
-    motion = integrate_interval(state, imu, noise, config.dt)
+    motion = _integrate_interval(state, imu, noise, config.dt)
     moved = transition(state, motion, anchored)
     lasting = lasting_motion(noise.displacement, config.clone_seconds, state.offset.dtype)
-    state = propagate(state, motion, lasting, anchored, newest)
+    state = _propagate(state, motion, lasting, anchored, newest)
 
     measurement, diagnostics = measure(state, oldest)
-    state, update, *corrections = update_with_correction(
+    state, update, *corrections = _update_with_correction(
         state, measurement, newest, oldest, config, frame, noise.displacement
     )
     rest = no_rest(update.nis.dtype)

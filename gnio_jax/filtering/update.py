@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Bool, Float
 
 from gnio_jax import geometry
@@ -26,7 +27,7 @@ from gnio_jax.filtering.state import (
     FilterState,
     FirstEstimates,
 )
-from gnio_jax.geometry import matmul
+from gnio_jax.geometry import contract_left, contract_right, matmul
 from gnio_jax.types import Array
 
 
@@ -60,10 +61,6 @@ class Cholesky(NamedTuple):
         y = (rows[1] - b * x) / d
         return jnp.stack([x, y, (rows[2] - c * x - e * y) / f])
 
-    def whiten(self, innovation: Float[Array, "3"]) -> Float[Array, "3"]:
-        """L⁻¹ r."""
-        return self.solve(innovation[:, None])[:, 0]
-
     @property
     def matrix(self) -> Float[Array, "3 3"]:
         """L."""
@@ -86,6 +83,55 @@ def cholesky(s: Float[Array, "3 3"]) -> Cholesky:
     return Cholesky((a, d, jnp.sqrt(s[2, 2] - c * c - e * e)), (b, c, e))
 
 
+class Whitened(NamedTuple):
+    """What S = L Lᵀ makes of some rows."""
+
+    rows: tuple[Float[Array, "3 _"], ...]
+    """L⁻¹ of each."""
+    volume: Float[Array, ""]
+    """√det S."""
+
+
+@jax.custom_jvp
+def whiten(s: Float[Array, "3 3"], rows: tuple[Float[Array, "3 _"], ...]) -> Whitened:
+    """L⁻¹ of each of the rows, for a symmetric S = L Lᵀ."""
+    root = cholesky(s)
+    return Whitened(tuple(root.solve(part) for part in rows), root.volume)
+
+
+@whiten.defjvp
+def _whiten_jvp(primals: tuple, tangents: tuple) -> tuple[Whitened, Whitened]:
+    """With A = L⁻¹ dS L⁻ᵀ and Y = L⁻¹ X: dY = L⁻¹ dX − Φ(A) Y, where Φ takes the lower triangle and
+    half of the diagonal, and d√det S = ½ tr(A) √det S."""
+    (s, rows), (ds, d_rows) = primals, tangents
+    eye = np.eye(3, dtype=s.dtype)
+    (inverse, *whitened), volume = whiten(s, (jnp.asarray(eye), *rows))
+    triangle = np.tril(np.ones((3, 3), s.dtype)) - 0.5 * eye
+    lower = triangle * contract_left(contract_right(inverse, ds), inverse.T)
+    d_whitened = [
+        contract_right(inverse, dx) - contract_left(lower, y)
+        for dx, y in zip(d_rows, whitened, strict=True)
+    ]
+    d_volume = volume * jnp.sum(eye * lower)
+    return Whitened(tuple(whitened), volume), Whitened(tuple(d_whitened), d_volume)
+
+
+@jax.custom_jvp
+def downdate(covariance: Float[Array, "m m"], rows: Float[Array, "3 m"]) -> Float[Array, "m m"]:
+    """P − Yᵀ Y."""
+    return covariance - matmul(rows.T, rows)
+
+
+@downdate.defjvp
+def _downdate_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
+    """The signs are with the rows, or the backward pass would turn that of the whole matrix. Two
+    products, as the transpose of one and its mirror image would add a matrix to its own transpose.
+    """
+    (covariance, rows), (d_covariance, d_rows) = primals, tangents
+    change = (-d_rows).T @ rows + (-rows).T @ d_rows
+    return downdate(covariance, rows), d_covariance + change
+
+
 def apply_correction(
     state: FilterState, correction: Correction, newest: Array | int
 ) -> FilterState:
@@ -98,9 +144,9 @@ def apply_correction(
     )
     corrected = retract(state, error, clone_errors.reshape(-1, CLONE), newest)
     return corrected._replace(
-        core_covariance=state.core_covariance - matmul(core_rows.T, core_rows),
+        core_covariance=downdate(state.core_covariance, core_rows),
         cross_covariance=state.cross_covariance - matmul(core_rows.T, clone_rows),
-        clone_covariance=state.clone_covariance - matmul(clone_rows.T, clone_rows),
+        clone_covariance=downdate(state.clone_covariance, clone_rows),
     )
 
 

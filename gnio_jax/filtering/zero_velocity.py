@@ -15,7 +15,7 @@ from gnio_jax.filtering.config import FilterConfig
 from gnio_jax.filtering.gaps import Imu
 from gnio_jax.filtering.gate import gate_activity
 from gnio_jax.filtering.state import CLONE, VELOCITY, FilterState
-from gnio_jax.filtering.update import Correction, apply_correction, cholesky, relinearize
+from gnio_jax.filtering.update import Correction, apply_correction, relinearize, whiten
 from gnio_jax.types import GRAVITY, Array
 
 
@@ -68,17 +68,16 @@ def update_at_rest(
     """
     dtype = state.velocity.dtype
     noise = config.zero_velocity_std**2 * np.eye(3, dtype=dtype)
-    root = cholesky(jnp.where(quiet, state.core_covariance[VELOCITY, VELOCITY], 0.0) + noise)
-    whitened = -root.solve(state.velocity[:, None])[:, 0]
+    spread = jnp.where(quiet, state.core_covariance[VELOCITY, VELOCITY], 0.0) + noise
+    jacobian = jnp.eye(len(state.core_covariance), dtype=dtype)[VELOCITY]
+    rows = (state.core_covariance[VELOCITY], state.cross_covariance[VELOCITY], jacobian)
+    (velocity, *rows), _ = whiten(spread, (state.velocity[:, None], *rows))
+    whitened = -velocity[:, 0]
     nis = jnp.dot(whitened, whitened)
     fits = nis <= config.gate_threshold
     active = gate_activity(state.gate, config, state.step * config.samples_per_clone).active
     accepted = quiet & (~(active & displacement_tested) | fits)
-    jacobian = np.eye(len(state.core_covariance), dtype=dtype)[VELOCITY]
-    rows = (state.core_covariance[VELOCITY], state.cross_covariance[VELOCITY], jacobian)
-    core_rows, clone_rows, core_jacobian = (
-        jnp.where(accepted, root.solve(part), 0.0) for part in rows
-    )
+    core_rows, clone_rows, core_jacobian = (jnp.where(accepted, part, 0.0) for part in rows)
     of_oldest = jnp.zeros((3, CLONE), dtype)
     correction = Correction(whitened, core_rows, clone_rows, core_jacobian, of_oldest)
     state = relinearize(apply_correction(state, correction, newest), accepted & ~fits)
