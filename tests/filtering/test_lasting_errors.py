@@ -24,7 +24,7 @@ CONFIG = filtering.FilterConfig(
     DT, N, CLONES, convergence_seconds=0.6, measurement_scale=2.0, history="core"
 )
 ERRORS = LastingErrors(0.8, 0.3, 0.1, 0.05, 5.0)
-NOISE = filtering.NoiseModel(2e-3, 2e-2, 1e-6, 1e-4, ERRORS)
+NOISE = filtering.NoiseModel(2e-3, 2e-2, 1e-6, 1e-4, displacement=ERRORS)
 
 
 def numpy_errors(errors):
@@ -121,7 +121,7 @@ def test_they_are_as_large_at_all_times():
 
 RUNS, SIGMA, LONG = 48, 0.05, 500
 LASTING_WALK = LastingErrors(0.9, 0.5, 0.08, 0.05, 40.0)
-MODEL = filtering.NoiseModel(5e-4, 5e-3, 1e-6, 2e-5, LASTING_WALK)
+MODEL = filtering.NoiseModel(5e-4, 5e-3, 1e-6, 2e-5, displacement=LASTING_WALK)
 STD = filtering.InitialStd(0.02, 0.01, 0.3, 1e-3, 1e-3, 0.02)
 
 
