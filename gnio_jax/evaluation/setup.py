@@ -1,14 +1,11 @@
-"""How a trajectory is estimated: the choices of the command line, and the filter they give."""
+"""How a trajectory is estimated: the choices of the command line."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from typing import Literal, NamedTuple
 
-from gnio_jax.config import DataConfig, FilterOptions
 from gnio_jax.errors import InputError
-from gnio_jax.filtering import FilterConfig, InitialStd, LastingErrors, NoiseModel
 
 Estimator = Literal["ekf", "integrate", "imu_only"]
 Orientation = Literal["filter", "device", "reference"]
@@ -58,58 +55,3 @@ def resolve(setup: Setup) -> Setup:
             "leave it out, or choose --coupling loose or --estimator integrate",
         )
     return setup._replace(orientation="filter")
-
-
-class FilterSetup(NamedTuple):
-    """A filter as the options ask for it."""
-
-    config: FilterConfig
-    noise: NoiseModel
-    initial_std: InitialStd
-
-
-def filter_setup(windows: DataConfig, options: FilterOptions) -> FilterSetup:
-    """The filter for the windows and strides that a network was trained with."""
-    config = FilterConfig(
-        dt=1.0 / windows.rate,
-        samples_per_clone=windows.stride,
-        clones_per_window=windows.window // windows.stride,
-        mahalanobis_fail_scale=options.mahalanobis_fail_scale,
-        measurement_scale=options.measurement_scale,
-        history="core",
-        window_rotation=options.window_rotation or windows.window_rotation,
-    )
-    noise = NoiseModel(
-        gyro_density=options.gyro_density,
-        accel_density=options.accel_density,
-        gyro_bias_walk=options.gyro_bias_walk,
-        accel_bias_walk=options.accel_bias_walk,
-        displacement=_lasting_errors(options),
-    )
-    initial_std = InitialStd(
-        tilt=math.radians(options.tilt_std_degrees),
-        yaw=math.radians(options.yaw_std_degrees),
-        velocity=options.velocity_std,
-        position=options.position_std,
-        gyro_bias=options.gyro_bias_std,
-        accel_bias=options.accel_bias_std,
-    )
-    return FilterSetup(config, noise, initial_std)
-
-
-def _lasting_errors(options: FilterOptions) -> LastingErrors | None:
-    """None where no error of the displacements lasts."""
-    sizes = (
-        options.window_error_share,
-        options.scale_error_std,
-        options.heading_error_std_degrees,
-    )
-    if not any(sizes):
-        return None
-    return LastingErrors(
-        window_share=options.window_error_share,
-        window_seconds=options.window_error_seconds,
-        scale_std=options.scale_error_std,
-        heading_std=math.radians(options.heading_error_std_degrees),
-        walk_seconds=options.walk_error_seconds,
-    )
