@@ -14,7 +14,7 @@ ROOMS = {
     "data": BASE,
     "models": BASE,
     "filtering": BASE,
-    "training": BASE | {"data", "models"},
+    "training": BASE | {"data", "models", "filtering"},
     "evaluation": BASE | {"data", "models", "filtering", "training"},
     "interop": BASE | {"models", "training"},
     "tables": BASE | {"data", "models", "filtering", "training", "evaluation"},
