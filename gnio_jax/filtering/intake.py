@@ -72,7 +72,7 @@ class Design(NamedTuple):
         return 1.5 * self.imu_rate if self.factor > 1 else 1 / self.dt
 
 
-class Run(NamedTuple):
+class SampleRun(NamedTuple):
     """Samples without a hole between them, as far as they are still needed."""
 
     first: int
@@ -96,7 +96,7 @@ class Intake(NamedTuple):
     """Their sum, s."""
     count: int
     """Grid samples made or passed over by the low-pass."""
-    run: Run | None
+    run: SampleRun | None
     """None before the first sample, in a hole, and where there is no low-pass."""
 
 
@@ -188,7 +188,9 @@ def low_pass_sample(
     return intake, events + ready
 
 
-def _drain(intake: Intake, run: Run, slack: float, design: Design) -> tuple[Intake, list[Event]]:
+def _drain(
+    intake: Intake, run: SampleRun, slack: float, design: Design
+) -> tuple[Intake, list[Event]]:
     """End a run at a hole: the grid samples up to its end, with the weights of what is there."""
     last, count, events = _last_point(run, slack, design), intake.count, []
     while count * design.factor <= last:
@@ -204,7 +206,7 @@ def _append(
     run = intake.run
     if run is None:
         first = math.ceil((elapsed - slack) * design.factor / design.dt)
-        run = Run(first, np.array([elapsed]), np.array([sample]))
+        run = SampleRun(first, np.array([elapsed]), np.array([sample]))
         return intake._replace(run=run, count=max(intake.count, -(-first // design.factor)))
     if elapsed - run.stamps[-1] < _CLOSEST / design.imu_rate:
         return intake
@@ -213,7 +215,7 @@ def _append(
 
 
 def _filter_ready(
-    intake: Intake, run: Run, slack: float, design: Design
+    intake: Intake, run: SampleRun, slack: float, design: Design
 ) -> tuple[Intake, list[Event]]:
     """The grid samples that the FIR reaches now; what it needs no more is dropped."""
     last, count, events = _last_point(run, slack, design), intake.count, []
@@ -227,16 +229,16 @@ def _filter_ready(
     return intake._replace(count=count, run=run), events
 
 
-def _last_point(run: Run, slack: float, design: Design) -> int:
+def _last_point(run: SampleRun, slack: float, design: Design) -> int:
     """The last point of the fine grid that the run has reached."""
     return math.floor((run.stamps[-1] + slack) * design.factor / design.dt)
 
 
-def _grid_event(intake: Intake, run: Run, count: int, last: int, design: Design) -> Event:
+def _grid_event(intake: Intake, run: SampleRun, count: int, last: int, design: Design) -> Event:
     return intake.origin + count * design.dt, _filtered(run, count, last, design)
 
 
-def _filtered(run: Run, count: int, last: int, design: Design) -> tuple[float, ...]:
+def _filtered(run: SampleRun, count: int, last: int, design: Design) -> tuple[float, ...]:
     """Grid sample `count` of a run that has come to point `last` of the fine grid."""
     half, centre = len(design.taps) // 2, count * design.factor
     low, high = max(centre - half, run.first), min(centre + half, last)
@@ -252,7 +254,7 @@ def _filtered(run: Run, count: int, last: int, design: Design) -> tuple[float, .
 
 
 def _interpolated(
-    run: Run, points: Float[np.ndarray, "p"], design: Design
+    run: SampleRun, points: Float[np.ndarray, "p"], design: Design
 ) -> Float[np.ndarray, "p 6"]:
     """The samples at some points of the run: a spline, and lines where they are far apart."""
     if len(run.stamps) < 4:

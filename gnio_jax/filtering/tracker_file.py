@@ -18,7 +18,7 @@ from gnio_jax.files import replacing
 from gnio_jax.filtering.clock import Clock
 from gnio_jax.filtering.config import FilterConfig
 from gnio_jax.filtering.inputs import checked_noise
-from gnio_jax.filtering.intake import Intake, Run, checked_design
+from gnio_jax.filtering.intake import Intake, SampleRun, checked_design
 from gnio_jax.filtering.noise import InitialStd, NoiseModel
 from gnio_jax.filtering.online import (
     GRID_COLUMNS,
@@ -160,7 +160,7 @@ def _intake(saved: dict[str, Any] | None, arrays: Arrays) -> Intake | None:
     if saved is None:
         return None
     first = saved["run"]
-    run = None if first is None else Run(first, arrays["stamps"], arrays["samples"])
+    run = None if first is None else SampleRun(first, arrays["stamps"], arrays["samples"])
     return Intake(**(saved | {"run": run}))
 
 

@@ -105,7 +105,7 @@ class IMoT(nn.Module):
                 content, where, tokens, positions, train
             )
             particles = particles + refine(content)
-        weights = Scores(name="scores")(content)
+        weights = AttentionScores(name="scores")(content)
         velocity = jnp.einsum("bp,bpk->bk", weights, particles)
         return Prediction(
             to_axes(velocity),
@@ -245,7 +245,7 @@ class ParticleAttention(nn.Module):
         return linear(features, "output")(attend(query, key, value).reshape(content.shape))
 
 
-class Scores(nn.Module):
+class AttentionScores(nn.Module):
     """Weights of the particles: for every feature two linear layers from all particles to all, the
     mean over features, softmax."""
 

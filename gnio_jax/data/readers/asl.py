@@ -38,7 +38,7 @@ _COLUMNS = {
 """Our names of the columns, and the authors' without unit, in small letters."""
 
 
-class Imu(NamedTuple):
+class ImuFile(NamedTuple):
     """Rows of an IMU's data.csv, in order."""
 
     start: int
@@ -51,7 +51,7 @@ class Imu(NamedTuple):
     """How many rows were sorted, and how many repeated ones dropped."""
 
 
-def read_imu(path: Path, rate: float) -> Imu:
+def read_imu(path: Path, rate: float) -> ImuFile:
     """The IMU's data.csv, complete, at about `rate` Hz and without gaps."""
     table, stamps = _table(path)
     start = int(stamps.min())
@@ -60,7 +60,7 @@ def read_imu(path: Path, rate: float) -> Imu:
     time, samples, repairs = in_order((stamps - start) * 1e-9, samples, path)
     check_rate(time, rate, path)
     check_gaps(time, path)
-    return Imu(start, time, samples, repairs)
+    return ImuFile(start, time, samples, repairs)
 
 
 def read_poses(path: Path, start: int) -> Poses:

@@ -35,7 +35,7 @@ from pathlib import Path
 import numpy as np
 
 from gnio_jax.data.dataset import Dataset, Recording, single
-from gnio_jax.data.readers.asl import Imu, SensorPose, read_imu, read_poses, sensor_pose
+from gnio_jax.data.readers.asl import ImuFile, SensorPose, read_imu, read_poses, sensor_pose
 from gnio_jax.data.readers.reference import Poses, fused, interpolated
 from gnio_jax.data.resampling import resample
 from gnio_jax.data.validation import validate
@@ -194,7 +194,7 @@ def _moved_to(imu: SensorPose, poses: Poses) -> Poses:
     )
 
 
-def _overlap(imu: Imu, poses: Poses, truth: Path) -> np.ndarray:
+def _overlap(imu: ImuFile, poses: Poses, truth: Path) -> np.ndarray:
     """Which rows of the IMU lie between the first pose and the last."""
     first, last = poses.time[[0, -1]]
     inside = (imu.time >= first - 1e-9) & (imu.time <= last + 1e-9)

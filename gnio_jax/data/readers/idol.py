@@ -91,7 +91,7 @@ def recordings(root: Path, split: str) -> list[Recording]:
     return [_recording(walk, note) for walk in chosen]
 
 
-class Walk(NamedTuple):
+class PhoneWalk(NamedTuple):
     """One recording, before it is read."""
 
     path: Path
@@ -105,7 +105,7 @@ class Walk(NamedTuple):
         return _name(self.path)
 
 
-def _recording(walk: Walk, note: dict[str, Any]) -> Recording:
+def _recording(walk: PhoneWalk, note: dict[str, Any]) -> Recording:
     person = {"subject": walk.subject, "group": walk.subject, "calibration": walk.calibration}
     return Recording(
         walk.name,
@@ -116,10 +116,10 @@ def _recording(walk: Walk, note: dict[str, Any]) -> Recording:
     )
 
 
-def find_walks(root: Path, folder: str) -> list[Walk]:
+def find_walks(root: Path, folder: str) -> list[PhoneWalk]:
     """The recordings in `folder` ("train", "known", "unknown") of every building; the buildings may
     lie a folder or two deeper."""
-    walks: list[Walk] = []
+    walks: list[PhoneWalk] = []
     nameless: list[Path] = []
     for building in _BUILDINGS:
         places = (sorted(root.glob(f"{depth}{building}/{folder}")) for depth in ("", "*/", "*/*/"))
@@ -135,7 +135,7 @@ def find_walks(root: Path, folder: str) -> list[Walk]:
             if subject is None:
                 nameless.append(path)
             person = _name(path) if subject is None else shortened(f"subject{subject}")
-            walks.append(Walk(path, person, shortened(entry.get("calibration", "unknown"))))
+            walks.append(PhoneWalk(path, person, shortened(entry.get("calibration", "unknown"))))
     if not walks:
         raise InputError(
             root,

@@ -12,7 +12,7 @@ from scipy.ndimage import binary_dilation, binary_erosion
 from scipy.spatial.transform import Rotation
 
 from gnio_jax.data.dataset import Refusal
-from gnio_jax.data.readers.oxiod.phone import SHORTEST, Imu
+from gnio_jax.data.readers.oxiod.phone import SHORTEST, PhoneSamples
 from gnio_jax.data.readers.oxiod.walks import RATE, SINGLE_USER, Walk
 from gnio_jax.data.validation import validate
 from gnio_jax.numerics import neighbours, outer_span, quaternions, slerp
@@ -50,7 +50,7 @@ class Samples(NamedTuple):
         )
 
 
-class Reference(NamedTuple):
+class WalkReference(NamedTuple):
     """Where the phone was, at its samples."""
 
     orientation: Rotation
@@ -63,7 +63,7 @@ class Reference(NamedTuple):
     """False where the tracker does not vouch for it."""
 
 
-def on_clock(imu: Imu) -> Samples:
+def on_clock(imu: PhoneSamples) -> Samples:
     """The samples on a uniform 100 Hz clock from the phone's first."""
     time = imu.time[0] + np.arange(int((imu.time[-1] - imu.time[0]) * RATE + 1e-6)) / RATE
     imu_rows = np.concatenate([imu.gyro, imu.accel], axis=1)
@@ -96,7 +96,7 @@ def sequence_of(
     walk: Walk,
     kind: str,
     samples: Samples,
-    reference: Reference,
+    reference: WalkReference,
     epoch: float,
     truth: Path,
     attributes: dict[str, str | float],

@@ -37,7 +37,7 @@ _NEXUS_EVENTS = ("time", "type", "x", "y", "z")
 _ACCEL_EVENT, _GYRO_EVENT = 1, 4
 
 
-class Imu(NamedTuple):
+class PhoneSamples(NamedTuple):
     """A phone's samples on its own clock."""
 
     time: Float[np.ndarray, " n"]
@@ -52,7 +52,7 @@ class Imu(NamedTuple):
     """Unix time of time 0, or 0 where the file's time is destroyed."""
 
 
-def read_imu(path: Path, kind: str) -> Imu:
+def read_imu(path: Path, kind: str) -> PhoneSamples:
     """A phone's file. Of kind "raw" its stamps are unix time; of kind "syn" they are not, and its
     rows are 1/100 s apart. Raises `Refusal`."""
     table = read_table(path, (16, 10, 5))
@@ -122,7 +122,7 @@ def is_fresh(values: Float[np.ndarray, "n w"]) -> Bool[np.ndarray, " n"]:
     return np.concatenate([[True], (np.diff(values, axis=0) != 0).any(axis=1)])
 
 
-def _iphone(table: np.ndarray, kind: str, path: Path) -> Imu:
+def _iphone(table: np.ndarray, kind: str, path: Path) -> PhoneSamples:
     check_complete(table, _IPHONE, path)
     stamps, values = np.arange(len(table)) / RATE, table[:, 1:13]
     if kind == "raw":  # the stamps are right, the order of some rows is not
@@ -139,7 +139,7 @@ def _iphone(table: np.ndarray, kind: str, path: Path) -> Imu:
             "check the column order",
         )
     epoch = float(stamps[0]) if kind == "raw" else 0.0
-    return Imu(
+    return PhoneSamples(
         time=restore_clock(stamps - epoch, path),
         gyro=rotation_rate,
         accel=-(gravity + user_acc) * STANDARD_G,
@@ -148,15 +148,15 @@ def _iphone(table: np.ndarray, kind: str, path: Path) -> Imu:
     )
 
 
-def _nexus_rows(table: np.ndarray, path: Path) -> Imu:
+def _nexus_rows(table: np.ndarray, path: Path) -> PhoneSamples:
     check_complete(table, _NEXUS, path)
     stamps, accel, gyro = np.arange(len(table)) / RATE, table[:, 1:4], table[:, 4:7]
     awake = gyro.any(axis=1)  # the gyro starts some rows after the accelerometer
     fresh = is_fresh(table[:, 1:7]) & awake
-    return Imu(restore_clock(stamps[fresh], path), gyro[fresh], accel[fresh], None, 0.0)
+    return PhoneSamples(restore_clock(stamps[fresh], path), gyro[fresh], accel[fresh], None, 0.0)
 
 
-def _nexus_events(table: np.ndarray, path: Path) -> Imu:
+def _nexus_events(table: np.ndarray, path: Path) -> PhoneSamples:
     """Rows of one sensor each."""
     check_complete(table, _NEXUS_EVENTS, path)
     kind = table[:, 1]
@@ -178,7 +178,7 @@ def _nexus_events(table: np.ndarray, path: Path) -> Imu:
     # The two sensors tick together; where one has lost rows the other's clock still holds.
     inside = (time >= accel_time[0]) & (time <= accel_time[-1])
     time, gyro = time[inside], gyro[inside]
-    return Imu(time, gyro, CubicSpline(accel_time, accel, axis=0)(time), None, epoch)
+    return PhoneSamples(time, gyro, CubicSpline(accel_time, accel, axis=0)(time), None, epoch)
 
 
 # --- clocks

@@ -15,8 +15,8 @@ from gnio_jax.data.alignment import (
     smooth_positions,
 )
 from gnio_jax.data.dataset import Refusal
-from gnio_jax.data.readers.oxiod.assembly import Reference, Samples, on_clock, sequence_of
-from gnio_jax.data.readers.oxiod.phone import Imu
+from gnio_jax.data.readers.oxiod.assembly import Samples, WalkReference, on_clock, sequence_of
+from gnio_jax.data.readers.oxiod.phone import PhoneSamples
 from gnio_jax.data.readers.oxiod.trackers import read_tango
 from gnio_jax.data.readers.oxiod.vicon import LONGEST_LAG
 from gnio_jax.data.readers.oxiod.walks import RATE, Walk
@@ -36,7 +36,7 @@ CUTOFF = 4.0
 """Hz, half response of the smoother of Tango's positions."""
 
 
-def build_with_tango(walk: Walk, kind: str, imu: Imu, path: Path) -> Sequence:
+def build_with_tango(walk: Walk, kind: str, imu: PhoneSamples, path: Path) -> Sequence:
     """One walk at 100 Hz: positions from the tablet, whose attitude is unusable; orientation from
     integrated gyro, led by the accelerations of both. Raises `Refusal`."""
     stamps, position, good = read_tango(path)
@@ -60,7 +60,7 @@ def build_with_tango(walk: Walk, kind: str, imu: Imu, path: Path) -> Sequence:
     )
     turned = about_z(np.interp(at, fit.knots, fit.yaw)) * device
     orientation = _orientation(samples, device, turned, position, kept)
-    reference = Reference(orientation, position, velocity, kept)
+    reference = WalkReference(orientation, position, velocity, kept)
     return sequence_of(walk, kind, samples, reference, imu.epoch, path, _fit_attributes(fit))
 
 

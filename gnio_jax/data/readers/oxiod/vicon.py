@@ -16,13 +16,13 @@ from gnio_jax.data.alignment import (
 )
 from gnio_jax.data.dataset import Refusal
 from gnio_jax.data.readers.oxiod.assembly import (
-    Reference,
     Samples,
+    WalkReference,
     on_clock,
     samples_at,
     sequence_of,
 )
-from gnio_jax.data.readers.oxiod.phone import SHORTEST, Imu
+from gnio_jax.data.readers.oxiod.phone import SHORTEST, PhoneSamples
 from gnio_jax.data.readers.oxiod.trackers import read_vicon
 from gnio_jax.data.readers.oxiod.walks import RATE, Walk
 from gnio_jax.numerics import integrate_gyro, interpolate, neighbours, outer_span, slerp, within
@@ -60,7 +60,7 @@ LAG_KNOTS = {"raw": 30.0, "syn": 5.0}
 filled in, and the lag steps by 10 to 20 ms."""
 
 
-def build_with_vicon(walk: Walk, kind: str, imu: Imu, path: Path) -> Sequence:
+def build_with_vicon(walk: Walk, kind: str, imu: PhoneSamples, path: Path) -> Sequence:
     """One walk at 100 Hz. Raises `Refusal` when the track or the fit is of no use."""
     samples = on_clock(imu)
     track = read_vicon(path, kind, imu.epoch)
@@ -82,14 +82,14 @@ def build_with_vicon(walk: Walk, kind: str, imu: Imu, path: Path) -> Sequence:
     return sequence_of(walk, kind, samples, reference, imu.epoch, path, _fit_attributes(fit))
 
 
-def _without_delay(samples: Samples, imu: Imu, delay: float) -> Samples:
+def _without_delay(samples: Samples, imu: PhoneSamples, delay: float) -> Samples:
     """The accelerometer tells of an event later than the gyro: read it later, from the phone's
     rows."""
     accel, measured = samples_at(imu.time, imu.accel, samples.time + delay)
     return samples._replace(accel=accel, measured=samples.measured & measured)
 
 
-def _reference(samples: Samples, track: Track, fit: Alignment, at: np.ndarray) -> Reference:
+def _reference(samples: Samples, track: Track, fit: Alignment, at: np.ndarray) -> WalkReference:
     """The phone's poses from the track's at its times `at`.
 
     Orientation: integrated gyro, corrected towards Vicon. Position: Vicon's plus the lever arm,
@@ -105,7 +105,7 @@ def _reference(samples: Samples, track: Track, fit: Alignment, at: np.ndarray) -
     marker = level.apply(interpolate(at, track.time, track.position))
     lever = orientation.apply(fit.extrinsic.inv().apply(fit.lever))
     position, velocity, kept = smooth_positions(marker + lever, believed, 1.0 / RATE)
-    return Reference(orientation, position, velocity, kept)
+    return WalkReference(orientation, position, velocity, kept)
 
 
 def _check_fit(fit: Alignment, kind: str, path: Path) -> None:
