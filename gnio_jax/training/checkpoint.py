@@ -127,7 +127,7 @@ class Checkpoints:
         )
         restored = manager.restore(step, args=items)
         state = TrainState.of(jnp.int32(step), restored["variables"], restored["optimizer"])
-        return _uncommitted(state), _position(meta["position"])
+        return uncommitted(state), _position(meta["position"])
 
 
 def load_run(workdir: Path, which: Which = "best") -> Run:
@@ -173,7 +173,7 @@ def load_run(workdir: Path, which: Which = "best") -> Run:
                 f"cannot be read ({str(error)[:120]})",
                 "the checkpoint is damaged",
             ) from None
-    variables = _uncommitted(variables)
+    variables = uncommitted(variables)
     numbers = variables.pop("filter", {})
     options = learning.learnt_options(config.filter, numbers)
     config = dataclasses.replace(config, filter=options)
@@ -187,8 +187,9 @@ def _manager(folder: Path, create: bool) -> ocp.CheckpointManager:
     return ocp.CheckpointManager(folder.absolute(), options=options)
 
 
-def _uncommitted(tree: Any) -> Any:
-    """Plain copies of arrays that Orbax has committed to a device: one compiled step for both."""
+def uncommitted(tree: Any) -> Any:
+    """Plain copies of arrays that are committed to a device, or to several: one compiled step for
+    both."""
     return jax.tree.map(lambda x: jnp.array(jax.device_get(x)), tree)
 
 

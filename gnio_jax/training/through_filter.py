@@ -17,7 +17,7 @@ from gnio_jax.config import TrainConfig
 from gnio_jax.reporting import Reporter
 from gnio_jax.training import learnt as learning
 from gnio_jax.training import optimizer as optimizers
-from gnio_jax.training.checkpoint import Run, create_model
+from gnio_jax.training.checkpoint import Run, create_model, uncommitted
 from gnio_jax.training.filter_losses import HORIZON_SECONDS
 from gnio_jax.training.filter_step import Sums, intervals, optimizer, train_steps, validate
 from gnio_jax.training.initial import with_weights
@@ -86,7 +86,7 @@ class FilterTraining(NamedTuple):
         count: int,
         learning_rate_factor: float,
     ) -> tuple[TrainState, Progress]:
-        return train_steps(
+        state, progress = train_steps(
             state,
             self.source,
             order,
@@ -97,6 +97,9 @@ class FilterTraining(NamedTuple):
             model=self.model,
             config=_without_folders(self.config),
         )
+        # Where the pieces were shared out, the state now lies on all devices, and the next step
+        # would be compiled once more for that.
+        return uncommitted(state) if len(jax.devices()) > 1 else state, progress
 
     def settled(self, state: TrainState) -> TrainState:
         """As it is: the batch statistics are frozen."""
