@@ -152,17 +152,26 @@ def right_jacobian(phi: Vector) -> Matrix:
     return _polynomial(phi, squared, -versine, excess)
 
 
+def direction(
+    x: Float[jax.Array, "*k"], y: Float[jax.Array, "*k"]
+) -> tuple[Float[jax.Array, "*k"], Float[jax.Array, "*k"]]:
+    """(cos, sin) of the azimuth of horizontal vectors.
+
+    A vector of length 0 has none: (1, 0) is returned, with zero derivative.
+    """
+    squared = x * x + y * y
+    undefined = squared < 1e-14
+    norm = jnp.sqrt(jnp.where(undefined, 1.0, squared))
+    return jnp.where(undefined, 1.0, x / norm), jnp.where(undefined, 0.0, y / norm)
+
+
 def yaw_direction(rotation: Matrix) -> tuple[Scalar, Scalar]:
     """(cos, sin) of the yaw of `rotation`, yaw = atan2(R[1,0], R[0,0]).
 
     At gimbal lock (both entries zero) the yaw is undefined: (1, 0) is returned, with zero
     derivative.
     """
-    x, y = rotation[0, 0], rotation[1, 0]
-    squared = x * x + y * y
-    locked = squared < 1e-14
-    norm = jnp.sqrt(jnp.where(locked, 1.0, squared))
-    return jnp.where(locked, 1.0, x / norm), jnp.where(locked, 0.0, y / norm)
+    return direction(rotation[0, 0], rotation[1, 0])
 
 
 def yaw(rotation: Matrix) -> Scalar:

@@ -16,9 +16,11 @@ ROOMS = {
     "filtering": BASE,
     "training": BASE | {"data", "models", "filtering"},
     "evaluation": BASE | {"data", "models", "filtering", "training"},
+    "calibration": BASE | {"data", "filtering", "training", "evaluation"},
     "interop": BASE | {"models", "training"},
     "tables": BASE | {"data", "models", "filtering", "training", "evaluation"},
-    "commands": BASE | {"data", "filtering", "training", "evaluation", "interop", "tables"},
+    "commands": BASE
+    | {"data", "filtering", "training", "evaluation", "calibration", "interop", "tables"},
     **{name: BASE for name in BASE},
 }
 """Rooms and top-level modules, and what each may import of the package besides itself."""

@@ -150,6 +150,14 @@ def test_yaw_is_the_last_extrinsic_euler_angle(angles):
     np.testing.assert_allclose(slope, 1.0, atol=1e-12)
 
 
+def test_direction_of_many_vectors_and_of_none():
+    x, y = jnp.asarray([3.0, 0.0, -1e-3]), jnp.asarray([-4.0, 0.0, 0.0])
+    np.testing.assert_allclose(geometry.direction(x, y), [[0.6, 1, -1], [-0.8, 0, 0]], atol=1e-15)
+    slope = jax.vmap(jax.jacrev(geometry.direction, (0, 1)))(x, y)
+    np.testing.assert_allclose(slope[0][0], [16 / 125, 0, 0], atol=1e-15)
+    np.testing.assert_allclose(slope[1][1], [9 / 125, 0, 1e3], atol=1e-9)
+
+
 def test_yaw_at_gimbal_lock_is_zero_with_zero_derivative():
     locked = jnp.asarray([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
     np.testing.assert_array_equal(geometry.yaw_rotation(locked), np.eye(3))

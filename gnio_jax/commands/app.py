@@ -4,12 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from gnio_jax.commands import console, data, evaluate, interop, options, tables, train
+from gnio_jax.commands import (
+    calibrate,
+    console,
+    data,
+    evaluate,
+    interop,
+    options,
+    tables,
+    train,
+)
 
 GNIO = options.Group(
     {
         "train": train.COMMAND,
         "evaluate": evaluate.COMMAND,
+        "calibrate": calibrate.COMMAND,
         "data": data.COMMANDS,
         "tables": tables.COMMAND,
         "interop": interop.COMMAND,

@@ -8,6 +8,7 @@ paper's.
 from gnio_jax.config.runs import default_workdir, newest_run
 from gnio_jax.config.schema import (
     AugmentConfig,
+    CalibrateConfig,
     DataConfig,
     EvaluateConfig,
     FilterOptions,
@@ -23,6 +24,7 @@ from gnio_jax.config.yaml_files import find, load, names, save
 
 __all__ = [
     "AugmentConfig",
+    "CalibrateConfig",
     "DataConfig",
     "EvaluateConfig",
     "FilterOptions",

@@ -39,6 +39,9 @@ Table = Literal[
 ]
 
 
+CalibratedGroup = Literal["measurement", "noise", "start", "window", "walk"]
+
+
 @dataclass(frozen=True)
 class DataConfig:
     """Which recordings are read, and how windows are cut from them."""
@@ -141,6 +144,10 @@ class ModelConfig:
     deepils, ctin, imot)."""
     dropout: Probability | None = None
     """Fraction of activations dropped in training (tlio, ronin_resnet, deepils: 0.5; imot: 0.1)."""
+    equivariance: Literal["none", "four_headings", "canonical_frame"] = "none"
+    """A window turned about the vertical gives the displacement turned alike, for every network:
+    the mean over four headings of the window, at inference, or a frame that a small network finds
+    in the window (EqNIO)."""
 
 
 @dataclass(frozen=True)
@@ -203,6 +210,17 @@ class OptimConfig:
     """Augmented training windows from which the statistics of batch normalisation are estimated
     before every validation and checkpoint (ours); 0 keeps the running averages of the last
     steps."""
+    ema_decay: Probability = 0.0
+    """Share of the averaged parameters that a step keeps, e.g. 0.999 (ours): the averages are
+    validated, kept as best and evaluated, while training goes on without them. 0 averages
+    nothing."""
+
+    def check(self, prefix: str, source: str) -> None:
+        """Running statistics of batch normalisation are not those of averaged parameters."""
+        if self.ema_decay and not self.statistics_windows:
+            problem = f"field '{prefix}ema_decay' is set without {prefix}statistics_windows"
+            remedy = "averaged parameters want statistics of their own: set it, e.g. to 16384"
+            raise InputError(source, problem, remedy)
 
 
 @dataclass(frozen=True)
@@ -231,6 +249,13 @@ class FilterOptions:
     """Initial standard deviation of the accelerometer bias, m/s²."""
     measurement_scale: Positive = 10.0
     """Factor of the network's covariance in the update."""
+    std_factor_x: Positive = 1.0
+    """Factor of the network's standard deviation along x of the window's yaw frame (ours; what
+    `gnio calibrate` finds that it lacks)."""
+    std_factor_y: Positive = 1.0
+    """The same along y."""
+    std_factor_z: Positive = 1.0
+    """The same along z."""
     window_error_share: Probability = 0.0
     """Share of a window's standard deviation that lasts beyond the window (ours); 0: its error is
     white."""
@@ -278,11 +303,22 @@ class TrainConfig:
     """Longest time between checkpoints within an epoch, s; every epoch ends with one anyway."""
 
     def check(self, prefix: str, source: str) -> None:
-        """A network that learns through the filter has weights, and its pieces are whole strides
-        and longer than a window."""
+        """Four headings are averaged only if training shows windows of every heading. A network
+        that learns through the filter has weights, and its pieces are whole strides and longer
+        than a window."""
+        if self.model.equivariance == "four_headings" and not self.augment.yaw:
+            problem = f"field '{prefix}model.equivariance' is four_headings without augment.yaw"
+            remedy = "training must show every heading: set augment.yaw to true"
+            raise InputError(source, problem, remedy)
+        self._check_through_filter(prefix, source)
+
+    def _check_through_filter(self, prefix: str, source: str) -> None:
         through = self.through_filter
         if not through.learn:
             return
+        if self.optim.ema_decay:
+            problem = f"field '{prefix}optim.ema_decay' is for training on windows alone"
+            raise InputError(source, problem, "set it to 0")
         if self.init_from is None:
             problem = "needs the weights of a network that has been trained on windows"
             raise InputError(source, f"field '{prefix}through_filter.learn' {problem}", _INIT_FROM)
@@ -340,6 +376,30 @@ class EvaluateConfig:
     """Draw the trajectories, errors, displacements and the errors' distribution."""
     filter: FilterOptions = field(default_factory=FilterOptions)
     """Noise and start of the filter; by default the run's own."""
+
+
+@dataclass(frozen=True)
+class CalibrateConfig:
+    """What `gnio calibrate` is asked for."""
+
+    workdir: str | None = None
+    """Folder of the run; by default the newest below runs/."""
+    out: str | None = None
+    """Folder of the calibrated run; by default the run's with _calibrated behind its name."""
+    data_root: str | None = None
+    """Folder of the run's dataset; by default the run's, $GNIO_DATA/<dataset>, or data/<dataset>.
+    """
+    split: str | None = None
+    """Split whose recordings are fitted: the run's validation split (default) or its training
+    split. Others are refused: what is tested must not have been fitted."""
+    fit: tuple[CalibratedGroup, ...] = ("measurement", "noise", "window")
+    """What is fitted by the likelihood of the innovations: the measurement's factor, the IMU's
+    noise, the standard deviations of the initial biases, the part of a window's error that lasts,
+    the errors of speed and heading that last."""
+    checkpoint: Literal["best", "latest"] = "best"
+    """Which checkpoint of the run."""
+    steps: Count = 60
+    """Most steps of the search (L-BFGS)."""
 
 
 @dataclass(frozen=True)

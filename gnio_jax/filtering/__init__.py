@@ -11,7 +11,7 @@ from gnio_jax.filtering.lasting_errors import LastingErrors
 from gnio_jax.filtering.noise import InitialStd, NoiseModel
 from gnio_jax.filtering.online import TrackerState
 from gnio_jax.filtering.pose import Pose
-from gnio_jax.filtering.scan import run_filter, run_odometry
+from gnio_jax.filtering.scan import repeat_odometry, run_filter, run_odometry
 from gnio_jax.filtering.smoother import SmoothedHistory, smooth, smooth_odometry
 from gnio_jax.filtering.start import initial_state, level_state
 from gnio_jax.filtering.state import FilterState, GateState
@@ -33,6 +33,7 @@ __all__ = [
     "initial_state",
     "level_state",
     "over_sequences",
+    "repeat_odometry",
     "run_filter",
     "run_odometry",
     "smooth",

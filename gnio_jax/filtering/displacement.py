@@ -13,6 +13,7 @@ from gnio_jax import geometry
 from gnio_jax.filtering.config import FilterConfig, YawFrame
 from gnio_jax.filtering.gate import innovation_gate
 from gnio_jax.filtering.lasting_errors import LastingErrors, distort
+from gnio_jax.filtering.noise import NoiseModel
 from gnio_jax.filtering.state import CLONE, LASTING, MOVE, OFFSET, FilterState
 from gnio_jax.filtering.update import (
     Cholesky,
@@ -75,14 +76,21 @@ class DisplacementUpdate(NamedTuple):
 
 
 def scaled_measurement(
-    displacement: Float[Array, "3"], covariance: Float[Array, "3 3"], config: FilterConfig
+    displacement: Float[Array, "3"],
+    covariance: Float[Array, "3 3"],
+    config: FilterConfig,
+    noise: NoiseModel,
 ) -> Measurement:
-    """Scale; keep NaN out of the arithmetic, or its derivatives would be NaN too."""
+    """Scale by `measurement_scale` and `std_factor`; keep NaN out of the arithmetic, or its
+    derivatives would be NaN too."""
     present = jnp.all(jnp.isfinite(displacement)) & jnp.all(jnp.isfinite(covariance))
     eye = jnp.eye(3, dtype=covariance.dtype)
+    factor = jnp.stack(jax.tree.map(jnp.asarray, noise.std_factor)).astype(covariance.dtype)
+    scale = config.measurement_scale * (factor[:, None] * factor[None])
+    known = jnp.where(present, covariance, eye)
     return Measurement(
         displacement=jnp.where(present, displacement, 0.0),
-        covariance=jnp.where(present, config.measurement_scale * covariance, eye),
+        covariance=jnp.where(present, scale * known, eye),
         present=present,
     )
 

@@ -157,3 +157,16 @@ def checked_measurements(
     covariance = checked_array("covariance", covariance, (intervals, 3, 3), config)
     check_positive_definite("covariance", covariance.astype(dtype))
     return displacement.astype(dtype), covariance.astype(dtype)
+
+
+def checked_displacements(
+    displacement: Any, std: Any, signals: Signals, config: FilterConfig
+) -> tuple[jax.Array, jax.Array]:
+    """The displacements of a run and their standard deviations, for every clone interval of
+    `signals`, in its precision."""
+    shape = (signals.gyro.shape[0] // config.samples_per_clone, 3)
+    displacement, std = (
+        checked_array(name, value, shape, config).astype(signals.gyro.dtype)
+        for name, value in [("displacement", displacement), ("measurement_std", std)]
+    )
+    return displacement, std

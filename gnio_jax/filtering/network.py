@@ -11,6 +11,7 @@ from jaxtyping import Float
 
 from gnio_jax.filtering.config import FilterConfig
 from gnio_jax.filtering.displacement import Measurement, scaled_measurement
+from gnio_jax.filtering.noise import NoiseModel
 from gnio_jax.filtering.state import FilterState
 from gnio_jax.types import Array, Prediction
 from gnio_jax.windows import cut_window
@@ -67,12 +68,14 @@ def no_prediction(shapes: Prediction) -> Prediction:
     )
 
 
-def predicted_measurement(prediction: Prediction, config: FilterConfig, dtype: Any) -> Measurement:
+def predicted_measurement(
+    prediction: Prediction, config: FilterConfig, noise: NoiseModel, dtype: Any
+) -> Measurement:
     """The measurement that the filter makes of a prediction: covariance diag(exp 2u), u raised to
     `log_std_min`, before scaling."""
     log_std = jnp.maximum(prediction.log_std.astype(dtype), config.log_std_min)
     covariance = jnp.diag(jnp.exp(2 * log_std))
-    return scaled_measurement(prediction.displacement.astype(dtype), covariance, config)
+    return scaled_measurement(prediction.displacement.astype(dtype), covariance, config, noise)
 
 
 def _as_floating(value: Any) -> Any:

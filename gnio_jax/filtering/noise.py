@@ -27,6 +27,9 @@ class NoiseModel(NamedTuple):
     """rad/s/√s"""
     accel_bias_walk: Float[Array, ""] | float = 1e-4
     """m/s²/√s"""
+    std_factor: tuple[Any, Any, Any] = (1.0, 1.0, 1.0)
+    """Factors of the displacements' standard deviations along x, y, z of their yaw frame (ours):
+    what calibration finds that they lack."""
     displacement: LastingErrors | None = None
     """Errors of the displacements that last, as entries of the filter's state; None: all of them
     are white."""

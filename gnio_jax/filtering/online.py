@@ -156,7 +156,7 @@ def advance(
 
     def measure(state: FilterState, oldest: Array | int) -> tuple[Measurement, dict]:
         prediction = jax.lax.cond(complete, infer, nothing, state, jnp.asarray(oldest))
-        return predicted_measurement(prediction, config, rows.dtype), {}
+        return predicted_measurement(prediction, config, noise, rows.dtype), {}
 
     slot, frame = core.intervals % config.clones, config.displacement_frame
     state, record = clone_step(core.filter, stream, measure, slot, config, noise, frame)

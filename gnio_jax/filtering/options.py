@@ -11,7 +11,8 @@ from gnio_jax.filtering.config import FilterConfig
 from gnio_jax.filtering.lasting_errors import LastingErrors
 from gnio_jax.filtering.noise import InitialStd, NoiseModel
 
-_RADIANS = math.pi / 180
+DEGREE = math.pi / 180
+"""rad."""
 
 
 class FilterSetup(NamedTuple):
@@ -33,43 +34,45 @@ def filter_setup(windows: DataConfig, options: FilterOptions) -> FilterSetup:
         history="core",
         window_rotation=options.window_rotation or windows.window_rotation,
     )
-    values = vars(options)
-    return FilterSetup(config, noise_model(values, errors_last(options)), initial_std(values))
+    return FilterSetup(config, noise_model(vars(options)), initial_std(vars(options)))
 
 
-def errors_last(options: FilterOptions) -> bool:
-    """Whether any error of the displacements lasts beyond its window."""
-    return any(
-        (options.window_error_share, options.scale_error_std, options.heading_error_std_degrees)
+def noise_model(options: Mapping[str, Any]) -> NoiseModel:
+    """The filter's noises, from the fields of its options; their values may be traced."""
+    return NoiseModel(
+        gyro_density=options["gyro_density"],
+        accel_density=options["accel_density"],
+        gyro_bias_walk=options["gyro_bias_walk"],
+        accel_bias_walk=options["accel_bias_walk"],
+        std_factor=tuple(options[f"std_factor_{axis}"] for axis in "xyz"),
+        displacement=_lasting_errors(options),
     )
 
 
-def noise_model(values: Mapping[str, Any], lasting: bool) -> NoiseModel:
-    """The noise of `FilterOptions`' fields by name, numbers or arrays; differentiable. `lasting`:
-    the displacements have errors that last."""
-    names = ("gyro_density", "accel_density", "gyro_bias_walk", "accel_bias_walk")
-    errors = _lasting_errors(values) if lasting else None
-    return NoiseModel(**{name: values[name] for name in names}, displacement=errors)
-
-
-def _lasting_errors(values: Mapping[str, Any]) -> LastingErrors:
-    return LastingErrors(
-        window_share=values["window_error_share"],
-        window_seconds=values["window_error_seconds"],
-        scale_std=values["scale_error_std"],
-        heading_std=values["heading_error_std_degrees"] * _RADIANS,
-        walk_seconds=values["walk_error_seconds"],
-    )
-
-
-def initial_std(values: Mapping[str, Any]) -> InitialStd:
-    """The uncertainty of the start from `FilterOptions`' fields by name, numbers or arrays;
-    differentiable."""
+def initial_std(options: Mapping[str, Any]) -> InitialStd:
+    """The standard deviations of the filter's start, as `noise_model` takes the options."""
     return InitialStd(
-        tilt=values["tilt_std_degrees"] * _RADIANS,
-        yaw=values["yaw_std_degrees"] * _RADIANS,
-        velocity=values["velocity_std"],
-        position=values["position_std"],
-        gyro_bias=values["gyro_bias_std"],
-        accel_bias=values["accel_bias_std"],
+        tilt=options["tilt_std_degrees"] * DEGREE,
+        yaw=options["yaw_std_degrees"] * DEGREE,
+        velocity=options["velocity_std"],
+        position=options["position_std"],
+        gyro_bias=options["gyro_bias_std"],
+        accel_bias=options["accel_bias_std"],
+    )
+
+
+def _lasting_errors(options: Mapping[str, Any]) -> LastingErrors | None:
+    """None where no error of the displacements lasts."""
+    sizes = [
+        options[name]
+        for name in ("window_error_share", "scale_error_std", "heading_error_std_degrees")
+    ]
+    if all(isinstance(size, int | float) and size == 0 for size in sizes):
+        return None
+    return LastingErrors(
+        window_share=options["window_error_share"],
+        window_seconds=options["window_error_seconds"],
+        scale_std=options["scale_error_std"],
+        heading_std=options["heading_error_std_degrees"] * DEGREE,
+        walk_seconds=options["walk_error_seconds"],
     )

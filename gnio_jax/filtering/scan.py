@@ -16,7 +16,12 @@ from gnio_jax.filtering.config import FilterConfig, YawFrame
 from gnio_jax.filtering.displacement import Measurement, scaled_measurement
 from gnio_jax.filtering.gaps import Imu, bridge
 from gnio_jax.filtering.history import FilterHistory, StepRecord, stacked_history
-from gnio_jax.filtering.inputs import Signals, checked_inputs, checked_measurements
+from gnio_jax.filtering.inputs import (
+    Signals,
+    checked_displacements,
+    checked_inputs,
+    checked_measurements,
+)
 from gnio_jax.filtering.network import (
     Predict,
     no_prediction,
@@ -55,10 +60,36 @@ def run_filter(
     """
     state, signals, noise = checked_inputs(state, gyro, accel, imu_valid, config, noise)
     displacement, covariance = checked_measurements(displacement, covariance, signals, config)
-    return _run_filter(state, signals, displacement, covariance, config, noise)
+    return _run_filter(state, signals, displacement, covariance, config, noise, "given")
 
 
-@functools.partial(jax.jit, static_argnames="config")
+def repeat_odometry(
+    state: FilterState,
+    gyro: Any,
+    accel: Any,
+    displacement: Any,
+    std: Any,
+    config: FilterConfig,
+    noise: NoiseModel,
+    imu_valid: Any = None,
+) -> tuple[FilterState, FilterHistory]:
+    """Filter a run of `run_odometry` again, with the displacements that the network said then.
+
+    displacement (K, 3) and std (K, 3), m, are `displacement` and `measurement_std` of that run's
+    history, told in the filter's own yaw frame; std is the network's own, before any scaling: that
+    run had `measurement_scale` 1 and no `std_factor`. With another noise or start this is the run
+    that would have been, but for the small changes of the windows that another attitude or bias
+    would have made. Differentiable without a network, so that calibration is cheap. All else as in
+    `run_filter`.
+    """
+    state, signals, noise = checked_inputs(state, gyro, accel, imu_valid, config, noise)
+    displacement, std = checked_displacements(displacement, std, signals, config)
+    covariance = jax.vmap(jnp.diag)(std**2)
+    frame = config.displacement_frame
+    return _run_filter(state, signals, displacement, covariance, config, noise, frame)
+
+
+@functools.partial(jax.jit, static_argnames=("config", "frame"))
 def _run_filter(
     state: FilterState,
     signals: Signals,
@@ -66,14 +97,15 @@ def _run_filter(
     covariance: Array,
     config: FilterConfig,
     noise: NoiseModel,
+    frame: YawFrame,
 ) -> tuple[FilterState, FilterHistory]:
-    scale = functools.partial(scaled_measurement, config=config)
+    scale = functools.partial(scaled_measurement, config=config, noise=noise)
     measurements = jax.vmap(scale)(displacement, covariance)
 
     def measure(step: _Step, state: FilterState, oldest: Array) -> tuple[Measurement, dict]:
         return step.measurement, {}
 
-    return _scan(measure, state, signals, measurements, config, noise, "given")
+    return _scan(measure, state, signals, measurements, config, noise, frame)
 
 
 def run_odometry(
@@ -112,7 +144,7 @@ def run_odometry(
         # stays a branch under vmap.
         has_window = step.number >= config.clones_per_window
         prediction = jax.lax.cond(has_window, infer, nothing, step, state, oldest)
-        measurement = predicted_measurement(prediction, config, signals.gyro.dtype)
+        measurement = predicted_measurement(prediction, config, noise, signals.gyro.dtype)
         return measurement, prediction.diagnostics
 
     return _scan(measure, state, signals, None, config, noise, config.displacement_frame)

@@ -34,12 +34,16 @@ from gnio_jax.filtering.adjoint import (
     without_anchor,
 )
 from gnio_jax.filtering.checkpointing import join_blocks, split_blocks
-from gnio_jax.filtering.checks import checked_array
 from gnio_jax.filtering.config import FilterConfig, YawFrame
 from gnio_jax.filtering.displacement import Measurement, scaled_measurement
 from gnio_jax.filtering.gaps import Imu, bridge
 from gnio_jax.filtering.history import FilterHistory
-from gnio_jax.filtering.inputs import Signals, checked_inputs, checked_measurements
+from gnio_jax.filtering.inputs import (
+    Signals,
+    checked_displacements,
+    checked_inputs,
+    checked_measurements,
+)
 from gnio_jax.filtering.noise import NoiseModel
 from gnio_jax.filtering.scan import interval_inputs
 from gnio_jax.filtering.state import (
@@ -124,14 +128,10 @@ def smooth_odometry(
     `ValueError` as `run_odometry` does, or if the history is not as long as the signals.
     """
     state, signals, noise = checked_inputs(state, gyro, accel, imu_valid, config, noise)
-    shape = (signals.gyro.shape[0] // config.samples_per_clone, 3)
-    displacement, std = (
-        checked_array(f"history.{name}", value, shape, config).astype(signals.gyro.dtype)
-        for name, value in [
-            ("displacement", history.displacement),
-            ("measurement_std", history.measurement_std),
-        ]
-    )
+    given = history.displacement, history.measurement_std
+    displacement, std = checked_displacements(*given, signals, config)
+    # The history's are scaled already.
+    noise = noise._replace(std_factor=(1.0, 1.0, 1.0))
     covariance = jax.vmap(jnp.diag)(std**2 / config.measurement_scale)
     frame = config.displacement_frame
     return _smooth(state, signals, displacement, covariance, config, noise, frame)
@@ -177,7 +177,7 @@ def _smooth(
     noise: NoiseModel,
     frame: YawFrame,
 ) -> SmoothedHistory:
-    scale = functools.partial(scaled_measurement, config=config)
+    scale = functools.partial(scaled_measurement, config=config, noise=noise)
     measurements = jax.vmap(scale)(displacement, covariance)
     stream, _, _ = bridge(*signals, state.imu, config)
     numbers, by_interval = interval_inputs(stream, config)

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from flax import linen as nn
 from jaxtyping import Float
 
-from gnio_jax.models.heads import to_axes
+from gnio_jax.models.heads import root_mean_square, to_axes
 from gnio_jax.models.layers import attention, check_dropout, check_output_dim, layer_norm, linear
 from gnio_jax.models.resnet import batch_norm, conv, he_normal_fan_out
 from gnio_jax.types import Prediction
@@ -96,7 +96,7 @@ class CTIN(nn.Module):
         task_log_std = self.param("task_log_std", nn.initializers.zeros, (2,), jnp.float32)
         return Prediction(
             velocity.mean(axis=1),
-            _root_mean_square(log_std),
+            root_mean_square(log_std),
             {
                 "velocity": velocity,
                 "velocity_log_std": log_std,
@@ -236,11 +236,6 @@ class SampleHead(nn.Module):
         return linear(self.outputs, "output", kernel_init=self.output_init)(
             layer_norm("norm")(linear(x.shape[-1] // 2, "hidden")(x))
         )
-
-
-def _root_mean_square(log_std: Float[jax.Array, "b n 3"]) -> Float[jax.Array, "b 3"]:
-    """log √(mean over time of exp 2u), without overflow."""
-    return 0.5 * (jax.nn.logsumexp(2 * log_std, axis=1) - jnp.log(jnp.float32(log_std.shape[1])))
 
 
 def _neighbours(x: Float[jax.Array, "b n c"], span: int) -> Float[jax.Array, "b n s c"]:

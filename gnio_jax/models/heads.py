@@ -101,3 +101,8 @@ def to_axes(output: Float[jax.Array, "b k"]) -> Float[jax.Array, "b 3"]:
     """The displacement of a head with two or three outputs: one that is horizontal only says 0 of
     the vertical."""
     return jnp.pad(output, ((0, 0), (0, 3 - output.shape[-1])))
+
+
+def root_mean_square(log_std: Float[jax.Array, "b n 3"]) -> Float[jax.Array, "b 3"]:
+    """log √(mean over n of exp 2u), without overflow."""
+    return 0.5 * (jax.nn.logsumexp(2 * log_std, axis=1) - jnp.log(jnp.float32(log_std.shape[1])))

@@ -14,6 +14,7 @@ from jaxtyping import PRNGKeyArray
 from gnio_jax.errors import InputError
 from gnio_jax.models.ctin import CTIN
 from gnio_jax.models.deepils import DeepILS
+from gnio_jax.models.equivariance import CanonicalFrame, FourHeadings
 from gnio_jax.models.gnio import GNIO
 from gnio_jax.models.imot import IMoT, IMoTText
 from gnio_jax.models.ronin import RoNINResNet
@@ -29,18 +30,24 @@ _MODELS: dict[str, type[nn.Module]] = {
     "tlio": TLIO,
 }
 
+_EQUIVARIANT: dict[str, type[nn.Module]] = {
+    "four_headings": FourHeadings,
+    "canonical_frame": CanonicalFrame,
+}
+
 
 def names() -> list[str]:
     """The networks `create` knows."""
     return sorted(_MODELS)
 
 
-def create(name: str, **options: object) -> nn.Module:
+def create(name: str, equivariance: str = "none", **options: object) -> nn.Module:
     """The network `name` with its options set; its `apply(variables, windows)` returns a
     `Prediction`.
 
-    Raises `InputError` for an unknown name or option, naming the known ones, or options that do not
-    fit together.
+    `equivariance` is "none", "four_headings" or "canonical_frame" (`models.equivariance`). Raises
+    `InputError` for an unknown name or option, naming the known ones, or options that do not fit
+    together.
     """
     if name not in _MODELS:
         raise InputError(f"model '{name}'", "unknown", f"known models: {', '.join(names())}")
@@ -48,7 +55,7 @@ def create(name: str, **options: object) -> nn.Module:
         field.name
         for field in dataclasses.fields(_MODELS[name])
         if field.name not in ("parent", "name")
-    ]
+    ] + ["equivariance"]
     for option in options:
         if option not in known:
             close = difflib.get_close_matches(option, known, n=1)
@@ -58,10 +65,15 @@ def create(name: str, **options: object) -> nn.Module:
                 (f"did you mean '{close[0]}'? " if close else "")
                 + f"known options: {', '.join(known)}",
             )
+    if equivariance != "none" and equivariance not in _EQUIVARIANT:
+        known = ", ".join(["none", *_EQUIVARIANT])
+        problem = f"unknown equivariance '{equivariance}'"
+        raise InputError(f"model '{name}'", problem, f"known ones: {known}")
     try:
-        return _MODELS[name](**options)
+        network = _MODELS[name](**options)
     except ValueError as error:
         raise InputError(f"model '{name}'", str(error)) from None
+    return network if equivariance == "none" else _EQUIVARIANT[equivariance](network)
 
 
 def initialise(model: nn.Module, key: PRNGKeyArray, window: int = 200) -> Any:

@@ -24,7 +24,7 @@ from gnio_jax.config import TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.training import learnt as learning
 from gnio_jax.training.optimizer import Plateau
-from gnio_jax.training.step import TrainState
+from gnio_jax.training.step import TrainState, evaluated
 
 Which = Literal["best", "latest"]
 
@@ -98,15 +98,21 @@ class Checkpoints:
 
     def save(self, which: Which, state: TrainState, position: Position) -> None:
         """Write a checkpoint at `position.step`; one that is already there for this step is the
-        same and stays."""
+        same and stays.
+
+        Its variables are those that are evaluated. Where they are averages, `latest` also holds the
+        parameters that training goes on with.
+        """
         manager = self._managers[which]
         if position.step in manager.all_steps():
             return
-        variables = state.variables
+        variables = evaluated(state).variables
         meta = {"position": position._asdict(), "shapes": _shapes(variables)}
         items = {"variables": ocp.args.StandardSave(variables), "meta": ocp.args.JsonSave(meta)}
         if which == "latest":
             items["optimizer"] = ocp.args.StandardSave(state.opt_state)
+            if state.average is not None:
+                items["training"] = ocp.args.StandardSave(state.params)
         manager.save(position.step, args=ocp.args.Composite(**items))
 
     def restore(self, template: TrainState) -> tuple[TrainState, Position]:
@@ -119,14 +125,15 @@ class Checkpoints:
         where = self._workdir / "checkpoints" / "latest"
         if step is None:
             raise InputError(where, "holds no checkpoint", "start the run without --resume")
-        variables = template.variables
-        meta = _checked_meta(manager, step, variables, where)
-        items = ocp.args.Composite(
-            variables=ocp.args.StandardRestore(variables),
-            optimizer=ocp.args.StandardRestore(template.opt_state),
-        )
-        restored = manager.restore(step, args=items)
+        wanted = {"variables": evaluated(template).variables, "optimizer": template.opt_state}
+        if template.average is not None:
+            wanted["training"] = template.params
+        meta = _checked_meta(manager, step, wanted["variables"], where)
+        items = {name: ocp.args.StandardRestore(tree) for name, tree in wanted.items()}
+        restored = manager.restore(step, args=ocp.args.Composite(**items))
         state = TrainState.of(jnp.int32(step), restored["variables"], restored["optimizer"])
+        if template.average is not None:
+            state = state._replace(params=restored["training"], average=state.params)
         return uncommitted(state), _position(meta["position"])
 
 

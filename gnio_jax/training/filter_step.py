@@ -25,7 +25,7 @@ from gnio_jax.filtering import (
     over_sequences,
     run_odometry,
 )
-from gnio_jax.filtering.options import errors_last, filter_setup, initial_std, noise_model
+from gnio_jax.filtering.options import filter_setup, initial_std, noise_model
 from gnio_jax.training import learnt as learning
 from gnio_jax.training import optimizer as optimizers
 from gnio_jax.training.filter_losses import FilterLosses, filter_losses, normalised_squares
@@ -143,7 +143,7 @@ def run_piece(
         errors.accel_bias,
         initial_std(options),
     )
-    noise = noise_model(options, errors_last(config.filter))
+    noise = noise_model(options)
     _, history = run_odometry(predict, start, piece.gyro, piece.accel, ekf, noise)
     path = Path(
         jnp.concatenate([start.rotation[None], history.rotation]),

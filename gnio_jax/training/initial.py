@@ -51,7 +51,8 @@ def with_weights(state: TrainState, run: Run) -> TrainState:
     """A fresh state with the variables of a run; what that does not have stays as it is. The state
     of the optimizer does not change."""
     variables = {**run.variables, "filter": run.filter}
-    return TrainState.of(state.step, _overlaid(state.variables, variables), state.opt_state)
+    found = _overlaid(state.variables, variables)
+    return TrainState.of(state.step, found, state.opt_state)
 
 
 def _overlaid(tree: dict[str, Any], other: dict[str, Any]) -> dict[str, Any]:

@@ -25,6 +25,9 @@ FILTER_PARTS = {
     "noise": ("gyro_density", "accel_density", "gyro_bias_walk", "accel_bias_walk"),
     "measurement": (
         "measurement_scale",
+        "std_factor_x",
+        "std_factor_y",
+        "std_factor_z",
         "window_error_share",
         "window_error_seconds",
         "scale_error_std",

@@ -35,6 +35,8 @@ from gnio_jax.training.step import (
     create_state,
     epoch_order,
     estimate_statistics,
+    evaluated,
+    isotropic,
     normalises,
     train_steps,
     validate,
@@ -62,12 +64,13 @@ class WindowTraining(NamedTuple):
         return switches(self.config.loss, self.steps_per_epoch)
 
     def new_state(self, start: Run | None) -> TrainState:
-        window = self.config.data.window
-        state = create_state(self.model, self.optimizer, self.keys.init, window)
+        window, decay = self.config.data.window, self.config.optim.ema_decay
+        state = create_state(self.model, self.optimizer, self.keys.init, window, decay)
         if start is None:
             return state
         state = with_weights(state, start)
-        return state._replace(opt_state=self.optimizer.init(state.params))
+        average = jax.tree.map(jnp.copy, state.params) if decay else None
+        return state._replace(opt_state=self.optimizer.init(state.params), average=average)
 
     def describe(self, state: TrainState, workdir: Path, reporter: Reporter) -> None:
         optim, steps = self.config.optim, self.steps_per_epoch
@@ -112,20 +115,24 @@ class WindowTraining(NamedTuple):
         )
 
     def settled(self, state: TrainState) -> TrainState:
-        """With the statistics of its batch normalisations estimated anew, if asked for."""
+        """With the statistics of its batch normalisations estimated anew, for the parameters that
+        are evaluated, if asked for."""
         if not self.config.optim.statistics_windows or not normalises(state):
             return state
+        options = {"model": self.model, "config": self.config}
         key = self.keys.statistics
-        return estimate_statistics(state, self.source, key, model=self.model, config=self.config)
+        estimated = estimate_statistics(evaluated(state), self.source, key, **options)
+        return state._replace(batch_stats=estimated.batch_stats)
 
     def validate(self, state: TrainState, step: int) -> tuple[TrainState, Row]:
         """With its uncertainty calibrated where it has constants for that."""
         now = stage(self.config.loss, step - 1, self.steps_per_epoch)
         options = {"model": self.model, "config": self.config}
-        found = validate(state, source=self.held_out, now=now, **options)
+        found = validate(evaluated(state), source=self.held_out, now=now, **options)
         if calibrates(state):
-            state = calibrated(state, found)
-            found = validate(state, source=self.held_out, now=now, **options)
+            equivariant = self.config.model.equivariance != "none"
+            state = calibrated(state, isotropic(found) if equivariant else found)
+            found = validate(evaluated(state), source=self.held_out, now=now, **options)
         loss, mse, nll = (float(each) for each in found.losses)
         normalised = zip("xyz", found.axis_normalised, strict=True)
         return state, {

@@ -4,6 +4,7 @@ on the device."""
 from __future__ import annotations
 
 import functools
+import math
 from typing import Any, NamedTuple
 
 import jax
@@ -28,6 +29,8 @@ class TrainState(NamedTuple):
     params: Any
     batch_stats: Any
     opt_state: Any
+    average: Any = None
+    """Moving average of `params` (`optim.ema_decay`); None where none is kept."""
     filter: Any = {}
     """Options of the filter as they learn (`learnt.unconstrained`); none in training on windows."""
 
@@ -41,7 +44,8 @@ class TrainState(NamedTuple):
     def of(cls, step: jax.Array, variables: dict[str, Any], opt_state: Any) -> TrainState:
         """The state whose `variables` these are."""
         params, batch_stats = variables["params"], variables["batch_stats"]
-        return cls(step, params, batch_stats, opt_state, variables.get("filter", {}))
+        numbers = variables.get("filter", {})
+        return cls(step, params, batch_stats, opt_state, filter=numbers)
 
 
 class Validation(NamedTuple):
@@ -67,14 +71,31 @@ class Progress(NamedTuple):
 
 
 def create_state(
-    model: nn.Module, optimizer: optax.GradientTransformation, key: PRNGKeyArray, window: int
+    model: nn.Module,
+    optimizer: optax.GradientTransformation,
+    key: PRNGKeyArray,
+    window: int,
+    ema_decay: float = 0.0,
 ) -> TrainState:
-    """Fresh parameters for windows of `window` samples, at step 0."""
+    """Fresh parameters for windows of `window` samples, at step 0; with an average of them unless
+    `ema_decay` is 0."""
     variables = initialise(model, key, window)
     params = variables["params"]
     return TrainState(
-        jnp.int32(0), params, variables.get("batch_stats", {}), optimizer.init(params)
+        jnp.int32(0),
+        params,
+        variables.get("batch_stats", {}),
+        optimizer.init(params),
+        jax.tree.map(jnp.copy, params) if ema_decay else None,
     )
+
+
+def evaluated(state: TrainState) -> TrainState:
+    """The state with the parameters that are validated, kept as best and evaluated: their average
+    where there is one."""
+    if state.average is None:
+        return state
+    return state._replace(params=state.average, average=None)
 
 
 def epoch_order(key: PRNGKeyArray, epoch: int, source: WindowSource) -> Int[jax.Array, "m"]:
@@ -122,7 +143,9 @@ def train_steps(
         update = optax.tree.scale(learning_rate_factor, update)
         params = optax.apply_updates(state.params, update)
         progress = _add_step(progress, state.step, loss, gradient)
-        return TrainState(jnp.add(state.step, 1), params, batch_stats, opt_state), progress
+        step = jnp.add(state.step, 1)
+        average = _averaged(state.average, params, step, config.optim.ema_decay)
+        return TrainState(step, params, batch_stats, opt_state, average), progress
 
     nothing = Progress(
         Losses(*[jnp.float32(0)] * 3),
@@ -150,6 +173,19 @@ def _gradient(
 
     gradient, (loss, batch_stats) = jax.grad(objective, has_aux=True)(state.params)
     return gradient, loss, batch_stats
+
+
+def _averaged(average: Any, params: Any, step: Int[jax.Array, ""], decay: float) -> Any:
+    """The moving average after `step` steps, the last of which gave `params`; None where none is
+    kept.
+
+    Weights β^(step − i) of the parameters after step i, divided by their sum, as Adam corrects its
+    moments: the first steps count as those of a plain mean, and the start not at all.
+    """
+    if average is None:
+        return None
+    share = (1 - decay) / -jnp.expm1(step.astype(jnp.float32) * math.log(decay))
+    return jax.tree.map(lambda mean, new: mean + share * (new - mean), average, params)
 
 
 def _add_step(progress: Progress, step: jax.Array, loss: Losses, gradient: Any) -> Progress:
@@ -295,6 +331,18 @@ def validate(
 
     return jax.tree.map(
         lambda x: jnp.sum(x, axis=0) / count, jax.lax.map(one_batch, (which, weight))
+    )
+
+
+def isotropic(found: Validation) -> Validation:
+    """The same, with the mean of the two horizontal axes in the place of each. Constants of the
+    uncertainty of an equivariant network cannot tell one from the other."""
+
+    def mean(axes: Float[jax.Array, "3"]) -> Float[jax.Array, "3"]:
+        return axes.at[:2].set(axes[:2].mean())
+
+    return found._replace(
+        axis_mse=mean(found.axis_mse), axis_normalised=mean(found.axis_normalised)
     )
 
 

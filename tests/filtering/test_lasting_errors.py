@@ -264,6 +264,27 @@ def test_they_can_be_learnt_from_any_size_on():
             )
 
 
+def test_the_factor_of_each_axis_scales_the_covariance():
+    """Its derivative is finite where there is no measurement, too."""
+    start, gyro, accel, displacement, spread = walk()
+    state = filtering.initial_state(CONFIG, *start)
+    factor = np.array([1.5, 0.7, 2.0])
+    scaled = spread * factor[:, None] * factor
+
+    @quick
+    def evidence(factor, spread):
+        noise = NOISE._replace(std_factor=tuple(factor))
+        given = (state, gyro, accel, displacement, spread)
+        return jnp.nansum(filtering.run_filter(*given, CONFIG, noise)[1].log_likelihood)
+
+    np.testing.assert_allclose(evidence(factor, spread), evidence(np.ones(3), scaled), rtol=1e-12)
+    gradient = quick(jax.grad(evidence))(jnp.asarray(factor), spread)
+    step = 1e-6 * np.eye(3)[1]
+    difference = (evidence(factor + step, spread) - evidence(factor - step, spread)) / 2e-6
+    np.testing.assert_allclose(gradient[1], difference, rtol=1e-5)
+    assert np.isfinite(gradient).all()
+
+
 @pytest.mark.parametrize(
     ("field", "value", "problem"),
     [

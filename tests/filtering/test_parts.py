@@ -163,7 +163,7 @@ def at_singularity(kind):
 @functools.partial(quick, static_argnums=3)
 @functools.partial(jax.grad, argnums=(0, 1, 2), allow_int=True, has_aux=True)
 def update_gradient(state, displacement, covariance, frame="given"):
-    measurement = scaled_measurement(displacement, covariance, CONFIG)
+    measurement = scaled_measurement(displacement, covariance, CONFIG, filtering.NoiseModel())
     new, outcome = update(state, measurement, 2, 0, CONFIG, frame)
     leaves = [
         leaf for leaf in jax.tree.leaves((new, outcome)) if jnp.issubdtype(leaf.dtype, jnp.floating)
@@ -182,7 +182,7 @@ def test_update_has_finite_derivatives_everywhere(kind):
         displacement = jnp.asarray([1.0, 0, 0])
     gradients, (new, outcome) = update_gradient(state, displacement, 0.01 * jnp.eye(3))
     floats = [leaf for leaf in jax.tree.leaves(gradients) if leaf.dtype == jnp.float64]
-    assert len(floats) == 16 and all(np.isfinite(leaf).all() for leaf in floats)
+    assert len(floats) == 17 and all(np.isfinite(leaf).all() for leaf in floats)
     assert bool(outcome.accepted) == (kind in ("plain", "coincident clones", "no innovation"))
     assert bool(outcome.present) == (kind != "missing")
     if not outcome.accepted:
@@ -197,7 +197,7 @@ def test_in_its_own_frame_there_is_no_gimbal_lock():
         state = state._replace(clone_covariance=0.1 * jnp.eye(18))
         gradients, (new, outcome) = update_gradient(state, displacement, 0.01 * jnp.eye(3), "own")
         floats = [leaf for leaf in jax.tree.leaves(gradients) if leaf.dtype == jnp.float64]
-        assert len(floats) == 16 and all(np.isfinite(leaf).all() for leaf in floats)
+        assert len(floats) == 17 and all(np.isfinite(leaf).all() for leaf in floats)
         assert bool(outcome.accepted) and outcome.gate_passed == 1
         assert np.abs(gradients[1]).max() > 0 and (new.clone_offset != state.clone_offset).any()
 

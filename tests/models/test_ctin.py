@@ -8,7 +8,7 @@ import pytest
 
 from gnio_jax import models
 from gnio_jax.errors import InputError
-from gnio_jax.models import ctin
+from gnio_jax.models import ctin, heads
 from tests.support.compiling import quick
 
 SMALL = {"width": 12, "encoder_width": 8, "ffn": 10, "heads": 2, "decoder_layers": 2}
@@ -254,7 +254,7 @@ def test_a_decoded_step_depends_on_no_later_one():
 
 
 def test_no_step_is_surer_than_the_window_says():
-    found = ctin._root_mean_square(jnp.array([[[-2.0, 0.0, 90.0], [1.0, 0.0, -90.0]]], jnp.float32))
+    found = heads.root_mean_square(jnp.array([[[-2.0, 0.0, 90.0], [1.0, 0.0, -90.0]]], jnp.float32))
     np.testing.assert_allclose(
         found, [[0.5 * np.log((np.exp(-4) + np.exp(2)) / 2), 0, 90 - 0.5 * np.log(2)]], rtol=1e-6
     )

@@ -92,15 +92,19 @@ def test_a_run_leaves_its_config_log_events_and_checkpoints(recording, finished)
     assert checkpoint.load_run(workdir, "latest").step == rows[-1]["step"]
 
 
-def test_validation_is_the_plain_mean_over_every_window(recording, finished):
-    workdir, _ = finished
-    run = checkpoint.load_run(workdir, "latest")
+def windows_of(recording, split, config):
     from gnio_jax import data
 
-    source = windows.window_source(
-        [data.resample(s, 50.0) for s in data.load("tlio", recording, "val")], run.config.data, 5
-    )
-    source = jax.device_put(source)
+    sequences = [data.resample(s, 50.0) for s in data.load("tlio", recording, split)]
+    return jax.device_put(windows.window_source(sequences, config.data, 5))
+
+
+@pytest.mark.parametrize("kept", ["finished", "averaged"])
+def test_validation_is_the_plain_mean_over_every_window(recording, kept, request):
+    """With the parameters that evaluation loads, averages or not."""
+    workdir, _ = request.getfixturevalue(kept)
+    run = checkpoint.load_run(workdir, "latest")
+    source = windows_of(recording, "val", run.config)
     every = windows.gather(source, jnp.arange(source.start.shape[0], dtype=jnp.int32), 50)
     prediction = jax.jit(run.model.apply)(run.variables, every.imu)
     mse = np.mean(
@@ -112,6 +116,80 @@ def test_validation_is_the_plain_mean_over_every_window(recording, finished):
     row = json.loads((workdir / "metrics.jsonl").read_text().splitlines()[-1])
     assert row["val_mse"] == pytest.approx(mse, rel=1e-4)
     assert len(every.displacement) % 16 != 0  # so that the filled-up last batch is part of the test
+
+
+def averaging(recording, workdir):
+    config = tiny(recording, workdir)
+    return dataclasses.replace(config, optim=dataclasses.replace(config.optim, ema_decay=0.9))
+
+
+@pytest.fixture(scope="module")
+def averaged(recording, tmp_path_factory):
+    """The same run, keeping an average of its parameters."""
+    workdir = tmp_path_factory.mktemp("averaged") / "run"
+    return workdir, loop.train(averaging(recording, workdir))
+
+
+def resumed_state(config):
+    """The state with which a run would go on."""
+    model = checkpoint.create_model(config)
+    tx = optimizer.create(config.optim, config.loss, 1)
+    template = step.create_state(model, tx, jax.random.key(0), 50, config.optim.ema_decay)
+    with checkpoint.Checkpoints(Path(config.workdir)) as checkpoints:
+        return jax.tree.map(np.asarray, checkpoints.restore(template)[0])
+
+
+def test_averages_are_evaluated_and_training_goes_on_without_them(recording, finished, averaged):
+    workdir, _ = averaged
+    loaded, plain = parameters(workdir), parameters(finished[0])
+    state = resumed_state(averaging(recording, workdir))
+    assert same(state.average, loaded["params"]) and not same(state.params, loaded["params"])
+    misses = [
+        sum(np.sum((a - b) ** 2) for a, b in zip(*map(jax.tree.leaves, pair), strict=True))
+        for pair in ((state.params, plain["params"]), (loaded["params"], plain["params"]))
+    ]
+    assert misses[0] < 1e-3 * misses[1]  # its steps are those of the run without
+    config = checkpoint.load_run(workdir).config
+    model, key = checkpoint.create_model(config), jax.random.key(config.seed)
+    with jax.enable_x64(False):
+        estimated = step.estimate_statistics(
+            step.evaluated(jax.tree.map(jnp.asarray, state)),
+            windows_of(recording, "train", config),
+            jax.random.fold_in(key, 3),
+            model=model,
+            config=config,
+        )
+    assert same(estimated.batch_stats, loaded["batch_stats"])
+    assert not same(plain["batch_stats"], loaded["batch_stats"])
+
+
+def test_a_run_that_averages_is_resumed_to_the_bit(recording, averaged, tmp_path, monkeypatch):
+    real, calls = step.train_steps, []
+
+    def stopping(*arguments, **options):
+        calls.append(1)
+        if len(calls) == 4:
+            os.kill(os.getpid(), signal.SIGTERM)
+        return real(*arguments, **options)
+
+    monkeypatch.setattr(on_windows, "train_steps", stopping)
+    monkeypatch.setattr(loop, "DISPATCH_SECONDS", 0.01)
+    config = averaging(recording, tmp_path / "run")
+    assert loop.train(config).stopped_by == signal.SIGTERM
+    assert loop.train(config, resume=True).stopped_by is None
+    for which in ("latest", "best"):
+        assert same(parameters(tmp_path / "run", which), parameters(averaged[0], which))
+    states = [resumed_state(averaging(recording, at)) for at in (tmp_path / "run", averaged[0])]
+    assert same(*states)
+
+
+def test_averages_want_statistics_of_their_own(recording):
+    optim = OptimConfig(ema_decay=0.9, statistics_windows=0)
+    with pytest.raises(InputError, match=r"optim\.ema_decay' is set without optim\.statistics_"):
+        configuration.validate(tiny(recording, "", optim=optim))
+    optim = OptimConfig(ema_decay=1.0)
+    with pytest.raises(InputError, match=r"optim\.ema_decay' must be at least 0 and below 1"):
+        configuration.validate(tiny(recording, "", optim=optim))
 
 
 def test_a_run_is_not_resumed_with_other_recordings(recording, finished, tmp_path):

@@ -6,11 +6,11 @@ import numpy as np
 import optax
 import pytest
 
-from gnio_jax.config import LossConfig, OptimConfig
+from gnio_jax.config import LossConfig, ModelConfig, OptimConfig, TrainConfig
 from gnio_jax.models.heads import CalibratedUncertainty
-from gnio_jax.training import losses, optimizer
+from gnio_jax.training import losses, on_windows, optimizer
 from gnio_jax.training.losses import Losses
-from gnio_jax.training.step import TrainState, Validation, calibrated
+from gnio_jax.training.step import TrainState, Validation, calibrated, isotropic
 from gnio_jax.types import Prediction, Windows
 
 
@@ -202,6 +202,25 @@ def test_a_constant_uncertainty_takes_the_errors_of_the_validation():
     ).batch_stats
     np.testing.assert_allclose(np.exp(found["uncertainty"]["log_std"]), [0.2, 1, 2], rtol=1e-6)
     assert found["bn"]["mean"] is other
+
+
+@pytest.mark.parametrize("equivariance", ["none", "four_headings", "canonical_frame"])
+def test_constants_of_an_equivariant_network_are_the_same_along_both_axes(
+    monkeypatch, equivariance
+):
+    """Their squares are the mean square errors of the plane."""
+    stats = {"uncertainty": {"log_std": jnp.zeros(3, jnp.float32)}}
+    state = TrainState(jnp.int32(7), {}, stats, ())
+    errors = jnp.array([1.0, 4.0, 9.0], jnp.float32)
+    found = Validation(Losses(*[jnp.float32(0)] * 3), errors, errors)
+    monkeypatch.setattr(on_windows, "validate", lambda *_, **__: found)
+    config = TrainConfig(model=ModelConfig(equivariance=equivariance))
+    nothing = dict.fromkeys(on_windows.WindowTraining._fields)
+    training = on_windows.WindowTraining(**nothing | {"config": config, "steps_per_epoch": 7})
+    constants = training.validate(state, 7)[0].batch_stats["uncertainty"]["log_std"]
+    wanted = [1.0, 4.0, 9.0] if equivariance == "none" else [2.5, 2.5, 9.0]
+    np.testing.assert_allclose(np.exp(2 * constants), wanted, rtol=1e-6)
+    np.testing.assert_allclose(isotropic(found).axis_normalised, [2.5, 2.5, 9.0], rtol=1e-6)
 
 
 def test_a_calibrated_head_announces_the_errors_of_the_validation():

@@ -47,7 +47,7 @@ def trainer(config, source, seed=0, train_steps=step.train_steps):
     model, tx = model_and_optimizer(config, steps)
     with jax.enable_x64(False):
         key = jax.random.key(seed)
-        state = step.create_state(model, tx, key, config.data.window)
+        state = step.create_state(model, tx, key, config.data.window, config.optim.ema_decay)
 
     def take(state, epoch, first, count):
         with jax.enable_x64(False):
@@ -211,6 +211,28 @@ def test_constants_of_the_uncertainty_are_left_alone():
     assert step.normalises(state) and not step.normalises(
         state._replace(batch_stats={"uncertainty": found["uncertainty"]})
     )
+
+
+def test_the_average_of_the_parameters_against_numpy():
+    """Over recorded steps, however they are dispatched; nothing is kept where it is off."""
+    optim = dataclasses.replace(CONFIG.optim, ema_decay=0.8)
+    config = dataclasses.replace(CONFIG, model=ModelConfig(width=2, bank_size=0), optim=optim)
+    source = source_of("val", 25)
+    _, state, take, _ = trainer(config, source)
+    seen, states = [], [state]
+    for number in range(6):
+        states.append(take(jax.tree.map(jnp.copy, states[-1]), 0, number, 1)[0])
+        seen.append(jax.tree.map(np.float64, states[-1].params))
+        weights = 0.8 ** np.arange(number + 1)[::-1]
+        wanted = jax.tree.map(lambda *x: np.average(x, axis=0, weights=weights), *seen)  # noqa: B023
+        close = functools.partial(np.testing.assert_allclose, rtol=1e-5, atol=1e-6)
+        jax.tree.map(close, states[-1].average, wanted)
+        assert step.evaluated(states[-1]).params is states[-1].average
+    at_once, _ = take(states[0], 0, 0, 6)
+    jax.tree.map(np.testing.assert_array_equal, at_once, states[-1])
+    plain = dataclasses.replace(config, optim=CONFIG.optim)
+    without = trainer(plain, source)[1]
+    assert without.average is None and step.evaluated(without) is without
 
 
 def test_the_uncertainty_fits_the_errors_after_training(trained):

@@ -1,0 +1,176 @@
+"""One calibration from its options to a run of its own."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from gnio_jax import config as configuration
+from gnio_jax import data
+from gnio_jax.calibration.errors import std_factors
+from gnio_jax.calibration.likelihood import Fit, Walks, fit
+from gnio_jax.calibration.unknowns import chosen, with_starts, written
+from gnio_jax.config import CalibrateConfig, FilterOptions, TrainConfig
+from gnio_jax.errors import InputError
+from gnio_jax.evaluation import Setup, estimate, inference_network, prepare, true_displacements
+from gnio_jax.evaluation.estimators.result import Estimate
+from gnio_jax.evaluation.preparation import Prepared
+from gnio_jax.files import replacing_folder, write_text
+from gnio_jax.training import checkpoint
+
+OnStage = Callable[[str, float], None]
+"""Called with the stage and the share of it that is done."""
+FACTORS = ("std_factor_x", "std_factor_y", "std_factor_z")
+
+
+class Calibration(NamedTuple):
+    """What `calibrate` found and where it is."""
+
+    before: FilterOptions
+    fit: Fit
+    """Its options are those of the calibrated run."""
+    recordings: int
+    folder: Path
+
+
+def calibrate(
+    config: CalibrateConfig, progress: OnStage = lambda stage, share: None, workers: int = 1
+) -> Calibration:
+    """Fit the filter's options of a run to recordings that its network did not learn from, and
+    write a run that differs in them alone.
+
+    Two steps (ours). First each axis gets the factor that makes the network's standard deviations
+    those of its errors, window by window against the reference. Then the options of `config.fit`
+    are those that make the innovations of the filter most likely, in which the reference has no
+    part but the start. Raises `InputError` for a split that is neither the run's validation nor
+    its training split, an output folder that is there already, and missing data.
+    """
+    workdir = Path(config.workdir) if config.workdir else configuration.newest_run()
+    run = checkpoint.load_run(workdir, config.checkpoint)
+    folder, split = _folder(config, workdir), _split(config, run.config)
+    root = config.data_root or run.config.data_root
+    sequences = data.load(
+        run.config.dataset, root, split, workers, lambda share: progress("reading", share)
+    )
+    prepared, _ = prepare(sequences, run.config.data, Setup())
+    if not prepared:
+        raise InputError(
+            f"dataset {run.config.dataset}", f"split '{split}' has no recording to fit"
+        )
+
+    own = dataclasses.replace(
+        run.config.filter, measurement_scale=1.0, **dict.fromkeys(FACTORS, 1.0)
+    )
+    network = inference_network(run.model, run.variables)
+    estimates = estimate(
+        prepared,
+        network,
+        run.config.data,
+        own,
+        progress=lambda share: progress("estimating", share),
+    )
+    truths = [true_displacements(each, run.config.data) for each in prepared]
+    try:
+        factors = std_factors(estimates, truths)
+    except ValueError as error:
+        raise InputError(f"split '{split}'", str(error)) from None
+
+    unknowns = chosen(config.fit)
+    options = written(own, dict(zip(FACTORS, jnp.asarray(factors), strict=True)))
+    options = with_starts(options, unknowns)
+    found = fit(
+        _walks(prepared, estimates, run.config.data.stride),
+        run.config.data,
+        options,
+        unknowns,
+        lambda calls: progress("fitting", min(1.0, calls / (1.3 * config.steps))),
+        config.steps,
+    )
+    calibration = Calibration(run.config.filter, found, len(prepared), folder)
+    _write(calibration, workdir, run.config, config, split)
+    return calibration
+
+
+def _folder(config: CalibrateConfig, workdir: Path) -> Path:
+    folder = Path(config.out) if config.out else workdir.with_name(workdir.name + "_calibrated")
+    if folder.exists():
+        raise InputError(folder, "is there already", "remove it, or give another --out")
+    return folder
+
+
+def _split(config: CalibrateConfig, run: TrainConfig) -> str:
+    split = config.split or run.data.val_split
+    allowed = (run.data.val_split, run.data.train_split)
+    if split not in allowed:
+        raise InputError(
+            f"--split {split}",
+            "is neither the validation nor the training split of the run",
+            f"give {' or '.join(allowed)}: what is tested must not have been fitted",
+        )
+    return split
+
+
+def _walks(prepared: list[Prepared], estimates: list[Estimate], stride: int) -> Walks:
+    """The recordings with the network's displacements, filled up to the longest: with samples that
+    come after all displacements and change nothing before them."""
+    strides = max(each.strides(stride) for each in prepared)
+
+    def of_recording(each: Prepared, estimate: Estimate) -> Walks:
+        signals = each.sequence.gyro[:-1], each.sequence.accel[:-1]
+        told = estimate.displacement, estimate.displacement_std
+        assert told[0] is not None and told[1] is not None
+        return Walks(
+            each.start.rotation,
+            each.start.velocity,
+            each.start.position,
+            each.gyro_bias,
+            *(_filled(signal, strides * stride, signal[-1:]) for signal in signals),
+            _filled(told[0][1:], strides, np.full((1, 3), np.nan)),
+            np.nan_to_num(_filled(told[1][1:], strides, np.ones((1, 3))), nan=1.0),
+        )
+
+    rows = [of_recording(*pair) for pair in zip(prepared, estimates, strict=True)]
+    return Walks(*(np.stack(column) for column in zip(*rows, strict=True)))
+
+
+def _filled(values: np.ndarray, rows: int, filling: np.ndarray) -> np.ndarray:
+    return np.concatenate([values, np.repeat(filling, rows - len(values), axis=0)])
+
+
+def _write(
+    calibration: Calibration,
+    workdir: Path,
+    trained: TrainConfig,
+    config: CalibrateConfig,
+    split: str,
+) -> None:
+    """The run with its new options, its checkpoint, and what was fitted."""
+    found = calibration.fit
+    about: dict[str, Any] = {
+        "run": str(workdir),
+        "checkpoint": config.checkpoint,
+        "split": split,
+        "recordings": calibration.recordings,
+        "fitted": list(config.fit),
+        "negative_log_likelihood_per_innovation": {"before": found.before, "after": found.after},
+        "steps": found.steps,
+        "filter": dataclasses.asdict(found.options),
+    }
+    source = Path("checkpoints") / config.checkpoint
+    with replacing_folder(calibration.folder) as new:
+        experiment = dataclasses.replace(
+            trained, workdir=str(calibration.folder), filter=found.options
+        )
+        configuration.save(new / "config.yaml", experiment)
+        write_text(new / "calibration.json", json.dumps(about, indent=2) + "\n")
+        shutil.copytree(workdir / source, new / "checkpoints" / "best")
+        for name in ("splits.yaml", "metrics.jsonl"):
+            if (workdir / name).exists():
+                shutil.copy(workdir / name, new / name)

@@ -1,0 +1,55 @@
+"""`gnio calibrate`: what a run does not know of its own errors."""
+
+from __future__ import annotations
+
+import dataclasses
+
+from rich.table import Table
+
+from gnio_jax.commands import console
+from gnio_jax.commands.options import Command, sibling
+from gnio_jax.config import CalibrateConfig, FilterOptions
+from gnio_jax.cores import usable_cores
+
+DESCRIPTION = """Fit the filter's options of a run to its validation split; write a run with them.
+
+  {prog}                                    (the newest run below runs/)
+  {prog} --workdir runs/oxiod --out runs/oxiod_honest
+  {prog} --workdir runs/oxiod --fit measurement noise
+
+A network learns the errors of the walks that it has fitted, which are smaller than those of others.
+First its standard deviations get a factor for each axis, from the errors on the validation split.
+Then the filter's noises are those that make its innovations most likely. The result is a run that
+gnio evaluate takes as any other; test splits are refused."""
+
+
+def calibrate(config: CalibrateConfig, prog: str) -> None:
+    """Calibrate, and show what has changed."""
+    # After the options: --help and mistakes do not wait for these imports.
+    import jax
+
+    from gnio_jax import calibration, filtering
+
+    jax.config.update("jax_enable_x64", True)  # for the filter; the network states its float32
+    filtering.cores_as_devices()
+    with console.terminal() as terminal:
+        found = calibration.calibrate(config, terminal.progress, usable_cores())
+    console.stdout().print(_table(found.before, found.fit.options))
+    print(
+        f"-log-likelihood of an innovation: {found.fit.before:.4f} -> {found.fit.after:.4f} "
+        f"({found.recordings} recordings, {found.fit.steps} steps)"
+    )
+    print(f"look at it with: {sibling(prog, 'evaluate')} --workdir {found.folder}")
+
+
+def _table(before: FilterOptions, after: FilterOptions) -> Table:
+    """The options that have changed."""
+    table = Table("filter", "before", "calibrated")
+    old, new = dataclasses.asdict(before), dataclasses.asdict(after)
+    for name in old:
+        if old[name] != new[name]:
+            table.add_row(name, f"{old[name]:.4g}", f"{new[name]:.4g}")
+    return table
+
+
+COMMAND = Command(CalibrateConfig, calibrate, DESCRIPTION)

@@ -1,0 +1,207 @@
+"""Yaw equivariance around any network: a window turned about the vertical gives the displacement
+turned alike.
+
+A heading is (cos, sin) of an angle about z. The parameters of the wrapped network keep their names,
+so weights of the network alone fit `FourHeadings`.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import linen as nn
+from jaxtyping import Float
+
+from gnio_jax.geometry import direction
+from gnio_jax.models.heads import root_mean_square
+from gnio_jax.models.layers import linear
+from gnio_jax.models.resnet import batch_norm, conv
+from gnio_jax.types import GRAVITY, Prediction
+
+QUARTER_TURNS = np.float32([[1, 0], [0, 1], [-1, 0], [0, -1]])
+"""Headings 0, 90, 180 and 270°."""
+FRAME_FEATURES = 16
+"""Features of the frame network's convolutions (ours)."""
+FRAME_SPAN = 7
+"""Samples that each of them sees (ours)."""
+
+
+class Equivariant(nn.Module):
+    """A network whose parts lie beside those that make it equivariant."""
+
+    network: nn.Module
+
+    def setup(self) -> None:
+        nn.share_scope(self, self.network)
+
+    @nn.nowrap
+    def constants(self, variables: Any) -> dict[str, Any]:
+        """Arguments of `apply` that depend on the variables alone: those of the network."""
+        constants = getattr(self.network, "constants", None)
+        return constants(variables) if constants else {}
+
+
+class FourHeadings(Equivariant):
+    """Inference: the mean over the window turned by 0, 90, 180 and 270°, each displacement turned
+    back. Exact for quarter turns.
+
+    The variance is the mean of the four variances, turned back too. Diagnostics are those of the
+    window as it is. Training applies the network once: augmentation draws the heading.
+    """
+
+    def __call__(
+        self, windows: Float[jax.Array, "b n 6"], train: bool = False, **constants: Any
+    ) -> Prediction:
+        if train:
+            return self.network(windows, train, **constants)
+        batch, turns = windows.shape[0], len(QUARTER_TURNS)
+        heading = jnp.repeat(jnp.asarray(QUARTER_TURNS), batch, axis=0)
+        every = turn_windows(jnp.tile(windows.astype(jnp.float32), (turns, 1, 1)), heading)
+        prediction = self.network(every, train, **constants)
+        back = turn_prediction(prediction, opposite(heading))
+        displacement, log_std = (
+            axes.reshape(turns, batch, 3).swapaxes(0, 1)
+            for axes in (back.displacement, back.log_std)
+        )
+        return Prediction(
+            displacement.mean(axis=1),
+            root_mean_square(log_std),
+            {name: value[:batch] for name, value in prediction.diagnostics.items()},
+        )
+
+
+class CanonicalFrame(Equivariant):
+    """The network sees the window in a frame that turns with it, and its displacement is turned
+    back (EqNIO: Jayanth et al., "EqNIO: Subequivariant Neural Inertial Odometry", 2024; its SO(2)
+    part, details ours). Exact for every angle.
+
+    The network's variances are along the axes of the frame. Turned back they are a covariance, of
+    which the diagonal is returned. Diagnostics are in the frame, but for the velocities of CTIN,
+    from which its loss learns: those are turned back.
+    """
+
+    def setup(self) -> None:
+        super().setup()
+        self.frame = FrameNetwork()
+
+    def __call__(
+        self, windows: Float[jax.Array, "b n 6"], train: bool = False, **constants: Any
+    ) -> Prediction:
+        windows = windows.astype(jnp.float32)
+        heading = self.frame(windows, train)
+        prediction = self.network(turn_windows(windows, opposite(heading)), train, **constants)
+        return turn_prediction(prediction, heading)
+
+
+class FrameNetwork(nn.Module):
+    """The heading of a window, which turns with it: the direction of a weighted sum of the
+    horizontal vectors of its samples.
+
+    The vectors are acceleration, angular rate and the quarter turns of both. A small convolutional
+    network finds the weights from quantities that do not turn. The sum points anywhere in the
+    plane. Where it is 0, as in a window without horizontal vectors, the heading is (1, 0), without
+    gradient.
+    """
+
+    @nn.compact
+    def __call__(self, windows: Float[jax.Array, "b n 6"], train: bool) -> Float[jax.Array, "b 2"]:
+        x = invariants(windows)
+        for layer in ("1", "2"):
+            x = conv(FRAME_FEATURES, FRAME_SPAN, 1, train, f"conv{layer}")(x)
+            x = nn.relu(batch_norm(train, f"bn{layer}")(x))
+        accel, gyro = windows[..., 0:2], windows[..., 3:5]
+        vectors = jnp.stack([accel, quarter_turn(accel), gyro, quarter_turn(gyro)], axis=2)
+        weights = linear(vectors.shape[2], "weights")(x)
+        mean = jnp.einsum("bnk,bnkd->bd", weights, vectors) / windows.shape[1]
+        return jnp.stack(direction(mean[:, 0], mean[:, 1]), axis=-1)
+
+
+def invariants(windows: Float[jax.Array, "b n 6"]) -> Float[jax.Array, "b n 6"]:
+    """What of every sample a turn about z leaves: |a|, |ω|, a · ω and a × ω of the horizontal
+    parts, the vertical acceleration without gravity and the vertical rate."""
+    accel, gyro = windows[..., 0:2], windows[..., 3:5]
+    values = (
+        length(accel),
+        length(gyro),
+        jnp.sum(accel * gyro, axis=-1),
+        jnp.sum(quarter_turn(accel) * gyro, axis=-1),
+        windows[..., 2] - GRAVITY,
+        windows[..., 5],
+    )
+    return jnp.stack(values, axis=-1)
+
+
+def length(vectors: Float[jax.Array, "*k 2"]) -> Float[jax.Array, "*k"]:
+    """Lengths, with zero derivative at 0."""
+    squared = jnp.sum(vectors**2, axis=-1)
+    return jnp.where(squared > 0, jnp.sqrt(jnp.where(squared > 0, squared, 1.0)), 0.0)
+
+
+def quarter_turn(vectors: Float[jax.Array, "*k 2"]) -> Float[jax.Array, "*k 2"]:
+    """Horizontal vectors turned by 90°."""
+    return jnp.stack([-vectors[..., 1], vectors[..., 0]], axis=-1)
+
+
+def opposite(heading: Float[jax.Array, "b 2"]) -> Float[jax.Array, "b 2"]:
+    """The headings of the opposite angles."""
+    return heading * jnp.float32([[1, -1]])
+
+
+def turn(
+    vectors: Float[jax.Array, "b *n 3"], heading: Float[jax.Array, "b 2"]
+) -> Float[jax.Array, "b *n 3"]:
+    """Vectors turned about z by the heading of their row."""
+    cosine, sine = _components(heading, vectors.ndim - 2)
+    x, y, z = jnp.moveaxis(vectors, -1, 0)
+    return jnp.stack([cosine * x - sine * y, sine * x + cosine * y, z], axis=-1)
+
+
+def turn_windows(
+    windows: Float[jax.Array, "b n 6"], heading: Float[jax.Array, "b 2"]
+) -> Float[jax.Array, "b n 6"]:
+    """Windows turned about z: acceleration and angular rate are both vectors."""
+    batch, samples, _ = windows.shape
+    return turn(windows.reshape(batch, samples, 2, 3), heading).reshape(windows.shape)
+
+
+def turn_log_std(
+    log_std: Float[jax.Array, "b *n 3"], heading: Float[jax.Array, "b 2"]
+) -> Float[jax.Array, "b *n 3"]:
+    """Of the covariance diag(exp 2u) turned about z the diagonal, as log standard deviations.
+
+    In logarithms, where nothing overflows. The squares of cosine and sine are kept from 0, so that
+    the derivative is finite.
+    """
+    squared = jnp.maximum(heading**2, jnp.float32(1e-30))
+    log_cosine, log_sine = _components(jnp.log(squared), log_std.ndim - 2)
+    x, y, z = jnp.moveaxis(2 * log_std, -1, 0)
+    turned = (
+        jnp.logaddexp(x + log_cosine, y + log_sine),
+        jnp.logaddexp(x + log_sine, y + log_cosine),
+        z,
+    )
+    return 0.5 * jnp.stack(turned, axis=-1)
+
+
+def turn_prediction(prediction: Prediction, heading: Float[jax.Array, "b 2"]) -> Prediction:
+    """The prediction turned about z, with the velocities among its diagnostics."""
+    diagnostics = dict(prediction.diagnostics)
+    for name, turned in (("velocity", turn), ("velocity_log_std", turn_log_std)):
+        if name in diagnostics:
+            diagnostics[name] = turned(diagnostics[name], heading)
+    return Prediction(
+        turn(prediction.displacement, heading),
+        turn_log_std(prediction.log_std, heading),
+        diagnostics,
+    )
+
+
+def _components(
+    heading: Float[jax.Array, "b 2"], axes: int
+) -> tuple[Float[jax.Array, "b *n"], Float[jax.Array, "b *n"]]:
+    """Both columns, with so many axes of length 1 behind the batch."""
+    columns = heading.reshape(-1, *[1] * axes, 2)
+    return columns[..., 0], columns[..., 1]

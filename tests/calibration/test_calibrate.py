@@ -1,0 +1,112 @@
+"""A calibrated run: what is written, what is refused, and what evaluation makes of it."""
+
+import dataclasses
+import json
+
+import jax
+import numpy as np
+import pytest
+
+from gnio_jax import calibration, data
+from gnio_jax.calibration.errors import std_factors
+from gnio_jax.commands import app
+from gnio_jax.config import CalibrateConfig, DataConfig, FilterOptions, ModelConfig, TrainConfig
+from gnio_jax.data.readers import synthetic
+from gnio_jax.errors import InputError
+from gnio_jax.evaluation import Estimate, Trajectory
+from gnio_jax.training import checkpoint
+from tests.support import drawn_run
+
+TRAINED = TrainConfig(
+    data=DataConfig(rate=50.0),
+    model=ModelConfig(width=2, bank_size=4, bank_heads=2),
+    filter=FilterOptions(velocity_std=0.7),
+)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    return drawn_run.save(
+        tmp_path_factory.mktemp("trained") / "run",
+        TRAINED,
+        lambda random, kind, shape: random.uniform(0.05, 0.2, shape),
+    )
+
+
+@pytest.fixture
+def two_walks(monkeypatch):
+    """Every split has two short walks; the splits that were read."""
+    walks = [
+        synthetic.pedestrian(seed, synthetic.person(seed), "handheld", 14.0, 50.0)
+        for seed in (1, 2)
+    ]
+    read = []
+    monkeypatch.setattr(data, "load", lambda name, root, split, *_: read.append(split) or walks)
+    return read
+
+
+def test_the_run_differs_in_the_filter_alone(run, two_walks, tmp_path, capsys):
+    out = tmp_path / "calibrated"
+    words = ["calibrate", "--workdir", str(run), "--out", str(out), "--steps", "2"]
+    app.main([*words, "--fit", "measurement", "window"])
+    told = capsys.readouterr().out
+    assert "std_factor_x" in told and f"gnio evaluate --workdir {out}" in told
+    assert two_walks == ["val"]
+    before, after = (checkpoint.load_run(folder) for folder in (run, out))
+    changed = dataclasses.replace(
+        after.config, workdir=before.config.workdir, filter=before.config.filter
+    )
+    assert changed == before.config
+    jax.tree.map(np.testing.assert_array_equal, after.variables, before.variables)
+    found = after.config.filter
+    assert found.velocity_std == 0.7 and found.gyro_density == TRAINED.filter.gyro_density
+    assert found.window_error_share > 0 and found.std_factor_x != 1
+    about = json.loads((out / "calibration.json").read_text())
+    likelihood = about["negative_log_likelihood_per_innovation"]
+    assert likelihood["after"] < likelihood["before"]
+    assert about["split"] == "val" and about["filter"] == dataclasses.asdict(found)
+
+
+@pytest.mark.parametrize(
+    ("options", "problem"),
+    [
+        ({"split": "test"}, "neither the validation nor the training split"),
+        ({"out": "."}, "is there already"),
+    ],
+)
+def test_what_is_refused(run, two_walks, options, problem):
+    with pytest.raises(InputError, match=problem):
+        calibration.calibrate(CalibrateConfig(workdir=str(run), **options))
+    assert two_walks == []
+
+
+def test_the_split_may_be_that_of_training(run, two_walks, tmp_path):
+    options = CalibrateConfig(str(run), str(tmp_path / "out"), split="train", steps=1)
+    calibration.calibrate(dataclasses.replace(options, fit=("measurement",)))
+    assert two_walks == ["train"]
+
+
+def estimate(error, std):
+    rows = len(error) + 2
+    path = Trajectory(np.arange(rows), np.zeros((rows, 3)), np.zeros((rows, 4)))
+    before = np.full((2, 3), np.nan)
+    return Estimate(
+        "walk",
+        path,
+        path,
+        displacement=np.concatenate([before, 1.0 + error]),
+        displacement_std=np.concatenate([before, std]),
+    )
+
+
+def test_the_factors_are_those_of_the_errors():
+    rng = np.random.default_rng(0)
+    std = rng.uniform(0.05, 0.2, (400, 3))
+    error = std * np.array([1.5, 0.5, 3.0]) * rng.choice([-1.0, 1.0], (400, 3))
+    truth = np.ones((400, 3))
+    truth[:50, 1] = np.nan
+    found = std_factors([estimate(error, std)], [truth])
+    np.testing.assert_allclose(found, [1.5, 0.5, 3.0], rtol=1e-12)
+    with pytest.raises(ValueError, match="10 windows have a reference"):
+        truth[:390] = np.nan
+        std_factors([estimate(error, std)], [truth])

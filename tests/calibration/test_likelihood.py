@@ -1,0 +1,67 @@
+"""Fitted options against the noises that simulated walks were made with, and the gradient against
+differences."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from gnio_jax import filtering
+from gnio_jax.calibration.likelihood import Walks, fit, innovation_objective
+from gnio_jax.calibration.unknowns import UNKNOWNS, chosen, from_free, to_free, with_starts, written
+from gnio_jax.config import DataConfig, FilterOptions
+from tests.support.walks import simulate
+
+DATA = DataConfig(rate=50.0, window_seconds=0.4, stride_seconds=0.1)
+STRIDES, N, CLONES, SIGMA = 400, 5, 4, 0.05
+TRUE = FilterOptions(
+    gyro_density=2e-3, accel_density=2e-2, measurement_scale=1.0, gyro_bias_std=1e-3
+)
+
+
+@functools.cache
+def walks():
+    """Eight walks whose displacements err by `SIGMA`, while the network says a third of it."""
+    noise = filtering.NoiseModel(2e-3, 2e-2, 1e-6, 1e-4)
+    std = filtering.InitialStd(gyro_bias=1e-3)
+    runs = simulate(5, 8, STRIDES, N, CLONES, 1 / DATA.rate, noise, std, SIGMA)
+    start = (runs[0], runs[1], runs[2], np.zeros((8, 3)))
+    told = np.full_like(runs.displacement, SIGMA / 3)
+    return Walks(*start, runs.gyro, runs.accel, runs.displacement, told)
+
+
+def test_the_noises_of_simulated_walks_are_found():
+    unknowns = (*chosen(("measurement",)), *UNKNOWNS["noise"][:2])
+    wrong = dataclasses.replace(TRUE, gyro_density=3e-4, accel_density=2e-1)
+    found = fit(walks(), DATA, wrong, unknowns, lambda calls: None)
+    assert found.after < found.before - 0.1
+    assert found.options.measurement_scale == pytest.approx(9.0, rel=0.15)
+    assert found.options.gyro_density == pytest.approx(2e-3, rel=0.4)
+    assert found.options.accel_density == pytest.approx(2e-2, rel=0.4)
+
+
+def test_the_gradient_is_that_of_the_likelihood():
+    unknowns = chosen(tuple(UNKNOWNS))
+    options = with_starts(TRUE, unknowns)
+    objective = jax.jit(innovation_objective(walks(), DATA, options, unknowns))
+    free = to_free(options, unknowns)
+    gradient = np.asarray(jax.jit(jax.grad(objective))(free))
+    assert (gradient != 0).all()
+    for i, step in enumerate(1e-4 * np.eye(len(free))):
+        difference = (objective(free + step) - objective(free - step)) / 2e-4
+        np.testing.assert_allclose(gradient[i], difference, rtol=1e-3, atol=1e-7)
+
+
+def test_unknowns_go_to_numbers_without_bounds_and_back():
+    unknowns = chosen(tuple(UNKNOWNS))
+    options = with_starts(dataclasses.replace(TRUE, window_error_seconds=0.7), unknowns)
+    assert options.window_error_share == 0.8 and options.window_error_seconds == 0.7
+    back = from_free(jnp.asarray(to_free(options, unknowns)), unknowns)
+    for unknown in unknowns:
+        wanted = getattr(options, unknown.field)
+        np.testing.assert_allclose(back[unknown.field], wanted, rtol=1e-12)
+    found = written(FilterOptions(measurement_scale=3.0), {"gyro_density": jnp.asarray(1.23456)})
+    assert found == FilterOptions(measurement_scale=3.0, gyro_density=1.235)
