@@ -35,6 +35,7 @@ def initial_run(config: TrainConfig) -> Run | None:
 def _description(config: TrainConfig) -> dict[str, Any]:
     """What makes a network the same: its kind and options, and the windows that it reads."""
     model = create_model(config)
+    model = getattr(model, "network", model)  # what an equivariant construction is made around
     options = {
         f"model.{field.name}": getattr(model, field.name)
         for field in dataclasses.fields(model)
@@ -44,7 +45,8 @@ def _description(config: TrainConfig) -> dict[str, Any]:
         f"data.{name}": getattr(config.data, name)
         for name in ("rate", "window_seconds", "window_rotation")
     }
-    return {"model.name": config.model.name, **options, **windows}
+    kind = {f"model.{name}": getattr(config.model, name) for name in ("name", "equivariance")}
+    return {**kind, **options, **windows}
 
 
 def with_weights(state: TrainState, run: Run) -> TrainState:
