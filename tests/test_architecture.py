@@ -14,7 +14,7 @@ ROOMS = {
     "data": BASE,
     "models": BASE,
     "filtering": BASE,
-    "training": BASE | {"data", "models"},
+    "training": BASE | {"data", "models", "filtering"},
     "evaluation": BASE | {"data", "models", "filtering", "training"},
     "calibration": BASE | {"data", "filtering", "training", "evaluation"},
     "interop": BASE | {"models", "training"},

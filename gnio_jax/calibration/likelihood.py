@@ -15,8 +15,8 @@ from scipy.optimize import minimize
 from gnio_jax.calibration.unknowns import PRIOR_STD, Unknown, from_free, to_free, written
 from gnio_jax.config import DataConfig, FilterOptions
 from gnio_jax.evaluation import filter_setup
-from gnio_jax.evaluation.setup import initial_std, noise_model
 from gnio_jax.filtering import FilterConfig, initial_state, over_sequences, repeat_odometry
+from gnio_jax.filtering.options import initial_std, noise_model
 from gnio_jax.types import Array
 
 CHECKPOINT_EVERY = 50

@@ -26,13 +26,20 @@ the reference's displacements."""
 
 
 def defaults(options: EvaluateConfig) -> EvaluateConfig:
-    """The newest run, where none is named, and the filter options of the run."""
+    """The newest run, where none is named, and the filter options that it has or has learnt."""
     workdir = Path(options.workdir or configuration.newest_run())
     default = EvaluateConfig(workdir=str(workdir))
     kept = workdir / "config.yaml"
     if not kept.is_file():
         return default
-    return dataclasses.replace(default, filter=configuration.load(kept).filter)
+    config = configuration.load(kept)
+    if config.through_filter.learn:
+        from gnio_jax import filtering
+        from gnio_jax.evaluation.run import run_config
+
+        filtering.cores_as_devices()  # before the checkpoint's arrays settle the devices
+        config = run_config(workdir, options.checkpoint)
+    return dataclasses.replace(default, filter=config.filter)
 
 
 def evaluate(config: EvaluateConfig, _prog: str) -> None:

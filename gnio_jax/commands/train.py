@@ -20,10 +20,13 @@ DESCRIPTION = """Train a network and leave a run: config.yaml, checkpoints, logs
   {prog} --config quickstart --workdir runs/demo
   {prog} --dataset tlio --data-root ~/tlio --workdir runs/tlio
   {prog} --workdir runs/tlio --resume
+  {prog} --config through_filter_oxiod --init-from runs/oxiod --workdir runs/through
 
 --config FILE reads options from a YAML file, or from one of the experiments that come with the
 package; options given here win over it. --resume continues a run from its latest checkpoint as if
-it had never stopped. The defaults are the paper's settings."""
+it had never stopped. --init-from RUN starts from the weights of a run with the same network; with
+--through-filter.learn, network and filter then learn as one program. The defaults are the paper's
+settings."""
 
 
 @dataclass(frozen=True)
@@ -58,8 +61,11 @@ def defaults(options: TrainOptions) -> TrainOptions | None:
 def train(options: TrainOptions, prog: str) -> None:
     """Train, and say how to go on."""
     # After the options: --help and mistakes do not wait for these imports.
+    from gnio_jax import filtering
     from gnio_jax.training import loop
 
+    if options.through_filter.learn:
+        filtering.cores_as_devices()  # the filter's operations are too small for several cores
     with console.terminal() as terminal:
         try:
             outcome = loop.train(options.experiment(), options.resume, terminal, usable_cores())

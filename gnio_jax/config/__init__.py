@@ -18,6 +18,7 @@ from gnio_jax.config.schema import (
     TablesConfig,
     TrainConfig,
 )
+from gnio_jax.config.through_filter import ThroughFilter
 from gnio_jax.config.validation import validate
 from gnio_jax.config.yaml_files import find, load, names, save
 
@@ -31,6 +32,7 @@ __all__ = [
     "ModelConfig",
     "OptimConfig",
     "TablesConfig",
+    "ThroughFilter",
     "TrainConfig",
     "default_workdir",
     "find",

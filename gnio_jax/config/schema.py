@@ -21,7 +21,10 @@ from gnio_jax.config.bounds import (
     Probability,
     TwoOrThree,
 )
+from gnio_jax.config.through_filter import ThroughFilter
 from gnio_jax.errors import InputError
+
+_INIT_FROM = "name its run with --init-from"
 
 Table = Literal[
     "complexity",
@@ -284,6 +287,9 @@ class TrainConfig:
     """Folder of the dataset; by default $GNIO_DATA/<dataset>, then data/<dataset>."""
     workdir: str | None = None
     """Folder for checkpoints and logs; by default runs/<dataset>_<model>."""
+    init_from: str | None = None
+    """Folder of a run with the same network, whose best weights training starts from, and whose
+    filter if that has learnt; by default the weights are drawn."""
     seed: int = 0
     """Seed of the initial parameters, the shuffling and the augmentation."""
     data: DataConfig = field(default_factory=DataConfig)
@@ -292,15 +298,42 @@ class TrainConfig:
     loss: LossConfig = field(default_factory=LossConfig)
     optim: OptimConfig = field(default_factory=OptimConfig)
     filter: FilterOptions = field(default_factory=FilterOptions)
+    through_filter: ThroughFilter = field(default_factory=ThroughFilter)
     checkpoint_every_seconds: float = 600.0
     """Longest time between checkpoints within an epoch, s; every epoch ends with one anyway."""
 
     def check(self, prefix: str, source: str) -> None:
-        """Four headings are averaged only if training shows windows of every heading."""
+        """Four headings are averaged only if training shows windows of every heading. A network
+        that learns through the filter has weights, and its pieces are whole strides and longer
+        than a window."""
         if self.model.equivariance == "four_headings" and not self.augment.yaw:
             problem = f"field '{prefix}model.equivariance' is four_headings without augment.yaw"
             remedy = "training must show every heading: set augment.yaw to true"
             raise InputError(source, problem, remedy)
+        self._check_through_filter(prefix, source)
+
+    def _check_through_filter(self, prefix: str, source: str) -> None:
+        through = self.through_filter
+        if not through.learn:
+            return
+        if self.optim.ema_decay:
+            problem = f"field '{prefix}optim.ema_decay' is for training on windows alone"
+            raise InputError(source, problem, "set it to 0")
+        if self.init_from is None:
+            problem = "needs the weights of a network that has been trained on windows"
+            raise InputError(source, f"field '{prefix}through_filter.learn' {problem}", _INIT_FROM)
+        for name in ("piece_seconds", "truncate_seconds"):
+            strides = getattr(through, name) / self.data.stride_seconds
+            if abs(strides - round(strides)) >= 1e-6:
+                problem = f"is not a whole number of strides of {self.data.stride_seconds:g} s"
+                raise InputError(source, f"field '{prefix}through_filter.{name}' {problem}")
+        if through.gate_softness > 0 and self.filter.mahalanobis_fail_scale > 0:
+            problem = "makes no sense beside filter.mahalanobis_fail_scale"
+            field_name = f"field '{prefix}through_filter.gate_softness'"
+            raise InputError(source, f"{field_name} {problem}", "set one of them to 0")
+        if through.piece_seconds < self.data.window_seconds + 2 * self.data.stride_seconds:
+            problem = f"must be longer than the window of {self.data.window_seconds:g} s"
+            raise InputError(source, f"field '{prefix}through_filter.piece_seconds' {problem}")
 
 
 @dataclass(frozen=True)

@@ -107,6 +107,8 @@ def _value(hint: Any, value: Any, source: str, name: str) -> Any:
     options = typing.get_args(hint) if union else (hint,)
     if value is None and type(None) in options:
         return None
+    if typing.get_origin(hint) is tuple:
+        return _list(typing.get_args(hint)[0], value, source, name)
     for option in options:
         if typing.get_origin(option) is Literal:
             if value in typing.get_args(option):
@@ -118,6 +120,13 @@ def _value(hint: Any, value: Any, source: str, name: str) -> Any:
     wanted = " or ".join(_spell(option) for option in options)
     problem = f"field '{name}' must be {wanted}, found {value!r}"
     raise InputError(source, problem, _number_hint(value) if float in options else "")
+
+
+def _list(hint: Any, value: Any, source: str, name: str) -> tuple:
+    """The values of a list of any length, each of the type `hint`."""
+    if not isinstance(value, list):
+        raise InputError(source, f"field '{name}' must be a list, found {value!r}")
+    return tuple(_value(hint, each, source, name) for each in value)
 
 
 def _number_hint(value: Any) -> str:

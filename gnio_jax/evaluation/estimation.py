@@ -25,13 +25,12 @@ from gnio_jax.evaluation.metrics import Trajectory
 from gnio_jax.evaluation.preparation import Prepared
 from gnio_jax.evaluation.setup import (
     DEFAULT_SETUP,
-    FilterSetup,
     OnShare,
     Setup,
-    filter_setup,
     no_progress,
     resolve,
 )
+from gnio_jax.filtering.options import FilterSetup, filter_setup
 from gnio_jax.types import Prediction
 
 PERFECT_STD = 0.01

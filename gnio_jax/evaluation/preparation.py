@@ -12,8 +12,9 @@ from gnio_jax import data
 from gnio_jax.config import DataConfig, FilterOptions
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation.metrics import Trajectory
-from gnio_jax.evaluation.setup import DEFAULT_SETUP, Setup, filter_setup, resolve
+from gnio_jax.evaluation.setup import DEFAULT_SETUP, Setup, resolve
 from gnio_jax.filtering import level_state
+from gnio_jax.filtering.options import filter_setup
 from gnio_jax.numerics import finite_rows, matrix_from_quaternion, rotations
 from gnio_jax.types import Sequence
 

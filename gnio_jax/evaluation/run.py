@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 
@@ -157,6 +157,19 @@ def _set_up(config: EvaluateConfig) -> Job:
     return Job(workdir, trained, network, provenance, checked.filter, setup, dataset, root)
 
 
+def run_config(workdir: Path, which: Literal["best", "latest"] = "best") -> TrainConfig:
+    """The settings of a run; the filter's options as this checkpoint has learnt them, if they did.
+
+    Raises `InputError` if they did and there is no checkpoint.
+    """
+    config = configuration.load(workdir / "config.yaml")
+    if not config.through_filter.learn:
+        return config
+    from gnio_jax.training import checkpoint  # Orbax takes seconds to import
+
+    return checkpoint.load_run(workdir, which).config
+
+
 def _load_run(
     workdir: Path, config: EvaluateConfig
 ) -> tuple[TrainConfig, Network | None, dict[str, Any]]:
@@ -165,7 +178,7 @@ def _load_run(
     kept = workdir / "config.yaml"
     if config.estimator == "imu_only" and kept.is_file():
         nothing: dict[str, Any] = dict.fromkeys(("model", "checkpoint", "epoch", "step"))
-        return configuration.load(kept), None, nothing
+        return run_config(workdir, config.checkpoint), None, nothing
     from gnio_jax.training import checkpoint  # Orbax takes seconds to import
 
     run = checkpoint.load_run(workdir, config.checkpoint)

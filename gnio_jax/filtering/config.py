@@ -36,7 +36,12 @@ _NOT_NEGATIVE = (
     "gap_gyro_std",
     "gap_accel_std",
 )
-_LEAST_COUNT = {"samples_per_clone": 1, "clones_per_window": 1, "checkpoint_every": 0}
+_LEAST_COUNT = {
+    "samples_per_clone": 1,
+    "clones_per_window": 1,
+    "checkpoint_every": 0,
+    "truncate_every": 0,
+}
 
 
 @no_type_check  # The tests' run-time checker would refuse what __post_init__ converts or names.
@@ -98,6 +103,9 @@ class FilterConfig:
     checkpoint_every: int = 0
     """Clone intervals between the states kept for the backward pass, all else being computed again:
     memory for time. 0 keeps everything."""
+    truncate_every: int = 0
+    """Clone intervals after which the state is carried on without gradient, for training on long
+    recordings: values stay as they are. The final state has no gradient then. 0 never."""
     window_rotation: Literal["per_sample", "single", "tlio"] = "per_sample"
     """Rotate each sample of the network's window with its own attitude, or all with that of the
     start (paper eq. 1 read literally), or cut and rotate it as TLIO's tracker does: one sample

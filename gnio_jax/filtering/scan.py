@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from gnio_jax.filtering.checkpointing import checkpointed_scan
+from gnio_jax.filtering.checkpointing import truncated_scan
 from gnio_jax.filtering.clones import unroll_clones
 from gnio_jax.filtering.config import FilterConfig, YawFrame
 from gnio_jax.filtering.displacement import Measurement, scaled_measurement
@@ -199,7 +199,8 @@ def _scan(
         return clone_step(state, imu, of_step, number % config.clones, config, noise, frame)
 
     inputs = numbers, by_interval, measurements
-    state, records = checkpointed_scan(step, state, inputs, config.checkpoint_every)
+    bounds = config.checkpoint_every, config.truncate_every
+    state, records = truncated_scan(step, state, inputs, *bounds)
     oldest_held = age.reshape(len(numbers), config.samples_per_clone).max(1)
     history = stacked_history(records, oldest_held, state.healthy, config)
     memory = memory._replace(quiet=state.imu.quiet)

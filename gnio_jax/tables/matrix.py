@@ -16,7 +16,7 @@ from gnio_jax import evaluation
 from gnio_jax.config import EvaluateConfig, TablesConfig
 from gnio_jax.evaluation import metrics, report
 from gnio_jax.evaluation.metrics import Trajectory
-from gnio_jax.evaluation.run import folder_name
+from gnio_jax.evaluation.run import folder_name, run_config
 from gnio_jax.evaluation.tum import read_tum
 from gnio_jax.reporting import Reporter
 from gnio_jax.tables.experiments import Cell
@@ -93,7 +93,7 @@ def evaluated(
 
 def _evaluation(workdir: Path, split: str, estimator: str) -> tuple[EvaluateConfig, Path]:
     """How `evaluated` evaluates a run, and the folder where that leaves its files."""
-    trained = configuration.load(workdir / "config.yaml")
+    trained = run_config(workdir)
     config = EvaluateConfig(
         str(workdir), split=split, estimator=estimator, plots=False, filter=trained.filter
     )  # type: ignore[arg-type]

@@ -8,6 +8,7 @@ previous one whole.
 
 from __future__ import annotations
 
+import dataclasses
 import logging
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -21,6 +22,7 @@ from gnio_jax import config as configuration
 from gnio_jax import models
 from gnio_jax.config import TrainConfig
 from gnio_jax.errors import InputError
+from gnio_jax.training import learnt as learning
 from gnio_jax.training.optimizer import Plateau
 from gnio_jax.training.step import TrainState, evaluated
 
@@ -38,8 +40,8 @@ class Position(NamedTuple):
     best_loss: float | None
     """Smallest value on the validation split, since the last switch of what is trained, of what
     `optim.best_by` names."""
-    loss_sums: tuple[float, float, float]
-    """Training losses summed over the steps of the epoch in progress."""
+    loss_sums: tuple[float, ...]
+    """Training losses summed over the steps of the epoch in progress; none before the first."""
     seconds: float
     """Time spent training so far."""
     plateau: Plateau = Plateau()
@@ -52,10 +54,13 @@ class Run(NamedTuple):
     """A trained network as evaluation needs it."""
 
     config: TrainConfig
+    """Its section `filter` has the values that have learnt."""
     model: nn.Module
     variables: Any
     epoch: int
     step: int
+    filter: dict[str, Any] = {}
+    """Options of the filter as they learn (`learnt.unconstrained`), if they do."""
 
 
 def create_model(config: TrainConfig) -> nn.Module:
@@ -101,7 +106,7 @@ class Checkpoints:
         manager = self._managers[which]
         if position.step in manager.all_steps():
             return
-        variables = _variables(state)
+        variables = evaluated(state).variables
         meta = {"position": position._asdict(), "shapes": _shapes(variables)}
         items = {"variables": ocp.args.StandardSave(variables), "meta": ocp.args.JsonSave(meta)}
         if which == "latest":
@@ -120,17 +125,16 @@ class Checkpoints:
         where = self._workdir / "checkpoints" / "latest"
         if step is None:
             raise InputError(where, "holds no checkpoint", "start the run without --resume")
-        wanted = {"variables": _variables(template), "optimizer": template.opt_state}
+        wanted = {"variables": evaluated(template).variables, "optimizer": template.opt_state}
         if template.average is not None:
             wanted["training"] = template.params
         meta = _checked_meta(manager, step, wanted["variables"], where)
         items = {name: ocp.args.StandardRestore(tree) for name, tree in wanted.items()}
         restored = manager.restore(step, args=ocp.args.Composite(**items))
-        params, batch_stats = (restored["variables"][name] for name in ("params", "batch_stats"))
-        state = TrainState(jnp.int32(step), params, batch_stats, restored["optimizer"])
+        state = TrainState.of(jnp.int32(step), restored["variables"], restored["optimizer"])
         if template.average is not None:
-            state = state._replace(params=restored["training"], average=params)
-        return _uncommitted(state), _position(meta["position"])
+            state = state._replace(params=restored["training"], average=state.params)
+        return uncommitted(state), _position(meta["position"])
 
 
 def load_run(workdir: Path, which: Which = "best") -> Run:
@@ -161,6 +165,8 @@ def load_run(workdir: Path, which: Which = "best") -> Run:
         model.init, jax.random.key(0), jax.ShapeDtypeStruct((1, config.data.window, 6), jnp.float32)
     )
     template = {"params": template["params"], "batch_stats": template.get("batch_stats", {})}
+    if config.through_filter.learn:
+        template["filter"] = learning.unconstrained(config.filter)
     with _manager(where, create=False) as manager:
         step = manager.latest_step()
         meta = _checked_meta(manager, step, template, where)
@@ -174,12 +180,11 @@ def load_run(workdir: Path, which: Which = "best") -> Run:
                 f"cannot be read ({str(error)[:120]})",
                 "the checkpoint is damaged",
             ) from None
-    return Run(config, model, _uncommitted(variables), meta["position"]["epoch"], step)
-
-
-def _variables(state: TrainState) -> dict[str, Any]:
-    """What evaluation loads."""
-    return {"params": evaluated(state).params, "batch_stats": state.batch_stats}
+    variables = uncommitted(variables)
+    numbers = variables.pop("filter", {})
+    options = learning.learnt_options(config.filter, numbers)
+    config = dataclasses.replace(config, filter=options)
+    return Run(config, model, variables, meta["position"]["epoch"], step, numbers)
 
 
 def _manager(folder: Path, create: bool) -> ocp.CheckpointManager:
@@ -189,8 +194,9 @@ def _manager(folder: Path, create: bool) -> ocp.CheckpointManager:
     return ocp.CheckpointManager(folder.absolute(), options=options)
 
 
-def _uncommitted(tree: Any) -> Any:
-    """Plain copies of arrays that Orbax has committed to a device: one compiled step for both."""
+def uncommitted(tree: Any) -> Any:
+    """Plain copies of arrays that are committed to a device, or to several: one compiled step for
+    both."""
     return jax.tree.map(lambda x: jnp.array(jax.device_get(x)), tree)
 
 

@@ -3,6 +3,7 @@ GNIO is compared with."""
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any, NamedTuple
 
 import jax
@@ -67,6 +68,31 @@ def create(
     if config.clip_norm is not None:
         parts.insert(0, optax.clip_by_global_norm(config.clip_norm))
     return optax.with_extra_args_support(optax.chain(*parts) if len(parts) > 1 else parts[0])
+
+
+def create_through_filter(
+    config: OptimConfig, filter_learning_rate: float, steps_per_epoch: int
+) -> optax.GradientTransformationExtraArgs:
+    """One optimizer for the network's parameters, and one for what else learns through the filter,
+    with the same schedule but another peak. The gradient of each is clipped apart."""
+    ratio = filter_learning_rate / config.learning_rate
+    of_filter = dataclasses.replace(
+        config,
+        learning_rate=filter_learning_rate,
+        start_learning_rate=ratio * config.start_learning_rate,
+        end_learning_rate=ratio * config.end_learning_rate,
+        weight_decay=0.0,
+    )
+    optimizers = {
+        "params": create(config, LossConfig(), steps_per_epoch),
+        "batch_stats": create(of_filter, LossConfig(), steps_per_epoch),
+        "filter": create(of_filter, LossConfig(), steps_per_epoch),
+    }
+    return optax.partition(optimizers, _collections)
+
+
+def _collections(learnt: Any) -> Any:
+    return {name: jax.tree.map(lambda _, name=name: name, tree) for name, tree in learnt.items()}
 
 
 def _kinds(params: Any) -> Any:

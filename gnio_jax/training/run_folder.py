@@ -12,7 +12,7 @@ from gnio_jax.config import TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.files import write_text
 
-MAY_CHANGE = ("workdir", "data_root", "checkpoint_every_seconds")
+MAY_CHANGE = ("workdir", "data_root", "init_from", "checkpoint_every_seconds")
 """Settings that a resumed run may change: where things lie, not what is computed."""
 
 

@@ -31,6 +31,21 @@ class TrainState(NamedTuple):
     opt_state: Any
     average: Any = None
     """Moving average of `params` (`optim.ema_decay`); None where none is kept."""
+    filter: Any = {}
+    """Options of the filter as they learn (`learnt.unconstrained`); none in training on windows."""
+
+    @property
+    def variables(self) -> dict[str, Any]:
+        """Variables by collection: the network's, and "filter" if that learns."""
+        network = {"params": self.params, "batch_stats": self.batch_stats}
+        return network | ({"filter": self.filter} if self.filter else {})
+
+    @classmethod
+    def of(cls, step: jax.Array, variables: dict[str, Any], opt_state: Any) -> TrainState:
+        """The state whose `variables` these are."""
+        params, batch_stats = variables["params"], variables["batch_stats"]
+        numbers = variables.get("filter", {})
+        return cls(step, params, batch_stats, opt_state, filter=numbers)
 
 
 class Validation(NamedTuple):
@@ -46,8 +61,9 @@ class Validation(NamedTuple):
 class Progress(NamedTuple):
     """What a run of steps reports."""
 
-    sums: Losses
-    """Losses summed over the steps."""
+    sums: Any
+    """Losses summed over the steps: a NamedTuple of scalars, the first of them what is minimised.
+    """
     gradient_norms: dict[str, Float[jax.Array, ""]]
     """Norms of the gradient by part of the network (`gradient_norms`), summed over the steps."""
     failed_step: Int[jax.Array, ""]

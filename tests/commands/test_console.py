@@ -45,6 +45,15 @@ def test_flags_and_optional_values():
     )
 
 
+def test_a_list_of_words():
+    given = ["--through-filter.learn", "noise", "head", "--through-filter.piece-seconds", "30"]
+    parsed = parse(*given).through_filter
+    assert parsed.learn == ("noise", "head") and parsed.piece_seconds == 30
+    told = mistake("--through-filter.learn", "noise", "gate")
+    assert told.startswith("--through-filter.learn: must be words out of noise, measurement, ")
+    assert "found 'gate'" in told
+
+
 def test_negative_numbers_are_values():
     assert parse("--seed", "-1").seed == -1
     assert parse("--loss.log-std-floor", "-6.9").loss.log_std_floor == -6.9

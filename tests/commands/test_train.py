@@ -84,6 +84,14 @@ def test_mistakes(monkeypatch, capsys, tmp_path, arguments, expected):
             "model: {head: gatd}",
             "field 'model.head' must be one of gated, linear or null, found 'gatd'",
         ),
+        (
+            "through_filter: {learn: noise}",
+            "field 'through_filter.learn' must be a list, found 'noise'",
+        ),
+        (
+            "through_filter: {learn: [noise, gate]}",
+            "field 'through_filter.learn' must be one of noise, measurement, start, ",
+        ),
         ("optim: 3", "optim must be a mapping"),
         ("- 1", "must be a mapping"),
         ("a: [", "is not YAML"),
@@ -144,9 +152,10 @@ def test_the_papers_configs_are_the_papers():
 
 
 def test_a_config_survives_its_file(tmp_path):
-    config = configuration.load(ROOT / "configs" / "gnio_oxiod_small.yaml")
-    configuration.save(tmp_path / "kept.yaml", config)
-    assert configuration.load(tmp_path / "kept.yaml") == config
+    for name in ("gnio_oxiod_small", "through_filter_oxiod"):
+        config = configuration.load(ROOT / "configs" / f"{name}.yaml")
+        configuration.save(tmp_path / "kept.yaml", config)
+        assert configuration.load(tmp_path / "kept.yaml") == config
 
 
 def test_help_teaches():

@@ -330,3 +330,32 @@ def test_gradient_reaches_the_network():
         rtol=2e-3,
         atol=2e-3 * np.abs(expected).max(),
     )
+
+
+def test_a_truncated_gradient_is_that_of_two_runs():
+    """Values are those of one run; the second half starts from a state that counts as given."""
+    half, gyro, accel = INTERVALS // 2, *recording(2)
+    spread = jnp.tile(0.01 * jnp.eye(3)[None], (INTERVALS, 1, 1))
+    truncated = filtering.FilterConfig(DT, N, CLONES, truncate_every=half)
+
+    def runs(x, config, parts):
+        noise = filtering.NoiseModel(*(jnp.array([1e-2, 1e-1, 1e-2, 1e-1]) * jnp.exp(x["noise"])))
+        state, histories = start(config), []
+        state = state._replace(velocity=state.velocity + x["velocity"])
+        for first, last in parts:
+            rows, samples = slice(first, last), slice(N * first, N * last)
+            given = gyro[samples], accel[samples], MEASURED[rows], spread[rows]
+            state, history = filtering.run_filter(state, *given, config, noise)
+            state = jax.lax.stop_gradient(state)
+            histories.append(history)
+        return of_history(jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *histories))
+
+    of_runs = quick(jax.value_and_grad(runs), static_argnums=(1, 2))
+    x = dict(noise=np.zeros(4), velocity=np.zeros(3))
+    value, gradient = of_runs(x, truncated, ((0, INTERVALS),))
+    expected, wanted = of_runs(x, PLAIN, ((0, half), (half, INTERVALS)))
+    np.testing.assert_allclose(value, expected, rtol=1e-12)
+    for name in x:
+        np.testing.assert_allclose(gradient[name], wanted[name], rtol=1e-9, err_msg=name)
+    whole = GRADIENT(point())[1]
+    assert np.abs(whole["noise"] / gradient["noise"] - 1).max() > 0.01

@@ -21,7 +21,7 @@ from gnio_jax import config as configuration
 from gnio_jax.config import DataConfig, LossConfig, ModelConfig, OptimConfig, TrainConfig
 from gnio_jax.data import windows
 from gnio_jax.errors import InputError
-from gnio_jax.training import checkpoint, loop, optimizer, step
+from gnio_jax.training import checkpoint, loop, on_windows, optimizer, step
 from gnio_jax.training.losses import Losses
 from tests.support.runs import shared_programs
 from tests.support.tlio_files import write_sequence
@@ -179,7 +179,7 @@ def test_a_run_that_averages_is_resumed_to_the_bit(recording, averaged, tmp_path
             os.kill(os.getpid(), signal.SIGTERM)
         return real(*arguments, **options)
 
-    monkeypatch.setattr(loop, "train_steps", stopping)
+    monkeypatch.setattr(on_windows, "train_steps", stopping)
     monkeypatch.setattr(loop, "DISPATCH_SECONDS", 0.01)
     config = averaging(recording, tmp_path / "run")
     assert loop.train(config).stopped_by == signal.SIGTERM
@@ -235,7 +235,7 @@ def test_stopping_within_an_epoch_and_resuming_gives_the_same_bits(
             os.kill(os.getpid(), signal.SIGTERM)
         return real(*arguments, **options)
 
-    monkeypatch.setattr(loop, "train_steps", stopping)
+    monkeypatch.setattr(on_windows, "train_steps", stopping)
     monkeypatch.setattr(loop, "DISPATCH_SECONDS", 0.01)
     outcome = loop.train(tiny(recording, tmp_path / "run"))
     assert outcome.stopped_by == signal.SIGTERM
@@ -372,8 +372,8 @@ def test_two_stage_loss_without_float64(recording, tmp_path, monkeypatch):
 
         return spying
 
-    monkeypatch.setattr(loop, "train_steps", spy(step.train_steps))
-    monkeypatch.setattr(loop, "validate", spy(step.validate))
+    monkeypatch.setattr(on_windows, "train_steps", spy(step.train_steps))
+    monkeypatch.setattr(on_windows, "validate", spy(step.validate))
     loop.train(
         tiny(
             recording,
@@ -456,7 +456,7 @@ def test_the_best_checkpoint_begins_anew_where_what_is_trained_changes(
             Losses(jnp.float32(loss), jnp.float32(mse), jnp.float32(0)), one, one
         )
 
-    monkeypatch.setattr(loop, "validate", validated)
+    monkeypatch.setattr(on_windows, "validate", validated)
     for criterion, best, epoch in (("loss", 6.0, 4), ("squared_error", 4.0, 3)):
         # before, with the switch, the first whole epoch, one more
         said = iter([(-100.0, 1.0), (-50.0, 2.0), (7.0, 4.0), (6.0, 5.0)])

@@ -8,9 +8,8 @@ import pytest
 
 from gnio_jax.config import LossConfig, ModelConfig, OptimConfig, TrainConfig
 from gnio_jax.models.heads import CalibratedUncertainty
-from gnio_jax.training import loop, losses, optimizer
+from gnio_jax.training import losses, on_windows, optimizer
 from gnio_jax.training.losses import Losses
-from gnio_jax.training.setup import Run
 from gnio_jax.training.step import TrainState, Validation, calibrated, isotropic
 from gnio_jax.types import Prediction, Windows
 
@@ -214,10 +213,11 @@ def test_constants_of_an_equivariant_network_are_the_same_along_both_axes(
     state = TrainState(jnp.int32(7), {}, stats, ())
     errors = jnp.array([1.0, 4.0, 9.0], jnp.float32)
     found = Validation(Losses(*[jnp.float32(0)] * 3), errors, errors)
-    monkeypatch.setattr(loop, "validate", lambda *_, **__: found)
+    monkeypatch.setattr(on_windows, "validate", lambda *_, **__: found)
     config = TrainConfig(model=ModelConfig(equivariance=equivariance))
-    nothing = dict.fromkeys(Run._fields) | {"config": config, "steps_per_epoch": 7}
-    constants = loop._validate(Run(**nothing), state, 7)[0].batch_stats["uncertainty"]["log_std"]
+    nothing = dict.fromkeys(on_windows.WindowTraining._fields)
+    training = on_windows.WindowTraining(**nothing | {"config": config, "steps_per_epoch": 7})
+    constants = training.validate(state, 7)[0].batch_stats["uncertainty"]["log_std"]
     wanted = [1.0, 4.0, 9.0] if equivariance == "none" else [2.5, 2.5, 9.0]
     np.testing.assert_allclose(np.exp(2 * constants), wanted, rtol=1e-6)
     np.testing.assert_allclose(isotropic(found).axis_normalised, [2.5, 2.5, 9.0], rtol=1e-6)

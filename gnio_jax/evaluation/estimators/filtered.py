@@ -19,7 +19,7 @@ from gnio_jax.evaluation.estimators.result import Estimate
 from gnio_jax.evaluation.inference import Network, keep_diagnostics
 from gnio_jax.evaluation.metrics import Trajectory
 from gnio_jax.evaluation.preparation import Prepared
-from gnio_jax.evaluation.setup import FilterSetup, OnShare, no_progress
+from gnio_jax.evaluation.setup import OnShare, no_progress
 from gnio_jax.filtering import (
     FilterConfig,
     FilterHistory,
@@ -30,6 +30,7 @@ from gnio_jax.filtering import (
     run_filter,
     run_odometry,
 )
+from gnio_jax.filtering.options import FilterSetup
 from gnio_jax.numerics import quaternion_from_matrix
 from gnio_jax.types import Array
 

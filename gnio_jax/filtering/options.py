@@ -1,0 +1,78 @@
+"""The filter that an experiment's options describe."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+from gnio_jax.config import DataConfig, FilterOptions
+from gnio_jax.filtering.config import FilterConfig
+from gnio_jax.filtering.lasting_errors import LastingErrors
+from gnio_jax.filtering.noise import InitialStd, NoiseModel
+
+DEGREE = math.pi / 180
+"""rad."""
+
+
+class FilterSetup(NamedTuple):
+    """A filter as the options ask for it."""
+
+    config: FilterConfig
+    noise: NoiseModel
+    initial_std: InitialStd
+
+
+def filter_setup(windows: DataConfig, options: FilterOptions) -> FilterSetup:
+    """The filter for the windows and strides that a network was trained with."""
+    config = FilterConfig(
+        dt=1.0 / windows.rate,
+        samples_per_clone=windows.stride,
+        clones_per_window=windows.window // windows.stride,
+        mahalanobis_fail_scale=options.mahalanobis_fail_scale,
+        measurement_scale=options.measurement_scale,
+        history="core",
+        window_rotation=options.window_rotation or windows.window_rotation,
+    )
+    return FilterSetup(config, noise_model(vars(options)), initial_std(vars(options)))
+
+
+def noise_model(options: Mapping[str, Any]) -> NoiseModel:
+    """The filter's noises, from the fields of its options; their values may be traced."""
+    return NoiseModel(
+        gyro_density=options["gyro_density"],
+        accel_density=options["accel_density"],
+        gyro_bias_walk=options["gyro_bias_walk"],
+        accel_bias_walk=options["accel_bias_walk"],
+        std_factor=tuple(options[f"std_factor_{axis}"] for axis in "xyz"),
+        displacement=_lasting_errors(options),
+    )
+
+
+def initial_std(options: Mapping[str, Any]) -> InitialStd:
+    """The standard deviations of the filter's start, as `noise_model` takes the options."""
+    return InitialStd(
+        tilt=options["tilt_std_degrees"] * DEGREE,
+        yaw=options["yaw_std_degrees"] * DEGREE,
+        velocity=options["velocity_std"],
+        position=options["position_std"],
+        gyro_bias=options["gyro_bias_std"],
+        accel_bias=options["accel_bias_std"],
+    )
+
+
+def _lasting_errors(options: Mapping[str, Any]) -> LastingErrors | None:
+    """None where no error of the displacements lasts."""
+    sizes = [
+        options[name]
+        for name in ("window_error_share", "scale_error_std", "heading_error_std_degrees")
+    ]
+    if all(isinstance(size, int | float) and size == 0 for size in sizes):
+        return None
+    return LastingErrors(
+        window_share=options["window_error_share"],
+        window_seconds=options["window_error_seconds"],
+        scale_std=options["scale_error_std"],
+        heading_std=options["heading_error_std_degrees"] * DEGREE,
+        walk_seconds=options["walk_error_seconds"],
+    )

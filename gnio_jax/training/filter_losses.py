@@ -1,0 +1,182 @@
+"""Losses of a piece that went through the filter: of its path, of what the filter says of its own
+errors, and of the displacements it was told.
+
+Each is a pure function of arrays, differentiable, and a mean over the piece. The scale-free errors
+have the form of KITTI's benchmark (Geiger et al. 2012) and of AI-IMU's training (Brossard et al.
+2020, §IV-C).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Float
+
+from gnio_jax import geometry
+from gnio_jax.config import ThroughFilter
+from gnio_jax.filtering import FilterConfig, FilterHistory
+from gnio_jax.training.pieces import Path
+from gnio_jax.types import Array
+
+HORIZON_SECONDS = (1.0, 5.0, 10.0, 30.0, 60.0)
+"""Times over which relative errors are taken, as far as a piece reaches."""
+DISTANCE_FLOOR = 1.0
+"""Added in squares to the distance that an error is divided by, m: standing still is no singular
+point (ours)."""
+VELOCITY_POSITION = slice(3, 9)
+"""Of the core error θ, v, p, b_g, b_a."""
+
+
+class FilterLosses(NamedTuple):
+    """Losses of one piece, or means over several."""
+
+    total: Float[Array, ""]
+    """What training minimises."""
+    displacement: Float[Array, "h"]
+    """`relative_displacement` of each horizon."""
+    yaw: Float[Array, "h"]
+    """`relative_yaw` of each horizon, 1/m²."""
+    innovation: Float[Array, ""]
+    """`innovation_nll`."""
+    state: Float[Array, ""]
+    """`gaussian_nll` of the true velocity (m/s) and position (m)."""
+    window: Float[Array, ""]
+    """`window_error`, m²."""
+
+
+def horizons(config: FilterConfig, intervals: int) -> list[int]:
+    """The horizons within a piece of `intervals` clone intervals, in clone intervals."""
+    counts = [round(seconds / config.clone_seconds) for seconds in HORIZON_SECONDS]
+    return [count for count in counts if 1 <= count <= intervals]
+
+
+def filter_losses(
+    estimate: Path,
+    truth: Path,
+    history: FilterHistory,
+    config: FilterConfig,
+    weights: ThroughFilter,
+) -> FilterLosses:
+    """All losses of a piece, and their sum with the weights.
+
+    `estimate` begins with the filter's start; `history` has the whole core covariance.
+    """
+    assert history.covariance is not None
+    counts = horizons(config, len(truth.position) - 1)
+    displacement = jnp.stack([relative_displacement(estimate, truth, count) for count in counts])
+    yaw = jnp.stack([relative_yaw(estimate, truth, count) for count in counts])
+    innovation = innovation_nll(history.log_likelihood)
+    error = jnp.concatenate(
+        [truth.velocity - estimate.velocity, truth.position - estimate.position], axis=1
+    )
+    # Differences of positions have no covariance in the history. The start is as good as certain,
+    # so the position's own covariance is that of the displacement from the start (ours).
+    covariance = history.covariance[:, VELOCITY_POSITION, VELOCITY_POSITION]
+    state = gaussian_nll(error[1:], covariance)
+    window = window_error(history.displacement, estimate, truth, config.clones_per_window)
+    total = (
+        weights.displacement_weight * jnp.mean(displacement)
+        + weights.yaw_weight * jnp.mean(yaw)
+        + weights.innovation_weight * innovation
+        + weights.state_weight * state
+        + weights.window_weight * window
+    )
+    return FilterLosses(total, displacement, yaw, innovation, state, window)
+
+
+def yaw_errors(
+    estimate: Float[Array, "k 3 3"], truth: Float[Array, "k 3 3"]
+) -> tuple[Float[jax.Array, "k"], Float[jax.Array, "k"]]:
+    """Cosine and sine of the yaw of R̂ Rᵀ, which turns the true attitude into the estimated one.
+
+    Unlike the difference of two yaws it has no singular point near the truth.
+    """
+    turn = jnp.einsum("kij,klj->kil", estimate, truth)
+    return jax.vmap(geometry.yaw_direction)(turn)
+
+
+def relative_displacement(estimate: Path, truth: Path, count: int) -> Float[jax.Array, ""]:
+    """‖Rz(ψ_i)ᵀ (p̂_j − p̂_i) − (p_j − p_i)‖² / (distance² + floor²), j = i + `count`, mean over i.
+
+    ψ_i is the yaw error at i, so what went wrong before i does not count; distance is that walked
+    from i to j, m.
+    """
+    cosine, sine = (part[:-count] for part in yaw_errors(estimate.rotation, truth.rotation))
+    moved = estimate.position[count:] - estimate.position[:-count]
+    x = cosine * moved[:, 0] + sine * moved[:, 1]
+    y = cosine * moved[:, 1] - sine * moved[:, 0]
+    true_moved = truth.position[count:] - truth.position[:-count]
+    error = jnp.stack([x, y, moved[:, 2]], axis=1) - true_moved
+    return jnp.mean(jnp.sum(error**2, axis=1) / _squared_distance(truth.position, count))
+
+
+def relative_yaw(estimate: Path, truth: Path, count: int) -> Float[jax.Array, ""]:
+    """4 sin²((ψ_j − ψ_i)/2) / (distance² + floor²), j = i + `count`, mean over i; 1/m².
+
+    ψ is the yaw error; for small changes the numerator is (ψ_j − ψ_i)², rad².
+    """
+    cosine, sine = yaw_errors(estimate.rotation, truth.rotation)
+    change = (cosine[count:] - cosine[:-count]) ** 2 + (sine[count:] - sine[:-count]) ** 2
+    return jnp.mean(change / _squared_distance(truth.position, count))
+
+
+def _squared_distance(position: Float[Array, "k 3"], count: int) -> Float[jax.Array, "i"]:
+    """Length of the path over `count` rows from each row on, squared, and the floor; m²."""
+    step = jnp.diff(position, axis=0)
+    walked = jnp.cumsum(jnp.sqrt(jnp.sum(step**2, axis=1)))
+    walked = jnp.concatenate([jnp.zeros_like(walked[:1]), walked])
+    return (walked[count:] - walked[:-count]) ** 2 + DISTANCE_FLOOR**2
+
+
+def innovation_nll(log_likelihood: Float[Array, "k"]) -> Float[jax.Array, ""]:
+    """Mean of −ln N(r; 0, S) over the measurements; rows of NaN are none, and 0 if all are."""
+    present = jnp.isfinite(log_likelihood)
+    total = jnp.sum(jnp.where(present, log_likelihood, 0.0))
+    return -total / jnp.maximum(jnp.sum(present), 1)
+
+
+def gaussian_nll(
+    error: Float[Array, "k d"], covariance: Float[Array, "k d d"]
+) -> Float[jax.Array, ""]:
+    """Mean over k of −ln N(e_k; 0, P_k), without its constant."""
+    root = jnp.linalg.cholesky(covariance)
+    log_volume = jnp.sum(jnp.log(jnp.diagonal(root, axis1=1, axis2=2)), axis=1)
+    return jnp.mean(0.5 * _squares(error, root) + log_volume)
+
+
+def normalised_squares(
+    error: Float[Array, "k d"], covariance: Float[Array, "k d d"]
+) -> Float[jax.Array, "k"]:
+    """eᵀ P⁻¹ e."""
+    return _squares(error, jnp.linalg.cholesky(covariance))
+
+
+def _squares(error: Float[Array, "k d"], root: Float[Array, "k d d"]) -> Float[jax.Array, "k"]:
+    whitened = jax.scipy.linalg.solve_triangular(root, error[:, :, None], lower=True)
+    return jnp.sum(whitened[:, :, 0] ** 2, axis=1)
+
+
+def window_error(
+    displacement: Float[Array, "k 3"], estimate: Path, truth: Path, clones_per_window: int
+) -> Float[jax.Array, ""]:
+    """Squared error of the measured displacements, summed over the axes, mean over the windows, m².
+
+    Row k spans from the (k − W)-th clone to the k-th; rows of NaN are none. The network tells a
+    displacement in the yaw frame of the filter's own attitude, and sees nothing of that attitude's
+    yaw error; so the truth is turned by that error before it is told in the same frame.
+    """
+    first, last = slice(1, -clones_per_window), slice(1 + clones_per_window, None)
+    moved = truth.position[last] - truth.position[first]
+    own = jax.lax.stop_gradient(estimate.rotation[first])
+    own_cosine, own_sine = jax.vmap(geometry.yaw_direction)(own)
+    cosine, sine = yaw_errors(own, truth.rotation[first])
+    # By the yaw error, then into the filter's own yaw frame: one turn about z.
+    c, s = own_cosine * cosine + own_sine * sine, own_cosine * sine - own_sine * cosine
+    x, y = c * moved[:, 0] - s * moved[:, 1], s * moved[:, 0] + c * moved[:, 1]
+    told = displacement[clones_per_window:]
+    error = told - jnp.stack([x, y, moved[:, 2]], axis=1)
+    present = jnp.all(jnp.isfinite(told), axis=1)
+    squared = jnp.sum(jnp.where(present[:, None], error, 0.0) ** 2, axis=1)
+    return jnp.sum(squared) / jnp.maximum(jnp.sum(present), 1)

@@ -1,0 +1,67 @@
+"""Training from the weights of another run."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+from gnio_jax.config import TrainConfig
+from gnio_jax.errors import InputError
+from gnio_jax.training.checkpoint import Run, create_model, load_run
+from gnio_jax.training.step import TrainState
+
+
+def initial_run(config: TrainConfig) -> Run | None:
+    """The run that `config.init_from` names, if any.
+
+    Raises `InputError` for a folder without a run, and for one whose network is not that of
+    `config`. A calibrated uncertainty may follow a plain head, since its parameters are the same.
+    """
+    if config.init_from is None:
+        return None
+    run = load_run(Path(config.init_from))
+    theirs, ours = (_description(each) for each in (run.config, config))
+    head_to_calibrated = ("head", "calibrated")
+    if (theirs.get("model.uncertainty"), ours.get("model.uncertainty")) == head_to_calibrated:
+        ours["model.uncertainty"] = "head"
+    for name in theirs | ours:
+        if theirs.get(name) != ours.get(name):
+            problem = f"its {name} is {theirs.get(name)}, and here it is {ours.get(name)}"
+            raise InputError(config.init_from, problem, "describe the same network")
+    return run
+
+
+def _description(config: TrainConfig) -> dict[str, Any]:
+    """What makes a network the same: its kind and options, and the windows that it reads."""
+    model = create_model(config)
+    model = getattr(model, "network", model)  # what an equivariant construction is made around
+    options = {
+        f"model.{field.name}": getattr(model, field.name)
+        for field in dataclasses.fields(model)
+        if field.name not in ("parent", "name")
+    }
+    windows = {
+        f"data.{name}": getattr(config.data, name)
+        for name in ("rate", "window_seconds", "window_rotation")
+    }
+    kind = {f"model.{name}": getattr(config.model, name) for name in ("name", "equivariance")}
+    return {**kind, **options, **windows}
+
+
+def with_weights(state: TrainState, run: Run) -> TrainState:
+    """A fresh state with the variables of a run; what that does not have stays as it is. The state
+    of the optimizer does not change."""
+    variables = {**run.variables, "filter": run.filter}
+    found = _overlaid(state.variables, variables)
+    return TrainState.of(state.step, found, state.opt_state)
+
+
+def _overlaid(tree: dict[str, Any], other: dict[str, Any]) -> dict[str, Any]:
+    """`tree` with the leaves that `other` has in the same places."""
+    return {
+        name: _overlaid(leaf, other.get(name, {}))
+        if isinstance(leaf, dict)
+        else other.get(name, leaf)
+        for name, leaf in tree.items()
+    }

@@ -1,0 +1,122 @@
+"""What learns through the filter: modules of the network, factors of its σ, and options of the
+filter.
+
+The filter's options learn as unconstrained numbers: logarithms, and the logit of the one that is a
+share. They lie beside the network's variables as the collection "filter", by the names of
+`FilterOptions`' fields, float32 like the network.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Iterable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from gnio_jax.config import FilterOptions
+from gnio_jax.training.optimizer import UNCERTAINTY
+
+FILTER_PARTS = {
+    "noise": ("gyro_density", "accel_density", "gyro_bias_walk", "accel_bias_walk"),
+    "measurement": (
+        "measurement_scale",
+        "std_factor_x",
+        "std_factor_y",
+        "std_factor_z",
+        "window_error_share",
+        "window_error_seconds",
+        "scale_error_std",
+        "heading_error_std_degrees",
+        "walk_error_seconds",
+    ),
+    "start": (
+        "tilt_std_degrees",
+        "yaw_std_degrees",
+        "velocity_std",
+        "position_std",
+        "gyro_bias_std",
+        "accel_bias_std",
+    ),
+}
+"""Fields of `FilterOptions` that each part of the filter has."""
+
+HEADS = ("head", "displacement")
+"""Names of the networks' modules from which the displacement comes."""
+TEMPERATURE = "uncertainty"
+"""Module whose `batch_stats` are factors or constants of σ, as logarithms (`models.heads`)."""
+SHARES = ("window_error_share",)
+"""Fields between 0 and 1; the others are positive."""
+
+Learnt = dict[str, dict[str, Any]]
+"""Variables that learn, by collection: "params", "batch_stats", "filter"; none of them empty."""
+
+
+def unconstrained(options: FilterOptions) -> dict[str, Float[jax.Array, ""]]:
+    """The numbers that stand for the filter's options. An option that is 0 is switched off, and has
+    none."""
+    found = {}
+    for name in (name for names in FILTER_PARTS.values() for name in names):
+        value = getattr(options, name)
+        if value > 0:
+            number = math.log(value) - (math.log1p(-value) if name in SHARES else 0.0)
+            found[name] = jnp.float32(number)
+    return found
+
+
+def natural(numbers: dict[str, Float[jax.Array, ""]]) -> dict[str, Float[jax.Array, ""]]:
+    """The values of options, float64, from their unconstrained numbers. Differentiable."""
+    wide = {name: number.astype(jnp.float64) for name, number in numbers.items()}
+    return {
+        name: jax.nn.sigmoid(number) if name in SHARES else jnp.exp(number)
+        for name, number in wide.items()
+    }
+
+
+def learnt_options(options: FilterOptions, numbers: dict[str, Any]) -> FilterOptions:
+    """The filter's options with the values that have learnt, to the six digits that float32 has."""
+    values = {}
+    for name, number in numbers.items():
+        wide = float(np.float64(number))
+        value = 1 / (1 + math.exp(-wide)) if name in SHARES else math.exp(wide)
+        values[name] = float(f"{value:.6g}")
+    return dataclasses.replace(options, **values)
+
+
+def chosen(variables: Any, learn: Iterable[str]) -> Learnt:
+    """The variables that learn, out of the network's and the filter's."""
+    parts = set(learn)
+    if "all" in parts:
+        parts = {*FILTER_PARTS, "uncertainty", "head", "encoder"}
+    names = {name for part in parts for name in FILTER_PARTS.get(part, ())}
+    found = {
+        "params": _those(variables["params"], lambda module: module_part(module) in parts),
+        "batch_stats": _those(
+            variables["batch_stats"],
+            lambda module: module == TEMPERATURE and "measurement" in parts,
+        ),
+        "filter": _those(variables["filter"], lambda name: name in names),
+    }
+    return {collection: tree for collection, tree in found.items() if tree}
+
+
+def _those(tree: dict[str, Any], wanted: Any) -> dict[str, Any]:
+    return {name: leaf for name, leaf in tree.items() if wanted(name)}
+
+
+def module_part(module: str) -> str:
+    """The part of the network that one of its modules belongs to."""
+    if module in UNCERTAINTY:
+        return "uncertainty"
+    return "head" if module in HEADS else "encoder"
+
+
+def merged(variables: Any, learnt: Learnt) -> Any:
+    """All variables, with those that learn in their places."""
+    return {
+        collection: {**tree, **learnt.get(collection, {})} for collection, tree in variables.items()
+    }

@@ -1,0 +1,188 @@
+"""Training on windows: each one apart, against the displacement of the reference."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import linen as nn
+
+from gnio_jax.config import TrainConfig
+from gnio_jax.data import windows
+from gnio_jax.reporting import Reporter
+from gnio_jax.training import optimizer as optimizers
+from gnio_jax.training.checkpoint import Run, create_model
+from gnio_jax.training.initial import with_weights
+from gnio_jax.training.kinds import (
+    Keys,
+    describe_split,
+    keys_of,
+    read_split,
+    size_of,
+    steps_in_epoch,
+)
+from gnio_jax.training.log import Row
+from gnio_jax.training.losses import stage, switches
+from gnio_jax.training.step import (
+    Progress,
+    TrainState,
+    calibrated,
+    calibrates,
+    create_state,
+    epoch_order,
+    estimate_statistics,
+    evaluated,
+    isotropic,
+    normalises,
+    train_steps,
+    validate,
+)
+
+
+class WindowTraining(NamedTuple):
+    """A `kinds.Training`."""
+
+    config: TrainConfig
+    model: nn.Module
+    optimizer: optax.GradientTransformationExtraArgs
+    schedule: optax.Schedule
+    source: windows.WindowSource
+    """Training windows."""
+    held_out: windows.WindowSource
+    """Validation windows."""
+    splits: dict[str, list[str]]
+    steps_per_epoch: int
+    keys: Keys
+    unit: str = "windows"
+
+    @property
+    def changes(self) -> tuple[int, ...]:
+        return switches(self.config.loss, self.steps_per_epoch)
+
+    def new_state(self, start: Run | None) -> TrainState:
+        window, decay = self.config.data.window, self.config.optim.ema_decay
+        state = create_state(self.model, self.optimizer, self.keys.init, window, decay)
+        if start is None:
+            return state
+        state = with_weights(state, start)
+        average = jax.tree.map(jnp.copy, state.params) if decay else None
+        return state._replace(opt_state=self.optimizer.init(state.params), average=average)
+
+    def describe(self, state: TrainState, workdir: Path, reporter: Reporter) -> None:
+        optim, steps = self.config.optim, self.steps_per_epoch
+        reporter.line(
+            f"{self.config.model.name}: {size_of(state.params):,} parameters on "
+            f"{jax.devices()[0].platform}, {steps} steps of {optim.batch_size} windows an epoch, "
+            f"{optim.epochs} epochs → {workdir}"
+        )
+        likelihood, uncertainty = self.changes
+        for what, step in (
+            ("the likelihood counts", likelihood),
+            ("the uncertainty learns", uncertainty),
+        ):
+            if step > 0:
+                reporter.line(f"{what} from step {step:,} of {optim.epochs * steps:,}")
+
+    def learning_rate(self, step: int) -> float:
+        return float(self.schedule(step))
+
+    def order(self, epoch: int) -> jax.Array:
+        return epoch_order(self.keys.order, epoch, self.source)
+
+    def take_steps(
+        self,
+        state: TrainState,
+        order: jax.Array,
+        first: int,
+        count: int,
+        learning_rate_factor: float,
+    ) -> tuple[TrainState, Progress]:
+        return train_steps(
+            state,
+            self.source,
+            order,
+            jnp.int32(first),
+            jnp.int32(count),
+            jnp.float32(learning_rate_factor),
+            self.keys.step,
+            model=self.model,
+            optimizer=self.optimizer,
+            config=self.config,
+        )
+
+    def settled(self, state: TrainState) -> TrainState:
+        """With the statistics of its batch normalisations estimated anew, for the parameters that
+        are evaluated, if asked for."""
+        if not self.config.optim.statistics_windows or not normalises(state):
+            return state
+        options = {"model": self.model, "config": self.config}
+        key = self.keys.statistics
+        estimated = estimate_statistics(evaluated(state), self.source, key, **options)
+        return state._replace(batch_stats=estimated.batch_stats)
+
+    def validate(self, state: TrainState, step: int) -> tuple[TrainState, Row]:
+        """With its uncertainty calibrated where it has constants for that."""
+        now = stage(self.config.loss, step - 1, self.steps_per_epoch)
+        options = {"model": self.model, "config": self.config}
+        found = validate(evaluated(state), source=self.held_out, now=now, **options)
+        if calibrates(state):
+            equivariant = self.config.model.equivariance != "none"
+            state = calibrated(state, isotropic(found) if equivariant else found)
+            found = validate(evaluated(state), source=self.held_out, now=now, **options)
+        loss, mse, nll = (float(each) for each in found.losses)
+        normalised = zip("xyz", found.axis_normalised, strict=True)
+        return state, {
+            "val_loss": loss,
+            "val_mse": mse,
+            "val_nll": nll,
+            "val_rmse": math.sqrt(mse),
+            **{f"val_normalised/{axis}": float(each) for axis, each in normalised},
+        }
+
+    def training_figures(self, sums: tuple[float, ...], steps: int) -> Row:
+        names = ("loss", "mse", "nll")
+        return {name: each / steps for name, each in zip(names, sums, strict=True)}
+
+    def remark(self, row: Row) -> str:
+        return ""
+
+
+def set_up(config: TrainConfig, reporter: Reporter, workers: int = 1) -> WindowTraining:
+    """Load the recordings and cut their windows.
+
+    Raises `InputError` for options that the network does not have, missing data, and a batch that
+    is larger than the split. `workers` processes read recordings that are slow to read.
+    """
+    model = create_model(config)  # a mistake in its options should not wait for the data
+    train, val = config.data.train_split, config.data.val_split
+    reporter.line(f"reading {config.dataset}: {train} and {val}")
+    stride, shift = config.data.train_stride, config.augment.shift_samples
+    source, learnt_from = _windows(config, train, stride, shift, reporter, workers)
+    stride = config.data.stride
+    held_out, validated_with = _windows(config, val, stride, 0, reporter, workers)
+    steps_per_epoch = steps_in_epoch(source.visited.shape[0], "windows", config)
+    return WindowTraining(
+        config,
+        model,
+        optimizers.create(config.optim, config.loss, steps_per_epoch),
+        optimizers.schedule(config.optim, steps_per_epoch),
+        source,
+        held_out,
+        {train: learnt_from, val: validated_with},
+        steps_per_epoch,
+        keys_of(config.seed),
+    )
+
+
+def _windows(
+    config: TrainConfig, split: str, stride: int, shift: int, reporter: Reporter, workers: int
+) -> tuple[windows.WindowSource, list[str]]:
+    """The windows of a split on the device, and the names of its recordings."""
+    sequences = read_split(config, split, reporter, workers)
+    source = windows.window_source(sequences, config.data, stride, shift)
+    describe_split(config, split, sequences, f"{source.visited.shape[0]:,} windows", reporter)
+    return jax.device_put(source), [sequence.name for sequence in sequences]

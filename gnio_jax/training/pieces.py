@@ -1,0 +1,169 @@
+"""Pieces of recordings for training through the filter: where they begin, what is known of them,
+and how wrong the filter's start is.
+
+The recordings lie on the device once, end to end, and pieces are cut inside the jitted step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int, PRNGKeyArray
+
+from gnio_jax import geometry
+from gnio_jax.errors import InputError
+from gnio_jax.filtering import InitialStd
+from gnio_jax.numerics import finite_rows, matrix_from_quaternion, spans
+from gnio_jax.types import Array, Sequence
+
+
+class PieceSource(NamedTuple):
+    """All recordings of a split, end to end, and where pieces may begin in them. float64."""
+
+    gyro: Float[Array, "t 3"]
+    """rad/s, raw."""
+    accel: Float[Array, "t 3"]
+    """m/s², raw."""
+    rotation: Float[Array, "t 3 3"]
+    """Reference, body → world; anything where it cannot be trusted, as the next two."""
+    velocity: Float[Array, "t 3"]
+    """Reference, m/s."""
+    position: Float[Array, "t 3"]
+    """Reference, m."""
+    earliest: Int[Array, "p"]
+    """First row at which each piece of an epoch may begin …"""
+    latest: Int[Array, "p"]
+    """… and the last one."""
+
+
+class Path(NamedTuple):
+    """Motion at K + 1 times: at the start, and at the end of each clone interval."""
+
+    rotation: Float[Array, "k+1 3 3"]
+    """Body → world."""
+    velocity: Float[Array, "k+1 3"]
+    """m/s."""
+    position: Float[Array, "k+1 3"]
+    """m."""
+
+
+class Piece(NamedTuple):
+    """One piece of K clone intervals of n samples."""
+
+    gyro: Float[Array, "s 3"]
+    """rad/s, raw, s = K·n."""
+    accel: Float[Array, "s 3"]
+    """m/s², raw."""
+    truth: Path
+    """The reference."""
+
+
+class StartErrors(NamedTuple):
+    """What is added to the truth for the filter's first estimate."""
+
+    rotation: Float[Array, "3"]
+    """θ of exp(θ) R, world frame, rad."""
+    velocity: Float[Array, "3"]
+    """m/s."""
+    position: Float[Array, "3"]
+    """m."""
+    gyro_bias: Float[Array, "3"]
+    """Added to a first estimate of zero, rad/s."""
+    accel_bias: Float[Array, "3"]
+    """The same, m/s²."""
+
+
+def piece_source(sequences: Iterable[Sequence], samples: int) -> PieceSource:
+    """Recordings (all at one rate) and the pieces of `samples` samples that fit in them.
+
+    A piece needs a trusted reference at each of its samples and at the one after them. A stretch of
+    L such samples has as many pieces as fit in it side by side. They may overlap: piece j of m
+    begins anywhere in the j-th of m equal shares of the rows at which a piece can begin, so that
+    every epoch meets the whole stretch, cut elsewhere. Raises `InputError` when not a single piece
+    fits.
+    """
+    parts: list[PieceSource] = []
+    rows = 0
+    for sequence in sequences:
+        part = _source_of(sequence, samples)
+        if not part.earliest.size:
+            continue
+        parts.append(part._replace(earliest=part.earliest + rows, latest=part.latest + rows))
+        rows += len(part.gyro)
+    if not parts:
+        problem = f"no piece of {samples} samples has a valid reference in any sequence"
+        raise InputError("data", problem, "lower through_filter.piece_seconds")
+    return PieceSource(*(np.concatenate(field) for field in zip(*parts, strict=True)))
+
+
+def _source_of(sequence: Sequence, samples: int) -> PieceSource:
+    """One recording's pieces, rows counted from 0."""
+    known = sequence.valid & finite_rows(sequence.velocity)
+    earliest: list[np.ndarray] = []
+    latest: list[np.ndarray] = []
+    for first, end in spans(known):
+        length = end - first
+        count = (length - 1) // samples
+        if count < 1:
+            continue
+        shares = first + (np.arange(count + 1) * (length - samples)) // count
+        earliest.append(shares[:-1])
+        latest.append(shares[1:] - 1)
+    orientation = np.where(known[:, None], sequence.orientation, [1.0, 0.0, 0.0, 0.0])
+    nothing = [np.zeros(0, np.int64)]
+    return PieceSource(
+        gyro=sequence.gyro,
+        accel=sequence.accel,
+        rotation=matrix_from_quaternion(orientation),
+        velocity=sequence.velocity,
+        position=sequence.position,
+        earliest=np.concatenate(earliest or nothing).astype(np.int32),
+        latest=np.concatenate(latest or nothing).astype(np.int32),
+    )
+
+
+def random_starts(key: PRNGKeyArray, source: PieceSource) -> Int[jax.Array, "p"]:
+    """First rows of the pieces of an epoch, in random order; a function of `key` alone."""
+    where_key, order_key = jax.random.split(key)
+    earliest, latest = jnp.asarray(source.earliest), jnp.asarray(source.latest)
+    starts = jax.random.randint(where_key, earliest.shape, earliest, latest + 1, jnp.int32)
+    return jax.random.permutation(order_key, starts)
+
+
+def cut_piece(source: PieceSource, start: Int[jax.Array, ""], intervals: int, stride: int) -> Piece:
+    """The piece of `intervals` clone intervals of `stride` samples that begins at row `start`.
+    Jittable."""
+    samples = intervals * stride
+
+    def at_clones(signal: Array) -> jax.Array:
+        rows = jax.lax.dynamic_slice_in_dim(signal, start, samples + 1)
+        return rows[::stride]
+
+    gyro, accel = (
+        jax.lax.dynamic_slice_in_dim(signal, start, samples)
+        for signal in (source.gyro, source.accel)
+    )
+    truth = (at_clones(signal) for signal in (source.rotation, source.velocity, source.position))
+    return Piece(gyro, accel, Path(*truth))
+
+
+def draw_start_errors(key: PRNGKeyArray, std: InitialStd, spread: float) -> StartErrors:
+    """Errors of a start as uncertain as `spread` times `std`. Jittable."""
+    draws = spread * jax.random.normal(key, (5, 3), jnp.float64)
+    tilt_tilt_yaw = jnp.stack([jnp.asarray(each) for each in (std.tilt, std.tilt, std.yaw)])
+    return StartErrors(
+        rotation=tilt_tilt_yaw * draws[0],
+        velocity=std.velocity * draws[1],
+        position=std.position * draws[2],
+        gyro_bias=std.gyro_bias * draws[3],
+        accel_bias=std.accel_bias * draws[4],
+    )
+
+
+def start_rotation(truth: Path, errors: StartErrors) -> Float[jax.Array, "3 3"]:
+    """The filter's first attitude: exp(θ) R of the reference."""
+    return geometry.matmul(geometry.exp(errors.rotation), truth.rotation[0])

@@ -1,0 +1,24 @@
+"""The smallest network with the parts that the others have: it compiles at once."""
+
+import jax.numpy as jnp
+from flax import linen as nn
+
+from gnio_jax.models.heads import CalibratedUncertainty, UncertaintyHead
+from gnio_jax.models.layers import linear
+from gnio_jax.types import Prediction
+
+
+class Tiny(nn.Module):
+    uncertainty: str = "head"
+
+    @nn.compact
+    def __call__(self, windows, train=False):
+        h = linear(4, "encoder")(windows.mean(axis=1))
+        norm = nn.BatchNorm(not train, dtype=jnp.float32, param_dtype=jnp.float32, name="norm")
+        h = jnp.tanh(norm(h))
+        displacement = linear(3, "head")(h)
+        if self.uncertainty == "calibrated":
+            log_std = CalibratedUncertainty(name="uncertainty")(h, train)
+        else:
+            log_std = UncertaintyHead(name="uncertainty")(h)
+        return Prediction(displacement, log_std, {})

@@ -1,0 +1,183 @@
+"""Losses of a filtered piece against plain NumPy and SciPy, row by row."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.spatial.transform import Rotation
+from scipy.stats import multivariate_normal
+
+from gnio_jax.config import ThroughFilter
+from gnio_jax.filtering import FilterConfig, FilterHistory
+from gnio_jax.training import filter_losses
+from gnio_jax.training.pieces import Path
+
+K, W = 40, 5
+CONFIG = FilterConfig(0.05, 4, W, history="core")
+"""Five clones a second: horizons of 5 and 25 intervals fit into 8 s."""
+
+
+def paths(seed=0):
+    """A true path that turns, and an estimate that is off by tilt, yaw, velocity and position; the
+    body's x axis is nearly vertical, where the difference of two yaws would be useless."""
+    rng = np.random.default_rng(seed)
+    turns = np.cumsum(0.1 * rng.standard_normal(K + 1))
+    upright = Rotation.from_euler("y", -1.5)
+    true = Rotation.from_euler("z", turns[:, None]) * upright
+    error = Rotation.from_rotvec(0.2 * rng.standard_normal((K + 1, 3)))
+    position = np.cumsum(0.3 * rng.standard_normal((K + 1, 3)), 0)
+    truth = Path(true.as_matrix(), rng.standard_normal((K + 1, 3)), position)
+    estimate = Path(
+        (error * true).as_matrix(),
+        truth.velocity + 0.1 * rng.standard_normal((K + 1, 3)),
+        position + 0.1 * rng.standard_normal((K + 1, 3)),
+    )
+    return estimate, truth
+
+
+def yaw_errors(estimate, truth):
+    turn = np.einsum("kij,klj->kil", estimate.rotation, truth.rotation)
+    return np.arctan2(turn[:, 1, 0], turn[:, 0, 0])
+
+
+def distance(position, i, j):
+    return sum(np.linalg.norm(position[m + 1] - position[m]) for m in range(i, j))
+
+
+def relative(count):
+    estimate, truth = paths()
+    psi = yaw_errors(estimate, truth)
+    displacement, yaw = [], []
+    for i in range(K + 1 - count):
+        j = i + count
+        back = Rotation.from_euler("z", -psi[i])
+        moved = back.apply(estimate.position[j] - estimate.position[i])
+        error = moved - (truth.position[j] - truth.position[i])
+        scale = distance(truth.position, i, j) ** 2 + 1.0
+        displacement.append(error @ error / scale)
+        yaw.append(4 * np.sin((psi[j] - psi[i]) / 2) ** 2 / scale)
+    return np.mean(displacement), np.mean(yaw)
+
+
+def test_relative_errors():
+    estimate, truth = paths()
+    for count in (1, 7, K):
+        displacement, yaw = relative(count)
+        found = filter_losses.relative_displacement(estimate, truth, count)
+        np.testing.assert_allclose(found, displacement, rtol=1e-12)
+        np.testing.assert_allclose(
+            filter_losses.relative_yaw(estimate, truth, count), yaw, rtol=1e-12
+        )
+
+
+def test_a_turned_and_shifted_estimate_has_no_relative_error():
+    _, truth = paths()
+    turn = Rotation.from_euler("z", 2.0)
+    moved = turn.apply(truth.position) + np.array([3.0, 2.0, 1.0])
+    estimate = Path(turn.as_matrix() @ truth.rotation, truth.velocity, moved)
+    for loss in (filter_losses.relative_displacement, filter_losses.relative_yaw):
+        assert abs(loss(estimate, truth, 7)) < 1e-25
+    # Where the path stands still, too, with a gradient.
+    still = truth._replace(position=np.zeros_like(truth.position))
+
+    def of(position):
+        return filter_losses.relative_displacement(estimate._replace(position=position), still, 3)
+
+    assert np.isfinite(jax.grad(of)(jnp.zeros((K + 1, 3)))).all()
+
+
+def test_likelihoods():
+    rng = np.random.default_rng(1)
+    roots = rng.standard_normal((K, 6, 6)) + 3 * np.eye(6)
+    covariance = roots @ roots.transpose(0, 2, 1)
+    error = rng.standard_normal((K, 6))
+    pairs = list(zip(error, covariance, strict=True))
+    expected = [-multivariate_normal(cov=p).logpdf(e) - 3 * np.log(2 * np.pi) for e, p in pairs]
+    found = filter_losses.gaussian_nll(error, covariance)
+    np.testing.assert_allclose(found, np.mean(expected), rtol=1e-9)
+    squares = [e @ np.linalg.solve(p, e) for e, p in pairs]
+    found = filter_losses.normalised_squares(error, covariance)
+    np.testing.assert_allclose(found, squares, rtol=1e-9)
+
+    likelihood = np.array([np.nan, 2.0, np.nan, 5.0])
+    assert filter_losses.innovation_nll(likelihood) == -3.5
+    assert filter_losses.innovation_nll(np.full(3, np.nan)) == 0
+    slope = jax.grad(filter_losses.innovation_nll)(jnp.asarray(likelihood))
+    np.testing.assert_array_equal(slope, [0, -0.5, 0, -0.5])
+
+
+def windows_told(estimate, truth):
+    """What a network without error says: the true displacement in the filter's own yaw frame, which
+    is off the true one by the yaw error."""
+    psi = yaw_errors(estimate, truth)
+    own = np.arctan2(estimate.rotation[:, 1, 0], estimate.rotation[:, 0, 0])
+    told = np.full((K, 3), np.nan)
+    for k in range(W, K):  # row k: after interval k, at index k + 1 of a path
+        i, j = k + 1 - W, k + 1
+        told[k] = Rotation.from_euler("z", psi[i] - own[i]).apply(
+            truth.position[j] - truth.position[i]
+        )
+    return told
+
+
+def test_window_error():
+    estimate, truth = paths()
+    told = windows_told(estimate, truth)
+    assert filter_losses.window_error(told, estimate, truth, W) < 1e-25
+    off = 0.1 * np.random.default_rng(2).standard_normal((K, 3))
+    off[10] = np.nan
+    found = filter_losses.window_error(told + off, estimate, truth, W)
+    np.testing.assert_allclose(found, np.nanmean(np.sum(off[W:] ** 2, 1)), rtol=1e-12)
+    slope = jax.grad(filter_losses.window_error)(jnp.asarray(told + off), estimate, truth, W)
+    assert np.isfinite(slope).all() and not slope[10].any() and not slope[:W].any()
+
+
+def test_the_filters_frame_is_no_part_of_the_windows_error():
+    """No gradient turns the frame to make the network right."""
+    estimate, truth = paths()
+    told = windows_told(estimate, truth) + 0.1
+
+    def of(rotation):
+        turned = estimate._replace(rotation=rotation)
+        return filter_losses.window_error(told, turned, truth, W)
+
+    assert not jax.grad(of)(jnp.asarray(estimate.rotation)).any()
+
+
+def test_the_sum_has_the_weights_and_the_horizons_that_fit():
+    estimate, truth = paths()
+    rng = np.random.default_rng(4)
+    roots = rng.standard_normal((K, 15, 15)) + 4 * np.eye(15)
+    nothing = {name: None for name in FilterHistory._fields}
+    history = FilterHistory(**nothing)._replace(
+        covariance=roots @ roots.transpose(0, 2, 1),
+        log_likelihood=rng.standard_normal(K),
+        displacement=windows_told(estimate, truth) + 0.1,
+    )
+    weights = ThroughFilter(
+        displacement_weight=2.0,
+        yaw_weight=3.0,
+        innovation_weight=5.0,
+        state_weight=7.0,
+        window_weight=11.0,
+    )
+    found = filter_losses.filter_losses(estimate, truth, history, CONFIG, weights)
+    np.testing.assert_allclose(found.displacement, [relative(5)[0], relative(25)[0]], rtol=1e-12)
+    np.testing.assert_allclose(found.yaw, [relative(5)[1], relative(25)[1]], rtol=1e-12)
+    error = np.concatenate(
+        [truth.velocity - estimate.velocity, truth.position - estimate.position], 1
+    )[1:]
+    nll = [
+        -multivariate_normal(cov=p[3:9, 3:9]).logpdf(e) - 3 * np.log(2 * np.pi)
+        for e, p in zip(error, history.covariance, strict=True)
+    ]
+    np.testing.assert_allclose(found.state, np.mean(nll), rtol=1e-9)
+    np.testing.assert_allclose(found.innovation, -history.log_likelihood.mean(), rtol=1e-12)
+    np.testing.assert_allclose(found.window, 0.03, rtol=1e-12)
+    total = (
+        2 * found.displacement.mean()
+        + 3 * found.yaw.mean()
+        + 5 * found.innovation
+        + 7 * found.state
+        + 11 * found.window
+    )
+    np.testing.assert_allclose(found.total, total, rtol=1e-12)

@@ -1,0 +1,88 @@
+"""Pieces of recordings: where they may begin, what they hold, and how wrong a start is."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from gnio_jax.errors import InputError
+from gnio_jax.filtering import InitialStd
+from gnio_jax.training import pieces
+from gnio_jax.types import Sequence
+
+SAMPLES = 20
+
+
+def sequence(length, seed=0, invalid=()):
+    rng = np.random.default_rng(seed)
+    draw = lambda columns: rng.standard_normal((length, columns))  # noqa: E731
+    valid = np.ones(length, bool)
+    valid[list(invalid)] = False
+    orientation = Rotation.random(length, random_state=seed).as_quat(scalar_first=True)
+    time = np.arange(length) / 50
+    found = Sequence("s", time, draw(3), draw(3), orientation, draw(3), draw(3), valid)
+    lost = np.where(valid[:, None], 0.0, np.nan)
+    return found._replace(position=found.position + lost, orientation=orientation + lost)
+
+
+def test_pieces_lie_in_trusted_stretches_and_cover_them_over_epochs():
+    broken = sequence(150, invalid=[45, 46, 110])
+    parts = [sequence(SAMPLES), broken, sequence(SAMPLES + 1, 1)]
+    source = pieces.piece_source(parts, SAMPLES)
+    # Stretches of 45, 63 and 39 samples, one short of 20, and one that just suffices.
+    assert len(source.earliest) == 2 + 3 + 1 + 0 + 1
+
+    keys = jax.vmap(jax.random.key)(jnp.arange(400))
+    starts = jax.vmap(pieces.random_starts, in_axes=(0, None))(keys, source)
+    starts = np.sort(starts, axis=1)
+    valid = np.concatenate([parts[1].valid, parts[2].valid])
+    for start in np.unique(starts):
+        rows = np.arange(start, start + SAMPLES + 1)
+        assert valid[rows].all() and (rows < 150).all() | (rows >= 150).all()
+    possible = [s for s in range(171 - SAMPLES) if valid[s : s + SAMPLES + 1].all()]
+    possible = [s for s in possible if not s < 150 <= s + SAMPLES]
+    assert set(np.unique(starts)) == set(possible)
+    # An epoch is a function of its key, and its order is not that of the rows.
+    again = pieces.random_starts(jax.random.key(3), source)
+    np.testing.assert_array_equal(np.sort(again), starts[3])
+    assert (np.asarray(again) != starts[3]).any()
+
+
+def test_a_piece_holds_its_samples_and_the_truth_at_its_clones():
+    whole = sequence(150, seed=2)
+    source = pieces.piece_source([whole], SAMPLES)
+    piece = jax.jit(lambda start: pieces.cut_piece(source, start, 5, 4))(jnp.int32(7))
+    np.testing.assert_array_equal(piece.gyro, whole.gyro[7:27])
+    np.testing.assert_array_equal(piece.accel, whole.accel[7:27])
+    ends = np.arange(7, 28, 4)
+    np.testing.assert_array_equal(piece.truth.velocity, whole.velocity[ends])
+    np.testing.assert_array_equal(piece.truth.position, whole.position[ends])
+    rotation = Rotation.from_quat(whole.orientation[ends], scalar_first=True).as_matrix()
+    np.testing.assert_allclose(piece.truth.rotation, rotation, atol=1e-12)
+
+
+def test_no_piece_at_all_is_a_mistake():
+    with pytest.raises(InputError, match=r"no piece of 20 samples .*piece_seconds"):
+        pieces.piece_source([sequence(SAMPLES)], SAMPLES)
+
+
+def test_start_errors_have_the_priors_deviations():
+    std = InitialStd(0.1, 0.2, 0.3, 0.4, 0.5, 0.6)
+    keys = jax.random.split(jax.random.key(0), 20_000)
+    draw = jax.jit(jax.vmap(lambda key: pieces.draw_start_errors(key, std, 2.0)))
+    found = jax.tree.map(lambda x: np.asarray(x).std(0), draw(keys))
+    np.testing.assert_allclose(found.rotation, [0.2, 0.2, 0.4], rtol=0.03)
+    for name, value in (("velocity", 0.3), ("position", 0.4), ("gyro_bias", 0.5)):
+        np.testing.assert_allclose(getattr(found, name), 3 * [2 * value], rtol=0.03)
+    np.testing.assert_allclose(found.accel_bias, 3 * [1.2], rtol=0.03)
+
+
+def test_a_start_is_turned_in_the_world():
+    whole = sequence(40, seed=3)
+    source = pieces.piece_source([whole], SAMPLES)
+    truth = pieces.cut_piece(source, jnp.int32(0), 5, 4).truth
+    nothing = jnp.zeros(3)
+    errors = pieces.StartErrors(jnp.array([0.1, -0.2, 0.3]), nothing, nothing, nothing, nothing)
+    expected = Rotation.from_rotvec([0.1, -0.2, 0.3]).as_matrix() @ np.asarray(truth.rotation[0])
+    np.testing.assert_allclose(pieces.start_rotation(truth, errors), expected, atol=1e-12)

@@ -1,0 +1,383 @@
+"""Training through the filter, with a network of one layer on walks of a few seconds."""
+
+import dataclasses
+import functools
+import json
+import os
+import signal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from gnio_jax import config as configuration
+from gnio_jax.commands import evaluate
+from gnio_jax.config import (
+    DataConfig,
+    EvaluateConfig,
+    FilterOptions,
+    ModelConfig,
+    OptimConfig,
+    ThroughFilter,
+    TrainConfig,
+)
+from gnio_jax.errors import InputError
+from gnio_jax.models import registry
+from gnio_jax.reporting import Lines
+from gnio_jax.training import (
+    checkpoint,
+    filter_step,
+    initial,
+    learnt,
+    loop,
+    on_windows,
+    through_filter,
+)
+from tests.support import drawn_run
+from tests.support.compiling import quick
+from tests.support.tiny_network import Tiny
+from tests.support.tlio_files import SPEED, TURN, write_sequence
+
+LEARN = ("noise", "measurement", "start", "head")
+WINDOW = 0.4
+OPTIONS = FilterOptions(
+    gyro_density=0.1,
+    accel_density=0.1,
+    gyro_bias_walk=1e-3,
+    accel_bias_walk=1e-2,
+    velocity_std=0.1,
+    gyro_bias_std=1e-3,
+    position_std=0.01,
+    measurement_scale=1.5,
+    window_error_share=0.3,
+    scale_error_std=0.05,
+)
+THROUGH = ThroughFilter(
+    learn=LEARN,
+    piece_seconds=2.0,
+    truncate_seconds=1.0,
+    filter_learning_rate=0.2,
+    displacement_weight=1.0,
+    yaw_weight=1.0,
+    innovation_weight=1.0,
+    state_weight=1.0,
+    window_weight=1.0,
+)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def registered():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(registry._MODELS, "tiny", Tiny)
+        yield
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    """A TLIO folder of three walks round a circle, and a run to start from."""
+    root = tmp_path_factory.mktemp("tlio")
+    for name in "abc":
+        write_sequence(root / name)
+    (root / "train_list.txt").write_text("a\nb\n")
+    for split in ("val", "test"):
+        (root / f"{split}_list.txt").write_text("c\n")
+    config = TrainConfig(
+        data=DataConfig(rate=50.0, window_seconds=WINDOW), model=ModelConfig(name="tiny")
+    )
+
+    def draw(random, kind, shape):
+        return (
+            random.uniform(0.9, 1.1, shape)
+            if kind == "batch_stats"
+            else random.normal(0, 0.1, shape)
+        )
+
+    drawn_run.save(root / "initial", config, draw)
+    return root
+
+
+def tiny(recording, workdir, **changes):
+    config = TrainConfig(
+        dataset="tlio",
+        data_root=str(recording),
+        workdir=str(workdir),
+        init_from=str(recording / "initial"),
+        data=DataConfig(rate=50.0, window_seconds=WINDOW),
+        model=ModelConfig(name="tiny", uncertainty="calibrated"),
+        optim=OptimConfig(epochs=2, batch_size=4, learning_rate=1e-3, warmup_epochs=0.5),
+        filter=OPTIONS,
+        through_filter=THROUGH,
+    )
+    return dataclasses.replace(config, **changes)
+
+
+@pytest.fixture(scope="module")
+def finished(recording, tmp_path_factory):
+    """A run of two epochs that nothing interrupted."""
+    workdir = tmp_path_factory.mktemp("finished") / "run"
+    loop.train(tiny(recording, workdir))
+    return workdir
+
+
+def rows(workdir):
+    return [json.loads(line) for line in (workdir / "metrics.jsonl").read_text().splitlines()]
+
+
+def same(a, b):
+    return all(jax.tree.leaves(jax.tree.map(np.array_equal, a, b)))
+
+
+def test_a_run_logs_its_losses_and_what_the_filter_knows_of_its_errors(finished):
+    found = rows(finished)
+    # 12 s have five pieces of 2 s, since the sample at the end of each is needed; two walks.
+    assert [(row["epoch"], row["step"]) for row in found] == [(0, 2), (1, 4)]
+    for row in found:
+        parts = ("displacement", "yaw", "innovation", "state", "mse")
+        assert row["loss"] == pytest.approx(sum(row[part] for part in parts), rel=1e-6)
+        assert row["skipped"] == 0 and row["pieces_per_second"] > 0
+        assert row["val_rmse"] == pytest.approx(row["val_mse"] ** 0.5)
+        assert row["val_nis"] > 0 and row["val_nees"] > 0
+        assert row["gradient_norm/head"] > 0 and row["gradient_norm/filter/gyro_density"] > 0
+        val = row["val_mse"] + row["val_innovation"] + row["val_state"]
+        val += row["val_displacement_error/1s"] ** 2 + row["val_yaw_error/1s"] ** 2
+        assert row["val_loss"] == pytest.approx(val, rel=1e-6)
+
+
+def test_what_is_not_to_learn_stays_to_the_bit(recording, finished):
+    before = checkpoint.load_run(recording / "initial")
+    after = checkpoint.load_run(finished, "latest")
+    for module, parameters in before.variables["params"].items():
+        assert same(parameters, after.variables["params"][module]) == (module != "head"), module
+    statistics = after.variables["batch_stats"]
+    assert same(before.variables["batch_stats"]["norm"], statistics["norm"])
+    assert (np.asarray(statistics["uncertainty"]["log_factor"]) != 0).all()
+    told, options = vars(OPTIONS), vars(after.config.filter)
+    numbers = {name for part in learnt.FILTER_PARTS.values() for name in part}
+    changed = {name for name in told if told[name] != options[name]}
+    assert changed == numbers - {"heading_error_std_degrees"}  # which is 0
+    assert configuration.load(finished / "config.yaml").filter == OPTIONS
+
+
+def test_stopped_and_resumed_gives_the_same_bits(recording, finished, tmp_path, monkeypatch):
+    real = filter_step.train_steps
+
+    def stopping(*arguments, **options):
+        os.kill(os.getpid(), signal.SIGTERM)
+        return real(*arguments, **options)
+
+    monkeypatch.setattr(through_filter, "train_steps", stopping)
+    run = tmp_path / "run"
+    assert loop.train(tiny(recording, run)).stopped_by == signal.SIGTERM
+    assert checkpoint.load_run(run, "latest").step == 1
+    monkeypatch.setattr(through_filter, "train_steps", real)
+    # The weights that it started from are not needed any more.
+    resumed = tiny(recording, run, init_from="gone")
+    assert loop.train(resumed, resume=True).stopped_by is None
+    for which in ("latest", "best"):
+        ours, theirs = (checkpoint.load_run(folder, which) for folder in (run, finished))
+        assert ours.step == theirs.step
+        assert same(ours.variables, theirs.variables) and same(ours.filter, theirs.filter)
+    for ours, theirs in zip(rows(run), rows(finished), strict=True):
+        for row in (ours, theirs):
+            row.pop("pieces_per_second"), row.pop("seconds")
+        assert ours == pytest.approx(theirs, rel=1e-9)
+
+
+def test_evaluation_takes_what_the_filter_has_learnt(finished, capsys):
+    evaluate.main(["--workdir", str(finished), "--no-plots"])
+    learnt_values = dataclasses.asdict(checkpoint.load_run(finished).config.filter)
+    metrics = json.loads((finished / "eval" / "tlio_test_ekf" / "metrics.json").read_text())
+    assert metrics["settings"]["filter"] == learnt_values
+    assert learnt_values["gyro_density"] != OPTIONS.gyro_density
+    # The latest checkpoint's are the defaults where that is asked for.
+    latest = checkpoint.load_run(finished, "latest").config.filter
+    asked = EvaluateConfig(workdir=str(finished), checkpoint="latest")
+    assert evaluate.defaults(asked).filter == latest
+
+
+@pytest.fixture(scope="module")
+def training(recording, tmp_path_factory):
+    """The data and the steps of a run that is never written."""
+    with jax.enable_x64(True):
+        return through_filter.set_up(tiny(recording, tmp_path_factory.mktemp("unused")), Lines())
+
+
+def oracle(state):
+    """The state whose network says the displacement of a walk round the circle, whatever it sees,
+    with σ = 5 cm."""
+    angle = TURN * WINDOW
+    truth = SPEED / TURN * np.array([np.sin(angle), 1 - np.cos(angle), 0.0])
+    params = jax.tree.map(lambda leaf: 0.01 * leaf, state.params)
+    params["head"]["bias"] = jnp.float32(truth)
+    params["uncertainty"]["log_std"]["bias"] = jnp.full(3, np.log(0.05), jnp.float32)
+    return state._replace(params=params)
+
+
+def new_state(training):
+    return oracle(training.new_state(initial.initial_run(training.config)))
+
+
+def test_wild_steps_are_skipped_and_counted(training):
+    """A sample that is no number; a reference that jumps, whose gradient is finite and far too
+    large."""
+    order = jnp.repeat(training.source.earliest[:5], 2)  # as long as an epoch: compiled once
+    first = int(order[0])
+    lost = training.source.accel.at[first + 30].set(np.nan)
+    jumps = training.source.position.at[first + 50 :].add(1e6)
+    for spoiled in ({"accel": lost}, {"position": jumps}):
+        wild = training._replace(source=training.source._replace(**spoiled))
+        state = new_state(training)
+        before = jax.tree.map(np.array, (state.variables, state.opt_state))
+        state, progress = wild.take_steps(state, order, 0, 1, 1.0)
+        assert int(state.step) == 1 and int(progress.failed_step) == -1
+        assert same(before, (state.variables, state.opt_state))
+        assert [float(x) for x in progress.sums] == [0, 0, 0, 0, 0, 0, 1]
+        assert all(float(norm) == 0 for norm in progress.gradient_norms.values())
+        figures = training.training_figures((6.0, *[0.0] * 5, 2.0), 5)
+        assert figures["loss"] == 2.0 and figures["skipped"] == 2
+
+
+def test_noise_is_recovered(training):
+    """In the four steps of a run, towards that of the data: three times the first guess, or a third
+    of it."""
+    white = np.sqrt(50.0) * np.random.default_rng(0).standard_normal(
+        (2, len(training.source.gyro), 3)
+    )
+    for share in (3.0, 1 / 3):
+        gyro = training.source.gyro + share * OPTIONS.gyro_density * white[0]
+        accel = training.source.accel + share * OPTIONS.accel_density * white[1]
+        noisy = training._replace(source=training.source._replace(gyro=gyro, accel=accel))
+        state = new_state(training)
+        for epoch in range(2):
+            state, progress = noisy.take_steps(state, noisy.order(epoch), 0, 2, 1.0)
+            assert progress.sums.skipped == 0
+        found = learnt.learnt_options(OPTIONS, state.filter)
+        for name in ("gyro_density", "accel_density"):
+            ratio = getattr(found, name) / getattr(OPTIONS, name)
+            assert ratio > 1.2 if share > 1 else ratio < 0.8, (name, share, ratio)
+
+
+def test_gradient_against_differences(training):
+    """Over pieces that are not truncated; by a number of each kind and a weight of the network."""
+    through = dataclasses.replace(THROUGH, learn=("all",), truncate_seconds=2.0)
+    config = dataclasses.replace(training.config, through_filter=through)
+    assert filter_step.filter_config(training.config, training=True).truncate_every == 10
+    state = new_state(training)
+    starts = training.source.earliest[:2]
+    batch = filter_step.draw_pieces(jax.random.key(5), training.source, starts, config)
+    chosen = learnt.chosen(state.variables, through.learn)
+    wide = {"filter", "batch_stats"}  # the network computes in float32 whatever it is given
+    chosen = {
+        name: jax.tree.map(lambda leaf: leaf.astype(jnp.float64), tree) if name in wide else tree
+        for name, tree in chosen.items()
+    }
+    evaluated = quick(
+        functools.partial(filter_step.gradient_of_pieces, model=training.model, config=config)
+    )
+    gradient, losses, healthy = evaluated(state.variables, chosen, *batch)
+    assert bool(healthy) and np.isfinite(losses.total)
+    places = [(("filter", name), (), 1e-4, 1e-4) for name in sorted(chosen["filter"])]
+    places += [(("batch_stats", "uncertainty", "log_factor"), (1,), 1e-4, 1e-4)]
+    places += [(("params", "head", "bias"), (0,), 3e-3, 1e-2)]
+    for path, index, step, tolerance in places:
+
+        def at(value, path=path, index=index):
+            moved = jax.tree_util.tree_map_with_path(
+                lambda place, leaf: (
+                    leaf.at[index].add(value) if tuple(key.key for key in place) == path else leaf
+                ),
+                chosen,
+            )
+            return float(evaluated(state.variables, moved, *batch)[1].total)
+
+        found = functools.reduce(lambda tree, key: tree[key], path, gradient)[index]
+        expected = (at(step) - at(-step)) / (2 * step)
+        assert expected != 0, path
+        np.testing.assert_allclose(found, expected, rtol=tolerance, atol=1e-7, err_msg=str(path))
+
+
+def test_parts_are_modules_and_options_by_name(training):
+    variables = new_state(training).variables
+    assert learnt.chosen(variables, ("uncertainty",)).keys() == {"params"}
+    chosen = {name: learnt.chosen(variables, (name,)) for name in ("encoder", "head", "noise")}
+    assert chosen["encoder"]["params"].keys() == {"encoder", "norm"}
+    assert chosen["head"]["params"].keys() == {"head"}
+    assert chosen["noise"] == {
+        "filter": {n: variables["filter"][n] for n in learnt.FILTER_PARTS["noise"]}
+    }
+    assert learnt.chosen(variables, ("measurement",))["batch_stats"].keys() == {"uncertainty"}
+    everything = learnt.chosen(variables, ("all",))
+    assert everything["params"].keys() == variables["params"].keys()
+    assert everything["filter"].keys() == variables["filter"].keys()
+    parts = {learnt.module_part(name) for name in ("log_std", "displacement", "bank")}
+    assert parts == {"uncertainty", "head", "encoder"}  # TLIO's names, and the bank
+
+
+def test_options_survive_their_unconstrained_numbers():
+    numbers = learnt.unconstrained(OPTIONS)
+    assert "heading_error_std_degrees" not in numbers
+    assert learnt.learnt_options(OPTIONS, numbers) == OPTIONS
+    found = learnt.natural(numbers)
+    for name, value in found.items():
+        assert value.dtype == jnp.float64
+        np.testing.assert_allclose(value, getattr(OPTIONS, name), rtol=2e-6)
+    moved = learnt.natural({"window_error_share": jnp.float32(0), "velocity_std": jnp.float32(1)})
+    assert moved["window_error_share"] == 0.5
+    np.testing.assert_allclose(moved["velocity_std"], np.e, rtol=1e-7)
+
+
+def test_a_later_stage_starts_from_what_the_filter_has_learnt(recording, finished, training):
+    config = tiny(recording, "unused", init_from=str(finished))
+    run = initial.initial_run(config)
+    state = training.new_state(run)
+    assert same(state.filter, run.filter) and same(state.params, run.variables["params"])
+
+
+def test_training_on_windows_starts_from_a_runs_weights(recording):
+    config = tiny(recording, "unused", through_filter=ThroughFilter())
+    with jax.enable_x64(False):
+        state = on_windows.set_up(config, Lines()).new_state(initial.initial_run(config))
+    theirs = checkpoint.load_run(recording / "initial").variables
+    assert same(state.params, theirs["params"]) and state.filter == {}
+    assert same(state.batch_stats["norm"], theirs["batch_stats"]["norm"])
+    assert (np.asarray(state.batch_stats["uncertainty"]["log_factor"]) == 0).all()
+
+
+@pytest.mark.parametrize(
+    "changes, expected",
+    [
+        ({"init_from": None}, r"'through_filter.learn' needs the weights .*--init-from"),
+        ({"init_from": "nowhere"}, "nowhere: holds no run"),
+        (
+            {"data": DataConfig(rate=100.0, window_seconds=WINDOW)},
+            "initial: its data.rate is 50.0, and here it is 100.0; describe the same network",
+        ),
+        ({"model": ModelConfig(name="tlio")}, "its model.name is tiny, and here it is tlio"),
+        (
+            {"through_filter": dataclasses.replace(THROUGH, truncate_seconds=1.5)},
+            r"'through_filter.truncate_seconds' must divide the piece of 2 s",
+        ),
+        (
+            {"through_filter": dataclasses.replace(THROUGH, truncate_seconds=0.25)},
+            r"'through_filter.truncate_seconds' is not a whole number of strides of 0.1 s",
+        ),
+        (
+            {"through_filter": ThroughFilter(LEARN, 0.4, 0.4)},
+            r"'through_filter.piece_seconds' must be longer than the window of 0.4 s",
+        ),
+        (
+            {"through_filter": ThroughFilter(LEARN, 60.0, 10.0)},
+            r"no piece of 3000 samples .*lower through_filter.piece_seconds",
+        ),
+        (
+            {"filter": dataclasses.replace(OPTIONS, mahalanobis_fail_scale=10.0)},
+            r"'through_filter.gate_softness' makes no sense beside",
+        ),
+        ({"optim": OptimConfig(batch_size=64)}, "is 64, but there are only 10 pieces"),
+    ],
+)
+def test_mistakes(recording, tmp_path, changes, expected):
+    with pytest.raises(InputError, match=expected):
+        loop.train(tiny(recording, tmp_path / "run", **changes))
+    assert not (tmp_path / "run").exists()
