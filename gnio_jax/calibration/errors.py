@@ -9,6 +9,8 @@ from gnio_jax.evaluation.estimators.result import Estimate
 
 LEAST_WINDOWS = 100
 """Below this many windows with a reference nothing is fitted (ours)."""
+LEAST_FACTOR = 1e-3
+"""No axis is surer than this of what the network says (ours)."""
 
 
 def std_factors(
@@ -25,7 +27,7 @@ def std_factors(
     )
     if len(normalised) < LEAST_WINDOWS:
         raise ValueError(f"{len(normalised)} windows have a reference, {LEAST_WINDOWS} are needed")
-    return np.sqrt(np.mean(normalised**2, axis=0))
+    return np.maximum(np.sqrt(np.mean(normalised**2, axis=0)), LEAST_FACTOR)
 
 
 def _normalised(estimate: Estimate, truth: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, "w 3"]:

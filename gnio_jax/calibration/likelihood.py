@@ -14,6 +14,7 @@ from scipy.optimize import minimize
 
 from gnio_jax.calibration.unknowns import PRIOR_STD, Unknown, from_free, to_free, written
 from gnio_jax.config import DataConfig, FilterOptions
+from gnio_jax.errors import InputError
 from gnio_jax.evaluation import filter_setup
 from gnio_jax.filtering import FilterConfig, initial_state, over_sequences, repeat_odometry
 from gnio_jax.filtering.options import initial_std, noise_model
@@ -21,6 +22,8 @@ from gnio_jax.types import Array
 
 CHECKPOINT_EVERY = 50
 """Clone intervals between the states that the backward pass keeps."""
+FAILED = 1e6
+"""What the search sees where the filter fails: it turns back."""
 NO_GATE = 1e9
 """Threshold of a χ² gate that lets everything through: one that rejects would reward a noise so
 small that everything is rejected."""
@@ -52,17 +55,19 @@ class Fit(NamedTuple):
 
     options: FilterOptions
     before: float
-    """−log-likelihood per innovation at the start of the fit."""
+    """−log-likelihood per innovation at the start of the fit, when the factors of the axes are
+    there."""
     after: float
-    """The same at its end."""
+    """The same with `options`."""
     steps: int
 
 
 def innovation_objective(
     walks: Walks, windows: DataConfig, options: FilterOptions, unknowns: tuple[Unknown, ...]
-) -> Callable[[Array], Array]:
-    """−log-likelihood of all innovations over their number, as a function of the unknowns without
-    bounds, and the prior that keeps those in place of which the walks say nothing."""
+) -> Callable[[Array], tuple[Array, Array]]:
+    """As a function of the unknowns without bounds: what is to be made small, and the part of it
+    that is −log-likelihood of all innovations over their number. The rest is the prior that keeps
+    those in place of which the walks say nothing."""
     start = to_free(options, unknowns)
     count = np.isfinite(walks.displacement).all(2).sum()
     fixed = dataclasses.replace(options, measurement_scale=1.0)
@@ -73,10 +78,10 @@ def innovation_objective(
         checkpoint_every=CHECKPOINT_EVERY,
     )
 
-    def objective(free: Array) -> Array:
+    def objective(free: Array) -> tuple[Array, Array]:
         evidence = _log_likelihood(walks, config, vars(options) | from_free(free, unknowns))
         prior = 0.5 * jnp.sum(((free - start) / PRIOR_STD) ** 2)
-        return (prior - evidence) / count
+        return (prior - evidence) / count, -evidence / count
 
     return objective
 
@@ -92,7 +97,9 @@ def _log_likelihood(walks: Walks, config: FilterConfig, options: Mapping[str, An
         state = initial_state(config, *pose, std=std)
         told = walk.displacement, factor * walk.std
         _, history = repeat_odometry(state, walk.gyro, walk.accel, *told, config, noise)
-        return jnp.nansum(history.log_likelihood)
+        told_at = jnp.isfinite(walk.displacement).all(axis=1)
+        known = jnp.where(told_at, history.log_likelihood, 0.0)
+        return jnp.where(history.healthy[-1] > 0, jnp.nansum(known), jnp.nan)
 
     return jnp.sum(over_sequences(of_walk, shared=1)((factor, noise, std), walks))
 
@@ -107,29 +114,33 @@ def fit(
 ) -> Fit:
     """The options that make the innovations most likely, by L-BFGS from `options`.
 
-    A step to where the filter fails counts as infinitely unlikely, and the search turns back.
+    A step to where the filter fails counts as very unlikely, and the search turns back. Raises
+    `InputError` where it fails with `options`.
     """
     objective = innovation_objective(walks, windows, options, unknowns)
-    compiled = jax.jit(jax.value_and_grad(objective))
+    compiled = jax.jit(jax.value_and_grad(objective, has_aux=True))
     calls = 0
 
-    def value_and_gradient(free: np.ndarray) -> tuple[float, np.ndarray]:
+    def evaluate(free: np.ndarray) -> tuple[float, float, np.ndarray]:
         nonlocal calls
         calls += 1
         progress(calls)
-        value, gradient = jax.device_get(compiled(free))
+        (value, evidence), gradient = jax.device_get(compiled(free))
         if not (np.isfinite(value) and np.isfinite(gradient).all()):
-            return 1e6, np.zeros_like(free)
-        return float(value), np.asarray(gradient, float)
+            return FAILED, FAILED, np.zeros_like(free)
+        return float(value), float(evidence), np.asarray(gradient, float)
 
     start = to_free(options, unknowns)
-    before, _ = value_and_gradient(start)
+    _, before, _ = evaluate(start)
+    if before == FAILED:
+        raise InputError("the filter", "fails on these recordings with the options of the run")
     found = minimize(
-        value_and_gradient,
+        lambda free: evaluate(free)[::2],
         start,
         jac=True,
         method="L-BFGS-B",
         options={"maxiter": most_steps, "ftol": 1e-7},
     )
     fitted = written(options, from_free(jnp.asarray(found.x), unknowns))
-    return Fit(fitted, before, float(found.fun), int(found.nit))
+    _, after, _ = evaluate(to_free(fitted, unknowns))
+    return Fit(fitted, before, after, int(found.nit))

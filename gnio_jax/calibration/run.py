@@ -16,7 +16,14 @@ from gnio_jax import config as configuration
 from gnio_jax import data
 from gnio_jax.calibration.errors import std_factors
 from gnio_jax.calibration.likelihood import Fit, Walks, fit
-from gnio_jax.calibration.unknowns import chosen, with_starts, written
+from gnio_jax.calibration.unknowns import (
+    UNKNOWNS,
+    Unknown,
+    check_fittable,
+    chosen,
+    with_starts,
+    written,
+)
 from gnio_jax.config import CalibrateConfig, FilterOptions, TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import Setup, estimate, inference_network, prepare, true_displacements
@@ -27,6 +34,8 @@ from gnio_jax.training import checkpoint
 
 OnStage = Callable[[str, float], None]
 """Called with the stage and the share of it that is done."""
+ABOUT = "calibration.json"
+"""What was fitted to what: the mark of a calibrated run."""
 FACTORS = ("std_factor_x", "std_factor_y", "std_factor_z")
 
 
@@ -52,18 +61,20 @@ def calibrate(
     part but the start. Raises `InputError` for a split that is neither the run's validation nor
     its training split, an output folder that is there already, and missing data.
     """
+    unknowns = _unknowns(config)
     workdir = Path(config.workdir) if config.workdir else configuration.newest_run()
     run = checkpoint.load_run(workdir, config.checkpoint)
     folder, split = _folder(config, workdir), _split(config, run.config)
+    check_fittable(run.config.filter, unknowns)
     root = config.data_root or run.config.data_root
     sequences = data.load(
         run.config.dataset, root, split, workers, lambda share: progress("reading", share)
     )
-    prepared, _ = prepare(sequences, run.config.data, Setup())
+    with_reference = [sequence for sequence in sequences if sequence.valid.any()]
+    prepared, _ = prepare(with_reference, run.config.data, Setup())
     if not prepared:
-        raise InputError(
-            f"dataset {run.config.dataset}", f"split '{split}' has no recording to fit"
-        )
+        problem = "has no recording with a reference that is long enough to be fitted"
+        raise InputError(f"dataset {run.config.dataset}, split '{split}'", problem)
 
     own = dataclasses.replace(
         run.config.filter, measurement_scale=1.0, **dict.fromkeys(FACTORS, 1.0)
@@ -82,7 +93,6 @@ def calibrate(
     except ValueError as error:
         raise InputError(f"split '{split}'", str(error)) from None
 
-    unknowns = chosen(config.fit)
     options = written(own, dict(zip(FACTORS, jnp.asarray(factors), strict=True)))
     options = with_starts(options, unknowns)
     found = fit(
@@ -98,8 +108,22 @@ def calibrate(
     return calibration
 
 
+def _unknowns(config: CalibrateConfig) -> tuple[Unknown, ...]:
+    """Of the groups that are asked for, each once."""
+    if not config.fit:
+        remedy = f"name some of {', '.join(UNKNOWNS)}"
+        raise InputError("--fit", "names nothing", remedy)
+    if config.steps < 1:
+        raise InputError("--steps", f"must be at least 1, found {config.steps}")
+    return chosen(tuple(dict.fromkeys(config.fit)))
+
+
 def _folder(config: CalibrateConfig, workdir: Path) -> Path:
-    folder = Path(config.out) if config.out else workdir.with_name(workdir.name + "_calibrated")
+    if (workdir / ABOUT).exists():
+        remedy = "calibrate the run that it was made from"
+        raise InputError(workdir, "is a calibrated run", remedy)
+    absolute = workdir.resolve()
+    folder = Path(config.out) if config.out else absolute.with_name(f"{absolute.name}_calibrated")
     if folder.exists():
         raise InputError(folder, "is there already", "remove it, or give another --out")
     return folder
@@ -168,9 +192,10 @@ def _write(
         experiment = dataclasses.replace(
             trained, workdir=str(calibration.folder), filter=found.options
         )
+        configuration.validate(experiment, "the calibrated run")
         configuration.save(new / "config.yaml", experiment)
-        write_text(new / "calibration.json", json.dumps(about, indent=2) + "\n")
+        write_text(new / ABOUT, json.dumps(about, indent=2) + "\n")
         shutil.copytree(workdir / source, new / "checkpoints" / "best")
         for name in ("splits.yaml", "metrics.jsonl"):
             if (workdir / name).exists():
-                shutil.copy(workdir / name, new / name)
+                shutil.copy2(workdir / name, new / name)

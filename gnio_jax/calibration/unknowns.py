@@ -13,11 +13,16 @@ import numpy as np
 from jaxtyping import Float
 
 from gnio_jax.config import FilterOptions
+from gnio_jax.errors import InputError
 from gnio_jax.types import Array
 
 PRIOR_STD = 2.0
 """Standard deviation of each unknown about its start, in its own logarithm or logit (ours). The
 recordings outweigh it by far in all that they tell; what they do not tell stays where it was."""
+
+
+LARGEST_SHARE = 0.9999
+"""Of a window's standard deviation that lasts, as it is written down."""
 
 
 class Unknown(NamedTuple):
@@ -66,6 +71,14 @@ def chosen(groups: tuple[str, ...]) -> tuple[Unknown, ...]:
     return tuple(unknown for group in groups for unknown in UNKNOWNS[group])
 
 
+def check_fittable(options: FilterOptions, unknowns: tuple[Unknown, ...]) -> None:
+    """`InputError` for an option that is 0: it has no logarithm, and the fit would not leave it."""
+    for unknown in unknowns:
+        if unknown.start is None and not getattr(options, unknown.field) > 0:
+            remedy = "leave its group out of --fit, or give the run a small value"
+            raise InputError(f"filter.{unknown.field}", "is 0 and cannot be fitted", remedy)
+
+
 def with_starts(options: FilterOptions, unknowns: tuple[Unknown, ...]) -> FilterOptions:
     """The options from which a fit begins: with errors where they were off."""
     starts = {
@@ -85,6 +98,11 @@ def from_free(free: Float[Array, "u"], unknowns: tuple[Unknown, ...]) -> dict[st
 
 
 def written(options: FilterOptions, fields: dict[str, Array]) -> FilterOptions:
-    """The options with these values, as four digits, which is how they are written down."""
+    """The options with these values, as four digits, which is how they are written down.
+
+    Rounding leaves a share below 1.
+    """
     values = {name: float(f"{float(value):.4g}") for name, value in fields.items()}
+    if "window_error_share" in values:
+        values["window_error_share"] = min(values["window_error_share"], LARGEST_SHARE)
     return dataclasses.replace(options, **values)

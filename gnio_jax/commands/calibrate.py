@@ -36,7 +36,8 @@ def calibrate(config: CalibrateConfig, prog: str) -> None:
         found = calibration.calibrate(config, terminal.progress, usable_cores())
     console.stdout().print(_table(found.before, found.fit.options))
     print(
-        f"-log-likelihood of an innovation: {found.fit.before:.4f} -> {found.fit.after:.4f} "
+        "-log-likelihood of an innovation, from the factors of the axes to the end of the fit: "
+        f"{found.fit.before:.4f} -> {found.fit.after:.4f} "
         f"({found.recordings} recordings, {found.fit.steps} steps)"
     )
     print(f"look at it with: {sibling(prog, 'evaluate')} --workdir {found.folder}")

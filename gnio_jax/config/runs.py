@@ -14,8 +14,10 @@ def default_workdir(config: TrainConfig) -> Path:
 
 
 def newest_run(folder: str | Path = "runs") -> Path:
-    """The run below `folder` that was trained last. Raises `InputError` when there is none."""
-    runs = [path.parent for path in Path(folder).glob("*/config.yaml")]
+    """The run below `folder` that was trained last; calibrated copies of a run do not count. Raises
+    `InputError` when there is none."""
+    found = [path.parent for path in Path(folder).glob("*/config.yaml")]
+    runs = [run for run in found if not (run / "calibration.json").exists()]
     if not runs:
         remedy = "train one with gnio train, or name its folder with --workdir"
         raise InputError(folder, "holds no run", remedy)

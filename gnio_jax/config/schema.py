@@ -393,9 +393,10 @@ class CalibrateConfig:
     """Split whose recordings are fitted: the run's validation split (default) or its training
     split. Others are refused: what is tested must not have been fitted."""
     fit: tuple[CalibratedGroup, ...] = ("measurement", "noise", "window")
-    """What is fitted by the likelihood of the innovations: the measurement's factor, the IMU's
-    noise, the standard deviations of the initial biases, the part of a window's error that lasts,
-    the errors of speed and heading that last."""
+    """What is fitted by the likelihood of the innovations: `measurement`, the factor of the
+    network's covariance; `noise`, the IMU's; `start`, the standard deviations of the initial
+    biases; `window`, the part of a window's error that lasts; `walk`, the errors of speed and
+    heading that last."""
     checkpoint: Literal["best", "latest"] = "best"
     """Which checkpoint of the run."""
     steps: Count = 60

@@ -65,6 +65,16 @@ def check_not_negative(name: str, value: Any) -> None:
             raise ValueError(f"{name}: must be a number that is not negative, found {number}")
 
 
+def check_positive(name: str, value: jax.Array) -> None:
+    """Refuse rows with a number that is zero or negative, naming the first; NaN passes."""
+    if isinstance(value, Tracer):
+        return
+    bad = (np.asarray(value) <= 0).reshape(len(value), -1).any(1)
+    if bad.any():
+        problem = f"{bad.sum()} of {len(bad)} rows are not positive"
+        raise ValueError(f"{name}: {problem}, the first is row {bad.argmax()}")
+
+
 def check_lasting_errors(name: str, errors: LastingErrors) -> None:
     """Refuse a share of a window's error that is all of it, and times that are zero."""
     for field in ("window_seconds", "walk_seconds"):

@@ -54,6 +54,8 @@ class Residual(NamedTuple):
     """H of the prediction over θ_i, p_i, p_j."""
     lasting_jacobian: Float[Array, "3 e"]
     """H over the errors that last."""
+    lasting_covariance: Float[Array, "3 3"]
+    """The part of the measurement's covariance that those make, which H P Hᵀ has already."""
     defined: Bool[Array, ""]
     """Whether H exists: no gimbal lock."""
 
@@ -132,8 +134,8 @@ def displacement_residual(
     # hat(d) Hz is a single outer product, (d × z) ⊗ yaw_row, and the yaw leaves z alone.
     turned = jnp.stack([lever[1], -lever[0], zero])
     jacobian = jnp.concatenate([turned[:, None] * yaw_row[None, :], -unyaw, unyaw], axis=1)
-    no_errors = jnp.zeros((3, 0), jacobian.dtype)
-    return Residual(displacement - predicted, jacobian, no_errors, defined)
+    none, nothing = jnp.zeros((3, 0), jacobian.dtype), jnp.zeros((3, 3), jacobian.dtype)
+    return Residual(displacement - predicted, jacobian, none, nothing, defined)
 
 
 def update(
@@ -173,7 +175,7 @@ def update_with_correction(
     moves_apart = jnp.where(oldest == 0, 0.0, 1.0).astype(state.move.dtype)
     residual = _residual_of_state(state, measurement.displacement, oldest, moves_apart, frame)
     if errors is not None:
-        residual, measurement = _with_lasting_errors(residual, measurement, state, errors)
+        residual = _with_lasting_errors(residual, measurement, state, errors)
     projected = _project(state, residual, oldest, moves_apart)
 
     white = _whiten(residual, projected, measurement, 1.0)
@@ -221,19 +223,17 @@ def _residual_of_state(
 
 def _with_lasting_errors(
     residual: Residual, measurement: Measurement, state: FilterState, errors: LastingErrors
-) -> tuple[Residual, Measurement]:
-    """The residual of a displacement with errors that last, and the measurement with what is left
-    of its covariance: that of the white noise."""
+) -> Residual:
+    """The residual of a displacement with errors that last."""
     root = cholesky(measurement.covariance).matrix
     moved = measurement.displacement - residual.innovation
     expected = distort(moved, root, state.lasting, errors)
-    residual = residual._replace(
+    return residual._replace(
         innovation=measurement.displacement - expected.displacement,
         jacobian=matmul(expected.gain, residual.jacobian),
         lasting_jacobian=expected.jacobian,
+        lasting_covariance=errors.window_share**2 * measurement.covariance,
     )
-    white = (1 - errors.window_share**2) * measurement.covariance
-    return residual, measurement._replace(covariance=white)
 
 
 class _Projected(NamedTuple):
@@ -272,8 +272,9 @@ def _whiten(
     residual: Residual, projected: _Projected, measurement: Measurement, scale: Array | float
 ) -> Whitened:
     """L⁻¹ of r, H P (core, clones) and H (clones, errors that last), with L of S = H P Hᵀ + scale ·
-    R, the identity where there is no measurement."""
+    R, the identity where there is no measurement. What of R lasts is in H P Hᵀ, once."""
     whole = projected.innovation_covariance + scale * measurement.covariance
+    whole = whole - residual.lasting_covariance
     spread = jnp.where(measurement.present, whole, jnp.eye(3, dtype=whole.dtype))
     rows = (
         residual.innovation[:, None],

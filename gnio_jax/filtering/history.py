@@ -35,7 +35,8 @@ class FilterHistory(NamedTuple):
     displacement: Float[Array, "k 3"]
     """The measurement, m, in the yaw frame of the oldest clone; NaN where none."""
     measurement_std: Float[Array, "k 3"]
-    """Its standard deviations after `FilterConfig.measurement_scale`, m; NaN where none."""
+    """Its standard deviations after `FilterConfig.measurement_scale` and `NoiseModel.std_factor`,
+    m; NaN where none."""
     innovation: Float[Array, "k 3"]
     """Measured − predicted displacement, m; NaN where no measurement."""
     covariance_diagonal: Float[Array, "k 15"]

@@ -14,6 +14,7 @@ from gnio_jax.filtering.checks import (
     check_finite,
     check_lasting_errors,
     check_not_negative,
+    check_positive,
     check_positive_definite,
     check_rotation,
     checked_array,
@@ -51,6 +52,8 @@ def checked_noise(noise: NoiseModel, dtype: Any) -> NoiseModel:
     """`noise` in one precision."""
     for path, value in jax.tree_util.tree_leaves_with_path(noise):
         check_not_negative("noise" + jax.tree_util.keystr(path), value)
+    if len(noise.std_factor) != 3:
+        raise ValueError("noise.std_factor: must be three numbers, for x, y and z")
     if noise.displacement is not None:
         check_lasting_errors("noise.displacement", noise.displacement)
     return jax.tree.map(lambda value: jnp.asarray(value, dtype), noise)
@@ -63,6 +66,9 @@ def checked_state(state: FilterState, config: FilterConfig, noise: NoiseModel) -
     """
     if noise.displacement is not None:
         state = with_lasting_errors(state, noise.displacement)
+    elif len(state.lasting):
+        problem = "the state has errors that last, but noise.displacement is None"
+        raise ValueError(f"state.lasting: {problem}")
     wanted = state_shapes(config, noise, jnp.float32 if config.allow_float32 else jnp.float64)
     if jax.tree.structure(state) != jax.tree.structure(wanted):
         raise ValueError(
@@ -169,4 +175,5 @@ def checked_displacements(
         checked_array(name, value, shape, config).astype(signals.gyro.dtype)
         for name, value in [("displacement", displacement), ("measurement_std", std)]
     )
+    check_positive("measurement_std", std)
     return displacement, std

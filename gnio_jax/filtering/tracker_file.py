@@ -29,7 +29,7 @@ from gnio_jax.filtering.online import (
 )
 from gnio_jax.filtering.pose import POSE_LENGTH
 
-_FORMAT = "gnio-jax tracker 3"
+_FORMAT = "gnio-jax tracker 4"
 _DAMAGED = "it is damaged"
 
 Arrays = dict[str, np.ndarray]

@@ -49,7 +49,8 @@ class FourHeadings(Equivariant):
     back. Exact for quarter turns.
 
     The variance is the mean of the four variances, turned back too. Diagnostics are those of the
-    window as it is. Training applies the network once: augmentation draws the heading.
+    window as it is, but for the velocities of CTIN, which are averaged alike. Training applies the
+    network once: augmentation draws the heading.
     """
 
     def __call__(
@@ -62,14 +63,20 @@ class FourHeadings(Equivariant):
         every = turn_windows(jnp.tile(windows.astype(jnp.float32), (turns, 1, 1)), heading)
         prediction = self.network(every, train, **constants)
         back = turn_prediction(prediction, opposite(heading))
-        displacement, log_std = (
-            axes.reshape(turns, batch, 3).swapaxes(0, 1)
-            for axes in (back.displacement, back.log_std)
-        )
+
+        def by_heading(axes: jax.Array) -> jax.Array:
+            return jnp.moveaxis(axes.reshape(turns, batch, *axes.shape[1:]), 0, -2)
+
+        diagnostics = {name: value[:batch] for name, value in prediction.diagnostics.items()}
+        if "velocity" in diagnostics:  # CTIN's loss learns from these
+            velocities = by_heading(back.diagnostics["velocity"])
+            log_stds = by_heading(back.diagnostics["velocity_log_std"])
+            diagnostics["velocity"] = velocities.mean(axis=-2)
+            diagnostics["velocity_log_std"] = jax.vmap(root_mean_square)(log_stds)
         return Prediction(
-            displacement.mean(axis=1),
-            root_mean_square(log_std),
-            {name: value[:batch] for name, value in prediction.diagnostics.items()},
+            by_heading(back.displacement).mean(axis=-2),
+            root_mean_square(by_heading(back.log_std)),
+            diagnostics,
         )
 
 

@@ -1,5 +1,4 @@
-"""What learns through the filter: modules of the network, factors of its σ, and options of the
-filter.
+"""What learns through the filter: modules of the network, and options of the filter.
 
 The filter's options learn as unconstrained numbers: logarithms, and the logit of the one that is a
 share. They lie beside the network's variables as the collection "filter", by the names of
@@ -47,13 +46,11 @@ FILTER_PARTS = {
 
 HEADS = ("head", "displacement")
 """Names of the networks' modules from which the displacement comes."""
-TEMPERATURE = "uncertainty"
-"""Module whose `batch_stats` are factors or constants of σ, as logarithms (`models.heads`)."""
 SHARES = ("window_error_share",)
 """Fields between 0 and 1; the others are positive."""
 
 Learnt = dict[str, dict[str, Any]]
-"""Variables that learn, by collection: "params", "batch_stats", "filter"; none of them empty."""
+"""Variables that learn, by collection: "params" and "filter"; none of them empty."""
 
 
 def unconstrained(options: FilterOptions) -> dict[str, Float[jax.Array, ""]]:
@@ -95,10 +92,6 @@ def chosen(variables: Any, learn: Iterable[str]) -> Learnt:
     names = {name for part in parts for name in FILTER_PARTS.get(part, ())}
     found = {
         "params": _those(variables["params"], lambda module: module_part(module) in parts),
-        "batch_stats": _those(
-            variables["batch_stats"],
-            lambda module: module == TEMPERATURE and "measurement" in parts,
-        ),
         "filter": _those(variables["filter"], lambda name: name in names),
     }
     return {collection: tree for collection, tree in found.items() if tree}

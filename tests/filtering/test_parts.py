@@ -123,19 +123,20 @@ def test_measurement_jacobian_against_differences(angles):
         return d - scekf_numpy.yaw_matrix(R).T @ (pj + delta[6:] - pi - delta[3:6])
 
     moved = jnp.asarray(pj - pi)
-    found, jacobian, defined = displacement_residual(jnp.asarray(Ri), moved, jnp.asarray(d), moved)
-    np.testing.assert_allclose(found, residual(np.zeros(9)), atol=1e-12)
-    assert bool(defined)
+    found = displacement_residual(jnp.asarray(Ri), moved, jnp.asarray(d), moved)
+    np.testing.assert_allclose(found.innovation, residual(np.zeros(9)), atol=1e-12)
+    assert bool(found.defined)
     expected = -differences(residual, 9, 1e-7 if angles[1] > 1.5 else 1e-5)
     np.testing.assert_allclose(
-        jacobian, expected, rtol=1e-5, atol=1e-7 if angles[1] < 1.5 else 1e-2
+        found.jacobian, expected, rtol=1e-5, atol=1e-7 if angles[1] < 1.5 else 1e-2
     )
 
 
 def test_gimbal_lock_begins_at_its_limit():
     for distance, defined in ((0.9e-5, False), (1.1e-5, True)):
         R = jnp.asarray(Rotation.from_euler("xyz", [0.2, np.pi / 2 - distance, 0.4]).as_matrix())
-        assert bool(displacement_residual(R, jnp.ones(3), jnp.ones(3), jnp.ones(3))[2]) == defined
+        found = displacement_residual(R, jnp.ones(3), jnp.ones(3), jnp.ones(3))
+        assert bool(found.defined) == defined
 
 
 def at_singularity(kind):

@@ -186,7 +186,7 @@ def run(
                 of_clone = slice(core, core + 3), slice(core + 3, core + 6)
                 H[:, of_clone[0]], H[:, of_clone[1]] = Ry.T @ skew(p - pi) @ Hz, -Ry.T
                 H[:, -3:] = Ry.T
-                expected, noise = Ry.T @ (p - pi), scale * C
+                expected, noise, lasting_part = Ry.T @ (p - pi), scale * C, 0
                 if lasting is not None:
                     share, root = lasting["share"], np.linalg.cholesky(noise)
                     turn = Rotation.from_euler("z", errors[4]).as_matrix()
@@ -195,9 +195,10 @@ def run(
                     H = gain @ H
                     H[:, 15:18], H[:, 18] = share * root, seen
                     H[:, 19] = np.cross([0, 0, 1], seen)
-                    expected, noise = seen + share * root @ errors[:3], (1 - share**2) * noise
+                    expected = seen + share * root @ errors[:3]
+                    lasting_part = share**2 * noise
                 r = d - expected
-                S = H @ P @ H.T + noise
+                S = H @ P @ H.T + noise - lasting_part
                 nis = r @ np.linalg.solve(S, r)
                 row.update(
                     nis=nis,
@@ -219,7 +220,7 @@ def run(
                         last_success, pause_end, active = None, now + round(pause / dt), False
                     if active and nis > threshold:
                         if fail_scale > 0:
-                            S = H @ P @ H.T + fail_scale * noise
+                            S = H @ P @ H.T + fail_scale * noise - lasting_part
                             row["accepted"] = 1.0
                     else:
                         last_success = now
