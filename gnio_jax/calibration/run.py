@@ -147,17 +147,18 @@ def _walks(prepared: list[Prepared], estimates: list[Estimate], stride: int) -> 
     strides = max(each.strides(stride) for each in prepared)
 
     def of_recording(each: Prepared, estimate: Estimate) -> Walks:
-        signals = each.sequence.gyro[:-1], each.sequence.accel[:-1]
-        told = estimate.displacement, estimate.displacement_std
-        assert told[0] is not None and told[1] is not None
+        gyro, accel = each.sequence.gyro[:-1], each.sequence.accel[:-1]
+        assert estimate.displacement is not None and estimate.displacement_std is not None
+        std = _filled(estimate.displacement_std[1:], strides, np.ones((1, 3)))
         return Walks(
             each.start.rotation,
             each.start.velocity,
             each.start.position,
             each.gyro_bias,
-            *(_filled(signal, strides * stride, signal[-1:]) for signal in signals),
-            _filled(told[0][1:], strides, np.full((1, 3), np.nan)),
-            np.nan_to_num(_filled(told[1][1:], strides, np.ones((1, 3))), nan=1.0),
+            gyro=_filled(gyro, strides * stride, gyro[-1:]),
+            accel=_filled(accel, strides * stride, accel[-1:]),
+            displacement=_filled(estimate.displacement[1:], strides, np.full((1, 3), np.nan)),
+            std=np.nan_to_num(std, nan=1.0),
         )
 
     rows = [of_recording(*pair) for pair in zip(prepared, estimates, strict=True)]

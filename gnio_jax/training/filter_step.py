@@ -267,8 +267,8 @@ def gradient_of_pieces(
 
 
 def gradient_norms(gradient: Learnt) -> dict[str, Float[jax.Array, ""]]:
-    """Norm of the gradient by each part that learns: modules of the network (`head`), options of the
-    filter (`filter/gyro_density`)."""
+    """Norm of the gradient by each part that learns: modules of the network (`head`), options of
+    the filter (`filter/gyro_density`)."""
     named = dict(gradient.get("params", {}))
     named |= {f"filter/{name}": leaf for name, leaf in gradient.get("filter", {}).items()}
     return {name: optax.tree.norm(part) for name, part in named.items()}
