@@ -24,8 +24,6 @@ from gnio_jax.config.bounds import (
 from gnio_jax.config.through_filter import ThroughFilter
 from gnio_jax.errors import InputError
 
-_INIT_FROM = "name its run with --init-from"
-
 Table = Literal[
     "complexity",
     "comparison",
@@ -319,9 +317,6 @@ class TrainConfig:
         if self.optim.ema_decay:
             problem = f"field '{prefix}optim.ema_decay' is for training on windows alone"
             raise InputError(source, problem, "set it to 0")
-        if self.init_from is None:
-            problem = "needs the weights of a network that has been trained on windows"
-            raise InputError(source, f"field '{prefix}through_filter.learn' {problem}", _INIT_FROM)
         for name in ("piece_seconds", "truncate_seconds"):
             strides = getattr(through, name) / self.data.stride_seconds
             if abs(strides - round(strides)) >= 1e-6:

@@ -16,8 +16,13 @@ def initial_run(config: TrainConfig) -> Run | None:
     """The run that `config.init_from` names, if any.
 
     Raises `InputError` for a folder without a run, and for one whose network is not that of
-    `config`. A calibrated uncertainty may follow a plain head, since its parameters are the same.
+    `config`; also if training through the filter has none to start from. A calibrated uncertainty
+    may follow a plain head, since its parameters are the same.
     """
+    if config.init_from is None and config.through_filter.learn:
+        problem = "needs the weights of a network that has been trained on windows"
+        remedy = "name its run with --init-from"
+        raise InputError("config", f"field 'through_filter.learn' {problem}", remedy)
     if config.init_from is None:
         return None
     run = load_run(Path(config.init_from))

@@ -301,7 +301,7 @@ def test_parts_are_modules_and_options_by_name(training):
     assert chosen["noise"] == {
         "filter": {n: variables["filter"][n] for n in learnt.FILTER_PARTS["noise"]}
     }
-    assert learnt.chosen(variables, ("measurement",))["batch_stats"].keys() == {"uncertainty"}
+    assert learnt.chosen(variables, ("measurement",)).keys() == {"filter"}
     everything = learnt.chosen(variables, ("all",))
     assert everything["params"].keys() == variables["params"].keys()
     assert everything["filter"].keys() == variables["filter"].keys()
