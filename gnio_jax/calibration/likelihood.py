@@ -97,9 +97,10 @@ def _log_likelihood(walks: Walks, config: FilterConfig, options: Mapping[str, An
         state = initial_state(config, *pose, std=std)
         told = walk.displacement, factor * walk.std
         _, history = repeat_odometry(state, walk.gyro, walk.accel, *told, config, noise)
-        told_at = jnp.isfinite(walk.displacement).all(axis=1)
-        known = jnp.where(told_at, history.log_likelihood, 0.0)
-        return jnp.where(history.healthy[-1] > 0, jnp.nansum(known), jnp.nan)
+        # What the walk is filled up with comes after its last displacement, and may run away.
+        told = jnp.isfinite(walk.displacement).all(axis=1)
+        healthy = jnp.all((history.healthy > 0) | ~told)
+        return jnp.where(healthy, jnp.nansum(history.log_likelihood), jnp.nan)
 
     return jnp.sum(over_sequences(of_walk, shared=1)((factor, noise, std), walks))
 

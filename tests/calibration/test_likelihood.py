@@ -13,6 +13,7 @@ from gnio_jax import filtering
 from gnio_jax.calibration.likelihood import Walks, fit, innovation_objective
 from gnio_jax.calibration.unknowns import UNKNOWNS, chosen, from_free, to_free, with_starts, written
 from gnio_jax.config import DataConfig, FilterOptions
+from gnio_jax.errors import InputError
 from tests.support.walks import simulate
 
 DATA = DataConfig(rate=50.0, window_seconds=0.4, stride_seconds=0.1)
@@ -66,3 +67,26 @@ def test_unknowns_go_to_numbers_without_bounds_and_back():
         np.testing.assert_allclose(back[unknown.field], wanted, rtol=1e-12)
     found = written(FilterOptions(measurement_scale=3.0), {"gyro_density": jnp.asarray(1.23456)})
     assert found == FilterOptions(measurement_scale=3.0, gyro_density=1.235)
+
+
+def test_a_walk_may_be_filled_up_and_a_filter_that_fails_is_named():
+    unknowns = chosen(("measurement",))
+    given = walks()
+    push = np.repeat([[[90.0, 0.0, 9.81]]], 8, axis=0)  # to 360 m/s, beyond the filter's bound
+    falling = given._replace(
+        gyro=np.concatenate([given.gyro, np.zeros((8, 40 * N, 3))], axis=1),
+        accel=np.concatenate([given.accel, np.repeat(push, 40 * N, axis=1)], axis=1),
+        displacement=np.concatenate([given.displacement, np.full((8, 40, 3), np.nan)], axis=1),
+        std=np.concatenate([given.std, np.ones((8, 40, 3))], axis=1),
+    )
+    free = to_free(TRUE, unknowns)
+    values = [
+        float(jax.jit(innovation_objective(each, DATA, TRUE, unknowns))(free)[1])
+        for each in (given, falling)
+    ]
+    np.testing.assert_allclose(values[0], values[1], rtol=1e-9)
+    broken = given._replace(
+        accel=np.where(np.arange(STRIDES * N)[:, None] == 900, 1e6, given.accel)
+    )
+    with pytest.raises(InputError, match="the filter: fails on these recordings"):
+        fit(broken, DATA, TRUE, unknowns, lambda calls: None)
