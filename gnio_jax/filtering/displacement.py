@@ -161,7 +161,7 @@ def update_with_correction(
     oldest: Array | int,
     config: FilterConfig,
     frame: YawFrame,
-    errors: LastingErrors | None,
+    errors: LastingErrors | None = None,
 ) -> tuple[FilterState, DisplacementUpdate, Correction]:
     """One EKF update with the displacement between the clones in slots `oldest` and `newest` of the
     ring, once it is full.

@@ -175,7 +175,7 @@ def test_a_config_is_found_by_its_name_from_anywhere(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     "arguments, expected",
     [
-        ([], "command: is missing; give one of train, evaluate, data, tables, interop"),
+        ([], "command: is missing; give one of train, evaluate, calibrate, data"),
         (["trian"], "command: unknown 'trian'; did you mean 'train'?"),
         (["--verbose"], "command: unknown '--verbose'; give one of train, evaluate"),
         (["data"], "command: is missing; give one of list, check, convert, import"),

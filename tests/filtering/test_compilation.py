@@ -13,6 +13,7 @@ from gnio_jax import filtering, geometry
 from gnio_jax.filtering import online, scan, smoother
 from gnio_jax.filtering.displacement import Measurement, update
 from gnio_jax.filtering.gaps import Imu
+from gnio_jax.filtering.lasting_errors import lasting_motion
 from gnio_jax.filtering.propagation import integrate_interval, propagate
 from gnio_jax.types import Prediction
 from gnio_jax.windows import WINDOW_CUTS, cut_window
@@ -63,7 +64,7 @@ def predict(windows):
 
 def test_run_filter(monkeypatch):
     """Another recording, another noise, given as a number or an array, a state carried on."""
-    program = once(scan._run_filter.__wrapped__, static_argnames="config")
+    program = once(scan._run_filter.__wrapped__, static_argnames=("config", "frame"))
     monkeypatch.setattr(scan, "_run_filter", program)
     state, _ = filtering.run_filter(start(), *signals(0), *measurements(0), CONFIG, NOISE)
     louder = NOISE._replace(gyro_density=jnp.asarray(1e-3))
@@ -157,7 +158,8 @@ class Variants(chex.TestCase):
     def test_propagate(self):
         def interval(state, gyro, accel, anchored):
             motion = integrate_interval(state, Imu(gyro, accel, None), NOISE, DT)
-            return propagate(state, motion, anchored, 1)
+            lasting = lasting_motion(None, N * DT, gyro.dtype)
+            return propagate(state, motion, lasting, anchored, 1)
 
         given = start(), *map(jnp.asarray, signals(0, intervals=1)), jnp.bool_(True)
         assert_agree(self.variant(interval)(*given), interval(*given))
