@@ -19,10 +19,9 @@ class ThroughFilter:
 
     learn: tuple[Part, ...] = ()
     """Parts that learn; none: the network is trained on windows. noise: the filter's densities and
-    bias walks; measurement: the factor of the network's covariance, the errors that last, and one
-    factor of σ per axis (where model.uncertainty is calibrated or constant); start: the standard
-    deviations at the start; uncertainty, head, encoder: the network's; all: everything. A filter
-    option that is 0 stays 0."""
+    bias walks; measurement: the factors of the network's covariance and the errors that last;
+    start: the standard deviations at the start; uncertainty, head, encoder: the network's; all:
+    everything. A filter option that is 0 stays 0."""
     piece_seconds: Positive = 60.0
     """Length of the pieces of recordings that are filtered, s."""
     truncate_seconds: Positive = 10.0
@@ -34,8 +33,8 @@ class ThroughFilter:
     """Slope of the χ² gate in training (`FilterConfig.gate_softness`); validation has the gate that
     evaluation has."""
     filter_learning_rate: Positive = 0.03
-    """Peak learning rate of the logarithms of the filter's options and of σ's factors; the
-    network's is optim.learning_rate. Both have its schedule."""
+    """Peak learning rate of the logarithms of the filter's options; the network's is
+    optim.learning_rate. Both have its schedule."""
     skip_above: Positive = 1000.0
     """A step is skipped, and counted in the log, when the norm of its gradient is above this, or
     anything in it is not finite, or the filter diverged."""
