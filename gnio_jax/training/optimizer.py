@@ -85,7 +85,6 @@ def create_through_filter(
     )
     optimizers = {
         "params": create(config, LossConfig(), steps_per_epoch),
-        "batch_stats": create(of_filter, LossConfig(), steps_per_epoch),
         "filter": create(of_filter, LossConfig(), steps_per_epoch),
     }
     return optax.partition(optimizers, _collections)
