@@ -55,17 +55,15 @@ class Positions(NamedTuple):
 
 
 def fit_considered(
-    walks: Walks, truth: Float[np.ndarray, "w k 3"], windows: DataConfig, options: FilterOptions
+    positions: Positions, stride_seconds: float, options: FilterOptions
 ) -> Considered:
     """The standard deviations of the errors that the filter leaves out, which make the errors of
-    its positions most likely.
+    its positions most likely; there is one every `stride_seconds`.
 
-    `truth` has the true positions after each stride, m; NaN where there is none. The search begins
-    at `CONSIDERED`, whatever the options say.
+    The search begins at `CONSIDERED`, whatever the options say.
     """
-    positions = filtered_positions(walks, truth, windows, options)
     start = free_vector(dataclasses.replace(options, **CONSIDERED), tuple(CONSIDERED))
-    independent = len(positions.error) * windows.stride_seconds / TOGETHER_SECONDS
+    independent = len(positions.error) * stride_seconds / TOGETHER_SECONDS
 
     def objective(free: Float[Array, "u"]) -> Array:
         std = considered_std(natural(dict(zip(CONSIDERED, free, strict=True))))
@@ -95,7 +93,8 @@ def with_considered(positions: Positions, std: ConsideredStd) -> Float[Array, "k
 def filtered_positions(
     walks: Walks, truth: Float[np.ndarray, "w k 3"], windows: DataConfig, options: FilterOptions
 ) -> Positions:
-    """The positions of a filter over the walks where the truth is known."""
+    """The positions of a filter over the walks. `truth` has the true ones after each stride, m; NaN
+    where there is none."""
     setup = filter_setup(windows, options)
 
     def of_walk(walk: Walks) -> tuple[Array, Array, Array]:

@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from gnio_jax import config as configuration
 from gnio_jax import data
-from gnio_jax.calibration.considered import Considered, fit_considered
+from gnio_jax.calibration.considered import Considered, filtered_positions, fit_considered
 from gnio_jax.calibration.errors import std_factors
 from gnio_jax.calibration.likelihood import Fit, Walks, fit
 from gnio_jax.calibration.unknowns import DIGITS, GROUPS, check_fittable, chosen, with_starts
@@ -106,9 +106,9 @@ def calibrate(
         config.steps,
     )
     progress("considering", 0.0)
-    considered = fit_considered(
-        walks, _true_positions(prepared, walks), run.config.data, found.options
-    )
+    windows, options = run.config.data, found.options
+    positions = filtered_positions(walks, _true_positions(prepared, walks), windows, options)
+    considered = fit_considered(positions, windows.stride_seconds, options)
     progress("considering", 1.0)
     calibration = Calibration(run.config.filter, found, considered, len(prepared), folder)
     _write(calibration, workdir, run, config, split)

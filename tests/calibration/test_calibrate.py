@@ -65,6 +65,9 @@ def test_the_run_differs_in_the_filter_alone(run, two_walks, tmp_path, capsys):
     about = json.loads((out / "calibration.json").read_text())
     likelihood = about["negative_log_likelihood_per_innovation"]
     assert likelihood["after"] < likelihood["before"]
+    assert found.considered_gyro_bias_std > 0
+    nees = about["position_nees_per_axis"]
+    assert abs(np.log(nees["after"])) < abs(np.log(nees["before"]))
     assert about["split"] == "val" and about["filter"] == dataclasses.asdict(found)
 
 
