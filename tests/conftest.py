@@ -4,21 +4,24 @@ Compiling is most of what the tests do, and what they compile runs once on small
 compiler optimises nothing, here and in the processes that tests start.
 """
 
+import gc
 import os
 from importlib.metadata import version
 from pathlib import Path
 
 from jaxtyping import install_import_hook
 
-COMPILER = ["--xla_backend_optimization_level=0"]
+# Each worker has one core: a module in many parts, to be compiled at once, is only more work.
+COMPILER = ["--xla_backend_optimization_level=0", "--xla_cpu_parallel_codegen_split_count=1"]
 if version("jax").startswith("0.10."):  # removed later, and XLA stops at a flag it does not know
     # Fusions as LLVM's loops instead of MLIR's: a third of the time to compile a filter.
     COMPILER.append("--xla_cpu_use_fusion_emitters=false")
 os.environ["XLA_FLAGS"] = " ".join([os.environ.get("XLA_FLAGS", ""), *COMPILER])
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # others would spin while they wait
 # The workers and the processes that tests start share what they compile through the cache, small
 # programs too.
-os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.05"
+os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
 
 # Every annotated shape and type is checked, in the tests alone.
 install_import_hook("gnio_jax", "beartype.beartype")
@@ -30,6 +33,9 @@ jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 # What is shared out among devices is shared out on every machine.
 jax.config.update("jax_num_cpu_devices", 2)
+
+# Tracing makes objects by the million, and hardly any of them in cycles.
+gc.set_threshold(100_000, 50, 100)
 
 # The files that take longest, in this order: begun first, they leave no worker alone at the end.
 LONGEST = (

@@ -85,6 +85,12 @@ def initialise(model: nn.Module, key: PRNGKeyArray, window: int = 200) -> Any:
     return _init(key, jnp.zeros((1, window, 6), jnp.float32), model=model)
 
 
+def variable_shapes(model: nn.Module, window: int = 200) -> Any:
+    """The shapes and types of what `initialise` gives; nothing is computed."""
+    windows = jax.ShapeDtypeStruct((1, window, 6), jnp.float32)
+    return _init.eval_shape(jax.random.key(0), windows, model=model)
+
+
 # For one use: the optimiser of the compiler takes more seconds than it saves.
 @functools.partial(
     jax.jit, static_argnames="model", compiler_options={"xla_backend_optimization_level": 1}
