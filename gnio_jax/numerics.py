@@ -14,6 +14,15 @@ from jaxtyping import Bool, Float, Int, Real
 from scipy.ndimage import maximum_filter1d
 from scipy.spatial.transform import Rotation, Slerp
 
+# --- rows
+
+
+def filled_up(values: np.ndarray, rows: int, filling: float | None = None) -> np.ndarray:
+    """`values` with copies of the last row, or rows of `filling`, at the end: `rows` in all."""
+    last = values[-1:] if filling is None else np.full((1, *values.shape[1:]), filling)
+    return np.concatenate([values, np.repeat(last, rows - len(values), axis=0)])
+
+
 # --- quaternions
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -12,14 +12,17 @@ import numpy as np
 from jaxtyping import Float
 from scipy.optimize import minimize
 
-from gnio_jax.calibration.unknowns import PRIOR_STD, Unknown, from_free, to_free, written
+from gnio_jax.calibration.unknowns import DIGITS
 from gnio_jax.config import DataConfig, FilterOptions
 from gnio_jax.errors import InputError
-from gnio_jax.evaluation import filter_setup
-from gnio_jax.filtering import FilterConfig, initial_state, over_sequences, repeat_odometry
-from gnio_jax.filtering.options import initial_std, noise_model
+from gnio_jax.filtering import initial_state, over_sequences, repeat_odometry
+from gnio_jax.filtering.options import FilterSetup, filter_with
+from gnio_jax.filtering.unconstrained import natural, unconstrained, with_numbers
 from gnio_jax.types import Array
 
+PRIOR_STD = 2.0
+"""Standard deviation of each unknown about its start, in its own logarithm or logit (ours). The
+recordings outweigh it by far in all that they tell; what they do not tell stays where it was."""
 CHECKPOINT_EVERY = 50
 """Clone intervals between the states that the backward pass keeps."""
 FAILED = 1e6
@@ -63,53 +66,56 @@ class Fit(NamedTuple):
 
 
 def innovation_objective(
-    walks: Walks, windows: DataConfig, options: FilterOptions, unknowns: tuple[Unknown, ...]
-) -> Callable[[Array], tuple[Array, Array]]:
-    """As a function of the unknowns without bounds: what is to be made small, and the part of it
-    that is −log-likelihood of all innovations over their number. The rest is the prior that keeps
-    those in place of which the walks say nothing."""
-    start = to_free(options, unknowns)
+    walks: Walks, windows: DataConfig, options: FilterOptions, unknowns: tuple[str, ...]
+) -> Callable[[Float[Array, "u"]], tuple[Array, Array]]:
+    """As a function of the numbers without bounds of some of the options: what is to be made small,
+    and the part of it that is −log-likelihood of all innovations over their number. The rest is the
+    prior that keeps those in place of which the walks say nothing."""
+    start = free_vector(options, unknowns)
     count = np.isfinite(walks.displacement).all(2).sum()
-    fixed = dataclasses.replace(options, measurement_scale=1.0)
-    config = dataclasses.replace(
-        filter_setup(windows, fixed).config,
-        gate_threshold=NO_GATE,
-        history="diagonal",
-        checkpoint_every=CHECKPOINT_EVERY,
-    )
 
-    def objective(free: Array) -> tuple[Array, Array]:
-        evidence = _log_likelihood(walks, config, vars(options) | from_free(free, unknowns))
+    def objective(free: Float[Array, "u"]) -> tuple[Array, Array]:
+        values = natural(dict(zip(unknowns, free, strict=True)))
+        evidence = _log_likelihood(walks, filter_with(windows, options, values))
         prior = 0.5 * jnp.sum(((free - start) / PRIOR_STD) ** 2)
         return (prior - evidence) / count, -evidence / count
 
     return objective
 
 
-def _log_likelihood(walks: Walks, config: FilterConfig, options: Mapping[str, Any]) -> Array:
-    """Of all innovations, with options whose values may be traced."""
-    noise, std = noise_model(options), initial_std(options)
-    factor = jnp.sqrt(jnp.asarray(options["measurement_scale"]))
+def free_vector(options: FilterOptions, unknowns: tuple[str, ...]) -> Float[np.ndarray, "u"]:
+    """The numbers without bounds of some of the options, in this order."""
+    return np.array(list(unconstrained(options, unknowns).values()))
 
-    def of_walk(given: tuple[Any, Any, Any], walk: Walks) -> Array:
-        factor, noise, std = given
+
+def _log_likelihood(walks: Walks, setup: FilterSetup) -> Array:
+    """Of all innovations, with a filter whose noise and start may be traced."""
+    config = dataclasses.replace(
+        setup.config,
+        gate_threshold=NO_GATE,
+        history="diagonal",
+        checkpoint_every=CHECKPOINT_EVERY,
+    )
+
+    def of_walk(given: tuple[Any, Any], walk: Walks) -> Array:
+        noise, std = given
         pose = (walk.rotation, walk.velocity, walk.position, walk.gyro_bias)
         state = initial_state(config, *pose, std=std)
-        told = walk.displacement, factor * walk.std
+        told = walk.displacement, walk.std
         _, history = repeat_odometry(state, walk.gyro, walk.accel, *told, config, noise)
         # What the walk is filled up with comes after its last displacement, and may run away.
         told = jnp.isfinite(walk.displacement).all(axis=1)
         healthy = jnp.all((history.healthy > 0) | ~told)
         return jnp.where(healthy, jnp.nansum(history.log_likelihood), jnp.nan)
 
-    return jnp.sum(over_sequences(of_walk, shared=1)((factor, noise, std), walks))
+    return jnp.sum(over_sequences(of_walk, shared=1)((setup.noise, setup.initial_std), walks))
 
 
 def fit(
     walks: Walks,
     windows: DataConfig,
     options: FilterOptions,
-    unknowns: tuple[Unknown, ...],
+    unknowns: tuple[str, ...],
     progress: Callable[[int], None],
     most_steps: int = 60,
 ) -> Fit:
@@ -120,28 +126,24 @@ def fit(
     """
     objective = innovation_objective(walks, windows, options, unknowns)
     compiled = jax.jit(jax.value_and_grad(objective, has_aux=True))
-    calls = 0
+    evidences: list[float] = []
+    """Of every call, the first of which is at the start."""
 
-    def evaluate(free: np.ndarray) -> tuple[float, float, np.ndarray]:
-        nonlocal calls
-        calls += 1
-        progress(calls)
+    def evaluate(free: np.ndarray) -> tuple[float, np.ndarray]:
         (value, evidence), gradient = jax.device_get(compiled(free))
-        if not (np.isfinite(value) and np.isfinite(gradient).all()):
-            return FAILED, FAILED, np.zeros_like(free)
-        return float(value), float(evidence), np.asarray(gradient, float)
+        sound = np.isfinite(value) and np.isfinite(gradient).all()
+        evidences.append(float(evidence) if sound else FAILED)
+        progress(len(evidences))
+        if not sound:
+            return FAILED, np.zeros_like(free)
+        return float(value), np.asarray(gradient, float)
 
-    start = to_free(options, unknowns)
-    _, before, _ = evaluate(start)
-    if before == FAILED:
+    limits = {"maxiter": most_steps, "ftol": 1e-7}
+    start = free_vector(options, unknowns)
+    found = minimize(evaluate, start, jac=True, method="L-BFGS-B", options=limits)
+    if evidences[0] == FAILED:
         raise InputError("the filter", "fails on these recordings with the options of the run")
-    found = minimize(
-        lambda free: evaluate(free)[::2],
-        start,
-        jac=True,
-        method="L-BFGS-B",
-        options={"maxiter": most_steps, "ftol": 1e-7},
-    )
-    fitted = written(options, from_free(jnp.asarray(found.x), unknowns))
-    _, after, _ = evaluate(to_free(fitted, unknowns))
-    return Fit(fitted, before, after, int(found.nit))
+    fitted = with_numbers(options, dict(zip(unknowns, found.x, strict=True)), DIGITS)
+    before = evidences[0]
+    evaluate(free_vector(fitted, unknowns))
+    return Fit(fitted, before, evidences[-1], int(found.nit))

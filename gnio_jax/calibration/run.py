@@ -9,34 +9,27 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 
 from gnio_jax import config as configuration
 from gnio_jax import data
 from gnio_jax.calibration.errors import std_factors
 from gnio_jax.calibration.likelihood import Fit, Walks, fit
-from gnio_jax.calibration.unknowns import (
-    UNKNOWNS,
-    Unknown,
-    check_fittable,
-    chosen,
-    with_starts,
-    written,
-)
+from gnio_jax.calibration.unknowns import DIGITS, GROUPS, check_fittable, chosen, with_starts
 from gnio_jax.config import CalibrateConfig, FilterOptions, TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import Setup, estimate, inference_network, prepare, true_displacements
 from gnio_jax.evaluation.estimators.result import Estimate
 from gnio_jax.evaluation.preparation import Prepared
 from gnio_jax.files import replacing_folder, write_text
+from gnio_jax.filtering.options import STD_FACTORS
+from gnio_jax.numerics import filled_up
 from gnio_jax.training import checkpoint
 
 OnStage = Callable[[str, float], None]
 """Called with the stage and the share of it that is done."""
 ABOUT = "calibration.json"
 """What was fitted to what: the mark of a calibrated run."""
-FACTORS = ("std_factor_x", "std_factor_y", "std_factor_z")
 
 
 class Calibration(NamedTuple):
@@ -77,7 +70,7 @@ def calibrate(
         raise InputError(f"dataset {run.config.dataset}, split '{split}'", problem)
 
     own = dataclasses.replace(
-        run.config.filter, measurement_scale=1.0, **dict.fromkeys(FACTORS, 1.0)
+        run.config.filter, measurement_scale=1.0, **dict.fromkeys(STD_FACTORS, 1.0)
     )
     network = inference_network(run.model, run.variables)
     estimates = estimate(
@@ -93,8 +86,11 @@ def calibrate(
     except ValueError as error:
         raise InputError(f"split '{split}'", str(error)) from None
 
-    options = written(own, dict(zip(FACTORS, jnp.asarray(factors), strict=True)))
-    options = with_starts(options, unknowns)
+    by_axis = {
+        name: float(f"{factor:.{DIGITS}g}")
+        for name, factor in zip(STD_FACTORS, factors, strict=True)
+    }
+    options = with_starts(dataclasses.replace(own, **by_axis), unknowns)
     found = fit(
         _walks(prepared, estimates, run.config.data.stride),
         run.config.data,
@@ -104,14 +100,14 @@ def calibrate(
         config.steps,
     )
     calibration = Calibration(run.config.filter, found, len(prepared), folder)
-    _write(calibration, workdir, run.config, config, split)
+    _write(calibration, workdir, run, config, split)
     return calibration
 
 
-def _unknowns(config: CalibrateConfig) -> tuple[Unknown, ...]:
+def _unknowns(config: CalibrateConfig) -> tuple[str, ...]:
     """Of the groups that are asked for, each once."""
     if not config.fit:
-        remedy = f"name some of {', '.join(UNKNOWNS)}"
+        remedy = f"name some of {', '.join(GROUPS)}"
         raise InputError("--fit", "names nothing", remedy)
     if config.steps < 1:
         raise InputError("--steps", f"must be at least 1, found {config.steps}")
@@ -149,15 +145,15 @@ def _walks(prepared: list[Prepared], estimates: list[Estimate], stride: int) -> 
     def of_recording(each: Prepared, estimate: Estimate) -> Walks:
         gyro, accel = each.sequence.gyro[:-1], each.sequence.accel[:-1]
         assert estimate.displacement is not None and estimate.displacement_std is not None
-        std = _filled(estimate.displacement_std[1:], strides, np.ones((1, 3)))
+        std = filled_up(estimate.displacement_std[1:], strides, 1.0)
         return Walks(
             each.start.rotation,
             each.start.velocity,
             each.start.position,
             each.gyro_bias,
-            gyro=_filled(gyro, strides * stride, gyro[-1:]),
-            accel=_filled(accel, strides * stride, accel[-1:]),
-            displacement=_filled(estimate.displacement[1:], strides, np.full((1, 3), np.nan)),
+            gyro=filled_up(gyro, strides * stride),
+            accel=filled_up(accel, strides * stride),
+            displacement=filled_up(estimate.displacement[1:], strides, np.nan),
             std=np.nan_to_num(std, nan=1.0),
         )
 
@@ -165,14 +161,10 @@ def _walks(prepared: list[Prepared], estimates: list[Estimate], stride: int) -> 
     return Walks(*(np.stack(column) for column in zip(*rows, strict=True)))
 
 
-def _filled(values: np.ndarray, rows: int, filling: np.ndarray) -> np.ndarray:
-    return np.concatenate([values, np.repeat(filling, rows - len(values), axis=0)])
-
-
 def _write(
     calibration: Calibration,
     workdir: Path,
-    trained: TrainConfig,
+    trained: checkpoint.Run,
     config: CalibrateConfig,
     split: str,
 ) -> None:
@@ -188,15 +180,14 @@ def _write(
         "steps": found.steps,
         "filter": dataclasses.asdict(found.options),
     }
-    source = Path("checkpoints") / config.checkpoint
     with replacing_folder(calibration.folder) as new:
         experiment = dataclasses.replace(
-            trained, workdir=str(calibration.folder), filter=found.options
+            trained.config, workdir=str(calibration.folder), filter=found.options
         )
         configuration.validate(experiment, "the calibrated run")
         configuration.save(new / "config.yaml", experiment)
         write_text(new / ABOUT, json.dumps(about, indent=2) + "\n")
-        shutil.copytree(workdir / source, new / "checkpoints" / "best")
+        checkpoint.write_best(new, trained._replace(config=experiment))
         for name in ("splits.yaml", "metrics.jsonl"):
             if (workdir / name).exists():
                 shutil.copy2(workdir / name, new / name)

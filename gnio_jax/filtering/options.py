@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
+
+import jax.numpy as jnp
 
 from gnio_jax.config import DataConfig, FilterOptions
 from gnio_jax.filtering.config import FilterConfig
@@ -13,6 +16,8 @@ from gnio_jax.filtering.noise import InitialStd, NoiseModel
 
 DEGREE = math.pi / 180
 """rad."""
+STD_FACTORS = ("std_factor_x", "std_factor_y", "std_factor_z")
+"""Fields of `FilterOptions`: factors of the network's σ, by axis."""
 
 
 class FilterSetup(NamedTuple):
@@ -37,6 +42,21 @@ def filter_setup(windows: DataConfig, options: FilterOptions) -> FilterSetup:
     return FilterSetup(config, noise_model(vars(options)), initial_std(vars(options)))
 
 
+def filter_with(
+    windows: DataConfig, options: FilterOptions, values: Mapping[str, Any]
+) -> FilterSetup:
+    """`filter_setup` with other values of some options, which may be traced.
+
+    The factor of the measurement's covariance, static in `FilterConfig`, goes into the factors of
+    σ, which are not.
+    """
+    fields = {**vars(options), **values}
+    root = jnp.sqrt(fields["measurement_scale"])
+    factors = {name: root * fields[name] for name in STD_FACTORS}
+    setup = filter_setup(windows, dataclasses.replace(options, measurement_scale=1.0))
+    return FilterSetup(setup.config, noise_model({**fields, **factors}), initial_std(fields))
+
+
 def noise_model(options: Mapping[str, Any]) -> NoiseModel:
     """The filter's noises, from the fields of its options; their values may be traced."""
     return NoiseModel(
@@ -44,7 +64,7 @@ def noise_model(options: Mapping[str, Any]) -> NoiseModel:
         accel_density=options["accel_density"],
         gyro_bias_walk=options["gyro_bias_walk"],
         accel_bias_walk=options["accel_bias_walk"],
-        std_factor=tuple(options[f"std_factor_{axis}"] for axis in "xyz"),
+        std_factor=tuple(options[name] for name in STD_FACTORS),
         displacement=_lasting_errors(options),
     )
 

@@ -60,7 +60,7 @@ class Run(NamedTuple):
     epoch: int
     step: int
     filter: dict[str, Any] = {}
-    """Options of the filter as they learn (`learnt.unconstrained`), if they do."""
+    """Options of the filter as they learn (`learnt.filter_numbers`), if they do."""
 
 
 def create_model(config: TrainConfig) -> nn.Module:
@@ -106,9 +106,7 @@ class Checkpoints:
         manager = self._managers[which]
         if position.step in manager.all_steps():
             return
-        variables = evaluated(state).variables
-        meta = {"position": position._asdict(), "shapes": _shapes(variables)}
-        items = {"variables": ocp.args.StandardSave(variables), "meta": ocp.args.JsonSave(meta)}
+        items = _evaluated_items(state, position)
         if which == "latest":
             items["optimizer"] = ocp.args.StandardSave(state.opt_state)
             if state.average is not None:
@@ -135,6 +133,18 @@ class Checkpoints:
         if template.average is not None:
             state = state._replace(params=restored["training"], average=state.params)
         return uncommitted(state), _position(meta["position"])
+
+
+def write_best(workdir: Path, run: Run) -> None:
+    """A checkpoint `best` with the variables of a run, and the filter of its config where one has
+    learnt."""
+    learns = bool(run.config.through_filter.learn)
+    numbers = learning.filter_numbers(run.config.filter) if learns else {}
+    network = (run.variables[name] for name in ("params", "batch_stats"))
+    state = TrainState(jnp.int32(run.step), *network, opt_state={}, filter=numbers)
+    position = Position(run.epoch, run.step, best_loss=None, loss_sums=(), seconds=0.0)
+    with _manager(workdir / "checkpoints" / "best", create=True) as manager:
+        manager.save(run.step, args=ocp.args.Composite(**_evaluated_items(state, position)))
 
 
 def load_run(workdir: Path, which: Which = "best") -> Run:
@@ -164,7 +174,7 @@ def load_run(workdir: Path, which: Which = "best") -> Run:
     template = models.variable_shapes(model, config.data.window)
     template = {"params": template["params"], "batch_stats": template.get("batch_stats", {})}
     if config.through_filter.learn:
-        template["filter"] = learning.unconstrained(config.filter)
+        template["filter"] = learning.filter_numbers(config.filter)
     with _manager(where, create=False) as manager:
         step = manager.latest_step()
         meta = _checked_meta(manager, step, template, where)
@@ -183,6 +193,13 @@ def load_run(workdir: Path, which: Which = "best") -> Run:
     options = learning.learnt_options(config.filter, numbers)
     config = dataclasses.replace(config, filter=options)
     return Run(config, model, variables, meta["position"]["epoch"], step, numbers)
+
+
+def _evaluated_items(state: TrainState, position: Position) -> dict[str, Any]:
+    """What every checkpoint holds."""
+    variables = evaluated(state).variables
+    meta = {"position": position._asdict(), "shapes": _shapes(variables)}
+    return {"variables": ocp.args.StandardSave(variables), "meta": ocp.args.JsonSave(meta)}
 
 
 def _manager(folder: Path, create: bool) -> ocp.CheckpointManager:

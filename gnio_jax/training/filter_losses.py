@@ -141,21 +141,36 @@ def gaussian_nll(
     error: Float[Array, "k d"], covariance: Float[Array, "k d d"]
 ) -> Float[jax.Array, ""]:
     """Mean over k of −ln N(e_k; 0, P_k), without its constant."""
-    root = jnp.linalg.cholesky(covariance)
-    log_volume = jnp.sum(jnp.log(jnp.diagonal(root, axis1=1, axis2=2)), axis=1)
-    return jnp.mean(0.5 * _squares(error, root) + log_volume)
+    variances, remainders = _eliminated(error, covariance)
+    return 0.5 * jnp.mean(jnp.sum(remainders**2 / variances + jnp.log(variances), axis=1))
 
 
 def normalised_squares(
     error: Float[Array, "k d"], covariance: Float[Array, "k d d"]
 ) -> Float[jax.Array, "k"]:
     """eᵀ P⁻¹ e."""
-    return _squares(error, jnp.linalg.cholesky(covariance))
+    variances, remainders = _eliminated(error, covariance)
+    return jnp.sum(remainders**2 / variances, axis=1)
 
 
-def _squares(error: Float[Array, "k d"], root: Float[Array, "k d d"]) -> Float[jax.Array, "k"]:
-    whitened = jax.scipy.linalg.solve_triangular(root, error[:, :, None], lower=True)
-    return jnp.sum(whitened[:, :, 0] ** 2, axis=1)
+def _eliminated(
+    error: Float[Array, "k d"], covariance: Float[Array, "k d d"]
+) -> tuple[Float[jax.Array, "k d"], Float[jax.Array, "k d"]]:
+    """Variance of each entry given the entries before it (D of P = L D Lᵀ), NaN where P is not
+    positive definite, and what is left of each entry (L⁻¹ e).
+
+    Gauss's elimination, written out. LAPACK's batched calls wait for workers of XLA's thread pool
+    while they hold one: where each core is a device, all wait for ever.
+    """
+    variances, remainders = [], []
+    for _ in range(error.shape[1]):
+        variance = jnp.where(covariance[:, 0, 0] > 0, covariance[:, 0, 0], jnp.nan)
+        column = covariance[:, 1:, 0] / variance[:, None]
+        variances.append(variance)
+        remainders.append(error[:, 0])
+        error = error[:, 1:] - column * error[:, :1]
+        covariance = covariance[:, 1:, 1:] - column[:, :, None] * covariance[:, :1, 1:]
+    return jnp.stack(variances, axis=1), jnp.stack(remainders, axis=1)
 
 
 def window_error(

@@ -25,7 +25,8 @@ from gnio_jax.filtering import (
     over_sequences,
     run_odometry,
 )
-from gnio_jax.filtering.options import filter_setup, initial_std, noise_model
+from gnio_jax.filtering.options import filter_setup, filter_with
+from gnio_jax.filtering.unconstrained import natural
 from gnio_jax.training import learnt as learning
 from gnio_jax.training import optimizer as optimizers
 from gnio_jax.training.filter_losses import FilterLosses, filter_losses, normalised_squares
@@ -40,12 +41,9 @@ from gnio_jax.training.pieces import (
     start_rotation,
 )
 from gnio_jax.training.step import Progress, TrainState
-from gnio_jax.types import Prediction
 
 CHECKPOINT_EVERY = 20
 """Clone intervals between the states that the backward pass keeps."""
-NO_FLOOR = -1e3
-"""A log σ that no network says: the floor is applied before the factor, not after it."""
 POSITION = slice(6, 9)
 """Of the core error θ, v, p, b_g, b_a."""
 
@@ -87,10 +85,9 @@ def filter_config(config: TrainConfig, training: bool) -> FilterConfig:
     """The filter of a piece: in training with a gate that has a slope and a gradient that is cut,
     else as evaluation has it.
 
-    The factor of the measurement's covariance is left to `predict`, since it may learn.
+    The factor of the measurement's covariance is not in it, since it may learn.
     """
-    ekf = filter_setup(config.data, config.filter).config
-    ekf = dataclasses.replace(ekf, measurement_scale=1.0, log_std_min=NO_FLOOR)
+    ekf = filter_with(config.data, config.filter, {}).config
     if not training:
         return ekf
     through = config.through_filter
@@ -110,7 +107,7 @@ def intervals(config: TrainConfig) -> int:
 def ready(variables: Any, model: nn.Module) -> Ready:
     """Variables, the collection "filter" among them, made ready for the filter's loop."""
     network = {name: tree for name, tree in variables.items() if name != "filter"}
-    options = learning.natural(variables["filter"])
+    options = natural(variables["filter"])
     return Ready(models.inference_variables(model, network), options)
 
 
@@ -123,16 +120,8 @@ def run_piece(
     ekf: FilterConfig,
 ) -> tuple[Path, FilterHistory]:
     """The filter over one piece with the network in its loop: its path, the start included."""
-    options = {**vars(config.filter), **program.options}
-    apply = models.Inference(model)
-    floor = filter_setup(config.data, config.filter).config.log_std_min
-    widening = 0.5 * jnp.log(options["measurement_scale"])
-
-    def predict(windows: jax.Array) -> Prediction:
-        said = apply(program.network, windows)
-        log_std = jnp.maximum(said.log_std.astype(jnp.float64), floor) + widening
-        return Prediction(said.displacement, log_std)
-
+    setup = filter_with(config.data, config.filter, program.options)
+    predict = functools.partial(models.Inference(model), program.network)
     truth = piece.truth
     start = initial_state(
         ekf,
@@ -141,10 +130,9 @@ def run_piece(
         truth.position[0] + errors.position,
         errors.gyro_bias,
         errors.accel_bias,
-        initial_std(options),
+        setup.initial_std,
     )
-    noise = noise_model(options)
-    _, history = run_odometry(predict, start, piece.gyro, piece.accel, ekf, noise)
+    _, history = run_odometry(predict, start, piece.gyro, piece.accel, ekf, setup.noise)
     path = Path(
         jnp.concatenate([start.rotation[None], history.rotation]),
         jnp.concatenate([start.velocity[None], history.velocity]),

@@ -1,23 +1,20 @@
 """What learns through the filter: modules of the network, and options of the filter.
 
-The filter's options learn as unconstrained numbers: logarithms, and the logit of the one that is a
-share. They lie beside the network's variables as the collection "filter", by the names of
-`FilterOptions`' fields, float32 like the network.
+The filter's options learn as numbers without bounds (`filtering.unconstrained`). They lie beside
+the network's variables as the collection "filter", float32 like the network.
 """
 
 from __future__ import annotations
 
-import dataclasses
-import math
 from collections.abc import Iterable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Float
 
 from gnio_jax.config import FilterOptions
+from gnio_jax.filtering.unconstrained import unconstrained, with_numbers
 from gnio_jax.training.optimizer import UNCERTAINTY
 
 FILTER_PARTS = {
@@ -43,45 +40,25 @@ FILTER_PARTS = {
     ),
 }
 """Fields of `FilterOptions` that each part of the filter has."""
+DIGITS = 5
+"""That float32 keeps of a value whose logarithm it holds."""
 
 HEADS = ("head", "displacement")
 """Names of the networks' modules from which the displacement comes."""
-SHARES = ("window_error_share",)
-"""Fields between 0 and 1; the others are positive."""
 
 Learnt = dict[str, dict[str, Any]]
 """Variables that learn, by collection: "params" and "filter"; none of them empty."""
 
 
-def unconstrained(options: FilterOptions) -> dict[str, Float[jax.Array, ""]]:
-    """The numbers that stand for the filter's options. An option that is 0 is switched off, and has
-    none."""
-    found = {}
-    for name in (name for names in FILTER_PARTS.values() for name in names):
-        value = getattr(options, name)
-        if value > 0:
-            number = math.log(value) - (math.log1p(-value) if name in SHARES else 0.0)
-            found[name] = jnp.float32(number)
-    return found
-
-
-def natural(numbers: dict[str, Float[jax.Array, ""]]) -> dict[str, Float[jax.Array, ""]]:
-    """The values of options, float64, from their unconstrained numbers. Differentiable."""
-    wide = {name: number.astype(jnp.float64) for name, number in numbers.items()}
-    return {
-        name: jax.nn.sigmoid(number) if name in SHARES else jnp.exp(number)
-        for name, number in wide.items()
-    }
+def filter_numbers(options: FilterOptions) -> dict[str, Float[jax.Array, ""]]:
+    """The collection "filter": a number for each option that is not switched off."""
+    fields = [name for names in FILTER_PARTS.values() for name in names]
+    return {name: jnp.float32(each) for name, each in unconstrained(options, fields).items()}
 
 
 def learnt_options(options: FilterOptions, numbers: dict[str, Any]) -> FilterOptions:
-    """The filter's options with the values that have learnt, to the six digits that float32 has."""
-    values = {}
-    for name, number in numbers.items():
-        wide = float(np.float64(number))
-        value = 1 / (1 + math.exp(-wide)) if name in SHARES else math.exp(wide)
-        values[name] = float(f"{value:.6g}")
-    return dataclasses.replace(options, **values)
+    """The filter's options with the values that have learnt, as five digits."""
+    return with_numbers(options, numbers, DIGITS)
 
 
 def chosen(variables: Any, learn: Iterable[str]) -> Learnt:

@@ -32,7 +32,7 @@ class TrainState(NamedTuple):
     average: Any = None
     """Moving average of `params` (`optim.ema_decay`); None where none is kept."""
     filter: Any = {}
-    """Options of the filter as they learn (`learnt.unconstrained`); none in training on windows."""
+    """Options of the filter as they learn (`learnt.filter_numbers`), if they do."""
 
     @property
     def variables(self) -> dict[str, Any]:

@@ -56,7 +56,7 @@ class FilterTraining(NamedTuple):
     def new_state(self, start: Run | None) -> TrainState:
         nothing = optax.identity()
         state = create_state(self.model, nothing, self.keys.init, self.config.data.window)
-        state = state._replace(filter=learning.unconstrained(self.config.filter))
+        state = state._replace(filter=learning.filter_numbers(self.config.filter))
         if start is not None:
             state = with_weights(state, start)
         learnt = learning.chosen(state.variables, self.config.through_filter.learn)

@@ -5,15 +5,15 @@ import dataclasses
 import functools
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from gnio_jax import filtering
-from gnio_jax.calibration.likelihood import Walks, fit, innovation_objective
-from gnio_jax.calibration.unknowns import UNKNOWNS, chosen, from_free, to_free, with_starts, written
+from gnio_jax.calibration.likelihood import Walks, fit, free_vector, innovation_objective
+from gnio_jax.calibration.unknowns import GROUPS, check_fittable, chosen, with_starts
 from gnio_jax.config import DataConfig, FilterOptions
 from gnio_jax.errors import InputError
+from gnio_jax.filtering.unconstrained import natural, with_numbers
 from tests.support.walks import simulate
 
 DATA = DataConfig(rate=50.0, window_seconds=0.4, stride_seconds=0.1)
@@ -35,7 +35,7 @@ def walks():
 
 
 def test_the_noises_of_simulated_walks_are_found():
-    unknowns = (*chosen(("measurement",)), *UNKNOWNS["noise"][:2])
+    unknowns = (*chosen(("measurement",)), *GROUPS["noise"][:2])
     wrong = dataclasses.replace(TRUE, gyro_density=3e-4, accel_density=2e-1)
     found = fit(walks(), DATA, wrong, unknowns, lambda calls: None)
     assert found.after < found.before - 0.1
@@ -45,11 +45,11 @@ def test_the_noises_of_simulated_walks_are_found():
 
 
 def test_the_gradient_is_that_of_the_likelihood():
-    unknowns = chosen(tuple(UNKNOWNS))
+    unknowns = chosen(tuple(GROUPS))
     options = with_starts(TRUE, unknowns)
     both = innovation_objective(walks(), DATA, options, unknowns)
     objective = jax.jit(lambda free: both(free)[0])
-    free = to_free(options, unknowns)
+    free = free_vector(options, unknowns)
     gradient = np.asarray(jax.jit(jax.grad(lambda free: both(free)[0]))(free))
     assert (gradient != 0).all()
     for i, step in enumerate(1e-4 * np.eye(len(free))):
@@ -58,15 +58,22 @@ def test_the_gradient_is_that_of_the_likelihood():
 
 
 def test_unknowns_go_to_numbers_without_bounds_and_back():
-    unknowns = chosen(tuple(UNKNOWNS))
+    unknowns = chosen(tuple(GROUPS))
     options = with_starts(dataclasses.replace(TRUE, window_error_seconds=0.7), unknowns)
     assert options.window_error_share == 0.8 and options.window_error_seconds == 0.7
-    back = from_free(jnp.asarray(to_free(options, unknowns)), unknowns)
-    for unknown in unknowns:
-        wanted = getattr(options, unknown.field)
-        np.testing.assert_allclose(back[unknown.field], wanted, rtol=1e-12)
-    found = written(FilterOptions(measurement_scale=3.0), {"gyro_density": jnp.asarray(1.23456)})
+    back = natural(dict(zip(unknowns, free_vector(options, unknowns), strict=True)))
+    for name in unknowns:
+        np.testing.assert_allclose(back[name], getattr(options, name), rtol=1e-12)
+    number = {"gyro_density": np.log(1.23456)}
+    found = with_numbers(FilterOptions(measurement_scale=3.0), number, 4)
     assert found == FilterOptions(measurement_scale=3.0, gyro_density=1.235)
+
+
+def test_what_is_switched_off_and_has_no_start_cannot_be_fitted():
+    off = dataclasses.replace(TRUE, gyro_bias_std=0.0)
+    check_fittable(off, chosen(("noise", "window", "walk")))
+    with pytest.raises(InputError, match=r"filter.gyro_bias_std: is 0 .*leave its group out"):
+        check_fittable(off, chosen(("start",)))
 
 
 def test_a_walk_may_be_filled_up_and_a_filter_that_fails_is_named():
@@ -79,7 +86,7 @@ def test_a_walk_may_be_filled_up_and_a_filter_that_fails_is_named():
         displacement=np.concatenate([given.displacement, np.full((8, 40, 3), np.nan)], axis=1),
         std=np.concatenate([given.std, np.ones((8, 40, 3))], axis=1),
     )
-    free = to_free(TRUE, unknowns)
+    free = free_vector(TRUE, unknowns)
     values = [
         float(jax.jit(innovation_objective(each, DATA, TRUE, unknowns))(free)[1])
         for each in (given, falling)

@@ -23,6 +23,7 @@ from gnio_jax.config import (
     TrainConfig,
 )
 from gnio_jax.errors import InputError
+from gnio_jax.filtering.unconstrained import natural
 from gnio_jax.models import registry
 from gnio_jax.reporting import Lines
 from gnio_jax.training import (
@@ -237,6 +238,24 @@ def test_wild_steps_are_skipped_and_counted(training):
         assert figures["loss"] == 2.0 and figures["skipped"] == 2
 
 
+def test_no_call_to_lapack_waits_for_a_worker(training):
+    """Where each core is a device, its batched calls in the step deadlock."""
+    state = new_state(training)
+    order, config = training.source.earliest, training.config
+    lowered = filter_step.train_steps.trace(
+        state,
+        training.source,
+        jnp.resize(order, 10),
+        jnp.int32(0),
+        jnp.int32(1),
+        jnp.float32(1),
+        jax.random.key(0),
+        model=training.model,
+        config=through_filter._without_folders(config),
+    )
+    assert "cholesky" not in str(lowered.jaxpr) and "triangular_solve" not in str(lowered.jaxpr)
+
+
 def test_noise_is_recovered(training):
     """In the four steps of a run, towards that of the data: three times the first guess, or a third
     of it."""
@@ -310,16 +329,19 @@ def test_parts_are_modules_and_options_by_name(training):
 
 
 def test_options_survive_their_unconstrained_numbers():
-    numbers = learnt.unconstrained(OPTIONS)
+    numbers = learnt.filter_numbers(OPTIONS)
     assert "heading_error_std_degrees" not in numbers
     assert learnt.learnt_options(OPTIONS, numbers) == OPTIONS
-    found = learnt.natural(numbers)
+    found = natural(numbers)
     for name, value in found.items():
         assert value.dtype == jnp.float64
         np.testing.assert_allclose(value, getattr(OPTIONS, name), rtol=2e-6)
-    moved = learnt.natural({"window_error_share": jnp.float32(0), "velocity_std": jnp.float32(1)})
+    moved = natural({"window_error_share": jnp.float32(0), "velocity_std": jnp.float32(1)})
     assert moved["window_error_share"] == 0.5
     np.testing.assert_allclose(moved["velocity_std"], np.e, rtol=1e-7)
+    # A share is never rounded to 1, which no option may be.
+    nearly = learnt.learnt_options(OPTIONS, {"window_error_share": jnp.float32(20)})
+    assert nearly.window_error_share == 0.9999
 
 
 def test_a_later_stage_starts_from_what_the_filter_has_learnt(recording, finished, training):

@@ -31,7 +31,7 @@ from gnio_jax.filtering import (
     run_odometry,
 )
 from gnio_jax.filtering.options import FilterSetup
-from gnio_jax.numerics import quaternion_from_matrix
+from gnio_jax.numerics import filled_up, quaternion_from_matrix
 from gnio_jax.types import Array
 
 POSITION = slice(6, 9)
@@ -117,15 +117,15 @@ def _run_batch(
     samples = batch.strides * setup.config.samples_per_clone
     start = _stacked([_filter_start(each, setup) for each in members])
     # What is appended comes after the recording and changes nothing before it.
-    gyro = np.stack([_extended(each.sequence.gyro[:-1], samples, 0.0) for each in members])
-    accel = np.stack([_extended(each.sequence.accel[:-1], samples, None) for each in members])
+    gyro = np.stack([filled_up(each.sequence.gyro[:-1], samples, 0.0) for each in members])
+    accel = np.stack([filled_up(each.sequence.accel[:-1], samples) for each in members])
     if isinstance(source, Network):
         history = _run_with_network(
             source.apply, source.variables, start, gyro, accel, setup.config, setup.noise
         )
     else:
         given = [
-            Measurements(*(_extended(part, batch.strides, np.nan) for part in source[i]))
+            Measurements(*(filled_up(part, batch.strides, np.nan) for part in source[i]))
             for i in batch.members
         ]
         history = _run_with_measurements(
@@ -227,12 +227,6 @@ def _after(first: Any, rest: Any) -> np.ndarray:
     """`rest` behind a row of `first`."""
     row = np.broadcast_to(np.asarray(first, float), rest.shape[1:])
     return np.concatenate([row[None], rest])
-
-
-def _extended(values: np.ndarray, rows: int, filling: float | None) -> np.ndarray:
-    """`values` with rows of `filling` or (None) of the last one added at the end, up to `rows`."""
-    added = values[-1:] if filling is None else np.full((1, *values.shape[1:]), filling)
-    return np.concatenate([values, np.repeat(added, rows - len(values), 0)])
 
 
 def _stacked(trees: list[Any]) -> Any:
