@@ -57,6 +57,16 @@ def pytest_collection_modifyitems(items):
     items.sort(key=lambda item: places.get(item.path, len(LONGEST)))
 
 
+@pytest.fixture(scope="module", autouse=True)
+def programs_that_fit():
+    """Compiled programs are let go before they use up the 65,530 memory maps that Linux grants a
+    process: XLA crashes without a word."""
+    yield
+    maps = Path("/proc/self/maps")
+    if maps.exists() and maps.read_bytes().count(b"\n") > 30_000:
+        jax.clear_caches()
+
+
 @pytest.fixture(scope="session")
 def recordings():
     """The folder of real recordings, $GNIO_DATA/<name>; tests that ask for it are skipped, and say
