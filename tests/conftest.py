@@ -39,15 +39,20 @@ gc.set_threshold(100_000, 50, 100)
 
 # The files that take longest, in this order: begun first, they leave no worker alone at the end.
 LONGEST = (
-    "training/test_loop.py",
     "training/test_statistics.py",
-    "test_installed.py",
-    "tables/test_tables.py",
-    "filtering/test_derivatives.py",
+    "training/test_loop.py",
+    "training/test_through_filter.py",
     "filtering/test_consistency.py",
+    "filtering/test_derivatives.py",
+    "filtering/test_lasting_errors.py",
     "filtering/test_smoother.py",
-    "filtering/test_precision.py",
+    "calibration/test_likelihood.py",
+    "calibration/test_calibrate.py",
+    "models/test_gnio.py",
+    "test_installed.py",
     "filtering/test_intake.py",
+    "filtering/test_precision.py",
+    "tables/test_tables.py",
 )
 
 
