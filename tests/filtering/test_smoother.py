@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from gnio_jax import filtering
 from gnio_jax.types import Prediction
 from tests.support import scekf_numpy
-from tests.support.compiling import quick
+from tests.support.compiling import optimised, quick
 from tests.support.walks import errors, simulate
 
 N, CLONES, INTERVALS, DT = 4, 3, 14, 0.05
@@ -332,7 +332,7 @@ def test_long_walks_come_closer_to_the_truth_and_say_by_how_much():
     valid[1, 1000:1005] = valid[2, 1500:1530] = False
     spread = np.tile(SIGMA**2 * np.eye(3), (LONG, 1, 1))
 
-    @jax.jit
+    @optimised
     @jax.vmap
     def both(rotation, velocity, position, gyro, accel, displacement, valid):
         state = filtering.initial_state(config, rotation, velocity, position, std=std)
