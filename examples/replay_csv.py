@@ -102,7 +102,8 @@ def create_tracker(run, recorded: Recorded, rest_seconds: float):
     from gnio_jax.evaluation import filter_setup
     from gnio_jax.filtering import Tracker
 
-    config, noise, initial_std = filter_setup(run.config.data, run.config.filter)
+    setup = filter_setup(run.config.data, run.config.filter)
+    config, noise, initial_std = setup.config, setup.noise, setup.initial_std
     # What depends on the weights alone is computed once.
     frozen = models.inference_variables(run.model, run.variables)
 

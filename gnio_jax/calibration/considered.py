@@ -14,6 +14,7 @@ from scipy.optimize import minimize
 from gnio_jax.calibration.likelihood import Walks, free_vector
 from gnio_jax.calibration.unknowns import CONSIDERED, DIGITS, PRIOR_STD
 from gnio_jax.config import DataConfig, FilterOptions
+from gnio_jax.errors import InputError
 from gnio_jax.filtering import (
     ConsideredStd,
     considered_covariance,
@@ -60,8 +61,11 @@ def fit_considered(
     """The standard deviations of the errors that the filter leaves out, which make the errors of
     its positions most likely; there is one every `stride_seconds`.
 
-    The search begins at `CONSIDERED`, whatever the options say.
+    The search begins at `CONSIDERED`, whatever the options say. Raises `InputError` where there is
+    no position with a reference, or no likelihood.
     """
+    if not len(positions.error):
+        raise InputError("the filter", "is not healthy where these recordings have a reference")
     start = free_vector(dataclasses.replace(options, **CONSIDERED), tuple(CONSIDERED))
     independent = len(positions.error) * stride_seconds / TOGETHER_SECONDS
 
@@ -74,6 +78,8 @@ def fit_considered(
     found = minimize(
         lambda free: jax.device_get(compiled(free)), start, jac=True, method="L-BFGS-B"
     )
+    if not np.isfinite(found.fun):
+        raise InputError("the filter", "has a covariance on these recordings that is not one")
     fitted = with_numbers(options, dict(zip(CONSIDERED, found.x, strict=True)), DIGITS)
     before, after = (
         float(jnp.mean(normalised_squares(positions.error, covariance)) / 3)
@@ -93,11 +99,13 @@ def with_considered(positions: Positions, std: ConsideredStd) -> Float[Array, "k
 def filtered_positions(
     walks: Walks, truth: Float[np.ndarray, "w k 3"], windows: DataConfig, options: FilterOptions
 ) -> Positions:
-    """The positions of a filter over the walks. `truth` has the true ones after each stride, m; NaN
-    where there is none."""
+    """The positions of a filter over the walks, where it is healthy.
+
+    `truth` has the true ones after each stride, m; NaN where there is none.
+    """
     setup = filter_setup(windows, options)
 
-    def of_walk(walk: Walks) -> tuple[Array, Array, Array]:
+    def of_walk(walk: Walks) -> tuple[Array, Array, Array, Array]:
         pose = (walk.rotation, walk.velocity, walk.position, walk.gyro_bias)
         state = initial_state(setup.config, *pose, std=setup.initial_std)
         run = state, walk.gyro, walk.accel
@@ -105,9 +113,11 @@ def filtered_positions(
         _, history = repeat_odometry(*run, *told, setup.config, setup.noise)
         found = sensitivity(*run, history, setup.config, setup.noise)
         assert history.covariance is not None
-        return history.position, history.covariance[:, POSITION, POSITION], found[:, POSITION]
+        covariance = history.covariance[:, POSITION, POSITION]
+        return history.healthy, history.position, covariance, found[:, POSITION]
 
-    position, covariance, of_position = jax.device_get(jax.jit(over_sequences(of_walk))(walks))
+    found = jax.device_get(jax.jit(over_sequences(of_walk))(walks))
+    healthy, position, covariance, of_position = found
     error = truth - position
-    known = np.isfinite(error).all(axis=2)
+    known = np.isfinite(error).all(axis=2) & (healthy > 0)
     return Positions(error[known], covariance[known], of_position[known])

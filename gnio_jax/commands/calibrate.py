@@ -19,9 +19,9 @@ DESCRIPTION = """Fit the filter's options of a run to its validation split; writ
 
 A network learns the errors of the walks that it has fitted, which are smaller than those of others.
 First its standard deviations get a factor for each axis, from the errors on the validation split.
-Then the filter's noises are those that make its innovations most likely. Last, the errors that the
-filter reports but does not estimate are those of its positions. The result is a run that gnio
-evaluate takes as any other; test splits are refused."""
+Then the filter's noises are those that make its innovations most likely. Last, the sizes of the
+errors that the filter reports but does not estimate are fitted to the errors of its positions. The
+result is a run that gnio evaluate takes as any other; test splits are refused."""
 
 
 def calibrate(config: CalibrateConfig, prog: str) -> None:

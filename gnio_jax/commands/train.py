@@ -14,7 +14,7 @@ import tyro
 from gnio_jax import config as configuration
 from gnio_jax.commands import console
 from gnio_jax.commands.options import Command, execute, sibling
-from gnio_jax.config import FilterOptions, TrainConfig
+from gnio_jax.config import CONSIDERED_FIELDS, FilterOptions, TrainConfig
 from gnio_jax.cores import usable_cores
 
 DESCRIPTION = """Train a network and leave a run: config.yaml, checkpoints, logs in its work folder.
@@ -22,7 +22,7 @@ DESCRIPTION = """Train a network and leave a run: config.yaml, checkpoints, logs
   {prog} --config quickstart --workdir runs/demo
   {prog} --dataset tlio --data-root ~/tlio --workdir runs/tlio
   {prog} --workdir runs/tlio --resume
-  {prog} --config through_filter_oxiod --init-from runs/oxiod --workdir runs/through
+  {prog} --config through_filter_oxiod --init-from runs/oxiod_calibrated --workdir runs/through
 
 --config FILE reads options from a YAML file, or from one of the experiments that come with the
 package; options given here win over it. --resume continues a run from its latest checkpoint as if
@@ -51,32 +51,40 @@ class TrainOptions(TrainConfig, RunOptions):
 
 
 def defaults(options: TrainOptions) -> TrainOptions:
-    """The settings of --config, else those of the run that is resumed; options win over both."""
+    """The settings of --config, else those of the run that is resumed; options win over both.
+
+    The filter, as far as they leave it open, is that of the run that is resumed, or of the run that
+    training through the filter starts from.
+    """
     kept = configuration.default_workdir(options) / "config.yaml"
-    if options.config is not None:
-        start = TrainOptions(**vars(configuration.load(options.config)))
-    elif options.resume and kept.exists():
-        start = TrainOptions(**vars(configuration.load(kept)))
-    else:
-        start = TrainOptions()
-    return start if options.resume else _with_filter_of_initial_run(start, options)
+    resumed = configuration.load(kept) if options.resume and kept.exists() else None
+    if options.config is None:
+        found = resumed or TrainConfig()
+        return _with(found, found.filter if resumed else _filter_to_begin_with(options, found))
+    found = configuration.load(options.config)
+    own = resumed.filter if resumed else _filter_to_begin_with(options, found)
+    return TrainOptions(**vars(configuration.load(options.config, TrainConfig(filter=own))))
 
 
-def _with_filter_of_initial_run(start: TrainOptions, options: TrainOptions) -> TrainOptions:
-    """Training through the filter begins with the filter of the run that it starts from; what
-    differs from the defaults in `start` stays."""
-    workdir = options.init_from or start.init_from
-    learns = options.through_filter.learn or start.through_filter.learn
+def _with(config: TrainConfig, filter_options: FilterOptions) -> TrainOptions:
+    return TrainOptions(**vars(dataclasses.replace(config, filter=filter_options)))
+
+
+def _filter_to_begin_with(options: TrainOptions, config: TrainConfig) -> FilterOptions:
+    """The filter of the initial run in training through the filter, else the default one.
+
+    What that run's filter considers belongs to its own covariance, not to the one that will learn.
+    """
+    workdir = options.init_from or config.init_from
+    learns = options.through_filter.learn or config.through_filter.learn
     if workdir is None or not learns or not (Path(workdir) / "config.yaml").is_file():
-        return start
+        return FilterOptions()
     from gnio_jax import filtering
     from gnio_jax.evaluation.run import run_config
 
     filtering.cores_as_devices()  # before the checkpoint's arrays settle the devices
-    usual, asked = vars(FilterOptions()), vars(start.filter)
-    kept = {name: value for name, value in asked.items() if value != usual[name]}
-    found = dataclasses.replace(run_config(Path(workdir)).filter, **kept)
-    return dataclasses.replace(start, filter=found)
+    nothing = dict.fromkeys(CONSIDERED_FIELDS, 0.0)
+    return dataclasses.replace(run_config(Path(workdir)).filter, **nothing)
 
 
 def train(options: TrainOptions, prog: str) -> None:

@@ -7,6 +7,7 @@ paper's.
 
 from gnio_jax.config.runs import default_workdir, newest_run
 from gnio_jax.config.schema import (
+    CONSIDERED_FIELDS,
     AugmentConfig,
     CalibrateConfig,
     DataConfig,
@@ -23,6 +24,7 @@ from gnio_jax.config.validation import validate
 from gnio_jax.config.yaml_files import find, load, names, save
 
 __all__ = [
+    "CONSIDERED_FIELDS",
     "AugmentConfig",
     "CalibrateConfig",
     "DataConfig",

@@ -221,6 +221,15 @@ class OptimConfig:
             raise InputError(source, problem, remedy)
 
 
+CONSIDERED_FIELDS = (
+    "considered_gyro_bias_std",
+    "considered_scale_std",
+    "considered_heading_std_degrees",
+    "considered_slope_std",
+)
+"""Fields of `FilterOptions`: errors that the filter reports but does not estimate."""
+
+
 @dataclass(frozen=True)
 class FilterOptions:
     """Noise and initial uncertainty of the stochastic-cloning EKF (paper §III-G; TLIO's values)."""
@@ -268,8 +277,9 @@ class FilterOptions:
     """Time constant of both, s."""
     considered_gyro_bias_std: NonNegative = 0.0
     """Standard deviation, rad/s, of the gyro's bias that the filter does not try to estimate but
-    reports in its covariance (ours; consider covariance analysis). The trajectory does not depend
-    on this nor on the next three."""
+    reports in the covariance of its trajectories (ours; consider covariance analysis). The
+    trajectory does not depend on this nor on the next three. Smoother and Tracker leave them out.
+    """
     considered_scale_std: NonNegative = 0.0
     """The same of the displacements' scale, as a fraction."""
     considered_heading_std_degrees: NonNegative = 0.0
@@ -297,7 +307,7 @@ class TrainConfig:
     """Folder for checkpoints and logs; by default runs/<dataset>_<model>."""
     init_from: str | None = None
     """Folder of a run with the same network, whose best weights training starts from; by default
-    they are drawn. Through the filter, training also starts from the run's filter."""
+    they are drawn. Through the filter, `gnio train` also begins with the run's filter options."""
     seed: int = 0
     """Seed of the initial parameters, the shuffling and the augmentation."""
     data: DataConfig = field(default_factory=DataConfig)
@@ -401,7 +411,8 @@ class CalibrateConfig:
     """What is fitted by the likelihood of the innovations: `measurement`, the factor of the
     network's covariance; `noise`, the IMU's; `start`, the standard deviations of the initial
     biases; `window`, the part of a window's error that lasts; `walk`, the errors of speed and
-    heading that last."""
+    heading that last. The factors of the axes and the errors that are considered are always
+    fitted."""
     checkpoint: Literal["best", "latest"] = "best"
     """Which checkpoint of the run."""
     steps: Count = 60

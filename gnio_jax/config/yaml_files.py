@@ -59,8 +59,9 @@ def _packaged() -> dict[str, Path]:
     return {file.relative_to(folder).with_suffix("").as_posix(): file for file in files}
 
 
-def load(path: str | Path) -> TrainConfig:
-    """Read a `TrainConfig` from a YAML file, or from the experiment of that name.
+def load(path: str | Path, base: TrainConfig | None = None) -> TrainConfig:
+    """Read a `TrainConfig` from a YAML file, or from the experiment of that name. What it leaves
+    out is as in `base`, or by default.
 
     Raises `InputError` on a missing file, an unknown key or a wrong type.
     """
@@ -71,7 +72,7 @@ def load(path: str | Path) -> TrainConfig:
         raise InputError(path, f"cannot be read ({error})") from None
     except yaml.YAMLError as error:
         raise InputError(path, f"is not YAML ({' '.join(str(error).split())})") from None
-    return _section(TrainConfig, {} if content is None else content, str(path), "")
+    return _section(base or TrainConfig(), {} if content is None else content, str(path), "")
 
 
 def save(path: str | Path, config: TrainConfig) -> None:
@@ -81,27 +82,30 @@ def save(path: str | Path, config: TrainConfig) -> None:
         temporary.write_text(text, encoding="utf-8")
 
 
-def _section(kind: type, content: Any, source: str, prefix: str) -> Any:
-    """The dataclass `kind` with the fields of a mapping."""
+def _section(base: Any, content: Any, source: str, prefix: str) -> Any:
+    """The dataclass `base` with the fields of a mapping in it."""
     if not isinstance(content, dict):
         place = prefix.rstrip(".") or "the file"
         problem = f"{place} must be a mapping of fields, found {type(content).__name__}"
         raise InputError(source, problem)
-    hints = typing.get_type_hints(kind)
+    hints = typing.get_type_hints(type(base))
     for key in content:
         if key not in hints:
             close = difflib.get_close_matches(str(key), hints, n=1)
             known = f"known fields: {', '.join(hints)}"
             remedy = f"did you mean '{prefix}{close[0]}'?" if close else known
             raise InputError(source, f"unknown field '{prefix}{key}'", remedy)
-    fields = {key: _value(hints[key], content[key], source, prefix + key) for key in content}
-    return kind(**fields)
+    fields = {
+        key: _section(getattr(base, key), value, source, f"{prefix}{key}.")
+        if dataclasses.is_dataclass(hints[key])
+        else _value(hints[key], value, source, prefix + key)
+        for key, value in content.items()
+    }
+    return dataclasses.replace(base, **fields)
 
 
 def _value(hint: Any, value: Any, source: str, name: str) -> Any:
     """The value of a field, if it has the field's type."""
-    if dataclasses.is_dataclass(hint):
-        return _section(typing.cast(type, hint), value, source, name + ".")
     # `Literal[...] | None` is a typing.Union, `int | None` is a types.UnionType.
     union = isinstance(hint, types.UnionType) or typing.get_origin(hint) is typing.Union
     options = typing.get_args(hint) if union else (hint,)

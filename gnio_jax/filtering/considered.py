@@ -19,6 +19,7 @@ whole filter, taken forward through every update that it made.
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any, NamedTuple
 
 import jax
@@ -69,6 +70,8 @@ def sensitivity(
     `run_filter`, whose measurements must have had diagonal covariances.
     """
     factors = jnp.stack(jax.tree.map(jnp.asarray, noise.std_factor))
+    # S is of the whole run, from its start.
+    config = dataclasses.replace(config, truncate_every=0, checkpoint_every=0)
     own_std = history.measurement_std / (factors[None] * config.measurement_scale**0.5)
 
     def means(c: Float[Array, "6"]) -> tuple[Array, ...]:

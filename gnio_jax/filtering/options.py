@@ -58,7 +58,7 @@ def filter_with(
     """`filter_setup` with other values of some options, which may be traced.
 
     The factor of the measurement's covariance, static in `FilterConfig`, goes into the factors of
-    σ, which are not.
+    σ, which are not. Errors that are considered are left out: they change no estimate.
     """
     fields = {**vars(options), **values}
     root = jnp.sqrt(fields["measurement_scale"])

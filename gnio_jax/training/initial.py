@@ -55,10 +55,9 @@ def _description(config: TrainConfig) -> dict[str, Any]:
 
 
 def with_weights(state: TrainState, run: Run) -> TrainState:
-    """A fresh state with the variables of a run; what that does not have stays as it is. The state
-    of the optimizer does not change."""
-    variables = {**run.variables, "filter": run.filter}
-    found = _overlaid(state.variables, variables)
+    """A fresh state with the network of a run; what that does not have stays as it is. The state of
+    the optimizer does not change, nor the filter, which is that of the configuration."""
+    found = _overlaid(state.variables, run.variables)
     return TrainState.of(state.step, found, state.opt_state)
 
 

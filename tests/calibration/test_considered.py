@@ -1,10 +1,15 @@
 """Errors that are to be considered, found in positions that were drawn with them."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 from gnio_jax.calibration import considered
 from gnio_jax.config import FilterOptions
+from gnio_jax.errors import InputError
+from gnio_jax.training.filter_losses import normalised_squares
+from tests.support.calibration_walks import DATA, TRUE, walks_with_truth
 
 
 def test_what_the_errors_were_drawn_with_is_found():
@@ -25,3 +30,31 @@ def test_what_the_errors_were_drawn_with_is_found():
     assert found.options.considered_scale_std == pytest.approx(0.1, rel=0.1)
     assert found.options.considered_heading_std_degrees == pytest.approx(8.0, rel=0.1)
     assert found.options.considered_slope_std == pytest.approx(0.01, rel=0.1)
+
+
+def test_positions_are_compared_with_the_truth_of_their_time():
+    """Of simulated walks that are as the filter has them: their errors are those it reports, but
+    against the truth of a stride later they are not. A filter that fails is left out."""
+    walks, truth = walks_with_truth()
+    options = dataclasses.replace(TRUE, measurement_scale=9.0)  # σ is three times what is said
+    truth[0, 100:] = np.nan
+    found = considered.filtered_positions(walks, truth, DATA, options)
+    assert len(found.error) == np.isfinite(truth).all(2).sum()
+    nees = normalised_squares(found.error, found.covariance).mean() / 3
+    assert nees == pytest.approx(1, abs=0.5)
+    later = np.roll(truth, -1, axis=1)
+    off = considered.filtered_positions(walks, later, DATA, options)
+    assert normalised_squares(off.error, off.covariance).mean() / 3 > 3 * nees
+    accel = walks.accel.copy()
+    accel[1, 200:] += 1e4
+    broken = considered.filtered_positions(walks._replace(accel=accel), truth, DATA, options)
+    assert len(broken.error) < len(found.error) - 150 and np.abs(broken.error).max() < 50
+
+
+def test_no_positions_and_no_likelihood_are_named():
+    none = considered.Positions(np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, 3, 6)))
+    with pytest.raises(InputError, match="not healthy where these recordings have a reference"):
+        considered.fit_considered(none, 0.1, FilterOptions())
+    lost = considered.Positions(np.ones((9, 3)), np.full((9, 3, 3), np.nan), np.ones((9, 3, 6)))
+    with pytest.raises(InputError, match="a covariance on these recordings that is not one"):
+        considered.fit_considered(lost, 0.1, FilterOptions())

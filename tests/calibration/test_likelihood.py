@@ -2,36 +2,17 @@
 differences."""
 
 import dataclasses
-import functools
 
 import jax
 import numpy as np
 import pytest
 
-from gnio_jax import filtering
-from gnio_jax.calibration.likelihood import Walks, fit, free_vector, innovation_objective
+from gnio_jax.calibration.likelihood import fit, free_vector, innovation_objective
 from gnio_jax.calibration.unknowns import GROUPS, check_fittable, chosen, with_starts
-from gnio_jax.config import DataConfig, FilterOptions
+from gnio_jax.config import FilterOptions
 from gnio_jax.errors import InputError
 from gnio_jax.filtering.unconstrained import natural, with_numbers
-from tests.support.walks import simulate
-
-DATA = DataConfig(rate=50.0, window_seconds=0.4, stride_seconds=0.1)
-STRIDES, N, CLONES, SIGMA = 250, 5, 4, 0.05
-TRUE = FilterOptions(
-    gyro_density=2e-3, accel_density=2e-2, measurement_scale=1.0, gyro_bias_std=1e-3
-)
-
-
-@functools.cache
-def walks():
-    """Eight walks whose displacements err by `SIGMA`, while the network says a third of it."""
-    noise = filtering.NoiseModel(2e-3, 2e-2, 1e-6, 1e-4)
-    std = filtering.InitialStd(gyro_bias=1e-3)
-    runs = simulate(5, 8, STRIDES, N, CLONES, 1 / DATA.rate, noise, std, SIGMA)
-    start = (runs[0], runs[1], runs[2], np.zeros((8, 3)))
-    told = np.full_like(runs.displacement, SIGMA / 3)
-    return Walks(*start, runs.gyro, runs.accel, runs.displacement, told)
+from tests.support.calibration_walks import DATA, STRIDES, TRUE, N, walks
 
 
 def test_the_noises_of_simulated_walks_are_found():

@@ -3,6 +3,7 @@ nothing left behind."""
 
 import dataclasses
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -177,19 +178,26 @@ def test_help_teaches():
 
 
 def test_training_through_the_filter_begins_with_the_filter_of_the_run(tmp_path):
-    calibrated = FilterOptions(gyro_density=0.02, velocity_std=0.7, window_error_share=0.8)
-    configuration.save(tmp_path / "config.yaml", TrainConfig(filter=calibrated))
-    own = TrainConfig(
-        filter=FilterOptions(velocity_std=0.3), through_filter=ThroughFilter(learn=("noise",))
-    )
-    configuration.save(tmp_path / "own.yaml", own)
-    asked = TrainOptions(config=str(tmp_path / "own.yaml"), init_from=str(tmp_path))
-    found = defaults(asked).filter
-    assert found == dataclasses.replace(calibrated, velocity_std=0.3)
-    # Training on windows has no use for it, and one that is resumed has its own.
-    windows = TrainOptions(init_from=str(tmp_path))
-    assert defaults(windows).filter == FilterOptions()
-    assert defaults(dataclasses.replace(asked, resume=True)).filter == own.filter
+    calibrated = FilterOptions(gyro_density=0.02, velocity_std=0.7, accel_bias_std=0.3)
+    considered = dataclasses.replace(calibrated, considered_scale_std=0.1)
+    configuration.save(tmp_path / "run" / "config.yaml", TrainConfig(filter=considered))
+    file = tmp_path / "own.yaml"
+    file.write_text("through_filter: {learn: [noise]}\nfilter: {velocity_std: 1.0}\n")
+    workdir = tmp_path / "new"
+    asked = TrainOptions(config=str(file), init_from=str(tmp_path / "run"), workdir=str(workdir))
+    # What the file says wins, also where it is the default of the package.
+    wanted = dataclasses.replace(calibrated, velocity_std=1.0)
+    assert defaults(asked).filter == wanted
+    bare = TrainOptions(init_from=asked.init_from, through_filter=ThroughFilter(learn=("noise",)))
+    assert defaults(bare).filter == calibrated
+    # Training on windows has no use for it.
+    assert defaults(TrainOptions(init_from=asked.init_from)).filter == FilterOptions()
+    # A run that is resumed goes on with its own, whether --config is given again or not.
+    configuration.save(workdir / "config.yaml", TrainConfig(filter=wanted))
+    shutil.rmtree(tmp_path / "run")
+    resumed = dataclasses.replace(asked, resume=True)
+    assert defaults(resumed).filter == wanted
+    assert defaults(dataclasses.replace(resumed, config=None)).filter == wanted
 
 
 def test_the_newest_run_is_the_one_trained_last(tmp_path):

@@ -13,6 +13,7 @@ import pytest
 
 from gnio_jax import config as configuration
 from gnio_jax.commands import evaluate
+from gnio_jax.commands.train import TrainOptions, defaults
 from gnio_jax.config import (
     DataConfig,
     EvaluateConfig,
@@ -357,10 +358,22 @@ def test_options_survive_their_unconstrained_numbers():
 
 
 def test_a_later_stage_starts_from_what_the_filter_has_learnt(recording, finished, training):
-    config = tiny(recording, "unused", init_from=str(finished))
-    run = initial.initial_run(config)
-    state = training.new_state(run)
-    assert same(state.filter, run.filter) and same(state.params, run.variables["params"])
+    """The command makes the filter of that run the default; what it asks for wins."""
+    asked = TrainOptions(
+        init_from=str(finished),
+        through_filter=THROUGH,
+        filter=dataclasses.replace(OPTIONS, velocity_std=0.3),
+    )
+    run = initial.initial_run(tiny(recording, "unused", init_from=str(finished)))
+    begins = defaults(asked).filter
+    assert begins == run.config.filter != OPTIONS
+    config = tiny(recording, "unused", filter=dataclasses.replace(begins, velocity_std=0.3))
+    state = training._replace(config=config).new_state(run)
+    assert same(state.params, run.variables["params"])
+    other = state.filter.pop("velocity_std")
+    np.testing.assert_allclose(other, np.log(0.3), rtol=1e-6)
+    for name, number in state.filter.items():
+        np.testing.assert_allclose(number, run.filter[name], atol=1e-4, err_msg=name)
 
 
 def test_training_on_windows_starts_from_a_runs_weights(recording):

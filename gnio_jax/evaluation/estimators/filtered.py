@@ -38,7 +38,7 @@ from gnio_jax.filtering.options import FilterSetup
 from gnio_jax.numerics import filled_up, quaternion_from_matrix
 from gnio_jax.types import Array
 
-POSITION = slice(6, 9)
+POSITION, GYRO_BIAS = slice(6, 9), slice(9, 12)
 """Of the core error θ, v, p, b_g, b_a."""
 SHORTEST = 16
 """No batch is padded to less than about this many strides."""
@@ -239,6 +239,8 @@ def _estimate(prepared: Prepared, history: FilterHistory, setup: FilterSetup) ->
     orientation = quaternion_from_matrix(_after(start.rotation, history.rotation))
     poses = (np.where(healthy[:, None], part, np.nan) for part in (position, orientation))
     start_std = np.repeat(np.array(start.std), [2, 1, 3, 3, 3, 3])
+    if setup.considered is not None:
+        start_std[GYRO_BIAS] = np.hypot(start_std[GYRO_BIAS], setup.considered.gyro_bias)
     start_covariance = np.eye(3) * setup.initial_std.position**2
     return Estimate(
         prepared.sequence.name,
