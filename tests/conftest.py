@@ -9,7 +9,10 @@ import os
 from importlib.metadata import version
 from pathlib import Path
 
-from jaxtyping import install_import_hook
+# Read as NumPy is imported. Other threads of BLAS would spin while they wait.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+from jaxtyping import install_import_hook  # noqa: E402
 
 # Each worker has one core: a module in many parts, to be compiled at once, is only more work.
 COMPILER = ["--xla_backend_optimization_level=0", "--xla_cpu_parallel_codegen_split_count=1"]
@@ -18,7 +21,6 @@ if version("jax").startswith("0.10."):  # removed later, and XLA stops at a flag
     COMPILER.append("--xla_cpu_use_fusion_emitters=false")
 os.environ["XLA_FLAGS"] = " ".join([os.environ.get("XLA_FLAGS", ""), *COMPILER])
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # others would spin while they wait
 # The workers and the processes that tests start share what they compile through the cache, small
 # programs too.
 os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
