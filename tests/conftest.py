@@ -12,7 +12,7 @@ from pathlib import Path
 # Read as NumPy is imported. Other threads of BLAS would spin while they wait.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-from jaxtyping import install_import_hook  # noqa: E402
+from jaxtyping import install_import_hook
 
 # Each worker has one core: a module in many parts, to be compiled at once, is only more work.
 COMPILER = ["--xla_backend_optimization_level=0", "--xla_cpu_parallel_codegen_split_count=1"]
