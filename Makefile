@@ -19,6 +19,8 @@ NEEDS := gnio-jax needs Python 3.11 or newer: make PYTHON=python3.11 ...
 # process that a test starts would compile the package and the tests anew.
 TEST_ENVIRONMENT := JAX_PLATFORMS=cpu JAX_COMPILATION_CACHE_DIR=$(CURDIR)/.jax_cache \
 	PYTHONDONTWRITEBYTECODE=
+# A file stays with one worker, or both would train what its tests share; the longest come first.
+SHARED_OUT := --dist loadfile --no-loadscope-reorder
 
 .PHONY: demo test lint clean
 
@@ -29,7 +31,7 @@ demo: $(VENV)/.package
 	$(BIN)/gnio evaluate --workdir $(DEMO)
 
 test: $(VENV)/.$(EXTRAS)
-	$(TEST_ENVIRONMENT) $(BIN)/python -m pytest -n $(JOBS) --dist worksteal $(PYTEST_ARGS)
+	$(TEST_ENVIRONMENT) $(BIN)/python -m pytest -n $(JOBS) $(SHARED_OUT) $(PYTEST_ARGS)
 
 lint: $(VENV)/.test,dev
 	$(BIN)/ruff check .

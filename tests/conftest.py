@@ -9,6 +9,9 @@ import os
 from importlib.metadata import version
 from pathlib import Path
 
+# Read as NumPy is imported. Other threads of BLAS would spin while they wait.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 from jaxtyping import install_import_hook
 
 # Each worker has one core: a module in many parts, to be compiled at once, is only more work.
@@ -16,9 +19,10 @@ COMPILER = ["--xla_backend_optimization_level=0", "--xla_cpu_parallel_codegen_sp
 if version("jax").startswith("0.10."):  # removed later, and XLA stops at a flag it does not know
     # Fusions as LLVM's loops instead of MLIR's: a third of the time to compile a filter.
     COMPILER.append("--xla_cpu_use_fusion_emitters=false")
-os.environ["XLA_FLAGS"] = " ".join([os.environ.get("XLA_FLAGS", ""), *COMPILER])
+# Each of them once, in a worker of pytest-xdist too: the cache's keys hold the flags as they stand.
+FLAGS = [*os.environ.get("XLA_FLAGS", "").split(), *COMPILER]
+os.environ["XLA_FLAGS"] = " ".join(dict.fromkeys(FLAGS))
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # others would spin while they wait
 # The workers and the processes that tests start share what they compile through the cache, small
 # programs too.
 os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"

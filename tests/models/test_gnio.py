@@ -8,7 +8,7 @@ from jax import lax
 
 from gnio_jax import models
 from gnio_jax.errors import InputError
-from gnio_jax.models import resnet
+from gnio_jax.models import registry, resnet
 from gnio_jax.models.motion_bank import MotionBank
 from tests.support.compiling import quick
 
@@ -374,6 +374,22 @@ def test_both_convolutions_are_one_function(size, stride):
         np.testing.assert_allclose(value, wanted, atol=1e-12)
     for one, other in zip(*found.values(), strict=True):
         np.testing.assert_allclose(one, other, atol=1e-12)
+
+
+def test_one_program_draws_every_first_parameter_of_a_network():
+    def drawn(seed):
+        model = models.create("gnio", width=2, bank_size=4, bank_heads=2)
+        return models.initialise(model, jax.random.key(seed), 64)
+
+    variables, compiled = drawn(0), registry._init._cache_size()
+    other = drawn(1)
+    assert registry._init._cache_size() == compiled
+    of = lambda found: found["params"]["bank"]["prototypes"]  # noqa: E731
+    assert not np.array_equal(of(variables), of(other))
+    shapes = models.variable_shapes(models.create("gnio", width=2, bank_size=4, bank_heads=2), 64)
+    assert jax.tree.structure(shapes) == jax.tree.structure(variables)
+    for shape, leaf in zip(*map(jax.tree.leaves, (shapes, variables)), strict=True):
+        assert (shape.shape, shape.dtype) == (leaf.shape, leaf.dtype)
 
 
 def test_constant_uncertainty_leaves_the_displacement_as_it_is():
