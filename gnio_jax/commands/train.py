@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated
 
 import tyro
@@ -14,6 +15,7 @@ from gnio_jax.commands import console
 from gnio_jax.commands.options import Command, execute, sibling
 from gnio_jax.config import TrainConfig
 from gnio_jax.cores import usable_cores
+from gnio_jax.scaling.meeting import Meeting
 
 DESCRIPTION = """Train a network and leave a run: config.yaml, checkpoints, logs in its work folder.
 
@@ -37,6 +39,17 @@ class RunOptions:
     """YAML file of settings, or the name of one that comes with the package, e.g. quickstart."""
     resume: tyro.conf.FlagCreatePairsOff[bool] = False
     """Continue the run in the work folder from its latest checkpoint."""
+    devices: int | None = None
+    """Devices of each process that share a batch; by default all of its GPUs, or the one that a CPU
+    is."""
+    coordinator: Annotated[str | None, tyro.conf.arg(metavar="HOST:PORT")] = None
+    """Where process 0 listens for the others; not needed under Slurm, Open MPI and Kubernetes."""
+    processes: int | None = None
+    """How many processes train together, with --coordinator."""
+    process_id: int | None = None
+    """Which of them this one is, counted from 0, with --coordinator."""
+    patience: int = 120
+    """Seconds after which a process that does not come, or gives no sign of life, is given up."""
 
 
 @dataclass(frozen=True)
@@ -46,6 +59,10 @@ class TrainOptions(TrainConfig, RunOptions):
     def experiment(self) -> TrainConfig:
         """The experiment alone."""
         return TrainConfig(**{name: getattr(self, name) for name in vars(TrainConfig())})
+
+    def meeting(self) -> Meeting:
+        """Where the processes meet."""
+        return Meeting(self.coordinator, self.processes, self.process_id, self.patience)
 
 
 def defaults(options: TrainOptions) -> TrainOptions | None:
@@ -62,22 +79,37 @@ def train(options: TrainOptions, prog: str) -> None:
     """Train, and say how to go on."""
     # After the options: --help and mistakes do not wait for these imports.
     from gnio_jax import filtering
+    from gnio_jax.scaling import devices, processes
     from gnio_jax.training import loop
 
     if options.through_filter.learn:
         filtering.cores_as_devices()  # the filter's operations are too small for several cores
-    with console.terminal() as terminal:
-        try:
-            outcome = loop.train(options.experiment(), options.resume, terminal, usable_cores())
-        except FloatingPointError as error:
-            terminal.line(str(error))
-            sys.exit(1)
+    elif options.devices:
+        devices.cpu_devices(options.devices)
+    processes.meet(options.meeting())
+    with processes.running():
+        with console.terminal(shown=processes.is_first()) as terminal:
+            try:
+                call = (options.experiment(), options.resume, terminal, usable_cores())
+                outcome = loop.train(*call, devices=options.devices)
+            except FloatingPointError as error:
+                terminal.line(str(error))
+                sys.exit(1)
+    if processes.is_first():
+        _say_how_to_go_on(prog, outcome.workdir, outcome.stopped_by, outcome.best_loss)
     if outcome.stopped_by:
-        remedy = f"{sibling(prog, 'train')} --workdir {outcome.workdir} --resume"
-        print(f"stopped and saved; continue with: {remedy}", file=sys.stderr)
         sys.exit(128 + outcome.stopped_by)
-    following = f"{sibling(prog, 'evaluate')} --workdir {outcome.workdir}"
-    print(f"best on validation {outcome.best_loss:.4g}; look at it with: {following}")
+
+
+def _say_how_to_go_on(
+    prog: str, workdir: Path, stopped_by: int | None, best_loss: float | None
+) -> None:
+    if stopped_by:
+        remedy = f"{sibling(prog, 'train')} --workdir {workdir} --resume"
+        print(f"stopped and saved; continue with: {remedy}", file=sys.stderr)
+    else:
+        following = f"{sibling(prog, 'evaluate')} --workdir {workdir}"
+        print(f"best on validation {best_loss:.4g}; look at it with: {following}")
 
 
 COMMAND = Command(TrainOptions, train, DESCRIPTION, defaults)

@@ -18,6 +18,8 @@ from gnio_jax.data.augmentation import augment
 from gnio_jax.data.windows import WindowSource, gather, shift_windows
 from gnio_jax.models import initialise
 from gnio_jax.models.resnet import MOMENTUM
+from gnio_jax.scaling import devices
+from gnio_jax.scaling.devices import kept_everywhere, shared_out
 from gnio_jax.training.losses import Losses, Stage, losses, stage
 from gnio_jax.types import Prediction, Windows
 
@@ -145,7 +147,8 @@ def train_steps(
         progress = _add_step(progress, state.step, loss, gradient)
         step = jnp.add(state.step, 1)
         average = _averaged(state.average, params, step, config.optim.ema_decay)
-        return TrainState(step, params, batch_stats, opt_state, average), progress
+        state = TrainState(step, params, batch_stats, opt_state, average)
+        return kept_everywhere(state), progress
 
     nothing = Progress(
         Losses(*[jnp.float32(0)] * 3),
@@ -214,12 +217,11 @@ def draw_windows(
     key: PRNGKeyArray, source: WindowSource, which: Int[jax.Array, "b"], config: TrainConfig
 ) -> tuple[Windows, PRNGKeyArray]:
     """The windows `which`, shifted and augmented by draws from `key`, and the key of the network's
-    dropout."""
+    dropout. Each device cuts its share of them."""
     augment_key, dropout_key, shift_key = jax.random.split(key, 3)
-    which = shift_windows(shift_key, source, which, config.augment.shift_samples)
-    return augment(
-        augment_key, gather(source, which, config.data.window), config.augment
-    ), dropout_key
+    which = shift_windows(shift_key, source, shared_out(which), config.augment.shift_samples)
+    windows = gather(source, shared_out(which), config.data.window)
+    return shared_out(augment(augment_key, windows, config.augment)), dropout_key
 
 
 def normalises(state: TrainState) -> bool:
@@ -281,9 +283,8 @@ def estimate_statistics(
     def statistic(path: tuple, total: jax.Array, before: jax.Array) -> jax.Array:
         return total / (batches * (1 - MOMENTUM)) if path[-1].key in ("mean", "var") else before
 
-    return state._replace(
-        batch_stats=jax.tree_util.tree_map_with_path(statistic, total, state.batch_stats)
-    )
+    estimated = jax.tree_util.tree_map_with_path(statistic, total, state.batch_stats)
+    return kept_everywhere(state._replace(batch_stats=estimated))
 
 
 def gradient_norms(gradient: Any) -> dict[str, Float[jax.Array, ""]]:
@@ -304,9 +305,10 @@ def validate(
     """Mean losses and errors over every window of `source`, without augmentation and in inference
     mode."""
     count = source.visited.shape[0]
-    size = min(config.optim.batch_size, count)
+    # Whole batches, of which each device has the same share: the last one is filled up with windows
+    # of weight zero.
+    size = -(-min(config.optim.batch_size, count) // devices.count()) * devices.count()
     batches = -(-count // size)
-    # The last batch is filled up with windows of weight zero.
     which = source.visited[
         jnp.minimum(jnp.arange(batches * size, dtype=jnp.int32), count - 1)
     ].reshape(batches, size)
@@ -322,7 +324,7 @@ def validate(
         )
 
     def one_batch(which_weight: tuple[jax.Array, jax.Array]) -> Validation:
-        windows = gather(source, which_weight[0], config.data.window)
+        windows = shared_out(gather(source, shared_out(which_weight[0]), config.data.window))
         prediction: Any = model.apply(
             {"params": state.params, "batch_stats": state.batch_stats}, windows.imu
         )

@@ -1,0 +1,30 @@
+"""`gnio train` in a process that may send itself a signal in the middle of an epoch.
+
+    python -m tests.support.training_process SIGTERM 15 --workdir RUN ...
+
+The words after signal and step are those of `gnio train`; `never 0` sends none.
+"""
+
+import os
+import signal
+import sys
+
+from gnio_jax.commands import app, console
+from gnio_jax.training import loop
+
+
+def main(name, step, *arguments):
+    run_steps = loop._run_steps
+
+    def interrupted(*given):
+        state, position = run_steps(*given)
+        if name != "never" and position.step >= int(step):
+            os.kill(os.getpid(), signal.Signals[name])
+        return state, position
+
+    loop._run_steps = interrupted
+    console.run(lambda: app.options.execute(app.GNIO, ["train", *arguments], "gnio"))
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
