@@ -83,11 +83,13 @@ def described() -> str:
     return f"{number}{platform}" + (f" in {processes} processes" if processes > 1 else "")
 
 
-def check_batch(size: int) -> None:
-    """Raise `InputError` unless the devices can share a batch of `size` evenly."""
-    if size % count():
-        problem = f"is {size}, which {count()} devices cannot share evenly"
-        remedy = f"make it a multiple of {count()}, or use fewer --devices"
+def check_batch(size: int, parts: int) -> None:
+    """Raise `InputError` unless the devices can share each of the parts of a batch of `size`
+    evenly."""
+    if size // parts % count():
+        whole = f"is {size}" + (f" in {parts} parts" if parts > 1 else "")
+        problem = f"{whole}, which {count()} devices cannot share evenly"
+        remedy = f"make it a multiple of {count() * parts}, or use fewer --devices"
         raise InputError("optim.batch_size", problem, remedy)
 
 

@@ -70,11 +70,14 @@ class Run(NamedTuple):
 
 
 def create_model(config: TrainConfig) -> nn.Module:
-    """The network that `config.model` describes; what that leaves open is the network's own."""
+    """The network that `config.model` describes; what that leaves open is the network's own.
+
+    In float32: `dtype` is for the steps of training.
+    """
     options = {
         key: value
         for key, value in vars(config.model).items()
-        if key != "name" and value is not None
+        if key not in ("name", "dtype") and value is not None
     }
     return models.create(config.model.name, **options)
 

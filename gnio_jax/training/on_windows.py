@@ -166,7 +166,7 @@ def set_up(config: TrainConfig, reporter: Reporter, workers: int = 1) -> WindowT
     stride = config.data.stride
     held_out, validated_with = _windows(config, val, stride, 0, reporter, workers)
     steps_per_epoch = steps_in_epoch(source.visited.shape[0], "windows", config)
-    devices.check_batch(config.optim.batch_size)
+    devices.check_batch(config.optim.batch_size, config.optim.accumulate)
     return WindowTraining(
         config,
         model,

@@ -17,6 +17,7 @@ from gnio_jax.config import TrainConfig
 from gnio_jax.data.augmentation import augment
 from gnio_jax.data.windows import WindowSource, gather, shift_windows
 from gnio_jax.models import initialise
+from gnio_jax.models.precision import products_in
 from gnio_jax.models.resnet import MOMENTUM
 from gnio_jax.scaling import devices
 from gnio_jax.scaling.devices import kept_everywhere, shared_out
@@ -166,16 +167,42 @@ def _gradient(
     model: nn.Module,
     config: TrainConfig,
 ) -> tuple[Any, Losses, Any]:
-    """Gradient of the loss of a batch, the losses, and the statistics of batch normalisation."""
+    """Gradient of the loss of a batch, the losses, and the statistics of batch normalisation: of
+    `optim.accumulate` parts of the batch, one after another."""
 
-    def objective(params: Any) -> tuple[jax.Array, tuple[Losses, Any]]:
-        variables = {"params": params, "batch_stats": state.batch_stats}
-        prediction, changed = _apply_training(model, variables, windows, dropout_key)
+    def objective(
+        params: Any, batch_stats: Any, windows: Windows, key: PRNGKeyArray
+    ) -> tuple[jax.Array, tuple[Losses, Any]]:
+        variables = {"params": params, "batch_stats": batch_stats}
+        with products_in(config.model.dtype):
+            prediction, changed = _apply_training(model, variables, windows, key)
         loss = losses(prediction, windows, config.loss, now)
         return loss.total, (loss, changed.get("batch_stats", {}))
 
-    gradient, (loss, batch_stats) = jax.grad(objective, has_aux=True)(state.params)
+    slope, parts = jax.grad(objective, has_aux=True), config.optim.accumulate
+    if parts == 1:
+        found = slope(state.params, state.batch_stats, windows, dropout_key)
+        return found[0], *found[1]
+
+    def add_part(
+        carry: tuple[Any, Losses, Any], part: tuple[Windows, PRNGKeyArray]
+    ) -> tuple[tuple[Any, Losses, Any], None]:
+        gradient, loss, batch_stats = carry
+        more, (more_loss, batch_stats) = slope(state.params, batch_stats, *part)
+        return (*jax.tree.map(jnp.add, (gradient, loss), (more, more_loss)), batch_stats), None
+
+    zeros = jax.tree.map(jnp.zeros_like, state.params), Losses(*[jnp.float32(0)] * 3)
+    each = jax.tree.map(lambda rows: _in_parts(rows, parts), windows)
+    keys = jax.random.split(dropout_key, parts)
+    (*sums, batch_stats), _ = jax.lax.scan(add_part, (*zeros, state.batch_stats), (each, keys))
+    gradient, loss = jax.tree.map(lambda total: total / parts, tuple(sums))
     return gradient, loss, batch_stats
+
+
+def _in_parts(rows: jax.Array, parts: int) -> jax.Array:
+    """Rows of a batch as (parts, rows of a part, ...). Row r goes to part r mod `parts`: a device
+    that has successive rows has the same number of each part."""
+    return rows.reshape(-1, parts, *rows.shape[1:]).swapaxes(0, 1)
 
 
 def _averaged(average: Any, params: Any, step: Int[jax.Array, ""], decay: float) -> Any:
