@@ -13,9 +13,9 @@ import tyro
 from gnio_jax import config as configuration
 from gnio_jax.commands import console
 from gnio_jax.commands.options import Command, execute, sibling
+from gnio_jax.commands.together import MeetingOptions
 from gnio_jax.config import TrainConfig
 from gnio_jax.cores import usable_cores
-from gnio_jax.scaling.meeting import Meeting
 
 DESCRIPTION = """Train a network and leave a run: config.yaml, checkpoints, logs in its work folder.
 
@@ -42,27 +42,15 @@ class RunOptions:
     devices: int | None = None
     """Devices of each process that share a batch; by default all of its GPUs, or the one that a CPU
     is."""
-    coordinator: Annotated[str | None, tyro.conf.arg(metavar="HOST:PORT")] = None
-    """Where process 0 listens for the others; not needed under Slurm, Open MPI and Kubernetes."""
-    processes: int | None = None
-    """How many processes train together, with --coordinator."""
-    process_id: int | None = None
-    """Which of them this one is, counted from 0, with --coordinator."""
-    patience: int = 120
-    """Seconds after which a process that does not come, or gives no sign of life, is given up."""
 
 
 @dataclass(frozen=True)
-class TrainOptions(TrainConfig, RunOptions):
+class TrainOptions(TrainConfig, RunOptions, MeetingOptions):
     """What `gnio train` is asked for: an experiment, and where its settings come from."""
 
     def experiment(self) -> TrainConfig:
         """The experiment alone."""
         return TrainConfig(**{name: getattr(self, name) for name in vars(TrainConfig())})
-
-    def meeting(self) -> Meeting:
-        """Where the processes meet."""
-        return Meeting(self.coordinator, self.processes, self.process_id, self.patience)
 
 
 def defaults(options: TrainOptions) -> TrainOptions | None:

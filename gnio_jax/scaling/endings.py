@@ -48,11 +48,12 @@ def leave_in_silence(status: int) -> None:
 
 @_HANDLER
 def _on_abort(_signum: int) -> None:
-    leave(*(_words or LastWords("aborted", 1)))
+    leave()
 
 
-def leave(line: str, status: int) -> NoReturn:
-    """Leave at once, without waiting for the other processes."""
+def leave() -> NoReturn:
+    """Say what an abort would say, and leave at once, without waiting for the other processes."""
+    line, status = _words or LastWords("aborted", 1)
     if line:
         sys.stderr.write(f"{line} (what the runtime says: {_log})\n")
     sys.stdout.flush()

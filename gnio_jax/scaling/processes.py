@@ -8,6 +8,7 @@ given.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, TypeVar
@@ -22,18 +23,21 @@ from gnio_jax.scaling.meeting import Meeting, check, launched, wait_for
 
 Tree = TypeVar("Tree")
 
+LOST = re.compile(r"Gloo|NCCL|coordination service|Connection (reset|closed)|Socket closed", re.I)
+"""What errors of JAX say where another process has gone; they have no type of their own."""
 SHUTDOWN_SECONDS = 15
 """Longest time that a process which has ended waits for the others."""
 
 
 def meet(meeting: Meeting) -> None:
-    """Meet the other processes, if there are any; before JAX's first computation.
+    """Meet the other processes, if there are any, and once; before JAX's first computation.
 
     From then on a process that loses the others ends with one line (`endings`). Raises `InputError`
     for options that do not fit together, and where the coordinator does not answer in time.
     """
     check(meeting)
-    if meeting.processes == 1 or (meeting.coordinator is None and not launched()):
+    alone = meeting.processes == 1 or (meeting.coordinator is None and not launched())
+    if alone or jax.distributed.is_initialized():
         return
     endings.speak_for_the_runtime(
         f"{meeting.coordinator or 'the processes'}: did not all meet within {meeting.patience} s; "
@@ -69,11 +73,9 @@ def running() -> Iterator[None]:
     loses the others leaves with one line."""
     try:
         yield
-    except jax.errors.JaxRuntimeError as error:
-        if not several():
-            raise
-        endings.leave(f"process {jax.process_index()}: {' '.join(str(error).split())[:150]}", 1)
     except BaseException as error:
+        if several() and LOST.search(str(error)):
+            endings.leave()
         endings.leave_in_silence(2 if isinstance(error, InputError | OSError) else 1)
         raise
 
@@ -99,6 +101,13 @@ def agreed(*numbers: int) -> tuple[int, ...]:
 def from_first(tree: Tree) -> Tree:
     """What the first process has; the others give arrays of the same shapes. On the host."""
     return multihost_utils.broadcast_one_to_all(tree) if several() else tree
+
+
+def on_host(tree: Tree) -> Tree:
+    """The whole of what a compiled program over all devices gives, in every process's memory."""
+    if not several():
+        return jax.device_get(tree)
+    return multihost_utils.process_allgather(tree, tiled=True)
 
 
 def text_from_first(text: str) -> str:

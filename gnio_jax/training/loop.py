@@ -10,9 +10,10 @@ import jax
 
 from gnio_jax import config as configuration
 from gnio_jax.config import TrainConfig
+from gnio_jax.errors import InputError
 from gnio_jax.reporting import Lines, Reporter, Silence
 from gnio_jax.scaling.devices import chosen, sharing
-from gnio_jax.scaling.processes import agreed, all_or_none, is_first
+from gnio_jax.scaling.processes import agreed, all_or_none, is_first, several
 from gnio_jax.training import optimizer as optimizers
 from gnio_jax.training import run_folder
 from gnio_jax.training.checkpoint import Checkpoints, Position, exists
@@ -60,6 +61,9 @@ def train(
     the same network, and where the devices cannot share a batch evenly.
     """
     through_filter = bool(config.through_filter.learn)  # it shares its pieces out by itself
+    if through_filter and several():
+        problem = "runs in one process, on all of its devices"
+        raise InputError("training through the filter", problem, "start one process")
     sharers = jax.devices()[:1] if through_filter else chosen(devices)
     # Whatever the process has: no float64 but for the filter, and the same random draws.
     with jax.enable_x64(through_filter), sharing(sharers):

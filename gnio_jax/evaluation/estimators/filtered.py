@@ -32,6 +32,7 @@ from gnio_jax.filtering import (
 )
 from gnio_jax.filtering.options import FilterSetup
 from gnio_jax.numerics import filled_up, quaternion_from_matrix
+from gnio_jax.scaling.processes import on_host
 from gnio_jax.types import Array
 
 POSITION = slice(6, 9)
@@ -131,7 +132,7 @@ def _run_batch(
         history = _run_with_measurements(
             start, gyro, accel, _stacked(given), setup.config, setup.noise
         )
-    return jax.device_get(history)
+    return on_host(history)
 
 
 @functools.partial(jax.jit, static_argnames=("apply", "config"))
