@@ -15,6 +15,7 @@ from gnio_jax.training import loop
 
 def main(name, step, *arguments):
     run_steps = loop._run_steps
+    loop.DISPATCH_SECONDS = 0  # one step at a time
 
     def interrupted(*given):
         state, position = run_steps(*given)
