@@ -15,8 +15,10 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 NEEDS := gnio-jax needs Python 3.11 or newer: make PYTHON=python3.11 ...
 
 # The compiled programs of the tests are kept between runs: the first run compiles them all, which is
-# most of what it does.
-TEST_ENVIRONMENT := JAX_PLATFORMS=cpu JAX_COMPILATION_CACHE_DIR=$(CURDIR)/.jax_cache
+# most of what it does. Python's own are kept too, whatever the shell says: every worker and every
+# process that a test starts would compile the package and the tests anew.
+TEST_ENVIRONMENT := JAX_PLATFORMS=cpu JAX_COMPILATION_CACHE_DIR=$(CURDIR)/.jax_cache \
+	PYTHONDONTWRITEBYTECODE=
 
 .PHONY: demo test lint clean
 

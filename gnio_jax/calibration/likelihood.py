@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.optimize import minimize
 
-from gnio_jax.calibration.unknowns import DIGITS
+from gnio_jax.calibration.unknowns import DIGITS, PRIOR_STD
 from gnio_jax.config import DataConfig, FilterOptions
 from gnio_jax.errors import InputError
 from gnio_jax.filtering import initial_state, over_sequences, repeat_odometry
@@ -20,9 +20,6 @@ from gnio_jax.filtering.options import FilterSetup, filter_with
 from gnio_jax.filtering.unconstrained import natural, unconstrained, with_numbers
 from gnio_jax.types import Array
 
-PRIOR_STD = 2.0
-"""Standard deviation of each unknown about its start, in its own logarithm or logit (ours). The
-recordings outweigh it by far in all that they tell; what they do not tell stays where it was."""
 CHECKPOINT_EVERY = 50
 """Clone intervals between the states that the backward pass keeps."""
 FAILED = 1e6

@@ -10,9 +10,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 from gnio_jax import config as configuration
 from gnio_jax import data
+from gnio_jax.calibration.considered import Considered, filtered_positions, fit_considered
 from gnio_jax.calibration.errors import std_factors
 from gnio_jax.calibration.likelihood import Fit, Walks, fit
 from gnio_jax.calibration.unknowns import DIGITS, GROUPS, check_fittable, chosen, with_starts
@@ -37,6 +39,7 @@ class Calibration(NamedTuple):
 
     before: FilterOptions
     fit: Fit
+    considered: Considered
     """Its options are those of the calibrated run."""
     recordings: int
     folder: Path
@@ -48,11 +51,13 @@ def calibrate(
     """Fit the filter's options of a run to recordings that its network did not learn from, and
     write a run that differs in them alone.
 
-    Two steps (ours). First each axis gets the factor that makes the network's standard deviations
+    Three steps (ours). First each axis gets the factor that makes the network's standard deviations
     those of its errors, window by window against the reference. Then the options of `config.fit`
     are those that make the innovations of the filter most likely, in which the reference has no
-    part but the start. Raises `InputError` for a split that is neither the run's validation nor
-    its training split, an output folder that is there already, and missing data.
+    part but the start. Last, the errors that the filter considers but does not estimate are those
+    that make the errors of its positions most likely; they change no trajectory. Raises
+    `InputError` for a split that is neither the run's validation nor its training split, an output
+    folder that is there already, and missing data.
     """
     unknowns = _unknowns(config)
     workdir = Path(config.workdir) if config.workdir else configuration.newest_run()
@@ -91,15 +96,21 @@ def calibrate(
         for name, factor in zip(STD_FACTORS, factors, strict=True)
     }
     options = with_starts(dataclasses.replace(own, **by_axis), unknowns)
+    walks = _walks(prepared, estimates, run.config.data.stride)
     found = fit(
-        _walks(prepared, estimates, run.config.data.stride),
+        walks,
         run.config.data,
         options,
         unknowns,
         lambda calls: progress("fitting", min(1.0, calls / (1.3 * config.steps))),
         config.steps,
     )
-    calibration = Calibration(run.config.filter, found, len(prepared), folder)
+    progress("considering", 0.0)
+    windows, options = run.config.data, found.options
+    positions = filtered_positions(walks, _true_positions(prepared, walks), windows, options)
+    considered = fit_considered(positions, windows.stride_seconds, options)
+    progress("considering", 1.0)
+    calibration = Calibration(run.config.filter, found, considered, len(prepared), folder)
     _write(calibration, workdir, run, config, split)
     return calibration
 
@@ -161,6 +172,15 @@ def _walks(prepared: list[Prepared], estimates: list[Estimate], stride: int) -> 
     return Walks(*(np.stack(column) for column in zip(*rows, strict=True)))
 
 
+def _true_positions(prepared: list[Prepared], walks: Walks) -> Float[np.ndarray, "w k 3"]:
+    """At the ends of the walks' strides, m; NaN where the reference is not trusted."""
+    rows = walks.displacement.shape[1]
+    stride = walks.gyro.shape[1] // rows
+    return np.stack(
+        [filled_up(each.reference(stride).position[1:], rows, np.nan) for each in prepared]
+    )
+
+
 def _write(
     calibration: Calibration,
     workdir: Path,
@@ -169,7 +189,7 @@ def _write(
     split: str,
 ) -> None:
     """The run with its new options, its checkpoint, and what was fitted."""
-    found = calibration.fit
+    found, options = calibration.fit, calibration.considered.options
     about: dict[str, Any] = {
         "run": str(workdir),
         "checkpoint": config.checkpoint,
@@ -178,11 +198,15 @@ def _write(
         "fitted": list(config.fit),
         "negative_log_likelihood_per_innovation": {"before": found.before, "after": found.after},
         "steps": found.steps,
-        "filter": dataclasses.asdict(found.options),
+        "position_nees_per_axis": {
+            "before": calibration.considered.before,
+            "after": calibration.considered.after,
+        },
+        "filter": dataclasses.asdict(options),
     }
     with replacing_folder(calibration.folder) as new:
         experiment = dataclasses.replace(
-            trained.config, workdir=str(calibration.folder), filter=found.options
+            trained.config, workdir=str(calibration.folder), filter=options
         )
         configuration.validate(experiment, "the calibrated run")
         configuration.save(new / "config.yaml", experiment)

@@ -16,6 +16,16 @@ GROUPS = {
 }
 STARTS = {"window_error_share": 0.8, "scale_error_std": 0.05, "heading_error_std_degrees": 2.0}
 """Where the fit begins with errors that the run has switched off (ours)."""
+CONSIDERED = {
+    "considered_gyro_bias_std": 1e-3,
+    "considered_scale_std": 0.05,
+    "considered_heading_std_degrees": 5.0,
+    "considered_slope_std": 0.02,
+}
+"""Errors that are fitted last, to those of the trajectory, and where that begins (ours)."""
+PRIOR_STD = 2.0
+"""Standard deviation of each unknown about its start, in its own logarithm or logit (ours). The
+recordings outweigh it by far in all that they tell; what they do not tell stays where it was."""
 DIGITS = 4
 """As many are written down."""
 

@@ -19,8 +19,9 @@ DESCRIPTION = """Fit the filter's options of a run to its validation split; writ
 
 A network learns the errors of the walks that it has fitted, which are smaller than those of others.
 First its standard deviations get a factor for each axis, from the errors on the validation split.
-Then the filter's noises are those that make its innovations most likely. The result is a run that
-gnio evaluate takes as any other; test splits are refused."""
+Then the filter's noises are those that make its innovations most likely. Last, the errors that the
+filter reports but does not estimate are those of its positions. The result is a run that gnio
+evaluate takes as any other; test splits are refused."""
 
 
 def calibrate(config: CalibrateConfig, prog: str) -> None:
@@ -34,11 +35,15 @@ def calibrate(config: CalibrateConfig, prog: str) -> None:
     filtering.cores_as_devices()
     with console.terminal() as terminal:
         found = calibration.calibrate(config, terminal.progress, usable_cores())
-    console.stdout().print(_table(found.before, found.fit.options))
+    console.stdout().print(_table(found.before, found.considered.options))
     print(
         "-log-likelihood of an innovation, from the factors of the axes to the end of the fit: "
         f"{found.fit.before:.4f} -> {found.fit.after:.4f} "
         f"({found.recordings} recordings, {found.fit.steps} steps)"
+    )
+    print(
+        "squared error of the position over what the filter says of it, per axis: "
+        f"{found.considered.before:.2f} -> {found.considered.after:.2f} with the errors considered"
     )
     print(f"look at it with: {sibling(prog, 'evaluate')} --workdir {found.folder}")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,7 +15,7 @@ from gnio_jax import config as configuration
 from gnio_jax.commands import console
 from gnio_jax.commands.options import Command, execute, sibling
 from gnio_jax.commands.together import MeetingOptions
-from gnio_jax.config import TrainConfig
+from gnio_jax.config import FilterOptions, TrainConfig
 from gnio_jax.cores import usable_cores
 
 DESCRIPTION = """Train a network and leave a run: config.yaml, checkpoints, logs in its work folder.
@@ -27,8 +28,8 @@ DESCRIPTION = """Train a network and leave a run: config.yaml, checkpoints, logs
 --config FILE reads options from a YAML file, or from one of the experiments that come with the
 package; options given here win over it. --resume continues a run from its latest checkpoint as if
 it had never stopped. --init-from RUN starts from the weights of a run with the same network; with
---through-filter.learn, network and filter then learn as one program. The defaults are the paper's
-settings."""
+--through-filter.learn, network and filter then learn as one program, beginning with the filter of
+that run (see gnio calibrate). The defaults are the paper's settings."""
 
 
 @dataclass(frozen=True)
@@ -53,14 +54,33 @@ class TrainOptions(TrainConfig, RunOptions, MeetingOptions):
         return TrainConfig(**{name: getattr(self, name) for name in vars(TrainConfig())})
 
 
-def defaults(options: TrainOptions) -> TrainOptions | None:
+def defaults(options: TrainOptions) -> TrainOptions:
     """The settings of --config, else those of the run that is resumed; options win over both."""
-    if options.config is not None:
-        return TrainOptions(**vars(configuration.load(options.config)))
     kept = configuration.default_workdir(options) / "config.yaml"
-    if options.resume and kept.exists():
-        return TrainOptions(**vars(configuration.load(kept)))
-    return None
+    if options.config is not None:
+        start = TrainOptions(**vars(configuration.load(options.config)))
+    elif options.resume and kept.exists():
+        start = TrainOptions(**vars(configuration.load(kept)))
+    else:
+        start = TrainOptions()
+    return start if options.resume else _with_filter_of_initial_run(start, options)
+
+
+def _with_filter_of_initial_run(start: TrainOptions, options: TrainOptions) -> TrainOptions:
+    """Training through the filter begins with the filter of the run that it starts from; what
+    differs from the defaults in `start` stays."""
+    workdir = options.init_from or start.init_from
+    learns = options.through_filter.learn or start.through_filter.learn
+    if workdir is None or not learns or not (Path(workdir) / "config.yaml").is_file():
+        return start
+    from gnio_jax import filtering
+    from gnio_jax.evaluation.run import run_config
+
+    filtering.cores_as_devices()  # before the checkpoint's arrays settle the devices
+    usual, asked = vars(FilterOptions()), vars(start.filter)
+    kept = {name: value for name, value in asked.items() if value != usual[name]}
+    found = dataclasses.replace(run_config(Path(workdir)).filter, **kept)
+    return dataclasses.replace(start, filter=found)
 
 
 def train(options: TrainOptions, prog: str) -> None:

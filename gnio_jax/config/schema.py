@@ -277,6 +277,16 @@ class FilterOptions:
     """Standard deviation of the displacements' heading (ours); 0: they have no such error."""
     walk_error_seconds: Positive = 60.0
     """Time constant of both, s."""
+    considered_gyro_bias_std: NonNegative = 0.0
+    """Standard deviation, rad/s, of the gyro's bias that the filter does not try to estimate but
+    reports in its covariance (ours; consider covariance analysis). The trajectory does not depend
+    on this nor on the next three."""
+    considered_scale_std: NonNegative = 0.0
+    """The same of the displacements' scale, as a fraction."""
+    considered_heading_std_degrees: NonNegative = 0.0
+    """The same of their heading."""
+    considered_slope_std: NonNegative = 0.0
+    """The same of their slope, metres up for each metre forward."""
     mahalanobis_fail_scale: NonNegative = 0.0
     """0 skips an update that the χ² gate rejects; above 0 the update is applied with its covariance
     multiplied by this."""
@@ -297,8 +307,8 @@ class TrainConfig:
     workdir: str | None = None
     """Folder for checkpoints and logs; by default runs/<dataset>_<model>."""
     init_from: str | None = None
-    """Folder of a run with the same network, whose best weights training starts from, and whose
-    filter if that has learnt; by default the weights are drawn."""
+    """Folder of a run with the same network, whose best weights training starts from; by default
+    they are drawn. Through the filter, training also starts from the run's filter."""
     seed: int = 0
     """Seed of the initial parameters, the shuffling and the augmentation."""
     data: DataConfig = field(default_factory=DataConfig)

@@ -30,6 +30,7 @@ from gnio_jax.evaluation.setup import (
     no_progress,
     resolve,
 )
+from gnio_jax.filtering import ConsideredStd
 from gnio_jax.filtering.options import FilterSetup, filter_setup
 from gnio_jax.types import Prediction
 
@@ -105,7 +106,9 @@ def perfect_displacements(
 
 def _without_network_errors(ekf: FilterSetup) -> FilterSetup:
     """The filter without what was calibrated for a network: true displacements lack nothing."""
-    return ekf._replace(noise=ekf.noise._replace(std_factor=(1.0, 1.0, 1.0), displacement=None))
+    noise = ekf.noise._replace(std_factor=(1.0, 1.0, 1.0), displacement=None)
+    considered = ekf.considered and ConsideredStd(gyro_bias=ekf.considered.gyro_bias)
+    return ekf._replace(noise=noise, considered=considered)
 
 
 def never_moves(estimates: list[Estimate]) -> list[Estimate]:

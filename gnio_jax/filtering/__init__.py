@@ -6,6 +6,7 @@ Needs only JAX and the geometry: the network is any function from windows to a `
 
 from gnio_jax.filtering.batch import cores_as_devices, over_sequences
 from gnio_jax.filtering.config import FilterConfig
+from gnio_jax.filtering.considered import ConsideredStd, considered_covariance, sensitivity
 from gnio_jax.filtering.history import FilterHistory
 from gnio_jax.filtering.lasting_errors import LastingErrors
 from gnio_jax.filtering.noise import InitialStd, NoiseModel
@@ -18,6 +19,7 @@ from gnio_jax.filtering.state import FilterState, GateState
 from gnio_jax.filtering.tracker import Tracker
 
 __all__ = [
+    "ConsideredStd",
     "FilterConfig",
     "FilterHistory",
     "FilterState",
@@ -29,6 +31,7 @@ __all__ = [
     "SmoothedHistory",
     "Tracker",
     "TrackerState",
+    "considered_covariance",
     "cores_as_devices",
     "initial_state",
     "level_state",
@@ -36,6 +39,7 @@ __all__ = [
     "repeat_odometry",
     "run_filter",
     "run_odometry",
+    "sensitivity",
     "smooth",
     "smooth_odometry",
 ]

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 
 from gnio_jax.config import DataConfig, FilterOptions
 from gnio_jax.filtering.config import FilterConfig
+from gnio_jax.filtering.considered import ConsideredStd
 from gnio_jax.filtering.lasting_errors import LastingErrors
 from gnio_jax.filtering.noise import InitialStd, NoiseModel
 
@@ -26,6 +27,8 @@ class FilterSetup(NamedTuple):
     config: FilterConfig
     noise: NoiseModel
     initial_std: InitialStd
+    considered: ConsideredStd | None = None
+    """Of errors that the filter does not estimate; None: there are none."""
 
 
 def filter_setup(windows: DataConfig, options: FilterOptions) -> FilterSetup:
@@ -39,7 +42,14 @@ def filter_setup(windows: DataConfig, options: FilterOptions) -> FilterSetup:
         history="core",
         window_rotation=options.window_rotation or windows.window_rotation,
     )
-    return FilterSetup(config, noise_model(vars(options)), initial_std(vars(options)))
+    fields = vars(options)
+    considered = considered_std(fields)
+    return FilterSetup(
+        config,
+        noise_model(fields),
+        initial_std(fields),
+        considered if any(considered) else None,
+    )
 
 
 def filter_with(
@@ -78,6 +88,17 @@ def initial_std(options: Mapping[str, Any]) -> InitialStd:
         position=options["position_std"],
         gyro_bias=options["gyro_bias_std"],
         accel_bias=options["accel_bias_std"],
+    )
+
+
+def considered_std(options: Mapping[str, Any]) -> ConsideredStd:
+    """The standard deviations of the errors that are considered, as `noise_model` takes the
+    options."""
+    return ConsideredStd(
+        options["considered_gyro_bias_std"],
+        options["considered_scale_std"],
+        options["considered_heading_std_degrees"] * DEGREE,
+        options["considered_slope_std"],
     )
 
 

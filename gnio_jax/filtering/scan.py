@@ -72,6 +72,7 @@ def repeat_odometry(
     config: FilterConfig,
     noise: NoiseModel,
     imu_valid: Any = None,
+    frame: YawFrame | None = None,
 ) -> tuple[FilterState, FilterHistory]:
     """Filter a run of `run_odometry` again, with the displacements that the network said then.
 
@@ -79,13 +80,13 @@ def repeat_odometry(
     history, told in the filter's own yaw frame; std is the network's own, before any scaling: that
     run had `measurement_scale` 1 and no `std_factor`. With another noise or start this is the run
     that would have been, but for the small changes of the windows that another attitude or bias
-    would have made. Differentiable without a network, so that calibration is cheap. All else as in
-    `run_filter`.
+    would have made. Differentiable without a network, so that calibration is cheap. With the frame
+    "given" it is a run of `run_filter` that is repeated. All else as in `run_filter`.
     """
     state, signals, noise = checked_inputs(state, gyro, accel, imu_valid, config, noise)
     displacement, std = checked_displacements(displacement, std, signals, config)
     covariance = jax.vmap(jnp.diag)(std**2)
-    frame = config.displacement_frame
+    frame = frame or config.displacement_frame
     return _run_filter(state, signals, displacement, covariance, config, noise, frame)
 
 

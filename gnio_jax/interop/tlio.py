@@ -104,8 +104,7 @@ def _template(where: str, given: Mapping[str, Any]) -> Any:
     if len(shape) != 2 or shape[1] % _PREP_CHANNELS or not shape[1]:
         wanted = f"(512, {_PREP_CHANNELS}·⌈N/32⌉) for windows of N samples"
         raise InputError(where, f"'{_FLATTENED}' must have shape {wanted}, found {shape}", _REMEDY)
-    windows = jax.ShapeDtypeStruct((1, 32 * (shape[1] // _PREP_CHANNELS), 6), jnp.float32)
-    return jax.eval_shape(models.create("tlio").init, jax.random.key(0), windows)
+    return models.variable_shapes(models.create("tlio"), 32 * (shape[1] // _PREP_CHANNELS))
 
 
 def _turned(where: str, key: str, value: Any, wanted: tuple[int, ...]) -> np.ndarray:

@@ -1,7 +1,7 @@
 """Networks: windows of IMU samples in, `Prediction` out."""
 
 from gnio_jax.models.inference import Inference, InferenceVariables, inference_variables
-from gnio_jax.models.registry import create, initialise, names
+from gnio_jax.models.registry import create, initialise, names, variable_shapes
 
 __all__ = [
     "Inference",
@@ -10,4 +10,5 @@ __all__ = [
     "inference_variables",
     "initialise",
     "names",
+    "variable_shapes",
 ]

@@ -201,9 +201,7 @@ def load_run(workdir: Path, which: Which = "best") -> Run:
             "let gnio train finish its first epoch, or give another --workdir",
         )
     model = create_model(config)
-    template = jax.eval_shape(
-        model.init, jax.random.key(0), jax.ShapeDtypeStruct((1, config.data.window, 6), jnp.float32)
-    )
+    template = models.variable_shapes(model, config.data.window)
     template = {"params": template["params"], "batch_stats": template.get("batch_stats", {})}
     if config.through_filter.learn:
         template["filter"] = learning.filter_numbers(config.filter)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import shutil
 
 import jax
 import numpy as np
@@ -64,6 +65,9 @@ def test_the_run_differs_in_the_filter_alone(run, two_walks, tmp_path, capsys):
     about = json.loads((out / "calibration.json").read_text())
     likelihood = about["negative_log_likelihood_per_innovation"]
     assert likelihood["after"] < likelihood["before"]
+    assert found.considered_gyro_bias_std > 0
+    nees = about["position_nees_per_axis"]
+    assert abs(np.log(nees["after"])) < abs(np.log(nees["before"]))
     assert about["split"] == "val" and about["filter"] == dataclasses.asdict(found)
 
 
@@ -72,12 +76,21 @@ def test_the_run_differs_in_the_filter_alone(run, two_walks, tmp_path, capsys):
     [
         ({"split": "test"}, "neither the validation nor the training split"),
         ({"out": "."}, "is there already"),
+        ({"fit": ()}, "--fit: names nothing; name some of measurement, noise"),
+        ({"steps": 0}, "--steps: must be at least 1, found 0"),
     ],
 )
 def test_what_is_refused(run, two_walks, options, problem):
     with pytest.raises(InputError, match=problem):
         calibration.calibrate(CalibrateConfig(workdir=str(run), **options))
     assert two_walks == []
+
+
+def test_a_calibrated_run_is_not_calibrated_again(run, two_walks, tmp_path):
+    shutil.copytree(run, tmp_path / "run")
+    (tmp_path / "run" / "calibration.json").write_text("{}")
+    with pytest.raises(InputError, match="is a calibrated run; calibrate the run that it was"):
+        calibration.calibrate(CalibrateConfig(workdir=str(tmp_path / "run")))
 
 
 def test_the_split_may_be_that_of_training(run, two_walks, tmp_path):

@@ -17,7 +17,7 @@ from gnio_jax.filtering.unconstrained import natural, with_numbers
 from tests.support.walks import simulate
 
 DATA = DataConfig(rate=50.0, window_seconds=0.4, stride_seconds=0.1)
-STRIDES, N, CLONES, SIGMA = 400, 5, 4, 0.05
+STRIDES, N, CLONES, SIGMA = 250, 5, 4, 0.05
 TRUE = FilterOptions(
     gyro_density=2e-3, accel_density=2e-2, measurement_scale=1.0, gyro_bias_std=1e-3
 )

@@ -1,6 +1,7 @@
 """The training command as a person types it: one line on stderr and status 2 for every mistake,
 nothing left behind."""
 
+import dataclasses
 import os
 import subprocess
 import sys
@@ -11,7 +12,8 @@ import pytest
 import train
 from gnio_jax import config as configuration
 from gnio_jax.commands import console
-from gnio_jax.config import TrainConfig
+from gnio_jax.commands.train import TrainOptions, defaults
+from gnio_jax.config import FilterOptions, ThroughFilter, TrainConfig
 from gnio_jax.errors import InputError
 
 ROOT = Path(__file__).parents[2]
@@ -174,6 +176,22 @@ def test_help_teaches():
         assert word in " ".join(shown.split()), word
 
 
+def test_training_through_the_filter_begins_with_the_filter_of_the_run(tmp_path):
+    calibrated = FilterOptions(gyro_density=0.02, velocity_std=0.7, window_error_share=0.8)
+    configuration.save(tmp_path / "config.yaml", TrainConfig(filter=calibrated))
+    own = TrainConfig(
+        filter=FilterOptions(velocity_std=0.3), through_filter=ThroughFilter(learn=("noise",))
+    )
+    configuration.save(tmp_path / "own.yaml", own)
+    asked = TrainOptions(config=str(tmp_path / "own.yaml"), init_from=str(tmp_path))
+    found = defaults(asked).filter
+    assert found == dataclasses.replace(calibrated, velocity_std=0.3)
+    # Training on windows has no use for it, and one that is resumed has its own.
+    windows = TrainOptions(init_from=str(tmp_path))
+    assert defaults(windows).filter == FilterOptions()
+    assert defaults(dataclasses.replace(asked, resume=True)).filter == own.filter
+
+
 def test_the_newest_run_is_the_one_trained_last(tmp_path):
     with pytest.raises(
         InputError,
@@ -188,3 +206,5 @@ def test_the_newest_run_is_the_one_trained_last(tmp_path):
     assert configuration.newest_run(tmp_path).name == "new"
     os.utime(tmp_path / "old" / "metrics.jsonl")  # trained on
     assert configuration.newest_run(tmp_path).name == "old"
+    (tmp_path / "old" / "calibration.json").write_text("{}")  # a calibrated copy
+    assert configuration.newest_run(tmp_path).name == "new"

@@ -1,6 +1,8 @@
 """Estimators against plain loops over samples and windows, and against what they must give with
 perfect inputs."""
 
+import dataclasses
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -103,6 +105,38 @@ def test_perfect_displacements_leave_little_error(walks, setup, ate):
     for found in evaluation.perfect_displacements(prepared, CONFIG, OPTIONS, setup):
         values = metrics.measure(found.trajectory, found.reference).values
         assert values["ate"] < ate and values["path_length_ratio"] == pytest.approx(1, abs=0.03)
+
+
+def test_true_displacements_lack_nothing_that_was_calibrated(walks):
+    prepared, _ = evaluation.prepare(walks[::2], CONFIG, Setup(gyro_bias="reference"))
+    calibrated = dataclasses.replace(OPTIONS, std_factor_x=3.0, window_error_share=0.8)
+    both = (
+        evaluation.perfect_displacements(prepared, CONFIG, options)
+        for options in (OPTIONS, calibrated)
+    )
+    for plain, found in zip(*both, strict=True):
+        np.testing.assert_array_equal(found.trajectory.position, plain.trajectory.position)
+
+
+def test_what_is_considered_widens_the_covariance_and_moves_nothing(walks):
+    """By ∂p/∂b_g of the filter, here of a run whose gyro is off by a little."""
+    prepared, _ = evaluation.prepare(walks[:1], CONFIG, Setup(gyro_bias="reference"))
+    options = dataclasses.replace(OPTIONS, considered_gyro_bias_std=1e-3)
+    (plain,), (found,) = (
+        evaluation.perfect_displacements(prepared, CONFIG, each) for each in (OPTIONS, options)
+    )
+    np.testing.assert_array_equal(found.trajectory.position, plain.trajectory.position)
+    moved = []
+    for axis in 1e-5 * np.eye(3):
+        off = [each._replace(gyro_bias=each.gyro_bias + axis) for each in prepared]
+        (shifted,) = evaluation.perfect_displacements(off, CONFIG, OPTIONS)
+        moved.append((shifted.trajectory.position - plain.trajectory.position) / 1e-5)
+    added = 1e-6 * sum(m[:, :, None] * m[:, None, :] for m in moved)
+    wanted = plain.position_covariance + added
+    assert added[-1].max() > 1e-6
+    np.testing.assert_allclose(found.position_covariance, wanted, rtol=1e-2, atol=1e-7)
+    std = np.sqrt(np.diagonal(wanted, axis1=1, axis2=2))
+    np.testing.assert_allclose(found.std[:, 6:9], std, rtol=1e-2)
 
 
 def test_integration_is_neither_ahead_nor_behind(clean):

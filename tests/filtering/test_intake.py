@@ -74,7 +74,7 @@ def tones(frequency, time):
 )
 def test_pure_tones(rate, dt, jitter, highest):
     """The pass band within 1 %, without delay against the stamps; the stop band 40 dB down."""
-    stamps = stamps_of(rate, 2.0, jitter)
+    stamps = stamps_of(rate, 1.2, jitter)
     delay = intake.design(dt, 1.5 * dt, float(rate)).delay
     assert 21 * dt < delay < 22.01 * dt
     inside = slice(round(0.3 / dt), None)  # at the start the FIR's reach is filled by reflection
@@ -193,7 +193,7 @@ def test_what_is_lost_is_bridged_without_a_swing(hole, lost):
 
 def test_a_shake_does_not_pass_at_the_ends_of_a_hole():
     """188 Hz of amplitude 1, which odd reflection hands over as it is."""
-    stamps = stamps_of(400, 2.0)
+    stamps = stamps_of(400, 1.2)
     highest = []
     for first in range(300, 320):
         keep = np.ones(len(stamps), bool)
@@ -219,7 +219,7 @@ def test_a_lost_sample_of_a_slower_imu_is_no_hole(share, most):
 
     off = []
     for seed in range(4):
-        stamps = stamps_of(250, 20.0)
+        stamps = stamps_of(250, 8.0)
         lost = np.random.default_rng(seed).uniform(size=len(stamps)) < share
         lost[[0, -1]] = False
         alone = lost & ~np.roll(lost, 1) & ~np.roll(lost, -1)
@@ -302,18 +302,18 @@ def test_a_faster_imu_gives_the_trajectory_of_the_batch_path(built, rate):
     assert np.linalg.norm(aliased - wanted, axis=1).max() > 0.1
 
 
-@pytest.mark.parametrize("split", [0, 1, 30, 2001, 5005, 5030])
+@pytest.mark.parametrize("split", [0, 1, 30, 601, 1005, 1030])
 def test_restored_in_mid_stream_it_goes_on_to_the_bit(built, tmp_path, split):
     """Before the first grid sample, in the middle, in a hole and after it while the FIR fills."""
     walked = walk(400)._replace(gyro=walk(400).gyro.copy())
-    walked.gyro[5000:5010] = np.nan
+    walked.gyro[1000:1010] = np.nan
     one = Tracker(predict, start(walked), CONFIG, NOISE, imu_rate=400.0)
     before = feed(one, walked, slice(split))
     one.save(tmp_path / "state.npz")
     again = Tracker.restore(tmp_path / "state.npz", predict, CONFIG, NOISE)
     assert again.delay == one.delay and (split > 30) == (len(before) > 0)
     jax.tree.map(np.testing.assert_array_equal, again.state, one.state)
-    rest = [feed(each, walked, slice(split, 5600)) for each in (one, again)]
+    rest = [feed(each, walked, slice(split, 1600)) for each in (one, again)]
     assert len(rest[0]) > 10
     jax.tree.map(np.testing.assert_array_equal, *rest)
 

@@ -15,7 +15,7 @@ from gnio_jax.filtering.lasting_errors import LastingErrors, distort, lasting_mo
 from gnio_jax.filtering.state import LASTING
 from gnio_jax.types import Prediction
 from tests.support import scekf_numpy
-from tests.support.compiling import quick
+from tests.support.compiling import optimised, quick
 from tests.support.random_walk import random_walk
 from tests.support.walks import errors, simulate
 
@@ -40,12 +40,16 @@ def walk():
 
 
 @functools.cache
+def program(config):
+    return quick(functools.partial(filtering.run_filter, config=config))
+
+
+@functools.cache
 def filtered(config=CONFIG, errors=ERRORS):
     start, gyro, accel, displacement, spread = walk()
     state = filtering.initial_state(config, *start)
-    run = quick(functools.partial(filtering.run_filter, config=config))
     given = (state, gyro, accel, displacement, spread)
-    return run(*given, noise=NOISE._replace(displacement=errors))
+    return program(config)(*given, noise=NOISE._replace(displacement=errors))
 
 
 @pytest.mark.parametrize("fail_scale", [0.0, 10.0])
@@ -153,7 +157,7 @@ def estimated(modelled):
     noise = MODEL if modelled else MODEL._replace(displacement=None)
     runs, spread = simulated(), np.tile(SIGMA**2 * np.eye(3), (LONG, 1, 1))
 
-    @jax.jit
+    @optimised
     @jax.vmap
     def run(rotation, velocity, position, *signals):
         state = filtering.initial_state(config, rotation, velocity, position, std=STD)
@@ -191,7 +195,7 @@ def test_the_smoother_is_consistent_with_them():
     )
     runs, spread = simulated(), np.tile(SIGMA**2 * np.eye(3), (LONG, 1, 1))
 
-    @jax.jit
+    @optimised
     @jax.vmap
     def run(rotation, velocity, position, *signals):
         state = filtering.initial_state(config, rotation, velocity, position, std=STD)
@@ -247,7 +251,7 @@ def test_their_derivatives_are_those_of_differences_and_finite_at_zero():
         _, history = filtering.run_filter(*given, CONFIG, noise)
         return jnp.nansum(history.log_likelihood)
 
-    gradient = quick(jax.grad(evidence))
+    value_of, gradient = quick(evidence), quick(jax.grad(evidence))
     for errors_ in (ERRORS, ERRORS._replace(window_share=0.0, scale_std=0.0, heading_std=0.0)):
         at = LastingErrors(*(jnp.float64(value) for value in errors_))
         found = gradient(at)
@@ -256,7 +260,7 @@ def test_their_derivatives_are_those_of_differences_and_finite_at_zero():
             step = 1e-5
             value = getattr(errors_, name)
             ahead, behind = (
-                float(quick(evidence)(at._replace(**{name: jnp.float64(value + change)})))
+                float(value_of(at._replace(**{name: jnp.float64(value + change)})))
                 for change in (step, -step)
             )
             np.testing.assert_allclose(
@@ -308,7 +312,7 @@ def test_a_state_that_has_them_goes_on_with_them():
     for part in (slice(0, 15), slice(15, INTERVALS)):
         samples = slice(part.start * N, part.stop * N)
         given = (state, gyro[samples], accel[samples], displacement[part], spread[part])
-        state, history = filtering.run_filter(*given, config, NOISE)
+        state, history = program(config)(*given, noise=NOISE)
         rows.append(history.position)
     np.testing.assert_allclose(np.concatenate(rows), filtered()[1].position, atol=1e-9)
     with pytest.raises(ValueError, match=r"state\.lasting: "):

@@ -10,6 +10,7 @@ from gnio_jax import models
 from gnio_jax.errors import InputError
 from gnio_jax.models import resnet
 from gnio_jax.models.motion_bank import MotionBank
+from tests.support.compiling import quick
 
 
 def count(tree):
@@ -48,10 +49,15 @@ def test_bank_sizes(size, total):
 
 
 def test_prototypes_start_as_far_apart_as_asked():
+    windows = jnp.zeros((1, 50, 6), jnp.float32)
     for options, std in (({}, 1.0), ({"bank_std": 64**-0.5}, 64**-0.5)):
         model = models.create("gnio", width=8, bank_size=400, **options)
-        prototypes = models.initialise(model, jax.random.key(0), 50)["params"]["bank"]["prototypes"]
-        np.testing.assert_allclose(np.std(prototypes), std, rtol=0.03)
+
+        @quick  # what else is drawn is not compiled
+        def prototypes(key, model=model):
+            return model.init(key, windows)["params"]["bank"]["prototypes"]
+
+        np.testing.assert_allclose(np.std(prototypes(jax.random.key(0))), std, rtol=0.03)
 
 
 def test_the_bank_starts_alive():
@@ -190,11 +196,12 @@ def test_convolution_and_its_gradients_against_xla(size, stride, length):
     def ours(x, k):
         return resnet.convolve(x, k, (stride,), padding)
 
-    np.testing.assert_allclose(ours(x, kernel), oracle(x, kernel), rtol=1e-5, atol=1e-5)
-    weight = jax.random.normal(jax.random.key(2), oracle(x, kernel).shape, jnp.float32)
+    wanted = quick(oracle)(x, kernel)
+    np.testing.assert_allclose(quick(ours)(x, kernel), wanted, rtol=1e-5, atol=1e-5)
+    weight = jax.random.normal(jax.random.key(2), wanted.shape, jnp.float32)
     for a, b in zip(
         *(
-            jax.grad(lambda x, k, f=f: jnp.sum(f(x, k) * weight), (0, 1))(x, kernel)
+            quick(jax.grad(lambda x, k, f=f: jnp.sum(f(x, k) * weight), (0, 1)))(x, kernel)
             for f in (ours, oracle)
         ),
         strict=True,
@@ -356,15 +363,15 @@ def test_both_convolutions_are_one_function(size, stride):
         def apply(x, kernel, function=function):
             return function(x, kernel, (stride,), padding)
 
-        np.testing.assert_allclose(apply(jnp.asarray(x), jnp.asarray(kernel)), wanted, atol=1e-12)
-        weights = np.random.default_rng(1).normal(size=wanted.shape)
-        found[function] = (
-            jax.jvp(apply, (x, kernel), (x[::-1], kernel[::-1]))[1],
-            *jax.grad(
-                lambda x, kernel, apply=apply, weights=weights: jnp.sum(weights * apply(x, kernel)),
-                (0, 1),
-            )(jnp.asarray(x), jnp.asarray(kernel)),
-        )
+        @quick
+        def with_derivatives(x, kernel, apply=apply):
+            weights = np.random.default_rng(1).normal(size=wanted.shape)
+            value, forward = jax.jvp(apply, (x, kernel), (x[::-1], kernel[::-1]))
+            weighted = jax.grad(lambda x, kernel: jnp.sum(weights * apply(x, kernel)), (0, 1))
+            return value, (forward, *weighted(x, kernel))
+
+        value, found[function] = with_derivatives(x, kernel)
+        np.testing.assert_allclose(value, wanted, atol=1e-12)
     for one, other in zip(*found.values(), strict=True):
         np.testing.assert_allclose(one, other, atol=1e-12)
 
@@ -385,10 +392,12 @@ def test_constant_uncertainty_leaves_the_displacement_as_it_is():
         jax.eval_shape(constant.init, jax.random.key(0), jnp.zeros((1, 64, 6)))
     )
     windows = jax.random.normal(jax.random.key(1), (2, 64, 6), jnp.float32)
-    found = constant.apply(given, windows)
-    np.testing.assert_array_equal(found.displacement, plain.apply(variables, windows).displacement)
+    found, of_plain = quick(constant.apply)(given, windows), quick(plain.apply)(variables, windows)
+    np.testing.assert_array_equal(found.displacement, of_plain.displacement)
     np.testing.assert_array_equal(found.log_std, [log_std, log_std])
     frozen = models.inference_variables(constant, given)
     np.testing.assert_allclose(
-        models.Inference(constant)(frozen, windows).displacement, found.displacement, atol=1e-6
+        quick(models.Inference(constant))(frozen, windows).displacement,
+        found.displacement,
+        atol=1e-6,
     )

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from gnio_jax import models
+from tests.support.compiling import quick
 
 
 def trained_like(model, seed=0):
@@ -33,7 +34,7 @@ def test_a_frozen_network_gives_the_same_numbers(options):
     variables = trained_like(model)
     windows = jax.random.normal(jax.random.key(1), (3, 64, 6), jnp.float32)
     frozen, apply = models.inference_variables(model, variables), models.Inference(model)
-    wanted, found = model.apply(variables, windows), apply(frozen, windows)
+    wanted, found = quick(model.apply)(variables, windows), quick(apply)(frozen, windows)
     assert float(jnp.abs(wanted.displacement).max()) > 1e-3
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5), found, wanted)
     for block in jax.tree.leaves(frozen.variables["batch_stats"], is_leaf=lambda x: "mean" in x):

@@ -9,6 +9,12 @@ import pytest
 from gnio_jax.training import loop, optimizer
 
 
+def shared_config(config):
+    """The settings of a run without those that change nothing of what is compiled."""
+    optim = dataclasses.replace(config.optim, best_by="loss")
+    return dataclasses.replace(config, workdir="", data_root="", seed=0, optim=optim)
+
+
 @contextlib.contextmanager
 def shared_programs():
     """Runs whose settings differ in nothing that is compiled share their programs.
@@ -20,9 +26,8 @@ def shared_programs():
 
     def shared(config, *more):
         run = set_up(config, *more)
-        optim = dataclasses.replace(config.optim, best_by="loss")
-        same = dataclasses.replace(config, workdir="", data_root="", seed=0, optim=optim)
-        steps = created(optim, config.loss, run.steps_per_epoch)
+        same = shared_config(config)
+        steps = created(same.optim, config.loss, run.steps_per_epoch)
         return run._replace(config=same, optimizer=steps)
 
     with pytest.MonkeyPatch.context() as patch:

@@ -2,7 +2,8 @@
 
     python -m tests.support.training_process SIGTERM 15 --workdir RUN ...
 
-The words after signal and step are those of `gnio train`; `never 0` sends none.
+The words after signal and step are those of `gnio train`; `never 0` sends none. The network may be
+`tiny`.
 """
 
 import os
@@ -10,12 +11,15 @@ import signal
 import sys
 
 from gnio_jax.commands import app, console
+from gnio_jax.models import registry
 from gnio_jax.training import loop
+from tests.support.tiny_network import Tiny
 
 
 def main(name, step, *arguments):
     run_steps = loop._run_steps
     loop.DISPATCH_SECONDS = 0  # one step at a time
+    registry._MODELS["tiny"] = Tiny
 
     def interrupted(*given):
         state, position = run_steps(*given)

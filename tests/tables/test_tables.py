@@ -14,6 +14,7 @@ from gnio_jax.config import DataConfig, ModelConfig, OptimConfig, TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.tables import complexity, matrix
 from gnio_jax.training import loop
+from tests.support.runs import shared_programs
 from tests.support.tlio_files import write_sequence
 
 
@@ -32,22 +33,10 @@ def made(tmp_path_factory):
         optim=OptimConfig(epochs=2, batch_size=16, learning_rate=1e-3),
     )
     configuration.save(root / "base.yaml", base)
-    return root, [
-        "--base",
-        str(root / "base.yaml"),
-        "--data-root",
-        str(root / "data"),
-        "--out",
-        str(root / "out"),
-        "--seeds",
-        "2",
-        "--methods",
-        "gnio",
-        "--split",
-        "test",
-        "--estimator",
-        "integrate",
-    ]
+    folders = ["--base", root / "base.yaml", "--data-root", root / "data", "--out", root / "out"]
+    choices = ["--seeds", 2, "--methods", "gnio", "--split", "test", "--estimator", "integrate"]
+    with shared_programs():
+        yield root, [str(argument) for argument in [*folders, *choices]]
 
 
 def test_a_table_from_nothing_and_again_without_training(made, monkeypatch, capsys):

@@ -196,6 +196,18 @@ def test_evaluation_takes_what_the_filter_has_learnt(finished, capsys):
     assert evaluate.defaults(asked).filter == latest
 
 
+def test_a_copy_with_other_options_has_them(finished, tmp_path):
+    """As calibration writes it: what had learnt does not come back."""
+    run = checkpoint.load_run(finished)
+    options = dataclasses.replace(run.config.filter, gyro_density=0.5, window_error_share=0.9)
+    config = dataclasses.replace(run.config, filter=options)
+    configuration.save(tmp_path / "config.yaml", config)
+    checkpoint.write_best(tmp_path, run._replace(config=config))
+    found = checkpoint.load_run(tmp_path)
+    assert found.config.filter == options and same(found.variables, run.variables)
+    assert (found.step, found.epoch) == (run.step, run.epoch)
+
+
 @pytest.fixture(scope="module")
 def training(recording, tmp_path_factory):
     """The data and the steps of a run that is never written."""

@@ -21,15 +21,19 @@ from gnio_jax.evaluation.metrics import Trajectory
 from gnio_jax.evaluation.preparation import Prepared
 from gnio_jax.evaluation.setup import OnShare, no_progress
 from gnio_jax.filtering import (
+    ConsideredStd,
     FilterConfig,
     FilterHistory,
     InitialStd,
     NoiseModel,
+    considered_covariance,
     initial_state,
     over_sequences,
     run_filter,
     run_odometry,
+    sensitivity,
 )
+from gnio_jax.filtering.config import YawFrame
 from gnio_jax.filtering.options import FilterSetup
 from gnio_jax.numerics import filled_up, quaternion_from_matrix
 from gnio_jax.scaling.processes import on_host
@@ -132,7 +136,38 @@ def _run_batch(
         history = _run_with_measurements(
             start, gyro, accel, _stacked(given), setup.config, setup.noise
         )
+    if setup.considered is not None:
+        frame = None if isinstance(source, Network) else "given"
+        fixed = setup.config, setup.noise, setup.considered, frame
+        history = _with_considered(start, gyro, accel, history, *fixed)
     return on_host(history)
+
+
+@functools.partial(jax.jit, static_argnames=("config", "frame"))
+def _with_considered(
+    start: FilterStart,
+    gyro: Array,
+    accel: Array,
+    history: FilterHistory,
+    config: FilterConfig,
+    noise: NoiseModel,
+    considered: ConsideredStd,
+    frame: YawFrame | None,
+) -> FilterHistory:
+    """With the errors that the filter considers in its covariance."""
+
+    def run(
+        start: FilterStart, gyro: Array, accel: Array, history: FilterHistory
+    ) -> tuple[Array, Array]:
+        state = initial_state(config, **start._asdict())
+        found = sensitivity(state, gyro, accel, history, config, noise, frame=frame)
+        added = considered_covariance(found, considered)
+        variances = history.covariance_diagonal + jnp.diagonal(added, axis1=1, axis2=2)
+        assert history.covariance is not None
+        return variances, history.covariance + added[:, POSITION, POSITION]
+
+    diagonal, covariance = over_sequences(run)(start, gyro, accel, history)
+    return history._replace(covariance_diagonal=diagonal, covariance=covariance)
 
 
 @functools.partial(jax.jit, static_argnames=("apply", "config"))
