@@ -66,7 +66,7 @@ def sensitivity(
 
     The displacements are those of the history: the network is not called again, and that other
     biases would have changed its windows a little is left out. `frame` is "given" for a run of
-    `run_filter`.
+    `run_filter`, whose measurements must have had diagonal covariances.
     """
     factors = jnp.stack(jax.tree.map(jnp.asarray, noise.std_factor))
     own_std = history.measurement_std / (factors[None] * config.measurement_scale**0.5)
