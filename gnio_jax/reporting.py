@@ -20,6 +20,16 @@ class Reporter(Protocol):
         ...
 
 
+class Silence:
+    """Says nothing: of several processes one alone speaks."""
+
+    def line(self, text: str) -> None:
+        pass
+
+    def progress(self, stage: str, share: float, numbers: str = "") -> None:
+        pass
+
+
 class Lines:
     """Plain lines on stderr, without a progress bar."""
 

@@ -90,8 +90,8 @@ class Terminal:
 
 
 @contextlib.contextmanager
-def terminal() -> Iterator[Terminal]:
-    """A `Terminal` whose bar is removed at the end."""
+def terminal(shown: bool = True) -> Iterator[Terminal]:
+    """A `Terminal` whose bar is removed at the end, or one without a bar."""
     console = Console(stderr=True, highlight=False, markup=False)
     columns = (
         TextColumn("{task.description}"),
@@ -101,7 +101,7 @@ def terminal() -> Iterator[Terminal]:
         TimeElapsedColumn(),
         TimeRemainingColumn(elapsed_when_finished=True),
     )
-    disable = not console.is_terminal
+    disable = not (shown and console.is_terminal)
     with Progress(
         *columns, console=console, transient=True, disable=disable, speed_estimate_period=120
     ) as bars:

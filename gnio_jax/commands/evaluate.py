@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from gnio_jax import config as configuration
 from gnio_jax.commands import console
 from gnio_jax.commands.options import Command, execute
+from gnio_jax.commands.together import MeetingOptions
 from gnio_jax.config import EvaluateConfig
 from gnio_jax.cores import usable_cores
 
@@ -25,10 +27,15 @@ with: never_moves, the start pose throughout, and perfect_displacements, the sam
 the reference's displacements."""
 
 
-def defaults(options: EvaluateConfig) -> EvaluateConfig:
+@dataclass(frozen=True)
+class EvaluateOptions(EvaluateConfig, MeetingOptions):
+    """What `gnio evaluate` is asked for, and where its processes meet."""
+
+
+def defaults(options: EvaluateOptions) -> EvaluateOptions:
     """The newest run, where none is named, and the filter options that it has or has learnt."""
     workdir = Path(options.workdir or configuration.newest_run())
-    default = EvaluateConfig(workdir=str(workdir))
+    default = EvaluateOptions(workdir=str(workdir))
     kept = workdir / "config.yaml"
     if not kept.is_file():
         return default
@@ -36,24 +43,30 @@ def defaults(options: EvaluateConfig) -> EvaluateConfig:
     if config.through_filter.learn:
         from gnio_jax import filtering
         from gnio_jax.evaluation.run import run_config
+        from gnio_jax.scaling import processes
 
         filtering.cores_as_devices()  # before the checkpoint's arrays settle the devices
+        processes.meet(options.meeting())
         config = run_config(workdir, options.checkpoint)
     return dataclasses.replace(default, filter=config.filter)
 
 
-def evaluate(config: EvaluateConfig, _prog: str) -> None:
+def evaluate(config: EvaluateOptions, _prog: str) -> None:
     """Evaluate, and show the table."""
     # After the options: --help and mistakes do not wait for these imports.
     import jax
 
     from gnio_jax import evaluation, filtering
     from gnio_jax.evaluation import table
+    from gnio_jax.scaling import processes
 
     jax.config.update("jax_enable_x64", True)  # for the filter; the network states its float32
     filtering.cores_as_devices()
-    with console.terminal() as terminal:
+    processes.meet(config.meeting())
+    with processes.running(), console.terminal(shown=processes.is_first()) as terminal:
         found, folder = evaluation.evaluate(config, terminal.progress, usable_cores())
+    if not processes.is_first():
+        return
     console.stdout().print(table.render(found))
     print(f"results: {folder}")
     if config.plots:
@@ -61,7 +74,7 @@ def evaluate(config: EvaluateConfig, _prog: str) -> None:
         print(f"pictures: {folder / 'plots' / 'error_cdf.png'}, and there of each sequence {names}")
 
 
-COMMAND = Command(EvaluateConfig, evaluate, DESCRIPTION, defaults)
+COMMAND = Command(EvaluateOptions, evaluate, DESCRIPTION, defaults)
 
 
 def main(argv: Sequence[str] | None = None, prog: str = "python evaluate.py") -> None:

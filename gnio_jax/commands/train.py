@@ -14,6 +14,7 @@ import tyro
 from gnio_jax import config as configuration
 from gnio_jax.commands import console
 from gnio_jax.commands.options import Command, execute, sibling
+from gnio_jax.commands.together import MeetingOptions
 from gnio_jax.config import CONSIDERED_FIELDS, FilterOptions, TrainConfig
 from gnio_jax.cores import usable_cores
 
@@ -39,10 +40,13 @@ class RunOptions:
     """YAML file of settings, or the name of one that comes with the package, e.g. quickstart."""
     resume: tyro.conf.FlagCreatePairsOff[bool] = False
     """Continue the run in the work folder from its latest checkpoint."""
+    devices: int | None = None
+    """Devices of each process that share a batch; by default all of its GPUs, or the one that a CPU
+    is."""
 
 
 @dataclass(frozen=True)
-class TrainOptions(TrainConfig, RunOptions):
+class TrainOptions(TrainConfig, RunOptions, MeetingOptions):
     """What `gnio train` is asked for: an experiment, and where its settings come from."""
 
     def experiment(self) -> TrainConfig:
@@ -91,22 +95,37 @@ def train(options: TrainOptions, prog: str) -> None:
     """Train, and say how to go on."""
     # After the options: --help and mistakes do not wait for these imports.
     from gnio_jax import filtering
+    from gnio_jax.scaling import devices, processes
     from gnio_jax.training import loop
 
     if options.through_filter.learn:
         filtering.cores_as_devices()  # the filter's operations are too small for several cores
-    with console.terminal() as terminal:
-        try:
-            outcome = loop.train(options.experiment(), options.resume, terminal, usable_cores())
-        except FloatingPointError as error:
-            terminal.line(str(error))
-            sys.exit(1)
+    elif options.devices:
+        devices.cpu_devices(options.devices)
+    processes.meet(options.meeting())
+    with processes.running():
+        with console.terminal(shown=processes.is_first()) as terminal:
+            try:
+                call = (options.experiment(), options.resume, terminal, usable_cores())
+                outcome = loop.train(*call, devices=options.devices)
+            except FloatingPointError as error:
+                terminal.line(str(error))
+                sys.exit(1)
+    if processes.is_first():
+        _say_how_to_go_on(prog, outcome.workdir, outcome.stopped_by, outcome.best_loss)
     if outcome.stopped_by:
-        remedy = f"{sibling(prog, 'train')} --workdir {outcome.workdir} --resume"
-        print(f"stopped and saved; continue with: {remedy}", file=sys.stderr)
         sys.exit(128 + outcome.stopped_by)
-    following = f"{sibling(prog, 'evaluate')} --workdir {outcome.workdir}"
-    print(f"best on validation {outcome.best_loss:.4g}; look at it with: {following}")
+
+
+def _say_how_to_go_on(
+    prog: str, workdir: Path, stopped_by: int | None, best_loss: float | None
+) -> None:
+    if stopped_by:
+        remedy = f"{sibling(prog, 'train')} --workdir {workdir} --resume"
+        print(f"stopped and saved; continue with: {remedy}", file=sys.stderr)
+    else:
+        following = f"{sibling(prog, 'evaluate')} --workdir {workdir}"
+        print(f"best on validation {best_loss:.4g}; look at it with: {following}")
 
 
 COMMAND = Command(TrainOptions, train, DESCRIPTION, defaults)

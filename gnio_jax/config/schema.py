@@ -146,6 +146,9 @@ class ModelConfig:
     """A window turned about the vertical gives the displacement turned alike, for every network:
     the mean over four headings of the window, at inference, or a frame that a small network finds
     in the window (EqNIO)."""
+    dtype: Literal["float32", "bfloat16"] = "float32"
+    """Factors of matrix products and convolutions in training on windows (ours). Sums, parameters,
+    statistics, loss and update are float32 either way, and so is the network once it is trained."""
 
 
 @dataclass(frozen=True)
@@ -183,6 +186,9 @@ class OptimConfig:
     """Passes over the training windows."""
     batch_size: Count = 1024
     """Windows per step."""
+    accumulate: Count = 1
+    """Parts of a batch whose gradients are computed one after another and averaged: less memory for
+    the same step. In training, batch normalisation then sees a part."""
     learning_rate: Positive = 1e-4
     """Peak learning rate, reached after the warm-up."""
     start_learning_rate: float = 1e-6
@@ -214,7 +220,12 @@ class OptimConfig:
     nothing."""
 
     def check(self, prefix: str, source: str) -> None:
-        """Running statistics of batch normalisation are not those of averaged parameters."""
+        """Running statistics of batch normalisation are not those of averaged parameters. Parts of
+        a batch have one size."""
+        if self.batch_size % self.accumulate:
+            problem = f"field '{prefix}accumulate' is {self.accumulate}"
+            remedy = f"it must divide {prefix}batch_size, which is {self.batch_size}"
+            raise InputError(source, problem, remedy)
         if self.ema_decay and not self.statistics_windows:
             problem = f"field '{prefix}ema_decay' is set without {prefix}statistics_windows"
             remedy = "averaged parameters want statistics of their own: set it, e.g. to 16384"
@@ -337,6 +348,12 @@ class TrainConfig:
         if self.optim.ema_decay:
             problem = f"field '{prefix}optim.ema_decay' is for training on windows alone"
             raise InputError(source, problem, "set it to 0")
+        if self.optim.accumulate > 1:
+            problem = f"field '{prefix}optim.accumulate' is for training on windows alone"
+            raise InputError(source, problem, "set it to 1")
+        if self.model.dtype != "float32":
+            problem = f"field '{prefix}model.dtype' is for training on windows alone"
+            raise InputError(source, problem, "set it to float32")
         for name in ("piece_seconds", "truncate_seconds"):
             strides = getattr(through, name) / self.data.stride_seconds
             if abs(strides - round(strides)) >= 1e-6:

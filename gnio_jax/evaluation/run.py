@@ -12,7 +12,7 @@ import jax
 
 from gnio_jax import config as configuration
 from gnio_jax import data
-from gnio_jax.config import EvaluateConfig, FilterOptions, TrainConfig
+from gnio_jax.config import DataConfig, EvaluateConfig, FilterOptions, TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation.estimation import (
     PERFECT_STD,
@@ -20,12 +20,14 @@ from gnio_jax.evaluation.estimation import (
     never_moves,
     perfect_displacements,
 )
+from gnio_jax.evaluation.estimators.result import Estimate
 from gnio_jax.evaluation.inference import Network, inference_network
 from gnio_jax.evaluation.preparation import Prepared, prepare
 from gnio_jax.evaluation.report import DEFINITIONS, Report, write
 from gnio_jax.evaluation.scores import score
 from gnio_jax.evaluation.setup import Setup, resolve
 from gnio_jax.files import replacing_folder
+from gnio_jax.scaling.processes import all_or_none, is_first
 from gnio_jax.types import Sequence
 
 OnStage = Callable[[str, float], None]
@@ -59,24 +61,26 @@ def evaluate(
     config: EvaluateConfig, progress: OnStage = lambda stage, share: None, workers: int = 1
 ) -> Evaluation:
     """Estimate every sequence of a split with a run's network, measure, and leave the results in a
-    folder of the run.
+    folder of the run. Several processes (`jax.distributed`) share the filter's work, and the first
+    one writes.
 
     The folder is written whole or not at all, and takes the place of the one an earlier evaluation
     with the same options left. `workers` processes read what is slow to read (`data.load`). Raises
     `InputError` for options that do not fit together, a workdir without the checkpoint, unknown or
     missing data, or sequences that cannot be estimated this way.
     """
-    job = _set_up(config)
-    trained, setup = job.trained, job.setup
-    sequences = data.load(
-        job.dataset, job.data_root, config.split, workers, lambda x: progress("reading", x)
-    )
+    with all_or_none():
+        job = _set_up(config)
+        trained, setup = job.trained, job.setup
+        sequences = data.load(
+            job.dataset, job.data_root, config.split, workers, lambda x: progress("reading", x)
+        )
 
-    prepared, left_out = prepare(sequences, trained.data, setup)
-    if not prepared:
-        name, reason = next(iter(left_out.items()))
-        problem = f"no sequence of split '{config.split}' can be estimated ({name}: {reason})"
-        raise InputError(f"dataset {job.dataset}", problem)
+        prepared, left_out = prepare(sequences, trained.data, setup)
+        if not prepared:
+            name, reason = next(iter(left_out.items()))
+            problem = f"no sequence of split '{config.split}' can be estimated ({name}: {reason})"
+            raise InputError(f"dataset {job.dataset}", problem)
 
     how = (trained.data, job.options, setup, config.batch_size)
     estimates = estimate(prepared, job.network, *how, lambda x: progress("estimating", x))
@@ -97,16 +101,29 @@ def evaluate(
     )
 
     folder = job.workdir / "eval" / folder_name(config, job.dataset, trained)
+    with all_or_none():
+        if is_first():
+            _write(folder, report, estimates, trained.data if config.plots else None, progress)
+    return Evaluation(report, folder)
+
+
+def _write(
+    folder: Path,
+    report: Report,
+    estimates: list[Estimate],
+    drawn: DataConfig | None,
+    progress: OnStage,
+) -> None:
+    """Leave the results in `folder`, with pictures if `drawn` says how windows are cut."""
     with replacing_folder(folder) as new:
         write(new, report, estimates)
-        if config.plots:
+        if drawn is not None:
             from gnio_jax.evaluation import plots  # Matplotlib takes a second to import
 
-            window = trained.data.window_seconds
+            window = drawn.window_seconds
             plots.save_all(
                 new / "plots", estimates, report, window, lambda x: progress("drawing", x)
             )
-    return Evaluation(report, folder)
 
 
 def folder_name(config: EvaluateConfig, dataset: str, trained: TrainConfig) -> str:

@@ -1,8 +1,7 @@
-"""Many sequences at once: vmapped, and the batch shared out among the devices of the machine."""
+"""Many sequences at once: vmapped, and the batch shared out among the devices of all processes."""
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from typing import TypeVar
 
@@ -12,20 +11,25 @@ import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 
 from gnio_jax.cores import usable_cores
+from gnio_jax.scaling.devices import cpu_devices
+from gnio_jax.scaling.processes import several
 from gnio_jax.types import Array
 
 T = TypeVar("T")
 
 
 def over_sequences(function: Callable[..., T], shared: int = 0) -> Callable[..., T]:
-    """`jax.vmap(function)` whose sequences are shared out among all devices; to be jitted, and
-    differentiable like it.
+    """`jax.vmap(function)` whose sequences are shared out among all devices of all processes; to be
+    jitted, and differentiable like it.
 
     The first `shared` arguments (parameters, noise) are the same for every sequence; the leaves of
     all others, and of the result, have the sequences as their leading axis. A number of sequences
     that does not divide evenly is filled up with the last one, whose additional results are
     dropped. With one device, or one sequence, it is `jax.vmap`. Arguments must not be bound to a
     device by `jax.device_put(x, device)`: JAX refuses those (ValueError).
+
+    In several processes (`jax.distributed`) each of them gives all sequences, and
+    `scaling.processes.on_host` gives each of them all results.
 
     On a machine without a GPU JAX sees one device however many cores there are, and the filter's
     operations are too small for XLA to split each among cores: call `cores_as_devices` first.
@@ -34,7 +38,8 @@ def over_sequences(function: Callable[..., T], shared: int = 0) -> Callable[...,
     def mapped(*arguments: object) -> T:
         own = arguments[shared:]
         count = jax.tree.leaves(own)[0].shape[0]
-        devices = jax.devices()[:count]
+        # Every process takes part, also where there are fewer sequences than devices.
+        devices = jax.devices() if several() else jax.devices()[:count]
         batched = jax.vmap(function, in_axes=(None,) * shared + (0,) * len(own))
         if len(devices) == 1:
             return batched(*arguments)
@@ -66,8 +71,4 @@ def cores_as_devices() -> None:
     Programs that do not spread anything go on running on the first device, with all cores. Raises
     RuntimeError after JAX's first computation, when the devices are settled.
     """
-    # JAX makes its settings when it is imported, so its types do not know this one.
-    given = jax.config.jax_num_cpu_devices  # pyright: ignore[reportAttributeAccessIssue]
-    if given >= 0 or "xla_force_host_platform_device_count" in os.environ.get("XLA_FLAGS", ""):
-        return
-    jax.config.update("jax_num_cpu_devices", usable_cores())
+    cpu_devices(usable_cores())

@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from gnio_jax.models.heads import root_mean_square, to_axes
 from gnio_jax.models.layers import attention, check_dropout, check_output_dim, layer_norm, linear
+from gnio_jax.models.precision import einsum
 from gnio_jax.models.resnet import batch_norm, conv, he_normal_fan_out
 from gnio_jax.types import Prediction
 
@@ -257,4 +258,4 @@ def _convolve_groups(
     batch, samples, _channels = x.shape
     shifted = _neighbours(x, size).reshape(batch, samples, size, feature_group_count, channels)
     kernel = kernel.reshape(size, channels, feature_group_count, features // feature_group_count)
-    return jnp.einsum("bnkgc,kcgd->bngd", shifted, kernel).reshape(batch, samples, features)
+    return einsum("bnkgc,kcgd->bngd", shifted, kernel).reshape(batch, samples, features)

@@ -9,10 +9,19 @@ import jax.numpy as jnp
 from flax import linen as nn
 from jaxtyping import Bool, Float
 
+from gnio_jax.models import precision
+
 
 def linear(features: int, name: str, **options: Any) -> nn.Dense:
     """A linear layer."""
-    return nn.Dense(features, dtype=jnp.float32, param_dtype=jnp.float32, name=name, **options)
+    return nn.Dense(
+        features,
+        dtype=jnp.float32,
+        param_dtype=jnp.float32,
+        dot_general=precision.dot_general,
+        name=name,
+        **options,
+    )
 
 
 def layer_norm(name: str) -> nn.LayerNorm:
@@ -37,11 +46,11 @@ def attend(
     query, key, value = (
         x.swapaxes(1, 2).reshape(batch * heads, -1, size) for x in (query, key, value)
     )
-    scores = jnp.einsum("bnd,bmd->bnm", query / jnp.sqrt(jnp.float32(size)), key)
+    scores = precision.einsum("bnd,bmd->bnm", query / jnp.sqrt(jnp.float32(size)), key)
     if mask is not None:
         scores = jnp.where(mask[0], scores, -jnp.inf)
     weights = jnp.exp(scores - jax.lax.stop_gradient(scores.max(axis=-1, keepdims=True)))
-    context = jnp.einsum("bnm,bmd->bnd", weights, value) / weights.sum(axis=-1, keepdims=True)
+    context = precision.einsum("bnm,bmd->bnd", weights, value) / weights.sum(axis=-1, keepdims=True)
     return context.reshape(batch, heads, samples, size).swapaxes(1, 2)
 
 
@@ -56,6 +65,8 @@ def attention(
         dtype=jnp.float32,
         param_dtype=jnp.float32,
         attention_fn=attend,
+        qkv_dot_general=precision.dot_general,
+        out_dot_general=precision.dot_general,
         name=name,
     )
 

@@ -8,6 +8,8 @@ import jax.numpy as jnp
 from flax import linen as nn
 from jaxtyping import Float
 
+from gnio_jax.models.precision import dot_general, einsum
+
 # PyTorch's `MultiheadAttention`: query, key and value are one (3d, d) matrix to its Xavier-uniform
 # start, so that their bound is √(6 / 4d) = √(3 · 0.5 / d), and the output is a linear layer with
 # its usual bound 1/√d.
@@ -37,7 +39,11 @@ class MotionBank(nn.Module):
         )
         self.query, self.key, self.value = (
             nn.DenseGeneral(
-                shape, kernel_init=stacked_xavier, dtype=jnp.float32, param_dtype=jnp.float32
+                shape,
+                kernel_init=stacked_xavier,
+                dtype=jnp.float32,
+                param_dtype=jnp.float32,
+                dot_general=dot_general,
             )
             for _ in range(3)
         )
@@ -47,6 +53,7 @@ class MotionBank(nn.Module):
             kernel_init=fan_in_uniform,
             dtype=jnp.float32,
             param_dtype=jnp.float32,
+            dot_general=dot_general,
         )
 
     def __call__(
@@ -57,11 +64,11 @@ class MotionBank(nn.Module):
         """Context (b, d) and attention weights (b, heads, m) of each feature; `memory` is that of
         an earlier call, if there was one."""
         query, (key, value) = self.query(feature), self.memory() if memory is None else memory
-        scores = jnp.einsum("bhk,hmk->bhm", query, key) / jnp.sqrt(
+        scores = einsum("bhk,hmk->bhm", query, key) / jnp.sqrt(
             jnp.float32(self.width // self.heads)
         )
         attention = nn.softmax(scores, axis=-1)
-        return self.output(jnp.einsum("bhm,hkm->bhk", attention, value)), attention
+        return self.output(einsum("bhm,hkm->bhk", attention, value)), attention
 
     def memory(self) -> tuple[Float[jax.Array, "h m k"], Float[jax.Array, "h k m"]]:
         """Keys (heads, m, d / heads) and values (heads, d / heads, m) of the prototypes: as the

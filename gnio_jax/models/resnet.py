@@ -11,6 +11,8 @@ import jax.numpy as jnp
 from flax import linen as nn
 from jaxtyping import Float
 
+from gnio_jax.models import precision
+
 BLOCKS_PER_GROUP = 2
 GROUP_STRIDES = (1, 2, 2, 2)
 
@@ -40,7 +42,8 @@ def convolve(
     length = (x.shape[1] - size) // stride + 1
     shifted = [x[:, i : i + stride * (length - 1) + 1 : stride] for i in range(size)]
     columns = jnp.concatenate(shifted, axis=-1).reshape(-1, size * channels)
-    return (columns @ kernel.reshape(size * channels, features)).reshape(-1, length, features)
+    product = precision.matmul(columns, kernel.reshape(size * channels, features))
+    return product.reshape(-1, length, features)
 
 
 def convolve_forward(

@@ -9,6 +9,7 @@ previous one whole.
 from __future__ import annotations
 
 import dataclasses
+import json
 import logging
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -17,16 +18,21 @@ import jax
 import jax.numpy as jnp
 import orbax.checkpoint as ocp
 from flax import linen as nn
+from orbax.checkpoint.options import MultiprocessingOptions
 
 from gnio_jax import config as configuration
 from gnio_jax import models
 from gnio_jax.config import TrainConfig
 from gnio_jax.errors import InputError
+from gnio_jax.scaling import devices
+from gnio_jax.scaling.processes import all_or_none, from_first, is_first, several, text_from_first
 from gnio_jax.training import learnt as learning
 from gnio_jax.training.optimizer import Plateau
 from gnio_jax.training.step import TrainState, evaluated
 
 Which = Literal["best", "latest"]
+ARRAYS = ("variables", "optimizer", "training")
+"""The items of a checkpoint that are trees of arrays."""
 
 logging.getLogger("absl").setLevel(logging.ERROR)  # Orbax logs every save there
 
@@ -64,11 +70,14 @@ class Run(NamedTuple):
 
 
 def create_model(config: TrainConfig) -> nn.Module:
-    """The network that `config.model` describes; what that leaves open is the network's own."""
+    """The network that `config.model` describes; what that leaves open is the network's own.
+
+    In float32: `dtype` is for the steps of training.
+    """
     options = {
         key: value
         for key, value in vars(config.model).items()
-        if key != "name" and value is not None
+        if key not in ("name", "dtype") and value is not None
     }
     return models.create(config.model.name, **options)
 
@@ -80,14 +89,18 @@ def exists(workdir: Path, which: Which = "latest") -> bool:
 
 
 class Checkpoints:
-    """The two series of a run; a context manager, because Orbax keeps threads that want closing."""
+    """The two series of a run; a context manager, because Orbax keeps threads that want closing.
+
+    Of several processes, all of which have the same state, the first one alone writes and reads;
+    `save` and `restore` are for all of them to call.
+    """
 
     def __init__(self, workdir: Path):
         self._workdir = workdir
-        self._managers = {
-            which: _manager(workdir / "checkpoints" / which, create=True)
-            for which in ("latest", "best")
-        }
+        self._managers: dict[Which, ocp.CheckpointManager] = {}
+        with all_or_none():
+            for which in ("latest", "best") if is_first() else ():
+                self._managers[which] = _manager(workdir / "checkpoints" / which, create=True)
 
     def __enter__(self) -> Checkpoints:
         return self
@@ -101,9 +114,16 @@ class Checkpoints:
         same and stays.
 
         Its variables are those that are evaluated. Where they are averages, `latest` also holds the
-        parameters that training goes on with.
+        parameters that training goes on with. Arrays are written from the host's memory: a
+        checkpoint does not know on which devices they lay, and fits any.
         """
-        manager = self._managers[which]
+        with all_or_none():
+            if is_first():
+                self._save(self._managers[which], which, jax.device_get(state), position)
+
+    def _save(
+        self, manager: ocp.CheckpointManager, which: Which, state: TrainState, position: Position
+    ) -> None:
         if position.step in manager.all_steps():
             return
         items = _evaluated_items(state, position)
@@ -114,10 +134,20 @@ class Checkpoints:
         manager.save(position.step, args=ocp.args.Composite(**items))
 
     def restore(self, template: TrainState) -> tuple[TrainState, Position]:
-        """The latest state, in the structure of `template`.
+        """The latest state, in the structure of `template`, as `devices.everywhere` places it.
 
         Raises `InputError` if it does not fit.
         """
+        template, meta = jax.device_get(template), "{}"
+        with all_or_none():
+            if is_first():
+                template, meta = self._restored(template)
+        # The others have the template's shapes, and now the first one's values.
+        state = devices.everywhere(from_first(template))
+        return state, _position(json.loads(text_from_first(meta)))
+
+    def _restored(self, template: TrainState) -> tuple[TrainState, str]:
+        """The latest state, and its position as JSON."""
         manager = self._managers["latest"]
         step = manager.latest_step()
         where = self._workdir / "checkpoints" / "latest"
@@ -132,7 +162,7 @@ class Checkpoints:
         state = TrainState.of(jnp.int32(step), restored["variables"], restored["optimizer"])
         if template.average is not None:
             state = state._replace(params=restored["training"], average=state.params)
-        return uncommitted(state), _position(meta["position"])
+        return state, json.dumps(meta["position"])
 
 
 def write_best(workdir: Path, run: Run) -> None:
@@ -206,7 +236,37 @@ def _manager(folder: Path, create: bool) -> ocp.CheckpointManager:
     options = ocp.CheckpointManagerOptions(
         max_to_keep=1, enable_async_checkpointing=False, create=create
     )
-    return ocp.CheckpointManager(folder.absolute(), options=options)
+    if not several():
+        return ocp.CheckpointManager(folder.absolute(), options=options)
+    if create:
+        folder.mkdir(parents=True, exist_ok=True)
+    own = jax.process_index()
+    alone = MultiprocessingOptions(own, {own}, barrier_sync_key_prefix=f"process{own}")
+    options = dataclasses.replace(options, create=False, multiprocessing_options=alone)
+    return ocp.CheckpointManager(
+        folder.absolute(), options=options, handler_registry=_handlers(alone)
+    )
+
+
+def _handlers(alone: MultiprocessingOptions) -> Any:
+    """What writes and reads the items of a checkpoint in one process of several."""
+    handlers = ocp.handlers.DefaultCheckpointHandlerRegistry()
+    for name in ARRAYS:
+        arrays = _WrittenByOne(multiprocessing_options=alone, use_ocdbt=False)
+        for arguments in (ocp.args.StandardSave, ocp.args.StandardRestore):
+            handlers.add(name, arguments, arrays)
+    meta = ocp.JsonCheckpointHandler(multiprocessing_options=alone)
+    for arguments in (ocp.args.JsonSave, ocp.args.JsonRestore):
+        handlers.add("meta", arguments, meta)
+    return handlers
+
+
+class _WrittenByOne(ocp.StandardCheckpointHandler):
+    """Arrays that one process of several writes or reads, without waiting for the others in Orbax:
+    one that fails must not keep them."""
+
+    def finalize(self, directory: Any) -> None:
+        """Nothing: there is no share of another process to merge, nor to compare with."""
 
 
 def uncommitted(tree: Any) -> Any:

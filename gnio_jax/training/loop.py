@@ -10,7 +10,10 @@ import jax
 
 from gnio_jax import config as configuration
 from gnio_jax.config import TrainConfig
-from gnio_jax.reporting import Lines, Reporter
+from gnio_jax.errors import InputError
+from gnio_jax.reporting import Lines, Reporter, Silence
+from gnio_jax.scaling.devices import chosen, sharing
+from gnio_jax.scaling.processes import agreed, all_or_none, is_first, several
 from gnio_jax.training import optimizer as optimizers
 from gnio_jax.training import run_folder
 from gnio_jax.training.checkpoint import Checkpoints, Position, exists
@@ -41,6 +44,7 @@ def train(
     resume: bool = False,
     reporter: Reporter | None = None,
     workers: int = 1,
+    devices: int | None = None,
 ) -> Outcome:
     """Train the network of `config` and leave checkpoints and logs in its work folder: on windows,
     or through the filter where `config.through_filter` says what learns.
@@ -51,22 +55,33 @@ def train(
     yet the run starts over; log rows after the checkpoint are dropped. SIGTERM and Ctrl-C save and
     return; a loss that is not finite raises `FloatingPointError` naming the step (through the
     filter such a step is skipped). `workers` processes read recordings that are slow to read
-    (`data.load`). Raises `InputError` where `config.init_from` is no run of the same network.
+    (`data.load`). A batch of windows is shared out among `devices` devices of each process, by
+    default all (`scaling.devices.chosen`); how many there are changes the results by rounding
+    alone, also in a run that is resumed. Raises `InputError` where `config.init_from` is no run of
+    the same network, and where the devices cannot share a batch evenly.
     """
+    through_filter = bool(config.through_filter.learn)  # it shares its pieces out by itself
+    if through_filter and several():
+        problem = "runs in one process, on all of its devices"
+        raise InputError("training through the filter", problem, "start one process")
+    sharers = jax.devices()[:1] if through_filter else chosen(devices)
     # Whatever the process has: no float64 but for the filter, and the same random draws.
-    with jax.enable_x64(bool(config.through_filter.learn)):
-        return _train(config, resume, reporter or Lines(), workers)
+    with jax.enable_x64(through_filter), sharing(sharers):
+        return _train(config, resume, (reporter or Lines()) if is_first() else Silence(), workers)
 
 
 def _train(config: TrainConfig, resume: bool, reporter: Reporter, workers: int) -> Outcome:
     configuration.validate(config)
-    workdir = run_folder.prepare(config, resume)
-    resuming = resume and exists(workdir)
-    start = None if resuming else initial_run(config)
-    training = set_up(config, reporter, workers)
-    state = training.new_state(start)
-    training.describe(state, workdir, reporter)
-    run_folder.write_settings(workdir, config, training.splits, resume)
+    with all_or_none():
+        workdir = run_folder.prepare(config, resume)
+    (resuming,) = agreed(resume and is_first() and exists(workdir))
+    with all_or_none():
+        start = None if resuming else initial_run(config)
+        training = set_up(config, reporter, workers)
+        state = training.new_state(start)
+        training.describe(state, workdir, reporter)
+        run_folder.write_settings(workdir, config, training.splits, resume)
+    run_folder.compare_processes(config, training.splits)
     position = Position(epoch=0, step=0, best_loss=None, loss_sums=(), seconds=0.0)
     with Checkpoints(workdir) as checkpoints, stop_signals() as stop:
         if resuming:
@@ -90,6 +105,7 @@ def _train(config: TrainConfig, resume: bool, reporter: Reporter, workers: int) 
                 if improved:
                     checkpoints.save("best", state, position)
                 checkpoints.save("latest", state, position)
+                stop.agree()
                 if stop.signum:
                     break
     return Outcome(workdir, position.best_loss, stop.signum)
@@ -116,11 +132,13 @@ def _run_epoch(
         state, position = _run_steps(training, order, epoch, done, count, state, position)
         clock = time.perf_counter()
         dispatch = max(1, min(2 * dispatch, round(DISPATCH_SECONDS * count / (clock - tick))))
+        due = int(clock - saved > training.config.checkpoint_every_seconds)
+        dispatch, due = agreed(dispatch, due)  # the clocks of the processes differ
+        stop.agree()
         done += count
         position = position._replace(seconds=start.seconds + clock - began)
         rate = (done - first) * training.config.optim.batch_size / (clock - began)
         _report(training, epoch, done, position, rate, reporter)
-        due = clock - saved > training.config.checkpoint_every_seconds
         if done < steps and (stop.signum or due):
             checkpoints.save("latest", training.settled(state), position)
             saved = time.perf_counter()

@@ -14,6 +14,7 @@ from flax import linen as nn
 from gnio_jax.config import TrainConfig
 from gnio_jax.data import windows
 from gnio_jax.reporting import Reporter
+from gnio_jax.scaling import devices
 from gnio_jax.training import optimizer as optimizers
 from gnio_jax.training.checkpoint import Run, create_model
 from gnio_jax.training.initial import with_weights
@@ -66,17 +67,17 @@ class WindowTraining(NamedTuple):
     def new_state(self, start: Run | None) -> TrainState:
         window, decay = self.config.data.window, self.config.optim.ema_decay
         state = create_state(self.model, self.optimizer, self.keys.init, window, decay)
-        if start is None:
-            return state
-        state = with_weights(state, start)
-        average = jax.tree.map(jnp.copy, state.params) if decay else None
-        return state._replace(opt_state=self.optimizer.init(state.params), average=average)
+        if start is not None:
+            state = with_weights(state, start)
+            average = jax.tree.map(jnp.copy, state.params) if decay else None
+            state = state._replace(opt_state=self.optimizer.init(state.params), average=average)
+        return devices.everywhere(state)
 
     def describe(self, state: TrainState, workdir: Path, reporter: Reporter) -> None:
         optim, steps = self.config.optim, self.steps_per_epoch
         reporter.line(
             f"{self.config.model.name}: {size_of(state.params):,} parameters on "
-            f"{jax.devices()[0].platform}, {steps} steps of {optim.batch_size} windows an epoch, "
+            f"{devices.described()}, {steps} steps of {optim.batch_size} windows an epoch, "
             f"{optim.epochs} epochs → {workdir}"
         )
         likelihood, uncertainty = self.changes
@@ -165,6 +166,7 @@ def set_up(config: TrainConfig, reporter: Reporter, workers: int = 1) -> WindowT
     stride = config.data.stride
     held_out, validated_with = _windows(config, val, stride, 0, reporter, workers)
     steps_per_epoch = steps_in_epoch(source.visited.shape[0], "windows", config)
+    devices.check_batch(config.optim.batch_size, config.optim.accumulate)
     return WindowTraining(
         config,
         model,
@@ -185,4 +187,4 @@ def _windows(
     sequences = read_split(config, split, reporter, workers)
     source = windows.window_source(sequences, config.data, stride, shift)
     describe_split(config, split, sequences, f"{source.visited.shape[0]:,} windows", reporter)
-    return jax.device_put(source), [sequence.name for sequence in sequences]
+    return devices.everywhere(source), [sequence.name for sequence in sequences]

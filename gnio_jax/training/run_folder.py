@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 from pathlib import Path
+from typing import Any
 
 import yaml
 
@@ -11,6 +13,7 @@ from gnio_jax import config as configuration
 from gnio_jax.config import TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.files import write_text
+from gnio_jax.scaling.processes import is_first, require_same
 
 MAY_CHANGE = ("workdir", "data_root", "init_from", "checkpoint_every_seconds")
 """Settings that a resumed run may change: where things lie, not what is computed."""
@@ -20,9 +23,11 @@ def prepare(config: TrainConfig, resume: bool) -> Path:
     """The work folder of a run that `config` may start or continue; nothing is written.
 
     Raises `InputError` for a folder that holds a run already, and with `resume` for one that holds
-    none, or one with other settings.
+    none, or one with other settings. Of several processes the first one alone sees the folder.
     """
     workdir = configuration.default_workdir(config)
+    if not is_first():
+        return workdir
     kept = workdir / "config.yaml"
     if not resume and kept.exists():
         remedy = "continue it with --resume, or choose another --workdir"
@@ -50,6 +55,8 @@ def write_settings(
 
     Raises `InputError` when the run was begun with other recordings.
     """
+    if not is_first():
+        return
     workdir.mkdir(parents=True, exist_ok=True)
     if not resume:
         configuration.save(workdir / "config.yaml", config)
@@ -58,6 +65,18 @@ def write_settings(
         _refuse_other_recordings(path, splits)
     else:
         write_text(path, yaml.safe_dump(splits, sort_keys=False, allow_unicode=True))
+
+
+def compare_processes(config: TrainConfig, splits: dict[str, list[str]]) -> None:
+    """Raise `InputError` unless all processes have the same settings and recordings: other ones
+    would compute something else, or wait for each other for ever."""
+    settings = {k: v for k, v in dataclasses.asdict(config).items() if k not in MAY_CHANGE}
+    require_same("settings", _digest(settings), "start all with the same options")
+    require_same("recordings", _digest(splits), "give all of them the same data")
+
+
+def _digest(value: Any) -> bytes:
+    return hashlib.sha256(repr(value).encode()).digest()
 
 
 def _refuse_other_recordings(path: Path, splits: dict[str, list[str]]) -> None:

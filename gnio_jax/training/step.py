@@ -17,7 +17,10 @@ from gnio_jax.config import TrainConfig
 from gnio_jax.data.augmentation import augment
 from gnio_jax.data.windows import WindowSource, gather, shift_windows
 from gnio_jax.models import initialise
+from gnio_jax.models.precision import products_in
 from gnio_jax.models.resnet import MOMENTUM
+from gnio_jax.scaling import devices
+from gnio_jax.scaling.devices import kept_everywhere, shared_out
 from gnio_jax.training.losses import Losses, Stage, losses, stage
 from gnio_jax.types import Prediction, Windows
 
@@ -145,7 +148,8 @@ def train_steps(
         progress = _add_step(progress, state.step, loss, gradient)
         step = jnp.add(state.step, 1)
         average = _averaged(state.average, params, step, config.optim.ema_decay)
-        return TrainState(step, params, batch_stats, opt_state, average), progress
+        state = TrainState(step, params, batch_stats, opt_state, average)
+        return kept_everywhere(state), progress
 
     nothing = Progress(
         Losses(*[jnp.float32(0)] * 3),
@@ -163,16 +167,42 @@ def _gradient(
     model: nn.Module,
     config: TrainConfig,
 ) -> tuple[Any, Losses, Any]:
-    """Gradient of the loss of a batch, the losses, and the statistics of batch normalisation."""
+    """Gradient of the loss of a batch, the losses, and the statistics of batch normalisation: of
+    `optim.accumulate` parts of the batch, one after another."""
 
-    def objective(params: Any) -> tuple[jax.Array, tuple[Losses, Any]]:
-        variables = {"params": params, "batch_stats": state.batch_stats}
-        prediction, changed = _apply_training(model, variables, windows, dropout_key)
+    def objective(
+        params: Any, batch_stats: Any, windows: Windows, key: PRNGKeyArray
+    ) -> tuple[jax.Array, tuple[Losses, Any]]:
+        variables = {"params": params, "batch_stats": batch_stats}
+        with products_in(config.model.dtype):
+            prediction, changed = _apply_training(model, variables, windows, key)
         loss = losses(prediction, windows, config.loss, now)
         return loss.total, (loss, changed.get("batch_stats", {}))
 
-    gradient, (loss, batch_stats) = jax.grad(objective, has_aux=True)(state.params)
+    slope, parts = jax.grad(objective, has_aux=True), config.optim.accumulate
+    if parts == 1:
+        found = slope(state.params, state.batch_stats, windows, dropout_key)
+        return found[0], *found[1]
+
+    def add_part(
+        carry: tuple[Any, Losses, Any], part: tuple[Windows, PRNGKeyArray]
+    ) -> tuple[tuple[Any, Losses, Any], None]:
+        gradient, loss, batch_stats = carry
+        more, (more_loss, batch_stats) = slope(state.params, batch_stats, *part)
+        return (*jax.tree.map(jnp.add, (gradient, loss), (more, more_loss)), batch_stats), None
+
+    zeros = jax.tree.map(jnp.zeros_like, state.params), Losses(*[jnp.float32(0)] * 3)
+    each = jax.tree.map(lambda rows: _in_parts(rows, parts), windows)
+    keys = jax.random.split(dropout_key, parts)
+    (*sums, batch_stats), _ = jax.lax.scan(add_part, (*zeros, state.batch_stats), (each, keys))
+    gradient, loss = jax.tree.map(lambda total: total / parts, tuple(sums))
     return gradient, loss, batch_stats
+
+
+def _in_parts(rows: jax.Array, parts: int) -> jax.Array:
+    """Rows of a batch as (parts, rows of a part, ...). Row r goes to part r mod `parts`: a device
+    that has successive rows has the same number of each part."""
+    return rows.reshape(-1, parts, *rows.shape[1:]).swapaxes(0, 1)
 
 
 def _averaged(average: Any, params: Any, step: Int[jax.Array, ""], decay: float) -> Any:
@@ -214,12 +244,11 @@ def draw_windows(
     key: PRNGKeyArray, source: WindowSource, which: Int[jax.Array, "b"], config: TrainConfig
 ) -> tuple[Windows, PRNGKeyArray]:
     """The windows `which`, shifted and augmented by draws from `key`, and the key of the network's
-    dropout."""
+    dropout. Each device cuts its share of them."""
     augment_key, dropout_key, shift_key = jax.random.split(key, 3)
-    which = shift_windows(shift_key, source, which, config.augment.shift_samples)
-    return augment(
-        augment_key, gather(source, which, config.data.window), config.augment
-    ), dropout_key
+    which = shift_windows(shift_key, source, shared_out(which), config.augment.shift_samples)
+    windows = gather(source, shared_out(which), config.data.window)
+    return shared_out(augment(augment_key, windows, config.augment)), dropout_key
 
 
 def normalises(state: TrainState) -> bool:
@@ -281,9 +310,8 @@ def estimate_statistics(
     def statistic(path: tuple, total: jax.Array, before: jax.Array) -> jax.Array:
         return total / (batches * (1 - MOMENTUM)) if path[-1].key in ("mean", "var") else before
 
-    return state._replace(
-        batch_stats=jax.tree_util.tree_map_with_path(statistic, total, state.batch_stats)
-    )
+    estimated = jax.tree_util.tree_map_with_path(statistic, total, state.batch_stats)
+    return kept_everywhere(state._replace(batch_stats=estimated))
 
 
 def gradient_norms(gradient: Any) -> dict[str, Float[jax.Array, ""]]:
@@ -304,9 +332,10 @@ def validate(
     """Mean losses and errors over every window of `source`, without augmentation and in inference
     mode."""
     count = source.visited.shape[0]
-    size = min(config.optim.batch_size, count)
+    # Whole batches, of which each device has the same share: the last one is filled up with windows
+    # of weight zero.
+    size = -(-min(config.optim.batch_size, count) // devices.count()) * devices.count()
     batches = -(-count // size)
-    # The last batch is filled up with windows of weight zero.
     which = source.visited[
         jnp.minimum(jnp.arange(batches * size, dtype=jnp.int32), count - 1)
     ].reshape(batches, size)
@@ -322,7 +351,7 @@ def validate(
         )
 
     def one_batch(which_weight: tuple[jax.Array, jax.Array]) -> Validation:
-        windows = gather(source, which_weight[0], config.data.window)
+        windows = shared_out(gather(source, shared_out(which_weight[0]), config.data.window))
         prediction: Any = model.apply(
             {"params": state.params, "batch_stats": state.batch_stats}, windows.imu
         )

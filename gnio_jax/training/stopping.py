@@ -6,11 +6,21 @@ import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+from gnio_jax.scaling.processes import agreed
+
 
 class Stop:
     """Whether a signal has asked the run to stop."""
 
+    received: int | None = None
+    """What this process has been sent."""
     signum: int | None = None
+    """What one of the processes has been sent, as all of them know since they last agreed."""
+
+    def agree(self) -> None:
+        """Tell the other processes what this one has been sent, and hear it of them."""
+        (signum,) = agreed(self.received or 0)
+        self.signum = signum or None
 
 
 @contextmanager
@@ -19,9 +29,9 @@ def stop_signals() -> Iterator[Stop]:
     stop = Stop()
 
     def note(signum: int, _: object) -> None:
-        if stop.signum == signal.SIGINT == signum:
+        if stop.received == signal.SIGINT == signum:
             raise KeyboardInterrupt
-        stop.signum = signum
+        stop.received = signum
 
     before = {signum: signal.signal(signum, note) for signum in (signal.SIGTERM, signal.SIGINT)}
     try:

@@ -36,6 +36,7 @@ from gnio_jax.filtering import (
 from gnio_jax.filtering.config import YawFrame
 from gnio_jax.filtering.options import FilterSetup
 from gnio_jax.numerics import filled_up, quaternion_from_matrix
+from gnio_jax.scaling.processes import on_host
 from gnio_jax.types import Array
 
 POSITION, GYRO_BIAS = slice(6, 9), slice(9, 12)
@@ -139,7 +140,7 @@ def _run_batch(
         frame = None if isinstance(source, Network) else "given"
         fixed = setup.config, setup.noise, setup.considered, frame
         history = _with_considered(start, gyro, accel, history, *fixed)
-    return jax.device_get(history)
+    return on_host(history)
 
 
 @functools.partial(jax.jit, static_argnames=("config", "frame"))

@@ -1,0 +1,207 @@
+"""Runs in several processes on localhost: they compute what one process computes, they are stopped
+and killed, and go on in another number of processes and devices."""
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.support.tlio_files import write_sequence
+
+ROOT = Path(__file__).parents[2]
+OPTIONS = (
+    "--dataset tlio --data.rate 50 --model.name tiny --optim.epochs 2 --optim.batch-size 16 "
+    "--optim.learning-rate 1e-3 --optim.warmup-epochs 1 --optim.statistics-windows 32"
+).split()
+STEPS = 13
+"""Of an epoch."""
+PATIENCE = 60
+"""Seconds after which a process is given up."""
+BRIEF = ("--patience", "12")
+LIMIT = 300
+"""Seconds after which a test gives up; the machine may be busy."""
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    """A TLIO folder of three short walks."""
+    root = tmp_path_factory.mktemp("tlio")
+    for name in "abc":
+        write_sequence(root / name)
+    (root / "train_list.txt").write_text("a\nb\n")
+    for split in ("val", "test"):
+        (root / f"{split}_list.txt").write_text("c\n")
+    return root
+
+
+@pytest.fixture(scope="module")
+def environment(tmp_path_factory):
+    """All share what they compile."""
+    found = {**os.environ, "JAX_PLATFORMS": "cpu"}
+    found.setdefault("JAX_COMPILATION_CACHE_DIR", str(tmp_path_factory.mktemp("cache")))
+    return found
+
+
+class Group:
+    """Processes that train together."""
+
+    def __init__(self, recording, environment, workdir, processes, devices, *more, **special):
+        """special: what process k does otherwise, as `send={k: (signal, step)}` and
+        `late={k: seconds}`; `started`: how many of them there are in truth."""
+        self.began = time.monotonic()
+        with socket.socket() as free:
+            free.bind(("localhost", 0))
+            port = free.getsockname()[1]
+        meeting = ["--coordinator", f"localhost:{port}", "--processes", str(processes)]
+        meeting += ["--patience", str(PATIENCE)]
+        self.processes = []
+        for k in range(special.get("started", processes)):
+            time.sleep(special.get("late", {}).get(k, 0))
+            name, step = special.get("send", {}).get(k, ("never", 0))
+            command = [sys.executable, "-m", "tests.support.training_process", name, str(step)]
+            command += [*OPTIONS, "--data-root", str(recording), "--workdir", str(workdir)]
+            command += [*meeting, "--process-id", str(k)] if processes > 1 else []
+            command += ["--devices", str(devices), *more]
+            self.processes.append(
+                subprocess.Popen(
+                    command,
+                    cwd=ROOT,
+                    env=environment,
+                    stdout=subprocess.PIPE,
+                    stderr=subprocess.PIPE,
+                    text=True,
+                )
+            )
+
+    def end(self):
+        """(status, lines on stderr) of each process."""
+        found = []
+        try:
+            for process in self.processes:
+                _, errors = process.communicate(timeout=LIMIT)
+                found.append((process.returncode, errors.splitlines()))
+        finally:
+            for process in self.processes:
+                process.kill()
+        return found
+
+
+@pytest.fixture(scope="module")
+def run(recording, environment):
+    def start(*arguments, **special):
+        return Group(recording, environment, *arguments, **special)
+
+    return start
+
+
+def rows(workdir):
+    return [json.loads(line) for line in (workdir / "metrics.jsonl").read_text().splitlines()]
+
+
+def assert_same_run(workdir, other):
+    """The losses of both, and what they have learnt."""
+    ours, theirs = rows(workdir), rows(other)
+    assert [row["step"] for row in ours] == [row["step"] for row in theirs]
+    for name in ("loss", "val_loss", "val_mse", "val_nll"):
+        np.testing.assert_allclose(
+            [row[name] for row in ours], [row[name] for row in theirs], rtol=1e-4
+        )
+
+
+@pytest.fixture(scope="module")
+def alone(run, tmp_path_factory):
+    """One process with one device, uninterrupted."""
+    workdir = tmp_path_factory.mktemp("alone") / "run"
+    (end,) = run(workdir, 1, 1).end()
+    assert end[0] == 0, end
+    return workdir
+
+
+@pytest.mark.parametrize("processes, devices, late", [(1, 8, {}), (2, 4, {1: 20})])
+def test_devices_and_processes_change_nothing_but_rounding(
+    run, alone, tmp_path, processes, devices, late
+):
+    """Also where a process starts 20 s late."""
+    ends = run(tmp_path / "run", processes, devices, late=late).end()
+    assert [status for status, _ in ends] == [0] * processes, ends
+    assert all(not lines for _, lines in ends[1:]), "the first process alone speaks"
+    assert_same_run(tmp_path / "run", alone)
+
+
+def test_a_run_goes_on_in_other_numbers_of_processes_and_devices(run, alone, tmp_path):
+    """4 × 2 until one of them is sent SIGTERM, 2 × 1 until one of them is killed, then 1 × 1."""
+    workdir = tmp_path / "run"
+    every = ("--checkpoint-every-seconds", "0")
+    stopped = run(workdir, 4, 2, send={2: ("SIGTERM", STEPS + 2)}).end()
+    assert [status for status, _ in stopped] == [128 + signal.SIGTERM] * 4, stopped
+    first = latest(workdir)
+    assert first == STEPS + 2
+
+    group = run(workdir, 2, 1, *every, *BRIEF, "--resume", send={1: ("SIGKILL", first + 2)})
+    survivor, killed = group.end()
+    assert killed[0] == -signal.SIGKILL
+    assert survivor[0] == 1 and "start all of them again with --resume" in survivor[1][-1], survivor
+    assert not any("Check failure" in line or "Traceback" in line for line in survivor[1])
+    second = latest(workdir)
+    assert first < second < 2 * STEPS  # saved after every step
+
+    # What a process leaves that is killed while it saves.
+    (workdir / "checkpoints" / "latest" / f"{second + 1}.orbax-checkpoint-tmp").mkdir()
+    (end,) = run(workdir, 1, 1, *every, "--resume").end()
+    assert end[0] == 0, end
+    assert f"resuming at step {second}" in end[1]
+    assert_same_run(workdir, alone)
+
+
+def latest(workdir):
+    (step,) = (workdir / "checkpoints" / "latest").glob("[0-9]*")
+    return int(step.name)
+
+
+def test_a_folder_that_cannot_be_written_ends_all(run, tmp_path):
+    """Also those that write nothing."""
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "checkpoints").write_text("in the way")
+    ends = run(tmp_path / "run", 2, 1).end()
+    assert [status for status, _ in ends] == [2, 2], ends
+    assert ends[1][1] == ["process 0: could not go on; its own line says why"]
+
+
+def test_a_process_that_never_comes_is_given_up(run, tmp_path):
+    """One that waits for another is told so in one line."""
+    group = run(tmp_path / "run", 2, 1, *BRIEF, started=1)
+    ((status, lines),) = group.end()
+    assert status == 2
+    assert len(lines) == 1 and "did not all meet within 12 s" in lines[0], lines
+    assert time.monotonic() - group.began < LIMIT
+    assert not (tmp_path / "run").exists()
+
+
+def test_processes_share_sequences_and_each_has_all_results(environment, tmp_path):
+    """Four devices in two processes, and five sequences: in order, and the same ones."""
+    with socket.socket() as free:
+        free.bind(("localhost", 0))
+        coordinator = f"localhost:{free.getsockname()[1]}"
+    module = [sys.executable, "-m", "tests.support.sequences_process"]
+    processes = [
+        subprocess.Popen(
+            [*module, coordinator, "2", str(k), str(tmp_path / f"{k}.npz")],
+            cwd=ROOT,
+            env=environment,
+        )
+        for k in range(2)
+    ]
+    assert [process.wait(LIMIT) for process in processes] == [0, 0]
+    steps = np.random.default_rng(0).normal(size=(5, 7, 3)).astype(np.float32)
+    for k in range(2):
+        found = np.load(tmp_path / f"{k}.npz")
+        np.testing.assert_allclose(found["path"], 2 * np.cumsum(steps, axis=1), rtol=1e-5)
+        np.testing.assert_array_equal(found["largest"], steps.max(axis=(1, 2)))
+        np.testing.assert_array_equal(found["one"], found["path"][:1])
