@@ -16,7 +16,6 @@ from gnio_jax.commands import evaluate
 from gnio_jax.commands.train import TrainOptions, defaults
 from gnio_jax.config import (
     DataConfig,
-    EvaluateConfig,
     FilterOptions,
     ModelConfig,
     OptimConfig,
@@ -193,7 +192,7 @@ def test_evaluation_takes_what_the_filter_has_learnt(finished, capsys):
     assert learnt_values["gyro_density"] != OPTIONS.gyro_density
     # The latest checkpoint's are the defaults where that is asked for.
     latest = checkpoint.load_run(finished, "latest").config.filter
-    asked = EvaluateConfig(workdir=str(finished), checkpoint="latest")
+    asked = evaluate.EvaluateOptions(workdir=str(finished), checkpoint="latest")
     assert evaluate.defaults(asked).filter == latest
 
 
