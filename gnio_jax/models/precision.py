@@ -1,7 +1,8 @@
 """Matrix products and convolutions in bfloat16; everything else stays float32.
 
 The factors of a product are rounded to bfloat16, and so are those of the products of its gradient.
-Sums and results are float32. bfloat16 has the range of float32, so that losses need no scaling.
+Results are float32; those of the gradient's products are rounded to bfloat16 first. bfloat16 has
+the range of float32, so that losses need no scaling.
 """
 
 from __future__ import annotations
