@@ -23,13 +23,12 @@ from gnio_jax.filtering import (
     repeat_odometry,
     sensitivity,
 )
+from gnio_jax.filtering.history import POSITION
 from gnio_jax.filtering.options import considered_std, filter_setup
 from gnio_jax.filtering.unconstrained import natural, with_numbers
 from gnio_jax.training.filter_losses import gaussian_nll, normalised_squares
 from gnio_jax.types import Array
 
-POSITION = slice(6, 9)
-"""Of the core error θ, v, p, b_g, b_a."""
 TOGETHER_SECONDS = 10.0
 """Errors of the position this far apart count as independent beside the prior (ours)."""
 

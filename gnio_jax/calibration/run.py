@@ -107,7 +107,8 @@ def calibrate(
     )
     progress("considering", 0.0)
     windows, options = run.config.data, found.options
-    positions = filtered_positions(walks, _true_positions(prepared, walks), windows, options)
+    truth = _true_positions(prepared, windows.stride)
+    positions = filtered_positions(walks, truth, windows, options)
     considered = fit_considered(positions, windows.stride_seconds, options)
     progress("considering", 1.0)
     calibration = Calibration(run.config.filter, found, considered, len(prepared), folder)
@@ -172,10 +173,10 @@ def _walks(prepared: list[Prepared], estimates: list[Estimate], stride: int) -> 
     return Walks(*(np.stack(column) for column in zip(*rows, strict=True)))
 
 
-def _true_positions(prepared: list[Prepared], walks: Walks) -> Float[np.ndarray, "w k 3"]:
-    """At the ends of the walks' strides, m; NaN where the reference is not trusted."""
-    rows = walks.displacement.shape[1]
-    stride = walks.gyro.shape[1] // rows
+def _true_positions(prepared: list[Prepared], stride: int) -> Float[np.ndarray, "w k 3"]:
+    """At the ends of the strides, m, filled up like the walks; NaN where the reference is not
+    trusted."""
+    rows = max(each.strides(stride) for each in prepared)
     return np.stack(
         [filled_up(each.reference(stride).position[1:], rows, np.nan) for each in prepared]
     )

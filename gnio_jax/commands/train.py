@@ -62,16 +62,11 @@ def defaults(options: TrainOptions) -> TrainOptions:
     """
     kept = configuration.default_workdir(options) / "config.yaml"
     resumed = configuration.load(kept) if options.resume and kept.exists() else None
-    if options.config is None:
-        found = resumed or TrainConfig()
-        return _with(found, found.filter if resumed else _filter_to_begin_with(options, found))
-    found = configuration.load(options.config)
+    named = options.config
+    found = configuration.load(named) if named else resumed or TrainConfig()
     own = resumed.filter if resumed else _filter_to_begin_with(options, found)
-    return TrainOptions(**vars(configuration.load(options.config, TrainConfig(filter=own))))
-
-
-def _with(config: TrainConfig, filter_options: FilterOptions) -> TrainOptions:
-    return TrainOptions(**vars(dataclasses.replace(config, filter=filter_options)))
+    base = dataclasses.replace(TrainConfig() if named else found, filter=own)
+    return TrainOptions(**vars(configuration.load(named, base) if named else base))
 
 
 def _filter_to_begin_with(options: TrainOptions, config: TrainConfig) -> FilterOptions:

@@ -15,6 +15,9 @@ from gnio_jax.filtering.state import Mean
 from gnio_jax.filtering.zero_velocity import RestUpdate
 from gnio_jax.types import Array
 
+VELOCITY, POSITION, GYRO_BIAS = slice(3, 6), slice(6, 9), slice(9, 12)
+"""Where these lie in the history's covariances, which are of θ, v, p, b_g, b_a."""
+
 
 class FilterHistory(NamedTuple):
     """The filter after each of K clone intervals.

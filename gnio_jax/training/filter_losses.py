@@ -17,6 +17,7 @@ from jaxtyping import Float
 from gnio_jax import geometry
 from gnio_jax.config import ThroughFilter
 from gnio_jax.filtering import FilterConfig, FilterHistory
+from gnio_jax.filtering.history import POSITION, VELOCITY
 from gnio_jax.training.pieces import Path
 from gnio_jax.types import Array
 
@@ -25,8 +26,7 @@ HORIZON_SECONDS = (1.0, 5.0, 10.0, 30.0, 60.0)
 DISTANCE_FLOOR = 1.0
 """Added in squares to the distance that an error is divided by, m: standing still is no singular
 point (ours)."""
-VELOCITY_POSITION = slice(3, 9)
-"""Of the core error θ, v, p, b_g, b_a."""
+VELOCITY_POSITION = slice(VELOCITY.start, POSITION.stop)
 
 
 class FilterLosses(NamedTuple):

@@ -25,6 +25,7 @@ from gnio_jax.filtering import (
     over_sequences,
     run_odometry,
 )
+from gnio_jax.filtering.history import POSITION
 from gnio_jax.filtering.options import filter_setup, filter_with
 from gnio_jax.filtering.unconstrained import natural
 from gnio_jax.training import learnt as learning
@@ -44,8 +45,6 @@ from gnio_jax.training.step import Progress, TrainState
 
 CHECKPOINT_EVERY = 20
 """Clone intervals between the states that the backward pass keeps."""
-POSITION = slice(6, 9)
-"""Of the core error θ, v, p, b_g, b_a."""
 
 
 class Sums(NamedTuple):

@@ -12,6 +12,7 @@ from gnio_jax import evaluation
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import Network, Setup, metrics
 from gnio_jax.evaluation.estimators.integrated import mean_over_windows
+from gnio_jax.types import Prediction
 from tests.support.estimators import (
     CONFIG,
     INTEGRATE,
@@ -118,25 +119,42 @@ def test_true_displacements_lack_nothing_that_was_calibrated(walks):
         np.testing.assert_array_equal(found.trajectory.position, plain.trajectory.position)
 
 
-def test_what_is_considered_widens_the_covariance_and_moves_nothing(walks):
+def says_the_same(_, windows):
+    """A network whose displacement does not depend on its windows."""
+    told, rows = jnp.array([[0.9, 0.2, 0.02]], jnp.float32), (len(windows), 3)
+    return Prediction(jnp.broadcast_to(told, rows), jnp.full(rows, -2.0, jnp.float32), {})
+
+
+def told_the_same(prepared, config, options):
+    return evaluation.estimate(prepared, Network(says_the_same, None), config, options)
+
+
+@pytest.mark.parametrize("run", [evaluation.perfect_displacements, told_the_same])
+def test_what_is_considered_widens_the_covariance_and_moves_nothing(walks, run):
     """By ∂p/∂b_g of the filter, here of a run whose gyro is off by a little."""
     prepared, _ = evaluation.prepare(walks[:1], CONFIG, Setup(gyro_bias="reference"))
     options = dataclasses.replace(OPTIONS, considered_gyro_bias_std=1e-3)
-    (plain,), (found,) = (
-        evaluation.perfect_displacements(prepared, CONFIG, each) for each in (OPTIONS, options)
-    )
+    (plain,), (found,) = (run(prepared, CONFIG, each) for each in (OPTIONS, options))
     np.testing.assert_array_equal(found.trajectory.position, plain.trajectory.position)
     moved = []
     for axis in 1e-5 * np.eye(3):
-        off = [each._replace(gyro_bias=each.gyro_bias + axis) for each in prepared]
-        (shifted,) = evaluation.perfect_displacements(off, CONFIG, OPTIONS)
-        moved.append((shifted.trajectory.position - plain.trajectory.position) / 1e-5)
+        ahead, behind = (
+            run(
+                [each._replace(gyro_bias=each.gyro_bias + off) for each in prepared],
+                CONFIG,
+                OPTIONS,
+            )
+            for off in (axis, -axis)
+        )
+        moved.append((ahead[0].trajectory.position - behind[0].trajectory.position) / 2e-5)
     added = 1e-6 * sum(m[:, :, None] * m[:, None, :] for m in moved)
     wanted = plain.position_covariance + added
     assert added[-1].max() > 1e-6
     np.testing.assert_allclose(found.position_covariance, wanted, rtol=1e-2, atol=1e-7)
     std = np.sqrt(np.diagonal(wanted, axis1=1, axis2=2))
     np.testing.assert_allclose(found.std[:, 6:9], std, rtol=1e-2)
+    at_start = np.hypot(plain.std[0, 9:12], 1e-3)  # a constant bias is there from the start
+    np.testing.assert_allclose(found.std[0, 9:12], at_start, rtol=1e-12)
 
 
 def test_integration_is_neither_ahead_nor_behind(clean):

@@ -1,6 +1,7 @@
 """Errors that are considered and not estimated: their sensitivity against filters that have them,
 and whether the covariance with them is that of the errors of simulated walks."""
 
+import dataclasses
 import functools
 
 import jax
@@ -79,6 +80,21 @@ def test_the_sensitivity_is_the_change_of_the_filter():
         np.testing.assert_allclose(
             found[0, :, :, entry] / (size + 1e-6), wanted / (size + 1e-6), atol=1e-5
         )
+
+
+def test_a_gradient_that_is_cut_leaves_the_sensitivity_whole():
+    runs, std = walks()
+    pose = runs.rotation0[0], runs.velocity0[0], runs.position0[0]
+    state = filtering.initial_state(CONFIG, *pose, std=START)
+    signals = runs.gyro[0, : 20 * N], runs.accel[0, : 20 * N]
+    told = runs.displacement[0, :20], std[0, :20]
+    _, history = filtering.repeat_odometry(state, *signals, *told, CONFIG, NOISE)
+    cut = dataclasses.replace(CONFIG, truncate_every=5)
+    whole, found = (
+        filtering.sensitivity(state, *signals, history, each, NOISE) for each in (CONFIG, cut)
+    )
+    assert np.abs(whole).max() > 0
+    np.testing.assert_array_equal(found, whole)
 
 
 def test_the_covariance_with_them_is_that_of_the_errors():

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.support.tlio_files import write_sequence
+from tests.support.tlio_files import write_splits
 
 ROOT = Path(__file__).parents[2]
 OPTIONS = (
@@ -32,13 +32,7 @@ LIMIT = 300
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory):
     """A TLIO folder of three short walks."""
-    root = tmp_path_factory.mktemp("tlio")
-    for name in "abc":
-        write_sequence(root / name)
-    (root / "train_list.txt").write_text("a\nb\n")
-    for split in ("val", "test"):
-        (root / f"{split}_list.txt").write_text("c\n")
-    return root
+    return write_splits(tmp_path_factory.mktemp("tlio"))
 
 
 @pytest.fixture(scope="module")

@@ -77,3 +77,13 @@ def spoil(name, rows, value):
         parts[name][rows] = value
 
     return change
+
+
+def write_splits(root):
+    """A folder of three short walks: two to train with, one for validation and test."""
+    for name in "abc":
+        write_sequence(root / name)
+    (root / "train_list.txt").write_text("a\nb\n")
+    for split in ("val", "test"):
+        (root / f"{split}_list.txt").write_text("c\n")
+    return root

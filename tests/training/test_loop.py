@@ -24,7 +24,7 @@ from gnio_jax.errors import InputError
 from gnio_jax.training import checkpoint, loop, on_windows, optimizer, step
 from gnio_jax.training.losses import Losses
 from tests.support.runs import shared_config, shared_programs
-from tests.support.tlio_files import write_sequence
+from tests.support.tlio_files import write_splits
 
 ROOT = Path(__file__).parents[2]
 
@@ -32,13 +32,7 @@ ROOT = Path(__file__).parents[2]
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory):
     """A TLIO folder of three short walks."""
-    root = tmp_path_factory.mktemp("tlio")
-    for name in "abc":
-        write_sequence(root / name)
-    (root / "train_list.txt").write_text("a\nb\n")
-    for split in ("val", "test"):
-        (root / f"{split}_list.txt").write_text("c\n")
-    return root
+    return write_splits(tmp_path_factory.mktemp("tlio"))
 
 
 def tiny(recording, workdir, **changes):

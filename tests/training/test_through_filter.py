@@ -38,7 +38,7 @@ from gnio_jax.training import (
 from tests.support import drawn_run
 from tests.support.compiling import quick
 from tests.support.tiny_network import Tiny
-from tests.support.tlio_files import SPEED, TURN, write_sequence
+from tests.support.tlio_files import SPEED, TURN, write_splits
 
 LEARN = ("noise", "measurement", "start", "head")
 WINDOW = 0.4
@@ -77,12 +77,7 @@ def registered():
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory):
     """A TLIO folder of three walks round a circle, and a run to start from."""
-    root = tmp_path_factory.mktemp("tlio")
-    for name in "abc":
-        write_sequence(root / name)
-    (root / "train_list.txt").write_text("a\nb\n")
-    for split in ("val", "test"):
-        (root / f"{split}_list.txt").write_text("c\n")
+    root = write_splits(tmp_path_factory.mktemp("tlio"))
     config = TrainConfig(
         data=DataConfig(rate=50.0, window_seconds=WINDOW), model=ModelConfig(name="tiny")
     )

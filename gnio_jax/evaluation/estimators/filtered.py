@@ -34,13 +34,12 @@ from gnio_jax.filtering import (
     sensitivity,
 )
 from gnio_jax.filtering.config import YawFrame
+from gnio_jax.filtering.history import GYRO_BIAS, POSITION
 from gnio_jax.filtering.options import FilterSetup
 from gnio_jax.numerics import filled_up, quaternion_from_matrix
 from gnio_jax.scaling.processes import on_host
 from gnio_jax.types import Array
 
-POSITION, GYRO_BIAS = slice(6, 9), slice(9, 12)
-"""Of the core error θ, v, p, b_g, b_a."""
 SHORTEST = 16
 """No batch is padded to less than about this many strides."""
 
