@@ -16,7 +16,7 @@ from gnio_jax.data import windows
 from gnio_jax.reporting import Reporter
 from gnio_jax.scaling import devices
 from gnio_jax.training import optimizer as optimizers
-from gnio_jax.training.checkpoint import Run, create_model
+from gnio_jax.training.checkpoint import Run, create_model, create_trained_model
 from gnio_jax.training.initial import with_weights
 from gnio_jax.training.kinds import (
     Keys,
@@ -49,6 +49,9 @@ class WindowTraining(NamedTuple):
 
     config: TrainConfig
     model: nn.Module
+    """The network as it is validated."""
+    trained_model: nn.Module
+    """The same network, with products of `config.model.dtype`."""
     optimizer: optax.GradientTransformationExtraArgs
     schedule: optax.Schedule
     source: windows.WindowSource
@@ -110,7 +113,7 @@ class WindowTraining(NamedTuple):
             jnp.int32(count),
             jnp.float32(learning_rate_factor),
             self.keys.step,
-            model=self.model,
+            model=self.trained_model,
             optimizer=self.optimizer,
             config=self.config,
         )
@@ -170,6 +173,7 @@ def set_up(config: TrainConfig, reporter: Reporter, workers: int = 1) -> WindowT
     return WindowTraining(
         config,
         model,
+        create_trained_model(config),
         optimizers.create(config.optim, config.loss, steps_per_epoch),
         optimizers.schedule(config.optim, steps_per_epoch),
         source,
