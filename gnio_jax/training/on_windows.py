@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -62,6 +62,10 @@ class WindowTraining(NamedTuple):
     steps_per_epoch: int
     keys: Keys
     unit: str = "windows"
+
+    @property
+    def recordings(self) -> Any:
+        return self.source, self.held_out
 
     @property
     def changes(self) -> tuple[int, ...]:
@@ -161,7 +165,8 @@ def set_up(config: TrainConfig, reporter: Reporter, workers: int = 1) -> WindowT
     Raises `InputError` for options that the network does not have, missing data, and a batch that
     is larger than the split. `workers` processes read recordings that are slow to read.
     """
-    model = create_model(config)  # a mistake in its options should not wait for the data
+    model = create_model(config)  # a mistake in the options should not wait for the data
+    devices.check_batch(config.optim.batch_size, config.optim.accumulate)
     train, val = config.data.train_split, config.data.val_split
     reporter.line(f"reading {config.dataset}: {train} and {val}")
     stride, shift = config.data.train_stride, config.augment.shift_samples
@@ -169,7 +174,6 @@ def set_up(config: TrainConfig, reporter: Reporter, workers: int = 1) -> WindowT
     stride = config.data.stride
     held_out, validated_with = _windows(config, val, stride, 0, reporter, workers)
     steps_per_epoch = steps_in_epoch(source.visited.shape[0], "windows", config)
-    devices.check_batch(config.optim.batch_size, config.optim.accumulate)
     return WindowTraining(
         config,
         model,
