@@ -27,6 +27,7 @@ ROOMS = {
 
 LIBRARIES = {
     "flax": {"models", "training", "evaluation", "interop"},
+    "grain": {"training.supply"},
     "matplotlib": {"data", "evaluation", "tables"},
     "optax": {"training"},
     "orbax": {"training.checkpoint"},
