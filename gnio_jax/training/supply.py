@@ -55,9 +55,7 @@ class Supply(Protocol):
         """The windows of an epoch, in this order."""
         ...
 
-    def windows(
-        self, source: WindowSource, order: Int[Array, "m"]
-    ) -> tuple[WindowSource, Int[jax.Array, "m"]]:
+    def windows(self, source: WindowSource, order: Int[Array, "m"]) -> tuple[WindowSource, Any]:
         """A source on the device that has these windows, and their order in it."""
         ...
 
@@ -102,9 +100,7 @@ class OnDevice(NamedTuple):
     def epoch(self, source: WindowSource, order: Int[Array, "m"]) -> Epoch:
         return _EpochOnDevice(source, order)
 
-    def windows(
-        self, source: WindowSource, order: Int[Array, "m"]
-    ) -> tuple[WindowSource, Int[Array, "m"]]:
+    def windows(self, source: WindowSource, order: Int[Array, "m"]) -> tuple[WindowSource, Any]:
         return source, order
 
     def sources(self, source: WindowSource) -> Iterator[WindowSource]:
@@ -135,9 +131,7 @@ class FromHost(NamedTuple):
     def epoch(self, source: WindowSource, order: Int[Array, "m"]) -> Epoch:
         return _EpochFromHost(source, np.asarray(order), self)
 
-    def windows(
-        self, source: WindowSource, order: Int[Array, "m"]
-    ) -> tuple[WindowSource, Int[Array, "m"]]:
+    def windows(self, source: WindowSource, order: Int[Array, "m"]) -> tuple[WindowSource, Any]:
         part = excerpt(source, np.asarray(order), self.length, self.shift)
         on_device = devices.everywhere(part)
         return on_device, on_device.visited
@@ -179,7 +173,7 @@ class _EpochFromHost:
         filled = np.resize(order, -(-len(order) // count) * count)
         self._excerpts = _Excerpts(source, filled, count, supply)
         self._ahead: Iterator[WindowSource] = iter(())
-        self._number, self._source = -1, None
+        self._last: tuple[int, WindowSource] | None = None
 
     def parts(self, first: int, count: int) -> Iterator[Part]:
         while count:
@@ -190,12 +184,15 @@ class _EpochFromHost:
             first, count = first + taken, count - taken
 
     def _part(self, number: int) -> WindowSource:
-        if number != self._number:
-            if self._source is None or number != self._number + 1:
-                self._ahead = _read_ahead(self._excerpts, number)
-            self._source = devices.everywhere(next(self._ahead))
-            self._number = number
-        return self._source
+        """The part of that number: the last one again, the next one, or any."""
+        last, source = self._last or (None, None)
+        if source is not None and last == number:
+            return source
+        if last is None or number != last + 1:
+            self._ahead = _read_ahead(self._excerpts, number)
+        source = devices.everywhere(next(self._ahead))
+        self._last = number, source
+        return source
 
 
 def _read_ahead(excerpts: _Excerpts, first: int) -> Iterator[Any]:
