@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
-from typing import Any
+from typing import Any, get_args
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +17,7 @@ from gnio_jax.models.deepils import DeepILS
 from gnio_jax.models.equivariance import CanonicalFrame, FourHeadings
 from gnio_jax.models.gnio import GNIO
 from gnio_jax.models.imot import IMoT, IMoTText
+from gnio_jax.models.precision import Dtype
 from gnio_jax.models.ronin import RoNINResNet
 from gnio_jax.models.tlio import TLIO
 
@@ -41,13 +42,15 @@ def names() -> list[str]:
     return sorted(_MODELS)
 
 
-def create(name: str, equivariance: str = "none", **options: object) -> nn.Module:
+def create(
+    name: str, equivariance: str = "none", dtype: str = "float32", **options: object
+) -> nn.Module:
     """The network `name` with its options set; its `apply(variables, windows)` returns a
     `Prediction`.
 
-    `equivariance` is "none", "four_headings" or "canonical_frame" (`models.equivariance`). Raises
-    `InputError` for an unknown name or option, naming the known ones, or options that do not fit
-    together.
+    `equivariance` is "none", "four_headings" or "canonical_frame" (`models.equivariance`), `dtype`
+    the type of the factors of its products (`models.precision`). Raises `InputError` for an unknown
+    name or option, naming the known ones, or options that do not fit together.
     """
     if name not in _MODELS:
         raise InputError(f"model '{name}'", "unknown", f"known models: {', '.join(names())}")
@@ -69,11 +72,14 @@ def create(name: str, equivariance: str = "none", **options: object) -> nn.Modul
         known = ", ".join(["none", *_EQUIVARIANT])
         problem = f"unknown equivariance '{equivariance}'"
         raise InputError(f"model '{name}'", problem, f"known ones: {known}")
+    if dtype not in get_args(Dtype):
+        known = ", ".join(get_args(Dtype))
+        raise InputError(f"model '{name}'", f"unknown dtype '{dtype}'", f"known ones: {known}")
     try:
-        network = _MODELS[name](**options)
+        network = _MODELS[name](dtype=dtype, **options)
     except ValueError as error:
         raise InputError(f"model '{name}'", str(error)) from None
-    return network if equivariance == "none" else _EQUIVARIANT[equivariance](network)
+    return network if equivariance == "none" else _EQUIVARIANT[equivariance](network, dtype)
 
 
 def initialise(model: nn.Module, key: PRNGKeyArray, window: int = 200) -> Any:
