@@ -9,6 +9,7 @@ types is not needed.
 from __future__ import annotations
 
 import importlib
+import os
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -20,6 +21,8 @@ from gnio_jax.errors import InputError
 
 LARGEST_CHUNK = 1 << 30
 """Bytes to which a chunk of an MCAP may unpack; recorders cut them at some MiB (ours)."""
+_MCAP = b"\x89MCAP0\r\n"
+"""First and last bytes of a whole MCAP (mcap.dev/spec)."""
 KINDS = {"rosbag1": "a ROS 1 bag", "rosbag2": "a ROS 2 bag", "mcap": "an MCAP"}
 
 
@@ -94,10 +97,15 @@ def _rosbag(path: Path, kind: str, stack: ExitStack) -> Bag:
 def _mcap(path: Path, stack: ExitStack) -> Bag:
     from mcap.reader import make_reader
 
-    reader = make_reader(stack.enter_context(path.open("rb")), validate_crcs=True)
+    file = stack.enter_context(path.open("rb"))
+    file.seek(-min(len(_MCAP), path.stat().st_size), os.SEEK_END)
+    if file.read() != _MCAP:
+        raise InputError(path, "is cut short, its end is missing", "mend it with mcap recover")
+    file.seek(0)
+    reader = make_reader(file, validate_crcs=True)
     summary = reader.get_summary()
     if summary is None or summary.statistics is None:
-        raise InputError(path, "has no summary, it may be cut short", "mend it: mcap recover")
+        raise InputError(path, "has no summary of its topics", "write one with mcap recover")
     if any(chunk.uncompressed_size > LARGEST_CHUNK for chunk in summary.chunk_indexes):
         raise InputError(path, "holds a chunk that unpacks to gigabytes", "record it anew")
     counts = summary.statistics.channel_message_counts

@@ -24,7 +24,7 @@ import warnings
 import zipfile
 from collections.abc import Iterable, Sequence
 from pathlib import Path, PurePosixPath
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -118,7 +118,7 @@ def _of_archive(path: Path) -> list[_Table]:
     return tables
 
 
-def _of_workbook(path: Path, engine: str) -> list[_Table]:
+def _of_workbook(path: Path, engine: Literal["openpyxl", "xlrd"]) -> list[_Table]:
     try:
         importlib.import_module(engine)
     except ImportError:

@@ -16,7 +16,7 @@ import numpy as np
 import pandas as pd
 from scipy.spatial.transform import Rotation
 
-from gnio_jax.data.importing.bags import Bag, Message, Topic, listed, opened
+from gnio_jax.data.importing.bags import Bag, Topic, listed, opened
 from gnio_jax.data.importing.reference import poses_of
 from gnio_jax.data.importing.source import Source, Track, Units
 from gnio_jax.data.importing.streams import SensorFile
@@ -100,16 +100,14 @@ def read_bag(
         imu = _imu_topic(bag, imu_topic)
         reference, child, notes = _reference_topic(bag, reference_topic)
         static = [topic.name for topic in bag.topics if topic.name.endswith("tf_static")]
-        names = {imu.name, *static, *([reference.name] if reference else [])}
-        messages = list(bag.messages(names))
-    samples = _Samples.of([one for one in messages if one.topic == imu.name], imu, path)
-    notes.insert(0, f"{path.name}: IMU {imu.name} ({imu.count} messages), {samples.clock}")
+        found = _collected(bag, imu.name, reference, static)
+    samples = _samples(found, imu, path)
+    clock = "headers" if samples.headers else "bag: its headers have no time"
+    notes.insert(0, f"{path.name}: IMU {imu.name} ({imu.count} messages), stamped by its {clock}")
     track = None
     if reference is not None:
-        found = [one for one in messages if one.topic == reference.name]
-        mounted = _mounting([one for one in messages if one.topic in static])
         try:
-            track = _track(found, reference, child, samples, mounted, path, notes)
+            track = _track(found, reference.name, child, samples, path, notes)
             track = track._replace(named=reference_topic is not None)
         except InputError as error:
             if reference_topic is not None:
@@ -172,7 +170,42 @@ def _reference_topic(bag: Bag, name: str | None) -> tuple[Topic | None, str, lis
     return None, "", [note]
 
 
-# --- samples
+# --- messages
+
+
+class _Collected(NamedTuple):
+    """What is kept of a bag: numbers, since decoded messages take a kilobyte each."""
+
+    imu: list[tuple[int, int, tuple[float, ...]]]
+    """Stamp of the header and of the bag, ns; gyro rad/s and accel of each sample."""
+    first: list[Any]
+    """The first message of the IMU, if there is one."""
+    poses: list[tuple[int, _Pose]]
+    """Stamp of the bag, ns, and pose of each pose of the reference."""
+    mounted: dict[tuple[str, str], SensorPose]
+    """(parent, child) -> the child in the parent, of static transforms."""
+
+
+def _collected(bag: Bag, imu: str, reference: Topic | None, static: list[str]) -> _Collected:
+    found = _Collected([], [], [], {})
+    names = {imu, *static, *([reference.name] if reference else [])}
+    for message in bag.messages(names):
+        content = message.content
+        if message.topic == imu:
+            if not found.first:
+                found.first.append(content)
+            found.imu.append((_stamp(content.header), message.log_time, _sample(content)))
+        if reference is not None and message.topic == reference.name:
+            poses = _POSES[reference.type](content)
+            found.poses.extend((message.log_time, pose) for pose in poses)
+        if message.topic in static:
+            found.mounted.update(_mounting(content))
+    return found
+
+
+def _sample(message: Any) -> tuple[float, ...]:
+    rate, force = message.angular_velocity, message.linear_acceleration
+    return rate.x, rate.y, rate.z, force.x, force.y, force.z
 
 
 class _Samples(NamedTuple):
@@ -183,69 +216,51 @@ class _Samples(NamedTuple):
     headers: bool
     """Stamped by its headers."""
 
-    @property
-    def clock(self) -> str:
-        return f"stamped by its {'headers' if self.headers else 'bag: its headers have no time'}"
 
-    @classmethod
-    def of(cls, messages: list[Message], topic: Topic, path: Path) -> _Samples:
-        if not messages:
-            raise InputError(path, f"topic {topic.name} has no messages", "record it anew")
-        first = messages[0].content
-        for name, covariance in (
-            ("gyro", first.angular_velocity_covariance),
-            ("accel", first.linear_acceleration_covariance),
-        ):
-            if covariance[0] == -1.0:
-                raise InputError(
-                    path, f"topic {topic.name} says that it has no {name}", "name another topic"
-                )
-        stamps = np.array([_stamp(one.content.header) for one in messages], dtype=np.int64)
-        headers = bool((stamps != 0).all())
-        logged = np.array([one.log_time for one in messages], dtype=np.int64)
-        rows = [
-            (rate.x, rate.y, rate.z, force.x, force.y, force.z)
-            for rate, force in (
-                (one.content.angular_velocity, one.content.linear_acceleration) for one in messages
+def _samples(found: _Collected, topic: Topic, path: Path) -> _Samples:
+    if not found.imu:
+        raise InputError(path, f"topic {topic.name} has no messages", "record it anew")
+    first = found.first[0]
+    for name, covariance in (
+        ("gyro", first.angular_velocity_covariance),
+        ("accel", first.linear_acceleration_covariance),
+    ):
+        if covariance[0] == -1.0:
+            raise InputError(
+                path, f"topic {topic.name} says that it has no {name}", "name another topic"
             )
-        ]
-        table = pd.DataFrame(np.array(rows, dtype=np.float64), columns=[*_GYRO, *_ACCEL])
-        table["stamp"] = stamps if headers else logged
-        return cls(table, first.header.frame_id, headers)
+    stamps, logged, values = zip(*found.imu, strict=True)
+    headers = all(stamps)
+    table = pd.DataFrame(np.array(values, dtype=np.float64), columns=[*_GYRO, *_ACCEL])
+    table["stamp"] = np.array(stamps if headers else logged, dtype=np.int64)
+    return _Samples(table, first.header.frame_id, headers)
 
 
 # --- reference
 
 
 def _track(
-    messages: list[Message],
-    topic: Topic,
-    child: str,
-    samples: _Samples,
-    mounted: dict[tuple[str, str], SensorPose],
-    path: Path,
-    notes: list[str],
+    found: _Collected, topic: str, child: str, samples: _Samples, path: Path, notes: list[str]
 ) -> Track:
     """The poses of a topic, as those of the IMU."""
-    read = _POSES[topic.type]
-    rows = [(one.log_time, pose) for one in messages for pose in read(one.content)]
+    rows = found.poses
     children = sorted({pose.child for _, pose in rows})
     if child:
         rows = [(time, pose) for time, pose in rows if pose.child == child]
     if not rows or (len(children) > 1 and not child):
         raise InputError(
             path,
-            f"topic {topic.name} moves the frames {', '.join(children) or 'none'}",
-            f"name one: --reference-topic {topic.name}:FRAME",
+            f"topic {topic} moves the frames {', '.join(children) or 'none'}",
+            f"name one: --reference-topic {topic}:FRAME",
         )
     headers = samples.headers and all(pose.stamp for _, pose in rows)
     stamps = np.array([pose.stamp if headers else time for time, pose in rows], dtype=np.int64)
     start = int(stamps.min())
     values = np.array([pose.values for _, pose in rows], dtype=np.float64)
-    name = f"{topic.name}{f':{child}' if child else ''}"
+    name = f"{topic}:{child}" if child else topic
     poses = poses_of((stamps - start) * 1e-9, values, f"{path}: topic {name}")
     body, imu = rows[0][1].child, samples.frame
-    place = _place(body, imu, mounted)
+    place = _place(body, imu, found.mounted)
     if place is None:
         notes.append(
             f"{path.name}: {name} gives the poses of '{body or 'an unnamed frame'}', the IMU is in "
@@ -256,14 +271,13 @@ def _track(
     return Track(path, name, start / 1e9, moved_to(place or SensorPose(), poses))
 
 
-def _mounting(messages: list[Message]) -> dict[tuple[str, str], SensorPose]:
-    """(parent, child) -> the child in the parent, of static transforms."""
+def _mounting(message: Any) -> dict[tuple[str, str], SensorPose]:
+    """(parent, child) -> the child in the parent, of the transforms of a message."""
     mounted = {}
-    for message in messages:
-        for one in message.content.transforms:
-            *place, w, x, y, z = _transform(one)[0].values
-            pose = SensorPose(Rotation.from_quat([x, y, z, w]), np.array(place))
-            mounted[_frame(one.header.frame_id), _frame(one.child_frame_id)] = pose
+    for one in message.transforms:
+        *place, w, x, y, z = _transform(one)[0].values
+        pose = SensorPose(Rotation.from_quat([x, y, z, w]), np.array(place))
+        mounted[_frame(one.header.frame_id), _frame(one.child_frame_id)] = pose
     return mounted
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from gnio_jax.data.importing import import_recording
+from gnio_jax.data.importing import bags, import_recording
 from gnio_jax.errors import InputError
 from tests.support import bag_files, known_walk
 from tests.support.bag_files import EPOCH, KINDS, LOGGED, Maker, imu, poses, text, write
@@ -197,7 +197,13 @@ def test_a_bag_cut_short_is_one_line(tmp_path, kind, kept):
     path = write(tmp_path, kind, imu(Maker(kind), seconds=2.0))
     whole = path.read_bytes()
     path.write_bytes(whole[: int(kept * len(whole))])
-    refused(path, f"{path.name}: .*it may be cut short")
+    refused(path, f"{path.name}: (cannot be read as a ROS . bag, it may be|is) cut short")
+
+
+def test_a_chunk_that_unpacks_to_gigabytes_is_refused(tmp_path, monkeypatch):
+    path = write(tmp_path, "mcap", imu(Maker(), seconds=2.0))
+    monkeypatch.setattr(bags, "LARGEST_CHUNK", 20_000)
+    refused(path, r"walk.mcap: holds a chunk that unpacks to gigabytes")
 
 
 def test_messages_of_another_encoding_are_refused(tmp_path):
@@ -210,7 +216,7 @@ def test_messages_of_another_encoding_are_refused(tmp_path):
 def test_garbage_behind_a_true_beginning_is_one_line(tmp_path, magic):
     noise = np.random.default_rng(5).integers(0, 256, 5000, dtype=np.uint8).tobytes()
     (tmp_path / "walk.db3").write_bytes(magic + noise)
-    refused(tmp_path / "walk.db3", r"walk.db3: cannot be read as a")
+    refused(tmp_path / "walk.db3", r"walk.db3: (cannot be read as a|is cut short)")
 
 
 def test_a_package_that_is_missing_is_named(tmp_path, monkeypatch):
