@@ -121,7 +121,8 @@ def poses(make, kind, mount, topic="/pose", rate=50.0, child="base_link", start=
         if kind == "TransformStamped":
             return make.transform(time, mount, "map", child)
         if kind == "TFMessage":
-            other = make.transform(time, mount, "map", "wheel")
+            other = make.transform(time + 9.0, mount, "map", "wheel")
+            other.header.stamp = header.stamp
             return make.new(name, [make.transform(time, mount, "map", child), other])
         spread = make.new("geometry_msgs/msg/PoseWithCovariance", pose, np.zeros(36))
         if kind == "PoseWithCovarianceStamped":

@@ -10,15 +10,16 @@ import zipfile
 from collections import defaultdict
 from pathlib import Path, PurePosixPath
 
+from gnio_jax.data.importing.streams import table_layout
 from gnio_jax.data.readers.parsing import parsed_as
 from gnio_jax.errors import InputError
 
 LARGEST = 512 * 2**20
 """Bytes of one file: six hours of a sensor at 200 Hz are less (ours)."""
-MOST_MEMBERS = 10_000
-"""Files in an archive; a logger with a camera writes thousands (ours)."""
+MOST_TABLES = 200
+"""CSV files; a logger writes one for each sensor (ours)."""
 HEAD = 4096
-"""Bytes that hold the first rows of a table."""
+"""Bytes that hold the first line of a table."""
 
 
 def csv_names(path: Path) -> dict[str, list[str]]:
@@ -29,8 +30,11 @@ def csv_names(path: Path) -> dict[str, list[str]]:
     found: dict[str, list[str]] = defaultdict(list)
     for name in _names(path):
         place = PurePosixPath(name)
-        if place.suffix.lower() == ".csv" and _is_own(place):
+        # macOS adds a file "._Gyroscope.csv" to each Gyroscope.csv.
+        if place.suffix.lower() == ".csv" and not place.name.startswith("."):
             found[str(place.parent)].append(name)
+    if (count := sum(map(len, found.values()))) > MOST_TABLES:
+        raise InputError(path, f"holds {count} CSV files", "give one recording of a logger")
     return dict(found)
 
 
@@ -43,21 +47,23 @@ def _names(path: Path) -> list[str]:
     return names
 
 
-def _is_own(place: PurePosixPath) -> bool:
-    """Not one of the files that macOS adds."""
-    return not place.name.startswith(".") and "__MACOSX" not in place.parts
-
-
 def check_members(path: Path, names: list[str]) -> None:
     """Raise `InputError` where an archive is none of a logger's."""
-    if len(names) > MOST_MEMBERS:
-        raise InputError(path, f"holds {len(names)} files", "give a logger's own export")
     for name in names:
         parts = name.replace("\\", "/").split("/")
         if ".." in parts or name.startswith(("/", "\\")) or ":" in parts[0]:
             raise InputError(
                 path, f"its member '{name}' climbs out of the folder", "give a logger's own export"
             )
+
+
+def labels(path: Path, name: str) -> tuple[str, ...]:
+    """The columns of a CSV of a zip or folder, by its first line; none where it is no text."""
+    line = content(path, name, HEAD).splitlines()[:1]
+    try:
+        return table_layout(path / name, content=b"".join(line)).labels
+    except InputError:
+        return ()
 
 
 def content(path: Path, name: str, most: int | None = None) -> bytes:
@@ -69,15 +75,15 @@ def content(path: Path, name: str, most: int | None = None) -> bytes:
         with parsed_as(place, "a file"), place.open("rb") as file:
             return _limited(file.read(limit), place)
     with parsed_as(path, "a zip"), zipfile.ZipFile(path) as archive:
-        check_announced(archive.getinfo(name), path)
+        check_announced(archive.getinfo(name).file_size, place)
         with archive.open(name) as file:
             return _limited(file.read(limit), place)
 
 
-def check_announced(member: zipfile.ZipInfo, path: Path) -> None:
-    """Raise `InputError` for a member that says it is larger than `LARGEST`."""
-    if member.file_size > LARGEST:
-        raise _too_large(path / member.filename, f"unpacks to {member.file_size / 2**20:.0f} MiB")
+def check_announced(size: int, place: Path) -> None:
+    """Raise `InputError` for what says that it unpacks to more than `LARGEST` bytes."""
+    if size > LARGEST:
+        raise _too_large(place, f"unpacks to {size / 2**20:.0f} MiB")
 
 
 def _limited(data: bytes, place: Path) -> bytes:
@@ -87,4 +93,4 @@ def _limited(data: bytes, place: Path) -> bytes:
 
 
 def _too_large(place: Path, problem: str) -> InputError:
-    return InputError(place, problem, f"no file may exceed {LARGEST / 2**20:.0f} MiB")
+    return InputError(place, problem, f"no table may exceed {LARGEST / 2**20:.0f} MiB")

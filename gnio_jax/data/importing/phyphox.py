@@ -31,7 +31,7 @@ import pandas as pd
 
 from gnio_jax.data.importing import archives
 from gnio_jax.data.importing.source import Source, Units
-from gnio_jax.data.importing.streams import SensorFile, read_table, table_layout
+from gnio_jax.data.importing.streams import SensorFile, read_table
 from gnio_jax.data.importing.units import named_unit
 from gnio_jax.data.readers.parsing import parsed_as
 from gnio_jax.data.readers.text import numbers
@@ -101,8 +101,7 @@ def _tables(path: Path) -> list[_Table]:
             members = archive.infolist()
         if any(member.filename == "xl/workbook.xml" for member in members):
             archives.check_members(path, [member.filename for member in members])
-            for member in members:
-                archives.check_announced(member, path)
+            archives.check_announced(sum(member.file_size for member in members), path)
             return _of_workbook(path, "openpyxl")
         return _of_archive(path)
     return [_Table(path, read_table(path, None, ()))]
@@ -112,8 +111,8 @@ def _of_archive(path: Path) -> list[_Table]:
     tables = []
     for names in archives.csv_names(path).values():
         for name in names:
-            content = archives.content(path, name)
-            if _sets(table_layout(path / name, content=content).labels):
+            if _sets(archives.labels(path, name)):
+                content = archives.content(path, name)
                 tables.append(_Table(path / name, read_table(path / name, None, (), content)))
     return tables
 

@@ -76,19 +76,10 @@ def _of_zip(path: Path) -> str:
 def _of_tables(path: Path) -> str:
     """The logger that wrote the CSV files of a zip or folder."""
     names = [name for group in archives.csv_names(path).values() for name in group]
-    labels = [_labels(path, name) for name in names]
+    labels = [archives.labels(path, name) for name in names]
     if is_sensor_logger(labels):
         return "sensor_logger"
     if is_phyphox(labels):
         return "phyphox"
     found = ", ".join(names[:8]) or "no CSV file"
     raise InputError(path, f"has the layout of no known recording (found: {found})", _KNOWN)
-
-
-def _labels(path: Path, name: str) -> tuple[str, ...]:
-    """The columns of a table, by its first line; none where it is no text."""
-    line = archives.content(path, name, archives.HEAD).splitlines()[:1]
-    try:
-        return table_layout(path / name, content=b"".join(line)).labels
-    except InputError:
-        return ()

@@ -191,7 +191,9 @@ def test_degrees_where_the_format_says_radians_are_refused(tmp_path):
 def test_a_member_of_gigabytes_is_refused_by_what_it_announces(tmp_path):
     data = lying_zip(sensor_logger(), "Gyroscope.csv", 3 * 2**30)
     (tmp_path / "bomb.zip").write_bytes(data)
-    refused(tmp_path / "bomb.zip", "Gyroscope.csv: unpacks to 3072 MiB; no file may exceed 512 MiB")
+    refused(
+        tmp_path / "bomb.zip", "Gyroscope.csv: unpacks to 3072 MiB; no table may exceed 512 MiB"
+    )
 
 
 def test_a_member_that_gives_more_than_it_announces_is_refused(tmp_path):
@@ -203,8 +205,8 @@ def test_what_is_read_is_limited_too(tmp_path, monkeypatch):
     folder = unpacked(tmp_path / "walk", sensor_logger())
     monkeypatch.setattr(archives, "LARGEST", 2**15)
     refused(folder, "holds more than 0 MiB")
-    monkeypatch.setattr(archives, "MOST_MEMBERS", 3)
-    refused(zipped(tmp_path / "walk.zip", sensor_logger()), "walk.zip: holds 8 files")
+    monkeypatch.setattr(archives, "MOST_TABLES", 3)
+    refused(zipped(tmp_path / "walk.zip", sensor_logger()), "walk.zip: holds 8 CSV files")
 
 
 @pytest.mark.parametrize("kept", [0.02, 0.5, 0.99])
@@ -228,7 +230,7 @@ def test_phyphox_as_text(tmp_path, separator, decimal):
     assert f"walk.zip: {text}" in notes
 
 
-def test_phyphox_as_a_workbook(tmp_path):
+def test_phyphox_as_a_workbook(tmp_path, monkeypatch):
     new, old = openpyxl.Workbook(), xlwt.Workbook()
     new.remove(new.active)
     for name, (time, values, labels) in phyphox_sets().items():
@@ -246,6 +248,8 @@ def test_phyphox_as_a_workbook(tmp_path):
         sequence, notes = import_recording(tmp_path / name)
         compare(sequence)
         assert f"{name}: phyphox; Gyroscope in rad/s, Accelerometer in m/s2" in notes[0]
+    monkeypatch.setattr(archives, "LARGEST", 2**15)
+    refused(tmp_path / "walk.xlsx", "walk.xlsx: unpacks to 0 MiB; no table may exceed 0 MiB")
     damaged = (tmp_path / "walk.xls").read_bytes()[:3000]
     (tmp_path / "cut.xls").write_bytes(damaged)
     refused(tmp_path / "cut.xls", "cut.xls: cannot be read as a workbook")
