@@ -9,6 +9,8 @@ import io
 import zipfile
 
 import numpy as np
+import openpyxl
+import xlwt
 
 from tests.support import known_walk
 
@@ -106,6 +108,24 @@ def zipped(path, members):
         for name, text in members.items():
             archive.writestr(name, text)
     return path
+
+
+def workbooks(folder, sets):
+    """walk.xlsx and walk.xls of phyphox, with a sheet of metadata."""
+    new, old = openpyxl.Workbook(), xlwt.Workbook()
+    new.remove(new.active)
+    tables = {
+        name: [["Time (s)", *labels], *np.column_stack([time, values]).tolist(), ["NaN"] * 4]
+        for name, (time, values, labels) in sets.items()
+    }
+    for name, rows in (tables | {"Metadata Device": [["property", "value"]]}).items():
+        sheet, other = new.create_sheet(name), old.add_sheet(name)
+        for number, row in enumerate(rows):
+            sheet.append(row)
+            for column, cell in enumerate(row):
+                other.write(number, column, cell)
+    new.save(folder / "walk.xlsx")
+    old.save(str(folder / "walk.xls"))
 
 
 def unpacked(folder, members):

@@ -19,12 +19,13 @@ Facts, from the app's sources (github.com/phyphox):
 from __future__ import annotations
 
 import importlib
+import io
 import re
 import warnings
 import zipfile
 from collections.abc import Iterable, Sequence
 from pathlib import Path, PurePosixPath
-from typing import Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -117,7 +118,7 @@ def _of_archive(path: Path) -> list[_Table]:
     return tables
 
 
-def _of_workbook(path: Path, engine: Literal["openpyxl", "xlrd"]) -> list[_Table]:
+def _of_workbook(path: Path, engine: str) -> list[_Table]:
     try:
         importlib.import_module(engine)
     except ImportError:
@@ -126,7 +127,10 @@ def _of_workbook(path: Path, engine: Literal["openpyxl", "xlrd"]) -> list[_Table
         ) from None
     with parsed_as(path, "a workbook"), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of styles
-        sheets = pd.read_excel(path, sheet_name=None, engine=engine)
+        options: dict[str, Any] = {"engine": engine}
+        if engine == "xlrd":  # it writes what it thinks of a damaged file to the standard output
+            options["engine_kwargs"] = {"logfile": io.StringIO()}
+        sheets: dict[Any, pd.DataFrame] = pd.read_excel(path, sheet_name=None, **options)
     return [
         _Table(path / str(name), values)
         for name, values in sheets.items()

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-import openpyxl
 import pytest
-import xlwt
 
 from gnio_jax.data.importing import archives, import_recording
 from gnio_jax.data.importing.units import named_unit
@@ -22,6 +20,7 @@ from tests.support.logger_files import (
     sensor_logger,
     sensor_table,
     unpacked,
+    workbooks,
     zipped,
 )
 
@@ -231,19 +230,7 @@ def test_phyphox_as_text(tmp_path, separator, decimal):
 
 
 def test_phyphox_as_a_workbook(tmp_path, monkeypatch):
-    new, old = openpyxl.Workbook(), xlwt.Workbook()
-    new.remove(new.active)
-    for name, (time, values, labels) in phyphox_sets().items():
-        sheets = new.create_sheet(name), old.add_sheet(name)
-        rows = [["Time (s)", *labels], *np.column_stack([time, values]).tolist(), ["NaN"] * 4]
-        for number, row in enumerate(rows):
-            sheets[0].append(row)
-            for column, cell in enumerate(row):
-                sheets[1].write(number, column, cell)
-    for book in (new.create_sheet("Metadata Device"), old.add_sheet("Metadata Device")):
-        assert book is not None
-    new.save(tmp_path / "walk.xlsx")
-    old.save(str(tmp_path / "walk.xls"))
+    workbooks(tmp_path, phyphox_sets())
     for name in ("walk.xlsx", "walk.xls"):
         sequence, notes = import_recording(tmp_path / name)
         compare(sequence)
