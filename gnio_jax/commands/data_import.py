@@ -86,6 +86,8 @@ class ImportOptions:
     """Separator of a CSV's columns; detected by default."""
     imu_topic: str | None = None
     """Topic of sensor_msgs/Imu in a bag that has several."""
+    accel_topic: str | None = None
+    """The accelerometer's topic, where it has one of its own."""
     reference_topic: str | None = None
     """Topic of poses, odometry or transforms in a bag that has several; /tf:CHILD_FRAME for TF."""
     name: str | None = None
@@ -119,6 +121,7 @@ def import_file(options: ImportOptions, prog: str) -> None:
             separator=options.separator,
             name=options.name or options.out.stem,
             imu_topic=options.imu_topic,
+            accel_topic=options.accel_topic,
             reference_topic=options.reference_topic,
         )
     write_hdf5(options.out, sequence)

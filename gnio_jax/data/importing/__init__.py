@@ -21,7 +21,7 @@ from gnio_jax.data.importing.bags import KINDS
 from gnio_jax.data.importing.phyphox import read_phyphox
 from gnio_jax.data.importing.recognition import recognise
 from gnio_jax.data.importing.reference import with_reference
-from gnio_jax.data.importing.ros import read_bag
+from gnio_jax.data.importing.ros import Topics, read_bag
 from gnio_jax.data.importing.sensor_logger import read_sensor_logger
 from gnio_jax.data.importing.source import Source, Track, Units
 from gnio_jax.data.importing.streams import (
@@ -69,6 +69,7 @@ def import_recording(
     separator: str | None = None,
     name: str | None = None,
     imu_topic: str | None = None,
+    accel_topic: str | None = None,
     reference_topic: str | None = None,
 ) -> Imported:
     """A recording as a `Sequence` on a uniform clock.
@@ -99,8 +100,8 @@ def import_recording(
         where there is none of them.
     `name`
         Of the sequence; None takes that of the file.
-    `imu_topic`, `reference_topic`
-        Of a bag; see `ros.read_bag`.
+    `imu_topic`, `accel_topic`, `reference_topic`
+        Of a bag, see `ros.Topics`.
 
     Two sensors with stamps of their own are put on the faster one's over the time that both cover,
     by cubic splines. Raises `InputError` naming file, field and remedy.
@@ -116,19 +117,18 @@ def import_recording(
         )
     path = Path(path)
     kind = "csv" if columns or accel_path is not None else recognise(path)
-    if (imu_topic or reference_topic) and kind not in KINDS:
+    topics = Topics(imu_topic, accel_topic, reference_topic)
+    if any(topics) and kind not in KINDS:
         raise InputError(path, "has no topics", "a topic is one of a ROS bag or an MCAP")
     if kind == "csv":
         source = _read_csv(path, accel_path, dict(columns or {}), separator)
     else:
-        source = _read_other(path, kind, imu_topic, reference_topic)
+        source = _read_other(path, kind, topics)
     stated = Units(time_unit, gyro_unit, accel_unit, accel_sign)
     return _imported(source, stated, order, rate, name or path.stem)
 
 
-def _read_other(
-    path: Path, kind: str, imu_topic: str | None, reference_topic: str | None
-) -> Source:
+def _read_other(path: Path, kind: str, topics: Topics) -> Source:
     match kind:
         case "sensor_logger":
             return read_sensor_logger(path)
@@ -137,7 +137,7 @@ def _read_other(
         case "euroc":
             return read_asl(path)
         case _:
-            return read_bag(path, kind, imu_topic, reference_topic)
+            return read_bag(path, kind, topics)
 
 
 def _imported(source: Source, stated: Units, order: str, rate: float | None, name: str) -> Imported:

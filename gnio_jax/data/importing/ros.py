@@ -87,36 +87,52 @@ _POSES: dict[str, Callable[[Any], list[_Pose]]] = {
 # --- topics
 
 
-def read_bag(
-    path: Path, kind: str, imu_topic: str | None = None, reference_topic: str | None = None
-) -> Source:
+class Topics(NamedTuple):
+    """What the user names; None takes the only one."""
+
+    imu: str | None = None
+    """Of sensor_msgs/Imu."""
+    accel: str | None = None
+    """The accelerometer's, where it is another one."""
+    reference: str | None = None
+    """Of poses; "/tf:CHILD_FRAME" of transforms."""
+
+
+def read_bag(path: Path, kind: str, topics: Topics) -> Source:
     """The IMU of a bag, and its reference where there is one.
 
     One topic of `sensor_msgs/Imu` is taken without being named, and so is one of poses; of several
-    the IMU must be named, and of the poses none is taken. `reference_topic` may be
-    "/tf:CHILD_FRAME". Raises `InputError` that names the topics there are.
+    the IMU must be named, and of the poses none is taken. Raises `InputError` that names the topics
+    there are.
     """
     with opened(path, kind) as bag:
-        imu = _imu_topic(bag, imu_topic)
-        reference, child, notes = _reference_topic(bag, reference_topic)
+        imu = _imu_topic(bag, topics.imu)
+        other = imu if topics.accel is None else _imu_topic(bag, topics.accel)
+        reference, child, notes = _reference_topic(bag, topics.reference)
         static = [topic.name for topic in bag.topics if topic.name.endswith("tf_static")]
-        found = _collected(bag, imu.name, reference, static)
-    samples = _samples(found, imu, path)
+        found = _collected(bag, {imu.name, other.name}, reference, static)
+    samples, forces = _samples(found, imu, "gyro", path), _samples(found, other, "accel", path)
+    if samples.headers != forces.headers:
+        raise InputError(
+            path, f"topics {imu.name} and {other.name} have other clocks", "name other topics"
+        )
     clock = "headers" if samples.headers else "bag: its headers have no time"
-    notes.insert(0, f"{path.name}: IMU {imu.name} ({imu.count} messages), stamped by its {clock}")
+    named = f"{imu.name} ({imu.count} messages)"
+    named += f", accel {other.name} ({other.count} messages)" if other != imu else ""
+    notes.insert(0, f"{path.name}: IMU {named}, stamped by its {clock}")
     track = None
     if reference is not None:
         try:
             track = _track(found, reference.name, child, samples, path, notes)
-            track = track._replace(named=reference_topic is not None)
+            track = track._replace(named=topics.reference is not None)
         except InputError as error:
-            if reference_topic is not None:
+            if topics.reference is not None:
                 raise
             notes.append(f"{path.name}: no reference is taken: {error}")
     return Source(
         path,
         SensorFile("gyro", path, samples.table, "stamp", _GYRO),
-        SensorFile("accel", path, samples.table, "stamp", _ACCEL),
+        SensorFile("accel", path, forces.table, "stamp", _ACCEL),
         Units("ns", "rad/s", None, "android"),
         track,
         tuple(notes),
@@ -176,25 +192,25 @@ def _reference_topic(bag: Bag, name: str | None) -> tuple[Topic | None, str, lis
 class _Collected(NamedTuple):
     """What is kept of a bag: numbers, since decoded messages take a kilobyte each."""
 
-    imu: list[tuple[int, int, tuple[float, ...]]]
-    """Stamp of the header and of the bag, ns; gyro rad/s and accel of each sample."""
-    first: list[Any]
-    """The first message of the IMU, if there is one."""
+    imu: dict[str, list[tuple[int, int, tuple[float, ...]]]]
+    """Topic -> stamp of the header and of the bag, ns; gyro rad/s and accel of each sample."""
+    first: dict[str, Any]
+    """Topic -> the first message of an IMU."""
     poses: list[tuple[int, _Pose]]
     """Stamp of the bag, ns, and pose of each pose of the reference."""
     mounted: dict[tuple[str, str], SensorPose]
     """(parent, child) -> the child in the parent, of static transforms."""
 
 
-def _collected(bag: Bag, imu: str, reference: Topic | None, static: list[str]) -> _Collected:
-    found = _Collected([], [], [], {})
-    names = {imu, *static, *([reference.name] if reference else [])}
+def _collected(bag: Bag, imus: set[str], reference: Topic | None, static: list[str]) -> _Collected:
+    found = _Collected({name: [] for name in imus}, {}, [], {})
+    names = {*imus, *static, *([reference.name] if reference else [])}
     for message in bag.messages(names):
         content = message.content
-        if message.topic == imu:
-            if not found.first:
-                found.first.append(content)
-            found.imu.append((_stamp(content.header), message.log_time, _sample(content)))
+        if message.topic in imus:
+            found.first.setdefault(message.topic, content)
+            sample = _stamp(content.header), message.log_time, _sample(content)
+            found.imu[message.topic].append(sample)
         if reference is not None and message.topic == reference.name:
             poses = _POSES[reference.type](content)
             found.poses.extend((message.log_time, pose) for pose in poses)
@@ -217,19 +233,17 @@ class _Samples(NamedTuple):
     """Stamped by its headers."""
 
 
-def _samples(found: _Collected, topic: Topic, path: Path) -> _Samples:
-    if not found.imu:
+def _samples(found: _Collected, topic: Topic, sensor: str, path: Path) -> _Samples:
+    """The topic's samples, of which it must have the sensor."""
+    if not found.imu[topic.name]:
         raise InputError(path, f"topic {topic.name} has no messages", "record it anew")
-    first = found.first[0]
-    for name, covariance in (
-        ("gyro", first.angular_velocity_covariance),
-        ("accel", first.linear_acceleration_covariance),
-    ):
-        if covariance[0] == -1.0:
-            raise InputError(
-                path, f"topic {topic.name} says that it has no {name}", "name another topic"
-            )
-    stamps, logged, values = zip(*found.imu, strict=True)
+    first = found.first[topic.name]
+    gyro, accel = first.angular_velocity_covariance, first.linear_acceleration_covariance
+    if (gyro if sensor == "gyro" else accel)[0] == -1.0:
+        raise InputError(
+            path, f"topic {topic.name} says that it has no {sensor}", "name another topic"
+        )
+    stamps, logged, values = zip(*found.imu[topic.name], strict=True)
     headers = all(stamps)
     table = pd.DataFrame(np.array(values, dtype=np.float64), columns=[*_GYRO, *_ACCEL])
     table["stamp"] = np.array(stamps if headers else logged, dtype=np.int64)

@@ -151,6 +151,21 @@ def test_topics_are_chosen_and_named(tmp_path):
     compare_reference(sequence, 2e-3)
 
 
+def test_gyro_and_accelerometer_of_two_topics(tmp_path):
+    """As a RealSense camera gives them, at two rates."""
+    make = Maker()
+    entries = imu(make, "/camera/gyro/sample", rate=200.0, no="accel")
+    entries += imu(make, "/camera/accel/sample", rate=100.0, no="gyro")
+    path = write(tmp_path, "mcap", entries)
+    topics = {"imu_topic": "/camera/gyro/sample", "accel_topic": "/camera/accel/sample"}
+    sequence, notes = import_recording(path, **topics)
+    assert "accel /camera/accel/sample (600 messages), stamped by its headers" in notes[0]
+    np.testing.assert_allclose(sequence.gyro, known_walk.rate(sequence.time), atol=1e-9)
+    force = known_walk.force(sequence.time)
+    np.testing.assert_allclose(sequence.accel[20:-20], force[20:-20], atol=2e-3)
+    refused(path, "/camera/gyro/sample says that it has no accel", imu_topic="/camera/gyro/sample")
+
+
 def test_a_bag_without_an_imu_names_its_topics(tmp_path):
     make = Maker()
     path = write(tmp_path, "mcap", text(make))
