@@ -14,11 +14,11 @@ from gnio_jax.errors import InputError
 
 DESCRIPTION = """A trajectory that `evaluate` left, in the format of another program.
 
-  {prog} runs/demo/eval/csv_test_ekf/trajectories/walk.txt walk.mcap         (Foxglove, ROS 2)
-  {prog} walk.txt walk.csv                                 (or .kitti, .tum)
-  {prog} walk.txt walk.geojson --first-fix 48.1375 11.5755 --heading 90      (or .gpx; maps)
+  {prog} trajectories/walk.txt walk.mcap        (Foxglove, ROS 2)
+  {prog} walk.txt walk.csv                      (or .kitti, .tum)
+  {prog} walk.txt walk.gpx --first-fix 48.1375 11.5755 --heading 90
 
---first-fix is where the first pose is, LAT LON [ALT], deg and m; --heading is the direction of the
+walk.geojson goes like walk.gpx. --first-fix is where the first pose is, LAT LON [ALT], deg and m; --heading is the direction of the
 trajectory's x axis, deg clockwise from true north: turn it until the path lies on the map."""
 
 

@@ -16,9 +16,9 @@ from gnio_jax.errors import InputError
 
 DESCRIPTION = """A recording of a phone or robot as the package's HDF5.
 
-  {prog} walk.zip --out recordings/walk.h5        (Sensor Logger, phyphox: zip, folder, xls, xlsx)
-  {prog} walk.mcap --imu-topic /imu --out recordings/walk.h5                   (rosbag1, rosbag2)
-  {prog} V1_01_easy --out recordings/walk.h5                         (a folder of EuRoC's layout)
+  {prog} walk.zip --out recordings/walk.h5      (Sensor Logger, phyphox)
+  {prog} walk.bag --imu-topic /imu --out recordings/walk.h5      (or MCAP)
+  {prog} V1_01_easy --out recordings/walk.h5    (a folder of EuRoC's layout)
   {prog} walk.csv --out recordings/walk.h5
   {prog} Gyroscope.csv --accel-path Accelerometer.csv --columns.time "Time (s)" \\
       --columns.gyro-x "X (rad/s)" --columns.gyro-y "Y (rad/s)" --columns.gyro-z "Z (rad/s)" \\

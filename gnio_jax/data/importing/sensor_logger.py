@@ -13,9 +13,9 @@ Facts, from the app's documentation (github.com/tszheichoi/awesome-sensor-logger
   Units & Frames" is on (UNITS.md). Its magnitude tells.
 - All accelerations of iOS have the other sign, unless that setting is on (CROSSPLATFORM.md).
 
-`Metadata.csv` has the columns `platform` and `standardisation`: seen in exports; that their values
-are ios or android, and true or false, is assumed. Where the file is missing, `TotalAcceleration`
-tells Android, and otherwise the sign must be stated.
+`Metadata.csv` says `platform`, ios or android (seen in exports of releases 1.10 and 1.28), and since
+1.29 `standardisation`, false where that setting is off (seen) and true where it is on (assumed).
+Where the file is missing, `TotalAcceleration` tells Android. Otherwise the sign must be stated.
 """
 
 from __future__ import annotations
@@ -56,10 +56,17 @@ class _Export(NamedTuple):
 
 
 class _Device(NamedTuple):
-    """What Metadata.csv says; None where it does not."""
+    """What Metadata.csv says; None where it says nothing that is known."""
 
     platform: str | None
     standardised: bool | None
+
+    @property
+    def sign(self) -> str | None:
+        """Of its accelerations."""
+        if self.platform == "ios":
+            return {True: "android", False: "ios", None: None}[self.standardised]
+        return self.platform
 
 
 def is_sensor_logger(tables: Iterable[Sequence[str]]) -> bool:
@@ -75,15 +82,13 @@ def read_sensor_logger(path: Path) -> Source:
         raise _missing("gyro", export)
     device = _device(export)
     accel, unit, how = _accelerometer(export)
-    system = device.platform or ("android" if "TotalAcceleration" in export.names else None)
-    sign = "android" if device.standardised or system == "android" else system
-    shown = {"ios": "iOS", "android": "Android"}.get(system or "", "unknown system")
+    shown = {"ios": "iOS", "android": "Android"}.get(device.platform or "", "unknown system")
     clock = "time" if "time" in accel.table.columns else "seconds_elapsed"
     return Source(
         path,
         SensorFile("gyro", export.file(gyro), export.table(gyro), clock, _AXES),
         accel._replace(time=clock),
-        Units("ns" if clock == "time" else "s", "rad/s", unit, sign),
+        Units("ns" if clock == "time" else "s", "rad/s", unit, device.sign),
         notes=(f"{path.name}: Sensor Logger ({shown}); {gyro} in rad/s, {how}",),
     )
 
@@ -150,11 +155,11 @@ def _with_gravity(export: _Export) -> SensorFile:
 
 def _device(export: _Export) -> _Device:
     if "Metadata" not in export.names:
-        return _Device(None, None)
+        return _Device("android" if "TotalAcceleration" in export.names else None, None)
     text = archives.content(export.path, export.names["Metadata"]).decode("utf-8-sig", "replace")
     row = next(csv.DictReader(io.StringIO(text)), {})
     platform = str(row.get("platform")).strip().lower()
-    setting = str(row.get("standardisation")).strip().lower()
+    setting = str(row.get("standardisation", "false")).strip().lower()
     return _Device(
         platform if platform in ("ios", "android") else None,
         {"true": True, "false": False}.get(setting),

@@ -96,6 +96,18 @@ def test_the_sign_of_an_unknown_system_must_be_stated(tmp_path):
     assert any("unknown system" in note for note in notes)
 
 
+def test_metadata_of_an_early_release_and_of_an_unknown_one(tmp_path):
+    members = sensor_logger("ios")
+    members["Metadata.csv"] = (
+        "version,device name,recording time,platform,appVersion,device id,sensors,sampleRateMs\n"
+        "3,iPhone 12 mini,2022-09-12_11-36-02,ios,1.10.4,id,Accelerometer|Gravity,10|10"
+    )
+    sequence, _ = import_recording(zipped(tmp_path / "early.zip", members))
+    compare(sequence)
+    members["Metadata.csv"] = "platform,standardisation\nios,perhaps\n"
+    refused(zipped(tmp_path / "walk.zip", members), "the sign of field 'accel' depends on the")
+
+
 def test_gravity_of_other_stamps_is_interpolated(tmp_path):
     members = without(sensor_logger("android"), "TotalAcceleration.csv")
     time = logger_files.clock(50.0) + 0.007
