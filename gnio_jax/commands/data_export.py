@@ -18,8 +18,9 @@ DESCRIPTION = """A trajectory that `evaluate` left, in the format of another pro
   {prog} walk.txt walk.csv                      (or .kitti, .tum)
   {prog} walk.txt walk.gpx --first-fix 48.1375 11.5755 --heading 90
 
-walk.geojson goes like walk.gpx. --first-fix is where the first pose is, LAT LON [ALT], deg and m; --heading is the direction of the
-trajectory's x axis, deg clockwise from true north: turn it until the path lies on the map."""
+walk.geojson goes like walk.gpx. --first-fix is where the first pose is, LAT LON [ALT], deg and m.
+--heading is the direction of the trajectory's x axis, deg clockwise from true north: turn it until
+the path lies on the map."""
 
 
 @dataclass(frozen=True)

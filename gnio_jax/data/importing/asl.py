@@ -42,7 +42,7 @@ def read_asl(path: Path) -> Source:
         accel,
         Units("ns", "rad/s", "m/s2", "android"),
         track,
-        (f"{path.name}: EuRoC's layout, {found}",),
+        (f"{path.name}: EuRoC's layout (ns, rad/s, m/s2), {found}",),
     )
 
 

@@ -83,7 +83,7 @@ def read_phyphox(path: Path) -> Source:
         gyro.sensor("gyro"),
         accel.sensor("accel"),
         Units("s", gyro.unit, accel.unit, "android"),
-        notes=(f"{path.name}: phyphox; {names}, by their headers",),
+        notes=(f"{path.name}: phyphox; time in s, {names}, by their headers",),
     )
 
 

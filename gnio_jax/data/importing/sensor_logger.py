@@ -13,8 +13,8 @@ Facts, from the app's documentation (github.com/tszheichoi/awesome-sensor-logger
   Units & Frames" is on (UNITS.md). Its magnitude tells.
 - All accelerations of iOS have the other sign, unless that setting is on (CROSSPLATFORM.md).
 
-`Metadata.csv` says `platform`, ios or android (seen in exports of releases 1.10 and 1.28), and since
-1.29 `standardisation`, false where that setting is off (seen) and true where it is on (assumed).
+`Metadata.csv` says `platform`, ios or android (seen in exports of releases 1.10 and 1.28), and
+since 1.29 `standardisation`, false where that setting is off (seen), true where it is on (assumed).
 Where the file is missing, `TotalAcceleration` tells Android. Otherwise the sign must be stated.
 """
 
@@ -84,12 +84,14 @@ def read_sensor_logger(path: Path) -> Source:
     accel, unit, how = _accelerometer(export)
     shown = {"ios": "iOS", "android": "Android"}.get(device.platform or "", "unknown system")
     clock = "time" if "time" in accel.table.columns else "seconds_elapsed"
+    unit_of_time = "ns" if clock == "time" else "s"
+    found = f"time in {unit_of_time}, {gyro} in rad/s, {how}"
     return Source(
         path,
         SensorFile("gyro", export.file(gyro), export.table(gyro), clock, _AXES),
         accel._replace(time=clock),
-        Units("ns" if clock == "time" else "s", "rad/s", unit, device.sign),
-        notes=(f"{path.name}: Sensor Logger ({shown}); {gyro} in rad/s, {how}",),
+        Units(unit_of_time, "rad/s", unit, device.sign),
+        notes=(f"{path.name}: Sensor Logger ({shown}); {found}",),
     )
 
 

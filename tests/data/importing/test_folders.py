@@ -36,7 +36,7 @@ def test_an_estimate_is_moved_to_the_imu(tmp_path, mount):
     sequence, notes = import_recording(tmp_path)
     compare(sequence, 1e-4)
     assert sequence.attributes["start_time"] == pytest.approx(EPOCH * 1e-9, abs=1e-6)
-    assert "EuRoC's layout, reference state_groundtruth_estimate0" in notes[0]
+    assert "EuRoC's layout (ns, rad/s, m/s2), reference state_groundtruth_estimate0" in notes[0]
     assert sequence.attributes["truth"] == "state_groundtruth_estimate0"
 
 
@@ -51,7 +51,7 @@ def test_no_reference(tmp_path):
     asl_files.write_imu(tmp_path / "mav0", seconds=3.0)
     sequence, notes = import_recording(tmp_path, rate=100.0)
     assert not sequence.valid.any() and len(sequence.time) == 300
-    assert "EuRoC's layout, no reference" in notes[0]
+    assert "EuRoC's layout (ns, rad/s, m/s2), no reference" in notes[0]
 
 
 def test_a_column_that_is_missing_is_named_as_the_authors_do(tmp_path):

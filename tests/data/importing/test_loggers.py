@@ -54,10 +54,20 @@ def without(members, *names):
 @pytest.mark.parametrize(
     ("platform", "standardised", "dropped", "words"),
     [
-        ("android", False, (), "Sensor Logger (Android); Gyroscope in rad/s, TotalAcceleration in"),
+        (
+            "android",
+            False,
+            (),
+            "Sensor Logger (Android); time in ns, Gyroscope in rad/s, TotalAcceleration in",
+        ),
         ("android", False, ("Metadata.csv",), "Sensor Logger (Android)"),
         ("android", False, ("TotalAcceleration.csv",), "Accelerometer + Gravity in m/s2"),
-        ("ios", False, (), "Sensor Logger (iOS); Gyroscope in rad/s, Accelerometer + Gravity"),
+        (
+            "ios",
+            False,
+            (),
+            "Sensor Logger (iOS); time in ns, Gyroscope in rad/s, Accelerometer + Gravity",
+        ),
         ("ios", True, (), "Sensor Logger (iOS)"),
         ("ios", False, ("Accelerometer.csv",), "AccelerometerUncalibrated.csv: accel taken as g"),
         ("ios", True, ("Accelerometer.csv",), "AccelerometerUncalibrated.csv: accel taken as m/s2"),
@@ -237,7 +247,7 @@ def test_phyphox_as_text(tmp_path, separator, decimal):
     path = zipped(tmp_path / "walk.zip", phyphox(separator, decimal))
     sequence, notes = import_recording(path)
     compare(sequence)
-    text = "phyphox; Gyroscope.csv in rad/s, Accelerometer.csv in m/s2, by their headers"
+    text = "phyphox; time in s, Gyroscope.csv in rad/s, Accelerometer.csv in m/s2, by their headers"
     assert f"walk.zip: {text}" in notes
 
 
@@ -246,7 +256,7 @@ def test_phyphox_as_a_workbook(tmp_path, monkeypatch):
     for name in ("walk.xlsx", "walk.xls"):
         sequence, notes = import_recording(tmp_path / name)
         compare(sequence)
-        assert f"{name}: phyphox; Gyroscope in rad/s, Accelerometer in m/s2" in notes[0]
+        assert f"{name}: phyphox; time in s, Gyroscope in rad/s, Accelerometer in m/s2" in notes[0]
     monkeypatch.setattr(archives, "LARGEST", 2**15)
     refused(tmp_path / "walk.xlsx", "walk.xlsx: unpacks to 0 MiB; no table may exceed 0 MiB")
     damaged = (tmp_path / "walk.xls").read_bytes()[:3000]
