@@ -144,7 +144,7 @@ def write(folder: Path, kind, entries):
     """The recording as one of `KINDS`."""
     entries = sorted(entries, key=lambda row: row[2])
     if kind.startswith("mcap"):
-        return _write_mcap(folder / "walk.mcap", kind, entries)
+        return write_mcap(folder / "walk.mcap", kind, entries)
     if kind == "rosbag1":
         path, writer = folder / "walk.bag", rosbag1.Writer(folder / "walk.bag")
     else:
@@ -166,7 +166,7 @@ def _encoded(store, name, message):
     return bytes(encode(message, name))
 
 
-def _write_mcap(path, kind, entries, encoding=None):
+def write_mcap(path, kind, entries, encoding=None):
     store, ids = store_of(kind), {}
     profile, schema, own = ("ros1", "ros1msg", 1) if store is ROS1 else ("ros2", "ros2msg", 2)
     encoding = encoding or ("ros1" if store is ROS1 else "cdr")

@@ -160,18 +160,27 @@ def _imported(source: Source, stated: Units, order: str, rate: float | None, nam
 
 
 def _with_track(sequence: Sequence, start: float, track: Track, notes: list[str]) -> Sequence:
-    """With the reference, where it can be one; whether both describe the same motion is said."""
+    """With the reference, where it can be one and describes the motion of the IMU."""
     try:
-        sequence = with_reference(sequence, start, track)
+        result = with_reference(sequence, start, track)
+        _check_motion_is_one(result, track)
     except InputError as error:
         if track.named:
             raise
         notes.append(f"no reference is taken: {error}")
         return sequence
-    notes.append(f"reference from {track.name}, {sequence.valid.mean():.0%} of the time")
-    check = self_check(sequence, pedestrian=False)
-    notes.extend(f"the reference does not fit the IMU: {problem}" for problem in check.failures)
-    return sequence
+    notes.append(f"reference from {track.name}, {result.valid.mean():.0%} of the time")
+    return result
+
+
+def _check_motion_is_one(sequence: Sequence, track: Track) -> None:
+    """Raise `InputError` where the self-check would leave the sequence out."""
+    if failures := self_check(sequence, pedestrian=False).failures:
+        raise InputError(
+            track.path,
+            f"the reference {track.name} does not fit the IMU ({'; '.join(failures)})",
+            "its frame must be the IMU's, its world z-up, its clock the same",
+        )
 
 
 def _joined(source: Source, stated: Units, order: str, notes: list[str]) -> Joined:

@@ -195,15 +195,19 @@ def test_a_reference_that_is_none_is_left_out_unless_it_was_named(tmp_path):
     assert any("does not overlap the IMU" in note for note in notes)
 
 
-def test_a_reference_of_another_body_is_said_to_be_one(tmp_path):
-    """Its frame is turned against the IMU's, and nothing says how."""
+def test_a_reference_that_does_not_fit_the_imu_is_none(tmp_path):
+    """Its world lies on its side."""
     make = Maker()
-    sequence, notes = import_recording(
-        write(tmp_path, "mcap", imu(make) + poses(make, "Odometry", MOUNT))
-    )
+    on_its_side = Rotation.from_euler("x", 90, degrees=True)
+    entries = imu(make) + poses(make, "PoseStamped", (on_its_side, np.zeros(3)))
+    path = write(tmp_path, "mcap", entries)
+    sequence, notes = import_recording(path)
     text = " | ".join(notes)
-    assert "poses of 'base_link', the IMU is in 'imu_link', and no static transform" in text
-    assert "the reference does not fit the IMU: " in text or not sequence.valid.any()
+    assert "poses of 'an unnamed frame', the IMU is in 'imu_link', and no static tra" in text
+    words = "the reference /pose does not fit the IMU .mean of R·accel is"
+    assert words.replace("IMU .", "IMU (") in text and not sequence.valid.any()
+    assert sequence.attributes["truth"] == "none"
+    refused(path, words, reference_topic="/pose")
 
 
 @pytest.mark.parametrize("kind", ["rosbag1", "db3", "mcap"])
@@ -223,7 +227,7 @@ def test_a_chunk_that_unpacks_to_gigabytes_is_refused(tmp_path, monkeypatch):
 
 def test_messages_of_another_encoding_are_refused(tmp_path):
     entries = imu(Maker(), seconds=2.0)
-    path = bag_files._write_mcap(tmp_path / "walk.mcap", "mcap", entries, encoding="protobuf")
+    path = bag_files.write_mcap(tmp_path / "walk.mcap", "mcap", entries, encoding="protobuf")
     refused(path, "walk.mcap: topic /imu/data is encoded as protobuf; record it as ROS 2")
 
 
