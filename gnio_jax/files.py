@@ -30,6 +30,9 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
         # mkstemp makes it private: give it the mode of any other new file.
         temporary.chmod(0o666 & ~umask)
         os.replace(temporary, path)
+    except OSError as error:
+        error.filename = error.filename or str(path)  # a full disk comes without a name
+        raise
     finally:
         temporary.unlink(missing_ok=True)
 

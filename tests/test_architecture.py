@@ -27,9 +27,11 @@ ROOMS = {
 
 LIBRARIES = {
     "flax": {"models", "training", "evaluation", "interop"},
+    "mcap": {"data.importing.bags", "evaluation.exporting.ros"},
     "matplotlib": {"data", "evaluation", "tables"},
     "optax": {"training"},
     "orbax": {"training.checkpoint"},
+    "rosbags": {"data.importing.bags", "evaluation.exporting.ros"},
     "rich.console.Console": {"commands"},
     "rich.progress": {"commands"},
     "tensorboardX": {"training.log"},

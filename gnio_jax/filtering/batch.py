@@ -1,21 +1,65 @@
-"""Many sequences at once: vmapped, and the batch shared out among the devices of all processes."""
+"""Many sequences at once: those of like lengths together, vmapped, and shared out among the devices
+of all processes."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import TypeVar
+from collections.abc import Callable, Iterable, Sequence
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, PartitionSpec
+from jaxtyping import Float
 
 from gnio_jax.cores import usable_cores
+from gnio_jax.numerics import filled_up
 from gnio_jax.scaling.devices import cpu_devices
 from gnio_jax.scaling.processes import several
 from gnio_jax.types import Array
 
 T = TypeVar("T")
+
+
+class Batch(NamedTuple):
+    """Recordings that are filtered side by side."""
+
+    members: list[int]
+    """Which; the last one repeated where they do not fill the batch."""
+    intervals: int
+    """Clone intervals that all are padded to."""
+
+
+def batches(intervals: Sequence[int], size: int, padded: Callable[[int], int]) -> list[Batch]:
+    """Recordings of like lengths together, which need little padding, the longest first.
+
+    intervals: length of each recording in clone intervals; `padded` gives the length of a batch
+    from that of its longest member. It should know few lengths: each is a compilation. All batches
+    have `size` members.
+    """
+    longest_first = sorted(range(len(intervals)), key=lambda i: -intervals[i])
+    found = []
+    for begin in range(0, len(intervals), size):
+        members = longest_first[begin : begin + size]
+        filled = members + members[-1:] * (size - len(members))
+        found.append(Batch(filled, padded(intervals[members[0]])))
+    return found
+
+
+def padded_signals(
+    recordings: Iterable[tuple[Float[Array, "m 3"], Float[Array, "m 3"]]], samples: int
+) -> tuple[Float[np.ndarray, "b n 3"], Float[np.ndarray, "b n 3"]]:
+    """Gyro and accel of recordings, each with `samples` rows.
+
+    What is appended comes after the recording and changes nothing before it: no rotation, and the
+    last specific force.
+    """
+    pairs = [
+        (filled_up(gyro[:samples], samples, 0.0), filled_up(accel[:samples], samples))
+        for gyro, accel in recordings
+    ]
+    gyro, accel = zip(*pairs, strict=True)
+    return np.stack(gyro), np.stack(accel)
 
 
 def over_sequences(function: Callable[..., T], shared: int = 0) -> Callable[..., T]:

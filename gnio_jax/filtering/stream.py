@@ -10,7 +10,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from gnio_jax.numerics import filled_up
+from gnio_jax.filtering.batch import batches, padded_signals
 from gnio_jax.scaling.processes import on_host
 from gnio_jax.types import Array
 
@@ -52,18 +52,13 @@ def _in_order(
     run: Callable[[Any, Array, Array], Any], chunk: list[Recorded], n: int, batch_size: int
 ) -> Iterator[Any]:
     intervals = [len(each.gyro) // n for each in chunk]
-    longest_first = sorted(range(len(chunk)), key=lambda i: -intervals[i])
     found: dict[int, Any] = {}
-    for begin in range(0, len(chunk), batch_size):
-        members = longest_first[begin : begin + batch_size]
-        rows = _padded(intervals[members[0]]) * n
-        filled = members + members[-1:] * (batch_size - len(members))
-        starts = jax.tree.map(lambda *leaves: np.stack(leaves), *(chunk[i].start for i in filled))
-        # What is appended comes after the recording and changes nothing before it.
-        gyro = np.stack([filled_up(chunk[i].gyro[:rows], rows, 0.0) for i in filled])
-        accel = np.stack([filled_up(chunk[i].accel[:rows], rows) for i in filled])
-        results = on_host(run(starts, gyro, accel))
-        for place, i in enumerate(members):
+    for batch in batches(intervals, batch_size, _padded):
+        members = [chunk[i] for i in batch.members]
+        starts = jax.tree.map(lambda *leaves: np.stack(leaves), *(each.start for each in members))
+        signals = padded_signals(((each.gyro, each.accel) for each in members), batch.intervals * n)
+        results = on_host(run(starts, *signals))
+        for place, i in enumerate(dict.fromkeys(batch.members)):
             # A copy: a part would keep the whole batch in memory.
             found[i] = jax.tree.map(
                 lambda leaf, p=place, k=intervals[i]: leaf[p, :k].copy(), results

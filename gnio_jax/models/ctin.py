@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 from flax import linen as nn
@@ -10,7 +12,7 @@ from jaxtyping import Float
 
 from gnio_jax.models.heads import root_mean_square, to_axes
 from gnio_jax.models.layers import attention, check_dropout, check_output_dim, layer_norm, linear
-from gnio_jax.models.precision import einsum
+from gnio_jax.models.precision import Dtype, einsum
 from gnio_jax.models.resnet import batch_norm, conv, he_normal_fan_out
 from gnio_jax.types import Prediction
 
@@ -57,6 +59,7 @@ class CTIN(nn.Module):
     encoder_dropout: float = 0.5
     decoder_dropout: float = 0.05
     output_dim: int = 3
+    dtype: Dtype = "float32"
 
     def __post_init__(self) -> None:
         check_dropout(self.encoder_dropout)
@@ -79,19 +82,18 @@ class CTIN(nn.Module):
     @nn.compact
     def __call__(self, windows: Float[jax.Array, "b n 6"], train: bool = False) -> Prediction:
         windows = windows.astype(jnp.float32)
-        x = SpatialEmbedding(self.width, name="spatial_embedding")(windows, train)
-        memory = SpatialEncoder(
-            self.encoder_width, self.heads, self.encoder_dropout, name="encoder"
-        )(x, train)
+        x = SpatialEmbedding(self.width, self.dtype, name="spatial_embedding")(windows, train)
+        sizes = self.encoder_width, self.heads, self.encoder_dropout
+        memory = SpatialEncoder(*sizes, self.dtype, name="encoder")(x, train)
         x = TemporalEmbedding(self.width, name="temporal_embedding")(windows)
+        sizes = self.heads, self.ffn, self.decoder_dropout
         for layer in range(self.decoder_layers):
-            x = DecoderLayer(
-                self.heads, self.ffn, self.decoder_dropout, name=f"decoder_{layer + 1}"
-            )(x, memory, train)
+            name = f"decoder_{layer + 1}"
+            x = DecoderLayer(*sizes, self.dtype, name=name)(x, memory, train)
         # The uncertainty starts at σ = 1 (ours), as in `heads.UncertaintyHead` and for its reason.
         starts = {"velocity": nn.initializers.lecun_normal(), "log_std": nn.initializers.zeros}
         velocity, log_std = (
-            jax.vmap(to_axes)(SampleHead(self.output_dim, start, name=name)(x))
+            jax.vmap(to_axes)(SampleHead(self.output_dim, start, self.dtype, name=name)(x))
             for name, start in starts.items()
         )
         task_log_std = self.param("task_log_std", nn.initializers.zeros, (2,), jnp.float32)
@@ -110,13 +112,14 @@ class SpatialEmbedding(nn.Module):
     """Convolution (ours: over 3 samples), normalisation, linear layer."""
 
     width: int
+    dtype: Dtype = "float32"
 
     @nn.compact
     def __call__(
         self, windows: Float[jax.Array, "b n c"], train: bool
     ) -> Float[jax.Array, "b n d"]:
-        x = batch_norm(train, "bn")(conv(self.width, 3, 1, train, "conv")(windows))
-        return linear(self.width, "linear")(x)
+        x = conv(self.width, 3, 1, train, "conv", self.dtype)(windows)
+        return linear(self.width, "linear", self.dtype)(batch_norm(train, "bn")(x))
 
 
 class SpatialEncoder(nn.Module):
@@ -126,13 +129,17 @@ class SpatialEncoder(nn.Module):
     width: int
     heads: int
     dropout: float
+    dtype: Dtype = "float32"
 
     @nn.compact
     def __call__(self, x: Float[jax.Array, "b n d"], train: bool) -> Float[jax.Array, "b n d"]:
-        y = nn.relu(batch_norm(train, "reduce_bn")(conv(self.width, 1, 1, train, "reduce_conv")(x)))
-        y = LocalAttention(name="local")(y, train)
-        y = nn.Dropout(self.dropout, deterministic=not train)(attention(self.heads, "global")(y))
-        y = batch_norm(train, "expand_bn")(conv(x.shape[-1], 1, 1, train, "expand_conv")(y))
+        drop = nn.Dropout(self.dropout, deterministic=not train)
+        y = conv(self.width, 1, 1, train, "reduce_conv", self.dtype)(x)
+        y = nn.relu(batch_norm(train, "reduce_bn")(y))
+        y = LocalAttention(self.dtype, name="local")(y, train)
+        y = drop(attention(self.heads, "global", self.dtype)(y))
+        y = conv(x.shape[-1], 1, 1, train, "expand_conv", self.dtype)(y)
+        y = batch_norm(train, "expand_bn")(y)
         return nn.relu(x + y)
 
 
@@ -147,6 +154,8 @@ class LocalAttention(nn.Module):
     the keys.
     """
 
+    dtype: Dtype = "float32"
+
     @nn.compact
     def __call__(self, x: Float[jax.Array, "b n c"], train: bool) -> Float[jax.Array, "b n c"]:
         batch, samples, channels = x.shape
@@ -159,25 +168,25 @@ class LocalAttention(nn.Module):
             kernel_init=he_normal_fan_out,
             dtype=jnp.float32,
             param_dtype=jnp.float32,
-            conv_general_dilated=_convolve_groups,
+            conv_general_dilated=partial(_convolve_groups, dtype=self.dtype),
             name="key_conv",
         )
         key = nn.relu(batch_norm(train, "key_bn")(key_conv(x)))
-        value = batch_norm(train, "value_bn")(conv(channels, 1, 1, train, "value_conv")(x))
-        hidden = conv(channels // SQUEEZE, 1, 1, train, "hidden_conv")(
+        value = conv(channels, 1, 1, train, "value_conv", self.dtype)(x)
+        value = batch_norm(train, "value_bn")(value)
+        hidden = conv(channels // SQUEEZE, 1, 1, train, "hidden_conv", self.dtype)(
             jnp.concatenate([x, key], axis=-1)
         )
-        scores = linear(SPAN * channels, "weights")(nn.relu(batch_norm(train, "hidden_bn")(hidden)))
+        hidden = nn.relu(batch_norm(train, "hidden_bn")(hidden))
+        scores = linear(SPAN * channels, "weights", self.dtype)(hidden)
         weights = nn.softmax(scores.reshape(batch, samples, SPAN, channels), axis=2)
         context = jnp.sum(weights * _neighbours(value, SPAN), axis=2)
 
         both = jnp.stack([context, key], axis=1)
-        pooled = nn.relu(
-            linear(channels // SQUEEZE, "squeeze", use_bias=False)(both.sum(axis=1).mean(axis=1))
-        )
-        shares = nn.softmax(
-            linear(2 * channels, "excite")(pooled).reshape(batch, 2, 1, channels), axis=1
-        )
+        squeeze = linear(channels // SQUEEZE, "squeeze", self.dtype, use_bias=False)
+        pooled = nn.relu(squeeze(both.sum(axis=1).mean(axis=1)))
+        excited = linear(2 * channels, "excite", self.dtype)(pooled)
+        shares = nn.softmax(excited.reshape(batch, 2, 1, channels), axis=1)
         return jnp.sum(shares * both, axis=1)
 
 
@@ -209,6 +218,7 @@ class DecoderLayer(nn.Module):
     heads: int
     ffn: int
     dropout: float
+    dtype: Dtype = "float32"
 
     @nn.compact
     def __call__(
@@ -216,9 +226,12 @@ class DecoderLayer(nn.Module):
     ) -> Float[jax.Array, "b n d"]:
         drop = nn.Dropout(self.dropout, deterministic=not train)
         causal = jnp.tril(jnp.ones((x.shape[1], x.shape[1]), bool))[None, None]
-        x = layer_norm("self_norm")(x + drop(attention(self.heads, "self")(x, mask=causal)))
-        x = layer_norm("cross_norm")(x + drop(attention(self.heads, "cross")(x, memory)))
-        y = linear(x.shape[-1], "contract")(drop(nn.relu(linear(self.ffn, "expand")(x))))
+        y = attention(self.heads, "self", self.dtype)(x, mask=causal)
+        x = layer_norm("self_norm")(x + drop(y))
+        y = attention(self.heads, "cross", self.dtype)(x, memory)
+        x = layer_norm("cross_norm")(x + drop(y))
+        y = drop(nn.relu(linear(self.ffn, "expand", self.dtype)(x)))
+        y = linear(x.shape[-1], "contract", self.dtype)(y)
         return layer_norm("ffn_norm")(x + drop(y))
 
 
@@ -231,12 +244,12 @@ class SampleHead(nn.Module):
 
     outputs: int
     output_init: nn.initializers.Initializer
+    dtype: Dtype = "float32"
 
     @nn.compact
     def __call__(self, x: Float[jax.Array, "b n d"]) -> Float[jax.Array, "b n k"]:
-        return linear(self.outputs, "output", kernel_init=self.output_init)(
-            layer_norm("norm")(linear(x.shape[-1] // 2, "hidden")(x))
-        )
+        hidden = layer_norm("norm")(linear(x.shape[-1] // 2, "hidden", self.dtype)(x))
+        return linear(self.outputs, "output", self.dtype, kernel_init=self.output_init)(hidden)
 
 
 def _neighbours(x: Float[jax.Array, "b n c"], span: int) -> Float[jax.Array, "b n s c"]:
@@ -250,6 +263,7 @@ def _convolve_groups(
     kernel: Float[jax.Array, "k g d"],
     *_: object,
     feature_group_count: int = 1,
+    dtype: Dtype,
     **__: object,
 ) -> Float[jax.Array, "b n d"]:
     """A convolution of groups of channels that keeps the length, as products: the gradient of XLA's
@@ -258,4 +272,5 @@ def _convolve_groups(
     batch, samples, _channels = x.shape
     shifted = _neighbours(x, size).reshape(batch, samples, size, feature_group_count, channels)
     kernel = kernel.reshape(size, channels, feature_group_count, features // feature_group_count)
-    return einsum("bnkgc,kcgd->bngd", shifted, kernel).reshape(batch, samples, features)
+    product = einsum("bnkgc,kcgd->bngd", shifted, kernel, dtype)
+    return product.reshape(batch, samples, features)

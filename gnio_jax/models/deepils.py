@@ -3,12 +3,15 @@ from the network's description."""
 
 from __future__ import annotations
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 from flax import linen as nn
 from jaxtyping import Float
 
 from gnio_jax.models.layers import linear
+from gnio_jax.models.precision import Dtype
 from gnio_jax.models.resnet import batch_norm, conv, max_pool, residual_groups
 from gnio_jax.models.ronin import DisplacementRegressor
 
@@ -30,9 +33,9 @@ class DeepILS(DisplacementRegressor):
 
     def features(self, windows: Float[jax.Array, "b n 6"], train: bool) -> jax.Array:
         padded = jnp.pad(windows, ((0, 0), (1, 1), (0, 0)))  # one more than its kernel asks for
-        x = conv(self.width, 5, 2, train, "stem_conv")(padded)
+        x = conv(self.width, 5, 2, train, "stem_conv", self.dtype)(padded)
         x = max_pool(nn.relu(batch_norm(train, "stem_bn")(x)))
-        return residual_groups(AttentiveBlock, self.width, x, train)
+        return residual_groups(partial(AttentiveBlock, dtype=self.dtype), self.width, x, train)
 
 
 class AttentiveBlock(nn.Module):
@@ -41,20 +44,20 @@ class AttentiveBlock(nn.Module):
 
     features: int
     stride: int
+    dtype: Dtype = "float32"
 
     @nn.compact
     def __call__(self, x: Float[jax.Array, "b n c"], train: bool) -> Float[jax.Array, "b m d"]:
-        y = conv(self.features, 1, 1, train, "conv1")(
-            _depthwise(x.shape[-1], self.stride, "depthwise1")(x)
-        )
+        y = _depthwise(x.shape[-1], self.stride, "depthwise1")(x)
+        y = conv(self.features, 1, 1, train, "conv1", self.dtype)(y)
         y = nn.relu(batch_norm(train, "bn1")(y))
-        y = conv(self.features, 1, 1, train, "conv2")(_depthwise(self.features, 1, "depthwise2")(y))
+        y = _depthwise(self.features, 1, "depthwise2")(y)
+        y = conv(self.features, 1, 1, train, "conv2", self.dtype)(y)
         y = batch_norm(train, "bn2")(y)
-        y = TimeAttention(name="time_attention")(
-            ChannelAttention(name="channel_attention")(y), train
-        )
+        y = ChannelAttention(self.dtype, name="channel_attention")(y)
+        y = TimeAttention(self.dtype, name="time_attention")(y, train)
         if self.stride != 1 or x.shape[-1] != self.features:
-            x = conv(self.features, 1, self.stride, train, "shortcut_conv")(x)
+            x = conv(self.features, 1, self.stride, train, "shortcut_conv", self.dtype)(x)
             x = batch_norm(train, "shortcut_bn")(x)
         return nn.relu(x + y)
 
@@ -63,23 +66,26 @@ class ChannelAttention(nn.Module):
     """x ⊙ σ(f(mean over time) + f(maximum over time)), f a shared C → C/16 → C without biases
     (ours: ReLU between, one unit at least)."""
 
+    dtype: Dtype = "float32"
+
     @nn.compact
     def __call__(self, x: Float[jax.Array, "b n c"]) -> Float[jax.Array, "b n c"]:
         channels = x.shape[-1]
         pooled = jnp.stack([x.mean(axis=1), _maximum(x, 1)], axis=1)
-        hidden = nn.relu(linear(max(channels // REDUCTION, 1), "squeeze", use_bias=False)(pooled))
-        return x * nn.sigmoid(
-            linear(channels, "excite", use_bias=False)(hidden).sum(axis=1, keepdims=True)
-        )
+        squeeze = linear(max(channels // REDUCTION, 1), "squeeze", self.dtype, use_bias=False)
+        excite = linear(channels, "excite", self.dtype, use_bias=False)
+        return x * nn.sigmoid(excite(nn.relu(squeeze(pooled))).sum(axis=1, keepdims=True))
 
 
 class TimeAttention(nn.Module):
     """x ⊙ σ(convolution over 7 samples of the mean and the maximum over channels), without bias."""
 
+    dtype: Dtype = "float32"
+
     @nn.compact
     def __call__(self, x: Float[jax.Array, "b n c"], train: bool) -> Float[jax.Array, "b n c"]:
         pooled = jnp.stack([x.mean(axis=-1), _maximum(x, 2)], axis=-1)
-        return x * nn.sigmoid(conv(1, 7, 1, train, "conv")(pooled))
+        return x * nn.sigmoid(conv(1, 7, 1, train, "conv", self.dtype)(pooled))
 
 
 def _maximum(x: Float[jax.Array, "b n c"], axis: int) -> Float[jax.Array, "b k"]:

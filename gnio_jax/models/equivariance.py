@@ -18,6 +18,7 @@ from jaxtyping import Float
 from gnio_jax.geometry import direction
 from gnio_jax.models.heads import root_mean_square
 from gnio_jax.models.layers import linear
+from gnio_jax.models.precision import Dtype
 from gnio_jax.models.resnet import batch_norm, conv
 from gnio_jax.types import GRAVITY, Prediction
 
@@ -33,6 +34,7 @@ class Equivariant(nn.Module):
     """A network whose parts lie beside those that make it equivariant."""
 
     network: nn.Module
+    dtype: Dtype = "float32"
 
     def setup(self) -> None:
         nn.share_scope(self, self.network)
@@ -92,7 +94,7 @@ class CanonicalFrame(Equivariant):
 
     def setup(self) -> None:
         super().setup()
-        self.frame = FrameNetwork()
+        self.frame = FrameNetwork(self.dtype)
 
     def __call__(
         self, windows: Float[jax.Array, "b n 6"], train: bool = False, **constants: Any
@@ -113,15 +115,17 @@ class FrameNetwork(nn.Module):
     gradient.
     """
 
+    dtype: Dtype = "float32"
+
     @nn.compact
     def __call__(self, windows: Float[jax.Array, "b n 6"], train: bool) -> Float[jax.Array, "b 2"]:
         x = invariants(windows)
         for layer in ("1", "2"):
-            x = conv(FRAME_FEATURES, FRAME_SPAN, 1, train, f"conv{layer}")(x)
+            x = conv(FRAME_FEATURES, FRAME_SPAN, 1, train, f"conv{layer}", self.dtype)(x)
             x = nn.relu(batch_norm(train, f"bn{layer}")(x))
         accel, gyro = windows[..., 0:2], windows[..., 3:5]
         vectors = jnp.stack([accel, quarter_turn(accel), gyro, quarter_turn(gyro)], axis=2)
-        weights = linear(vectors.shape[2], "weights")(x)
+        weights = linear(vectors.shape[2], "weights", self.dtype)(x)
         mean = jnp.einsum("bnk,bnkd->bd", weights, vectors) / windows.shape[1]
         return jnp.stack(direction(mean[:, 0], mean[:, 1]), axis=-1)
 

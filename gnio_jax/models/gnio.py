@@ -18,6 +18,7 @@ from gnio_jax.models.heads import (
     UncertaintyHead,
 )
 from gnio_jax.models.motion_bank import MotionBank
+from gnio_jax.models.precision import Dtype
 from gnio_jax.models.resnet import ResNet18
 from gnio_jax.types import Prediction
 
@@ -41,6 +42,7 @@ class GNIO(nn.Module):
     gate: Literal["tanh", "sigmoid"] = "tanh"
     scale: Literal["softplus", "pos_elu", "abs", "exp", "linear"] = "softplus"
     uncertainty: Literal["head", "calibrated", "constant"] = "head"
+    dtype: Dtype = "float32"
 
     def __post_init__(self) -> None:
         if self.bank_size and (8 * self.width) % self.bank_heads:
@@ -53,30 +55,33 @@ class GNIO(nn.Module):
     def __call__(
         self, windows: Float[jax.Array, "b n 6"], train: bool = False, memory: Any = None
     ) -> Prediction:
-        features = ResNet18(self.width, name="encoder")(windows.astype(jnp.float32), train)
+        features = ResNet18(self.width, self.dtype, name="encoder")(
+            windows.astype(jnp.float32), train
+        )
         h = features.mean(axis=1)
         diagnostics = {}
         if self.bank_size:
             context, diagnostics["attention"] = self._bank(name="bank")(h, memory)
             h = h + context
         head = (
-            GatedHead(self.gate, self.scale, name="head")
+            GatedHead(self.gate, self.scale, self.dtype, name="head")
             if self.head == "gated"
-            else LinearHead(name="head")
+            else LinearHead(self.dtype, name="head")
         )
         displacement, seen = head(h)
         match self.uncertainty:
             case "head":
-                log_std = UncertaintyHead(name="uncertainty")(h)
+                log_std = UncertaintyHead(self.dtype, name="uncertainty")(h)
             case "calibrated":
-                log_std = CalibratedUncertainty(name="uncertainty")(h, train)
+                log_std = CalibratedUncertainty(self.dtype, name="uncertainty")(h, train)
             case "constant":
                 log_std = ConstantUncertainty(name="uncertainty")(windows.shape[0])
         return Prediction(displacement, log_std, diagnostics | seen)
 
     @nn.nowrap
     def _bank(self, name: str | None = None) -> MotionBank:
-        return MotionBank(self.bank_size, self.bank_heads, 8 * self.width, self.bank_std, name=name)
+        sizes = self.bank_size, self.bank_heads, 8 * self.width
+        return MotionBank(*sizes, self.bank_std, self.dtype, name=name)
 
     @nn.nowrap
     def constants(self, variables: Any) -> dict[str, Any]:

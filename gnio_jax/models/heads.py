@@ -9,6 +9,7 @@ from flax import linen as nn
 from jaxtyping import Float
 
 from gnio_jax.models.layers import linear
+from gnio_jax.models.precision import Dtype
 
 GATES = {"tanh": jnp.tanh, "sigmoid": nn.sigmoid}
 SCALES = {
@@ -30,24 +31,28 @@ class GatedHead(nn.Module):
 
     gate: str = "tanh"
     scale: str = "softplus"
+    dtype: Dtype = "float32"
 
     @nn.compact
     def __call__(
         self, h: Float[jax.Array, "b d"]
     ) -> tuple[Float[jax.Array, "b 3"], dict[str, jax.Array]]:
-        scale = SCALES[self.scale](linear(3, "scale")(h))
-        gate = GATES[self.gate](linear(3, "gate", kernel_init=nn.initializers.normal(1e-3))(h))
+        scale = SCALES[self.scale](linear(3, "scale", self.dtype)(h))
+        small = nn.initializers.normal(1e-3)
+        gate = GATES[self.gate](linear(3, "gate", self.dtype, kernel_init=small)(h))
         return scale * gate, {"scale": scale, "gate": gate}
 
 
 class LinearHead(nn.Module):
     """d̂ = W h + b: the ablation without a gate."""
 
+    dtype: Dtype = "float32"
+
     @nn.compact
     def __call__(
         self, h: Float[jax.Array, "b d"]
     ) -> tuple[Float[jax.Array, "b 3"], dict[str, jax.Array]]:
-        return linear(3, "displacement")(h), {}
+        return linear(3, "displacement", self.dtype)(h), {}
 
 
 class UncertaintyHead(nn.Module):
@@ -58,9 +63,11 @@ class UncertaintyHead(nn.Module):
     moment for thousands of steps.
     """
 
+    dtype: Dtype = "float32"
+
     @nn.compact
     def __call__(self, h: Float[jax.Array, "b d"]) -> Float[jax.Array, "b 3"]:
-        return _log_std()(h)
+        return _log_std(self.dtype)(h)
 
 
 class CalibratedUncertainty(nn.Module):
@@ -72,15 +79,17 @@ class CalibratedUncertainty(nn.Module):
     deviations announce (`training.step.calibrated`).
     """
 
+    dtype: Dtype = "float32"
+
     @nn.compact
     def __call__(self, h: Float[jax.Array, "b d"], train: bool) -> Float[jax.Array, "b 3"]:
-        log_std = _log_std()(h)
+        log_std = _log_std(self.dtype)(h)
         factor = self.variable("batch_stats", "log_factor", jnp.zeros, (3,), jnp.float32)
         return log_std if train else log_std + factor.value[None]
 
 
-def _log_std() -> nn.Dense:
-    return linear(3, "log_std", kernel_init=nn.initializers.zeros)
+def _log_std(dtype: Dtype) -> nn.Dense:
+    return linear(3, "log_std", dtype, kernel_init=nn.initializers.zeros)
 
 
 class ConstantUncertainty(nn.Module):

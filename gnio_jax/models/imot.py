@@ -3,6 +3,8 @@ arXiv 2412.12190), from its text."""
 
 from __future__ import annotations
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 from flax import linen as nn
@@ -17,6 +19,7 @@ from gnio_jax.models.layers import (
     layer_norm,
     linear,
 )
+from gnio_jax.models.precision import Dtype
 from gnio_jax.types import Prediction
 
 TREND_SPANS = (9, 3)
@@ -61,6 +64,7 @@ class IMoT(nn.Module):
     particles: int = 128
     dropout: float = 0.1
     output_dim: int = 3
+    dtype: Dtype = "float32"
 
     def __post_init__(self) -> None:
         check_dropout(self.dropout)
@@ -88,24 +92,24 @@ class IMoT(nn.Module):
                 .reshape(batch, 6, -1)
                 / 2
             )
-            tokens, positions = EncoderLayer(heads, ffn, self.dropout, name=f"encoder_{layer + 1}")(
-                channels, train
-            )
+            name = f"encoder_{layer + 1}"
+            encoder = EncoderLayer(heads, ffn, self.dropout, self.dtype, name=name)
+            tokens, positions = encoder(channels, train)
 
         start = self.param(
             "particles", nn.initializers.normal(1.0), (self.particles, self.output_dim), jnp.float32
         )
         particles = jnp.broadcast_to(start[None], (batch, *start.shape))
         content = jnp.zeros((batch, self.particles, samples), jnp.float32)
-        locate = Perceptron((samples, samples), name="particle_positions")
-        refine = Perceptron((samples, self.output_dim), name="refinement")
+        locate = Perceptron((samples, samples), self.dtype, name="particle_positions")
+        refine = Perceptron((samples, self.output_dim), self.dtype, name="refinement")
         for layer in range(self.decoder_layers):
             where = locate(sinusoids_of(particles, samples))
-            content = DecoderLayer(heads, ffn, self.dropout, name=f"decoder_{layer + 1}")(
-                content, where, tokens, positions, train
-            )
+            name = f"decoder_{layer + 1}"
+            decoder = DecoderLayer(heads, ffn, self.dropout, self.dtype, name=name)
+            content = decoder(content, where, tokens, positions, train)
             particles = particles + refine(content)
-        weights = AttentionScores(name="scores")(content)
+        weights = AttentionScores(self.dtype, name="scores")(content)
         velocity = jnp.einsum("bp,bpk->bk", weights, particles)
         return Prediction(
             to_axes(velocity),
@@ -137,6 +141,7 @@ class EncoderLayer(nn.Module):
     heads: int
     ffn: int
     dropout: float
+    dtype: Dtype = "float32"
 
     @nn.compact
     def __call__(
@@ -146,13 +151,15 @@ class EncoderLayer(nn.Module):
         x = decouple(channels)
         samples = x.shape[-1]
         e = (
-            Perceptron((samples, samples), name="positions")(x)
+            Perceptron((samples, samples), self.dtype, name="positions")(x)
             * sinusoids(jnp.arange(x.shape[1], dtype=jnp.float32), samples)[None]
         )
-        y = attention(self.heads, "attention")(x + e, x + e, x)
-        x = layer_norm("attention_norm")(SpatialBlock(name="attention_spatial")(x) + drop(y))
-        y = Perceptron((self.ffn, samples), name="ffn")(x)
-        return layer_norm("ffn_norm")(SpatialBlock(name="ffn_spatial")(x) + drop(y)), e
+        y = attention(self.heads, "attention", self.dtype)(x + e, x + e, x)
+        spatial = SpatialBlock(self.dtype, name="attention_spatial")(x)
+        x = layer_norm("attention_norm")(spatial + drop(y))
+        y = Perceptron((self.ffn, samples), self.dtype, name="ffn")(x)
+        spatial = SpatialBlock(self.dtype, name="ffn_spatial")(x)
+        return layer_norm("ffn_norm")(spatial + drop(y)), e
 
 
 class SpatialBlock(nn.Module):
@@ -163,16 +170,18 @@ class SpatialBlock(nn.Module):
     1×1 convolution, GELU.
     """
 
+    dtype: Dtype = "float32"
+
     @nn.compact
     def __call__(self, x: Float[jax.Array, "b k n"]) -> Float[jax.Array, "b k n"]:
         batch, tokens, samples = x.shape
         y = jnp.concatenate(jnp.split(x, MODALITIES, axis=1), axis=2)
         padded = jnp.pad(y, ((0, 0), (1, 1), (0, 0)))
-        y = linear(2 * samples, "conv3")(
+        y = linear(2 * samples, "conv3", self.dtype)(
             jnp.concatenate([padded[:, :-2], y, padded[:, 2:]], axis=2)
         )
         y = y * nn.sigmoid(y.mean(axis=1, keepdims=True))
-        y = nn.gelu(linear(2 * samples, "conv1")(y), approximate=False)
+        y = nn.gelu(linear(2 * samples, "conv1", self.dtype)(y), approximate=False)
         return jnp.concatenate(jnp.split(y, MODALITIES, axis=2), axis=1).reshape(
             batch, tokens, samples
         )
@@ -190,6 +199,7 @@ class DecoderLayer(nn.Module):
     heads: int
     ffn: int
     dropout: float
+    dtype: Dtype = "float32"
 
     @nn.compact
     def __call__(
@@ -203,7 +213,7 @@ class DecoderLayer(nn.Module):
         drop = nn.Dropout(self.dropout, deterministic=not train)
         samples = content.shape[-1]
         x = layer_norm("self_norm")(
-            content + drop(ParticleAttention(self.heads, name="self")(content, where))
+            content + drop(ParticleAttention(self.heads, self.dtype, name="self")(content, where))
         )
         found = []
         for name, token, position in zip(
@@ -216,10 +226,12 @@ class DecoderLayer(nn.Module):
                 jnp.concatenate([x, where], axis=-1),
                 jnp.concatenate([token, position], axis=-1),
             )
-            y = attention(self.heads, name, samples)(query, key, token)
+            y = attention(self.heads, name, self.dtype, samples)(query, key, token)
             found.append(layer_norm(f"{name}_norm")(x + drop(y)))
-        x = Perceptron((samples, samples), name="fusion")(jnp.concatenate(found, axis=-1))
-        return layer_norm("ffn_norm")(x + drop(Perceptron((self.ffn, samples), name="ffn")(x)))
+        fusion = Perceptron((samples, samples), self.dtype, name="fusion")
+        x = fusion(jnp.concatenate(found, axis=-1))
+        y = Perceptron((self.ffn, samples), self.dtype, name="ffn")(x)
+        return layer_norm("ffn_norm")(x + drop(y))
 
 
 class ParticleAttention(nn.Module):
@@ -227,32 +239,39 @@ class ParticleAttention(nn.Module):
     projected contents."""
 
     heads: int
+    dtype: Dtype = "float32"
 
     @nn.compact
     def __call__(
         self, content: Float[jax.Array, "b p n"], where: Float[jax.Array, "b p n"]
     ) -> Float[jax.Array, "b p n"]:
         features = content.shape[-1]
+        project = partial(linear, features, dtype=self.dtype)
         query, key = (
-            linear(features, f"{name}_content")(content)
-            + linear(features, f"{name}_position")(where)
+            project(f"{name}_content")(content) + project(f"{name}_position")(where)
             for name in ("query", "key")
         )
         query, key, value = (
-            x.reshape(*x.shape[:2], self.heads, -1)
-            for x in (query, key, linear(features, "value")(content))
+            x.reshape(*x.shape[:2], self.heads, -1) for x in (query, key, project("value")(content))
         )
-        return linear(features, "output")(attend(query, key, value).reshape(content.shape))
+        found = attend(query, key, value, dtype=self.dtype)
+        return project("output")(found.reshape(content.shape))
 
 
 class AttentionScores(nn.Module):
     """Weights of the particles: for every feature two linear layers from all particles to all, the
     mean over features, softmax."""
 
+    dtype: Dtype = "float32"
+
+    dtype: Dtype = "float32"
+
     @nn.compact
     def __call__(self, content: Float[jax.Array, "b p n"]) -> Float[jax.Array, "b p"]:
         particles = content.shape[1]
-        scores = Perceptron((particles, particles), name="mlp")(content.transpose(0, 2, 1))
+        scores = Perceptron((particles, particles), self.dtype, name="mlp")(
+            content.transpose(0, 2, 1)
+        )
         return nn.softmax(scores.mean(axis=1), axis=-1)
 
 
@@ -260,10 +279,13 @@ class Perceptron(nn.Module):
     """Linear, ReLU, linear."""
 
     features: tuple[int, int]
+    dtype: Dtype = "float32"
 
     @nn.compact
     def __call__(self, x: Float[jax.Array, "*b n"]) -> Float[jax.Array, "*b d"]:
-        return linear(self.features[1], "output")(nn.relu(linear(self.features[0], "hidden")(x)))
+        inside, outside = self.features
+        hidden = nn.relu(linear(inside, "hidden", self.dtype)(x))
+        return linear(outside, "output", self.dtype)(hidden)
 
 
 def decouple(channels: Float[jax.Array, "b c n"]) -> Float[jax.Array, "b k n"]:

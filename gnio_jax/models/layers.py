@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import jax
@@ -9,16 +10,16 @@ import jax.numpy as jnp
 from flax import linen as nn
 from jaxtyping import Bool, Float
 
-from gnio_jax.models import precision
+from gnio_jax.models.precision import Dtype, dot_general, einsum
 
 
-def linear(features: int, name: str, **options: Any) -> nn.Dense:
-    """A linear layer."""
+def linear(features: int, name: str, dtype: Dtype, **options: Any) -> nn.Dense:
+    """A linear layer; `dtype` is that of its product's factors."""
     return nn.Dense(
         features,
         dtype=jnp.float32,
         param_dtype=jnp.float32,
-        dot_general=precision.dot_general,
+        dot_general=partial(dot_general, dtype=dtype),
         name=name,
         **options,
     )
@@ -34,7 +35,8 @@ def attend(
     key: Float[jax.Array, "b m h d"],
     value: Float[jax.Array, "b m h d"],
     mask: Bool[jax.Array, "1 1 n m"] | None = None,
-    **_: object,
+    *,
+    dtype: Dtype = "float32",
 ) -> Float[jax.Array, "b n h d"]:
     """Scaled dot-product attention in the place of Flax's: with few features a head, passes over
     the scores cost more than products.
@@ -46,27 +48,34 @@ def attend(
     query, key, value = (
         x.swapaxes(1, 2).reshape(batch * heads, -1, size) for x in (query, key, value)
     )
-    scores = precision.einsum("bnd,bmd->bnm", query / jnp.sqrt(jnp.float32(size)), key)
+    scores = einsum("bnd,bmd->bnm", query / jnp.sqrt(jnp.float32(size)), key, dtype)
     if mask is not None:
         scores = jnp.where(mask[0], scores, -jnp.inf)
     weights = jnp.exp(scores - jax.lax.stop_gradient(scores.max(axis=-1, keepdims=True)))
-    context = precision.einsum("bnm,bmd->bnd", weights, value) / weights.sum(axis=-1, keepdims=True)
+    context = einsum("bnm,bmd->bnd", weights, value, dtype) / weights.sum(axis=-1, keepdims=True)
     return context.reshape(batch, heads, samples, size).swapaxes(1, 2)
 
 
 def attention(
-    heads: int, name: str, features: int | None = None
+    heads: int, name: str, dtype: Dtype, features: int | None = None
 ) -> nn.MultiHeadDotProductAttention:
     """Multi-head attention by `attend`, as wide inside as its query; `features` come out, the
     query's number of them where it is None."""
+
+    def attention_fn(
+        query: jax.Array, key: jax.Array, value: jax.Array, mask: Any = None, **_: object
+    ) -> jax.Array:
+        return attend(query, key, value, mask, dtype=dtype)
+
+    product = partial(dot_general, dtype=dtype)
     return nn.MultiHeadDotProductAttention(
         heads,
         out_features=features,
         dtype=jnp.float32,
         param_dtype=jnp.float32,
-        attention_fn=attend,
-        qkv_dot_general=precision.dot_general,
-        out_dot_general=precision.dot_general,
+        attention_fn=attention_fn,
+        qkv_dot_general=product,
+        out_dot_general=product,
         name=name,
     )
 

@@ -3,12 +3,14 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 from flax import linen as nn
 from jaxtyping import Float
 
-from gnio_jax.models.precision import dot_general, einsum
+from gnio_jax.models.precision import Dtype, dot_general, einsum
 
 # PyTorch's `MultiheadAttention`: query, key and value are one (3d, d) matrix to its Xavier-uniform
 # start, so that their bound is √(6 / 4d) = √(3 · 0.5 / d), and the output is a linear layer with
@@ -31,9 +33,11 @@ class MotionBank(nn.Module):
     heads: int = 8
     width: int = 512
     std: float = 1.0
+    dtype: Dtype = "float32"
 
     def setup(self) -> None:
         shape = (self.heads, self.width // self.heads)
+        product = partial(dot_general, dtype=self.dtype)
         self.prototypes = self.param(
             "prototypes", nn.initializers.normal(self.std), (self.size, self.width), jnp.float32
         )
@@ -43,7 +47,7 @@ class MotionBank(nn.Module):
                 kernel_init=stacked_xavier,
                 dtype=jnp.float32,
                 param_dtype=jnp.float32,
-                dot_general=dot_general,
+                dot_general=product,
             )
             for _ in range(3)
         )
@@ -53,7 +57,7 @@ class MotionBank(nn.Module):
             kernel_init=fan_in_uniform,
             dtype=jnp.float32,
             param_dtype=jnp.float32,
-            dot_general=dot_general,
+            dot_general=product,
         )
 
     def __call__(
@@ -64,11 +68,11 @@ class MotionBank(nn.Module):
         """Context (b, d) and attention weights (b, heads, m) of each feature; `memory` is that of
         an earlier call, if there was one."""
         query, (key, value) = self.query(feature), self.memory() if memory is None else memory
-        scores = einsum("bhk,hmk->bhm", query, key) / jnp.sqrt(
+        scores = einsum("bhk,hmk->bhm", query, key, self.dtype) / jnp.sqrt(
             jnp.float32(self.width // self.heads)
         )
         attention = nn.softmax(scores, axis=-1)
-        return self.output(einsum("bhm,hkm->bhk", attention, value)), attention
+        return self.output(einsum("bhm,hkm->bhk", attention, value, self.dtype)), attention
 
     def memory(self) -> tuple[Float[jax.Array, "h m k"], Float[jax.Array, "h k m"]]:
         """Keys (heads, m, d / heads) and values (heads, d / heads, m) of the prototypes: as the

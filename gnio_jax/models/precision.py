@@ -7,46 +7,37 @@ the range of float32, so that losses need no scaling.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from contextvars import ContextVar
+from collections.abc import Callable
 from functools import partial
 from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
 
-_dtype: ContextVar[str] = ContextVar("dtype", default="float32")
+Dtype = Literal["float32", "bfloat16"]
+"""Type of the factors of a network's products: its option `dtype`."""
 
 
-@contextmanager
-def products_in(dtype: Literal["float32", "bfloat16"]) -> Iterator[None]:
-    """Products of networks that are traced within the context have factors of this type."""
-    token = _dtype.set(dtype)
-    try:
-        yield
-    finally:
-        _dtype.reset(token)
-
-
-def dot_general(a: jax.Array, b: jax.Array, dimension_numbers: Any, **options: Any) -> jax.Array:
-    """`jax.lax.dot_general`; for the layers of Flax."""
-    if _dtype.get() == "float32":
+def dot_general(
+    a: jax.Array, b: jax.Array, dimension_numbers: Any, *, dtype: Dtype, **options: Any
+) -> jax.Array:
+    """`jax.lax.dot_general`; for the layers of Flax, with `dtype` bound by `partial`."""
+    if dtype == "float32":
         return jax.lax.dot_general(a, b, dimension_numbers, **options)
     multiply = partial(jax.lax.dot_general, dimension_numbers=dimension_numbers)
     return _rounded(multiply, a, b)
 
 
-def einsum(subscripts: str, a: jax.Array, b: jax.Array) -> jax.Array:
+def einsum(subscripts: str, a: jax.Array, b: jax.Array, dtype: Dtype) -> jax.Array:
     """`jnp.einsum` of two arrays."""
-    if _dtype.get() == "float32":
+    if dtype == "float32":
         return jnp.einsum(subscripts, a, b)
     return _rounded(partial(jnp.einsum, subscripts), a, b)
 
 
-def matmul(a: jax.Array, b: jax.Array) -> jax.Array:
+def matmul(a: jax.Array, b: jax.Array, dtype: Dtype) -> jax.Array:
     """`a @ b`."""
-    return a @ b if _dtype.get() == "float32" else _rounded(jnp.matmul, a, b)
+    return a @ b if dtype == "float32" else _rounded(jnp.matmul, a, b)
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(0,))

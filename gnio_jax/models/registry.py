@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
-import functools
-from typing import Any
+from typing import Any, get_args
 
 import jax
 import jax.numpy as jnp
 from flax import linen as nn
-from jaxtyping import Float, PRNGKeyArray
+from jaxtyping import PRNGKeyArray
 
 from gnio_jax.errors import InputError
 from gnio_jax.models.ctin import CTIN
@@ -18,6 +17,7 @@ from gnio_jax.models.deepils import DeepILS
 from gnio_jax.models.equivariance import CanonicalFrame, FourHeadings
 from gnio_jax.models.gnio import GNIO
 from gnio_jax.models.imot import IMoT, IMoTText
+from gnio_jax.models.precision import Dtype
 from gnio_jax.models.ronin import RoNINResNet
 from gnio_jax.models.tlio import TLIO
 
@@ -42,13 +42,15 @@ def names() -> list[str]:
     return sorted(_MODELS)
 
 
-def create(name: str, equivariance: str = "none", **options: object) -> nn.Module:
+def create(
+    name: str, equivariance: str = "none", dtype: str = "float32", **options: object
+) -> nn.Module:
     """The network `name` with its options set; its `apply(variables, windows)` returns a
     `Prediction`.
 
-    `equivariance` is "none", "four_headings" or "canonical_frame" (`models.equivariance`). Raises
-    `InputError` for an unknown name or option, naming the known ones, or options that do not fit
-    together.
+    `equivariance` is "none", "four_headings" or "canonical_frame" (`models.equivariance`), `dtype`
+    the type of the factors of its products (`models.precision`). Raises `InputError` for an unknown
+    name or option, naming the known ones, or options that do not fit together.
     """
     if name not in _MODELS:
         raise InputError(f"model '{name}'", "unknown", f"known models: {', '.join(names())}")
@@ -70,30 +72,29 @@ def create(name: str, equivariance: str = "none", **options: object) -> nn.Modul
         known = ", ".join(["none", *_EQUIVARIANT])
         problem = f"unknown equivariance '{equivariance}'"
         raise InputError(f"model '{name}'", problem, f"known ones: {known}")
+    if dtype not in get_args(Dtype):
+        known = ", ".join(get_args(Dtype))
+        raise InputError(f"model '{name}'", f"unknown dtype '{dtype}'", f"known ones: {known}")
     try:
-        network = _MODELS[name](**options)
+        network = _MODELS[name](dtype=dtype, **options)
     except ValueError as error:
         raise InputError(f"model '{name}'", str(error)) from None
-    return network if equivariance == "none" else _EQUIVARIANT[equivariance](network)
+    return network if equivariance == "none" else _EQUIVARIANT[equivariance](network, dtype)
 
 
 def initialise(model: nn.Module, key: PRNGKeyArray, window: int = 200) -> Any:
     """Fresh variables of `model` for windows of `window` samples.
 
-    `model.init` gives the same; here it is compiled, once for each network.
+    `model.init` gives the same to rounding. Here the network itself is never run, and one small
+    program draws all parameters of one shape: compiling `model.init` takes many times as long.
     """
-    return _init(key, jnp.zeros((1, window, 6), jnp.float32), model=model)
+    return model.lazy_init(key, _windows(window))
 
 
 def variable_shapes(model: nn.Module, window: int = 200) -> Any:
     """The shapes and types of what `initialise` gives; nothing is computed."""
-    windows = jax.ShapeDtypeStruct((1, window, 6), jnp.float32)
-    return _init.eval_shape(jax.random.key(0), windows, model=model)
+    return jax.eval_shape(model.init, jax.random.key(0), _windows(window))
 
 
-# For one use: the optimiser of the compiler takes more seconds than it saves.
-@functools.partial(
-    jax.jit, static_argnames="model", compiler_options={"xla_backend_optimization_level": 1}
-)
-def _init(key: PRNGKeyArray, windows: Float[jax.Array, "1 n 6"], *, model: nn.Module) -> Any:
-    return model.init(key, windows)
+def _windows(window: int) -> jax.ShapeDtypeStruct:
+    return jax.ShapeDtypeStruct((1, window, 6), jnp.float32)

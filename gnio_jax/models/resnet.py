@@ -4,6 +4,7 @@ share)."""
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
@@ -11,7 +12,7 @@ import jax.numpy as jnp
 from flax import linen as nn
 from jaxtyping import Float
 
-from gnio_jax.models import precision
+from gnio_jax.models.precision import Dtype, matmul
 
 BLOCKS_PER_GROUP = 2
 GROUP_STRIDES = (1, 2, 2, 2)
@@ -28,6 +29,8 @@ def convolve(
     kernel: Float[jax.Array, "k c d"],
     window_strides: tuple[int],
     padding: list[tuple[int, int]],
+    *,
+    dtype: Dtype = "float32",
     **_: object,
 ) -> Float[jax.Array, "b m d"]:
     """A 1-D convolution written as one matrix product of the k shifted inputs with the kernel.
@@ -42,7 +45,7 @@ def convolve(
     length = (x.shape[1] - size) // stride + 1
     shifted = [x[:, i : i + stride * (length - 1) + 1 : stride] for i in range(size)]
     columns = jnp.concatenate(shifted, axis=-1).reshape(-1, size * channels)
-    product = precision.matmul(columns, kernel.reshape(size * channels, features))
+    product = matmul(columns, kernel.reshape(size * channels, features), dtype)
     return product.reshape(-1, length, features)
 
 
@@ -87,9 +90,10 @@ def max_pool(x: Float[jax.Array, "b n c"]) -> Float[jax.Array, "b m c"]:
     )
 
 
-def conv(features: int, size: int, stride: int, train: bool, name: str) -> nn.Conv:
+def conv(features: int, size: int, stride: int, train: bool, name: str, dtype: Dtype) -> nn.Conv:
     """A convolution without bias and with explicit symmetric padding ("SAME" pads differently at
-    stride 2)."""
+    stride 2); `dtype` is that of its product's factors."""
+    native = not train and dtype == "float32"
     return nn.Conv(
         features,
         kernel_size=(size,),
@@ -99,7 +103,7 @@ def conv(features: int, size: int, stride: int, train: bool, name: str) -> nn.Co
         kernel_init=he_normal_fan_out,
         dtype=jnp.float32,
         param_dtype=jnp.float32,
-        conv_general_dilated=convolve if train else convolve_forward,
+        conv_general_dilated=convolve_forward if native else partial(convolve, dtype=dtype),
         name=name,
     )
 
@@ -122,15 +126,16 @@ class BasicBlock(nn.Module):
 
     features: int
     stride: int
+    dtype: Dtype = "float32"
 
     @nn.compact
     def __call__(self, x: Float[jax.Array, "b n c"], train: bool) -> Float[jax.Array, "b m d"]:
-        y = conv(self.features, 3, self.stride, train, "conv1")(x)
+        y = conv(self.features, 3, self.stride, train, "conv1", self.dtype)(x)
         y = nn.relu(batch_norm(train, "bn1")(y))
-        y = conv(self.features, 3, 1, train, "conv2")(y)
+        y = conv(self.features, 3, 1, train, "conv2", self.dtype)(y)
         y = batch_norm(train, "bn2")(y)
         if self.stride != 1 or x.shape[-1] != self.features:
-            x = conv(self.features, 1, self.stride, train, "shortcut_conv")(x)
+            x = conv(self.features, 1, self.stride, train, "shortcut_conv", self.dtype)(x)
             x = batch_norm(train, "shortcut_bn")(x)
         return nn.relu(x + y)
 
@@ -140,14 +145,15 @@ class ResNet18(nn.Module):
     basic blocks."""
 
     width: int = 64
+    dtype: Dtype = "float32"
 
     @nn.compact
     def __call__(
         self, windows: Float[jax.Array, "b n 6"], train: bool = False
     ) -> Float[jax.Array, "b m d"]:
-        x = conv(self.width, 7, 2, train, "stem_conv")(windows)
+        x = conv(self.width, 7, 2, train, "stem_conv", self.dtype)(windows)
         x = max_pool(nn.relu(batch_norm(train, "stem_bn")(x)))
-        return residual_groups(BasicBlock, self.width, x, train)
+        return residual_groups(partial(BasicBlock, dtype=self.dtype), self.width, x, train)
 
 
 def residual_groups(

@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from gnio_jax.models.heads import ConstantUncertainty, to_axes
 from gnio_jax.models.layers import check_dropout, check_output_dim
+from gnio_jax.models.precision import Dtype
 from gnio_jax.models.resnet import ResNet18
 from gnio_jax.models.tlio import FullyConnectedHead
 from gnio_jax.types import Prediction
@@ -25,6 +26,7 @@ class DisplacementRegressor(nn.Module):
     width: int = 64
     dropout: float = 0.5
     output_dim: int = 3
+    dtype: Dtype = "float32"
 
     def __post_init__(self) -> None:
         check_dropout(self.dropout)
@@ -34,9 +36,8 @@ class DisplacementRegressor(nn.Module):
     @nn.compact
     def __call__(self, windows: Float[jax.Array, "b n 6"], train: bool = False) -> Prediction:
         features = self.features(windows.astype(jnp.float32), train)
-        output = FullyConnectedHead(self.width, self.output_dim, self.dropout, name="displacement")(
-            features, train
-        )
+        sizes = self.width, self.output_dim, self.dropout
+        output = FullyConnectedHead(*sizes, self.dtype, name="displacement")(features, train)
         return Prediction(
             to_axes(output), ConstantUncertainty(name="uncertainty")(windows.shape[0])
         )
@@ -57,4 +58,4 @@ class RoNINResNet(DisplacementRegressor):
     """
 
     def features(self, windows: Float[jax.Array, "b n 6"], train: bool) -> jax.Array:
-        return ResNet18(self.width, name="encoder")(windows, train)
+        return ResNet18(self.width, self.dtype, name="encoder")(windows, train)

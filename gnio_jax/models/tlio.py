@@ -9,6 +9,7 @@ from flax import linen as nn
 from jaxtyping import Float
 
 from gnio_jax.models.layers import check_dropout, linear
+from gnio_jax.models.precision import Dtype
 from gnio_jax.models.resnet import ResNet18, batch_norm, conv
 from gnio_jax.types import Prediction
 
@@ -28,15 +29,17 @@ class FullyConnectedHead(nn.Module):
     width: int
     outputs: int
     dropout: float
+    dtype: Dtype = "float32"
 
     @nn.compact
     def __call__(self, features: Float[jax.Array, "b m d"], train: bool) -> Float[jax.Array, "b k"]:
-        x = batch_norm(train, "neck_bn")(conv(2 * self.width, 1, 1, train, "neck_conv")(features))
+        neck = conv(2 * self.width, 1, 1, train, "neck_conv", self.dtype)
+        x = batch_norm(train, "neck_bn")(neck(features))
         x = x.transpose(0, 2, 1).reshape(x.shape[0], -1)
         for name in ("fc1", "fc2"):
-            x = nn.relu(linear(8 * self.width, name, kernel_init=SMALL)(x))
+            x = nn.relu(linear(8 * self.width, name, self.dtype, kernel_init=SMALL)(x))
             x = nn.Dropout(self.dropout, deterministic=not train)(x)
-        return linear(self.outputs, "fc3", kernel_init=SMALL)(x)
+        return linear(self.outputs, "fc3", self.dtype, kernel_init=SMALL)(x)
 
 
 class TLIO(nn.Module):
@@ -50,6 +53,7 @@ class TLIO(nn.Module):
 
     width: int = 64
     dropout: float = 0.5
+    dtype: Dtype = "float32"
 
     def __post_init__(self) -> None:
         check_dropout(self.dropout)
@@ -57,9 +61,11 @@ class TLIO(nn.Module):
 
     @nn.compact
     def __call__(self, windows: Float[jax.Array, "b n 6"], train: bool = False) -> Prediction:
-        features = ResNet18(self.width, name="encoder")(windows.astype(jnp.float32), train)
+        features = ResNet18(self.width, self.dtype, name="encoder")(
+            windows.astype(jnp.float32), train
+        )
         displacement, log_std = (
-            FullyConnectedHead(self.width, 3, self.dropout, name=name)(features, train)
+            FullyConnectedHead(self.width, 3, self.dropout, self.dtype, name=name)(features, train)
             for name in ("displacement", "log_std")
         )
         return Prediction(displacement, log_std)

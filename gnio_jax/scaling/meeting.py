@@ -55,8 +55,22 @@ def check(meeting: Meeting) -> None:
         problem = f"is {meeting.process_id}, but there are {meeting.processes} processes"
         raise InputError("--process-id", problem, "count them from 0")
     host, _, port = meeting.coordinator.rpartition(":")
-    if not (host and port.isdigit()):
+    if not (host and port.isdecimal() and 0 < int(port) < 2**16):
         raise InputError("--coordinator", f"must be HOST:PORT, found '{meeting.coordinator}'")
+
+
+def require_free(coordinator: str) -> None:
+    """Raise `InputError` where another program listens at the port of process 0, e.g. another run.
+
+    JAX would listen there too, take that run's processes away from it, and so end it.
+    """
+    port = coordinator.rpartition(":")[2]
+    try:
+        socket.create_server(("", int(port))).close()
+    except OSError as error:
+        problem = f"process 0 cannot listen there ({error.strerror})"
+        remedy = "choose another port, for every process of this run"
+        raise InputError(f"--coordinator {coordinator}", problem, remedy) from None
 
 
 def wait_for(coordinator: str, patience: int) -> None:

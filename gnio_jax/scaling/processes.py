@@ -19,7 +19,7 @@ from jax.experimental import multihost_utils
 
 from gnio_jax.errors import InputError
 from gnio_jax.scaling import endings
-from gnio_jax.scaling.meeting import Meeting, check, launched, wait_for
+from gnio_jax.scaling.meeting import Meeting, check, launched, require_free, wait_for
 
 Tree = TypeVar("Tree")
 
@@ -44,8 +44,11 @@ def meet(meeting: Meeting) -> None:
         "every one needs the same --coordinator and --processes, and a --process-id of its own",
         status=2,
     )
-    if meeting.coordinator is not None and meeting.process_id != 0:
-        wait_for(meeting.coordinator, meeting.patience)
+    if meeting.coordinator is not None:
+        if meeting.process_id == 0:
+            require_free(meeting.coordinator)
+        else:
+            wait_for(meeting.coordinator, meeting.patience)
     jax.config.update("jax_cpu_collectives_implementation", "gloo")
     try:
         jax.distributed.initialize(

@@ -9,8 +9,14 @@ previous one whole.
 from __future__ import annotations
 
 import dataclasses
+import errno
 import json
 import logging
+import os
+import re
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -24,6 +30,7 @@ from gnio_jax import config as configuration
 from gnio_jax import models
 from gnio_jax.config import TrainConfig
 from gnio_jax.errors import InputError
+from gnio_jax.models.precision import Dtype
 from gnio_jax.scaling import devices
 from gnio_jax.scaling.processes import all_or_none, from_first, is_first, several, text_from_first
 from gnio_jax.training import learnt as learning
@@ -33,8 +40,13 @@ from gnio_jax.training.step import TrainState, evaluated
 Which = Literal["best", "latest"]
 ARRAYS = ("variables", "optimizer", "training")
 """The items of a checkpoint that are trees of arrays."""
+METADATA = 2**17
+"""Bytes that a checkpoint takes besides its arrays, at most."""
 
-logging.getLogger("absl").setLevel(logging.ERROR)  # Orbax logs every save there
+# Orbax logs every save there, and each of its failures before it raises them.
+logging.getLogger("absl").setLevel(logging.CRITICAL)
+# Parts of a save that failed after the first failure, which is raised.
+logging.getLogger("asyncio").addFilter(lambda record: "orbax" not in record.getMessage())
 
 
 class Position(NamedTuple):
@@ -72,14 +84,24 @@ class Run(NamedTuple):
 def create_model(config: TrainConfig) -> nn.Module:
     """The network that `config.model` describes; what that leaves open is the network's own.
 
-    In float32: `dtype` is for the steps of training.
+    In float32, as it is validated and evaluated: `config.model.dtype` is for the steps of training
+    (`create_trained_model`).
     """
+    return _create_model(config, "float32")
+
+
+def create_trained_model(config: TrainConfig) -> nn.Module:
+    """The same network as the steps of training apply it: with products in `config.model.dtype`."""
+    return _create_model(config, config.model.dtype)
+
+
+def _create_model(config: TrainConfig, dtype: Dtype) -> nn.Module:
     options = {
         key: value
         for key, value in vars(config.model).items()
         if key not in ("name", "dtype") and value is not None
     }
-    return models.create(config.model.name, **options)
+    return models.create(config.model.name, dtype=dtype, **options)
 
 
 def exists(workdir: Path, which: Which = "latest") -> bool:
@@ -115,7 +137,8 @@ class Checkpoints:
 
         Its variables are those that are evaluated. Where they are averages, `latest` also holds the
         parameters that training goes on with. Arrays are written from the host's memory: a
-        checkpoint does not know on which devices they lay, and fits any.
+        checkpoint does not know on which devices they lay, and fits any. Raises `OSError` naming
+        the folder where it cannot be written; the checkpoint before stays.
         """
         with all_or_none():
             if is_first():
@@ -131,7 +154,10 @@ class Checkpoints:
             items["optimizer"] = ocp.args.StandardSave(state.opt_state)
             if state.average is not None:
                 items["training"] = ocp.args.StandardSave(state.params)
-        manager.save(position.step, args=ocp.args.Composite(**items))
+        folder = self._workdir / "checkpoints" / which
+        with _disk_errors_named(folder):
+            _require_room(folder, sum(leaf.nbytes for leaf in jax.tree.leaves(state)))
+            manager.save(position.step, args=ocp.args.Composite(**items))
 
     def restore(self, template: TrainState) -> tuple[TrainState, Position]:
         """The latest state, in the structure of `template`, as `devices.everywhere` places it.
@@ -157,8 +183,7 @@ class Checkpoints:
         if template.average is not None:
             wanted["training"] = template.params
         meta = _checked_meta(manager, step, wanted["variables"], where)
-        items = {name: ocp.args.StandardRestore(tree) for name, tree in wanted.items()}
-        restored = manager.restore(step, args=ocp.args.Composite(**items))
+        restored = _read_arrays(manager, step, wanted, where)
         state = TrainState.of(jnp.int32(step), restored["variables"], restored["optimizer"])
         if template.average is not None:
             state = state._replace(params=restored["training"], average=state.params)
@@ -208,16 +233,7 @@ def load_run(workdir: Path, which: Which = "best") -> Run:
     with _manager(where, create=False) as manager:
         step = manager.latest_step()
         meta = _checked_meta(manager, step, template, where)
-        try:
-            variables = manager.restore(
-                step, args=ocp.args.Composite(variables=ocp.args.StandardRestore(template))
-            )["variables"]
-        except (OSError, ValueError, KeyError) as error:
-            raise InputError(
-                where / str(step),
-                f"cannot be read ({str(error)[:120]})",
-                "the checkpoint is damaged",
-            ) from None
+        variables = _read_arrays(manager, step, {"variables": template}, where)["variables"]
     variables = uncommitted(variables)
     numbers = variables.pop("filter", {})
     options = learning.learnt_options(config.filter, numbers)
@@ -234,7 +250,10 @@ def _evaluated_items(state: TrainState, position: Position) -> dict[str, Any]:
 
 def _manager(folder: Path, create: bool) -> ocp.CheckpointManager:
     options = ocp.CheckpointManagerOptions(
-        max_to_keep=1, enable_async_checkpointing=False, create=create
+        max_to_keep=1,
+        enable_async_checkpointing=False,
+        create=create,
+        cleanup_tmp_directories=create,  # what a killed process has left
     )
     if not several():
         return ocp.CheckpointManager(folder.absolute(), options=options)
@@ -246,6 +265,48 @@ def _manager(folder: Path, create: bool) -> ocp.CheckpointManager:
     return ocp.CheckpointManager(
         folder.absolute(), options=options, handler_registry=_handlers(alone)
     )
+
+
+def _read_arrays(
+    manager: ocp.CheckpointManager, step: int, templates: dict[str, Any], where: Path
+) -> Any:
+    """The items of a checkpoint that these templates name. Raises `InputError` for damaged ones."""
+    items = {name: ocp.args.StandardRestore(tree) for name, tree in templates.items()}
+    try:
+        return manager.restore(step, args=ocp.args.Composite(**items))
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise _damaged(where / str(step), error) from None
+
+
+def _damaged(checkpoint: Path, error: Exception) -> InputError:
+    problem = f"cannot be read ({str(error)[:120]})"
+    return InputError(checkpoint, problem, "the checkpoint is damaged")
+
+
+def _require_room(folder: Path, size: int) -> None:
+    """Raise `OSError` where the disk has no room for arrays of `size` bytes.
+
+    Orbax raises it, too, but only after the tracebacks of many threads.
+    """
+    if shutil.disk_usage(folder).free < size + METADATA:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+@contextmanager
+def _disk_errors_named(folder: Path) -> Iterator[None]:
+    """What the disk refuses is an `OSError` with the folder's name, also where Orbax raises
+    `ValueError` for it."""
+    try:
+        yield
+    except OSError as error:
+        error.filename = error.filename or str(folder)
+        raise
+    except ValueError as error:
+        code = re.search(r"os_error_code='(\d+)'", str(error))
+        if code is None:
+            raise
+        number = int(code[1])
+        raise OSError(number, os.strerror(number), str(folder)) from None
 
 
 def _handlers(alone: MultiprocessingOptions) -> Any:
@@ -297,9 +358,7 @@ def _checked_meta(
         meta = manager.restore(step, args=ocp.args.Composite(meta=ocp.args.JsonRestore()))["meta"]
         found = meta["shapes"]
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(
-            where / str(step), f"cannot be read ({str(error)[:120]})", "the checkpoint is damaged"
-        ) from None
+        raise _damaged(where / str(step), error) from None
     wanted = _shapes(variables)
     for name in sorted(wanted.keys() | found.keys()):
         if wanted.get(name) != found.get(name):

@@ -35,6 +35,11 @@ class Training(Protocol):
         ...
 
     @property
+    def recordings(self) -> Any:
+        """What it learns from and is validated with: a tree of arrays."""
+        ...
+
+    @property
     def steps_per_epoch(self) -> int: ...
 
     @property

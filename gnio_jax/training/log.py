@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import json
+import time
 from pathlib import Path
 
-from tensorboardX import SummaryWriter
+from tensorboardX.event_file_writer import EventsWriter
+from tensorboardX.proto.event_pb2 import Event, SessionLog
+from tensorboardX.summary import scalar
 
 from gnio_jax.files import write_text
 from gnio_jax.scaling.processes import is_first
@@ -22,7 +25,7 @@ class Log:
         self._rows, self._board = [], None
         if is_first():
             self._rows = _rows_before(self._path, epoch)
-            self._board = SummaryWriter(str(workdir / "tensorboard"), purge_step=step)
+            self._board = _Board(workdir / "tensorboard", step)
 
     def __enter__(self) -> Log:
         return self
@@ -37,8 +40,39 @@ class Log:
             return
         self._rows.append(row)
         write_text(self._path, "".join(json.dumps(row) + "\n" for row in self._rows))
-        for name, value in row.items():
-            self._board.add_scalar(name, value, row["step"])
+        self._board.add(row)
+
+
+class _Board:
+    """A TensorBoard event file, written row by row.
+
+    tensorboardX's own SummaryWriter writes in a thread, which dies where the disk is full; then
+    the run would wait for it for ever.
+    """
+
+    def __init__(self, folder: Path, step: int):
+        """Rows from `step` on that other files of the folder hold are void."""
+        folder.mkdir(parents=True, exist_ok=True)
+        self._folder = folder
+        self._file = EventsWriter(str(folder / "events"))
+        start = SessionLog(status=SessionLog.START)
+        self._file.write_event(Event(wall_time=time.time(), step=step, session_log=start))
+
+    def add(self, row: Row) -> None:
+        try:
+            for name, value in row.items():
+                event = Event(wall_time=time.time(), step=row["step"], summary=scalar(name, value))
+                self._file.write_event(event)
+            self._file.flush()
+        except OSError as error:
+            error.filename = str(self._folder)
+            raise
+
+    def close(self) -> None:
+        try:
+            self._file.close()
+        except OSError:
+            pass  # `add` has said it, or something worse has
 
 
 def _rows_before(path: Path, epoch: int) -> list[Row]:

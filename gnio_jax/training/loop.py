@@ -64,6 +64,8 @@ def train(
     if through_filter and several():
         problem = "runs in one process, on all of its devices"
         raise InputError("training through the filter", problem, "start one process")
+    if through_filter and devices is not None:
+        raise InputError("--devices", "is for training on windows", "leave it out")
     sharers = jax.devices()[:1] if through_filter else chosen(devices)
     # Whatever the process has: no float64 but for the filter, and the same random draws.
     with jax.enable_x64(through_filter), sharing(sharers):
@@ -81,7 +83,7 @@ def _train(config: TrainConfig, resume: bool, reporter: Reporter, workers: int) 
         state = training.new_state(start)
         training.describe(state, workdir, reporter)
         run_folder.write_settings(workdir, config, training.splits, resume)
-    run_folder.compare_processes(config, training.splits)
+    run_folder.compare_processes(config, training.splits, training.recordings, state.variables)
     position = Position(epoch=0, step=0, best_loss=None, loss_sums=(), seconds=0.0)
     with Checkpoints(workdir) as checkpoints, stop_signals() as stop:
         if resuming:

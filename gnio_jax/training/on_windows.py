@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +16,7 @@ from gnio_jax.data import windows
 from gnio_jax.reporting import Reporter
 from gnio_jax.scaling import devices
 from gnio_jax.training import optimizer as optimizers
-from gnio_jax.training.checkpoint import Run, create_model
+from gnio_jax.training.checkpoint import Run, create_model, create_trained_model
 from gnio_jax.training.initial import with_weights
 from gnio_jax.training.kinds import (
     Keys,
@@ -49,6 +49,9 @@ class WindowTraining(NamedTuple):
 
     config: TrainConfig
     model: nn.Module
+    """The network as it is validated."""
+    trained_model: nn.Module
+    """The same network, with products of `config.model.dtype`."""
     optimizer: optax.GradientTransformationExtraArgs
     schedule: optax.Schedule
     source: windows.WindowSource
@@ -59,6 +62,10 @@ class WindowTraining(NamedTuple):
     steps_per_epoch: int
     keys: Keys
     unit: str = "windows"
+
+    @property
+    def recordings(self) -> Any:
+        return self.source, self.held_out
 
     @property
     def changes(self) -> tuple[int, ...]:
@@ -110,7 +117,7 @@ class WindowTraining(NamedTuple):
             jnp.int32(count),
             jnp.float32(learning_rate_factor),
             self.keys.step,
-            model=self.model,
+            model=self.trained_model,
             optimizer=self.optimizer,
             config=self.config,
         )
@@ -158,7 +165,8 @@ def set_up(config: TrainConfig, reporter: Reporter, workers: int = 1) -> WindowT
     Raises `InputError` for options that the network does not have, missing data, and a batch that
     is larger than the split. `workers` processes read recordings that are slow to read.
     """
-    model = create_model(config)  # a mistake in its options should not wait for the data
+    model = create_model(config)  # a mistake in the options should not wait for the data
+    devices.check_batch(config.optim.batch_size, config.optim.accumulate)
     train, val = config.data.train_split, config.data.val_split
     reporter.line(f"reading {config.dataset}: {train} and {val}")
     stride, shift = config.data.train_stride, config.augment.shift_samples
@@ -166,10 +174,10 @@ def set_up(config: TrainConfig, reporter: Reporter, workers: int = 1) -> WindowT
     stride = config.data.stride
     held_out, validated_with = _windows(config, val, stride, 0, reporter, workers)
     steps_per_epoch = steps_in_epoch(source.visited.shape[0], "windows", config)
-    devices.check_batch(config.optim.batch_size, config.optim.accumulate)
     return WindowTraining(
         config,
         model,
+        create_trained_model(config),
         optimizers.create(config.optim, config.loss, steps_per_epoch),
         optimizers.schedule(config.optim, steps_per_epoch),
         source,

@@ -7,13 +7,15 @@ import hashlib
 from pathlib import Path
 from typing import Any
 
+import jax
+import numpy as np
 import yaml
 
 from gnio_jax import config as configuration
 from gnio_jax.config import TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.files import write_text
-from gnio_jax.scaling.processes import is_first, require_same
+from gnio_jax.scaling.processes import is_first, require_same, several
 
 MAY_CHANGE = ("workdir", "data_root", "init_from", "checkpoint_every_seconds")
 """Settings that a resumed run may change: where things lie, not what is computed."""
@@ -67,12 +69,29 @@ def write_settings(
         write_text(path, yaml.safe_dump(splits, sort_keys=False, allow_unicode=True))
 
 
-def compare_processes(config: TrainConfig, splits: dict[str, list[str]]) -> None:
-    """Raise `InputError` unless all processes have the same settings and recordings: other ones
-    would compute something else, or wait for each other for ever."""
+def compare_processes(
+    config: TrainConfig, splits: dict[str, list[str]], recordings: Any, variables: Any
+) -> None:
+    """Raise `InputError` unless all processes have the same settings, recordings and weights to
+    begin with: other ones would compute something else, or wait for each other for ever.
+
+    Trees of arrays are compared by their shapes and a sample of their rows.
+    """
+    if not several():
+        return
     settings = {k: v for k, v in dataclasses.asdict(config).items() if k not in MAY_CHANGE}
-    require_same("settings", _digest(settings), "start all with the same options")
-    require_same("recordings", _digest(splits), "give all of them the same data")
+    require_same("settings", _digest(settings), "start all with the same options, also --config")
+    same_data = "give all of them the same data"
+    require_same("recordings", _digest(splits), same_data)
+    require_same("samples of the same recordings", _digest(_sampled(recordings)), same_data)
+    same_run = "give all of them the same run in --init-from"
+    require_same("weights to begin with", _digest(_sampled(variables)), same_run)
+
+
+def _sampled(tree: Any) -> list[Any]:
+    """Shape, and the bytes of some rows, of each array of a tree."""
+    leaves = [np.atleast_1d(leaf) for leaf in jax.tree.leaves(tree)]
+    return [(leaf.shape, leaf[:: len(leaf) // 999 + 1].tobytes()) for leaf in leaves]
 
 
 def _digest(value: Any) -> bytes:

@@ -17,7 +17,6 @@ from gnio_jax.config import TrainConfig
 from gnio_jax.data.augmentation import augment
 from gnio_jax.data.windows import WindowSource, gather, shift_windows
 from gnio_jax.models import initialise
-from gnio_jax.models.precision import products_in
 from gnio_jax.models.resnet import MOMENTUM
 from gnio_jax.scaling import devices
 from gnio_jax.scaling.devices import kept_everywhere, shared_out
@@ -174,8 +173,7 @@ def _gradient(
         params: Any, batch_stats: Any, windows: Windows, key: PRNGKeyArray
     ) -> tuple[jax.Array, tuple[Losses, Any]]:
         variables = {"params": params, "batch_stats": batch_stats}
-        with products_in(config.model.dtype):
-            prediction, changed = _apply_training(model, variables, windows, key)
+        prediction, changed = _apply_training(model, variables, windows, key)
         loss = losses(prediction, windows, config.loss, now)
         return loss.total, (loss, changed.get("batch_stats", {}))
 

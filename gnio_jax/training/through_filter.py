@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -48,6 +48,10 @@ class FilterTraining(NamedTuple):
     steps_per_epoch: int
     keys: Keys
     unit: str = "pieces"
+
+    @property
+    def recordings(self) -> Any:
+        return self.source, self.held_out
 
     @property
     def changes(self) -> tuple[int, ...]:

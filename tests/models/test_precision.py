@@ -1,11 +1,15 @@
 """Products whose factors are rounded to bfloat16, against NumPy in float64."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import ml_dtypes
 import numpy as np
 import pytest
 
+from gnio_jax import models
+from gnio_jax.errors import InputError
 from gnio_jax.models import precision
 
 
@@ -20,17 +24,19 @@ def factors():
 
 PRODUCTS = {
     "matmul": precision.matmul,
-    "einsum": lambda a, b: precision.einsum("ij,jk->ik", a, b),
-    "dot_general": lambda a, b: precision.dot_general(a, b, (((1,), (0,)), ((), ()))),
+    "einsum": lambda a, b, dtype: precision.einsum("ij,jk->ik", a, b, dtype),
+    "dot_general": lambda a, b, dtype: precision.dot_general(
+        a, b, (((1,), (0,)), ((), ())), dtype=dtype
+    ),
 }
 
 
 @pytest.mark.parametrize("name", PRODUCTS)
 def test_a_product_and_its_gradient_have_rounded_factors(name):
     a, b, weight = factors()
-    with precision.products_in("bfloat16"):
-        found, pull = jax.vjp(PRODUCTS[name], jnp.asarray(a), jnp.asarray(b))
-        gradient = pull(jnp.asarray(weight))
+    product = partial(PRODUCTS[name], dtype="bfloat16")
+    found, pull = jax.vjp(product, jnp.asarray(a), jnp.asarray(b))
+    gradient = pull(jnp.asarray(weight))
     assert found.dtype == jnp.float32
     np.testing.assert_allclose(found, rounded(a) @ rounded(b), rtol=1e-5, atol=1e-5)
     # Sums are float32; what a gradient's product gives is rounded once.
@@ -43,6 +49,10 @@ def test_a_product_and_its_gradient_have_rounded_factors(name):
 @pytest.mark.parametrize("name", PRODUCTS)
 def test_in_float32_a_product_is_the_plain_one(name):
     a, b, _ = (jnp.asarray(x) for x in factors())
-    with precision.products_in("bfloat16"):
-        pass
-    np.testing.assert_array_equal(PRODUCTS[name](a, b), a @ b)
+    np.testing.assert_array_equal(PRODUCTS[name](a, b, "float32"), a @ b)
+
+
+def test_an_unknown_dtype_is_told():
+    expected = "model 'gnio': unknown dtype 'float16'; known ones: float32, bfloat16"
+    with pytest.raises(InputError, match=expected):
+        models.create("gnio", dtype="float16")

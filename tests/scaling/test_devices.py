@@ -9,10 +9,11 @@ import pytest
 from jax.sharding import PartitionSpec
 
 from gnio_jax.config import DataConfig, ModelConfig, OptimConfig, TrainConfig
+from gnio_jax.config.through_filter import ThroughFilter
 from gnio_jax.errors import InputError
 from gnio_jax.reporting import Silence
 from gnio_jax.scaling import devices
-from gnio_jax.training import on_windows, step
+from gnio_jax.training import loop, on_windows, run_folder, step
 from tests.support.tlio_files import write_sequence
 
 
@@ -75,8 +76,38 @@ def test_a_cpu_is_one_device_unless_asked_for_more():
 
 def test_a_batch_that_cannot_be_shared_evenly_is_told(config):
     optim = dataclasses.replace(config.optim, batch_size=15)
+    changed = dataclasses.replace(config, optim=optim, data_root="nowhere")
     with devices.sharing(devices.chosen(2)), pytest.raises(InputError, match="2 devices cannot"):
-        on_windows.set_up(dataclasses.replace(config, optim=optim), Silence())
+        on_windows.set_up(changed, Silence())  # before it reads anything
+
+
+def test_through_the_filter_there_is_no_number_of_devices():
+    config = TrainConfig(through_filter=ThroughFilter(("head",)))
+    with pytest.raises(InputError, match="--devices: is for training on windows; leave it out"):
+        loop.train(config, devices=2)
+
+
+def test_processes_with_other_samples_or_weights_are_told(monkeypatch):
+    """As `require_same` compares them: the digests differ where an array does."""
+    monkeypatch.setattr(run_folder, "several", lambda: True)
+
+    def digests(samples, weights):
+        found = {}
+        compared = lambda what, digest, _: found.update({what: digest})  # noqa: E731
+        monkeypatch.setattr(run_folder, "require_same", compared)
+        tree = {"imu": samples, "start": np.arange(3)}
+        run_folder.compare_processes(TrainConfig(), {"train": ["a"]}, tree, {"scale": weights})
+        return found
+
+    samples, weights = np.arange(12.0).reshape(4, 3), jnp.float32(1)
+    before = digests(samples, weights)
+    for other, what in (
+        ((samples[:3], weights), "samples of the same recordings"),
+        ((samples + 1e-9, weights), "samples of the same recordings"),
+        ((samples, jnp.float32(2)), "weights to begin with"),
+    ):
+        after = digests(*other)
+        assert [name for name in before if before[name] != after[name]] == [what]
 
 
 def test_with_one_device_nothing_is_placed_nor_constrained():

@@ -6,7 +6,7 @@ import time
 import pytest
 
 from gnio_jax.errors import InputError
-from gnio_jax.scaling.meeting import Meeting, check, launched, wait_for
+from gnio_jax.scaling.meeting import Meeting, check, launched, require_free, wait_for
 
 
 @pytest.mark.parametrize(
@@ -18,6 +18,8 @@ from gnio_jax.scaling.meeting import Meeting, check, launched, wait_for
         (Meeting("here:1", 2, -1), "--process-id: is -1"),
         (Meeting("here:1", 0, 0), "--processes: must be at least 1, found 0"),
         (Meeting("here", 2, 0), "--coordinator: must be HOST:PORT, found 'here'"),
+        (Meeting("here:65536", 2, 0), "--coordinator: must be HOST:PORT, found 'here:65536'"),
+        (Meeting("here:0", 2, 0), "--coordinator: must be HOST:PORT, found 'here:0'"),
         (Meeting(":80", 2, 0), "--coordinator: must be HOST:PORT, found ':80'"),
         (Meeting(patience=0), "--patience: must be at least 1, found 0"),
     ],
@@ -46,6 +48,18 @@ def test_a_coordinator_that_is_not_there_is_told_in_time():
 def test_a_coordinator_that_listens_is_found():
     with socket.create_server(("localhost", 0)) as listening:
         wait_for(f"localhost:{listening.getsockname()[1]}", 1)
+
+
+def test_a_port_that_another_run_listens_at_is_told():
+    """JAX would share it, and end that run."""
+    with socket.socket(socket.AF_INET6) as other:
+        other.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
+        other.bind(("::", 0))
+        other.listen()
+        address = f"localhost:{other.getsockname()[1]}"
+        with pytest.raises(InputError, match=r"process 0 cannot listen there .* another port"):
+            require_free(address)
+    require_free(address)
 
 
 @pytest.mark.parametrize(

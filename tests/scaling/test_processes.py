@@ -17,14 +17,14 @@ from tests.support.tlio_files import write_splits
 
 ROOT = Path(__file__).parents[2]
 OPTIONS = (
-    "--dataset tlio --data.rate 50 --model.name tiny --optim.epochs 2 --optim.batch-size 16 "
-    "--optim.learning-rate 1e-3 --optim.warmup-epochs 1 --optim.statistics-windows 32"
+    "--dataset tlio --data.rate 50 --model.name tiny --optim.epochs 2 --optim.batch-size 32 "
+    "--optim.learning-rate 1e-3 --optim.warmup-epochs 1 --optim.statistics-windows 64"
 ).split()
-STEPS = 13
+STEPS = 6
 """Of an epoch."""
 PATIENCE = 60
 """Seconds after which a process is given up."""
-BRIEF = ("--patience", "12")
+BRIEF = ("--patience", "5")
 LIMIT = 300
 """Seconds after which a test gives up; the machine may be busy."""
 
@@ -35,20 +35,56 @@ def recording(tmp_path_factory):
     return write_splits(tmp_path_factory.mktemp("tlio"))
 
 
+class Server:
+    """What starts the processes; all share what they compile."""
+
+    def __init__(self, folder):
+        environment = {**os.environ, "JAX_PLATFORMS": "cpu"}
+        environment.setdefault("JAX_COMPILATION_CACHE_DIR", str(folder / "cache"))
+        self.folder, self.started = folder, 0
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "tests.support.training_server"],
+            cwd=ROOT,
+            env=environment,
+            stdin=subprocess.PIPE,
+            text=True,
+            start_new_session=True,  # so that it ends with all that it has started
+        )
+
+    def start(self, module, *arguments):
+        """Begin a process; returns the place of what it writes."""
+        self.started += 1
+        files = self.folder / str(self.started)
+        asked = {"module": module, "arguments": list(arguments), "files": str(files)}
+        self.process.stdin.write(json.dumps(asked) + "\n")
+        self.process.stdin.flush()
+        return files
+
+
+def end_of(files):
+    """(status, lines on stderr) of a process, once it has ended."""
+    until = time.monotonic() + LIMIT
+    while not files.with_suffix(".status").exists():
+        assert time.monotonic() < until, files.with_suffix(".err").read_text()
+        time.sleep(0.05)
+    status = int(files.with_suffix(".status").read_text())
+    return status, files.with_suffix(".err").read_text().splitlines()
+
+
 @pytest.fixture(scope="module")
-def environment(tmp_path_factory):
-    """All share what they compile."""
-    found = {**os.environ, "JAX_PLATFORMS": "cpu"}
-    found.setdefault("JAX_COMPILATION_CACHE_DIR", str(tmp_path_factory.mktemp("cache")))
-    return found
+def server(tmp_path_factory):
+    found = Server(tmp_path_factory.mktemp("server"))
+    yield found
+    os.killpg(found.process.pid, signal.SIGKILL)
+    found.process.wait()
 
 
 class Group:
     """Processes that train together."""
 
-    def __init__(self, recording, environment, workdir, processes, devices, *more, **special):
-        """special: what process k does otherwise, as `send={k: (signal, step)}` and
-        `late={k: seconds}`; `started`: how many of them there are in truth."""
+    def __init__(self, recording, server, workdir, processes, devices, *more, **special):
+        """special: what process k does otherwise, as `send={k: (signal, step)}`; `started`: how
+        many of them begin at once, the others by `start_next`."""
         self.began = time.monotonic()
         with socket.socket() as free:
             free.bind(("localhost", 0))
@@ -56,41 +92,28 @@ class Group:
         meeting = ["--coordinator", f"localhost:{port}", "--processes", str(processes)]
         meeting += ["--patience", str(PATIENCE)]
         self.processes = []
-        for k in range(special.get("started", processes)):
-            time.sleep(special.get("late", {}).get(k, 0))
+
+        def start(k):
             name, step = special.get("send", {}).get(k, ("never", 0))
-            command = [sys.executable, "-m", "tests.support.training_process", name, str(step)]
-            command += [*OPTIONS, "--data-root", str(recording), "--workdir", str(workdir)]
+            command = [name, str(step), *OPTIONS]
+            command += ["--data-root", str(recording), "--workdir", str(workdir)]
             command += [*meeting, "--process-id", str(k)] if processes > 1 else []
             command += ["--devices", str(devices), *more]
-            self.processes.append(
-                subprocess.Popen(
-                    command,
-                    cwd=ROOT,
-                    env=environment,
-                    stdout=subprocess.PIPE,
-                    stderr=subprocess.PIPE,
-                    text=True,
-                )
-            )
+            self.processes.append(server.start("training", *command))
+
+        self.start_next = lambda: start(len(self.processes))
+        for _ in range(special.get("started", processes)):
+            self.start_next()
 
     def end(self):
         """(status, lines on stderr) of each process."""
-        found = []
-        try:
-            for process in self.processes:
-                _, errors = process.communicate(timeout=LIMIT)
-                found.append((process.returncode, errors.splitlines()))
-        finally:
-            for process in self.processes:
-                process.kill()
-        return found
+        return [end_of(process) for process in self.processes]
 
 
 @pytest.fixture(scope="module")
-def run(recording, environment):
+def run(recording, server):
     def start(*arguments, **special):
-        return Group(recording, environment, *arguments, **special)
+        return Group(recording, server, *arguments, **special)
 
     return start
 
@@ -118,15 +141,28 @@ def alone(run, tmp_path_factory):
     return workdir
 
 
-@pytest.mark.parametrize("processes, devices, late", [(1, 8, {}), (2, 4, {1: 20})])
-def test_devices_and_processes_change_nothing_but_rounding(
-    run, alone, tmp_path, processes, devices, late
-):
-    """Also where a process starts 20 s late."""
-    ends = run(tmp_path / "run", processes, devices, late=late).end()
-    assert [status for status, _ in ends] == [0] * processes, ends
-    assert all(not lines for _, lines in ends[1:]), "the first process alone speaks"
+@pytest.fixture(scope="module")
+def incomplete(run, tmp_path_factory):
+    """The first of two processes. It waits while other tests run."""
+    workdir = tmp_path_factory.mktemp("incomplete") / "run"
+    return workdir, run(workdir, 2, 4, "--patience", str(LIMIT), started=1)
+
+
+def test_devices_change_nothing_but_rounding(run, incomplete, alone, tmp_path):
+    (end,) = run(tmp_path / "run", 1, 8).end()
+    assert end[0] == 0, end
     assert_same_run(tmp_path / "run", alone)
+
+
+def test_processes_change_nothing_but_rounding(incomplete, alone):
+    """Also where one starts 20 s late."""
+    workdir, group = incomplete
+    time.sleep(max(0, 20 - (time.monotonic() - group.began)))
+    group.start_next()
+    ends = group.end()
+    assert [status for status, _ in ends] == [0, 0], ends
+    assert not ends[1][1], "the first process alone speaks"
+    assert_same_run(workdir, alone)
 
 
 def test_a_run_goes_on_in_other_numbers_of_processes_and_devices(run, alone, tmp_path):
@@ -173,26 +209,21 @@ def test_a_process_that_never_comes_is_given_up(run, tmp_path):
     group = run(tmp_path / "run", 2, 1, *BRIEF, started=1)
     ((status, lines),) = group.end()
     assert status == 2
-    assert len(lines) == 1 and "did not all meet within 12 s" in lines[0], lines
+    assert len(lines) == 1 and "did not all meet within 5 s" in lines[0], lines
     assert time.monotonic() - group.began < LIMIT
     assert not (tmp_path / "run").exists()
 
 
-def test_processes_share_sequences_and_each_has_all_results(environment, tmp_path):
+def test_processes_share_sequences_and_each_has_all_results(server, tmp_path):
     """Four devices in two processes, and five sequences: in order, and the same ones."""
     with socket.socket() as free:
         free.bind(("localhost", 0))
         coordinator = f"localhost:{free.getsockname()[1]}"
-    module = [sys.executable, "-m", "tests.support.sequences_process"]
-    processes = [
-        subprocess.Popen(
-            [*module, coordinator, "2", str(k), str(tmp_path / f"{k}.npz")],
-            cwd=ROOT,
-            env=environment,
-        )
+    each = [
+        server.start("sequences", coordinator, "2", str(k), str(tmp_path / f"{k}.npz"))
         for k in range(2)
     ]
-    assert [process.wait(LIMIT) for process in processes] == [0, 0]
+    assert [end_of(files)[0] for files in each] == [0, 0]
     steps = np.random.default_rng(0).normal(size=(5, 7, 3)).astype(np.float32)
     for k in range(2):
         found = np.load(tmp_path / f"{k}.npz")

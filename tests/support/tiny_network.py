@@ -5,20 +5,22 @@ from flax import linen as nn
 
 from gnio_jax.models.heads import CalibratedUncertainty, UncertaintyHead
 from gnio_jax.models.layers import linear
+from gnio_jax.models.precision import Dtype
 from gnio_jax.types import Prediction
 
 
 class Tiny(nn.Module):
     uncertainty: str = "head"
+    dtype: Dtype = "float32"
 
     @nn.compact
     def __call__(self, windows, train=False):
-        h = linear(4, "encoder")(windows.mean(axis=1))
+        h = linear(4, "encoder", self.dtype)(windows.mean(axis=1))
         norm = nn.BatchNorm(not train, dtype=jnp.float32, param_dtype=jnp.float32, name="norm")
         h = jnp.tanh(norm(h))
-        displacement = linear(3, "head")(h)
+        displacement = linear(3, "head", self.dtype)(h)
         if self.uncertainty == "calibrated":
-            log_std = CalibratedUncertainty(name="uncertainty")(h, train)
+            log_std = CalibratedUncertainty(self.dtype, name="uncertainty")(h, train)
         else:
-            log_std = UncertaintyHead(name="uncertainty")(h)
+            log_std = UncertaintyHead(self.dtype, name="uncertainty")(h)
         return Prediction(displacement, log_std, {})

@@ -33,6 +33,7 @@ from gnio_jax.filtering import (
     run_odometry,
     sensitivity,
 )
+from gnio_jax.filtering.batch import Batch, batches, padded_signals
 from gnio_jax.filtering.config import YawFrame
 from gnio_jax.filtering.history import GYRO_BIAS, POSITION
 from gnio_jax.filtering.options import FilterSetup
@@ -51,15 +52,6 @@ class Measurements(NamedTuple):
     """m, in the yaw frame of the window's start."""
     std: Float[Array, "k 3"]
     """m."""
-
-
-class Batch(NamedTuple):
-    """Recordings that are filtered side by side."""
-
-    members: list[int]
-    """Which; the last one repeated where they do not fill the batch."""
-    strides: int
-    """Length that all are padded to."""
 
 
 class FilterStart(NamedTuple):
@@ -84,7 +76,7 @@ def run_filters(
     n = setup.config.samples_per_clone
     strides = [each.strides(n) for each in prepared]
     found: dict[int, Estimate] = {}
-    for batch in batches(strides, batch_size):
+    for batch in _batches(strides, batch_size):
         history = _run_batch([prepared[i] for i in batch.members], batch, source, setup)
         for place, i in enumerate(dict.fromkeys(batch.members)):
             own = jax.tree.map(lambda leaf, p=place, k=strides[i]: leaf[p, :k], history)
@@ -93,22 +85,19 @@ def run_filters(
     return [found[i] for i in range(len(prepared))]
 
 
-def batches(strides: list[int], batch_size: int) -> list[Batch]:
-    """Recordings of like lengths together, which need little padding, the longest first.
-
-    All batches have one size and their lengths are few (the longest recording's times powers of
-    0.8), so there are few compilations, and none is padded by more than a quarter.
-    """
-    longest_first = sorted(range(len(strides)), key=lambda i: -strides[i])
+def _batches(strides: list[int], batch_size: int) -> list[Batch]:
+    """Batches of one size, as full as they can be. Their lengths are few (the longest recording's
+    times powers of 0.8), and none is padded by more than a quarter."""
     count = max(1, math.ceil(len(strides) / batch_size))
     size = max(1, math.ceil(len(strides) / count))
-    length, found = max(strides, default=0), []
-    for begin in range(0, len(strides), size):
-        members = longest_first[begin : begin + size]
-        while 0.8 * length >= strides[members[0]] and length > SHORTEST:
+
+    def padded(longest: int) -> int:
+        length = max(strides)
+        while 0.8 * length >= longest and length > SHORTEST:
             length = math.ceil(0.8 * length)
-        found.append(Batch(members + members[-1:] * (size - len(members)), length))
-    return found
+        return length
+
+    return batches(strides, size, padded)
 
 
 def _run_batch(
@@ -118,18 +107,17 @@ def _run_batch(
     setup: FilterSetup,
 ) -> FilterHistory:
     """One compiled run; leading axis: the members."""
-    samples = batch.strides * setup.config.samples_per_clone
+    samples = batch.intervals * setup.config.samples_per_clone
     start = _stacked([_filter_start(each, setup) for each in members])
-    # What is appended comes after the recording and changes nothing before it.
-    gyro = np.stack([filled_up(each.sequence.gyro[:-1], samples, 0.0) for each in members])
-    accel = np.stack([filled_up(each.sequence.accel[:-1], samples) for each in members])
+    signals = ((each.sequence.gyro[:-1], each.sequence.accel[:-1]) for each in members)
+    gyro, accel = padded_signals(signals, samples)
     if isinstance(source, Network):
         history = _run_with_network(
             source.apply, source.variables, start, gyro, accel, setup.config, setup.noise
         )
     else:
         given = [
-            Measurements(*(filled_up(part, batch.strides, np.nan) for part in source[i]))
+            Measurements(*(filled_up(part, batch.intervals, np.nan) for part in source[i]))
             for i in batch.members
         ]
         history = _run_with_measurements(

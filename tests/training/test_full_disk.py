@@ -1,0 +1,114 @@
+"""A disk that takes no more while a checkpoint is written, and a checkpoint that is damaged."""
+
+import errno
+import resource
+import shutil
+from collections import namedtuple
+from contextlib import contextmanager
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from gnio_jax.errors import InputError
+from gnio_jax.training.checkpoint import Checkpoints, Position
+from gnio_jax.training.log import Log
+from gnio_jax.training.step import TrainState
+
+
+def state(step):
+    """Random numbers, which do not compress."""
+    rng = np.random.default_rng(step)
+    draw = lambda: {"weights": jnp.asarray(rng.normal(size=9000).astype(np.float32))}  # noqa: E731
+    return TrainState(jnp.int32(step), draw(), {}, draw())
+
+
+def position(step):
+    return Position(0, step, None, (), 0.0)
+
+
+@contextmanager
+def files_of_at_most(size):
+    """Bytes that a file may have: writing more fails, as on a full disk."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+@pytest.fixture
+def checkpoints(tmp_path):
+    with Checkpoints(tmp_path) as found:
+        found.save("latest", state(1), position(1))
+        yield found
+
+
+def assert_kept(checkpoints):
+    restored, where = checkpoints.restore(state(0))
+    assert where.step == 1
+    jax.tree.map(np.testing.assert_array_equal, restored, state(1))
+
+
+@pytest.mark.parametrize("size", [100, 10_000])
+def test_a_write_that_fails_names_the_folder_and_keeps_the_checkpoint(checkpoints, tmp_path, size):
+    """In the metadata, which Python writes, and in the arrays, where Orbax raises ValueError."""
+    with files_of_at_most(size), pytest.raises(OSError) as told:
+        checkpoints.save("latest", state(2), position(2))
+    assert told.value.errno == errno.EFBIG
+    assert str(tmp_path / "checkpoints" / "latest") in told.value.filename
+    assert_kept(checkpoints)
+    checkpoints.save("latest", state(3), position(3))  # where there is room again
+    assert checkpoints.restore(state(0))[1].step == 3
+
+
+def test_a_disk_without_room_is_told_before_anything_is_written(
+    checkpoints, tmp_path, monkeypatch, capfd
+):
+    usage = namedtuple("usage", "total used free")
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage(10**9, 10**9 - 60_000, 60_000))
+    with pytest.raises(OSError) as told:
+        checkpoints.save("latest", state(2), position(2))
+    assert told.value.errno == errno.ENOSPC
+    assert told.value.filename == str(tmp_path / "checkpoints" / "latest")
+    assert [child.name for child in (tmp_path / "checkpoints" / "latest").iterdir()] == ["1"]
+    assert capfd.readouterr() == ("", "")
+    assert_kept(checkpoints)
+
+
+def test_a_log_that_cannot_be_written_names_its_place(tmp_path):
+    with Log(tmp_path, 0, 0) as log:
+        log.add({"epoch": 0, "step": 1, "loss": 1.0})
+        with files_of_at_most(50), pytest.raises(OSError) as told:
+            log.add({"epoch": 1, "step": 2, "loss": 1.0})
+    assert told.value.filename == str(tmp_path / "metrics.jsonl")
+    assert len((tmp_path / "metrics.jsonl").read_text().splitlines()) == 1
+
+
+def test_a_board_that_cannot_be_written_names_its_place(tmp_path):
+    """It ends the run: nothing waits for a thread that the disk has stopped."""
+    many = {f"gradient_norm/{i}": 1.0 for i in range(100)}
+    with Log(tmp_path, 0, 0) as log:
+        with files_of_at_most(6000), pytest.raises(OSError) as told:
+            for step in range(20):
+                log._board.add({"step": step, **many})
+    assert told.value.filename == str(tmp_path / "tensorboard")
+
+
+def test_arrays_that_are_cut_short_are_told(tmp_path):
+    with Checkpoints(tmp_path) as checkpoints:
+        checkpoints.save("latest", state(1), position(1))
+        for file in (tmp_path / "checkpoints" / "latest" / "1" / "optimizer" / "d").iterdir():
+            file.write_bytes(file.read_bytes()[:20])
+        with pytest.raises(InputError, match=r"latest/1: cannot be read .* is damaged"):
+            checkpoints.restore(state(0))
+
+
+def test_what_a_killed_process_left_is_removed(tmp_path):
+    rest = tmp_path / "checkpoints" / "latest" / "7.orbax-checkpoint-tmp"
+    rest.mkdir(parents=True)
+    with Checkpoints(tmp_path) as checkpoints:
+        checkpoints.save("latest", state(1), position(1))
+    assert not rest.exists()
