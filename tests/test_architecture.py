@@ -27,10 +27,12 @@ ROOMS = {
 
 LIBRARIES = {
     "flax": {"models", "training", "evaluation", "interop"},
+    "mcap": {"data.importing.bags", "evaluation.exporting.ros"},
     "grain": {"training.supply"},
     "matplotlib": {"data", "evaluation", "tables"},
     "optax": {"training"},
     "orbax": {"training.checkpoint"},
+    "rosbags": {"data.importing.bags", "evaluation.exporting.ros"},
     "rich.console.Console": {"commands"},
     "rich.progress": {"commands"},
     "tensorboardX": {"training.log"},

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import os
-import warnings
 from collections.abc import Sequence as Arguments
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import tyro
 
-from gnio_jax.commands import console
+from gnio_jax.commands import console, data_export, data_import
 from gnio_jax.commands.options import Command, Group, execute, sibling
 from gnio_jax.errors import InputError
 from gnio_jax.files import write_text
@@ -47,18 +45,6 @@ CONVERT = """Any dataset as the package's HDF5, with its splits: one file a reco
 
 What fails the self-check is left out. Stop it when you like: the same command goes on where it was.
 ROOT - stands for the usual place, $GNIO_DATA/<name>, else data/<name>."""
-
-IMPORT = """A phone logger's CSV (one file, or one for each sensor) as the package's HDF5.
-
-  {prog} walk.csv --out recordings/walk.h5
-  {prog} Gyroscope.csv --accel-path Accelerometer.csv --columns.time "Time (s)" \\
-      --columns.gyro-x "X (rad/s)" --columns.gyro-y "Y (rad/s)" --columns.gyro-z "Z (rad/s)" \\
-      --columns.accel-x "X (m/s^2)" --columns.accel-y "Y (m/s^2)" --columns.accel-z "Z (m/s^2)" \\
-      --out recordings/walk.h5
-  {prog} ios.csv --accel-sign ios --gyro-unit deg/s --rate 100 --out recordings/ios.h5
-
-Units and the unit of time are detected where the data tell them; what was assumed is said. A
-recording without a reference is evaluated with --init static."""
 
 
 @dataclass(frozen=True)
@@ -103,60 +89,6 @@ class ConvertOptions:
     """Rate of the result, Hz; by default each recording's own."""
     workers: int | None = None
     """Processes; by default as many as there are cores, and one for a few recordings."""
-
-
-@dataclass(frozen=True)
-class Columns:
-    """Names of the file's columns, or their places from 0 without a header; "a+b" is a sum."""
-
-    time: str | None = None
-    """Stamps."""
-    accel_time: str | None = None
-    """Stamps of the accelerometer, where they are another column."""
-    gyro_x: str | None = None
-    """Angular rate."""
-    gyro_y: str | None = None
-    """Angular rate."""
-    gyro_z: str | None = None
-    """Angular rate."""
-    accel_x: str | None = None
-    """Acceleration, gravity included."""
-    accel_y: str | None = None
-    """Acceleration, gravity included."""
-    accel_z: str | None = None
-    """Acceleration, gravity included."""
-
-
-@dataclass(frozen=True)
-class ImportOptions:
-    """What `gnio data import` is asked for."""
-
-    file: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="FILE")]]
-    """The logger's file, or the gyro's where the accelerometer has one of its own."""
-    out: Path
-    """HDF5 file to write, NAME.h5."""
-    accel_path: Path | None = None
-    """The accelerometer's file."""
-    columns: Columns = field(default_factory=Columns)
-    """What the columns are called; those not given are looked up by our own names: time, gyro_x,
-    ..."""
-    time_unit: Literal["s", "ms", "us", "ns"] | None = None
-    """Unit of the stamps; detected by default."""
-    gyro_unit: Literal["rad/s", "deg/s"] | None = None
-    """Unit of the gyro; detected by default."""
-    accel_unit: Literal["m/s2", "g", "mg"] | None = None
-    """Unit of the accelerometer; detected by default."""
-    accel_sign: Literal["android", "ios", "detect"] = "android"
-    """At rest, level, the up axis reads +1 g (android) or −1 g (ios); detect assumes that the
-    screen points up."""
-    order: Literal["sort", "refuse"] = "sort"
-    """Rows out of order are sorted, or refused."""
-    rate: float | None = None
-    """Rate of the result, Hz; by default that of the faster sensor."""
-    separator: str | None = None
-    """Separator of the columns; detected by default."""
-    name: str | None = None
-    """Name of the sequence; by default that of the file OUT."""
 
 
 def show_list(_options: ListOptions, _prog: str) -> None:
@@ -276,54 +208,13 @@ def convert(options: ConvertOptions, prog: str) -> None:
     output.print(f"next: {following}", soft_wrap=True)
 
 
-def import_file(options: ImportOptions, prog: str) -> None:
-    """Write the file, say what was assumed and what it looks like, and what to do with it."""
-    from gnio_jax.data import importing
-    from gnio_jax.data.checking import impressions
-    from gnio_jax.data.hdf5 import write_hdf5
-    from gnio_jax.data.readers import csv_files
-
-    if options.out.suffix.lower() not in (".h5", ".hdf5"):
-        raise InputError("--out", f"'{options.out}' is no name of an HDF5 file", "name it NAME.h5")
-    if options.out.is_dir():
-        raise InputError("--out", f"'{options.out}' is a folder", "name a file in it, NAME.h5")
-    columns = dataclasses.asdict(options.columns)
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        sequence, notes = importing.import_recording(
-            options.file,
-            {name: column for name, column in columns.items() if column is not None},
-            accel_path=options.accel_path,
-            time_unit=options.time_unit,
-            gyro_unit=options.gyro_unit,
-            accel_unit=options.accel_unit,
-            accel_sign=options.accel_sign,
-            order=options.order,
-            rate=options.rate,
-            separator=options.separator,
-            name=options.name or options.out.stem,
-        )
-    write_hdf5(options.out, sequence)
-    folder = options.out.parent
-    lists = [split for split in csv_files.SPLITS if (folder / f"{split}.txt").is_file()]
-    notes = [*notes, *(str(warning.message) for warning in caught), *impressions(sequence)]
-    if lists:
-        line = f"add the line {options.out.stem} to {lists[-1]}.txt, or it is not read"
-        notes.append(f"{folder} has lists: {line}")
-    evaluate = f"{sibling(prog, 'evaluate')} --dataset csv --data-root {folder}"
-    output = console.stdout()
-    output.print(f"{options.out}: {sequence.name}", soft_wrap=True)
-    for note in notes:
-        output.print(f"  {note}", soft_wrap=True)
-    output.print(f"next: {evaluate} --split test --init static", soft_wrap=True)
-
-
 COMMANDS = Group(
     {
         "list": Command(ListOptions, show_list, LIST),
         "check": Command(CheckOptions, check, CHECK),
         "convert": Command(ConvertOptions, convert, CONVERT),
-        "import": Command(ImportOptions, import_file, IMPORT),
+        "import": data_import.COMMAND,
+        "export": data_export.COMMAND,
     },
     OVERVIEW,
 )

@@ -161,7 +161,7 @@ def check_sequence(sequence: Sequence, dataset: Dataset) -> SelfCheck:
     return check if needed else check._replace(failures=())
 
 
-def keep_plausible(sequences: Iterable[Sequence], dataset: Dataset) -> Iterator[Sequence]:
+def each_plausible(sequences: Iterable[Sequence], dataset: Dataset) -> Iterator[Sequence]:
     """The sequences that pass the self-check of their dataset; a warning names each other one with
     the reason.
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 from gnio_jax.data.cache import cached, is_cached, is_refused
 from gnio_jax.data.dataset import Dataset, Recording, Refusal
-from gnio_jax.data.plausibility import SelfCheck, check_sequence, keep_plausible
+from gnio_jax.data.plausibility import SelfCheck, check_sequence, each_plausible
 from gnio_jax.data.processes import ProcessDied, map_in_processes
 from gnio_jax.errors import InputError
 from gnio_jax.types import Sequence
@@ -110,7 +110,7 @@ def read_each(
 ) -> Iterator[Sequence]:
     """The sequences of `read_split` one after another: none is kept in memory."""
     sequences = _sequences(dataset, root, split, workers, progress)
-    return keep_plausible(sequences, dataset) if dataset.needs_root else sequences
+    return each_plausible(sequences, dataset) if dataset.needs_root else sequences
 
 
 def _sequences(

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
-import functools
 from typing import Any, get_args
 
 import jax
 import jax.numpy as jnp
 from flax import linen as nn
-from jaxtyping import Float, PRNGKeyArray
+from jaxtyping import PRNGKeyArray
 
 from gnio_jax.errors import InputError
 from gnio_jax.models.ctin import CTIN
@@ -86,20 +85,16 @@ def create(
 def initialise(model: nn.Module, key: PRNGKeyArray, window: int = 200) -> Any:
     """Fresh variables of `model` for windows of `window` samples.
 
-    `model.init` gives the same; here it is compiled, once for each network.
+    `model.init` gives the same to rounding. Here the network itself is never run, and one small
+    program draws all parameters of one shape: compiling `model.init` takes many times as long.
     """
-    return _init(key, jnp.zeros((1, window, 6), jnp.float32), model=model)
+    return model.lazy_init(key, _windows(window))
 
 
 def variable_shapes(model: nn.Module, window: int = 200) -> Any:
     """The shapes and types of what `initialise` gives; nothing is computed."""
-    windows = jax.ShapeDtypeStruct((1, window, 6), jnp.float32)
-    return _init.eval_shape(jax.random.key(0), windows, model=model)
+    return jax.eval_shape(model.init, jax.random.key(0), _windows(window))
 
 
-# For one use: the optimiser of the compiler takes more seconds than it saves.
-@functools.partial(
-    jax.jit, static_argnames="model", compiler_options={"xla_backend_optimization_level": 1}
-)
-def _init(key: PRNGKeyArray, windows: Float[jax.Array, "1 n 6"], *, model: nn.Module) -> Any:
-    return model.init(key, windows)
+def _windows(window: int) -> jax.ShapeDtypeStruct:
+    return jax.ShapeDtypeStruct((1, window, 6), jnp.float32)

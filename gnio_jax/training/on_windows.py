@@ -227,6 +227,6 @@ def _windows(
             samples[sequence.name] = len(sequence.time)
             yield sequence
 
-    source = stored(config, windows.window_parts(noted(), config.data, stride, shift))
+    source = stored(config, noted(), stride, shift)
     describe_split(config, split, samples, f"{source.visited.shape[0]:,} windows", reporter)
     return source, list(samples)

@@ -16,11 +16,11 @@ import numpy as np
 from jaxtyping import Int
 
 from gnio_jax.config import TrainConfig
-from gnio_jax.data import cache
+from gnio_jax.data import cache, windows
 from gnio_jax.data.on_disk import bytes_of, source_on_disk
-from gnio_jax.data.windows import WindowSource, excerpt, joined
+from gnio_jax.data.windows import WindowSource, excerpt
 from gnio_jax.scaling import devices
-from gnio_jax.types import Array
+from gnio_jax.types import Array, Sequence
 
 PART_BYTES = 2**25
 """Size of a part that is read and brought to the device at once, unless a step needs more."""
@@ -64,11 +64,14 @@ class Supply(Protocol):
         ...
 
 
-def stored(config: TrainConfig, parts: Iterable[WindowSource]) -> WindowSource:
+def stored(
+    config: TrainConfig, sequences: Iterable[Sequence], stride: int, shift: int
+) -> WindowSource:
     """The windows of recordings on the host: in memory if they will lie on the device, else mapped
     from files in the cache's folder."""
     if config.data.residency == "device":
-        return joined(parts)
+        return windows.window_source(sequences, config.data, stride, shift)
+    parts = windows.window_parts(sequences, config.data, stride, shift)
     return source_on_disk(parts, cache.folder())
 
 

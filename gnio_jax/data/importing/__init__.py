@@ -1,8 +1,9 @@
-"""The CSV of a phone's logger as a `Sequence`: columns of other names, other units, one file per
-sensor.
+"""A recording as people have it, as a `Sequence`: a phone logger's export, a robot's bag, a folder
+of EuRoC's layout, or any CSV.
 
-The steps: the columns of each sensor in order (`streams`), both on one clock (`streams.join`),
-units and signs (`units`), one uniform clock.
+The steps: the format by the content (`recognition`), the samples of each sensor and the reference
+as the reader of the format gives them (a `source.Source`), both sensors in order and on one clock
+(`streams`), units and signs (`units`), one uniform clock, and the reference on it (`reference`).
 """
 
 from __future__ import annotations
@@ -15,6 +16,14 @@ from typing import NamedTuple
 import numpy as np
 
 from gnio_jax.data.importing import units
+from gnio_jax.data.importing.asl import read_asl
+from gnio_jax.data.importing.bags import KINDS
+from gnio_jax.data.importing.phyphox import read_phyphox
+from gnio_jax.data.importing.recognition import recognise
+from gnio_jax.data.importing.reference import with_reference
+from gnio_jax.data.importing.ros import Topics, read_bag
+from gnio_jax.data.importing.sensor_logger import read_sensor_logger
+from gnio_jax.data.importing.source import Source, Track, Units
 from gnio_jax.data.importing.streams import (
     Joined,
     SensorFile,
@@ -23,12 +32,16 @@ from gnio_jax.data.importing.streams import (
     read_stream,
     read_table,
 )
+from gnio_jax.data.plausibility import self_check
 from gnio_jax.data.readers.csv_files import ACCEL, GYRO
 from gnio_jax.data.readers.stamps import PER_SECOND, RATES, rounded_rate
 from gnio_jax.data.resampling import resample
-from gnio_jax.data.validation import validate
+from gnio_jax.data.validation import WINDOW_SECONDS, validate
 from gnio_jax.errors import InputError
 from gnio_jax.types import Sequence
+
+SLOW = 50.0
+"""Hz below which the impacts of steps are lost; networks are trained on 100 and more (ours)."""
 
 _COLUMNS = ("time", "accel_time", *GYRO, *ACCEL)
 
@@ -37,7 +50,7 @@ class Imported(NamedTuple):
     """What `import_recording` made of a recording."""
 
     sequence: Sequence
-    """On a uniform clock, without a reference."""
+    """On a uniform clock, with a reference where the recording has one."""
     notes: tuple[str, ...]
     """What was detected, assumed or repaired, one sentence each, to be shown to the user."""
 
@@ -50,38 +63,45 @@ def import_recording(
     time_unit: str | None = None,
     gyro_unit: str | None = None,
     accel_unit: str | None = None,
-    accel_sign: str = "android",
+    accel_sign: str | None = None,
     order: str = "sort",
     rate: float | None = None,
     separator: str | None = None,
     name: str | None = None,
+    imu_topic: str | None = None,
+    accel_topic: str | None = None,
+    reference_topic: str | None = None,
 ) -> Imported:
-    """A phone logger's CSV as a `Sequence` without a reference, on a uniform clock.
+    """A recording as a `Sequence` on a uniform clock.
 
     `path`
-        The gyro's file, and the accelerometer's unless `accel_path` is given; lines that begin with
-        # are comments.
+        A zip, folder or workbook of Sensor Logger or phyphox, a bag or MCAP, a folder of EuRoC's
+        layout, or a CSV: the gyro's file, and the accelerometer's unless `accel_path` is given;
+        lines that begin with # are comments.
     `columns`
-        From our names to the file's: `time`, `gyro_x..z`, `accel_x..z`, and `accel_time` if the
-        accelerometer's time is another column. What is not mapped is looked up by our name. "a+b"
-        is the sum of two columns (gravity and user acceleration). In a file whose header names
-        nothing, or that has none, all are places counted from "0".
+        Of a CSV, from our names to the file's: `time`, `gyro_x..z`, `accel_x..z`, and `accel_time`
+        if the accelerometer's time is another column. What is not mapped is looked up by our name.
+        "a+b" is the sum of two columns (gravity and user acceleration). In a file whose header
+        names nothing, or that has none, all are places counted from "0".
     `time_unit`, `gyro_unit`, `accel_unit`
-        None detects it: s, ms, us or ns by the rate of an IMU, 10 to 2000 Hz; rad/s or deg/s by
-        `units.gyro_scale`; m/s2, g or mg by the magnitude of gravity. What is ambiguous is refused.
+        None takes what the format or the header says, e.g. "(rad/s)", and else detects it: s, ms,
+        us or ns by the rate of an IMU, 10 to 2000 Hz; rad/s or deg/s by `units.gyro_scale`; m/s2, g
+        or mg by the magnitude of gravity. What is ambiguous is refused.
     `accel_sign`
         "android": at rest, level, the up axis reads +1 g; "ios": it reads −1 g and everything is
         negated; "detect" assumes that the screen (+z) points up more than down over the recording.
-        Nothing in the data alone tells the sign.
+        None takes what the format says, Android's for a CSV. Nothing in the data alone tells it.
     `order`
         Rows out of order are sorted and rows that are there twice dropped ("sort"), or refused.
     `rate`
         Hz of the result; None keeps the faster sensor's own.
     `separator`
-        Of the columns; None takes the most frequent of comma, semicolon and tab, or blanks where
-        there is none of them.
+        Of a CSV's columns; None takes the most frequent of comma, semicolon and tab, or blanks
+        where there is none of them.
     `name`
         Of the sequence; None takes that of the file.
+    `imu_topic`, `accel_topic`, `reference_topic`
+        Of a bag, see `ros.Topics`.
 
     Two sensors with stamps of their own are put on the faster one's over the time that both cover,
     by cubic splines. Raises `InputError` naming file, field and remedy.
@@ -95,20 +115,108 @@ def import_recording(
         raise InputError(
             "rate", f"{rate:g} Hz is no rate to resample to", f"give 1 to {RATES[1]:g} Hz"
         )
-    notes: list[str] = []
-    gyro_file, accel_file = _sensor_files(path, accel_path, dict(columns or {}), separator)
+    path = Path(path)
+    kind = "csv" if columns or accel_path is not None else recognise(path)
+    topics = Topics(imu_topic, accel_topic, reference_topic)
+    if any(topics) and kind not in KINDS:
+        raise InputError(path, "has no topics", "a topic is one of a ROS bag or an MCAP")
+    if kind == "csv":
+        source = _read_csv(path, accel_path, dict(columns or {}), separator)
+    else:
+        source = _read_other(path, kind, topics)
+    stated = Units(time_unit, gyro_unit, accel_unit, accel_sign)
+    return _imported(source, stated, order, rate, name or path.stem)
+
+
+def _read_other(path: Path, kind: str, topics: Topics) -> Source:
+    match kind:
+        case "sensor_logger":
+            return read_sensor_logger(path)
+        case "phyphox":
+            return read_phyphox(path)
+        case "euroc":
+            return read_asl(path)
+        case _:
+            return read_bag(path, kind, topics)
+
+
+def _imported(source: Source, stated: Units, order: str, rate: float | None, name: str) -> Imported:
+    """What any format comes to: `stated` wins over what the format says of its units."""
+    notes = list(source.notes)
+    imu = _joined(source, stated, order, notes)
+    sequence = _without_reference(imu, name, source.gyro.path)
+    own = rounded_rate(imu.time)
+    target = rate or own
+    notes.append(f"put on a uniform clock of {target:g} Hz")
+    if own < SLOW:
+        notes.append(
+            f"it was recorded at {own:g} Hz, which is slow: steps need {SLOW:g} Hz, and the "
+            "networks were trained on 100 Hz and more"
+        )
+    sequence = resample(sequence, target)
+    if source.track is not None:
+        sequence = _with_track(sequence, imu.start, source.track, notes)
+    return Imported(sequence, tuple(notes))
+
+
+def _with_track(sequence: Sequence, start: float, track: Track, notes: list[str]) -> Sequence:
+    """With the reference, where it can be one and describes the motion of the IMU."""
+    try:
+        result = with_reference(sequence, start, track)
+        _check_motion_is_one(result, track)
+    except InputError as error:
+        if track.named:
+            raise
+        notes.append(f"no reference is taken: {error}")
+        return sequence
+    notes.append(f"reference from {track.name}, {result.valid.mean():.0%} of the time")
+    return result
+
+
+def _check_motion_is_one(sequence: Sequence, track: Track) -> None:
+    """Raise `InputError` where the self-check would leave the sequence out."""
+    if failures := self_check(sequence, pedestrian=False).failures:
+        raise InputError(
+            track.path,
+            f"the reference {track.name} does not fit the IMU ({'; '.join(failures)})",
+            "its frame must be the IMU's, its world z-up, its clock the same",
+        )
+
+
+def _joined(source: Source, stated: Units, order: str, notes: list[str]) -> Joined:
+    """Both sensors on one clock, in SI units and with Android's sign."""
+    gyro_file, accel_file, known = source.gyro, source.accel, source.units
+    time_unit = stated.time or known.time
     gyro = read_stream(gyro_file, time_unit, order, notes)
     accel = read_stream(accel_file, time_unit, order, notes)
-    scale = units.accel_scale(accel.values, accel_unit, accel_file.path, notes)
+    _check_length(gyro, accel, source.path)
+    scale = units.accel_scale(accel.values, stated.accel or known.accel, accel_file.path, notes)
     imu = join(gyro, _scaled(accel, scale), gyro_file.path, accel_file.path, notes)
-    scale = units.gyro_scale(imu, gyro_unit, gyro_file.path, notes)
-    force = units.signed(imu.accel, accel_sign, accel_file.path, notes)
-    imu = imu._replace(gyro=imu.gyro * scale, accel=force)
+    scale = units.gyro_scale(imu, stated.gyro or known.gyro, gyro_file.path, notes)
+    imu = imu._replace(gyro=imu.gyro * scale)
+    if stated.gyro is None and known.gyro is not None:
+        units.check_rad_per_second(imu, gyro_file.path)
+    sign = stated.sign or known.sign
+    if sign is None:
+        raise InputError(
+            accel_file.path,
+            "the sign of field 'accel' depends on the phone's system, which is not known here",
+            "state it: android, ios or detect",
+        )
+    force = units.signed(imu.accel, sign, accel_file.path, notes)
+    imu = imu._replace(accel=force)
     units.note_gravity(imu, accel_file.path, notes)
-    sequence = _without_reference(imu, name or gyro_file.path.stem, gyro_file.path)
-    target = rate or rounded_rate(imu.time)
-    notes.append(f"put on a uniform clock of {target:g} Hz")
-    return Imported(resample(sequence, target), tuple(notes))
+    return imu
+
+
+def _check_length(gyro: Stream, accel: Stream, path: Path) -> None:
+    seconds = float(min(gyro.time[-1], accel.time[-1]))
+    if seconds < WINDOW_SECONDS:
+        raise InputError(
+            path,
+            f"lasts {seconds:.2f} s, less than the network's window of {WINDOW_SECONDS:g} s",
+            "record for longer",
+        )
 
 
 def _check_choice(option: str, value: str | None, choices: Mapping[str, float] | tuple) -> None:
@@ -116,13 +224,13 @@ def _check_choice(option: str, value: str | None, choices: Mapping[str, float] |
         raise InputError(option, f"unknown value '{value}'", f"known: {', '.join(choices)}")
 
 
-def _sensor_files(
-    path: str | os.PathLike[str],
+def _read_csv(
+    gyro_path: Path,
     accel_path: str | os.PathLike[str] | None,
     columns: dict[str, str],
     separator: str | None,
-) -> tuple[SensorFile, SensorFile]:
-    """Where the gyro's and the accelerometer's samples are; the tables are read."""
+) -> Source:
+    """One file, or one of each sensor, with the columns that the user names."""
     if unknown := sorted(set(columns) - set(_COLUMNS)):
         known = ", ".join(sorted(_COLUMNS))
         raise InputError("columns", f"unknown name '{unknown[0]}'", f"known names: {known}")
@@ -130,7 +238,6 @@ def _sensor_files(
     gyro_axes, accel_axes = (
         tuple(columns.get(axis, axis) for axis in axes) for axes in (GYRO, ACCEL)
     )
-    gyro_path = Path(path)
     table = read_table(gyro_path, separator, (time, *gyro_axes))
     gyro = SensorFile("gyro", gyro_path, table, time, gyro_axes)
     accel = SensorFile("accel", gyro_path, table, columns.get("accel_time", time), accel_axes)
@@ -138,7 +245,16 @@ def _sensor_files(
         own = Path(accel_path)
         accel_table = read_table(own, separator, (accel.time, *accel_axes))
         accel = accel._replace(path=own, table=accel_table)
-    return gyro, accel
+    known = Units(
+        gyro=units.common_unit(gyro.axes, units.TO_RAD_PER_SECOND),
+        accel=units.common_unit(accel.axes, units.TO_METRES_PER_SECOND_SQUARED),
+        sign="android",
+    )
+    pairs = ((gyro, known.gyro), (accel, known.accel))
+    notes = [
+        f"{one.path.name}: {one.sensor} in {unit}, by its header" for one, unit in pairs if unit
+    ]
+    return Source(gyro_path, gyro, accel, known, notes=tuple(notes))
 
 
 def _scaled(stream: Stream, scale: float) -> Stream:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import NamedTuple
 
@@ -11,7 +12,7 @@ from jaxtyping import Float, Num
 from scipy.interpolate import CubicSpline
 
 from gnio_jax.data.readers.stamps import PER_SECOND, RATES, in_order, time_unit
-from gnio_jax.data.readers.text import numbers, read_csv
+from gnio_jax.data.readers.text import numbers, open_text, read_csv
 from gnio_jax.data.validation import check_finite, check_gaps, check_increasing
 from gnio_jax.errors import InputError
 from gnio_jax.numerics import interpolate, neighbours
@@ -63,29 +64,53 @@ class Joined(NamedTuple):
 # --- columns
 
 
-def read_table(path: Path, separator: str | None, columns: tuple[str, ...]) -> pd.DataFrame:
-    """A logger's table; without a header where all `columns` are places. `separator` None takes the
-    most frequent of comma, semicolon and tab, or blanks where there is none of them."""
-    if separator is None:
-        separator = _separator(path)
-    header = not all(name.isdigit() for name in columns)
-    table = read_csv(path, separator=separator, header=header)
-    # Some names begin with a byte order mark, some are quoted.
-    table.columns = [str(label).strip("\ufeff \"'") for label in table.columns]
+class Layout(NamedTuple):
+    """How the rows of a text table are written."""
+
+    separator: str
+    """" " stands for any run of blanks."""
+    decimal: str
+    """A point, or the comma of loggers set to it."""
+    labels: tuple[str, ...]
+    """The cells of the first row, without quotes."""
+
+
+def read_table(
+    path: Path, separator: str | None, columns: tuple[str, ...], content: bytes | None = None
+) -> pd.DataFrame:
+    """A logger's table; without a header where all `columns` are places.
+
+    `separator` None takes the most frequent of comma, semicolon and tab, or blanks where there is
+    none of them. `content` is what the file holds where it is part of an archive.
+    """
+    layout = table_layout(path, separator, content)
+    header = not (columns and all(name.isdigit() for name in columns))
+    table = read_csv(path, layout.separator, header, content, layout.decimal)
+    table.columns = [_label(label) for label in table.columns]
     return table
 
 
-def _separator(path: Path) -> str:
+def table_layout(path: Path, separator: str | None = None, content: bytes | None = None) -> Layout:
+    """The layout of a table, from its first two rows. Raises `InputError` for what is no text."""
     try:
-        with path.open(encoding="utf-8") as file:
+        with open_text(path, content) as file:
             rows = (line for line in file if line.strip() and not line.startswith("#"))
-            first = next(rows, "")
+            first, second = next(rows, ""), next(rows, "")
     except OSError as error:
         raise InputError(path, f"cannot be read ({error.strerror})") from None
     except UnicodeDecodeError as error:
         raise InputError(path, f"is no text ({error})", "export the recording as CSV") from None
-    separator = max((",", ";", "\t"), key=first.count)
-    return separator if separator in first else " "
+    if separator is None:
+        separator = max((",", ";", "\t"), key=first.count)
+        separator = separator if separator in first else " "
+    decimal = "," if separator != "," and re.search(r"\d,\d", second) else "."
+    labels = first.split(None if separator == " " else separator)
+    return Layout(separator, decimal, tuple(_label(label) for label in labels))
+
+
+def _label(text: object) -> str:
+    """The name of a column: some begin with a byte order mark, some are quoted."""
+    return str(text).strip("\ufeff \"'\n\r")
 
 
 def _column(table: pd.DataFrame, name: str, path: Path) -> Float[np.ndarray, " n"]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,6 +20,20 @@ TO_RAD_PER_SECOND = {"rad/s": 1.0, "deg/s": np.pi / 180.0}
 TO_METRES_PER_SECOND_SQUARED = {"m/s2": 1.0, "g": STANDARD_G, "mg": STANDARD_G * 1e-3}
 SIGNS = ("android", "ios", "detect")
 
+_SPELLINGS = {
+    "rad/s": ("rad/s", "rads^-1", "rads-1", "radian/s", "radians/s"),
+    "deg/s": ("deg/s", "degs^-1", "degree/s", "degrees/s", "°/s", "dps"),
+    "m/s2": ("m/s2", "m/s^2", "m/s²", "m/s/s", "ms^-2", "ms-2"),
+    "g": ("g",),
+    "mg": ("mg",),
+    "s": ("s", "sec", "seconds"),
+    "ms": ("ms",),
+    "us": ("us", "µs", "μs"),
+    "ns": ("ns",),
+}
+"""Our names of units, and what headers call them, without blanks and in small letters."""
+_NAMED = {spelling: unit for unit, spellings in _SPELLINGS.items() for spelling in spellings}
+
 GRAVITY_RANGES = {"m/s2": (7.0, 13.0), "g": (0.7, 1.3), "mg": (700.0, 1300.0)}
 """Median magnitude of the accelerometer, by which its unit is told."""
 GYRO_RANGE = 35.0
@@ -26,6 +42,19 @@ CARRIED_TURN = 10.0
 """deg/s: what somebody carries turns faster than this at times."""
 STEPS = 1.0
 """m/s²: steps make the magnitude of the specific force vary by more (standard deviation)."""
+
+
+def named_unit(label: str) -> str | None:
+    """The unit that a column's header names at its end, in round or square brackets: "rad/s" of
+    "Gyroscope x (rad/s)"; None where it names none that is known."""
+    inside = re.search(r"[(\[]([^()\[\]]*)[)\]]\s*$", label)
+    return _NAMED.get(re.sub(r"[\s*·]", "", inside[1]).lower()) if inside else None
+
+
+def common_unit(labels: Iterable[str], known: Iterable[str]) -> str | None:
+    """The unit, one of `known`, that all `labels` name."""
+    found = {named_unit(label) for label in labels}
+    return found.pop() if len(found) == 1 and found <= set(known) else None
 
 
 def accel_scale(
@@ -77,6 +106,22 @@ def gyro_scale(imu: Joined, unit: str | None, path: Path, notes: list[str]) -> f
         )
     notes.append(f"{path.name}: gyro taken as {unit} ({reason})")
     return TO_RAD_PER_SECOND[unit]
+
+
+def check_rad_per_second(imu: Joined, path: Path) -> None:
+    """Raise `InputError` where a gyro that a format or header gives a unit does not turn as gravity
+    does, but by the factor between rad and deg. `imu` is in SI units by that statement."""
+    turning, factor = _turning_of_gravity(imu), TO_RAD_PER_SECOND["deg/s"]
+    if turning.correlation <= 0.5:
+        return
+    for share, looks in ((turning.slope / factor, "deg/s"), (turning.slope * factor, "rad/s")):
+        if 0.5 < share < 2.0:
+            raise InputError(
+                path,
+                f"its gyro looks like {looks}, which it does not say "
+                f"(gravity turns by {turning.slope:.3g} of it)",
+                "state the unit of the gyro: rad/s or deg/s",
+            )
 
 
 class _Turning(NamedTuple):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,7 +25,7 @@ from gnio_jax.numerics import finite_rows
 LONGEST_LEVER = 100.0
 """m; no sensor is further away from its body."""
 
-_GYRO, _ACCEL = ("wx", "wy", "wz"), ("ax", "ay", "az")
+GYRO, ACCEL = ("wx", "wy", "wz"), ("ax", "ay", "az")
 _POSITION, _QUATERNION = ("px", "py", "pz"), ("qw", "qx", "qy", "qz")
 _VELOCITY = ("vx", "vy", "vz")
 _COLUMNS = {
@@ -53,9 +54,9 @@ class ImuFile(NamedTuple):
 
 def read_imu(path: Path, rate: float) -> ImuFile:
     """The IMU's data.csv, complete, at about `rate` Hz and without gaps."""
-    table, stamps = _table(path)
+    table, stamps = read_table(path)
     start = int(stamps.min())
-    samples = _values(table, [*_GYRO, *_ACCEL], path)
+    samples = _values(table, [*GYRO, *ACCEL], path)
     check_finite(samples, "gyro and accel", path)
     time, samples, repairs = in_order((stamps - start) * 1e-9, samples, path)
     check_rate(time, rate, path)
@@ -65,7 +66,7 @@ def read_imu(path: Path, rate: float) -> ImuFile:
 
 def read_poses(path: Path, start: int) -> Poses:
     """A reference's data.csv, in s after `start` (ns); rows without a pose are left out."""
-    table, stamps = _table(path)
+    table, stamps = read_table(path)
     velocity = _VELOCITY if _VELOCITY[0] in table.columns else ()
     values = _values(table, [*_POSITION, *_QUATERNION, *velocity], path)
     seen = finite_rows(values)
@@ -84,9 +85,9 @@ def read_poses(path: Path, start: int) -> Poses:
     )
 
 
-def _table(path: Path) -> tuple[pd.DataFrame, np.ndarray]:
-    """A data.csv with our names for the columns it has, and its stamps in ns as integers (a float
-    has too few digits)."""
+def read_table(path: Path) -> tuple[pd.DataFrame, np.ndarray]:
+    """A data.csv with our names for the columns it has (`stamp`, `wx`, `ax`, ...), and its stamps
+    in ns as integers (a float has too few digits)."""
     table = read_csv(path)
     plain = [re.sub(r"[\[(].*", "", str(name)).strip().lower() for name in table.columns]
     ours = {name: ours for ours, names in _COLUMNS.items() for name in names}
@@ -100,7 +101,12 @@ def _table(path: Path) -> tuple[pd.DataFrame, np.ndarray]:
 
 
 def _values(table: pd.DataFrame, names: list[str], path: Path) -> Float[np.ndarray, "n w"]:
-    """The columns; one that is missing is named as the authors name it."""
+    check_columns(table, names, path)
+    return numbers(table, names, path)
+
+
+def check_columns(table: pd.DataFrame, names: Iterable[str], path: Path) -> None:
+    """Raise `InputError` for a column that is missing, named as the authors name it."""
     for name in names:
         if name not in table.columns:
             raise InputError(
@@ -108,7 +114,6 @@ def _values(table: pd.DataFrame, names: list[str], path: Path) -> Float[np.ndarr
                 f"column '{_COLUMNS[name][0]}' is missing",
                 f"found: {', '.join(str(column) for column in table.columns)}",
             )
-    return numbers(table, names, path)
 
 
 class SensorPose(NamedTuple):
@@ -150,6 +155,15 @@ def sensor_pose(path: Path) -> SensorPose:
             "it holds cols, rows and data of a 4 × 4 matrix",
         ) from None
     return SensorPose(Rotation.from_matrix(turn), translation)
+
+
+def moved_to(imu: SensorPose, poses: Poses) -> Poses:
+    """Poses of the IMU, which sits at `imu` in the tracked sensor's frame. The velocity stays that
+    of the sensor."""
+    return poses._replace(
+        position=poses.position + poses.attitude.apply(imu.translation),
+        attitude=poses.attitude * imu.rotation,
+    )
 
 
 def _yaml(path: Path) -> Any:

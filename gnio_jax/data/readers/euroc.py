@@ -35,7 +35,7 @@ from pathlib import Path
 import numpy as np
 
 from gnio_jax.data.dataset import Dataset, Recording, single
-from gnio_jax.data.readers.asl import ImuFile, SensorPose, read_imu, read_poses, sensor_pose
+from gnio_jax.data.readers.asl import ImuFile, moved_to, read_imu, read_poses, sensor_pose
 from gnio_jax.data.readers.reference import Poses, fused, interpolated
 from gnio_jax.data.resampling import resample
 from gnio_jax.data.validation import validate
@@ -64,7 +64,7 @@ TUMVI_SPLITS = {
     ),
 }
 
-_REFERENCES = ("state_groundtruth_estimate0", "mocap0")
+REFERENCES = ("state_groundtruth_estimate0", "mocap0")
 
 
 def recordings(root: Path, split: str, dataset: str = "euroc") -> list[Recording]:
@@ -91,7 +91,7 @@ def _about(dataset: str) -> Dataset:
 
 
 def _recording(folder: Path, about: Dataset) -> Recording:
-    sensors = [folder / "mav0" / sensor for sensor in ("imu0", *_REFERENCES)]
+    sensors = [folder / "mav0" / sensor for sensor in ("imu0", *REFERENCES)]
     files = [sensor / name for sensor in sensors for name in ("data.csv", "sensor.yaml")]
     return single(short_name(folder.name), _read_by_name, folder, about.name)._replace(
         files=tuple(path for path in files if path.is_file()), version=f"{VERSION} {about.name}"
@@ -142,7 +142,7 @@ def read_sequence(folder: str | os.PathLike[str], about: Dataset | None = None) 
     sensor = _reference_sensor(mav)
     truth = sensor / "data.csv"
     lever = sensor_pose(mav / "imu0" / "sensor.yaml").seen_from(sensor_pose(sensor / "sensor.yaml"))
-    poses = _moved_to(lever, read_poses(truth, imu.start))
+    poses = moved_to(lever, read_poses(truth, imu.start))
     inside = _overlap(imu, poses, truth)
     first = imu.time[inside][0]
     clocked = _on_clock(imu.time[inside] - first, imu.samples[inside], path)
@@ -175,22 +175,13 @@ def read_sequence(folder: str | os.PathLike[str], about: Dataset | None = None) 
 
 def _reference_sensor(mav: Path) -> Path:
     """Folder of the first reference that is there."""
-    for kind in _REFERENCES:
+    for kind in REFERENCES:
         if (mav / kind / "data.csv").is_file():
             return mav / kind
     raise InputError(
         mav,
-        f"has no reference ({' or '.join(_REFERENCES)})/data.csv",
+        f"has no reference ({' or '.join(REFERENCES)})/data.csv",
         "bring a recording without one into the dataset 'csv'",
-    )
-
-
-def _moved_to(imu: SensorPose, poses: Poses) -> Poses:
-    """Poses of the IMU, which sits at `imu` in the tracked sensor's frame. The velocity stays that
-    of the sensor."""
-    return poses._replace(
-        position=poses.position + poses.attitude.apply(imu.translation),
-        attitude=poses.attitude * imu.rotation,
     )
 
 

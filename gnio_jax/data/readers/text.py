@@ -3,6 +3,7 @@ is quick over millions of rows."""
 
 from __future__ import annotations
 
+import io
 import os
 import warnings
 from collections.abc import Callable, Iterable
@@ -23,25 +24,37 @@ def shortened(text: object, most: int = 80) -> str:
     return line if len(str(text)) <= most else line[: most - 3] + "..."
 
 
+def open_text(path: Path, content: bytes | None = None) -> io.TextIOWrapper:
+    """The text of a file, or `content` in its place; a byte order mark is dropped."""
+    if content is None:
+        return path.open(encoding="utf-8-sig")
+    return io.TextIOWrapper(io.BytesIO(content), encoding="utf-8-sig")
+
+
 def read_csv(
-    path: str | os.PathLike[str], separator: str = ",", header: bool = True
+    path: str | os.PathLike[str],
+    separator: str = ",",
+    header: bool = True,
+    content: bytes | None = None,
+    decimal: str = ".",
 ) -> pd.DataFrame:
     """The columns of a text file by their names (stripped of blanks and of a leading '#'), or by
     their places from 0 without a header.
 
     Lines that begin with '#' are no data; the last of them before the data names the columns if
-    `header`, or else the first line does. `separator` " " stands for any run of blanks. Raises
-    `InputError` naming the file when it is missing, empty or no table.
+    `header`, or else the first line does. `separator` " " stands for any run of blanks. `content`
+    is what the file holds where it is part of an archive; `path` is then its name in messages.
+    Raises `InputError` naming the file when it is missing, empty or no table.
     """
     path = Path(path)
     try:
-        comments, first = _before_data(path)
+        comments, first = _before_data(path, content)
         names = next((line for line in reversed(comments) if line.startswith("#")), None)
         skip = len(comments)
         if header and names is None:
             names, skip = first, skip + 1
         table = pd.read_csv(
-            path,
+            path if content is None else io.BytesIO(content),
             header=None,
             skiprows=skip,
             comment="#",
@@ -49,6 +62,7 @@ def read_csv(
             skipinitialspace=True,
             skip_blank_lines=True,
             low_memory=False,
+            decimal=decimal,
         )
     except OSError as error:
         raise InputError(path, f"cannot be read ({error.strerror})") from None
@@ -67,10 +81,10 @@ def read_csv(
     return table
 
 
-def _before_data(path: Path) -> tuple[list[str], str]:
+def _before_data(path: Path, content: bytes | None) -> tuple[list[str], str]:
     """(lines of comments and blanks before the first line that is neither, that line)."""
     before = []
-    with path.open(encoding="utf-8-sig") as file:
+    with open_text(path, content) as file:
         for line in file:
             if not line.startswith("#") and line.strip():
                 return before, line

@@ -1,0 +1,231 @@
+"""phyphox (RWTH Aachen; Android and iOS): a zip of CSV files, one CSV, or a workbook (xls, xlsx).
+
+Facts, from the app's sources (github.com/phyphox):
+
+- A table for each set of an experiment's export: `Accelerometer`, `Gyroscope`, `Linear
+  Acceleration`, ..., of a single sensor `Raw Data` (phyphox-android, SimpleExperimentCreator.java,
+  accelerometer.phyphox). A zip has `meta/` beside them, a workbook the sheets `Metadata ...`
+  (DataExport.java).
+- Columns `Time (s)`, `Acceleration x (m/s^2)`, `Linear Acceleration x (m/s^2)`, `Gyroscope x
+  (rad/s)`. Earlier releases wrote `X (m/s^2)` and `X (rad/s)` (seen in exports). The app translates
+  names, so that the units and the axes tell here, and of the names only Linear and Gravity.
+- Separators are comma, semicolon or tab, the decimal is a point or a comma; short columns are
+  filled with NaN (DataExport.java).
+- All sensors share one clock, s since the start.
+- "Acceleration" includes gravity, "Linear Acceleration" does not. iOS's readings are multiplied by
+  −9.81, so that both systems have Android's sign (phyphox-ios, ExperimentSensorInput.swift: kG).
+"""
+
+from __future__ import annotations
+
+import importlib
+import io
+import re
+import warnings
+import zipfile
+from collections.abc import Iterable, Sequence
+from pathlib import Path, PurePosixPath
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+
+from gnio_jax.data.importing import archives
+from gnio_jax.data.importing.source import Source, Units
+from gnio_jax.data.importing.streams import SensorFile, read_table
+from gnio_jax.data.importing.units import named_unit
+from gnio_jax.data.readers.parsing import parsed_as
+from gnio_jax.data.readers.text import numbers
+from gnio_jax.errors import InputError
+from gnio_jax.numerics import interpolate
+
+_AXIS = re.compile(r"\b([xyz])\b", re.IGNORECASE)
+
+
+class _Table(NamedTuple):
+    path: Path
+    """As messages name it."""
+    values: pd.DataFrame
+
+
+class _Set(NamedTuple):
+    """One sensor's columns of a table."""
+
+    kind: str
+    """gyro, accel, linear (without gravity) or gravity."""
+    unit: str
+    table: _Table
+    time: str
+    axes: tuple[str, ...]
+
+    def sensor(self, name: str) -> SensorFile:
+        return SensorFile(name, self.table.path, self.table.values, self.time, self.axes)
+
+
+def is_phyphox(tables: Iterable[Sequence[str]]) -> bool:
+    """By the columns of the tables of a zip, folder or file."""
+    return any(_is_time(label) for labels in tables for label in labels) and any(
+        _sets(labels) for labels in tables
+    )
+
+
+def read_phyphox(path: Path) -> Source:
+    """A recording of its zip, folder, CSV or workbook. Raises `InputError` where a sensor is
+    missing or there is only acceleration without gravity."""
+    tables = _tables(path)
+    found = [one for table in tables for one in _columns(table)]
+    if not (gyros := [one for one in found if one.kind == "gyro"]):
+        raise _missing("gyro", path, tables)
+    gyro, accel = _only(gyros, path), _accelerometer(found, path, tables)
+    names = f"{gyro.table.path.name} in {gyro.unit}, {accel.table.path.name} in {accel.unit}"
+    return Source(
+        path,
+        gyro.sensor("gyro"),
+        accel.sensor("accel"),
+        Units("s", gyro.unit, accel.unit, "android"),
+        notes=(f"{path.name}: phyphox; time in s, {names}, by their headers",),
+    )
+
+
+# --- tables
+
+
+def _tables(path: Path) -> list[_Table]:
+    if path.is_dir():
+        return _of_archive(path)
+    with path.open("rb") as file:
+        magic = file.read(4)
+    if magic.startswith(b"\xd0\xcf\x11\xe0"):
+        return _of_workbook(path, "xlrd")
+    if magic.startswith(b"PK"):
+        with parsed_as(path, "a zip"), zipfile.ZipFile(path) as archive:
+            members = archive.infolist()
+        if any(member.filename == "xl/workbook.xml" for member in members):
+            archives.check_members(path, [member.filename for member in members])
+            archives.check_announced(sum(member.file_size for member in members), path)
+            return _of_workbook(path, "openpyxl")
+        return _of_archive(path)
+    return [_Table(path, read_table(path, None, ()))]
+
+
+def _of_archive(path: Path) -> list[_Table]:
+    tables = []
+    for names in archives.csv_names(path).values():
+        for name in names:
+            if _sets(archives.labels(path, name)):
+                content = archives.content(path, name)
+                tables.append(_Table(path / name, read_table(path / name, None, (), content)))
+    return tables
+
+
+def _of_workbook(path: Path, engine: str) -> list[_Table]:
+    try:
+        importlib.import_module(engine)
+    except ImportError:
+        raise InputError(
+            path, f"needs the package {engine}", "pip install 'gnio-jax[excel]'"
+        ) from None
+    with parsed_as(path, "a workbook"), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of styles
+        options: dict[str, Any] = {"engine": engine}
+        if engine == "xlrd":  # it writes what it thinks of a damaged file to the standard output
+            options["engine_kwargs"] = {"logfile": io.StringIO()}
+        sheets: dict[Any, pd.DataFrame] = pd.read_excel(path, sheet_name=None, **options)
+    return [
+        _Table(path / str(name), values)
+        for name, values in sheets.items()
+        if _sets([str(label) for label in values.columns])
+    ]
+
+
+# --- columns
+
+
+def _is_time(label: str) -> bool:
+    return named_unit(label) == "s"
+
+
+def _sets(labels: Sequence[str]) -> list[tuple[str, str, tuple[str, ...]]]:
+    """(kind, unit, columns x, y, z) of each sensor in a table."""
+    found: dict[tuple[str, str], dict[str, str]] = {}
+    for label in labels:
+        unit, axis = named_unit(label), _AXIS.search(label)
+        if unit in ("rad/s", "deg/s", "m/s2", "g") and axis:
+            name = label[: axis.start()].strip().lower()
+            found.setdefault((name, unit), {}).setdefault(axis[1].lower(), label)
+    return [
+        (_kind(name, unit), unit, tuple(axes[axis] for axis in "xyz"))
+        for (name, unit), axes in found.items()
+        if len(axes) == 3
+    ]
+
+
+def _kind(name: str, unit: str) -> str:
+    if unit in ("rad/s", "deg/s"):
+        return "gyro"
+    return next((kind for kind in ("linear", "gravity") if name.startswith(kind)), "accel")
+
+
+def _columns(table: _Table) -> list[_Set]:
+    labels = [str(label) for label in table.values.columns]
+    time = next((label for label in labels if _is_time(label)), None)
+    if time is None:
+        raise InputError(table.path, "has no column of time in s", "export it again")
+    # Earlier releases name the sensor by the file alone.
+    own = _kind(PurePosixPath(table.path.name).stem.lower(), "m/s2")
+    return [
+        _Set(own if kind == "accel" else kind, unit, table, time, axes)
+        for kind, unit, axes in _sets(labels)
+    ]
+
+
+def _only(sets: list[_Set], path: Path) -> _Set:
+    if len(sets) > 1:
+        names = ", ".join(f"{one.table.path.name} ({one.axes[0]})" for one in sets)
+        raise InputError(
+            path, f"holds {len(sets)} sets of a sensor: {names}", "name the columns of one"
+        )
+    return sets[0]
+
+
+def _accelerometer(found: list[_Set], path: Path, tables: list[_Table]) -> _Set:
+    """The set with gravity in it, or the sum of the two without."""
+    by_kind = {
+        kind: [one for one in found if one.kind == kind] for kind in ("accel", "linear", "gravity")
+    }
+    if by_kind["accel"]:
+        return _only(by_kind["accel"], path)
+    if by_kind["linear"] and by_kind["gravity"]:
+        return _sum(_only(by_kind["linear"], path), _only(by_kind["gravity"], path))
+    if by_kind["linear"]:
+        raise InputError(
+            by_kind["linear"][0].table.path,
+            "holds acceleration without gravity",
+            "add the accelerometer with g to the experiment and record again",
+        )
+    raise _missing("accelerometer", path, tables)
+
+
+def _sum(linear: _Set, gravity: _Set) -> _Set:
+    """Both added on the stamps of `linear`; gravity, which turns slowly, by lines (ours)."""
+    values = linear.table.values
+    stamps = numbers(values, [linear.time], linear.table.path)[:, 0]
+    down = numbers(gravity.table.values, [gravity.time, *gravity.axes], gravity.table.path)
+    down = down[np.isfinite(down).all(axis=1)]
+    inside = (stamps >= down[:, 0].min(initial=np.inf)) & (
+        stamps <= down[:, 0].max(initial=-np.inf)
+    )
+    added = interpolate(stamps[inside], down[:, 0], down[:, 1:]) if inside.any() else 0.0
+    values = values[inside].reset_index(drop=True)
+    total = numbers(values, linear.axes, linear.table.path) + added
+    values = values.assign(**dict(zip(linear.axes, total.T, strict=True)))
+    return linear._replace(kind="accel", table=linear.table._replace(values=values))
+
+
+def _missing(sensor: str, path: Path, tables: list[_Table]) -> InputError:
+    names = ", ".join(table.path.name for table in tables) or "no table of a sensor"
+    return InputError(
+        path,
+        f"has no {sensor} (found: {names})",
+        "record accelerometer (with g) and gyroscope in one experiment",
+    )

@@ -1,0 +1,110 @@
+"""Trajectories in the formats of other programs.
+
+- `tum`: `t x y z qx qy qz qw`, as `gnio evaluate` writes it (evo).
+- `kitti`: the 3 × 4 matrix [R p] of each pose in rows of twelve numbers, without stamps (evo).
+- `csv`: with the columns of our own dataset `csv`.
+- `geojson`, `gpx`: on the earth, where a first fix is known (`geographic`).
+- `mcap`: `nav_msgs/Odometry`, `nav_msgs/Path` and TF for Foxglove and ROS 2 (`ros`).
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from gnio_jax.data.readers.text import numbers, read_csv
+from gnio_jax.data.validation import check_finite, check_increasing, check_unit_norm
+from gnio_jax.errors import InputError
+from gnio_jax.evaluation.exporting.geographic import FirstFix, write_geojson, write_gpx
+from gnio_jax.evaluation.exporting.ros import check_mcap, write_mcap
+from gnio_jax.evaluation.metrics import Trajectory
+from gnio_jax.evaluation.metrics.trajectory import finite_poses
+from gnio_jax.evaluation.tum import write_tum
+from gnio_jax.files import replacing
+from gnio_jax.numerics import matrix_from_quaternion, wxyz_from_xyzw
+
+SUFFIXES = {
+    ".tum": "tum",
+    ".txt": "tum",
+    ".kitti": "kitti",
+    ".csv": "csv",
+    ".geojson": "geojson",
+    ".gpx": "gpx",
+    ".mcap": "mcap",
+}
+FORMATS = tuple(dict.fromkeys(SUFFIXES.values()))
+
+_TUM = "t x y z qx qy qz qw"
+
+
+def export(
+    path: Path,
+    trajectory: Trajectory,
+    kind: str | None = None,
+    fix: FirstFix | None = None,
+    covariance: Float[np.ndarray, "n 3 3"] | None = None,
+) -> int:
+    """Write a trajectory, whole or not at all, and return its number of poses.
+
+    Rows that are not finite are left out. `kind` is one of `FORMATS`; None takes that of the
+    suffix. `fix` places the first pose on the earth (geojson, gpx). `covariance` is that of the
+    positions, m², an `Estimate.position_covariance` (mcap). Raises `InputError`.
+    """
+    kind = kind or SUFFIXES.get(path.suffix.lower())
+    if kind not in FORMATS:
+        raise InputError(path, "its name tells no format", f"known: {', '.join(SUFFIXES)}")
+    known = finite_poses(trajectory) & np.isfinite(trajectory.time)
+    if not known.any():
+        raise InputError(path, "the trajectory has no pose", "evaluate the recording again")
+    poses = Trajectory(*(field[known] for field in trajectory))
+    if kind in ("geojson", "gpx") and fix is None:
+        raise InputError(
+            path, f"{kind} needs a place on the earth", "give --first-fix LAT LON --heading DEG"
+        )
+    if kind == "mcap":
+        check_mcap(path, poses)
+    with replacing(path) as temporary:
+        match kind:
+            case "tum":
+                write_tum(temporary, poses)
+            case "kitti":
+                _write_kitti(temporary, poses)
+            case "csv":
+                _write_csv(temporary, poses)
+            case "geojson":
+                write_geojson(temporary, poses, fix, path.stem)
+            case "gpx":
+                write_gpx(temporary, poses, fix, path.stem)
+            case _:
+                write_mcap(temporary, poses, None if covariance is None else covariance[known])
+    return len(poses.time)
+
+
+def read_trajectory(path: Path) -> Trajectory:
+    """A trajectory in TUM format. Raises `InputError` for anything else."""
+    table = read_csv(path, separator=" ", header=False)
+    if table.shape[1] != 8:
+        raise InputError(
+            path, f"has {table.shape[1]} columns, not the 8 of TUM's format", f"they are {_TUM}"
+        )
+    rows = numbers(table, range(8), path)
+    check_finite(rows, _TUM, path)
+    time, position, xyzw = np.split(rows, [1, 4], axis=1)
+    check_increasing(time[:, 0], path)
+    everywhere = np.ones(len(rows), dtype=bool)
+    wxyz = check_unit_norm(wxyz_from_xyzw(xyzw), everywhere, "qx qy qz qw", path)
+    return Trajectory(time[:, 0], position, wxyz)
+
+
+def _write_kitti(path: Path, poses: Trajectory) -> None:
+    rotation = matrix_from_quaternion(poses.orientation)
+    matrices = np.concatenate([rotation, poses.position[:, :, None]], axis=2)
+    np.savetxt(path, matrices.reshape(-1, 12), fmt="%.9f")
+
+
+def _write_csv(path: Path, poses: Trajectory) -> None:
+    rows = np.column_stack([poses.time, poses.position, poses.orientation])
+    names = "time,px,py,pz,qw,qx,qy,qz"
+    np.savetxt(path, rows, fmt="%.9f", delimiter=",", header=names, comments="")

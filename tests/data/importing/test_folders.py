@@ -1,0 +1,85 @@
+"""A folder of EuRoC's layout, at any rate and with or without a reference; what is no recording."""
+
+from __future__ import annotations
+
+import h5py
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from gnio_jax.data.importing import import_recording
+from gnio_jax.errors import InputError
+from tests.support import asl_files, known_walk
+from tests.support.asl_files import EPOCH, Mount
+
+LEVER = Mount(Rotation.from_euler("zyx", [0.4, 0.2, -0.9]), np.array([0.2, -0.1, 0.3]))
+
+
+def compare(sequence, atol):
+    np.testing.assert_allclose(sequence.gyro, known_walk.rate(sequence.time), atol=1e-6)
+    np.testing.assert_allclose(sequence.accel, known_walk.force(sequence.time), atol=1e-6)
+    rows = (sequence.time > 1.5) & (sequence.time < 10.5)
+    assert sequence.valid[rows].all() and not sequence.valid[sequence.time < 0.9].any()
+    time = sequence.time[rows]
+    np.testing.assert_allclose(sequence.position[rows], known_walk.position(time), atol=atol)
+    speed = known_walk.velocity(time)
+    np.testing.assert_allclose(sequence.velocity[rows], speed, atol=20 * atol)
+    turned = Rotation.from_quat(sequence.orientation[rows][:, [1, 2, 3, 0]]).inv()
+    assert (turned * known_walk.attitude(time)).magnitude().max() < 10 * atol
+
+
+@pytest.mark.parametrize("mount", [None, LEVER])
+def test_an_estimate_is_moved_to_the_imu(tmp_path, mount):
+    """At 100 Hz, which no published set has."""
+    asl_files.write_imu(tmp_path / "mav0", step=0.01)
+    asl_files.write_estimate(tmp_path / "mav0", mount=mount)
+    sequence, notes = import_recording(tmp_path)
+    compare(sequence, 1e-4)
+    assert sequence.attributes["start_time"] == pytest.approx(EPOCH * 1e-9, abs=1e-6)
+    assert "EuRoC's layout (ns, rad/s, m/s2), reference state_groundtruth_estimate0" in notes[0]
+    assert sequence.attributes["truth"] == "state_groundtruth_estimate0"
+
+
+def test_mocap_without_velocities(tmp_path):
+    asl_files.write_imu(tmp_path / "mav0")
+    asl_files.write_mocap(tmp_path / "mav0", mount=LEVER)
+    sequence, _ = import_recording(tmp_path / "mav0")
+    compare(sequence, 2e-3)
+
+
+def test_no_reference(tmp_path):
+    asl_files.write_imu(tmp_path / "mav0", seconds=3.0)
+    sequence, notes = import_recording(tmp_path, rate=100.0)
+    assert not sequence.valid.any() and len(sequence.time) == 300
+    assert "EuRoC's layout (ns, rad/s, m/s2), no reference" in notes[0]
+
+
+def test_a_column_that_is_missing_is_named_as_the_authors_do(tmp_path):
+    asl_files.write_imu(tmp_path / "mav0", seconds=3.0)
+    path = tmp_path / "mav0" / "imu0" / "data.csv"
+    path.write_text(path.read_text().replace("a_RS_S_y", "b"))
+    with pytest.raises(InputError, match=r"data.csv: column 'a_rs_s_y' is missing; found: stamp"):
+        import_recording(tmp_path)
+
+
+def test_what_is_no_recording(tmp_path):
+    with h5py.File(tmp_path / "walk.h5", "w"):
+        pass
+    (tmp_path / "noise.csv").write_bytes(bytes(range(128, 256)) * 9)
+    (tmp_path / "words.txt").write_text("The quick brown fox\njumps over the lazy dog\n")
+    (tmp_path / "empty.csv").write_text("")
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "bag").mkdir()
+    (tmp_path / "bag" / "metadata.yaml").write_text("rosbag2_bagfile_information: [1, 2]\n")
+    for name, words in {
+        "walk.h5": "walk.h5: is HDF5 already; check it with gnio data check",
+        "noise.csv": "noise.csv: is no text",
+        "words.txt": "words.txt: ",
+        "empty.csv": "empty.csv: holds no row",
+        "empty": "empty: has the layout of no known recording .found: no CSV file.; known: CSV",
+        "bag": "bag: cannot be read as a ROS 2 bag",
+        "gone": "gone: cannot be read .No such file",
+    }.items():
+        with pytest.raises(InputError, match=words) as caught:
+            import_recording(tmp_path / name)
+        assert "\n" not in str(caught.value)

@@ -1,0 +1,337 @@
+"""The exports of phone loggers must tell of the known walk again, or be refused in one line."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gnio_jax.data.importing import archives, import_recording
+from gnio_jax.data.importing.units import named_unit
+from gnio_jax.errors import InputError
+from tests.support import known_walk, logger_files
+from tests.support.logger_files import (
+    DELAY,
+    EPOCH,
+    axes,
+    lying_zip,
+    phyphox,
+    phyphox_sets,
+    phyphox_table,
+    sensor_logger,
+    sensor_table,
+    unpacked,
+    workbooks,
+    zipped,
+)
+
+
+def compare(sequence):
+    """Both sensors are those of the walk; what was interpolated has a spline's error at its ends.
+
+    The sequence begins with the first sample that both sensors cover.
+    """
+    time = sequence.time + 0.01
+    inner = slice(20, -20)
+    force, rate = known_walk.force(time), known_walk.rate(time)
+    np.testing.assert_allclose(sequence.gyro[inner], rate[inner], atol=1e-4)
+    np.testing.assert_allclose(sequence.accel[inner], force[inner], atol=5e-3)
+    assert len(time) > 700 and not sequence.valid.any()
+
+
+def refused(path, words, **options):
+    with pytest.raises(InputError, match=words) as caught:
+        import_recording(path, **options)
+    assert "\n" not in str(caught.value)
+
+
+def without(members, *names):
+    return {name: text for name, text in members.items() if name not in names}
+
+
+# --- Sensor Logger
+
+
+@pytest.mark.parametrize(
+    ("platform", "standardised", "dropped", "words"),
+    [
+        (
+            "android",
+            False,
+            (),
+            "Sensor Logger (Android); time in ns, Gyroscope in rad/s, TotalAcceleration in",
+        ),
+        ("android", False, ("Metadata.csv",), "Sensor Logger (Android)"),
+        ("android", False, ("TotalAcceleration.csv",), "Accelerometer + Gravity in m/s2"),
+        (
+            "ios",
+            False,
+            (),
+            "Sensor Logger (iOS); time in ns, Gyroscope in rad/s, Accelerometer + Gravity",
+        ),
+        ("ios", True, (), "Sensor Logger (iOS)"),
+        ("ios", False, ("Accelerometer.csv",), "AccelerometerUncalibrated.csv: accel taken as g"),
+        ("ios", True, ("Accelerometer.csv",), "AccelerometerUncalibrated.csv: accel taken as m/s2"),
+    ],
+)
+def test_sensor_logger(tmp_path, platform, standardised, dropped, words):
+    members = without(sensor_logger(platform, standardised), *dropped)
+    sequence, notes = import_recording(zipped(tmp_path / "walk.zip", members))
+    compare(sequence)
+    text = " | ".join(notes)
+    assert words in text and sequence.name == "walk"
+    assert ("negated (iOS's sign)" in text) == (platform == "ios" and not standardised)
+    start = sequence.attributes["start_time"] - EPOCH * 1e-9
+    assert start == pytest.approx(0.01, abs=1e-6)
+
+
+def test_a_folder_reads_as_its_zip(tmp_path):
+    members = sensor_logger("ios")
+    packed, _ = import_recording(zipped(tmp_path / "walk.zip", members))
+    # As macOS packs a folder.
+    extra = {f"walk/{name}": text for name, text in members.items()}
+    extra["__MACOSX/walk/._Gyroscope.csv"] = "\0"
+    inside, _ = import_recording(zipped(tmp_path / "inside.zip", extra))
+    folder, _ = import_recording(unpacked(tmp_path / "walk", members))
+    for other in (inside, folder):
+        np.testing.assert_array_equal(other.accel, packed.accel)
+        np.testing.assert_array_equal(other.gyro, packed.gyro)
+
+
+def test_the_sign_of_an_unknown_system_must_be_stated(tmp_path):
+    members = without(sensor_logger("ios"), "Metadata.csv")
+    path = zipped(tmp_path / "walk.zip", members)
+    refused(path, "the sign of field 'accel' depends on the phone's system.*android, ios or detect")
+    sequence, notes = import_recording(path, accel_sign="ios")
+    compare(sequence)
+    assert any("unknown system" in note for note in notes)
+
+
+def test_metadata_of_an_early_release_and_of_an_unknown_one(tmp_path):
+    members = sensor_logger("ios")
+    members["Metadata.csv"] = (
+        "version,device name,recording time,platform,appVersion,device id,sensors,sampleRateMs\n"
+        "3,iPhone 12 mini,2022-09-12_11-36-02,ios,1.10.4,id,Accelerometer|Gravity,10|10"
+    )
+    sequence, _ = import_recording(zipped(tmp_path / "early.zip", members))
+    compare(sequence)
+    members["Metadata.csv"] = "platform,standardisation\nios,perhaps\n"
+    refused(zipped(tmp_path / "walk.zip", members), "the sign of field 'accel' depends on the")
+
+
+def test_gravity_of_other_stamps_is_interpolated(tmp_path):
+    members = without(sensor_logger("android"), "TotalAcceleration.csv")
+    time = logger_files.clock(50.0) + 0.007
+    members["Gravity.csv"] = sensor_table(time, logger_files.gravity(time))
+    sequence, _ = import_recording(zipped(tmp_path / "walk.zip", members))
+    place = sequence.attributes["start_time"] - EPOCH * 1e-9
+    force = known_walk.force(sequence.time + place)
+    np.testing.assert_allclose(sequence.accel[20:-20], force[20:-20], atol=0.03)
+
+
+@pytest.mark.parametrize(
+    ("members", "words"),
+    [
+        (
+            without(sensor_logger(), "Gyroscope.csv"),
+            "walk.zip: has no gyro .found: Accelerometer, .*; switch on",
+        ),
+        (
+            {"Gyroscope.csv": sensor_logger()["Gyroscope.csv"]},
+            "walk.zip: has no accelerometer .found: Gyroscope.",
+        ),
+        (
+            {"Magnetometer.csv": sensor_logger()["Magnetometer.csv"]},
+            "walk.zip: has no gyro .found: Magnetometer.",
+        ),
+        (
+            without(sensor_logger("ios"), "Gravity.csv", "AccelerometerUncalibrated.csv"),
+            "Accelerometer.csv: is without gravity, and there is no Gravity.csv",
+        ),
+        (
+            {f"{day}/{name}": text for day in "ab" for name, text in sensor_logger().items()},
+            "walk.zip: holds 2 recordings: a, b",
+        ),
+        (
+            sensor_logger() | {"TotalAcceleration.csv": "time,seconds_elapsed,z,y\n1,2,3,4\n"},
+            "TotalAcceleration.csv: column 'x' is missing",
+        ),
+        (
+            sensor_logger() | {"Gyroscope.csv": "time,seconds_elapsed,z,y,x\n1,2,a,b,c\n"},
+            "Gyroscope.csv: column 'x' holds 'c' in its row 1, no number",
+        ),
+        (sensor_logger(seconds=0.5), "walk.zip: lasts 0.49 s, less than the network's window"),
+        (
+            {"notes.txt": "hello"},
+            "has the layout of no known recording .found: no CSV file.; known",
+        ),
+        ({"notes.csv": "\0\1\2 nothing"}, "the layout of no known recording .found: notes.csv"),
+        ({"a.csv": "\xff" * 9}, "the layout of no known recording .found: a.csv"),
+        (
+            sensor_logger() | {"../../etc/Gyroscope.csv": "x"},
+            r"walk.zip: its member '../../etc/Gyroscope.csv' climbs out",
+        ),
+        (sensor_logger() | {"C:/Gyroscope.csv": "x"}, "climbs out of the folder"),
+        (sensor_logger() | {"/Gyroscope.csv": "x"}, "climbs out of the folder"),
+    ],
+)
+def test_what_is_wrong_with_a_zip_is_one_line(tmp_path, members, words):
+    refused(zipped(tmp_path / "walk.zip", members), words)
+    assert [path.name for path in tmp_path.iterdir()] == ["walk.zip"]
+
+
+def test_a_slow_recording_says_so(tmp_path):
+    members = sensor_logger(rate=20.0, seconds=10.0)
+    sequence, notes = import_recording(zipped(tmp_path / "walk.zip", members))
+    assert any("recorded at 20 Hz, which is slow" in note for note in notes)
+    fast, notes = import_recording(zipped(tmp_path / "fast.zip", sensor_logger()))
+    assert not any("slow" in note for note in notes)
+    assert (len(sequence.time), len(fast.time)) == (199, 799)
+
+
+def test_degrees_where_the_format_says_radians_are_refused(tmp_path):
+    """A phone that turns slowly, in deg/s: no number is too large for rad/s."""
+    time = np.arange(2000) / 100
+    angle = 0.7 * np.sin(2 * np.pi * time / 13.0)
+    rate = 0.7 * 2 * np.pi / 13.0 * np.cos(2 * np.pi * time / 13.0)
+    turning = np.stack([rate, 0 * time, 0 * time], axis=1)
+    force = 9.81 * np.stack([0 * time, np.sin(angle), np.cos(angle)], axis=1)
+    members = {"TotalAcceleration.csv": sensor_table(time, force)}
+    degrees = members | {"Gyroscope.csv": sensor_table(time, np.degrees(turning))}
+    path = zipped(tmp_path / "walk.zip", degrees)
+    refused(path, "its gyro looks like deg/s, which it does not say .* state the unit")
+    sequence, _ = import_recording(path, gyro_unit="deg/s")
+    np.testing.assert_allclose(sequence.gyro, turning, atol=1e-6)
+    members["Gyroscope.csv"] = sensor_table(time, turning)
+    sequence, _ = import_recording(zipped(tmp_path / "right.zip", members))
+    np.testing.assert_allclose(sequence.gyro, turning, atol=1e-6)
+
+
+# --- archives that lie
+
+
+def test_a_member_of_gigabytes_is_refused_by_what_it_announces(tmp_path):
+    data = lying_zip(sensor_logger(), "Gyroscope.csv", 3 * 2**30)
+    (tmp_path / "bomb.zip").write_bytes(data)
+    refused(
+        tmp_path / "bomb.zip", "Gyroscope.csv: unpacks to 3072 MiB; no table may exceed 512 MiB"
+    )
+
+
+def test_a_member_that_gives_more_than_it_announces_is_refused(tmp_path):
+    (tmp_path / "bomb.zip").write_bytes(lying_zip(sensor_logger(), "Gyroscope.csv", 5000))
+    refused(tmp_path / "bomb.zip", "bomb.zip: cannot be read as a zip, it may be cut short")
+
+
+def test_what_is_read_is_limited_too(tmp_path, monkeypatch):
+    folder = unpacked(tmp_path / "walk", sensor_logger())
+    monkeypatch.setattr(archives, "LARGEST", 2**15)
+    refused(folder, "holds more than 0 MiB")
+    monkeypatch.setattr(archives, "MOST_TABLES", 3)
+    refused(zipped(tmp_path / "walk.zip", sensor_logger()), "walk.zip: holds 8 CSV files")
+
+
+@pytest.mark.parametrize("kept", [0.02, 0.5, 0.99])
+def test_a_zip_cut_short_is_one_line(tmp_path, kept):
+    whole = zipped(tmp_path / "walk.zip", sensor_logger()).read_bytes()
+    (tmp_path / "walk.zip").write_bytes(whole[: int(kept * len(whole))])
+    refused(tmp_path / "walk.zip", "walk.zip: cannot be read as a zip, it may be cut short")
+
+
+# --- phyphox
+
+
+@pytest.mark.parametrize(
+    ("separator", "decimal"), [(",", "."), ("\t", "."), (";", "."), ("\t", ","), (";", ",")]
+)
+def test_phyphox_as_text(tmp_path, separator, decimal):
+    path = zipped(tmp_path / "walk.zip", phyphox(separator, decimal))
+    sequence, notes = import_recording(path)
+    compare(sequence)
+    text = "phyphox; time in s, Gyroscope.csv in rad/s, Accelerometer.csv in m/s2, by their headers"
+    assert f"walk.zip: {text}" in notes
+
+
+def test_phyphox_as_a_workbook(tmp_path, monkeypatch):
+    workbooks(tmp_path, phyphox_sets())
+    for name in ("walk.xlsx", "walk.xls"):
+        sequence, notes = import_recording(tmp_path / name)
+        compare(sequence)
+        assert f"{name}: phyphox; time in s, Gyroscope in rad/s, Accelerometer in m/s2" in notes[0]
+    monkeypatch.setattr(archives, "LARGEST", 2**15)
+    refused(tmp_path / "walk.xlsx", "walk.xlsx: unpacks to 0 MiB; no table may exceed 0 MiB")
+    damaged = (tmp_path / "walk.xls").read_bytes()[:3000]
+    (tmp_path / "cut.xls").write_bytes(damaged)
+    refused(tmp_path / "cut.xls", "cut.xls: cannot be read as a workbook")
+
+
+def test_phyphox_of_an_earlier_release_in_another_language_in_degrees(tmp_path):
+    time, rate, _ = phyphox_sets()["Gyroscope"]
+    later, force, _ = phyphox_sets()["Accelerometer"]
+    down = logger_files.gravity(later)
+    sets = {
+        "Gyroscope": (time, np.degrees(rate), axes("", "°/s")),
+        "Beschleunigung": (later, force, axes("Beschleunigung", "m/s²")),
+        "Linear Accelerometer": (later, force - down, axes("", "m/s^2")),
+    }
+    sequence, notes = import_recording(zipped(tmp_path / "walk.zip", phyphox(sets=sets)))
+    compare(sequence)
+    assert "Gyroscope.csv in deg/s" in notes[0]
+    del sets["Beschleunigung"]
+    path = zipped(tmp_path / "linear.zip", phyphox(sets=sets))
+    refused(path, "Linear Accelerometer.csv: holds acceleration without gravity; add")
+    sets["Gravity"] = (later, down, axes("Gravity", "m/s^2"))
+    sequence, _ = import_recording(zipped(tmp_path / "sum.zip", phyphox(sets=sets)))
+    compare(sequence)
+
+
+def test_phyphox_in_one_file(tmp_path):
+    """The columns tell, whatever the file is called; a file of ours has names of ours."""
+    time = logger_files.clock()
+    values = np.concatenate([known_walk.rate(time), known_walk.force(time)], axis=1)
+    labels = [*axes("Gyroscope", "rad/s"), *axes("Acceleration", "m/s^2"), "Absolute (m/s^2)"]
+    table = phyphox_table(time, np.column_stack([values, time]), labels)
+    (tmp_path / "Raw Data.csv").write_text(table)
+    sequence, _ = import_recording(tmp_path / "Raw Data.csv")
+    np.testing.assert_allclose(sequence.gyro, known_walk.rate(sequence.time), atol=1e-8)
+    np.testing.assert_allclose(sequence.accel, known_walk.force(sequence.time), atol=1e-8)
+    (tmp_path / "gyro.csv").write_text(phyphox()["Gyroscope.csv"])
+    refused(tmp_path / "gyro.csv", "gyro.csv: has no accelerometer .found: gyro.csv.; record")
+    refused(tmp_path / "gyro.csv", "gyro.csv: has no topics", imu_topic="/imu")
+
+
+def test_a_csvs_header_tells_the_unit(tmp_path):
+    """A phone that hardly turns: the numbers alone would be ambiguous."""
+    time = np.arange(300) / 100
+    rows = [[t, 0.1, -0.2, 0.1, 0.0, 0.0, 9.81] for t in time]
+    names = {name: f"g{name[-1]} [deg/s]" for name in ("gyro_x", "gyro_y", "gyro_z")}
+    header = ["time", *names.values(), "accel_x", "accel_y", "accel_z"]
+    text = "\n".join([",".join(header), *(",".join(map(str, row)) for row in rows)])
+    (tmp_path / "still.csv").write_text(text)
+    sequence, notes = import_recording(tmp_path / "still.csv", names)
+    np.testing.assert_allclose(sequence.gyro[0], np.radians([0.1, -0.2, 0.1]))
+    assert "still.csv: gyro in deg/s, by its header" in notes
+    (tmp_path / "still.csv").write_text(text.replace(" [deg/s]", ""))
+    refused(
+        tmp_path / "still.csv",
+        "the unit of field 'gyro' is ambiguous",
+        columns={name: label.split()[0] for name, label in names.items()},
+    )
+
+
+def test_units_are_known_by_their_spellings():
+    for label, unit in {
+        "Gyroscope x (rad/s)": "rad/s",
+        "w_RS_S_x [rad s^-1]": "rad/s",
+        "X (°/s)": "deg/s",
+        "wx [dps]": "deg/s",
+        "Acceleration x (m/s^2)": "m/s2",
+        "a_RS_S_x [m s^-2]": "m/s2",
+        "Time (s)": "s",
+        "#timestamp [ns]": "ns",
+        "accel (g)": "g",
+        "Magnetic field x (µT)": None,
+        "gyro_x": None,
+        "g": None,
+    }.items():
+        assert named_unit(label) == unit
+    assert DELAY < 0.01
