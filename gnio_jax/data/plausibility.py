@@ -8,12 +8,12 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from scipy.signal import fftconvolve
 from scipy.spatial.transform import Rotation
 
 from gnio_jax.data.dataset import Dataset
 from gnio_jax.errors import InputError
 from gnio_jax.numerics import (
+    convolved,
     last_true,
     midpoints,
     quaternion_product,
@@ -286,7 +286,7 @@ def _accel_correlation(sequence: Sequence, force: np.ndarray, step: float) -> tu
     position = sequence.position[:, :2]
     geometric = (position[2 * h :] - 2.0 * position[h:-h] + position[: -2 * h]) / (h * step) ** 2
     triangle = 1.0 - np.abs(np.arange(-h, h + 1)) / h
-    inertial = fftconvolve(force[:, :2], (triangle / triangle.sum())[:, None], mode="valid", axes=0)
+    inertial = convolved(force[:, :2], triangle / triangle.sum())
     broken = np.concatenate([[0], np.cumsum(~sequence.valid)])
     whole = broken[2 * h + 1 :] == broken[: -2 * h - 1]
     if whole.sum() < 2 * h:

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 from scipy.interpolate import PPoly
-from scipy.linalg.lapack import dgtsv
+from scipy.linalg import get_lapack_funcs
 
 from gnio_jax.decimation import decimation_factor, low_pass
 
@@ -41,6 +41,9 @@ _TOO_FAST = 1.05
 """Times the fastest rate that the low-pass is made for."""
 _BEFORE = 4
 """Samples kept before the FIR's reach, so that the spline's new end is not felt within it."""
+
+
+(_solve_tridiagonal,) = get_lapack_funcs(("gtsv",), dtype=np.float64)
 
 
 class Design(NamedTuple):
@@ -288,7 +291,7 @@ def _spline(x: Float[np.ndarray, "n"], y: Float[np.ndarray, "n 6"]) -> PPoly:
     right[-1] /= last
     diagonal = np.concatenate([steps[1:2], 2 * (steps[:-1] + steps[1:]), steps[-2:-1]])
     lower, upper = np.append(steps[1:], last), np.append(first, steps[:-1])
-    derivative = dgtsv(lower, diagonal, upper, right)[3]
+    derivative = _solve_tridiagonal(lower, diagonal, upper, right)[3]
     bend = (derivative[:-1] + derivative[1:] - 2 * slope) / column
     quadratic = (slope - derivative[:-1]) / column - bend
     return PPoly.construct_fast(

@@ -7,6 +7,11 @@ from gnio_jax.evaluation import Trajectory, plots
 from tests.support.estimates import SETTINGS
 
 
+@pytest.fixture(autouse=True)
+def few_dots(monkeypatch):
+    monkeypatch.setattr(plots, "DOTS_PER_INCH", 30)
+
+
 @pytest.mark.parametrize("alignment", ["origin", "yaw_position", "se3"])
 def test_the_distribution_of_errors_counts_what_diverged(with_divergence, alignment):
     of, found = with_divergence
