@@ -11,8 +11,10 @@ from gnio_jax.commands import (
     evaluate,
     interop,
     options,
+    publish,
     tables,
     train,
+    weights,
 )
 
 GNIO = options.Group(
@@ -20,6 +22,8 @@ GNIO = options.Group(
         "train": train.COMMAND,
         "evaluate": evaluate.COMMAND,
         "calibrate": calibrate.COMMAND,
+        "publish": publish.COMMAND,
+        "weights": weights.COMMAND,
         "data": data.COMMANDS,
         "tables": tables.COMMAND,
         "interop": interop.COMMAND,
