@@ -21,6 +21,7 @@ __all__ = [
     "models",
     "pretrained",
     "tables",
+    "tracking",
     "training",
 ]
 

@@ -5,9 +5,7 @@ import json
 import pytest
 
 from gnio_jax.config import DataConfig, FilterOptions, ModelConfig, TrainConfig
-from gnio_jax.models import registry
-from tests.support import drawn_run
-from tests.support.tiny_network import Tiny
+from tests.support import tiny_run
 
 CONFIG = TrainConfig(
     dataset="synthetic",
@@ -29,13 +27,8 @@ FIGURES = {
 
 @pytest.fixture(scope="package")
 def run(tmp_path_factory):
-    def draw(random, kind, shape):
-        statistics = kind == "batch_stats"
-        return random.uniform(0.5, 1.5, shape) if statistics else random.normal(0, 0.2, shape)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(registry._MODELS, "tiny", Tiny)
-        folder = drawn_run.save(tmp_path_factory.mktemp("trained") / "walk", CONFIG, draw)
+    with tiny_run.known():
+        folder = tiny_run.save(tmp_path_factory.mktemp("trained") / "walk", CONFIG)
         evaluation = folder / "eval" / "synthetic_test_ekf"
         evaluation.mkdir(parents=True)
         (evaluation / "metrics.json").write_text(json.dumps(FIGURES))
