@@ -9,7 +9,6 @@ import math
 
 import numpy as np
 from jaxtyping import Float
-from scipy.signal import kaiserord
 
 
 def decimation_factor(native: float, rate: float) -> int:
@@ -29,6 +28,8 @@ def low_pass(factor: int) -> Float[np.ndarray, "taps"]:
     Kaiser's window: the pass band ends at 0.8 of the new Nyquist frequency, the stop band begins at
     it and is 70 dB down. The group delay is half the taps, about 22 samples of the new rate.
     """
+    from scipy.signal import kaiserord  # takes half a second to import
+
     count, beta = kaiserord(70.0, 0.2 / factor)
     half = int(count) // 2
     taps = np.sinc(0.9 / factor * np.arange(-half, half + 1)) * np.kaiser(2 * half + 1, beta)

@@ -14,6 +14,8 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from jaxtyping import install_import_hook
 
+import tests.support.type_checks  # noqa: F401  (found by its name, below)
+
 # Each worker has one core: a module in many parts, to be compiled at once, is only more work.
 COMPILER = ["--xla_backend_optimization_level=0", "--xla_cpu_parallel_codegen_split_count=1"]
 if version("jax").startswith("0.10."):  # removed later, and XLA stops at a flag it does not know
@@ -28,7 +30,7 @@ os.environ.setdefault("JAX_PLATFORMS", "cpu")
 os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
 
 # Every annotated shape and type is checked, in the tests alone.
-install_import_hook("gnio_jax", "beartype.beartype")
+install_import_hook("gnio_jax", "tests.support.type_checks.when_called")
 
 import jax  # noqa: E402
 import pytest  # noqa: E402

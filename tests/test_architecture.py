@@ -31,6 +31,7 @@ ROOMS = {
 LIBRARIES = {
     "flax": {"models", "training", "evaluation", "interop"},
     "mcap": {"data.importing.bags", "evaluation.exporting.ros"},
+    "grain": {"training.supply"},
     "matplotlib": {"data", "evaluation", "tables", "tracking"},
     "optax": {"training"},
     "orbax": {"training.checkpoint"},

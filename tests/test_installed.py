@@ -107,5 +107,10 @@ def test_help_and_version_need_no_jax(gnio):
 
 
 def test_the_facade_is_readmes():
-    check = "from gnio_jax import data, evaluation, filtering, geometry, interop, models, training"
+    check = (
+        "import sys\n"
+        "from gnio_jax import data, evaluation, filtering, geometry, interop, models, training\n"
+        "slow = {'scipy.signal', 'scipy.stats', 'matplotlib.figure'} & set(sys.modules)\n"
+        "assert not slow, slow"
+    )
     subprocess.run([sys.executable, "-c", check], check=True, cwd=ROOT)

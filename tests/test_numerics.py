@@ -222,3 +222,13 @@ def test_within_is_dilation(reach):
 def test_last_true_holds_and_reaches_back_to_the_first():
     mask = np.array([False, True, False, False, True, False])
     np.testing.assert_array_equal(numerics.last_true(mask), [1, 1, 1, 1, 4, 4])
+
+
+@pytest.mark.parametrize("rows, taps", [(50, 7), (11, 10), (40, 40)])
+def test_columns_are_convolved_where_they_overlap_the_kernel_wholly(rows, taps):
+    random = np.random.default_rng(taps)
+    values, kernel = random.standard_normal((rows, 3)), random.standard_normal(taps)
+    wanted = [np.convolve(column, kernel, mode="valid") for column in values.T]
+    np.testing.assert_allclose(numerics.convolved(values, kernel), np.transpose(wanted), atol=1e-12)
+    found = numerics.convolved(values[:, 0], kernel)
+    np.testing.assert_allclose(found, wanted[0], atol=1e-12)

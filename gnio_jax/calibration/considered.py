@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from typing import NamedTuple
 
 import jax
@@ -102,6 +103,18 @@ def filtered_positions(
 
     `truth` has the true ones after each stride, m; NaN where there is none.
     """
+    of_all = _filtered(walks, windows=windows, options=options)
+    healthy, position, covariance, of_position = jax.device_get(of_all)
+    error = truth - position
+    known = np.isfinite(error).all(axis=2) & (healthy > 0)
+    return Positions(error[known], covariance[known], of_position[known])
+
+
+@functools.partial(jax.jit, static_argnames=("windows", "options"))
+def _filtered(
+    walks: Walks, *, windows: DataConfig, options: FilterOptions
+) -> tuple[Array, Array, Array, Array]:
+    """Of every walk: where the filter is healthy, its positions, their covariances and S."""
     setup = filter_setup(windows, options)
 
     def of_walk(walk: Walks) -> tuple[Array, Array, Array, Array]:
@@ -115,8 +128,4 @@ def filtered_positions(
         covariance = history.covariance[:, POSITION, POSITION]
         return history.healthy, history.position, covariance, found[:, POSITION]
 
-    found = jax.device_get(jax.jit(over_sequences(of_walk))(walks))
-    healthy, position, covariance, of_position = found
-    error = truth - position
-    known = np.isfinite(error).all(axis=2) & (healthy > 0)
-    return Positions(error[known], covariance[known], of_position[known])
+    return over_sequences(of_walk)(walks)

@@ -60,6 +60,10 @@ class DataConfig:
     """Split of the dataset for training."""
     val_split: str = "val"
     """Split of the dataset for validation, which chooses the best checkpoint."""
+    residency: Literal["device", "host", "auto"] = "device"
+    """Where recordings lie in training on windows: on the device, or on the disk, from which
+    batches are read ahead; auto: on the disk if they take more than half of the device's memory.
+    The numbers are the same (ours)."""
 
     @property
     def window(self) -> int:
@@ -354,6 +358,9 @@ class TrainConfig:
         if self.model.dtype != "float32":
             problem = f"field '{prefix}model.dtype' is for training on windows alone"
             raise InputError(source, problem, "set it to float32")
+        if self.data.residency == "host":
+            problem = f"field '{prefix}data.residency' is for training on windows alone"
+            raise InputError(source, problem, "set it to device")
         for name in ("piece_seconds", "truncate_seconds"):
             strides = getattr(through, name) / self.data.stride_seconds
             if abs(strides - round(strides)) >= 1e-6:

@@ -3,7 +3,7 @@
 from gnio_jax.data.dataset import Dataset
 from gnio_jax.data.hdf5 import read_hdf5, write_hdf5
 from gnio_jax.data.plausibility import SelfCheck, self_check
-from gnio_jax.data.registry import find_root, get, load, names
+from gnio_jax.data.registry import find_root, get, load, load_each, names
 from gnio_jax.data.resampling import resample
 from gnio_jax.data.validation import validate
 from gnio_jax.types import Sequence
@@ -15,6 +15,7 @@ __all__ = [
     "find_root",
     "get",
     "load",
+    "load_each",
     "names",
     "read_hdf5",
     "resample",

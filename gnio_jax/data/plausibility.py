@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from scipy.signal import fftconvolve
 from scipy.spatial.transform import Rotation
 
 from gnio_jax.data.dataset import Dataset
 from gnio_jax.errors import InputError
 from gnio_jax.numerics import (
+    convolved,
     last_true,
     midpoints,
     quaternion_product,
@@ -160,13 +161,13 @@ def check_sequence(sequence: Sequence, dataset: Dataset) -> SelfCheck:
     return check if needed else check._replace(failures=())
 
 
-def keep_plausible(sequences: list[Sequence], dataset: Dataset) -> list[Sequence]:
+def each_plausible(sequences: Iterable[Sequence], dataset: Dataset) -> Iterator[Sequence]:
     """The sequences that pass the self-check of their dataset; a warning names each other one with
     the reason.
 
-    Raises `InputError` when none is left.
+    None is kept in memory. Raises `InputError` at the end when there was none.
     """
-    kept, refused = [], []
+    kept, refused = 0, []
     for sequence in sequences:
         failures = check_sequence(sequence, dataset).failures
         if failures:
@@ -174,14 +175,14 @@ def keep_plausible(sequences: list[Sequence], dataset: Dataset) -> list[Sequence
             warnings.warn(f"{sequence.name}: left out by the self-check: {reasons}", stacklevel=2)
             refused.append(sequence.name)
         else:
-            kept.append(sequence)
+            kept += 1
+            yield sequence
     if not kept:
         raise InputError(
             ", ".join(refused[:3]) or "no sequence",
             f"none of {len(refused)} sequences passes the physical self-check",
             "see the warnings above; check units, frames and time offset of the recordings",
         )
-    return kept
 
 
 def _held_attitude(sequence: Sequence) -> Float[np.ndarray, "n 4"]:
@@ -285,7 +286,7 @@ def _accel_correlation(sequence: Sequence, force: np.ndarray, step: float) -> tu
     position = sequence.position[:, :2]
     geometric = (position[2 * h :] - 2.0 * position[h:-h] + position[: -2 * h]) / (h * step) ** 2
     triangle = 1.0 - np.abs(np.arange(-h, h + 1)) / h
-    inertial = fftconvolve(force[:, :2], (triangle / triangle.sum())[:, None], mode="valid", axes=0)
+    inertial = convolved(force[:, :2], triangle / triangle.sum())
     broken = np.concatenate([[0], np.cumsum(~sequence.valid)])
     whole = broken[2 * h + 1 :] == broken[: -2 * h - 1]
     if whole.sum() < 2 * h:

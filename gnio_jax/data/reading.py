@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 from gnio_jax.data.cache import cached, is_cached, is_refused
 from gnio_jax.data.dataset import Dataset, Recording, Refusal
-from gnio_jax.data.plausibility import SelfCheck, check_sequence, keep_plausible
+from gnio_jax.data.plausibility import SelfCheck, check_sequence, each_plausible
 from gnio_jax.data.processes import ProcessDied, map_in_processes
 from gnio_jax.errors import InputError
 from gnio_jax.types import Sequence
@@ -102,6 +102,20 @@ def read_split(
     the share of these recordings that is read. Raises `InputError` when a file is damaged or no
     sequence is left.
     """
+    return list(read_each(dataset, root, split, workers, progress))
+
+
+def read_each(
+    dataset: Dataset, root: Path, split: str, workers: int, progress: Callable[[float], None]
+) -> Iterator[Sequence]:
+    """The sequences of `read_split` one after another: none is kept in memory."""
+    sequences = _sequences(dataset, root, split, workers, progress)
+    return each_plausible(sequences, dataset) if dataset.needs_root else sequences
+
+
+def _sequences(
+    dataset: Dataset, root: Path, split: str, workers: int, progress: Callable[[float], None]
+) -> Iterator[Sequence]:
     recordings = dataset.recordings(root, split)
     if not recordings:
         raise InputError(
@@ -109,7 +123,7 @@ def read_split(
             f"split '{split}' of dataset '{dataset.name}' holds no sequence",
             f"expected layout: {dataset.layout}",
         )
-    sequences: list[Sequence] = []
+    found = False
     readings = _read_all(recordings, workers, progress)
     for recording, reading in zip(recordings, readings, strict=True):
         for note in reading.notes:
@@ -118,14 +132,14 @@ def read_split(
             warnings.warn(f"{recording.name}: left out: {reason}", stacklevel=3)
         if reading.damage is not None:
             raise reading.damage
-        sequences += reading.sequences
-    if not sequences:
+        found |= bool(reading.sequences)
+        yield from reading.sequences
+    if not found:
         raise InputError(
             root,
             f"none of the {len(recordings)} recordings of split '{split}' can be used",
             "see the warnings above",
         )
-    return keep_plausible(sequences, dataset) if dataset.needs_root else sequences
 
 
 def _read_all(

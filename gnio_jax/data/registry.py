@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import difflib
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from gnio_jax.data.dataset import Dataset
@@ -24,7 +24,7 @@ from gnio_jax.data.readers import (
     synthetic,
     tlio,
 )
-from gnio_jax.data.reading import read_split
+from gnio_jax.data.reading import read_each
 from gnio_jax.errors import InputError
 from gnio_jax.types import Sequence
 
@@ -99,6 +99,17 @@ def load(
     that is read. Raises `InputError` on an unknown name or split, a missing folder, a damaged file,
     or a split without a sequence.
     """
+    return list(load_each(name, root, split, workers, progress))
+
+
+def load_each(
+    name: str,
+    root: str | os.PathLike[str] | None = None,
+    split: str = "test",
+    workers: int = 1,
+    progress: Callable[[float], None] = lambda share: None,
+) -> Iterator[Sequence]:
+    """The sequences of `load` one after another, for those that do not fit the memory together."""
     dataset = get(name)
     # Where lists at the root name the splits, the reader knows them.
     if split not in dataset.splits and dataset.list_splits is None:
@@ -108,7 +119,7 @@ def load(
             f"{_did_you_mean(split, dataset.splits)}known splits: {', '.join(dataset.splits)}",
         )
     folder = find_root(name, root) if dataset.needs_root else Path(root or ".")
-    return read_split(dataset, folder, split, workers, progress)
+    return read_each(dataset, folder, split, workers, progress)
 
 
 def _did_you_mean(word: str, known: list[str] | tuple[str, ...]) -> str:

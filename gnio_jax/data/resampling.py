@@ -7,11 +7,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.interpolate import CubicSpline
-from scipy.signal import fftconvolve
 from scipy.spatial.transform import Rotation
 
 from gnio_jax.decimation import decimation_factor, low_pass
-from gnio_jax.numerics import quaternions, rotations
+from gnio_jax.numerics import convolved, quaternions, rotations
 from gnio_jax.types import Sequence
 
 LONGEST_BRIDGE = 0.1
@@ -143,4 +142,4 @@ def _low_pass(values: np.ndarray, factor: int) -> np.ndarray:
     taps = low_pass(factor)
     half = len(taps) // 2
     padded = np.pad(values, ((half, half), (0, 0)), mode="reflect", reflect_type="odd")
-    return fftconvolve(padded, taps[:, None], mode="valid", axes=0)
+    return convolved(padded, taps)

@@ -1,4 +1,4 @@
-"""Training windows: recordings that lie on the device once, and an index of where windows start.
+"""Training windows: recordings that are stored once, and an index of where windows start.
 
 Overlapping windows are never copied: a second of IMU belongs to ten windows and is stored once.
 Windows are cut and rotated inside the jitted step (`gnio_jax.windows.cut_windows`).
@@ -6,7 +6,7 @@ Windows are cut and rotated inside the jitted step (`gnio_jax.windows.cut_window
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
 import jax
@@ -50,6 +50,11 @@ class WindowSource(NamedTuple):
     """Numbers of the windows an epoch visits: all of them, unless they are to be shifted (see
     `shift_windows`)."""
 
+    def moved(self, rows: int, windows: int) -> WindowSource:
+        """The same behind so many rows and windows of other recordings."""
+        count = np.int32(windows)
+        return self._replace(start=self.start + np.int32(rows), visited=self.visited + count)
+
 
 def window_source(
     sequences: Iterable[Sequence], config: DataConfig, stride: int, shift: int = 0
@@ -61,22 +66,34 @@ def window_source(
     from the reference (biases zero). Differences of positions are taken in float64, before they are
     stored in float32. Raises `InputError` when not a single window fits.
     """
-    parts: list[WindowSource] = []
+    return joined(window_parts(sequences, config, stride, shift))
+
+
+def joined(parts: Iterable[WindowSource]) -> WindowSource:
+    """The windows of `parts`, one part for each recording, end to end."""
+    found: list[WindowSource] = []
     rows = windows = 0
-    for sequence in sequences:
-        start = _valid_starts(sequence, config.window, 1 if shift else stride)
-        if start.size == 0:
-            continue
-        part = _source_of(sequence, start, config, stride)
-        parts.append(part._replace(start=part.start + rows, visited=part.visited + windows))
+    for part in parts:
+        found.append(part.moved(rows, windows))
         rows += len(part.imu)
         windows += len(part.start)
-    if not parts:
-        raise InputError(
-            "data",
-            f"no window of {config.window_seconds:g} s with a valid reference in any sequence",
-        )
-    return WindowSource(*(np.concatenate(field) for field in zip(*parts, strict=True)))
+    return WindowSource(*(np.concatenate(field) for field in zip(*found, strict=True)))
+
+
+def window_parts(
+    sequences: Iterable[Sequence], config: DataConfig, stride: int, shift: int = 0
+) -> Iterator[WindowSource]:
+    """The windows of each sequence that has any, rows and numbers counted from 0: `window_source`
+    in parts. Raises `InputError` at the end when there was none."""
+    found = False
+    for sequence in sequences:
+        start = _valid_starts(sequence, config.window, 1 if shift else stride)
+        if start.size:
+            found = True
+            yield _source_of(sequence, start, config, stride)
+    if not found:
+        length = f"{config.window_seconds:g} s"
+        raise InputError("data", f"no window of {length} with a valid reference in any sequence")
 
 
 def _valid_starts(sequence: Sequence, length: int, stride: int) -> Starts:
@@ -117,6 +134,37 @@ def gather(source: WindowSource, which: Int[jax.Array, "b"], length: int) -> Win
         imu=cut_windows(source.imu, start, source.rotation[which], length),
         displacement=source.displacement[which],
         steps=jnp.stack([cosine * x + sine * y, cosine * y - sine * x, z], axis=-1),
+    )
+
+
+def excerpt(
+    source: WindowSource, which: Int[np.ndarray, "b"], length: int, shift: int
+) -> WindowSource:
+    """What `gather` and `shift_windows` read for the windows `which`, and no more, on the host.
+
+    Window number `which[i]` is number `visited[i]` of the excerpt, among those up to `shift`
+    samples later or earlier. Where the recording has no window at a distance, the one in the middle
+    stands in: `shift_windows` sees that it is not at that distance.
+    """
+    distances = np.arange(-shift, shift + 1, dtype=np.int32)
+    around = np.clip(which[:, None] + distances, 0, len(source.start) - 1)
+    distance = source.start[around] - source.start[which][:, None]
+    around = np.where(distance == distances, around, which[:, None])
+    distance = np.where(distance == distances, distance, 0)
+    span = length + 2 * shift
+    rows = source.start[which][:, None] - shift + np.arange(span)
+    rows = np.clip(rows, 0, len(source.imu) - 1).reshape(-1)
+    begin = np.arange(len(which))[:, None] * span + shift
+    middle = np.arange(len(which)) * len(distances) + shift
+    numbers = around.reshape(-1)
+    return WindowSource(
+        imu=source.imu[rows],
+        start=(begin + distance).reshape(-1).astype(np.int32),
+        rotation=source.rotation[numbers],
+        displacement=source.displacement[numbers],
+        step=source.step[rows],
+        unyaw=source.unyaw[numbers],
+        visited=middle.astype(np.int32),
     )
 
 

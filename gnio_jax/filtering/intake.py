@@ -17,7 +17,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from scipy.interpolate import CubicSpline
+from scipy.interpolate import PPoly
+from scipy.linalg import get_lapack_funcs
 
 from gnio_jax.decimation import decimation_factor, low_pass
 
@@ -40,6 +41,9 @@ _TOO_FAST = 1.05
 """Times the fastest rate that the low-pass is made for."""
 _BEFORE = 4
 """Samples kept before the FIR's reach, so that the spline's new end is not felt within it."""
+
+
+(_solve_tridiagonal,) = get_lapack_funcs(("gtsv",), dtype=np.float64)
 
 
 class Design(NamedTuple):
@@ -260,10 +264,36 @@ def _interpolated(
     if len(run.stamps) < 4:
         fine, lines = np.empty((len(points), 6)), np.ones(len(points), bool)
     else:
-        fine = CubicSpline(run.stamps, run.samples)(points)
+        fine = _spline(run.stamps, run.samples)(points)
         wide = np.diff(run.stamps) > _LINE / design.imu_rate
         lines = wide[np.searchsorted(run.stamps[1:-1], points, side="right")]
     if lines.any():
         for row, column in zip(fine.T, run.samples.T, strict=True):
             row[lines] = np.interp(points[lines], run.stamps, column)
     return fine
+
+
+def _spline(x: Float[np.ndarray, "n"], y: Float[np.ndarray, "n 6"]) -> PPoly:
+    """SciPy's `CubicSpline(x, y)` of at least 4 samples, to the bit.
+
+    Its checks of every argument take longer than all else that is done for a sample.
+    """
+    steps = np.diff(x)
+    column = steps[:, None]
+    slope = np.diff(y, axis=0) / column
+    # Equal second derivatives at every sample, and no knot at the second and the last but one.
+    first, last = x[2] - x[0], x[-1] - x[-3]
+    right = np.empty_like(y)
+    right[1:-1] = 3 * (column[1:] * slope[:-1] + column[:-1] * slope[1:])
+    right[0] = (column[0] + 2 * first) * column[1] * slope[0] + column[0] ** 2 * slope[1]
+    right[0] /= first
+    right[-1] = column[-1] ** 2 * slope[-2] + (2 * last + column[-1]) * column[-2] * slope[-1]
+    right[-1] /= last
+    diagonal = np.concatenate([steps[1:2], 2 * (steps[:-1] + steps[1:]), steps[-2:-1]])
+    lower, upper = np.append(steps[1:], last), np.append(first, steps[:-1])
+    derivative = _solve_tridiagonal(lower, diagonal, upper, right)[3]
+    bend = (derivative[:-1] + derivative[1:] - 2 * slope) / column
+    quadratic = (slope - derivative[:-1]) / column - bend
+    return PPoly.construct_fast(
+        np.stack([bend / column, quadratic, derivative[:-1], y[:-1]]), x, extrapolate=True
+    )

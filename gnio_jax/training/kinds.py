@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
@@ -59,14 +60,15 @@ class Training(Protocol):
         """Learning rate of a step by the schedule."""
         ...
 
-    def order(self, epoch: int) -> jax.Array:
-        """What an epoch visits, in order: a function of the seed and the epoch."""
+    def order(self, epoch: int) -> Any:
+        """What an epoch visits, in order: a function of the seed and the epoch. For
+        `take_steps`."""
         ...
 
     def take_steps(
         self,
         state: TrainState,
-        order: jax.Array,
+        order: Any,
         first: int,
         count: int,
         learning_rate_factor: float,
@@ -108,24 +110,26 @@ def keys_of(seed: int) -> Keys:
     return Keys(*jax.random.split(key, 3), statistics=jax.random.fold_in(key, 3))
 
 
-def read_split(config: TrainConfig, split: str, reporter: Reporter, workers: int) -> list[Sequence]:
-    """The recordings of a split at the network's rate."""
-    loaded = data.load(
+def read_split(
+    config: TrainConfig, split: str, reporter: Reporter, workers: int
+) -> Iterator[Sequence]:
+    """The recordings of a split at the network's rate, one after another."""
+    loaded = data.load_each(
         config.dataset,
         config.data_root,
         split,
         workers,
         lambda share: reporter.progress(f"reading {split}", share),
     )
-    return [data.resample(sequence, config.data.rate) for sequence in loaded]
+    return (data.resample(sequence, config.data.rate) for sequence in loaded)
 
 
 def describe_split(
-    config: TrainConfig, split: str, sequences: list[Sequence], contents: str, reporter: Reporter
+    config: TrainConfig, split: str, samples: dict[str, int], contents: str, reporter: Reporter
 ) -> None:
-    """Say how much was read."""
-    hours = sum(len(sequence.time) for sequence in sequences) / config.data.rate / 3600
-    reporter.line(f"  {split}: {len(sequences)} sequences, {hours:.2f} h, {contents}")
+    """Say how much was read: samples of each recording."""
+    hours = sum(samples.values()) / config.data.rate / 3600
+    reporter.line(f"  {split}: {len(samples)} sequences, {hours:.2f} h, {contents}")
 
 
 def steps_in_epoch(count: int, unit: str, config: TrainConfig) -> int:

@@ -7,13 +7,16 @@ import time
 from pathlib import Path
 
 from tensorboardX.event_file_writer import EventsWriter
-from tensorboardX.proto.event_pb2 import Event, SessionLog
+from tensorboardX.proto import event_pb2
 from tensorboardX.summary import scalar
 
 from gnio_jax.files import write_text
 from gnio_jax.scaling.processes import is_first
 
 Row = dict[str, int | float]
+
+# Made when the module is imported, so type checkers do not know them.
+_Event, _SessionLog = (getattr(event_pb2, name) for name in ("Event", "SessionLog"))
 
 
 class Log:
@@ -55,13 +58,13 @@ class _Board:
         folder.mkdir(parents=True, exist_ok=True)
         self._folder = folder
         self._file = EventsWriter(str(folder / "events"))
-        start = SessionLog(status=SessionLog.START)
-        self._file.write_event(Event(wall_time=time.time(), step=step, session_log=start))
+        start = _SessionLog(status=_SessionLog.START)
+        self._file.write_event(_Event(wall_time=time.time(), step=step, session_log=start))
 
     def add(self, row: Row) -> None:
         try:
             for name, value in row.items():
-                event = Event(wall_time=time.time(), step=row["step"], summary=scalar(name, value))
+                event = _Event(wall_time=time.time(), step=row["step"], summary=scalar(name, value))
                 self._file.write_event(event)
             self._file.flush()
         except OSError as error:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 
@@ -151,7 +151,7 @@ def _run_epoch(
 
 def _run_steps(
     training: Training,
-    order: jax.Array,
+    order: Any,
     epoch: int,
     first: int,
     count: int,

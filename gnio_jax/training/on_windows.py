@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -31,17 +32,23 @@ from gnio_jax.training.losses import stage, switches
 from gnio_jax.training.step import (
     Progress,
     TrainState,
+    Validation,
+    added,
     calibrated,
     calibrates,
     create_state,
     epoch_order,
-    estimate_statistics,
     evaluated,
     isotropic,
+    mean_of,
     normalises,
+    statistics_order,
+    statistics_over,
     train_steps,
     validate,
 )
+from gnio_jax.training.supply import Epoch, FromHost, Supply, stored, supplied
+from gnio_jax.types import Sequence
 
 
 class WindowTraining(NamedTuple):
@@ -55,17 +62,19 @@ class WindowTraining(NamedTuple):
     optimizer: optax.GradientTransformationExtraArgs
     schedule: optax.Schedule
     source: windows.WindowSource
-    """Training windows."""
+    """Training windows, on the device or on the disk."""
     held_out: windows.WindowSource
-    """Validation windows."""
+    """Validation windows, likewise."""
     splits: dict[str, list[str]]
     steps_per_epoch: int
     keys: Keys
+    supply: Supply
+    """How they come to the device."""
     unit: str = "windows"
 
     @property
     def recordings(self) -> Any:
-        return self.source, self.held_out
+        return self.source, self.held_out, isinstance(self.supply, FromHost)
 
     @property
     def changes(self) -> tuple[int, ...]:
@@ -98,29 +107,36 @@ class WindowTraining(NamedTuple):
     def learning_rate(self, step: int) -> float:
         return float(self.schedule(step))
 
-    def order(self, epoch: int) -> jax.Array:
-        return epoch_order(self.keys.order, epoch, self.source)
+    def order(self, epoch: int) -> Epoch:
+        order = epoch_order(self.keys.order, epoch, self.source)
+        return self.supply.epoch(self.source, order)
 
     def take_steps(
         self,
         state: TrainState,
-        order: jax.Array,
+        order: Epoch,
         first: int,
         count: int,
         learning_rate_factor: float,
     ) -> tuple[TrainState, Progress]:
-        return train_steps(
-            state,
-            self.source,
-            order,
-            jnp.int32(first),
-            jnp.int32(count),
-            jnp.float32(learning_rate_factor),
-            self.keys.step,
-            model=self.trained_model,
-            optimizer=self.optimizer,
-            config=self.config,
-        )
+        found = None
+        for part in order.parts(first, count):
+            state, progress = train_steps(
+                state,
+                part.source,
+                part.order,
+                jnp.int32(part.first),
+                jnp.int32(part.count),
+                jnp.float32(learning_rate_factor),
+                self.keys.step,
+                model=self.trained_model,
+                optimizer=self.optimizer,
+                config=self.config,
+                steps_per_epoch=self.steps_per_epoch,
+            )
+            found = progress if found is None else added(found, progress)
+        assert found is not None, "no step was asked for"
+        return state, found
 
     def settled(self, state: TrainState) -> TrainState:
         """With the statistics of its batch normalisations estimated anew, for the parameters that
@@ -129,18 +145,18 @@ class WindowTraining(NamedTuple):
             return state
         options = {"model": self.model, "config": self.config}
         key = self.keys.statistics
-        estimated = estimate_statistics(evaluated(state), self.source, key, **options)
+        order = statistics_order(key, self.source, self.config)
+        source, order = self.supply.windows(self.source, order)
+        estimated = statistics_over(evaluated(state), source, order, key, **options)
         return state._replace(batch_stats=estimated.batch_stats)
 
     def validate(self, state: TrainState, step: int) -> tuple[TrainState, Row]:
         """With its uncertainty calibrated where it has constants for that."""
-        now = stage(self.config.loss, step - 1, self.steps_per_epoch)
-        options = {"model": self.model, "config": self.config}
-        found = validate(evaluated(state), source=self.held_out, now=now, **options)
+        found = self._errors(state, step)
         if calibrates(state):
             equivariant = self.config.model.equivariance != "none"
             state = calibrated(state, isotropic(found) if equivariant else found)
-            found = validate(evaluated(state), source=self.held_out, now=now, **options)
+            found = self._errors(state, step)
         loss, mse, nll = (float(each) for each in found.losses)
         normalised = zip("xyz", found.axis_normalised, strict=True)
         return state, {
@@ -150,6 +166,16 @@ class WindowTraining(NamedTuple):
             "val_rmse": math.sqrt(mse),
             **{f"val_normalised/{axis}": float(each) for axis, each in normalised},
         }
+
+    def _errors(self, state: TrainState, step: int) -> Validation:
+        """Means over the validation windows."""
+        now = stage(self.config.loss, step - 1, self.steps_per_epoch)
+        options = {"model": self.model, "config": self.config}
+        means, counts = [], []
+        for source in self.supply.sources(self.held_out):
+            means.append(validate(evaluated(state), source=source, now=now, **options))
+            counts.append(source.visited.shape[0])
+        return mean_of(means, counts)
 
     def training_figures(self, sums: tuple[float, ...], steps: int) -> Row:
         names = ("loss", "mse", "nll")
@@ -173,6 +199,7 @@ def set_up(config: TrainConfig, reporter: Reporter, workers: int = 1) -> WindowT
     source, learnt_from = _windows(config, train, stride, shift, reporter, workers)
     stride = config.data.stride
     held_out, validated_with = _windows(config, val, stride, 0, reporter, workers)
+    supply, source, held_out = supplied(config, source, held_out)
     steps_per_epoch = steps_in_epoch(source.visited.shape[0], "windows", config)
     return WindowTraining(
         config,
@@ -185,14 +212,21 @@ def set_up(config: TrainConfig, reporter: Reporter, workers: int = 1) -> WindowT
         {train: learnt_from, val: validated_with},
         steps_per_epoch,
         keys_of(config.seed),
+        supply,
     )
 
 
 def _windows(
     config: TrainConfig, split: str, stride: int, shift: int, reporter: Reporter, workers: int
 ) -> tuple[windows.WindowSource, list[str]]:
-    """The windows of a split on the device, and the names of its recordings."""
-    sequences = read_split(config, split, reporter, workers)
-    source = windows.window_source(sequences, config.data, stride, shift)
-    describe_split(config, split, sequences, f"{source.visited.shape[0]:,} windows", reporter)
-    return devices.everywhere(source), [sequence.name for sequence in sequences]
+    """The windows of a split, on the host or on its disk, and the names of its recordings."""
+    samples: dict[str, int] = {}
+
+    def noted() -> Iterator[Sequence]:
+        for sequence in read_split(config, split, reporter, workers):
+            samples[sequence.name] = len(sequence.time)
+            yield sequence
+
+    source = stored(config, noted(), stride, shift)
+    describe_split(config, split, samples, f"{source.visited.shape[0]:,} windows", reporter)
+    return source, list(samples)

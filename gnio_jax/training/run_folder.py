@@ -44,6 +44,7 @@ def prepare(config: TrainConfig, resume: bool) -> Path:
 
 def _refuse_other_settings(config: TrainConfig, kept: Path) -> None:
     ours, theirs = (dataclasses.asdict(c) for c in (config, configuration.load(kept)))
+    theirs["data"]["residency"] = ours["data"]["residency"]  # where things lie, too
     for name in ours:
         if name not in MAY_CHANGE and ours[name] != theirs[name]:
             problem = f"'{name}' was {theirs[name]} and is now {ours[name]}"

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 from flax import linen as nn
 from jaxtyping import Float, Int, PRNGKeyArray
@@ -107,7 +108,9 @@ def epoch_order(key: PRNGKeyArray, epoch: int, source: WindowSource) -> Int[jax.
 
 
 @functools.partial(
-    jax.jit, static_argnames=("model", "optimizer", "config"), donate_argnames="state"
+    jax.jit,
+    static_argnames=("model", "optimizer", "config", "steps_per_epoch"),
+    donate_argnames="state",
 )
 def train_steps(
     state: TrainState,
@@ -121,15 +124,16 @@ def train_steps(
     model: nn.Module,
     optimizer: optax.GradientTransformationExtraArgs,
     config: TrainConfig,
+    steps_per_epoch: int | None = None,
 ) -> tuple[TrainState, Progress]:
-    """Take `count` steps of an epoch from its step number `first` on, in one dispatch;
-    `learning_rate_factor` is `optimizer.Plateau.factor`.
+    """Take `count` steps from step number `first` of `order` on, in one dispatch: of an epoch, or
+    of a part of one with `steps_per_epoch`. `learning_rate_factor` is `optimizer.Plateau.factor`.
 
     `count` is not static: however an epoch is cut into dispatches it is the same program, so a run
     that was interrupted and resumed has the same parameters to the bit.
     """
     size = config.optim.batch_size
-    steps_per_epoch = order.shape[0] // size
+    steps_per_epoch = steps_per_epoch or order.shape[0] // size
 
     def one_step(i: jax.Array, carry: tuple[TrainState, Progress]) -> tuple[TrainState, Progress]:
         state, progress = carry
@@ -225,6 +229,25 @@ def _add_step(progress: Progress, step: jax.Array, loss: Losses, gradient: Any) 
     return Progress(sums, norms, jnp.where(failed, step, progress.failed_step))
 
 
+def added(one: Progress, other: Progress) -> Progress:
+    """The progress of steps and of those after them."""
+    sums, norms = jax.tree.map(
+        jnp.add, (one.sums, one.gradient_norms), (other.sums, other.gradient_norms)
+    )
+    failed = jnp.where(one.failed_step < 0, other.failed_step, one.failed_step)
+    return Progress(sums, norms, failed)
+
+
+def mean_of(found: list[Validation], counts: list[int]) -> Validation:
+    """The means over all windows from those over parts of so many windows."""
+    if len(found) == 1:
+        return found[0]
+    shares = np.float32(counts) / np.float32(sum(counts))
+    return jax.tree.map(
+        lambda *means: sum(s * m for s, m in zip(shares, means, strict=True)), *found
+    )
+
+
 def _apply_training(
     model: nn.Module, variables: Any, windows: Windows, dropout_key: PRNGKeyArray
 ) -> tuple[Prediction, Any]:
@@ -269,7 +292,15 @@ def statistics_batches(source: WindowSource, config: TrainConfig) -> int:
     return min(-(-config.optim.statistics_windows // size), source.visited.shape[0] // size)
 
 
-@functools.partial(jax.jit, static_argnames=("model", "config"))
+def statistics_order(
+    key: PRNGKeyArray, source: WindowSource, config: TrainConfig
+) -> Int[jax.Array, "m"]:
+    """The windows of `estimate_statistics`: whole batches, drawn from `key` alone."""
+    order_key, _ = jax.random.split(key)
+    count = statistics_batches(source, config) * config.optim.batch_size
+    return jax.random.permutation(order_key, jnp.asarray(source.visited))[:count]
+
+
 def estimate_statistics(
     state: TrainState,
     source: WindowSource,
@@ -285,11 +316,23 @@ def estimate_statistics(
     (ours; Wu and Johnson 2021, "Rethinking 'Batch' in BatchNorm"). Nothing else of `batch_stats`
     changes.
     """
-    size, batches = config.optim.batch_size, statistics_batches(source, config)
-    order_key, draw_key = jax.random.split(key)
-    order = jax.random.permutation(order_key, source.visited)[: batches * size].reshape(
-        batches, size
-    )
+    order = statistics_order(key, source, config)
+    return statistics_over(state, source, order, key, model=model, config=config)
+
+
+@functools.partial(jax.jit, static_argnames=("model", "config"))
+def statistics_over(
+    state: TrainState,
+    source: WindowSource,
+    order: Int[jax.Array, "m"],
+    key: PRNGKeyArray,
+    *,
+    model: nn.Module,
+    config: TrainConfig,
+) -> TrainState:
+    """`estimate_statistics` over the windows of `order`, as `statistics_order` draws them."""
+    batches = order.shape[0] // config.optim.batch_size
+    _, draw_key = jax.random.split(key)
     # A normalisation adds 1 − MOMENTUM of the batch's statistics to the MOMENTUM-fold of its own:
     # of zeros, that alone is left.
     zeros = jax.tree.map(jnp.zeros_like, state.batch_stats)
@@ -303,7 +346,8 @@ def estimate_statistics(
         _, changed = _apply_training(model, variables, windows, dropout_key)
         return jax.tree.map(jnp.add, total, changed["batch_stats"]), None
 
-    total, _ = jax.lax.scan(add_batch, zeros, (jnp.arange(batches), order))
+    parts = order.reshape(batches, config.optim.batch_size)
+    total, _ = jax.lax.scan(add_batch, zeros, (jnp.arange(batches), parts))
 
     def statistic(path: tuple, total: jax.Array, before: jax.Array) -> jax.Array:
         return total / (batches * (1 - MOMENTUM)) if path[-1].key in ("mean", "var") else before

@@ -181,7 +181,8 @@ def _pieces(
     config: TrainConfig, split: str, reporter: Reporter, workers: int
 ) -> tuple[PieceSource, list[str]]:
     """The pieces of a split on the device, and the names of its recordings."""
-    sequences = read_split(config, split, reporter, workers)
+    sequences = list(read_split(config, split, reporter, workers))
     source = piece_source(sequences, intervals(config) * config.data.stride)
-    describe_split(config, split, sequences, f"{source.earliest.shape[0]:,} pieces", reporter)
-    return jax.device_put(source), [sequence.name for sequence in sequences]
+    samples = {sequence.name: len(sequence.time) for sequence in sequences}
+    describe_split(config, split, samples, f"{source.earliest.shape[0]:,} pieces", reporter)
+    return jax.device_put(source), list(samples)

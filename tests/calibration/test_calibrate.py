@@ -95,7 +95,7 @@ def test_a_calibrated_run_is_not_calibrated_again(run, two_walks, tmp_path):
 
 def test_the_split_may_be_that_of_training(run, two_walks, tmp_path):
     options = CalibrateConfig(str(run), str(tmp_path / "out"), split="train", steps=1)
-    calibration.calibrate(dataclasses.replace(options, fit=("measurement",)))
+    calibration.calibrate(dataclasses.replace(options, fit=("measurement", "window")))
     assert two_walks == ["train"]
 
 

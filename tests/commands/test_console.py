@@ -128,7 +128,7 @@ def test_help_teaches(capsys):
 
 def outcome(body):
     program = (
-        "from gnio_jax.commands import console\nfrom gnio_jax.types import InputError\n"
+        "from gnio_jax.commands import console\nfrom gnio_jax.errors import InputError\n"
         f"def main():\n    {body}\nconsole.run(main)\n"
     )
     return subprocess.run(

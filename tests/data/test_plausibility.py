@@ -6,9 +6,13 @@ import numpy as np
 import pytest
 
 from gnio_jax import data
-from gnio_jax.data.plausibility import check_sequence, gyro_windows, keep_plausible, self_check
+from gnio_jax.data.plausibility import check_sequence, each_plausible, gyro_windows, self_check
 from gnio_jax.errors import InputError
 from tests.support.circle import changed, circle
+
+
+def keep_plausible(sequences, dataset):
+    return list(each_plausible(sequences, dataset))
 
 
 def asking(**options):

@@ -7,8 +7,13 @@ from gnio_jax.evaluation import Trajectory, plots
 from tests.support.estimates import SETTINGS
 
 
+@pytest.fixture(autouse=True)
+def few_dots(monkeypatch):
+    monkeypatch.setattr(plots, "DOTS_PER_INCH", 30)
+
+
 @pytest.mark.parametrize("alignment", ["origin", "yaw_position", "se3"])
-def test_the_distribution_of_errors_counts_what_diverged(tmp_path, with_divergence, alignment):
+def test_the_distribution_of_errors_counts_what_diverged(with_divergence, alignment):
     of, found = with_divergence
     figure = plots.error_cdf(of, found._replace(settings=SETTINGS | {"alignment": alignment}))
     left, right = figure.axes
@@ -17,7 +22,10 @@ def test_the_distribution_of_errors_counts_what_diverged(tmp_path, with_divergen
     assert of_all.get_label() == "all samples"
     assert of_all.get_ydata()[-1] == pytest.approx(1000 / 1200)
     assert right.get_lines()[0].get_ydata()[-1] == pytest.approx(2 / 3)
-    plots.save_all(tmp_path, of, found, 1.0)
+
+
+def test_what_diverged_is_drawn(tmp_path, with_divergence):
+    plots.save_all(tmp_path, *with_divergence, 1.0)
 
 
 def test_an_estimate_lost_before_the_reference_begins_is_drawn(estimates):

@@ -34,7 +34,7 @@ def through(stamps, values, imu_rate, dt=DT, hole=None):
     design = intake.design(dt, hole, float(imu_rate))
     stream, clock, rows, known = None, None, [], []
     samples = zip(stamps.tolist(), values.tolist(), strict=True)
-    for time, row in checked_at_first(samples):
+    for time, row in checked_at_first(samples, 60):  # 400 Hz: a row from 46 on
         stream, events = intake.low_pass_sample(stream, time, tuple(row), design)
         for event in events:
             clock, new = advance_clock(clock, *event, dt, hole)
@@ -47,6 +47,14 @@ def linear(stamps, values, dt=DT):
     """The grid by interpolation alone, without a low-pass: gyro, accel."""
     grid = np.arange(int((stamps[-1] - stamps[0]) / dt)) * dt
     return np.stack([np.interp(grid, stamps - stamps[0], column) for column in values.T], axis=1)
+
+
+@pytest.mark.parametrize("count", [4, 5, 100])
+def test_the_spline_is_scipys_to_the_bit(count):
+    random = np.random.default_rng(count)
+    x, y = np.cumsum(random.uniform(0.3, 1, count)), random.standard_normal((count, 6))
+    points = np.linspace(x[0], x[-1], 300)
+    np.testing.assert_array_equal(intake._spline(x, y)(points), CubicSpline(x, y)(points))
 
 
 def stamps_of(rate, seconds, jitter=0.0):

@@ -19,6 +19,7 @@ def count(tree):
     return sum(int(np.prod(leaf.shape)) for leaf in jax.tree.leaves(tree))
 
 
+@functools.cache
 def shapes(**options):
     model = models.create("gnio", **options)
     return jax.eval_shape(
@@ -70,9 +71,8 @@ def test_the_bank_starts_alive():
     entropy, spread = {}, {}
     for std in (1.0, 512**-0.5):
         bank = MotionBank(std=std)
-        context, attention = jax.jit(
-            lambda key, bank=bank: bank.init_with_output(key, features)[0]
-        )(jax.random.key(1))
+        drawn = quick(lambda key, bank=bank: bank.init_with_output(key, features)[0])
+        context, attention = map(np.asarray, drawn(jax.random.key(1)))
         entropy[std] = -np.mean(np.sum(attention * np.log(attention), axis=-1)) / np.log(64)
         spread[std] = np.mean(np.std(context, axis=0)) / np.mean(np.std(features, axis=0))
     assert entropy[1.0] < 0.98 and entropy[512**-0.5] > 0.999
@@ -82,9 +82,8 @@ def test_the_bank_starts_alive():
 def test_the_projections_start_as_those_of_pytorch():
     """Xavier-uniform over query, key and value as one (3d, d) matrix, a linear layer's bound for
     the output, biases zero."""
-    params = MotionBank(size=3, heads=2, width=64).init(
-        jax.random.key(0), jnp.zeros((1, 64), jnp.float32)
-    )["params"]
+    bank = MotionBank(size=3, heads=2, width=64)
+    params = quick(bank.init)(jax.random.key(0), jnp.zeros((1, 64), jnp.float32))["params"]
     for name, bound in [
         ("query", (6 / (64 + 192)) ** 0.5),
         ("key", (6 / (64 + 192)) ** 0.5),
@@ -165,17 +164,32 @@ def numpy_forward(variables, windows):
     return tuple(map(np.array, (displacement, log_std, gates, attention)))
 
 
+def drawn(tree):
+    """Variables whose statistics, scales and biases are away from their neutral start, so that none
+    can be left out unnoticed."""
+    rng = np.random.default_rng(3)
+
+    def draw(path, leaf):
+        name = path[-1].key
+        if name in ("var", "scale"):
+            values = 1 + 0.1 * rng.random(leaf.shape)
+        elif leaf.ndim == 1 or name == "bias":
+            values = 0.1 * rng.random(leaf.shape)
+        elif name == "prototypes":
+            values = rng.standard_normal(leaf.shape)
+        else:
+            values = rng.standard_normal(leaf.shape) * np.prod(leaf.shape[:-1]) ** -0.5
+        return jnp.asarray(values, jnp.float32)
+
+    return jax.tree.map_with_path(draw, tree)
+
+
 @pytest.mark.parametrize("samples", [100, 200])
 def test_forward_against_numpy(samples):
-    model = models.create("gnio", width=8, bank_size=5, bank_heads=4)
-    windows = jax.random.normal(jax.random.key(1), (2, samples, 6), jnp.float32)
-    variables = models.initialise(model, jax.random.key(0), windows.shape[1])
-    # Statistics and gate away from their neutral start, so that none can be left out unnoticed.
-    rng = np.random.default_rng(3)
-    variables = jax.tree.map(
-        lambda x: x + 0.1 * rng.random(x.shape, np.float32) if x.ndim == 1 else x, variables
-    )
-    found = jax.jit(model.apply)(variables, windows)
+    options = {"width": 8, "bank_size": 5, "bank_heads": 4}
+    model, variables = models.create("gnio", **options), drawn(shapes(**options))
+    windows = np.random.default_rng(1).standard_normal((2, samples, 6)).astype(np.float32)
+    found = quick(model.apply)(variables, windows)
     displacement, log_std, gate, attention = numpy_forward(variables, windows)
     np.testing.assert_allclose(found.displacement, displacement, rtol=2e-4, atol=2e-5)
     np.testing.assert_allclose(found.log_std, log_std, rtol=2e-4, atol=2e-5)
@@ -187,8 +201,9 @@ def test_forward_against_numpy(samples):
     "size, stride, length", [(7, 2, 200), (3, 1, 25), (3, 2, 25), (1, 2, 13), (3, 2, 50)]
 )
 def test_convolution_and_its_gradients_against_xla(size, stride, length):
-    x = jax.random.normal(jax.random.key(0), (3, length, 4), jnp.float32)
-    kernel = jax.random.normal(jax.random.key(1), (size, 4, 5), jnp.float32)
+    random = np.random.default_rng(0)
+    x, kernel = random.standard_normal((3, length, 4)), random.standard_normal((size, 4, 5))
+    x, kernel = jnp.asarray(x, jnp.float32), jnp.asarray(kernel, jnp.float32)
     padding = [((size - 1) // 2, (size - 1) // 2)]
     axes = ("NWC", "WIO", "NWC")
 
@@ -198,16 +213,17 @@ def test_convolution_and_its_gradients_against_xla(size, stride, length):
     def ours(x, k):
         return resnet.convolve(x, k, (stride,), padding)
 
-    wanted = quick(oracle)(x, kernel)
-    np.testing.assert_allclose(quick(ours)(x, kernel), wanted, rtol=1e-5, atol=1e-5)
-    weight = jax.random.normal(jax.random.key(2), wanted.shape, jnp.float32)
-    for a, b in zip(
-        *(
-            quick(jax.grad(lambda x, k, f=f: jnp.sum(f(x, k) * weight), (0, 1)))(x, kernel)
-            for f in (ours, oracle)
-        ),
-        strict=True,
-    ):
+    shape = jax.eval_shape(oracle, x, kernel).shape
+    weight = jnp.asarray(random.standard_normal(shape), jnp.float32)
+
+    def with_gradient(function, x, kernel):
+        value, pull_back = jax.vjp(function, x, kernel)
+        return value, *pull_back(weight)
+
+    both = quick(lambda *given: [with_gradient(function, *given) for function in (ours, oracle)])
+    found, wanted = both(x, kernel)
+    np.testing.assert_allclose(found[0], wanted[0], rtol=1e-5, atol=1e-5)
+    for a, b in zip(found[1:], wanted[1:], strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4)
 
 
@@ -219,7 +235,7 @@ def test_max_pool_against_torch_convention(length):
     rows = range(0, length + 2 - 3 + 1, 2)
     padded = np.pad(x, ((0, 0), (1, 1), (0, 0)), constant_values=-np.inf)
     np.testing.assert_array_equal(
-        resnet.max_pool(jnp.asarray(x)),
+        quick(resnet.max_pool)(jnp.asarray(x)),
         np.stack([padded[:, r : r + 3].max(axis=1) for r in rows], axis=1),
     )
 
@@ -240,12 +256,13 @@ def test_gates_and_scales(gate, scale):
     from gnio_jax.models.heads import GatedHead
 
     head = GatedHead(gate, scale)
-    h = jax.random.normal(jax.random.key(0), (4, 16), jnp.float32)
-    variables = head.init(jax.random.key(1), h)
+    random = np.random.default_rng(0)
+    h = random.standard_normal((4, 16)).astype(np.float32)
     variables = jax.tree.map(
-        lambda x: x + 0.3 * jax.random.normal(jax.random.key(7), x.shape, x.dtype), variables
+        lambda leaf: 0.3 * random.standard_normal(leaf.shape).astype(leaf.dtype),
+        jax.eval_shape(head.init, jax.random.key(1), h),
     )
-    displacement, seen = head.apply(variables, h)
+    displacement, seen = quick(head.apply)(variables, h)
     linear = lambda q: np.asarray(h, np.float64) @ np.asarray(q["kernel"]) + np.asarray(q["bias"])  # noqa: E731
     s, g = (
         SCALES[scale](linear(variables["params"]["scale"])),
@@ -272,9 +289,12 @@ def test_gradient_is_finite_where_everything_is_zero(options):
     """Zero input, zero parameters, zero gate, |0| as scale."""
     model = models.create("gnio", width=8, **options)
     still = jnp.zeros((2, 32, 6), jnp.float32)
-    variables = jax.tree.map(jnp.zeros_like, jax.eval_shape(model.init, jax.random.key(0), still))
-    gradient = jax.jit(jax.grad(lambda v: jnp.sum(model.apply(v, still).displacement)))(variables)
-    assert all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves(gradient))
+    variables = jax.tree.map(
+        lambda leaf: np.zeros(leaf.shape, leaf.dtype),
+        jax.eval_shape(model.init, jax.random.key(0), still),
+    )
+    gradient = quick(jax.grad(lambda v: jnp.sum(model.apply(v, still).displacement)))(variables)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
 
 
 def test_training_mode_updates_the_statistics_with_momentum():
@@ -284,10 +304,9 @@ def test_training_mode_updates_the_statistics_with_momentum():
     _, changed = jax.jit(lambda v, w: model.apply(v, w, train=True, mutable=["batch_stats"]))(
         variables, windows
     )
-    stem = resnet.convolve(
-        windows, variables["params"]["encoder"]["stem_conv"]["kernel"], (2,), [(3, 3)]
-    )
-    expected = 0.1 * np.asarray(stem).mean(axis=(0, 1))
+    stem = quick(lambda x, kernel: resnet.convolve(x, kernel, (2,), [(3, 3)]))
+    kernel = variables["params"]["encoder"]["stem_conv"]["kernel"]
+    expected = 0.1 * np.asarray(stem(windows, kernel)).mean(axis=(0, 1))
     np.testing.assert_allclose(
         changed["batch_stats"]["encoder"]["stem_bn"]["mean"], expected, rtol=1e-4, atol=1e-5
     )

@@ -11,19 +11,18 @@ from tests.support.compiling import quick
 
 def trained_like(model, seed=0):
     """Variables with statistics and affine parameters that are not the initial ones."""
-    variables = models.initialise(model, jax.random.key(seed), 64)
-    leaves, tree = jax.tree.flatten_with_path(variables)
     rng = np.random.default_rng(seed)
 
-    def shaken(path, leaf):
+    def drawn(path, leaf):
         name = path[-1].key
         if name in ("var", "scale"):
             return jnp.asarray(rng.uniform(0.4, 1.6, leaf.shape), jnp.float32)
         if name in ("mean", "bias"):
             return jnp.asarray(0.3 * rng.standard_normal(leaf.shape), jnp.float32)
-        return leaf
+        size = 1.0 if name == "prototypes" else np.prod(leaf.shape[:-1]) ** -0.5
+        return jnp.asarray(size * rng.standard_normal(leaf.shape), jnp.float32)
 
-    return jax.tree.unflatten(tree, [shaken(path, leaf) for path, leaf in leaves])
+    return jax.tree.map_with_path(drawn, models.variable_shapes(model, 64))
 
 
 @pytest.mark.parametrize(
@@ -47,7 +46,7 @@ def test_keys_and_values_are_not_computed_again():
     variables, windows = trained_like(model), jnp.zeros((1, 64, 6), jnp.float32)
 
     def operations(apply, given):
-        return jax.jit(apply).lower(given, windows).compile().cost_analysis()["flops"]
+        return quick(apply).lower(given, windows).compile().cost_analysis()["flops"]
 
     saved = operations(model.apply, variables) - operations(
         models.Inference(model), models.inference_variables(model, variables)

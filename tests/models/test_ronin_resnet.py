@@ -8,6 +8,7 @@ import pytest
 from gnio_jax import models
 from gnio_jax.errors import InputError
 from gnio_jax.models.resnet import ResNet18
+from tests.support.compiling import quick
 
 
 def count(tree):
@@ -59,9 +60,9 @@ def prepared(output_dim):
 @pytest.mark.parametrize("output_dim", [2, 3])
 def test_output_against_numpy(output_dim):
     model, variables, windows = prepared(output_dim)
-    found = jax.jit(model.apply)(variables, windows)
+    found = quick(model.apply)(variables, windows)
     encoder = {kind: variables[kind]["encoder"] for kind in variables}
-    features = np.asarray(jax.jit(ResNet18(4).apply)(encoder, windows), np.float64)
+    features = np.asarray(quick(ResNet18(4).apply)(encoder, windows), np.float64)
     assert features.shape == (2, 3, 32)
     head, seen = (
         variables["params"]["displacement"],
@@ -92,7 +93,7 @@ def test_output_against_numpy(output_dim):
 def test_a_frozen_network_gives_the_same_numbers():
     model, variables, windows = prepared(3)
     frozen = models.inference_variables(model, variables)
-    apply = jax.jit(models.Inference(model).__call__)
+    apply = quick(models.Inference(model).__call__)
     wanted, found = apply(models.InferenceVariables(variables, {}), windows), apply(frozen, windows)
     np.testing.assert_allclose(found.displacement, wanted.displacement, rtol=2e-4, atol=2e-5)
     np.testing.assert_array_equal(found.log_std, wanted.log_std)
@@ -101,7 +102,7 @@ def test_a_frozen_network_gives_the_same_numbers():
 
 def test_training_leaves_the_uncertainty_alone():
     model, variables, windows = prepared(3)
-    _, changed = jax.jit(
+    _, changed = quick(
         lambda v, w: model.apply(
             v, w, train=True, rngs={"dropout": jax.random.key(0)}, mutable=["batch_stats"]
         )

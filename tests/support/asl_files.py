@@ -69,14 +69,12 @@ def write_table(
     columns = (
         np.random.default_rng(3).permutation(len(header)) if shuffle else np.arange(len(header))
     )
-    cells = [
-        [str(stamp), *(style % value for value in row)]
-        for stamp, row in zip(stamps, values, strict=True)
-    ]
+    styles = ",".join("%s" if i == 0 else style for i in columns)
+    cells = zip(stamps.tolist(), *values.T.tolist(), strict=True)
     names = [header[i].strip().lstrip("#") for i in columns] if shuffle else header
     text = [
         ("#" if shuffle else "") + ",".join(names),
-        *(",".join(row[i] for i in columns) for row in cells),
+        *(styles % tuple(row[i] for i in columns) for row in cells),
     ]
     path.write_text("\n".join(text) + "\n")
 

@@ -49,7 +49,8 @@ def write(
             file.create_dataset(name, data=values)
     if text:
         table = np.concatenate([(START + time)[:, None], pose, speed], axis=1)[:, :text]
-        rows = [" ".join(f"{value:.12f}" for value in row) for row in table]
+        style = " ".join(["%.12f"] * text)
+        rows = [style % tuple(row) for row in table.tolist()]
         (folder / "stamped_groundtruth_imu.txt").write_text(
             "\n".join(["# ts x y z qx qy qz qw", *rows]) + "\n"
         )

@@ -6,6 +6,7 @@ A `Damage` is drawn by `damages` and done by `after`. Its tables are in `damage_
 from __future__ import annotations
 
 import contextlib
+import functools
 import io
 import json
 import re
@@ -323,6 +324,7 @@ def damages(files: list[str]) -> st.SearchStrategy[Damage]:
     """One damage to one of the files, as its kind of file can have it."""
     share = st.floats(0.0, 1.0, width=32)
 
+    @functools.cache  # a strategy is checked anew where it is made anew
     def of_file(file: str) -> st.SearchStrategy[Damage]:
         def some(
             what: tuple[str, ...], tokens: tuple[Any, ...] = (None,)

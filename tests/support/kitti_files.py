@@ -61,10 +61,9 @@ def write_rows(oxts: Path, stamps: list[str], values: np.ndarray) -> Path:
     (oxts / "data").mkdir(parents=True)
     (oxts / "timestamps.txt").write_text("\n".join(stamps) + "\n")
     (oxts / "dataformat.txt").write_text("lat: latitude of the oxts-unit (deg)\n")
-    for row, line in enumerate(values):
-        (oxts / "data" / f"{row:010d}.txt").write_text(
-            " ".join(f"{value:.15g}" for value in line) + "\n"
-        )
+    style = " ".join(["%.15g"] * values.shape[1]) + "\n"
+    for row, line in enumerate(values.tolist()):
+        (oxts / "data" / f"{row:010d}.txt").write_text(style % tuple(line))
     return oxts
 
 

@@ -143,10 +143,9 @@ def vicon_columns(time: np.ndarray, truth: Truth, seed: int = 0, flips: bool = T
 
 def write_rows(path: Path, time: list[str], columns: np.ndarray, style: str) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    rows = [
-        stamp + "," + ",".join(style % value for value in row)
-        for stamp, row in zip(time, columns, strict=True)
-    ]
+    styles = ",".join([style] * columns.shape[1])
+    values = columns.tolist()
+    rows = [f"{stamp}," + styles % tuple(row) for stamp, row in zip(time, values, strict=True)]
     path.write_text("\n".join(rows) + "\n")
 
 

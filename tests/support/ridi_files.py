@@ -78,10 +78,7 @@ def write_table(root, name, time=None, order=None, rows=None, spoil=None):
     path = root / name / "processed" / "data.csv"
     path.parent.mkdir(parents=True)
     lines = [",".join(["", *names])]
-    lines += [
-        f"{i}," + ",".join(repr(float(value)) for value in values[row])
-        for i, row in enumerate(rows)
-    ]
+    lines += [f"{i}," + ",".join(map(repr, row)) for i, row in enumerate(values[rows].tolist())]
     path.write_text("\n".join(lines) + "\n")
     return path
 
@@ -117,9 +114,10 @@ def write_text(root, name, poses="pose.txt", pose_time=None, gyro_time=None, spo
         rows = np.arange(len(time))
         rows[[40, 41]] = rows[[41, 40]]
         rows = np.insert(rows, 70, rows[70])
+        style = " ".join(["%.9f"] * values.shape[1])
         lines = [
-            f"{BOOT + round(time[row] * 1e9)} " + " ".join(f"{value:.9f}" for value in values[row])
-            for row in rows
+            f"{BOOT + round(stamp * 1e9)} " + style % tuple(row)
+            for stamp, row in zip(time[rows].tolist(), values[rows].tolist(), strict=True)
         ]
         (folder / file).write_text(
             "# Created at Wed Dec 27 22:30:22 GMT+09:00 2023\n" + "\n".join(lines) + "\n"

@@ -10,12 +10,13 @@ from gnio_jax.types import Prediction
 
 
 class Tiny(nn.Module):
+    width: int = 4
     uncertainty: str = "head"
     dtype: Dtype = "float32"
 
     @nn.compact
     def __call__(self, windows, train=False):
-        h = linear(4, "encoder", self.dtype)(windows.mean(axis=1))
+        h = linear(self.width, "encoder", self.dtype)(windows.mean(axis=1))
         norm = nn.BatchNorm(not train, dtype=jnp.float32, param_dtype=jnp.float32, name="norm")
         h = jnp.tanh(norm(h))
         displacement = linear(3, "head", self.dtype)(h)

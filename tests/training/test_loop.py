@@ -21,9 +21,11 @@ from gnio_jax import config as configuration
 from gnio_jax.config import DataConfig, LossConfig, ModelConfig, OptimConfig, TrainConfig
 from gnio_jax.data import windows
 from gnio_jax.errors import InputError
+from gnio_jax.models import registry
 from gnio_jax.training import checkpoint, loop, on_windows, optimizer, step
 from gnio_jax.training.losses import Losses
 from tests.support.runs import shared_config, shared_programs
+from tests.support.tiny_network import Tiny
 from tests.support.tlio_files import write_splits
 
 ROOT = Path(__file__).parents[2]
@@ -41,7 +43,7 @@ def tiny(recording, workdir, **changes):
         data_root=str(recording),
         workdir=str(workdir),
         data=DataConfig(rate=50.0),
-        model=ModelConfig(width=2, bank_size=3, bank_heads=2),
+        model=ModelConfig("tiny"),
         optim=OptimConfig(epochs=6, batch_size=16, learning_rate=1e-3, warmup_epochs=1.0),
     )
     return dataclasses.replace(config, **changes)
@@ -57,7 +59,9 @@ def same(a, b):
 
 @pytest.fixture(scope="module", autouse=True)
 def one_compilation():
-    with shared_programs():
+    """Of the smallest network."""
+    with pytest.MonkeyPatch.context() as patch, shared_programs():
+        patch.setitem(registry._MODELS, "tiny", Tiny)
         yield
 
 
@@ -257,8 +261,7 @@ def test_stopping_within_an_epoch_and_resuming_gives_the_same_bits(
 
 def command(recording, workdir):
     return [
-        sys.executable,
-        "train.py",
+        *[sys.executable, "-m", "tests.support.training_process", "never", "0"],
         "--dataset",
         "tlio",
         "--data-root",
@@ -267,12 +270,8 @@ def command(recording, workdir):
         str(workdir),
         "--data.rate",
         "50",
-        "--model.width",
-        "2",
-        "--model.bank-size",
-        "3",
-        "--model.bank-heads",
-        "2",
+        "--model.name",
+        "tiny",
         "--optim.epochs",
         "6",
         "--optim.batch-size",
@@ -416,7 +415,7 @@ def test_runs_that_cannot_be_loaded(finished, tmp_path):
     config = configuration.load(other / "config.yaml")
     configuration.save(
         other / "config.yaml",
-        dataclasses.replace(config, model=dataclasses.replace(config.model, width=4)),
+        dataclasses.replace(config, model=dataclasses.replace(config.model, width=5)),
     )
     with pytest.raises(
         InputError, match=r"has shape \[.*\] in the checkpoint and \[.*\] in the configured model"

@@ -11,7 +11,6 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
-from scipy.signal import find_peaks
 
 from gnio_jax.data.alignment.lag import SAME_LAG
 from gnio_jax.data.alignment.signals import (
@@ -160,6 +159,8 @@ def _correlation(
 def _constant_lag(signals: _Accelerations, search_seconds: float) -> tuple[float, float]:
     """The constant lag (s) at which the accelerations correlate best, and what it leaves
     unexplained over what the next best peak leaves."""
+    from scipy.signal import find_peaks  # takes half a second to import
+
     most = round(search_seconds / LAG_STEP)
     lags = np.arange(-most, most + 1) * LAG_STEP
     scores = []

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Float
-from scipy.signal import correlate, correlation_lags, find_peaks
 from scipy.spatial.transform import Rotation
 
 from gnio_jax.data.alignment.signals import covered
@@ -52,6 +51,9 @@ def _correlation_peaks(
     """Lags (s) within ± `search_seconds` at which the magnitudes of the angular rates correlate
     better than nearby."""
     of_track = np.where(track.unreliable, 0.0, np.linalg.norm(track.rate, axis=1))
+    # It takes half a second to import.
+    from scipy.signal import correlate, correlation_lags, find_peaks
+
     step = track.step
     start = min(track.time[0], time[0])
     grid = np.arange(start, max(track.time[-1], time[-1]) + step, step)

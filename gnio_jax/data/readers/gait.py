@@ -13,7 +13,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 from scipy.interpolate import make_interp_spline
-from scipy.signal import fftconvolve
+
+from gnio_jax.numerics import convolved
 
 
 class Person(NamedTuple):
@@ -230,7 +231,7 @@ def smooth_steps(values: np.ndarray, seconds: float, dt: float) -> np.ndarray:
     """Steps turned into ramps of `seconds` with three continuous derivatives."""
     half = round(seconds / dt / 2)
     kernel = np.hanning(2 * half + 3)[1:-1] ** 2
-    return fftconvolve(np.pad(values, half, mode="edge"), kernel / kernel.sum(), mode="valid")
+    return convolved(np.pad(values, half, mode="edge"), kernel / kernel.sum())
 
 
 def integral(time: np.ndarray, values: np.ndarray) -> np.ndarray:

@@ -293,7 +293,7 @@ def copy(tmp_path):
         ("handheld", "data5", 1),
         ("running", "data1", 7),
     ):
-        files.write_syn(dataset(tmp_path, scene, folder), number, truth, seconds=30)
+        files.write_syn(dataset(tmp_path, scene, folder), number, truth, seconds=20)
     for scene, train, test in (
         ("handheld", "data1\ndata2", "data5"),
         ("running", "data1/imu1.csv", "data1/imu7.csv"),
@@ -481,11 +481,11 @@ def test_damaged_truth_is_refused_and_one_bad_recording_is_left_out(copy):
     # Another walk's truth fits nothing.
     files.write_rows(
         path,
-        ["1.5e11"] * 3000,
+        ["1.5e11"] * 2000,
         np.concatenate(
             [
-                np.zeros((3000, 1)),
-                files.vicon_columns(np.arange(3000) / -100, files.Truth(pace=1.3)),
+                np.zeros((2000, 1)),
+                files.vicon_columns(np.arange(2000) / -100, files.Truth(pace=1.3)),
             ],
             axis=1,
         ),

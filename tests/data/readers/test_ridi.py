@@ -3,6 +3,7 @@ recording must be physically plausible."""
 
 from __future__ import annotations
 
+import shutil
 import warnings
 
 import numpy as np
@@ -255,8 +256,9 @@ def copy(tmp_path):
     (`dan_bag9`)."""
     root = tmp_path / "downloaded" / "data_publish_v2"
     time = np.arange(int(11 * 202.3)) / 202.3
-    for name in [*TRAIN[:-1], "hang_leg7", "shali_bag1", "dan_bag9"]:
-        write_table(root, name, time=time)
+    write_table(root, TRAIN[0], time=time)
+    for name in [*TRAIN[1:-1], "hang_leg7", "shali_bag1", "dan_bag9"]:
+        shutil.copytree(root / TRAIN[0], root / name)
     (root / "list_train_publish_v2.txt").write_text(
         "\n".join(f"{name},{name.split('_')[1][:-1]}" for name in TRAIN)
     )

@@ -13,6 +13,11 @@ def val():
     return data.load("synthetic", split="val")
 
 
+@pytest.fixture(scope="module")
+def test():
+    return data.load("synthetic", split="test")
+
+
 def matrices(wxyz):
     w, x, y, z = np.moveaxis(wxyz, -1, 0)
     return np.stack(
@@ -34,20 +39,22 @@ def strap_down(sequence):
         sequence.velocity[0],
         sequence.position[0],
     )
+    angles = np.linalg.norm(sequence.gyro, axis=1)[:, None, None] * dt
+    x, y, z = sequence.gyro.T * dt
+    zero = np.zeros_like(x)
+    cross = np.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]]).transpose(2, 0, 1)
+    turns = (
+        np.eye(3)
+        + np.sinc(angles / np.pi) * cross
+        + 0.5 * np.sinc(angles / 2 / np.pi) ** 2 * cross @ cross
+    )
     positions = np.empty_like(sequence.position)
     for k in range(len(sequence.time)):
         positions[k] = position
         change = rotation @ sequence.accel[k] * dt
         position = position + velocity * dt + 0.5 * change * dt + 0.5 * gravity * dt**2
         velocity = velocity + change + gravity * dt
-        angle = np.linalg.norm(sequence.gyro[k]) * dt
-        x, y, z = sequence.gyro[k] * dt
-        cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-        rotation = rotation @ (
-            np.eye(3)
-            + np.sinc(angle / np.pi) * cross
-            + 0.5 * np.sinc(angle / 2 / np.pi) ** 2 * cross @ cross
-        )
+        rotation = rotation @ turns[k]
     return positions
 
 
@@ -57,8 +64,8 @@ def test_the_error_free_imu_integrates_to_the_trajectory(placement):
     assert np.abs(strap_down(sequence) - sequence.position).max() < 1e-3
 
 
-def test_the_imu_of_a_phone_alone_is_lost_within_two_minutes():
-    sequence = data.load("synthetic", split="test")[0]
+def test_the_imu_of_a_phone_alone_is_lost_within_two_minutes(test):
+    sequence = test[0]
     assert np.linalg.norm(strap_down(sequence)[-1] - sequence.position[-1]) > 100.0
 
 
@@ -103,16 +110,13 @@ def test_the_stated_biases_and_noise_are_the_true_ones():
         assert bounds[0] <= np.linalg.norm(stated) <= bounds[1]
 
 
-def test_a_seed_is_a_walk_and_splits_share_neither_seeds_nor_people(val):
+def test_a_seed_is_a_walk_and_splits_share_neither_seeds_nor_people(val, test):
     for once, again in zip(val, data.load("synthetic", split="val"), strict=True):
         np.testing.assert_array_equal(once.accel, again.accel)
         assert once.attributes == again.attributes
     used = {
-        split: [
-            (s.attributes["seed"], s.attributes["subject"])
-            for s in data.load("synthetic", split=split)
-        ]
-        for split in ("val", "test")
+        split: [(s.attributes["seed"], s.attributes["subject"]) for s in sequences]
+        for split, sequences in (("val", val), ("test", test))
     }
     assert not {seed for seed, _ in used["val"]} & {seed for seed, _ in used["test"]}
     assert all(len({seed for seed, _ in pairs}) == len(pairs) for pairs in used.values())
@@ -122,9 +126,9 @@ def test_a_seed_is_a_walk_and_splits_share_neither_seeds_nor_people(val):
         data.load("synthetic", split="dev")
 
 
-def test_walks_hold_stops_strolls_runs_turns_and_stairs():
+def test_walks_hold_stops_strolls_runs_turns_and_stairs(test):
     speeds, climbs, turned = [], [], 0.0
-    for sequence in data.load("synthetic", split="test"):
+    for sequence in test:
         second = sequence.position[200::200] - sequence.position[:-200:200]
         speeds.append(np.linalg.norm(second[:, :2], axis=1))
         climbs.append(second[:, 2])
@@ -168,11 +172,11 @@ def test_cadence_and_bounce_grow_with_the_speed():
     np.testing.assert_allclose(cadence, synthetic.step_frequency(speed, walker.cadence), rtol=0.08)
 
 
-def test_the_sign_of_the_direction_of_travel_shows_in_the_imu():
+def test_the_sign_of_the_direction_of_travel_shows_in_the_imu(test):
     """The walker surges while bouncing up, whoever walks and wherever the phone is: forward is not
     backward."""
     correlations = []
-    for sequence in data.load("synthetic", split="test"):
+    for sequence in test:
         force = np.einsum("nij,nj->ni", matrices(sequence.orientation), sequence.accel)
         surge = np.cumsum(force[:, :2], axis=0) / 200
         surge = surge - np.apply_along_axis(np.convolve, 0, surge, np.ones(201) / 201, mode="same")
