@@ -79,8 +79,8 @@ def write(place: Path, about: About, files: Mapping[str, bytes]) -> None:
 
     An older package at this place is replaced. Raises `InputError` where something else is there.
     """
-    if place.exists() and not is_package(place):
-        raise InputError(place, "is there already and is no package", "name another --out")
+    if place.exists() and not (place.is_dir() and not any(place.iterdir())):
+        _check_replaced(place)
     manifest = {
         "format": FORMAT,
         "version": VERSION,
@@ -100,6 +100,15 @@ def write(place: Path, about: About, files: Mapping[str, bytes]) -> None:
     with replacing_folder(place) as folder:
         for name, content in contents.items():
             (folder / name).write_bytes(content)
+
+
+def _check_replaced(place: Path) -> None:
+    """Raise `InputError` unless a package may take the place of what is there."""
+    try:
+        _manifest(place)
+    except InputError:
+        problem = "is there already and is no package"
+        raise InputError(place, problem, "name another --out") from None
 
 
 def read(place: Path) -> Package:

@@ -74,11 +74,17 @@ def track(
 
 def _check(out: Path, formats: tuple[str, ...], fix: FirstFix | None) -> None:
     """What can be refused before the work."""
-    if out.exists() and not (out / SUMMARY).is_file() and (not out.is_dir() or any(out.iterdir())):
+    if out.exists() and not _may_be_replaced(out):
         raise InputError(out, "is there already and is no track", "name another --out")
     if fix is None and {"geojson", "gpx"} & set(formats):
         problem = "geojson and gpx need a place on the earth"
         raise InputError("--format", problem, "give --first-fix LAT LON --heading DEG")
+
+
+def _may_be_replaced(out: Path) -> bool:
+    """An earlier track, or an empty folder."""
+    track = all((out / name).is_file() for name in (SUMMARY, TRAJECTORY, PICTURE))
+    return track or (out.is_dir() and not any(out.iterdir()))
 
 
 def _prepared(sequence: Sequence, windows: DataConfig) -> Prepared:

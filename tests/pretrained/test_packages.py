@@ -222,6 +222,7 @@ def test_the_command(run, tmp_path, gnio, capsys):
     assert "float32" in again
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "thesis.txt").write_text("mine")
+    (tmp_path / "other" / "manifest.json").write_text("{}")
     for wrong, words in (
         (["--out", tmp_path / "other"], "is no package"),
         (["--name", "a/b"], "no name of a folder"),

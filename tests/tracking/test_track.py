@@ -4,15 +4,17 @@ All recordings last six seconds, so that they share one compiled filter.
 """
 
 import json
+import shutil
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from gnio_jax import pretrained
 from gnio_jax.commands import app, console
 from gnio_jax.config import DataConfig, ModelConfig, TrainConfig
 from gnio_jax.evaluation.exporting import read_trajectory
-from gnio_jax.tracking import picture
+from gnio_jax.tracking import choose_weights, picture
 from gnio_jax.tracking.summary import Summary
 from tests.support import bag_files, known_walk, logger_files, tiny_run
 
@@ -159,6 +161,7 @@ def test_what_is_refused(mistake, runs, tmp_path):
     thesis = tmp_path / "mine" / "thesis.txt"
     thesis.parent.mkdir()
     thesis.write_text("mine")
+    (thesis.parent / "summary.json").write_text("{}")
     assert "is no track" in mistake(*given, "--out", thesis.parent)
     assert "is no track" in mistake(*given, "--out", thesis)
     assert thesis.read_text() == "mine"
@@ -168,6 +171,29 @@ def test_what_is_refused(mistake, runs, tmp_path):
     deaf = logger_files.zipped(tmp_path / "deaf.zip", members)
     assert "deaf.zip" in mistake("track", deaf, *weights)
     assert not list(runs.parent.glob("tracks/.*"))
+
+
+def test_what_was_measured_of_a_run(runs, tmp_path):
+    run = shutil.copytree(runs / "walker", tmp_path / "walker")
+    assert choose_weights(str(run)).measured == ""
+    figures = {
+        "settings": {"dataset": "synthetic", "split": "test", "estimator": "ekf"},
+        "sequences": {"a": {}},
+        "mean": {"ate_2d": 1.26},
+        "interval": {"ate_2d": None},
+        "n": {"ate_2d": 1},
+    }
+    path = run / "eval" / "synthetic_test_ekf" / "metrics.json"
+    path.parent.mkdir(parents=True)
+    path.write_text(json.dumps(figures))
+    said = "whose ATE 2-D is 1.3 m on synthetic_test_ekf"
+    assert choose_weights(str(run)).measured == said
+    package = tmp_path / "net.zip"
+    pretrained.publish(run, package, pretrained.Description("net", "walks", "CC0"))
+    weights = choose_weights(str(package))
+    assert (weights.name, weights.trained_on, weights.measured) == ("net", "walks", said)
+    path.write_text("{")  # what is damaged keeps nobody from tracking
+    assert choose_weights(str(run)).measured == ""
 
 
 def test_an_ellipse_is_the_contour_of_its_covariance():
