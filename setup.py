@@ -5,5 +5,9 @@ from setuptools import find_packages, setup
 setup(
     packages=[*find_packages(include=["gnio_jax*"]), "gnio_jax.configs"],
     package_dir={"gnio_jax.configs": "configs"},
-    package_data={"gnio_jax": ["py.typed"], "gnio_jax.configs": ["*.yaml", "*/*.yaml"]},
+    package_data={
+        "gnio_jax": ["py.typed"],
+        "gnio_jax.configs": ["*.yaml", "*/*.yaml"],
+        "gnio_jax.weights": ["*.zip", "*/*"],
+    },
 )

@@ -17,8 +17,11 @@ __all__ = [
     "filtering",
     "geometry",
     "interop",
+    "load_pretrained",
     "models",
+    "pretrained",
     "tables",
+    "tracking",
     "training",
 ]
 
@@ -26,6 +29,8 @@ __all__ = [
 def __getattr__(name: str) -> Any:
     if name == "__version__":
         return importlib.metadata.version("gnio-jax")
+    if name == "load_pretrained":
+        return importlib.import_module("gnio_jax.pretrained").load_pretrained
     if name in __all__:
         return importlib.import_module(f"gnio_jax.{name}")
     raise AttributeError(f"module 'gnio_jax' has no attribute '{name}'")

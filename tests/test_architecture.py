@@ -19,8 +19,11 @@ ROOMS = {
     "calibration": BASE | {"data", "filtering", "training", "evaluation"},
     "interop": BASE | {"models", "training"},
     "tables": BASE | {"data", "models", "filtering", "training", "evaluation"},
+    "pretrained": BASE | {"models", "training"},
+    "tracking": BASE | {"data", "filtering", "training", "evaluation", "pretrained"},
     "commands": BASE
-    | {"data", "filtering", "training", "evaluation", "calibration", "interop", "tables"},
+    | {"data", "filtering", "training", "evaluation", "calibration", "interop", "tables"}
+    | {"pretrained", "tracking"},
     **{name: BASE for name in BASE},
 }
 """Rooms and top-level modules, and what each may import of the package besides itself."""
@@ -29,12 +32,13 @@ LIBRARIES = {
     "flax": {"models", "training", "evaluation", "interop"},
     "mcap": {"data.importing.bags", "evaluation.exporting.ros"},
     "grain": {"training.supply"},
-    "matplotlib": {"data", "evaluation", "tables"},
+    "matplotlib": {"data", "evaluation", "tables", "tracking"},
     "optax": {"training"},
     "orbax": {"training.checkpoint"},
     "rosbags": {"data.importing.bags", "evaluation.exporting.ros"},
     "rich.console.Console": {"commands"},
     "rich.progress": {"commands"},
+    "safetensors": {"pretrained.arrays"},
     "tensorboardX": {"training.log"},
     "tyro": {"commands", "config"},
 }

@@ -11,8 +11,11 @@ from gnio_jax.commands import (
     evaluate,
     interop,
     options,
+    publish,
     tables,
+    track,
     train,
+    weights,
 )
 
 GNIO = options.Group(
@@ -21,12 +24,16 @@ GNIO = options.Group(
         "evaluate": evaluate.COMMAND,
         "calibrate": calibrate.COMMAND,
         "data": data.COMMANDS,
+        "track": track.COMMAND,
+        "publish": publish.COMMAND,
+        "weights": weights.COMMAND,
         "tables": tables.COMMAND,
         "interop": interop.COMMAND,
     },
     """Gated Neural Inertial Odometry: where has a person walked, from the IMU of a phone alone?
 
   {prog} train --config quickstart --workdir runs/demo     (a first network, without a download)
+  {prog} track walk.zip                                    (the path of your own recording)
   {prog} evaluate --workdir runs/demo                      (its trajectories, errors and pictures)
   {prog} data list                                         (the datasets, and where they are had)
 

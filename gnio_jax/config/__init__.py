@@ -21,7 +21,7 @@ from gnio_jax.config.schema import (
 )
 from gnio_jax.config.through_filter import ThroughFilter
 from gnio_jax.config.validation import validate
-from gnio_jax.config.yaml_files import find, load, names, save
+from gnio_jax.config.yaml_files import find, load, names, parse, save, text
 
 __all__ = [
     "CONSIDERED_FIELDS",
@@ -41,6 +41,8 @@ __all__ = [
     "load",
     "names",
     "newest_run",
+    "parse",
     "save",
+    "text",
     "validate",
 ]

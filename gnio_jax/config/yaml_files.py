@@ -14,7 +14,7 @@ import yaml
 
 from gnio_jax.config.schema import TrainConfig
 from gnio_jax.errors import InputError
-from gnio_jax.files import replacing
+from gnio_jax.files import write_text
 
 _SPELLING = {
     float: "a number",
@@ -67,19 +67,29 @@ def load(path: str | Path, base: TrainConfig | None = None) -> TrainConfig:
     """
     path = find(path)
     try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+        content = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(path, f"cannot be read ({error})") from None
+    return parse(content, str(path), base)
+
+
+def parse(content: str, source: str, base: TrainConfig | None = None) -> TrainConfig:
+    """`load` of a file's text; `source` names the file in errors."""
+    try:
+        fields = yaml.safe_load(content)
     except yaml.YAMLError as error:
-        raise InputError(path, f"is not YAML ({' '.join(str(error).split())})") from None
-    return _section(base or TrainConfig(), {} if content is None else content, str(path), "")
+        raise InputError(source, f"is not YAML ({' '.join(str(error).split())})") from None
+    return _section(base or TrainConfig(), {} if fields is None else fields, source, "")
 
 
 def save(path: str | Path, config: TrainConfig) -> None:
     """Write `config` as YAML that `load` reads back to an equal value."""
-    with replacing(path) as temporary:
-        text = yaml.safe_dump(dataclasses.asdict(config), sort_keys=False)
-        temporary.write_text(text, encoding="utf-8")
+    write_text(path, text(config))
+
+
+def text(config: TrainConfig) -> str:
+    """`config` as YAML that `parse` reads back to an equal value."""
+    return yaml.safe_dump(dataclasses.asdict(config), sort_keys=False)
 
 
 def _section(base: Any, content: Any, source: str, prefix: str) -> Any:

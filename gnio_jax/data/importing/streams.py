@@ -25,6 +25,9 @@ then."""
 SHORTEST_OVERLAP = 1.0
 """s that both sensors must cover."""
 
+GAPS = "lacks samples"
+"""What a note of holes in a recording says."""
+
 
 class SensorFile(NamedTuple):
     """Where a sensor's samples are."""
@@ -164,7 +167,7 @@ def read_stream(source: SensorFile, unit: str | None, order: str, notes: list[st
     holes = steps[steps > max(0.1, 3.0 / rate)]
     if holes.size:
         notes.append(
-            f"{path.name}: {sensor} lacks samples {holes.size} times, "
+            f"{path.name}: {sensor} {GAPS} {holes.size} times, "
             f"for up to {holes.max():.2f} s; bridged linearly"
         )
     return Stream(time - time[0], values, float(first) / PER_SECOND[unit])

@@ -1,0 +1,133 @@
+"""One recording to its folder of results."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from gnio_jax import data
+from gnio_jax.config import DataConfig
+from gnio_jax.data.importing import Imported
+from gnio_jax.errors import InputError
+from gnio_jax.evaluation import Estimate, Trajectory, exporting, inference_network, prepare
+from gnio_jax.evaluation.estimators.filtered import run_filters
+from gnio_jax.evaluation.exporting.geographic import FirstFix
+from gnio_jax.evaluation.preparation import Prepared
+from gnio_jax.evaluation.setup import OnShare, Setup, no_progress
+from gnio_jax.evaluation.tum import write_tum
+from gnio_jax.files import replacing_folder
+from gnio_jax.filtering.options import FilterSetup, filter_setup
+from gnio_jax.tracking.summary import Summary, as_json, summarise
+from gnio_jax.tracking.weights import Weights
+from gnio_jax.training.checkpoint import Run
+from gnio_jax.types import Sequence
+
+START = Setup(init="static", gyro_bias="rest")
+"""Level from the gravity of the first second, the velocity zero as surely as that second is quiet,
+the gyro's bias from a rest at the start if there is one."""
+ZERO_VELOCITY_STD = 0.02
+"""m/s that the filter measures while the IMU is quiet (ours): what lies on a table stays there."""
+SUMMARY, TRAJECTORY, REFERENCE, PICTURE = (
+    "summary.json",
+    "trajectory.txt",
+    "reference.txt",
+    "track.png",
+)
+
+
+class Tracked(NamedTuple):
+    """What `track` found and where it is."""
+
+    estimate: Estimate
+    summary: Summary
+    folder: Path
+
+
+def track(
+    recording: Imported,
+    weights: Weights,
+    out: Path,
+    formats: tuple[str, ...] = (),
+    fix: FirstFix | None = None,
+    progress: OnShare = no_progress,
+) -> Tracked:
+    """Track a recording and leave trajectory, picture and summary in the folder `out`.
+
+    The trajectory starts at the origin with yaw zero; its stamps are the recording's own. `formats`
+    are further ones of `exporting.FORMATS`, `fix` places them on the earth. The folder is written
+    whole or not at all and takes the place of an earlier track. Raises `InputError`.
+    """
+    _check(out, formats, fix)
+    prepared = _prepared(recording.sequence, weights.run.config.data)
+    ekf = _filter(weights.run)
+    network = inference_network(weights.run.model, weights.run.variables)
+    (estimate,) = run_filters([prepared], network, ekf, 1, progress)
+    summary = summarise(estimate, prepared, recording, weights, ekf)
+    with replacing_folder(out) as folder:
+        _write(folder, estimate, summary, formats, fix)
+    return Tracked(estimate, summary, out)
+
+
+def _check(out: Path, formats: tuple[str, ...], fix: FirstFix | None) -> None:
+    """What can be refused before the work."""
+    if out.exists() and not _may_be_replaced(out):
+        raise InputError(out, "is there already and is no track", "name another --out")
+    if fix is None and {"geojson", "gpx"} & set(formats):
+        problem = "geojson and gpx need a place on the earth"
+        raise InputError("--format", problem, "give --first-fix LAT LON --heading DEG")
+
+
+def _may_be_replaced(out: Path) -> bool:
+    """An earlier track, or an empty folder."""
+    track = all((out / name).is_file() for name in (SUMMARY, TRAJECTORY, PICTURE))
+    return track or (out.is_dir() and not any(out.iterdir()))
+
+
+def _prepared(sequence: Sequence, windows: DataConfig) -> Prepared:
+    """The whole recording at the network's rate. A reference starts nothing: it comes in again to
+    be compared with."""
+    sequence = data.resample(sequence, windows.rate)
+    blind = sequence._replace(valid=np.zeros_like(sequence.valid))
+    prepared, left_out = prepare([blind], windows, START)
+    if not prepared:
+        raise InputError(sequence.name, left_out[sequence.name], "record for longer")
+    cut = prepared[0].sequence
+    valid = sequence.valid[: len(cut.time)]
+    return prepared[0]._replace(sequence=cut._replace(valid=valid))
+
+
+def _filter(run: Run) -> FilterSetup:
+    """The run's own filter, for which rest is a measurement too."""
+    setup = filter_setup(run.config.data, run.config.filter)
+    config = dataclasses.replace(setup.config, zero_velocity_std=ZERO_VELOCITY_STD)
+    return setup._replace(config=config)
+
+
+def _write(
+    folder: Path,
+    estimate: Estimate,
+    summary: Summary,
+    formats: tuple[str, ...],
+    fix: FirstFix | None,
+) -> None:
+    from gnio_jax.tracking import picture  # Matplotlib takes a second to import
+
+    text = json.dumps(as_json(summary), indent=2, allow_nan=False, ensure_ascii=False)
+    (folder / SUMMARY).write_text(text + "\n", encoding="utf-8")
+    own_clock = _stamped(estimate.trajectory, summary.start_time)
+    write_tum(folder / TRAJECTORY, own_clock)
+    if np.isfinite(estimate.reference.position).any():
+        write_tum(folder / REFERENCE, _stamped(estimate.reference, summary.start_time))
+    for kind in formats:
+        path = folder / f"trajectory.{kind}"
+        exporting.export(path, own_clock, kind, fix, estimate.position_covariance)
+    picture.save(folder / PICTURE, picture.draw(estimate, summary))
+
+
+def _stamped(trajectory: Trajectory, start: float) -> Trajectory:
+    """With the stamps of the recording's own clock."""
+    return trajectory._replace(time=trajectory.time + start)

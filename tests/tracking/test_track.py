@@ -1,0 +1,231 @@
+"""From a recording as people have it to a folder with a trajectory, its picture and its limits.
+
+All recordings last six seconds, so that they share one compiled filter.
+"""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from gnio_jax import pretrained
+from gnio_jax.commands import app, console
+from gnio_jax.config import DataConfig, ModelConfig, TrainConfig
+from gnio_jax.evaluation.exporting import read_trajectory
+from gnio_jax.tracking import choose_weights, picture
+from gnio_jax.tracking.summary import Summary
+from tests.support import bag_files, known_walk, logger_files, tiny_run
+
+CONFIG = TrainConfig(data=DataConfig(rate=50.0), model=ModelConfig(name="tiny"))
+SECONDS = 6.0
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    """`walker` says something of each window, `mute` nothing: zero, give or take a metre."""
+    folder = tmp_path_factory.mktemp("home") / "runs"
+    with tiny_run.known():
+        tiny_run.save(folder / "mute", CONFIG, size=0.0)
+        tiny_run.save(folder / "walker", CONFIG)
+        yield folder
+
+
+@pytest.fixture
+def gnio(monkeypatch, capsys, runs):
+    monkeypatch.chdir(runs.parent)
+
+    def call(*arguments):
+        console.run(lambda: app.main(list(map(str, arguments))))
+        return capsys.readouterr().out
+
+    return call
+
+
+@pytest.fixture
+def mistake(gnio, capsys):
+    def call(*arguments):
+        with pytest.raises(SystemExit, match="2"):
+            gnio(*arguments)
+        told = capsys.readouterr().err
+        assert told.count("\n") == 1
+        return told
+
+    return call
+
+
+def csv(path, time, gyro, accel):
+    header = "time,gyro_x,gyro_y,gyro_z,accel_x,accel_y,accel_z"
+    rows = np.column_stack([time, gyro, accel])
+    np.savetxt(path, rows, delimiter=",", header=header, comments="", fmt="%.9f")
+    return path
+
+
+def summary_of(folder):
+    return json.loads((folder / "summary.json").read_text())
+
+
+def test_a_bag_with_a_reference(gnio, runs, tmp_path):
+    one = (Rotation.identity(), np.zeros(3))
+    make = bag_files.Maker("mcap")
+    entries = bag_files.imu(make) + bag_files.poses(make, "Odometry", one, child="imu_link")
+    walk = bag_files.write(tmp_path, "mcap", entries)
+    out = tmp_path / "track"
+    told = gnio("track", walk, "--weights", runs / "walker", "--out", out, "--format", "csv")
+    names = ["reference.txt", "summary.json", "track.png", "trajectory.csv", "trajectory.txt"]
+    assert sorted(path.name for path in out.iterdir()) == names
+    assert (out / "track.png").read_bytes().startswith(b"\x89PNG")
+    path, summary = read_trajectory(out / "trajectory.txt"), summary_of(out)
+    # In the recording's own clock, from its first sample on, to whole strides.
+    np.testing.assert_allclose(path.time[0], bag_files.EPOCH * 1e-9, atol=1e-6)
+    np.testing.assert_allclose(np.diff(path.time), 0.1, atol=1e-6)
+    assert len(path.time) == 60
+    np.testing.assert_allclose(path.position[0], 0.0, atol=1e-9)
+    seconds = path.position[[*range(0, 60, 10), 59], :2]
+    length = np.linalg.norm(np.diff(seconds, axis=0), axis=1).sum()
+    np.testing.assert_allclose(summary["path_length"], length, atol=1e-6)
+    np.testing.assert_allclose(summary["from_start"], np.hypot(*path.position[-1, :2]), atol=1e-6)
+    reference = read_trajectory(out / "reference.txt")
+    place = known_walk.position(reference.time - bag_files.EPOCH * 1e-9)
+    np.testing.assert_allclose(reference.position, place, atol=5e-3)
+    # The error with the starts aligned, by hand.
+    rows = np.isin(np.round(path.time, 3), np.round(reference.time, 3))
+    moved = path.position[rows] - path.position[rows][0]
+    yaws = [
+        Rotation.from_quat(each.orientation[k], scalar_first=True).as_matrix()
+        for each, k in ((reference, 0), (path, np.flatnonzero(rows)[0]))
+    ]
+    turn = yaws[0] @ yaws[1].T
+    angle = np.arctan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1])
+    moved = Rotation.from_euler("z", angle).apply(moved)
+    error = (moved - (reference.position - reference.position[0]))[:, :2]
+    ate = np.sqrt((error**2).sum(axis=1).mean())
+    np.testing.assert_allclose(summary["errors"]["ate_2d"], ate, rtol=1e-3)
+    assert f"{ate:.2f} m" in told and "against the reference" in told
+    limits = next(line for line in told.splitlines() if line.startswith("limits:"))
+    assert limits == summary["limits"]
+    for words in (f"{length:.1f} m in 6 s", "expect more", "dataset synthetic, split train"):
+        assert words in limits
+    assert "IMU /imu/data" in told and f"results: {out}" in told
+
+
+def test_a_phone_on_a_table_stays_there(gnio, runs, tmp_path):
+    """Its accelerometer is wrong by 3 cm/s²: half a metre in six seconds. The network is mute."""
+    time = np.arange(600) / 100
+    random = np.random.default_rng(0)
+    gyro = random.normal([0.01, -0.02, 0.015], 1e-3, (600, 3))
+    accel = random.normal([0.0, 0.0, 9.81], 0.01, (600, 3))
+    accel[100:, 0] += 0.03  # after the second that levels it
+    table = csv(tmp_path / "table.csv", time, gyro, accel)
+    out = tmp_path / "track"
+    told = gnio("track", table, "--weights", runs / "mute", "--out", out, "--gyro-unit", "rad/s")
+    path = read_trajectory(out / "trajectory.txt")
+    assert np.linalg.norm(path.position, axis=1).max() < 0.05
+    turned = Rotation.from_quat(path.orientation[-1], scalar_first=True).magnitude()
+    assert turned < np.radians(0.5)  # the bias, 1.5° in this time, is that of the rest
+    assert "warning: rest: it lies still 100% of the time" in told and "it moves" not in told
+    assert "gyro bias: mean of 5 s of rest" in told
+
+
+def test_the_newest_run_a_slow_logger_and_our_own_file(gnio, runs, tmp_path, monkeypatch):
+    time = np.delete(np.arange(120), np.s_[60:70]) / 20
+    slow = csv(tmp_path / "slow.csv", time, known_walk.rate(time), known_walk.force(time))
+    monkeypatch.setattr("gnio_jax.pretrained.finding.SHIPPED", tmp_path)
+    told = gnio("track", slow)
+    folder = runs.parent / "tracks" / "slow"
+    assert summary_of(folder)["weights"] == "walker"
+    assert "lacks samples 1 times, for up to 0.55 s" in told and "warning: gaps:" in told
+    assert "rate: recorded at 20 Hz, the network has learnt at 50 Hz" in told
+    assert "warning: start: it moves in its first second" in told
+    gnio("data", "import", slow, "--out", tmp_path / "slow.h5")
+    gnio("track", tmp_path / "slow.h5", "--out", tmp_path / "again")
+    ours, theirs = (
+        read_trajectory(place / "trajectory.txt").position for place in (tmp_path / "again", folder)
+    )
+    np.testing.assert_allclose(ours, theirs, atol=1e-4)
+
+
+def test_what_is_refused(mistake, runs, tmp_path):
+    time = np.arange(50) / 100
+    short = csv(tmp_path / "short.csv", time, known_walk.rate(time), known_walk.force(time))
+    weights = ("--weights", runs / "walker")
+    assert "lasts 0.49 s" in mistake("track", short, *weights)
+    time = np.arange(104) / 100
+    short = csv(tmp_path / "short.csv", time, known_walk.rate(time), known_walk.force(time))
+    assert "too short for a window and a stride" in mistake("track", short, *weights)
+    members = logger_files.sensor_logger()
+    walk = logger_files.zipped(tmp_path / "walk.zip", members)
+    given = ("track", walk, *weights)
+    assert "--first-fix" in mistake(*given, "--format", "gpx")
+    thesis = tmp_path / "mine" / "thesis.txt"
+    thesis.parent.mkdir()
+    thesis.write_text("mine")
+    (thesis.parent / "summary.json").write_text("{}")
+    assert "is no track" in mistake(*given, "--out", thesis.parent)
+    assert "is no track" in mistake(*given, "--out", thesis)
+    assert thesis.read_text() == "mine"
+    assert "no such weights" in mistake("track", walk, "--weights", "walkr2")
+    del members["TotalAcceleration.csv"], members["Accelerometer.csv"]
+    del members["AccelerometerUncalibrated.csv"], members["Gravity.csv"]
+    deaf = logger_files.zipped(tmp_path / "deaf.zip", members)
+    assert "deaf.zip" in mistake("track", deaf, *weights)
+    assert not list(runs.parent.glob("tracks/.*"))
+
+
+def test_what_was_measured_of_a_run(runs, tmp_path):
+    run = shutil.copytree(runs / "walker", tmp_path / "walker")
+    assert choose_weights(str(run)).measured == ""
+    figures = {
+        "settings": {"dataset": "synthetic", "split": "test", "estimator": "ekf"},
+        "sequences": {"a": {}},
+        "mean": {"ate_2d": 1.26},
+        "interval": {"ate_2d": None},
+        "n": {"ate_2d": 1},
+    }
+    path = run / "eval" / "synthetic_test_ekf" / "metrics.json"
+    path.parent.mkdir(parents=True)
+    path.write_text(json.dumps(figures))
+    said = "whose ATE 2-D is 1.3 m on synthetic_test_ekf"
+    assert choose_weights(str(run)).measured == said
+    package = tmp_path / "net.zip"
+    pretrained.publish(run, package, pretrained.Description("net", "walks", "CC0"))
+    weights = choose_weights(str(package))
+    assert (weights.name, weights.trained_on, weights.measured) == ("net", "walks", said)
+    path.write_text("{")  # what is damaged keeps nobody from tracking
+    assert choose_weights(str(run)).measured == ""
+
+
+def test_an_ellipse_is_the_contour_of_its_covariance():
+    covariance = np.array([[4.0, 1.5], [1.5, 1.0]])
+    shape = picture.ellipse(np.array([2.0, -1.0]), covariance, sigmas=3.0)
+    contour = shape.get_transform().transform(shape.get_path().vertices) - [2.0, -1.0]
+    distance = np.einsum("ki,ij,kj->k", contour, np.linalg.inv(covariance), contour)
+    on_curve = distance[:-1][::3]  # the points of its splines that are no control points
+    np.testing.assert_allclose(on_curve, 9.0, rtol=1e-6)
+
+
+def test_the_line_says_what_is_counted():
+    summary = Summary(
+        recording="walk",
+        weights="net",
+        trained_on="walks",
+        measured="whose ATE 2-D is 1.1 m on test",
+        start_time=0.0,
+        seconds=100.0,
+        path_length=80.0,
+        from_start=1.0,
+        expected_error=2.0,
+        considered=True,
+        rest=0.0,
+        accepted=1.0,
+        errors={},
+        warnings=(),
+        notes=(),
+    )
+    line = summary.limits
+    assert "80.0 m in 100 s" in line and "2.0 m (2.5% of the path)" in line
+    assert "errors considered" in line and "expect more" not in line
+    assert "trained on walks, whose ATE 2-D is 1.1 m on test" in line
+    assert "of the path" not in summary._replace(path_length=0.3).limits
+    assert "\n" not in line
