@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib
+
 
 class InputError(ValueError):
     """A mistake a user can mend: its text is one line naming the place, the problem and the remedy.
@@ -16,3 +18,13 @@ class InputError(ValueError):
 
     def __reduce__(self) -> tuple[type[InputError], tuple[str, str, str]]:
         return type(self), self.parts  # so that it can come from another process
+
+
+def require_packages(where: object, extra: str, *names: str) -> None:
+    """Raise `InputError` where a package of an extra of gnio-jax is not installed."""
+    for name in names:
+        try:
+            importlib.import_module(name)
+        except ImportError:
+            remedy = f"pip install 'gnio-jax[{extra}]'"
+            raise InputError(where, f"needs the package {name}", remedy) from None

@@ -8,7 +8,6 @@ types is not needed.
 
 from __future__ import annotations
 
-import importlib
 import os
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -17,7 +16,7 @@ from typing import Any, NamedTuple
 
 from gnio_jax.data.readers.parsing import parsed_as
 from gnio_jax.data.readers.text import shortened
-from gnio_jax.errors import InputError
+from gnio_jax.errors import InputError, require_packages
 
 LARGEST_CHUNK = 1 << 30
 """Bytes to which a chunk of an MCAP may unpack; recorders cut them at some MiB (ours)."""
@@ -58,13 +57,7 @@ class Bag(NamedTuple):
 def opened(path: Path, kind: str) -> Iterator[Bag]:
     """The recording, while it is open; `kind` is one of `KINDS`. What fails within, where it is
     damaged, is an `InputError`."""
-    for name in ("rosbags", "mcap"):
-        try:
-            importlib.import_module(name)
-        except ImportError:
-            raise InputError(
-                path, f"needs the package {name}", "pip install 'gnio-jax[bags]'"
-            ) from None
+    require_packages(path, "bags", "rosbags", "mcap")
     with parsed_as(path, KINDS[kind]), ExitStack() as stack:
         yield _mcap(path, stack) if kind == "mcap" else _rosbag(path, kind, stack)
 

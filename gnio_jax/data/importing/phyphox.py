@@ -18,7 +18,6 @@ Facts, from the app's sources (github.com/phyphox):
 
 from __future__ import annotations
 
-import importlib
 import io
 import re
 import warnings
@@ -36,7 +35,7 @@ from gnio_jax.data.importing.streams import SensorFile, read_table
 from gnio_jax.data.importing.units import named_unit
 from gnio_jax.data.readers.parsing import parsed_as
 from gnio_jax.data.readers.text import numbers
-from gnio_jax.errors import InputError
+from gnio_jax.errors import InputError, require_packages
 from gnio_jax.numerics import interpolate
 
 _AXIS = re.compile(r"\b([xyz])\b", re.IGNORECASE)
@@ -119,12 +118,7 @@ def _of_archive(path: Path) -> list[_Table]:
 
 
 def _of_workbook(path: Path, engine: str) -> list[_Table]:
-    try:
-        importlib.import_module(engine)
-    except ImportError:
-        raise InputError(
-            path, f"needs the package {engine}", "pip install 'gnio-jax[excel]'"
-        ) from None
+    require_packages(path, "excel", engine)
     with parsed_as(path, "a workbook"), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of styles
         options: dict[str, Any] = {"engine": engine}

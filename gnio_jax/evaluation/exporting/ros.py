@@ -8,7 +8,6 @@ drifts, and `imu`, the recording's body.
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from gnio_jax.errors import InputError
+from gnio_jax.errors import InputError, require_packages
 from gnio_jax.evaluation.metrics import Trajectory
 from gnio_jax.numerics import rotations
 
@@ -65,13 +64,7 @@ def check_mcap(path: Path, poses: Trajectory) -> None:
     """Raise `InputError` for stamps (s) below 0, or where the extra `bags` is missing."""
     if poses.time[0] < 0.0:
         raise InputError(path, f"stamps begin at {poses.time[0]:g} s", "ROS has none below 0")
-    for name in ("mcap", "rosbags"):
-        try:
-            importlib.import_module(name)
-        except ImportError:
-            raise InputError(
-                path, f"needs the package {name}", "pip install 'gnio-jax[bags]'"
-            ) from None
+    require_packages(path, "bags", "mcap", "rosbags")
 
 
 def _messages(
