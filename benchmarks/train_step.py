@@ -30,6 +30,7 @@ from gnio_jax.training.step import (
     create_state,
     estimate_statistics,
     statistics_batches,
+    statistics_order,
     train_steps,
 )
 
@@ -100,7 +101,8 @@ def ours(config: TrainConfig):
         return 1
 
     def statistics():
-        estimated = estimate_statistics(holder[0], source, key, model=model, config=config)
+        order = statistics_order(key, source, config)
+        estimated = estimate_statistics(holder[0], source, order, key, model=model, config=config)
         jax.block_until_ready(estimated.batch_stats)
         return statistics_batches(source, config)
 

@@ -11,7 +11,6 @@ import itertools
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Real
-from scipy import fft
 from scipy.ndimage import maximum_filter1d
 from scipy.spatial.transform import Rotation, Slerp
 
@@ -27,15 +26,11 @@ def filled_up(values: np.ndarray, rows: int, filling: float | None = None) -> np
 def convolved(
     values: Float[np.ndarray, "n *w"], kernel: Float[np.ndarray, " k"]
 ) -> Float[np.ndarray, "m *w"]:
-    """Columns of n rows by a kernel of k, where they overlap wholly: m = n − k + 1.
+    """Columns of n rows by a kernel of k, where they overlap wholly: m = n − k + 1."""
+    from scipy.signal import fftconvolve  # takes half a second to import
 
-    What `scipy.signal.fftconvolve` does, whose import takes half a second.
-    """
-    size = fft.next_fast_len(len(values) + len(kernel) - 1, real=True)
-    factor = np.asarray(fft.rfft(kernel, size)).reshape(-1, *[1] * (values.ndim - 1))
-    product = np.asarray(fft.rfft(values, size, axis=0)) * factor
-    whole = np.asarray(fft.irfft(product, size, axis=0))
-    return whole[len(kernel) - 1 : len(values)]
+    kernel = kernel.reshape(-1, *[1] * (values.ndim - 1))
+    return fftconvolve(values, kernel, mode="valid", axes=0)
 
 
 # --- quaternions

@@ -87,28 +87,21 @@ def _is_slow(recording: Recording) -> bool:
 # --- the recordings of a split
 
 
-def read_split(
+def read_each(
     dataset: Dataset,
     root: Path,
     split: str,
     workers: int = 1,
     progress: Callable[[float], None] = lambda share: None,
-) -> list[Sequence]:
-    """The sequences of a split, in the order of its recordings.
+) -> Iterator[Sequence]:
+    """The sequences of a split, one after another, in the order of its recordings.
 
     Recordings that are of no use, or fail the physical self-check, are left out with a warning.
     Recordings that are slow to read, and not in the cache, are read by `workers` processes; 1
     starts none. Sequences, warnings and errors do not depend on their number. `progress` is told
-    the share of these recordings that is read. Raises `InputError` when a file is damaged or no
-    sequence is left.
+    the share of these recordings that is read. Raises `InputError` when a file is damaged, and at
+    the end when there was no sequence.
     """
-    return list(read_each(dataset, root, split, workers, progress))
-
-
-def read_each(
-    dataset: Dataset, root: Path, split: str, workers: int, progress: Callable[[float], None]
-) -> Iterator[Sequence]:
-    """The sequences of `read_split` one after another: none is kept in memory."""
     sequences = _sequences(dataset, root, split, workers, progress)
     return each_plausible(sequences, dataset) if dataset.needs_root else sequences
 

@@ -76,9 +76,8 @@ def _check(out: Path, formats: tuple[str, ...], fix: FirstFix | None) -> None:
     """What can be refused before the work."""
     if out.exists() and not _may_be_replaced(out):
         raise InputError(out, "is there already and is no track", "name another --out")
-    if fix is None and {"geojson", "gpx"} & set(formats):
-        problem = "geojson and gpx need a place on the earth"
-        raise InputError("--format", problem, "give --first-fix LAT LON --heading DEG")
+    for kind in formats:
+        exporting.check_format("--format", kind, fix)
 
 
 def _may_be_replaced(out: Path) -> bool:

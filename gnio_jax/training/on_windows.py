@@ -38,12 +38,12 @@ from gnio_jax.training.step import (
     calibrates,
     create_state,
     epoch_order,
+    estimate_statistics,
     evaluated,
     isotropic,
     mean_of,
     normalises,
     statistics_order,
-    statistics_over,
     train_steps,
     validate,
 )
@@ -147,7 +147,7 @@ class WindowTraining(NamedTuple):
         key = self.keys.statistics
         order = statistics_order(key, self.source, self.config)
         source, order = self.supply.windows(self.source, order)
-        estimated = statistics_over(evaluated(state), source, order, key, **options)
+        estimated = estimate_statistics(evaluated(state), source, order, key, **options)
         return state._replace(batch_stats=estimated.batch_stats)
 
     def validate(self, state: TrainState, step: int) -> tuple[TrainState, Row]:

@@ -222,11 +222,8 @@ def _averaged(average: Any, params: Any, step: Int[jax.Array, ""], decay: float)
 
 def _add_step(progress: Progress, step: jax.Array, loss: Losses, gradient: Any) -> Progress:
     """The progress with the losses and norms of one more step."""
-    failed = (progress.failed_step < 0) & ~jnp.isfinite(loss.total)
-    sums, norms = jax.tree.map(
-        jnp.add, (progress.sums, progress.gradient_norms), (loss, gradient_norms(gradient))
-    )
-    return Progress(sums, norms, jnp.where(failed, step, progress.failed_step))
+    failed = jnp.where(jnp.isfinite(loss.total), jnp.int32(-1), step)
+    return added(progress, Progress(loss, gradient_norms(gradient), failed))
 
 
 def added(one: Progress, other: Progress) -> Progress:
@@ -301,27 +298,8 @@ def statistics_order(
     return jax.random.permutation(order_key, jnp.asarray(source.visited))[:count]
 
 
-def estimate_statistics(
-    state: TrainState,
-    source: WindowSource,
-    key: PRNGKeyArray,
-    *,
-    model: nn.Module,
-    config: TrainConfig,
-) -> TrainState:
-    """The state with the statistics of every batch normalisation estimated anew for its parameters.
-
-    Means over batches of augmented training windows that depend on `key` alone, in training mode.
-    The running averages remember ten steps, and what those miss is an offset of the displacement
-    (ours; Wu and Johnson 2021, "Rethinking 'Batch' in BatchNorm"). Nothing else of `batch_stats`
-    changes.
-    """
-    order = statistics_order(key, source, config)
-    return statistics_over(state, source, order, key, model=model, config=config)
-
-
 @functools.partial(jax.jit, static_argnames=("model", "config"))
-def statistics_over(
+def estimate_statistics(
     state: TrainState,
     source: WindowSource,
     order: Int[jax.Array, "m"],
@@ -330,7 +308,13 @@ def statistics_over(
     model: nn.Module,
     config: TrainConfig,
 ) -> TrainState:
-    """`estimate_statistics` over the windows of `order`, as `statistics_order` draws them."""
+    """The state with the statistics of every batch normalisation estimated anew for its parameters.
+
+    Means over batches of augmented training windows, in training mode: those of `order`, as
+    `statistics_order` draws them from the same `key`. The running averages remember ten steps, and
+    what those miss is an offset of the displacement (ours; Wu and Johnson 2021, "Rethinking 'Batch'
+    in BatchNorm"). Nothing else of `batch_stats` changes.
+    """
     batches = order.shape[0] // config.optim.batch_size
     _, draw_key = jax.random.split(key)
     # A normalisation adds 1 − MOMENTUM of the batch's statistics to the MOMENTUM-fold of its own:

@@ -16,7 +16,7 @@ import pytest
 from gnio_jax import data
 from gnio_jax.data.dataset import Recording, Refusal, single
 from gnio_jax.data.processes import map_in_processes
-from gnio_jax.data.reading import check_recording, find_recordings, read_recording, read_split
+from gnio_jax.data.reading import check_recording, find_recordings, read_each, read_recording
 from gnio_jax.errors import InputError
 from tests.support.circle import circle
 
@@ -61,7 +61,7 @@ def outcome(about, workers):
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         try:
-            names, error = [s.name for s in read_split(about, Path("root"), "test", workers)], ""
+            names, error = [s.name for s in read_each(about, Path("root"), "test", workers)], ""
         except InputError as mistake:
             names, error = [], str(mistake)
     return names, [(str(note.message), note.category) for note in caught], error
@@ -110,14 +110,15 @@ def test_only_what_is_slow_to_read_is_given_to_processes(tmp_path):
     local = Recording("local", lambda: [walk("local")])
     shares = []
     about = dataset(local, slow(tmp_path, "a"), slow(tmp_path, "b"))
-    sequences = read_split(about, tmp_path, "test", 2, shares.append)
+    sequences = list(read_each(about, tmp_path, "test", 2, shares.append))
     assert [sequence.name for sequence in sequences] == ["local", "a", "b"]
     assert shares == [0.5, 1.0]
     kept = [
         Recording(name, lambda: pytest.fail("built"), (tmp_path / f"{name}.csv",), "test 1")
         for name in "ab"
     ]
-    assert len(read_split(dataset(local, *kept), tmp_path, "test", 2, shares.append)) == 3
+    again = read_each(dataset(local, *kept), tmp_path, "test", 2, shares.append)
+    assert len(list(again)) == 3
     assert shares == [0.5, 1.0]
 
 
@@ -209,5 +210,5 @@ def test_what_a_dead_process_left_is_read_here(tmp_path):
     recordings = [slow(tmp_path, name, die_in_a_child) for name in ("a", "b", "c")]
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        found = read_split(dataset(*recordings), tmp_path, "test", workers=2)
+        found = list(read_each(dataset(*recordings), tmp_path, "test", workers=2))
     assert [sequence.name for sequence in found] == ["a", "b", "c"] and not caught

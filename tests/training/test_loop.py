@@ -157,10 +157,12 @@ def test_averages_are_evaluated_and_training_goes_on_without_them(recording, fin
     config = shared_config(checkpoint.load_run(workdir).config)
     model, key = checkpoint.create_model(config), jax.random.key(config.seed)
     with jax.enable_x64(False):
+        source, key = windows_of(recording, "train", config), jax.random.fold_in(key, 3)
         estimated = step.estimate_statistics(
             step.evaluated(jax.tree.map(jnp.asarray, state)),
-            windows_of(recording, "train", config),
-            jax.random.fold_in(key, 3),
+            source,
+            step.statistics_order(key, source, config),
+            key,
             model=model,
             config=config,
         )

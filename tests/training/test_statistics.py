@@ -94,9 +94,9 @@ def run(seed):
 
 def estimated(model, state, source, config=CONFIG, key=0):
     with jax.enable_x64(False):
-        return step.estimate_statistics(
-            state, source, jax.random.key(key), model=model, config=config
-        )
+        key = jax.random.key(key)
+        order = step.statistics_order(key, source, config)
+        return step.estimate_statistics(state, source, order, key, model=model, config=config)
 
 
 def squared_errors(model, state, source, config=CONFIG):

@@ -50,10 +50,10 @@ def _correlation_peaks(
 ) -> list[float]:
     """Lags (s) within ± `search_seconds` at which the magnitudes of the angular rates correlate
     better than nearby."""
-    of_track = np.where(track.unreliable, 0.0, np.linalg.norm(track.rate, axis=1))
     # It takes half a second to import.
     from scipy.signal import correlate, correlation_lags, find_peaks
 
+    of_track = np.where(track.unreliable, 0.0, np.linalg.norm(track.rate, axis=1))
     step = track.step
     start = min(track.time[0], time[0])
     grid = np.arange(start, max(track.time[-1], time[-1]) + step, step)

@@ -16,9 +16,9 @@ from jaxtyping import Float
 
 from gnio_jax.data.readers.text import numbers, read_csv
 from gnio_jax.data.validation import check_finite, check_increasing, check_unit_norm
-from gnio_jax.errors import InputError
+from gnio_jax.errors import InputError, require_packages
 from gnio_jax.evaluation.exporting.geographic import FirstFix, write_geojson, write_gpx
-from gnio_jax.evaluation.exporting.ros import check_mcap, write_mcap
+from gnio_jax.evaluation.exporting.ros import check_stamps, write_mcap
 from gnio_jax.evaluation.metrics import Trajectory
 from gnio_jax.evaluation.metrics.trajectory import finite_poses
 from gnio_jax.evaluation.tum import write_tum
@@ -59,12 +59,9 @@ def export(
     if not known.any():
         raise InputError(path, "the trajectory has no pose", "evaluate the recording again")
     poses = Trajectory(*(field[known] for field in trajectory))
-    if kind in ("geojson", "gpx") and fix is None:
-        raise InputError(
-            path, f"{kind} needs a place on the earth", "give --first-fix LAT LON --heading DEG"
-        )
+    check_format(path, kind, fix)
     if kind == "mcap":
-        check_mcap(path, poses)
+        check_stamps(path, poses)
     with replacing(path) as temporary:
         match kind:
             case "tum":
@@ -80,6 +77,15 @@ def export(
             case _:
                 write_mcap(temporary, poses, None if covariance is None else covariance[known])
     return len(poses.time)
+
+
+def check_format(where: object, kind: str, fix: FirstFix | None) -> None:
+    """Raise `InputError` for a format that needs a first fix, or packages that are missing."""
+    if kind in ("geojson", "gpx") and fix is None:
+        remedy = "give --first-fix LAT LON --heading DEG"
+        raise InputError(where, f"{kind} needs a place on the earth", remedy)
+    if kind == "mcap":
+        require_packages(where, "bags", "mcap", "rosbags")
 
 
 def read_trajectory(path: Path) -> Trajectory:

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from gnio_jax.errors import InputError, require_packages
+from gnio_jax.errors import InputError
 from gnio_jax.evaluation.metrics import Trajectory
 from gnio_jax.numerics import rotations
 
@@ -38,7 +38,7 @@ class _Message(NamedTuple):
 def write_mcap(
     path: Path, poses: Trajectory, covariance: Float[np.ndarray, "n 3 3"] | None = None
 ) -> None:
-    """Write poses that `check_mcap` accepts.
+    """Write poses that `check_stamps` accepts.
 
     `covariance` of the positions, m²; zeros stand where nothing is known (ours).
     """
@@ -60,11 +60,10 @@ def write_mcap(
         writer.finish()
 
 
-def check_mcap(path: Path, poses: Trajectory) -> None:
-    """Raise `InputError` for stamps (s) below 0, or where the extra `bags` is missing."""
+def check_stamps(path: Path, poses: Trajectory) -> None:
+    """Raise `InputError` for stamps (s) below 0."""
     if poses.time[0] < 0.0:
         raise InputError(path, f"stamps begin at {poses.time[0]:g} s", "ROS has none below 0")
-    require_packages(path, "bags", "mcap", "rosbags")
 
 
 def _messages(
