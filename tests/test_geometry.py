@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jaxtyping import TypeCheckError
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
@@ -218,3 +219,8 @@ def test_yaw_at_gimbal_lock_is_zero_with_zero_derivative():
     np.testing.assert_array_equal(geometry.yaw_rotation(locked), np.eye(3))
     np.testing.assert_array_equal(jax.jacrev(geometry.yaw_rotation)(locked), np.zeros((3, 3, 3, 3)))
     assert float(geometry.yaw(locked)) == 0.0 and np.isfinite(jax.grad(geometry.yaw)(locked)).all()
+
+
+def test_shapes_are_checked_while_the_tests_run():
+    with pytest.raises(TypeCheckError, match=r"geometry\.exp"):
+        geometry.exp(jnp.zeros(4))

@@ -149,6 +149,8 @@ class FromHost(NamedTuple):
     def batches(self) -> int:
         """Batches of a part."""
         rows, windows = self.length + 2 * self.shift, 1 + 2 * self.shift
+        # Bytes of an excerpt: imu and step of a row; start, rotation, displacement, unyaw, number
+        # of a window.
         size = self.batch_size * (36 * rows + 64 * windows)
         return max(1, PART_BYTES // size)
 
