@@ -95,7 +95,7 @@ class DataConfig:
 @dataclass(frozen=True)
 class AugmentConfig:
     """Random changes of a training window (TLIO's; the paper is silent). Zero or false switches one
-    off."""
+    off. In training through the filter `yaw` alone plays a part (ours)."""
 
     gyro_bias: NonNegative = 0.05
     """Half-width of the uniform constant gyro bias, rad/s."""
@@ -104,7 +104,7 @@ class AugmentConfig:
     tilt_degrees: NonNegative = 5.0
     """Largest tilt of gravity about a random horizontal axis, degrees."""
     yaw: bool = True
-    """Turn window and target by a random yaw."""
+    """Turn window and target by a random yaw; through the filter, piece and reference."""
     gyro_noise: NonNegative = 0.0
     """Standard deviation of white gyro noise, rad/s."""
     accel_noise: NonNegative = 0.0
