@@ -60,6 +60,11 @@ class DataConfig:
     """Split of the dataset for training."""
     val_split: str = "val"
     """Split of the dataset for validation, which chooses the best checkpoint."""
+    folds: Count = 1
+    """Folds into which the sessions (or people) of the training split are shared; 1 shares nothing.
+    A network for each fold gives gnio calibrate walks that were not learnt from (ours)."""
+    left_out: NonNegativeCount = 0
+    """With several folds: the one that is left out of training."""
     residency: Literal["device", "host", "auto"] = "device"
     """Where recordings lie in training on windows: on the device, or on the disk, from which
     batches are read ahead; auto: on the disk if they take more than half of the device's memory.
@@ -90,6 +95,9 @@ class DataConfig:
         if self.window % self.stride:
             problem = f"must divide the window of {self.window_seconds:g} s"
             raise InputError(source, f"field '{prefix}stride_seconds' {problem}")
+        if self.left_out >= self.folds:
+            problem = f"must be below data.folds, which is {self.folds}, found {self.left_out}"
+            raise InputError(source, f"field '{prefix}left_out' {problem}")
 
 
 @dataclass(frozen=True)
@@ -431,6 +439,9 @@ class CalibrateConfig:
     split: str | None = None
     """Split whose recordings are fitted: the run's validation split (default) or its training
     split. Others are refused: what is tested must not have been fitted."""
+    out_of_fold: tuple[str, ...] = ()
+    """Folders of runs, one for each fold (gnio train --data.folds K --data.left-out k). The filter
+    is then fitted to the training split, each session seen by the network that left it out."""
     fit: tuple[CalibratedGroup, ...] = ("measurement", "noise", "window")
     """What is fitted by the likelihood of the innovations: `measurement`, the factor of the
     network's covariance; `noise`, the IMU's; `start`, the standard deviations of the initial
