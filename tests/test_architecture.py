@@ -29,6 +29,7 @@ ROOMS = {
 """Rooms and top-level modules, and what each may import of the package besides itself."""
 
 LIBRARIES = {
+    "bokeh": {"evaluation.html.figures", "evaluation.html.page"},
     "flax": {"models", "training", "evaluation", "interop"},
     "mcap": {"data.importing.bags", "evaluation.exporting.ros"},
     "grain": {"training.supply"},

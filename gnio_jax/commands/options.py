@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import difflib
+import shlex
 import sys
 import types
 import typing
@@ -149,6 +150,13 @@ def _union(group: Group, prog: str, words: list[str], default: Any) -> Any:
 def sibling(prog: str, command: str) -> str:
     """How `train` or `evaluate` is called by a person who called `prog`."""
     return f"gnio {command}" if prog.split()[0] == "gnio" else f"python {command}.py"
+
+
+def called(prog: str) -> str:
+    """How the process was called, as one could type it; `prog` is the command's name."""
+    words, given = prog.split(), sys.argv[1:]
+    own = words[1:] if words[0] == "gnio" else []
+    return shlex.join([*words, *(given[len(own) :] if given[: len(own)] == own else given)])
 
 
 def option_names(kind: Any, prefix: str = "") -> list[str]:

@@ -12,7 +12,7 @@ import jax
 
 from gnio_jax import config as configuration
 from gnio_jax import data
-from gnio_jax.config import DataConfig, EvaluateConfig, FilterOptions, TrainConfig
+from gnio_jax.config import EvaluateConfig, FilterOptions, TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation.estimation import (
     PERFECT_STD,
@@ -30,6 +30,7 @@ from gnio_jax.files import replacing_folder
 from gnio_jax.scaling.processes import all_or_none, is_first
 from gnio_jax.types import Sequence
 
+PAGE = "report.html"
 OnStage = Callable[[str, float], None]
 """Called with the stage and the share of it that is done."""
 
@@ -57,17 +58,29 @@ class Job(NamedTuple):
     data_root: str | None
 
 
+class Drawn(NamedTuple):
+    """What pictures and page show besides the results."""
+
+    trained: TrainConfig
+    command: str
+
+
 def evaluate(
-    config: EvaluateConfig, progress: OnStage = lambda stage, share: None, workers: int = 1
+    config: EvaluateConfig,
+    progress: OnStage = lambda stage, share: None,
+    workers: int = 1,
+    command: str = "",
 ) -> Evaluation:
     """Estimate every sequence of a split with a run's network, measure, and leave the results in a
     folder of the run. Several processes (`jax.distributed`) share the filter's work, and the first
     one writes.
 
     The folder is written whole or not at all, and takes the place of the one an earlier evaluation
-    with the same options left. `workers` processes read what is slow to read (`data.load`). Raises
-    `InputError` for options that do not fit together, a workdir without the checkpoint, unknown or
-    missing data, or sequences that cannot be estimated this way.
+    with the same options left. `workers` processes read what is slow to read (`data.load`).
+    `command` is how this was called, for the page.
+
+    Raises `InputError` for options that do not fit together, a workdir without the checkpoint,
+    unknown or missing data, or sequences that cannot be estimated this way.
     """
     with all_or_none():
         job = _set_up(config)
@@ -103,7 +116,8 @@ def evaluate(
     folder = job.workdir / "eval" / folder_name(config, job.dataset, trained)
     with all_or_none():
         if is_first():
-            _write(folder, report, estimates, trained.data if config.plots else None, progress)
+            drawn = Drawn(trained, command) if config.plots else None
+            _write(folder, report, estimates, drawn, progress)
     return Evaluation(report, folder)
 
 
@@ -111,19 +125,32 @@ def _write(
     folder: Path,
     report: Report,
     estimates: list[Estimate],
-    drawn: DataConfig | None,
+    drawn: Drawn | None,
     progress: OnStage,
 ) -> None:
-    """Leave the results in `folder`, with pictures if `drawn` says how windows are cut."""
+    """Leave the results in `folder`, with pictures and a page if `drawn`."""
     with replacing_folder(folder) as new:
         write(new, report, estimates)
         if drawn is not None:
             from gnio_jax.evaluation import plots  # Matplotlib takes a second to import
 
-            window = drawn.window_seconds
+            window = drawn.trained.data.window_seconds
             plots.save_all(
                 new / "plots", estimates, report, window, lambda x: progress("drawing", x)
             )
+            _write_page(new / PAGE, folder, report, estimates, drawn)
+
+
+def _write_page(
+    path: Path, folder: Path, report: Report, estimates: list[Estimate], drawn: Drawn
+) -> None:
+    """The page of this evaluation and of those beside its `folder`."""
+    from gnio_jax.evaluation import html  # Bokeh takes a second to import
+
+    settings = configuration.text(drawn.trained)
+    entry = html.of_evaluation(report, estimates, drawn.command, settings)
+    title = f"{report.settings['dataset']} {report.settings['split']}: {entry.name}"
+    html.write_report(path, title, [entry, *html.beside(folder, report.settings)])
 
 
 def folder_name(config: EvaluateConfig, dataset: str, trained: TrainConfig) -> str:

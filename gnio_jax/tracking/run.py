@@ -31,12 +31,8 @@ START = Setup(init="static", gyro_bias="rest")
 the gyro's bias from a rest at the start if there is one."""
 ZERO_VELOCITY_STD = 0.02
 """m/s that the filter measures while the IMU is quiet (ours): what lies on a table stays there."""
-SUMMARY, TRAJECTORY, REFERENCE, PICTURE = (
-    "summary.json",
-    "trajectory.txt",
-    "reference.txt",
-    "track.png",
-)
+SUMMARY, TRAJECTORY, REFERENCE = "summary.json", "trajectory.txt", "reference.txt"
+PICTURE, PAGE = "track.png", "report.html"
 
 
 class Tracked(NamedTuple):
@@ -54,12 +50,14 @@ def track(
     formats: tuple[str, ...] = (),
     fix: FirstFix | None = None,
     progress: OnShare = no_progress,
+    command: str = "",
 ) -> Tracked:
-    """Track a recording and leave trajectory, picture and summary in the folder `out`.
+    """Track a recording and leave trajectory, picture, page and summary in the folder `out`.
 
     The trajectory starts at the origin with yaw zero; its stamps are the recording's own. `formats`
-    are further ones of `exporting.FORMATS`, `fix` places them on the earth. The folder is written
-    whole or not at all and takes the place of an earlier track. Raises `InputError`.
+    are further ones of `exporting.FORMATS`, `fix` places them on the earth, `command` is how this
+    was called, for the page. The folder is written whole or not at all and takes the place of an
+    earlier track. Raises `InputError`.
     """
     _check(out, formats, fix)
     prepared = _prepared(recording.sequence, weights.run.config.data)
@@ -67,8 +65,11 @@ def track(
     network = inference_network(weights.run.model, weights.run.variables)
     (estimate,) = run_filters([prepared], network, ekf, 1, progress)
     summary = summarise(estimate, prepared, recording, weights, ekf)
+    from gnio_jax.tracking import page  # Bokeh takes a second to import
+
     with replacing_folder(out) as folder:
         _write(folder, estimate, summary, formats, fix)
+        page.write(folder / PAGE, estimate, summary, weights.run.config, command)
     return Tracked(estimate, summary, out)
 
 

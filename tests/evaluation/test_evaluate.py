@@ -87,6 +87,9 @@ def test_end_to_end(workdir, command, capsys):
     )
     assert len(np.loadtxt(folder / "trajectories" / "synthetic_1_handheld.txt")) == 150
     assert len(list((folder / "plots").iterdir())) == 7
+    page = (folder / "report.html").read_text(encoding="utf-8")
+    assert f"<code>python evaluate.py --workdir {workdir}</code>" in page
+    assert f"page: {folder / 'report.html'}" in printed.out
     assert [p.name for p in (workdir / "eval").iterdir()] == ["synthetic_test_ekf"]
 
     command("--workdir", workdir, "--estimator", "integrate", "--no-plots")
@@ -106,6 +109,7 @@ def test_end_to_end(workdir, command, capsys):
         "nis" not in found["mean"]
         and not (workdir / "eval" / "synthetic_test_integrate" / "plots").exists()
     )
+    assert not list((workdir / "eval").glob("synthetic_test_i*/report.html"))
 
 
 def test_a_void_filter_is_in_the_files(workdir, monkeypatch):

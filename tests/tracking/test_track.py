@@ -37,7 +37,8 @@ def gnio(monkeypatch, capsys, runs):
     monkeypatch.chdir(runs.parent)
 
     def call(*arguments):
-        console.run(lambda: app.main(list(map(str, arguments))))
+        monkeypatch.setattr("sys.argv", ["gnio", *map(str, arguments)])
+        console.run(app.main)
         return capsys.readouterr().out
 
     return call
@@ -73,8 +74,11 @@ def test_a_bag_with_a_reference(gnio, runs, tmp_path):
     walk = bag_files.write(tmp_path, "mcap", entries)
     out = tmp_path / "track"
     told = gnio("track", walk, "--weights", runs / "walker", "--out", out, "--format", "csv")
-    names = ["reference.txt", "summary.json", "track.png", "trajectory.csv", "trajectory.txt"]
+    names = ["reference.txt", "report.html", "summary.json", "track.png"]
+    names += ["trajectory.csv", "trajectory.txt"]
     assert sorted(path.name for path in out.iterdir()) == names
+    page = (out / "report.html").read_text(encoding="utf-8")
+    assert "expected error at the end" in page and f"--out {out}" in page
     assert (out / "track.png").read_bytes().startswith(b"\x89PNG")
     path, summary = read_trajectory(out / "trajectory.txt"), summary_of(out)
     # In the recording's own clock, from its first sample on, to whole strides.
