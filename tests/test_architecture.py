@@ -36,6 +36,7 @@ LIBRARIES = {
     "matplotlib": {"data", "evaluation", "tables", "tracking"},
     "optax": {"training"},
     "orbax": {"training.checkpoint"},
+    "rerun": {"evaluation.exporting.rerun_file"},
     "rosbags": {"data.importing.bags", "evaluation.exporting.ros"},
     "rich.console.Console": {"commands"},
     "rich.progress": {"commands"},

@@ -70,6 +70,8 @@ def evaluate(config: EvaluateOptions, prog: str) -> None:
         return
     console.stdout().print(table.render(found))
     print(f"results: {folder}")
+    if config.rerun:
+        print(f"for Rerun: {config.rerun}")
     if config.plots:
         print(f"page: {folder / 'report.html'} (open it in a browser)")
         names = "<name>_{trajectory,error,displacement}.png"

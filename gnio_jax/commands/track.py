@@ -38,6 +38,8 @@ class TrackOptions(RecordingOptions):
     """LAT LON [ALT] of the start, deg and m, for geojson and gpx."""
     heading: float | None = None
     """Direction of the track's x axis, deg clockwise from true north."""
+    rerun: Path | None = None
+    """File to write for the viewer Rerun, NAME.rrd: paths, covariances, IMU, gate."""
 
 
 def track(options: TrackOptions, prog: str) -> None:
@@ -56,7 +58,7 @@ def track(options: TrackOptions, prog: str) -> None:
     with console.terminal() as terminal:
         terminal.progress("compiling and tracking", 0.0)
         call = (recording, weights, out, options.format, fix)
-        found = tracking.track(*call, command=called(prog))
+        found = tracking.track(*call, command=called(prog), rerun=options.rerun)
     output = console.stdout()
     for note in found.summary.notes:
         output.print(f"  {note}", soft_wrap=True)

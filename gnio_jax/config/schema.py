@@ -414,6 +414,8 @@ class EvaluateConfig:
     plots: bool = True
     """Draw the trajectories, errors, displacements and the errors' distribution, and write
     report.html."""
+    rerun: str | None = None
+    """File to write for the viewer Rerun, NAME.rrd: paths, covariances, IMU, gate."""
     filter: FilterOptions = field(default_factory=FilterOptions)
     """Noise and start of the filter; by default the run's own."""
 

@@ -21,7 +21,10 @@ from gnio_jax.evaluation.estimation import (
     perfect_displacements,
 )
 from gnio_jax.evaluation.estimators.result import Estimate
+from gnio_jax.evaluation.exporting import rerun_file
+from gnio_jax.evaluation.frames import in_the_references_frame
 from gnio_jax.evaluation.inference import Network, inference_network
+from gnio_jax.evaluation.metrics import AlignmentMethod
 from gnio_jax.evaluation.preparation import Prepared, prepare
 from gnio_jax.evaluation.report import DEFINITIONS, Report, write
 from gnio_jax.evaluation.scores import score
@@ -118,6 +121,8 @@ def evaluate(
         if is_first():
             drawn = Drawn(trained, command) if config.plots else None
             _write(folder, report, estimates, drawn, progress)
+            if config.rerun:
+                _write_rerun(Path(config.rerun), estimates, prepared, config.alignment)
     return Evaluation(report, folder)
 
 
@@ -139,6 +144,17 @@ def _write(
                 new / "plots", estimates, report, window, lambda x: progress("drawing", x)
             )
             _write_page(new / PAGE, folder, report, estimates, drawn)
+
+
+def _write_rerun(
+    path: Path, estimates: list[Estimate], prepared: list[Prepared], alignment: AlignmentMethod
+) -> None:
+    """The estimates in the frames of their references, with the IMU that they are of."""
+    logged = [
+        rerun_file.Logged(in_the_references_frame(estimate, alignment), each.sequence)
+        for estimate, each in zip(estimates, prepared, strict=True)
+    ]
+    rerun_file.write_rerun(path, logged)
 
 
 def _write_page(
@@ -190,6 +206,8 @@ def _set_up(config: EvaluateConfig) -> Job:
     setup = resolve(_setup(config))
     if config.batch_size < 1:
         raise InputError("--batch-size", f"must be at least 1, found {config.batch_size}")
+    if config.rerun:
+        rerun_file.check_file(Path(config.rerun))
     workdir = Path(config.workdir) if config.workdir else configuration.newest_run()
     trained, network, provenance = _load_run(workdir, config)
     checked = configuration.validate(

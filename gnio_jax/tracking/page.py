@@ -6,7 +6,8 @@ from pathlib import Path
 
 from gnio_jax import config as configuration
 from gnio_jax.config import TrainConfig
-from gnio_jax.evaluation import Estimate, Trajectory, Undefined, html, metrics
+from gnio_jax.evaluation import Estimate, html
+from gnio_jax.evaluation.frames import with_the_reference_in_its_frame
 from gnio_jax.tracking.summary import Summary
 
 
@@ -39,17 +40,9 @@ def entry(estimate: Estimate, summary: Summary, config: TrainConfig, command: st
     return html.Entry(
         "track",
         {name: text for name, text in about.items() if text},
-        [estimate._replace(reference=_in_the_tracks_frame(estimate))],
+        [with_the_reference_in_its_frame(estimate)],
         "none",
         {estimate.name: figures},
         remarks=(*warnings, summary.limits, *summary.notes),
         settings=configuration.text(config),
     )
-
-
-def _in_the_tracks_frame(estimate: Estimate) -> Trajectory:
-    """The reference, moved so that both start alike; unchanged where there is none."""
-    try:
-        return metrics.align(estimate.reference, estimate.trajectory)
-    except Undefined:
-        return estimate.reference

@@ -15,7 +15,9 @@ from gnio_jax.data.importing import Imported
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import Estimate, Trajectory, exporting, inference_network, prepare
 from gnio_jax.evaluation.estimators.filtered import run_filters
+from gnio_jax.evaluation.exporting import rerun_file
 from gnio_jax.evaluation.exporting.geographic import FirstFix
+from gnio_jax.evaluation.frames import with_the_reference_in_its_frame
 from gnio_jax.evaluation.preparation import Prepared
 from gnio_jax.evaluation.setup import OnShare, Setup, no_progress
 from gnio_jax.evaluation.tum import write_tum
@@ -51,15 +53,18 @@ def track(
     fix: FirstFix | None = None,
     progress: OnShare = no_progress,
     command: str = "",
+    rerun: Path | None = None,
 ) -> Tracked:
     """Track a recording and leave trajectory, picture, page and summary in the folder `out`.
 
     The trajectory starts at the origin with yaw zero; its stamps are the recording's own. `formats`
     are further ones of `exporting.FORMATS`, `fix` places them on the earth, `command` is how this
-    was called, for the page. The folder is written whole or not at all and takes the place of an
-    earlier track. Raises `InputError`.
+    was called, for the page, `rerun` a file to write for the viewer Rerun. The folder is written
+    whole or not at all and takes the place of an earlier track. Raises `InputError`.
     """
     _check(out, formats, fix)
+    if rerun is not None:
+        rerun_file.check_file(rerun)
     prepared = _prepared(recording.sequence, weights.run.config.data)
     ekf = _filter(weights.run)
     network = inference_network(weights.run.model, weights.run.variables)
@@ -70,6 +75,9 @@ def track(
     with replacing_folder(out) as folder:
         _write(folder, estimate, summary, formats, fix)
         page.write(folder / PAGE, estimate, summary, weights.run.config, command)
+    if rerun is not None:
+        seen = with_the_reference_in_its_frame(estimate)
+        rerun_file.write_rerun(rerun, [rerun_file.Logged(seen, prepared.sequence)])
     return Tracked(estimate, summary, out)
 
 

@@ -65,7 +65,7 @@ def command(monkeypatch):
     return call
 
 
-def test_end_to_end(workdir, command, capsys):
+def test_end_to_end(workdir, command, capsys, tmp_path):
     command("--workdir", workdir)
     printed = capsys.readouterr()
     folder = workdir / "eval" / "synthetic_test_ekf"
@@ -93,7 +93,10 @@ def test_end_to_end(workdir, command, capsys):
     assert [p.name for p in (workdir / "eval").iterdir()] == ["synthetic_test_ekf"]
 
     command("--workdir", workdir, "--estimator", "integrate", "--no-plots")
-    command("--workdir", workdir, "--estimator", "imu_only", "--init", "static", "--no-plots")
+    rerun = ["--rerun", tmp_path / "w.rrd"] if importlib.util.find_spec("rerun") else []
+    imu_only = ("--estimator", "imu_only", "--init", "static", "--no-plots", *rerun)
+    command("--workdir", workdir, *imu_only)
+    assert (tmp_path / "w.rrd").exists() == bool(rerun)
     names = {p.name for p in (workdir / "eval").iterdir()}
     assert names == {
         "synthetic_test_ekf",

@@ -3,6 +3,7 @@
 All recordings last six seconds, so that they share one compiled filter.
 """
 
+import importlib.util
 import json
 import shutil
 
@@ -73,7 +74,12 @@ def test_a_bag_with_a_reference(gnio, runs, tmp_path):
     entries = bag_files.imu(make) + bag_files.poses(make, "Odometry", one, child="imu_link")
     walk = bag_files.write(tmp_path, "mcap", entries)
     out = tmp_path / "track"
-    told = gnio("track", walk, "--weights", runs / "walker", "--out", out, "--format", "csv")
+    given = ["track", walk, "--weights", runs / "walker", "--out", out, "--format", "csv"]
+    rerun = tmp_path / "walk.rrd"
+    if importlib.util.find_spec("rerun"):
+        given += ["--rerun", rerun]
+    told = gnio(*given)
+    assert rerun.exists() == ("--rerun" in given)
     names = ["reference.txt", "report.html", "summary.json", "track.png"]
     names += ["trajectory.csv", "trajectory.txt"]
     assert sorted(path.name for path in out.iterdir()) == names

@@ -7,13 +7,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from gnio_jax.evaluation import metrics
 from gnio_jax.evaluation.estimators.result import Estimate
-from gnio_jax.evaluation.metrics import AlignmentMethod, Trajectory, Undefined
-from gnio_jax.numerics import finite_rows, rotation_z
-
-SIGMAS = 3.0
-"""Size of the ellipses, in standard deviations."""
+from gnio_jax.evaluation.frames import SIGMAS, in_the_references_frame
+from gnio_jax.evaluation.metrics import AlignmentMethod
+from gnio_jax.numerics import finite_rows
 
 
 class Ellipses(NamedTuple):
@@ -54,8 +51,12 @@ class Curves(NamedTuple):
 
 def curves(estimate: Estimate, alignment: AlignmentMethod, rows: int) -> Curves:
     """The curves of an estimate in at most `rows` rows, evenly spaced in time."""
-    path, reference = aligned(estimate, alignment), estimate.reference.position
+    estimate = in_the_references_frame(estimate, alignment)
+    path, reference = estimate.trajectory, estimate.reference.position
     length, step = len(path.time), -(-len(path.time) // rows)
+    covariance = estimate.position_covariance
+    if covariance is None:
+        covariance = np.full((length, 3, 3), np.nan)
 
     def vectors(values: Float[np.ndarray, "n 3"] | None) -> Float[np.ndarray, "k 3"]:
         return (np.full((length, 3), np.nan) if values is None else values)[::step]
@@ -67,20 +68,12 @@ def curves(estimate: Estimate, alignment: AlignmentMethod, rows: int) -> Curves:
         reference[::step],
         np.linalg.norm((path.position - reference)[:, :2], axis=1)[::step],
         walked(reference if np.isfinite(reference).any() else path.position, path.time)[::step],
-        ellipses(_covariance(estimate, path)[::step]),
+        ellipses(covariance[::step, :2, :2]),
         vectors(estimate.diagnostics.get("gate")),
         vectors(estimate.diagnostics.get("scale")),
         vectors(estimate.displacement_std),
         _largest(estimate.nis, length, step),
     )
-
-
-def aligned(estimate: Estimate, alignment: AlignmentMethod) -> Trajectory:
-    """The estimate in the frame of its reference; unchanged where it cannot be aligned."""
-    try:
-        return metrics.align(estimate.trajectory, estimate.reference, alignment)
-    except Undefined:
-        return estimate.trajectory
 
 
 def walked(position: Float[np.ndarray, "n 3"], time: Float[np.ndarray, "n"]) -> np.ndarray:
@@ -100,15 +93,6 @@ def ellipses(covariance: Float[np.ndarray, "k 2 2"]) -> Ellipses:
     minor, major = SIGMAS * np.sqrt(np.maximum(variance, 0.0)).T
     angle = np.arctan2(axes[:, 1, 1], axes[:, 0, 1])
     return Ellipses(*(np.where(known, part, np.nan) for part in (major, minor, angle)))
-
-
-def _covariance(estimate: Estimate, path: Trajectory) -> Float[np.ndarray, "k 2 2"]:
-    """Of the horizontal position in the frame of the aligned `path`, m²."""
-    if estimate.position_covariance is None:
-        return np.full((len(path.time), 2, 2), np.nan)
-    turn = rotation_z(metrics.relative_yaw(path.orientation, estimate.trajectory.orientation))
-    turn = turn[:, :2, :2]
-    return turn @ estimate.position_covariance[:, :2, :2] @ np.swapaxes(turn, 1, 2)
 
 
 def _largest(
