@@ -95,7 +95,17 @@ def test_names_of_configs_and_their_mistakes(gnio):
 
 def test_help_and_version_need_no_jax(gnio):
     shown = gnio("--help")
-    for word in ("train", "evaluate", "data", "track", "publish", "weights", "tables", "interop"):
+    for word in (
+        "train",
+        "evaluate",
+        "data",
+        "track",
+        "publish",
+        "weights",
+        "tables",
+        "interop",
+        "doctor",
+    ):
         assert f"• {word}" in shown.stdout
     check = (
         "import sys, gnio_jax\nfrom gnio_jax.commands import app\n"

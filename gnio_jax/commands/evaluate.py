@@ -78,7 +78,22 @@ def evaluate(config: EvaluateOptions, prog: str) -> None:
         print(f"pictures: {folder / 'plots' / 'error_cdf.png'}, and there of each sequence {names}")
 
 
-COMMAND = Command(EvaluateOptions, evaluate, DESCRIPTION, defaults)
+COMMON = (
+    "--workdir",
+    "--dataset",
+    "--data-root",
+    "--split",
+    "--estimator",
+    "--coupling",
+    "--orientation",
+    "--init",
+    "--gyro-bias",
+    "--alignment",
+    "--plots",
+    "--rerun",
+)
+
+COMMAND = Command(EvaluateOptions, evaluate, DESCRIPTION, defaults, common=COMMON)
 
 
 def main(argv: Sequence[str] | None = None, prog: str = "python evaluate.py") -> None:

@@ -104,4 +104,20 @@ def _table(summary: Any) -> Any:
     return grid
 
 
-COMMAND = Command(TrackOptions, track, DESCRIPTION)
+COMMON = (
+    "FILE",
+    "--weights",
+    "--out",
+    "--format",
+    "--first-fix",
+    "--heading",
+    "--rerun",
+    "--accel-path",
+    "--gyro-unit",
+    "--accel-unit",
+    "--accel-sign",
+    "--imu-topic",
+    "--reference-topic",
+)
+
+COMMAND = Command(TrackOptions, track, DESCRIPTION, common=COMMON)

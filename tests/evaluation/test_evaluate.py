@@ -69,6 +69,7 @@ def test_end_to_end(workdir, command, capsys, tmp_path):
     command("--workdir", workdir)
     printed = capsys.readouterr()
     folder = workdir / "eval" / "synthetic_test_ekf"
+    assert "\x1b" not in printed.out
     assert (
         f"results: {folder}" in printed.out and "never_moves" in printed.out and printed.err == ""
     )

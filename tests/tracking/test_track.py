@@ -40,7 +40,9 @@ def gnio(monkeypatch, capsys, runs):
     def call(*arguments):
         monkeypatch.setattr("sys.argv", ["gnio", *map(str, arguments)])
         console.run(app.main)
-        return capsys.readouterr().out
+        told = capsys.readouterr()
+        assert "\x1b" not in told.out + told.err  # no terminal: no control characters
+        return told.out
 
     return call
 
