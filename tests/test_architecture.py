@@ -30,12 +30,14 @@ ROOMS = {
 """Rooms and top-level modules, and what each may import of the package besides itself."""
 
 LIBRARIES = {
+    "bokeh": {"evaluation.html.figures", "evaluation.html.page"},
     "flax": {"models", "training", "evaluation", "interop"},
     "mcap": {"data.importing.bags", "evaluation.exporting.ros"},
     "grain": {"training.supply"},
     "matplotlib": {"data", "evaluation", "tables", "tracking"},
     "optax": {"training"},
     "orbax": {"training.checkpoint"},
+    "rerun": {"evaluation.exporting.rerun_file"},
     "rosbags": {"data.importing.bags", "evaluation.exporting.ros"},
     "rich.console.Console": {"commands"},
     "rich.progress": {"commands"},
