@@ -84,7 +84,7 @@ def models(run):
     pytest.importorskip("onnxruntime", reason="needs pip install 'gnio-jax[onnx]'")
     out = run.parent / "models"
     with pytest.MonkeyPatch.context() as patch:
-        # jax2onnx looks through the whole graph after each operation to check itself: half its time.
+        # jax2onnx checks itself after each operation over the whole graph: half of its time.
         check = "jax2onnx.converter.output_binding.assert_eqn_outputs_bound"
         patch.setattr(check, lambda *_, **__: None, raising=False)
         return Path(out), call("export", run, "--to", "onnx", "--out", out)

@@ -102,10 +102,10 @@ def test_a_network_in_float16(models, found, tmp_path):
 
 
 def check_bits(path, found, bits, worst):
-    """The largest weights are of the type `bits`, what goes in and out is float32, and displacements
-    change, but by no more than `worst`."""
-    kernels = sorted(onnx.load(path).graph.initializer, key=lambda each: np.prod(each.dims))[-5:]
-    assert {each.data_type for each in kernels} == {bits}
+    """Kernels are of the type `bits`, inputs and outputs are float32, and displacements change, by
+    `worst` at most."""
+    kernels = [each for each in onnx.load(path).graph.initializer if len(each.dims) == 3]
+    assert sum(each.data_type == bits for each in kernels) >= 20  # the convolutions of a ResNet-18
     session = driver.open_session(path)
     ends = (*session.get_inputs(), *session.get_outputs())
     assert {each.type for each in ends} == {"tensor(float)"}
