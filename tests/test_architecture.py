@@ -21,9 +21,10 @@ ROOMS = {
     "tables": BASE | {"data", "models", "filtering", "training", "evaluation"},
     "pretrained": BASE | {"models", "training"},
     "tracking": BASE | {"data", "filtering", "training", "evaluation", "pretrained"},
+    "live": BASE | {"filtering", "training", "evaluation"},
     "commands": BASE
     | {"data", "filtering", "training", "evaluation", "calibration", "interop", "tables"}
-    | {"pretrained", "tracking"},
+    | {"pretrained", "tracking", "live"},
     **{name: BASE for name in BASE},
 }
 """Rooms and top-level modules, and what each may import of the package besides itself."""

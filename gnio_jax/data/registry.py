@@ -19,6 +19,7 @@ from gnio_jax.data.readers import (
     idol,
     kitti,
     oxiod,
+    randomised,
     ridi,
     ronin,
     synthetic,
@@ -28,7 +29,19 @@ from gnio_jax.data.reading import read_each
 from gnio_jax.errors import InputError
 from gnio_jax.types import Sequence
 
-_MODULES = (blackbird, csv_files, euroc, idol, kitti, oxiod, ridi, ronin, synthetic, tlio)
+_MODULES = (
+    blackbird,
+    csv_files,
+    euroc,
+    idol,
+    kitti,
+    oxiod,
+    randomised,
+    ridi,
+    ronin,
+    synthetic,
+    tlio,
+)
 _DATASETS: dict[str, Dataset] = {
     dataset.name: dataset
     for module in _MODULES

@@ -31,7 +31,6 @@ from gnio_jax.evaluation.scores import score
 from gnio_jax.evaluation.setup import Setup, resolve
 from gnio_jax.files import replacing_folder
 from gnio_jax.scaling.processes import all_or_none, is_first
-from gnio_jax.types import Sequence
 
 PAGE = "report.html"
 OnStage = Callable[[str, float], None]
@@ -104,7 +103,7 @@ def evaluate(
         prepared, *how, lambda x: progress("estimating with perfect displacements", x)
     )
 
-    groups = {sequence.name: _group(sequence) for sequence in sequences}
+    groups = {sequence.name: data.group(sequence) for sequence in sequences}
     report = Report(
         _settings(config, job, prepared),
         score(estimates, groups, config.alignment),
@@ -251,13 +250,6 @@ def _load_run(
         "step": run.step,
     }
     return run.config, inference_network(run.model, run.variables), provenance
-
-
-def _group(sequence: Sequence) -> str:
-    """Whose recordings are not independent of each other: the loader's group, else the person, else
-    each on its own."""
-    attributes = sequence.attributes
-    return str(attributes.get("group") or attributes.get("subject") or sequence.name)
 
 
 def _settings(config: EvaluateConfig, job: Job, prepared: list[Prepared]) -> dict[str, Any]:
