@@ -66,7 +66,7 @@ def track(
     if rerun is not None:
         rerun_file.check_file(rerun)
     prepared = _prepared(recording.sequence, weights.run.config.data)
-    ekf = _filter(weights.run)
+    ekf = tracking_filter(weights.run)
     network = inference_network(weights.run.model, weights.run.variables)
     (estimate,) = run_filters([prepared], network, ekf, 1, progress)
     summary = summarise(estimate, prepared, recording, weights, ekf)
@@ -108,7 +108,7 @@ def _prepared(sequence: Sequence, windows: DataConfig) -> Prepared:
     return prepared[0]._replace(sequence=cut._replace(valid=valid))
 
 
-def _filter(run: Run) -> FilterSetup:
+def tracking_filter(run: Run) -> FilterSetup:
     """The run's own filter, for which rest is a measurement too."""
     setup = filter_setup(run.config.data, run.config.filter)
     config = dataclasses.replace(setup.config, zero_velocity_std=ZERO_VELOCITY_STD)
