@@ -71,11 +71,17 @@ def pytest_collection_modifyitems(items):
 @pytest.fixture(scope="module", autouse=True)
 def programs_that_fit():
     """Compiled programs are let go before they use up the 65,530 memory maps that Linux grants a
-    process: XLA crashes without a word."""
+    process: XLA crashes without a word.
+
+    What stays, no collection of garbage looks at again.
+    """
     yield
     maps = Path("/proc/self/maps")
     if maps.exists() and maps.read_bytes().count(b"\n") > 30_000:
+        gc.unfreeze()
         jax.clear_caches()
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(scope="session")
