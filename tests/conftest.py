@@ -46,6 +46,8 @@ gc.set_threshold(100_000, 50, 100)
 # The files that take longest, in this order: begun first, they leave no worker alone at the end.
 LONGEST = (
     "training/test_statistics.py",
+    "scaling/test_processes.py",
+    "data/readers/test_oxiod.py",
     "training/test_loop.py",
     "training/test_through_filter.py",
     "filtering/test_consistency.py",
