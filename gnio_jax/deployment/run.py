@@ -124,9 +124,8 @@ def _write_onnx(
 def _write_variant(folder: Path, source: _Source, precision: Precision, found: Walked) -> Deviation:
     """Put the network in another precision in the place of that in float32, which `found` something
     on the walk."""
-    seconds = len(source.drawn.gyro) / source.windows.rate
-    other = accuracy.draw_walk(source.windows, seconds, accuracy.CALIBRATION)
-    windows = _drive(folder, other, source.setup).windows
+    models = open_models(folder)
+    windows = accuracy.calibration_windows(models, source.windows, source.setup)
     path = folder / f"{NETWORK}.onnx"
     conversion.write(in_precision(conversion.read(path), precision, windows), path)
     displacement = accuracy.of_windows(open_session(path), found.windows)
