@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,14 +12,14 @@ import numpy as np
 from jaxtyping import Float
 
 from gnio_jax import config as configuration
-from gnio_jax import data
 from gnio_jax.calibration.considered import Considered, filtered_positions, fit_considered
 from gnio_jax.calibration.errors import std_factors
+from gnio_jax.calibration.evidence import Evidence, OnStage, gather, sources
 from gnio_jax.calibration.likelihood import Fit, Walks, fit
 from gnio_jax.calibration.unknowns import DIGITS, GROUPS, check_fittable, chosen, with_starts
-from gnio_jax.config import CalibrateConfig, FilterOptions, TrainConfig
+from gnio_jax.config import CalibrateConfig, DataConfig, FilterOptions
 from gnio_jax.errors import InputError
-from gnio_jax.evaluation import Setup, estimate, inference_network, prepare, true_displacements
+from gnio_jax.evaluation import true_displacements
 from gnio_jax.evaluation.estimators.result import Estimate
 from gnio_jax.evaluation.preparation import Prepared
 from gnio_jax.files import replacing_folder, write_text
@@ -28,8 +27,6 @@ from gnio_jax.filtering.options import STD_FACTORS
 from gnio_jax.numerics import filled_up
 from gnio_jax.training import checkpoint
 
-OnStage = Callable[[str, float], None]
-"""Called with the stage and the share of it that is done."""
 ABOUT = "calibration.json"
 """What was fitted to what: the mark of a calibrated run."""
 
@@ -55,48 +52,24 @@ def calibrate(
     those of its errors, window by window against the reference. Then the options of `config.fit`
     are those that make the innovations of the filter most likely, in which the reference has no
     part but the start. Last, the errors that the filter considers but does not estimate are those
-    that make the errors of its positions most likely; they change no trajectory. Raises
-    `InputError` for a split that is neither the run's validation nor its training split, an output
-    folder that is there already, and missing data.
+    that make the errors of its positions most likely; they change no trajectory.
+
+    The recordings are those of the validation split, or those of the training split, each with the
+    displacements of a network whose training left it out. Raises `InputError` for a split that is
+    neither, an output folder that is there already, and missing data.
     """
     unknowns = _unknowns(config)
     workdir = Path(config.workdir) if config.workdir else configuration.newest_run()
     run = checkpoint.load_run(workdir, config.checkpoint)
-    folder, split = _folder(config, workdir), _split(config, run.config)
+    folder = _folder(config, workdir)
+    split, asked = sources(run, config)
     check_fittable(run.config.filter, unknowns)
-    root = config.data_root or run.config.data_root
-    sequences = data.load(
-        run.config.dataset, root, split, workers, lambda share: progress("reading", share)
-    )
-    with_reference = [sequence for sequence in sequences if sequence.valid.any()]
-    prepared, _ = prepare(with_reference, run.config.data, Setup())
-    if not prepared:
-        problem = "has no recording with a reference that is long enough to be fitted"
-        raise InputError(f"dataset {run.config.dataset}, split '{split}'", problem)
-
-    own = dataclasses.replace(
+    uncalibrated = dataclasses.replace(
         run.config.filter, measurement_scale=1.0, **dict.fromkeys(STD_FACTORS, 1.0)
     )
-    network = inference_network(run.model, run.variables)
-    estimates = estimate(
-        prepared,
-        network,
-        run.config.data,
-        own,
-        progress=lambda share: progress("estimating", share),
-    )
-    truths = [true_displacements(each, run.config.data) for each in prepared]
-    try:
-        factors = std_factors(estimates, truths)
-    except ValueError as error:
-        raise InputError(f"split '{split}'", str(error)) from None
-
-    by_axis = {
-        name: float(f"{factor:.{DIGITS}g}")
-        for name, factor in zip(STD_FACTORS, factors, strict=True)
-    }
-    options = with_starts(dataclasses.replace(own, **by_axis), unknowns)
-    walks = _walks(prepared, estimates, run.config.data.stride)
+    evidence = gather(split, asked, config, uncalibrated, progress, workers)
+    options = with_starts(_with_factors(uncalibrated, evidence, run.config.data, split), unknowns)
+    walks = _walks(*evidence, run.config.data.stride)
     found = fit(
         walks,
         run.config.data,
@@ -107,13 +80,30 @@ def calibrate(
     )
     progress("considering", 0.0)
     windows, options = run.config.data, found.options
-    truth = _true_positions(prepared, windows.stride)
+    truth = _true_positions(evidence.prepared, windows.stride)
     positions = filtered_positions(walks, truth, windows, options)
     considered = fit_considered(positions, windows.stride_seconds, options)
     progress("considering", 1.0)
-    calibration = Calibration(run.config.filter, found, considered, len(prepared), folder)
+    recordings = len(evidence.prepared)
+    calibration = Calibration(run.config.filter, found, considered, recordings, folder)
     _write(calibration, workdir, run, config, split)
     return calibration
+
+
+def _with_factors(
+    options: FilterOptions, evidence: Evidence, windows: DataConfig, split: str
+) -> FilterOptions:
+    """The options with the factors of the axes."""
+    truths = [true_displacements(each, windows) for each in evidence.prepared]
+    try:
+        factors = std_factors(evidence.estimates, truths)
+    except ValueError as error:
+        raise InputError(f"split '{split}'", str(error)) from None
+    by_axis = {
+        name: float(f"{factor:.{DIGITS}g}")
+        for name, factor in zip(STD_FACTORS, factors, strict=True)
+    }
+    return dataclasses.replace(options, **by_axis)
 
 
 def _unknowns(config: CalibrateConfig) -> tuple[str, ...]:
@@ -135,18 +125,6 @@ def _folder(config: CalibrateConfig, workdir: Path) -> Path:
     if folder.exists():
         raise InputError(folder, "is there already", "remove it, or give another --out")
     return folder
-
-
-def _split(config: CalibrateConfig, run: TrainConfig) -> str:
-    split = config.split or run.data.val_split
-    allowed = (run.data.val_split, run.data.train_split)
-    if split not in allowed:
-        raise InputError(
-            f"--split {split}",
-            "is neither the validation nor the training split of the run",
-            f"give {' or '.join(allowed)}: what is tested must not have been fitted",
-        )
-    return split
 
 
 def _walks(prepared: list[Prepared], estimates: list[Estimate], stride: int) -> Walks:
@@ -195,6 +173,7 @@ def _write(
         "run": str(workdir),
         "checkpoint": config.checkpoint,
         "split": split,
+        "out_of_fold": list(config.out_of_fold),
         "recordings": calibration.recordings,
         "fitted": list(config.fit),
         "negative_log_likelihood_per_innovation": {"before": found.before, "after": found.after},

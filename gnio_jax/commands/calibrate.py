@@ -16,6 +16,7 @@ DESCRIPTION = """Fit the filter's options of a run to its validation split; writ
   {prog}                                    (the newest run below runs/)
   {prog} --workdir runs/oxiod --out runs/oxiod_honest
   {prog} --workdir runs/oxiod --fit measurement noise
+  {prog} --workdir runs/oxiod --out-of-fold runs/fold0 runs/fold1
 
 A network learns the errors of the walks that it has fitted, which are smaller than those of others.
 First its standard deviations get a factor for each axis, from the errors on the validation split.

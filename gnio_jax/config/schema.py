@@ -60,6 +60,11 @@ class DataConfig:
     """Split of the dataset for training."""
     val_split: str = "val"
     """Split of the dataset for validation, which chooses the best checkpoint."""
+    folds: Count = 1
+    """Folds into which the sessions (or people) of the training split are shared; 1 shares nothing.
+    A network for each fold gives gnio calibrate walks that were not learnt from (ours)."""
+    left_out: NonNegativeCount = 0
+    """With several folds: the one that is left out of training."""
     residency: Literal["device", "host", "auto"] = "device"
     """Where recordings lie in training on windows: on the device, or on the disk, from which
     batches are read ahead; auto: on the disk if they take more than half of the device's memory.
@@ -90,12 +95,15 @@ class DataConfig:
         if self.window % self.stride:
             problem = f"must divide the window of {self.window_seconds:g} s"
             raise InputError(source, f"field '{prefix}stride_seconds' {problem}")
+        if self.left_out >= self.folds:
+            problem = f"must be below data.folds, which is {self.folds}, found {self.left_out}"
+            raise InputError(source, f"field '{prefix}left_out' {problem}")
 
 
 @dataclass(frozen=True)
 class AugmentConfig:
     """Random changes of a training window (TLIO's; the paper is silent). Zero or false switches one
-    off."""
+    off. In training through the filter `yaw` alone plays a part (ours)."""
 
     gyro_bias: NonNegative = 0.05
     """Half-width of the uniform constant gyro bias, rad/s."""
@@ -104,7 +112,7 @@ class AugmentConfig:
     tilt_degrees: NonNegative = 5.0
     """Largest tilt of gravity about a random horizontal axis, degrees."""
     yaw: bool = True
-    """Turn window and target by a random yaw."""
+    """Turn window and target by a random yaw; through the filter, piece and reference."""
     gyro_noise: NonNegative = 0.0
     """Standard deviation of white gyro noise, rad/s."""
     accel_noise: NonNegative = 0.0
@@ -412,7 +420,10 @@ class EvaluateConfig:
     batch_size: int = 16
     """Recordings estimated side by side."""
     plots: bool = True
-    """Draw the trajectories, errors, displacements and the errors' distribution."""
+    """Draw the trajectories, errors, displacements and the errors' distribution, and write
+    report.html."""
+    rerun: str | None = None
+    """File to write for the viewer Rerun, NAME.rrd: paths, covariances, IMU, gate."""
     filter: FilterOptions = field(default_factory=FilterOptions)
     """Noise and start of the filter; by default the run's own."""
 
@@ -431,6 +442,9 @@ class CalibrateConfig:
     split: str | None = None
     """Split whose recordings are fitted: the run's validation split (default) or its training
     split. Others are refused: what is tested must not have been fitted."""
+    out_of_fold: tuple[str, ...] = ()
+    """Folders of runs, one for each fold (gnio train --data.folds K --data.left-out k). The filter
+    is then fitted to the training split, each session seen by the network that left it out."""
     fit: tuple[CalibratedGroup, ...] = ("measurement", "noise", "window")
     """What is fitted by the likelihood of the innovations: `measurement`, the factor of the
     network's covariance; `noise`, the IMU's; `start`, the standard deviations of the initial

@@ -1,6 +1,7 @@
 """Every dataset as a list of `Sequence`: `load(name, root, split)`, `names()`."""
 
 from gnio_jax.data.dataset import Dataset
+from gnio_jax.data.folds import folds, group
 from gnio_jax.data.hdf5 import read_hdf5, write_hdf5
 from gnio_jax.data.plausibility import SelfCheck, self_check
 from gnio_jax.data.registry import find_root, get, load, load_each, names
@@ -13,7 +14,9 @@ __all__ = [
     "SelfCheck",
     "Sequence",
     "find_root",
+    "folds",
     "get",
+    "group",
     "load",
     "load_each",
     "names",

@@ -40,6 +40,7 @@ from gnio_jax.training.pieces import (
     cut_piece,
     draw_start_errors,
     start_rotation,
+    turned_piece,
 )
 from gnio_jax.training.step import Progress, TrainState
 
@@ -175,6 +176,19 @@ def draw_pieces(
     return pieces, errors
 
 
+def training_pieces(
+    key: PRNGKeyArray, source: PieceSource, starts: Int[jax.Array, "b"], config: TrainConfig
+) -> tuple[Piece, StartErrors]:
+    """`draw_pieces`, with `augment.yaw` each turned by a random yaw: the filter finds the same path
+    but for the turn, and the network sees windows of another heading."""
+    pieces, errors = draw_pieces(key, source, starts, config)
+    if config.augment.yaw:
+        count, key = starts.shape[0], jax.random.fold_in(key, 1)
+        angles = jax.random.uniform(key, (count,), jnp.float64, -jnp.pi, jnp.pi)
+        pieces = jax.vmap(turned_piece)(pieces, angles)
+    return pieces, errors
+
+
 def optimizer(config: TrainConfig, steps_per_epoch: int) -> optax.GradientTransformationExtraArgs:
     """The optimizer of what learns."""
     rate = config.through_filter.filter_learning_rate
@@ -202,7 +216,7 @@ def train_steps(
     def one_step(i: jax.Array, carry: tuple[TrainState, Progress]) -> tuple[TrainState, Progress]:
         state, progress = carry
         starts = jax.lax.dynamic_slice(order, ((first + i) * size,), (size,))
-        batch = draw_pieces(jax.random.fold_in(key, state.step), source, starts, config)
+        batch = training_pieces(jax.random.fold_in(key, state.step), source, starts, config)
         variables = state.variables
         learnt = learning.chosen(variables, config.through_filter.learn)
         gradient, losses, healthy = gradient_of_pieces(variables, learnt, *batch, model, config)

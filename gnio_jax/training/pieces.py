@@ -151,6 +151,15 @@ def cut_piece(source: PieceSource, start: Int[jax.Array, ""], intervals: int, st
     return Piece(gyro, accel, Path(*truth))
 
 
+def turned_piece(piece: Piece, angle: Float[jax.Array, ""]) -> Piece:
+    """The piece as if it had been walked in a world turned by `angle` (rad) about the vertical. The
+    IMU's samples are the same. Jittable."""
+    turn = geometry.exp(jnp.stack([jnp.zeros_like(angle), jnp.zeros_like(angle), angle]))
+    rotation, velocity, position = piece.truth
+    truth = Path(jnp.einsum("ij,kjl->kil", turn, rotation), velocity @ turn.T, position @ turn.T)
+    return piece._replace(truth=truth)
+
+
 def draw_start_errors(key: PRNGKeyArray, std: InitialStd, spread: float) -> StartErrors:
     """Errors of a start as uncertain as `spread` times `std`. Jittable."""
     draws = spread * jax.random.normal(key, (5, 3), jnp.float64)

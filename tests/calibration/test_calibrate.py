@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from gnio_jax import calibration, data
+from gnio_jax.calibration import evidence
 from gnio_jax.calibration.errors import std_factors
 from gnio_jax.commands import app
 from gnio_jax.config import CalibrateConfig, DataConfig, FilterOptions, ModelConfig, TrainConfig
@@ -123,3 +124,64 @@ def test_the_factors_are_those_of_the_errors():
     with pytest.raises(ValueError, match="10 windows have a reference"):
         truth[:390] = np.nan
         std_factors([estimate(error, std)], [truth])
+
+
+@pytest.fixture
+def fold_runs(run, tmp_path):
+    """Copies of the run as the folds of one experiment, whose networks differ by a factor."""
+    folders = []
+    for fold in (0, 1):
+        loaded = checkpoint.load_run(run)
+        windows = dataclasses.replace(loaded.config.data, folds=2, left_out=fold)
+        folders.append(
+            drawn_run.save(
+                tmp_path / f"fold{fold}",
+                dataclasses.replace(loaded.config, data=windows, workdir=None),
+                lambda random, kind, shape, fold=fold: random.uniform(0.05, 0.2 + fold, shape),
+            )
+        )
+    return [str(folder) for folder in folders]
+
+
+def test_each_session_is_judged_by_the_network_that_left_it_out(run, two_walks, fold_runs):
+    loaded = checkpoint.load_run(run)
+    config = CalibrateConfig(workdir=str(run), out_of_fold=tuple(fold_runs))
+    split, asked = evidence.sources(loaded, config)
+    found = evidence.gather(split, asked, config, loaded.config.filter, lambda *_: None, 1)
+    assert two_walks == ["train"] and len(found.estimates) == 2
+    walks = data.load("synthetic", None, "train")
+    fold_of = data.folds(walks, 2)
+    assert sorted(fold_of.values()) == [0, 1]
+    for prepared, estimate in zip(*found, strict=True):
+        walk = prepared.sequence
+        fold = fold_of[data.group(walk)]
+        alone = evidence.Source(asked[fold].run, None)
+        both = evidence.gather("train", [alone], config, loaded.config.filter, lambda *_: None, 1)
+        expected = {p.sequence.name: e for p, e in zip(*both, strict=True)}[walk.name]
+        np.testing.assert_array_equal(estimate.displacement, expected.displacement)
+
+
+@pytest.mark.parametrize(
+    ("folders", "split", "problem"),
+    [
+        ([0], None, "--out-of-fold: leaves out the folds 0 of 2; train one run for each of"),
+        ([0, 0], None, "leaves out the folds 0 of 2, 0 of 2"),
+        ([0, 1], "train", "--split train: is of no use with --out-of-fold"),
+    ],
+)
+def test_folds_that_do_not_make_a_whole_are_refused(
+    run, two_walks, fold_runs, folders, split, problem
+):
+    chosen = tuple(fold_runs[fold] for fold in folders)
+    with pytest.raises(InputError, match=problem):
+        calibration.calibrate(CalibrateConfig(workdir=str(run), out_of_fold=chosen, split=split))
+    assert two_walks == []
+
+
+def test_folds_of_another_experiment_are_refused(run, two_walks, fold_runs):
+    config = CalibrateConfig(workdir=str(run), out_of_fold=tuple(fold_runs))
+    loaded = checkpoint.load_run(run)
+    other = dataclasses.replace(loaded.config.model, bank_size=5)
+    changed = loaded._replace(config=dataclasses.replace(loaded.config, model=other))
+    with pytest.raises(InputError, match="fold0: differs from the calibrated run in 'model'"):
+        evidence.sources(changed, config)

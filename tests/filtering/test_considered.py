@@ -5,7 +5,6 @@ import dataclasses
 import functools
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -100,7 +99,7 @@ def test_a_gradient_that_is_cut_leaves_the_sensitivity_whole():
 def test_the_covariance_with_them_is_that_of_the_errors():
     runs, _ = walks()
     (history, found), _ = filtered()
-    added = jax.vmap(lambda s: filtering.considered_covariance(s, STD))(found)
+    added = jax.jit(jax.vmap(lambda s: filtering.considered_covariance(s, STD)))(found)
 
     def nees(covariance):
         error = errors(runs, history)[:, CLONES:, 6:9]
@@ -120,7 +119,7 @@ def test_displacements_are_disturbed_as_they_are_said_to_be():
     wanted = np.exp(0.2) * Rotation.from_euler("z", -0.3).apply(np.nan_to_num(u))
     wanted[:, 2] += 0.1 * np.hypot(u[:, 0], u[:, 1])
     np.testing.assert_allclose(disturbed(u, c), np.where(np.isnan(u), np.nan, wanted), atol=2e-7)
-    slope = jax.jacfwd(lambda c: disturbed(u, c))(jnp.asarray(c))
+    slope = jax.jit(jax.jacfwd(lambda c: disturbed(u, c)))(c)
     assert np.isfinite(np.asarray(slope)[[0, 1, 3, 4]]).all()
 
 

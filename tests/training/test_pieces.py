@@ -62,6 +62,19 @@ def test_a_piece_holds_its_samples_and_the_truth_at_its_clones():
     np.testing.assert_allclose(piece.truth.rotation, rotation, atol=1e-12)
 
 
+def test_a_turned_piece_is_the_same_walk_in_a_turned_world():
+    source = pieces.piece_source([sequence(150, seed=2)], SAMPLES)
+    piece = pieces.cut_piece(source, jnp.int32(7), 5, 4)
+    found = jax.jit(pieces.turned_piece)(piece, jnp.float64(0.7))
+    turn = Rotation.from_euler("z", 0.7).as_matrix()
+    np.testing.assert_array_equal(found.gyro, piece.gyro)
+    np.testing.assert_array_equal(found.accel, piece.accel)
+    np.testing.assert_allclose(found.truth.rotation, turn @ piece.truth.rotation, atol=1e-12)
+    for name in ("velocity", "position"):
+        expected = np.asarray(getattr(piece.truth, name)) @ turn.T
+        np.testing.assert_allclose(getattr(found.truth, name), expected, atol=1e-12)
+
+
 def test_no_piece_at_all_is_a_mistake():
     with pytest.raises(InputError, match=r"no piece of 20 samples .*piece_seconds"):
         pieces.piece_source([sequence(SAMPLES)], SAMPLES)

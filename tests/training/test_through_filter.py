@@ -245,6 +245,29 @@ def test_wild_steps_are_skipped_and_counted(training):
         assert figures["loss"] == 2.0 and figures["skipped"] == 2
 
 
+def test_training_pieces_are_turned_by_any_yaw(training):
+    starts = jnp.zeros(64, jnp.int32)
+    draw = jax.jit(filter_step.training_pieces, static_argnames="config")
+    as_walked, turned = (
+        draw(
+            jax.random.key(0),
+            training.source,
+            starts,
+            config=dataclasses.replace(
+                training.config, augment=dataclasses.replace(training.config.augment, yaw=yaw)
+            ),
+        )
+        for yaw in (False, True)
+    )
+    np.testing.assert_array_equal(as_walked[0].gyro, turned[0].gyro)
+    np.testing.assert_array_equal(as_walked[1].velocity, turned[1].velocity)
+    before, after = (np.asarray(found[0].truth.velocity[:, 0]) for found in (as_walked, turned))
+    np.testing.assert_allclose(np.linalg.norm(after, axis=1), np.linalg.norm(before, axis=1))
+    assert (before == before[0]).all()
+    angle = np.arctan2(after[:, 1], after[:, 0])
+    assert abs(np.exp(1j * angle).mean()) < 0.4  # all round the circle
+
+
 def test_no_call_to_lapack_waits_for_a_worker(training):
     """Where each core is a device, its batched calls in the step deadlock."""
     state = new_state(training)

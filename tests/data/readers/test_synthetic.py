@@ -6,6 +6,7 @@ import pytest
 from gnio_jax import data
 from gnio_jax.data.readers import synthetic
 from gnio_jax.errors import InputError
+from tests.support.strap_down import matrices, strap_down
 
 
 @pytest.fixture(scope="module")
@@ -16,46 +17,6 @@ def val():
 @pytest.fixture(scope="module")
 def test():
     return data.load("synthetic", split="test")
-
-
-def matrices(wxyz):
-    w, x, y, z = np.moveaxis(wxyz, -1, 0)
-    return np.stack(
-        [
-            np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], -1),
-            np.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], -1),
-            np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], -1),
-        ],
-        -2,
-    )
-
-
-def strap_down(sequence):
-    """Positions from integrating the IMU alone, sample by sample: R exp((gyro) dt), v + (R accel +
-    g) dt."""
-    dt, gravity = 1 / 200, np.array([0, 0, -9.81])
-    rotation, velocity, position = (
-        matrices(sequence.orientation[0]),
-        sequence.velocity[0],
-        sequence.position[0],
-    )
-    angles = np.linalg.norm(sequence.gyro, axis=1)[:, None, None] * dt
-    x, y, z = sequence.gyro.T * dt
-    zero = np.zeros_like(x)
-    cross = np.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]]).transpose(2, 0, 1)
-    turns = (
-        np.eye(3)
-        + np.sinc(angles / np.pi) * cross
-        + 0.5 * np.sinc(angles / 2 / np.pi) ** 2 * cross @ cross
-    )
-    positions = np.empty_like(sequence.position)
-    for k in range(len(sequence.time)):
-        positions[k] = position
-        change = rotation @ sequence.accel[k] * dt
-        position = position + velocity * dt + 0.5 * change * dt + 0.5 * gravity * dt**2
-        velocity = velocity + change + gravity * dt
-        rotation = rotation @ turns[k]
-    return positions
 
 
 @pytest.mark.parametrize("placement", list(synthetic.PLACEMENTS))
@@ -95,8 +56,8 @@ def test_the_stated_biases_and_noise_are_the_true_ones():
     sequence = synthetic.pedestrian(11, walker, "bag", 60.0)
     np.testing.assert_array_equal(ideal.position, sequence.position)
     for field, density, bounds in (
-        ("gyro", synthetic.GYRO_DENSITY, synthetic.GYRO_BIAS),
-        ("accel", synthetic.ACCEL_DENSITY, synthetic.ACCEL_BIAS),
+        ("gyro", synthetic.PHONE.gyro_density, synthetic.PHONE.gyro_bias),
+        ("accel", synthetic.PHONE.accel_density, synthetic.PHONE.accel_bias),
     ):
         error = getattr(sequence, field) - getattr(ideal, field)
         stated = np.array([sequence.attributes[f"{field}_bias_{axis}"] for axis in "xyz"])

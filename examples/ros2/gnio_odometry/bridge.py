@@ -1,0 +1,81 @@
+"""From sensor_msgs/Imu to nav_msgs/Odometry, without ROS: what the node does with each message."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+NANOSECONDS = 1_000_000_000
+
+
+class Odometry(NamedTuple):
+    """The fields of nav_msgs/Odometry and of the transform, of one clone step."""
+
+    stamp: tuple[int, int]
+    """(sec, nanosec) of the pose."""
+    position: tuple[float, float, float]
+    """In the frame `odom`, m."""
+    orientation: tuple[float, float, float, float]
+    """x, y, z, w: from the IMU to `odom`."""
+    velocity: tuple[float, float, float]
+    """In the IMU's frame, as nav_msgs/Odometry asks for it, m/s."""
+    pose_covariance: list[float]
+    """36 numbers, row by row: x, y, z, and rotation about x, y, z."""
+    twist_covariance: list[float]
+    """36 numbers; that of the angular rate is unknown (-1)."""
+
+
+class Bridge:
+    """Feeds a `gnio_jax.filtering.Tracker` with messages. Stamps are counted from the first one, in
+    whole nanoseconds, so that no digit is lost in float64."""
+
+    def __init__(self, tracker: Any):
+        self._tracker = tracker
+        self._first: int | None = None
+        self.refused = 0
+        """Messages that the tracker could not take."""
+        self.reason = ""
+        """Why the newest of them was refused."""
+
+    def take(self, message: Any) -> Odometry | None:
+        """One message; returns the odometry of a clone step, if it made one.
+
+        `linear_acceleration` must contain gravity, as REP 145 wants it of raw data.
+        """
+        stamp = message.header.stamp
+        now = stamp.sec * NANOSECONDS + stamp.nanosec
+        self._first = now if self._first is None else self._first
+        gyro, accel = message.angular_velocity, message.linear_acceleration
+        try:
+            pose = self._tracker.push(
+                (now - self._first) / NANOSECONDS,
+                (gyro.x, gyro.y, gyro.z),
+                (accel.x, accel.y, accel.z),
+            )
+        except ValueError as error:
+            self.refused += 1
+            self.reason = str(error)
+            return None
+        return None if pose is None else self._odometry(pose)
+
+    def _odometry(self, pose: Any) -> Odometry:
+        assert self._first is not None
+        sec, nanosec = divmod(self._first + round(pose.time * NANOSECONDS), NANOSECONDS)
+        covariance = np.asarray(pose.covariance)
+        of_pose, of_twist = np.zeros((6, 6)), np.zeros((6, 6))
+        # The filter's error is (θ, v, p, ...), θ in the world frame.
+        order = [6, 7, 8, 0, 1, 2]
+        of_pose[:] = covariance[np.ix_(order, order)]
+        rotation = np.asarray(pose.rotation)
+        of_twist[:3, :3] = rotation.T @ covariance[3:6, 3:6] @ rotation
+        of_twist[3:, 3:] = -np.eye(3)
+        return Odometry(
+            (sec, nanosec),
+            tuple(np.asarray(pose.position).tolist()),
+            tuple(Rotation.from_matrix(rotation).as_quat().tolist()),
+            tuple((rotation.T @ np.asarray(pose.velocity)).tolist()),
+            of_pose.ravel().tolist(),
+            of_twist.ravel().tolist(),
+        )

@@ -1,0 +1,70 @@
+"""A ROS 2 node around `gnio_jax.filtering.Tracker`: sensor_msgs/Imu in, nav_msgs/Odometry and TF
+out."""
+
+import jax
+import rclpy
+from geometry_msgs.msg import TransformStamped
+from nav_msgs.msg import Odometry
+from rclpy.node import Node
+from rclpy.qos import qos_profile_sensor_data
+from sensor_msgs.msg import Imu
+from tf2_ros import TransformBroadcaster
+
+from gnio_jax import live, tracking
+from gnio_odometry.bridge import Bridge
+
+
+class GnioOdometry(Node):
+    """Parameters: weights (name, package or run folder), imu_rate (Hz; 0: the network's),
+    rest_seconds (the device lies still so long at the start), odom_frame."""
+
+    def __init__(self):
+        super().__init__("gnio_odometry")
+        weights = self.declare_parameter("weights", "pedestrian").value
+        rate = self.declare_parameter("imu_rate", 0.0).value
+        rest = self.declare_parameter("rest_seconds", 1.0).value
+        self._odom = self.declare_parameter("odom_frame", "odom").value
+        run = tracking.choose_weights(weights).run
+        self._bridge = Bridge(live.create_tracker(run, rate or None, rest))
+        self._publisher = self.create_publisher(Odometry, "odometry", 10)
+        self._transforms = TransformBroadcaster(self)
+        self.create_subscription(Imu, "imu", self._take, qos_profile_sensor_data)
+        self.get_logger().info(f"ready with {weights}; keep the device still for {rest:g} s")
+
+    def _take(self, message: Imu) -> None:
+        refused = self._bridge.refused
+        found = self._bridge.take(message)
+        if self._bridge.refused > refused:
+            self.get_logger().warning(self._bridge.reason, throttle_duration_sec=5.0)
+        if found is None:
+            return
+        odometry = Odometry()
+        odometry.header.stamp.sec, odometry.header.stamp.nanosec = found.stamp
+        odometry.header.frame_id = self._odom
+        odometry.child_frame_id = message.header.frame_id
+        place, turn = odometry.pose.pose.position, odometry.pose.pose.orientation
+        place.x, place.y, place.z = found.position
+        turn.x, turn.y, turn.z, turn.w = found.orientation
+        speed = odometry.twist.twist.linear
+        speed.x, speed.y, speed.z = found.velocity
+        odometry.pose.covariance = found.pose_covariance
+        odometry.twist.covariance = found.twist_covariance
+        self._publisher.publish(odometry)
+
+        transform = TransformStamped()
+        transform.header, transform.child_frame_id = odometry.header, odometry.child_frame_id
+        move = transform.transform.translation
+        move.x, move.y, move.z = found.position
+        transform.transform.rotation = turn
+        self._transforms.sendTransform(transform)
+
+
+def main() -> None:
+    jax.config.update("jax_enable_x64", True)  # for the filter
+    rclpy.init()
+    node = GnioOdometry()
+    try:
+        rclpy.spin(node)
+    finally:
+        node.destroy_node()
+        rclpy.try_shutdown()

@@ -1,0 +1,133 @@
+"""What a calibration is fitted to: recordings, and displacements of them by a network that did not
+learn from them."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+from gnio_jax import data
+from gnio_jax.config import CalibrateConfig, FilterOptions, TrainConfig
+from gnio_jax.errors import InputError
+from gnio_jax.evaluation import Setup, estimate, inference_network, prepare
+from gnio_jax.evaluation.estimators.result import Estimate
+from gnio_jax.evaluation.preparation import Prepared
+from gnio_jax.training import checkpoint
+from gnio_jax.training.checkpoint import Run
+from gnio_jax.types import Sequence
+
+OnStage = Callable[[str, float], None]
+"""Called with the stage and the share of it that is done."""
+
+
+class Evidence(NamedTuple):
+    """Recordings and what a network says of each, in one order."""
+
+    prepared: list[Prepared]
+    estimates: list[Estimate]
+
+
+class Source(NamedTuple):
+    """A network and the recordings that it is asked about."""
+
+    run: Run
+    fold: int | None
+    """The fold of the split; None for all of it."""
+
+
+def sources(run: Run, config: CalibrateConfig) -> tuple[str, list[Source]]:
+    """The split, and the networks that are asked about it: the run's own, or one for each fold.
+
+    Raises `InputError` for a split that is neither the run's validation nor its training split, and
+    for runs that are not the folds of one experiment.
+    """
+    if not config.out_of_fold:
+        return _split(config, run.config), [Source(run, None)]
+    if config.split:
+        problem = "is of no use with --out-of-fold, which takes the training split"
+        raise InputError(f"--split {config.split}", problem)
+    runs = [checkpoint.load_run(Path(folder), config.checkpoint) for folder in config.out_of_fold]
+    for folder, fold_run in zip(config.out_of_fold, runs, strict=True):
+        _check_alike(folder, fold_run.config, run.config)
+    folds = runs[0].config.data.folds
+    left_out = [each.config.data.left_out for each in runs]
+    alike = {each.config.data.folds for each in runs} == {folds}
+    if not alike or folds == 1 or sorted(left_out) != list(range(folds)):
+        found = ", ".join(f"{r.config.data.left_out} of {r.config.data.folds}" for r in runs)
+        remedy = "train one run for each of --data.left-out 0 to K - 1 with --data.folds K"
+        raise InputError("--out-of-fold", f"leaves out the folds {found}", remedy)
+    return run.config.data.train_split, [Source(each, each.config.data.left_out) for each in runs]
+
+
+def _split(config: CalibrateConfig, run: TrainConfig) -> str:
+    split = config.split or run.data.val_split
+    allowed = (run.data.val_split, run.data.train_split)
+    if split not in allowed:
+        raise InputError(
+            f"--split {split}",
+            "is neither the validation nor the training split of the run",
+            f"give {' or '.join(allowed)}: what is tested must not have been fitted",
+        )
+    return split
+
+
+def _check_alike(folder: str, fold_run: TrainConfig, run: TrainConfig) -> None:
+    """A fold has the experiment of the run, but for its share of the recordings."""
+    own = dataclasses.replace(fold_run.data, folds=run.data.folds, left_out=run.data.left_out)
+    for name, found, expected in (
+        ("dataset", fold_run.dataset, run.dataset),
+        ("data", own, run.data),
+        ("model", fold_run.model, run.model),
+    ):
+        if found != expected:
+            raise InputError(folder, f"differs from the calibrated run in '{name}'")
+
+
+def gather(
+    split: str,
+    asked: list[Source],
+    config: CalibrateConfig,
+    options: FilterOptions,
+    progress: OnStage,
+    workers: int,
+) -> Evidence:
+    """What each network says of its recordings of the split. Raises `InputError` for missing data.
+
+    Displacements are asked for along the filter with `options`: its attitude turns the windows.
+    """
+    own = asked[0].run.config
+    root = config.data_root or own.data_root
+    sequences = data.load(
+        own.dataset, root, split, workers, lambda share: progress("reading", share)
+    )
+    found = Evidence([], [])
+    for number, source in enumerate(asked):
+        prepared = _prepared(source, sequences, split)
+        network = inference_network(source.run.model, source.run.variables)
+        estimates = estimate(
+            prepared,
+            network,
+            own.data,
+            options,
+            progress=lambda share, n=number: progress("estimating", (n + share) / len(asked)),
+        )
+        found.prepared.extend(prepared)
+        found.estimates.extend(estimates)
+    return found
+
+
+def _prepared(source: Source, sequences: list[Sequence], split: str) -> list[Prepared]:
+    config = source.run.config
+    with_reference = [each for each in sequences if each.valid.any()]
+    where = f"dataset {config.dataset}, split '{split}'"
+    if source.fold is not None:
+        fold_of = data.folds(sequences, config.data.folds)
+        with_reference = [e for e in with_reference if fold_of[data.group(e)] == source.fold]
+        where = f"{where}, fold {source.fold}"
+    prepared, _ = prepare(with_reference, config.data, Setup())
+    if not prepared:
+        problem = "has no recording with a reference that is long enough to be fitted"
+        raise InputError(where, problem)
+    return prepared

@@ -1,0 +1,177 @@
+"""`gnio live`: the trajectory while the samples come."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import tyro
+
+from gnio_jax.commands import console
+from gnio_jax.commands.options import Command
+from gnio_jax.errors import InputError
+
+DESCRIPTION = """Follow an IMU live: where its carrier is now.
+
+  phone_stream | {prog} --weights runs/mine      (lines time,gyro x,y,z,accel x,y,z)
+  {prog} udp:5555 --imu-rate 200                 (the same lines as datagrams on this machine)
+  {prog} walk.zip --speed 4                      (a recording or bag, four times as fast)
+
+Units are s, rad/s and m/s², +9.81 upwards at rest; a JSON object with time, gyro and accel does as
+well. Keep the device still for the first second: tilt and velocity are taken from it. In a terminal
+it draws the path, elsewhere it prints a line each second. Ctrl-C ends it; the trajectory is written
+all the same. A log of one's own is read with the options of gnio track after gnio data import."""
+
+UDP = "udp:"
+
+
+@dataclass(frozen=True)
+class LiveOptions:
+    """What `gnio live` is asked for."""
+
+    source: tyro.conf.Positional[Annotated[str, tyro.conf.arg(metavar="SOURCE")]] = "-"
+    """- for standard input, udp:PORT on this machine, or a recording."""
+    weights: str | None = None
+    """Name, package or run folder; by default the network that comes with gnio-jax, else the newest
+    run below runs/."""
+    out: Path | None = None
+    """File for the trajectory, in TUM format, when the stream has ended."""
+    imu_rate: float | None = None
+    """Samples per second that will come, Hz; by default the network's, or the recording's."""
+    rest_seconds: float = 1.0
+    """How long the device lies still at the start, s."""
+    speed: float = 1.0
+    """Of a recording: how many times as fast as it was taken; 0 as fast as can be."""
+    silence: float | None = None
+    """Of datagrams: end after so many seconds without one."""
+
+
+def live(options: LiveOptions, _prog: str) -> None:
+    """Follow, show, and write the trajectory."""
+    # After the options: --help and mistakes do not wait for these imports.
+    import jax
+
+    from gnio_jax import live as following
+    from gnio_jax import tracking
+
+    jax.config.update("jax_enable_x64", True)  # for the filter; the network states its float32
+    weights = tracking.choose_weights(options.weights)
+    source, rate = _source(options)
+    found = following.Follower()
+    with console.terminal() as terminal:
+        terminal.progress("compiling", 0.0)
+        try:
+            tracker = following.create_tracker(weights.run, rate, options.rest_seconds)
+        except ValueError as error:
+            raise InputError("--imu-rate or --rest-seconds", str(error)) from None
+    output = console.stdout()
+    output.print(f"following {source.name} with {weights.name}; Ctrl-C ends it", soft_wrap=True)
+    with _shown(output) as show, contextlib.suppress(KeyboardInterrupt):
+        following.follow(tracker.push, source, found, show)
+    if found.refused:
+        lines = f"warning: {found.refused} lines refused, the first: {found.reason}"
+        output.print(lines, soft_wrap=True)
+    if not found.poses:
+        problem = f"ended before the device was still for {options.rest_seconds:g} s"
+        raise InputError(source.name, problem, "let it run longer, or lower --rest-seconds")
+    output.print(_line(found.poses), soft_wrap=True)
+    if options.out:
+        _write(options.out, found.poses)
+        output.print(f"trajectory: {options.out}", soft_wrap=True)
+
+
+def _source(options: LiveOptions) -> tuple[Any, float | None]:
+    """Where samples come from, and their rate where it is known."""
+    from gnio_jax import live as following
+
+    if options.source == "-":
+        return following.lines_of(sys.stdin), options.imu_rate
+    if options.source.startswith(UDP):
+        port = options.source.removeprefix(UDP)
+        if not port.isdigit():
+            raise InputError(options.source, "names no port", "write udp:5555")
+        return following.datagrams(int(port), options.silence), options.imu_rate
+    if options.speed < 0:
+        raise InputError("--speed", f"must not be negative, found {options.speed:g}")
+    sequence = _recording(Path(options.source))
+    rate = 1 / float(np.median(np.diff(sequence.time)))
+    return following.from_recording(sequence, options.speed), options.imu_rate or rate
+
+
+def _recording(path: Path) -> Any:
+    if path.suffix.lower() in (".h5", ".hdf5"):
+        from gnio_jax.data.hdf5 import read_hdf5
+
+        return read_hdf5(path)
+    from gnio_jax.data.importing import import_recording
+
+    return import_recording(path).sequence
+
+
+@contextlib.contextmanager
+def _shown(output: Any) -> Iterator[Callable[[Any], None]]:
+    """What is called after each clone step: it draws in a terminal, and prints a line each second
+    elsewhere."""
+    if not output.is_terminal:
+        yield lambda found: _print_each_second(output, found.poses)
+        return
+    from rich.live import Live
+    from rich.text import Text
+
+    from gnio_jax.live import drawing
+
+    with Live(console=output, refresh_per_second=8, transient=True) as screen:
+
+        def draw(found: Any) -> None:
+            columns, rows = max(10, output.width - 2), max(5, output.height - 4)
+            positions = np.array([pose.position for pose in found.poses])
+            screen.update(Text(f"{drawing(positions, columns, rows)}\n{_line(found.poses)}"))
+
+        yield draw
+
+
+def _print_each_second(output: Any, poses: list[Any]) -> None:
+    newest, start = poses[-1].time, poses[0].time
+    before = poses[-2].time if len(poses) > 1 else start - 1
+    if int(newest - start) > int(before - start):
+        output.print(_line(poses), soft_wrap=True)
+
+
+def _line(poses: list[Any]) -> str:
+    """The newest pose in words."""
+    pose = poses[-1]
+    x, y, z = pose.position
+    sigma = float(np.sqrt(np.trace(pose.covariance[6:8, 6:8])))
+    path = np.array([each.position for each in poses[::10]])
+    walked = float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
+    health = "" if pose.healthy else "  THE FILTER DIVERGED"
+    return (
+        f"{pose.time - poses[0].time:7.1f} s  x {x:+8.2f}  y {y:+8.2f}  z {z:+7.2f} m  "
+        f"± {sigma:.2f} m  walked {walked:.1f} m{health}"
+    )
+
+
+def _write(path: Path, poses: list[Any]) -> None:
+    from scipy.spatial.transform import Rotation
+
+    from gnio_jax.evaluation import Trajectory
+    from gnio_jax.evaluation.tum import write_tum
+    from gnio_jax.files import replacing
+
+    sound = [pose for pose in poses if np.isfinite(pose.rotation).all()]
+    orientation = Rotation.from_matrix(np.array([pose.rotation for pose in sound]))
+    trajectory = Trajectory(
+        np.array([pose.time for pose in sound]),
+        np.array([pose.position for pose in sound]),
+        orientation.as_quat(scalar_first=True),
+    )
+    with replacing(path) as temporary:
+        write_tum(temporary, trajectory)
+
+
+COMMAND = Command(LiveOptions, live, DESCRIPTION)

@@ -1,0 +1,19 @@
+"""Odometry while the samples come: where they come from, the filter that follows, the screen."""
+
+from gnio_jax.live.following import Follower, create_tracker, follow
+from gnio_jax.live.samples import Sample, parse_line
+from gnio_jax.live.screen import drawing
+from gnio_jax.live.sources import Source, datagrams, from_recording, lines_of
+
+__all__ = [
+    "Follower",
+    "Sample",
+    "Source",
+    "create_tracker",
+    "datagrams",
+    "drawing",
+    "follow",
+    "from_recording",
+    "lines_of",
+    "parse_line",
+]

@@ -1,0 +1,99 @@
+"""A tracker that follows a stream: what is refused is counted, and said once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+from gnio_jax.errors import InputError
+from gnio_jax.evaluation import inference_network
+from gnio_jax.filtering import Tracker
+from gnio_jax.filtering.options import filter_setup
+from gnio_jax.filtering.pose import Pose
+from gnio_jax.live.samples import Sample
+from gnio_jax.live.sources import Source
+from gnio_jax.training.checkpoint import Run
+
+Push = Callable[[Any, Any, Any], Pose | None]
+"""`Tracker.push`: (time, gyro, accel) -> the pose of a clone step; raises `ValueError`."""
+LINES_BEFORE_A_SAMPLE = 100
+"""So many lines without a single sample are no stream of an IMU."""
+
+
+def create_tracker(
+    run: Run, imu_rate: float | None = None, rest_seconds: float = 1.0, hole: float | None = None
+) -> Tracker:
+    """The compiled tracker of a run, which starts from rest.
+
+    `imu_rate` is that of the samples that will come, Hz (None: the network's), `hole` the time
+    between two samples beyond which some are missing, s (None: 1.5 intervals). Raises `ValueError`
+    for a rest that is shorter than two samples.
+    """
+    setup = filter_setup(run.config.data, run.config.filter)
+    network = inference_network(run.model, run.variables)
+
+    def predict(windows: Any) -> Any:
+        return network.apply(network.variables, windows)
+
+    interval = 1 / (imu_rate or run.config.data.rate)
+    longest_gap = hole or 1.5 * max(setup.config.dt, interval)
+    return Tracker.from_rest(
+        predict,
+        setup.config,
+        setup.noise,
+        rest_seconds,
+        setup.initial_std,
+        longest_gap,
+        imu_rate=1 / interval,
+    )
+
+
+@dataclass
+class Follower:
+    """What has been found so far."""
+
+    poses: list[Pose] = field(default_factory=list)
+    """One for each clone step."""
+    samples: int = 0
+    refused: int = 0
+    """Lines that were no samples, and samples that the tracker could not take."""
+    reason: str = ""
+    """Why the first one was refused."""
+
+
+def follow(
+    push: Push, source: Source, found: Follower, on_pose: Callable[[Follower], None]
+) -> None:
+    """Feed the samples to a tracker until the source ends; `found` grows on the way, and
+    `on_pose` is called after each clone step.
+
+    Raises `InputError` where nothing that comes is a sample.
+    """
+    for sample in source.samples:
+        pose = _pushed(push, sample, found)
+        if pose is not None:
+            found.poses.append(pose)
+            on_pose(found)
+        if found.samples == 0 and found.refused >= LINES_BEFORE_A_SAMPLE:
+            problem = f"has no sample in its first {LINES_BEFORE_A_SAMPLE} lines"
+            raise InputError(source.name, problem, f"the first one {found.reason}")
+
+
+def _pushed(push: Push, sample: Sample | None, found: Follower) -> Pose | None:
+    """The pose that a sample makes, if it makes one."""
+    if sample is None:
+        _refuse(found, "is no sample: time,gyro x,y,z,accel x,y,z or JSON is wanted")
+        return None
+    try:
+        pose = push(sample.time, sample.gyro, sample.accel)
+    except ValueError as error:
+        _refuse(found, str(error))
+        return None
+    found.samples += 1
+    return pose
+
+
+def _refuse(found: Follower, reason: str) -> None:
+    found.refused += 1
+    found.reason = found.reason or reason

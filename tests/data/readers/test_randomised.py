@@ -1,0 +1,98 @@
+"""The randomised pedestrians obey physics, differ widely, and share what a network shall learn."""
+
+import numpy as np
+import pytest
+
+from gnio_jax import data
+from gnio_jax.data.readers import randomised, simulated_phone
+from gnio_jax.data.readers.random_gait import CARRYING, random_errors, random_motion
+from tests.support.strap_down import matrices, strap_down
+
+RATE = 100.0
+
+
+@pytest.fixture(scope="module")
+def walks():
+    return [randomised.random_walk(seed, 40.0) for seed in range(40)]
+
+
+def error_free(seed, placement, seconds=60.0):
+    rng = np.random.default_rng(seed)
+    time = np.arange(round(seconds * RATE) + 1) / RATE
+    walk = random_motion(rng, CARRYING[placement], time, 1 / RATE)
+    samples = simulated_phone.imu(rng, walk, 1 / RATE, random_errors(rng), with_errors=False)
+    device = simulated_phone.device_attitude(rng, walk, 1 / RATE)
+    return simulated_phone.phone_sequence("walk", walk, samples, device, {})
+
+
+@pytest.mark.parametrize("placement", list(CARRYING))
+def test_the_error_free_imu_integrates_to_the_trajectory(placement):
+    sequence = error_free(3, placement)
+    found = strap_down(sequence)
+    # A sample's velocity is the mean of its ends; the path between them is curved.
+    assert np.abs(found - sequence.position).max() < 5e-3
+
+
+def test_every_walk_passes_the_self_check(walks):
+    for sequence in walks:
+        data.validate(sequence, sequence.name)
+        check = data.self_check(sequence)
+        assert check.failures == ()
+        assert check.accel_correlation_horizontal > 0.9
+
+
+def test_a_seed_is_a_walk_and_splits_share_none(walks):
+    again = randomised.random_walk(7, 40.0)
+    np.testing.assert_array_equal(again.accel, walks[7].accel)
+    assert again.attributes == walks[7].attributes
+    names = [
+        {r.name for r in randomised.recordings(None, split)} for split in ("train", "val", "test")
+    ]
+    assert sum(map(len, names)) == len(set.union(*names)) == 600 + 40 + 24
+
+
+def test_all_ways_of_carrying_occur(walks):
+    assert {walk.attributes["placement"] for walk in walks} == set(CARRYING)
+    assert sum(each.share for each in CARRYING.values()) == pytest.approx(1.0)
+
+
+def surge_and_force(sequence):
+    """(velocity against the walker's own along the direction of travel, vertical force, speed), the
+    first by integrating the IMU's horizontal force over a second."""
+    force = np.einsum("nij,nj->ni", matrices(sequence.orientation), sequence.accel)
+    second = round(RATE)
+    travel = (sequence.position[second:] - sequence.position[:-second])[:, :2]
+    speed = np.linalg.norm(travel, axis=1)
+    surge = np.cumsum(force[:, :2], axis=0) / RATE
+    box = np.ones(second + 1) / (second + 1)
+    surge = surge - np.apply_along_axis(np.convolve, 0, surge, box, mode="same")
+    middle = slice(second // 2, -second // 2)
+    direction = travel / np.maximum(speed, 1e-6)[:, None]
+    return np.einsum("ni,ni->n", surge[middle], direction), force[middle, 2], speed
+
+
+@pytest.mark.parametrize(
+    ("placement", "sign"), [("handheld", 1), ("pocket", 1), ("chest", 1), ("handbag", -1)]
+)
+def test_forward_is_told_from_backward_by_the_same_rule_for_nearly_all_walkers(placement, sign):
+    found = []
+    for seed in range(12):
+        surge, vertical, speed = surge_and_force(error_free(seed, placement, 40.0))
+        # Runs, which are told by their force, follow the opposite rule.
+        walking = (speed > 0.6) & (speed < 1.7)
+        force = np.convolve(np.abs(vertical - 9.81), np.ones(200) / 200, mode="same")
+        walking &= force < 3.0
+        if walking.sum() > 500:
+            found.append(np.corrcoef(surge[walking], vertical[walking])[0, 1])
+    assert len(found) >= 8
+    assert np.mean(sign * np.array(found) > 0) >= 0.8 and sign * np.mean(found) > 0.15
+
+
+def test_bounce_at_one_speed_differs_widely_between_walkers():
+    bounces = []
+    for seed in range(16):
+        _, vertical, speed = surge_and_force(error_free(seed, "handheld", 40.0))
+        walking = (speed > 0.9) & (speed < 1.3)
+        if walking.sum() > 200:
+            bounces.append(vertical[walking].std())
+    assert len(bounces) >= 6 and max(bounces) > 1.6 * min(bounces)

@@ -1,0 +1,122 @@
+"""`gnio live`: the trajectory of a stream is that of the tracker, and nonsense is refused."""
+
+import io
+import sys
+
+import numpy as np
+import pytest
+
+from gnio_jax import live, tracking
+from gnio_jax.commands import app, console
+from gnio_jax.config import DataConfig, ModelConfig, TrainConfig
+from gnio_jax.errors import InputError
+from gnio_jax.evaluation.tum import read_tum
+from tests.support import known_walk, tiny_run
+
+CONFIG = TrainConfig(data=DataConfig(rate=50.0), model=ModelConfig(name="tiny"))
+RATE = 50.0
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    with tiny_run.known():
+        yield tiny_run.save(tmp_path_factory.mktemp("home") / "run", CONFIG)
+
+
+@pytest.fixture(scope="module")
+def recorded():
+    """(time, gyro, accel) of a second of rest and four of walking."""
+    time = np.arange(0, 5, 1 / RATE)
+    gyro, accel = known_walk.rate(time), known_walk.force(time)
+    still = time < 1.0
+    down = known_walk.force(np.array([1.0]))
+    gyro[still], accel[still] = 0.0, 9.81 * down / np.linalg.norm(down)
+    return time, gyro, accel
+
+
+@pytest.fixture
+def gnio(monkeypatch, capsys):
+    def call(lines, *arguments):
+        monkeypatch.setattr(sys, "stdin", io.StringIO("\n".join(lines)))
+        console.run(lambda: app.main(["live", *map(str, arguments)]))
+        return capsys.readouterr().out
+
+    return call
+
+
+def as_lines(recorded):
+    rows = np.column_stack(recorded).tolist()
+    return [",".join(map(repr, row)) for row in rows]
+
+
+def test_a_stream_gives_the_trackers_poses(gnio, run, recorded, tmp_path):
+    out = tmp_path / "live.txt"
+    lines = as_lines(recorded)
+    # A header, noise on the line and a repeated sample are refused and counted.
+    lines = ["time,gx,gy,gz,ax,ay,az", *lines[:70], "garbage", lines[69], *lines[70:]]
+    told = gnio(lines, "--weights", run, "--out", out)
+    assert "\x1b" not in told and "warning: 3 lines refused, the first: is no sample" in told
+    # A line a second, the last one repeated at the end.
+    assert sum(line.lstrip()[0].isdigit() for line in told.splitlines()) == 6
+
+    tracker, expected = live.create_tracker(tracking.choose_weights(str(run)).run, RATE), []
+    for time, gyro, accel in zip(*recorded, strict=True):
+        pose = tracker.push(time, gyro, accel)
+        expected += [] if pose is None else [pose]
+    found = read_tum(out)
+    np.testing.assert_allclose(found.time, [pose.time for pose in expected], atol=1e-8)
+    np.testing.assert_allclose(found.position, [p.position for p in expected], atol=1e-8)
+
+
+class Refusing:
+    """A tracker that takes nothing."""
+
+    def push(self, time, gyro, accel):
+        raise ValueError(f"time: must increase, found {time}")
+
+
+@pytest.mark.parametrize(
+    ("line", "problem"),
+    [("HTTP/1.1 400", "is no sample"), ("5,0,0,0,0,0,9", "time: must increase")],
+)
+def test_a_stream_of_nonsense_ends_with_one_line(line, problem):
+    found = live.Follower()
+    source = live.lines_of([line] * 500, "udp:5555")
+    with pytest.raises(InputError, match=f"udp:5555: has no sample in its first 100.*{problem}"):
+        live.follow(Refusing().push, source, found, lambda found: None)
+    assert found.refused == 100 and found.poses == []
+
+
+@pytest.mark.parametrize(
+    ("lines", "arguments", "problem"),
+    [
+        ([], ["udp:nine"], "udp:nine: names no port; write udp:5555"),
+        ([], ["nowhere.csv"], "nowhere.csv"),
+        ([], ["nowhere.csv", "--speed", "-1"], "--speed: must not be negative"),
+        ([], ["--rest-seconds", "0"], "--imu-rate or --rest-seconds: seconds: must be a time of"),
+    ],
+)
+def test_mistakes_are_one_line(gnio, capsys, run, lines, arguments, problem):
+    with pytest.raises(SystemExit, match="2"):
+        gnio(lines, *arguments, "--weights", run)
+    told = capsys.readouterr().err
+    assert told.count("\n") == 1 and problem in told
+
+
+def test_a_stream_that_ends_at_once_has_no_trajectory(gnio, capsys, run, monkeypatch):
+    monkeypatch.setattr(live, "create_tracker", lambda *_: Refusing())
+    with pytest.raises(SystemExit, match="2"):
+        gnio(["0,0,0,0,0,0,9.81"], "--weights", run)
+    told = capsys.readouterr().err
+    assert told == (
+        "standard input: ended before the device was still for 1 s; "
+        "let it run longer, or lower --rest-seconds\n"
+    )
+
+
+def test_a_recording_is_played(gnio, run, recorded, tmp_path):
+    header = "time,gyro_x,gyro_y,gyro_z,accel_x,accel_y,accel_z"
+    walk = tmp_path / "walk.csv"
+    np.savetxt(walk, np.column_stack(recorded), delimiter=",", header=header, comments="")
+    told = gnio([], walk, "--speed", "0", "--weights", run)
+    assert told.startswith("following walk with run") and "walked" in told

@@ -1,0 +1,87 @@
+"""The logic of the ROS 2 node, without ROS."""
+
+import importlib.util
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from gnio_jax.filtering.pose import Pose
+
+BRIDGE = Path(__file__).parents[2] / "examples" / "ros2" / "gnio_odometry" / "bridge.py"
+TURN = Rotation.from_euler("xyz", [0.3, -0.5, 1.2])
+SQUARE = np.random.default_rng(0).normal(size=(15, 15))
+COVARIANCE = SQUARE @ SQUARE.T
+
+
+@pytest.fixture(scope="module")
+def bridge():
+    spec = importlib.util.spec_from_file_location("bridge", BRIDGE)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+class Recorder:
+    """A tracker that keeps what it is given and makes a pose of every second sample."""
+
+    def __init__(self):
+        self.samples = []
+
+    def push(self, time, gyro, accel):
+        if self.samples and time <= self.samples[-1][0]:
+            raise ValueError(f"time: must increase, found {time}")
+        self.samples.append((time, gyro, accel))
+        if len(self.samples) % 2:
+            return None
+        zero = np.zeros(3)
+        velocity, position = np.array([1.0, 2.0, 3.0]), np.array([4.0, 5.0, 6.0])
+        return Pose(
+            time, TURN.as_matrix(), velocity, position, zero, zero, COVARIANCE, 1.0, 1.0, True
+        )
+
+
+def message(sec, nanosec, gyro=(0.1, 0.2, 0.3), accel=(0.0, 1.0, 9.8)):
+    vector = lambda values: SimpleNamespace(**dict(zip("xyz", values, strict=True)))  # noqa: E731
+    stamp = SimpleNamespace(sec=sec, nanosec=nanosec)
+    return SimpleNamespace(
+        header=SimpleNamespace(stamp=stamp),
+        angular_velocity=vector(gyro),
+        linear_acceleration=vector(accel),
+    )
+
+
+def test_messages_become_odometry(bridge):
+    tracker = Recorder()
+    found = bridge.Bridge(tracker)
+    # Unix time in float64 would keep 0.24 µs.
+    assert found.take(message(1_700_000_000, 999_999_999)) is None
+    odometry = found.take(message(1_700_000_001, 4_999_999))
+    assert tracker.samples[1][0] == 5e-3 and tracker.samples[0] == (
+        0.0,
+        (0.1, 0.2, 0.3),
+        (0.0, 1.0, 9.8),
+    )
+    assert odometry.stamp == (1_700_000_001, 4_999_999)
+    assert odometry.position == (4.0, 5.0, 6.0)
+    turned = Rotation.from_quat(odometry.orientation)
+    np.testing.assert_allclose((turned * TURN.inv()).magnitude(), 0.0, atol=1e-12)
+    np.testing.assert_allclose(TURN.apply(odometry.velocity), [1.0, 2.0, 3.0])
+    pose = np.reshape(odometry.pose_covariance, (6, 6))
+    np.testing.assert_array_equal(pose[:3, :3], COVARIANCE[6:9, 6:9])
+    np.testing.assert_array_equal(pose[3:, 3:], COVARIANCE[:3, :3])
+    np.testing.assert_array_equal(pose[:3, 3:], COVARIANCE[6:9, :3])
+    twist = np.reshape(odometry.twist_covariance, (6, 6))
+    world = TURN.as_matrix() @ twist[:3, :3] @ TURN.as_matrix().T
+    np.testing.assert_allclose(world, COVARIANCE[3:6, 3:6])
+    assert twist[3, 3] == -1
+
+
+def test_a_repeated_message_is_refused_and_the_next_one_taken(bridge):
+    found = bridge.Bridge(Recorder())
+    found.take(message(5, 0))
+    assert found.take(message(5, 0)) is None
+    assert found.refused == 1 and found.reason.startswith("time: must increase")
+    assert found.take(message(5, 10_000_000)) is not None
