@@ -88,9 +88,11 @@ def _check(out: Path, kind: Kind, precision: Precision) -> None:
     """What can be refused before the work."""
     if kind == "onnx":
         require_packages("--to onnx", "onnx", *PACKAGES)
-    elif precision != "float32":
-        problem = f"'{precision}' is for --to onnx alone"
-        raise InputError("--precision", problem, "leave it out")
+    else:
+        require_packages("--to stablehlo", "stablehlo", "flatbuffers")
+        if precision != "float32":
+            problem = f"'{precision}' is for --to onnx alone"
+            raise InputError("--precision", problem, "leave it out")
     if out.exists() and not (out.is_dir() and not any(out.iterdir())):
         raise InputError(out, "is there already", "name another --out, or remove it")
 
