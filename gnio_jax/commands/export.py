@@ -11,7 +11,7 @@ import tyro
 from gnio_jax.commands import console
 from gnio_jax.commands.options import Command
 
-DESCRIPTION = """A run for other programs: network and filter as ONNX models, or the whole odometry.
+DESCRIPTION = """A run for programs without Python: ONNX models, or the whole odometry.
 
   {prog} runs/mine --to onnx                      (network, start, window and filter step)
   {prog} runs/mine --to onnx --precision int8 --out exports/mine_int8

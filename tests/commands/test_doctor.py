@@ -52,6 +52,7 @@ def test_what_is_found(home, capsys):
     assert found["datasets"] == {
         "oxiod": str(recordings / "oxiod"),
         "tlio": str(recordings / "tlio_layout"),
+        "randomised": "computed",
         "synthetic": "computed",
     }
     assert found["caches"]["recordings"] == str(home / "kept")
