@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -145,10 +144,10 @@ def of_windows(session: Any, windows: Float[np.ndarray, "m n 6"]) -> Float[np.nd
     return np.array([run(session, {"window": each[None]})["displacement"][0] for each in windows])
 
 
-def check(found: Deviation, where: Path) -> None:
+def check(found: Deviation, where: str, converter: str) -> None:
     """Raise `InputError` where a float32 export is not the package's odometry."""
     largest = found.displacement_largest, found.position_largest
     limits = DISPLACEMENT_LIMIT, POSITION_LIMIT
     if not all(value <= limit for value, limit in zip(largest, limits, strict=True)):
         problem = f"the conversion is off by {largest[0]:.2g} m a window, {largest[1]:.2g} m a walk"
-        raise InputError(where, problem, "another version of jax2onnx may do better")
+        raise InputError(where, problem, f"another version of {converter} may do better")

@@ -113,7 +113,7 @@ def _write_onnx(
         conversion.write(conversion.to_model(program, source.setup), _path(folder, program))
     found = _drive(folder, source.drawn, source.setup)
     deviation = source.deviation(Said(found.position, found.displacement))
-    accuracy.check(deviation, folder)
+    accuracy.check(deviation, "--to onnx", "jax2onnx")
     if precision != "float32":
         deviation = _write_variant(folder, source, precision, found)
     contents = {
@@ -155,7 +155,7 @@ def _write_stablehlo(
     found = odometry({**drawn.start, "gyro": drawn.gyro, "accel": drawn.accel})
     displacement = found["displacement"][config.clones_per_window :]
     deviation = source.deviation(Said(found["position"], displacement))
-    accuracy.check(deviation, folder)
+    accuracy.check(deviation, "--to stablehlo", "jax")
     return contents, deviation
 
 
