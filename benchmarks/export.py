@@ -47,7 +47,7 @@ def main() -> None:
         drawn = accuracy.draw_walk(run.config.data, arguments.seconds)
         network = conversion.read(out / "network.onnx")
         setup = tracking_filter(run)
-        windows = accuracy.drive(models, drawn, setup).windows
+        windows = accuracy.calibration_windows(models, run.config.data, setup)
         variants = {}
         for precision in VARIANTS:
             path = out / f"{precision}.onnx"

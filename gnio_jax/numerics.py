@@ -34,8 +34,8 @@ def convolved(
     rows, taps = len(values), len(kernel)
     length = fft.next_fast_len(rows + taps - 1, real=True)
     kernel = kernel.reshape(-1, *[1] * (values.ndim - 1))
-    product = fft.rfft(values, length, axis=0) * fft.rfft(kernel, length, axis=0)
-    return np.asarray(fft.irfft(product, length, axis=0))[taps - 1 : rows]
+    of_values, of_kernel = (np.asarray(fft.rfft(x, length, axis=0)) for x in (values, kernel))
+    return np.asarray(fft.irfft(of_values * of_kernel, length, axis=0))[taps - 1 : rows]
 
 
 # --- quaternions

@@ -58,4 +58,15 @@ def _table(before: FilterOptions, after: FilterOptions) -> Table:
     return table
 
 
-COMMAND = Command(CalibrateConfig, calibrate, DESCRIPTION)
+COMMON = (
+    "--workdir",
+    "--out",
+    "--data-root",
+    "--split",
+    "--out-of-fold",
+    "--fit",
+    "--checkpoint",
+    "--steps",
+)
+
+COMMAND = Command(CalibrateConfig, calibrate, DESCRIPTION, common=COMMON)

@@ -19,7 +19,8 @@ DESCRIPTION = """A run for programs without Python: ONNX models, or the whole od
 
 The filter is that of gnio track. Everything is then driven over a minute of a synthetic walk, and
 the deviation from the package is printed. export.json says what each file takes and gives.
---to onnx needs pip install 'gnio-jax[onnx]'. docs/deployment.md and examples/onnx show the loop."""
+Needs pip install 'gnio-jax[onnx]' or 'gnio-jax[stablehlo]'. docs/deployment.md and examples/onnx
+show the loop around the models."""
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -10,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from gnio_jax.config import DataConfig
-from gnio_jax.data.readers.gait import person
+from gnio_jax.data.readers.gait import PLACEMENTS, person
 from gnio_jax.data.readers.synthetic import pedestrian
 from gnio_jax.deployment.driver import Models, Walked, run, walk
 from gnio_jax.deployment.flat_state import start_arrays
@@ -32,10 +31,14 @@ class Drawn(NamedTuple):
 
     seed: int
     person: int
+    placement: str
 
 
-MEASURED, CALIBRATION = Drawn(9000, 900), Drawn(9001, 901)
-"""The walk on which exports are measured; the one from which int8 takes its ranges."""
+MEASURED = Drawn(9000, 900, "handheld")
+"""The walk on which exports are measured."""
+CALIBRATION = tuple(Drawn(9001 + i, 901 + i, where) for i, where in enumerate(PLACEMENTS))
+"""The walks from which int8 takes its ranges: one walk alone knows too few."""
+CALIBRATION_SECONDS = 30.0
 
 
 class Walk(NamedTuple):
@@ -77,7 +80,13 @@ def draw_walk(windows: DataConfig, seconds: float, drawn: Drawn = MEASURED) -> W
     """A pedestrian at the network's rate."""
     n, rate = windows.stride, windows.rate
     samples = int(seconds * rate) // n * n
-    found = pedestrian(drawn.seed, person(drawn.person), seconds=samples / rate + 1, rate=rate)
+    found = pedestrian(
+        drawn.seed,
+        person(drawn.person),
+        drawn.placement,
+        seconds=samples / rate + 1,
+        rate=rate,
+    )
     start = {
         "rotation": matrix_from_quaternion(found.orientation[0]),
         "velocity": found.velocity[0],
@@ -109,6 +118,14 @@ def drive(models: Models, drawn: Walk, setup: FilterSetup) -> Walked:
     return walk(models, start_arrays(state, setup), drawn.gyro, drawn.accel)
 
 
+def calibration_windows(
+    models: Models, windows: DataConfig, setup: FilterSetup
+) -> Float[np.ndarray, "m n 6"]:
+    """What the network sees on the walks of `CALIBRATION`."""
+    walks = (draw_walk(windows, CALIBRATION_SECONDS, drawn) for drawn in CALIBRATION)
+    return np.concatenate([drive(models, drawn, setup).windows for drawn in walks])
+
+
 def deviation(drawn: Walk, package: Said, export: Said) -> Deviation:
     """Of what an export says of the walk from what the package says."""
     moved = np.linalg.norm(export.displacement - package.displacement, axis=1)
@@ -127,10 +144,10 @@ def of_windows(session: Any, windows: Float[np.ndarray, "m n 6"]) -> Float[np.nd
     return np.array([run(session, {"window": each[None]})["displacement"][0] for each in windows])
 
 
-def check(found: Deviation, where: Path) -> None:
+def check(found: Deviation, where: str, converter: str) -> None:
     """Raise `InputError` where a float32 export is not the package's odometry."""
     largest = found.displacement_largest, found.position_largest
     limits = DISPLACEMENT_LIMIT, POSITION_LIMIT
     if not all(value <= limit for value, limit in zip(largest, limits, strict=True)):
         problem = f"the conversion is off by {largest[0]:.2g} m a window, {largest[1]:.2g} m a walk"
-        raise InputError(where, problem, "another version of jax2onnx may do better")
+        raise InputError(where, problem, f"another version of {converter} may do better")

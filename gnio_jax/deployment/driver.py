@@ -4,6 +4,9 @@ This is the loop that a user writes in another language; `examples/onnx/track.cp
 C++. It needs NumPy and ONNX Runtime alone, but for the shapes in its annotations.
 """
 
+# The extra `onnx` need not be installed where types are checked.
+# pyright: reportMissingImports=false
+
 from __future__ import annotations
 
 from collections.abc import Mapping

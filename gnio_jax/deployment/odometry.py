@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gnio_jax.deployment.manifest import read_file, read_manifest
+from gnio_jax.errors import require_packages
 from gnio_jax.evaluation.inference import Network
 from gnio_jax.filtering import initial_state, run_odometry
 from gnio_jax.filtering.options import FilterSetup
@@ -82,6 +83,7 @@ def load_odometry(folder: str | Path) -> Callable[[dict[str, Any]], dict[str, np
     It takes and returns what `odometry_program` says, with K rows, and compiles for each number of
     rounds. Switches JAX's x64 on. Raises `InputError` for a folder that is no such export.
     """
+    require_packages(folder, "stablehlo", "flatbuffers")
     manifest = read_manifest(Path(folder))
     content = read_file(Path(folder), FILE, manifest)
     n = manifest["samples_per_clone"]

@@ -1,5 +1,8 @@
 """The network in float16 or int8."""
 
+# The extra `onnx` need not be installed where types are checked.
+# pyright: reportMissingImports=false
+
 from __future__ import annotations
 
 import tempfile
@@ -11,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 Precision = Literal["float32", "float16", "int8"]
-CALIBRATION_WINDOWS = 128
+CALIBRATION_WINDOWS = 256
 PRODUCTS = ["Conv", "Gemm", "MatMul"]
 """What int8 is worth its loss for; all else stays float32."""
 
@@ -19,7 +22,7 @@ PRODUCTS = ["Conv", "Gemm", "MatMul"]
 def in_precision(model: Any, precision: Precision, windows: Float[np.ndarray, "m n 6"]) -> Any:
     """The model of a network, whose inputs and outputs stay float32, in another precision.
 
-    `windows` are of a walk: int8 takes the ranges of its activations from some of them.
+    int8 takes the ranges of its activations from some of the `windows`.
     """
     if precision == "float16":
         return _in_float16(model)

@@ -88,9 +88,11 @@ def _check(out: Path, kind: Kind, precision: Precision) -> None:
     """What can be refused before the work."""
     if kind == "onnx":
         require_packages("--to onnx", "onnx", *PACKAGES)
-    elif precision != "float32":
-        problem = f"'{precision}' is for --to onnx alone"
-        raise InputError("--precision", problem, "leave it out")
+    else:
+        require_packages("--to stablehlo", "stablehlo", "flatbuffers")
+        if precision != "float32":
+            problem = f"'{precision}' is for --to onnx alone"
+            raise InputError("--precision", problem, "leave it out")
     if out.exists() and not (out.is_dir() and not any(out.iterdir())):
         raise InputError(out, "is there already", "name another --out, or remove it")
 
@@ -111,7 +113,7 @@ def _write_onnx(
         conversion.write(conversion.to_model(program, source.setup), _path(folder, program))
     found = _drive(folder, source.drawn, source.setup)
     deviation = source.deviation(Said(found.position, found.displacement))
-    accuracy.check(deviation, folder)
+    accuracy.check(deviation, "--to onnx", "jax2onnx")
     if precision != "float32":
         deviation = _write_variant(folder, source, precision, found)
     contents = {
@@ -124,9 +126,8 @@ def _write_onnx(
 def _write_variant(folder: Path, source: _Source, precision: Precision, found: Walked) -> Deviation:
     """Put the network in another precision in the place of that in float32, which `found` something
     on the walk."""
-    seconds = len(source.drawn.gyro) / source.windows.rate
-    other = accuracy.draw_walk(source.windows, seconds, accuracy.CALIBRATION)
-    windows = _drive(folder, other, source.setup).windows
+    models = open_models(folder)
+    windows = accuracy.calibration_windows(models, source.windows, source.setup)
     path = folder / f"{NETWORK}.onnx"
     conversion.write(in_precision(conversion.read(path), precision, windows), path)
     displacement = accuracy.of_windows(open_session(path), found.windows)
@@ -154,7 +155,7 @@ def _write_stablehlo(
     found = odometry({**drawn.start, "gyro": drawn.gyro, "accel": drawn.accel})
     displacement = found["displacement"][config.clones_per_window :]
     deviation = source.deviation(Said(found["position"], displacement))
-    accuracy.check(deviation, folder)
+    accuracy.check(deviation, "--to stablehlo", "jax")
     return contents, deviation
 
 

@@ -46,7 +46,7 @@ def mistake(monkeypatch, capsys, tmp_path, *arguments):
             ["--dataset", "oxoid"],
             (
                 "did you mean 'oxiod'? known datasets: blackbird, csv, euroc, idol, kitti, "
-                "oxiod, ridi, ronin, synthetic, tlio, tumvi"
+                "oxiod, randomised, ridi, ronin, synthetic, tlio, tumvi"
             ),
         ),
         (["--datset", "tlio"], "--datset: unknown option; did you mean --dataset?"),

@@ -22,7 +22,7 @@ from tests.support import drawn_run
 CONFIG = TrainConfig(
     data=DataConfig(rate=20.0, stride_seconds=0.25),
     model=ModelConfig(name="gnio", width=2, bank_size=3, bank_heads=2),
-    filter=FilterOptions(std_factor_x=1.5),
+    filter=FilterOptions(std_factor_x=1.5, velocity_std=0.3, gyro_bias_std=1e-3),
 )
 SECONDS = 60.0
 

@@ -4,6 +4,7 @@ import json
 import shutil
 import subprocess
 import sys
+import types
 
 import numpy as np
 import pytest
@@ -28,6 +29,7 @@ np.savez(sys.argv[3], **found)
 @pytest.fixture(scope="module")
 def program(run):
     """Exported in a process of its own: the tests' run-time checker knows no symbolic shapes."""
+    pytest.importorskip("flatbuffers", reason="needs pip install 'gnio-jax[stablehlo]'")
     out = run.parent / "program"
     command = ["-m", "gnio_jax", "export", run, "--to", "stablehlo", "--out", out]
     said = subprocess.run([sys.executable, *command], check=True, stdout=subprocess.PIPE, text=True)
@@ -65,7 +67,7 @@ def test_a_fresh_process_without_the_package(program, walked, package, tmp_path)
     assert "odometry.stablehlo" in told and manifest["accuracy"]["position_largest"] <= 1e-9
 
 
-def test_a_damaged_program_is_refused(program, tmp_path):
+def test_a_damaged_program_is_refused(program, tmp_path, monkeypatch):
     shutil.copytree(program[0], tmp_path / "copy")
     path = tmp_path / "copy" / "odometry.stablehlo"
     path.write_bytes(path.read_bytes()[:-1] + b"?")
@@ -76,6 +78,9 @@ def test_a_damaged_program_is_refused(program, tmp_path):
         deployment.load_odometry(path.parent)
     (path.parent / "export.json").write_text('{"format": "gnio-export", "version": 99}')
     with pytest.raises(InputError, match="version 99"):
+        deployment.load_odometry(path.parent)
+    monkeypatch.setitem(sys.modules, "flatbuffers", None)
+    with pytest.raises(InputError, match=r"flatbuffers; pip install 'gnio-jax\[stablehlo\]'"):
         deployment.load_odometry(path.parent)
 
 
@@ -93,6 +98,9 @@ def test_a_damaged_program_is_refused(program, tmp_path):
 def test_mistakes(run, tmp_path, monkeypatch, capsys, arguments, told):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setitem(sys.modules, "jax2onnx", None)  # as if it were not installed
+    monkeypatch.setitem(
+        sys.modules, "flatbuffers", types.ModuleType("flatbuffers")
+    )  # as if it were
     (tmp_path / "taken").mkdir()
     (tmp_path / "taken" / "thesis.tex").touch()
     (tmp_path / "untrained").mkdir()

@@ -248,7 +248,7 @@ def test_in_a_browser(page, walks):
     walk = walks[0]
     whole = curves(walk, "origin", 400)
     with browser.browser() as tab:
-        tab.open(page)
+        tab.open(page, width=1500)  # the map is wider than high, unlike the walk
         place, before = tab.evaluate(PLACE), tab.picture()
         per_metre = [
             (place["right"] - place["left"]) / np.ptp(place["x"]),

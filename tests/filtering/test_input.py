@@ -191,7 +191,11 @@ def test_windows_with_a_long_hole_are_no_measurements():
             jnp.mean(windows[:, :, :3], axis=1) * 0.01, jnp.full((1, 3), -1.0, jnp.float32)
         )
 
-    _, history = filtering.run_odometry(predict, start(), gyro, accel, CONFIG, NOISE, valid)
+    @jax.jit
+    def odometry(state):
+        return filtering.run_odometry(predict, state, gyro, accel, CONFIG, NOISE, valid)
+
+    _, history = odometry(start())
     missing = np.isnan(np.asarray(history.accepted))
     # Coasting are samples 153 … 159, in intervals 30 and 31: in the windows that end with intervals
     # 30 … 34. The short hole is bridged.
