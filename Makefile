@@ -1,6 +1,7 @@
 # make demo   train on the embedded synthetic pedestrians, evaluate, show the table and the pictures
 # make test   install everything the tests need, and run them on every core
 # make lint   ruff and pyright
+# make docs   the documentation as a site, in site/index.html; its notebooks run
 #
 # Each makes its own virtual environment in .venv first. PYTHON chooses the interpreter (3.11 or
 # newer). EXTRAS=test,reference adds evo and PyTorch, which some tests compare with.
@@ -22,7 +23,7 @@ TEST_ENVIRONMENT := JAX_PLATFORMS=cpu JAX_COMPILATION_CACHE_DIR=$(CURDIR)/.jax_c
 # A file stays with one worker, or both would train what its tests share; the longest come first.
 SHARED_OUT := --dist loadfile --no-loadscope-reorder
 
-.PHONY: demo test lint clean
+.PHONY: demo test lint docs clean
 
 demo: $(VENV)/.package
 	rm -rf $(DEMO)
@@ -38,8 +39,11 @@ lint: $(VENV)/.test,dev
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
+docs: $(VENV)/.docs
+	PYTHONPATH=$(CURDIR) $(BIN)/mkdocs build --strict
+
 clean:
-	rm -rf $(VENV) .jax_cache .pytest_cache build *.egg-info
+	rm -rf $(VENV) .jax_cache .pytest_cache build site *.egg-info
 
 $(BIN)/python:
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "$(NEEDS)")'
@@ -51,4 +55,8 @@ $(VENV)/.package: $(BIN)/python pyproject.toml setup.py
 
 $(VENV)/.test%: $(BIN)/python pyproject.toml setup.py
 	$(PIP) -e '.[test$*]'
+	touch $@
+
+$(VENV)/.docs: $(BIN)/python pyproject.toml setup.py
+	$(PIP) -e '.[docs]'
 	touch $@

@@ -10,6 +10,9 @@ import math
 import numpy as np
 from jaxtyping import Float
 
+STOP_BAND = 70.0
+"""dB by which the low-pass attenuates what it does not keep."""
+
 
 def decimation_factor(native: float, rate: float) -> int:
     """The low-pass runs at so many times `rate` (Hz, of what comes out); the IMU at `native` Hz.
@@ -28,9 +31,8 @@ def low_pass(factor: int) -> Float[np.ndarray, "taps"]:
     Kaiser's window: the pass band ends at 0.8 of the new Nyquist frequency, the stop band begins at
     it and is 70 dB down. The group delay is half the taps, about 22 samples of the new rate.
     """
-    from scipy.signal import kaiserord  # takes half a second to import
-
-    count, beta = kaiserord(70.0, 0.2 / factor)
-    half = int(count) // 2
+    # Kaiser (1974), as `scipy.signal.kaiserord` has it, which takes half a second to import.
+    count = math.ceil((STOP_BAND - 7.95) / (2.285 * math.pi * 0.2 / factor) + 1)
+    half, beta = count // 2, 0.1102 * (STOP_BAND - 8.7)
     taps = np.sinc(0.9 / factor * np.arange(-half, half + 1)) * np.kaiser(2 * half + 1, beta)
     return taps / taps.sum()

@@ -11,6 +11,7 @@ import itertools
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Real
+from scipy import fft
 from scipy.ndimage import maximum_filter1d
 from scipy.spatial.transform import Rotation, Slerp
 
@@ -26,11 +27,15 @@ def filled_up(values: np.ndarray, rows: int, filling: float | None = None) -> np
 def convolved(
     values: Float[np.ndarray, "n *w"], kernel: Float[np.ndarray, " k"]
 ) -> Float[np.ndarray, "m *w"]:
-    """Columns of n rows by a kernel of k, where they overlap wholly: m = n − k + 1."""
-    from scipy.signal import fftconvolve  # takes half a second to import
+    """Columns of n rows by a kernel of k ≤ n, where they overlap wholly: m = n − k + 1.
 
+    SciPy's `fftconvolve`, whose import would take longer than most of what it computes here.
+    """
+    rows, taps = len(values), len(kernel)
+    length = fft.next_fast_len(rows + taps - 1, real=True)
     kernel = kernel.reshape(-1, *[1] * (values.ndim - 1))
-    return fftconvolve(values, kernel, mode="valid", axes=0)
+    of_values, of_kernel = (np.asarray(fft.rfft(x, length, axis=0)) for x in (values, kernel))
+    return np.asarray(fft.irfft(of_values * of_kernel, length, axis=0))[taps - 1 : rows]
 
 
 # --- quaternions

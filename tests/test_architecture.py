@@ -22,20 +22,26 @@ ROOMS = {
     "pretrained": BASE | {"models", "training"},
     "tracking": BASE | {"data", "filtering", "training", "evaluation", "pretrained"},
     "live": BASE | {"filtering", "training", "evaluation"},
+    "deployment": BASE | {"data", "filtering", "training", "evaluation", "pretrained", "tracking"},
     "commands": BASE
     | {"data", "filtering", "training", "evaluation", "calibration", "interop", "tables"}
-    | {"pretrained", "tracking", "live"},
+    | {"pretrained", "tracking", "live", "deployment"},
     **{name: BASE for name in BASE},
 }
 """Rooms and top-level modules, and what each may import of the package besides itself."""
 
 LIBRARIES = {
+    "bokeh": {"evaluation.html.figures", "evaluation.html.page"},
     "flax": {"models", "training", "evaluation", "interop"},
+    "jax2onnx": {"deployment.conversion"},
     "mcap": {"data.importing.bags", "evaluation.exporting.ros"},
     "grain": {"training.supply"},
     "matplotlib": {"data", "evaluation", "tables", "tracking"},
+    "onnx": {"deployment"},
+    "onnxruntime": {"deployment"},
     "optax": {"training"},
     "orbax": {"training.checkpoint"},
+    "rerun": {"evaluation.exporting.rerun_file"},
     "rosbags": {"data.importing.bags", "evaluation.exporting.ros"},
     "rich.console.Console": {"commands"},
     "rich.progress": {"commands"},

@@ -1,17 +1,208 @@
-"""The code of a page runs as it stands there."""
+"""What the pages say runs: their Python, and their command lines as far as the parser."""
 
+import ast
+import importlib
 import re
-from pathlib import Path
+import tomllib
 
-DOCS = Path(__file__).parents[1] / "docs"
+import jax
+import numpy as np
+import pytest
+
+import gnio_jax
+from gnio_jax import config as configuration
+from gnio_jax import data, models, pretrained
+from gnio_jax.commands import app, options
+from gnio_jax.config import DataConfig, ModelConfig, TrainConfig
+from gnio_jax.errors import InputError
+from tests.support import pages, tiny_run
+
+SMALLER = {
+    "README.md": {"width=16": "width=2", "6000": "220", "6001": "221", "300": "11"},
+    "docs/differentiable_filter.md": {"20 * 100": "20 * 25", "range(20)": "range(5)"},
+    "docs/notebooks/learn_noise.py": {"SECONDS = 30": "SECONDS = 2", "STEPS = 150": "STEPS = 2"},
+}
+"""Fewer samples and steps than on the page: page -> what stands there -> what runs."""
+HELP = {"--help", "--help-all", "--tyro-write-completion", "COMMAND"}
+"""Words that leave with a text; COMMAND stands for any command."""
+RUN = [block for block in pages.python_blocks() if not block.reason]
+NOT_RUN = [block for block in pages.python_blocks() if block.reason]
+NOTEBOOKS = sorted((pages.ROOT / "docs" / "notebooks").glob("*.py"))
 
 
-def test_the_loop_of_ones_own(capsys):
+@pytest.fixture(scope="module")
+def walks():
+    return data.load("synthetic", split="test")[:1]
+
+
+@pytest.fixture
+def one_walk(walks, monkeypatch):
+    """The embedded walks are computed once for all pages."""
+    monkeypatch.setattr(data, "load", lambda *_, **__: walks)
+
+
+def run(page, code, names=None):
+    """Execute the code of a page, made smaller; returns its names."""
+    names = {} if names is None else names
+    for there, smaller in SMALLER.get(page, {}).items():
+        assert there in code, f"{page} has no '{there}' any more"
+        code = re.sub(rf"(?<!\d){re.escape(there)}(?!\d)", smaller, code)
+    with jax.numpy_rank_promotion("allow"):  # as a reader's JAX has it
+        exec(compile(code, page, "exec"), names)
+    return names
+
+
+def code_of(page):
+    """The blocks of a page that run, one after another."""
+    return "\n".join(block.code for block in RUN if block.page == page)
+
+
+def test_the_example_of_the_readme(one_walk, capsys):
+    run("README.md", code_of("README.md"))
+    printed = capsys.readouterr().out
+    assert "(11, 3)" in printed and "nan" not in printed
+    assert len(re.findall(r"-?\d\.\d+e[-+]\d+|-?\d+\.\d+", printed.splitlines()[-1])) == 4
+
+
+def test_the_loop_of_ones_own(one_walk, capsys):
     """A quarter of its piece and of its steps."""
-    (code,) = re.findall(
-        r"```python\n(.*?)```", (DOCS / "differentiable_filter.md").read_text(), re.S
-    )
-    assert "20 * 100" in code and "range(20)" in code
-    exec(code.replace("20 * 100", "20 * 25").replace("range(20)", "range(5)"), {})
+    run("docs/differentiable_filter.md", code_of("docs/differentiable_filter.md"))
     losses = [float(line.split()[1]) for line in capsys.readouterr().out.splitlines()]
     assert len(losses) == 5 and losses[-1] < losses[0]
+
+
+def test_weights_that_are_loaded(tmp_path, monkeypatch):
+    """`mine` is the package of a tiny network."""
+    config = TrainConfig(data=DataConfig(rate=50.0), model=ModelConfig(name="tiny"))
+    monkeypatch.setenv("GNIO_WEIGHTS", str(tmp_path))
+    names = {"gnio_jax": gnio_jax, "windows": np.zeros((2, 50, 6), np.float32)}
+    with tiny_run.known():
+        folder = tiny_run.save(tmp_path / "run", config)
+        about = pretrained.Description("mine", "nobody's walks", "CC0")
+        pretrained.publish(folder, tmp_path / "mine", about)
+        run("docs/weights.md", code_of("docs/weights.md"), names)
+    assert names["prediction"].displacement.shape == (2, 3)
+
+
+def test_the_imports_of_the_reference():
+    run("docs/api/index.md", code_of("docs/api/index.md"))
+
+
+def test_every_block_that_runs_has_a_test():
+    tested = {"README.md", "docs/differentiable_filter.md", "docs/weights.md", "docs/api/index.md"}
+    assert {block.page for block in RUN} == tested
+
+
+@pytest.mark.parametrize("block", NOT_RUN, ids=lambda b: f"{b.page}:{b.line} {b.reason}")
+def test_a_block_that_is_not_run_names_what_there_is(block):
+    check_names(block.code, block.page)
+
+
+@pytest.mark.parametrize("notebook", NOTEBOOKS, ids=lambda path: path.stem)
+def test_a_notebook_names_what_there_is(notebook):
+    check_names(notebook.read_text(encoding="utf-8"), notebook.name)
+
+
+def test_the_notebook_that_learns(one_walk, capsys):
+    """Two seconds, two steps: the gradient is the difference quotient that is printed beside it."""
+    pytest.importorskip("matplotlib").use("Agg")
+    page = "docs/notebooks/learn_noise.py"
+    run(page, (pages.ROOT / page).read_text(encoding="utf-8"))
+    printed = capsys.readouterr().out
+    gradient = [float(word) for word in re.search(r"gradient \[(.*)\]", printed)[1].split()]
+    quotient = [float(re.search(rf"{name}: (.*)", printed)[1]) for name in ("gyro", "accel.*")]
+    np.testing.assert_allclose(gradient, quotient, atol=2e-4)
+
+
+def check_names(code, page):
+    """The code compiles, and what it takes from gnio_jax is there."""
+    tree = ast.parse(code, page)
+    modules = {}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and node.module.split(".")[0] == "gnio_jax":
+            for alias in node.names:
+                modules[alias.asname or alias.name] = member(node.module, alias.name)
+        elif isinstance(node, ast.Import):
+            for alias in node.names:
+                importlib.import_module(alias.name)
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
+            owner = modules.get(node.value.id)
+            if owner is not None:
+                assert hasattr(owner, node.attr), f"{page}: {node.value.id}.{node.attr}"
+
+
+def member(module, name):
+    """What `from module import name` gives."""
+    try:
+        return importlib.import_module(f"{module}.{name}")
+    except ModuleNotFoundError:
+        return getattr(importlib.import_module(module), name)
+
+
+@pytest.mark.parametrize(
+    "line", pages.command_lines(), ids=lambda line: f"{line.page}: {' '.join(line.words)[:60]}"
+)
+def test_a_command_line_is_understood(line, monkeypatch):
+    """By the parser of the command, which runs nothing; a config that it names is there."""
+    monkeypatch.chdir(pages.ROOT)
+    words, found = list(line.words), app.GNIO
+    while isinstance(found, options.Group) and words and words[0] in found.commands:
+        found = found.commands[words.pop(0)]
+    if isinstance(found, options.Group) or HELP & set(words):
+        assert words[0] in HELP, f"{line.page}: no command {words}"
+        return
+    try:
+        settings = options.parse(found.options, argv=words)
+    except InputError as error:
+        # A sentence may leave out what the option or the command is about.
+        assert line.quoted and re.search("is missing|needs a value", str(error)), error
+        return
+    for option in ("config", "base"):
+        name = getattr(settings, option, None)
+        if name is not None and name != "FILE":
+            configuration.find(name)
+
+
+def test_a_command_line_of_yesterday_is_not():
+    with pytest.raises(InputError, match="unknown option"):
+        options.parse(app.GNIO.commands["track"].options, argv=["walk.zip", "--wieghts", "mine"])
+
+
+def test_what_else_the_shell_is_told_is_there():
+    """Targets of make, extras of pip, modules and scripts of Python."""
+    makefile = (pages.ROOT / "Makefile").read_text(encoding="utf-8")
+    targets = set(re.findall(r"^([a-z]+):", makefile, re.M))
+    project = tomllib.loads((pages.ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    for page, line in pages.shell_lines():
+        for target in re.findall(r"^(?:\w+=\S+ )?make ([a-z]+)", line):
+            assert target in targets, f"{page}: make {target}"
+        for extra in re.findall(r"pip install .*(?:gnio-jax|\.)\[(\w+)\]", line):
+            assert extra in project["optional-dependencies"], f"{page}: {extra}"
+        for script in re.findall(r"^python ([\w/]+\.py)", line):
+            assert (pages.ROOT / script).is_file(), f"{page}: {script}"
+        for module in re.findall(r"^python -m ((?:gnio_jax|benchmarks)[\w.]*)", line):
+            path = pages.ROOT / module.replace(".", "/")
+            assert path.is_dir() or path.with_suffix(".py").is_file(), f"{page}: {module}"
+
+
+def rooms_with_public_names():
+    """Packages of gnio_jax that say what is public, and those names."""
+    for path in sorted((pages.ROOT / "gnio_jax").glob("*/__init__.py")):
+        for node in ast.parse(path.read_text(encoding="utf-8")).body:
+            if isinstance(node, ast.Assign) and node.targets[0].id == "__all__":
+                yield path.parent.name, ast.literal_eval(node.value)
+
+
+@pytest.mark.parametrize("room", [room for room, _ in rooms_with_public_names()])
+def test_a_room_has_its_page_in_the_reference(room):
+    """The whole room is asked for, so every name of its `__all__` is there (`make docs` counts
+    them)."""
+    page = pages.ROOT / "docs" / "api" / f"{room}.md"
+    assert f"\n::: gnio_jax.{room}\n" in page.read_text(encoding="utf-8")
+    assert f"api/{room}.md" in (pages.ROOT / "mkdocs.yml").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("name", models.names())
+def test_every_network_is_named_where_people_look(name):
+    assert f"`{name}`" in (pages.ROOT / "README.md").read_text(encoding="utf-8")

@@ -68,8 +68,9 @@ def test_the_wheel_holds_the_package_its_configs_and_its_types(wheel):
     assert "gnio_jax/py.typed" in names
     for path in (ROOT / "configs").rglob("*.yaml"):
         assert f"gnio_jax/configs/{path.relative_to(ROOT / 'configs').as_posix()}" in names
-    for path in (ROOT / "gnio_jax").rglob("*.py"):
-        assert path.relative_to(ROOT).as_posix() in names
+    for suffix in ("py", "html", "js"):
+        for path in (ROOT / "gnio_jax").rglob(f"*.{suffix}"):
+            assert path.relative_to(ROOT).as_posix() in names
     assert not [name for name in names if name.startswith(("tests", "configs", "docs"))]
     described = next(name for name in names if name.endswith("/METADATA"))
     assert b"Project-URL: Changelog, https://" in zipfile.ZipFile(wheel).read(described)
@@ -94,7 +95,17 @@ def test_names_of_configs_and_their_mistakes(gnio):
 
 def test_help_and_version_need_no_jax(gnio):
     shown = gnio("--help")
-    for word in ("train", "evaluate", "data", "track", "publish", "weights", "tables", "interop"):
+    for word in (
+        "train",
+        "evaluate",
+        "data",
+        "track",
+        "publish",
+        "weights",
+        "tables",
+        "interop",
+        "doctor",
+    ):
         assert f"• {word}" in shown.stdout
     check = (
         "import sys, gnio_jax\nfrom gnio_jax.commands import app\n"

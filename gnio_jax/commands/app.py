@@ -8,7 +8,9 @@ from gnio_jax.commands import (
     calibrate,
     console,
     data,
+    doctor,
     evaluate,
+    export,
     interop,
     live,
     options,
@@ -28,9 +30,11 @@ GNIO = options.Group(
         "track": track.COMMAND,
         "live": live.COMMAND,
         "publish": publish.COMMAND,
+        "export": export.COMMAND,
         "weights": weights.COMMAND,
         "tables": tables.COMMAND,
         "interop": interop.COMMAND,
+        "doctor": doctor.COMMAND,
     },
     """Gated Neural Inertial Odometry: where has a person walked, from the IMU of a phone alone?
 
@@ -38,6 +42,7 @@ GNIO = options.Group(
   {prog} track walk.zip                                    (the path of your own recording)
   {prog} evaluate --workdir runs/demo                      (its trajectories, errors and pictures)
   {prog} data list                                         (the datasets, and where they are had)
+  {prog} doctor                                            (what is installed here and found)
 
 {prog} COMMAND --help explains each command with examples.""",
 )

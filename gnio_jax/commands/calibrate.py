@@ -14,8 +14,7 @@ from gnio_jax.cores import usable_cores
 DESCRIPTION = """Fit the filter's options of a run to its validation split; write a run with them.
 
   {prog}                                    (the newest run below runs/)
-  {prog} --workdir runs/oxiod --out runs/oxiod_honest
-  {prog} --workdir runs/oxiod --fit measurement noise
+  {prog} --workdir runs/oxiod --fit measurement noise --out runs/oxiod_honest
   {prog} --workdir runs/oxiod --out-of-fold runs/fold0 runs/fold1
 
 A network learns the errors of the walks that it has fitted, which are smaller than those of others.
@@ -59,4 +58,15 @@ def _table(before: FilterOptions, after: FilterOptions) -> Table:
     return table
 
 
-COMMAND = Command(CalibrateConfig, calibrate, DESCRIPTION)
+COMMON = (
+    "--workdir",
+    "--out",
+    "--data-root",
+    "--split",
+    "--out-of-fold",
+    "--fit",
+    "--checkpoint",
+    "--steps",
+)
+
+COMMAND = Command(CalibrateConfig, calibrate, DESCRIPTION, common=COMMON)

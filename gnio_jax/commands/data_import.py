@@ -66,4 +66,18 @@ def import_file(options: ImportOptions, prog: str) -> None:
     output.print(f"next: {evaluate}{start}", soft_wrap=True)
 
 
-COMMAND = Command(ImportOptions, import_file, DESCRIPTION)
+COMMON = (
+    "FILE",
+    "--out",
+    "--rate",
+    "--name",
+    "--accel-path",
+    "--columns.time",
+    "--gyro-unit",
+    "--accel-unit",
+    "--accel-sign",
+    "--imu-topic",
+    "--reference-topic",
+)
+
+COMMAND = Command(ImportOptions, import_file, DESCRIPTION, common=COMMON)

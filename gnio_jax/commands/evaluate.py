@@ -9,7 +9,7 @@ from pathlib import Path
 
 from gnio_jax import config as configuration
 from gnio_jax.commands import console
-from gnio_jax.commands.options import Command, execute
+from gnio_jax.commands.options import Command, called, execute
 from gnio_jax.commands.together import MeetingOptions
 from gnio_jax.config import EvaluateConfig
 from gnio_jax.cores import usable_cores
@@ -22,9 +22,9 @@ DESCRIPTION = """Estimate the trajectories of a split with a trained network and
   {prog} --workdir runs/tlio --estimator integrate --orientation device
 
 Results go to <workdir>/eval/<dataset>_<split>_<estimator>/: metrics.json, metrics.csv,
-trajectories/ and references/ in TUM format (for evo), plots/. Every table has two rows to compare
-with: never_moves, the start pose throughout, and perfect_displacements, the same estimator fed with
-the reference's displacements."""
+trajectories/ and references/ in TUM format (for evo), plots/, and report.html, a page with map,
+curves and a time slider. Every table has two rows to compare with: never_moves, the start pose
+throughout, and perfect_displacements, the same estimator fed with the reference's displacements."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ def defaults(options: EvaluateOptions) -> EvaluateOptions:
     return dataclasses.replace(default, filter=config.filter)
 
 
-def evaluate(config: EvaluateOptions, _prog: str) -> None:
+def evaluate(config: EvaluateOptions, prog: str) -> None:
     """Evaluate, and show the table."""
     # After the options: --help and mistakes do not wait for these imports.
     import jax
@@ -64,17 +64,36 @@ def evaluate(config: EvaluateOptions, _prog: str) -> None:
     filtering.cores_as_devices()
     processes.meet(config.meeting())
     with processes.running(), console.terminal(shown=processes.is_first()) as terminal:
-        found, folder = evaluation.evaluate(config, terminal.progress, usable_cores())
+        call = (config, terminal.progress, usable_cores(), called(prog))
+        found, folder = evaluation.evaluate(*call)
     if not processes.is_first():
         return
     console.stdout().print(table.render(found))
     print(f"results: {folder}")
+    if config.rerun:
+        print(f"for Rerun: {config.rerun}")
     if config.plots:
+        print(f"page: {folder / 'report.html'} (open it in a browser)")
         names = "<name>_{trajectory,error,displacement}.png"
         print(f"pictures: {folder / 'plots' / 'error_cdf.png'}, and there of each sequence {names}")
 
 
-COMMAND = Command(EvaluateOptions, evaluate, DESCRIPTION, defaults)
+COMMON = (
+    "--workdir",
+    "--dataset",
+    "--data-root",
+    "--split",
+    "--estimator",
+    "--coupling",
+    "--orientation",
+    "--init",
+    "--gyro-bias",
+    "--alignment",
+    "--plots",
+    "--rerun",
+)
+
+COMMAND = Command(EvaluateOptions, evaluate, DESCRIPTION, defaults, common=COMMON)
 
 
 def main(argv: Sequence[str] | None = None, prog: str = "python evaluate.py") -> None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import difflib
+import shlex
 import sys
 import types
 import typing
@@ -19,6 +20,7 @@ from typing import Annotated, Any, Literal, NamedTuple, TypeVar, Union
 
 import tyro
 
+from gnio_jax.commands import short_help
 from gnio_jax.errors import InputError
 
 try:
@@ -48,6 +50,8 @@ class Command(NamedTuple):
     """Help: a first line that says what it does, then examples. `{prog}` is the program's name."""
     defaults: Callable[[Any], Any] | None = None
     """Reads the file that some of the options name: the defaults of all (None: the class's own)."""
+    common: tuple[str, ...] = ()
+    """Options that --help explains where they are too many for a screen; () for all of them."""
 
 
 class Group(NamedTuple):
@@ -69,6 +73,7 @@ def execute(program: Command | Group, argv: Sequence[str] | None = None, prog: s
     found: Any = program
     for word in words:
         found = found.commands[word]
+    argv = _show_short_help(found, argv, " ".join([prog, *words]))
     known = option_names(found.options) if isinstance(found, Command) else list(found.commands)
     with _one_line_errors(argv[len(words) :], known, isinstance(found, Group)):
         options = _read(program, argv, prog, words)
@@ -76,6 +81,17 @@ def execute(program: Command | Group, argv: Sequence[str] | None = None, prog: s
         if start is not None:
             options = _read(program, argv, prog, words, start)
     found.run(options, " ".join([prog, *words]))
+
+
+def _show_short_help(program: Command | Group, argv: list[str], prog: str) -> list[str]:
+    """Print the help that fits a screen, where that is asked for, and leave; --help-all becomes
+    what tyro knows as --help."""
+    if isinstance(program, Command) and program.common:
+        if any(word in short_help.SHORT for word in argv):
+            description = program.description.format(prog=prog)
+            print(short_help.short_help(program.options, description, prog, program.common))
+            raise SystemExit(0)
+    return ["--help" if word in short_help.WHOLE else word for word in argv]
 
 
 def parse(
@@ -149,6 +165,13 @@ def _union(group: Group, prog: str, words: list[str], default: Any) -> Any:
 def sibling(prog: str, command: str) -> str:
     """How `train` or `evaluate` is called by a person who called `prog`."""
     return f"gnio {command}" if prog.split()[0] == "gnio" else f"python {command}.py"
+
+
+def called(prog: str) -> str:
+    """How the process was called, as one could type it; `prog` is the command's name."""
+    words, given = prog.split(), sys.argv[1:]
+    own = words[1:] if words[0] == "gnio" else []
+    return shlex.join([*words, *(given[len(own) :] if given[: len(own)] == own else given)])
 
 
 def option_names(kind: Any, prefix: str = "") -> list[str]:

@@ -48,7 +48,21 @@ def make(options: TablesConfig, _prog: str) -> None:
     console.stdout().print(text, soft_wrap=True)
 
 
-COMMAND = Command(TablesConfig, make, DESCRIPTION)
+COMMON = (
+    "TABLE",
+    "--base",
+    "--data-root",
+    "--split",
+    "--estimator",
+    "--seeds",
+    "--epochs",
+    "--width",
+    "--methods",
+    "--sequences",
+    "--out",
+)
+
+COMMAND = Command(TablesConfig, make, DESCRIPTION, common=COMMON)
 
 
 def main(argv: Sequence[str] | None = None, prog: str = "python -m gnio_jax.tables") -> None:

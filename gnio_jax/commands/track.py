@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from gnio_jax.commands import console
-from gnio_jax.commands.options import Command
+from gnio_jax.commands.options import Command, called
 from gnio_jax.commands.recording import RecordingOptions, read_recording
 from gnio_jax.files import file_stem
 
@@ -20,8 +20,8 @@ DESCRIPTION = """The trajectory of a recording: where its carrier walked, and ho
   {prog} walk.zip --format gpx --first-fix 48.1375 11.5755 --heading 90
 
 It reads what gnio data import reads, and its HDF5. Stand still for a second at the beginning. In
-the folder OUT it leaves trajectory.txt (TUM format), track.png and summary.json. gnio weights lists
-the networks that are found by name."""
+the folder OUT it leaves trajectory.txt (TUM format), track.png, report.html and summary.json. gnio
+weights lists the networks that are found by name."""
 
 
 @dataclass(frozen=True)
@@ -39,9 +39,11 @@ class TrackOptions(RecordingOptions):
     """LAT LON [ALT] of the start, deg and m, for geojson and gpx."""
     heading: float | None = None
     """Direction of the track's x axis, deg clockwise from true north."""
+    rerun: Path | None = None
+    """File to write for the viewer Rerun, NAME.rrd: paths, covariances, IMU, gate."""
 
 
-def track(options: TrackOptions, _prog: str) -> None:
+def track(options: TrackOptions, prog: str) -> None:
     """Track, and show the figures and the limits."""
     # After the options: --help and mistakes do not wait for these imports.
     import jax
@@ -56,7 +58,8 @@ def track(options: TrackOptions, _prog: str) -> None:
     out = options.out or Path("tracks") / _folder_name(recording.sequence.name)
     with console.terminal() as terminal:
         terminal.progress("compiling and tracking", 0.0)
-        found = tracking.track(recording, weights, out, options.format, fix)
+        call = (recording, weights, out, options.format, fix)
+        found = tracking.track(*call, command=called(prog), rerun=options.rerun)
     output = console.stdout()
     for note in found.summary.notes:
         output.print(f"  {note}", soft_wrap=True)
@@ -64,7 +67,7 @@ def track(options: TrackOptions, _prog: str) -> None:
     for warning in found.summary.warnings:
         output.print(f"warning: {warning}", soft_wrap=True)
     output.print(found.summary.limits, soft_wrap=True)
-    output.print(f"results: {found.folder} (look at track.png)", soft_wrap=True)
+    output.print(f"results: {found.folder} (look at track.png, report.html)", soft_wrap=True)
 
 
 def _folder_name(name: str) -> str:
@@ -108,4 +111,20 @@ def _table(summary: Any) -> Any:
     return grid
 
 
-COMMAND = Command(TrackOptions, track, DESCRIPTION)
+COMMON = (
+    "FILE",
+    "--weights",
+    "--out",
+    "--format",
+    "--first-fix",
+    "--heading",
+    "--rerun",
+    "--accel-path",
+    "--gyro-unit",
+    "--accel-unit",
+    "--accel-sign",
+    "--imu-topic",
+    "--reference-topic",
+)
+
+COMMAND = Command(TrackOptions, track, DESCRIPTION, common=COMMON)

@@ -123,7 +123,24 @@ def _say_how_to_go_on(
         print(f"best on validation {best_loss:.4g}; look at it with: {following}")
 
 
-COMMAND = Command(TrainOptions, train, DESCRIPTION, defaults)
+COMMON = (
+    "--config",
+    "--dataset",
+    "--data-root",
+    "--workdir",
+    "--resume",
+    "--init-from",
+    "--seed",
+    "--devices",
+    "--model.name",
+    "--model.width",
+    "--optim.epochs",
+    "--optim.batch-size",
+    "--optim.learning-rate",
+    "--data.rate",
+)
+
+COMMAND = Command(TrainOptions, train, DESCRIPTION, defaults, common=COMMON)
 
 
 def main(argv: Sequence[str] | None = None, prog: str = "python train.py") -> None:

@@ -420,7 +420,10 @@ class EvaluateConfig:
     batch_size: int = 16
     """Recordings estimated side by side."""
     plots: bool = True
-    """Draw the trajectories, errors, displacements and the errors' distribution."""
+    """Draw the trajectories, errors, displacements and the errors' distribution, and write
+    report.html."""
+    rerun: str | None = None
+    """File to write for the viewer Rerun, NAME.rrd: paths, covariances, IMU, gate."""
     filter: FilterOptions = field(default_factory=FilterOptions)
     """Noise and start of the filter; by default the run's own."""
 

@@ -82,8 +82,7 @@ def find_root(
         candidates = [Path(root)]
     else:
         bases = [Path(os.environ["GNIO_DATA"])] if os.environ.get("GNIO_DATA") else []
-        folders = _FOLDERS.get(name, (name,))
-        candidates = [base / folder for base in [*bases, Path("data")] for folder in folders]
+        candidates = [place for base in [*bases, Path("data")] for place in _folders_in(name, base)]
     for candidate in candidates:
         if candidate.is_dir():
             return candidate
@@ -94,6 +93,15 @@ def find_root(
         f"{hint}, or set GNIO_DATA to its parent; get it from {dataset.source}; "
         f"expected layout: {dataset.layout}",
     )
+
+
+def folder_in(name: str, base: Path) -> Path | None:
+    """The folder of dataset `name` in a folder of datasets; None where it has none."""
+    return next((place for place in _folders_in(name, base) if place.is_dir()), None)
+
+
+def _folders_in(name: str, base: Path) -> list[Path]:
+    return [base / folder for folder in _FOLDERS.get(name, (name,))]
 
 
 def load(

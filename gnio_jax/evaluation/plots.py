@@ -18,7 +18,8 @@ from matplotlib.ticker import PercentFormatter
 
 from gnio_jax.evaluation import metrics
 from gnio_jax.evaluation.estimators.result import Estimate
-from gnio_jax.evaluation.metrics import AlignmentMethod, Trajectory, Undefined
+from gnio_jax.evaluation.frames import in_the_references_frame
+from gnio_jax.evaluation.metrics import AlignmentMethod
 from gnio_jax.evaluation.report import Report, file_names
 from gnio_jax.evaluation.setup import OnShare, no_progress
 from gnio_jax.numerics import finite_rows, rotation_z, spans
@@ -78,7 +79,8 @@ def trajectory(
     """Plan view of the estimate over the reference, both axes to the same scale."""
     figure = Figure(figsize=(6.4, 6.4), layout="constrained")
     axes = figure.add_subplot()
-    path, reference = _aligned(estimate, alignment).position, estimate.reference.position
+    path = in_the_references_frame(estimate, alignment).trajectory.position
+    reference = estimate.reference.position
     axes.plot(reference[:, 0], reference[:, 1], color=REFERENCE, lw=1.6, label="reference")
     axes.plot(path[:, 0], path[:, 1], color=BLUE, lw=1.4, label="estimate")
     for track, colour in ((reference, REFERENCE), (path, BLUE)):
@@ -213,7 +215,7 @@ def _draw_sample_errors(axes: Axes, estimates: list[Estimate], alignment: Alignm
     """Returns the number of sequences that have a reference."""
     samples = []
     for e in estimates:
-        path = _aligned(e, alignment).position
+        path = in_the_references_frame(e, alignment).trajectory.position
         error = np.linalg.norm((path - e.reference.position)[:, :2], axis=1)
         error = error[finite_rows(e.reference.position)]
         if len(error):
@@ -276,17 +278,9 @@ def _shade(axes: Axes, time: Float[np.ndarray, "k"], still: Bool[np.ndarray, "k"
         axes.axvspan(begin, end, color=STANDING, lw=0, zorder=0, label=label)
 
 
-def _aligned(estimate: Estimate, alignment: AlignmentMethod) -> Trajectory:
-    """The estimate unchanged where it cannot be aligned."""
-    try:
-        return metrics.align(estimate.trajectory, estimate.reference, alignment)
-    except Undefined:
-        return estimate.trajectory
-
-
 def _error_in_filter_frame(estimate: Estimate) -> Float[np.ndarray, "k 3"]:
     """Position error of the start-aligned estimate, m, in the frame of the filter's covariance."""
-    aligned = _aligned(estimate, "origin")
+    aligned = in_the_references_frame(estimate).trajectory
     start, aligned_start = (path.orientation[:1] for path in (estimate.trajectory, aligned))
     turn = rotation_z(metrics.relative_yaw(start, aligned_start)[0])
     return (aligned.position - estimate.reference.position) @ turn.T

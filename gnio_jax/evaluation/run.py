@@ -12,7 +12,7 @@ import jax
 
 from gnio_jax import config as configuration
 from gnio_jax import data
-from gnio_jax.config import DataConfig, EvaluateConfig, FilterOptions, TrainConfig
+from gnio_jax.config import EvaluateConfig, FilterOptions, TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation.estimation import (
     PERFECT_STD,
@@ -21,7 +21,10 @@ from gnio_jax.evaluation.estimation import (
     perfect_displacements,
 )
 from gnio_jax.evaluation.estimators.result import Estimate
+from gnio_jax.evaluation.exporting import rerun_file
+from gnio_jax.evaluation.frames import in_the_references_frame
 from gnio_jax.evaluation.inference import Network, inference_network
+from gnio_jax.evaluation.metrics import AlignmentMethod
 from gnio_jax.evaluation.preparation import Prepared, prepare
 from gnio_jax.evaluation.report import DEFINITIONS, Report, write
 from gnio_jax.evaluation.scores import score
@@ -29,6 +32,7 @@ from gnio_jax.evaluation.setup import Setup, resolve
 from gnio_jax.files import replacing_folder
 from gnio_jax.scaling.processes import all_or_none, is_first
 
+PAGE = "report.html"
 OnStage = Callable[[str, float], None]
 """Called with the stage and the share of it that is done."""
 
@@ -56,17 +60,29 @@ class Job(NamedTuple):
     data_root: str | None
 
 
+class Drawn(NamedTuple):
+    """What pictures and page show besides the results."""
+
+    trained: TrainConfig
+    command: str
+
+
 def evaluate(
-    config: EvaluateConfig, progress: OnStage = lambda stage, share: None, workers: int = 1
+    config: EvaluateConfig,
+    progress: OnStage = lambda stage, share: None,
+    workers: int = 1,
+    command: str = "",
 ) -> Evaluation:
     """Estimate every sequence of a split with a run's network, measure, and leave the results in a
     folder of the run. Several processes (`jax.distributed`) share the filter's work, and the first
     one writes.
 
     The folder is written whole or not at all, and takes the place of the one an earlier evaluation
-    with the same options left. `workers` processes read what is slow to read (`data.load`). Raises
-    `InputError` for options that do not fit together, a workdir without the checkpoint, unknown or
-    missing data, or sequences that cannot be estimated this way.
+    with the same options left. `workers` processes read what is slow to read (`data.load`).
+    `command` is how this was called, for the page.
+
+    Raises `InputError` for options that do not fit together, a workdir without the checkpoint,
+    unknown or missing data, or sequences that cannot be estimated this way.
     """
     with all_or_none():
         job = _set_up(config)
@@ -102,7 +118,10 @@ def evaluate(
     folder = job.workdir / "eval" / folder_name(config, job.dataset, trained)
     with all_or_none():
         if is_first():
-            _write(folder, report, estimates, trained.data if config.plots else None, progress)
+            drawn = Drawn(trained, command) if config.plots else None
+            _write(folder, report, estimates, drawn, progress)
+            if config.rerun:
+                _write_rerun(Path(config.rerun), estimates, prepared, config.alignment)
     return Evaluation(report, folder)
 
 
@@ -110,19 +129,43 @@ def _write(
     folder: Path,
     report: Report,
     estimates: list[Estimate],
-    drawn: DataConfig | None,
+    drawn: Drawn | None,
     progress: OnStage,
 ) -> None:
-    """Leave the results in `folder`, with pictures if `drawn` says how windows are cut."""
+    """Leave the results in `folder`, with pictures and a page if `drawn`."""
     with replacing_folder(folder) as new:
         write(new, report, estimates)
         if drawn is not None:
             from gnio_jax.evaluation import plots  # Matplotlib takes a second to import
 
-            window = drawn.window_seconds
+            window = drawn.trained.data.window_seconds
             plots.save_all(
                 new / "plots", estimates, report, window, lambda x: progress("drawing", x)
             )
+            _write_page(new / PAGE, folder, report, estimates, drawn)
+
+
+def _write_rerun(
+    path: Path, estimates: list[Estimate], prepared: list[Prepared], alignment: AlignmentMethod
+) -> None:
+    """The estimates in the frames of their references, with the IMU that they are of."""
+    logged = [
+        rerun_file.Logged(in_the_references_frame(estimate, alignment), each.sequence)
+        for estimate, each in zip(estimates, prepared, strict=True)
+    ]
+    rerun_file.write_rerun(path, logged)
+
+
+def _write_page(
+    path: Path, folder: Path, report: Report, estimates: list[Estimate], drawn: Drawn
+) -> None:
+    """The page of this evaluation and of those beside its `folder`."""
+    from gnio_jax.evaluation import html  # Bokeh takes a second to import
+
+    settings = configuration.text(drawn.trained)
+    entry = html.of_evaluation(report, estimates, drawn.command, settings)
+    title = f"{report.settings['dataset']} {report.settings['split']}: {entry.name}"
+    html.write_report(path, title, [entry, *html.beside(folder, report.settings)])
 
 
 def folder_name(config: EvaluateConfig, dataset: str, trained: TrainConfig) -> str:
@@ -162,6 +205,8 @@ def _set_up(config: EvaluateConfig) -> Job:
     setup = resolve(_setup(config))
     if config.batch_size < 1:
         raise InputError("--batch-size", f"must be at least 1, found {config.batch_size}")
+    if config.rerun:
+        rerun_file.check_file(Path(config.rerun))
     workdir = Path(config.workdir) if config.workdir else configuration.newest_run()
     trained, network, provenance = _load_run(workdir, config)
     checked = configuration.validate(

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Bool, Float
 
@@ -110,7 +109,7 @@ def stacked_history(
     std = jnp.sqrt(jnp.diagonal(records.measurement.covariance, axis1=1, axis2=2))
     diagonal = jnp.diagonal(covariance, axis1=1, axis2=2) if whole else covariance
     sound = _sound(records, diagonal, config)
-    healthy = healthy & (jax.lax.cummin(sound.astype(jnp.int32)) > 0)
+    healthy = healthy & (jnp.cumsum(~sound) == 0)
     return FilterHistory(
         *records.mean,
         displacement=where_present(records.measurement.displacement),
@@ -136,6 +135,6 @@ def _sound(
 ) -> Bool[Array, "k"]:
     """Where everything is finite, no variance negative and the speed possible."""
     parts = (*records.mean, records.covariance)
-    finite = [jnp.all(jnp.isfinite(part.reshape(len(part), -1)), axis=1) for part in parts]
+    finite = [jnp.all(jnp.isfinite(part), axis=tuple(range(1, part.ndim))) for part in parts]
     possible = jnp.sum(records.mean.velocity**2, axis=1) <= config.speed_limit**2
     return jnp.all(jnp.stack(finite), axis=0) & jnp.all(variances >= 0, axis=1) & possible

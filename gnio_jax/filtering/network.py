@@ -54,11 +54,22 @@ def predict_window(
     gyro and accel are the last `config.reach` raw samples up to the window's newer clone, rotation
     the attitude of its older clone.
     """
+    prediction = predict(network_window(state, rotation, gyro, accel, config))
+    return jax.tree.map(lambda leaf: _as_floating(leaf[0]), prediction)
+
+
+def network_window(
+    state: FilterState,
+    rotation: Float[Array, "3 3"],
+    gyro: Float[Array, "r 3"],
+    accel: Float[Array, "r 3"],
+    config: FilterConfig,
+) -> Float[Array, "1 n 6"]:
+    """The window that `predict_window` shows the network, float32."""
     gyro, accel = gyro[: config.window], accel[: config.window]
     biases = state.gyro_bias, state.accel_bias
     window = cut_window(rotation, gyro, accel, *biases, config.cut, config.dt)
-    prediction = predict(window[None].astype(jnp.float32))
-    return jax.tree.map(lambda leaf: _as_floating(leaf[0]), prediction)
+    return window[None].astype(jnp.float32)
 
 
 def no_prediction(shapes: Prediction) -> Prediction:

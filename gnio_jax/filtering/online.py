@@ -18,8 +18,8 @@ from jaxtyping import Float, Int
 from gnio_jax.filtering.clock import Clock
 from gnio_jax.filtering.config import FilterConfig
 from gnio_jax.filtering.displacement import Measurement
-from gnio_jax.filtering.gaps import bridge
-from gnio_jax.filtering.history import stacked_history
+from gnio_jax.filtering.gaps import Imu, bridge
+from gnio_jax.filtering.history import FilterHistory, stacked_history
 from gnio_jax.filtering.inputs import state_shapes
 from gnio_jax.filtering.intake import Design, Intake
 from gnio_jax.filtering.network import (
@@ -40,7 +40,7 @@ from gnio_jax.filtering.pose import (
 from gnio_jax.filtering.propagation import integrate_interval
 from gnio_jax.filtering.start import initial_state
 from gnio_jax.filtering.state import FilterState, ImuMemory
-from gnio_jax.filtering.step import clone_step
+from gnio_jax.filtering.step import Measure, clone_step
 from gnio_jax.types import Array, Prediction
 
 GYRO, ACCEL, VALID = slice(0, 3), slice(3, 6), 6
@@ -158,13 +158,28 @@ def advance(
         prediction = jax.lax.cond(complete, infer, nothing, state, jnp.asarray(oldest))
         return predicted_measurement(prediction, config, noise, rows.dtype), {}
 
-    slot, frame = core.intervals % config.clones, config.displacement_frame
-    state, record = clone_step(core.filter, stream, measure, slot, config, noise, frame)
+    slot = core.intervals % config.clones
+    state, history = advance_filter(core.filter, stream, age, measure, slot, config, noise)
+    memory = memory._replace(quiet=state.imu.quiet)
+    state = state._replace(imu=memory)
+    return TrackerCore(state, window, core.intervals + 1), history_vector(history)
+
+
+def advance_filter(
+    state: FilterState,
+    stream: Imu,
+    age: Float[Array, "n"],
+    measure: Measure,
+    slot: Array,
+    config: FilterConfig,
+    noise: NoiseModel,
+) -> tuple[FilterState, FilterHistory]:
+    """One clone step, and a history of one row. `age` of each held sample, s: see `gaps.bridge`."""
+    frame = config.displacement_frame
+    state, record = clone_step(state, stream, measure, slot, config, noise, frame)
     records = jax.tree.map(lambda leaf: leaf[None], record)
     history = stacked_history(records, jnp.max(age)[None], state.healthy, config)
-    memory = memory._replace(quiet=state.imu.quiet)
-    state = state._replace(imu=memory, healthy=history.healthy[-1] > 0)
-    return TrackerCore(state, window, core.intervals + 1), history_vector(history)
+    return state._replace(healthy=history.healthy[-1] > 0), history
 
 
 def look_ahead(

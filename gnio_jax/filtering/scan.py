@@ -202,11 +202,11 @@ def _scan(
     inputs = numbers, by_interval, measurements
     bounds = config.checkpoint_every, config.truncate_every
     state, records = truncated_scan(step, state, inputs, *bounds)
-    oldest_held = age.reshape(len(numbers), config.samples_per_clone).max(1)
+    oldest_held = age.reshape(numbers.shape[0], config.samples_per_clone).max(1)
     history = stacked_history(records, oldest_held, state.healthy, config)
     memory = memory._replace(quiet=state.imu.quiet)
     state = state._replace(imu=memory, healthy=history.healthy[-1] > 0)
-    return unroll_clones(state, len(numbers) % config.clones), history
+    return unroll_clones(state, numbers.shape[0] % config.clones), history
 
 
 def interval_inputs(stream: Imu, config: FilterConfig) -> tuple[Array, Imu]:

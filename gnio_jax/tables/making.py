@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -169,8 +170,11 @@ def make_complexity(options: TablesConfig, reporter: Reporter) -> str:
 
 
 def make_trajectories(options: TablesConfig, reporter: Reporter, workers: int) -> str:
-    """All methods over the reference in one picture, with the first seed of each."""
-    experiment = experiment_of(options, base_config(options))
+    """All methods over the reference in one picture and one page, with the first seed of each."""
+    from gnio_jax.evaluation import html  # Bokeh takes a second to import
+
+    base = base_config(options)
+    experiment = experiment_of(options, base)
     results = results_of(experiment, dataclasses.replace(options, seeds=1), reporter, workers)
     paths = {
         result.cell.name: matrix.paths(result, options.split, options.estimator)
@@ -196,7 +200,22 @@ def make_trajectories(options: TablesConfig, reporter: Reporter, workers: int) -
     }
     path = _path(options).with_suffix(".png")
     pictures.save(path, pictures.trajectories(drawn))
-    return f"picture: {path}"
+    page = path.with_suffix(".html")
+    title = f"{base.dataset} {options.split}: {options.estimator} of all methods"
+    html.write_report(page, title, _entries(results, options))
+    return f"picture: {path}\npage: {page}"
+
+
+def _entries(results: list[Result], options: TablesConfig) -> list[Any]:
+    """What the page is told: the first seed of each method."""
+    from gnio_jax.evaluation import html
+
+    return [
+        html.read_entry(
+            matrix.results_folder(result, options.split, options.estimator), result.cell.label
+        )
+        for result in results
+    ]
 
 
 def make_standing(options: TablesConfig, reporter: Reporter, workers: int) -> str:

@@ -110,7 +110,7 @@ class PlanView(NamedTuple):
 
 def paths(result: Result, split: str, estimator: str) -> dict[str, PlanView]:
     """Reference and the first seed's estimate of each sequence that has a reference."""
-    _, folder = _evaluation(result.runs[0], split, estimator)
+    folder = results_folder(result, split, estimator)
     names = list(result.figures[0]["sequences"])
     found = {}
     for name, stem in zip(names, report.file_names(names), strict=True):
@@ -120,6 +120,11 @@ def paths(result: Result, split: str, estimator: str) -> dict[str, PlanView]:
         if reference.exists():
             found[name] = _plan_view(read_tum(estimate), read_tum(reference))
     return found
+
+
+def results_folder(result: Result, split: str, estimator: str) -> Path:
+    """Of the first seed's evaluation."""
+    return _evaluation(result.runs[0], split, estimator)[1]
 
 
 def _plan_view(estimate: Trajectory, reference: Trajectory) -> PlanView:

@@ -8,7 +8,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
-from gnio_jax.evaluation import Estimate, Undefined, metrics
+from gnio_jax.evaluation import Estimate
+from gnio_jax.evaluation.frames import with_the_reference_in_its_frame
 from gnio_jax.evaluation.plots import AXES, BLUE, END, REFERENCE, START, finish, save
 from gnio_jax.tracking.summary import Summary
 
@@ -53,8 +54,8 @@ def ellipse(
 
 def _draw_map(axes: Axes, estimate: Estimate) -> None:
     path, covariance = estimate.trajectory.position, estimate.position_covariance
-    reference = _in_the_tracks_frame(estimate)
-    if reference is not None:
+    reference = with_the_reference_in_its_frame(estimate).reference.position
+    if np.isfinite(reference).any():
         axes.plot(*reference[:, :2].T, color=REFERENCE, lw=1.6, label="reference")
     axes.plot(path[:, 0], path[:, 1], color=BLUE, lw=1.5, label="track")
     good = np.flatnonzero(np.isfinite(path).all(axis=1))
@@ -72,14 +73,6 @@ def _draw_map(axes: Axes, estimate: Estimate) -> None:
     axes.set_ylabel("y (m)")
     axes.legend(loc="best", fontsize=9, framealpha=0.9)
     finish(axes)
-
-
-def _in_the_tracks_frame(estimate: Estimate) -> Float[np.ndarray, "k 3"] | None:
-    """Positions of the reference, moved so that both start alike; None without a reference."""
-    try:
-        return metrics.align(estimate.reference, estimate.trajectory).position
-    except Undefined:
-        return None
 
 
 def _draw_speed(axes: Axes, time: Float[np.ndarray, "k"], estimate: Estimate) -> None:

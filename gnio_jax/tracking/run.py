@@ -16,7 +16,9 @@ from gnio_jax.data.validation import check_gaps
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import Estimate, Trajectory, exporting, inference_network, prepare
 from gnio_jax.evaluation.estimators.filtered import run_filters
+from gnio_jax.evaluation.exporting import rerun_file
 from gnio_jax.evaluation.exporting.geographic import FirstFix
+from gnio_jax.evaluation.frames import with_the_reference_in_its_frame
 from gnio_jax.evaluation.preparation import Prepared
 from gnio_jax.evaluation.setup import OnShare, Setup, no_progress
 from gnio_jax.evaluation.tum import write_tum
@@ -32,12 +34,8 @@ START = Setup(init="static", gyro_bias="rest")
 the gyro's bias from a rest at the start if there is one."""
 ZERO_VELOCITY_STD = 0.02
 """m/s that the filter measures while the IMU is quiet (ours): what lies on a table stays there."""
-SUMMARY, TRAJECTORY, REFERENCE, PICTURE = (
-    "summary.json",
-    "trajectory.txt",
-    "reference.txt",
-    "track.png",
-)
+SUMMARY, TRAJECTORY, REFERENCE = "summary.json", "trajectory.txt", "reference.txt"
+PICTURE, PAGE = "track.png", "report.html"
 
 
 class Tracked(NamedTuple):
@@ -55,21 +53,32 @@ def track(
     formats: tuple[str, ...] = (),
     fix: FirstFix | None = None,
     progress: OnShare = no_progress,
+    command: str = "",
+    rerun: Path | None = None,
 ) -> Tracked:
-    """Track a recording and leave trajectory, picture and summary in the folder `out`.
+    """Track a recording and leave trajectory, picture, page and summary in the folder `out`.
 
     The trajectory starts at the origin with yaw zero; its stamps are the recording's own. `formats`
-    are further ones of `exporting.FORMATS`, `fix` places them on the earth. The folder is written
+    are further ones of `exporting.FORMATS`, `fix` places them on the earth, `command` is how this
+    was called, for the page, `rerun` a file to write for the viewer Rerun. The folder is written
     whole or not at all and takes the place of an earlier track. Raises `InputError`.
     """
     _check(out, formats, fix)
+    if rerun is not None:
+        rerun_file.check_file(rerun)
     prepared = _prepared(recording.sequence, weights.run.config.data)
-    ekf = _filter(weights.run)
+    ekf = tracking_filter(weights.run)
     network = inference_network(weights.run.model, weights.run.variables)
     (estimate,) = run_filters([prepared], network, ekf, 1, progress)
     summary = summarise(estimate, prepared, recording, weights, ekf)
+    from gnio_jax.tracking import page  # Bokeh takes a second to import
+
     with replacing_folder(out) as folder:
         _write(folder, estimate, summary, formats, fix)
+        page.write(folder / PAGE, estimate, summary, weights.run.config, command)
+    if rerun is not None:
+        seen = with_the_reference_in_its_frame(estimate)
+        rerun_file.write_rerun(rerun, [rerun_file.Logged(seen, prepared.sequence)])
     return Tracked(estimate, summary, out)
 
 
@@ -103,7 +112,7 @@ def _prepared(sequence: Sequence, windows: DataConfig) -> Prepared:
     return prepared[0]._replace(sequence=cut._replace(valid=valid))
 
 
-def _filter(run: Run) -> FilterSetup:
+def tracking_filter(run: Run) -> FilterSetup:
     """The run's own filter, for which rest is a measurement too."""
     setup = filter_setup(run.config.data, run.config.filter)
     config = dataclasses.replace(setup.config, zero_velocity_std=ZERO_VELOCITY_STD)

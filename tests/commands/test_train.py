@@ -46,7 +46,7 @@ def mistake(monkeypatch, capsys, tmp_path, *arguments):
             ["--dataset", "oxoid"],
             (
                 "did you mean 'oxiod'? known datasets: blackbird, csv, euroc, idol, kitti, "
-                "oxiod, ridi, ronin, synthetic, tlio, tumvi"
+                "oxiod, randomised, ridi, ronin, synthetic, tlio, tumvi"
             ),
         ),
         (["--datset", "tlio"], "--datset: unknown option; did you mean --dataset?"),
@@ -163,7 +163,11 @@ def test_a_config_survives_its_file(tmp_path):
 
 def test_help_teaches():
     shown = subprocess.run(
-        [sys.executable, "train.py", "--help"], cwd=ROOT, capture_output=True, text=True, check=True
+        [sys.executable, "train.py", "--help-all"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=True,
     ).stdout
     for word in (
         "--dataset",

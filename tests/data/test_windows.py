@@ -1,5 +1,7 @@
 """The gather against a brute-force window cutter that goes sample by sample with SciPy."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,6 +16,10 @@ from gnio_jax.types import Sequence, Windows
 
 KEY = jax.random.key(3)
 CONFIG = DataConfig(rate=20.0, window_seconds=1.0, stride_seconds=0.1)
+
+# One program each, in place of one for every operation.
+gather = jax.jit(windows.gather, static_argnums=2)
+shift_windows = jax.jit(windows.shift_windows, static_argnums=3)
 
 
 def tumbling(count, seed, invalid=()):
@@ -76,9 +82,7 @@ def test_gather_against_a_brute_force_cutter(rotation, stride):
     imu, target, steps = cut(sequences, rotation, stride)
     assert source.start.shape == (len(target),)
     order = np.random.default_rng(0).permutation(len(target)).astype(np.int32)
-    found = jax.jit(windows.gather, static_argnums=2)(
-        jax.device_put(source), jnp.asarray(order), 20
-    )
+    found = gather(jax.device_put(source), jnp.asarray(order), 20)
     np.testing.assert_allclose(found.imu, imu[order], atol=1e-5)
     np.testing.assert_allclose(found.displacement, target[order], atol=1e-5)
     np.testing.assert_allclose(found.steps, steps[order], atol=1e-5)
@@ -92,10 +96,11 @@ def test_shifted_windows_are_those_of_the_neighbouring_samples_in_the_same_recor
     plain = windows.window_source(sequences, CONFIG, 4)
     np.testing.assert_array_equal(source.start[source.visited], plain.start)
     which = jnp.tile(jnp.asarray(source.visited), 200)
-    there = np.asarray(windows.shift_windows(KEY, source, which, 3))
-    moved = np.asarray(source.start[there] - source.start[which])
+    there = np.asarray(shift_windows(KEY, source, which, 3))
+    start = np.asarray(source.start)
+    moved = start[there] - start[which]
     assert set(moved) == set(range(-3, 4))
-    recording = np.searchsorted([57, 118], source.start, side="right")
+    recording = np.searchsorted([57, 118], start, side="right")
     np.testing.assert_array_equal(recording[there], recording[which])
     first = (
         np.asarray(which) == 0
@@ -115,10 +120,9 @@ def test_samples_without_a_reference_may_hold_nan():
     for field in (sequence.orientation, sequence.position):
         field[25:30] = np.nan
     source = windows.window_source([sequence], CONFIG, 2)
-    found = windows.gather(
-        jax.device_put(source), jnp.arange(source.start.shape[0], dtype=jnp.int32), 20
-    )
-    assert all(bool(jnp.isfinite(field).all()) for field in found)
+    which = np.arange(source.start.shape[0], dtype=np.int32)
+    found = gather(jax.device_put(source), which, 20)
+    assert all(np.isfinite(field).all() for field in found)
 
 
 def batch(count=4000, length=5):
@@ -129,7 +133,7 @@ def batch(count=4000, length=5):
 
 def test_bias_is_constant_in_a_window_uniform_over_windows_and_spares_the_target():
     before = batch()
-    after = augment.bias(KEY, before, gyro=0.05, accel=0.2)
+    after = jax.jit(functools.partial(augment.bias, gyro=0.05, accel=0.2))(KEY, before)
     offset = np.asarray(after.imu - before.imu)
     np.testing.assert_allclose(offset, np.broadcast_to(offset[:, :1], offset.shape), atol=1e-6)
     for channels, half_width in [(slice(0, 3), 0.2), (slice(3, 6), 0.05)]:
@@ -151,7 +155,7 @@ def recovered(before, after, index):
 
 def test_tilt_turns_accel_and_gyro_about_a_horizontal_axis_by_at_most_its_angle():
     before = batch(300)
-    after = augment.tilt(KEY, before, degrees=5.0)
+    after = jax.jit(functools.partial(augment.tilt, degrees=5.0))(KEY, before)
     vectors = np.array([recovered(before, after, i) for i in range(300)])
     angle = np.degrees(np.linalg.norm(vectors, axis=1))
     assert np.abs(vectors[:, 2]).max() < 1e-4 and angle.max() <= 5.01
@@ -163,7 +167,7 @@ def test_tilt_turns_accel_and_gyro_about_a_horizontal_axis_by_at_most_its_angle(
 
 def test_yaw_turns_window_and_target_by_the_same_angle_about_the_vertical():
     before = batch(300)
-    after = augment.yaw(KEY, before)
+    after = jax.jit(augment.yaw)(KEY, before)
     vectors = np.array([recovered(before, after, i) for i in range(300)])
     assert np.abs(vectors[:, :2]).max() < 2e-3
     np.testing.assert_allclose(
@@ -177,17 +181,18 @@ def test_yaw_turns_window_and_target_by_the_same_angle_about_the_vertical():
 
 def test_noise_has_the_stated_deviation():
     before = batch()
-    difference = np.asarray(augment.noise(KEY, before, gyro=0.01, accel=0.1).imu - before.imu)
+    after = jax.jit(functools.partial(augment.noise, gyro=0.01, accel=0.1))(KEY, before)
+    difference = np.asarray(after.imu - before.imu)
     np.testing.assert_allclose(difference.std(axis=(0, 1)), [0.1] * 3 + [0.01] * 3, rtol=0.02)
 
 
 def test_switched_off_augmentation_changes_nothing_and_draws_depend_on_the_key_alone():
     before = batch(10)
     off = AugmentConfig(gyro_bias=0.0, accel_bias=0.0, tilt_degrees=0.0, yaw=False)
-    after = augment.augment(KEY, before, off)
+    augmented = jax.jit(augment.augment, static_argnums=2)
+    after = augmented(KEY, before, off)
     np.testing.assert_array_equal(after.imu, before.imu)
-    first, again, other = (
-        augment.augment(k, before, AugmentConfig()) for k in (KEY, KEY, jax.random.key(4))
-    )
+    keys = KEY, KEY, jax.random.key(4)
+    first, again, other = (augmented(key, before, AugmentConfig()) for key in keys)
     np.testing.assert_array_equal(first.imu, again.imu)
     assert not np.allclose(first.imu, other.imu, atol=1e-3)

@@ -65,10 +65,11 @@ def command(monkeypatch):
     return call
 
 
-def test_end_to_end(workdir, command, capsys):
+def test_end_to_end(workdir, command, capsys, tmp_path):
     command("--workdir", workdir)
     printed = capsys.readouterr()
     folder = workdir / "eval" / "synthetic_test_ekf"
+    assert "\x1b" not in printed.out
     assert (
         f"results: {folder}" in printed.out and "never_moves" in printed.out and printed.err == ""
     )
@@ -87,10 +88,16 @@ def test_end_to_end(workdir, command, capsys):
     )
     assert len(np.loadtxt(folder / "trajectories" / "synthetic_1_handheld.txt")) == 150
     assert len(list((folder / "plots").iterdir())) == 7
+    page = (folder / "report.html").read_text(encoding="utf-8")
+    assert f"<code>python evaluate.py --workdir {workdir}</code>" in page
+    assert f"page: {folder / 'report.html'}" in printed.out
     assert [p.name for p in (workdir / "eval").iterdir()] == ["synthetic_test_ekf"]
 
     command("--workdir", workdir, "--estimator", "integrate", "--no-plots")
-    command("--workdir", workdir, "--estimator", "imu_only", "--init", "static", "--no-plots")
+    rerun = ["--rerun", tmp_path / "w.rrd"] if importlib.util.find_spec("rerun") else []
+    imu_only = ("--estimator", "imu_only", "--init", "static", "--no-plots", *rerun)
+    command("--workdir", workdir, *imu_only)
+    assert (tmp_path / "w.rrd").exists() == bool(rerun)
     names = {p.name for p in (workdir / "eval").iterdir()}
     assert names == {
         "synthetic_test_ekf",
@@ -106,6 +113,7 @@ def test_end_to_end(workdir, command, capsys):
         "nis" not in found["mean"]
         and not (workdir / "eval" / "synthetic_test_integrate" / "plots").exists()
     )
+    assert not list((workdir / "eval").glob("synthetic_test_i*/report.html"))
 
 
 def test_a_void_filter_is_in_the_files(workdir, monkeypatch):

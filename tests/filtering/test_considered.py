@@ -5,7 +5,6 @@ import dataclasses
 import functools
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -88,11 +87,15 @@ def test_a_gradient_that_is_cut_leaves_the_sensitivity_whole():
     state = filtering.initial_state(CONFIG, *pose, std=START)
     signals = runs.gyro[0, : 20 * N], runs.accel[0, : 20 * N]
     told = runs.displacement[0, :20], std[0, :20]
-    _, history = filtering.repeat_odometry(state, *signals, *told, CONFIG, NOISE)
     cut = dataclasses.replace(CONFIG, truncate_every=5)
-    whole, found = (
-        filtering.sensitivity(state, *signals, history, each, NOISE) for each in (CONFIG, cut)
-    )
+
+    @jax.jit
+    def sensitivities(state):
+        _, history = filtering.repeat_odometry(state, *signals, *told, CONFIG, NOISE)
+        sensitivity = functools.partial(filtering.sensitivity, state, *signals, history)
+        return sensitivity(CONFIG, NOISE), sensitivity(cut, NOISE)
+
+    whole, found = sensitivities(state)
     assert np.abs(whole).max() > 0
     np.testing.assert_array_equal(found, whole)
 
@@ -100,7 +103,7 @@ def test_a_gradient_that_is_cut_leaves_the_sensitivity_whole():
 def test_the_covariance_with_them_is_that_of_the_errors():
     runs, _ = walks()
     (history, found), _ = filtered()
-    added = jax.vmap(lambda s: filtering.considered_covariance(s, STD))(found)
+    added = jax.jit(jax.vmap(lambda s: filtering.considered_covariance(s, STD)))(found)
 
     def nees(covariance):
         error = errors(runs, history)[:, CLONES:, 6:9]
@@ -120,7 +123,7 @@ def test_displacements_are_disturbed_as_they_are_said_to_be():
     wanted = np.exp(0.2) * Rotation.from_euler("z", -0.3).apply(np.nan_to_num(u))
     wanted[:, 2] += 0.1 * np.hypot(u[:, 0], u[:, 1])
     np.testing.assert_allclose(disturbed(u, c), np.where(np.isnan(u), np.nan, wanted), atol=2e-7)
-    slope = jax.jacfwd(lambda c: disturbed(u, c))(jnp.asarray(c))
+    slope = jax.jit(jax.jacfwd(lambda c: disturbed(u, c)))(c)
     assert np.isfinite(np.asarray(slope)[[0, 1, 3, 4]]).all()
 
 

@@ -11,8 +11,9 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import multivariate_normal
 
 from gnio_jax import filtering, geometry
-from gnio_jax.filtering.gaps import Gap, Imu, bridge
-from gnio_jax.filtering.zero_velocity import detect_rest, update_at_rest
+from gnio_jax.filtering import gaps, zero_velocity
+from gnio_jax.filtering.gaps import Gap, Imu
+from gnio_jax.filtering.zero_velocity import detect_rest
 from gnio_jax.types import Prediction
 from tests.support import scekf_numpy
 from tests.support.random_walk import random_walk
@@ -22,6 +23,11 @@ CONFIG = filtering.FilterConfig(
     DT, N, CLONES, measurement_scale=2.0, bridge_seconds=0.06, history="core"
 )
 NOISE = filtering.NoiseModel()
+
+# One program in place of one for every operation.
+bridge = jax.jit(gaps.bridge, static_argnums=4)
+update_at_rest = jax.jit(zero_velocity.update_at_rest, static_argnums=4)
+slope_of_level = jax.jit(jax.jacrev(geometry.level))
 
 
 def start(config=CONFIG, walk=None):
@@ -86,9 +92,7 @@ def test_holes_are_filled_with_the_last_sample(missing_before):
     memory = start().imu._replace(
         gyro=jnp.full(3, 5.0), accel=jnp.full(3, 6.0), missing=jnp.int32(missing_before)
     )
-    imu, age, after = bridge(
-        jnp.asarray(gyro), jnp.asarray(accel), jnp.asarray(valid), memory, CONFIG
-    )
+    imu, age, after = bridge(gyro, accel, valid, memory, CONFIG)
     ages, held, variances = gap_of(good, (missing_before, True), 3)
     np.testing.assert_allclose(age, np.array(ages) * DT)
     for found, signal, remembered in ((imu.gyro, gyro, 5.0), (imu.accel, accel, 6.0)):
@@ -104,18 +108,11 @@ def test_holes_are_filled_with_the_last_sample(missing_before):
 
 
 def test_nothing_held_before_the_first_sample():
-    imu, _, after = bridge(
-        jnp.ones((4, 3)),
-        jnp.ones((4, 3)),
-        jnp.array([False, False, True, False]),
-        start().imu,
-        CONFIG,
-    )
+    ones, valid = np.ones((4, 3)), np.array([False, False, True, False])
+    imu, _, after = bridge(ones, ones, valid, start().imu, CONFIG)
     np.testing.assert_array_equal(imu.gap.used, [0, 0, 1, 1])
     assert np.isfinite(after.gyro).all()
-    _, _, never = bridge(
-        jnp.ones((4, 3)), jnp.ones((4, 3)), jnp.zeros(4, bool), start().imu, CONFIG
-    )
+    _, _, never = bridge(ones, ones, np.zeros(4, bool), start().imu, CONFIG)
     assert np.isnan(never.gyro).all() and never.missing == 4
 
 
@@ -194,7 +191,11 @@ def test_windows_with_a_long_hole_are_no_measurements():
             jnp.mean(windows[:, :, :3], axis=1) * 0.01, jnp.full((1, 3), -1.0, jnp.float32)
         )
 
-    _, history = filtering.run_odometry(predict, start(), gyro, accel, CONFIG, NOISE, valid)
+    @jax.jit
+    def odometry(state):
+        return filtering.run_odometry(predict, state, gyro, accel, CONFIG, NOISE, valid)
+
+    _, history = odometry(start())
     missing = np.isnan(np.asarray(history.accepted))
     # Coasting are samples 153 … 159, in intervals 30 and 31: in the windows that end with intervals
     # 30 … 34. The short hole is bridged.
@@ -270,7 +271,7 @@ def resting(
     state = state._replace(gate=gate, step=jnp.int32(now // N))
     if state.first is not None:
         state = state._replace(first=jax.tree.map(lambda part: part + 0.25, state.first))
-    new, found, _ = update_at_rest(state, jnp.bool_(True), jnp.bool_(tried), 0, config)
+    new, found, _ = update_at_rest(state, np.bool_(True), np.bool_(tried), 0, config)
     return state, new, found
 
 
@@ -427,21 +428,21 @@ def test_level_state(pitch):
     "up", [[0.0, 0, 1], [0, 0, -1], [1, 0, 0], [-1, 0, 0], [0, 1, 0], [0.3, -0.2, 0.9]]
 )
 def test_level_is_a_rotation_with_derivatives(up):
-    up = jnp.asarray(up, float)
-    rotation = geometry.level(up)
+    up = np.asarray(up, float)
+    rotation = np.asarray(jax.jit(geometry.level)(up))
     np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
     np.testing.assert_allclose(rotation @ up / np.linalg.norm(up), [0, 0, 1], atol=1e-12)
     assert np.linalg.det(rotation) > 0
     if abs(up[0]) < 0.99:
-        np.testing.assert_allclose(geometry.yaw(rotation), 0, atol=1e-12)
-    assert np.isfinite(jax.jacrev(geometry.level)(up)).all()
+        np.testing.assert_allclose(jax.jit(geometry.yaw)(rotation), 0, atol=1e-12)
+    assert np.isfinite(slope_of_level(up)).all()
 
 
 def test_orthonormalize_is_the_nearest_rotation():
     rng = np.random.default_rng(2)
     R = Rotation.random(rng=rng).as_matrix() + 1e-5 * rng.standard_normal((3, 3))
     u, _, vt = np.linalg.svd(R)
-    np.testing.assert_allclose(geometry.orthonormalize(jnp.asarray(R)), u @ vt, atol=1e-9)
+    np.testing.assert_allclose(jax.jit(geometry.orthonormalize)(R), u @ vt, atol=1e-9)
 
 
 def spoilt(name):

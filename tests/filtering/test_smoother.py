@@ -299,7 +299,11 @@ def test_smooths_the_network_in_the_loop():
             displacement=0.1 * mean[:, :3], log_std=-1.0 + 0.1 * mean[:, 3:], diagnostics={}
         )
 
-    final, history = filtering.run_odometry(predict, state, gyro, accel, config, noise)
+    @jax.jit
+    def odometry(state):
+        return filtering.run_odometry(predict, state, gyro, accel, config, noise)
+
+    final, history = odometry(state)
     smoothed = filtering.smooth_odometry(state, gyro, accel, history, config, noise)
     np.testing.assert_allclose(smoothed.position[-1], final.position, atol=1e-10)
     np.testing.assert_allclose(

@@ -30,34 +30,37 @@ def test_whiten_and_its_derivatives():
         (left, right), volume = whiten(s, (rows[:, :2], rows[:, 2:]))
         return jnp.append(jnp.concatenate([left, right], axis=1), volume)
 
-    given = jnp.asarray(COVARIANCE), jnp.asarray(ROWS)
-    np.testing.assert_allclose(flat(*given), whitened(COVARIANCE, ROWS), rtol=1e-13)
-    assert not np.isfinite(whiten(-given[0], ()).volume)
+    @jax.jit
+    def with_derivatives(given, change):
+        return flat(*given), jax.jvp(flat, given, change)[1], jax.jacrev(flat, (0, 1))(*given)
 
     change = np.array([[0.2, -0.1, 0.05], [-0.1, 0.3, 0.15], [0.05, 0.15, -0.1]])
     ahead, behind = (
         whitened(COVARIANCE + step * change, (1 + step) * ROWS) for step in (1e-6, -1e-6)
     )
     expected = (ahead - behind) / 2e-6
-    forward = jax.jvp(flat, given, (jnp.asarray(change), given[1]))[1]
-    by_s, by_rows = jax.jacrev(flat, (0, 1))(*given)
+    found, forward, (by_s, by_rows) = with_derivatives((COVARIANCE, ROWS), (change, ROWS))
+    np.testing.assert_allclose(found, whitened(COVARIANCE, ROWS), rtol=1e-13)
     reverse = np.tensordot(by_s, change, 2) + np.tensordot(by_rows, ROWS, 2)
     np.testing.assert_allclose(forward, expected, rtol=1e-6, atol=1e-6)
     np.testing.assert_allclose(reverse, expected, rtol=1e-6, atol=1e-6)
+    assert not np.isfinite(whiten(jnp.asarray(-COVARIANCE), ()).volume)
 
 
 def test_downdate_and_its_derivatives():
     rng = np.random.default_rng(1)
     shapes = (5, 5), (3, 5)
-    given, change = (
-        [jnp.asarray(rng.standard_normal(shape)) for shape in shapes] for _ in range(2)
-    )
+    given, change = ([rng.standard_normal(shape) for shape in shapes] for _ in range(2))
     result = rng.standard_normal((5, 5))
     (covariance, rows), (d_covariance, d_rows) = given, change
-    found, along = jax.jvp(downdate, given, change)
+
+    @jax.jit
+    def with_derivatives(given, change, result):
+        return jax.jvp(downdate, given, change), jax.vjp(downdate, *given)[1](result)
+
+    (found, along), (by_covariance, by_rows) = with_derivatives(given, change, result)
     np.testing.assert_allclose(found, covariance - rows.T @ rows, rtol=1e-12, atol=1e-14)
     expected = d_covariance - d_rows.T @ rows - rows.T @ d_rows
     np.testing.assert_allclose(along, expected, rtol=1e-12, atol=1e-13)
-    by_covariance, by_rows = jax.vjp(downdate, *given)[1](result)
     np.testing.assert_array_equal(by_covariance, result)
     np.testing.assert_allclose(by_rows, -rows @ (result + result.T), rtol=1e-12, atol=1e-13)

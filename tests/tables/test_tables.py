@@ -87,6 +87,8 @@ def test_a_table_from_nothing_and_again_without_training(made, monkeypatch, caps
         "trajectories_test_integrate",
     ):
         assert (root / "out" / f"{name}.png").read_bytes()[:4] == b"\x89PNG", name
+    page = (root / "out" / "trajectories_test_integrate.html").read_text(encoding="utf-8")
+    assert 'class="swatch"' in page and "</span>gnio</h2>" in page
     with pytest.raises(InputError, match="no sequence 'x' in split 'test'; there are: b, c"):
         commands.main(["trajectories", *arguments, "--sequences", "x"])
     changed = yaml.safe_load((root / "base.yaml").read_text())

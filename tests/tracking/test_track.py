@@ -3,6 +3,7 @@
 All recordings last six seconds, so that they share one compiled filter.
 """
 
+import importlib.util
 import json
 import shutil
 
@@ -39,8 +40,11 @@ def gnio(monkeypatch, capsys, runs):
     monkeypatch.chdir(runs.parent)
 
     def call(*arguments):
-        console.run(lambda: app.main(list(map(str, arguments))))
-        return capsys.readouterr().out
+        monkeypatch.setattr("sys.argv", ["gnio", *map(str, arguments)])
+        console.run(app.main)
+        told = capsys.readouterr()
+        assert "\x1b" not in told.out + told.err  # no terminal: no control characters
+        return told.out
 
     return call
 
@@ -74,9 +78,17 @@ def test_a_bag_with_a_reference(gnio, runs, tmp_path):
     entries = bag_files.imu(make) + bag_files.poses(make, "Odometry", one, child="imu_link")
     walk = bag_files.write(tmp_path, "mcap", entries)
     out = tmp_path / "track"
-    told = gnio("track", walk, "--weights", runs / "walker", "--out", out, "--format", "csv")
-    names = ["reference.txt", "summary.json", "track.png", "trajectory.csv", "trajectory.txt"]
+    given = ["track", walk, "--weights", runs / "walker", "--out", out, "--format", "csv"]
+    rerun = tmp_path / "walk.rrd"
+    if importlib.util.find_spec("rerun"):
+        given += ["--rerun", rerun]
+    told = gnio(*given)
+    assert rerun.exists() == ("--rerun" in given)
+    names = ["reference.txt", "report.html", "summary.json", "track.png"]
+    names += ["trajectory.csv", "trajectory.txt"]
     assert sorted(path.name for path in out.iterdir()) == names
+    page = (out / "report.html").read_text(encoding="utf-8")
+    assert "expected error at the end" in page and f"--out {out}" in page
     assert (out / "track.png").read_bytes().startswith(b"\x89PNG")
     path, summary = read_trajectory(out / "trajectory.txt"), summary_of(out)
     # In the recording's own clock, from its first sample on, to whole strides.

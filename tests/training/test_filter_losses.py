@@ -10,10 +10,21 @@ from gnio_jax.config import ThroughFilter
 from gnio_jax.filtering import FilterConfig, FilterHistory
 from gnio_jax.training import filter_losses
 from gnio_jax.training.pieces import Path
+from tests.support.compiling import quick
 
 K, W = 40, 5
 CONFIG = FilterConfig(0.05, 4, W, history="core")
 """Five clones a second: horizons of 5 and 25 intervals fit into 8 s."""
+
+# One program in place of one for every operation.
+relative_displacement = quick(filter_losses.relative_displacement, static_argnums=2)
+relative_yaw = quick(filter_losses.relative_yaw, static_argnums=2)
+gaussian_nll, normalised_squares, innovation_nll = map(
+    quick,
+    (filter_losses.gaussian_nll, filter_losses.normalised_squares, filter_losses.innovation_nll),
+)
+window_error = quick(filter_losses.window_error, static_argnums=3)
+window_slope = quick(jax.grad(filter_losses.window_error), static_argnums=3)
 
 
 def paths(seed=0):
@@ -62,11 +73,9 @@ def test_relative_errors():
     estimate, truth = paths()
     for count in (1, 7, K):
         displacement, yaw = relative(count)
-        found = filter_losses.relative_displacement(estimate, truth, count)
+        found = relative_displacement(estimate, truth, count)
         np.testing.assert_allclose(found, displacement, rtol=1e-12)
-        np.testing.assert_allclose(
-            filter_losses.relative_yaw(estimate, truth, count), yaw, rtol=1e-12
-        )
+        np.testing.assert_allclose(relative_yaw(estimate, truth, count), yaw, rtol=1e-12)
 
 
 def test_a_turned_and_shifted_estimate_has_no_relative_error():
@@ -74,7 +83,7 @@ def test_a_turned_and_shifted_estimate_has_no_relative_error():
     turn = Rotation.from_euler("z", 2.0)
     moved = turn.apply(truth.position) + np.array([3.0, 2.0, 1.0])
     estimate = Path(turn.as_matrix() @ truth.rotation, truth.velocity, moved)
-    for loss in (filter_losses.relative_displacement, filter_losses.relative_yaw):
+    for loss in (relative_displacement, relative_yaw):
         assert abs(loss(estimate, truth, 7)) < 1e-25
     # Where the path stands still, too, with a gradient.
     still = truth._replace(position=np.zeros_like(truth.position))
@@ -82,7 +91,7 @@ def test_a_turned_and_shifted_estimate_has_no_relative_error():
     def of(position):
         return filter_losses.relative_displacement(estimate._replace(position=position), still, 3)
 
-    assert np.isfinite(jax.grad(of)(jnp.zeros((K + 1, 3)))).all()
+    assert np.isfinite(quick(jax.grad(of))(jnp.zeros((K + 1, 3)))).all()
 
 
 def test_likelihoods():
@@ -92,16 +101,16 @@ def test_likelihoods():
     error = rng.standard_normal((K, 6))
     pairs = list(zip(error, covariance, strict=True))
     expected = [-multivariate_normal(cov=p).logpdf(e) - 3 * np.log(2 * np.pi) for e, p in pairs]
-    found = filter_losses.gaussian_nll(error, covariance)
+    found = gaussian_nll(error, covariance)
     np.testing.assert_allclose(found, np.mean(expected), rtol=1e-9)
     squares = [e @ np.linalg.solve(p, e) for e, p in pairs]
-    found = filter_losses.normalised_squares(error, covariance)
+    found = normalised_squares(error, covariance)
     np.testing.assert_allclose(found, squares, rtol=1e-9)
 
     likelihood = np.array([np.nan, 2.0, np.nan, 5.0])
-    assert filter_losses.innovation_nll(likelihood) == -3.5
-    assert filter_losses.innovation_nll(np.full(3, np.nan)) == 0
-    slope = jax.grad(filter_losses.innovation_nll)(jnp.asarray(likelihood))
+    assert innovation_nll(likelihood) == -3.5
+    assert innovation_nll(np.full(4, np.nan)) == 0
+    slope = quick(jax.grad(filter_losses.innovation_nll))(likelihood)
     np.testing.assert_array_equal(slope, [0, -0.5, 0, -0.5])
 
 
@@ -122,12 +131,12 @@ def windows_told(estimate, truth):
 def test_window_error():
     estimate, truth = paths()
     told = windows_told(estimate, truth)
-    assert filter_losses.window_error(told, estimate, truth, W) < 1e-25
+    assert window_error(told, estimate, truth, W) < 1e-25
     off = 0.1 * np.random.default_rng(2).standard_normal((K, 3))
     off[10] = np.nan
-    found = filter_losses.window_error(told + off, estimate, truth, W)
+    found = window_error(told + off, estimate, truth, W)
     np.testing.assert_allclose(found, np.nanmean(np.sum(off[W:] ** 2, 1)), rtol=1e-12)
-    slope = jax.grad(filter_losses.window_error)(jnp.asarray(told + off), estimate, truth, W)
+    slope = window_slope(told + off, estimate, truth, W)
     assert np.isfinite(slope).all() and not slope[10].any() and not slope[:W].any()
 
 
@@ -140,7 +149,7 @@ def test_the_filters_frame_is_no_part_of_the_windows_error():
         turned = estimate._replace(rotation=rotation)
         return filter_losses.window_error(told, turned, truth, W)
 
-    assert not jax.grad(of)(jnp.asarray(estimate.rotation)).any()
+    assert not quick(jax.grad(of))(estimate.rotation).any()
 
 
 def test_the_sum_has_the_weights_and_the_horizons_that_fit():
@@ -160,7 +169,8 @@ def test_the_sum_has_the_weights_and_the_horizons_that_fit():
         state_weight=7.0,
         window_weight=11.0,
     )
-    found = filter_losses.filter_losses(estimate, truth, history, CONFIG, weights)
+    losses = quick(filter_losses.filter_losses, static_argnums=(3, 4))
+    found = losses(estimate, truth, history, CONFIG, weights)
     np.testing.assert_allclose(found.displacement, [relative(5)[0], relative(25)[0]], rtol=1e-12)
     np.testing.assert_allclose(found.yaw, [relative(5)[1], relative(25)[1]], rtol=1e-12)
     error = np.concatenate(

@@ -1,5 +1,7 @@
 """Losses by hand, the schedule by its formula, Adam against a plain NumPy loop."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -28,6 +30,7 @@ def target(displacement, steps=4):
 STEPS_PER_EPOCH = 7
 
 
+@functools.partial(jax.jit, static_argnames=("config", "epoch"))
 def found_losses(prediction, windows, config, epoch=0):
     return losses.losses(
         prediction, windows, config, losses.stage(config, epoch * STEPS_PER_EPOCH, STEPS_PER_EPOCH)
@@ -63,7 +66,7 @@ def test_uncertainty_learns_from_its_epoch_on():
 
     def slopes(epoch):
         value = lambda d, u: found_losses(Prediction(d, u), walked, config, epoch).total  # noqa: E731
-        return jax.value_and_grad(value, (0, 1))(
+        return jax.jit(jax.value_and_grad(value, (0, 1)))(
             jnp.zeros((1, 3), jnp.float32), jnp.full((1, 3), -1.0, jnp.float32)
         )
 
@@ -148,10 +151,9 @@ def by_formula(step, steps_per_epoch, warmup, epochs):
 def test_schedule_of_the_paper(epochs, warmup):
     """Short runs (4 epochs for a warm-up of 5) warm up for their first half."""
     rate = optimizer.schedule(OptimConfig(epochs=epochs), 7)
-    for step in range(0, 7 * epochs + 1):
-        assert float(rate(step)) == pytest.approx(by_formula(step, 7, warmup, epochs), rel=1e-4), (
-            step
-        )
+    steps = np.arange(7 * epochs + 1)
+    expected = [by_formula(step, 7, warmup, epochs) for step in steps]
+    np.testing.assert_allclose(jax.jit(jax.vmap(rate))(steps), expected, rtol=1e-4)
 
 
 def test_no_decay_after_the_warm_up():
@@ -292,12 +294,12 @@ def test_adam_against_numpy(clip, decay):
     config = OptimConfig(epochs=10, clip_norm=clip, weight_decay=decay)
     tx = optimizer.create(config, LossConfig(), 3)
     params = {"w": jnp.array([1.0, -2.0, 3.0], jnp.float32)}
-    state = tx.init(params)
+    state, learn = tx.init(params), jax.jit(tx.update)
     w, m, v = np.array([1.0, -2.0, 3.0]), np.zeros(3), np.zeros(3)
     rng = np.random.default_rng(0)
     for step in range(20):
         gradient = rng.standard_normal(3)
-        update, state = tx.update({"w": jnp.asarray(gradient, jnp.float32)}, state, params)
+        update, state = learn({"w": jnp.asarray(gradient, jnp.float32)}, state, params)
         params = optax.apply_updates(params, update)
         if clip:
             gradient = gradient * min(1, clip / np.linalg.norm(gradient))
@@ -310,18 +312,24 @@ def test_adam_against_numpy(clip, decay):
     np.testing.assert_allclose(params["w"], w, atol=1e-6)
 
 
-@pytest.mark.parametrize("error", [0.0, 0.5, 0.999, 1.0, 1.001, 30.0])
-def test_an_outlier_pulls_at_the_uncertainty_no_more_than_ten_standard_deviations(error):
-    """σ = 0.1 m: the likelihood is the normal one up to 1 m; value and slope are steady there."""
-    log_std = np.log(0.1)
+@jax.jit
+def value_and_slopes(log_std, error):
+    """The likelihood of one window, and its derivatives."""
 
     def likelihood(log_std, error):
         prediction = Prediction(jnp.zeros((1, 3)), jnp.array([[log_std, 0, 0]]), {})
         return found_losses(prediction, target([[error, 0, 0]]), LossConfig()).nll
 
+    return jax.value_and_grad(likelihood, (0, 1))(log_std, error)
+
+
+@pytest.mark.parametrize("error", [0.0, 0.5, 0.999, 1.0, 1.001, 30.0])
+def test_an_outlier_pulls_at_the_uncertainty_no_more_than_ten_standard_deviations(error):
+    """σ = 0.1 m: the likelihood is the normal one up to 1 m; value and slope are steady there."""
+    log_std = np.log(0.1)
     squared = (error / 0.1) ** 2
+    value, (slope, by_error) = value_and_slopes(log_std, error)
     counted = squared if squared <= 100 else 100 * (1 + np.log(squared / 100))
-    np.testing.assert_allclose(likelihood(log_std, error), 0.5 * counted + log_std, rtol=1e-5)
-    slope = jax.grad(likelihood)(log_std, error)
+    np.testing.assert_allclose(value, 0.5 * counted + log_std, rtol=1e-5)
     np.testing.assert_allclose(slope, 1 - min(squared, 100.0), rtol=1e-4, atol=1e-4)
-    assert np.isfinite(jax.grad(likelihood, 1)(log_std, error))
+    assert np.isfinite(by_error)

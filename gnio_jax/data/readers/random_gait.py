@@ -74,7 +74,7 @@ class Carrying(NamedTuple):
 
 CARRYING = {
     "handheld": Carrying(
-        share=0.38,
+        share=0.4,
         surge=(0.4, 1.1),
         surge_phase=(-0.2, 0.25),
         bounce=(0.7, 1.6),
@@ -90,7 +90,7 @@ CARRYING = {
         lever=((0.1, 0.4), (-0.1, 0.2), (0.0, 0.3)),
     ),
     "pocket": Carrying(
-        share=0.27,
+        share=0.25,
         surge=(0.8, 2.2),
         surge_phase=(-0.2, 0.35),
         bounce=(0.6, 1.7),
@@ -106,12 +106,12 @@ CARRYING = {
         lever=((-0.1, 0.15), (0.1, 0.2), (-0.3, 0.0)),
     ),
     "bag": Carrying(
-        share=0.15,
-        surge=(0.4, 1.3),
-        surge_phase=(-0.1, 0.4),
+        share=0.2,
+        surge=(0.05, 1.2),
+        surge_phase=(0.0, 1.0),
         bounce=(0.7, 1.7),
         harmonics=(0.1, 0.9),
-        stride=((0.05, 0.6), (0.1, 0.6), (0.05, 0.5)),
+        stride=((0.1, 1.0), (0.1, 0.6), (0.05, 0.5)),
         strike=(0.1, 1.5),
         stride_rate=((0.05, 0.6), (0.05, 0.8), (0.05, 0.6)),
         step_rate=((0.02, 0.4), (0.02, 0.4), (0.02, 0.3)),
@@ -121,25 +121,8 @@ CARRYING = {
         roll=0.5,
         lever=((-0.2, 0.1), (0.05, 0.3), (-0.5, 0.1)),
     ),
-    # A pendulum driven above its own frequency: what hangs goes back as the shoulder goes forward.
-    "handbag": Carrying(
-        share=0.1,
-        surge=(0.05, 0.35),
-        surge_phase=(np.pi, 0.5),
-        bounce=(0.7, 1.7),
-        harmonics=(0.1, 0.9),
-        stride=((0.3, 1.2), (0.1, 0.6), (0.05, 0.5)),
-        strike=(0.1, 1.5),
-        stride_rate=((0.05, 0.5), (0.05, 0.8), (0.05, 0.6)),
-        step_rate=((0.02, 0.3), (0.02, 0.4), (0.02, 0.3)),
-        grip=(0.02, 0.12),
-        tilt=(-3.1, 3.1),
-        turned=0.0,
-        roll=0.5,
-        lever=((-0.2, 0.2), (0.1, 0.3), (-0.6, 0.0)),
-    ),
     "chest": Carrying(
-        share=0.1,
+        share=0.15,
         surge=(0.7, 1.2),
         surge_phase=(-0.1, 0.2),
         bounce=(0.8, 1.4),

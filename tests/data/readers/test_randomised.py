@@ -71,10 +71,8 @@ def surge_and_force(sequence):
     return np.einsum("ni,ni->n", surge[middle], direction), force[middle, 2], speed
 
 
-@pytest.mark.parametrize(
-    ("placement", "sign"), [("handheld", 1), ("pocket", 1), ("chest", 1), ("handbag", -1)]
-)
-def test_forward_is_told_from_backward_by_the_same_rule_for_nearly_all_walkers(placement, sign):
+@pytest.mark.parametrize("placement", ["handheld", "pocket", "chest"])
+def test_forward_is_told_from_backward_by_the_same_rule_for_nearly_all_walkers(placement):
     found = []
     for seed in range(12):
         surge, vertical, speed = surge_and_force(error_free(seed, placement, 40.0))
@@ -85,7 +83,7 @@ def test_forward_is_told_from_backward_by_the_same_rule_for_nearly_all_walkers(p
         if walking.sum() > 500:
             found.append(np.corrcoef(surge[walking], vertical[walking])[0, 1])
     assert len(found) >= 8
-    assert np.mean(sign * np.array(found) > 0) >= 0.8 and sign * np.mean(found) > 0.15
+    assert np.mean(np.array(found) > 0) >= 0.8 and np.mean(found) > 0.15
 
 
 def test_bounce_at_one_speed_differs_widely_between_walkers():

@@ -1,0 +1,124 @@
+"""Latency of exported models in ONNX Runtime beside the package's own online filter.
+
+    python -m benchmarks.export RUN [--seconds 60] [--threads 1]
+
+RUN is exported to a temporary folder. A synthetic walk is then filtered by `filtering.Tracker` and
+by the exported models, a clone interval of each in turn. The table gives medians over the intervals
+that have a window, by part where the models have parts, and the network in fewer bits.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+import time
+from collections import defaultdict
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+jax.config.update("jax_enable_x64", True)
+
+from gnio_jax import deployment, filtering, pretrained  # noqa: E402
+from gnio_jax.deployment import accuracy, conversion, driver  # noqa: E402
+from gnio_jax.deployment.flat_state import start_arrays  # noqa: E402
+from gnio_jax.deployment.precision import in_precision  # noqa: E402
+from gnio_jax.evaluation import inference_network  # noqa: E402
+from gnio_jax.tracking.run import tracking_filter  # noqa: E402
+
+VARIANTS = ("float16", "int8")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("run", help="folder of the run, a package or its name")
+    parser.add_argument("--seconds", type=float, default=60.0, help="length of the walk")
+    parser.add_argument("--threads", type=int, default=1, help="of ONNX Runtime")
+    arguments = parser.parse_args()
+    run = pretrained.load_pretrained(arguments.run)
+    print(f"{jax.devices()[0].device_kind}, jax {jax.__version__}, {run.config.model}")
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / "models"
+        deployment.export_run(arguments.run, out, "onnx")
+        models = driver.open_models(out, arguments.threads)
+        drawn = accuracy.draw_walk(run.config.data, arguments.seconds)
+        network = conversion.read(out / "network.onnx")
+        setup = tracking_filter(run)
+        windows = accuracy.calibration_windows(models, run.config.data, setup)
+        variants = {}
+        for precision in VARIANTS:
+            path = out / f"{precision}.onnx"
+            conversion.write(in_precision(network, precision, windows), path)
+            variants[precision] = driver.open_session(path, arguments.threads)
+        times = measure(run, models, variants, drawn)
+    period = 1e3 * setup.config.clone_seconds
+    print(f"\n{'part':>34} {'p50 ms':>8} {'p99 ms':>8} {'of the period':>14}")
+    for part, values in times.items():
+        p50, p99 = np.percentile(1e3 * np.array(values), [50, 99])
+        print(f"{part:>34} {p50:8.3f} {p99:8.3f} {p50 / period:13.2%}")
+    ours, theirs = (np.median(times[part]) for part in ("gnio-jax, whole", "ONNX, whole"))
+    print(f"\nONNX / gnio-jax, whole interval: {theirs / ours:.2f}")
+    ours, theirs = (np.median(times[part]) for part in ("gnio-jax, network", "ONNX, network"))
+    print(f"ONNX / gnio-jax, network:        {theirs / ours:.2f}")
+
+
+def measure(
+    run: Any, models: driver.Models, variants: dict[str, Any], drawn: accuracy.Walk
+) -> dict[str, list[float]]:
+    """Seconds of each part of each clone interval that has a window."""
+    setup = tracking_filter(run)
+    network = inference_network(run.model, run.variables)
+    apply = jax.jit(
+        lambda window: network.apply(network.variables, window)._replace(diagnostics={})
+    )
+    state = filtering.initial_state(setup.config, **drawn.start, std=setup.initial_std)
+    tracker = filtering.Tracker(apply, state, setup.config, setup.noise)
+    arrays, dt = start_arrays(state, setup), setup.config.dt
+    times: dict[str, list[float]] = defaultdict(list)
+    for k, rows in enumerate(clone_intervals(len(drawn.gyro), setup.config.samples_per_clone)):
+        stride = {"gyro": drawn.gyro[rows], "accel": drawn.accel[rows]}
+        stamps = dt * np.arange(rows.start, rows.stop)
+        samples = list(zip(stamps, *stride.values(), strict=True))
+        for sample in samples[:-1]:
+            tracker.push(*sample)
+        ours, _ = timed(lambda sample=samples[-1]: tracker.push(*sample))
+        measured = {"displacement": np.full(3, np.nan), "covariance": np.eye(3)}
+        parts = {}
+        if k >= models.clones_per_window:
+            inputs = {**arrays, **stride}
+            parts["window"], cut = timed(lambda given=inputs: driver.run(models.window, given))
+            window = cut["window"]
+            parts["network"], measured = timed(lambda w=window: driver.measure(models, w))
+            times["gnio-jax, whole"].append(ours)
+            jitted, _ = timed(lambda w=window: jax.block_until_ready(apply(w)))
+            times["gnio-jax, network"].append(jitted)
+            for precision, session in variants.items():
+                spent, _ = timed(lambda s=session, w=window: driver.run(s, {"window": w}))
+                times[f"ONNX, network in {precision}"].append(spent)
+        inputs = {**arrays, **stride, **measured}
+        parts["filter step"], after = timed(lambda given=inputs: driver.run(models.step, given))
+        arrays = {"state." + key.removeprefix("next."): value for key, value in after.items()}
+        if "network" in parts:
+            times["ONNX, whole"].append(sum(parts.values()))
+            for part, spent in parts.items():
+                times[f"ONNX, {part}"].append(spent)
+    return times
+
+
+def clone_intervals(samples: int, n: int) -> list[slice]:
+    """Their rows."""
+    return [slice(first, first + n) for first in range(0, samples - n + 1, n)]
+
+
+def timed(call: Callable[[], Any]) -> tuple[float, Any]:
+    """Seconds, and what it returned: on the host, or waited for."""
+    begin = time.perf_counter()
+    found = call()
+    return time.perf_counter() - begin, found
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,107 @@
+"""A program as an ONNX model; the only importer of jax2onnx.
+
+jax2onnx replaces layers of Flax and functions of jax.numpy by its own while it traces. A program is
+therefore traced here, and jax2onnx sees primitives of JAX alone: what is converted is what runs.
+"""
+
+# The extra `onnx` need not be installed where types are checked.
+# pyright: reportMissingImports=false
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from jax.extend.core import jaxpr_as_fun
+
+from gnio_jax.deployment.programs import Program
+from gnio_jax.filtering.options import FilterSetup
+
+OPSET = 18
+"""Of the ONNX operators: ONNX Runtime 1.14 or newer reads it."""
+
+
+def to_model(program: Program, setup: FilterSetup) -> Any:
+    """An `onnx.ModelProto` whose inputs and outputs have the program's names, shapes and types.
+
+    float64 stays float64. The metadata have the numbers that the loop around the models needs.
+    Raises what jax2onnx raises for an operation that it does not know.
+    """
+    import onnx
+    import onnx_ir
+    from jax2onnx import to_onnx
+    from onnx_ir.passes.common import RemoveUnusedNodesPass
+
+    names, shapes = list(program.inputs), list(program.inputs.values())
+
+    def flat(*values: Any) -> list[Any]:
+        found = program.function(dict(zip(names, values, strict=True)))
+        return [found[name] for name in program.outputs]
+
+    traced = jaxpr_as_fun(jax.make_jaxpr(flat)(*shapes))
+    double = any(each.dtype == np.float64 for each in shapes)
+    converted = to_onnx(
+        traced,
+        shapes,
+        model_name=program.name,
+        opset=OPSET,
+        enable_double_precision=double,
+        return_mode="ir",
+    )
+    model = onnx_ir.to_proto(RemoveUnusedNodesPass()(converted).model)
+    _name_ends(model.graph, program)
+    onnx.helper.set_model_props(model, _metadata(setup))
+    return model
+
+
+def read(path: Path) -> Any:
+    """The `onnx.ModelProto` of a file."""
+    import onnx
+
+    return onnx.load(path)
+
+
+def write(model: Any, path: Path) -> None:
+    """One file, weights included, once it is found to be valid."""
+    import onnx
+
+    onnx.checker.check_model(model)
+    onnx.save(model, path)
+
+
+def _metadata(setup: FilterSetup) -> dict[str, str]:
+    config = setup.config
+    return {
+        "rate": f"{1 / config.dt:.17g}",
+        "clones_per_window": str(config.clones_per_window),
+        "log_std_min": f"{config.log_std_min:.17g}",
+    }
+
+
+def _name_ends(graph: Any, program: Program) -> None:
+    """Give inputs and outputs their names, by copies at both ends: one value may be two outputs, or
+    an input too. ONNX Runtime removes the copies."""
+    from onnx import helper
+
+    at_start = zip(program.inputs, graph.input, strict=True)
+    at_end = zip(program.outputs, graph.output, strict=True)
+    nodes = [
+        *(helper.make_node("Identity", [ours], [theirs.name]) for ours, theirs in at_start),
+        *graph.node,
+        *(helper.make_node("Identity", [theirs.name], [ours]) for ours, theirs in at_end),
+    ]
+    del graph.node[:], graph.input[:], graph.output[:], graph.value_info[:]
+    graph.node.extend(nodes)
+    graph.input.extend(_described(program.inputs))
+    graph.output.extend(_described(program.outputs))
+
+
+def _described(arrays: dict[str, jax.ShapeDtypeStruct]) -> list[Any]:
+    from onnx import helper
+
+    return [
+        helper.make_tensor_value_info(name, helper.np_dtype_to_tensor_dtype(each.dtype), each.shape)
+        for name, each in arrays.items()
+    ]

@@ -1,0 +1,121 @@
+"""Exported models driven by ONNX Runtime, as a program without JAX drives them.
+
+This is the loop that a user writes in another language; `examples/onnx/track.cpp` is the same in
+C++. It needs NumPy and ONNX Runtime alone, but for the shapes in its annotations.
+"""
+
+# The extra `onnx` need not be installed where types are checked.
+# pyright: reportMissingImports=false
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+STATE, NEXT, POSE = "state.", "next.", "pose."
+"""Begin the names of arrays of the state, of the state after a step, and of the pose."""
+
+
+class Models(NamedTuple):
+    """Open sessions of the four models, and what they say of themselves."""
+
+    network: Any
+    start: Any
+    window: Any
+    step: Any
+    clones_per_window: int
+    log_std_min: float
+
+
+class Walked(NamedTuple):
+    """What the models say of K clone intervals."""
+
+    windows: Float[np.ndarray, "m n 6"]
+    """That the network saw: none in the first W intervals, m = K − W."""
+    displacement: Float[np.ndarray, "m 3"]
+    """m."""
+    position: Float[np.ndarray, "k 3"]
+    """m."""
+    rotation: Float[np.ndarray, "k 3 3"]
+    """Body → world."""
+    covariance: Float[np.ndarray, "k 15 15"]
+    """Of θ, v, p, b_g, b_a."""
+
+
+def open_models(folder: Path, threads: int = 1) -> Models:
+    """The models of an export."""
+    names = ("network", "filter_start", "filter_window", "filter_step")
+    network, start, window, step = (
+        open_session(folder / f"{name}.onnx", threads) for name in names
+    )
+    said = step.get_modelmeta().custom_metadata_map
+    return Models(
+        network=network,
+        start=start,
+        window=window,
+        step=step,
+        clones_per_window=int(said["clones_per_window"]),
+        log_std_min=float(said["log_std_min"]),
+    )
+
+
+def open_session(path: Path, threads: int = 1) -> Any:
+    """An `onnxruntime.InferenceSession` on the CPU."""
+    import onnxruntime
+
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = threads
+    options.log_severity_level = 3  # It warns of constants that it has folded itself.
+    return onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
+
+
+def run(session: Any, arrays: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """Outputs by name, of those arrays that the session takes."""
+    inputs = {each.name: arrays[each.name] for each in session.get_inputs()}
+    names = [each.name for each in session.get_outputs()]
+    return dict(zip(names, session.run(names, inputs), strict=True))
+
+
+def walk(
+    models: Models,
+    state: Mapping[str, np.ndarray],
+    gyro: Float[np.ndarray, "s 3"],
+    accel: Float[np.ndarray, "s 3"],
+) -> Walked:
+    """Filter K·n samples, rad/s and m/s², raw, from a state: `models.start` or `start_arrays`."""
+    n = _samples(models.step)
+    windows, displacements, poses = [], [], []
+    for k in range(len(gyro) // n):
+        rows = slice(k * n, (k + 1) * n)
+        stride = {"gyro": gyro[rows], "accel": accel[rows]}
+        measured = {"displacement": np.full(3, np.nan), "covariance": np.eye(3)}  # none
+        if k >= models.clones_per_window:
+            window = run(models.window, {**state, **stride})["window"]
+            measured = measure(models, window)
+            windows.append(window[0])
+            displacements.append(measured["displacement"])
+        after = run(models.step, {**state, **stride, **measured})
+        state = {STATE + name.removeprefix(NEXT): value for name, value in after.items()}
+        poses.append(after)
+    position, rotation, covariance = (
+        np.array([pose[POSE + name] for pose in poses])
+        for name in ("position", "rotation", "covariance")
+    )
+    return Walked(np.array(windows), np.array(displacements), position, rotation, covariance)
+
+
+def measure(models: Models, window: Float[np.ndarray, "1 n 6"]) -> dict[str, np.ndarray]:
+    """What the network says of a window, as the filter step takes it."""
+    said = run(models.network, {"window": window})
+    log_std = np.maximum(said["log_std"][0].astype(float), models.log_std_min)
+    displacement = said["displacement"][0].astype(float)
+    return {"displacement": displacement, "covariance": np.diag(np.exp(2 * log_std))}
+
+
+def _samples(step: Any) -> int:
+    """In one clone interval."""
+    return next(each.shape[0] for each in step.get_inputs() if each.name == "gyro")

@@ -1,0 +1,48 @@
+"""The page of a track: the same as that of an evaluation, with what is told of a track."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from gnio_jax import config as configuration
+from gnio_jax.config import TrainConfig
+from gnio_jax.evaluation import Estimate, html
+from gnio_jax.evaluation.frames import with_the_reference_in_its_frame
+from gnio_jax.tracking.summary import Summary
+
+
+def write(
+    path: Path, estimate: Estimate, summary: Summary, config: TrainConfig, command: str = ""
+) -> None:
+    """Write the page; `config` is of the run whose weights track, `command` how it was called."""
+    html.write_report(path, summary.recording, [entry(estimate, summary, config, command)])
+
+
+def entry(estimate: Estimate, summary: Summary, config: TrainConfig, command: str) -> html.Entry:
+    """What the page is told. The reference is moved into the frame of the track."""
+    windows = config.data
+    about = {
+        "command": command,
+        "walked": f"{summary.path_length:.1f} m in {summary.seconds:.0f} s, "
+        f"ends {summary.from_start:.1f} m from the start",
+        "expected error at the end": f"{summary.expected_error:.1f} m by the filter",
+        "weights": f"{summary.weights}, trained on {summary.trained_on}",
+        "orientation source": "filter",
+        "alignment": "start position and yaw" if summary.errors else "",
+        "windows": f"{windows.window_seconds:g} s at {windows.rate:g} Hz",
+    }
+    figures = summary.errors or {
+        "duration": summary.seconds,
+        "path_length": summary.path_length,
+        "accepted": None if summary.accepted is None else 100.0 * summary.accepted,
+    }
+    warnings = [f"warning: {each}" for each in summary.warnings]
+    return html.Entry(
+        "track",
+        {name: text for name, text in about.items() if text},
+        [with_the_reference_in_its_frame(estimate)],
+        "none",
+        {estimate.name: figures},
+        remarks=(*warnings, summary.limits, *summary.notes),
+        settings=configuration.text(config),
+    )

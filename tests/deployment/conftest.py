@@ -1,0 +1,90 @@
+"""A run of GNIO at width 2, whose weights are drawn, and what is exported of it, once for all."""
+
+import contextlib
+import io
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import numpy as np
+import pytest
+
+from gnio_jax import filtering
+from gnio_jax.commands import app
+from gnio_jax.config import DataConfig, FilterOptions, ModelConfig, TrainConfig
+from gnio_jax.data.readers.gait import person
+from gnio_jax.data.readers.synthetic import pedestrian
+from gnio_jax.evaluation import inference_network
+from gnio_jax.tracking.run import tracking_filter
+from gnio_jax.training.checkpoint import load_run
+from tests.support import drawn_run
+
+CONFIG = TrainConfig(
+    data=DataConfig(rate=20.0, stride_seconds=0.25),
+    model=ModelConfig(name="gnio", width=2, bank_size=3, bank_heads=2),
+    filter=FilterOptions(std_factor_x=1.5, velocity_std=0.3, gyro_bias_std=1e-3),
+)
+SECONDS = 60.0
+
+
+class Walked(NamedTuple):
+    """A minute of a pedestrian."""
+
+    gyro: np.ndarray
+    accel: np.ndarray
+
+
+def draw(random, kind, shape):
+    """Weights that leave a network of so many layers alive."""
+    if kind == "batch_stats":
+        return random.uniform(0.5, 1.5, shape)
+    return random.normal(0, 1.2 * max(1, np.prod(shape[:-1])) ** -0.5, shape)
+
+
+def call(*arguments):
+    """What `gnio` prints."""
+    printed = io.StringIO()
+    with contextlib.redirect_stdout(printed):
+        app.main(list(map(str, arguments)))
+    return printed.getvalue()
+
+
+@pytest.fixture(scope="package")
+def run(tmp_path_factory):
+    return drawn_run.save(tmp_path_factory.mktemp("trained") / "walk", CONFIG, draw)
+
+
+@pytest.fixture(scope="package")
+def package(run):
+    """The odometry of the package over the walk, from a state that is made of its filter."""
+    loaded = load_run(run)
+    setup = tracking_filter(loaded)
+    network = inference_network(loaded.model, loaded.variables)
+
+    def predict(windows):
+        return network.apply(network.variables, windows)._replace(diagnostics={})
+
+    @jax.jit
+    def odometry(state, gyro, accel):
+        return filtering.run_odometry(predict, state, gyro, accel, setup.config, setup.noise)[1]
+
+    return lambda start, *signals: odometry(start(setup), *signals)
+
+
+@pytest.fixture(scope="package")
+def walked():
+    drawn = pedestrian(5, person(5), seconds=SECONDS, rate=CONFIG.data.rate)
+    return Walked(drawn.gyro, drawn.accel)
+
+
+@pytest.fixture(scope="package")
+def models(run):
+    """Folder of the ONNX models, in float32, and what the command said."""
+    pytest.importorskip("jax2onnx", reason="needs pip install 'gnio-jax[onnx]'")
+    pytest.importorskip("onnxruntime", reason="needs pip install 'gnio-jax[onnx]'")
+    out = run.parent / "models"
+    with pytest.MonkeyPatch.context() as patch:
+        # jax2onnx checks itself after each operation over the whole graph: half of its time.
+        check = "jax2onnx.converter.output_binding.assert_eqn_outputs_bound"
+        patch.setattr(check, lambda *_, **__: None, raising=False)
+        return Path(out), call("export", run, "--to", "onnx", "--out", out)

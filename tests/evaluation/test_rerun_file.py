@@ -1,0 +1,78 @@
+"""The file for Rerun is read back by Rerun's own reader."""
+
+import sys
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from gnio_jax.errors import InputError
+from gnio_jax.evaluation.exporting import rerun_file
+from gnio_jax.types import Sequence
+from tests.support.estimates import estimate
+
+
+def recording_of(walk, rate=50.0):
+    """An IMU that runs a second before the walk and a second after it."""
+    time = np.arange(-rate, 41 * rate) / rate + walk.trajectory.time[0]
+    n = len(time)
+    gyro, accel = (np.sin(np.outer(time - time[0], [1.0, 2.0, 3.0]) + k) for k in (0.0, 1.0))
+    nothing, level = np.zeros((n, 3)), np.tile([1.0, 0.0, 0.0, 0.0], (n, 1))
+    return Sequence(walk.name, time, gyro, accel, level, nothing, nothing, np.ones(n, bool))
+
+
+def columns_of(path):
+    """{place: {column: values of all rows}} of the file, its parts one behind the other."""
+    reader = pytest.importorskip("rerun.chunk", reason="needs rerun-sdk").RrdReader(str(path))
+    found = {}
+    for part in reader.stream().to_chunks():
+        batch = part.to_record_batch()
+        place = found.setdefault(str(part.entity_path), {})
+        for name, values in zip(batch.schema.names, batch.columns, strict=True):
+            place.setdefault(name, []).extend(values.to_pylist())
+    return found
+
+
+def seconds(column):
+    return np.array([each.total_seconds() for each in column])
+
+
+def test_the_file_is_read_back(tmp_path):
+    pytest.importorskip("rerun", reason="needs rerun-sdk")
+    walk, blind = estimate("room 1/walk", 0), estimate("blind", 1, truth=False)
+    covariance = np.array([[4.0, 1.5, 0.2], [1.5, 1.0, 0.1], [0.2, 0.1, 0.5]])
+    walk = walk._replace(position_covariance=np.tile(covariance, (400, 1, 1)))
+    path = tmp_path / "walks.rrd"
+    logged = [rerun_file.Logged(each, recording_of(each)) for each in (walk, blind)]
+    rerun_file.write_rerun(path, logged)
+    assert [each.name for each in tmp_path.iterdir()] == ["walks.rrd"]
+    found = columns_of(path)
+    assert "/blind/estimate" in found and "/blind/reference" not in found
+    for kind, of in (("estimate", walk.trajectory), ("reference", walk.reference)):
+        ((line,),) = found[f"/room_1_walk/{kind}"]["LineStrips3D:strips"]
+        np.testing.assert_allclose(line, of.position, atol=1e-5)
+    ellipsoid = found["/room_1_walk/ellipsoid"]
+    (size,), (turn,) = (
+        ellipsoid[f"Ellipsoids3D:{name}"][7] for name in ("half_sizes", "quaternions")
+    )
+    axes = Rotation.from_quat(turn).as_matrix()
+    np.testing.assert_allclose(axes @ np.diag(np.square(size) / 9) @ axes.T, covariance, atol=1e-5)
+    gate = found["/room_1_walk/gate"]
+    rows = ~np.isnan(walk.displacement[:, 0])
+    np.testing.assert_allclose(seconds(gate["time"]), 0.1 * np.flatnonzero(rows), atol=1e-6)
+    np.testing.assert_allclose(gate["Scalars:scalars"], walk.diagnostics["gate"][rows])
+    gyro = found["/room_1_walk/imu/gyro"]
+    np.testing.assert_allclose(seconds(gyro["time"])[[0, -1]], [0.0, 40.98], atol=1e-6)
+    np.testing.assert_allclose(gyro["Scalars:scalars"], recording_of(walk).gyro[50:])
+
+
+def test_what_is_refused_before_the_work(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "rerun", None)  # as if it were not installed
+    with pytest.raises(InputError, match=r"--rerun: needs the package rerun; .*gnio-jax\[rerun\]"):
+        rerun_file.check_file(tmp_path / "a.rrd")
+    monkeypatch.setitem(sys.modules, "rerun", pytest)
+    with pytest.raises(InputError, match=r"name it NAME\.rrd"):
+        rerun_file.check_file(tmp_path / "a.txt")
+    (tmp_path / "b.rrd").mkdir()
+    with pytest.raises(InputError, match="is a folder"):
+        rerun_file.check_file(tmp_path / "b.rrd")
