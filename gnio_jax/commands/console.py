@@ -5,11 +5,13 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
+import re
 import signal
 import sys
 import typing
 import warnings
 from collections.abc import Callable, Iterator
+from typing import Any
 
 from rich.console import Console
 from rich.progress import (
@@ -20,6 +22,7 @@ from rich.progress import (
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
+from rich.text import Text
 
 from gnio_jax.errors import InputError
 
@@ -31,6 +34,8 @@ _DISK_ERRORS = {
     errno.EIO,
     errno.EROFS,
     errno.EDQUOT,
+    errno.EEXIST,
+    errno.EISDIR,
     errno.ENOTDIR,
     errno.ENAMETOOLONG,
 }
@@ -65,10 +70,31 @@ def run(main: Callable[[], object]) -> None:
         _leave(f"{error.filename or 'output'}: {error.strerror}", 2)
 
 
+_CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069]")
+"""Characters that move a terminal's cursor, colour it or turn its text about; not tab and newline.
+"""
+
+
+def without_controls(text: str) -> str:
+    """`text` without control characters, which names of files and of people's recordings may hold:
+    they are written as Python's escapes."""
+    return _CONTROL.sub(lambda found: found[0].encode("unicode_escape").decode(), text)
+
+
+class _Plain(Console):
+    """A console on which text is text, and no control of the terminal."""
+
+    def __init__(self, **options: Any):
+        super().__init__(highlight=False, markup=False, emoji=False, **options)
+
+    def render_str(self, text: str, **options: Any) -> Text:
+        return super().render_str(without_controls(text), **options)
+
+
 def stdout() -> Console:
     """The console of results. Into a file or a pipe, lines are not cut to a terminal's width."""
-    console = Console(highlight=False, markup=False)
-    return console if console.is_terminal else Console(highlight=False, markup=False, width=200)
+    console = _Plain()
+    return console if console.is_terminal else _Plain(width=200)
 
 
 class Terminal:
@@ -94,7 +120,7 @@ class Terminal:
 @contextlib.contextmanager
 def terminal(shown: bool = True) -> Iterator[Terminal]:
     """A `Terminal` whose bar is removed at the end, or one without a bar."""
-    console = Console(stderr=True, highlight=False, markup=False)
+    console = _Plain(stderr=True)
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
@@ -111,7 +137,7 @@ def terminal(shown: bool = True) -> Iterator[Terminal]:
 
 
 def _leave(line: str, status: int) -> typing.NoReturn:
-    print(" ".join(line.split()), file=sys.stderr)
+    print(without_controls(" ".join(line.split())), file=sys.stderr)
     raise SystemExit(status) from None
 
 
@@ -120,4 +146,4 @@ def _terminate(number: int, _frame: object) -> typing.NoReturn:
 
 
 def _print_warning(message: Warning | str, *_: object) -> None:
-    print(f"warning: {' '.join(str(message).split())}", file=sys.stderr)
+    print(f"warning: {without_controls(' '.join(str(message).split()))}", file=sys.stderr)

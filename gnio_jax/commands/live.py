@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import io
+import math
 import sys
+import threading
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +19,7 @@ import tyro
 from gnio_jax.commands import console
 from gnio_jax.commands.options import Command
 from gnio_jax.errors import InputError
+from gnio_jax.files import check_writable
 
 DESCRIPTION = """Follow an IMU live: where its carrier is now.
 
@@ -28,6 +33,8 @@ it draws the path, elsewhere it prints a line each second. Ctrl-C ends it; the t
 all the same. A log of one's own is read with the options of gnio track after gnio data import."""
 
 UDP = "udp:"
+DRAWN_EVERY = 0.125
+"""s. A drawing looks at the whole path: one for each pose would fall behind a long stream."""
 
 
 @dataclass(frozen=True)
@@ -62,6 +69,8 @@ def live(options: LiveOptions, _prog: str) -> None:
     jax.config.update("jax_enable_x64", True)  # for the filter; the network states its float32
     weights = tracking.choose_weights(options.weights)
     source, rate = _source(options)
+    if options.out:
+        check_writable(options.out)  # or the trajectory would be lost at the end
     found = following.Follower()
     with console.terminal() as terminal:
         terminal.progress("compiling", 0.0)
@@ -76,6 +85,9 @@ def live(options: LiveOptions, _prog: str) -> None:
     if found.refused:
         lines = f"warning: {found.refused} lines refused, the first: {found.reason}"
         output.print(lines, soft_wrap=True)
+    if found.lost:
+        lines = f"{found.in_a_row} lines in a row refused, the newest: {found.newest_reason}"
+        output.print(f"warning: stopped, {lines}", soft_wrap=True)
     if not found.poses:
         problem = f"ended before the device was still for {options.rest_seconds:g} s"
         raise InputError(source.name, problem, "let it run longer, or lower --rest-seconds")
@@ -90,11 +102,15 @@ def _source(options: LiveOptions) -> tuple[Any, float | None]:
     from gnio_jax import live as following
 
     if options.source == "-":
+        if isinstance(sys.stdin, io.TextIOWrapper):
+            sys.stdin.reconfigure(errors="replace")  # noise on a line is no text
         return following.lines_of(sys.stdin), options.imu_rate
     if options.source.startswith(UDP):
         port = options.source.removeprefix(UDP)
-        if not port.isdigit():
+        if not (port.isdecimal() and int(port[:6]) > 0):
             raise InputError(options.source, "names no port", "write udp:5555")
+        if options.silence is not None and not 0 <= options.silence <= threading.TIMEOUT_MAX:
+            raise InputError("--silence", f"{options.silence:g} s is no time to wait")
         return following.datagrams(int(port), options.silence), options.imu_rate
     if options.speed < 0:
         raise InputError("--speed", f"must not be negative, found {options.speed:g}")
@@ -126,11 +142,16 @@ def _shown(output: Any) -> Iterator[Callable[[Any], None]]:
     from gnio_jax.live import drawing
 
     with Live(console=output, refresh_per_second=8, transient=True) as screen:
+        drawn = -math.inf
 
         def draw(found: Any) -> None:
+            nonlocal drawn
+            if time.monotonic() - drawn < DRAWN_EVERY:
+                return
             columns, rows = max(10, output.width - 2), max(5, output.height - 4)
             positions = np.array([pose.position for pose in found.poses])
             screen.update(Text(f"{drawing(positions, columns, rows)}\n{_line(found.poses)}"))
+            drawn = time.monotonic()
 
         yield draw
 
@@ -163,7 +184,9 @@ def _write(path: Path, poses: list[Any]) -> None:
     from gnio_jax.evaluation.tum import write_tum
     from gnio_jax.files import replacing
 
-    sound = [pose for pose in poses if np.isfinite(pose.rotation).all()]
+    sound = [p for p in poses if np.isfinite(p.rotation).all() and np.isfinite(p.position).all()]
+    if not sound:
+        raise InputError(path, "there is no sound pose to write", "the filter diverged at once")
     orientation = Rotation.from_matrix(np.array([pose.rotation for pose in sound]))
     trajectory = Trajectory(
         np.array([pose.time for pose in sound]),

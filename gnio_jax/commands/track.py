@@ -10,6 +10,7 @@ from typing import Any, Literal
 from gnio_jax.commands import console
 from gnio_jax.commands.options import Command, called
 from gnio_jax.commands.recording import RecordingOptions, read_recording
+from gnio_jax.files import file_stem
 
 DESCRIPTION = """The trajectory of a recording: where its carrier walked, and how far to trust it.
 
@@ -54,7 +55,7 @@ def track(options: TrackOptions, prog: str) -> None:
     fix = None if options.first_fix is None else first_fix(options.first_fix, options.heading)
     recording = _recording(options)
     weights = tracking.choose_weights(options.weights)
-    out = options.out or Path("tracks") / recording.sequence.name
+    out = options.out or Path("tracks") / _folder_name(recording.sequence.name)
     with console.terminal() as terminal:
         terminal.progress("compiling and tracking", 0.0)
         call = (recording, weights, out, options.format, fix)
@@ -67,6 +68,12 @@ def track(options: TrackOptions, prog: str) -> None:
         output.print(f"warning: {warning}", soft_wrap=True)
     output.print(found.summary.limits, soft_wrap=True)
     output.print(f"results: {found.folder} (look at track.png, report.html)", soft_wrap=True)
+
+
+def _folder_name(name: str) -> str:
+    """The recording's name, or what can be one of a folder: a file may say anything of itself."""
+    plain = name == Path(name).name and name.isprintable() and name not in ("", "..")
+    return name if plain else file_stem(name)
 
 
 def _recording(options: TrackOptions) -> Any:

@@ -6,6 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
+
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import inference_network
 from gnio_jax.filtering import Tracker
@@ -19,6 +21,13 @@ Push = Callable[[Any, Any, Any], Pose | None]
 """`Tracker.push`: (time, gyro, accel) -> the pose of a clone step; raises `ValueError`."""
 LINES_BEFORE_A_SAMPLE = 100
 """So many lines without a single sample are no stream of an IMU."""
+REFUSED_IN_A_ROW = 1000
+"""So many refused samples in a row end the stream: its clock or its format is another one now, and
+no later sample would be taken (ours)."""
+LONGEST_INTERVAL = 0.5
+"""s between samples, by their stamps: what is slower is no IMU, but stamps in ms (ours)."""
+FIRST_STAMPS = 21
+"""Samples by which that is told."""
 
 
 def create_tracker(
@@ -60,15 +69,26 @@ class Follower:
     """Lines that were no samples, and samples that the tracker could not take."""
     reason: str = ""
     """Why the first one was refused."""
+    in_a_row: int = 0
+    """Refused since the newest sample."""
+    newest_reason: str = ""
+    """Why the newest one was refused."""
+    stamps: list[float] = field(default_factory=list)
+    """Of the first samples, s."""
+
+    @property
+    def lost(self) -> bool:
+        """Whether the stream was given up."""
+        return self.in_a_row >= REFUSED_IN_A_ROW
 
 
 def follow(
     push: Push, source: Source, found: Follower, on_pose: Callable[[Follower], None]
 ) -> None:
-    """Feed the samples to a tracker until the source ends; `found` grows on the way, and
-    `on_pose` is called after each clone step.
+    """Feed the samples to a tracker until the source ends, or nothing of it is taken any more
+    (`Follower.lost`); `found` grows on the way, and `on_pose` is called after each clone step.
 
-    Raises `InputError` where nothing that comes is a sample.
+    Raises `InputError` where nothing that comes is a sample, or its stamps are not in seconds.
     """
     for sample in source.samples:
         pose = _pushed(push, sample, found)
@@ -78,6 +98,10 @@ def follow(
         if found.samples == 0 and found.refused >= LINES_BEFORE_A_SAMPLE:
             problem = f"has no sample in its first {LINES_BEFORE_A_SAMPLE} lines"
             raise InputError(source.name, problem, f"the first one {found.reason}")
+        if found.samples == FIRST_STAMPS:
+            _check_interval(found.stamps, source.name)
+        if found.lost:
+            return
 
 
 def _pushed(push: Push, sample: Sample | None, found: Follower) -> Pose | None:
@@ -91,9 +115,22 @@ def _pushed(push: Push, sample: Sample | None, found: Follower) -> Pose | None:
         _refuse(found, str(error))
         return None
     found.samples += 1
+    found.in_a_row = 0
+    if found.samples <= FIRST_STAMPS:
+        found.stamps.append(sample.time)
     return pose
+
+
+def _check_interval(stamps: list[float], where: str) -> None:
+    """Raise `InputError` where the stamps are no IMU's if they are seconds."""
+    interval = float(np.median(np.diff(stamps)))
+    if interval > LONGEST_INTERVAL:
+        problem = f"its samples come {interval:g} s apart by their stamps"
+        raise InputError(where, problem, "stamps must be in seconds, not in ms")
 
 
 def _refuse(found: Follower, reason: str) -> None:
     found.refused += 1
+    found.in_a_row += 1
     found.reason = found.reason or reason
+    found.newest_reason = reason

@@ -54,7 +54,7 @@ def _of_json(line: str) -> Sample | None:
         found = json.loads(line)
         gyro, accel = ([_number(value) for value in found[name]] for name in ("gyro", "accel"))
         return _checked(_number(found["time"]), gyro, accel)
-    except (KeyError, TypeError, ValueError, RecursionError):
+    except (KeyError, TypeError, ValueError, OverflowError, RecursionError):
         return None
 
 

@@ -25,6 +25,18 @@ FIGURES = "evaluations.json"
 NEEDED = (WEIGHTS, CONFIG, CARD)
 LARGEST_MANIFEST = 2**20
 """Bytes."""
+LARGEST_FILE = 2**32
+"""Bytes: a zip of some megabytes may say that it unpacks to any size (ours)."""
+_KINDS = {
+    "name": str,
+    "network": str,
+    "data": str,
+    "license": str,
+    "storage": str,
+    "bytes": int,
+    "metric": dict | None,
+}
+"""What the manifest says of a package, and how."""
 _REMEDY = "the package is damaged: fetch or publish it again"
 
 
@@ -141,7 +153,7 @@ def _manifest(place: Path) -> dict[str, Any]:
     """The manifest, of a version and with the fields that are known."""
     try:
         found = json.loads(_content(place, MANIFEST, LARGEST_MANIFEST))
-    except ValueError as error:  # InputError, too, is one
+    except (ValueError, RecursionError) as error:  # InputError, too, is a ValueError
         if isinstance(error, InputError):
             raise
         raise InputError(place, f"'{MANIFEST}' is no JSON ({error})", _REMEDY) from None
@@ -166,20 +178,31 @@ def _is_entry(name: str, entry: Any) -> bool:
         plain
         and isinstance(entry, dict)
         and isinstance(entry.get("bytes"), int)
+        and 0 <= entry["bytes"] <= LARGEST_FILE
         and isinstance(entry.get("sha256"), str)
     )
 
 
 def _about(place: Path, manifest: dict[str, Any]) -> About:
     try:
-        metric = manifest["metric"] and Metric(**manifest["metric"])
         known = {name: manifest[name] for name in About._fields}
-        for name, kind in (("name", str), ("data", str), ("license", str), ("bytes", int)):
+        for name, kind in _KINDS.items():
             if not isinstance(known[name], kind):
                 raise TypeError(f"'{name}' is {known[name]!r}")
+        metric = Metric(**known["metric"]) if known["metric"] else None
+        if metric is not None:
+            _check_metric(metric)
         return About(**known | {"metric": metric})
     except (KeyError, TypeError) as error:
         raise InputError(place, f"'{MANIFEST}' lacks a field ({error})", _REMEDY) from None
+
+
+def _check_metric(metric: Metric) -> None:
+    """Raise `TypeError` for values that are no figures."""
+    interval = [metric.low, metric.high]
+    figures = [metric.value, *interval] if interval != [None, None] else [metric.value]
+    if not all(isinstance(each, int | float) for each in figures):
+        raise TypeError(f"'metric' is {metric!r}")
 
 
 def _content(place: Path, name: str, most: int) -> bytes:

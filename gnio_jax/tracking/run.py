@@ -12,6 +12,7 @@ import numpy as np
 from gnio_jax import data
 from gnio_jax.config import DataConfig
 from gnio_jax.data.importing import Imported
+from gnio_jax.data.validation import check_gaps
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import Estimate, Trajectory, exporting, inference_network, prepare
 from gnio_jax.evaluation.estimators.filtered import run_filters
@@ -21,7 +22,7 @@ from gnio_jax.evaluation.frames import with_the_reference_in_its_frame
 from gnio_jax.evaluation.preparation import Prepared
 from gnio_jax.evaluation.setup import OnShare, Setup, no_progress
 from gnio_jax.evaluation.tum import write_tum
-from gnio_jax.files import replacing_folder
+from gnio_jax.files import check_writable_folder, replacing_folder
 from gnio_jax.filtering.options import FilterSetup, filter_setup
 from gnio_jax.tracking.summary import Summary, as_json, summarise
 from gnio_jax.tracking.weights import Weights
@@ -87,6 +88,7 @@ def _check(out: Path, formats: tuple[str, ...], fix: FirstFix | None) -> None:
         raise InputError(out, "is there already and is no track", "name another --out")
     for kind in formats:
         exporting.check_format("--format", kind, fix)
+    check_writable_folder(out.parent)
 
 
 def _may_be_replaced(out: Path) -> bool:
@@ -97,7 +99,9 @@ def _may_be_replaced(out: Path) -> bool:
 
 def _prepared(sequence: Sequence, windows: DataConfig) -> Prepared:
     """The whole recording at the network's rate. A reference starts nothing: it comes in again to
-    be compared with."""
+    be compared with. Raises `InputError` for a hole that nothing bridges: what was walked in it is
+    in no sample."""
+    check_gaps(sequence.time, sequence.name)
     sequence = data.resample(sequence, windows.rate)
     blind = sequence._replace(valid=np.zeros_like(sequence.valid))
     prepared, left_out = prepare([blind], windows, START)

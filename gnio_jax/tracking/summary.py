@@ -9,6 +9,7 @@ import numpy as np
 
 from gnio_jax.data.importing import Imported
 from gnio_jax.data.importing.streams import GAPS
+from gnio_jax.data.resampling import LONGEST_BRIDGE
 from gnio_jax.evaluation import Estimate, metrics
 from gnio_jax.evaluation.metrics.trajectory import finite_poses
 from gnio_jax.evaluation.preparation import Prepared
@@ -115,8 +116,10 @@ def summarise(
     )
     own_rate = 1.0 / float(np.median(np.diff(sequence.time)))
     found = _warnings(summary, own_rate, 1.0 / ekf.config.dt)
-    if any(GAPS in note for note in recording.notes):
-        found.append("gaps: samples are missing (see above), and what happened there is guessed")
+    holes = bool((np.diff(sequence.time) > LONGEST_BRIDGE).any())
+    if holes or any(GAPS in note for note in recording.notes):
+        where = "" if holes else " (see above)"
+        found.append(f"gaps: samples are missing{where}, and what happened there is guessed")
     if (prepared.start.velocity_std or 0.0) > QUIET_START:
         found.append("start: it moves in its first second, so its velocity and tilt are rough")
     diverged = (note for note in estimate.notes if note not in prepared.notes)

@@ -158,7 +158,8 @@ def test_each_session_is_judged_by_the_network_that_left_it_out(run, two_walks, 
         alone = evidence.Source(asked[fold].run, None)
         both = evidence.gather("train", [alone], config, loaded.config.filter, lambda *_: None, 1)
         expected = {p.sequence.name: e for p, e in zip(*both, strict=True)}[walk.name]
-        np.testing.assert_array_equal(estimate.displacement, expected.displacement)
+        # To rounding: batches of other sizes are other programs. The networks differ by far more.
+        np.testing.assert_allclose(estimate.displacement, expected.displacement, atol=1e-5)
 
 
 @pytest.mark.parametrize(

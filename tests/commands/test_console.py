@@ -2,11 +2,13 @@
 
 import subprocess
 import sys
+import warnings
 
 import pytest
+from rich.table import Table
 
 from gnio_jax import config
-from gnio_jax.commands import app, options, train
+from gnio_jax.commands import app, console, options, train
 from gnio_jax.config import TrainConfig
 from gnio_jax.errors import InputError
 
@@ -221,3 +223,25 @@ def test_events_of_another_tyro_fall_through():
         pass
 
     assert options._explain(Unheard(), [], [], subcommands=False) is None
+
+
+def test_names_of_files_are_no_controls_of_the_terminal(capsys):
+    """A name may colour the terminal, retitle it or delete what it showed."""
+    name = "walk\x1b]0;mine\x07\x1b[2J\x9b31m\u202e.zip"
+
+    def told():
+        console.stdout().print(f"{name}: read", soft_wrap=True)
+        grid = Table()
+        grid.add_column(name, overflow="fold")
+        console.stdout().print(grid)
+        with console.terminal() as terminal:
+            terminal.line(name)
+        warnings.warn(name, stacklevel=1)
+        raise InputError(name, "no such file")
+
+    with pytest.raises(SystemExit, match="2"):
+        console.run(told)
+    out, err = capsys.readouterr()
+    assert not set(out + err) & set("\x1b\x07\x9b\u202e")
+    assert r"walk\x1b]0;mine\x07\x1b[2J\x9b31m\u202e.zip: read" in out
+    assert err.count(r"walk\x1b]0;mine") == 3

@@ -228,6 +228,36 @@ def test_rows_out_of_order_are_sorted_or_refused(tmp_path):
         import_recording(path, MAPPED, order="refuse")
 
 
+def test_a_clock_that_is_set_back_is_refused(tmp_path):
+    """Sorted, the samples of two times would lie among each other: noise of twice the rate. A
+    block in the wrong place only has to be moved."""
+
+    def back(columns):
+        later = np.arange(2800) >= 1500
+        return columns | {"Timestamp": columns["Timestamp"] - later * 2_003_000_000}
+
+    path = write_logger(tmp_path / "back.csv", spoil=back)
+    problem = r"back\.csv: field 'time' of gyro jumps back by 2\.00 s in row 1500, .*overlaps"
+    with pytest.raises(InputError, match=problem):
+        import_recording(path, MAPPED)
+    moved = np.r_[1000:1600, 0:1000, 1600:2800]
+    path = write_logger(
+        tmp_path / "moved.csv", spoil=lambda c: {name: values[moved] for name, values in c.items()}
+    )
+    compare_imu(import_recording(path, MAPPED).sequence)
+
+
+def test_decimal_commas_are_seen_behind_whole_numbers(tmp_path):
+    path = write_logger(tmp_path / "phone.csv", unit="ms", separator=";")
+    first, *rows = path.read_text().replace(".", ",").splitlines()
+    rows[0] = ";".join(cell.split(",")[0] for cell in rows[0].split(";"))
+    path.write_bytes("\r\n".join(["\ufeff" + first, *rows]).encode())
+    sequence, _ = import_recording(path, MAPPED)
+    np.testing.assert_allclose(
+        sequence.accel[100:110], imu(sequence.time[100:110])[:, 3:], atol=1e-3
+    )
+
+
 def test_a_clock_too_coarse_and_gaps_are_told(tmp_path):
     coarse = write_logger(
         tmp_path / "coarse.csv", spoil=lambda c: c | {"Timestamp": c["Timestamp"] // 10**7 * 10**7}

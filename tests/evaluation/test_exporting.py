@@ -147,6 +147,13 @@ def test_what_is_not_known_is_left_out(tmp_path):
 # --- MCAP
 
 
+def test_a_stamp_that_is_no_date_has_none(tmp_path):
+    poses = walk()
+    poses = poses._replace(time=poses.time * 1e9)  # somebody's nanoseconds
+    export(tmp_path / "walk.gpx", poses, fix=FIX)
+    assert "<time>" not in (tmp_path / "walk.gpx").read_text()
+
+
 def test_the_mcap_is_read_by_rosbags(tmp_path):
     """With the types that the file itself defines."""
     poses = walk()
@@ -240,6 +247,7 @@ def test_the_command_writes_what_the_suffix_says(trajectory, tmp_path, capsys):
         (["turn.txt", "a.csv"], "turn.txt: field 'qx qy qz qw' is not a unit quaternion"),
         (["nan.txt", "a.csv"], "nan.txt: field 't x y z qx qy qz qw' is NaN or Inf"),
         (["early.txt", "a.mcap"], "a.mcap: stamps begin at -1 s; ROS has none below 0"),
+        (["late.txt", "a.mcap"], "a.mcap: stamps end at 1.7e+18 s; ROS counts seconds in 32 bits"),
         (["walk.txt", "a.gpx"], "a.gpx: gpx needs a place on the earth; give --first-fix LAT LON"),
         (["walk.txt", "a.gpx", "--first-fix", "48", "11"], "--heading: is missing"),
         (
@@ -260,6 +268,7 @@ def test_a_mistake_is_one_line(trajectory, tmp_path, capsys, arguments, expected
         "back.txt": "1 0 0 0 0 0 0 1\n0 0 0 0 0 0 0 1\n",
         "turn.txt": "0 0 0 0 0 0 0 2\n1 0 0 0 0 0 0 1\n",
         "nan.txt": "0 0 0 0 0 0 0 1\n1 nan 0 0 0 0 0 1\n",
+        "late.txt": "0 0 0 0 0 0 0 1\n1.7e18 0 0 0 0 0 0 1\n",
         "early.txt": "-1 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n",
     }.items():
         (tmp_path / name).write_text(text)

@@ -87,9 +87,61 @@ def test_a_stream_of_nonsense_ends_with_one_line(line, problem):
     assert found.refused == 100 and found.poses == []
 
 
+class Clocked:
+    """A tracker that wants stamps that increase, and keeps them."""
+
+    def __init__(self):
+        self.stamps = []
+
+    def push(self, time, gyro, accel):
+        if self.stamps and time <= self.stamps[-1]:
+            raise ValueError(f"time: must increase, found {time}")
+        self.stamps.append(time)
+
+
+def test_a_clock_that_is_set_back_ends_the_stream():
+    """After a glitch the samples are taken again; where no later one can be, nothing waits."""
+    lines = [f"{time},0,0,0,0,0,9.81" for time in np.arange(50) / 100]
+    lines = [*lines[:30], *lines[:20], *lines[30:], *lines * 100]
+    found, tracker = live.Follower(), Clocked()
+    live.follow(tracker.push, live.lines_of(lines), found, lambda found: None)
+    assert tracker.stamps == [k / 100 for k in range(50)] and found.lost
+    assert found.in_a_row == 1000 and found.refused == 1020
+    assert found.newest_reason.startswith("time: must increase")
+
+
+def test_stamps_in_milliseconds_are_told():
+    """Within the tracker's longest gap they are no mistake to it, and nothing would ever come."""
+    lines = [f"{10 * k},0,0,0,0,0,9.81" for k in range(100)]
+    with pytest.raises(InputError, match=r"udp:5: its samples come 10 s apart.*seconds, not in ms"):
+        live.follow(Clocked().push, live.lines_of(lines, "udp:5"), live.Follower(), print)
+    # A pause is none.
+    lines = [f"{k / 100 + 30 * (k > 5)},0,0,0,0,0,9.81" for k in range(100)]
+    live.follow(Clocked().push, live.lines_of(lines), live.Follower(), print)
+
+
+def test_what_cannot_be_written_is_found_before_the_stream(gnio, capsys, run, tmp_path):
+    (tmp_path / "file").write_text("")
+    for out in (tmp_path, tmp_path / "file" / "x.txt", tmp_path / "file" / "x" / "y.txt"):
+        with pytest.raises(SystemExit, match="2"):
+            gnio(["0,0,0,0,0,0,9.81"], "--weights", run, "--out", out)
+        told = capsys.readouterr()
+        assert told.err.count("\n") == 1 and "following" not in told.out
+
+
+def test_noise_on_the_line_is_no_text(gnio, run, recorded, monkeypatch, tmp_path):
+    noisy = "\n".join(as_lines(recorded)).encode().replace(b"\n", b"\n\xff\xfe\n", 1)
+    stream = io.TextIOWrapper(io.BytesIO(noisy), encoding="utf-8")
+    monkeypatch.setattr(io, "StringIO", lambda _: stream)
+    assert "warning: 1 lines refused" in gnio([], "--weights", run)
+
+
 @pytest.mark.parametrize(
     ("lines", "arguments", "problem"),
     [
+        ([], ["udp:²"], "udp:²: names no port; write udp:5555"),
+        ([], ["udp:0"], "udp:0: names no port; write udp:5555"),
+        ([], ["udp:5555", "--silence", "-1"], "--silence: -1 s is no time to wait"),
         ([], ["udp:nine"], "udp:nine: names no port; write udp:5555"),
         ([], ["nowhere.csv"], "nowhere.csv"),
         ([], ["nowhere.csv", "--speed", "-1"], "--speed: must not be negative"),

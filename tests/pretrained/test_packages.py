@@ -161,8 +161,17 @@ def test_what_else_is_damaged(package, tmp_path):
     refused(package, "lists its files wrongly")
     with_changes(files={k: v for k, v in good["files"].items() if k != "config.yaml"})
     refused(package, "lacks 'config.yaml'")
-    manifest.write_text("{")
-    refused(package, "no JSON")
+    for size in (-2, 2**40):  # either would read all that a bomb unpacks to
+        with_changes(files={**good["files"], "README.md": {"bytes": size, "sha256": ""}})
+        refused(package, "lists its files wrongly")
+    with_changes(network=["tlio"])
+    refused(package, "lacks a field", "network")
+    for metric in ("1.2", {**good["metric"], "value": "1.2"}, {**good["metric"], "low": None}):
+        with_changes(metric=metric)
+        refused(package, "lacks a field", "metric")
+    for text in ("{", "[" * 100_000):
+        manifest.write_text(text)
+        refused(package, "no JSON")
     with_changes()
     (package / "README.md").write_text("longer " * 9999)
     refused(package, "'README.md'", "larger")

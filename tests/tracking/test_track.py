@@ -14,9 +14,11 @@ from scipy.spatial.transform import Rotation
 from gnio_jax import pretrained
 from gnio_jax.commands import app, console
 from gnio_jax.config import DataConfig, ModelConfig, TrainConfig
+from gnio_jax.data.hdf5 import write_hdf5
 from gnio_jax.evaluation.exporting import read_trajectory
 from gnio_jax.tracking import choose_weights, picture
 from gnio_jax.tracking.summary import Summary
+from gnio_jax.types import Sequence
 from tests.support import bag_files, known_walk, logger_files, tiny_run
 
 CONFIG = TrainConfig(data=DataConfig(rate=50.0), model=ModelConfig(name="tiny"))
@@ -183,6 +185,39 @@ def test_what_is_refused(mistake, runs, tmp_path):
     deaf = logger_files.zipped(tmp_path / "deaf.zip", members)
     assert "deaf.zip" in mistake("track", deaf, *weights)
     assert not list(runs.parent.glob("tracks/.*"))
+
+
+def test_our_own_file_with_holes(gnio, mistake, runs, tmp_path):
+    """It comes to the tracker as it is: nobody has looked for holes yet."""
+    given = ("track", tmp_path / "walk.h5", "--weights", runs / "walker")
+    for lost, name in ((70, "../../walk"), (320, "walk")):
+        time = np.delete(np.arange(900), np.s_[200 : 200 + lost])[:600] / 100
+        nothing = np.full((len(time), 3), np.nan)
+        sequence = Sequence(
+            name=name,
+            time=time,
+            gyro=known_walk.rate(time),
+            accel=known_walk.force(time),
+            orientation=np.full((len(time), 4), np.nan),
+            position=nothing,
+            velocity=nothing,
+            valid=np.zeros(len(time), bool),
+        )
+        write_hdf5(tmp_path / "walk.h5", sequence)
+        if lost == 70:
+            # Whatever the file says of itself, the folder lies in tracks/.
+            assert "warning: gaps: samples are missing, and" in gnio(*given)
+            assert (runs.parent / "tracks" / "_.._walk" / "summary.json").is_file()
+        else:
+            told = mistake(*given)
+            assert "walk: field 'time' has a gap of 3.210 s after row 199, longer than 1 s" in told
+
+
+def test_an_out_that_cannot_be_written_is_found_first(mistake, runs, tmp_path, monkeypatch):
+    monkeypatch.setattr("gnio_jax.tracking.run.run_filters", lambda *_: pytest.fail("too late"))
+    walk = logger_files.zipped(tmp_path / "walk.zip", logger_files.sensor_logger())
+    given = ("track", walk, "--weights", runs / "walker", "--out")
+    assert f"{tmp_path / 'walk.zip'}: " in mistake(*given, walk / "track")
 
 
 def test_what_was_measured_of_a_run(runs, tmp_path):

@@ -11,7 +11,9 @@ Facts, from the app's sources (github.com/phyphox):
   names, so that the units and the axes tell here, and of the names only Linear and Gravity.
 - Separators are comma, semicolon or tab, the decimal is a point or a comma; short columns are
   filled with NaN (DataExport.java).
-- All sensors share one clock, s since the start.
+- All sensors share one clock, s since the start. It stands while the experiment is paused
+  (ExperimentTimeReference.java); `meta/time.csv`, or the sheet `Metadata Time`, has the times of
+  START and PAUSE by the phone's clock too.
 - "Acceleration" includes gravity, "Linear Acceleration" does not. iOS's readings are multiplied by
   −9.81, so that both systems have Android's sign (phyphox-ios, ExperimentSensorInput.swift: kG).
 """
@@ -19,6 +21,7 @@ Facts, from the app's sources (github.com/phyphox):
 from __future__ import annotations
 
 import io
+import itertools
 import re
 import warnings
 import zipfile
@@ -38,6 +41,8 @@ from gnio_jax.data.readers.text import numbers
 from gnio_jax.errors import InputError, require_packages
 from gnio_jax.numerics import interpolate
 
+EVENTS = "meta/time.csv"
+"""When the experiment was started and paused."""
 _AXIS = re.compile(r"\b([xyz])\b", re.IGNORECASE)
 
 
@@ -108,6 +113,7 @@ def _tables(path: Path) -> list[_Table]:
 
 
 def _of_archive(path: Path) -> list[_Table]:
+    _check_pauses(_events(path), path)
     tables = []
     for names in archives.csv_names(path).values():
         for name in names:
@@ -125,11 +131,50 @@ def _of_workbook(path: Path, engine: str) -> list[_Table]:
         if engine == "xlrd":  # it writes what it thinks of a damaged file to the standard output
             options["engine_kwargs"] = {"logfile": io.StringIO()}
         sheets: dict[Any, pd.DataFrame] = pd.read_excel(path, sheet_name=None, **options)
+    for values in sheets.values():
+        _check_pauses(values, path)
     return [
         _Table(path / str(name), values)
         for name, values in sheets.items()
         if _sets([str(label) for label in values.columns])
     ]
+
+
+def _events(path: Path) -> pd.DataFrame:
+    """The table of starts and pauses of a zip or folder; empty where there is none, or no row."""
+    named = [name for names in archives.csv_names(path).values() for name in names]
+    if path.is_dir() and (path / EVENTS).is_file():
+        named.append(EVENTS)
+    for name in named:
+        if name == EVENTS or name.endswith(f"/{EVENTS}"):
+            try:
+                return read_table(path / name, None, (), archives.content(path, name))
+            except InputError:
+                return pd.DataFrame()
+    return pd.DataFrame()
+
+
+def _check_pauses(events: pd.DataFrame, path: Path) -> None:
+    """Raise `InputError` where a table of events tells of a pause: the clock stood, so that nothing
+    in the samples tells that some are missing."""
+    if not {"event", "system time"} <= set(events.columns):
+        return
+    kinds = [str(kind).strip().upper() for kind in events["event"]]
+    clock = pd.to_numeric(events["system time"], errors="coerce").to_list()
+    pauses = [
+        after - before
+        for (kind, following), (before, after) in zip(
+            itertools.pairwise(kinds), itertools.pairwise(clock), strict=True
+        )
+        if (kind, following) == ("PAUSE", "START")
+    ]
+    if pauses:
+        raise InputError(
+            path,
+            f"was paused {len(pauses)} times, for up to {max(pauses):.1f} s, "
+            "and the stamps do not show where",
+            "record without a pause",
+        )
 
 
 # --- columns

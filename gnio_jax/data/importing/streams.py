@@ -24,6 +24,11 @@ MOST_REPEATED = 0.01
 then."""
 SHORTEST_OVERLAP = 1.0
 """s that both sensors must cover."""
+DECIMAL_ROWS = 20
+"""Rows by which a decimal comma is told: in some all numbers may be whole."""
+MOST_APART = 10
+"""Neighbours in time that are none in the file, for each step back in time, above which samples of
+two clocks lie among each other (ours). A block of rows in the wrong place has three."""
 
 GAPS = "lacks samples"
 """What a note of holes in a recording says."""
@@ -94,11 +99,11 @@ def read_table(
 
 
 def table_layout(path: Path, separator: str | None = None, content: bytes | None = None) -> Layout:
-    """The layout of a table, from its first two rows. Raises `InputError` for what is no text."""
+    """The layout of a table, from its first rows. Raises `InputError` for what is no text."""
     try:
         with open_text(path, content) as file:
             rows = (line for line in file if line.strip() and not line.startswith("#"))
-            first, second = next(rows, ""), next(rows, "")
+            first, *others = [next(rows, "") for _ in range(1 + DECIMAL_ROWS)]
     except OSError as error:
         raise InputError(path, f"cannot be read ({error.strerror})") from None
     except UnicodeDecodeError as error:
@@ -106,7 +111,8 @@ def table_layout(path: Path, separator: str | None = None, content: bytes | None
     if separator is None:
         separator = max((",", ";", "\t"), key=first.count)
         separator = separator if separator in first else " "
-    decimal = "," if separator != "," and re.search(r"\d,\d", second) else "."
+    comma = separator != "," and any(re.search(r"\d,\d", row) for row in others)
+    decimal = "," if comma else "."
     labels = first.split(None if separator == " " else separator)
     return Layout(separator, decimal, tuple(_label(label) for label in labels))
 
@@ -218,6 +224,7 @@ def _sorted(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Rows in the order of their stamps, of those that share one the first."""
     sensor, path, rows = source.sensor, source.path, len(time)
+    _check_one_clock(time, source)
     time, values, repairs = in_order(time, values, path, repeats="first")
     if backward := repairs.get("rows_sorted"):
         notes.append(
@@ -234,6 +241,25 @@ def _sorted(
         notes.append(f"{path.name}: {repeated} rows of {sensor} repeat a stamp and were dropped")
     _check_count(time, source)
     return time, values
+
+
+def _check_one_clock(time: np.ndarray, source: SensorFile) -> None:
+    """Raise `InputError` where the clock was set back: sorted, the samples before and after it
+    would lie among each other."""
+    steps = np.diff(time)
+    backward = int((steps < 0).sum())
+    if not backward:
+        return
+    _, order = np.unique(time, return_index=True)
+    apart = int((np.abs(np.diff(order)) > 1).sum())
+    if apart > MOST_APART * backward:
+        row = int(np.argmin(steps)) + 1
+        raise InputError(
+            source.path,
+            f"field 'time' of {source.sensor} jumps back by {-steps[row - 1]:.2f} s in row {row}, "
+            "and what follows overlaps what was before",
+            "its clock was set: cut the recording there",
+        )
 
 
 # --- both sensors

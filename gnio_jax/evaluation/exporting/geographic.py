@@ -24,6 +24,8 @@ SEMI_MAJOR, FLATTENING = 6378137.0, 1.0 / 298.257223563
 ECCENTRICITY_SQUARED = FLATTENING * (2.0 - FLATTENING)
 UNIX_TIME = 1e9
 """s: a stamp beyond is unix time (from 2001 on), below it a clock of its own."""
+LAST_YEAR = 253_370_764_800.0
+"""s: unix time of the year 9999, the last that a date can say. What is later is no time in s."""
 
 
 class FirstFix(NamedTuple):
@@ -139,7 +141,7 @@ def write_gpx(path: Path, poses: Trajectory, fix: FirstFix, name: str) -> None:
         point = ElementTree.SubElement(segment, "trkpt", {"lat": f"{lat:.9f}", "lon": f"{lon:.9f}"})
         if fix.altitude is not None:
             ElementTree.SubElement(point, "ele").text = f"{height:.4f}"
-        if stamp >= UNIX_TIME:
+        if UNIX_TIME <= stamp < LAST_YEAR:
             utc = datetime.fromtimestamp(stamp, UTC).strftime("%Y-%m-%dT%H:%M:%S.%fZ")
             ElementTree.SubElement(point, "time").text = utc
     ElementTree.ElementTree(root).write(path, encoding="utf-8", xml_declaration=True)

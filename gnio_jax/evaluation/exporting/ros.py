@@ -19,6 +19,8 @@ from gnio_jax.errors import InputError
 from gnio_jax.evaluation.metrics import Trajectory
 from gnio_jax.numerics import rotations
 
+LAST_STAMP = 2.0**31
+"""s, builtin_interfaces/Time."""
 WORLD, BODY = "odom", "imu"
 ODOMETRY, PATH, TRANSFORMS = "/odometry", "/path", "/tf"
 _TYPES = {
@@ -61,9 +63,12 @@ def write_mcap(
 
 
 def check_stamps(path: Path, poses: Trajectory) -> None:
-    """Raise `InputError` for stamps (s) below 0."""
+    """Raise `InputError` for stamps (s) below 0 or beyond ROS's 32 bits."""
     if poses.time[0] < 0.0:
         raise InputError(path, f"stamps begin at {poses.time[0]:g} s", "ROS has none below 0")
+    if poses.time[-1] >= LAST_STAMP:
+        remedy = "ROS counts seconds in 32 bits: give stamps in s"
+        raise InputError(path, f"stamps end at {poses.time[-1]:g} s", remedy)
 
 
 def _messages(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import openpyxl
 import pytest
 
 from gnio_jax.data.importing import archives, import_recording
@@ -262,6 +263,34 @@ def test_phyphox_as_a_workbook(tmp_path, monkeypatch):
     damaged = (tmp_path / "walk.xls").read_bytes()[:3000]
     (tmp_path / "cut.xls").write_bytes(damaged)
     refused(tmp_path / "cut.xls", "cut.xls: cannot be read as a workbook")
+
+
+def test_phyphox_that_was_paused_is_refused(tmp_path):
+    """Its clock stands meanwhile: the samples show no hole."""
+    events = [("START", 0.0, 100.0), ("PAUSE", 4.0, 104.0), ("START", 4.0, 107.5)]
+    lines = [f'"{event}",{time:.9E},{system:.3f},"x"' for event, time, system in events]
+    members = phyphox()
+    header = members["meta/time.csv"]
+    words = r"walk[a-z]*\.?[a-z]*: was paused 1 times, for up to 3\.5 s"
+    for kept, paused in ((3, True), (2, False)):
+        members["meta/time.csv"] = header + "\n".join(lines[:kept]) + "\n"
+        folder = tmp_path / f"walk{'a' * kept}"
+        for path in (
+            zipped(tmp_path / "walk.zip", members),
+            zipped(tmp_path / "walkb.zip", {f"deep/{name}": t for name, t in members.items()}),
+            logger_files.unpacked(folder, members),
+        ):
+            if paused:
+                refused(path, words)
+            else:
+                compare(import_recording(path).sequence)
+    workbooks(tmp_path, phyphox_sets())
+    book = openpyxl.load_workbook(tmp_path / "walk.xlsx")
+    sheet = book.create_sheet("Metadata Time")
+    for row in [("event", "experiment time", "system time", "system time text"), *events]:
+        sheet.append(row)
+    book.save(tmp_path / "walk.xlsx")
+    refused(tmp_path / "walk.xlsx", words)
 
 
 def test_phyphox_of_an_earlier_release_in_another_language_in_degrees(tmp_path):
