@@ -160,7 +160,7 @@ def _check_pauses(events: pd.DataFrame, path: Path) -> None:
     if not {"event", "system time"} <= set(events.columns):
         return
     kinds = [str(kind).strip().upper() for kind in events["event"]]
-    clock = pd.to_numeric(events["system time"], errors="coerce").to_list()
+    clock = np.asarray(pd.to_numeric(events["system time"], errors="coerce"), np.float64).tolist()
     pauses = [
         after - before
         for (kind, following), (before, after) in zip(
