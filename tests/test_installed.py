@@ -10,6 +10,7 @@ import zipfile
 from importlib import metadata
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 ROOT = Path(__file__).parents[1]
@@ -85,6 +86,21 @@ def test_train_and_evaluate_from_anywhere(gnio, tmp_path):
     folder = tmp_path / "runs" / "synthetic_gnio" / "eval" / "synthetic_val_integrate"
     figures = json.loads((folder / "metrics.json").read_text())
     assert figures["mean"]["ate"] > 0 and len(figures["sequences"]) == 4
+
+
+def test_the_path_of_a_recording_without_any_training(gnio, tmp_path):
+    tracked = gnio("track", ROOT / "examples" / "walk.csv")
+    assert tracked.returncode == 0, tracked.stderr
+    assert "limits: " in tracked.stdout and "by pedestrian" in tracked.stdout
+    folder = tmp_path / "tracks" / "walk"
+    for name in ("trajectory.txt", "track.png", "report.html", "summary.json"):
+        assert (folder / name).is_file()
+    path = np.loadtxt(folder / "trajectory.txt")[:, 1:4]
+    # examples/make_walk.py tells the truth: 76.3 m, and 13.0 m from the start at the end.
+    seconds = path[::10]
+    length = np.linalg.norm(np.diff(seconds, axis=0), axis=1).sum()
+    assert abs(length / 76.3 - 1) < 0.15
+    assert abs(np.linalg.norm(path[-1] - path[0]) - 13.0) < 5.0
 
 
 def test_names_of_configs_and_their_mistakes(gnio):
