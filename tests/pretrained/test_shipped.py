@@ -1,5 +1,6 @@
 """The network that comes with gnio-jax."""
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -38,7 +39,7 @@ def test_it_loads_and_answers(about):
     # A phone that lies still goes nowhere, by the network alone.
     still = np.zeros((1, run.config.data.window, 6), np.float32)
     still[..., 2] = 9.81
-    prediction = run.model.apply(run.variables, still)
+    prediction = run.model.apply(run.variables, jnp.asarray(still))
     assert np.linalg.norm(prediction.displacement) < 0.05
 
 
