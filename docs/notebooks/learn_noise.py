@@ -120,7 +120,7 @@ figure.tight_layout()
 print("learnt / added:", (path[-1] / true_density).round(2))
 
 # %% [markdown]
-# The noises end within a factor of two of what we added (dotted), from values that were 16 and 100
+# The noises end within a quarter of what we added (dotted), from values that were 16 and 100
 # times too small. Thirty seconds of one walk do not say it better: a wrong tilt at the start and a
 # drifting gyro look much alike. More recordings side by side, with `jax.vmap`, do.
 #
