@@ -79,6 +79,15 @@ def test_messages_become_odometry(bridge):
     assert twist[3, 3] == -1
 
 
+def test_a_filter_that_diverged_publishes_nothing(bridge):
+    tracker = Recorder()
+    sound = tracker.push
+    tracker.push = lambda *sample: (pose := sound(*sample)) and pose._replace(healthy=False)
+    found = bridge.Bridge(tracker)
+    assert [found.take(message(5, k)) for k in range(4)] == [None] * 4
+    assert found.refused == 2 and "diverged" in found.reason
+
+
 def test_a_repeated_message_is_refused_and_the_next_one_taken(bridge):
     found = bridge.Bridge(Recorder())
     found.take(message(5, 0))

@@ -17,7 +17,7 @@ from gnio_jax.config import DataConfig, ModelConfig, TrainConfig
 from gnio_jax.data.hdf5 import write_hdf5
 from gnio_jax.evaluation.exporting import read_trajectory
 from gnio_jax.tracking import choose_weights, picture
-from gnio_jax.tracking.summary import Summary
+from gnio_jax.tracking.summary import Summary, _warnings
 from gnio_jax.types import Sequence
 from tests.support import bag_files, known_walk, logger_files, tiny_run
 
@@ -275,4 +275,7 @@ def test_the_line_says_what_is_counted():
     assert "errors considered" in line and "expect more" not in line
     assert "trained on walks, whose ATE 2-D is 1.1 m on test" in line
     assert "of the path" not in summary._replace(path_length=0.3).limits
+    for accepted, told in ((0.95, []), (0.71, ["gate: the filter refused 29% of"])):
+        warned = _warnings(summary._replace(accepted=accepted), own_rate=100.0, rate=100.0)
+        assert [line[: len(words)] for line, words in zip(warned, told, strict=True)] == told
     assert "\n" not in line

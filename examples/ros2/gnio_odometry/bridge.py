@@ -35,7 +35,7 @@ class Bridge:
         self._tracker = tracker
         self._first: int | None = None
         self.refused = 0
-        """Messages that the tracker could not take."""
+        """Messages that the tracker could not take, and clone steps of a filter that diverged."""
         self.reason = ""
         """Why the newest of them was refused."""
 
@@ -57,6 +57,10 @@ class Bridge:
         except ValueError as error:
             self.refused += 1
             self.reason = str(error)
+            return None
+        if pose is not None and not pose.healthy:
+            self.refused += 1
+            self.reason = "the filter diverged: start the node again"
             return None
         return None if pose is None else self._odometry(pose)
 
