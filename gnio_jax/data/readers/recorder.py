@@ -61,13 +61,14 @@ def read_recorder(folder: Path) -> Native:
     gyro_stamps, gyro = _text(gyro_path, 3)
     force_stamps, force = _text(force_path, 3)
     pose_stamps, pose = _text(pose_path, 7)
+    # First: with stamps of the gyro in another unit, those of the other files would look wrong.
+    _check_rate(gyro_stamps, gyro_path)
+    _check_rate(force_stamps, force_path)
     start = gyro_stamps[0]
     gyro_time, force_time, pose_time = (
         (stamps - start) * 1e-9 for stamps in (gyro_stamps, force_stamps, pose_stamps)
     )
     check_increasing(pose_time, pose_path)  # stamps of another unit may fall together
-    _check_rate(gyro_stamps, gyro_path)
-    _check_rate(force_stamps, force_path)
     rows = _shared(gyro_time, force_time, pose_time, force_path, pose_path)
     time = gyro_time[rows]
     attitude = unit_rotations(wxyz_from_xyzw(pose[:, 3:]), "qx qy qz qw", pose_path)
