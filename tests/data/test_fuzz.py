@@ -79,6 +79,11 @@ _EURO = "MH_04_difficult/mav0/imu0"
 _OXTS = LAYOUTS["kitti packets"].targets
 _FLIGHT = "clover/yawForward/maxSpeed5p0/test/stamped_groundtruth_imu.txt"
 ONCE_WRONG = {
+    "gyro that begins before the world": (
+        "ridi text",
+        [Damage("hang_leg1/gyro.txt", "cell", 0.5, 0.0, "-1e30")],
+        "gyro.txt: field 'time' goes over",
+    ),
     "gyro of another unit": (
         "ridi text",
         [Damage("hang_leg1/gyro.txt", "scale column", 0.0, 0.0, 1e9)],

@@ -26,6 +26,9 @@ from gnio_jax.numerics import neighbours, wxyz_from_xyzw
 RATES = (90.0, 1100.0)
 """Hz: 200 in RIDI itself, more in what newer phones wrote."""
 
+MOST_DAYS = 30.0
+"""Longer recordings are mistaken stamps; in float64, ns lose nothing of theirs up to there."""
+
 TANGO, ARCORE = "Tango VIO of the phone itself", "ARCore VIO of the phone itself"
 
 _Y_UP = Rotation.from_matrix([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
@@ -61,9 +64,9 @@ def read_recorder(folder: Path) -> Native:
     gyro_stamps, gyro = _text(gyro_path, 3)
     force_stamps, force = _text(force_path, 3)
     pose_stamps, pose = _text(pose_path, 7)
-    # First: with stamps of the gyro in another unit, those of the other files would look wrong.
-    _check_rate(gyro_stamps, gyro_path)
-    _check_rate(force_stamps, force_path)
+    # First: where the gyro's first stamp is nonsense, those of the other files would look wrong.
+    _check_clock(gyro_stamps, gyro_path)
+    _check_clock(force_stamps, force_path)
     start = gyro_stamps[0]
     gyro_time, force_time, pose_time = (
         (stamps - start) * 1e-9 for stamps in (gyro_stamps, force_stamps, pose_stamps)
@@ -94,7 +97,7 @@ def _pose_file(folder: Path) -> tuple[Path, Rotation]:
     return folder / "pose.txt", Rotation.identity()
 
 
-def _check_rate(stamps: Float[np.ndarray, " n"], path: Path) -> None:
+def _check_clock(stamps: Float[np.ndarray, " n"], path: Path) -> None:
     rate = 1e9 / float(np.median(np.diff(stamps)))
     slowest, fastest = RATES
     if not slowest <= rate <= fastest:
@@ -103,6 +106,10 @@ def _check_rate(stamps: Float[np.ndarray, " n"], path: Path) -> None:
             f"field 'time' runs at {rate:.4g} Hz, expected {slowest:g} to {fastest:g} Hz",
             "check the unit of the stamps: they are ns",
         )
+    days = (stamps[-1] - stamps[0]) * 1e-9 / 86400
+    if days > MOST_DAYS:
+        problem = f"field 'time' goes over {days:.3g} days"
+        raise InputError(path, problem, "repair or cut the rows of other times")
 
 
 def _shared(
@@ -135,7 +142,8 @@ def _shared(
         raise InputError(
             pose_path,
             f"its stamps ({pose_time[0]:.1f} to {pose_time[-1]:.1f} s after the gyro's first) "
-            f"share nothing with the IMU's ({gyro_time[0]:.1f} to {gyro_time[-1]:.1f} s)",
+            f"share nothing with the IMU's in gyro.txt and acce.txt "
+            f"({gyro_time[0]:.1f} to {gyro_time[-1]:.1f} s)",
             remedy,
         )
     return rows
