@@ -98,24 +98,10 @@ def read(path: Path) -> Recorded:
 
 def create_tracker(run, recorded: Recorded, rest_seconds: float):
     """The compiled tracker of a trained run, which starts from rest."""
-    from gnio_jax import models
-    from gnio_jax.evaluation import filter_setup
-    from gnio_jax.filtering import Tracker
+    from gnio_jax import live
 
-    setup = filter_setup(run.config.data, run.config.filter)
-    config, noise, initial_std = setup.config, setup.noise, setup.initial_std
-    # What depends on the weights alone is computed once.
-    frozen = models.inference_variables(run.model, run.variables)
-
-    def predict(windows):
-        return models.Inference(run.model)(frozen, windows)
-
-    longest_gap = 1.5 * max(config.dt, recorded.interval)
-    imu_rate = 1 / recorded.interval
     try:
-        return Tracker.from_rest(
-            predict, config, noise, rest_seconds, initial_std, longest_gap, imu_rate=imu_rate
-        )
+        return live.create_tracker(run, 1 / recorded.interval, rest_seconds)
     except ValueError as error:
         raise InputError("--rest-seconds", str(error)) from None
 

@@ -30,14 +30,12 @@ FIRST_STAMPS = 21
 """Samples by which that is told."""
 
 
-def create_tracker(
-    run: Run, imu_rate: float | None = None, rest_seconds: float = 1.0, hole: float | None = None
-) -> Tracker:
+def create_tracker(run: Run, imu_rate: float | None = None, rest_seconds: float = 1.0) -> Tracker:
     """The compiled tracker of a run, which starts from rest.
 
-    `imu_rate` is that of the samples that will come, Hz (None: the network's), `hole` the time
-    between two samples beyond which some are missing, s (None: 1.5 intervals). Raises `ValueError`
-    for a rest that is shorter than two samples.
+    `imu_rate` is that of the samples that will come, Hz (None: the network's). Samples that are
+    further apart than 1.5 of its intervals miss some between them. Raises `ValueError` for a rest
+    that is shorter than two samples.
     """
     setup = filter_setup(run.config.data, run.config.filter)
     network = inference_network(run.model, run.variables)
@@ -46,7 +44,7 @@ def create_tracker(
         return network.apply(network.variables, windows)
 
     interval = 1 / (imu_rate or run.config.data.rate)
-    longest_gap = hole or 1.5 * max(setup.config.dt, interval)
+    longest_gap = 1.5 * max(setup.config.dt, interval)
     return Tracker.from_rest(
         predict,
         setup.config,
