@@ -48,7 +48,7 @@ def _description(config: TrainConfig) -> dict[str, Any]:
     }
     windows = {
         f"data.{name}": getattr(config.data, name)
-        for name in ("rate", "window_seconds", "window_rotation")
+        for name in ("rate", "window_seconds", "context_seconds", "window_rotation")
     }
     kind = {f"model.{name}": getattr(config.model, name) for name in ("name", "equivariance")}
     return {**kind, **options, **windows}
