@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from gnio_jax import data
 from gnio_jax.config import DataConfig, FilterOptions
@@ -70,6 +70,12 @@ class Prepared(NamedTuple):
     def strides(self, samples: int) -> int:
         """K, for strides of `samples`."""
         return (len(self.sequence.time) - 1) // samples
+
+    @property
+    def imu_valid(self) -> Bool[np.ndarray, "m"] | None:
+        """Which of the samples that drive the filter are there; None: all."""
+        mask = self.sequence.imu_valid
+        return None if mask is None or mask.all() else mask[:-1]
 
     def reference(self, samples: int) -> Trajectory:
         """The reference at the ends of the strides, NaN where it cannot be trusted."""

@@ -273,6 +273,7 @@ def _without_reference(imu: Joined, name: str, source: Path) -> Sequence:
         position=nothing,
         velocity=nothing,
         valid=np.zeros(count, dtype=bool),
+        imu_valid=imu.valid,
         attributes={"dataset": "csv", "group": name, "truth": "none", "start_time": imu.start},
     )
     return validate(sequence, source)
