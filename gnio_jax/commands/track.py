@@ -80,10 +80,9 @@ def _recording(options: TrackOptions) -> Any:
     """An `importing.Imported` of the file; our own HDF5 is read as it is."""
     if options.file.suffix.lower() not in (".h5", ".hdf5"):
         return read_recording(options)
-    from gnio_jax.data.hdf5 import read_hdf5
-    from gnio_jax.data.importing import Imported
+    from gnio_jax.data.importing.kept import read_imported
 
-    return Imported(read_hdf5(options.file), ())
+    return read_imported(options.file)
 
 
 def _table(summary: Any) -> Any:
