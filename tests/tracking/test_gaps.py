@@ -14,7 +14,7 @@ from gnio_jax.evaluation import prepare
 from gnio_jax.evaluation.estimators.filtered import Measurements, run_filters
 from gnio_jax.evaluation.setup import Setup
 from gnio_jax.filtering import InitialStd
-from gnio_jax.tracking.run import GAP_ACCEL_STD, GAP_GYRO_STD, tracking_filter
+from gnio_jax.tracking.filter import GAP_ACCEL_STD, GAP_GYRO_STD, tracking_filter
 from gnio_jax.training.checkpoint import Run
 from gnio_jax.types import Sequence
 from tests.support import known_walk
