@@ -87,7 +87,7 @@ def measure(
         ours, _ = timed(lambda sample=samples[-1]: tracker.push(*sample))
         measured = {"displacement": np.full(3, np.nan), "covariance": np.eye(3)}
         parts = {}
-        if k >= models.clones_per_window:
+        if k >= models.first_measured:
             inputs = {**arrays, **stride}
             parts["window"], cut = timed(lambda given=inputs: driver.run(models.window, given))
             window = cut["window"]

@@ -47,7 +47,7 @@ def measure(clone_rate: int, batch: int, seconds: float, repeats: int) -> dict[s
     state = filtering.initial_state(config, np.eye(3), np.array([1.2, 0.0, 0.0]), np.zeros(3))
     noise = filtering.NoiseModel.per_sample(1e-2, 3.16e-2, config.dt)
     model = models.create("gnio")
-    variables = models.initialise(model, jax.random.key(0), config.window)
+    variables = models.initialise(model, jax.random.key(0), config.seen)
     apply, frozen = models.Inference(model), models.inference_variables(model, variables)
 
     def with_network(frozen, gyro, accel):

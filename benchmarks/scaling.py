@@ -73,7 +73,7 @@ def configuration(width: int, batch: int) -> TrainConfig:
 
 def prepared(config: TrainConfig):
     """A function that takes a state through STEPS steps, the state, and its program."""
-    model, samples = create_model(config), config.data.window
+    model, samples = create_model(config), config.data.seen
     optimizer = optimizers.create(config.optim, config.loss, 1000)
     source = devices.everywhere(jax.device_get(recordings(samples, config.optim.batch_size)))
     state = devices.everywhere(create_state(model, optimizer, jax.random.key(0), samples))
@@ -144,7 +144,7 @@ def measure(arguments: argparse.Namespace) -> None:
 def supplied_steps(arguments: argparse.Namespace) -> None:
     """Measure with the recordings where `arguments.supply` says; print windows/s and MiB."""
     config = configuration(arguments.width, arguments.batch)
-    network, samples = create_model(config), config.data.window
+    network, samples = create_model(config), config.data.seen
     optimizer = optimizers.create(config.optim, config.loss, 1000)
     state = create_state(network, optimizer, jax.random.key(0), samples)
     size, supply = config.optim.batch_size, OnDevice()
@@ -239,7 +239,7 @@ def row(gpus: int, each: int, flops: float, sums: list[int], network: Network) -
 
 def flops_per_window(config: TrainConfig) -> float:
     """Operations of the gradient, as XLA counts those of the program for one device."""
-    network, samples = create_model(config), config.data.window
+    network, samples = create_model(config), config.data.seen
     imu = jnp.zeros((config.optim.batch_size, samples, 6), jnp.float32)
     variables = jax.eval_shape(network.init, jax.random.key(0), imu[:1])
 

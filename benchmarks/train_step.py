@@ -60,7 +60,7 @@ def ours(config: TrainConfig):
 
     The whole step runs STEPS steps in one dispatch, as the training loop does.
     """
-    size, samples = config.optim.batch_size, config.data.window
+    size, samples = config.optim.batch_size, config.data.seen
     source, model = recordings(samples, size), create_model(config)
     optimizer = optimizers.create(config.optim, config.loss, 1000)
     holder = [create_state(model, optimizer, jax.random.key(0), samples)]

@@ -6,7 +6,8 @@ Sample j of the window that starts at sample i is (paper eq. 1)
 
 where R_j is the attitude at sample j (body → world) and R_γ(R_i) the rotation about z by the yaw
 of R_i. So gravity stays on z, the start has zero yaw, and the channels are [accel, gyro]. The
-network answers with the displacement over the window in this same frame.
+network answers with the displacement over the window in this same frame. It may see a context too:
+samples before i, in the same frame (ours).
 
 The attitudes R_j have two sources:
 
@@ -50,7 +51,8 @@ class AlignedRecording(NamedTuple):
 def window_starts(samples: int, length: int, stride: int) -> Starts:
     """First samples of all windows of `length` samples in a recording, `stride` samples apart.
 
-    The last window still has the sample after it, at whose stamp its displacement ends.
+    The last window still has the sample after it, at whose stamp its displacement ends. With a
+    context, `length` counts it too, and a window is said to start with its context.
     """
     return np.arange(0, samples - length, stride)
 
@@ -65,9 +67,10 @@ def align_recording(
     """Do once for a recording what all its windows have in common, in float64.
 
     accel m/s² and gyro rad/s, biases subtracted, in the body frame; attitude body → world; start
-    the first samples of the windows. With `window_rotation="per_sample"` every sample is rotated to
-    the world by its own attitude, and a window needs only its start's yaw removed. With `"single"`
-    the samples stay in the body, and a window is rotated by its start's attitude without yaw.
+    the samples whose yaw the windows remove: their first ones after the context. With
+    `window_rotation="per_sample"` every sample is rotated to the world by its own attitude, and a
+    window needs only its start's yaw removed. With `"single"` the samples stay in the body, and a
+    window is rotated by its start's attitude without yaw.
     """
     signals = np.stack([accel, gyro], axis=2)
     rotation = remove_yaw(attitude[start])
@@ -155,17 +158,23 @@ def cut_window(
     accel_bias: Float[Array, "3"],
     cut: WindowCut,
     dt: float,
+    context: int = 0,
 ) -> Float[jax.Array, "n 6"]:
-    """The window of n raw samples, `dt` seconds apart, whose first has the attitude `rotation`.
+    """The window of n raw samples, `dt` seconds apart, whose first after `context` samples has the
+    attitude `rotation`.
 
     gyro rad/s and accel m/s² in the body frame. Attitudes are propagated by R_{j+1} = R_j exp(φ_j),
-    φ the bias-corrected rate times dt, as `cut` says. Jittable and differentiable.
+    φ the bias-corrected rate times dt, as `cut` says: forwards from there, and backwards through
+    the context. Jittable and differentiable.
     """
     rates = gyro - gyro_bias[None]
     if cut.subtract_biases:
         gyro, accel = rates, accel - accel_bias[None]
     turns = jax.vmap(geometry.exp, out_axes=2)(rates[cut.propagating] * dt)
     first = geometry.yaw_rotation(rotation).T @ rotation
+    if context:
+        before = geometry.cumulative_rotation(jnp.eye(3, dtype=first.dtype), turns[:, :, :context])
+        first = first @ before[:, :, -1].T
     attitudes = geometry.cumulative_rotation(first, turns)
     # Samples lie along the last axis: sums over three that XLA fuses, as everywhere in the filter.
     attitudes = jnp.broadcast_to(attitudes, (3, 3, len(gyro)))

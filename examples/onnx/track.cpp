@@ -147,7 +147,7 @@ void track(const std::string& folder, const std::string& csv, const std::string&
   Model window(env, options, folder + "/filter_window.onnx");
   Model step(env, options, folder + "/filter_step.onnx");
   const double rate = step.said("rate"), log_std_min = step.said("log_std_min");
-  const size_t first_window = step.said("clones_per_window"), n = step.samples();
+  const size_t first_window = step.said("first_measured"), n = step.samples();
 
   const auto samples = resample(read(csv), rate);
   if (samples.size() < start.samples()) throw std::runtime_error(csv + ": is too short");

@@ -48,6 +48,9 @@ class DataConfig:
     """Samples per second to which every recording is resampled, Hz."""
     window_seconds: Positive = 1.0
     """Length of the network's window, s (paper: 1 s)."""
+    context_seconds: NonNegative = 0.0
+    """IMU before the window that the network sees too, s; it still tells the displacement over the
+    window (ours; paper: none)."""
     stride_seconds: Positive = 0.1
     """Distance between window starts, and between the filter's clones, s (paper: 0.1 s)."""
     train_stride_seconds: Positive = 0.1
@@ -76,6 +79,16 @@ class DataConfig:
         return round(self.window_seconds * self.rate)
 
     @property
+    def context(self) -> int:
+        """Samples before a window that the network sees too."""
+        return round(self.context_seconds * self.rate)
+
+    @property
+    def seen(self) -> int:
+        """Samples that the network sees: the context and the window."""
+        return self.context + self.window
+
+    @property
     def stride(self) -> int:
         """Samples between window starts, which is also one clone interval of the filter."""
         return round(self.stride_seconds * self.rate)
@@ -86,14 +99,22 @@ class DataConfig:
         return round(self.train_stride_seconds * self.rate)
 
     def check(self, prefix: str, source: str) -> None:
-        """Window and strides are whole samples, and strides fill the window exactly."""
-        for name in ("window_seconds", "stride_seconds", "train_stride_seconds"):
+        """Window, context and strides are whole samples, and strides fill window and context."""
+        for name in (
+            "window_seconds",
+            "context_seconds",
+            "stride_seconds",
+            "train_stride_seconds",
+        ):
             samples = getattr(self, name) * self.rate
             if abs(samples - round(samples)) >= 1e-6:
                 problem = f"is not a whole number of samples at {self.rate:g} Hz ({samples:g})"
                 raise InputError(source, f"field '{prefix}{name}' {problem}")
         if self.window % self.stride:
             problem = f"must divide the window of {self.window_seconds:g} s"
+            raise InputError(source, f"field '{prefix}stride_seconds' {problem}")
+        if self.context % self.stride:
+            problem = f"must divide the context of {self.context_seconds:g} s"
             raise InputError(source, f"field '{prefix}stride_seconds' {problem}")
         if self.left_out >= self.folds:
             problem = f"must be below data.folds, which is {self.folds}, found {self.left_out}"
@@ -329,8 +350,9 @@ class TrainConfig:
     workdir: str | None = None
     """Folder for checkpoints and logs; by default runs/<dataset>_<model>."""
     init_from: str | None = None
-    """Folder of a run with the same network, whose best weights training starts from; by default
-    they are drawn. Through the filter, `gnio train` also begins with the run's filter options."""
+    """Run, or package of weights (see gnio weights), with the same network, whose best weights
+    training starts from; by default they are drawn. Through the filter, `gnio train` also begins
+    with its filter options."""
     seed: int = 0
     """Seed of the initial parameters, the shuffling and the augmentation."""
     data: DataConfig = field(default_factory=DataConfig)
@@ -346,7 +368,10 @@ class TrainConfig:
     def check(self, prefix: str, source: str) -> None:
         """Four headings are averaged only if training shows windows of every heading. A network
         that learns through the filter has weights, and its pieces are whole strides and longer
-        than a window."""
+        than a window and its context. A network that predicts every sample takes no context."""
+        if self.data.context and self.model.name == "ctin":
+            problem = f"field '{prefix}data.context_seconds' is not for ctin"
+            raise InputError(source, problem, "it predicts every sample it sees: set it to 0")
         if self.model.equivariance == "four_headings" and not self.augment.yaw:
             problem = f"field '{prefix}model.equivariance' is four_headings without augment.yaw"
             remedy = "training must show every heading: set augment.yaw to true"
@@ -378,8 +403,9 @@ class TrainConfig:
             problem = "makes no sense beside filter.mahalanobis_fail_scale"
             field_name = f"field '{prefix}through_filter.gate_softness'"
             raise InputError(source, f"{field_name} {problem}", "set one of them to 0")
-        if through.piece_seconds < self.data.window_seconds + 2 * self.data.stride_seconds:
-            problem = f"must be longer than the window of {self.data.window_seconds:g} s"
+        seen = self.data.context_seconds + self.data.window_seconds
+        if through.piece_seconds < seen + 2 * self.data.stride_seconds:
+            problem = f"must be longer than the {seen:g} s that the network sees"
             raise InputError(source, f"field '{prefix}through_filter.piece_seconds' {problem}")
 
 

@@ -34,18 +34,18 @@ class WindowSource(NamedTuple):
     imu: Float[Array, "t 6"]
     """[accel m/s², gyro rad/s], as `gnio_jax.windows.AlignedRecording` has it."""
     start: Int[Array, "m"]
-    """Row of `imu` at which each window begins."""
+    """Row of `imu` at which each window begins, with its context."""
     rotation: Float[Array, "m 3 3"]
-    """From the frame of `imu` to the gravity-aligned frame in which the window's start has zero
-    yaw."""
+    """From the frame of `imu` to the gravity-aligned frame in which the window's start, after the
+    context, has zero yaw."""
     displacement: Float[Array, "m 3"]
-    """Target in that frame, m: from the stamp of the first sample to one interval after the last
-    (paper eq. 1)."""
+    """Target in that frame, m: from the stamp of the first sample after the context to one interval
+    after the last (paper eq. 1)."""
     step: Float[Array, "t 3"]
     """Displacement from each sample's stamp to the next in the world, m; NaN where the reference
     has none."""
     unyaw: Float[Array, "m 2"]
-    """Cosine and sine of each window start's yaw: from the world to the window's frame."""
+    """Cosine and sine of the yaw that `rotation` removes: from the world to the window's frame."""
     visited: Int[Array, "v"]
     """Numbers of the windows an epoch visits: all of them, unless they are to be shifted (see
     `shift_windows`)."""
@@ -62,9 +62,10 @@ def window_source(
     """Cut `sequences` (all at `config.rate`) into windows every `stride` samples.
 
     With `shift` there is a window at every sample, for those of an epoch to be shifted to. A window
-    of N samples from i needs the reference at i … i+N, all of it valid. Attitude and biases come
-    from the reference (biases zero). Differences of positions are taken in float64, before they are
-    stored in float32. Raises `InputError` when not a single window fits.
+    of C + N samples from i, context included, needs the reference at i … i+C+N, all of it
+    valid. Attitude and biases come from the reference (biases zero). Differences of positions are
+    taken in float64, before they are stored in float32. Raises `InputError` when not a single
+    window fits.
     """
     return joined(window_parts(sequences, config, stride, shift))
 
@@ -87,12 +88,12 @@ def window_parts(
     in parts. Raises `InputError` at the end when there was none."""
     found = False
     for sequence in sequences:
-        start = _valid_starts(sequence, config.window, 1 if shift else stride)
+        start = _valid_starts(sequence, config.seen, 1 if shift else stride)
         if start.size:
             found = True
             yield _source_of(sequence, start, config, stride)
     if not found:
-        length = f"{config.window_seconds:g} s"
+        length = f"{config.context_seconds + config.window_seconds:g} s"
         raise InputError("data", f"no window of {length} with a valid reference in any sequence")
 
 
@@ -108,11 +109,12 @@ def _source_of(sequence: Sequence, start: Starts, config: DataConfig, stride: in
     # An invalid row may hold NaN; no window touches it, so any rotation will do there.
     orientation = np.where(sequence.valid[:, None], sequence.orientation, [1.0, 0.0, 0.0, 0.0])
     attitude = rotations(orientation).as_matrix()
+    after_context = start + config.context
     imu, rotation = align_recording(
-        sequence.accel, sequence.gyro, attitude, start, config.window_rotation
+        sequence.accel, sequence.gyro, attitude, after_context, config.window_rotation
     )
-    displacement = true_displacement(orientation, sequence.position, start, config.window)
-    heading = yaw(attitude[start])
+    displacement = true_displacement(orientation, sequence.position, after_context, config.window)
+    heading = yaw(attitude[after_context])
     return WindowSource(
         imu=imu,
         start=start.astype(np.int32),

@@ -58,7 +58,7 @@ class Said(NamedTuple):
     position: Float[np.ndarray, "k 3"]
     """m."""
     displacement: Float[np.ndarray, "m 3"]
-    """Of each window, m = K − W, m."""
+    """Of each of the m windows, m."""
 
 
 class Deviation(NamedTuple):
@@ -107,7 +107,7 @@ def of_package(network: Network, setup: FilterSetup, drawn: Walk) -> Said:
     def odometry(start: dict[str, Any], gyro: Any, accel: Any) -> Said:
         state = initial_state(setup.config, **start, std=setup.initial_std)
         _, history = run_odometry(predict, state, gyro, accel, setup.config, setup.noise)
-        return Said(history.position, history.displacement[setup.config.clones_per_window :])
+        return Said(history.position, history.displacement[setup.config.first_measured :])
 
     return Said(*map(np.asarray, odometry(drawn.start, drawn.gyro, drawn.accel)))
 

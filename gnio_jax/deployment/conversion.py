@@ -75,7 +75,7 @@ def _metadata(setup: FilterSetup) -> dict[str, str]:
     config = setup.config
     return {
         "rate": f"{1 / config.dt:.17g}",
-        "clones_per_window": str(config.clones_per_window),
+        "first_measured": str(config.first_measured),
         "log_std_min": f"{config.log_std_min:.17g}",
     }
 

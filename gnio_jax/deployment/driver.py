@@ -27,7 +27,7 @@ class Models(NamedTuple):
     start: Any
     window: Any
     step: Any
-    clones_per_window: int
+    first_measured: int
     log_std_min: float
 
 
@@ -58,7 +58,7 @@ def open_models(folder: Path, threads: int = 1) -> Models:
         start=start,
         window=window,
         step=step,
-        clones_per_window=int(said["clones_per_window"]),
+        first_measured=int(said["first_measured"]),
         log_std_min=float(said["log_std_min"]),
     )
 
@@ -93,7 +93,7 @@ def walk(
         rows = slice(k * n, (k + 1) * n)
         stride = {"gyro": gyro[rows], "accel": accel[rows]}
         measured = {"displacement": np.full(3, np.nan), "covariance": np.eye(3)}  # none
-        if k >= models.clones_per_window:
+        if k >= models.first_measured:
             window = run(models.window, {**state, **stride})["window"]
             measured = measure(models, window)
             windows.append(window[0])

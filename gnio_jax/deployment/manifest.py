@@ -16,18 +16,18 @@ import numpy as np
 from gnio_jax.errors import InputError
 from gnio_jax.filtering.options import FilterSetup
 
-FORMAT, VERSION = "gnio-export", 1
+FORMAT, VERSION = "gnio-export", 2
 MANIFEST = "export.json"
 CONVENTIONS = (
     "SI units. The world is z-up with gravity (0, 0, -9.81) m/s². Rotations are matrices body → "
     "world. gyro and accel are raw, in the body frame, at `rate`, without holes; accel includes "
-    "gravity. A displacement is told in the gravity frame of its window's first sample, whose yaw "
-    "is zero. covariance of a measurement: diag(exp(2 max(log_std, log_std_min))), m²; a "
-    "displacement of NaN is no measurement. Errors of rotations are in the world frame, "
-    "left-multiplied."
+    "gravity. A displacement is told in the gravity frame of its window's first sample after the "
+    "context, whose yaw is zero. covariance of a measurement: diag(exp(2 max(log_std, "
+    "log_std_min))), m²; a displacement of NaN is no measurement. Errors of rotations are in the "
+    "world frame, left-multiplied."
 )
 _MEANINGS = {
-    "window": "[accel m/s², gyro rad/s] in the gravity frame of the first sample, zero yaw",
+    "window": "[accel m/s², gyro rad/s] in the frame of the displacement, context first",
     "displacement": "over the window, m",
     "log_std": "logarithm of the standard deviation of the displacement, m",
     "covariance": "m², of the displacement",
@@ -86,8 +86,10 @@ def describe_filter(setup: FilterSetup) -> dict[str, Any]:
     return {
         "rate": 1 / config.dt,
         "window": config.window,
+        "context": config.context_samples,
         "samples_per_clone": config.samples_per_clone,
         "clones_per_window": config.clones_per_window,
+        "first_measured": config.first_measured,
         "samples_per_round": config.samples_per_clone * config.clones,
         "log_std_min": config.log_std_min,
         "filter": {

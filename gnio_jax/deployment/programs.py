@@ -61,7 +61,7 @@ def programs(network: Network, setup: FilterSetup) -> list[Program]:
     stride = {"gyro": _float64(n, 3), "accel": _float64(n, 3)}
     rest = round(REST_SECONDS / setup.config.dt)
     measured = {"displacement": _float64(3), "covariance": _float64(3, 3)}
-    window = jax.ShapeDtypeStruct((1, setup.config.window, 6), jnp.float32)
+    window = jax.ShapeDtypeStruct((1, setup.config.seen, 6), jnp.float32)
     read = {f"{PREFIX}{name}": flat.shapes[f"{PREFIX}{name}"] for name in _READ_BY_WINDOW}
     with_setup = functools.partial(functools.partial, setup=setup, flat=flat)
     return [

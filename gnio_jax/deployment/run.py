@@ -153,7 +153,7 @@ def _write_stablehlo(
     drawn, config = source.drawn, source.setup.config
     odometry = whole_odometry(program.content, config.samples_per_clone, config.clones)
     found = odometry({**drawn.start, "gyro": drawn.gyro, "accel": drawn.accel})
-    displacement = found["displacement"][config.clones_per_window :]
+    displacement = found["displacement"][config.first_measured :]
     deviation = source.deviation(Said(found["position"], displacement))
     accuracy.check(deviation, "--to stablehlo", "jax")
     return contents, deviation

@@ -98,7 +98,8 @@ def predict_windows(
     diagnostics: tuple[str, ...] = KEPT_DIAGNOSTICS,
 ) -> list[Prediction]:
     """What the network predicts for every window of the recordings, cut with the given attitudes,
-    in large batches over all of them.
+    in large batches over all of them. Row k is the window that starts k strides after the
+    recording; the first rows are NaN where the context would begin before it.
 
     Of its diagnostics only those named, if it has them. Float64 on the host.
     """
@@ -113,14 +114,23 @@ def predict_windows(
         rows = np.minimum(np.arange(begin, begin + size), total - 1)
         batch = windows._replace(start=windows.start[rows], rotation=windows.rotation[rows])
         prediction = _predict(
-            network.apply, network.variables, batch, length=config.window, diagnostics=diagnostics
+            network.apply, network.variables, batch, length=config.seen, diagnostics=diagnostics
         )
         found.append(jax.device_get(prediction))
         progress(min(1.0, (begin + size) / total))
     whole = jax.tree.map(lambda *leaves: np.concatenate(leaves)[:total].astype(np.float64), *found)
     ends = np.cumsum([len(part.start) for part in parts])
     rows = [slice(end - len(part.start), end) for end, part in zip(ends, parts, strict=True)]
-    return [jax.tree.map(lambda leaf, own=own: leaf[own], whole) for own in rows]
+    without_context = config.context // config.stride
+    return [
+        jax.tree.map(lambda leaf, own=own: _after_nothing(leaf[own], without_context), whole)
+        for own in rows
+    ]
+
+
+def _after_nothing(rows: Float[np.ndarray, "m *d"], count: int) -> Float[np.ndarray, "_ *d"]:
+    """The rows after `count` rows of NaN."""
+    return np.concatenate([np.full((count, *rows.shape[1:]), np.nan), rows])
 
 
 def true_displacements(prepared: Prepared, config: DataConfig) -> Float[np.ndarray, "m 3"]:
@@ -137,7 +147,7 @@ class _Windows(NamedTuple):
     imu: Float[Array, "t 6"]
     """[accel m/s², gyro rad/s], as `AlignedRecording` has it."""
     start: Int[Array, "m"]
-    """Row of `imu` at which each window begins."""
+    """Row of `imu` at which each window begins, with its context."""
     rotation: Float[Array, "m 3 3"]
     """From the frame of `imu` to the gravity-aligned frame of each window."""
 
@@ -147,9 +157,11 @@ def _align(
 ) -> _Windows:
     """Every window of one recording, without the first gyro bias."""
     sequence = prepared.sequence
-    start = window_starts(len(sequence.time), config.window, config.stride)
-    gyro = sequence.gyro - prepared.gyro_bias
-    imu, to_window = align_recording(sequence.accel, gyro, rotation, start, config.window_rotation)
+    start = window_starts(len(sequence.time), config.seen, config.stride)
+    gyro, after_context = sequence.gyro - prepared.gyro_bias, start + config.context
+    imu, to_window = align_recording(
+        sequence.accel, gyro, rotation, after_context, config.window_rotation
+    )
     return _Windows(imu, start, to_window)
 
 

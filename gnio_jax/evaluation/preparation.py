@@ -104,7 +104,7 @@ def prepare(
         _check_reference(sequence, setup)
         first = int(np.argmax(sequence.valid)) if sequence.valid.any() else 0
         strides = (len(sequence.time) - 1 - first) // config.stride
-        if strides <= config.window // config.stride:
+        if strides <= config.seen // config.stride:
             seconds = max(0, len(sequence.time) - first) / config.rate
             left_out[sequence.name] = (
                 f"{seconds:.2f} s from its first trusted sample on, "

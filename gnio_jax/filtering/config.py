@@ -39,6 +39,7 @@ _NOT_NEGATIVE = (
 _LEAST_COUNT = {
     "samples_per_clone": 1,
     "clones_per_window": 1,
+    "context_samples": 0,
     "checkpoint_every": 0,
     "truncate_every": 0,
 }
@@ -59,6 +60,8 @@ class FilterConfig:
     """IMU samples n in one clone interval."""
     clones_per_window: int
     """Clone intervals W in one measurement; W + 1 poses are cloned."""
+    context_samples: int = 0
+    """IMU samples C before a measurement's window that the network sees too (ours)."""
     mahalanobis_fail_scale: float = 0.0
     """0 skips a rejected measurement; above 0 its covariance is multiplied by this and it is
     applied."""
@@ -153,6 +156,18 @@ class FilterConfig:
         return self.samples_per_clone * self.clones_per_window
 
     @property
+    def seen(self) -> int:
+        """IMU samples C + N that the network sees: the context and the window."""
+        return self.context_samples + self.window
+
+    @property
+    def first_measured(self) -> int:
+        """Number of the first clone interval that ends with a measurement: the samples that it
+        depends on are there, and W intervals lie before it, as in TLIO's tracker."""
+        before_window = -(-(self.context_samples + self.cut.lead) // self.samples_per_clone)
+        return self.clones_per_window + max(before_window - 1, 0)
+
+    @property
     def clone_seconds(self) -> float:
         """Length of a clone interval, s."""
         return self.dt * self.samples_per_clone
@@ -170,7 +185,7 @@ class FilterConfig:
     @property
     def reach(self) -> int:
         """IMU samples, the newest included, that a measurement depends on."""
-        return self.window + self.cut.lead
+        return self.seen + self.cut.lead
 
     @property
     def displacement_frame(self) -> YawFrame:

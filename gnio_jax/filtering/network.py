@@ -17,14 +17,14 @@ from gnio_jax.types import Array, Prediction
 from gnio_jax.windows import cut_window
 
 Predict = Callable[[Any], Prediction]
-"""From windows (1, N, 6) float32, channels [accel m/s², gyro rad/s], to a `Prediction` with the
-same leading axis."""
+"""From windows with their context (1, C + N, 6) float32, channels [accel m/s², gyro rad/s], to a
+`Prediction` with the same leading axis."""
 
 
 def prediction_shapes(predict: Predict, config: FilterConfig) -> Prediction:
     """Shapes of what `predict` returns for one window; `ValueError` if that is not what the filter
     needs."""
-    found = jax.eval_shape(predict, jax.ShapeDtypeStruct((1, config.window, 6), jnp.float32))
+    found = jax.eval_shape(predict, jax.ShapeDtypeStruct((1, config.seen, 6), jnp.float32))
     if not isinstance(found, Prediction):
         raise ValueError(
             f"predict: must return a gnio_jax.types.Prediction, found {type(found).__name__}"
@@ -66,9 +66,9 @@ def network_window(
     config: FilterConfig,
 ) -> Float[Array, "1 n 6"]:
     """The window that `predict_window` shows the network, float32."""
-    gyro, accel = gyro[: config.window], accel[: config.window]
-    biases = state.gyro_bias, state.accel_bias
-    window = cut_window(rotation, gyro, accel, *biases, config.cut, config.dt)
+    gyro, accel = gyro[: config.seen], accel[: config.seen]
+    biases, context = (state.gyro_bias, state.accel_bias), config.context_samples
+    window = cut_window(rotation, gyro, accel, *biases, config.cut, config.dt, context)
     return window[None].astype(jnp.float32)
 
 

@@ -37,6 +37,7 @@ def filter_setup(windows: DataConfig, options: FilterOptions) -> FilterSetup:
         dt=1.0 / windows.rate,
         samples_per_clone=windows.stride,
         clones_per_window=windows.window // windows.stride,
+        context_samples=windows.context,
         mahalanobis_fail_scale=options.mahalanobis_fail_scale,
         measurement_scale=options.measurement_scale,
         history="core",

@@ -121,17 +121,18 @@ def run_odometry(
     """Filter K clone intervals with the network in the loop (paper fig. 2): its windows are cut
     with the filter's own state.
 
-    predict maps windows (1, N, 6) float32, N = n·W, channels [accel m/s², gyro rad/s], to a
+    predict maps windows (1, C + N, 6) float32, N = n·W, channels [accel m/s², gyro rad/s], to a
     `Prediction` with the same leading axis. A window spans the samples between its two clones i and
-    j; the filter's present biases are subtracted and the samples rotated by R_γ(R_i)ᵀ R_j, R_j
-    being the present estimate of clone i advanced by integrating gyro − b_g (paper eq. 1), unless
-    `FilterConfig.window_rotation` says otherwise. Its displacement is told in the filter's own yaw
-    frame, and taken so (`displacement.displacement_residual`), but with "tlio". The measurement's
-    covariance is diag(exp 2u), u raised to `log_std_min`. The network is not called in the first W
-    intervals, which have no window, and a window in which the filter coasted through a gap is no
-    measurement. gyro, accel and imu_valid as in `run_filter`. Jit it from outside; differentiable
-    in whatever `predict` closes over, too. Raises `ValueError` as `run_filter` does, or for a
-    `predict` that returns something else.
+    j, and before them come the C samples of its context (`FilterConfig.context_samples`). The
+    filter's present biases are subtracted and the samples rotated by R_γ(R_i)ᵀ R_j, R_j being the
+    present estimate of clone i advanced by integrating gyro − b_g (paper eq. 1; backwards through
+    the context), unless `FilterConfig.window_rotation` says otherwise. Its displacement is told in
+    the filter's own yaw frame, and taken so (`displacement.displacement_residual`), but with
+    "tlio". The measurement's covariance is diag(exp 2u), u raised to `log_std_min`. The network is
+    not called in the first `FilterConfig.first_measured` intervals, which have no whole window, and
+    a window in which the filter coasted through a gap is no measurement. gyro, accel and imu_valid
+    as in `run_filter`. Jit it from outside; differentiable in whatever `predict` closes over, too.
+    Raises `ValueError` as `run_filter` does, or for a `predict` that returns something else.
     """
     state, signals, noise = checked_inputs(state, gyro, accel, imu_valid, config, noise)
     shapes = prediction_shapes(predict, config)
@@ -143,7 +144,7 @@ def run_odometry(
     def measure(step: _Step, state: FilterState, oldest: Array) -> tuple[Measurement, dict]:
         # The number is the scan's own counter, the same for every sequence of a batch, so that this
         # stays a branch under vmap.
-        has_window = step.number >= config.clones_per_window
+        has_window = step.number >= config.first_measured
         prediction = jax.lax.cond(has_window, infer, nothing, step, state, oldest)
         measurement = predicted_measurement(prediction, config, noise, signals.gyro.dtype)
         return measurement, prediction.diagnostics
@@ -167,7 +168,7 @@ def _infer(
 ) -> Prediction:
     """The network's prediction; its displacement is NaN where the filter coasted in the window."""
     intervals = step.number - config.clones_per_window + 1
-    first = intervals * config.samples_per_clone - config.cut.lead
+    first = intervals * config.samples_per_clone - config.context_samples - config.cut.lead
     gyro, accel = (
         jax.lax.dynamic_slice_in_dim(signal, first, config.reach)
         for signal in (step.stream.gyro, step.stream.accel)

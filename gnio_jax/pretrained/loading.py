@@ -35,7 +35,7 @@ def _load_package(place: Path) -> Run:
         raise InputError(source, f"is no text ({error})") from None
     config = configuration.validate(configuration.parse(text, source), source)
     model = create_model(config)
-    shapes = models.variable_shapes(model, config.data.window)
+    shapes = models.variable_shapes(model, config.data.seen)
     template = {"params": shapes["params"], "batch_stats": shapes.get("batch_stats", {})}
     content = found.files[package.WEIGHTS]
     variables = arrays.from_bytes(content, template, place / package.WEIGHTS)

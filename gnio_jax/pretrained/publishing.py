@@ -36,7 +36,7 @@ def publish(
     stored = arrays.from_bytes(content, run.variables, workdir)
     loss = arrays.StorageLoss(0.0, 0.0)
     if storage != "float32":
-        loss = arrays.storage_loss(run.model, run.variables, stored, run.config.data.window)
+        loss = arrays.storage_loss(run.model, run.variables, stored, run.config.data.seen)
     evaluations = figures.read(workdir)
     about = _about(said, run, storage, figures.key_metric(evaluations, run.config.dataset))
     begun = run.config.init_from

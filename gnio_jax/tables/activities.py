@@ -48,10 +48,11 @@ def predict_split(workdir: Path, split: str) -> PredictedWindows:
         network, prepared, attitudes, config, diagnostics=DIAGNOSTICS
     )
     truth = np.concatenate([evaluation.true_displacements(each, config) for each in prepared])
-    trusted = np.isfinite(truth).all(1)
+    displacement = np.concatenate([p.displacement for p in predictions])
+    trusted = np.isfinite(truth).all(1) & np.isfinite(displacement).all(1)
     return PredictedWindows(
         truth[trusted],
-        np.concatenate([p.displacement for p in predictions])[trusted],
+        displacement[trusted],
         np.concatenate([p.log_std for p in predictions])[trusted],
         {
             name: np.concatenate([p.diagnostics[name] for p in predictions])[trusted]

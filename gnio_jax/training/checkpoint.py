@@ -226,7 +226,7 @@ def load_run(workdir: Path, which: Which = "best") -> Run:
             "let gnio train finish its first epoch, or give another --workdir",
         )
     model = create_model(config)
-    template = models.variable_shapes(model, config.data.window)
+    template = models.variable_shapes(model, config.data.seen)
     template = {"params": template["params"], "batch_stats": template.get("batch_stats", {})}
     if config.through_filter.learn:
         template["filter"] = learning.filter_numbers(config.filter)

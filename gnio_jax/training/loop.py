@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,7 +17,7 @@ from gnio_jax.scaling.devices import chosen, sharing
 from gnio_jax.scaling.processes import agreed, all_or_none, is_first, several
 from gnio_jax.training import optimizer as optimizers
 from gnio_jax.training import run_folder
-from gnio_jax.training.checkpoint import Checkpoints, Position, exists
+from gnio_jax.training.checkpoint import Checkpoints, Position, Run, exists, load_run
 from gnio_jax.training.initial import initial_run
 from gnio_jax.training.kinds import Training
 from gnio_jax.training.log import Log, Row
@@ -45,6 +46,7 @@ def train(
     reporter: Reporter | None = None,
     workers: int = 1,
     devices: int | None = None,
+    load_initial: Callable[[str], Run] = load_run,
 ) -> Outcome:
     """Train the network of `config` and leave checkpoints and logs in its work folder: on windows,
     or through the filter where `config.through_filter` says what learns.
@@ -57,8 +59,10 @@ def train(
     filter such a step is skipped). `workers` processes read recordings that are slow to read
     (`data.load`). A batch of windows is shared out among `devices` devices of each process, by
     default all (`scaling.devices.chosen`); how many there are changes the results by rounding
-    alone, also in a run that is resumed. Raises `InputError` where `config.init_from` is no run of
-    the same network, and where the devices cannot share a batch evenly.
+    alone, also in a run that is resumed. `load_initial` reads what `config.init_from` names, by
+    default the folder of a run; `gnio_jax.load_pretrained` also takes packages of weights. Raises
+    `InputError` where that is not of the same network, and where the devices cannot share a batch
+    evenly.
     """
     through_filter = bool(config.through_filter.learn)  # it shares its pieces out by itself
     if through_filter and several():
@@ -69,16 +73,23 @@ def train(
     sharers = jax.devices()[:1] if through_filter else chosen(devices)
     # Whatever the process has: no float64 but for the filter, and the same random draws.
     with jax.enable_x64(through_filter), sharing(sharers):
-        return _train(config, resume, (reporter or Lines()) if is_first() else Silence(), workers)
+        reporter = (reporter or Lines()) if is_first() else Silence()
+        return _train(config, resume, reporter, workers, load_initial)
 
 
-def _train(config: TrainConfig, resume: bool, reporter: Reporter, workers: int) -> Outcome:
+def _train(
+    config: TrainConfig,
+    resume: bool,
+    reporter: Reporter,
+    workers: int,
+    load_initial: Callable[[str], Run],
+) -> Outcome:
     configuration.validate(config)
     with all_or_none():
         workdir = run_folder.prepare(config, resume)
     (resuming,) = agreed(resume and is_first() and exists(workdir))
     with all_or_none():
-        start = None if resuming else initial_run(config)
+        start = None if resuming else initial_run(config, load_initial)
         training = set_up(config, reporter, workers)
         state = training.new_state(start)
         training.describe(state, workdir, reporter)

@@ -81,7 +81,7 @@ class WindowTraining(NamedTuple):
         return switches(self.config.loss, self.steps_per_epoch)
 
     def new_state(self, start: Run | None) -> TrainState:
-        window, decay = self.config.data.window, self.config.optim.ema_decay
+        window, decay = self.config.data.seen, self.config.optim.ema_decay
         state = create_state(self.model, self.optimizer, self.keys.init, window, decay)
         if start is not None:
             state = with_weights(state, start)

@@ -265,7 +265,7 @@ def draw_windows(
     dropout. Each device cuts its share of them."""
     augment_key, dropout_key, shift_key = jax.random.split(key, 3)
     which = shift_windows(shift_key, source, shared_out(which), config.augment.shift_samples)
-    windows = gather(source, shared_out(which), config.data.window)
+    windows = gather(source, shared_out(which), config.data.seen)
     return shared_out(augment(augment_key, windows, config.augment)), dropout_key
 
 
@@ -377,7 +377,7 @@ def validate(
         )
 
     def one_batch(which_weight: tuple[jax.Array, jax.Array]) -> Validation:
-        windows = shared_out(gather(source, shared_out(which_weight[0]), config.data.window))
+        windows = shared_out(gather(source, shared_out(which_weight[0]), config.data.seen))
         prediction: Any = model.apply(
             {"params": state.params, "batch_stats": state.batch_stats}, windows.imu
         )

@@ -83,7 +83,7 @@ def supplied(
     fits = config.data.residency == "auto" and size <= _memory() // 2
     if config.data.residency == "device" or fits:
         return OnDevice(), devices.everywhere(source), devices.everywhere(held_out)
-    length, shift = config.data.window, config.augment.shift_samples
+    length, shift = config.data.seen, config.augment.shift_samples
     return FromHost(config.optim.batch_size, length, shift), source, held_out
 
 

@@ -59,7 +59,7 @@ class FilterTraining(NamedTuple):
 
     def new_state(self, start: Run | None) -> TrainState:
         nothing = optax.identity()
-        state = create_state(self.model, nothing, self.keys.init, self.config.data.window)
+        state = create_state(self.model, nothing, self.keys.init, self.config.data.seen)
         state = state._replace(filter=learning.filter_numbers(self.config.filter))
         if start is not None:
             state = with_weights(state, start)

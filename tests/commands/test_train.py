@@ -63,6 +63,11 @@ def mistake(monkeypatch, capsys, tmp_path, *arguments):
         ),
         (["--data.rate", "0"], "field 'data.rate' must be positive"),
         (["--data.stride-seconds", "0.3"], "field 'data.stride_seconds' must divide the window"),
+        (["--data.context-seconds", "0.25"], "field 'data.stride_seconds' must divide the context"),
+        (
+            ["--data.context-seconds", "1", "--model.name", "ctin"],
+            "field 'data.context_seconds' is not for ctin",
+        ),
         (["--data.train-split", "trian"], "trian"),
         (["--config", "none.yaml"], "none.yaml: no such config file"),
         (["--resume", "--workdir", "none"], "none: holds no run to resume"),

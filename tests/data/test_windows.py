@@ -40,17 +40,18 @@ def tumbling(count, seed, invalid=()):
     )
 
 
-def cut(sequences, rotation, stride):
+def cut(sequences, rotation, stride, context=0):
     imu, target, steps = [], [], []
     for s in sequences:
         for i in range(0, len(s.time), stride):
-            if i + 20 >= len(s.time) or not all(s.valid[j] for j in range(i, i + 21)):
+            end, after_context = i + context + 20, i + context
+            if end >= len(s.time) or not all(s.valid[j] for j in range(i, end + 1)):
                 continue
-            start = Rotation.from_quat(s.orientation[i], scalar_first=True)
+            start = Rotation.from_quat(s.orientation[after_context], scalar_first=True)
             heading = np.arctan2(start.as_matrix()[1, 0], start.as_matrix()[0, 0])
             back = Rotation.from_euler("z", -heading)
             rows = []
-            for j in range(i, i + 20):
+            for j in range(i, end):
                 attitude = (
                     Rotation.from_quat(s.orientation[j], scalar_first=True)
                     if rotation == "per_sample"
@@ -62,13 +63,16 @@ def cut(sequences, rotation, stride):
                     )
                 )
             imu.append(rows)
-            target.append(back.apply(s.position[i + 20] - s.position[i]))
-            steps.append([back.apply(s.position[j + 1] - s.position[j]) for j in range(i, i + 20)])
+            target.append(back.apply(s.position[end] - s.position[after_context]))
+            steps.append([back.apply(s.position[j + 1] - s.position[j]) for j in range(i, end)])
     return np.array(imu), np.array(target), np.array(steps)
 
 
-@pytest.mark.parametrize("rotation, stride", [("per_sample", 2), ("single", 2), ("per_sample", 1)])
-def test_gather_against_a_brute_force_cutter(rotation, stride):
+@pytest.mark.parametrize(
+    "rotation, stride, context",
+    [("per_sample", 2, 0), ("single", 2, 0), ("per_sample", 1, 0), ("per_sample", 2, 6)],
+)
+def test_gather_against_a_brute_force_cutter(rotation, stride, context):
     sequences = [
         tumbling(57, 1),
         tumbling(61, 2, invalid=[0, 33]),
@@ -76,13 +80,12 @@ def test_gather_against_a_brute_force_cutter(rotation, stride):
         tumbling(21, 4),
         tumbling(20, 5),
     ]
-    source = windows.window_source(
-        sequences, DataConfig(rate=20.0, window_rotation=rotation), stride
-    )
-    imu, target, steps = cut(sequences, rotation, stride)
+    config = DataConfig(rate=20.0, window_rotation=rotation, context_seconds=context / 20)
+    source = windows.window_source(sequences, config, stride)
+    imu, target, steps = cut(sequences, rotation, stride, context)
     assert source.start.shape == (len(target),)
     order = np.random.default_rng(0).permutation(len(target)).astype(np.int32)
-    found = gather(jax.device_put(source), jnp.asarray(order), 20)
+    found = gather(jax.device_put(source), jnp.asarray(order), config.seen)
     np.testing.assert_allclose(found.imu, imu[order], atol=1e-5)
     np.testing.assert_allclose(found.displacement, target[order], atol=1e-5)
     np.testing.assert_allclose(found.steps, steps[order], atol=1e-5)

@@ -89,6 +89,12 @@ def test_a_stride_without_a_window_goes_on_as_before():
     np.testing.assert_allclose(moved, [1, 1, 1, 1, 1, 2, 2])
 
 
+def test_strides_before_the_first_window_take_its_movement():
+    steps = np.array([[np.nan] * 3, [np.nan] * 3, [1.0, 0, 0], [3.0, 0, 0]])
+    moved = mean_over_windows(steps, 5, 2)[:, 0]
+    np.testing.assert_allclose(moved, [1, 1, 1, 2, 3])
+
+
 @pytest.mark.parametrize(
     "setup, ate",
     [
@@ -225,25 +231,30 @@ def test_many_batches_of_unlike_lengths(walks):
     assert told == sorted(told) and len(told) == 2 and told[-1] == 1.0
 
 
-def test_tight_and_loose_see_the_same_windows(clean):
+@pytest.mark.parametrize("context, first", [(0.0, 11), (0.2, 12)])
+def test_tight_and_loose_see_the_same_windows(clean, context, first):
     """With an exact IMU the filter's attitude is the reference's, as long as no measurement
     disturbs it."""
-    network = Network(sensed, {"gain": jnp.float32(0.05), "log_std": jnp.float32(4.0)})
-    found = []
+    network = Network(sensed, {"gain": jnp.float32(0.1), "log_std": jnp.float32(4.0)})
+    config, found = dataclasses.replace(CONFIG, context_seconds=context), []
     for setup in (Setup(), LOOSE):
-        prepared, _ = evaluation.prepare([clean], CONFIG, setup)
-        found += evaluation.estimate(prepared, network, CONFIG, OPTIONS, setup, batch_size=1)
+        prepared, _ = evaluation.prepare([clean], config, setup)
+        found += evaluation.estimate(prepared, network, config, OPTIONS, setup, batch_size=1)
     tight, loose = found
-    assert np.isnan(tight.displacement[:11]).all() and np.isfinite(tight.displacement[11:]).all()
+    assert (
+        np.isnan(tight.displacement[:first]).all() and np.isfinite(tight.displacement[first:]).all()
+    )
     np.testing.assert_array_equal(np.isnan(tight.displacement), np.isnan(loose.displacement))
-    np.testing.assert_allclose(tight.displacement[11:], loose.displacement[11:], atol=2e-3)
-    np.testing.assert_allclose(tight.displacement_std[11:], loose.displacement_std[11:], rtol=2e-2)
+    np.testing.assert_allclose(tight.displacement[first:], loose.displacement[first:], atol=2e-3)
     np.testing.assert_allclose(
-        tight.diagnostics["gate"][11:], loose.diagnostics["gate"][11:], atol=2e-2
+        tight.displacement_std[first:], loose.displacement_std[first:], rtol=2e-2
+    )
+    np.testing.assert_allclose(
+        tight.diagnostics["gate"][first:], loose.diagnostics["gate"][first:], atol=2e-2
     )
     np.testing.assert_allclose(tight.trajectory.position, loose.trajectory.position, atol=2e-2)
     assert (
-        np.std(tight.displacement[11:], axis=0).max() > 0.01
+        np.std(tight.displacement[first:], axis=0).max() > 0.01
     )  # else the agreement would say nothing
 
 

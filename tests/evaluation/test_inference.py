@@ -10,9 +10,11 @@ from gnio_jax.numerics import yaw
 from tests.support.estimators import CONFIG, INTEGRATE, NETWORK, RATE, rotations, unyaw
 
 
-@pytest.mark.parametrize("reading", ["per_sample", "single"])
-def test_windows_are_cut_with_the_given_attitude(walks, reading):
-    config = DataConfig(rate=RATE, window_rotation=reading)
+@pytest.mark.parametrize(
+    "reading, context", [("per_sample", 0.0), ("single", 0.0), ("per_sample", 0.4)]
+)
+def test_windows_are_cut_with_the_given_attitude(walks, reading, context):
+    config = DataConfig(rate=RATE, window_rotation=reading, context_seconds=context)
     prepared, _ = evaluation.prepare(walks[:2], config, INTEGRATE)
     attitudes = [evaluation.attitude(r, config, "reference") for r in prepared]
     predictions = evaluation.predict_windows(NETWORK, prepared, attitudes, config)
@@ -20,8 +22,10 @@ def test_windows_are_cut_with_the_given_attitude(walks, reading):
         turns = rotations(walk.orientation).as_matrix()
         starts = range(0, len(each.sequence.time) - config.window, config.stride)
         assert len(prediction.displacement) == len(starts)
-        for row, i in list(enumerate(starts))[::17]:
-            rows = range(i, i + config.window)
+        without = config.context // config.stride
+        assert np.isnan(prediction.displacement[:without]).all()
+        for row, i in list(enumerate(starts))[without::17]:
+            rows = range(i - config.context, i + config.window)
             means = [
                 np.mean(
                     [

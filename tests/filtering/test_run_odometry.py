@@ -28,8 +28,8 @@ NOISE = filtering.NoiseModel()
 
 def predict(windows, parameters=PARAMETERS):
     """A network of one layer, whose output depends on the order of samples and channels."""
-    assert windows.shape == (1, N * CLONES, 6) and windows.dtype == jnp.float32
-    ramp = jnp.linspace(0.5, 1.5, N * CLONES, dtype=jnp.float32)[None, :, None]
+    assert windows.shape[::2] == (1, 6) and windows.dtype == jnp.float32
+    ramp = jnp.linspace(0.5, 1.5, windows.shape[1], dtype=jnp.float32)[None, :, None]
     pooled = jnp.mean(ramp * windows, axis=1) @ jnp.asarray(parameters, jnp.float32)
     return Prediction(
         pooled,
@@ -63,12 +63,15 @@ def test_a_repeated_run_is_the_one_with_the_other_noise():
 
 
 def predict_numpy(window):
-    pooled = (np.linspace(0.5, 1.5, N * CLONES)[:, None] * window).mean(0) @ PARAMETERS
+    pooled = (np.linspace(0.5, 1.5, len(window))[:, None] * window).mean(0) @ PARAMETERS
     return pooled, np.diag(np.exp(2 * np.maximum(-2.0 + 0.1 * pooled, -4.0)))
 
 
-@pytest.mark.parametrize("window_rotation", ["per_sample", "single"])
-def test_windows_are_cut_with_the_state_of_the_filter(window_rotation):
+@pytest.mark.parametrize(
+    "window_rotation, context, first",
+    [("per_sample", 0, 4), ("single", 0, 4), ("per_sample", 6, 5)],
+)
+def test_windows_are_cut_with_the_state_of_the_filter(window_rotation, context, first):
     gyro, accel = recording(0)
     config = filtering.FilterConfig(
         DT,
@@ -77,12 +80,18 @@ def test_windows_are_cut_with_the_state_of_the_filter(window_rotation):
         convergence_seconds=0.6,
         measurement_scale=2.0,
         window_rotation=window_rotation,
+        context_samples=context,
     )
+    assert config.first_measured == first
 
     def measure(k, clone_rotation, gyro_bias, accel_bias):
-        cut = slice((k - CLONES + 1) * N, (k + 1) * N)
+        if k < first:
+            return np.full(3, np.nan), np.eye(3)
+        cut = slice((k - CLONES + 1) * N - context, (k + 1) * N)
         unyaw = scekf_numpy.yaw_matrix(clone_rotation).T
         R, rows = clone_rotation, []
+        for w in gyro[cut][:context][::-1] - gyro_bias:
+            R = R @ Rotation.from_rotvec(w * DT).as_matrix().T
         for w, a in zip(gyro[cut] - gyro_bias, accel[cut] - accel_bias, strict=True):
             rows.append(np.concatenate([unyaw @ R @ a, unyaw @ R @ w]))
             if window_rotation == "per_sample":
@@ -130,8 +139,8 @@ def test_windows_are_cut_with_the_state_of_the_filter(window_rotation):
     )
     assert history.diagnostics["attention"].shape == (INTERVALS, 2, 3)
     assert (
-        np.isnan(history.diagnostics["attention"][:CLONES]).all()
-        and (history.diagnostics["attention"][CLONES:] == 1).all()
+        np.isnan(history.diagnostics["attention"][:first]).all()
+        and (history.diagnostics["attention"][first:] == 1).all()
     )
 
 

@@ -35,7 +35,7 @@ HIT = slice(180, 184)
 
 
 def predict(windows):
-    ramp = jnp.linspace(0.5, 1.5, N * CLONES, dtype=jnp.float32)[None, :, None]
+    ramp = jnp.linspace(0.5, 1.5, windows.shape[1], dtype=jnp.float32)[None, :, None]
     pooled = jnp.mean(ramp * windows, axis=1) @ jnp.asarray(WEIGHTS, jnp.float32)
     leap = jnp.where(jnp.max(jnp.abs(windows)) > 50, 40.0, 0.0).astype(jnp.float32)
     return Prediction(pooled + leap, -2.0 + 0.1 * pooled, {"gate": jnp.tanh(pooled)})
@@ -63,6 +63,7 @@ def start(config=CONFIG):
 
 OTHER = dataclasses.replace(
     CONFIG,
+    context_samples=6,
     window_rotation="single",
     zero_velocity_std=0.02,
     rest_seconds=0.3,

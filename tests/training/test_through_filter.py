@@ -423,7 +423,7 @@ def test_training_on_windows_starts_from_a_runs_weights(recording):
         ),
         (
             {"through_filter": ThroughFilter(LEARN, 0.4, 0.4)},
-            r"'through_filter.piece_seconds' must be longer than the window of 0.4 s",
+            r"'through_filter.piece_seconds' must be longer than the 0.4 s that the network sees",
         ),
         (
             {"through_filter": ThroughFilter(LEARN, 60.0, 10.0)},

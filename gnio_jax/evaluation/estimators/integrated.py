@@ -53,7 +53,8 @@ def mean_over_windows(
 
     Taking the one window that starts (or ends) at the stride instead puts the whole trajectory half
     a window ahead of (or behind) its time: 0.6 m at walking speed. A stride without any window
-    keeps the movement of the one before.
+    keeps the movement of the one before; those before all windows (the context of the first) take
+    that of the first that has one.
     """
     good = finite_rows(steps)
     sums = np.concatenate([np.zeros((1, 3)), np.cumsum(np.where(good[:, None], steps, 0.0), 0)])
@@ -64,4 +65,5 @@ def mean_over_windows(
     covering = (counts[last] - counts[first])[:, None]
     moved = np.zeros((strides, 3))
     np.divide(sums[last] - sums[first], covering, out=moved, where=covering > 0)
-    return moved[np.maximum.accumulate(np.where(covering[:, 0] > 0, stride, 0))]
+    covered = covering[:, 0] > 0
+    return moved[np.maximum.accumulate(np.where(covered, stride, int(np.argmax(covered))))]
