@@ -45,6 +45,9 @@ class Sequence(NamedTuple):
     """True where the reference can be trusted; windows that touch a False are never cut."""
     device_orientation: Float[np.ndarray, "n 4"] | None = None
     """The device's own body→world estimate (its yaw is arbitrary), where it gives one."""
+    imu_valid: Bool[np.ndarray, "n"] | None = None
+    """False where `gyro` and `accel` are no measurement but a line across a gap; None: all are
+    there. The filter bridges and coasts there, and believes nothing (`filtering.gaps`)."""
     attributes: dict[str, Any] = {}
     """Where it comes from: dataset, session, group, subject, device, placement, truth, licence, ...
     (str/float/bool)."""

@@ -21,7 +21,7 @@ ROOMS = {
     "tables": BASE | {"data", "models", "filtering", "training", "evaluation"},
     "pretrained": BASE | {"models", "training"},
     "tracking": BASE | {"data", "filtering", "training", "evaluation", "pretrained"},
-    "live": BASE | {"filtering", "training", "evaluation"},
+    "live": BASE | {"data", "filtering", "training", "evaluation", "tracking"},
     "deployment": BASE | {"data", "filtering", "training", "evaluation", "pretrained", "tracking"},
     "commands": BASE
     | {"data", "filtering", "training", "evaluation", "calibration", "interop", "tables"}
@@ -41,7 +41,7 @@ LIBRARIES = {
     "onnxruntime": {"deployment"},
     "optax": {"training"},
     "orbax": {"training.checkpoint"},
-    "rerun": {"evaluation.exporting.rerun_file"},
+    "rerun": {"evaluation.exporting.rerun_file", "live.rerun_stream"},
     "rosbags": {"data.importing.bags", "evaluation.exporting.ros"},
     "rich.console.Console": {"commands"},
     "rich.progress": {"commands"},

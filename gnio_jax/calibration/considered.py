@@ -121,9 +121,10 @@ def _filtered(
         pose = (walk.rotation, walk.velocity, walk.position, walk.gyro_bias)
         state = initial_state(setup.config, *pose, std=setup.initial_std)
         run = state, walk.gyro, walk.accel
+        fixed = setup.config, setup.noise, walk.imu_valid
         told = walk.displacement, walk.std
-        _, history = repeat_odometry(*run, *told, setup.config, setup.noise)
-        found = sensitivity(*run, history, setup.config, setup.noise)
+        _, history = repeat_odometry(*run, *told, *fixed)
+        found = sensitivity(*run, history, *fixed)
         assert history.covariance is not None
         covariance = history.covariance[:, POSITION, POSITION]
         return history.healthy, history.position, covariance, found[:, POSITION]

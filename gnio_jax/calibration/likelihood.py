@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.optimize import minimize
 
 from gnio_jax.calibration.unknowns import DIGITS, PRIOR_STD
@@ -48,6 +48,8 @@ class Walks(NamedTuple):
     """Of the network, m, in the filter's own yaw frame; NaN where there is none."""
     std: Float[np.ndarray, "w k 3"]
     """Of the network, m; 1 where there is none."""
+    imu_valid: Bool[np.ndarray, "w t"] | None = None
+    """Which samples are there; None: all."""
 
 
 class Fit(NamedTuple):
@@ -99,7 +101,8 @@ def _log_likelihood(walks: Walks, setup: FilterSetup) -> Array:
         pose = (walk.rotation, walk.velocity, walk.position, walk.gyro_bias)
         state = initial_state(config, *pose, std=std)
         told = walk.displacement, walk.std
-        _, history = repeat_odometry(state, walk.gyro, walk.accel, *told, config, noise)
+        run = state, walk.gyro, walk.accel
+        _, history = repeat_odometry(*run, *told, config, noise, walk.imu_valid)
         # What the walk is filled up with comes after its last displacement, and may run away.
         told = jnp.isfinite(walk.displacement).all(axis=1)
         healthy = jnp.all((history.healthy > 0) | ~told)

@@ -8,6 +8,7 @@ import shutil
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 from jaxtyping import Float
 
@@ -23,6 +24,7 @@ from gnio_jax.evaluation import true_displacements
 from gnio_jax.evaluation.estimators.result import Estimate
 from gnio_jax.evaluation.preparation import Prepared
 from gnio_jax.files import replacing_folder, write_text
+from gnio_jax.filtering.batch import padded_masks
 from gnio_jax.filtering.options import STD_FACTORS
 from gnio_jax.numerics import filled_up
 from gnio_jax.training import checkpoint
@@ -148,7 +150,9 @@ def _walks(prepared: list[Prepared], estimates: list[Estimate], stride: int) -> 
         )
 
     rows = [of_recording(*pair) for pair in zip(prepared, estimates, strict=True)]
-    return Walks(*(np.stack(column) for column in zip(*rows, strict=True)))
+    walks = jax.tree.map(lambda *column: np.stack(column), *rows)
+    masks = (each.imu_valid for each in prepared)
+    return walks._replace(imu_valid=padded_masks(masks, strides * stride))
 
 
 def _true_positions(prepared: list[Prepared], stride: int) -> Float[np.ndarray, "w k 3"]:

@@ -41,7 +41,7 @@ class ImportOptions(RecordingOptions):
 def import_file(options: ImportOptions, prog: str) -> None:
     """Write the file, say what was assumed and what it looks like, and what to do with it."""
     from gnio_jax.data.checking import impressions
-    from gnio_jax.data.hdf5 import write_hdf5
+    from gnio_jax.data.importing.kept import write_imported
     from gnio_jax.data.readers import csv_files
 
     if options.out.suffix.lower() not in (".h5", ".hdf5"):
@@ -49,8 +49,9 @@ def import_file(options: ImportOptions, prog: str) -> None:
     if options.out.is_dir():
         raise InputError("--out", f"'{options.out}' is a folder", "name a file in it, NAME.h5")
     name = options.name or options.out.stem
-    sequence, notes = read_recording(options, name, options.rate)
-    write_hdf5(options.out, sequence)
+    recording = read_recording(options, name, options.rate)
+    write_imported(options.out, recording)
+    sequence, notes = recording
     folder = options.out.parent
     lists = [split for split in csv_files.SPLITS if (folder / f"{split}.txt").is_file()]
     notes = [*notes, *impressions(sequence)]

@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 from gnio_jax.commands import console
 from gnio_jax.commands.options import Command, called
-from gnio_jax.commands.recording import RecordingOptions, read_recording
+from gnio_jax.commands.recording import RecordingOptions, read_any
 from gnio_jax.files import file_stem
 
 DESCRIPTION = """The trajectory of a recording: where its carrier walked, and how far to trust it.
@@ -53,7 +53,7 @@ def track(options: TrackOptions, prog: str) -> None:
 
     jax.config.update("jax_enable_x64", True)  # for the filter; the network states its float32
     fix = None if options.first_fix is None else first_fix(options.first_fix, options.heading)
-    recording = _recording(options)
+    recording = read_any(options)
     weights = tracking.choose_weights(options.weights)
     out = options.out or Path("tracks") / _folder_name(recording.sequence.name)
     with console.terminal() as terminal:
@@ -74,16 +74,6 @@ def _folder_name(name: str) -> str:
     """The recording's name, or what can be one of a folder: a file may say anything of itself."""
     plain = name == Path(name).name and name.isprintable() and name not in ("", "..")
     return name if plain else file_stem(name)
-
-
-def _recording(options: TrackOptions) -> Any:
-    """An `importing.Imported` of the file; our own HDF5 is read as it is."""
-    if options.file.suffix.lower() not in (".h5", ".hdf5"):
-        return read_recording(options)
-    from gnio_jax.data.hdf5 import read_hdf5
-    from gnio_jax.data.importing import Imported
-
-    return Imported(read_hdf5(options.file), ())
 
 
 def _table(summary: Any) -> Any:

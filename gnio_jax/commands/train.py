@@ -6,7 +6,6 @@ import dataclasses
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
@@ -31,10 +30,11 @@ DESCRIPTION = """Train a network and leave a run: config.yaml, checkpoints, logs
 
 --config FILE reads options from a YAML file, or from one of the experiments that come with the
 package; options given here win over it. --resume continues a run from its latest checkpoint as if
-it had never stopped. --init-from RUN starts from the weights of a run with the same network; with
---through-filter.learn, network and filter then learn as one program, beginning with the filter of
-that run (see gnio calibrate). --seeds trains several runs together, in WORKDIR_s0, WORKDIR_s1, ...:
-they share recordings and compiled programs. The defaults are the paper's settings."""
+it had never stopped. --init-from starts from the weights of a run with the same network, or of a
+package (see gnio weights); with --through-filter.learn, network and filter then learn as one
+program, beginning with the filter of that run (see gnio calibrate). --seeds trains several runs
+together, in WORKDIR_s0, WORKDIR_s1, ...: they share recordings and compiled programs. The defaults
+are the paper's settings."""
 
 
 @dataclass(frozen=True)
@@ -75,30 +75,36 @@ def defaults(options: TrainOptions) -> TrainOptions:
     found = configuration.load(named) if named else resumed or TrainConfig()
     own = resumed.filter if resumed else _filter_to_begin_with(options, found)
     base = dataclasses.replace(TrainConfig() if named else found, filter=own)
+    if options.seeds:
+        base = dataclasses.replace(base, workdir=options.workdir)  # not that of the first seed
     return TrainOptions(**vars(configuration.load(named, base) if named else base))
 
 
 def _filter_to_begin_with(options: TrainOptions, config: TrainConfig) -> FilterOptions:
-    """The filter of the initial run in training through the filter, else the default one.
+    """The filter that training through the filter starts from, that of a run or package; else the
+    default one.
 
     What that run's filter considers belongs to its own covariance, not to the one that will learn.
     """
-    workdir = options.init_from or config.init_from
+    initial = options.init_from or config.init_from
     learns = options.through_filter.learn or config.through_filter.learn
-    if workdir is None or not learns or not (Path(workdir) / "config.yaml").is_file():
+    if initial is None or not learns:
         return FilterOptions()
-    from gnio_jax import filtering
+    from gnio_jax import filtering, pretrained
     from gnio_jax.evaluation.run import run_config
+    from gnio_jax.pretrained.package import is_package
 
+    place = pretrained.find(initial)
     filtering.cores_as_devices()  # before the checkpoint's arrays settle the devices
     nothing = dict.fromkeys(CONSIDERED_FIELDS, 0.0)
-    return dataclasses.replace(run_config(Path(workdir)).filter, **nothing)
+    found = pretrained.load_pretrained(place).config if is_package(place) else run_config(place)
+    return dataclasses.replace(found.filter, **nothing)
 
 
 def train(options: TrainOptions, prog: str) -> None:
     """Train, and say how to go on."""
     # After the options: --help and mistakes do not wait for these imports.
-    from gnio_jax import filtering
+    from gnio_jax import filtering, pretrained
     from gnio_jax.scaling import devices, processes
     from gnio_jax.training import loop, run_folder
 
@@ -110,11 +116,12 @@ def train(options: TrainOptions, prog: str) -> None:
     with processes.running():
         with console.terminal(shown=processes.is_first()) as terminal:
             try:
-                given = (options.resume, terminal, usable_cores(), options.devices)
+                how = (options.resume, terminal, usable_cores(), options.devices)
+                how = (*how, pretrained.load_pretrained)
                 if options.seeds:
-                    outcomes = loop.train_seeds(options.experiment(), options.seeds, *given)
+                    outcomes = loop.train_seeds(options.experiment(), options.seeds, *how)
                 else:
-                    outcomes = [loop.train(options.experiment(), *given)]
+                    outcomes = [loop.train(options.experiment(), *how)]
             except FloatingPointError as error:
                 terminal.line(str(error))
                 sys.exit(1)

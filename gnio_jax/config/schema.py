@@ -350,8 +350,9 @@ class TrainConfig:
     workdir: str | None = None
     """Folder for checkpoints and logs; by default runs/<dataset>_<model>."""
     init_from: str | None = None
-    """Folder of a run with the same network, whose best weights training starts from; by default
-    they are drawn. Through the filter, `gnio train` also begins with the run's filter options."""
+    """Run, or package of weights (see gnio weights), with the same network, whose best weights
+    training starts from; by default they are drawn. Through the filter, `gnio train` also begins
+    with its filter options."""
     seed: int = 0
     """Seed of the initial parameters, the shuffling and the augmentation."""
     data: DataConfig = field(default_factory=DataConfig)

@@ -15,6 +15,7 @@ from gnio_jax.files import replacing
 from gnio_jax.types import Sequence
 
 _FORMAT = "gnio-jax sequence 1"
+_OPTIONAL_FIELDS = ("device_orientation", "imu_valid")
 _FIELDS = ("time", "gyro", "accel", "orientation", "position", "velocity", "valid")
 _ATTRIBUTE_TYPES = (str, bool, int, float, np.bool_, np.integer, np.floating)
 
@@ -31,8 +32,9 @@ def write_hdf5(path: str | os.PathLike[str], sequence: Sequence) -> None:
         file.attrs["name"] = sequence.name
         for field in _FIELDS:
             file.create_dataset(field, data=getattr(sequence, field))
-        if sequence.device_orientation is not None:
-            file.create_dataset("device_orientation", data=sequence.device_orientation)
+        for field in _OPTIONAL_FIELDS:
+            if getattr(sequence, field) is not None:
+                file.create_dataset(field, data=getattr(sequence, field))
         group = file.create_group("attributes")
         for key, value in sequence.attributes.items():
             if not isinstance(value, _ATTRIBUTE_TYPES):
@@ -76,8 +78,9 @@ def _sequence_of(file: h5py.File, path: Path) -> Sequence:
         if field not in file:
             raise InputError(path, f"field '{field}' is missing", "convert the recording again")
         values[field] = _array(file, field, path)
-    if "device_orientation" in file:
-        values["device_orientation"] = _array(file, "device_orientation", path)
+    for field in _OPTIONAL_FIELDS:
+        if field in file:
+            values[field] = _array(file, field, path)
     stored = file["attributes"].attrs if "attributes" in file else {}
     attributes = {
         key: value.item() if isinstance(value, np.generic) else value
@@ -87,9 +90,9 @@ def _sequence_of(file: h5py.File, path: Path) -> Sequence:
 
 
 def _array(file: h5py.File, field: str, path: Path) -> np.ndarray:
-    """Booleans of `valid`, float64 of every other field."""
+    """Booleans of what is valid, float64 of every other field."""
     value: Any = file[field][()]  # pyright: ignore[reportIndexIssue]
-    kind, content = ("b", "booleans") if field == "valid" else ("f", "numbers")
+    kind, content = ("b", "booleans") if field.endswith("valid") else ("f", "numbers")
     if not isinstance(value, np.ndarray) or value.dtype.kind != kind:
         raise InputError(
             path, f"field '{field}' is not an array of {content}", "convert the recording again"

@@ -33,8 +33,8 @@ def resample(sequence: Sequence, rate: float, max_gap: float = LONGEST_BRIDGE) -
     attitudes slerp along the shorter arc. Going to a lower rate the IMU is band-limited first
     (zero-phase FIR, pass band to 0.8 of the new Nyquist frequency), or vibrations would alias into
     the gait band; poses stay those of the stamp. `valid` is False between samples of which one is
-    invalid, and in gaps longer than `max_gap` (s), where the IMU is interpolated linearly. A
-    reference value next to a NaN is NaN.
+    invalid, and in gaps longer than `max_gap` (s), where the IMU is interpolated linearly: there
+    `imu_valid` is False, too. A reference value next to a NaN is NaN.
     """
     time = sequence.time
     if is_uniform(time, rate):
@@ -54,6 +54,7 @@ def resample(sequence: Sequence, rate: float, max_gap: float = LONGEST_BRIDGE) -
         velocity=_interpolate(time, sequence.velocity, sequence.valid, clock, max_gap),
         valid=_valid_at(time, sequence.valid, clock, max_gap),
         device_orientation=None if device is None else _slerp(time, device, clock),
+        imu_valid=_imu_valid_at(time, sequence.imu_valid, clock, max_gap),
     )
 
 
@@ -98,6 +99,15 @@ def _valid_at(
 ) -> Bool[np.ndarray, "m"]:
     near = _neighbours(time, clock)
     return valid[near.left] & valid[near.right] & (near.span <= max_gap)
+
+
+def _imu_valid_at(
+    time: np.ndarray, valid: np.ndarray | None, clock: np.ndarray, max_gap: float
+) -> Bool[np.ndarray, "m"] | None:
+    """None where every sample lies among measured ones."""
+    everywhere = np.ones(len(time), dtype=bool)
+    found = _valid_at(time, everywhere if valid is None else valid, clock, max_gap)
+    return None if found.all() else found
 
 
 def _interpolate(

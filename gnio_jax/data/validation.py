@@ -70,11 +70,13 @@ def _check_shapes(sequence: Sequence, source: object) -> None:
                 f"field '{field}' has shape {shape}, expected {(count, width)} "
                 f"as field 'time' has {count} stamps",
             )
-    if valid.shape != (count,) or valid.dtype != np.bool_:
-        raise InputError(
-            source,
-            f"field 'valid' must be {count} booleans, found {valid.dtype} of shape {valid.shape}",
-        )
+    for field, mask in (("valid", valid), ("imu_valid", sequence.imu_valid)):
+        if mask is not None and (mask.shape != (count,) or mask.dtype != np.bool_):
+            raise InputError(
+                source,
+                f"field '{field}' must be {count} booleans, "
+                f"found {mask.dtype} of shape {mask.shape}",
+            )
 
 
 def check_finite(values: Float[np.ndarray, "n ..."], field: str, source: object) -> None:

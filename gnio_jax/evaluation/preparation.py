@@ -6,25 +6,20 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from gnio_jax import data
 from gnio_jax.config import DataConfig, FilterOptions
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation.metrics import Trajectory
 from gnio_jax.evaluation.setup import DEFAULT_SETUP, Setup, resolve
-from gnio_jax.filtering import level_state
+from gnio_jax.filtering import InitialStd, level_state
+from gnio_jax.filtering.noise import TLIO_STD
 from gnio_jax.filtering.options import filter_setup
+from gnio_jax.filtering.start import rest_at_start
 from gnio_jax.numerics import finite_rows, matrix_from_quaternion, rotations
 from gnio_jax.types import Sequence
 
-REST_GYRO_STD = 0.01
-"""Largest standard deviation of each gyro axis at rest, rad/s: a phone on a table, not in a hand.
-"""
-REST_ACCEL_STD = 0.1
-"""Largest standard deviation of each accelerometer axis at rest, m/s²."""
-REST_SECONDS = 1.0
-"""Shortest rest from which a bias is taken, s."""
 REFERENCE_BIAS_SECONDS = 10.0
 """How long `gyro_bias="reference"` looks at the reference, s."""
 STANDING_ACCEL_STD = 0.5
@@ -71,6 +66,12 @@ class Prepared(NamedTuple):
         """K, for strides of `samples`."""
         return (len(self.sequence.time) - 1) // samples
 
+    @property
+    def imu_valid(self) -> Bool[np.ndarray, "m"] | None:
+        """Which of the samples that drive the filter are there; None: all."""
+        mask = self.sequence.imu_valid
+        return None if mask is None or mask.all() else mask[:-1]
+
     def reference(self, samples: int) -> Trajectory:
         """The reference at the ends of the strides, NaN where it cannot be trusted."""
         sequence = self.sequence
@@ -83,10 +84,13 @@ class Prepared(NamedTuple):
 
 
 def prepare(
-    sequences: Iterable[Sequence], config: DataConfig, setup: Setup = DEFAULT_SETUP
+    sequences: Iterable[Sequence],
+    config: DataConfig,
+    setup: Setup = DEFAULT_SETUP,
+    std: InitialStd = TLIO_STD,
 ) -> tuple[list[Prepared], dict[str, str]]:
     """Sequences to estimate, and the names of those left out with the reason (shorter than a window
-    and a stride).
+    and a stride). `std`, of the filter, says how far a static start may be off level.
 
     Raises `InputError` if `setup` needs a reference, a device orientation or more data where a
     sequence has none.
@@ -109,7 +113,7 @@ def prepare(
             continue
         whole = _samples(sequence, slice(first, first + strides * config.stride + 1))
         bias = _gyro_bias(whole, config.rate, setup)
-        start, note = _start(whole, config, setup)
+        start, note = _start(whole, config, setup, std)
         notes = tuple(filter(None, (bias.note, note)))
         prepared.append(Prepared(whole, start, bias.value, notes))
     return prepared, left_out
@@ -139,17 +143,19 @@ def _samples(sequence: Sequence, rows: slice) -> Sequence:
     return sequence._replace(**arrays)
 
 
-def _start(sequence: Sequence, config: DataConfig, setup: Setup) -> tuple[Start, str]:
+def _start(
+    sequence: Sequence, config: DataConfig, setup: Setup, std: InitialStd
+) -> tuple[Start, str]:
     """The start that `setup.init` asks for, with what a reader should know of it."""
     if setup.init == "static":
-        return _static_start(sequence, config)
+        return _static_start(sequence, config, std)
     rotation = matrix_from_quaternion(sequence.orientation[0])
     velocity = sequence.velocity[0]
     velocity = velocity if np.isfinite(velocity).all() else np.zeros(3)
     return Start(rotation, velocity, sequence.position[0]), ""
 
 
-def _static_start(sequence: Sequence, config: DataConfig) -> tuple[Start, str]:
+def _static_start(sequence: Sequence, config: DataConfig, std: InitialStd) -> tuple[Start, str]:
     """Level from the gravity of the first second; yaw, velocity and position zero."""
     second = slice(round(config.rate))
     spread, note = sequence.accel[second].std(0).max(), ""
@@ -158,15 +164,15 @@ def _static_start(sequence: Sequence, config: DataConfig) -> tuple[Start, str]:
             f"start: not standing still (accel varies by {spread:.1f} m/s²), so its tilt is rough"
         )
     filter_config = filter_setup(config, FilterOptions()).config
-    level = level_state(filter_config, sequence.gyro[second], sequence.accel[second])
-    std = np.sqrt(np.diag(level.core_covariance))
+    level = level_state(filter_config, sequence.gyro[second], sequence.accel[second], std)
+    found = np.sqrt(np.diag(level.core_covariance))
     return (
         Start(
             np.asarray(level.rotation),
             velocity=np.zeros(3),
             position=np.zeros(3),
-            tilt_std=float(std[0]),
-            velocity_std=float(std[3]),
+            tilt_std=float(found[0]),
+            velocity_std=float(found[3]),
         ),
         note,
     )
@@ -185,18 +191,11 @@ def _gyro_bias(sequence: Sequence, rate: float, setup: Setup) -> GyroBias:
 
 def _gyro_bias_at_rest(sequence: Sequence, rate: float) -> GyroBias:
     """Mean of the gyro over the whole seconds of rest at the start."""
-    second = round(REST_SECONDS * rate)
-    rest = 0
-    while rest + second <= len(sequence.time):
-        rows = slice(rest, rest + second)
-        gyro_std, accel_std = sequence.gyro[rows].std(0), sequence.accel[rows].std(0)
-        if gyro_std.max() > REST_GYRO_STD or accel_std.max() > REST_ACCEL_STD:
-            break
-        rest += second
-    if not rest:
+    rest = rest_at_start(sequence.gyro, sequence.accel, 1.0 / rate)
+    if not rest.seconds:
         return GyroBias(np.zeros(3), "gyro bias: no rest at the start, so it starts from zero")
-    note = f"gyro bias: mean of {rest / rate:g} s of rest at the start"
-    return GyroBias(sequence.gyro[:rest].mean(0), note)
+    note = f"gyro bias: mean of {rest.seconds:g} s of rest at the start"
+    return GyroBias(rest.gyro_bias, note)
 
 
 def _gyro_bias_from_reference(sequence: Sequence, rate: float) -> GyroBias:

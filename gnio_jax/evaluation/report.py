@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gnio_jax.evaluation import metrics
+from gnio_jax.evaluation.curves_file import write_curves
 from gnio_jax.evaluation.estimators.result import Estimate
 from gnio_jax.evaluation.scores import Scores
 from gnio_jax.evaluation.tum import write_tum
@@ -39,15 +40,16 @@ class Report(NamedTuple):
 
 
 def write(folder: Path, report: Report, estimates: list[Estimate]) -> None:
-    """metrics.json, metrics.csv, trajectories/ and references/ (TUM format) into an empty folder
-    (see `files.replacing_folder`)."""
+    """metrics.json, metrics.csv, trajectories/ and references/ (TUM format) and curves/ into an
+    empty folder (see `files.replacing_folder`)."""
     text = json.dumps(as_json(report), indent=2, allow_nan=False, ensure_ascii=False)
     (folder / "metrics.json").write_text(text + "\n", encoding="utf-8")
     _write_csv(folder / "metrics.csv", report.scores)
-    for kind in ("trajectories", "references"):
+    for kind in ("trajectories", "references", "curves"):
         (folder / kind).mkdir()
     for stem, e in zip(file_names([e.name for e in estimates]), estimates, strict=True):
         write_tum(folder / "trajectories" / f"{stem}.txt", e.trajectory)
+        write_curves(folder / "curves" / f"{stem}.npz", e)
         if np.isfinite(e.reference.position).any():
             write_tum(folder / "references" / f"{stem}.txt", e.reference)
 

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, PartitionSpec
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from gnio_jax.cores import usable_cores
 from gnio_jax.numerics import filled_up
@@ -60,6 +60,21 @@ def padded_signals(
     ]
     gyro, accel = zip(*pairs, strict=True)
     return np.stack(gyro), np.stack(accel)
+
+
+def padded_masks(
+    masks: Iterable[Bool[np.ndarray, "m"] | None], samples: int
+) -> Bool[np.ndarray, "b n"] | None:
+    """Which samples of recordings are there, as `run_filter` takes it, each mask with `samples`
+    rows; None where no recording lacks any. What is appended lacks none."""
+    masks = list(masks)
+    if all(mask is None for mask in masks):
+        return None
+    filled = np.ones((len(masks), samples), bool)
+    for row, mask in zip(filled, masks, strict=True):
+        if mask is not None:
+            row[: len(mask)] = mask[:samples]
+    return filled
 
 
 def over_sequences(function: Callable[..., T], shared: int = 0) -> Callable[..., T]:

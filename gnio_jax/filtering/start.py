@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from gnio_jax import geometry
 from gnio_jax.filtering.checks import (
@@ -36,6 +37,14 @@ from gnio_jax.types import GRAVITY
 _NEVER = -1
 _STILL_STD, _MOVING_STD = 0.05, 1.0
 """Standard deviation of the velocity at a level start, m/s, where the samples are quiet and not."""
+
+REST_GYRO_STD = 0.01
+"""Largest standard deviation of each gyro axis at rest, rad/s: a phone on a table, not in a hand.
+"""
+REST_ACCEL_STD = 0.1
+"""Largest standard deviation of each accelerometer axis at rest, m/s²."""
+REST_SECONDS = 1.0
+"""Shortest rest from which a bias is taken, s; also what the tilt is taken from."""
 
 
 # The arguments of the public functions carry no shapes for the run-time checker: a wrong one is the
@@ -163,6 +172,45 @@ def level_state(
     std = std._replace(tilt=mean_error / GRAVITY, velocity=velocity)
     nothing = jnp.zeros(3, accel.dtype)
     return initial_state(config, geometry.level(accel.mean(0)), nothing, nothing, std=std)
+
+
+class Rest(NamedTuple):
+    """The gyro while the device rests at the start."""
+
+    gyro_bias: Float[np.ndarray, "3"]
+    """Its mean, rad/s; zero where there is no rest."""
+    seconds: float
+    """How long it rests, in whole seconds."""
+
+
+def rest_at_start(
+    gyro: Float[np.ndarray, "m 3"], accel: Float[np.ndarray, "m 3"], dt: float
+) -> Rest:
+    """The whole seconds at the start in which raw gyro (rad/s) and accel (m/s²) are as quiet as on
+    a table (ours)."""
+    second, rest = round(REST_SECONDS / dt), 0
+    while rest + second <= len(gyro):
+        rows = slice(rest, rest + second)
+        quiet = gyro[rows].std(0).max() <= REST_GYRO_STD
+        if not (quiet and accel[rows].std(0).max() <= REST_ACCEL_STD):
+            break
+        rest += second
+    bias = gyro[:rest].mean(0) if rest else np.zeros(3)
+    return Rest(np.asarray(bias, np.float64), rest * dt)
+
+
+def rest_state(
+    config: FilterConfig,
+    gyro: Float[np.ndarray, "m 3"],
+    accel: Float[np.ndarray, "m 3"],
+    std: InitialStd = TLIO_STD,
+) -> FilterState:
+    """Start from the first samples, raw, in which the device should lie still: `level_state` of the
+    first second, and the gyro's bias where it rests (`rest_at_start`)."""
+    second = slice(max(round(REST_SECONDS / config.dt), 2))
+    state = level_state(config, gyro[second], accel[second], std)
+    bias = rest_at_start(gyro, accel, config.dt).gyro_bias
+    return state._replace(gyro_bias=jnp.asarray(bias, state.gyro_bias.dtype))
 
 
 def _spread(samples: jax.Array) -> jax.Array:

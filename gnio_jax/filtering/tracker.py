@@ -47,7 +47,7 @@ from gnio_jax.filtering.online import (
     start_core,
 )
 from gnio_jax.filtering.pose import Pose, pose_from_vector, start_vector
-from gnio_jax.filtering.start import initial_state, level_state, with_lasting_errors
+from gnio_jax.filtering.start import initial_state, rest_state, with_lasting_errors
 from gnio_jax.filtering.state import FilterState, ImuMemory
 from gnio_jax.filtering.tracker_file import load_tracker, save_tracker
 from gnio_jax.types import Prediction
@@ -102,7 +102,8 @@ class Tracker:
         imu_rate: float | None = None,
     ) -> Tracker:
         """Start without a state: the device lies still for the first `seconds`, from which
-        `level_state` makes one for the first sample.
+        `rest_state` makes one for the first sample: tilt, velocity, and the gyro's bias where a
+        second or more is as quiet as on a table.
 
         Until then there is no pose; then these samples are filtered, too. A missing sample begins
         the collection anew.
@@ -266,7 +267,7 @@ class Tracker:
             return None
         collected = self._pending
         samples = self._rows(collected)
-        self._start(level_state(config, samples[:, GYRO], samples[:, ACCEL], std))
+        self._start(rest_state(config, samples[:, GYRO], samples[:, ACCEL], std))
         pose, n, before = None, config.samples_per_clone, number - rest
         for done in range(n, rest + 1, n):
             assert self._core is not None

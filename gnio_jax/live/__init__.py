@@ -1,14 +1,17 @@
 """Odometry while the samples come: where they come from, the filter that follows, the screen."""
 
 from gnio_jax.live.following import Follower, create_tracker, follow
-from gnio_jax.live.samples import Sample, parse_line
+from gnio_jax.live.samples import Sample, Scale, parse_line
 from gnio_jax.live.screen import drawing
 from gnio_jax.live.sources import Source, datagrams, from_recording, lines_of
+from gnio_jax.live.units import checked_units, scale_of
 
 __all__ = [
     "Follower",
     "Sample",
+    "Scale",
     "Source",
+    "checked_units",
     "create_tracker",
     "datagrams",
     "drawing",
@@ -16,4 +19,5 @@ __all__ = [
     "from_recording",
     "lines_of",
     "parse_line",
+    "scale_of",
 ]

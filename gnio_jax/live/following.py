@@ -11,10 +11,10 @@ import numpy as np
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import inference_network
 from gnio_jax.filtering import Tracker
-from gnio_jax.filtering.options import filter_setup
 from gnio_jax.filtering.pose import Pose
 from gnio_jax.live.samples import Sample
 from gnio_jax.live.sources import Source
+from gnio_jax.tracking.filter import tracking_filter
 from gnio_jax.training.checkpoint import Run
 
 Push = Callable[[Any, Any, Any], Pose | None]
@@ -31,13 +31,18 @@ FIRST_STAMPS = 21
 
 
 def create_tracker(run: Run, imu_rate: float | None = None, rest_seconds: float = 1.0) -> Tracker:
-    """The compiled tracker of a run, which starts from rest.
+    """The compiled tracker of a run, with the filter and the start of `tracking.track`.
+
+    Of the same samples it makes the same trajectory, to rounding, where the recording rests for
+    `rest_seconds` and less than a second longer: of a longer rest a track takes the whole for the
+    gyro's bias, but what has not come yet is not known. Live, samples are interpolated by lines
+    where the rates differ, and the covariance is without what a calibrated filter considers.
 
     `imu_rate` is that of the samples that will come, Hz (None: the network's). Samples that are
     further apart than 1.5 of its intervals miss some between them. Raises `ValueError` for a rest
     that is shorter than two samples.
     """
-    setup = filter_setup(run.config.data, run.config.filter)
+    setup = tracking_filter(run)
     network = inference_network(run.model, run.variables)
 
     def predict(windows: Any) -> Any:

@@ -12,6 +12,18 @@ _LARGEST = (100.0, 1000.0)
 """rad/s and m/s²: no phone measures more, so such a line has other units or is damaged."""
 
 
+class Scale(NamedTuple):
+    """What one unit of a stream is."""
+
+    gyro: float = 1.0
+    """rad/s."""
+    accel: float = 1.0
+    """m/s²."""
+
+
+SI = Scale()
+
+
 class Sample(NamedTuple):
     """Raw, in the body frame. A value that is missing is NaN."""
 
@@ -23,8 +35,8 @@ class Sample(NamedTuple):
     """m/s², +9.81 upwards at rest."""
 
 
-def parse_line(line: str) -> Sample | None:
-    """The sample of a line, or None where it is no sample.
+def parse_line(line: str, scale: Scale = SI) -> Sample | None:
+    """The sample of a line, whose units are `scale`, or None where it is no sample.
 
     Two forms: seven numbers `time,gyro_x,gyro_y,gyro_z,accel_x,accel_y,accel_z`, separated by
     commas, semicolons, tabs or blanks, an empty one missing; or a JSON object with `time`, `gyro`
@@ -34,10 +46,10 @@ def parse_line(line: str) -> Sample | None:
     line = line.strip()
     if not line or len(line) > LONGEST_LINE:
         return None
-    return _of_json(line) if line.startswith("{") else _of_columns(line)
+    return _of_json(line, scale) if line.startswith("{") else _of_columns(line, scale)
 
 
-def _of_columns(line: str) -> Sample | None:
+def _of_columns(line: str, scale: Scale) -> Sample | None:
     separator = next((mark for mark in ",;\t" if mark in line), None)
     cells = [cell.strip() for cell in line.split(separator)]
     if len(cells) != 7:
@@ -46,14 +58,14 @@ def _of_columns(line: str) -> Sample | None:
         numbers = [float(cell) if cell else math.nan for cell in cells]
     except ValueError:
         return None
-    return _checked(numbers[0], numbers[1:4], numbers[4:7])
+    return _checked(numbers[0], numbers[1:4], numbers[4:7], scale)
 
 
-def _of_json(line: str) -> Sample | None:
+def _of_json(line: str, scale: Scale) -> Sample | None:
     try:
         found = json.loads(line)
         gyro, accel = ([_number(value) for value in found[name]] for name in ("gyro", "accel"))
-        return _checked(_number(found["time"]), gyro, accel)
+        return _checked(_number(found["time"]), gyro, accel, scale)
     except (KeyError, TypeError, ValueError, OverflowError, RecursionError):
         return None
 
@@ -67,9 +79,11 @@ def _number(value: Any) -> float:
     return float(value)
 
 
-def _checked(time: float, gyro: list[float], accel: list[float]) -> Sample | None:
+def _checked(time: float, gyro: list[float], accel: list[float], scale: Scale) -> Sample | None:
     if not math.isfinite(time) or len(gyro) != 3 or len(accel) != 3:
         return None
+    gyro = [scale.gyro * value for value in gyro]
+    accel = [scale.accel * value for value in accel]
     for values, largest in zip((gyro, accel), _LARGEST, strict=True):
         if any(abs(value) > largest for value in values):
             return None

@@ -9,8 +9,10 @@ import time
 from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
+import numpy as np
+
 from gnio_jax.errors import InputError
-from gnio_jax.live.samples import LONGEST_LINE, Sample, parse_line
+from gnio_jax.live.samples import LONGEST_LINE, SI, Sample, Scale, parse_line
 from gnio_jax.types import Sequence
 
 LOCALHOST = "127.0.0.1"
@@ -26,14 +28,14 @@ class Source(NamedTuple):
     name: str
 
 
-def lines_of(stream: Iterable[str], name: str = "standard input") -> Source:
-    """The lines of a stream, until it ends."""
-    return Source((parse_line(line) for line in stream), name)
+def lines_of(stream: Iterable[str], name: str = "standard input", scale: Scale = SI) -> Source:
+    """The lines of a stream, until it ends; its units are `scale`."""
+    return Source((parse_line(line, scale) for line in stream), name)
 
 
-def datagrams(port: int, silence: float | None = None) -> Source:
+def datagrams(port: int, silence: float | None = None, scale: Scale = SI) -> Source:
     """Datagrams on a UDP port of this machine, with one or several lines each, until nothing comes
-    for `silence` s (None: for ever).
+    for `silence` s (None: for ever); their units are `scale`.
 
     A thread takes them from the socket, so that none is lost while the filter is compiled. Raises
     `InputError` where the port is taken.
@@ -48,7 +50,7 @@ def datagrams(port: int, silence: float | None = None) -> Source:
         raise InputError(where, problem, "choose another port") from None
     waiting: queue.Queue[bytes] = queue.Queue(LONGEST_QUEUE)
     threading.Thread(target=_receive, args=(inbox, waiting), daemon=True).start()
-    return Source(_received(inbox, waiting, silence), where)
+    return Source(_received(inbox, waiting, silence, scale), where)
 
 
 def _receive(inbox: socket.socket, waiting: queue.Queue[bytes]) -> None:
@@ -62,7 +64,7 @@ def _receive(inbox: socket.socket, waiting: queue.Queue[bytes]) -> None:
 
 
 def _received(
-    inbox: socket.socket, waiting: queue.Queue[bytes], silence: float | None
+    inbox: socket.socket, waiting: queue.Queue[bytes], silence: float | None, scale: Scale
 ) -> Iterator[Sample | None]:
     try:
         while True:
@@ -71,20 +73,23 @@ def _received(
             except queue.Empty:
                 return
             for line in message.decode("utf-8", "replace").splitlines() or [""]:
-                yield parse_line(line[: LONGEST_LINE + 1])
+                yield parse_line(line[: LONGEST_LINE + 1], scale)
     finally:
         inbox.close()
 
 
 def from_recording(sequence: Sequence, speed: float) -> Source:
     """The samples of a recording, `speed` times as fast as they were taken; 0 as fast as they can
-    be followed."""
+    be followed. What lies across a gap is missing."""
     return Source(_played(sequence, speed), sequence.name)
 
 
 def _played(sequence: Sequence, speed: float) -> Iterator[Sample]:
     begin, first = time.monotonic(), float(sequence.time[0])
-    for stamp, gyro, accel in zip(sequence.time, sequence.gyro, sequence.accel, strict=True):
+    there = sequence.imu_valid
+    missing = np.zeros((len(sequence.time), 1), bool) if there is None else ~there[:, None]
+    signals = (np.where(missing, np.nan, each) for each in (sequence.gyro, sequence.accel))
+    for stamp, gyro, accel in zip(sequence.time, *signals, strict=True):
         if speed > 0:
             time.sleep(max(0.0, begin + (stamp - first) / speed - time.monotonic()))
         yield Sample(float(stamp), tuple(gyro.tolist()), tuple(accel.tolist()))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 from pathlib import Path
 from typing import NamedTuple
@@ -23,17 +22,15 @@ from gnio_jax.evaluation.preparation import Prepared
 from gnio_jax.evaluation.setup import OnShare, Setup, no_progress
 from gnio_jax.evaluation.tum import write_tum
 from gnio_jax.files import check_writable_folder, replacing_folder
-from gnio_jax.filtering.options import FilterSetup, filter_setup
+from gnio_jax.filtering.noise import InitialStd
+from gnio_jax.tracking.filter import tracking_filter
 from gnio_jax.tracking.summary import Summary, as_json, summarise
 from gnio_jax.tracking.weights import Weights
-from gnio_jax.training.checkpoint import Run
 from gnio_jax.types import Sequence
 
 START = Setup(init="static", gyro_bias="rest")
 """Level from the gravity of the first second, the velocity zero as surely as that second is quiet,
 the gyro's bias from a rest at the start if there is one."""
-ZERO_VELOCITY_STD = 0.02
-"""m/s that the filter measures while the IMU is quiet (ours): what lies on a table stays there."""
 SUMMARY, TRAJECTORY, REFERENCE = "summary.json", "trajectory.txt", "reference.txt"
 PICTURE, PAGE = "track.png", "report.html"
 
@@ -66,8 +63,8 @@ def track(
     _check(out, formats, fix)
     if rerun is not None:
         rerun_file.check_file(rerun)
-    prepared = _prepared(recording.sequence, weights.run.config.data)
     ekf = tracking_filter(weights.run)
+    prepared = _prepared(recording.sequence, weights.run.config.data, ekf.initial_std)
     network = inference_network(weights.run.model, weights.run.variables)
     (estimate,) = run_filters([prepared], network, ekf, 1, progress)
     summary = summarise(estimate, prepared, recording, weights, ekf)
@@ -97,26 +94,19 @@ def _may_be_replaced(out: Path) -> bool:
     return track or (out.is_dir() and not any(out.iterdir()))
 
 
-def _prepared(sequence: Sequence, windows: DataConfig) -> Prepared:
+def _prepared(sequence: Sequence, windows: DataConfig, std: InitialStd) -> Prepared:
     """The whole recording at the network's rate. A reference starts nothing: it comes in again to
     be compared with. Raises `InputError` for a hole that nothing bridges: what was walked in it is
     in no sample."""
     check_gaps(sequence.time, sequence.name)
     sequence = data.resample(sequence, windows.rate)
     blind = sequence._replace(valid=np.zeros_like(sequence.valid))
-    prepared, left_out = prepare([blind], windows, START)
+    prepared, left_out = prepare([blind], windows, START, std)
     if not prepared:
         raise InputError(sequence.name, left_out[sequence.name], "record for longer")
     cut = prepared[0].sequence
     valid = sequence.valid[: len(cut.time)]
     return prepared[0]._replace(sequence=cut._replace(valid=valid))
-
-
-def tracking_filter(run: Run) -> FilterSetup:
-    """The run's own filter, for which rest is a measurement too."""
-    setup = filter_setup(run.config.data, run.config.filter)
-    config = dataclasses.replace(setup.config, zero_velocity_std=ZERO_VELOCITY_STD)
-    return setup._replace(config=config)
 
 
 def _write(

@@ -9,7 +9,6 @@ import numpy as np
 
 from gnio_jax.data.importing import Imported
 from gnio_jax.data.importing.streams import GAPS
-from gnio_jax.data.resampling import LONGEST_BRIDGE
 from gnio_jax.evaluation import Estimate, metrics
 from gnio_jax.evaluation.metrics.trajectory import finite_poses
 from gnio_jax.evaluation.preparation import Prepared
@@ -117,7 +116,7 @@ def summarise(
     )
     own_rate = 1.0 / float(np.median(np.diff(sequence.time)))
     found = _warnings(summary, own_rate, 1.0 / ekf.config.dt)
-    holes = bool((np.diff(sequence.time) > LONGEST_BRIDGE).any())
+    holes = prepared.imu_valid is not None
     if holes or any(GAPS in note for note in recording.notes):
         where = "" if holes else " (see above)"
         found.append(f"gaps: samples are missing{where}, and what happened there is guessed")

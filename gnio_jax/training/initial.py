@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
-from pathlib import Path
+from collections.abc import Callable
 from typing import Any
 
 from gnio_jax.config import TrainConfig
 from gnio_jax.errors import InputError
-from gnio_jax.training.checkpoint import Run, create_model, load_run
+from gnio_jax.training.checkpoint import Run, create_model
 from gnio_jax.training.step import TrainState
 
 
-def initial_run(config: TrainConfig) -> Run | None:
-    """The run that `config.init_from` names, if any.
+def initial_run(config: TrainConfig, load: Callable[[str], Run]) -> Run | None:
+    """The run that `config.init_from` names, if any, as `load` reads it.
 
     Raises `InputError` for a folder without a run, and for one whose network is not that of
     `config`; also if training through the filter has none to start from. A calibrated uncertainty
@@ -25,7 +25,7 @@ def initial_run(config: TrainConfig) -> Run | None:
         raise InputError("config", f"field 'through_filter.learn' {problem}", remedy)
     if config.init_from is None:
         return None
-    run = load_run(Path(config.init_from))
+    run = load(config.init_from)
     theirs, ours = (_description(each) for each in (run.config, config))
     head_to_calibrated = ("head", "calibrated")
     if (theirs.get("model.uncertainty"), ours.get("model.uncertainty")) == head_to_calibrated:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -22,7 +22,7 @@ from gnio_jax.reporting import Lines, Reporter, Silence
 from gnio_jax.scaling.devices import BATCH, SEEDS, chosen, sharing
 from gnio_jax.scaling.processes import agreed, all_or_none, is_first, several
 from gnio_jax.training import run_folder
-from gnio_jax.training.checkpoint import Checkpoints, exists
+from gnio_jax.training.checkpoint import Checkpoints, Run, exists, load_run
 from gnio_jax.training.initial import initial_run
 from gnio_jax.training.kinds import Training
 from gnio_jax.training.log import Log
@@ -64,6 +64,7 @@ def train(
     reporter: Reporter | None = None,
     workers: int = 1,
     devices: int | None = None,
+    load_initial: Callable[[str], Run] = load_run,
 ) -> Outcome:
     """Train the network of `config` and leave checkpoints and logs in its work folder: on windows,
     or through the filter where `config.through_filter` says what learns.
@@ -76,15 +77,17 @@ def train(
     filter such a step is skipped). `workers` processes read recordings that are slow to read
     (`data.load`). A batch of windows is shared out among `devices` devices of each process, by
     default all (`scaling.devices.chosen`); how many there are changes the results by rounding
-    alone, also in a run that is resumed. Raises `InputError` where `config.init_from` is no run of
-    the same network, and where the devices cannot share a batch evenly.
+    alone, also in a run that is resumed. `load_initial` reads what `config.init_from` names, by
+    default the folder of a run; `gnio_jax.load_pretrained` also takes packages of weights. Raises
+    `InputError` where that is not of the same network, and where the devices cannot share a batch
+    evenly.
     """
     _check_devices(config, devices)
     through_filter = bool(config.through_filter.learn)
     sharers = jax.devices()[:1] if through_filter else chosen(devices)
     # Whatever the process has: no float64 but for the filter, and the same random draws.
     with jax.enable_x64(through_filter), sharing(sharers, BATCH):
-        (outcome,) = _train([config], resume, reporter or Lines(), workers)
+        (outcome,) = _train([config], resume, reporter or Lines(), workers, load_initial)
     return outcome
 
 
@@ -95,6 +98,7 @@ def train_seeds(
     reporter: Reporter | None = None,
     workers: int = 1,
     devices: int | None = None,
+    load_initial: Callable[[str], Run] = load_run,
 ) -> list[Outcome]:
     """Train `config` with each of these seeds together, as `train` would in the work folders
     WORKDIR_s0, WORKDIR_s1, ... (`config.with_seeds`).
@@ -114,7 +118,7 @@ def train_seeds(
     through_filter = bool(config.through_filter.learn)
     sharers = jax.devices()[:1] if through_filter else chosen(devices)[: len(configs)]
     with jax.enable_x64(through_filter), sharing(sharers, SEEDS):
-        return _train(configs, resume, reporter or Lines(), workers)
+        return _train(configs, resume, reporter or Lines(), workers, load_initial)
 
 
 def _check_devices(config: TrainConfig, devices: int | None) -> None:
@@ -127,9 +131,13 @@ def _check_devices(config: TrainConfig, devices: int | None) -> None:
 
 
 def _train(
-    configs: list[TrainConfig], resume: bool, reporter: Reporter, workers: int
+    configs: list[TrainConfig],
+    resume: bool,
+    reporter: Reporter,
+    workers: int,
+    load_initial: Callable[[str], Run],
 ) -> list[Outcome]:
-    """Set the runs up, and train those that stand at the same step together, to their end."""
+    """Set the runs up, and train them."""
     reporter = reporter if is_first() else Silence()
     for config in configs:
         configuration.validate(config)
@@ -137,7 +145,7 @@ def _train(
         workdirs = [run_folder.prepare(config, resume) for config in configs]
     resuming = agreed(*(resume and is_first() and exists(workdir) for workdir in workdirs))
     with all_or_none():
-        start = None if all(resuming) else initial_run(configs[0])
+        start = None if all(resuming) else initial_run(configs[0], load_initial)
         first = set_up(configs[0], reporter, workers)
         trainings = [first, *(first.with_seed(config.seed) for config in configs[1:])]
         states = [training.new_state(start) for training in trainings]
@@ -145,24 +153,35 @@ def _train(
         for config, workdir in zip(configs, workdirs, strict=True):
             run_folder.write_settings(workdir, config, first.splits, resume)
     run_folder.compare_processes(configs[0], first.splits, first.recordings, states[0].variables)
-    names = [f"seed {config.seed}: " if len(configs) > 1 else "" for config in configs]
     with stop_signals() as stop, ExitStack() as opened:
-        runs = [
-            SeedRun(name, workdir, training, opened.enter_context(Checkpoints(workdir)), BEGINNING)
-            for name, workdir, training in zip(names, workdirs, trainings, strict=True)
-        ]
+        runs = []
+        for config, workdir, training in zip(configs, workdirs, trainings, strict=True):
+            name = f"seed {config.seed}: " if len(configs) > 1 else ""
+            checkpoints = opened.enter_context(Checkpoints(workdir))
+            runs.append(SeedRun(name, workdir, training, checkpoints, BEGINNING))
         for k in range(len(runs)):
             if resuming[k]:
-                states[k], position = runs[k].checkpoints.restore(states[k])
-                runs[k] = runs[k]._replace(position=position)
-                reporter.line(f"{names[k]}resuming at step {position.step}")
-        ended = [
-            run
-            for group in _at_the_same_step(runs, states)
-            for run in _train_group(group, stop, reporter).runs
-        ]
-        best = {run.workdir: run.position.best_loss for run in ended}
-    return [Outcome(workdir, best[workdir], stop.signum) for workdir in workdirs]
+                runs[k], states[k] = _restored(runs[k], states[k], reporter)
+        runs = _train_all(runs, states, stop, reporter)
+        return [Outcome(run.workdir, run.position.best_loss, stop.signum) for run in runs]
+
+
+def _restored(run: SeedRun, template: TrainState, reporter: Reporter) -> tuple[SeedRun, TrainState]:
+    """A run at its latest checkpoint."""
+    state, position = run.checkpoints.restore(template)
+    reporter.line(f"{run.name}resuming at step {position.step}")
+    return run._replace(position=position), state
+
+
+def _train_all(
+    runs: list[SeedRun], states: list[TrainState], stop: Stop, reporter: Reporter
+) -> list[SeedRun]:
+    """Train the runs that stand at the same step together, to their end."""
+    ended = {}
+    for group in _at_the_same_step(runs, states):
+        for run in _train_group(group, stop, reporter).runs:
+            ended[run.workdir] = run
+    return [ended[run.workdir] for run in runs]
 
 
 def _describe(

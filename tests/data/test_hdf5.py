@@ -15,6 +15,7 @@ def test_hdf5_returns_every_bit(tmp_path, device):
     sequence = changed(circle(), "valid", 3, False)
     sequence = changed(sequence, "position", 3, np.nan)._replace(
         device_orientation=circle().orientation if device else None,
+        imu_valid=circle().time < 0.5 if device else None,
         attributes={"truth": "Vicon", "rows": 7, "bias": 0.25, "calibrated": True, "person": "Ö"},
     )
     path = tmp_path / "deep" / "walk.h5"

@@ -315,6 +315,7 @@ def test_one_file_per_sensor_is_joined_on_one_clock(tmp_path, gyro_rate, accel_r
     np.testing.assert_allclose(sequence.gyro[inner], known[inner, :3], atol=1e-3)
     np.testing.assert_allclose(sequence.accel[inner], known[inner, 3:], atol=1e-3)
     assert sequence.time[-1] == pytest.approx(SECONDS - 0.3 - start, abs=0.03)
+    assert sequence.imu_valid is None
     moved = "accel" if gyro_rate > accel_rate else "gyro"
     assert any(
         f"stamps of their own: {moved} interpolated" in note and "1.0" in note for note in notes
@@ -328,6 +329,17 @@ def test_one_file_per_sensor_is_joined_on_one_clock(tmp_path, gyro_rate, accel_r
     )
     same, _ = import_recording(gyro, columns, accel_path=accel, rate=100.0)
     np.testing.assert_allclose(same.accel[inner], known[inner, 3:], atol=1e-3)
+
+    # One of them stops for half a second: what is there of the other is no whole sample either.
+    kept = (accel_time < 4.0) | (accel_time > 4.5)
+    rows = [stamps_of(accel_time, "us"), *imu(accel_time)[:, 5:2:-1].T, np.full(len(kept), 3)]
+    accel = write(tmp_path / "Accelerometer.csv", ["t", *head[1:]], [row[kept] for row in rows])
+    holed, _ = import_recording(gyro, columns, accel_path=accel, rate=100.0)
+    missing = holed.time[~holed.imu_valid] + start
+    assert len(missing) == pytest.approx(50, abs=3)
+    assert missing[0] == pytest.approx(4.0, abs=0.02) and missing[-1] == pytest.approx(
+        4.5, abs=0.02
+    )
     assert same.attributes["start_time"] == pytest.approx(UNIX * 1e-9 + start, abs=2e-6)
 
     later = write(

@@ -151,3 +151,17 @@ def test_a_missing_reference_stays_missing(rows):
         np.testing.assert_array_equal(np.isfinite(getattr(result, field)).all(axis=1), result.valid)
     assert np.isfinite(result.accel).all()
     validate(result, "walk")
+
+
+def test_what_lies_across_a_gap_is_no_measurement():
+    """Samples strictly between two that are more than 0.1 s apart, and around one that was none."""
+    stamps = np.delete(np.arange(400) / 100, np.s_[101:125])  # from 1.0 to 1.25 s
+    stamps = np.delete(stamps, stamps.searchsorted(2.0))  # a single sample is no gap
+    found = resample(circle(stamps=stamps), 200.0)
+    inside = (found.time > 1.0 + 1e-6) & (found.time < 1.25 - 1e-6)
+    np.testing.assert_array_equal(found.imu_valid, ~inside)
+    again = resample(found, 100.0)
+    np.testing.assert_array_equal(again.imu_valid, ~((again.time > 1.001) & (again.time < 1.249)))
+    assert resample(circle(stamps=np.arange(400) / 101), 200.0).imu_valid is None
+    line = found.gyro[inside] - found.gyro[inside][0]
+    np.testing.assert_allclose(np.diff(line, 2, axis=0), 0.0, atol=1e-9)

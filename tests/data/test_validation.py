@@ -15,6 +15,7 @@ BAD = [
     (GOOD._replace(device_orientation=GOOD.orientation[1:]), "'device_orientation'", "shape"),
     (GOOD._replace(time=GOOD.time[:1]), "'time'", "two stamps"),
     (GOOD._replace(valid=GOOD.valid.astype(float)), "'valid'", "booleans"),
+    (GOOD._replace(imu_valid=GOOD.valid[1:]), "'imu_valid'", "booleans"),
     (changed(GOOD, "time", 7, GOOD.time[6]), "'time'", "row 7"),
     (changed(GOOD, "time", 7, np.nan), "'time'", "row 7"),
     (changed(GOOD, "gyro", 9, np.nan), "'gyro'", "row 9"),

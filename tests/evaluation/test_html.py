@@ -201,6 +201,35 @@ def test_evaluations_beside_are_read_back(tmp_path, estimates, made):
     assert first.summary["never moves"]["path_length_ratio"] == 0
 
 
+def test_a_page_made_later_has_the_strips_of_the_first(tmp_path, walks):
+    """σ, NIS, gate, scale and ellipses, of a filter that diverged at the end, too."""
+    lost = walks[1].trajectory.position.copy()
+    lost[380:] = np.nan
+    walks = [walks[0], walks[1]._replace(trajectory=walks[1].trajectory._replace(position=lost))]
+    walks[0].diagnostics["scale"] = 1.0 + 0.1 * walks[0].displacement
+    (tmp_path / "eval").mkdir()
+    told = report_of(walks, SETTINGS | {"definitions": report.DEFINITIONS})
+    report.write(tmp_path / "eval", told, walks)
+    now, later = pages.of_evaluation(told, walks), folders.read_entry(tmp_path / "eval")
+    assert later.remarks == now.remarks and later.remarks[0] == "walk: start: rough"
+    assert "diverged" in later.remarks[-1]
+    for ours, theirs, rows in zip(now.estimates, later.estimates, (400, 380), strict=True):
+        first, again = (curves(each, "none", 400) for each in (ours, theirs))
+        assert np.isfinite(again.std).any() and np.isfinite(again.nis).any()
+        for name in set(first._fields) - {"sequence", "ellipses"}:
+            found, wanted = getattr(again, name), getattr(first, name)[:rows]
+            if name == "distance":  # its last second is known less well
+                found, wanted = found[:-10], wanted[:-10]
+            np.testing.assert_allclose(found, wanted, rtol=1e-6, atol=1e-6, err_msg=name)
+        for found, wanted in zip(again.ellipses, first.ellipses, strict=True):
+            np.testing.assert_allclose(found, wanted[:rows], rtol=1e-5, atol=1e-6)
+    file = tmp_path / "eval" / "curves" / "walk.npz"
+    assert file.stat().st_size < 400 * 16 * 4
+    file.write_bytes(file.read_bytes()[:200])  # what is damaged costs the strips alone
+    damaged = folders.read_entry(tmp_path / "eval").estimates[0]
+    assert damaged.nis is None and len(damaged.trajectory.time) == 400
+
+
 # In a browser
 # --------------------------------------------------------------------------------------------------
 

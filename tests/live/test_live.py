@@ -1,6 +1,7 @@
 """`gnio live`: the trajectory of a stream is that of the tracker, and nonsense is refused."""
 
 import io
+import signal
 import sys
 
 import numpy as np
@@ -11,6 +12,7 @@ from gnio_jax.commands import app, console
 from gnio_jax.config import DataConfig, ModelConfig, TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation.tum import read_tum
+from tests.evaluation.test_rerun_file import columns_of
 from tests.support import known_walk, tiny_run
 
 CONFIG = TrainConfig(data=DataConfig(rate=50.0), model=ModelConfig(name="tiny"))
@@ -145,6 +147,9 @@ def test_noise_on_the_line_is_no_text(gnio, run, recorded, monkeypatch, tmp_path
         ([], ["udp:nine"], "udp:nine: names no port; write udp:5555"),
         ([], ["nowhere.csv"], "nowhere.csv"),
         ([], ["nowhere.csv", "--speed", "-1"], "--speed: must not be negative"),
+        ([], ["--accel-sign", "ios"], "--accel-sign: is of a recording"),
+        ([], ["--rerun", "live.txt"], "--rerun"),
+        (["0,0,0,0,0,0,1.01"] * 30, [], "standard input: its accelerometer reads 1.01"),
         ([], ["--rest-seconds", "0"], "--imu-rate or --rest-seconds: seconds: must be a time of"),
     ],
 )
@@ -172,3 +177,98 @@ def test_a_recording_is_played(gnio, run, recorded, tmp_path):
     np.savetxt(walk, np.column_stack(recorded), delimiter=",", header=header, comments="")
     told = gnio([], walk, "--speed", "0", "--weights", run)
     assert told.startswith("following walk with run") and "walked" in told
+
+
+def test_a_recording_played_gives_the_track_of_it(gnio, run, recorded, monkeypatch, tmp_path):
+    """A second and a half of rest with a biased gyro, and a walk that lacks half a second. Only
+    while the rest is not yet seen there is no pose."""
+    _, gyro, accel = recorded
+    noise = np.random.default_rng(0).normal(0, 1e-3, (2, 75, 3))
+    gyro = np.concatenate([noise[0], gyro[50:]]) + np.array([0.03, -0.02, 0.01])
+    accel = np.concatenate([accel[0] + noise[1], accel[50:]])
+    walk = tmp_path / "walk.csv"
+    rows = np.column_stack([np.arange(len(gyro)) / RATE, gyro, accel])
+    rows = np.delete(rows, np.s_[150:175], axis=0)
+    header = "time,gyro_x,gyro_y,gyro_z,accel_x,accel_y,accel_z"
+    np.savetxt(walk, rows, delimiter=",", header=header, comments="", fmt="%.12f")
+    given = ("--weights", run, "--gyro-unit", "rad/s")
+    told = gnio([], walk, "--speed", "0", "--out", tmp_path / "live.txt", *given)
+    monkeypatch.chdir(tmp_path)
+    console.run(lambda: app.main(["track", str(walk), "--out", "track", *map(str, given)]))
+    followed, tracked = read_tum(tmp_path / "live.txt"), read_tum(tmp_path / "track/trajectory.txt")
+    assert "lacks samples 1 times" in told and "in the quietest second" in told
+    rows = np.searchsorted(tracked.time, followed.time - 1e-4)
+    assert rows[0] == round(1.0 / 0.1) and (np.diff(rows[:-1]) == 1).all()
+    both = rows < len(tracked.time)  # a track ends with the stamp of its last sample
+    assert (~both).sum() <= 1 and both.sum() > 35
+    for name in ("position", "orientation"):
+        found, wanted = getattr(followed, name)[both], getattr(tracked, name)[rows[both]]
+        np.testing.assert_allclose(found, wanted, atol=1e-7)
+    assert np.ptp(tracked.position, axis=0).max() > 0.3
+
+
+@pytest.mark.parametrize(
+    ("number", "status", "said"),
+    [(signal.SIGTERM, 143, "terminated\n"), (signal.SIGINT, 130, "interrupted\n")],
+)
+def test_a_signal_ends_the_stream_and_nothing_is_lost(
+    capsys, run, recorded, monkeypatch, tmp_path, number, status, said
+):
+    lines, out = as_lines(recorded), tmp_path / "live.txt"
+
+    def follow_until(samples):
+        def stream():
+            yield from lines[:samples]
+            signal.raise_signal(number)
+            yield from lines[samples:]
+
+        monkeypatch.setattr(sys, "stdin", stream())
+        with pytest.raises(SystemExit, match=str(status)):
+            console.run(lambda: app.main(["live", "--weights", str(run), "--out", str(out)]))
+        assert capsys.readouterr().err == said
+
+    follow_until(10)
+    assert list(tmp_path.iterdir()) == []
+    follow_until(155)
+    # 31 whole intervals of 0.1 s; the first pose is that of the end of the rest.
+    time = read_tum(out).time
+    np.testing.assert_allclose(time, np.arange(10, 32) / 10, atol=1e-6)
+
+
+def test_a_stream_of_degrees_and_g(gnio, run, recorded, tmp_path):
+    time, gyro, accel = recorded
+    other = as_lines((time, np.degrees(gyro), accel / 9.80665))
+    si = gnio(as_lines(recorded), "--weights", run)
+    assert gnio(other, "--weights", run, "--gyro-unit", "deg/s", "--accel-unit", "g") == si
+
+
+def test_a_gyro_that_turns_gravity_as_degrees_would_is_told():
+    time = np.arange(0, 12, 0.02)
+    walk = time, np.degrees(known_walk.rate(time)), known_walk.force(time)
+    with pytest.raises(InputError, match=r"udp:5: its gyro looks like deg/s.*state the unit"):
+        list(live.checked_units(live.lines_of(as_lines(walk), "udp:5")).samples)
+    scale = live.scale_of("deg/s", None)
+    source = live.checked_units(live.lines_of(as_lines(walk), "udp:5", scale))
+    np.testing.assert_allclose([s.gyro for s in source.samples], known_walk.rate(time), atol=1e-9)
+
+
+def test_the_file_for_rerun(gnio, run, recorded, monkeypatch, tmp_path):
+    rerun_stream = pytest.importorskip("gnio_jax.live.rerun_stream")
+    pytest.importorskip("rerun", reason="needs rerun-sdk")
+    monkeypatch.setattr(rerun_stream, "LINE_EVERY", 3)
+    monkeypatch.setattr(rerun_stream, "LONGEST_PIECE", 9)
+    given = ("--weights", run, "--out", tmp_path / "live.txt", "--rerun", tmp_path / "live.rrd")
+    gnio(as_lines(recorded), *given)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["live.rrd", "live.txt"]
+    found, path = columns_of(tmp_path / "live.rrd"), read_tum(tmp_path / "live.txt")
+    moved = np.array(found["/live/pose"]["Transform3D:translation"])[:, 0]
+    np.testing.assert_allclose(moved, path.position, atol=1e-5)
+    seconds = [each.total_seconds() for each in found["/live/pose"]["time"]]
+    np.testing.assert_allclose(seconds, path.time - path.time[0], atol=1e-6)
+    pieces = [
+        found[f"/live/estimate/{number:04d}"]["LineStrips3D:strips"][-1][0] for number in range(5)
+    ]
+    # Each begins where the one before ended.
+    line = np.concatenate([pieces[0], *(piece[1:] for piece in pieces[1:])])
+    np.testing.assert_allclose(line, path.position, atol=1e-5)
+    assert len(found["/live/ellipsoid"]["Ellipsoids3D:half_sizes"]) == len(path.time)

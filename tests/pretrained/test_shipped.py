@@ -1,12 +1,17 @@
 """The network that comes with gnio-jax."""
 
+import dataclasses
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import gnio_jax
+from gnio_jax import config as configuration
 from gnio_jax import pretrained
+from gnio_jax.errors import InputError
 from gnio_jax.pretrained.finding import SHIPPED
+from gnio_jax.training.initial import initial_run
 
 MAXIMUM = 5e6
 """Bytes."""
@@ -49,3 +54,13 @@ def _leaves(tree):
             yield from _leaves(branch)
     else:
         yield np.asarray(tree)
+
+
+def test_training_starts_from_it_by_its_name():
+    config = configuration.load("pedestrian")
+    config = dataclasses.replace(config, init_from="pedestrian")
+    run = initial_run(config, gnio_jax.load_pretrained)
+    assert run is not None and run.step > 0
+    other = dataclasses.replace(config, model=dataclasses.replace(config.model, width=8))
+    with pytest.raises(InputError, match=r"pedestrian: its model.width is 16.* describe the same"):
+        initial_run(other, gnio_jax.load_pretrained)

@@ -153,7 +153,10 @@ def test_the_newest_run_a_slow_logger_and_our_own_file(gnio, runs, tmp_path, mon
     assert "rate: recorded at 20 Hz, the network has learnt at 50 Hz" in told
     assert "warning: start: it moves in its first second" in told
     gnio("data", "import", slow, "--out", tmp_path / "slow.h5")
-    gnio("track", tmp_path / "slow.h5", "--out", tmp_path / "again")
+    again = gnio("track", tmp_path / "slow.h5", "--out", tmp_path / "again")
+    of_gaps = [line for line in told.splitlines() if "lacks samples" in line or "gaps" in line]
+    assert len(of_gaps) == 3 and set(of_gaps) <= set(again.splitlines())
+    assert summary_of(tmp_path / "again")["notes"] == summary_of(folder)["notes"]
     ours, theirs = (
         read_trajectory(place / "trajectory.txt").position for place in (tmp_path / "again", folder)
     )

@@ -11,13 +11,13 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
 from gnio_jax.data.importing import units
 from gnio_jax.data.importing.asl import read_asl
 from gnio_jax.data.importing.bags import KINDS
+from gnio_jax.data.importing.kept import Imported
 from gnio_jax.data.importing.phyphox import read_phyphox
 from gnio_jax.data.importing.recognition import recognise
 from gnio_jax.data.importing.reference import with_reference
@@ -44,15 +44,6 @@ SLOW = 50.0
 """Hz below which the impacts of steps are lost; networks are trained on 100 and more (ours)."""
 
 _COLUMNS = ("time", "accel_time", *GYRO, *ACCEL)
-
-
-class Imported(NamedTuple):
-    """What `import_recording` made of a recording."""
-
-    sequence: Sequence
-    """On a uniform clock, with a reference where the recording has one."""
-    notes: tuple[str, ...]
-    """What was detected, assumed or repaired, one sentence each, to be shown to the user."""
 
 
 def import_recording(
@@ -273,6 +264,7 @@ def _without_reference(imu: Joined, name: str, source: Path) -> Sequence:
         position=nothing,
         velocity=nothing,
         valid=np.zeros(count, dtype=bool),
+        imu_valid=imu.valid,
         attributes={"dataset": "csv", "group": name, "truth": "none", "start_time": imu.start},
     )
     return validate(sequence, source)

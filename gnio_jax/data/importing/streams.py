@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
-from jaxtyping import Float, Num
+from jaxtyping import Bool, Float, Num
 from scipy.interpolate import CubicSpline
 
 from gnio_jax.data.readers.stamps import PER_SECOND, RATES, in_order, time_unit
@@ -67,6 +67,8 @@ class Joined(NamedTuple):
     """s from `start`."""
     gyro: Float[np.ndarray, "n 3"]
     accel: Float[np.ndarray, "n 3"]
+    valid: Bool[np.ndarray, " n"] | None = None
+    """False where the slower sensor lacks samples; None: it lacks none."""
 
 
 # --- columns
@@ -287,7 +289,7 @@ def join(
     faster, slower = (gyro, accel) if gyro_is_faster else (accel, gyro)
     inside = (faster.time >= first) & (faster.time <= last)
     time, measured = faster.time[inside], faster.values[inside]
-    interpolated = _values_at(slower, time)
+    interpolated, in_gap = _values_at(slower, time)
     cut = max(gyro.time[-1], accel.time[-1]) - min(gyro.time[0], accel.time[0]) - (last - first)
     moved = "accel" if gyro_is_faster else "gyro"
     notes.append(
@@ -295,13 +297,16 @@ def join(
         f"{cut:.2f} s cut that only one of them covers"
     )
     rates, forces = (measured, interpolated) if gyro_is_faster else (interpolated, measured)
-    return Joined(gyro.epoch + float(time[0]), time - time[0], rates, forces)
+    valid = ~in_gap if in_gap.any() else None
+    return Joined(gyro.epoch + float(time[0]), time - time[0], rates, forces, valid)
 
 
-def _values_at(stream: Stream, time: np.ndarray) -> Float[np.ndarray, "m 3"]:
-    """By a cubic spline, and by lines across gaps."""
+def _values_at(
+    stream: Stream, time: np.ndarray
+) -> tuple[Float[np.ndarray, "m 3"], Bool[np.ndarray, " m"]]:
+    """By a cubic spline, and by lines across gaps; and what lies in a gap."""
     values = CubicSpline(stream.time, stream.values, axis=0)(time)
     left, right = neighbours(stream.time, time)
     gap = stream.time[right] - stream.time[left] > LONGEST_SPLINE
     values[gap] = interpolate(time[gap], stream.time, stream.values)
-    return values
+    return values, gap & (time != stream.time[left]) & (time != stream.time[right])

@@ -43,7 +43,7 @@ from gnio_jax.errors import InputError
 from gnio_jax.types import Sequence
 
 RATE = 200.0
-VERSION = "asl 2"
+VERSION = "asl 3"
 """Changes whenever other sequences would come of the same files: it is part of the cache's key."""
 SPLITS = ("train", "val", "test", "seen", "unseen")
 EUROC_SPLITS = {

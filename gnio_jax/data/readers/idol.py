@@ -49,7 +49,7 @@ from gnio_jax.numerics import finite_rows, levelling, outer_span, quaternions, r
 from gnio_jax.types import STANDARD_G, Sequence
 
 RATE = 100.0
-VERSION = "idol 2"
+VERSION = "idol 3"
 """Changes whenever other sequences would come of the same files: it is part of the cache's key."""
 
 PHONE_TO_RIG = Rotation.from_rotvec([-0.01853, 0.02801, 3.12916])

@@ -43,7 +43,7 @@ from gnio_jax.numerics import quaternions
 from gnio_jax.types import Sequence
 
 RATE = 200.0
-VERSION = "ridi 2"
+VERSION = "ridi 3"
 """Changes whenever other sequences would come of the same files: it is part of the cache's key."""
 NATIVE_RATE = 202.3
 """Hz, of data.csv."""

@@ -33,7 +33,7 @@ from gnio_jax.filtering import (
     run_odometry,
     sensitivity,
 )
-from gnio_jax.filtering.batch import Batch, batches, padded_signals
+from gnio_jax.filtering.batch import Batch, batches, padded_masks, padded_signals
 from gnio_jax.filtering.config import YawFrame
 from gnio_jax.filtering.history import GYRO_BIAS, POSITION
 from gnio_jax.filtering.options import FilterSetup
@@ -52,6 +52,17 @@ class Measurements(NamedTuple):
     """m, in the yaw frame of the window's start."""
     std: Float[Array, "k 3"]
     """m."""
+
+
+class Imu(NamedTuple):
+    """What the filter is driven by, the recordings along the leading axis."""
+
+    gyro: Array
+    """(b, K·n, 3), rad/s."""
+    accel: Array
+    """(b, K·n, 3), m/s²."""
+    valid: Array | None
+    """(b, K·n) booleans: False where a sample was made up; None: nowhere."""
 
 
 class FilterStart(NamedTuple):
@@ -110,31 +121,29 @@ def _run_batch(
     samples = batch.intervals * setup.config.samples_per_clone
     start = _stacked([_filter_start(each, setup) for each in members])
     signals = ((each.sequence.gyro[:-1], each.sequence.accel[:-1]) for each in members)
-    gyro, accel = padded_signals(signals, samples)
+    masks = (each.imu_valid for each in members)
+    imu = Imu(*padded_signals(signals, samples), padded_masks(masks, samples))
     if isinstance(source, Network):
         history = _run_with_network(
-            source.apply, source.variables, start, gyro, accel, setup.config, setup.noise
+            source.apply, source.variables, start, imu, setup.config, setup.noise
         )
     else:
         given = [
             Measurements(*(filled_up(part, batch.intervals, np.nan) for part in source[i]))
             for i in batch.members
         ]
-        history = _run_with_measurements(
-            start, gyro, accel, _stacked(given), setup.config, setup.noise
-        )
+        history = _run_with_measurements(start, imu, _stacked(given), setup.config, setup.noise)
     if setup.considered is not None:
         frame = None if isinstance(source, Network) else "given"
         fixed = setup.config, setup.noise, setup.considered, frame
-        history = _with_considered(start, gyro, accel, history, *fixed)
+        history = _with_considered(start, imu, history, *fixed)
     return on_host(history)
 
 
 @functools.partial(jax.jit, static_argnames=("config", "frame"))
 def _with_considered(
     start: FilterStart,
-    gyro: Array,
-    accel: Array,
+    imu: Imu,
     history: FilterHistory,
     config: FilterConfig,
     noise: NoiseModel,
@@ -143,17 +152,16 @@ def _with_considered(
 ) -> FilterHistory:
     """With the errors that the filter considers in its covariance."""
 
-    def run(
-        start: FilterStart, gyro: Array, accel: Array, history: FilterHistory
-    ) -> tuple[Array, Array]:
+    def run(start: FilterStart, imu: Imu, history: FilterHistory) -> tuple[Array, Array]:
         state = initial_state(config, **start._asdict())
-        found = sensitivity(state, gyro, accel, history, config, noise, frame=frame)
+        signals = imu.gyro, imu.accel
+        found = sensitivity(state, *signals, history, config, noise, imu.valid, frame)
         added = considered_covariance(found, considered)
         variances = history.covariance_diagonal + jnp.diagonal(added, axis1=1, axis2=2)
         assert history.covariance is not None
         return variances, history.covariance + added[:, POSITION, POSITION]
 
-    diagonal, covariance = over_sequences(run)(start, gyro, accel, history)
+    diagonal, covariance = over_sequences(run)(start, imu, history)
     return history._replace(covariance_diagonal=diagonal, covariance=covariance)
 
 
@@ -162,40 +170,36 @@ def _run_with_network(
     apply: Callable,
     variables: Any,
     start: FilterStart,
-    gyro: Array,
-    accel: Array,
+    imu: Imu,
     config: FilterConfig,
     noise: NoiseModel,
 ) -> FilterHistory:
     def predict(windows: Array) -> Any:
         return keep_diagnostics(apply(variables, windows))
 
-    def run(start: FilterStart, gyro: Array, accel: Array) -> FilterHistory:
+    def run(start: FilterStart, imu: Imu) -> FilterHistory:
         state = initial_state(config, **start._asdict())
-        return _lean(run_odometry(predict, state, gyro, accel, config, noise)[1])
+        signals = imu.gyro, imu.accel
+        return _lean(run_odometry(predict, state, *signals, config, noise, imu.valid)[1])
 
-    return over_sequences(run)(start, gyro, accel)
+    return over_sequences(run)(start, imu)
 
 
 @functools.partial(jax.jit, static_argnames="config")
 def _run_with_measurements(
     start: FilterStart,
-    gyro: Array,
-    accel: Array,
+    imu: Imu,
     measurements: Measurements,
     config: FilterConfig,
     noise: NoiseModel,
 ) -> FilterHistory:
-    def run(
-        start: FilterStart, gyro: Array, accel: Array, measurements: Measurements
-    ) -> FilterHistory:
+    def run(start: FilterStart, imu: Imu, measurements: Measurements) -> FilterHistory:
         state = initial_state(config, **start._asdict())
-        covariance = jax.vmap(jnp.diag)(measurements.std**2)
-        return _lean(
-            run_filter(state, gyro, accel, measurements.displacement, covariance, config, noise)[1]
-        )
+        given = measurements.displacement, jax.vmap(jnp.diag)(measurements.std**2)
+        signals = imu.gyro, imu.accel
+        return _lean(run_filter(state, *signals, *given, config, noise, imu.valid)[1])
 
-    return over_sequences(run)(start, gyro, accel, measurements)
+    return over_sequences(run)(start, imu, measurements)
 
 
 def _lean(history: FilterHistory) -> FilterHistory:

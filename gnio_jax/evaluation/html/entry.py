@@ -39,9 +39,6 @@ def of_evaluation(
 ) -> Entry:
     """The entry of an evaluation; `settings` is the configuration of its run."""
     scores, made = report.scores, report.settings
-    remarks = [f"{name}: {note}" for name, notes in report.notes.items() for note in notes]
-    remarks += [f"{name}: left out, {reason}" for name, reason in report.left_out.items()]
-    remarks += [f"{name}: the estimate diverged, and is in no mean" for name in scores.diverged]
     references = {
         label.replace("_", " "): of.summary.mean for label, of in report.reference_rows.items()
     }
@@ -52,9 +49,18 @@ def of_evaluation(
         alignment=made["alignment"],
         figures={name: measures.values for name, measures in scores.sequences.items()},
         summary={"mean": scores.summary.mean, "median": scores.summary.median, **references},
-        remarks=tuple(remarks),
+        remarks=remarks(report.notes, report.left_out, scores.diverged),
         settings=settings,
     )
+
+
+def remarks(
+    notes: Mapping[str, list[str]], left_out: Mapping[str, str], diverged: list[str]
+) -> tuple[str, ...]:
+    """What a reader should know of sequences: notes, those left out and why, those diverged."""
+    found = [f"{name}: {note}" for name, own in notes.items() for note in own]
+    found += [f"{name}: left out, {reason}" for name, reason in left_out.items()]
+    return (*found, *(f"{name}: the estimate diverged, and is in no mean" for name in diverged))
 
 
 def label(settings: Mapping[str, Any]) -> str:

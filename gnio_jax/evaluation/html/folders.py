@@ -8,8 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from gnio_jax.evaluation import metrics
+from gnio_jax.evaluation.curves_file import with_curves
 from gnio_jax.evaluation.estimators.result import Estimate
-from gnio_jax.evaluation.html.entry import Entry, Figures, about, label
+from gnio_jax.evaluation.html.entry import Entry, Figures, about, label, remarks
 from gnio_jax.evaluation.metrics import Trajectory
 from gnio_jax.evaluation.report import DEFINITIONS, definitions, file_names, read_metric
 from gnio_jax.evaluation.tum import read_tum
@@ -21,8 +23,9 @@ SAME = ("dataset", "split", "model", "checkpoint", "step")
 def beside(folder: Path, settings: dict[str, Any]) -> list[Entry]:
     """The other evaluations of the same recordings by the same network, beside `folder`.
 
-    They have trajectories and figures, but no curves of network and filter. What cannot be read,
-    and what an older version measured otherwise, is left away.
+    They have all that their own pages show, but for the command and the configuration; those of
+    older versions have no curves of network and filter. What cannot be read, and what an older
+    version measured otherwise, is left away.
     """
     found: dict[str, Entry | None] = {label(settings): None}
     for path in sorted(folder.parent.glob("*/metrics.json")):
@@ -39,6 +42,7 @@ def read_entry(folder: Path, name: str | None = None) -> Entry:
     references = {
         row.replace("_", " "): values["mean"] for row, values in figures["reference_rows"].items()
     }
+    measured = {sequence: _figures(values) for sequence, values in sequences.items()}
     return Entry(
         name or label(settings),
         about(settings),
@@ -47,8 +51,13 @@ def read_entry(folder: Path, name: str | None = None) -> Entry:
             for sequence, stem in zip(sequences, file_names(list(sequences)), strict=True)
         ],
         settings["alignment"],
-        {sequence: _figures(values) for sequence, values in sequences.items()},
+        measured,
         {"mean": figures["mean"], "median": figures["median"], **references},
+        remarks(
+            {name: values["notes"] for name, values in sequences.items() if "notes" in values},
+            figures["left_out"],
+            [name for name, values in measured.items() if metrics.diverged(values)],
+        ),
     )
 
 
@@ -72,10 +81,11 @@ def _figures(values: dict[str, Any]) -> Figures:
 
 
 def _estimate(folder: Path, sequence: str, stem: str) -> Estimate:
-    """Trajectory and reference of a sequence, at the trajectory's stamps."""
+    """Trajectory, reference and curves of a sequence, at the trajectory's stamps."""
     path = read_tum(folder / "trajectories" / f"{stem}.txt")
     file = folder / "references" / f"{stem}.txt"
-    return Estimate(sequence, path, _at(path.time, read_tum(file) if file.exists() else None))
+    reference = _at(path.time, read_tum(file) if file.exists() else None)
+    return with_curves(Estimate(sequence, path, reference), folder / "curves" / f"{stem}.npz")
 
 
 def _at(time: np.ndarray, reference: Trajectory | None) -> Trajectory:
