@@ -73,6 +73,8 @@ def defaults(options: TrainOptions) -> TrainOptions:
     found = configuration.load(named) if named else resumed or TrainConfig()
     own = resumed.filter if resumed else _filter_to_begin_with(options, found)
     base = dataclasses.replace(TrainConfig() if named else found, filter=own)
+    if options.seeds:
+        base = dataclasses.replace(base, workdir=options.workdir)  # not that of the first seed
     return TrainOptions(**vars(configuration.load(named, base) if named else base))
 
 

@@ -137,7 +137,7 @@ def _train(
     workers: int,
     load_initial: Callable[[str], Run],
 ) -> list[Outcome]:
-    """Set the runs up, and train those that stand at the same step together, to their end."""
+    """Set the runs up, and train them."""
     reporter = reporter if is_first() else Silence()
     for config in configs:
         configuration.validate(config)
@@ -153,24 +153,35 @@ def _train(
         for config, workdir in zip(configs, workdirs, strict=True):
             run_folder.write_settings(workdir, config, first.splits, resume)
     run_folder.compare_processes(configs[0], first.splits, first.recordings, states[0].variables)
-    names = [f"seed {config.seed}: " if len(configs) > 1 else "" for config in configs]
     with stop_signals() as stop, ExitStack() as opened:
-        runs = [
-            SeedRun(name, workdir, training, opened.enter_context(Checkpoints(workdir)), BEGINNING)
-            for name, workdir, training in zip(names, workdirs, trainings, strict=True)
-        ]
+        runs = []
+        for config, workdir, training in zip(configs, workdirs, trainings, strict=True):
+            name = f"seed {config.seed}: " if len(configs) > 1 else ""
+            checkpoints = opened.enter_context(Checkpoints(workdir))
+            runs.append(SeedRun(name, workdir, training, checkpoints, BEGINNING))
         for k in range(len(runs)):
             if resuming[k]:
-                states[k], position = runs[k].checkpoints.restore(states[k])
-                runs[k] = runs[k]._replace(position=position)
-                reporter.line(f"{names[k]}resuming at step {position.step}")
-        ended = [
-            run
-            for group in _at_the_same_step(runs, states)
-            for run in _train_group(group, stop, reporter).runs
-        ]
-        best = {run.workdir: run.position.best_loss for run in ended}
-    return [Outcome(workdir, best[workdir], stop.signum) for workdir in workdirs]
+                runs[k], states[k] = _restored(runs[k], states[k], reporter)
+        runs = _train_all(runs, states, stop, reporter)
+        return [Outcome(run.workdir, run.position.best_loss, stop.signum) for run in runs]
+
+
+def _restored(run: SeedRun, template: TrainState, reporter: Reporter) -> tuple[SeedRun, TrainState]:
+    """A run at its latest checkpoint."""
+    state, position = run.checkpoints.restore(template)
+    reporter.line(f"{run.name}resuming at step {position.step}")
+    return run._replace(position=position), state
+
+
+def _train_all(
+    runs: list[SeedRun], states: list[TrainState], stop: Stop, reporter: Reporter
+) -> list[SeedRun]:
+    """Train the runs that stand at the same step together, to their end."""
+    ended = {}
+    for group in _at_the_same_step(runs, states):
+        for run in _train_group(group, stop, reporter).runs:
+            ended[run.workdir] = run
+    return [ended[run.workdir] for run in runs]
 
 
 def _describe(

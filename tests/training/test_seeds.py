@@ -215,3 +215,7 @@ def test_the_command_names_each_run_and_how_to_go_on(config, tmp_path, monkeypat
     assert f"--workdir {run} --seeds 1 2 --resume" in capsys.readouterr().err
     assert [seeds for _, seeds, _ in given] == [(1, 2)] * 2 and given[1][2]
     assert given[1][0].optim.epochs == 5
+    monkeypatch.chdir(tmp_path)
+    configuration.save(Path("runs/synthetic_gnio_s1/config.yaml"), given[0][0])
+    found = command.defaults(command.TrainOptions(seeds=(1, 2), resume=True))
+    assert found.optim.epochs == 5 and found.workdir is None
