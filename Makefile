@@ -2,6 +2,7 @@
 # make test   install everything the tests need, and run them on every core
 # make lint   ruff and pyright
 # make docs   the documentation as a site, in site/index.html; its notebooks run
+# make links  ask every external link of the pages if it answers; needs a network
 #
 # Each makes its own virtual environment in .venv first. PYTHON chooses the interpreter (3.11 or
 # newer). EXTRAS=test,reference adds evo and PyTorch, which some tests compare with.
@@ -23,7 +24,7 @@ TEST_ENVIRONMENT := JAX_PLATFORMS=cpu JAX_COMPILATION_CACHE_DIR=$(CURDIR)/.jax_c
 # A file stays with one worker, or both would train what its tests share; the longest come first.
 SHARED_OUT := --dist loadfile --no-loadscope-reorder
 
-.PHONY: demo test lint docs clean
+.PHONY: demo test lint docs links clean
 
 demo: $(VENV)/.package
 	rm -rf $(DEMO)
@@ -41,6 +42,9 @@ lint: $(VENV)/.test,dev
 
 docs: $(VENV)/.docs
 	PYTHONPATH=$(CURDIR) $(BIN)/mkdocs build --strict
+
+links: $(BIN)/python
+	$(BIN)/python scripts/external_links.py
 
 clean:
 	rm -rf $(VENV) .jax_cache .pytest_cache build site *.egg-info

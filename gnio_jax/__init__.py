@@ -11,12 +11,15 @@ from typing import Any
 
 __all__ = [
     "__version__",
+    "calibration",
     "config",
     "data",
+    "deployment",
     "evaluation",
     "filtering",
     "geometry",
     "interop",
+    "live",
     "load_pretrained",
     "models",
     "pretrained",

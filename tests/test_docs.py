@@ -206,3 +206,17 @@ def test_a_room_has_its_page_in_the_reference(room):
 @pytest.mark.parametrize("name", models.names())
 def test_every_network_is_named_where_people_look(name):
     assert f"`{name}`" in (pages.ROOT / "README.md").read_text(encoding="utf-8")
+
+
+def test_the_names_of_the_package_are_those_of_the_reference():
+    """All rooms with public names, and a line for each in the table."""
+    table = (pages.ROOT / "docs" / "api" / "index.md").read_text(encoding="utf-8")
+    named = re.findall(r"^\| \[?`gnio_jax\.(\w+)`", table, re.MULTILINE)
+    assert sorted(named) == sorted(gnio_jax.__all__)
+    assert {room for room, _ in rooms_with_public_names()} <= {*gnio_jax.__all__}
+    assert all(hasattr(gnio_jax, name) for name in gnio_jax.__all__)
+
+
+def test_no_page_needs_a_script_from_a_network():
+    for page in (pages.ROOT / "docs").rglob("*.md"):
+        assert "```mermaid" not in page.read_text(encoding="utf-8"), page

@@ -46,7 +46,7 @@ def defaults(options: EvaluateOptions) -> EvaluateOptions:
         from gnio_jax.scaling import processes
 
         filtering.cores_as_devices()  # before the checkpoint's arrays settle the devices
-        processes.meet(options.meeting())
+        processes.meet(options.meeting(), "evaluate")
         config = run_config(workdir, options.checkpoint)
     return dataclasses.replace(default, filter=config.filter)
 
@@ -62,7 +62,7 @@ def evaluate(config: EvaluateOptions, prog: str) -> None:
 
     jax.config.update("jax_enable_x64", True)  # for the filter; the network states its float32
     filtering.cores_as_devices()
-    processes.meet(config.meeting())
+    processes.meet(config.meeting(), "evaluate")
     with processes.running(), console.terminal(shown=processes.is_first()) as terminal:
         call = (config, terminal.progress, usable_cores(), called(prog))
         found, folder = evaluation.evaluate(*call)

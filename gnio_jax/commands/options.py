@@ -89,8 +89,11 @@ def _show_short_help(program: Command | Group, argv: list[str], prog: str) -> li
     if isinstance(program, Command) and program.common:
         if any(word in short_help.SHORT for word in argv):
             description = program.description.format(prog=prog)
-            print(short_help.short_help(program.options, description, prog, program.common))
-            raise SystemExit(0)
+            known = option_names(program.options)
+            text = short_help.short_help(program.options, description, prog, program.common, known)
+            if text is not None:
+                print(text)
+                raise SystemExit(0)
     return ["--help" if word in short_help.WHOLE else word for word in argv]
 
 

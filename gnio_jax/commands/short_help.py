@@ -10,7 +10,7 @@ import io
 import os
 import re
 import textwrap
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from typing import NamedTuple
 
 import tyro
@@ -35,9 +35,18 @@ class Option(NamedTuple):
     """What it means, and its default."""
 
 
-def short_help(kind: type, description: str, prog: str, common: tuple[str, ...]) -> str:
-    """Description, common options, and where the others are explained."""
+def short_help(
+    kind: type, description: str, prog: str, common: tuple[str, ...], known: Collection[str]
+) -> str | None:
+    """Description, common options, and where the others are explained.
+
+    `known` are the names of all options. None where tyro's help cannot be read as it used to be:
+    an option is not found in it, or nothing is said of it.
+    """
     options = {option.name: option for option in all_options(kind)}
+    wanted = {*common, *(name for name in known if not _negates(name, known))}
+    if not all(name in options and options[name].text for name in wanted):
+        return None
     rest = [name for name in options if name not in common]
     sections = sorted({name[2:].partition(".")[0] for name in rest if "." in name})
     more = f"{prog} --help-all explains all {len(options)} options"
@@ -48,6 +57,13 @@ def short_help(kind: type, description: str, prog: str, common: tuple[str, ...])
     for name in common:
         lines += _lines(options[name])
     return "\n".join([*lines, "", *textwrap.wrap(f"{more}.", WIDTH)])
+
+
+def _negates(name: str, known: Collection[str]) -> bool:
+    """Whether an option is --no-flag of another one, with which it shares its place."""
+    head, _, last = name.rpartition(".")
+    positive = last.replace("no-", "", 1)
+    return last != positive and (f"{head}.{positive}" if head else positive) in known
 
 
 def all_options(kind: type) -> list[Option]:

@@ -6,8 +6,7 @@ import dataclasses
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
@@ -18,19 +17,22 @@ from gnio_jax.commands.together import MeetingOptions
 from gnio_jax.config import CONSIDERED_FIELDS, FilterOptions, TrainConfig
 from gnio_jax.cores import usable_cores
 
+if TYPE_CHECKING:
+    from gnio_jax.training.loop import Outcome
+
 DESCRIPTION = """Train a network and leave a run: config.yaml, checkpoints, logs in its work folder.
 
   {prog} --config quickstart --workdir runs/demo
   {prog} --dataset tlio --data-root ~/tlio --workdir runs/tlio
   {prog} --workdir runs/tlio --resume
+  {prog} --config quickstart --workdir runs/demo --seeds 0 1 2
   {prog} --config through_filter_oxiod --init-from runs/oxiod_calibrated --workdir runs/through
 
---config FILE reads options from a YAML file, or from one of the experiments that come with the
-package; options given here win over it. --resume continues a run from its latest checkpoint as if
-it had never stopped. --init-from starts from the weights of a run with the same network, or of a
-package (see gnio weights); with --through-filter.learn, network and filter then learn as one
-program, beginning with the filter of that run (see gnio calibrate). The defaults are the paper's
-settings."""
+--config FILE reads options from a YAML file, or from an experiment that comes with the package;
+options given here win over it. --resume goes on from the latest checkpoint as if the run had never
+stopped. --init-from starts from the weights of a run or package (gnio weights) of the same network;
+with --through-filter.learn, network and filter then learn as one program, from the filter of that
+run (gnio calibrate). --seeds trains several runs together, in WORKDIR_s0, WORKDIR_s1, ..."""
 
 
 @dataclass(frozen=True)
@@ -41,9 +43,12 @@ class RunOptions:
     """YAML file of settings, or the name of one that comes with the package, e.g. quickstart."""
     resume: tyro.conf.FlagCreatePairsOff[bool] = False
     """Continue the run in the work folder from its latest checkpoint."""
+    seeds: tuple[int, ...] = ()
+    """Seeds to train together, in the place of --seed: each is a run of its own, in the work folder
+    WORKDIR_s<seed>."""
     devices: int | None = None
-    """Devices of each process that share a batch; by default all of its GPUs, or the one that a CPU
-    is."""
+    """Devices of each process that share a batch, or the --seeds; by default all of its GPUs, or
+    the one that a CPU is."""
 
 
 @dataclass(frozen=True)
@@ -61,12 +66,15 @@ def defaults(options: TrainOptions) -> TrainOptions:
     The filter, as far as they leave it open, is that of the run that is resumed, or of the run that
     training through the filter starts from.
     """
-    kept = configuration.default_workdir(options) / "config.yaml"
+    runs = configuration.with_seeds(options, options.seeds) if options.seeds else [options]
+    kept = configuration.default_workdir(runs[0]) / "config.yaml"
     resumed = configuration.load(kept) if options.resume and kept.exists() else None
     named = options.config
     found = configuration.load(named) if named else resumed or TrainConfig()
     own = resumed.filter if resumed else _filter_to_begin_with(options, found)
     base = dataclasses.replace(TrainConfig() if named else found, filter=own)
+    if options.seeds:
+        base = dataclasses.replace(base, workdir=options.workdir)  # not that of the first seed
     return TrainOptions(**vars(configuration.load(named, base) if named else base))
 
 
@@ -96,37 +104,43 @@ def train(options: TrainOptions, prog: str) -> None:
     # After the options: --help and mistakes do not wait for these imports.
     from gnio_jax import filtering, pretrained
     from gnio_jax.scaling import devices, processes
-    from gnio_jax.training import loop
+    from gnio_jax.training import loop, run_folder
 
     if options.through_filter.learn:
         filtering.cores_as_devices()  # the filter's operations are too small for several cores
     elif options.devices:
         devices.cpu_devices(options.devices)
-    processes.meet(options.meeting())
+    processes.meet(options.meeting(), f"train {run_folder.identity(options.experiment())}")
     with processes.running():
         with console.terminal(shown=processes.is_first()) as terminal:
             try:
-                call = (options.experiment(), options.resume, terminal, usable_cores())
                 load = pretrained.load_pretrained
-                outcome = loop.train(*call, devices=options.devices, load_initial=load)
+                given = (options.resume, terminal, usable_cores(), options.devices, load)
+                if options.seeds:
+                    outcomes = loop.train_seeds(options.experiment(), options.seeds, *given)
+                else:
+                    outcomes = [loop.train(options.experiment(), *given)]
             except FloatingPointError as error:
                 terminal.line(str(error))
                 sys.exit(1)
     if processes.is_first():
-        _say_how_to_go_on(prog, outcome.workdir, outcome.stopped_by, outcome.best_loss)
-    if outcome.stopped_by:
-        sys.exit(128 + outcome.stopped_by)
+        _say_how_to_go_on(prog, options, outcomes)
+    if outcomes[0].stopped_by:
+        sys.exit(128 + outcomes[0].stopped_by)
 
 
-def _say_how_to_go_on(
-    prog: str, workdir: Path, stopped_by: int | None, best_loss: float | None
-) -> None:
-    if stopped_by:
-        remedy = f"{sibling(prog, 'train')} --workdir {workdir} --resume"
+def _say_how_to_go_on(prog: str, options: TrainOptions, outcomes: Sequence[Outcome]) -> None:
+    if outcomes[0].stopped_by:
+        workdir, seeds = outcomes[0].workdir, ""
+        if options.seeds:
+            workdir = configuration.default_workdir(options)
+            seeds = " --seeds " + " ".join(map(str, options.seeds))
+        remedy = f"{sibling(prog, 'train')} --workdir {workdir}{seeds} --resume"
         print(f"stopped and saved; continue with: {remedy}", file=sys.stderr)
-    else:
-        following = f"{sibling(prog, 'evaluate')} --workdir {workdir}"
-        print(f"best on validation {best_loss:.4g}; look at it with: {following}")
+        return
+    for outcome in outcomes:
+        following = f"{sibling(prog, 'evaluate')} --workdir {outcome.workdir}"
+        print(f"best on validation {outcome.best_loss:.4g}; look at it with: {following}")
 
 
 COMMON = (
@@ -137,6 +151,7 @@ COMMON = (
     "--resume",
     "--init-from",
     "--seed",
+    "--seeds",
     "--devices",
     "--model.name",
     "--model.width",

@@ -5,7 +5,7 @@ the command line win over the file, the file wins over the defaults, and the def
 paper's.
 """
 
-from gnio_jax.config.runs import default_workdir, newest_run
+from gnio_jax.config.runs import default_workdir, newest_run, with_seeds
 from gnio_jax.config.schema import (
     CONSIDERED_FIELDS,
     AugmentConfig,
@@ -45,4 +45,5 @@ __all__ = [
     "save",
     "text",
     "validate",
+    "with_seeds",
 ]

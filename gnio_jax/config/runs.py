@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
 
 from gnio_jax.config.schema import TrainConfig
@@ -11,6 +13,18 @@ from gnio_jax.errors import InputError
 def default_workdir(config: TrainConfig) -> Path:
     """Where a run goes: its `workdir`, else runs/<dataset>_<model>."""
     return Path(config.workdir or f"runs/{config.dataset}_{config.model.name}")
+
+
+def with_seeds(config: TrainConfig, seeds: Sequence[int]) -> list[TrainConfig]:
+    """The experiment with each of these seeds: ordinary runs, in the work folders WORKDIR_s0,
+    WORKDIR_s1, ... Raises `InputError` for no seed, and for one that is named twice."""
+    if not seeds:
+        raise InputError("--seeds", "names no seed", "give some, e.g. 0 1 2")
+    twice = [seed for seed in seeds if seeds.count(seed) > 1]
+    if twice:
+        raise InputError("--seeds", f"names {twice[0]} twice", "each seed is one run")
+    folder = default_workdir(config)
+    return [dataclasses.replace(config, seed=seed, workdir=f"{folder}_s{seed}") for seed in seeds]
 
 
 def newest_run(folder: str | Path = "runs") -> Path:

@@ -22,8 +22,8 @@ from gnio_jax.errors import InputError
 
 Tree = TypeVar("Tree")
 
-BATCH = "batch"
-"""The axis of the mesh."""
+BATCH, SEEDS = "batch", "seeds"
+"""What devices share: the axis of the mesh."""
 EVERYWHERE, ROWS = PartitionSpec(), PartitionSpec(BATCH)
 
 
@@ -60,26 +60,25 @@ def chosen(limit: int | None = None) -> list[Any]:
 
 
 @contextmanager
-def sharing(devices: Sequence[Any]) -> Iterator[None]:
-    """Share batches out among `devices` while the context lasts."""
+def sharing(devices: Sequence[Any], what: str = BATCH) -> Iterator[None]:
+    """Share batches, or the seeds of an experiment, out among `devices` while the context lasts."""
     if len(devices) == 1:
         yield
         return
-    mesh = jax.make_mesh((len(devices),), (BATCH,), (AxisType.Auto,), devices=devices)
+    mesh = jax.make_mesh((len(devices),), (what,), (AxisType.Auto,), devices=devices)
     with jax.set_mesh(mesh):
         yield
 
 
-def count() -> int:
-    """Devices that share a batch. Known while a program is compiled."""
-    mesh = jax.sharding.get_abstract_mesh()
-    return 1 if mesh.empty else mesh.size
+def count(what: str = BATCH) -> int:
+    """Devices that share a batch, or the seeds. Known while a program is compiled."""
+    return jax.sharding.get_abstract_mesh().shape.get(what, 1)
 
 
 def described() -> str:
     """The devices in words: "cpu", "8 × gpu", "16 × gpu in 2 processes"."""
     platform, processes = jax.devices()[0].platform, jax.process_count()
-    number = f"{count()} × " if count() > 1 else ""
+    number = f"{max(count(), count(SEEDS))} × " if max(count(), count(SEEDS)) > 1 else ""
     return f"{number}{platform}" + (f" in {processes} processes" if processes > 1 else "")
 
 
@@ -104,6 +103,14 @@ def everywhere(tree: Tree) -> Tree:
 def _copied(leaf: Any, mesh: Mesh) -> jax.Array:
     host = np.asarray(leaf)
     return jax.make_array_from_process_local_data(NamedSharding(mesh, EVERYWHERE), host, host.shape)
+
+
+def one_each(tree: Tree) -> Tree:
+    """Host arrays whose rows, one for each seed, are shared out among the devices."""
+    mesh = jax.sharding.get_mesh()
+    if mesh.empty:
+        return jax.tree.map(jnp.array, tree)
+    return jax.device_put(tree, NamedSharding(mesh, PartitionSpec(SEEDS)))
 
 
 def shared_out(tree: Tree) -> Tree:

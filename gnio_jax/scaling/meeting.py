@@ -64,9 +64,16 @@ def require_free(coordinator: str) -> None:
 
     JAX would listen there too, take that run's processes away from it, and so end it.
     """
-    port = coordinator.rpartition(":")[2]
+    listening(coordinator).close()
+
+
+def listening(coordinator: str) -> socket.socket:
+    """What listens at the port of process 0. Raises `InputError` where another program does."""
+    address = ("", int(coordinator.rpartition(":")[2]))
     try:
-        socket.create_server(("", int(port))).close()
+        if socket.has_dualstack_ipv6():
+            return socket.create_server(address, family=socket.AF_INET6, dualstack_ipv6=True)
+        return socket.create_server(address)
     except OSError as error:
         problem = f"process 0 cannot listen there ({error.strerror})"
         remedy = "choose another port, for every process of this run"
@@ -75,12 +82,16 @@ def require_free(coordinator: str) -> None:
 
 def wait_for(coordinator: str, patience: int) -> None:
     """Return once something listens there. Raises `InputError` when nothing does in time."""
+    connected(coordinator, patience).close()
+
+
+def connected(coordinator: str, patience: int) -> socket.socket:
+    """A connection to what listens there. Raises `InputError` when nothing does in time."""
     host, _, port = coordinator.rpartition(":")
     until = time.monotonic() + patience
     while True:
         try:
-            socket.create_connection((host.strip("[]"), int(port)), timeout=5).close()
-            return
+            return socket.create_connection((host.strip("[]"), int(port)), timeout=5)
         except OSError as error:
             if time.monotonic() > until:
                 problem = f"does not answer after {patience} s ({error.strerror or error})"

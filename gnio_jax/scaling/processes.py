@@ -19,7 +19,8 @@ from jax.experimental import multihost_utils
 
 from gnio_jax.errors import InputError
 from gnio_jax.scaling import endings
-from gnio_jax.scaling.meeting import Meeting, check, launched, require_free, wait_for
+from gnio_jax.scaling.gathering import gather
+from gnio_jax.scaling.meeting import Meeting, check, launched, wait_for
 
 Tree = TypeVar("Tree")
 
@@ -29,11 +30,13 @@ SHUTDOWN_SECONDS = 15
 """Longest time that a process which has ended waits for the others."""
 
 
-def meet(meeting: Meeting) -> None:
-    """Meet the other processes, if there are any, and once; before JAX's first computation.
+def meet(meeting: Meeting, run: str = "") -> None:
+    """Meet the other processes of the run `run`, if there are any, and once; before JAX's first
+    computation.
 
     From then on a process that loses the others ends with one line (`endings`). Raises `InputError`
-    for options that do not fit together, and where the coordinator does not answer in time.
+    for options that do not fit together, where the coordinator does not answer in time, and as
+    `gathering.gather` where processes meet that do not belong together.
     """
     check(meeting)
     alone = meeting.processes == 1 or (meeting.coordinator is None and not launched())
@@ -45,10 +48,9 @@ def meet(meeting: Meeting) -> None:
         status=2,
     )
     if meeting.coordinator is not None:
-        if meeting.process_id == 0:
-            require_free(meeting.coordinator)
-        else:
-            wait_for(meeting.coordinator, meeting.patience)
+        gather(meeting, run)
+        if meeting.process_id:
+            wait_for(meeting.coordinator, meeting.patience)  # for JAX's own
     jax.config.update("jax_cpu_collectives_implementation", "gloo")
     try:
         jax.distributed.initialize(

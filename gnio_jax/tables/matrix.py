@@ -1,19 +1,20 @@
-"""Configurations × seeds: trained and evaluated one after the other, restartable, nothing done
-twice."""
+"""Configurations × seeds: the seeds of a configuration are trained together, then evaluated one
+after the other; restartable, nothing done twice."""
 
 from __future__ import annotations
 
 import dataclasses
 import json
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from gnio_jax import config as configuration
 from gnio_jax import evaluation
-from gnio_jax.config import EvaluateConfig, TablesConfig
+from gnio_jax.config import EvaluateConfig, TablesConfig, TrainConfig
 from gnio_jax.evaluation import metrics, report
 from gnio_jax.evaluation.metrics import Trajectory
 from gnio_jax.evaluation.run import folder_name, run_config
@@ -48,29 +49,42 @@ def run_cell(cell: Cell, options: TablesConfig, reporter: Reporter, workers: int
     that is there is read. Raises `InputError` if a folder holds a run with other settings, and
     `Interrupted` after a signal. `workers` processes read recordings that are slow to read.
     """
-    figures, runs = [], []
-    for seed in range(options.seeds):
-        workdir = Path(options.out) / "runs" / f"{cell.name}_s{seed}"
-        config = dataclasses.replace(cell.config, seed=seed, workdir=str(workdir))
-        train(config, reporter, workers)
-        figures.append(evaluated(workdir, options.split, options.estimator, reporter, workers))
-        runs.append(workdir)
+    workdir = Path(options.out) / "runs" / cell.name
+    config, seeds = dataclasses.replace(cell.config, workdir=str(workdir)), range(options.seeds)
+    train(config, seeds, reporter, workers)
+    runs = [Path(each.workdir or "") for each in configuration.with_seeds(config, seeds)]
+    figures = [evaluated(run, options.split, options.estimator, reporter, workers) for run in runs]
     return Result(cell, figures, runs)
 
 
-def train(config: configuration.TrainConfig, reporter: Reporter, workers: int = 1) -> None:
-    """Train the run of `config` to its end, if it is not there yet."""
+def train(config: TrainConfig, seeds: Sequence[int], reporter: Reporter, workers: int = 1) -> None:
+    """Train the runs of `config` with these seeds together to their end, as far as they are not
+    there yet."""
+    states: dict[str, list[int]] = {"begun": [], "new": [], "finished": []}
+    for each in configuration.with_seeds(config, seeds):
+        states[_standing(each)].append(each.seed)
+    for standing in ("begun", "new"):
+        if not states[standing]:
+            continue
+        numbers = ", ".join(f"s{seed}" for seed in states[standing])
+        reporter.line(f"── {configuration.default_workdir(config).name} {numbers}")
+        outcomes = loop.train_seeds(
+            config, states[standing], standing == "begun", reporter, workers
+        )
+        if outcomes[0].stopped_by:
+            raise Interrupted(outcomes[0].stopped_by)
+
+
+def _standing(config: TrainConfig) -> Literal["new", "begun", "finished"]:
+    """How far the run of `config` is. Raises `InputError` if its folder holds one with other
+    settings."""
     workdir = Path(config.workdir or "")
-    begun = (workdir / "config.yaml").exists()
-    if begun:
-        run_folder.prepare(config, resume=True)  # refuses other settings
-        log = workdir / "metrics.jsonl"
-        if log.exists() and log.read_text(encoding="utf-8").count("\n") >= config.optim.epochs:
-            return
-    reporter.line(f"── {workdir.name}")
-    outcome = loop.train(config, resume=begun, reporter=reporter, workers=workers)
-    if outcome.stopped_by:
-        raise Interrupted(outcome.stopped_by)
+    if not (workdir / "config.yaml").exists():
+        return "new"
+    run_folder.prepare(config, resume=True)  # refuses other settings
+    log = workdir / "metrics.jsonl"
+    rows = log.read_text(encoding="utf-8").count("\n") if log.exists() else 0
+    return "finished" if rows >= config.optim.epochs else "begun"
 
 
 def evaluated(

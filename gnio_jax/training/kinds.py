@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol, runtime_checkable
@@ -46,6 +47,10 @@ class Training(Protocol):
     @property
     def changes(self) -> tuple[int, ...]:
         """Steps at which what is trained changes: losses before and after do not compare."""
+        ...
+
+    def with_seed(self, seed: int) -> Training:
+        """The same training, recordings and compiled programs with another seed."""
         ...
 
     def new_state(self, start: Run | None) -> TrainState:
@@ -102,6 +107,12 @@ class Keys(NamedTuple):
     order: jax.Array
     step: jax.Array
     statistics: jax.Array
+
+
+def compiled(config: TrainConfig) -> TrainConfig:
+    """What the compiled steps depend on: runs in several folders and with several seeds share
+    them."""
+    return dataclasses.replace(config, workdir=None, data_root=None, init_from=None, seed=0)
 
 
 def keys_of(seed: int) -> Keys:

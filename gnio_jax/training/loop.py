@@ -1,9 +1,15 @@
-"""The training loop, top to bottom: set-up, epochs of dispatches, validation, log, checkpoints."""
+"""The training loop, top to bottom: set-up, epochs of dispatches, validation, log, checkpoints.
+
+It trains any number of seeds of an experiment together. Each is a run with a folder of its own; one
+seed is the case of length one.
+"""
 
 from __future__ import annotations
 
+import itertools
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,17 +19,29 @@ from gnio_jax import config as configuration
 from gnio_jax.config import TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.reporting import Lines, Reporter, Silence
-from gnio_jax.scaling.devices import chosen, sharing
+from gnio_jax.scaling.devices import BATCH, SEEDS, chosen, sharing
 from gnio_jax.scaling.processes import agreed, all_or_none, is_first, several
-from gnio_jax.training import optimizer as optimizers
 from gnio_jax.training import run_folder
-from gnio_jax.training.checkpoint import Checkpoints, Position, Run, exists, load_run
+from gnio_jax.training.checkpoint import Checkpoints, Run, exists, load_run
 from gnio_jax.training.initial import initial_run
 from gnio_jax.training.kinds import Training
-from gnio_jax.training.log import Log, Row
+from gnio_jax.training.log import Log
+from gnio_jax.training.seed_runs import (
+    BEGINNING,
+    Group,
+    SeedRun,
+    after_steps,
+    improves,
+    learning_rate,
+    next_epoch,
+    row_of,
+    speed,
+    summary,
+)
 from gnio_jax.training.setup import set_up
 from gnio_jax.training.step import TrainState
 from gnio_jax.training.stopping import Stop, stop_signals
+from gnio_jax.training.together import together
 
 DISPATCH_SECONDS = 0.5
 """Steps are dispatched in runs of about this long: few round trips, and still a lively progress bar
@@ -64,198 +82,226 @@ def train(
     `InputError` where that is not of the same network, and where the devices cannot share a batch
     evenly.
     """
-    through_filter = bool(config.through_filter.learn)  # it shares its pieces out by itself
-    if through_filter and several():
-        problem = "runs in one process, on all of its devices"
-        raise InputError("training through the filter", problem, "start one process")
-    if through_filter and devices is not None:
-        raise InputError("--devices", "is for training on windows", "leave it out")
+    _check_devices(config, devices)
+    through_filter = bool(config.through_filter.learn)
     sharers = jax.devices()[:1] if through_filter else chosen(devices)
     # Whatever the process has: no float64 but for the filter, and the same random draws.
-    with jax.enable_x64(through_filter), sharing(sharers):
-        reporter = (reporter or Lines()) if is_first() else Silence()
-        return _train(config, resume, reporter, workers, load_initial)
+    with jax.enable_x64(through_filter), sharing(sharers, BATCH):
+        (outcome,) = _train([config], resume, reporter or Lines(), workers, load_initial)
+    return outcome
+
+
+def train_seeds(
+    config: TrainConfig,
+    seeds: Sequence[int],
+    resume: bool = False,
+    reporter: Reporter | None = None,
+    workers: int = 1,
+    devices: int | None = None,
+    load_initial: Callable[[str], Run] = load_run,
+) -> list[Outcome]:
+    """Train `config` with each of these seeds together, as `train` would in the work folders
+    WORKDIR_s0, WORKDIR_s1, ... (`config.with_seeds`).
+
+    Recordings are read once, and the seeds share what is compiled. `devices` devices, by default
+    all, share the seeds out among them: a device has whole seeds, and a batch is not shared. Each
+    run has the numbers that it has alone, to rounding; it may be resumed alone, and `resume` takes
+    runs that were trained alone, also those that stand at different steps. Raises
+    `FloatingPointError` and `InputError` as `train`, and `InputError` in several processes, for no
+    seed, and for one that is named twice.
+    """
+    configs = configuration.with_seeds(config, seeds)
+    if len(configs) > 1 and several():
+        remedy = "start one process, or each seed as a run of its own"
+        raise InputError("--seeds", "run in one process, on all of its devices", remedy)
+    _check_devices(config, devices)
+    through_filter = bool(config.through_filter.learn)
+    sharers = jax.devices()[:1] if through_filter else chosen(devices)[: len(configs)]
+    with jax.enable_x64(through_filter), sharing(sharers, SEEDS):
+        return _train(configs, resume, reporter or Lines(), workers, load_initial)
+
+
+def _check_devices(config: TrainConfig, devices: int | None) -> None:
+    """Training through the filter shares its pieces out by itself."""
+    if config.through_filter.learn and several():
+        problem = "runs in one process, on all of its devices"
+        raise InputError("training through the filter", problem, "start one process")
+    if config.through_filter.learn and devices is not None:
+        raise InputError("--devices", "is for training on windows", "leave it out")
 
 
 def _train(
-    config: TrainConfig,
+    configs: list[TrainConfig],
     resume: bool,
     reporter: Reporter,
     workers: int,
     load_initial: Callable[[str], Run],
-) -> Outcome:
-    configuration.validate(config)
+) -> list[Outcome]:
+    """Set the runs up, and train them."""
+    reporter = reporter if is_first() else Silence()
+    for config in configs:
+        configuration.validate(config)
     with all_or_none():
-        workdir = run_folder.prepare(config, resume)
-    (resuming,) = agreed(resume and is_first() and exists(workdir))
+        workdirs = [run_folder.prepare(config, resume) for config in configs]
+    resuming = agreed(*(resume and is_first() and exists(workdir) for workdir in workdirs))
     with all_or_none():
-        start = None if resuming else initial_run(config, load_initial)
-        training = set_up(config, reporter, workers)
-        state = training.new_state(start)
-        training.describe(state, workdir, reporter)
-        run_folder.write_settings(workdir, config, training.splits, resume)
-    run_folder.compare_processes(config, training.splits, training.recordings, state.variables)
-    position = Position(epoch=0, step=0, best_loss=None, loss_sums=(), seconds=0.0)
-    with Checkpoints(workdir) as checkpoints, stop_signals() as stop:
-        if resuming:
-            state, position = checkpoints.restore(state)
-            reporter.line(f"resuming at step {position.step}")
-        with Log(workdir, position.epoch, position.step) as log:
-            for epoch in range(position.epoch, config.optim.epochs):
-                state, position, rate = _run_epoch(
-                    training, epoch, state, position, checkpoints, stop, reporter
-                )
-                if position.step < (epoch + 1) * training.steps_per_epoch:
-                    break  # stopped on the way, and saved
-
-                state, found = training.validate(training.settled(state), position.step)
-                row = _row(training, epoch, position, found, rate)
-                merit = row["val_loss" if config.optim.best_by == "loss" else "val_mse"]
-                improved = _improves(training, position, merit)
-                position = _next_epoch(training, epoch, position, row, merit if improved else None)
-                log.add(row)
-                reporter.line(_summary(training, row) + ("  best" if improved else ""))
-                if improved:
-                    checkpoints.save("best", state, position)
-                checkpoints.save("latest", state, position)
-                stop.agree()
-                if stop.signum:
-                    break
-    return Outcome(workdir, position.best_loss, stop.signum)
+        start = None if all(resuming) else initial_run(configs[0], load_initial)
+        first = set_up(configs[0], reporter, workers)
+        trainings = [first, *(first.with_seed(config.seed) for config in configs[1:])]
+        states = [training.new_state(start) for training in trainings]
+        _describe(trainings, workdirs, states[0], reporter)
+        for config, workdir in zip(configs, workdirs, strict=True):
+            run_folder.write_settings(workdir, config, first.splits, resume)
+    run_folder.compare_processes(configs[0], first.splits, first.recordings, states[0].variables)
+    with stop_signals() as stop, ExitStack() as opened:
+        runs = []
+        for config, workdir, training in zip(configs, workdirs, trainings, strict=True):
+            name = f"seed {config.seed}: " if len(configs) > 1 else ""
+            checkpoints = opened.enter_context(Checkpoints(workdir))
+            runs.append(SeedRun(name, workdir, training, checkpoints, BEGINNING))
+        for k in range(len(runs)):
+            if resuming[k]:
+                runs[k], states[k] = _restored(runs[k], states[k], reporter)
+        runs = _train_all(runs, states, stop, reporter)
+        return [Outcome(run.workdir, run.position.best_loss, stop.signum) for run in runs]
 
 
-def _run_epoch(
-    training: Training,
-    epoch: int,
-    state: TrainState,
-    position: Position,
-    checkpoints: Checkpoints,
-    stop: Stop,
-    reporter: Reporter,
-) -> tuple[TrainState, Position, float]:
-    """Finish epoch `epoch` from `position` on, or save and return when asked to stop; with the
-    windows or pieces per second of these steps."""
-    order, steps = training.order(epoch), training.steps_per_epoch
+def _restored(run: SeedRun, template: TrainState, reporter: Reporter) -> tuple[SeedRun, TrainState]:
+    """A run at its latest checkpoint."""
+    state, position = run.checkpoints.restore(template)
+    reporter.line(f"{run.name}resuming at step {position.step}")
+    return run._replace(position=position), state
+
+
+def _train_all(
+    runs: list[SeedRun], states: list[TrainState], stop: Stop, reporter: Reporter
+) -> list[SeedRun]:
+    """Train the runs that stand at the same step together, to their end."""
+    ended = {}
+    for group in _at_the_same_step(runs, states):
+        for run in _train_group(group, stop, reporter).runs:
+            ended[run.workdir] = run
+    return [ended[run.workdir] for run in runs]
+
+
+def _describe(
+    trainings: list[Training], workdirs: list[Path], state: TrainState, reporter: Reporter
+) -> None:
+    trainings[0].describe(state, workdirs[0], reporter)
+    for training, workdir in zip(trainings[1:], workdirs[1:], strict=True):
+        reporter.line(f"together with seed {training.config.seed} → {workdir}")
+
+
+def _at_the_same_step(runs: list[SeedRun], states: list[TrainState]) -> Iterator[Group]:
+    """Runs that are resumed may stand at different steps, e.g. where they were killed while some
+    had saved. Those that are behind come first."""
+    in_order = sorted(zip(runs, states, strict=True), key=lambda each: each[0].position.step)
+    for _, same in itertools.groupby(in_order, key=lambda each: each[0].position.step):
+        members, their_states = zip(*same, strict=True)
+        program = together([run.training for run in members])
+        yield Group(members, program, program.joined(their_states))
+
+
+def _train_group(group: Group, stop: Stop, reporter: Reporter) -> Group:
+    """Train to the end, or until asked to stop."""
+    training, position = group.training, group.runs[0].position
+    with ExitStack() as opened:
+        logs = [
+            opened.enter_context(Log(run.workdir, position.epoch, position.step))
+            for run in group.runs
+        ]
+        for epoch in range(position.epoch, training.config.optim.epochs):
+            if stop.signum:
+                break
+            group, rate = _run_epoch(group, epoch, stop, reporter)
+            if group.step < (epoch + 1) * training.steps_per_epoch:
+                break  # stopped on the way, and saved
+
+            group = _end_epoch(group, epoch, rate, logs, reporter)
+            stop.agree()
+    return group
+
+
+def _run_epoch(group: Group, epoch: int, stop: Stop, reporter: Reporter) -> tuple[Group, float]:
+    """Finish epoch `epoch`, or save and return when asked to stop; with the windows or pieces of a
+    seed per second of these steps."""
+    training = group.training
+    order, steps = group.together.order(epoch), training.steps_per_epoch
     began = saved = time.perf_counter()
-    start, first = position, position.step - epoch * steps
+    seconds, first = [run.position.seconds for run in group.runs], group.step - epoch * steps
     done, dispatch, rate = first, 1, 0.0
     while done < steps:
         count = min(dispatch, steps - done)
         tick = time.perf_counter()
-        state, position = _run_steps(training, order, epoch, done, count, state, position)
+        group = _run_steps(group, order, epoch, done, count)
         clock = time.perf_counter()
         dispatch = max(1, min(2 * dispatch, round(DISPATCH_SECONDS * count / (clock - tick))))
         due = int(clock - saved > training.config.checkpoint_every_seconds)
         dispatch, due = agreed(dispatch, due)  # the clocks of the processes differ
         stop.agree()
         done += count
-        position = position._replace(seconds=start.seconds + clock - began)
+        group = group.at(
+            [
+                run.position._replace(seconds=before + clock - began)
+                for run, before in zip(group.runs, seconds, strict=True)
+            ]
+        )
         rate = (done - first) * training.config.optim.batch_size / (clock - began)
-        _report(training, epoch, done, position, rate, reporter)
+        _report(group, epoch, done, rate, reporter)
         if done < steps and (stop.signum or due):
-            checkpoints.save("latest", training.settled(state), position)
+            group._replace(states=group.together.settled(group.states)).save()
             saved = time.perf_counter()
             if stop.signum:
                 break
-    return state, position, rate
+    return group, rate
 
 
-def _run_steps(
-    training: Training,
-    order: Any,
-    epoch: int,
-    first: int,
-    count: int,
-    state: TrainState,
-    position: Position,
-) -> tuple[TrainState, Position]:
+def _run_steps(group: Group, order: Any, epoch: int, first: int, count: int) -> Group:
     """Take `count` steps of an epoch from its step `first` on, in one dispatch."""
-    factor = position.plateau.factor
-    state, progress = training.take_steps(state, order, first, count, factor)
-    failed_step = int(progress.failed_step)  # waits for the device
-    if failed_step >= 0:
-        raise FloatingPointError(
-            f"the loss is not finite at step {failed_step} (epoch {epoch}); "
-            "lower optim.learning_rate, set optim.clip_norm, or look at the data"
-        )
-    before = position.loss_sums or (0.0,) * len(progress.sums)
-    sums = zip(before, progress.sums, strict=True)
-    norms = {
-        part: position.gradient_norms.get(part, 0.0) + float(norm)
-        for part, norm in progress.gradient_norms.items()
-    }
-    return state, position._replace(
-        step=epoch * training.steps_per_epoch + first + count,
-        loss_sums=tuple(before + float(more) for before, more in sums),
-        gradient_norms=norms,
-    )
+    factors = [run.position.plateau.factor for run in group.runs]
+    states, found = group.together.take_steps(group.states, order, first, count, factors)
+    step = epoch * group.training.steps_per_epoch + first + count
+    positions = [
+        after_steps(run, progress, epoch, step)
+        for run, progress in zip(group.runs, found, strict=True)
+    ]
+    return group._replace(states=states).at(positions)
 
 
-def _improves(training: Training, position: Position, merit: float) -> bool:
-    """Whether the epoch that ends at `position` is the best one so far.
-
-    The choice begins anew with the epoch that changes what is trained, and again with the first
-    whole one after it: losses before and after do not compare, and what has just begun to learn has
-    learnt little.
-    """
-    before = position.step - 2 * training.steps_per_epoch
-    changed = any(before < change < position.step for change in training.changes)
-    return position.best_loss is None or changed or merit < position.best_loss
-
-
-def _next_epoch(
-    training: Training, epoch: int, position: Position, row: Row, best_loss: float | None
-) -> Position:
-    """The start of the next epoch; `best_loss` is None where the epoch was not the best."""
-    return position._replace(
-        epoch=epoch + 1,
-        best_loss=position.best_loss if best_loss is None else best_loss,
-        loss_sums=(),
-        gradient_norms={},
-        plateau=optimizers.watch(position.plateau, row["val_mse"], training.config.optim),
-    )
-
-
-def _row(training: Training, epoch: int, position: Position, validation: Row, rate: float) -> Row:
-    """The log's row of a finished epoch: mean losses of training (as its steps met them) and the
-    figures of validation."""
-    steps, norms = training.steps_per_epoch, position.gradient_norms
-    return {
-        "epoch": epoch,
-        "step": position.step,
-        **training.training_figures(position.loss_sums, steps),
-        **validation,
-        "learning_rate": _learning_rate(training, position),
-        f"{training.unit}_per_second": rate,
-        "seconds": position.seconds,
-        **{f"gradient_norm/{part}": norms[part] / steps for part in norms},
-    }
+def _end_epoch(
+    group: Group, epoch: int, rate: float, logs: Sequence[Log], reporter: Reporter
+) -> Group:
+    """Validate, and write the row and the checkpoints of each run."""
+    states = group.together.settled(group.states)
+    states, found = group.together.validate(states, group.step)
+    group = group._replace(states=states)
+    positions = []
+    for run, state, figures, log in zip(
+        group.runs, group.together.apart(states), found, logs, strict=True
+    ):
+        row = row_of(run, epoch, figures, rate)
+        by_loss = run.training.config.optim.best_by == "loss"
+        merit = row["val_loss" if by_loss else "val_mse"]
+        improved = improves(run.training, run.position, merit)
+        best = merit if improved else None
+        position = next_epoch(run.training, epoch, run.position, row, best)
+        log.add(row)
+        reporter.line(summary(run, row) + ("  best" if improved else ""))
+        if improved:
+            run.checkpoints.save("best", state, position)
+        run.checkpoints.save("latest", state, position)
+        positions.append(position)
+    return group.at(positions)
 
 
-def _learning_rate(training: Training, position: Position) -> float:
-    return training.learning_rate(position.step) * position.plateau.factor
-
-
-def _summary(training: Training, row: Row) -> str:
-    return (
-        f"epoch {row['epoch'] + 1:4d}/{training.config.optim.epochs}  loss {row['loss']:.4g}  "
-        f"val {row['val_loss']:.4g}  val rmse {row['val_rmse']:.4f} m  {training.remark(row)}"
-        f"lr {row['learning_rate']:.2e}  {_speed(training, row[f'{training.unit}_per_second'])}"
-    )
-
-
-def _report(
-    training: Training, epoch: int, done: int, position: Position, rate: float, reporter: Reporter
-) -> None:
-    """The progress of the run, with the mean loss of the epoch so far."""
+def _report(group: Group, epoch: int, done: int, rate: float, reporter: Reporter) -> None:
+    """The progress of the runs: the mean loss of the epoch so far, over the seeds too, and what all
+    of them do in a second."""
+    training, step = group.training, group.step
     steps = training.config.optim.epochs * training.steps_per_epoch
-    loss = training.training_figures(position.loss_sums, done)["loss"]
+    losses = [training.training_figures(run.position.loss_sums, done)["loss"] for run in group.runs]
     numbers = (
-        f"{position.step}/{steps}  epoch {epoch + 1}  loss {loss:.4g}  "
-        f"lr {_learning_rate(training, position):.2e}  {_speed(training, rate)}"
+        f"{step}/{steps}  epoch {epoch + 1}  loss {sum(losses) / len(losses):.4g}  "
+        f"lr {learning_rate(group.runs[0]):.2e}  {speed(training, rate * len(losses))}"
     )
-    reporter.progress("training", position.step / steps, numbers)
-
-
-def _speed(training: Training, rate: float) -> str:
-    return f"{rate:,.0f} {training.unit}/s" if rate >= 10 else f"{rate:.2g} {training.unit}/s"
+    reporter.progress("training", step / steps, numbers)

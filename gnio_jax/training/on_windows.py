@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Iterator
 from pathlib import Path
@@ -21,6 +22,7 @@ from gnio_jax.training.checkpoint import Run, create_model, create_trained_model
 from gnio_jax.training.initial import with_weights
 from gnio_jax.training.kinds import (
     Keys,
+    compiled,
     describe_split,
     keys_of,
     read_split,
@@ -80,6 +82,10 @@ class WindowTraining(NamedTuple):
     def changes(self) -> tuple[int, ...]:
         return switches(self.config.loss, self.steps_per_epoch)
 
+    def with_seed(self, seed: int) -> WindowTraining:
+        config = dataclasses.replace(self.config, seed=seed)
+        return self._replace(config=config, keys=keys_of(seed))
+
     def new_state(self, start: Run | None) -> TrainState:
         window, decay = self.config.data.seen, self.config.optim.ema_decay
         state = create_state(self.model, self.optimizer, self.keys.init, window, decay)
@@ -131,7 +137,7 @@ class WindowTraining(NamedTuple):
                 self.keys.step,
                 model=self.trained_model,
                 optimizer=self.optimizer,
-                config=self.config,
+                config=compiled(self.config),
                 steps_per_epoch=self.steps_per_epoch,
             )
             found = progress if found is None else added(found, progress)
@@ -143,7 +149,7 @@ class WindowTraining(NamedTuple):
         are evaluated, if asked for."""
         if not self.config.optim.statistics_windows or not normalises(state):
             return state
-        options = {"model": self.model, "config": self.config}
+        options = {"model": self.model, "config": compiled(self.config)}
         key = self.keys.statistics
         order = statistics_order(key, self.source, self.config)
         source, order = self.supply.windows(self.source, order)
@@ -157,20 +163,12 @@ class WindowTraining(NamedTuple):
             equivariant = self.config.model.equivariance != "none"
             state = calibrated(state, isotropic(found) if equivariant else found)
             found = self._errors(state, step)
-        loss, mse, nll = (float(each) for each in found.losses)
-        normalised = zip("xyz", found.axis_normalised, strict=True)
-        return state, {
-            "val_loss": loss,
-            "val_mse": mse,
-            "val_nll": nll,
-            "val_rmse": math.sqrt(mse),
-            **{f"val_normalised/{axis}": float(each) for axis, each in normalised},
-        }
+        return state, figures(found)
 
     def _errors(self, state: TrainState, step: int) -> Validation:
         """Means over the validation windows."""
         now = stage(self.config.loss, step - 1, self.steps_per_epoch)
-        options = {"model": self.model, "config": self.config}
+        options = {"model": self.model, "config": compiled(self.config)}
         means, counts = [], []
         for source in self.supply.sources(self.held_out):
             means.append(validate(evaluated(state), source=source, now=now, **options))
@@ -183,6 +181,19 @@ class WindowTraining(NamedTuple):
 
     def remark(self, row: Row) -> str:
         return ""
+
+
+def figures(found: Validation) -> Row:
+    """The figures of the log."""
+    loss, mse, nll = (float(each) for each in found.losses)
+    normalised = zip("xyz", found.axis_normalised, strict=True)
+    return {
+        "val_loss": loss,
+        "val_mse": mse,
+        "val_nll": nll,
+        "val_rmse": math.sqrt(mse),
+        **{f"val_normalised/{axis}": float(each) for axis, each in normalised},
+    }
 
 
 def set_up(config: TrainConfig, reporter: Reporter, workers: int = 1) -> WindowTraining:

@@ -80,13 +80,19 @@ def compare_processes(
     """
     if not several():
         return
-    settings = {k: v for k, v in dataclasses.asdict(config).items() if k not in MAY_CHANGE}
-    require_same("settings", _digest(settings), "start all with the same options, also --config")
+    settings = bytes.fromhex(identity(config))
+    require_same("settings", settings, "start all with the same options, also --config")
     same_data = "give all of them the same data"
     require_same("recordings", _digest(splits), same_data)
     require_same("samples of the same recordings", _digest(_sampled(recordings)), same_data)
     same_run = "give all of them the same run in --init-from"
     require_same("weights to begin with", _digest(_sampled(variables)), same_run)
+
+
+def identity(config: TrainConfig) -> str:
+    """The same for all processes of a run, wherever its files lie for each."""
+    settings = {k: v for k, v in dataclasses.asdict(config).items() if k not in MAY_CHANGE}
+    return _digest(settings).hex()
 
 
 def _sampled(tree: Any) -> list[Any]:

@@ -23,6 +23,7 @@ from gnio_jax.training.filter_step import Sums, intervals, optimizer, train_step
 from gnio_jax.training.initial import with_weights
 from gnio_jax.training.kinds import (
     Keys,
+    compiled,
     describe_split,
     keys_of,
     read_split,
@@ -56,6 +57,10 @@ class FilterTraining(NamedTuple):
     @property
     def changes(self) -> tuple[int, ...]:
         return ()
+
+    def with_seed(self, seed: int) -> FilterTraining:
+        config = dataclasses.replace(self.config, seed=seed)
+        return self._replace(config=config, keys=keys_of(seed))
 
     def new_state(self, start: Run | None) -> TrainState:
         nothing = optax.identity()
@@ -99,7 +104,7 @@ class FilterTraining(NamedTuple):
             jnp.float32(learning_rate_factor),
             self.keys.step,
             model=self.model,
-            config=_without_folders(self.config),
+            config=compiled(self.config),
         )
         # Where the pieces were shared out, the state now lies on all devices, and the next step
         # would be compiled once more for that.
@@ -111,7 +116,7 @@ class FilterTraining(NamedTuple):
 
     def validate(self, state: TrainState, step: int) -> tuple[TrainState, Row]:
         """The loss is infinite where the filter diverges."""
-        fixed = {"model": self.model, "config": _without_folders(self.config)}
+        fixed = {"model": self.model, "config": compiled(self.config)}
         found = validate(state, self.held_out, self.keys.statistics, **fixed)
         losses = jax.device_get(found.losses)
         sound = bool(found.healthy) and math.isfinite(losses.total)
@@ -138,11 +143,6 @@ class FilterTraining(NamedTuple):
     def remark(self, row: Row) -> str:
         skipped = f"{row['skipped']} skipped  " if row["skipped"] else ""
         return f"nis/3 {row['val_nis']:.2f}  nees/3 {row['val_nees']:.2f}  {skipped}"
-
-
-def _without_folders(config: TrainConfig) -> TrainConfig:
-    """What the compiled steps depend on: runs in several folders share them."""
-    return dataclasses.replace(config, workdir=None, data_root=None, init_from=None)
 
 
 def _by_horizon(name: str, squares: np.ndarray) -> Row:

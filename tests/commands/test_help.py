@@ -70,3 +70,15 @@ def test_a_common_option_has_its_values_meaning_and_default(capsys):
     meaning = "The paper's filter, the sum of the displacements, or the IMU integrated without the"
     assert f"--estimator {{ekf,integrate,imu_only}} {meaning} network. (default: ekf)" in text
     assert "--help-all explains all" in text and "of the section filter" in text
+
+
+@pytest.mark.parametrize("mark, other", [("│", "┃"), ("--out ", "-out ")])
+def test_where_the_layout_of_tyro_is_another_one_the_help_is_whole(
+    mark, other, capsys, monkeypatch
+):
+    """Boxes drawn otherwise, and an option spelt otherwise."""
+    monkeypatch.setenv("COLUMNS", "100")
+    whole = shown(capsys, "track", "--help-all")
+    read = short_help._help_of_tyro
+    monkeypatch.setattr(short_help, "_help_of_tyro", lambda kind: read(kind).replace(mark, other))
+    assert shown(capsys, "track", "--help") == whole

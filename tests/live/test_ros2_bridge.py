@@ -12,6 +12,7 @@ from gnio_jax.filtering.pose import Pose
 
 BRIDGE = Path(__file__).parents[2] / "examples" / "ros2" / "gnio_odometry" / "bridge.py"
 TURN = Rotation.from_euler("xyz", [0.3, -0.5, 1.2])
+BIAS = np.array([0.01, -0.02, 0.03])
 SQUARE = np.random.default_rng(0).normal(size=(15, 15))
 COVARIANCE = SQUARE @ SQUARE.T
 
@@ -39,7 +40,7 @@ class Recorder:
         zero = np.zeros(3)
         velocity, position = np.array([1.0, 2.0, 3.0]), np.array([4.0, 5.0, 6.0])
         return Pose(
-            time, TURN.as_matrix(), velocity, position, zero, zero, COVARIANCE, 1.0, 1.0, True
+            time, TURN.as_matrix(), velocity, position, BIAS, zero, COVARIANCE, 1.0, 1.0, True
         )
 
 
@@ -77,6 +78,7 @@ def test_messages_become_odometry(bridge):
     world = TURN.as_matrix() @ twist[:3, :3] @ TURN.as_matrix().T
     np.testing.assert_allclose(world, COVARIANCE[3:6, 3:6])
     assert twist[3, 3] == -1
+    np.testing.assert_allclose(odometry.rate, [0.09, 0.22, 0.27])
 
 
 def test_a_filter_that_diverged_publishes_nothing(bridge):

@@ -1,11 +1,13 @@
 """Options of a meeting that do not fit, and a coordinator that is not there."""
 
 import socket
+import threading
 import time
 
 import pytest
 
 from gnio_jax.errors import InputError
+from gnio_jax.scaling.gathering import gather
 from gnio_jax.scaling.meeting import Meeting, check, launched, require_free, wait_for
 
 
@@ -60,6 +62,77 @@ def test_a_port_that_another_run_listens_at_is_told():
         with pytest.raises(InputError, match=r"process 0 cannot listen there .* another port"):
             require_free(address)
     require_free(address)
+
+
+def free_address():
+    with socket.socket() as free:
+        free.bind(("localhost", 0))
+        return f"localhost:{free.getsockname()[1]}"
+
+
+def gathered(*told, patience=20):
+    """What becomes of processes that are told (run, processes, process id), in this order; None for
+    those that met."""
+    coordinator, ends = free_address(), [None] * len(told)
+
+    def come(number, run, processes, process_id):
+        try:
+            gather(Meeting(coordinator, processes, process_id, patience), run)
+        except InputError as error:
+            ends[number] = str(error)
+
+    threads = [threading.Thread(target=come, args=(k, *each)) for k, each in enumerate(told)]
+    for thread in threads:
+        thread.start()
+        time.sleep(0.2)
+    for thread in threads:
+        thread.join(60)
+    return ends
+
+
+def test_the_processes_of_a_run_meet_whichever_comes_first():
+    assert gathered(("a", 3, 2), ("a", 3, 0), ("a", 3, 1)) == [None] * 3
+
+
+def test_a_process_of_another_run_is_told_and_does_no_harm():
+    ends = gathered(("a", 2, 0), ("b", 2, 1), ("a", 2, 1))
+    assert ends[::2] == [None, None]
+    assert "process 0 there has other settings; choose another port" in ends[1]
+
+
+def test_other_numbers_of_processes_are_told_to_both():
+    """JAX would train with the smaller one."""
+    first, other = gathered(("a", 2, 0), ("a", 3, 1))
+    assert "process 0 was told --processes 2, process 1 was told 3; give all" in first
+    assert "process 0 was told --processes 2, this one 3; give all of them the same" in other
+
+
+def test_a_number_that_is_taken_is_told():
+    ends = gathered(("a", 3, 0), ("a", 3, 1), ("a", 3, 1), ("a", 3, 2))
+    assert ends[:2] == [None, None] and ends[3] is None
+    assert "process 1 is there already; give each its own --process-id" in ends[2]
+
+
+def test_those_that_wait_in_vain_are_told():
+    ends = gathered(("a", 3, 0), ("a", 3, 1), patience=2)
+    assert all("did not all meet within 2 s; every one needs the same" in end for end in ends)
+
+
+@pytest.mark.parametrize("answer", [b"\x00\x00\x06\x04\x00", b"", b"{}\n", b"{" * 5000])
+def test_a_run_that_has_begun_is_not_joined(answer):
+    """Its coordinator, which is JAX's, listens there."""
+    with socket.create_server(("localhost", 0)) as other:
+
+        def serve():
+            connection, _ = other.accept()
+            connection.recv(4096)
+            connection.sendall(answer)
+            connection.close()
+
+        threading.Thread(target=serve).start()
+        meeting = Meeting(f"localhost:{other.getsockname()[1]}", 2, 1, 20)
+        with pytest.raises(InputError, match=r"answers, but not as process 0 .* another port"):
+            gather(meeting, "a")
 
 
 @pytest.mark.parametrize(

@@ -40,6 +40,7 @@ class Server:
 
     def __init__(self, folder):
         environment = {**os.environ, "JAX_PLATFORMS": "cpu"}
+        environment["GNIO_CACHE"] = str(folder / "recordings")
         environment.setdefault("JAX_COMPILATION_CACHE_DIR", str(folder / "cache"))
         self.folder, self.started = folder, 0
         self.process = subprocess.Popen(
@@ -84,12 +85,13 @@ class Group:
 
     def __init__(self, recording, server, workdir, processes, devices, *more, **special):
         """special: what process k does otherwise, as `send={k: (signal, step)}`; `started`: how
-        many of them begin at once, the others by `start_next`."""
+        many of them begin at once, the others by `start_next`; `more_of={k: options}`."""
         self.began = time.monotonic()
         with socket.socket() as free:
             free.bind(("localhost", 0))
             port = free.getsockname()[1]
-        meeting = ["--coordinator", f"localhost:{port}", "--processes", str(processes)]
+        self.coordinator = f"localhost:{port}"
+        meeting = ["--coordinator", self.coordinator, "--processes", str(processes)]
         meeting += ["--patience", str(PATIENCE)]
         self.processes = []
 
@@ -98,7 +100,7 @@ class Group:
             command = [name, str(step), *OPTIONS]
             command += ["--data-root", str(recording), "--workdir", str(workdir)]
             command += [*meeting, "--process-id", str(k)] if processes > 1 else []
-            command += ["--devices", str(devices), *more]
+            command += ["--devices", str(devices), *more, *special.get("more_of", {}).get(k, ())]
             self.processes.append(server.start("training", *command))
 
         self.start_next = lambda: start(len(self.processes))
@@ -152,6 +154,31 @@ def test_devices_change_nothing_but_rounding(run, incomplete, alone, tmp_path):
     (end,) = run(tmp_path / "run", 1, 8).end()
     assert end[0] == 0, end
     assert_same_run(tmp_path / "run", alone)
+
+
+@pytest.mark.parametrize("processes, devices", [(1, 2), (2, 1)])
+def test_recordings_on_the_disk_change_nothing_but_rounding(
+    run, alone, tmp_path, processes, devices
+):
+    ends = run(tmp_path / "run", processes, devices, "--data.residency", "host").end()
+    assert [status for status, _ in ends] == [0] * processes, ends
+    assert_same_run(tmp_path / "run", alone)
+
+
+def test_processes_that_do_not_belong_together_are_told(run, incomplete, tmp_path):
+    """One of another run, and one that was told another number. Neither trains, nor do they harm
+    the run that gathers at this port."""
+    _, group = incomplete
+    port = ("--coordinator", group.coordinator, "--processes", "2", "--process-id", "1")
+    ((status, lines),) = run(tmp_path / "run", 1, 1, *port, "--optim.epochs", "3").end()
+    assert status == 2 and len(lines) == 1, lines
+    assert "process 0 there has other settings; choose another port" in lines[0]
+    more = ("--processes", "3")
+    told = run(tmp_path / "run", 2, 1, more_of={1: more}).end()
+    assert [status for status, _ in told] == [2, 2], told
+    assert "process 0 was told --processes 2, process 1 was told 3" in told[0][1][-1]
+    assert "process 0 was told --processes 2, this one 3" in told[1][1][-1]
+    assert not (tmp_path / "run").exists()
 
 
 def test_processes_change_nothing_but_rounding(incomplete, alone):

@@ -22,10 +22,10 @@ def main(name, step, *arguments):
     registry._MODELS["tiny"] = Tiny
 
     def interrupted(*given):
-        state, position = run_steps(*given)
-        if name != "never" and position.step >= int(step):
+        group = run_steps(*given)
+        if name != "never" and group.step >= int(step):
             os.kill(os.getpid(), signal.Signals[name])
-        return state, position
+        return group
 
     loop._run_steps = interrupted
     console.run(lambda: app.options.execute(app.GNIO, ["train", *arguments], "gnio"))

@@ -22,9 +22,9 @@ from gnio_jax.config import DataConfig, LossConfig, ModelConfig, OptimConfig, Tr
 from gnio_jax.data import windows
 from gnio_jax.errors import InputError
 from gnio_jax.models import registry
-from gnio_jax.training import checkpoint, loop, on_windows, optimizer, step
+from gnio_jax.training import checkpoint, kinds, loop, on_windows, optimizer, step
 from gnio_jax.training.losses import Losses
-from tests.support.runs import shared_config, shared_programs
+from tests.support.runs import shared_programs
 from tests.support.tiny_network import Tiny
 from tests.support.tlio_files import write_splits
 
@@ -154,8 +154,8 @@ def test_averages_are_evaluated_and_training_goes_on_without_them(recording, fin
         for pair in ((state.params, plain["params"]), (loaded["params"], plain["params"]))
     ]
     assert misses[0] < 1e-3 * misses[1]  # its steps are those of the run without
-    config = shared_config(checkpoint.load_run(workdir).config)
-    model, key = checkpoint.create_model(config), jax.random.key(config.seed)
+    config = kinds.compiled(checkpoint.load_run(workdir).config)
+    model, key = checkpoint.create_model(config), jax.random.key(0)
     with jax.enable_x64(False):
         source, key = windows_of(recording, "train", config), jax.random.fold_in(key, 3)
         estimated = step.estimate_statistics(

@@ -90,10 +90,10 @@ def test_a_run_that_stopped_within_a_part_goes_on_from_the_disk(
     run_steps = loop._run_steps
 
     def stopped(*given):
-        state, position = run_steps(*given)
-        if position.step == 8:
+        group = run_steps(*given)
+        if group.step == 8:
             signal.raise_signal(signal.SIGTERM)
-        return state, position
+        return group
 
     monkeypatch.setattr(loop, "DISPATCH_SECONDS", 0)
     with monkeypatch.context() as patch:

@@ -30,6 +30,7 @@ from gnio_jax.training import (
     checkpoint,
     filter_step,
     initial,
+    kinds,
     learnt,
     loop,
     on_windows,
@@ -281,7 +282,7 @@ def test_no_call_to_lapack_waits_for_a_worker(training):
         jnp.float32(1),
         jax.random.key(0),
         model=training.model,
-        config=through_filter._without_folders(config),
+        config=kinds.compiled(config),
     )
     assert "cholesky" not in str(lowered.jaxpr) and "triangular_solve" not in str(lowered.jaxpr)
 

@@ -21,10 +21,12 @@ class Odometry(NamedTuple):
     """x, y, z, w: from the IMU to `odom`."""
     velocity: tuple[float, float, float]
     """In the IMU's frame, as nav_msgs/Odometry asks for it, m/s."""
+    rate: tuple[float, float, float]
+    """In the IMU's frame, rad/s: that of the message, without the gyro's bias."""
     pose_covariance: list[float]
-    """36 numbers, row by row: x, y, z, and rotation about x, y, z."""
+    """36 numbers, row by row: x, y, z, and rotation about the fixed axes x, y, z of `odom`."""
     twist_covariance: list[float]
-    """36 numbers; that of the angular rate is unknown (-1)."""
+    """36 numbers, row by row, in the IMU's frame; that of the angular rate is unknown (-1)."""
 
 
 class Bridge:
@@ -62,9 +64,9 @@ class Bridge:
             self.refused += 1
             self.reason = "the filter diverged: start the node again"
             return None
-        return None if pose is None else self._odometry(pose)
+        return None if pose is None else self._odometry(pose, np.array([gyro.x, gyro.y, gyro.z]))
 
-    def _odometry(self, pose: Any) -> Odometry:
+    def _odometry(self, pose: Any, gyro: np.ndarray) -> Odometry:
         assert self._first is not None
         sec, nanosec = divmod(self._first + round(pose.time * NANOSECONDS), NANOSECONDS)
         covariance = np.asarray(pose.covariance)
@@ -80,6 +82,7 @@ class Bridge:
             tuple(np.asarray(pose.position).tolist()),
             tuple(Rotation.from_matrix(rotation).as_quat().tolist()),
             tuple((rotation.T @ np.asarray(pose.velocity)).tolist()),
+            tuple((gyro - np.asarray(pose.gyro_bias)).tolist()),
             of_pose.ravel().tolist(),
             of_twist.ravel().tolist(),
         )

@@ -5,18 +5,24 @@ import jax
 import rclpy
 from geometry_msgs.msg import TransformStamped
 from nav_msgs.msg import Odometry
+from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
-from rclpy.qos import qos_profile_sensor_data
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Imu
 from tf2_ros import TransformBroadcaster
 
 from gnio_jax import live, tracking
 from gnio_odometry.bridge import Bridge
 
+SENSOR_DATA = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
+"""Matches publishers of either reliability. The profile of that name keeps five messages: a clone
+step takes longer than those, and every message that is lost is a hole."""
+
 
 class GnioOdometry(Node):
     """Parameters: weights (name, package or run folder), imu_rate (Hz; 0: the network's),
-    rest_seconds (the device lies still so long at the start), odom_frame."""
+    rest_seconds (the device lies still so long at the start), odom_frame, imu_frame (of messages
+    that name none), publish_tf (odom -> the IMU's frame; off where that frame has a parent)."""
 
     def __init__(self):
         super().__init__("gnio_odometry")
@@ -24,11 +30,13 @@ class GnioOdometry(Node):
         rate = self.declare_parameter("imu_rate", 0.0).value
         rest = self.declare_parameter("rest_seconds", 1.0).value
         self._odom = self.declare_parameter("odom_frame", "odom").value
+        self._imu = self.declare_parameter("imu_frame", "imu_link").value
+        publish_tf = self.declare_parameter("publish_tf", True).value
         run = tracking.choose_weights(weights).run
         self._bridge = Bridge(live.create_tracker(run, rate or None, rest))
         self._publisher = self.create_publisher(Odometry, "odometry", 10)
-        self._transforms = TransformBroadcaster(self)
-        self.create_subscription(Imu, "imu", self._take, qos_profile_sensor_data)
+        self._transforms = TransformBroadcaster(self) if publish_tf else None
+        self.create_subscription(Imu, "imu", self._take, SENSOR_DATA)
         self.get_logger().info(f"ready with {weights}; keep the device still for {rest:g} s")
 
     def _take(self, message: Imu) -> None:
@@ -41,21 +49,27 @@ class GnioOdometry(Node):
         odometry = Odometry()
         odometry.header.stamp.sec, odometry.header.stamp.nanosec = found.stamp
         odometry.header.frame_id = self._odom
-        odometry.child_frame_id = message.header.frame_id
+        odometry.child_frame_id = message.header.frame_id or self._imu
         place, turn = odometry.pose.pose.position, odometry.pose.pose.orientation
         place.x, place.y, place.z = found.position
         turn.x, turn.y, turn.z, turn.w = found.orientation
         speed = odometry.twist.twist.linear
         speed.x, speed.y, speed.z = found.velocity
+        rate = odometry.twist.twist.angular
+        rate.x, rate.y, rate.z = found.rate
         odometry.pose.covariance = found.pose_covariance
         odometry.twist.covariance = found.twist_covariance
         self._publisher.publish(odometry)
+        if self._transforms is not None:
+            self._send_transform(odometry)
 
+    def _send_transform(self, odometry: Odometry) -> None:
+        """From the IMU's frame to `odom`."""
         transform = TransformStamped()
         transform.header, transform.child_frame_id = odometry.header, odometry.child_frame_id
-        move = transform.transform.translation
-        move.x, move.y, move.z = found.position
-        transform.transform.rotation = turn
+        place, move = odometry.pose.pose.position, transform.transform.translation
+        move.x, move.y, move.z = place.x, place.y, place.z
+        transform.transform.rotation = odometry.pose.pose.orientation
         self._transforms.sendTransform(transform)
 
 
@@ -65,6 +79,8 @@ def main() -> None:
     node = GnioOdometry()
     try:
         rclpy.spin(node)
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass  # Ctrl-C, or SIGTERM of the launch
     finally:
         node.destroy_node()
         rclpy.try_shutdown()

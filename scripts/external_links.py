@@ -1,7 +1,7 @@
 """Asks every external link of the pages whether it is still there. Run by hand; needs a network.
 
-python docs/site_build/external_links.py           (ask, and show those that do not answer)
-python docs/site_build/external_links.py --list    (only list them)
+python scripts/external_links.py           (ask, and show those that do not answer)
+python scripts/external_links.py --list    (only list them)
 """
 
 import re
@@ -11,7 +11,7 @@ import urllib.request
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[1]
 URL = re.compile(r"https?://[^\s)>\"'`\]]+")
 EXAMPLES = ("https://github.com/gnio-jax/gnio-jax",)
 """Addresses of this repository, and what only stands for an address."""

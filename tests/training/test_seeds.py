@@ -1,0 +1,221 @@
+"""Seeds that are trained together: runs with the numbers that each has alone."""
+
+import dataclasses
+import json
+import signal
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from gnio_jax import config as configuration
+from gnio_jax.commands import train as command
+from gnio_jax.config import DataConfig, ModelConfig, OptimConfig, TrainConfig
+from gnio_jax.errors import InputError
+from gnio_jax.models import registry
+from gnio_jax.reporting import Silence
+from gnio_jax.training import checkpoint, loop, step, together
+from tests.support.runs import shared_programs
+from tests.support.tiny_network import Tiny
+from tests.support.tlio_files import write_splits
+
+SEEDS = (3, 0, 7)
+STEPS = 13
+"""Of an epoch."""
+
+
+class Told(Silence):
+    """What a run says."""
+
+    def __init__(self):
+        self.lines = []
+
+    def line(self, text):
+        self.lines.append(text)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_compilation():
+    with pytest.MonkeyPatch.context() as patch, shared_programs():
+        patch.setitem(registry._MODELS, "tiny", Tiny)
+        yield
+
+
+@pytest.fixture(scope="module")
+def config(tmp_path_factory):
+    """Two epochs of a network whose uncertainty is calibrated, and a rate of its own for each
+    seed's plateau."""
+    folder = tmp_path_factory.mktemp("seeds")
+    return TrainConfig(
+        "tlio",
+        str(write_splits(folder / "tlio")),
+        str(folder / "run"),
+        data=DataConfig(rate=50.0),
+        model=ModelConfig("tiny", uncertainty="calibrated"),
+        optim=OptimConfig(epochs=2, batch_size=16, learning_rate=1e-3, statistics_windows=64),
+    )
+
+
+@pytest.fixture(scope="module")
+def alone(config, tmp_path_factory):
+    """The work folders of the seeds, trained one by one."""
+    config = at(config, tmp_path_factory.mktemp("alone") / "run")
+    return [loop.train(each).workdir for each in configuration.with_seeds(config, SEEDS)]
+
+
+def at(config, workdir):
+    return dataclasses.replace(config, workdir=str(workdir))
+
+
+def rows(workdir):
+    found = [json.loads(line) for line in (workdir / "metrics.jsonl").read_text().splitlines()]
+    return [
+        {name: row[name] for name in row if name not in ("seconds", "windows_per_second")}
+        for row in found
+    ]
+
+
+def variables(workdir, which):
+    return jax.device_get(checkpoint.load_run(workdir, which).variables)
+
+
+def assert_same_runs(workdirs, others, rtol):
+    for workdir, other in zip(workdirs, others, strict=True):
+        ours, theirs = rows(workdir), rows(other)
+        assert [row["step"] for row in ours] == [STEPS, 2 * STEPS]
+        for mine, expected in zip(ours, theirs, strict=True):
+            assert mine == pytest.approx(expected, rel=rtol, abs=0)
+        for which in ("latest", "best"):
+            both = variables(workdir, which), variables(other, which)
+            jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, 10 * rtol, 1e-6), *both)
+
+
+def test_every_seed_is_an_ordinary_run(config, alone, tmp_path):
+    """Its folder, its settings, its parameters to the bit; recordings are read and steps compiled
+    once."""
+    told, programs = Told(), step.train_steps._cache_size()
+    outcomes = loop.train_seeds(at(config, tmp_path / "run"), SEEDS, reporter=told)
+    assert step.train_steps._cache_size() == programs
+    assert [outcome.workdir.name for outcome in outcomes] == ["run_s3", "run_s0", "run_s7"]
+    for seed, outcome in zip(SEEDS, outcomes, strict=True):
+        kept = configuration.load(outcome.workdir / "config.yaml")
+        assert kept == dataclasses.replace(config, seed=seed, workdir=str(outcome.workdir))
+        assert outcome.best_loss == min(row["val_loss"] for row in rows(outcome.workdir))
+    assert_same_runs([outcome.workdir for outcome in outcomes], alone, rtol=1e-6)
+    for outcome, other in zip(outcomes, alone, strict=True):
+        both = variables(outcome.workdir, "latest"), variables(other, "latest")
+        jax.tree.map(np.testing.assert_array_equal, *both)
+    losses = [rows(workdir)[-1]["val_loss"] for workdir in alone]
+    assert len(set(losses)) == 3
+    assert len([line for line in told.lines if line.startswith("reading")]) == 1
+    assert len([line for line in told.lines if line.startswith("seed 7: epoch")]) == 2
+
+
+@pytest.mark.parametrize("backend", ["cpu", "gpu"])
+def test_seeds_side_by_side_have_the_same_numbers(config, alone, tmp_path, monkeypatch, backend):
+    """Three seeds on two devices, one after the other on each, as on a CPU, or batched."""
+    monkeypatch.setattr(together.jax, "default_backend", lambda: backend)
+    used = []
+    joined = together.SideBySide.joined
+
+    def noted(*given):
+        used.append(joined(*given))
+        return used[-1]
+
+    monkeypatch.setattr(together.SideBySide, "joined", noted)
+    outcomes = loop.train_seeds(at(config, tmp_path / "run"), SEEDS, devices=2)
+    for leaf in jax.tree.leaves(used[0].step):
+        assert leaf.shape == (4,) and leaf.sharding.spec[0] == "seeds"
+    assert_same_runs([outcome.workdir for outcome in outcomes], alone, rtol=1e-5)
+
+
+def test_a_signal_saves_all_and_each_goes_on_alone_or_together(
+    config, alone, tmp_path, monkeypatch
+):
+    """Stopped together within an epoch; then one of them finished alone, so that the others are
+    behind it."""
+    run_steps = loop._run_steps
+
+    def stopped(*given):
+        group = run_steps(*given)
+        if group.step == STEPS + 2:
+            signal.raise_signal(signal.SIGTERM)
+        return group
+
+    config = at(config, tmp_path / "run")
+    with monkeypatch.context() as patch:
+        patch.setattr(loop, "DISPATCH_SECONDS", 0)
+        patch.setattr(loop, "_run_steps", stopped)
+        outcomes = loop.train_seeds(config, SEEDS)
+    workdirs = [outcome.workdir for outcome in outcomes]
+    assert [outcome.stopped_by for outcome in outcomes] == [signal.SIGTERM] * 3
+    latest = [checkpoint.load_run(workdir, "latest").step for workdir in workdirs]
+    assert latest == [STEPS + 2] * 3
+    loop.train(configuration.with_seeds(config, SEEDS)[1], resume=True)
+    told = Told()
+    outcomes = loop.train_seeds(config, SEEDS, resume=True, reporter=told)
+    assert [outcome.stopped_by for outcome in outcomes] == [None] * 3
+    assert f"seed 0: resuming at step {2 * STEPS}" in told.lines
+    assert f"seed 7: resuming at step {STEPS + 2}" in told.lines
+    assert_same_runs(workdirs, alone, rtol=1e-6)
+
+
+def test_a_loss_that_is_not_finite_names_its_seed(config, tmp_path, monkeypatch):
+    take_steps = together.InTurn.take_steps
+
+    def failing(*given):
+        states, progress = take_steps(*given)
+        failed = progress[1]._replace(failed_step=np.int32(5))
+        return states, [progress[0], failed, progress[2]]
+
+    monkeypatch.setattr(together.InTurn, "take_steps", failing)
+    with pytest.raises(FloatingPointError, match=r"^seed 0: the loss .* at step 5 "):
+        loop.train_seeds(at(config, tmp_path / "run"), SEEDS)
+
+
+@pytest.mark.parametrize(
+    "seeds, expected",
+    [
+        ((), "--seeds: names no seed"),
+        ((1, 2, 1), "--seeds: names 1 twice"),
+        ((0, 1), "run_s0: already holds a run; continue it with --resume"),
+    ],
+)
+def test_mistakes(config, tmp_path, seeds, expected):
+    configuration.save(tmp_path / "run_s0" / "config.yaml", config)
+    with pytest.raises(InputError, match=expected):
+        loop.train_seeds(at(config, tmp_path / "run"), seeds)
+    assert [path.name for path in tmp_path.iterdir()] == ["run_s0"]
+
+
+def test_seeds_of_several_processes_are_refused(config, monkeypatch):
+    monkeypatch.setattr(loop, "several", lambda: True)
+    with pytest.raises(InputError, match="--seeds: run in one process"):
+        loop.train_seeds(config, (0, 1))
+
+
+def test_the_command_names_each_run_and_how_to_go_on(config, tmp_path, monkeypatch, capsys):
+    """And a resumed command takes the settings of the first seed's run."""
+    given = []
+
+    def train_seeds(config, seeds, resume, *_):
+        given.append((config, seeds, resume))
+        runs = [Path(each.workdir) for each in configuration.with_seeds(config, seeds)]
+        return [loop.Outcome(run, 0.5, signal.SIGTERM if resume else None) for run in runs]
+
+    monkeypatch.setattr(loop, "train_seeds", train_seeds)
+    run = str(tmp_path / "run")
+    command.main(["--workdir", run, "--seeds", "1", "2", "--optim.epochs", "5"], "gnio train")
+    out = capsys.readouterr().out.splitlines()
+    assert [line.split()[-1] for line in out] == [f"{run}_s1", f"{run}_s2"]
+    configuration.save(Path(f"{run}_s1") / "config.yaml", given[0][0])
+    with pytest.raises(SystemExit):
+        command.main(["--workdir", run, "--seeds", "1", "2", "--resume"], "gnio train")
+    assert f"--workdir {run} --seeds 1 2 --resume" in capsys.readouterr().err
+    assert [seeds for _, seeds, _ in given] == [(1, 2)] * 2 and given[1][2]
+    assert given[1][0].optim.epochs == 5
+    monkeypatch.chdir(tmp_path)
+    configuration.save(Path("runs/synthetic_gnio_s1/config.yaml"), given[0][0])
+    found = command.defaults(command.TrainOptions(seeds=(1, 2), resume=True))
+    assert found.optim.epochs == 5 and found.workdir is None
