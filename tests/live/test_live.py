@@ -76,9 +76,16 @@ def test_the_tracker_of_a_calibrated_run_considers_what_its_track_does(run, monk
     options = FilterOptions(considered_scale_std=0.1, considered_heading_std_degrees=90.0)
     found = tracking.choose_weights(str(run)).run
     calibrated = found._replace(config=dataclasses.replace(found.config, filter=options))
-    monkeypatch.setattr(Tracker, "from_rest", lambda *_, considered, **__: considered)
-    assert live.create_tracker(calibrated, RATE) == ConsideredStd(0.0, 0.1, np.pi / 2, 0.0)
-    assert live.create_tracker(found, RATE) is None
+    passed = []
+
+    def noted(*_, considered, **__):
+        passed.append(considered)
+        return Tracker.__new__(Tracker)
+
+    monkeypatch.setattr(Tracker, "from_rest", noted)
+    live.create_tracker(calibrated, RATE)
+    live.create_tracker(found, RATE)
+    assert passed == [ConsideredStd(0.0, 0.1, np.pi / 2, 0.0), None]
 
 
 class Refusing:
