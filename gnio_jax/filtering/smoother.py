@@ -35,6 +35,15 @@ from gnio_jax.filtering.adjoint import (
 )
 from gnio_jax.filtering.checkpointing import join_blocks, split_blocks
 from gnio_jax.filtering.config import FilterConfig, YawFrame
+from gnio_jax.filtering.considered import (
+    ENTRIES,
+    OF_BIAS,
+    ConsideredStd,
+    check_considered,
+    considered_covariance,
+    disturbed,
+    of_error,
+)
 from gnio_jax.filtering.displacement import Measurement, scaled_measurement
 from gnio_jax.filtering.gaps import Imu, bridge
 from gnio_jax.filtering.history import FilterHistory
@@ -92,6 +101,7 @@ def smooth(
     config: FilterConfig,
     noise: NoiseModel,
     imu_valid: Any = None,
+    considered: ConsideredStd | None = None,
 ) -> SmoothedHistory:
     """Filter K clone intervals as `run_filter` does, then smooth: each row is the estimate given
     all measurements of the interval.
@@ -106,10 +116,17 @@ def smooth(
     every E-th interval only, and E intervals at a time are filtered once more on the way back: (K /
     E) · m² + E · (18 m + 500). Smoothed variances are differences: in float32 one that is lowered
     by many orders of magnitude, as at the start, has few digits left and can come out below zero.
+
+    With errors that are `considered` the covariances are P + S C Sᵀ, S the derivative of the whole
+    smoother (see `considered`); the estimates are as without. It takes up to seven times the
+    memory.
     """
     state, signals, noise = checked_inputs(state, gyro, accel, imu_valid, config, noise)
-    displacement, covariance = checked_measurements(displacement, covariance, signals, config)
-    return _smooth(state, signals, displacement, covariance, config, noise, "given")
+    measured = checked_measurements(displacement, covariance, signals, config)
+    if considered is None:
+        return _smooth(state, signals, *measured, config, noise, "given")
+    check_considered(considered)
+    return _smooth_considering(considered, state, signals, *measured, config, noise, "given")
 
 
 def smooth_odometry(
@@ -120,6 +137,7 @@ def smooth_odometry(
     config: FilterConfig,
     noise: NoiseModel,
     imu_valid: Any = None,
+    considered: ConsideredStd | None = None,
 ) -> SmoothedHistory:
     """Smooth a run of `run_odometry`, whose arguments these are, with the `history` that it left.
 
@@ -134,7 +152,11 @@ def smooth_odometry(
     noise = noise._replace(std_factor=(1.0, 1.0, 1.0))
     covariance = jax.vmap(jnp.diag)(std**2 / config.measurement_scale)
     frame = config.displacement_frame
-    return _smooth(state, signals, displacement, covariance, config, noise, frame)
+    if considered is None:
+        return _smooth(state, signals, displacement, covariance, config, noise, frame)
+    check_considered(considered)
+    measured = displacement, covariance
+    return _smooth_considering(considered, state, signals, *measured, config, noise, frame)
 
 
 class _Inputs(NamedTuple):
@@ -198,6 +220,33 @@ def _smooth(
     else:
         smoothed = _smooth_in_blocks(there_and_back, forward, state, nothing, inputs, every)
     return _smoothed_history(smoothed, config)
+
+
+@functools.partial(jax.jit, static_argnames=("config", "frame"))
+def _smooth_considering(
+    considered: ConsideredStd,
+    state: FilterState,
+    signals: Signals,
+    displacement: Array,
+    covariance: Array,
+    config: FilterConfig,
+    noise: NoiseModel,
+    frame: YawFrame,
+) -> SmoothedHistory:
+    """`_smooth`, with the errors that are considered in its covariances."""
+
+    def means(c: Float[Array, "6"]) -> tuple[Mean, SmoothedHistory]:
+        start = state._replace(gyro_bias=state.gyro_bias + c[OF_BIAS])
+        told = disturbed(displacement, c)
+        found = _smooth(start, signals, told, covariance, config, noise, frame)
+        return Mean(*(getattr(found, name) for name in Mean._fields)), found
+
+    nothing = jnp.zeros(ENTRIES, displacement.dtype)
+    derivatives, smoothed = jax.jacfwd(means, has_aux=True)(nothing)
+    added = considered_covariance(of_error(smoothed.rotation, derivatives), considered)
+    variances = smoothed.covariance_diagonal + jnp.diagonal(added, axis1=1, axis2=2)
+    whole = None if smoothed.covariance is None else smoothed.covariance + added
+    return smoothed._replace(covariance_diagonal=variances, covariance=whole)
 
 
 def _smooth_in_blocks(

@@ -11,6 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from gnio_jax import filtering
+from gnio_jax.filtering import smoother
 from gnio_jax.filtering import tracker as online
 from gnio_jax.filtering.considered import disturbed
 from gnio_jax.filtering.pose import pose_parts, widened_vector
@@ -318,3 +319,96 @@ def test_a_negative_size_is_refused():
     wrong = STD._replace(scale=-1.0)
     with pytest.raises(ValueError, match=r"^considered\.scale: must be a number that is not neg"):
         filtering.Tracker(TOLD, started(0), CONFIG, NOISE, considered=wrong)
+
+
+# The smoother
+# ------------------------------------------------------------------------------------------------
+
+
+@functools.cache
+def smoothed():
+    """Some runs smoothed, as a function of which, of more errors and of what is considered."""
+    runs, _ = walks()
+    (history, _), _ = filtered()
+    pose = runs.rotation0, runs.velocity0, runs.position0
+    given = drawn(), pose, runs.gyro, runs.accel, jax.tree.map(np.asarray, history)
+
+    def one(considered, more, c, pose, gyro, accel, history):
+        start = filtering.initial_state(CONFIG, *pose, c[:3] + more[:3], std=START)
+        history = history._replace(displacement=disturbed(history.displacement, more))
+        given = start, gyro, accel, history, CONFIG, NOISE
+        return filtering.smooth_odometry(*given, considered=considered)
+
+    program = jax.jit(jax.vmap(one, in_axes=(None, 0, 0, 0, 0, 0, 0)))
+
+    def of_runs(which, more, considered=STD):
+        return program(considered, more, *jax.tree.map(lambda leaf: leaf[which], given))
+
+    return of_runs
+
+
+@functools.cache
+def added_by_considering():
+    """The smoothed runs, and S C Sᵀ of each."""
+    every = np.arange(RUNS), np.zeros((RUNS, 6))
+    found, alone = smoothed()(*every), smoothed()(*every, filtering.ConsideredStd(0.0, 0.0))
+    return found, np.asarray(found.covariance - alone.covariance)
+
+
+def test_what_the_smoother_adds_is_its_change():
+    found, added = added_by_considering()
+    steps = np.repeat([1e-5, 1e-4], 3)
+    more = np.zeros((RUNS, 6))
+    more[:6], more[6:12] = np.diag(steps), -np.diag(steps)
+    changed = smoothed()(np.zeros(RUNS, int), more)
+    ahead, behind = (jax.tree.map(lambda leaf, b=b: leaf[b : b + 6], changed) for b in (0, 6))
+    wanted = np.zeros((STRIDES, 15, 15))
+    for entry, step in enumerate(steps):
+        column = core_error(ahead, behind, entry) / (2 * step) * SPREAD[entry]
+        wanted += column[:, :, None] * column[:, None, :]
+    std = np.sqrt(np.asarray(found.covariance_diagonal)[0])
+    scale = std[:, :, None] * std[:, None, :]
+    np.testing.assert_allclose(added[0] / scale, wanted / scale, atol=1e-5)
+    assert (np.diagonal(added[0] / scale, axis1=1, axis2=2)[-1, 6:9] > 0.5).any()
+    whole = np.diagonal(found.covariance, axis1=2, axis2=3)
+    np.testing.assert_allclose(found.covariance_diagonal, whole, rtol=1e-12)
+
+
+def test_the_smoothers_covariance_is_that_of_its_errors():
+    runs, _ = walks()
+    found, added = added_by_considering()
+
+    def nees(covariance):
+        error, chosen = runs.position - np.asarray(found.position), covariance[:, :, 6:9, 6:9]
+        squares = np.einsum("rki,rkij,rkj->rk", error, np.linalg.inv(chosen), error)
+        return squares[:, CLONES::10].mean() / 3
+
+    covariance = np.asarray(found.covariance)
+    assert nees(covariance - added) > 5
+    assert nees(covariance) == pytest.approx(1, abs=0.35)
+
+
+def test_both_ways_to_smooth_consider_what_they_are_given(monkeypatch):
+    runs, std = walks()
+    passed = []
+
+    def noted(considered, *rest):
+        passed.append((considered, rest[-1]))
+        return filtering.SmoothedHistory(*[None] * 7)
+
+    monkeypatch.setattr(smoother, "_smooth_considering", noted)
+    short, told = slice(20 * N), (runs.displacement[0, :20], std[0, :20])
+    signals = started(0), runs.gyro[0, short], runs.accel[0, short]
+    fixed = CONFIG, NOISE
+    covariance = np.stack([np.diag(row**2) for row in told[1]])
+    given = *signals, told[0], covariance, *fixed
+    filtering.smooth(*given, considered=STD)
+    (history, _), _ = filtered()
+    row = jax.tree.map(lambda leaf: np.asarray(leaf)[0, :20], history)
+    filtering.smooth_odometry(*signals, row, *fixed, considered=STD)
+    assert passed == [(STD, "given"), (STD, "own")]
+    wrong = STD._replace(slope=np.nan)
+    with pytest.raises(ValueError, match=r"^considered\.slope"):
+        filtering.smooth(*given, considered=wrong)
+    with pytest.raises(ValueError, match=r"^considered\.slope"):
+        filtering.smooth_odometry(*signals, row, *fixed, considered=wrong)
