@@ -28,13 +28,11 @@ DESCRIPTION = """Train a network and leave a run: config.yaml, checkpoints, logs
   {prog} --config quickstart --workdir runs/demo --seeds 0 1 2
   {prog} --config through_filter_oxiod --init-from runs/oxiod_calibrated --workdir runs/through
 
---config FILE reads options from a YAML file, or from one of the experiments that come with the
-package; options given here win over it. --resume continues a run from its latest checkpoint as if
-it had never stopped. --init-from starts from the weights of a run with the same network, or of a
-package (see gnio weights); with --through-filter.learn, network and filter then learn as one
-program, beginning with the filter of that run (see gnio calibrate). --seeds trains several runs
-together, in WORKDIR_s0, WORKDIR_s1, ...: they share recordings and compiled programs. The defaults
-are the paper's settings."""
+--config FILE reads options from a YAML file, or from an experiment that comes with the package;
+options given here win over it. --resume goes on from the latest checkpoint as if the run had never
+stopped. --init-from starts from the weights of a run or package (gnio weights) of the same network;
+with --through-filter.learn, network and filter then learn as one program, from the filter of that
+run (gnio calibrate). --seeds trains several runs together, in WORKDIR_s0, WORKDIR_s1, ..."""
 
 
 @dataclass(frozen=True)
@@ -116,12 +114,12 @@ def train(options: TrainOptions, prog: str) -> None:
     with processes.running():
         with console.terminal(shown=processes.is_first()) as terminal:
             try:
-                how = (options.resume, terminal, usable_cores(), options.devices)
-                how = (*how, pretrained.load_pretrained)
+                load = pretrained.load_pretrained
+                given = (options.resume, terminal, usable_cores(), options.devices, load)
                 if options.seeds:
-                    outcomes = loop.train_seeds(options.experiment(), options.seeds, *how)
+                    outcomes = loop.train_seeds(options.experiment(), options.seeds, *given)
                 else:
-                    outcomes = [loop.train(options.experiment(), *how)]
+                    outcomes = [loop.train(options.experiment(), *given)]
             except FloatingPointError as error:
                 terminal.line(str(error))
                 sys.exit(1)

@@ -23,7 +23,7 @@ BATCH_REMEDY = "for a batch of sequences use jax.vmap"
 
 def checked_array(name: str, value: Any, shape: tuple[int, ...], config: FilterConfig) -> jax.Array:
     """`value` as a JAX array of this shape and of the precision that `config` asks for."""
-    value = jnp.asarray(value)
+    value = on_device(value)
     if value.shape != shape:
         raise ValueError(f"{name}: the shape must be {shape}, found {value.shape}; {BATCH_REMEDY}")
     single = value.dtype == jnp.float32
@@ -35,6 +35,14 @@ def checked_array(name: str, value: Any, shape: tuple[int, ...], config: FilterC
     if single:
         remedy += ", or ask for FilterConfig(allow_float32=True)"
     raise ValueError(f"{name}: the filter runs in float64, found {value.dtype}; {remedy}")
+
+
+def on_device(value: Any) -> jax.Array:
+    """`value` as a JAX array, which shares no memory with it. `jnp.asarray` would compile a program
+    for each shape of NumPy's arrays."""
+    if isinstance(value, np.ndarray):
+        return jax.device_put(np.array(value))
+    return jnp.asarray(value)
 
 
 def check_finite(name: str, value: jax.Array, remedy: str = "") -> None:

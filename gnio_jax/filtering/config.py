@@ -60,7 +60,7 @@ class FilterConfig:
     """IMU samples n in one clone interval."""
     clones_per_window: int
     """Clone intervals W in one measurement; W + 1 poses are cloned."""
-    context_samples: int = 0
+    context_samples: int = dataclasses.field(default=0, kw_only=True)
     """IMU samples C before a measurement's window that the network sees too (ours)."""
     mahalanobis_fail_scale: float = 0.0
     """0 skips a rejected measurement; above 0 its covariance is multiplied by this and it is

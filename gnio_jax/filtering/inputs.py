@@ -18,6 +18,7 @@ from gnio_jax.filtering.checks import (
     check_positive_definite,
     check_rotation,
     checked_array,
+    on_device,
 )
 from gnio_jax.filtering.config import FilterConfig
 from gnio_jax.filtering.noise import NoiseModel
@@ -146,7 +147,7 @@ def checked_inputs(
 
 
 def _checked_mask(imu_valid: Any, samples: int) -> jax.Array:
-    mask = jnp.asarray(imu_valid)
+    mask = on_device(imu_valid)
     if mask.shape != (samples,) or mask.dtype != jnp.bool_:
         found = f"{mask.dtype} of shape {mask.shape}"
         raise ValueError(f"imu_valid: must be {samples} booleans, found {found}")

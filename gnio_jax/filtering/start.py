@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Any, NamedTuple
 
 import jax
@@ -32,7 +33,7 @@ from gnio_jax.filtering.state import (
     GateState,
     ImuMemory,
 )
-from gnio_jax.types import GRAVITY
+from gnio_jax.types import GRAVITY, Array
 
 _NEVER = -1
 _STILL_STD, _MOVING_STD = 0.05, 1.0
@@ -79,15 +80,35 @@ def initial_state(
     check_rotation("rotation", rotation)
     for name, value in std._asdict().items():
         check_not_negative(f"std.{name}", value)
-    clones, nothing = config.clones, jnp.zeros(3, dtype)
-    first = FirstEstimates(velocity, nothing, nothing, jnp.zeros((clones, 3), dtype))
+    pose = _Pose(rotation, velocity, position, gyro_bias, accel_bias)
+    return _without_clones(pose, std, config.clones, config.jacobians == "first")
+
+
+class _Pose(NamedTuple):
+    """Where the filter starts, in one precision; the arguments of `initial_state`."""
+
+    rotation: Array
+    velocity: Array
+    position: Array
+    gyro_bias: Array
+    accel_bias: Array
+
+
+# One program in place of thirty, which take three times as long when first called.
+@functools.partial(jax.jit, static_argnames=("clones", "first_estimates"))
+def _without_clones(
+    pose: _Pose, std: InitialStd, clones: int, first_estimates: bool
+) -> FilterState:
+    dtype = pose.rotation.dtype
+    nothing = jnp.zeros(3, dtype)
+    first = FirstEstimates(pose.velocity, nothing, nothing, jnp.zeros((clones, 3), dtype))
     return FilterState(
-        rotation=rotation,
-        velocity=velocity,
+        rotation=pose.rotation,
+        velocity=pose.velocity,
         offset=nothing,
-        gyro_bias=gyro_bias,
-        accel_bias=accel_bias,
-        anchor=position,
+        gyro_bias=pose.gyro_bias,
+        accel_bias=pose.accel_bias,
+        anchor=pose.position,
         move=nothing,
         clone_rotation=jnp.tile(jnp.eye(3, dtype=dtype)[None], (clones, 1, 1)),
         clone_offset=jnp.zeros((clones, 3), dtype),
@@ -99,15 +120,18 @@ def initial_state(
         gate=GateState(jnp.bool_(False), last_success=jnp.int32(_NEVER), pause_end=jnp.int32(0)),
         imu=_no_imu(dtype),
         healthy=jnp.bool_(True),
-        first=first if config.jacobians == "first" else None,
+        first=first if first_estimates else None,
     )
 
 
 def with_lasting_errors(state: FilterState, errors: LastingErrors) -> FilterState:
     """A state that knows nothing yet of the errors of the displacements that last; one that has
     them is as it was."""
-    if len(state.lasting):
-        return state
+    return state if len(state.lasting) else _with_lasting_errors(state, errors)
+
+
+@jax.jit
+def _with_lasting_errors(state: FilterState, errors: LastingErrors) -> FilterState:
     variance = prior_variance(errors, state.offset.dtype)
     count = len(variance)
     return state._replace(
@@ -164,14 +188,25 @@ def level_state(
         raise ValueError(f"accel: at least two samples are needed, found {samples}")
     check_finite("gyro", gyro)
     check_finite("accel", accel)
-    gyro_spread, accel_spread = _spread(gyro), _spread(accel)
     independent = max(1.0, 2 * samples * config.dt)
-    mean_error = jnp.sqrt(jnp.asarray(std.accel_bias) ** 2 + accel_spread**2 / independent)
-    quiet = (gyro_spread < config.rest_gyro) & (accel_spread < config.rest_accel)
+    bias_std, quiet = jnp.asarray(std.accel_bias), (config.rest_gyro, config.rest_accel)
+    rotation, tilt_std, velocity_std = _levelled(gyro, accel, bias_std, independent, quiet)
+    std = std._replace(tilt=tilt_std, velocity=velocity_std)
+    nothing = np.zeros(3, accel.dtype)
+    return initial_state(config, rotation, nothing, nothing, std=std)
+
+
+# One program, as in `_without_clones`.
+@jax.jit
+def _levelled(
+    gyro: Array, accel: Array, bias_std: Array, independent: Any, quiet_below: tuple[Any, Any]
+) -> tuple[Array, Array, Array]:
+    """Attitude from gravity, and the standard deviations of tilt and velocity."""
+    gyro_spread, accel_spread = _spread(gyro), _spread(accel)
+    mean_error = jnp.sqrt(bias_std**2 + accel_spread**2 / independent)
+    quiet = (gyro_spread < quiet_below[0]) & (accel_spread < quiet_below[1])
     velocity = jnp.where(quiet, _STILL_STD, _MOVING_STD)
-    std = std._replace(tilt=mean_error / GRAVITY, velocity=velocity)
-    nothing = jnp.zeros(3, accel.dtype)
-    return initial_state(config, geometry.level(accel.mean(0)), nothing, nothing, std=std)
+    return geometry.level(accel.mean(0)), mean_error / GRAVITY, velocity
 
 
 class Rest(NamedTuple):

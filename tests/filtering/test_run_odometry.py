@@ -191,6 +191,7 @@ def test_vmap_keeps_the_branch_and_equals_single():
         INTERVALS - CLONES,
         2 * (INTERVALS - CLONES),
     )  # once a step (or once a sequence), never before there is a window
+    many = jax.device_get(many)  # indexed in JAX, every leaf would be two programs
     alone = jax.jit(lambda *given: run(predict, *given))
     for index in range(2):
         one = alone(*[signal[index] for signal in signals])

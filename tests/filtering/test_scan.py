@@ -10,12 +10,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from gnio_jax import filtering
-from gnio_jax.filtering.state import covariance
+from gnio_jax.filtering import state as states
 from tests.support import scekf_numpy
 from tests.support.random_walk import random_walk
 
 RECORDED = Path(__file__).parents[1] / "recorded" / "scekf"
 DECISIONS = ("accepted", "gate_passed")
+# One program in place of one for every operation.
+covariance = jax.jit(states.covariance)
 MEAN = ("rotation", "velocity", "position", "gyro_bias", "accel_bias")
 
 
@@ -35,9 +37,10 @@ def replay(name):
     state = filtering.initial_state(config, run["rotation0"], run["velocity0"], run["position0"])
     covariance = run["displacement_std"][:, :, None] ** 2 * np.eye(3)
     noise = filtering.NoiseModel.per_sample(1e-2, 3.16227766e-2, config.dt)
-    return run, *filtering.run_filter(
+    found = filtering.run_filter(
         state, run["gyro"], run["accel"], run["displacement"], covariance, config, noise
     )
+    return run, *jax.device_get(found)
 
 
 @pytest.mark.parametrize(
@@ -53,7 +56,7 @@ def test_recorded_runs(name):
     sigma = np.sqrt(
         np.diag(run["out_final_covariance"])
     )  # off the diagonal, 1e-8 of what the two variances allow
-    core = covariance(final)[:15, :15]
+    core = np.asarray(covariance(final))[:15, :15]
     assert_close(
         core / np.outer(sigma, sigma), run["out_final_covariance"] / np.outer(sigma, sigma), 1e-8
     )
@@ -217,11 +220,12 @@ def test_gate_boundaries_count_samples():
         0.1, 1, 1, convergence_seconds=0.3, success_seconds=0.7, pause_seconds=1.2
     )
 
+    gate = jax.jit(lambda memory, *given: innovation_gate(memory, config, *given))
+
     def step(memory, now, nis=20.0, oldest=100, tested=True):
         memory = filtering.GateState(*[jnp.asarray(value) for value in memory])
-        memory, passed = innovation_gate(
+        memory, passed = gate(
             memory,
-            config,
             jnp.asarray(now),
             jnp.asarray(oldest),
             jnp.asarray(nis),
@@ -263,6 +267,7 @@ def test_vmap_and_jit_equal_single():
     arguments = [(*start, *signals) for start, *signals in walks]
     single = [run(*one) for one in arguments]
     batch = jax.jit(jax.vmap(run))(*[np.stack(column) for column in zip(*arguments, strict=True)])
+    batch = jax.device_get(batch)  # indexed in JAX, every leaf would be two programs
     for index, one in enumerate(single):
         jax.tree.map(
             lambda many, alone, index=index: assert_close(many[index], alone, 1e-10, 1e-9),
