@@ -27,11 +27,12 @@ import jax.numpy as jnp
 from jaxtyping import Float
 
 from gnio_jax import geometry
+from gnio_jax.filtering.checks import check_not_negative
 from gnio_jax.filtering.config import FilterConfig, YawFrame
 from gnio_jax.filtering.history import FilterHistory
 from gnio_jax.filtering.noise import NoiseModel
 from gnio_jax.filtering.scan import repeat_odometry
-from gnio_jax.filtering.state import FilterState
+from gnio_jax.filtering.state import FilterState, Mean
 from gnio_jax.types import Array
 
 ENTRIES = 6
@@ -50,6 +51,12 @@ class ConsideredStd(NamedTuple):
     heading: Float[Array, ""] | float = 0.0
     """rad"""
     slope: Float[Array, ""] | float = 0.0
+
+
+def check_considered(std: ConsideredStd) -> None:
+    """Raise `ValueError` where a standard deviation is negative or not finite."""
+    for name, value in std._asdict().items():
+        check_not_negative(f"considered.{name}", value)
 
 
 def sensitivity(
@@ -74,17 +81,23 @@ def sensitivity(
     config = dataclasses.replace(config, truncate_every=0, checkpoint_every=0)
     own_std = history.measurement_std / (factors[None] * config.measurement_scale**0.5)
 
-    def means(c: Float[Array, "6"]) -> tuple[Array, ...]:
+    def means(c: Float[Array, "6"]) -> Mean:
         displacement = disturbed(history.displacement, c)
         start = state._replace(gyro_bias=state.gyro_bias + c[OF_BIAS])
         told = displacement, own_std
         _, found = repeat_odometry(start, gyro, accel, *told, config, noise, imu_valid, frame)
-        return found.rotation, found.velocity, found.position, found.gyro_bias, found.accel_bias
+        return Mean(*(getattr(found, name) for name in Mean._fields))
 
     nothing = jnp.zeros(ENTRIES, history.position.dtype)
-    rotation, *others = jax.jacfwd(means)(nothing)
+    return of_error(history.rotation, jax.jacfwd(means)(nothing))
+
+
+def of_error(rotation: Float[Array, "k 3 3"], derivatives: Mean) -> Float[jax.Array, "k 15 6"]:
+    """S of θ, v, p, b_g, b_a from the derivatives of estimates by c, its 6 entries last, where the
+    rotations are `rotation`."""
+    of_rotation, *others = derivatives
     # The change of R by a small turn θ in the world is [θ]× R.
-    turn = jnp.einsum("kilc,kjl->kijc", rotation, history.rotation)
+    turn = jnp.einsum("kilc,kjl->kijc", of_rotation, rotation)
     theta = jnp.stack([turn[:, 2, 1], turn[:, 0, 2], turn[:, 1, 0]], axis=1)
     return jnp.concatenate([theta, *others], axis=1)
 

@@ -17,6 +17,7 @@ from jaxtyping import Float, Int
 
 from gnio_jax.filtering.clock import Clock
 from gnio_jax.filtering.config import FilterConfig
+from gnio_jax.filtering.considered import ConsideredStd, considered_covariance
 from gnio_jax.filtering.displacement import Measurement
 from gnio_jax.filtering.gaps import Imu, bridge
 from gnio_jax.filtering.history import FilterHistory, stacked_history
@@ -36,11 +37,18 @@ from gnio_jax.filtering.pose import (
     history_vector,
     moved_vector,
     pose_parts,
+    widened_vector,
 )
 from gnio_jax.filtering.propagation import integrate_interval
 from gnio_jax.filtering.start import initial_state
 from gnio_jax.filtering.state import FilterState, ImuMemory
 from gnio_jax.filtering.step import Measure, clone_step
+from gnio_jax.filtering.tangents import (
+    Tangents,
+    core_sensitivity,
+    start_tangents,
+    step_with_tangents,
+)
 from gnio_jax.types import Array, Prediction
 
 GYRO, ACCEL, VALID = slice(0, 3), slice(3, 6), 6
@@ -59,6 +67,8 @@ class TrackerCore(NamedTuple):
     raw, and whether the filter used the sample."""
     intervals: Int[Array, ""]
     """Clone steps so far."""
+    tangents: Tangents | None
+    """Derivatives of the filter by the errors that are considered; None where there are none."""
 
 
 class TrackerState(NamedTuple):
@@ -88,6 +98,8 @@ class TrackerSettings(NamedTuple):
     """Samples at rest that make the start; 0: the start was given."""
     std: InitialStd = TLIO_STD
     """Of a start from rest."""
+    considered: ConsideredStd | None = None
+    """Of errors that the poses' covariance counts in, and the filter does not estimate."""
 
 
 class Programs(NamedTuple):
@@ -97,29 +109,29 @@ class Programs(NamedTuple):
     look_ahead: Callable[[Any, Any, np.ndarray], tuple[jax.Array, ImuMemory]]
 
 
-def start_core(state: FilterState, config: FilterConfig) -> TrackerCore:
+def start_core(state: FilterState, settings: TrackerSettings) -> TrackerCore:
     """Before the first clone step."""
-    window = jnp.zeros((config.reach, GRID_COLUMNS), state.offset.dtype)
-    return TrackerCore(state, window, jnp.int32(0))
+    window = jnp.zeros((settings.config.reach, GRID_COLUMNS), state.offset.dtype)
+    tangents = None if settings.considered is None else start_tangents(state)
+    return TrackerCore(state, window, jnp.int32(0), tangents)
 
 
-def core_shapes(config: FilterConfig, noise: NoiseModel, dtype: Any) -> TrackerCore:
+def core_shapes(settings: TrackerSettings) -> TrackerCore:
     """Shapes and types of the core."""
-    window = jax.ShapeDtypeStruct((config.reach, GRID_COLUMNS), dtype)
-    return TrackerCore(
-        state_shapes(config, noise, dtype), window, jax.ShapeDtypeStruct((), jnp.int32)
-    )
+    state = state_shapes(settings.config, settings.noise, settings.dtype)
+    return jax.eval_shape(functools.partial(start_core, settings=settings), state)
 
 
-def compile_programs(
-    predict: Predict, config: FilterConfig, noise: NoiseModel, dtype: Any
-) -> Programs:
+def compile_programs(predict: Predict, settings: TrackerSettings) -> Programs:
     """Compile both, so that no sample waits for a compiler."""
-    shapes = core_shapes(config, noise, dtype)
-    of_type = functools.partial(jax.ShapeDtypeStruct, dtype=dtype)
+    config, noise, considered = settings.config, settings.noise, settings.considered
+    shapes = core_shapes(settings)
+    of_type = functools.partial(jax.ShapeDtypeStruct, dtype=settings.dtype)
     rows, row = of_type((config.samples_per_clone, GRID_COLUMNS)), of_type((GRID_COLUMNS,))
     whole = dataclasses.replace(config, history="core")
-    step = functools.partial(advance, predict=predict, config=whole, noise=noise)
+    step = functools.partial(
+        advance, predict=predict, config=whole, noise=noise, considered=considered
+    )
     ahead = functools.partial(look_ahead, config=config, noise=noise)
     return Programs(
         jax.jit(step, donate_argnums=0).lower(shapes, rows).compile(),
@@ -133,11 +145,14 @@ def advance(
     predict: Predict,
     config: FilterConfig,
     noise: NoiseModel,
+    considered: ConsideredStd | None,
 ) -> tuple[TrackerCore, PoseVector]:
     """One clone step, as `run_odometry` makes it, from the n grid samples (gyro, accel, valid) of
     its interval; and its pose.
 
     `config.history` must be "core". Where the window is no measurement the network is not called.
+    With errors that are `considered` the core carries the tangents along, and the pose's covariance
+    has them.
     """
     valid = rows[:, VALID] > 0
     stream, age, memory = bridge(rows[:, GYRO], rows[:, ACCEL], valid, core.filter.imu, config)
@@ -159,10 +174,37 @@ def advance(
         return predicted_measurement(prediction, config, noise, rows.dtype), {}
 
     slot = core.intervals % config.clones
-    state, history = advance_filter(core.filter, stream, age, measure, slot, config, noise)
+
+    def step(state: FilterState, measure: Measure) -> tuple[FilterState, FilterHistory]:
+        return advance_filter(state, stream, age, measure, slot, config, noise)
+
+    state, pose, tangents = _step_and_pose(step, core, measure, considered)
     memory = memory._replace(quiet=state.imu.quiet)
     state = state._replace(imu=memory)
-    return TrackerCore(state, window, core.intervals + 1), history_vector(history)
+    return TrackerCore(state, window, core.intervals + 1, tangents), pose
+
+
+def _step_and_pose(
+    step: Callable[[FilterState, Measure], tuple[FilterState, FilterHistory]],
+    core: TrackerCore,
+    measure: Measure,
+    considered: ConsideredStd | None,
+) -> tuple[FilterState, PoseVector, Tangents | None]:
+    """What a clone step makes of the filter, its pose, and the tangents where there are some."""
+    if considered is None or core.tangents is None:
+        state, history = step(core.filter, measure)
+        return state, history_vector(history), None
+    state, history, tangents = step_with_tangents(step, core.filter, core.tangents, measure)
+    pose = with_considered(history_vector(history), state, tangents, considered)
+    return state, pose, tangents
+
+
+def with_considered(
+    pose: PoseVector, state: FilterState, tangents: Tangents, considered: ConsideredStd
+) -> PoseVector:
+    """The pose of `state`, with the errors that are considered in its covariance."""
+    found = core_sensitivity(state.mean, tangents)
+    return widened_vector(pose, considered_covariance(found[None], considered)[0])
 
 
 def advance_filter(
@@ -189,7 +231,10 @@ def look_ahead(
     config: FilterConfig,
     noise: NoiseModel,
 ) -> tuple[PoseVector, ImuMemory]:
-    """The pose and the memory of the IMU after one more grid sample, by integration alone."""
+    """The pose and the memory of the IMU after one more grid sample, by integration alone.
+
+    Its covariance is P + S C Sᵀ where errors are considered: both parts take the same transition.
+    """
     parts = pose_parts(pose)
     start = (
         parts[name] for name in ("rotation", "velocity", "position", "gyro_bias", "accel_bias")

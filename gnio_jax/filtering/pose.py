@@ -52,7 +52,8 @@ class Pose(NamedTuple):
     accel_bias: Float[np.ndarray, "3"]
     """m/s²"""
     covariance: Float[np.ndarray, "15 15"]
-    """Of the error in θ (world frame, left), v, p, b_g, b_a."""
+    """Of the error in θ (world frame, left), v, p, b_g, b_a; with the errors that the tracker
+    considers, if any."""
     accepted: float
     """Of the last clone step: 1 its measurement was used, 0 it was not, NaN there was none."""
     nis: float
@@ -101,5 +102,14 @@ def moved_vector(
         "position": position,
         "covariance": covariance,
     }
-    parts = pose_parts(vector) | moved
+    return _vector(pose_parts(vector) | moved)
+
+
+def widened_vector(vector: PoseVector, added: Float[Array, "15 15"]) -> PoseVector:
+    """With `added` to the covariance, all else as it is."""
+    parts = pose_parts(vector)
+    return _vector(parts | {"covariance": parts["covariance"] + added})
+
+
+def _vector(parts: dict[str, Array]) -> PoseVector:
     return jnp.concatenate([parts[name].reshape(-1) for name in _SHAPES])

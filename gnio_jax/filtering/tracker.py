@@ -25,6 +25,7 @@ import numpy as np
 from gnio_jax.filtering.clock import Clock, GridSample, advance_clock
 from gnio_jax.filtering.clones import unroll_clones
 from gnio_jax.filtering.config import FilterConfig
+from gnio_jax.filtering.considered import ConsideredStd, check_considered
 from gnio_jax.filtering.inputs import checked_noise, checked_state
 from gnio_jax.filtering.intake import (
     Intake,
@@ -45,6 +46,7 @@ from gnio_jax.filtering.online import (
     TrackerState,
     compile_programs,
     start_core,
+    with_considered,
 )
 from gnio_jax.filtering.pose import Pose, pose_from_vector, start_vector
 from gnio_jax.filtering.start import initial_state, rest_state, with_lasting_errors
@@ -69,6 +71,8 @@ class Tracker:
     - imu_rate: Hz, nominal, of the samples that will come; None: 1/dt. A faster IMU is band-limited
       as `data.resample` does it, and poses come later by `delay`. The stamps could tell the rate,
       but no pose could be given before, and jitter would decide on the delay.
+    - considered: errors that the covariances of the poses count in and the filter does not estimate
+      (see `considered`); constant since the start. None: there are none.
 
     Everything is compiled here, so that no sample waits for a compiler. Poses are new arrays, which
     later samples do not touch. Not for several threads at once. Raises `ValueError` naming an
@@ -83,11 +87,19 @@ class Tracker:
         noise: NoiseModel,
         hole: float | None = None,
         imu_rate: float | None = None,
+        considered: ConsideredStd | None = None,
     ):
         state = checked_state(state, config, noise)
         dtype = np.dtype(state.offset.dtype)
         low_pass = checked_design(config.dt, hole, imu_rate)
-        self._make(predict, TrackerSettings(config, checked_noise(noise, dtype), low_pass, dtype))
+        settings = TrackerSettings(
+            config=config,
+            noise=checked_noise(noise, dtype),
+            design=low_pass,
+            dtype=dtype,
+            considered=_checked_numbers(considered),
+        )
+        self._make(predict, settings)
         self._start(state)
 
     @classmethod
@@ -100,6 +112,7 @@ class Tracker:
         std: InitialStd = TLIO_STD,
         hole: float | None = None,
         imu_rate: float | None = None,
+        considered: ConsideredStd | None = None,
     ) -> Tracker:
         """Start without a state: the device lies still for the first `seconds`, from which
         `rest_state` makes one for the first sample: tilt, velocity, and the gyro's bias where a
@@ -124,6 +137,7 @@ class Tracker:
             dtype=dtype,
             rest=round(seconds / config.dt),
             std=InitialStd(*(float(value) for value in std)),
+            considered=_checked_numbers(considered),
         )
         tracker = cls.__new__(cls)
         tracker._make(predict, settings)
@@ -137,8 +151,8 @@ class Tracker:
         config: FilterConfig,
         noise: NoiseModel,
     ) -> Tracker:
-        """A tracker as `save` left it. Raises `InputError` for a file that is damaged or of another
-        config or noise."""
+        """A tracker as `save` left it, with what it considers. Raises `InputError` for a file that
+        is damaged or of another config or noise."""
         settings, state = load_tracker(path, config, noise)
         tracker = cls.__new__(cls)
         tracker._make(predict, settings)
@@ -223,7 +237,7 @@ class Tracker:
         """Compile for these settings; nothing has come yet."""
         prediction_shapes(predict, settings.config)
         self._settings = settings
-        self._programs = compile_programs(predict, settings.config, settings.noise, settings.dtype)
+        self._programs = compile_programs(predict, settings)
         self._core: TrackerCore | None = None
         self._latest: np.ndarray | None = None
         self._pending: list[GridSample] = []
@@ -233,13 +247,17 @@ class Tracker:
         """How many pending samples `pose` has integrated, its vector and IMU memory after them."""
 
     def _start(self, state: FilterState) -> None:
-        errors = self._settings.noise.displacement
+        errors, considered = self._settings.noise.displacement, self._settings.considered
         if errors is not None:
             state = with_lasting_errors(state, errors)
         # Copies: the first step is given their memory, and it may not be shared, not even between
         # two fields.
-        self._core = _copied(start_core(state, self._settings.config))
+        core = start_core(state, self._settings)
+        self._core = _copied(core)
         self._latest = start_vector(state, self._settings.dtype)
+        if considered is not None and core.tangents is not None:
+            pose = with_considered(self._latest, state, core.tangents, considered)
+            self._latest = np.asarray(pose)
         self._pending, self._ahead = [], None
 
     def _push_grid_sample(self, row: GridSample, number: int) -> Pose | None:
@@ -306,6 +324,14 @@ class Tracker:
             )
         check_rate(self._intake, stamp, self._settings.design)
         return stamp
+
+
+def _checked_numbers(considered: ConsideredStd | None) -> ConsideredStd | None:
+    """The same as numbers of Python, which a program and a file hold."""
+    if considered is None:
+        return None
+    check_considered(considered)
+    return ConsideredStd(*(float(value) for value in considered))
 
 
 def _three_numbers(name: str, value: Any) -> tuple[float, ...]:

@@ -17,6 +17,7 @@ from gnio_jax.errors import InputError
 from gnio_jax.files import replacing
 from gnio_jax.filtering.clock import Clock
 from gnio_jax.filtering.config import FilterConfig
+from gnio_jax.filtering.considered import ConsideredStd
 from gnio_jax.filtering.inputs import checked_noise
 from gnio_jax.filtering.intake import Intake, SampleRun, checked_design
 from gnio_jax.filtering.noise import InitialStd, NoiseModel
@@ -61,6 +62,8 @@ def save_tracker(
         "imu_rate": settings.design.imu_rate,
         "intake": intake,
     }
+    if settings.considered is not None:
+        about["considered"] = list(settings.considered)
     arrays["about"] = np.array(json.dumps(about))
     with replacing(path) as temporary, temporary.open("wb") as file:
         np.savez(file, **arrays)  # pyright: ignore[reportArgumentType]
@@ -83,8 +86,9 @@ def load_tracker(
         dtype=dtype,
         rest=about["rest"],
         std=InitialStd(*about["std"]),
+        considered=ConsideredStd(*about["considered"]) if "considered" in about else None,
     )
-    shapes = core_shapes(config, noise, dtype) if "latest" in arrays else None
+    shapes = core_shapes(settings) if "latest" in arrays else None
     _check_arrays(path, arrays, _wanted_arrays(about, arrays, dtype, shapes))
     _check_pending(path, arrays["pending"], settings, started=shapes is not None)
     state = TrackerState(

@@ -36,7 +36,7 @@ def create_tracker(run: Run, imu_rate: float | None = None, rest_seconds: float 
     Of the same samples it makes the same trajectory, to rounding, where the recording rests for
     `rest_seconds` and less than a second longer: of a longer rest a track takes the whole for the
     gyro's bias, but what has not come yet is not known. Live, samples are interpolated by lines
-    where the rates differ, and the covariance is without what a calibrated filter considers.
+    where the rates differ. The covariance has the errors that a calibrated filter considers.
 
     `imu_rate` is that of the samples that will come, Hz (None: the network's). Samples that are
     further apart than 1.5 of its intervals miss some between them. Raises `ValueError` for a rest
@@ -58,6 +58,7 @@ def create_tracker(run: Run, imu_rate: float | None = None, rest_seconds: float 
         setup.initial_std,
         longest_gap,
         imu_rate=1 / interval,
+        considered=setup.considered,
     )
 
 

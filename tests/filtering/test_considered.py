@@ -5,12 +5,17 @@ import dataclasses
 import functools
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from gnio_jax import filtering
+from gnio_jax.filtering import tracker as online
 from gnio_jax.filtering.considered import disturbed
+from gnio_jax.filtering.pose import pose_parts, widened_vector
+from gnio_jax.filtering.state import core_covariance
+from gnio_jax.types import Prediction
 from tests.support.walks import errors, simulate
 
 N, CLONES, STRIDES, DT, SIGMA, RUNS = 5, 4, 100, 0.02, 0.03, 24
@@ -20,6 +25,7 @@ CONFIG = filtering.FilterConfig(
 NOISE = filtering.NoiseModel(2e-3, 2e-2, 1e-6, 1e-4, std_factor=(0.5, 0.5, 0.5**0.5))
 START = filtering.InitialStd(gyro_bias=1e-4, velocity=0.1)
 STD = filtering.ConsideredStd(gyro_bias=0.02, scale=0.1, heading=0.08, slope=0.05)
+SPREAD = np.array([*[STD.gyro_bias] * 3, *STD[1:]])
 
 
 @functools.cache
@@ -28,6 +34,11 @@ def walks():
     runs = simulate(7, RUNS, STRIDES, N, CLONES, DT, NOISE, START, SIGMA)
     root_scale = np.sqrt(2.0) * np.array(NOISE.std_factor)
     return runs, np.broadcast_to(SIGMA / root_scale, (RUNS, STRIDES, 3))
+
+
+def drawn():
+    """The errors of each run, from `STD`."""
+    return SPREAD * np.random.default_rng(1).standard_normal((RUNS, 6))
 
 
 def run(c, more, rotation, velocity, position, gyro, accel, displacement, std):
@@ -49,13 +60,12 @@ def filtered():
     """All runs, each with errors drawn from `STD`: history and sensitivity, and the history as a
     function of more errors."""
     runs, std = walks()
-    wide = np.array([*[STD.gyro_bias] * 3, STD.scale, STD.heading, STD.slope])
-    drawn = wide * np.random.default_rng(1).standard_normal((RUNS, 6))
+    disturbances = drawn()
     given = (runs.rotation0, runs.velocity0, runs.position0, runs.gyro, runs.accel)
     both, alone = jax.jit(jax.vmap(run_and_sensitivity)), jax.jit(jax.vmap(run))
     given = (*given, runs.displacement, std)
-    found = both(drawn, np.zeros((RUNS, 6)), *given)
-    return found, lambda more: alone(drawn, more, *given)[1]
+    found = both(disturbances, np.zeros((RUNS, 6)), *given)
+    return found, lambda more: alone(disturbances, more, *given)[1]
 
 
 def core_error(estimate, other, r=0):
@@ -123,8 +133,18 @@ def test_displacements_are_disturbed_as_they_are_said_to_be():
     wanted = np.exp(0.2) * Rotation.from_euler("z", -0.3).apply(np.nan_to_num(u))
     wanted[:, 2] += 0.1 * np.hypot(u[:, 0], u[:, 1])
     np.testing.assert_allclose(disturbed(u, c), np.where(np.isnan(u), np.nan, wanted), atol=2e-7)
-    slope = jax.jit(jax.jacfwd(lambda c: disturbed(u, c)))(c)
+    derivative = jax.jit(jax.jacfwd(lambda c: disturbed(u, c)))
+    slope = derivative(c)
     assert np.isfinite(np.asarray(slope)[[0, 1, 3, 4]]).all()
+    # Where there are no errors it is that of the formula, standing still too.
+    slope, lifted = np.asarray(derivative(np.zeros(6))), np.hypot(u[:, 0], u[:, 1])
+    nothing = np.zeros(len(u))
+    across = np.stack([-u[:, 1], u[:, 0], nothing], axis=1)
+    up = np.stack([nothing, nothing, lifted], axis=1)
+    known = [0, 1, 3, 4]
+    wanted = np.stack([u, across, up], axis=2)
+    np.testing.assert_allclose(slope[known][:, :, 3:], wanted[known], atol=2e-6)
+    assert not slope[known][:, :, :3].any()
 
 
 def test_nothing_considered_adds_nothing():
@@ -132,3 +152,169 @@ def test_nothing_considered_adds_nothing():
     assert not np.any(filtering.considered_covariance(ones, filtering.ConsideredStd()))
     only = filtering.considered_covariance(ones, filtering.ConsideredStd(slope=2.0))
     np.testing.assert_array_equal(only, np.full((2, 15, 15), 4.0))
+
+
+# The tracker
+# ------------------------------------------------------------------------------------------------
+
+
+class Told:
+    """A network whose next displacement the test chooses, and the number of its calls."""
+
+    def __init__(self):
+        self.displacement, self.calls = np.zeros(3), 0
+        root_scale = np.sqrt(2.0) * np.array(NOISE.std_factor)
+        self.log_std = np.log(SIGMA / root_scale)
+
+    def __call__(self, windows):
+        told = jax.pure_callback(self._next, jax.ShapeDtypeStruct((3,), float), windows[0, 0, 0])
+        return Prediction(told[None], jnp.asarray(self.log_std)[None], {})
+
+    def _next(self, _):
+        self.calls += 1
+        return self.displacement
+
+
+TOLD = Told()
+
+
+@functools.cache
+def compiled():
+    """The program of every tracker below."""
+    return filtering.Tracker(TOLD, started(0), CONFIG, NOISE, considered=STD)._programs
+
+
+@pytest.fixture
+def built(monkeypatch):
+    ready = compiled()
+    monkeypatch.setattr(online, "compile_programs", lambda *_: ready)
+
+
+def started(r, more=0.0):
+    """The start of a run with its own errors and more."""
+    runs, _ = walks()
+    bias = (drawn()[r] + more)[:3]
+    pose = runs.rotation0[r], runs.velocity0[r], runs.position0[r]
+    return filtering.initial_state(CONFIG, *pose, bias, std=START)
+
+
+@functools.cache
+def told_of_run(r):
+    runs, _ = walks()
+    return np.asarray(disturbed(runs.displacement[r], drawn()[r]))
+
+
+def disturbed_in_numpy(u, c):
+    turned = np.exp(c[3]) * Rotation.from_euler("z", c[4]).apply(u)
+    return turned + np.array([0.0, 0.0, c[5] * np.hypot(*u[:2])])
+
+
+def push(tracker, r, samples, more=None):
+    """Push samples of a run, with more errors; the poses of the clone steps."""
+    runs, _ = walks()
+    poses = []
+    for k in samples:
+        told = np.nan_to_num(told_of_run(r)[k // N])
+        TOLD.displacement = told if more is None else disturbed_in_numpy(told, more)
+        pose = tracker.push(k * DT, runs.gyro[r, k], runs.accel[r, k])
+        poses += [] if pose is None else [pose]
+    return poses
+
+
+def tracker_of(r, more=None):
+    state = started(r, 0.0 if more is None else more)
+    return filtering.Tracker(TOLD, state, CONFIG, NOISE, considered=STD)
+
+
+@functools.cache
+def tracked():
+    """The poses of all runs, and the calls of the network."""
+    TOLD.calls = 0
+    return [push(tracker_of(r), r, range(N * STRIDES)) for r in range(RUNS)], TOLD.calls
+
+
+def test_the_tracker_has_the_covariance_of_the_whole_run(built):
+    (history, found), _ = filtered()
+    added = jax.jit(jax.vmap(lambda s: filtering.considered_covariance(s, STD)))(found)
+    wanted = np.asarray(history.covariance + added)
+    poses, calls = tracked()
+    covariance = np.array([[pose.covariance for pose in row] for row in poses])
+    std = np.sqrt(np.diagonal(wanted, axis1=2, axis2=3))
+    scale = std[:, :, :, None] * std[:, :, None, :]
+    np.testing.assert_allclose(covariance / scale, wanted / scale, atol=1e-9)
+    position = np.array([[pose.position for pose in row] for row in poses])
+    np.testing.assert_allclose(position, history.position, atol=1e-9)
+    assert calls == RUNS * (STRIDES - CLONES)  # of the derivatives none calls it again
+
+
+def test_the_trackers_covariance_is_that_of_its_errors(built):
+    runs, _ = walks()
+    poses, _ = tracked()
+    error = runs.position - np.array([[pose.position for pose in row] for row in poses])
+    covariance = np.array([[pose.covariance[6:9, 6:9] for pose in row] for row in poses])
+    squares = np.einsum("rki,rkij,rkj->rk", error, np.linalg.inv(covariance), error)
+    assert squares[:, CLONES::10].mean() / 3 == pytest.approx(1, abs=0.35)
+
+
+def without_considered(tracker, covariance):
+    """The covariance of the tracker's pose, from P alone after its last clone step."""
+    vector = widened_vector(tracker._latest, covariance - pose_parts(tracker._latest)["covariance"])
+    memory = tracker._core.filter.imu
+    for row in tracker._rows(tracker._pending):
+        vector, memory = tracker._programs.look_ahead(np.asarray(vector), memory, row)
+    return pose_parts(np.asarray(vector))["covariance"]
+
+
+def test_what_is_added_is_the_change_of_the_tracker(built):
+    """Against trackers that have more errors: before the first clone step, at one and after it."""
+    stops = 2, 20 * N, 20 * N + 3
+
+    def visited(more=None):
+        tracker, before = tracker_of(0, more), 0
+        for stop in stops:
+            push(tracker, 0, range(before, stop), more)
+            before = stop
+            yield tracker, tracker.pose()
+
+    wanted = np.zeros((len(stops), 15, 15))
+    for entry, step in enumerate([1e-5, 1e-5, 1e-5, 1e-4, 1e-4, 1e-4]):
+        more = step * np.eye(6)[entry]
+        pairs = zip(visited(more), visited(-more), strict=True)
+        for place, ((_, ahead), (_, behind)) in enumerate(pairs):
+            turn = Rotation.from_matrix(ahead.rotation @ behind.rotation.T).as_rotvec()
+            names = "velocity", "position", "gyro_bias", "accel_bias"
+            rest = [getattr(ahead, name) - getattr(behind, name) for name in names]
+            column = np.concatenate([turn, *rest]) / (2 * step) * SPREAD[entry]
+            wanted[place] += np.outer(column, column)
+    for place, (tracker, pose) in enumerate(visited()):
+        alone = core_covariance(tracker.filter_state().core_covariance)
+        added = pose.covariance - without_considered(tracker, np.asarray(alone))
+        std = np.sqrt(np.diag(pose.covariance))
+        assert np.abs((added - wanted[place]) / np.outer(std, std)).max() < 1e-6, place
+        assert np.abs(added / np.outer(std, std)).max() > 0.5
+
+
+def test_it_goes_on_from_a_file_with_what_it_considers(built, tmp_path):
+    one = tracker_of(0)
+    push(one, 0, range(43))
+    one.save(tmp_path / "state.npz")
+    again = filtering.Tracker.restore(tmp_path / "state.npz", TOLD, CONFIG, NOISE)
+    jax.tree.map(np.testing.assert_array_equal, again.state, one.state)
+    assert again.state.core.tangents["gyro_bias"].any()
+    poses = [push(tracker, 0, range(43, 60)) for tracker in (one, again)]
+    assert len(poses[0]) == 4
+    jax.tree.map(np.testing.assert_array_equal, *poses)
+    waiting = filtering.Tracker.from_rest(TOLD, CONFIG, NOISE, considered=STD)
+    waiting.save(tmp_path / "waiting.npz")
+    still = filtering.Tracker.restore(tmp_path / "waiting.npz", TOLD, CONFIG, NOISE)
+    rest = [[0.0, 0.0, 0.0], [0.0, 0.0, 9.81]]
+    poses = [[t.push(k * DT, *rest) for k in range(50)][-1] for t in (waiting, still)]
+    jax.tree.map(np.testing.assert_array_equal, *poses)
+    variance = np.diag(poses[0].covariance)[9:12]
+    assert (variance > 0.9 * STD.gyro_bias**2).all()
+
+
+def test_a_negative_size_is_refused():
+    wrong = STD._replace(scale=-1.0)
+    with pytest.raises(ValueError, match=r"^considered\.scale: must be a number that is not neg"):
+        filtering.Tracker(TOLD, started(0), CONFIG, NOISE, considered=wrong)

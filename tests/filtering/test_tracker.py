@@ -362,6 +362,14 @@ def test_files_that_do_not_fit_are_refused(tracker, tmp_path):
     assert "is no file of Tracker.save" in refusal()
 
 
+def test_a_file_says_nothing_of_considered_errors_where_there_are_none(tracker, tmp_path):
+    tracker.save(tmp_path / "state.npz")
+    with np.load(tmp_path / "state.npz") as file:
+        about = json.loads(str(file["about"]))
+        assert "considered" not in about and about["format"] == "gnio-jax tracker 4"
+        assert not [name for name in file.files if name.startswith("tangents")]
+
+
 def test_a_failed_save_leaves_the_old_file(tracker, tmp_path, monkeypatch):
     tracker.save(tmp_path / "state.npz")
     before = (tmp_path / "state.npz").read_bytes()

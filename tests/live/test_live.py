@@ -1,5 +1,6 @@
 """`gnio live`: the trajectory of a stream is that of the tracker, and nonsense is refused."""
 
+import dataclasses
 import io
 import signal
 import sys
@@ -9,9 +10,10 @@ import pytest
 
 from gnio_jax import live, tracking
 from gnio_jax.commands import app, console
-from gnio_jax.config import DataConfig, ModelConfig, TrainConfig
+from gnio_jax.config import DataConfig, FilterOptions, ModelConfig, TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation.tum import read_tum
+from gnio_jax.filtering import ConsideredStd, Tracker
 from tests.evaluation.test_rerun_file import columns_of
 from tests.support import known_walk, tiny_run
 
@@ -68,6 +70,15 @@ def test_a_stream_gives_the_trackers_poses(gnio, run, recorded, tmp_path):
     found = read_tum(out)
     np.testing.assert_allclose(found.time, [pose.time for pose in expected], atol=1e-8)
     np.testing.assert_allclose(found.position, [p.position for p in expected], atol=1e-8)
+
+
+def test_the_tracker_of_a_calibrated_run_considers_what_its_track_does(run, monkeypatch):
+    options = FilterOptions(considered_scale_std=0.1, considered_heading_std_degrees=90.0)
+    found = tracking.choose_weights(str(run)).run
+    calibrated = found._replace(config=dataclasses.replace(found.config, filter=options))
+    monkeypatch.setattr(Tracker, "from_rest", lambda *_, considered, **__: considered)
+    assert live.create_tracker(calibrated, RATE) == ConsideredStd(0.0, 0.1, np.pi / 2, 0.0)
+    assert live.create_tracker(found, RATE) is None
 
 
 class Refusing:
