@@ -44,8 +44,7 @@ class RunOptions:
     resume: tyro.conf.FlagCreatePairsOff[bool] = False
     """Continue the run in the work folder from its latest checkpoint."""
     seeds: tuple[int, ...] = ()
-    """Seeds to train together, in the place of --seed: each is a run of its own, in the work folder
-    WORKDIR_s<seed>."""
+    """Seeds to train together, in the place of --seed: WORKDIR_s0, ..."""
     devices: int | None = None
     """Devices of each process that share a batch, or the --seeds; by default all of its GPUs, or
     the one that a CPU is."""

@@ -202,7 +202,7 @@ def write_best(workdir: Path, run: Run) -> None:
         manager.save(run.step, args=ocp.args.Composite(**_evaluated_items(state, position)))
 
 
-def load_run(workdir: Path, which: Which = "best") -> Run:
+def load_run(workdir: Path | str, which: Which = "best") -> Run:
     """The network of a run with its trained variables.
 
     Raises `InputError` for a folder without a run or checkpoint, or one whose arrays do not fit the

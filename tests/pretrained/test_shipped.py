@@ -42,7 +42,7 @@ def test_it_loads_and_answers(about):
     assert run.config.dataset == "randomised" and run.config.model.name == about.network
     assert all(np.isfinite(leaf).all() for leaf in _leaves(run.variables))
     # A phone that lies still goes nowhere, by the network alone.
-    still = np.zeros((1, run.config.data.window, 6), np.float32)
+    still = np.zeros((1, run.config.data.seen, 6), np.float32)
     still[..., 2] = 9.81
     prediction = run.model.apply(run.variables, jnp.asarray(still))
     assert np.linalg.norm(prediction.displacement) < 0.05
