@@ -8,11 +8,11 @@ from typing import Any
 
 from gnio_jax.config import TrainConfig
 from gnio_jax.errors import InputError
-from gnio_jax.training.checkpoint import Run, create_model
+from gnio_jax.training.checkpoint import Run, create_model, load_run
 from gnio_jax.training.step import TrainState
 
 
-def initial_run(config: TrainConfig, load: Callable[[str], Run]) -> Run | None:
+def initial_run(config: TrainConfig, load: Callable[[str], Run] = load_run) -> Run | None:
     """The run that `config.init_from` names, if any, as `load` reads it.
 
     Raises `InputError` for a folder without a run, and for one whose network is not that of

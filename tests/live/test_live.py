@@ -230,9 +230,12 @@ def test_a_recording_played_gives_the_track_of_it(gnio, run, recorded, monkeypat
     [(signal.SIGTERM, 143, "terminated\n"), (signal.SIGINT, 130, "interrupted\n")],
 )
 def test_a_signal_ends_the_stream_and_nothing_is_lost(
-    capsys, run, recorded, monkeypatch, tmp_path, number, status, said
+    request, capsys, run, recorded, monkeypatch, tmp_path, number, status, said
 ):
     lines, out = as_lines(recorded), tmp_path / "live.txt"
+    # A shell starts background jobs with Ctrl-C ignored; this one is to hear it.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    request.addfinalizer(lambda: signal.signal(signal.SIGINT, before))
 
     def follow_until(samples):
         def stream():
