@@ -18,7 +18,7 @@ ROOMS = {
     "evaluation": BASE | {"data", "models", "filtering", "training"},
     "calibration": BASE | {"data", "filtering", "training", "evaluation"},
     "interop": BASE | {"models", "training"},
-    "tables": BASE | {"data", "models", "filtering", "training", "evaluation"},
+    "tables": BASE | {"data", "models", "filtering", "training", "evaluation", "calibration"},
     "pretrained": BASE | {"models", "training"},
     "tracking": BASE | {"data", "filtering", "training", "evaluation", "pretrained"},
     "live": BASE | {"data", "filtering", "training", "evaluation", "tracking"},

@@ -37,6 +37,15 @@ class Source(NamedTuple):
     """The fold of the split; None for all of it."""
 
 
+def load_run(workdir: Path, config: CalibrateConfig) -> Run:
+    """A run with its network as it is to be calibrated. Raises `InputError` as
+    `checkpoint.load_run` and `checkpoint.averaged_over_headings` do."""
+    run = checkpoint.load_run(workdir, config.checkpoint)
+    if not config.average_headings:
+        return run
+    return checkpoint.averaged_over_headings(run, f"--average-headings with {workdir}")
+
+
 def sources(run: Run, config: CalibrateConfig) -> tuple[str, list[Source]]:
     """The split, and the networks that are asked about it: the run's own, or one for each fold.
 
@@ -48,7 +57,7 @@ def sources(run: Run, config: CalibrateConfig) -> tuple[str, list[Source]]:
     if config.split:
         problem = "is of no use with --out-of-fold, which takes the training split"
         raise InputError(f"--split {config.split}", problem)
-    runs = [checkpoint.load_run(Path(folder), config.checkpoint) for folder in config.out_of_fold]
+    runs = [load_run(Path(folder), config) for folder in config.out_of_fold]
     for folder, fold_run in zip(config.out_of_fold, runs, strict=True):
         _check_alike(folder, fold_run.config, run.config)
     folds = runs[0].config.data.folds

@@ -15,7 +15,7 @@ from jaxtyping import Float
 from gnio_jax import config as configuration
 from gnio_jax.calibration.considered import Considered, filtered_positions, fit_considered
 from gnio_jax.calibration.errors import std_factors
-from gnio_jax.calibration.evidence import Evidence, OnStage, gather, sources
+from gnio_jax.calibration.evidence import Evidence, OnStage, gather, load_run, sources
 from gnio_jax.calibration.likelihood import Fit, Walks, fit
 from gnio_jax.calibration.unknowns import DIGITS, GROUPS, check_fittable, chosen, with_starts
 from gnio_jax.config import CalibrateConfig, DataConfig, FilterOptions
@@ -48,7 +48,7 @@ def calibrate(
     config: CalibrateConfig, progress: OnStage = lambda stage, share: None, workers: int = 1
 ) -> Calibration:
     """Fit the filter's options of a run to recordings that its network did not learn from, and
-    write a run that differs in them alone.
+    write a run that differs in them alone, and in the average over headings if that is asked for.
 
     Three steps (ours). First each axis gets the factor that makes the network's standard deviations
     those of its errors, window by window against the reference. Then the options of `config.fit`
@@ -62,7 +62,7 @@ def calibrate(
     """
     unknowns = _unknowns(config)
     workdir = Path(config.workdir) if config.workdir else configuration.newest_run()
-    run = checkpoint.load_run(workdir, config.checkpoint)
+    run = load_run(workdir, config)
     folder = _folder(config, workdir)
     split, asked = sources(run, config)
     check_fittable(run.config.filter, unknowns)
@@ -178,6 +178,7 @@ def _write(
         "checkpoint": config.checkpoint,
         "split": split,
         "out_of_fold": list(config.out_of_fold),
+        "average_headings": config.average_headings,
         "recordings": calibration.recordings,
         "fitted": list(config.fit),
         "negative_log_likelihood_per_innovation": {"before": found.before, "after": found.after},

@@ -15,6 +15,7 @@ DESCRIPTION = """Fit the filter's options of a run to its validation split; writ
 
   {prog}                                    (the newest run below runs/)
   {prog} --workdir runs/oxiod --fit measurement noise --out runs/oxiod_honest
+  {prog} --workdir runs/oxiod --average-headings
   {prog} --workdir runs/oxiod --out-of-fold runs/fold0 runs/fold1
 
 A network learns the errors of the walks that it has fitted, which are smaller than those of others.
@@ -65,6 +66,7 @@ COMMON = (
     "--split",
     "--out-of-fold",
     "--fit",
+    "--average-headings",
     "--checkpoint",
     "--steps",
 )

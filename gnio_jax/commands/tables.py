@@ -54,6 +54,7 @@ COMMON = (
     "--data-root",
     "--split",
     "--estimator",
+    "--calibrate",
     "--seeds",
     "--epochs",
     "--width",

@@ -477,6 +477,9 @@ class CalibrateConfig:
     biases; `window`, the part of a window's error that lasts; `walk`, the errors of speed and
     heading that last. The factors of the axes and the errors that are considered are always
     fitted."""
+    average_headings: bool = False
+    """Average the network over four headings, as model.equivariance: four_headings does, whatever
+    the run says. The network must have learnt from walks turned by a random yaw."""
     checkpoint: Literal["best", "latest"] = "best"
     """Which checkpoint of the run."""
     steps: Count = 60
@@ -498,6 +501,8 @@ class TablesConfig:
     """Split that is measured."""
     estimator: Literal["ekf", "integrate"] = "ekf"
     """The paper's filter, or the sum of the displacements with the reference's orientation."""
+    calibrate: bool = False
+    """Calibrate every run on its validation split before it is measured."""
     seeds: int = 3
     """Runs of every row: seeds 0, 1, 2, ..."""
     epochs: int | None = None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import Any, NamedTuple
 
-from gnio_jax.config import LossConfig, OptimConfig, TrainConfig
+from gnio_jax.config import LossConfig, ModelConfig, OptimConfig, TrainConfig
 
 METHODS = ("tlio", "ronin_resnet", "deepils", "ctin", "imot", "gnio")
 """The networks of table II, and RoNIN's, which it leaves out."""
@@ -65,10 +65,10 @@ class Experiment(NamedTuple):
 
 def method(network: str, base: TrainConfig) -> TrainConfig:
     """`base` with another network, its loss and regularisation: the same recordings, augmentation,
-    batches, epochs and learning rate. Losses differ, so every row's checkpoint is the one with the
-    smallest squared error on the validation split."""
+    equivariance, batches, epochs and learning rate. Losses differ, so every row's checkpoint is the
+    one with the smallest squared error on the validation split."""
     width = base.model.width if network in SCALED else None
-    model = dataclasses.replace(type(base.model)(), name=network, width=width)
+    model = ModelConfig(name=network, width=width, equivariance=base.model.equivariance)
     regularisation = REGULARISATION.get(network, {})
     optim = dataclasses.replace(base.optim, best_by="squared_error", **regularisation)
     return dataclasses.replace(base, model=model, loss=loss(network, base), optim=optim)

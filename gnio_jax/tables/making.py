@@ -244,8 +244,9 @@ def notes(base: TrainConfig, options: TablesConfig, experiment: Experiment) -> l
         f"learning rate {base.optim.learning_rate:g}, width {base.model.width or 64}, "
         f"{base.data.rate:g} Hz, {options.seeds} seeds"
     )
+    calibrated = f", gnio calibrate on {base.data.val_split}" if options.calibrate else ""
     return [
-        f"{base.dataset} {options.split}, {options.estimator}; every row: {budget}; "
+        f"{base.dataset} {options.split}, {options.estimator}; every row: {budget}{calibrated}; "
         f"on {complexity.hardware()}. ± is the standard deviation over seeds; "
         "the difference to the first row is over sequences.",
         "",
@@ -254,4 +255,5 @@ def notes(base: TrainConfig, options: TablesConfig, experiment: Experiment) -> l
 
 
 def _path(options: TablesConfig) -> Path:
-    return Path(options.out) / f"{options.table}_{options.split}_{options.estimator}"
+    name = f"{options.table}_{options.split}_{options.estimator}"
+    return Path(options.out) / (f"{name}_calibrated" if options.calibrate else name)

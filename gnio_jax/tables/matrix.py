@@ -1,10 +1,11 @@
-"""Configurations × seeds: the seeds of a configuration are trained together, then evaluated one
-after the other; restartable, nothing done twice."""
+"""Configurations × seeds: the seeds of a configuration are trained together, then calibrated and
+evaluated one after the other; restartable, nothing done twice."""
 
 from __future__ import annotations
 
 import dataclasses
 import json
+import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -12,9 +13,9 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from gnio_jax import calibration, evaluation
 from gnio_jax import config as configuration
-from gnio_jax import evaluation
-from gnio_jax.config import EvaluateConfig, TablesConfig, TrainConfig
+from gnio_jax.config import CalibrateConfig, EvaluateConfig, TablesConfig, TrainConfig
 from gnio_jax.evaluation import metrics, report
 from gnio_jax.evaluation.metrics import Trajectory
 from gnio_jax.evaluation.run import folder_name, run_config
@@ -43,16 +44,20 @@ class Result(NamedTuple):
 
 
 def run_cell(cell: Cell, options: TablesConfig, reporter: Reporter, workers: int = 1) -> Result:
-    """Train and evaluate a cell with seeds 0 … seeds−1 below OUT/runs.
+    """Train, calibrate if that is asked for, and evaluate a cell with seeds 0 … seeds−1 below
+    OUT/runs.
 
-    A run that is finished is not trained again, one that was interrupted goes on, an evaluation
-    that is there is read. Raises `InputError` if a folder holds a run with other settings, and
-    `Interrupted` after a signal. `workers` processes read recordings that are slow to read.
+    A run that is finished is not trained again, one that was interrupted goes on, a calibration and
+    an evaluation that are there are read. Raises `InputError` if a folder holds a run with other
+    settings, and `Interrupted` after a signal. `workers` processes read recordings that are slow to
+    read.
     """
     workdir = Path(options.out) / "runs" / cell.name
     config, seeds = dataclasses.replace(cell.config, workdir=str(workdir)), range(options.seeds)
     train(config, seeds, reporter, workers)
     runs = [Path(each.workdir or "") for each in configuration.with_seeds(config, seeds)]
+    if options.calibrate:
+        runs = [calibrated(run, reporter, workers) for run in runs]
     figures = [evaluated(run, options.split, options.estimator, reporter, workers) for run in runs]
     return Result(cell, figures, runs)
 
@@ -85,6 +90,22 @@ def _standing(config: TrainConfig) -> Literal["new", "begun", "finished"]:
     log = workdir / "metrics.jsonl"
     rows = log.read_text(encoding="utf-8").count("\n") if log.exists() else 0
     return "finished" if rows >= config.optim.epochs else "begun"
+
+
+def calibrated(workdir: Path, reporter: Reporter, workers: int = 1) -> Path:
+    """The run's best checkpoint with its filter fitted to its validation split: the calibrated run
+    that is there if it is of that checkpoint, else a new one."""
+    folder = workdir.with_name(f"{workdir.name}_calibrated")
+    if folder.exists() and _best_step(folder) == _best_step(workdir):
+        return folder
+    reporter.line(f"calibrating {workdir.name}")
+    shutil.rmtree(folder, ignore_errors=True)
+    calibration.calibrate(CalibrateConfig(str(workdir), out=str(folder)), workers=workers)
+    return folder
+
+
+def _best_step(workdir: Path) -> list[str]:
+    return sorted(entry.name for entry in (workdir / "checkpoints" / "best").glob("[0-9]*"))
 
 
 def evaluated(

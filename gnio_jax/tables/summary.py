@@ -19,6 +19,8 @@ COLUMNS = {
     "rte_60s": "rte_60s",
     "path_length_ratio": "path ratio",
     "stationary_drift": "standing m/min",
+    "nis": "NIS/3",
+    "nees": "NEES/3",
 }
 """Metrics of every table: name in metrics.json, heading."""
 

@@ -241,6 +241,18 @@ def load_run(workdir: Path | str, which: Which = "best") -> Run:
     return Run(config, model, variables, meta["position"]["epoch"], step, numbers)
 
 
+def averaged_over_headings(run: Run, source: str) -> Run:
+    """The run with its network averaged over four headings (`models.equivariance.FourHeadings`),
+    which has the same weights. Raises `InputError` naming `source` for a network that did not learn
+    from every heading, or is equivariant in another way."""
+    if run.config.model.equivariance == "canonical_frame":
+        raise InputError(source, "its network has a canonical frame: there is nothing to average")
+    averaged = dataclasses.replace(run.config.model, equivariance="four_headings")
+    config = dataclasses.replace(run.config, model=averaged)
+    configuration.validate(config, source)
+    return run._replace(config=config, model=create_model(config))
+
+
 def _evaluated_items(state: TrainState, position: Position) -> dict[str, Any]:
     """What every checkpoint holds."""
     variables = evaluated(state).variables

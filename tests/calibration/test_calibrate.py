@@ -7,6 +7,7 @@ import shutil
 import jax
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from gnio_jax import calibration, data
 from gnio_jax.calibration import evidence
@@ -70,6 +71,49 @@ def test_the_run_differs_in_the_filter_alone(run, two_walks, tmp_path, capsys):
     nees = about["position_nees_per_axis"]
     assert abs(np.log(nees["after"])) < abs(np.log(nees["before"]))
     assert about["split"] == "val" and about["filter"] == dataclasses.asdict(found)
+
+
+def test_the_network_is_averaged_over_four_headings(run, two_walks, tmp_path):
+    asked = CalibrateConfig(str(run), average_headings=True)
+    plain = evidence.load_run(run, CalibrateConfig(str(run)))
+    averaged = evidence.load_run(run, asked)
+    assert averaged.config.model.equivariance == "four_headings"
+    jax.tree.map(np.testing.assert_array_equal, averaged.variables, plain.variables)
+    windows = np.random.default_rng(0).normal(size=(1, 50, 6)).astype(np.float32)
+    answers = []
+    for quarter in range(4):
+        turn = np.float32(Rotation.from_euler("z", 90 * quarter, degrees=True).as_matrix())
+        turned = (windows.reshape(1, 50, 2, 3) @ turn.T).reshape(1, 50, 6)
+        answers.append(plain.model.apply(plain.variables, turned).displacement @ turn)
+    np.testing.assert_allclose(
+        averaged.model.apply(averaged.variables, windows).displacement,
+        np.mean(answers, axis=0),
+        rtol=1e-4,
+        atol=1e-6,
+    )
+    out = tmp_path / "out"
+    fit = dataclasses.replace(asked, out=str(out), steps=1, fit=("measurement",))
+    calibration.calibrate(fit)
+    written = checkpoint.load_run(out)
+    assert written.config.model.equivariance == "four_headings"
+
+
+@pytest.mark.parametrize(
+    ("model", "augment", "problem"),
+    [
+        ({"equivariance": "canonical_frame"}, {}, "has a canonical frame"),
+        ({}, {"yaw": False}, "four_headings without augment.yaw"),
+    ],
+)
+def test_a_network_that_cannot_be_averaged(run, model, augment, problem):
+    loaded = checkpoint.load_run(run)
+    config = dataclasses.replace(
+        loaded.config,
+        model=dataclasses.replace(loaded.config.model, **model),
+        augment=dataclasses.replace(loaded.config.augment, **augment),
+    )
+    with pytest.raises(InputError, match=f"the run.*{problem}"):
+        checkpoint.averaged_over_headings(loaded._replace(config=config), "the run")
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from gnio_jax import config as configuration
+from gnio_jax.config import CalibrateConfig
 from gnio_jax.evaluation import report
 from gnio_jax.evaluation.metrics import Trajectory
 from gnio_jax.evaluation.tum import write_tum
@@ -43,6 +44,26 @@ def test_figures_of_other_definitions_or_steps_are_made_anew(
     monkeypatch.setattr(matrix.evaluation, "evaluate", lambda config, **_: path.write_text("{}"))
     found = matrix.evaluated(tmp_path, "test", "ekf", Lines())
     assert (found != {}) == kept
+
+
+def test_a_calibration_is_of_the_best_checkpoint(tmp_path, monkeypatch):
+    run, made = tmp_path / "gnio_s0", []
+
+    def calibrate(config, workers):
+        made.append(config)
+        (best,) = (run / "checkpoints" / "best").iterdir()
+        (tmp_path / config.out / "checkpoints" / "best" / best.name).mkdir(parents=True)
+
+    monkeypatch.setattr(matrix.calibration, "calibrate", calibrate)
+    (run / "checkpoints" / "best" / "7").mkdir(parents=True)
+    for _ in range(2):
+        assert matrix.calibrated(run, Lines()) == tmp_path / "gnio_s0_calibrated"
+    assert made == [CalibrateConfig(str(run), out=str(tmp_path / "gnio_s0_calibrated"))]
+    # The run goes on and finds a better checkpoint: what was fitted to the old one is replaced.
+    (run / "checkpoints" / "best" / "7").rename(run / "checkpoints" / "best" / "9")
+    matrix.calibrated(run, Lines())
+    (kept,) = (tmp_path / "gnio_s0_calibrated" / "checkpoints" / "best").iterdir()
+    assert len(made) == 2 and kept.name == "9"
 
 
 def test_paths_end_where_the_estimate_diverged(tmp_path):

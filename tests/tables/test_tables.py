@@ -98,6 +98,25 @@ def test_a_table_from_nothing_and_again_without_training(made, monkeypatch, caps
         commands.main(["comparison", *arguments, "--base", str(root / "other.yaml")])
 
 
+def test_every_run_is_calibrated_before_it_is_measured(made, capsys):
+    root, arguments = made
+    arguments = [*arguments, "--seeds", "1", "--estimator", "ekf"]
+    commands.main(["comparison", *arguments])
+    commands.main(["comparison", *arguments, "--calibrate"])
+    told = capsys.readouterr()
+    assert "calibrating gnio_s0" in told.err and "gnio calibrate on val;" in told.out
+    plain, calibrated = (
+        (root / "out" / f"comparison_test_ekf{name}.csv").read_text()
+        for name in ("", "_calibrated")
+    )
+    (before,), (after,) = (list(csv.DictReader(text.splitlines())) for text in (plain, calibrated))
+    run = configuration.load(root / "out" / "runs" / "gnio_s0_calibrated" / "config.yaml")
+    assert run.filter.measurement_scale != 10 and run.filter.considered_gyro_bias_std > 0
+    assert float(after["nis"]) > 0 and after["nis"] != before["nis"]
+    # Nothing else has changed: the network is the same.
+    assert run.model == configuration.load(root / "base.yaml").model
+
+
 def test_a_signal_ends_the_table_and_says_how_to_go_on(made, monkeypatch, capsys):
     root, arguments = made
     monkeypatch.setattr(loop, "train_seeds", lambda *_, **__: [loop.Outcome(root, None, 15)])
