@@ -16,7 +16,10 @@ class Tiny(nn.Module):
 
     @nn.compact
     def __call__(self, windows, train=False):
-        h = linear(self.width, "encoder", self.dtype)(windows.mean(axis=1))
+        # A bias would cancel in the normalisation: its gradient is rounding, which Adam makes whole
+        # steps of, and two machines, or two orders of a sum, would not agree on it.
+        mean = windows.mean(axis=1)
+        h = linear(self.width, "encoder", self.dtype, use_bias=False)(mean)
         norm = nn.BatchNorm(not train, dtype=jnp.float32, param_dtype=jnp.float32, name="norm")
         h = jnp.tanh(norm(h))
         displacement = linear(3, "head", self.dtype)(h)
