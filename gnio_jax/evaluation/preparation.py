@@ -22,8 +22,9 @@ from gnio_jax.types import Sequence
 
 REFERENCE_BIAS_SECONDS = 10.0
 """How long `gyro_bias="reference"` looks at the reference, s."""
-STANDING_ACCEL_STD = 0.5
-"""Standard deviation of an accelerometer axis above which a static start is only rough, m/s²."""
+ROUGH_START = 0.4
+"""Standard deviation of the first velocity above which a static start is only rough, m/s (ours):
+nobody stands still there."""
 
 
 class Start(NamedTuple):
@@ -158,24 +159,15 @@ def _start(
 def _static_start(sequence: Sequence, config: DataConfig, std: InitialStd) -> tuple[Start, str]:
     """Level from the gravity of the first second; yaw, velocity and position zero."""
     second = slice(round(config.rate))
-    spread, note = sequence.accel[second].std(0).max(), ""
-    if spread > STANDING_ACCEL_STD:
-        note = (
-            f"start: not standing still (accel varies by {spread:.1f} m/s²), so its tilt is rough"
-        )
     filter_config = filter_setup(config, FilterOptions()).config
     level = level_state(filter_config, sequence.gyro[second], sequence.accel[second], std)
     found = np.sqrt(np.diag(level.core_covariance))
-    return (
-        Start(
-            np.asarray(level.rotation),
-            velocity=np.zeros(3),
-            position=np.zeros(3),
-            tilt_std=float(found[0]),
-            velocity_std=float(found[3]),
-        ),
-        note,
-    )
+    tilt_std, velocity_std = float(found[0]), float(found[3])
+    start = Start(np.asarray(level.rotation), np.zeros(3), np.zeros(3), tilt_std, velocity_std)
+    if velocity_std <= ROUGH_START:
+        return start, ""
+    tilt = np.degrees(tilt_std)
+    return start, f"start: not standing still, so its tilt is rough (to {tilt:.0f}°)"
 
 
 def _gyro_bias(sequence: Sequence, rate: float, setup: Setup) -> GyroBias:

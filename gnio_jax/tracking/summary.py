@@ -11,7 +11,7 @@ from gnio_jax.data.importing import Imported
 from gnio_jax.data.importing.streams import GAPS
 from gnio_jax.evaluation import Estimate, metrics
 from gnio_jax.evaluation.metrics.trajectory import finite_poses
-from gnio_jax.evaluation.preparation import Prepared
+from gnio_jax.evaluation.preparation import ROUGH_START, Prepared
 from gnio_jax.evaluation.scores import score
 from gnio_jax.filtering.config import FilterConfig
 from gnio_jax.filtering.options import FilterSetup
@@ -23,8 +23,6 @@ LYING = 0.95
 REFUSED = 0.15
 """Share of refused displacements that is told (ours). On people that a network has not met it
 refuses 0 to 5 %; walks of a kind that it has not met went wrong by 20 sigma with 29 %."""
-QUIET_START = 0.1
-"""Standard deviation of the first velocity in m/s, which a quiet first second is below (ours)."""
 FASTEST = 3.0
 """Mean speed in m/s above which nobody walks; the self-check of recordings has the same."""
 ERRORS = ("ate", "ate_2d", "rte_60s", "rpe_1s", "yaw_rmse", "path_length", "path_length_ratio")
@@ -120,7 +118,7 @@ def summarise(
     if holes or any(GAPS in note for note in recording.notes):
         where = "" if holes else " (see above)"
         found.append(f"gaps: samples are missing{where}, and what happened there is guessed")
-    if (prepared.start.velocity_std or 0.0) > QUIET_START:
+    if (prepared.start.velocity_std or 0.0) > ROUGH_START:
         found.append("start: it moves in its first second, so its velocity and tilt are rough")
     diverged = (note for note in estimate.notes if note not in prepared.notes)
     return summary._replace(warnings=(*found, *diverged))

@@ -424,6 +424,43 @@ def test_level_state(pitch):
     )
 
 
+@pytest.mark.parametrize("rate", [[0.3, -0.8, 0.5], [0.0, 0.0, 2.0], [0.0, 0.0, 0.0]])
+def test_level_state_of_a_phone_that_a_hand_turns(rate):
+    """The attitude is that of the first sample, not of the second's middle, and not rough."""
+    first = Rotation.from_euler("ZYX", [0.0, 0.4, -1.1])
+    turned = first * Rotation.from_rotvec(np.outer(np.arange(50) * CONFIG.dt, rate))
+    accel = turned.inv().apply([0, 0, 9.81])
+    state = filtering.level_state(CONFIG, np.tile(rate, (50, 1)), accel)
+    np.testing.assert_allclose(state.rotation, first.as_matrix(), atol=1e-9)
+    np.testing.assert_allclose(np.sqrt(state.core_covariance[0, 0]), 0.02 / 9.81, rtol=1e-6)
+
+
+def test_level_state_says_how_far_the_velocity_can_be_from_zero():
+    """1.5 s times the spread, between a table's and a walker's, with a slope everywhere."""
+
+    shake = np.outer(np.sin(np.arange(50)), [1.0, 0, 0])
+
+    def velocity_std(amplitude):
+        shaken = np.tile([0, 0, 9.81], (50, 1)) + amplitude * shake
+        state = filtering.level_state(CONFIG, np.zeros((50, 3)), shaken)
+        return jnp.sqrt(state.core_covariance[3, 3])
+
+    spread = np.sin(np.arange(50)).std()
+    for amplitude, wanted in ((0.0, 0.05), (0.4, 1.5 * 0.4 * spread), (5.0, 1.0)):
+        np.testing.assert_allclose(velocity_std(amplitude), wanted, rtol=1e-9)
+        slope = 0 if amplitude != 0.4 else 1.5 * spread
+        np.testing.assert_allclose(jax.grad(velocity_std)(amplitude), slope, rtol=1e-6)
+
+
+def test_level_state_at_rest_takes_a_gyro_for_biased():
+    """It does not turn what does not turn."""
+    accel = np.tile([0.5, 1.0, 9.7], (50, 1))
+    still, biased = (
+        filtering.level_state(CONFIG, np.full((50, 3), bias), accel) for bias in (0.0, 0.05)
+    )
+    np.testing.assert_array_equal(still.rotation, biased.rotation)
+
+
 @pytest.mark.parametrize(
     "up", [[0.0, 0, 1], [0, 0, -1], [1, 0, 0], [-1, 0, 0], [0, 1, 0], [0.3, -0.2, 0.9]]
 )
