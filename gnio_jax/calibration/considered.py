@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -25,7 +25,7 @@ from gnio_jax.filtering import (
     sensitivity,
 )
 from gnio_jax.filtering.history import POSITION
-from gnio_jax.filtering.options import considered_std, filter_setup
+from gnio_jax.filtering.options import considered_std, filter_with, switches_and_numbers
 from gnio_jax.filtering.unconstrained import natural, with_numbers
 from gnio_jax.training.filter_losses import gaussian_nll, normalised_squares
 from gnio_jax.types import Array
@@ -103,19 +103,20 @@ def filtered_positions(
 
     `truth` has the true ones after each stride, m; NaN where there is none.
     """
-    of_all = _filtered(walks, windows=windows, options=options)
+    switches, numbers = switches_and_numbers(options)
+    of_all = _filtered(walks, numbers, windows=windows, switches=switches)
     healthy, position, covariance, of_position = jax.device_get(of_all)
     error = truth - position
     known = np.isfinite(error).all(axis=2) & (healthy > 0)
     return Positions(error[known], covariance[known], of_position[known])
 
 
-@functools.partial(jax.jit, static_argnames=("windows", "options"))
+@functools.partial(jax.jit, static_argnames=("windows", "switches"))
 def _filtered(
-    walks: Walks, *, windows: DataConfig, options: FilterOptions
+    walks: Walks, numbers: dict[str, Any], *, windows: DataConfig, switches: FilterOptions
 ) -> tuple[Array, Array, Array, Array]:
     """Of every walk: where the filter is healthy, its positions, their covariances and S."""
-    setup = filter_setup(windows, options)
+    setup = filter_with(windows, switches, numbers)
 
     def of_walk(walk: Walks) -> tuple[Array, Array, Array, Array]:
         pose = (walk.rotation, walk.velocity, walk.position, walk.gyro_bias)

@@ -16,7 +16,7 @@ from gnio_jax.calibration.unknowns import DIGITS, PRIOR_STD
 from gnio_jax.config import DataConfig, FilterOptions
 from gnio_jax.errors import InputError
 from gnio_jax.filtering import initial_state, over_sequences, repeat_odometry
-from gnio_jax.filtering.options import FilterSetup, filter_with
+from gnio_jax.filtering.options import FilterSetup, filter_with, switches_and_numbers
 from gnio_jax.filtering.unconstrained import natural, unconstrained, with_numbers
 from gnio_jax.types import Array
 
@@ -70,16 +70,43 @@ def innovation_objective(
     """As a function of the numbers without bounds of some of the options: what is to be made small,
     and the part of it that is −log-likelihood of all innovations over their number. The rest is the
     prior that keeps those in place of which the walks say nothing."""
-    start = free_vector(options, unknowns)
-    count = np.isfinite(walks.displacement).all(2).sum()
+    switches, numbers = switches_and_numbers(options)
+    given = _Given(walks, free_vector(options, unknowns), numbers)
+    fixed = {"windows": windows, "switches": switches, "unknowns": unknowns}
+    return lambda free: _objective(free, given, **fixed)
 
-    def objective(free: Float[Array, "u"]) -> tuple[Array, Array]:
-        values = natural(dict(zip(unknowns, free, strict=True)))
-        evidence = _log_likelihood(walks, filter_with(windows, options, values))
-        prior = 0.5 * jnp.sum(((free - start) / PRIOR_STD) ** 2)
-        return (prior - evidence) / count, -evidence / count
 
-    return objective
+class _Given(NamedTuple):
+    """What the objective is told beside the numbers that are sought. Arguments of its program: what
+    one calibration compiles serves the next."""
+
+    walks: Walks
+    start: Float[np.ndarray, "u"]
+    numbers: dict[str, float]
+    """Of the options (`switches_and_numbers`)."""
+
+
+def _objective(
+    free: Float[Array, "u"],
+    given: _Given,
+    *,
+    windows: DataConfig,
+    switches: FilterOptions,
+    unknowns: tuple[str, ...],
+) -> tuple[Array, Array]:
+    """`innovation_objective`."""
+    sought = natural(dict(zip(unknowns, free, strict=True)))
+    setup = filter_with(windows, switches, {**given.numbers, **sought})
+    evidence = _log_likelihood(given.walks, setup)
+    prior = 0.5 * jnp.sum(((free - given.start) / PRIOR_STD) ** 2)
+    count = jnp.isfinite(given.walks.displacement).all(axis=2).sum()
+    return (prior - evidence) / count, -evidence / count
+
+
+_value_and_gradient = jax.jit(
+    jax.value_and_grad(_objective, has_aux=True),
+    static_argnames=("windows", "switches", "unknowns"),
+)
 
 
 def free_vector(options: FilterOptions, unknowns: tuple[str, ...]) -> Float[np.ndarray, "u"]:
@@ -124,13 +151,15 @@ def fit(
     A step to where the filter fails counts as very unlikely, and the search turns back. Raises
     `InputError` where it fails with `options`.
     """
-    objective = innovation_objective(walks, windows, options, unknowns)
-    compiled = jax.jit(jax.value_and_grad(objective, has_aux=True))
+    switches, numbers = switches_and_numbers(options)
+    start = free_vector(options, unknowns)
+    given = jax.device_put(_Given(walks, start, numbers))
+    fixed = {"windows": windows, "switches": switches, "unknowns": unknowns}
     evidences: list[float] = []
     """Of every call, the first of which is at the start."""
 
     def evaluate(free: np.ndarray) -> tuple[float, np.ndarray]:
-        (value, evidence), gradient = jax.device_get(compiled(free))
+        (value, evidence), gradient = jax.device_get(_value_and_gradient(free, given, **fixed))
         sound = np.isfinite(value) and np.isfinite(gradient).all()
         evidences.append(float(evidence) if sound else FAILED)
         progress(len(evidences))
@@ -139,7 +168,6 @@ def fit(
         return float(value), np.asarray(gradient, float)
 
     limits = {"maxiter": most_steps, "ftol": 1e-7}
-    start = free_vector(options, unknowns)
     found = minimize(evaluate, start, jac=True, method="L-BFGS-B", options=limits)
     if evidences[0] == FAILED:
         raise InputError("the filter", "fails on these recordings with the options of the run")

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
-from gnio_jax.config import DataConfig, FilterOptions
+from gnio_jax.config import CONSIDERED_FIELDS, DataConfig, FilterOptions
 from gnio_jax.filtering.config import FilterConfig
 from gnio_jax.filtering.considered import ConsideredStd
 from gnio_jax.filtering.lasting_errors import LastingErrors
@@ -19,6 +19,8 @@ DEGREE = math.pi / 180
 """rad."""
 STD_FACTORS = ("std_factor_x", "std_factor_y", "std_factor_z")
 """Fields of `FilterOptions`: factors of the network's σ, by axis."""
+_STATIC = ("mahalanobis_fail_scale", "window_rotation")
+"""Fields that decide what is compiled."""
 
 
 class FilterSetup(NamedTuple):
@@ -66,6 +68,21 @@ def filter_with(
     factors = {name: root * fields[name] for name in STD_FACTORS}
     setup = filter_setup(windows, dataclasses.replace(options, measurement_scale=1.0))
     return FilterSetup(setup.config, noise_model({**fields, **factors}), initial_std(fields))
+
+
+def switches_and_numbers(options: FilterOptions) -> tuple[FilterOptions, dict[str, float]]:
+    """The options as the static part of a program and what it is told when it runs: with both,
+    `filter_with` gives the filter of the options, and filters that have the same things switched on
+    share what is compiled. What is considered is left out, as there."""
+    numbers = {
+        name: float(value)
+        for name, value in vars(options).items()
+        if name not in _STATIC and isinstance(value, int | float) and value > 0
+    }
+    considered = dict.fromkeys(CONSIDERED_FIELDS, 0.0)
+    for name in considered:
+        numbers.pop(name, None)
+    return dataclasses.replace(options, **dict.fromkeys(numbers, 1.0), **considered), numbers
 
 
 def noise_model(options: Mapping[str, Any]) -> NoiseModel:

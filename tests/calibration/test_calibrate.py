@@ -5,6 +5,7 @@ import json
 import shutil
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -84,9 +85,9 @@ def test_the_network_is_averaged_over_four_headings(run, two_walks, tmp_path):
     for quarter in range(4):
         turn = np.float32(Rotation.from_euler("z", 90 * quarter, degrees=True).as_matrix())
         turned = (windows.reshape(1, 50, 2, 3) @ turn.T).reshape(1, 50, 6)
-        answers.append(plain.model.apply(plain.variables, turned).displacement @ turn)
+        answers.append(plain.model.apply(plain.variables, jnp.asarray(turned)).displacement @ turn)
     np.testing.assert_allclose(
-        averaged.model.apply(averaged.variables, windows).displacement,
+        averaged.model.apply(averaged.variables, jnp.asarray(windows)).displacement,
         np.mean(answers, axis=0),
         rtol=1e-4,
         atol=1e-6,

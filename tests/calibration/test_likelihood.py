@@ -7,10 +7,12 @@ import jax
 import numpy as np
 import pytest
 
+from gnio_jax.calibration import likelihood
 from gnio_jax.calibration.likelihood import fit, free_vector, innovation_objective
 from gnio_jax.calibration.unknowns import GROUPS, check_fittable, chosen, with_starts
 from gnio_jax.config import FilterOptions
 from gnio_jax.errors import InputError
+from gnio_jax.filtering.options import filter_setup, filter_with, switches_and_numbers
 from gnio_jax.filtering.unconstrained import natural, with_numbers
 from tests.support.calibration_walks import DATA, STRIDES, TRUE, N, walks
 
@@ -36,6 +38,39 @@ def test_the_gradient_is_that_of_the_likelihood():
     for i, step in enumerate(1e-4 * np.eye(len(free))):
         difference = (objective(free + step) - objective(free - step)) / 2e-4
         np.testing.assert_allclose(gradient[i], difference, rtol=1e-3, atol=1e-7)
+
+
+def test_a_second_calibration_compiles_nothing():
+    """Of other walks, with other factors of the axes and another start."""
+    unknowns, given = chosen(("measurement",)), walks()
+    fit(given, DATA, TRUE, unknowns, lambda calls: None, most_steps=1)
+    programs = likelihood._value_and_gradient._cache_size()
+    others = given._replace(displacement=1.01 * given.displacement)
+    options = dataclasses.replace(TRUE, std_factor_x=0.7, velocity_std=0.2)
+    fit(others, DATA, options, unknowns, lambda calls: None, most_steps=1)
+    assert likelihood._value_and_gradient._cache_size() == programs
+
+
+@pytest.mark.parametrize("share", [0.0, 0.8])
+def test_switches_and_numbers_make_the_filter_of_the_options(share):
+    options = dataclasses.replace(
+        TRUE,
+        measurement_scale=2.5,
+        window_error_share=share,
+        mahalanobis_fail_scale=3.0,
+        considered_scale_std=0.1,
+        std_factor_z=0.5,
+    )
+    switches, numbers = switches_and_numbers(options)
+    other = dataclasses.replace(options, velocity_std=0.123, considered_scale_std=0.0)
+    assert switches_and_numbers(other)[0] == switches
+    found, wanted = filter_with(DATA, switches, numbers), filter_setup(DATA, options)
+    assert found.config == dataclasses.replace(wanted.config, measurement_scale=1.0)
+    factors = np.sqrt(2.5) * np.array(wanted.noise.std_factor)
+    np.testing.assert_allclose(found.noise.std_factor, factors, rtol=1e-12)
+    assert found.noise._replace(std_factor=None) == wanted.noise._replace(std_factor=None)
+    assert found.initial_std == wanted.initial_std
+    assert (found.noise.displacement is None) == (share == 0)
 
 
 def test_unknowns_go_to_numbers_without_bounds_and_back():
