@@ -15,6 +15,7 @@ from gnio_jax import pretrained
 from gnio_jax.commands import app, console
 from gnio_jax.config import DataConfig, ModelConfig, TrainConfig
 from gnio_jax.data.hdf5 import write_hdf5
+from gnio_jax.data.resampling import resample
 from gnio_jax.evaluation.exporting import read_trajectory
 from gnio_jax.tracking import choose_weights, picture
 from gnio_jax.tracking.summary import Summary, _warnings
@@ -214,6 +215,9 @@ def test_our_own_file_with_holes(gnio, mistake, runs, tmp_path):
         else:
             told = mistake(*given)
             assert "walk: field 'time' has a gap of 3.210 s after row 199, longer than 1 s" in told
+            # The same on a clock that runs through the hole.
+            write_hdf5(tmp_path / "walk.h5", resample(sequence, 100.0))
+            assert "walk: field 'time' has a gap of 3.210 s" in mistake(*given)
 
 
 def test_an_out_that_cannot_be_written_is_found_first(mistake, runs, tmp_path, monkeypatch):
