@@ -33,6 +33,7 @@ from gnio_jax.filtering.state import (
     GateState,
     ImuMemory,
 )
+from gnio_jax.numerics import finite_rows
 from gnio_jax.types import GRAVITY, Array
 
 _NEVER = -1
@@ -224,7 +225,7 @@ def rest_at_start(
     """The whole seconds at the start in which raw gyro (rad/s) and accel (m/s²) are as quiet as on
     a table (ours). NaN: a sample is missing; a second that lacks more than half of them is not."""
     second, rest = round(REST_SECONDS / dt), 0
-    there = np.isfinite(gyro).all(1) & np.isfinite(accel).all(1)
+    there = finite_rows(gyro) & finite_rows(accel)
     while rest + second <= len(gyro):
         rows = rest + np.flatnonzero(there[rest : rest + second])
         if 2 * len(rows) < second or gyro[rows].std(0).max() > REST_GYRO_STD:
