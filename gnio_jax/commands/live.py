@@ -50,7 +50,8 @@ class LiveOptions:
     """Name, package or run folder; by default the network that comes with gnio-jax, else the newest
     run below runs/."""
     out: Path | None = None
-    """File for the trajectory, in TUM format, when the stream has ended."""
+    """File for the trajectory, in TUM format, when the stream has ended; up to where the filter
+    diverged, if it did."""
     rerun: str | None = None
     """File for the viewer Rerun, NAME.rrd, or the word viewer to look at it now."""
     gyro_unit: Literal["rad/s", "deg/s"] | None = None
@@ -230,7 +231,7 @@ def _line(poses: list[Any]) -> str:
     """The newest pose in words."""
     pose = poses[-1]
     x, y, z = pose.position
-    sigma = float(np.sqrt(np.trace(pose.covariance[6:8, 6:8])))
+    sigma = float(np.sqrt(np.maximum(np.trace(pose.covariance[6:8, 6:8]), 0.0)))
     path = np.array([each.position for each in poses[::10]])
     walked = float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
     health = "" if pose.healthy else "  THE FILTER DIVERGED"
@@ -247,7 +248,7 @@ def _write(path: Path, poses: list[Any]) -> None:
     from gnio_jax.evaluation.tum import write_tum
     from gnio_jax.files import replacing
 
-    sound = [p for p in poses if np.isfinite(p.rotation).all() and np.isfinite(p.position).all()]
+    sound = [pose for pose in poses if pose.healthy]
     if not sound:
         raise InputError(path, "there is no sound pose to write", "the filter diverged at once")
     orientation = Rotation.from_matrix(np.array([pose.rotation for pose in sound]))
