@@ -50,8 +50,7 @@ class LiveOptions:
     """Name, package or run folder; by default the network that comes with gnio-jax, else the newest
     run below runs/."""
     out: Path | None = None
-    """File for the trajectory, in TUM format, when the stream has ended; up to where the filter
-    diverged, if it did."""
+    """File for the trajectory, in TUM format, when the stream has ended."""
     rerun: str | None = None
     """File for the viewer Rerun, NAME.rrd, or the word viewer to look at it now."""
     gyro_unit: Literal["rad/s", "deg/s"] | None = None

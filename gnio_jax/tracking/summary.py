@@ -119,7 +119,10 @@ def summarise(
     holes = prepared.imu_valid is not None
     if holes or any(GAPS in note for note in recording.notes):
         where = "" if holes else " (see above)"
-        found.append(f"gaps: samples are missing{where}, and what happened there is guessed")
+        found.append(
+            f"gaps: samples are missing{where}, and what happened there is guessed: from there on "
+            "heading and place are less certain than the filter says"
+        )
     if (prepared.start.velocity_std or 0.0) > QUIET_START:
         found.append("start: it moves in its first second, so its velocity and tilt are rough")
     diverged = (note for note in estimate.notes if note not in prepared.notes)

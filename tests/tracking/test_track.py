@@ -210,7 +210,9 @@ def test_our_own_file_with_holes(gnio, mistake, runs, tmp_path):
         write_hdf5(tmp_path / "walk.h5", sequence)
         if lost == 70:
             # Whatever the file says of itself, the folder lies in tracks/.
-            assert "warning: gaps: samples are missing, and" in gnio(*given)
+            told = gnio(*given)
+            assert "warning: gaps: samples are missing, and" in told
+            assert "heading and place are less certain than the filter says" in told
             assert (runs.parent / "tracks" / "_.._walk" / "summary.json").is_file()
         else:
             told = mistake(*given)
