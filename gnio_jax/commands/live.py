@@ -39,6 +39,12 @@ UDP = "udp:"
 DRAWN_EVERY = 0.125
 """s. A drawing looks at the whole path: one for each pose would fall behind a long stream."""
 
+VELOCITY = slice(3, 6)
+"""Of a pose's covariance."""
+ROUGH_START = 0.5
+"""m/s. Standard deviation of the first pose's velocity: a start in motion begins with 1, one at
+rest with 0.05 (ours)."""
+
 
 @dataclass(frozen=True)
 class LiveOptions:
@@ -146,7 +152,10 @@ def _rerun(target: str | None) -> Iterator[Callable[[Any], None]]:
 
 
 def _tell(output: Any, found: Any) -> None:
-    """What was refused."""
+    """What was refused, and how it began."""
+    if found.poses and found.poses[0].covariance[VELOCITY, VELOCITY].max() > ROUGH_START**2:
+        lines = "start: it moved while it should lie still, so velocity and tilt are rough"
+        output.print(f"warning: {lines}", soft_wrap=True)
     if found.refused:
         lines = f"warning: {found.refused} lines refused, the first: {found.reason}"
         output.print(lines, soft_wrap=True)

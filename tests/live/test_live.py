@@ -275,6 +275,14 @@ def test_a_gyro_that_turns_gravity_as_degrees_would_is_told():
     np.testing.assert_allclose([s.gyro for s in source.samples], known_walk.rate(time), atol=1e-9)
 
 
+def test_a_start_in_motion_is_told(gnio, run, recorded):
+    """As a track tells it."""
+    lines = as_lines(recorded)
+    warning = "warning: start: it moved while it should lie still"
+    assert warning not in gnio(lines[:75], "--weights", run)
+    assert warning in gnio(lines[50:125], "--weights", run)
+
+
 class Diverging:
     """A tracker whose filter diverges with the sixth pose, and stays finite: all since is void."""
 
