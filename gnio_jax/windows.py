@@ -25,7 +25,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from gnio_jax import geometry
 from gnio_jax.numerics import about_z, finite_rows, rotations, yaw
@@ -55,6 +55,12 @@ def window_starts(samples: int, length: int, stride: int) -> Starts:
     context, `length` counts it too, and a window is said to start with its context.
     """
     return np.arange(0, samples - length, stride)
+
+
+def without_any(bad: Bool[np.ndarray, "t"], start: Starts, length: int) -> Bool[np.ndarray, "m"]:
+    """Which of the windows of `length` samples from `start` on touch no sample that is `bad`."""
+    before = np.concatenate([[0], np.cumsum(bad)])
+    return before[start + length] == before[start]
 
 
 def align_recording(

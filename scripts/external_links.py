@@ -9,6 +9,7 @@ import sys
 import urllib.error
 import urllib.request
 from concurrent.futures import ThreadPoolExecutor
+from http.client import HTTPException
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
@@ -42,7 +43,7 @@ def problem(url):
     except urllib.error.HTTPError as error:
         # Some sites refuse programs, not people.
         return "" if error.code in (403, 405, 429) else f"status {error.code}"
-    except OSError as error:
+    except (OSError, HTTPException, ValueError) as error:  # ValueError: it is no address
         return str(error)
 
 

@@ -39,6 +39,9 @@ UDP = "udp:"
 DRAWN_EVERY = 0.125
 """s. A drawing looks at the whole path: one for each pose would fall behind a long stream."""
 
+VELOCITY = slice(3, 6)
+"""Of a pose's covariance."""
+
 
 @dataclass(frozen=True)
 class LiveOptions:
@@ -146,7 +149,12 @@ def _rerun(target: str | None) -> Iterator[Callable[[Any], None]]:
 
 
 def _tell(output: Any, found: Any) -> None:
-    """What was refused."""
+    """What was refused, and how it began."""
+    from gnio_jax.evaluation.preparation import ROUGH_START
+
+    if found.poses and found.poses[0].covariance[VELOCITY, VELOCITY].max() > ROUGH_START**2:
+        lines = "start: it moved while it should lie still, so velocity and tilt are rough"
+        output.print(f"warning: {lines}", soft_wrap=True)
     if found.refused:
         lines = f"warning: {found.refused} lines refused, the first: {found.reason}"
         output.print(lines, soft_wrap=True)
@@ -230,7 +238,7 @@ def _line(poses: list[Any]) -> str:
     """The newest pose in words."""
     pose = poses[-1]
     x, y, z = pose.position
-    sigma = float(np.sqrt(np.trace(pose.covariance[6:8, 6:8])))
+    sigma = float(np.sqrt(np.maximum(np.trace(pose.covariance[6:8, 6:8]), 0.0)))
     path = np.array([each.position for each in poses[::10]])
     walked = float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
     health = "" if pose.healthy else "  THE FILTER DIVERGED"
@@ -247,7 +255,7 @@ def _write(path: Path, poses: list[Any]) -> None:
     from gnio_jax.evaluation.tum import write_tum
     from gnio_jax.files import replacing
 
-    sound = [p for p in poses if np.isfinite(p.rotation).all() and np.isfinite(p.position).all()]
+    sound = [pose for pose in poses if pose.healthy]
     if not sound:
         raise InputError(path, "there is no sound pose to write", "the filter diverged at once")
     orientation = Rotation.from_matrix(np.array([pose.rotation for pose in sound]))

@@ -25,6 +25,7 @@ from gnio_jax.windows import (
     true_displacement,
     window_rows,
     window_starts,
+    without_any,
 )
 
 
@@ -63,9 +64,9 @@ def window_source(
 
     With `shift` there is a window at every sample, for those of an epoch to be shifted to. A window
     of C + N samples from i, context included, needs the reference at i … i+C+N, all of it
-    valid. Attitude and biases come from the reference (biases zero). Differences of positions are
-    taken in float64, before they are stored in float32. Raises `InputError` when not a single
-    window fits.
+    valid, and no sample across a gap of the IMU. Attitude and biases come from the reference
+    (biases zero). Differences of positions are taken in float64, before they are stored in float32.
+    Raises `InputError` when not a single window fits.
     """
     return joined(window_parts(sequences, config, stride, shift))
 
@@ -98,10 +99,12 @@ def window_parts(
 
 
 def _valid_starts(sequence: Sequence, length: int, stride: int) -> Starts:
-    """Starts of the windows whose reference is valid throughout and at the sample after them."""
+    """Starts of the windows whose reference is valid throughout and at the sample after them, and
+    whose IMU was measured throughout."""
     start = window_starts(len(sequence.time), length, stride)
-    invalid_before = np.concatenate([[0], np.cumsum(~sequence.valid)])
-    return start[invalid_before[start + length + 1] == invalid_before[start]]
+    start = start[without_any(~sequence.valid, start, length + 1)]
+    mask = sequence.imu_valid
+    return start if mask is None else start[without_any(~mask, start, length)]
 
 
 def _source_of(sequence: Sequence, start: Starts, config: DataConfig, stride: int) -> WindowSource:

@@ -3,7 +3,6 @@ made later draws its strips from it."""
 
 from __future__ import annotations
 
-import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +13,8 @@ from gnio_jax.evaluation.estimators.result import Estimate
 DIAGNOSTICS = ("gate", "scale")
 """Of the network; the page shows no others."""
 _UPPER = np.triu_indices(3)
+_ROW = {"gate": (3,), "scale": (3,), "std": (3,), "nis": (), "covariance": (6,)}
+"""What a row of each curve is like."""
 
 
 def write_curves(path: Path, estimate: Estimate) -> None:
@@ -36,12 +37,13 @@ def write_curves(path: Path, estimate: Estimate) -> None:
 def with_curves(estimate: Estimate, path: Path) -> Estimate:
     """An estimate that was read back, with the curves of `path`; as it is where an older version
     wrote none, or they are damaged."""
+    rows = len(estimate.trajectory.time)
     try:
         with np.load(path, allow_pickle=False) as file:
             found = {name: file[name].astype(np.float64) for name in file.files}
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile):
+    except Exception:  # a damaged file makes the parser fail in any way
         return estimate
-    if any(len(values) != len(estimate.trajectory.time) for values in found.values()):
+    if any(found[name].shape != (rows, *_ROW[name]) for name in _ROW.keys() & found.keys()):
         return estimate
     return estimate._replace(
         diagnostics={name: found[name] for name in DIAGNOSTICS if name in found},

@@ -30,6 +30,7 @@ from gnio_jax.windows import (
     cut_windows,
     true_displacement,
     window_starts,
+    without_any,
 )
 
 WINDOWS_PER_CALL = 512
@@ -99,7 +100,8 @@ def predict_windows(
 ) -> list[Prediction]:
     """What the network predicts for every window of the recordings, cut with the given attitudes,
     in large batches over all of them. Row k is the window that starts k strides after the
-    recording; the first rows are NaN where the context would begin before it.
+    recording; the first rows are NaN where the context would begin before it. A displacement over a
+    gap of the IMU is NaN, as it is no measurement to the filter.
 
     Of its diagnostics only those named, if it has them. Float64 on the host.
     """
@@ -122,10 +124,25 @@ def predict_windows(
     ends = np.cumsum([len(part.start) for part in parts])
     rows = [slice(end - len(part.start), end) for end, part in zip(ends, parts, strict=True)]
     without_context = config.context // config.stride
+    each_own = [jax.tree.map(lambda leaf, own=own: leaf[own], whole) for own in rows]
     return [
-        jax.tree.map(lambda leaf, own=own: _after_nothing(leaf[own], without_context), whole)
-        for own in rows
+        jax.tree.map(
+            lambda leaf: _after_nothing(leaf, without_context),
+            _without_gaps(own, each, part.start, config.seen),
+        )
+        for own, each, part in zip(each_own, prepared, parts, strict=True)
     ]
+
+
+def _without_gaps(
+    prediction: Prediction, prepared: Prepared, start: Int[np.ndarray, "m"], length: int
+) -> Prediction:
+    """NaN for the displacements of windows that touch a sample that was not measured."""
+    mask = prepared.imu_valid
+    if mask is None:
+        return prediction
+    whole = without_any(~mask, start, length)[:, None]
+    return prediction._replace(displacement=np.where(whole, prediction.displacement, np.nan))
 
 
 def _after_nothing(rows: Float[np.ndarray, "m *d"], count: int) -> Float[np.ndarray, "_ *d"]:

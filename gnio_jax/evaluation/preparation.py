@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from gnio_jax import data
 from gnio_jax.config import DataConfig, FilterOptions
@@ -113,11 +113,21 @@ def prepare(
             )
             continue
         whole = _samples(sequence, slice(first, first + strides * config.stride + 1))
+        if (measured := len(measured_rows(whole))) < config.seen:
+            seconds = measured / config.rate
+            left_out[sequence.name] = f"{seconds:.2f} s of it measured, too short for a window"
+            continue
         bias = _gyro_bias(whole, config.rate, setup)
         start, note = _start(whole, config, setup, std)
         notes = tuple(filter(None, (bias.note, note)))
         prepared.append(Prepared(whole, start, bias.value, notes))
     return prepared, left_out
+
+
+def measured_rows(sequence: Sequence) -> Int[np.ndarray, "m"]:
+    """Samples of the IMU that are no line across a gap."""
+    mask = sequence.imu_valid
+    return np.arange(len(sequence.time)) if mask is None else np.flatnonzero(mask)
 
 
 def _check_reference(sequence: Sequence, setup: Setup) -> None:
@@ -158,7 +168,7 @@ def _start(
 
 def _static_start(sequence: Sequence, config: DataConfig, std: InitialStd) -> tuple[Start, str]:
     """Level from the gravity of the first second; yaw, velocity and position zero."""
-    second = slice(round(config.rate))
+    second = _first_second(sequence, round(config.rate))
     filter_config = filter_setup(config, FilterOptions()).config
     level = level_state(filter_config, sequence.gyro[second], sequence.accel[second], std)
     found = np.sqrt(np.diag(level.core_covariance))
@@ -168,6 +178,14 @@ def _static_start(sequence: Sequence, config: DataConfig, std: InitialStd) -> tu
         return start, ""
     tilt = np.degrees(tilt_std)
     return start, f"start: not standing still, so its tilt is rough (to {tilt:.0f}°)"
+
+
+def _first_second(sequence: Sequence, samples: int) -> Int[np.ndarray, "m"]:
+    """What was measured of the first second, or where that is not half of it, the first so many
+    samples that were."""
+    measured = measured_rows(sequence)
+    first = measured[measured < samples]
+    return first if 2 * len(first) >= samples else measured[:samples]
 
 
 def _gyro_bias(sequence: Sequence, rate: float, setup: Setup) -> GyroBias:
@@ -183,7 +201,11 @@ def _gyro_bias(sequence: Sequence, rate: float, setup: Setup) -> GyroBias:
 
 def _gyro_bias_at_rest(sequence: Sequence, rate: float) -> GyroBias:
     """Mean of the gyro over the whole seconds of rest at the start."""
-    rest = rest_at_start(sequence.gyro, sequence.accel, 1.0 / rate)
+    # A line across a gap is as quiet as a table: what was not measured is no rest.
+    gyro, accel = np.full((2, len(sequence.time), 3), np.nan)
+    rows = measured_rows(sequence)
+    gyro[rows], accel[rows] = sequence.gyro[rows], sequence.accel[rows]
+    rest = rest_at_start(gyro, accel, 1.0 / rate)
     if not rest.seconds:
         return GyroBias(np.zeros(3), "gyro bias: no rest at the start, so it starts from zero")
     note = f"gyro bias: mean of {rest.seconds:g} s of rest at the start"
@@ -194,6 +216,7 @@ def _gyro_bias_from_reference(sequence: Sequence, rate: float) -> GyroBias:
     """Mean difference of the gyro from the rates of the reference's attitude at the start."""
     rows = np.arange(min(round(REFERENCE_BIAS_SECONDS * rate), len(sequence.time) - 1))
     rows = rows[sequence.valid[rows] & sequence.valid[rows + 1]]
+    rows = np.intersect1d(rows, measured_rows(sequence))
     if len(rows) < rate:
         note = "gyro bias: under 1 s of reference at the start, so it starts from zero"
         return GyroBias(np.zeros(3), note)

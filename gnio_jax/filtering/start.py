@@ -33,6 +33,7 @@ from gnio_jax.filtering.state import (
     GateState,
     ImuMemory,
 )
+from gnio_jax.numerics import finite_rows
 from gnio_jax.types import GRAVITY, Array
 
 _NEVER = -1
@@ -239,15 +240,17 @@ def rest_at_start(
     gyro: Float[np.ndarray, "m 3"], accel: Float[np.ndarray, "m 3"], dt: float
 ) -> Rest:
     """The whole seconds at the start in which raw gyro (rad/s) and accel (m/s²) are as quiet as on
-    a table (ours)."""
+    a table (ours). NaN: a sample is missing; a second that lacks more than half of them is not."""
     second, rest = round(REST_SECONDS / dt), 0
+    there = finite_rows(gyro) & finite_rows(accel)
     while rest + second <= len(gyro):
-        rows = slice(rest, rest + second)
-        quiet = gyro[rows].std(0).max() <= REST_GYRO_STD
-        if not (quiet and accel[rows].std(0).max() <= REST_ACCEL_STD):
+        rows = rest + np.flatnonzero(there[rest : rest + second])
+        if 2 * len(rows) < second or gyro[rows].std(0).max() > REST_GYRO_STD:
+            break
+        if accel[rows].std(0).max() > REST_ACCEL_STD:
             break
         rest += second
-    bias = gyro[:rest].mean(0) if rest else np.zeros(3)
+    bias = gyro[:rest][there[:rest]].mean(0) if rest else np.zeros(3)
     return Rest(np.asarray(bias, np.float64), rest * dt)
 
 

@@ -68,10 +68,11 @@ class RerunStream:
         recording.log("/", rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
 
     def add(self, pose: Pose) -> None:
-        """Send the pose, its 3σ ellipsoid and its NIS; now and then the path."""
+        """Send the pose, its 3σ ellipsoid and its NIS; now and then the path. Nothing of a filter
+        that has diverged."""
         import rerun
 
-        if not (np.isfinite(pose.rotation).all() and np.isfinite(pose.position).all()):
+        if not pose.healthy:
             return
         recording = self._recording
         self._start = pose.time if self._start is None else self._start

@@ -163,4 +163,7 @@ def _received(connection: socket.socket, patience: float) -> dict[str, Any]:
         found += more
         if not more or len(found) > LONGEST or not found.startswith(b"{"):
             raise ValueError("no message")
-    return json.loads(found)
+    try:
+        return json.loads(found)
+    except RecursionError:
+        raise ValueError("no message") from None

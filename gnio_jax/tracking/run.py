@@ -11,14 +11,15 @@ import numpy as np
 from gnio_jax import data
 from gnio_jax.config import DataConfig
 from gnio_jax.data.importing import Imported
-from gnio_jax.data.validation import check_gaps
+from gnio_jax.data.resampling import LONGEST_BRIDGE
+from gnio_jax.data.validation import WINDOW_SECONDS, check_gaps
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import Estimate, Trajectory, exporting, inference_network, prepare
 from gnio_jax.evaluation.estimators.filtered import run_filters
 from gnio_jax.evaluation.exporting import rerun_file
 from gnio_jax.evaluation.exporting.geographic import FirstFix
 from gnio_jax.evaluation.frames import with_the_reference_in_its_frame
-from gnio_jax.evaluation.preparation import Prepared
+from gnio_jax.evaluation.preparation import Prepared, measured_rows
 from gnio_jax.evaluation.setup import OnShare, Setup, no_progress
 from gnio_jax.evaluation.tum import write_tum
 from gnio_jax.files import check_writable_folder, replacing_folder
@@ -99,6 +100,9 @@ def _prepared(sequence: Sequence, windows: DataConfig, std: InitialStd) -> Prepa
     be compared with. Raises `InputError` for a hole that nothing bridges: what was walked in it is
     in no sample."""
     check_gaps(sequence.time, sequence.name)
+    # Lines of an earlier resampling; each clock has widened a hole by up to a sample at each end.
+    there = np.union1d(sequence.time[measured_rows(sequence)], sequence.time[[0, -1]])
+    check_gaps(there, sequence.name, WINDOW_SECONDS + LONGEST_BRIDGE)
     sequence = data.resample(sequence, windows.rate)
     blind = sequence._replace(valid=np.zeros_like(sequence.valid))
     prepared, left_out = prepare([blind], windows, START, std)

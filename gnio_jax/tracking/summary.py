@@ -117,7 +117,10 @@ def summarise(
     holes = prepared.imu_valid is not None
     if holes or any(GAPS in note for note in recording.notes):
         where = "" if holes else " (see above)"
-        found.append(f"gaps: samples are missing{where}, and what happened there is guessed")
+        found.append(
+            f"gaps: samples are missing{where}, and what happened there is guessed: from there on "
+            "heading and place are less certain than the filter says"
+        )
     if (prepared.start.velocity_std or 0.0) > ROUGH_START:
         found.append("start: it moves in its first second, so its velocity and tilt are rough")
     diverged = (note for note in estimate.notes if note not in prepared.notes)
@@ -140,11 +143,14 @@ def _errors(estimate: Estimate) -> dict[str, float | None]:
 
 
 def _rest(prepared: Prepared, config: FilterConfig) -> float:
-    """Share of the strides in which the IMU is as quiet as the filter's rest."""
+    """Share of the strides in which the IMU is as quiet as the filter's rest; a line across a gap
+    is not."""
     sequence, n = prepared.sequence, config.samples_per_clone
     turn = np.linalg.norm(sequence.gyro[:-1] - prepared.gyro_bias, axis=1)
     pull = np.abs(np.linalg.norm(sequence.accel[:-1], axis=1) - GRAVITY)
     quiet = (turn < config.rest_gyro) & (pull < config.rest_accel)
+    if prepared.imu_valid is not None:
+        quiet = quiet & prepared.imu_valid
     return float(quiet.reshape(-1, n).all(axis=1).mean())
 
 

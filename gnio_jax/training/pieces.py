@@ -103,6 +103,8 @@ def piece_source(sequences: Iterable[Sequence], samples: int) -> PieceSource:
 def _source_of(sequence: Sequence, samples: int) -> PieceSource:
     """One recording's pieces, rows counted from 0."""
     known = sequence.valid & finite_rows(sequence.velocity)
+    if sequence.imu_valid is not None:  # a line across a gap is nothing to learn from
+        known = known & sequence.imu_valid
     earliest: list[np.ndarray] = []
     latest: list[np.ndarray] = []
     for first, end in spans(known):

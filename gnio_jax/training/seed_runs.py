@@ -120,14 +120,10 @@ def row_of(run: SeedRun, epoch: int, validation: Row, rate: float) -> Row:
 
 def learning_rate(run: SeedRun) -> float:
     """That of the next step."""
-    """That of the next step."""
-    """That of the next step."""
     return run.training.learning_rate(run.position.step) * run.position.plateau.factor
 
 
 def summary(run: SeedRun, row: Row) -> str:
-    """The line of a finished epoch."""
-    """The line of a finished epoch."""
     """The line of a finished epoch."""
     training = run.training
     return (
@@ -139,7 +135,5 @@ def summary(run: SeedRun, row: Row) -> str:
 
 
 def speed(training: Training, rate: float) -> str:
-    """Windows or pieces per second in words."""
-    """Windows or pieces per second in words."""
     """Windows or pieces per second in words."""
     return f"{rate:,.0f} {training.unit}/s" if rate >= 10 else f"{rate:.2g} {training.unit}/s"

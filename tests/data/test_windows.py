@@ -118,6 +118,15 @@ def test_a_window_of_exactly_its_length_lacks_the_pose_after_it():
     assert windows.window_source([tumbling(21, 0)], CONFIG, 2).start.shape == (1,)
 
 
+def test_no_window_lies_across_a_gap_of_the_imu():
+    """The reference sees through it."""
+    there = np.ones(60, bool)
+    there[[0, 33]] = False
+    source = windows.window_source([tumbling(60, 0)._replace(imu_valid=there)], CONFIG, 1)
+    starts = [i for i in range(40) if there[i : i + 20].all()]
+    np.testing.assert_array_equal(source.start, starts)
+
+
 def test_samples_without_a_reference_may_hold_nan():
     sequence = tumbling(60, 0, invalid=range(25, 30))
     for field in (sequence.orientation, sequence.position):

@@ -8,6 +8,7 @@ import pytest
 
 from gnio_jax.evaluation import Estimate, Trajectory, never_moves, report, score
 from gnio_jax.evaluation import html as pages
+from gnio_jax.evaluation.curves_file import with_curves
 from gnio_jax.evaluation.html import folders
 from gnio_jax.evaluation.html.curves import curves, ellipses, walked
 from tests.support import browser
@@ -228,6 +229,27 @@ def test_a_page_made_later_has_the_strips_of_the_first(tmp_path, walks):
     file.write_bytes(file.read_bytes()[:200])  # what is damaged costs the strips alone
     damaged = folders.read_entry(tmp_path / "eval").estimates[0]
     assert damaged.nis is None and len(damaged.trajectory.time) == 400
+
+
+def compressed(file, **arrays):
+    np.savez_compressed(file, **arrays)
+    return file.read_bytes()
+
+
+def test_damaged_curves_cost_the_strips_alone(tmp_path, walks):
+    """Whatever was damaged: bits of the compressed numbers, or what they are."""
+    file, n = tmp_path / "walk.npz", len(walks[0].trajectory.time)
+    nis, std = np.linspace(0, 9, n), np.ones((n, 3))
+    sound = compressed(file, nis=nis, std=std)
+    assert with_curves(walks[0], file).displacement_std is not None
+    bare = walks[0]._replace(nis=None)
+    flipped = (sound[:k] + bytes([sound[k] ^ 0xFF]) + sound[k + 1 :] for k in range(0, 400, 3))
+    others = ({"nis": np.float32(1)}, {"covariance": std}, {"nis": std}, {"gate": nis})
+    for content in (*flipped, *(compressed(file, **each) for each in others)):
+        file.write_bytes(content)
+        found = with_curves(bare, file)
+        assert found.nis is None or found.nis.shape == (n,)
+        assert len(found.trajectory.time) == n
 
 
 # In a browser

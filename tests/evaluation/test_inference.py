@@ -7,7 +7,7 @@ from gnio_jax import evaluation
 from gnio_jax.config import DataConfig
 from gnio_jax.evaluation import Setup
 from gnio_jax.numerics import yaw
-from tests.support.estimators import CONFIG, INTEGRATE, NETWORK, RATE, rotations, unyaw
+from tests.support.estimators import CONFIG, INTEGRATE, NETWORK, OPTIONS, RATE, rotations, unyaw
 
 
 @pytest.mark.parametrize(
@@ -51,6 +51,26 @@ def test_the_first_gyro_bias_is_taken_off_the_windows_and_the_attitude(clean):
     np.testing.assert_allclose(*attitudes, atol=1e-9)
     a, b = evaluation.predict_windows(NETWORK, [prepared, biased], attitudes, CONFIG)
     np.testing.assert_allclose(a.log_std, b.log_std, atol=1e-5)
+
+
+def test_a_displacement_across_a_gap_of_the_imu_is_none(walks):
+    there = np.ones(len(walks[0].time), bool)
+    there[203:240] = False
+    config = DataConfig(rate=RATE, context_seconds=0.4)
+    sequences = [walks[0]._replace(imu_valid=there), walks[0]]
+    prepared, _ = evaluation.prepare(sequences, config, INTEGRATE)
+    attitudes = [evaluation.attitude(r, config, "reference") for r in prepared]
+    holed, whole = evaluation.predict_windows(NETWORK, prepared, attitudes, config)
+    for row, (found, expected) in enumerate(
+        zip(holed.displacement, whole.displacement, strict=True)
+    ):
+        begin = row * config.stride - config.context
+        if begin >= 0 and there[begin : begin + config.seen].all():
+            np.testing.assert_array_equal(found, expected)
+        else:
+            assert np.isnan(found).all()
+    (path, *_) = evaluation.estimate(prepared, NETWORK, config, OPTIONS, INTEGRATE)
+    assert np.isfinite(path.trajectory.position).all()
 
 
 def test_attitudes(walks):

@@ -70,3 +70,53 @@ def test_other_rates_are_resampled():
     walk = synthetic.pedestrian(1, synthetic.person(1), "handheld", 6.0, 200.0)
     (prepared,), _ = evaluation.prepare([walk], CONFIG)
     assert np.median(np.diff(prepared.sequence.time)) == pytest.approx(1 / RATE)
+
+
+def with_hole(sequence, rows):
+    """The IMU follows lines over the rows, and says so."""
+    there = np.ones(len(sequence.time), bool)
+    there[rows] = False
+    before = np.flatnonzero(there)
+    lines = (
+        np.column_stack([np.interp(np.arange(len(there)), before, c[there]) for c in each.T])
+        for each in (sequence.gyro, sequence.accel)
+    )
+    gyro, accel = lines
+    return sequence._replace(gyro=gyro, accel=accel, imu_valid=there)
+
+
+def test_a_line_across_a_gap_is_no_rest(clean):
+    """A walker whose log lacks its first second rests no more than any other."""
+    holed = with_hole(clean, slice(1, round(RATE)))
+    setup = Setup(init="static", gyro_bias="rest")
+    (prepared,), _ = evaluation.prepare([holed], CONFIG, setup)
+    assert not prepared.gyro_bias.any() and "no rest" in prepared.notes[0]
+    assert prepared.start.velocity_std == 1.0 and (prepared.start.tilt_std or 0.0) > 0.01
+
+
+def test_a_rest_that_lacks_some_samples_is_a_rest(clean):
+    """What was measured of it counts, and the line does not."""
+    rest, second = np.array([0.01, -0.02, 0.005]), round(RATE)
+    resting = clean._replace(gyro=clean.gyro.copy(), accel=clean.accel.copy())
+    resting.gyro[:second], resting.accel[:second] = rest, clean.accel[:second].mean(0)
+    holed = with_hole(resting, slice(5, 5 + second // 3))
+    holed.gyro[10:15] += 1.0
+    setup = Setup(init="static", gyro_bias="rest")
+    (prepared,), _ = evaluation.prepare([holed], CONFIG, setup)
+    np.testing.assert_allclose(prepared.gyro_bias, rest, atol=1e-12)
+    assert "mean of 1 s of rest" in prepared.notes[0] and (prepared.start.velocity_std or 1.0) < 0.1
+
+
+def test_a_gap_says_nothing_of_the_bias(walks):
+    """The reference is there, the gyro is not."""
+    true = np.array([walks[0].attributes[f"gyro_bias_{axis}"] for axis in "xyz"])
+    holed = with_hole(walks[0], slice(100, 150))
+    holed.gyro[100:150] += 3.0
+    (prepared,), _ = evaluation.prepare([holed], CONFIG, Setup(gyro_bias="reference"))
+    np.testing.assert_allclose(prepared.gyro_bias, true, atol=1e-4)
+
+
+def test_what_was_hardly_measured_is_left_out(walks):
+    lost = with_hole(walks[0], slice(30, None))
+    prepared, left_out = evaluation.prepare([lost], CONFIG)
+    assert not prepared and "of it measured, too short" in left_out[lost.name]

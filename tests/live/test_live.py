@@ -14,6 +14,8 @@ from gnio_jax.config import DataConfig, FilterOptions, ModelConfig, TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation.tum import read_tum
 from gnio_jax.filtering import ConsideredStd, Tracker
+from gnio_jax.filtering.pose import Pose
+from gnio_jax.live import rerun_stream
 from tests.evaluation.test_rerun_file import columns_of
 from tests.support import known_walk, tiny_run
 
@@ -273,8 +275,47 @@ def test_a_gyro_that_turns_gravity_as_degrees_would_is_told():
     np.testing.assert_allclose([s.gyro for s in source.samples], known_walk.rate(time), atol=1e-9)
 
 
+def test_a_start_in_motion_is_told(gnio, run, recorded):
+    """As a track tells it."""
+    lines = as_lines(recorded)
+    warning = "warning: start: it moved while it should lie still"
+    assert warning not in gnio(lines[:75], "--weights", run)
+    assert warning in gnio(lines[50:125], "--weights", run)
+
+
+class Diverging:
+    """A tracker whose filter diverges with the sixth pose, and stays finite: all since is void."""
+
+    def __init__(self):
+        self.time = 0
+
+    def push(self, time, gyro, accel):
+        self.time += 1
+        covariance = np.eye(15) * (1.0 if self.time < 6 else -1.0)
+        bias, place = np.zeros(3), np.array([self.time, 0.0, 0.0])
+        flags = {"accepted": 1.0, "nis": 1.0, "healthy": self.time < 6}
+        return Pose(self.time, np.eye(3), bias, place, bias, bias, covariance, **flags)
+
+
+@pytest.mark.filterwarnings("error")
+def test_what_a_diverged_filter_says_is_not_kept(gnio, run, recorded, monkeypatch, tmp_path):
+    monkeypatch.setattr(live, "create_tracker", lambda *_: Diverging())
+    told = gnio(as_lines(recorded)[:9], "--weights", run, "--out", tmp_path / "live.txt")
+    assert "THE FILTER DIVERGED" in told and "nan" not in told
+    np.testing.assert_allclose(read_tum(tmp_path / "live.txt").position[:, 0], np.arange(1, 6))
+
+
+def test_a_diverged_filter_is_not_shown(tmp_path):
+    pytest.importorskip("rerun", reason="needs rerun-sdk")
+    tracker = Diverging()
+    with rerun_stream.streaming(str(tmp_path / "live.rrd")) as stream:
+        for _ in range(9):
+            stream.add(tracker.push(None, None, None))
+    moved = columns_of(tmp_path / "live.rrd")["/live/pose"]["Transform3D:translation"]
+    np.testing.assert_allclose(np.array(moved)[:, 0, 0], np.arange(1, 6))
+
+
 def test_the_file_for_rerun(gnio, run, recorded, monkeypatch, tmp_path):
-    rerun_stream = pytest.importorskip("gnio_jax.live.rerun_stream")
     pytest.importorskip("rerun", reason="needs rerun-sdk")
     monkeypatch.setattr(rerun_stream, "LINE_EVERY", 3)
     monkeypatch.setattr(rerun_stream, "LONGEST_PIECE", 9)

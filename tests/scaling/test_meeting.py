@@ -64,6 +64,10 @@ def test_a_port_that_another_run_listens_at_is_told():
     require_free(address)
 
 
+NESTED = b'{"":' * 1000 + b"\n"
+"""JSON deeper than Python follows."""
+
+
 def free_address():
     with socket.socket() as free:
         free.bind(("localhost", 0))
@@ -113,12 +117,35 @@ def test_a_number_that_is_taken_is_told():
     assert "process 1 is there already; give each its own --process-id" in ends[2]
 
 
+def test_nonsense_at_the_door_keeps_nobody_out():
+    """A program that is no process of a run comes first."""
+    address, ends = free_address(), [None, None]
+
+    def come(process_id):
+        try:
+            gather(Meeting(address, 2, process_id, 20), "a")
+        except Exception as error:
+            ends[process_id] = error
+
+    host, port = address.split(":")
+    first = threading.Thread(target=come, args=(0,))
+    first.start()
+    wait_for(address, 10)
+    with socket.create_connection((host, int(port))) as stranger:
+        stranger.sendall(NESTED)
+        other = threading.Thread(target=come, args=(1,))
+        other.start()
+        for thread in (first, other):
+            thread.join()
+    assert ends == [None, None]
+
+
 def test_those_that_wait_in_vain_are_told():
     ends = gathered(("a", 3, 0), ("a", 3, 1), patience=2)
     assert all("did not all meet within 2 s; every one needs the same" in end for end in ends)
 
 
-@pytest.mark.parametrize("answer", [b"\x00\x00\x06\x04\x00", b"", b"{}\n", b"{" * 5000])
+@pytest.mark.parametrize("answer", [b"\x00\x00\x06\x04\x00", b"", b"{}\n", b"{" * 5000, NESTED])
 def test_a_run_that_has_begun_is_not_joined(answer):
     """Its coordinator, which is JAX's, listens there."""
     with socket.create_server(("localhost", 0)) as other:

@@ -15,6 +15,7 @@ from gnio_jax import pretrained
 from gnio_jax.commands import app, console
 from gnio_jax.config import DataConfig, ModelConfig, TrainConfig
 from gnio_jax.data.hdf5 import write_hdf5
+from gnio_jax.data.resampling import resample
 from gnio_jax.evaluation.exporting import read_trajectory
 from gnio_jax.tracking import choose_weights, picture
 from gnio_jax.tracking.summary import Summary, _warnings
@@ -209,11 +210,16 @@ def test_our_own_file_with_holes(gnio, mistake, runs, tmp_path):
         write_hdf5(tmp_path / "walk.h5", sequence)
         if lost == 70:
             # Whatever the file says of itself, the folder lies in tracks/.
-            assert "warning: gaps: samples are missing, and" in gnio(*given)
+            told = gnio(*given)
+            assert "warning: gaps: samples are missing, and" in told
+            assert "heading and place are less certain than the filter says" in told
             assert (runs.parent / "tracks" / "_.._walk" / "summary.json").is_file()
         else:
             told = mistake(*given)
             assert "walk: field 'time' has a gap of 3.210 s after row 199, longer than 1 s" in told
+            # The same on a clock that runs through the hole.
+            write_hdf5(tmp_path / "walk.h5", resample(sequence, 100.0))
+            assert "walk: field 'time' has a gap of 3.210 s" in mistake(*given)
 
 
 def test_an_out_that_cannot_be_written_is_found_first(mistake, runs, tmp_path, monkeypatch):

@@ -49,6 +49,18 @@ def test_pieces_lie_in_trusted_stretches_and_cover_them_over_epochs():
     assert (np.asarray(again) != starts[3]).any()
 
 
+def test_no_piece_lies_across_a_gap_of_the_imu():
+    there = np.ones(150, bool)
+    there[[45, 46, 110]] = False
+    holed = sequence(150)._replace(imu_valid=there)
+    found, expected = (
+        pieces.piece_source([each], SAMPLES)
+        for each in (holed, sequence(150, invalid=[45, 46, 110]))
+    )
+    np.testing.assert_array_equal(found.earliest, expected.earliest)
+    np.testing.assert_array_equal(found.latest, expected.latest)
+
+
 def test_a_piece_holds_its_samples_and_the_truth_at_its_clones():
     whole = sequence(150, seed=2)
     source = pieces.piece_source([whole], SAMPLES)
