@@ -68,6 +68,9 @@ def _wait_for_all(meeting: Meeting, own: Said, until: float) -> None:
                 raise InputError(f"{meeting.coordinator}", *_in_vain(meeting)) from None
             opened.enter_context(connection)
             said = _heard(connection)
+            # One that was ended meanwhile has left its number to the one that is started in its
+            # place, and is not met.
+            come = {number: other for number, other in come.items() if not _gone(other)}
             if said is None:
                 continue
             problem = _problem(said, own, come)
@@ -93,6 +96,19 @@ def _heard(connection: socket.socket) -> Said | None:
         return Said(str(found["run"]), processes, process_id)
     except (OSError, ValueError, KeyError):
         return None
+
+
+def _gone(connection: socket.socket) -> bool:
+    """Whether the other side has closed it: it says nothing more while it waits."""
+    connection.settimeout(0.0)
+    try:
+        return not connection.recv(1, socket.MSG_PEEK)
+    except BlockingIOError:
+        return False
+    except OSError:
+        return True
+    finally:
+        connection.settimeout(ANSWER_SECONDS)
 
 
 def _problem(said: Said, own: Said, come: dict[int, socket.socket]) -> str | None:

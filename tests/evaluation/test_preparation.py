@@ -91,7 +91,8 @@ def test_a_line_across_a_gap_is_no_rest(clean):
     setup = Setup(init="static", gyro_bias="rest")
     (prepared,), _ = evaluation.prepare([holed], CONFIG, setup)
     assert not prepared.gyro_bias.any() and "no rest" in prepared.notes[0]
-    assert prepared.start.velocity_std == 1.0 and (prepared.start.tilt_std or 0.0) > 0.01
+    # A line would spread by nothing: 0.05 m/s, and 0.002 rad.
+    assert (prepared.start.velocity_std or 0.0) > 0.1 and (prepared.start.tilt_std or 0.0) > 0.005
 
 
 def test_a_rest_that_lacks_some_samples_is_a_rest(clean):

@@ -140,6 +140,32 @@ def test_nonsense_at_the_door_keeps_nobody_out():
     assert ends == [None, None]
 
 
+def test_a_process_that_was_ended_may_come_once_more():
+    """Nobody is met who has gone, and its number is free."""
+    address, ends = free_address(), {}
+
+    def come(process_id):
+        try:
+            gather(Meeting(address, 3, process_id, 20), "a")
+            ends[process_id] = None
+        except InputError as error:
+            ends[process_id] = str(error)
+
+    threads = [threading.Thread(target=come, args=(number,)) for number in range(3)]
+    threads[0].start()
+    wait_for(address, 10)
+    host, port = address.split(":")
+    with socket.create_connection((host, int(port))) as ended:
+        ended.sendall(b'{"run": "a", "processes": 3, "process_id": 1}\n')
+        time.sleep(0.3)
+    for thread in threads[:0:-1]:
+        thread.start()
+        time.sleep(0.2)
+    for thread in threads:
+        thread.join(60)
+    assert ends == {0: None, 1: None, 2: None}
+
+
 def test_those_that_wait_in_vain_are_told():
     ends = gathered(("a", 3, 0), ("a", 3, 1), patience=2)
     assert all("did not all meet within 2 s; every one needs the same" in end for end in ends)
