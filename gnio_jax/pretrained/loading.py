@@ -26,6 +26,15 @@ def load_pretrained(which: str | Path) -> Run:
     return _load_package(place) if package.is_package(place) else load_run(place)
 
 
+def card_of(which: str | Path) -> str:
+    """The model card of a package, Markdown. Raises `InputError`, also for a run, which has
+    none."""
+    place = find(which)
+    if not package.is_package(place):
+        raise InputError(place, "is a run and has no model card", "gnio publish makes a package")
+    return package.read(place).files[package.CARD].decode(errors="replace")
+
+
 def _load_package(place: Path) -> Run:
     found = package.read(place)
     source = str(place / package.CONFIG)

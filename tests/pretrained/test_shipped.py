@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -9,8 +10,10 @@ import pytest
 import gnio_jax
 from gnio_jax import config as configuration
 from gnio_jax import pretrained
+from gnio_jax.commands import app
 from gnio_jax.errors import InputError
 from gnio_jax.pretrained.finding import SHIPPED
+from gnio_jax.training import checkpoint
 from gnio_jax.training.initial import initial_run
 
 MAXIMUM = 5e6
@@ -46,6 +49,27 @@ def test_it_loads_and_answers(about):
     still[..., 2] = 9.81
     prediction = run.model.apply(run.variables, jnp.asarray(still))
     assert np.linalg.norm(prediction.displacement) < 0.05
+
+
+def test_a_run_of_it_is_the_same_network(tmp_path, capsys):
+    out = tmp_path / "runs" / "pedestrian"
+    app.main(["weights", "pedestrian", "--out", str(out)])
+    assert f"gnio evaluate --workdir {out}" in capsys.readouterr().out
+    found, packed = checkpoint.load_run(out), gnio_jax.load_pretrained("pedestrian")
+    assert found.config == dataclasses.replace(packed.config, workdir=str(out))
+    assert (found.epoch, found.step) == (packed.epoch, packed.step)
+    jax.tree.map(np.testing.assert_array_equal, found.variables, packed.variables)
+    with pytest.raises(InputError, match="is there already; name another folder"):
+        pretrained.write_run("pedestrian", out)
+
+
+def test_its_card_is_shown(tmp_path, capsys):
+    app.main(["weights", "pedestrian"])
+    assert capsys.readouterr().out.strip() == pretrained.card_of("pedestrian").strip()
+    with pytest.raises(SystemExit) as leaving:
+        app.main(["weights", "--out", str(tmp_path / "run")])
+    assert leaving.value.code == 2
+    assert "is for one package; name it before --out" in capsys.readouterr().err
 
 
 def _leaves(tree):
