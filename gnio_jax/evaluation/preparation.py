@@ -176,8 +176,8 @@ def _static_start(sequence: Sequence, config: DataConfig, std: InitialStd) -> tu
     start = Start(np.asarray(level.rotation), np.zeros(3), np.zeros(3), tilt_std, velocity_std)
     if velocity_std <= ROUGH_START:
         return start, ""
-    tilt = np.degrees(tilt_std)
-    return start, f"start: not standing still, so its tilt is rough (to {tilt:.0f}°)"
+    known = f"velocity to {velocity_std:.1f} m/s, tilt to {np.degrees(tilt_std):.0f}°"
+    return start, f"start: not standing still, known to one sigma: {known}"
 
 
 def _first_second(sequence: Sequence, samples: int) -> Int[np.ndarray, "m"]:
