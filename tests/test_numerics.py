@@ -128,6 +128,12 @@ def test_cumulative_rotation_is_the_running_product_from_the_identity(count):
     np.testing.assert_allclose(found.as_matrix(), np.stack(expected), atol=1e-13)
 
 
+def test_a_turn_that_is_not_finite_is_refused():
+    turns = Rotation.from_rotvec([[0.1, 0.0, 0.0], [np.nan, 0.0, 0.0]])
+    with pytest.raises(ValueError):
+        numerics.cumulative_rotation(turns)
+
+
 def test_integrate_gyro_returns_the_attitude_of_a_steady_turn_on_any_clock():
     rate = np.array([0.3, -0.5, 0.9])
     time = np.cumsum(np.random.default_rng(0).uniform(0.005, 0.02, 40))

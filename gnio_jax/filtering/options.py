@@ -70,6 +70,15 @@ def filter_with(
     return FilterSetup(setup.config, noise_model({**fields, **factors}), initial_std(fields))
 
 
+def scale_in_noise(setup: FilterSetup) -> FilterSetup:
+    """The same filter, its `measurement_scale` in the noise's factors of σ: filters that differ in
+    the scale alone share what is compiled."""
+    root = math.sqrt(setup.config.measurement_scale)
+    factors = tuple(root * factor for factor in setup.noise.std_factor)
+    config = dataclasses.replace(setup.config, measurement_scale=1.0)
+    return setup._replace(config=config, noise=setup.noise._replace(std_factor=factors))
+
+
 def switches_and_numbers(options: FilterOptions) -> tuple[FilterOptions, dict[str, float]]:
     """The options as the static part of a program and what it is told when it runs: with both,
     `filter_with` gives the filter of the options, and filters that have the same things switched on

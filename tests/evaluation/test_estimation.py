@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from gnio_jax import evaluation
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import Network, Setup, metrics
+from gnio_jax.evaluation.estimators import filtered
 from gnio_jax.evaluation.estimators.integrated import mean_over_windows
 from gnio_jax.types import Prediction
 from tests.support.estimators import (
@@ -193,6 +194,26 @@ def test_batches_change_nothing(walks):
         np.testing.assert_allclose(
             alone.diagnostics["gate"], in_batch.diagnostics["gate"], atol=1e-6
         )
+
+
+def test_another_scale_of_the_covariances_is_used_and_compiles_nothing(walks):
+    prepared, _ = evaluation.prepare(walks[::2], CONFIG)
+    (_, one) = evaluation.estimate(prepared, NETWORK, CONFIG, OPTIONS)
+    programs = filtered._run_with_network._cache_size()
+    options = dataclasses.replace(OPTIONS, measurement_scale=OPTIONS.measurement_scale * 9)
+    (_, scaled) = evaluation.estimate(prepared, NETWORK, CONFIG, options)
+    assert filtered._run_with_network._cache_size() == programs
+    first = np.isfinite(one.displacement_std).all(axis=1).argmax()  # a later window is seen turned
+    np.testing.assert_allclose(
+        scaled.displacement_std[first], 3 * one.displacement_std[first], rtol=1e-12
+    )
+    np.testing.assert_allclose(
+        one.displacement_std[first], np.exp(-3.0) * OPTIONS.measurement_scale**0.5, rtol=0.5
+    )
+    factors = dict.fromkeys(("std_factor_x", "std_factor_y", "std_factor_z"), 3.0)
+    options = dataclasses.replace(OPTIONS, **factors)
+    (_, same_filter) = evaluation.estimate(prepared, NETWORK, CONFIG, options)
+    same(scaled, same_filter, 1e-9)
 
 
 @pytest.mark.parametrize(
