@@ -88,7 +88,7 @@ def live(options: LiveOptions, _prog: str) -> None:
         check_writable(options.out)  # or the trajectory would be lost at the end
     if options.rerun:
         rerun_stream.check(options.rerun)
-    found = following.Follower()
+    found = following.Follower(following.longest_interval(weights.run, rate))
     with console.terminal() as terminal:
         terminal.progress("compiling", 0.0)
         try:
@@ -155,6 +155,10 @@ def _tell(output: Any, found: Any) -> None:
     if found.poses and found.poses[0].covariance[VELOCITY, VELOCITY].max() > ROUGH_START**2:
         lines = "start: it moved while it should lie still, so velocity and tilt are rough"
         output.print(f"warning: {lines}", soft_wrap=True)
+    if found.gaps:
+        lines = f"{len(found.gaps)}, the longest of {max(found.gaps):.2g} s: samples are missing"
+        guessed = "what happened there is guessed, and the filter is surer than it should be"
+        output.print(f"warning: gaps: {lines}, {guessed}", soft_wrap=True)
     if found.refused:
         lines = f"warning: {found.refused} lines refused, the first: {found.reason}"
         output.print(lines, soft_wrap=True)

@@ -269,6 +269,7 @@ def _settings(config: EvaluateConfig, job: Job, prepared: list[Prepared]) -> dic
         **job.provenance,
         "rate": windows.rate,
         "window_seconds": windows.window_seconds,
+        "context_seconds": windows.context_seconds,
         "stride_seconds": windows.stride_seconds,
         "window_rotation": windows.window_rotation,
         "filter": dataclasses.asdict(job.options),

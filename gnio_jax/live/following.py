@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
@@ -48,24 +49,30 @@ def create_tracker(run: Run, imu_rate: float | None = None, rest_seconds: float 
     def predict(windows: Any) -> Any:
         return network.apply(network.variables, windows)
 
-    interval = 1 / (imu_rate or run.config.data.rate)
-    longest_gap = 1.5 * max(setup.config.dt, interval)
     return Tracker.from_rest(
         predict,
         setup.config,
         setup.noise,
         rest_seconds,
         setup.initial_std,
-        longest_gap,
-        imu_rate=1 / interval,
+        longest_interval(run, imu_rate),
+        imu_rate=imu_rate or run.config.data.rate,
         considered=setup.considered,
     )
+
+
+def longest_interval(run: Run, imu_rate: float | None = None) -> float:
+    """s between samples that miss none between them; `imu_rate` as in `create_tracker`."""
+    own = 1 / run.config.data.rate
+    return 1.5 * max(own, 1 / imu_rate if imu_rate else own)
 
 
 @dataclass
 class Follower:
     """What has been found so far."""
 
+    longest_interval: float = math.inf
+    """s; across a longer interval between two samples some are missing."""
     poses: list[Pose] = field(default_factory=list)
     """One for each clone step."""
     samples: int = 0
@@ -79,6 +86,10 @@ class Follower:
     """Why the newest one was refused."""
     stamps: list[float] = field(default_factory=list)
     """Of the first samples, s."""
+    newest: float = math.inf
+    """Stamp of the newest sample, s."""
+    gaps: list[float] = field(default_factory=list)
+    """Lengths of the intervals in which samples are missing, s."""
 
     @property
     def lost(self) -> bool:
@@ -118,6 +129,9 @@ def _pushed(push: Push, sample: Sample | None, found: Follower) -> Pose | None:
     except ValueError as error:
         _refuse(found, str(error))
         return None
+    if sample.time - found.newest > found.longest_interval:
+        found.gaps.append(sample.time - found.newest)
+    found.newest = sample.time
     found.samples += 1
     found.in_a_row = 0
     if found.samples <= FIRST_STAMPS:

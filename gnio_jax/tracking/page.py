@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 from gnio_jax import config as configuration
@@ -20,7 +21,6 @@ def write(
 
 def entry(estimate: Estimate, summary: Summary, config: TrainConfig, command: str) -> html.Entry:
     """What the page is told. The reference is moved into the frame of the track."""
-    windows = config.data
     about = {
         "command": command,
         "walked": f"{summary.path_length:.1f} m in {summary.seconds:.0f} s, "
@@ -29,7 +29,7 @@ def entry(estimate: Estimate, summary: Summary, config: TrainConfig, command: st
         "weights": f"{summary.weights}, trained on {summary.trained_on}",
         "orientation source": "filter",
         "alignment": "start position and yaw" if summary.errors else "",
-        "windows": f"{windows.window_seconds:g} s at {windows.rate:g} Hz",
+        "windows": html.windows_in_words(dataclasses.asdict(config.data)),
     }
     figures = summary.errors or {
         "duration": summary.seconds,

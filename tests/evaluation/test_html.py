@@ -150,6 +150,14 @@ def test_the_table_has_the_figures_of_both_runs(page, entries):
     assert "never moves" in text and "orientation source" in text
 
 
+def test_the_windows_are_told_with_their_context():
+    windows = {"window_seconds": 1.0, "rate": 100.0}
+    assert pages.windows_in_words(windows) == "1 s at 100 Hz"
+    assert pages.windows_in_words({**windows, "context_seconds": 0.0}) == "1 s at 100 Hz"
+    with_context = pages.windows_in_words({**windows, "context_seconds": 0.5})
+    assert with_context == "1 s at 100 Hz, and 0.5 s before"
+
+
 def test_a_page_that_fails_leaves_the_old_one(page, entries, monkeypatch):
     before = page.read_bytes()
     monkeypatch.setattr("pathlib.Path.write_text", lambda *_, **__: (_ for _ in ()).throw(OSError))

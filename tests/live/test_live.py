@@ -132,6 +132,13 @@ def test_a_clock_that_is_set_back_ends_the_stream():
     assert found.newest_reason.startswith("time: must increase")
 
 
+def test_gaps_are_told(gnio, run, recorded):
+    lines = as_lines(recorded)
+    told = gnio([*lines[:100], *lines[115:150], *lines[151:]], "--weights", run)
+    assert "warning: gaps: 2, the longest of 0.32 s: samples are missing" in told
+    assert "gaps" not in gnio(lines, "--weights", run)
+
+
 def test_stamps_in_milliseconds_are_told():
     """Within the tracker's longest gap they are no mistake to it, and nothing would ever come."""
     lines = [f"{10 * k},0,0,0,0,0,9.81" for k in range(100)]

@@ -78,7 +78,7 @@ def label(settings: Mapping[str, Any]) -> str:
 def about(settings: Mapping[str, Any]) -> dict[str, str]:
     """The choices behind the figures, in words."""
     network = settings.get("model")
-    rate, window = settings.get("rate"), settings.get("window_seconds")
+    rate = settings.get("rate")
     found = {
         "recordings": f"{settings['dataset']}, split {settings['split']}",
         "estimator": label(settings),
@@ -88,9 +88,17 @@ def about(settings: Mapping[str, Any]) -> dict[str, str]:
         "gyro bias": settings["gyro_bias"],
         "network": network
         and f"{network}, checkpoint {settings.get('checkpoint')}, step {settings.get('step')}",
-        "windows": rate and f"{window:g} s at {rate:g} Hz",
+        "windows": rate and windows_in_words(settings),
     }
     return {name: str(value) for name, value in found.items() if value}
+
+
+def windows_in_words(settings: Mapping[str, Any]) -> str:
+    """Of what the network sees, from fields of `DataConfig`; reports of earlier versions have no
+    context."""
+    text = f"{settings['window_seconds']:g} s at {settings['rate']:g} Hz"
+    context = settings.get("context_seconds")
+    return f"{text}, and {context:g} s before" if context else text
 
 
 # Figures in words
