@@ -36,6 +36,7 @@ from gnio_jax.training.seed_runs import (
     next_epoch,
     row_of,
     speed,
+    stuck_head,
     summary,
 )
 from gnio_jax.training.setup import set_up
@@ -287,6 +288,8 @@ def _end_epoch(
         position = next_epoch(run.training, epoch, run.position, row, best)
         log.add(row)
         reporter.line(summary(run, row) + ("  best" if improved else ""))
+        if warning := stuck_head(row):
+            reporter.line(run.name + warning)
         if improved:
             run.checkpoints.save("best", state, position)
         run.checkpoints.save("latest", state, position)

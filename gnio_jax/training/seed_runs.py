@@ -13,6 +13,7 @@ from gnio_jax.training.log import Row
 from gnio_jax.training.step import Progress
 from gnio_jax.training.together import Together
 
+_HEAD = "gradient_norm/head/"
 BEGINNING = Position(epoch=0, step=0, best_loss=None, loss_sums=(), seconds=0.0)
 
 
@@ -131,6 +132,22 @@ def summary(run: SeedRun, row: Row) -> str:
         f"loss {row['loss']:.4g}  val {row['val_loss']:.4g}  val rmse {row['val_rmse']:.4f} m  "
         f"{training.remark(row)}lr {row['learning_rate']:.2e}  "
         f"{speed(training, row[f'{training.unit}_per_second'])}"
+    )
+
+
+def stuck_head(row: Row) -> str | None:
+    """A warning where no gradient at all reached a layer of the head in the epoch of `row`.
+
+    A training that diverges may leave the network there: where every scale s = softplus(·)
+    underflows to 0, so do the gradients of gate and encoder, and d̂ = 0 for good.
+    """
+    layers = [name for name, norm in row.items() if name.startswith(_HEAD) and norm == 0]
+    if not layers:
+        return None
+    named = ", ".join(name.removeprefix("gradient_norm/") for name in layers)
+    return (
+        f"warning: no gradient reached {named} in this epoch, the network learns no more; "
+        "start over with a lower optim.learning_rate, or with optim.clip_norm"
     )
 
 

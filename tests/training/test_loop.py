@@ -22,7 +22,7 @@ from gnio_jax.config import DataConfig, LossConfig, ModelConfig, OptimConfig, Tr
 from gnio_jax.data import windows
 from gnio_jax.errors import InputError
 from gnio_jax.models import registry
-from gnio_jax.training import checkpoint, kinds, loop, on_windows, optimizer, step
+from gnio_jax.training import checkpoint, kinds, loop, on_windows, optimizer, seed_runs, step
 from gnio_jax.training.losses import Losses
 from tests.support.runs import shared_programs
 from tests.support.tiny_network import Tiny
@@ -343,6 +343,29 @@ def test_a_loss_that_is_not_finite_stops_with_its_step(recording, tmp_path, monk
         int(np.flatnonzero(np.asarray(step.epoch_order(order_key, 0, found[0])) == 77)[0]) // 16
     )
     assert f"at step {expected} " in str(raised.value)
+
+
+class Stuck(Tiny):
+    """A network whose scale has underflowed: what it says of the displacement is 0, whatever its
+    head does."""
+
+    def __call__(self, windows, train=False):
+        found = super().__call__(windows, train)
+        return found._replace(displacement=0 * found.displacement)
+
+
+def test_a_head_that_no_gradient_reaches_is_told_of(recording, finished, tmp_path, capsys):
+    optim = OptimConfig(epochs=1, batch_size=16)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(registry._MODELS, "tiny", Stuck)
+        loop.train(tiny(recording, tmp_path / "run", optim=optim))
+    warned = [line for line in capsys.readouterr().err.splitlines() if "warning" in line]
+    assert warned == [
+        "warning: no gradient reached head/bias, head/kernel in this epoch, the network learns no "
+        "more; start over with a lower optim.learning_rate, or with optim.clip_norm"
+    ]
+    rows = (finished[0] / "metrics.jsonl").read_text().splitlines()
+    assert not any(seed_runs.stuck_head(json.loads(row)) for row in rows)
 
 
 def test_two_stage_loss_without_float64(recording, tmp_path, monkeypatch):
