@@ -82,7 +82,7 @@ def fit_considered(
         raise InputError("the filter", "has a covariance on these recordings that is not one")
     fitted = with_numbers(options, dict(zip(CONSIDERED, found.x, strict=True)), DIGITS)
     before, after = (
-        float(jnp.mean(normalised_squares(positions.error, covariance)) / 3)
+        float(_nees_per_axis(positions.error, covariance))
         for covariance in (
             positions.covariance,
             with_considered(positions, considered_std(vars(fitted))),
@@ -91,6 +91,15 @@ def fit_considered(
     return Considered(fitted, before, after)
 
 
+@jax.jit
+def _nees_per_axis(
+    error: Float[Array, "k 3"], covariance: Float[Array, "k 3 3"]
+) -> Float[Array, ""]:
+    """Mean over all positions of eᵀ P⁻¹ e / 3."""
+    return jnp.mean(normalised_squares(error, covariance)) / 3
+
+
+@jax.jit
 def with_considered(positions: Positions, std: ConsideredStd) -> Float[Array, "k 3 3"]:
     """Covariances of the positions with the errors that are considered, m²."""
     return positions.covariance + considered_covariance(positions.sensitivity, std)

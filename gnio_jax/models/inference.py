@@ -7,6 +7,7 @@ products as the whole encoder.
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -38,6 +39,7 @@ class Inference:
         return self.model.apply(ready.variables, windows, **ready.constants)  # type: ignore[return-value]
 
 
+@functools.partial(jax.jit, static_argnames="model")
 def inference_variables(model: nn.Module, variables: Any) -> InferenceVariables:
     """Variables with every batch normalisation folded into its convolution, and what
     `model.constants` makes of them, if it has that."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import functools
 from typing import Any, get_args
 
 import jax
@@ -93,7 +94,13 @@ def initialise(model: nn.Module, key: PRNGKeyArray, window: int = 200) -> Any:
 
 def variable_shapes(model: nn.Module, window: int = 200) -> Any:
     """The shapes and types of what `initialise` gives; nothing is computed."""
-    return jax.eval_shape(model.init, jax.random.key(0), _windows(window))
+    return _initialised.eval_shape(model, jax.random.key(0), _windows(window))
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _initialised(model: nn.Module, key: PRNGKeyArray, windows: Any) -> Any:
+    """`model.init`, whose traces JAX keeps: a run is loaded many times in one process."""
+    return model.init(key, windows)
 
 
 def _windows(window: int) -> jax.ShapeDtypeStruct:

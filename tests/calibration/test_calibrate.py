@@ -81,19 +81,19 @@ def test_the_network_is_averaged_over_four_headings(run, two_walks, tmp_path):
     assert averaged.config.model.equivariance == "four_headings"
     jax.tree.map(np.testing.assert_array_equal, averaged.variables, plain.variables)
     windows = np.random.default_rng(0).normal(size=(1, 50, 6)).astype(np.float32)
-    answers = []
+    predict, answers = jax.jit(plain.model.apply), []
     for quarter in range(4):
         turn = np.float32(Rotation.from_euler("z", 90 * quarter, degrees=True).as_matrix())
         turned = (windows.reshape(1, 50, 2, 3) @ turn.T).reshape(1, 50, 6)
-        answers.append(plain.model.apply(plain.variables, jnp.asarray(turned)).displacement @ turn)
+        answers.append(predict(plain.variables, jnp.asarray(turned)).displacement @ turn)
     np.testing.assert_allclose(
-        averaged.model.apply(averaged.variables, jnp.asarray(windows)).displacement,
+        jax.jit(averaged.model.apply)(averaged.variables, jnp.asarray(windows)).displacement,
         np.mean(answers, axis=0),
         rtol=1e-4,
         atol=1e-6,
     )
     out = tmp_path / "out"
-    fit = dataclasses.replace(asked, out=str(out), steps=1, fit=("measurement",))
+    fit = dataclasses.replace(asked, out=str(out), steps=1, fit=("measurement", "window"))
     calibration.calibrate(fit)
     written = checkpoint.load_run(out)
     assert written.config.model.equivariance == "four_headings"
@@ -171,16 +171,15 @@ def test_the_factors_are_those_of_the_errors():
         std_factors([estimate(error, std)], [truth])
 
 
-@pytest.fixture
-def fold_runs(run, tmp_path):
+@pytest.fixture(scope="module")
+def fold_runs(run, tmp_path_factory):
     """Copies of the run as the folds of one experiment, whose networks differ by a factor."""
-    folders = []
+    folders, loaded, parent = [], checkpoint.load_run(run), tmp_path_factory.mktemp("folds")
     for fold in (0, 1):
-        loaded = checkpoint.load_run(run)
         windows = dataclasses.replace(loaded.config.data, folds=2, left_out=fold)
         folders.append(
             drawn_run.save(
-                tmp_path / f"fold{fold}",
+                parent / f"fold{fold}",
                 dataclasses.replace(loaded.config, data=windows, workdir=None),
                 lambda random, kind, shape, fold=fold: random.uniform(0.05, 0.2 + fold, shape),
             )

@@ -16,11 +16,13 @@ from gnio_jax.filtering.options import filter_setup, filter_with, switches_and_n
 from gnio_jax.filtering.unconstrained import natural, with_numbers
 from tests.support.calibration_walks import DATA, STRIDES, TRUE, N, walks
 
+UNKNOWNS = (*chosen(("measurement",)), *GROUPS["noise"][:2])
+"""Of every fit here: one program serves them all."""
+
 
 def test_the_noises_of_simulated_walks_are_found():
-    unknowns = (*chosen(("measurement",)), *GROUPS["noise"][:2])
     wrong = dataclasses.replace(TRUE, gyro_density=3e-4, accel_density=2e-1)
-    found = fit(walks(), DATA, wrong, unknowns, lambda calls: None)
+    found = fit(walks(), DATA, wrong, UNKNOWNS, lambda calls: None)
     assert found.after < found.before - 0.1
     assert found.options.measurement_scale == pytest.approx(9.0, rel=0.15)
     assert found.options.gyro_density == pytest.approx(2e-3, rel=0.4)
@@ -30,7 +32,8 @@ def test_the_noises_of_simulated_walks_are_found():
 def test_the_gradient_is_that_of_the_likelihood():
     unknowns = chosen(tuple(GROUPS))
     options = with_starts(TRUE, unknowns)
-    both = innovation_objective(walks(), DATA, options, unknowns)
+    two = jax.tree.map(lambda rows: rows[:2], walks())
+    both = innovation_objective(two, DATA, options, unknowns)
     objective = jax.jit(lambda free: both(free)[0])
     free = free_vector(options, unknowns)
     gradient = np.asarray(jax.jit(jax.grad(lambda free: both(free)[0]))(free))
@@ -42,12 +45,12 @@ def test_the_gradient_is_that_of_the_likelihood():
 
 def test_a_second_calibration_compiles_nothing():
     """Of other walks, with other factors of the axes and another start."""
-    unknowns, given = chosen(("measurement",)), walks()
-    fit(given, DATA, TRUE, unknowns, lambda calls: None, most_steps=1)
+    given = walks()
+    fit(given, DATA, TRUE, UNKNOWNS, lambda calls: None, most_steps=1)
     programs = likelihood._value_and_gradient._cache_size()
     others = given._replace(displacement=1.01 * given.displacement)
     options = dataclasses.replace(TRUE, std_factor_x=0.7, velocity_std=0.2)
-    fit(others, DATA, options, unknowns, lambda calls: None, most_steps=1)
+    fit(others, DATA, options, UNKNOWNS, lambda calls: None, most_steps=1)
     assert likelihood._value_and_gradient._cache_size() == programs
 
 
@@ -93,7 +96,6 @@ def test_what_is_switched_off_and_has_no_start_cannot_be_fitted():
 
 
 def test_a_walk_may_be_filled_up_and_a_filter_that_fails_is_named():
-    unknowns = chosen(("measurement",))
     given = walks()
     push = np.repeat([[[90.0, 0.0, 9.81]]], 8, axis=0)  # to 360 m/s, beyond the filter's bound
     falling = given._replace(
@@ -102,9 +104,9 @@ def test_a_walk_may_be_filled_up_and_a_filter_that_fails_is_named():
         displacement=np.concatenate([given.displacement, np.full((8, 40, 3), np.nan)], axis=1),
         std=np.concatenate([given.std, np.ones((8, 40, 3))], axis=1),
     )
-    free = free_vector(TRUE, unknowns)
+    free = free_vector(TRUE, UNKNOWNS)
     values = [
-        float(jax.jit(innovation_objective(each, DATA, TRUE, unknowns))(free)[1])
+        float(jax.jit(innovation_objective(each, DATA, TRUE, UNKNOWNS))(free)[1])
         for each in (given, falling)
     ]
     np.testing.assert_allclose(values[0], values[1], rtol=1e-9)
@@ -112,4 +114,4 @@ def test_a_walk_may_be_filled_up_and_a_filter_that_fails_is_named():
         accel=np.where(np.arange(STRIDES * N)[:, None] == 900, 1e6, given.accel)
     )
     with pytest.raises(InputError, match="the filter: fails on these recordings"):
-        fit(broken, DATA, TRUE, unknowns, lambda calls: None)
+        fit(broken, DATA, TRUE, UNKNOWNS, lambda calls: None)

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gnio_jax import config as configuration
+from gnio_jax import models
 from gnio_jax.training import checkpoint
 from gnio_jax.training.step import TrainState
 
@@ -17,11 +18,10 @@ def save(folder, config, draw):
     """
     configuration.save(folder / "config.yaml", config)
     random = np.random.default_rng(0)
-    window = jax.ShapeDtypeStruct((1, config.data.window, 6), jnp.float32)
-    shapes = jax.eval_shape(checkpoint.create_model(config).init, jax.random.key(0), window)
+    shapes = models.variable_shapes(checkpoint.create_model(config), config.data.window)
     drawn = {
         kind: jax.tree.map(
-            lambda leaf, kind=kind: jnp.asarray(draw(random, kind, leaf.shape), jnp.float32), tree
+            lambda leaf, kind=kind: jnp.asarray(np.float32(draw(random, kind, leaf.shape))), tree
         )
         for kind, tree in shapes.items()
     }

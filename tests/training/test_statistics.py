@@ -14,7 +14,7 @@ from gnio_jax.config import DataConfig, LossConfig, ModelConfig, OptimConfig, Tr
 from gnio_jax.data import windows
 from gnio_jax.training import losses, optimizer, step
 from gnio_jax.training.checkpoint import create_model
-from tests.support.compiling import as_usual, optimised, quick
+from tests.support.compiling import as_usual, lightly_optimised, quick
 
 CONFIG = TrainConfig(
     data=DataConfig(rate=50.0),
@@ -25,9 +25,13 @@ CONFIG = TrainConfig(
     ),
 )
 
+FEW = dataclasses.replace(
+    CONFIG, optim=dataclasses.replace(CONFIG.optim, statistics_windows=3 * 64)
+)
+"""With statistics of three batches."""
 
 NAMES = ("model", "optimizer", "config")
-STEPS = optimised(step.train_steps.__wrapped__, static_argnames=NAMES)
+STEPS = lightly_optimised(step.train_steps.__wrapped__, static_argnames=NAMES)
 FEW_STEPS = quick(step.train_steps.__wrapped__, static_argnames=NAMES)
 
 
@@ -143,21 +147,17 @@ def test_training_windows_err_in_inference_mode_as_in_training_mode(trained):
 def test_statistics_are_means_over_batches(trained):
     """Of the first normalisation, against NumPy: its input is a convolution of drawn windows."""
     model, _, state, source = trained
-    few = dataclasses.replace(
-        CONFIG, optim=dataclasses.replace(CONFIG.optim, statistics_windows=3 * 64)
-    )
-    assert step.statistics_batches(source, few) == 3
-    found = estimated(model, state, source, few, key=7).batch_stats["encoder"]["stem_bn"]
+    assert step.statistics_batches(source, FEW) == 3
+    found = estimated(model, state, source, FEW, key=7).batch_stats["encoder"]["stem_bn"]
     kernel = np.asarray(state.params["encoder"]["stem_conv"]["kernel"], np.float64)
     order_key, draw_key = jax.random.split(jax.random.key(7))
     order = np.asarray(jax.random.permutation(order_key, source.visited))[: 3 * 64].reshape(3, 64)
+    draw = jax.jit(step.draw_windows, static_argnames="config")
     means, variances = [], []
     for number, which in enumerate(order):
         with jax.enable_x64(False):
             imu = np.asarray(
-                step.draw_windows(
-                    jax.random.fold_in(draw_key, number), source, jnp.asarray(which), few
-                )[0].imu,
+                draw(jax.random.fold_in(draw_key, number), source, jnp.asarray(which), FEW)[0].imu,
                 np.float64,
             )
         padded = np.pad(imu, ((0, 0), (3, 3), (0, 0)))
@@ -173,20 +173,17 @@ def test_statistics_are_means_over_batches(trained):
 
 def test_an_estimate_depends_on_parameters_and_key_alone(trained):
     model, _, state, source = trained
-    few = dataclasses.replace(
-        CONFIG, optim=dataclasses.replace(CONFIG.optim, statistics_windows=128)
-    )
-    one = estimated(model, state, source, few)
+    one = estimated(model, state, source, FEW)
     other = estimated(
         model,
         state._replace(
             batch_stats=jax.tree.map(lambda x: x + 3, state.batch_stats), step=jnp.int32(5)
         ),
         source,
-        few,
+        FEW,
     )
     assert all(jax.tree.leaves(jax.tree.map(np.array_equal, one.batch_stats, other.batch_stats)))
-    third = estimated(model, state, source, few, key=1)
+    third = estimated(model, state, source, FEW, key=1)
     assert not np.array_equal(
         one.batch_stats["encoder"]["stem_bn"]["mean"],
         third.batch_stats["encoder"]["stem_bn"]["mean"],
@@ -195,7 +192,7 @@ def test_an_estimate_depends_on_parameters_and_key_alone(trained):
         step.statistics_batches(
             source,
             dataclasses.replace(
-                few, optim=dataclasses.replace(few.optim, statistics_windows=10**9)
+                FEW, optim=dataclasses.replace(FEW.optim, statistics_windows=10**9)
             ),
         )
         == source.visited.shape[0] // 64
