@@ -1,0 +1,96 @@
+"""Winograd's convolution against XLA's own and against differences."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from gnio_jax.models import resnet
+from gnio_jax.models.winograd import convolve_three
+from tests.support.compiling import quick
+
+GIVEN = dict(window_strides=(1,), padding=[(1, 1)], dimension_numbers=("NWC", "WIO", "NWC"))
+
+
+def drawn(length, channels=3, features=2, batch=2):
+    random = np.random.default_rng(length)
+    x = random.standard_normal((batch, length, channels)).astype(np.float32)
+    return x, random.standard_normal((3, channels, features)).astype(np.float32)
+
+
+def by_definition(x, kernel):
+    """In float64, sample by sample."""
+    padded = np.pad(x.astype(np.float64), ((0, 0), (1, 1), (0, 0)))
+    samples = range(x.shape[1])
+    return np.stack([np.einsum("bkc,kcd->bd", padded[:, n : n + 3], kernel) for n in samples], 1)
+
+
+@pytest.mark.parametrize("length", [1, 3, 4, 5, 8, 13])
+def test_values_and_gradients_are_those_of_the_definition(length):
+    x, kernel = drawn(length)
+    weight = np.random.default_rng(9).standard_normal((2, length, 2)).astype(np.float32)
+
+    def loss(convolution, x, kernel):
+        return jnp.sum(convolution(x, kernel) * weight)
+
+    def native(x, kernel):
+        return jax.lax.conv_general_dilated(x, kernel, **GIVEN)
+
+    @quick
+    def both(x, kernel):
+        gradients = (jax.grad(loss, (1, 2))(each, x, kernel) for each in (convolve_three, native))
+        return convolve_three(x, kernel), *gradients
+
+    found, gradient, wanted = both(x, kernel)
+    assert found.dtype == jnp.float32
+    np.testing.assert_allclose(found, by_definition(x, kernel), atol=2e-5)
+    for one, other in zip(gradient, wanted, strict=True):
+        np.testing.assert_allclose(one, other, atol=2e-5)
+
+
+def test_it_loses_a_digit_at_most():
+    """Of many channels, the error as a share of the result's size."""
+    x, kernel = drawn(25, channels=128, features=128, batch=8)
+    wanted = by_definition(x, kernel)
+    size = np.sqrt(np.mean(wanted**2))
+
+    def error(convolution):
+        return np.sqrt(np.mean((np.asarray(convolution(x, kernel)) - wanted) ** 2)) / size
+
+    def product(x, kernel):
+        return resnet.convolve(x, kernel, (1,), [(1, 1)])
+
+    assert error(quick(product)) < 1e-6
+    assert error(quick(convolve_three)) < 5e-6
+
+
+def test_no_derivative_in_forward_mode_is_promised():
+    x, kernel = map(jnp.asarray, drawn(4))
+    with pytest.raises(TypeError, match="forward-mode"):
+        jax.jvp(convolve_three, (x, kernel), (x, kernel))
+
+
+@pytest.mark.parametrize(
+    "channels, stride, train, dtype, used",
+    [
+        (64, 1, True, "float32", True),
+        (32, 1, True, "float32", False),
+        (64, 2, True, "float32", False),
+        (64, 1, False, "float32", False),
+        (64, 1, True, "bfloat16", False),
+    ],
+)
+def test_training_uses_it_where_it_is_quicker(channels, stride, train, dtype, used, monkeypatch):
+    calls = []
+    monkeypatch.setattr(resnet, "convolve_three", lambda *given: calls.append(given) or given[0])
+    layer = resnet.conv(channels, 3, stride, train, "conv", dtype)
+    jax.eval_shape(layer.init, jax.random.key(0), jnp.zeros((1, 8, channels), jnp.float32))
+    assert bool(calls) is used
+
+
+def test_other_devices_train_with_the_product(monkeypatch):
+    """Their products may have fewer digits than float32."""
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    monkeypatch.setattr(resnet, "convolve_three", lambda *_: pytest.fail("used"))
+    layer = resnet.conv(64, 3, 1, True, "conv", "float32")
+    jax.eval_shape(layer.init, jax.random.key(0), jnp.zeros((1, 8, 64), jnp.float32))
