@@ -14,6 +14,7 @@ from contextlib import contextmanager
 from typing import Any, TypeVar
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
@@ -91,16 +92,20 @@ def check_batch(size: int, parts: int) -> None:
         raise InputError("optim.batch_size", problem, remedy)
 
 
-def host_copy(leaf: Any) -> jax.Array:
-    """A copy of an array, by way of the host: `jnp.array` compiles a program for each shape."""
-    return jax.device_put(np.array(leaf))
+def fresh_copy(leaf: Any) -> jax.Array:
+    """A copy of an array of the device or of the host.
+
+    `jnp.array` compiles a program for each shape, so the many shapes of a network's state go by way
+    of the host. Parts of recordings do not: JAX frees late what it shares with NumPy.
+    """
+    return jax.device_put(np.array(leaf)) if isinstance(leaf, jax.Array) else jnp.array(leaf)
 
 
 def everywhere(tree: Tree) -> Tree:
     """Copies of host arrays on each of the devices; every process must give the same ones."""
     mesh = jax.sharding.get_mesh()
     if mesh.empty:
-        return jax.tree.map(host_copy, tree)
+        return jax.tree.map(fresh_copy, tree)
     return jax.tree.map(lambda leaf: _copied(leaf, mesh), tree)
 
 
@@ -113,7 +118,7 @@ def one_each(tree: Tree) -> Tree:
     """Host arrays whose rows, one for each seed, are shared out among the devices."""
     mesh = jax.sharding.get_mesh()
     if mesh.empty:
-        return jax.tree.map(host_copy, tree)
+        return jax.tree.map(fresh_copy, tree)
     return jax.device_put(tree, NamedSharding(mesh, PartitionSpec(SEEDS)))
 
 

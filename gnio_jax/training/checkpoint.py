@@ -345,7 +345,7 @@ class _WrittenByOne(ocp.StandardCheckpointHandler):
 def uncommitted(tree: Any) -> Any:
     """Plain copies of arrays that are committed to a device, or to several: one compiled step for
     both."""
-    return jax.tree.map(devices.host_copy, tree)
+    return jax.tree.map(devices.fresh_copy, tree)
 
 
 def _position(found: dict[str, Any]) -> Position:
