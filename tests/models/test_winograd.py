@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.sharding import AxisType, NamedSharding, PartitionSpec
 
 from gnio_jax.models import resnet
 from gnio_jax.models.winograd import convolve_three
@@ -62,6 +63,28 @@ def test_it_loses_a_digit_at_most():
 
     assert error(quick(product)) < 1e-6
     assert error(quick(convolve_three)) < 5e-6
+
+
+def test_devices_that_share_a_batch_and_seeds_side_by_side_have_the_same_gradients():
+    x, kernel = drawn(8)
+    kernels = np.stack([kernel, 2 * kernel])
+
+    @quick
+    def gradients(x, kernels):
+        def loss(x, kernel):
+            return jnp.mean(convolve_three(x, kernel) ** 2)
+
+        return jax.vmap(jax.grad(loss, (0, 1)), (None, 0))(x, kernels)
+
+    alone = gradients(x, kernels)
+    mesh = jax.make_mesh((2,), ("batch",), (AxisType.Auto,))
+    shared = jax.device_put(x, NamedSharding(mesh, PartitionSpec("batch")))
+    jax.tree.map(
+        lambda one, other: np.testing.assert_allclose(one, other, 1e-5, 1e-6),
+        gradients(shared, kernels),
+        alone,
+    )
+    np.testing.assert_allclose(alone[1][1], 2 * alone[1][0], rtol=1e-5)
 
 
 def test_no_derivative_in_forward_mode_is_promised():
