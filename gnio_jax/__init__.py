@@ -12,6 +12,7 @@ from typing import Any
 __all__ = [
     "__version__",
     "calibration",
+    "comparison",
     "config",
     "data",
     "deployment",

@@ -18,14 +18,16 @@ ROOMS = {
     "evaluation": BASE | {"data", "models", "filtering", "training"},
     "calibration": BASE | {"data", "filtering", "training", "evaluation"},
     "interop": BASE | {"models", "training"},
-    "tables": BASE | {"data", "models", "filtering", "training", "evaluation", "calibration"},
+    "comparison": BASE | {"evaluation"},
+    "tables": BASE
+    | {"data", "models", "filtering", "training", "evaluation", "calibration", "comparison"},
     "pretrained": BASE | {"models", "training"},
     "tracking": BASE | {"data", "filtering", "training", "evaluation", "pretrained"},
     "live": BASE | {"data", "filtering", "training", "evaluation", "tracking"},
     "deployment": BASE | {"data", "filtering", "training", "evaluation", "pretrained", "tracking"},
     "commands": BASE
-    | {"data", "filtering", "training", "evaluation", "calibration", "interop", "tables"}
-    | {"pretrained", "tracking", "live", "deployment"},
+    | {"data", "filtering", "training", "evaluation", "calibration", "interop", "comparison"}
+    | {"tables", "pretrained", "tracking", "live", "deployment"},
     **{name: BASE for name in BASE},
 }
 """Rooms and top-level modules, and what each may import of the package besides itself."""
@@ -36,7 +38,7 @@ LIBRARIES = {
     "jax2onnx": {"deployment.conversion"},
     "mcap": {"data.importing.bags", "evaluation.exporting.ros"},
     "grain": {"training.supply"},
-    "matplotlib": {"data", "evaluation", "tables", "tracking"},
+    "matplotlib": {"data", "evaluation", "comparison", "tables", "tracking"},
     "onnx": {"deployment"},
     "onnxruntime": {"deployment"},
     "optax": {"training"},

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 from gnio_jax.commands import (
     calibrate,
+    compare,
     console,
     data,
     doctor,
@@ -26,6 +27,7 @@ GNIO = options.Group(
         "train": train.COMMAND,
         "evaluate": evaluate.COMMAND,
         "calibrate": calibrate.COMMAND,
+        "compare": compare.COMMAND,
         "data": data.COMMANDS,
         "track": track.COMMAND,
         "live": live.COMMAND,

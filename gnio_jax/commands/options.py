@@ -299,8 +299,6 @@ def _spell(hint: Any) -> str:
         return "one of " + ", ".join(map(str, members))
     if typing.get_origin(hint) is tuple:
         return f"words out of {_spell(members[0]).removeprefix('one of ')}"
-    if typing.get_origin(hint) is tuple:
-        return _spell(members[0]).replace("one of", "some of", 1)
     if isinstance(hint, types.UnionType) or typing.get_origin(hint) is Union:
         return " or ".join(_spell(member) for member in members)
     return _SPELLING.get(hint, str(hint))

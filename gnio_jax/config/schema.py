@@ -516,3 +516,21 @@ class TablesConfig:
     """Sequences that trajectories draws, separated by commas; by default the first eight."""
     out: str = "runs/tables"
     """Folder of the runs and the tables."""
+
+
+@dataclass(frozen=True)
+class CompareConfig:
+    """What `gnio compare` is asked for."""
+
+    rows: tyro.conf.Positional[Annotated[tuple[str, ...], tyro.conf.arg(metavar="RUNS")]]
+    """Runs, the one to compare with first. A name without its seed stands for all seeds: runs/gnio
+    for runs/gnio_s0, runs/gnio_s1, ... The folder of an evaluation stands for itself."""
+    split: str = "test"
+    """Split whose evaluations are compared."""
+    estimator: Literal["ekf", "integrate", "imu_only"] = "ekf"
+    """Estimator whose evaluations are compared."""
+    metrics: tuple[str, ...] = ("ate", "rpe_1s", "yaw_rmse", "path_length_ratio", "nis", "nees")
+    """Metrics that are compared, as metrics.json names them."""
+    out: str | None = None
+    """Name of files to write, OUT.md, OUT.csv and OUT.png, the errors of every sequence. By
+    default the table is only shown."""

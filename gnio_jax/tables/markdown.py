@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from gnio_jax.comparison.text import grid, spread
 from gnio_jax.files import replacing
 from gnio_jax.tables.experiments import Experiment
 from gnio_jax.tables.summary import COLUMNS, TableRow
@@ -29,12 +30,6 @@ def write(path: Path, experiment: Experiment, found: list[TableRow], notes: list
         open(temporary, "w", newline="", encoding="utf-8") as file,
     ):
         csv.writer(file).writerows(_csv_lines(found))
-
-
-def grid(header: list[str], table: list[list[str]]) -> str:
-    """Cells as a Markdown table."""
-    lines = [header, ["---"] * len(header), *table]
-    return "".join(f"| {' | '.join(cells)} |\n" for cells in lines)
 
 
 def render(experiment: Experiment, found: list[TableRow], notes: list[str]) -> str:
@@ -78,11 +73,6 @@ def arrow(gain: float | None) -> str:
     if round(gain, 1) == 0:
         return "0 %"
     return f"{'↓' if gain > 0 else '↑'} {abs(gain):.1f} %"
-
-
-def spread(values: list[float]) -> float:
-    """Standard deviation over seeds; NaN of one."""
-    return float(np.std(values, ddof=1)) if len(values) > 1 else math.nan
 
 
 def _mean(row: TableRow, metric: str) -> str:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
-from gnio_jax.evaluation import metrics, report
+from gnio_jax.comparison import pairs
 from gnio_jax.tables.experiments import Experiment
 from gnio_jax.tables.matrix import Result
 
@@ -66,22 +66,8 @@ class TableRow(NamedTuple):
     """Figures that belong to this table alone."""
 
 
-Figures = dict[str, Any]
-"""One metrics.json."""
 Extra = dict[str, dict[str, float]]
 """Figures that belong to one table alone: name of a cell -> heading -> value."""
-
-
-class Difference(NamedTuple):
-    """Of `ate` between a row and the first, over the sequences that both have and in which neither
-    diverged with any seed. None, all three, without such a sequence."""
-
-    gain: float | None
-    """% by which the row's is smaller."""
-    mean: float | None
-    """Row minus first, over sequences, of the means over seeds, m."""
-    interval: tuple[float, float] | None
-    """95 % of the mean, groups drawn anew; None for a single group."""
 
 
 def rows(
@@ -92,8 +78,7 @@ def rows(
     group_of, found = groups(results), []
     for result in results:
         cell, own, every = result.cell, errors(result), _every_ate(result)
-        pairs = _pairs(own, first)
-        difference = _difference(own, first, pairs, group_of)
+        difference = pairs.difference(own, first, group_of)
         row = TableRow(
             name=cell.name,
             label=cell.label,
@@ -103,9 +88,9 @@ def rows(
             median=float(np.median(every)) if len(every) else None,
             diverged=int(np.isinf(every).sum()),
             estimates=len(every),
-            compared=len(pairs),
+            compared=difference.compared,
             sequences=len(own.keys() | first.keys()),
-            groups=len({group_of[name] for name in pairs}),
+            groups=difference.groups,
             gain=difference.gain,
             difference=difference.mean,
             interval=difference.interval,
@@ -115,40 +100,20 @@ def rows(
     return found
 
 
-def errors(result: Result) -> dict[str, Float[np.ndarray, "seeds"]]:
-    """Sequence -> `ate` with every seed, m, infinite where the estimate diverged.
-
-    Only sequences that have one with every seed.
-    """
-    seeds = [_ates(figures) for figures in result.figures]
-    return {
-        name: np.array([ates[name] for ates in seeds], float)
-        for name in sorted(seeds[0])
-        if all(name in ates for ates in seeds)
-    }
+def errors(result: Result) -> pairs.Errors:
+    """Sequence -> `ate` with every seed, m, infinite where the estimate diverged."""
+    return pairs.errors(result.figures)
 
 
 def groups(results: list[Result]) -> dict[str, str]:
     """Sequence -> the person or session it belongs to."""
-    return {
-        name: sequence["group"]
-        for result in results
-        for figures in result.figures
-        for name, sequence in figures["sequences"].items()
-    }
-
-
-def _ates(figures: Figures) -> dict[str, float]:
-    """Sequence -> `ate`, m, of the sequences that have one."""
-    ates = {
-        name: report.read_metric(sequence, "ate") for name, sequence in figures["sequences"].items()
-    }
-    return {name: ate for name, ate in ates.items() if ate is not None}
+    return pairs.groups([figures for result in results for figures in result.figures])
 
 
 def _every_ate(result: Result) -> Float[np.ndarray, "estimates"]:
     """Over seeds × sequences, m."""
-    return np.array([ate for seed in result.figures for ate in _ates(seed).values()], float)
+    ates = [pairs.errors([seed]) for seed in result.figures]
+    return np.array([ate for seed in ates for (ate,) in seed.values()], float)
 
 
 def _means_of_seeds(result: Result) -> dict[str, list[float]]:
@@ -161,27 +126,6 @@ def _means_of_seeds(result: Result) -> dict[str, list[float]]:
         for metric, values in means.items()
         if all(value is not None for value in values)
     }
-
-
-def _pairs(own: dict[str, np.ndarray], first: dict[str, np.ndarray]) -> list[str]:
-    """Sequences that both rows have and in which neither diverged with any seed."""
-    return [name for name in own if name in first and np.isfinite([*own[name], *first[name]]).all()]
-
-
-def _difference(
-    own: dict[str, np.ndarray],
-    first: dict[str, np.ndarray],
-    pairs: list[str],
-    group_of: dict[str, str],
-) -> Difference:
-    if not pairs:
-        return Difference(None, None, None)
-    ours, theirs = (np.array([table[name].mean() for name in pairs]) for table in (own, first))
-    return Difference(
-        gain=100 * (1 - float(ours.mean() / theirs.mean())),
-        mean=float((ours - theirs).mean()),
-        interval=metrics.bootstrap(ours - theirs, [group_of[name] for name in pairs]),
-    )
 
 
 def _published_gain(published: float | None, first: float | None) -> float | None:

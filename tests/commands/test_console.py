@@ -177,7 +177,7 @@ def test_a_config_is_found_by_its_name_from_anywhere(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     "arguments, expected",
     [
-        ([], "command: is missing; give one of train, evaluate, calibrate, data"),
+        ([], "command: is missing; give one of train, evaluate, calibrate, compare, data"),
         (["trian"], "command: unknown 'trian'; did you mean 'train'?"),
         (["--verbose"], "command: unknown '--verbose'; give one of train, evaluate"),
         (["data"], "command: is missing; give one of list, check, convert, import"),

@@ -1,0 +1,74 @@
+"""`gnio compare`: runs side by side."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rich import box
+from rich.table import Table
+
+from gnio_jax.commands import console
+from gnio_jax.commands.options import Command
+from gnio_jax.config import CompareConfig
+
+if TYPE_CHECKING:
+    from gnio_jax.comparison import Comparison
+
+DESCRIPTION = """Compare runs sequence by sequence: what a change has changed, and how sure that is.
+
+  {prog} runs/plain runs/context --split sessions_test
+  {prog} runs/plain runs/context --metrics ate rpe_1s rte_60s --out runs/plain_or_context
+  {prog} runs/gnio runs/gnio/eval/oxiod_test_integrate
+
+It reads what gnio evaluate has left; the first run is what the others are compared with. Seeds of a
+run are averaged, and the name of a run without its seed stands for all of them: runs/plain for
+runs/plain_s0, runs/plain_s1, ..., runs/plain_calibrated for runs/plain_s0_calibrated, ... Walks of
+one person or session are not independent, so the 95 % interval of a difference draws whole people
+or sessions anew. An interval on both sides of zero says that the recordings do not tell the two
+apart."""
+
+
+def show(config: CompareConfig, _prog: str) -> None:
+    """Compare, show the table, and write the files that are asked for."""
+    # After the options: --help and mistakes do not wait for these imports.
+    from gnio_jax import comparison
+    from gnio_jax.comparison import text
+
+    found = comparison.compare(config)
+    output = console.stdout()
+    output.print(f"{text.title(found)}\n")
+    output.print(_table(text.lines(found)))
+    for line in text.explanations(found):
+        output.print(line, soft_wrap=True)
+    if config.out:
+        _write(Path(config.out), found)
+        output.print(f"\nresults: {config.out}.md, .csv, .png", soft_wrap=True)
+
+
+def _table(lines: list[list[str]]) -> Table:
+    """The lines, with a space between metrics."""
+    table = Table(box=box.SIMPLE_HEAD, header_style="bold")
+    table.add_column("metric", no_wrap=True)
+    table.add_column("row", overflow="fold")
+    for name in ("mean", "difference (95 %)", "smaller in"):
+        table.add_column(name, justify="right", no_wrap=True)
+    for line, following in zip(lines, [*lines[1:], None], strict=True):
+        table.add_row(*line, end_section=bool(following and following[0]))
+    return table
+
+
+def _write(path: Path, found: Comparison) -> None:
+    """Table and picture."""
+    from gnio_jax.comparison import picture, text
+    from gnio_jax.evaluation import plots
+    from gnio_jax.files import replacing
+
+    text.write(path, found)
+    with replacing(path.with_name(path.name + ".png")) as temporary:
+        plots.save(temporary, picture.draw(found))
+
+
+COMMON = ("RUNS", "--split", "--estimator", "--metrics", "--out")
+
+COMMAND = Command(CompareConfig, show, DESCRIPTION, common=COMMON)

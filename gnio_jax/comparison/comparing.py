@@ -1,0 +1,93 @@
+"""Rows of evaluations compared, metric by metric, with the first of them."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import NamedTuple
+
+from gnio_jax.comparison import pairs
+from gnio_jax.comparison.pairs import Difference
+from gnio_jax.comparison.rows import Row, read_row
+from gnio_jax.config import CompareConfig
+from gnio_jax.errors import InputError
+
+
+class Cell(NamedTuple):
+    """A metric of a row."""
+
+    label: str
+    seeds: list[float]
+    """Mean over the sequences that did not diverge, with each seed; empty where some seed has
+    none."""
+    diverged: int
+    """Estimates that diverged, of seeds × sequences; they are in no mean."""
+    difference: Difference | None
+    """To the first row; None for the first itself, and without the metric."""
+
+
+class Comparison(NamedTuple):
+    """What a comparison shows."""
+
+    dataset: str
+    split: str
+    rows: list[Row]
+    cells: dict[str, list[Cell]]
+    """Metric -> a cell for each row."""
+
+
+def compare(config: CompareConfig) -> Comparison:
+    """Read the rows' evaluations and compare them. Raises `InputError` for rows that cannot be
+    compared and metrics that none of them has."""
+    if len(config.rows) < 2:
+        raise InputError("RUNS", "needs two or more", "name the run to compare with first")
+    rows = [read_row(word, config.split, config.estimator) for word in config.rows]
+    dataset, split = _common_recordings(rows)
+    rows = [row._replace(label=label) for row, label in zip(rows, _labels(rows), strict=True)]
+    known = {metric: None for row in rows for seed in row.seeds for metric in seed["mean"]}
+    for metric in config.metrics:
+        if metric not in known or metric == "diverged":
+            names = ", ".join(name for name in known if name != "diverged")
+            raise InputError("--metrics", f"no row has '{metric}'", f"there are: {names}")
+    return Comparison(dataset, split, rows, {m: _cells(rows, m) for m in config.metrics})
+
+
+def _common_recordings(rows: list[Row]) -> tuple[str, str]:
+    """Dataset and split of all rows. Raises `InputError` where they differ."""
+    first = _recordings(rows[0], 0)
+    for row in rows:
+        for number, folder in enumerate(row.folders):
+            if _recordings(row, number) != first:
+                problem = f"is of {' '.join(_recordings(row, number))}, the first row of"
+                raise InputError(str(folder), f"{problem} {' '.join(first)}")
+    return first
+
+
+def _recordings(row: Row, seed: int) -> tuple[str, str]:
+    settings = row.seeds[seed]["settings"]
+    return settings["dataset"], settings["split"]
+
+
+def _labels(rows: list[Row]) -> list[str]:
+    """The rows' names without the folder that all are in."""
+    paths = [Path(row.label).absolute() for row in rows]
+    common = os.path.commonpath([path.parent for path in paths])
+    return [str(path.relative_to(common)) for path in paths]
+
+
+def _cells(rows: list[Row], metric: str) -> list[Cell]:
+    """One metric of every row."""
+    group_of = pairs.groups([seed for row in rows for seed in row.seeds])
+    tables = [pairs.errors(row.seeds, metric) for row in rows]
+    cells = []
+    for number, (row, own) in enumerate(zip(rows, tables, strict=True)):
+        means = [seed["mean"].get(metric) for seed in row.seeds]
+        cells.append(
+            Cell(
+                label=row.label,
+                seeds=[] if None in means else [float(mean) for mean in means],
+                diverged=sum(seed["mean"]["diverged"] for seed in row.seeds),
+                difference=pairs.difference(own, tables[0], group_of) if number and own else None,
+            )
+        )
+    return cells

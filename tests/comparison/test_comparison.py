@@ -1,0 +1,188 @@
+"""Comparisons of made-up evaluations, by hand."""
+
+import csv
+import json
+import math
+
+import numpy as np
+import pytest
+
+from gnio_jax import comparison
+from gnio_jax.commands import app
+from gnio_jax.comparison import pairs, picture, rows, text
+from gnio_jax.config import CompareConfig
+from gnio_jax.errors import InputError
+
+GROUPS = {"a": "ann", "b": "ann", "c": "bob"}
+
+
+def write(run, ates, name="oxiod_test_ekf", drop=(), **settings):
+    """An evaluation of a run: `ate` of sequence -> m, infinite where it diverged; `rpe_1s` is a
+    tenth of it. `drop`: metrics that it lacks."""
+    sequences = {}
+    for sequence, ate in ates.items():
+        values = {"ate": ate, "rpe_1s": ate / 10}
+        if math.isinf(ate):
+            reason = "the estimate is not finite from 2.0 s on"
+            values = {"ate": None, "rpe_1s": 0.5, "undefined": {"ate": reason}}
+        kept = {key: value for key, value in values.items() if key not in drop}
+        sequences[sequence] = {**kept, "group": GROUPS[sequence]}
+    finite = [ate for ate in ates.values() if math.isfinite(ate)]
+    mean = {"ate": np.mean(finite), "rpe_1s": np.mean(finite) / 10}
+    figures = {
+        "settings": {"dataset": "oxiod", "split": "test", "definitions": 2, **settings},
+        "sequences": sequences,
+        "mean": {
+            **{key: value for key, value in mean.items() if key not in drop},
+            "diverged": len(ates) - len(finite),
+        },
+    }
+    folder = run / "eval" / name
+    folder.mkdir(parents=True)
+    (run / "config.yaml").write_text("dataset: oxiod\n")
+    (folder / "metrics.json").write_text(json.dumps(figures))
+    return folder
+
+
+@pytest.fixture
+def runs(tmp_path):
+    """`plain` with two seeds and `new` with one."""
+    write(tmp_path / "plain_s0", {"a": 1.0, "b": 2.0, "c": 5.0})
+    write(tmp_path / "plain_s1", {"a": 3.0, "b": 2.0, "c": 7.0})
+    write(tmp_path / "new_s0", {"a": 1.0, "b": 3.0, "c": 3.0})
+    return tmp_path
+
+
+def test_by_hand(runs):
+    """Means over seeds 2, 2, 6 against 1, 3, 3. Draws of two groups: ann twice gives the mean of
+    −1 and +1, bob twice −3, each of the four draws equally likely."""
+    found = comparison.compare(CompareConfig((f"{runs}/plain", f"{runs}/new"), metrics=("ate",)))
+    plain, new = found.cells["ate"]
+    assert plain.label == "plain" and plain.difference is None
+    assert plain.seeds == pytest.approx([8 / 3, 4.0]) and new.seeds == pytest.approx([7 / 3])
+    assert new.difference.mean == pytest.approx(-1.0)
+    assert new.difference.interval == pytest.approx((-3.0, 0.0))
+    assert new.difference.gain == pytest.approx(30.0)
+    assert (new.difference.smaller, new.difference.compared, new.difference.groups) == (2, 3, 2)
+    assert text.lines(found) == [
+        ["ATE (m)", "plain", "3.33 ± 0.94", "", ""],
+        ["", "new", "2.33", "-1.00 (-3.00 to +0.00)", "2 of 3"],
+    ]
+    assert "there are 2." in text.explanations(found)[1]
+
+
+def test_what_diverged_is_in_no_difference(runs):
+    """Its other metrics neither, although they may have values."""
+    write(runs / "lost", {"a": 0.5, "b": math.inf, "c": 3.0})
+    words = (f"{runs}/new_s0", f"{runs}/lost")
+    found = comparison.compare(CompareConfig(words, metrics=("ate", "rpe_1s")))
+    for metric, scale in (("ate", 1.0), ("rpe_1s", 0.1)):
+        lost = found.cells[metric][1]
+        assert lost.difference.compared == 2 and lost.diverged == 1
+        assert lost.difference.mean == pytest.approx(-0.25 * scale)
+    assert "†" in text.lines(found)[1][2] and text.explanations(found)[-1].startswith("†")
+    names = [label.get_text() for label in picture.draw(found).axes[0].get_yticklabels()]
+    assert [name for name in names if "†" in name] == ["b  (ann) †"]
+
+
+def test_a_metric_that_one_row_lacks(runs):
+    write(runs / "other", {"a": 1.0, "b": 1.0, "c": 1.0}, drop=("rpe_1s",))
+    words = (f"{runs}/plain", f"{runs}/other", f"{runs}/new")
+    found = comparison.compare(CompareConfig(words, metrics=("rpe_1s",)))
+    assert text.lines(found)[1] == ["", "other", "–", "", ""]
+    assert text.lines(found)[2][3].startswith("-0.100")
+    found = comparison.compare(CompareConfig(words[1:], metrics=("rpe_1s",)))
+    assert text.lines(found)[1][3] == "–"  # nothing to compare with
+
+
+def test_one_group_has_no_interval(tmp_path):
+    for name, ate in (("one", 1.0), ("two", 2.0)):
+        write(tmp_path / name, {"a": ate, "b": ate})
+    found = comparison.compare(
+        CompareConfig((f"{tmp_path}/one", f"{tmp_path}/two"), metrics=("ate",))
+    )
+    assert text.lines(found)[1][3] == "+1.00"
+    assert text.explanations(found)[1].startswith("No interval")
+
+
+def test_names_without_a_seed_stand_for_all_seeds(tmp_path):
+    names = [
+        "net_s0",
+        "net_s10",
+        "net_s2",
+        "net_s0_calibrated",
+        "net_s2_calibrated",
+        "net_small_s1",
+    ]
+    for name in names:
+        (tmp_path / name / "eval" / "x").mkdir(parents=True)
+    found = {
+        word: [str(path.relative_to(tmp_path)) for path in rows.of_all_seeds(tmp_path / word)]
+        for word in ("net", "net_calibrated", "net_s2", "net/eval/x", "net/eval/y", "nothing")
+    }
+    assert found == {
+        "net": ["net_s0", "net_s2", "net_s10"],
+        "net_calibrated": ["net_s0_calibrated", "net_s2_calibrated"],
+        "net_s2": ["net_s2"],
+        "net/eval/x": ["net_s0/eval/x", "net_s2/eval/x", "net_s10/eval/x"],
+        "net/eval/y": [],
+        "nothing": [],
+    }
+
+
+def test_evaluations_by_their_folders(runs):
+    """Two estimators of one run, side by side."""
+    other = write(runs / "new_s0", {"a": 2.0, "b": 4.0, "c": 4.0}, "oxiod_test_integrate")
+    found = comparison.compare(CompareConfig((f"{runs}/new", str(other)), metrics=("ate",)))
+    assert found.cells["ate"][1].difference.mean == pytest.approx(1.0)
+    assert [row.label for row in found.rows] == ["new", "new_s0/eval/oxiod_test_integrate"]
+
+
+def test_refusals(runs):
+    def refused(*words, **options):
+        with pytest.raises(InputError) as error:
+            comparison.compare(CompareConfig(tuple(f"{runs}/{word}" for word in words), **options))
+        return str(error.value)
+
+    assert "needs two or more" in refused("plain")
+    assert "is not there" in refused("plain", "gone")
+    missing = refused("plain", "new", split="val")
+    assert "has no evaluation of 'val'" in missing and "--split val" in missing
+    assert "--estimator integrate" in refused("plain", "new", estimator="integrate")
+    assert "no row has 'ape'; there are: ate, rpe_1s" in refused("plain", "new", metrics=("ape",))
+    write(runs / "seen", {"a": 1.0}, split="seen")
+    assert "is of oxiod seen, the first row of oxiod test" in refused("plain", "seen")
+    write(runs / "old", {"a": 1.0}, definitions=1)
+    assert "another version" in refused("plain", "old")
+    write(runs / "two", {"a": 1.0})
+    write(runs / "two", {"a": 1.0}, name="ridi_test_ekf")
+    assert "several datasets" in refused("plain", "two")
+    (runs / "new_s0" / "eval" / "oxiod_test_ekf" / "metrics.json").write_text("[]")
+    assert "is not a metrics.json" in refused("plain", "new")
+    assert "neither a run nor an evaluation" in refused("plain", "new_s0/eval")
+
+
+def test_the_command_shows_and_writes(runs, capsys):
+    out = runs / "results" / "both"
+    words = [f"{runs}/plain", f"{runs}/new", "--metrics", "ate", "rpe_1s", "--out", str(out)]
+    app.main(["compare", *words])
+    shown = capsys.readouterr().out
+    assert "-1.00 (-3.00 to +0.00)" in shown and str(out) in shown
+    table = list(csv.DictReader((out.parent / "both.csv").open(encoding="utf-8")))
+    assert [(line["metric"], line["row"]) for line in table] == [
+        ("ate", "plain"),
+        ("ate", "new"),
+        ("rpe_1s", "plain"),
+        ("rpe_1s", "new"),
+    ]
+    assert float(table[1]["difference"]) == pytest.approx(-1.0) and table[0]["difference"] == ""
+    assert float(table[0]["std"]) == pytest.approx(np.std([8 / 3, 4.0], ddof=1))
+    assert "| ATE (m) | plain | 3.33 ± 0.94 |" in (out.parent / "both.md").read_text("utf-8")
+    assert (out.parent / "both.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_errors_are_infinite_where_the_estimate_diverged(tmp_path):
+    folder = write(tmp_path, {"a": math.inf, "b": 2.0})
+    figures = json.loads((folder / "metrics.json").read_text())
+    found = pairs.errors([figures], "rpe_1s")
+    assert {name: list(values) for name, values in found.items()} == {"a": [math.inf], "b": [0.2]}
