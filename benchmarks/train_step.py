@@ -24,15 +24,14 @@ from benchmarks import baseline
 from gnio_jax.config import DataConfig, ModelConfig, OptimConfig, TrainConfig
 from gnio_jax.data.windows import WindowSource, gather
 from gnio_jax.training import optimizer as optimizers
-from gnio_jax.training.checkpoint import create_model
-from gnio_jax.training.losses import losses, stage
-from gnio_jax.training.step import (
-    create_state,
+from gnio_jax.training.batch_statistics import (
     estimate_statistics,
     statistics_batches,
     statistics_order,
-    train_steps,
 )
+from gnio_jax.training.checkpoint import create_model
+from gnio_jax.training.losses import losses, stage
+from gnio_jax.training.step import create_state, train_steps
 
 STEPS = 4
 """Steps per dispatch, as in the training loop."""

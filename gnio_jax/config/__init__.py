@@ -5,19 +5,16 @@ the command line win over the file, the file wins over the defaults, and the def
 paper's.
 """
 
+from gnio_jax.config.requests import CalibrateConfig, CompareConfig, EvaluateConfig, TablesConfig
 from gnio_jax.config.runs import default_workdir, newest_run, with_seeds
 from gnio_jax.config.schema import (
     CONSIDERED_FIELDS,
     AugmentConfig,
-    CalibrateConfig,
-    CompareConfig,
     DataConfig,
-    EvaluateConfig,
     FilterOptions,
     LossConfig,
     ModelConfig,
     OptimConfig,
-    TablesConfig,
     TrainConfig,
 )
 from gnio_jax.config.through_filter import ThroughFilter

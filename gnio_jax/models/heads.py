@@ -76,7 +76,7 @@ class CalibratedUncertainty(nn.Module):
 
     The factor (ours) lies among the `batch_stats` as its logarithm. It is set after every
     validation, so that the squared errors on the validation split are those that the standard
-    deviations announce (`training.step.calibrated`).
+    deviations announce (`training.validation.calibrated`).
     """
 
     dtype: Dtype = "float32"
@@ -97,7 +97,7 @@ class ConstantUncertainty(nn.Module):
     same for every window.
 
     Not a parameter: it lies among the `batch_stats` and is set to the errors on the validation
-    split after every epoch (`training.step.calibrated`).
+    split after every epoch (`training.validation.calibrated`).
     """
 
     @nn.compact

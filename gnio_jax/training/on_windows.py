@@ -18,6 +18,7 @@ from gnio_jax.data import windows
 from gnio_jax.reporting import Reporter
 from gnio_jax.scaling import devices
 from gnio_jax.training import optimizer as optimizers
+from gnio_jax.training.batch_statistics import estimate_statistics, normalises, statistics_order
 from gnio_jax.training.checkpoint import Run, create_model, create_trained_model
 from gnio_jax.training.initial import with_weights
 from gnio_jax.training.kinds import (
@@ -34,22 +35,21 @@ from gnio_jax.training.losses import stage, switches
 from gnio_jax.training.step import (
     Progress,
     TrainState,
-    Validation,
     added,
-    calibrated,
-    calibrates,
     create_state,
     epoch_order,
-    estimate_statistics,
     evaluated,
-    isotropic,
-    mean_of,
-    normalises,
-    statistics_order,
     train_steps,
-    validate,
 )
 from gnio_jax.training.supply import Epoch, FromHost, Supply, stored, supplied
+from gnio_jax.training.validation import (
+    Validation,
+    calibrated,
+    calibrates,
+    isotropic,
+    mean_of,
+    validate,
+)
 from gnio_jax.types import Sequence
 
 

@@ -1,5 +1,5 @@
-"""The jitted training and validation steps: gather, rotate, augment, forward, backward, update, all
-on the device."""
+"""The jitted training step on windows: gather, rotate, augment, forward, backward, update, all on
+the device."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 import optax
 from flax import linen as nn
 from jaxtyping import Float, Int, PRNGKeyArray
@@ -18,8 +17,6 @@ from gnio_jax.config import TrainConfig
 from gnio_jax.data.augmentation import augment
 from gnio_jax.data.windows import WindowSource, gather, shift_windows
 from gnio_jax.models import initialise
-from gnio_jax.models.resnet import MOMENTUM
-from gnio_jax.scaling import devices
 from gnio_jax.scaling.devices import kept_everywhere, shared_out
 from gnio_jax.training.losses import Losses, Stage, losses, stage
 from gnio_jax.types import Prediction, Windows
@@ -49,16 +46,6 @@ class TrainState(NamedTuple):
         params, batch_stats = variables["params"], variables["batch_stats"]
         numbers = variables.get("filter", {})
         return cls(step, params, batch_stats, opt_state, filter=numbers)
-
-
-class Validation(NamedTuple):
-    """Means over every window of a split."""
-
-    losses: Losses
-    axis_mse: Float[jax.Array, "3"]
-    """Squared error of each axis, m²."""
-    axis_normalised: Float[jax.Array, "3"]
-    """(e/σ)² of each axis: 1 where the standard deviations are those of the errors."""
 
 
 class Progress(NamedTuple):
@@ -177,7 +164,7 @@ def _gradient(
         params: Any, batch_stats: Any, windows: Windows, key: PRNGKeyArray
     ) -> tuple[jax.Array, tuple[Losses, Any]]:
         variables = {"params": params, "batch_stats": batch_stats}
-        prediction, changed = _apply_training(model, variables, windows, key)
+        prediction, changed = apply_training(model, variables, windows, key)
         loss = losses(prediction, windows, config.loss, now)
         return loss.total, (loss, changed.get("batch_stats", {}))
 
@@ -235,17 +222,7 @@ def added(one: Progress, other: Progress) -> Progress:
     return Progress(sums, norms, failed)
 
 
-def mean_of(found: list[Validation], counts: list[int]) -> Validation:
-    """The means over all windows from those over parts of so many windows."""
-    if len(found) == 1:
-        return found[0]
-    shares = np.float32(counts) / np.float32(sum(counts))
-    return jax.tree.map(
-        lambda *means: sum(s * m for s, m in zip(shares, means, strict=True)), *found
-    )
-
-
-def _apply_training(
+def apply_training(
     model: nn.Module, variables: Any, windows: Windows, dropout_key: PRNGKeyArray
 ) -> tuple[Prediction, Any]:
     """The prediction in training mode, and the variables that changed: statistics of the batch."""
@@ -269,77 +246,6 @@ def draw_windows(
     return shared_out(augment(augment_key, windows, config.augment)), dropout_key
 
 
-def normalises(state: TrainState) -> bool:
-    """Whether the network has batch normalisations."""
-    return any(
-        path[-1].key == "mean" for path, _ in jax.tree_util.tree_leaves_with_path(state.batch_stats)
-    )
-
-
-def calibrates(state: TrainState) -> bool:
-    """Whether the network has constants or factors of the uncertainty that validation sets."""
-    found = jax.tree_util.tree_leaves_with_path(state.batch_stats)
-    return any(path[-1].key in ("log_std", "log_factor") for path, _ in found)
-
-
-def statistics_batches(source: WindowSource, config: TrainConfig) -> int:
-    """Batches of `estimate_statistics`: those of `optim.statistics_windows`, but no more than an
-    epoch has."""
-    size = config.optim.batch_size
-    return min(-(-config.optim.statistics_windows // size), source.visited.shape[0] // size)
-
-
-def statistics_order(
-    key: PRNGKeyArray, source: WindowSource, config: TrainConfig
-) -> Int[jax.Array, "m"]:
-    """The windows of `estimate_statistics`: whole batches, drawn from `key` alone."""
-    order_key, _ = jax.random.split(key)
-    count = statistics_batches(source, config) * config.optim.batch_size
-    return jax.random.permutation(order_key, jnp.asarray(source.visited))[:count]
-
-
-@functools.partial(jax.jit, static_argnames=("model", "config"))
-def estimate_statistics(
-    state: TrainState,
-    source: WindowSource,
-    order: Int[jax.Array, "m"],
-    key: PRNGKeyArray,
-    *,
-    model: nn.Module,
-    config: TrainConfig,
-) -> TrainState:
-    """The state with the statistics of every batch normalisation estimated anew for its parameters.
-
-    Means over batches of augmented training windows, in training mode: those of `order`, as
-    `statistics_order` draws them from the same `key`. The running averages remember ten steps, and
-    what those miss is an offset of the displacement (ours; Wu and Johnson 2021, "Rethinking 'Batch'
-    in BatchNorm"). Nothing else of `batch_stats` changes.
-    """
-    batches = order.shape[0] // config.optim.batch_size
-    _, draw_key = jax.random.split(key)
-    # A normalisation adds 1 − MOMENTUM of the batch's statistics to the MOMENTUM-fold of its own:
-    # of zeros, that alone is left.
-    zeros = jax.tree.map(jnp.zeros_like, state.batch_stats)
-
-    def add_batch(total: Any, number_which: tuple[jax.Array, jax.Array]) -> tuple[Any, None]:
-        number, which = number_which
-        windows, dropout_key = draw_windows(
-            jax.random.fold_in(draw_key, number), source, which, config
-        )
-        variables = {"params": state.params, "batch_stats": zeros}
-        _, changed = _apply_training(model, variables, windows, dropout_key)
-        return jax.tree.map(jnp.add, total, changed["batch_stats"]), None
-
-    parts = order.reshape(batches, config.optim.batch_size)
-    total, _ = jax.lax.scan(add_batch, zeros, (jnp.arange(batches), parts))
-
-    def statistic(path: tuple, total: jax.Array, before: jax.Array) -> jax.Array:
-        return total / (batches * (1 - MOMENTUM)) if path[-1].key in ("mean", "var") else before
-
-    estimated = jax.tree_util.tree_map_with_path(statistic, total, state.batch_stats)
-    return kept_everywhere(state._replace(batch_stats=estimated))
-
-
 def gradient_norms(gradient: Any) -> dict[str, Float[jax.Array, ""]]:
     """Norm of the gradient with respect to each part of the network: its modules, and of a head its
     layers (`head/scale`)."""
@@ -349,73 +255,3 @@ def gradient_norms(gradient: Any) -> dict[str, Float[jax.Array, ""]]:
         part = "/".join(names[: 2 if names[0] == "head" else 1])
         squares.setdefault(part, []).append(jnp.sum(leaf**2))
     return {part: jnp.sqrt(sum(found)) for part, found in squares.items()}
-
-
-@functools.partial(jax.jit, static_argnames=("model", "config"))
-def validate(
-    state: TrainState, source: WindowSource, now: Stage, *, model: nn.Module, config: TrainConfig
-) -> Validation:
-    """Mean losses and errors over every window of `source`, without augmentation and in inference
-    mode."""
-    count = source.visited.shape[0]
-    # Whole batches, of which each device has the same share: the last one is filled up with windows
-    # of weight zero.
-    size = -(-min(config.optim.batch_size, count) // devices.count()) * devices.count()
-    batches = -(-count // size)
-    which = source.visited[
-        jnp.minimum(jnp.arange(batches * size, dtype=jnp.int32), count - 1)
-    ].reshape(batches, size)
-    weight = (jnp.arange(batches * size) < count).astype(jnp.float32).reshape(batches, size)
-
-    def one_window(prediction: Prediction, windows: Windows) -> Validation:
-        prediction, windows = jax.tree.map(lambda x: x[None], (prediction, windows))
-        error = windows.displacement - prediction.displacement
-        return Validation(
-            losses(prediction, windows, config.loss, now),
-            error[0] ** 2,
-            error[0] ** 2 * jnp.exp(-2 * prediction.log_std[0]),
-        )
-
-    def one_batch(which_weight: tuple[jax.Array, jax.Array]) -> Validation:
-        windows = shared_out(gather(source, shared_out(which_weight[0]), config.data.seen))
-        prediction: Any = model.apply(
-            {"params": state.params, "batch_stats": state.batch_stats}, windows.imu
-        )
-        each = jax.vmap(one_window)(prediction, windows)
-        return jax.tree.map(lambda x: jnp.tensordot(which_weight[1], x, 1), each)
-
-    return jax.tree.map(
-        lambda x: jnp.sum(x, axis=0) / count, jax.lax.map(one_batch, (which, weight))
-    )
-
-
-def isotropic(found: Validation) -> Validation:
-    """The same, with the mean of the two horizontal axes in the place of each. Constants of the
-    uncertainty of an equivariant network cannot tell one from the other."""
-
-    def mean(axes: Float[jax.Array, "3"]) -> Float[jax.Array, "3"]:
-        return axes.at[:2].set(axes[:2].mean())
-
-    return found._replace(
-        axis_mse=mean(found.axis_mse), axis_normalised=mean(found.axis_normalised)
-    )
-
-
-def calibrated(state: TrainState, found: Validation) -> TrainState:
-    """The state whose constants and factors of the uncertainty (`models.heads`) fit the errors that
-    validation found with it.
-
-    Errors below 0.1 mm, and σ wrong by more than a factor of 1000 at once, are taken for that:
-    nothing becomes infinite.
-    """
-
-    def fitted(path: tuple, leaf: jax.Array) -> jax.Array:
-        match path[-1].key:
-            case "log_std":
-                return 0.5 * jnp.log(jnp.maximum(found.axis_mse, 1e-8))
-            case "log_factor":
-                return leaf + 0.5 * jnp.log(jnp.clip(found.axis_normalised, 1e-6, 1e6))
-            case _:
-                return leaf
-
-    return state._replace(batch_stats=jax.tree_util.tree_map_with_path(fitted, state.batch_stats))

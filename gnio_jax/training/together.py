@@ -16,26 +16,14 @@ import numpy as np
 from jax.sharding import PartitionSpec
 
 from gnio_jax.scaling import devices
+from gnio_jax.training.batch_statistics import estimate_statistics, normalises, statistics_order
 from gnio_jax.training.kinds import Training, compiled
 from gnio_jax.training.log import Row
 from gnio_jax.training.losses import stage
 from gnio_jax.training.on_windows import WindowTraining, figures
-from gnio_jax.training.step import (
-    Progress,
-    TrainState,
-    Validation,
-    calibrated,
-    calibrates,
-    epoch_order,
-    estimate_statistics,
-    evaluated,
-    isotropic,
-    normalises,
-    statistics_order,
-    train_steps,
-    validate,
-)
+from gnio_jax.training.step import Progress, TrainState, epoch_order, evaluated, train_steps
 from gnio_jax.training.supply import OnDevice
+from gnio_jax.training.validation import Validation, calibrated, calibrates, isotropic, validate
 
 
 @runtime_checkable

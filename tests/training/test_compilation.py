@@ -10,7 +10,7 @@ import pytest
 
 from gnio_jax.config import DataConfig, ModelConfig, OptimConfig, TrainConfig
 from gnio_jax.data.windows import WindowSource
-from gnio_jax.training import optimizer, step
+from gnio_jax.training import optimizer, step, validation
 from gnio_jax.training.checkpoint import create_model
 from gnio_jax.training.losses import stage
 from tests.support.compiling import quick
@@ -53,7 +53,7 @@ def test_a_step_of_training_and_a_validation():
         tx = optimizer.create(CONFIG.optim, CONFIG.loss, WINDOWS // 2)
         fixed = dict(model=model, config=CONFIG)
         train = once(step.train_steps, static_argnames=("model", "optimizer", "config"))
-        validate = once(step.validate, static_argnames=("model", "config"))
+        validate = once(validation.validate, static_argnames=("model", "config"))
         train = functools.partial(train, **fixed, optimizer=tx)
         validate = functools.partial(validate, **fixed)
         state = step.create_state(model, tx, jax.random.key(0), CONFIG.data.window)

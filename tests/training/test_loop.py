@@ -22,7 +22,17 @@ from gnio_jax.config import DataConfig, LossConfig, ModelConfig, OptimConfig, Tr
 from gnio_jax.data import windows
 from gnio_jax.errors import InputError
 from gnio_jax.models import registry
-from gnio_jax.training import checkpoint, kinds, loop, on_windows, optimizer, seed_runs, step
+from gnio_jax.training import (
+    batch_statistics,
+    checkpoint,
+    kinds,
+    loop,
+    on_windows,
+    optimizer,
+    seed_runs,
+    step,
+    validation,
+)
 from gnio_jax.training.losses import Losses
 from tests.support.runs import shared_programs
 from tests.support.tiny_network import Tiny
@@ -159,10 +169,10 @@ def test_averages_are_evaluated_and_training_goes_on_without_them(recording, fin
     model, key = checkpoint.create_model(config), jax.random.key(0)
     with jax.enable_x64(False):
         source, key = windows_of(recording, "train", config), jax.random.fold_in(key, 3)
-        estimated = step.estimate_statistics(
+        estimated = batch_statistics.estimate_statistics(
             step.evaluated(jax.tree.map(jnp.asarray, state)),
             source,
-            step.statistics_order(key, source, config),
+            batch_statistics.statistics_order(key, source, config),
             key,
             model=model,
             config=config,
@@ -384,7 +394,7 @@ def test_two_stage_loss_without_float64(recording, tmp_path, monkeypatch):
         return spying
 
     monkeypatch.setattr(on_windows, "train_steps", spy(step.train_steps))
-    monkeypatch.setattr(on_windows, "validate", spy(step.validate))
+    monkeypatch.setattr(on_windows, "validate", spy(validation.validate))
     loop.train(
         tiny(
             recording,
@@ -469,7 +479,7 @@ def test_the_best_checkpoint_begins_anew_where_what_is_trained_changes(
     def validated(*_, **__):
         loss, mse = next(said)
         one = jnp.ones(3, jnp.float32)
-        return step.Validation(
+        return validation.Validation(
             Losses(jnp.float32(loss), jnp.float32(mse), jnp.float32(0)), one, one
         )
 

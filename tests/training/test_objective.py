@@ -12,7 +12,8 @@ from gnio_jax.config import LossConfig, ModelConfig, OptimConfig, TrainConfig
 from gnio_jax.models.heads import CalibratedUncertainty
 from gnio_jax.training import losses, on_windows, optimizer
 from gnio_jax.training.losses import Losses
-from gnio_jax.training.step import TrainState, Validation, calibrated, isotropic
+from gnio_jax.training.step import TrainState
+from gnio_jax.training.validation import Validation, calibrated, isotropic
 from gnio_jax.types import Prediction, Windows
 
 

@@ -12,7 +12,7 @@ import pytest
 from gnio_jax import data, models
 from gnio_jax.config import DataConfig, LossConfig, ModelConfig, OptimConfig, TrainConfig
 from gnio_jax.data import windows
-from gnio_jax.training import losses, optimizer, step
+from gnio_jax.training import batch_statistics, losses, optimizer, step, validation
 from gnio_jax.training.checkpoint import create_model
 from tests.support.compiling import as_usual, lightly_optimised, quick
 
@@ -99,8 +99,10 @@ def run(seed):
 def estimated(model, state, source, config=CONFIG, key=0):
     with jax.enable_x64(False):
         key = jax.random.key(key)
-        order = step.statistics_order(key, source, config)
-        return step.estimate_statistics(state, source, order, key, model=model, config=config)
+        order = batch_statistics.statistics_order(key, source, config)
+        return batch_statistics.estimate_statistics(
+            state, source, order, key, model=model, config=config
+        )
 
 
 def squared_errors(model, state, source, config=CONFIG):
@@ -147,7 +149,7 @@ def test_training_windows_err_in_inference_mode_as_in_training_mode(trained):
 def test_statistics_are_means_over_batches(trained):
     """Of the first normalisation, against NumPy: its input is a convolution of drawn windows."""
     model, _, state, source = trained
-    assert step.statistics_batches(source, FEW) == 3
+    assert batch_statistics.statistics_batches(source, FEW) == 3
     found = estimated(model, state, source, FEW, key=7).batch_stats["encoder"]["stem_bn"]
     kernel = np.asarray(state.params["encoder"]["stem_conv"]["kernel"], np.float64)
     order_key, draw_key = jax.random.split(jax.random.key(7))
@@ -189,7 +191,7 @@ def test_an_estimate_depends_on_parameters_and_key_alone(trained):
         third.batch_stats["encoder"]["stem_bn"]["mean"],
     )
     assert (
-        step.statistics_batches(
+        batch_statistics.statistics_batches(
             source,
             dataclasses.replace(
                 FEW, optim=dataclasses.replace(FEW.optim, statistics_windows=10**9)
@@ -213,7 +215,7 @@ def test_constants_of_the_uncertainty_are_left_alone():
     assert not np.array_equal(
         found["encoder"]["stem_bn"]["mean"], state.batch_stats["encoder"]["stem_bn"]["mean"]
     )
-    assert step.normalises(state) and not step.normalises(
+    assert batch_statistics.normalises(state) and not batch_statistics.normalises(
         state._replace(batch_stats={"uncertainty": found["uncertainty"]})
     )
 
@@ -248,7 +250,7 @@ def test_the_uncertainty_fits_the_errors_after_training(trained):
     for state in (first, run(1)[-1]):
         with jax.enable_x64(False):
             state = estimated(model, state, source)
-            said = step.validate(
+            said = validation.validate(
                 state, held_out, losses.stage(CONFIG.loss, 0, 1), model=model, config=CONFIG
             )
         found.append(said.axis_normalised)

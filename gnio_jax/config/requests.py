@@ -1,0 +1,153 @@
+"""What the commands beside `gnio train` are asked for: frozen dataclasses whose field comments are
+the text of `--help`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Annotated, Literal
+
+import tyro
+
+from gnio_jax.config.bounds import Count
+from gnio_jax.config.schema import FilterOptions
+
+Table = Literal[
+    "complexity",
+    "comparison",
+    "components",
+    "gates",
+    "bank-size",
+    "bank-spread",
+    "uncertainty",
+    "trajectories",
+    "standing",
+]
+
+CalibratedGroup = Literal["measurement", "noise", "start", "window", "walk"]
+
+
+@dataclass(frozen=True)
+class EvaluateConfig:
+    """What `gnio evaluate` is asked for."""
+
+    workdir: str | None = None
+    """Folder of the run, with its config.yaml and checkpoints; by default the newest below runs/.
+    Results go to its folder eval/."""
+    dataset: str | None = None
+    """Dataset to evaluate on; by default the run's own."""
+    data_root: str | None = None
+    """Folder of the dataset; by default the run's (for its own dataset), $GNIO_DATA/<dataset>, or
+    data/<dataset>."""
+    split: str = "test"
+    """Split of the dataset."""
+    estimator: Literal["ekf", "integrate", "imu_only"] = "ekf"
+    """The paper's filter, the sum of the displacements, or the IMU integrated without the network.
+    """
+    coupling: Literal["tight", "loose"] = "tight"
+    """For the ekf: the network runs inside the filter, or over all windows before it with a given
+    orientation."""
+    orientation: Literal["filter", "device", "reference"] | None = None
+    """Attitude that rotates the network's windows; by default the filter's for the tight coupling,
+    else the reference's. Without a filter, `filter` is the gyro integrated from the start."""
+    init: Literal["reference", "static"] = "reference"
+    """Start from the reference's pose and velocity, or from gravity with yaw, velocity and position
+    zero."""
+    gyro_bias: Literal["zero", "rest", "reference"] = "zero"
+    """Initial gyro bias: zero, the mean of a rest at the start, or the first 10 s against the
+    reference orientation."""
+    alignment: Literal["origin", "none", "yaw_position", "se3"] = "origin"
+    """How an estimate is aligned with the reference before absolute errors: start position and yaw,
+    not at all, or least squares."""
+    checkpoint: Literal["best", "latest"] = "best"
+    """Which checkpoint of the run."""
+    batch_size: int = 16
+    """Recordings estimated side by side."""
+    plots: bool = True
+    """Draw the trajectories, errors, displacements and the errors' distribution, and write
+    report.html."""
+    rerun: str | None = None
+    """File to write for the viewer Rerun, NAME.rrd: paths, covariances, IMU, gate."""
+    filter: FilterOptions = field(default_factory=FilterOptions)
+    """Noise and start of the filter; by default the run's own."""
+
+
+@dataclass(frozen=True)
+class CalibrateConfig:
+    """What `gnio calibrate` is asked for."""
+
+    workdir: str | None = None
+    """Folder of the run; by default the newest below runs/."""
+    out: str | None = None
+    """Folder of the calibrated run; by default the run's with _calibrated behind its name."""
+    data_root: str | None = None
+    """Folder of the run's dataset; by default the run's, $GNIO_DATA/<dataset>, or data/<dataset>.
+    """
+    split: str | None = None
+    """Split whose recordings are fitted: the run's validation split (default) or its training
+    split. Others are refused: what is tested must not have been fitted."""
+    out_of_fold: tuple[str, ...] = ()
+    """Folders of runs, one for each fold (gnio train --data.folds K --data.left-out k). The filter
+    is then fitted to the training split, each session seen by the network that left it out."""
+    fit: tuple[CalibratedGroup, ...] = ("measurement", "noise", "window")
+    """What is fitted by the likelihood of the innovations: `measurement`, the factor of the
+    network's covariance; `noise`, the IMU's; `start`, the standard deviations of the initial
+    biases; `window`, the part of a window's error that lasts; `walk`, the errors of speed and
+    heading that last. The factors of the axes and the errors that are considered are always
+    fitted."""
+    average_headings: bool = False
+    """Average the network over four headings, as model.equivariance: four_headings does, whatever
+    the run says. The network must have learnt from walks turned by a random yaw."""
+    checkpoint: Literal["best", "latest"] = "best"
+    """Which checkpoint of the run."""
+    steps: Count = 60
+    """Most steps of the search (L-BFGS)."""
+
+
+@dataclass(frozen=True)
+class TablesConfig:
+    """What `gnio tables` is asked for."""
+
+    table: tyro.conf.Positional[Annotated[Table, tyro.conf.arg(metavar="TABLE")]]
+    """complexity, comparison, components, gates, bank-size, bank-spread, uncertainty, trajectories
+    or standing."""
+    base: str = "quickstart"
+    """Config whose recordings, budget and augmentation every row has (not for complexity)."""
+    data_root: str | None = None
+    """Folder of the dataset; by default the config's, $GNIO_DATA/<dataset>, or data/<dataset>."""
+    split: str = "test"
+    """Split that is measured."""
+    estimator: Literal["ekf", "integrate"] = "ekf"
+    """The paper's filter, or the sum of the displacements with the reference's orientation."""
+    calibrate: bool = False
+    """Calibrate every run on its validation split before it is measured."""
+    seeds: int = 3
+    """Runs of every row: seeds 0, 1, 2, ..."""
+    epochs: int | None = None
+    """Epochs of every run, instead of the config's."""
+    width: int | None = None
+    """Width of the convolutional networks, instead of the config's model.width."""
+    methods: str = "tlio,ronin_resnet,deepils,ctin,imot,gnio"
+    """Networks of comparison, trajectories and standing, separated by commas; the first is the one
+    that the others are compared with."""
+    sequences: str | None = None
+    """Sequences that trajectories draws, separated by commas; by default the first eight."""
+    out: str = "runs/tables"
+    """Folder of the runs and the tables."""
+
+
+@dataclass(frozen=True)
+class CompareConfig:
+    """What `gnio compare` is asked for."""
+
+    rows: tyro.conf.Positional[Annotated[tuple[str, ...], tyro.conf.arg(metavar="RUNS")]]
+    """Runs, the one to compare with first. A name without its seed stands for all seeds: runs/gnio
+    for runs/gnio_s0, runs/gnio_s1, ... The folder of an evaluation stands for itself."""
+    split: str = "test"
+    """Split whose evaluations are compared."""
+    estimator: Literal["ekf", "integrate", "imu_only"] = "ekf"
+    """Estimator whose evaluations are compared."""
+    metrics: tuple[str, ...] = ("ate", "rpe_1s", "yaw_rmse", "path_length_ratio", "nis", "nees")
+    """Metrics that are compared, as metrics.json names them."""
+    out: str | None = None
+    """Name of files to write, OUT.md, OUT.csv and OUT.png, the errors of every sequence. By
+    default the table is only shown."""
