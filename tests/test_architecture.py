@@ -92,3 +92,11 @@ def test_a_library_stays_in_its_rooms(library):
 def test_every_module_has_a_room():
     rooms = {module.split(".")[0] for module, _ in imports()}
     assert rooms - {"__init__", "__main__"} <= ROOMS.keys()
+
+
+def test_no_test_module_imports_another():
+    for path in (PACKAGE.parent / "tests").rglob("test_*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("tests"):
+                names = [*(node.module or "").split("."), *(alias.name for alias in node.names)]
+                assert not any(name.startswith("test_") for name in names), path

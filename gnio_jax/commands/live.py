@@ -88,7 +88,7 @@ def live(options: LiveOptions, _prog: str) -> None:
         check_writable(options.out)  # or the trajectory would be lost at the end
     if options.rerun:
         rerun_stream.check(options.rerun)
-    found = following.Follower(following.longest_interval(weights.run, rate))
+    found = following.Follower(following.longest_untold(weights.run, rate))
     with console.terminal() as terminal:
         terminal.progress("compiling", 0.0)
         try:

@@ -18,6 +18,14 @@ STAMP_ROUNDING = 1e-6
 """s: what float64 leaves of differences of unix stamps, and more."""
 
 
+def told_beyond(rate: float) -> float:
+    """s: of longer intervals between two samples of an IMU at `rate` Hz a user is told (ours).
+
+    What a filter guesses of a few lost samples is right, and clocks of phones jitter.
+    """
+    return max(0.1, 3.0 / rate)
+
+
 def divide_at_gaps(sequence: Sequence, source: object) -> list[Sequence]:
     """The pieces of a recording (on its native stamps) between gaps longer than a window.
 

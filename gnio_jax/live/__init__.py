@@ -1,6 +1,6 @@
 """Odometry while the samples come: where they come from, the filter that follows, the screen."""
 
-from gnio_jax.live.following import Follower, create_tracker, follow, longest_interval
+from gnio_jax.live.following import Follower, create_tracker, follow, longest_untold
 from gnio_jax.live.samples import Sample, Scale, parse_line
 from gnio_jax.live.screen import drawing
 from gnio_jax.live.sources import Source, datagrams, from_recording, lines_of
@@ -18,7 +18,7 @@ __all__ = [
     "follow",
     "from_recording",
     "lines_of",
-    "longest_interval",
+    "longest_untold",
     "parse_line",
     "scale_of",
 ]

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from gnio_jax.data.gaps import told_beyond
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import inference_network
 from gnio_jax.filtering import Tracker
@@ -67,12 +68,17 @@ def longest_interval(run: Run, imu_rate: float | None = None) -> float:
     return 1.5 * max(own, 1 / imu_rate if imu_rate else own)
 
 
+def longest_untold(run: Run, imu_rate: float | None = None) -> float:
+    """s between samples of which nobody needs to be told; `imu_rate` as in `create_tracker`."""
+    return told_beyond(imu_rate or run.config.data.rate)
+
+
 @dataclass
 class Follower:
     """What has been found so far."""
 
     longest_interval: float = math.inf
-    """s; across a longer interval between two samples some are missing."""
+    """s between two whole samples; a longer one is a gap."""
     poses: list[Pose] = field(default_factory=list)
     """One for each clone step."""
     samples: int = 0
@@ -87,9 +93,9 @@ class Follower:
     stamps: list[float] = field(default_factory=list)
     """Of the first samples, s."""
     newest: float = math.inf
-    """Stamp of the newest sample, s."""
+    """Stamp of the newest whole sample, s."""
     gaps: list[float] = field(default_factory=list)
-    """Lengths of the intervals in which samples are missing, s."""
+    """Lengths of the gaps since the first pose, s."""
 
     @property
     def lost(self) -> bool:
@@ -129,9 +135,11 @@ def _pushed(push: Push, sample: Sample | None, found: Follower) -> Pose | None:
     except ValueError as error:
         _refuse(found, str(error))
         return None
-    if sample.time - found.newest > found.longest_interval:
-        found.gaps.append(sample.time - found.newest)
-    found.newest = sample.time
+    if np.isfinite([sample.gyro, sample.accel]).all():
+        # What came before the start is not in the path.
+        if found.poses and sample.time - found.newest > found.longest_interval:
+            found.gaps.append(sample.time - found.newest)
+        found.newest = sample.time
     found.samples += 1
     found.in_a_row = 0
     if found.samples <= FIRST_STAMPS:

@@ -64,8 +64,10 @@ def convolve_training(
     is quicker.
 
     Elsewhere products may be rounded to fewer digits (TF32), which Winograd's sums would magnify.
+    Of one or two samples most of a tile is padding. Processes that share a batch would send six
+    matrices to each other where the product's gradient has three.
     """
-    wide = kernel.shape[1] >= WINOGRAD_CHANNELS
+    wide = kernel.shape[1] >= WINOGRAD_CHANNELS and x.shape[1] > 2 and jax.process_count() == 1
     if wide and kernel.shape[0] == 3 and window_strides[0] == 1 and padding[0] == (1, 1):
         return convolve_three(x, kernel)
     return convolve(x, kernel, window_strides, padding)

@@ -4,7 +4,8 @@ Four outputs y of one channel are yᵀ = Aᵀ (G g ⊙ Bᵀ d), with the kernel 
 six inputs d that it meets: 6 multiplications where the definition has 12 (Winograd 1980; the
 matrices are those of Lavin and Gray 2016, §4.3). Over channels each of the six is a matrix product.
 The sums before and after cost a digit of float32 at most: results differ from the definition by
-some 2e-6 of their size.
+some 2e-6 of the largest among the six inputs. What is not finite makes all outputs that share a sum
+with it not finite.
 """
 
 from __future__ import annotations
@@ -44,7 +45,8 @@ _OUTPUT = np.array(
 def convolve_three(
     x: Float[jax.Array, "b n c"], kernel: Float[jax.Array, "3 c d"]
 ) -> Float[jax.Array, "b n d"]:
-    """The correlation of `x`, padded by a zero on both sides, with `kernel`, at every sample.
+    """The correlation of `x`, padded by a zero on both sides, with `kernel`, at every sample, in
+    the type of `x`.
 
     It has a gradient, and no derivative in forward mode. The gradient is written out: that of the
     strided slices below would be sums of six padded arrays.
@@ -64,8 +66,9 @@ def _forward(x: jax.Array, kernel: jax.Array) -> tuple[jax.Array, tuple]:
     inputs = [_combined(row, inputs) for row in _INPUT]
     kernels = [_combined(row, list(kernel)) for row in _KERNEL]
     products = [a @ b for a, b in zip(inputs, kernels, strict=True)]
-    outputs = [_combined(row, products).reshape(batch, tiles, -1) for row in _OUTPUT]
-    found = jnp.stack(outputs, axis=2).reshape(batch, tiles * TILE, -1)[:, :length]
+    features = kernel.shape[-1]
+    outputs = [_combined(row, products).reshape(batch, tiles, features) for row in _OUTPUT]
+    found = jnp.stack(outputs, axis=2).reshape(batch, tiles * TILE, features)[:, :length]
     return found, (inputs, kernels)
 
 
@@ -96,7 +99,7 @@ convolve_three.defvjp(_forward, _backward)
 def _combined(factors: Sequence[float] | np.ndarray, parts: Sequence[jax.Array]) -> jax.Array:
     """The sum of the parts, each times its factor."""
     terms = [
-        part if factor == 1 else np.float32(factor) * part
+        part if factor == 1 else jnp.asarray(factor, part.dtype) * part
         for factor, part in zip(factors, parts, strict=True)
         if factor != 0
     ]

@@ -102,7 +102,8 @@ def fresh_copy(leaf: Any) -> jax.Array:
 
 
 def everywhere(tree: Tree) -> Tree:
-    """Copies of host arrays on each of the devices; every process must give the same ones."""
+    """Host arrays on each of the devices; every process must give the same ones, and nobody may
+    write to them afterwards: on a CPU their memory may be shared."""
     mesh = jax.sharding.get_mesh()
     if mesh.empty:
         return jax.tree.map(fresh_copy, tree)
@@ -115,7 +116,8 @@ def _copied(leaf: Any, mesh: Mesh) -> jax.Array:
 
 
 def one_each(tree: Tree) -> Tree:
-    """Host arrays whose rows, one for each seed, are shared out among the devices."""
+    """Host arrays whose rows, one for each seed, are shared out among the devices. Nobody may write
+    to them afterwards, as with `everywhere`."""
     mesh = jax.sharding.get_mesh()
     if mesh.empty:
         return jax.tree.map(fresh_copy, tree)

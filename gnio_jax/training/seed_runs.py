@@ -14,6 +14,8 @@ from gnio_jax.training.step import Progress
 from gnio_jax.training.together import Together
 
 _HEAD = "gradient_norm/head/"
+_NOTHING = 1e-9
+"""Norm of a gradient, mean of an epoch, of which Adam, whose ε is 1e-8, makes next to no step."""
 BEGINNING = Position(epoch=0, step=0, best_loss=None, loss_sums=(), seconds=0.0)
 
 
@@ -136,13 +138,14 @@ def summary(run: SeedRun, row: Row) -> str:
 
 
 def stuck_head(row: Row) -> str | None:
-    """A warning where no gradient at all reached a layer of the head in the epoch of `row`.
+    """A warning where hardly a gradient reached a layer of the head in the epoch of `row`.
 
     A training that diverges may leave the network there: where every scale s = softplus(·)
-    underflows to 0, so do the gradients of gate and encoder, and d̂ = 0 for good.
+    underflows to 0, so do the gradients of gate and encoder, and d̂ = 0 for good. A loss of 0 has
+    not begun yet (`LossConfig.nll_from_epoch`).
     """
-    layers = [name for name, norm in row.items() if name.startswith(_HEAD) and norm == 0]
-    if not layers:
+    layers = [name for name, norm in row.items() if name.startswith(_HEAD) and norm < _NOTHING]
+    if not layers or row["loss"] == 0:
         return None
     named = ", ".join(name.removeprefix("gradient_norm/") for name in layers)
     return (

@@ -10,6 +10,7 @@ from gnio_jax.errors import InputError
 from gnio_jax.evaluation.exporting import rerun_file
 from gnio_jax.types import Sequence
 from tests.support.estimates import estimate
+from tests.support.rerun_files import columns_of
 
 
 def recording_of(walk, rate=50.0):
@@ -19,18 +20,6 @@ def recording_of(walk, rate=50.0):
     gyro, accel = (np.sin(np.outer(time - time[0], [1.0, 2.0, 3.0]) + k) for k in (0.0, 1.0))
     nothing, level = np.zeros((n, 3)), np.tile([1.0, 0.0, 0.0, 0.0], (n, 1))
     return Sequence(walk.name, time, gyro, accel, level, nothing, nothing, np.ones(n, bool))
-
-
-def columns_of(path):
-    """{place: {column: values of all rows}} of the file, its parts one behind the other."""
-    reader = pytest.importorskip("rerun.chunk", reason="needs rerun-sdk").RrdReader(str(path))
-    found = {}
-    for part in reader.stream().to_chunks():
-        batch = part.to_record_batch()
-        place = found.setdefault(str(part.entity_path), {})
-        for name, values in zip(batch.schema.names, batch.columns, strict=True):
-            place.setdefault(name, []).extend(values.to_pylist())
-    return found
 
 
 def seconds(column):

@@ -16,8 +16,9 @@ from gnio_jax.evaluation.tum import read_tum
 from gnio_jax.filtering import ConsideredStd, Tracker
 from gnio_jax.filtering.pose import Pose
 from gnio_jax.live import rerun_stream
-from tests.evaluation.test_rerun_file import columns_of
+from gnio_jax.types import Sequence
 from tests.support import known_walk, tiny_run
+from tests.support.rerun_files import columns_of
 
 CONFIG = TrainConfig(data=DataConfig(rate=50.0), model=ModelConfig(name="tiny"))
 RATE = 50.0
@@ -135,8 +136,24 @@ def test_a_clock_that_is_set_back_ends_the_stream():
 def test_gaps_are_told(gnio, run, recorded):
     lines = as_lines(recorded)
     told = gnio([*lines[:100], *lines[115:150], *lines[151:]], "--weights", run)
-    assert "warning: gaps: 2, the longest of 0.32 s: samples are missing" in told
-    assert "gaps" not in gnio(lines, "--weights", run)
+    assert "warning: gaps: 1, the longest of 0.32 s: samples are missing" in told
+    empty = [f"{line.split(',')[0]},,,,,," for line in lines[100:115]]
+    told = gnio([*lines[:100], *empty, *lines[115:]], "--weights", run)
+    assert "warning: gaps: 1, the longest of 0.32 s: samples are missing" in told
+    assert "gaps" not in gnio([*lines[:20], *lines[50:]], "--weights", run)  # before the start
+
+
+def test_gaps_of_a_recording_are_told(recorded):
+    time, gyro, accel = recorded
+    valid = (time < 3.0) | (time > 3.5)
+    found = live.Follower(0.1)
+    found.poses.append(None)
+    nothing, level = np.full_like(gyro, np.nan), np.full((len(time), 4), np.nan)
+    none = np.zeros(len(time), bool)
+    sequence = Sequence("walk", time, gyro, accel, level, nothing, nothing, none, imu_valid=valid)
+    source = live.from_recording(sequence, speed=0.0)
+    live.follow(lambda *sample: None, source, found, lambda found: None)
+    assert found.gaps == pytest.approx([0.54], abs=0.021) and found.samples == len(time)
 
 
 def test_stamps_in_milliseconds_are_told():

@@ -21,7 +21,7 @@ def drawn(length, channels=3, features=2, batch=2):
 
 def by_definition(x, kernel):
     """In float64, sample by sample."""
-    padded = np.pad(x.astype(np.float64), ((0, 0), (1, 1), (0, 0)))
+    padded = np.pad(np.asarray(x, np.float64), ((0, 0), (1, 1), (0, 0)))
     samples = range(x.shape[1])
     return np.stack([np.einsum("bkc,kcd->bd", padded[:, n : n + 3], kernel) for n in samples], 1)
 
@@ -93,27 +93,34 @@ def test_no_derivative_in_forward_mode_is_promised():
         jax.jvp(convolve_three, (x, kernel), (x, kernel))
 
 
-@pytest.mark.parametrize(
-    "channels, stride, train, dtype, used",
-    [
-        (64, 1, True, "float32", True),
-        (32, 1, True, "float32", False),
-        (64, 2, True, "float32", False),
-        (64, 1, False, "float32", False),
-        (64, 1, True, "bfloat16", False),
-    ],
-)
-def test_training_uses_it_where_it_is_quicker(channels, stride, train, dtype, used, monkeypatch):
+def used(monkeypatch, channels=64, length=8, stride=1, train=True, dtype="float32"):
+    """Whether a layer of the network uses it."""
     calls = []
     monkeypatch.setattr(resnet, "convolve_three", lambda *given: calls.append(given) or given[0])
     layer = resnet.conv(channels, 3, stride, train, "conv", dtype)
-    jax.eval_shape(layer.init, jax.random.key(0), jnp.zeros((1, 8, channels), jnp.float32))
-    assert bool(calls) is used
+    jax.eval_shape(layer.init, jax.random.key(0), jnp.zeros((1, length, channels), jnp.float32))
+    return bool(calls)
+
+
+def test_training_uses_it_where_it_is_quicker(monkeypatch):
+    assert used(monkeypatch) and used(monkeypatch, length=3)
+    assert not used(monkeypatch, channels=32)
+    assert not used(monkeypatch, length=2)
+    assert not used(monkeypatch, stride=2)
+    assert not used(monkeypatch, train=False)
+    assert not used(monkeypatch, dtype="bfloat16")
+    monkeypatch.setattr(jax, "process_count", lambda: 2)
+    assert not used(monkeypatch)
 
 
 def test_other_devices_train_with_the_product(monkeypatch):
     """Their products may have fewer digits than float32."""
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    monkeypatch.setattr(resnet, "convolve_three", lambda *_: pytest.fail("used"))
-    layer = resnet.conv(64, 3, 1, True, "conv", "float32")
-    jax.eval_shape(layer.init, jax.random.key(0), jnp.zeros((1, 8, 64), jnp.float32))
+    assert not used(monkeypatch)
+
+
+def test_float64_keeps_its_digits_and_no_windows_make_none():
+    with jax.enable_x64(True):
+        x, kernel = (jnp.asarray(each, jnp.float64) for each in drawn(9))
+        np.testing.assert_allclose(convolve_three(x, kernel), by_definition(x, kernel), atol=1e-13)
+    assert convolve_three(jnp.zeros((0, 9, 3)), kernel.astype(jnp.float32)).shape == (0, 9, 2)

@@ -377,6 +377,12 @@ def test_a_head_that_no_gradient_reaches_is_told_of(recording, finished, tmp_pat
     ]
     rows = (finished[0] / "metrics.jsonl").read_text().splitlines()
     assert not any(seed_runs.stuck_head(json.loads(row)) for row in rows)
+    # Steps that Adam's ε swallows are none, and a loss that has not begun is no mistake.
+    row = json.loads(rows[-1])
+    assert "head/kernel" in (
+        seed_runs.stuck_head({**row, "gradient_norm/head/kernel": 1e-12}) or ""
+    )
+    assert seed_runs.stuck_head({**row, "gradient_norm/head/kernel": 0.0, "loss": 0.0}) is None
 
 
 def test_two_stage_loss_without_float64(recording, tmp_path, monkeypatch):

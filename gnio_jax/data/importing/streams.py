@@ -11,6 +11,7 @@ import pandas as pd
 from jaxtyping import Bool, Float, Num
 from scipy.interpolate import CubicSpline
 
+from gnio_jax.data.gaps import told_beyond
 from gnio_jax.data.readers.stamps import PER_SECOND, RATES, in_order, time_unit
 from gnio_jax.data.readers.text import numbers, open_text, read_csv
 from gnio_jax.data.validation import check_finite, check_gaps, check_increasing
@@ -172,7 +173,7 @@ def read_stream(source: SensorFile, unit: str | None, order: str, notes: list[st
         )
     check_gaps(time, path)
     steps = np.diff(time)
-    holes = steps[steps > max(0.1, 3.0 / rate)]
+    holes = steps[steps > told_beyond(rate)]
     if holes.size:
         notes.append(
             f"{path.name}: {sensor} {GAPS} {holes.size} times, "
