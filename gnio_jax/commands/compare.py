@@ -11,6 +11,7 @@ from rich.table import Table
 from gnio_jax.commands import console
 from gnio_jax.commands.options import Command
 from gnio_jax.config import CompareConfig
+from gnio_jax.cores import usable_cores
 
 if TYPE_CHECKING:
     from gnio_jax.comparison import Comparison
@@ -21,21 +22,26 @@ DESCRIPTION = """Compare runs sequence by sequence: what a change has changed, a
   {prog} runs/plain runs/context --metrics ate rpe_1s rte_60s --out runs/plain_or_context
   {prog} runs/gnio runs/gnio/eval/oxiod_test_integrate
 
-It reads what gnio evaluate has left; the first run is what the others are compared with. Seeds of a
-run are averaged, and the name of a run without its seed stands for all of them: runs/plain for
+The first run is what the others are compared with. Runs are evaluated where they are not yet. Seeds
+of a run are averaged, and the name of a run without its seed stands for all of them: runs/plain for
 runs/plain_s0, runs/plain_s1, ..., runs/plain_calibrated for runs/plain_s0_calibrated, ... Walks of
 one person or session are not independent, so the 95 % interval of a difference draws whole people
 or sessions anew. An interval on both sides of zero says that the recordings do not tell the two
-apart."""
+apart. It knows nothing of other seeds: ± is their standard deviation."""
 
 
 def show(config: CompareConfig, _prog: str) -> None:
     """Compare, show the table, and write the files that are asked for."""
     # After the options: --help and mistakes do not wait for these imports.
-    from gnio_jax import comparison
+    import jax
+
+    from gnio_jax import comparison, filtering
     from gnio_jax.comparison import text
 
-    found = comparison.compare(config)
+    jax.config.update("jax_enable_x64", True)  # for the filter; the network states its float32
+    filtering.cores_as_devices()
+    with console.terminal() as terminal:
+        found = comparison.compare(config, terminal, usable_cores())
     output = console.stdout()
     output.print(f"{text.title(found)}\n")
     output.print(_table(text.lines(found)))
@@ -69,6 +75,6 @@ def _write(path: Path, found: Comparison) -> None:
         plots.save(temporary, picture.draw(found))
 
 
-COMMON = ("RUNS", "--split", "--estimator", "--metrics", "--out")
+COMMON = ("RUNS", "--split", "--estimator", "--data-root", "--metrics", "--out")
 
 COMMAND = Command(CompareConfig, show, DESCRIPTION, common=COMMON)

@@ -11,6 +11,7 @@ from gnio_jax.comparison.pairs import Difference
 from gnio_jax.comparison.rows import Row, read_row
 from gnio_jax.config import CompareConfig
 from gnio_jax.errors import InputError
+from gnio_jax.reporting import Lines, Reporter
 
 
 class Cell(NamedTuple):
@@ -36,12 +37,18 @@ class Comparison(NamedTuple):
     """Metric -> a cell for each row."""
 
 
-def compare(config: CompareConfig) -> Comparison:
-    """Read the rows' evaluations and compare them. Raises `InputError` for rows that cannot be
-    compared and metrics that none of them has."""
+def compare(
+    config: CompareConfig, reporter: Reporter | None = None, workers: int = 1
+) -> Comparison:
+    """Read the rows' evaluations, make those that are missing, and compare them.
+
+    `workers` processes read recordings that are slow to read. Raises `InputError` for rows that
+    cannot be compared and metrics that none of them has.
+    """
+    reporter = reporter or Lines()
     if len(config.rows) < 2:
         raise InputError("RUNS", "needs two or more", "name the run to compare with first")
-    rows = [read_row(word, config.split, config.estimator) for word in config.rows]
+    rows = [read_row(word, config, reporter, workers) for word in config.rows]
     dataset, split = _common_recordings(rows)
     rows = [row._replace(label=label) for row, label in zip(rows, _labels(rows), strict=True)]
     known = {metric: None for row in rows for seed in row.seeds for metric in seed["mean"]}

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
+from gnio_jax.comparison.figures import Figures
 from gnio_jax.evaluation import metrics, report
 
-Figures = dict[str, Any]
-"""One metrics.json."""
 Errors = Mapping[str, Float[np.ndarray, "_"]]
 """Sequence -> a metric with every seed: (seeds,), infinite where the estimate diverged."""
 

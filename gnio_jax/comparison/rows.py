@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import json
 import re
 from pathlib import Path
 from typing import NamedTuple
 
-from gnio_jax.comparison.pairs import Figures
+from gnio_jax.comparison.figures import Evaluated, Figures, of_evaluation, of_run
+from gnio_jax.config import CompareConfig
 from gnio_jax.errors import InputError
-from gnio_jax.evaluation import report
+from gnio_jax.reporting import Reporter
 
 _SEED = re.compile(r"_s(\d+)(?=_|$)")
 
@@ -25,19 +25,19 @@ class Row(NamedTuple):
     """metrics.json of each."""
 
 
-def read_row(word: str, split: str, estimator: str) -> Row:
+def read_row(word: str, config: CompareConfig, reporter: Reporter, workers: int) -> Row:
     """The row that `word` names: a run, or the folder of one of its evaluations.
 
     A name without a seed stands for all its seeds: `runs/gnio` for `runs/gnio_s0`, `runs/gnio_s1`
-    and so on, `runs/gnio_calibrated` for `runs/gnio_s0_calibrated` and so on. Raises `InputError`
-    where there is nothing, or no such evaluation.
+    and so on, `runs/gnio_calibrated` for `runs/gnio_s0_calibrated` and so on. Runs are evaluated
+    where they are not yet. Raises `InputError` where there is nothing.
     """
-    found = of_all_seeds(Path(word))
-    if not found:
+    paths = of_all_seeds(Path(word))
+    if not paths:
         remedy = "name a run, the folder of an evaluation, or a run of several seeds without _s0"
         raise InputError(word, "is not there", remedy)
-    folders = [_evaluation(folder, split, estimator) for folder in found]
-    return Row(str(Path(word)), folders, [_read(folder) for folder in folders])
+    found = [_evaluated(path, config, reporter, workers) for path in paths]
+    return Row(str(Path(word)), [each.folder for each in found], [each.figures for each in found])
 
 
 def of_all_seeds(path: Path) -> list[Path]:
@@ -58,37 +58,8 @@ def of_all_seeds(path: Path) -> list[Path]:
     return []
 
 
-def _evaluation(folder: Path, split: str, estimator: str) -> Path:
-    """Of a run, the evaluation of this split with this estimator, all else as by default; any other
-    folder is an evaluation's."""
+def _evaluated(folder: Path, config: CompareConfig, reporter: Reporter, workers: int) -> Evaluated:
+    """Of a run, its evaluation with all options as by default; any other folder is one."""
     if not (folder / "config.yaml").exists():
-        return folder
-    found = sorted((folder / "eval").glob(f"*_{split}_{estimator}"))
-    if len(found) == 1:
-        return found[0]
-    if found:
-        remedy = f"name one of {', '.join(map(str, found))}"
-        raise InputError(str(folder), f"has evaluations of '{split}' on several datasets", remedy)
-    remedy = f"run gnio evaluate --workdir {folder} --split {split}"
-    if estimator != "ekf":
-        remedy += f" --estimator {estimator}"
-    raise InputError(str(folder), f"has no evaluation of '{split}' with {estimator}", remedy)
-
-
-def _read(folder: Path) -> Figures:
-    """metrics.json of an evaluation. Raises `InputError` where it is not there, or its figures
-    cannot stand beside those of today."""
-    path = folder / "metrics.json"
-    try:
-        figures = json.loads(path.read_text(encoding="utf-8"))
-        definitions = report.definitions(figures)
-    except FileNotFoundError:
-        remedy = "name a run, or a folder below its eval/"
-        raise InputError(str(folder), "is neither a run nor an evaluation", remedy) from None
-    except (ValueError, KeyError, TypeError, AttributeError):
-        remedy = "run gnio evaluate again"
-        raise InputError(str(path), "is not a metrics.json of an evaluation", remedy) from None
-    if definitions != report.DEFINITIONS:
-        problem = "was written by another version, whose figures mean something else"
-        raise InputError(str(path), problem, "run gnio evaluate again")
-    return figures
+        return of_evaluation(folder)
+    return of_run(folder, config.split, config.estimator, reporter, config.data_root, workers)

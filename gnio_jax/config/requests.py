@@ -146,6 +146,9 @@ class CompareConfig:
     """Split whose evaluations are compared."""
     estimator: Literal["ekf", "integrate", "imu_only"] = "ekf"
     """Estimator whose evaluations are compared."""
+    data_root: str | None = None
+    """Folder of the dataset, for runs that are not evaluated yet; by default the run's,
+    $GNIO_DATA/<dataset>, or data/<dataset>."""
     metrics: tuple[str, ...] = ("ate", "rpe_1s", "yaw_rmse", "path_length_ratio", "nis", "nees")
     """Metrics that are compared, as metrics.json names them."""
     out: str | None = None

@@ -4,7 +4,6 @@ evaluated one after the other; restartable, nothing done twice."""
 from __future__ import annotations
 
 import dataclasses
-import json
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,12 +12,12 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from gnio_jax import calibration, evaluation
+from gnio_jax import calibration
 from gnio_jax import config as configuration
-from gnio_jax.config import CalibrateConfig, EvaluateConfig, TablesConfig, TrainConfig
+from gnio_jax.comparison.figures import how, of_run
+from gnio_jax.config import CalibrateConfig, TablesConfig, TrainConfig
 from gnio_jax.evaluation import metrics, report
 from gnio_jax.evaluation.metrics import Trajectory
-from gnio_jax.evaluation.run import folder_name, run_config
 from gnio_jax.evaluation.tum import read_tum
 from gnio_jax.reporting import Reporter
 from gnio_jax.tables.experiments import Cell
@@ -58,7 +57,8 @@ def run_cell(cell: Cell, options: TablesConfig, reporter: Reporter, workers: int
     runs = [Path(each.workdir or "") for each in configuration.with_seeds(config, seeds)]
     if options.calibrate:
         runs = [calibrated(run, reporter, workers) for run in runs]
-    figures = [evaluated(run, options.split, options.estimator, reporter, workers) for run in runs]
+    given = dict(split=options.split, estimator=options.estimator, reporter=reporter)
+    figures = [of_run(run, **given, workers=workers).figures for run in runs]
     return Result(cell, figures, runs)
 
 
@@ -108,33 +108,6 @@ def _best_step(workdir: Path) -> list[str]:
     return sorted(entry.name for entry in (workdir / "checkpoints" / "best").glob("[0-9]*"))
 
 
-def evaluated(
-    workdir: Path, split: str, estimator: str, reporter: Reporter, workers: int = 1
-) -> dict[str, Any]:
-    """The figures of the run's best checkpoint on a split: those that are there if they are of that
-    checkpoint and mean the same (`report.DEFINITIONS`), else new ones."""
-    config, folder = _evaluation(workdir, split, estimator)
-    path = folder / "metrics.json"
-    best = workdir / "checkpoints" / "best"
-    if path.exists():
-        found = json.loads(path.read_text(encoding="utf-8"))
-        same = report.definitions(found) == report.DEFINITIONS
-        if same and (best / str(found["settings"]["step"])).is_dir():
-            return found
-    reporter.line(f"evaluating {workdir.name} on {split} ({estimator})")
-    evaluation.evaluate(config, workers=workers)
-    return json.loads(path.read_text(encoding="utf-8"))
-
-
-def _evaluation(workdir: Path, split: str, estimator: str) -> tuple[EvaluateConfig, Path]:
-    """How `evaluated` evaluates a run, and the folder where that leaves its files."""
-    trained = run_config(workdir)
-    config = EvaluateConfig(
-        str(workdir), split=split, estimator=estimator, plots=False, filter=trained.filter
-    )  # type: ignore[arg-type]
-    return config, workdir / "eval" / folder_name(config, trained.dataset, trained)
-
-
 class PlanView(NamedTuple):
     """Paths of one sequence seen from above, m."""
 
@@ -159,7 +132,7 @@ def paths(result: Result, split: str, estimator: str) -> dict[str, PlanView]:
 
 def results_folder(result: Result, split: str, estimator: str) -> Path:
     """Of the first seed's evaluation."""
-    return _evaluation(result.runs[0], split, estimator)[1]
+    return how(result.runs[0], split, estimator)[1]
 
 
 def _plan_view(estimate: Trajectory, reference: Trajectory) -> PlanView:

@@ -9,7 +9,7 @@ import pytest
 
 from gnio_jax import comparison
 from gnio_jax.commands import app
-from gnio_jax.comparison import pairs, picture, rows, text
+from gnio_jax.comparison import figures, pairs, picture, rows, text
 from gnio_jax.config import CompareConfig
 from gnio_jax.errors import InputError
 
@@ -29,7 +29,7 @@ def write(run, ates, name="oxiod_test_ekf", drop=(), **settings):
         sequences[sequence] = {**kept, "group": GROUPS[sequence]}
     finite = [ate for ate in ates.values() if math.isfinite(ate)]
     mean = {"ate": np.mean(finite), "rpe_1s": np.mean(finite) / 10}
-    figures = {
+    found = {
         "settings": {"dataset": "oxiod", "split": "test", "definitions": 2, **settings},
         "sequences": sequences,
         "mean": {
@@ -40,7 +40,7 @@ def write(run, ates, name="oxiod_test_ekf", drop=(), **settings):
     folder = run / "eval" / name
     folder.mkdir(parents=True)
     (run / "config.yaml").write_text("dataset: oxiod\n")
-    (folder / "metrics.json").write_text(json.dumps(figures))
+    (folder / "metrics.json").write_text(json.dumps(found))
     return folder
 
 
@@ -53,6 +53,13 @@ def runs(tmp_path):
     return tmp_path
 
 
+def second(found, metric="ate"):
+    """The difference of the second row."""
+    difference = found.cells[metric][1].difference
+    assert difference is not None
+    return difference
+
+
 def test_by_hand(runs):
     """Means over seeds 2, 2, 6 against 1, 3, 3. Draws of two groups: ann twice gives the mean of
     −1 and +1, bob twice −3, each of the four draws equally likely."""
@@ -60,10 +67,11 @@ def test_by_hand(runs):
     plain, new = found.cells["ate"]
     assert plain.label == "plain" and plain.difference is None
     assert plain.seeds == pytest.approx([8 / 3, 4.0]) and new.seeds == pytest.approx([7 / 3])
-    assert new.difference.mean == pytest.approx(-1.0)
-    assert new.difference.interval == pytest.approx((-3.0, 0.0))
-    assert new.difference.gain == pytest.approx(30.0)
-    assert (new.difference.smaller, new.difference.compared, new.difference.groups) == (2, 3, 2)
+    difference = second(found)
+    assert difference.mean == pytest.approx(-1.0)
+    assert difference.interval == pytest.approx((-3.0, 0.0))
+    assert difference.gain == pytest.approx(30.0)
+    assert (difference.smaller, difference.compared, difference.groups) == (2, 3, 2)
     assert text.lines(found) == [
         ["ATE (m)", "plain", "3.33 ± 0.94", "", ""],
         ["", "new", "2.33", "-1.00 (-3.00 to +0.00)", "2 of 3"],
@@ -77,9 +85,8 @@ def test_what_diverged_is_in_no_difference(runs):
     words = (f"{runs}/new_s0", f"{runs}/lost")
     found = comparison.compare(CompareConfig(words, metrics=("ate", "rpe_1s")))
     for metric, scale in (("ate", 1.0), ("rpe_1s", 0.1)):
-        lost = found.cells[metric][1]
-        assert lost.difference.compared == 2 and lost.diverged == 1
-        assert lost.difference.mean == pytest.approx(-0.25 * scale)
+        assert second(found, metric).compared == 2 and found.cells[metric][1].diverged == 1
+        assert second(found, metric).mean == pytest.approx(-0.25 * scale)
     assert "†" in text.lines(found)[1][2] and text.explanations(found)[-1].startswith("†")
     names = [label.get_text() for label in picture.draw(found).axes[0].get_yticklabels()]
     assert [name for name in names if "†" in name] == ["b  (ann) †"]
@@ -130,11 +137,32 @@ def test_names_without_a_seed_stand_for_all_seeds(tmp_path):
     }
 
 
+def test_runs_are_evaluated_where_they_are_not_yet(runs, monkeypatch):
+    made = []
+
+    def evaluate(config, workers):
+        made.append((config.workdir, config.split, config.estimator, config.data_root, workers))
+        write(
+            runs / config.workdir.removeprefix(f"{runs}/"), {"a": 4.0}, "oxiod_val_ekf", split="val"
+        )
+
+    monkeypatch.setattr(figures.evaluation, "evaluate", evaluate)
+    words = (f"{runs}/plain", f"{runs}/new")
+    config = CompareConfig(words, split="val", metrics=("ate",), data_root="there")
+    found = comparison.compare(config, workers=3)
+    assert made == [
+        (f"{runs}/{name}", "val", "ekf", "there", 3) for name in ("plain_s0", "plain_s1", "new_s0")
+    ]
+    assert found.split == "val" and second(found).mean == 0
+    comparison.compare(config)
+    assert len(made) == 3
+
+
 def test_evaluations_by_their_folders(runs):
     """Two estimators of one run, side by side."""
     other = write(runs / "new_s0", {"a": 2.0, "b": 4.0, "c": 4.0}, "oxiod_test_integrate")
     found = comparison.compare(CompareConfig((f"{runs}/new", str(other)), metrics=("ate",)))
-    assert found.cells["ate"][1].difference.mean == pytest.approx(1.0)
+    assert second(found).mean == pytest.approx(1.0)
     assert [row.label for row in found.rows] == ["new", "new_s0/eval/oxiod_test_integrate"]
 
 
@@ -146,19 +174,18 @@ def test_refusals(runs):
 
     assert "needs two or more" in refused("plain")
     assert "is not there" in refused("plain", "gone")
-    missing = refused("plain", "new", split="val")
-    assert "has no evaluation of 'val'" in missing and "--split val" in missing
-    assert "--estimator integrate" in refused("plain", "new", estimator="integrate")
     assert "no row has 'ape'; there are: ate, rpe_1s" in refused("plain", "new", metrics=("ape",))
     write(runs / "seen", {"a": 1.0}, split="seen")
     assert "is of oxiod seen, the first row of oxiod test" in refused("plain", "seen")
+    old = "old/eval/oxiod_test_ekf"
     write(runs / "old", {"a": 1.0}, definitions=1)
-    assert "another version" in refused("plain", "old")
-    write(runs / "two", {"a": 1.0})
-    write(runs / "two", {"a": 1.0}, name="ridi_test_ekf")
-    assert "several datasets" in refused("plain", "two")
+    assert "another version" in refused("plain", old)
+    write(runs / "gone", {"a": 1.0}, checkpoint="best", step=7)
+    assert "of a checkpoint that the run has no more" in refused(
+        "plain", "gone/eval/oxiod_test_ekf"
+    )
     (runs / "new_s0" / "eval" / "oxiod_test_ekf" / "metrics.json").write_text("[]")
-    assert "is not a metrics.json" in refused("plain", "new")
+    assert "is not a metrics.json" in refused("plain", "new_s0/eval/oxiod_test_ekf")
     assert "neither a run nor an evaluation" in refused("plain", "new_s0/eval")
 
 
@@ -183,6 +210,6 @@ def test_the_command_shows_and_writes(runs, capsys):
 
 def test_errors_are_infinite_where_the_estimate_diverged(tmp_path):
     folder = write(tmp_path, {"a": math.inf, "b": 2.0})
-    figures = json.loads((folder / "metrics.json").read_text())
-    found = pairs.errors([figures], "rpe_1s")
+    made = json.loads((folder / "metrics.json").read_text())
+    found = pairs.errors([made], "rpe_1s")
     assert {name: list(values) for name, values in found.items()} == {"a": [math.inf], "b": [0.2]}
