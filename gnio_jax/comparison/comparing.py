@@ -76,10 +76,13 @@ def _recordings(row: Row, seed: int) -> tuple[str, str]:
 
 
 def _labels(rows: list[Row]) -> list[str]:
-    """The rows' names without the folder that all are in."""
+    """The rows' names without the folders that all begin with, and those that all end with."""
     paths = [Path(row.label).absolute() for row in rows]
     common = os.path.commonpath([path.parent for path in paths])
-    return [str(path.relative_to(common)) for path in paths]
+    parts = [path.relative_to(common).parts for path in paths]
+    while len({each[-1] for each in parts}) == 1 and all(len(each) > 1 for each in parts):
+        parts = [each[:-1] for each in parts]
+    return [str(Path(*each)) for each in parts]
 
 
 def _cells(rows: list[Row], metric: str) -> list[Cell]:

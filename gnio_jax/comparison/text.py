@@ -58,8 +58,7 @@ def lines(comparison: Comparison) -> list[list[str]]:
 
 def explanations(comparison: Comparison) -> list[str]:
     """What a reader must know of the figures."""
-    seeds = ", ".join(f"{row.label} {len(row.seeds)}" for row in comparison.rows)
-    found = [f"Seeds: {seeds}; ± is their standard deviation."]
+    found = [_seeds(comparison)]
     differences = [cell.difference for cell in _cells(comparison) if cell.difference]
     groups = sorted({difference.groups for difference in differences if difference.interval})
     if groups:
@@ -73,6 +72,16 @@ def explanations(comparison: Comparison) -> list[str]:
             "neither row diverged."
         )
     return found
+
+
+def _seeds(comparison: Comparison) -> str:
+    """How many there are."""
+    counts = [len(row.seeds) for row in comparison.rows]
+    if max(counts) == 1:
+        return "One seed each: what another seed would give is not known."
+    each = ", ".join(f"{row.label} {len(row.seeds)}" for row in comparison.rows)
+    said = f"{counts[0]} each" if len(set(counts)) == 1 else each
+    return f"Seeds: {said}; ± is their standard deviation."
 
 
 def column(metric: str) -> Column:

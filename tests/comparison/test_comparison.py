@@ -164,6 +164,10 @@ def test_evaluations_by_their_folders(runs):
     found = comparison.compare(CompareConfig((f"{runs}/new", str(other)), metrics=("ate",)))
     assert second(found).mean == pytest.approx(1.0)
     assert [row.label for row in found.rows] == ["new", "new_s0/eval/oxiod_test_integrate"]
+    assert text.explanations(found)[0].startswith("One seed each")
+    words = [f"{runs}/{name}_s0/eval/oxiod_test_ekf" for name in ("plain", "new")]
+    found = comparison.compare(CompareConfig(tuple(words), metrics=("ate",)))
+    assert [row.label for row in found.rows] == ["plain_s0", "new_s0"]
 
 
 def test_refusals(runs):
