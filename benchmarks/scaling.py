@@ -39,6 +39,7 @@ from gnio_jax.config import ModelConfig, OptimConfig, TrainConfig
 from gnio_jax.data import cache
 from gnio_jax.data.on_disk import source_on_disk
 from gnio_jax.data.windows import WindowSource, joined
+from gnio_jax.models import resnet
 from gnio_jax.scaling import devices
 from gnio_jax.scaling.meeting import Meeting
 from gnio_jax.scaling.processes import is_first, meet
@@ -205,6 +206,8 @@ def compare_residencies(arguments: argparse.Namespace) -> None:
 def model(batch: int) -> None:
     """Time of a step of the paper's network on many GPUs, from its operations and its sums."""
     devices.cpu_devices(2)
+    # As on a GPU, whose convolutions are not Winograd's.
+    resnet.convolve_training = resnet.convolve
     # A small batch compiles in seconds; operations of a window and sums of a step are the same.
     config = configuration(64, 16)
     flops = flops_per_window(config)

@@ -3,7 +3,7 @@ computed person with the phone in the hand, of a seed that no split has.
 
     python examples/make_walk.py
 
-The true path is 76.4 m long and ends 13.1 m from its start.
+The true path is 76.3 m long and ends 13.0 m from its start.
 """
 
 from pathlib import Path

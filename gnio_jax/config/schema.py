@@ -305,8 +305,8 @@ class FilterOptions:
     considered_gyro_bias_std: NonNegative = 0.0
     """Standard deviation, rad/s, of the gyro's bias that the filter does not try to estimate but
     reports in the covariance of its trajectories (ours; consider covariance analysis). The
-    trajectory does not depend on this nor on the next three. Smoother and Tracker leave them out.
-    """
+    trajectory does not depend on this nor on the next three. Smoother and Tracker count them where
+    they are given (`considered=`)."""
     considered_scale_std: NonNegative = 0.0
     """The same of the displacements' scale, as a fraction."""
     considered_heading_std_degrees: NonNegative = 0.0

@@ -15,7 +15,8 @@ Part = Literal["noise", "measurement", "start", "uncertainty", "head", "encoder"
 @dataclass(frozen=True)
 class ThroughFilter:
     """Training with the network in the filter's loop (ours), from the weights of `init_from`. The
-    section `optim` counts pieces instead of windows; `loss` and `augment` are for windows alone."""
+    section `optim` counts pieces instead of windows; `loss` is for windows alone, and so is
+    `augment` but for its `yaw`."""
 
     learn: tuple[Part, ...] = ()
     """Parts that learn; none: the network is trained on windows. noise: the filter's densities and
