@@ -12,6 +12,8 @@ from gnio_jax.commands import console
 from gnio_jax.commands.options import Command
 from gnio_jax.config import CompareConfig
 from gnio_jax.cores import usable_cores
+from gnio_jax.errors import InputError
+from gnio_jax.files import check_writable, replacing
 
 if TYPE_CHECKING:
     from gnio_jax.comparison import Comparison
@@ -27,11 +29,14 @@ of a run are averaged, and the name of a run without its seed stands for all of 
 runs/plain_s0, runs/plain_s1, ..., runs/plain_calibrated for runs/plain_s0_calibrated, ... Walks of
 one person or session are not independent, so the 95 % interval of a difference draws whole people
 or sessions anew. An interval on both sides of zero says that the recordings do not tell the two
-apart. It knows nothing of other seeds: ± is their standard deviation."""
+apart; with few people or sessions one beside zero does not say that they do. It knows nothing of
+other seeds: ± is their standard deviation."""
 
 
 def show(config: CompareConfig, _prog: str) -> None:
     """Compare, show the table, and write the files that are asked for."""
+    if config.out is not None:
+        _check_out(config.out)  # or what was evaluated for it would be lost
     # After the options: --help and mistakes do not wait for these imports.
     import jax
 
@@ -43,37 +48,47 @@ def show(config: CompareConfig, _prog: str) -> None:
     with console.terminal() as terminal:
         found = comparison.compare(config, terminal, usable_cores())
     output = console.stdout()
-    output.print(f"{text.title(found)}\n")
-    output.print(_table(text.lines(found)))
+    output.print(f"{text.title(found)}\n", soft_wrap=True)
+    output.print(_table(text.HEADER, text.lines(found)))
     for line in text.explanations(found):
-        output.print(line, soft_wrap=True)
-    if config.out:
+        output.print(line)
+    if config.out is not None:
         _write(Path(config.out), found)
         output.print(f"\nresults: {config.out}.md, .csv, .png", soft_wrap=True)
 
 
-def _table(lines: list[list[str]]) -> Table:
-    """The lines, with a space between metrics."""
+def _table(header: list[str], lines: list[list[str]]) -> Table:
+    """The lines below a heading for each metric: names of rows have the width that is left."""
     table = Table(box=box.SIMPLE_HEAD, header_style="bold")
-    table.add_column("metric", no_wrap=True)
-    table.add_column("row", overflow="fold")
-    for name in ("mean", "difference (95 %)", "smaller in"):
+    table.add_column(overflow="fold")
+    for name in header[2:]:
         table.add_column(name, justify="right", no_wrap=True)
-    for line, following in zip(lines, [*lines[1:], None], strict=True):
-        table.add_row(*line, end_section=bool(following and following[0]))
+    for metric, *cells in lines:
+        if metric:
+            table.add_row(f"{metric}", style="bold")
+        table.add_row(f"  {cells[0]}", *cells[1:])
     return table
+
+
+def _check_out(out: str) -> None:
+    """Raise now where the files could not be written later."""
+    if Path(out).name in ("", "..") or out.endswith(("/", "\\")):
+        raise InputError("--out", f"'{out}' names no file", "give a name without ending: runs/both")
+    for ending in ENDINGS:
+        check_writable(out + ending)
 
 
 def _write(path: Path, found: Comparison) -> None:
     """Table and picture."""
     from gnio_jax.comparison import picture, text
     from gnio_jax.evaluation import plots
-    from gnio_jax.files import replacing
 
     text.write(path, found)
-    with replacing(path.with_name(path.name + ".png")) as temporary:
+    with replacing(f"{path}.png") as temporary:
         plots.save(temporary, picture.draw(found))
 
+
+ENDINGS = (".md", ".csv", ".png")
 
 COMMON = ("RUNS", "--split", "--estimator", "--data-root", "--metrics", "--out")
 

@@ -13,6 +13,15 @@ from gnio_jax.config import CompareConfig
 from gnio_jax.errors import InputError
 from gnio_jax.reporting import Lines, Reporter
 
+USUAL = ("ate", "rpe_1s", "yaw_rmse", "path_length_ratio", "nis", "nees")
+"""Metrics that are compared where none are named."""
+BEST = {
+    **dict.fromkeys(("path_length_ratio", "path_length_ratio_2d", "nis", "nees", "nees_2d"), 1.0),
+    **dict.fromkeys(("nis_coverage", "nees_coverage", "nees_coverage_2d"), 95.0),
+    "accepted": 100.0,
+}
+"""The best value of a metric whose best is not 0."""
+
 
 class Cell(NamedTuple):
     """A metric of a row."""
@@ -22,7 +31,9 @@ class Cell(NamedTuple):
     """Mean over the sequences that did not diverge, with each seed; empty where some seed has
     none."""
     diverged: int
-    """Estimates that diverged, of seeds × sequences; they are in no mean."""
+    """Estimates that diverged; they are in no mean."""
+    estimates: int
+    """Seeds × sequences."""
     difference: Difference | None
     """To the first row; None for the first itself, and without the metric."""
 
@@ -48,15 +59,25 @@ def compare(
     reporter = reporter or Lines()
     if len(config.rows) < 2:
         raise InputError("RUNS", "needs two or more", "name the run to compare with first")
+    if config.metrics == ():
+        raise InputError("--metrics", "names no metric", "leave it out for the usual ones")
     rows = [read_row(word, config, reporter, workers) for word in config.rows]
     dataset, split = _common_recordings(rows)
     rows = [row._replace(label=label) for row, label in zip(rows, _labels(rows), strict=True)]
+    metrics = _metrics(rows, config.metrics)
+    return Comparison(dataset, split, rows, {metric: _cells(rows, metric) for metric in metrics})
+
+
+def _metrics(rows: list[Row], wanted: tuple[str, ...] | None) -> list[str]:
+    """Those that are wanted; by default the usual ones that some row has."""
     known = {metric: None for row in rows for seed in row.seeds for metric in seed["mean"]}
-    for metric in config.metrics:
-        if metric not in known or metric == "diverged":
-            names = ", ".join(name for name in known if name != "diverged")
-            raise InputError("--metrics", f"no row has '{metric}'", f"there are: {names}")
-    return Comparison(dataset, split, rows, {m: _cells(rows, m) for m in config.metrics})
+    del known["diverged"]
+    for metric in wanted or ():
+        if metric not in known:
+            raise InputError(
+                "--metrics", f"no row has '{metric}'", f"there are: {', '.join(known)}"
+            )
+    return list(wanted) if wanted else [metric for metric in USUAL if metric in known]
 
 
 def _common_recordings(rows: list[Row]) -> tuple[str, str]:
@@ -65,8 +86,10 @@ def _common_recordings(rows: list[Row]) -> tuple[str, str]:
     for row in rows:
         for number, folder in enumerate(row.folders):
             if _recordings(row, number) != first:
-                problem = f"is of {' '.join(_recordings(row, number))}, the first row of"
-                raise InputError(str(folder), f"{problem} {' '.join(first)}")
+                dataset, split = _recordings(row, number)
+                problem = f"is of {dataset} {split}, the first row of {' '.join(first)}"
+                remedy = f"give --split {split}, or name evaluations of one split of one dataset"
+                raise InputError(str(folder), problem, remedy)
     return first
 
 
@@ -77,7 +100,7 @@ def _recordings(row: Row, seed: int) -> tuple[str, str]:
 
 def _labels(rows: list[Row]) -> list[str]:
     """The rows' names without the folders that all begin with, and those that all end with."""
-    paths = [Path(row.label).absolute() for row in rows]
+    paths = [Path(os.path.abspath(row.label)) for row in rows]
     common = os.path.commonpath([path.parent for path in paths])
     parts = [path.relative_to(common).parts for path in paths]
     while len({each[-1] for each in parts}) == 1 and all(len(each) > 1 for each in parts):
@@ -97,7 +120,10 @@ def _cells(rows: list[Row], metric: str) -> list[Cell]:
                 label=row.label,
                 seeds=[] if None in means else [float(mean) for mean in means],
                 diverged=sum(seed["mean"]["diverged"] for seed in row.seeds),
-                difference=pairs.difference(own, tables[0], group_of) if number and own else None,
+                estimates=sum(len(seed["sequences"]) for seed in row.seeds),
+                difference=pairs.difference(own, tables[0], group_of, BEST.get(metric, 0.0))
+                if number and own
+                else None,
             )
         )
     return cells

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from gnio_jax import evaluation
-from gnio_jax.config import EvaluateConfig
+from gnio_jax.config import EvaluateConfig, FilterOptions
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import report
 from gnio_jax.evaluation.run import folder_name, run_config
@@ -35,14 +36,12 @@ def of_run(
     """The figures of the run's best checkpoint on a split: those that are there if they are of that
     checkpoint and mean the same (`report.DEFINITIONS`), else new ones."""
     config, folder = how(workdir, split, estimator, data_root)
-    path = folder / "metrics.json"
-    if path.exists():
-        found = json.loads(path.read_text(encoding="utf-8"))
-        if report.definitions(found) == report.DEFINITIONS and _is_newest(workdir, found):
-            return Evaluated(folder, found)
-    reporter.line(f"evaluating {workdir.name} on {split} ({estimator})")
-    evaluation.evaluate(config, workers=workers)
-    return Evaluated(folder, json.loads(path.read_text(encoding="utf-8")))
+    found = _read(folder / "metrics.json")
+    if found is None or _out_of_date(workdir, found, config.filter):
+        reporter.line(f"evaluating {workdir.name} on {split} ({estimator})")
+        evaluation.evaluate(config, reporter.progress, workers)
+        found = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
+    return Evaluated(folder, found)
 
 
 def how(
@@ -64,28 +63,44 @@ def how(
 def of_evaluation(folder: Path) -> Evaluated:
     """The figures of an evaluation that is there. Raises `InputError` where it is not, its run has
     learnt since, or its figures cannot stand beside those of today."""
-    path = folder / "metrics.json"
-    try:
-        figures = json.loads(path.read_text(encoding="utf-8"))
-        definitions = report.definitions(figures)
-    except FileNotFoundError:
+    path, remedy = folder / "metrics.json", "run gnio evaluate again"
+    if not path.exists():
         remedy = "name a run, or a folder below its eval/"
-        raise InputError(str(folder), "is neither a run nor an evaluation", remedy) from None
-    except (ValueError, KeyError, TypeError, AttributeError):
-        remedy = "run gnio evaluate again"
-        raise InputError(str(path), "is not a metrics.json of an evaluation", remedy) from None
-    if definitions != report.DEFINITIONS:
-        problem = "was written by another version, whose figures mean something else"
-        raise InputError(str(path), problem, "run gnio evaluate again")
-    if folder.parent.name == "eval" and not _is_newest(folder.parents[1], figures):
-        problem = "is of a checkpoint that the run has no more"
-        raise InputError(str(path), problem, "run gnio evaluate again")
+        raise InputError(str(folder), "is neither a run nor an evaluation", remedy)
+    figures = _read(path)
+    if figures is None:
+        raise InputError(str(path), "is not a metrics.json of an evaluation", remedy)
+    whole = folder.resolve()
+    workdir = whole.parents[1] if whole.parent.name == "eval" else None
+    if problem := _out_of_date(workdir, figures, None):
+        raise InputError(str(path), problem, remedy)
     return Evaluated(folder, figures)
 
 
-def _is_newest(workdir: Path, figures: Figures) -> bool:
-    """Whether the figures are of a checkpoint that the run still has; those without a network are
-    of none."""
+def _read(path: Path) -> Figures | None:
+    """metrics.json; None where it is not there or not whole."""
+    try:
+        figures = json.loads(path.read_text(encoding="utf-8"))
+        needed = [figures["mean"]["diverged"], *map(dict, figures["sequences"].values())]
+        needed += [figures["settings"][name] for name in ("dataset", "split")]
+        if report.definitions(figures) == report.DEFINITIONS:
+            needed += [sequence["group"] for sequence in figures["sequences"].values()]
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return None
+    return figures
+
+
+def _out_of_date(
+    workdir: Path | None, figures: Figures, options: FilterOptions | None
+) -> str | None:
+    """Why figures cannot stand for the run in `workdir`, as far as that is known; None where they
+    can. `options`: the filter that they must be of."""
     settings = figures["settings"]
+    if report.definitions(figures) != report.DEFINITIONS:
+        return "was written by another version, whose figures mean something else"
     step, which = settings.get("step"), settings.get("checkpoint") or "best"
-    return step is None or (workdir / "checkpoints" / which / str(step)).is_dir()
+    if workdir and step is not None and not (workdir / "checkpoints" / which / str(step)).is_dir():
+        return "is of a checkpoint that the run has no more"
+    if options and settings.get("filter", asdict(options)) != asdict(options):
+        return "is of another filter than the run's"
+    return None

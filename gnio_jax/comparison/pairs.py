@@ -26,12 +26,14 @@ class Difference(NamedTuple):
     """95 % of the mean, groups drawn anew (`metrics.bootstrap`); None for a single group."""
     gain: float | None
     """% by which the row's mean is smaller; None without such a sequence."""
-    smaller: int
-    """Sequences in which the row's is smaller."""
+    better: int
+    """Sequences in which the row is nearer to the best value there is, mean over seeds."""
     compared: int
     """Sequences that all this is over."""
+    sequences: int
+    """Sequences of this row or the first."""
     groups: int
-    """People or sessions that they belong to."""
+    """People or sessions that the compared ones belong to."""
 
 
 def errors(seeds: Sequence[Figures], metric: str = "ate") -> Errors:
@@ -58,19 +60,24 @@ def paired(own: Errors, first: Errors) -> list[str]:
     return [name for name in own if name in first and np.isfinite([*own[name], *first[name]]).all()]
 
 
-def difference(own: Errors, first: Errors, group_of: Mapping[str, str]) -> Difference:
-    """How a row differs from the first. The rows may have different numbers of seeds."""
-    names = paired(own, first)
+def difference(
+    own: Errors, first: Errors, group_of: Mapping[str, str], best: float = 0.0
+) -> Difference:
+    """How a row differs from the first, in a metric whose best value is `best`. The rows may have
+    different numbers of seeds."""
+    names, sequences = paired(own, first), len(own.keys() | first.keys())
     if not names:
-        return Difference(None, None, None, 0, 0, 0)
+        return Difference(None, None, None, 0, 0, sequences, 0)
     ours, theirs = (np.array([table[name].mean() for name in names]) for table in (own, first))
+    far = [[np.abs(table[name] - best).mean() for name in names] for table in (own, first)]
     drawn = [group_of[name] for name in names]
     return Difference(
         mean=float((ours - theirs).mean()),
         interval=metrics.bootstrap(ours - theirs, drawn),
         gain=100 * (1 - float(ours.mean() / theirs.mean())) if theirs.mean() else None,
-        smaller=int((ours < theirs).sum()),
+        better=sum(one < other for one, other in zip(*far, strict=True)),
         compared=len(names),
+        sequences=sequences,
         groups=len(set(drawn)),
     )
 

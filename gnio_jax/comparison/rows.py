@@ -11,7 +11,7 @@ from gnio_jax.config import CompareConfig
 from gnio_jax.errors import InputError
 from gnio_jax.reporting import Reporter
 
-_SEED = re.compile(r"_s(\d+)(?=_|$)")
+_SEED = re.compile(r"_s\d+(?=_|$)")
 
 
 class Row(NamedTuple):
@@ -42,20 +42,25 @@ def read_row(word: str, config: CompareConfig, reporter: Reporter, workers: int)
 
 def of_all_seeds(path: Path) -> list[Path]:
     """`path` where it is there; else the paths that differ from it in the seed alone, in the order
-    of the seeds."""
+    of the seeds. Raises `InputError` where some seeds have such a path and others do not."""
     if path.exists():
         return [path]
-    for parent in path.parents:
-        if parent.exists():
-            name, *rest = path.relative_to(parent).parts
-            seeds = {
-                int(seed[1]): entry
-                for entry in parent.iterdir()
-                if (seed := _SEED.search(entry.name)) and _SEED.sub("", entry.name, 1) == name
-            }
-            paths = [seeds[seed].joinpath(*rest) for seed in sorted(seeds)]
-            return [seed for seed in paths if seed.exists()]
-    return []
+    parent = next((folder for folder in path.parents if folder.exists()), None)
+    if parent is None:
+        return []
+    name, *rest = path.relative_to(parent).parts
+    seeds = {
+        int(seed[0][2:]): entry.joinpath(*rest)
+        for entry in parent.iterdir()
+        for seed in _SEED.finditer(entry.name)
+        if entry.name[: seed.start()] + entry.name[seed.end() :] == name
+    }
+    paths = [seeds[seed] for seed in sorted(seeds)]
+    missing = [each for each in paths if not each.exists()]
+    if missing and len(missing) < len(paths):
+        problem = f"is there for {len(paths) - len(missing)} of {len(paths)} seeds"
+        raise InputError(str(path), problem, f"missing: {', '.join(map(str, missing))}")
+    return [] if missing else paths
 
 
 def _evaluated(folder: Path, config: CompareConfig, reporter: Reporter, workers: int) -> Evaluated:

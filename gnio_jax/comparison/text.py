@@ -8,12 +8,14 @@ from pathlib import Path
 
 import numpy as np
 
-from gnio_jax.comparison.comparing import Cell, Comparison
+from gnio_jax.comparison.comparing import BEST, Cell, Comparison
 from gnio_jax.comparison.pairs import Difference
 from gnio_jax.evaluation.table import COLUMNS, Column
 from gnio_jax.files import replacing, write_text
 
-HEADER = ["metric", "row", "mean", "difference (95 %)", "smaller in"]
+HEADER = ["metric", "row", "mean", "difference (95 %)", "better in"]
+FEW_GROUPS = 10
+"""With fewer the interval of a mean leaves out the truth more than twice as often as it says."""
 
 
 def grid(header: list[str], table: list[list[str]]) -> str:
@@ -30,10 +32,10 @@ def spread(values: list[float]) -> float:
 def write(path: Path, comparison: Comparison) -> None:
     """`path`.md and `path`.csv."""
     text = f"{title(comparison)}\n\n{grid(HEADER, lines(comparison))}\n"
-    text += "".join(f"{line}\n" for line in explanations(comparison))
-    write_text(path.with_name(path.name + ".md"), text)
+    text += "".join(f"{line}\n\n" for line in explanations(comparison))
+    write_text(f"{path}.md", text.rstrip() + "\n")
     with (
-        replacing(path.with_name(path.name + ".csv")) as temporary,
+        replacing(f"{path}.csv") as temporary,
         open(temporary, "w", newline="", encoding="utf-8") as file,
     ):
         csv.writer(file).writerows(_csv_lines(comparison))
@@ -64,13 +66,20 @@ def explanations(comparison: Comparison) -> list[str]:
     if groups:
         drawn = " or ".join(map(str, groups))
         found.append(f"The interval draws people or sessions anew; there are {drawn}.")
-    elif differences:
+    elif any(difference.groups == 1 for difference in differences):
         found.append("No interval: the sequences are of one person or session.")
-    if any(cell.diverged for cell in _cells(comparison)):
+    if groups and groups[0] < FEW_GROUPS:
         found.append(
-            "† Without the estimates that diverged. A difference is over the sequences in which "
-            "neither row diverged."
+            "With so few it is too narrow: where runs do not differ, it leaves out 0 in 26 % of "
+            "the cases with 3 groups, in 15 % with 6 and in 9 % with 10."
         )
+    if any(difference.compared < difference.sequences for difference in differences):
+        found.append(
+            "A difference is over the sequences that both rows have and in which neither diverged; "
+            "a mean is over all that a row has."
+        )
+    if any(cell.diverged for cell in _cells(comparison)):
+        found.append("† Without the estimates that diverged, so many of all.")
     return found
 
 
@@ -90,9 +99,11 @@ def column(metric: str) -> Column:
 
 
 def heading(metric: str) -> str:
-    """Name and unit."""
+    """Name, unit, and the best value where that is not 0."""
     unit = column(metric).unit
-    return f"{column(metric).heading} ({unit})" if unit else column(metric).heading
+    best = f"best {BEST[metric]:g}" if metric in BEST else ""
+    remarks = ", ".join(filter(None, (unit, best)))
+    return f"{column(metric).heading} ({remarks})" if remarks else column(metric).heading
 
 
 def _cells(comparison: Comparison) -> list[Cell]:
@@ -100,19 +111,17 @@ def _cells(comparison: Comparison) -> list[Cell]:
 
 
 def _texts(cell: Cell, digits: int) -> list[str]:
-    """Row, mean, difference, sequences in which it is smaller."""
+    """Row, mean, difference, sequences in which it is better."""
     found = cell.difference
-    smaller = f"{found.smaller} of {found.compared}" if found and found.compared else ""
-    return [cell.label, _mean(cell, digits), _difference(found, digits), smaller]
+    better = f"{found.better} of {found.compared}" if found and found.compared else ""
+    return [cell.label, _mean(cell, digits), _difference(found, digits), better]
 
 
 def _mean(cell: Cell, digits: int) -> str:
-    if not cell.seeds:
-        return "–"
-    text = f"{np.mean(cell.seeds):.{digits}f}"
+    text = f"{np.mean(cell.seeds):.{digits}f}" if cell.seeds else "–"
     if len(cell.seeds) > 1:
         text += f" ± {spread(cell.seeds):.{digits}f}"
-    return f"{text} †" if cell.diverged else text
+    return f"{text} † {cell.diverged}/{cell.estimates}" if cell.diverged else text
 
 
 def _difference(found: Difference | None, digits: int) -> str:
@@ -123,17 +132,18 @@ def _difference(found: Difference | None, digits: int) -> str:
         return "–"
     low, high = found.interval or (None, None)
     between = "" if low is None else f" ({low:+.{digits}f} to {high:+.{digits}f})"
-    return f"{found.mean:+.{digits}f}{between}"
+    over = f" over {found.compared}" if found.compared < found.sequences else ""
+    return f"{found.mean:+.{digits}f}{between}{over}"
 
 
 def _csv_lines(comparison: Comparison) -> list[list[object]]:
     """Header and lines; empty where there is no value."""
     header: list[object] = ["metric", "row", "seeds", "mean", "std", "diverged", "difference"]
-    header += ["difference_low", "difference_high", "smaller", "compared", "groups"]
+    header += ["difference_low", "difference_high", "better", "compared", "sequences", "groups"]
     table = [header]
     for metric, cells in comparison.cells.items():
         for row, cell in zip(comparison.rows, cells, strict=True):
-            found = cell.difference or Difference(None, None, None, 0, 0, 0)
+            found = cell.difference or Difference(None, None, None, 0, 0, 0, 0)
             low, high = found.interval or (None, None)
             numbers = [np.mean(cell.seeds) if cell.seeds else None]
             numbers += [spread(cell.seeds) if len(cell.seeds) > 1 else None]
@@ -142,5 +152,5 @@ def _csv_lines(comparison: Comparison) -> list[list[object]]:
                 "" if value is None else repr(float(value)) for value in (found.mean, low, high)
             ]
             line = [metric, cell.label, len(row.seeds), *texts, cell.diverged, *differences]
-            table.append([*line, found.smaller, found.compared, found.groups])
+            table.append([*line, found.better, found.compared, found.sequences, found.groups])
     return table

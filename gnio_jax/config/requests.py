@@ -149,8 +149,9 @@ class CompareConfig:
     data_root: str | None = None
     """Folder of the dataset, for runs that are not evaluated yet; by default the run's,
     $GNIO_DATA/<dataset>, or data/<dataset>."""
-    metrics: tuple[str, ...] = ("ate", "rpe_1s", "yaw_rmse", "path_length_ratio", "nis", "nees")
-    """Metrics that are compared, as metrics.json names them."""
+    metrics: tuple[str, ...] | None = None
+    """Metrics that are compared, as metrics.json names them; by default ate, rpe_1s, yaw_rmse,
+    path_length_ratio, nis and nees, as far as they are there."""
     out: str | None = None
     """Name of files to write, OUT.md, OUT.csv and OUT.png, the errors of every sequence. By
     default the table is only shown."""

@@ -92,6 +92,8 @@ class Follower:
     """Why the newest one was refused."""
     stamps: list[float] = field(default_factory=list)
     """Of the first samples, s."""
+    last: float = math.nan
+    """Stamp of the last sample, s."""
     newest: float = math.inf
     """Stamp of the newest whole sample, s."""
     gaps: list[float] = field(default_factory=list)
@@ -122,7 +124,8 @@ def follow(
         if found.samples == FIRST_STAMPS:
             _check_interval(found.stamps, source.name)
         if found.lost:
-            return
+            break
+    _note_gap(found)
 
 
 def _pushed(push: Push, sample: Sample | None, found: Follower) -> Pose | None:
@@ -135,16 +138,22 @@ def _pushed(push: Push, sample: Sample | None, found: Follower) -> Pose | None:
     except ValueError as error:
         _refuse(found, str(error))
         return None
+    found.last = sample.time
     if np.isfinite([sample.gyro, sample.accel]).all():
-        # What came before the start is not in the path.
-        if found.poses and sample.time - found.newest > found.longest_interval:
-            found.gaps.append(sample.time - found.newest)
+        _note_gap(found)
         found.newest = sample.time
     found.samples += 1
     found.in_a_row = 0
     if found.samples <= FIRST_STAMPS:
         found.stamps.append(sample.time)
     return pose
+
+
+def _note_gap(found: Follower) -> None:
+    """Keep the time from the newest whole sample to the last one, if samples are missing there.
+    What came before the start is not in the path."""
+    if found.poses and found.last - found.newest > found.longest_interval:
+        found.gaps.append(found.last - found.newest)
 
 
 def _check_interval(stamps: list[float], where: str) -> None:

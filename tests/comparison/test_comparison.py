@@ -71,12 +71,13 @@ def test_by_hand(runs):
     assert difference.mean == pytest.approx(-1.0)
     assert difference.interval == pytest.approx((-3.0, 0.0))
     assert difference.gain == pytest.approx(30.0)
-    assert (difference.smaller, difference.compared, difference.groups) == (2, 3, 2)
+    assert (difference.better, difference.compared, difference.groups) == (2, 3, 2)
     assert text.lines(found) == [
         ["ATE (m)", "plain", "3.33 ± 0.94", "", ""],
         ["", "new", "2.33", "-1.00 (-3.00 to +0.00)", "2 of 3"],
     ]
     assert "there are 2." in text.explanations(found)[1]
+    assert text.explanations(found)[2].startswith("With so few it is too narrow")
 
 
 def test_what_diverged_is_in_no_difference(runs):
@@ -87,7 +88,8 @@ def test_what_diverged_is_in_no_difference(runs):
     for metric, scale in (("ate", 1.0), ("rpe_1s", 0.1)):
         assert second(found, metric).compared == 2 and found.cells[metric][1].diverged == 1
         assert second(found, metric).mean == pytest.approx(-0.25 * scale)
-    assert "†" in text.lines(found)[1][2] and text.explanations(found)[-1].startswith("†")
+    assert text.lines(found)[1][2] == "1.75 † 1/3" and text.lines(found)[1][3].endswith("over 2")
+    assert text.explanations(found)[-1].startswith("†")
     names = [label.get_text() for label in picture.draw(found).axes[0].get_yticklabels()]
     assert [name for name in names if "†" in name] == ["b  (ann) †"]
 
@@ -140,7 +142,7 @@ def test_names_without_a_seed_stand_for_all_seeds(tmp_path):
 def test_runs_are_evaluated_where_they_are_not_yet(runs, monkeypatch):
     made = []
 
-    def evaluate(config, workers):
+    def evaluate(config, progress, workers):
         made.append((config.workdir, config.split, config.estimator, config.data_root, workers))
         write(
             runs / config.workdir.removeprefix(f"{runs}/"), {"a": 4.0}, "oxiod_val_ekf", split="val"
@@ -170,6 +172,48 @@ def test_evaluations_by_their_folders(runs):
     assert [row.label for row in found.rows] == ["plain_s0", "new_s0"]
 
 
+def test_rows_without_a_common_sequence(tmp_path):
+    write(tmp_path / "one", {"a": 1.0})
+    write(tmp_path / "two", {"c": 2.0})
+    words = (f"{tmp_path}/one", f"{tmp_path}/two")
+    found = comparison.compare(CompareConfig(words, metrics=("ate",)))
+    assert text.lines(found)[1] == ["", "two", "2.00", "–", ""]
+    assert any("both rows have" in line for line in text.explanations(found))
+    assert not any("No interval" in line for line in text.explanations(found))
+
+
+def test_better_is_nearer_to_the_best_value():
+    """Each seed for itself: 0.7 and 1.4 are no 1.05."""
+    first, own = {"a": np.array([0.7, 1.4])}, {"a": np.array([0.9])}
+    assert pairs.difference(own, first, {"a": "x"}, best=1.0).better == 1
+    assert pairs.difference(first, own, {"a": "x"}, best=1.0).better == 0
+
+
+def test_an_interval_over_few_groups_is_too_narrow():
+    """As the table says: three walks of each of three sessions, and no difference."""
+    random, names = np.random.default_rng(1), [f"{k}{n}" for k in "abc" for n in range(3)]
+    outside = 0
+    for _ in range(200):
+        drawn = (random.normal(size=(3, 1)) + 0.5 * random.normal(size=(3, 3))).ravel()
+        own = {name: np.array([value]) for name, value in zip(names, drawn, strict=True)}
+        first = {name: np.array([0.0]) for name in names}
+        interval = pairs.difference(own, first, {name: name[0] for name in names}).interval
+        assert interval is not None
+        outside += not interval[0] <= 0 <= interval[1]
+    assert 0.18 < outside / 200 < 0.34
+
+
+def test_without_metrics_the_usual_ones_that_are_there(runs):
+    found = comparison.compare(CompareConfig((f"{runs}/plain", f"{runs}/new")))
+    assert list(found.cells) == ["ate", "rpe_1s"]
+
+
+def test_a_name_may_look_like_a_seed(tmp_path):
+    for name in ("galaxy_s8_w8_s0", "galaxy_s8_w8_s1"):
+        (tmp_path / name).mkdir()
+    assert len(rows.of_all_seeds(tmp_path / "galaxy_s8_w8")) == 2
+
+
 def test_refusals(runs):
     def refused(*words, **options):
         with pytest.raises(InputError) as error:
@@ -180,7 +224,9 @@ def test_refusals(runs):
     assert "is not there" in refused("plain", "gone")
     assert "no row has 'ape'; there are: ate, rpe_1s" in refused("plain", "new", metrics=("ape",))
     write(runs / "seen", {"a": 1.0}, split="seen")
-    assert "is of oxiod seen, the first row of oxiod test" in refused("plain", "seen")
+    assert "is of oxiod seen, the first row of oxiod test; give --split seen" in refused(
+        "plain", "seen"
+    )
     old = "old/eval/oxiod_test_ekf"
     write(runs / "old", {"a": 1.0}, definitions=1)
     assert "another version" in refused("plain", old)
@@ -190,7 +236,10 @@ def test_refusals(runs):
     )
     (runs / "new_s0" / "eval" / "oxiod_test_ekf" / "metrics.json").write_text("[]")
     assert "is not a metrics.json" in refused("plain", "new_s0/eval/oxiod_test_ekf")
+    assert "names no metric" in refused("plain", "new", metrics=())
     assert "neither a run nor an evaluation" in refused("plain", "new_s0/eval")
+    (runs / "plain_s1" / "eval" / "oxiod_test_ekf").rename(runs / "elsewhere")
+    assert "is there for 1 of 2 seeds; missing: " in refused("seen", "plain/eval/oxiod_test_ekf")
 
 
 def test_the_command_shows_and_writes(runs, capsys):
@@ -217,3 +266,15 @@ def test_errors_are_infinite_where_the_estimate_diverged(tmp_path):
     made = json.loads((folder / "metrics.json").read_text())
     found = pairs.errors([made], "rpe_1s")
     assert {name: list(values) for name, values in found.items()} == {"a": [math.inf], "b": [0.2]}
+
+
+@pytest.mark.parametrize("out", [".", "..", "results/", "", "c"])
+def test_a_name_that_cannot_be_written_is_told_first(runs, out, monkeypatch, capsys):
+    monkeypatch.chdir(runs)
+    (runs / "c.csv").mkdir()
+    before = sorted(runs.iterdir())
+    with pytest.raises(SystemExit) as left:
+        app.main(["compare", "plain", "new", "--out", out])
+    assert left.value.code == 2 and sorted(runs.iterdir()) == before
+    said = capsys.readouterr()
+    assert not said.out and len(said.err.splitlines()) == 1

@@ -1,5 +1,6 @@
 """Figures of runs that are there already."""
 
+import dataclasses
 import json
 
 import pytest
@@ -29,12 +30,47 @@ def test_figures_of_other_definitions_or_steps_are_made_anew(
     (tmp_path / "checkpoints" / "best" / "7").mkdir(parents=True)
     path = tmp_path / "eval" / "tlio_test_ekf" / "metrics.json"
     path.parent.mkdir(parents=True)
-    settings = {"step": step} | ({} if definitions is None else {"definitions": definitions})
+    settings = {"step": step, "dataset": "tlio", "split": "test"} | (
+        {} if definitions is None else {"definitions": definitions}
+    )
     sequences = {
         "a": {"ate": 1.0, "group": "x"},
         "b": {"ate": 1.0} | ({"group": "y"} if group else {}),
     }
-    path.write_text(json.dumps({"settings": settings, "sequences": sequences}))
-    monkeypatch.setattr(figures.evaluation, "evaluate", lambda config, **_: path.write_text("{}"))
+    found = {"settings": settings, "sequences": sequences, "mean": {"ate": 1.0, "diverged": 0}}
+    path.write_text(json.dumps(found))
+    monkeypatch.setattr(figures.evaluation, "evaluate", lambda *given: path.write_text("{}"))
     found = figures.of_run(tmp_path, "test", "ekf", Lines())
     assert found.folder == path.parent and (found.figures != {}) == kept
+
+
+def test_figures_of_another_filter_or_damaged_ones_are_made_anew(tmp_path, monkeypatch):
+    configuration.save(tmp_path / "config.yaml", BASE)
+    path = tmp_path / "eval" / "tlio_test_ekf" / "metrics.json"
+    path.parent.mkdir(parents=True)
+    options = dataclasses.asdict(BASE.filter)
+    whole = {
+        "settings": {"dataset": "tlio", "split": "test", "definitions": 2, "filter": options},
+        "sequences": {"a": {"ate": 1.0, "group": "x"}},
+        "mean": {"ate": 1.0, "diverged": 0},
+    }
+    made = []
+
+    def evaluate(*given):
+        made.append(given)
+        path.write_text(json.dumps(whole))
+
+    monkeypatch.setattr(figures.evaluation, "evaluate", evaluate)
+    other = {**whole, "settings": {**whole["settings"], "filter": {**options, "gravity": 9.0}}}
+    texts = [
+        json.dumps(other),
+        json.dumps(whole)[:40],
+        "{}",
+        "[]",
+        json.dumps({**whole, "mean": {}}),
+    ]
+    for number, text in enumerate(texts):
+        path.write_text(text)
+        found = figures.of_run(tmp_path, "test", "ekf", Lines())
+        assert found.figures == whole and len(made) == number + 1
+    assert figures.of_run(tmp_path, "test", "ekf", Lines()).figures == whole and len(made) == 5

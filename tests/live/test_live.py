@@ -154,6 +154,12 @@ def test_gaps_of_a_recording_are_told(recorded):
     source = live.from_recording(sequence, speed=0.0)
     live.follow(lambda *sample: None, source, found, lambda found: None)
     assert found.gaps == pytest.approx([0.54], abs=0.021) and found.samples == len(time)
+    # What is missing at the end never ends.
+    found = live.Follower(0.1)
+    found.poses.append(None)
+    source = live.from_recording(sequence._replace(imu_valid=time < 3.0), speed=0.0)
+    live.follow(lambda *sample: None, source, found, lambda found: None)
+    assert found.gaps == pytest.approx([2.0], abs=0.021)
 
 
 def test_stamps_in_milliseconds_are_told():
