@@ -81,6 +81,7 @@ def _read(path: Path) -> Figures | None:
     """metrics.json; None where it is not there or not whole."""
     try:
         figures = json.loads(path.read_text(encoding="utf-8"))
+        # All that a comparison reads: what is not there raises.
         needed = [figures["mean"]["diverged"], *map(dict, figures["sequences"].values())]
         needed += [figures["settings"][name] for name in ("dataset", "split")]
         if report.definitions(figures) == report.DEFINITIONS:

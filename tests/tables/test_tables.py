@@ -10,9 +10,10 @@ import yaml
 from gnio_jax import config as configuration
 from gnio_jax import models
 from gnio_jax.commands import tables as commands
+from gnio_jax.comparison import figures
 from gnio_jax.config import DataConfig, ModelConfig, OptimConfig, TrainConfig
 from gnio_jax.errors import InputError
-from gnio_jax.tables import complexity, matrix
+from gnio_jax.tables import complexity
 from gnio_jax.training import loop
 from tests.support.runs import shared_programs
 from tests.support.tlio_files import write_sequence
@@ -72,7 +73,7 @@ def test_a_table_from_nothing_and_again_without_training(made, monkeypatch, caps
         raise AssertionError("done already")
 
     monkeypatch.setattr(loop, "train_seeds", never)
-    monkeypatch.setattr(matrix.evaluation, "evaluate", never)
+    monkeypatch.setattr(figures.evaluation, "evaluate", never)
     (root / "out" / "comparison_test_integrate.md").unlink()
     commands.main(["comparison", *arguments])
     assert (root / "out" / "comparison_test_integrate.md").read_text(encoding="utf-8") == text
