@@ -13,7 +13,7 @@ from gnio_jax.commands.options import Command
 from gnio_jax.config import CompareConfig
 from gnio_jax.cores import usable_cores
 from gnio_jax.errors import InputError
-from gnio_jax.files import check_writable, replacing
+from gnio_jax.files import check_writable
 
 if TYPE_CHECKING:
     from gnio_jax.comparison import Comparison
@@ -81,11 +81,9 @@ def _check_out(out: str) -> None:
 def _write(path: Path, found: Comparison) -> None:
     """Table and picture."""
     from gnio_jax.comparison import picture, text
-    from gnio_jax.evaluation import plots
 
     text.write(path, found)
-    with replacing(f"{path}.png") as temporary:
-        plots.save(temporary, picture.draw(found))
+    picture.save(Path(f"{path}.png"), picture.draw(found))
 
 
 ENDINGS = (".md", ".csv", ".png")

@@ -114,11 +114,10 @@ def _cells(rows: list[Row], metric: str) -> list[Cell]:
     tables = [pairs.errors(row.seeds, metric) for row in rows]
     cells = []
     for number, (row, own) in enumerate(zip(rows, tables, strict=True)):
-        means = [seed["mean"].get(metric) for seed in row.seeds]
         cells.append(
             Cell(
                 label=row.label,
-                seeds=[] if None in means else [float(mean) for mean in means],
+                seeds=pairs.means(row.seeds, metric),
                 diverged=sum(seed["mean"]["diverged"] for seed in row.seeds),
                 estimates=sum(len(seed["sequences"]) for seed in row.seeds),
                 difference=pairs.difference(own, tables[0], group_of, BEST.get(metric, 0.0))

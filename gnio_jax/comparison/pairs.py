@@ -46,6 +46,13 @@ def errors(seeds: Sequence[Figures], metric: str = "ate") -> Errors:
     }
 
 
+def means(seeds: Sequence[Figures], metric: str) -> list[float]:
+    """Mean of a metric over the sequences that did not diverge, with each seed; empty where some
+    seed has none."""
+    found = [figures["mean"].get(metric) for figures in seeds]
+    return [] if None in found else [float(mean) for mean in found]
+
+
 def groups(seeds: Sequence[Figures]) -> dict[str, str]:
     """Sequence -> the person or session it belongs to."""
     return {

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -10,9 +12,16 @@ from matplotlib.figure import Figure
 from gnio_jax.comparison import pairs, text
 from gnio_jax.comparison.comparing import Comparison
 from gnio_jax.evaluation import plots
+from gnio_jax.files import replacing
 
 COLOURS = (plots.GREY, plots.BLUE, plots.VERMILION, plots.GREEN, "#CC79A7", "#E69F00", "#56B4E9")
 """The first row grey, the others in the colours of Okabe and Ito."""
+
+
+def save(path: Path, figure: Figure) -> None:
+    """Write one figure as PNG, whole or not at all."""
+    with replacing(path) as temporary:
+        plots.save(temporary, figure)
 
 
 def draw(comparison: Comparison) -> Figure:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import math
 from pathlib import Path
 
@@ -11,7 +10,7 @@ import numpy as np
 from gnio_jax.comparison.comparing import BEST, Cell, Comparison
 from gnio_jax.comparison.pairs import Difference
 from gnio_jax.evaluation.table import COLUMNS, Column
-from gnio_jax.files import replacing, write_text
+from gnio_jax.files import write_csv, write_text
 
 HEADER = ["metric", "row", "mean", "difference (95 %)", "better in"]
 FEW_GROUPS = 10
@@ -34,11 +33,7 @@ def write(path: Path, comparison: Comparison) -> None:
     text = f"{title(comparison)}\n\n{grid(HEADER, lines(comparison))}\n"
     text += "".join(f"{line}\n\n" for line in explanations(comparison))
     write_text(f"{path}.md", text.rstrip() + "\n")
-    with (
-        replacing(f"{path}.csv") as temporary,
-        open(temporary, "w", newline="", encoding="utf-8") as file,
-    ):
-        csv.writer(file).writerows(_csv_lines(comparison))
+    write_csv(f"{path}.csv", _csv_lines(comparison))
 
 
 def title(comparison: Comparison) -> str:

@@ -99,7 +99,7 @@ convolve_three.defvjp(_forward, _backward)
 def _combined(factors: Sequence[float] | np.ndarray, parts: Sequence[jax.Array]) -> jax.Array:
     """The sum of the parts, each times its factor."""
     terms = [
-        part if factor == 1 else jnp.asarray(factor, part.dtype) * part
+        part if factor == 1 else part.dtype.type(factor) * part
         for factor, part in zip(factors, parts, strict=True)
         if factor != 0
     ]

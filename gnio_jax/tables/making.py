@@ -10,6 +10,7 @@ import numpy as np
 
 from gnio_jax import config as configuration
 from gnio_jax import models
+from gnio_jax.comparison.picture import save
 from gnio_jax.config import TablesConfig, TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.files import write_text
@@ -115,12 +116,12 @@ def make_table(options: TablesConfig, reporter: Reporter, workers: int) -> str:
     path, extra = _path(options), {}
     if options.table == "gates":
         extra = _gradient_norms(results)
-        pictures.save(path.with_name(path.name + "_gradients.png"), pictures.gradients(results))
+        save(path.with_name(path.name + "_gradients.png"), pictures.gradients(results))
     if options.table in ("bank-size", "bank-spread"):
         extra = _entropies(path, options, results)
     found = summary.rows(experiment, results, extra)
     markdown.write(path, experiment, found, notes(base, options, experiment))
-    pictures.save(path.with_suffix(".png"), pictures.table(experiment, results, found))
+    save(path.with_suffix(".png"), pictures.table(experiment, results, found))
     text = path.with_suffix(".md").read_text(encoding="utf-8")
     return f"{text}\nresults: {path}.md, .csv, .png"
 
@@ -153,7 +154,7 @@ def _entropies(path: Path, options: TablesConfig, results: list[Result]) -> Extr
             "of their mean": float(np.mean(of_mean[-1])),
         }
     picture = pictures.entropies(labels, of_window, of_mean)
-    pictures.save(path.with_name(path.name + "_entropy.png"), picture)
+    save(path.with_name(path.name + "_entropy.png"), picture)
     return extra
 
 
@@ -199,7 +200,7 @@ def make_trajectories(options: TablesConfig, reporter: Reporter, workers: int) -
         for name in wanted
     }
     path = _path(options).with_suffix(".png")
-    pictures.save(path, pictures.trajectories(drawn))
+    save(path, pictures.trajectories(drawn))
     page = path.with_suffix(".html")
     title = f"{base.dataset} {options.split}: {options.estimator} of all methods"
     html.write_report(page, title, _entries(results, options))
@@ -228,7 +229,7 @@ def make_standing(options: TablesConfig, reporter: Reporter, workers: int) -> st
         seeds = [activities.predict_split(run, options.split) for run in result.runs]
         by_method[result.cell.name] = standing.mean_over_seeds(seeds)
         lines += standing.draw(result.cell, seeds, path)
-    pictures.save(path.with_suffix(".png"), pictures.standing(by_method))
+    save(path.with_suffix(".png"), pictures.standing(by_method))
     found = summary.rows(experiment, results)
     remarks = [*notes(base, options, experiment), *lines]
     table = markdown.render(experiment, found, remarks)

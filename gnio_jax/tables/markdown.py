@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import csv
 import math
 from pathlib import Path
 
 import numpy as np
 
 from gnio_jax.comparison.text import grid, spread
-from gnio_jax.files import replacing
+from gnio_jax.files import write_csv, write_text
 from gnio_jax.tables.experiments import Experiment
 from gnio_jax.tables.summary import COLUMNS, TableRow
 
@@ -23,13 +22,8 @@ DIVERGED = (
 
 def write(path: Path, experiment: Experiment, found: list[TableRow], notes: list[str]) -> None:
     """`path`.md and `path`.csv."""
-    with replacing(path.with_suffix(".md")) as temporary:
-        temporary.write_text(render(experiment, found, notes), encoding="utf-8")
-    with (
-        replacing(path.with_suffix(".csv")) as temporary,
-        open(temporary, "w", newline="", encoding="utf-8") as file,
-    ):
-        csv.writer(file).writerows(_csv_lines(found))
+    write_text(path.with_suffix(".md"), render(experiment, found, notes))
+    write_csv(path.with_suffix(".csv"), _csv_lines(found))
 
 
 def render(experiment: Experiment, found: list[TableRow], notes: list[str]) -> str:

@@ -14,7 +14,6 @@ from matplotlib.figure import Figure
 
 from gnio_jax.evaluation import plots
 from gnio_jax.evaluation.plots import BLUE, GREEN, GREY, VERMILION
-from gnio_jax.files import replacing
 from gnio_jax.tables.activities import ACTIVITIES, HORIZONTAL, PredictedWindows
 from gnio_jax.tables.experiments import Experiment
 from gnio_jax.tables.matrix import Result
@@ -32,12 +31,6 @@ COLOURS = {
 """TLIO blue and GNIO green, as in the paper's figure."""
 OTHERS = (BLUE, VERMILION, GREEN, "#CC79A7", "#E69F00", "#56B4E9")
 LIGHT_GRID = "#E5E5E5"
-
-
-def save(path: Path, figure: Figure) -> None:
-    """Write one figure as PNG, whole or not at all."""
-    with replacing(path) as temporary:
-        plots.save(temporary, figure)
 
 
 # Errors of the rows

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from gnio_jax.comparison.picture import save
 from gnio_jax.tables import activities, markdown, pictures
 from gnio_jax.tables.activities import PredictedWindows
 from gnio_jax.tables.experiments import Cell
@@ -42,7 +43,7 @@ def draw(cell: Cell, seeds: list[PredictedWindows], path: Path) -> list[str]:
     lines, diagnostics = [], seeds[0].diagnostics
     if "gate" in diagnostics:
         picture = pictures.gate(seeds[0])
-        pictures.save(path.with_name(f"{path.name}_{cell.name}_gate.png"), picture)
+        save(path.with_name(f"{path.name}_{cell.name}_gate.png"), picture)
     if "attention" in diagnostics:
         told, chance = np.mean([activities.information(seed) for seed in seeds], axis=0)
         words = (
@@ -51,7 +52,7 @@ def draw(cell: Cell, seeds: list[PredictedWindows], path: Path) -> list[str]:
         )
         lines.append(f"{cell.label}: {words}.")
         picture = pictures.attention(*activities.attention_by_activity(seeds[0]), words)
-        pictures.save(path.with_name(f"{path.name}_{cell.name}_attention.png"), picture)
+        save(path.with_name(f"{path.name}_{cell.name}_attention.png"), picture)
     return lines
 
 

@@ -89,7 +89,7 @@ def rows(
             diverged=int(np.isinf(every).sum()),
             estimates=len(every),
             compared=difference.compared,
-            sequences=len(own.keys() | first.keys()),
+            sequences=difference.sequences,
             groups=difference.groups,
             gain=difference.gain,
             difference=difference.mean,
@@ -118,14 +118,8 @@ def _every_ate(result: Result) -> Float[np.ndarray, "estimates"]:
 
 def _means_of_seeds(result: Result) -> dict[str, list[float]]:
     """Metric -> mean over sequences with each seed; only metrics that have one with every seed."""
-    means = {
-        metric: [figures["mean"].get(metric) for figures in result.figures] for metric in COLUMNS
-    }
-    return {
-        metric: [float(value) for value in values]
-        for metric, values in means.items()
-        if all(value is not None for value in values)
-    }
+    means = {metric: pairs.means(result.figures, metric) for metric in COLUMNS}
+    return {metric: values for metric, values in means.items() if values}
 
 
 def _published_gain(published: float | None, first: float | None) -> float | None:

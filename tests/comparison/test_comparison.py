@@ -9,7 +9,7 @@ import pytest
 
 from gnio_jax import comparison
 from gnio_jax.commands import app
-from gnio_jax.comparison import figures, pairs, picture, rows, text
+from gnio_jax.comparison import comparing, figures, pairs, picture, rows, text
 from gnio_jax.config import CompareConfig
 from gnio_jax.errors import InputError
 
@@ -187,6 +187,14 @@ def test_better_is_nearer_to_the_best_value():
     first, own = {"a": np.array([0.7, 1.4])}, {"a": np.array([0.9])}
     assert pairs.difference(own, first, {"a": "x"}, best=1.0).better == 1
     assert pairs.difference(first, own, {"a": "x"}, best=1.0).better == 0
+
+
+def test_a_comparison_knows_which_value_is_best(runs, monkeypatch):
+    words = (f"{runs}/plain_s0", f"{runs}/new")
+    monkeypatch.setitem(comparing.BEST, "ate", 4.0)  # |1, 2, 5 − 4| against |1, 3, 3 − 4|
+    found = comparison.compare(CompareConfig(words, metrics=("ate",)))
+    assert text.lines(found)[0][0] == "ATE (m, best 4)"
+    assert second(found).better == 1
 
 
 def test_an_interval_over_few_groups_is_too_narrow():
