@@ -1,4 +1,4 @@
-"""Files and folders are written whole or not at all; names that a file may have."""
+"""Files and folders are written whole or not at all; names in files and pictures."""
 
 from __future__ import annotations
 
@@ -44,29 +44,41 @@ def check_writable(path: str | os.PathLike[str]) -> None:
     path = Path(path)
     if path.is_dir():
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
-    check_writable_folder(path.parent)
+    # As `replacing` names its file: a name can be too long.
+    _check_writable_folder(path.parent, f".{path.stem}.", path.suffix)
 
 
 def check_writable_folder(folder: Path) -> None:
-    """Raise `OSError` now where nothing could be written into `folder` later. It is created when
-    missing."""
-    folder.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(prefix=".probe.", dir=folder)
+    """Raise `OSError` now where nothing could be written into `folder` later."""
+    _check_writable_folder(folder, ".probe.", "")
+
+
+def _check_writable_folder(folder: Path, prefix: str, suffix: str) -> None:
+    """Try it. A folder that is missing is not made: its nearest parent must take one."""
+    there = next(
+        parent for parent in (folder.absolute(), *folder.absolute().parents) if parent.exists()
+    )
+    handle, name = tempfile.mkstemp(prefix=prefix, suffix=suffix, dir=there)
     os.close(handle)
     Path(name).unlink()
+
+
+def with_ending(path: Path, ending: str) -> Path:
+    """`path` with an ending more: a name may hold points (`Path.with_suffix` would cut it)."""
+    return path.with_name(path.name + ending)
 
 
 def write_text(path: str | os.PathLike[str], text: str) -> None:
     """Write a text file whole or not at all."""
     with replacing(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+        temporary.write_text(text, encoding="utf-8", errors="backslashreplace")
 
 
 def write_csv(path: str | os.PathLike[str], rows: Iterable[Iterable[object]]) -> None:
     """Write a CSV whole or not at all."""
     with (
         replacing(path) as temporary,
-        open(temporary, "w", newline="", encoding="utf-8") as file,
+        open(temporary, "w", newline="", encoding="utf-8", errors="backslashreplace") as file,
     ):
         csv.writer(file).writerows(rows)
 
@@ -74,6 +86,14 @@ def write_csv(path: str | os.PathLike[str], rows: Iterable[Iterable[object]]) ->
 def file_stem(name: str) -> str:
     """The name of a sequence as the name of a file."""
     return re.sub(r"[^\w.+-]+", "_", name).lstrip(".") or "_"
+
+
+def shown_name(name: str, length: int = 60) -> str:
+    """A name of a file or a recording as text of a picture: its end where it is long, a $ as it
+    stands (Matplotlib would read mathematics)."""
+    text = name.encode("utf-8", "backslashreplace").decode()  # a name may hold any bytes
+    text = text if len(text) <= length else f"…{text[1 - length :]}"
+    return text.replace("$", r"\$")
 
 
 @contextmanager

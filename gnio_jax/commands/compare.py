@@ -13,7 +13,7 @@ from gnio_jax.commands.options import Command
 from gnio_jax.config import CompareConfig
 from gnio_jax.cores import usable_cores
 from gnio_jax.errors import InputError
-from gnio_jax.files import check_writable
+from gnio_jax.files import check_writable, with_ending
 
 if TYPE_CHECKING:
     from gnio_jax.comparison import Comparison
@@ -22,7 +22,7 @@ DESCRIPTION = """Compare runs sequence by sequence: what a change has changed, a
 
   {prog} runs/plain runs/context --split sessions_test
   {prog} runs/plain runs/context --metrics ate rpe_1s rte_60s --out runs/plain_or_context
-  {prog} runs/gnio runs/gnio/eval/oxiod_test_integrate
+  {prog} runs/gnio_s0 runs/gnio_s0/eval/oxiod_test_ekf_loose
 
 The first run is what the others are compared with. Runs are evaluated where they are not yet. Seeds
 of a run are averaged, and the name of a run without its seed stands for all of them: runs/plain for
@@ -60,9 +60,9 @@ def show(config: CompareConfig, _prog: str) -> None:
 def _table(header: list[str], lines: list[list[str]]) -> Table:
     """The lines below a heading for each metric: names of rows have the width that is left."""
     table = Table(box=box.SIMPLE_HEAD, header_style="bold")
-    table.add_column(overflow="fold")
+    table.add_column(overflow="fold", min_width=16)
     for name in header[2:]:
-        table.add_column(name, justify="right", no_wrap=True)
+        table.add_column(name, justify="right")
     for metric, *cells in lines:
         if metric:
             table.add_row(f"{metric}", style="bold")
@@ -72,18 +72,25 @@ def _table(header: list[str], lines: list[list[str]]) -> Table:
 
 def _check_out(out: str) -> None:
     """Raise now where the files could not be written later."""
-    if Path(out).name in ("", "..") or out.endswith(("/", "\\")):
-        raise InputError("--out", f"'{out}' names no file", "give a name without ending: runs/both")
+    path = Path(out)
+    if path.name in ("", "..") or path.suffix in ENDINGS or out.endswith(("/", "\\")):
+        remedy = "give the name of a file without its ending: runs/both"
+        raise InputError("--out", f"'{out}' is no such name", remedy)
     for ending in ENDINGS:
-        check_writable(out + ending)
+        try:
+            check_writable(with_ending(path, ending))
+        except OSError as error:
+            problem = f"{with_ending(path, ending)} cannot be written ({error.strerror})"
+            raise InputError("--out", problem, "give another name") from None
 
 
 def _write(path: Path, found: Comparison) -> None:
     """Table and picture."""
     from gnio_jax.comparison import picture, text
 
+    figure = picture.draw(found)
     text.write(path, found)
-    picture.save(Path(f"{path}.png"), picture.draw(found))
+    picture.save(with_ending(path, ".png"), figure)
 
 
 ENDINGS = (".md", ".csv", ".png")

@@ -53,7 +53,14 @@ def short_help(
     if sections:
         plural = "s" if len(sections) > 1 else ""
         more += f", also those of the section{plural} {', '.join(sections)}"
-    lines = [f"usage: {prog} [OPTIONS]", "", description.rstrip(), "", "options:"]
+    words = [options[name].usage for name in common if not name.startswith("-")]
+    lines = [
+        f"usage: {' '.join([prog, *words, '[OPTIONS]'])}",
+        "",
+        description.rstrip(),
+        "",
+        "options:",
+    ]
     for name in common:
         lines += _lines(options[name])
     return "\n".join([*lines, "", *textwrap.wrap(f"{more}.", WIDTH)])

@@ -6,11 +6,12 @@ import os
 from pathlib import Path
 from typing import NamedTuple
 
-from gnio_jax.comparison import pairs
+from gnio_jax.comparison import pairs, rows
 from gnio_jax.comparison.pairs import Difference
-from gnio_jax.comparison.rows import Row, read_row
+from gnio_jax.comparison.rows import Recordings, Row
 from gnio_jax.config import CompareConfig
 from gnio_jax.errors import InputError
+from gnio_jax.evaluation.metrics import NAMES
 from gnio_jax.reporting import Lines, Reporter
 
 USUAL = ("ate", "rpe_1s", "yaw_rmse", "path_length_ratio", "nis", "nees")
@@ -21,6 +22,11 @@ BEST = {
     "accepted": 100.0,
 }
 """The best value of a metric whose best is not 0."""
+METRICS = (*NAMES, "accepted")
+"""All that can be compared."""
+SAME_LENGTH = 0.05
+"""Two recordings of one name are the same where their durations differ by less than this share:
+estimates begin a window later or earlier."""
 
 
 class Cell(NamedTuple):
@@ -28,10 +34,9 @@ class Cell(NamedTuple):
 
     label: str
     seeds: list[float]
-    """Mean over the sequences that did not diverge, with each seed; empty where some seed has
-    none."""
+    """Mean with each seed, over the sequences that diverged with none (`pairs.means`)."""
     diverged: int
-    """Estimates that diverged; they are in no mean."""
+    """Estimates that diverged."""
     estimates: int
     """Seeds × sequences."""
     difference: Difference | None
@@ -54,53 +59,94 @@ def compare(
     """Read the rows' evaluations, make those that are missing, and compare them.
 
     `workers` processes read recordings that are slow to read. Raises `InputError` for rows that
-    cannot be compared and metrics that none of them has.
+    cannot be compared and metrics that none of them has, before it evaluates where that can be
+    known.
     """
     reporter = reporter or Lines()
+    _check_metrics(config.metrics)
     if len(config.rows) < 2:
-        raise InputError("RUNS", "needs two or more", "name the run to compare with first")
-    if config.metrics == ():
+        remedy = "name the run to compare with first, and all of them before --metrics"
+        raise InputError("RUNS", "needs two or more", remedy)
+    named = {word: rows.find(word) for word in config.rows}
+    _check_different(config.rows, named)
+    common = _common_recordings(named, config)
+    found = [rows.read(word, named[word], config, reporter, workers) for word in config.rows]
+    for row in found[1:]:
+        _check_same_sequences(found[0], row)
+    labels = _labels(found)
+    found = [row._replace(label=label) for row, label in zip(found, labels, strict=True)]
+    cells = {metric: _cells(found, metric) for metric in _metrics(found, config.metrics)}
+    return Comparison(common.dataset, common.split, found, cells)
+
+
+def _check_metrics(wanted: tuple[str, ...] | None) -> None:
+    """Raise `InputError` for words that are no metrics."""
+    if wanted == ():
         raise InputError("--metrics", "names no metric", "leave it out for the usual ones")
-    rows = [read_row(word, config, reporter, workers) for word in config.rows]
-    dataset, split = _common_recordings(rows)
-    rows = [row._replace(label=label) for row, label in zip(rows, _labels(rows), strict=True)]
-    metrics = _metrics(rows, config.metrics)
-    return Comparison(dataset, split, rows, {metric: _cells(rows, metric) for metric in metrics})
+    for word in wanted or ():
+        if word not in METRICS:
+            remedy = f"name RUNS before it; there are: {', '.join(METRICS)}"
+            raise InputError("--metrics", f"no metric '{word}'", remedy)
 
 
-def _metrics(rows: list[Row], wanted: tuple[str, ...] | None) -> list[str]:
+def _check_different(words: tuple[str, ...], named: dict[str, list[Path]]) -> None:
+    """Raise `InputError` where a folder stands in two rows."""
+    taken: dict[Path, int] = {}
+    for number, word in enumerate(words):
+        for folder in named[word]:
+            if taken.setdefault(folder.resolve(), number) != number:
+                raise InputError(str(folder), "is named twice", "name each run once")
+
+
+def _metrics(found: list[Row], wanted: tuple[str, ...] | None) -> list[str]:
     """Those that are wanted; by default the usual ones that some row has."""
-    known = {metric: None for row in rows for seed in row.seeds for metric in seed["mean"]}
-    del known["diverged"]
+    there = {metric for row in found for seed in row.seeds for metric in seed["mean"]}
     for metric in wanted or ():
-        if metric not in known:
-            raise InputError(
-                "--metrics", f"no row has '{metric}'", f"there are: {', '.join(known)}"
-            )
-    return list(wanted) if wanted else [metric for metric in USUAL if metric in known]
+        if metric not in there:
+            has = ", ".join(name for name in METRICS if name in there)
+            raise InputError("--metrics", f"no row has '{metric}'", f"there are: {has}")
+    return list(wanted) if wanted else [metric for metric in USUAL if metric in there]
 
 
-def _common_recordings(rows: list[Row]) -> tuple[str, str]:
-    """Dataset and split of all rows. Raises `InputError` where they differ."""
-    first = _recordings(rows[0], 0)
-    for row in rows:
-        for number, folder in enumerate(row.folders):
-            if _recordings(row, number) != first:
-                dataset, split = _recordings(row, number)
-                problem = f"is of {dataset} {split}, the first row of {' '.join(first)}"
-                remedy = f"give --split {split}, or name evaluations of one split of one dataset"
-                raise InputError(str(folder), problem, remedy)
+def _common_recordings(named: dict[str, list[Path]], config: CompareConfig) -> Recordings:
+    """Dataset, split and alignment of all rows. Raises `InputError` where they differ."""
+    found = {
+        folder: rows.recordings(folder, config) for folders in named.values() for folder in folders
+    }
+    first = next(iter(found.values()))
+    for folder, own in found.items():
+        for field, here, there in zip(Recordings._fields, own, first, strict=True):
+            if here == there:
+                continue
+            remedy = f"compare evaluations of one {field}"
+            split = next((each.split for path, each in found.items() if not rows.is_run(path)), "")
+            if field == "split" and split:
+                remedy = f"give --split {split} for the runs, or {remedy}"
+            problem = f"is of {field} {here}, the first row of {there}"
+            raise InputError(str(folder), problem, remedy)
     return first
 
 
-def _recordings(row: Row, seed: int) -> tuple[str, str]:
-    settings = row.seeds[seed]["settings"]
-    return settings["dataset"], settings["split"]
+def _check_same_sequences(first: Row, row: Row) -> None:
+    """Raise `InputError` where sequences of one name are different recordings, or belong to
+    different people or sessions."""
+    known = {name: each for seed in first.seeds for name, each in seed["sequences"].items()}
+    for folder, seed in zip(row.folders, row.seeds, strict=True):
+        for name, own in seed["sequences"].items():
+            other = known.get(name, own)
+            remedy = f"evaluate it again, or the first row ({first.folders[0]})"
+            if own["group"] != other["group"]:
+                problem = f"is of {own['group']} here, of {other['group']} in the first row"
+                raise InputError(folder, f"sequence {name} {problem}", remedy)
+            lengths = [each.get("duration") or 0.0 for each in (own, other)]
+            if abs(lengths[0] - lengths[1]) > SAME_LENGTH * max(lengths):
+                problem = f"takes {lengths[0]:.0f} s here, {lengths[1]:.0f} s in the first row"
+                raise InputError(folder, f"sequence {name} {problem}", remedy)
 
 
-def _labels(rows: list[Row]) -> list[str]:
+def _labels(found: list[Row]) -> list[str]:
     """The rows' names without the folders that all begin with, and those that all end with."""
-    paths = [Path(os.path.abspath(row.label)) for row in rows]
+    paths = [Path(os.path.abspath(row.label)) for row in found]
     common = os.path.commonpath([path.parent for path in paths])
     parts = [path.relative_to(common).parts for path in paths]
     while len({each[-1] for each in parts}) == 1 and all(len(each) > 1 for each in parts):
@@ -108,21 +154,19 @@ def _labels(rows: list[Row]) -> list[str]:
     return [str(Path(*each)) for each in parts]
 
 
-def _cells(rows: list[Row], metric: str) -> list[Cell]:
+def _cells(found: list[Row], metric: str) -> list[Cell]:
     """One metric of every row."""
-    group_of = pairs.groups([seed for row in rows for seed in row.seeds])
-    tables = [pairs.errors(row.seeds, metric) for row in rows]
-    cells = []
-    for number, (row, own) in enumerate(zip(rows, tables, strict=True)):
-        cells.append(
-            Cell(
-                label=row.label,
-                seeds=pairs.means(row.seeds, metric),
-                diverged=sum(seed["mean"]["diverged"] for seed in row.seeds),
-                estimates=sum(len(seed["sequences"]) for seed in row.seeds),
-                difference=pairs.difference(own, tables[0], group_of, BEST.get(metric, 0.0))
-                if number and own
-                else None,
-            )
+    group_of = pairs.groups([seed for row in found for seed in row.seeds])
+    first, best = found[0].seeds, BEST.get(metric, 0.0)
+    return [
+        Cell(
+            label=row.label,
+            seeds=pairs.means(row.seeds, metric),
+            diverged=sum(seed["mean"]["diverged"] for seed in row.seeds),
+            estimates=sum(len(seed["sequences"]) for seed in row.seeds),
+            difference=pairs.compare(row.seeds, first, group_of, metric, best)
+            if number and pairs.names(row.seeds, metric)
+            else None,
         )
-    return cells
+        for number, row in enumerate(found)
+    ]

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
+import math
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -36,18 +38,30 @@ def of_run(
     """The figures of the run's best checkpoint on a split: those that are there if they are of that
     checkpoint and mean the same (`report.DEFINITIONS`), else new ones."""
     config, folder = how(workdir, split, estimator, data_root)
-    found = _read(folder / "metrics.json")
-    if found is None or _out_of_date(workdir, found, config.filter):
-        reporter.line(f"evaluating {workdir.name} on {split} ({estimator})")
+    if problem := missing(workdir, split, estimator):
+        reporter.line(f"evaluating {workdir.name} on {split} ({estimator}): {problem}")
         evaluation.evaluate(config, reporter.progress, workers)
-        found = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
-    return Evaluated(folder, found)
+    return Evaluated(folder, json.loads((folder / "metrics.json").read_text(encoding="utf-8")))
+
+
+def missing(workdir: Path, split: str, estimator: str) -> str | None:
+    """Why a run has to be evaluated; None where its figures are there. Raises `InputError` for a
+    run that cannot be."""
+    config, folder = how(workdir, split, estimator)
+    found = _read(folder / "metrics.json")
+    options = config.filter if estimator != "integrate" else None  # which takes no filter
+    problem = _out_of_date(workdir, found, options) if found else "there are no whole figures yet"
+    best = workdir / "checkpoints" / config.checkpoint
+    if problem and estimator != "imu_only" and not any(best.glob("[0-9]*")):
+        raise InputError(best, "holds no checkpoint", "let gnio train finish its first epoch")
+    return problem
 
 
 def how(
     workdir: Path, split: str, estimator: str, data_root: str | None = None
 ) -> tuple[EvaluateConfig, Path]:
-    """How `of_run` evaluates a run, and the folder where that leaves its files."""
+    """How `of_run` evaluates a run, and the folder where that leaves its files. Pictures are drawn
+    anew where there are some."""
     trained = run_config(workdir)
     config = EvaluateConfig(
         str(workdir),
@@ -57,13 +71,14 @@ def how(
         plots=False,
         filter=trained.filter,
     )
-    return config, workdir / "eval" / folder_name(config, trained.dataset, trained)
+    folder = workdir / "eval" / folder_name(config, trained.dataset, trained)
+    return dataclasses.replace(config, plots=(folder / "plots").exists()), folder
 
 
 def of_evaluation(folder: Path) -> Evaluated:
     """The figures of an evaluation that is there. Raises `InputError` where it is not, its run has
     learnt since, or its figures cannot stand beside those of today."""
-    path, remedy = folder / "metrics.json", "run gnio evaluate again"
+    path, remedy = folder / "metrics.json", "evaluate the run anew with gnio evaluate"
     if not path.exists():
         remedy = "name a run, or a folder below its eval/"
         raise InputError(str(folder), "is neither a run nor an evaluation", remedy)
@@ -86,9 +101,16 @@ def _read(path: Path) -> Figures | None:
         needed += [figures["settings"][name] for name in ("dataset", "split")]
         if report.definitions(figures) == report.DEFINITIONS:
             needed += [sequence["group"] for sequence in figures["sequences"].values()]
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        whole = all(map(_has_numbers, figures["sequences"].values()))
+    except (ValueError, KeyError, TypeError, AttributeError, FileNotFoundError, NotADirectoryError):
         return None
-    return figures
+    return figures if whole else None
+
+
+def _has_numbers(sequence: dict[str, Any]) -> bool:
+    """Whether the metrics of a sequence are finite numbers or null, as they are written."""
+    values = [value for name, value in sequence.items() if name not in ("group", "undefined")]
+    return all(value is None or math.isfinite(value) for value in values)
 
 
 def _out_of_date(

@@ -153,5 +153,5 @@ class CompareConfig:
     """Metrics that are compared, as metrics.json names them; by default ate, rpe_1s, yaw_rmse,
     path_length_ratio, nis and nees, as far as they are there."""
     out: str | None = None
-    """Name of files to write, OUT.md, OUT.csv and OUT.png, the errors of every sequence. By
-    default the table is only shown."""
+    """Name of files to write: OUT.md and OUT.csv, the table, and OUT.png, the first metric of every
+    sequence. By default the table is only shown."""

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from gnio_jax.data.plausibility import SelfCheck, gyro_windows
-from gnio_jax.files import replacing
+from gnio_jax.files import replacing, shown_name
 from gnio_jax.numerics import finite_rows, spans
 from gnio_jax.types import Sequence
 
@@ -58,9 +58,9 @@ def overview(sequence: Sequence, check: SelfCheck) -> Figure:
     gyro.set_xlabel("time (s)")
     gyro.set_xlim(0.0, float(sequence.time[-1] - sequence.time[0]))
     used = f"left out: {check.failures[0]}" if check.failures else f"{check.share_valid:.1%} valid"
-    dataset = _short(str(sequence.attributes.get("dataset", "")))
+    dataset = shown_name(str(sequence.attributes.get("dataset", "")))
     recorded = f"{check.duration:.0f} s at {check.rate:.4g} Hz"
-    title = f"{dataset} {_short(sequence.name)}: {recorded}, {used}".strip()
+    title = f"{dataset} {shown_name(sequence.name)}: {recorded}, {used}".strip()
     figure.suptitle(title, fontsize=10)
     return figure
 
@@ -119,10 +119,6 @@ def _shade(axes: Axes, sequence: Sequence) -> None:
     time = sequence.time - sequence.time[0]
     for start, stop in spans(~sequence.valid):
         axes.axvspan(float(time[start]), float(time[stop - 1]), color=UNTRUSTED, lw=0, zorder=0)
-
-
-def _short(name: str) -> str:
-    return name if len(name) <= 60 else f"…{name[-59:]}"
 
 
 def _finish(axes: Axes) -> None:

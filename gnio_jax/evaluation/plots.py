@@ -22,6 +22,7 @@ from gnio_jax.evaluation.frames import in_the_references_frame
 from gnio_jax.evaluation.metrics import AlignmentMethod
 from gnio_jax.evaluation.report import Report, file_names
 from gnio_jax.evaluation.setup import OnShare, no_progress
+from gnio_jax.files import shown_name
 from gnio_jax.numerics import finite_rows, rotation_z, spans
 from gnio_jax.windows import true_displacement
 
@@ -98,7 +99,7 @@ def trajectory(
         f"ATE {ate:.2f} m" if ate is not None else "",
         f"{ate_2d:.2f} m in 2-D" if ate_2d is not None else "",
     ]
-    lines = [_short(estimate.name), ", ".join(filter(None, errors))]
+    lines = [shown_name(estimate.name), ", ".join(filter(None, errors))]
     axes.set_title("\n".join(filter(None, lines)), fontsize=11)
     axes.legend(loc="best", ncols=2, fontsize=9, framealpha=0.9)
     finish(axes)
@@ -121,7 +122,7 @@ def position_error(estimate: Estimate) -> Figure:
         panel.plot(time, error[:, k], color=colour, lw=1.2, label="error")
         panel.axhline(0, color=REFERENCE, lw=0.6)
         panel.set_ylabel(f"{name} (m)")
-    panels[0].set_title(f"{_short(estimate.name)}: position error", fontsize=11)
+    panels[0].set_title(f"{shown_name(estimate.name)}: position error", fontsize=11)
     _finish_over_time(panels, time)
     return figure
 
@@ -142,7 +143,7 @@ def displacement(estimate: Estimate, window_seconds: float) -> Figure:
     middle = time - window_seconds / 2
     truth = _true_displacement(estimate, round(window_seconds / step))
     _draw_speed(panels[0], middle, truth, estimate.displacement, window_seconds)
-    title = f"{_short(estimate.name)}: displacement of the window, at its middle"
+    title = f"{shown_name(estimate.name)}: displacement of the window, at its middle"
     panels[0].set_title(title, fontsize=11)
     _draw_displacement(panels[1], middle, truth, estimate.displacement)
     if gate is not None:
@@ -294,7 +295,3 @@ def _true_displacement(estimate: Estimate, rows: int) -> Float[np.ndarray, "k 3"
         start = np.arange(len(found) - rows)
         found[rows:] = true_displacement(reference.orientation, reference.position, start, rows)
     return found
-
-
-def _short(name: str) -> str:
-    return name if len(name) <= 60 else f"…{name[-59:]}"

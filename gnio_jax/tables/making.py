@@ -13,7 +13,7 @@ from gnio_jax import models
 from gnio_jax.comparison.picture import save
 from gnio_jax.config import TablesConfig, TrainConfig
 from gnio_jax.errors import InputError
-from gnio_jax.files import write_text
+from gnio_jax.files import with_ending, write_text
 from gnio_jax.reporting import Lines, Reporter
 from gnio_jax.tables import (
     activities,
@@ -121,8 +121,8 @@ def make_table(options: TablesConfig, reporter: Reporter, workers: int) -> str:
         extra = _entropies(path, options, results)
     found = summary.rows(experiment, results, extra)
     markdown.write(path, experiment, found, notes(base, options, experiment))
-    save(path.with_suffix(".png"), pictures.table(experiment, results, found))
-    text = path.with_suffix(".md").read_text(encoding="utf-8")
+    save(with_ending(path, ".png"), pictures.table(experiment, results, found))
+    text = with_ending(path, ".md").read_text(encoding="utf-8")
     return f"{text}\nresults: {path}.md, .csv, .png"
 
 
@@ -199,9 +199,9 @@ def make_trajectories(options: TablesConfig, reporter: Reporter, workers: int) -
         )
         for name in wanted
     }
-    path = _path(options).with_suffix(".png")
+    path = with_ending(_path(options), ".png")
     save(path, pictures.trajectories(drawn))
-    page = path.with_suffix(".html")
+    page = with_ending(_path(options), ".html")
     title = f"{base.dataset} {options.split}: {options.estimator} of all methods"
     html.write_report(page, title, _entries(results, options))
     return f"picture: {path}\npage: {page}"
@@ -229,12 +229,12 @@ def make_standing(options: TablesConfig, reporter: Reporter, workers: int) -> st
         seeds = [activities.predict_split(run, options.split) for run in result.runs]
         by_method[result.cell.name] = standing.mean_over_seeds(seeds)
         lines += standing.draw(result.cell, seeds, path)
-    save(path.with_suffix(".png"), pictures.standing(by_method))
+    save(with_ending(path, ".png"), pictures.standing(by_method))
     found = summary.rows(experiment, results)
     remarks = [*notes(base, options, experiment), *lines]
     table = markdown.render(experiment, found, remarks)
     text = f"{table}\n{standing.render(by_method)}"
-    write_text(path.with_suffix(".md"), text)
+    write_text(with_ending(path, ".md"), text)
     return f"{text}\nresults: {path}.md, .png and the pictures beside them"
 
 

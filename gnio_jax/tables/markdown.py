@@ -8,22 +8,22 @@ from pathlib import Path
 import numpy as np
 
 from gnio_jax.comparison.text import grid, spread
-from gnio_jax.files import write_csv, write_text
+from gnio_jax.files import with_ending, write_csv, write_text
 from gnio_jax.tables.experiments import Experiment
 from gnio_jax.tables.summary import COLUMNS, TableRow
 
 INTERVAL = "The interval draws whole groups of sequences (people or sessions) anew; there are {}."
 DIVERGED = (
-    "† Over the estimates that did not diverge. The median counts a diverged one as infinite. Gain "
-    "and difference are over the sequences in which neither row diverged. A row that would be "
+    "† Over the sequences on which no seed diverged. The median counts a diverged one as infinite. "
+    "Gain and difference are over the sequences in which neither row diverged. A row that would be "
     "better there but diverged more often than the first has neither."
 )
 
 
 def write(path: Path, experiment: Experiment, found: list[TableRow], notes: list[str]) -> None:
     """`path`.md and `path`.csv."""
-    write_text(path.with_suffix(".md"), render(experiment, found, notes))
-    write_csv(path.with_suffix(".csv"), _csv_lines(found))
+    write_text(with_ending(path, ".md"), render(experiment, found, notes))
+    write_csv(with_ending(path, ".csv"), _csv_lines(found))
 
 
 def render(experiment: Experiment, found: list[TableRow], notes: list[str]) -> str:

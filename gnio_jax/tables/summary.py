@@ -38,8 +38,8 @@ class TableRow(NamedTuple):
     published_gain: float | None
     """% of the first row's published figure."""
     seeds: dict[str, list[float]]
-    """Metric -> mean over the sequences that did not diverge, for each seed; a metric that has none
-    with some seed is not there."""
+    """Metric -> mean for each seed, over the sequences that have one with every seed and diverged
+    with none; without such a sequence the metric is not there."""
     median: float | None
     """Of `ate`, m, over seeds × sequences: infinite where half diverged, None without any `ate`."""
     diverged: int
@@ -74,11 +74,11 @@ def rows(
     experiment: Experiment, results: list[Result], extra: Extra | None = None
 ) -> list[TableRow]:
     """The table of an experiment. Sequences are paired by name."""
-    first, published = errors(results[0]), experiment.cells[0].published
+    published = experiment.cells[0].published
     group_of, found = groups(results), []
     for result in results:
-        cell, own, every = result.cell, errors(result), _every_ate(result)
-        difference = pairs.difference(own, first, group_of)
+        cell, every = result.cell, _every_ate(result)
+        difference = pairs.compare(result.figures, results[0].figures, group_of)
         row = TableRow(
             name=cell.name,
             label=cell.label,
@@ -96,7 +96,7 @@ def rows(
             interval=difference.interval,
             extra=(extra or {}).get(cell.name, {}),
         )
-        found.append(_withheld(row, found[0]) if found else row._replace(interval=None))
+        found.append(row if found else row._replace(interval=None))
     return found
 
 
@@ -117,7 +117,7 @@ def _every_ate(result: Result) -> Float[np.ndarray, "estimates"]:
 
 
 def _means_of_seeds(result: Result) -> dict[str, list[float]]:
-    """Metric -> mean over sequences with each seed; only metrics that have one with every seed."""
+    """Metric -> mean over sequences with each seed (`pairs.means`)."""
     means = {metric: pairs.means(result.figures, metric) for metric in COLUMNS}
     return {metric: values for metric, values in means.items() if values}
 
@@ -127,12 +127,3 @@ def _published_gain(published: float | None, first: float | None) -> float | Non
     if published is None or first is None:
         return None
     return 100 * (1 - published / first)
-
-
-def _withheld(row: TableRow, first: TableRow) -> TableRow:
-    """Without gain and difference where the row would gain but diverged more often than the first:
-    where it did, it is not better."""
-    more_often = row.diverged * first.estimates > first.diverged * row.estimates
-    if more_often and row.gain is not None and row.gain > 0:
-        return row._replace(gain=None, difference=None, interval=None)
-    return row

@@ -223,7 +223,7 @@ def load_run(workdir: Path | str, which: Which = "best") -> Run:
         raise InputError(
             where,
             "holds no checkpoint",
-            "let gnio train finish its first epoch, or give another --workdir",
+            "let gnio train finish its first epoch, or name another run",
         )
     model = create_model(config)
     template = models.variable_shapes(model, config.data.seen)

@@ -46,6 +46,7 @@ def test_figures_of_other_definitions_or_steps_are_made_anew(
 
 def test_figures_of_another_filter_or_damaged_ones_are_made_anew(tmp_path, monkeypatch):
     configuration.save(tmp_path / "config.yaml", BASE)
+    (tmp_path / "checkpoints" / "best" / "7").mkdir(parents=True)
     path = tmp_path / "eval" / "tlio_test_ekf" / "metrics.json"
     path.parent.mkdir(parents=True)
     options = dataclasses.asdict(BASE.filter)
@@ -68,9 +69,36 @@ def test_figures_of_another_filter_or_damaged_ones_are_made_anew(tmp_path, monke
         "{}",
         "[]",
         json.dumps({**whole, "mean": {}}),
+        json.dumps({**whole, "sequences": {"a": {"ate": "1.0", "group": "x"}}}),
+        json.dumps({**whole, "sequences": {"a": {"ate": float("nan"), "group": "x"}}}),
     ]
     for number, text in enumerate(texts):
         path.write_text(text)
         found = figures.of_run(tmp_path, "test", "ekf", Lines())
         assert found.figures == whole and len(made) == number + 1
-    assert figures.of_run(tmp_path, "test", "ekf", Lines()).figures == whole and len(made) == 5
+    assert figures.of_run(tmp_path, "test", "ekf", Lines()).figures == whole and len(made) == 7
+
+
+def test_integrate_takes_no_filter_and_pictures_are_drawn_anew(tmp_path, monkeypatch):
+    """An evaluation of `integrate` with other options of the filter means the same."""
+    configuration.save(tmp_path / "config.yaml", BASE)
+    (tmp_path / "checkpoints" / "best" / "7").mkdir(parents=True)
+    folder = tmp_path / "eval" / "tlio_test_integrate"
+    (folder / "plots").mkdir(parents=True)
+    options = {**dataclasses.asdict(BASE.filter), "gravity": 9.0}
+    whole = {
+        "settings": {"dataset": "tlio", "split": "test", "definitions": 2, "filter": options},
+        "sequences": {"a": {"ate": 1.0, "group": "x"}},
+        "mean": {"ate": 1.0, "diverged": 0},
+    }
+    (folder / "metrics.json").write_text(json.dumps(whole))
+    assert figures.missing(tmp_path, "test", "integrate") is None
+    whole["settings"]["step"] = 6
+    (folder / "metrics.json").write_text(json.dumps(whole))
+    drawn, lines = [], []
+    monkeypatch.setattr(
+        figures.evaluation, "evaluate", lambda config, *given: drawn.append(config.plots)
+    )
+    monkeypatch.setattr(Lines, "line", lambda self, text: lines.append(text))
+    figures.of_run(tmp_path, "test", "integrate", Lines())
+    assert drawn == [True] and lines[0].endswith("is of a checkpoint that the run has no more")

@@ -19,7 +19,7 @@ def result(name, ate, published=None, groups=None):
     figures = []
     for row in ate:
         sequences = {
-            f"s{k}": {"ate": value} if np.isfinite(value) else dict(lost)
+            f"s{k}": {"ate": value, "rpe_1s": value} if np.isfinite(value) else dict(lost)
             for k, value in enumerate(row)
         }
         for sequence, group in zip(sequences.values(), groups or sequences, strict=True):

@@ -15,7 +15,7 @@ from gnio_jax.evaluation.metrics.consistency import (
     position_nees,
 )
 from gnio_jax.evaluation.metrics.heading import relative_yaw, yaw_drift, yaw_rmse
-from gnio_jax.evaluation.metrics.measures import Measures, diverged, is_infinite, measure
+from gnio_jax.evaluation.metrics.measures import NAMES, Measures, diverged, is_infinite, measure
 from gnio_jax.evaluation.metrics.movement import (
     path_length,
     path_length_ratio,
@@ -27,6 +27,7 @@ from gnio_jax.evaluation.metrics.summary import Summary, bootstrap, summarise
 from gnio_jax.evaluation.metrics.trajectory import Trajectory, Undefined
 
 __all__ = [
+    "NAMES",
     "AlignmentMethod",
     "Measures",
     "Summary",

@@ -120,6 +120,12 @@ OF_MEASUREMENTS: dict[str, Metric] = {
     "nis_coverage": lambda c: coverage(_present_nis(c), 3),
 }
 """Need no reference."""
+NAMES = (
+    *(f"{name}{tag}" for tag in ("", "_2d") for name in (SPATIAL | POSITION_CONSISTENCY)),
+    *HEADING,
+    *OF_MEASUREMENTS,
+)
+"""Every metric of an estimate."""
 
 
 def measure(
