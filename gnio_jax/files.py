@@ -55,10 +55,13 @@ def check_writable_folder(folder: Path) -> None:
 
 def _check_writable_folder(folder: Path, prefix: str, suffix: str) -> None:
     """Try it. A folder that is missing is not made: its nearest parent must take one."""
-    there = next(
-        parent for parent in (folder.absolute(), *folder.absolute().parents) if parent.exists()
-    )
-    handle, name = tempfile.mkstemp(prefix=prefix, suffix=suffix, dir=there)
+    parents = (folder.absolute(), *folder.absolute().parents)
+    there = next(parent for parent in parents if parent.exists())
+    try:
+        handle, name = tempfile.mkstemp(prefix=prefix, suffix=suffix, dir=there)
+    except OSError as error:
+        error.filename = str(there)  # the user knows no temporary file
+        raise
     os.close(handle)
     Path(name).unlink()
 
