@@ -12,6 +12,10 @@ _LARGEST = (100.0, 1000.0)
 """rad/s and m/s²: no phone measures more, so such a line has other units or is damaged."""
 
 
+MISSING = (math.nan, math.nan, math.nan)
+"""Of a sensor that was not read."""
+
+
 class Scale(NamedTuple):
     """What one unit of a stream is."""
 
@@ -40,8 +44,8 @@ def parse_line(line: str, scale: Scale = SI) -> Sample | None:
 
     Two forms: seven numbers `time,gyro_x,gyro_y,gyro_z,accel_x,accel_y,accel_z`, separated by
     commas, semicolons, tabs or blanks, an empty one missing; or a JSON object with `time`, `gyro`
-    and `accel`, a null missing. A line without a time, with too many numbers, or with rates or
-    accelerations that no phone measures is no sample.
+    and `accel`, a null missing, or one sensor alone. A line without a time, with too many numbers,
+    or with rates or accelerations that no phone measures is no sample.
     """
     line = line.strip()
     if not line or len(line) > LONGEST_LINE:
@@ -64,7 +68,10 @@ def _of_columns(line: str, scale: Scale) -> Sample | None:
 def _of_json(line: str, scale: Scale) -> Sample | None:
     try:
         found = json.loads(line)
-        gyro, accel = ([_number(value) for value in found[name]] for name in ("gyro", "accel"))
+        if "gyro" not in found and "accel" not in found:
+            return None
+        sensors = (found.get(name, [None] * 3) for name in ("gyro", "accel"))
+        gyro, accel = ([_number(value) for value in values] for values in sensors)
         return _checked(_number(found["time"]), gyro, accel, scale)
     except (KeyError, TypeError, ValueError, OverflowError, RecursionError):
         return None

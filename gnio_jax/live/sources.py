@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gnio_jax.errors import InputError
+from gnio_jax.live.pairing import paired
 from gnio_jax.live.samples import LONGEST_LINE, SI, Sample, Scale, parse_line
 from gnio_jax.types import Sequence
 
@@ -30,7 +31,7 @@ class Source(NamedTuple):
 
 def lines_of(stream: Iterable[str], name: str = "standard input", scale: Scale = SI) -> Source:
     """The lines of a stream, until it ends; its units are `scale`."""
-    return Source((parse_line(line, scale) for line in stream), name)
+    return Source(paired(parse_line(line, scale) for line in stream), name)
 
 
 def datagrams(port: int, silence: float | None = None, scale: Scale = SI) -> Source:
@@ -50,7 +51,7 @@ def datagrams(port: int, silence: float | None = None, scale: Scale = SI) -> Sou
         raise InputError(where, problem, "choose another port") from None
     waiting: queue.Queue[bytes] = queue.Queue(LONGEST_QUEUE)
     threading.Thread(target=_receive, args=(inbox, waiting), daemon=True).start()
-    return Source(_received(inbox, waiting, silence, scale), where)
+    return Source(paired(_received(inbox, waiting, silence, scale)), where)
 
 
 def _receive(inbox: socket.socket, waiting: queue.Queue[bytes]) -> None:
