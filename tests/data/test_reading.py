@@ -21,9 +21,19 @@ from gnio_jax.errors import InputError
 from tests.support.circle import circle
 
 
-@pytest.fixture(autouse=True)
-def empty_cache(tmp_path, monkeypatch):
-    monkeypatch.setenv("GNIO_CACHE", str(tmp_path / "cache"))
+@pytest.fixture(scope="module", autouse=True)
+def one_import_for_all(tmp_path_factory):
+    """The processes come from one that has imported the package, in place of importing it each.
+
+    They share its environment, and so one cache: every test has files of its own. Processes as the
+    package starts them are those of the tests of OxIOD.
+    """
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload([__name__])
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("GNIO_CACHE", str(tmp_path_factory.mktemp("cache")))
+        patch.setattr(multiprocessing, "get_context", lambda _: context)
+        yield
 
 
 # What other processes run must have a name there.
@@ -80,13 +90,14 @@ def six(tmp_path):
 
 
 @pytest.mark.parametrize("damage", [False, True])
-def test_sequences_warnings_and_errors_do_not_depend_on_the_workers(tmp_path, monkeypatch, damage):
-    recordings = six(tmp_path)
-    if damage:
-        recordings.insert(4, slow(tmp_path, "g", damage="field 'gyro' is NaN"))
+def test_sequences_warnings_and_errors_do_not_depend_on_the_workers(tmp_path, damage):
     found = []
     for workers in (1, 2):
-        monkeypatch.setenv("GNIO_CACHE", str(tmp_path / f"cache by {workers}"))
+        folder = tmp_path / f"by {workers}"
+        folder.mkdir()
+        recordings = six(folder)
+        if damage:
+            recordings.insert(4, slow(folder, "g", damage="field 'gyro' is NaN"))
         found += [outcome(dataset(*recordings), workers) for _ in range(2)]  # cold and cached
     names, notes, error = found[0]
     assert found == [found[0]] * 4

@@ -18,12 +18,8 @@ def count(tree):
     return sum(int(np.prod(leaf.shape)) for leaf in jax.tree.leaves(tree))
 
 
-@functools.cache
 def shapes(samples=200, **options):
-    model = models.create("deepils", **options)
-    return jax.eval_shape(
-        model.init, jax.random.key(0), jax.ShapeDtypeStruct((1, samples, 6), jnp.float32)
-    )
+    return models.variable_shapes(models.create("deepils", **options), samples)
 
 
 def drawn(samples, seed=3, **options):

@@ -67,9 +67,7 @@ def variables(name, kind):
         size = 0.05 if path[1].key in ("uncertainty", "log_std") else 0.4
         return jnp.asarray(size * rng.standard_normal(leaf.shape), jnp.float32)
 
-    shape = jax.ShapeDtypeStruct((1, SAMPLES, 6), jnp.float32)
-    shapes = jax.eval_shape(network(name, kind).init, jax.random.key(0), shape)
-    return jax.tree.map_with_path(draw, shapes)
+    return jax.tree.map_with_path(draw, models.variable_shapes(network(name, kind), SAMPLES))
 
 
 @functools.cache

@@ -19,12 +19,26 @@ def count(tree):
     return sum(int(np.prod(leaf.shape)) for leaf in jax.tree.leaves(tree))
 
 
-@functools.cache
 def shapes(**options):
-    model = models.create("gnio", **options)
-    return jax.eval_shape(
-        model.init, jax.random.key(0), jax.ShapeDtypeStruct((1, 200, 6), jnp.float32)
-    )
+    return models.variable_shapes(models.create("gnio", **options))
+
+
+SMALL = models.create("gnio", width=2, bank_size=4, bank_heads=2)
+
+
+@pytest.fixture(scope="module")
+def fresh():
+    """First variables of the small network."""
+    return models.initialise(SMALL, jax.random.key(0), 64)
+
+
+@quick
+def trained_once(variables, windows):
+    return SMALL.apply(variables, windows, train=True, mutable=["batch_stats"])
+
+
+def noise(mean=0.0):
+    return np.random.default_rng(1).normal(mean, 1.0, (16, 64, 6)).astype(np.float32)
 
 
 def test_parameters_of_the_paper_block_by_block():
@@ -272,14 +286,9 @@ def test_gates_and_scales(gate, scale):
     np.testing.assert_allclose(seen["gate"], g, rtol=1e-4, atol=1e-5)
 
 
-def test_a_new_network_predicts_that_it_stands_still():
-    model = models.create("gnio", width=8)
-    windows = jax.random.normal(jax.random.key(1), (4, 100, 6), jnp.float32)
-    variables = models.initialise(model, jax.random.key(0), windows.shape[1])
-    prediction, _ = jax.jit(lambda v, w: model.apply(v, w, train=True, mutable=["batch_stats"]))(
-        variables, windows
-    )
-    assert float(jnp.abs(prediction.displacement).max()) < 0.1
+def test_a_new_network_predicts_that_it_stands_still(fresh):
+    prediction, _ = trained_once(fresh, noise())
+    assert np.abs(prediction.displacement).max() < 0.1
 
 
 @pytest.mark.parametrize(
@@ -297,27 +306,21 @@ def test_gradient_is_finite_where_everything_is_zero(options):
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
 
 
-def test_training_mode_updates_the_statistics_with_momentum():
-    model = models.create("gnio", width=8)
-    windows = 3 + jax.random.normal(jax.random.key(1), (16, 100, 6), jnp.float32)
-    variables = models.initialise(model, jax.random.key(0), windows.shape[1])
-    _, changed = jax.jit(lambda v, w: model.apply(v, w, train=True, mutable=["batch_stats"]))(
-        variables, windows
-    )
+def test_training_mode_updates_the_statistics_with_momentum(fresh):
+    windows = noise(3.0)
+    _, changed = trained_once(fresh, windows)
     stem = quick(lambda x, kernel: resnet.convolve(x, kernel, (2,), [(3, 3)]))
-    kernel = variables["params"]["encoder"]["stem_conv"]["kernel"]
+    kernel = fresh["params"]["encoder"]["stem_conv"]["kernel"]
     expected = 0.1 * np.asarray(stem(windows, kernel)).mean(axis=(0, 1))
     np.testing.assert_allclose(
         changed["batch_stats"]["encoder"]["stem_bn"]["mean"], expected, rtol=1e-4, atol=1e-5
     )
 
 
-def test_parameters_and_outputs_are_float32_whatever_comes_in():
-    model = models.create("gnio", width=8)
-    windows = jnp.ones((1, 100, 6), jnp.float64)
-    variables = models.initialise(model, jax.random.key(0), windows.shape[1])
-    assert {leaf.dtype for leaf in jax.tree.leaves(variables)} == {jnp.dtype("float32")}
-    prediction = jax.eval_shape(model.apply, variables, windows)
+def test_parameters_and_outputs_are_float32_whatever_comes_in(fresh):
+    assert {leaf.dtype for leaf in jax.tree.leaves(fresh)} == {jnp.dtype("float32")}
+    windows = jax.ShapeDtypeStruct((1, 64, 6), jnp.float64)
+    prediction = jax.eval_shape(SMALL.apply, fresh, windows)
     assert prediction.displacement.dtype == prediction.log_std.dtype == jnp.float32
 
 
@@ -397,43 +400,36 @@ def test_both_convolutions_are_one_function(size, stride):
         np.testing.assert_allclose(one, other, atol=1e-12)
 
 
-def test_first_parameters_are_those_of_flax_and_another_seed_compiles_nothing(caplog):
+def test_first_parameters_are_those_of_flax_and_another_seed_compiles_nothing(fresh, caplog):
     def drawn(seed):
         model = models.create("gnio", width=2, bank_size=4, bank_heads=2)
         return models.initialise(model, jax.random.key(seed), 64)
 
-    variables = drawn(0)
+    variables = fresh
     with jax.log_compiles(), caplog.at_level("WARNING"):
         other = drawn(1)
     assert not [line for line in caplog.messages if "Compiling" in line]
     of = lambda found: found["params"]["bank"]["prototypes"]  # noqa: E731
     assert not np.array_equal(of(variables), of(other))
-    model = models.create("gnio", width=2, bank_size=4, bank_heads=2)
-    wanted = quick(model.init)(jax.random.key(0), jnp.zeros((1, 64, 6), jnp.float32))
+    wanted = quick(SMALL.init)(jax.random.key(0), jnp.zeros((1, 64, 6), jnp.float32))
     jax.tree.map(functools.partial(np.testing.assert_allclose, atol=1e-6), variables, wanted)
-    shapes = models.variable_shapes(model, 64)
+    shapes = models.variable_shapes(SMALL, 64)
     assert jax.tree.structure(shapes) == jax.tree.structure(variables)
     for shape, leaf in zip(*map(jax.tree.leaves, (shapes, variables)), strict=True):
         assert (shape.shape, shape.dtype) == (leaf.shape, leaf.dtype)
 
 
-def test_constant_uncertainty_leaves_the_displacement_as_it_is():
-    plain, constant = (
-        models.create("gnio", width=2, bank_size=4, bank_heads=2, uncertainty=kind)
-        for kind in ("head", "constant")
-    )
-    variables = models.initialise(plain, jax.random.key(0), 64)
-    params = {name: part for name, part in variables["params"].items() if name != "uncertainty"}
-    log_std = jnp.array([-1.0, -2.0, -3.0], jnp.float32)
+def test_constant_uncertainty_leaves_the_displacement_as_it_is(fresh):
+    constant = SMALL.clone(uncertainty="constant")
+    params = {name: part for name, part in fresh["params"].items() if name != "uncertainty"}
+    log_std = np.array([-1.0, -2.0, -3.0], np.float32)
     given = {
         "params": params,
-        "batch_stats": variables["batch_stats"] | {"uncertainty": {"log_std": log_std}},
+        "batch_stats": fresh["batch_stats"] | {"uncertainty": {"log_std": log_std}},
     }
-    assert jax.tree.structure(given) == jax.tree.structure(
-        jax.eval_shape(constant.init, jax.random.key(0), jnp.zeros((1, 64, 6)))
-    )
-    windows = jax.random.normal(jax.random.key(1), (2, 64, 6), jnp.float32)
-    found, of_plain = quick(constant.apply)(given, windows), quick(plain.apply)(variables, windows)
+    assert jax.tree.structure(given) == jax.tree.structure(models.variable_shapes(constant, 64))
+    windows = noise()[:2]
+    found, of_plain = quick(constant.apply)(given, windows), quick(SMALL.apply)(fresh, windows)
     np.testing.assert_array_equal(found.displacement, of_plain.displacement)
     np.testing.assert_array_equal(found.log_std, [log_std, log_std])
     frozen = models.inference_variables(constant, given)

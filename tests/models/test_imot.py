@@ -1,8 +1,6 @@
 """iMoT against its description: sizes block by block, a plain NumPy forward pass of the whole
 network, its decoupler."""
 
-import functools
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -21,12 +19,8 @@ def count(tree):
     return sum(int(np.prod(leaf.shape)) for leaf in jax.tree.leaves(tree))
 
 
-@functools.cache
 def shapes(samples=200, name="imot", **options):
-    model = models.create(name, **options)
-    return jax.eval_shape(
-        model.init, jax.random.key(0), jax.ShapeDtypeStruct((1, samples, 6), jnp.float32)
-    )
+    return models.variable_shapes(models.create(name, **options), samples)
 
 
 def drawn(tree, seed=3):

@@ -16,10 +16,7 @@ def count(tree):
 
 
 def shapes(samples=200, **options):
-    model = models.create("ronin_resnet", **options)
-    return jax.eval_shape(
-        model.init, jax.random.key(0), jax.ShapeDtypeStruct((1, samples, 6), jnp.float32)
-    )
+    return models.variable_shapes(models.create("ronin_resnet", **options), samples)
 
 
 @pytest.mark.parametrize("options, total", [({"output_dim": 2}, 4_634_882), ({}, 4_635_395)])

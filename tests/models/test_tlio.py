@@ -21,12 +21,6 @@ def count(tree):
     return sum(int(np.prod(leaf.shape)) for leaf in jax.tree.leaves(tree))
 
 
-def shapes(model, samples):
-    return jax.eval_shape(
-        model.init, jax.random.key(0), jax.ShapeDtypeStruct((1, samples, 6), jnp.float32)
-    )
-
-
 def drawn(model, samples, seed=0):
     """Variables away from every neutral start, without compiling the initialisation."""
     rng = np.random.default_rng(seed)
@@ -36,12 +30,12 @@ def drawn(model, samples, seed=0):
             return jnp.asarray(rng.uniform(0.5, 1.5, leaf.shape), jnp.float32)
         return jnp.asarray(rng.normal(0, 0.2, leaf.shape), jnp.float32)
 
-    return jax.tree_util.tree_map_with_path(one, shapes(model, samples))
+    return jax.tree_util.tree_map_with_path(one, models.variable_shapes(model, samples))
 
 
 @pytest.mark.parametrize("samples, rows, total", [(200, 7, 5_424_646), (100, 4, 5_031_430)])
 def test_parameters_of_the_published_network_block_by_block(samples, rows, total):
-    params = shapes(models.create("tlio"), samples)["params"]
+    params = models.variable_shapes(models.create("tlio"), samples)["params"]
     assert count(params) == total
     assert params.keys() == {"encoder", "displacement", "log_std"}
     assert count(params["encoder"]) == ENCODER
@@ -56,7 +50,7 @@ def test_parameters_of_the_published_network_block_by_block(samples, rows, total
 
 
 def test_other_widths_scale_the_heads_too():
-    params = shapes(models.create("tlio", width=8), 200)["params"]["log_std"]
+    params = models.variable_shapes(models.create("tlio", width=8))["params"]["log_std"]
     assert {name: part["kernel"].shape for name, part in params.items() if name != "neck_bn"} == {
         "neck_conv": (1, 64, 16),
         "fc1": (7 * 16, 64),

@@ -121,7 +121,7 @@ def test_raw_walk_comes_back(tmp_path, skew):
 def test_the_accelerometers_delay_is_taken_out(tmp_path, kind, delay):
     truth = files.Truth(accel_delay=delay)
     write = files.write_raw if kind == "raw" else files.write_syn
-    write(dataset(tmp_path, "handheld", "data1"), 1, truth, seconds=40)
+    write(dataset(tmp_path, "handheld", "data1"), 1, truth, seconds=25)
     (walk,) = oxiod.find_walks(tmp_path)
     sequence = oxiod.build(walk, kind)
     assert sequence.attributes["accel_delay_removed"] == pytest.approx(delay, abs=1e-3)
@@ -170,9 +170,9 @@ def refused(tmp_path, kind="raw"):
 def test_the_truth_of_another_walk_is_refused_by_name(tmp_path):
     truth = files.Truth()
     folder = dataset(tmp_path, "handheld", "data1")
-    files.write_raw(folder, 1, truth._replace(pace=1.3))
+    files.write_raw(folder, 1, truth._replace(pace=1.3), seconds=30)
     other = (folder / "raw" / "vi1.csv").read_text()
-    files.write_raw(folder, 1, truth)
+    files.write_raw(folder, 1, truth, seconds=30)
     (folder / "raw" / "vi1.csv").write_text(other)
     message = refused(tmp_path)
     assert "does not move as the phone does" in message
@@ -196,19 +196,19 @@ def test_a_walk_that_fits_at_two_lags_is_refused_by_name(tmp_path):
     ids=["lever", "delay", "tilt", "bias"],
 )
 def test_what_no_phone_on_a_marker_body_can_be_is_refused_by_name(tmp_path, change, message):
-    files.write_raw(dataset(tmp_path, "handheld", "data1"), 1, files.Truth(**change), seconds=40)
+    files.write_raw(dataset(tmp_path, "handheld", "data1"), 1, files.Truth(**change), seconds=30)
     assert message in refused(tmp_path)
 
 
 def test_rows_that_the_authors_cannot_have_matched_are_refused_by_name(tmp_path):
     truth = files.Truth(lag_rows=-250.0)
-    files.write_syn(dataset(tmp_path, "handheld", "data1"), 1, truth, seconds=40)
+    files.write_syn(dataset(tmp_path, "handheld", "data1"), 1, truth, seconds=25)
     assert "the lag would be 2.5 s, at most 1 s is plausible" in refused(tmp_path, "syn")
 
 
 def test_syn_walk_comes_back(tmp_path):
     truth = files.Truth(lag_rows=-12.4)
-    files.write_syn(dataset(tmp_path, "pocket", "data1"), 1, truth)
+    files.write_syn(dataset(tmp_path, "pocket", "data1"), 1, truth, seconds=40)
     (walk,) = oxiod.find_walks(tmp_path)
     sequence = oxiod.build(walk, "syn")
     time = sequence.time + sequence.attributes["start_time"]
@@ -230,7 +230,7 @@ def test_nexus_events_come_back(tmp_path):
     truth = files.Truth(
         accel_delay=0.0, extrinsic=Rotation.from_euler("ZXY", [-173, 2, 1], degrees=True)
     )
-    files.write_nexus_raw(dataset(tmp_path, "multi devices", "nexus 5"), 7, truth)
+    files.write_nexus_raw(dataset(tmp_path, "multi devices", "nexus 5"), 7, truth, seconds=40)
     (sequence,) = data.load("oxiod", tmp_path, "unseen")
     time = sequence.time + (sequence.attributes["start_time"] - files.EPOCH)
     position, attitude, walked = compare(sequence, truth, time)
@@ -245,8 +245,8 @@ def test_nexus_events_come_back(tmp_path):
 def test_large_scale_takes_positions_of_tango_and_attitude_of_gyro(tmp_path):
     truth = files.Truth()
     folder = dataset(tmp_path, "large scale", "floor1")
-    files.write_large_scale(folder, 1, truth, offset=0.2)
-    files.write_large_scale(folder, 2, truth, broken=True)
+    files.write_large_scale(folder, 1, truth, offset=0.2, seconds=50)
+    files.write_large_scale(folder, 2, truth, broken=True, seconds=50)
     with pytest.warns(UserWarning, match=r"floor1_2: left out.*out of step"):
         (sequence,) = data.load("oxiod", tmp_path, "large_scale")
     assert sequence.attributes["truth"] == "tango"
@@ -264,8 +264,8 @@ def test_large_scale_takes_positions_of_tango_and_attitude_of_gyro(tmp_path):
 def test_same_walk_twice_counts_once_and_a_ruined_raw_file_leaves_syn(tmp_path):
     truth = files.Truth()
     folder = dataset(tmp_path, "handheld", "data1")
-    files.write_raw(folder, 1, truth, seconds=40)
-    files.write_syn(folder, 1, truth, seconds=40)
+    files.write_raw(folder, 1, truth, seconds=25)
+    files.write_syn(folder, 1, truth, seconds=25)
     (walk,) = oxiod.find_walks(tmp_path)
     assert set(walk.files) == {"raw", "syn"}
     (sequence,) = read_recording(oxiod.recording_of(walk)).sequences
