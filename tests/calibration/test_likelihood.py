@@ -44,7 +44,7 @@ def test_the_noises_of_simulated_walks_are_found():
 def test_the_gradient_is_that_of_the_likelihood():
     unknowns = chosen(tuple(GROUPS))
     options = with_starts(TRUE, unknowns)
-    two = jax.tree.map(lambda rows: rows[:2], first_strides(walks(), 60))
+    two = jax.tree.map(lambda rows: rows[:2], first_strides(walks(), 110))
     both = quick(
         jax.value_and_grad(innovation_objective(two, DATA, options, unknowns), has_aux=True)
     )
