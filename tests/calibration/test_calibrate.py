@@ -19,22 +19,19 @@ from gnio_jax.data.readers import synthetic
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import Estimate, Trajectory
 from gnio_jax.training import checkpoint
-from tests.support import drawn_run
+from tests.support import tiny_run
 
 TRAINED = TrainConfig(
     data=DataConfig(rate=50.0),
-    model=ModelConfig(width=2, bank_size=4, bank_heads=2),
+    model=ModelConfig(name="tiny", width=4),
     filter=FilterOptions(velocity_std=0.7),
 )
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
-    return drawn_run.save(
-        tmp_path_factory.mktemp("trained") / "run",
-        TRAINED,
-        lambda random, kind, shape: random.uniform(0.05, 0.2, shape),
-    )
+    with tiny_run.known():
+        yield tiny_run.save(tmp_path_factory.mktemp("trained") / "run", TRAINED)
 
 
 @pytest.fixture
@@ -178,10 +175,10 @@ def fold_runs(run, tmp_path_factory):
     for fold in (0, 1):
         windows = dataclasses.replace(loaded.config.data, folds=2, left_out=fold)
         folders.append(
-            drawn_run.save(
+            tiny_run.save(
                 parent / f"fold{fold}",
                 dataclasses.replace(loaded.config, data=windows, workdir=None),
-                lambda random, kind, shape, fold=fold: random.uniform(0.05, 0.2 + fold, shape),
+                size=0.2 + fold,
             )
         )
     return [str(folder) for folder in folders]
@@ -226,7 +223,7 @@ def test_folds_that_do_not_make_a_whole_are_refused(
 def test_folds_of_another_experiment_are_refused(run, two_walks, fold_runs):
     config = CalibrateConfig(workdir=str(run), out_of_fold=tuple(fold_runs))
     loaded = checkpoint.load_run(run)
-    other = dataclasses.replace(loaded.config.model, bank_size=5)
+    other = dataclasses.replace(loaded.config.model, width=5)
     changed = loaded._replace(config=dataclasses.replace(loaded.config, model=other))
     with pytest.raises(InputError, match="fold0: differs from the calibrated run in 'model'"):
         evidence.sources(changed, config)

@@ -14,10 +14,22 @@ from gnio_jax.config import FilterOptions
 from gnio_jax.errors import InputError
 from gnio_jax.filtering.options import filter_setup, filter_with, switches_and_numbers
 from gnio_jax.filtering.unconstrained import natural, with_numbers
-from tests.support.calibration_walks import DATA, STRIDES, TRUE, N, walks
+from tests.support.calibration_walks import DATA, STRIDES, TRUE, N, first_strides, walks
+from tests.support.compiling import lightly_optimised, quick
 
 UNKNOWNS = (*chosen(("measurement",)), *GROUPS["noise"][:2])
 """Of every fit here: one program serves them all."""
+SEARCH = lightly_optimised(
+    likelihood._value_and_gradient, static_argnames=("windows", "switches", "unknowns")
+)
+"""A search runs it some thirty times."""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def search():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(likelihood, "_value_and_gradient", SEARCH)
+        yield
 
 
 def test_the_noises_of_simulated_walks_are_found():
@@ -32,26 +44,27 @@ def test_the_noises_of_simulated_walks_are_found():
 def test_the_gradient_is_that_of_the_likelihood():
     unknowns = chosen(tuple(GROUPS))
     options = with_starts(TRUE, unknowns)
-    two = jax.tree.map(lambda rows: rows[:2], walks())
-    both = innovation_objective(two, DATA, options, unknowns)
-    objective = jax.jit(lambda free: both(free)[0])
+    two = jax.tree.map(lambda rows: rows[:2], first_strides(walks(), 110))
+    both = quick(
+        jax.value_and_grad(innovation_objective(two, DATA, options, unknowns), has_aux=True)
+    )
     free = free_vector(options, unknowns)
-    gradient = np.asarray(jax.jit(jax.grad(lambda free: both(free)[0]))(free))
+    gradient = np.asarray(both(free)[1])
     assert (gradient != 0).all()
     for i, step in enumerate(1e-4 * np.eye(len(free))):
-        difference = (objective(free + step) - objective(free - step)) / 2e-4
-        np.testing.assert_allclose(gradient[i], difference, rtol=1e-3, atol=1e-7)
+        ahead, behind = (float(both(free + off)[0][0]) for off in (step, -step))
+        np.testing.assert_allclose(gradient[i], (ahead - behind) / 2e-4, rtol=1e-3, atol=1e-7)
 
 
 def test_a_second_calibration_compiles_nothing():
     """Of other walks, with other factors of the axes and another start."""
     given = walks()
     fit(given, DATA, TRUE, UNKNOWNS, lambda calls: None, most_steps=1)
-    programs = likelihood._value_and_gradient._cache_size()
+    programs = SEARCH._cache_size()
     others = given._replace(displacement=1.01 * given.displacement)
     options = dataclasses.replace(TRUE, std_factor_x=0.7, velocity_std=0.2)
     fit(others, DATA, options, UNKNOWNS, lambda calls: None, most_steps=1)
-    assert likelihood._value_and_gradient._cache_size() == programs
+    assert programs > 0 and SEARCH._cache_size() == programs
 
 
 @pytest.mark.parametrize("share", [0.0, 0.8])
@@ -96,20 +109,23 @@ def test_what_is_switched_off_and_has_no_start_cannot_be_fitted():
 
 
 def test_a_walk_may_be_filled_up_and_a_filter_that_fails_is_named():
-    given = walks()
-    push = np.repeat([[[90.0, 0.0, 9.81]]], 8, axis=0)  # to 360 m/s, beyond the filter's bound
-    falling = given._replace(
-        gyro=np.concatenate([given.gyro, np.zeros((8, 40 * N, 3))], axis=1),
-        accel=np.concatenate([given.accel, np.repeat(push, 40 * N, axis=1)], axis=1),
-        displacement=np.concatenate([given.displacement, np.full((8, 40, 3), np.nan)], axis=1),
-        std=np.concatenate([given.std, np.ones((8, 40, 3))], axis=1),
+    given, known = walks(), STRIDES - 40
+    push = np.array([90.0, 0.0, 9.81])  # to 360 m/s, beyond the filter's bound
+    after, nothing = (
+        np.arange(N * STRIDES)[:, None] >= N * known,
+        np.arange(STRIDES)[:, None] >= known,
     )
+    falling = given._replace(
+        gyro=np.where(after, 0.0, given.gyro),
+        accel=np.where(after, push, given.accel),
+        displacement=np.where(nothing, np.nan, given.displacement),
+        std=np.where(nothing, 1.0, given.std),
+    )
+    short = first_strides(given, known)
     free = free_vector(TRUE, UNKNOWNS)
-    values = [
-        float(jax.jit(innovation_objective(each, DATA, TRUE, UNKNOWNS))(free)[1])
-        for each in (given, falling)
-    ]
-    np.testing.assert_allclose(values[0], values[1], rtol=1e-9)
+    alone = quick(innovation_objective(short, DATA, TRUE, UNKNOWNS))(free)[1]
+    filled = fit(falling, DATA, TRUE, UNKNOWNS, lambda calls: None, most_steps=1).before
+    np.testing.assert_allclose(filled, alone, rtol=1e-9)
     broken = given._replace(
         accel=np.where(np.arange(STRIDES * N)[:, None] == 900, 1e6, given.accel)
     )

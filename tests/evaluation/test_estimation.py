@@ -3,17 +3,15 @@ perfect inputs."""
 
 import dataclasses
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from gnio_jax import evaluation
 from gnio_jax.errors import InputError
-from gnio_jax.evaluation import Network, Setup, metrics
+from gnio_jax.evaluation import Setup, metrics
 from gnio_jax.evaluation.estimators import filtered
 from gnio_jax.evaluation.estimators.integrated import mean_over_windows
-from gnio_jax.types import Prediction
 from tests.support.estimators import (
     CONFIG,
     INTEGRATE,
@@ -21,15 +19,15 @@ from tests.support.estimators import (
     NETWORK,
     OPTIONS,
     RATE,
+    network,
     rotations,
-    sensed,
     unyaw,
 )
 
 
 def test_imu_only_is_strap_down_integration(walks):
-    (prepared,), _ = evaluation.prepare(walks[:1], CONFIG, Setup("imu_only"))
-    (found,) = evaluation.estimate([prepared], None, CONFIG, OPTIONS, Setup("imu_only"))
+    (prepared, other), _ = evaluation.prepare(walks[::2], CONFIG, Setup("imu_only"))
+    (found, _) = evaluation.estimate([prepared, other], None, CONFIG, OPTIONS, Setup("imu_only"))
     rotation, velocity, position = (
         rotations(walks[0].orientation[0]).as_matrix(),
         walks[0].velocity[0],
@@ -126,22 +124,18 @@ def test_true_displacements_lack_nothing_that_was_calibrated(walks):
         np.testing.assert_array_equal(found.trajectory.position, plain.trajectory.position)
 
 
-def says_the_same(_, windows):
-    """A network whose displacement does not depend on its windows."""
-    told, rows = jnp.array([[0.9, 0.2, 0.02]], jnp.float32), (len(windows), 3)
-    return Prediction(jnp.broadcast_to(told, rows), jnp.full(rows, -2.0, jnp.float32), {})
-
-
 def told_the_same(prepared, config, options):
-    return evaluation.estimate(prepared, Network(says_the_same, None), config, options)
+    """By a network that does not look at its windows."""
+    alike = network(0.0, -2.0, log_std_gain=0.0, constant=(0.9, 0.2, 0.02))
+    return evaluation.estimate(prepared, alike, config, options)
 
 
 @pytest.mark.parametrize("run", [evaluation.perfect_displacements, told_the_same])
 def test_what_is_considered_widens_the_covariance_and_moves_nothing(walks, run):
     """By ∂p/∂b_g of the filter, here of a run whose gyro is off by a little."""
-    prepared, _ = evaluation.prepare(walks[:1], CONFIG, Setup(gyro_bias="reference"))
+    prepared, _ = evaluation.prepare(walks[::2], CONFIG, Setup(gyro_bias="reference"))
     options = dataclasses.replace(OPTIONS, considered_gyro_bias_std=1e-3)
-    (plain,), (found,) = (run(prepared, CONFIG, each) for each in (OPTIONS, options))
+    (plain, _), (found, _) = (run(prepared, CONFIG, each) for each in (OPTIONS, options))
     np.testing.assert_array_equal(found.trajectory.position, plain.trajectory.position)
     moved = []
     for axis in 1e-5 * np.eye(3):
@@ -256,11 +250,12 @@ def test_many_batches_of_unlike_lengths(walks):
 def test_tight_and_loose_see_the_same_windows(clean, context, first):
     """With an exact IMU the filter's attitude is the reference's, as long as no measurement
     disturbs it."""
-    network = Network(sensed, {"gain": jnp.float32(0.1), "log_std": jnp.float32(4.0)})
     config, found = dataclasses.replace(CONFIG, context_seconds=context), []
     for setup in (Setup(), LOOSE):
         prepared, _ = evaluation.prepare([clean], config, setup)
-        found += evaluation.estimate(prepared, network, config, OPTIONS, setup, batch_size=1)
+        found += evaluation.estimate(
+            prepared, network(0.1, 4.0), config, OPTIONS, setup, batch_size=1
+        )
     tight, loose = found
     assert (
         np.isnan(tight.displacement[:first]).all() and np.isfinite(tight.displacement[first:]).all()
@@ -280,9 +275,9 @@ def test_tight_and_loose_see_the_same_windows(clean, context, first):
 
 
 def test_loose_measurements_have_the_same_least_std(clean):
-    network = Network(sensed, {"gain": jnp.float32(0.0), "log_std": jnp.float32(-90.0)})
+    sure = network(0.0, -90.0)
     prepared, _ = evaluation.prepare([clean], CONFIG, LOOSE)
-    (found,) = evaluation.estimate(prepared, network, CONFIG, OPTIONS, LOOSE, batch_size=1)
+    (found,) = evaluation.estimate(prepared, sure, CONFIG, OPTIONS, LOOSE, batch_size=1)
     np.testing.assert_allclose(found.displacement_std[11:], np.exp(-4) * np.sqrt(10), rtol=1e-6)
 
 

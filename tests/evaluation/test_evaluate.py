@@ -119,8 +119,8 @@ def test_end_to_end(workdir, command, capsys, tmp_path):
 def test_a_void_filter_is_in_the_files(workdir, monkeypatch):
     """Accelerations in the wrong unit: the sequence says so, and no figure is of it."""
     walks = [
-        synthetic.pedestrian(seed, synthetic.person(seed), "handheld", 14.0, 50.0)
-        for seed in (1, 2)
+        synthetic.pedestrian(seed, synthetic.person(seed), "handheld", seconds, 50.0)
+        for seed, seconds in ((1, 15.0), (2, 14.0))  # one program with those of the command
     ]
     walks[0] = walks[0]._replace(accel=1e3 * walks[0].accel)
     monkeypatch.setattr(data, "load", lambda *_: walks)

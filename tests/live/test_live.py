@@ -14,6 +14,7 @@ from gnio_jax.config import DataConfig, FilterOptions, ModelConfig, TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation.tum import read_tum
 from gnio_jax.filtering import ConsideredStd, Tracker
+from gnio_jax.filtering import tracker as trackers
 from gnio_jax.filtering.pose import Pose
 from gnio_jax.live import rerun_stream
 from gnio_jax.types import Sequence
@@ -28,6 +29,22 @@ RATE = 50.0
 def run(tmp_path_factory):
     with tiny_run.known():
         yield tiny_run.save(tmp_path_factory.mktemp("home") / "run", CONFIG)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def programs():
+    """Trackers of the one run that take the same steps share what is compiled."""
+    compiled, compile_programs = {}, trackers.compile_programs
+
+    def once(predict, settings):
+        steps = settings._replace(design=None, rest=0, std=None)
+        if repr(steps) not in compiled:
+            compiled[repr(steps)] = compile_programs(predict, settings)
+        return compiled[repr(steps)]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(trackers, "compile_programs", once)
+        yield
 
 
 @pytest.fixture(scope="module")

@@ -3,7 +3,6 @@
 import dataclasses
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -15,6 +14,7 @@ from gnio_jax.errors import InputError
 from gnio_jax.pretrained.finding import SHIPPED
 from gnio_jax.training import checkpoint
 from gnio_jax.training.initial import initial_run
+from tests.support.compiling import quick
 
 MAXIMUM = 5e6
 """Bytes."""
@@ -47,7 +47,7 @@ def test_it_loads_and_answers(about):
     # A phone that lies still goes nowhere, by the network alone.
     still = np.zeros((1, run.config.data.seen, 6), np.float32)
     still[..., 2] = 9.81
-    prediction = run.model.apply(run.variables, jnp.asarray(still))
+    prediction = quick(run.model.apply)(run.variables, still)
     assert np.linalg.norm(prediction.displacement) < 0.05
 
 

@@ -35,3 +35,10 @@ def walks():
 def walks_with_truth():
     """And the true positions after each stride, (8, STRIDES, 3)."""
     return walks(), _simulated().position.copy()
+
+
+def first_strides(given, strides):
+    """The walks up to there."""
+    samples = {name: getattr(given, name)[:, : N * strides] for name in ("gyro", "accel")}
+    told = {name: getattr(given, name)[:, :strides] for name in ("displacement", "std")}
+    return given._replace(**samples, **told)

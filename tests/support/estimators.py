@@ -22,12 +22,19 @@ def sensed(variables, windows):
         "gate": jnp.tanh(means[:, 3:]),
         "attention": jnp.zeros((windows.shape[0], 8, 64)),
     }
-    return Prediction(
-        variables["gain"] * means[:, :3], means[:, 3:] + variables["log_std"], diagnostics
-    )
+    displacement = variables["constant"] + variables["gain"] * means[:, :3]
+    log_std = variables["log_std"] + variables["log_std_gain"] * means[:, 3:]
+    return Prediction(displacement, log_std, diagnostics)
 
 
-NETWORK = Network(sensed, {"gain": jnp.float32(0.05), "log_std": jnp.float32(-3.0)})
+def network(gain, log_std, log_std_gain=1.0, constant=(0.0, 0.0, 0.0)):
+    """`sensed` with these numbers: all of them share its programs."""
+    named = {"gain": gain, "log_std": log_std, "log_std_gain": log_std_gain}
+    named["constant"] = np.array([constant])
+    return Network(sensed, {name: jnp.float32(value) for name, value in named.items()})
+
+
+NETWORK = network(0.05, -3.0)
 
 
 def rotations(wxyz):

@@ -1,17 +1,18 @@
 """A table made from nothing to its pictures, then again without training."""
 
 import csv
+import dataclasses
 import json
 
 import numpy as np
 import pytest
 import yaml
 
+from gnio_jax import calibration, models
 from gnio_jax import config as configuration
-from gnio_jax import models
 from gnio_jax.commands import tables as commands
 from gnio_jax.comparison import figures
-from gnio_jax.config import DataConfig, ModelConfig, OptimConfig, TrainConfig
+from gnio_jax.config import CalibrateConfig, DataConfig, ModelConfig, OptimConfig, TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.tables import complexity
 from gnio_jax.training import loop
@@ -25,7 +26,7 @@ def made(tmp_path_factory):
     root = tmp_path_factory.mktemp("tables")
     for name in "abc":
         write_sequence(root / "data" / name)
-    for split, names in [("train", "a\nb\n"), ("val", "c\n"), ("test", "b\nc\n")]:
+    for split, names in [("train", "a\nb\n"), ("val", "b\nc\n"), ("test", "b\nc\n")]:
         (root / "data" / f"{split}_list.txt").write_text(names)
     base = TrainConfig(
         dataset="tlio",
@@ -99,7 +100,15 @@ def test_a_table_from_nothing_and_again_without_training(made, monkeypatch, caps
         commands.main(["comparison", *arguments, "--base", str(root / "other.yaml")])
 
 
-def test_every_run_is_calibrated_before_it_is_measured(made, capsys):
+def test_every_run_is_calibrated_before_it_is_measured(made, monkeypatch, capsys):
+    """As `gnio calibrate` does by default, of which one unknown and two steps are enough here."""
+    calibrate = calibration.calibrate
+
+    def quickly(config, **more):
+        assert config == CalibrateConfig(config.workdir, config.out)
+        return calibrate(dataclasses.replace(config, fit=("measurement",), steps=2), **more)
+
+    monkeypatch.setattr(calibration, "calibrate", quickly)
     root, arguments = made
     arguments = [*arguments, "--seeds", "1", "--estimator", "ekf"]
     commands.main(["comparison", *arguments])

@@ -195,7 +195,7 @@ def test_our_own_file_with_holes(gnio, mistake, runs, tmp_path):
     """It comes to the tracker as it is: nobody has looked for holes yet."""
     given = ("track", tmp_path / "walk.h5", "--weights", runs / "walker")
     for lost, name in ((70, "../../walk"), (320, "walk")):
-        time = np.delete(np.arange(900), np.s_[200 : 200 + lost])[:600] / 100
+        time = np.delete(np.arange(900), np.s_[200 : 200 + lost])[:530] / 100
         nothing = np.full((len(time), 3), np.nan)
         sequence = Sequence(
             name=name,
