@@ -308,7 +308,7 @@ def test_no_spike_in_the_gradient_of_the_uncertainty(width, seeds, count):
 
     With the learning rates of configs/quickstart.yaml, whose warm-up takes 223 steps. With a kernel
     of the head that does not start at zero, and a likelihood that does not bound outliers, every
-    seed of every width has spikes of 600 times the median and more, the first of them within ten
+    seed of every width has spikes of 300 times the median and more, the first of them within ten
     steps.
     """
     source = source_of("val", 2, 20.0)
