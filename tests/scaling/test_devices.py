@@ -14,6 +14,7 @@ from gnio_jax.errors import InputError
 from gnio_jax.reporting import Silence
 from gnio_jax.scaling import devices
 from gnio_jax.training import loop, on_windows, run_folder, step
+from tests.support.drawn_state import drawn_state
 from tests.support.tlio_files import write_sequence
 
 
@@ -33,7 +34,8 @@ def config(tmp_path_factory):
 def trained(config):
     """Losses and gradient norms of each of five steps, figures of validation, parameters."""
     training = on_windows.set_up(config, Silence())
-    state, order, found = training.new_state(None), training.order(0), []
+    drawn = drawn_state(training.model, training.optimizer, config.data.seen)
+    state, order, found = devices.everywhere(drawn), training.order(0), []
     for first in range(5):
         state, progress = training.take_steps(state, order, first, 1, 1.0)
         found.append((progress.sums, progress.gradient_norms))

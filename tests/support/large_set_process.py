@@ -5,6 +5,7 @@ python -m tests.support.large_set_process MEGABYTES
 Prints the steps taken and the bytes of the set, and what taking it into memory raises.
 """
 
+import functools
 import itertools
 import resource
 import sys
@@ -17,7 +18,7 @@ from gnio_jax.data import windows
 from gnio_jax.data.on_disk import bytes_of
 from gnio_jax.models import registry
 from gnio_jax.reporting import Silence
-from gnio_jax.training import on_windows, supply
+from gnio_jax.training import on_windows, optimizer, supply
 from tests.support.tiny_network import Tiny
 
 CONFIG = TrainConfig(
@@ -44,10 +45,15 @@ def part():
     )
 
 
-def train(one, times):
-    """Some steps here and there in an epoch, and validation, over so many recordings."""
+def train(one, times, validated=None):
+    """Some steps here and there in an epoch, and validation, over so many recordings; there of the
+    last `validated` windows, by default all."""
     on_windows.windows.window_parts = lambda *_: itertools.repeat(one, times)
     training = on_windows.set_up(CONFIG, Silence())
+    held_out = training.held_out
+    if validated:
+        held_out = held_out._replace(visited=held_out.visited[-validated:])
+        training = training._replace(held_out=held_out)
     state, order = training.new_state(None), training.order(0)
     for first in (0, training.steps_per_epoch // 2, training.steps_per_epoch - 8):
         state, _ = training.take_steps(state, order, first, 8, 1.0)
@@ -59,10 +65,14 @@ def train(one, times):
 def main(megabytes):
     registry._MODELS["tiny"] = Tiny
     supply.PART_BYTES = 2**22
+    # The same optimizer for both, so that the steps are compiled once.
+    on_windows.optimizers.create = functools.cache(optimizer.create)
     one, limit = part(), int(megabytes) * 10**6
     times = -(-5 * limit // (2 * bytes_of(one)))  # there are as many validation windows
     # A small set with as many visits: programs and threads are there before the limit.
-    train(one._replace(visited=np.tile(one.visited, times)), 1)
+    few = one._replace(visited=np.tile(one.visited, times))
+    whole = 256 * supply.FromHost(256, CONFIG.data.seen, 0).batches()
+    train(few, 1, validated=whole + len(few.visited) % whole)
     (line,) = (s for s in Path("/proc/self/status").read_text().split("\n") if "VmData" in s)
     taken = int(line.split()[1]) * 1024
     resource.setrlimit(resource.RLIMIT_DATA, (taken + limit,) * 2)

@@ -6,13 +6,14 @@ PREFIX}. What the process prints is in PREFIX.out and PREFIX.err; its exit statu
 PREFIX.status when it has ended.
 """
 
+import gc
 import json
 import os
 import signal
 import sys
 from pathlib import Path
 
-from gnio_jax import filtering  # noqa: F401
+from gnio_jax import filtering, pretrained  # noqa: F401
 from gnio_jax.files import write_text
 from gnio_jax.training import loop  # noqa: F401
 from tests.support import sequences_process, training_process
@@ -22,6 +23,10 @@ MODULES = {"training": training_process, "sequences": sequences_process}
 
 def main():
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # nobody waits for those that watch
+    # A process that looks through what it shares with this one copies it: a second of each.
+    gc.set_threshold(100_000, 50, 100)
+    gc.collect()
+    gc.freeze()
     for line in sys.stdin:
         asked = json.loads(line)
         if os.fork() == 0:

@@ -14,6 +14,7 @@ from gnio_jax.training import optimizer, step, validation
 from gnio_jax.training.checkpoint import create_model
 from gnio_jax.training.losses import stage
 from tests.support.compiling import quick
+from tests.support.tiny_network import Tiny
 
 CONFIG = TrainConfig(
     data=DataConfig(rate=20.0),
@@ -49,7 +50,7 @@ def once(function, **options):
 def test_a_step_of_training_and_a_validation():
     """Other windows, another order, more steps, another learning rate, another stage."""
     with jax.enable_x64(False):
-        model = create_model(CONFIG)
+        model = Tiny()  # a trace of another is no different
         tx = optimizer.create(CONFIG.optim, CONFIG.loss, WINDOWS // 2)
         fixed = dict(model=model, config=CONFIG)
         train = once(step.train_steps, static_argnames=("model", "optimizer", "config"))
@@ -65,3 +66,12 @@ def test_a_step_of_training_and_a_validation():
             found = validate(state, windows, stage(CONFIG.loss, state.step, WINDOWS // 2))
             chex.assert_tree_all_finite((progress.sums, found.losses))
         assert int(state.step) == 3
+
+
+def test_no_type_of_a_fresh_state_is_weak():
+    """Steps give types that are none: the second one would be compiled anew."""
+    model, tx = create_model(CONFIG), optimizer.create(CONFIG.optim, CONFIG.loss, WINDOWS // 2)
+    with jax.enable_x64(False):
+        create = functools.partial(step.create_state, model, tx, window=CONFIG.data.window)
+        fresh = jax.eval_shape(create, jax.random.key(0))
+    assert not [leaf for leaf in jax.tree.leaves(fresh) if leaf.weak_type]

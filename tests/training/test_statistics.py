@@ -14,7 +14,9 @@ from gnio_jax.config import DataConfig, LossConfig, ModelConfig, OptimConfig, Tr
 from gnio_jax.data import windows
 from gnio_jax.training import batch_statistics, losses, optimizer, step, validation
 from gnio_jax.training.checkpoint import create_model
-from tests.support.compiling import as_usual, lightly_optimised, quick
+from tests.support import tiny_run
+from tests.support.compiling import lightly_optimised, quick
+from tests.support.drawn_state import drawn_state
 
 CONFIG = TrainConfig(
     data=DataConfig(rate=50.0),
@@ -33,11 +35,23 @@ FEW = dataclasses.replace(
 NAMES = ("model", "optimizer", "config")
 STEPS = lightly_optimised(step.train_steps.__wrapped__, static_argnames=NAMES)
 FEW_STEPS = quick(step.train_steps.__wrapped__, static_argnames=NAMES)
+CREATE = quick(step.create_state, static_argnames=("model", "optimizer", "window"))
+
+
+@pytest.fixture(scope="module", autouse=True)
+def registered():
+    with tiny_run.known():
+        yield
+
+
+@functools.cache
+def walks(split):
+    return data.load("synthetic", split=split)
 
 
 @functools.cache
 def source_of(split, stride, rate=CONFIG.data.rate):
-    sequences = [data.resample(s, rate) for s in data.load("synthetic", split=split)]
+    sequences = [data.resample(each, rate) for each in walks(split)]
     return jax.device_put(
         windows.window_source(sequences, dataclasses.replace(CONFIG.data, rate=rate), stride)
     )
@@ -49,14 +63,26 @@ def model_and_optimizer(config, steps):
     return create_model(config), optimizer.create(config.optim, config.loss, steps)
 
 
+def fresh(config, source, seed=0):
+    """Network and fresh state."""
+    model, tx = model_and_optimizer(config, source.visited.shape[0] // config.optim.batch_size)
+    with jax.enable_x64(False):
+        return model, CREATE(model, tx, jax.random.key(seed), config.data.window)
+
+
+def drawn(config, source):
+    """The same with parameters that NumPy has drawn, where it does not matter how they begin."""
+    model, tx = model_and_optimizer(config, source.visited.shape[0] // config.optim.batch_size)
+    with jax.enable_x64(False):
+        return model, drawn_state(model, tx, config.data.window, config.optim.ema_decay)
+
+
 def trainer(config, source, seed=0, train_steps=STEPS):
-    """Network, fresh state, a function that takes `count` of its steps, and the number of steps in
-    an epoch."""
+    """A function that takes `count` steps from a state, and the number of steps in an epoch."""
     steps = source.visited.shape[0] // config.optim.batch_size
     model, tx = model_and_optimizer(config, steps)
     with jax.enable_x64(False):
         key = jax.random.key(seed)
-        state = step.create_state(model, tx, key, config.data.window, config.optim.ema_decay)
 
     @functools.cache
     def order(epoch):
@@ -77,7 +103,7 @@ def trainer(config, source, seed=0, train_steps=STEPS):
                 config=config,
             )
 
-    return model, state, take, steps
+    return take, steps
 
 
 @pytest.fixture(scope="module")
@@ -88,7 +114,9 @@ def trained():
 
 
 def run(seed):
-    model, state, take, steps = trainer(CONFIG, source_of("train", 20), seed)
+    source = source_of("train", 20)
+    model, state = fresh(CONFIG, source, seed)
+    take, steps = trainer(CONFIG, source, seed)
     for epoch in range(CONFIG.optim.epochs):
         if epoch == CONFIG.optim.epochs // 2:
             midway = state
@@ -204,17 +232,15 @@ def test_an_estimate_depends_on_parameters_and_key_alone(trained):
 def test_constants_of_the_uncertainty_are_left_alone():
     config = dataclasses.replace(
         CONFIG,
-        model=ModelConfig(width=2, uncertainty="calibrated", bank_size=0),
+        model=ModelConfig("tiny", uncertainty="calibrated"),
         optim=dataclasses.replace(CONFIG.optim, statistics_windows=64),
     )
     source = source_of("val", 25)
-    model, state, _, _ = trainer(config, source)
+    model, state = drawn(config, source)
     state.batch_stats["uncertainty"]["log_factor"] = jnp.array([0.5, -1.0, 2.0], jnp.float32)
     found = estimated(model, state, source, config).batch_stats
     np.testing.assert_array_equal(found["uncertainty"]["log_factor"], [0.5, -1.0, 2.0])
-    assert not np.array_equal(
-        found["encoder"]["stem_bn"]["mean"], state.batch_stats["encoder"]["stem_bn"]["mean"]
-    )
+    assert not np.array_equal(found["norm"]["mean"], state.batch_stats["norm"]["mean"])
     assert batch_statistics.normalises(state) and not batch_statistics.normalises(
         state._replace(batch_stats={"uncertainty": found["uncertainty"]})
     )
@@ -223,12 +249,12 @@ def test_constants_of_the_uncertainty_are_left_alone():
 def test_the_average_of_the_parameters_against_numpy():
     """Over recorded steps, however they are dispatched; nothing is kept where it is off."""
     optim = dataclasses.replace(CONFIG.optim, ema_decay=0.8)
-    config = dataclasses.replace(CONFIG, model=ModelConfig(width=2, bank_size=0), optim=optim)
+    config = dataclasses.replace(CONFIG, model=ModelConfig("tiny"), optim=optim)
     source = source_of("val", 25)
-    _, state, take, _ = trainer(config, source, train_steps=FEW_STEPS)
-    seen, states = [], [state]
+    take, _ = trainer(config, source, train_steps=FEW_STEPS)
+    seen, states = [], [drawn(config, source)[1]]
     for number in range(6):
-        states.append(take(jax.tree.map(jnp.copy, states[-1]), 0, number, 1)[0])
+        states.append(take(states[-1], 0, number, 1)[0])
         seen.append(jax.tree.map(np.float64, states[-1].params))
         weights = 0.8 ** np.arange(number + 1)[::-1]
         wanted = jax.tree.map(lambda *x: np.average(x, axis=0, weights=weights), *seen)  # noqa: B023
@@ -238,7 +264,7 @@ def test_the_average_of_the_parameters_against_numpy():
     at_once, _ = take(states[0], 0, 0, 6)
     jax.tree.map(np.testing.assert_array_equal, at_once, states[-1])
     plain = dataclasses.replace(config, optim=CONFIG.optim)
-    without = trainer(plain, source)[1]
+    _, without = drawn(plain, source)
     assert without.average is None and step.evaluated(without) is without
 
 
@@ -258,9 +284,9 @@ def test_the_uncertainty_fits_the_errors_after_training(trained):
     assert np.all((typical > 0.5) & (typical < 2.5)), found
 
 
-@functools.partial(as_usual, static_argnames=NAMES)
-def norms_of_the_head(state, source, orders, key, model, optimizer, config):
-    """The norm of its gradient in each of the first 200 steps: (200,)."""
+@functools.partial(lightly_optimised, static_argnames=(*NAMES, "count"))
+def norms_of_the_head(state, source, orders, key, count, model, optimizer, config):
+    """The norm of its gradient in each of the first `count` steps: (count,)."""
     steps = orders.shape[1] // config.optim.batch_size
 
     def one_step(state, number):
@@ -270,16 +296,20 @@ def norms_of_the_head(state, source, orders, key, model, optimizer, config):
         state, progress = step.train_steps.__wrapped__(*given, **options)
         return state, progress.gradient_norms["uncertainty"]
 
-    return jax.lax.scan(one_step, state, jnp.arange(200, dtype=jnp.int32))[1]
+    return jax.lax.scan(one_step, state, jnp.arange(count, dtype=jnp.int32))[1]
 
 
-@pytest.mark.parametrize("width, seeds", [(16, range(10)), (32, range(1)), (64, range(1))])
-def test_no_spike_in_the_gradient_of_the_uncertainty(width, seeds):
-    """In the first 200 steps the largest norm of the gradient of the head stays within 100 times
-    the median.
+@pytest.mark.parametrize(
+    "width, seeds, count", [(16, range(4), 200), (32, range(1), 200), (64, range(1), 60)]
+)
+def test_no_spike_in_the_gradient_of_the_uncertainty(width, seeds, count):
+    """In the first steps the largest norm of the gradient of the head stays within 100 times the
+    median.
 
-    With the learning rates of configs/quickstart.yaml, whose warm-up these steps are. A spike is
-    one window of one step, which rounding decides: it is compiled as users' programs are.
+    With the learning rates of configs/quickstart.yaml, whose warm-up takes 223 steps. With a kernel
+    of the head that does not start at zero, and a likelihood that does not bound outliers, every
+    seed of every width has spikes of 300 times the median and more, the first of them within ten
+    steps.
     """
     source = source_of("val", 2, 20.0)
     steps = source.visited.shape[0] // 64
@@ -297,16 +327,15 @@ def test_no_spike_in_the_gradient_of_the_uncertainty(width, seeds):
         loss=LossConfig(),
         optim=optim,
     )
-    model, tx = model_and_optimizer(config, steps)
+    options = dict(zip(NAMES, (*model_and_optimizer(config, steps), config), strict=True))
     for seed in seeds:
+        _, state = fresh(config, source, seed)
         with jax.enable_x64(False):
             key = jax.random.key(seed)
-            state = step.create_state(model, tx, key, config.data.window)
-            orders = [step.epoch_order(key, epoch, source) for epoch in range(-(-200 // steps))]
-            norms = norms_of_the_head(
-                state, source, jnp.stack(orders), key, model=model, optimizer=tx, config=config
-            )
-        assert norms.max() < 100 * jnp.median(norms), (seed, norms.max(), jnp.median(norms))
+            orders = [step.epoch_order(key, epoch, source) for epoch in range(-(-count // steps))]
+            orders = np.stack(orders)
+            norms = np.asarray(norms_of_the_head(state, source, orders, key, count, **options))
+        assert norms.max() < 100 * np.median(norms), (seed, norms.max(), np.median(norms))
 
 
 SMALL = {"gnio": {"width": 16}, "tlio": {"width": 16}, "ctin": {"decoder_layers": 1}}
@@ -319,16 +348,16 @@ def test_networks_with_a_head_begin_with_a_standard_deviation_near_one(name):
     imu = np.float32([0, 0, 9.81, 0, 0, 0]) + rng.normal(0, [3, 3, 3, 2, 2, 2], (8, 50, 6)).astype(
         np.float32
     )
-    apply = jax.jit(
-        lambda variables: model.apply(
-            variables,
-            jnp.asarray(imu),
-            train=True,
-            mutable=["batch_stats"],
-            rngs={"dropout": jax.random.key(1)},
-        )
-    )
+
+    @quick
+    def said(key):
+        variables = models.initialise(model, key, 50)
+        options = {
+            "train": True,
+            "mutable": ["batch_stats"],
+            "rngs": {"dropout": jax.random.key(1)},
+        }
+        return model.apply(variables, jnp.asarray(imu), **options)[0]
+
     for seed in range(3):
-        variables = models.initialise(model, jax.random.key(seed), 50)
-        said, _ = apply(variables)
-        assert np.abs(said.log_std).max() < 0.1
+        assert np.abs(said(jax.random.key(seed)).log_std).max() < 0.1

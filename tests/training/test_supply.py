@@ -176,7 +176,7 @@ def test_through_the_filter_recordings_lie_on_the_device(config):
 
 def test_a_set_five_times_as_large_as_the_memory_trains(tmp_path):
     """And it would not fit: the same process cannot take it into memory."""
-    megabytes = 100
+    megabytes = 70
     environment = {
         **os.environ,
         "JAX_COMPILATION_CACHE_DIR": str(tmp_path),

@@ -314,7 +314,8 @@ def test_gradient_against_differences(training):
     assert filter_step.filter_config(training.config, training=True).truncate_every == 10
     state = new_state(training)
     starts = training.source.earliest[:2]
-    batch = filter_step.draw_pieces(jax.random.key(5), training.source, starts, config)
+    draw = jax.jit(filter_step.draw_pieces, static_argnames="config")
+    batch = draw(jax.random.key(5), training.source, starts, config)
     chosen = learnt.chosen(state.variables, through.learn)
     # The network computes in float32 whatever it is given.
     chosen["filter"] = {name: jnp.float64(number) for name, number in chosen["filter"].items()}

@@ -1,0 +1,39 @@
+"""The state at the start of training, with parameters that NumPy has drawn: compiling the programs
+that initialise a network takes longer than what many tests do with it."""
+
+import functools
+
+import jax
+import numpy as np
+
+from gnio_jax.training import step
+
+
+def drawn_state(model, optimizer, window, ema_decay=0.0):
+    """As `step.create_state` in shapes and types. Kernels are normal, the smaller the more numbers
+    they sum, and those of the heads next to nothing; the optimizer has seen nothing."""
+    create = functools.partial(step.create_state, model, optimizer)
+    shapes = jax.eval_shape(
+        lambda key: create(key, window=window, ema_decay=ema_decay), jax.random.key(0)
+    )
+    random = np.random.default_rng(0)
+
+    def parameter(path, leaf):
+        if path[-1].key == "scale":
+            return np.ones(leaf.shape, leaf.dtype)
+        spread = np.prod(leaf.shape[:-1]) ** -0.5 if leaf.ndim > 1 else 0.1
+        spread *= 0.01 if path[0].key in ("head", "uncertainty") else 1.0
+        return random.normal(0, spread, leaf.shape).astype(leaf.dtype)
+
+    def statistic(path, leaf):
+        return np.full(leaf.shape, path[-1].key == "var", leaf.dtype)
+
+    params = jax.tree_util.tree_map_with_path(parameter, shapes.params)
+    drawn = shapes._replace(
+        step=np.int32(0),
+        params=params,
+        batch_stats=jax.tree_util.tree_map_with_path(statistic, shapes.batch_stats),
+        opt_state=jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), shapes.opt_state),
+        average=None if shapes.average is None else jax.tree.map(np.copy, params),
+    )
+    return jax.device_put(drawn)
