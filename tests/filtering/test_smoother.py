@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from gnio_jax import filtering
 from gnio_jax.types import Prediction
 from tests.support import scekf_numpy
-from tests.support.compiling import optimised, quick
+from tests.support.compiling import lightly_optimised, quick
 from tests.support.walks import errors, simulate, yaw_matrix
 
 N, CLONES, INTERVALS, DT = 4, 3, 14, 0.05
@@ -189,18 +189,17 @@ NOISE = filtering.NoiseModel.per_sample(*WHITE, DT, *WALK)
 
 @pytest.mark.parametrize("case", ["rejected", "scaled", "weighted"])
 def test_equals_least_squares_over_all_states(case):
-    """Missing rows in all cases; a rejected row; one applied with scaled covariance; a gate with a
-    slope, rest, and first estimates."""
+    """Missing rows in all cases; a rejected row; one applied with scaled covariance, in blocks of
+    intervals and two left over; a gate with a slope, rest, and first estimates."""
     options = {
         "rejected": dict(history="core"),
-        "scaled": dict(history="core", mahalanobis_fail_scale=7.0),
+        "scaled": dict(history="core", mahalanobis_fail_scale=7.0, checkpoint_every=4),
         "weighted": dict(
             gate_softness=3.0,
             gate_threshold=4.0,
             zero_velocity_std=5 * SMALL,
             rest_seconds=0.5,
             jacobians="first",
-            checkpoint_every=4,
         ),
     }[case]
     config = CONFIG(**options)
@@ -346,7 +345,7 @@ def test_long_walks_come_closer_to_the_truth_and_say_by_how_much():
     valid[1, 1000:1005] = valid[2, 1500:1530] = False
     spread = np.tile(SIGMA**2 * np.eye(3), (LONG, 1, 1))
 
-    @optimised
+    @lightly_optimised
     @jax.vmap
     def both(rotation, velocity, position, gyro, accel, displacement, valid):
         state = filtering.initial_state(config, rotation, velocity, position, std=std)
