@@ -55,12 +55,16 @@ def program(jacobians):
     return optimised(jax.vmap(run, in_axes=(None, None, *6 * [0])))
 
 
-@functools.cache
+WIDE = filtering.InitialStd(gyro_bias=1e-2, accel_bias=0.1)
+
+
+@functools.lru_cache(1)
 def walks(std, sigma):
     return simulate(1, RUNS, INTERVALS, N, CLONES, DT, NOISE, std, sigma)
 
 
-def monte_carlo(std, sigma, jacobians="latest"):
+@functools.lru_cache(1)
+def monte_carlo(std, sigma, jacobians):
     """Errors (r, K, 15), covariances (r, K, 15, 15), NIS (r, K) and the final states of simulated
     runs from the prior."""
     runs = walks(std, sigma)
@@ -89,7 +93,7 @@ def bounds(freedoms, level=0.95):
 
 def test_certainty_agrees_with_the_errors():
     """NEES of every part and NIS lie in the 95 % bounds of the average over 64 runs."""
-    runs, error, spread, nis, final = monte_carlo(filtering.InitialStd(), sigma=0.03)
+    runs, error, spread, nis, final = monte_carlo(filtering.InitialStd(), 0.03, "latest")
     for name, index in PARTS.items():
         found = nees(error[..., index], spread[:, :, index][..., index])
         low, high = bounds(len(index) * RUNS)
@@ -125,12 +129,11 @@ def test_biases_converge_from_a_wide_prior():
 
     z takes longer where it is the gyro's, since yaw is seen by turning only; the whole run moves in
     every direction here."""
-    prior = filtering.InitialStd(gyro_bias=1e-2, accel_bias=0.1)
-    _, error, spread, _, _ = monte_carlo(prior, sigma=0.02)
+    _, error, spread, _, _ = monte_carlo(WIDE, 0.02, "latest")
     sigma = np.sqrt(spread[:, -1].diagonal(axis1=1, axis2=2)).mean(0)
     found = np.sqrt((error[:, -1] ** 2).mean(0))
     for values in (sigma, found):
-        gyro, accel = values[9:12] / prior.gyro_bias, values[12:15] / prior.accel_bias
+        gyro, accel = values[9:12] / WIDE.gyro_bias, values[12:15] / WIDE.accel_bias
         assert (gyro[:2] < 0.1).all() and (accel < 0.1).all(), (gyro, accel)
         assert gyro[2] < 0.2, gyro
         print(f"\nbias, share of the prior: gyro {gyro.round(3)}, accel {accel.round(3)}")
@@ -139,10 +142,9 @@ def test_biases_converge_from_a_wide_prior():
 def test_yaw_is_consistent_only_with_first_estimates():
     """With a wide prior the latest-estimate filter becomes too sure of its yaw; with the first ones
     it does not."""
-    prior = filtering.InitialStd(gyro_bias=1e-2)
     by_yaw = {}
     for jacobians in ("latest", "first"):
-        _, error, spread, nis, _ = monte_carlo(prior, 0.02, jacobians)
+        _, error, spread, nis, _ = monte_carlo(WIDE, 0.02, jacobians)
         by_yaw[jacobians] = nees(error[..., [2]], spread[:, :, [2]][..., [2]])[300:].mean()
         assert abs(nis[:, CLONES:].mean() / 3 - 1) < 0.02
     print(f"\nNEES of yaw, mean over time: {by_yaw}")
