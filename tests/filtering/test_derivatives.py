@@ -2,6 +2,7 @@
 finite where input is hostile."""
 
 import functools
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -28,20 +29,42 @@ MEASURED = 0.1 * np.random.default_rng(4).standard_normal((INTERVALS, 3))
 PLAIN = filtering.FilterConfig(DT, N, CLONES)
 
 
-def of_history(history):
+class Felt(NamedTuple):
+    """What of a history is felt."""
+
+    weights: np.ndarray
+    """(K, 3) of the positions."""
+    rows: np.ndarray
+    """(K,): 1 where innovations are felt, else 0."""
+    end: np.ndarray
+    """(K,): 1 in the row after which the state is felt, else 0."""
+
+
+WHOLE = Felt(WEIGHTS, np.ones(INTERVALS), np.eye(INTERVALS)[-1])
+
+
+def of_history(history, felt=WHOLE):
     """A scalar that feels every part of the history."""
+    weights, rows, end = map(jnp.asarray, felt)
     return (
-        jnp.sum(WEIGHTS * history.position)
-        + jnp.sum(history.rotation[-1, 0])
-        + 0.01 * jnp.nansum(history.nis)
-        + jnp.sum(history.velocity[-1])
-        + 10 * jnp.sum(history.gyro_bias[-1] + history.accel_bias[-1])
-        + 0.1 * jnp.nansum(history.log_likelihood)
-        + jnp.sum(jnp.log(history.covariance_diagonal[-1]))
+        jnp.sum(weights * history.position)
+        + jnp.sum(end[:, None] * history.rotation[:, 0])
+        + 0.01 * jnp.nansum(rows * history.nis)
+        + jnp.sum(end[:, None] * history.velocity)
+        + 10 * jnp.sum(end[:, None] * (history.gyro_bias + history.accel_bias))
+        + 0.1 * jnp.nansum(rows * history.log_likelihood)
+        + jnp.sum(end[:, None] * jnp.log(history.covariance_diagonal))
     )
 
 
-def loss(x, config=PLAIN):
+class Carried(NamedTuple):
+    """A state to begin with, where it is `taken`."""
+
+    taken: bool
+    state: filtering.FilterState
+
+
+def loss(x, felt=WHOLE, carried=None, config=PLAIN):
     """x: noise (4,) log factors, std (6,) log factors of the start's, state (12,) added to the
     start, measured (K, 3), gyro, accel."""
     noise = filtering.NoiseModel(*(jnp.array([1e-2, 1e-1, 1e-2, 1e-1]) * jnp.exp(x["noise"])))
@@ -56,11 +79,14 @@ def loss(x, config=PLAIN):
         first.accel_bias + x["state"][9:],
         std,
     )
+    if carried is not None:
+        choose = functools.partial(jnp.where, carried.taken)
+        state = jax.tree.map(choose, carried.state, state)
     spread = jnp.tile(0.01 * jnp.eye(3)[None], (INTERVALS, 1, 1))
     _, history = filtering.run_filter(
         state, x["gyro"], x["accel"], x["measured"], spread, config, noise
     )
-    return of_history(history)
+    return of_history(history, felt)
 
 
 def point(measured=MEASURED):
@@ -75,23 +101,45 @@ def point(measured=MEASURED):
     )
 
 
-GRADIENT = quick(jax.value_and_grad(loss))
+BATCH = 3
+GRADIENT = quick(jax.vmap(jax.value_and_grad(loss), in_axes=(0, None, None)))
 RUN = quick(filtering.run_filter, static_argnums=5)
+
+
+def gradients(points, felt=WHOLE, carried=None):
+    """Values and gradients at all of the points, from one program for batches."""
+    carried = Carried(False, start()) if carried is None else carried
+    found = []
+    for first in range(0, len(points), BATCH):
+        some = points[first : first + BATCH]
+        some = some + [some[-1]] * (BATCH - len(some))
+        stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *some)
+        found.append(jax.device_get(GRADIENT(stacked, felt, carried)))
+    return jax.tree.map(lambda *parts: np.concatenate(parts)[: len(points)], *found)
+
+
+def differences(x, name, step, row=...):
+    """Central ones of the loss in every entry of x[name][row]."""
+    shape, points = x[name][row].shape, []
+    for change in step * np.eye(int(np.prod(shape))):
+        for sign in (1, -1):
+            moved = x[name].copy()
+            moved[row] += sign * change.reshape(shape)
+            points.append({**x, name: moved})
+    ahead, behind = gradients(points)[0].reshape(-1, 2).T
+    return ((ahead - behind) / (2 * step)).reshape(shape)
 
 
 def test_gradient_against_differences():
     """Over a run with missing rows, with respect to everything but the network."""
     measured = MEASURED.copy()
     measured[[7, 8]] = np.nan
-    found = GRADIENT(point(measured))[1]
+    x = point(measured)
+    _, found = gradients([x])
     for name in ("noise", "std", "state"):
-        expected = central(
-            lambda value, name=name: float(GRADIENT({**point(measured), name: value})[0]),
-            point()[name],
-            1e-4,
-        )
+        expected = differences(x, name, 1e-4)
         np.testing.assert_allclose(
-            found[name], expected, rtol=1e-5, atol=1e-6 * np.abs(expected).max(), err_msg=name
+            found[name][0], expected, rtol=1e-5, atol=1e-6 * np.abs(expected).max(), err_msg=name
         )
         assert (np.abs(expected) > 0).all()
     for name, k in (
@@ -101,14 +149,8 @@ def test_gradient_against_differences():
         ("accel", 3),
         ("accel", -1),
     ):
-
-        def at(value, name=name, k=k):
-            rows = point(measured)[name].copy()
-            rows[k] = value
-            return float(GRADIENT({**point(measured), name: rows})[0])
-
         np.testing.assert_allclose(
-            found[name][k], central(at, point(measured)[name][k], 1e-5), rtol=1e-5, atol=1e-8
+            found[name][0][k], differences(x, name, 1e-5, k), rtol=1e-5, atol=1e-8
         )
 
 
@@ -126,7 +168,7 @@ def test_jvp_against_differences_and_vmap_of_grad_against_jvp():
     )
 
     points = [point(), point(MEASURED + 0.02), point(-MEASURED)]
-    many = quick(jax.vmap(jax.grad(loss)))(jax.tree.map(lambda *leaves: np.stack(leaves), *points))
+    _, many = gradients(points)
     for index, one in enumerate(points):
         inner = sum(
             np.sum(g[index] * d)
@@ -135,33 +177,40 @@ def test_jvp_against_differences_and_vmap_of_grad_against_jvp():
         np.testing.assert_allclose(inner, along(one, direction)[1], rtol=1e-8)
 
 
-@pytest.mark.parametrize("every", [0, 4, 5, 13, 50])
-def test_checkpoints_change_nothing(every):
-    """Of any scan, whole blocks or not; the filter's own is differentiated through checkpoints with
-    the network below."""
+def scanned(scan, start, inputs):
+    """A scalar of a scan's carry and of all that it returns."""
 
     def step(carry, x):
         carry = jnp.tanh(carry @ (jnp.eye(2) + x["turn"])) + x["push"]
         return carry, {"square": carry**2, "first": carry[0]}
 
-    def value(scan, start, inputs):
-        carry, out = scan(step, start, inputs)
-        return (
-            jnp.sum(carry)
-            + jnp.sum(jnp.arange(1.0, 14)[:, None] * out["square"])
-            + jnp.sum(out["first"])
-        )
+    carry, out = scan(step, start, inputs)
+    return (
+        jnp.sum(carry)
+        + jnp.sum(jnp.arange(1.0, 14)[:, None] * out["square"])
+        + jnp.sum(out["first"])
+    )
 
+
+@functools.cache
+def of_a_plain_scan():
+    """The arguments of `scanned`, its value and its gradients."""
     rng = np.random.default_rng(2)
     arguments = (
         jnp.array([0.3, -0.2]),
         {"turn": 0.3 * rng.standard_normal((13, 2, 2)), "push": 0.3 * rng.standard_normal((13, 2))},
     )
-    ours = functools.partial(value, functools.partial(checkpointed_scan, every=every))
-    found, wanted = (
-        quick(jax.value_and_grad(function, (0, 1)))(*arguments)
-        for function in (ours, functools.partial(value, jax.lax.scan))
-    )
+    plain = functools.partial(scanned, jax.lax.scan)
+    return arguments, quick(jax.value_and_grad(plain, (0, 1)))(*arguments)
+
+
+@pytest.mark.parametrize("every", [0, 4, 5, 13, 50])
+def test_checkpoints_change_nothing(every):
+    """Of any scan, whole blocks or not; the filter's own is differentiated through checkpoints with
+    the network below."""
+    arguments, wanted = of_a_plain_scan()
+    ours = functools.partial(scanned, functools.partial(checkpointed_scan, every=every))
+    found = quick(jax.value_and_grad(ours, (0, 1)))(*arguments)
     jax.tree.map(
         lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12), found, wanted
     )
@@ -237,6 +286,14 @@ def test_gradients_are_finite_for_hostile_input():
             assert np.abs(leaf).max() > 0, (kind, name)
 
 
+def behind_a_gate(softness, measured, noise):
+    config = filtering.FilterConfig(
+        DT, N, CLONES, convergence_seconds=0.1, gate_softness=softness, gate_threshold=8.0
+    )
+    spread = np.tile(0.01 * np.eye(3), (INTERVALS, 1, 1))
+    return RUN(start(config), *recording(2), measured, spread, config, noise)[1]
+
+
 def test_a_gate_with_a_slope_lets_the_gradient_through():
     measured = MEASURED.copy()
     measured[14, 0] += 1.2
@@ -252,15 +309,8 @@ def test_a_gate_with_a_slope_lets_the_gradient_through():
     )
     assert abs(slope) > 0  # behind the hard gate it would be zero where the row is rejected
 
-    def history(softness):
-        config = filtering.FilterConfig(
-            DT, N, CLONES, convergence_seconds=0.1, gate_softness=softness, gate_threshold=8.0
-        )
-        spread = np.tile(0.01 * np.eye(3), (INTERVALS, 1, 1))
-        noise = filtering.NoiseModel(1e-2, 1e-1, 1e-2, 1e-1)
-        return RUN(start(config), *recording(2), measured, spread, config, noise)[1]
-
-    hard, soft = history(0.0), history(2.0)
+    noise = filtering.NoiseModel(1e-2, 1e-1, 1e-2, 1e-1)
+    hard, soft = (behind_a_gate(softness, measured, noise) for softness in (0.0, 2.0))
     weights, nis = np.asarray(soft.gate_passed), np.asarray(soft.nis)
     watched = np.asarray(soft.gate_passed) < 1
     np.testing.assert_allclose(
@@ -279,30 +329,20 @@ def test_softness_has_a_limit():
     measured[14, 0] += 2.5
 
     def positions(softness):
-        config = filtering.FilterConfig(
-            DT, N, CLONES, convergence_seconds=0.1, gate_softness=softness
-        )
-        spread = np.tile(0.01 * np.eye(3), (INTERVALS, 1, 1))
-        return np.asarray(
-            RUN(start(config), *recording(2), measured, spread, config, filtering.NoiseModel())[
-                1
-            ].position
-        )
+        return np.asarray(behind_a_gate(softness, measured, filtering.NoiseModel()).position)
 
     np.testing.assert_allclose(positions(1e-3), positions(0.0), atol=1e-4)
-    assert np.abs(positions(3.0) - positions(0.0)).max() > 1e-3
+    assert np.abs(positions(2.0) - positions(0.0)).max() > 1e-3
 
 
 def test_gradient_reaches_the_network():
     """Of its own parameters to 1e-5; through the windows, which are cut with the state, as far as
-    differences can say, since the window is rounded to float32. One program for both: `share` is
-    that of what the network makes of its window."""
+    differences can say, since the window is rounded to float32. `share` is that of what the network
+    makes of its window."""
     gyro, accel = recording(0)
     config = filtering.FilterConfig(DT, N, CLONES, checkpoint_every=INTERVALS // 2)
     assert INTERVALS % 2 == 0  # no step is left over, which would be compiled once more
 
-    @quick
-    @jax.value_and_grad
     def value(parameters, share):
         def network(windows):
             ramp = jnp.linspace(0.5, 1.5, N * CLONES)[None, :, None]
@@ -315,17 +355,13 @@ def test_gradient_reaches_the_network():
         )
         return of_history(history)
 
-    expected = central(lambda p: float(value(jnp.asarray(p), 0.0)[0]), PARAMETERS, 1e-4)
-    np.testing.assert_allclose(
-        value(jnp.asarray(PARAMETERS), 0.0)[1], expected, rtol=1e-5, atol=1e-7
-    )
-    coarse, fine = (
-        central(lambda p: float(value(jnp.asarray(p), 1.0)[0]), PARAMETERS, step)
-        for step in (1e-2, 5e-3)
-    )
+    of, gradient = quick(value), quick(jax.grad(value))
+    expected = central(lambda p: float(of(p, 0.0)), PARAMETERS, 1e-4)
+    np.testing.assert_allclose(gradient(PARAMETERS, 0.0), expected, rtol=1e-5, atol=1e-7)
+    coarse, fine = (central(lambda p: float(of(p, 1.0)), PARAMETERS, step) for step in (1e-2, 5e-3))
     expected = (4 * fine - coarse) / 3
     np.testing.assert_allclose(
-        value(jnp.asarray(PARAMETERS), 1.0)[1],
+        gradient(PARAMETERS, 1.0),
         expected,
         rtol=2e-3,
         atol=2e-3 * np.abs(expected).max(),
@@ -334,28 +370,42 @@ def test_gradient_reaches_the_network():
 
 def test_a_truncated_gradient_is_that_of_two_runs():
     """Values are those of one run; the second half starts from a state that counts as given."""
-    half, gyro, accel = INTERVALS // 2, *recording(2)
-    spread = jnp.tile(0.01 * jnp.eye(3)[None], (INTERVALS, 1, 1))
-    truncated = filtering.FilterConfig(DT, N, CLONES, truncate_every=half)
+    half, x = INTERVALS // 2, point()
+    truncated = functools.partial(
+        loss, config=filtering.FilterConfig(DT, N, CLONES, truncate_every=half)
+    )
+    value, gradient = quick(jax.value_and_grad(truncated))(x)
 
-    def runs(x, config, parts):
-        noise = filtering.NoiseModel(*(jnp.array([1e-2, 1e-1, 1e-2, 1e-1]) * jnp.exp(x["noise"])))
-        state, histories = start(config), []
-        state = state._replace(velocity=state.velocity + x["velocity"])
-        for first, last in parts:
-            rows, samples = slice(first, last), slice(N * first, N * last)
-            given = gyro[samples], accel[samples], MEASURED[rows], spread[rows]
-            state, history = filtering.run_filter(state, *given, config, noise)
-            state = jax.lax.stop_gradient(state)
-            histories.append(history)
-        return of_history(jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *histories))
+    # Runs of full length, of which the first half alone is felt.
+    rows, samples = slice(half), slice(half * N)
+    first = 1.0 * (np.arange(INTERVALS) < half)
+    felt = Felt(WEIGHTS * first[:, None], first, np.zeros(INTERVALS))
+    one, of_one = gradients([x], felt)
+    noise, spread = filtering.NoiseModel(1e-2, 1e-1, 1e-2, 1e-1), 0.01 * np.eye(3)
+    state, _ = filtering.run_filter(
+        start(),
+        x["gyro"][samples],
+        x["accel"][samples],
+        MEASURED[rows],
+        np.tile(spread, (half, 1, 1)),
+        PLAIN,
+        noise,
+    )
+    turned = {name: np.roll(x[name], -half * N, axis=0) for name in ("gyro", "accel")}
+    later = x | turned | {"measured": np.roll(MEASURED, -half, axis=0)}
+    end = np.eye(INTERVALS)[half - 1]
+    felt = Felt(np.roll(WEIGHTS, -half, axis=0) * first[:, None], first, end)
+    other, of_other = gradients([later], felt, Carried(True, state))
 
-    of_runs = quick(jax.value_and_grad(runs), static_argnums=(1, 2))
-    x = dict(noise=np.zeros(4), velocity=np.zeros(3))
-    value, gradient = of_runs(x, truncated, ((0, INTERVALS),))
-    expected, wanted = of_runs(x, PLAIN, ((0, half), (half, INTERVALS)))
-    np.testing.assert_allclose(value, expected, rtol=1e-12)
+    np.testing.assert_allclose(value, one[0] + other[0], rtol=1e-12)
+    wanted = {"noise": of_one["noise"][0] + of_other["noise"][0]}
+    wanted |= {name: of_one[name][0] for name in ("std", "state")}
+    for name, part in (("measured", rows), ("gyro", samples), ("accel", samples)):
+        wanted[name] = np.concatenate([of_one[name][0][part], of_other[name][0][part]])
     for name in x:
-        np.testing.assert_allclose(gradient[name], wanted[name], rtol=1e-9, err_msg=name)
-    whole = GRADIENT(point())[1]
-    assert np.abs(whole["noise"] / gradient["noise"] - 1).max() > 0.01
+        size = np.abs(wanted[name]).max()
+        np.testing.assert_allclose(
+            gradient[name], wanted[name], rtol=1e-9, atol=1e-12 * size, err_msg=name
+        )
+    _, whole = gradients([x])
+    assert np.abs(whole["noise"][0] / gradient["noise"] - 1).max() > 0.01

@@ -151,16 +151,15 @@ def test_the_filter_coasts_where_nothing_is_known():
     """No turn, no change of velocity: constant velocity for the whole gap, whatever the attitude is
     believed to be."""
     (R, v, p), gyro, accel, _, c = WALK
-    valid = np.zeros(N * 6, bool)
-    _, history = filtering.run_filter(
-        start(), gyro[: N * 6], accel[: N * 6], np.full((6, 3), np.nan), c[:6], CONFIG, NOISE, valid
-    )
+    valid, missing = np.zeros(N * INTERVALS, bool), np.full((INTERVALS, 3), np.nan)
+    _, history = filtering.run_filter(start(), gyro, accel, missing, c, CONFIG, NOISE, valid)
+    history = jax.tree.map(lambda leaf: np.asarray(leaf)[:6], history)
     np.testing.assert_allclose(history.velocity, np.tile(v, (6, 1)), atol=1e-12)
     np.testing.assert_allclose(history.rotation, np.tile(R, (6, 1, 1)), atol=1e-12)
     np.testing.assert_allclose(history.position[-1], p + v * 6 * N * DT, atol=1e-12)
     # Nothing was there to hold, so every sample has the variance of one just beyond the limit: e_4
     # = 1, Σ e = 3, of which 3² − 2² is its.
-    growth = np.asarray(history.covariance_diagonal)[-1, 0] - np.radians(1.0) ** 2
+    growth = history.covariance_diagonal[-1, 0] - np.radians(1.0) ** 2
     np.testing.assert_allclose(
         growth,
         30 * DT**2 * ((3**2 - 2**2) * CONFIG.gap_gyro_std**2 + NOISE.gyro_density**2 / DT),
@@ -170,10 +169,11 @@ def test_the_filter_coasts_where_nothing_is_known():
 
 def test_a_gap_across_two_runs_is_one_gap():
     valid = np.ones(N * INTERVALS, bool)
-    valid[96:108] = False
+    half = INTERVALS // 2
+    valid[N * half - 4 : N * half + 8] = False
     _, together = run(valid=valid)
-    state, first = run(valid=valid, rows=slice(0, 20))
-    _, second = run(valid=valid, rows=slice(20, INTERVALS), state=state)
+    state, first = run(valid=valid, rows=slice(0, half))
+    _, second = run(valid=valid, rows=slice(half, INTERVALS), state=state)
     for name in ("position", "velocity", "covariance_diagonal", "imu_gap"):
         both = np.concatenate([getattr(first, name), getattr(second, name)])
         np.testing.assert_allclose(
@@ -328,24 +328,33 @@ def test_rest_takes_first_estimates_anew_where_it_corrects_much(gate, speed, ane
     jax.tree.map(np.testing.assert_array_equal, new.first, wanted)
 
 
+RESTING = filtering.FilterConfig(
+    DT,
+    N,
+    CLONES,
+    measurement_scale=1.0,
+    zero_velocity_std=0.02,
+    rest_seconds=0.3,
+    convergence_seconds=1.0,
+)
+
+
 def test_rest_without_displacements_corrects_a_wrong_velocity():
-    """Displacements until interval 38 and then none; a false knock of 4 m/s; then 36 s at rest."""
-    config = filtering.FilterConfig(
-        DT,
-        N,
-        CLONES,
-        measurement_scale=1.0,
-        zero_velocity_std=0.02,
-        rest_seconds=0.3,
-        convergence_seconds=1.0,
-    )
-    intervals, last, knock = 400, 38, 39 * N
+    """Displacements until interval 38 and then none; a false knock of 4 m/s; then 38 s at rest. In
+    pieces, for the program of the next test."""
+    intervals, last, knock = 7 * INTERVALS, 38, 39 * N
     gyro, accel = np.zeros((N * intervals, 3)), np.tile([0, 0, 9.81], (N * intervals, 1))
     accel[knock, 0] += 4.0 / DT
     displacement = np.where(np.arange(intervals)[:, None] <= last, np.zeros(3), np.nan)
-    spread = np.tile(0.02**2 * np.eye(3), (intervals, 1, 1))
-    state = filtering.initial_state(config, np.eye(3), np.zeros(3), np.zeros(3))
-    final, history = filtering.run_filter(state, gyro, accel, displacement, spread, config, NOISE)
+    spread = np.tile(0.02**2 * np.eye(3), (INTERVALS, 1, 1))
+    final, parts = filtering.initial_state(RESTING, np.eye(3), np.zeros(3), np.zeros(3)), []
+    for first in range(0, intervals, INTERVALS):
+        rows = slice(first, first + INTERVALS)
+        samples = slice(N * first, N * (first + INTERVALS))
+        given = final, gyro[samples], accel[samples], displacement[rows], spread
+        final, history = filtering.run_filter(*given, RESTING, NOISE)
+        parts.append(history)
+    history = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
     assert bool(final.gate.converged) and int(final.gate.pause_end) <= 0  # it never became stale
     np.testing.assert_allclose(np.asarray(history.velocity)[39:41, 0], 4.0, atol=0.05)
     assert history.rest_nis[42] > 100 and (np.asarray(history.at_rest)[42:] == 1).all()
@@ -357,15 +366,6 @@ def test_rest_without_displacements_corrects_a_wrong_velocity():
 def test_a_quiet_ride_is_no_rest_and_a_wrong_start_is_corrected_by_rest():
     """A carriage that glides at 1 m/s, as the filter knows by displacements; and a device at rest
     that starts with 3 m/s, so sure of it that it would not pass the test."""
-    config = filtering.FilterConfig(
-        DT,
-        N,
-        CLONES,
-        measurement_scale=1.0,
-        zero_velocity_std=0.02,
-        rest_seconds=0.3,
-        convergence_seconds=1.0,
-    )
     gliding, samples = 30, N * INTERVALS
     gyro, accel = np.zeros((samples, 3)), np.tile([0, 0, 9.81], (samples, 1))
     accel[: N * gliding : 2, 2] += 1.0  # rattles before
@@ -374,13 +374,13 @@ def test_a_quiet_ride_is_no_rest_and_a_wrong_start_is_corrected_by_rest():
 
     def go(speed, accel, displacement):
         state = filtering.initial_state(
-            config,
+            RESTING,
             np.eye(3),
             np.array([speed, 0.0, 0.0]),
             np.zeros(3),
             std=filtering.InitialStd(velocity=0.05),
         )
-        return filtering.run_filter(state, gyro, accel, displacement, spread, config, NOISE)[1]
+        return filtering.run_filter(state, gyro, accel, displacement, spread, RESTING, NOISE)[1]
 
     history = go(1.0, accel, np.tile([CLONES * N * DT, 0.0, 0.0], (INTERVALS, 1)))
     quiet = np.arange(INTERVALS) >= gliding + 2

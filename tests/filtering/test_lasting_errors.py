@@ -154,20 +154,24 @@ def simulated():
 
 
 @functools.cache
-def estimated(modelled):
+def batched():
+    """(noise, start and signals of each run) -> their histories."""
     config = filtering.FilterConfig(
         0.01, 10, 10, measurement_scale=1.0, gate_threshold=1e9, history="core"
     )
-    noise = MODEL if modelled else MODEL._replace(displacement=None)
-    runs, spread = simulated(), np.tile(SIGMA**2 * np.eye(3), (LONG, 1, 1))
+    spread = np.tile(SIGMA**2 * np.eye(3), (LONG, 1, 1))
 
-    @optimised
-    @jax.vmap
-    def run(rotation, velocity, position, *signals):
+    def run(noise, rotation, velocity, position, *signals):
         state = filtering.initial_state(config, rotation, velocity, position, std=STD)
         return filtering.run_filter(state, *signals, spread, config, noise)[1]
 
-    history = run(*runs[:6])
+    return optimised(jax.vmap(run, in_axes=(None, *6 * [0])))
+
+
+@functools.cache
+def estimated(errors_=LASTING_WALK):
+    runs = simulated()
+    history = batched()(MODEL._replace(displacement=errors_), *runs[:6])
     error, covariance = errors(runs, history), np.asarray(history.covariance)
     return error[:, 100:], covariance[:, 100:], np.asarray(history.nis)[:, 100:]
 
@@ -178,17 +182,20 @@ def normalised(error, covariance):
 
 
 def test_the_filter_is_as_certain_as_it_may_be():
-    error, covariance, nis = estimated(True)
+    error, covariance, nis = estimated()
     assert 0.9 < nis.mean() / 3 < 1.1
     for part in (slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12), slice(12, 15)):
         assert 0.7 < normalised(error[..., part], covariance[..., part, part]) < 1.4, part
 
 
 def test_taken_for_white_they_make_it_too_certain():
-    error, covariance, _ = estimated(False)
+    """Without any size they change nothing, as above: one program for both filters."""
+    error, covariance, _ = estimated(
+        LASTING_WALK._replace(window_share=0.0, scale_std=0.0, heading_std=0.0)
+    )
     position = slice(6, 9)
     assert normalised(error[..., position], covariance[..., position, position]) > 4
-    with_them, _, _ = estimated(True)
+    with_them, _, _ = estimated()
     squares = [np.mean(e[:, -1, position] ** 2) for e in (with_them, error)]
     assert squares[0] < squares[1]
 
@@ -212,7 +219,7 @@ def test_the_smoother_is_consistent_with_them():
         found = normalised(error[:, middle, part], covariance[:, middle, part, part])
         assert 0.7 < found < 1.4, part
     # at the end both are the same
-    filtered, of_filter, _ = estimated(True)
+    filtered, of_filter, _ = estimated()
     np.testing.assert_allclose(error[:, -1, :9], filtered[:, -1, :9], atol=1e-8)
     np.testing.assert_allclose(covariance[:, -1], of_filter[:, -1], rtol=1e-6, atol=1e-12)
 
@@ -243,29 +250,38 @@ def test_the_tracker_has_them_too(tmp_path):
         filtering.Tracker.restore(tmp_path / "tracker.npz", predict, CONFIG, other)
 
 
-def test_their_derivatives_are_those_of_differences_and_finite_at_zero():
-    start, gyro, accel, displacement, spread = walk()
-    displacement = displacement.copy()
-    displacement[~np.isfinite(displacement).all(1)] = np.nan
+def evidence(errors=ERRORS, factor=(1.0, 1.0, 1.0), spread=None):
+    """The log likelihood of the walk, from the program of `filtered`."""
+    start, *signals, told = walk()
+    state, noise = filtering.initial_state(CONFIG, *start), NOISE._replace(displacement=errors)
+    given = state, *signals, told if spread is None else spread
+    _, history = program(CONFIG)(*given, noise=noise._replace(std_factor=tuple(factor)))
+    return np.nansum(history.log_likelihood)
 
-    def evidence(errors):
-        noise = NOISE._replace(displacement=errors)
+
+@functools.cache
+def gradient():
+    """(errors, factors of the axes) -> derivatives of the log likelihood by both."""
+    start, *signals = walk()
+
+    def of(errors, factor):
+        noise = NOISE._replace(displacement=errors, std_factor=tuple(factor))
         state = filtering.initial_state(CONFIG, *start)
-        given = (state, gyro, accel, displacement, spread)
-        _, history = filtering.run_filter(*given, CONFIG, noise)
+        _, history = filtering.run_filter(state, *signals, CONFIG, noise)
         return jnp.nansum(history.log_likelihood)
 
-    value_of, gradient = quick(evidence), quick(jax.grad(evidence))
+    return quick(jax.grad(of, (0, 1)))
+
+
+def test_their_derivatives_are_those_of_differences_and_finite_at_zero():
     for errors_ in (ERRORS, ERRORS._replace(window_share=0.0, scale_std=0.0, heading_std=0.0)):
-        at = LastingErrors(*(jnp.float64(value) for value in errors_))
-        found = gradient(at)
+        found, _ = gradient()(errors_, np.ones(3))
         assert all(np.isfinite(np.asarray(found)))
         for name in ("window_share", "scale_std"):
             step = 1e-5
             value = getattr(errors_, name)
             ahead, behind = (
-                float(value_of(at._replace(**{name: jnp.float64(value + change)})))
-                for change in (step, -step)
+                evidence(errors_._replace(**{name: value + change})) for change in (step, -step)
             )
             np.testing.assert_allclose(
                 getattr(found, name), (ahead - behind) / (2 * step), rtol=1e-4, atol=1e-4
@@ -274,23 +290,17 @@ def test_their_derivatives_are_those_of_differences_and_finite_at_zero():
 
 def test_the_factor_of_each_axis_scales_the_covariance():
     """Its derivative is finite where there is no measurement, too."""
-    start, gyro, accel, displacement, spread = walk()
-    state = filtering.initial_state(CONFIG, *start)
+    *_, spread = walk()
     factor = np.array([1.5, 0.7, 2.0])
     scaled = spread * factor[:, None] * factor
-
-    def log_likelihood(factor, spread):
-        noise = NOISE._replace(std_factor=tuple(factor))
-        given = (state, gyro, accel, displacement, spread)
-        return jnp.nansum(filtering.run_filter(*given, CONFIG, noise)[1].log_likelihood)
-
-    evidence = quick(log_likelihood)
-    np.testing.assert_allclose(evidence(factor, spread), evidence(np.ones(3), scaled), rtol=1e-12)
-    gradient = quick(jax.grad(log_likelihood))(jnp.asarray(factor), spread)
+    np.testing.assert_allclose(
+        evidence(factor=factor.tolist()), evidence(spread=scaled), rtol=1e-12
+    )
+    _, found = gradient()(ERRORS, factor)
     step = 1e-6 * np.eye(3)[1]
-    difference = (evidence(factor + step, spread) - evidence(factor - step, spread)) / 2e-6
-    np.testing.assert_allclose(gradient[1], difference, rtol=1e-5)
-    assert np.isfinite(gradient).all()
+    ahead, behind = (evidence(factor=(factor + sign * step).tolist()) for sign in (1, -1))
+    np.testing.assert_allclose(found[1], (ahead - behind) / 2e-6, rtol=1e-5)
+    assert np.isfinite(found).all()
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 against central differences."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -26,16 +27,31 @@ from tests.support.odometry import (
 NOISE = filtering.NoiseModel()
 
 
-def predict(windows, parameters=PARAMETERS):
-    """A network of one layer, whose output depends on the order of samples and channels."""
+BASE, SLOPE = np.full(3, -2.0, np.float32), np.float32(0.1)
+
+
+def predict(windows, base=BASE, slope=SLOPE):
+    """A network of one layer, whose output depends on the order of samples and channels. `base` and
+    `slope` make its log standard deviation."""
     assert windows.shape[::2] == (1, 6) and windows.dtype == jnp.float32
     ramp = jnp.linspace(0.5, 1.5, windows.shape[1], dtype=jnp.float32)[None, :, None]
-    pooled = jnp.mean(ramp * windows, axis=1) @ jnp.asarray(parameters, jnp.float32)
+    pooled = jnp.mean(ramp * windows, axis=1) @ jnp.asarray(PARAMETERS, jnp.float32)
     return Prediction(
         pooled,
-        -2.0 + 0.1 * pooled,
+        base[None] + slope * pooled,
         {"gate": jnp.tanh(pooled), "attention": jnp.ones((1, 2, 3), jnp.float32)},
     )
+
+
+@functools.cache
+def program(config):
+    """(state, gyro, accel, base, slope) -> final state and history, with the network above."""
+
+    def run(state, gyro, accel, base, slope):
+        network = functools.partial(predict, base=base, slope=slope)
+        return filtering.run_odometry(network, state, gyro, accel, config, NOISE)
+
+    return jax.jit(run)
 
 
 def test_a_repeated_run_is_the_one_with_the_other_noise():
@@ -99,11 +115,7 @@ def test_windows_are_cut_with_the_state_of_the_filter(window_rotation, context, 
         return predict_numpy(np.array(rows))
 
     state = start(config)
-    _, history = jax.jit(
-        lambda state: filtering.run_odometry(
-            predict, state, gyro, accel, config, filtering.NoiseModel()
-        )
-    )(state)
+    _, history = program(config)(state, gyro, accel, BASE, SLOPE)
     wanted = scekf_numpy.run_from(
         state,
         filtering.NoiseModel(),
@@ -161,14 +173,8 @@ def test_given_its_own_measurements_the_filter_repeats_itself():
 def test_log_std_is_raised_to_its_floor():
     gyro, accel = recording(1)
 
-    def sure(windows):
-        return Prediction(
-            jnp.zeros((1, 3), jnp.float32), jnp.asarray([[-9.0, -4.5, 1.0]], jnp.float32)
-        )
-
-    _, history = jax.jit(
-        lambda s: filtering.run_odometry(sure, s, gyro, accel, CONFIG, filtering.NoiseModel())
-    )(start())
+    sure = np.array([-9.0, -4.5, 1.0], np.float32), np.float32(0.0)
+    _, history = program(CONFIG)(start(), gyro, accel, *sure)
     np.testing.assert_allclose(
         history.measurement_std[-1], np.sqrt(2.0) * np.exp([-4.0, -4.0, 1.0]), rtol=1e-12
     )
@@ -182,19 +188,18 @@ def test_vmap_keeps_the_branch_and_equals_single():
         jax.debug.callback(lambda: calls.append(1))
         return predict(windows)
 
-    def run(network, gyro, accel):
-        return filtering.run_odometry(network, start(), gyro, accel, CONFIG, filtering.NoiseModel())
+    def run(gyro, accel):
+        return filtering.run_odometry(counting, start(), gyro, accel, CONFIG, NOISE)
 
-    many = jax.jit(jax.vmap(lambda *given: run(counting, *given)))(*signals)
+    many = jax.jit(jax.vmap(run))(*signals)
     jax.effects_barrier()
     assert len(calls) in (
         INTERVALS - CLONES,
         2 * (INTERVALS - CLONES),
     )  # once a step (or once a sequence), never before there is a window
     many = jax.device_get(many)  # indexed in JAX, every leaf would be two programs
-    alone = jax.jit(lambda *given: run(predict, *given))
     for index in range(2):
-        one = alone(*[signal[index] for signal in signals])
+        one = program(CONFIG)(start(), *(signal[index] for signal in signals), BASE, SLOPE)
         jax.tree.map(
             lambda a, b, index=index: np.testing.assert_allclose(a[index], b, atol=3e-6), many, one
         )

@@ -20,7 +20,8 @@ TLIO_STD = dict(
 
 
 def skew(v):
-    return np.cross(np.eye(3), v)
+    x, y, z = v
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
 def right_jacobian(phi, terms=30):
