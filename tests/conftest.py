@@ -4,6 +4,7 @@ Compiling is most of what the tests do, and what they compile runs once on small
 compiler optimises nothing, here and in the processes that tests start.
 """
 
+import atexit
 import gc
 import os
 from importlib.metadata import version
@@ -16,8 +17,23 @@ from jaxtyping import install_import_hook
 
 import tests.support.type_checks  # noqa: F401  (found by its name, below)
 
+# Passes of XLA that only make programs faster, and take a tenth of the time to compile a filter.
+PASSES = (
+    "conditional-canonicalizer",
+    "reshape-mover",
+    "simplify-conditional",
+    "simplify-while-loops",
+    "tree_reduction_rewriter",
+    "while-loop-constant-sinking",
+    "while-loop-invariant-code-motion",
+    "zero_sized_hlo_elimination",
+)
 # Each worker has one core: a module in many parts, to be compiled at once, is only more work.
-COMPILER = ["--xla_backend_optimization_level=0", "--xla_cpu_parallel_codegen_split_count=1"]
+COMPILER = [
+    "--xla_backend_optimization_level=0",
+    "--xla_cpu_parallel_codegen_split_count=1",
+    "--xla_disable_hlo_passes=" + ",".join(PASSES),
+]
 if version("jax").startswith("0.10."):  # removed later, and XLA stops at a flag it does not know
     # Fusions as LLVM's loops instead of MLIR's: a third of the time to compile a filter.
     COMPILER.append("--xla_cpu_use_fusion_emitters=false")
@@ -28,6 +44,8 @@ os.environ.setdefault("JAX_PLATFORMS", "cpu")
 # The workers and the processes that tests start share what they compile through the cache, small
 # programs too.
 os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
+# Instructions do not carry the lines of Python that they come from: nobody reads them here.
+os.environ["JAX_TRACEBACK_IN_LOCATIONS_LIMIT"] = "0"
 
 # Every annotated shape and type is checked, in the tests alone.
 install_import_hook("gnio_jax", "tests.support.type_checks.when_called")
@@ -47,21 +65,30 @@ gc.set_threshold(100_000, 50, 100)
 LONGEST = (
     "training/test_statistics.py",
     "scaling/test_processes.py",
-    "data/readers/test_oxiod.py",
-    "training/test_loop.py",
-    "training/test_through_filter.py",
-    "filtering/test_consistency.py",
-    "filtering/test_derivatives.py",
-    "filtering/test_lasting_errors.py",
-    "filtering/test_smoother.py",
-    "calibration/test_likelihood.py",
-    "calibration/test_calibrate.py",
-    "models/test_gnio.py",
     "test_installed.py",
-    "filtering/test_intake.py",
-    "filtering/test_precision.py",
     "tables/test_tables.py",
+    "training/test_through_filter.py",
+    "calibration/test_calibrate.py",
+    "data/readers/test_oxiod.py",
+    "calibration/test_likelihood.py",
+    "filtering/test_considered.py",
+    "filtering/test_lasting_errors.py",
+    "filtering/test_derivatives.py",
+    "filtering/test_consistency.py",
+    "training/test_loop.py",
+    "evaluation/test_estimation.py",
+    "filtering/test_smoother.py",
+    "test_docs.py",
+    "training/test_supply.py",
+    "data/test_fuzz.py",
+    "models/test_gnio.py",
 )
+
+
+def pytest_configure(config):
+    """A worker ends at once: JAX would take seconds to free what its process holds."""
+    if hasattr(config, "workerinput"):
+        atexit.register(os._exit, 0)
 
 
 def pytest_collection_modifyitems(items):
