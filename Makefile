@@ -24,6 +24,9 @@ TEST_ENVIRONMENT := JAX_PLATFORMS=cpu JAX_COMPILATION_CACHE_DIR=$(CURDIR)/.jax_c
 # A file stays with one worker, or both would train what its tests share; the longest come first.
 SHARED_OUT := --dist loadfile --no-loadscope-reorder
 
+# No rules but these.
+MAKEFLAGS += --no-builtin-rules
+
 .PHONY: demo test lint docs links clean
 
 demo: $(VENV)/.package
@@ -32,15 +35,15 @@ demo: $(VENV)/.package
 	$(BIN)/gnio evaluate --workdir $(DEMO) --estimator imu_only
 	$(BIN)/gnio evaluate --workdir $(DEMO)
 
-test: $(VENV)/.$(EXTRAS)
+test: $(VENV)/.with-$(EXTRAS)
 	$(TEST_ENVIRONMENT) $(BIN)/python -m pytest -n $(JOBS) $(SHARED_OUT) $(PYTEST_ARGS)
 
-lint: $(VENV)/.test,dev
+lint: $(VENV)/.with-test,dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
-docs: $(VENV)/.docs
+docs: $(VENV)/.with-docs
 	PYTHONPATH=$(CURDIR) $(BIN)/mkdocs build --strict
 
 links: $(BIN)/python
@@ -57,12 +60,8 @@ $(VENV)/.package: $(BIN)/python pyproject.toml setup.py
 	$(PIP) -e .
 	touch $@
 
-# Of the packages' modules the tests import a third; Python compiles what it imports. To compile them
-# all takes half of the time to install them.
-$(VENV)/.test%: $(BIN)/python pyproject.toml setup.py
-	$(PIP) --no-compile -e '.[test$*]'
-	touch $@
-
-$(VENV)/.docs: $(BIN)/python pyproject.toml setup.py
-	$(PIP) -e '.[docs]'
+# The package with extras. Of the packages' modules the tests import a third; Python compiles what it
+# imports. To compile them all takes half of the time to install them.
+$(VENV)/.with-%: $(BIN)/python pyproject.toml setup.py
+	$(PIP) --no-compile -e '.[$*]'
 	touch $@

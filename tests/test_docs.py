@@ -2,7 +2,10 @@
 
 import ast
 import importlib
+import os
 import re
+import shutil
+import subprocess
 import tomllib
 
 import jax
@@ -184,6 +187,29 @@ def test_what_else_the_shell_is_told_is_there():
         for module in re.findall(r"^python -m ((?:gnio_jax|benchmarks)[\w.]*)", line):
             path = pages.ROOT / module.replace(".", "/")
             assert path.is_dir() or path.with_suffix(".py").is_file(), f"{page}: {module}"
+
+
+@pytest.mark.skipif(not shutil.which("make"), reason="no make here")
+@pytest.mark.parametrize(
+    ("words", "installed"),
+    [
+        ("test", ".[test]"),
+        ("test EXTRAS=test,reference", ".[test,reference]"),
+        ("lint", ".[test,dev]"),
+        ("docs", ".[docs]"),
+        ("demo", "."),
+    ],
+)
+def test_make_installs_what_it_needs(words, installed, tmp_path):
+    """Into an environment of its own, before anything else runs there."""
+    command = ["make", "--dry-run", f"VENV={tmp_path / 'none'}", *words.split()]
+    alone = {"PATH": os.environ["PATH"]}  # without what the make of these tests was told
+    said = subprocess.run(
+        command, cwd=pages.ROOT, env=alone, capture_output=True, text=True, check=True
+    )
+    steps = [line for line in said.stdout.splitlines() if "/none/bin/" in line]
+    assert re.search(r"-m pip install .*-e '?([^' ]+)'?$", steps[0])[1] == installed
+    assert len(steps) > 1
 
 
 def rooms_with_public_names():
