@@ -5,7 +5,7 @@ from __future__ import annotations
 import multiprocessing
 import signal
 from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from typing import TypeVar
 
@@ -57,7 +57,7 @@ def map_in_processes(
     )
     with pool:
         try:
-            futures = [pool.submit(function, *item) for item in items]
+            futures = _submitted(pool, function, items)
             for finished, _ in enumerate(as_completed(futures), 1):
                 done(finished / len(items))
             for future in futures:
@@ -68,3 +68,17 @@ def map_in_processes(
             ) from None
         finally:
             pool.shutdown(wait=False, cancel_futures=True)
+
+
+def _submitted(
+    pool: ProcessPoolExecutor, function: Callable[..., Result], items: list[tuple]
+) -> list[Future[Result]]:
+    """Every item's future. Raises `BrokenProcessPool`.
+
+    A process that dies while the next one is started closes the pipes between them, and Python
+    meets a closed pipe.
+    """
+    try:
+        return [pool.submit(function, *item) for item in items]
+    except OSError as error:
+        raise BrokenProcessPool(str(error)) from error

@@ -7,6 +7,7 @@ import multiprocessing
 import operator
 import os
 import warnings
+from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from pathlib import Path
 
@@ -209,6 +210,25 @@ def test_a_process_that_dies_is_told_in_one_line():
     # What is called needs no import of the package in a process.
     with pytest.raises(InputError, match="--workers: a process died, perhaps for want of memory"):
         list(map_in_processes(operator.call, items, 2))
+
+
+def test_a_process_that_dies_while_the_next_one_starts_is_told_too(monkeypatch):
+    submit, started = ProcessPoolExecutor.submit, []
+
+    def once(pool, *item):
+        if started:
+            raise OSError("handle is closed")
+        started.append(item)
+        return submit(pool, *item)
+
+    monkeypatch.setattr(ProcessPoolExecutor, "submit", once)
+    with pytest.raises(InputError, match="--workers: a process died"):
+        list(map_in_processes(pow, [(2, 2), (3, 2)], 2))
+
+
+def test_what_the_function_cannot_open_is_its_own_error(tmp_path):
+    with pytest.raises(FileNotFoundError, match="nowhere"):
+        list(map_in_processes(os.stat, [(tmp_path / "nowhere",), (tmp_path,)], 2))
 
 
 def die_in_a_child(name):
