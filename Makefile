@@ -60,8 +60,9 @@ $(VENV)/.package: $(BIN)/python pyproject.toml setup.py
 	$(PIP) -e .
 	touch $@
 
-# The package with extras. Of the packages' modules the tests import a third; Python compiles what it
-# imports. To compile them all takes half of the time to install them.
+# The package with extras. All cores compile the modules: pip would compile them by one, and without
+# either every worker and every process of the tests would.
 $(VENV)/.with-%: $(BIN)/python pyproject.toml setup.py
 	$(PIP) --no-compile -e '.[$*]'
+	-$(BIN)/python -m compileall -qq -j 0 $(VENV)/lib
 	touch $@

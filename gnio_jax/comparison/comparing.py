@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from gnio_jax.comparison import pairs, rows
+from gnio_jax.comparison.figures import COMPARED
 from gnio_jax.comparison.pairs import Difference
 from gnio_jax.comparison.rows import Recordings, Row
 from gnio_jax.config import CompareConfig
 from gnio_jax.errors import InputError
-from gnio_jax.evaluation.metrics import NAMES
 from gnio_jax.reporting import Lines, Reporter
 
 USUAL = ("ate", "rpe_1s", "yaw_rmse", "path_length_ratio", "nis", "nees")
@@ -22,8 +23,6 @@ BEST = {
     "accepted": 100.0,
 }
 """The best value of a metric whose best is not 0."""
-METRICS = (*NAMES, "accepted")
-"""All that can be compared."""
 SAME_LENGTH = 0.05
 """Two recordings of one name are the same where their durations differ by less than this share:
 estimates begin a window later or earlier."""
@@ -71,8 +70,8 @@ def compare(
     _check_different(config.rows, named)
     common = _common_recordings(named, config)
     found = [rows.read(word, named[word], config, reporter, workers) for word in config.rows]
-    for row in found[1:]:
-        _check_same_sequences(found[0], row)
+    _check_different_evaluations(found)
+    _check_same_sequences(found)
     labels = _labels(found)
     found = [row._replace(label=label) for row, label in zip(found, labels, strict=True)]
     cells = {metric: _cells(found, metric) for metric in _metrics(found, config.metrics)}
@@ -84,8 +83,8 @@ def _check_metrics(wanted: tuple[str, ...] | None) -> None:
     if wanted == ():
         raise InputError("--metrics", "names no metric", "leave it out for the usual ones")
     for word in wanted or ():
-        if word not in METRICS:
-            remedy = f"name RUNS before it; there are: {', '.join(METRICS)}"
+        if word not in COMPARED:
+            remedy = f"name RUNS before it; there are: {', '.join(COMPARED)}"
             raise InputError("--metrics", f"no metric '{word}'", remedy)
 
 
@@ -103,7 +102,7 @@ def _metrics(found: list[Row], wanted: tuple[str, ...] | None) -> list[str]:
     there = {metric for row in found for seed in row.seeds for metric in seed["mean"]}
     for metric in wanted or ():
         if metric not in there:
-            has = ", ".join(name for name in METRICS if name in there)
+            has = ", ".join(name for name in COMPARED if name in there)
             raise InputError("--metrics", f"no row has '{metric}'", f"there are: {has}")
     return list(wanted) if wanted else [metric for metric in USUAL if metric in there]
 
@@ -127,21 +126,33 @@ def _common_recordings(named: dict[str, list[Path]], config: CompareConfig) -> R
     return first
 
 
-def _check_same_sequences(first: Row, row: Row) -> None:
+def _check_different_evaluations(found: list[Row]) -> None:
+    """Raise `InputError` where an evaluation stands twice, in two rows or as two seeds of one."""
+    taken: set[Path] = set()
+    for folder in (folder for row in found for folder in row.folders):
+        if folder.resolve() in taken:
+            raise InputError(
+                str(folder), "is named twice, here as a seed or a link", "name it once"
+            )
+        taken.add(folder.resolve())
+
+
+def _check_same_sequences(found: list[Row]) -> None:
     """Raise `InputError` where sequences of one name are different recordings, or belong to
-    different people or sessions."""
-    known = {name: each for seed in first.seeds for name, each in seed["sequences"].items()}
-    for folder, seed in zip(row.folders, row.seeds, strict=True):
+    different people or sessions: the seeds of a row are compared too."""
+    known: dict[str, tuple[Path, Mapping[str, Any]]] = {}
+    evaluations = [each for row in found for each in zip(row.folders, row.seeds, strict=True)]
+    for folder, seed in evaluations:
         for name, own in seed["sequences"].items():
-            other = known.get(name, own)
-            remedy = f"evaluate it again, or the first row ({first.folders[0]})"
+            first, other = known.setdefault(name, (folder, own))
+            remedy = f"evaluate it again, or {first}"
             if own["group"] != other["group"]:
-                problem = f"is of {own['group']} here, of {other['group']} in the first row"
-                raise InputError(folder, f"sequence {name} {problem}", remedy)
+                problem = f"is of {own['group']} here, of {other['group']} in {first}"
+                raise InputError(str(folder), f"sequence {name} {problem}", remedy)
             lengths = [each.get("duration") or 0.0 for each in (own, other)]
             if abs(lengths[0] - lengths[1]) > SAME_LENGTH * max(lengths):
-                problem = f"takes {lengths[0]:.0f} s here, {lengths[1]:.0f} s in the first row"
-                raise InputError(folder, f"sequence {name} {problem}", remedy)
+                problem = f"takes {lengths[0]:.0f} s here, {lengths[1]:.0f} s in {first}"
+                raise InputError(str(folder), f"sequence {name} {problem}", remedy)
 
 
 def _labels(found: list[Row]) -> list[str]:

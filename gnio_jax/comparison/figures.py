@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import errno
 import json
 import math
 from dataclasses import asdict
@@ -13,9 +14,14 @@ from gnio_jax import evaluation
 from gnio_jax.config import EvaluateConfig, FilterOptions
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import report
+from gnio_jax.evaluation.metrics import NAMES
 from gnio_jax.evaluation.run import folder_name, run_config
 from gnio_jax.reporting import Reporter
 
+COMPARED = (*NAMES, "accepted")
+"""Metrics of a sequence that can be compared."""
+OPTIONAL_NAMES = ("estimator", "alignment", "checkpoint", "coupling", "orientation_source")
+"""Settings that are words where they are given."""
 Figures = dict[str, Any]
 """One metrics.json."""
 
@@ -50,7 +56,10 @@ def missing(workdir: Path, split: str, estimator: str) -> str | None:
     config, folder = how(workdir, split, estimator)
     found = _read(folder / "metrics.json")
     options = config.filter if estimator != "integrate" else None  # which takes no filter
-    problem = _out_of_date(workdir, found, options) if found else "there are no whole figures yet"
+    asked = {"dataset": run_config(workdir).dataset, "split": split, "alignment": "origin"}
+    problem = "there are no whole figures yet"
+    if found:
+        problem = _of_others(found, asked) or _out_of_date(workdir, found, options)
     best = workdir / "checkpoints" / config.checkpoint
     if problem and estimator != "imu_only" and not any(best.glob("[0-9]*")):
         raise InputError(best, "holds no checkpoint", "let gnio train finish its first epoch")
@@ -93,24 +102,51 @@ def of_evaluation(folder: Path) -> Evaluated:
 
 
 def _read(path: Path) -> Figures | None:
-    """metrics.json; None where it is not there or not whole."""
+    """metrics.json; None where it is not there or not as `report` writes it."""
     try:
         figures = json.loads(path.read_text(encoding="utf-8"))
-        # All that a comparison reads: what is not there raises.
-        needed = [figures["mean"]["diverged"], *map(dict, figures["sequences"].values())]
-        needed += [figures["settings"][name] for name in ("dataset", "split")]
-        if report.definitions(figures) == report.DEFINITIONS:
-            needed += [sequence["group"] for sequence in figures["sequences"].values()]
-        whole = all(map(_has_numbers, figures["sequences"].values()))
-    except (ValueError, KeyError, TypeError, AttributeError, FileNotFoundError, NotADirectoryError):
+        return figures if _is_whole(figures) else None
+    except (ValueError, LookupError, TypeError, AttributeError, OverflowError, RecursionError):
         return None
-    return figures if whole else None
+    except OSError as error:
+        if error.errno not in (errno.ENOENT, errno.ENOTDIR, errno.ELOOP):
+            raise
+        return None
 
 
-def _has_numbers(sequence: dict[str, Any]) -> bool:
-    """Whether the metrics of a sequence are finite numbers or null, as they are written."""
-    values = [value for name, value in sequence.items() if name not in ("group", "undefined")]
-    return all(value is None or math.isfinite(value) for value in values)
+def _is_whole(figures: Figures) -> bool:
+    """Whether all that a comparison reads is there, of its type; what is not there may raise."""
+    settings, sequences = figures["settings"], figures["sequences"]
+    names = ("dataset", "split", *(name for name in OPTIONAL_NAMES if settings.get(name)))
+    diverged = figures["mean"]["diverged"]
+    known = report.definitions(figures) != report.DEFINITIONS or all(
+        isinstance(sequence["group"], str) for sequence in sequences.values()
+    )
+    return (
+        all(isinstance(settings[name], str) for name in names)
+        and isinstance(settings.get("filter", {}), dict)
+        and type(diverged) is int
+        and 0 <= diverged <= len(sequences) > 0
+        and known
+        and all(map(_has_metrics, sequences.values()))
+    )
+
+
+def _has_metrics(sequence: dict[str, Any]) -> bool:
+    """Whether the metrics of a sequence are finite numbers or null, null with a reason, as they are
+    written. What else is said of it is not compared."""
+    values = [value for name, value in sequence.items() if name in (*COMPARED, "duration")]
+    reasons = sequence.get("undefined", {})
+    return all(value is None or math.isfinite(value) for value in values) and all(
+        isinstance(reason, str) for reason in dict(reasons).values()
+    )
+
+
+def _of_others(figures: Figures, asked: dict[str, str]) -> str | None:
+    """Why figures are not of what is asked for; None where they are."""
+    settings = {"alignment": "origin", **figures["settings"]}
+    differs = [name for name, wanted in asked.items() if settings[name] != wanted]
+    return f"is of {differs[0]} {settings[differs[0]]}" if differs else None
 
 
 def _out_of_date(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from pathlib import Path
 from typing import NamedTuple
@@ -102,8 +103,13 @@ def read(
         label=str(Path(word)),
         folders=[each.folder for each in found],
         seeds=[each.figures for each in found],
-        runs=[(folder if is_run(folder) else folder.parents[1]).name for folder in folders],
+        runs=[_run(folder).name for folder in folders],
     )
+
+
+def _run(folder: Path) -> Path:
+    """The run that a row names, or that has the evaluation which it names."""
+    return folder if is_run(folder) else Path(os.path.abspath(folder)).parent.parent
 
 
 def _evaluated(folder: Path, config: CompareConfig, reporter: Reporter, workers: int) -> Evaluated:

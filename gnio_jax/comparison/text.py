@@ -77,6 +77,20 @@ def _way(settings: dict[str, Any]) -> str:
     return ", ".join(said)
 
 
+def filter_options(comparison: Comparison) -> list[str]:
+    """Names of the filter's options in which a row differs from the first."""
+    found: list[dict[str, set[str]]] = []
+    for row in comparison.rows:
+        values: dict[str, set[str]] = {}
+        for settings in (figures["settings"] for figures in row.seeds):
+            given = settings.get("filter") if settings.get("estimator") != "integrate" else None
+            for name, value in (given or {}).items():
+                values.setdefault(name, set()).add(repr(value))
+        found.append(values)
+    both = [(found[0], other) for other in found[1:] if found[0] and other]
+    return sorted({name for a, b in both for name in a | b if a.get(name) != b.get(name)})
+
+
 def lines(comparison: Comparison) -> list[list[str]]:
     """The table's lines: each metric's rows one below the other."""
     return [
@@ -92,6 +106,8 @@ def explanations(comparison: Comparison) -> list[str]:
     if len({way(row) for row in comparison.rows}) > 1:
         ways = "; ".join(f"{row.label}: {way(row)}" for row in comparison.rows)
         found.append(f"The rows are not estimated alike. {ways}.")
+    if options := filter_options(comparison):
+        found.append(f"The rows differ in options of the filter: {', '.join(options)}.")
     differences = [cell.difference for cell in _cells(comparison) if cell.difference]
     groups = sorted({difference.groups for difference in differences if difference.interval})
     if groups:

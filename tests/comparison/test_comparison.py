@@ -333,10 +333,17 @@ def test_refusals(runs):
     )
     other = {"a": "ann", "b": "eve", "c": "bob"}
     write(runs / "groups", {"a": 1.0, "b": 1.0}, groups=other)
-    assert "sequence b is of eve here, of ann in the first row" in refused("plain", "groups")
+    assert f"sequence b is of eve here, of ann in {runs}/plain_s0/" in refused("plain", "groups")
     for name, seconds in (("short", 60.0), ("long", 100.0)):
         write(runs / name, {"a": 1.0}, more={"duration": seconds})
-    assert "sequence a takes 100 s here, 60 s in the first row" in refused("short", "long")
+    assert f"sequence a takes 100 s here, 60 s in {runs}/short/" in refused("short", "long")
+    for seed, seconds in enumerate((60.0, 600.0)):
+        write(runs / f"mix_s{seed}", {"a": 1.0}, more={"duration": seconds})
+    assert "mix_s1/eval/oxiod_test_ekf: sequence a takes 600 s here" in refused("mix", "new")
+    (runs / "linked_s0").symlink_to(runs / "new_s0")
+    (runs / "linked_s1").symlink_to(runs / "new_s0")
+    assert "is named twice" in refused("linked", "plain")
+    assert "is named twice" in refused("new_s0", "new_s0/eval/oxiod_test_ekf")
     se3 = write(runs / "new_s0", {"a": 0.5}, "oxiod_test_ekf_se3-alignment", alignment="se3")
     assert "is of alignment se3, the first row of origin" in refused(
         "plain", str(se3.relative_to(runs))
@@ -396,3 +403,55 @@ def test_a_name_that_cannot_be_written_is_told_first(runs, out, monkeypatch, cap
     assert left.value.code == 2 and sorted(runs.iterdir()) == before
     said = capsys.readouterr()
     assert not said.out and len(said.err.splitlines()) == 1
+
+
+def test_options_of_the_filter_that_differ_are_told(runs):
+    """Not where no filter runs."""
+    for name, gravity in (("here", 9.8), ("there", 9.7)):
+        options = {"gravity": gravity, "accel_density": 0.1}
+        write(runs / name, {"a": 1.0}, "own", filter=options)
+        write(runs / name, {"a": 1.0}, "kept", filter=options, estimator="integrate")
+    folders = (f"{runs}/here/eval/own", f"{runs}/there/eval/own")
+    found = comparison.compare(CompareConfig(folders))
+    assert text.filter_options(found) == ["gravity"]
+    assert "The rows differ in options of the filter: gravity." in text.explanations(found)
+    folders = (f"{runs}/here/eval/kept", f"{runs}/there/eval/kept")
+    assert text.filter_options(comparison.compare(CompareConfig(folders))) == []
+
+
+def test_an_evaluation_may_be_named_from_inside(runs, monkeypatch):
+    write(runs / "new_s0", {"a": 1.0, "b": 3.0, "c": 3.0}, "oxiod_test_ekf_loose")
+    monkeypatch.chdir(runs / "new_s0" / "eval")
+    found = comparison.compare(CompareConfig(("oxiod_test_ekf", "oxiod_test_ekf_loose")))
+    assert [row.runs for row in found.rows] == [["new_s0"], ["new_s0"]]
+
+
+@pytest.mark.parametrize(
+    ("where", "value"),
+    [
+        (("sequences", "a", "undefined"), ["x"]),
+        (("sequences", "a", "undefined"), {"ate": 5}),
+        (("sequences", "a", "group"), None),
+        (("sequences", "a", "ate"), 10**400),
+        (("sequences", "a", "ate"), math.inf),
+        (("mean", "diverged"), None),
+        (("mean", "diverged"), "1"),
+        (("settings", "checkpoint"), 5),
+        (("settings", "filter"), 5),
+        (("sequences",), {}),
+        (("sequences",), [[1]]),
+    ],
+)
+def test_a_damaged_evaluation_is_refused(runs, where, value):
+    path = runs / "new_s0" / "eval" / "oxiod_test_ekf" / "metrics.json"
+    found = inner = json.loads(path.read_text())
+    for name in where[:-1]:
+        inner = inner[name]
+    inner[where[-1]] = value
+    path.write_text(json.dumps(found))
+    with pytest.raises(InputError, match=r"is not a metrics\.json of an evaluation"):
+        comparison.compare(CompareConfig((f"{runs}/plain", str(path.parent))))
+    for broken in ("[" * 100_000, "nothing"):
+        path.write_text(broken)
+        with pytest.raises(InputError, match=r"is not a metrics\.json of an evaluation"):
+            figures.of_evaluation(path.parent)

@@ -52,7 +52,7 @@ def test_figures_of_another_filter_or_damaged_ones_are_made_anew(tmp_path, monke
     options = dataclasses.asdict(BASE.filter)
     whole = {
         "settings": {"dataset": "tlio", "split": "test", "definitions": 2, "filter": options},
-        "sequences": {"a": {"ate": 1.0, "group": "x"}},
+        "sequences": {"a": {"ate": 1.0, "group": "x", "notes": ["it began while it moved"]}},
         "mean": {"ate": 1.0, "diverged": 0},
     }
     made = []
@@ -63,8 +63,10 @@ def test_figures_of_another_filter_or_damaged_ones_are_made_anew(tmp_path, monke
 
     monkeypatch.setattr(figures.evaluation, "evaluate", evaluate)
     other = {**whole, "settings": {**whole["settings"], "filter": {**options, "gravity": 9.0}}}
+    elsewhere = {**whole, "settings": {**whole["settings"], "split": "val"}}
     texts = [
         json.dumps(other),
+        json.dumps(elsewhere),
         json.dumps(whole)[:40],
         "{}",
         "[]",
@@ -76,7 +78,9 @@ def test_figures_of_another_filter_or_damaged_ones_are_made_anew(tmp_path, monke
         path.write_text(text)
         found = figures.of_run(tmp_path, "test", "ekf", Lines())
         assert found.figures == whole and len(made) == number + 1
-    assert figures.of_run(tmp_path, "test", "ekf", Lines()).figures == whole and len(made) == 7
+    assert figures.of_run(tmp_path, "test", "ekf", Lines()).figures == whole and len(made) == len(
+        texts
+    )
 
 
 def test_integrate_takes_no_filter_and_pictures_are_drawn_anew(tmp_path, monkeypatch):
