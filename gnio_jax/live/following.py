@@ -23,6 +23,8 @@ Push = Callable[[Any, Any, Any], Pose | None]
 """`Tracker.push`: (time, gyro, accel) -> the pose of a clone step; raises `ValueError`."""
 LINES_BEFORE_A_SAMPLE = 100
 """So many lines without a single sample are no stream of an IMU."""
+SAMPLES_BEFORE_A_WHOLE_ONE = 1000
+"""So many samples of which none has both sensors: one of them is not sent, or named otherwise."""
 REFUSED_IN_A_ROW = 1000
 """So many refused samples in a row end the stream: its clock or its format is another one now, and
 no later sample would be taken (ours)."""
@@ -111,7 +113,8 @@ def follow(
     """Feed the samples to a tracker until the source ends, or nothing of it is taken any more
     (`Follower.lost`); `found` grows on the way, and `on_pose` is called after each clone step.
 
-    Raises `InputError` where nothing that comes is a sample, or its stamps are not in seconds.
+    Raises `InputError` where nothing that comes is a sample or none has both sensors, or its stamps
+    are not in seconds.
     """
     for sample in source.samples:
         pose = _pushed(push, sample, found)
@@ -123,8 +126,12 @@ def follow(
             raise InputError(source.name, problem, f"the first one {found.reason}")
         if found.samples == FIRST_STAMPS:
             _check_interval(found.stamps, source.name)
+        if found.samples >= SAMPLES_BEFORE_A_WHOLE_ONE:
+            _check_sensors(found, source.name)
         if found.lost:
             break
+    if found.samples > 0:
+        _check_sensors(found, source.name)
     _note_gap(found)
 
 
@@ -154,6 +161,14 @@ def _note_gap(found: Follower) -> None:
     What came before the start is not in the path."""
     if found.poses and found.last - found.newest > found.longest_interval:
         found.gaps.append(found.last - found.newest)
+
+
+def _check_sensors(found: Follower, where: str) -> None:
+    """Raise `InputError` where no sample has had both sensors."""
+    if math.isinf(found.newest):
+        problem = f"has no whole sample among its first {found.samples}"
+        remedy = "each moment needs the gyro (gyro) and the accelerometer (accel)"
+        raise InputError(where, problem, remedy)
 
 
 def _check_interval(stamps: list[float], where: str) -> None:

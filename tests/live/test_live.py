@@ -127,6 +127,17 @@ def test_a_stream_of_nonsense_ends_with_one_line(line, problem):
     assert found.refused == 100 and found.poses == []
 
 
+@pytest.mark.parametrize("line", ['{{"time": {}, "accel": [0, 0, 9.8]}}', "{},0,0,0.1,,,"])
+@pytest.mark.parametrize("count", [60, 5000])
+def test_a_stream_of_one_sensor_ends_with_one_line(line, count):
+    """Also where the other one goes by a name that is not known."""
+    source = live.lines_of([line.format(k / 100) for k in range(count)], "udp:5555")
+    found = live.Follower()
+    with pytest.raises(InputError, match=r"udp:5555: has no whole sample .*the gyro \(gyro\) and"):
+        live.follow(Clocked().push, source, found, print)
+    assert found.samples <= 1000
+
+
 class Clocked:
     """A tracker that wants stamps that increase, and keeps them."""
 

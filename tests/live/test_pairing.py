@@ -83,3 +83,80 @@ def test_lines_of_either_sensor_make_a_stream():
     ]
     found = list(lines_of(lines).samples)
     assert found == [Sample(0.01, (1.0, 2.0, 3.0), (0.0, 0.0, 9.5))]
+
+
+def at_100_hz(seconds=5.0):
+    """Rows of both sensors, the gyro 3 ms behind the accelerometer."""
+    times = np.arange(0.0, seconds, 0.01)
+    return [accel(t) for t in times], [gyro(t + 0.003) for t in times]
+
+
+def whole(found):
+    return [row for row in found if row is not None and np.isfinite([row.gyro, row.accel]).all()]
+
+
+@pytest.mark.parametrize("late", [0.0, 0.006, 0.011, 0.05, 0.09, -0.006, -0.02, -0.05, -0.09])
+def test_either_sensor_may_come_late(late):
+    """In the order of arrival, the gyro `late` s after the accelerometer."""
+    pulled, turned = at_100_hz()
+    rows = [(row.time, row) for row in pulled] + [(row.time + late, row) for row in turned]
+    found = whole(paired(row for _, row in sorted(rows, key=lambda pair: pair[0])))
+    assert [row.time for row in found] == [row.time for row in turned[:-1]]
+
+
+@pytest.mark.parametrize("first", ["accel", "gyro"])
+def test_rows_may_come_in_batches(first):
+    pulled, turned = at_100_hz()
+    rows = []
+    for k in range(0, len(pulled), 5):
+        both = (pulled[k : k + 5], turned[k : k + 5])
+        for batch in both if first == "accel" else both[::-1]:
+            rows += batch
+    assert len(whole(paired(rows))) == len(turned) - 1
+
+
+@pytest.mark.parametrize("sensor", [gyro, accel])
+@pytest.mark.parametrize("off", [1e6, 5.0, -5.0])
+def test_one_wrong_stamp_costs_a_moment(sensor, off):
+    """And what waits stays little."""
+    pulled, turned = at_100_hz()
+    wrong = sensor(2.0 + off)
+    rows = sorted([*pulled, *turned], key=lambda row: row.time)
+    rows.insert(400, wrong)
+    taken = []
+    found = []
+    for row in paired(taken.append(row) or row for row in rows):
+        found.append(row)
+        assert len(taken) - 2 * len(found) < 50
+    assert len([row for row in whole(found) if row.time != wrong.time]) > len(turned) - 25
+
+
+def test_a_clock_that_stands_still_gives_no_samples():
+    found = list(paired([gyro(1.0)] * 1000))
+    assert found.count(None) == 999
+
+
+def test_where_the_gyro_falls_silent_time_passes():
+    pulled, turned = at_100_hz(2.0)
+    rows = sorted([*pulled, *turned[:100]], key=lambda row: row.time)
+    found = list(paired(rows))
+    silent = found[-1]
+    assert silent is not None and silent.time == pulled[-1].time and math.isnan(silent.gyro[0])
+    assert len(found) == pytest.approx(100 + 89, abs=2)
+    assert len(list(paired(pulled))) == pytest.approx(189, abs=2)
+
+
+def test_an_empty_row_lets_others_wait():
+    """As the third sensor of a log has them."""
+    pulled, turned = at_100_hz(1.0)
+    rows = sorted([*pulled, *turned], key=lambda row: row.time)
+    rows = [each for row in rows for each in (row, Sample(row.time, MISSING, MISSING))]
+    assert len(whole(paired(rows))) == len(turned) - 1
+
+
+@pytest.mark.parametrize("start", [0.0, 1.7e9])
+def test_an_accelerometer_of_10_hz_is_enough(start):
+    pulled = [accel(start + k / 10) for k in range(50)]
+    turned = [gyro(start + k / 100 + 0.001) for k in range(490)]
+    rows = sorted([*pulled, *turned], key=lambda row: row.time)
+    assert len(whole(paired(rows))) == 490
