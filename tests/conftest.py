@@ -17,20 +17,8 @@ from jaxtyping import install_import_hook
 
 import tests.support.type_checks  # noqa: F401  (found by its name, below)
 
-# Passes of XLA that only make loops faster, and take a tenth of the time to compile a filter.
-PASSES = (
-    "conditional-canonicalizer",
-    "simplify-conditional",
-    "simplify-while-loops",
-    "while-loop-constant-sinking",
-    "while-loop-invariant-code-motion",
-)
 # Each worker has one core: a module in many parts, to be compiled at once, is only more work.
-COMPILER = [
-    "--xla_backend_optimization_level=0",
-    "--xla_cpu_parallel_codegen_split_count=1",
-    "--xla_disable_hlo_passes=" + ",".join(PASSES),
-]
+COMPILER = ["--xla_backend_optimization_level=0", "--xla_cpu_parallel_codegen_split_count=1"]
 if version("jax").startswith("0.10."):  # removed later, and XLA stops at a flag it does not know
     # Fusions as LLVM's loops instead of MLIR's: a third of the time to compile a filter.
     COMPILER.append("--xla_cpu_use_fusion_emitters=false")
@@ -41,8 +29,6 @@ os.environ.setdefault("JAX_PLATFORMS", "cpu")
 # The workers and the processes that tests start share what they compile through the cache, small
 # programs too.
 os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
-# Instructions do not carry the lines of Python that they come from: nobody reads them here.
-os.environ["JAX_TRACEBACK_IN_LOCATIONS_LIMIT"] = "0"
 
 # Every annotated shape and type is checked, in the tests alone.
 install_import_hook("gnio_jax", "tests.support.type_checks.when_called")
