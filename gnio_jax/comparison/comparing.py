@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from gnio_jax.comparison import pairs, rows
+from gnio_jax.comparison import figures, pairs, rows
 from gnio_jax.comparison.figures import COMPARED
 from gnio_jax.comparison.pairs import Difference
 from gnio_jax.comparison.rows import Recordings, Row
@@ -67,10 +67,9 @@ def compare(
         remedy = "name the run to compare with first, and all of them before --metrics"
         raise InputError("RUNS", "needs two or more", remedy)
     named = {word: rows.find(word) for word in config.rows}
-    _check_different(config.rows, named)
+    _check_different(named, config)
     common = _common_recordings(named, config)
     found = [rows.read(word, named[word], config, reporter, workers) for word in config.rows]
-    _check_different_evaluations(found)
     _check_same_sequences(found)
     labels = _labels(found)
     found = [row._replace(label=label) for row, label in zip(found, labels, strict=True)]
@@ -88,13 +87,16 @@ def _check_metrics(wanted: tuple[str, ...] | None) -> None:
             raise InputError("--metrics", f"no metric '{word}'", remedy)
 
 
-def _check_different(words: tuple[str, ...], named: dict[str, list[Path]]) -> None:
-    """Raise `InputError` where a folder stands in two rows."""
-    taken: dict[Path, int] = {}
-    for number, word in enumerate(words):
-        for folder in named[word]:
-            if taken.setdefault(folder.resolve(), number) != number:
-                raise InputError(str(folder), "is named twice", "name each run once")
+def _check_different(named: dict[str, list[Path]], config: CompareConfig) -> None:
+    """Raise `InputError` where an evaluation stands twice, in two rows or as two seeds of one."""
+    taken: dict[Path, Path] = {}
+    for folder in (folder for word in config.rows for folder in named[word]):
+        is_run = rows.is_run(folder)
+        own = figures.how(folder, config.split, config.estimator)[1] if is_run else folder
+        if other := taken.get(own.resolve()):
+            problem = "is named twice" if folder == other else f"is the same evaluation as {other}"
+            raise InputError(str(folder), problem, "name each once")
+        taken[own.resolve()] = folder
 
 
 def _metrics(found: list[Row], wanted: tuple[str, ...] | None) -> list[str]:
@@ -124,17 +126,6 @@ def _common_recordings(named: dict[str, list[Path]], config: CompareConfig) -> R
             problem = f"is of {field} {here}, the first row of {there}"
             raise InputError(str(folder), problem, remedy)
     return first
-
-
-def _check_different_evaluations(found: list[Row]) -> None:
-    """Raise `InputError` where an evaluation stands twice, in two rows or as two seeds of one."""
-    taken: set[Path] = set()
-    for folder in (folder for row in found for folder in row.folders):
-        if folder.resolve() in taken:
-            raise InputError(
-                str(folder), "is named twice, here as a seed or a link", "name it once"
-            )
-        taken.add(folder.resolve())
 
 
 def _check_same_sequences(found: list[Row]) -> None:

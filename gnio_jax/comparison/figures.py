@@ -133,12 +133,14 @@ def _is_whole(figures: Figures) -> bool:
 
 
 def _has_metrics(sequence: dict[str, Any]) -> bool:
-    """Whether the metrics of a sequence are finite numbers or null, null with a reason, as they are
-    written. What else is said of it is not compared."""
+    """Whether the metrics of a sequence are finite numbers or null, and the reasons of null are
+    words. What else is said of it is not compared."""
     values = [value for name, value in sequence.items() if name in (*COMPARED, "duration")]
     reasons = sequence.get("undefined", {})
-    return all(value is None or math.isfinite(value) for value in values) and all(
-        isinstance(reason, str) for reason in dict(reasons).values()
+    return (
+        all(value is None or math.isfinite(value) for value in values)
+        and isinstance(reasons, dict)
+        and all(isinstance(reason, str) for reason in reasons.values())
     )
 
 

@@ -79,16 +79,23 @@ def _way(settings: dict[str, Any]) -> str:
 
 def filter_options(comparison: Comparison) -> list[str]:
     """Names of the filter's options in which a row differs from the first."""
-    found: list[dict[str, set[str]]] = []
+    found: list[dict[str, list[Any]]] = []
     for row in comparison.rows:
-        values: dict[str, set[str]] = {}
+        values: dict[str, list[Any]] = {}
         for settings in (figures["settings"] for figures in row.seeds):
             given = settings.get("filter") if settings.get("estimator") != "integrate" else None
             for name, value in (given or {}).items():
-                values.setdefault(name, set()).add(repr(value))
+                values.setdefault(name, []).append(value)
         found.append(values)
     both = [(found[0], other) for other in found[1:] if found[0] and other]
-    return sorted({name for a, b in both for name in a | b if a.get(name) != b.get(name)})
+    return sorted(
+        {name for a, b in both for name in a | b if _differ(a.get(name, []), b.get(name, []))}
+    )
+
+
+def _differ(some: list[Any], others: list[Any]) -> bool:
+    """Whether one of the lists has a value that the other has not."""
+    return any(a not in others for a in some) or any(b not in some for b in others)
 
 
 def lines(comparison: Comparison) -> list[list[str]]:

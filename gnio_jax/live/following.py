@@ -23,8 +23,9 @@ Push = Callable[[Any, Any, Any], Pose | None]
 """`Tracker.push`: (time, gyro, accel) -> the pose of a clone step; raises `ValueError`."""
 LINES_BEFORE_A_SAMPLE = 100
 """So many lines without a single sample are no stream of an IMU."""
-SAMPLES_BEFORE_A_WHOLE_ONE = 1000
-"""So many samples of which none has both sensors: one of them is not sent, or named otherwise."""
+SECONDS_WITHOUT_A_SENSOR = 10.0
+"""So many s from the start without a sample that has both sensors: one of them is not sent, or goes
+by another name (ours)."""
 REFUSED_IN_A_ROW = 1000
 """So many refused samples in a row end the stream: its clock or its format is another one now, and
 no later sample would be taken (ours)."""
@@ -126,12 +127,10 @@ def follow(
             raise InputError(source.name, problem, f"the first one {found.reason}")
         if found.samples == FIRST_STAMPS:
             _check_interval(found.stamps, source.name)
-        if found.samples >= SAMPLES_BEFORE_A_WHOLE_ONE:
+        if found.samples > LINES_BEFORE_A_SAMPLE:
             _check_sensors(found, source.name)
         if found.lost:
             break
-    if found.samples > 0:
-        _check_sensors(found, source.name)
     _note_gap(found)
 
 
@@ -164,11 +163,10 @@ def _note_gap(found: Follower) -> None:
 
 
 def _check_sensors(found: Follower, where: str) -> None:
-    """Raise `InputError` where no sample has had both sensors."""
-    if math.isinf(found.newest):
-        problem = f"has no whole sample among its first {found.samples}"
-        remedy = "each moment needs the gyro (gyro) and the accelerometer (accel)"
-        raise InputError(where, problem, remedy)
+    """Raise `InputError` where one of the sensors has not come for `SECONDS_WITHOUT_A_SENSOR`."""
+    if math.isinf(found.newest) and found.last - found.stamps[0] > SECONDS_WITHOUT_A_SENSOR:
+        problem = f"has no sample with both sensors in its first {SECONDS_WITHOUT_A_SENSOR:g} s"
+        raise InputError(where, problem, "send the gyro (gyro) and the accelerometer (accel)")
 
 
 def _check_interval(stamps: list[float], where: str) -> None:

@@ -12,8 +12,8 @@ import numpy as np
 from gnio_jax.live.samples import Sample
 
 LONGEST_WAIT = 0.1
-"""s that a row of the gyro waits for the accelerometer or comes after it, and between two rows of
-the accelerometer that are interpolated (ours)."""
+"""s: a row of the gyro waits so long for the accelerometer, and may come so late after it. Two rows
+of the accelerometer are interpolated if they are no further apart (ours)."""
 
 
 ROUNDING = 1e-6
@@ -34,36 +34,56 @@ def paired(samples: Iterable[Sample | None]) -> Iterator[Sample | None]:
     has none.
 
     A row that has every value of one sensor and none of the other is a reading of that sensor
-    alone. One of the gyro gets the accelerometer if readings at most `LONGEST_WAIT` apart enclose
-    it. It waits for the later one until a stamp is so far from its own, and so do the rows after
-    it; then it stays without. One of the accelerometer makes no sample while the gyro is read: it
-    comes through where the gyro has been silent for longer, so that time passes. A stamp that is
-    not later than the one before of its sensor is None, which is no sample. Other rows come through
-    as they are, and None does.
+    alone. One of the gyro gets the accelerometer if two readings of it enclose the stamp, at most
+    `LONGEST_WAIT` apart. It waits for the later one until a row's stamp is `LONGEST_WAIT` away;
+    then it comes without the accelerometer. Rows after it wait behind it. One of the accelerometer
+    makes no sample, nor does an empty row once the gyro has rows of its own. Where the gyro is
+    silent for longer than `LONGEST_WAIT`, they come through, so late that no row of the gyro is
+    still expected: time passes. None, which is no sample, stands for a stamp of the accelerometer
+    that is not later than the one before, and for one that is not later than a row that waits.
+    Other rows come through as they are, and None does.
     """
     waiting: deque[Sample] = deque()
     readings: deque[Reading] = deque()
-    newest = math.nan  # stamp of the newest row that is more than a reading of the accelerometer
+    quiet: deque[Sample] = deque()  # rows without the gyro
+    newest = math.nan  # stamp of the newest row with it, or where the stream began
+    apart = False
     for sample in samples:
         if sample is None:
             yield None
             continue
         if math.isnan(newest):
             newest = sample.time
-        read = _is_whole(sample.accel) and _keep(readings, Reading(sample.time, sample.accel))
+        alone = _is_missing(sample.gyro)
+        apart = apart or _waits(sample)
+        late = False
+        if _is_whole(sample.accel):
+            if readings and sample.time < readings[-1].time - LONGEST_WAIT:
+                newest = min(newest, sample.time)  # the clock was set back, or one stamp was wrong
+            late = not _keep(readings, Reading(sample.time, sample.accel))
         yield from _ready(waiting, readings, sample.time)
-        if _is_whole(sample.accel) and _is_missing(sample.gyro):
-            if not read:
+        yield from _passing(quiet, newest, sample.time)
+        if alone and (_is_whole(sample.accel) or (apart and _is_missing(sample.accel))):
+            if late:
                 yield None
-            elif len(readings) > 1 and readings[-2].time > newest + LONGEST_WAIT:
-                yield sample  # two readings say so: one stamp may be wrong
-        elif _waits(sample) and waiting and sample.time <= waiting[-1].time:
+            elif not quiet or sample.time > quiet[-1].time:
+                quiet.append(sample)
+        elif waiting and sample.time <= waiting[-1].time:
             yield None
         else:
             newest = sample.time
             waiting.append(sample)
             yield from _ready(waiting, readings, sample.time)
     yield from waiting
+
+
+def _passing(quiet: deque[Sample], newest: float, now: float) -> Iterator[Sample]:
+    """The rows without the gyro that show at the stamp `now` that it is silent since `newest`. All
+    that are as old leave `quiet`, and so do those whose stamps are too far ahead."""
+    while quiet and abs(now - quiet[0].time) > LONGEST_WAIT:
+        row = quiet.popleft()
+        if newest + LONGEST_WAIT < row.time < now:
+            yield row
 
 
 def _keep(readings: deque[Reading], reading: Reading) -> bool:
@@ -81,7 +101,8 @@ def _keep(readings: deque[Reading], reading: Reading) -> bool:
 
 
 def _ready(waiting: deque[Sample], readings: deque[Reading], now: float) -> Iterator[Sample]:
-    """The first rows that need not wait any longer at the stamp `now`; they leave `waiting`."""
+    """Rows at the head of `waiting` that are complete, or that no reading can complete any more
+    when the stamp is `now`; they leave it."""
     while waiting:
         row = _with_accelerometer(waiting[0], readings)
         if row is None:

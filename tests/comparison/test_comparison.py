@@ -324,7 +324,8 @@ def test_refusals(runs):
     assert "is not there" in refused("plain", "gone")
     assert "no row has 'nis'; there are: ate, rpe_1s" in refused("plain", "new", metrics=("nis",))
     assert "no metric 'new'; name RUNS before it" in refused("plain", metrics=("ate", "new"))
-    assert "is named twice" in refused("plain", "plain_s1")
+    assert "plain_s1: is named twice" in refused("plain", "plain_s1")
+    assert "new_s0: is named twice" in refused("new", "new")
     write(runs / "seen", {"a": 1.0}, split="seen")
     seen = "seen/eval/oxiod_test_ekf"
     assert "is of split seen, the first row of test; give --split seen" in refused("plain", seen)
@@ -342,8 +343,8 @@ def test_refusals(runs):
     assert "mix_s1/eval/oxiod_test_ekf: sequence a takes 600 s here" in refused("mix", "new")
     (runs / "linked_s0").symlink_to(runs / "new_s0")
     (runs / "linked_s1").symlink_to(runs / "new_s0")
-    assert "is named twice" in refused("linked", "plain")
-    assert "is named twice" in refused("new_s0", "new_s0/eval/oxiod_test_ekf")
+    assert "linked_s1: is the same evaluation as" in refused("linked", "plain")
+    assert "is the same evaluation as" in refused("new_s0", "new_s0/eval/oxiod_test_ekf")
     se3 = write(runs / "new_s0", {"a": 0.5}, "oxiod_test_ekf_se3-alignment", alignment="se3")
     assert "is of alignment se3, the first row of origin" in refused(
         "plain", str(se3.relative_to(runs))
@@ -407,8 +408,8 @@ def test_a_name_that_cannot_be_written_is_told_first(runs, out, monkeypatch, cap
 
 def test_options_of_the_filter_that_differ_are_told(runs):
     """Not where no filter runs."""
-    for name, gravity in (("here", 9.8), ("there", 9.7)):
-        options = {"gravity": gravity, "accel_density": 0.1}
+    for name, gravity, density in (("here", 9.8, 1), ("there", 9.7, 1.0)):
+        options = {"gravity": gravity, "accel_density": density}
         write(runs / name, {"a": 1.0}, "own", filter=options)
         write(runs / name, {"a": 1.0}, "kept", filter=options, estimator="integrate")
     folders = (f"{runs}/here/eval/own", f"{runs}/there/eval/own")
@@ -430,6 +431,7 @@ def test_an_evaluation_may_be_named_from_inside(runs, monkeypatch):
     ("where", "value"),
     [
         (("sequences", "a", "undefined"), ["x"]),
+        (("sequences", "a", "undefined"), ""),
         (("sequences", "a", "undefined"), {"ate": 5}),
         (("sequences", "a", "group"), None),
         (("sequences", "a", "ate"), 10**400),

@@ -117,8 +117,8 @@ def test_rows_may_come_in_batches(first):
 
 @pytest.mark.parametrize("sensor", [gyro, accel])
 @pytest.mark.parametrize("off", [1e6, 5.0, -5.0])
-def test_one_wrong_stamp_costs_a_moment(sensor, off):
-    """And what waits stays little."""
+def test_one_wrong_stamp_holds_nothing_up(sensor, off):
+    """What a tracker makes of one that comes through is its own matter."""
     pulled, turned = at_100_hz()
     wrong = sensor(2.0 + off)
     rows = sorted([*pulled, *turned], key=lambda row: row.time)
@@ -131,26 +131,66 @@ def test_one_wrong_stamp_costs_a_moment(sensor, off):
     assert len([row for row in whole(found) if row.time != wrong.time]) > len(turned) - 25
 
 
-def test_a_clock_that_stands_still_gives_no_samples():
-    found = list(paired([gyro(1.0)] * 1000))
+@pytest.mark.parametrize("then", [gyro(1.0), Sample(1.0, MISSING, (math.nan, 0.0, 0.0))])
+def test_a_clock_that_stands_still_gives_no_samples(then):
+    found = list(paired([gyro(1.0), *[then] * 999]))
     assert found.count(None) == 999
+    assert len(list(paired([gyro(1.0), *[Sample(1.0, MISSING, MISSING)] * 999]))) == 1
+
+
+def taken_by_a_tracker(rows):
+    """What comes out, less what comes too late for a tracker, which wants increasing stamps."""
+    found, newest = [], -math.inf
+    for row in paired(rows):
+        if row is not None and row.time > newest:
+            found.append(row)
+            newest = row.time
+    return found
 
 
 def test_where_the_gyro_falls_silent_time_passes():
+    """Also after a clock that was set back, and after a first stamp that was wrong."""
     pulled, turned = at_100_hz(2.0)
     rows = sorted([*pulled, *turned[:100]], key=lambda row: row.time)
-    found = list(paired(rows))
+    found = taken_by_a_tracker(rows)
     silent = found[-1]
-    assert silent is not None and silent.time == pulled[-1].time and math.isnan(silent.gyro[0])
-    assert len(found) == pytest.approx(100 + 89, abs=2)
-    assert len(list(paired(pulled))) == pytest.approx(189, abs=2)
+    assert silent.time == pytest.approx(1.88, abs=0.02) and math.isnan(silent.gyro[0])
+    assert len(found) == pytest.approx(100 + 79, abs=2)
+    assert len(list(paired(pulled))) == pytest.approx(179, abs=2)
+    assert len(list(paired([accel(1e6), *pulled]))) == pytest.approx(179, abs=2)
+    back = [row._replace(time=row.time - 50.0) for row in pulled]
+    assert len(list(paired([*rows, *back]))) == pytest.approx(len(found) + 179, abs=3)
+
+
+@pytest.mark.parametrize("late", [0.0, 0.02, 0.05, 0.09])
+@pytest.mark.parametrize("between", [None, 0.02])
+def test_no_row_overtakes_a_late_gyro(late, between):
+    """Where rows of it are missing, and where empty ones come between, as of a third sensor."""
+    pulled, turned = at_100_hz()
+    lost = [*turned[:200], *turned[203:]]
+    rows = [(row.time, row) for row in pulled] + [(row.time + late, row) for row in lost]
+    if between:
+        times = np.arange(1.001, 5.0, between)  # once the gyro has rows of its own
+        rows += [(time, Sample(time, MISSING, MISSING)) for time in times]
+    arrived = [row for _, row in sorted(rows, key=lambda pair: pair[0])]
+    found = taken_by_a_tracker(arrived)
+    assert [row.time for row in whole(found)] == [row.time for row in lost[:-1]]
+
+
+@pytest.mark.parametrize("length", [8, 10])
+def test_batches_of_the_accelerometer_overtake_nothing(length):
+    pulled, turned = at_100_hz()
+    rows = []
+    for k in range(0, len(pulled), length):
+        rows += pulled[k : k + length] + turned[k : k + length]
+    assert len(whole(taken_by_a_tracker(rows))) >= len(turned) - 1
 
 
 def test_an_empty_row_lets_others_wait():
     """As the third sensor of a log has them."""
     pulled, turned = at_100_hz(1.0)
     rows = sorted([*pulled, *turned], key=lambda row: row.time)
-    rows = [each for row in rows for each in (row, Sample(row.time, MISSING, MISSING))]
+    rows = [each for row in rows for each in (row, Sample(row.time + 1e-3, MISSING, MISSING))]
     assert len(whole(paired(rows))) == len(turned) - 1
 
 
