@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from gnio_jax.comparison import figures, pairs, rows
-from gnio_jax.comparison.figures import COMPARED
+from gnio_jax.comparison.figures import COMPARED, Recordings
 from gnio_jax.comparison.pairs import Difference
-from gnio_jax.comparison.rows import Recordings, Row
+from gnio_jax.comparison.rows import Row
 from gnio_jax.config import CompareConfig
 from gnio_jax.errors import InputError
 from gnio_jax.reporting import Lines, Reporter

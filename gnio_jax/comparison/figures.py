@@ -26,6 +26,14 @@ Figures = dict[str, Any]
 """One metrics.json."""
 
 
+class Recordings(NamedTuple):
+    """What an evaluation is of."""
+
+    dataset: str
+    split: str
+    alignment: str
+
+
 class Evaluated(NamedTuple):
     """An evaluation that is there."""
 
@@ -56,9 +64,9 @@ def missing(workdir: Path, split: str, estimator: str) -> str | None:
     config, folder = how(workdir, split, estimator)
     found = _read(folder / "metrics.json")
     options = config.filter if estimator != "integrate" else None  # which takes no filter
-    asked = {"dataset": run_config(workdir).dataset, "split": split, "alignment": "origin"}
     problem = "there are no whole figures yet"
     if found:
+        asked = usual_recordings(workdir, split)
         problem = _of_others(found, asked) or _out_of_date(workdir, found, options)
     best = workdir / "checkpoints" / config.checkpoint
     if problem and estimator != "imu_only" and not any(best.glob("[0-9]*")):
@@ -144,11 +152,23 @@ def _has_metrics(sequence: dict[str, Any]) -> bool:
     )
 
 
-def _of_others(figures: Figures, asked: dict[str, str]) -> str | None:
+def usual_recordings(workdir: Path, split: str) -> Recordings:
+    """What `of_run` evaluates a run on."""
+    return Recordings(run_config(workdir).dataset, split, "origin")
+
+
+def recordings(figures: Figures) -> Recordings:
+    """What an evaluation that is there is of."""
+    settings = figures["settings"]
+    return Recordings(settings["dataset"], settings["split"], settings.get("alignment", "origin"))
+
+
+def _of_others(figures: Figures, asked: Recordings) -> str | None:
     """Why figures are not of what is asked for; None where they are."""
-    settings = {"alignment": "origin", **figures["settings"]}
-    differs = [name for name, wanted in asked.items() if settings[name] != wanted]
-    return f"is of {differs[0]} {settings[differs[0]]}" if differs else None
+    for field, own, wanted in zip(Recordings._fields, recordings(figures), asked, strict=True):
+        if own != wanted:
+            return f"is of {field} {own}"
+    return None
 
 
 def _out_of_date(

@@ -8,10 +8,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 from gnio_jax.comparison import figures
-from gnio_jax.comparison.figures import Evaluated, Figures
+from gnio_jax.comparison.figures import Evaluated, Figures, Recordings
 from gnio_jax.config import CompareConfig
 from gnio_jax.errors import InputError
-from gnio_jax.evaluation.run import run_config
 from gnio_jax.reporting import Reporter
 
 _SEED = re.compile(r"_s(\d+)(?=(_calibrated)?$)")
@@ -29,14 +28,6 @@ class Row(NamedTuple):
     """metrics.json of each."""
     runs: list[str]
     """Names of the runs."""
-
-
-class Recordings(NamedTuple):
-    """What an evaluation is of."""
-
-    dataset: str
-    split: str
-    alignment: str
 
 
 def find(word: str) -> list[Path]:
@@ -89,9 +80,8 @@ def recordings(folder: Path, config: CompareConfig) -> Recordings:
     and none can be made."""
     if is_run(folder):
         figures.missing(folder, config.split, config.estimator)
-        return Recordings(run_config(folder).dataset, config.split, "origin")
-    settings = figures.of_evaluation(folder).figures["settings"]
-    return Recordings(settings["dataset"], settings["split"], settings.get("alignment", "origin"))
+        return figures.usual_recordings(folder, config.split)
+    return figures.recordings(figures.of_evaluation(folder).figures)
 
 
 def read(

@@ -14,8 +14,6 @@ from gnio_jax.live.samples import Sample
 LONGEST_WAIT = 0.1
 """s: a row of the gyro waits so long for the accelerometer, and may come so late after it. Two rows
 of the accelerometer are interpolated if they are no further apart (ours)."""
-
-
 ROUNDING = 1e-6
 """s by which differences of stamps may be off: Unix time in float64 has steps of 2e-7 s."""
 
@@ -58,8 +56,10 @@ def paired(samples: Iterable[Sample | None]) -> Iterator[Sample | None]:
         apart = apart or _waits(sample)
         late = False
         if _is_whole(sample.accel):
-            if readings and sample.time < readings[-1].time - LONGEST_WAIT:
-                newest = min(newest, sample.time)  # the clock was set back, or one stamp was wrong
+            if readings and readings[-1].time - sample.time > LONGEST_WAIT:
+                # The clock was set back, or the newest stamp was wrong: begin anew.
+                readings.clear()
+                newest = min(newest, sample.time)
             late = not _keep(readings, Reading(sample.time, sample.accel))
         yield from _ready(waiting, readings, sample.time)
         yield from _passing(quiet, newest, sample.time)
@@ -87,12 +87,9 @@ def _passing(quiet: deque[Sample], newest: float, now: float) -> Iterator[Sample
 
 
 def _keep(readings: deque[Reading], reading: Reading) -> bool:
-    """Add a reading to those of the last moments; False where it comes late or twice. One that is
-    far behind the newest starts anew: the clock was set, or the stamp of the newest was wrong."""
+    """Add a reading to those of the last moments; False where it comes late or twice."""
     if readings and reading.time <= readings[-1].time:
-        if readings[-1].time - reading.time <= LONGEST_WAIT:
-            return False
-        readings.clear()
+        return False
     readings.append(reading)
     # A row of the gyro may come LONGEST_WAIT late, and lie in an interval as long.
     while len(readings) > 2 and readings[1].time < reading.time - 2 * LONGEST_WAIT:

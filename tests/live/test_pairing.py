@@ -167,14 +167,14 @@ def test_where_the_gyro_falls_silent_time_passes():
 def test_no_row_overtakes_a_late_gyro(late, between):
     """Where rows of it are missing, and where empty ones come between, as of a third sensor."""
     pulled, turned = at_100_hz()
-    lost = [*turned[:200], *turned[203:]]
-    rows = [(row.time, row) for row in pulled] + [(row.time + late, row) for row in lost]
+    turned = [*turned[:200], *turned[203:]]
+    rows = [(row.time, row) for row in pulled] + [(row.time + late, row) for row in turned]
     if between:
         times = np.arange(1.001, 5.0, between)  # once the gyro has rows of its own
         rows += [(time, Sample(time, MISSING, MISSING)) for time in times]
     arrived = [row for _, row in sorted(rows, key=lambda pair: pair[0])]
     found = taken_by_a_tracker(arrived)
-    assert [row.time for row in whole(found)] == [row.time for row in lost[:-1]]
+    assert [row.time for row in whole(found)] == [row.time for row in turned[:-1]]
 
 
 @pytest.mark.parametrize("length", [8, 10])
