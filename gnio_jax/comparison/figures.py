@@ -145,10 +145,8 @@ def _has_metrics(sequence: dict[str, Any]) -> bool:
     words. What else is said of it is not compared."""
     values = [value for name, value in sequence.items() if name in (*COMPARED, "duration")]
     reasons = sequence.get("undefined", {})
-    return (
-        all(value is None or math.isfinite(value) for value in values)
-        and isinstance(reasons, dict)
-        and all(isinstance(reason, str) for reason in reasons.values())
+    return all(value is None or math.isfinite(value) for value in values) and all(
+        isinstance(reason, str) for reason in reasons.values()
     )
 
 

@@ -438,6 +438,7 @@ def test_an_evaluation_may_be_named_from_inside(runs, monkeypatch):
         (("sequences", "a", "ate"), math.inf),
         (("mean", "diverged"), None),
         (("mean", "diverged"), "1"),
+        (("mean", "diverged"), 0.5),
         (("settings", "checkpoint"), 5),
         (("settings", "filter"), 5),
         (("sequences",), {}),
@@ -457,3 +458,6 @@ def test_a_damaged_evaluation_is_refused(runs, where, value):
         path.write_text(broken)
         with pytest.raises(InputError, match=r"is not a metrics\.json of an evaluation"):
             figures.of_evaluation(path.parent)
+    path.unlink()
+    path.symlink_to(path)
+    assert figures._read(path) is None

@@ -196,6 +196,9 @@ def test_stamps_in_milliseconds_are_told():
     lines = [f"{10 * k},0,0,0,0,0,9.81" for k in range(100)]
     with pytest.raises(InputError, match=r"udp:5: its samples come 10 s apart.*seconds, not in ms"):
         live.follow(Clocked().push, live.lines_of(lines, "udp:5"), live.Follower(), print)
+    turned = [f"{10 * k},0,0,0,,," for k in range(100)]
+    with pytest.raises(InputError, match="its samples come 10 s apart"):
+        live.follow(Clocked().push, live.lines_of(turned), live.Follower(), print)
     # A pause is none.
     lines = [f"{k / 100 + 30 * (k > 5)},0,0,0,0,0,9.81" for k in range(100)]
     live.follow(Clocked().push, live.lines_of(lines), live.Follower(), print)

@@ -200,3 +200,7 @@ def test_an_accelerometer_of_10_hz_is_enough(start):
     turned = [gyro(start + k / 100 + 0.001) for k in range(490)]
     rows = sorted([*pulled, *turned], key=lambda row: row.time)
     assert len(whole(paired(rows))) == 490
+
+
+def test_a_reading_at_the_same_stamp_needs_no_other():
+    assert list(paired([accel(0.0), gyro(0.5), accel(0.5)])) == [Sample(0.5, SPIN, PULL)]
