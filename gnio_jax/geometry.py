@@ -1,5 +1,4 @@
-"""Rotations of the method: gravity and yaw frames, quaternions, the right Jacobian, on top of
-jaxlie.
+"""Rotations of the method: the exponential map, its right Jacobian, gravity and yaw frames.
 
 Every function acts on one element (use `jax.vmap` for more) unless its shape says otherwise, keeps
 the dtype of its input and has finite derivatives at its singular points.
@@ -15,7 +14,6 @@ import functools
 
 import jax
 import jax.numpy as jnp
-import jaxlie
 import numpy as np
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Float
@@ -111,11 +109,6 @@ def exp(phi: Vector) -> Matrix:
     return _polynomial(phi, squared, sine, versine)
 
 
-def log(rotation: Matrix) -> Vector:
-    """Rotation vector (rad, norm ≤ π) of a rotation matrix."""
-    return jaxlie.SO3.from_matrix(rotation).log()
-
-
 @jax.custom_jvp
 def matmul(
     a: Float[jax.Array, "p k *n"], b: Float[jax.Array, "k q *n"]
@@ -169,7 +162,7 @@ def orthonormalize(rotation: Matrix) -> Matrix:
 
 
 def level(up: Vector) -> Matrix:
-    """The rotation body → world of yaw 0 (as `yaw` has it) that turns `up`, a direction in the
+    """The rotation body → world of yaw 0 (see `yaw_direction`) that turns `up`, a direction in the
     body, to the world's z.
 
     Where the body's x axis is vertical, and its yaw with it undefined, the body's y axis takes the
@@ -227,13 +220,10 @@ def _integrate_turns_jvp(primals: tuple, tangents: tuple) -> tuple[jax.Array, ja
 
 
 def matrix_from_quaternion(wxyz: Quaternion) -> Matrix:
-    """Rotation matrix of a unit quaternion wxyz."""
-    return jaxlie.SO3(wxyz).as_matrix()
-
-
-def quaternion_from_matrix(rotation: Matrix) -> Quaternion:
-    """Unit quaternion wxyz of a rotation matrix."""
-    return jaxlie.SO3.from_matrix(rotation).wxyz
+    """Rotation matrix of a unit quaternion wxyz: (w² − |u|²) I + 2 u uᵀ + 2 w hat(u)."""
+    w, u = wxyz[0], wxyz[1:]
+    eye = np.eye(3, dtype=wxyz.dtype)
+    return (w * w - jnp.sum(u * u)) * eye + 2 * (u[:, None] * u[None, :]) + 2 * w * hat(u)
 
 
 def right_jacobian(phi: Vector) -> Matrix:
@@ -264,12 +254,6 @@ def yaw_direction(rotation: Matrix) -> tuple[Scalar, Scalar]:
     derivative.
     """
     return direction(rotation[0, 0], rotation[1, 0])
-
-
-def yaw(rotation: Matrix) -> Scalar:
-    """Yaw angle of a body→world rotation, rad, in (−π, π]."""
-    cosine, sine = yaw_direction(rotation)
-    return jnp.arctan2(sine, cosine)
 
 
 def rotation_z(angle: Scalar) -> Matrix:

@@ -16,10 +16,9 @@ ANGLES = [0.0, 1e-12, 1e-8, 1e-4, 9.99e-2, 1.001e-1, 0.7, 3.0, np.pi, 6.0]
 AXIS = np.array([0.36, -0.48, 0.8])
 
 # One program for every angle, in place of one for every operation.
-exp, right_jacobian, log = map(jax.jit, (geometry.exp, geometry.right_jacobian, geometry.log))
+exp, right_jacobian = map(jax.jit, (geometry.exp, geometry.right_jacobian))
 slope_of_exp = jax.jit(jax.jacrev(geometry.exp))
 slope_of_right_jacobian = jax.jit(jax.jacrev(geometry.right_jacobian))
-slope_of_log_of_exp = jax.jit(jax.jacrev(lambda phi: geometry.log(geometry.exp(phi))))
 integrate_turns = jax.jit(geometry.integrate_turns)
 slopes_of_integrate_turns = jax.jit(jax.jacrev(geometry.integrate_turns, (0, 1)))
 
@@ -35,8 +34,13 @@ def curvature_of_exp(phi, along):
 def yaws(matrix, angle):
     """The yaw of a rotation, the rotation by it, that by an angle, and the slope of the yaw along
     a further turn."""
-    further = jax.grad(lambda turn: geometry.yaw(geometry.rotation_z(turn) @ matrix))
-    found = geometry.yaw(matrix), geometry.yaw_rotation(matrix), geometry.rotation_z(angle)
+
+    def yaw(matrix):
+        cosine, sine = geometry.yaw_direction(matrix)
+        return jnp.arctan2(sine, cosine)
+
+    further = jax.grad(lambda turn: yaw(geometry.rotation_z(turn) @ matrix))
+    found = yaw(matrix), geometry.yaw_rotation(matrix), geometry.rotation_z(angle)
     return *found, further(jnp.asarray(0.01))
 
 
@@ -93,9 +97,7 @@ def test_dtype_is_kept(dtype, tolerance):
         geometry.exp,
         geometry.right_jacobian,
         geometry.hat,
-        lambda v: geometry.log(geometry.exp(v)),
         lambda v: geometry.yaw_rotation(geometry.exp(v)),
-        lambda v: geometry.quaternion_from_matrix(geometry.exp(v)),
     ):
         assert jax.eval_shape(function, phi).dtype == dtype
     there_and_back = np.asarray(exp(phi)) @ np.asarray(exp(-phi))
@@ -183,27 +185,11 @@ def test_second_derivative_of_exp(angle):
     np.testing.assert_allclose(second, 2 * expm(blocks)[:3, 6:], atol=1e-11)
 
 
-@pytest.mark.parametrize("angle", [1e-9, 1e-3, 1.0, 3.0, np.pi - 1e-4])
-def test_log_inverts_exp(angle):
-    phi = angle * AXIS
-    np.testing.assert_allclose(log(Rotation.from_rotvec(phi).as_matrix()), phi, atol=1e-12)
-    np.testing.assert_allclose(slope_of_log_of_exp(phi), np.eye(3), atol=1e-6)
-
-
-def test_log_and_quaternion_have_finite_derivatives_at_the_identity():
-    for function in (geometry.log, geometry.quaternion_from_matrix):
-        slope = jax.jit(jax.jacrev(function))
-        assert np.isfinite(slope(np.eye(3))).all()
-        assert np.isfinite(slope(np.diag([1.0, -1.0, -1.0]))).all()
-
-
 def test_quaternions_are_wxyz():
     rotation = Rotation.from_euler("xyz", [0.4, -1.0, 2.0])
     wxyz = np.roll(rotation.as_quat(), 1)
     matrix = jax.jit(geometry.matrix_from_quaternion)(wxyz)
     np.testing.assert_allclose(matrix, rotation.as_matrix(), atol=1e-15)
-    found = np.asarray(jax.jit(geometry.quaternion_from_matrix)(rotation.as_matrix()))
-    np.testing.assert_allclose(found * np.sign(found @ wxyz), wxyz, atol=1e-15)
 
 
 @pytest.mark.parametrize(
@@ -233,9 +219,10 @@ def test_yaw_at_gimbal_lock_is_zero_with_zero_derivative():
     locked = jnp.asarray([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
     found, about_z, _, _ = yaws(locked, 0.0)
     np.testing.assert_array_equal(about_z, np.eye(3))
-    slope = jax.jit(jax.jacrev(geometry.yaw_rotation))(locked)
-    np.testing.assert_array_equal(slope, np.zeros((3, 3, 3, 3)))
-    assert float(found) == 0.0 and np.isfinite(jax.jit(jax.grad(geometry.yaw))(locked)).all()
+    assert float(found) == 0.0
+    for function in (geometry.yaw_rotation, geometry.yaw_direction):
+        for slope in jax.tree.leaves(jax.jit(jax.jacrev(function))(locked)):
+            np.testing.assert_array_equal(slope, np.zeros(slope.shape))
 
 
 def test_shapes_are_checked_while_the_tests_run():

@@ -136,12 +136,9 @@ class Variants(chex.TestCase):
         ("exp", geometry.exp, VECTOR),
         ("exp_at_zero", geometry.exp, 0 * VECTOR),
         ("right_jacobian", geometry.right_jacobian, VECTOR),
-        ("log", geometry.log, ATTITUDE),
         ("orthonormalize", geometry.orthonormalize, ATTITUDE + 1e-6),
         ("level", geometry.level, VECTOR),
-        ("yaw", geometry.yaw, ATTITUDE),
         ("yaw_rotation", geometry.yaw_rotation, ATTITUDE),
-        ("quaternion", geometry.quaternion_from_matrix, ATTITUDE),
     )
     def test_geometry(self, function, value):
         value = jnp.asarray(value)

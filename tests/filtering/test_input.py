@@ -471,7 +471,7 @@ def test_level_is_a_rotation_with_derivatives(up):
     np.testing.assert_allclose(rotation @ up / np.linalg.norm(up), [0, 0, 1], atol=1e-12)
     assert np.linalg.det(rotation) > 0
     if abs(up[0]) < 0.99:
-        np.testing.assert_allclose(jax.jit(geometry.yaw)(rotation), 0, atol=1e-12)
+        np.testing.assert_allclose(np.arctan2(rotation[1, 0], rotation[0, 0]), 0, atol=1e-12)
     assert np.isfinite(slope_of_level(up)).all()
 
 
