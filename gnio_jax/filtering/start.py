@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Float
 
 from gnio_jax import geometry
@@ -49,6 +50,8 @@ REST_ACCEL_STD = 0.1
 """Largest standard deviation of each accelerometer axis at rest, m/s²."""
 REST_SECONDS = 1.0
 """Shortest rest from which a bias is taken, s; also what the tilt is taken from."""
+LEAST_GRAVITY = 0.5 * GRAVITY
+"""A mean acceleration below this does not show where up is, m/s² (ours)."""
 
 
 # The arguments of the public functions carry no shapes for the run-time checker: a wrong one is the
@@ -180,7 +183,8 @@ def level_state(
     gyro rad/s and accel m/s² (m, 3), raw, are the first samples, of a second or so, in which the
     device should be still. Where they are not quiet by `rest_gyro` and `rest_accel`, the gyro turns
     the accelerations into the frame of the first sample before they are averaged: a hand that turns
-    the phone takes gravity along.
+    the phone takes gravity along. Where a second or more is as quiet as on a table, the bias of the
+    gyro is its mean, as in `rest_at_start`; else it is zero.
 
     Of `std`, tilt and velocity are replaced: the tilt's is what the accelerometer's bias and the
     spread of what is averaged leave of the mean, over half a second to an independent sample; the
@@ -197,12 +201,25 @@ def level_state(
     check_finite("accel", accel)
     independent = max(1.0, 2 * samples * config.dt)
     bias_std, quiet = jnp.asarray(std.accel_bias), (config.rest_gyro, config.rest_accel)
-    rotation, tilt_std, velocity_std = _levelled(
-        gyro, accel, config.dt, bias_std, independent, quiet
-    )
-    std = std._replace(tilt=tilt_std, velocity=velocity_std)
+    long_enough = samples >= round(REST_SECONDS / config.dt)
+    level = _levelled(gyro, accel, config.dt, bias_std, independent, quiet, long_enough)
+    if not isinstance(level.up, Tracer) and (size := np.linalg.norm(level.up)) < LEAST_GRAVITY:
+        problem = f"shows no gravity, its mean is {size:.2g} m/s²"
+        raise ValueError(f"accel: {problem}; it must be in m/s² and include gravity")
+    std = std._replace(tilt=level.tilt_std, velocity=level.velocity_std)
     nothing = np.zeros(3, accel.dtype)
-    return initial_state(config, rotation, nothing, nothing, std=std)
+    return initial_state(config, level.rotation, nothing, nothing, level.gyro_bias, std=std)
+
+
+class _Level(NamedTuple):
+    """What the samples of a level start show."""
+
+    rotation: Array
+    gyro_bias: Array
+    tilt_std: Array
+    velocity_std: Array
+    up: Array
+    """Mean acceleration, m/s²."""
 
 
 # One program, as in `_without_clones`.
@@ -214,17 +231,27 @@ def _levelled(
     bias_std: Array,
     independent: Any,
     quiet_below: tuple[Any, Any],
-) -> tuple[Array, Array, Array]:
-    """Attitude from gravity, and the standard deviations of tilt and velocity."""
-    quiet = (_variance(gyro) < quiet_below[0] ** 2) & (_variance(accel) < quiet_below[1] ** 2)
+    long_enough: Any,
+) -> _Level:
+    """Attitude from gravity, the gyro's bias, and the standard deviations of tilt and velocity."""
+    of_gyro, of_accel = jnp.var(gyro, axis=0), jnp.var(accel, axis=0)
+    at_rest = jnp.all(of_gyro <= REST_GYRO_STD**2) & jnp.all(of_accel <= REST_ACCEL_STD**2)
+    gyro_bias = jnp.where(at_rest & long_enough, gyro.mean(0), 0.0)
+    quiet = (of_gyro.sum() < quiet_below[0] ** 2) & (of_accel.sum() < quiet_below[1] ** 2)
     attitudes = geometry.integrate_turns(jnp.eye(3, dtype=gyro.dtype), gyro[:-1] * dt)
     # A quiet gyro shows its bias alone.
     accel = jnp.where(quiet, accel, jnp.einsum("ijn,nj->ni", attitudes, accel))
-    variance = _variance(accel)
+    variance, up = jnp.sum(jnp.var(accel, axis=0)), accel.mean(0)
     mean_error = jnp.sqrt(bias_std**2 + variance / independent)
     # Bounded before the root, whose slope at zero is infinite.
     velocity = jnp.clip(_SPEED_OF_SPREAD**2 * variance, _STILL_STD**2, _MOVING_STD**2)
-    return geometry.level(accel.mean(0)), mean_error / GRAVITY, jnp.sqrt(velocity)
+    return _Level(
+        rotation=geometry.level(up),
+        gyro_bias=gyro_bias,
+        tilt_std=mean_error / GRAVITY,
+        velocity_std=jnp.sqrt(velocity),
+        up=up,
+    )
 
 
 class Rest(NamedTuple):
@@ -266,8 +293,3 @@ def rest_state(
     state = level_state(config, gyro[second], accel[second], std)
     bias = rest_at_start(gyro, accel, config.dt).gyro_bias
     return state._replace(gyro_bias=jnp.asarray(bias, state.gyro_bias.dtype))
-
-
-def _variance(samples: jax.Array) -> jax.Array:
-    """Of the samples about their mean, summed over the axes."""
-    return jnp.sum(jnp.var(samples, axis=0))

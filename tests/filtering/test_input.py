@@ -13,6 +13,7 @@ from scipy.stats import multivariate_normal
 from gnio_jax import filtering, geometry
 from gnio_jax.filtering import gaps, zero_velocity
 from gnio_jax.filtering.gaps import Gap, Imu
+from gnio_jax.filtering.start import rest_at_start
 from gnio_jax.filtering.zero_velocity import detect_rest
 from gnio_jax.types import Prediction
 from tests.support import scekf_numpy
@@ -459,6 +460,27 @@ def test_level_state_at_rest_takes_a_gyro_for_biased():
         filtering.level_state(CONFIG, np.full((50, 3), bias), accel) for bias in (0.0, 0.05)
     )
     np.testing.assert_array_equal(still.rotation, biased.rotation)
+
+
+@pytest.mark.parametrize("samples, gyro_std, accel_std", [(49, 0, 0), (50, 0.02, 0), (50, 0, 0.2)])
+def test_level_state_takes_the_bias_of_a_second_on_a_table(samples, gyro_std, accel_std):
+    """The mean of the gyro, and nothing of a shorter or a shaken rest."""
+    rng, bias = np.random.default_rng(3), np.array([0.02, -0.01, 0.03])
+    noise = rng.standard_normal((2, 50, 3))
+    gyro, accel = bias + 0.002 * noise[0], [0, 0, 9.81] + 0.02 * noise[1]
+    found = filtering.level_state(CONFIG, gyro, accel).gyro_bias
+    np.testing.assert_allclose(found, gyro.mean(0), rtol=1e-12)
+    np.testing.assert_allclose(found, rest_at_start(gyro, accel, CONFIG.dt).gyro_bias, rtol=1e-12)
+    shaken = gyro + gyro_std * noise[0], accel + accel_std * noise[1]
+    found = filtering.level_state(CONFIG, *(each[:samples] for each in shaken)).gyro_bias
+    np.testing.assert_array_equal(found, 0)
+
+
+@pytest.mark.parametrize("size", [0.0, 1.0])
+def test_level_state_refuses_accelerations_without_gravity(size):
+    """Such as those of a sensor that does not run yet, or that are in units of gravity."""
+    with pytest.raises(ValueError, match=rf"^accel: shows no gravity, its mean is {size:.2g} m/s²"):
+        filtering.level_state(CONFIG, np.zeros((50, 3)), np.tile([0, 0, size], (50, 1)))
 
 
 @pytest.mark.parametrize(
