@@ -4,7 +4,7 @@
 
 RUN is exported to a temporary folder. A synthetic walk is then filtered by `filtering.Tracker` and
 by the exported models, a clone interval of each in turn. The table gives medians over the intervals
-that have a window, by part where the models have parts, and the network in fewer bits.
+that have a window, by part where the models have parts.
 """
 
 from __future__ import annotations
@@ -23,13 +23,10 @@ import numpy as np
 jax.config.update("jax_enable_x64", True)
 
 from gnio_jax import deployment, filtering, pretrained  # noqa: E402
-from gnio_jax.deployment import accuracy, conversion, driver  # noqa: E402
+from gnio_jax.deployment import accuracy, driver  # noqa: E402
 from gnio_jax.deployment.flat_state import start_arrays  # noqa: E402
-from gnio_jax.deployment.precision import in_precision  # noqa: E402
 from gnio_jax.evaluation import inference_network  # noqa: E402
 from gnio_jax.tracking.run import tracking_filter  # noqa: E402
-
-VARIANTS = ("float16", "int8")
 
 
 def main() -> None:
@@ -42,18 +39,11 @@ def main() -> None:
     print(f"{jax.devices()[0].device_kind}, jax {jax.__version__}, {run.config.model}")
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "models"
-        deployment.export_run(arguments.run, out, "onnx")
+        deployment.export_run(arguments.run, out)
         models = driver.open_models(out, arguments.threads)
         drawn = accuracy.draw_walk(run.config.data, arguments.seconds)
-        network = conversion.read(out / "network.onnx")
         setup = tracking_filter(run)
-        windows = accuracy.calibration_windows(models, run.config.data, setup)
-        variants = {}
-        for precision in VARIANTS:
-            path = out / f"{precision}.onnx"
-            conversion.write(in_precision(network, precision, windows), path)
-            variants[precision] = driver.open_session(path, arguments.threads)
-        times = measure(run, models, variants, drawn)
+        times = measure(run, models, drawn)
     period = 1e3 * setup.config.clone_seconds
     print(f"\n{'part':>34} {'p50 ms':>8} {'p99 ms':>8} {'of the period':>14}")
     for part, values in times.items():
@@ -65,9 +55,7 @@ def main() -> None:
     print(f"ONNX / gnio-jax, network:        {theirs / ours:.2f}")
 
 
-def measure(
-    run: Any, models: driver.Models, variants: dict[str, Any], drawn: accuracy.Walk
-) -> dict[str, list[float]]:
+def measure(run: Any, models: driver.Models, drawn: accuracy.Walk) -> dict[str, list[float]]:
     """Seconds of each part of each clone interval that has a window."""
     setup = tracking_filter(run)
     network = inference_network(run.model, run.variables)
@@ -95,9 +83,6 @@ def measure(
             times["gnio-jax, whole"].append(ours)
             jitted, _ = timed(lambda w=window: jax.block_until_ready(apply(w)))
             times["gnio-jax, network"].append(jitted)
-            for precision, session in variants.items():
-                spent, _ = timed(lambda s=session, w=window: driver.run(s, {"window": w}))
-                times[f"ONNX, network in {precision}"].append(spent)
         inputs = {**arrays, **stride, **measured}
         parts["filter step"], after = timed(lambda given=inputs: driver.run(models.step, given))
         arrays = {"state." + key.removeprefix("next."): value for key, value in after.items()}

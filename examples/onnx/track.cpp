@@ -1,4 +1,4 @@
-// Tracks a CSV of IMU samples with the models that `gnio export RUN --to onnx` writes.
+// Tracks a CSV of IMU samples with the models that `gnio export RUN` writes.
 //
 //   track EXPORT walk.csv positions.csv
 //

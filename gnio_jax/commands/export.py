@@ -4,23 +4,21 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import tyro
 
 from gnio_jax.commands import console
 from gnio_jax.commands.options import Command
 
-DESCRIPTION = """A run for programs without Python: ONNX models, or the whole odometry.
+DESCRIPTION = """A run as ONNX models, for programs without Python.
 
-  {prog} runs/mine --to onnx                      (network, start, window and filter step)
-  {prog} runs/mine --to onnx --precision int8 --out exports/mine_int8
-  {prog} runs/mine --to stablehlo                 (one program for jax.export)
+  {prog} runs/mine                                (network, start, window and filter step)
 
-The filter is that of gnio track. Everything is then driven over a minute of a synthetic walk, and
-the deviation from the package is printed. export.json says what each file takes and gives.
-Needs pip install 'gnio-jax[onnx]' or 'gnio-jax[stablehlo]'. docs/deployment.md and examples/onnx
-show the loop around the models."""
+The filter is that of gnio track. The models are then driven over a minute of a synthetic walk, and
+their deviation from the package is printed. export.json lists what each model takes and gives.
+Needs pip install 'gnio-jax[onnx]'. docs/deployment.md and examples/onnx show the loop around the
+models."""
 
 
 @dataclass(frozen=True)
@@ -29,12 +27,8 @@ class ExportOptions:
 
     run: tyro.conf.Positional[Annotated[str, tyro.conf.arg(metavar="RUN")]]
     """Folder of the run, a package or its name."""
-    to: Literal["onnx", "stablehlo"]
-    """onnx for ONNX Runtime, stablehlo for jax.export."""
     out: Path | None = None
-    """Folder to write; by default exports/ and the names of RUN and of the format."""
-    precision: Literal["float32", "float16", "int8"] = "float32"
-    """Of the network; the filter is in float64."""
+    """Folder to write; by default exports/ and the name of RUN."""
 
 
 def export(options: ExportOptions, _prog: str) -> None:
@@ -46,10 +40,10 @@ def export(options: ExportOptions, _prog: str) -> None:
 
     jax.config.update("jax_enable_x64", True)  # for the filter; the network states its float32
     name = Path(options.run).name.removesuffix(".zip")
-    out = options.out or Path("exports") / f"{name}_{options.to}"
+    out = options.out or Path("exports") / name
     with console.terminal() as terminal:
         terminal.progress("exporting and measuring", 0.0)
-        found = deployment.export_run(options.run, out, options.to, options.precision)
+        found = deployment.export_run(options.run, out)
     output = console.stdout()
     for file, size in found.bytes.items():
         output.print(f"  {out / file}  {size / 1e6:.2f} MB", soft_wrap=True)

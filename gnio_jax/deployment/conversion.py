@@ -40,27 +40,23 @@ def to_model(program: Program, setup: FilterSetup) -> Any:
         found = program.function(dict(zip(names, values, strict=True)))
         return [found[name] for name in program.outputs]
 
-    traced = jaxpr_as_fun(jax.make_jaxpr(flat)(*shapes))
-    double = any(each.dtype == np.float64 for each in shapes)
     converted = to_onnx(
-        traced,
+        jaxpr_as_fun(jax.make_jaxpr(flat)(*shapes)),
         shapes,
         model_name=program.name,
         opset=OPSET,
-        enable_double_precision=double,
+        enable_double_precision=any(each.dtype == np.float64 for each in shapes),
         return_mode="ir",
     )
     model = onnx_ir.to_proto(RemoveUnusedNodesPass()(converted).model)
     _name_ends(model.graph, program)
-    onnx.helper.set_model_props(model, _metadata(setup))
+    metadata = {
+        "rate": f"{1 / setup.config.dt:.17g}",
+        "first_measured": str(setup.config.first_measured),
+        "log_std_min": f"{setup.config.log_std_min:.17g}",
+    }
+    onnx.helper.set_model_props(model, metadata)
     return model
-
-
-def read(path: Path) -> Any:
-    """The `onnx.ModelProto` of a file."""
-    import onnx
-
-    return onnx.load(path)
 
 
 def write(model: Any, path: Path) -> None:
@@ -69,15 +65,6 @@ def write(model: Any, path: Path) -> None:
 
     onnx.checker.check_model(model)
     onnx.save(model, path)
-
-
-def _metadata(setup: FilterSetup) -> dict[str, str]:
-    config = setup.config
-    return {
-        "rate": f"{1 / config.dt:.17g}",
-        "first_measured": str(config.first_measured),
-        "log_std_min": f"{config.log_std_min:.17g}",
-    }
 
 
 def _name_ends(graph: Any, program: Program) -> None:
@@ -94,14 +81,7 @@ def _name_ends(graph: Any, program: Program) -> None:
     ]
     del graph.node[:], graph.input[:], graph.output[:], graph.value_info[:]
     graph.node.extend(nodes)
-    graph.input.extend(_described(program.inputs))
-    graph.output.extend(_described(program.outputs))
-
-
-def _described(arrays: dict[str, jax.ShapeDtypeStruct]) -> list[Any]:
-    from onnx import helper
-
-    return [
-        helper.make_tensor_value_info(name, helper.np_dtype_to_tensor_dtype(each.dtype), each.shape)
-        for name, each in arrays.items()
-    ]
+    for ends, arrays in ((graph.input, program.inputs), (graph.output, program.outputs)):
+        for name, each in arrays.items():
+            dtype = helper.np_dtype_to_tensor_dtype(each.dtype)
+            ends.append(helper.make_tensor_value_info(name, dtype, each.shape))

@@ -21,7 +21,7 @@ STATE, NEXT, POSE = "state.", "next.", "pose."
 
 
 class Models(NamedTuple):
-    """Open sessions of the four models, and what they say of themselves."""
+    """Open sessions of the four models, and the numbers of their metadata."""
 
     network: Any
     start: Any
@@ -32,10 +32,10 @@ class Models(NamedTuple):
 
 
 class Walked(NamedTuple):
-    """What the models say of K clone intervals."""
+    """What the models make of K clone intervals."""
 
     windows: Float[np.ndarray, "m n 6"]
-    """That the network saw: none in the first W intervals, m = K − W."""
+    """That the network saw: none in the first `first_measured` intervals, F, m = K − F."""
     displacement: Float[np.ndarray, "m 3"]
     """m."""
     position: Float[np.ndarray, "k 3"]
@@ -52,14 +52,14 @@ def open_models(folder: Path, threads: int = 1) -> Models:
     network, start, window, step = (
         open_session(folder / f"{name}.onnx", threads) for name in names
     )
-    said = step.get_modelmeta().custom_metadata_map
+    metadata = step.get_modelmeta().custom_metadata_map
     return Models(
         network=network,
         start=start,
         window=window,
         step=step,
-        first_measured=int(said["first_measured"]),
-        log_std_min=float(said["log_std_min"]),
+        first_measured=int(metadata["first_measured"]),
+        log_std_min=float(metadata["log_std_min"]),
     )
 
 
@@ -86,7 +86,8 @@ def walk(
     gyro: Float[np.ndarray, "s 3"],
     accel: Float[np.ndarray, "s 3"],
 ) -> Walked:
-    """Filter K·n samples, rad/s and m/s², raw, from a state: `models.start` or `start_arrays`."""
+    """Filter K·n samples, rad/s and m/s², raw, from a state: that of `models.start`, or
+    `start_arrays`."""
     n = _samples(models.step)
     windows, displacements, poses = [], [], []
     for k in range(len(gyro) // n):
@@ -109,10 +110,10 @@ def walk(
 
 
 def measure(models: Models, window: Float[np.ndarray, "1 n 6"]) -> dict[str, np.ndarray]:
-    """What the network says of a window, as the filter step takes it."""
-    said = run(models.network, {"window": window})
-    log_std = np.maximum(said["log_std"][0].astype(float), models.log_std_min)
-    displacement = said["displacement"][0].astype(float)
+    """The prediction of the network for a window, as the filter step takes it."""
+    predicted = run(models.network, {"window": window})
+    log_std = np.maximum(predicted["log_std"][0].astype(float), models.log_std_min)
+    displacement = predicted["displacement"][0].astype(float)
     return {"displacement": displacement, "covariance": np.diag(np.exp(2 * log_std))}
 
 

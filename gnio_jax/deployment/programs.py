@@ -13,14 +13,20 @@ corrects neither the attitude of the oldest clone nor the biases before it measu
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from gnio_jax.deployment.flat_state import PREFIX, DeployedState, FlatState, flat_state, started
+from gnio_jax.deployment.flat_state import (
+    PREFIX,
+    DeployedState,
+    from_arrays,
+    started,
+    state_shape,
+    to_arrays,
+)
 from gnio_jax.evaluation.inference import Network
 from gnio_jax.filtering import Pose, level_state
 from gnio_jax.filtering.displacement import scaled_measurement
@@ -28,16 +34,15 @@ from gnio_jax.filtering.gaps import Imu
 from gnio_jax.filtering.network import network_window
 from gnio_jax.filtering.online import ACCEL, GYRO, advance_filter
 from gnio_jax.filtering.options import FilterSetup
+from gnio_jax.filtering.start import REST_SECONDS
 from gnio_jax.types import Array
 
 NETWORK, START, WINDOW, STEP = "network", "filter_start", "filter_window", "filter_step"
 NEXT = "next."
 """Begins the name of an array of the state after a step."""
-REST_SECONDS = 1.0
-"""Of samples at rest from which `filter_start` makes a state, s."""
 POSE = "pose."
-"""Begins the name of what a step tells besides the state: the fields of `filtering.Pose`."""
-_POSE_FIELDS = tuple(name for name in Pose._fields if name != "time")
+"""Begins the name of what a step returns besides the state: the fields of `filtering.Pose`."""
+_READ_BY_WINDOW = ("clone_rotation", "gyro_bias", "accel_bias", "step", "samples")
 
 Arrays = Mapping[str, Array]
 
@@ -57,67 +62,61 @@ class Program(NamedTuple):
 
 def programs(network: Network, setup: FilterSetup) -> list[Program]:
     """The four programs of a network and its filter. JAX's x64 must be on."""
-    n, flat = setup.config.samples_per_clone, flat_state(setup.config, setup.noise)
-    stride = {"gyro": _float64(n, 3), "accel": _float64(n, 3)}
-    rest = round(REST_SECONDS / setup.config.dt)
+    config, noise = setup.config, setup.noise
+    shape, n = state_shape(setup), config.samples_per_clone
+
+    def infer(arrays: Arrays) -> dict[str, Array]:
+        prediction = network.apply(network.variables, arrays["window"])
+        return {"displacement": prediction.displacement, "log_std": prediction.log_std}
+
+    def start(arrays: Arrays) -> dict[str, Array]:
+        """`level_state` of a second at rest."""
+        state = level_state(config, arrays["gyro"], arrays["accel"], setup.initial_std)
+        return to_arrays(started(state, setup))
+
+    def window(arrays: Arrays) -> dict[str, Array]:
+        """`network_window` between the oldest clone that the next step will have and its end."""
+        state = from_arrays(arrays, shape)
+        samples = _with_latest(state.samples, arrays)
+        rotation = state.filter.clone_rotation[(state.filter.step + 1) % config.clones]
+        signals = samples[:, GYRO], samples[:, ACCEL]
+        return {"window": network_window(state.filter, rotation, *signals, config)}
+
+    def step(arrays: Arrays) -> dict[str, Array]:
+        """`advance_filter` with a given displacement."""
+        state = from_arrays(arrays, shape)
+        given = arrays["displacement"], arrays["covariance"]
+        measurement = scaled_measurement(*given, config, noise)
+        filtered, history = advance_filter(
+            state.filter,
+            Imu(arrays["gyro"], arrays["accel"], None),
+            jnp.zeros(n),
+            lambda state, oldest: (measurement, {}),
+            state.filter.step % config.clones,
+            config,
+            noise,
+        )
+        after = to_arrays(DeployedState(filtered, _with_latest(state.samples, arrays)))
+        state_after = {NEXT + name.removeprefix(PREFIX): value for name, value in after.items()}
+        fields = (name for name in Pose._fields if name != "time")
+        return state_after | {POSE + name: getattr(history, name)[0] for name in fields}
+
+    state = to_arrays(shape)
+    read_by_window = {PREFIX + name: state[PREFIX + name] for name in _READ_BY_WINDOW}
+    interval = {"gyro": _float64(n, 3), "accel": _float64(n, 3)}
+    rest = round(REST_SECONDS / config.dt)
     measured = {"displacement": _float64(3), "covariance": _float64(3, 3)}
-    window = jax.ShapeDtypeStruct((1, setup.config.seen, 6), jnp.float32)
-    read = {f"{PREFIX}{name}": flat.shapes[f"{PREFIX}{name}"] for name in _READ_BY_WINDOW}
-    with_setup = functools.partial(functools.partial, setup=setup, flat=flat)
+    network_input = jax.ShapeDtypeStruct((1, config.seen, 6), jnp.float32)
     return [
-        Program(NETWORK, functools.partial(_network, network=network), {"window": window}),
-        Program(START, with_setup(_start), {"gyro": _float64(rest, 3), "accel": _float64(rest, 3)}),
-        Program(WINDOW, with_setup(_window), read | stride),
-        Program(STEP, with_setup(_step), flat.shapes | stride | measured),
+        Program(NETWORK, infer, {"window": network_input}),
+        Program(START, start, {"gyro": _float64(rest, 3), "accel": _float64(rest, 3)}),
+        Program(WINDOW, window, read_by_window | interval),
+        Program(STEP, step, state | interval | measured),
     ]
 
 
 def _float64(*shape: int) -> jax.ShapeDtypeStruct:
     return jax.ShapeDtypeStruct(shape, jnp.float64)
-
-
-def _network(arrays: Arrays, network: Network) -> dict[str, Array]:
-    prediction = network.apply(network.variables, arrays["window"])
-    return {"displacement": prediction.displacement, "log_std": prediction.log_std}
-
-
-def _start(arrays: Arrays, setup: FilterSetup, flat: FlatState) -> dict[str, Array]:
-    """`level_state` of samples at rest."""
-    state = level_state(setup.config, arrays["gyro"], arrays["accel"], setup.initial_std)
-    return flat.arrays(started(state, setup))
-
-
-_READ_BY_WINDOW = ("clone_rotation", "gyro_bias", "accel_bias", "step", "samples")
-
-
-def _window(arrays: Arrays, setup: FilterSetup, flat: FlatState) -> dict[str, Array]:
-    """`network_window` between the oldest clone that the next step will have and its end."""
-    state, config = flat.state(arrays), setup.config
-    samples = _with_latest(state.samples, arrays)
-    oldest = (state.filter.step + 1) % config.clones
-    rotation = state.filter.clone_rotation[oldest]
-    signals = samples[:, GYRO], samples[:, ACCEL]
-    return {"window": network_window(state.filter, rotation, *signals, config)}
-
-
-def _step(arrays: Arrays, setup: FilterSetup, flat: FlatState) -> dict[str, Array]:
-    """`advance_filter` with a given displacement."""
-    state, config = flat.state(arrays), setup.config
-    stream = Imu(arrays["gyro"], arrays["accel"], None)
-    given = arrays["displacement"], arrays["covariance"]
-    measurement = scaled_measurement(*given, config, setup.noise)
-    filtered, history = advance_filter(
-        state.filter,
-        stream,
-        jnp.zeros(config.samples_per_clone),
-        lambda state, oldest: (measurement, {}),
-        state.filter.step % config.clones,
-        config,
-        setup.noise,
-    )
-    following = flat.arrays(DeployedState(filtered, _with_latest(state.samples, arrays)))
-    renamed = {NEXT + name.removeprefix(PREFIX): value for name, value in following.items()}
-    return renamed | {POSE + name: getattr(history, name)[0] for name in _POSE_FIELDS}
 
 
 def _with_latest(samples: Array, arrays: Arrays) -> Array:

@@ -15,8 +15,10 @@ from gnio_jax.config import DataConfig, FilterOptions, ModelConfig, TrainConfig
 from gnio_jax.data.readers.gait import person
 from gnio_jax.data.readers.synthetic import pedestrian
 from gnio_jax.evaluation import inference_network
+from gnio_jax.numerics import matrix_from_quaternion
 from gnio_jax.tracking.run import tracking_filter
 from gnio_jax.training.checkpoint import load_run
+from gnio_jax.types import GRAVITY
 from tests.support import drawn_run
 
 CONFIG = TrainConfig(
@@ -25,10 +27,12 @@ CONFIG = TrainConfig(
     filter=FilterOptions(std_factor_x=1.5, velocity_std=0.3, gyro_bias_std=1e-3),
 )
 SECONDS = 60.0
+BIAS = np.array([0.02, -0.01, 0.03])
+"""Of the gyro, rad/s."""
 
 
 class Walked(NamedTuple):
-    """A minute of a pedestrian."""
+    """A second at rest and a pedestrian, a minute in all, by a gyro with a bias."""
 
     gyro: np.ndarray
     accel: np.ndarray
@@ -56,7 +60,7 @@ def run(tmp_path_factory):
 
 @pytest.fixture(scope="package")
 def package(run):
-    """The odometry of the package over the walk, from a state that is made of its filter."""
+    """The odometry of the package over the walk, from a state made of its setup."""
     loaded = load_run(run)
     setup = tracking_filter(loaded)
     network = inference_network(loaded.model, loaded.variables)
@@ -73,13 +77,16 @@ def package(run):
 
 @pytest.fixture(scope="package")
 def walked():
-    drawn = pedestrian(5, person(5), seconds=SECONDS, rate=CONFIG.data.rate)
-    return Walked(drawn.gyro, drawn.accel)
+    rate = CONFIG.data.rate
+    drawn, second = pedestrian(5, person(5), seconds=SECONDS - 1, rate=rate), round(rate)
+    gravity = matrix_from_quaternion(drawn.orientation[0]).T @ [0, 0, GRAVITY]
+    gyro = np.concatenate([np.zeros((second, 3)), drawn.gyro])
+    return Walked(gyro + BIAS, np.concatenate([np.tile(gravity, (second, 1)), drawn.accel]))
 
 
 @pytest.fixture(scope="package")
 def models(run):
-    """Folder of the ONNX models, in float32, and what the command said."""
+    """Folder of the ONNX models, and what the command printed."""
     pytest.importorskip("jax2onnx", reason="needs pip install 'gnio-jax[onnx]'")
     pytest.importorskip("onnxruntime", reason="needs pip install 'gnio-jax[onnx]'")
     out = run.parent / "models"
@@ -87,4 +94,4 @@ def models(run):
         # jax2onnx checks itself after each operation over the whole graph: half of its time.
         check = "jax2onnx.converter.output_binding.assert_eqn_outputs_bound"
         patch.setattr(check, lambda *_, **__: None, raising=False)
-        return Path(out), call("export", run, "--to", "onnx", "--out", out)
+        return Path(out), call("export", run, "--out", out)
