@@ -63,7 +63,6 @@ settings = filtering.FilterConfig(
     dt=1 / RATE,
     samples_per_clone=SAMPLES,
     clones_per_window=CLONES,
-    measurement_scale=1.0,  # the errors of these displacements are white
     gate_softness=2.0,  # a gate with a slope
 )
 std_of_start = filtering.InitialStd(accel_bias=0.2)  # a phone's bias, which is no noise
@@ -73,7 +72,12 @@ start = filtering.initial_state(
 
 
 def loss(log_density):
-    noise = filtering.NoiseModel(*jnp.exp(log_density))
+    gyro_density, accel_density = jnp.exp(log_density)
+    noise = filtering.NoiseModel(
+        gyro_density,
+        accel_density,
+        measurement_scale=1.0,  # the errors of these displacements are white
+    )
     _, history = filtering.run_filter(start, gyro, accel, displacement, covariance, settings, noise)
     return -jnp.nanmean(history.log_likelihood)
 

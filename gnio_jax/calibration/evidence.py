@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from gnio_jax import data
-from gnio_jax.config import CalibrateConfig, FilterOptions, TrainConfig
+from gnio_jax.config import CalibrateConfig, FilterSettings, TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import Setup, estimate, inference_network, prepare
 from gnio_jax.evaluation.estimators.result import Estimate
@@ -98,13 +98,13 @@ def gather(
     split: str,
     asked: list[Source],
     config: CalibrateConfig,
-    options: FilterOptions,
+    settings: FilterSettings,
     progress: OnStage,
     workers: int,
 ) -> Evidence:
     """What each network says of its recordings of the split. Raises `InputError` for missing data.
 
-    Displacements are asked for along the filter with `options`: its attitude turns the windows.
+    Displacements are asked for along the filter with `settings`: its attitude turns the windows.
     """
     own = asked[0].run.config
     root = config.data_root or own.data_root
@@ -119,7 +119,7 @@ def gather(
             prepared,
             network,
             own.data,
-            options,
+            settings,
             progress=lambda share, n=number: progress("estimating", (n + share) / len(asked)),
         )
         found.prepared.extend(prepared)

@@ -13,19 +13,26 @@ import numpy as np
 from jaxtyping import Float
 
 from gnio_jax import config as configuration
-from gnio_jax.calibration.considered import Considered, filtered_positions, fit_considered
-from gnio_jax.calibration.errors import std_factors
 from gnio_jax.calibration.evidence import Evidence, OnStage, gather, load_run, sources
-from gnio_jax.calibration.likelihood import Fit, Walks, fit
-from gnio_jax.calibration.unknowns import DIGITS, GROUPS, check_fittable, chosen, with_starts
-from gnio_jax.config import CalibrateConfig, DataConfig, FilterOptions
+from gnio_jax.calibration.fit import (
+    DIGITS,
+    GROUPS,
+    Considered,
+    Fit,
+    Walks,
+    filtered_positions,
+    fit_considered,
+    fit_innovations,
+    start_of_fit,
+    std_factors,
+)
+from gnio_jax.config import CalibrateConfig, DataConfig, FilterSettings
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import true_displacements
 from gnio_jax.evaluation.estimators.result import Estimate
 from gnio_jax.evaluation.preparation import Prepared
 from gnio_jax.files import replacing_folder, write_text
 from gnio_jax.filtering.batch import padded_masks
-from gnio_jax.filtering.options import STD_FACTORS
 from gnio_jax.numerics import filled_up
 from gnio_jax.training import checkpoint
 
@@ -36,10 +43,10 @@ ABOUT = "calibration.json"
 class Calibration(NamedTuple):
     """What `calibrate` found and where it is."""
 
-    before: FilterOptions
+    before: FilterSettings
     fit: Fit
     considered: Considered
-    """Its options are those of the calibrated run."""
+    """Its settings are those of the calibrated run."""
     recordings: int
     folder: Path
 
@@ -60,31 +67,31 @@ def calibrate(
     displacements of a network whose training left it out. Raises `InputError` for a split that is
     neither, an output folder that is there already, and missing data.
     """
-    unknowns = _unknowns(config)
+    paths = _fitted(config)
     workdir = Path(config.workdir) if config.workdir else configuration.newest_run()
     run = load_run(workdir, config)
     folder = _folder(config, workdir)
     split, asked = sources(run, config)
-    check_fittable(run.config.filter, unknowns)
-    uncalibrated = dataclasses.replace(
-        run.config.filter, measurement_scale=1.0, **dict.fromkeys(STD_FACTORS, 1.0)
-    )
+    windows = run.config.data
+    noise = run.config.filter.noise._replace(measurement_scale=1.0, std_factor=(1.0, 1.0, 1.0))
+    uncalibrated = dataclasses.replace(run.config.filter, noise=noise)
+    start_of_fit(uncalibrated, paths)  # its mistakes do not wait for the data
     evidence = gather(split, asked, config, uncalibrated, progress, workers)
-    options = with_starts(_with_factors(uncalibrated, evidence, run.config.data, split), unknowns)
-    walks = _walks(*evidence, run.config.data.stride)
-    found = fit(
+    noise = noise._replace(std_factor=_factors(evidence, windows, split))
+    settings = start_of_fit(dataclasses.replace(uncalibrated, noise=noise), paths)
+    walks = _walks(*evidence, windows.stride)
+    found = fit_innovations(
         walks,
-        run.config.data,
-        options,
-        unknowns,
+        windows,
+        settings,
+        paths,
         lambda calls: progress("fitting", min(1.0, calls / (1.3 * config.steps))),
         config.steps,
     )
     progress("considering", 0.0)
-    windows, options = run.config.data, found.options
     truth = _true_positions(evidence.prepared, windows.stride)
-    positions = filtered_positions(walks, truth, windows, options)
-    considered = fit_considered(positions, windows.stride_seconds, options)
+    positions = filtered_positions(walks, truth, windows, found.settings)
+    considered = fit_considered(positions, windows.stride_seconds, found.settings)
     progress("considering", 1.0)
     recordings = len(evidence.prepared)
     calibration = Calibration(run.config.filter, found, considered, recordings, folder)
@@ -92,30 +99,23 @@ def calibrate(
     return calibration
 
 
-def _with_factors(
-    options: FilterOptions, evidence: Evidence, windows: DataConfig, split: str
-) -> FilterOptions:
-    """The options with the factors of the axes."""
+def _factors(evidence: Evidence, windows: DataConfig, split: str) -> tuple[float, float, float]:
+    """The factors of the axes, as they are written down."""
     truths = [true_displacements(each, windows) for each in evidence.prepared]
     try:
-        factors = std_factors(evidence.estimates, truths)
+        x, y, z = std_factors(evidence.estimates, truths)
     except ValueError as error:
         raise InputError(f"split '{split}'", str(error)) from None
-    by_axis = {
-        name: float(f"{factor:.{DIGITS}g}")
-        for name, factor in zip(STD_FACTORS, factors, strict=True)
-    }
-    return dataclasses.replace(options, **by_axis)
+    return float(f"{x:.{DIGITS}g}"), float(f"{y:.{DIGITS}g}"), float(f"{z:.{DIGITS}g}")
 
 
-def _unknowns(config: CalibrateConfig) -> tuple[str, ...]:
-    """Of the groups that are asked for, each once."""
+def _fitted(config: CalibrateConfig) -> list[str]:
+    """The settings of the groups that are asked for, each once."""
     if not config.fit:
-        remedy = f"name some of {', '.join(GROUPS)}"
-        raise InputError("--fit", "names nothing", remedy)
+        raise InputError("--fit", "names nothing", f"name some of {', '.join(GROUPS)}")
     if config.steps < 1:
         raise InputError("--steps", f"must be at least 1, found {config.steps}")
-    return chosen(tuple(dict.fromkeys(config.fit)))
+    return [path for group in dict.fromkeys(config.fit) for path in GROUPS[group]]
 
 
 def _folder(config: CalibrateConfig, workdir: Path) -> Path:
@@ -172,7 +172,7 @@ def _write(
     split: str,
 ) -> None:
     """The run with its new options, its checkpoint, and what was fitted."""
-    found, options = calibration.fit, calibration.considered.options
+    found, settings = calibration.fit, calibration.considered.settings
     about: dict[str, Any] = {
         "run": str(workdir),
         "checkpoint": config.checkpoint,
@@ -183,15 +183,16 @@ def _write(
         "fitted": list(config.fit),
         "negative_log_likelihood_per_innovation": {"before": found.before, "after": found.after},
         "steps": found.steps,
+        "warnings": list(found.warnings),
         "position_nees_per_axis": {
             "before": calibration.considered.before,
             "after": calibration.considered.after,
         },
-        "filter": dataclasses.asdict(options),
+        "filter": configuration.plain(settings),
     }
     with replacing_folder(calibration.folder) as new:
         experiment = dataclasses.replace(
-            trained.config, workdir=str(calibration.folder), filter=options
+            trained.config, workdir=str(calibration.folder), filter=settings
         )
         configuration.validate(experiment, "the calibrated run")
         configuration.save(new / "config.yaml", experiment)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import dataclasses
+import sys
 
 from rich.table import Table
 
+from gnio_jax import config as configuration
 from gnio_jax.commands import console
 from gnio_jax.commands.options import Command, sibling
-from gnio_jax.config import CalibrateConfig, FilterOptions
+from gnio_jax.config import CalibrateConfig, FilterSettings
 from gnio_jax.cores import usable_cores
 
 DESCRIPTION = """Fit the filter's options of a run to its validation split; write a run with them.
@@ -36,7 +37,7 @@ def calibrate(config: CalibrateConfig, prog: str) -> None:
     filtering.cores_as_devices()
     with console.terminal() as terminal:
         found = calibration.calibrate(config, terminal.progress, usable_cores())
-    console.stdout().print(_table(found.before, found.considered.options))
+    console.stdout().print(_table(found.before, found.considered.settings))
     print(
         "-log-likelihood of an innovation, from the factors of the axes to the end of the fit: "
         f"{found.fit.before:.4f} -> {found.fit.after:.4f} "
@@ -46,16 +47,19 @@ def calibrate(config: CalibrateConfig, prog: str) -> None:
         "squared error of the position over what the filter says of it, per axis: "
         f"{found.considered.before:.2f} -> {found.considered.after:.2f} with the errors considered"
     )
+    for warning in found.fit.warnings:
+        print(f"warning: {warning}", file=sys.stderr)
     print(f"look at it with: {sibling(prog, 'evaluate')} --workdir {found.folder}")
 
 
-def _table(before: FilterOptions, after: FilterOptions) -> Table:
+def _table(before: FilterSettings, after: FilterSettings) -> Table:
     """The options that have changed."""
     table = Table("filter", "before", "calibrated")
-    old, new = dataclasses.asdict(before), dataclasses.asdict(after)
-    for name in old:
-        if old[name] != new[name]:
-            table.add_row(name, f"{old[name]:.4g}", f"{new[name]:.4g}")
+    old = configuration.flat(before)
+    for name, value in configuration.flat(after).items():
+        if value != old.get(name):
+            was = f"{old[name]:.4g}" if old.get(name) is not None else "none"
+            table.add_row(name, was, f"{value:.4g}")
     return table
 
 

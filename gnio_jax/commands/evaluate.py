@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+
+import tyro
 
 from gnio_jax import config as configuration
 from gnio_jax.commands import console
 from gnio_jax.commands.options import Command, called, execute
 from gnio_jax.commands.together import MeetingOptions
-from gnio_jax.config import EvaluateConfig
+from gnio_jax.config import EvaluateConfig, FilterSettings, TrainConfig
 from gnio_jax.cores import usable_cores
 
 DESCRIPTION = """Estimate the trajectories of a split with a trained network and report the errors.
@@ -30,6 +32,12 @@ throughout, and perfect_displacements, the same estimator fed with the reference
 @dataclass(frozen=True)
 class EvaluateOptions(EvaluateConfig, MeetingOptions):
     """What `gnio evaluate` is asked for, and where its processes meet."""
+
+    filter: tyro.conf.Suppress[tyro.conf.Fixed[FilterSettings]] = field(
+        default_factory=FilterSettings
+    )
+    set: tuple[str, ...] = ()
+    """Settings of the filter by name: --set filter.noise.measurement_scale=1"""
 
 
 def defaults(options: EvaluateOptions) -> EvaluateOptions:
@@ -60,6 +68,8 @@ def evaluate(config: EvaluateOptions, prog: str) -> None:
     from gnio_jax.evaluation import table
     from gnio_jax.scaling import processes
 
+    given = configuration.assign(TrainConfig(filter=config.filter), config.set)
+    config = dataclasses.replace(config, filter=given.filter)
     jax.config.update("jax_enable_x64", True)  # for the filter; the network states its float32
     filtering.cores_as_devices()
     processes.meet(config.meeting(), "evaluate")

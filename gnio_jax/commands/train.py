@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
@@ -14,7 +14,7 @@ from gnio_jax import config as configuration
 from gnio_jax.commands import console
 from gnio_jax.commands.options import Command, execute, sibling
 from gnio_jax.commands.together import MeetingOptions
-from gnio_jax.config import CONSIDERED_FIELDS, FilterOptions, TrainConfig
+from gnio_jax.config import ConsideredStd, FilterSettings, TrainConfig
 from gnio_jax.cores import usable_cores
 
 if TYPE_CHECKING:
@@ -43,6 +43,8 @@ class RunOptions:
     """YAML file of settings, or the name of one that comes with the package, e.g. quickstart."""
     resume: tyro.conf.FlagCreatePairsOff[bool] = False
     """Continue the run in the work folder from its latest checkpoint."""
+    set: tuple[str, ...] = ()
+    """Further settings by name, which win over all else: --set filter.noise.gyro_density=3e-4"""
     seeds: tuple[int, ...] = ()
     """Seeds to train together, in the place of --seed: WORKDIR_s0, ..."""
     devices: int | None = None
@@ -54,9 +56,14 @@ class RunOptions:
 class TrainOptions(TrainConfig, RunOptions, MeetingOptions):
     """What `gnio train` is asked for: an experiment, and where its settings come from."""
 
+    filter: tyro.conf.Suppress[tyro.conf.Fixed[FilterSettings]] = field(
+        default_factory=FilterSettings
+    )
+
     def experiment(self) -> TrainConfig:
         """The experiment alone."""
-        return TrainConfig(**{name: getattr(self, name) for name in vars(TrainConfig())})
+        given = {name: getattr(self, name) for name in vars(TrainConfig())}
+        return configuration.assign(TrainConfig(**given), self.set)
 
 
 def defaults(options: TrainOptions) -> TrainOptions:
@@ -77,7 +84,7 @@ def defaults(options: TrainOptions) -> TrainOptions:
     return TrainOptions(**vars(configuration.load(named, base) if named else base))
 
 
-def _filter_to_begin_with(options: TrainOptions, config: TrainConfig) -> FilterOptions:
+def _filter_to_begin_with(options: TrainOptions, config: TrainConfig) -> FilterSettings:
     """The filter that training through the filter starts from, that of a run or package; else the
     default one.
 
@@ -86,16 +93,15 @@ def _filter_to_begin_with(options: TrainOptions, config: TrainConfig) -> FilterO
     initial = options.init_from or config.init_from
     learns = options.through_filter.learn or config.through_filter.learn
     if initial is None or not learns:
-        return FilterOptions()
+        return FilterSettings()
     from gnio_jax import filtering, pretrained
     from gnio_jax.evaluation.run import run_config
     from gnio_jax.pretrained.package import is_package
 
     place = pretrained.find(initial)
     filtering.cores_as_devices()  # before the checkpoint's arrays settle the devices
-    nothing = dict.fromkeys(CONSIDERED_FIELDS, 0.0)
     found = pretrained.load_pretrained(place).config if is_package(place) else run_config(place)
-    return dataclasses.replace(found.filter, **nothing)
+    return dataclasses.replace(found.filter, considered=ConsideredStd())
 
 
 def train(options: TrainOptions, prog: str) -> None:

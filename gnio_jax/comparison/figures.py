@@ -6,12 +6,11 @@ import dataclasses
 import errno
 import json
 import math
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from gnio_jax import evaluation
-from gnio_jax.config import EvaluateConfig, FilterOptions
+from gnio_jax.config import EvaluateConfig, FilterSettings, plain
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import report
 from gnio_jax.evaluation.metrics import NAMES
@@ -170,7 +169,7 @@ def _of_others(figures: Figures, asked: Recordings) -> str | None:
 
 
 def _out_of_date(
-    workdir: Path | None, figures: Figures, options: FilterOptions | None
+    workdir: Path | None, figures: Figures, options: FilterSettings | None
 ) -> str | None:
     """Why figures cannot stand for the run in `workdir`, as far as that is known; None where they
     can. `options`: the filter that they must be of."""
@@ -180,6 +179,6 @@ def _out_of_date(
     step, which = settings.get("step"), settings.get("checkpoint") or "best"
     if workdir and step is not None and not (workdir / "checkpoints" / which / str(step)).is_dir():
         return "is of a checkpoint that the run has no more"
-    if options and settings.get("filter", asdict(options)) != asdict(options):
+    if options and settings.get("filter", plain(options)) != plain(options):
         return "is of another filter than the run's"
     return None

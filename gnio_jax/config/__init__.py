@@ -5,44 +5,67 @@ the command line win over the file, the file wins over the defaults, and the def
 paper's.
 """
 
+from gnio_jax.config.files import (
+    assign,
+    default_workdir,
+    find,
+    flat,
+    load,
+    names,
+    newest_run,
+    parse,
+    plain,
+    save,
+    text,
+    validate,
+    value_from_words,
+    with_seeds,
+)
 from gnio_jax.config.requests import CalibrateConfig, CompareConfig, EvaluateConfig, TablesConfig
-from gnio_jax.config.runs import default_workdir, newest_run, with_seeds
 from gnio_jax.config.schema import (
-    CONSIDERED_FIELDS,
     AugmentConfig,
+    ConsideredStd,
+    CorrelatedError,
     DataConfig,
-    FilterOptions,
+    FilterSettings,
+    InitialStd,
     LossConfig,
     ModelConfig,
+    NoiseModel,
     OptimConfig,
+    ThroughFilter,
     TrainConfig,
 )
-from gnio_jax.config.through_filter import ThroughFilter
-from gnio_jax.config.validation import validate
-from gnio_jax.config.yaml_files import find, load, names, parse, save, text
 
 __all__ = [
-    "CONSIDERED_FIELDS",
     "AugmentConfig",
     "CalibrateConfig",
     "CompareConfig",
+    "ConsideredStd",
+    "CorrelatedError",
     "DataConfig",
     "EvaluateConfig",
-    "FilterOptions",
+    "FilterSettings",
+    "InitialStd",
     "LossConfig",
     "ModelConfig",
+    "NoiseModel",
     "OptimConfig",
     "TablesConfig",
     "ThroughFilter",
     "TrainConfig",
+    "assign",
     "default_workdir",
     "find",
+    "flat",
     "load",
     "names",
     "newest_run",
     "parse",
+    "plain",
     "save",
     "text",
     "validate",
+    "value_from_words",
     "with_seeds",
 ]

@@ -8,8 +8,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from gnio_jax.config.bounds import Count
-from gnio_jax.config.schema import FilterOptions
+from gnio_jax.config.schema import Count, FilterSettings
 
 Table = Literal[
     "complexity",
@@ -23,7 +22,7 @@ Table = Literal[
     "standing",
 ]
 
-CalibratedGroup = Literal["measurement", "noise", "start", "window", "walk"]
+CalibratedGroup = Literal["measurement", "noise", "start", "window"]
 
 
 @dataclass(frozen=True)
@@ -67,7 +66,7 @@ class EvaluateConfig:
     report.html."""
     rerun: str | None = None
     """File to write for the viewer Rerun, NAME.rrd: paths, covariances, IMU, gate."""
-    filter: FilterOptions = field(default_factory=FilterOptions)
+    filter: FilterSettings = field(default_factory=FilterSettings)
     """Noise and start of the filter; by default the run's own."""
 
 
@@ -91,9 +90,8 @@ class CalibrateConfig:
     fit: tuple[CalibratedGroup, ...] = ("measurement", "noise", "window")
     """What is fitted by the likelihood of the innovations: `measurement`, the factor of the
     network's covariance; `noise`, the IMU's; `start`, the standard deviations of the initial
-    biases; `window`, the part of a window's error that lasts; `walk`, the errors of speed and
-    heading that last. The factors of the axes and the errors that are considered are always
-    fitted."""
+    biases; `window`, the part of a window's error that is temporally correlated. The factors of the
+    axes and the errors that are considered are always fitted."""
     average_headings: bool = False
     """Average the network over four headings, as model.equivariance: four_headings does, whatever
     the run says. The network must have learnt from walks turned by a random yaw."""

@@ -1,26 +1,70 @@
-"""The sections of an experiment's configuration: frozen dataclasses whose field comments are the
-text of `--help` and whose types carry the bounds of the values.
+"""The sections of an experiment: frozen dataclasses, and tuples of the numbers that the filter uses
+as they stand here. The comments of the fields are the text of `--help`; their types carry bounds.
 
 A section that relates several fields to each other checks them in `check`.
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Annotated, Any, Literal, NamedTuple, NoReturn
 
-from gnio_jax.config.bounds import (
-    Count,
-    FiniteNonNegative,
-    Fraction,
-    NonNegative,
-    NonNegativeCount,
-    Positive,
-    Probability,
-    TwoOrThree,
-)
-from gnio_jax.config.through_filter import ThroughFilter
 from gnio_jax.errors import InputError
+
+
+class Place(NamedTuple):
+    """Where settings stand: in a file or on the command line, and in which section."""
+
+    source: str
+    section: str = ""
+    """Names joined by dots; empty at the top."""
+
+    def below(self, name: str) -> Place:
+        """The section or the field `name` of this section."""
+        return Place(self.source, f"{self.section}.{name}" if self.section else name)
+
+    def refuse(self, field: str, problem: str, remedy: str = "") -> NoReturn:
+        """Raise the `InputError` of a field of this section."""
+        raise InputError(self.source, f"field '{self.below(field).section}' {problem}", remedy)
+
+
+class Bound(NamedTuple):
+    """What a value, or each number of a tuple, must fulfil. A field that is None has no value and
+    fulfils every bound."""
+
+    holds: Callable[[Any], bool]
+    problem: str
+    """How the message goes on after the field's name."""
+
+
+MOST = 1e9
+"""No window, stride or segment has more samples or strides (ours): a mistake of units."""
+
+
+def _is_whole(number: float) -> bool:
+    return number <= MOST and abs(number - round(number)) < 1e-6
+
+
+Number = Any
+"""A float in a file. Inside a JAX program it may be an array, so type checkers take anything."""
+
+ABOVE_ZERO = Bound(lambda value: 0 < value < math.inf, "must be positive and finite")
+NOT_NEGATIVE = Bound(lambda value: 0 <= value < math.inf, "must be finite and not negative")
+SHARE = Bound(lambda value: 0 <= value < 1, "must be at least 0 and below 1")
+
+Positive = Annotated[float, ABOVE_ZERO]
+NonNegative = Annotated[float, NOT_NEGATIVE]
+Finite = Annotated[float, Bound(math.isfinite, "must be finite")]
+Fraction = Annotated[float, Bound(lambda value: 0 < value < 1, "must be between 0 and 1")]
+Probability = Annotated[float, SHARE]
+Count = Annotated[int, Bound(lambda value: 1 <= value < 2**31, "must be at least 1 and below 2^31")]
+NonNegativeCount = Annotated[
+    int, Bound(lambda value: 0 <= value < 2**31, "must not be negative and below 2^31")
+]
+Seed = Annotated[int, Bound(lambda value: 0 <= value < 2**32, "must be from 0 to 2^32 - 1")]
+TwoOrThree = Annotated[int, Bound(lambda value: value in (2, 3), "must be 2 or 3")]
 
 
 @dataclass(frozen=True)
@@ -81,7 +125,7 @@ class DataConfig:
         """Samples between window starts in training."""
         return round(self.train_stride_seconds * self.rate)
 
-    def check(self, prefix: str, source: str) -> None:
+    def check(self, at: Place) -> None:
         """Window, context and strides are whole samples, and strides fill window and context."""
         for name in (
             "window_seconds",
@@ -90,18 +134,20 @@ class DataConfig:
             "train_stride_seconds",
         ):
             samples = getattr(self, name) * self.rate
-            if abs(samples - round(samples)) >= 1e-6:
-                problem = f"is not a whole number of samples at {self.rate:g} Hz ({samples:g})"
-                raise InputError(source, f"field '{prefix}{name}' {problem}")
+            if not _is_whole(samples):
+                at.refuse(
+                    name, f"is not a whole number of samples at {self.rate:g} Hz ({samples:g})"
+                )
+        for name in ("window_seconds", "stride_seconds", "train_stride_seconds"):
+            if round(getattr(self, name) * self.rate) < 1:
+                at.refuse(name, f"is less than one sample at {self.rate:g} Hz")
         if self.window % self.stride:
-            problem = f"must divide the window of {self.window_seconds:g} s"
-            raise InputError(source, f"field '{prefix}stride_seconds' {problem}")
+            at.refuse("stride_seconds", f"must divide the window of {self.window_seconds:g} s")
         if self.context % self.stride:
-            problem = f"must divide the context of {self.context_seconds:g} s"
-            raise InputError(source, f"field '{prefix}stride_seconds' {problem}")
+            at.refuse("stride_seconds", f"must divide the context of {self.context_seconds:g} s")
         if self.left_out >= self.folds:
             problem = f"must be below data.folds, which is {self.folds}, found {self.left_out}"
-            raise InputError(source, f"field '{prefix}left_out' {problem}")
+            at.refuse("left_out", problem)
 
 
 @dataclass(frozen=True)
@@ -175,18 +221,18 @@ class LossConfig:
     """Weighted sum of squared error, absolute error and negative log-likelihood of the
     displacement, with the weights below; or CTIN's loss: errors of velocity and position and the
     likelihood of each sample's velocity, weighted by two learnt parameters."""
-    mse_weight: float = 1e2
+    mse_weight: NonNegative = 1e2
     """λ_MSE."""
-    mae_weight: float = 0.0
+    mae_weight: NonNegative = 0.0
     """Weight of the absolute error, summed over the axes (DeepILS: equal to λ_MSE)."""
-    nll_weight: float = 1e-4
+    nll_weight: NonNegative = 1e-4
     """λ_NLL."""
-    nll_from_epoch: FiniteNonNegative = 0.0
+    nll_from_epoch: NonNegative = 0.0
     """Epochs before the likelihood counts. Above 0: the two-stage reading of the paper's text."""
-    log_std_from_epoch: FiniteNonNegative = 0.0
+    log_std_from_epoch: NonNegative = 0.0
     """Epochs before the likelihood trains the uncertainty; until then it trains the displacement
     alone (TLIO: 10)."""
-    log_std_floor: float | None = None
+    log_std_floor: Finite | None = None
     """Smallest log standard deviation in the likelihood (TLIO: log 1e-3); none by default."""
 
 
@@ -207,11 +253,11 @@ class OptimConfig:
     the same step. In training, batch normalisation then sees a part."""
     learning_rate: Positive = 1e-4
     """Peak learning rate, reached after the warm-up."""
-    start_learning_rate: float = 1e-6
+    start_learning_rate: NonNegative = 1e-6
     """Learning rate at the first step."""
-    end_learning_rate: float = 1e-6
+    end_learning_rate: NonNegative = 1e-6
     """Learning rate at the last step."""
-    warmup_epochs: FiniteNonNegative = 5.0
+    warmup_epochs: NonNegative = 5.0
     """Epochs of linear warm-up; a run shorter than twice this warms up for its first half."""
     clip_norm: Positive | None = None
     """Largest global norm of the gradient; none by default."""
@@ -235,84 +281,112 @@ class OptimConfig:
     validated, kept as best and evaluated, while training goes on without them. 0 averages
     nothing."""
 
-    def check(self, prefix: str, source: str) -> None:
+    def check(self, at: Place) -> None:
         """Running statistics of batch normalisation are not those of averaged parameters. Parts of
         a batch have one size."""
         if self.batch_size % self.accumulate:
-            problem = f"field '{prefix}accumulate' is {self.accumulate}"
-            remedy = f"it must divide {prefix}batch_size, which is {self.batch_size}"
-            raise InputError(source, problem, remedy)
+            remedy = f"it must divide {at.below('batch_size').section}, which is {self.batch_size}"
+            at.refuse("accumulate", f"is {self.accumulate}", remedy)
         if self.ema_decay and not self.statistics_windows:
-            problem = f"field '{prefix}ema_decay' is set without {prefix}statistics_windows"
+            problem = f"is set without {at.below('statistics_windows').section}"
             remedy = "averaged parameters want statistics of their own: set it, e.g. to 16384"
-            raise InputError(source, problem, remedy)
+            at.refuse("ema_decay", problem, remedy)
 
 
-CONSIDERED_FIELDS = (
-    "considered_gyro_bias_std",
-    "considered_scale_std",
-    "considered_heading_std_degrees",
-    "considered_slope_std",
-)
-"""Fields of `FilterOptions`: errors that the filter reports but does not estimate."""
+class CorrelatedError(NamedTuple):
+    """The part of a window's error that is temporally correlated (ours): a first-order Gauss–Markov
+    process, since windows overlap and the errors of neighbours are alike."""
+
+    share: Annotated[Number, SHARE] = 0.8
+    """Share c of the network's standard deviation; the rest is white."""
+    seconds: Annotated[Number, ABOVE_ZERO] = 0.5
+    """Time constant τ, s."""
+
+
+class NoiseModel(NamedTuple):
+    """White noise of the IMU as densities, so that it does not depend on the rate, random walks of
+    its biases, and how the filter takes the network's covariances. Each number may be traced.
+
+    The defaults of the IMU are TLIO's per-sample values, tuned at about 1 kHz, as densities.
+    """
+
+    gyro_density: Annotated[Number, ABOVE_ZERO] = 3.16e-4
+    """White gyro noise, rad/s/√Hz."""
+    accel_density: Annotated[Number, ABOVE_ZERO] = 1.0e-3
+    """White accelerometer noise, m/s²/√Hz."""
+    gyro_bias_walk: Annotated[Number, NOT_NEGATIVE] = 1e-6
+    """Random walk of the gyro bias, rad/s/√s."""
+    accel_bias_walk: Annotated[Number, NOT_NEGATIVE] = 1e-4
+    """Random walk of the accelerometer bias, m/s²/√s."""
+    std_factor: Annotated[tuple[Number, Number, Number], ABOVE_ZERO] = (1.0, 1.0, 1.0)
+    """Factors of the network's standard deviations along x, y, z of the window's yaw frame (ours;
+    what `gnio calibrate` finds that they lack)."""
+    measurement_scale: Annotated[Number, ABOVE_ZERO] = 10.0
+    """Factor of the network's covariance in the update: overlapping windows are not independent
+    (TLIO)."""
+    correlation: CorrelatedError | None = None
+    """Temporally correlated part of a window's error; by default the error is white."""
+
+    @classmethod
+    def per_sample(
+        cls,
+        gyro_std: Any,
+        accel_std: Any,
+        dt: Any,
+        gyro_bias_walk: Any = 1e-6,
+        accel_bias_walk: Any = 1e-4,
+    ) -> NoiseModel:
+        """From the standard deviation of one sample, rad/s and m/s², at `dt` seconds per sample:
+        density = σ √dt."""
+        root = dt**0.5
+        return cls(gyro_std * root, accel_std * root, gyro_bias_walk, accel_bias_walk)
+
+
+class InitialStd(NamedTuple):
+    """Standard deviations of the initial state; the defaults are TLIO's. Each may be traced."""
+
+    tilt: Annotated[Number, NOT_NEGATIVE] = math.radians(1.0)
+    """Rotation about the world's x and y, rad."""
+    yaw: Annotated[Number, NOT_NEGATIVE] = math.radians(0.1)
+    """Rotation about the world's z, rad."""
+    velocity: Annotated[Number, NOT_NEGATIVE] = 1.0
+    """Velocity, m/s."""
+    position: Annotated[Number, NOT_NEGATIVE] = 1e-3
+    """Position, m."""
+    gyro_bias: Annotated[Number, NOT_NEGATIVE] = 1e-4
+    """Gyro bias, rad/s."""
+    accel_bias: Annotated[Number, NOT_NEGATIVE] = 0.02
+    """Accelerometer bias, m/s²."""
+
+
+TLIO_STD = InitialStd()
+
+
+class ConsideredStd(NamedTuple):
+    """Standard deviations of errors that the filter does not estimate but reports in the covariance
+    of its trajectories (ours; consider covariance analysis). No trajectory depends on them."""
+
+    gyro_bias: Annotated[Number, NOT_NEGATIVE] = 0.0
+    """Bias of each gyro axis beside its first estimate, rad/s."""
+    scale: Annotated[Number, NOT_NEGATIVE] = 0.0
+    """Logarithm of the scale of the displacements."""
+    heading: Annotated[Number, NOT_NEGATIVE] = 0.0
+    """Heading of the displacements, rad."""
+    slope: Annotated[Number, NOT_NEGATIVE] = 0.0
+    """Slope of the displacements, metres up for each metre forward."""
 
 
 @dataclass(frozen=True)
-class FilterOptions:
-    """Noise and initial uncertainty of the stochastic-cloning EKF (paper §III-G; TLIO's values)."""
+class FilterSettings:
+    """The stochastic-cloning EKF of an experiment (paper §III-G; TLIO's values). Its sections are
+    the tuples that `filtering.run_odometry` takes."""
 
-    gyro_density: Positive = 3.16e-4
-    """White gyro noise, rad/s/√Hz."""
-    accel_density: Positive = 1.0e-3
-    """White accelerometer noise, m/s²/√Hz."""
-    gyro_bias_walk: NonNegative = 1e-6
-    """Random walk of the gyro bias, rad/s/√s."""
-    accel_bias_walk: NonNegative = 1e-4
-    """Random walk of the accelerometer bias, m/s²/√s."""
-    tilt_std_degrees: NonNegative = 1.0
-    """Initial standard deviation of roll and pitch."""
-    yaw_std_degrees: NonNegative = 0.1
-    """Initial standard deviation of yaw."""
-    velocity_std: NonNegative = 1.0
-    """Initial standard deviation of the velocity, m/s."""
-    position_std: NonNegative = 1e-3
-    """Initial standard deviation of the position, m."""
-    gyro_bias_std: NonNegative = 1e-4
-    """Initial standard deviation of the gyro bias, rad/s."""
-    accel_bias_std: NonNegative = 0.02
-    """Initial standard deviation of the accelerometer bias, m/s²."""
-    measurement_scale: Positive = 10.0
-    """Factor of the network's covariance in the update."""
-    std_factor_x: Positive = 1.0
-    """Factor of the network's standard deviation along x of the window's yaw frame (ours; what
-    `gnio calibrate` finds that it lacks)."""
-    std_factor_y: Positive = 1.0
-    """The same along y."""
-    std_factor_z: Positive = 1.0
-    """The same along z."""
-    window_error_share: Probability = 0.0
-    """Share of a window's standard deviation that lasts beyond the window (ours); 0: its error is
-    white."""
-    window_error_seconds: Positive = 0.5
-    """Time constant of that error, s."""
-    scale_error_std: NonNegative = 0.0
-    """Standard deviation of the walker's speed over what the network says of it, as a fraction
-    (ours); 0: the displacements have no such error."""
-    heading_error_std_degrees: NonNegative = 0.0
-    """Standard deviation of the displacements' heading (ours); 0: they have no such error."""
-    walk_error_seconds: Positive = 60.0
-    """Time constant of both, s."""
-    considered_gyro_bias_std: NonNegative = 0.0
-    """Standard deviation, rad/s, of the gyro's bias that the filter does not try to estimate but
-    reports in the covariance of its trajectories (ours; consider covariance analysis). The
-    trajectory does not depend on this nor on the next three. Smoother and Tracker count them where
-    they are given (`considered=`)."""
-    considered_scale_std: NonNegative = 0.0
-    """The same of the displacements' scale, as a fraction."""
-    considered_heading_std_degrees: NonNegative = 0.0
-    """The same of their heading."""
-    considered_slope_std: NonNegative = 0.0
-    """The same of their slope, metres up for each metre forward."""
+    noise: NoiseModel = field(default_factory=NoiseModel)
+    """Noise of the IMU and of the network's displacements."""
+    start: InitialStd = TLIO_STD
+    """Standard deviations of the initial state."""
+    considered: ConsideredStd = field(default_factory=ConsideredStd)
+    """Errors in the covariance that are not estimated (Schmidt's consider states)."""
     mahalanobis_fail_scale: NonNegative = 0.0
     """0 skips an update that the χ² gate rejects; above 0 the update is applied with its covariance
     multiplied by this."""
@@ -320,6 +394,58 @@ class FilterOptions:
     """How the tight coupling cuts and rotates the network's windows; by default as in training.
     `tlio` does it as TLIO's tracker: a sample earlier and without the filter's biases, for weights
     trained that way."""
+
+
+SHORTEST_HORIZON = 1.0
+"""s, of the relative errors in the losses through the filter."""
+Part = Literal["noise", "measurement", "start", "uncertainty", "head", "encoder", "all"]
+"""A part of network and filter that can learn."""
+
+
+@dataclass(frozen=True)
+class ThroughFilter:
+    """Training with the network in the filter's loop (ours), from the weights of `init_from`. The
+    section `optim` counts pieces instead of windows; `loss` is for windows alone, and so is
+    `augment` but for its `yaw`."""
+
+    learn: tuple[Part, ...] = ()
+    """Parts that learn; none: the network is trained on windows. noise: the filter's densities and
+    bias walks; measurement: the factors of the network's covariance and the errors that last;
+    start: the standard deviations at the start; uncertainty, head, encoder: the network's; all:
+    everything. A filter option that is 0 stays 0."""
+    piece_seconds: Positive = 60.0
+    """Length of the pieces of recordings that are filtered, s."""
+    truncate_seconds: Positive = 10.0
+    """The filter's state is carried on without gradient after every so many seconds."""
+    start_spread: NonNegative = 1.0
+    """Each piece starts off the reference by errors drawn from the filter's initial standard
+    deviations times this; 0 starts at the reference."""
+    gate_softness: NonNegative = 2.0
+    """Slope of the χ² gate in training (`FilterConfig.gate_softness`); validation has the gate that
+    evaluation has."""
+    filter_learning_rate: Positive = 0.03
+    """Peak learning rate of the logarithms of the filter's options; the network's is
+    optim.learning_rate. Both have its schedule."""
+    skip_above: Positive = 1000.0
+    """A step is skipped, and counted in the log, when the norm of its gradient is above this, or
+    anything in it is not finite, or the filter diverged."""
+    displacement_weight: NonNegative = 100.0
+    """Weight of the relative error of displacements over 1, 5, 10, 30 and 60 s."""
+    yaw_weight: NonNegative = 1000.0
+    """Weight of the relative error of yaw over the same times."""
+    innovation_weight: NonNegative = 0.1
+    """Weight of the negative log-likelihood of the innovations."""
+    state_weight: NonNegative = 0.1
+    """Weight of the negative log-likelihood of the true velocity and position under the filter's
+    covariance."""
+    window_weight: NonNegative = 100.0
+    """Weight of the squared error of each window's displacement."""
+
+    def check(self, at: Place) -> None:
+        """Truncation divides the piece."""
+        ratio = self.piece_seconds / self.truncate_seconds
+        if not _is_whole(ratio) or ratio < 1:
+            at.refuse("truncate_seconds", f"must divide the piece of {self.piece_seconds:g} s")
 
 
 @dataclass(frozen=True)
@@ -336,57 +462,54 @@ class TrainConfig:
     """Run, or package of weights (see gnio weights), with the same network, whose best weights
     training starts from; by default they are drawn. Through the filter, `gnio train` also begins
     with its filter options."""
-    seed: int = 0
+    seed: Seed = 0
     """Seed of the initial parameters, the shuffling and the augmentation."""
     data: DataConfig = field(default_factory=DataConfig)
     augment: AugmentConfig = field(default_factory=AugmentConfig)
     model: ModelConfig = field(default_factory=ModelConfig)
     loss: LossConfig = field(default_factory=LossConfig)
     optim: OptimConfig = field(default_factory=OptimConfig)
-    filter: FilterOptions = field(default_factory=FilterOptions)
+    filter: FilterSettings = field(default_factory=FilterSettings)
     through_filter: ThroughFilter = field(default_factory=ThroughFilter)
-    checkpoint_every_seconds: float = 600.0
+    checkpoint_every_seconds: NonNegative = 600.0
     """Longest time between checkpoints within an epoch, s; every epoch ends with one anyway."""
 
-    def check(self, prefix: str, source: str) -> None:
+    def check(self, at: Place) -> None:
         """Four headings are averaged only if training shows windows of every heading. A network
         that learns through the filter has weights, and its pieces are whole strides and longer
         than a window and its context. A network that predicts every sample takes no context."""
         if self.data.context and self.model.name == "ctin":
-            problem = f"field '{prefix}data.context_seconds' is not for ctin"
-            raise InputError(source, problem, "it predicts every sample it sees: set it to 0")
+            remedy = "it predicts every sample it sees: set it to 0"
+            at.refuse("data.context_seconds", "is not for ctin", remedy)
         if self.model.equivariance == "four_headings" and not self.augment.yaw:
-            problem = f"field '{prefix}model.equivariance' is four_headings without augment.yaw"
+            problem = "is four_headings without augment.yaw"
             remedy = "training must show every heading: set augment.yaw to true"
-            raise InputError(source, problem, remedy)
-        self._check_through_filter(prefix, source)
+            at.refuse("model.equivariance", problem, remedy)
+        self._check_through_filter(at)
 
-    def _check_through_filter(self, prefix: str, source: str) -> None:
+    def _check_through_filter(self, at: Place) -> None:
         through = self.through_filter
         if not through.learn:
             return
         if self.optim.ema_decay:
-            problem = f"field '{prefix}optim.ema_decay' is for training on windows alone"
-            raise InputError(source, problem, "set it to 0")
+            at.refuse("optim.ema_decay", "is for training on windows alone", "set it to 0")
         if self.optim.accumulate > 1:
-            problem = f"field '{prefix}optim.accumulate' is for training on windows alone"
-            raise InputError(source, problem, "set it to 1")
+            at.refuse("optim.accumulate", "is for training on windows alone", "set it to 1")
         if self.model.dtype != "float32":
-            problem = f"field '{prefix}model.dtype' is for training on windows alone"
-            raise InputError(source, problem, "set it to float32")
+            at.refuse("model.dtype", "is for training on windows alone", "set it to float32")
         if self.data.residency == "host":
-            problem = f"field '{prefix}data.residency' is for training on windows alone"
-            raise InputError(source, problem, "set it to device")
+            at.refuse("data.residency", "is for training on windows alone", "set it to device")
         for name in ("piece_seconds", "truncate_seconds"):
-            strides = getattr(through, name) / self.data.stride_seconds
-            if abs(strides - round(strides)) >= 1e-6:
+            if not _is_whole(getattr(through, name) / self.data.stride_seconds):
                 problem = f"is not a whole number of strides of {self.data.stride_seconds:g} s"
-                raise InputError(source, f"field '{prefix}through_filter.{name}' {problem}")
+                at.refuse(f"through_filter.{name}", problem)
         if through.gate_softness > 0 and self.filter.mahalanobis_fail_scale > 0:
             problem = "makes no sense beside filter.mahalanobis_fail_scale"
-            field_name = f"field '{prefix}through_filter.gate_softness'"
-            raise InputError(source, f"{field_name} {problem}", "set one of them to 0")
+            at.refuse("through_filter.gate_softness", problem, "set one of them to 0")
         seen = self.data.context_seconds + self.data.window_seconds
         if through.piece_seconds < seen + 2 * self.data.stride_seconds:
             problem = f"must be longer than the {seen:g} s that the network sees"
-            raise InputError(source, f"field '{prefix}through_filter.piece_seconds' {problem}")
+            at.refuse("through_filter.piece_seconds", problem)
+        if through.piece_seconds < SHORTEST_HORIZON:
+            problem = f"must be at least {SHORTEST_HORIZON:g} s, the shortest time of its losses"
+            at.refuse("through_filter.piece_seconds", problem)

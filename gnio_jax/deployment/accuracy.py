@@ -15,7 +15,7 @@ from gnio_jax.errors import InputError
 from gnio_jax.evaluation.inference import Network
 from gnio_jax.evaluation.metrics import ate
 from gnio_jax.filtering import FilterHistory, initial_state, run_odometry
-from gnio_jax.filtering.options import FilterSetup
+from gnio_jax.filtering.settings import FilterSetup
 from gnio_jax.numerics import matrix_from_quaternion
 from gnio_jax.types import Prediction
 

@@ -17,7 +17,7 @@ import numpy as np
 from jax.extend.core import jaxpr_as_fun
 
 from gnio_jax.deployment.programs import Program
-from gnio_jax.filtering.options import FilterSetup
+from gnio_jax.filtering.settings import FilterSetup
 
 OPSET = 18
 """Of the ONNX operators: ONNX Runtime 1.14 or newer reads it."""

@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from gnio_jax.filtering import FilterState
 from gnio_jax.filtering.inputs import checked_state, state_shapes
-from gnio_jax.filtering.options import FilterSetup
+from gnio_jax.filtering.settings import FilterSetup
 from gnio_jax.types import Array
 
 PREFIX = "state."

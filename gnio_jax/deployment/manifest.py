@@ -13,7 +13,7 @@ import jax
 import numpy as np
 
 from gnio_jax.deployment.programs import Program
-from gnio_jax.filtering.options import FilterSetup
+from gnio_jax.filtering.settings import FilterSetup
 
 FORMAT, VERSION = "gnio-export", 3
 MANIFEST = "export.json"

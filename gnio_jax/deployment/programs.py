@@ -33,7 +33,7 @@ from gnio_jax.filtering.displacement import scaled_measurement
 from gnio_jax.filtering.gaps import Imu
 from gnio_jax.filtering.network import network_window
 from gnio_jax.filtering.online import ACCEL, GYRO, advance_filter
-from gnio_jax.filtering.options import FilterSetup
+from gnio_jax.filtering.settings import FilterSetup
 from gnio_jax.filtering.start import REST_SECONDS
 from gnio_jax.types import Array
 
@@ -86,7 +86,7 @@ def programs(network: Network, setup: FilterSetup) -> list[Program]:
         """`advance_filter` with a given displacement."""
         state = from_arrays(arrays, shape)
         given = arrays["displacement"], arrays["covariance"]
-        measurement = scaled_measurement(*given, config, noise)
+        measurement = scaled_measurement(*given, noise)
         filtered, history = advance_filter(
             state.filter,
             Imu(arrays["gyro"], arrays["accel"], None),

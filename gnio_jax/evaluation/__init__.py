@@ -28,7 +28,7 @@ from gnio_jax.evaluation.report import Report
 from gnio_jax.evaluation.run import Evaluation, evaluate
 from gnio_jax.evaluation.scores import Scores, score
 from gnio_jax.evaluation.setup import Setup, resolve
-from gnio_jax.filtering.options import FilterSetup, filter_setup
+from gnio_jax.filtering.settings import FilterSetup, filter_setup
 
 __all__ = [
     "Estimate",

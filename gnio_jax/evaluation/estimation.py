@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-from gnio_jax.config import DataConfig, FilterOptions
+from gnio_jax.config import DataConfig, FilterSettings
 from gnio_jax.evaluation.estimators.filtered import Measurements, run_filters
 from gnio_jax.evaluation.estimators.integrated import integrate
 from gnio_jax.evaluation.estimators.result import Estimate, at_window_ends
@@ -31,7 +31,7 @@ from gnio_jax.evaluation.setup import (
     resolve,
 )
 from gnio_jax.filtering import ConsideredStd
-from gnio_jax.filtering.options import FilterSetup, filter_setup
+from gnio_jax.filtering.settings import FilterSetup, filter_setup
 from gnio_jax.types import Prediction
 
 PERFECT_STD = 0.01
@@ -43,7 +43,7 @@ def estimate(
     prepared: list[Prepared],
     network: Network | None,
     config: DataConfig,
-    options: FilterOptions,
+    options: FilterSettings,
     setup: Setup = DEFAULT_SETUP,
     batch_size: int = 16,
     progress: OnShare = no_progress,
@@ -75,7 +75,7 @@ def estimate(
 def perfect_displacements(
     prepared: list[Prepared],
     config: DataConfig,
-    options: FilterOptions,
+    options: FilterSettings,
     setup: Setup = DEFAULT_SETUP,
     batch_size: int = 16,
     progress: OnShare = no_progress,
@@ -106,7 +106,7 @@ def perfect_displacements(
 
 def _without_network_errors(ekf: FilterSetup) -> FilterSetup:
     """The filter without what was calibrated for a network: true displacements lack nothing."""
-    noise = ekf.noise._replace(std_factor=(1.0, 1.0, 1.0), displacement=None)
+    noise = ekf.noise._replace(std_factor=(1.0, 1.0, 1.0), correlation=None)
     considered = ekf.considered and ConsideredStd(gyro_bias=ekf.considered.gyro_bias)
     return ekf._replace(noise=noise, considered=considered)
 

@@ -9,13 +9,13 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from gnio_jax import data
-from gnio_jax.config import DataConfig, FilterOptions
+from gnio_jax.config import DataConfig, FilterSettings
+from gnio_jax.config.schema import TLIO_STD
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation.metrics import Trajectory
 from gnio_jax.evaluation.setup import DEFAULT_SETUP, Setup, resolve
 from gnio_jax.filtering import InitialStd, level_state
-from gnio_jax.filtering.noise import TLIO_STD
-from gnio_jax.filtering.options import filter_setup
+from gnio_jax.filtering.settings import filter_setup
 from gnio_jax.filtering.start import rest_at_start
 from gnio_jax.numerics import finite_rows, matrix_from_quaternion, rotations
 from gnio_jax.types import Sequence
@@ -169,7 +169,7 @@ def _start(
 def _static_start(sequence: Sequence, config: DataConfig, std: InitialStd) -> tuple[Start, str]:
     """Level from the gravity of the first second; yaw, velocity and position zero."""
     second = _first_second(sequence, round(config.rate))
-    filter_config = filter_setup(config, FilterOptions()).config
+    filter_config = filter_setup(config, FilterSettings()).config
     level = level_state(filter_config, sequence.gyro[second], sequence.accel[second], std)
     found = np.sqrt(np.diag(level.core_covariance))
     tilt_std, velocity_std = float(found[0]), float(found[3])

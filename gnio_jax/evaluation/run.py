@@ -12,7 +12,7 @@ import jax
 
 from gnio_jax import config as configuration
 from gnio_jax import data
-from gnio_jax.config import EvaluateConfig, FilterOptions, TrainConfig
+from gnio_jax.config import EvaluateConfig, FilterSettings, TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation.estimation import (
     PERFECT_STD,
@@ -54,7 +54,7 @@ class Job(NamedTuple):
     """None for `imu_only`."""
     provenance: dict[str, Any]
     """Where the network is from."""
-    options: FilterOptions
+    options: FilterSettings
     setup: Setup
     dataset: str
     data_root: str | None
@@ -186,10 +186,10 @@ def folder_name(config: EvaluateConfig, dataset: str, trained: TrainConfig) -> s
     if config.checkpoint != "best" and config.estimator != "imu_only":
         parts.append(config.checkpoint)
     if config.estimator != "integrate":
-        usual_options = dataclasses.asdict(trained.filter)
-        for name, value in dataclasses.asdict(config.filter).items():
-            if value != usual_options[name]:
-                text = value if isinstance(value, str | None) else f"{value:g}"
+        usual_settings = configuration.flat(trained.filter)
+        for name, value in configuration.flat(config.filter).items():
+            if value != usual_settings.get(name):
+                text = f"{value:g}" if isinstance(value, float) else value
                 parts.append(f"{name}-{text}")
     return "_".join(parts)
 
@@ -272,7 +272,7 @@ def _settings(config: EvaluateConfig, job: Job, prepared: list[Prepared]) -> dic
         "context_seconds": windows.context_seconds,
         "stride_seconds": windows.stride_seconds,
         "window_rotation": windows.window_rotation,
-        "filter": dataclasses.asdict(job.options),
+        "filter": configuration.plain(job.options),
         "perfect_displacements_std": PERFECT_STD if setup.estimator != "integrate" else None,
         "definitions": DEFINITIONS,
         "device": jax.devices()[0].device_kind,

@@ -4,15 +4,21 @@ network in the loop.
 Needs only JAX and the geometry: the network is any function from windows to a `Prediction`.
 """
 
+from gnio_jax.config import (
+    ConsideredStd,
+    CorrelatedError,
+    FilterSettings,
+    InitialStd,
+    NoiseModel,
+)
 from gnio_jax.filtering.batch import cores_as_devices, over_sequences
 from gnio_jax.filtering.config import FilterConfig
-from gnio_jax.filtering.considered import ConsideredStd, considered_covariance, sensitivity
+from gnio_jax.filtering.considered import considered_covariance, sensitivity
 from gnio_jax.filtering.history import FilterHistory
-from gnio_jax.filtering.lasting_errors import LastingErrors
-from gnio_jax.filtering.noise import InitialStd, NoiseModel
 from gnio_jax.filtering.online import TrackerState
 from gnio_jax.filtering.pose import Pose
 from gnio_jax.filtering.scan import repeat_odometry, run_filter, run_odometry
+from gnio_jax.filtering.settings import FilterSetup, filter_setup
 from gnio_jax.filtering.smoother import SmoothedHistory, smooth, smooth_odometry
 from gnio_jax.filtering.start import initial_state, level_state
 from gnio_jax.filtering.state import FilterState, GateState
@@ -20,12 +26,14 @@ from gnio_jax.filtering.tracker import Tracker
 
 __all__ = [
     "ConsideredStd",
+    "CorrelatedError",
     "FilterConfig",
     "FilterHistory",
+    "FilterSettings",
+    "FilterSetup",
     "FilterState",
     "GateState",
     "InitialStd",
-    "LastingErrors",
     "NoiseModel",
     "Pose",
     "SmoothedHistory",
@@ -33,6 +41,7 @@ __all__ = [
     "TrackerState",
     "considered_covariance",
     "cores_as_devices",
+    "filter_setup",
     "initial_state",
     "level_state",
     "over_sequences",

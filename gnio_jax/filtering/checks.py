@@ -15,8 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
+from gnio_jax.config import CorrelatedError
 from gnio_jax.filtering.config import FilterConfig
-from gnio_jax.filtering.lasting_errors import LastingErrors
 
 BATCH_REMEDY = "for a batch of sequences use jax.vmap"
 
@@ -83,15 +83,13 @@ def check_positive(name: str, value: jax.Array) -> None:
         raise ValueError(f"{name}: {problem}, the first is row {bad.argmax()}")
 
 
-def check_lasting_errors(name: str, errors: LastingErrors) -> None:
-    """Refuse a share of a window's error that is all of it, and times that are zero."""
-    for field in ("window_seconds", "walk_seconds"):
-        value = getattr(errors, field)
-        if not isinstance(value, Tracer) and not float(value) > 0:
-            raise ValueError(f"{name}.{field}: must be positive, found {float(value)}")
-    share = errors.window_share
+def check_correlation(name: str, errors: CorrelatedError) -> None:
+    """Refuse a share of a window's error that is all of it, and a time that is zero."""
+    share, seconds = errors
+    if not isinstance(seconds, Tracer) and not float(seconds) > 0:
+        raise ValueError(f"{name}.seconds: must be positive, found {float(seconds)}")
     if not isinstance(share, Tracer) and not float(share) < 1:
-        raise ValueError(f"{name}.window_share: must be below 1, found {float(share)}")
+        raise ValueError(f"{name}.share: must be below 1, found {float(share)}")
 
 
 def check_positive_definite(name: str, value: jax.Array) -> None:

@@ -21,7 +21,7 @@ _CHOICES = {
     "window_rotation": tuple(WINDOW_CUTS),
     "jacobians": ("latest", "first"),
 }
-_POSITIVE = ("dt", "measurement_scale", "gate_threshold", "speed_limit")
+_POSITIVE = ("dt", "gate_threshold", "speed_limit")
 _NOT_NEGATIVE = (
     "mahalanobis_fail_scale",
     "convergence_seconds",
@@ -67,9 +67,6 @@ class FilterConfig:
     applied."""
     history: Literal["diagonal", "core"] = "diagonal"
     """Keep the diagonal of the core covariance at every interval, or the whole 15×15 block too."""
-    measurement_scale: float = 10.0
-    """Every measurement covariance is multiplied by this: overlapping windows are not independent.
-    """
     log_std_min: float = -4.0
     """The network's log standard deviation is raised to at least this (`run_odometry` only)."""
     gate_threshold: float = 11.345

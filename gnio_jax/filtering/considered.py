@@ -20,17 +20,17 @@ whole filter, taken forward through every update that it made.
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Float
 
 from gnio_jax import geometry
+from gnio_jax.config import ConsideredStd, NoiseModel
 from gnio_jax.filtering.checks import check_not_negative
 from gnio_jax.filtering.config import FilterConfig, YawFrame
 from gnio_jax.filtering.history import FilterHistory
-from gnio_jax.filtering.noise import NoiseModel
 from gnio_jax.filtering.scan import repeat_odometry
 from gnio_jax.filtering.state import FilterState, Mean
 from gnio_jax.types import Array
@@ -40,17 +40,6 @@ OF_BIAS, OF_SCALE, OF_HEADING, OF_SLOPE = slice(0, 3), 3, 4, 5
 """Where the gyro's bias, s, ψ and γ lie in c."""
 STILL = 1e-6
 """Added in squares to the length of a displacement, m: standing still is no singular point."""
-
-
-class ConsideredStd(NamedTuple):
-    """Standard deviations of c, each a scalar."""
-
-    gyro_bias: Float[Array, ""] | float = 0.0
-    """Of each axis, rad/s."""
-    scale: Float[Array, ""] | float = 0.0
-    heading: Float[Array, ""] | float = 0.0
-    """rad"""
-    slope: Float[Array, ""] | float = 0.0
 
 
 def check_considered(std: ConsideredStd) -> None:
@@ -79,7 +68,8 @@ def sensitivity(
     factors = jnp.stack(jax.tree.map(jnp.asarray, noise.std_factor))
     # S is of the whole run, from its start.
     config = dataclasses.replace(config, truncate_every=0, checkpoint_every=0)
-    own_std = history.measurement_std / (factors[None] * config.measurement_scale**0.5)
+    scale = jnp.sqrt(noise.measurement_scale)
+    own_std = history.measurement_std / (factors[None] * scale)
 
     def means(c: Float[Array, "6"]) -> Mean:
         displacement = disturbed(history.displacement, c)

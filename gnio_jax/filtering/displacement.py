@@ -10,10 +10,9 @@ import jax.numpy as jnp
 from jaxtyping import Bool, Float
 
 from gnio_jax import geometry
+from gnio_jax.config import CorrelatedError, NoiseModel
 from gnio_jax.filtering.config import FilterConfig, YawFrame
 from gnio_jax.filtering.gate import innovation_gate
-from gnio_jax.filtering.lasting_errors import LastingErrors, distort
-from gnio_jax.filtering.noise import NoiseModel
 from gnio_jax.filtering.state import CLONE, LASTING, MOVE, OFFSET, FilterState
 from gnio_jax.filtering.update import (
     Correction,
@@ -81,7 +80,6 @@ class DisplacementUpdate(NamedTuple):
 def scaled_measurement(
     displacement: Float[Array, "3"],
     covariance: Float[Array, "3 3"],
-    config: FilterConfig,
     noise: NoiseModel,
 ) -> Measurement:
     """Scale by `measurement_scale` and `std_factor`; keep NaN out of the arithmetic, or its
@@ -89,7 +87,8 @@ def scaled_measurement(
     present = jnp.all(jnp.isfinite(displacement)) & jnp.all(jnp.isfinite(covariance))
     eye = jnp.eye(3, dtype=covariance.dtype)
     factor = jnp.stack(jax.tree.map(jnp.asarray, noise.std_factor)).astype(covariance.dtype)
-    scale = config.measurement_scale * (factor[:, None] * factor[None])
+    scale = jnp.asarray(noise.measurement_scale, covariance.dtype)
+    scale = scale * (factor[:, None] * factor[None])
     known = jnp.where(present, covariance, eye)
     return Measurement(
         displacement=jnp.where(present, displacement, 0.0),
@@ -145,7 +144,7 @@ def update(
     oldest: Array | int,
     config: FilterConfig,
     frame: YawFrame = "given",
-    errors: LastingErrors | None = None,
+    errors: CorrelatedError | None = None,
 ) -> tuple[FilterState, DisplacementUpdate]:
     """`update_with_correction` for those who do not smooth."""
     state, result, _ = update_with_correction(
@@ -161,7 +160,7 @@ def update_with_correction(
     oldest: Array | int,
     config: FilterConfig,
     frame: YawFrame,
-    errors: LastingErrors | None = None,
+    errors: CorrelatedError | None = None,
 ) -> tuple[FilterState, DisplacementUpdate, Correction]:
     """One EKF update with the displacement between the clones in slots `oldest` and `newest` of the
     ring, once it is full.
@@ -222,17 +221,15 @@ def _residual_of_state(
 
 
 def _with_lasting_errors(
-    residual: Residual, measurement: Measurement, state: FilterState, errors: LastingErrors
+    residual: Residual, measurement: Measurement, state: FilterState, errors: CorrelatedError
 ) -> Residual:
     """The residual of a displacement with errors that last."""
-    root = cholesky(measurement.covariance).matrix
-    moved = measurement.displacement - residual.innovation
-    expected = distort(moved, root, state.lasting, errors)
+    jacobian = errors.share * cholesky(measurement.covariance).matrix
+    expected = matmul(jacobian, state.lasting[:, None])[:, 0]
     return residual._replace(
-        innovation=measurement.displacement - expected.displacement,
-        jacobian=matmul(expected.gain, residual.jacobian),
-        lasting_jacobian=expected.jacobian,
-        lasting_covariance=errors.window_share**2 * measurement.covariance,
+        innovation=residual.innovation - expected,
+        lasting_jacobian=jacobian,
+        lasting_covariance=errors.share**2 * measurement.covariance,
     )
 
 

@@ -37,8 +37,8 @@ class FilterHistory(NamedTuple):
     displacement: Float[Array, "k 3"]
     """The measurement, m, in the yaw frame of the oldest clone; NaN where none."""
     measurement_std: Float[Array, "k 3"]
-    """Its standard deviations after `FilterConfig.measurement_scale` and `NoiseModel.std_factor`,
-    m; NaN where none."""
+    """Its standard deviations after `NoiseModel.measurement_scale` and `std_factor`, m; NaN where
+    none."""
     innovation: Float[Array, "k 3"]
     """Measured − predicted displacement, m; NaN where no measurement."""
     covariance_diagonal: Float[Array, "k 15"]
@@ -69,8 +69,8 @@ class FilterHistory(NamedTuple):
     above `FilterConfig.speed_limit`: bad input that could not be seen before, and all after it is
     void. The final state remembers it, and a later run from that begins with 0."""
     lasting: Float[Array, "k e"]
-    """Errors of the displacements that last, as estimated (see `lasting_errors`): window (3), log
-    scale, heading rad; no columns where `NoiseModel.displacement` is None."""
+    """Temporally correlated errors of the windows, as estimated (see `lasting_errors`), in standard
+    deviations: 3, or no columns where `NoiseModel.correlation` is None."""
     diagnostics: dict[str, Array]
     """The network's diagnostics stacked over K, NaN where it had no window; empty without a
     network."""

@@ -9,10 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
+from gnio_jax.config import NoiseModel
 from gnio_jax.filtering.checks import (
     BATCH_REMEDY,
+    check_correlation,
     check_finite,
-    check_lasting_errors,
     check_not_negative,
     check_positive,
     check_positive_definite,
@@ -21,7 +22,6 @@ from gnio_jax.filtering.checks import (
     on_device,
 )
 from gnio_jax.filtering.config import FilterConfig
-from gnio_jax.filtering.noise import NoiseModel
 from gnio_jax.filtering.start import initial_state, with_lasting_errors
 from gnio_jax.filtering.state import FilterState
 from gnio_jax.types import Array
@@ -55,8 +55,12 @@ def checked_noise(noise: NoiseModel, dtype: Any) -> NoiseModel:
         check_not_negative("noise" + jax.tree_util.keystr(path), value)
     if len(noise.std_factor) != 3:
         raise ValueError("noise.std_factor: must be three numbers, for x, y and z")
-    if noise.displacement is not None:
-        check_lasting_errors("noise.displacement", noise.displacement)
+    for name in ("measurement_scale", "std_factor"):
+        for value in jax.tree.leaves(getattr(noise, name)):
+            if not isinstance(value, Tracer) and float(value) == 0:
+                raise ValueError(f"noise.{name}: must be positive, found 0")
+    if noise.correlation is not None:
+        check_correlation("noise.correlation", noise.correlation)
     return jax.tree.map(lambda value: jnp.asarray(value, dtype), noise)
 
 
@@ -65,10 +69,10 @@ def checked_state(state: FilterState, config: FilterConfig, noise: NoiseModel) -
 
     A state without the errors that last gets them, as large as `noise` says.
     """
-    if noise.displacement is not None:
-        state = with_lasting_errors(state, noise.displacement)
+    if noise.correlation is not None:
+        state = with_lasting_errors(state)
     elif len(state.lasting):
-        problem = "the state has errors that last, but noise.displacement is None"
+        problem = "the state has errors that last, but noise.correlation is None"
         raise ValueError(f"state.lasting: {problem}")
     wanted = state_shapes(config, noise, jnp.float32 if config.allow_float32 else jnp.float64)
     if jax.tree.structure(state) != jax.tree.structure(wanted):
@@ -100,8 +104,7 @@ def state_shapes(config: FilterConfig, noise: NoiseModel, dtype: Any) -> FilterS
     def start() -> FilterState:
         nothing = jnp.zeros(3, dtype)
         state = initial_state(config, jnp.eye(3, dtype=dtype), nothing, nothing)
-        errors = noise.displacement
-        return state if errors is None else with_lasting_errors(state, errors)
+        return state if noise.correlation is None else with_lasting_errors(state)
 
     return jax.eval_shape(start)
 

@@ -9,9 +9,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Float
 
+from gnio_jax.config import NoiseModel
 from gnio_jax.filtering.config import FilterConfig
 from gnio_jax.filtering.displacement import Measurement, scaled_measurement
-from gnio_jax.filtering.noise import NoiseModel
 from gnio_jax.filtering.state import FilterState
 from gnio_jax.types import Array, Prediction
 from gnio_jax.windows import cut_window
@@ -86,7 +86,7 @@ def predicted_measurement(
     `log_std_min`, before scaling."""
     log_std = jnp.maximum(prediction.log_std.astype(dtype), config.log_std_min)
     covariance = jnp.diag(jnp.exp(2 * log_std))
-    return scaled_measurement(prediction.displacement.astype(dtype), covariance, config, noise)
+    return scaled_measurement(prediction.displacement.astype(dtype), covariance, noise)
 
 
 def _as_floating(value: Any) -> Any:

@@ -15,9 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
+from gnio_jax.config import ConsideredStd, InitialStd, NoiseModel
+from gnio_jax.config.schema import TLIO_STD
 from gnio_jax.filtering.clock import Clock
 from gnio_jax.filtering.config import FilterConfig
-from gnio_jax.filtering.considered import ConsideredStd, considered_covariance
+from gnio_jax.filtering.considered import considered_covariance
 from gnio_jax.filtering.displacement import Measurement
 from gnio_jax.filtering.gaps import Imu, bridge
 from gnio_jax.filtering.history import FilterHistory, stacked_history
@@ -30,7 +32,6 @@ from gnio_jax.filtering.network import (
     predicted_measurement,
     prediction_shapes,
 )
-from gnio_jax.filtering.noise import TLIO_STD, InitialStd, NoiseModel
 from gnio_jax.filtering.pose import (
     POSE_LENGTH,
     PoseVector,

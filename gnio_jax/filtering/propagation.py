@@ -29,9 +29,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from gnio_jax import geometry
+from gnio_jax.config import NoiseModel
 from gnio_jax.filtering.gaps import Gap, Imu
 from gnio_jax.filtering.lasting_errors import LastingMotion
-from gnio_jax.filtering.noise import NoiseModel
 from gnio_jax.filtering.state import (
     ANCHOR,
     BIASES,

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from gnio_jax.config import NoiseModel
 from gnio_jax.filtering.checkpointing import truncated_scan
 from gnio_jax.filtering.clones import unroll_clones
 from gnio_jax.filtering.config import FilterConfig, YawFrame
@@ -29,7 +30,6 @@ from gnio_jax.filtering.network import (
     predicted_measurement,
     prediction_shapes,
 )
-from gnio_jax.filtering.noise import NoiseModel
 from gnio_jax.filtering.state import FilterState
 from gnio_jax.filtering.step import clone_step
 from gnio_jax.types import Array, Prediction
@@ -100,7 +100,7 @@ def _run_filter(
     noise: NoiseModel,
     frame: YawFrame,
 ) -> tuple[FilterState, FilterHistory]:
-    scale = functools.partial(scaled_measurement, config=config, noise=noise)
+    scale = functools.partial(scaled_measurement, noise=noise)
     measurements = jax.vmap(scale)(displacement, covariance)
 
     def measure(step: _Step, state: FilterState, oldest: Array) -> tuple[Measurement, dict]:

@@ -26,6 +26,7 @@ import jax.numpy as jnp
 from jaxtyping import Float, Int
 
 from gnio_jax import geometry
+from gnio_jax.config import ConsideredStd, NoiseModel
 from gnio_jax.filtering.adjoint import (
     Adjoint,
     before_propagation,
@@ -38,7 +39,6 @@ from gnio_jax.filtering.config import FilterConfig, YawFrame
 from gnio_jax.filtering.considered import (
     ENTRIES,
     OF_BIAS,
-    ConsideredStd,
     check_considered,
     considered_covariance,
     disturbed,
@@ -53,7 +53,6 @@ from gnio_jax.filtering.inputs import (
     checked_inputs,
     checked_measurements,
 )
-from gnio_jax.filtering.noise import NoiseModel
 from gnio_jax.filtering.scan import interval_inputs
 from gnio_jax.filtering.state import (
     ACCEL_BIAS,
@@ -149,8 +148,9 @@ def smooth_odometry(
     given = history.displacement, history.measurement_std
     displacement, std = checked_displacements(*given, signals, config)
     # The history's are scaled already.
-    noise = noise._replace(std_factor=(1.0, 1.0, 1.0))
-    covariance = jax.vmap(jnp.diag)(std**2 / config.measurement_scale)
+    one = jnp.ones((), std.dtype)
+    noise = noise._replace(std_factor=(one, one, one), measurement_scale=one)
+    covariance = jax.vmap(jnp.diag)(std**2)
     frame = config.displacement_frame
     if considered is None:
         return _smooth(state, signals, displacement, covariance, config, noise, frame)
@@ -199,7 +199,7 @@ def _smooth(
     noise: NoiseModel,
     frame: YawFrame,
 ) -> SmoothedHistory:
-    scale = functools.partial(scaled_measurement, config=config, noise=noise)
+    scale = functools.partial(scaled_measurement, noise=noise)
     measurements = jax.vmap(scale)(displacement, covariance)
     stream, _, _ = bridge(*signals, state.imu, config)
     numbers, by_interval = interval_inputs(stream, config)

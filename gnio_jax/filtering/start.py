@@ -12,6 +12,8 @@ from jax.core import Tracer
 from jaxtyping import Float
 
 from gnio_jax import geometry
+from gnio_jax.config import InitialStd
+from gnio_jax.config.schema import TLIO_STD
 from gnio_jax.filtering.checks import (
     check_finite,
     check_not_negative,
@@ -19,8 +21,7 @@ from gnio_jax.filtering.checks import (
     checked_array,
 )
 from gnio_jax.filtering.config import FilterConfig
-from gnio_jax.filtering.lasting_errors import LastingErrors, prior_variance
-from gnio_jax.filtering.noise import TLIO_STD, InitialStd
+from gnio_jax.filtering.lasting_errors import ENTRIES
 from gnio_jax.filtering.state import (
     ACCEL_BIAS,
     ANCHOR,
@@ -130,21 +131,20 @@ def _without_clones(
     )
 
 
-def with_lasting_errors(state: FilterState, errors: LastingErrors) -> FilterState:
-    """A state that knows nothing yet of the errors of the displacements that last; one that has
-    them is as it was."""
-    return state if len(state.lasting) else _with_lasting_errors(state, errors)
+def with_lasting_errors(state: FilterState) -> FilterState:
+    """A state that knows nothing yet of the correlated errors of the windows, whose variances are
+    one; a state that has them is as it was."""
+    return state if len(state.lasting) else _with_lasting_errors(state)
 
 
 @jax.jit
-def _with_lasting_errors(state: FilterState, errors: LastingErrors) -> FilterState:
-    variance = prior_variance(errors, state.offset.dtype)
-    count = len(variance)
+def _with_lasting_errors(state: FilterState) -> FilterState:
+    dtype = state.offset.dtype
     return state._replace(
-        lasting=jnp.zeros_like(variance),
-        core_covariance=jnp.pad(state.core_covariance, (0, count))
-        + jnp.diag(jnp.pad(variance, (CORE, 0))),
-        cross_covariance=jnp.pad(state.cross_covariance, ((0, count), (0, 0))),
+        lasting=jnp.zeros(ENTRIES, dtype),
+        core_covariance=jnp.pad(state.core_covariance, (0, ENTRIES))
+        + jnp.diag(jnp.pad(jnp.ones(ENTRIES, dtype), (CORE, 0))),
+        cross_covariance=jnp.pad(state.cross_covariance, ((0, ENTRIES), (0, 0))),
     )
 
 

@@ -3,7 +3,7 @@
 The error state is δ = (θ, v, o, b_g, b_a, a, s, e | θ_0, o_0, θ_1, o_1, …): 21 core entries and
 those of e, then 6 per clone, oldest clone first. Rotation errors are world-frame and left,
 R ← exp(δθ) R; everything else adds. e are the errors of the displacements that last (see
-`lasting_errors`): none, or 5 entries.
+`lasting_errors`): none, or 3 entries.
 
 Positions are held as offsets o = p − a from an anchor a, a past position that moves up to the
 present once in a window; s is its last move. A clone keeps the anchor that it was taken with: the
@@ -37,7 +37,7 @@ BIASES = slice(GYRO_BIAS.start, ACCEL_BIAS.stop)
 LOCAL = slice(THETA.start, ANCHOR.start)
 """θ, v, o, b_g, b_a: all but the anchor, its move and e."""
 LASTING = slice(MOVE.stop, None)
-"""e: 0 or 5 entries."""
+"""e: 0 or 3 entries."""
 CLONE_THETA, CLONE_OFFSET = slice(0, 3), slice(3, 6)
 """Where each part of a clone's error lies."""
 
@@ -124,14 +124,14 @@ class FilterState(NamedTuple):
     move: Float[Array, "3"]
     """From the anchor before it, m."""
     lasting: Float[Array, "e"]
-    """Errors of the displacements that last (`lasting_errors`): none, or 5."""
+    """Errors of the displacements that last (`lasting_errors`): none, or 3."""
     clone_rotation: Float[Array, "c 3 3"]
     """Cloned rotations."""
     clone_offset: Float[Array, "c 3"]
     """Cloned positions, from the anchor they were taken with; between runs, from the present one,
     m."""
     core_covariance: Float[Array, "n n"]
-    """θ, v, o, b_g, b_a, a, s, e: n = 21, or 26 with lasting errors."""
+    """θ, v, o, b_g, b_a, a, s, e: n = 21, or 24 with lasting errors."""
     cross_covariance: Float[Array, "n 6c"]
     """Core against the clones' θ, o."""
     clone_covariance: Float[Array, "6c 6c"]

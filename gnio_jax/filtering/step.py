@@ -9,13 +9,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Float
 
+from gnio_jax.config import NoiseModel
 from gnio_jax.filtering.clones import move_anchor
 from gnio_jax.filtering.config import FilterConfig, YawFrame
 from gnio_jax.filtering.displacement import Measurement, update_with_correction
 from gnio_jax.filtering.gaps import Imu
 from gnio_jax.filtering.history import StepRecord
 from gnio_jax.filtering.lasting_errors import lasting_motion
-from gnio_jax.filtering.noise import NoiseModel
 from gnio_jax.filtering.propagation import integrate_interval, propagate, transition
 from gnio_jax.filtering.state import FilterState, core_covariance
 from gnio_jax.filtering.update import Correction
@@ -94,12 +94,12 @@ def traced_clone_step(
     state = move_anchor(state, anchored)
     motion = _integrate_interval(state, imu, noise, config.dt)
     moved = transition(state, motion, anchored)
-    lasting = lasting_motion(noise.displacement, config.clone_seconds, state.offset.dtype)
+    lasting = lasting_motion(noise.correlation, config.clone_seconds, state.offset.dtype)
     state = _propagate(state, motion, lasting, anchored, newest)
 
     measurement, diagnostics = measure(state, oldest)
     state, update, *corrections = _update_with_correction(
-        state, measurement, newest, oldest, config, frame, noise.displacement
+        state, measurement, newest, oldest, config, frame, noise.correlation
     )
     rest = no_rest(update.nis.dtype)
     if config.zero_velocity_std > 0:

@@ -22,10 +22,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from gnio_jax.config import ConsideredStd, InitialStd, NoiseModel
+from gnio_jax.config.schema import TLIO_STD
 from gnio_jax.filtering.clock import Clock, GridSample, advance_clock
 from gnio_jax.filtering.clones import unroll_clones
 from gnio_jax.filtering.config import FilterConfig
-from gnio_jax.filtering.considered import ConsideredStd, check_considered
+from gnio_jax.filtering.considered import check_considered
 from gnio_jax.filtering.inputs import checked_noise, checked_state
 from gnio_jax.filtering.intake import (
     Intake,
@@ -35,7 +37,6 @@ from gnio_jax.filtering.intake import (
     low_pass_sample,
 )
 from gnio_jax.filtering.network import Predict, prediction_shapes
-from gnio_jax.filtering.noise import TLIO_STD, InitialStd, NoiseModel
 from gnio_jax.filtering.online import (
     ACCEL,
     GRID_COLUMNS,
@@ -247,9 +248,9 @@ class Tracker:
         """How many pending samples `pose` has integrated, its vector and IMU memory after them."""
 
     def _start(self, state: FilterState) -> None:
-        errors, considered = self._settings.noise.displacement, self._settings.considered
-        if errors is not None:
-            state = with_lasting_errors(state, errors)
+        considered = self._settings.considered
+        if self._settings.noise.correlation is not None:
+            state = with_lasting_errors(state)
         # Copies: the first step is given their memory, and it may not be shared, not even between
         # two fields.
         core = start_core(state, self._settings)

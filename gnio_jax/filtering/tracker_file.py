@@ -13,14 +13,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from gnio_jax.config import ConsideredStd, InitialStd, NoiseModel
 from gnio_jax.errors import InputError
 from gnio_jax.files import replacing
 from gnio_jax.filtering.clock import Clock
 from gnio_jax.filtering.config import FilterConfig
-from gnio_jax.filtering.considered import ConsideredStd
 from gnio_jax.filtering.inputs import checked_noise
 from gnio_jax.filtering.intake import Intake, SampleRun, checked_design
-from gnio_jax.filtering.noise import InitialStd, NoiseModel
 from gnio_jax.filtering.online import (
     GRID_COLUMNS,
     TrackerCore,

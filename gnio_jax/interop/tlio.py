@@ -18,7 +18,7 @@ import numpy as np
 
 from gnio_jax import config as configuration
 from gnio_jax import models
-from gnio_jax.config import DataConfig, FilterOptions, ModelConfig, TrainConfig
+from gnio_jax.config import DataConfig, FilterSettings, ModelConfig, TrainConfig
 from gnio_jax.errors import InputError
 
 _CHANNELS = np.array([3, 4, 5, 0, 1, 2])
@@ -178,7 +178,7 @@ def write_run(checkpoint: Path, workdir: Path, data: DataConfig, dataset: str = 
         dataset=dataset,
         data=data,
         model=ModelConfig(name="tlio"),
-        filter=FilterOptions(window_rotation="tlio"),
+        filter=FilterSettings(window_rotation="tlio"),
     )
     configuration.validate(config, "gnio interop")
     if (workdir / "config.yaml").exists() or (workdir / "checkpoints").exists():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-from gnio_jax.config import CONSIDERED_FIELDS, TrainConfig
+from gnio_jax.config import TrainConfig
 from gnio_jax.pretrained import figures
 from gnio_jax.pretrained.arrays import StorageLoss
 from gnio_jax.pretrained.package import About
@@ -70,7 +70,7 @@ def _recipe(said: Description, config: TrainConfig, origin: Origin) -> list[str]
         lines.append(f"gnio calibrate --workdir runs/{said.name}")
     lines += ["```", "", f"Dataset `{config.dataset}`, seed {config.seed}; all settings are in "]
     lines[-1] += "config.yaml, with the filter's options as they are used."
-    considered = [name for name in CONSIDERED_FIELDS if getattr(config.filter, name) > 0]
+    considered = [name for name, std in config.filter.considered._asdict().items() if std > 0]
     if considered:
         lines += ["", f"The filter's covariance counts errors in: {', '.join(considered)}."]
     return lines

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
-from gnio_jax.filtering.options import FilterSetup, filter_setup
+from gnio_jax.filtering.settings import FilterSetup, filter_setup
 from gnio_jax.training.checkpoint import Run
 
 ZERO_VELOCITY_STD = 0.02

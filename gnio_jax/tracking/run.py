@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gnio_jax import data
-from gnio_jax.config import DataConfig
+from gnio_jax.config import DataConfig, InitialStd
 from gnio_jax.data.importing import Imported
 from gnio_jax.data.resampling import LONGEST_BRIDGE
 from gnio_jax.data.validation import WINDOW_SECONDS, check_gaps
@@ -23,7 +23,6 @@ from gnio_jax.evaluation.preparation import Prepared, measured_rows
 from gnio_jax.evaluation.setup import OnShare, Setup, no_progress
 from gnio_jax.evaluation.tum import write_tum
 from gnio_jax.files import check_writable_folder, replacing_folder
-from gnio_jax.filtering.noise import InitialStd
 from gnio_jax.tracking.filter import tracking_filter
 from gnio_jax.tracking.summary import Summary, as_json, summarise
 from gnio_jax.tracking.weights import Weights

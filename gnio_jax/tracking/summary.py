@@ -14,7 +14,7 @@ from gnio_jax.evaluation.metrics.trajectory import finite_poses
 from gnio_jax.evaluation.preparation import ROUGH_START, Prepared
 from gnio_jax.evaluation.scores import score
 from gnio_jax.filtering.config import FilterConfig
-from gnio_jax.filtering.options import FilterSetup
+from gnio_jax.filtering.settings import FilterSetup
 from gnio_jax.tracking.weights import Weights
 from gnio_jax.types import GRAVITY
 

@@ -26,8 +26,7 @@ from gnio_jax.filtering import (
     run_odometry,
 )
 from gnio_jax.filtering.history import POSITION
-from gnio_jax.filtering.options import filter_setup, filter_with
-from gnio_jax.filtering.unconstrained import natural
+from gnio_jax.filtering.settings import filter_setup, with_free_parameters
 from gnio_jax.training import learnt as learning
 from gnio_jax.training import optimizer as optimizers
 from gnio_jax.training.filter_losses import FilterLosses, filter_losses, normalised_squares
@@ -77,17 +76,14 @@ class Ready(NamedTuple):
     """Network and filter options as the filter's loop takes them; the same for every piece."""
 
     network: models.InferenceVariables
-    options: dict[str, Any]
-    """Learnt values of `FilterOptions`' fields."""
+    filter: dict[str, Any]
+    """Free parameters of `FilterSettings`."""
 
 
 def filter_config(config: TrainConfig, training: bool) -> FilterConfig:
     """The filter of a piece: in training with a gate that has a slope and a gradient that is cut,
-    else as evaluation has it.
-
-    The factor of the measurement's covariance is not in it, since it may learn.
-    """
-    ekf = filter_with(config.data, config.filter, {}).config
+    else as evaluation has it."""
+    ekf = filter_setup(config.data, config.filter).config
     if not training:
         return ekf
     through = config.through_filter
@@ -107,8 +103,7 @@ def intervals(config: TrainConfig) -> int:
 def ready(variables: Any, model: nn.Module) -> Ready:
     """Variables, the collection "filter" among them, made ready for the filter's loop."""
     network = {name: tree for name, tree in variables.items() if name != "filter"}
-    options = natural(variables["filter"])
-    return Ready(models.inference_variables(model, network), options)
+    return Ready(models.inference_variables(model, network), variables["filter"])
 
 
 def run_piece(
@@ -120,7 +115,7 @@ def run_piece(
     ekf: FilterConfig,
 ) -> tuple[Path, FilterHistory]:
     """The filter over one piece with the network in its loop: its path, the start included."""
-    setup = filter_with(config.data, config.filter, program.options)
+    settings = with_free_parameters(config.filter, program.filter)
     predict = functools.partial(models.Inference(model), program.network)
     truth = piece.truth
     start = initial_state(
@@ -130,9 +125,9 @@ def run_piece(
         truth.position[0] + errors.position,
         errors.gyro_bias,
         errors.accel_bias,
-        setup.initial_std,
+        settings.start,
     )
-    _, history = run_odometry(predict, start, piece.gyro, piece.accel, ekf, setup.noise)
+    _, history = run_odometry(predict, start, piece.gyro, piece.accel, ekf, settings.noise)
     path = Path(
         jnp.concatenate([start.rotation[None], history.rotation]),
         jnp.concatenate([start.velocity[None], history.velocity]),

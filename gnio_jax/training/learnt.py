@@ -1,6 +1,6 @@
 """What learns through the filter: modules of the network, and options of the filter.
 
-The filter's options learn as numbers without bounds (`filtering.unconstrained`). They lie beside
+The filter's options learn as numbers without bounds (`filtering.settings`). They lie beside
 the network's variables as the collection "filter", float32 like the network.
 """
 
@@ -13,33 +13,21 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Float
 
-from gnio_jax.config import FilterOptions
-from gnio_jax.filtering.unconstrained import unconstrained, with_numbers
+from gnio_jax.config import FilterSettings
+from gnio_jax.filtering.settings import free_parameters, is_below, with_written_parameters
 from gnio_jax.training.optimizer import UNCERTAINTY
 
 FILTER_PARTS = {
-    "noise": ("gyro_density", "accel_density", "gyro_bias_walk", "accel_bias_walk"),
-    "measurement": (
-        "measurement_scale",
-        "std_factor_x",
-        "std_factor_y",
-        "std_factor_z",
-        "window_error_share",
-        "window_error_seconds",
-        "scale_error_std",
-        "heading_error_std_degrees",
-        "walk_error_seconds",
+    "noise": (
+        "noise.gyro_density",
+        "noise.accel_density",
+        "noise.gyro_bias_walk",
+        "noise.accel_bias_walk",
     ),
-    "start": (
-        "tilt_std_degrees",
-        "yaw_std_degrees",
-        "velocity_std",
-        "position_std",
-        "gyro_bias_std",
-        "accel_bias_std",
-    ),
+    "measurement": ("noise.measurement_scale", "noise.std_factor", "noise.correlation"),
+    "start": ("start",),
 }
-"""Fields of `FilterOptions` that each part of the filter has."""
+"""Numbers of `FilterSettings` that each part of the filter has, by their paths."""
 DIGITS = 5
 """That float32 keeps of a value whose logarithm it holds."""
 
@@ -50,15 +38,15 @@ Learnt = dict[str, dict[str, Any]]
 """Variables that learn, by collection: "params" and "filter"; none of them empty."""
 
 
-def filter_numbers(options: FilterOptions) -> dict[str, Float[jax.Array, ""]]:
-    """The collection "filter": a number for each option that is not switched off."""
-    fields = [name for names in FILTER_PARTS.values() for name in names]
-    return {name: jnp.float32(each) for name, each in unconstrained(options, fields).items()}
+def filter_numbers(settings: FilterSettings) -> dict[str, Float[jax.Array, ""]]:
+    """The collection "filter": a number for each setting that is not switched off."""
+    paths = [path for of_part in FILTER_PARTS.values() for path in of_part]
+    return {name: jnp.float32(each) for name, each in free_parameters(settings, paths).items()}
 
 
-def learnt_options(options: FilterOptions, numbers: dict[str, Any]) -> FilterOptions:
-    """The filter's options with the values that have learnt, as five digits."""
-    return with_numbers(options, numbers, DIGITS)
+def learnt_options(settings: FilterSettings, numbers: dict[str, Any]) -> FilterSettings:
+    """The filter's settings with the values that have learnt, as five digits."""
+    return with_written_parameters(settings, numbers, DIGITS)
 
 
 def chosen(variables: Any, learn: Iterable[str]) -> Learnt:
@@ -66,10 +54,12 @@ def chosen(variables: Any, learn: Iterable[str]) -> Learnt:
     parts = set(learn)
     if "all" in parts:
         parts = {*FILTER_PARTS, "uncertainty", "head", "encoder"}
-    names = {name for part in parts for name in FILTER_PARTS.get(part, ())}
+    paths = [path for part in parts for path in FILTER_PARTS.get(part, ())]
     found = {
         "params": _those(variables["params"], lambda module: module_part(module) in parts),
-        "filter": _those(variables["filter"], lambda name: name in names),
+        "filter": _those(
+            variables["filter"], lambda name: any(is_below(name, path) for path in paths)
+        ),
     }
     return {collection: tree for collection, tree in found.items() if tree}
 

@@ -12,19 +12,20 @@ from scipy.spatial.transform import Rotation
 
 from gnio_jax import calibration, data
 from gnio_jax.calibration import evidence
-from gnio_jax.calibration.errors import std_factors
+from gnio_jax.calibration.fit import std_factors
 from gnio_jax.commands import app
-from gnio_jax.config import CalibrateConfig, DataConfig, FilterOptions, ModelConfig, TrainConfig
+from gnio_jax.config import CalibrateConfig, DataConfig, ModelConfig, TrainConfig, plain
 from gnio_jax.data.readers import synthetic
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import Estimate, Trajectory
 from gnio_jax.training import checkpoint
 from tests.support import tiny_run
+from tests.support.filter_settings import changed
 
 TRAINED = TrainConfig(
     data=DataConfig(rate=50.0),
     model=ModelConfig(name="tiny", width=4),
-    filter=FilterOptions(velocity_std=0.7),
+    filter=changed(start={"velocity": 0.7}),
 )
 
 
@@ -51,7 +52,7 @@ def test_the_run_differs_in_the_filter_alone(run, two_walks, tmp_path, capsys):
     words = ["calibrate", "--workdir", str(run), "--out", str(out), "--steps", "2"]
     app.main([*words, "--fit", "measurement", "window"])
     told = capsys.readouterr().out
-    assert "std_factor_x" in told and f"gnio evaluate --workdir {out}" in told
+    assert "noise.std_factor.0" in told and f"gnio evaluate --workdir {out}" in told
     assert two_walks == ["val"]
     before, after = (checkpoint.load_run(folder) for folder in (run, out))
     changed = dataclasses.replace(
@@ -60,15 +61,16 @@ def test_the_run_differs_in_the_filter_alone(run, two_walks, tmp_path, capsys):
     assert changed == before.config
     jax.tree.map(np.testing.assert_array_equal, after.variables, before.variables)
     found = after.config.filter
-    assert found.velocity_std == 0.7 and found.gyro_density == TRAINED.filter.gyro_density
-    assert found.window_error_share > 0 and found.std_factor_x != 1
+    assert found.start == TRAINED.filter.start
+    assert found.noise.gyro_density == TRAINED.filter.noise.gyro_density
+    assert found.noise.correlation.share > 0 and found.noise.std_factor[0] != 1
     about = json.loads((out / "calibration.json").read_text())
     likelihood = about["negative_log_likelihood_per_innovation"]
     assert likelihood["after"] < likelihood["before"]
-    assert found.considered_gyro_bias_std > 0
+    assert found.considered.gyro_bias > 0
     nees = about["position_nees_per_axis"]
     assert abs(np.log(nees["after"])) < abs(np.log(nees["before"]))
-    assert about["split"] == "val" and about["filter"] == dataclasses.asdict(found)
+    assert about["split"] == "val" and about["filter"] == plain(found)
 
 
 def test_the_network_is_averaged_over_four_headings(run, two_walks, tmp_path):

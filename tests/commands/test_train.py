@@ -14,8 +14,9 @@ import train
 from gnio_jax import config as configuration
 from gnio_jax.commands import console
 from gnio_jax.commands.train import TrainOptions, defaults
-from gnio_jax.config import FilterOptions, ThroughFilter, TrainConfig
+from gnio_jax.config import FilterSettings, ThroughFilter, TrainConfig
 from gnio_jax.errors import InputError
+from tests.support.filter_settings import changed
 
 ROOT = Path(__file__).parents[2]
 
@@ -187,20 +188,20 @@ def test_help_teaches():
 
 
 def test_training_through_the_filter_begins_with_the_filter_of_the_run(tmp_path):
-    calibrated = FilterOptions(gyro_density=0.02, velocity_std=0.7, accel_bias_std=0.3)
-    considered = dataclasses.replace(calibrated, considered_scale_std=0.1)
+    calibrated = changed(noise={"gyro_density": 0.02}, start={"velocity": 0.7, "accel_bias": 0.3})
+    considered = changed(calibrated, considered={"scale": 0.1})
     configuration.save(tmp_path / "run" / "config.yaml", TrainConfig(filter=considered))
     file = tmp_path / "own.yaml"
-    file.write_text("through_filter: {learn: [noise]}\nfilter: {velocity_std: 1.0}\n")
+    file.write_text("through_filter: {learn: [noise]}\nfilter: {start: {velocity: 1.0}}\n")
     workdir = tmp_path / "new"
     asked = TrainOptions(config=str(file), init_from=str(tmp_path / "run"), workdir=str(workdir))
     # What the file says wins, also where it is the default of the package.
-    wanted = dataclasses.replace(calibrated, velocity_std=1.0)
+    wanted = changed(calibrated, start={"velocity": 1.0})
     assert defaults(asked).filter == wanted
     bare = TrainOptions(init_from=asked.init_from, through_filter=ThroughFilter(learn=("noise",)))
     assert defaults(bare).filter == calibrated
     # Training on windows has no use for it.
-    assert defaults(TrainOptions(init_from=asked.init_from)).filter == FilterOptions()
+    assert defaults(TrainOptions(init_from=asked.init_from)).filter == FilterSettings()
     # A run that is resumed goes on with its own, whether --config is given again or not.
     configuration.save(workdir / "config.yaml", TrainConfig(filter=wanted))
     shutil.rmtree(tmp_path / "run")

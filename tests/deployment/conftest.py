@@ -11,7 +11,7 @@ import pytest
 
 from gnio_jax import filtering
 from gnio_jax.commands import app
-from gnio_jax.config import DataConfig, FilterOptions, ModelConfig, TrainConfig
+from gnio_jax.config import DataConfig, ModelConfig, TrainConfig
 from gnio_jax.data.readers.gait import person
 from gnio_jax.data.readers.synthetic import pedestrian
 from gnio_jax.evaluation import inference_network
@@ -20,11 +20,14 @@ from gnio_jax.tracking.run import tracking_filter
 from gnio_jax.training.checkpoint import load_run
 from gnio_jax.types import GRAVITY
 from tests.support import drawn_run
+from tests.support.filter_settings import changed
 
 CONFIG = TrainConfig(
     data=DataConfig(rate=20.0, stride_seconds=0.25),
     model=ModelConfig(name="gnio", width=2, bank_size=3, bank_heads=2),
-    filter=FilterOptions(std_factor_x=1.5, velocity_std=0.3, gyro_bias_std=1e-3),
+    filter=changed(
+        noise={"std_factor": (1.5, 1.0, 1.0)}, start={"velocity": 0.3, "gyro_bias": 1e-3}
+    ),
 )
 SECONDS = 60.0
 BIAS = np.array([0.02, -0.01, 0.03])

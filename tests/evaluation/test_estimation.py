@@ -12,6 +12,7 @@ from gnio_jax.errors import InputError
 from gnio_jax.evaluation import Setup, metrics
 from gnio_jax.evaluation.estimators import filtered
 from gnio_jax.evaluation.estimators.integrated import mean_over_windows
+from gnio_jax.filtering import CorrelatedError
 from tests.support.estimators import (
     CONFIG,
     INTEGRATE,
@@ -23,6 +24,7 @@ from tests.support.estimators import (
     rotations,
     unyaw,
 )
+from tests.support.filter_settings import changed
 
 
 def test_imu_only_is_strap_down_integration(walks):
@@ -115,13 +117,18 @@ def test_perfect_displacements_leave_little_error(walks, setup, ate):
 
 def test_true_displacements_lack_nothing_that_was_calibrated(walks):
     prepared, _ = evaluation.prepare(walks[::2], CONFIG, Setup(gyro_bias="reference"))
-    calibrated = dataclasses.replace(OPTIONS, std_factor_x=3.0, window_error_share=0.8)
+    calibrated = changed(
+        OPTIONS, noise={"std_factor": (3.0, 1.0, 1.0), "correlation": CorrelatedError()}
+    )
     both = (
         evaluation.perfect_displacements(prepared, CONFIG, options)
         for options in (OPTIONS, calibrated)
     )
     for plain, found in zip(*both, strict=True):
         np.testing.assert_array_equal(found.trajectory.position, plain.trajectory.position)
+
+
+SCALE = OPTIONS.noise.measurement_scale
 
 
 def told_the_same(prepared, config, options):
@@ -134,7 +141,7 @@ def told_the_same(prepared, config, options):
 def test_what_is_considered_widens_the_covariance_and_moves_nothing(walks, run):
     """By ∂p/∂b_g of the filter, here of a run whose gyro is off by a little."""
     prepared, _ = evaluation.prepare(walks[::2], CONFIG, Setup(gyro_bias="reference"))
-    options = dataclasses.replace(OPTIONS, considered_gyro_bias_std=1e-3)
+    options = changed(OPTIONS, considered={"gyro_bias": 1e-3})
     (plain, _), (found, _) = (run(prepared, CONFIG, each) for each in (OPTIONS, options))
     np.testing.assert_array_equal(found.trajectory.position, plain.trajectory.position)
     moved = []
@@ -194,18 +201,15 @@ def test_another_scale_of_the_covariances_is_used_and_compiles_nothing(walks):
     prepared, _ = evaluation.prepare(walks[::2], CONFIG)
     (_, one) = evaluation.estimate(prepared, NETWORK, CONFIG, OPTIONS)
     programs = filtered._run_with_network._cache_size()
-    options = dataclasses.replace(OPTIONS, measurement_scale=OPTIONS.measurement_scale * 9)
+    options = changed(OPTIONS, noise={"measurement_scale": SCALE * 9})
     (_, scaled) = evaluation.estimate(prepared, NETWORK, CONFIG, options)
     assert filtered._run_with_network._cache_size() == programs
     first = np.isfinite(one.displacement_std).all(axis=1).argmax()  # a later window is seen turned
     np.testing.assert_allclose(
         scaled.displacement_std[first], 3 * one.displacement_std[first], rtol=1e-12
     )
-    np.testing.assert_allclose(
-        one.displacement_std[first], np.exp(-3.0) * OPTIONS.measurement_scale**0.5, rtol=0.5
-    )
-    factors = dict.fromkeys(("std_factor_x", "std_factor_y", "std_factor_z"), 3.0)
-    options = dataclasses.replace(OPTIONS, **factors)
+    np.testing.assert_allclose(one.displacement_std[first], np.exp(-3.0) * SCALE**0.5, rtol=0.5)
+    options = changed(OPTIONS, noise={"std_factor": (3.0, 3.0, 3.0)})
     (_, same_filter) = evaluation.estimate(prepared, NETWORK, CONFIG, options)
     same(scaled, same_filter, 1e-9)
 

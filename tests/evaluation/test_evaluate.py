@@ -13,16 +13,17 @@ import pytest
 
 from gnio_jax import data
 from gnio_jax.commands import console
-from gnio_jax.config import DataConfig, EvaluateConfig, FilterOptions, ModelConfig, TrainConfig
+from gnio_jax.config import DataConfig, EvaluateConfig, ModelConfig, TrainConfig
 from gnio_jax.data.readers import synthetic
 from gnio_jax.evaluation import report, run
 from tests.support import drawn_run
+from tests.support.filter_settings import changed
 
 ROOT = Path(__file__).parents[2]
 TRAINED = TrainConfig(
     data=DataConfig(rate=50.0),
     model=ModelConfig(width=2, bank_size=4, bank_heads=2),
-    filter=FilterOptions(velocity_std=0.7),
+    filter=changed(start={"velocity": 0.7}),
 )
 
 
@@ -177,8 +178,8 @@ def test_folders_tell_choices_apart():
             ["--estimator", "kalman"],
             "--estimator: must be one of ekf, integrate, imu_only, found 'kalman'",
         ),
-        (["--filter.gyro-density", "-1"], "'filter.gyro_density' must be positive"),
-        (["--filter.gyro-densty", "1"], "did you mean --filter.gyro-density?"),
+        (["--set", "filter.noise.gyro_density=-1"], "'filter.noise.gyro_density' must be positive"),
+        (["--set", "filter.noise.gyro_densty=1"], "did you mean 'filter.noise.gyro_density'?"),
         (["--batch-size", "0"], "--batch-size: must be at least 1"),
         (["--orientation", "device"], "leave it out"),
         (["--checkpoint", "latest"], "holds no checkpoint"),

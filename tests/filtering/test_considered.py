@@ -22,10 +22,10 @@ from tests.support.walks import errors, simulate
 
 N, CLONES, STRIDES, DT, SIGMA, RUNS = 5, 4, 100, 0.02, 0.03, 24
 HALF = RUNS // 2
-CONFIG = filtering.FilterConfig(
-    DT, N, CLONES, measurement_scale=2.0, gate_threshold=1e9, history="core"
+CONFIG = filtering.FilterConfig(DT, N, CLONES, gate_threshold=1e9, history="core")
+NOISE = filtering.NoiseModel(
+    2e-3, 2e-2, 1e-6, 1e-4, std_factor=(0.5, 0.5, 0.5**0.5), measurement_scale=2.0
 )
-NOISE = filtering.NoiseModel(2e-3, 2e-2, 1e-6, 1e-4, std_factor=(0.5, 0.5, 0.5**0.5))
 START = filtering.InitialStd(gyro_bias=1e-4, velocity=0.1)
 STD = filtering.ConsideredStd(gyro_bias=0.02, scale=0.1, heading=0.08, slope=0.05)
 SPREAD = np.array([*[STD.gyro_bias] * 3, *STD[1:]])

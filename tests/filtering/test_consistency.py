@@ -22,7 +22,7 @@ from tests.support.compiling import optimised, quick
 from tests.support.walks import errors, simulate
 
 RUNS, INTERVALS, N, CLONES, DT = 64, 900, 10, 10, 0.01
-NOISE = filtering.NoiseModel(5e-4, 5e-3, 1e-6, 2e-5)
+NOISE = filtering.NoiseModel(5e-4, 5e-3, 1e-6, 2e-5, measurement_scale=1.0)
 PARTS = {
     "tilt": [0, 1],
     "yaw": [2],
@@ -41,7 +41,6 @@ def program(jacobians):
         DT,
         N,
         CLONES,
-        measurement_scale=1.0,
         gate_threshold=1e9,
         history="core",
         jacobians=jacobians,
@@ -157,11 +156,9 @@ def test_measurements_tell_nothing_of_the_yaw(jacobians):
     """With a perfect gyro, no displacement in the body's yaw frame can say where north is, if the
     start does not either: its velocity is as uncertain about z as its yaw."""
     prior = filtering.InitialStd(tilt=0.01, yaw=0.0, velocity=0.5, gyro_bias=0.0, accel_bias=0.05)
-    noise = filtering.NoiseModel(0.0, 5e-3, 0.0, 2e-5)
+    noise = filtering.NoiseModel(0.0, 5e-3, 0.0, 2e-5, measurement_scale=1.0)
     runs = simulate(3, 1, 120, N, CLONES, DT, noise, prior, 0.05)
-    config = filtering.FilterConfig(
-        DT, N, CLONES, measurement_scale=1.0, gate_threshold=1e9, jacobians=jacobians
-    )
+    config = filtering.FilterConfig(DT, N, CLONES, gate_threshold=1e9, jacobians=jacobians)
     state = filtering.initial_state(config, *[runs[i][0] for i in range(3)], std=prior)
     turning = np.zeros(21)
     turning[2], turning[3:6] = 1.0, np.cross([0.0, 0, 1], state.velocity)
@@ -338,9 +335,7 @@ def tight():
     """(tables, start, gyro, accel) -> history of `run_odometry`, batched over runs, with a network
     that knows the truth, but for its noise, and tells it in the frame of its window, which it finds
     out from the window alone."""
-    config = filtering.FilterConfig(
-        DT, N, CLONES, measurement_scale=1.0, gate_threshold=1e9, history="core"
-    )
+    config = filtering.FilterConfig(DT, N, CLONES, gate_threshold=1e9, history="core")
     length = N * CLONES
 
     @optimised

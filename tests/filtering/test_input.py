@@ -20,10 +20,8 @@ from tests.support import scekf_numpy
 from tests.support.random_walk import random_walk
 
 N, CLONES, DT, INTERVALS = 5, 4, 0.02, 60
-CONFIG = filtering.FilterConfig(
-    DT, N, CLONES, measurement_scale=2.0, bridge_seconds=0.06, history="core"
-)
-NOISE = filtering.NoiseModel()
+CONFIG = filtering.FilterConfig(DT, N, CLONES, bridge_seconds=0.06, history="core")
+NOISE = filtering.NoiseModel(measurement_scale=2.0)
 
 # One program in place of one for every operation.
 bridge = jax.jit(gaps.bridge, static_argnums=4)
@@ -131,9 +129,7 @@ def test_a_short_hole_is_bridged_a_long_one_costs_certainty():
     valid[200:240] = False
     broken = gyro.copy()
     broken[~valid] = np.nan
-    config = filtering.FilterConfig(
-        DT, N, CLONES, measurement_scale=2.0, bridge_seconds=0.06, history="core"
-    )
+    config = filtering.FilterConfig(DT, N, CLONES, bridge_seconds=0.06, history="core")
     _, whole = run(config)
     _, found = run(config, valid, gyro=broken)
     gap = np.asarray(found.imu_gap)
@@ -333,7 +329,6 @@ RESTING = filtering.FilterConfig(
     DT,
     N,
     CLONES,
-    measurement_scale=1.0,
     zero_velocity_std=0.02,
     rest_seconds=0.3,
     convergence_seconds=1.0,

@@ -1,5 +1,5 @@
-"""Errors of the displacements that last: against a plain NumPy filter, autodiff and simulated
-walks, and through smoother and tracker."""
+"""Temporally correlated errors of the windows: against a plain NumPy filter and simulated walks,
+and through smoother and tracker."""
 
 import dataclasses
 import functools
@@ -8,10 +8,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from gnio_jax import filtering
-from gnio_jax.filtering.lasting_errors import LastingErrors, distort, lasting_motion, prior_variance
+from gnio_jax.filtering import CorrelatedError
+from gnio_jax.filtering.lasting_errors import lasting_motion
 from gnio_jax.filtering.state import LASTING
 from gnio_jax.types import Prediction
 from tests.support import scekf_numpy
@@ -20,16 +20,9 @@ from tests.support.random_walk import random_walk
 from tests.support.walks import errors, simulate
 
 N, CLONES, INTERVALS, DT = 4, 4, 40, 0.02
-CONFIG = filtering.FilterConfig(
-    DT, N, CLONES, convergence_seconds=0.6, measurement_scale=2.0, history="core"
-)
-ERRORS = LastingErrors(0.8, 0.3, 0.1, 0.05, 5.0)
-NOISE = filtering.NoiseModel(2e-3, 2e-2, 1e-6, 1e-4, displacement=ERRORS)
-
-
-def numpy_errors(errors):
-    named = errors._asdict()
-    return {"share": named.pop("window_share")} | named
+CONFIG = filtering.FilterConfig(DT, N, CLONES, convergence_seconds=0.6, history="core")
+ERRORS = CorrelatedError(0.8, 0.3)
+NOISE = filtering.NoiseModel(2e-3, 2e-2, 1e-6, 1e-4, measurement_scale=2.0, correlation=ERRORS)
 
 
 @functools.cache
@@ -49,7 +42,7 @@ def filtered(config=CONFIG, errors=ERRORS):
     start, gyro, accel, displacement, spread = walk()
     state = filtering.initial_state(config, *start)
     given = (state, gyro, accel, displacement, spread)
-    return program(config)(*given, noise=NOISE._replace(displacement=errors))
+    return program(config)(*given, noise=NOISE._replace(correlation=errors))
 
 
 @pytest.mark.parametrize("fail_scale", [0.0, 10.0])
@@ -70,7 +63,7 @@ def test_as_a_plain_filter_has_them(fail_scale):
         convergence=0.6,
         scale=2.0,
         fail_scale=fail_scale,
-        lasting=numpy_errors(ERRORS),
+        lasting=ERRORS._asdict(),
     )
     assert np.nansum(wanted["accepted"] == 0) == (fail_scale == 0)  # the outlier
     assert np.abs(wanted["lasting"][-1]).min() > 1e-3
@@ -91,45 +84,26 @@ def test_as_a_plain_filter_has_them(fail_scale):
 
 def test_without_any_size_they_change_nothing():
     _, with_none = filtered(errors=None)
-    _, with_zero = filtered(errors=LastingErrors(0.0, 0.3, 0.0, 0.0, 5.0))
+    _, with_zero = filtered(errors=CorrelatedError(0.0, 0.3))
     for name in with_none._fields:
         if name not in ("lasting", "diagnostics"):
             np.testing.assert_allclose(
                 getattr(with_zero, name), getattr(with_none, name), atol=1e-12, err_msg=name
             )
-    assert with_none.lasting.shape == (INTERVALS, 0) and with_zero.lasting.shape == (INTERVALS, 5)
-
-
-def test_the_jacobians_are_the_derivatives():
-    rng = np.random.default_rng(0)
-    root = np.tril(rng.normal(size=(3, 3)))
-    displacement, lasting = rng.normal(size=3), np.array([0.3, -1.2, 0.5, 0.2, -0.4])
-
-    def expected(displacement, lasting):
-        return distort(displacement, jnp.asarray(root), lasting, ERRORS).displacement
-
-    @jax.jit
-    def with_derivatives(displacement, lasting):
-        found = distort(displacement, jnp.asarray(root), lasting, ERRORS)
-        return found, jax.jacobian(expected, (0, 1))(displacement, lasting)
-
-    found, (gain, jacobian) = with_derivatives(displacement, lasting)
-    np.testing.assert_allclose(found.gain, gain, atol=1e-14)
-    np.testing.assert_allclose(found.jacobian, jacobian, atol=1e-14)
-    by_hand = np.exp(0.2) * Rotation.from_euler("z", -0.4).apply(displacement)
-    np.testing.assert_allclose(found.displacement, by_hand + 0.8 * root @ lasting[:3], atol=1e-14)
+    assert with_none.lasting.shape == (INTERVALS, 0) and with_zero.lasting.shape == (INTERVALS, 3)
 
 
 def test_they_are_as_large_at_all_times():
-    prior = prior_variance(ERRORS, np.dtype(float))
     motion = lasting_motion(ERRORS, 0.7, np.dtype(float))
-    np.testing.assert_allclose(motion.decay**2 * prior + motion.variance, prior, rtol=1e-14)
-    np.testing.assert_allclose(motion.decay, np.exp(-0.7 / np.array([0.3] * 3 + [5.0] * 2)))
+    np.testing.assert_allclose(motion.decay**2 + motion.variance, np.ones(3), rtol=1e-14)
+    np.testing.assert_allclose(motion.decay, np.exp(-0.7 / np.array([0.3] * 3)))
 
 
 RUNS, SIGMA, LONG = 48, 0.05, 500
-LASTING_WALK = LastingErrors(0.9, 0.5, 0.08, 0.05, 40.0)
-MODEL = filtering.NoiseModel(5e-4, 5e-3, 1e-6, 2e-5, displacement=LASTING_WALK)
+LASTING_WALK = CorrelatedError(0.9, 0.5)
+MODEL = filtering.NoiseModel(
+    5e-4, 5e-3, 1e-6, 2e-5, measurement_scale=1.0, correlation=LASTING_WALK
+)
 STD = filtering.InitialStd(0.02, 0.01, 0.3, 1e-3, 1e-3, 0.02)
 
 
@@ -137,28 +111,20 @@ STD = filtering.InitialStd(0.02, 0.01, 0.3, 1e-3, 1e-3, 0.02)
 def simulated():
     """Walks whose displacements have errors as the model has them, drawn in NumPy."""
     runs = simulate(2, RUNS, LONG, 10, 10, 0.01, MODEL, STD, 0.0)
-    rng, (share, window_seconds, scale_std, heading_std, walk_seconds) = (
-        np.random.default_rng(3),
-        LASTING_WALK,
-    )
-    decay = np.exp(-0.1 / np.array([window_seconds] * 3 + [walk_seconds] * 2))
-    std = np.array([1.0, 1.0, 1.0, scale_std, heading_std])
-    state, seen = std * rng.normal(size=(RUNS, 5)), np.array(runs.displacement)
+    rng, (share, seconds) = np.random.default_rng(3), LASTING_WALK
+    decay = np.exp(-0.1 / seconds)
+    state, seen = rng.normal(size=(RUNS, 3)), np.array(runs.displacement)
     for k in range(LONG):
-        state = decay * state + np.sqrt(1 - decay**2) * std * rng.normal(size=(RUNS, 5))
-        turned = Rotation.from_rotvec(state[:, 4:] * [[0.0, 0.0, 1.0]]).apply(seen[:, k])
+        state = decay * state + np.sqrt(1 - decay**2) * rng.normal(size=(RUNS, 3))
         white = np.sqrt(1 - share**2) * rng.normal(size=(RUNS, 3))
-        noise = SIGMA * (share * state[:, :3] + white)
-        seen[:, k] = np.exp(state[:, 3:4]) * turned + noise
+        seen[:, k] += SIGMA * (share * state + white)
     return runs._replace(displacement=seen)
 
 
 @functools.cache
 def batched():
     """(noise, start and signals of each run) -> their histories."""
-    config = filtering.FilterConfig(
-        0.01, 10, 10, measurement_scale=1.0, gate_threshold=1e9, history="core"
-    )
+    config = filtering.FilterConfig(0.01, 10, 10, gate_threshold=1e9, history="core")
     spread = np.tile(SIGMA**2 * np.eye(3), (LONG, 1, 1))
 
     def run(noise, rotation, velocity, position, *signals):
@@ -171,7 +137,7 @@ def batched():
 @functools.cache
 def estimated(errors_=LASTING_WALK):
     runs = simulated()
-    history = batched()(MODEL._replace(displacement=errors_), *runs[:6])
+    history = batched()(MODEL._replace(correlation=errors_), *runs[:6])
     error, covariance = errors(runs, history), np.asarray(history.covariance)
     return error[:, 100:], covariance[:, 100:], np.asarray(history.nis)[:, 100:]
 
@@ -190,9 +156,7 @@ def test_the_filter_is_as_certain_as_it_may_be():
 
 def test_taken_for_white_they_make_it_too_certain():
     """Without any size they change nothing, as above: one program for both filters."""
-    error, covariance, _ = estimated(
-        LASTING_WALK._replace(window_share=0.0, scale_std=0.0, heading_std=0.0)
-    )
+    error, covariance, _ = estimated(LASTING_WALK._replace(share=0.0))
     position = slice(6, 9)
     assert normalised(error[..., position], covariance[..., position, position]) > 4
     with_them, _, _ = estimated()
@@ -201,9 +165,7 @@ def test_taken_for_white_they_make_it_too_certain():
 
 
 def test_the_smoother_is_consistent_with_them():
-    config = filtering.FilterConfig(
-        0.01, 10, 10, measurement_scale=1.0, gate_threshold=1e9, history="core"
-    )
+    config = filtering.FilterConfig(0.01, 10, 10, gate_threshold=1e9, history="core")
     runs, spread = simulated(), np.tile(SIGMA**2 * np.eye(3), (LONG, 1, 1))
 
     @optimised
@@ -245,15 +207,15 @@ def test_the_tracker_has_them_too(tmp_path):
     tracker.save(tmp_path / "tracker.npz")
     restored = filtering.Tracker.restore(tmp_path / "tracker.npz", predict, CONFIG, NOISE)
     np.testing.assert_array_equal(restored.pose().covariance, tracker.pose().covariance)
-    other = NOISE._replace(displacement=ERRORS._replace(walk_seconds=6.0))
-    with pytest.raises(ValueError, match=r"displacement\.walk_seconds = 5\.0, not 6\.0"):
+    other = NOISE._replace(correlation=ERRORS._replace(seconds=6.0))
+    with pytest.raises(ValueError, match=r"correlation\.seconds = 0\.3, not 6\.0"):
         filtering.Tracker.restore(tmp_path / "tracker.npz", predict, CONFIG, other)
 
 
 def evidence(errors=ERRORS, factor=(1.0, 1.0, 1.0), spread=None):
     """The log likelihood of the walk, from the program of `filtered`."""
     start, *signals, told = walk()
-    state, noise = filtering.initial_state(CONFIG, *start), NOISE._replace(displacement=errors)
+    state, noise = filtering.initial_state(CONFIG, *start), NOISE._replace(correlation=errors)
     given = state, *signals, told if spread is None else spread
     _, history = program(CONFIG)(*given, noise=noise._replace(std_factor=tuple(factor)))
     return np.nansum(history.log_likelihood)
@@ -265,7 +227,7 @@ def gradient():
     start, *signals = walk()
 
     def of(errors, factor):
-        noise = NOISE._replace(displacement=errors, std_factor=tuple(factor))
+        noise = NOISE._replace(correlation=errors, std_factor=tuple(factor))
         state = filtering.initial_state(CONFIG, *start)
         _, history = filtering.run_filter(state, *signals, CONFIG, noise)
         return jnp.nansum(history.log_likelihood)
@@ -274,10 +236,10 @@ def gradient():
 
 
 def test_their_derivatives_are_those_of_differences_and_finite_at_zero():
-    for errors_ in (ERRORS, ERRORS._replace(window_share=0.0, scale_std=0.0, heading_std=0.0)):
+    for errors_ in (ERRORS, ERRORS._replace(share=0.0)):
         found, _ = gradient()(errors_, np.ones(3))
         assert all(np.isfinite(np.asarray(found)))
-        for name in ("window_share", "scale_std"):
+        for name in ("share", "seconds"):
             step = 1e-5
             value = getattr(errors_, name)
             ahead, behind = (
@@ -306,16 +268,16 @@ def test_the_factor_of_each_axis_scales_the_covariance():
 @pytest.mark.parametrize(
     ("field", "value", "problem"),
     [
-        ("window_share", 1.0, "must be below 1"),
-        ("window_share", -0.1, "must be a number that is not negative"),
-        ("walk_seconds", 0.0, "must be positive"),
-        ("scale_std", -1.0, "must be a number that is not negative"),
+        ("share", 1.0, "must be below 1"),
+        ("share", -0.1, "must be a number that is not negative"),
+        ("seconds", 0.0, "must be positive"),
+        ("seconds", -1.0, "must be a number that is not negative"),
     ],
 )
 def test_sizes_that_make_no_sense_are_refused(field, value, problem):
     start, *signals = walk()
-    noise = NOISE._replace(displacement=ERRORS._replace(**{field: value}))
-    with pytest.raises(ValueError, match=rf"noise\.displacement\.{field}: {problem}"):
+    noise = NOISE._replace(correlation=ERRORS._replace(**{field: value}))
+    with pytest.raises(ValueError, match=rf"noise\.correlation\.{field}: {problem}"):
         filtering.run_filter(filtering.initial_state(CONFIG, *start), *signals, CONFIG, noise)
 
 
@@ -331,4 +293,4 @@ def test_a_state_that_has_them_goes_on_with_them():
     np.testing.assert_allclose(np.concatenate(rows), filtered()[1].position, atol=1e-9)
     with pytest.raises(ValueError, match=r"state\.lasting: "):
         given = (state, gyro, accel, displacement, spread)
-        filtering.run_filter(*given, config, NOISE._replace(displacement=None))
+        filtering.run_filter(*given, config, NOISE._replace(correlation=None))

@@ -164,7 +164,7 @@ def at_singularity(kind):
 @functools.partial(quick, static_argnums=3)
 @functools.partial(jax.grad, argnums=(0, 1, 2), allow_int=True, has_aux=True)
 def update_gradient(state, displacement, covariance, frame="given"):
-    measurement = scaled_measurement(displacement, covariance, CONFIG, filtering.NoiseModel())
+    measurement = scaled_measurement(displacement, covariance, filtering.NoiseModel())
     new, outcome = update(state, measurement, 2, 0, CONFIG, frame)
     leaves = [
         leaf for leaf in jax.tree.leaves((new, outcome)) if jnp.issubdtype(leaf.dtype, jnp.floating)
@@ -258,7 +258,6 @@ def test_initial_state():
         ("clones_per_window", True),
         ("mahalanobis_fail_scale", -1.0),
         ("history", "all"),
-        ("measurement_scale", 0.0),
         ("log_std_min", float("-inf")),
         ("gate_threshold", 0.0),
         ("convergence_seconds", -1.0),
@@ -316,6 +315,8 @@ def arguments():
         ("displacement", np.zeros((4, 3), np.float32)),
         ("covariance", np.zeros((4, 3))),
         ("noise.gyro_density", filtering.NoiseModel(np.zeros(3))),
+        ("noise.measurement_scale", filtering.NoiseModel(measurement_scale=0.0)),
+        ("noise.std_factor", filtering.NoiseModel(std_factor=(1.0, 0.0, 1.0))),
     ],
 )
 def test_run_filter_names_the_bad_argument(name, value):

@@ -20,11 +20,9 @@ from tests.support.compiling import quick
 from tests.support.random_walk import random_walk
 
 N, CLONES, DT = 4, 4, 0.02
-CONFIG = filtering.FilterConfig(
-    DT, N, CLONES, convergence_seconds=0.6, success_seconds=0.35, measurement_scale=2.0
-)
+CONFIG = filtering.FilterConfig(DT, N, CLONES, convergence_seconds=0.6, success_seconds=0.35)
 """A window is 0.32 s, and so a knock spoils no more than 0.35 s; a gap takes longer."""
-NOISE = filtering.NoiseModel(2e-3, 2e-2)
+NOISE = filtering.NoiseModel(2e-3, 2e-2, measurement_scale=2.0)
 HIT = slice(180, 184)
 """Samples of the knock."""
 
@@ -159,9 +157,7 @@ def test_online_too_and_across_a_file(tmp_path, monkeypatch):
 # Any input ----------------------------------------------------------------------------------------
 
 ROWS = 60
-PLAIN = filtering.FilterConfig(
-    DT, 5, 4, measurement_scale=2.0, convergence_seconds=1.0, rest_seconds=0.2
-)
+PLAIN = filtering.FilterConfig(DT, 5, 4, convergence_seconds=1.0, rest_seconds=0.2)
 CONFIGS = [
     dataclasses.replace(PLAIN, jacobians="first", zero_velocity_std=0.02),
     dataclasses.replace(PLAIN, jacobians="latest"),
@@ -206,7 +202,12 @@ def disturbed(
         for signal, unit in zip((gyro, accel, displacement), units, strict=True)
     ]
     final, history = FILTER(
-        state, *signals, covariance.astype(dtype), config, filtering.NoiseModel(2e-3, 2e-2), valid
+        state,
+        *signals,
+        covariance.astype(dtype),
+        config,
+        filtering.NoiseModel(2e-3, 2e-2, measurement_scale=2.0),
+        valid,
     )
     return final, history, np.linalg.norm(np.asarray(history.velocity, np.float64), axis=1)
 
@@ -278,7 +279,7 @@ def test_first_estimates_are_taken_anew_only_above_the_threshold():
     state, found = filtering.initial_state(config, *begin), []
     step = quick(
         lambda state, *given: filtering.run_filter(
-            state, *given, config, filtering.NoiseModel(2e-3, 2e-2)
+            state, *given, config, filtering.NoiseModel(2e-3, 2e-2, measurement_scale=2.0)
         )
     )
     for k in range(12):

@@ -24,7 +24,7 @@ from tests.support.odometry import (
     start,
 )
 
-NOISE = filtering.NoiseModel()
+NOISE = filtering.NoiseModel(measurement_scale=2.0)
 
 
 BASE, SLOPE = np.full(3, -2.0, np.float32), np.float32(0.1)
@@ -57,7 +57,7 @@ def program(config):
 def test_a_repeated_run_is_the_one_with_the_other_noise():
     """Where the network says the same whatever it sees."""
     gyro, accel = recording(0)
-    config = dataclasses.replace(CONFIG, measurement_scale=1.0)
+    noise = NOISE._replace(measurement_scale=1.0)
 
     def constant(windows):
         return Prediction(
@@ -65,12 +65,12 @@ def test_a_repeated_run_is_the_one_with_the_other_noise():
         )
 
     run = jax.jit(
-        lambda noise: filtering.run_odometry(constant, start(), gyro, accel, config, noise)[1]
+        lambda noise: filtering.run_odometry(constant, start(), gyro, accel, CONFIG, noise)[1]
     )
-    before = run(NOISE)
-    other = NOISE._replace(gyro_density=1e-2, std_factor=(1.5, 0.7, 2.0))
+    before = run(noise)
+    other = noise._replace(gyro_density=1e-2, std_factor=(1.5, 0.7, 2.0))
     told = before.displacement, before.measurement_std
-    _, found = filtering.repeat_odometry(start(), gyro, accel, *told, config, other)
+    _, found = filtering.repeat_odometry(start(), gyro, accel, *told, CONFIG, other)
     wanted = run(other)
     for name in ("position", "rotation", "nis", "measurement_std", "log_likelihood"):
         ours, theirs = getattr(found, name), getattr(wanted, name)
@@ -94,7 +94,6 @@ def test_windows_are_cut_with_the_state_of_the_filter(window_rotation, context, 
         N,
         CLONES,
         convergence_seconds=0.6,
-        measurement_scale=2.0,
         window_rotation=window_rotation,
         context_samples=context,
     )
@@ -118,7 +117,7 @@ def test_windows_are_cut_with_the_state_of_the_filter(window_rotation, context, 
     _, history = program(config)(state, gyro, accel, BASE, SLOPE)
     wanted = scekf_numpy.run_from(
         state,
-        filtering.NoiseModel(),
+        NOISE,
         DT,
         gyro,
         accel,
@@ -162,7 +161,7 @@ def test_given_its_own_measurements_the_filter_repeats_itself():
     config = dataclasses.replace(CONFIG, window_rotation="tlio")
     run = jax.jit(lambda state: filtering.run_odometry(predict, state, gyro, accel, config, NOISE))
     final, history = run(start())
-    covariance = jax.vmap(jnp.diag)(history.measurement_std**2 / config.measurement_scale)
+    covariance = jax.vmap(jnp.diag)(history.measurement_std**2 / NOISE.measurement_scale)
     measured = history.displacement, covariance
     again_final, again = filtering.run_filter(start(), gyro, accel, *measured, config, NOISE)
     assert again.diagnostics == {}
@@ -215,6 +214,4 @@ def test_predict_is_asked_for_what_it_must_return():
         good._replace(diagnostics={"gate": jnp.zeros(3)}),
     ):
         with pytest.raises(ValueError, match=r"^predict: "):
-            filtering.run_odometry(
-                lambda _, bad=bad: bad, start(), gyro, accel, CONFIG, filtering.NoiseModel()
-            )
+            filtering.run_odometry(lambda _, bad=bad: bad, start(), gyro, accel, CONFIG, NOISE)

@@ -122,7 +122,7 @@ def both(walk, config, chunks=None):
         bg=bg,
         ba=ba,
         std=STD._asdict(),
-        scale=config.measurement_scale,
+        scale=noise.measurement_scale,
         fail_scale=config.mahalanobis_fail_scale,
         threshold=config.gate_threshold,
         convergence=config.convergence_seconds,
@@ -155,7 +155,6 @@ GATED = functools.partial(
     success_seconds=0.3,
     pause_seconds=0.5,
     history="core",
-    measurement_scale=2.0,
 )
 # One rejected row; ten in a row, so that the gate gives up and pauses; rejected rows around missing
 # ones.

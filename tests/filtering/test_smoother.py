@@ -182,9 +182,8 @@ CONFIG = functools.partial(
     CLONES,
     convergence_seconds=0.0,
     success_seconds=5.0,
-    measurement_scale=2.0,
 )
-NOISE = filtering.NoiseModel.per_sample(*WHITE, DT, *WALK)
+NOISE = filtering.NoiseModel.per_sample(*WHITE, DT, *WALK)._replace(measurement_scale=2.0)
 
 
 @pytest.mark.parametrize("case", ["rejected", "scaled", "weighted"])
@@ -323,7 +322,7 @@ def test_smooths_the_network_in_the_loop():
 
 
 RUNS, LONG, STEP, WINDOW, RATE, SIGMA = 16, 300, 10, 10, 0.01, 0.03
-DENSITIES = filtering.NoiseModel(5e-4, 5e-3, 1e-6, 2e-5)
+DENSITIES = filtering.NoiseModel(5e-4, 5e-3, 1e-6, 2e-5, measurement_scale=1.0)
 
 
 def test_long_walks_come_closer_to_the_truth_and_say_by_how_much():
@@ -335,7 +334,6 @@ def test_long_walks_come_closer_to_the_truth_and_say_by_how_much():
         RATE,
         STEP,
         WINDOW,
-        measurement_scale=1.0,
         gate_threshold=1e9,
         history="core",
         gap_gyro_std=0.5,

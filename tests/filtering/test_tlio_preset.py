@@ -101,12 +101,11 @@ CONFIG = filtering.FilterConfig(
     N,
     CLONES,
     convergence_seconds=0.6,
-    measurement_scale=2.0,
     bridge_seconds=0.04,
     window_rotation="tlio",
 )
 WEIGHTS = np.random.default_rng(5).standard_normal((6, 3)) * 0.02
-NOISE = filtering.NoiseModel(2e-3, 2e-2)
+NOISE = filtering.NoiseModel(2e-3, 2e-2, measurement_scale=2.0)
 
 
 def recording():

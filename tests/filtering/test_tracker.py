@@ -25,10 +25,8 @@ from gnio_jax.types import Prediction
 from tests.support import drawn_run, scekf_numpy
 
 N, CLONES, INTERVALS, DT = 4, 4, 70, 0.02
-CONFIG = filtering.FilterConfig(
-    DT, N, CLONES, convergence_seconds=0.6, measurement_scale=2.0, bridge_seconds=0.05
-)
-NOISE = filtering.NoiseModel(2e-3, 2e-2)
+CONFIG = filtering.FilterConfig(DT, N, CLONES, convergence_seconds=0.6, bridge_seconds=0.05)
+NOISE = filtering.NoiseModel(2e-3, 2e-2, measurement_scale=2.0)
 WEIGHTS = np.random.default_rng(5).standard_normal((6, 3)) * 0.02
 HIT = slice(180, 184)
 """Samples of a knock that the network takes for a leap: its measurement is rejected."""

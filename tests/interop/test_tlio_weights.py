@@ -12,7 +12,7 @@ import pytest
 from gnio_jax import interop, models
 from gnio_jax.commands import console
 from gnio_jax.commands import interop as interop_command
-from gnio_jax.config import FilterOptions
+from gnio_jax.config import FilterSettings
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import filter_setup
 from gnio_jax.training import checkpoint
@@ -315,7 +315,7 @@ def test_a_run_is_made_of_them(file, tmp_path, monkeypatch, capsys, loaded):
     )
     assert run.model == models.create("tlio")
     assert filter_setup(run.config.data, run.config.filter).config.window_rotation == "tlio"
-    assert filter_setup(run.config.data, FilterOptions()).config.window_rotation == "per_sample"
+    assert filter_setup(run.config.data, FilterSettings()).config.window_rotation == "per_sample"
     equal(run.variables, loaded)
     with pytest.raises(SystemExit) as left:  # a second time
         command(monkeypatch, file, tmp_path / "run")

@@ -10,7 +10,7 @@ import pytest
 
 from gnio_jax import live, tracking
 from gnio_jax.commands import app, console
-from gnio_jax.config import DataConfig, FilterOptions, ModelConfig, TrainConfig
+from gnio_jax.config import DataConfig, ModelConfig, TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation.tum import read_tum
 from gnio_jax.filtering import ConsideredStd, Tracker
@@ -19,6 +19,7 @@ from gnio_jax.filtering.pose import Pose
 from gnio_jax.live import rerun_stream
 from gnio_jax.types import Sequence
 from tests.support import known_walk, tiny_run
+from tests.support.filter_settings import changed
 from tests.support.rerun_files import columns_of
 
 CONFIG = TrainConfig(data=DataConfig(rate=50.0), model=ModelConfig(name="tiny"))
@@ -93,7 +94,7 @@ def test_a_stream_gives_the_trackers_poses(gnio, run, recorded, tmp_path):
 
 
 def test_the_tracker_of_a_calibrated_run_considers_what_its_track_does(run, monkeypatch):
-    options = FilterOptions(considered_scale_std=0.1, considered_heading_std_degrees=90.0)
+    options = changed(considered={"scale": 0.1, "heading": np.pi / 2})
     found = tracking.choose_weights(str(run)).run
     calibrated = found._replace(config=dataclasses.replace(found.config, filter=options))
     passed = []

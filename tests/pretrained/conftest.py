@@ -4,8 +4,9 @@ import json
 
 import pytest
 
-from gnio_jax.config import DataConfig, FilterOptions, ModelConfig, TrainConfig
+from gnio_jax.config import DataConfig, ModelConfig, TrainConfig
 from tests.support import tiny_run
+from tests.support.filter_settings import changed
 
 CONFIG = TrainConfig(
     dataset="synthetic",
@@ -14,7 +15,7 @@ CONFIG = TrainConfig(
     seed=7,
     data=DataConfig(rate=50.0),
     model=ModelConfig(name="tiny"),
-    filter=FilterOptions(std_factor_x=1.7, considered_scale_std=0.02),
+    filter=changed(noise={"std_factor": (1.7, 1.0, 1.0)}, considered={"scale": 0.02}),
 )
 FIGURES = {
     "settings": {"dataset": "synthetic", "split": "test", "estimator": "ekf"},

@@ -105,7 +105,7 @@ def test_the_card_says_what_the_publisher_and_the_evaluations_say(published):
         "- Running | jumping.",
         "gnio train --config config.yaml --workdir runs/walk --init-from runs/earlier",
         "Dataset `synthetic`, seed 7",
-        "considered_scale_std",
+        "counts errors in: scale",
         "| synthetic_test_ekf | 2 | 1.23 (0.90–1.60) |",
         "in float32",
     ):

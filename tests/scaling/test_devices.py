@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from jax.sharding import PartitionSpec
 
-from gnio_jax.config import DataConfig, ModelConfig, OptimConfig, TrainConfig
-from gnio_jax.config.through_filter import ThroughFilter
+from gnio_jax.config import DataConfig, ModelConfig, OptimConfig, ThroughFilter, TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.reporting import Silence
 from gnio_jax.scaling import devices

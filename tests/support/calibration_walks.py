@@ -5,14 +5,16 @@ import functools
 import numpy as np
 
 from gnio_jax import filtering
-from gnio_jax.calibration.likelihood import Walks
-from gnio_jax.config import DataConfig, FilterOptions
+from gnio_jax.calibration.fit import Walks
+from gnio_jax.config import DataConfig
+from tests.support.filter_settings import changed
 from tests.support.walks import simulate
 
 DATA = DataConfig(rate=50.0, window_seconds=0.4, stride_seconds=0.1)
 STRIDES, N, CLONES, SIGMA = 250, 5, 4, 0.05
-TRUE = FilterOptions(
-    gyro_density=2e-3, accel_density=2e-2, measurement_scale=1.0, gyro_bias_std=1e-3
+TRUE = changed(
+    noise={"gyro_density": 2e-3, "accel_density": 2e-2, "measurement_scale": 1.0},
+    start={"gyro_bias": 1e-3},
 )
 
 

@@ -4,13 +4,13 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from gnio_jax.config import DataConfig, FilterOptions
+from gnio_jax.config import DataConfig, FilterSettings
 from gnio_jax.evaluation import Network, Setup
 from gnio_jax.types import Prediction
 
 RATE = 50.0
 CONFIG = DataConfig(rate=RATE)
-OPTIONS = FilterOptions()
+OPTIONS = FilterSettings()
 INTEGRATE = Setup("integrate")
 LOOSE = Setup(coupling="loose")
 

@@ -7,7 +7,7 @@ from gnio_jax import filtering
 
 N, CLONES, INTERVALS, DT = 4, 4, 26, 0.02
 
-CONFIG = filtering.FilterConfig(DT, N, CLONES, convergence_seconds=0.6, measurement_scale=2.0)
+CONFIG = filtering.FilterConfig(DT, N, CLONES, convergence_seconds=0.6)
 
 PARAMETERS = np.random.default_rng(5).standard_normal((6, 3)) * 0.02
 

@@ -98,7 +98,7 @@ def run(
 
     measure(k, clone_rotation, bg, ba), where given, supplies displacement and covariance at step k.
     frame "own": the displacement turns with the filter's own attitude, whose yaw then cancels.
-    lasting: share, window_seconds, scale_std, heading_std, walk_seconds of errors that last."""
+    lasting: share and seconds of the temporally correlated part of a window's error."""
     bg, ba = np.zeros(3) if bg is None else bg, np.zeros(3) if ba is None else ba
     P = np.diag(
         np.repeat(
@@ -114,12 +114,10 @@ def run(
         )
         ** 2
     )
-    errors = np.zeros(0 if lasting is None else 5)
+    errors = np.zeros(0 if lasting is None else 3)
     decay, spread = np.ones(len(errors)), np.ones(len(errors))
     if lasting is not None:
-        spread[3:] = lasting["scale_std"], lasting["heading_std"]
-        times = np.array([lasting["window_seconds"]] * 3 + [lasting["walk_seconds"]] * 2)
-        decay = np.exp(-n * dt / times)
+        decay = np.exp(-n * dt / lasting["seconds"]) * np.ones(3)
     core = 15 + len(errors)
     P = np.block(
         [
@@ -190,13 +188,8 @@ def run(
                 expected, noise, lasting_part = Ry.T @ (p - pi), scale * C, 0
                 if lasting is not None:
                     share, root = lasting["share"], np.linalg.cholesky(noise)
-                    turn = Rotation.from_euler("z", errors[4]).as_matrix()
-                    gain = np.exp(errors[3]) * turn
-                    seen = gain @ expected
-                    H = gain @ H
-                    H[:, 15:18], H[:, 18] = share * root, seen
-                    H[:, 19] = np.cross([0, 0, 1], seen)
-                    expected = seen + share * root @ errors[:3]
+                    H[:, 15:18] = share * root
+                    expected = expected + share * root @ errors
                     lasting_part = share**2 * noise
                 r = d - expected
                 S = H @ P @ H.T + noise - lasting_part

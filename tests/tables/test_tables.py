@@ -124,7 +124,7 @@ def test_every_run_is_calibrated_before_it_is_measured(made, monkeypatch, capsys
         configuration.load(root / "out" / "runs" / name / "config.yaml")
         for name in ("gnio_s0", "gnio_s0_calibrated")
     )
-    assert run.filter.measurement_scale != 10 and run.filter.considered_gyro_bias_std > 0
+    assert run.filter.noise.measurement_scale != 10 and run.filter.considered.gyro_bias > 0
     assert run.model == trained.model
     assert float(after["nis"]) > 0 and after["nis"] != before["nis"]
 

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from gnio_jax import config as configuration
-from gnio_jax.config import ModelConfig, OptimConfig, TrainConfig
-from gnio_jax.config.through_filter import ThroughFilter
+from gnio_jax.config import ModelConfig, OptimConfig, ThroughFilter, TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.training import step
 from gnio_jax.training.checkpoint import create_trained_model

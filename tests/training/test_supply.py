@@ -14,8 +14,14 @@ import numpy as np
 import pytest
 
 from gnio_jax import config as configuration
-from gnio_jax.config import AugmentConfig, DataConfig, ModelConfig, OptimConfig, TrainConfig
-from gnio_jax.config.through_filter import ThroughFilter
+from gnio_jax.config import (
+    AugmentConfig,
+    DataConfig,
+    ModelConfig,
+    OptimConfig,
+    ThroughFilter,
+    TrainConfig,
+)
 from gnio_jax.data import windows
 from gnio_jax.data.on_disk import source_on_disk
 from gnio_jax.errors import InputError

@@ -15,15 +15,18 @@ from gnio_jax import config as configuration
 from gnio_jax.commands import evaluate
 from gnio_jax.commands.train import TrainOptions, defaults
 from gnio_jax.config import (
+    CorrelatedError,
     DataConfig,
-    FilterOptions,
+    FilterSettings,
+    InitialStd,
     ModelConfig,
+    NoiseModel,
     OptimConfig,
     ThroughFilter,
     TrainConfig,
 )
 from gnio_jax.errors import InputError
-from gnio_jax.filtering.unconstrained import natural
+from gnio_jax.filtering.settings import with_free_parameters
 from gnio_jax.models import registry
 from gnio_jax.reporting import Lines
 from gnio_jax.training import (
@@ -38,22 +41,15 @@ from gnio_jax.training import (
 )
 from tests.support import drawn_run
 from tests.support.compiling import quick
+from tests.support.filter_settings import changed
 from tests.support.tiny_network import Tiny
 from tests.support.tlio_files import SPEED, TURN, write_splits
 
 LEARN = ("noise", "measurement", "start", "head")
 WINDOW = 0.4
-OPTIONS = FilterOptions(
-    gyro_density=0.1,
-    accel_density=0.1,
-    gyro_bias_walk=1e-3,
-    accel_bias_walk=1e-2,
-    velocity_std=0.1,
-    gyro_bias_std=1e-3,
-    position_std=0.01,
-    measurement_scale=1.5,
-    window_error_share=0.3,
-    scale_error_std=0.05,
+OPTIONS = FilterSettings(
+    NoiseModel(0.1, 0.1, 1e-3, 1e-2, measurement_scale=1.5, correlation=CorrelatedError(0.3, 0.5)),
+    InitialStd(tilt=0.0, yaw=2e-3, velocity=0.1, gyro_bias=1e-3, position=0.01),
 )
 THROUGH = ThroughFilter(
     learn=LEARN,
@@ -135,7 +131,7 @@ def test_a_run_logs_its_losses_and_what_the_filter_knows_of_its_errors(finished)
         assert row["skipped"] == 0 and row["pieces_per_second"] > 0
         assert row["val_rmse"] == pytest.approx(row["val_mse"] ** 0.5)
         assert row["val_nis"] > 0 and row["val_nees"] > 0
-        assert row["gradient_norm/head"] > 0 and row["gradient_norm/filter/gyro_density"] > 0
+        assert row["gradient_norm/head"] > 0 and row["gradient_norm/filter/noise.gyro_density"] > 0
         val = row["val_mse"] + row["val_innovation"] + row["val_state"]
         val += row["val_displacement_error/1s"] ** 2 + row["val_yaw_error/1s"] ** 2
         assert row["val_loss"] == pytest.approx(val, rel=1e-6)
@@ -148,10 +144,10 @@ def test_what_is_not_to_learn_stays_to_the_bit(recording, finished):
         assert same(parameters, after.variables["params"][module]) == (module != "head"), module
     statistics = after.variables["batch_stats"]
     assert same(before.variables["batch_stats"]["norm"], statistics["norm"])
-    told, options = vars(OPTIONS), vars(after.config.filter)
-    numbers = {name for part in learnt.FILTER_PARTS.values() for name in part}
-    changed = {name for name in told if told[name] != options[name]}
-    assert changed == numbers - {"heading_error_std_degrees"}  # which is 0
+    given, found = configuration.flat(OPTIONS), configuration.flat(after.config.filter)
+    moved = {name for name in given if given[name] != found[name]}
+    numbers = {name for name in given if name.startswith(("noise.", "start."))}
+    assert moved == numbers - {"start.tilt"}  # which is 0
     assert configuration.load(finished / "config.yaml").filter == OPTIONS
 
 
@@ -182,10 +178,10 @@ def test_stopped_and_resumed_gives_the_same_bits(recording, finished, tmp_path, 
 
 def test_evaluation_takes_what_the_filter_has_learnt(finished, capsys):
     evaluate.main(["--workdir", str(finished), "--no-plots"])
-    learnt_values = dataclasses.asdict(checkpoint.load_run(finished).config.filter)
+    learnt_values = configuration.plain(checkpoint.load_run(finished).config.filter)
     metrics = json.loads((finished / "eval" / "tlio_test_ekf" / "metrics.json").read_text())
     assert metrics["settings"]["filter"] == learnt_values
-    assert learnt_values["gyro_density"] != OPTIONS.gyro_density
+    assert learnt_values["noise"]["gyro_density"] != OPTIONS.noise.gyro_density
     # The latest checkpoint's are the defaults where that is asked for.
     latest = checkpoint.load_run(finished, "latest").config.filter
     asked = evaluate.EvaluateOptions(workdir=str(finished), checkpoint="latest")
@@ -195,7 +191,10 @@ def test_evaluation_takes_what_the_filter_has_learnt(finished, capsys):
 def test_a_copy_with_other_options_has_them(finished, tmp_path):
     """As calibration writes it: what had learnt does not come back."""
     run = checkpoint.load_run(finished)
-    options = dataclasses.replace(run.config.filter, gyro_density=0.5, window_error_share=0.9)
+    options = changed(
+        run.config.filter,
+        noise={"gyro_density": 0.5, "correlation": CorrelatedError(0.9, 0.5)},
+    )
     config = dataclasses.replace(run.config, filter=options)
     configuration.save(tmp_path / "config.yaml", config)
     checkpoint.write_best(tmp_path, run._replace(config=config))
@@ -294,8 +293,8 @@ def test_noise_is_recovered(training):
         (2, len(training.source.gyro), 3)
     )
     for share in (3.0, 1 / 3):
-        gyro = training.source.gyro + share * OPTIONS.gyro_density * white[0]
-        accel = training.source.accel + share * OPTIONS.accel_density * white[1]
+        gyro = training.source.gyro + share * OPTIONS.noise.gyro_density * white[0]
+        accel = training.source.accel + share * OPTIONS.noise.accel_density * white[1]
         noisy = training._replace(source=training.source._replace(gyro=gyro, accel=accel))
         state = new_state(training)
         for epoch in range(2):
@@ -303,7 +302,7 @@ def test_noise_is_recovered(training):
             assert progress.sums.skipped == 0
         found = learnt.learnt_options(OPTIONS, state.filter)
         for name in ("gyro_density", "accel_density"):
-            ratio = getattr(found, name) / getattr(OPTIONS, name)
+            ratio = getattr(found.noise, name) / getattr(OPTIONS.noise, name)
             assert ratio > 1.2 if share > 1 else ratio < 0.8, (name, share, ratio)
 
 
@@ -362,18 +361,23 @@ def test_parts_are_modules_and_options_by_name(training):
 
 def test_options_survive_their_unconstrained_numbers():
     numbers = learnt.filter_numbers(OPTIONS)
-    assert "heading_error_std_degrees" not in numbers
+    assert "start.tilt" not in numbers and "considered.scale" not in numbers
     assert learnt.learnt_options(OPTIONS, numbers) == OPTIONS
-    found = natural(numbers)
-    for name, value in found.items():
-        assert value.dtype == jnp.float64
-        np.testing.assert_allclose(value, getattr(OPTIONS, name), rtol=2e-6)
-    moved = natural({"window_error_share": jnp.float32(0), "velocity_std": jnp.float32(1)})
-    assert moved["window_error_share"] == 0.5
-    np.testing.assert_allclose(moved["velocity_std"], np.e, rtol=1e-7)
-    # A share is never rounded to 1, which no option may be.
-    nearly = learnt.learnt_options(OPTIONS, {"window_error_share": jnp.float32(20)})
-    assert nearly.window_error_share == 0.9999
+    given, found = (
+        dict(jax.tree_util.tree_leaves_with_path(each))
+        for each in (OPTIONS, with_free_parameters(OPTIONS, numbers))
+    )
+    for path, value in found.items():
+        assert jnp.asarray(value).dtype == jnp.float64
+        np.testing.assert_allclose(value, given[path], rtol=2e-6)
+    moved = with_free_parameters(
+        OPTIONS, {"noise.correlation.share": jnp.float32(0), "start.velocity": jnp.float32(1)}
+    )
+    assert moved.noise.correlation.share == 0.5
+    np.testing.assert_allclose(moved.start.velocity, np.e, rtol=1e-7)
+    # A share is never rounded to 1, which no setting may be.
+    nearly = learnt.learnt_options(OPTIONS, {"noise.correlation.share": jnp.float32(20)})
+    assert nearly.noise.correlation.share == 0.9999
 
 
 def test_a_later_stage_starts_from_what_the_filter_has_learnt(recording, finished, training):
@@ -381,15 +385,15 @@ def test_a_later_stage_starts_from_what_the_filter_has_learnt(recording, finishe
     asked = TrainOptions(
         init_from=str(finished),
         through_filter=THROUGH,
-        filter=dataclasses.replace(OPTIONS, velocity_std=0.3),
+        filter=changed(OPTIONS, start={"velocity": 0.3}),
     )
     run = initial.initial_run(tiny(recording, "unused", init_from=str(finished)))
     begins = defaults(asked).filter
     assert begins == run.config.filter != OPTIONS
-    config = tiny(recording, "unused", filter=dataclasses.replace(begins, velocity_std=0.3))
+    config = tiny(recording, "unused", filter=changed(begins, start={"velocity": 0.3}))
     state = training._replace(config=config).new_state(run)
     assert same(state.params, run.variables["params"])
-    other = state.filter.pop("velocity_std")
+    other = state.filter.pop("start.velocity")
     np.testing.assert_allclose(other, np.log(0.3), rtol=1e-6)
     for name, number in state.filter.items():
         np.testing.assert_allclose(number, run.filter[name], atol=1e-4, err_msg=name)

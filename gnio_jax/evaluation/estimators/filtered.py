@@ -36,7 +36,7 @@ from gnio_jax.filtering import (
 from gnio_jax.filtering.batch import Batch, batches, padded_masks, padded_signals
 from gnio_jax.filtering.config import YawFrame
 from gnio_jax.filtering.history import GYRO_BIAS, POSITION
-from gnio_jax.filtering.options import FilterSetup, scale_in_noise
+from gnio_jax.filtering.settings import FilterSetup
 from gnio_jax.numerics import filled_up, quaternion_from_matrix
 from gnio_jax.scaling.processes import on_host
 from gnio_jax.types import Array
@@ -84,7 +84,6 @@ def run_filters(
 ) -> list[Estimate]:
     """The filter over every recording, with the network in its loop or with the measurements of
     each recording."""
-    setup = scale_in_noise(setup)
     n = setup.config.samples_per_clone
     strides = [each.strides(n) for each in prepared]
     found: dict[int, Estimate] = {}

@@ -1,0 +1,381 @@
+"""What a calibration fits: the factors of the axes, the filter's noises to the likelihood of its
+innovations, and the errors that it only considers to the errors of its positions."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.optimize import minimize
+
+from gnio_jax.config import CorrelatedError, DataConfig, FilterSettings, flat
+from gnio_jax.errors import InputError
+from gnio_jax.evaluation.estimators.result import Estimate
+from gnio_jax.filtering import (
+    ConsideredStd,
+    FilterConfig,
+    InitialStd,
+    NoiseModel,
+    considered_covariance,
+    initial_state,
+    over_sequences,
+    repeat_odometry,
+    sensitivity,
+)
+from gnio_jax.filtering.history import POSITION
+from gnio_jax.filtering.settings import (
+    filter_config,
+    free_parameters,
+    with_free_parameters,
+    with_written_parameters,
+)
+from gnio_jax.training.filter_losses import gaussian_nll, normalised_squares
+from gnio_jax.types import Array
+
+GROUPS = {
+    "measurement": ("noise.measurement_scale",),
+    "noise": (
+        "noise.gyro_density",
+        "noise.accel_density",
+        "noise.gyro_bias_walk",
+        "noise.accel_bias_walk",
+    ),
+    "start": ("start.gyro_bias", "start.accel_bias"),
+    "window": ("noise.correlation",),
+}
+"""The settings that each group of `--fit` has."""
+CONSIDERED = ConsideredStd(gyro_bias=1e-3, scale=0.05, heading=math.radians(5.0), slope=0.02)
+"""Where the fit of the considered errors begins (ours)."""
+PHYSICAL = {
+    "noise.gyro_density": (1e-6, 0.1),
+    "noise.accel_density": (1e-5, 1.0),
+    "noise.gyro_bias_walk": (0.0, 0.01),
+    "noise.accel_bias_walk": (0.0, 0.3),
+    "noise.measurement_scale": (0.01, 100.0),
+    "noise.correlation.share": (0.0, 0.99),
+    "noise.correlation.seconds": (0.05, 60.0),
+    "start.gyro_bias": (0.0, 0.2),
+    "start.accel_bias": (0.0, 2.0),
+}
+"""Between which values the sensors of phones and headsets and the errors of networks lie, with room
+on both sides (ours). A fitted value outside says that the recordings did not determine it."""
+PRIOR_STD = 2.0
+"""Standard deviation of each fitted number about its start, in its own logarithm or logit (ours).
+The recordings outweigh it by far in all that they determine; what they do not determine stays where
+it was."""
+DIGITS = 4
+"""As many are written down."""
+CHECKPOINT_EVERY = 50
+"""Clone intervals between the states that the backward pass keeps."""
+FAILED = 1e6
+"""What the search sees where the filter fails: it turns back."""
+NO_GATE = 1e9
+"""Threshold of a χ² gate that lets everything through: one that rejects would reward a noise so
+small that everything is rejected."""
+INDEPENDENT_SECONDS = 10.0
+"""Errors of the position this far apart count as independent beside the prior (ours)."""
+LEAST_WINDOWS = 100
+"""Below this many windows with a reference no factors of the axes are fitted (ours)."""
+LEAST_FACTOR = 1e-3
+"""No axis is surer than this of what the network predicts (ours)."""
+
+
+def std_factors(
+    estimates: list[Estimate], truths: list[Float[np.ndarray, "m 3"]]
+) -> Float[np.ndarray, "3"]:
+    """Root mean square of error over standard deviation, of each axis, over all windows.
+
+    `truths` are the true displacements of the windows, in the yaw frame of the reference at their
+    starts; the network's are in the filter's own, which is the frame that it answers in.
+    Raises `ValueError` where too few windows have both.
+    """
+    found = []
+    for estimate, truth in zip(estimates, truths, strict=True):
+        assert estimate.displacement is not None and estimate.displacement_std is not None
+        last = slice(len(estimate.displacement) - len(truth), None)
+        found.append((estimate.displacement[last] - truth) / estimate.displacement_std[last])
+    normalised = np.concatenate(found)
+    normalised = normalised[np.isfinite(normalised).all(1)]
+    if len(normalised) < LEAST_WINDOWS:
+        raise ValueError(f"{len(normalised)} windows have a reference, {LEAST_WINDOWS} are needed")
+    return np.maximum(np.sqrt(np.mean(normalised**2, axis=0)), LEAST_FACTOR)
+
+
+class Walks(NamedTuple):
+    """Recordings with the network's displacements, padded to one length. Axis 0: the recording."""
+
+    rotation: Float[np.ndarray, "w 3 3"]
+    """At the start, body → world."""
+    velocity: Float[np.ndarray, "w 3"]
+    """At the start, m/s."""
+    position: Float[np.ndarray, "w 3"]
+    """At the start, m."""
+    gyro_bias: Float[np.ndarray, "w 3"]
+    """First estimate, rad/s."""
+    gyro: Float[np.ndarray, "w t 3"]
+    """rad/s."""
+    accel: Float[np.ndarray, "w t 3"]
+    """m/s²."""
+    displacement: Float[np.ndarray, "w k 3"]
+    """Of the network, m, in the filter's own yaw frame; NaN where there is none."""
+    std: Float[np.ndarray, "w k 3"]
+    """Of the network, m; 1 where there is none."""
+    imu_valid: Bool[np.ndarray, "w t"] | None = None
+    """Which samples are there; None: all."""
+
+
+class Fit(NamedTuple):
+    """Where the likelihood of the innovations is largest."""
+
+    settings: FilterSettings
+    before: float
+    """−log-likelihood per innovation at the start of the fit, with the factors of the axes."""
+    after: float
+    """The same with `settings`."""
+    steps: int
+    warnings: tuple[str, ...] = ()
+    """Why the settings may not be the best ones, each in one sentence."""
+
+
+def start_of_fit(settings: FilterSettings, paths: Sequence[str]) -> FilterSettings:
+    """The settings from which those of these paths are fitted: with a correlation where it was off.
+
+    Raises `InputError` for a number that is 0: it has no logarithm, and the fit would not leave it.
+    """
+    correlation = settings.noise.correlation
+    if "noise.correlation" in paths and not (correlation and correlation.share):
+        noise = settings.noise._replace(correlation=CorrelatedError())
+        settings = dataclasses.replace(settings, noise=noise)
+    values = flat(settings)
+    for path in paths:
+        if values.get(path) == 0:
+            remedy = "leave its group out of --fit, or give the run a small value"
+            raise InputError(f"filter.{path}", "is 0 and cannot be fitted", remedy)
+    return settings
+
+
+def fit_innovations(
+    walks: Walks,
+    windows: DataConfig,
+    settings: FilterSettings,
+    paths: Sequence[str],
+    progress: Callable[[int], None],
+    most_steps: int = 60,
+) -> Fit:
+    """The settings that make the innovations most likely, by L-BFGS from `settings`; `paths` names
+    those that are fitted.
+
+    A step to where the filter fails counts as very unlikely, and the search turns back. Raises
+    `InputError` where it fails with `settings`.
+    """
+    free = free_parameters(settings, paths)
+    names, start = tuple(free), np.array(list(free.values()))
+    given = jax.device_put((walks, start, settings))
+    config = innovation_config(windows, settings)
+    evidences: list[float] = []
+    """Of every call, the first of which is at the start."""
+
+    def evaluate(vector: np.ndarray) -> tuple[float, np.ndarray]:
+        call = _value_and_gradient(vector, *given, names=names, config=config)
+        (value, evidence), gradient = jax.device_get(call)
+        sound = np.isfinite(value) and np.isfinite(gradient).all()
+        evidences.append(float(evidence) if sound else FAILED)
+        progress(len(evidences))
+        if not sound:
+            return FAILED, np.zeros_like(vector)
+        return float(value), np.asarray(gradient, float)
+
+    limits = {"maxiter": most_steps, "ftol": 1e-7}
+    found = minimize(evaluate, start, jac=True, method="L-BFGS-B", options=limits)
+    if evidences[0] == FAILED:
+        raise InputError("the filter", "fails on these recordings with the settings of the run")
+    fitted = with_written_parameters(settings, dict(zip(names, found.x, strict=True)), DIGITS)
+    before = evidences[0]
+    evaluate(np.array(list(free_parameters(fitted, names).values())))
+    warnings = []
+    if found.nit >= most_steps:
+        warnings.append(f"the fit ended at its limit of {most_steps} steps; raise --steps")
+    warnings += unphysical(fitted, names)
+    return Fit(fitted, before, evidences[-1], int(found.nit), tuple(warnings))
+
+
+def unphysical(settings: FilterSettings, names: tuple[str, ...]) -> list[str]:
+    """A sentence for each of these numbers that is outside what is physical."""
+    values, found = flat(settings), []
+    for name in names:
+        low, high = PHYSICAL.get(name, (-math.inf, math.inf))
+        if not low <= values[name] <= high:
+            found.append(
+                f"filter.{name} came out as {values[name]:.4g}, outside {low:g} to {high:g}: "
+                "these recordings do not determine it"
+            )
+    return found
+
+
+def innovation_config(windows: DataConfig, settings: FilterSettings) -> FilterConfig:
+    """The filter whose innovations are judged: its gate lets everything through."""
+    return dataclasses.replace(
+        filter_config(windows, settings),
+        gate_threshold=NO_GATE,
+        history="diagonal",
+        checkpoint_every=CHECKPOINT_EVERY,
+    )
+
+
+def innovation_objective(
+    free: Float[Array, "u"],
+    walks: Walks,
+    start: Float[Array, "u"],
+    settings: FilterSettings,
+    *,
+    names: tuple[str, ...],
+    config: FilterConfig,
+) -> tuple[Array, Array]:
+    """What is to be made small, as a function of the free parameters `names` of the settings, and
+    the part of it that is −log-likelihood of all innovations over their number. The rest is the
+    prior about `start`, which keeps those in place that the walks do not determine."""
+    chex.assert_equal_shape([free, start])
+    chex.assert_equal_shape([walks.displacement, walks.std])
+    settings = with_free_parameters(settings, dict(zip(names, free, strict=True)))
+    evidence = _log_likelihood(walks, config, settings.noise, settings.start)
+    prior = 0.5 * jnp.sum(((free - start) / PRIOR_STD) ** 2)
+    count = jnp.isfinite(walks.displacement).all(axis=2).sum()
+    return (prior - evidence) / count, -evidence / count
+
+
+_value_and_gradient = jax.jit(
+    jax.value_and_grad(innovation_objective, has_aux=True), static_argnames=("names", "config")
+)
+
+
+def _log_likelihood(
+    walks: Walks, config: FilterConfig, noise: NoiseModel, start: InitialStd
+) -> Array:
+    """Of all innovations."""
+
+    def of_walk(given: tuple[NoiseModel, InitialStd], walk: Walks) -> Array:
+        noise, std = given
+        pose = (walk.rotation, walk.velocity, walk.position, walk.gyro_bias)
+        state = initial_state(config, *pose, std=std)
+        given_then = walk.displacement, walk.std
+        run = state, walk.gyro, walk.accel
+        _, history = repeat_odometry(*run, *given_then, config, noise, walk.imu_valid)
+        # What the walk is filled up with comes after its last displacement, and may run away.
+        present = jnp.isfinite(walk.displacement).all(axis=1)
+        healthy = jnp.all((history.healthy > 0) | ~present)
+        return jnp.where(healthy, jnp.nansum(history.log_likelihood), jnp.nan)
+
+    return jnp.sum(over_sequences(of_walk, shared=1)((noise, start), walks))
+
+
+class Considered(NamedTuple):
+    """The errors to be considered."""
+
+    settings: FilterSettings
+    before: float
+    """Mean over all positions of eᵀ P⁻¹ e / 3 with none."""
+    after: float
+    """The same with `settings`."""
+
+
+class Positions(NamedTuple):
+    """Of all recordings, where there is a reference; axis 0: the rows."""
+
+    error: Float[np.ndarray, "k 3"]
+    """Truth − estimate, m."""
+    covariance: Float[np.ndarray, "k 3 3"]
+    """Of the filter, m²."""
+    sensitivity: Float[np.ndarray, "k 3 6"]
+    """S of the position."""
+
+
+def fit_considered(
+    positions: Positions, stride_seconds: float, settings: FilterSettings
+) -> Considered:
+    """The standard deviations of the errors that the filter leaves out, which make the errors of
+    its positions most likely; there is one every `stride_seconds`.
+
+    The search begins at `CONSIDERED`, whatever the settings have. Raises `InputError` where there
+    is no position with a reference, or no likelihood.
+    """
+    if not len(positions.error):
+        raise InputError("the filter", "is not healthy where these recordings have a reference")
+    settings = dataclasses.replace(settings, considered=CONSIDERED)
+    free = free_parameters(settings, ["considered"])
+    names, start = tuple(free), np.array(list(free.values()))
+    independent = len(positions.error) * stride_seconds / INDEPENDENT_SECONDS
+
+    def objective(vector: Float[Array, "u"]) -> Array:
+        std = with_free_parameters(settings, dict(zip(names, vector, strict=True))).considered
+        prior = 0.5 * jnp.sum(((vector - start) / PRIOR_STD) ** 2)
+        return gaussian_nll(positions.error, with_considered(positions, std)) + prior / independent
+
+    compiled = jax.jit(jax.value_and_grad(objective))
+    found = minimize(
+        lambda vector: jax.device_get(compiled(vector)), start, jac=True, method="L-BFGS-B"
+    )
+    if not np.isfinite(found.fun):
+        raise InputError("the filter", "has a covariance on these recordings that is not one")
+    fitted = with_written_parameters(settings, dict(zip(names, found.x, strict=True)), DIGITS)
+    before, after = (
+        float(_nees_per_axis(positions.error, covariance))
+        for covariance in (positions.covariance, with_considered(positions, fitted.considered))
+    )
+    return Considered(fitted, before, after)
+
+
+@jax.jit
+def _nees_per_axis(
+    error: Float[Array, "k 3"], covariance: Float[Array, "k 3 3"]
+) -> Float[Array, ""]:
+    """Mean over all positions of eᵀ P⁻¹ e / 3."""
+    return jnp.mean(normalised_squares(error, covariance)) / 3
+
+
+@jax.jit
+def with_considered(positions: Positions, std: ConsideredStd) -> Float[Array, "k 3 3"]:
+    """Covariances of the positions with the errors that are considered, m²."""
+    return positions.covariance + considered_covariance(positions.sensitivity, std)
+
+
+def filtered_positions(
+    walks: Walks, truth: Float[np.ndarray, "w k 3"], windows: DataConfig, settings: FilterSettings
+) -> Positions:
+    """The positions of a filter over the walks, where it is healthy.
+
+    `truth` has the true ones after each stride, m; NaN where there is none.
+    """
+    config = filter_config(windows, settings)
+    of_all = _filtered(walks, settings.noise, settings.start, config=config)
+    healthy, position, covariance, of_position = jax.device_get(of_all)
+    error = truth - position
+    known = np.isfinite(error).all(axis=2) & (healthy > 0)
+    return Positions(error[known], covariance[known], of_position[known])
+
+
+@functools.partial(jax.jit, static_argnames="config")
+def _filtered(
+    walks: Walks, noise: NoiseModel, start: InitialStd, *, config: FilterConfig
+) -> tuple[Array, Array, Array, Array]:
+    """Of every walk: where the filter is healthy, its positions, their covariances and S."""
+
+    def of_walk(given: tuple[NoiseModel, InitialStd], walk: Walks) -> tuple[Any, ...]:
+        noise, std = given
+        pose = (walk.rotation, walk.velocity, walk.position, walk.gyro_bias)
+        run = initial_state(config, *pose, std=std), walk.gyro, walk.accel
+        fixed = config, noise, walk.imu_valid
+        _, history = repeat_odometry(*run, walk.displacement, walk.std, *fixed)
+        found = sensitivity(*run, history, *fixed)
+        assert history.covariance is not None
+        covariance = history.covariance[:, POSITION, POSITION]
+        return history.healthy, history.position, covariance, found[:, POSITION]
+
+    return over_sequences(of_walk, shared=1)((noise, start), walks)

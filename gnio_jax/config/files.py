@@ -1,0 +1,514 @@
+"""Settings in files and on the command line: strict YAML, the checks of values, and where runs and
+the experiments that come with the package lie."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import math
+import re
+import reprlib
+import types
+import typing
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar
+
+import yaml
+
+from gnio_jax.config.schema import Bound, Place, TrainConfig
+from gnio_jax.errors import InputError
+from gnio_jax.files import write_text
+
+Section = TypeVar("Section")
+
+_SPELLING = {
+    Any: "a number",
+    float: "a number",
+    int: "a whole number",
+    str: "text",
+    bool: "true or false",
+    type(None): "null",
+}
+
+# ---------------------------------------------------------------- the experiments and the runs
+
+
+def names() -> list[str]:
+    """Names of the experiments that come with the package, such as quickstart, baselines/tlio."""
+    return list(_packaged())
+
+
+def find(config: str | Path) -> Path:
+    """The file of `config`: a path, or a name of `names()`.
+
+    Raises `InputError` that suggests the closest name when it is neither.
+    """
+    path, packaged = Path(config), _packaged()
+    if path.is_file():
+        return path
+    if str(config) in packaged:
+        return packaged[str(config)]
+    if path.exists():  # a pipe is read, and a folder is refused as one
+        return path
+    by_stem = {Path(name).stem: name for name in packaged}
+    close = difflib.get_close_matches(path.stem, by_stem, n=1)
+    hint = f"did you mean '{by_stem[close[0]]}'? " if close else ""
+    known = f"give a file, or one of the package's own: {', '.join(packaged)}"
+    raise InputError(config, "no such config file", hint + known)
+
+
+def _packaged() -> dict[str, Path]:
+    """Files of the package's experiments by name: in an installed package beside the modules, in a
+    checkout at its top."""
+    package = Path(__file__).parents[1]
+    folders = (package / "configs", package.parent / "configs")
+    folder = next((folder for folder in folders if folder.is_dir()), folders[0])
+    files = sorted(folder.rglob("*.yaml"))
+    return {file.relative_to(folder).with_suffix("").as_posix(): file for file in files}
+
+
+def default_workdir(config: TrainConfig) -> Path:
+    """Where a run goes: its `workdir`, else runs/<dataset>_<model>."""
+    return Path(config.workdir or f"runs/{config.dataset}_{config.model.name}")
+
+
+def with_seeds(config: TrainConfig, seeds: Sequence[int]) -> list[TrainConfig]:
+    """The experiment with each of these seeds: ordinary runs, in the work folders WORKDIR_s0,
+    WORKDIR_s1, ... Raises `InputError` for no seed, and for one that is named twice."""
+    if not seeds:
+        raise InputError("--seeds", "names no seed", "give some, e.g. 0 1 2")
+    twice = [seed for seed in seeds if seeds.count(seed) > 1]
+    if twice:
+        raise InputError("--seeds", f"names {twice[0]} twice", "each seed is one run")
+    folder = default_workdir(config)
+    return [dataclasses.replace(config, seed=seed, workdir=f"{folder}_s{seed}") for seed in seeds]
+
+
+def newest_run(folder: str | Path = "runs") -> Path:
+    """The run below `folder` that was trained last; calibrated copies of a run do not count. Raises
+    `InputError` when there is none."""
+    found = [path.parent for path in Path(folder).glob("*/config.yaml")]
+    runs = [run for run in found if not (run / "calibration.json").exists()]
+    if not runs:
+        remedy = "train one with gnio train, or name its folder with --workdir"
+        raise InputError(folder, "holds no run", remedy)
+
+    def last_trained(run: Path) -> float:
+        files = (run / "config.yaml", run / "metrics.jsonl")
+        return max(path.stat().st_mtime for path in files if path.exists())
+
+    return max(runs, key=last_trained)
+
+
+# ---------------------------------------------------------------- reading
+
+
+def load(path: str | Path, base: TrainConfig | None = None) -> TrainConfig:
+    """Read a `TrainConfig` from a YAML file, or from the experiment of that name. What it leaves
+    out is as in `base`, or by default.
+
+    Raises `InputError` on a missing or empty file, an unknown key or a wrong type.
+    """
+    path = find(path)
+    try:
+        content = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(path, f"cannot be read ({error})") from None
+    return parse(content, str(path), base)
+
+
+def parse(content: str, source: str, base: TrainConfig | None = None) -> TrainConfig:
+    """`load` of a file's text; `source` names the file in errors."""
+    fields = _yaml(content, source)
+    if fields is None:
+        raise InputError(source, "is empty", "write settings into it, e.g. seed: 0")
+    if isinstance(fields, dict):
+        fields = _of_today(fields, source)
+    return _section(base or TrainConfig(), fields, Place(source))
+
+
+def assign(config: Section, assignments: Sequence[str]) -> Section:
+    """`config` with settings of the form section.field=value, such as
+    "filter.noise.gyro_density=1e-3", each checked as in a file. The last one of a field wins.
+
+    Raises `InputError` that names the assignment.
+    """
+    for assignment in assignments:
+        name, equals, text = assignment.partition("=")
+        if not (equals and name):
+            remedy = "write section.field=value, e.g. optim.epochs=3"
+            raise InputError(f"'{assignment}'", "is not a setting", remedy)
+        content = _yaml(text, assignment)
+        for part in reversed(name.strip().split(".")):
+            content = {part: content}
+        config = _section(config, content, Place(assignment))
+    return config
+
+
+def value_from_words(hint: Any, words: Sequence[str], name: str) -> Any:
+    """The value of a field of the type `hint` from the words of a command line behind the option
+    `name`, checked as a file's values are; a flag has no word and is true.
+
+    Raises `InputError` that names the option.
+    """
+    place = Place(name)
+    kinds = _kinds(hint)
+    if any(typing.get_origin(kind) is tuple for kind in kinds):
+        return _value(hint, [_word(kinds, word, name) for word in words], place)
+    if not words and bool in kinds:
+        return True
+    if len(words) != 1:
+        raise InputError(name, f"needs one value, which must be {_spell(hint)}")
+    return _value(hint, _word(kinds, words[0], name), place)
+
+
+def _word(kinds: list[Any], word: str, name: str) -> Any:
+    """What a word of a command line stands for: text where only text is wanted."""
+    members = [each for kind in kinds for each in (typing.get_args(kind) or (kind,))]
+    if str in members and not {int, float, bool} & set(members):
+        return None if word == "null" and type(None) in members else word
+    return _yaml(word, name)
+
+
+def _section(base: Any, content: Any, place: Place) -> Any:
+    """The section `base` with the fields of a mapping in it."""
+    if not isinstance(content, Mapping):
+        problem = f"{place.section or 'the file'} must be a mapping of fields"
+        raise InputError(place.source, f"{problem}, found {_shown(content)}")
+    hints = _hints(base)
+    for key in content:
+        if key not in hints:
+            close = difflib.get_close_matches(str(key), hints, n=1)
+            known = f"known fields: {', '.join(hints)}"
+            remedy = f"did you mean '{place.below(close[0]).section}'?" if close else known
+            name = place.below(reprlib.repr(key).strip("'")).section
+            raise InputError(place.source, f"unknown field '{name}'", remedy)
+    fields = {}
+    for key, value in content.items():
+        old, kind = getattr(base, key), _section_kind(hints[key])
+        if kind is None or value is None:
+            fields[key] = _value(hints[key], value, place.below(key))
+        else:
+            fields[key] = _section(kind() if old is None else old, value, place.below(key))
+    return base._replace(**fields) if _is_tuple(type(base)) else dataclasses.replace(base, **fields)
+
+
+def _value(hint: Any, value: Any, place: Place) -> Any:
+    """The value of a field, if it has the field's type."""
+    for kind in _kinds(hint):
+        if typing.get_origin(kind) is tuple:
+            if value is not None or type(None) not in _kinds(hint):
+                return _tuple(typing.get_args(kind), value, place)
+        elif typing.get_origin(kind) is Literal:
+            if isinstance(value, str) and value in typing.get_args(kind):
+                return value
+        elif kind in (float, Any):
+            if isinstance(value, int | float) and not isinstance(value, bool):
+                return _float(value, place)
+        elif type(value) is kind:
+            return value
+    _refuse(place, f"must be {_spell(hint)}, found {_shown(value)}")
+
+
+def _tuple(members: tuple[Any, ...], value: Any, place: Place) -> tuple:
+    """The values of a list: as many as there are `members`, or any number of the first."""
+    several = members[1:] == (Ellipsis,)
+    if not isinstance(value, list):
+        _refuse(place, f"must be a list, found {_shown(value)}")
+    if not several and len(value) != len(members):
+        _refuse(place, f"must be a list of {len(members)} values, found {_shown(value)}")
+    return tuple(_value(members[0], each, place) for each in value)
+
+
+def _float(value: int | float, place: Place) -> float:
+    try:
+        return float(value)
+    except OverflowError:
+        _refuse(place, "is larger than any number of floating point")
+
+
+def _refuse(place: Place, problem: str) -> typing.NoReturn:
+    name = f"field '{place.section}' " if place.section else ""
+    raise InputError(place.source, name + problem)
+
+
+def _shown(value: Any) -> str:
+    """A value in a message, however long or deep it is."""
+    return reprlib.repr(value)
+
+
+def _spell(hint: Any) -> str:
+    """A type in words."""
+
+    def spell(kind: Any) -> str:
+        if typing.get_origin(kind) is Literal:
+            return "one of " + ", ".join(typing.get_args(kind))
+        if typing.get_origin(kind) is tuple:
+            return f"a list of {spell(typing.get_args(kind)[0])}"
+        return _SPELLING.get(kind, getattr(kind, "__name__", str(kind)))
+
+    return " or ".join(map(spell, _kinds(hint)))
+
+
+# ---------------------------------------------------------------- checks
+
+
+def validate(config: TrainConfig, source: str = "config") -> TrainConfig:
+    """Return `config` if its values make sense together.
+
+    Raises `InputError` naming `source` and the first field that does not.
+    """
+    _check(config, Place(source))
+    return config
+
+
+def _check(section: Any, place: Place) -> None:
+    """Check the fields of a section, the sections below it, and how its fields go together."""
+    for name, hint in _hints(section).items():
+        value = getattr(section, name)
+        if _section_kind(hint) is not None and value is not None:
+            _check(value, place.below(name))
+        elif value is not None:
+            numbers = value if isinstance(value, tuple) else (value,)
+            for bound in _bounds(hint):
+                if not all(map(bound.holds, numbers)):
+                    place.refuse(name, f"{bound.problem}, found {_shown(value)}")
+    if hasattr(section, "check"):
+        section.check(place)
+
+
+def bounds(kind: Any, name: str) -> list[Bound]:
+    """The bounds of a value of the section `kind` by its name in it, as `flat` has it."""
+    hint = kind
+    for part in name.split("."):
+        if _section_kind(hint) is None:
+            break  # the number of an entry
+        hint = _hints(_section_kind(hint))[part]
+    return list(_bounds(hint))
+
+
+def _bounds(hint: Any) -> Iterator[Bound]:
+    """The bounds in a type, also in those of a union's members."""
+    for argument in typing.get_args(hint):
+        if isinstance(argument, Bound):
+            yield argument
+        else:
+            yield from _bounds(argument)
+
+
+# ---------------------------------------------------------------- types of fields
+
+
+def _is_tuple(kind: Any) -> bool:
+    """Whether it is a section of numbers, a NamedTuple."""
+    return isinstance(kind, type) and issubclass(kind, tuple) and hasattr(kind, "_fields")
+
+
+def _hints(section: Any) -> dict[str, Any]:
+    """The fields of a section and their types."""
+    kind = section if isinstance(section, type) else type(section)
+    return typing.get_type_hints(kind, include_extras=True)
+
+
+def _kinds(hint: Any) -> list[Any]:
+    """The types that a value may have, without what is annotated to them."""
+    if typing.get_origin(hint) is Annotated:
+        return _kinds(typing.get_args(hint)[0])
+    # `Literal[...] | None` is a typing.Union, `int | None` is a types.UnionType.
+    if isinstance(hint, types.UnionType) or typing.get_origin(hint) is typing.Union:
+        return [kind for member in typing.get_args(hint) for kind in _kinds(member)]
+    return [hint]
+
+
+def _section_kind(hint: Any) -> Any:
+    """The section that a field is, or None where it is a value."""
+    for kind in _kinds(hint):
+        if dataclasses.is_dataclass(kind) or _is_tuple(kind):
+            return kind
+    return None
+
+
+# ---------------------------------------------------------------- writing
+
+
+def save(path: str | Path, config: TrainConfig) -> None:
+    """Write `config` as YAML that `load` reads back to an equal value."""
+    write_text(path, text(config))
+
+
+def text(config: TrainConfig) -> str:
+    """`config` as YAML that `parse` reads back to an equal value."""
+    return yaml.dump(plain(config), Dumper=_Dumper, sort_keys=False)
+
+
+def plain(value: Any) -> Any:
+    """Settings as the dictionaries, lists and numbers that YAML and JSON know."""
+    if dataclasses.is_dataclass(value):
+        return {name: plain(getattr(value, name)) for name in _hints(value)}
+    if _is_tuple(type(value)):
+        return {name: plain(each) for name, each in value._asdict().items()}
+    return [plain(each) for each in value] if isinstance(value, tuple) else value
+
+
+def flat(section: Any) -> dict[str, Any]:
+    """The values of a section by their names in it, such as noise.gyro_density. A tuple of numbers
+    has one for each, such as noise.std_factor.0."""
+
+    def values(content: Any, name: str) -> Iterator[tuple[str, Any]]:
+        if not isinstance(content, dict | list):
+            yield name, content
+            return
+        inner = content.items() if isinstance(content, dict) else enumerate(content)
+        for key, value in inner:
+            yield from values(value, f"{name}.{key}" if name else str(key))
+
+    return dict(values(plain(section), ""))
+
+
+# ---------------------------------------------------------------- YAML
+
+
+class _Loader(yaml.SafeLoader):
+    """YAML's core schema, version 1.2: 1e-3 is a number, and of the older 010, 1:30, 0b1, yes and
+    2020-01-01 is none, nor is infinity. A key that is repeated is refused, and so are aliases."""
+
+    yaml_implicit_resolvers: typing.ClassVar[dict] = {}
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        """Refuse aliases: settings need none, and nested ones grow without bound."""
+        if self.check_event(yaml.AliasEvent):
+            mark = self.peek_event().start_mark
+            raise yaml.composer.ComposerError(None, None, "aliases are not for settings", mark)
+        return super().compose_node(parent, index)
+
+    def construct_mapping(self, node: Any, deep: bool = False) -> dict:
+        """A mapping without repeated keys."""
+        seen: set[str] = set()
+        for key, _ in node.value:
+            if not isinstance(key, yaml.ScalarNode) or key.value in seen:
+                problem = f"the key {_shown(key.value)} is repeated, or it is not a word"
+                raise yaml.constructor.ConstructorError(None, None, problem, key.start_mark)
+            seen.add(key.value)
+        return super().construct_mapping(node, deep)
+
+
+class _Dumper(yaml.SafeDumper):
+    """It writes what `_Loader` reads: text that would be taken for a number is quoted."""
+
+    yaml_implicit_resolvers: typing.ClassVar[dict] = {}
+
+
+_WHOLE = "(0|[1-9][0-9]*)"
+_RESOLVERS = (
+    ("null", r"^(null|Null|NULL|~|)$", ["n", "N", "~", ""]),
+    ("bool", r"^(true|True|TRUE|false|False|FALSE)$", list("tTfF")),
+    ("int", rf"^[-+]?{_WHOLE}$", list("-+0123456789")),
+    (
+        "float",
+        rf"^[-+]?({_WHOLE}?\.[0-9]+|{_WHOLE}\.?)([eE][-+]?[0-9]+)?$",
+        list("-+.0123456789"),
+    ),
+)
+"""Which plain words are not text, in order: tag, form, first letters."""
+
+for _kind in (_Loader, _Dumper):
+    for _tag, _form, _letters in _RESOLVERS:
+        _kind.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(_form), _letters)
+
+
+def _yaml(content: str, source: str) -> Any:
+    """The value of a YAML text, or an `InputError`."""
+    try:
+        return yaml.load(content, Loader=_Loader)
+    except yaml.YAMLError as error:
+        problem = " ".join(str(error).split())
+    except (ValueError, OverflowError) as error:  # of an explicit tag, and of too many digits
+        problem = " ".join(str(error).split())
+    except RecursionError:
+        problem = "it is nested too deeply"
+    raise InputError(source, f"is not YAML ({problem})")
+
+
+# ---------------------------------------------------------------- files of earlier versions
+
+_DEGREE = math.pi / 180
+_MOVED = {
+    "gyro_density": ("noise", "gyro_density", 1),
+    "accel_density": ("noise", "accel_density", 1),
+    "gyro_bias_walk": ("noise", "gyro_bias_walk", 1),
+    "accel_bias_walk": ("noise", "accel_bias_walk", 1),
+    "measurement_scale": ("noise", "measurement_scale", 1),
+    "tilt_std_degrees": ("start", "tilt", _DEGREE),
+    "yaw_std_degrees": ("start", "yaw", _DEGREE),
+    "velocity_std": ("start", "velocity", 1),
+    "position_std": ("start", "position", 1),
+    "gyro_bias_std": ("start", "gyro_bias", 1),
+    "accel_bias_std": ("start", "accel_bias", 1),
+    "considered_gyro_bias_std": ("considered", "gyro_bias", 1),
+    "considered_scale_std": ("considered", "scale", 1),
+    "considered_heading_std_degrees": ("considered", "heading", _DEGREE),
+    "considered_slope_std": ("considered", "slope", 1),
+}
+"""Fields of the section `filter` as it was, and where each stands now, in which unit."""
+_ANY = object()
+_GONE = {
+    "filter": {
+        "scale_error_std": 0.0,
+        "heading_error_std_degrees": 0.0,
+        "walk_error_seconds": _ANY,
+    },
+    "data": {"folds": 1, "left_out": _ANY, "residency": _ANY},
+    "model": {"dtype": "float32", "bank_heads": None, "dropout": None},
+    "optim": {
+        "accumulate": 1,
+        "ema_decay": 0.0,
+        "end_learning_rate": 1e-6,
+        "plateau_epochs": 10,
+        "plateau_factor": 0.1,
+    },
+    "through_filter": {
+        "truncate_seconds": 10.0,
+        "start_spread": 1.0,
+        "gate_softness": 2.0,
+        "skip_above": 1000.0,
+    },
+    "": {"checkpoint_every_seconds": _ANY},
+}
+"""Fields that are no more, by section, and the value with which each changed nothing."""
+
+
+def _of_today(fields: dict, source: str) -> dict:
+    """The settings of an earlier version's file as this version has them.
+
+    Raises `InputError` where they ask for what there is no more.
+    """
+    hints, new = _hints(TrainConfig), dict(fields)
+    for section, gone in _GONE.items():
+        inner = new.get(section) if section else new
+        if not isinstance(inner, dict):
+            continue
+        known = _hints(_section_kind(hints[section])) if section else hints
+        kept = {name: each for name, each in inner.items() if name in known or name not in gone}
+        for name in inner.keys() - kept.keys():
+            if gone[name] is not _ANY and inner[name] != gone[name]:
+                problem = f"is {_shown(inner[name])}, and there is no such setting any more"
+                Place(source, section).refuse(name, problem, f"it is always {gone[name]!r}")
+        new = new | {section: kept} if section else kept
+    old = new.get("filter")
+    if not isinstance(old, dict):
+        return new
+    filter_ = {name: each for name, each in old.items() if name not in _MOVED}
+    for name, (section, field, unit) in _MOVED.items():
+        if name in old:
+            value = old[name] * unit if isinstance(old[name], int | float) else old[name]
+            filter_.setdefault(section, {})[field] = value
+    factors = [filter_.pop(f"std_factor_{axis}", None) for axis in "xyz"]
+    if factors != [None] * 3:
+        own = [1.0 if each is None else each for each in factors]
+        filter_.setdefault("noise", {})["std_factor"] = own
+    share, seconds = (filter_.pop(f"window_error_{name}", None) for name in ("share", "seconds"))
+    if share:
+        found = {"share": share} | ({} if seconds is None else {"seconds": seconds})
+        filter_.setdefault("noise", {})["correlation"] = found
+    return new | {"filter": filter_}

@@ -1,0 +1,285 @@
+"""Strict YAML, checks, settings of the command line and files of earlier versions."""
+
+import dataclasses
+import math
+import os
+import threading
+from pathlib import Path
+
+import pytest
+import yaml
+
+from gnio_jax import config as configuration
+from gnio_jax.config import (
+    CorrelatedError,
+    FilterSettings,
+    InitialStd,
+    NoiseModel,
+    ThroughFilter,
+    TrainConfig,
+)
+from gnio_jax.errors import InputError
+from tests.support.filter_settings import changed
+
+DEGREE = math.pi / 180  # as the earlier version multiplied
+SHIPPED = Path(configuration.__file__).parents[1] / "weights" / "pedestrian" / "config.yaml"
+
+
+def read(text):
+    return configuration.validate(configuration.parse(text, "f.yaml"), "f.yaml")
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        ("seed: 1\nseed: 2", "is not YAML (the key 'seed' is repeated"),
+        ("optim: {epochs: 3}\noptim: {batch_size: 8}", "the key 'optim' is repeated"),
+        ("optim: {epochs: 3, epochs: 4}", "the key 'epochs' is repeated"),
+        ("seed: 010", "field 'seed' must be a whole number, found '010'"),
+        ("seed: 1:30", "field 'seed' must be a whole number, found '1:30'"),
+        ("seed: 0b_", "field 'seed' must be a whole number, found '0b_'"),
+        ("seed: 0x1f", "field 'seed' must be a whole number, found '0x1f'"),
+        ("seed: 2020-13-45", "field 'seed' must be a whole number, found '2020-13-45'"),
+        ("seed: !!timestamp 2020-13-45", "is not YAML (month must be in 1..12)"),
+        ("seed: !!int 0b_", "is not YAML ("),
+        ("seed: " + "9" * 400, "field 'seed' must be "),
+        ("seed: " + "9" * 5000, "is not YAML (Exceeds the limit"),
+        ("seed: 99999999999999999999999", "field 'seed' must be "),
+        ("seed: -1", "field 'seed' must be "),
+        ("data: {rate: " + "9" * 400 + "}", "field 'data.rate' is larger than any number"),
+        ("seed: " + "[" * 3000, "is not YAML (it is nested too deeply)"),
+        ("seed: [&a [x], *a]", "is not YAML (aliases are not for settings"),
+        ("? [a]\n: 3", "is not YAML (the key"),
+        ("<<: {seed: 3}", "unknown field '<<'"),
+        ("", "is empty"),
+        ("# only a comment", "is empty"),
+        ("augment: {yaw: yes}", "field 'augment.yaw' must be true or false, found 'yes'"),
+        ("data: {rate: .inf}", "field 'data.rate' must be a number, found '.inf'"),
+        ("data: {rate: !!float .inf}", "field 'data.rate' must be positive and finite, found inf"),
+        ("data: {rate: 1e999}", "field 'data.rate' must be positive and finite"),
+        ("data: {rate: 1e308, window_seconds: 1e308}", "is not a whole number of samples"),
+        ("data: {stride_seconds: 1e-9}", "'data.stride_seconds' is less than one sample"),
+        ("data: {train_stride_seconds: 1e-9}", "'data.train_stride_seconds' is less than one"),
+        ("data: {window_seconds: .inf}", "field 'data.window_seconds' must be a number"),
+        ("through_filter: {piece_seconds: !!float .inf}", "must be positive and finite"),
+        ("loss: {mse_weight: .nan}", "field 'loss.mse_weight' must be a number, found '.nan'"),
+        ("loss: {mse_weight: !!float .nan}", "field 'loss.mse_weight' must be finite and not neg"),
+        ("loss: {mse_weight: -5}", "field 'loss.mse_weight' must be finite and not negative"),
+        ("loss: {log_std_floor: !!float -.inf}", "field 'loss.log_std_floor' must be finite"),
+        ("optim: {learning_rate: 1e999}", "field 'optim.learning_rate' must be positive"),
+        ("optim: {start_learning_rate: -1.0}", "field 'optim.start_learning_rate' must be fin"),
+        ("optim: {epochs: 99999999999}", "field 'optim.epochs' must be at least 1"),
+        ("filter: {noise: {gyro_density: 1e999}}", "field 'filter.noise.gyro_density' must be"),
+        ("filter: {noise: {measurement_scale: 0}}", "'filter.noise.measurement_scale' must be p"),
+        ("filter: {noise: {std_factor: [1, 2]}}", "must be a list of 3 values, found [1, 2]"),
+        ("filter: {noise: {std_factor: [1, 2, 0]}}", "'filter.noise.std_factor' must be positive"),
+        ("filter: {noise: {correlation: {share: 1}}}", "must be at least 0 and below 1, found 1.0"),
+        ("filter: {noise: {gyro_densty: 1}}", "did you mean 'filter.noise.gyro_density'?"),
+        (
+            "data: {window_seconds: 0.5}\n"
+            "through_filter: {learn: [noise], piece_seconds: 0.7, truncate_seconds: 0.7}",
+            "field 'through_filter.piece_seconds' must be at least 1 s",
+        ),
+    ],
+)
+def test_a_mistake_is_one_line_that_names_the_file_and_the_field(text, problem):
+    with pytest.raises(InputError) as refused:
+        read(text)
+    line = str(refused.value)
+    assert line.startswith("f.yaml: ") and problem in line
+    assert "\n" not in line and len(line) < 400
+
+
+def test_nested_aliases_take_no_time_and_no_room():
+    """Each list has the one before ten times: printed, the last one has 10^9 entries."""
+    levels = [f"&a{k} [{', '.join([f'*a{k - 1}'] * 10)}]" for k in range(1, 10)]
+    with pytest.raises(InputError, match="aliases are not for settings"):
+        read(f"seed: [&a0 [x], {', '.join(levels)}]")
+
+
+def test_numbers_are_those_of_yaml_1_2():
+    found = read("optim: {learning_rate: 1e-3}\nloss: {mse_weight: 3}\ndata: {rate: 2.e+2}")
+    assert (found.optim.learning_rate, found.loss.mse_weight, found.data.rate) == (1e-3, 3.0, 200.0)
+
+
+@pytest.mark.parametrize("name", ["1e-3", "010", "yes", "null", "2020-01-01", "~", "a: b", "1:30"])
+def test_text_that_looks_like_something_else_survives_its_file(name):
+    config = TrainConfig(workdir=name, filter=changed(noise={"correlation": CorrelatedError()}))
+    assert read(configuration.text(config)) == config
+
+
+def test_a_pipe_is_read_once(tmp_path):
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    writer = threading.Thread(target=pipe.write_text, args=("seed: 7",))
+    writer.start()
+    assert configuration.load(pipe).seed == 7
+    writer.join()
+
+
+def test_settings_are_assigned_by_name():
+    config = configuration.assign(
+        TrainConfig(),
+        [
+            "filter.noise.gyro_density=1e-3",
+            "filter.noise.correlation.share=0.9",
+            "filter.noise.std_factor=[1, 2, 0.5]",
+            "optim.epochs=3",
+            "optim.epochs=4",
+            "through_filter.learn=[noise]",
+            "workdir=runs/a=b",
+        ],
+    )
+    noise = NoiseModel(
+        1e-3, std_factor=(1.0, 2.0, 0.5), correlation=CorrelatedError(share=0.9, seconds=0.5)
+    )
+    assert config == dataclasses.replace(
+        TrainConfig(),
+        workdir="runs/a=b",
+        filter=FilterSettings(noise),
+        optim=dataclasses.replace(TrainConfig().optim, epochs=4),
+        through_filter=ThroughFilter(learn=("noise",)),
+    )
+    off = configuration.assign(config, ["filter.noise.correlation=null"])
+    assert off.filter.noise == noise._replace(correlation=None)
+
+
+@pytest.mark.parametrize(
+    ("assignment", "problem"),
+    [
+        ("optim.epochs", "is not a setting; write section.field=value"),
+        ("=3", "is not a setting"),
+        ("optim.epohcs=3", "unknown field 'optim.epohcs'; did you mean 'optim.epochs'?"),
+        ("optim=3", "optim must be a mapping of fields, found 3"),
+        ("optim.epochs.x=3", "field 'optim.epochs' must be a whole number"),
+        ("optim.epochs=3.5", "field 'optim.epochs' must be a whole number, found 3.5"),
+        ("seed=[", "is not YAML"),
+    ],
+)
+def test_an_assignment_that_makes_no_sense_is_named(assignment, problem):
+    with pytest.raises(InputError) as refused:
+        configuration.assign(TrainConfig(), [assignment])
+    assert assignment in str(refused.value) and problem in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("hint", "words", "value"),
+    [
+        (int, ["3"], 3),
+        (float, ["1e-3"], 1e-3),
+        (float | None, ["null"], None),
+        (str | None, ["010"], "010"),
+        (str | None, ["null"], None),
+        (tuple[int, ...], ["1", "2"], (1, 2)),
+        (tuple[str, ...], ["1", "true"], ("1", "true")),
+        (tuple[int, ...], [], ()),
+        (bool, [], True),
+        (bool, ["false"], False),
+    ],
+)
+def test_words_of_a_command_line_are_values(hint, words, value):
+    found = configuration.value_from_words(hint, words, "--x")
+    assert found == value and type(found) is type(value)
+
+
+@pytest.mark.parametrize(
+    ("hint", "words", "problem"),
+    [
+        (int, ["3.5"], "--x: must be a whole number, found 3.5"),
+        (int, [], "--x: needs one value, which must be a whole number"),
+        (float, [".inf"], "--x: must be a number, found '.inf'"),
+        (tuple[int, ...], ["1", "a"], "--x: must be a whole number, found 'a'"),
+    ],
+)
+def test_words_that_are_no_values_are_named(hint, words, problem):
+    with pytest.raises(InputError) as refused:
+        configuration.value_from_words(hint, words, "--x")
+    assert str(refused.value) == problem
+
+
+# Files of earlier versions
+# ------------------------------------------------------------------------------------------------
+
+OLD = """
+dataset: oxiod
+seed: 3
+filter:
+  gyro_density: 0.02
+  accel_density: 0.03
+  gyro_bias_walk: 1.021e-06
+  accel_bias_walk: 0.0104
+  tilt_std_degrees: 2.0
+  yaw_std_degrees: 0.1
+  velocity_std: 0.7
+  position_std: 0.001
+  gyro_bias_std: 0.0002
+  accel_bias_std: 0.02
+  measurement_scale: 1.073
+  std_factor_x: 0.9455
+  std_factor_y: 0.8488
+  std_factor_z: 0.8295
+  window_error_share: 0.8971
+  window_error_seconds: 3.281
+  scale_error_std: 0.0
+  heading_error_std_degrees: 0.0
+  walk_error_seconds: 40.0
+  considered_gyro_bias_std: 0.003941
+  considered_scale_std: 0.1742
+  considered_heading_std_degrees: 4.273
+  considered_slope_std: 0.03128
+  mahalanobis_fail_scale: 2.0
+  window_rotation: tlio
+"""
+
+
+def test_an_old_file_is_the_same_filter():
+    found = read(OLD)
+    assert (found.dataset, found.seed) == ("oxiod", 3)
+    assert found.filter == FilterSettings(
+        NoiseModel(
+            0.02,
+            0.03,
+            1.021e-06,
+            0.0104,
+            (0.9455, 0.8488, 0.8295),
+            1.073,
+            CorrelatedError(0.8971, 3.281),
+        ),
+        InitialStd(2.0 * DEGREE, 0.1 * DEGREE, 0.7, 0.001, 0.0002, 0.02),
+        configuration.ConsideredStd(0.003941, 0.1742, 4.273 * DEGREE, 0.03128),
+        mahalanobis_fail_scale=2.0,
+        window_rotation="tlio",
+    )
+
+
+def test_the_shipped_package_is_read():
+    old = yaml.safe_load(SHIPPED.read_text())["filter"]
+    found = configuration.load(SHIPPED).filter
+    assert found.noise.gyro_density == old["gyro_density"]
+    assert found.noise.std_factor == tuple(old[f"std_factor_{axis}"] for axis in "xyz")
+    assert found.noise.correlation == (old["window_error_share"], old["window_error_seconds"])
+    assert found.start.tilt == old["tilt_std_degrees"] * DEGREE
+    assert found.considered.heading == old["considered_heading_std_degrees"] * DEGREE
+
+
+def test_an_old_file_may_leave_fields_out():
+    found = read("filter: {std_factor_y: 1.5, velocity_std: 0.3, window_error_share: 0.0}")
+    assert found.filter == changed(noise={"std_factor": (1.0, 1.5, 1.0)}, start={"velocity": 0.3})
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        (
+            "filter: {scale_error_std: 0.1}",
+            "'filter.scale_error_std' is 0.1, and there is no",
+        ),
+        ("filter: {heading_error_std_degrees: 2.0}", "'filter.heading_error_std_degrees' is 2.0"),
+        ("filter: {tilt_std_degrees: a}", "field 'filter.start.tilt' must be a number, found 'a'"),
+        ("filter: {gyro_density: -1.0}", "field 'filter.noise.gyro_density' must be positive"),
+    ],
+)
+def test_an_old_file_that_asks_for_what_is_gone_is_refused(text, problem):
+    with pytest.raises(InputError) as refused:
+        read(text)
+    assert problem in str(refused.value)
