@@ -33,8 +33,8 @@ class Source(NamedTuple):
     """A network and the recordings that it is asked about."""
 
     run: Run
-    fold: int | None
-    """The fold of the split; None for all of it."""
+    fold: data.Fold | None
+    """The part of the split; None for all of it."""
 
 
 def load_run(workdir: Path, config: CalibrateConfig) -> Run:
@@ -60,14 +60,13 @@ def sources(run: Run, config: CalibrateConfig) -> tuple[str, list[Source]]:
     runs = [load_run(Path(folder), config) for folder in config.out_of_fold]
     for folder, fold_run in zip(config.out_of_fold, runs, strict=True):
         _check_alike(folder, fold_run.config, run.config)
-    folds = runs[0].config.data.folds
-    left_out = [each.config.data.left_out for each in runs]
-    alike = {each.config.data.folds for each in runs} == {folds}
-    if not alike or folds == 1 or sorted(left_out) != list(range(folds)):
-        found = ", ".join(f"{r.config.data.left_out} of {r.config.data.folds}" for r in runs)
-        remedy = "train one run for each of --data.left-out 0 to K - 1 with --data.folds K"
-        raise InputError("--out-of-fold", f"leaves out the folds {found}", remedy)
-    return run.config.data.train_split, [Source(each, each.config.data.left_out) for each in runs]
+    found = [each.config.data.train_split for each in runs]
+    split, count = run.config.data.train_split, len(runs)
+    if count < 2 or sorted(found) != sorted(f"{split}-{k}of{count}" for k in range(count)):
+        remedy = f"train one run for each of --data.train-split {split}-0ofK, {split}-1ofK, ..."
+        raise InputError("--out-of-fold", f"learnt from the splits {', '.join(found)}", remedy)
+    parts = [data.parse_fold(name.replace(f"{split}-", f"{split}+")) for name in found]
+    return split, [Source(each, part) for each, part in zip(runs, parts, strict=True)]
 
 
 def _split(config: CalibrateConfig, run: TrainConfig) -> str:
@@ -84,7 +83,7 @@ def _split(config: CalibrateConfig, run: TrainConfig) -> str:
 
 def _check_alike(folder: str, fold_run: TrainConfig, run: TrainConfig) -> None:
     """A fold has the experiment of the run, but for its share of the recordings."""
-    own = dataclasses.replace(fold_run.data, folds=run.data.folds, left_out=run.data.left_out)
+    own = dataclasses.replace(fold_run.data, train_split=run.data.train_split)
     for name, found, expected in (
         ("dataset", fold_run.dataset, run.dataset),
         ("data", own, run.data),
@@ -129,12 +128,11 @@ def gather(
 
 def _prepared(source: Source, sequences: list[Sequence], split: str) -> list[Prepared]:
     config = source.run.config
-    with_reference = [each for each in sequences if each.valid.any()]
+    asked = sequences if source.fold is None else source.fold.select(sequences)
+    with_reference = [each for each in asked if each.valid.any()]
     where = f"dataset {config.dataset}, split '{split}'"
     if source.fold is not None:
-        fold_of = data.folds(sequences, config.data.folds)
-        with_reference = [e for e in with_reference if fold_of[data.group(e)] == source.fold]
-        where = f"{where}, fold {source.fold}"
+        where = f"{where}, fold {source.fold.number}"
     prepared, _ = prepare(with_reference, config.data, Setup())
     if not prepared:
         problem = "has no recording with a reference that is long enough to be fitted"

@@ -210,8 +210,8 @@ def fit_innovations(
 def unphysical(settings: FilterSettings, names: tuple[str, ...]) -> list[str]:
     """A sentence for each of these numbers that is outside what is physical."""
     values, found = flat(settings), []
-    for name in names:
-        low, high = PHYSICAL.get(name, (-math.inf, math.inf))
+    for name in (name for name in names if name in PHYSICAL):
+        low, high = PHYSICAL[name]
         if not low <= values[name] <= high:
             found.append(
                 f"filter.{name} came out as {values[name]:.4g}, outside {low:g} to {high:g}: "

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from typing import Any
 
 from rich.table import Table
 
@@ -58,9 +59,15 @@ def _table(before: FilterSettings, after: FilterSettings) -> Table:
     old = configuration.flat(before)
     for name, value in configuration.flat(after).items():
         if value != old.get(name):
-            was = f"{old[name]:.4g}" if old.get(name) is not None else "none"
-            table.add_row(name, was, f"{value:.4g}")
+            table.add_row(name, _spelled(old.get(name)), _spelled(value))
     return table
+
+
+def _spelled(value: Any) -> str:
+    """A setting in a cell: a number, several, or none where it was switched off."""
+    if value is None:
+        return "none"
+    return ", ".join(f"{each:.4g}" for each in (value if isinstance(value, tuple) else (value,)))
 
 
 COMMON = (

@@ -10,13 +10,13 @@ import re
 import reprlib
 import types
 import typing
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
 import yaml
 
-from gnio_jax.config.schema import Bound, Place, TrainConfig
+from gnio_jax.config.schema import Bound, FilterSettings, InitialStd, NoiseModel, Place, TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.files import write_text
 
@@ -31,7 +31,8 @@ _SPELLING = {
     type(None): "null",
 }
 
-# ---------------------------------------------------------------- the experiments and the runs
+# The experiments and the runs
+# ------------------------------------------------------------------------------------------------
 
 
 def names() -> list[str]:
@@ -101,7 +102,16 @@ def newest_run(folder: str | Path = "runs") -> Path:
     return max(runs, key=last_trained)
 
 
-# ---------------------------------------------------------------- reading
+# Reading
+# ------------------------------------------------------------------------------------------------
+
+
+def read(path: str | Path) -> str:
+    """The text of a file of settings. A pipe gives it once. Raises `InputError`."""
+    try:
+        return Path(path).read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(path, f"cannot be read ({error})") from None
 
 
 def load(path: str | Path, base: TrainConfig | None = None) -> TrainConfig:
@@ -111,11 +121,7 @@ def load(path: str | Path, base: TrainConfig | None = None) -> TrainConfig:
     Raises `InputError` on a missing or empty file, an unknown key or a wrong type.
     """
     path = find(path)
-    try:
-        content = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(path, f"cannot be read ({error})") from None
-    return parse(content, str(path), base)
+    return parse(read(path), str(path), base)
 
 
 def parse(content: str, source: str, base: TrainConfig | None = None) -> TrainConfig:
@@ -148,32 +154,32 @@ def assign(config: Section, assignments: Sequence[str]) -> Section:
 
 def value_from_words(hint: Any, words: Sequence[str], name: str) -> Any:
     """The value of a field of the type `hint` from the words of a command line behind the option
-    `name`, checked as a file's values are; a flag has no word and is true.
+    `name`, checked as the values of a file are; a flag has no word and is true.
 
     Raises `InputError` that names the option.
     """
-    place = Place(name)
     kinds = _kinds(hint)
-    if any(typing.get_origin(kind) is tuple for kind in kinds):
-        return _value(hint, [_word(kinds, word, name) for word in words], place)
-    if not words and bool in kinds:
+    if bool in kinds and not words:
         return True
+    several = [kind for kind in kinds if typing.get_origin(kind) is tuple]
+    wanted = _kinds(typing.get_args(several[0])[0]) if several else kinds
+    is_text = not {Any, float, int, bool} & set(wanted)
+
+    def value(word: str) -> Any:
+        if is_text:
+            return None if word == "null" and type(None) in wanted else word
+        return _yaml(word, name)
+
+    if several:
+        return _value(hint, [value(word) for word in words], Place(name))
     if len(words) != 1:
         raise InputError(name, f"needs one value, which must be {_spell(hint)}")
-    return _value(hint, _word(kinds, words[0], name), place)
-
-
-def _word(kinds: list[Any], word: str, name: str) -> Any:
-    """What a word of a command line stands for: text where only text is wanted."""
-    members = [each for kind in kinds for each in (typing.get_args(kind) or (kind,))]
-    if str in members and not {int, float, bool} & set(members):
-        return None if word == "null" and type(None) in members else word
-    return _yaml(word, name)
+    return _value(hint, value(words[0]), Place(name))
 
 
 def _section(base: Any, content: Any, place: Place) -> Any:
     """The section `base` with the fields of a mapping in it."""
-    if not isinstance(content, Mapping):
+    if not isinstance(content, dict):
         problem = f"{place.section or 'the file'} must be a mapping of fields"
         raise InputError(place.source, f"{problem}, found {_shown(content)}")
     hints = _hints(base)
@@ -184,48 +190,45 @@ def _section(base: Any, content: Any, place: Place) -> Any:
             remedy = f"did you mean '{place.below(close[0]).section}'?" if close else known
             name = place.below(reprlib.repr(key).strip("'")).section
             raise InputError(place.source, f"unknown field '{name}'", remedy)
-    fields = {}
-    for key, value in content.items():
-        old, kind = getattr(base, key), _section_kind(hints[key])
-        if kind is None or value is None:
-            fields[key] = _value(hints[key], value, place.below(key))
-        else:
-            fields[key] = _section(kind() if old is None else old, value, place.below(key))
-    return base._replace(**fields) if _is_tuple(type(base)) else dataclasses.replace(base, **fields)
+    fields = {
+        key: _value(hints[key], value, place.below(key), getattr(base, key))
+        for key, value in content.items()
+    }
+    if dataclasses.is_dataclass(base):
+        return dataclasses.replace(base, **fields)
+    return base._replace(**fields)
 
 
-def _value(hint: Any, value: Any, place: Place) -> Any:
-    """The value of a field, if it has the field's type."""
-    for kind in _kinds(hint):
+def _value(hint: Any, content: Any, place: Place, base: Any = None) -> Any:
+    """The value of a field, if it has the field's type; a section takes the rest from `base`."""
+    kinds = _kinds(hint)
+    if content is None and type(None) in kinds:
+        return None
+    for kind in kinds:
+        if _is_section(kind):
+            return _section(kind() if base is None else base, content, place)
         if typing.get_origin(kind) is tuple:
-            if value is not None or type(None) not in _kinds(hint):
-                return _tuple(typing.get_args(kind), value, place)
-        elif typing.get_origin(kind) is Literal:
-            if isinstance(value, str) and value in typing.get_args(kind):
-                return value
-        elif kind in (float, Any):
-            if isinstance(value, int | float) and not isinstance(value, bool):
-                return _float(value, place)
-        elif type(value) is kind:
-            return value
-    _refuse(place, f"must be {_spell(hint)}, found {_shown(value)}")
+            return _tuple(typing.get_args(kind), content, place)
+        if typing.get_origin(kind) is Literal:
+            if isinstance(content, str) and content in typing.get_args(kind):
+                return content
+        elif kind in (float, Any) and type(content) in (int, float):
+            try:
+                return float(content)
+            except OverflowError:
+                _refuse(place, "is larger than any number of floating point")
+        elif type(content) is kind:
+            return content
+    _refuse(place, f"must be {_spell(hint)}, found {_shown(content)}")
 
 
-def _tuple(members: tuple[Any, ...], value: Any, place: Place) -> tuple:
+def _tuple(members: tuple[Any, ...], content: Any, place: Place) -> tuple:
     """The values of a list: as many as there are `members`, or any number of the first."""
-    several = members[1:] == (Ellipsis,)
-    if not isinstance(value, list):
-        _refuse(place, f"must be a list, found {_shown(value)}")
-    if not several and len(value) != len(members):
-        _refuse(place, f"must be a list of {len(members)} values, found {_shown(value)}")
-    return tuple(_value(members[0], each, place) for each in value)
-
-
-def _float(value: int | float, place: Place) -> float:
-    try:
-        return float(value)
-    except OverflowError:
-        _refuse(place, "is larger than any number of floating point")
+    if not isinstance(content, list):
+        _refuse(place, f"must be a list, found {_shown(content)}")
+    if members[1:] != (Ellipsis,) and len(content) != len(members):
+        _refuse(place, f"must be a list of {len(members)} values, found {_shown(content)}")
+    return tuple(_value(members[0], each, place) for each in content)
 
 
 def _refuse(place: Place, problem: str) -> typing.NoReturn:
@@ -242,67 +245,21 @@ def _spell(hint: Any) -> str:
     """A type in words."""
 
     def spell(kind: Any) -> str:
+        members = typing.get_args(kind)
         if typing.get_origin(kind) is Literal:
-            return "one of " + ", ".join(typing.get_args(kind))
-        if typing.get_origin(kind) is tuple:
-            return f"a list of {spell(typing.get_args(kind)[0])}"
-        return _SPELLING.get(kind, getattr(kind, "__name__", str(kind)))
+            return "one of " + ", ".join(members)
+        return f"a list of {spell(members[0])}" if members else _SPELLING[kind]
 
     return " or ".join(map(spell, _kinds(hint)))
 
 
-# ---------------------------------------------------------------- checks
+# Types of fields
+# ------------------------------------------------------------------------------------------------
 
 
-def validate(config: TrainConfig, source: str = "config") -> TrainConfig:
-    """Return `config` if its values make sense together.
-
-    Raises `InputError` naming `source` and the first field that does not.
-    """
-    _check(config, Place(source))
-    return config
-
-
-def _check(section: Any, place: Place) -> None:
-    """Check the fields of a section, the sections below it, and how its fields go together."""
-    for name, hint in _hints(section).items():
-        value = getattr(section, name)
-        if _section_kind(hint) is not None and value is not None:
-            _check(value, place.below(name))
-        elif value is not None:
-            numbers = value if isinstance(value, tuple) else (value,)
-            for bound in _bounds(hint):
-                if not all(map(bound.holds, numbers)):
-                    place.refuse(name, f"{bound.problem}, found {_shown(value)}")
-    if hasattr(section, "check"):
-        section.check(place)
-
-
-def bounds(kind: Any, name: str) -> list[Bound]:
-    """The bounds of a value of the section `kind` by its name in it, as `flat` has it."""
-    hint = kind
-    for part in name.split("."):
-        if _section_kind(hint) is None:
-            break  # the number of an entry
-        hint = _hints(_section_kind(hint))[part]
-    return list(_bounds(hint))
-
-
-def _bounds(hint: Any) -> Iterator[Bound]:
-    """The bounds in a type, also in those of a union's members."""
-    for argument in typing.get_args(hint):
-        if isinstance(argument, Bound):
-            yield argument
-        else:
-            yield from _bounds(argument)
-
-
-# ---------------------------------------------------------------- types of fields
-
-
-def _is_tuple(kind: Any) -> bool:
-    """Whether it is a section of numbers, a NamedTuple."""
-    return isinstance(kind, type) and issubclass(kind, tuple) and hasattr(kind, "_fields")
+def _is_section(kind: Any) -> bool:
+    """Whether fields of this type are sections: dataclasses, or the tuples of the filter."""
+    return dataclasses.is_dataclass(kind) or hasattr(kind, "_fields")
 
 
 def _hints(section: Any) -> dict[str, Any]:
@@ -321,15 +278,53 @@ def _kinds(hint: Any) -> list[Any]:
     return [hint]
 
 
-def _section_kind(hint: Any) -> Any:
-    """The section that a field is, or None where it is a value."""
-    for kind in _kinds(hint):
-        if dataclasses.is_dataclass(kind) or _is_tuple(kind):
-            return kind
-    return None
+def bounds(hint: Any) -> Iterator[Bound]:
+    """The bounds in a type, also in those of a union's members."""
+    for argument in typing.get_args(hint):
+        if isinstance(argument, Bound):
+            yield argument
+        else:
+            yield from bounds(argument)
 
 
-# ---------------------------------------------------------------- writing
+def flat(section: Any) -> dict[str, Any]:
+    """The settings of a section by names such as noise.gyro_density."""
+    return {name: value for name, _, value in named(section)}
+
+
+def named(section: Any, prefix: str = "") -> Iterator[tuple[str, Any, Any]]:
+    """Name, type and value of each setting of a section."""
+    for field, hint in _hints(section).items():
+        name, value = prefix + field, getattr(section, field)
+        if _is_section(type(value)):
+            yield from named(value, f"{name}.")
+        else:
+            yield name, hint, value
+
+
+# Checks
+# ------------------------------------------------------------------------------------------------
+
+
+def validate(config: TrainConfig, source: str = "config") -> TrainConfig:
+    """Return `config` if its values make sense together.
+
+    Raises `InputError` naming `source` and the first field that does not.
+    """
+    place = Place(source)
+    for name, hint, value in named(config):
+        if value is not None:
+            for bound in bounds(hint):
+                if not all(map(bound.holds, value if isinstance(value, tuple) else (value,))):
+                    place.refuse(name, f"{bound.problem}, found {_shown(value)}")
+    for name in ("data", "optim", "through_filter"):
+        getattr(config, name).check(place.below(name))
+    config.check(place)
+    return config
+
+
+# Writing
+# ------------------------------------------------------------------------------------------------
 
 
 def save(path: str | Path, config: TrainConfig) -> None:
@@ -344,36 +339,20 @@ def text(config: TrainConfig) -> str:
 
 def plain(value: Any) -> Any:
     """Settings as the dictionaries, lists and numbers that YAML and JSON know."""
-    if dataclasses.is_dataclass(value):
+    if _is_section(type(value)):
         return {name: plain(getattr(value, name)) for name in _hints(value)}
-    if _is_tuple(type(value)):
-        return {name: plain(each) for name, each in value._asdict().items()}
-    return [plain(each) for each in value] if isinstance(value, tuple) else value
+    return list(value) if isinstance(value, tuple) else value
 
 
-def flat(section: Any) -> dict[str, Any]:
-    """The values of a section by their names in it, such as noise.gyro_density. A tuple of numbers
-    has one for each, such as noise.std_factor.0."""
-
-    def values(content: Any, name: str) -> Iterator[tuple[str, Any]]:
-        if not isinstance(content, dict | list):
-            yield name, content
-            return
-        inner = content.items() if isinstance(content, dict) else enumerate(content)
-        for key, value in inner:
-            yield from values(value, f"{name}.{key}" if name else str(key))
-
-    return dict(values(plain(section), ""))
-
-
-# ---------------------------------------------------------------- YAML
+# YAML
+# ------------------------------------------------------------------------------------------------
 
 
 class _Loader(yaml.SafeLoader):
-    """YAML's core schema, version 1.2: 1e-3 is a number, and of the older 010, 1:30, 0b1, yes and
-    2020-01-01 is none, nor is infinity. A key that is repeated is refused, and so are aliases."""
+    """The core schema of YAML 1.2: 1e-3 is a number, and the older 010, 1:30, 0b1, yes and
+    2020-01-01 are text, as is infinity. Repeated keys and aliases are refused."""
 
-    yaml_implicit_resolvers: typing.ClassVar[dict] = {}
+    yaml_implicit_resolvers: ClassVar[dict] = {}
 
     def compose_node(self, parent: Any, index: Any) -> Any:
         """Refuse aliases: settings need none, and nested ones grow without bound."""
@@ -396,7 +375,7 @@ class _Loader(yaml.SafeLoader):
 class _Dumper(yaml.SafeDumper):
     """It writes what `_Loader` reads: text that would be taken for a number is quoted."""
 
-    yaml_implicit_resolvers: typing.ClassVar[dict] = {}
+    yaml_implicit_resolvers: ClassVar[dict] = {}
 
 
 _WHOLE = "(0|[1-9][0-9]*)"
@@ -418,39 +397,19 @@ for _kind in (_Loader, _Dumper):
 
 
 def _yaml(content: str, source: str) -> Any:
-    """The value of a YAML text, or an `InputError`."""
+    """The value of a YAML text. Raises `InputError`."""
     try:
         return yaml.load(content, Loader=_Loader)
-    except yaml.YAMLError as error:
-        problem = " ".join(str(error).split())
-    except (ValueError, OverflowError) as error:  # of an explicit tag, and of too many digits
-        problem = " ".join(str(error).split())
     except RecursionError:
         problem = "it is nested too deeply"
+    except (yaml.YAMLError, ValueError) as error:  # ValueError: too many digits, wrong tags
+        problem = " ".join(str(error).split())
     raise InputError(source, f"is not YAML ({problem})")
 
 
-# ---------------------------------------------------------------- files of earlier versions
+# Files of earlier versions
+# ------------------------------------------------------------------------------------------------
 
-_DEGREE = math.pi / 180
-_MOVED = {
-    "gyro_density": ("noise", "gyro_density", 1),
-    "accel_density": ("noise", "accel_density", 1),
-    "gyro_bias_walk": ("noise", "gyro_bias_walk", 1),
-    "accel_bias_walk": ("noise", "accel_bias_walk", 1),
-    "measurement_scale": ("noise", "measurement_scale", 1),
-    "tilt_std_degrees": ("start", "tilt", _DEGREE),
-    "yaw_std_degrees": ("start", "yaw", _DEGREE),
-    "velocity_std": ("start", "velocity", 1),
-    "position_std": ("start", "position", 1),
-    "gyro_bias_std": ("start", "gyro_bias", 1),
-    "accel_bias_std": ("start", "accel_bias", 1),
-    "considered_gyro_bias_std": ("considered", "gyro_bias", 1),
-    "considered_scale_std": ("considered", "scale", 1),
-    "considered_heading_std_degrees": ("considered", "heading", _DEGREE),
-    "considered_slope_std": ("considered", "slope", 1),
-}
-"""Fields of the section `filter` as it was, and where each stands now, in which unit."""
 _ANY = object()
 _GONE = {
     "filter": {
@@ -458,7 +417,7 @@ _GONE = {
         "heading_error_std_degrees": 0.0,
         "walk_error_seconds": _ANY,
     },
-    "data": {"folds": 1, "left_out": _ANY, "residency": _ANY},
+    "data": {"residency": _ANY},
     "model": {"dtype": "float32", "bank_heads": None, "dropout": None},
     "optim": {
         "accumulate": 1,
@@ -488,27 +447,46 @@ def _of_today(fields: dict, source: str) -> dict:
         inner = new.get(section) if section else new
         if not isinstance(inner, dict):
             continue
-        known = _hints(_section_kind(hints[section])) if section else hints
+        known = _hints(hints[section]) if section else hints
         kept = {name: each for name, each in inner.items() if name in known or name not in gone}
         for name in inner.keys() - kept.keys():
             if gone[name] is not _ANY and inner[name] != gone[name]:
                 problem = f"is {_shown(inner[name])}, and there is no such setting any more"
                 Place(source, section).refuse(name, problem, f"it is always {gone[name]!r}")
         new = new | {section: kept} if section else kept
-    old = new.get("filter")
-    if not isinstance(old, dict):
-        return new
-    filter_ = {name: each for name, each in old.items() if name not in _MOVED}
-    for name, (section, field, unit) in _MOVED.items():
-        if name in old:
-            value = old[name] * unit if isinstance(old[name], int | float) else old[name]
-            filter_.setdefault(section, {})[field] = value
-    factors = [filter_.pop(f"std_factor_{axis}", None) for axis in "xyz"]
-    if factors != [None] * 3:
+    if isinstance(new.get("data"), dict) and "folds" in new["data"]:
+        data = dict(new["data"])
+        count, left_out = data.pop("folds"), data.pop("left_out", 0)
+        if count != 1:
+            data["train_split"] = f"{data.get('train_split', 'train')}-{left_out}of{count}"
+        new["data"] = data
+    if isinstance(new.get("filter"), dict):
+        new["filter"] = _filter_of_today(new["filter"])
+    return new
+
+
+def _filter_of_today(old: dict) -> dict:
+    """The section `filter` of an earlier version's file, which was flat and in degrees."""
+    new: dict[str, Any] = {}
+    for name, value in old.items():
+        field = name.removesuffix("_degrees").removesuffix("_std").removeprefix("considered_")
+        if name.endswith("_degrees") and type(value) in (int, float):
+            value = value * (math.pi / 180)
+        if name in _hints(FilterSettings) or name.startswith(("std_factor_", "window_error_")):
+            new[name] = value
+        elif name.startswith("considered_"):
+            new.setdefault("considered", {})[field] = value
+        elif field in InitialStd._fields and field != name:
+            new.setdefault("start", {})[field] = value
+        elif name in NoiseModel._fields:
+            new.setdefault("noise", {})[name] = value
+        else:
+            new[name] = value
+    factors = [new.pop(f"std_factor_{axis}", None) for axis in "xyz"]
+    if factors != [None, None, None]:
         own = [1.0 if each is None else each for each in factors]
-        filter_.setdefault("noise", {})["std_factor"] = own
-    share, seconds = (filter_.pop(f"window_error_{name}", None) for name in ("share", "seconds"))
+        new.setdefault("noise", {})["std_factor"] = own
+    share, seconds = new.pop("window_error_share", None), new.pop("window_error_seconds", 0.5)
     if share:
-        found = {"share": share} | ({} if seconds is None else {"seconds": seconds})
-        filter_.setdefault("noise", {})["correlation"] = found
-    return new | {"filter": filter_}
+        new.setdefault("noise", {})["correlation"] = {"share": share, "seconds": seconds}
+    return new

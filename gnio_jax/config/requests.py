@@ -85,8 +85,9 @@ class CalibrateConfig:
     """Split whose recordings are fitted: the run's validation split (default) or its training
     split. Others are refused: what is tested must not have been fitted."""
     out_of_fold: tuple[str, ...] = ()
-    """Folders of runs, one for each fold (gnio train --data.folds K --data.left-out k). The filter
-    is then fitted to the training split, each session seen by the network that left it out."""
+    """Folders of runs, one for each fold: gnio train --data.train-split train-0of4, then train-1of4
+    and so on. The filter is then fitted to the training split, each session seen by the network
+    that left it out."""
     fit: tuple[CalibratedGroup, ...] = ("measurement", "noise", "window")
     """What is fitted by the likelihood of the innovations: `measurement`, the factor of the
     network's covariance; `noise`, the IMU's; `start`, the standard deviations of the initial

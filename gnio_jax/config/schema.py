@@ -87,14 +87,11 @@ class DataConfig:
     """Rotate each sample with its own attitude, or the whole window with the attitude at its start
     (eq. 1 read literally)."""
     train_split: str = "train"
-    """Split of the dataset for training."""
+    """Split of the dataset for training. train-0of4 leaves out the first of four folds of it, in
+    which people and sessions are whole: with a network for each fold, gnio calibrate has walks that
+    were not learnt from (ours)."""
     val_split: str = "val"
     """Split of the dataset for validation, which chooses the best checkpoint."""
-    folds: Count = 1
-    """Folds into which the sessions (or people) of the training split are shared; 1 shares nothing.
-    A network for each fold gives gnio calibrate walks that were not learnt from (ours)."""
-    left_out: NonNegativeCount = 0
-    """With several folds: the one that is left out of training."""
     residency: Literal["device", "host", "auto"] = "device"
     """Where recordings lie in training on windows: on the device, or on the disk, from which
     batches are read ahead; auto: on the disk if they take more than half of the device's memory.
@@ -145,9 +142,6 @@ class DataConfig:
             at.refuse("stride_seconds", f"must divide the window of {self.window_seconds:g} s")
         if self.context % self.stride:
             at.refuse("stride_seconds", f"must divide the context of {self.context_seconds:g} s")
-        if self.left_out >= self.folds:
-            problem = f"must be below data.folds, which is {self.folds}, found {self.left_out}"
-            at.refuse("left_out", problem)
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """Every dataset as a list of `Sequence`: `load(name, root, split)`, `names()`."""
 
 from gnio_jax.data.dataset import Dataset
-from gnio_jax.data.folds import folds, group
+from gnio_jax.data.folds import Fold, folds, group, parse_fold
 from gnio_jax.data.hdf5 import read_hdf5, write_hdf5
 from gnio_jax.data.plausibility import SelfCheck, self_check
 from gnio_jax.data.registry import find_root, get, load, load_each, names
@@ -11,6 +11,7 @@ from gnio_jax.types import Sequence
 
 __all__ = [
     "Dataset",
+    "Fold",
     "SelfCheck",
     "Sequence",
     "find_root",
@@ -20,6 +21,7 @@ __all__ = [
     "load",
     "load_each",
     "names",
+    "parse_fold",
     "read_hdf5",
     "resample",
     "self_check",

@@ -1,10 +1,54 @@
-"""Cross-validation: recordings shared into folds, people and sessions whole."""
+"""Cross-validation: the recordings of a split shared into folds, people and sessions whole.
+
+`train+0of4` is the first of four folds of the split `train`, and `train-0of4` is all but that one.
+"""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
+from typing import NamedTuple
 
+from gnio_jax.errors import InputError
 from gnio_jax.types import Sequence
+
+_NOTATION = re.compile(r"(.+)([+-])(\d{1,4})of(\d{1,4})")
+
+
+class Fold(NamedTuple):
+    """A fold of a split, or all of the split but that fold."""
+
+    split: str
+    number: int
+    """From 0 to `count` − 1."""
+    count: int
+    left_out: bool
+
+    def select(self, sequences: Iterable[Sequence]) -> list[Sequence]:
+        """Those of the split's sequences that belong to it. All must be given: a fold depends on
+        the lengths of all. Raises `InputError` for a fold without a sequence."""
+        every = list(sequences)
+        fold_of = folds(every, self.count)
+        if self.number not in fold_of.values():
+            problem = f"has nothing in fold {self.number} of {self.count}"
+            remedy = f"there are {len(fold_of)} people or sessions to share; take fewer folds"
+            raise InputError(f"split '{self.split}'", problem, remedy)
+        return [e for e in every if (fold_of[group(e)] == self.number) != self.left_out]
+
+
+def parse_fold(split: str) -> Fold | None:
+    """What the name of a split stands for; None for a split as the dataset has it.
+
+    Raises `InputError` for a fold that is not there.
+    """
+    found = _NOTATION.fullmatch(split)
+    if found is None:
+        return None
+    name, sign, number, count = found.groups()
+    if not int(number) < int(count):
+        last = int(count) - 1
+        raise InputError(f"split '{split}'", "has no such fold", f"they are numbered 0 to {last}")
+    return Fold(name, int(number), int(count), sign == "-")
 
 
 def group(sequence: Sequence) -> str:

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from gnio_jax.data.dataset import Dataset
+from gnio_jax.data.folds import parse_fold
 from gnio_jax.data.readers import (
     blackbird,
     csv_files,
@@ -112,7 +113,7 @@ def load(
     progress: Callable[[float], None] = lambda share: None,
 ) -> list[Sequence]:
     """The sequences of a split of a dataset, validated and self-checked, at its native rate
-    (`resample` changes that).
+    (`resample` changes that). A split may be a fold, or all but a fold (see `folds`).
 
     Recordings that cannot be used are left out with a warning. With `workers` > 1 that many
     processes read the recordings that are slow to read and not in the cache yet; a script that asks
@@ -131,6 +132,9 @@ def load_each(
     progress: Callable[[float], None] = lambda share: None,
 ) -> Iterator[Sequence]:
     """The sequences of `load` one after another, for those that do not fit the memory together."""
+    fold = parse_fold(split)
+    if fold is not None:
+        return iter(fold.select(load_each(name, root, fold.split, workers, progress)))
     dataset = get(name)
     # Where lists at the root name the splits, the reader knows them.
     if split not in dataset.splits and dataset.list_splits is None:

@@ -186,10 +186,12 @@ def folder_name(config: EvaluateConfig, dataset: str, trained: TrainConfig) -> s
     if config.checkpoint != "best" and config.estimator != "imu_only":
         parts.append(config.checkpoint)
     if config.estimator != "integrate":
-        usual_settings = configuration.flat(trained.filter)
-        for name, value in configuration.flat(config.filter).items():
-            if value != usual_settings.get(name):
-                text = f"{value:g}" if isinstance(value, float) else value
+        usual, own = configuration.flat(trained.filter), configuration.flat(config.filter)
+        for name in {**usual, **own}:
+            value = own.get(name)
+            if value != usual.get(name):
+                numbers = value if isinstance(value, tuple) else (value,)
+                text = ",".join(f"{x:g}" if isinstance(x, float) else str(x) for x in numbers)
                 parts.append(f"{name}-{text}")
     return "_".join(parts)
 

@@ -10,8 +10,15 @@ import jax
 import jax.numpy as jnp
 from jax.tree_util import keystr, tree_leaves_with_path, tree_map_with_path
 
-from gnio_jax.config import ConsideredStd, DataConfig, FilterSettings, InitialStd, NoiseModel
-from gnio_jax.config.files import bounds
+from gnio_jax.config import (
+    ConsideredStd,
+    CorrelatedError,
+    DataConfig,
+    FilterSettings,
+    InitialStd,
+    NoiseModel,
+)
+from gnio_jax.config.files import bounds, named
 from gnio_jax.config.schema import SHARE
 from gnio_jax.filtering.config import FilterConfig
 
@@ -65,7 +72,7 @@ def free_parameters(settings: FilterSettings, paths: Iterable[str]) -> dict[str,
     wanted = tuple(paths)
     values = {_name(path): value for path, value in tree_leaves_with_path(settings)}
     return {
-        name: math.log(value) - (math.log1p(-value) if _is_share(name) else 0.0)
+        name: math.log(value) - (math.log1p(-value) if name in _SHARES else 0.0)
         for name, value in values.items()
         if value > 0 and any(is_below(name, path) for path in wanted)
     }
@@ -84,7 +91,7 @@ def with_free_parameters(settings: FilterSettings, free: Mapping[str, Any]) -> F
         if name not in free:
             return old
         number = jnp.asarray(free[name], jnp.float64)
-        return jax.nn.sigmoid(number) if _is_share(name) else jnp.exp(number)
+        return jax.nn.sigmoid(number) if name in _SHARES else jnp.exp(number)
 
     return tree_map_with_path(value, settings)
 
@@ -100,9 +107,9 @@ def with_written_parameters(
         if name not in free:
             return old
         number = float(free[name])
-        natural = 1 / (1 + math.exp(-number)) if _is_share(name) else math.exp(number)
+        natural = 1 / (1 + math.exp(-number)) if name in _SHARES else math.exp(number)
         written = float(f"{natural:.{digits}g}")
-        return min(written, LARGEST_SHARE) if _is_share(name) else written
+        return min(written, LARGEST_SHARE) if name in _SHARES else written
 
     return tree_map_with_path(value, settings)
 
@@ -111,6 +118,9 @@ def _name(path: Any) -> str:
     return keystr(path, simple=True, separator=".")
 
 
-def _is_share(name: str) -> bool:
-    """Whether a number lies between 0 and 1, as its field's bound says."""
-    return SHARE in bounds(FilterSettings, name)
+_SHARES = {
+    name
+    for name, hint, _ in named(FilterSettings(NoiseModel(correlation=CorrelatedError())))
+    if SHARE in bounds(hint)
+}
+"""Numbers that lie between 0 and 1, as their bounds say; the others are positive."""

@@ -124,24 +124,15 @@ def keys_of(seed: int) -> Keys:
 def read_split(
     config: TrainConfig, split: str, reporter: Reporter, workers: int
 ) -> Iterator[Sequence]:
-    """The recordings of a split at the network's rate, one after another. Those of the training
-    split lack the fold that is left out."""
-
-    def loaded() -> Iterator[Sequence]:
-        return data.load_each(
-            config.dataset,
-            config.data_root,
-            split,
-            workers,
-            lambda share: reporter.progress(f"reading {split}", share),
-        )
-
-    resampled = (data.resample(sequence, config.data.rate) for sequence in loaded())
-    if split != config.data.train_split or config.data.folds == 1:
-        return resampled
-    # All are read once more, since a fold depends on the lengths of all.
-    fold_of = data.folds(loaded(), config.data.folds)
-    return (each for each in resampled if fold_of[data.group(each)] != config.data.left_out)
+    """The recordings of a split at the network's rate, one after another."""
+    loaded = data.load_each(
+        config.dataset,
+        config.data_root,
+        split,
+        workers,
+        lambda share: reporter.progress(f"reading {split}", share),
+    )
+    return (data.resample(sequence, config.data.rate) for sequence in loaded)
 
 
 def describe_split(

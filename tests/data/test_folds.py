@@ -1,13 +1,13 @@
 """Folds: groups stay whole, the time is shared fairly, and training lacks what is left out."""
 
-import dataclasses
 import itertools
 
 import numpy as np
 import pytest
 
 from gnio_jax import data
-from gnio_jax.config import DataConfig, TrainConfig, validate
+from gnio_jax.config import DataConfig, TrainConfig
+from gnio_jax.data import registry
 from gnio_jax.errors import InputError
 from gnio_jax.reporting import Lines
 from gnio_jax.training import kinds
@@ -48,19 +48,40 @@ def test_folds_share_the_time_and_keep_groups_whole():
         assert data.folds(order, 2) == found
 
 
-@pytest.mark.parametrize("left_out", [0, 1, 2])
-def test_training_lacks_the_fold_that_is_left_out(monkeypatch, left_out):
-    monkeypatch.setattr(data, "load_each", lambda *_: iter(RECORDINGS))
-    config = TrainConfig(data=DataConfig(rate=50.0, folds=3, left_out=left_out))
-    read = [s.name for s in kinds.read_split(config, "train", Lines(), 1)]
+@pytest.mark.parametrize("number", [0, 1, 2])
+def test_a_split_may_be_a_fold_or_all_but_that(monkeypatch, number):
+    monkeypatch.setattr(registry, "read_each", lambda *_: iter(RECORDINGS))
     fold_of = data.folds(RECORDINGS, 3)
-    assert read == [s.name for s in RECORDINGS if fold_of[data.group(s)] != left_out]
+    without, alone = (
+        [s.name for s in data.load("synthetic", None, f"train{sign}{number}of3")] for sign in "-+"
+    )
+    assert without == [s.name for s in RECORDINGS if fold_of[data.group(s)] != number]
+    assert alone == [s.name for s in RECORDINGS if fold_of[data.group(s)] == number]
+    assert 0 < len(alone) < len(RECORDINGS)
+
+
+def test_training_reads_the_fold_that_its_split_names(monkeypatch):
+    monkeypatch.setattr(registry, "read_each", lambda *_: iter(RECORDINGS))
+    config = TrainConfig(data=DataConfig(rate=50.0, train_split="train-1of3"))
+    read = [s.name for s in kinds.read_split(config, "train-1of3", Lines(), 1)]
+    assert read == [s.name for s in data.load("synthetic", None, "train-1of3")]
     assert 0 < len(read) < len(RECORDINGS)
-    # Validation has a split of its own.
-    assert len(list(kinds.read_split(config, "val", Lines(), 1))) == len(RECORDINGS)
 
 
-def test_a_fold_that_is_not_there_is_a_mistake():
-    config = TrainConfig(data=DataConfig(folds=2, left_out=2))
-    with pytest.raises(InputError, match=r"data.left_out.* below data.folds, which is 2, found 2"):
-        validate(dataclasses.replace(config), "here")
+@pytest.mark.parametrize(
+    ("split", "problem"),
+    [
+        ("train-2of2", r"split 'train-2of2': has no such fold; they are numbered 0 to 1"),
+        ("trian-0of2", r"unknown split 'trian'; did you mean 'train'"),
+        ("train-6of9", r"split 'train': has nothing in fold 6 of 9; there are 5 people or"),
+    ],
+)
+def test_a_fold_that_is_not_there_is_a_mistake(monkeypatch, split, problem):
+    monkeypatch.setattr(registry, "read_each", lambda *_: iter(RECORDINGS))
+    with pytest.raises(InputError, match=problem):
+        data.load("synthetic", None, split)
+
+
+def test_names_without_a_fold_are_splits():
+    assert data.parse_fold("train") is None and data.parse_fold("sessions-of-4") is None
+    assert data.parse_fold("a-b+10of12") == data.Fold("a-b", 10, 12, left_out=False)
