@@ -22,6 +22,15 @@ STANDARD_G = 9.80665
 """The unit "G" in which phones report acceleration, m/s²."""
 
 
+class Waypoints(NamedTuple):
+    """Where a walker was at a few moments, in the place of a pose at every sample."""
+
+    time: Float[np.ndarray, "k"]
+    """Increasing stamps on the clock of the sequence, s."""
+    position: Float[np.ndarray, "k 2"]
+    """Horizontal, in the world of a map, m."""
+
+
 class Sequence(NamedTuple):
     """One recording: IMU and reference on one uniform clock. Host arrays in float64.
 
@@ -48,6 +57,8 @@ class Sequence(NamedTuple):
     imu_valid: Bool[np.ndarray, "n"] | None = None
     """False where `gyro` and `accel` are no measurement but a line across a gap; None: all are
     there. The filter bridges and coasts there, and believes nothing (`filtering.gaps`)."""
+    waypoints: Waypoints | None = None
+    """The reference of a recording without poses; what needs a pose refuses it by name."""
     attributes: dict[str, Any] = {}
     """Where it comes from: dataset, session, group, subject, device, placement, truth, licence, ...
     (str/float/bool)."""

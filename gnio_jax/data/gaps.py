@@ -9,21 +9,13 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from gnio_jax.data.dataset import Refusal
-from gnio_jax.data.resampling import LONGEST_BRIDGE
+from gnio_jax.data.reference import LONGEST_BRIDGE
 from gnio_jax.data.validation import WINDOW_SECONDS
 from gnio_jax.numerics import spans, stretches
 from gnio_jax.types import Sequence
 
 STAMP_ROUNDING = 1e-6
 """s: what float64 leaves of differences of unix stamps, and more."""
-
-
-def told_beyond(rate: float) -> float:
-    """s: of longer intervals between two samples of an IMU at `rate` Hz a user is told (ours).
-
-    What a filter guesses of a few lost samples is right, and clocks of phones jitter.
-    """
-    return max(0.1, 3.0 / rate)
 
 
 def divide_at_gaps(sequence: Sequence, source: object) -> list[Sequence]:

@@ -1,7 +1,8 @@
-"""One uniform clock for a recording."""
+"""Samples on other stamps: splines within unbroken runs, and a low-pass before a lower rate."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -10,14 +11,23 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from gnio_jax.decimation import decimation_factor, low_pass
-from gnio_jax.numerics import convolved, quaternions, rotations
+from gnio_jax.numerics import convolved, finite_rows, quaternions, rotations, stretches
 from gnio_jax.types import Sequence
 
-LONGEST_BRIDGE = 0.1
-"""s between samples within which `resample` trusts what it interpolates."""
+SPLINE_INTERVALS = 3.5
+"""Usual intervals of a sensor up to which a spline follows it between two samples; across more it
+would swing, and a line is drawn (ours)."""
+SHORTEST_SPLINE = 4
+"""Samples in a row below which straight lines stand in for a spline."""
 
 
-def is_uniform(time: Float[np.ndarray, "n"], rate: float) -> bool:
+def longest_bridge(rate: float) -> float:
+    """s between two samples of an IMU at `rate` Hz up to which what lies between them counts as
+    measured (ours): clocks of phones jitter, and what is guessed of a few lost samples is right."""
+    return max(0.1, 3.0 / rate)
+
+
+def is_uniform(time: Float[np.ndarray, " n"], rate: float) -> bool:
     """True if every interval is 1/rate to 0.1 % and the whole to 0.01 %.
 
     Stamps rounded to a microsecond are.
@@ -26,53 +36,84 @@ def is_uniform(time: Float[np.ndarray, "n"], rate: float) -> bool:
     return bool(np.abs(intervals - 1.0).max() < 1e-3 and abs(intervals.mean() - 1.0) < 1e-4)
 
 
-def resample(sequence: Sequence, rate: float, max_gap: float = LONGEST_BRIDGE) -> Sequence:
+def uniform_clock(first: float, last: float, rate: float) -> Float[np.ndarray, " m"]:
+    """Stamps at `rate` Hz from `first`, as far as `last` reaches."""
+    clock = first + np.arange(int(np.floor((last - first) * rate + 1e-6)) + 1) / rate
+    clock[-1] = min(clock[-1], last)  # rounding must not extrapolate
+    return clock
+
+
+class Resampled(NamedTuple):
+    """An IMU's samples on another clock."""
+
+    values: Float[np.ndarray, "m w"]
+    measured: Bool[np.ndarray, " m"]
+    """False in gaps longer than `longest_bridge`, where `values` are a line, and beyond the
+    ends."""
+
+
+def resampled(
+    time: Float[np.ndarray, " n"],
+    values: Float[np.ndarray, "n w"],
+    clock: Float[np.ndarray, " m"],
+    rate: float,
+) -> Resampled:
+    """An IMU's samples at the uniform stamps `clock` of `rate` Hz.
+
+    Going to a lower rate they are band-limited first (zero-phase FIR, pass band to 0.8 of the new
+    Nyquist frequency), or vibrations would alias into the gait band.
+    """
+    step = float(np.median(np.diff(time)))
+    factor, longest = decimation_factor(1.0 / step, rate), SPLINE_INTERVALS * step
+    measured = known_at(time, np.ones(len(time), dtype=bool), clock, longest_bridge(1.0 / step))
+    if factor == 1:
+        return Resampled(splined(time, values, clock, longest), measured)
+    fine = clock[0] + np.arange((len(clock) - 1) * factor + 1) / (rate * factor)
+    fine = splined(time, values, np.minimum(fine, time[-1]), longest)
+    taps = low_pass(factor)
+    half = len(taps) // 2
+    padded = np.pad(fine, ((half, half), (0, 0)), mode="reflect", reflect_type="odd")
+    return Resampled(convolved(padded, taps)[::factor], measured)
+
+
+def resample(sequence: Sequence, rate: float) -> Sequence:
     """`sequence` on a uniform clock of `rate` Hz that starts at its first stamp.
 
-    Unchanged if it is on such a clock already. IMU, position and velocity follow cubic splines,
-    attitudes slerp along the shorter arc. Going to a lower rate the IMU is band-limited first
-    (zero-phase FIR, pass band to 0.8 of the new Nyquist frequency), or vibrations would alias into
-    the gait band; poses stay those of the stamp. `valid` is False between samples of which one is
-    invalid, and in gaps longer than `max_gap` (s), where the IMU is interpolated linearly: there
-    `imu_valid` is False, too. A reference value next to a NaN is NaN.
+    Unchanged if it is on such a clock already. The IMU goes as in `resampled`, position and
+    velocity follow splines, attitudes slerp along the shorter arc. `valid` is False between samples
+    of which one is invalid, and in gaps of the IMU; there `imu_valid` is False, too. A reference
+    value next to a NaN is NaN. Waypoints have stamps of their own and stay.
     """
-    time = sequence.time
+    time, valid = sequence.time, sequence.valid
     if is_uniform(time, rate):
         return sequence
-    count = int(np.floor((time[-1] - time[0]) * rate + 1e-6)) + 1
-    clock = time[0] + np.arange(count) / rate
-    clock[-1] = min(clock[-1], time[-1])
+    clock = uniform_clock(time[0], time[-1], rate)
+    step = float(np.median(np.diff(time)))
+    longest, bridge = SPLINE_INTERVALS * step, longest_bridge(1.0 / step)
     imu = np.concatenate([sequence.gyro, sequence.accel], axis=1)
-    imu = _resample_imu(time, imu, clock, rate, max_gap)
+    imu, measured = resampled(time, imu, clock, rate)
+    if sequence.imu_valid is not None:
+        measured = known_at(time, sequence.imu_valid, clock, bridge)
     device = sequence.device_orientation
     return sequence._replace(
         time=clock,
         gyro=imu[:, :3],
         accel=imu[:, 3:],
-        orientation=_slerp(time, sequence.orientation, clock),
-        position=_interpolate(time, sequence.position, sequence.valid, clock, max_gap),
-        velocity=_interpolate(time, sequence.velocity, sequence.valid, clock, max_gap),
-        valid=_valid_at(time, sequence.valid, clock, max_gap),
-        device_orientation=None if device is None else _slerp(time, device, clock),
-        imu_valid=_imu_valid_at(time, sequence.imu_valid, clock, max_gap),
+        orientation=slerped(time, sequence.orientation, clock),
+        position=splined(time, sequence.position, clock, longest, valid),
+        velocity=splined(time, sequence.velocity, clock, longest, valid),
+        valid=known_at(time, valid, clock, bridge),
+        device_orientation=None if device is None else slerped(time, device, clock),
+        imu_valid=None if measured.all() else measured,
     )
 
 
-def _resample_imu(
-    time: np.ndarray, imu: np.ndarray, clock: np.ndarray, rate: float, max_gap: float
-) -> np.ndarray:
-    everywhere = np.ones(len(time), dtype=bool)
-    factor = decimation_factor(1.0 / float(np.median(np.diff(time))), rate)
-    if factor == 1:
-        return _interpolate(time, imu, everywhere, clock, max_gap)
-    fine = time[0] + np.arange((len(clock) - 1) * factor + 1) / (rate * factor)
-    fine = np.minimum(fine, time[-1])
-    return _low_pass(_interpolate(time, imu, everywhere, fine, max_gap), factor)[::factor]
+# --- between samples
 
 
-class _Neighbours(NamedTuple):
+class Between(NamedTuple):
     """The samples around each stamp of a clock; one and the same where a stamp is a sample's own to
-    1 µs."""
+    1 µs, and beyond the ends."""
 
     left: np.ndarray
     """Rows."""
@@ -84,72 +125,86 @@ class _Neighbours(NamedTuple):
     """Where the stamp lies between them, 0 to 1."""
 
 
-def _neighbours(time: np.ndarray, clock: np.ndarray) -> _Neighbours:
+def between(time: Float[np.ndarray, " n"], clock: Float[np.ndarray, " m"]) -> Between:
+    """The samples at `time` around each stamp of `clock`."""
     right = np.clip(np.searchsorted(time, clock), 1, len(time) - 1)
     left = right - 1
-    left = np.where(np.abs(time[right] - clock) <= 1e-6, right, left)
-    right = np.where(np.abs(time[left] - clock) <= 1e-6, left, right)
+    left = np.where(time[right] - clock <= 1e-6, right, left)
+    right = np.where(clock - time[left] <= 1e-6, left, right)
     span = time[right] - time[left]
     share = np.divide(clock - time[left], span, out=np.zeros_like(clock), where=span > 0)
-    return _Neighbours(left, right, span, share)
+    return Between(left, right, span, share)
 
 
-def _valid_at(
-    time: np.ndarray, valid: np.ndarray, clock: np.ndarray, max_gap: float
-) -> Bool[np.ndarray, "m"]:
-    near = _neighbours(time, clock)
-    return valid[near.left] & valid[near.right] & (near.span <= max_gap)
+def known_at(
+    time: Float[np.ndarray, " n"],
+    known: Bool[np.ndarray, " n"],
+    clock: Float[np.ndarray, " m"],
+    longest: float,
+) -> Bool[np.ndarray, " m"]:
+    """Where a clock lies between known samples that are no more than `longest` (s) apart."""
+    near = between(time, clock)
+    covered = (clock >= time[0] - 1e-6) & (clock <= time[-1] + 1e-6)
+    return known[near.left] & known[near.right] & (near.span <= longest) & covered
 
 
-def _imu_valid_at(
-    time: np.ndarray, valid: np.ndarray | None, clock: np.ndarray, max_gap: float
-) -> Bool[np.ndarray, "m"] | None:
-    """None where every sample lies among measured ones."""
-    everywhere = np.ones(len(time), dtype=bool)
-    found = _valid_at(time, everywhere if valid is None else valid, clock, max_gap)
-    return None if found.all() else found
+def runs_within(
+    time: Float[np.ndarray, " n"],
+    broken: Bool[np.ndarray, " i"],
+    clock: Float[np.ndarray, " m"],
+    shortest: int = SHORTEST_SPLINE,
+) -> Iterator[tuple[slice, slice]]:
+    """(rows of `time`, rows of `clock` within them to 1 µs) of each unbroken run of at least
+    `shortest` samples."""
+    for run in stretches(broken):
+        if run.stop - run.start >= shortest:
+            start = np.searchsorted(clock, time[run.start] - 1e-6)
+            stop = np.searchsorted(clock, time[run.stop - 1] + 1e-6, side="right")
+            if stop > start:
+                yield run, slice(int(start), int(stop))
 
 
-def _interpolate(
-    time: np.ndarray, values: np.ndarray, good: np.ndarray, clock: np.ndarray, max_gap: float
-) -> np.ndarray:
-    """Cubic splines within runs of good samples, linear between the runs.
+def splined(
+    time: Float[np.ndarray, " n"],
+    values: Float[np.ndarray, "n w"],
+    clock: Float[np.ndarray, " m"],
+    longest: float,
+    good: Bool[np.ndarray, " n"] | None = None,
+) -> Float[np.ndarray, "m w"]:
+    """Cubic splines within runs of good samples at most `longest` (s) apart, straight lines between
+    the runs, and the outermost values beyond the ends.
 
     A spline would carry an outlier or a gap into its surroundings.
     """
-    near = _neighbours(time, clock)
+    near = between(time, clock)
     share = near.share[:, None]
     line = (1.0 - share) * values[near.left] + share * values[near.right]
     result = np.where(share > 0, line, values[near.left])
-    rows = np.flatnonzero(good)
-    if rows.size == 0:
+    rows = slice(None) if good is None else np.flatnonzero(good)
+    time, values = time[rows], values[rows]
+    if len(time) < SHORTEST_SPLINE:
         return result
-    breaks = np.flatnonzero((np.diff(rows) > 1) | (np.diff(time[rows]) > max_gap)) + 1
-    for run in np.split(rows, breaks):
-        if run.size >= 4:
-            first = np.searchsorted(clock, time[run[0]], side="left")
-            stop = np.searchsorted(clock, time[run[-1]], side="right")
-            spline = CubicSpline(time[run], values[run], axis=0)
-            result[first:stop] = spline(clock[first:stop])
+    broken = np.diff(time) > longest
+    if good is not None:
+        broken |= np.diff(rows) > 1
+    for run, there in runs_within(time, broken, clock):
+        # A spline starts at 0, or large stamps would cost its coefficients digits.
+        own = time[run] - time[run.start]
+        at = np.clip(clock[there] - time[run.start], 0.0, own[-1])
+        result[there] = CubicSpline(own, values[run], axis=0)(at)
     return result
 
 
-def _slerp(time: np.ndarray, wxyz: np.ndarray, clock: np.ndarray) -> np.ndarray:
-    near = _neighbours(time, clock)
+def slerped(
+    time: Float[np.ndarray, " n"], wxyz: Float[np.ndarray, "n 4"], clock: Float[np.ndarray, " m"]
+) -> Float[np.ndarray, "m 4"]:
+    """Attitudes on the shorter arc between samples, whatever the signs of the quaternions; NaN
+    beside a NaN, and the outermost ones beyond the ends."""
+    near = between(time, clock)
     result = np.full((len(clock), 4), np.nan)
-    known = np.isfinite(wxyz[near.left]).all(axis=1) & np.isfinite(wxyz[near.right]).all(axis=1)
-    if not known.any():
-        return result
-    start, end = rotations(wxyz[near.left[known]]), rotations(wxyz[near.right[known]])
-    # The relative rotation vector is the shorter arc whatever the signs of the quaternions.
-    turn = (start.inv() * end).as_rotvec() * near.share[known, None]
-    result[known] = quaternions(start * Rotation.from_rotvec(turn))
+    known = finite_rows(wxyz[near.left]) & finite_rows(wxyz[near.right])
+    if known.any():
+        start, end = rotations(wxyz[near.left[known]]), rotations(wxyz[near.right[known]])
+        turn = (start.inv() * end).as_rotvec() * np.clip(near.share, 0.0, 1.0)[known, None]
+        result[known] = quaternions(start * Rotation.from_rotvec(turn))
     return result
-
-
-def _low_pass(values: np.ndarray, factor: int) -> np.ndarray:
-    """The FIR `low_pass` with zero phase, ends filled by odd reflection."""
-    taps = low_pass(factor)
-    half = len(taps) // 2
-    padded = np.pad(values, ((half, half), (0, 0)), mode="reflect", reflect_type="odd")
-    return convolved(padded, taps)

@@ -18,7 +18,9 @@ FARTHEST = 1e8
 """m from the world's origin, up to which a float64 has digits enough."""
 WINDOW_SECONDS = 1.0
 """The network's window, s. A longer hole in the IMU is no jitter: readers divide the recording
-there (`gaps.divide_at_gaps`), or refuse it."""
+there (`assembly.assemble`), or refuse it."""
+FEWEST_WAYPOINTS = 3
+"""Below which a track cannot be laid on them: a rotation and a shift take two."""
 UNIT_NORM_TOLERANCE = 1e-3
 """Rounding in text files moves the norm of a quaternion by less."""
 
@@ -33,16 +35,18 @@ def validate(sequence: Sequence, source: object) -> Sequence:
     for field in ("time", "gyro", "accel"):
         check_finite(getattr(sequence, field), field, source)
     check_increasing(sequence.time, source)
-    check_units(sequence.gyro, sequence.accel, source)
+    check_accel(sequence.accel, source)
+    check_gyro(sequence.gyro, source)
     for field in ("orientation", "position", "velocity"):
         bad = sequence.valid & ~np.isfinite(getattr(sequence, field)).all(axis=1)
         if bad.any():
             raise InputError(
                 source,
                 f"field '{field}' is NaN or Inf in {bad.sum()} rows marked valid, "
-                f"first in row {np.argmax(bad)}",
+                f"first in row {np.argmax(bad) + 1}",
                 "mark these rows invalid",
             )
+    _check_waypoints(sequence, source)
     orientation = check_unit_norm(sequence.orientation, sequence.valid, "orientation", source)
     device = sequence.device_orientation
     if device is not None:
@@ -79,13 +83,36 @@ def _check_shapes(sequence: Sequence, source: object) -> None:
             )
 
 
+def _check_waypoints(sequence: Sequence, source: object) -> None:
+    """Three or more, finite, increasing, and on the sequence's clock to a sample."""
+    if sequence.waypoints is None:
+        return
+    time, position = sequence.waypoints
+    count, clock = len(time), sequence.time
+    problem = ""
+    if time.ndim != 1 or position.shape != (count, 2):
+        problem = f"have the shapes {time.shape} and {position.shape}, expected (k,) and (k, 2)"
+    elif count < FEWEST_WAYPOINTS:
+        problem = f"are {count}, at least {FEWEST_WAYPOINTS} are needed"
+    elif not (np.isfinite(time).all() and np.isfinite(position).all()):
+        problem = "are not all finite"
+    elif not (np.diff(time) > 0).all():
+        problem = "do not increase in time"
+    else:
+        step = clock[1] - clock[0]
+        if time[0] < clock[0] - step or time[-1] > clock[-1] + step:
+            problem = f"({time[0]:.2f} to {time[-1]:.2f} s) are not all on the IMU's clock"
+    if problem:
+        raise InputError(source, f"field 'waypoints' {problem}", "repair or leave out these")
+
+
 def check_finite(values: Float[np.ndarray, "n ..."], field: str, source: object) -> None:
     """Raise `InputError` where a column that must be complete holds NaN or Inf."""
     bad = ~np.isfinite(values).reshape(len(values), -1).all(axis=1)
     if bad.any():
         raise InputError(
             source,
-            f"field '{field}' is NaN or Inf in {bad.sum()} rows, first in row {np.argmax(bad)}",
+            f"field '{field}' is NaN or Inf in {bad.sum()} rows, first in row {np.argmax(bad) + 1}",
             "repair or cut the recording there",
         )
 
@@ -97,16 +124,31 @@ def check_increasing(time: Float[np.ndarray, "n"], source: object) -> None:
         row = int(backward[0]) + 1
         raise InputError(
             source,
-            f"field 'time' does not increase in {backward.size} rows, first in row {row} "
+            f"field 'time' does not increase in {backward.size} rows, first in row {row + 1} "
             f"({time[row - 1]:.6f} s, then {time[row]:.6f} s)",
             "sort the rows and drop repeated ones",
         )
 
 
-def check_units(
-    gyro: Float[np.ndarray, "n 3"], accel: Float[np.ndarray, "n 3"], source: object
+def check_gyro(
+    gyro: Float[np.ndarray, "n 3"], source: object, time: Float[np.ndarray, " n"] | None = None
 ) -> None:
-    """Raise `InputError` when the magnitudes say that the IMU is not in rad/s and m/s²."""
+    """Raise `InputError` where the magnitudes say that a gyro is not in rad/s. Samples are named by
+    their stamps `time` (s), or else by their rows."""
+    turn = float(np.median(np.linalg.norm(gyro, axis=1)))
+    if turn > 20.0:
+        raise InputError(
+            source,
+            f"field 'gyro' looks like deg/s (median magnitude {turn:.3g})",
+            "convert it to rad/s (× π/180)",
+        )
+    _check_range("gyro", gyro, FASTEST_TURN, "rad/s", source, time)
+
+
+def check_accel(
+    accel: Float[np.ndarray, "n 3"], source: object, time: Float[np.ndarray, " n"] | None = None
+) -> None:
+    """The same of an accelerometer, m/s², gravity included."""
     force = float(np.median(np.linalg.norm(accel, axis=1)))
     problem, remedy = "", ""
     if 0.5 < force < 2.0:
@@ -120,24 +162,26 @@ def check_units(
         remedy = "convert it to m/s²"
     if problem:
         raise InputError(source, f"field 'accel' {problem}", remedy)
-    turn = float(np.median(np.linalg.norm(gyro, axis=1)))
-    if turn > 20.0:
-        raise InputError(
-            source,
-            f"field 'gyro' looks like deg/s (median magnitude {turn:.3g})",
-            "convert it to rad/s (× π/180)",
-        )
-    _check_range("gyro", gyro, FASTEST_TURN, "rad/s", source)
-    _check_range("accel", accel, STRONGEST_FORCE, "m/s²", source)
+    _check_range("accel", accel, STRONGEST_FORCE, "m/s²", source, time)
 
 
-def _check_range(field: str, values: np.ndarray, most: float, unit: str, source: object) -> None:
+def _check_range(
+    field: str,
+    values: np.ndarray,
+    most: float,
+    unit: str,
+    source: object,
+    time: np.ndarray | None,
+) -> None:
     beyond = (np.abs(values) > most).any(axis=1)
     if beyond.any():
+        row = int(np.argmax(beyond))
+        first = (
+            f"in row {row + 1}" if time is None else f"{time[row] - time[0]:.3f} s after the start"
+        )
         raise InputError(
             source,
-            f"field '{field}' is beyond {most:g} {unit} in {beyond.sum()} rows, "
-            f"first in row {np.argmax(beyond)}",
+            f"field '{field}' is beyond {most:g} {unit} in {beyond.sum()} rows, first {first}",
             "no such sensor measures that: repair or cut the recording there",
         )
 
@@ -153,7 +197,7 @@ def check_motion(sequence: Sequence, source: object) -> None:
         raise InputError(
             source,
             f"field 'velocity' is beyond {FASTEST:g} m/s in {fast.sum()} rows, "
-            f"first in row {np.argmax(fast)}",
+            f"first in row {np.argmax(fast) + 1}",
             "repair these rows or mark them invalid",
         )
     far = valid & (np.abs(position).max(axis=1) > FARTHEST)
@@ -161,7 +205,7 @@ def check_motion(sequence: Sequence, source: object) -> None:
         raise InputError(
             source,
             f"field 'position' is beyond {FARTHEST:g} m in {far.sum()} rows, "
-            f"first in row {np.argmax(far)}",
+            f"first in row {np.argmax(far) + 1}",
             "give metres in a local world, or mark these rows invalid",
         )
     step = np.abs(np.diff(position, axis=0)).max(axis=1)
@@ -171,7 +215,7 @@ def check_motion(sequence: Sequence, source: object) -> None:
         row = int(np.argmax(jump)) + 1
         raise InputError(
             source,
-            f"field 'position' jumps in {jump.sum()} rows, first in row {row} "
+            f"field 'position' jumps in {jump.sum()} rows, first in row {row + 1} "
             f"(by {step[row - 1]:.3g} m)",
             "repair these rows or mark them invalid",
         )
@@ -191,7 +235,7 @@ def check_unit_norm(
         row = int(np.argmax(bad))
         raise InputError(
             source,
-            f"field '{field}' is not a unit quaternion in {bad.sum()} rows, first in row {row} "
+            f"field '{field}' is not a unit quaternion in {bad.sum()} rows, first in row {row + 1} "
             f"(norm {norm[row]:.4g})",
             "check the column order and normalize, or mark the rows invalid",
         )
@@ -230,7 +274,7 @@ def check_gaps(
         row = int(np.argmax(gaps))
         raise InputError(
             source,
-            f"field 'time' has a gap of {gaps[row]:.3f} s after row {row}, "
+            f"field 'time' has a gap of {gaps[row]:.3f} s after row {row + 1}, "
             f"longer than {longest:g} s",
             "cut the recording there",
         )

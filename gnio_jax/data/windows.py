@@ -89,6 +89,10 @@ def window_parts(
     in parts. Raises `InputError` at the end when there was none."""
     found = False
     for sequence in sequences:
+        if sequence.waypoints is not None:
+            raise InputError(
+                sequence.name, "has waypoints, no poses", "windows need a pose at every sample"
+            )
         start = _valid_starts(sequence, config.seen, 1 if shift else stride)
         if start.size:
             found = True

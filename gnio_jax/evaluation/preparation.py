@@ -99,6 +99,10 @@ def prepare(
     setup = resolve(setup)
     prepared, left_out = [], {}
     for sequence in sequences:
+        if sequence.waypoints is not None:
+            raise InputError(
+                sequence.name, "has waypoints, no poses", "nothing can be compared with a track yet"
+            )
         sequence = data.resample(sequence, config.rate)
         good = finite_rows(sequence.position) & finite_rows(sequence.orientation)
         sequence = sequence._replace(valid=sequence.valid & good)

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from gnio_jax.data.gaps import told_beyond
+from gnio_jax.data.resampling import longest_bridge
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import inference_network
 from gnio_jax.filtering import Tracker
@@ -73,7 +73,7 @@ def longest_interval(run: Run, imu_rate: float | None = None) -> float:
 
 def longest_untold(run: Run, imu_rate: float | None = None) -> float:
     """s between samples of which nobody needs to be told; `imu_rate` as in `create_tracker`."""
-    return told_beyond(imu_rate or run.config.data.rate)
+    return longest_bridge(imu_rate or run.config.data.rate)
 
 
 @dataclass

@@ -11,7 +11,7 @@ import numpy as np
 from gnio_jax import data
 from gnio_jax.config import DataConfig, InitialStd
 from gnio_jax.data.importing import Imported
-from gnio_jax.data.resampling import LONGEST_BRIDGE
+from gnio_jax.data.resampling import longest_bridge
 from gnio_jax.data.validation import WINDOW_SECONDS, check_gaps
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import Estimate, Trajectory, exporting, inference_network, prepare
@@ -101,7 +101,8 @@ def _prepared(sequence: Sequence, windows: DataConfig, std: InitialStd) -> Prepa
     check_gaps(sequence.time, sequence.name)
     # Lines of an earlier resampling; each clock has widened a hole by up to a sample at each end.
     there = np.union1d(sequence.time[measured_rows(sequence)], sequence.time[[0, -1]])
-    check_gaps(there, sequence.name, WINDOW_SECONDS + LONGEST_BRIDGE)
+    bridged = longest_bridge(1.0 / float(np.median(np.diff(sequence.time))))
+    check_gaps(there, sequence.name, WINDOW_SECONDS + bridged)
     sequence = data.resample(sequence, windows.rate)
     blind = sequence._replace(valid=np.zeros_like(sequence.valid))
     prepared, left_out = prepare([blind], windows, START, std)

@@ -122,7 +122,7 @@ def test_check_shows_every_recording_with_its_figures_and_reasons(root, capsys):
     main(["check", str(root), *files])
     out = capsys.readouterr().out
     assert out.startswith(f"tlio at {root}, split all")
-    fair = data.self_check(tlio.read_sequence(root / "fair"))
+    fair = data.self_check(*tlio.read(root / "fair"))
     assert row(out, "fair") == [
         "fair",
         "train",
@@ -250,13 +250,13 @@ def test_the_module_runs_and_draws_nothing_unasked(root):
 @pytest.fixture
 def reads(monkeypatch):
     """Names of the recordings that were read, in their order."""
-    names, real = [], tlio.read_sequence
+    names, real = [], tlio.read
 
-    def read_sequence(folder):
+    def read(folder):
         names.append(folder.name)
         return real(folder)
 
-    monkeypatch.setattr(tlio, "read_sequence", read_sequence)
+    monkeypatch.setattr(tlio, "read", read)
     return names
 
 
@@ -277,7 +277,7 @@ def test_convert_keeps_every_figure_and_the_splits(root, capsys):
         "train.txt",
     ]
     for split, name in (("train", "fair"), ("test", "also")):
-        (ours,), theirs = data.load("csv", converted, split), tlio.read_sequence(root / name)
+        (ours,), (theirs,) = data.load("csv", converted, split), tlio.read(root / name)
         same(ours, theirs)
         assert ours.name == name and theirs.attributes.items() <= ours.attributes.items()
     with pytest.raises(InputError, match=r"val\.txt: the list cannot be read"):
@@ -287,7 +287,7 @@ def test_convert_keeps_every_figure_and_the_splits(root, capsys):
 def test_convert_to_another_rate(root):
     main(["convert", "tlio", str(root), "slow", "--split", "test", "--rate", "50"])
     (ours,) = data.load("csv", root.parent / "slow", "test")
-    same(ours, data.resample(tlio.read_sequence(root / "also"), 50.0))
+    same(ours, data.resample(*tlio.read(root / "also"), 50.0))
 
 
 def test_convert_goes_on_where_it_was_stopped(root, reads, monkeypatch, capsys):

@@ -16,23 +16,23 @@ BAD = [
     (GOOD._replace(time=GOOD.time[:1]), "'time'", "two stamps"),
     (GOOD._replace(valid=GOOD.valid.astype(float)), "'valid'", "booleans"),
     (GOOD._replace(imu_valid=GOOD.valid[1:]), "'imu_valid'", "booleans"),
-    (changed(GOOD, "time", 7, GOOD.time[6]), "'time'", "row 7"),
-    (changed(GOOD, "time", 7, np.nan), "'time'", "row 7"),
-    (changed(GOOD, "gyro", 9, np.nan), "'gyro'", "row 9"),
-    (changed(GOOD, "accel", (9, 2), np.inf), "'accel'", "row 9"),
+    (changed(GOOD, "time", 7, GOOD.time[6]), "'time'", "row 8"),
+    (changed(GOOD, "time", 7, np.nan), "'time'", "row 8"),
+    (changed(GOOD, "gyro", 9, np.nan), "'gyro'", "row 10"),
+    (changed(GOOD, "accel", (9, 2), np.inf), "'accel'", "row 10"),
     (GOOD._replace(accel=GOOD.accel / 9.81), "'accel'", "looks like G"),
     (GOOD._replace(accel=GOOD.accel - np.array([0, 0, 9.81])), "'accel'", "no gravity"),
     (GOOD._replace(accel=GOOD.accel * 1e3), "'accel'", "not in m/s²"),
     (GOOD._replace(gyro=GOOD.gyro * 180 / np.pi), "'gyro'", "looks like deg/s"),
-    (changed(GOOD, "orientation", 5, [0.9, 0, 0, 0]), "'orientation'", "row 5"),
-    (changed(GOOD, "orientation", 5, 0.0), "'orientation'", "row 5"),
-    (changed(GOOD, "orientation", 5, np.nan), "'orientation'", "row 5"),
+    (changed(GOOD, "orientation", 5, [0.9, 0, 0, 0]), "'orientation'", "row 6"),
+    (changed(GOOD, "orientation", 5, 0.0), "'orientation'", "row 6"),
+    (changed(GOOD, "orientation", 5, np.nan), "'orientation'", "row 6"),
     (changed(GOOD, "position", 5, np.nan), "'position'", "mark these rows invalid"),
-    (changed(GOOD, "velocity", 5, np.inf), "'velocity'", "row 5"),
+    (changed(GOOD, "velocity", 5, np.inf), "'velocity'", "row 6"),
     (
         changed(GOOD._replace(device_orientation=GOOD.orientation), "device_orientation", 5, 2.0),
         "'device_orientation'",
-        "row 5",
+        "row 6",
     ),
 ]
 
@@ -77,6 +77,6 @@ def test_check_rate_and_gaps():
     check_gaps(time, "walk.csv")
     time[50:] += 1.2
     with pytest.raises(
-        InputError, match=r"walk\.csv: field 'time' has a gap of 1\.205 s after row 49"
+        InputError, match=r"walk\.csv: field 'time' has a gap of 1\.205 s after row 50"
     ):
         check_gaps(time, "walk.csv")

@@ -18,15 +18,14 @@ The steps, a file each: filtered motion of the tracked body (`track`), first gue
 equation pass the same Gaussian filter, so that filtering removes noise but biases nothing.
 
 `heading` aligns a tracker that says nothing of the IMU's attitude; `clocks` finds the lag of poses
-that are the IMU's own. `attitude` corrects the gyro's drift, `smoothing` gives positions and
-velocities. Attitudes are SciPy rotations, body→world.
+that are the IMU's own. `attitude` corrects the gyro's drift by accelerations. Attitudes are SciPy
+rotations, body→world.
 """
 
-from gnio_jax.data.alignment.attitude import attitude_from_acceleration, fuse_attitude
+from gnio_jax.data.alignment.attitude import attitude_from_acceleration
 from gnio_jax.data.alignment.clocks import PoseLag, pose_lag
 from gnio_jax.data.alignment.heading import Heading, align_heading
 from gnio_jax.data.alignment.mounting import Alignment, align
-from gnio_jax.data.alignment.smoothing import smooth_positions
 from gnio_jax.data.alignment.track import TooLittle, Track
 
 __all__ = [
@@ -38,7 +37,5 @@ __all__ = [
     "align",
     "align_heading",
     "attitude_from_acceleration",
-    "fuse_attitude",
     "pose_lag",
-    "smooth_positions",
 ]

@@ -15,92 +15,15 @@ from gnio_jax.data.alignment.signals import (
 )
 from gnio_jax.numerics import (
     hat,
-    interpolate,
-    quaternions,
     robust_std,
-    rotations,
     slerp,
     within,
 )
 from gnio_jax.types import GRAVITY
 
-COURSE_SECONDS, FLIP_DEGREES = 3.0, 15.0
-"""Filter (standard deviation, s) of the correction's median course, and how far off it a sample
-is a flip of the tracker."""
-
 TILT_DRIFT_STD, YAW_DRIFT_STD = 0.05, 0.02
 """rad by which the gyro's drift may change from one interval of 10 s to the next: 0.005 rad/s in
 tilt and 0.002 rad/s in yaw."""
-
-
-def fuse_attitude(
-    integrated: Rotation,
-    measured: Rotation,
-    good: Bool[np.ndarray, " n"],
-    step: float,
-    seconds: float = 0.3,
-) -> tuple[Rotation, Bool[np.ndarray, " n"]]:
-    """Integrated attitude times a smooth correction towards the measured one, and where the
-    measured one was believed.
-
-    The correction measured · integrated⁻¹ moves as slowly as the gyro's bias does. Samples more
-    than 15° off its median course (σ 3 s) are flips of the tracker; the rest is smoothed over
-    `seconds` (σ), with weights that fall with the residual. Where nothing was measured the
-    correction is interpolated, so that the gyro bridges the gap.
-    """
-    correction = quaternions(measured * integrated.inv())
-    correction[good] = _one_sign(correction[good])
-    believed = good
-    course = _filled(correction, good)
-    for _ in range(4):
-        correction, angle = _against(correction, course)
-        believed = _enough(good & (angle < np.radians(FLIP_DEGREES)), good)
-        course = _course(correction, angle, believed, np.radians(1.0), COURSE_SECONDS / step)
-    for _ in range(3):
-        correction, angle = _against(correction, course)
-        believed = _enough(believed & (angle < np.pi), good)
-        course = _course(correction, angle, believed, np.radians(0.3), seconds / step)
-    return rotations(course) * integrated, believed
-
-
-def _one_sign(wxyz: Float[np.ndarray, "m 4"]) -> Float[np.ndarray, "m 4"]:
-    """The same rotations; q and −q are one, and neighbours get the same sign."""
-    opposite = (wxyz[1:] * wxyz[:-1]).sum(axis=1) < 0
-    return wxyz * np.cumprod(np.concatenate([[1.0], np.where(opposite, -1.0, 1.0)]))[:, None]
-
-
-def _against(
-    wxyz: Float[np.ndarray, "n 4"], course: Float[np.ndarray, "n 4"]
-) -> tuple[Float[np.ndarray, "n 4"], Float[np.ndarray, " n"]]:
-    """The same rotations with the course's sign, and by what angle (rad) they are off it."""
-    wxyz = wxyz * np.where((wxyz * course).sum(axis=1) < 0, -1.0, 1.0)[:, None]
-    return wxyz, 2.0 * np.arccos(np.clip((wxyz * course).sum(axis=1), -1.0, 1.0))
-
-
-def _enough(near: Bool[np.ndarray, " n"], good: Bool[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
-    """The samples near the course; all good ones if it has lost more than four fifths of them."""
-    return near if near.sum() > 0.2 * good.sum() else good
-
-
-def _course(
-    correction: Float[np.ndarray, "n 4"],
-    angle: Float[np.ndarray, " n"],
-    believed: Bool[np.ndarray, " n"],
-    least_scale: float,
-    sigma: float,
-) -> Float[np.ndarray, "n 4"]:
-    """Quaternions of the correction filtered over `sigma` samples, those far off the last course
-    (`angle`, rad) counting less."""
-    scale = max(3.0 * float(np.median(angle[believed])), least_scale)
-    weight = np.where(believed, 1.0 / (1.0 + (angle / scale) ** 2) ** 2, 1.0)
-    course = smooth(weight[:, None] * _filled(correction, believed), sigma)
-    return course / np.linalg.norm(course, axis=1, keepdims=True)
-
-
-def _filled(values: Float[np.ndarray, "n w"], good: Bool[np.ndarray, " n"]) -> np.ndarray:
-    """Rows that are not good, interpolated between those that are."""
-    rows = np.flatnonzero(good)
-    return interpolate(np.arange(len(good)), rows, values[rows])
 
 
 def attitude_from_acceleration(

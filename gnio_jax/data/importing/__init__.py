@@ -32,9 +32,9 @@ from gnio_jax.data.importing.streams import (
     read_stream,
     read_table,
 )
+from gnio_jax.data.parsing.stamps import PER_SECOND, RATES, rounded_rate
 from gnio_jax.data.plausibility import self_check
 from gnio_jax.data.readers.csv_files import ACCEL, GYRO
-from gnio_jax.data.readers.stamps import PER_SECOND, RATES, rounded_rate
 from gnio_jax.data.resampling import resample
 from gnio_jax.data.validation import WINDOW_SECONDS, validate
 from gnio_jax.errors import InputError

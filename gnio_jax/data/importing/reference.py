@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-from gnio_jax.data.alignment import smooth_positions
 from gnio_jax.data.importing.source import Track
+from gnio_jax.data.parsing.stamps import in_order
 from gnio_jax.data.readers.reference import (
     LOST_POSES,
     SHORTEST_RUN,
@@ -16,7 +16,7 @@ from gnio_jax.data.readers.reference import (
     interpolated,
     poses_at,
 )
-from gnio_jax.data.readers.stamps import in_order
+from gnio_jax.data.reference import smooth_positions
 from gnio_jax.data.validation import check_motion, check_unit_norm, validate
 from gnio_jax.errors import InputError
 from gnio_jax.numerics import finite_rows, quaternions, rotations
@@ -40,7 +40,9 @@ def poses_of(
     `InputError` where they are too few, too slow, or no unit quaternions.
     """
     seen = finite_rows(pose)
-    time, pose, _ = in_order(time[seen], pose[seen], source, repeats="first")
+    time, pose = time[seen], pose[seen]
+    rows, _ = in_order(time, pose, source)
+    time, pose = time[rows], pose[rows]
     if len(time) < SHORTEST_RUN:
         raise InputError(source, f"holds {len(time)} poses", "name another reference")
     rate = 1.0 / float(np.median(np.diff(time)))

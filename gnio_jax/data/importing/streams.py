@@ -11,9 +11,10 @@ import pandas as pd
 from jaxtyping import Bool, Float, Num
 from scipy.interpolate import CubicSpline
 
-from gnio_jax.data.gaps import told_beyond
-from gnio_jax.data.readers.stamps import PER_SECOND, RATES, in_order, time_unit
-from gnio_jax.data.readers.text import numbers, open_text, read_csv
+from gnio_jax.data.parsing.stamps import PER_SECOND, RATES, in_order, time_unit
+from gnio_jax.data.parsing.tables import open_text
+from gnio_jax.data.readers.text import numbers, read_csv
+from gnio_jax.data.resampling import longest_bridge
 from gnio_jax.data.validation import check_finite, check_gaps, check_increasing
 from gnio_jax.errors import InputError
 from gnio_jax.numerics import interpolate, neighbours
@@ -173,7 +174,7 @@ def read_stream(source: SensorFile, unit: str | None, order: str, notes: list[st
         )
     check_gaps(time, path)
     steps = np.diff(time)
-    holes = steps[steps > told_beyond(rate)]
+    holes = steps[steps > longest_bridge(rate)]
     if holes.size:
         notes.append(
             f"{path.name}: {sensor} {GAPS} {holes.size} times, "
@@ -228,7 +229,8 @@ def _sorted(
     """Rows in the order of their stamps, of those that share one the first."""
     sensor, path, rows = source.sensor, source.path, len(time)
     _check_one_clock(time, source)
-    time, values, repairs = in_order(time, values, path, repeats="first")
+    order, repairs = in_order(time, values, path)
+    time, values = time[order], values[order]
     if backward := repairs.get("rows_sorted"):
         notes.append(
             f"{path.name}: {sensor} had {backward:.0f} steps back in time; its rows were sorted"

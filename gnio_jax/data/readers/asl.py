@@ -13,11 +13,12 @@ import yaml
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
+from gnio_jax.data.parsing.stamps import in_order
+from gnio_jax.data.parsing.tables import shortened
 from gnio_jax.data.readers.parsing import unit_rotations
 from gnio_jax.data.readers.reference import SHORTEST_RUN, Poses
-from gnio_jax.data.readers.stamps import in_order
-from gnio_jax.data.readers.text import numbers, read_csv, shortened
-from gnio_jax.data.resampling import LONGEST_BRIDGE
+from gnio_jax.data.readers.text import numbers, read_csv
+from gnio_jax.data.reference import LONGEST_BRIDGE
 from gnio_jax.data.validation import check_finite, check_gaps, check_rate
 from gnio_jax.errors import InputError
 from gnio_jax.numerics import finite_rows
@@ -58,7 +59,9 @@ def read_imu(path: Path, rate: float) -> ImuFile:
     start = int(stamps.min())
     samples = _values(table, [*GYRO, *ACCEL], path)
     check_finite(samples, "gyro and accel", path)
-    time, samples, repairs = in_order((stamps - start) * 1e-9, samples, path)
+    time = (stamps - start) * 1e-9
+    rows, repairs = in_order(time, samples, path)
+    time, samples = time[rows], samples[rows]
     check_rate(time, rate, path)
     check_gaps(time, path)
     return ImuFile(start, time, samples, repairs)
@@ -72,7 +75,9 @@ def read_poses(path: Path, start: int) -> Poses:
     seen = finite_rows(values)
     if seen.sum() < SHORTEST_RUN:
         raise InputError(path, f"holds {seen.sum()} poses", "copy it again")
-    time, values, _ = in_order((stamps[seen] - start) * 1e-9, values[seen], path)
+    time, values = (stamps[seen] - start) * 1e-9, values[seen]
+    rows, _ = in_order(time, values, path)
+    time, values = time[rows], values[rows]
     if (slowest := float(np.median(np.diff(time)))) > LONGEST_BRIDGE:
         raise InputError(
             path,

@@ -25,8 +25,9 @@ from scipy.spatial.transform import Rotation
 
 from gnio_jax.data.dataset import Dataset, Recording, single
 from gnio_jax.data.readers.parsing import float_columns, parsed_as, unit_rotations
-from gnio_jax.data.readers.text import listed, numbers, read_csv
+from gnio_jax.data.readers.text import numbers, read_csv
 from gnio_jax.data.resampling import resample
+from gnio_jax.data.splits import listed
 from gnio_jax.data.validation import (
     FASTEST,
     check_finite,

@@ -22,9 +22,10 @@ from scipy.interpolate import CubicSpline
 
 from gnio_jax.data.dataset import Dataset, Recording, single
 from gnio_jax.data.hdf5 import read_hdf5
-from gnio_jax.data.readers.stamps import check_seconds, rounded_rate
-from gnio_jax.data.readers.text import listed, numbers, read_csv
+from gnio_jax.data.parsing.stamps import check_seconds, rounded_rate
+from gnio_jax.data.readers.text import numbers, read_csv
 from gnio_jax.data.resampling import resample
+from gnio_jax.data.splits import listed
 from gnio_jax.data.validation import (
     check_finite,
     check_gaps,

@@ -32,11 +32,14 @@ from scipy.spatial.transform import Rotation
 from gnio_jax.data.alignment import PoseLag, pose_lag
 from gnio_jax.data.dataset import Dataset, Recording, Refusal
 from gnio_jax.data.gaps import divide_at_gaps
+from gnio_jax.data.parsing.tables import shortened
 from gnio_jax.data.readers.parsing import json_object, parsed_as
-from gnio_jax.data.readers.phones import held_out, with_velocity
+from gnio_jax.data.readers.phones import with_velocity
 from gnio_jax.data.readers.reference import Poses, poses_at
-from gnio_jax.data.readers.text import numbers, shortened
-from gnio_jax.data.resampling import LONGEST_BRIDGE, resample
+from gnio_jax.data.readers.text import numbers
+from gnio_jax.data.reference import LONGEST_BRIDGE
+from gnio_jax.data.resampling import resample
+from gnio_jax.data.splits import held_out
 from gnio_jax.data.validation import (
     WINDOW_SECONDS,
     check_finite,

@@ -14,8 +14,8 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
-from gnio_jax.data.readers.stamps import in_order
-from gnio_jax.data.readers.text import shortened
+from gnio_jax.data.parsing.stamps import in_order
+from gnio_jax.data.parsing.tables import shortened
 from gnio_jax.data.validation import FASTEST, FASTEST_TURN, STRONGEST_FORCE, check_rate
 from gnio_jax.errors import InputError
 
@@ -77,7 +77,8 @@ def read_oxts(oxts: Path, rate: float, layout: str) -> tuple[Motion, float, dict
     stamps, packets = stamps[rows][known], packets[known]
     start = stamps.min()
     seconds = (stamps - start).astype(np.int64) * 1e-9
-    time, packets, repairs = in_order(seconds, packets, times, repeats="first")
+    order, repairs = in_order(seconds, packets, times)
+    time, packets = seconds[order], packets[order]
     if np.median(np.diff(time)) > 0.05:
         raise InputError(
             times,

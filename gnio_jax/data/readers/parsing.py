@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from gnio_jax.data.readers.text import shortened
+from gnio_jax.data.parsing.tables import shortened
 from gnio_jax.data.validation import check_unit_norm
 from gnio_jax.errors import InputError
 from gnio_jax.numerics import rotations

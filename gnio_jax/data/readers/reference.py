@@ -15,8 +15,7 @@ from jaxtyping import Bool, Float
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
-from gnio_jax.data.alignment import fuse_attitude, smooth_positions
-from gnio_jax.data.resampling import LONGEST_BRIDGE
+from gnio_jax.data.reference import LONGEST_BRIDGE, fuse_attitude, smooth_positions
 from gnio_jax.numerics import (
     integrate_gyro,
     interpolate,

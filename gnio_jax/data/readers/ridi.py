@@ -9,7 +9,8 @@ where there is one. IMU and pose are of one rigid body; nothing is calibrated, a
 reads 1–3 % high.
 
 Recorders that followed use ARCore, whose world is y-up, and whose pose.txt is the camera's: their
-android_sensor_pose.txt is the IMU's, and it is taken, turned to z-up, where it is there.
+android_sensor_pose.txt is the IMU's, and it is taken, turned to z-up, where it is there. Their
+rates differ by the phone.
 
 Everything comes back at 200 Hz. The lists name train and test; for validation whole people are held
 out of train (`held_out_of_train`).
@@ -21,34 +22,30 @@ import os
 import re
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
+from gnio_jax.data.assembly import Poses, Samples, Streams, assemble
 from gnio_jax.data.dataset import Dataset, Recording
-from gnio_jax.data.gaps import divide_at_gaps
-from gnio_jax.data.readers.parsing import unit_rotations
-from gnio_jax.data.readers.phones import find_folders, find_list, held_out, with_velocity
-from gnio_jax.data.readers.recorder import FILES, TANGO, Native, read_recorder, sorted_stamps
-from gnio_jax.data.readers.text import listed, numbers, read_csv
-from gnio_jax.data.resampling import resample
-from gnio_jax.data.validation import (
-    check_finite,
-    check_rate,
-    validate,
-)
+from gnio_jax.data.parsing.stamps import first_stamp, seconds
+from gnio_jax.data.parsing.tables import Table, read_text
+from gnio_jax.data.splits import find_folders, find_list, held_out, listed
 from gnio_jax.errors import InputError
-from gnio_jax.numerics import quaternions
+from gnio_jax.numerics import quaternions, rotations
 from gnio_jax.types import Sequence
 
 RATE = 200.0
-VERSION = "ridi 3"
+VERSION = "ridi 4"
 """Changes whenever other sequences would come of the same files: it is part of the cache's key."""
 NATIVE_RATE = 202.3
 """Hz, of data.csv."""
+FASTEST_WALKER = 6.0
+"""m/s: faster than this not a person walks but a visual odometry that relocalises."""
 
 _TABLE = Path("processed") / "data.csv"
+_ARCORE = "android_sensor_pose.txt"
+_TEXT_FILES = ("gyro.txt", "acce.txt", "orientation.txt", "pose.txt", _ARCORE)
 _LISTS = {
     "train": "list_train_publish_v2.txt",
     "val": "list_train_publish_v2.txt",
@@ -56,7 +53,6 @@ _LISTS = {
     "seen": "list_test_publish_v2.txt",
     "unseen": "list_crosssubject.txt",
 }
-SPLITS = (*_LISTS, "all")
 _PLACEMENTS = {"handheld": "handheld", "leg": "pocket", "bag": "bag", "body": "body"}
 
 
@@ -93,10 +89,10 @@ def recordings(root: Path, split: str) -> list[Recording]:
 
 def _recording(folder: Path, attributes: dict[str, str]) -> Recording:
     table = folder / _TABLE
-    files = [table] if table.is_file() else [folder / name for name in FILES]
+    files = [table] if table.is_file() else [folder / name for name in _TEXT_FILES]
     return Recording(
         folder.name,
-        partial(read_pieces, folder),
+        partial(read, folder),
         files=tuple(path for path in files if path.is_file()),
         version=VERSION,
         attributes=attributes,
@@ -106,94 +102,8 @@ def _recording(folder: Path, attributes: dict[str, str]) -> Recording:
 def held_out_of_train(path: str | os.PathLike[str]) -> set[str]:
     """Names in the training list that validate: whole people, about a tenth of the list, the same
     in every copy of the data."""
-    names = [
-        folder.name
-        for folder in listed(
-            path, lambda entry: Path(_name(entry)), Path(path).parent, DATASET.layout
-        )
-    ]
-    return held_out({name: _subject(name) for name in names})
-
-
-def read_pieces(folder: str | os.PathLike[str]) -> list[Sequence]:
-    """One recording of its folder, at 200 Hz, from its table or else from the recorder's text
-    files.
-
-    Rows out of order are sorted and repeated ones dropped. The recording is divided where its IMU
-    or odometry has a gap longer than a window (`divide_at_gaps`). `device_orientation` is the game
-    rotation vector, turned to begin at the reference's attitude. Raises `InputError` naming file
-    and field.
-    """
-    folder = Path(folder)
-    table = folder / _TABLE
-    if table.is_file():
-        native, source, place = _from_table(table), table, table
-    else:
-        native, source = read_recorder(folder), f"{folder / 'gyro.txt'}, acce.txt, pose.txt"
-        place = folder
-    if not native.valid.any():
-        raise InputError(source, "no IMU sample has a pose", "leave it out")
-    device = native.device
-    if device is not None:
-        device = quaternions(native.attitude[0] * device[0].inv() * device)
-    sequence = Sequence(
-        name=folder.name,
-        time=native.time - native.time[0],
-        gyro=native.gyro,
-        accel=native.accel,
-        orientation=quaternions(native.attitude),
-        position=native.position,
-        velocity=np.zeros_like(native.position),
-        valid=native.valid,
-        device_orientation=device,
-        attributes=_attributes(folder.name, native),
-    )
-    pieces = divide_at_gaps(validate(sequence, source), place)
-    return [validate(with_velocity(resample(piece, RATE)), source) for piece in pieces]
-
-
-def _attributes(name: str, native: Native) -> dict[str, Any]:
-    words = re.findall("|".join(_PLACEMENTS), name)
-    return {
-        "dataset": "ridi",
-        "group": _subject(name),
-        "subject": _subject(name),
-        "device": "Tango phone" if native.truth == TANGO else "Android phone",
-        "placement": _PLACEMENTS[words[0]] if words else "unknown",
-        "truth": native.truth,
-        "imu_compensated": "no",
-        "licence": DATASET.licence,
-        "start_time": native.start + float(native.time[0]),
-    }
-
-
-# --- the table
-
-
-def _from_table(path: Path) -> Native:
-    table = read_csv(path)
-    stamps, order = sorted_stamps(numbers(table, ["time"], path)[:, 0], path)
-
-    def columns(name: str, axes: str) -> Float[np.ndarray, "n w"]:
-        return numbers(table, [f"{name}_{axis}" for axis in axes], path)[order]
-
-    vectors = {name: columns(name, "xyz") for name in ("gyro", "acce", "pos")}
-    quaternion = {name: columns(name, "wxyz") for name in ("ori", "rv")}
-    for name, values in (vectors | quaternion).items():
-        check_finite(values, name, path)
-    time = (stamps - stamps[0]) * 1e-9
-    check_rate(time, NATIVE_RATE, path)
-    return Native(
-        time=time,
-        start=float(stamps[0] * 1e-9),
-        gyro=vectors["gyro"],
-        accel=vectors["acce"],
-        position=vectors["pos"],
-        attitude=unit_rotations(quaternion["ori"], "ori", path),
-        device=unit_rotations(quaternion["rv"], "rv", path),
-        valid=np.ones(len(time), dtype=bool),
-        truth=TANGO,
-    )
+    folders = listed(path, lambda entry: Path(_name(entry)), Path(path).parent, DATASET.layout)
+    return held_out({folder.name: _subject(folder.name) for folder in folders})
 
 
 def _is_recording(folder: Path) -> bool:
@@ -211,10 +121,124 @@ def _subject(name: str) -> str:
     return name.partition("_")[0]
 
 
+# --- one recording
+
+
+def read(folder: str | os.PathLike[str]) -> list[Sequence]:
+    """One recording of its folder, at 200 Hz, from its table or else from the recorder's text
+    files, divided where its IMU or odometry has a gap longer than a window.
+
+    `device_orientation` is the game rotation vector, turned to begin at the reference's attitude.
+    Raises `InputError` naming file and field.
+    """
+    folder = Path(folder)
+    table = (folder / _TABLE).is_file()
+    streams = _from_table(folder) if table else _from_text_files(folder)
+    native = NATIVE_RATE if table else None
+    pieces = assemble(streams, RATE, native=native, divide=True, max_speed=FASTEST_WALKER)
+    return [_device_from_reference(piece) for piece in pieces]
+
+
+def _from_table(folder: Path) -> Streams:
+    path = folder / _TABLE
+    table = read_text(path)
+    stamps = table.stamps("time")
+    start = first_stamp(stamps, "ns", path)
+    time = seconds(stamps, start)
+    imu = (Samples(time, table.axes(f"{name}_"), str(path)) for name in ("gyro", "acce"))
+    attitude, device = (_rotations(table, name) for name in ("ori", "rv"))
+    poses = Poses(time, attitude, table.axes("pos_"), source=str(path))
+    own = Samples(time, quaternions(device), str(path))
+    return _streams(folder, path, *imu, start, poses, own, "Tango")
+
+
+def _rotations(table: Table, name: str) -> Rotation:
+    return table.rotations(*(f"{name}_{axis}" for axis in "wxyz"))
+
+
+def _from_text_files(folder: Path) -> Streams:
+    arcore = (folder / _ARCORE).is_file()
+    gyro, accel, pose = (
+        _text(folder / name, width)
+        for name, width in (
+            ("gyro.txt", 3),
+            ("acce.txt", 3),
+            (_ARCORE if arcore else "pose.txt", 7),
+        )
+    )
+    start = first_stamp(gyro.stamps(0), "ns", gyro.path)
+    first_stamp(accel.stamps(0), "ns", accel.path)
+
+    def samples(table: Table) -> Samples:
+        return Samples(seconds(table.stamps(0), start), table.take(1, 2, 3), str(table.path))
+
+    upright = Rotation.from_euler("x", 90.0 if arcore else 0.0, degrees=True)  # of a y-up world
+    poses = Poses(
+        seconds(pose.stamps(0), start),
+        upright * pose.rotations(4, 5, 6, 7, scalar_first=False),
+        upright.apply(pose.take(1, 2, 3)),
+        ends_pieces=True,
+        source=str(pose.path),
+    )
+    device, path = None, folder / "orientation.txt"
+    if path.is_file():
+        game = _text(path, 4)
+        attitude = quaternions(game.rotations(1, 2, 3, 4, scalar_first=False))
+        device = Samples(seconds(game.stamps(0), start), attitude, str(path))
+    system = "ARCore" if arcore else "Tango"
+    return _streams(folder, folder, samples(gyro), samples(accel), start, poses, device, system)
+
+
+def _text(path: Path, width: int) -> Table:
+    """A text file of stamps (ns) and so many values."""
+    table = read_text(path, separator=" ", header=False)
+    if table.width() < width + 1:
+        raise InputError(
+            path,
+            f"has {table.width()} columns, expected the time and {width} values",
+            "copy it again",
+        )
+    return table
+
+
+def _streams(
+    folder: Path,
+    source: Path,
+    gyro: Samples,
+    accel: Samples,
+    start: float | int,
+    poses: Poses,
+    device: Samples | None,
+    system: str,
+) -> Streams:
+    words = re.findall("|".join(_PLACEMENTS), folder.name)
+    about = {
+        "dataset": "ridi",
+        "group": _subject(folder.name),
+        "subject": _subject(folder.name),
+        "device": "Tango phone" if system == "Tango" else "Android phone",
+        "placement": _PLACEMENTS[words[0]] if words else "unknown",
+        "truth": f"{system} VIO of the phone itself",
+        "imu_compensated": "no",
+        "licence": DATASET.licence,
+    }
+    return Streams(folder.name, str(source), gyro, accel, about, start * 1e-9, poses, device=device)
+
+
+def _device_from_reference(piece: Sequence) -> Sequence:
+    """The device's own attitude, turned to that of the reference at the first valid sample: its yaw
+    is arbitrary."""
+    if piece.device_orientation is None:
+        return piece
+    own, first = rotations(piece.device_orientation), int(np.argmax(piece.valid))
+    turned = rotations(piece.orientation[first]) * own[first].inv() * own
+    return piece._replace(device_orientation=quaternions(turned))
+
+
 DATASET = Dataset(
     name="ridi",
     recordings=recordings,
-    splits=SPLITS,
+    splits=(*_LISTS, "all"),
     rate=RATE,
     source="https://github.com/higerra/ridi_imu "
     "(its README links the data, ridi_data_publish_v2.zip)",

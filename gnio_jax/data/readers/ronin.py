@@ -27,10 +27,11 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from gnio_jax.data.dataset import Dataset, Recording, single
+from gnio_jax.data.parsing.tables import shortened
 from gnio_jax.data.readers.parsing import json_object, parsed_as, unit_rotations
-from gnio_jax.data.readers.phones import find_folders, find_list, with_velocity
-from gnio_jax.data.readers.text import listed, shortened
+from gnio_jax.data.readers.phones import with_velocity
 from gnio_jax.data.resampling import resample
+from gnio_jax.data.splits import find_folders, find_list, listed
 from gnio_jax.data.validation import (
     check_finite,
     check_gaps,

@@ -5,30 +5,14 @@ from __future__ import annotations
 
 import io
 import os
-import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
+from gnio_jax.data.parsing.tables import open_text, shortened
 from gnio_jax.errors import InputError
-
-
-def shortened(text: object, most: int = 80) -> str:
-    """What a file says, as far as a message can quote it: one line of printable characters, at most
-    `most` of them."""
-    line = "".join(
-        character if character.isprintable() else "\ufffd" for character in str(text)[: 4 * most]
-    )
-    return line if len(str(text)) <= most else line[: most - 3] + "..."
-
-
-def open_text(path: Path, content: bytes | None = None) -> io.TextIOWrapper:
-    """The text of a file, or `content` in its place; a byte order mark is dropped."""
-    if content is None:
-        return path.open(encoding="utf-8-sig")
-    return io.TextIOWrapper(io.BytesIO(content), encoding="utf-8-sig")
 
 
 def read_csv(
@@ -128,48 +112,3 @@ def numbers(table: pd.DataFrame, columns: Iterable[object], path: object) -> np.
                 path, f"column '{name}' holds '{cell}' in its row {row + 1}, no number"
             ) from None
     return np.stack(out, axis=1)
-
-
-def listed(
-    path: str | os.PathLike[str], find: Callable[[str], Path | None], root: Path, layout: str
-) -> list[Path]:
-    """What `find` says of the entries of a list file, one a line: the place of a recording, or None
-    where this copy lacks it.
-
-    Absent entries are warned of with their count. Raises `InputError` when the list cannot be read
-    or names nothing that is present.
-    """
-    path = Path(path)
-    try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise InputError(
-            path, f"the list cannot be read ({reason})", f"expected layout: {layout}"
-        ) from None
-    entries = list(
-        dict.fromkeys(line.strip() for line in lines if line.strip() and not line.startswith("#"))
-    )
-    found = {entry: _found(find, entry) for entry in entries}
-    present = [place for place in found.values() if place is not None]
-    absent = [entry for entry, place in found.items() if place is None]
-    if not present:
-        raise InputError(
-            path,
-            f"none of its {len(entries)} sequences is below {root}",
-            f"expected layout: {layout}",
-        )
-    if absent:
-        some = ", ".join([*map(shortened, absent[:3]), *(["..."] if len(absent) > 3 else [])])
-        warnings.warn(
-            f"{path}: {len(absent)} of {len(entries)} listed sequences are absent: {some}",
-            stacklevel=3,
-        )
-    return present
-
-
-def _found(find: Callable[[str], Path | None], entry: str) -> Path | None:
-    try:
-        return find(entry)
-    except OSError:  # too long for a name, for one
-        return None

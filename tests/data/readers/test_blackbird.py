@@ -83,14 +83,14 @@ def test_a_flight_that_contradicts_itself_is_left_out(tmp_path):
         (put("traj_target", lambda p: p[:, :6]), ("field 'traj_target'", "(1200, 6)", "(1200, 7)")),
         (put("accel_calib", lambda a: a[:-1]), ("field 'accel_calib'", "(1199, 3)")),
         (put("ts", lambda t: (t * 1e3).astype(np.int64)), ("field 'ts'", "int64")),
-        (put("gyro_calib", one((5, 1), np.nan)), ("field 'gyro_calib'", "row 5")),
-        (put("traj_target", one((6, 0), np.inf)), ("field 'traj_target'", "row 6")),
+        (put("gyro_calib", one((5, 1), np.nan)), ("field 'gyro_calib'", "row 6")),
+        (put("traj_target", one((6, 0), np.inf)), ("field 'traj_target'", "row 7")),
         (put("traj_target", one((7, slice(3, 7)), 0.5001 + np.zeros(4) * 1e-9)), None),
         (
             put("traj_target", one((7, slice(3, 7)), 0.0)),
-            ("field 'traj_target'", "not a unit quaternion", "row 7"),
+            ("field 'traj_target'", "not a unit quaternion", "row 8"),
         ),
-        (put("ts", one(8, START)), ("field 'time'", "does not increase", "row 8")),
+        (put("ts", one(8, START)), ("field 'time'", "does not increase", "row 9")),
         (
             put("ts", lambda t: START + (t - START) * 2),
             ("field 'time'", "50 Hz, expected about 100 Hz"),
@@ -138,7 +138,7 @@ def test_damaged_files_are_refused(tmp_path):
     truth.write_text("\n".join([lines[0], *(line.rsplit(" ", 1)[0] for line in lines[1:])]))
     refused(truth, "has 10 columns")
     truth.write_text("\n".join([*lines[:5], lines[5].rsplit(" ", 1)[0] + " nan", *lines[6:]]))
-    refused(truth, "'velocity'", "row 4")
+    refused(truth, "'velocity'", "row 5")
     truth.write_text("\n".join(lines))
 
     whole = table.read_bytes()

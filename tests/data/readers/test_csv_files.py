@@ -155,12 +155,12 @@ def hole_of(seconds):
         ({"drop": ("time",)}, ("column 'time' is missing",)),
         ({"drop": ("qx",)}, ("column 'qx' is missing while 'qw' is there",)),
         ({"drop": ("pz",)}, ("column 'pz' is missing",)),
-        ({"spoil": set_value("accel_x", 5, np.nan)}, ("field 'accel'", "row 5")),
-        ({"spoil": set_value("gyro_x", 6, np.inf)}, ("field 'gyro'", "row 6")),
-        ({"spoil": set_value("time", 7, 0.0)}, ("field 'time'", "does not increase", "row 7")),
+        ({"spoil": set_value("accel_x", 5, np.nan)}, ("field 'accel'", "row 6")),
+        ({"spoil": set_value("gyro_x", 6, np.inf)}, ("field 'gyro'", "row 7")),
+        ({"spoil": set_value("time", 7, 0.0)}, ("field 'time'", "does not increase", "row 8")),
         (
             {"spoil": set_value("qw", 8, 3.0)},
-            ("field 'orientation'", "not a unit quaternion", "row 8"),
+            ("field 'orientation'", "not a unit quaternion", "row 9"),
         ),
         ({"spoil": hole_of(2.0)}, ("field 'time'", "gap of 2.01")),
         (

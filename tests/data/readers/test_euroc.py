@@ -342,9 +342,9 @@ def set_value(row, column, value):
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (set_value(5, 1, np.nan), ("'gyro and accel'", "row 5")),
+        (set_value(5, 1, np.nan), ("'gyro and accel'", "row 6")),
         (
-            lambda s, v: (np.where(np.arange(len(s)) == 9, s[8], s), v),
+            lambda s, v: (np.where(np.arange(len(s)) % 9 == 8, np.roll(s, 1), s), v),
             ("field 'time'", "stamp of another row"),
         ),
         (
@@ -374,11 +374,11 @@ def test_a_bad_imu_is_refused_by_file_and_field(tmp_path, change, words):
     ("change", "words"),
     [
         (set_value(slice(3, None), 2, np.nan), ("holds 3 poses",)),
-        (set_value(7, slice(3, 7), 0.0), ("field 'q_rs'", "not a unit quaternion", "row 7")),
+        (set_value(7, slice(3, 7), 0.0), ("field 'q_rs'", "not a unit quaternion", "row 8")),
         (lambda s, v: (s[::40], v[::40]), ("field 'time'", "5 Hz, too slow for a reference")),
         (lambda s, v: (s + 3600 * 10**9, v), ("field 'time'", "does not overlap the IMU's")),
         (
-            lambda s, v: (np.where(np.arange(len(s)) == 9, s[8], s), v),
+            lambda s, v: (np.where(np.arange(len(s)) % 9 == 8, np.roll(s, 1), s), v),
             ("field 'time'", "stamp of another row"),
         ),
     ],

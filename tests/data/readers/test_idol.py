@@ -339,11 +339,11 @@ def scaling(prefix, factor):
         (lambda table: table.assign(orientW="one"), "column 'orientW' holds 'one'"),
         (
             setting("iphoneGyroX", 50, np.nan),
-            "field 'iphoneGyro' is NaN or Inf in 1 rows, first in row 50",
+            "field 'iphoneGyro' is NaN or Inf in 1 rows, first in row 51",
         ),
         (
             setting("iphoneAccX", 50, np.inf),
-            "field 'iphoneAcc' is NaN or Inf in 1 rows, first in row 50",
+            "field 'iphoneAcc' is NaN or Inf in 1 rows, first in row 51",
         ),
         (setting("timestamp", 50, np.nan), "field 'timestamp' is NaN"),
         (

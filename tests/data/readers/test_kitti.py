@@ -229,9 +229,9 @@ def test_wrong_rates_and_units_are_refused(tmp_path):
         (put("u", lambda u: u[:, :5]), ("field 'u'", "shape (1200, 5)", "(1200, 6)")),
         (put("p_gt", lambda p: p[:-1]), ("field 'p_gt'", "(1199, 3)")),
         (put("t", lambda t: np.round(t).astype(int)), ("field 't'", "int64")),
-        (put("u", one((3, 1), np.nan)), ("field 'u'", "row 3")),
-        (put("ang_gt", one((4, 1), np.inf)), ("field 'ang_gt'", "row 4")),
-        (put("t", one(9, 0.0)), ("field 'time'", "does not increase", "row 9")),
+        (put("u", one((3, 1), np.nan)), ("field 'u'", "row 4")),
+        (put("ang_gt", one((4, 1), np.inf)), ("field 'ang_gt'", "row 5")),
+        (put("t", one(9, 0.0)), ("field 'time'", "does not increase", "row 10")),
         (put("t", lambda t: t * 2), ("field 'time'", "50 Hz")),
         (
             put("t", lambda t: np.where(np.arange(1200) < 600, t, t + 2)),

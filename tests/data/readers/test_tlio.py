@@ -31,8 +31,9 @@ SHUFFLED = [
 @pytest.mark.parametrize("columns", [COLUMNS, SHUFFLED], ids=["native", "shuffled"])
 def test_imu_comes_back_in_the_body_frame_and_attitude_wxyz(tmp_path, columns):
     time, rotation, wxyz, gyro, accel, position, velocity = body_values()
-    sequence = tlio.read_sequence(write_sequence(tmp_path / "walk", columns))
-    np.testing.assert_allclose(sequence.time, time, atol=1e-6)
+    (sequence,) = tlio.read(write_sequence(tmp_path / "walk", columns))
+    np.testing.assert_allclose(sequence.time, time - time[0], atol=1e-6)
+    assert sequence.attributes["start_time"] == pytest.approx(time[0], abs=1e-6)
     np.testing.assert_allclose(sequence.gyro, np.einsum("nji,nj->ni", rotation, gyro), atol=1e-12)
     np.testing.assert_allclose(sequence.accel, np.einsum("nji,nj->ni", rotation, accel), atol=1e-12)
     np.testing.assert_allclose(np.abs((sequence.orientation * wxyz).sum(1)), 1.0, atol=1e-12)
@@ -97,15 +98,15 @@ def scale(name, factor):
         (
             spoil("gyr_compensated_rotated_in_World", (5, 1), np.nan),
             "'gyr_compensated_rotated_in_World'",
-            "row 5",
+            "row 6",
         ),
         (
             spoil("acc_compensated_rotated_in_World", (6, 1), np.inf),
             "'acc_compensated_rotated_in_World'",
-            "row 6",
+            "row 7",
         ),
         (spoil("ts_us", 7, 0.0), "'time'", "does not increase"),
-        (spoil("ts_us", 7, np.nan), "'ts_us'", "row 7"),
+        (spoil("ts_us", 7, np.nan), "'ts_us'", "row 8"),
         (
             spoil("ts_us", slice(1000, None), np.arange(1400)[:, None] * 5e3 + 9e6),
             "'time'",
@@ -113,16 +114,16 @@ def scale(name, factor):
         ),
         (scale("ts_us", 2.0), "'time'", "runs at 100 Hz"),
         (scale("ts_us", 1e3), "'time'", "expected about 200 Hz"),
-        (spoil("qxyzw_World_Device", 8, 0.0), "'qxyzw_World_Device'", "row 8"),
-        (spoil("qxyzw_World_Device", 8, np.nan), "'qxyzw_World_Device'", "row 8"),
-        (spoil("pos_World_Device", (9, 2), np.nan), "'position'", "row 9"),
-        (spoil("vel_World", 9, np.inf), "'velocity'", "row 9"),
+        (spoil("qxyzw_World_Device", 8, 0.0), "'qxyzw_World_Device'", "row 9"),
+        (spoil("qxyzw_World_Device", 8, np.nan), "'qxyzw_World_Device'", "row 9"),
+        (spoil("pos_World_Device", (9, 2), np.nan), "'pos_World_Device'", "row 10"),
+        (spoil("vel_World", 9, np.inf), "'vel_World'", "row 10"),
     ],
 )
 def test_a_bad_table_is_refused_by_file_and_field(tmp_path, change, field, problem):
     folder = write_sequence(tmp_path / "walk", spoil=change)
     with pytest.raises(InputError) as error:
-        tlio.read_sequence(folder)
+        tlio.read(folder)
     text = str(error.value)
     assert (
         text.startswith(str(folder / "imu0_resampled.npy"))
@@ -138,7 +139,7 @@ def test_a_damaged_file_is_refused(tmp_path):
 
     def fails(path, *words):
         with pytest.raises(InputError) as error:
-            tlio.read_sequence(folder)
+            tlio.read(folder)
         assert str(error.value).startswith(f"{path}: ") and all(
             word in str(error.value) for word in words
         )
@@ -158,7 +159,7 @@ def test_a_damaged_file_is_refused(tmp_path):
     table.write_bytes(whole)
 
     description.write_text("{")
-    fails(description, "'columns_name(width)'")
+    fails(description, "is no JSON")
     description.write_text("{}")
     fails(description, "'columns_name(width)'")
     description.write_text(json.dumps({"columns_name(width)": ["ts_us 1", *COLUMNS[1:]]}))
@@ -183,7 +184,7 @@ def test_a_damaged_file_is_refused(tmp_path):
 
 def test_float32_tables_are_read_as_float64(tmp_path):
     # Stamps of a short recording survive float32 to some tens of µs only when they are small.
-    sequence = tlio.read_sequence(write_sequence(tmp_path / "walk", dtype=np.float32))
+    (sequence,) = tlio.read(write_sequence(tmp_path / "walk", dtype=np.float32))
     assert sequence.gyro.dtype == np.float64
 
 
@@ -217,11 +218,11 @@ def test_real_recordings_are_physical(recordings, split, names):
 
 def test_missing_rows_leave_a_uniform_clock_and_a_stretch_that_is_not_valid(tmp_path):
     folder = write_sequence(tmp_path / "walk")
-    whole = tlio.read_sequence(folder)
+    (whole,) = tlio.read(folder)
     table = np.load(folder / "imu0_resampled.npy")
     first, last = N // 2, N // 2 + 40  # 0.2 s
     np.save(folder / "imu0_resampled.npy", np.delete(table, slice(first, last), axis=0))
-    holed = tlio.read_sequence(folder)
+    (holed,) = tlio.read(folder)
     np.testing.assert_allclose(holed.time, whole.time, atol=1e-9)
     assert not holed.valid[first:last].any()
     assert holed.valid[: first - 1].all() and holed.valid[last + 1 :].all()

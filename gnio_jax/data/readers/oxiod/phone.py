@@ -14,9 +14,9 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from gnio_jax.data.dataset import Refusal
+from gnio_jax.data.parsing.tables import shortened
 from gnio_jax.data.readers.oxiod.walks import RATE
-from gnio_jax.data.readers.text import shortened
-from gnio_jax.data.validation import check_units
+from gnio_jax.data.validation import check_accel, check_gyro
 from gnio_jax.errors import InputError
 from gnio_jax.types import STANDARD_G
 
@@ -64,7 +64,8 @@ def read_imu(path: Path, kind: str) -> PhoneSamples:
     else:
         imu = _nexus_events(table, path)
     try:
-        check_units(imu.gyro, imu.accel, path)
+        check_accel(imu.accel, path)
+        check_gyro(imu.gyro, path)
     except InputError as error:
         raise Refusal(*error.parts) from None
     return imu

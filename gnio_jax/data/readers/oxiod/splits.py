@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from gnio_jax.data.parsing.tables import shortened
 from gnio_jax.data.readers.oxiod.walks import (
     LARGE_SCALE,
     LAYOUT,
@@ -17,7 +18,6 @@ from gnio_jax.data.readers.oxiod.walks import (
     Walk,
     scene_folders,
 )
-from gnio_jax.data.readers.text import shortened
 from gnio_jax.errors import InputError
 
 SPLITS = (

@@ -12,7 +12,6 @@ from gnio_jax.data.alignment import (
     Heading,
     align_heading,
     attitude_from_acceleration,
-    smooth_positions,
 )
 from gnio_jax.data.dataset import Refusal
 from gnio_jax.data.readers.oxiod.assembly import Samples, WalkReference, on_clock, sequence_of
@@ -20,6 +19,7 @@ from gnio_jax.data.readers.oxiod.phone import PhoneSamples
 from gnio_jax.data.readers.oxiod.trackers import read_tango
 from gnio_jax.data.readers.oxiod.vicon import LONGEST_LAG
 from gnio_jax.data.readers.oxiod.walks import RATE, Walk
+from gnio_jax.data.reference import smooth_positions
 from gnio_jax.numerics import (
     about_z,
     integrate_gyro,

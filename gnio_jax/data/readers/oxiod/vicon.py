@@ -11,8 +11,6 @@ from gnio_jax.data.alignment import (
     TooLittle,
     Track,
     align,
-    fuse_attitude,
-    smooth_positions,
 )
 from gnio_jax.data.dataset import Refusal
 from gnio_jax.data.readers.oxiod.assembly import (
@@ -25,6 +23,7 @@ from gnio_jax.data.readers.oxiod.assembly import (
 from gnio_jax.data.readers.oxiod.phone import SHORTEST, PhoneSamples
 from gnio_jax.data.readers.oxiod.trackers import read_vicon
 from gnio_jax.data.readers.oxiod.walks import RATE, Walk
+from gnio_jax.data.reference import fuse_attitude, smooth_positions
 from gnio_jax.numerics import integrate_gyro, interpolate, neighbours, outer_span, slerp, within
 from gnio_jax.types import Sequence
 

@@ -1,0 +1,131 @@
+"""Stamps as files give them: their unit, their rate, and rows that are out of order."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int, Real
+
+from gnio_jax.errors import InputError
+
+RATES = (10.0, 2000.0)
+"""Hz; between these lies every IMU one walks with."""
+PER_SECOND = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
+"""Units of stamps."""
+MOST_DAYS = 30.0
+"""Longer recordings are mistaken stamps; float64 holds the ns of as many days to the last digit."""
+MOST_REPEATED = 0.01
+"""Share of the rows that may give the stamp of another row other values: stamps rounded to a coarse
+unit fall together now and then (ours)."""
+MOST_APART = 10
+"""Neighbours in time that are none in the file, for each step back in time, above which samples of
+two clocks lie among each other (ours). A block of rows in the wrong place has three."""
+
+
+class TimeUnit(NamedTuple):
+    """What the steps of stamps say of their unit."""
+
+    unit: str | None
+    """The one by which they are an IMU's; None if there is none."""
+    rate: float
+    """Hz, if they were seconds."""
+
+
+def time_unit(stamps: Real[np.ndarray, " n"]) -> TimeUnit:
+    """The unit by which the stamps run at `RATES`; the ranges of the units do not overlap."""
+    steps = np.diff(np.sort(stamps))
+    steps = steps[steps > 0]
+    step = float(np.median(steps)) if steps.size else np.inf
+    # A rate at the very edge is inside, whatever the last digit of its stamps.
+    lowest, highest = RATES[0] * (1 - 1e-6), RATES[1] * (1 + 1e-6)
+    units = [unit for unit, count in PER_SECOND.items() if lowest <= count / step <= highest]
+    return TimeUnit(units[0] if units else None, 1.0 / step)
+
+
+def check_seconds(time: Float[np.ndarray, " n"], source: object) -> None:
+    """Raise `InputError` where stamps in seconds would not be an IMU's."""
+    unit, rate = time_unit(time)
+    if unit == "s":
+        return
+    hint = f"an IMU runs at {RATES[0]:g} to {RATES[1]:g} Hz"
+    if unit is not None:
+        hint = f"it looks like {unit}: divide it by {PER_SECOND[unit]:g}"
+    raise InputError(
+        source, f"field 'time' is not in seconds (as such its rate would be {rate:.3g} Hz)", hint
+    )
+
+
+def rounded_rate(time: Float[np.ndarray, " n"]) -> float:
+    """Hz, to four digits: stamps are never as exact as the clock they come from."""
+    return float(f"{1.0 / float(np.median(np.diff(time))):.4g}")
+
+
+def first_stamp(
+    stamps: Real[np.ndarray, " n"], unit: str, source: object, field: str = "time"
+) -> float | int:
+    """The earliest of the stamps (in `unit`), from which a recording counts its time.
+
+    Raises `InputError` where they span more than `MOST_DAYS`: a damaged stamp would take the digits
+    of all others.
+    """
+    first, last = stamps.min(), stamps.max()
+    days = (float(last) - float(first)) / PER_SECOND[unit] / 86400
+    if not days <= MOST_DAYS:
+        problem = f"field '{field}' goes over {days:.3g} days"
+        remedy = f"cut the rows of other times, or check the unit of the stamps ({unit})"
+        raise InputError(source, problem, remedy)
+    return first.item()
+
+
+def seconds(
+    stamps: Real[np.ndarray, " n"], start: float | int, unit: str = "ns"
+) -> Float[np.ndarray, " n"]:
+    """s since the stamp `start`. Integers are subtracted as such: unix time in ns has more digits
+    than a float."""
+    return np.asarray((stamps - start) / PER_SECOND[unit], dtype=np.float64)
+
+
+class InOrder(NamedTuple):
+    """Rows in the order of their stamps."""
+
+    rows: Int[np.ndarray, " m"]
+    """Of the file: sorted, without those whose stamp is there already."""
+    repairs: dict[str, float]
+    """The counts `rows_sorted` and `rows_repeated`, where they are not zero."""
+
+
+def in_order(
+    time: Float[np.ndarray, " n"], values: Float[np.ndarray, "n w"], source: object
+) -> InOrder:
+    """The rows sorted by their stamps (s), of those that share a stamp the first.
+
+    Raises `InputError` where the clock was set back, since the samples before and after it would
+    lie among each other, and where more than `MOST_REPEATED` of the rows give the stamp of another
+    row other values.
+    """
+    steps = np.diff(time)
+    if (steps > 0).all():
+        return InOrder(np.arange(len(time)), {})
+    order = np.argsort(time, kind="stable")
+    backward = int((steps < 0).sum())
+    if (np.abs(np.diff(order)) > 1).sum() > MOST_APART * max(backward, 1):
+        row = int(np.argmin(steps))
+        raise InputError(
+            source,
+            f"field 'time' jumps back by {-steps[row]:.2f} s after {time[row]:.6f} s, and what "
+            "follows overlaps what was before",
+            "its clock was set: cut the recording there",
+        )
+    again = np.concatenate([[False], np.diff(time[order]) == 0])
+    other_values = (np.diff(values[order], axis=0) != 0).any(axis=1)
+    conflicts = int((again[1:] & other_values).sum())
+    if conflicts > max(MOST_REPEATED * len(time), 1):
+        raise InputError(
+            source,
+            f"field 'time' gives {conflicts} of {len(time)} rows the stamp of another row with "
+            f"other values, first at {time[order][1:][again[1:] & other_values][0]:.6f} s",
+            "give stamps fine enough to tell the samples apart",
+        )
+    counts = {"rows_sorted": float(backward), "rows_repeated": float(again.sum())}
+    return InOrder(order[~again], {name: count for name, count in counts.items() if count})

@@ -1,0 +1,372 @@
+"""Tables of numbers as files hold them: text, HDF5, NumPy's formats, feather; and JSON.
+
+A `Table` answers three questions of a column in one place: is it there, is it of numbers, is it
+complete. Rows are counted from 1 in every message, as an editor shows a text file, header and
+comments included.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import struct
+import zipfile
+import zlib
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+from jaxtyping import Num
+from scipy.spatial.transform import Rotation
+
+from gnio_jax.data.validation import UNIT_NORM_TOLERANCE
+from gnio_jax.errors import InputError
+from gnio_jax.numerics import rotations, wxyz_from_xyzw
+
+DAMAGE = (
+    *(OSError, EOFError, ValueError, TypeError, LookupError, ArithmeticError, RuntimeError),
+    *(AttributeError, SyntaxError, NotImplementedError),
+    *(zipfile.BadZipFile, zlib.error, struct.error),
+)
+"""What the parsers of damaged files raise. Lack of memory and failed assertions are no damage."""
+
+
+def shortened(text: object, most: int = 80) -> str:
+    """What a file says, as far as a message can quote it: one line of printable characters, at most
+    `most` of them."""
+    line = "".join(
+        character if character.isprintable() else "\ufffd" for character in str(text)[: 4 * most]
+    )
+    return line if len(str(text)) <= most else line[: most - 3] + "..."
+
+
+@contextmanager
+def parsed_as(path: Path, kind: str) -> Iterator[None]:
+    """What a parser raises within becomes an `InputError`. Nothing but the parser's own calls
+    belongs within, or a mistake of ours would be called damage of the file."""
+    try:
+        yield
+    except InputError:
+        raise
+    except MemoryError:
+        raise InputError(
+            path, f"does not fit the memory as {kind}", "if it should, copy it again"
+        ) from None
+    except DAMAGE as error:
+        raise InputError(
+            path,
+            f"cannot be read as {kind}, it may be cut short ({shortened(error, 200)})",
+            "copy it again",
+        ) from None
+
+
+class Table(NamedTuple):
+    """Columns of one file: by name, or by their places from 0 where no header names them."""
+
+    path: Path
+    columns: Mapping[Any, Any]
+    """Series of text and feather; arrays of NumPy's formats and HDF5, also of several axes."""
+    kind: str = "column"
+    """What messages call one: a column or a field."""
+    before: int = 0
+    """Lines before the first row, of a text file."""
+    content: bytes | None = None
+    """What a text file holds where it is part of an archive."""
+
+    def width(self) -> int:
+        """How many columns there are."""
+        return len(list(self.columns))
+
+    def take(self, *names: Any, width: int | None = None, gaps: bool = False) -> np.ndarray:
+        """Float64 of one column (n,), of several side by side (n, k), or of one field with `width`
+        axes (n, width).
+
+        Raises `InputError` where one is missing, holds no numbers or has another shape, and, but
+        for `gaps`, where one is NaN or infinite.
+        """
+        if width is not None:
+            values = self._numbers(names[0])
+            rows = len(values) if values.ndim else 0
+            if values.shape != (rows, width):
+                self._refuse_shape(names[0], values, f"(N, {width})")
+        else:
+            found = [self._numbers(name) for name in names]
+            for name, column in zip(names, found, strict=True):
+                if column.ndim != 1:
+                    self._refuse_shape(name, column, "(N,)")
+            values = np.stack(found, axis=1)
+        if not gaps:
+            self.check_complete(values, names)
+        return values[:, 0] if width is None and len(names) == 1 else values
+
+    def axes(self, prefix: str, letters: str = "xyz", gaps: bool = False) -> np.ndarray:
+        """The columns `prefix` + letter side by side."""
+        return self.take(*(prefix + letter for letter in letters), gaps=gaps)
+
+    def stamps(self, name: Any) -> Num[np.ndarray, " n"]:
+        """A column of stamps, complete. Integers stay: ns of unix time have more digits than a
+        float."""
+        column = self._column(name)
+        if column.ndim == 1 and column.dtype.kind in "iu":
+            return np.asarray(column)
+        return self.take(name)
+
+    def rotations(
+        self, *names: Any, width: int | None = None, scalar_first: bool = True
+    ) -> Rotation:
+        """Rotations of unit quaternions, every row's. Raises `InputError` as `take` does, and where
+        a norm is off 1 by more than `UNIT_NORM_TOLERANCE`."""
+        wxyz = self.take(*names, width=width)
+        if not scalar_first:
+            wxyz = wxyz_from_xyzw(wxyz)
+        norm = np.linalg.norm(wxyz, axis=1)
+        bad = np.abs(norm - 1.0) > UNIT_NORM_TOLERANCE
+        if bad.any():
+            row = int(np.argmax(bad))
+            raise InputError(
+                self.path,
+                f"{self._named(names)} not a unit quaternion in {bad.sum()} rows, first in row "
+                f"{self.row(row)} (norm {norm[row]:.4g})",
+                "check the column order and normalize, or copy it again",
+            )
+        return rotations(wxyz)
+
+    def row(self, index: int) -> int:
+        """The row of the file, from 1, that holds entry `index` of every column."""
+        if not self.before and self.content is None:
+            return index + 1
+        with open_text(self.path, self.content) as file:
+            lines = enumerate(file, 1)
+            rows = (n for n, line in lines if n > self.before and _is_data(line))
+            return next((n for k, n in enumerate(rows) if k == index), self.before + index + 1)
+
+    def check_complete(self, values: Float[np.ndarray, "n w"], names: Iterable[Any]) -> None:
+        """Raise `InputError` where a value is not finite; the columns have these names, or all of
+        them the one."""
+        finite = np.isfinite(values)
+        if finite.all():
+            return
+        bad, named = ~finite, list(names)
+        row, place = (int(i) for i in np.argwhere(bad)[0])
+        name, count = named[place % len(named)], bad.any(axis=1).sum()
+        raise InputError(
+            self.path,
+            f"{self.kind} '{name}' is NaN or Inf in {count} rows, first in row {self.row(row)}",
+            "repair or cut the recording there",
+        )
+
+    def _column(self, name: Any) -> Any:
+        if name not in self.columns:
+            known = shortened(", ".join(str(column) for column in self.columns), 600)
+            raise InputError(self.path, f"{self.kind} '{name}' is missing", f"found: {known}")
+        column = self.columns[name]
+        if isinstance(column, pd.DataFrame):
+            raise InputError(
+                self.path, f"column '{name}' is there {column.shape[1]} times", "leave one"
+            )
+        return column
+
+    def _numbers(self, name: Any) -> np.ndarray:
+        column = self._column(name)
+        if isinstance(column, np.ndarray):
+            if column.dtype.kind not in "fiu":
+                raise InputError(
+                    self.path,
+                    f"{self.kind} '{name}' holds {column.dtype}, expected numbers",
+                    "copy it again",
+                )
+            return column.astype(np.float64)
+        try:
+            return column.to_numpy(dtype=np.float64, na_value=np.nan)
+        except (TypeError, ValueError, OverflowError):  # Python's integers have no end
+            cells = pd.to_numeric(column.astype(str), errors="coerce")
+            bad = ~np.isfinite(pd.Series(cells, dtype=np.float64).to_numpy())
+            index = int(np.argmax(bad & column.notna().to_numpy()))
+            raise InputError(
+                self.path,
+                f"{self.kind} '{name}' holds '{shortened(column.iloc[index])}' in its row "
+                f"{self.row(index)}, no number",
+            ) from None
+
+    def _refuse_shape(self, name: Any, values: np.ndarray, expected: str) -> None:
+        raise InputError(
+            self.path,
+            f"{self.kind} '{name}' has shape {values.shape}, expected {expected}",
+            "copy it again",
+        )
+
+    def _named(self, names: tuple[Any, ...]) -> str:
+        joined = "', '".join(str(name) for name in names)
+        return f"{self.kind}s '{joined}' are" if len(names) > 1 else f"{self.kind} '{joined}' is"
+
+
+# --- text
+
+
+def open_text(path: Path, content: bytes | None = None) -> io.TextIOWrapper:
+    """The text of a file, or `content` in its place; a byte order mark is dropped."""
+    if content is None:
+        return path.open(encoding="utf-8-sig")
+    return io.TextIOWrapper(io.BytesIO(content), encoding="utf-8-sig")
+
+
+def read_text(
+    path: Path,
+    separator: str = ",",
+    header: bool = True,
+    content: bytes | None = None,
+    decimal: str = ".",
+) -> Table:
+    """The columns of a text file by their names (stripped of blanks), or by their places from 0
+    without a `header`.
+
+    Lines that begin with '#' are comments. The first other line names the columns, unless it holds
+    a number: then the last comment before it does. `separator` " " stands for any run of blanks.
+    `content` is what the file holds where it is part of an archive; `path` is then its name in
+    messages. Raises `InputError` naming the file when it is missing, empty or no table.
+    """
+    try:
+        comments, first = _before_data(path, content)
+        names, before = "", len(comments)
+        if header:
+            names = next((line for line in reversed(comments) if line.startswith("#")), first)
+            if not _holds_a_number(first, separator, decimal):
+                names, before = first, before + 1
+        frame = pd.read_csv(
+            path if content is None else io.BytesIO(content),
+            header=None,
+            skiprows=before,
+            comment="#",
+            sep=r"\s+" if separator == " " else separator,
+            skipinitialspace=True,
+            skip_blank_lines=True,
+            low_memory=False,
+            decimal=decimal,
+        )
+    except OSError as error:
+        raise InputError(path, f"cannot be read ({error.strerror})") from None
+    except InputError:
+        raise
+    except pd.errors.EmptyDataError:
+        raise InputError(path, "holds no row", "copy it again") from None
+    except (UnicodeDecodeError, pd.errors.ParserError, ValueError) as error:
+        raise InputError(
+            path,
+            f"is no table of text ({shortened(error, 200)})",
+            "it may be cut short or damaged: copy it again",
+        ) from None
+    if header:
+        frame.columns = _labels(names, separator, frame.shape[1], path)
+    return Table(path, frame, before=before, content=content)
+
+
+def _is_data(line: str) -> bool:
+    return not line.startswith("#") and bool(line.strip())
+
+
+def _before_data(path: Path, content: bytes | None) -> tuple[list[str], str]:
+    """(lines of comments and blanks before the first line that is neither, that line)."""
+    before = []
+    with open_text(path, content) as file:
+        for line in file:
+            if _is_data(line):
+                return before, line
+            before.append(line)
+    raise InputError(path, "holds no row", "copy it again")
+
+
+def _cells(line: str, separator: str) -> list[str]:
+    return line.strip().split(None if separator == " " else separator)
+
+
+def _holds_a_number(line: str, separator: str, decimal: str) -> bool:
+    for cell in _cells(line, separator):
+        try:
+            float(cell.replace(decimal, "."))
+        except ValueError:
+            continue
+        return True
+    return False
+
+
+def _labels(names: str, separator: str, width: int, path: Path) -> list[str]:
+    """The names of `width` columns."""
+    labels = [cell.strip() for cell in _cells(names.lstrip("#"), separator)]
+    if len(labels) == width + 1 and not labels[-1]:
+        labels = labels[:-1]
+    if len(labels) != width:
+        raise InputError(
+            path, f"its header names {len(labels)} columns, its rows have {width}", "copy it again"
+        )
+    return labels
+
+
+# --- other formats
+
+
+def read_hdf5_fields(path: Path, names: Iterable[str]) -> Table:
+    """Those of the fields `names` (of any depth, "group/field") that an HDF5 file has."""
+    import h5py
+
+    fields: dict[str, np.ndarray] = {}
+    with parsed_as(path, "HDF5"), h5py.File(path, "r") as file:
+        for name in names:
+            node = file.get(name)
+            if isinstance(node, h5py.Dataset):
+                fields[name] = np.asarray(node)
+    return Table(path, fields, "field")
+
+
+def read_npz(path: Path) -> Table:
+    """The arrays of an npz."""
+    with parsed_as(path, "npz"), np.load(path, allow_pickle=False) as file:
+        return Table(path, dict(file), "field")
+
+
+def read_npy(path: Path, names: Mapping[str, slice], width: int) -> Table:
+    """The table (N, `width`) of floats of an npy, its fields by name."""
+    with parsed_as(path, "a NumPy array"):
+        # Mapped, since a damaged header may name more rows than there is memory.
+        table = np.load(path, mmap_mode="r", allow_pickle=False)
+    if table.ndim != 2 or table.shape[1] != width or table.dtype.kind != "f" or len(table) < 2:
+        raise InputError(
+            path,
+            f"holds {table.dtype} of shape {table.shape}, expected floats (N, {width})",
+            "copy it again",
+        )
+    return Table(
+        path, {name: np.asarray(table[:, place]) for name, place in names.items()}, "field"
+    )
+
+
+def read_feather(path: Path) -> Table:
+    """The columns of a feather file; needs pyarrow."""
+    try:
+        from pyarrow import feather
+    except ImportError:
+        raise InputError(
+            path,
+            "feather files need pyarrow, which is not installed",
+            "pip install 'gnio-jax[idol]'",
+        ) from None
+    if not path.exists():
+        raise InputError(path, "no such file")
+    with parsed_as(path, "feather"):
+        # What pandas noted of its own index when it wrote the file is of no use here.
+        return Table(path, feather.read_table(str(path)).to_pandas(ignore_metadata=True))
+
+
+def json_object(path: Path, remedy: str = "copy it again") -> dict[str, Any]:
+    """The object that a JSON file holds; `remedy` is what to do where it cannot be opened."""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(path, f"cannot be read ({error.strerror})", remedy) from None
+    except (ValueError, RecursionError) as error:
+        raise InputError(path, f"is no JSON ({shortened(error, 200)})", "copy it again") from None
+    if not isinstance(content, dict):
+        raise InputError(path, "is no JSON object", "copy it again")
+    return content

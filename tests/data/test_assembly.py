@@ -1,0 +1,301 @@
+"""Streams with stamps of their own become sequences on one clock, and nothing that holds a window
+is lost in silence."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from gnio_jax import evaluation
+from gnio_jax.config import DataConfig
+from gnio_jax.data import windows
+from gnio_jax.data.assembly import Poses, Samples, Streams, assemble
+from gnio_jax.data.dataset import Refusal
+from gnio_jax.data.validation import validate
+from gnio_jax.errors import InputError
+from gnio_jax.numerics import rotations
+from gnio_jax.types import Waypoints
+from tests.support import known_walk as walk
+
+
+def known(gyro_time, accel_time, **options):
+    """The known walk by a gyro and an accelerometer with these stamps."""
+    return Streams(
+        "walk",
+        "walk.csv",
+        Samples(gyro_time, walk.rate(gyro_time), "gyro.csv"),
+        Samples(accel_time, walk.force(accel_time), "accel.csv"),
+        **options,
+    )
+
+
+def tracked(stamps, **options):
+    return Poses(
+        stamps, walk.attitude(stamps), walk.position(stamps), source="poses.csv", **options
+    )
+
+
+def test_two_sensors_and_a_tracker_each_on_its_own_clock_come_back():
+    """A gyro at 90 Hz, an accelerometer at 107 Hz and noisy poses at 60 Hz with a lever."""
+    gyro_time, accel_time = 0.7 + np.arange(2700) / 90.3, np.arange(3300) / 107.1
+    stamps = 1.0 + np.arange(1700) / 60.0
+    poses = tracked(stamps, noisy=True)
+    lever = np.array([0.0, 0.02, -0.05])
+    poses = poses._replace(position=poses.position - poses.attitude.apply(lever), lever=lever)
+    (sequence,) = assemble(
+        known(gyro_time, accel_time, poses=poses, start=50.0, attributes={"device": "phone"}), 100.0
+    )
+    time = sequence.time + sequence.attributes["start_time"] - 50.0
+    inner = slice(30, -30)
+    np.testing.assert_allclose(np.diff(sequence.time), 0.01, rtol=1e-9)
+    np.testing.assert_allclose(sequence.gyro[inner], walk.rate(time)[inner], atol=1e-3)
+    np.testing.assert_allclose(sequence.accel[inner], walk.force(time)[inner], atol=1e-3)
+    np.testing.assert_allclose(sequence.position[inner], walk.position(time)[inner], atol=2e-3)
+    error = rotations(sequence.orientation) * walk.attitude(time).inv()
+    assert np.degrees(error.magnitude())[inner].max() < 0.5
+    off = (sequence.velocity - walk.velocity(time))[inner]
+    assert np.sqrt((off**2).sum(axis=1).mean()) < 0.05
+    assert sequence.valid[inner].all() and sequence.imu_valid is None
+    # Cut to the poses, from the first sample of the gyro after the first pose.
+    assert 0.0 <= time[0] - stamps[0] < 1 / 90.0 and 0.0 <= stamps[-1] - time[-1] < 0.02
+    assert sequence.attributes["device"] == "phone"
+
+
+@pytest.mark.parametrize("rate", [40.0, 50.4, 60.0])
+def test_slow_phones_are_read_as_they_are(rate):
+    time = np.arange(round(20 * rate)) / rate
+    (sequence,) = assemble(known(time, time))
+    assert 1.0 / np.diff(sequence.time).mean() == pytest.approx(rate, rel=1e-3)
+    np.testing.assert_allclose(sequence.gyro, walk.rate(sequence.time), atol=1e-3)
+    assert not sequence.valid.any() and np.isnan(sequence.position).all()
+
+
+def test_at_ten_hertz_jitter_is_no_hole():
+    """At 10.5 Hz two samples of a jittering clock lie more than 0.1 s apart half of the time."""
+    rng = np.random.default_rng(3)
+    time = np.arange(300) / 10.5 + rng.uniform(-0.02, 0.02, 300)
+    (sequence,) = assemble(known(time, time))
+    assert sequence.imu_valid is None
+    holed = np.delete(time, np.s_[100:104])
+    (sequence,) = assemble(known(holed, holed))
+    assert sequence.imu_valid is not None and 2 <= (~sequence.imu_valid).sum() <= 6
+
+
+def test_samples_on_the_clock_already_stay_to_the_bit():
+    time = np.round(5.0 + np.arange(800) / 200.0, 6)
+    streams = known(time, time, poses=tracked(time, velocity=walk.velocity(time)))
+    (sequence,) = assemble(streams, 200.0)
+    np.testing.assert_array_equal(sequence.gyro, streams.gyro.values)
+    np.testing.assert_array_equal(sequence.accel, streams.accel.values)
+    np.testing.assert_array_equal(sequence.position, walk.position(time))
+    np.testing.assert_array_equal(sequence.velocity, walk.velocity(time))
+
+
+def test_the_imu_beyond_the_poses_is_cut_away_unless_all_of_it_is_wanted():
+    time = np.arange(2000) / 100.0
+    streams = known(time, time, poses=tracked(np.arange(5.0, 15.0, 0.01)))
+    (cut,), (whole,) = assemble(streams, 100.0), assemble(streams, 100.0, whole=True)
+    assert cut.attributes["start_time"] == pytest.approx(5.0) and len(cut.time) == 1000
+    assert len(whole.time) == 2000 and whole.valid.sum() == cut.valid.sum() == 1000
+    assert np.isnan(whole.position[~whole.valid]).all()
+
+
+def test_rows_out_of_order_are_sorted_and_counted_but_no_two_clocks():
+    time = np.arange(2000) / 100.0
+    rows = np.arange(2000)
+    rows[[100, 101]] = rows[[101, 100]]
+    rows = np.insert(rows, 500, 500)
+    (sequence,) = assemble(known(time[rows], time[rows]), 100.0)
+    np.testing.assert_allclose(sequence.gyro, walk.rate(time), atol=1e-9)
+    assert sequence.attributes["rows_sorted"] == 1.0
+    assert sequence.attributes["rows_repeated"] == 1.0
+    back = np.concatenate([time[:1000], time[:1000] + 4.995])
+    with pytest.raises(InputError, match=r"^gyro\.csv: field 'time' jumps back by 5\.0\d s after"):
+        assemble(known(back, time), 100.0)
+    coarse = Samples(np.floor(time * 50) / 50, walk.force(time), "accel.csv")
+    with pytest.raises(InputError, match=r"^accel\.csv: field 'time' gives 1000 of 2000 rows"):
+        assemble(known(time, time)._replace(accel=coarse), 100.0)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (
+            lambda s: s._replace(accel=s.accel._replace(time=s.accel.time + 99.0)),
+            "accel.csv: field",
+        ),
+        (
+            lambda s: s._replace(poses=s.poses._replace(time=s.poses.time - 99.0)),
+            "poses.csv: field",
+        ),
+        (lambda s: s._replace(gyro=s.gyro._replace(time=s.gyro.time * 1e3)), "gyro.csv: field"),
+        (
+            lambda s: s._replace(accel=s.accel._replace(values=s.accel.values / 9.81)),
+            "accel.csv: field 'accel' looks like G",
+        ),
+        (
+            lambda s: s._replace(
+                gyro=s.gyro._replace(
+                    values=np.where(s.gyro.time[:, None] == 3.0, 1e3, s.gyro.values)
+                )
+            ),
+            "gyro.csv: field 'gyro' is beyond 100 rad/s in 1 rows, first 3.000 s after the start",
+        ),
+        (
+            lambda s: s._replace(
+                poses=s.poses._replace(
+                    velocity=np.where(
+                        s.poses.time[:, None] == 3.0, 1e3, walk.velocity(s.poses.time)
+                    )
+                )
+            ),
+            "poses.csv: field 'velocity' is beyond 300 m/s in 1 rows, first at 3.000 s",
+        ),
+    ],
+)
+def test_a_stream_that_cannot_be_is_refused_by_its_file(change, words):
+    time = np.arange(2000) / 100.0
+    with pytest.raises(InputError) as caught:
+        assemble(change(known(time, time, poses=tracked(time))), 100.0)
+    assert str(caught.value).startswith(words)
+
+
+# --- waypoints
+
+
+def test_waypoints_stand_in_the_place_of_poses_and_are_refused_where_a_pose_is_needed():
+    time = np.arange(1500) / 50.0
+    taps = Samples(
+        np.array([2.0, 9.0, 17.0, 25.0]), walk.position(np.array([2.0, 9, 17, 25]))[:, :2], "taps"
+    )
+    streams = known(1.0 + time, 1.0 + time, waypoints=taps)
+    (sequence,) = assemble(streams)
+    assert sequence.waypoints is not None
+    np.testing.assert_allclose(sequence.waypoints.time, [1.0, 8.0, 16.0, 24.0])
+    np.testing.assert_array_equal(sequence.waypoints.position, taps.values)
+    assert not sequence.valid.any()
+    config = DataConfig(rate=50.0)
+    with pytest.raises(InputError, match=r"^walk: has waypoints, no poses"):
+        windows.window_source([sequence], config, 10)
+    with pytest.raises(InputError, match=r"^walk: has waypoints, no poses"):
+        evaluation.prepare([sequence], config)
+    few = taps._replace(time=taps.time[:2], values=taps.values[:2])
+    with pytest.raises(Refusal):
+        assemble(streams._replace(waypoints=few))
+
+
+@pytest.mark.parametrize(
+    ("time", "problem"),
+    [
+        ([1.0, 2.0], "are 2, at least 3"),
+        ([1.0, 2.0, 2.0], "do not increase"),
+        ([1.0, np.nan, 2.0], "not all finite"),
+        ([1.0, 2.0, 99.0], "not all on the IMU's clock"),
+    ],
+)
+def test_waypoints_that_cannot_be_are_refused(time, problem):
+    clock = np.arange(500) / 50.0
+    (sequence,) = assemble(known(clock, clock))
+    waypoints = Waypoints(np.array(time), np.zeros((len(time), 2)))
+    with pytest.raises(InputError, match=f"^file: field 'waypoints' .*{problem}"):
+        validate(sequence._replace(waypoints=waypoints), "file")
+
+
+# --- gaps
+
+
+def level(time, tracked_at=None):
+    """Somebody who walks straight on, with a pose wherever `tracked_at` is."""
+    count = len(time)
+    poses = None
+    if tracked_at is not None:
+        poses = Poses(
+            tracked_at,
+            Rotation.identity(len(tracked_at)),
+            np.outer(tracked_at, [1.0, 0.5, 0.0]),
+            np.tile([1.0, 0.5, 0.0], (len(tracked_at), 1)),
+        )
+    return Streams(
+        "walk",
+        "walk.csv",
+        Samples(time, np.zeros((count, 3)), "walk.csv"),
+        Samples(time, np.tile([0, 0, 9.81], (count, 1)), "walk.csv"),
+        {"group": "someone"},
+        100.0,
+        poses,
+    )
+
+
+def stamps(*spans):
+    return np.concatenate(
+        [np.arange(round(100 * first), round(100 * last) + 1) / 100 for first, last in spans]
+    )
+
+
+def test_every_piece_with_a_window_is_kept_and_named():
+    time = stamps((0, 5), (7, 7.5), (9, 10), (12, 20), (30, 34))
+    # No whole window of the last piece has a reference.
+    seen = time[(time < 30) | (time % 0.5 > 0.15)]
+    with pytest.warns(UserWarning) as caught:
+        pieces = assemble(level(time, np.append(seen, 34.0)), 100.0, divide=True)
+    (warning,) = caught
+    assert str(warning.message) == (
+        "walk.csv: field 'time' has gaps longer than 1 s (4, up to 10.0 s); "
+        "kept: 14.0 of 34.0 s, walk_piece1 (0.0 to 5.0 s), walk_piece2 (9.0 to 10.0 s), "
+        "walk_piece3 (12.0 to 20.0 s); "
+        "lost: 15.5 s in gaps, 4.5 s in pieces without a whole window"
+    )
+    assert [piece.name for piece in pieces] == ["walk_piece1", "walk_piece2", "walk_piece3"]
+    for piece, first, last in zip(pieces, (0, 9, 12), (5, 10, 20), strict=True):
+        count = round(100 * (last - first)) + 1
+        np.testing.assert_allclose(piece.time, np.arange(count) / 100, atol=1e-9)
+        np.testing.assert_allclose(piece.position[:, 0], first + piece.time, atol=1e-9)
+        assert piece.attributes == {"group": "someone", "start_time": pytest.approx(100.0 + first)}
+    # Each holds at least the one window it was kept for, and no estimate runs through a hole.
+    config = DataConfig(rate=100.0)
+    assert all(
+        len(windows.window_source([piece], config, stride=10).start) >= 1 for piece in pieces
+    )
+    prepared, short = evaluation.prepare(pieces, config)
+    assert [each.sequence.name for each in prepared] == ["walk_piece1", "walk_piece3"]
+    assert list(short) == ["walk_piece2"]
+    assert all(np.diff(each.sequence.time).max() < 0.011 for each in prepared)
+    with pytest.raises(InputError, match=r"^walk\.csv: field 'time' has a gap of 2\.000 s after 5"):
+        assemble(level(time, time), 100.0)
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_recording_without_a_long_gap_stays_one():
+    time = stamps((0, 5), (5.9, 9))
+    (sequence,) = assemble(level(time, time), 100.0, divide=True)
+    assert sequence.name == "walk" and len(sequence.time) == 901
+    inside = (sequence.time > 5.001) & (sequence.time < 5.899)
+    np.testing.assert_array_equal(sequence.imu_valid, ~inside)
+    np.testing.assert_array_equal(sequence.valid, ~inside)
+
+
+def test_a_recording_of_which_nothing_is_left_is_refused():
+    time = stamps((0, 0.9), (2.5, 3.3), (5, 5.5))
+    with (
+        warnings.catch_warnings(),
+        pytest.raises(Refusal, match=r"^walk\.csv: .*\(2, up to 1\.7 s\), and no piece"),
+    ):
+        warnings.simplefilter("error")
+        assemble(level(time, time), 100.0, divide=True)
+    with pytest.raises(Refusal, match=r"^walk\.csv: no 1 s of it have an IMU and a reference"):
+        assemble(level(stamps((0, 0.9))), 100.0)
+
+
+def test_a_piece_whose_valid_runs_are_cut_by_short_gaps_holds_no_window():
+    """What nothing bridges, 0.9 s here, parts a window as a long gap does."""
+    time = stamps((0, 0.6), (1.5, 2.1), (5, 9))
+    with pytest.warns(
+        UserWarning,
+        match=r"kept: 4\.0 of 9\.0 s, walk \(5\.0 to 9\.0 s\); "
+        r"lost: 2\.9 s in gaps, 2\.1 s in pieces",
+    ):
+        (piece,) = assemble(level(time, time), 100.0, divide=True)
+    assert piece.name == "walk" and len(piece.time) == 401
