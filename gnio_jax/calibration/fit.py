@@ -22,8 +22,6 @@ from gnio_jax.evaluation.estimators.result import Estimate
 from gnio_jax.filtering import (
     ConsideredStd,
     FilterConfig,
-    InitialStd,
-    NoiseModel,
     considered_covariance,
     initial_state,
     over_sequences,
@@ -244,11 +242,18 @@ def innovation_objective(
     prior about `start`, which keeps those in place that the walks do not determine."""
     chex.assert_equal_shape([free, start])
     chex.assert_equal_shape([walks.displacement, walks.std])
+
+    def of_walk(settings: FilterSettings, walk: Walks) -> Array:
+        _, history = repeat_odometry(*_run(walk, settings, config))
+        # What the walk is filled up with comes after its last displacement, and may run away.
+        present = jnp.isfinite(walk.displacement).all(axis=1)
+        healthy = jnp.all((history.healthy > 0) | ~present)
+        return jnp.where(healthy, jnp.nansum(history.log_likelihood), jnp.nan)
+
     settings = with_free_parameters(settings, dict(zip(names, free, strict=True)))
-    evidence = _log_likelihood(walks, config, settings.noise, settings.start)
-    prior = 0.5 * jnp.sum(((free - start) / PRIOR_STD) ** 2)
+    evidence = jnp.sum(over_sequences(of_walk, shared=1)(settings, walks))
     count = jnp.isfinite(walks.displacement).all(axis=2).sum()
-    return (prior - evidence) / count, -evidence / count
+    return (_prior(free, start) - evidence) / count, -evidence / count
 
 
 _value_and_gradient = jax.jit(
@@ -256,24 +261,17 @@ _value_and_gradient = jax.jit(
 )
 
 
-def _log_likelihood(
-    walks: Walks, config: FilterConfig, noise: NoiseModel, start: InitialStd
-) -> Array:
-    """Of all innovations."""
+def _run(walk: Walks, settings: FilterSettings, config: FilterConfig) -> tuple[Any, ...]:
+    """The arguments of `repeat_odometry` for one walk."""
+    pose = (walk.rotation, walk.velocity, walk.position, walk.gyro_bias)
+    state = initial_state(config, *pose, std=settings.start)
+    given = walk.displacement, walk.std
+    return state, walk.gyro, walk.accel, *given, config, settings.noise, walk.imu_valid
 
-    def of_walk(given: tuple[NoiseModel, InitialStd], walk: Walks) -> Array:
-        noise, std = given
-        pose = (walk.rotation, walk.velocity, walk.position, walk.gyro_bias)
-        state = initial_state(config, *pose, std=std)
-        given_then = walk.displacement, walk.std
-        run = state, walk.gyro, walk.accel
-        _, history = repeat_odometry(*run, *given_then, config, noise, walk.imu_valid)
-        # What the walk is filled up with comes after its last displacement, and may run away.
-        present = jnp.isfinite(walk.displacement).all(axis=1)
-        healthy = jnp.all((history.healthy > 0) | ~present)
-        return jnp.where(healthy, jnp.nansum(history.log_likelihood), jnp.nan)
 
-    return jnp.sum(over_sequences(of_walk, shared=1)((noise, start), walks))
+def _prior(free: Float[Array, "u"], start: Float[Array, "u"]) -> Float[Array, ""]:
+    """−log density of the free parameters, up to a constant."""
+    return 0.5 * jnp.sum(((free - start) / PRIOR_STD) ** 2)
 
 
 class Considered(NamedTuple):
@@ -313,37 +311,25 @@ def fit_considered(
     names, start = tuple(free), np.array(list(free.values()))
     independent = len(positions.error) * stride_seconds / INDEPENDENT_SECONDS
 
-    def objective(vector: Float[Array, "u"]) -> Array:
-        std = with_free_parameters(settings, dict(zip(names, vector, strict=True))).considered
-        prior = 0.5 * jnp.sum(((vector - start) / PRIOR_STD) ** 2)
-        return gaussian_nll(positions.error, with_considered(positions, std)) + prior / independent
+    def covariance(std: ConsideredStd) -> Array:
+        return positions.covariance + considered_covariance(positions.sensitivity, std)
+
+    def objective(free: Float[Array, "u"]) -> Array:
+        std = with_free_parameters(settings, dict(zip(names, free, strict=True))).considered
+        return gaussian_nll(positions.error, covariance(std)) + _prior(free, start) / independent
 
     compiled = jax.jit(jax.value_and_grad(objective))
     found = minimize(
-        lambda vector: jax.device_get(compiled(vector)), start, jac=True, method="L-BFGS-B"
+        lambda free: jax.device_get(compiled(free)), start, jac=True, method="L-BFGS-B"
     )
     if not np.isfinite(found.fun):
         raise InputError("the filter", "has a covariance on these recordings that is not one")
     fitted = with_written_parameters(settings, dict(zip(names, found.x, strict=True)), DIGITS)
     before, after = (
-        float(_nees_per_axis(positions.error, covariance))
-        for covariance in (positions.covariance, with_considered(positions, fitted.considered))
+        float(jnp.mean(normalised_squares(positions.error, each))) / 3
+        for each in (positions.covariance, covariance(fitted.considered))
     )
     return Considered(fitted, before, after)
-
-
-@jax.jit
-def _nees_per_axis(
-    error: Float[Array, "k 3"], covariance: Float[Array, "k 3 3"]
-) -> Float[Array, ""]:
-    """Mean over all positions of eᵀ P⁻¹ e / 3."""
-    return jnp.mean(normalised_squares(error, covariance)) / 3
-
-
-@jax.jit
-def with_considered(positions: Positions, std: ConsideredStd) -> Float[Array, "k 3 3"]:
-    """Covariances of the positions with the errors that are considered, m²."""
-    return positions.covariance + considered_covariance(positions.sensitivity, std)
 
 
 def filtered_positions(
@@ -353,9 +339,9 @@ def filtered_positions(
 
     `truth` has the true ones after each stride, m; NaN where there is none.
     """
-    config = filter_config(windows, settings)
-    of_all = _filtered(walks, settings.noise, settings.start, config=config)
-    healthy, position, covariance, of_position = jax.device_get(of_all)
+    healthy, position, covariance, of_position = jax.device_get(
+        _filtered(walks, settings, config=filter_config(windows, settings))
+    )
     error = truth - position
     known = np.isfinite(error).all(axis=2) & (healthy > 0)
     return Positions(error[known], covariance[known], of_position[known])
@@ -363,19 +349,16 @@ def filtered_positions(
 
 @functools.partial(jax.jit, static_argnames="config")
 def _filtered(
-    walks: Walks, noise: NoiseModel, start: InitialStd, *, config: FilterConfig
+    walks: Walks, settings: FilterSettings, *, config: FilterConfig
 ) -> tuple[Array, Array, Array, Array]:
     """Of every walk: where the filter is healthy, its positions, their covariances and S."""
 
-    def of_walk(given: tuple[NoiseModel, InitialStd], walk: Walks) -> tuple[Any, ...]:
-        noise, std = given
-        pose = (walk.rotation, walk.velocity, walk.position, walk.gyro_bias)
-        run = initial_state(config, *pose, std=std), walk.gyro, walk.accel
-        fixed = config, noise, walk.imu_valid
-        _, history = repeat_odometry(*run, walk.displacement, walk.std, *fixed)
-        found = sensitivity(*run, history, *fixed)
+    def of_walk(settings: FilterSettings, walk: Walks) -> tuple[Any, ...]:
+        run = _run(walk, settings, config)
+        _, history = repeat_odometry(*run)
+        found = sensitivity(*run[:3], history, *run[5:])
         assert history.covariance is not None
         covariance = history.covariance[:, POSITION, POSITION]
         return history.healthy, history.position, covariance, found[:, POSITION]
 
-    return over_sequences(of_walk, shared=1)((noise, start), walks)
+    return over_sequences(of_walk, shared=1)(settings, walks)

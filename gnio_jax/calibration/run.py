@@ -26,7 +26,7 @@ from gnio_jax.calibration.fit import (
     start_of_fit,
     std_factors,
 )
-from gnio_jax.config import CalibrateConfig, DataConfig, FilterSettings
+from gnio_jax.config import CalibrateConfig, ConsideredStd, DataConfig, FilterSettings
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import true_displacements
 from gnio_jax.evaluation.estimators.result import Estimate
@@ -74,7 +74,8 @@ def calibrate(
     split, asked = sources(run, config)
     windows = run.config.data
     noise = run.config.filter.noise._replace(measurement_scale=1.0, std_factor=(1.0, 1.0, 1.0))
-    uncalibrated = dataclasses.replace(run.config.filter, noise=noise)
+    nothing = ConsideredStd()  # it changes no estimate, and is found last
+    uncalibrated = dataclasses.replace(run.config.filter, noise=noise, considered=nothing)
     start_of_fit(uncalibrated, paths)  # its mistakes do not wait for the data
     evidence = gather(split, asked, config, uncalibrated, progress, workers)
     noise = noise._replace(std_factor=_factors(evidence, windows, split))

@@ -306,6 +306,23 @@ def named(section: Any, prefix: str = "") -> Iterator[tuple[str, Any, Any]]:
 # ------------------------------------------------------------------------------------------------
 
 
+def checked_value(hint: Any, value: Any, place: Place) -> Any:
+    """The value of a field of the type `hint`, if it has this type and is within its bounds.
+
+    Raises `InputError`.
+    """
+    value = _value(hint, value, place)
+    _check_bounds(hint, value, place)
+    return value
+
+
+def _check_bounds(hint: Any, value: Any, place: Place) -> None:
+    for bound in bounds(hint):
+        for number in value if isinstance(value, tuple) else (value,):
+            if number is not None and not bound.holds(number):
+                _refuse(place, f"{bound.problem}, found {_shown(value)}")
+
+
 def validate(config: TrainConfig, source: str = "config") -> TrainConfig:
     """Return `config` if its values make sense together.
 
@@ -313,10 +330,7 @@ def validate(config: TrainConfig, source: str = "config") -> TrainConfig:
     """
     place = Place(source)
     for name, hint, value in named(config):
-        if value is not None:
-            for bound in bounds(hint):
-                if not all(map(bound.holds, value if isinstance(value, tuple) else (value,))):
-                    place.refuse(name, f"{bound.problem}, found {_shown(value)}")
+        _check_bounds(hint, value, place.below(name))
     for name in ("data", "optim", "through_filter"):
         getattr(config, name).check(place.below(name))
     config.check(place)

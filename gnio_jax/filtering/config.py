@@ -3,46 +3,26 @@
 from __future__ import annotations
 
 import dataclasses
-import math
-import numbers
+import inspect
 from dataclasses import dataclass
-from typing import Any, Literal, no_type_check
+from typing import Literal, no_type_check
 
 import numpy as np
 
+from gnio_jax.config.files import checked_value
+from gnio_jax.config.schema import (
+    Count,
+    Finite,
+    NonNegative,
+    NonNegativeCount,
+    Place,
+    Positive,
+)
 from gnio_jax.windows import WINDOW_CUTS, WindowCut
 
 YawFrame = Literal["own", "given"]
 """Whose yaw frame a displacement is told in: that of the filter's own attitude of the oldest clone,
 with which the network's window was cut, or that of another attitude."""
-
-_CHOICES = {
-    "history": ("diagonal", "core"),
-    "window_rotation": tuple(WINDOW_CUTS),
-    "jacobians": ("latest", "first"),
-}
-_POSITIVE = ("dt", "gate_threshold", "speed_limit")
-_NOT_NEGATIVE = (
-    "mahalanobis_fail_scale",
-    "convergence_seconds",
-    "success_seconds",
-    "pause_seconds",
-    "gate_softness",
-    "zero_velocity_std",
-    "rest_gyro",
-    "rest_accel",
-    "rest_seconds",
-    "bridge_seconds",
-    "gap_gyro_std",
-    "gap_accel_std",
-)
-_LEAST_COUNT = {
-    "samples_per_clone": 1,
-    "clones_per_window": 1,
-    "context_samples": 0,
-    "checkpoint_every": 0,
-    "truncate_every": 0,
-}
 
 
 @no_type_check  # The tests' run-time checker would refuse what __post_init__ converts or names.
@@ -50,60 +30,60 @@ _LEAST_COUNT = {
 class FilterConfig:
     """Static settings of the filter. The defaults are TLIO's.
 
-    Numbers may come as 0-d arrays, as NumPy files give them. Raises `ValueError` naming a field
-    that makes no sense.
+    Numbers may come as 0-d arrays, as NumPy files give them. Raises `InputError`, a `ValueError`,
+    naming a field that makes no sense.
     """
 
-    dt: float
+    dt: Positive
     """Time between IMU samples, s."""
-    samples_per_clone: int
+    samples_per_clone: Count
     """IMU samples n in one clone interval."""
-    clones_per_window: int
+    clones_per_window: Count
     """Clone intervals W in one measurement; W + 1 poses are cloned."""
-    context_samples: int = dataclasses.field(default=0, kw_only=True)
+    context_samples: NonNegativeCount = dataclasses.field(default=0, kw_only=True)
     """IMU samples C before a measurement's window that the network sees too (ours)."""
-    mahalanobis_fail_scale: float = 0.0
+    mahalanobis_fail_scale: NonNegative = 0.0
     """0 skips a rejected measurement; above 0 its covariance is multiplied by this and it is
     applied."""
     history: Literal["diagonal", "core"] = "diagonal"
     """Keep the diagonal of the core covariance at every interval, or the whole 15×15 block too."""
-    log_std_min: float = -4.0
+    log_std_min: Finite = -4.0
     """The network's log standard deviation is raised to at least this (`run_odometry` only)."""
-    gate_threshold: float = 11.345
+    gate_threshold: Positive = 11.345
     """Largest rᵀ S⁻¹ r that passes, of a displacement and of a velocity at rest: 99 % of χ² with
     three degrees of freedom."""
-    convergence_seconds: float = 10.0
+    convergence_seconds: NonNegative = 10.0
     """The gate stays open until the oldest clone is more than this after initialisation, s."""
-    success_seconds: float = 0.5
+    success_seconds: NonNegative = 0.5
     """When the last success is older than this, the gate pauses: everything passes, s."""
-    pause_seconds: float = 1.0
+    pause_seconds: NonNegative = 1.0
     """Length of such a pause, s."""
-    gate_softness: float = 0.0
+    gate_softness: NonNegative = 0.0
     """0 accepts or rejects; above 0 the gate has a slope, for training: a measurement's information
     is weighted by the logistic function of (gate_threshold − rᵀ S⁻¹ r) / gate_softness."""
-    zero_velocity_std: float = 0.0
+    zero_velocity_std: NonNegative = 0.0
     """Standard deviation of the velocity at rest, m/s, used as a measurement while the IMU is
     quiet; 0 for no such update. Where a displacement is tested in the same interval and its gate is
     active, a rest that does not fit is refused, whatever `mahalanobis_fail_scale` and
     `gate_softness`."""
-    rest_gyro: float = 0.05
+    rest_gyro: NonNegative = 0.05
     """Quiet: no |gyro − b_g| above this, rad/s …"""
-    rest_accel: float = 0.3
+    rest_accel: NonNegative = 0.3
     """… and no | |accel − b_a| − g | above this, m/s² …"""
-    rest_seconds: float = 0.5
+    rest_seconds: NonNegative = 0.5
     """… for this long, s."""
-    bridge_seconds: float = 0.1
+    bridge_seconds: NonNegative = 0.1
     """Missing IMU samples hold the last one for this long, s; after it attitude and velocity coast,
     and windows are no measurements."""
-    gap_gyro_std: float = 1.0
+    gap_gyro_std: NonNegative = 1.0
     """Standard deviation of the rate that a gap may hide, rad/s; of a held sample as much less as
     it is younger than `bridge_seconds`."""
-    gap_accel_std: float = 3.0
+    gap_accel_std: NonNegative = 3.0
     """The same of the acceleration, m/s²."""
-    checkpoint_every: int = 0
+    checkpoint_every: NonNegativeCount = 0
     """Clone intervals between the states kept for the backward pass, all else being computed again:
     memory for time. 0 keeps everything."""
-    truncate_every: int = 0
+    truncate_every: NonNegativeCount = 0
     """Clone intervals after which the state is carried on without gradient, for training on long
     recordings: values stay as they are. The final state has no gradient then. 0 never."""
     window_rotation: Literal["per_sample", "single", "tlio"] = "per_sample"
@@ -113,7 +93,7 @@ class FilterConfig:
     jacobians: Literal["latest", "first"] = "latest"
     """Where the filter is linearised: at the latest estimates, as TLIO's, or at the first of each
     velocity and position; these are taken anew after an update above `gate_threshold`."""
-    speed_limit: float = 100.0
+    speed_limit: Positive = 100.0
     """No carrier is faster, m/s: an estimate that is has diverged, and is not `healthy` from then
     on (ours)."""
     allow_float32: bool = False
@@ -122,30 +102,14 @@ class FilterConfig:
     anyway."""
 
     def __post_init__(self) -> None:
-        for field in dataclasses.fields(self):
-            value = getattr(self, field.name)
-            if field.type == "float":
-                object.__setattr__(self, field.name, _finite_number(field.name, value))
-            elif field.type == "int":
-                object.__setattr__(self, field.name, _whole_number(field.name, value))
-        self._require(
-            isinstance(self.allow_float32, bool), "allow_float32", "must be True or False"
-        )
-        for name, choices in _CHOICES.items():
-            self._require(getattr(self, name) in choices, name, f"must be {_either(choices)}")
-        for name in _POSITIVE:
-            self._require(getattr(self, name) > 0, name, "must be positive")
-        for name in _NOT_NEGATIVE:
-            self._require(getattr(self, name) >= 0, name, "must not be negative")
-        self._require(
-            self.gate_softness == 0 or self.mahalanobis_fail_scale == 0,
-            "gate_softness",
-            "makes no sense beside mahalanobis_fail_scale",
-        )
-
-    def _require(self, condition: bool, name: str, problem: str) -> None:
-        if not condition:
-            raise ValueError(f"{name} {problem}, found {getattr(self, name)!r}")
+        for name, hint in inspect.get_annotations(type(self), eval_str=True).items():
+            value = getattr(self, name)
+            if isinstance(value, np.ndarray | np.generic) and value.ndim == 0:
+                value = value.item()
+            object.__setattr__(self, name, checked_value(hint, value, Place("FilterConfig", name)))
+        if self.gate_softness and self.mahalanobis_fail_scale:
+            problem = "makes no sense beside mahalanobis_fail_scale"
+            Place("FilterConfig").refuse("gate_softness", problem, "set one of them to 0")
 
     @property
     def window(self) -> int:
@@ -195,29 +159,3 @@ class FilterConfig:
     def whole_samples(self, seconds: float) -> int:
         """t·dt > seconds ⇔ t > this number, whatever rounding does to seconds / dt."""
         return int(np.floor(seconds / self.dt + 1e-6))
-
-
-def _finite_number(name: str, value: Any) -> float:
-    try:
-        number = math.nan if isinstance(value, bool | str) else float(value)
-    except (TypeError, ValueError):
-        number = math.nan
-    if not math.isfinite(number):
-        raise ValueError(f"{name} must be a finite number, found {value!r}")
-    return number
-
-
-def _whole_number(name: str, value: Any) -> int:
-    if isinstance(value, np.ndarray) and value.ndim == 0:
-        value = value.item()
-    least = _LEAST_COUNT[name]
-    whole = isinstance(value, numbers.Integral) and not isinstance(value, bool)
-    if not whole or int(value) < least:
-        raise ValueError(f"{name} must be a whole number of at least {least}, found {value!r}")
-    return int(value)
-
-
-def _either(choices: tuple[str, ...]) -> str:
-    """'a', 'b' or 'c'."""
-    *others, last = (repr(choice) for choice in choices)
-    return f"{', '.join(others)} or {last}"

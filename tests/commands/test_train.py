@@ -82,10 +82,7 @@ def test_mistakes(monkeypatch, capsys, tmp_path, arguments, expected):
     "content, expected",
     [
         ("optim: {epohcs: 3}", "unknown field 'optim.epohcs'; did you mean 'optim.epochs'?"),
-        (
-            "optim: {learning_rate: 1e-4}",
-            "field 'optim.learning_rate' must be a number, found '1e-4'; YAML reads '1e-4' as text",
-        ),
+        ("optim: {learning_rate: a}", "field 'optim.learning_rate' must be a number, found 'a'"),
         ("optim: {epochs: '3'}", "field 'optim.epochs' must be a whole number, found '3'"),
         ("optim: {epochs: 2.5}", "field 'optim.epochs' must be a whole number, found 2.5"),
         ("augment: {yaw: 1}", "field 'augment.yaw' must be true or false, found 1"),

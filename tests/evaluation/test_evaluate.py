@@ -80,7 +80,7 @@ def test_end_to_end(workdir, command, capsys, tmp_path):
         and "synthetic_3_handheld" in found["left_out"]
     )
     assert found["settings"]["coupling"] == "tight" and found["settings"]["epoch"] == 1
-    assert found["settings"]["filter"]["velocity_std"] == 0.7
+    assert found["settings"]["filter"]["start"]["velocity"] == 0.7
     # Nothing says whose these walks are, so each is on its own.
     assert [one["group"] for one in found["sequences"].values()] == list(found["sequences"])
     assert (
@@ -156,11 +156,11 @@ def test_folders_tell_choices_apart():
     )
     assert (
         name(
-            filter=dataclasses.replace(TRAINED.filter, velocity_std=0.5),
+            filter=changed(TRAINED.filter, start={"velocity": 0.5}),
             alignment="se3",
             checkpoint="latest",
         )
-        == "tlio_test_ekf_se3-alignment_latest_velocity_std-0.5"
+        == "tlio_test_ekf_se3-alignment_latest_start.velocity-0.5"
     )
     assert (
         name(filter=dataclasses.replace(TRAINED.filter, window_rotation="tlio"))

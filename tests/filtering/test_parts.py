@@ -270,7 +270,7 @@ def test_initial_state():
     ],
 )
 def test_config_names_the_field_that_makes_no_sense(name, value):
-    with pytest.raises(ValueError, match=f"^{name} "):
+    with pytest.raises(ValueError, match=f"^FilterConfig: field '{name}' "):
         filtering.FilterConfig(
             **{"dt": 0.01, "samples_per_clone": 2, "clones_per_window": 3, name: value}
         )
