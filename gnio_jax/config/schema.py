@@ -39,19 +39,12 @@ class Bound(NamedTuple):
     """How the message goes on after the field's name."""
 
 
-MOST = 1e9
-"""No window, stride or segment has more samples or strides (ours): a mistake of units."""
-
-
-def _is_whole(number: float) -> bool:
-    return number <= MOST and abs(number - round(number)) < 1e-6
-
-
 Number = Any
 """A float in a file. Inside a JAX program it may be an array, so type checkers take anything."""
 
 ABOVE_ZERO = Bound(lambda value: 0 < value < math.inf, "must be positive and finite")
 NOT_NEGATIVE = Bound(lambda value: 0 <= value < math.inf, "must be finite and not negative")
+FACTOR = Bound(lambda value: 1e-6 <= value <= 1e6, "must be from 1e-6 to 1e6")
 SHARE = Bound(lambda value: 0 <= value < 1, "must be at least 0 and below 1")
 
 Positive = Annotated[float, ABOVE_ZERO]
@@ -67,6 +60,11 @@ Seed = Annotated[int, Bound(lambda value: 0 <= value < 2**32, "must be from 0 to
 TwoOrThree = Annotated[int, Bound(lambda value: value in (2, 3), "must be 2 or 3")]
 
 
+def _is_whole(number: float) -> bool:
+    """Whether it is a whole number of samples or strides, to rounding. No recording has 10^9."""
+    return number == 0 or (0.5 < number < 1e9 and abs(number - round(number)) < 1e-6)
+
+
 @dataclass(frozen=True)
 class DataConfig:
     """Which recordings are read, and how windows are cut from them."""
@@ -76,8 +74,8 @@ class DataConfig:
     window_seconds: Positive = 1.0
     """Length of the network's window, s (paper: 1 s)."""
     context_seconds: NonNegative = 0.0
-    """IMU before the window that the network sees too, s; it still tells the displacement over the
-    window (ours; paper: none)."""
+    """IMU before the window that the network sees too, s; it still predicts the displacement over
+    the window (ours; paper: none)."""
     stride_seconds: Positive = 0.1
     """Distance between window starts, and between the filter's clones, s (paper: 0.1 s)."""
     train_stride_seconds: Positive = 0.1
@@ -124,20 +122,11 @@ class DataConfig:
 
     def check(self, at: Place) -> None:
         """Window, context and strides are whole samples, and strides fill window and context."""
-        for name in (
-            "window_seconds",
-            "context_seconds",
-            "stride_seconds",
-            "train_stride_seconds",
-        ):
+        for name in ("window_seconds", "context_seconds", "stride_seconds", "train_stride_seconds"):
             samples = getattr(self, name) * self.rate
             if not _is_whole(samples):
-                at.refuse(
-                    name, f"is not a whole number of samples at {self.rate:g} Hz ({samples:g})"
-                )
-        for name in ("window_seconds", "stride_seconds", "train_stride_seconds"):
-            if round(getattr(self, name) * self.rate) < 1:
-                at.refuse(name, f"is less than one sample at {self.rate:g} Hz")
+                problem = f"is not a whole number of samples at {self.rate:g} Hz ({samples:g})"
+                at.refuse(name, problem)
         if self.window % self.stride:
             at.refuse("stride_seconds", f"must divide the window of {self.window_seconds:g} s")
         if self.context % self.stride:
@@ -312,10 +301,10 @@ class NoiseModel(NamedTuple):
     """Random walk of the gyro bias, rad/s/√s."""
     accel_bias_walk: Annotated[Number, NOT_NEGATIVE] = 1e-4
     """Random walk of the accelerometer bias, m/s²/√s."""
-    std_factor: Annotated[tuple[Number, Number, Number], ABOVE_ZERO] = (1.0, 1.0, 1.0)
+    std_factor: Annotated[tuple[Number, Number, Number], FACTOR] = (1.0, 1.0, 1.0)
     """Factors of the network's standard deviations along x, y, z of the window's yaw frame (ours;
     what `gnio calibrate` finds that they lack)."""
-    measurement_scale: Annotated[Number, ABOVE_ZERO] = 10.0
+    measurement_scale: Annotated[Number, FACTOR] = 10.0
     """Factor of the network's covariance in the update: overlapping windows are not independent
     (TLIO)."""
     correlation: CorrelatedError | None = None
