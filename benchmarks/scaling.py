@@ -33,13 +33,13 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from flax import linen as nn
 
 from benchmarks.train_step import recordings
 from gnio_jax.config import ModelConfig, OptimConfig, TrainConfig
 from gnio_jax.data import cache
 from gnio_jax.data.on_disk import source_on_disk
 from gnio_jax.data.windows import WindowSource, joined
-from gnio_jax.models import resnet
 from gnio_jax.scaling import devices
 from gnio_jax.scaling.meeting import Meeting
 from gnio_jax.scaling.processes import is_first, meet
@@ -72,9 +72,9 @@ def configuration(width: int, batch: int) -> TrainConfig:
     return TrainConfig(model=ModelConfig(width=width), optim=OptimConfig(batch_size=batch))
 
 
-def prepared(config: TrainConfig):
+def prepared(config: TrainConfig, model: nn.Module):
     """A function that takes a state through STEPS steps, the state, and its program."""
-    model, samples = create_model(config), config.data.seen
+    samples = config.data.seen
     optimizer = optimizers.create(config.optim, config.loss, 1000)
     source = devices.everywhere(jax.device_get(recordings(samples, config.optim.batch_size)))
     state = devices.everywhere(create_state(model, optimizer, jax.random.key(0), samples))
@@ -90,7 +90,8 @@ def work(arguments: argparse.Namespace) -> None:
     devices.cpu_devices(arguments.devices)
     meet(Meeting(coordinator, int(count), int(own)) if int(count) > 1 else Meeting())
     with devices.sharing(devices.chosen(arguments.devices)):
-        run, state, _ = prepared(configuration(arguments.width, arguments.batch))
+        config = configuration(arguments.width, arguments.batch)
+        run, state, _ = prepared(config, create_model(config))
         best = math.inf
         for _ in range(arguments.repeats + 1):  # the first compiles
             began = time.perf_counter()
@@ -206,13 +207,12 @@ def compare_residencies(arguments: argparse.Namespace) -> None:
 def model(batch: int) -> None:
     """Time of a step of the paper's network on many GPUs, from its operations and its sums."""
     devices.cpu_devices(2)
-    # As on a GPU, whose convolutions are not Winograd's.
-    resnet.convolve_training = resnet.convolve
     # A small batch compiles in seconds; operations of a window and sums of a step are the same.
     config = configuration(64, 16)
-    flops = flops_per_window(config)
+    network = create_model(config).clone(winograd=False)  # as on a GPU
+    flops = flops_per_window(config, network)
     with devices.sharing(devices.chosen(2)):
-        _, state, (given, static) = prepared(config)
+        _, state, (given, static) = prepared(config, network)
         text = train_steps.lower(state, *given, **static).compile().as_text()
     sums = [
         numbers(line) for line in text.splitlines() if re.search(r" all-reduce(-start)?\(", line)
@@ -221,12 +221,12 @@ def model(batch: int) -> None:
         f"{flops / 1e9:.2f} GFLOP a window (forward and backward); a step sums "
         f"{4 * sum(sums) / 1e6:.1f} MB over the devices, in {len(sums)} sums"
     )
-    network = Network()
-    print(f"assumed: {assumptions(network)}")
+    gpu = Network()
+    print(f"assumed: {assumptions(gpu)}")
     print("GPUs  batch each  computing ms  sums ms  share of the time that computes")
     for gpus in (8, 64, 512):
         for each in (batch // gpus, batch, 8 * batch):
-            row(gpus, each, flops, sums, network)
+            row(gpus, each, flops, sums, gpu)
 
 
 def row(gpus: int, each: int, flops: float, sums: list[int], network: Network) -> None:
@@ -240,10 +240,9 @@ def row(gpus: int, each: int, flops: float, sums: list[int], network: Network) -
     print(f"{gpus:4d}  {each:10d}  {1e3 * computing:12.2f}  {1e3 * summing:7.2f}  {share:6.0%}")
 
 
-def flops_per_window(config: TrainConfig) -> float:
+def flops_per_window(config: TrainConfig, network: nn.Module) -> float:
     """Operations of the gradient, as XLA counts those of the program for one device."""
-    network, samples = create_model(config), config.data.seen
-    imu = jnp.zeros((config.optim.batch_size, samples, 6), jnp.float32)
+    imu = jnp.zeros((config.optim.batch_size, config.data.seen, 6), jnp.float32)
     variables = jax.eval_shape(network.init, jax.random.key(0), imu[:1])
 
     def loss(params, rest):

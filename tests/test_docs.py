@@ -18,6 +18,8 @@ from gnio_jax import data, models, pretrained
 from gnio_jax.commands import app, options
 from gnio_jax.config import DataConfig, ModelConfig, TrainConfig
 from gnio_jax.errors import InputError
+from gnio_jax.models import registry
+from gnio_jax.training.checkpoint import create_model
 from tests.support import pages, tiny_run
 
 SMALLER = {
@@ -87,12 +89,25 @@ def test_weights_that_are_loaded(tmp_path, monkeypatch):
     assert names["prediction"].displacement.shape == (2, 3)
 
 
+def test_a_head_of_ones_own(monkeypatch):
+    """The network is known to a configuration, and its head has the place of GNIO's."""
+    monkeypatch.setattr(registry, "_MODELS", dict(registry._MODELS))
+    run("docs/networks.md", code_of("docs/networks.md"))
+    model = create_model(TrainConfig(model=ModelConfig(name="deeper", width=2)))
+    shapes = models.variable_shapes(model, 64)
+    assert shapes["params"]["head"].keys() == {"hidden", "displacement"}
+    assert shapes["params"]["bank"] and shapes["params"]["uncertainty"]
+    found = jax.eval_shape(model.apply, shapes, jax.ShapeDtypeStruct((2, 64, 6), np.float32))
+    assert found.displacement.shape == (2, 3)
+
+
 def test_the_imports_of_the_reference():
     run("docs/api/index.md", code_of("docs/api/index.md"))
 
 
 def test_every_block_that_runs_has_a_test():
-    tested = {"README.md", "docs/differentiable_filter.md", "docs/weights.md", "docs/api/index.md"}
+    tested = {"README.md", "docs/differentiable_filter.md", "docs/networks.md", "docs/weights.md"}
+    tested |= {"docs/api/index.md"}
     assert {block.page for block in RUN} == tested
 
 

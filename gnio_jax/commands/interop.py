@@ -30,7 +30,7 @@ class InteropOptions:
     checkpoint: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="CHECKPOINT")]]
     """File of the weights."""
     workdir: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="WORKDIR")]]
-    """Folder of the run; must not hold one."""
+    """Folder of the run, which is made."""
     rate: float = 200.0
     """Samples per second that the network was trained with, Hz (imu_freq in TLIO's
     parameters.json)."""
@@ -60,6 +60,6 @@ def write_run(options: InteropOptions, prog: str) -> None:
 COMMAND = Command(InteropOptions, write_run, DESCRIPTION)
 
 
-def main(argv: Sequence[str] | None = None, prog: str = "python -m gnio_jax.interop") -> None:
+def main(argv: Sequence[str] | None = None, prog: str = "gnio interop") -> None:
     """Read the options and write the run."""
     execute(COMMAND, argv, prog)

@@ -167,8 +167,6 @@ class ModelConfig:
     64)."""
     bank_size: NonNegativeCount | None = None
     """Prototypes in the Motion Bank; 0 leaves the bank out (gnio: 64)."""
-    bank_heads: Count | None = None
-    """Attention heads of the bank's query (gnio: 8)."""
     bank_std: Positive | None = None
     """Standard deviation of the prototypes before training (gnio: 1). Near 1/√d, for d features,
     all prototypes receive the same attention."""
@@ -185,15 +183,10 @@ class ModelConfig:
     output_dim: TwoOrThree | None = None
     """Dimensions of the displacement: 3, or 2 without the vertical, as published (ronin_resnet,
     deepils, ctin, imot)."""
-    dropout: Probability | None = None
-    """Fraction of activations dropped in training (tlio, ronin_resnet, deepils: 0.5; imot: 0.1)."""
     equivariance: Literal["none", "four_headings", "canonical_frame"] = "none"
     """A window turned about the vertical gives the displacement turned alike, for every network:
     the mean over four headings of the window, at inference, or a frame that a small network finds
     in the window (EqNIO)."""
-    dtype: Literal["float32", "bfloat16"] = "float32"
-    """Factors of matrix products and convolutions in training on windows (ours). Sums, parameters,
-    statistics, loss and update are float32 either way, and so is the network once it is trained."""
 
 
 @dataclass(frozen=True)
@@ -478,8 +471,6 @@ class TrainConfig:
             at.refuse("optim.ema_decay", "is for training on windows alone", "set it to 0")
         if self.optim.accumulate > 1:
             at.refuse("optim.accumulate", "is for training on windows alone", "set it to 1")
-        if self.model.dtype != "float32":
-            at.refuse("model.dtype", "is for training on windows alone", "set it to float32")
         if self.data.residency == "host":
             at.refuse("data.residency", "is for training on windows alone", "set it to device")
         for name in ("piece_seconds", "truncate_seconds"):

@@ -19,10 +19,34 @@ import numpy as np
 from gnio_jax import config as configuration
 from gnio_jax import models
 from gnio_jax.config import DataConfig, FilterSettings, ModelConfig, TrainConfig
-from gnio_jax.errors import InputError
+from gnio_jax.errors import InputError, require_packages
+from gnio_jax.files import replacing_folder
 
 _CHANNELS = np.array([3, 4, 5, 0, 1, 2])
 """Where our channels, [accel, gyro], are among TLIO's, [gyro, accel]."""
+
+_STEM = "input_block.0.weight"
+_FLATTENED = "output_block1.fc1.weight"
+_PREP_CHANNELS = 128
+_PARTS = {
+    "encoder": "",
+    "displacement": "output_block1.",
+    "log_std": "output_block2.",
+    "stem_conv": "input_block.0.",
+    "stem_bn": "input_block.1.",
+    "shortcut_conv": "downsample.0.",
+    "shortcut_bn": "downsample.1.",
+    "neck_conv": "prep1.",
+    "neck_bn": "bn1.",
+    "kernel": "weight",
+    "scale": "weight",
+    "mean": "running_mean",
+    "var": "running_var",
+    "bias": "bias",
+    **{f"group{g + 1}_block{b + 1}": f"residual_groups.{g}.{b}." for g in range(4) for b in (0, 1)},
+}
+"""Names of ours, and what TLIO's keys have in their place; those that are not here are the same,
+and a dot."""
 
 _REMEDY = "the weights must be those of TLIO's network 'resnet', as its training saves them"
 
@@ -44,56 +68,19 @@ def load_tlio_state_dict(mapping_or_path: Mapping[str, Any] | str | Path) -> Any
     given = {str(key).removeprefix("module."): value for key, value in given.items()}
     given = {key: value for key, value in given.items() if not key.endswith("num_batches_tracked")}
     template = _template(where, given)
-    wanted = {_source(path): leaf for path, leaf in jax.tree_util.tree_leaves_with_path(template)}
-    for name, problem in [
-        (wanted.keys() - given.keys(), "is missing"),
-        (given.keys() - wanted.keys(), "is unexpected"),
-    ]:
-        if name:
-            raise InputError(
-                where,
-                f"'{min(name)}' {problem}"
-                + (f" (and {len(name) - 1} more)" if len(name) > 1 else ""),
-                _REMEDY,
-            )
+    wanted = {
+        "".join(_PARTS.get(step.key, f"{step.key}.") for step in path[1:]): leaf
+        for path, leaf in jax.tree_util.tree_leaves_with_path(template)
+    }
+    odd = {"missing": wanted.keys() - given.keys(), "unexpected": given.keys() - wanted.keys()}
+    for problem, keys in odd.items():
+        if keys:
+            more = f" (and {len(keys) - 1} more)" if len(keys) > 1 else ""
+            raise InputError(where, f"'{min(keys)}' is {problem}{more}", _REMEDY)
     arrays = {key: _turned(where, key, given[key], leaf.shape) for key, leaf in wanted.items()}
     arrays[_STEM] = arrays[_STEM][:, _CHANNELS]
-    return jax.tree.unflatten(
-        jax.tree.structure(template), [jnp.asarray(arrays[key], jnp.float32) for key in wanted]
-    )
-
-
-_STEM = "input_block.0.weight"
-_FLATTENED = "output_block1.fc1.weight"
-_PREP_CHANNELS = 128
-_PARTS = {
-    "encoder": "",
-    "displacement": "output_block1.",
-    "log_std": "output_block2.",
-    "stem_conv": "input_block.0.",
-    "stem_bn": "input_block.1.",
-    "shortcut_conv": "downsample.0.",
-    "shortcut_bn": "downsample.1.",
-    "neck_conv": "prep1.",
-    "neck_bn": "bn1.",
-    "kernel": "weight",
-    "scale": "weight",
-    "mean": "running_mean",
-    "var": "running_var",
-    "bias": "bias",
-    **{
-        f"group{g + 1}_block{b + 1}": f"residual_groups.{g}.{b}."
-        for g in range(4)
-        for b in range(2)
-    },
-}
-"""Names of ours, and what TLIO's keys have in their place; those that are not here are the same,
-and a dot."""
-
-
-def _source(path: tuple[Any, ...]) -> str:
-    """TLIO's key of the array at this place of our variables."""
-    return "".join(_PARTS.get(step.key, f"{step.key}.") for step in path[1:])
+    leaves = [jnp.asarray(arrays[key], jnp.float32) for key in wanted]
+    return jax.tree.unflatten(jax.tree.structure(template), leaves)
 
 
 def _template(where: str, given: Mapping[str, Any]) -> Any:
@@ -111,13 +98,11 @@ def _turned(where: str, key: str, value: Any, wanted: tuple[int, ...]) -> np.nda
     """The array with PyTorch's (out, in, size) turned to our (size, in, out)."""
     array = np.asarray(value.detach().cpu().float() if hasattr(value, "detach") else value)
     if array.shape != wanted[::-1]:
-        raise InputError(
-            where, f"'{key}' must have shape {wanted[::-1]}, found {array.shape}", _REMEDY
-        )
+        problem = f"'{key}' must have shape {wanted[::-1]}, found {array.shape}"
+        raise InputError(where, problem, _REMEDY)
     if not np.issubdtype(array.dtype, np.floating) or not np.isfinite(array).all():
-        raise InputError(
-            where, f"'{key}' holds values that are not finite numbers", "the weights are damaged"
-        )
+        problem = f"'{key}' holds values that are not finite numbers"
+        raise InputError(where, problem, "the weights are damaged")
     return array.T
 
 
@@ -127,15 +112,17 @@ def _opened(given: Mapping[str, Any] | str | Path) -> tuple[str, Mapping[str, An
         return "state dict", given
     path = Path(given)
     if not path.is_file():
-        known = (
-            "a checkpoint of TLIO's training, a TorchScript archive or an .npz of the state dict"
-        )
-        raise InputError(path, "no such file", f"give {known}")
+        known = "a checkpoint of TLIO's training, a TorchScript archive or an .npz"
+        raise InputError(path, "no such file", f"give {known} of the state dict")
     try:
-        content = _arrays(path) if path.suffix == ".npz" else _torch(path)
+        if path.suffix == ".npz":
+            with np.load(path, allow_pickle=False) as file:
+                content = dict(file)
+        else:
+            content = _torch(path)
     except InputError:
         raise
-    except Exception as error:  # torch and zipfile tell damage by half a dozen types
+    except Exception as error:  # torch and zipfile raise half a dozen types for damaged files
         problem = f"cannot be read ({str(error).partition(chr(10))[0][:160]})"
         known = "an .npz of arrays, or a file of PyTorch that holds tensors and plain values only"
         raise InputError(path, problem, f"it must be {known}") from None
@@ -144,18 +131,10 @@ def _opened(given: Mapping[str, Any] | str | Path) -> tuple[str, Mapping[str, An
     return str(path), content
 
 
-def _arrays(path: Path) -> dict[str, np.ndarray]:
-    with np.load(path, allow_pickle=False) as file:
-        return {name: file[name] for name in file.files}
-
-
 def _torch(path: Path) -> Any:
-    try:
-        import torch  # pyright: ignore[reportMissingImports]
-    except ImportError:
-        raise InputError(
-            path, "reading a file of PyTorch needs PyTorch", "pip install 'gnio-jax[torch]'"
-        ) from None
+    require_packages(path, "torch", "torch")
+    import torch  # pyright: ignore[reportMissingImports]
+
     if zipfile.is_zipfile(path):
         with zipfile.ZipFile(path) as archive:
             script = any(name.endswith("/constants.pkl") for name in archive.namelist())
@@ -164,38 +143,27 @@ def _torch(path: Path) -> Any:
     return torch.load(path, map_location="cpu", weights_only=True)
 
 
-def write_run(checkpoint: Path, workdir: Path, data: DataConfig, dataset: str = "tlio") -> None:
-    """Make a run of TLIO's weights that `evaluate` reads: config.yaml and checkpoints/best.
+def write_run(weights: Path, workdir: Path, data: DataConfig, dataset: str = "tlio") -> None:
+    """Make a run of TLIO's weights that `evaluate` reads: config.yaml and checkpoints/best. The
+    folder appears whole or not at all.
 
     `data` gives rate, window and stride that the network was trained with. Raises `InputError` for
-    weights that do not fit them, or a folder that holds a run already.
+    weights that do not fit them, or a folder that is there already.
     """
-    # Orbax takes longer to import than all else.
-    from gnio_jax.training.checkpoint import Checkpoints, Position
-    from gnio_jax.training.step import TrainState
+    from gnio_jax.training import checkpoint  # Orbax takes longer to import than all else
 
-    config = TrainConfig(
-        dataset=dataset,
-        data=data,
-        model=ModelConfig(name="tlio"),
-        filter=FilterSettings(window_rotation="tlio"),
-    )
+    network, settings = ModelConfig(name="tlio"), FilterSettings(window_rotation="tlio")
+    config = TrainConfig(dataset=dataset, data=data, model=network, filter=settings)
     configuration.validate(config, "gnio interop")
-    if (workdir / "config.yaml").exists() or (workdir / "checkpoints").exists():
-        raise InputError(workdir, "holds a run already", "name another folder")
-    variables = load_tlio_state_dict(checkpoint)
-    _check_window(checkpoint, variables, data.window)
-    workdir.mkdir(parents=True, exist_ok=True)
-    with Checkpoints(workdir) as checkpoints:
-        state = TrainState(jnp.int32(0), variables["params"], variables["batch_stats"], {})
-        checkpoints.save("best", state, Position(0, 0, None, (0.0, 0.0, 0.0), 0.0))
-    configuration.save(workdir / "config.yaml", config)
-
-
-def _check_window(checkpoint: Path, variables: Any, window: int) -> None:
-    """Refuse a window length that the weights do not have: they tell ⌈N/32⌉ of N samples."""
+    if workdir.exists():
+        raise InputError(workdir, "is there already", "name another folder")
+    variables = load_tlio_state_dict(weights)
     features = variables["params"]["displacement"]["fc1"]["kernel"].shape[0] // _PREP_CHANNELS
-    if features != math.ceil(window / 32):
-        problem = f"is for windows of {32 * features - 31} to {32 * features} samples, not {window}"
+    if features != math.ceil(data.window / 32):  # all that weights show of their window's length
+        samples = f"{32 * features - 31} to {32 * features} samples"
         remedy = "give the --rate and --window-seconds that it was trained with"
-        raise InputError(checkpoint, problem, remedy)
+        raise InputError(weights, f"is for windows of {samples}, not {data.window}", remedy)
+    run = checkpoint.Run(config, models.create("tlio"), variables, epoch=0, step=0)
+    with replacing_folder(workdir) as new:
+        configuration.save(new / "config.yaml", config)
+        checkpoint.write_best(new, run)

@@ -1,7 +1,7 @@
 """Networks: windows of IMU samples in, `Prediction` out."""
 
 from gnio_jax.models.inference import Inference, InferenceVariables, inference_variables
-from gnio_jax.models.registry import create, initialise, names, variable_shapes
+from gnio_jax.models.registry import create, initialise, names, register, variable_shapes
 
 __all__ = [
     "Inference",
@@ -10,5 +10,6 @@ __all__ = [
     "inference_variables",
     "initialise",
     "names",
+    "register",
     "variable_shapes",
 ]

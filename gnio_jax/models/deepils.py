@@ -3,16 +3,14 @@ from the network's description."""
 
 from __future__ import annotations
 
-from functools import partial
-
 import jax
 import jax.numpy as jnp
 from flax import linen as nn
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
-from gnio_jax.models.layers import linear
-from gnio_jax.models.precision import Dtype
-from gnio_jax.models.resnet import batch_norm, conv, max_pool, residual_groups
+from gnio_jax.models.convolution import convolve_depthwise, max_pool
+from gnio_jax.models.layers import conv, conv_norm, linear
+from gnio_jax.models.resnet import residual_groups, shortcut
 from gnio_jax.models.ronin import DisplacementRegressor
 
 REDUCTION = 16
@@ -31,11 +29,10 @@ class DeepILS(DisplacementRegressor):
     other than 64 scale every layer, for machines without an accelerator.
     """
 
-    def features(self, windows: Float[jax.Array, "b n 6"], train: bool) -> jax.Array:
+    def features(self, windows: Float[Array, "b n 6"], train: bool) -> Array:
         padded = jnp.pad(windows, ((0, 0), (1, 1), (0, 0)))  # one more than its kernel asks for
-        x = conv(self.width, 5, 2, train, "stem_conv", self.dtype)(padded)
-        x = max_pool(nn.relu(batch_norm(train, "stem_bn")(x)))
-        return residual_groups(partial(AttentiveBlock, dtype=self.dtype), self.width, x, train)
+        x = max_pool(nn.relu(conv_norm(padded, self.width, 5, 2, train, "stem_conv")))
+        return residual_groups(AttentiveBlock, self.width, x, train)
 
 
 class AttentiveBlock(nn.Module):
@@ -44,51 +41,41 @@ class AttentiveBlock(nn.Module):
 
     features: int
     stride: int
-    dtype: Dtype = "float32"
 
     @nn.compact
-    def __call__(self, x: Float[jax.Array, "b n c"], train: bool) -> Float[jax.Array, "b m d"]:
-        y = _depthwise(x.shape[-1], self.stride, "depthwise1")(x)
-        y = conv(self.features, 1, 1, train, "conv1", self.dtype)(y)
-        y = nn.relu(batch_norm(train, "bn1")(y))
-        y = _depthwise(self.features, 1, "depthwise2")(y)
-        y = conv(self.features, 1, 1, train, "conv2", self.dtype)(y)
-        y = batch_norm(train, "bn2")(y)
-        y = ChannelAttention(self.dtype, name="channel_attention")(y)
-        y = TimeAttention(self.dtype, name="time_attention")(y, train)
-        if self.stride != 1 or x.shape[-1] != self.features:
-            x = conv(self.features, 1, self.stride, train, "shortcut_conv", self.dtype)(x)
-            x = batch_norm(train, "shortcut_bn")(x)
-        return nn.relu(x + y)
+    def __call__(self, x: Float[Array, "b n c"], train: bool) -> Float[Array, "b m d"]:
+        y = _depthwise(x.shape[-1], self.stride, train, "depthwise1")(x)
+        y = nn.relu(conv_norm(y, self.features, 1, 1, train, "conv1"))
+        y = _depthwise(self.features, 1, train, "depthwise2")(y)
+        y = conv_norm(y, self.features, 1, 1, train, "conv2")
+        y = ChannelAttention(name="channel_attention")(y)
+        y = TimeAttention(name="time_attention")(y, train)
+        return nn.relu(shortcut(x, self.features, self.stride, train) + y)
 
 
 class ChannelAttention(nn.Module):
     """x ⊙ σ(f(mean over time) + f(maximum over time)), f a shared C → C/16 → C without biases
     (ours: ReLU between, one unit at least)."""
 
-    dtype: Dtype = "float32"
-
     @nn.compact
-    def __call__(self, x: Float[jax.Array, "b n c"]) -> Float[jax.Array, "b n c"]:
+    def __call__(self, x: Float[Array, "b n c"]) -> Float[Array, "b n c"]:
         channels = x.shape[-1]
         pooled = jnp.stack([x.mean(axis=1), _maximum(x, 1)], axis=1)
-        squeeze = linear(max(channels // REDUCTION, 1), "squeeze", self.dtype, use_bias=False)
-        excite = linear(channels, "excite", self.dtype, use_bias=False)
+        squeeze = linear(max(channels // REDUCTION, 1), "squeeze", use_bias=False)
+        excite = linear(channels, "excite", use_bias=False)
         return x * nn.sigmoid(excite(nn.relu(squeeze(pooled))).sum(axis=1, keepdims=True))
 
 
 class TimeAttention(nn.Module):
     """x ⊙ σ(convolution over 7 samples of the mean and the maximum over channels), without bias."""
 
-    dtype: Dtype = "float32"
-
     @nn.compact
-    def __call__(self, x: Float[jax.Array, "b n c"], train: bool) -> Float[jax.Array, "b n c"]:
+    def __call__(self, x: Float[Array, "b n c"], train: bool) -> Float[Array, "b n c"]:
         pooled = jnp.stack([x.mean(axis=-1), _maximum(x, 2)], axis=-1)
-        return x * nn.sigmoid(conv(1, 7, 1, train, "conv", self.dtype)(pooled))
+        return x * nn.sigmoid(conv(1, 7, 1, train, "conv")(pooled))
 
 
-def _maximum(x: Float[jax.Array, "b n c"], axis: int) -> Float[jax.Array, "b k"]:
+def _maximum(x: Float[Array, "b n c"], axis: int) -> Float[Array, "b k"]:
     """The maximum, whose gradient goes to the first place that holds it, as in PyTorch.
 
     That of `jnp.max` is shared by all values equal to the maximum; compilers may compute x a second
@@ -99,37 +86,12 @@ def _maximum(x: Float[jax.Array, "b n c"], axis: int) -> Float[jax.Array, "b k"]
     return jnp.sum(jnp.where(places == jnp.argmax(x, axis=axis, keepdims=True), x, 0), axis=axis)
 
 
-def _convolve_depthwise(
-    x: Float[jax.Array, "b n c"],
-    kernel: Float[jax.Array, "k 1 c"],
-    window_strides: tuple[int],
-    padding: list[tuple[int, int]],
-    **_: object,
-) -> Float[jax.Array, "b m c"]:
-    """A convolution of every channel by itself, as a sum of k shifted products: XLA's own takes a
-    generic loop for it on CPUs."""
-    x = jnp.pad(x, ((0, 0), padding[0], (0, 0)))
-    stride, size = window_strides[0], kernel.shape[0]
-    length = (x.shape[1] - size) // stride + 1
-    terms = [
-        x[:, i : i + stride * (length - 1) + 1 : stride] * kernel[None, i] for i in range(size)
-    ]
-    return sum(terms[1:], terms[0])
-
-
-def _depthwise(channels: int, stride: int, name: str) -> nn.Conv:
-    """Over three samples, without bias. Ours: He's normal start over the three samples that a
-    channel sees."""
-    return nn.Conv(
-        channels,
-        (3,),
-        stride,
-        padding=[(1, 1)],
-        feature_group_count=channels,
-        use_bias=False,
-        kernel_init=nn.initializers.variance_scaling(2.0, "fan_in", "normal"),
-        dtype=jnp.float32,
-        param_dtype=jnp.float32,
-        conv_general_dilated=_convolve_depthwise,
-        name=name,
-    )
+def _depthwise(channels: int, stride: int, train: bool, name: str) -> nn.Conv:
+    """Three samples of every channel by itself. Ours: He's normal start over the three samples that
+    a channel sees."""
+    options = {
+        "feature_group_count": channels,
+        "kernel_init": nn.initializers.variance_scaling(2.0, "fan_in", "normal"),
+        "conv_general_dilated": convolve_depthwise,
+    }
+    return conv(channels, 3, stride, train, name, **options)

@@ -13,13 +13,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import linen as nn
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from gnio_jax.geometry import direction
 from gnio_jax.models.heads import root_mean_square
-from gnio_jax.models.layers import linear
-from gnio_jax.models.precision import Dtype
-from gnio_jax.models.resnet import batch_norm, conv
+from gnio_jax.models.layers import checked_windows, conv_norm, linear
 from gnio_jax.types import GRAVITY, Prediction
 
 QUARTER_TURNS = np.float32([[1, 0], [0, 1], [-1, 0], [0, -1]])
@@ -34,7 +32,6 @@ class Equivariant(nn.Module):
     """A network whose parts lie beside those that make it equivariant."""
 
     network: nn.Module
-    dtype: Dtype = "float32"
 
     def setup(self) -> None:
         nn.share_scope(self, self.network)
@@ -56,17 +53,17 @@ class FourHeadings(Equivariant):
     """
 
     def __call__(
-        self, windows: Float[jax.Array, "b n 6"], train: bool = False, **constants: Any
+        self, windows: Float[Array, "b n 6"], train: bool = False, **constants: Any
     ) -> Prediction:
         if train:
             return self.network(windows, train, **constants)
         batch, turns = windows.shape[0], len(QUARTER_TURNS)
         heading = jnp.repeat(jnp.asarray(QUARTER_TURNS), batch, axis=0)
-        every = turn_windows(jnp.tile(windows.astype(jnp.float32), (turns, 1, 1)), heading)
+        every = turn_windows(jnp.tile(checked_windows(windows), (turns, 1, 1)), heading)
         prediction = self.network(every, train, **constants)
         back = turn_prediction(prediction, opposite(heading))
 
-        def by_heading(axes: jax.Array) -> jax.Array:
+        def by_heading(axes: Array) -> Array:
             return jnp.moveaxis(axes.reshape(turns, batch, *axes.shape[1:]), 0, -2)
 
         diagnostics = {name: value[:batch] for name, value in prediction.diagnostics.items()}
@@ -94,12 +91,12 @@ class CanonicalFrame(Equivariant):
 
     def setup(self) -> None:
         super().setup()
-        self.frame = FrameNetwork(self.dtype)
+        self.frame = FrameNetwork()
 
     def __call__(
-        self, windows: Float[jax.Array, "b n 6"], train: bool = False, **constants: Any
+        self, windows: Float[Array, "b n 6"], train: bool = False, **constants: Any
     ) -> Prediction:
-        windows = windows.astype(jnp.float32)
+        windows = checked_windows(windows)
         heading = self.frame(windows, train)
         prediction = self.network(turn_windows(windows, opposite(heading)), train, **constants)
         return turn_prediction(prediction, heading)
@@ -115,23 +112,20 @@ class FrameNetwork(nn.Module):
     gradient.
     """
 
-    dtype: Dtype = "float32"
-
     @nn.compact
-    def __call__(self, windows: Float[jax.Array, "b n 6"], train: bool) -> Float[jax.Array, "b 2"]:
+    def __call__(self, windows: Float[Array, "b n 6"], train: bool) -> Float[Array, "b 2"]:
         x = invariants(windows)
         for layer in ("1", "2"):
-            x = conv(FRAME_FEATURES, FRAME_SPAN, 1, train, f"conv{layer}", self.dtype)(x)
-            x = nn.relu(batch_norm(train, f"bn{layer}")(x))
+            x = nn.relu(conv_norm(x, FRAME_FEATURES, FRAME_SPAN, 1, train, f"conv{layer}"))
         accel, gyro = windows[..., 0:2], windows[..., 3:5]
         vectors = jnp.stack([accel, quarter_turn(accel), gyro, quarter_turn(gyro)], axis=2)
-        weights = linear(vectors.shape[2], "weights", self.dtype)(x)
+        weights = linear(vectors.shape[2], "weights")(x)
         mean = jnp.einsum("bnk,bnkd->bd", weights, vectors) / windows.shape[1]
         return jnp.stack(direction(mean[:, 0], mean[:, 1]), axis=-1)
 
 
-def invariants(windows: Float[jax.Array, "b n 6"]) -> Float[jax.Array, "b n 6"]:
-    """What of every sample a turn about z leaves: |a|, |ω|, a · ω and a × ω of the horizontal
+def invariants(windows: Float[Array, "b n 6"]) -> Float[Array, "b n 6"]:
+    """What a turn about z leaves of every sample: |a|, |ω|, a · ω and a × ω of the horizontal
     parts, the vertical acceleration without gravity and the vertical rate."""
     accel, gyro = windows[..., 0:2], windows[..., 3:5]
     values = (
@@ -145,25 +139,23 @@ def invariants(windows: Float[jax.Array, "b n 6"]) -> Float[jax.Array, "b n 6"]:
     return jnp.stack(values, axis=-1)
 
 
-def length(vectors: Float[jax.Array, "*k 2"]) -> Float[jax.Array, "*k"]:
+def length(vectors: Float[Array, "*k 2"]) -> Float[Array, "*k"]:
     """Lengths, with zero derivative at 0."""
     squared = jnp.sum(vectors**2, axis=-1)
     return jnp.where(squared > 0, jnp.sqrt(jnp.where(squared > 0, squared, 1.0)), 0.0)
 
 
-def quarter_turn(vectors: Float[jax.Array, "*k 2"]) -> Float[jax.Array, "*k 2"]:
+def quarter_turn(vectors: Float[Array, "*k 2"]) -> Float[Array, "*k 2"]:
     """Horizontal vectors turned by 90°."""
     return jnp.stack([-vectors[..., 1], vectors[..., 0]], axis=-1)
 
 
-def opposite(heading: Float[jax.Array, "b 2"]) -> Float[jax.Array, "b 2"]:
+def opposite(heading: Float[Array, "b 2"]) -> Float[Array, "b 2"]:
     """The headings of the opposite angles."""
     return heading * jnp.float32([[1, -1]])
 
 
-def turn(
-    vectors: Float[jax.Array, "b *n 3"], heading: Float[jax.Array, "b 2"]
-) -> Float[jax.Array, "b *n 3"]:
+def turn(vectors: Float[Array, "b *n 3"], heading: Float[Array, "b 2"]) -> Float[Array, "b *n 3"]:
     """Vectors turned about z by the heading of their row."""
     cosine, sine = _components(heading, vectors.ndim - 2)
     x, y, z = jnp.moveaxis(vectors, -1, 0)
@@ -171,20 +163,20 @@ def turn(
 
 
 def turn_windows(
-    windows: Float[jax.Array, "b n 6"], heading: Float[jax.Array, "b 2"]
-) -> Float[jax.Array, "b n 6"]:
+    windows: Float[Array, "b n 6"], heading: Float[Array, "b 2"]
+) -> Float[Array, "b n 6"]:
     """Windows turned about z: acceleration and angular rate are both vectors."""
     batch, samples, _ = windows.shape
     return turn(windows.reshape(batch, samples, 2, 3), heading).reshape(windows.shape)
 
 
 def turn_log_std(
-    log_std: Float[jax.Array, "b *n 3"], heading: Float[jax.Array, "b 2"]
-) -> Float[jax.Array, "b *n 3"]:
-    """Of the covariance diag(exp 2u) turned about z the diagonal, as log standard deviations.
+    log_std: Float[Array, "b *n 3"], heading: Float[Array, "b 2"]
+) -> Float[Array, "b *n 3"]:
+    """The diagonal of the covariance diag(exp 2u) turned about z, as log standard deviations.
 
-    In logarithms, where nothing overflows. The squares of cosine and sine are kept from 0, so that
-    the derivative is finite.
+    It is computed in logarithms, where nothing overflows. The squares of cosine and sine are kept
+    from 0, so that the derivative is finite.
     """
     squared = jnp.maximum(heading**2, jnp.float32(1e-30))
     log_cosine, log_sine = _components(jnp.log(squared), log_std.ndim - 2)
@@ -197,7 +189,7 @@ def turn_log_std(
     return 0.5 * jnp.stack(turned, axis=-1)
 
 
-def turn_prediction(prediction: Prediction, heading: Float[jax.Array, "b 2"]) -> Prediction:
+def turn_prediction(prediction: Prediction, heading: Float[Array, "b 2"]) -> Prediction:
     """The prediction turned about z, with the velocities among its diagnostics."""
     diagnostics = dict(prediction.diagnostics)
     for name, turned in (("velocity", turn), ("velocity_log_std", turn_log_std)):
@@ -211,8 +203,8 @@ def turn_prediction(prediction: Prediction, heading: Float[jax.Array, "b 2"]) ->
 
 
 def _components(
-    heading: Float[jax.Array, "b 2"], axes: int
-) -> tuple[Float[jax.Array, "b *n"], Float[jax.Array, "b *n"]]:
+    heading: Float[Array, "b 2"], axes: int
+) -> tuple[Float[Array, "b *n"], Float[Array, "b *n"]]:
     """Both columns, with so many axes of length 1 behind the batch."""
     columns = heading.reshape(-1, *[1] * axes, 2)
     return columns[..., 0], columns[..., 1]

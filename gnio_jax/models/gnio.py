@@ -3,13 +3,13 @@ ablations as options."""
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any, Literal
 
-import jax
-import jax.numpy as jnp
 from flax import linen as nn
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
+from gnio_jax.config.schema import Count, NonNegativeCount, Positive
 from gnio_jax.models.heads import (
     CalibratedUncertainty,
     ConstantUncertainty,
@@ -17,8 +17,8 @@ from gnio_jax.models.heads import (
     LinearHead,
     UncertaintyHead,
 )
+from gnio_jax.models.layers import checked_windows
 from gnio_jax.models.motion_bank import MotionBank
-from gnio_jax.models.precision import Dtype
 from gnio_jax.models.resnet import ResNet18
 from gnio_jax.types import Prediction
 
@@ -29,59 +29,55 @@ class GNIO(nn.Module):
 
     The defaults are the paper's: 4,934,153 parameters, 32,768 of them the bank. `bank_size = 0`
     leaves the bank out (h = f). Widths other than 64 scale every layer, for machines without an
-    accelerator. Two kinds of `uncertainty` are ours: "calibrated" multiplies the head's standard
+    accelerator. Two choices of `uncertainty` are ours: "calibrated" multiplies the head's standard
     deviation by one factor per axis, "constant" puts one standard deviation per axis in its place;
     both make it fit the errors on the validation split.
+
+    A network with a head of its own overrides `displacement_head` or `uncertainty_head`.
     """
 
-    width: int = 64
-    bank_size: int = 64
-    bank_heads: int = 8
-    bank_std: float = 1.0
+    width: Count = 64
+    bank_size: NonNegativeCount = 64
+    bank_std: Positive = 1.0
     head: Literal["gated", "linear"] = "gated"
     gate: Literal["tanh", "sigmoid"] = "tanh"
     scale: Literal["softplus", "pos_elu", "abs", "exp", "linear"] = "softplus"
     uncertainty: Literal["head", "calibrated", "constant"] = "head"
-    dtype: Dtype = "float32"
-
-    def __post_init__(self) -> None:
-        if self.bank_size and (8 * self.width) % self.bank_heads:
-            raise ValueError(
-                f"bank_heads must divide the {8 * self.width} features, found {self.bank_heads}"
-            )
-        super().__post_init__()
+    winograd: bool = False
 
     @nn.compact
     def __call__(
-        self, windows: Float[jax.Array, "b n 6"], train: bool = False, memory: Any = None
+        self, windows: Float[Array, "b n 6"], train: bool = False, memory: Any = None
     ) -> Prediction:
-        features = ResNet18(self.width, self.dtype, name="encoder")(
-            windows.astype(jnp.float32), train
-        )
-        h = features.mean(axis=1)
-        diagnostics = {}
+        encoder = ResNet18(self.width, self.winograd, name="encoder")
+        h, diagnostics = encoder(checked_windows(windows), train).mean(axis=1), {}
         if self.bank_size:
             context, diagnostics["attention"] = self._bank(name="bank")(h, memory)
             h = h + context
-        head = (
-            GatedHead(self.gate, self.scale, self.dtype, name="head")
-            if self.head == "gated"
-            else LinearHead(self.dtype, name="head")
-        )
-        displacement, seen = head(h)
-        match self.uncertainty:
-            case "head":
-                log_std = UncertaintyHead(self.dtype, name="uncertainty")(h)
-            case "calibrated":
-                log_std = CalibratedUncertainty(self.dtype, name="uncertainty")(h, train)
-            case "constant":
-                log_std = ConstantUncertainty(name="uncertainty")(windows.shape[0])
+        displacement, seen = self.displacement_head()(h)
+        log_std = self.uncertainty_head()(h, train)
         return Prediction(displacement, log_std, diagnostics | seen)
 
     @nn.nowrap
+    def displacement_head(self) -> nn.Module:
+        """A module named "head" that maps h (b, 8·width) to the displacement (b, 3), m, and a dict
+        of diagnostics, each with b rows."""
+        gated = partial(GatedHead, self.gate, self.scale)
+        return {"gated": gated, "linear": LinearHead}[self.head](name="head")
+
+    @nn.nowrap
+    def uncertainty_head(self) -> nn.Module:
+        """A module named "uncertainty" that maps h (b, 8·width) and `train` to the logarithms of
+        the standard deviations (b, 3), m."""
+        return {
+            "head": UncertaintyHead,
+            "calibrated": CalibratedUncertainty,
+            "constant": ConstantUncertainty,
+        }[self.uncertainty](name="uncertainty")
+
+    @nn.nowrap
     def _bank(self, name: str | None = None) -> MotionBank:
-        sizes = self.bank_size, self.bank_heads, 8 * self.width
-        return MotionBank(*sizes, self.bank_std, self.dtype, name=name)
+        return MotionBank(self.bank_size, width=8 * self.width, std=self.bank_std, name=name)
 
     @nn.nowrap
     def constants(self, variables: Any) -> dict[str, Any]:

@@ -6,10 +6,9 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 from flax import linen as nn
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from gnio_jax.models.layers import linear
-from gnio_jax.models.precision import Dtype
 
 GATES = {"tanh": jnp.tanh, "sigmoid": nn.sigmoid}
 SCALES = {
@@ -31,43 +30,34 @@ class GatedHead(nn.Module):
 
     gate: str = "tanh"
     scale: str = "softplus"
-    dtype: Dtype = "float32"
 
     @nn.compact
-    def __call__(
-        self, h: Float[jax.Array, "b d"]
-    ) -> tuple[Float[jax.Array, "b 3"], dict[str, jax.Array]]:
-        scale = SCALES[self.scale](linear(3, "scale", self.dtype)(h))
+    def __call__(self, h: Float[Array, "b d"]) -> tuple[Float[Array, "b 3"], dict[str, Array]]:
+        scale = SCALES[self.scale](linear(3, "scale")(h))
         small = nn.initializers.normal(1e-3)
-        gate = GATES[self.gate](linear(3, "gate", self.dtype, kernel_init=small)(h))
+        gate = GATES[self.gate](linear(3, "gate", kernel_init=small)(h))
         return scale * gate, {"scale": scale, "gate": gate}
 
 
 class LinearHead(nn.Module):
     """d̂ = W h + b: the ablation without a gate."""
 
-    dtype: Dtype = "float32"
-
     @nn.compact
-    def __call__(
-        self, h: Float[jax.Array, "b d"]
-    ) -> tuple[Float[jax.Array, "b 3"], dict[str, jax.Array]]:
-        return linear(3, "displacement", self.dtype)(h), {}
+    def __call__(self, h: Float[Array, "b d"]) -> tuple[Float[Array, "b 3"], dict[str, Array]]:
+        return linear(3, "displacement")(h), {}
 
 
 class UncertaintyHead(nn.Module):
     """u = W_u h + b_u, the log standard deviation per axis: Σ̂ = diag(exp 2u).
 
     Ours: kernel and bias start at zero, σ = 1 m. The likelihood's gradient holds e² exp(−2u), which
-    no bound limits where a random kernel says a small σ; one such step stays in Adam's second
+    no bound limits where a random kernel gives a small σ; one such step stays in Adam's second
     moment for thousands of steps.
     """
 
-    dtype: Dtype = "float32"
-
     @nn.compact
-    def __call__(self, h: Float[jax.Array, "b d"]) -> Float[jax.Array, "b 3"]:
-        return _log_std(self.dtype)(h)
+    def __call__(self, h: Float[Array, "b d"], train: bool) -> Float[Array, "b 3"]:
+        return linear(3, "log_std", kernel_init=nn.initializers.zeros)(h)
 
 
 class CalibratedUncertainty(nn.Module):
@@ -75,43 +65,36 @@ class CalibratedUncertainty(nn.Module):
     does not see.
 
     The factor (ours) lies among the `batch_stats` as its logarithm. It is set after every
-    validation, so that the squared errors on the validation split are those that the standard
-    deviations announce (`training.validation.calibrated`).
+    validation, so that the squared errors on the validation split agree with the predicted
+    standard deviations.
     """
 
-    dtype: Dtype = "float32"
-
     @nn.compact
-    def __call__(self, h: Float[jax.Array, "b d"], train: bool) -> Float[jax.Array, "b 3"]:
-        log_std = _log_std(self.dtype)(h)
+    def __call__(self, h: Float[Array, "b d"], train: bool) -> Float[Array, "b 3"]:
+        log_std = linear(3, "log_std", kernel_init=nn.initializers.zeros)(h)
         factor = self.variable("batch_stats", "log_factor", jnp.zeros, (3,), jnp.float32)
         return log_std if train else log_std + factor.value[None]
-
-
-def _log_std(dtype: Dtype) -> nn.Dense:
-    return linear(3, "log_std", dtype, kernel_init=nn.initializers.zeros)
 
 
 class ConstantUncertainty(nn.Module):
     """The log standard deviation of a network that has none of its own: one constant per axis, the
     same for every window.
 
-    Not a parameter: it lies among the `batch_stats` and is set to the errors on the validation
-    split after every epoch (`training.validation.calibrated`).
+    Not a parameter: it lies among the `batch_stats` and is set after every validation, so that it
+    agrees with the squared errors on the validation split.
     """
 
     @nn.compact
-    def __call__(self, windows: int) -> Float[jax.Array, "b 3"]:
+    def __call__(self, h: Float[Array, "b *d"], train: bool) -> Float[Array, "b 3"]:
         constant = self.variable("batch_stats", "log_std", jnp.zeros, (3,), jnp.float32)
-        return jnp.broadcast_to(constant.value[None], (windows, 3))
+        return jnp.broadcast_to(constant.value[None], (h.shape[0], 3))
 
 
-def to_axes(output: Float[jax.Array, "b k"]) -> Float[jax.Array, "b 3"]:
-    """The displacement of a head with two or three outputs: one that is horizontal only says 0 of
-    the vertical."""
+def to_axes(output: Float[Array, "b k"]) -> Float[Array, "b 3"]:
+    """The displacement of a head with two or three outputs; with two, its vertical is 0."""
     return jnp.pad(output, ((0, 0), (0, 3 - output.shape[-1])))
 
 
-def root_mean_square(log_std: Float[jax.Array, "b n 3"]) -> Float[jax.Array, "b 3"]:
+def root_mean_square(log_std: Float[Array, "b n 3"]) -> Float[Array, "b 3"]:
     """log √(mean over n of exp 2u), without overflow."""
     return 0.5 * (jax.nn.logsumexp(2 * log_std, axis=1) - jnp.log(jnp.float32(log_std.shape[1])))

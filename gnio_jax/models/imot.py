@@ -4,22 +4,21 @@ arXiv 2412.12190), from its text."""
 from __future__ import annotations
 
 from functools import partial
+from typing import Literal
 
-import jax
 import jax.numpy as jnp
 from flax import linen as nn
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
+from gnio_jax.config.schema import Count, Positive, Probability
 from gnio_jax.models.heads import ConstantUncertainty, to_axes
 from gnio_jax.models.layers import (
     attend,
     attention,
-    check_dropout,
-    check_output_dim,
+    checked_windows,
     layer_norm,
     linear,
 )
-from gnio_jax.models.precision import Dtype
 from gnio_jax.types import Prediction
 
 TREND_SPANS = (9, 3)
@@ -57,77 +56,54 @@ class IMoT(nn.Module):
     `particle_weights` (b, p), which sum to 1.
     """
 
-    encoder_layers: int = 4
-    decoder_layers: int = 4
-    ffn_ratio: float = 4.58
-    heads: int = 8
-    particles: int = 128
-    dropout: float = 0.1
-    output_dim: int = 3
-    dtype: Dtype = "float32"
-
-    def __post_init__(self) -> None:
-        check_dropout(self.dropout)
-        check_output_dim(self.output_dim)
-        for name in ("encoder_layers", "decoder_layers", "heads", "particles"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, found {getattr(self, name)!r}")
-        if not self.ffn_ratio > 0:
-            raise ValueError(f"ffn_ratio must be positive, found {self.ffn_ratio!r}")
-        super().__post_init__()
+    encoder_layers: Count = 4
+    decoder_layers: Count = 4
+    ffn_ratio: Positive = 4.58
+    heads: Count = 8
+    particles: Count = 128
+    dropout: Probability = 0.1
+    output_dim: Literal[2, 3] = 3
 
     @nn.compact
-    def __call__(self, windows: Float[jax.Array, "b n 6"], train: bool = False) -> Prediction:
-        batch, samples, _ = windows.shape
+    def __call__(self, windows: Float[Array, "b n 6"], train: bool = False) -> Prediction:
+        channels = checked_windows(windows).transpose(0, 2, 1)
+        batch, _, samples = channels.shape
         heads, ffn = head_count(samples, self.heads), max(round(self.ffn_ratio * samples), 1)
-        tokens, positions = windows.astype(jnp.float32).transpose(0, 2, 1), None
+        tokens = positions = channels  # the first layer replaces both
         for layer in range(self.encoder_layers):
+            encoder = EncoderLayer(heads, ffn, self.dropout, name=f"encoder_{layer + 1}")
+            tokens, positions = encoder(channels, train)
             # The three parts of a channel become one series again, which a layer that changes
             # nothing leaves as it was.
-            channels = (
-                tokens
-                if layer == 0
-                else tokens.reshape(batch, MODALITIES, PARTS, 3, samples)
-                .sum(axis=2)
-                .reshape(batch, 6, -1)
-                / 2
-            )
-            name = f"encoder_{layer + 1}"
-            encoder = EncoderLayer(heads, ffn, self.dropout, self.dtype, name=name)
-            tokens, positions = encoder(channels, train)
+            parts = tokens.reshape(batch, MODALITIES, PARTS, 3, samples)
+            channels = parts.sum(axis=2).reshape(batch, 6, samples) / 2
 
         start = self.param(
             "particles", nn.initializers.normal(1.0), (self.particles, self.output_dim), jnp.float32
         )
         particles = jnp.broadcast_to(start[None], (batch, *start.shape))
         content = jnp.zeros((batch, self.particles, samples), jnp.float32)
-        locate = Perceptron((samples, samples), self.dtype, name="particle_positions")
-        refine = Perceptron((samples, self.output_dim), self.dtype, name="refinement")
+        locate = Perceptron((samples, samples), name="particle_positions")
+        refine = Perceptron((samples, self.output_dim), name="refinement")
         for layer in range(self.decoder_layers):
             where = locate(sinusoids_of(particles, samples))
-            name = f"decoder_{layer + 1}"
-            decoder = DecoderLayer(heads, ffn, self.dropout, self.dtype, name=name)
+            decoder = DecoderLayer(heads, ffn, self.dropout, name=f"decoder_{layer + 1}")
             content = decoder(content, where, tokens, positions, train)
             particles = particles + refine(content)
-        weights = AttentionScores(self.dtype, name="scores")(content)
+        weights = AttentionScores(name="scores")(content)
         velocity = jnp.einsum("bp,bpk->bk", weights, particles)
-        return Prediction(
-            to_axes(velocity),
-            ConstantUncertainty(name="uncertainty")(batch),
-            {
-                "particles": particles,
-                "particle_weights": weights,
-            },
-        )
+        log_std = ConstantUncertainty(name="uncertainty")(windows, train)
+        diagnostics = {"particles": particles, "particle_weights": weights}
+        return Prediction(to_axes(velocity), log_std, diagnostics)
 
 
 class IMoTText(IMoT):
     """iMoT by its text: two encoder and two decoder layers, 4 T hidden units. 7,137,482 parameters
     for T = 200 and two axes."""
 
-    encoder_layers: int = 2
-    decoder_layers: int = 2
-    ffn_ratio: float = 4.0
+    encoder_layers: Count = 2
+    decoder_layers: Count = 2
+    ffn_ratio: Positive = 4.0
 
 
 class EncoderLayer(nn.Module):
@@ -141,24 +117,21 @@ class EncoderLayer(nn.Module):
     heads: int
     ffn: int
     dropout: float
-    dtype: Dtype = "float32"
 
     @nn.compact
     def __call__(
-        self, channels: Float[jax.Array, "b c n"], train: bool
-    ) -> tuple[Float[jax.Array, "b k n"], Float[jax.Array, "b k n"]]:
+        self, channels: Float[Array, "b c n"], train: bool
+    ) -> tuple[Float[Array, "b k n"], Float[Array, "b k n"]]:
         drop = nn.Dropout(self.dropout, deterministic=not train)
         x = decouple(channels)
         samples = x.shape[-1]
-        e = (
-            Perceptron((samples, samples), self.dtype, name="positions")(x)
-            * sinusoids(jnp.arange(x.shape[1], dtype=jnp.float32), samples)[None]
-        )
-        y = attention(self.heads, "attention", self.dtype)(x + e, x + e, x)
-        spatial = SpatialBlock(self.dtype, name="attention_spatial")(x)
+        places = sinusoids(jnp.arange(x.shape[1], dtype=jnp.float32), samples)
+        e = Perceptron((samples, samples), name="positions")(x) * places[None]
+        y = attention(self.heads, "attention")(x + e, x + e, x)
+        spatial = SpatialBlock(name="attention_spatial")(x)
         x = layer_norm("attention_norm")(spatial + drop(y))
-        y = Perceptron((self.ffn, samples), self.dtype, name="ffn")(x)
-        spatial = SpatialBlock(self.dtype, name="ffn_spatial")(x)
+        y = Perceptron((self.ffn, samples), name="ffn")(x)
+        spatial = SpatialBlock(name="ffn_spatial")(x)
         return layer_norm("ffn_norm")(spatial + drop(y)), e
 
 
@@ -170,21 +143,16 @@ class SpatialBlock(nn.Module):
     1×1 convolution, GELU.
     """
 
-    dtype: Dtype = "float32"
-
     @nn.compact
-    def __call__(self, x: Float[jax.Array, "b k n"]) -> Float[jax.Array, "b k n"]:
-        batch, tokens, samples = x.shape
+    def __call__(self, x: Float[Array, "b k n"]) -> Float[Array, "b k n"]:
+        features = 2 * x.shape[-1]
         y = jnp.concatenate(jnp.split(x, MODALITIES, axis=1), axis=2)
         padded = jnp.pad(y, ((0, 0), (1, 1), (0, 0)))
-        y = linear(2 * samples, "conv3", self.dtype)(
-            jnp.concatenate([padded[:, :-2], y, padded[:, 2:]], axis=2)
-        )
+        three = jnp.concatenate([padded[:, :-2], y, padded[:, 2:]], axis=2)
+        y = linear(features, "conv3")(three)
         y = y * nn.sigmoid(y.mean(axis=1, keepdims=True))
-        y = nn.gelu(linear(2 * samples, "conv1", self.dtype)(y), approximate=False)
-        return jnp.concatenate(jnp.split(y, MODALITIES, axis=2), axis=1).reshape(
-            batch, tokens, samples
-        )
+        y = nn.gelu(linear(features, "conv1")(y), approximate=False)
+        return jnp.concatenate(jnp.split(y, MODALITIES, axis=2), axis=1)
 
 
 class DecoderLayer(nn.Module):
@@ -199,38 +167,29 @@ class DecoderLayer(nn.Module):
     heads: int
     ffn: int
     dropout: float
-    dtype: Dtype = "float32"
 
     @nn.compact
     def __call__(
         self,
-        content: Float[jax.Array, "b p n"],
-        where: Float[jax.Array, "b p n"],
-        tokens: Float[jax.Array, "b k n"],
-        positions: Float[jax.Array, "b k n"],
+        content: Float[Array, "b p n"],
+        where: Float[Array, "b p n"],
+        tokens: Float[Array, "b k n"],
+        positions: Float[Array, "b k n"],
         train: bool,
-    ) -> Float[jax.Array, "b p n"]:
+    ) -> Float[Array, "b p n"]:
         drop = nn.Dropout(self.dropout, deterministic=not train)
         samples = content.shape[-1]
-        x = layer_norm("self_norm")(
-            content + drop(ParticleAttention(self.heads, self.dtype, name="self")(content, where))
-        )
+        own = ParticleAttention(self.heads, name="self")(content, where)
+        x = layer_norm("self_norm")(content + drop(own))
         found = []
-        for name, token, position in zip(
-            ("accel", "gyro"),
-            jnp.split(tokens, MODALITIES, axis=1),
-            jnp.split(positions, MODALITIES, axis=1),
-            strict=True,
-        ):
-            query, key = (
-                jnp.concatenate([x, where], axis=-1),
-                jnp.concatenate([token, position], axis=-1),
-            )
-            y = attention(self.heads, name, self.dtype, samples)(query, key, token)
+        halves = (jnp.split(both, MODALITIES, axis=1) for both in (tokens, positions))
+        for name, token, position in zip(("accel", "gyro"), *halves, strict=True):
+            query = jnp.concatenate([x, where], axis=-1)
+            key = jnp.concatenate([token, position], axis=-1)
+            y = attention(self.heads, name, samples)(query, key, token)
             found.append(layer_norm(f"{name}_norm")(x + drop(y)))
-        fusion = Perceptron((samples, samples), self.dtype, name="fusion")
-        x = fusion(jnp.concatenate(found, axis=-1))
-        y = Perceptron((self.ffn, samples), self.dtype, name="ffn")(x)
+        x = Perceptron((samples, samples), name="fusion")(jnp.concatenate(found, axis=-1))
+        y = Perceptron((self.ffn, samples), name="ffn")(x)
         return layer_norm("ffn_norm")(x + drop(y))
 
 
@@ -239,14 +198,13 @@ class ParticleAttention(nn.Module):
     projected contents."""
 
     heads: int
-    dtype: Dtype = "float32"
 
     @nn.compact
     def __call__(
-        self, content: Float[jax.Array, "b p n"], where: Float[jax.Array, "b p n"]
-    ) -> Float[jax.Array, "b p n"]:
+        self, content: Float[Array, "b p n"], where: Float[Array, "b p n"]
+    ) -> Float[Array, "b p n"]:
         features = content.shape[-1]
-        project = partial(linear, features, dtype=self.dtype)
+        project = partial(linear, features)
         query, key = (
             project(f"{name}_content")(content) + project(f"{name}_position")(where)
             for name in ("query", "key")
@@ -254,7 +212,7 @@ class ParticleAttention(nn.Module):
         query, key, value = (
             x.reshape(*x.shape[:2], self.heads, -1) for x in (query, key, project("value")(content))
         )
-        found = attend(query, key, value, dtype=self.dtype)
+        found = attend(query, key, value)
         return project("output")(found.reshape(content.shape))
 
 
@@ -262,16 +220,10 @@ class AttentionScores(nn.Module):
     """Weights of the particles: for every feature two linear layers from all particles to all, the
     mean over features, softmax."""
 
-    dtype: Dtype = "float32"
-
-    dtype: Dtype = "float32"
-
     @nn.compact
-    def __call__(self, content: Float[jax.Array, "b p n"]) -> Float[jax.Array, "b p"]:
+    def __call__(self, content: Float[Array, "b p n"]) -> Float[Array, "b p"]:
         particles = content.shape[1]
-        scores = Perceptron((particles, particles), self.dtype, name="mlp")(
-            content.transpose(0, 2, 1)
-        )
+        scores = Perceptron((particles, particles), name="mlp")(content.transpose(0, 2, 1))
         return nn.softmax(scores.mean(axis=1), axis=-1)
 
 
@@ -279,16 +231,15 @@ class Perceptron(nn.Module):
     """Linear, ReLU, linear."""
 
     features: tuple[int, int]
-    dtype: Dtype = "float32"
 
     @nn.compact
-    def __call__(self, x: Float[jax.Array, "*b n"]) -> Float[jax.Array, "*b d"]:
+    def __call__(self, x: Float[Array, "*b n"]) -> Float[Array, "*b d"]:
         inside, outside = self.features
-        hidden = nn.relu(linear(inside, "hidden", self.dtype)(x))
-        return linear(outside, "output", self.dtype)(hidden)
+        hidden = nn.relu(linear(inside, "hidden")(x))
+        return linear(outside, "output")(hidden)
 
 
-def decouple(channels: Float[jax.Array, "b c n"]) -> Float[jax.Array, "b k n"]:
+def decouple(channels: Float[Array, "b c n"]) -> Float[Array, "b k n"]:
     """Per modality its three channels, their trends MA3(MA9(x)) and their seasons x − trend: (b, 6,
     n) to (b, 18, n)."""
     trend = channels
@@ -296,14 +247,11 @@ def decouple(channels: Float[jax.Array, "b c n"]) -> Float[jax.Array, "b k n"]:
         trend = moving_average(trend, span)
     parts = jnp.stack([channels, trend, channels - trend], axis=1)
     batch, _, _, samples = parts.shape
-    return (
-        parts.reshape(batch, PARTS, MODALITIES, 3, samples)
-        .swapaxes(1, 2)
-        .reshape(batch, PARTS * MODALITIES * 3, samples)
-    )
+    by_modality = parts.reshape(batch, PARTS, MODALITIES, 3, samples).swapaxes(1, 2)
+    return by_modality.reshape(batch, PARTS * MODALITIES * 3, samples)
 
 
-def moving_average(x: Float[jax.Array, "b c n"], span: int) -> Float[jax.Array, "b c n"]:
+def moving_average(x: Float[Array, "b c n"], span: int) -> Float[Array, "b c n"]:
     """Centred mean over an odd number of samples; the first and the last sample go on beyond the
     ends (ours)."""
     padded = jnp.pad(x, ((0, 0), (0, 0), (span // 2, span // 2)), mode="edge")
@@ -311,7 +259,7 @@ def moving_average(x: Float[jax.Array, "b c n"], span: int) -> Float[jax.Array, 
     return sum(terms[1:], terms[0]) / span
 
 
-def sinusoids(x: Float[jax.Array, "*b"], features: int) -> Float[jax.Array, "*b d"]:
+def sinusoids(x: Float[Array, "*b"], features: int) -> Float[Array, "*b d"]:
     """sin(x ω_i), then cos(x ω_i), ω from 1 down towards 1e-4 in equal ratios; an odd last feature
     is 0."""
     half = features // 2
@@ -320,7 +268,7 @@ def sinusoids(x: Float[jax.Array, "*b"], features: int) -> Float[jax.Array, "*b 
     return _padded(jnp.concatenate([jnp.sin(angles), jnp.cos(angles)], axis=-1), features)
 
 
-def sinusoids_of(points: Float[jax.Array, "b p k"], features: int) -> Float[jax.Array, "b p d"]:
+def sinusoids_of(points: Float[Array, "b p k"], features: int) -> Float[Array, "b p d"]:
     """Every coordinate's sinusoids side by side, 2π times the coordinate; features that do not
     divide evenly are 0."""
     each = 2 * (features // (2 * points.shape[-1]))
@@ -333,5 +281,5 @@ def head_count(features: int, most: int) -> int:
     return max(heads for heads in range(1, most + 1) if features % heads == 0)
 
 
-def _padded(x: Float[jax.Array, "*b k"], features: int) -> Float[jax.Array, "*b d"]:
+def _padded(x: Float[Array, "*b k"], features: int) -> Float[Array, "*b d"]:
     return jnp.pad(x, [(0, 0)] * (x.ndim - 1) + [(0, features - x.shape[-1])])

@@ -15,9 +15,8 @@ import jax
 import jax.numpy as jnp
 from flax import linen as nn
 
+from gnio_jax.models.layers import EPSILON
 from gnio_jax.types import Prediction
-
-EPSILON = 1e-5
 
 
 class InferenceVariables(NamedTuple):

@@ -1,92 +1,107 @@
-"""Layers that several networks share, in float32, and checks of the options that they share."""
+"""Layers that several networks share, in float32 and with PyTorch's constants."""
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Any
 
+import chex
 import jax
 import jax.numpy as jnp
 from flax import linen as nn
-from jaxtyping import Bool, Float
+from jaxtyping import Array, Bool, Float
 
-from gnio_jax.models.precision import Dtype, dot_general, einsum
+from gnio_jax.models.convolution import convolve, convolve_forward, convolve_winograd
+
+MOMENTUM = 0.9
+"""Share of batch normalisation's running statistics that a training step keeps (PyTorch's momentum
+0.1 is its complement)."""
+EPSILON = 1e-5
+"""Added to the variance in batch and layer normalisation."""
+
+FLOAT32: dict[str, Any] = {"dtype": jnp.float32, "param_dtype": jnp.float32}
+he_normal_fan_out = nn.initializers.variance_scaling(2.0, "fan_out", "normal")
 
 
-def linear(features: int, name: str, dtype: Dtype, **options: Any) -> nn.Dense:
-    """A linear layer; `dtype` is that of its product's factors."""
-    return nn.Dense(
-        features,
-        dtype=jnp.float32,
-        param_dtype=jnp.float32,
-        dot_general=partial(dot_general, dtype=dtype),
-        name=name,
-        **options,
+def checked_windows(windows: Array) -> Float[Array, "b n 6"]:
+    """The windows in float32. Raises `AssertionError` for another shape than (b, n, 6), which would
+    show itself deep in a convolution otherwise."""
+    chex.assert_shape(windows, (None, None, 6))
+    return windows.astype(jnp.float32)
+
+
+def linear(features: int, name: str, **options: Any) -> nn.Dense:
+    """A linear layer."""
+    return nn.Dense(features, name=name, **FLOAT32, **options)
+
+
+def conv_norm(
+    x: Float[Array, "b n c"],
+    features: int,
+    size: int,
+    stride: int,
+    train: bool,
+    name: str,
+    **options: Any,
+) -> Float[Array, "b m d"]:
+    """A convolution, called `name`, and its batch normalisation, whose name has "bn" in the place
+    of "conv": so `models.inference` finds them. To be called from within a module."""
+    x = conv(features, size, stride, train, name, **options)(x)
+    norm = nn.BatchNorm(
+        use_running_average=not train,
+        momentum=MOMENTUM,
+        epsilon=EPSILON,
+        name=name.replace("conv", "bn"),
+        **FLOAT32,
     )
+    return norm(x)
+
+
+def conv(features: int, size: int, stride: int, train: bool, name: str, **options: Any) -> nn.Conv:
+    """A convolution without bias and with explicit symmetric padding ("SAME" pads differently at
+    stride 2). `options`: those of `nn.Conv`, and `winograd`, whether it trains by Winograd's
+    algorithm where that is quicker."""
+    in_training = convolve_winograd if options.pop("winograd", False) else convolve
+    options.setdefault("kernel_init", he_normal_fan_out)
+    options.setdefault("conv_general_dilated", in_training if train else convolve_forward)
+    options |= {"use_bias": False, "name": name} | FLOAT32
+    return nn.Conv(features, (size,), (stride,), [((size - 1) // 2, (size - 1) // 2)], **options)
 
 
 def layer_norm(name: str) -> nn.LayerNorm:
-    """Layer normalisation with PyTorch's ε."""
-    return nn.LayerNorm(epsilon=1e-5, dtype=jnp.float32, param_dtype=jnp.float32, name=name)
+    """Layer normalisation."""
+    return nn.LayerNorm(epsilon=EPSILON, name=name, **FLOAT32)
 
 
 def attend(
-    query: Float[jax.Array, "b n h d"],
-    key: Float[jax.Array, "b m h d"],
-    value: Float[jax.Array, "b m h d"],
-    mask: Bool[jax.Array, "1 1 n m"] | None = None,
-    *,
-    dtype: Dtype = "float32",
-) -> Float[jax.Array, "b n h d"]:
-    """Scaled dot-product attention in the place of Flax's: with few features a head, passes over
-    the scores cost more than products.
+    query: Float[Array, "b n h d"],
+    key: Float[Array, "b m h d"],
+    value: Float[Array, "b m h d"],
+    mask: Bool[Array, "1 1 n m"] | None = None,
+    **_: object,
+) -> Float[Array, "b n h d"]:
+    """Scaled dot-product attention in the place of Flax's, with fewer passes over the scores: with
+    few features a head they cost more than the products.
 
-    So there are fewer: the softmax divides by its sum after meeting the values, and heads lie
-    beside windows.
+    The softmax divides by its sum after the product with the values, and heads are windows of the
+    batch.
     """
     batch, samples, heads, size = query.shape
     query, key, value = (
         x.swapaxes(1, 2).reshape(batch * heads, -1, size) for x in (query, key, value)
     )
-    scores = einsum("bnd,bmd->bnm", query / jnp.sqrt(jnp.float32(size)), key, dtype)
+    scores = jnp.einsum("bnd,bmd->bnm", query / jnp.sqrt(jnp.float32(size)), key)
     if mask is not None:
         scores = jnp.where(mask[0], scores, -jnp.inf)
     weights = jnp.exp(scores - jax.lax.stop_gradient(scores.max(axis=-1, keepdims=True)))
-    context = einsum("bnm,bmd->bnd", weights, value, dtype) / weights.sum(axis=-1, keepdims=True)
+    context = jnp.einsum("bnm,bmd->bnd", weights, value) / weights.sum(axis=-1, keepdims=True)
     return context.reshape(batch, heads, samples, size).swapaxes(1, 2)
 
 
 def attention(
-    heads: int, name: str, dtype: Dtype, features: int | None = None
+    heads: int, name: str, features: int | None = None
 ) -> nn.MultiHeadDotProductAttention:
-    """Multi-head attention by `attend`, as wide inside as its query; `features` come out, the
-    query's number of them where it is None."""
-
-    def attention_fn(
-        query: jax.Array, key: jax.Array, value: jax.Array, mask: Any = None, **_: object
-    ) -> jax.Array:
-        return attend(query, key, value, mask, dtype=dtype)
-
-    product = partial(dot_general, dtype=dtype)
+    """Multi-head attention by `attend`. It is as wide inside as its query and has `features`
+    outputs, by default as many as the query."""
     return nn.MultiHeadDotProductAttention(
-        heads,
-        out_features=features,
-        dtype=jnp.float32,
-        param_dtype=jnp.float32,
-        attention_fn=attention_fn,
-        qkv_dot_general=product,
-        out_dot_general=product,
-        name=name,
+        heads, out_features=features, attention_fn=attend, name=name, **FLOAT32
     )
-
-
-def check_dropout(share: Any) -> None:
-    """`ValueError` unless it is a share that leaves something."""
-    if not 0 <= share < 1:
-        raise ValueError(f"dropout must be at least 0 and below 1, found {share!r}")
-
-
-def check_output_dim(output_dim: object) -> None:
-    """`ValueError` unless the network is asked for two axes or three."""
-    if output_dim not in (2, 3):
-        raise ValueError(f"output_dim must be 2 or 3, found {output_dim!r}")

@@ -1,16 +1,14 @@
-"""The Motion Bank: a learnt matrix of motion prototypes that each window's feature queries (paper
-§III-C)."""
+"""The Motion Bank: a trainable matrix of motion prototypes that the feature of each window queries
+(paper §III-C)."""
 
 from __future__ import annotations
 
-from functools import partial
-
-import jax
+import chex
 import jax.numpy as jnp
 from flax import linen as nn
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
-from gnio_jax.models.precision import Dtype, dot_general, einsum
+from gnio_jax.models.layers import FLOAT32
 
 # PyTorch's `MultiheadAttention`: query, key and value are one (3d, d) matrix to its Xavier-uniform
 # start, so that their bound is √(6 / 4d) = √(3 · 0.5 / d), and the output is a linear layer with
@@ -33,50 +31,35 @@ class MotionBank(nn.Module):
     heads: int = 8
     width: int = 512
     std: float = 1.0
-    dtype: Dtype = "float32"
 
     def setup(self) -> None:
         shape = (self.heads, self.width // self.heads)
-        product = partial(dot_general, dtype=self.dtype)
         self.prototypes = self.param(
             "prototypes", nn.initializers.normal(self.std), (self.size, self.width), jnp.float32
         )
         self.query, self.key, self.value = (
-            nn.DenseGeneral(
-                shape,
-                kernel_init=stacked_xavier,
-                dtype=jnp.float32,
-                param_dtype=jnp.float32,
-                dot_general=product,
-            )
-            for _ in range(3)
+            nn.DenseGeneral(shape, kernel_init=stacked_xavier, **FLOAT32) for _ in range(3)
         )
         self.output = nn.DenseGeneral(
-            self.width,
-            axis=(-2, -1),
-            kernel_init=fan_in_uniform,
-            dtype=jnp.float32,
-            param_dtype=jnp.float32,
-            dot_general=product,
+            self.width, axis=(-2, -1), kernel_init=fan_in_uniform, **FLOAT32
         )
 
     def __call__(
         self,
-        feature: Float[jax.Array, "b d"],
-        memory: tuple[Float[jax.Array, "h m k"], Float[jax.Array, "h k m"]] | None = None,
-    ) -> tuple[Float[jax.Array, "b d"], Float[jax.Array, "b h m"]]:
+        feature: Float[Array, "b d"],
+        memory: tuple[Float[Array, "h m k"], Float[Array, "h k m"]] | None = None,
+    ) -> tuple[Float[Array, "b d"], Float[Array, "b h m"]]:
         """Context (b, d) and attention weights (b, heads, m) of each feature; `memory` is that of
         an earlier call, if there was one."""
+        chex.assert_shape(feature, (None, self.width))
         query, (key, value) = self.query(feature), self.memory() if memory is None else memory
-        scores = einsum("bhk,hmk->bhm", query, key, self.dtype) / jnp.sqrt(
-            jnp.float32(self.width // self.heads)
-        )
+        size = jnp.float32(self.width // self.heads)
+        scores = jnp.einsum("bhk,hmk->bhm", query, key) / jnp.sqrt(size)
         attention = nn.softmax(scores, axis=-1)
-        return self.output(einsum("bhm,hkm->bhk", attention, value, self.dtype)), attention
+        return self.output(jnp.einsum("bhm,hkm->bhk", attention, value)), attention
 
-    def memory(self) -> tuple[Float[jax.Array, "h m k"], Float[jax.Array, "h k m"]]:
+    def memory(self) -> tuple[Float[Array, "h m k"], Float[Array, "h k m"]]:
         """Keys (heads, m, d / heads) and values (heads, d / heads, m) of the prototypes: as the
         products with one window read them."""
-        return self.key(self.prototypes).transpose(1, 0, 2), self.value(self.prototypes).transpose(
-            1, 2, 0
-        )
+        keys, values = self.key(self.prototypes), self.value(self.prototypes)
+        return keys.transpose(1, 0, 2), values.transpose(1, 2, 0)

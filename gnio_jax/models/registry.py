@@ -1,11 +1,16 @@
-"""Names of networks to Flax modules; every one maps windows (b, n, 6) to a `Prediction`."""
+"""Names of networks to Flax modules; every one maps windows (b, n, 6) to a `Prediction`.
+
+The fields of a module are its options, their types the choices (`Literal`) or bounds (those of
+`gnio_jax.config.schema`) of each, and their defaults the published values.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import difflib
 import functools
-from typing import Any, get_args
+from collections.abc import Iterable
+from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
 import jax
 import jax.numpy as jnp
@@ -13,12 +18,12 @@ from flax import linen as nn
 from jaxtyping import PRNGKeyArray
 
 from gnio_jax.errors import InputError
+from gnio_jax.models.convolution import winograd_pays
 from gnio_jax.models.ctin import CTIN
 from gnio_jax.models.deepils import DeepILS
 from gnio_jax.models.equivariance import CanonicalFrame, FourHeadings
 from gnio_jax.models.gnio import GNIO
 from gnio_jax.models.imot import IMoT, IMoTText
-from gnio_jax.models.precision import Dtype
 from gnio_jax.models.ronin import RoNINResNet
 from gnio_jax.models.tlio import TLIO
 
@@ -31,6 +36,7 @@ _MODELS: dict[str, type[nn.Module]] = {
     "ronin_resnet": RoNINResNet,
     "tlio": TLIO,
 }
+_PUBLISHED = frozenset(_MODELS)
 
 _EQUIVARIANT: dict[str, type[nn.Module]] = {
     "four_headings": FourHeadings,
@@ -43,44 +49,73 @@ def names() -> list[str]:
     return sorted(_MODELS)
 
 
-def create(
-    name: str, equivariance: str = "none", dtype: str = "float32", **options: object
-) -> nn.Module:
+def register(name: str, network: type[nn.Module]) -> None:
+    """Make a network of one's own known to `create`, and so to configurations and command lines.
+
+    `network(**options).apply(variables, windows, train=False)` must give a `Prediction`. Its fields
+    are its options. A second registration replaces the first. Raises `InputError` for the name of a
+    network of this package.
+    """
+    if name in _PUBLISHED:
+        raise InputError(f"model '{name}'", "is a network of gnio-jax", "choose another name")
+    _MODELS[name] = network
+
+
+def options(name: str) -> dict[str, Any]:
+    """The options of the network `name` and their types. Raises `InputError` for an unknown
+    name."""
+    if name not in _MODELS:
+        raise InputError(f"model '{name}'", "unknown", _remedy(name, names(), "known models"))
+    types = get_type_hints(_MODELS[name], include_extras=True)
+    fields = [field.name for field in dataclasses.fields(_MODELS[name])]
+    own = {option: types[option] for option in fields if option not in ("parent", "name")}
+    return own | {"equivariance": Literal["none", *_EQUIVARIANT]}
+
+
+def create(name: str, **given: Any) -> nn.Module:
     """The network `name` with its options set; its `apply(variables, windows)` returns a
     `Prediction`.
 
-    `equivariance` is "none", "four_headings" or "canonical_frame" (`models.equivariance`), `dtype`
-    the type of the factors of its products (`models.precision`). Raises `InputError` for an unknown
-    name or option, naming the known ones, or options that do not fit together.
+    `equivariance` is an option of all: "none", "four_headings" or "canonical_frame"
+    (`models.equivariance`). `winograd`, how convolutions are computed in training, is chosen for
+    the machine that this runs on unless it is given (`models.convolution`). Raises `InputError` for
+    an unknown name or option, naming the known ones, a value that is not one of an option's choices
+    or beyond its bounds, or options that do not fit together.
     """
-    if name not in _MODELS:
-        raise InputError(f"model '{name}'", "unknown", f"known models: {', '.join(names())}")
-    known = [
-        field.name
-        for field in dataclasses.fields(_MODELS[name])
-        if field.name not in ("parent", "name")
-    ] + ["equivariance"]
-    for option in options:
+    place, known = f"model '{name}'", options(name)
+    for option, value in given.items():
         if option not in known:
-            close = difflib.get_close_matches(option, known, n=1)
-            raise InputError(
-                f"model '{name}'",
-                f"unknown option '{option}'",
-                (f"did you mean '{close[0]}'? " if close else "")
-                + f"known options: {', '.join(known)}",
-            )
-    if equivariance != "none" and equivariance not in _EQUIVARIANT:
-        known = ", ".join(["none", *_EQUIVARIANT])
-        problem = f"unknown equivariance '{equivariance}'"
-        raise InputError(f"model '{name}'", problem, f"known ones: {known}")
-    if dtype not in get_args(Dtype):
-        known = ", ".join(get_args(Dtype))
-        raise InputError(f"model '{name}'", f"unknown dtype '{dtype}'", f"known ones: {known}")
+            remedy = _remedy(option, known, "known options")
+            raise InputError(place, f"unknown option '{option}'", remedy)
+        _check(place, option, known[option], value)
+    if "winograd" in known:
+        given.setdefault("winograd", winograd_pays())
+    equivariance = given.pop("equivariance", "none")
     try:
-        network = _MODELS[name](dtype=dtype, **options)
+        network = _MODELS[name](**given)
     except ValueError as error:
-        raise InputError(f"model '{name}'", str(error)) from None
-    return network if equivariance == "none" else _EQUIVARIANT[equivariance](network, dtype)
+        raise InputError(place, str(error)) from None
+    return network if equivariance == "none" else _EQUIVARIANT[equivariance](network)
+
+
+def _check(place: str, option: str, kind: Any, value: Any) -> None:
+    """Raise `InputError` unless the value is one of the choices of the type `kind`, or within its
+    bounds."""
+    if get_origin(kind) is Literal and value not in get_args(kind):
+        raise InputError(place, f"{option} is {value!r}", _remedy(value, get_args(kind), "choices"))
+    if get_origin(kind) is Annotated:
+        number, *bounds = get_args(kind)
+        fits = isinstance(value, (int, float) if number is float else number)
+        for bound in bounds:
+            if not fits or not bound.holds(value):
+                raise InputError(place, f"{option} {bound.problem}, found {value!r}")
+
+
+def _remedy(given: object, known: Iterable[Any], title: str) -> str:
+    """The known names, the closest to what was given first."""
+    known = [str(each) for each in known]
+    close = difflib.get_close_matches(str(given), known, n=1)
+    return (f"did you mean '{close[0]}'? " if close else "") + f"{title}: {', '.join(known)}"
 
 
 def initialise(model: nn.Module, key: PRNGKeyArray, window: int = 200) -> Any:

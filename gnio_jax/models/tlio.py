@@ -3,17 +3,39 @@ fully connected head that it shares."""
 
 from __future__ import annotations
 
-import jax
-import jax.numpy as jnp
 from flax import linen as nn
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
-from gnio_jax.models.layers import check_dropout, linear
-from gnio_jax.models.precision import Dtype
-from gnio_jax.models.resnet import ResNet18, batch_norm, conv
+from gnio_jax.config.schema import Count, Probability
+from gnio_jax.models.layers import checked_windows, conv_norm, linear
+from gnio_jax.models.resnet import ResNet18
 from gnio_jax.types import Prediction
 
 SMALL = nn.initializers.normal(0.01)
+
+
+class TLIO(nn.Module):
+    """Windows [accel, gyro] in the gravity-aligned frame to displacement and log standard
+    deviation, each by a head of its own.
+
+    The encoder of `gnio_jax.models.resnet`, not pooled. 5,424,646 parameters for windows of 200
+    samples, 5,031,430 for 100. Training needs the random stream `dropout`. TLIO's own channel order
+    is [gyro, accel]; `gnio_jax.interop` reads its weights.
+    """
+
+    width: Count = 64
+    dropout: Probability = 0.5
+    winograd: bool = False
+
+    @nn.compact
+    def __call__(self, windows: Float[Array, "b n 6"], train: bool = False) -> Prediction:
+        encoder = ResNet18(self.width, self.winograd, name="encoder")
+        features = encoder(checked_windows(windows), train)
+        displacement, log_std = (
+            FullyConnectedHead(self.width, 3, self.dropout, name=name)(features, train)
+            for name in ("displacement", "log_std")
+        )
+        return Prediction(displacement, log_std)
 
 
 class FullyConnectedHead(nn.Module):
@@ -29,43 +51,12 @@ class FullyConnectedHead(nn.Module):
     width: int
     outputs: int
     dropout: float
-    dtype: Dtype = "float32"
 
     @nn.compact
-    def __call__(self, features: Float[jax.Array, "b m d"], train: bool) -> Float[jax.Array, "b k"]:
-        neck = conv(2 * self.width, 1, 1, train, "neck_conv", self.dtype)
-        x = batch_norm(train, "neck_bn")(neck(features))
+    def __call__(self, features: Float[Array, "b m d"], train: bool) -> Float[Array, "b k"]:
+        x = conv_norm(features, 2 * self.width, 1, 1, train, "neck_conv")
         x = x.transpose(0, 2, 1).reshape(x.shape[0], -1)
         for name in ("fc1", "fc2"):
-            x = nn.relu(linear(8 * self.width, name, self.dtype, kernel_init=SMALL)(x))
+            x = nn.relu(linear(8 * self.width, name, kernel_init=SMALL)(x))
             x = nn.Dropout(self.dropout, deterministic=not train)(x)
-        return linear(self.outputs, "fc3", self.dtype, kernel_init=SMALL)(x)
-
-
-class TLIO(nn.Module):
-    """Windows [accel, gyro] in the gravity-aligned frame to displacement and log standard
-    deviation, each by a head of its own.
-
-    The encoder of `gnio_jax.models.resnet`, not pooled. 5,424,646 parameters for windows of 200
-    samples, 5,031,430 for 100. Training needs the random stream `dropout`. TLIO's own channel order
-    is [gyro, accel]; `gnio_jax.interop` reads its weights.
-    """
-
-    width: int = 64
-    dropout: float = 0.5
-    dtype: Dtype = "float32"
-
-    def __post_init__(self) -> None:
-        check_dropout(self.dropout)
-        super().__post_init__()
-
-    @nn.compact
-    def __call__(self, windows: Float[jax.Array, "b n 6"], train: bool = False) -> Prediction:
-        features = ResNet18(self.width, self.dtype, name="encoder")(
-            windows.astype(jnp.float32), train
-        )
-        displacement, log_std = (
-            FullyConnectedHead(self.width, 3, self.dropout, self.dtype, name=name)(features, train)
-            for name in ("displacement", "log_std")
-        )
-        return Prediction(displacement, log_std)
+        return linear(self.outputs, "fc3", kernel_init=SMALL)(x)

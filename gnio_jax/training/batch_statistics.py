@@ -12,7 +12,7 @@ from jaxtyping import Int, PRNGKeyArray
 
 from gnio_jax.config import TrainConfig
 from gnio_jax.data.windows import WindowSource
-from gnio_jax.models.resnet import MOMENTUM
+from gnio_jax.models.layers import MOMENTUM
 from gnio_jax.scaling.devices import kept_everywhere
 from gnio_jax.training.step import TrainState, apply_training, draw_windows
 

@@ -30,7 +30,6 @@ from gnio_jax import config as configuration
 from gnio_jax import models
 from gnio_jax.config import TrainConfig
 from gnio_jax.errors import InputError
-from gnio_jax.models.precision import Dtype
 from gnio_jax.scaling import devices
 from gnio_jax.scaling.processes import all_or_none, from_first, is_first, several, text_from_first
 from gnio_jax.training import learnt as learning
@@ -82,26 +81,13 @@ class Run(NamedTuple):
 
 
 def create_model(config: TrainConfig) -> nn.Module:
-    """The network that `config.model` describes; what that leaves open is the network's own.
-
-    In float32, as it is validated and evaluated: `config.model.dtype` is for the steps of training
-    (`create_trained_model`).
-    """
-    return _create_model(config, "float32")
-
-
-def create_trained_model(config: TrainConfig) -> nn.Module:
-    """The same network as the steps of training apply it: with products in `config.model.dtype`."""
-    return _create_model(config, config.model.dtype)
-
-
-def _create_model(config: TrainConfig, dtype: Dtype) -> nn.Module:
+    """The network that `config.model` describes; what that leaves open is the network's own."""
     options = {
         key: value
         for key, value in vars(config.model).items()
-        if key not in ("name", "dtype") and value is not None
+        if key != "name" and value is not None
     }
-    return models.create(config.model.name, dtype=dtype, **options)
+    return models.create(config.model.name, **options)
 
 
 def exists(workdir: Path, which: Which = "latest") -> bool:

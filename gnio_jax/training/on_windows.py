@@ -19,7 +19,7 @@ from gnio_jax.reporting import Reporter
 from gnio_jax.scaling import devices
 from gnio_jax.training import optimizer as optimizers
 from gnio_jax.training.batch_statistics import estimate_statistics, normalises, statistics_order
-from gnio_jax.training.checkpoint import Run, create_model, create_trained_model
+from gnio_jax.training.checkpoint import Run, create_model
 from gnio_jax.training.initial import with_weights
 from gnio_jax.training.kinds import (
     Keys,
@@ -58,9 +58,6 @@ class WindowTraining(NamedTuple):
 
     config: TrainConfig
     model: nn.Module
-    """The network as it is validated."""
-    trained_model: nn.Module
-    """The same network, with products of `config.model.dtype`."""
     optimizer: optax.GradientTransformationExtraArgs
     schedule: optax.Schedule
     source: windows.WindowSource
@@ -135,7 +132,7 @@ class WindowTraining(NamedTuple):
                 jnp.int32(part.count),
                 jnp.float32(learning_rate_factor),
                 self.keys.step,
-                model=self.trained_model,
+                model=self.model,
                 optimizer=self.optimizer,
                 config=compiled(self.config),
                 steps_per_epoch=self.steps_per_epoch,
@@ -215,7 +212,6 @@ def set_up(config: TrainConfig, reporter: Reporter, workers: int = 1) -> WindowT
     return WindowTraining(
         config,
         model,
-        create_trained_model(config),
         optimizers.create(config.optim, config.loss, steps_per_epoch),
         optimizers.schedule(config.optim, steps_per_epoch),
         source,

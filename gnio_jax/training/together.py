@@ -169,7 +169,7 @@ class SideBySide(NamedTuple):
     ) -> tuple[TrainState, list[Progress]]:
         training = self._first
         fixed = {
-            "model": training.trained_model,
+            "model": training.model,
             "optimizer": training.optimizer,
             "config": compiled(training.config),
             "steps_per_epoch": training.steps_per_epoch,

@@ -57,10 +57,10 @@ def mistake(monkeypatch, capsys, tmp_path, *arguments):
             ["--model.gate", "relu"],
             "--model.gate: must be one of tanh, sigmoid or None, found 'relu'",
         ),
-        (["--model.name", "gnoi"], "model 'gnoi': unknown; known models: ctin, deepils, gnio"),
+        (["--model.name", "gnoi"], "model 'gnoi': unknown; did you mean 'gnio'?"),
         (
-            ["--model.bank-heads", "7"],
-            "model 'gnio': bank_heads must divide the 512 features, found 7",
+            ["--model.name", "ctin", "--model.width", "90"],
+            "model 'ctin': width must be even and a multiple of the 8 heads, found 90",
         ),
         (["--data.rate", "0"], "field 'data.rate' must be positive"),
         (["--data.stride-seconds", "0.3"], "field 'data.stride_seconds' must divide the window"),

@@ -24,7 +24,7 @@ from tests.support.filter_settings import changed
 
 CONFIG = TrainConfig(
     data=DataConfig(rate=20.0, stride_seconds=0.25),
-    model=ModelConfig(name="gnio", width=2, bank_size=3, bank_heads=2),
+    model=ModelConfig(name="gnio", width=2, bank_size=3),
     filter=changed(
         noise={"std_factor": (1.5, 1.0, 1.0)}, start={"velocity": 0.3, "gyro_bias": 1e-3}
     ),

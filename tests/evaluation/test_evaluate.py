@@ -22,7 +22,7 @@ from tests.support.filter_settings import changed
 ROOT = Path(__file__).parents[2]
 TRAINED = TrainConfig(
     data=DataConfig(rate=50.0),
-    model=ModelConfig(width=2, bank_size=4, bank_heads=2),
+    model=ModelConfig(width=2, bank_size=4),
     filter=changed(start={"velocity": 0.7}),
 )
 

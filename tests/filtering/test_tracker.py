@@ -459,7 +459,7 @@ def test_from_rest(built, tmp_path):
 ROOT = Path(__file__).parents[2]
 TRAINED = configuration.TrainConfig(
     data=configuration.DataConfig(rate=50.0),
-    model=configuration.ModelConfig(width=2, bank_size=4, bank_heads=2),
+    model=configuration.ModelConfig(width=2, bank_size=4),
 )
 
 

@@ -12,7 +12,7 @@ import pytest
 from gnio_jax import interop, models
 from gnio_jax.commands import console
 from gnio_jax.commands import interop as interop_command
-from gnio_jax.config import FilterSettings
+from gnio_jax.config import DataConfig, FilterSettings
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import filter_setup
 from gnio_jax.training import checkpoint
@@ -209,7 +209,7 @@ def test_without_pytorch_it_says_how_to_get_it(tmp_path, monkeypatch):
     (tmp_path / "a.pth").write_bytes(b"weights")
     with pytest.raises(
         InputError,
-        match=r"a\.pth: reading a file of PyTorch needs PyTorch; pip install 'gnio-jax\[torch\]'$",
+        match=r"a\.pth: needs the package torch; pip install 'gnio-jax\[torch\]'$",
     ):
         interop.load_tlio_state_dict(tmp_path / "a.pth")
 
@@ -305,7 +305,7 @@ def command(monkeypatch, *arguments):
 
 def test_a_run_is_made_of_them(file, tmp_path, monkeypatch, capsys, loaded):
     command(monkeypatch, file, tmp_path / "run", "--stride-seconds", "0.1")
-    assert f"python evaluate.py --workdir {tmp_path / 'run'}" in capsys.readouterr().out
+    assert f"gnio evaluate --workdir {tmp_path / 'run'}" in capsys.readouterr().out
     run = checkpoint.load_run(tmp_path / "run")
     assert (run.config.model.name, run.config.dataset) == ("tlio", "tlio")
     assert (run.config.data.rate, run.config.data.window, run.config.data.stride) == (
@@ -320,9 +320,19 @@ def test_a_run_is_made_of_them(file, tmp_path, monkeypatch, capsys, loaded):
     with pytest.raises(SystemExit) as left:  # a second time
         command(monkeypatch, file, tmp_path / "run")
     assert left.value.code == 2
-    assert (
-        capsys.readouterr().err == f"{tmp_path / 'run'}: holds a run already; name another folder\n"
-    )
+    assert capsys.readouterr().err == f"{tmp_path / 'run'}: is there already; name another folder\n"
+
+
+def test_a_run_appears_whole_or_not_at_all(file, tmp_path, monkeypatch):
+    """The checkpoint fails: no config.yaml without it, and the name is free again."""
+
+    def full(*_):
+        raise OSError("No space left on device")
+
+    monkeypatch.setattr(checkpoint, "write_best", full)
+    with pytest.raises(OSError, match="No space"):
+        interop.write_run(file, tmp_path / "run", DataConfig())
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(

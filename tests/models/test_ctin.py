@@ -1,41 +1,21 @@
 """CTIN against its description: sizes block by block, a plain NumPy forward pass of the whole
 network, causality."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from gnio_jax import models
-from gnio_jax.errors import InputError
 from gnio_jax.models import ctin, heads
+from tests.support import networks
 from tests.support.compiling import quick
+from tests.support.networks import count, drawn
 
-SMALL = {"width": 12, "encoder_width": 8, "ffn": 10, "heads": 2, "decoder_layers": 2}
-
-
-def count(tree):
-    return sum(int(np.prod(leaf.shape)) for leaf in jax.tree.leaves(tree))
-
-
-def shapes(samples=200, **options):
-    return models.variable_shapes(models.create("ctin", **options), samples)
-
-
-def drawn(tree, seed=3):
-    """Variables far from their neutral start, statistics and biases too, so that nothing can be
-    left out unnoticed."""
-    rng = np.random.default_rng(seed)
-
-    def draw(path, leaf):
-        if path[-1].key in ("var", "scale"):
-            return jnp.asarray(rng.uniform(0.5, 1.5, leaf.shape), jnp.float32)
-        return jnp.asarray(
-            rng.standard_normal(leaf.shape) * (1.0 if path[-1].key == "positions" else 0.4),
-            jnp.float32,
-        )
-
-    return jax.tree.map_with_path(draw, tree)
+SMALL = networks.SMALL["ctin"]
+shapes = functools.partial(networks.shapes, "ctin")
 
 
 def test_parameters_block_by_block():
@@ -202,7 +182,7 @@ def numpy_forward(variables, windows):
 @pytest.mark.parametrize("samples, output_dim", [(20, 3), (11, 2)])
 def test_forward_against_numpy_frozen_or_not(samples, output_dim):
     model = models.create("ctin", output_dim=output_dim, **SMALL)
-    variables = drawn(shapes(samples, output_dim=output_dim, **SMALL))
+    variables = drawn(shapes(samples, output_dim=output_dim, **SMALL), size=0.4)
     windows = jax.random.normal(jax.random.key(1), (2, samples, 6), jnp.float32)
     apply, (velocity, log_std) = quick(model.apply), numpy_forward(variables, windows)
     missing = ((0, 0), (0, 0), (0, 3 - output_dim))
@@ -213,12 +193,6 @@ def test_forward_against_numpy_frozen_or_not(samples, output_dim):
             and np.ptp(values[..., :output_dim], axis=1).min() > 0.05
         )
     frozen = models.inference_variables(model, variables)
-    assert not frozen.constants
-    assert all(
-        (x == 0).all()
-        for path, x in jax.tree.leaves_with_path(frozen.variables["batch_stats"])
-        if path[-1].key == "mean"
-    )
     for given in (variables, frozen.variables):
         found = apply(given, windows)
         np.testing.assert_allclose(found.diagnostics["velocity"], velocity, rtol=1e-3, atol=1e-4)
@@ -241,7 +215,7 @@ def test_a_decoded_step_depends_on_no_later_one():
     x, memory = np.random.default_rng(0).standard_normal((2, 1, 9, 12)).astype(np.float32)
     key = jax.random.key(0)
     init = lambda key, x, memory: layer.init(key, x, memory, False)  # noqa: E731
-    variables = drawn(jax.eval_shape(init, key, x, memory))
+    variables = drawn(jax.eval_shape(init, key, x, memory), size=0.4)
     program = quick(lambda x, memory: layer.apply(variables, x, memory, False))
     apply = lambda x, memory: np.asarray(program(x, memory))  # noqa: E731
     later, last = (np.float32(np.arange(9) == row)[None, :, None] for row in (5, 8))
@@ -258,59 +232,3 @@ def test_no_step_is_surer_than_the_window_says():
     np.testing.assert_allclose(
         found, [[0.5 * np.log((np.exp(-4) + np.exp(2)) / 2), 0, 90 - 0.5 * np.log(2)]], rtol=1e-6
     )
-
-
-def test_every_parameter_is_trained_in_float32_and_dropout_is_drawn():
-    model, variables = models.create("ctin", **SMALL), drawn(shapes(12, **SMALL))
-    windows = np.random.default_rng(1).standard_normal((4, 12, 6))
-    windows = jnp.asarray(windows, jnp.float32)
-    assert {leaf.dtype for leaf in jax.tree.leaves(shapes())} == {jnp.dtype("float32")}
-    still = jax.eval_shape(model.apply, variables, jnp.ones((1, 12, 6), jnp.float64))
-    assert {leaf.dtype for leaf in jax.tree.leaves(still)} == {jnp.dtype("float32")}
-
-    def loss(params, key):
-        given = {"params": params, "batch_stats": variables["batch_stats"]}
-        prediction, _ = model.apply(
-            given, windows, train=True, mutable=["batch_stats"], rngs={"dropout": key}
-        )
-        d, task = prediction.diagnostics, prediction.diagnostics["task_log_std"]
-        velocity = jnp.sum((d["velocity"] - 1) ** 2, axis=(1, 2)) * jnp.exp(-2 * task[:, 0])
-        return jnp.sum(prediction.log_std) + jnp.sum(velocity) + jnp.sum(
-            task
-        ), prediction.displacement
-
-    gradient = quick(jax.grad(loss, has_aux=True))
-    (grads, one), (others, other) = (
-        jax.device_get(gradient(variables["params"], jax.random.key(seed))) for seed in (0, 1)
-    )
-    for (path, leaf), another in zip(
-        jax.tree.leaves_with_path(grads), jax.tree.leaves(others), strict=True
-    ):
-        assert leaf.dtype == jnp.float32 and np.isfinite(leaf).all(), path
-        if [key.key for key in path[-2:]] == ["key", "bias"]:
-            continue  # one number added to all scores: a softmax does not see it
-        trained = np.abs(leaf).max() + np.abs(another).max()
-        if path[-1].key == "task_log_std":
-            assert abs(float(leaf[0])) > 0 and leaf[1] == len(
-                windows
-            )  # the second is but a summand of this loss
-        assert trained > 1e-6, path
-    assert np.abs(one - other).max() > 1e-3
-
-
-@pytest.mark.parametrize(
-    "options, problem",
-    [
-        ({"heads": 0}, "heads must be at least 1, found 0"),
-        ({"width": 90}, "width must be even and a multiple of the 8 heads, found 90"),
-        (
-            {"encoder_width": 20},
-            "encoder_width must be a multiple of the 8 heads and of 4, found 20",
-        ),
-        ({"encoder_dropout": -0.1}, "dropout must be at least 0 and below 1, found -0.1"),
-        ({"output_dim": 4}, "output_dim must be 2 or 3, found 4"),
-    ],
-)
-def test_options_that_cannot_be_are_refused(options, problem):
-    with pytest.raises(InputError, match=f"model 'ctin': {problem}"):
-        models.create("ctin", **options)

@@ -9,35 +9,12 @@ import numpy as np
 import pytest
 
 from gnio_jax import models
-from gnio_jax.errors import InputError
 from gnio_jax.models import deepils
+from tests.support import networks
 from tests.support.compiling import quick
+from tests.support.networks import count, drawn
 
-
-def count(tree):
-    return sum(int(np.prod(leaf.shape)) for leaf in jax.tree.leaves(tree))
-
-
-def shapes(samples=200, **options):
-    return models.variable_shapes(models.create("deepils", **options), samples)
-
-
-def drawn(samples, seed=3, **options):
-    """Variables far from their neutral start, statistics and biases too, so that nothing can be
-    left out unnoticed."""
-    rng = np.random.default_rng(seed)
-
-    def draw(path, leaf):
-        name = path[-1].key
-        if name in ("var", "scale"):
-            return jnp.asarray(rng.uniform(0.5, 1.5, leaf.shape), jnp.float32)
-        if name in ("mean", "bias", "log_std"):
-            return jnp.asarray(0.3 * rng.standard_normal(leaf.shape), jnp.float32)
-        return jnp.asarray(
-            rng.standard_normal(leaf.shape) * np.prod(leaf.shape[:-1]) ** -0.5, leaf.dtype
-        )
-
-    return jax.tree.map_with_path(draw, shapes(samples, **options))
+shapes = functools.partial(networks.shapes, "deepils")
 
 
 @pytest.mark.parametrize("output_dim, total", [(2, 2_290_226), (3, 2_290_739)])
@@ -146,7 +123,7 @@ def numpy_forward(variables, windows):
 @pytest.mark.parametrize("samples, output_dim", [(100, 2), (200, 3)])
 def test_forward_against_numpy_frozen_or_not(samples, output_dim):
     model = models.create("deepils", width=8, output_dim=output_dim)
-    variables = drawn(samples, width=8, output_dim=output_dim)
+    variables = drawn(shapes(samples, width=8, output_dim=output_dim))
     windows = jax.random.normal(jax.random.key(1), (2, samples, 6), jnp.float32)
     apply, wanted = quick(model.apply), numpy_forward(variables, windows)
     found = apply(variables, windows)
@@ -157,48 +134,8 @@ def test_forward_against_numpy_frozen_or_not(samples, output_dim):
     np.testing.assert_array_equal(found.log_std, np.stack([constant, constant]))
 
     frozen = models.inference_variables(model, variables)
-    blocks = [
-        x
-        for x in jax.tree.leaves(
-            frozen.variables["batch_stats"], is_leaf=lambda x: "mean" in x or "log_std" in x
-        )
-        if "mean" in x
-    ]
-    assert len(blocks) == 1 + 16 + 3 + 1 and all((block["mean"] == 0).all() for block in blocks)
-    assert not frozen.constants
-    np.testing.assert_allclose(
-        apply(frozen.variables, windows).displacement[:, :output_dim], wanted, rtol=2e-4, atol=2e-5
-    )
-
-
-def test_every_parameter_is_trained_in_float32_and_dropout_is_drawn():
-    model, variables = models.create("deepils", width=4), drawn(64, width=4)
-    windows = np.random.default_rng(1).standard_normal((4, 64, 6))
-    windows = jnp.asarray(windows, jnp.float32)
-    assert {leaf.dtype for leaf in jax.tree.leaves(shapes())} == {jnp.dtype("float32")}
-    still = jax.eval_shape(model.apply, variables, jnp.ones((1, 64, 6), jnp.float64))
-    assert still.displacement.dtype == still.log_std.dtype == jnp.float32
-
-    def loss(params, key):
-        given = {"params": params, "batch_stats": variables["batch_stats"]}
-        prediction, changed = model.apply(
-            given, windows, train=True, mutable=["batch_stats"], rngs={"dropout": key}
-        )
-        return jnp.sum(prediction.displacement**2), (prediction.displacement, changed)
-
-    gradient = quick(jax.grad(loss, has_aux=True))
-    (grads, (one, changed)), (others, (other, _)) = (
-        jax.device_get(gradient(variables["params"], jax.random.key(seed))) for seed in (0, 1)
-    )
-    for (path, leaf), another in zip(
-        jax.tree.leaves_with_path(grads), jax.tree.leaves(others), strict=True
-    ):
-        assert leaf.dtype == jnp.float32 and np.isfinite(leaf).all(), path
-        assert np.abs(leaf).max() + np.abs(another).max() > 1e-6, path
-    assert np.abs(one - other).max() > 1e-3
-    before, after = variables["batch_stats"], changed["batch_stats"]
-    np.testing.assert_array_equal(before["uncertainty"]["log_std"], after["uncertainty"]["log_std"])
-    assert np.abs(before["stem_bn"]["mean"] - after["stem_bn"]["mean"]).min() > 0
+    frozen = apply(frozen.variables, windows).displacement[:, :output_dim]
+    np.testing.assert_allclose(frozen, wanted, rtol=2e-4, atol=2e-5)
 
 
 def test_the_gradient_of_a_maximum_goes_to_one_place():
@@ -209,15 +146,3 @@ def test_the_gradient_of_a_maximum_goes_to_one_place():
         found, slope = quick(lambda x, f=largest, g=gradient: (f(x), g(x)))(x)
         np.testing.assert_array_equal(found, np.max(x, axis=axis))
         np.testing.assert_array_equal(slope[0], first)
-
-
-@pytest.mark.parametrize(
-    "options, problem",
-    [
-        ({"output_dim": 1}, "output_dim must be 2 or 3, found 1"),
-        ({"dropout": 1.0}, "dropout must be at least 0 and below 1, found 1.0"),
-    ],
-)
-def test_options_that_cannot_be_are_refused(options, problem):
-    with pytest.raises(InputError, match=f"model 'deepils': {problem}"):
-        models.create("deepils", **options)

@@ -6,24 +6,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax import lax
 
 from gnio_jax import models
-from gnio_jax.errors import InputError
-from gnio_jax.models import resnet
+from gnio_jax.models.convolution import convolve
 from gnio_jax.models.motion_bank import MotionBank
+from tests.support import networks
 from tests.support.compiling import quick
+from tests.support.networks import count, drawn
+
+shapes = functools.partial(networks.shapes, "gnio")
 
 
-def count(tree):
-    return sum(int(np.prod(leaf.shape)) for leaf in jax.tree.leaves(tree))
-
-
-def shapes(**options):
-    return models.variable_shapes(models.create("gnio", **options))
-
-
-SMALL = models.create("gnio", width=2, bank_size=4, bank_heads=2)
+SMALL = models.create("gnio", width=2, bank_size=4)
 
 
 @pytest.fixture(scope="module")
@@ -178,29 +172,9 @@ def numpy_forward(variables, windows):
     return tuple(map(np.array, (displacement, log_std, gates, attention)))
 
 
-def drawn(tree):
-    """Variables whose statistics, scales and biases are away from their neutral start, so that none
-    can be left out unnoticed."""
-    rng = np.random.default_rng(3)
-
-    def draw(path, leaf):
-        name = path[-1].key
-        if name in ("var", "scale"):
-            values = 1 + 0.1 * rng.random(leaf.shape)
-        elif leaf.ndim == 1 or name == "bias":
-            values = 0.1 * rng.random(leaf.shape)
-        elif name == "prototypes":
-            values = rng.standard_normal(leaf.shape)
-        else:
-            values = rng.standard_normal(leaf.shape) * np.prod(leaf.shape[:-1]) ** -0.5
-        return jnp.asarray(values, jnp.float32)
-
-    return jax.tree.map_with_path(draw, tree)
-
-
 @pytest.mark.parametrize("samples", [100, 200])
 def test_forward_against_numpy(samples):
-    options = {"width": 8, "bank_size": 5, "bank_heads": 4}
+    options = {"width": 8, "bank_size": 5}
     model, variables = models.create("gnio", **options), drawn(shapes(**options))
     windows = np.random.default_rng(1).standard_normal((2, samples, 6)).astype(np.float32)
     found = quick(model.apply)(variables, windows)
@@ -209,49 +183,6 @@ def test_forward_against_numpy(samples):
     np.testing.assert_allclose(found.log_std, log_std, rtol=2e-4, atol=2e-5)
     np.testing.assert_allclose(found.diagnostics["gate"], gate, rtol=2e-4, atol=2e-5)
     np.testing.assert_allclose(found.diagnostics["attention"], attention, rtol=2e-4, atol=2e-6)
-
-
-@pytest.mark.parametrize(
-    "size, stride, length", [(7, 2, 200), (3, 1, 25), (3, 2, 25), (1, 2, 13), (3, 2, 50)]
-)
-def test_convolution_and_its_gradients_against_xla(size, stride, length):
-    random = np.random.default_rng(0)
-    x, kernel = random.standard_normal((3, length, 4)), random.standard_normal((size, 4, 5))
-    x, kernel = jnp.asarray(x, jnp.float32), jnp.asarray(kernel, jnp.float32)
-    padding = [((size - 1) // 2, (size - 1) // 2)]
-    axes = ("NWC", "WIO", "NWC")
-
-    def oracle(x, k):
-        return lax.conv_general_dilated(x, k, (stride,), padding, dimension_numbers=axes)
-
-    def ours(x, k):
-        return resnet.convolve(x, k, (stride,), padding)
-
-    shape = jax.eval_shape(oracle, x, kernel).shape
-    weight = jnp.asarray(random.standard_normal(shape), jnp.float32)
-
-    def with_gradient(function, x, kernel):
-        value, pull_back = jax.vjp(function, x, kernel)
-        return value, *pull_back(weight)
-
-    both = quick(lambda *given: [with_gradient(function, *given) for function in (ours, oracle)])
-    found, wanted = both(x, kernel)
-    np.testing.assert_allclose(found[0], wanted[0], rtol=1e-5, atol=1e-5)
-    for a, b in zip(found[1:], wanted[1:], strict=True):
-        np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4)
-
-
-@pytest.mark.parametrize("length", [100, 50, 25, 13])
-def test_max_pool_against_torch_convention(length):
-    x = -1 - np.random.default_rng(0).random((2, length, 3)).astype(
-        np.float32
-    )  # negative: a zero padding would show
-    rows = range(0, length + 2 - 3 + 1, 2)
-    padded = np.pad(x, ((0, 0), (1, 1), (0, 0)), constant_values=-np.inf)
-    np.testing.assert_array_equal(
-        quick(resnet.max_pool)(jnp.asarray(x)),
-        np.stack([padded[:, r : r + 3].max(axis=1) for r in rows], axis=1),
-    )
 
 
 SCALES = {
@@ -309,19 +240,12 @@ def test_gradient_is_finite_where_everything_is_zero(options):
 def test_training_mode_updates_the_statistics_with_momentum(fresh):
     windows = noise(3.0)
     _, changed = trained_once(fresh, windows)
-    stem = quick(lambda x, kernel: resnet.convolve(x, kernel, (2,), [(3, 3)]))
+    stem = quick(lambda x, kernel: convolve(x, kernel, (2,), [(3, 3)]))
     kernel = fresh["params"]["encoder"]["stem_conv"]["kernel"]
     expected = 0.1 * np.asarray(stem(windows, kernel)).mean(axis=(0, 1))
     np.testing.assert_allclose(
         changed["batch_stats"]["encoder"]["stem_bn"]["mean"], expected, rtol=1e-4, atol=1e-5
     )
-
-
-def test_parameters_and_outputs_are_float32_whatever_comes_in(fresh):
-    assert {leaf.dtype for leaf in jax.tree.leaves(fresh)} == {jnp.dtype("float32")}
-    windows = jax.ShapeDtypeStruct((1, 64, 6), jnp.float64)
-    prediction = jax.eval_shape(SMALL.apply, fresh, windows)
-    assert prediction.displacement.dtype == prediction.log_std.dtype == jnp.float32
 
 
 def test_keys_and_values_are_projected_once_per_call():
@@ -360,49 +284,9 @@ def test_keys_and_values_are_projected_once_per_call():
     assert flops(1) - per_window == pytest.approx(2 * 2 * 64 * 512 * 512, rel=0.05)
 
 
-def test_unknown_names_are_told_the_known_ones():
-    with pytest.raises(InputError, match=r"model 'gnoi': unknown; known models: .*gnio"):
-        models.create("gnoi")
-    with pytest.raises(InputError, match=r"unknown option 'bank_sise'; did you mean 'bank_size'\?"):
-        models.create("gnio", bank_sise=3)
-
-
-@pytest.mark.parametrize("size,stride", [(7, 2), (3, 2), (3, 1), (1, 2)])
-def test_both_convolutions_are_one_function(size, stride):
-    """Values, forward and reverse derivatives, against plain NumPy and against each other."""
-    rng = np.random.default_rng(0)
-    x, kernel = rng.normal(size=(2, 11, 3)), rng.normal(size=(size, 3, 4))
-    padding = [((size - 1) // 2,) * 2]
-    padded = np.pad(x, ((0, 0), padding[0], (0, 0)))
-    wanted = np.stack(
-        [
-            np.einsum("bkc,kcd->bd", padded[:, i : i + size], kernel)
-            for i in range(0, padded.shape[1] - size + 1, stride)
-        ],
-        axis=1,
-    )
-    found = {}
-    for function in (resnet.convolve, resnet.convolve_forward):
-
-        def apply(x, kernel, function=function):
-            return function(x, kernel, (stride,), padding)
-
-        @quick
-        def with_derivatives(x, kernel, apply=apply):
-            weights = np.random.default_rng(1).normal(size=wanted.shape)
-            value, forward = jax.jvp(apply, (x, kernel), (x[::-1], kernel[::-1]))
-            weighted = jax.grad(lambda x, kernel: jnp.sum(weights * apply(x, kernel)), (0, 1))
-            return value, (forward, *weighted(x, kernel))
-
-        value, found[function] = with_derivatives(x, kernel)
-        np.testing.assert_allclose(value, wanted, atol=1e-12)
-    for one, other in zip(*found.values(), strict=True):
-        np.testing.assert_allclose(one, other, atol=1e-12)
-
-
 def test_first_parameters_are_those_of_flax_and_another_seed_compiles_nothing(fresh, caplog):
     def drawn(seed):
-        model = models.create("gnio", width=2, bank_size=4, bank_heads=2)
+        model = models.create("gnio", width=2, bank_size=4)
         return models.initialise(model, jax.random.key(seed), 64)
 
     variables = fresh

@@ -1,6 +1,8 @@
 """iMoT against its description: sizes block by block, a plain NumPy forward pass of the whole
 network, its decoupler."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,35 +10,13 @@ import pytest
 from scipy.special import erf
 
 from gnio_jax import models
-from gnio_jax.errors import InputError
 from gnio_jax.models import imot
+from tests.support import networks
 from tests.support.compiling import quick
+from tests.support.networks import count, drawn
 
-SMALL = {"encoder_layers": 2, "decoder_layers": 2, "ffn_ratio": 1.5, "heads": 4, "particles": 5}
-
-
-def count(tree):
-    return sum(int(np.prod(leaf.shape)) for leaf in jax.tree.leaves(tree))
-
-
-def shapes(samples=200, name="imot", **options):
-    return models.variable_shapes(models.create(name, **options), samples)
-
-
-def drawn(tree, seed=3):
-    """Variables far from their neutral start, biases too, so that nothing can be left out
-    unnoticed."""
-    rng = np.random.default_rng(seed)
-
-    def draw(path, leaf):
-        if path[-1].key == "scale":
-            return jnp.asarray(rng.uniform(0.5, 1.5, leaf.shape), jnp.float32)
-        return jnp.asarray(
-            rng.standard_normal(leaf.shape) * (1.0 if path[-1].key == "particles" else 0.3),
-            jnp.float32,
-        )
-
-    return jax.tree.map_with_path(draw, tree)
+SMALL = networks.SMALL["imot"]
+shapes = functools.partial(networks.shapes, "imot")
 
 
 def layer_sizes(t, ffn):
@@ -58,7 +38,7 @@ def layer_sizes(t, ffn):
     "name, layers, ffn, total", [("imot", 4, 916, 14_492_810), ("imot_text", 2, 800, 7_137_482)]
 )
 def test_parameters_of_the_publication_and_of_its_text(name, layers, ffn, total):
-    params = shapes(name=name, output_dim=2)["params"]
+    params = networks.shapes(name, output_dim=2)["params"]
     assert count(params) == total
     encoder, decoder = layer_sizes(200, ffn)
     for layer in range(1, layers + 1):
@@ -69,7 +49,7 @@ def test_parameters_of_the_publication_and_of_its_text(name, layers, ffn, total)
     assert count(params["particle_positions"]) == 2 * (200 * 200 + 200)
     assert count(params["refinement"]) == 200 * 200 + 200 + 200 * 2 + 2
     assert count(params["scores"]) == 2 * (128 * 128 + 128)
-    assert count(shapes(name=name)["params"]) == total + 128 + 201  # a third axis
+    assert count(networks.shapes(name)["params"]) == total + 128 + 201  # a third axis
 
 
 def test_a_window_of_100_samples_has_heads_that_divide_it():
@@ -239,7 +219,7 @@ def numpy_forward(variables, windows, heads):
 @pytest.mark.parametrize("samples, output_dim", [(20, 3), (14, 2)])
 def test_forward_against_numpy(samples, output_dim):
     model = models.create("imot", output_dim=output_dim, **SMALL)
-    variables = drawn(shapes(samples, output_dim=output_dim, **SMALL))
+    variables = drawn(shapes(samples, output_dim=output_dim, **SMALL), size=0.3)
     windows = jax.random.normal(jax.random.key(1), (2, samples, 6), jnp.float32)
     found = quick(model.apply)(variables, windows)
     velocity, particles, weights = numpy_forward(
@@ -255,61 +235,3 @@ def test_forward_against_numpy(samples, output_dim):
     )
     constant = variables["batch_stats"]["uncertainty"]["log_std"]
     np.testing.assert_array_equal(found.log_std, np.stack([constant, constant]))
-
-
-def test_every_parameter_that_can_be_is_trained_in_float32_and_dropout_is_drawn():
-    model, variables = models.create("imot", **SMALL), drawn(shapes(12, **SMALL))
-    windows = np.random.default_rng(1).standard_normal((4, 12, 6))
-    windows = jnp.asarray(windows, jnp.float32)
-    assert {leaf.dtype for leaf in jax.tree.leaves(shapes())} == {jnp.dtype("float32")}
-    still = jax.eval_shape(model.apply, variables, jnp.ones((1, 12, 6), jnp.float64))
-    assert {leaf.dtype for leaf in jax.tree.leaves(still)} == {jnp.dtype("float32")}
-
-    def loss(params, key):
-        given = {"params": params, "batch_stats": variables["batch_stats"]}
-        prediction, _ = model.apply(
-            given, windows, train=True, mutable=["batch_stats"], rngs={"dropout": key}
-        )
-        return jnp.sum((prediction.displacement - 1) ** 2), prediction.displacement
-
-    gradient = quick(jax.grad(loss, has_aux=True))
-    (grads, one), (others, other) = (
-        jax.device_get(gradient(variables["params"], jax.random.key(seed))) for seed in (0, 1)
-    )
-    for (path, leaf), another in zip(
-        jax.tree.leaves_with_path(grads), jax.tree.leaves(others), strict=True
-    ):
-        assert leaf.dtype == jnp.float32 and np.isfinite(leaf).all(), path
-        names = [key.key for key in path]
-        trained = np.abs(leaf).max() + np.abs(another).max()
-        if names[:2] == ["decoder_1", "self"] and names[2:] not in (
-            ["value", "bias"],
-            ["output", "bias"],
-            ["output", "kernel"],
-        ):
-            assert trained < 1e-5, (
-                path
-            )  # all contents are zero at first: whom a particle attends to makes no difference
-        elif names[-2:] != ["key", "bias"] and names[-2:] not in (
-            ["key_content", "bias"],
-            ["key_position", "bias"],
-        ):
-            assert trained > 1e-6, (
-                path
-            )  # but for one number added to all scores, which a softmax does not see
-    assert np.abs(one - other).max() > 1e-3
-
-
-@pytest.mark.parametrize(
-    "options, problem",
-    [
-        ({"particles": 0}, "particles must be at least 1, found 0"),
-        ({"heads": 0}, "heads must be at least 1, found 0"),
-        ({"ffn_ratio": 0.0}, "ffn_ratio must be positive, found 0.0"),
-        ({"dropout": 1.0}, "dropout must be at least 0 and below 1, found 1.0"),
-        ({"output_dim": 1}, "output_dim must be 2 or 3, found 1"),
-    ],
-)
-def test_options_that_cannot_be_are_refused(options, problem):
-    with pytest.raises(InputError, match=f"model 'imot_text': {problem}"):
-        models.create("imot_text", **options)

@@ -1,22 +1,19 @@
 """RoNIN's network: its sizes, its head against plain NumPy, and its uncertainty."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from gnio_jax import models
-from gnio_jax.errors import InputError
 from gnio_jax.models.resnet import ResNet18
+from tests.support import networks
 from tests.support.compiling import quick
+from tests.support.networks import count
 
-
-def count(tree):
-    return sum(int(np.prod(leaf.shape)) for leaf in jax.tree.leaves(tree))
-
-
-def shapes(samples=200, **options):
-    return models.variable_shapes(models.create("ronin_resnet", **options), samples)
+shapes = functools.partial(networks.shapes, "ronin_resnet")
 
 
 @pytest.mark.parametrize("options, total", [({"output_dim": 2}, 4_634_882), ({}, 4_635_395)])
@@ -85,38 +82,3 @@ def test_output_against_numpy(output_dim):
         found.log_std, np.tile(variables["batch_stats"]["uncertainty"]["log_std"], (2, 1))
     )
     assert found.displacement.dtype == found.log_std.dtype == jnp.float32
-
-
-def test_a_frozen_network_gives_the_same_numbers():
-    model, variables, windows = prepared(3)
-    frozen = models.inference_variables(model, variables)
-    apply = quick(models.Inference(model).__call__)
-    wanted, found = apply(models.InferenceVariables(variables, {}), windows), apply(frozen, windows)
-    np.testing.assert_allclose(found.displacement, wanted.displacement, rtol=2e-4, atol=2e-5)
-    np.testing.assert_array_equal(found.log_std, wanted.log_std)
-    assert (np.asarray(frozen.variables["params"]["displacement"]["neck_bn"]["scale"]) == 1).all()
-
-
-def test_training_leaves_the_uncertainty_alone():
-    model, variables, windows = prepared(3)
-    _, changed = quick(
-        lambda v, w: model.apply(
-            v, w, train=True, rngs={"dropout": jax.random.key(0)}, mutable=["batch_stats"]
-        )
-    )(variables, windows)
-    assert jax.tree.structure(changed["batch_stats"]) == jax.tree.structure(
-        variables["batch_stats"]
-    )
-    np.testing.assert_array_equal(
-        changed["batch_stats"]["uncertainty"]["log_std"],
-        variables["batch_stats"]["uncertainty"]["log_std"],
-    )
-    bn = [tree["batch_stats"]["displacement"]["neck_bn"]["mean"] for tree in (changed, variables)]
-    assert (np.asarray(bn[0]) != np.asarray(bn[1])).all()
-
-
-def test_other_numbers_of_outputs_are_refused():
-    with pytest.raises(
-        InputError, match="model 'ronin_resnet': output_dim must be 2 or 3, found 4"
-    ):
-        models.create("ronin_resnet", output_dim=4)

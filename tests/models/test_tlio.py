@@ -9,28 +9,12 @@ import pytest
 from flax import linen as nn
 
 from gnio_jax import interop, models
-from gnio_jax.errors import InputError
 from gnio_jax.models.tlio import FullyConnectedHead
 from tests.support import tlio_weights
+from tests.support.networks import count
 
 RECORDED = Path(__file__).parents[1] / "recorded" / "tlio_tracker" / "pipeline.npz"
 ENCODER = 3_846_144
-
-
-def count(tree):
-    return sum(int(np.prod(leaf.shape)) for leaf in jax.tree.leaves(tree))
-
-
-def drawn(model, samples, seed=0):
-    """Variables away from every neutral start, without compiling the initialisation."""
-    rng = np.random.default_rng(seed)
-
-    def one(path, leaf):
-        if path[-1].key in ("scale", "var"):
-            return jnp.asarray(rng.uniform(0.5, 1.5, leaf.shape), jnp.float32)
-        return jnp.asarray(rng.normal(0, 0.2, leaf.shape), jnp.float32)
-
-    return jax.tree_util.tree_map_with_path(one, models.variable_shapes(model, samples))
 
 
 @pytest.mark.parametrize("samples, rows, total", [(200, 7, 5_424_646), (100, 4, 5_031_430)])
@@ -72,21 +56,6 @@ def test_output_is_the_recorded_one():
         variables, np.concatenate([gyro, accel], axis=-1)
     )  # what the comparison would say of channels in the other order
     assert np.abs(swapped.displacement - recorded["net_displacement"]).max() > 1e-3
-
-
-def test_a_frozen_network_gives_the_same_numbers():
-    model = models.create("tlio", width=4)
-    variables = drawn(model, 64)
-    windows = jax.random.normal(jax.random.key(1), (3, 64, 6), jnp.float32)
-    frozen = models.inference_variables(model, variables)
-    apply = jax.jit(models.Inference(model).__call__)
-    wanted, found = apply(models.InferenceVariables(variables, {}), windows), apply(frozen, windows)
-    for one, other in [(found.displacement, wanted.displacement), (found.log_std, wanted.log_std)]:
-        assert np.abs(other).max() > 1e-2
-        np.testing.assert_allclose(one, other, rtol=2e-4, atol=2e-5)
-    for head in ("displacement", "log_std"):  # the normalisation is in the convolution now
-        assert (np.asarray(frozen.variables["params"][head]["neck_bn"]["scale"]) == 1).all()
-        assert (np.asarray(variables["params"][head]["neck_bn"]["scale"]) != 1).any()
 
 
 def test_dropout_keeps_its_share_in_training_alone():
@@ -153,32 +122,3 @@ def test_a_new_head_predicts_next_to_nothing_and_learns_every_parameter():
     assert all(
         np.isfinite(leaf).all() and np.abs(leaf).max() > 0 for leaf in jax.tree.leaves(found)
     )
-
-
-@pytest.mark.parametrize("name", ["tlio", "ronin_resnet"])
-def test_parameters_and_outputs_are_float32_whatever_comes_in(name):
-    model, windows = models.create(name, width=4), jax.ShapeDtypeStruct((2, 64, 6), jnp.float64)
-    variables = jax.eval_shape(model.init, jax.random.key(0), windows)
-    assert {leaf.dtype for leaf in jax.tree.leaves(variables)} == {jnp.dtype("float32")}
-    found, changed = jax.eval_shape(
-        lambda variables, windows, key: model.apply(
-            variables, windows, train=True, rngs={"dropout": key}, mutable=["batch_stats"]
-        ),
-        variables,
-        windows,
-        jax.random.key(0),
-    )
-    for leaf in (found.displacement, found.log_std):
-        assert (leaf.shape, leaf.dtype) == ((2, 3), jnp.dtype("float32"))
-    assert (
-        changed["batch_stats"] == variables["batch_stats"]
-    )  # shapes and dtypes: nothing comes or goes
-
-
-@pytest.mark.parametrize("share", [1.0, -0.1, float("nan")])
-def test_a_share_that_leaves_nothing_is_refused(share):
-    for name in ("tlio", "ronin_resnet"):
-        with pytest.raises(
-            InputError, match=f"model '{name}': dropout must be at least 0 and below 1"
-        ):
-            models.create(name, dropout=share)

@@ -25,7 +25,7 @@ def config(tmp_path_factory):
     for split, name in (("train", "a"), ("val", "b"), ("test", "b")):
         (root / f"{split}_list.txt").write_text(f"{name}\n")
     optim = OptimConfig(epochs=2, batch_size=16, learning_rate=1e-3, statistics_windows=32)
-    model = ModelConfig(width=2, bank_size=3, bank_heads=2)
+    model = ModelConfig(width=2, bank_size=3)
     data = DataConfig(rate=50.0)
     return TrainConfig("tlio", str(root), data=data, model=model, optim=optim)
 

@@ -5,26 +5,24 @@ from flax import linen as nn
 
 from gnio_jax.models.heads import CalibratedUncertainty, UncertaintyHead
 from gnio_jax.models.layers import linear
-from gnio_jax.models.precision import Dtype
 from gnio_jax.types import Prediction
 
 
 class Tiny(nn.Module):
     width: int = 4
     uncertainty: str = "head"
-    dtype: Dtype = "float32"
 
     @nn.compact
     def __call__(self, windows, train=False):
         # A bias would cancel in the normalisation: its gradient is rounding, which Adam makes whole
         # steps of, and two machines, or two orders of a sum, would not agree on it.
         mean = windows.mean(axis=1)
-        h = linear(self.width, "encoder", self.dtype, use_bias=False)(mean)
+        h = linear(self.width, "encoder", use_bias=False)(mean)
         norm = nn.BatchNorm(not train, dtype=jnp.float32, param_dtype=jnp.float32, name="norm")
         h = jnp.tanh(norm(h))
-        displacement = linear(3, "head", self.dtype)(h)
+        displacement = linear(3, "head")(h)
         if self.uncertainty == "calibrated":
-            log_std = CalibratedUncertainty(self.dtype, name="uncertainty")(h, train)
+            log_std = CalibratedUncertainty(name="uncertainty")(h, train)
         else:
-            log_std = UncertaintyHead(self.dtype, name="uncertainty")(h)
+            log_std = UncertaintyHead(name="uncertainty")(h, train)
         return Prediction(displacement, log_std, {})

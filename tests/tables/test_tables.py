@@ -31,7 +31,7 @@ def made(tmp_path_factory):
     base = TrainConfig(
         dataset="tlio",
         data=DataConfig(rate=50.0),
-        model=ModelConfig(width=2, bank_size=3, bank_heads=2),
+        model=ModelConfig(width=2, bank_size=3),
         optim=OptimConfig(epochs=2, batch_size=16, learning_rate=1e-3),
     )
     configuration.save(root / "base.yaml", base)

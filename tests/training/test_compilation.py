@@ -18,7 +18,7 @@ from tests.support.tiny_network import Tiny
 
 CONFIG = TrainConfig(
     data=DataConfig(rate=20.0),
-    model=ModelConfig(width=1, bank_size=2, bank_heads=1),
+    model=ModelConfig(width=1, bank_size=2),
     optim=OptimConfig(epochs=3, batch_size=2, warmup_epochs=1.0),
 )
 WINDOWS = 6

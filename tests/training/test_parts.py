@@ -1,4 +1,4 @@
-"""What a step of training computes in bfloat16, and a batch that is taken in parts."""
+"""A batch that is taken in parts."""
 
 from dataclasses import replace
 
@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 
 from gnio_jax import config as configuration
-from gnio_jax.config import ModelConfig, OptimConfig, ThroughFilter, TrainConfig
+from gnio_jax.config import OptimConfig, ThroughFilter, TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.training import step
-from gnio_jax.training.checkpoint import create_trained_model
 from gnio_jax.training.losses import stage
 from gnio_jax.types import Prediction, Windows
 from tests.support.compiling import quick
@@ -58,66 +57,6 @@ def test_parts_have_rows_of_every_device():
         assert [len(np.intersect1d(part, device)) for part in parts] == [2, 2, 2]
 
 
-IMU = jnp.zeros((1, 200, 6), jnp.float32)
-NETWORKS = {
-    "gnio": {"width": 2, "bank_size": 3, "bank_heads": 2},
-    "gnio in a canonical frame": {"width": 2, "equivariance": "canonical_frame"},
-    "ctin": {},
-    "deepils": {"width": 4},
-    "imot": {},
-    "ronin_resnet": {"width": 2},
-    "tlio": {"width": 2},
-}
-
-
-FEWER_LAYERS = {
-    "ctin": {"decoder_layers": 1},
-    "imot": {"encoder_layers": 1, "decoder_layers": 1},
-}
-"""The others are no different, and take long to trace."""
-
-FLOAT32_PRODUCTS = {"ctin": 10, "gnio in a canonical frame": 2, "imot": 6}
-"""Products of recurrences (ctin), of positions and of sums of vectors: float32 in every step."""
-
-
-@pytest.mark.parametrize("name", NETWORKS)
-def test_bfloat16_is_for_products_alone(name):
-    """Parameters, statistics, loss and gradient are float32, and so is what is no product."""
-    found, variables = {}, None
-    for dtype in ("bfloat16", "float32"):
-        options = ModelConfig(name.split()[0], **NETWORKS[name], dtype=dtype)
-        config = TrainConfig(model=options, optim=OptimConfig(batch_size=12))
-        model = create_trained_model(config).clone(**FEWER_LAYERS.get(name, {}))
-        if variables is None:  # the other's are no different
-            variables = jax.eval_shape(lambda m=model: m.init(jax.random.key(0), IMU))
-            assert all(leaf.dtype == jnp.float32 for leaf in jax.tree.leaves(variables))
-        found[dtype] = jax.make_jaxpr(lambda v, m=model, c=config: gradient(m, c, v))(variables)
-        assert all(leaf.dtype != jnp.bfloat16 for leaf in found[dtype].out_avals)
-    assert "bf16" not in str(found["float32"])
-    products, others = [], []
-    for equation in equations(found["bfloat16"].jaxpr):
-        kinds = [getattr(value.aval, "dtype", None) for value in equation.invars]
-        if equation.primitive.name == "dot_general":
-            products.append(all(kind == jnp.bfloat16 for kind in kinds))
-        elif jnp.bfloat16 in kinds:
-            others.append(equation.primitive.name)
-    assert sum(products) > 10
-    assert products.count(False) <= FLOAT32_PRODUCTS.get(name, 0)
-    layout = {"transpose", "reshape", "convert_element_type", "squeeze", "broadcast_in_dim"}
-    calls = {"pjit", "jit", "custom_vjp_call", "mul"}
-    assert set(others) <= layout | calls
-
-
-def equations(jaxpr):
-    for equation in jaxpr.eqns:
-        yield equation
-        for value in equation.params.values():
-            for inner in value if isinstance(value, list | tuple) else [value]:
-                inner = getattr(inner, "jaxpr", inner)
-                if hasattr(inner, "eqns"):
-                    yield from equations(inner)
-
-
 @pytest.mark.parametrize(
     "changes, expected",
     [
@@ -126,10 +65,6 @@ def equations(jaxpr):
         (
             {"optim": OptimConfig(accumulate=2), "through_filter": ThroughFilter(("head",))},
             "'optim.accumulate' is for training on windows alone",
-        ),
-        (
-            {"model": ModelConfig(dtype="bfloat16"), "through_filter": ThroughFilter(("head",))},
-            "'model.dtype' is for training on windows alone",
         ),
     ],
 )

@@ -1,0 +1,220 @@
+"""What every network promises: options that are checked, float32, finite gradients of every
+parameter, windows that do not know of each other, and the same numbers once it is frozen."""
+
+import typing
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import linen as nn
+
+from gnio_jax import models
+from gnio_jax.config import ModelConfig
+from gnio_jax.errors import InputError
+from gnio_jax.models import layers, registry
+from gnio_jax.models.motion_bank import MotionBank
+from gnio_jax.types import Prediction
+from tests.support.compiling import quick
+from tests.support.networks import SMALL, drawn
+
+SAMPLES = {"ctin": 12, "imot": 12, "imot_text": 12}
+"""Of a window; 64 where nothing is said."""
+NETWORKS = pytest.mark.parametrize("name", models.names())
+
+
+def prepared(name, **options):
+    """A small network, variables far from their start, and four windows."""
+    samples = SAMPLES.get(name, 64)
+    model = models.create(name, **SMALL[name] | options)
+    windows = np.random.default_rng(1).standard_normal((4, samples, 6))
+    variables = drawn(models.variable_shapes(model, samples))
+    return model, variables, jnp.asarray(windows, jnp.float32)
+
+
+@NETWORKS
+def test_parameters_and_outputs_are_float32_whatever_comes_in(name):
+    model, variables, windows = prepared(name)
+    assert {leaf.dtype for leaf in jax.tree.leaves(models.variable_shapes(model, 64))} == {
+        jnp.dtype("float32")
+    }
+    statistics = variables["batch_stats"]
+    for train in (False, True):
+        found, changed = jax.eval_shape(
+            lambda variables, windows, key, train=train: model.apply(
+                variables, windows, train, rngs={"dropout": key}, mutable=["batch_stats"]
+            ),
+            variables,
+            jax.ShapeDtypeStruct(windows.shape, jnp.float64),
+            jax.random.key(0),
+        )
+        assert {leaf.dtype for leaf in jax.tree.leaves(found)} == {jnp.dtype("float32")}
+        assert found.displacement.shape == found.log_std.shape == (4, 3)
+        assert all(value.shape[0] == 4 for value in found.diagnostics.values())
+        same = jax.tree.map(lambda a, b: a.shape == b.shape, changed, {"batch_stats": statistics})
+        assert all(jax.tree.leaves(same))  # nothing comes or goes
+
+
+SOFTMAX = {("key", "bias"), ("key_content", "bias"), ("key_position", "bias")}
+"""One number added to all scores, which a softmax does not see."""
+FIRST = {("value", "bias"), ("output", "bias"), ("output", "kernel")}
+"""What iMoT's first attention of particles learns: all contents are zero there, so whom a particle
+attends to makes no difference."""
+
+
+@NETWORKS
+def test_every_parameter_that_can_be_is_trained_and_dropout_is_drawn(name):
+    model, variables, windows = prepared(name)
+
+    def loss(params, key):
+        given = {"params": params, "batch_stats": variables["batch_stats"]}
+        prediction, changed = model.apply(
+            given, windows, train=True, mutable=["batch_stats"], rngs={"dropout": key}
+        )
+        balance = prediction.diagnostics.get("task_log_std", jnp.zeros((1, 2), jnp.float32))
+        value = jnp.sum((prediction.displacement - 1) ** 2) + jnp.sum(prediction.log_std**2)
+        return value + jnp.sum(balance**2), (prediction.displacement, changed["batch_stats"])
+
+    gradient = quick(jax.grad(loss, has_aux=True))
+    (grads, (one, changed)), (others, (other, _)) = (
+        jax.device_get(gradient(variables["params"], jax.random.key(seed))) for seed in (0, 1)
+    )
+    for (path, leaf), another in zip(
+        jax.tree.leaves_with_path(grads), jax.tree.leaves(others), strict=True
+    ):
+        names = tuple(key.key for key in path)
+        trained = np.abs(leaf).max() + np.abs(another).max()
+        assert leaf.dtype == jnp.float32 and np.isfinite(leaf).all(), path
+        if names[:2] == ("decoder_1", "self") and name != "ctin" and names[2:] not in FIRST:
+            assert trained < 1e-5, path
+        elif names[-2:] not in SOFTMAX:
+            assert trained > 1e-6, path
+    assert (np.abs(one - other).max() > 1e-3) == (name != "gnio")  # which drops nothing
+    before = jax.tree.leaves_with_path(variables["batch_stats"])
+    assert jax.tree.structure(changed) == jax.tree.structure(variables["batch_stats"])
+    for (path, old), new in zip(before, jax.tree.leaves(changed), strict=True):
+        if path[-1].key in ("mean", "var"):
+            assert np.abs(old - new).max() > 0, path
+        else:  # constants of the uncertainty
+            np.testing.assert_array_equal(old, new)
+
+
+@NETWORKS
+def test_frozen_it_gives_the_same_numbers_and_windows_do_not_know_of_each_other(name):
+    model, variables, windows = prepared(name)
+    frozen, apply = models.inference_variables(model, variables), models.Inference(model)
+    program = quick(apply.__call__)
+    plain = models.InferenceVariables(variables, {})
+    wanted, found = program(plain, windows), program(frozen, windows)
+    for ours, theirs in zip(jax.tree.leaves(found), jax.tree.leaves(wanted), strict=True):
+        assert np.abs(theirs).max() > 1e-3
+        np.testing.assert_allclose(ours, theirs, rtol=1e-3, atol=1e-4)
+    statistics = frozen.variables["batch_stats"]
+    for path, leaf in jax.tree.leaves_with_path(statistics):
+        if path[-1].key in ("mean", "var"):
+            folded = 0 if path[-1].key == "mean" else np.float32(1 - layers.EPSILON)
+            np.testing.assert_array_equal(leaf, folded, err_msg=str(path))
+    assert jax.tree.leaves(variables["batch_stats"])
+    others = program(plain, windows.at[2].add(1.0))
+    for ours, theirs in zip(jax.tree.leaves(others), jax.tree.leaves(wanted), strict=True):
+        np.testing.assert_array_equal(ours[jnp.array([0, 1, 3])], theirs[jnp.array([0, 1, 3])])
+    assert np.abs(others.displacement[2] - wanted.displacement[2]).max() > 1e-4
+    assert hash(apply) == hash(models.Inference(models.create(name, **SMALL[name])))
+
+
+@pytest.mark.parametrize(
+    "name, options, problem",
+    [
+        ("gnoi", {}, r"unknown; did you mean 'gnio'\? known models: ctin, deepils, gnio"),
+        ("gnio", {"bank_sise": 3}, r"unknown option 'bank_sise'; did you mean 'bank_size'\?"),
+        (
+            "tlio",
+            {"equivarience": "none"},
+            r"unknown option 'equivarience'; did you mean 'equivariance'\?",
+        ),
+        ("gnio", {"head": "gatd"}, r"head is 'gatd'; did you mean 'gated'\? choices: gated, line"),
+        ("gnio", {"gate": "relu"}, "gate is 'relu'; choices: tanh, sigmoid"),
+        (
+            "gnio",
+            {"scale": "softpluss"},
+            r"scale is 'softpluss'; did you mean 'softplus'\? choices",
+        ),
+        ("gnio", {"uncertainty": "x"}, "uncertainty is 'x'; choices: head, calibrated, constant"),
+        ("tlio", {"equivariance": "so3"}, "equivariance is 'so3'; choices: none, four_headings"),
+        ("gnio", {"width": 0}, "width must be at least 1.*, found 0"),
+        ("gnio", {"width": "8"}, "width must be at least 1.*, found '8'"),
+        ("gnio", {"bank_size": -1}, "bank_size must not be negative.*, found -1"),
+        ("tlio", {"dropout": 1.0}, "dropout must be at least 0 and below 1, found 1.0"),
+        ("ronin_resnet", {"dropout": float("nan")}, "dropout must be at least 0 and below 1"),
+        ("deepils", {"dropout": -0.1}, "dropout must be at least 0 and below 1, found -0.1"),
+        ("deepils", {"output_dim": 1}, "output_dim is 1; choices: 2, 3"),
+        ("imot_text", {"particles": 0}, "particles must be at least 1.*, found 0"),
+        ("imot_text", {"heads": 0}, "heads must be at least 1.*, found 0"),
+        ("imot", {"ffn_ratio": 0.0}, "ffn_ratio must be positive.*, found 0.0"),
+        ("ctin", {"heads": 0}, "heads must be at least 1.*, found 0"),
+        ("ctin", {"width": 90}, "width must be even and a multiple of the 8 heads, found 90"),
+        ("ctin", {"encoder_width": 20}, "encoder_width must be a multiple of the 8 heads and of 4"),
+        ("ctin", {"encoder_dropout": -0.1}, "encoder_dropout must be at least 0 and below 1"),
+    ],
+)
+def test_options_that_cannot_be_are_refused(name, options, problem):
+    with pytest.raises(InputError, match=f"^model '{name}': {problem}"):
+        models.create(name, **options)
+
+
+def choices(kind):
+    """The choices in a type, also in those of a union's members."""
+    kinds = [kind, *typing.get_args(kind)]
+    literals = [each for each in kinds if typing.get_origin(each) is typing.Literal]
+    return set().union(*(typing.get_args(each) for each in literals))
+
+
+def test_the_settings_have_the_options_and_choices_of_the_networks():
+    """`ModelConfig` repeats them for YAML and the command line, which do not wait for JAX."""
+    networks = [registry.options(name) for name in models.names()]
+    for option, kind in typing.get_type_hints(ModelConfig).items():
+        if option == "name":
+            continue
+        kinds = [known[option] for known in networks if option in known]
+        assert kinds, option
+        if option != "output_dim":  # numbers, which YAML checks by a bound
+            assert choices(kind) == set().union(*map(choices, kinds)), option
+
+
+@pytest.mark.parametrize("option", ["head", "gate", "scale", "uncertainty"])
+def test_every_choice_makes_a_network(option):
+    windows = jax.ShapeDtypeStruct((2, 64, 6), jnp.float32)
+    for choice in choices(registry.options("gnio")[option]):
+        model = models.create("gnio", **SMALL["gnio"], **{option: choice})
+        variables = models.variable_shapes(model, 64)
+        assert jax.eval_shape(model.apply, variables, windows).displacement.shape == (2, 3)
+
+
+class Mean(nn.Module):
+    """The smallest network."""
+
+    size: typing.Literal["small", "large"] = "small"
+
+    @nn.compact
+    def __call__(self, windows, train=False):
+        mean = nn.Dense(6, param_dtype=jnp.float32)(windows.mean(axis=1))
+        return Prediction(mean[:, :3], mean[:, 3:])
+
+
+def test_a_network_of_ones_own_is_created_by_its_name(monkeypatch):
+    monkeypatch.setattr(registry, "_MODELS", dict(registry._MODELS))
+    models.register("mean", Mean)
+    assert "mean" in models.names() and models.create("mean", size="large") == Mean("large")
+    with pytest.raises(InputError, match=r"size is 'lage'; did you mean 'large'\?"):
+        models.create("mean", size="lage")
+    models.register("mean", Mean)  # a cell of a notebook that runs again
+    with pytest.raises(InputError, match="model 'gnio': is a network of gnio-jax"):
+        models.register("gnio", Mean)
+
+
+def test_wrong_shapes_are_told_at_the_door():
+    with pytest.raises(AssertionError, match="shape"):
+        layers.checked_windows(jnp.zeros((2, 64, 5), jnp.float32))
+    bank = MotionBank(size=3, width=16)
+    with pytest.raises(AssertionError, match="shape"):
+        jax.eval_shape(bank.init, jax.random.key(0), jnp.zeros((2, 24), jnp.float32))

@@ -1,0 +1,55 @@
+"""Small networks with variables that NumPy has drawn: nothing is compiled to initialise them."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from gnio_jax import models
+
+SMALL = {
+    "ctin": {"width": 12, "encoder_width": 8, "ffn": 10, "heads": 2, "decoder_layers": 2},
+    "deepils": {"width": 4},
+    "gnio": {"width": 4, "bank_size": 3},
+    "imot": {
+        "encoder_layers": 2,
+        "decoder_layers": 2,
+        "ffn_ratio": 1.5,
+        "heads": 4,
+        "particles": 5,
+    },
+    "imot_text": {"ffn_ratio": 1.5, "heads": 4, "particles": 5},
+    "ronin_resnet": {"width": 4},
+    "tlio": {"width": 4},
+}
+"""Options of every network with which it compiles soon."""
+
+
+def count(tree):
+    """Numbers in all arrays of a tree."""
+    return sum(int(np.prod(leaf.shape)) for leaf in jax.tree.leaves(tree))
+
+
+def shapes(name, samples=200, **options):
+    """Shapes of a network's variables."""
+    return models.variable_shapes(models.create(name, **options), samples)
+
+
+def drawn(tree, seed=3, size=None):
+    """Variables far from their neutral start, statistics, scales and biases too, so that nothing
+    can be left out unnoticed. Kernels and biases are of `size`, or kernels the smaller the more
+    numbers they sum."""
+    rng = np.random.default_rng(seed)
+
+    def draw(path, leaf):
+        name = path[-1].key
+        if name in ("var", "scale"):
+            values = rng.uniform(0.5, 1.5, leaf.shape)
+        elif name in ("particles", "positions", "prototypes"):
+            values = rng.standard_normal(leaf.shape)
+        elif leaf.ndim == 1 or name == "bias":
+            values = (size or 0.3) * rng.standard_normal(leaf.shape)
+        else:
+            values = rng.standard_normal(leaf.shape) * (size or np.prod(leaf.shape[:-1]) ** -0.5)
+        return jnp.asarray(values, jnp.float32)
+
+    return jax.tree.map_with_path(draw, tree)
