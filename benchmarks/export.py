@@ -63,7 +63,7 @@ def measure(run: Any, models: driver.Models, drawn: accuracy.Walk) -> dict[str, 
         lambda window: network.apply(network.variables, window)._replace(diagnostics={})
     )
     state = filtering.initial_state(setup.config, **drawn.start, std=setup.initial_std)
-    tracker = filtering.Tracker(apply, state, setup.config, setup.noise)
+    tracker = filtering.Tracker(apply, setup.config, setup.noise, state)
     arrays, dt = start_arrays(state, setup), setup.config.dt
     times: dict[str, list[float]] = defaultdict(list)
     for k, rows in enumerate(clone_intervals(len(drawn.gyro), setup.config.samples_per_clone)):

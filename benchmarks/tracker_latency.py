@@ -94,7 +94,7 @@ def main() -> None:
     )
     predict = network(arguments.width)
     begin = time.perf_counter()
-    tracker = filtering.Tracker(predict, state, config, filtering.NoiseModel(), imu_rate=imu_rate)
+    tracker = filtering.Tracker(predict, config, filtering.NoiseModel(), state, imu_rate=imu_rate)
     print(f"compiled in {time.perf_counter() - begin:.1f} s\n")
     pushed = WARM_UP * per_step
     measure(tracker, 0, pushed, imu_rate, True)

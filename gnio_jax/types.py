@@ -18,6 +18,9 @@ Array = jax.Array | np.ndarray
 GRAVITY = 9.81
 """Magnitude of gravity in the world frame, m/s²."""
 
+FASTEST_TURN, STRONGEST_FORCE = 100.0, 1000.0
+"""rad/s and m/s²: beyond the range of any gyro or accelerometer one navigates with."""
+
 STANDARD_G = 9.80665
 """The unit "G" in which phones report acceleration, m/s²."""
 

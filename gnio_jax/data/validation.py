@@ -6,10 +6,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from gnio_jax.errors import InputError
-from gnio_jax.types import Sequence
+from gnio_jax.types import FASTEST_TURN, STRONGEST_FORCE, Sequence
 
-FASTEST_TURN, STRONGEST_FORCE = 100.0, 1000.0
-"""rad/s and m/s²: beyond the range of any gyro or accelerometer one navigates with."""
 FASTEST = 300.0
 """m/s: faster than anything that carries such an IMU."""
 LARGEST_STEP = 10.0

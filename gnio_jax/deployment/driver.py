@@ -88,7 +88,7 @@ def walk(
 ) -> Walked:
     """Filter K·n samples, rad/s and m/s², raw, from a state: that of `models.start`, or
     `start_arrays`."""
-    n = _samples(models.step)
+    n = next(each.shape[0] for each in models.step.get_inputs() if each.name == "gyro")
     windows, displacements, poses = [], [], []
     for k in range(len(gyro) // n):
         rows = slice(k * n, (k + 1) * n)
@@ -115,8 +115,3 @@ def measure(models: Models, window: Float[np.ndarray, "1 n 6"]) -> dict[str, np.
     log_std = np.maximum(predicted["log_std"][0].astype(float), models.log_std_min)
     displacement = predicted["displacement"][0].astype(float)
     return {"displacement": displacement, "covariance": np.diag(np.exp(2 * log_std))}
-
-
-def _samples(step: Any) -> int:
-    """In one clone interval."""
-    return next(each.shape[0] for each in step.get_inputs() if each.name == "gyro")

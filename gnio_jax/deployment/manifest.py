@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import numpy as np
 
+from gnio_jax.config.files import plain
 from gnio_jax.deployment.programs import Program
 from gnio_jax.filtering.settings import FilterSetup
 
@@ -33,6 +33,11 @@ def write_manifest(
     """Write `export.json` into the folder of the export: its tensors, the filter as it is exported,
     whose settings cannot be changed any more, and what else there is to say `about` it."""
     config = setup.config
+
+    def tensors(arrays: Mapping[str, jax.ShapeDtypeStruct]) -> list[dict[str, Any]]:
+        shapes = ((name, list(each.shape), str(each.dtype)) for name, each in arrays.items())
+        return [{"name": name, "shape": shape, "dtype": dtype} for name, shape, dtype in shapes]
+
     manifest = {
         "format": FORMAT,
         "version": VERSION,
@@ -48,32 +53,13 @@ def write_manifest(
         "log_std_min": config.log_std_min,
         "filter": {
             "config": dataclasses.asdict(config),
-            "noise": _plain(setup.noise),
-            "initial_std": _plain(setup.initial_std),
+            "noise": plain(setup.noise),
+            "initial_std": plain(setup.initial_std),
         },
         "files": {
-            f"{each.name}.onnx": {
-                "inputs": _tensors(each.inputs),
-                "outputs": _tensors(each.outputs),
-            }
+            f"{each.name}.onnx": {"inputs": tensors(each.inputs), "outputs": tensors(each.outputs)}
             for each in programs
         },
     }
     text = json.dumps(manifest, indent=2, ensure_ascii=False, allow_nan=False)
     (folder / MANIFEST).write_text(text + "\n", encoding="utf-8")
-
-
-def _tensors(arrays: Mapping[str, jax.ShapeDtypeStruct]) -> list[dict[str, Any]]:
-    return [
-        {"name": name, "shape": list(each.shape), "dtype": str(each.dtype)}
-        for name, each in arrays.items()
-    ]
-
-
-def _plain(tree: Any) -> Any:
-    """NamedTuples of numbers as dictionaries and lists for JSON."""
-    if hasattr(tree, "_asdict"):
-        return {name: _plain(value) for name, value in tree._asdict().items()}
-    if isinstance(tree, tuple | list):
-        return [_plain(value) for value in tree]
-    return None if tree is None else float(np.asarray(tree))

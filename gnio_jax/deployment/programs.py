@@ -19,22 +19,17 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from gnio_jax.deployment.flat_state import (
-    PREFIX,
-    DeployedState,
-    from_arrays,
-    started,
-    state_shape,
-    to_arrays,
-)
+from gnio_jax.deployment import flat_state
+from gnio_jax.deployment.flat_state import PREFIX, DeployedState, from_arrays, to_arrays
 from gnio_jax.evaluation.inference import Network
 from gnio_jax.filtering import Pose, level_state
 from gnio_jax.filtering.displacement import scaled_measurement
 from gnio_jax.filtering.gaps import Imu
 from gnio_jax.filtering.network import network_window
-from gnio_jax.filtering.online import ACCEL, GYRO, advance_filter
+from gnio_jax.filtering.resampler import ACCEL, GYRO
 from gnio_jax.filtering.settings import FilterSetup
 from gnio_jax.filtering.start import REST_SECONDS
+from gnio_jax.filtering.tracker import advance_filter
 from gnio_jax.types import Array
 
 NETWORK, START, WINDOW, STEP = "network", "filter_start", "filter_window", "filter_step"
@@ -63,7 +58,7 @@ class Program(NamedTuple):
 def programs(network: Network, setup: FilterSetup) -> list[Program]:
     """The four programs of a network and its filter. JAX's x64 must be on."""
     config, noise = setup.config, setup.noise
-    shape, n = state_shape(setup), config.samples_per_clone
+    shape, n = flat_state.state_shape(setup), config.samples_per_clone
 
     def infer(arrays: Arrays) -> dict[str, Array]:
         prediction = network.apply(network.variables, arrays["window"])
@@ -72,7 +67,7 @@ def programs(network: Network, setup: FilterSetup) -> list[Program]:
     def start(arrays: Arrays) -> dict[str, Array]:
         """`level_state` of a second at rest."""
         state = level_state(config, arrays["gyro"], arrays["accel"], setup.initial_std)
-        return to_arrays(started(state, setup))
+        return to_arrays(flat_state.started(state, setup))
 
     def window(arrays: Arrays) -> dict[str, Array]:
         """`network_window` between the oldest clone that the next step will have and its end."""

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack
 from pathlib import Path
 from typing import NamedTuple
 
@@ -49,7 +48,9 @@ def export_run(which: str | Path, out: Path, seconds: float = SECONDS) -> Export
     run = pretrained.load_pretrained(place)
     network, setup = inference_network(run.model, run.variables), tracking_filter(run)
     made = programs(network, setup)
-    with replacing_folder(out) as folder, _quiet_converters():
+    with replacing_folder(out) as folder, ExitStack() as at_end:
+        at_end.callback(logging.disable, logging.root.manager.disable)
+        logging.disable(logging.WARNING)  # Converters log what they do about every other node.
         for program in made:
             model = conversion.to_model(program, setup)
             conversion.write(model, folder / f"{program.name}.onnx")
@@ -70,14 +71,3 @@ def export_run(which: str | Path, out: Path, seconds: float = SECONDS) -> Export
         write_manifest(folder, made, setup, about)
         sizes = {path.name: path.stat().st_size for path in sorted(folder.glob("*.onnx"))}
     return Exported(out, sizes, deviation)
-
-
-@contextmanager
-def _quiet_converters() -> Iterator[None]:
-    """Converters log what they do about every other node."""
-    before = logging.root.manager.disable
-    logging.disable(logging.WARNING)
-    try:
-        yield
-    finally:
-        logging.disable(before)

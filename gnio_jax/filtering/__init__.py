@@ -15,14 +15,12 @@ from gnio_jax.filtering.batch import cores_as_devices, over_sequences
 from gnio_jax.filtering.config import FilterConfig
 from gnio_jax.filtering.considered import considered_covariance, sensitivity
 from gnio_jax.filtering.history import FilterHistory
-from gnio_jax.filtering.online import TrackerState
-from gnio_jax.filtering.pose import Pose
 from gnio_jax.filtering.scan import repeat_odometry, run_filter, run_odometry
 from gnio_jax.filtering.settings import FilterSetup, filter_setup
 from gnio_jax.filtering.smoother import SmoothedHistory, smooth, smooth_odometry
 from gnio_jax.filtering.start import initial_state, level_state
 from gnio_jax.filtering.state import FilterState, GateState
-from gnio_jax.filtering.tracker import Tracker
+from gnio_jax.filtering.tracker import Pose, Tracker
 
 __all__ = [
     "ConsideredStd",
@@ -38,7 +36,6 @@ __all__ = [
     "Pose",
     "SmoothedHistory",
     "Tracker",
-    "TrackerState",
     "considered_covariance",
     "cores_as_devices",
     "filter_setup",

@@ -55,6 +55,21 @@ def check_finite(name: str, value: jax.Array, remedy: str = "") -> None:
         raise ValueError(f"{name}: {problem}" + (f"; {remedy}" if remedy else ""))
 
 
+def check_measurable(
+    name: str, value: jax.Array, largest: float, unit: str, valid: Any = None
+) -> None:
+    """Refuse finite values, of the rows that are `valid`, which no IMU measures, naming the first
+    such row."""
+    if isinstance(value, Tracer) or isinstance(valid, Tracer):
+        return
+    size = np.abs(np.asarray(value)).max(1)
+    bad = np.isfinite(size) & (size > largest)
+    bad = bad if valid is None else bad & np.asarray(valid)
+    if bad.any():
+        problem = f"is beyond {largest:g} {unit} in {bad.sum()} of {len(bad)} rows"
+        raise ValueError(f"{name}: {problem}, the first is row {bad.argmax()}")
+
+
 def check_rotation(name: str, value: jax.Array) -> None:
     """Refuse what is no rotation matrix, to what rounding and text files leave of one."""
     if not isinstance(value, Tracer):

@@ -14,6 +14,7 @@ from gnio_jax.filtering.checks import (
     BATCH_REMEDY,
     check_correlation,
     check_finite,
+    check_measurable,
     check_not_negative,
     check_positive,
     check_positive_definite,
@@ -24,7 +25,7 @@ from gnio_jax.filtering.checks import (
 from gnio_jax.filtering.config import FilterConfig
 from gnio_jax.filtering.start import initial_state, with_lasting_errors
 from gnio_jax.filtering.state import FilterState
-from gnio_jax.types import Array
+from gnio_jax.types import FASTEST_TURN, STRONGEST_FORCE, Array
 
 _FINITE_FIELDS = (
     "velocity",
@@ -145,6 +146,8 @@ def checked_inputs(
         check_finite("accel", accel, remedy)
     else:
         imu_valid = _checked_mask(imu_valid, samples)
+    check_measurable("gyro", gyro, FASTEST_TURN, "rad/s", imu_valid)
+    check_measurable("accel", accel, STRONGEST_FORCE, "m/s²", imu_valid)
     signals = Signals(gyro.astype(dtype), accel.astype(dtype), imu_valid)
     return state, signals, checked_noise(noise, dtype)
 

@@ -1,72 +1,116 @@
-"""The filter online: IMU samples as they come, one compiled program per clone step, a pose at any
-time.
+"""The filter online: IMU samples as they come, a pose after every clone interval, or at any time.
 
-A sample passes the low-pass (`intake`), the clock (`clock`), and every n-th grid sample makes a
-clone step (`online`). All of these are pure; `Tracker` around them is the one object of the package
-that changes: a stream has a present, and somebody must hold it.
+A stream has a present, so `Tracker` is an object that changes. It holds the samples that are not
+yet used (`resampler.Stream`), and on the device the filter with the last window of samples
+(`Core`). The samples reach the filter on its own uniform clock, and every n of them make the clone
+step that `run_odometry` makes, in one compiled program.
 
 Grid sample k, at t_0 + k·dt, drives the interval up to t_0 + (k + 1)·dt. It is known when the first
-stamp at or after its own has come, so the latency is at most one sample; the pose is then given for
-the end of its interval. Where the IMU is faster than the filter, the low-pass adds its delay to the
+stamp at or after its own has come, so the latency is at most one sample; the pose is that of the
+end of its interval. Where the IMU is faster than the filter, the low-pass adds its delay to the
 latency: `Tracker.delay`, some 22 samples of the filter, 0.11 s at 200 Hz.
 """
 
 from __future__ import annotations
 
+import dataclasses
+import functools
 import math
-import os
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float, Int
 
 from gnio_jax.config import ConsideredStd, InitialStd, NoiseModel
 from gnio_jax.config.schema import TLIO_STD
-from gnio_jax.filtering.clock import Clock, GridSample, advance_clock
 from gnio_jax.filtering.clones import unroll_clones
 from gnio_jax.filtering.config import FilterConfig
-from gnio_jax.filtering.considered import check_considered
+from gnio_jax.filtering.considered import check_considered, considered_covariance
+from gnio_jax.filtering.displacement import Measurement
+from gnio_jax.filtering.gaps import Imu, bridge
+from gnio_jax.filtering.history import FilterHistory, stacked_history
 from gnio_jax.filtering.inputs import checked_noise, checked_state
-from gnio_jax.filtering.intake import (
-    Intake,
-    check_rate,
-    checked_design,
-    is_finite_number,
-    low_pass_sample,
+from gnio_jax.filtering.network import (
+    Predict,
+    no_prediction,
+    predict_window,
+    predicted_measurement,
+    prediction_shapes,
 )
-from gnio_jax.filtering.network import Predict, prediction_shapes
-from gnio_jax.filtering.online import (
-    ACCEL,
-    GRID_COLUMNS,
-    GYRO,
-    VALID,
-    TrackerCore,
-    TrackerSettings,
-    TrackerState,
-    compile_programs,
-    start_core,
-    with_considered,
+from gnio_jax.filtering.propagation import integrate_interval
+from gnio_jax.filtering.resampler import ACCEL, GYRO, VALID, Stream, create_grid, is_finite_number
+from gnio_jax.filtering.start import initial_state, rest_state
+from gnio_jax.filtering.state import FilterState, ImuMemory, Mean, core_covariance
+from gnio_jax.filtering.step import Measure, clone_step
+from gnio_jax.filtering.tangents import (
+    Tangents,
+    core_sensitivity,
+    start_tangents,
+    step_with_tangents,
 )
-from gnio_jax.filtering.pose import Pose, pose_from_vector, start_vector
-from gnio_jax.filtering.start import initial_state, rest_state, with_lasting_errors
-from gnio_jax.filtering.state import FilterState, ImuMemory
-from gnio_jax.filtering.tracker_file import load_tracker, save_tracker
-from gnio_jax.types import Prediction
+from gnio_jax.types import FASTEST_TURN, STRONGEST_FORCE, Array, Prediction
 
-LONGEST_GAP = 60.0
-"""A stamp further than this from the one before is taken for a mistake (of its unit, most often),
-s."""
+
+class Pose(NamedTuple):
+    """The estimate at one time. Host arrays."""
+
+    time: float
+    """s, on the clock of the stamps."""
+    rotation: Float[np.ndarray, "3 3"]
+    """Body → world."""
+    velocity: Float[np.ndarray, "3"]
+    """World frame, m/s."""
+    position: Float[np.ndarray, "3"]
+    """World frame, m."""
+    gyro_bias: Float[np.ndarray, "3"]
+    """rad/s"""
+    accel_bias: Float[np.ndarray, "3"]
+    """m/s²"""
+    covariance: Float[np.ndarray, "15 15"]
+    """Of the error in θ (world frame, left), v, p, b_g, b_a, considered errors included."""
+    accepted: float
+    """Of the last clone step: 1 its measurement was used, 0 it was not, NaN there was none."""
+    nis: float
+    """Of the last clone step: rᵀ S⁻¹ r of its measurement; NaN where there was none."""
+    healthy: bool
+    """False once a clone step left a state that is not finite, a negative variance or a speed above
+    `FilterConfig.speed_limit`: all since is void."""
+
+
+PoseVector = Float[Array, "l"]
+"""A `Pose` without its time, so that one transfer from the device is enough: rotation, velocity,
+position, biases, covariance, accepted, nis, healthy."""
+_SIZES = (9, 3, 3, 3, 3, 225, 1, 1, 1)
+_SPLITS = np.cumsum(_SIZES)[:-1]
+
+
+class Core(NamedTuple):
+    """What lives on the device."""
+
+    filter: FilterState
+    """After the last clone step; its clones are a ring, the next of which to be written is
+    `intervals` mod W + 1."""
+    window: Float[Array, "r 7"]
+    """The last `FilterConfig.reach` grid samples before it, holes bridged: gyro rad/s, accel m/s²,
+    raw, and whether the filter used the sample."""
+    intervals: Int[Array, ""]
+    """Clone steps so far."""
+    tangents: Tangents | None
+    """Derivatives of the filter by the errors that are considered; None where there are none."""
 
 
 class Tracker:
     """The filter with the network in the loop, fed sample by sample.
 
-    - predict: as `run_odometry` takes it.
+    - predict, config, noise: as `run_odometry` takes them.
     - state: the start, at the time of the first sample (`initial_state`, `level_state`, or what a
-      run left).
-    - config, noise: the filter's.
+      run left). None: it is made of the first `rest_seconds`, in which the device must lie still
+      (`rest_state`); until then there is no pose, and then these samples are filtered, too. A
+      sample that is missing, or without any acceleration, begins the rest anew.
+    - rest_seconds, std: length of that rest, s, and the standard deviations of that start.
     - hole: samples further apart than this leave the grid samples between them missing, s; None:
       1.5 dt. A slower IMU needs more.
     - imu_rate: Hz, nominal, of the samples that will come; None: 1/dt. A faster IMU is band-limited
@@ -83,106 +127,65 @@ class Tracker:
     def __init__(
         self,
         predict: Callable[[Any], Prediction],
-        state: FilterState,
         config: FilterConfig,
         noise: NoiseModel,
-        hole: float | None = None,
-        imu_rate: float | None = None,
-        considered: ConsideredStd | None = None,
-    ):
-        state = checked_state(state, config, noise)
-        dtype = np.dtype(state.offset.dtype)
-        low_pass = checked_design(config.dt, hole, imu_rate)
-        settings = TrackerSettings(
-            config=config,
-            noise=checked_noise(noise, dtype),
-            design=low_pass,
-            dtype=dtype,
-            considered=_checked_numbers(considered),
-        )
-        self._make(predict, settings)
-        self._start(state)
-
-    @classmethod
-    def from_rest(
-        cls,
-        predict: Callable[[Any], Prediction],
-        config: FilterConfig,
-        noise: NoiseModel,
-        seconds: float = 1.0,
+        state: FilterState | None = None,
+        *,
+        rest_seconds: float = 1.0,
         std: InitialStd = TLIO_STD,
         hole: float | None = None,
         imu_rate: float | None = None,
         considered: ConsideredStd | None = None,
-    ) -> Tracker:
-        """Start without a state: the device lies still for the first `seconds`, from which
-        `rest_state` makes one for the first sample: tilt, velocity, and the gyro's bias where a
-        second or more is as quiet as on a table.
-
-        Until then there is no pose; then these samples are filtered, too. A missing sample begins
-        the collection anew.
-        """
-        if not (is_finite_number(seconds) and round(seconds / config.dt) >= 2):
+    ):
+        if not (is_finite_number(rest_seconds) and round(rest_seconds / config.dt) >= 2):
             raise ValueError(
-                f"seconds: must be a time of at least two samples of {config.dt:g} s, "
-                f"found {seconds!r}"
+                f"rest_seconds: must be a time of at least two samples of {config.dt:g} s, "
+                f"found {rest_seconds!r}"
             )
-        dtype = np.dtype(jax.dtypes.canonicalize_dtype(np.float64))
-        eye, nothing = jnp.eye(3, dtype=dtype), jnp.zeros(3, dtype)
-        initial_state(config, eye, nothing, nothing, std=std)  # complains of precision and std
-        low_pass = checked_design(config.dt, hole, imu_rate)
-        settings = TrackerSettings(
-            config=config,
-            noise=checked_noise(noise, dtype),
-            design=low_pass,
-            dtype=dtype,
-            rest=round(seconds / config.dt),
-            std=InitialStd(*(float(value) for value in std)),
-            considered=_checked_numbers(considered),
-        )
-        tracker = cls.__new__(cls)
-        tracker._make(predict, settings)
-        return tracker
-
-    @classmethod
-    def restore(
-        cls,
-        path: str | os.PathLike[str],
-        predict: Callable[[Any], Prediction],
-        config: FilterConfig,
-        noise: NoiseModel,
-    ) -> Tracker:
-        """A tracker as `save` left it, with what it considers. Raises `InputError` for a file that
-        is damaged or of another config or noise."""
-        settings, state = load_tracker(path, config, noise)
-        tracker = cls.__new__(cls)
-        tracker._make(predict, settings)
-        tracker._core, tracker._latest = state.core, state.latest
-        tracker._pending = [tuple(row) for row in state.pending.tolist()]
-        tracker._clock, tracker._intake = state.clock, state.intake
-        return tracker
+        if considered is not None:
+            check_considered(considered)
+        self._config, self._std, self._considered = config, std, considered
+        self._rest = round(rest_seconds / config.dt)
+        self._stream = Stream(create_grid(config.dt, hole, imu_rate))
+        dtype = jax.dtypes.canonicalize_dtype(np.float64) if state is None else state.offset.dtype
+        self._noise = checked_noise(noise, dtype)
+        start = state
+        if start is None:  # Any start will do to compile for.
+            nothing = jnp.zeros(3, dtype)
+            start = initial_state(config, jnp.eye(3, dtype=dtype), nothing, nothing, std=std)
+        core = self._start(start)
+        self._programs = compile_programs(predict, core, config, self._noise, considered)
+        if state is None:
+            self._core = None
 
     def push(self, time: Any, gyro: Any, accel: Any) -> Pose | None:
         """Take one sample: time s, gyro (3,) rad/s, accel (3,) m/s², raw, in the body frame; a
         value that is not finite: missing.
 
         Returns the pose of a clone step, if one was made (of the last, after a gap), else None:
-        then `pose()` has the newest. Raises `ValueError` naming the argument if the time does not
-        increase, or by more than `LONGEST_GAP`, or a shape is wrong; then nothing has changed. So
-        does an IMU that is so much faster than `imu_rate` that it would alias; every hundred grid
-        samples that is looked at.
+        then `pose()` has the newest. A stamp that is more than `LONGEST_TRUSTED` after the one
+        before is believed once that of the next sample agrees with it; until then its sample waits.
+
+        Raises `ValueError` naming the argument if the time does not increase, or by more than
+        `LONGEST_GAP`, or a shape is wrong, or a value is beyond what an IMU measures; then nothing
+        has changed. So does an IMU that is so much faster than `imu_rate` that it would alias;
+        every hundred grid samples that is looked at. So does a rest without gravity, whose samples
+        are left out.
         """
-        stamp = self._checked_stamp(time)
-        sample = (*_three_numbers("gyro", gyro), *_three_numbers("accel", accel))
-        low_pass = self._settings.design
-        self._intake, events = low_pass_sample(self._intake, stamp, sample, low_pass)
-        newest_pose = None
-        for event in events:
-            self._clock, rows = advance_clock(self._clock, *event, low_pass.dt, low_pass.hole)
-            before = self._clock.count - len(rows)
-            for number, row in enumerate(rows, start=before + 1):
-                newest_pose = self._push_grid_sample(row, number) or newest_pose
-        return newest_pose
+        sample = _three_numbers("gyro", gyro, FASTEST_TURN, "rad/s")
+        sample += _three_numbers("accel", accel, STRONGEST_FORCE, "m/s²")
+        self._stream.push(_finite_seconds(time), sample)
+        if self._core is None:
+            self._start_from_rest()
+        n, vector = self._config.samples_per_clone, None
+        while self._core is not None and self._stream.known >= n:
+            rows = self._stream.rows(n).astype(self._core.window.dtype)
+            self._stream.take(n)
+            self._core, vector = self._programs.advance(self._core, rows)
+        if vector is None:
+            return None
+        self._vector, self._ahead = vector, None
+        return self._as_pose(vector, 0)
 
     def pose(self) -> Pose | None:
         """The pose after the newest grid sample; between clone steps by integrating the samples
@@ -191,23 +194,21 @@ class Tracker:
         Its time is NaN before the first sample on the grid. Costs a dispatch for each sample
         since it was last asked.
         """
-        if self._core is None or self._latest is None:
+        if self._core is None:
             return None
-        if self._ahead is None:
-            self._ahead = 0, self._latest, self._core.filter.imu
-        done, vector, memory = self._ahead
-        for row in self._rows(self._pending[done:]):
+        done, vector, memory = self._ahead or (0, self._vector, self._core.filter.imu)
+        known = self._stream.known
+        for row in self._stream.rows(known)[done:].astype(self._core.window.dtype):
             vector, memory = self._programs.look_ahead(vector, memory, row)
-        self._ahead = len(self._pending), vector, memory
-        samples = math.nan if self._clock is None else self._clock.count
-        return pose_from_vector(np.asarray(vector), self._time_after(samples))
+        self._ahead = known, vector, memory
+        return self._as_pose(vector, known)
 
     def filter_state(self) -> FilterState | None:
         """The filter after the last clone step, as `run_odometry` would return it; None while there
         is no start."""
         if self._core is None:
             return None
-        oldest = int(self._core.intervals) % self._settings.config.clones
+        oldest = int(self._core.intervals) % self._config.clones
         return unroll_clones(_copied(self._core.filter), oldest)
 
     @property
@@ -216,133 +217,207 @@ class Tracker:
 
         It is latency: the times of the poses are right.
         """
-        return self._settings.design.delay
+        return self._stream.grid.delay
 
-    @property
-    def state(self) -> TrackerState:
-        """A copy of all that changes."""
-        return TrackerState(
-            _copied(self._core),
-            None if self._latest is None else self._latest.copy(),
-            self._rows(self._pending),
-            self._clock,
-            self._intake,
+    def _start_from_rest(self) -> None:
+        """Start, once the next samples are a whole rest; they stay to be filtered."""
+        while self._core is None and self._stream.known >= self._rest:
+            rows = self._stream.rows(self._rest)
+            unusable = np.flatnonzero((rows[:, VALID] == 0) | ~rows[:, ACCEL].any(axis=1))
+            if len(unusable):
+                self._stream.take(int(unusable[-1]) + 1)
+                continue
+            try:
+                state = rest_state(self._config, rows[:, GYRO], rows[:, ACCEL], self._std)
+            except ValueError:  # It shows no gravity: the next samples may.
+                self._stream.take(self._rest)
+                raise
+            self._start(state)
+
+    def _start(self, state: FilterState) -> Core:
+        """The filter begins with `state`, at the time of the next sample."""
+        state = checked_state(state, self._config, self._noise)
+        window = jnp.zeros((self._config.reach, 7), state.offset.dtype)
+        tangents = None if self._considered is None else start_tangents(state)
+        # Copies: the compiled step takes the memory of its argument, which may not be shared, not
+        # even between two of its fields.
+        core = _copied(Core(state, window, jnp.int32(0), tangents))
+        flags = jnp.stack([jnp.nan, jnp.nan, state.healthy])
+        covariance = core_covariance(state.core_covariance)
+        self._core: Core | None = core
+        self._vector = _pose_vector(state.mean, covariance, flags, tangents, self._considered)
+        self._ahead: tuple[int, PoseVector, ImuMemory] | None = None
+        """How many known samples `pose` has integrated, its vector and IMU memory after them."""
+        return core
+
+    def _as_pose(self, vector: PoseVector, ahead: int) -> Pose:
+        """On the host, at the end of the interval of the last sample taken, or of one `ahead`."""
+        rotation, *vectors, covariance, accepted, nis, healthy = np.split(np.array(vector), _SPLITS)
+        samples = self._stream.taken + ahead
+        return Pose(
+            self._stream.origin + samples * self._config.dt,
+            rotation.reshape(3, 3),
+            *vectors,
+            covariance.reshape(15, 15),
+            accepted.item(),
+            nis.item(),
+            bool(healthy.item() > 0),
         )
 
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write all but the network into an .npz file, whole or not at all; `restore` goes on from
-        it to the bit."""
-        save_tracker(path, self._settings, self.state)
 
-    def _make(self, predict: Predict, settings: TrackerSettings) -> None:
-        """Compile for these settings; nothing has come yet."""
-        prediction_shapes(predict, settings.config)
-        self._settings = settings
-        self._programs = compile_programs(predict, settings)
-        self._core: TrackerCore | None = None
-        self._latest: np.ndarray | None = None
-        self._pending: list[GridSample] = []
-        self._clock: Clock | None = None
-        self._intake: Intake | None = None
-        self._ahead: tuple[int, Any, ImuMemory] | None = None
-        """How many pending samples `pose` has integrated, its vector and IMU memory after them."""
+class Programs(NamedTuple):
+    """The compiled programs of a tracker."""
 
-    def _start(self, state: FilterState) -> None:
-        considered = self._settings.considered
-        if self._settings.noise.correlation is not None:
-            state = with_lasting_errors(state)
-        # Copies: the first step is given their memory, and it may not be shared, not even between
-        # two fields.
-        core = start_core(state, self._settings)
-        self._core = _copied(core)
-        self._latest = start_vector(state, self._settings.dtype)
-        if considered is not None and core.tangents is not None:
-            pose = with_considered(self._latest, state, core.tangents, considered)
-            self._latest = np.asarray(pose)
-        self._pending, self._ahead = [], None
-
-    def _push_grid_sample(self, row: GridSample, number: int) -> Pose | None:
-        """Take the `number`-th grid sample, counted from 1."""
-        self._pending.append(row)
-        if self._core is None:
-            return self._collect_rest(number)
-        if len(self._pending) < self._settings.config.samples_per_clone:
-            return None
-        rows, self._pending = self._rows(self._pending), []
-        return self._clone_step(self._core, rows, number)
-
-    def _clone_step(self, core: TrackerCore, rows: np.ndarray, number: int) -> Pose:
-        """A clone step with the samples up to the `number`-th."""
-        self._core, vector = self._programs.advance(core, rows)
-        self._latest, self._ahead = np.asarray(vector), None
-        return pose_from_vector(self._latest, self._time_after(number))
-
-    def _collect_rest(self, number: int) -> Pose | None:
-        """Start, once the samples at rest are together, and filter them."""
-        if self._pending[-1][VALID] == 0:
-            self._pending = []
-        config, rest, std = self._settings.config, self._settings.rest, self._settings.std
-        if len(self._pending) < rest:
-            return None
-        collected = self._pending
-        samples = self._rows(collected)
-        self._start(rest_state(config, samples[:, GYRO], samples[:, ACCEL], std))
-        pose, n, before = None, config.samples_per_clone, number - rest
-        for done in range(n, rest + 1, n):
-            assert self._core is not None
-            pose = self._clone_step(self._core, samples[done - n : done], before + done)
-        self._pending = collected[rest - rest % n :]
-        return pose
-
-    def _rows(self, samples: list[GridSample]) -> np.ndarray:
-        return np.array(samples, self._settings.dtype).reshape(-1, GRID_COLUMNS)
-
-    def _time_after(self, samples: int | float) -> float:
-        """End of the interval of the last of so many grid samples, s."""
-        return math.nan if self._clock is None else self._clock.origin + samples * self._dt
-
-    @property
-    def _dt(self) -> float:
-        return self._settings.config.dt
-
-    def _checked_stamp(self, time: Any) -> float:
-        try:
-            stamp = float(time)
-        except (TypeError, ValueError):
-            stamp = math.nan
-        if not math.isfinite(stamp):
-            raise ValueError(f"time: must be a finite number of seconds, found {time!r}")
-        if self._intake is None:
-            return stamp
-        before = self._intake.newest
-        if stamp <= before:
-            raise ValueError(f"time: must increase, found {stamp!r} after {before!r}")
-        if stamp - before > LONGEST_GAP:
-            raise ValueError(
-                f"time: {stamp!r} is {stamp - before:g} s after the sample before, more than "
-                f"{LONGEST_GAP:g} s; stamps are in seconds, and after a long stop a new tracker "
-                "starts better"
-            )
-        check_rate(self._intake, stamp, self._settings.design)
-        return stamp
+    advance: Callable[[Core, np.ndarray], tuple[Core, jax.Array]]
+    look_ahead: Callable[[PoseVector, ImuMemory, np.ndarray], tuple[jax.Array, ImuMemory]]
 
 
-def _checked_numbers(considered: ConsideredStd | None) -> ConsideredStd | None:
-    """The same as numbers of Python, which a program and a file hold."""
-    if considered is None:
-        return None
-    check_considered(considered)
-    return ConsideredStd(*(float(value) for value in considered))
+def compile_programs(
+    predict: Predict,
+    core: Core,
+    config: FilterConfig,
+    noise: NoiseModel,
+    considered: ConsideredStd | None,
+) -> Programs:
+    """Compile `advance` and `look_ahead` for cores like this one."""
+    config = dataclasses.replace(config, history="core")
+    of_type = functools.partial(jax.ShapeDtypeStruct, dtype=core.window.dtype)
+    step = functools.partial(
+        advance, predict=predict, config=config, noise=noise, considered=considered
+    )
+    ahead = functools.partial(look_ahead, config=config, noise=noise)
+    rows, row, vector = ((config.samples_per_clone, 7), (7,), (sum(_SIZES),))
+    return Programs(
+        jax.jit(step, donate_argnums=0).lower(core, of_type(rows)).compile(),
+        jax.jit(ahead).lower(of_type(vector), core.filter.imu, of_type(row)).compile(),
+    )
 
 
-def _three_numbers(name: str, value: Any) -> tuple[float, ...]:
+def advance(
+    core: Core,
+    rows: Float[Array, "n 7"],
+    predict: Predict,
+    config: FilterConfig,
+    noise: NoiseModel,
+    considered: ConsideredStd | None,
+) -> tuple[Core, PoseVector]:
+    """One clone step, as `run_odometry` makes it, from the n grid samples (gyro, accel, valid) of
+    its interval; and its pose.
+
+    `config.history` must be "core". Where the window is no measurement the network is not called.
+    """
+    valid = rows[:, VALID] > 0
+    imu, age, memory = bridge(rows[:, GYRO], rows[:, ACCEL], valid, core.filter.imu, config)
+    assert imu.gap is not None
+    latest = jnp.concatenate([imu.gyro, imu.accel, imu.gap.used[:, None]], axis=1)
+    window = jnp.concatenate([core.window[config.samples_per_clone :], latest])
+    complete = (core.intervals >= config.clones_per_window) & jnp.all(window[:, VALID] > 0)
+    shapes = prediction_shapes(predict, config)
+
+    def infer(state: FilterState, oldest: Array) -> Prediction:
+        rotation, gyro, accel = state.clone_rotation[oldest], window[:, GYRO], window[:, ACCEL]
+        return predict_window(predict, state, rotation, gyro, accel, config)
+
+    def measure(state: FilterState, oldest: Array | int) -> tuple[Measurement, dict]:
+        prediction = jax.lax.cond(
+            complete, infer, lambda *_: no_prediction(shapes), state, jnp.asarray(oldest)
+        )
+        return predicted_measurement(prediction, config, noise, rows.dtype), {}
+
+    def step(state: FilterState, measure: Measure) -> tuple[FilterState, FilterHistory]:
+        slot = core.intervals % config.clones
+        return advance_filter(state, imu, age, measure, slot, config, noise)
+
+    if core.tangents is None:
+        (state, history), tangents = step(core.filter, measure), None
+    else:
+        state, history, tangents = step_with_tangents(step, core.filter, core.tangents, measure)
+    state = state._replace(imu=memory._replace(quiet=state.imu.quiet))
+    mean = Mean(*(getattr(history, name)[0] for name in Mean._fields))
+    flags = jnp.stack([history.accepted[0], history.nis[0], history.healthy[0]])
+    assert history.covariance is not None
+    vector = _pose_vector(mean, history.covariance[0], flags, tangents, considered)
+    return Core(state, window, core.intervals + 1, tangents), vector
+
+
+def advance_filter(
+    state: FilterState,
+    imu: Imu,
+    age: Float[Array, "n"],
+    measure: Measure,
+    slot: Array,
+    config: FilterConfig,
+    noise: NoiseModel,
+) -> tuple[FilterState, FilterHistory]:
+    """One clone step, and a history of one row. `age` of each held sample, s: see `gaps.bridge`."""
+    frame = config.displacement_frame
+    state, record = clone_step(state, imu, measure, slot, config, noise, frame)
+    records = jax.tree.map(lambda leaf: leaf[None], record)
+    history = stacked_history(records, jnp.max(age)[None], state.healthy, config)
+    return state._replace(healthy=history.healthy[-1] > 0), history
+
+
+def look_ahead(
+    pose: PoseVector,
+    memory: ImuMemory,
+    row: Float[Array, "7"],
+    config: FilterConfig,
+    noise: NoiseModel,
+) -> tuple[PoseVector, ImuMemory]:
+    """The pose and the memory of the IMU after one more grid sample, by integration alone.
+
+    Its covariance is P + S C Sᵀ where errors are considered: both parts take the same transition.
+    """
+    rotation, velocity, position, *biases, covariance, accepted, nis, healthy = jnp.split(
+        pose, _SPLITS
+    )
+    state = initial_state(config, rotation.reshape(3, 3), velocity, position, *biases)
+    imu, _, memory = bridge(row[None, GYRO], row[None, ACCEL], row[None, VALID] > 0, memory, config)
+    motion = integrate_interval(state, imu, noise, config.dt)
+    covariance = covariance.reshape(15, 15)
+    covariance = motion.transition @ covariance @ motion.transition.T + motion.noise
+    mean = Mean(motion.rotation, motion.velocity, position + motion.offset, *biases)
+    flags = jnp.concatenate([accepted, nis, healthy])
+    return _pose_vector(mean, 0.5 * (covariance + covariance.T), flags), memory
+
+
+def _pose_vector(
+    mean: Mean,
+    covariance: Float[Array, "15 15"],
+    flags: Float[Array, "3"],
+    tangents: Tangents | None = None,
+    considered: ConsideredStd | None = None,
+) -> PoseVector:
+    """With the errors that are considered added to the covariance."""
+    if tangents is not None and considered is not None:
+        sensitivity = core_sensitivity(mean, tangents)
+        covariance = covariance + considered_covariance(sensitivity[None], considered)[0]
+    parts = (*mean, covariance, flags)
+    return jnp.concatenate([jnp.ravel(part).astype(covariance.dtype) for part in parts])
+
+
+def _finite_seconds(time: Any) -> float:
+    try:
+        seconds = float(time)
+    except (TypeError, ValueError):
+        seconds = math.nan
+    if not math.isfinite(seconds):
+        raise ValueError(f"time: must be a finite number of seconds, found {time!r}")
+    return seconds
+
+
+def _three_numbers(name: str, value: Any, largest: float, unit: str) -> tuple[float, ...]:
     try:
         array = np.asarray(value, np.float64)
     except (TypeError, ValueError):
         raise ValueError(f"{name}: must be three numbers, found {value!r}") from None
     if array.shape != (3,):
         raise ValueError(f"{name}: must be three numbers, found shape {array.shape}")
-    return tuple(array.tolist())
+    numbers = tuple(array.tolist())
+    if any(largest < abs(number) < math.inf for number in numbers):
+        problem = f"no IMU measures more than {largest:g} {unit}"
+        raise ValueError(f"{name}: {problem}, found {max(map(abs, numbers)):g}")
+    return numbers
 
 
 def _copied(tree: Any) -> Any:

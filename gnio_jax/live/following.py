@@ -12,8 +12,7 @@ import numpy as np
 from gnio_jax.data.resampling import longest_bridge
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import inference_network
-from gnio_jax.filtering import Tracker
-from gnio_jax.filtering.pose import Pose
+from gnio_jax.filtering import Pose, Tracker
 from gnio_jax.live.samples import Sample
 from gnio_jax.live.sources import Source
 from gnio_jax.tracking.filter import tracking_filter
@@ -53,13 +52,13 @@ def create_tracker(run: Run, imu_rate: float | None = None, rest_seconds: float 
     def predict(windows: Any) -> Any:
         return network.apply(network.variables, windows)
 
-    return Tracker.from_rest(
+    return Tracker(
         predict,
         setup.config,
         setup.noise,
-        rest_seconds,
-        setup.initial_std,
-        longest_interval(run, imu_rate),
+        rest_seconds=rest_seconds,
+        std=setup.initial_std,
+        hole=longest_interval(run, imu_rate),
         imu_rate=imu_rate or run.config.data.rate,
         considered=setup.considered,
     )
@@ -101,6 +100,8 @@ class Follower:
     """Stamp of the newest whole sample, s."""
     gaps: list[float] = field(default_factory=list)
     """Lengths of the gaps since the first pose, s."""
+    gap_ends: list[float] = field(default_factory=list)
+    """Stamps at which they ended, s."""
 
     @property
     def lost(self) -> bool:
@@ -144,6 +145,10 @@ def _pushed(push: Push, sample: Sample | None, found: Follower) -> Pose | None:
     except ValueError as error:
         _refuse(found, str(error))
         return None
+    while found.gap_ends and found.gap_ends[-1] > sample.time:
+        # The stamp leapt, and the tracker did not believe it: there was no gap before it.
+        found.gaps.pop()
+        found.gap_ends.pop()
     found.last = sample.time
     if np.isfinite([sample.gyro, sample.accel]).all():
         _note_gap(found)
@@ -160,6 +165,7 @@ def _note_gap(found: Follower) -> None:
     What came before the start is not in the path."""
     if found.poses and found.last - found.newest > found.longest_interval:
         found.gaps.append(found.last - found.newest)
+        found.gap_ends.append(found.last)
 
 
 def _check_sensors(found: Follower, where: str) -> None:

@@ -16,7 +16,7 @@ import numpy as np
 from gnio_jax.errors import require_packages
 from gnio_jax.evaluation.exporting.rerun_file import BLUE, OPTION, check_file, ellipsoids
 from gnio_jax.files import replacing
-from gnio_jax.filtering.pose import Pose
+from gnio_jax.filtering import Pose
 from gnio_jax.numerics import quaternion_from_matrix, xyzw_from_wxyz
 
 VIEWER = "viewer"

@@ -6,11 +6,10 @@ import json
 import math
 from typing import Any, NamedTuple
 
+from gnio_jax.types import FASTEST_TURN, STRONGEST_FORCE
+
 LONGEST_LINE = 4096
 """Characters; what is longer is no sample."""
-_LARGEST = (100.0, 1000.0)
-"""rad/s and m/s²: no phone measures more, so such a line has other units or is damaged."""
-
 
 MISSING = (math.nan, math.nan, math.nan)
 """Of a sensor that was not read."""
@@ -91,7 +90,7 @@ def _checked(time: float, gyro: list[float], accel: list[float], scale: Scale) -
         return None
     gyro = [scale.gyro * value for value in gyro]
     accel = [scale.accel * value for value in accel]
-    for values, largest in zip((gyro, accel), _LARGEST, strict=True):
+    for values, largest in zip((gyro, accel), (FASTEST_TURN, STRONGEST_FORCE), strict=True):
         if any(abs(value) > largest for value in values):
             return None
     return Sample(time, (gyro[0], gyro[1], gyro[2]), (accel[0], accel[1], accel[2]))

@@ -10,7 +10,8 @@ from absl.testing import parameterized
 from scipy.spatial.transform import Rotation
 
 from gnio_jax import filtering, geometry
-from gnio_jax.filtering import online, scan, smoother
+from gnio_jax.filtering import scan, smoother
+from gnio_jax.filtering import tracker as online
 from gnio_jax.filtering.displacement import Measurement, update
 from gnio_jax.filtering.gaps import Imu
 from gnio_jax.filtering.lasting_errors import lasting_motion
@@ -101,7 +102,7 @@ def test_tracker(monkeypatch):
     """Neither clone steps, nor looks ahead, nor holes, nor a new start compile anything."""
     for name in ("advance", "look_ahead"):
         monkeypatch.setattr(online, name, chex.assert_max_traces(getattr(online, name), n=1))
-    tracker = filtering.Tracker(predict, start(), CONFIG, NOISE)
+    tracker = filtering.Tracker(predict, CONFIG, NOISE, start())
     gyro, accel = signals(0, intervals=10)
     poses = []
     for k in range(len(gyro)):

@@ -191,10 +191,10 @@ def predict(windows):
     return Prediction(pooled, -2.0 + 0.1 * pooled)
 
 
-def test_the_tracker_has_them_too(tmp_path):
+def test_the_tracker_has_them_too():
     start, gyro, accel, _, _ = walk()
     state = filtering.initial_state(CONFIG, *start)
-    tracker = filtering.Tracker(predict, state, CONFIG, NOISE)
+    tracker = filtering.Tracker(predict, CONFIG, NOISE, state)
     poses = [
         tracker.push(DT * k, *sample) for k, sample in enumerate(zip(gyro, accel, strict=True))
     ]
@@ -204,12 +204,6 @@ def test_the_tracker_has_them_too(tmp_path):
     np.testing.assert_allclose(
         [pose.position for pose in found], history.position[: len(found)], atol=1e-9
     )
-    tracker.save(tmp_path / "tracker.npz")
-    restored = filtering.Tracker.restore(tmp_path / "tracker.npz", predict, CONFIG, NOISE)
-    np.testing.assert_array_equal(restored.pose().covariance, tracker.pose().covariance)
-    other = NOISE._replace(correlation=ERRORS._replace(seconds=6.0))
-    with pytest.raises(ValueError, match=r"correlation\.seconds = 0\.3, not 6\.0"):
-        filtering.Tracker.restore(tmp_path / "tracker.npz", predict, CONFIG, other)
 
 
 def evidence(errors=ERRORS, factor=(1.0, 1.0, 1.0), spread=None):

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from gnio_jax import filtering
 from gnio_jax.filtering import Tracker
 from gnio_jax.filtering import displacement as measured
-from gnio_jax.filtering import tracker as online
+from gnio_jax.filtering.inputs import checked_inputs
 from gnio_jax.filtering.state import OFFSET
 from gnio_jax.types import Prediction
 from tests.support.compiling import quick
@@ -108,11 +108,11 @@ def test_a_state_that_is_carried_on_keeps_its_gate():
 
 
 def leap():
-    """The recording with a leap to some 400 m/s and back, long before its end."""
+    """The recording with a leap to some 140 m/s and back, long before its end."""
     gyro, accel = recording(0.0)
     accel = accel.copy()
-    accel[100] += [2e4, 0, 0]
-    accel[108] -= [2e4, 0, 0]
+    accel[98:106] += [900.0, 0, 0]
+    accel[106:114] -= [900.0, 0, 0]
     return gyro, accel
 
 
@@ -132,26 +132,40 @@ def test_unhealthy_once_is_unhealthy_for_good():
     assert bool(state.healthy) and (np.asarray(history.healthy) == 1).all()
 
 
-def test_online_too_and_across_a_file(tmp_path, monkeypatch):
+def test_online_too():
     gyro, accel = leap()
     _, history, _ = run(gyro, accel)
-    tracker = Tracker(predict, start(), CONFIG, NOISE)
-    found, half = [], 130
-    # Compiled once, for the one from the file too.
-    monkeypatch.setattr(online, "compile_programs", lambda *_: tracker._programs)
-    for k in range(half):
-        found.append(tracker.push(k * DT, gyro[k], accel[k]))
-    assert tracker.pose().healthy is False and not tracker.filter_state().healthy
-    tracker.save(tmp_path / "state.npz")
-    again = Tracker.restore(tmp_path / "state.npz", predict, CONFIG, NOISE)
-    assert again.pose().healthy is False
-    for k in range(half, len(gyro)):
-        found.append(again.push(k * DT, gyro[k], accel[k]))
+    tracker = Tracker(predict, CONFIG, NOISE, start())
+    found = [tracker.push(k * DT, gyro[k], accel[k]) for k in range(len(gyro))]
     np.testing.assert_array_equal(
         [pose.healthy for pose in found if pose is not None], np.asarray(history.healthy) > 0
     )
-    again._start(again.filter_state())  # another one, from what this one left
-    assert again.pose().healthy is False
+    assert tracker.pose().healthy is False and not tracker.filter_state().healthy
+    tracker._start(tracker.filter_state())  # another one, from what this one left
+    assert tracker.pose().healthy is False
+
+
+@pytest.mark.parametrize("name, largest, unit", [("gyro", 100, "rad/s"), ("accel", 1000, "m/s²")])
+def test_what_no_imu_measures_is_refused(name, largest, unit):
+    """By a run, in a sample that is there, and by a tracker, which goes on without it."""
+    signals = {"gyro": recording(0.0)[0].copy(), "accel": recording(0.0)[1].copy()}
+    signals[name][57, 1] = -1.01 * largest
+    words = rf"^{name}: is beyond {largest} {unit} in 1 of 280 rows, the first is row 57"
+    there = np.arange(280) != 57
+    for valid in (None, ~there):
+        with pytest.raises(ValueError, match=words):
+            filtering.run_odometry(predict, start(), *signals.values(), CONFIG, NOISE, valid)
+    checked_inputs(start(), *signals.values(), there, CONFIG, NOISE)  # what is missing may be so
+    _, history, _ = run(*signals.values(), there)
+    tracker, poses = Tracker(predict, CONFIG, NOISE, start()), []
+    for k, row in enumerate(zip(*signals.values(), strict=True)):
+        if k == 57:
+            words = rf"^{name}: no IMU measures more than {largest} {unit}, found"
+            with pytest.raises(ValueError, match=words):
+                tracker.push(k * DT, *row)
+        elif (pose := tracker.push(k * DT, *row)) is not None:
+            poses.append(pose)
+    np.testing.assert_allclose([pose.position for pose in poses], history.position, atol=1e-9)
 
 
 # Any input ----------------------------------------------------------------------------------------

@@ -197,7 +197,7 @@ def test_online_it_is_the_scan_and_a_gap_under_any_sample_of_a_window_voids_it()
     assert np.flatnonzero(np.isnan(np.asarray(history.displacement)[CLONES:, 0])).tolist() == [
         k - CLONES for k in (25, 26, 27, 28, 29)
     ]
-    tracker = filtering.Tracker(predict, start(), CONFIG, NOISE)
+    tracker = filtering.Tracker(predict, CONFIG, NOISE, start())
     found = {}
     for k in range(len(gyro)):
         pose = tracker.push(k * DT, np.where(valid[k], gyro[k], np.nan), accel[k])

@@ -4,7 +4,6 @@ clones against a plain NumPy filter."""
 import dataclasses
 import functools
 import importlib.util
-import json
 import sys
 from pathlib import Path
 
@@ -17,10 +16,9 @@ from scipy.spatial.transform import Rotation
 from gnio_jax import config as configuration
 from gnio_jax import filtering
 from gnio_jax.commands import console
-from gnio_jax.errors import InputError
 from gnio_jax.filtering import Tracker
 from gnio_jax.filtering import tracker as online
-from gnio_jax.filtering.clock import advance_clock
+from gnio_jax.filtering.resampler import Stream, create_grid
 from gnio_jax.types import Prediction
 from tests.support import drawn_run, scekf_numpy
 
@@ -75,7 +73,7 @@ OTHER = dataclasses.replace(
 def compiled(config=CONFIG):
     """One tracker a configuration, for its programs: compiling takes most of the time of these
     tests."""
-    return Tracker(predict, start(config), config, NOISE)
+    return Tracker(predict, config, NOISE, start(config))
 
 
 @functools.cache
@@ -105,7 +103,7 @@ def built(monkeypatch):
 
 @pytest.fixture
 def tracker(built):
-    return Tracker(predict, start(), CONFIG, NOISE)
+    return Tracker(predict, CONFIG, NOISE, start())
 
 
 def feed(tracker, gyro, accel, time):
@@ -198,7 +196,7 @@ def test_clock_against_a_slow_resampler(kind):
     if kind == "holes":
         stamps[50:] += 0.2
         stamps[51:] += 0.012
-        stamps[300:] += 3.0
+        stamps[300:] += 0.9
     elif kind == "uniform":
         stamps = 100.0 + np.arange(400) * 0.01
     elif kind.startswith("missing"):
@@ -206,14 +204,18 @@ def test_clock_against_a_slow_resampler(kind):
         values[200:240] = np.inf
         if kind.endswith("start"):
             values[:30, 2] = np.nan
-    clock, rows, known = None, [], []
+    if kind == "fast":  # so fast an IMU is refused after a second
+        stamps, values = stamps[:240], values[:240]
+    stream, rows, known = Stream(create_grid(0.01, hole)), [], []
     for time, row in zip(stamps.tolist(), values.tolist(), strict=True):
-        clock, new = advance_clock(clock, time, tuple(row), 0.01, hole)
-        rows += new
+        stream.push(time, tuple(row))
+        new = stream.known
+        rows += list(stream.rows(new))
+        stream.take(new)
         known.append(len(rows))
     wanted = oracle(stamps, values, 0.01, hole)
     np.testing.assert_allclose(np.array(rows), wanted, atol=1e-9)
-    assert (clock.count, clock.newest) == (len(rows), stamps[-1])
+    assert stream.taken == len(rows)
     assert (wanted[:, 6] == 0).any() == (kind.startswith("missing") or kind == "holes")
     if not kind.startswith(
         "missing"
@@ -311,77 +313,6 @@ def test_between_clones_it_coasts_through_a_gap(tracker):
     assert pose.time == pytest.approx((N + 3) * DT)
 
 
-@pytest.mark.parametrize("split", [0, 1, 57, 186])
-def test_goes_on_from_a_file_to_the_bit(tracker, tmp_path, monkeypatch, split):
-    gyro, accel = recording()
-    time = (
-        3.0
-        + np.arange(len(gyro)) * DT
-        + np.random.default_rng(2).uniform(-0.3, 0.3, len(gyro)) * DT
-    )
-    gyro = np.where(np.arange(len(gyro))[:, None] == 100, np.nan, gyro)
-    feed(tracker, gyro[:split], accel[:split], time[:split])
-    tracker.save(tmp_path / "state.npz")
-    if split == 57:
-        monkeypatch.undo()  # once with programs of its own, as in another process
-    again = Tracker.restore(tmp_path / "state.npz", predict, CONFIG, NOISE)
-    jax.tree.map(np.testing.assert_array_equal, again.state, tracker.state)
-    jax.tree.map(np.testing.assert_array_equal, again.pose(), tracker.pose())
-    rest = [feed(t, gyro[split:], accel[split:], time[split:]) for t in (tracker, again)]
-    assert len(rest[0]) >= 23
-    jax.tree.map(np.testing.assert_array_equal, *rest)
-    assert [p.name for p in tmp_path.iterdir()] == ["state.npz"]
-
-
-def test_files_that_do_not_fit_are_refused(tracker, tmp_path):
-    path = tmp_path / "state.npz"
-    tracker.save(path)
-
-    def refusal(config=CONFIG, noise=NOISE, path=path):
-        with pytest.raises(InputError) as refused:
-            Tracker.restore(path, predict, config, noise)
-        assert str(refused.value).startswith(str(path)) and "\n" not in str(refused.value)
-        return str(refused.value)
-
-    assert "FilterConfig.gate_threshold = 11.345, not 9.0" in refusal(
-        dataclasses.replace(CONFIG, gate_threshold=9.0)
-    )
-    assert "NoiseModel.gyro_density = 0.002, not 0.001" in refusal(
-        noise=NOISE._replace(gyro_density=1e-3)
-    )
-    assert "no such file" in refusal(path=tmp_path / "none.npz")
-    whole = path.read_bytes()
-    for content in (b"", b"text", whole[: len(whole) // 2]):
-        path.write_bytes(content)
-        assert "is no file of Tracker.save, or damaged" in refusal()
-    np.savez(path, about=np.array(json.dumps({"format": "another"})))
-    assert "is not a 'gnio-jax tracker" in refusal()
-    np.savez(path, about=np.array({"format": 1}, dtype=object))
-    assert "is no file of Tracker.save" in refusal()
-
-
-def test_a_file_says_nothing_of_considered_errors_where_there_are_none(tracker, tmp_path):
-    tracker.save(tmp_path / "state.npz")
-    with np.load(tmp_path / "state.npz") as file:
-        about = json.loads(str(file["about"]))
-        assert "considered" not in about and about["format"] == "gnio-jax tracker 4"
-        assert not [name for name in file.files if name.startswith("tangents")]
-
-
-def test_a_failed_save_leaves_the_old_file(tracker, tmp_path, monkeypatch):
-    tracker.save(tmp_path / "state.npz")
-    before = (tmp_path / "state.npz").read_bytes()
-
-    def full(file, **_):
-        file.write(b"half")
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(np, "savez", full)
-    with pytest.raises(OSError):
-        tracker.save(tmp_path / "state.npz")
-    assert (tmp_path / "state.npz").read_bytes() == before and len(list(tmp_path.iterdir())) == 1
-
-
 @pytest.mark.parametrize(
     "arguments, words",
     [
@@ -392,65 +323,123 @@ def test_a_failed_save_leaves_the_old_file(tracker, tmp_path, monkeypatch):
         ((1020.0, np.zeros(3), np.zeros(3)), r"^time: .* more than 60 s; stamps are in seconds"),
         ((1.1, np.zeros(4), np.zeros(3)), r"^gyro: must be three numbers, found shape \(4,\)"),
         ((1.1, np.zeros(3), "up"), r"^accel: must be three numbers"),
+        ((1.1, np.full(3, 1e6), np.zeros(3)), r"^gyro: no IMU measures more than 100 rad/s"),
     ],
 )
 def test_mistakes_change_nothing(tracker, arguments, words):
-    feed(
-        tracker, np.zeros((6, 3)), np.tile([0, 0, 9.81], (6, 1)), [0.9, 0.92, 0.94, 0.96, 0.98, 1.0]
-    )
-    before = tracker.state
+    """Neither now nor for the samples that come after them."""
+    time, (gyro, accel) = 0.9 + np.arange(20) * DT, recording()
+    other = Tracker(predict, CONFIG, NOISE, start())
+    for each in (tracker, other):
+        feed(each, gyro[:6], accel[:6], time[:6])
     with pytest.raises(ValueError, match=words):
         tracker.push(*arguments)
-    jax.tree.map(np.testing.assert_array_equal, tracker.state, before)
+    jax.tree.map(np.testing.assert_array_equal, tracker.pose(), other.pose())
+    after = [feed(each, gyro[6:20], accel[6:20], time[6:]) for each in (tracker, other)]
+    assert len(after[0]) == 4
+    jax.tree.map(np.testing.assert_array_equal, *after)
+
+
+@pytest.mark.parametrize("leap", [1.5, 30.0, 59.0])
+def test_a_stamp_that_leaps_is_believed_once_a_second_one_agrees(tracker, leap):
+    """One stamp in the future costs its sample, and a stop of the stream none."""
+    gyro, accel = recording()
+    wrong, time = 100, np.arange(len(gyro)) * DT
+    alone = np.where(np.arange(len(gyro)) == wrong, time + leap, time)
+    found = feed(tracker, gyro, accel, alone)
+    _, wanted = scan(start(), gyro, accel, np.arange(len(gyro)) != wrong)
+    assert len(found) == INTERVALS
+    np.testing.assert_allclose([p.position for p in found], wanted.position, atol=1e-9)
+
+    stopped = Tracker(predict, CONFIG, NOISE, start())
+    keep, gap = 120, round(leap / DT)  # the samples before the stop, and those that it costs
+    feed(stopped, gyro[:keep], accel[:keep], time[:keep])
+    assert stopped.push(time[keep] + leap, gyro[keep], accel[keep]) is None
+    assert stopped.pose().time == pytest.approx(keep * DT)
+    made = stopped.push(time[keep + 1] + leap, gyro[keep + 1], accel[keep + 1])
+    samples = keep + gap + 2
+    assert made.time == pytest.approx(samples // N * N * DT)
+    assert stopped.pose().time == pytest.approx(samples * DT)
+
+
+def test_stamps_that_leap_apart_are_not_believed(tracker):
+    """Each of them waits for one that agrees, and the old clock goes on."""
+    gyro, accel = recording()
+    feed(tracker, gyro[:8], accel[:8], np.arange(8) * DT)
+    for time in (20.0, 40.0, 5.0, 30.0):
+        assert tracker.push(time, gyro[8], accel[8]) is None
+    assert tracker.pose().time == pytest.approx(8 * DT)
+    tracker.push(8 * DT, gyro[8], accel[8])
+    assert tracker.pose().time == pytest.approx(9 * DT)
 
 
 def test_mistakes_at_the_start():
     with pytest.raises(ValueError, match=r"^hole: must be a time of at least dt"):
-        Tracker(predict, start(), CONFIG, NOISE, hole=0.001)
+        Tracker(predict, CONFIG, NOISE, start(), hole=0.001)
     with pytest.raises(ValueError, match=r"^noise\.gyro_density"):
-        Tracker(predict, start(), CONFIG, NOISE._replace(gyro_density=-1.0))
+        Tracker(predict, CONFIG, NOISE._replace(gyro_density=-1.0), start())
     with pytest.raises(ValueError, match=r"^predict: "):
-        Tracker(lambda windows: windows, start(), CONFIG, NOISE)
+        Tracker(lambda windows: windows, CONFIG, NOISE, start())
     with pytest.raises(ValueError, match=r"^state"):
-        Tracker(predict, start(), dataclasses.replace(CONFIG, clones_per_window=5), NOISE)
-    with pytest.raises(ValueError, match=r"^seconds: "):
-        Tracker.from_rest(predict, CONFIG, NOISE, seconds=0.01)
+        Tracker(predict, dataclasses.replace(CONFIG, clones_per_window=5), NOISE, start())
+    with pytest.raises(ValueError, match=r"^rest_seconds: "):
+        Tracker(predict, CONFIG, NOISE, rest_seconds=0.01)
     with pytest.raises(ValueError, match=r"^std\.tilt"):
-        Tracker.from_rest(predict, CONFIG, NOISE, std=filtering.InitialStd(tilt=-1.0))
+        Tracker(predict, CONFIG, NOISE, std=filtering.InitialStd(tilt=-1.0))
 
 
-def test_from_rest(built, tmp_path):
-    """The first second without a hole makes the state, and is filtered from its first sample on."""
-    gyro, accel = recording()
-    gyro, accel = (
-        np.concatenate([gyro[-80:], gyro[: 10 - 80]]),
-        np.concatenate([accel[-80:], accel[: 10 - 80]]),
-    )
+def resting():
+    """The last 80 samples of the recording, at rest, and then its first ones."""
+    return (np.concatenate([signal[-80:], signal[: 10 - 80]]) for signal in recording())
+
+
+@pytest.mark.parametrize("lost", ["missing", "without acceleration"])
+def test_from_rest(built, lost):
+    """The first 0.9 s without a hole make the state, and are filtered from their first sample on.
+    A sensor that does not run yet reads zero."""
+    gyro, accel = resting()
     time = 7.0 + np.arange(len(gyro)) * DT
-    tracker = Tracker.from_rest(
-        predict, CONFIG, NOISE, seconds=0.9
-    )  # 45 samples: no whole number of intervals
+    # 45 samples: no whole number of intervals
+    tracker = Tracker(predict, CONFIG, NOISE, rest_seconds=0.9)
     assert tracker.pose() is None and tracker.filter_state() is None
-    early = [
-        tracker.push(time[k], gyro[k] * (np.nan if k == 9 else 1), accel[k]) for k in range(40)
-    ]
+    given_gyro, given_accel = gyro.copy(), accel.copy()
+    if lost == "missing":
+        given_gyro[9] = np.nan
+    else:
+        given_accel[:10] = 0.0
+    early = [tracker.push(*row) for row in zip(time[:40], given_gyro, given_accel, strict=False)]
     assert early == [None] * 40 and tracker.pose() is None
-    tracker.save(tmp_path / "waiting.npz")
     first = 10
     state = filtering.level_state(CONFIG, gyro[first : first + 45], accel[first : first + 45])
     intervals = (len(gyro) - first) // N
     used = slice(first, first + intervals * N)
     _, wanted = scan(state, gyro[used], accel[used], np.ones(intervals * N, bool))
-    for each in (tracker, Tracker.restore(tmp_path / "waiting.npz", predict, CONFIG, NOISE)):
-        found = feed(each, gyro[40:], accel[40:], time[40:])
-        assert (
-            len(found) == intervals - 45 // N + 1
-        )  # the first stands for all intervals of the rest
-        np.testing.assert_allclose(found[0].time, time[first] + 45 // N * N * DT)
-        np.testing.assert_allclose(
-            [p.position for p in found], wanted.position[45 // N - 1 :], atol=1e-9
-        )
-        np.testing.assert_allclose([p.nis for p in found], wanted.nis[45 // N - 1 :], rtol=1e-7)
+    found = feed(tracker, gyro[40:], accel[40:], time[40:])
+    assert len(found) == intervals - 45 // N + 1  # the first stands for all intervals of the rest
+    np.testing.assert_allclose(found[0].time, time[first] + 45 // N * N * DT)
+    later = slice(45 // N - 1, len(wanted.position))
+    np.testing.assert_allclose([p.position for p in found], wanted.position[later], atol=1e-9)
+    np.testing.assert_allclose([p.nis for p in found], wanted.nis[later], rtol=1e-7)
+
+
+def test_a_rest_without_gravity_is_told_once_and_another_starts(built):
+    """Such as in units of gravity, until somebody mends it."""
+    gyro, accel = resting()
+    time = np.arange(len(gyro)) * DT
+    tracker, problems, found = Tracker(predict, CONFIG, NOISE), [], []
+    for k, stamp in enumerate(time):
+        try:
+            pose = tracker.push(stamp, gyro[k], accel[k] / (9.81 if k < 50 else 1))
+        except ValueError as error:
+            problems.append((k, str(error)))
+        else:
+            found += [] if pose is None else [pose]
+    ((k, problem),) = problems
+    assert k == 49 and problem.startswith("accel: shows no gravity, its mean is 1 m/s²")
+    # The first pose stands for all intervals of the rest.
+    assert len(found) == (len(time) - 50) // N - 50 // N + 1 and found[0].healthy
+    with pytest.raises(ValueError, match=r"^time: must increase"):
+        tracker.push(time[-1], gyro[0], accel[0])
 
 
 # The example
@@ -530,11 +519,9 @@ def test_a_faster_recording_is_replayed_through_the_low_pass(workdir, replay, tm
     out, err = capsys.readouterr()
     assert err == "" and "DIVERGED" not in out and "Hz to 50 Hz: poses come 433 ms later" in out
     found = np.loadtxt(tmp_path / "walk_trajectory.txt")
-    # The hole at 1.4 s drains the low-pass before the first pose has come: several steps at once.
-    assert (
-        found[0, 0] - time[0] == pytest.approx(1.4, abs=1e-3)
-        and 0.4 < time[-1] - found[-1, 0] < 0.56
-    )
+    # Of the steps of the rest the last one counts; the poses are behind by the low-pass.
+    assert found[0, 0] - time[0] == pytest.approx(1.0, abs=1e-3)
+    assert 0.4 < time[-1] - found[-1, 0] < 0.56
 
 
 @pytest.mark.parametrize(
@@ -549,7 +536,7 @@ def test_a_faster_recording_is_replayed_through_the_low_pass(workdir, replay, tm
         (["--csv", "short.csv"], "short.csv: ends before the device was still for 1 s"),
         (
             ["--csv", "walk.csv", "--rest-seconds", "0"],
-            "--rest-seconds: seconds: must be a time of at least two samples",
+            "--rest-seconds: rest_seconds: must be a time of at least two samples",
         ),
     ],
 )

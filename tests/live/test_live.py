@@ -13,10 +13,9 @@ from gnio_jax.commands import app, console
 from gnio_jax.config import DataConfig, ModelConfig, TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation.tum import read_tum
-from gnio_jax.filtering import ConsideredStd, Tracker
+from gnio_jax.filtering import ConsideredStd, Pose, Tracker
 from gnio_jax.filtering import tracker as trackers
-from gnio_jax.filtering.pose import Pose
-from gnio_jax.live import rerun_stream
+from gnio_jax.live import following, rerun_stream
 from gnio_jax.types import Sequence
 from tests.support import known_walk, tiny_run
 from tests.support.filter_settings import changed
@@ -37,11 +36,10 @@ def programs():
     """Trackers of the one run that take the same steps share what is compiled."""
     compiled, compile_programs = {}, trackers.compile_programs
 
-    def once(predict, settings):
-        steps = settings._replace(design=None, rest=0, std=None)
-        if repr(steps) not in compiled:
-            compiled[repr(steps)] = compile_programs(predict, settings)
-        return compiled[repr(steps)]
+    def once(predict, core, *settings):
+        if repr(settings) not in compiled:
+            compiled[repr(settings)] = compile_programs(predict, core, *settings)
+        return compiled[repr(settings)]
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(trackers, "compile_programs", once)
@@ -103,7 +101,7 @@ def test_the_tracker_of_a_calibrated_run_considers_what_its_track_does(run, monk
         passed.append(considered)
         return Tracker.__new__(Tracker)
 
-    monkeypatch.setattr(Tracker, "from_rest", noted)
+    monkeypatch.setattr(following, "Tracker", noted)
     live.create_tracker(calibrated, RATE)
     live.create_tracker(found, RATE)
     assert passed == [ConsideredStd(0.0, 0.1, np.pi / 2, 0.0), None]
@@ -173,6 +171,16 @@ def test_gaps_are_told(gnio, run, recorded):
     assert "gaps" not in gnio([*lines[:20], *lines[50:]], "--weights", run)  # before the start
 
 
+def test_one_stamp_in_the_future_costs_its_sample_alone(run, recorded, gnio):
+    lines = as_lines(recorded)
+    time, values = lines[150].split(",", 1)
+    leaping = [*lines[:150], f"{float(time) + 30},{values}", *lines[151:]]
+    printed = gnio(leaping, "--weights", run)
+    assert "gaps" not in printed and "refused" not in printed
+    newest = [text.splitlines()[-1].split()[0] for text in (printed, gnio(lines, "--weights", run))]
+    assert newest[0] == newest[1]  # s
+
+
 def test_gaps_of_a_recording_are_told(recorded):
     time, gyro, accel = recorded
     valid = (time < 3.0) | (time > 3.5)
@@ -233,7 +241,11 @@ def test_noise_on_the_line_is_no_text(gnio, run, recorded, monkeypatch, tmp_path
         ([], ["--accel-sign", "ios"], "--accel-sign: is of a recording"),
         ([], ["--rerun", "live.txt"], "--rerun"),
         (["0,0,0,0,0,0,1.01"] * 30, [], "standard input: its accelerometer reads 1.01"),
-        ([], ["--rest-seconds", "0"], "--imu-rate or --rest-seconds: seconds: must be a time of"),
+        (
+            [],
+            ["--rest-seconds", "0"],
+            "--imu-rate or --rest-seconds: rest_seconds: must be a time of",
+        ),
     ],
 )
 def test_mistakes_are_one_line(gnio, capsys, run, lines, arguments, problem):

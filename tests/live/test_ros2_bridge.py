@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from gnio_jax.filtering.pose import Pose
+from gnio_jax.filtering import Pose
 
 BRIDGE = Path(__file__).parents[2] / "examples" / "ros2" / "gnio_odometry" / "bridge.py"
 TURN = Rotation.from_euler("xyz", [0.3, -0.5, 1.2])

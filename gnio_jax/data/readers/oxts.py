@@ -16,8 +16,9 @@ from scipy.spatial.transform import Rotation
 
 from gnio_jax.data.parsing.stamps import in_order
 from gnio_jax.data.parsing.tables import shortened
-from gnio_jax.data.validation import FASTEST, FASTEST_TURN, STRONGEST_FORCE, check_rate
+from gnio_jax.data.validation import FASTEST, check_rate
 from gnio_jax.errors import InputError
+from gnio_jax.types import FASTEST_TURN, STRONGEST_FORCE
 
 EARTH_RADIUS = 6378137.0
 """m, of the sphere of the projection."""

@@ -1,9 +1,8 @@
 """The low-pass of a stream: pure tones, a slow resampler of SciPy's parts, the trajectory of the
-batch path, save and restore."""
+batch path, the rate of the IMU."""
 
 import functools
 import itertools
-import json
 
 import jax
 import jax.numpy as jnp
@@ -15,10 +14,9 @@ from scipy.signal import firwin
 from gnio_jax import filtering, geometry
 from gnio_jax.data.readers import synthetic
 from gnio_jax.data.resampling import resample
-from gnio_jax.errors import InputError
-from gnio_jax.filtering import Tracker, intake
+from gnio_jax.filtering import Tracker
 from gnio_jax.filtering import tracker as online
-from gnio_jax.filtering.clock import advance_clock
+from gnio_jax.filtering.resampler import Stream, create_grid
 from gnio_jax.types import Prediction
 from tests.support.checks import checked_at_first
 
@@ -30,16 +28,14 @@ WEIGHTS = np.random.default_rng(5).standard_normal((6, 3)) * 0.02
 
 def through(stamps, values, imu_rate, dt=DT, hole=None):
     """The rows (gyro, accel, valid) that the filter gets, and the newest stamp when each came."""
-    hole = 1.5 * dt if hole is None else hole
-    design = intake.design(dt, hole, float(imu_rate))
-    stream, clock, rows, known = None, None, [], []
+    stream, rows, known = Stream(create_grid(dt, hole, float(imu_rate))), [], []
     samples = zip(stamps.tolist(), values.tolist(), strict=True)
     for time, row in checked_at_first(samples, 60):  # 400 Hz: a row from 46 on
-        stream, events = intake.low_pass_sample(stream, time, tuple(row), design)
-        for event in events:
-            clock, new = advance_clock(clock, *event, dt, hole)
-            rows += new
-            known += [time] * len(new)
+        stream.push(time, tuple(row))
+        new = stream.known
+        rows += list(stream.rows(new))
+        stream.take(new)
+        known += [time] * new
     return np.array(rows).reshape(-1, 7), np.array(known)
 
 
@@ -47,14 +43,6 @@ def linear(stamps, values, dt=DT):
     """The grid by interpolation alone, without a low-pass: gyro, accel."""
     grid = np.arange(int((stamps[-1] - stamps[0]) / dt)) * dt
     return np.stack([np.interp(grid, stamps - stamps[0], column) for column in values.T], axis=1)
-
-
-@pytest.mark.parametrize("count", [4, 5, 100])
-def test_the_spline_is_scipys_to_the_bit(count):
-    random = np.random.default_rng(count)
-    x, y = np.cumsum(random.uniform(0.3, 1, count)), random.standard_normal((count, 6))
-    points = np.linspace(x[0], x[-1], 300)
-    np.testing.assert_array_equal(intake._spline(x, y)(points), CubicSpline(x, y)(points))
 
 
 def stamps_of(rate, seconds, jitter=0.0):
@@ -94,7 +82,7 @@ def amplitudes(columns):
 def test_pure_tones(rate, dt, jitter, highest):
     """The pass band within 1 %, without delay against the stamps; the stop band 40 dB down."""
     stamps = stamps_of(rate, 1.2, jitter)
-    delay = intake.design(dt, 1.5 * dt, float(rate)).delay
+    delay = create_grid(dt, imu_rate=float(rate)).delay
     assert 21 * dt < delay < 22.01 * dt
     inside = slice(round(0.3 / dt), None)  # at the start the FIR's reach is filled by reflection
     for passed in np.reshape([0.0, 1.0, *np.linspace(0.25, 1, 4) * highest], (2, 3)):
@@ -185,11 +173,16 @@ def test_against_a_slow_resampler(kind):
 
 @pytest.mark.parametrize("rate", [100, 200, 209])
 def test_an_imu_that_is_no_faster_is_left_alone(rate):
-    stamps, design, stream = stamps_of(rate, 1.0), intake.design(DT, 2 / rate, float(rate)), None
-    assert design.delay == 0
-    for k, time in enumerate(stamps.tolist()):
-        stream, events = intake.low_pass_sample(stream, time, (float(k),) * 6, design)
-        assert events == [(time, (float(k),) * 6)]
+    """Between its samples there are lines, and a sample that is on the grid is as it was."""
+    stamps = stamps_of(rate, 1.0)
+    assert create_grid(DT, 2 / rate, float(rate)).delay == 0
+    counted = np.tile(np.arange(len(stamps))[:, None], (1, 6)).astype(float)
+    rows, known = through(stamps, counted, rate, hole=2 / rate)
+    wanted = np.arange(len(rows)) * DT * rate
+    np.testing.assert_allclose(rows[:, :6], np.tile(wanted[:, None], (1, 6)), atol=1e-4)
+    assert (rows[:, 6] == 1).all() and len(rows) == int((stamps[-1] - stamps[0]) / DT + 1e-4) + 1
+    late = known - stamps[0] - np.arange(len(rows)) * DT
+    assert late.min() > -1e-6 and late.max() < 1 / rate
 
 
 def test_two_stamps_almost_alike_do_no_harm():
@@ -293,7 +286,7 @@ def feed(tracker, walked, rows=slice(None)):
 
 @functools.cache
 def compiled():
-    return Tracker(predict, start(walk(400)), CONFIG, NOISE, imu_rate=400.0)
+    return Tracker(predict, CONFIG, NOISE, start(walk(400)), imu_rate=400.0)
 
 
 @pytest.fixture
@@ -310,7 +303,7 @@ def test_a_faster_imu_gives_the_trajectory_of_the_batch_path(built, rate):
     n = 20 * steps
     even = resample(walked, 200.0)
     wanted = np.asarray(program()(state, even.gyro[:n], even.accel[:n]).position)
-    tracker = Tracker(predict, state, CONFIG, NOISE, imu_rate=float(rate))
+    tracker = Tracker(predict, CONFIG, NOISE, state, imu_rate=float(rate))
     found = feed(tracker, walked)
     assert 0.105 < tracker.delay < 0.1101
     times = [pose.time for _, pose in found[:steps]]
@@ -324,94 +317,36 @@ def test_a_faster_imu_gives_the_trajectory_of_the_batch_path(built, rate):
     assert np.linalg.norm(aliased - wanted, axis=1).max() > 0.1
 
 
-SPLITS = [0, 1, 30, 601, 1005, 1030]
-
-
-@functools.cache
-def with_a_hole():
-    walked = walk(400)._replace(gyro=walk(400).gyro.copy())
-    walked.gyro[1000:1010] = np.nan
-    return walked
-
-
-@pytest.fixture(scope="module")
-def split_up(tmp_path_factory):
-    """One tracker over a walk with a hole: its file and its state after so many samples, and the
-    poses of each part."""
-    folder, walked = tmp_path_factory.mktemp("split"), with_a_hole()
-    one = compiled()
-    one._start(start(walked))
-    files, states, parts = [], [], []
-    for first, last in itertools.pairwise([0, *SPLITS, 1600]):
-        parts.append(feed(one, walked, slice(first, last)))
-        files.append(folder / f"{last}.npz")
-        states.append(one.state)
-        one.save(files[-1])
-    return files, states, parts
-
-
-@pytest.mark.parametrize("split", SPLITS)
-def test_restored_in_mid_stream_it_goes_on_to_the_bit(built, split_up, split):
-    """Before the first grid sample, in the middle, in a hole and after it while the FIR fills."""
-    place, (files, states, parts) = SPLITS.index(split), split_up
-    again = Tracker.restore(files[place], predict, CONFIG, NOISE)
-    before, wanted = (
-        list(itertools.chain(*some)) for some in (parts[: place + 1], parts[place + 1 :])
-    )
-    assert again.delay == compiled().delay and (split > 30) == (len(before) > 0)
-    jax.tree.map(np.testing.assert_array_equal, again.state, states[place])
-    rest = feed(again, with_a_hole(), slice(split, 1600))
-    assert len(rest) > 10
-    jax.tree.map(np.testing.assert_array_equal, rest, wanted)
-
-
-def test_a_file_without_the_low_passes_samples_is_damaged(built, tmp_path):
-    path = tmp_path / "state.npz"
-    tracker = Tracker(predict, start(walk(400)), CONFIG, NOISE, imu_rate=400.0)
-    feed(tracker, walk(400), slice(10))
-    tracker.save(path)
-    with np.load(path) as file:
-        arrays = {name: file[name] for name in file.files}
-    assert arrays["stamps"].shape == (10,) and json.loads(str(arrays["about"]))["imu_rate"] == 400
-    stamps, samples = arrays["stamps"], arrays["samples"]
-    for broken in ({"samples": samples[:-1]}, {"stamps": stamps.astype(np.float32)}):
-        np.savez(path, **(arrays | broken))
-        with pytest.raises(InputError, match=r"array 's.*' is missing or not float64 .* damaged"):
-            Tracker.restore(path, predict, CONFIG, NOISE)
-
-
 def test_an_imu_faster_than_told_is_refused_before_it_aliases_for_long(built):
-    tracker = Tracker(predict, start(walk(400)), CONFIG, NOISE)
+    tracker = Tracker(predict, CONFIG, NOISE, start(walk(400)))
     feed(tracker, walk(400), slice(200))
-    before = tracker.state
+    before = tracker.pose()
     words = r"^imu_rate: the samples come at 400 Hz, .* for 200 Hz: .* make it with imu_rate=400"
     for _ in range(2):
         with pytest.raises(ValueError, match=words):
             tracker.push(0.5, np.zeros(3), np.zeros(3))
-        jax.tree.map(np.testing.assert_array_equal, tracker.state, before)
+        jax.tree.map(np.testing.assert_array_equal, tracker.pose(), before)
 
 
 @pytest.mark.parametrize("hole", [0.3, 0.04])
-def test_neither_a_hole_nor_a_file_hides_that_the_imu_is_faster(built, tmp_path, hole):
-    """400 Hz for 0.1 s, nothing, then 400 Hz again; or so with a hole after every 0.1 s."""
+def test_no_hole_hides_that_the_imu_is_faster(built, hole):
+    """400 Hz for 0.1 s, nothing, then 400 Hz again; or so with a hole after every 0.1 s. The time
+    in the holes does not count: half a second of samples is enough."""
     count = np.arange(400)
     stops = np.minimum(count // 40, 1) if hole == 0.3 else count // 40
     stamps = 1.7e9 + count / 400 + stops * hole
-    one, still = Tracker(predict, start(walk(400)), CONFIG, NOISE), (np.zeros(3), [0, 0, 9.81])
-    for time in stamps[:150]:
-        one.push(time, *still)
-    one.save(tmp_path / "state.npz")
-    again = Tracker.restore(tmp_path / "state.npz", predict, CONFIG, NOISE)
-    for tracker in (one, again):
-        with pytest.raises(ValueError, match=r"^imu_rate: the samples come at 400 Hz"):
-            for time in stamps[150:220]:
-                tracker.push(time, *still)
-        assert 0.49 < tracker.state.intake.covered < 0.5
+    tracker, still = Tracker(predict, CONFIG, NOISE, start(walk(400))), (np.zeros(3), [0, 0, 9.81])
+    taken = 0
+    with pytest.raises(ValueError, match=r"^imu_rate: the samples come at 400 Hz"):
+        for time in stamps:
+            tracker.push(time, *still)
+            taken += 1
+    assert 0.49 < (taken - len(np.unique(stops[:taken]))) / 400 < 0.5
 
 
 @pytest.mark.parametrize("kind", ["jitter", "a slower IMU", "lost", "a change"])
 def test_the_rate_is_measured_as_long_as_the_stream_lasts(built, kind):
-    tracker, random = Tracker(predict, start(walk(400)), CONFIG, NOISE), np.random.default_rng(0)
+    tracker, random = Tracker(predict, CONFIG, NOISE, start(walk(400))), np.random.default_rng(0)
     stamps = np.arange(1000) * DT
     if kind == "jitter":
         stamps = stamps + DT * random.uniform(0, 0.99, len(stamps))
@@ -433,4 +368,4 @@ def test_the_rate_is_measured_as_long_as_the_stream_lasts(built, kind):
 @pytest.mark.parametrize("rate", [0.0, -1.0, float("nan")])
 def test_a_rate_that_is_none_is_refused(rate):
     with pytest.raises(ValueError, match=r"^imu_rate: must be a rate in Hz"):
-        Tracker(predict, start(walk(400)), CONFIG, NOISE, imu_rate=float(rate))
+        Tracker(predict, CONFIG, NOISE, start(walk(400)), imu_rate=float(rate))

@@ -1,0 +1,310 @@
+"""IMU samples with irregular stamps on the uniform clock of the filter.
+
+Grid sample k is that of time k·dt after the first stamp. Where the IMU is about as fast as the
+filter, it is interpolated linearly between its two neighbours. Where the IMU is faster, a low-pass
+comes first, or what the filter's rate cannot carry would alias. It is what `data.resample` does to
+a recording: a cubic spline through the samples is read at `factor` points per grid sample, and a
+symmetric FIR makes one sample of them. The FIR of a grid sample reaches beyond it by `delay`, so
+that it is known that much later; its time stays k·dt.
+
+A hole in the stream ends a run of samples, and the grid samples in it are missing. At the start of
+the stream odd reflection stands for what was before it, as in a recording. At the other ends of
+runs the FIR has the weights of what is there, divided by their sum: odd reflection would hand over
+the last sample before a hole as raw as it is, with all its vibration, and the filter would hold
+that. A single lost sample is no hole. All of this happens on the host.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.interpolate import CubicSpline
+
+from gnio_jax.decimation import decimation_factor, low_pass
+
+GYRO, ACCEL, VALID = slice(0, 3), slice(3, 6), 6
+"""Columns of grid samples: rad/s, m/s², and 1, or NaN and 0 where the sample is missing."""
+
+LONGEST_GAP = 60.0
+"""A stamp further than this from the one before is taken for a mistake (of its unit, most often),
+s."""
+LONGEST_TRUSTED = 1.0
+"""A stamp further than this from the one before is believed once a second one agrees with it, s
+(ours): a clock may be wrong for one sample."""
+
+_CLOSEST = 0.25
+"""Of the IMU's interval: before the low-pass a sample that comes sooner after another is left out
+(ours), or noise would make the spline swing."""
+_LINE = 1.75
+"""Of the IMU's interval: samples further apart are joined by a line (ours). There the spline has no
+hold, and swings the higher the wider the gap; a lost sample of a vibration is enough for that."""
+_LOST = 2.5
+"""Of the IMU's interval: samples no further apart belong to one run (ours), so that the loss of a
+single one does not end it."""
+_STOP = 5.0
+"""Of the grid's interval: what is longer is a stop of the IMU and says nothing of its rate (ours).
+Shorter ones may be jitter."""
+_RATE_CHECK = 100
+"""Every so many grid samples the IMU's rate is held against `imu_rate`: by the number of stamps
+till then, which jitter hardly changes. The time in which the IMU stopped does not count."""
+_TOO_FAST = 1.05
+"""Times the fastest rate that the low-pass is made for."""
+_BEFORE = 4
+"""Samples kept before the FIR's reach, so that the spline's new end is not felt within it."""
+
+
+class Grid(NamedTuple):
+    """The uniform clock of the filter, and how samples are brought onto it."""
+
+    dt: float
+    """Between grid samples, s."""
+    hole: float
+    """Grid samples between stamps further apart are missing, s."""
+    imu_rate: float
+    """Hz, nominal."""
+    factor: int
+    """Points of the fine grid per grid sample; 1: there is no low-pass."""
+    taps: Float[np.ndarray, "taps"]
+    """Of the FIR, on the fine grid; (1,) where there is none."""
+
+    @property
+    def delay(self) -> float:
+        """By how much the FIR of a grid sample reaches beyond its time, s."""
+        return len(self.taps) // 2 * self.dt / self.factor
+
+    @property
+    def longest(self) -> float:
+        """Samples further apart belong to two runs, s."""
+        return max(self.hole, _LOST / self.imu_rate) if self.factor > 1 else self.hole
+
+    @property
+    def fastest(self) -> float:
+        """Above this rate of the IMU, Hz, vibrations alias all the same."""
+        return 1.5 * self.imu_rate if self.factor > 1 else 1 / self.dt
+
+
+def create_grid(dt: float, hole: Any = None, imu_rate: Any = None) -> Grid:
+    """For a filter with a sample every `dt` s and an IMU of `imu_rate` Hz, by default 1/dt.
+
+    `hole` is 1.5 dt by default. Raises `ValueError`.
+    """
+    hole = 1.5 * dt if hole is None else hole
+    if not (is_finite_number(hole) and hole >= dt):
+        raise ValueError(f"hole: must be a time of at least dt = {dt:g} s, found {hole!r}")
+    imu_rate = 1 / dt if imu_rate is None else imu_rate
+    if not (is_finite_number(imu_rate) and imu_rate > 0):
+        raise ValueError(f"imu_rate: must be a rate in Hz, found {imu_rate!r}")
+    factor = decimation_factor(imu_rate, 1 / dt)
+    taps = low_pass(factor) if factor > 1 else np.ones(1)
+    return Grid(dt, float(hole), float(imu_rate), factor, taps)
+
+
+def is_finite_number(value: Any) -> bool:
+    """Whether `value` is a Python number, and finite."""
+    return isinstance(value, int | float) and math.isfinite(value)
+
+
+def grid_rows(
+    stamps: Float[np.ndarray, "m"],
+    samples: Float[np.ndarray, "m 6"],
+    first: int,
+    count: int,
+    grid: Grid,
+    slack: float,
+) -> Float[np.ndarray, "count 7"]:
+    """Grid samples `first` … `first + count − 1`.
+
+    `stamps` (s since that of grid sample 0, increasing) and `samples` (gyro, accel) are those that
+    were there, as far as the grid samples depend on them. Stamps closer than `slack` (s) to a time
+    are that time.
+    """
+    numbers = first + np.arange(count)
+    if len(stamps) == 0 or count == 0:
+        values = np.full((count, 6), np.nan)
+    elif grid.factor == 1:
+        values = _interpolated(stamps, samples, numbers * grid.dt, grid.hole, slack)
+    else:
+        values = _low_passed(stamps, samples, numbers * grid.factor, grid, slack)
+    return np.concatenate([values, np.isfinite(values[:, :1])], axis=1)
+
+
+def _interpolated(
+    stamps: Float[np.ndarray, "m"],
+    samples: Float[np.ndarray, "m 6"],
+    times: Float[np.ndarray, "count"],
+    hole: float,
+    slack: float,
+) -> Float[np.ndarray, "count 6"]:
+    """The samples at these times: those that lie there, or lines between two that are no hole
+    apart, else NaN."""
+    after = np.searchsorted(stamps, times - slack)
+    before, inner = np.maximum(after - 1, 0), np.minimum(after, len(stamps) - 1)
+    apart, ended = stamps[inner] - stamps[before], after == len(stamps)
+    equal = (stamps[inner] <= times + slack) & ~ended
+    between = (after > 0) & (apart <= hole) & ~ended
+    share = (times - stamps[before]) / np.where(apart > 0, apart, 1.0)
+    values = samples[before] + share[:, None] * (samples[inner] - samples[before])
+    values[equal] = samples[inner[equal]]
+    values[~(equal | between)] = np.nan
+    return values
+
+
+def _low_passed(
+    stamps: Float[np.ndarray, "m"],
+    samples: Float[np.ndarray, "m 6"],
+    centres: Int[np.ndarray, "count"],
+    grid: Grid,
+    slack: float,
+) -> Float[np.ndarray, "count 6"]:
+    """The FIR at these points of the fine grid, run by run of samples; NaN between the runs."""
+    half, step = len(grid.taps) // 2, grid.dt / grid.factor
+    # The points of the fine grid that all centres together depend on.
+    lowest, highest = centres[0] - half, centres[-1] + half
+    values = np.full((len(centres), 6), np.nan)
+    for run in np.split(np.arange(len(stamps)), np.flatnonzero(np.diff(stamps) > grid.longest) + 1):
+        time = stamps[run]
+        begin, end = math.ceil((time[0] - slack) / step), math.floor((time[-1] + slack) / step)
+        low, high = max(begin, lowest), min(end, highest)
+        inside = (begin <= centres) & (centres <= end)
+        if not inside.any():
+            continue
+        points = np.clip(np.arange(low, high + 1) * step, time[0], time[-1])
+        fine = _curve(time, samples[run], points, grid.imu_rate)
+        if begin == 0:  # the stream's start, as far as there is something to reflect
+            reflected = min(low - lowest, high - low)
+            fine = np.concatenate([2 * fine[0] - fine[reflected:0:-1], fine])
+            low -= reflected
+        weighted = np.zeros((highest - lowest + 1, 7))
+        weighted[low - lowest : high - lowest + 1] = np.pad(
+            fine, ((0, 0), (0, 1)), constant_values=1.0
+        )
+        windows = np.lib.stride_tricks.sliding_window_view(weighted, len(grid.taps), axis=0)
+        sums = (windows[:: grid.factor] @ grid.taps)[inside]
+        # From the centre on to either side the taps never sum to less than half the middle one.
+        values[inside] = sums[:, :6] / sums[:, 6:]
+    return values
+
+
+def _curve(
+    time: Float[np.ndarray, "m"],
+    samples: Float[np.ndarray, "m 6"],
+    points: Float[np.ndarray, "p"],
+    imu_rate: float,
+) -> Float[np.ndarray, "p 6"]:
+    """A run read at some points of it: a spline, and lines where samples are far apart."""
+    lines = np.stack([np.interp(points, time, column) for column in samples.T], axis=1)
+    if len(time) < 4:
+        return lines
+    wide = np.diff(time) > _LINE / imu_rate
+    on_line = wide[np.searchsorted(time[1:-1], points, side="right")]
+    return np.where(on_line[:, None], lines, CubicSpline(time, samples)(points))
+
+
+class Stream:
+    """The samples that have come and are not yet used, and the grid samples that they make."""
+
+    def __init__(self, grid: Grid):
+        self.grid = grid
+        self.origin = math.nan
+        """The first stamp, s."""
+        self.taken = 0
+        """Grid samples that were taken."""
+        self._ended = 0
+        """Grid samples, those that were taken included, that no later sample can change."""
+        self._newest = 0.0
+        """The newest stamp, s since the origin."""
+        self._stamps: list[float] = []
+        """Of the samples that were there and are still needed, s since the origin."""
+        self._samples: list[tuple[float, ...]] = []
+        self._unproven: tuple[float, tuple[float, ...]] | None = None
+        """A sample whose stamp leaps, until another agrees with it."""
+        self._intervals, self._covered = 0, 0.0
+        """Between stamps, missing samples included, and their sum in s, without those in which the
+        IMU stopped."""
+
+    def push(self, time: float, sample: tuple[float, ...]) -> None:
+        """Take a sample: time s, gyro rad/s, accel m/s²; one that is not finite is missing.
+
+        Raises `ValueError`, and nothing has changed, for a time that does not increase or leaps by
+        more than `LONGEST_GAP`, or for an IMU so fast that it would alias.
+        """
+        if math.isnan(self.origin):
+            self.origin = time
+            self._append(0.0, sample)
+            return
+        stamp, newest = time - self.origin, self._newest
+        if stamp <= newest:
+            raise ValueError(f"time: must increase, found {time!r} after {self.origin + newest!r}")
+        if stamp - newest > LONGEST_GAP:
+            raise ValueError(
+                f"time: {time!r} is {stamp - newest:g} s after the sample before, more than "
+                f"{LONGEST_GAP:g} s; stamps are in seconds, and after a long stop a new tracker "
+                "starts better"
+            )
+        waiting, come = self._unproven, [(stamp, sample)]
+        if stamp - newest > LONGEST_TRUSTED:
+            if waiting is None or not 0 < stamp - waiting[0] <= LONGEST_TRUSTED:
+                self._unproven = stamp, sample
+                return
+            come.insert(0, waiting)
+        self._intervals, self._covered = self._measured_rate([each for each, _ in come])
+        self._unproven = None
+        for each in come:
+            self._append(*each)
+
+    @property
+    def known(self) -> int:
+        """How many of the next grid samples no later sample can change any more."""
+        return self._ended - self.taken
+
+    def rows(self, count: int) -> Float[np.ndarray, "count 7"]:
+        """The next grid samples, at most `known`. They are not taken by that."""
+        stamps, samples = np.array(self._stamps), np.array(self._samples).reshape(-1, 6)
+        slack = self._slack(self._newest)
+        return grid_rows(stamps, samples, self.taken, count, self.grid, slack)
+
+    def take(self, count: int) -> None:
+        """Go on behind the next `count` grid samples, and forget what only they depended on."""
+        self.taken += count
+        reach = self.taken * self.grid.dt - self.grid.delay
+        unneeded = int(np.searchsorted(self._stamps, reach, side="right")) - 1 - _BEFORE
+        del self._stamps[: max(unneeded, 0)], self._samples[: max(unneeded, 0)]
+
+    def _append(self, stamp: float, sample: tuple[float, ...]) -> None:
+        self._newest = stamp
+        too_close = self._stamps and stamp - self._stamps[-1] < _CLOSEST / self.grid.imu_rate
+        if all(map(math.isfinite, sample)) and not (self.grid.factor > 1 and too_close):
+            self._stamps.append(stamp)
+            self._samples.append(sample)
+        reached = self._stamps[-1] if self._stamps else -math.inf
+        in_hole = stamp - reached > self.grid.longest  # and all up to now is missing
+        last = stamp if in_hole else reached - self.grid.delay
+        ended = math.floor((last + self._slack(stamp)) / self.grid.dt) + 1
+        self._ended = max(self._ended, ended)
+
+    def _slack(self, stamp: float) -> float:
+        """What rounding leaves of the stamps, s: this close is the same time."""
+        largest = max(abs(self.origin), abs(self.origin + stamp))
+        return 1e-6 * self.grid.dt + 4 * math.ulp(largest)
+
+    def _measured_rate(self, stamps: list[float]) -> tuple[int, float]:
+        """The intervals and their sum after these stamps. Raises `ValueError` if the samples come
+        so much faster than `imu_rate` that vibrations would alias."""
+        grid, period = self.grid, _RATE_CHECK * self.grid.dt
+        intervals, covered, before = self._intervals, self._covered, self._newest
+        for stamp in stamps:
+            interval, before, slack = stamp - before, stamp, self._slack(stamp)
+            if interval > max(grid.hole, _STOP * grid.dt):
+                continue
+            due = (covered + interval + slack) // period > (covered + slack) // period
+            intervals, covered = intervals + 1, covered + interval
+            if due and (rate := intervals / covered) > _TOO_FAST * grid.fastest:
+                raise ValueError(
+                    f"imu_rate: the samples come at {rate:.4g} Hz, the tracker was made for "
+                    f"{grid.imu_rate:.4g} Hz: vibrations would alias; make it with "
+                    f"imu_rate={rate:.4g}"
+                )
+        return intervals, covered
