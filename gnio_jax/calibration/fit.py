@@ -354,9 +354,9 @@ def _filtered(
     """Of every walk: where the filter is healthy, its positions, their covariances and S."""
 
     def of_walk(settings: FilterSettings, walk: Walks) -> tuple[Any, ...]:
-        run = _run(walk, settings, config)
-        _, history = repeat_odometry(*run)
-        found = sensitivity(*run[:3], history, *run[5:])
+        state, gyro, accel, displacement, std, *fixed = _run(walk, settings, config)
+        _, history = repeat_odometry(state, gyro, accel, displacement, std, *fixed)
+        found = sensitivity(state, gyro, accel, history, *fixed)
         assert history.covariance is not None
         covariance = history.covariance[:, POSITION, POSITION]
         return history.healthy, history.position, covariance, found[:, POSITION]

@@ -15,6 +15,8 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
 import yaml
+from yaml.composer import ComposerError
+from yaml.constructor import ConstructorError
 
 from gnio_jax.config.schema import Bound, FilterSettings, InitialStd, NoiseModel, Place, TrainConfig
 from gnio_jax.errors import InputError
@@ -372,7 +374,7 @@ class _Loader(yaml.SafeLoader):
         """Refuse aliases: settings need none, and nested ones grow without bound."""
         if self.check_event(yaml.AliasEvent):
             mark = self.peek_event().start_mark
-            raise yaml.composer.ComposerError(None, None, "aliases are not for settings", mark)
+            raise ComposerError(None, None, "aliases are not for settings", mark)
         return super().compose_node(parent, index)
 
     def construct_mapping(self, node: Any, deep: bool = False) -> dict:
@@ -381,7 +383,7 @@ class _Loader(yaml.SafeLoader):
         for key, _ in node.value:
             if not isinstance(key, yaml.ScalarNode) or key.value in seen:
                 problem = f"the key {_shown(key.value)} is repeated, or it is not a word"
-                raise yaml.constructor.ConstructorError(None, None, problem, key.start_mark)
+                raise ConstructorError(None, None, problem, key.start_mark)
             seen.add(key.value)
         return super().construct_mapping(node, deep)
 
