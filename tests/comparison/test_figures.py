@@ -49,7 +49,7 @@ def test_figures_of_another_filter_or_damaged_ones_are_made_anew(tmp_path, monke
     (tmp_path / "checkpoints" / "best" / "7").mkdir(parents=True)
     path = tmp_path / "eval" / "tlio_test_ekf" / "metrics.json"
     path.parent.mkdir(parents=True)
-    options = dataclasses.asdict(BASE.filter)
+    options = configuration.plain(BASE.filter)
     whole = {
         "settings": {"dataset": "tlio", "split": "test", "definitions": 2, "filter": options},
         "sequences": {"a": {"ate": 1.0, "group": "x", "notes": ["it began while it moved"]}},
