@@ -1,5 +1,5 @@
-"""What a calibration is fitted to: recordings, and displacements of them by a network that did not
-learn from them."""
+"""What a calibration is fitted to: recordings, and the displacements that a network which was not
+trained on them predicts."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ OnStage = Callable[[str, float], None]
 
 
 class Evidence(NamedTuple):
-    """Recordings and what a network says of each, in one order."""
+    """Recordings and the estimates of a network for each, in one order."""
 
     prepared: list[Prepared]
     estimates: list[Estimate]
@@ -62,11 +62,13 @@ def sources(run: Run, config: CalibrateConfig) -> tuple[str, list[Source]]:
         _check_alike(folder, fold_run.config, run.config)
     found = [each.config.data.train_split for each in runs]
     split, count = run.config.data.train_split, len(runs)
-    if count < 2 or sorted(found) != sorted(f"{split}-{k}of{count}" for k in range(count)):
+    unseen = {
+        f"{split}-{k}of{count}": data.Fold(split, k, count, left_out=False) for k in range(count)
+    }
+    if count < 2 or sorted(found) != sorted(unseen):
         remedy = f"train one run for each of --data.train-split {split}-0ofK, {split}-1ofK, ..."
         raise InputError("--out-of-fold", f"learnt from the splits {', '.join(found)}", remedy)
-    parts = [data.parse_fold(name.replace(f"{split}-", f"{split}+")) for name in found]
-    return split, [Source(each, part) for each, part in zip(runs, parts, strict=True)]
+    return split, [Source(each, unseen[name]) for each, name in zip(runs, found, strict=True)]
 
 
 def _split(config: CalibrateConfig, run: TrainConfig) -> str:
@@ -101,9 +103,10 @@ def gather(
     progress: OnStage,
     workers: int,
 ) -> Evidence:
-    """What each network says of its recordings of the split. Raises `InputError` for missing data.
+    """The predictions of each network for its recordings of the split. Raises `InputError` for
+    missing data.
 
-    Displacements are asked for along the filter with `settings`: its attitude turns the windows.
+    The network runs in the loop of the filter with `settings`, whose attitude turns the windows.
     """
     own = asked[0].run.config
     root = config.data_root or own.data_root

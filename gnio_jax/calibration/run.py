@@ -54,11 +54,11 @@ class Calibration(NamedTuple):
 def calibrate(
     config: CalibrateConfig, progress: OnStage = lambda stage, share: None, workers: int = 1
 ) -> Calibration:
-    """Fit the filter's options of a run to recordings that its network did not learn from, and
+    """Fit the filter's settings of a run to recordings that its network was not trained on, and
     write a run that differs in them alone, and in the average over headings if that is asked for.
 
     Three steps (ours). First each axis gets the factor that makes the network's standard deviations
-    those of its errors, window by window against the reference. Then the options of `config.fit`
+    those of its errors, window by window against the reference. Then the settings of `config.fit`
     are those that make the innovations of the filter most likely, in which the reference has no
     part but the start. Last, the errors that the filter considers but does not estimate are those
     that make the errors of its positions most likely; they change no trajectory.
@@ -172,7 +172,7 @@ def _write(
     config: CalibrateConfig,
     split: str,
 ) -> None:
-    """The run with its new options, its checkpoint, and what was fitted."""
+    """The run with its new settings, its checkpoint, and what was fitted."""
     found, settings = calibration.fit, calibration.considered.settings
     about: dict[str, Any] = {
         "run": str(workdir),
