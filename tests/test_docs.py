@@ -72,8 +72,11 @@ def test_the_example_of_the_readme(one_walk, capsys):
 def test_the_loop_of_ones_own(one_walk, capsys):
     """A quarter of its piece and of its steps."""
     run("docs/differentiable_filter.md", code_of("docs/differentiable_filter.md"))
-    losses = [float(line.split()[1]) for line in capsys.readouterr().out.splitlines()]
-    assert len(losses) == 5 and losses[-1] < losses[0]
+    lines = [line.split() for line in capsys.readouterr().out.splitlines()]
+    losses = [float(loss) for _, loss in lines[:5]]
+    assert losses[-1] < losses[0]
+    nees, without, filtered, smoothed = (float(line[-1]) for line in lines[5:])
+    assert nees < 3 and smoothed < filtered < without
 
 
 def test_weights_that_are_loaded(tmp_path, monkeypatch):

@@ -22,10 +22,12 @@ from gnio_jax.evaluation.estimators.result import Estimate
 from gnio_jax.filtering import (
     ConsideredStd,
     FilterConfig,
+    FilterHistory,
+    FilterState,
     considered_covariance,
     initial_state,
     over_sequences,
-    repeat_odometry,
+    run_filter,
     sensitivity,
 )
 from gnio_jax.filtering.history import POSITION
@@ -244,7 +246,8 @@ def innovation_objective(
     chex.assert_equal_shape([walks.displacement, walks.std])
 
     def of_walk(settings: FilterSettings, walk: Walks) -> Array:
-        _, history = repeat_odometry(*_run(walk, settings, config))
+        run, state = _repeated(walk, settings, config)
+        history = run(state, walk.displacement)
         # What the walk is filled up with comes after its last displacement, and may run away.
         present = jnp.isfinite(walk.displacement).all(axis=1)
         healthy = jnp.all((history.healthy > 0) | ~present)
@@ -261,12 +264,20 @@ _value_and_gradient = jax.jit(
 )
 
 
-def _run(walk: Walks, settings: FilterSettings, config: FilterConfig) -> tuple[Any, ...]:
-    """The arguments of `repeat_odometry` for one walk."""
+def _repeated(
+    walk: Walks, settings: FilterSettings, config: FilterConfig
+) -> tuple[Callable[[FilterState, Array], FilterHistory], FilterState]:
+    """The run over one walk without the network, from a start and the displacements, and its
+    start."""
     pose = (walk.rotation, walk.velocity, walk.position, walk.gyro_bias)
     state = initial_state(config, *pose, std=settings.start)
-    given = walk.displacement, walk.std
-    return state, walk.gyro, walk.accel, *given, config, settings.noise, walk.imu_valid
+    covariance = jax.vmap(jnp.diag)(walk.std**2)
+    fixed = config, settings.noise, walk.imu_valid, config.displacement_frame
+
+    def run(state: FilterState, displacement: Array) -> FilterHistory:
+        return run_filter(state, walk.gyro, walk.accel, displacement, covariance, *fixed)[1]
+
+    return run, state
 
 
 def _prior(free: Float[Array, "u"], start: Float[Array, "u"]) -> Float[Array, ""]:
@@ -354,9 +365,9 @@ def _filtered(
     """Of every walk: where the filter is healthy, its positions, their covariances and S."""
 
     def of_walk(settings: FilterSettings, walk: Walks) -> tuple[Any, ...]:
-        state, gyro, accel, displacement, std, *fixed = _run(walk, settings, config)
-        _, history = repeat_odometry(state, gyro, accel, displacement, std, *fixed)
-        found = sensitivity(state, gyro, accel, history, *fixed)
+        run, state = _repeated(walk, settings, config)
+        history = run(state, walk.displacement)
+        found = sensitivity(run, state, walk.displacement)
         assert history.covariance is not None
         covariance = history.covariance[:, POSITION, POSITION]
         return history.healthy, history.position, covariance, found[:, POSITION]

@@ -15,8 +15,9 @@ import numpy as np
 from jaxtyping import Float
 
 from gnio_jax.filtering import FilterState
-from gnio_jax.filtering.inputs import checked_state, state_shapes
+from gnio_jax.filtering.checks import checked_state
 from gnio_jax.filtering.settings import FilterSetup
+from gnio_jax.filtering.state import state_shapes
 from gnio_jax.types import Array
 
 PREFIX = "state."

@@ -23,7 +23,7 @@ from gnio_jax.deployment import flat_state
 from gnio_jax.deployment.flat_state import PREFIX, DeployedState, from_arrays, to_arrays
 from gnio_jax.evaluation.inference import Network
 from gnio_jax.filtering import Pose, level_state
-from gnio_jax.filtering.displacement import scaled_measurement
+from gnio_jax.filtering.displacement import scaled_displacement
 from gnio_jax.filtering.gaps import Imu
 from gnio_jax.filtering.network import network_window
 from gnio_jax.filtering.resampler import ACCEL, GYRO
@@ -73,15 +73,15 @@ def programs(network: Network, setup: FilterSetup) -> list[Program]:
         """`network_window` between the oldest clone that the next step will have and its end."""
         state = from_arrays(arrays, shape)
         samples = _with_latest(state.samples, arrays)
-        rotation = state.filter.clone_rotation[(state.filter.step + 1) % config.clones]
+        oldest = (state.filter.step + 1) % config.clones
         signals = samples[:, GYRO], samples[:, ACCEL]
-        return {"window": network_window(state.filter, rotation, *signals, config)}
+        return {"window": network_window(state.filter, oldest, *signals, config)}
 
     def step(arrays: Arrays) -> dict[str, Array]:
         """`advance_filter` with a given displacement."""
         state = from_arrays(arrays, shape)
         given = arrays["displacement"], arrays["covariance"]
-        measurement = scaled_measurement(*given, noise)
+        measurement = scaled_displacement(*given, noise, config.displacement_frame)
         filtered, history = advance_filter(
             state.filter,
             Imu(arrays["gyro"], arrays["accel"], None),

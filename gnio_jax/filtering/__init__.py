@@ -13,14 +13,16 @@ from gnio_jax.config import (
 )
 from gnio_jax.filtering.batch import cores_as_devices, over_sequences
 from gnio_jax.filtering.config import FilterConfig
-from gnio_jax.filtering.considered import considered_covariance, sensitivity
+from gnio_jax.filtering.consider import considered_covariance, sensitivity
+from gnio_jax.filtering.displacement import displacements
 from gnio_jax.filtering.history import FilterHistory
-from gnio_jax.filtering.scan import repeat_odometry, run_filter, run_odometry
+from gnio_jax.filtering.scan import run_filter, run_odometry
 from gnio_jax.filtering.settings import FilterSetup, filter_setup
-from gnio_jax.filtering.smoother import SmoothedHistory, smooth, smooth_odometry
+from gnio_jax.filtering.smoother import SmoothedHistory, smooth
 from gnio_jax.filtering.start import initial_state, level_state
 from gnio_jax.filtering.state import FilterState, GateState
 from gnio_jax.filtering.tracker import Pose, Tracker
+from gnio_jax.filtering.update import Linearised, Outcome, Step, linearise, measure
 
 __all__ = [
     "ConsideredStd",
@@ -32,20 +34,24 @@ __all__ = [
     "FilterState",
     "GateState",
     "InitialStd",
+    "Linearised",
     "NoiseModel",
+    "Outcome",
     "Pose",
     "SmoothedHistory",
+    "Step",
     "Tracker",
     "considered_covariance",
     "cores_as_devices",
+    "displacements",
     "filter_setup",
     "initial_state",
     "level_state",
+    "linearise",
+    "measure",
     "over_sequences",
-    "repeat_odometry",
     "run_filter",
     "run_odometry",
     "sensitivity",
     "smooth",
-    "smooth_odometry",
 ]

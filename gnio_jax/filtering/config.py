@@ -21,8 +21,8 @@ from gnio_jax.config.schema import (
 from gnio_jax.windows import WINDOW_CUTS, WindowCut
 
 YawFrame = Literal["own", "given"]
-"""Whose yaw frame a displacement is told in: that of the filter's own attitude of the oldest clone,
-with which the network's window was cut, or that of another attitude."""
+"""Whose yaw frame a displacement is expressed in: that of the filter's own attitude of the oldest
+clone, with which the network's window was cut, or that of another attitude."""
 
 
 @no_type_check  # The tests' run-time checker would refuse what __post_init__ converts or names.
@@ -90,9 +90,6 @@ class FilterConfig:
     """Rotate each sample of the network's window with its own attitude, or all with that of the
     start (paper eq. 1 read literally), or cut and rotate it as TLIO's tracker does: one sample
     earlier, the network's input with the biases that the IMU comes with."""
-    jacobians: Literal["latest", "first"] = "latest"
-    """Where the filter is linearised: at the latest estimates, as TLIO's, or at the first of each
-    velocity and position; these are taken anew after an update above `gate_threshold`."""
     speed_limit: Positive = 100.0
     """No carrier is faster, m/s: an estimate that is has diverged, and is not `healthy` from then
     on (ours)."""

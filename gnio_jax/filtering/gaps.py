@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from gnio_jax.filtering.config import FilterConfig
@@ -21,10 +22,10 @@ from gnio_jax.types import Array
 
 
 class Gap(NamedTuple):
-    """What is to be known of n samples beside their values."""
+    """How far n samples can be believed."""
 
     gyro_variance: Float[Array, "*n"]
-    """To be added to that of the white noise, (rad/s)²."""
+    """Added to the variance of the white noise, (rad/s)²."""
     accel_variance: Float[Array, "*n"]
     """The same, (m/s²)²."""
     used: Float[Array, "*n"]
@@ -40,6 +41,11 @@ class Imu(NamedTuple):
     """m/s²"""
     gap: Gap | None
     """None where the stream is complete."""
+
+
+def no_gap(n: int, dtype: np.dtype) -> Gap:
+    """For n samples none of which is missing."""
+    return Gap(np.zeros(n, dtype), np.zeros(n, dtype), np.ones(n, dtype))
 
 
 def bridge(

@@ -5,13 +5,15 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Bool, Float
 
+from gnio_jax.config import NoiseModel
 from gnio_jax.filtering.config import FilterConfig
-from gnio_jax.filtering.displacement import DisplacementUpdate, Measurement
+from gnio_jax.filtering.displacement import Displacement
 from gnio_jax.filtering.state import Mean
-from gnio_jax.filtering.zero_velocity import RestUpdate
+from gnio_jax.filtering.update import Outcome
 from gnio_jax.types import Array
 
 VELOCITY, POSITION, GYRO_BIAS = slice(3, 6), slice(6, 9), slice(9, 12)
@@ -21,7 +23,8 @@ VELOCITY, POSITION, GYRO_BIAS = slice(3, 6), slice(6, 9), slice(9, 12)
 class FilterHistory(NamedTuple):
     """The filter after each of K clone intervals.
 
-    Row k is at t_0 + (k + 1)·n·dt, after its update.
+    Row k is at t_0 + (k + 1)·n·dt, after its updates. The whole covariances are kept with
+    `FilterConfig(history="core")` only; without it `covariance` is None.
     """
 
     rotation: Float[Array, "k 3 3"]
@@ -37,8 +40,8 @@ class FilterHistory(NamedTuple):
     displacement: Float[Array, "k 3"]
     """The measurement, m, in the yaw frame of the oldest clone; NaN where none."""
     measurement_std: Float[Array, "k 3"]
-    """Its standard deviations after `NoiseModel.measurement_scale` and `std_factor`, m; NaN where
-    none."""
+    """Its standard deviations after scaling by `NoiseModel.measurement_scale` and `std_factor`, m;
+    NaN where none."""
     innovation: Float[Array, "k 3"]
     """Measured − predicted displacement, m; NaN where no measurement."""
     covariance_diagonal: Float[Array, "k 15"]
@@ -57,10 +60,8 @@ class FilterHistory(NamedTuple):
     """ln N(r; 0, S) of the innovation, r in m; NaN where no measurement. Their sum is the evidence
     for the noise model."""
     at_rest: Float[Array, "k"]
-    """1 the velocity was measured as zero (`zero_velocity_std`), else 0, also where the χ² gate
+    """1 the velocity was measured as zero (`zero_velocity_std`), else 0, also where the χ² test
     refused that."""
-    rest_nis: Float[Array, "k"]
-    """Normalised innovation squared of the velocity at rest; NaN where the IMU was not quiet."""
     imu_gap: Float[Array, "k"]
     """Age of the oldest held IMU sample of the interval, s; 0 where none was missing. Above
     `bridge_seconds` the filter coasted."""
@@ -68,12 +69,20 @@ class FilterHistory(NamedTuple):
     """0 from the first row on where the state is not finite, a variance is negative or the speed
     above `FilterConfig.speed_limit`: bad input that could not be seen before, and all after it is
     void. The final state remembers it, and a later run from that begins with 0."""
-    lasting: Float[Array, "k e"]
-    """Temporally correlated errors of the windows, as estimated (see `lasting_errors`), in standard
-    deviations: 3, or no columns where `NoiseModel.correlation` is None."""
+    others: tuple[Outcome, ...]
+    """What became of the measurements beside the displacement, their leaves stacked over K: of the
+    velocity at rest where `zero_velocity_std` is above 0, then of the caller's `measurements`."""
     diagnostics: dict[str, Array]
     """The network's diagnostics stacked over K, NaN where it had no window; empty without a
     network."""
+
+    def given(self, noise: NoiseModel) -> tuple[Float[Array, "k 3"], Float[Array, "k 3 3"]]:
+        """Displacements (K, 3), m, and their covariances (K, 3, 3), m², before the scaling of
+        `noise`, which must be the run's: with them `run_filter(..., frame="own")` repeats a run of
+        `run_odometry` without its network."""
+        factor = jnp.stack([jnp.asarray(value) for value in noise.std_factor])
+        variance = self.measurement_std**2 / (noise.measurement_scale * factor**2)[None]
+        return jnp.asarray(self.displacement), jax.vmap(jnp.diag)(variance)
 
 
 class StepRecord(NamedTuple):
@@ -82,22 +91,20 @@ class StepRecord(NamedTuple):
     mean: Mean
     covariance: Array
     """Of θ, v, p, b_g, b_a, or its diagonal: see `FilterConfig.history`."""
-    measurement: Measurement
-    update: DisplacementUpdate
-    rest: RestUpdate
-    lasting: Array
-    """Errors of the displacements that last."""
+    displacement: Displacement
+    outcomes: tuple[Outcome, ...]
+    """Of the displacement, and of the other measurements in their order."""
     diagnostics: dict[str, Array]
 
 
-def stacked_history(
+def finished_history(
     records: StepRecord,
     imu_gap: Float[Array, "k"],
     healthy: Bool[Array, ""],
     config: FilterConfig,
 ) -> FilterHistory:
     """The history of K stacked records from a state that was `healthy` or not."""
-    update, covariance = records.update, records.covariance
+    (update, *others), covariance = records.outcomes, records.covariance
     dtype, whole = covariance.dtype, config.history == "core"
 
     def where_present(value: Array) -> Array:
@@ -106,35 +113,29 @@ def stacked_history(
 
     # S is the identity where there is no measurement, so that the logarithm has a derivative there.
     log_likelihood = -0.5 * (update.nis + 3 * math.log(2 * math.pi)) - jnp.log(update.volume)
-    std = jnp.sqrt(jnp.diagonal(records.measurement.covariance, axis1=1, axis2=2))
+    std = jnp.sqrt(jnp.diagonal(records.displacement.covariance, axis1=1, axis2=2))
     diagonal = jnp.diagonal(covariance, axis1=1, axis2=2) if whole else covariance
-    sound = _sound(records, diagonal, config)
+    at_rest = others[0].accepted if config.zero_velocity_std > 0 else jnp.zeros_like(update.present)
+
+    parts = (*records.mean, covariance)
+    finite = [jnp.all(jnp.isfinite(part), axis=tuple(range(1, part.ndim))) for part in parts]
+    possible = jnp.sum(records.mean.velocity**2, axis=1) <= config.speed_limit**2
+    sound = jnp.all(jnp.stack(finite), axis=0) & jnp.all(diagonal >= 0, axis=1) & possible
     healthy = healthy & (jnp.cumsum(~sound) == 0)
     return FilterHistory(
         *records.mean,
-        displacement=where_present(records.measurement.displacement),
+        displacement=where_present(records.displacement.displacement),
         measurement_std=where_present(std),
-        innovation=where_present(update.innovation),
+        innovation=where_present(update.residual),
         covariance_diagonal=diagonal,
         covariance=covariance if whole else None,
         accepted=where_present(update.accepted),
-        gate_passed=where_present(update.gate_passed),
+        gate_passed=where_present(update.weight),
         nis=where_present(update.nis),
         log_likelihood=where_present(log_likelihood),
-        at_rest=records.rest.accepted.astype(dtype),
-        rest_nis=jnp.where(records.rest.quiet, records.rest.nis, jnp.nan).astype(dtype),
+        at_rest=at_rest.astype(dtype),
         imu_gap=imu_gap.astype(dtype),
         healthy=healthy.astype(dtype),
-        lasting=records.lasting,
+        others=tuple(others),
         diagnostics=records.diagnostics,
     )
-
-
-def _sound(
-    records: StepRecord, variances: Float[Array, "k 15"], config: FilterConfig
-) -> Bool[Array, "k"]:
-    """Where everything is finite, no variance negative and the speed possible."""
-    parts = (*records.mean, records.covariance)
-    finite = [jnp.all(jnp.isfinite(part), axis=tuple(range(1, part.ndim))) for part in parts]
-    possible = jnp.sum(records.mean.velocity**2, axis=1) <= config.speed_limit**2
-    return jnp.all(jnp.stack(finite), axis=0) & jnp.all(variances >= 0, axis=1) & possible

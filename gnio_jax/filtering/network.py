@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from gnio_jax.config import NoiseModel
 from gnio_jax.filtering.config import FilterConfig
-from gnio_jax.filtering.displacement import Measurement, scaled_measurement
+from gnio_jax.filtering.displacement import Displacement, scaled_displacement
 from gnio_jax.filtering.state import FilterState
 from gnio_jax.types import Array, Prediction
 from gnio_jax.windows import cut_window
@@ -44,31 +44,33 @@ def prediction_shapes(predict: Predict, config: FilterConfig) -> Prediction:
 def predict_window(
     predict: Predict,
     state: FilterState,
-    rotation: Float[Array, "3 3"],
+    oldest: Array | int,
     gyro: Float[Array, "r 3"],
     accel: Float[Array, "r 3"],
     config: FilterConfig,
 ) -> Prediction:
-    """What the network says of one window, without the leading axis of one.
-
-    gyro and accel are the last `config.reach` raw samples up to the window's newer clone, rotation
-    the attitude of its older clone.
-    """
-    prediction = predict(network_window(state, rotation, gyro, accel, config))
+    """The network's prediction for one window (`network_window`), without the leading axis of
+    one."""
+    prediction = predict(network_window(state, oldest, gyro, accel, config))
     return jax.tree.map(lambda leaf: _as_floating(leaf[0]), prediction)
 
 
 def network_window(
     state: FilterState,
-    rotation: Float[Array, "3 3"],
+    oldest: Array | int,
     gyro: Float[Array, "r 3"],
     accel: Float[Array, "r 3"],
     config: FilterConfig,
 ) -> Float[Array, "1 n 6"]:
-    """The window that `predict_window` shows the network, float32."""
+    """The network's window from the clone in slot `oldest` to the present, float32.
+
+    gyro and accel are the last `config.reach` raw samples.
+    """
     gyro, accel = gyro[: config.seen], accel[: config.seen]
-    biases, context = (state.gyro_bias, state.accel_bias), config.context_samples
-    window = cut_window(rotation, gyro, accel, *biases, config.cut, config.dt, context)
+    rotation, biases = state.clone_rotation[oldest], (state.gyro_bias, state.accel_bias)
+    window = cut_window(
+        rotation, gyro, accel, *biases, config.cut, config.dt, config.context_samples
+    )
     return window[None].astype(jnp.float32)
 
 
@@ -79,14 +81,15 @@ def no_prediction(shapes: Prediction) -> Prediction:
     )
 
 
-def predicted_measurement(
+def predicted_displacement(
     prediction: Prediction, config: FilterConfig, noise: NoiseModel, dtype: Any
-) -> Measurement:
+) -> Displacement:
     """The measurement that the filter makes of a prediction: covariance diag(exp 2u), u raised to
-    `log_std_min`, before scaling."""
+    `log_std_min`, before scaling. It is expressed in the yaw frame that `config` names."""
     log_std = jnp.maximum(prediction.log_std.astype(dtype), config.log_std_min)
     covariance = jnp.diag(jnp.exp(2 * log_std))
-    return scaled_measurement(prediction.displacement.astype(dtype), covariance, noise)
+    displacement = prediction.displacement.astype(dtype)
+    return scaled_displacement(displacement, covariance, noise, config.displacement_frame)
 
 
 def _as_floating(value: Any) -> Any:

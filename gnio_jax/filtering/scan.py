@@ -1,5 +1,5 @@
-"""The stochastic-cloning EKF as one scan over clone intervals: with given measurements, or with the
-network in the loop."""
+"""The stochastic-cloning EKF as one `lax.scan` over clone intervals: with given displacements, or
+with the network in the loop."""
 
 from __future__ import annotations
 
@@ -11,27 +11,21 @@ import jax
 import jax.numpy as jnp
 
 from gnio_jax.config import NoiseModel
-from gnio_jax.filtering.checkpointing import truncated_scan
-from gnio_jax.filtering.clones import unroll_clones
+from gnio_jax.filtering.checks import Inputs, checked_displacements, checked_inputs
 from gnio_jax.filtering.config import FilterConfig, YawFrame
-from gnio_jax.filtering.displacement import Measurement, scaled_measurement
+from gnio_jax.filtering.displacement import Displacement, scaled_displacements
 from gnio_jax.filtering.gaps import Imu, bridge
-from gnio_jax.filtering.history import FilterHistory, StepRecord, stacked_history
-from gnio_jax.filtering.inputs import (
-    Signals,
-    checked_displacements,
-    checked_inputs,
-    checked_measurements,
-)
+from gnio_jax.filtering.history import FilterHistory, StepRecord, finished_history
 from gnio_jax.filtering.network import (
-    Predict,
     no_prediction,
     predict_window,
-    predicted_measurement,
+    predicted_displacement,
     prediction_shapes,
 )
-from gnio_jax.filtering.state import FilterState
-from gnio_jax.filtering.step import clone_step
+from gnio_jax.filtering.propagation import Transition, correlation_decay, integrate, propagate
+from gnio_jax.filtering.state import FilterState, core_covariance, move_anchor, unroll_clones
+from gnio_jax.filtering.update import Correction, Measurement, Outcome, Step
+from gnio_jax.filtering.zero_velocity import ZeroVelocity
 from gnio_jax.types import Array, Prediction
 
 
@@ -44,69 +38,43 @@ def run_filter(
     config: FilterConfig,
     noise: NoiseModel,
     imu_valid: Any = None,
+    frame: YawFrame = "given",
+    measurements: tuple[Measurement, ...] = (),
 ) -> tuple[FilterState, FilterHistory]:
-    """Filter K clone intervals of IMU samples with given displacement measurements.
+    """Filter K clone intervals of n IMU samples with given displacements (paper §III-G).
 
-    gyro rad/s and accel m/s² (K·n, 3), raw, in the body frame: the filter's biases are subtracted
-    inside; displacement (K, 3), m, row k from clone k−W to clone k in the yaw frame of clone k−W,
-    by another attitude than the filter's; covariance (K, 3, 3), m², before `measurement_scale`. A
-    row with a NaN, or before there are W + 1 clones, is no measurement. imu_valid (K·n,) says which
-    IMU samples are there; the others, and with it those that are not finite, are bridged (see
-    `gaps`). Returns the final state, from which a later call goes on (clone numbers k then count
-    on, too), and the history. Works under `jax.jit`, `jax.vmap` and `jax.grad`. Raises `ValueError`
-    naming an argument of wrong shape or precision, with values that are not finite, or a covariance
-    that is not positive definite; of values that only exist inside `jit`, `FilterHistory.healthy`
-    tells.
+    - state: the start (`initial_state`, `level_state`), or what an earlier run returned.
+    - gyro, accel: (K·n, 3) rad/s and m/s², raw, in the body frame; the filter subtracts its biases.
+    - displacement, covariance: (K, 3) m and (K, 3, 3) m², before the scaling of `noise`. Row k is
+      from clone k − W to clone k, expressed in the yaw frame of clone k − W (`displacements` makes
+      such rows from a known trajectory). A row with a NaN, or before there are W + 1 clones, is no
+      measurement.
+    - imu_valid: (K·n,) booleans, False where an IMU sample is missing. Missing samples, and where
+      there is a mask also those that are not finite, are bridged (see `gaps`). None: the stream is
+      complete.
+    - frame: whose attitude defines that yaw frame: "given", another than the filter's; "own", the
+      filter's, as for the displacements of `FilterHistory.given`, which repeat a run of
+      `run_odometry` without its network.
+    - measurements: other measurements to be taken after the displacement of each interval; their
+      arrays lead with K (see `update`).
+
+    Returns the final state, from which a later call goes on (clone numbers k then count on, too),
+    and the history. Works under `jax.jit`, `jax.vmap` and `jax.grad`. Raises `ValueError` naming an
+    argument of wrong shape or precision, with values that are not finite, or a covariance that is
+    not positive definite. Inside `jit` values are not known; `FilterHistory.healthy` reports bad
+    ones.
     """
-    state, signals, noise = checked_inputs(state, gyro, accel, imu_valid, config, noise)
-    displacement, covariance = checked_measurements(displacement, covariance, signals, config)
-    return _run_filter(state, signals, displacement, covariance, config, noise, "given")
-
-
-def repeat_odometry(
-    state: FilterState,
-    gyro: Any,
-    accel: Any,
-    displacement: Any,
-    std: Any,
-    config: FilterConfig,
-    noise: NoiseModel,
-    imu_valid: Any = None,
-    frame: YawFrame | None = None,
-) -> tuple[FilterState, FilterHistory]:
-    """Filter a run of `run_odometry` again, with the displacements that the network said then.
-
-    displacement (K, 3) and std (K, 3), m, are `displacement` and `measurement_std` of that run's
-    history, told in the filter's own yaw frame; std is the network's own, before any scaling: that
-    run had `measurement_scale` 1 and no `std_factor`. With another noise or start this is the run
-    that would have been, but for the small changes of the windows that another attitude or bias
-    would have made. Differentiable without a network, so that calibration is cheap. With the frame
-    "given" it is a run of `run_filter` that is repeated. All else as in `run_filter`.
-    """
-    state, signals, noise = checked_inputs(state, gyro, accel, imu_valid, config, noise)
-    displacement, std = checked_displacements(displacement, std, signals, config)
-    covariance = jax.vmap(jnp.diag)(std**2)
-    frame = frame or config.displacement_frame
-    return _run_filter(state, signals, displacement, covariance, config, noise, frame)
+    inputs = checked_inputs(state, gyro, accel, imu_valid, measurements, config, noise)
+    measured = checked_displacements(displacement, covariance, inputs, config)
+    return _run_filter(inputs, *measured, config, frame)
 
 
 @functools.partial(jax.jit, static_argnames=("config", "frame"))
 def _run_filter(
-    state: FilterState,
-    signals: Signals,
-    displacement: Array,
-    covariance: Array,
-    config: FilterConfig,
-    noise: NoiseModel,
-    frame: YawFrame,
+    inputs: Inputs, displacement: Array, covariance: Array, config: FilterConfig, frame: YawFrame
 ) -> tuple[FilterState, FilterHistory]:
-    scale = functools.partial(scaled_measurement, noise=noise)
-    measurements = jax.vmap(scale)(displacement, covariance)
-
-    def measure(step: _Step, state: FilterState, oldest: Array) -> tuple[Measurement, dict]:
-        return step.measurement, {}
-
-    return _scan(measure, state, signals, measurements, config, noise, frame)
+    given = scaled_displacements(displacement, covariance, inputs.noise, frame)
+    return _scan(lambda number, stream, given, *_: (given, {}), inputs, given, config)
 
 
 def run_odometry(
@@ -117,6 +85,7 @@ def run_odometry(
     config: FilterConfig,
     noise: NoiseModel,
     imu_valid: Any = None,
+    measurements: tuple[Measurement, ...] = (),
 ) -> tuple[FilterState, FilterHistory]:
     """Filter K clone intervals with the network in the loop (paper fig. 2): its windows are cut
     with the filter's own state.
@@ -124,95 +93,209 @@ def run_odometry(
     predict maps windows (1, C + N, 6) float32, N = n·W, channels [accel m/s², gyro rad/s], to a
     `Prediction` with the same leading axis. A window spans the samples between its two clones i and
     j, and before them come the C samples of its context (`FilterConfig.context_samples`). The
-    filter's present biases are subtracted and the samples rotated by R_γ(R_i)ᵀ R_j, R_j being the
+    filter's present biases are subtracted and the samples rotated by R_γ(R_i)ᵀ R_m, R_m being the
     present estimate of clone i advanced by integrating gyro − b_g (paper eq. 1; backwards through
-    the context), unless `FilterConfig.window_rotation` says otherwise. Its displacement is told in
-    the filter's own yaw frame, and taken so (`displacement.displacement_residual`), but with
-    "tlio". The measurement's covariance is diag(exp 2u), u raised to `log_std_min`. The network is
+    the context), unless `FilterConfig.window_rotation` says otherwise. The displacement is
+    expressed in the filter's own yaw frame, and taken so (`displacement.linearise_displacement`),
+    except with "tlio". Its covariance is diag(exp 2u), u raised to `log_std_min`. The network is
     not called in the first `FilterConfig.first_measured` intervals, which have no whole window, and
-    a window in which the filter coasted through a gap is no measurement. gyro, accel and imu_valid
-    as in `run_filter`. Jit it from outside; differentiable in whatever `predict` closes over, too.
+    a window in which the filter coasted through a gap is no measurement. All else as in
+    `run_filter`. Jit it from outside; it is differentiable in whatever `predict` closes over, too.
     Raises `ValueError` as `run_filter` does, or for a `predict` that returns something else.
     """
-    state, signals, noise = checked_inputs(state, gyro, accel, imu_valid, config, noise)
-    shapes = prediction_shapes(predict, config)
-    infer = functools.partial(_infer, predict=predict, config=config)
+    inputs = checked_inputs(state, gyro, accel, imu_valid, measurements, config, noise)
+    nothing = no_prediction(prediction_shapes(predict, config))
 
-    def nothing(step: _Step, state: FilterState, oldest: Array) -> Prediction:
-        return no_prediction(shapes)
+    def infer(number: Array, stream: Imu, state: FilterState, oldest: Array) -> Prediction:
+        first = (number + 1) * config.samples_per_clone - config.reach
+        seen = jax.tree.map(
+            lambda signal: jax.lax.dynamic_slice_in_dim(signal, first, config.reach), stream
+        )
+        prediction = predict_window(predict, state, oldest, seen.gyro, seen.accel, config)
+        if seen.gap is None:
+            return prediction
+        whole = jnp.all(seen.gap.used > 0)
+        return prediction._replace(displacement=jnp.where(whole, prediction.displacement, jnp.nan))
 
-    def measure(step: _Step, state: FilterState, oldest: Array) -> tuple[Measurement, dict]:
+    def measure(
+        number: Array, stream: Imu, _: None, state: FilterState, oldest: Array
+    ) -> tuple[Displacement, dict]:
         # The number is the scan's own counter, the same for every sequence of a batch, so that this
         # stays a branch under vmap.
-        has_window = step.number >= config.first_measured
-        prediction = jax.lax.cond(has_window, infer, nothing, step, state, oldest)
-        measurement = predicted_measurement(prediction, config, noise, signals.gyro.dtype)
+        has_window = number >= config.first_measured
+        given = number, stream, state, oldest
+        prediction = jax.lax.cond(has_window, infer, lambda *_: nothing, *given)
+        dtype = stream.gyro.dtype
+        measurement = predicted_displacement(prediction, config, inputs.noise, dtype)
         return measurement, prediction.diagnostics
 
-    return _scan(measure, state, signals, None, config, noise, config.displacement_frame)
-
-
-class _Step(NamedTuple):
-    """What a measurement may be made of at one step of the scan."""
-
-    number: Array
-    """Of the clone interval, from 0."""
-    stream: Imu
-    """The samples of all intervals."""
-    measurement: Any
-    """The given `Measurement`; None with a network."""
-
-
-def _infer(
-    step: _Step, state: FilterState, oldest: Array, predict: Predict, config: FilterConfig
-) -> Prediction:
-    """The network's prediction; its displacement is NaN where the filter coasted in the window."""
-    intervals = step.number - config.clones_per_window + 1
-    first = intervals * config.samples_per_clone - config.context_samples - config.cut.lead
-    gyro, accel = (
-        jax.lax.dynamic_slice_in_dim(signal, first, config.reach)
-        for signal in (step.stream.gyro, step.stream.accel)
-    )
-    rotation = state.clone_rotation[oldest]
-    prediction = predict_window(predict, state, rotation, gyro, accel, config)
-    gap = step.stream.gap
-    if gap is None:
-        return prediction
-    whole = jnp.all(jax.lax.dynamic_slice_in_dim(gap.used, first, config.reach) > 0)
-    return prediction._replace(displacement=jnp.where(whole, prediction.displacement, jnp.nan))
+    return _scan(measure, inputs, None, config)
 
 
 def _scan(
-    measure: Callable[[_Step, FilterState, Array], tuple[Measurement, dict]],
-    state: FilterState,
-    signals: Signals,
-    measurements: Measurement | None,
+    measure: Callable[..., tuple[Displacement, dict]],
+    inputs: Inputs,
+    given: Displacement | None,
     config: FilterConfig,
-    noise: NoiseModel,
-    frame: YawFrame,
 ) -> tuple[FilterState, FilterHistory]:
-    """Bridge the stream's holes, make a clone step of every interval, collect the history."""
-    stream, age, memory = bridge(*signals, state.imu, config)
-    numbers, by_interval = interval_inputs(stream, config)
+    """Bridge holes of the stream, take a clone step for every interval, collect the history.
 
-    def step(state: FilterState, inputs: tuple) -> tuple[FilterState, StepRecord]:
-        number, imu, measurement = inputs
-        of_step = functools.partial(measure, _Step(number, stream, measurement))
-        return clone_step(state, imu, of_step, number % config.clones, config, noise, frame)
+    measure(number, stream, given, state, oldest) returns the displacement of an interval and the
+    network's diagnostics: `number` counts the intervals from 0, `stream` is the whole stream,
+    `given` the interval's row, `oldest` the slot of the oldest clone.
+    """
+    signals = inputs.gyro, inputs.accel, inputs.imu_valid
+    stream, age, memory = bridge(*signals, inputs.state.imu, config)
+    numbers, by_interval = intervals(stream, config)
 
-    inputs = numbers, by_interval, measurements
+    def step(state: FilterState, row: tuple) -> tuple[FilterState, StepRecord]:
+        number, imu, given, others = row
+        at_step = functools.partial(measure, number, stream, given)
+        slot = number % config.clones
+        state, record, _ = clone_step(state, imu, slot, at_step, config, inputs.noise, others)
+        return state, record
+
+    rows = numbers, by_interval, given, inputs.measurements
     bounds = config.checkpoint_every, config.truncate_every
-    state, records = truncated_scan(step, state, inputs, *bounds)
-    oldest_held = age.reshape(numbers.shape[0], config.samples_per_clone).max(1)
-    history = stacked_history(records, oldest_held, state.healthy, config)
+    state, records = blocked_scan(step, inputs.state, rows, *bounds)
+    oldest_held = age.reshape(len(numbers), config.samples_per_clone).max(1)
+    history = finished_history(records, oldest_held, inputs.state.healthy, config)
     memory = memory._replace(quiet=state.imu.quiet)
     state = state._replace(imu=memory, healthy=history.healthy[-1] > 0)
-    return unroll_clones(state, numbers.shape[0] % config.clones), history
+    return unroll_clones(state, len(numbers) % config.clones), history
 
 
-def interval_inputs(stream: Imu, config: FilterConfig) -> tuple[Array, Imu]:
+def intervals(stream: Imu, config: FilterConfig) -> tuple[Array, Imu]:
     """Numbers of the K clone intervals, and their samples (K, n, …)."""
     n = config.samples_per_clone
-    intervals = stream.gyro.shape[0] // n
-    by_interval = jax.tree.map(lambda x: x.reshape(intervals, n, *x.shape[1:]), stream)
-    return jnp.arange(intervals), by_interval
+    count = stream.gyro.shape[0] // n
+    return jnp.arange(count), jax.tree.map(lambda x: x.reshape(count, n, *x.shape[1:]), stream)
+
+
+# One clone interval
+# ------------------------------------------------------------------------------------------------
+
+Measure = Callable[[FilterState, Array | int], tuple[Displacement, dict]]
+"""From the state and the slot of its oldest clone to the displacement and the network's
+diagnostics."""
+
+
+class StepTrace(NamedTuple):
+    """What happened to the error in one clone interval, as smoothing needs it."""
+
+    transition: Transition
+    corrections: tuple[Correction, ...]
+    """The updates in the order in which they were made."""
+
+
+def clone_step(
+    state: FilterState,
+    imu: Imu,
+    slot: Array | int,
+    measure: Measure,
+    config: FilterConfig,
+    noise: NoiseModel,
+    measurements: tuple[Measurement, ...] = (),
+) -> tuple[FilterState, StepRecord, StepTrace]:
+    """One clone interval with the samples `imu`: propagate, clone into `slot` of the ring, take the
+    displacement and the other measurements."""
+    # A ring of clones: the newest takes the place of the one that has served as oldest, and the
+    # next slot is the oldest now. The anchor moves once in a round of the ring.
+    dtype, oldest = state.offset.dtype, (slot + 1) % config.clones
+    anchored = jnp.where(jnp.asarray(slot) == 0, 1.0, 0.0).astype(dtype)
+    state = move_anchor(state, anchored)
+    local = state.mean._replace(position=state.offset)
+    interval = _integrate(local, imu, noise, config.dt)
+    decay = correlation_decay(noise.correlation, config.clone_seconds, dtype)
+    transition = Transition(interval.transition, decay, anchored)
+    state = _propagate(state, interval, transition, slot)
+
+    displacement, diagnostics = measure(state, oldest)
+    at_rest = (ZeroVelocity(),) if config.zero_velocity_std > 0 else ()
+    outcomes: tuple[Outcome, ...] = ()
+    corrections: tuple[Correction, ...] = ()
+    for measurement in (displacement, *at_rest, *measurements):
+        step = Step(imu, slot, oldest, config, noise, outcomes)
+        state, outcome, correction = _take(measurement, state, step)
+        outcomes, corrections = (*outcomes, outcome), (*corrections, correction)
+
+    covariance = core_covariance(state.core_covariance)
+    if config.history == "diagonal":
+        covariance = jnp.diagonal(covariance)
+    record = StepRecord(state.mean, covariance, displacement, outcomes, diagnostics)
+    return state, record, StepTrace(transition, corrections)
+
+
+def _keep(primitive: Any, *_: Any, **__: Any) -> bool:
+    """What the backward pass keeps of a step: all but other forms of what it has."""
+    return primitive.name not in {
+        "broadcast_in_dim",
+        "convert_element_type",
+        "neg",
+        "reshape",
+        "squeeze",
+        "transpose",
+    }
+
+
+# To write, and on the way back to read, the numbers that a backward pass keeps costs more than to
+# compute the interval again.
+_integrate = jax.checkpoint(integrate, static_argnums=3, prevent_cse=False)
+_propagate = jax.checkpoint(propagate, policy=_keep, prevent_cse=False)
+
+
+def _take(
+    measurement: Measurement, state: FilterState, step: Step
+) -> tuple[FilterState, Outcome, Correction]:
+    """The measurement's update."""
+    kept = jax.checkpoint(
+        lambda measurement, state: measurement.update(state, step),
+        policy=_keep,
+        prevent_cse=False,
+    )
+    return kept(measurement, state)
+
+
+# A scan whose backward pass is bounded
+# ------------------------------------------------------------------------------------------------
+
+
+def blocked_scan(
+    step: Callable, carry: Any, inputs: Any, checkpoint_every: int = 0, truncate_every: int = 0
+) -> tuple[Any, Any]:
+    """`lax.scan` whose backward pass keeps the carry of every `checkpoint_every`-th step only, and
+    computes the steps between them again, and which hands the carry on without gradient after
+    every `truncate_every`-th step. 0: it keeps every carry, and never cuts the gradient."""
+    run = functools.partial(jax.lax.scan, step)
+    rows = jax.tree.leaves(inputs)[0].shape[0]
+    longest = min(truncate_every, rows) or rows
+    if 0 < checkpoint_every < longest:
+        run = in_blocks(jax.checkpoint(run, prevent_cse=False), run, checkpoint_every)
+    if truncate_every:
+        within = run
+
+        def cut(carry: Any, block: Any) -> tuple[Any, Any]:
+            carry, out = within(carry, block)
+            return jax.lax.stop_gradient(carry), out
+
+        run = in_blocks(cut, cut, longest)
+    return run(carry, inputs)
+
+
+def in_blocks(run: Callable, run_rest: Callable, every: int) -> Callable:
+    """A scan over blocks of `every` rows of its inputs, each by `run(carry, block)`, then by
+    `run_rest` over the rows that are left over."""
+
+    def scan(carry: Any, inputs: Any) -> tuple[Any, Any]:
+        length = jax.tree.leaves(inputs)[0].shape[0]
+        count = length // every
+        whole = count * every
+        blocks = jax.tree.map(lambda x: x[:whole].reshape(count, every, *x.shape[1:]), inputs)
+        carry, out = jax.lax.scan(run, carry, blocks)
+        out = jax.tree.map(lambda y: y.reshape(whole, *y.shape[2:]), out)
+        if length > whole:
+            carry, rest = run_rest(carry, jax.tree.map(lambda x: x[whole:], inputs))
+            out = jax.tree.map(lambda y, z: jnp.concatenate([y, z]), out, rest)
+        return carry, out
+
+    return scan

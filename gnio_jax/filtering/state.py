@@ -1,9 +1,10 @@
-"""State of the stochastic-cloning EKF (paper §III-G, after TLIO).
+"""State of the stochastic-cloning EKF (paper §III-G, after TLIO), its ring of clones and the anchor
+of its positions.
 
-The error state is δ = (θ, v, o, b_g, b_a, a, s, e | θ_0, o_0, θ_1, o_1, …): 21 core entries and
-those of e, then 6 per clone, oldest clone first. Rotation errors are world-frame and left,
-R ← exp(δθ) R; everything else adds. e are the errors of the displacements that last (see
-`lasting_errors`): none, or 3 entries.
+The error state is δ = (θ, v, o, b_g, b_a, a, s, b | θ_0, o_0, θ_1, o_1, …): 21 core entries and
+those of b, then 6 for each clone. Rotation errors are in the world frame and on the left,
+R ← exp(δθ) R; everything else adds. b is the temporally correlated part of the displacements'
+errors (see `update`): no entries, or 3.
 
 Positions are held as offsets o = p − a from an anchor a, a past position that moves up to the
 present once in a window; s is its last move. A clone keeps the anchor that it was taken with: the
@@ -11,33 +12,35 @@ present one, or the one before. The variance of a position grows without bound, 
 differences of positions are measured; those of offsets and moves do not. So no update subtracts
 large variances from each other, which is what makes the plain form (θ, v, p, …) diverge in float32.
 The change of variables is linear with constant coefficients (p = a + o for the core), so the filter
-is the plain one, exactly.
+is exactly the plain one.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import functools
+from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from gnio_jax.config import InitialStd, NoiseModel
+from gnio_jax.filtering.config import FilterConfig
 from gnio_jax.types import Array
 
 CORE, CLONE = 21, 6
-"""Entries of the error state: of the core without e, and of each clone."""
+"""Entries of the error state: of the core without b, and of each clone."""
 THETA, VELOCITY, OFFSET, GYRO_BIAS, ACCEL_BIAS, ANCHOR, MOVE = (
     slice(3 * i, 3 * i + 3) for i in range(7)
 )
 """Where each part of the core's error lies."""
-MOTION = slice(THETA.start, OFFSET.stop)
-"""θ, v, o: what an interval moves."""
 BIASES = slice(GYRO_BIAS.start, ACCEL_BIAS.stop)
-"""b_g, b_a: what an interval keeps."""
+"""b_g, b_a: constant over an interval."""
 LOCAL = slice(THETA.start, ANCHOR.start)
-"""θ, v, o, b_g, b_a: all but the anchor, its move and e."""
-LASTING = slice(MOVE.stop, None)
-"""e: 0 or 3 entries."""
+"""θ, v, o, b_g, b_a: all but the anchor, its move and b."""
+CORRELATED = slice(MOVE.stop, None)
+"""b: 0 or 3 entries."""
 CLONE_THETA, CLONE_OFFSET = slice(0, 3), slice(3, 6)
 """Where each part of a clone's error lies."""
 
@@ -69,27 +72,6 @@ class ImuMemory(NamedTuple):
     above 0."""
 
 
-class FirstEstimates(NamedTuple):
-    """What was known of velocity and positions when they were first estimated, before any update at
-    or after that time.
-
-    Jacobians at these values leave the yaw of the whole trajectory as unobservable to the filter as
-    it is (Huang, Mourikis and Roumeliotis 2010); at the latest values an update learns something of
-    it that the measurement does not tell.
-
-    That is for small corrections: Φ[v, θ] holds −hat(v − v_first), the last correction. Below the
-    χ² threshold it is bounded by the filter's own standard deviations, as δᵀ P⁻¹ δ ≤ rᵀ S⁻¹ r;
-    above it, it feeds itself: a larger Φ[v, θ], a larger variance, a larger gain, a larger
-    correction. So an update above the threshold sets all of them to the latest estimates (ours).
-    S is that of the update: a measurement with a weight or a scaled covariance corrects less.
-    """
-
-    velocity: Float[Array, "3"]
-    offset: Float[Array, "3"]
-    move: Float[Array, "3"]
-    clone_offset: Float[Array, "c 3"]
-
-
 class Mean(NamedTuple):
     """Estimates of one time, or stacked over K of them."""
 
@@ -106,8 +88,8 @@ class Mean(NamedTuple):
 
 
 class FilterState(NamedTuple):
-    """Mean and covariance, clones oldest first. c = W + 1 clones; those not yet taken are zero
-    (their rotations the identity)."""
+    """Mean and covariance. c = W + 1 clones, oldest first between runs; inside a run they are a
+    ring. Those not yet taken are zero (their rotations the identity)."""
 
     rotation: Float[Array, "3 3"]
     """Body → world."""
@@ -123,15 +105,16 @@ class FilterState(NamedTuple):
     """A past position in the world frame, m."""
     move: Float[Array, "3"]
     """From the anchor before it, m."""
-    lasting: Float[Array, "e"]
-    """Errors of the displacements that last (`lasting_errors`): none, or 3."""
+    correlated: Float[Array, "e"]
+    """Temporally correlated part of the displacements' errors, in their standard deviations: no
+    entries, or 3."""
     clone_rotation: Float[Array, "c 3 3"]
     """Cloned rotations."""
     clone_offset: Float[Array, "c 3"]
     """Cloned positions, from the anchor they were taken with; between runs, from the present one,
     m."""
     core_covariance: Float[Array, "n n"]
-    """θ, v, o, b_g, b_a, a, s, e: n = 21, or 24 with lasting errors."""
+    """θ, v, o, b_g, b_a, a, s, b: n = 21, or 24 with a correlated error."""
     cross_covariance: Float[Array, "n 6c"]
     """Core against the clones' θ, o."""
     clone_covariance: Float[Array, "6c 6c"]
@@ -141,9 +124,7 @@ class FilterState(NamedTuple):
     gate: GateState
     imu: ImuMemory
     healthy: Bool[Array, ""]
-    """Never False again where it once was: see `FilterHistory.healthy`."""
-    first: FirstEstimates | None
-    """Where `FilterConfig.jacobians` is "first"."""
+    """False for good once it was False: see `FilterHistory.healthy`."""
 
     @property
     def position(self) -> Float[Array, "3"]:
@@ -154,6 +135,67 @@ class FilterState(NamedTuple):
     def mean(self) -> Mean:
         """Of the core, with the position instead of the offset."""
         return Mean(self.rotation, self.velocity, self.position, self.gyro_bias, self.accel_bias)
+
+
+# One program in place of thirty, which take three times as long when first called.
+@functools.partial(jax.jit, static_argnames="clones")
+def without_clones(pose: Mean, std: InitialStd, clones: int) -> FilterState:
+    """The state at the start, in the precision of `pose`, with independent errors of `std`.
+
+    The whole uncertainty of the position is in the anchor: there is no offset and no move yet.
+    """
+    dtype = pose.rotation.dtype
+    nothing, unknown = jnp.zeros(3, dtype), jnp.full(3, jnp.nan, dtype)
+    tilt, yaw, velocity, position, gyro_bias, accel_bias = range(len(std))
+    index = np.full(CORE, len(std))  # the zero behind them
+    index[THETA] = tilt, tilt, yaw
+    index[VELOCITY], index[ANCHOR] = velocity, position
+    index[GYRO_BIAS], index[ACCEL_BIAS] = gyro_bias, accel_bias
+    values = jnp.stack([*(jnp.asarray(value, dtype) for value in std), jnp.zeros((), dtype)])
+    return FilterState(
+        rotation=pose.rotation,
+        velocity=pose.velocity,
+        offset=nothing,
+        gyro_bias=pose.gyro_bias,
+        accel_bias=pose.accel_bias,
+        anchor=pose.position,
+        move=nothing,
+        correlated=jnp.zeros(0, dtype),
+        clone_rotation=jnp.tile(jnp.eye(3, dtype=dtype)[None], (clones, 1, 1)),
+        clone_offset=jnp.zeros((clones, 3), dtype),
+        core_covariance=jnp.diag(values[index] ** 2),
+        cross_covariance=jnp.zeros((CORE, CLONE * clones), dtype),
+        clone_covariance=jnp.zeros((CLONE * clones, CLONE * clones), dtype),
+        step=jnp.int32(0),
+        gate=GateState(jnp.bool_(False), last_success=jnp.int32(-1), pause_end=jnp.int32(0)),
+        imu=ImuMemory(unknown, unknown, missing=jnp.int32(0), quiet=jnp.int32(0)),
+        healthy=jnp.bool_(True),
+    )
+
+
+def with_correlated_error(state: FilterState) -> FilterState:
+    """With a correlated error of which nothing is known but its variance of 1. A state that has one
+    stays as it is."""
+    if len(state.correlated):
+        return state
+    variance = np.diag(np.repeat([0.0, 1.0], [CORE, 3])).astype(state.offset.dtype)
+    return state._replace(
+        correlated=jnp.zeros(3, state.offset.dtype),
+        core_covariance=jnp.pad(state.core_covariance, (0, 3)) + variance,
+        cross_covariance=jnp.pad(state.cross_covariance, ((0, 3), (0, 0))),
+    )
+
+
+def state_shapes(config: FilterConfig, noise: NoiseModel, dtype: Any) -> FilterState:
+    """Shapes and types of the filter's state."""
+
+    def start() -> FilterState:
+        zero = jnp.zeros(3, dtype)
+        pose = Mean(jnp.eye(3, dtype=dtype), *[zero] * 4)
+        state = without_clones(pose, InitialStd(), config.clones)
+        return state if noise.correlation is None else with_correlated_error(state)
+
+    return jax.eval_shape(start)
 
 
 def core_covariance(covariance: Float[Array, "n n"]) -> Float[Array, "15 15"]:
@@ -169,18 +211,42 @@ def _onto_offset(part: Array, axis: int) -> Array:
     return jnp.pad(part, around)
 
 
-def covariance(state: FilterState) -> Float[Array, "d d"]:
-    """The whole covariance of θ, v, p, b_g, b_a and the clones' θ, p from the oldest, d = 15 + 6 (W
-    + 1)."""
-    core, clones = len(state.core_covariance), state.clone_offset.shape[0]
-    world = np.eye(core + CLONE * clones)  # p = a + o for the core and for every clone
-    for start in [OFFSET.start, *range(core + CLONE_OFFSET.start, len(world), CLONE)]:
-        world[start : start + 3, ANCHOR] = np.eye(3)
-    world = np.delete(world, np.r_[ANCHOR.start : core], axis=0).astype(state.core_covariance.dtype)
-    whole = jnp.block(
-        [
-            [state.core_covariance, state.cross_covariance],
-            [state.cross_covariance.T, state.clone_covariance],
-        ]
+# The ring of clones and its anchor
+# ------------------------------------------------------------------------------------------------
+
+
+def move_anchor(state: FilterState, anchored: Float[Array, ""]) -> FilterState:
+    """The mean with the anchor moved up to the present position where `anchored` is 1, as it is
+    where that is 0."""
+    wanted = anchored > 0
+    return state._replace(
+        anchor=jnp.where(wanted, state.anchor + state.offset, state.anchor),
+        offset=jnp.where(wanted, 0.0, state.offset),
+        move=jnp.where(wanted, state.offset, state.move),
     )
-    return world @ whole @ world.T
+
+
+def unroll_clones(state: FilterState, oldest: int) -> FilterState:
+    """The state between runs: oldest clone first, and all clones at the present anchor.
+
+    `oldest` is the slot of the oldest clone. The slots before it, written since the anchor's last
+    move, are at the present anchor already.
+    """
+    clones, dtype = state.clone_offset.shape[0], state.move.dtype
+    at_anchor_before = (np.arange(clones) >= (oldest or clones)).astype(dtype)[:, None]
+    # o ← o − s for those, in the mean and in the covariance.
+    by_move = np.zeros((CLONE, 3))
+    by_move[CLONE_OFFSET] = np.eye(3)
+    loss = np.kron(at_anchor_before, by_move).astype(dtype)
+    across = loss @ state.cross_covariance[MOVE]
+    of_moves = loss @ state.core_covariance[MOVE, MOVE] @ loss.T
+    clone_covariance = state.clone_covariance - across - across.T + of_moves
+    cross_covariance = state.cross_covariance - state.core_covariance[:, MOVE] @ loss.T
+    offset = state.clone_offset - at_anchor_before * state.move[None]
+    entries = CLONE * oldest
+    return state._replace(
+        clone_rotation=jnp.roll(state.clone_rotation, -oldest, 0),
+        clone_offset=jnp.roll(offset, -oldest, 0),
+        cross_covariance=jnp.roll(cross_covariance, -entries, 1),
+        clone_covariance=jnp.roll(clone_covariance, (-entries, -entries), (0, 1)),
+    )

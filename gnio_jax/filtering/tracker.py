@@ -26,30 +26,37 @@ from jaxtyping import Float, Int
 
 from gnio_jax.config import ConsideredStd, InitialStd, NoiseModel
 from gnio_jax.config.schema import TLIO_STD
-from gnio_jax.filtering.clones import unroll_clones
+from gnio_jax.filtering.checks import checked_noise, checked_state
 from gnio_jax.filtering.config import FilterConfig
-from gnio_jax.filtering.considered import check_considered, considered_covariance
-from gnio_jax.filtering.displacement import Measurement
+from gnio_jax.filtering.consider import (
+    Tangents,
+    check_considered,
+    considered_covariance,
+    core_sensitivity,
+    start_tangents,
+    step_with_tangents,
+)
+from gnio_jax.filtering.displacement import Displacement
 from gnio_jax.filtering.gaps import Imu, bridge
-from gnio_jax.filtering.history import FilterHistory, stacked_history
-from gnio_jax.filtering.inputs import checked_noise, checked_state
+from gnio_jax.filtering.history import FilterHistory, finished_history
 from gnio_jax.filtering.network import (
     Predict,
     no_prediction,
     predict_window,
-    predicted_measurement,
+    predicted_displacement,
     prediction_shapes,
 )
-from gnio_jax.filtering.propagation import integrate_interval
+from gnio_jax.filtering.propagation import integrate
 from gnio_jax.filtering.resampler import ACCEL, GYRO, VALID, Stream, create_grid, is_finite_number
+from gnio_jax.filtering.scan import Measure, clone_step
 from gnio_jax.filtering.start import initial_state, rest_state
-from gnio_jax.filtering.state import FilterState, ImuMemory, Mean, core_covariance
-from gnio_jax.filtering.step import Measure, clone_step
-from gnio_jax.filtering.tangents import (
-    Tangents,
-    core_sensitivity,
-    start_tangents,
-    step_with_tangents,
+from gnio_jax.filtering.state import (
+    BIASES,
+    FilterState,
+    ImuMemory,
+    Mean,
+    core_covariance,
+    unroll_clones,
 )
 from gnio_jax.types import FASTEST_TURN, STRONGEST_FORCE, Array, Prediction
 
@@ -315,14 +322,13 @@ def advance(
     shapes = prediction_shapes(predict, config)
 
     def infer(state: FilterState, oldest: Array) -> Prediction:
-        rotation, gyro, accel = state.clone_rotation[oldest], window[:, GYRO], window[:, ACCEL]
-        return predict_window(predict, state, rotation, gyro, accel, config)
+        return predict_window(predict, state, oldest, window[:, GYRO], window[:, ACCEL], config)
 
-    def measure(state: FilterState, oldest: Array | int) -> tuple[Measurement, dict]:
+    def measure(state: FilterState, oldest: Array | int) -> tuple[Displacement, dict]:
         prediction = jax.lax.cond(
             complete, infer, lambda *_: no_prediction(shapes), state, jnp.asarray(oldest)
         )
-        return predicted_measurement(prediction, config, noise, rows.dtype), {}
+        return predicted_displacement(prediction, config, noise, rows.dtype), {}
 
     def step(state: FilterState, measure: Measure) -> tuple[FilterState, FilterHistory]:
         slot = core.intervals % config.clones
@@ -350,10 +356,9 @@ def advance_filter(
     noise: NoiseModel,
 ) -> tuple[FilterState, FilterHistory]:
     """One clone step, and a history of one row. `age` of each held sample, s: see `gaps.bridge`."""
-    frame = config.displacement_frame
-    state, record = clone_step(state, imu, measure, slot, config, noise, frame)
+    state, record, _ = clone_step(state, imu, slot, measure, config, noise)
     records = jax.tree.map(lambda leaf: leaf[None], record)
-    history = stacked_history(records, jnp.max(age)[None], state.healthy, config)
+    history = finished_history(records, jnp.max(age)[None], state.healthy, config)
     return state._replace(healthy=history.healthy[-1] > 0), history
 
 
@@ -371,12 +376,12 @@ def look_ahead(
     rotation, velocity, position, *biases, covariance, accepted, nis, healthy = jnp.split(
         pose, _SPLITS
     )
-    state = initial_state(config, rotation.reshape(3, 3), velocity, position, *biases)
+    start = Mean(rotation.reshape(3, 3), velocity, position, *biases)
     imu, _, memory = bridge(row[None, GYRO], row[None, ACCEL], row[None, VALID] > 0, memory, config)
-    motion = integrate_interval(state, imu, noise, config.dt)
-    covariance = covariance.reshape(15, 15)
-    covariance = motion.transition @ covariance @ motion.transition.T + motion.noise
-    mean = Mean(motion.rotation, motion.velocity, position + motion.offset, *biases)
+    ahead = integrate(start, imu, noise, config.dt)
+    transition = jnp.concatenate([ahead.transition, jnp.eye(15, dtype=pose.dtype)[BIASES]])
+    covariance = transition @ covariance.reshape(15, 15) @ transition.T + ahead.noise
+    mean = Mean(ahead.rotation, ahead.velocity, ahead.position, *biases)
     flags = jnp.concatenate([accepted, nis, healthy])
     return _pose_vector(mean, 0.5 * (covariance + covariance.T), flags), memory
 

@@ -12,10 +12,10 @@ from scipy.spatial.transform import Rotation
 from gnio_jax import filtering, geometry
 from gnio_jax.filtering import scan, smoother
 from gnio_jax.filtering import tracker as online
-from gnio_jax.filtering.displacement import Measurement, update
+from gnio_jax.filtering.displacement import scaled_displacement
 from gnio_jax.filtering.gaps import Imu
-from gnio_jax.filtering.lasting_errors import lasting_motion
-from gnio_jax.filtering.propagation import integrate_interval, propagate
+from gnio_jax.filtering.propagation import Transition, integrate, propagate
+from gnio_jax.filtering.update import Step
 from gnio_jax.types import Prediction
 from gnio_jax.windows import WINDOW_CUTS, cut_window
 from tests.support.compiling import quick
@@ -155,11 +155,11 @@ class Variants(chex.TestCase):
     @variants
     def test_propagate(self):
         def interval(state, gyro, accel, anchored):
-            motion = integrate_interval(state, Imu(gyro, accel, None), NOISE, DT)
-            lasting = lasting_motion(None, N * DT, gyro.dtype)
-            return propagate(state, motion, lasting, anchored, 1)
+            moved = integrate(state.mean, Imu(gyro, accel, None), NOISE, DT)
+            transition = Transition(moved.transition, jnp.zeros(0), anchored)
+            return propagate(state, moved, transition, 1)
 
-        given = start(), *map(jnp.asarray, signals(0, intervals=1)), jnp.bool_(True)
+        given = start(), *map(jnp.asarray, signals(0, intervals=1)), jnp.ones(())
         assert_agree(self.variant(interval)(*given), interval(*given))
 
     @variants
@@ -169,8 +169,14 @@ class Variants(chex.TestCase):
             clone_offset=jnp.asarray([[-1.0, 0, 0], [-0.5, 0, 0], [0, 0, 0]]),
             clone_covariance=0.1 * jnp.eye(18),
         )
-        measurement = Measurement(jnp.array([1.1, 0.1, 0.0]), 0.01 * jnp.eye(3), jnp.bool_(True))
-        correct = functools.partial(update, newest=2, oldest=0, config=CONFIG)
-        found = self.variant(correct)(state, measurement)
-        assert_agree(found, correct(state, measurement))
+        imu = Imu(*map(jnp.asarray, signals(0, intervals=1)), None)
+
+        def correct(state, displacement):
+            noise = NOISE._replace(measurement_scale=1.0)
+            measurement = scaled_displacement(displacement, 0.01 * jnp.eye(3), noise, "given")
+            return measurement.update(state, Step(imu, 2, 0, CONFIG, noise))
+
+        displacement = jnp.array([1.1, 0.1, 0.0])
+        found = self.variant(correct)(state, displacement)
+        assert_agree(found, correct(state, displacement))
         assert bool(found[1].accepted)

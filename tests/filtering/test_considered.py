@@ -1,7 +1,6 @@
 """Errors that are considered and not estimated: their sensitivity against filters that have them,
 and whether the covariance with them is that of the errors of simulated walks."""
 
-import dataclasses
 import functools
 
 import jax
@@ -11,9 +10,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from gnio_jax import filtering
-from gnio_jax.filtering import smoother
 from gnio_jax.filtering import tracker as online
-from gnio_jax.filtering.considered import disturbed
+from gnio_jax.filtering.consider import disturbed
 from gnio_jax.filtering.state import core_covariance
 from gnio_jax.types import Prediction
 from tests.support.checks import checked_at_first
@@ -49,14 +47,23 @@ def run(c, more, rotation, velocity, position, gyro, accel, displacement, std):
     """A filter that is disturbed by `c` and then by `more`: its start and its history."""
     bias = c[:3] + more[:3]
     start = filtering.initial_state(CONFIG, rotation, velocity, position, bias, std=START)
-    told = disturbed(disturbed(displacement, c), more), std
-    _, history = filtering.repeat_odometry(start, gyro, accel, *told, CONFIG, NOISE)
-    return start, history
+    given = disturbed(disturbed(displacement, c), more), jax.vmap(jnp.diag)(std**2)
+    return start, repeated(start, gyro, accel, *given)
+
+
+def repeated(start, gyro, accel, displacement, covariance):
+    given = displacement, covariance, CONFIG, NOISE
+    return filtering.run_filter(start, gyro, accel, *given, frame="own")[1]
 
 
 def run_and_sensitivity(c, more, *given):
     start, history = run(c, more, *given)
-    return history, filtering.sensitivity(start, *given[3:5], history, CONFIG, NOISE)
+    displacement, covariance = history.given(NOISE)
+
+    def again(start, displacement):
+        return repeated(start, *given[3:5], displacement, covariance)
+
+    return history, filtering.sensitivity(again, start, displacement)
 
 
 @functools.cache
@@ -103,25 +110,6 @@ def test_the_sensitivity_is_the_change_of_the_filter():
         np.testing.assert_allclose(
             found[0, :, :, entry] / (size + 1e-6), wanted / (size + 1e-6), atol=1e-5
         )
-
-
-def test_a_gradient_that_is_cut_leaves_the_sensitivity_whole():
-    runs, std = walks()
-    pose = runs.rotation0[0], runs.velocity0[0], runs.position0[0]
-    state = filtering.initial_state(CONFIG, *pose, std=START)
-    signals = runs.gyro[0, : 20 * N], runs.accel[0, : 20 * N]
-    told = runs.displacement[0, :20], std[0, :20]
-    cut = dataclasses.replace(CONFIG, truncate_every=5)
-
-    @jax.jit
-    def sensitivities(state):
-        _, history = filtering.repeat_odometry(state, *signals, *told, CONFIG, NOISE)
-        sensitivity = functools.partial(filtering.sensitivity, state, *signals, history)
-        return sensitivity(CONFIG, NOISE), sensitivity(cut, NOISE)
-
-    whole, found = sensitivities(state)
-    assert np.abs(whole).max() > 0
-    np.testing.assert_array_equal(found, whole)
 
 
 def test_the_covariance_with_them_is_that_of_the_errors():
@@ -338,9 +326,17 @@ def smoothed():
 
     def one(considered, more, c, pose, gyro, accel, history):
         start = filtering.initial_state(CONFIG, *pose, c[:3] + more[:3], std=START)
-        history = history._replace(displacement=disturbed(history.displacement, more))
-        given = start, gyro, accel, history, CONFIG, NOISE
-        return filtering.smooth_odometry(*given, considered=considered)
+        displacement, covariance = history.given(NOISE)
+
+        def run(start, displacement):
+            given = displacement, covariance, CONFIG, NOISE
+            return filtering.smooth(start, gyro, accel, *given, frame="own")
+
+        displacement = disturbed(displacement, more)
+        found, s = run(start, displacement), filtering.sensitivity(run, start, displacement)
+        added = filtering.considered_covariance(s, considered)
+        variances = found.covariance_diagonal + jnp.diagonal(added, axis1=1, axis2=2)
+        return found._replace(covariance_diagonal=variances, covariance=found.covariance + added)
 
     program = jax.jit(jax.vmap(one, in_axes=(None, 0, 0, 0, 0, 0, 0)))
 
@@ -390,27 +386,6 @@ def test_the_smoothers_covariance_is_that_of_its_errors():
     assert nees(found.covariance) == pytest.approx(1, abs=0.35)
 
 
-def test_both_ways_to_smooth_consider_what_they_are_given(monkeypatch):
-    runs, std = walks()
-    passed = []
-
-    def noted(considered, *rest):
-        passed.append((considered, rest[-1]))
-        return filtering.SmoothedHistory(*[None] * 7)
-
-    monkeypatch.setattr(smoother, "_smooth_considering", noted)
-    short, told = slice(20 * N), (runs.displacement[0, :20], std[0, :20])
-    signals = started(0), runs.gyro[0, short], runs.accel[0, short]
-    fixed = CONFIG, NOISE
-    covariance = np.stack([np.diag(row**2) for row in told[1]])
-    given = *signals, told[0], covariance, *fixed
-    filtering.smooth(*given, considered=STD)
-    (history, _), _ = filtered()
-    row = jax.tree.map(lambda leaf: np.asarray(leaf)[0, :20], history)
-    filtering.smooth_odometry(*signals, row, *fixed, considered=STD)
-    assert passed == [(STD, "given"), (STD, "own")]
-    wrong = STD._replace(slope=np.nan)
+def test_sizes_that_make_no_sense_are_refused():
     with pytest.raises(ValueError, match=r"^considered\.slope"):
-        filtering.smooth(*given, considered=wrong)
-    with pytest.raises(ValueError, match=r"^considered\.slope"):
-        filtering.smooth_odometry(*signals, row, *fixed, considered=wrong)
+        filtering.considered_covariance(np.ones((2, 15, 6)), STD._replace(slope=np.nan))

@@ -11,15 +11,17 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from gnio_jax import filtering, geometry
-from gnio_jax.filtering.displacement import displacement_residual
+from gnio_jax.filtering.displacement import Displacement, linearise_displacement
 from gnio_jax.filtering.gaps import Imu
-from gnio_jax.filtering.propagation import integrate_interval
-from gnio_jax.filtering.state import CLONE, MOVE, OFFSET, THETA, VELOCITY, covariance
-from gnio_jax.filtering.update import retract
+from gnio_jax.filtering.propagation import integrate
+from gnio_jax.filtering.state import ANCHOR, CLONE, OFFSET, THETA, VELOCITY, Mean
+from gnio_jax.filtering.update import Step, retract
 from gnio_jax.types import Prediction
 from gnio_jax.windows import cut_window
 from tests.support.compiling import optimised, quick
+from tests.support.measured import NO_IMU, displacement_residual
 from tests.support.walks import errors, simulate
+from tests.support.whole_covariance import covariance
 
 RUNS, INTERVALS, N, CLONES, DT = 64, 900, 10, 10, 0.01
 NOISE = filtering.NoiseModel(5e-4, 5e-3, 1e-6, 2e-5, measurement_scale=1.0)
@@ -34,7 +36,7 @@ PARTS = {
 
 
 @functools.cache
-def program(jacobians):
+def program():
     """(std, covariance of a measurement, start and signals of each run) -> final states and
     histories."""
     config = filtering.FilterConfig(
@@ -43,7 +45,6 @@ def program(jacobians):
         CLONES,
         gate_threshold=1e9,
         history="core",
-        jacobians=jacobians,
     )
 
     def run(std, spread, rotation, velocity, position, gyro, accel, displacement):
@@ -63,11 +64,11 @@ def walks(std, sigma):
 
 
 @functools.lru_cache(1)
-def monte_carlo(std, sigma, jacobians):
+def monte_carlo(std, sigma):
     """Errors (r, K, 15), covariances (r, K, 15, 15), NIS (r, K) and the final states of simulated
     runs from the prior."""
     runs = walks(std, sigma)
-    final, history = program(jacobians)(std, sigma**2 * np.eye(3), *runs[:6])
+    final, history = program()(std, sigma**2 * np.eye(3), *runs[:6])
     assert (np.asarray(history.healthy) == 1).all()
     return (
         runs,
@@ -92,7 +93,7 @@ def bounds(freedoms, level=0.95):
 
 def test_certainty_agrees_with_the_errors():
     """NEES of every part and NIS lie in the 95 % bounds of the average over 64 runs."""
-    runs, error, spread, nis, final = monte_carlo(filtering.InitialStd(), 0.03, "latest")
+    runs, error, spread, nis, final = monte_carlo(filtering.InitialStd(), 0.03)
     for name, index in PARTS.items():
         found = nees(error[..., index], spread[:, :, index][..., index])
         low, high = bounds(len(index) * RUNS)
@@ -128,7 +129,7 @@ def test_biases_converge_from_a_wide_prior():
 
     z takes longer where it is the gyro's, since yaw is seen by turning only; the whole run moves in
     every direction here."""
-    _, error, spread, _, _ = monte_carlo(WIDE, 0.02, "latest")
+    _, error, spread, _, _ = monte_carlo(WIDE, 0.02)
     sigma = np.sqrt(spread[:, -1].diagonal(axis1=1, axis2=2)).mean(0)
     found = np.sqrt((error[:, -1] ** 2).mean(0))
     for values in (sigma, found):
@@ -136,49 +137,6 @@ def test_biases_converge_from_a_wide_prior():
         assert (gyro[:2] < 0.1).all() and (accel < 0.1).all(), (gyro, accel)
         assert gyro[2] < 0.2, gyro
         print(f"\nbias, share of the prior: gyro {gyro.round(3)}, accel {accel.round(3)}")
-
-
-def test_yaw_is_consistent_only_with_first_estimates():
-    """With a wide prior the latest-estimate filter becomes too sure of its yaw; with the first ones
-    it does not."""
-    by_yaw = {}
-    for jacobians in ("latest", "first"):
-        _, error, spread, nis, _ = monte_carlo(WIDE, 0.02, jacobians)
-        by_yaw[jacobians] = nees(error[..., [2]], spread[:, :, [2]][..., [2]])[300:].mean()
-        assert abs(nis[:, CLONES:].mean() / 3 - 1) < 0.02
-    print(f"\nNEES of yaw, mean over time: {by_yaw}")
-    assert bounds(RUNS)[0] < by_yaw["first"] < bounds(RUNS, 0.99)[1]
-    assert by_yaw["latest"] > 1.1 * by_yaw["first"] and by_yaw["latest"] > bounds(RUNS)[1]
-
-
-@pytest.mark.parametrize("jacobians", ["latest", "first"])
-def test_measurements_tell_nothing_of_the_yaw(jacobians):
-    """With a perfect gyro, no displacement in the body's yaw frame can say where north is, if the
-    start does not either: its velocity is as uncertain about z as its yaw."""
-    prior = filtering.InitialStd(tilt=0.01, yaw=0.0, velocity=0.5, gyro_bias=0.0, accel_bias=0.05)
-    noise = filtering.NoiseModel(0.0, 5e-3, 0.0, 2e-5, measurement_scale=1.0)
-    runs = simulate(3, 1, 120, N, CLONES, DT, noise, prior, 0.05)
-    config = filtering.FilterConfig(DT, N, CLONES, gate_threshold=1e9, jacobians=jacobians)
-    state = filtering.initial_state(config, *[runs[i][0] for i in range(3)], std=prior)
-    turning = np.zeros(21)
-    turning[2], turning[3:6] = 1.0, np.cross([0.0, 0, 1], state.velocity)
-    state = state._replace(
-        core_covariance=state.core_covariance + 0.01 * np.outer(turning, turning)
-    )
-    _, history = filtering.run_filter(
-        state,
-        runs.gyro[0],
-        runs.accel[0],
-        runs.displacement[0],
-        np.tile(0.05**2 * np.eye(3), (120, 1, 1)),
-        config,
-        noise,
-    )
-    left = np.asarray(history.covariance_diagonal)[:, 2] / 0.01
-    if jacobians == "first":
-        np.testing.assert_allclose(left, 1.0, rtol=1e-6)
-    else:
-        assert left[-1] < 0.99  # what the latest-estimate filter believes to have learnt
 
 
 def random_state(config, seed=0):
@@ -213,25 +171,18 @@ def test_transition_is_the_derivative_of_the_retraction():
     )
 
     def end(error):
-        moved = state._replace(
+        start = Mean(
             rotation=geometry.exp(error[THETA]) @ state.rotation,
             velocity=state.velocity + error[VELOCITY],
-            offset=state.offset + error[OFFSET],
+            position=state.position + error[OFFSET],
             gyro_bias=state.gyro_bias + error[9:12],
             accel_bias=state.accel_bias + error[12:15],
         )
-        motion = integrate_interval(moved, imu, filtering.NoiseModel(), config.dt)
-        return jnp.concatenate(
-            [
-                vee(motion.rotation @ reference.rotation.T),
-                motion.velocity,
-                motion.offset,
-                moved.gyro_bias,
-                moved.accel_bias,
-            ]
-        )
+        motion = integrate(start, imu, filtering.NoiseModel(), config.dt)
+        turn = vee(motion.rotation @ reference.rotation.T)
+        return jnp.concatenate([turn, motion.velocity, motion.position])
 
-    reference = quick(lambda: integrate_interval(state, imu, filtering.NoiseModel(), config.dt))()
+    reference = quick(lambda: integrate(state.mean, imu, filtering.NoiseModel(), config.dt))()
     np.testing.assert_allclose(
         reference.transition, quick(jax.jacfwd(end))(jnp.zeros(15)), atol=1e-6
     )
@@ -240,26 +191,26 @@ def test_transition_is_the_derivative_of_the_retraction():
 def test_measurement_jacobian_is_the_derivative_of_the_retraction():
     config = filtering.FilterConfig(0.05, 6, 3)
     state = random_state(config, 2)
-    newest, oldest = 3, 0
+    newest, oldest = 3, 1
 
     def predicted(errors):
-        core = jnp.zeros(21).at[MOVE].set(errors[-3:])
-        moved = retract(state, core, errors[:-3].reshape(-1, CLONE), newest)
+        core = jnp.zeros(21).at[OFFSET.start :].set(errors[-15:])
+        moved = retract(state, core, errors[:-15].reshape(-1, CLONE), newest)
         return geometry.yaw_rotation(moved.clone_rotation[oldest]).T @ (
             moved.offset + moved.move - moved.clone_offset[oldest]
         )
 
-    moved = state.offset + state.move - state.clone_offset[oldest]
-    given = state.clone_rotation[oldest], moved, jnp.zeros(3), moved
-    jacobian = quick(displacement_residual)(*given).jacobian
-    expected = np.zeros((3, 4 * CLONE + 3))
-    expected[:, :6], expected[:, -6:-3], expected[:, -3:] = (
-        jacobian[:, :6],
-        jacobian[:, 6:],
-        jacobian[:, 6:],
-    )
+    measured = Displacement(jnp.zeros(3), jnp.eye(3), jnp.bool_(True), "given")
+    step = Step(NO_IMU, newest, oldest, config, filtering.NoiseModel())
+    linear, _ = quick(lambda: linearise_displacement(measured, state, step))()
+    found = np.zeros((3, 4 * CLONE + 15))
+    found[:, CLONE * oldest : CLONE * (oldest + 1)] = linear.oldest
+    # The core's offset is that of the newest clone.
+    found[:, CLONE * newest + 3 : CLONE * (newest + 1)] = linear.core[:, OFFSET]
+    found[:, -12:] = linear.core[:, OFFSET.stop :]
+    assert not np.asarray(linear.core[:, ANCHOR]).any()
     np.testing.assert_allclose(
-        expected, quick(jax.jacfwd(predicted))(jnp.zeros(4 * CLONE + 3)), atol=1e-6
+        found, quick(jax.jacfwd(predicted))(jnp.zeros(4 * CLONE + 15)), atol=1e-6
     )
 
 
@@ -291,7 +242,7 @@ def told_by_a_network(R, gyro, accel, bias, weights, seen):
         return said(theta) - geometry.yaw_rotation(cut(theta)).T @ seen
 
     nothing = jnp.zeros(3)
-    found = displacement_residual(R, seen, nothing, seen, "own")
+    found = displacement_residual(R, seen, nothing, "own")
     return geometry.yaw_rotation(R) @ said(nothing), jax.jacfwd(innovation)(nothing), found
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from gnio_jax import filtering
-from gnio_jax.filtering.checkpointing import checkpointed_scan
+from gnio_jax.filtering.scan import blocked_scan
 from gnio_jax.types import Prediction
 from tests.support.compiling import quick
 from tests.support.odometry import (
@@ -209,7 +209,7 @@ def test_checkpoints_change_nothing(every):
     """Of any scan, whole blocks or not; the filter's own is differentiated through checkpoints with
     the network below."""
     arguments, wanted = of_a_plain_scan()
-    ours = functools.partial(scanned, functools.partial(checkpointed_scan, every=every))
+    ours = functools.partial(scanned, functools.partial(blocked_scan, checkpoint_every=every))
     found = quick(jax.value_and_grad(ours, (0, 1)))(*arguments)
     jax.tree.map(
         lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12), found, wanted
@@ -221,7 +221,7 @@ def test_checkpoints_change_nothing(every):
 def test_checkpoints_bound_the_memory():
     def temporary(every):
         def value(start):
-            carry, out = checkpointed_scan(
+            carry, out = blocked_scan(
                 lambda x, push: (jnp.tanh(x @ x) + push, x[0, 0]), start, jnp.ones(1040), every
             )
             return jnp.sum(carry) + jnp.sum(out)

@@ -3,7 +3,6 @@
 import dataclasses
 import functools
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -12,11 +11,13 @@ from hypothesis import strategies as st
 
 from gnio_jax import filtering
 from gnio_jax.filtering import Tracker
-from gnio_jax.filtering import displacement as measured
-from gnio_jax.filtering.inputs import checked_inputs
+from gnio_jax.filtering.checks import checked_inputs
+from gnio_jax.filtering.displacement import Displacement
 from gnio_jax.filtering.state import OFFSET
+from gnio_jax.filtering.update import Step
 from gnio_jax.types import Prediction
 from tests.support.compiling import quick
+from tests.support.measured import NO_IMU
 from tests.support.random_walk import random_walk
 
 N, CLONES, DT = 4, 4, 0.02
@@ -155,7 +156,9 @@ def test_what_no_imu_measures_is_refused(name, largest, unit):
     for valid in (None, ~there):
         with pytest.raises(ValueError, match=words):
             filtering.run_odometry(predict, start(), *signals.values(), CONFIG, NOISE, valid)
-    checked_inputs(start(), *signals.values(), there, CONFIG, NOISE)  # what is missing may be so
+    checked_inputs(
+        start(), *signals.values(), there, (), CONFIG, NOISE
+    )  # what is missing may be so
     _, history, _ = run(*signals.values(), there)
     tracker, poses = Tracker(predict, CONFIG, NOISE, start()), []
     for k, row in enumerate(zip(*signals.values(), strict=True)):
@@ -173,12 +176,11 @@ def test_what_no_imu_measures_is_refused(name, largest, unit):
 ROWS = 60
 PLAIN = filtering.FilterConfig(DT, 5, 4, convergence_seconds=1.0, rest_seconds=0.2)
 CONFIGS = [
-    dataclasses.replace(PLAIN, jacobians="first", zero_velocity_std=0.02),
-    dataclasses.replace(PLAIN, jacobians="latest"),
-    dataclasses.replace(PLAIN, jacobians="first", allow_float32=True),
-    dataclasses.replace(PLAIN, jacobians="latest", zero_velocity_std=0.02, allow_float32=True),
+    dataclasses.replace(PLAIN, zero_velocity_std=0.02),
+    PLAIN,
+    dataclasses.replace(PLAIN, allow_float32=True),
+    dataclasses.replace(PLAIN, zero_velocity_std=0.02, allow_float32=True),
 ]
-"""Every two of Jacobians, rest and precision together once."""
 WALK = random_walk(21, n=5, clones=4, intervals=ROWS, dt=DT, bias=False)
 FILTER = quick(filtering.run_filter, static_argnums=5)
 
@@ -254,7 +256,7 @@ RUN_AWAY = dict(
     missing=True,
     still=0,
 )
-"""1e94 m/s, then NaN, where first estimates are kept whatever the correction."""
+"""A gap, a knock and displacements that are wrong by 84 m."""
 
 
 @settings(max_examples=60, deadline=None, derandomize=True, database=None)
@@ -284,40 +286,8 @@ def said(history, speed):
     np.testing.assert_array_equal(healthy, np.logical_and.accumulate(healthy))
 
 
-def test_first_estimates_are_taken_anew_only_above_the_threshold():
-    """Without such an update they are what was estimated first: before the update."""
-    config = CONFIGS[0]
-    begin, gyro, accel, displacement, covariance = WALK
-    displacement = displacement.copy()
-    displacement[8] += 5.0
-    state, found = filtering.initial_state(config, *begin), []
-    step = quick(
-        lambda state, *given: filtering.run_filter(
-            state, *given, config, filtering.NoiseModel(2e-3, 2e-2, measurement_scale=2.0)
-        )
-    )
-    for k in range(12):
-        rows = slice(5 * k, 5 * (k + 1))
-        state, history = step(
-            state, gyro[rows], accel[rows], displacement[k : k + 1], covariance[k : k + 1]
-        )
-        found.append(
-            (
-                float(history.nis[0]),
-                float(np.abs(state.first.velocity - state.velocity).max()),
-                float(np.abs(state.first.clone_offset - state.clone_offset).max()),
-            )
-        )
-    nis, of_velocity, of_clones = np.array(found).T
-    updated = np.arange(12) >= 4  # the ring of five clones is full in the fifth interval
-    large = nis > config.gate_threshold
-    assert large[8] and large[updated].sum() < 6
-    assert (of_velocity[large] == 0).all() and (of_clones[large] == 0).all()
-    assert (of_velocity[updated & ~large] > 0).all() and (of_clones[updated & ~large] > 0).all()
-
-
 @pytest.mark.parametrize(
-    "options, converged, accepted, anew",
+    "options, converged, accepted, corrected",
     [
         (dict(), True, False, False),
         (dict(), False, True, True),
@@ -328,30 +298,21 @@ def test_first_estimates_are_taken_anew_only_above_the_threshold():
     ],
     ids=["rejected", "gate open", "scaled", "scaled away", "weighted 1", "weighted 1e-6"],
 )
-def test_a_displacement_takes_first_estimates_anew_where_it_corrects_much(
-    options, converged, accepted, anew
+def test_a_displacement_corrects_as_much_as_the_gate_lets_it(
+    options, converged, accepted, corrected
 ):
     """Five metres of which the filter takes all, half, or nothing to speak of."""
-    config = dataclasses.replace(PLAIN, jacobians="first", convergence_seconds=10.0, **options)
+    config = dataclasses.replace(PLAIN, convergence_seconds=10.0, **options)
     state = filtering.initial_state(config, *WALK[0])
     known = state.core_covariance.at[OFFSET, OFFSET].set(0.01 * jnp.eye(3))
     state = state._replace(core_covariance=known)
     gate = filtering.GateState(jnp.bool_(converged), jnp.int32(95), jnp.int32(0))
     state = state._replace(step=jnp.int32(20), gate=gate)
-    state = state._replace(first=jax.tree.map(lambda part: part + 0.25, state.first))
-    measurement = measured.Measurement(
-        jnp.array([3.0, -4.0, 0.0]), 0.01 * jnp.eye(3), jnp.bool_(True)
+    measurement = Displacement(
+        jnp.array([3.0, -4.0, 0.0]), 0.01 * jnp.eye(3), jnp.bool_(True), "given"
     )
-    new, outcome, made = measured.update_with_correction(state, measurement, 0, 1, config, "given")
+    step = Step(NO_IMU, 0, 1, config, NOISE)
+    _, outcome, made = measurement.update(state, step)
     assert float(outcome.nis) > 50 and bool(outcome.accepted) == accepted
-    moved = float(jnp.linalg.norm((made.whitened @ made.core_rows)[OFFSET]))
-    assert bool(outcome.tested) and (moved > 1.0 if anew else moved < 0.01)
-    wanted = state.first
-    if anew:
-        wanted = wanted._replace(
-            velocity=new.velocity,
-            offset=new.offset,
-            move=new.move,
-            clone_offset=new.clone_offset,
-        )
-    jax.tree.map(np.testing.assert_array_equal, new.first, wanted)
+    moved = float(jnp.linalg.norm((made.residual @ made.core)[OFFSET]))
+    assert bool(outcome.tested) and (moved > 1.0 if corrected else moved < 0.01)

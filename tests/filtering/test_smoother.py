@@ -189,7 +189,7 @@ NOISE = filtering.NoiseModel.per_sample(*WHITE, DT, *WALK)._replace(measurement_
 @pytest.mark.parametrize("case", ["rejected", "scaled", "weighted"])
 def test_equals_least_squares_over_all_states(case):
     """Missing rows in all cases; a rejected row; one applied with scaled covariance, in blocks of
-    intervals and two left over; a gate with a slope, rest, and first estimates."""
+    intervals and two left over; a gate with a slope, and rest."""
     options = {
         "rejected": dict(history="core"),
         "scaled": dict(history="core", mahalanobis_fail_scale=7.0, checkpoint_every=4),
@@ -198,7 +198,6 @@ def test_equals_least_squares_over_all_states(case):
             gate_threshold=4.0,
             zero_velocity_std=5 * SMALL,
             rest_seconds=0.5,
-            jacobians="first",
         ),
     }[case]
     config = CONFIG(**options)
@@ -312,7 +311,9 @@ def test_smooths_the_network_in_the_loop():
         return filtering.run_odometry(predict, state, gyro, accel, config, noise)
 
     final, history = odometry(state)
-    smoothed = filtering.smooth_odometry(state, gyro, accel, history, config, noise)
+    smoothed = filtering.smooth(
+        state, gyro, accel, *history.given(noise), config, noise, frame="own"
+    )
     np.testing.assert_allclose(smoothed.position[-1], final.position, atol=1e-10)
     np.testing.assert_allclose(
         smoothed.covariance[-1], history.covariance[-1], rtol=1e-6, atol=1e-18
@@ -431,7 +432,6 @@ def test_refuses_at_the_door():
         (dict(imu_valid=np.ones(3, bool)), "imu_valid: must be 56 booleans"),
         (dict(noise=NOISE._replace(gyro_density=-1.0)), "noise.gyro_density"),
         (dict(state=state._replace(velocity=np.zeros(2))), "state.velocity"),
-        (dict(config=CONFIG(jacobians="first")), "state: was made"),
     ]:
         with pytest.raises(ValueError, match=message):
             filtering.smooth(**{**good, **wrong})

@@ -63,7 +63,6 @@ OTHER = dataclasses.replace(
     window_rotation="single",
     zero_velocity_std=0.02,
     rest_seconds=0.3,
-    jacobians="first",
     gap_gyro_std=0.05,
     gap_accel_std=0.2,
 )

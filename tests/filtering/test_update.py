@@ -3,8 +3,9 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
-from gnio_jax.filtering.update import cholesky, downdate, whiten
+from gnio_jax.filtering.update import cholesky, downdate, lower_triangular, whiten
 
 ROOT = np.array([[0.3, 0.0, 0.0], [0.1, 0.5, 0.0], [-0.2, 0.4, 0.2]])
 COVARIANCE = ROOT @ ROOT.T
@@ -19,12 +20,16 @@ def whitened(s, rows):
     return np.append(np.linalg.solve(root, rows), np.prod(np.diag(root)))
 
 
-def test_cholesky():
-    np.testing.assert_allclose(cholesky(jnp.asarray(COVARIANCE)).matrix, ROOT, atol=1e-15)
+@pytest.mark.parametrize("rows", [1, 2, 3])
+def test_cholesky(rows):
+    found = lower_triangular(cholesky(jnp.asarray(COVARIANCE[:rows, :rows])))
+    np.testing.assert_allclose(found, ROOT[:rows, :rows], atol=1e-15)
 
 
-def test_whiten_and_its_derivatives():
+@pytest.mark.parametrize("size", [1, 2, 3])
+def test_whiten_and_its_derivatives(size):
     """In both modes, along symmetric changes of S; of several rows that share it."""
+    covariance, all_rows = COVARIANCE[:size, :size], ROWS[:size]
 
     def flat(s, rows):
         (left, right), volume = whiten(s, (rows[:, :2], rows[:, 2:]))
@@ -34,17 +39,17 @@ def test_whiten_and_its_derivatives():
     def with_derivatives(given, change):
         return flat(*given), jax.jvp(flat, given, change)[1], jax.jacrev(flat, (0, 1))(*given)
 
-    change = np.array([[0.2, -0.1, 0.05], [-0.1, 0.3, 0.15], [0.05, 0.15, -0.1]])
+    change = np.array([[0.2, -0.1, 0.05], [-0.1, 0.3, 0.15], [0.05, 0.15, -0.1]])[:size, :size]
     ahead, behind = (
-        whitened(COVARIANCE + step * change, (1 + step) * ROWS) for step in (1e-6, -1e-6)
+        whitened(covariance + step * change, (1 + step) * all_rows) for step in (1e-6, -1e-6)
     )
     expected = (ahead - behind) / 2e-6
-    found, forward, (by_s, by_rows) = with_derivatives((COVARIANCE, ROWS), (change, ROWS))
-    np.testing.assert_allclose(found, whitened(COVARIANCE, ROWS), rtol=1e-13)
-    reverse = np.tensordot(by_s, change, 2) + np.tensordot(by_rows, ROWS, 2)
+    found, forward, (by_s, by_rows) = with_derivatives((covariance, all_rows), (change, all_rows))
+    np.testing.assert_allclose(found, whitened(covariance, all_rows), rtol=1e-13)
+    reverse = np.tensordot(by_s, change, 2) + np.tensordot(by_rows, all_rows, 2)
     np.testing.assert_allclose(forward, expected, rtol=1e-6, atol=1e-6)
     np.testing.assert_allclose(reverse, expected, rtol=1e-6, atol=1e-6)
-    assert not np.isfinite(whiten(jnp.asarray(-COVARIANCE), ()).volume)
+    assert not np.isfinite(whiten(jnp.asarray(-covariance), ())[1])
 
 
 def test_downdate_and_its_derivatives():

@@ -24,6 +24,7 @@ from gnio_jax.filtering import (
     ConsideredStd,
     FilterConfig,
     FilterHistory,
+    FilterState,
     InitialStd,
     NoiseModel,
     considered_covariance,
@@ -134,7 +135,7 @@ def _run_batch(
         ]
         history = _run_with_measurements(start, imu, _stacked(given), setup.config, setup.noise)
     if setup.considered is not None:
-        frame = None if isinstance(source, Network) else "given"
+        frame = setup.config.displacement_frame if isinstance(source, Network) else "given"
         fixed = setup.config, setup.noise, setup.considered, frame
         history = _with_considered(start, imu, history, *fixed)
     return on_host(history)
@@ -148,14 +149,20 @@ def _with_considered(
     config: FilterConfig,
     noise: NoiseModel,
     considered: ConsideredStd,
-    frame: YawFrame | None,
+    frame: YawFrame,
 ) -> FilterHistory:
     """With the errors that the filter considers in its covariance."""
 
     def run(start: FilterStart, imu: Imu, history: FilterHistory) -> tuple[Array, Array]:
         state = initial_state(config, **start._asdict())
         signals = imu.gyro, imu.accel
-        found = sensitivity(state, *signals, history, config, noise, imu.valid, frame)
+        displacement, covariance = history.given(noise)
+        fixed = config, noise, imu.valid, frame
+
+        def repeated(state: FilterState, displacement: Array) -> FilterHistory:
+            return run_filter(state, *signals, displacement, covariance, *fixed)[1]
+
+        found = sensitivity(repeated, state, displacement)
         added = considered_covariance(found, considered)
         variances = history.covariance_diagonal + jnp.diagonal(added, axis1=1, axis2=2)
         assert history.covariance is not None

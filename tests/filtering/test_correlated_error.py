@@ -11,8 +11,8 @@ import pytest
 
 from gnio_jax import filtering
 from gnio_jax.filtering import CorrelatedError
-from gnio_jax.filtering.lasting_errors import lasting_motion
-from gnio_jax.filtering.state import LASTING
+from gnio_jax.filtering.propagation import correlation_decay
+from gnio_jax.filtering.state import CORRELATED
 from gnio_jax.types import Prediction
 from tests.support import scekf_numpy
 from tests.support.compiling import optimised, quick
@@ -71,11 +71,11 @@ def test_as_a_plain_filter_has_them(fail_scale):
         np.testing.assert_array_equal(getattr(history, name), wanted[name])
     for name in ("rotation", "velocity", "position", "gyro_bias", "accel_bias", "innovation"):
         np.testing.assert_allclose(getattr(history, name), wanted[name], atol=1e-9, err_msg=name)
-    np.testing.assert_allclose(history.lasting, wanted["lasting"], atol=1e-9)
+    np.testing.assert_allclose(final.correlated, wanted["lasting"][-1], atol=1e-9)
     np.testing.assert_allclose(history.nis, wanted["nis"], rtol=1e-7)
     np.testing.assert_allclose(history.covariance, wanted["covariance"], rtol=1e-6, atol=1e-12)
     np.testing.assert_allclose(
-        final.core_covariance[LASTING, LASTING],
+        final.core_covariance[CORRELATED, CORRELATED],
         wanted["lasting_covariance"][-1],
         rtol=1e-7,
         atol=1e-12,
@@ -83,20 +83,24 @@ def test_as_a_plain_filter_has_them(fail_scale):
 
 
 def test_without_any_size_they_change_nothing():
-    _, with_none = filtered(errors=None)
-    _, with_zero = filtered(errors=CorrelatedError(0.0, 0.3))
+    without, with_none = filtered(errors=None)
+    final, with_zero = filtered(errors=CorrelatedError(0.0, 0.3))
     for name in with_none._fields:
-        if name not in ("lasting", "diagnostics"):
+        if name not in ("others", "diagnostics"):
             np.testing.assert_allclose(
                 getattr(with_zero, name), getattr(with_none, name), atol=1e-12, err_msg=name
             )
-    assert with_none.lasting.shape == (INTERVALS, 0) and with_zero.lasting.shape == (INTERVALS, 3)
+    assert without.correlated.shape == (0,) and final.correlated.shape == (3,)
 
 
 def test_they_are_as_large_at_all_times():
-    motion = lasting_motion(ERRORS, 0.7, np.dtype(float))
-    np.testing.assert_allclose(motion.decay**2 + motion.variance, np.ones(3), rtol=1e-14)
-    np.testing.assert_allclose(motion.decay, np.exp(-0.7 / np.array([0.3] * 3)))
+    """Their variance is 1 at the start, and stays so without measurements."""
+    decay = correlation_decay(ERRORS, 0.7, np.dtype(float))
+    np.testing.assert_allclose(decay, np.exp(-0.7 / np.array([0.3] * 3)), rtol=1e-14)
+    start, gyro, accel, displacement, spread = walk()
+    given = gyro, accel, np.full_like(displacement, np.nan), spread
+    final, _ = program(CONFIG)(filtering.initial_state(CONFIG, *start), *given, noise=NOISE)
+    np.testing.assert_allclose(final.core_covariance[CORRELATED, CORRELATED], np.eye(3), rtol=1e-12)
 
 
 RUNS, SIGMA, LONG = 48, 0.05, 500
@@ -285,6 +289,6 @@ def test_a_state_that_has_them_goes_on_with_them():
         state, history = program(config)(*given, noise=NOISE)
         rows.append(history.position)
     np.testing.assert_allclose(np.concatenate(rows), filtered()[1].position, atol=1e-9)
-    with pytest.raises(ValueError, match=r"state\.lasting: "):
+    with pytest.raises(ValueError, match=r"state\.correlated: "):
         given = (state, gyro, accel, displacement, spread)
         filtering.run_filter(*given, config, NOISE._replace(correlation=None))

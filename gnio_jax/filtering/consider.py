@@ -1,0 +1,181 @@
+"""Errors that are reported in the covariance without being estimated (ours; consider covariance
+analysis, after Schmidt: Tapley, Schutz and Born 2004, ch. 6).
+
+A filter that estimates every error it may have can do worse than one that leaves some out: a
+displacement of uncertain heading corrects the yaw with its own error. But a covariance P that
+leaves them out is too small. With c the errors that are left out, constant over a recording,
+E[c cᵀ] = C, and S = ∂x̂/∂c the sensitivity of the estimate x̂, the covariance of its error is
+
+    P + S C Sᵀ.
+
+The estimate, its gains and its innovations are as before. c is the bias that the gyro has beside
+its first estimate (3, rad/s), and an error of all displacements u of a walk (ours):
+
+    d = exp(s) Rz(ψ) u + γ |u_xy| e_z,
+
+with the logarithm s of their scale, their heading ψ (rad) and their slope γ. S is the derivative of
+the whole estimator, taken forward through every update that it made: of a run (`sensitivity`), or
+from clone step to clone step as it goes (`step_with_tangents`).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Float
+
+from gnio_jax import geometry
+from gnio_jax.config import ConsideredStd
+from gnio_jax.filtering.checks import check_not_negative
+from gnio_jax.filtering.displacement import Displacement
+from gnio_jax.filtering.history import FilterHistory
+from gnio_jax.filtering.scan import Measure
+from gnio_jax.filtering.smoother import SmoothedHistory
+from gnio_jax.filtering.state import FilterState, Mean
+from gnio_jax.types import Array
+
+T = TypeVar("T")
+
+ENTRIES = 6
+OF_BIAS, OF_SCALE, OF_HEADING, OF_SLOPE = slice(0, 3), 3, 4, 5
+"""Where the gyro's bias, s, ψ and γ lie in c."""
+STILL = 1e-6
+"""Added in squares to the length of a displacement, m: standing still is no singular point."""
+
+
+def check_considered(std: ConsideredStd) -> None:
+    """Raise `ValueError` where a standard deviation is negative or not finite."""
+    for name, value in std._asdict().items():
+        check_not_negative(f"considered.{name}", value)
+
+
+def considered_covariance(
+    sensitivity: Float[Array, "k d 6"], std: ConsideredStd
+) -> Float[jax.Array, "k d d"]:
+    """S C Sᵀ, to be added to P; of as many rows of S as are given. Raises `ValueError` for a
+    standard deviation that is negative or not finite."""
+    check_considered(std)
+    bias, *others = std
+    each = jnp.stack([jnp.asarray(value) for value in (bias, bias, bias, *others)])
+    root = sensitivity * each[None, None]
+    return jnp.einsum("kic,kjc->kij", root, root)
+
+
+def disturbed(displacement: Float[Array, "k 3"], c: Float[Array, "6"]) -> Float[jax.Array, "k 3"]:
+    """d of the displacements u = `displacement`, m; NaN stays NaN."""
+    displacement, c = jnp.asarray(displacement), jnp.asarray(c)
+    turn = geometry.rotation_z(c[OF_HEADING])
+    length = jnp.sqrt(jnp.sum(displacement[:, :2] ** 2, axis=1) + STILL**2)
+    turned = jnp.exp(c[OF_SCALE]) * geometry.matmul(displacement, turn.T)
+    return turned.at[:, 2].add(c[OF_SLOPE] * length)
+
+
+def sensitivity(
+    run: Callable[[FilterState, Array], FilterHistory | SmoothedHistory],
+    state: FilterState,
+    displacement: Float[Array, "k 3"],
+) -> Float[jax.Array, "k 15 6"]:
+    """S of θ, v, p, b_g, b_a after each clone interval of `run(state, displacement)`: a function
+    from the start and the displacements, m, to the history of `run_filter` or `smooth`.
+
+    For a run of `run_odometry` the displacements are those of its history, so the network is not
+    called again, and that other biases would have changed its windows a little is left out. `run`
+    must not cut its gradient (`FilterConfig.truncate_every`): S is of the whole run.
+    """
+
+    def means(c: Float[Array, "6"]) -> tuple[Mean, Array]:
+        start = state._replace(gyro_bias=state.gyro_bias + c[OF_BIAS])
+        found = run(start, disturbed(displacement, c))
+        return Mean(*(getattr(found, name) for name in Mean._fields)), found.rotation
+
+    nothing = jnp.zeros(ENTRIES, state.offset.dtype)
+    derivatives, rotation = jax.jacfwd(means, has_aux=True)(nothing)
+    return _of_error(rotation, derivatives)
+
+
+def _of_error(rotation: Float[Array, "k 3 3"], derivatives: Mean) -> Float[jax.Array, "k 15 6"]:
+    """S of θ, v, p, b_g, b_a from the derivatives of estimates by c, its 6 entries last, where the
+    rotations are `rotation`."""
+    of_rotation, *others = derivatives
+    # The change of R by a small turn θ in the world is [θ]× R.
+    turn = jnp.einsum("kilc,kjl->kijc", of_rotation, rotation)
+    theta = jnp.stack([turn[:, 2, 1], turn[:, 0, 2], turn[:, 1, 0]], axis=1)
+    return jnp.concatenate([theta, *others], axis=1)
+
+
+# From clone step to clone step
+# ------------------------------------------------------------------------------------------------
+
+Tangents = FilterState
+"""∂x/∂c for each array x of floating numbers of a state, the 6 entries of c leading; None for the
+others, which count, decide or remember."""
+
+
+def start_tangents(state: FilterState) -> Tangents:
+    """At the start c is nothing but a bias of the gyro."""
+    zeros = jax.tree.map(
+        lambda leaf: jnp.zeros((ENTRIES, *leaf.shape), leaf.dtype), _floating(state)
+    )
+    return zeros._replace(gyro_bias=jnp.eye(ENTRIES, dtype=state.gyro_bias.dtype)[:, OF_BIAS])
+
+
+def step_with_tangents(
+    step: Callable[[FilterState, Measure], tuple[FilterState, T]],
+    state: FilterState,
+    tangents: Tangents,
+    measure: Measure,
+) -> tuple[FilterState, T, Tangents]:
+    """One clone step by `step`, and the tangents after it.
+
+    What `measure` gives is held: c disturbs it as a displacement, but the network is called once,
+    and not differentiated. After K steps S is that of `sensitivity` at the end of the run, to
+    rounding.
+    """
+
+    def moved(floating: Tangents, c: Float[Array, "6"]) -> tuple[Tangents, tuple[FilterState, T]]:
+        def measure_disturbed(
+            state: FilterState, oldest: Array | int
+        ) -> tuple[Displacement, dict[str, Array]]:
+            measured, diagnostics = measure(jax.lax.stop_gradient(state), oldest)
+            displacement = disturbed(measured.displacement[None], c)[0]
+            return dataclasses.replace(measured, displacement=displacement), diagnostics
+
+        whole = jax.tree.map(
+            lambda part, leaf: leaf if part is None else part,
+            floating,
+            state,
+            is_leaf=lambda part: part is None,
+        )
+        after, found = step(whole, measure_disturbed)
+        return _floating(after), (after, found)
+
+    point, dtype = (_floating(state), jnp.zeros(ENTRIES, state.offset.dtype)), state.offset.dtype
+
+    def along(tangent: Tangents, direction: Float[Array, "6"]) -> tuple:
+        _, after, found = jax.jvp(moved, point, (tangent, direction), has_aux=True)
+        return after, found
+
+    # Only the tangents are mapped over: the step itself is made once.
+    every_entry = jnp.eye(ENTRIES, dtype=dtype)
+    after, (state, found) = jax.vmap(along, out_axes=(0, None))(tangents, every_entry)
+    return state, found, after
+
+
+def core_sensitivity(mean: Mean, tangents: Tangents) -> Float[jax.Array, "15 6"]:
+    """S of θ, v, p, b_g, b_a."""
+    of_position = tangents.anchor + tangents.offset
+    of_biases = tangents.gyro_bias, tangents.accel_bias
+    of_mean = Mean(tangents.rotation, tangents.velocity, of_position, *of_biases)
+    last = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1)[None], of_mean)
+    return _of_error(mean.rotation[None], last)[0]
+
+
+def _floating(state: FilterState) -> Any:
+    """The state without what is no floating number."""
+    return jax.tree.map(
+        lambda leaf: leaf if jnp.issubdtype(leaf.dtype, jnp.floating) else None, state
+    )

@@ -1,0 +1,195 @@
+"""Measurements of the caller's own: in the filter, in the smoother, and as they are refused."""
+
+import functools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from gnio_jax import filtering, geometry
+from gnio_jax.filtering.update import oldest_offset
+from tests.support.compiling import quick
+from tests.support.random_walk import random_walk
+from tests.support.whole_covariance import covariance
+
+N, CLONES, INTERVALS, DT = 5, 4, 30, 0.02
+CONFIG = filtering.FilterConfig(DT, N, CLONES, history="core")
+NOISE = filtering.NoiseModel(2e-3, 2e-2, measurement_scale=1.0)
+START, GYRO, ACCEL, DISPLACEMENT, SPREAD = random_walk(
+    5, n=N, clones=CLONES, intervals=INTERVALS, dt=DT, nan_rows=[9, 17]
+)
+NONE = np.full_like(DISPLACEMENT, np.nan)
+
+
+class Height(NamedTuple):
+    """m, above the origin of the world."""
+
+    height: jax.Array
+    std: jax.Array
+
+    def update(self, state, step):
+        residual = jnp.stack([self.height - state.position[2]])
+        linear = filtering.linearise(
+            state, step, residual, self.std[None, None] ** 2, position=[[0.0, 0.0, 1.0]]
+        )
+        return filtering.measure(state, linear, step, threshold=10.8)
+
+
+class Between(NamedTuple):
+    """The displacement again, as TLIO has it, written from the outside."""
+
+    displacement: jax.Array
+    covariance: jax.Array
+
+    def update(self, state, step):
+        rotation = state.clone_rotation[step.oldest]
+        to_yaw = geometry.yaw_rotation(rotation).T
+        moved = to_yaw @ (state.offset - oldest_offset(state, step.oldest))
+
+        def yaw_of(theta):
+            turned = geometry.exp(theta) @ rotation
+            return jnp.arctan2(turned[1, 0], turned[0, 0])
+
+        by_yaw = jnp.stack([moved[1], -moved[0], 0.0 * moved[2]])
+        residual = jnp.where(state.step > CLONES, self.displacement - moved, jnp.nan)
+        linear = filtering.linearise(
+            state,
+            step,
+            residual,
+            self.covariance,
+            position=to_yaw,
+            oldest_position=-to_yaw,
+            oldest_rotation=by_yaw[:, None] * jax.grad(yaw_of)(jnp.zeros(3))[None],
+        )
+        return filtering.measure(state, linear, step)
+
+
+def start(config=CONFIG):
+    return filtering.initial_state(config, *START)
+
+
+@functools.cache
+def run(smoothed=False):
+    """(displacements, measurements) -> the run, or the smoothed one; one program for each tree."""
+    function = filtering.smooth if smoothed else filtering.run_filter
+    return quick(
+        lambda displacement, measurements: function(
+            start(), GYRO, ACCEL, displacement, SPREAD, CONFIG, NOISE, measurements=measurements
+        )
+    )
+
+
+@pytest.mark.parametrize("smoothed", [False, True])
+def test_a_displacement_from_the_outside_is_the_one_from_the_inside(smoothed):
+    """Over both anchors of the ring, with the rows that have no measurement; smoothed, too."""
+    wanted = run(smoothed)(DISPLACEMENT, ())
+    found = run(smoothed)(NONE, (Between(DISPLACEMENT, SPREAD),))
+    if not smoothed:
+        (state, wanted), (own, found) = wanted, found
+        jax.tree.map(
+            lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-11),
+            state._replace(gate=None),
+            own._replace(gate=None),
+        )
+        (outcome,) = found.others
+        np.testing.assert_array_equal(outcome.present, np.isfinite(wanted.nis))
+        np.testing.assert_allclose(outcome.nis[outcome.present], wanted.nis[outcome.present])
+    for name in ("rotation", "velocity", "position", "gyro_bias", "accel_bias", "covariance"):
+        np.testing.assert_allclose(
+            getattr(found, name), getattr(wanted, name), rtol=1e-8, atol=1e-11, err_msg=name
+        )
+
+
+def heights():
+    """Those of the filter with displacements, but for some decimetres, where there is one."""
+    _, history = run()(DISPLACEMENT, ())
+    height = np.asarray(history.position)[:, 2] + 0.1 * np.sin(np.arange(INTERVALS))
+    height[::3], height[20] = np.nan, 100.0
+    return height
+
+
+def test_a_height_is_the_textbooks_update():
+    """In the whole covariance, clones and all, for every interval; one that is 100 m off fails its
+    χ² test, and a NaN is none."""
+    height, std, state = heights(), 0.05, start()
+    step = quick(
+        lambda state, *given: filtering.run_filter(
+            state, *given[:4], CONFIG, NOISE, measurements=given[4]
+        )
+    )
+    whole = jax.jit(covariance)
+    for k in range(INTERVALS):
+        rows, row = slice(N * k, N * (k + 1)), slice(k, k + 1)
+        given = GYRO[rows], ACCEL[rows], DISPLACEMENT[row], SPREAD[row]
+        without, _ = step(state, *given, (Height(np.full(1, np.nan), np.full(1, std)),))
+        state, history = step(state, *given, (Height(height[row], np.full(1, std)),))
+        (outcome,) = history.others
+        assert outcome.present[0] == np.isfinite(height[k])
+        assert outcome.accepted[0] == (np.isfinite(height[k]) and k != 20)
+        before = np.asarray(whole(without))
+        spread, residual = before[8, 8] + std**2, height[k] - without.position[2]
+        gain = before[:, 8] / spread * float(outcome.accepted[0])
+        np.testing.assert_allclose(
+            whole(state), before - np.outer(gain, before[8]), rtol=1e-9, atol=1e-12
+        )
+        correction = gain * np.nan_to_num(residual)
+        np.testing.assert_allclose(state.velocity, without.velocity + correction[3:6], atol=1e-12)
+        np.testing.assert_allclose(state.position, without.position + correction[6:9], atol=1e-12)
+        if outcome.present[0]:
+            np.testing.assert_allclose(outcome.residual[0], [residual], atol=1e-12)
+            np.testing.assert_allclose(outcome.nis[0], residual**2 / spread, rtol=1e-9)
+
+
+def test_the_smoother_knows_a_height():
+    """At the end it is the filter; before, the heights that come later are known already."""
+    measured = (Height(heights(), np.full(INTERVALS, 0.05)),)
+    _, filtered = run()(DISPLACEMENT, measured)
+    smoothed, without = run(True)(DISPLACEMENT, measured), run(True)(DISPLACEMENT, ())
+    np.testing.assert_allclose(smoothed.position[-1], filtered.position[-1], atol=1e-10)
+    of_height = np.asarray(smoothed.covariance_diagonal)[:, 8]
+    assert (of_height <= np.asarray(filtered.covariance_diagonal)[:, 8] * (1 + 1e-9)).all()
+    assert (of_height < 0.5 * np.asarray(without.covariance_diagonal)[:, 8])[5:].all()
+
+
+def test_odometry_takes_it_with_a_gradient():
+    """Of a height's standard deviation, against differences; NaN rows have none."""
+    height = heights()
+
+    def loss(std):
+        measured = (Height(jnp.asarray(height), jnp.full(INTERVALS, std)),)
+        given = DISPLACEMENT, SPREAD, CONFIG, NOISE
+        _, history = filtering.run_filter(start(), GYRO, ACCEL, *given, measurements=measured)
+        return jnp.sum(history.position[:, 2] ** 2)
+
+    value_and_slope = quick(jax.value_and_grad(loss))
+    ahead, behind = (float(value_and_slope(0.05 + step)[0]) for step in (1e-5, -1e-5))
+    slope = float(value_and_slope(0.05)[1])
+    assert abs(slope) > 1e-3
+    np.testing.assert_allclose(slope, (ahead - behind) / 2e-5, rtol=1e-5)
+
+
+def test_rows_that_are_missing_are_refused_by_name():
+    measured = (Height(np.zeros(INTERVALS - 1), np.ones(INTERVALS)),)
+    with pytest.raises(ValueError, match=r"^measurements\[0\]\.height: the shape must be \(30,\)"):
+        run.__wrapped__()(DISPLACEMENT, measured)
+
+
+def test_known_displacements_are_those_of_the_filter():
+    """Between the poses at the ends of intervals, in the yaw frame of the earlier one."""
+    rng = np.random.default_rng(0)
+    (rotation, _, _), turn = START, rng.normal(size=3)
+    angles = np.arange(INTERVALS + 1)[:, None] * 0.1 * turn
+    rotations = np.asarray(jax.vmap(geometry.exp)(jnp.asarray(angles))) @ rotation
+    position = rng.normal(size=(INTERVALS + 1, 3))
+    found = filtering.displacements(rotations, position, CONFIG)
+    assert np.isnan(found[:CLONES]).all() and found.shape == (INTERVALS, 3)
+    for k in range(CLONES, INTERVALS):
+        # Clone k is taken at the end of interval k, that is at row k + 1.
+        old, new = k - CLONES + 1, k + 1
+        yaw = np.arctan2(rotations[old, 1, 0], rotations[old, 0, 0])
+        c, s = np.cos(yaw), np.sin(yaw)
+        x, y, z = position[new] - position[old]
+        np.testing.assert_allclose(found[k], [c * x + s * y, c * y - s * x, z], atol=1e-12)
+    assert np.isnan(filtering.displacements(rotations[:3], position[:3], CONFIG)).all()

@@ -1,0 +1,125 @@
+"""Starts without a reference."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from gnio_jax import filtering, geometry
+from gnio_jax.filtering.start import rest_at_start
+
+N, CLONES, DT = 5, 4, 0.02
+CONFIG = filtering.FilterConfig(DT, N, CLONES)
+
+# One program in place of one for every operation.
+slope_of_level = jax.jit(jax.jacrev(geometry.level))
+
+
+@pytest.mark.parametrize("pitch", [0.0, 0.7, -np.pi / 2, np.pi / 2])
+def test_level_state(pitch):
+    rng = np.random.default_rng(1)
+    R = Rotation.from_euler("ZYX", [0.0, pitch, 0.4]).as_matrix()
+    accel = R.T @ [0, 0, 9.81] + 0.01 * rng.standard_normal((50, 3))
+    state = filtering.level_state(CONFIG, 0.01 * rng.standard_normal((50, 3)), accel)
+    np.testing.assert_allclose(
+        state.rotation @ accel.mean(0) / np.linalg.norm(accel.mean(0)), [0, 0, 1], atol=1e-12
+    )
+    if abs(pitch) < 1:
+        np.testing.assert_allclose(state.rotation, R, atol=2e-3)
+    np.testing.assert_allclose(
+        np.asarray(state.rotation) @ np.asarray(state.rotation).T, np.eye(3), atol=1e-12
+    )
+    assert np.linalg.det(state.rotation) > 0
+    sigma = np.sqrt(np.diag(state.core_covariance))
+    spread = np.sqrt(accel.var(0).sum())
+    np.testing.assert_allclose(
+        sigma[0], np.sqrt(0.02**2 + spread**2 / 2.0) / 9.81, rtol=1e-9
+    )  # one second, two half seconds
+    np.testing.assert_allclose(sigma[3:6], 0.05)
+    shaken = filtering.level_state(
+        CONFIG, np.zeros((50, 3)), accel + np.sin(np.arange(50))[:, None]
+    )
+    assert (
+        np.sqrt(shaken.core_covariance[3, 3]) == 1.0
+        and shaken.core_covariance[0, 0] > state.core_covariance[0, 0]
+    )
+
+
+@pytest.mark.parametrize("rate", [[0.3, -0.8, 0.5], [0.0, 0.0, 2.0], [0.0, 0.0, 0.0]])
+def test_level_state_of_a_phone_that_a_hand_turns(rate):
+    """The attitude is that of the first sample, not of the second's middle, and not rough."""
+    first = Rotation.from_euler("ZYX", [0.0, 0.4, -1.1])
+    turned = first * Rotation.from_rotvec(np.outer(np.arange(50) * CONFIG.dt, rate))
+    accel = turned.inv().apply([0, 0, 9.81])
+    state = filtering.level_state(CONFIG, np.tile(rate, (50, 1)), accel)
+    np.testing.assert_allclose(state.rotation, first.as_matrix(), atol=1e-9)
+    np.testing.assert_allclose(np.sqrt(state.core_covariance[0, 0]), 0.02 / 9.81, rtol=1e-6)
+
+
+def test_level_state_says_how_far_the_velocity_can_be_from_zero():
+    """1.5 s times the spread, between a table's and a walker's, with a slope everywhere."""
+
+    shake = np.outer(np.sin(np.arange(50)), [1.0, 0, 0])
+
+    def velocity_std(amplitude):
+        shaken = np.tile([0, 0, 9.81], (50, 1)) + amplitude * shake
+        state = filtering.level_state(CONFIG, np.zeros((50, 3)), shaken)
+        return jnp.sqrt(state.core_covariance[3, 3])
+
+    spread = np.sin(np.arange(50)).std()
+    for amplitude, wanted in ((0.0, 0.05), (0.4, 1.5 * 0.4 * spread), (5.0, 1.0)):
+        np.testing.assert_allclose(velocity_std(amplitude), wanted, rtol=1e-9)
+        slope = 0 if amplitude != 0.4 else 1.5 * spread
+        np.testing.assert_allclose(jax.grad(velocity_std)(amplitude), slope, rtol=1e-6)
+
+
+def test_level_state_at_rest_takes_a_gyro_for_biased():
+    """It does not turn what does not turn."""
+    accel = np.tile([0.5, 1.0, 9.7], (50, 1))
+    still, biased = (
+        filtering.level_state(CONFIG, np.full((50, 3), bias), accel) for bias in (0.0, 0.05)
+    )
+    np.testing.assert_array_equal(still.rotation, biased.rotation)
+
+
+@pytest.mark.parametrize("samples, gyro_std, accel_std", [(49, 0, 0), (50, 0.02, 0), (50, 0, 0.2)])
+def test_level_state_takes_the_bias_of_a_second_on_a_table(samples, gyro_std, accel_std):
+    """The mean of the gyro, and nothing of a shorter or a shaken rest."""
+    rng, bias = np.random.default_rng(3), np.array([0.02, -0.01, 0.03])
+    noise = rng.standard_normal((2, 50, 3))
+    gyro, accel = bias + 0.002 * noise[0], [0, 0, 9.81] + 0.02 * noise[1]
+    found = filtering.level_state(CONFIG, gyro, accel).gyro_bias
+    np.testing.assert_allclose(found, gyro.mean(0), rtol=1e-12)
+    np.testing.assert_allclose(found, rest_at_start(gyro, accel, CONFIG.dt).gyro_bias, rtol=1e-12)
+    shaken = gyro + gyro_std * noise[0], accel + accel_std * noise[1]
+    found = filtering.level_state(CONFIG, *(each[:samples] for each in shaken)).gyro_bias
+    np.testing.assert_array_equal(found, 0)
+
+
+@pytest.mark.parametrize("size", [0.0, 1.0])
+def test_level_state_refuses_accelerations_without_gravity(size):
+    """Such as those of a sensor that does not run yet, or that are in units of gravity."""
+    with pytest.raises(ValueError, match=rf"^accel: shows no gravity, its mean is {size:.2g} m/s²"):
+        filtering.level_state(CONFIG, np.zeros((50, 3)), np.tile([0, 0, size], (50, 1)))
+
+
+@pytest.mark.parametrize(
+    "up", [[0.0, 0, 1], [0, 0, -1], [1, 0, 0], [-1, 0, 0], [0, 1, 0], [0.3, -0.2, 0.9]]
+)
+def test_level_is_a_rotation_with_derivatives(up):
+    up = np.asarray(up, float)
+    rotation = np.asarray(jax.jit(geometry.level)(up))
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(rotation @ up / np.linalg.norm(up), [0, 0, 1], atol=1e-12)
+    assert np.linalg.det(rotation) > 0
+    if abs(up[0]) < 0.99:
+        np.testing.assert_allclose(np.arctan2(rotation[1, 0], rotation[0, 0]), 0, atol=1e-12)
+    assert np.isfinite(slope_of_level(up)).all()
+
+
+def test_orthonormalize_is_the_nearest_rotation():
+    rng = np.random.default_rng(2)
+    R = Rotation.random(rng=rng).as_matrix() + 1e-5 * rng.standard_normal((3, 3))
+    u, _, vt = np.linalg.svd(R)
+    np.testing.assert_allclose(jax.jit(geometry.orthonormalize)(R), u @ vt, atol=1e-9)

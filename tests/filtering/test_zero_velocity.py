@@ -1,0 +1,196 @@
+"""The velocity at rest as a measurement."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from gnio_jax import filtering
+from gnio_jax.filtering.gaps import Gap, Imu
+from gnio_jax.filtering.zero_velocity import ZeroVelocity, detect_rest
+
+N, CLONES, DT, INTERVALS = 5, 4, 0.02, 60
+CONFIG = filtering.FilterConfig(DT, N, CLONES, bridge_seconds=0.06, history="core")
+NOISE = filtering.NoiseModel(measurement_scale=2.0)
+
+
+STILL = Imu(jnp.zeros((N, 3)), jnp.tile(jnp.array([[0.0, 0.0, 9.81]]), (N, 1)), None)
+
+
+@jax.jit
+def at_rest(state, tried):
+    """The state after an interval at rest, and what became of that measurement."""
+    config = dataclasses.replace(CONFIG, zero_velocity_std=0.05, rest_seconds=0.0)
+    scalar, no = jnp.zeros(()), jnp.bool_(False)
+    displacement = filtering.Outcome(tried, tried, jnp.zeros(3), scalar, scalar, scalar, no)
+    step = filtering.Step(STILL, 0, 1, config, filtering.NoiseModel(), (displacement,))
+    new, outcome, _ = ZeroVelocity().update(state, step)
+    return new, outcome
+
+
+def test_rest_is_a_measurement_if_wanted():
+    """Standing still with biased sensors: without it the velocity wanders, with it it stays."""
+    rng = np.random.default_rng(5)
+    R = Rotation.from_euler("xyz", [0.2, -0.1, 1.0]).as_matrix()
+    samples = N * INTERVALS
+    gyro = 1e-3 * rng.standard_normal((samples, 3))
+    accel = (
+        np.tile(R.T @ [0, 0, 9.81], (samples, 1)) + 0.05 + 1e-2 * rng.standard_normal((samples, 3))
+    )
+    accel[150:160] += R.T @ [0, 0, 0.5]  # a knock
+    nothing = np.full((INTERVALS, 3), np.nan), np.tile(np.eye(3), (INTERVALS, 1, 1))
+    found = {}
+    for std in (0.0, 0.02):
+        config = filtering.FilterConfig(
+            DT, N, CLONES, zero_velocity_std=std, rest_seconds=0.3, history="core"
+        )
+        state = filtering.initial_state(config, R, np.zeros(3), np.zeros(3))
+        _, found[std] = filtering.run_filter(state, gyro, accel, *nothing, config, NOISE)
+    assert (np.asarray(found[0.0].at_rest) == 0).all()
+    expected = np.ones(INTERVALS)
+    expected[[0, 1, 30, 31, 32, 33]] = (
+        0  # three intervals of 0.1 s until it counts, and again after the knock
+    )
+    np.testing.assert_array_equal(found[0.02].at_rest, expected)
+    speed = {std: np.linalg.norm(h.velocity, axis=1) for std, h in found.items()}
+    assert speed[0.0][-1] > 0.3 and speed[0.02][-1] < 0.02
+    # the same numbers from the textbook's update at the first rest
+    k, h = 2, found[0.0]
+    P, v = np.asarray(h.covariance)[k], np.asarray(h.velocity)[k]
+    gain = P[:, 3:6] @ np.linalg.inv(P[3:6, 3:6] + 0.02**2 * np.eye(3))
+    np.testing.assert_allclose(found[0.02].velocity[k], v - gain[3:6] @ v, atol=1e-12)
+    np.testing.assert_allclose(found[0.02].covariance[k], P - gain @ P[3:6], atol=1e-12)
+    np.testing.assert_allclose(
+        found[0.02].accel_bias[k], np.asarray(h.accel_bias)[k] - gain[12:] @ v, atol=1e-12
+    )
+
+
+@pytest.mark.parametrize("seconds, intervals", [(0.0, 1), (0.1, 1), (0.11, 2), (0.3, 3), (0.35, 4)])
+def test_rest_counts_only_after_its_time(seconds, intervals):
+    """Intervals of 0.1 s: as many as `rest_seconds` needs, and anew after each that is not quiet,
+    in one of three ways."""
+    config = filtering.FilterConfig(DT, N, CLONES, zero_velocity_std=0.02, rest_seconds=seconds)
+    turning = STILL._replace(gyro=STILL.gyro.at[2, 1].set(1.01 * config.rest_gyro))
+    shaken = STILL._replace(accel=STILL.accel.at[3, 2].add(-1.01 * config.rest_accel))
+    held = STILL._replace(gap=Gap(jnp.zeros(N).at[-1].set(1e-6), jnp.zeros(N), jnp.ones(N)))
+    state, found, expected, count = (
+        filtering.initial_state(config, np.eye(3), np.zeros(3), np.zeros(3)),
+        [],
+        [],
+        0,
+    )
+    for imu in [*5 * [STILL], turning, *5 * [STILL], shaken, *5 * [STILL], held, *5 * [STILL]]:
+        state, quiet = detect_rest(state, imu, config)
+        count = count + 1 if imu is STILL else 0
+        found.append(bool(quiet))
+        expected.append(count >= intervals)
+    assert found == expected and sum(found) == 4 * (6 - intervals)
+
+
+def resting(now, converged=True, last_success=100, pause_end=0, tried=True, speed=1.0):
+    """The state before and after the IMU is quiet at sample `now`, with a velocity of `speed` known
+    to 0.1 m/s per axis, and what the filter made of it. `tried`: there was a displacement, too."""
+    std, velocity = filtering.InitialStd(velocity=0.1), speed * np.array([0.6, 0.0, -0.8])
+    state = filtering.initial_state(CONFIG, np.eye(3), velocity, np.zeros(3), std=std)
+    gate = filtering.GateState(jnp.bool_(converged), jnp.int32(last_success), jnp.int32(pause_end))
+    state = state._replace(gate=gate, step=jnp.int32(now // N))
+    new, found = at_rest(state, np.bool_(tried))
+    return state, new, found
+
+
+EDGE = np.sqrt(CONFIG.gate_threshold * (0.1**2 + 0.05**2))
+"""Speed at which the χ² test is just passed, m/s."""
+
+
+@pytest.mark.parametrize(
+    "gate, speed, accepted",
+    [
+        (dict(now=110), 1.001 * EDGE, False),
+        (dict(now=110), 0.999 * EDGE, True),
+        (dict(now=125), 3.0, False),
+        (dict(now=130), 3.0, True),  # the last success is 0.5 s old, older
+        (dict(now=110, converged=False), 3.0, True),
+        (dict(now=110, last_success=-1), 3.0, False),
+        (dict(now=110, pause_end=115), 3.0, True),
+        (dict(now=115, pause_end=115), 3.0, False),
+        (dict(now=110, tried=False), 3.0, True),
+        (dict(now=110, tried=False), 0.999 * EDGE, True),
+    ],
+)
+def test_rest_passes_a_chi_square_test_where_the_gate_is_active(gate, speed, accepted):
+    state, new, found = resting(speed=speed, **gate)
+    np.testing.assert_allclose(found.nis, speed**2 / (0.1**2 + 0.05**2), rtol=1e-12)
+    assert bool(found.accepted) == accepted and bool(found.present)
+    jax.tree.map(np.testing.assert_array_equal, new.gate, state.gate)
+    wanted = np.asarray(state.velocity) * (0.05**2 / (0.1**2 + 0.05**2) if accepted else 1.0)
+    np.testing.assert_allclose(new.velocity, wanted, rtol=1e-12)
+    variance = 1 / (1 / 0.1**2 + accepted / 0.05**2)
+    np.testing.assert_allclose(np.diag(new.core_covariance)[3:6], variance, rtol=1e-12)
+
+
+RESTING = filtering.FilterConfig(
+    DT,
+    N,
+    CLONES,
+    zero_velocity_std=0.02,
+    rest_seconds=0.3,
+    convergence_seconds=1.0,
+)
+
+
+def test_rest_without_displacements_corrects_a_wrong_velocity():
+    """Displacements until interval 38 and then none; a false knock of 4 m/s; then 38 s at rest. In
+    pieces, for the program of the next test."""
+    intervals, last, knock = 7 * INTERVALS, 38, 39 * N
+    gyro, accel = np.zeros((N * intervals, 3)), np.tile([0, 0, 9.81], (N * intervals, 1))
+    accel[knock, 0] += 4.0 / DT
+    displacement = np.where(np.arange(intervals)[:, None] <= last, np.zeros(3), np.nan)
+    spread = np.tile(0.02**2 * np.eye(3), (INTERVALS, 1, 1))
+    final, parts = filtering.initial_state(RESTING, np.eye(3), np.zeros(3), np.zeros(3)), []
+    for first in range(0, intervals, INTERVALS):
+        rows = slice(first, first + INTERVALS)
+        samples = slice(N * first, N * (first + INTERVALS))
+        given = final, gyro[samples], accel[samples], displacement[rows], spread
+        final, history = filtering.run_filter(*given, RESTING, NOISE)
+        parts.append(history)
+    history = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+    assert bool(final.gate.converged) and int(final.gate.pause_end) <= 0  # it never became stale
+    np.testing.assert_allclose(np.asarray(history.velocity)[39:41, 0], 4.0, atol=0.05)
+    assert history.others[0].nis[42] > 100 and (np.asarray(history.at_rest)[42:] == 1).all()
+    speed = np.linalg.norm(history.velocity, axis=1)
+    # The filter was sure of its velocity: each interval at rest takes a part of the error away.
+    assert (np.diff(speed[41:52]) < -0.1).all() and speed[52] < 1.0 and speed[-1] < 0.05
+
+
+def test_a_quiet_ride_is_no_rest_and_a_wrong_start_is_corrected_by_rest():
+    """A carriage that glides at 1 m/s, as the filter knows by displacements; and a device at rest
+    that starts with 3 m/s, so sure of it that it would not pass the test."""
+    gliding, samples = 30, N * INTERVALS
+    gyro, accel = np.zeros((samples, 3)), np.tile([0, 0, 9.81], (samples, 1))
+    accel[: N * gliding : 2, 2] += 1.0  # rattles before
+    accel[1 : N * gliding : 2, 2] -= 1.0
+    spread = np.tile(0.02**2 * np.eye(3), (INTERVALS, 1, 1))
+
+    def go(speed, accel, displacement):
+        state = filtering.initial_state(
+            RESTING,
+            np.eye(3),
+            np.array([speed, 0.0, 0.0]),
+            np.zeros(3),
+            std=filtering.InitialStd(velocity=0.05),
+        )
+        return filtering.run_filter(state, gyro, accel, displacement, spread, RESTING, NOISE)[1]
+
+    history = go(1.0, accel, np.tile([CLONES * N * DT, 0.0, 0.0], (INTERVALS, 1)))
+    quiet = np.arange(INTERVALS) >= gliding + 2
+    np.testing.assert_array_equal(history.others[0].present, quiet)
+    assert (np.asarray(history.others[0].nis)[quiet] > 100).all()
+    assert (np.asarray(history.at_rest) == 0).all()
+    np.testing.assert_allclose(history.velocity[:, 0], 1.0, atol=0.02)
+
+    history = go(3.0, np.tile([0, 0, 9.81], (samples, 1)), np.full((INTERVALS, 3), np.nan))
+    assert history.others[0].nis[2] > 1000 and (np.asarray(history.at_rest)[2:] == 1).all()
+    assert np.abs(history.velocity[2:, 0]).max() < 0.5 and abs(history.velocity[-1, 0]) < 0.02
