@@ -177,10 +177,9 @@ def _low_passed(
             reflected = min(low - lowest, high - low)
             fine = np.concatenate([2 * fine[0] - fine[reflected:0:-1], fine])
             low -= reflected
-        weighted = np.zeros((highest - lowest + 1, 7))
-        weighted[low - lowest : high - lowest + 1] = np.pad(
-            fine, ((0, 0), (0, 1)), constant_values=1.0
-        )
+        weighted = np.zeros((highest - lowest + 1, 7))  # samples, and 1 where there is one
+        in_run = slice(low - lowest, high - lowest + 1)
+        weighted[in_run, :6], weighted[in_run, 6] = fine, 1.0
         windows = np.lib.stride_tricks.sliding_window_view(weighted, len(grid.taps), axis=0)
         sums = (windows[:: grid.factor] @ grid.taps)[inside]
         # From the centre on to either side the taps never sum to less than half the middle one.

@@ -293,7 +293,7 @@ def compile_programs(
         advance, predict=predict, config=config, noise=noise, considered=considered
     )
     ahead = functools.partial(look_ahead, config=config, noise=noise)
-    rows, row, vector = ((config.samples_per_clone, 7), (7,), (sum(_SIZES),))
+    rows, row, vector = (config.samples_per_clone, 7), (7,), (sum(_SIZES),)
     return Programs(
         jax.jit(step, donate_argnums=0).lower(core, of_type(rows)).compile(),
         jax.jit(ahead).lower(of_type(vector), core.filter.imu, of_type(row)).compile(),
