@@ -43,7 +43,7 @@ def names() -> list[str]:
 
 
 def find(config: str | Path) -> Path:
-    """The file of `config`: a path, or a name of `names()`.
+    """The file of `config`: a path, the folder of a run, or a name of `names()`.
 
     Raises `InputError` that suggests the closest name when it is neither.
     """
@@ -52,8 +52,8 @@ def find(config: str | Path) -> Path:
         return path
     if str(config) in packaged:
         return packaged[str(config)]
-    if path.exists():  # a pipe is read, and a folder is refused as one
-        return path
+    if path.exists():  # a pipe is read, and a folder that is no run is refused as one
+        return path / "config.yaml" if (path / "config.yaml").is_file() else path
     by_stem = {Path(name).stem: name for name in packaged}
     close = difflib.get_close_matches(path.stem, by_stem, n=1)
     hint = f"did you mean '{by_stem[close[0]]}'? " if close else ""

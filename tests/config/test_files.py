@@ -118,6 +118,14 @@ def test_a_pipe_is_read_once(tmp_path):
     writer.join()
 
 
+def test_the_folder_of_a_run_stands_for_its_config(tmp_path):
+    configuration.save(tmp_path / "config.yaml", TrainConfig(seed=5))
+    assert configuration.load(tmp_path).seed == 5
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError, match=r"empty: cannot be read .*Is a directory"):
+        configuration.load(tmp_path / "empty")
+
+
 def test_settings_are_assigned_by_name():
     config = configuration.assign(
         TrainConfig(),
