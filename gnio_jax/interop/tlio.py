@@ -24,7 +24,6 @@ from gnio_jax.files import replacing_folder
 
 _CHANNELS = np.array([3, 4, 5, 0, 1, 2])
 """Where our channels, [accel, gyro], are among TLIO's, [gyro, accel]."""
-
 _STEM = "input_block.0.weight"
 _FLATTENED = "output_block1.fc1.weight"
 _PREP_CHANNELS = 128
@@ -47,7 +46,6 @@ _PARTS = {
 }
 """Names of ours, and what TLIO's keys have in their place; those that are not here are the same,
 and a dot."""
-
 _REMEDY = "the weights must be those of TLIO's network 'resnet', as its training saves them"
 
 
@@ -77,7 +75,7 @@ def load_tlio_state_dict(mapping_or_path: Mapping[str, Any] | str | Path) -> Any
         if keys:
             more = f" (and {len(keys) - 1} more)" if len(keys) > 1 else ""
             raise InputError(where, f"'{min(keys)}' is {problem}{more}", _REMEDY)
-    arrays = {key: _turned(where, key, given[key], leaf.shape) for key, leaf in wanted.items()}
+    arrays = {key: _turned(where, key, given[key], each.shape) for key, each in wanted.items()}
     arrays[_STEM] = arrays[_STEM][:, _CHANNELS]
     leaves = [jnp.asarray(arrays[key], jnp.float32) for key in wanted]
     return jax.tree.unflatten(jax.tree.structure(template), leaves)
@@ -94,12 +92,11 @@ def _template(where: str, given: Mapping[str, Any]) -> Any:
     return models.variable_shapes(models.create("tlio"), 32 * (shape[1] // _PREP_CHANNELS))
 
 
-def _turned(where: str, key: str, value: Any, wanted: tuple[int, ...]) -> np.ndarray:
-    """The array with PyTorch's (out, in, size) turned to our (size, in, out)."""
+def _turned(where: str, key: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """The array with PyTorch's (out, in, size) turned to our `shape`, (size, in, out)."""
     array = np.asarray(value.detach().cpu().float() if hasattr(value, "detach") else value)
-    if array.shape != wanted[::-1]:
-        problem = f"'{key}' must have shape {wanted[::-1]}, found {array.shape}"
-        raise InputError(where, problem, _REMEDY)
+    if array.shape != (theirs := shape[::-1]):
+        raise InputError(where, f"'{key}' must have shape {theirs}, found {array.shape}", _REMEDY)
     if not np.issubdtype(array.dtype, np.floating) or not np.isfinite(array).all():
         problem = f"'{key}' holds values that are not finite numbers"
         raise InputError(where, problem, "the weights are damaged")
@@ -114,14 +111,14 @@ def _opened(given: Mapping[str, Any] | str | Path) -> tuple[str, Mapping[str, An
     if not path.is_file():
         known = "a checkpoint of TLIO's training, a TorchScript archive or an .npz"
         raise InputError(path, "no such file", f"give {known} of the state dict")
+    if path.suffix != ".npz":
+        require_packages(path, "torch", "torch")
     try:
         if path.suffix == ".npz":
             with np.load(path, allow_pickle=False) as file:
                 content = dict(file)
         else:
             content = _torch(path)
-    except InputError:
-        raise
     except Exception as error:  # torch and zipfile raise half a dozen types for damaged files
         problem = f"cannot be read ({str(error).partition(chr(10))[0][:160]})"
         known = "an .npz of arrays, or a file of PyTorch that holds tensors and plain values only"
@@ -132,7 +129,6 @@ def _opened(given: Mapping[str, Any] | str | Path) -> tuple[str, Mapping[str, An
 
 
 def _torch(path: Path) -> Any:
-    require_packages(path, "torch", "torch")
     import torch  # pyright: ignore[reportMissingImports]
 
     if zipfile.is_zipfile(path):
