@@ -468,7 +468,7 @@ def _of_today(fields: dict, source: str) -> dict:
         for name in inner.keys() - kept.keys():
             if gone[name] is not _ANY and inner[name] != gone[name]:
                 problem = f"is {_shown(inner[name])}, and there is no such setting any more"
-                Place(source, section).refuse(name, problem, f"it is always {gone[name]!r}")
+                Place(source, section).refuse(name, problem, "leave it out")
         new = new | {section: kept} if section else kept
     if isinstance(new.get("data"), dict) and "folds" in new["data"]:
         data = dict(new["data"])

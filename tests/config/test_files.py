@@ -17,6 +17,7 @@ from gnio_jax.config import (
     NoiseModel,
     ThroughFilter,
     TrainConfig,
+    files,
 )
 from gnio_jax.errors import InputError
 from tests.support.filter_settings import changed
@@ -292,3 +293,33 @@ def test_an_old_file_that_asks_for_what_is_gone_is_refused(text, problem):
     with pytest.raises(InputError) as refused:
         read(text)
     assert problem in str(refused.value)
+
+
+def gone():
+    """Fields that are no more, and the value with which each changed nothing."""
+    for section, fields in files._GONE.items():
+        known = vars(getattr(TrainConfig(), section) if section else TrainConfig())
+        yield from ((section, name, each) for name, each in fields.items() if name not in known)
+
+
+def old_text(section, name, value):
+    fields = {name: value}
+    return yaml.safe_dump({section: fields} if section else fields)
+
+
+@pytest.mark.parametrize(("section", "name", "neutral"), list(gone()))
+def test_a_field_that_is_no_more_must_have_changed_nothing(section, name, neutral):
+    if neutral is files._ANY:
+        assert read(old_text(section, name, 7)) == TrainConfig()
+        return
+    assert read(old_text(section, name, neutral)) == TrainConfig()
+    field = f"{section}.{name}" if section else name
+    with pytest.raises(InputError, match=rf"^f.yaml: field '{field}' is 7, and there is no such"):
+        read(old_text(section, name, 7))
+
+
+def test_an_old_file_without_a_fold_has_a_part_of_its_split():
+    found = read("data: {folds: 4, left_out: 1, train_split: sessions_train}")
+    assert found.data.train_split == "sessions_train-1of4"
+    assert read("data: {folds: 2, left_out: 0}").data.train_split == "train-0of2"
+    assert read("data: {folds: 1, left_out: 0}") == TrainConfig()
