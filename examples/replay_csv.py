@@ -1,10 +1,11 @@
 """Replay a recording through the online filter.
 
-python examples/replay_csv.py --workdir runs/mine --csv walk.csv
+python examples/replay_csv.py --csv walk.csv
 """
 
 import gc
 import os
+import sys
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,37 +15,22 @@ os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
 
 import jax
 import numpy as np
+import tyro
 
-from gnio_jax import config as configuration
-from gnio_jax.commands import console
-from gnio_jax.commands.options import parse
+from gnio_jax.commands import console, options
 from gnio_jax.data.importing import InputError
-
-DESCRIPTION = """Feed a recording to gnio_jax.filtering.Tracker sample by sample, like an app on a
-phone.
-
-  python examples/replay_csv.py --csv walk.csv                       (the newest run below runs/)
-  python examples/replay_csv.py --workdir runs/mine --csv walk.csv --out walk.txt
-  python examples/replay_csv.py --workdir runs/mine --csv walk.h5 --realtime
-
-The CSV has a header with time (s), gyro_x..z (rad/s) and accel_x..z (m/s2, +9.81 upwards at rest).
-A file named .h5 is read as the package's own format. `gnio data import` converts the file of a
-phone's logger into either. The stamps may be irregular; empty cells are missing samples. Keep the
-device still for the first second: the tilt is taken from it.
-
-The results are the trajectory in TUM format, one pose for each clone step, and a picture of it
-(.png) beside it."""
 
 
 @dataclass(frozen=True)
 class Replay:
     csv: str
     """The recording: a CSV, or the package's HDF5 (.h5)."""
-    workdir: str | None = None
-    """Folder of the run whose network is used. Default: the newest below runs/."""
+    weights: str | None = None
+    """Name, package or run folder; by default the network that comes with gnio-jax, else the newest
+    run below runs/."""
     out: str | None = None
-    """File of the trajectory. Default: <recording>_trajectory.txt in the current folder."""
-    realtime: bool = False
+    """File of the trajectory; by default <recording>_trajectory.txt in the working folder."""
+    realtime: tyro.conf.FlagCreatePairsOff[bool] = False
     """Push each sample at its own time, as if the recording happened now."""
     rest_seconds: float = 1.0
     """How long the device is still at the start, s."""
@@ -189,34 +175,51 @@ def summarise(
 
 
 def main() -> None:
+    console.run(lambda: options.run(follow, options.Call("python replay_csv.py", sys.argv[1:])))
+
+
+def follow(asked: Replay, _call: options.Call) -> None:
+    """Feed a recording to gnio_jax.filtering.Tracker sample by sample, like an app on a phone.
+
+    The CSV has a header with time (s), gyro_x..z (rad/s) and accel_x..z (m/s2, +9.81 upwards at
+    rest). A file named .h5 is read as the package's own format. `gnio data import` converts the
+    file of a phone's logger into either. The stamps may be irregular; empty cells are missing
+    samples. Keep the device still for the first second: the tilt is taken from it.
+
+    The results are the trajectory in TUM format, one pose for each clone step, and a picture of it
+    (.png) beside it.
+
+    examples:
+      python examples/replay_csv.py --csv examples/walk.csv
+      python examples/replay_csv.py --weights runs/mine --csv walk.csv --out walk.txt
+      python examples/replay_csv.py --weights runs/mine --csv walk.h5 --realtime
+    """
     # The filter needs float64. The network states its float32 everywhere.
     jax.config.update("jax_enable_x64", True)
-    options = parse(Replay, description=DESCRIPTION)
-    path = Path(options.csv)
+    path = Path(asked.csv)
     recorded = read(path)
 
-    from gnio_jax.training import checkpoint
+    from gnio_jax import tracking
 
-    workdir = Path(options.workdir) if options.workdir else configuration.newest_run()
-    run = checkpoint.load_run(workdir)
+    run = tracking.choose_weights(asked.weights).run
     if len(recorded.time) < 2:
         raise InputError(path, "holds a single sample", "record a walk of some seconds")
     with console.terminal() as terminal:
         progress = terminal.progress
         progress("compiling", 0.0)
         begin = time.perf_counter()
-        tracker = create_tracker(run, recorded, options.rest_seconds)
+        tracker = create_tracker(run, recorded, asked.rest_seconds)
         compiled = time.perf_counter() - begin
-        replayed = replay(tracker, recorded, path, options.realtime, progress)
+        replayed = replay(tracker, recorded, path, asked.realtime, progress)
     if not replayed.poses:
         raise InputError(
             path,
-            f"ends before the device was still for {options.rest_seconds:g} s "
+            f"ends before the device was still for {asked.rest_seconds:g} s "
             "without a missing sample",
             "record longer, or give a smaller --rest-seconds",
         )
 
-    out = Path(options.out or f"{path.stem}_trajectory.txt")
+    out = Path(asked.out or f"{path.stem}_trajectory.txt")
     position = write_trajectory(out, path.stem, replayed.poses)
     summarise(replayed, recorded, position, compiled)
     if tracker.delay:
@@ -229,4 +232,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    console.run(main)
+    main()

@@ -15,12 +15,12 @@ import pytest
 import gnio_jax
 from gnio_jax import config as configuration
 from gnio_jax import data, models, pretrained
-from gnio_jax.commands import app, options
 from gnio_jax.config import DataConfig, ModelConfig, TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.models import registry
 from gnio_jax.training.checkpoint import create_model
 from tests.support import pages, tiny_run
+from tests.support.command_lines import understood
 
 SMALLER = {
     "README.md": {"width=16": "width=2", "6000": "220", "6001": "221", "300": "11"},
@@ -28,7 +28,7 @@ SMALLER = {
     "docs/notebooks/learn_noise.py": {"SECONDS = 30": "SECONDS = 2", "STEPS = 150": "STEPS = 2"},
 }
 """Fewer samples and steps than on the page: page -> what stands there -> what runs."""
-HELP = {"--help", "--help-all", "--tyro-write-completion", "COMMAND"}
+HELP = {"--help", "--tyro-write-completion", "COMMAND"}
 """Words that leave with a text; COMMAND stands for any command."""
 RUN = [block for block in pages.python_blocks() if not block.reason]
 NOT_RUN = [block for block in pages.python_blocks() if block.reason]
@@ -167,14 +167,10 @@ def member(module, name):
 def test_a_command_line_is_understood(line, monkeypatch):
     """By the parser of the command, which runs nothing; a config that it names is there."""
     monkeypatch.chdir(pages.ROOT)
-    words, found = list(line.words), app.GNIO
-    while isinstance(found, options.Group) and words and words[0] in found.commands:
-        found = found.commands[words.pop(0)]
-    if isinstance(found, options.Group) or HELP & set(words):
-        assert words[0] in HELP, f"{line.page}: no command {words}"
+    if HELP & set(line.words):
         return
     try:
-        settings = options.parse(found.options, argv=words)
+        settings = understood(line.words)
     except InputError as error:
         # A sentence may leave out what the option or the command is about.
         assert line.quoted and re.search("is missing|needs a value", str(error)), error
@@ -187,7 +183,7 @@ def test_a_command_line_is_understood(line, monkeypatch):
 
 def test_a_command_line_of_yesterday_is_not():
     with pytest.raises(InputError, match="unknown option"):
-        options.parse(app.GNIO.commands["track"].options, argv=["walk.zip", "--wieghts", "mine"])
+        understood(["track", "walk.zip", "--wieghts", "mine"])
 
 
 def test_what_else_the_shell_is_told_is_there():

@@ -12,6 +12,7 @@ import sys
 import typing
 import warnings
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 from rich.console import Console
@@ -25,6 +26,7 @@ from rich.progress import (
 )
 from rich.text import Text
 
+import gnio_jax
 from gnio_jax.errors import InputError
 
 _DISK_ERRORS = {
@@ -41,6 +43,8 @@ _DISK_ERRORS = {
     errno.ENAMETOOLONG,
 }
 _READER_LEFT = 141
+_COMPILE_SECONDS = "0.1"
+"""s. What takes longer to compile is kept; JAX itself keeps what takes a second."""
 
 
 def run(main: Callable[[], object]) -> None:
@@ -56,7 +60,9 @@ def run(main: Callable[[], object]) -> None:
         sys.stdout.reconfigure(errors="backslashreplace")
     try:
         with warnings.catch_warnings():
-            warnings.showwarning = _print_warning
+            warnings.showwarning = warn
+            warn_of_other_sources()
+            keep_compiled_programs()
             main()
         sys.stdout.flush()
     except InputError as error:
@@ -71,6 +77,30 @@ def run(main: Callable[[], object]) -> None:
         if error.errno not in _DISK_ERRORS:
             raise
         _leave(f"{error.filename or 'output'}: {error.strerror}", 2)
+
+
+def warn_of_other_sources() -> None:
+    """Warn where the working folder holds another gnio_jax than the one that runs: what is changed
+    there would have no effect."""
+    running = Path(gnio_jax.__file__)
+    if os.path.isfile("gnio_jax/__init__.py") and not running.samefile("gnio_jax/__init__.py"):
+        there = f"runs gnio_jax of {running.parent}, not that of this folder"
+        warn(f"gnio {there}; pip install -e . makes them one")
+
+
+def keep_compiled_programs() -> None:
+    """Let JAX keep what it compiles in the user's cache, unless the user has said where.
+
+    JAX reads the variables as it is imported, and processes that are started inherit them. Where
+    the folder cannot be written every command compiles anew.
+    """
+    base = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+    folder = Path(base) / "gnio-jax" / "compiled"
+    with contextlib.suppress(OSError):
+        folder.mkdir(parents=True, exist_ok=True)
+        if os.access(folder, os.W_OK):
+            os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(folder))
+            os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", _COMPILE_SECONDS)
 
 
 _CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069]")
@@ -148,5 +178,5 @@ def _terminate(number: int, _frame: object) -> typing.NoReturn:
     raise SystemExit(128 + number)
 
 
-def _print_warning(message: Warning | str, *_: object) -> None:
+def warn(message: Warning | str, *_: object) -> None:
     print(f"warning: {without_controls(' '.join(str(message).split()))}", file=sys.stderr)

@@ -3,189 +3,233 @@
 from __future__ import annotations
 
 import json
+import math
 import os
-from collections.abc import Sequence as Arguments
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Any
 
 import tyro
+from rich.table import Table
 
-from gnio_jax.commands import console, data_export, data_import
-from gnio_jax.commands.options import Command, Group, execute, sibling
+from gnio_jax.commands import console, options
 from gnio_jax.errors import InputError
 from gnio_jax.files import write_text
-
-OVERVIEW = """The datasets: what there is, whether it is sound, and how it comes into one form.
-
-{prog} COMMAND --help explains each command with examples."""
-
-LIST = """Every dataset that is read: splits, rate, licence, where it is had, what is found here.
-
-  {prog}
-  GNIO_DATA=~/recordings {prog}
-
-Looked for in $GNIO_DATA/<name>, else in data/<name>. Only lists are read."""
-
-CHECK = """Do IMU and reference of each recording describe the same motion? A table and the reasons.
-
-  {prog} oxiod                                        (in $GNIO_DATA/oxiod, else data/oxiod)
-  {prog} ~/tlio --dataset tlio --split test
-  {prog} ~/my_recordings --dataset csv --plots pictures --json figures.json
-
-The physical self-check: the mean of R·accel must be gravity, the gyro must turn as the reference
-does, nobody walks faster than 3 m/s, and the positions must accelerate as the accelerometer says.
-Every loader leaves out a recording that fails; here it is shown with its figures and the reason."""
-
-CONVERT = """Any dataset as the package's HDF5, with its splits: one file a recording, at one rate.
-
-  {prog} oxiod ~/oxiod ~/converted/oxiod
-  {prog} tlio ~/tlio ~/converted/tlio_100 --rate 100 --workers 8
-  gnio train --dataset csv --data-root ~/converted/oxiod
-
-What fails the self-check is left out. Stop it when you like: the same command goes on where it was.
-ROOT - stands for the usual place, $GNIO_DATA/<name>, else data/<name>."""
 
 
 @dataclass(frozen=True)
 class ListOptions:
-    """What `gnio data list` is asked for."""
+    """What `gnio data list` is asked for: nothing."""
 
 
 @dataclass(frozen=True)
 class CheckOptions:
     """What `gnio data check` is asked for."""
 
-    dataset_or_root: tyro.conf.Positional[Annotated[str, tyro.conf.arg(metavar="DATASET_OR_ROOT")]]
-    """Name of a dataset, which is then looked for in the usual place; or its folder."""
-    dataset: str | None = None
-    """Dataset whose layout the folder has; by default the one that finds its recordings there."""
+    name: tyro.conf.Positional[str]
+    """Name of the dataset, csv for recordings of your own."""
+    data_root: str | None = None
+    """Folder of the dataset; by default $GNIO_DATA/NAME, then data/NAME."""
     split: str = "all"
     """A split, or all of them."""
     plots: Path | None = None
     """Folder for a picture of each recording: trajectory, speed, |accel|, gyro against reference,
-    where it is not valid."""
+    and where it is not valid."""
     json: Path | None = None
     """File for the figures."""
-    markdown: Path | None = None
-    """File for the table as Markdown."""
-    workers: int | None = None
-    """Processes; by default as many as there are cores, and one for a few recordings."""
 
 
 @dataclass(frozen=True)
 class ConvertOptions:
     """What `gnio data convert` is asked for."""
 
-    dataset: tyro.conf.Positional[Annotated[str, tyro.conf.arg(metavar="DATASET")]]
+    name: tyro.conf.Positional[str]
     """Name of the dataset."""
-    root: tyro.conf.Positional[Annotated[str, tyro.conf.arg(metavar="ROOT")]]
-    """Its folder; - for the usual place."""
-    out: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="OUT")]]
+    out: tyro.conf.Positional[Path]
     """Folder for the result."""
+    data_root: str | None = None
+    """Folder of the dataset; by default $GNIO_DATA/NAME, then data/NAME."""
     split: str = "all"
     """A split, or all of them."""
     rate: float | None = None
     """Rate of the result, Hz; by default each recording's own."""
-    workers: int | None = None
-    """Processes; by default as many as there are cores, and one for a few recordings."""
 
 
-def show_list(_options: ListOptions, _prog: str) -> None:
-    """Two tables: what there is and what of it is here, and where it is had."""
-    from gnio_jax.commands import data_tables
+def show_list(asked: ListOptions, _call: options.Call) -> None:
+    """Every dataset that is read: rate, splits, licence, where it is had, what is found here.
 
+    A dataset is looked for in $GNIO_DATA/NAME, then in data/NAME. Its recordings are not read.
+
+    examples:
+      {prog}
+      GNIO_DATA=~/recordings {prog}
+    """
+    from gnio_jax.data import registry  # late: mistakes do not wait for JAX
+
+    here = Table(title="Datasets", title_justify="left", show_lines=True)
+    for column in ("dataset", "Hz", "splits", "licence", "found here"):
+        here.add_column(column, overflow="fold", justify="right" if column == "Hz" else "left")
+    title = "Where they are had, and the layout that is expected"
+    sources = Table(title=title, title_justify="left", show_lines=True)
+    for column in ("dataset", "where", "layout"):
+        sources.add_column(column, overflow="fold")
+    for name in registry.names():
+        dataset = registry.get(name)
+        splits = ", ".join(dataset.splits)
+        here.add_row(name, f"{dataset.rate:g}", splits, dataset.licence, _found_here(dataset))
+        sources.add_row(name, dataset.source, dataset.layout if dataset.needs_root else "–")
     output = console.stdout()
-    for table in data_tables.datasets():
-        output.print(table)
+    output.print(here)
+    output.print(sources)
     bases = [os.environ["GNIO_DATA"]] if os.environ.get("GNIO_DATA") else []
-    places = " and ".join([*bases, "data"])
     other = "another place is named by --data-root, or GNIO_DATA for all of them"
-    output.print(f"looked in {places}; {other}")
+    output.print(f"looked in {' and '.join([*bases, 'data'])}; {other}")
 
 
-def check(options: CheckOptions, _prog: str) -> None:
-    """The table, the reasons and notes, and on request pictures, JSON and Markdown."""
-    from gnio_jax.commands import data_tables
-    from gnio_jax.data import checking
+def _found_here(dataset: Any) -> str:
+    """Of a `Dataset`: its folder and the recordings of each split."""
+    from gnio_jax.data import registry
+    from gnio_jax.data.reading import find_recordings
 
-    _refuse_check_options(options)
-    dataset, root = checking.resolve(options.dataset_or_root, options.dataset)
+    try:
+        root = registry.find_root(dataset.name) if dataset.needs_root else Path(".")
+    except InputError:
+        return "not found"
+    place = f"{root}: " if dataset.needs_root else "computed: "
+    try:
+        found, splits, _ = find_recordings(dataset, root, "all")
+    except InputError as error:
+        return f"{place}no recording ({error})"
+    counts = ", ".join(f"{split} {len(names)}" for split, names in splits.items())
+    return f"{place}{len(found)} recordings ({counts})"
+
+
+def check(asked: CheckOptions, _call: options.Call) -> None:
+    """Do IMU and reference of each recording describe one motion?
+
+    The mean of R·accel must be gravity, the gyro must turn as the reference does, nobody walks
+    faster than 3 m/s, and the positions must accelerate as the accelerometer says. Every loader
+    leaves out a recording that fails; here it is shown with its figures and the reason.
+
+    examples:
+      {prog} oxiod                                        in $GNIO_DATA/oxiod, else data/oxiod
+      {prog} tlio --data-root ~/tlio --split test
+      {prog} csv --data-root ~/walks --plots pictures --json figures.json
+    """
+    if asked.json is not None and asked.json.is_dir():
+        raise InputError("--json", f"{asked.json} is a folder", "name a file")
+    if asked.plots is not None and asked.plots.exists() and not asked.plots.is_dir():
+        raise InputError("--plots", f"{asked.plots} is a file", "name a folder")
+    from gnio_jax.data import checking  # late: mistakes do not wait for JAX
+
+    dataset, root = _find(asked.name, asked.data_root)
     with console.terminal() as terminal:
         checked = checking.check(
             dataset,
             root,
-            options.split,
-            options.plots,
-            options.workers,
+            asked.split,
+            asked.plots,
+            None,
             lambda share: terminal.progress("checking", share),
         )
     place = f" at {root}" if dataset.needs_root else ""
-    title = f"{dataset.name}{place}, split {options.split}"
+    title = f"{dataset.name}{place}, split {asked.split}"
     output = console.stdout()
-    output.print(data_tables.check_table(checked.sequences, title))
+    table = Table(title=title, title_justify="left")
+    for column in _FIGURES:
+        text = column in ("sequence", "split", "")
+        width = 14 if column == "sequence" else None
+        table.add_column(
+            column,
+            overflow="fold",
+            justify="left" if text else "right",
+            no_wrap=not text,
+            min_width=width,
+        )
+    for row in checked.sequences:
+        table.add_row(*_figures(row), style="red" if row.reason else None)
+    output.print(table)
     _print_reasons({row.name: row.reason for row in checked.sequences if row.reason}, checked.notes)
     used, count = checked.used(), len(checked.sequences)
     hours = sum(row.check.duration for row in used if row.check) / 3600
     output.print(f"{len(used)} of {count} sequences are used, {hours:.2f} h")
-    if options.json:
+    if asked.json:
         found = {
             "dataset": dataset.name,
             "root": str(root) if dataset.needs_root else None,
-            "split": options.split,
+            "split": asked.split,
             "sequences": checking.figures(checked),
             "notes": checked.notes,
         }
-        write_text(options.json, json.dumps(found, indent=2, ensure_ascii=False) + "\n")
-    if options.markdown:
-        write_text(options.markdown, data_tables.check_markdown(checked.sequences))
-    if options.plots:
-        output.print(f"pictures: {options.plots}", soft_wrap=True)
+        write_text(asked.json, json.dumps(found, indent=2, ensure_ascii=False) + "\n")
+    if asked.plots:
+        output.print(f"pictures: {asked.plots}", soft_wrap=True)
     if not used:
         raise InputError(root, f"none of {count} sequences can be used", "see the reasons above")
 
 
-def _refuse_check_options(options: CheckOptions) -> None:
-    _refuse_workers(options.workers)
-    for option, path in (("--json", options.json), ("--markdown", options.markdown)):
-        if path is not None and path.is_dir():
-            raise InputError(option, f"{path} is a folder", "name a file")
-    if options.plots is not None and options.plots.exists() and not options.plots.is_dir():
-        raise InputError("--plots", f"{options.plots} is a file", "name a folder")
+_FIGURES = (
+    "sequence",
+    "split",
+    "s",
+    "Hz",
+    "mean of R·accel\nm/s²",
+    "gyro\n°/10 s",
+    "speed\nm/s",
+    "accel\ncorr.",
+    "valid",
+    "",
+)
 
 
-def _refuse_workers(workers: int | None) -> None:
-    if workers is not None and workers < 1:
-        raise InputError("--workers", f"must be at least 1, found {workers}")
+def _figures(row: Any) -> list[str]:
+    """The cells of a `CheckedSequence`."""
+    found = row.check
+    if found is None:
+        return [row.name, row.split, *["–"] * 7, "left out"]
+    numbers = (
+        found.gyro_consistency_degrees,
+        found.median_speed,
+        found.accel_correlation_horizontal,
+    )
+    gravity = [round(value, 2) + 0.0 for value in found.gravity_mean]  # no −0.00
+    return [
+        row.name,
+        row.split,
+        f"{found.duration:.1f}",
+        f"{found.rate:.1f}",
+        "–" if any(map(math.isnan, gravity)) else " ".join(f"{value:.2f}" for value in gravity),
+        *("–" if math.isnan(number) else f"{number:.2f}" for number in numbers),
+        f"{found.share_valid:.1%}",
+        "left out" if row.reason else "used",
+    ]
 
 
-def _print_reasons(left_out: dict[str, str], notes: list[str]) -> None:
-    output = console.stdout()
-    for name, reason in left_out.items():
-        output.print(f"left out: {name}: {reason}", soft_wrap=True)
-    for note in dict.fromkeys(notes):
-        output.print(f"note: {note}", soft_wrap=True)
+def convert(asked: ConvertOptions, _call: options.Call) -> None:
+    """A dataset as the package's HDF5: a file for each recording, a list for each split.
 
+    What fails the self-check is left out. A conversion that was stopped goes on with the same
+    command.
 
-def convert(options: ConvertOptions, prog: str) -> None:
-    """Write what is not there yet, then the lists."""
-    from gnio_jax.data import conversion, registry
-
-    _refuse_workers(options.workers)
-    if options.rate is not None and not 1.0 <= options.rate <= 10000.0:
-        problem = f"{options.rate:g} Hz is no rate to resample to"
+    examples:
+      {prog} oxiod ~/converted/oxiod
+      {prog} tlio ~/converted/tlio_100 --data-root ~/tlio --rate 100
+      gnio train --dataset csv --data-root ~/converted/oxiod
+    """
+    if asked.rate is not None and not 1.0 <= asked.rate <= 10000.0:
+        problem = f"{asked.rate:g} Hz is no rate to resample to"
         raise InputError("--rate", problem, "give 1 to 10000 Hz")
-    dataset, root = registry.get(options.dataset), Path(".")
-    if dataset.needs_root:
-        root = registry.find_root(dataset.name, None if options.root == "-" else options.root)
+    from gnio_jax.data import conversion  # late: mistakes do not wait for JAX
+
+    dataset, root = _find(asked.name, asked.data_root)
     with console.terminal() as terminal:
         result = conversion.convert(
             dataset,
             root,
-            options.out,
-            options.split,
-            options.rate,
-            options.workers,
+            asked.out,
+            asked.split,
+            asked.rate,
+            None,
             lambda share: terminal.progress("converting", share),
         )
     done = result.recordings.values()
@@ -200,26 +244,24 @@ def convert(options: ConvertOptions, prog: str) -> None:
     again = sum(len(one.kept) for one in done if one.there_already)
     there = f"; {again} of them were there already" if again else ""
     output = console.stdout()
-    summary = f"{options.out}: {kept} sequences, {hours:.2f} h ({counts}){there}"
+    summary = f"{asked.out}: {kept} sequences, {hours:.2f} h ({counts}){there}"
     output.print(summary, soft_wrap=True)
-    following = f"{prog.rpartition(' ')[0]} check {options.out} --dataset csv"
-    if {"train", "val"} <= result.splits.keys():
-        following = f"{sibling(prog, 'train')} --dataset csv --data-root {options.out}"
-    output.print(f"next: {following}", soft_wrap=True)
+    learnable = {"train", "val"} <= result.splits.keys()
+    following = "gnio train --dataset csv" if learnable else "gnio data check csv"
+    output.print(f"next: {following} --data-root {asked.out}", soft_wrap=True)
 
 
-COMMANDS = Group(
-    {
-        "list": Command(ListOptions, show_list, LIST),
-        "check": Command(CheckOptions, check, CHECK),
-        "convert": Command(ConvertOptions, convert, CONVERT),
-        "import": data_import.COMMAND,
-        "export": data_export.COMMAND,
-    },
-    OVERVIEW,
-)
+def _find(name: str, data_root: str | None) -> tuple[Any, Path]:
+    """A dataset and its folder."""
+    from gnio_jax.data import registry
+
+    dataset = registry.get(name)
+    return dataset, registry.find_root(name, data_root) if dataset.needs_root else Path(".")
 
 
-def main(argv: Arguments[str] | None = None, prog: str = "python -m gnio_jax.data") -> None:
-    """Run one of the commands."""
-    execute(COMMANDS, argv, prog)
+def _print_reasons(left_out: dict[str, str], notes: list[str]) -> None:
+    output = console.stdout()
+    for name, reason in left_out.items():
+        output.print(f"left out: {name}: {reason}", soft_wrap=True)
+    for note in dict.fromkeys(notes):
+        output.print(f"note: {note}", soft_wrap=True)

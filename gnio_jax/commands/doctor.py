@@ -2,90 +2,118 @@
 
 from __future__ import annotations
 
+import contextlib
+import importlib.metadata
 import json as json_format
+import platform
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
 
 import tyro
+from rich.table import Table
 
-from gnio_jax.commands import console
-from gnio_jax.commands.options import Command
+from gnio_jax.commands import console, options
+from gnio_jax.errors import InputError
 
-DESCRIPTION = """What is installed here and what is found: packages, devices, datasets, weights.
-
-  {prog}
-  {prog} --data-root ~/recordings
-  {prog} --json
-
-Missing things are remarks, not errors: it leaves with status 0. The last lines say what you may
-want to change. Show its output where you ask for help."""
-MOST = 6
-"""Names in a line; of more, their number is told."""
+PACKAGES = ("jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "numpy", "scipy", "h5py")
 
 
 @dataclass(frozen=True)
 class DoctorOptions:
     """What `gnio doctor` is asked for."""
 
-    data_root: str | None = None
-    """Folder whose folders are datasets; by default $GNIO_DATA, then data."""
     json: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Print all of it as JSON."""
+    """Print it as JSON."""
 
 
-def doctor(options: DoctorOptions, _prog: str) -> None:
-    """Look, and say what is there."""
-    from gnio_jax.commands import installation
+def doctor(asked: DoctorOptions, _call: options.Call) -> None:
+    """What is installed here and what is found: packages, devices, datasets, weights, caches.
 
-    found = installation.find(options.data_root)
-    if options.json:
-        print(json_format.dumps(found._asdict(), indent=2, ensure_ascii=False))
+    What is missing is no error. Show the output where you ask for help. A dataset is looked for in
+    $GNIO_DATA/NAME, then in data/NAME.
+
+    examples:
+      {prog}
+      GNIO_DATA=~/recordings {prog}
+      {prog} --json
+    """
+    found = {
+        "gnio_jax": f"{_version('gnio-jax')} in {Path(__file__).parents[1]}",
+        "python": f"{platform.python_version()} on {platform.system()} {platform.machine()}",
+        "packages": ", ".join(map(_version, PACKAGES)),
+        **_devices(),
+        **_datasets(),
+        **_weights(),
+        **_caches(),
+    }
+    if asked.json:
+        print(json_format.dumps(found, indent=2, ensure_ascii=False))
         return
-    output = console.stdout()
-    output.print(f"gnio-jax {found.version}, Python {found.python}", soft_wrap=True)
-    output.print(_grid(found))
-    for remark in found.remarks:
-        output.print(f"remark: {remark}", soft_wrap=True)
-
-
-def _grid(found: Any) -> Any:
-    """Two columns: what, and how it is."""
-    from rich.table import Table
-
     grid = Table.grid(padding=(0, 2))
     grid.add_column(no_wrap=True)
     grid.add_column(overflow="fold")
-    for name, text in _lines(found):
+    for name, text in found.items():
         grid.add_row(name, text)
-    return grid
+    console.stdout().print(grid)
 
 
-def _lines(found: Any) -> list[tuple[str, str]]:
-    versions = [f"{name} {version or 'missing'}" for name, version in found.packages.items()]
-    kinds = dict.fromkeys(found.devices["kinds"])
-    counts = [f"{found.devices['kinds'].count(kind)} × {kind}" for kind in kinds]
-    works = "float64 works" if found.devices["float64"] else "float64 does not work"
-    weights = found.weights["packages"]
-    return [
-        ("packages", ", ".join(versions)),
-        *((f"extra {name}", _extra(name, lacks)) for name, lacks in found.extras.items()),
-        ("devices", f"{', '.join(counts)}; {works}" if counts else "none"),
-        *((f"dataset {name}", place) for name, place in found.datasets.items()),
-        ("looked in", f"{', '.join(found.looked_in)} (gnio data list shows every dataset)"),
-        ("weights", _names(list(weights)) if weights else "no packages"),
-        ("newest run", found.weights["newest_run"] or "none below runs/"),
-        *((f"cache of {name}", place) for name, place in found.caches.items()),
-    ]
+def _version(name: str) -> str:
+    try:
+        return f"{name} {importlib.metadata.version(name)}"
+    except importlib.metadata.PackageNotFoundError:
+        return f"{name} is not installed"
 
 
-def _extra(name: str, lacks: list[str]) -> str:
-    missing = f"lacks {', '.join(lacks)}: pip install 'gnio-jax[{name}]'"
-    return missing if lacks else "complete"
+def _devices() -> dict[str, str]:
+    import jax
+    import jax.numpy as jnp
+
+    jax.config.update("jax_enable_x64", True)  # as every command that filters
+    try:
+        kinds = [f"{device.platform} {device.device_kind}" for device in jax.devices()]
+        third = float(jnp.asarray(1.0, jnp.float64) / 3.0)
+    except RuntimeError as error:  # a platform that was asked for and is not there
+        return {"devices": f"none: {error}"}
+    counted = ", ".join(f"{kinds.count(kind)} × {kind}" for kind in dict.fromkeys(kinds))
+    found = {"devices": counted, "float64": "works" if third == 1 / 3 else "does not work"}
+    if jax.default_backend() == "cpu" and Path("/proc/driver/nvidia").exists():
+        found["gpu"] = "there is a driver, but JAX sees no GPU: pip install 'jax[cuda13]'"
+    return found
 
 
-def _names(names: list[str]) -> str:
-    more = f" and {len(names) - MOST} more (gnio weights)" if len(names) > MOST else ""
-    return ", ".join(names[:MOST]) + more
+def _datasets() -> dict[str, str]:
+    """Those whose folder is there."""
+    from gnio_jax.data import registry
+
+    found = {}
+    for name in registry.names():
+        with contextlib.suppress(InputError):
+            here = str(registry.find_root(name)) if registry.get(name).needs_root else "computed"
+            found[f"dataset {name}"] = here
+    return found
 
 
-COMMAND = Command(DoctorOptions, doctor, DESCRIPTION)
+def _weights() -> dict[str, str]:
+    from gnio_jax import config as configuration
+    from gnio_jax import pretrained
+
+    found = {}
+    for name, find in (("weights", pretrained.packages), ("newest run", configuration.newest_run)):
+        try:
+            place = find()
+            found[name] = ", ".join(place) if isinstance(place, dict) else str(place)
+        except InputError as error:
+            found[name] = f"none: {error}"
+    return found
+
+
+def _caches() -> dict[str, str]:
+    import jax
+
+    from gnio_jax.data import cache
+
+    compiled = jax.config.values["jax_compilation_cache_dir"]
+    return {
+        "compiled programs": compiled or "not kept: the cache's folder cannot be written",
+        "recordings read": str(cache.folder()),
+    }

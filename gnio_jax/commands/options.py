@@ -1,304 +1,328 @@
-"""Typed options and subcommands: tyro reads them from dataclasses, and each mistake is one line.
+"""Options of the commands: tyro reads them from dataclasses, and each mistake is one line.
 
-tyro shows a mistake as a box of several lines. Its parse-error hook hands out the mistake itself,
-which becomes an `InputError` here that names the option and the remedy. The hook is not a public
-part of tyro: where a version lacks it, tyro's own box is shown.
+tyro shows a mistake as a box of several lines, so names and values are checked before it sees them.
 """
 
 from __future__ import annotations
 
-import contextlib
+import ast
 import dataclasses
 import difflib
+import importlib
+import inspect
+import itertools
+import math
 import shlex
-import sys
+import shutil
+import textwrap
 import types
 import typing
 from collections.abc import Callable, Iterator, Sequence
+from functools import cache, partial
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple, TypeVar, Union
+from typing import Annotated, Any, NamedTuple, Union
 
 import tyro
+from tyro.constructors import (
+    ConstructorRegistry,
+    PrimitiveConstructorSpec,
+    PrimitiveTypeInfo,
+    StructConstructorSpec,
+    StructFieldSpec,
+    StructTypeInfo,
+    UnsupportedTypeAnnotationError,
+)
 
-from gnio_jax.commands import short_help
+from gnio_jax import config as configuration
 from gnio_jax.errors import InputError
 
-try:
-    from tyro._errors import on_parse_error
-except ImportError:
-    on_parse_error = None
-
-Options = TypeVar("Options")
-
-_SPELLING = {
-    float: "a number",
-    int: "a whole number",
-    str: "text",
-    type(None): "None",
-    Path: "a path",
-}
-
-
-class Command(NamedTuple):
-    """A program, or a subcommand of one: typed options in, one call."""
-
-    options: type
-    """Dataclass of the options; the comments of its fields are their help."""
-    run: Callable[[Any, str], None]
-    """Takes the options and the name by which the program was called."""
-    description: str
-    """Help: a first line that says what it does, then examples. `{prog}` is the program's name."""
-    defaults: Callable[[Any], Any] | None = None
-    """Reads the file that some of the options name: the defaults of all (None: the class's own)."""
-    common: tuple[str, ...] = ()
-    """Options that --help explains where they are too many for a screen; () for all of them."""
+HELP, HELP_VERBOSE = ("-h", "--help"), ("-H", "--help-verbose")
+COMPLETION = "--tyro-"
+"""What tyro's options for the completion of a shell begin with."""
+MANY = 24
+"""Options of which the help lists names and defaults alone; --help-verbose explains them."""
+WIDTH = 100
+"""Columns of a help text, where the terminal is not narrower."""
 
 
 class Group(NamedTuple):
-    """A program whose first word is a subcommand."""
+    """A program whose first word is the name of a command."""
 
-    commands: dict[str, Any]
-    """`Command` or `Group` by name."""
-    description: str
-
-
-def execute(program: Command | Group, argv: Sequence[str] | None = None, prog: str = "") -> None:
-    """Read the options from `argv` (default: the process's own arguments) and run the command.
-
-    Raises `InputError` as `parse`, and for a subcommand that is unknown or missing.
-    """
-    argv = list(sys.argv[1:] if argv is None else argv)
-    prog = prog or Path(sys.argv[0]).name
-    words = _subcommands(program, argv)
-    found: Any = program
-    for word in words:
-        found = found.commands[word]
-    argv = _show_short_help(found, argv, " ".join([prog, *words]))
-    known = option_names(found.options) if isinstance(found, Command) else list(found.commands)
-    with _one_line_errors(argv[len(words) :], known, isinstance(found, Group)):
-        options = _read(program, argv, prog, words)
-        start = found.defaults and found.defaults(options)
-        if start is not None:
-            options = _read(program, argv, prog, words, start)
-    found.run(options, " ".join([prog, *words]))
+    help: str
+    commands: dict[str, str | Group]
+    """Name -> "module:function" of this room. Only the module of a command that is called is
+    imported, so a mistake does not wait for the others."""
 
 
-def _show_short_help(program: Command | Group, argv: list[str], prog: str) -> list[str]:
-    """Print the help that fits a screen, where that is asked for, and leave; --help-all becomes
-    what tyro knows as --help."""
-    if isinstance(program, Command) and program.common:
-        if any(word in short_help.SHORT for word in argv):
-            description = program.description.format(prog=prog)
-            known = option_names(program.options)
-            text = short_help.short_help(program.options, description, prog, program.common, known)
-            if text is not None:
-                print(text)
-                raise SystemExit(0)
-    return ["--help" if word in short_help.WHOLE else word for word in argv]
+class Call(NamedTuple):
+    """How a command was called."""
+
+    prog: str
+    """`gnio train`, or `python train.py`."""
+    argv: Sequence[str]
+    """The words behind it."""
+
+    def __str__(self) -> str:
+        return shlex.join([*self.prog.split(), *self.argv])
 
 
-def parse(
-    kind: type[Options],
-    default: Options | None = None,
-    description: str = "",
-    argv: Sequence[str] | None = None,
-    prog: str | None = None,
-) -> Options:
-    """Read a value of the dataclass `kind` from `argv` (default: the process's own arguments).
-
-    Nested fields are dotted (`--optim.epochs 3`), words are joined by `-` or `_`, a flag's negation
-    is `--no-flag`; fields of type `tyro.conf.Positional[...]` are given without a name. Options
-    win over `default`, which wins over the class's own defaults. `--help` prints the options with
-    their meaning and leaves with status 0. Raises `InputError` for an option that does not exist
-    (naming the closest that does), lacks its value, has one of the wrong type, or is missing.
-    """
-    argv = list(sys.argv[1:] if argv is None else argv)
-    start = tyro.MISSING_NONPROP if default is None else default
-    with _one_line_errors(argv, option_names(kind), subcommands=False):
-        return tyro.cli(kind, default=start, description=description, args=argv, prog=prog)
+Command = Callable[[Any, Call], None]
+"""A function of `asked`, a dataclass of options, and of its call; its docstring is its help."""
 
 
-def _subcommands(program: Command | Group, argv: list[str]) -> list[str]:
-    """The words of `argv` that are subcommands, from the first one on."""
-    words = []
-    for word in argv:
-        if isinstance(program, Command) or word not in program.commands:
-            break
-        words.append(word)
-        program = program.commands[word]
-    return words
+class Option(NamedTuple):
+    """An option, or a word that is given without a name."""
+
+    name: str
+    """`--optim.epochs`; of a word what stands for it, `FILE`."""
+    hint: Any
+    """Type of its value; bool for a flag, which has none."""
+    words: int | None
+    """How many words make its value; None: all that follow."""
+    required: bool
 
 
-def _read(
-    program: Command | Group, argv: list[str], prog: str, words: list[str], default: Any = None
-) -> Any:
-    """The options of a program as tyro reads them."""
-    description = program.description.format(prog=prog)
-    if isinstance(program, Group):
-        kind = _union(program, prog, words, default)
-        return tyro.cli(kind, description=description, args=argv, prog=prog)
-    start = tyro.MISSING_NONPROP if default is None else default
-    return tyro.cli(program.options, default=start, description=description, args=argv, prog=prog)
+def run(program: Group | str | Command, call: Call) -> None:
+    """Find the command that the words name, read its options and run it. Raises `InputError` for a
+    command that is unknown or missing, and as `read`."""
+    while isinstance(program, Group):
+        word = call.argv[0] if call.argv else ""
+        if word in HELP:
+            print(program.help.format(prog=call.prog))
+            return
+        if word.startswith(COMPLETION):
+            tyro.cli(_union(program), args=call.argv, prog=call.prog, registry=REGISTRY)
+        if word not in program.commands:
+            close = difflib.get_close_matches(word, program.commands, n=1)
+            remedy = f"give one of {', '.join(program.commands)}; --help explains them"
+            remedy = f"did you mean '{close[0]}'?" if close else remedy
+            raise InputError("command", f"unknown '{word}'" if word else "is missing", remedy)
+        program, call = program.commands[word], Call(f"{call.prog} {word}", call.argv[1:])
+    command = function(program) if isinstance(program, str) else program
+    command(read(command, call), call)
 
 
-def _union(group: Group, prog: str, words: list[str], default: Any) -> Any:
-    """tyro's type of a group: a union of its subcommands' options.
-
-    The subcommand in `words` has its whole description and `default`, the others have their first
-    line, for the list in the group's own help.
-    """
+def _union(group: Group) -> Any:
+    """tyro's type of a group, for the completion of a shell: the options of every command."""
     members = []
     for name, command in group.commands.items():
-        chosen = words[:1] == [name]
-        description = command.description.format(prog=f"{prog} {name}")
-        description = description if chosen else description.partition("\n")[0]
         if isinstance(command, Group):
-            inner = _union(command, f"{prog} {name}", words[1:] if chosen else [], default)
-            settings = tyro.conf.subcommand(
-                name, description=description, constructor_factory=lambda inner=inner: inner
-            )
-            members.append(Annotated[Any, settings])
+            inner = tyro.conf.subcommand(name, constructor_factory=partial(_union, command))
+            members.append(Annotated[Any, inner])
         else:
-            start = default if chosen and default is not None else tyro.MISSING_NONPROP
-            settings = tyro.conf.subcommand(name, default=start, description=description)
-            members.append(Annotated[command.options, settings])
+            members.append(Annotated[options_type(function(command)), tyro.conf.subcommand(name)])
     return Union[tuple(members)]  # noqa: UP007
 
 
-def sibling(prog: str, command: str) -> str:
-    """How `train` or `evaluate` is called by a person who called `prog`."""
-    return f"gnio {command}" if prog.split()[0] == "gnio" else f"python {command}.py"
+def function(command: str) -> Command:
+    """The function of a command, "module:function"."""
+    module, _, name = command.partition(":")
+    return getattr(importlib.import_module(f"{__package__}.{module}"), name)
 
 
-def called(prog: str) -> str:
-    """How the process was called, as one could type it; `prog` is the command's name."""
-    words, given = prog.split(), sys.argv[1:]
-    own = words[1:] if words[0] == "gnio" else []
-    return shlex.join([*words, *(given[len(own) :] if given[: len(own)] == own else given)])
+def options_type(command: Command) -> type:
+    """The dataclass of the options that a command takes."""
+    return typing.get_type_hints(command, include_extras=True)["asked"]
 
 
-def option_names(kind: Any, prefix: str = "") -> list[str]:
-    """Every option of the dataclass `kind` as tyro spells it: ["--optim.batch-size", ...]."""
-    names = []
-    for name, hint in typing.get_type_hints(kind, include_extras=True).items():
-        if _is_positional(hint):
-            continue
-        word = name.replace("_", "-")
-        if dataclasses.is_dataclass(hint):
-            names += option_names(hint, f"{prefix}{word}.")
+def read(command: Command, call: Call, default: Any = None) -> Any:
+    """The options of a command from the words of its call.
+
+    Nested fields are dotted (`--optim.epochs 3`), words are joined by `-` or `_`, a flag's negation
+    is `--no-flag`; fields of type `tyro.conf.Positional[...]` are given without a name. Options win
+    over `default`, which wins over the class's own defaults. Raises `InputError` for an option that
+    does not exist (naming the closest that does), lacks its value, has one of the wrong type, or is
+    missing. `--help` shows the command's docstring as far as its line "examples:", then the options
+    with the comments of their fields, last the examples, and leaves with status 0; of many options
+    it lists names and defaults, and `--help-verbose` explains them.
+    """
+    kind = options_type(command)
+    brief = len(list(options_of(kind))) > MANY and not any(
+        word in HELP_VERBOSE for word in call.argv
+    )
+    ask = partial(
+        tyro.cli,
+        kind,
+        default=tyro.MISSING_NONPROP if default is None else default,
+        prog=call.prog,
+        description="",
+        registry=REGISTRY,
+        compact_help=brief,
+        config=(tyro.conf.PositionalMetavarFromFieldName,),
+    )
+    if not any(word in HELP + HELP_VERBOSE for word in call.argv):
+        check(kind, call.argv)
+        return ask(args=call.argv)
+    configs = ", ".join(configuration.names())
+    text = (inspect.getdoc(command) or "").format(prog=call.prog, configs=configs)
+    about, _, examples = text.partition("\nexamples:\n")
+    width = min(WIDTH, shutil.get_terminal_size().columns)
+    for paragraph in about.strip().split("\n\n"):
+        paragraph = " ".join(paragraph.split())
+        print(textwrap.fill(paragraph, width, break_on_hyphens=False), end="\n\n")
+    try:
+        return ask(args=["--help"])
+    finally:
+        more = f"{call.prog} -H explains the options.\n" if brief else ""
+        print(f"{more}\nexamples:\n{examples}")
+
+
+def check(kind: type, argv: Sequence[str]) -> None:
+    """Raise `InputError` for the first mistake in the words of a command line."""
+    known = {option.name: option for option in options_of(kind)}
+    places = [option for name, option in known.items() if not name.startswith("-")]
+    missing = [name for name, option in known.items() if option.required]
+    rest = list(argv)
+    while rest:
+        token = rest.pop(0)
+        if _is_value(token):
+            if not places:
+                remedy = "options are --name VALUE; --help lists them"
+                raise InputError(f"'{token}'", "is not an option", remedy)
+            option, words = places.pop(0), [token]
         else:
-            names.append(f"--{prefix}{word}")
-            if hint is bool:
-                names.append(f"--{prefix}no-{word}")
-    return names
+            name, equals, value = token.partition("=")
+            option, words = _find(name, known), [value] if equals else []
+        while rest and _is_value(rest[0]) and (option.words is None or len(words) < option.words):
+            words.append(rest.pop(0))
+        if option.hint is not bool:
+            configuration.value_from_words(option.hint, words, option.name)
+        elif words:
+            raise InputError(option.name, f"takes no value, found '{words[0]}'")
+        if option.name in missing:
+            missing.remove(option.name)
+    for name in missing:
+        given = f"give {name} {name[2:].upper()}" if name[0] == "-" else "give it as a word"
+        raise InputError(name, "is missing", f"{given}; --help explains it")
 
 
-def _is_positional(hint: Any) -> bool:
-    marker = typing.get_args(tyro.conf.Positional[str])[1]
-    return marker in typing.get_args(hint)[1:]
+def _find(name: str, known: dict[str, Option]) -> Option:
+    """The option of this name. `-` and `_` are the same."""
+    option = known.get(name.replace("_", "-"))
+    if option is None:
+        close = difflib.get_close_matches(name.replace("_", "-"), known, n=1, cutoff=0.5)
+        close += [each for each in known if each.endswith("." + name.lstrip("-"))]
+        remedy = f"did you mean {close[0]}?" if close else "--help lists the known ones"
+        raise InputError(name, "unknown option", remedy)
+    return option
 
 
-@contextlib.contextmanager
-def _one_line_errors(argv: list[str], known: list[str], subcommands: bool) -> Iterator[None]:
-    """Raise tyro's parse errors as `InputError`; `known` are the options, or the subcommands."""
-
-    def hook(event: Any) -> None:
-        error = _explain(event, argv, known, subcommands)
-        if error is not None:
-            raise error
-
-    with contextlib.nullcontext() if on_parse_error is None else on_parse_error(hook):
-        yield
+def _is_value(word: str) -> bool:
+    """Whether a word is no option: `-` and negative numbers are none."""
+    try:
+        return not word.startswith("-") or word == "-" or not math.isnan(float(word))
+    except ValueError:
+        return False
 
 
-def _explain(event: Any, argv: list[str], known: list[str], subcommands: bool) -> InputError | None:
-    """The `InputError` of a parse-error event; None for events of a kind that is not known here."""
-    if subcommands:
-        return _wrong_subcommand(argv, known)
-    for token in argv:
-        option = _spelling(token)
-        if option.startswith("--") and option not in known:
-            return _unknown_option(token, known)
-    match type(event).__name__:
-        case "UnrecognizedArgs":
-            return _unknown_option(event.tokens[0], known)
-        case "MissingArgs":
-            return _missing_option(event.missing_arguments[0].arg)
-        case "BadValue":
-            problem = f"needs a value, which must be {_spell(event.argument.field.type)}"
-            return InputError(_label(event.argument), problem)
-        case "InvalidChoice":
-            return _wrong_value(event.argument, event.value)
-        case "InstantiationFailure" if event.argument is not None:
-            return _wrong_value(event.argument, _value_given(event.argument, argv))
-        case "InstantiationFailure":
-            return InputError("command line", event.message)
-    return None
+def options_of(kind: type, prefix: str = "") -> Iterator[Option]:
+    """Every option of a dataclass as tyro spells it; a flag that can be negated is two of them."""
+    for field, hint, markers in _fields(kind):
+        word = field.name.replace("_", "-")
+        name, required = f"--{prefix}{word}", _default(field) is tyro.MISSING_NONPROP
+        if tyro.conf.Suppress in markers:
+            continue
+        if Path in (hint, *typing.get_args(hint)):
+            hint = str
+        if dataclasses.is_dataclass(hint):
+            inner = prefix if tyro.conf.OmitArgPrefixes in markers else f"{prefix}{word}."
+            yield from options_of(typing.cast(type, hint), inner)
+        elif tyro.conf.Positional in markers:
+            named = [each.metavar for each in markers if getattr(each, "metavar", None)]
+            yield Option(*named or [word.upper()], hint, _words(hint), required)
+        elif tyro.conf.UseAppendAction in markers:
+            yield Option(name, typing.get_args(hint)[0], 1, required)
+        else:
+            yield Option(name, hint, _words(hint), required)
+            if hint is bool and tyro.conf.FlagCreatePairsOff not in markers:
+                yield Option(f"--{prefix}no-{word}", hint, 0, required)
 
 
-def _wrong_subcommand(argv: list[str], known: list[str]) -> InputError:
-    given = next((word for word in argv if word not in known), None)
-    remedy = f"give one of {', '.join(known)}; --help explains them"
-    if given is None:
-        return InputError("command", "is missing", remedy)
-    close = difflib.get_close_matches(given, known, n=1)
-    hint = f"did you mean '{close[0]}'?" if close else remedy
-    return InputError("command", f"unknown '{given}'", hint)
+def _fields(kind: type) -> Iterator[tuple[dataclasses.Field, Any, tuple[Any, ...]]]:
+    """Each field of a dataclass, its type, and tyro's markers of it."""
+    hints = typing.get_type_hints(kind, include_extras=True)
+    for field in dataclasses.fields(kind):
+        hint, markers = hints[field.name], ()
+        if typing.get_origin(hint) is Annotated:
+            hint, *markers = typing.get_args(hint)
+        yield field, hint, tuple(markers)
 
 
-def _unknown_option(token: str, known: list[str]) -> InputError:
-    if not token.startswith("-"):
-        remedy = "options are --name VALUE; --help lists them"
-        return InputError(f"'{token}'", "is not an option", remedy)
-    option = _spelling(token)
-    close = difflib.get_close_matches(option, known, n=1, cutoff=0.5)
-    close = close or [name for name in known if name.endswith("." + option.lstrip("-"))]
-    remedy = f"did you mean {close[0]}?" if close else "--help lists the known ones"
-    return InputError(token.partition("=")[0], "unknown option", remedy)
+def _words(hint: Any) -> int | None:
+    """How many words make a value of this type."""
+    for member in (hint, *typing.get_args(hint)):
+        if typing.get_origin(member) is tuple:
+            items = typing.get_args(member)
+            return None if Ellipsis in items else len(items)
+    return 0 if hint is bool else 1
 
 
-def _missing_option(argument: Any) -> InputError:
-    label = _label(argument)
-    if argument.is_positional():
-        remedy = "give it as a word of its own; --help explains it"
-        return InputError(label, "is missing", remedy)
-    value = argument.field.intern_name.upper()
-    return InputError(label, "is missing", f"give {label} {value}; --help explains it")
+def _default(field: dataclasses.Field, values: Any = None) -> Any:
+    """The value of a field in `values`, or else its default."""
+    if dataclasses.is_dataclass(values):
+        return getattr(values, field.name)
+    if field.default_factory is not dataclasses.MISSING:
+        return field.default_factory()
+    return tyro.MISSING_NONPROP if field.default is dataclasses.MISSING else field.default
 
 
-def _wrong_value(argument: Any, value: str) -> InputError:
-    problem = f"must be {_spell(argument.field.type)}, found '{value}'"
-    return InputError(_label(argument), problem)
+REGISTRY = ConstructorRegistry()
+"""How tyro reads values and dataclasses: as it does itself, but for null and for the help."""
 
 
-def _label(argument: Any) -> str:
-    """What help calls an option: `--optim.epochs`, or the word in its place."""
-    return argument.lowered.metavar if argument.is_positional() else argument.display_name()
+@REGISTRY.struct_rule
+def _as_it_reads_well(found: StructTypeInfo) -> StructConstructorSpec | None:
+    """A comment is one paragraph, and defaults are shown that say something."""
+    if not dataclasses.is_dataclass(found.type) or found.type.__module__.startswith("tyro."):
+        return None
+    comments, shown = _comments(found.type), tyro.conf.arg(help_behavior_hint=_shown)
+    fields = [
+        StructFieldSpec(
+            field.name,
+            Annotated[hint, shown, *markers],  # type: ignore
+            _default(field, found.default),
+            comments.get(field.name, ""),
+        )
+        for field, hint, markers in _fields(found.type)
+    ]
+    return StructConstructorSpec(found.type, tuple(fields))
 
 
-def _value_given(argument: Any, argv: list[str]) -> str:
-    """The last value that was given for an option."""
-    value = ""
-    for token, following in zip(argv, [*argv[1:], ""], strict=True):
-        if _spelling(token) == argument.display_name():
-            value = token.partition("=")[2] if "=" in token else following
-    return value
+@REGISTRY.primitive_rule
+def _value_or_null(found: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
+    """A value that may be missing is null on the command line as in a file; the help shows the
+    type of the value alone."""
+    kinds = typing.get_args(found.type)
+    if found.type_origin not in (types.UnionType, typing.Union) or type(None) not in kinds:
+        return None
+    value = Union[tuple(kind for kind in kinds if kind is not type(None))]  # noqa: UP007
+    spec = ConstructorRegistry.get_primitive_spec(PrimitiveTypeInfo.make(value, found.markers))
+    if isinstance(spec, UnsupportedTypeAnnotationError):
+        return None
+    return dataclasses.replace(
+        spec,
+        instance_from_str=lambda words: (
+            spec.instance_from_str(words) if words != ["null"] else None
+        ),
+        is_instance=lambda value: value is None or spec.is_instance(value),
+        str_from_instance=lambda value: [] if value is None else spec.str_from_instance(value),
+        choices=None,  # or null would be none of them
+    )
 
 
-def _spelling(token: str) -> str:
-    """`--optim.batch_size=3` -> `--optim.batch-size`."""
-    return token.partition("=")[0].replace("_", "-")
+def _shown(default: str) -> str:
+    return {"None": "", "": "", "False": "", "True": "(on by default)"}.get(
+        default, f"(default: {default})"
+    )
 
 
-def _spell(hint: Any) -> str:
-    """A type in words."""
-    members = typing.get_args(hint)
-    if typing.get_origin(hint) is Annotated:
-        return _spell(members[0])
-    if typing.get_origin(hint) is Literal:
-        return "one of " + ", ".join(map(str, members))
-    if typing.get_origin(hint) is tuple:
-        return f"words out of {_spell(members[0]).removeprefix('one of ')}"
-    if isinstance(hint, types.UnionType) or typing.get_origin(hint) is Union:
-        return " or ".join(_spell(member) for member in members)
-    return _SPELLING.get(hint, str(hint))
+@cache
+def _comments(kind: type) -> dict[str, str]:
+    """The string below each field of a dataclass and of its bases."""
+    found = {}
+    for base in filter(dataclasses.is_dataclass, reversed(kind.__mro__)):
+        (definition,) = ast.parse(textwrap.dedent(inspect.getsource(base))).body
+        for field, after in itertools.pairwise(typing.cast(ast.ClassDef, definition).body):
+            if isinstance(field, ast.AnnAssign) and isinstance(after, ast.Expr):
+                found[ast.unparse(field.target)] = " ".join(ast.literal_eval(after.value).split())
+    return found

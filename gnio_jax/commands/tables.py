@@ -3,35 +3,33 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
 
-from gnio_jax.commands import console
-from gnio_jax.commands.options import Command, execute
+from gnio_jax.commands import console, options
 from gnio_jax.config import TablesConfig
 from gnio_jax.cores import usable_cores
 
-DESCRIPTION = """Make one of the paper's tables anew: train and evaluate its rows, side by side.
 
-  {prog} complexity                                  parameters, operations, latency
-  {prog} comparison --base quickstart                the networks side by side
-  {prog} components --base gnio_oxiod_small --data-root DIR --split sessions_test
-  {prog} gates --base ... [--epochs 3]               gate and scale functions, their gradients
-  {prog} bank-size --base ...                        size of the Motion Bank, entropy of attention
-  {prog} bank-spread --base ...                      how far apart its prototypes start
-  {prog} uncertainty --base ...                      what makes the uncertainty fit for the filter
-  {prog} trajectories --base ... [--sequences A,B]   all methods over the reference, one picture
-  {prog} standing --base ...                         errors at rest and in slow walking
+def tables(asked: TablesConfig, _call: options.Call) -> None:
+    """Make one of the paper's tables anew: train and evaluate its rows, side by side.
 
-Every row is trained with the same recordings, batches, epochs, learning rate and augmentation, each
-network with its own published loss, clipping and weight decay. Runs are kept below OUT/runs and
-shared by the tables: a command that was interrupted goes on where it stopped, one that is finished
-only writes its summary anew. Results: OUT/<table>_<split>_<estimator>.md, .csv and .png."""
+    Every row is trained with the same recordings, batches, epochs, learning rate and augmentation,
+    each network with its own published loss, clipping and weight decay. Runs are kept below
+    OUT/runs and shared by the tables: a command that was interrupted goes on where it stopped, one
+    that is finished only writes its summary anew. Results: OUT/<table>_<split>_<estimator>.md, .csv
+    and .png.
 
-
-def make(options: TablesConfig, _prog: str) -> None:
-    """Make the table and show it."""
-    # After the options: --help and mistakes do not wait for these imports.
-    import jax
+    examples:
+      {prog} complexity                              parameters, operations, latency
+      {prog} comparison --base quickstart            the networks side by side
+      {prog} components --base gnio_oxiod_small --data-root DIR --split sessions_test
+      {prog} gates --base ... --epochs 3             gate and scale functions, their gradients
+      {prog} bank-size --base ...                    size of the Motion Bank, entropy of attention
+      {prog} bank-spread --base ...                  how far apart its prototypes start
+      {prog} uncertainty --base ...                  what makes the uncertainty fit for the filter
+      {prog} trajectories --base ...                   all methods over the reference, one picture
+      {prog} standing --base ...                     errors at rest and in slow walking
+    """
+    import jax  # late: mistakes do not wait for it
 
     from gnio_jax import filtering
     from gnio_jax.tables import making, matrix
@@ -41,31 +39,8 @@ def make(options: TablesConfig, _prog: str) -> None:
     filtering.cores_as_devices()
     try:
         with console.terminal() as terminal:
-            text = making.make(options, terminal, usable_cores())
+            text = making.make(asked, terminal, usable_cores())
     except matrix.Interrupted as stopped:
         print("stopped and saved; the same command goes on from here", file=sys.stderr)
         sys.exit(128 + stopped.signum)
     console.stdout().print(text, soft_wrap=True)
-
-
-COMMON = (
-    "TABLE",
-    "--base",
-    "--data-root",
-    "--split",
-    "--estimator",
-    "--calibrate",
-    "--seeds",
-    "--epochs",
-    "--width",
-    "--methods",
-    "--sequences",
-    "--out",
-)
-
-COMMAND = Command(TablesConfig, make, DESCRIPTION, common=COMMON)
-
-
-def main(argv: Sequence[str] | None = None, prog: str = "python -m gnio_jax.tables") -> None:
-    """Read the options and make the table."""
-    execute(COMMAND, argv, prog)

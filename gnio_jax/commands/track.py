@@ -5,61 +5,63 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from gnio_jax.commands import console
-from gnio_jax.commands.options import Command, called
-from gnio_jax.commands.recording import RecordingOptions, read_any
+import tyro
+from rich import box
+from rich.table import Table
+
+from gnio_jax.commands import console, options
+from gnio_jax.commands.recordings import read_any
+from gnio_jax.config import ImportOptions
 from gnio_jax.files import file_stem
-
-DESCRIPTION = """The trajectory of a recording: where its carrier walked, and how far to trust it.
-
-  {prog} walk.zip                              (Sensor Logger, phyphox; weights found by themselves)
-  {prog} walk.bag --imu-topic /imu --weights runs/mine --out tracks/walk
-  {prog} walk.csv --accel-sign ios --format csv mcap
-  {prog} walk.zip --format gpx --first-fix 48.1375 11.5755 --heading 90
-
-It reads what gnio data import reads, and its HDF5. Stand still for a second at the beginning. In
-the folder OUT it leaves trajectory.txt (TUM format), track.png, report.html and summary.json. gnio
-weights lists the networks that are found by name."""
 
 
 @dataclass(frozen=True)
-class TrackOptions(RecordingOptions):
+class TrackOptions:
     """What `gnio track` is asked for."""
 
+    file: tyro.conf.Positional[Path]
+    """The recording: a file or folder; of two CSVs the gyro's."""
     weights: str | None = None
     """Name, package or run folder; by default the network that comes with gnio-jax, else the newest
     run below runs/."""
     out: Path | None = None
     """Folder for the results; by default tracks/ and the recording's name."""
-    format: tuple[Literal["kitti", "csv", "geojson", "gpx", "mcap"], ...] = ()
-    """Further formats of the trajectory."""
-    first_fix: tuple[float, ...] | None = None
-    """LAT LON [ALT] of the start, deg and m, for geojson and gpx."""
-    heading: float | None = None
-    """Direction of the track's x axis, deg clockwise from true north."""
+    format: Annotated[tuple[Literal["csv", "mcap"], ...], tyro.conf.arg(metavar="{csv,mcap}")] = ()
+    """Further formats of the trajectory, one or both."""
     rerun: Path | None = None
     """File to write for the viewer Rerun, NAME.rrd: paths, covariances, IMU, gate."""
+    recording: tyro.conf.OmitArgPrefixes[ImportOptions] = ImportOptions()  # noqa: RUF009 - it is frozen
 
 
-def track(options: TrackOptions, prog: str) -> None:
-    """Track, and show the figures and the limits."""
-    # After the options: --help and mistakes do not wait for these imports.
-    import jax
+def track(asked: TrackOptions, call: options.Call) -> None:
+    """The trajectory of a recording: where its carrier walked, and how far to trust it.
+
+    FILE is what gnio data import reads, or its HDF5. Stand still for a second at the beginning. The
+    folder OUT gets trajectory.txt (TUM format), track.png, report.html and summary.json. gnio
+    weights lists the networks that are found by name.
+
+    examples:
+      {prog} walk.zip                              of Sensor Logger or phyphox
+      {prog} walk.bag --imu-topic /imu --weights runs/mine --out tracks/walk
+      {prog} walk.csv --accel-sign ios --format csv mcap
+      {prog} robot.csv --columns time=stamp gyro_x=wx gyro_y=wy gyro_z=wz accel_x=ax accel_y=ay \\
+          accel_z=az
+    """
+    import jax  # late: mistakes do not wait for it
 
     from gnio_jax import tracking
-    from gnio_jax.evaluation.exporting.geographic import first_fix
 
     jax.config.update("jax_enable_x64", True)  # for the filter; the network states its float32
-    fix = None if options.first_fix is None else first_fix(options.first_fix, options.heading)
-    recording = read_any(options)
-    weights = tracking.choose_weights(options.weights)
-    out = options.out or Path("tracks") / _folder_name(recording.sequence.name)
+    recording = read_any(asked.file, asked.recording)
+    weights = tracking.choose_weights(asked.weights)
+    out = asked.out or Path("tracks") / _folder_name(recording.sequence.name)
     with console.terminal() as terminal:
         terminal.progress("compiling and tracking", 0.0)
-        call = (recording, weights, out, options.format, fix)
-        found = tracking.track(*call, command=called(prog), rerun=options.rerun)
+        found = tracking.track(
+            recording, weights, out, asked.format, command=str(call), rerun=asked.rerun
+        )
     output = console.stdout()
     for note in found.summary.notes:
         output.print(f"  {note}", soft_wrap=True)
@@ -76,11 +78,8 @@ def _folder_name(name: str) -> str:
     return name if plain else file_stem(name)
 
 
-def _table(summary: Any) -> Any:
+def _table(summary: Any) -> Table:
     """Two columns: figure and value."""
-    from rich import box
-    from rich.table import Table
-
     from gnio_jax.evaluation.table import COLUMNS
     from gnio_jax.tracking.summary import ERRORS
 
@@ -99,22 +98,3 @@ def _table(summary: Any) -> Any:
         text = "–" if value is None or not math.isfinite(value) else f"{value:.{column.digits}f}"
         grid.add_row(f"{column.heading} (against the reference)", f"{text} {column.unit}".strip())
     return grid
-
-
-COMMON = (
-    "FILE",
-    "--weights",
-    "--out",
-    "--format",
-    "--first-fix",
-    "--heading",
-    "--rerun",
-    "--accel-path",
-    "--gyro-unit",
-    "--accel-unit",
-    "--accel-sign",
-    "--imu-topic",
-    "--reference-topic",
-)
-
-COMMAND = Command(TrackOptions, track, DESCRIPTION, common=COMMON)

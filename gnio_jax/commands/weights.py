@@ -1,4 +1,4 @@
-"""`gnio weights`: the packages of trained networks that are found by name."""
+"""`gnio weights`, `gnio publish`, `gnio export`: trained networks that are passed on."""
 
 from __future__ import annotations
 
@@ -7,54 +7,81 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
+from rich import box
+from rich.table import Table
 
-from gnio_jax.commands import console
-from gnio_jax.commands.options import Command, sibling
+from gnio_jax.commands import console, options
 from gnio_jax.errors import InputError
-
-DESCRIPTION = """Packages of trained networks: name, size, trained on, key metric.
-
-  {prog}                                     a list of what is found
-  {prog} pedestrian                          its model card
-  {prog} pedestrian --out runs/pedestrian    a run of it
-  GNIO_WEIGHTS=~/packages {prog}
-
-Looked for in the installed gnio-jax and in the folders of $GNIO_WEIGHTS. gnio publish makes them,
-gnio track --weights NAME uses them. A run of a package is for gnio evaluate, gnio calibrate and
-gnio export."""
 
 
 @dataclass(frozen=True)
 class WeightsOptions:
     """What `gnio weights` is asked for."""
 
-    package: tyro.conf.Positional[Annotated[str | None, tyro.conf.arg(metavar="NAME")]] = None
+    name: tyro.conf.Positional[str | None] = None
     """Name, folder or zip of a package; by default all are listed."""
     out: Path | None = None
     """Folder for a run of the package; by default its model card is shown."""
 
 
-def weights(options: WeightsOptions, prog: str) -> None:
-    """List the packages, show the card of one, or make a run of it."""
-    from gnio_jax import pretrained
+@dataclass(frozen=True)
+class PublishOptions:
+    """What `gnio publish` is asked for."""
 
-    if options.package is None and options.out is not None:
-        raise InputError(f"--out {options.out}", "is for one package", "name it before --out")
-    if options.package is None:
-        _list()
-    elif options.out is None:
-        print(pretrained.card_of(options.package).rstrip())
+    run: tyro.conf.Positional[Path]
+    """Folder of the run; its best checkpoint is taken."""
+    out: Path
+    """Folder to write, or NAME.zip."""
+    data: str
+    """What it was trained on: recordings, devices, people, carrying positions."""
+    license: str
+    """Under which the data may be used and the weights passed on."""
+    fails: Annotated[tuple[str, ...], tyro.conf.arg(metavar="TEXT ...")] = ()
+    """Where it is known to fail, a sentence each."""
+    name: str | None = None
+    """Name of the package; by default that of OUT."""
+
+
+@dataclass(frozen=True)
+class ExportOptions:
+    """What `gnio export` is asked for."""
+
+    run: tyro.conf.Positional[str]
+    """Folder of the run, a package or its name."""
+    out: Path | None = None
+    """Folder to write; by default exports/NAME_onnx, with the name of RUN."""
+
+
+def weights(asked: WeightsOptions, _call: options.Call) -> None:
+    """The trained networks that are found here: name, size, trained on, key metric.
+
+    Packages are looked for in the installed gnio-jax and in the folders of $GNIO_WEIGHTS. gnio
+    track --weights NAME uses one; gnio publish makes one of a run. With --out a package becomes a
+    run, which gnio evaluate, gnio calibrate and gnio train --init-from take.
+
+    examples:
+      {prog}                                     a list of what is found
+      {prog} pedestrian                          its model card
+      {prog} pedestrian --out runs/pedestrian    a run of it
+      GNIO_WEIGHTS=~/packages {prog}
+    """
+    if asked.name is None and asked.out is not None:
+        raise InputError(f"--out {asked.out}", "is for one package", "name it before --out")
+    from gnio_jax import pretrained  # late: mistakes do not wait for JAX
+
+    output = console.stdout()
+    if asked.name is None:
+        _list_packages()
+    elif asked.out is None:
+        output.print(pretrained.card_of(asked.name).rstrip(), soft_wrap=True)
     else:
-        pretrained.write_run(options.package, options.out)
-        following = f"{sibling(prog, 'evaluate')} --workdir {options.out} --dataset ..."
-        print(f"run: {options.out}; next: {following}")
+        pretrained.write_run(asked.name, asked.out)
+        following = f"gnio evaluate --workdir {asked.out} --dataset ..."
+        output.print(f"run: {asked.out}; next: {following}", soft_wrap=True)
 
 
-def _list() -> None:
+def _list_packages() -> None:
     """A line per package; one that is damaged has its fault in its line."""
-    from rich import box
-    from rich.table import Table
-
     from gnio_jax import pretrained
 
     found = pretrained.packages()
@@ -86,4 +113,64 @@ def _metric(metric: Any) -> str:
     return f"ATE 2-D {metric.value:.2f} m{interval}, {metric.of}"
 
 
-COMMAND = Command(WeightsOptions, weights, DESCRIPTION)
+def publish(asked: PublishOptions, _call: options.Call) -> None:
+    """A package of a run: weights, configuration, model card, checksums.
+
+    It holds no data, and no code that is run when it is loaded. The figures of the run's
+    evaluations go with it, so evaluate before you publish.
+
+    examples:
+      {prog} runs/mine --out packages/mine --data "12 h of walks by 9 people, phone in hand" \\
+          --license "CC BY 4.0"
+      {prog} runs/mine --out mine.zip --data "..." --license "..." --fails "Running." "In a car."
+      gnio track walk.zip --weights mine.zip
+    """
+    from gnio_jax import pretrained  # late: mistakes do not wait for JAX
+
+    name = asked.name or asked.out.name.removesuffix(".zip")
+    said = pretrained.Description(name, asked.data, asked.license, asked.fails)
+    about = pretrained.publish(asked.run, asked.out, said)
+    output = console.stdout()
+    size = f"{about.bytes / 1e6:.2f} MB"
+    output.print(f"{asked.out}: {about.name}, network {about.network}, {size}", soft_wrap=True)
+    if about.metric is None:
+        line = "the run holds no evaluation, so the card has no figures: gnio evaluate"
+        output.print(f"warning: {line} --workdir {asked.run}", soft_wrap=True)
+    output.print(f"next: gnio track RECORDING --weights {asked.out}", soft_wrap=True)
+
+
+def export(asked: ExportOptions, _call: options.Call) -> None:
+    """A run as ONNX models, for programs without Python: network, start, window, filter step.
+
+    The filter is that of gnio track. The models are then driven over a minute of a simulated walk,
+    and their deviation from the package is printed. export.json says what each file takes and
+    gives; docs/deployment.md and examples/onnx show the loop around them. It needs pip install
+    'gnio-jax[onnx]'.
+
+    examples:
+      {prog} runs/mine
+      {prog} pedestrian --out exports/pedestrian
+    """
+    import jax  # late: mistakes do not wait for it
+
+    from gnio_jax import deployment
+
+    jax.config.update("jax_enable_x64", True)  # for the filter; the network states its float32
+    name = Path(asked.run).name.removesuffix(".zip")
+    out = asked.out or Path("exports") / f"{name}_onnx"
+    with console.terminal() as terminal:
+        terminal.progress("exporting and measuring", 0.0)
+        found = deployment.export_run(asked.run, out, "onnx")
+    output = console.stdout()
+    for file, size in found.bytes.items():
+        output.print(f"  {out / file}  {size / 1e6:.2f} MB", soft_wrap=True)
+    deviation = found.deviation
+    for line in (
+        "against gnio-jax, over a simulated walk:",
+        f"  displacement of a window  rms {deviation.displacement_rms:.2g} m, "
+        f"largest {deviation.displacement_largest:.2g} m",
+        f"  position                  largest {deviation.position_largest:.2g} m",
+        f"  ATE                       {deviation.ate:.3f} m "
+        f"(gnio-jax {deviation.ate_of_package:.3f} m)",
+    ):
+        output.print(f"  {line}", soft_wrap=True)

@@ -22,7 +22,13 @@ from gnio_jax.config.files import (
     value_from_words,
     with_seeds,
 )
-from gnio_jax.config.requests import CalibrateConfig, CompareConfig, EvaluateConfig, TablesConfig
+from gnio_jax.config.requests import (
+    CalibrateConfig,
+    CompareConfig,
+    EvaluateConfig,
+    ImportOptions,
+    TablesConfig,
+)
 from gnio_jax.config.schema import (
     AugmentConfig,
     ConsideredStd,
@@ -47,6 +53,7 @@ __all__ = [
     "DataConfig",
     "EvaluateConfig",
     "FilterSettings",
+    "ImportOptions",
     "InitialStd",
     "LossConfig",
     "ModelConfig",

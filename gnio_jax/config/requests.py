@@ -4,6 +4,7 @@ the text of `--help`."""
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
@@ -154,3 +155,33 @@ class CompareConfig:
     out: str | None = None
     """Name of files to write: OUT.md and OUT.csv, the table, and OUT.png, the first metric of every
     sequence. By default the table is only shown."""
+
+
+@dataclass(frozen=True)
+class ImportOptions:
+    """What a recording does not say of itself. By default its format or its header says it, or it
+    is detected; what is ambiguous is refused."""
+
+    columns: Annotated[tuple[str, ...], tyro.conf.arg(metavar="OURS=THEIRS ...")] = ()
+    """Of a CSV, our name and the file's of each column that has another: time=stamp gyro_x=wx ...
+    Ours are time, gyro_x..z, accel_x..z, and accel_time if the accelerometer's time is another
+    column. "a+b" is the sum of two columns (gravity and user acceleration). Without a header, the
+    file's names are places counted from 0."""
+    accel_path: Path | None = None
+    """The accelerometer's CSV, where it is not the gyro's."""
+    time_unit: Literal["s", "ms", "us", "ns"] | None = None
+    """Unit of the stamps; detected by the rate of an IMU, 10 to 2000 Hz."""
+    gyro_unit: Literal["rad/s", "deg/s"] | None = None
+    """Unit of the gyro."""
+    accel_unit: Literal["m/s2", "g", "mg"] | None = None
+    """Unit of the accelerometer; detected by the magnitude of gravity."""
+    accel_sign: Literal["android", "ios", "detect"] | None = None
+    """At rest, level, the up axis reads +1 g (android) or −1 g (ios, everything is negated); detect
+    assumes that the screen points up more than down. A CSV has android's by default: nothing in
+    the data alone tells it."""
+    imu_topic: str | None = None
+    """Topic of sensor_msgs/Imu in a bag that has several."""
+    accel_topic: str | None = None
+    """The accelerometer's topic, where it has one of its own."""
+    reference_topic: str | None = None
+    """Topic of poses, odometry or transforms in a bag that has several; /tf:CHILD_FRAME for TF."""

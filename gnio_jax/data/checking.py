@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from gnio_jax.data import registry
 from gnio_jax.data.dataset import Dataset, Recording
 from gnio_jax.data.plausibility import SelfCheck
 from gnio_jax.data.processes import map_in_processes, suggested_workers
 from gnio_jax.data.reading import check_recording, find_recordings
-from gnio_jax.errors import InputError
 from gnio_jax.files import file_stem
 from gnio_jax.types import Sequence
 
@@ -94,52 +91,6 @@ def _splits_of(name: str, splits: dict[str, tuple[str, ...]]) -> str:
     """The splits a recording is in; the split "all" is named where there is no other."""
     own = [split for split, names in splits.items() if name in names]
     return ", ".join(split for split in own if split != "all" or len(own) == 1)
-
-
-def resolve(name_or_root: str, name: str | None = None) -> tuple[Dataset, Path]:
-    """The dataset and its folder that a person means by a name, or by a folder and a name.
-
-    A folder without a name is that of the dataset which finds its recordings there. Raises
-    `InputError` when that is not clear.
-    """
-    if name is not None:
-        dataset = registry.get(name)
-        root = registry.find_root(name, name_or_root) if dataset.needs_root else Path(name_or_root)
-        return dataset, root
-    if name_or_root in registry.names():
-        dataset = registry.get(name_or_root)
-        hint = f"give its folder with --dataset {name_or_root}"
-        root = registry.find_root(name_or_root, hint=hint) if dataset.needs_root else Path(".")
-        return dataset, root
-    root = Path(name_or_root)
-    if root.is_dir():
-        return _dataset_of(root), root
-    if os.sep in name_or_root or name_or_root.startswith("."):
-        remedy = "give the name of a dataset, or the folder of one"
-        raise InputError(name_or_root, "no such folder", remedy)
-    return registry.get(name_or_root), root  # raises, with the names that are known
-
-
-def _dataset_of(root: Path) -> Dataset:
-    """The dataset whose layout a folder has."""
-    datasets = [registry.get(name) for name in registry.names()]
-    fitting = [dataset for dataset in datasets if dataset.needs_root and _fits(dataset, root)]
-    # EuRoC's layout is TUM-VI's, too: the folder's own name may tell.
-    named = [dataset for dataset in fitting if dataset.name == root.resolve().name.lower()]
-    fitting = named or fitting
-    if len(fitting) == 1:
-        return fitting[0]
-    layouts = " and of ".join(dataset.name for dataset in fitting) or "no dataset"
-    remedy = f"say which it is: --dataset NAME, one of {', '.join(registry.names())}"
-    raise InputError(root, f"has the layout of {layouts}", remedy)
-
-
-def _fits(dataset: Dataset, root: Path) -> bool:
-    try:
-        find_recordings(dataset, root, "all")
-    except InputError:
-        return False
-    return True
 
 
 def figures(checked: Checked) -> dict[str, Any]:

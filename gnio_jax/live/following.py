@@ -5,13 +5,18 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from gnio_jax.data.resampling import longest_bridge
 from gnio_jax.errors import InputError
-from gnio_jax.evaluation import inference_network
+from gnio_jax.evaluation import Trajectory, inference_network
+from gnio_jax.evaluation.preparation import ROUGH_START
+from gnio_jax.evaluation.tum import write_tum
+from gnio_jax.files import replacing
 from gnio_jax.filtering import Pose, Tracker
 from gnio_jax.live.samples import Sample
 from gnio_jax.live.sources import Source
@@ -32,6 +37,8 @@ LONGEST_INTERVAL = 0.5
 """s between samples, by their stamps: what is slower is no IMU, but stamps in ms (ours)."""
 FIRST_STAMPS = 21
 """Samples by which that is told."""
+VELOCITY = slice(3, 6)
+"""Of a pose's covariance."""
 
 
 def create_tracker(run: Run, imu_rate: float | None = None, rest_seconds: float = 1.0) -> Tracker:
@@ -107,6 +114,26 @@ class Follower:
     def lost(self) -> bool:
         """Whether the stream was given up."""
         return self.in_a_row >= REFUSED_IN_A_ROW
+
+    def warnings(self) -> list[str]:
+        """How it began, what is missing and what was refused, as far as somebody must know."""
+        lines = []
+        if self.poses and self.poses[0].covariance[VELOCITY, VELOCITY].max() > ROUGH_START**2:
+            lines.append(
+                "start: it moved while it should lie still, so velocity and tilt are rough"
+            )
+        if self.gaps:
+            longest = (
+                f"{len(self.gaps)}, the longest of {max(self.gaps):.2g} s: samples are missing"
+            )
+            guessed = "what happened there is guessed, and the filter is surer than it should be"
+            lines.append(f"gaps: {longest}, {guessed}")
+        if self.refused:
+            lines.append(f"{self.refused} lines refused, the first: {self.reason}")
+        if self.lost:
+            newest = f"{self.in_a_row} lines in a row refused, the newest: {self.newest_reason}"
+            lines.append(f"stopped, {newest}")
+        return lines
 
 
 def follow(
@@ -188,3 +215,18 @@ def _refuse(found: Follower, reason: str) -> None:
     found.in_a_row += 1
     found.reason = found.reason or reason
     found.newest_reason = reason
+
+
+def write_trajectory(path: Path, poses: list[Pose]) -> None:
+    """Write the healthy poses in TUM format. Raises `InputError` where there is none."""
+    healthy = [pose for pose in poses if pose.healthy]
+    if not healthy:
+        raise InputError(path, "there is no sound pose to write", "the filter diverged at once")
+    orientation = Rotation.from_matrix(np.array([pose.rotation for pose in healthy]))
+    trajectory = Trajectory(
+        np.array([pose.time for pose in healthy]),
+        np.array([pose.position for pose in healthy]),
+        orientation.as_quat(scalar_first=True),
+    )
+    with replacing(path) as temporary:
+        write_tum(temporary, trajectory)

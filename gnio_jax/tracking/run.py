@@ -17,7 +17,6 @@ from gnio_jax.errors import InputError
 from gnio_jax.evaluation import Estimate, Trajectory, exporting, inference_network, prepare
 from gnio_jax.evaluation.estimators.filtered import run_filters
 from gnio_jax.evaluation.exporting import rerun_file
-from gnio_jax.evaluation.exporting.geographic import FirstFix
 from gnio_jax.evaluation.frames import with_the_reference_in_its_frame
 from gnio_jax.evaluation.preparation import Prepared, measured_rows
 from gnio_jax.evaluation.setup import OnShare, Setup, no_progress
@@ -48,7 +47,6 @@ def track(
     weights: Weights,
     out: Path,
     formats: tuple[str, ...] = (),
-    fix: FirstFix | None = None,
     progress: OnShare = no_progress,
     command: str = "",
     rerun: Path | None = None,
@@ -56,11 +54,11 @@ def track(
     """Track a recording and leave trajectory, picture, page and summary in the folder `out`.
 
     The trajectory starts at the origin with yaw zero; its stamps are the recording's own. `formats`
-    are further ones of `exporting.FORMATS`, `fix` places them on the earth, `command` is how this
-    was called, for the page, `rerun` a file to write for the viewer Rerun. The folder is written
-    whole or not at all and takes the place of an earlier track. Raises `InputError`.
+    are further ones of `exporting.FORMATS`, `command` is how this was called, for the page, `rerun`
+    a file to write for the viewer Rerun. The folder is written whole or not at all and takes the
+    place of an earlier track. Raises `InputError`.
     """
-    _check(out, formats, fix)
+    _check(out, formats)
     if rerun is not None:
         rerun_file.check_file(rerun)
     ekf = tracking_filter(weights.run)
@@ -71,7 +69,7 @@ def track(
     from gnio_jax.tracking import page  # Bokeh takes a second to import
 
     with replacing_folder(out) as folder:
-        _write(folder, estimate, summary, formats, fix)
+        _write(folder, estimate, summary, formats)
         page.write(folder / PAGE, estimate, summary, weights.run.config, command)
     if rerun is not None:
         seen = with_the_reference_in_its_frame(estimate)
@@ -79,12 +77,12 @@ def track(
     return Tracked(estimate, summary, out)
 
 
-def _check(out: Path, formats: tuple[str, ...], fix: FirstFix | None) -> None:
+def _check(out: Path, formats: tuple[str, ...]) -> None:
     """What can be refused before the work."""
     if out.exists() and not _may_be_replaced(out):
         raise InputError(out, "is there already and is no track", "name another --out")
     for kind in formats:
-        exporting.check_format("--format", kind, fix)
+        exporting.check_format("--format", kind)
     check_writable_folder(out.parent)
 
 
@@ -118,7 +116,6 @@ def _write(
     estimate: Estimate,
     summary: Summary,
     formats: tuple[str, ...],
-    fix: FirstFix | None,
 ) -> None:
     from gnio_jax.tracking import picture  # Matplotlib takes a second to import
 
@@ -130,7 +127,7 @@ def _write(
         write_tum(folder / REFERENCE, _stamped(estimate.reference, summary.start_time))
     for kind in formats:
         path = folder / f"trajectory.{kind}"
-        exporting.export(path, own_clock, kind, fix, estimate.position_covariance)
+        exporting.export(path, own_clock, kind, estimate.position_covariance)
     picture.save(folder / PICTURE, picture.draw(estimate, summary))
 
 

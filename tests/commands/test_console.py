@@ -1,140 +1,26 @@
-"""The command lines' shared handling: mistakes in one line, help that teaches, configs."""
+"""The terminal: exit statuses and one-line errors, no control characters, the compilers' cache."""
 
+import os
 import subprocess
 import sys
 import warnings
+from pathlib import Path
 
 import pytest
 from rich.table import Table
 
-from gnio_jax import config
-from gnio_jax.commands import app, console, options, train
-from gnio_jax.config import TrainConfig
+import gnio_jax
+from gnio_jax.commands import console
 from gnio_jax.errors import InputError
 
 
-def parse(*arguments):
-    """The experiment that `train` reads from these options."""
-    found = []
-    command = train.COMMAND._replace(run=lambda read, _prog: found.append(read.experiment()))
-    options.execute(command, arguments, "train.py")
-    return found[0]
-
-
-def mistake(*arguments):
-    with pytest.raises(InputError) as caught:
-        parse(*arguments)
-    assert "\n" not in str(caught.value)
-    return str(caught.value)
-
-
-def test_nothing_given_is_the_default():
-    assert parse() == TrainConfig()
-
-
-@pytest.mark.parametrize(
-    "arguments",
-    [["--optim.batch-size", "3"], ["--optim.batch_size", "3"], ["--optim.batch-size=3"]],
-)
-def test_spellings_of_a_nested_option(arguments):
-    assert parse(*arguments).optim.batch_size == 3
-
-
-def test_flags_and_optional_values():
-    parsed = parse("--augment.no-yaw", "--optim.clip-norm", "1", "--data-root", "None")
-    assert (
-        parsed.augment.yaw is False and parsed.optim.clip_norm == 1.0 and parsed.data_root is None
-    )
-
-
-def test_a_list_of_words():
-    given = ["--through-filter.learn", "noise", "head", "--through-filter.piece-seconds", "30"]
-    parsed = parse(*given).through_filter
-    assert parsed.learn == ("noise", "head") and parsed.piece_seconds == 30
-    told = mistake("--through-filter.learn", "noise", "gate")
-    assert told.startswith("--through-filter.learn: must be words out of noise, measurement, ")
-    assert "found 'gate'" in told
-
-
-def test_negative_numbers_are_values():
-    assert parse("--seed", "-1").seed == -1
-    assert parse("--loss.log-std-floor", "-6.9").loss.log_std_floor == -6.9
-
-
-def test_misspelt_option_names_the_closest():
-    assert (
-        mistake("--optim.epoch", "3")
-        == "--optim.epoch: unknown option; did you mean --optim.epochs?"
-    )
-    assert mistake("--epochs", "3") == "--epochs: unknown option; did you mean --optim.epochs?"
-    assert mistake("--qqqq=3") == "--qqqq: unknown option; --help lists the known ones"
-    assert "unknown option" in mistake("-x")
-
-
-def test_wrong_types_say_what_is_wanted_and_found():
-    assert mistake("--optim.epochs", "abc") == "--optim.epochs: must be a whole number, found 'abc'"
-    assert (
-        mistake("--optim.batch_size=3.5")
-        == "--optim.batch-size: must be a whole number, found '3.5'"
-    )
-    assert (
-        mistake("--optim.clip-norm", "a")
-        == "--optim.clip-norm: must be a number or None, found 'a'"
-    )
-    assert (
-        mistake("--model.head", "foo")
-        == "--model.head: must be one of gated, linear or None, found 'foo'"
-    )
-
-
-def test_missing_values_and_stray_words():
-    assert (
-        mistake("--optim.epochs") == "--optim.epochs: needs a value, which must be a whole number"
-    )
-    assert (
-        mistake("--data-root", "--seed", "1")
-        == "--data-root: needs a value, which must be text or None"
-    )
-    assert mistake("stray").startswith("'stray': is not an option")
-    assert mistake("--augment.yaw", "True").startswith("'True': is not an option")
-    assert mistake("--config") == "--config: needs a value, which must be text or None"
-
-
-def test_options_win_over_the_file_and_the_file_over_the_default(tmp_path):
-    path = tmp_path / "experiment.yaml"
-    path.write_text("dataset: tlio\noptim: {epochs: 7, batch_size: 5}\n")
-    for arguments in (
-        ["--config", str(path), "--optim.epochs", "3"],
-        ["--optim.epochs", "3", f"--config={path}"],
-    ):
-        parsed = parse(*arguments)
-        assert (parsed.dataset, parsed.optim.epochs, parsed.optim.batch_size) == ("tlio", 3, 5)
-        assert parsed.data == config.DataConfig()
-
-
-def test_file_mistakes_are_input_errors(tmp_path):
-    path = tmp_path / "experiment.yaml"
-    path.write_text("optim: {epoch: 7}\n")
-    assert "did you mean 'optim.epochs'?" in mistake("--config", str(path))
-    assert "no such config file" in mistake("--config", str(tmp_path / "missing.yaml"))
-
-
-def test_help_teaches(capsys):
-    with pytest.raises(SystemExit) as leaving:
-        parse("--help")
-    assert leaving.value.code == 0
-    text = " ".join(capsys.readouterr().out.replace("│", " ").split())
-    assert "Train a network" in text and "--config FILE" in text
-    assert "--optim.epochs INT Passes over the training windows. (default: 200)" in text
-
-
-def outcome(body):
+def outcome(body, **options):
     program = (
         "from gnio_jax.commands import console\nfrom gnio_jax.errors import InputError\n"
         f"def main():\n    {body}\nconsole.run(main)\n"
     )
     return subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, timeout=60
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=60, **options
     )
 
 
@@ -163,68 +49,6 @@ def test_faults_of_the_program_keep_their_traceback():
     assert result.returncode == 1 and "Traceback" in result.stderr
 
 
-def test_a_config_is_found_by_its_name_from_anywhere(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    assert parse("--config", "quickstart").model.width == 16
-    assert parse("--config", "baselines/tlio").model.name == "tlio"
-    for wrong, hint in (("quickstrat", "quickstart"), ("configs/tlio.yaml", "baselines/tlio")):
-        assert f"{wrong}: no such config file; did you mean '{hint}'?" in mistake("--config", wrong)
-    (tmp_path / "quickstart").mkdir()
-    assert parse("--config", "quickstart").model.width == 16
-    assert set(config.names()) >= {"gnio_tlio", "gnio_oxiod", "gnio_oxiod_small", "quickstart"}
-
-
-@pytest.mark.parametrize(
-    "arguments, expected",
-    [
-        ([], "command: is missing; give one of train, evaluate, calibrate, compare, data"),
-        (["trian"], "command: unknown 'trian'; did you mean 'train'?"),
-        (["--verbose"], "command: unknown '--verbose'; give one of train, evaluate"),
-        (["data"], "command: is missing; give one of list, check, convert, import"),
-        (["data", "chek"], "command: unknown 'chek'; did you mean 'check'?"),
-        (["data", "convert", "oxiod", "-", "out", "--workers"], "--workers: needs a value"),
-        (["data", "check", "tlio", "--splt", "a"], "--splt: unknown option; did you mean --split?"),
-        (["evaluate", "--estimater", "ekf"], "unknown option; did you mean --estimator?"),
-        (["tables", "gatse"], "TABLE: must be one of complexity, comparison"),
-        (["tables", "gates", "--seeds", "x"], "--seeds: must be a whole number, found 'x'"),
-        (["interop", "weights.npz"], "WORKDIR: is missing"),
-    ],
-)
-def test_subcommands_and_their_mistakes(arguments, expected):
-    with pytest.raises(InputError) as caught:
-        options.execute(app.GNIO, arguments, "gnio")
-    assert str(caught.value).startswith(expected) or expected in str(caught.value)
-    assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    "arguments, words",
-    [
-        (["--help"], ["usage: gnio [-h]", "• train", "gnio data list"]),
-        (["train", "--help"], ["usage: gnio train", "gnio train --config quickstart", "--resume"]),
-        (["data", "--help"], ["usage: gnio data", "• check", "gnio data COMMAND --help"]),
-        (["data", "convert", "--help"], ["usage: gnio data convert", "gnio data convert oxiod"]),
-        (["tables", "--help"], ["gnio tables complexity", "Width of the convolutional networks"]),
-    ],
-)
-def test_help_of_the_subcommands(arguments, words, capsys):
-    with pytest.raises(SystemExit) as leaving:
-        options.execute(app.GNIO, arguments, "gnio")
-    assert leaving.value.code == 0
-    text = " ".join(capsys.readouterr().out.replace("│", " ").split())
-    for word in words:
-        assert word in text, word
-
-
-def test_events_of_another_tyro_fall_through():
-    """A version of tyro with other mistakes shows its own box."""
-
-    class Unheard:
-        pass
-
-    assert options._explain(Unheard(), [], [], subcommands=False) is None
-
-
 def test_names_of_files_are_no_controls_of_the_terminal(capsys):
     """A name may colour the terminal, retitle it or delete what it showed."""
     name = "walk\x1b]0;mine\x07\x1b[2J\x9b31m\u202e.zip"
@@ -245,3 +69,64 @@ def test_names_of_files_are_no_controls_of_the_terminal(capsys):
     assert not set(out + err) & set("\x1b\x07\x9b\u202e")
     assert r"walk\x1b]0;mine\x07\x1b[2J\x9b31m\u202e.zip: read" in out
     assert err.count(r"walk\x1b]0;mine") == 3
+
+
+def test_another_copy_of_the_package_in_the_working_folder_is_told(tmp_path):
+    """What is changed there would have no effect on `gnio`."""
+    environment = {**os.environ, "PYTHONPATH": str(Path(gnio_jax.__file__).parents[1])}
+    (tmp_path / "gnio_jax").mkdir()
+    # `gnio` is a script in another folder; a program that is given by -c looks here first.
+    body = "print('ran')"
+    (tmp_path / "bin").mkdir()
+    (tmp_path / "bin" / "gnio.py").write_text(
+        f"from gnio_jax.commands import console\nconsole.run(lambda: {body})\n"
+    )
+    command = [sys.executable, str(tmp_path / "bin" / "gnio.py")]
+
+    def run():
+        return subprocess.run(
+            command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=60
+        )
+
+    assert (run().stderr, run().stdout) == ("", "ran\n")
+    (tmp_path / "gnio_jax" / "__init__.py").write_text("")
+    shown = run()
+    (line,) = shown.stderr.splitlines()
+    assert line.startswith("warning: ") and "pip install -e ." in line
+    assert (shown.returncode, shown.stdout) == (0, "ran\n")
+
+
+CACHED = (
+    "import jax, jax.numpy as jnp; "
+    "jax.config.update('jax_persistent_cache_min_compile_time_secs', 0); "
+    "print(jax.config.jax_compilation_cache_dir, jax.jit(lambda x: x + 1)(1.0))"
+)
+
+
+def compiling(**variables):
+    """A command that compiles, with these variables and no word of a cache besides."""
+    kept = {name: value for name, value in os.environ.items() if "CACHE" not in name}
+    return outcome(CACHED, env={**kept, **variables})
+
+
+def test_what_is_compiled_is_kept_in_the_users_cache(tmp_path):
+    shown = compiling(XDG_CACHE_HOME=str(tmp_path))
+    place = tmp_path / "gnio-jax" / "compiled"
+    assert shown.stdout == f"{place} 2.0\n" and shown.stderr == ""
+    assert any(place.iterdir())
+    home = compiling(HOME=str(tmp_path / "home"))
+    assert home.stdout == f"{tmp_path / 'home' / '.cache' / 'gnio-jax' / 'compiled'} 2.0\n"
+
+
+def test_the_user_says_where_compiled_programs_are_kept(tmp_path):
+    own = tmp_path / "own"
+    shown = compiling(XDG_CACHE_HOME=str(tmp_path), JAX_COMPILATION_CACHE_DIR=str(own))
+    assert shown.stdout == f"{own} 2.0\n" and any(own.iterdir())
+
+
+def test_no_cache_makes_a_command_fail(tmp_path):
+    """A file where the folder would be, and a folder that nobody may write into."""
+    (tmp_path / "gnio-jax").write_text("")
+    for base in (tmp_path, Path("/proc")):
+        shown = compiling(XDG_CACHE_HOME=str(base))
+        assert (shown.returncode, shown.stdout, shown.stderr) == (0, "None 2.0\n", "")

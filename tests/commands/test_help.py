@@ -1,26 +1,26 @@
-"""The help of every command fits a screen, and has an example and every option."""
+"""Every help explains all options, ends with examples that are understood, and nobody is asked for
+too many."""
+
+import dataclasses
+import re
+import shlex
 
 import pytest
+import tyro
 
-from gnio_jax.commands import app, options, short_help
+from gnio_jax import config
+from gnio_jax.commands import options
+from tests.support.command_lines import commands, run, understood
 
-SCREEN = (45, 100)
-"""Lines and columns."""
-
-
-def commands(group=app.GNIO, words=()):
-    """(words of the command line, command) of every command."""
-    for name, command in group.commands.items():
-        if isinstance(command, options.Group):
-            yield from commands(command, (*words, name))
-        else:
-            yield (*words, name), command
+WORDS = [words for words, _ in commands()]
 
 
-def shown(capsys, *arguments):
-    with pytest.raises(SystemExit) as leaving:
-        options.execute(app.GNIO, arguments, "gnio")
-    assert leaving.value.code == 0
+def shown(capsys, *words):
+    """The help of a command, for people whose terminal has 100 columns."""
+    try:
+        run(*words, "--help")
+    except SystemExit as leaving:
+        assert leaving.code == 0
     return capsys.readouterr().out
 
 
@@ -29,56 +29,71 @@ def plain(text):
     return all(sign == "\n" or sign.isprintable() for sign in text)
 
 
-@pytest.mark.parametrize("words", [(), ("data",), *(words for words, _ in commands())])
-def test_help_fits_a_screen_and_has_an_example(words, capsys, monkeypatch):
-    lines, columns = SCREEN
-    monkeypatch.setenv("COLUMNS", str(columns))
-    text = shown(capsys, *words, "--help")
-    folded = sum(max(1, -(-len(line) // columns)) for line in text.rstrip().splitlines())
-    assert folded <= lines
-    assert f"\n  {' '.join(['gnio', *words])}" in text or words == ("data",)
-    assert plain(text)
+def joined(text):
+    """The words of a help text, without its boxes."""
+    return " ".join(re.sub("[│╭╮╰╯─]", " ", text).split())
 
 
-@pytest.mark.parametrize("words, command", [each for each in commands() if each[1].common])
-def test_all_options_are_in_the_whole_help(words, command, capsys, monkeypatch):
+@pytest.fixture(autouse=True)
+def columns(monkeypatch):
     monkeypatch.setenv("COLUMNS", "100")
-    short, whole = shown(capsys, *words, "-h"), shown(capsys, *words, "--help-all")
-    assert plain(whole)
-    for name in options.option_names(command.options):
-        assert f" {name}" in whole, name
-    for name in command.common:
-        assert f"\n  {name}" in short, name
-    known = {option.name: option for option in short_help.all_options(command.options)}
-    assert f"explains all {len(known)} options" in " ".join(short.split())
-    negations = sum("no-" in name for name in options.option_names(command.options))
-    words = ("FILE", "RUNS", "TABLE")  # of those that are given without a name
-    named = len(options.option_names(command.options)) - negations
-    assert len(known) - sum(word in known for word in words) == named
-    assert all(option.text for option in known.values())
+
+
+@pytest.mark.parametrize("words", [(), ("data",), *WORDS], ids=" ".join)
+def test_help_ends_with_examples_that_are_understood(words, capsys):
+    text = shown(capsys, *words)
+    assert plain(text) and max(map(len, text.splitlines())) <= 100
+    about, _, examples = text.partition("\nexamples:\n")
+    assert f"usage: {' '.join(['gnio', *words])}" in about
+    lines = re.sub(r"\\\n +", "", examples).splitlines()
+    lines = [line for line in lines if "gnio" in line and line.startswith("  ")]
+    assert lines and any(" ".join(["gnio", *words]) in line for line in lines)
+    for line in lines:
+        # What the example does stands behind it.
+        call = re.split(r" {3,}", line[line.index("gnio ") :])[0].replace("...", "quickstart")
+        understood(shlex.split(call)[1:])
+
+
+@pytest.mark.parametrize(("words", "command"), list(commands()), ids=str)
+def test_help_explains_every_option(words, command, capsys):
+    kind, text = options.options_type(command), shown(capsys, *words, "-H")
+    for option in options.options_of(kind):
+        assert re.search(rf"[ \[]{re.escape(option.name)}[ ,\]\n]", text), option.name
+    assert "None" not in text  # what is not given is told in words
+    for field, hint, markers in options._fields(kind):
+        if tyro.conf.Suppress not in markers and not dataclasses.is_dataclass(hint):
+            meaning = options._comments(kind)[field.name]
+            assert " ".join(meaning.split()[:6]) in joined(text), field.name
+
+
+def test_help_of_the_overviews_names_every_command(capsys):
+    overview, of_data = shown(capsys), shown(capsys, "data")
+    for word, *inner in WORDS:
+        assert re.search(rf"^ +{word} ", overview, re.M), word
+        for name in inner:
+            assert re.search(rf"^ +{name} ", of_data, re.M), name
+
+
+def test_help_of_train_names_the_configs(capsys):
+    text = joined(shown(capsys, "train", "-H"))
+    assert all(name in text for name in config.names())
+    assert "--optim.epochs INT Passes over the training windows. (default: 200)" in text
+
+
+def test_nobody_is_asked_for_too_much():
+    counts = {
+        words: sum(
+            option.name.startswith("--") and "no-" not in option.name
+            for option in options.options_of(options.options_type(command))
+        )
+        for words, command in commands()
+    }
+    assert counts[("train",)] <= 75
+    assert sum(counts.values()) <= 172, counts
 
 
 @pytest.mark.parametrize("words", [("data", "list"), ("weights",), ("data", "check", "synthetic")])
 def test_results_in_a_pipe_have_no_control_characters(words, capsys):
-    options.execute(app.GNIO, [*words, *(["--split", "val"] if len(words) == 3 else [])], "gnio")
+    run(*words, *(["--split", "val"] if len(words) == 3 else []))
     text = capsys.readouterr().out
     assert text and plain(text)
-
-
-def test_a_common_option_has_its_values_meaning_and_default(capsys):
-    text = " ".join(shown(capsys, "evaluate", "--help").split())
-    meaning = "The paper's filter, the sum of the displacements, or the IMU integrated without the"
-    assert f"--estimator {{ekf,integrate,imu_only}} {meaning} network. (default: ekf)" in text
-    assert "--help-all explains all" in text and "of the section filter" in text
-
-
-@pytest.mark.parametrize("mark, other", [("│", "┃"), ("--out ", "-out ")])
-def test_where_the_layout_of_tyro_is_another_one_the_help_is_whole(
-    mark, other, capsys, monkeypatch
-):
-    """Boxes drawn otherwise, and an option spelt otherwise."""
-    monkeypatch.setenv("COLUMNS", "100")
-    whole = shown(capsys, "track", "--help-all")
-    read = short_help._help_of_tyro
-    monkeypatch.setattr(short_help, "_help_of_tyro", lambda kind: read(kind).replace(mark, other))
-    assert shown(capsys, "track", "--help") == whole

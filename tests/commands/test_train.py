@@ -6,6 +6,7 @@ import os
 import shutil
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import pytest
@@ -13,9 +14,12 @@ import pytest
 import train
 from gnio_jax import config as configuration
 from gnio_jax.commands import console
-from gnio_jax.commands.train import TrainOptions, defaults
-from gnio_jax.config import FilterSettings, ThroughFilter, TrainConfig
+from gnio_jax.commands.options import Call, read
+from gnio_jax.commands.train import experiment
+from gnio_jax.commands.train import train as command
+from gnio_jax.config import DataConfig, FilterSettings, ModelConfig, TrainConfig
 from gnio_jax.errors import InputError
+from tests.support import tiny_run
 from tests.support.filter_settings import changed
 
 ROOT = Path(__file__).parents[2]
@@ -55,7 +59,7 @@ def mistake(monkeypatch, capsys, tmp_path, *arguments):
         (["--optim.epochs", "three"], "--optim.epochs: must be a whole number, found 'three'"),
         (
             ["--model.gate", "relu"],
-            "--model.gate: must be one of tanh, sigmoid or None, found 'relu'",
+            "--model.gate: must be one of tanh, sigmoid or null, found 'relu'",
         ),
         (["--model.name", "gnoi"], "model 'gnoi': unknown; did you mean 'gnio'?"),
         (
@@ -166,7 +170,7 @@ def test_a_config_survives_its_file(tmp_path):
 
 def test_help_teaches():
     shown = subprocess.run(
-        [sys.executable, "train.py", "--help-all"],
+        [sys.executable, "train.py", "--help-verbose"],
         cwd=ROOT,
         capture_output=True,
         text=True,
@@ -184,27 +188,49 @@ def test_help_teaches():
         assert word in " ".join(shown.split()), word
 
 
+def asked(*words):
+    """The experiment that these words come to."""
+    call = Call("gnio train", words)
+    return experiment(read(command, call), call)
+
+
 def test_training_through_the_filter_begins_with_the_filter_of_the_run(tmp_path):
     calibrated = changed(noise={"gyro_density": 0.02}, start={"velocity": 0.7, "accel_bias": 0.3})
     considered = changed(calibrated, considered={"scale": 0.1})
-    configuration.save(tmp_path / "run" / "config.yaml", TrainConfig(filter=considered))
-    file = tmp_path / "own.yaml"
-    file.write_text("through_filter: {learn: [noise]}\nfilter: {start: {velocity: 1.0}}\n")
-    workdir = tmp_path / "new"
-    asked = TrainOptions(config=str(file), init_from=str(tmp_path / "run"), workdir=str(workdir))
-    # What the file says wins, also where it is the default of the package.
-    wanted = changed(calibrated, start={"velocity": 1.0})
-    assert defaults(asked).filter == wanted
-    bare = TrainOptions(init_from=asked.init_from, through_filter=ThroughFilter(learn=("noise",)))
-    assert defaults(bare).filter == calibrated
-    # Training on windows has no use for it.
-    assert defaults(TrainOptions(init_from=asked.init_from)).filter == FilterSettings()
+    tiny = TrainConfig(data=DataConfig(rate=50.0), model=ModelConfig(name="tiny"))
+    with tiny_run.known():
+        run = tiny_run.save(tmp_path / "run", dataclasses.replace(tiny, filter=considered))
+        file = tmp_path / "own.yaml"
+        file.write_text("through_filter: {learn: [noise]}\nfilter: {start: {velocity: 1.0}}\n")
+        workdir = tmp_path / "new"
+        given = ["--config", str(file), "--init-from", str(run), "--workdir", str(workdir)]
+        # What the file says wins, also where it is the default of the package.
+        wanted = changed(calibrated, start={"velocity": 1.0})
+        assert asked(*given).filter == wanted
+        louder = asked(*given, "--set", "filter.noise.gyro_density=0.5").filter
+        assert louder == changed(wanted, noise={"gyro_density": 0.5})
+        bare = asked("--init-from", str(run), "--through-filter.learn", "noise")
+        assert bare.filter == calibrated
+        by_name = asked("--init-from", str(run), "--set", "through_filter.learn=[noise]")
+        assert by_name.filter == calibrated
+        # Training on windows has no use for it.
+        assert asked("--init-from", str(run)).filter == FilterSettings()
     # A run that is resumed goes on with its own, whether --config is given again or not.
     configuration.save(workdir / "config.yaml", TrainConfig(filter=wanted))
-    shutil.rmtree(tmp_path / "run")
-    resumed = dataclasses.replace(asked, resume=True)
-    assert defaults(resumed).filter == wanted
-    assert defaults(dataclasses.replace(resumed, config=None)).filter == wanted
+    shutil.rmtree(run)
+    assert asked(*given, "--resume").filter == wanted
+    assert asked(*given[2:], "--resume").filter == wanted
+
+
+def test_a_config_may_come_from_a_pipe(tmp_path):
+    """Its text is there once."""
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    writer = threading.Thread(target=pipe.write_text, args=("seed: 7\nmodel: {width: 4}\n",))
+    writer.start()
+    config = asked("--config", str(pipe), "--optim.epochs", "1")
+    writer.join(10)
+    assert (config.seed, config.model.width, config.optim.epochs) == (7, 4, 1)
 
 
 def test_the_newest_run_is_the_one_trained_last(tmp_path):

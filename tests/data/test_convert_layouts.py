@@ -7,8 +7,7 @@ import warnings
 import pytest
 
 from gnio_jax import data
-from gnio_jax.commands.data import main
-from gnio_jax.data.checking import resolve
+from tests.support.command_lines import run
 from tests.support.layouts import LAYOUTS
 from tests.support.sequences import assert_same_arrays
 
@@ -23,11 +22,8 @@ def test_a_layout_survives_its_conversion(name, tmp_path, monkeypatch, capsys):
         warnings.simplefilter("ignore")
         expected = data.load(layout.dataset, root, layout.split)
 
-    if layout.dataset not in ("euroc", "tumvi"):  # these two share a layout
-        assert resolve(str(root), None)[0].name == layout.dataset
-    main(
-        ["check", str(root), "--dataset", layout.dataset, "--json", str(tmp_path / "figures.json")]
-    )
+    at = [layout.dataset, "--data-root", str(root)]
+    run("data", "check", *at, "--json", str(tmp_path / "figures.json"))
     rows = json.loads((tmp_path / "figures.json").read_text())["sequences"]
     assert set(rows) == {sequence.name for sequence in expected} and all(
         row["used"] for row in rows.values()
@@ -36,7 +32,7 @@ def test_a_layout_survives_its_conversion(name, tmp_path, monkeypatch, capsys):
         assert rows[sequence.name]["split"].split(", ").count(layout.split) == 1
         assert rows[sequence.name]["duration"] == sequence.time[-1] - sequence.time[0]
 
-    main(["convert", layout.dataset, str(root), str(out)])
+    run("data", "convert", *at, str(out))
     assert f"{len(expected)} sequences" in capsys.readouterr().out
     found = data.load("csv", out, layout.split)
     for ours, theirs in zip(

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import struct
-from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -12,17 +10,14 @@ from mcap.reader import make_reader
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from gnio_jax.commands import console
-from gnio_jax.commands.data import main
+from gnio_jax.commands import app
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation.exporting import export, read_trajectory
-from gnio_jax.evaluation.exporting.geographic import FirstFix, on_the_earth
 from gnio_jax.evaluation.metrics import Trajectory
 from tests.support import known_walk
 
 START = 1_700_000_000.25
 TIME = START + np.arange(60) / 20
-FIX = FirstFix(48.1375, 11.5755, 520.0, 30.0)
 
 
 def walk(time=TIME, start=START):
@@ -48,15 +43,6 @@ def test_csv_and_tum_have_the_poses(tmp_path):
         np.testing.assert_allclose(field, own, atol=1e-9)
 
 
-def test_kitti_is_the_matrix_that_turns_the_body_into_the_world(tmp_path):
-    poses = walk()
-    export(tmp_path / "poses.txt", poses, kind="kitti")
-    rows = np.loadtxt(tmp_path / "poses.txt").reshape(-1, 3, 4)
-    point = np.array([0.3, -0.2, 0.7])
-    expected = known_walk.attitude(TIME - START).apply(point) + poses.position
-    np.testing.assert_allclose(rows @ np.append(point, 1.0), expected, atol=1e-8)
-
-
 def test_rows_without_a_pose_are_left_out(tmp_path):
     poses = walk()
     poses.position[10:20] = np.nan
@@ -67,91 +53,7 @@ def test_rows_without_a_pose_are_left_out(tmp_path):
         export(tmp_path / "walk.csv", poses)
 
 
-# --- on the earth
-
-
-def cartesian(latitude, longitude, height):
-    """WGS 84 by the axes of the ellipse."""
-    lat, lon = np.radians(latitude), np.radians(longitude)
-    a, b = 6378137.0, 6356752.314245179
-    normal = a**2 / np.sqrt((a * np.cos(lat)) ** 2 + (b * np.sin(lat)) ** 2)
-    across = (normal + height) * np.cos(lat)
-    z = (b**2 / a**2 * normal + height) * np.sin(lat)
-    return np.stack([across * np.cos(lon), across * np.sin(lon), z], axis=-1)
-
-
-@pytest.mark.parametrize("latitude", [0.0, 48.1375, -33.9, 89.9999])
-def test_distances_on_the_earth_are_those_of_the_world(latitude):
-    position = np.array([[5.0, 6.0, 7.0], [305.0, 6.0, 7.0], [5.0, 806.0, 7.0], [-95.0, 6.0, 57.0]])
-    places = on_the_earth(position, FIX._replace(latitude=latitude))
-    there = cartesian(*places.T)
-    for first in range(4):
-        for second in range(4):
-            expected = np.linalg.norm(position[first] - position[second])
-            found = np.linalg.norm(there[first] - there[second])
-            assert found == pytest.approx(expected, abs=1e-5)
-    np.testing.assert_allclose(places[0], [latitude, FIX.longitude, 520.0], atol=1e-8)
-
-
-@pytest.mark.parametrize(
-    ("heading", "moved", "north", "east"),
-    [(0, [9, 0, 0], 9, 0), (90, [9, 0, 0], 0, 9), (0, [0, 9, 0], 0, -9), (180, [9, 4, 0], -9, 4)],
-)
-def test_x_points_to_the_heading_and_y_to_its_left(heading, moved, north, east):
-    fix = FIX._replace(heading=heading)
-    position = np.array([[0.0, 0.0, 0.0], moved], dtype=float)
-    step = np.radians(np.diff(on_the_earth(position, fix)[:, :2], axis=0)[0])
-    # Radii of curvature at this latitude, by the formulas of geodesy.
-    lat, flat = np.radians(fix.latitude), 0.0066943799901413165
-    normal = 6378137.0 / np.sqrt(1 - flat * np.sin(lat) ** 2)
-    meridian = normal * (1 - flat) / (1 - flat * np.sin(lat) ** 2)
-    assert step[0] * (meridian + 520.0) == pytest.approx(north, abs=1e-4)
-    assert step[1] * (normal + 520.0) * np.cos(lat) == pytest.approx(east, abs=1e-4)
-
-
-def test_geojson_and_gpx_hold_the_same_places(tmp_path):
-    poses, name = walk(), "walk <1> & more"
-    export(tmp_path / f"{name}.geojson", poses, fix=FIX)
-    feature = json.loads((tmp_path / f"{name}.geojson").read_text())["features"][0]
-    assert feature["geometry"]["type"] == "LineString" and feature["properties"]["name"] == name
-    assert feature["properties"]["times"] == TIME.tolist()
-    line = np.array(feature["geometry"]["coordinates"])
-    expected = on_the_earth(poses.position, FIX)[:, [1, 0, 2]]
-    np.testing.assert_allclose(line, expected, atol=1e-4)
-    np.testing.assert_allclose(line[:, :2], expected[:, :2], atol=1e-9)
-
-    export(tmp_path / f"{name}.gpx", poses, fix=FIX)
-    space = {"": "http://www.topografix.com/GPX/1/1"}
-    root = ElementTree.parse(tmp_path / f"{name}.gpx").getroot()
-    points = root.findall("trk/trkseg/trkpt", space)
-    assert root.findtext("trk/name", namespaces=space) == name
-    places = [[float(point.get("lon")), float(point.get("lat"))] for point in points]
-    np.testing.assert_allclose(places, line[:, :2], atol=2e-9)
-    heights = [float(point.findtext("ele", namespaces=space)) for point in points]
-    np.testing.assert_allclose(heights, line[:, 2], atol=1e-4)
-    assert points[0].findtext("time", namespaces=space) == "2023-11-14T22:13:20.250000Z"
-
-
-def test_what_is_not_known_is_left_out(tmp_path):
-    """Neither an altitude nor unix time."""
-    poses = walk(TIME - START, 0.0)
-    fix = FIX._replace(altitude=None)
-    export(tmp_path / "walk.geojson", poses, fix=fix)
-    feature = json.loads((tmp_path / "walk.geojson").read_text())["features"][0]
-    assert {len(place) for place in feature["geometry"]["coordinates"]} == {2}
-    export(tmp_path / "walk.gpx", poses, fix=fix)
-    text = (tmp_path / "walk.gpx").read_text()
-    assert "<ele>" not in text and "<time>" not in text and text.count("<trkpt") == 60
-
-
 # --- MCAP
-
-
-def test_a_stamp_that_is_no_date_has_none(tmp_path):
-    poses = walk()
-    poses = poses._replace(time=poses.time * 1e9)  # somebody's nanoseconds
-    export(tmp_path / "walk.gpx", poses, fix=FIX)
-    assert "<time>" not in (tmp_path / "walk.gpx").read_text()
 
 
 def test_the_mcap_is_read_by_rosbags(tmp_path):
@@ -221,17 +123,12 @@ def trajectory(tmp_path, monkeypatch):
 
 
 def test_the_command_writes_what_the_suffix_says(trajectory, tmp_path, capsys):
-    place = ["--first-fix", "-48.1375", "-11.5755", "--heading", "-30"]
-    for name in ("a.csv", "a.kitti", "a.tum", "a.mcap"):
-        main(["export", "walk.txt", name])
-    for name in ("a.gpx", "a.geojson"):
-        main(["export", "walk.txt", name, *place])
-    main(["export", "walk.txt", "poses.dat", "--format", "kitti"])
+    for name in ("a.csv", "a.tum", "a.mcap"):
+        app.main(["data", "export", "walk.txt", name])
+    app.main(["data", "export", "walk.txt", "poses.dat", "--format", "csv"])
     out = capsys.readouterr().out.splitlines()
-    assert out[0] == "a.csv: 60 poses, 3.0 s" and len(out) == 7
-    assert (tmp_path / "poses.dat").read_text() == (tmp_path / "a.kitti").read_text()
-    line = json.loads((tmp_path / "a.geojson").read_text())["features"][0]["geometry"]
-    assert line["coordinates"][0] == [-11.5755, -48.1375]
+    assert out[0] == "a.csv: 60 poses, 3.0 s" and len(out) == 4
+    assert (tmp_path / "poses.dat").read_text() == (tmp_path / "a.csv").read_text()
 
 
 @pytest.mark.parametrize(
@@ -239,7 +136,7 @@ def test_the_command_writes_what_the_suffix_says(trajectory, tmp_path, capsys):
     [
         (["walk.txt"], "OUT: is missing"),
         (["gone.txt", "a.csv"], "gone.txt: cannot be read (No such file or directory)"),
-        (["walk.txt", "a.dat"], "a.dat: its name tells no format; known: .tum, .txt, .kitti"),
+        (["walk.txt", "a.dat"], "a.dat: its name tells no format; known: .tum, .txt, .csv"),
         (["walk.txt", "folder"], "OUT: 'folder' is a folder; name a file in it"),
         (["words.txt", "a.csv"], "words.txt: "),
         (["short.txt", "a.csv"], "short.txt: has 4 columns, not the 8 of TUM's format"),
@@ -248,16 +145,6 @@ def test_the_command_writes_what_the_suffix_says(trajectory, tmp_path, capsys):
         (["nan.txt", "a.csv"], "nan.txt: field 't x y z qx qy qz qw' is NaN or Inf"),
         (["early.txt", "a.mcap"], "a.mcap: stamps begin at -1 s; ROS has none below 0"),
         (["late.txt", "a.mcap"], "a.mcap: stamps end at 1.7e+18 s; ROS counts seconds in 32 bits"),
-        (["walk.txt", "a.gpx"], "a.gpx: gpx needs a place on the earth; give --first-fix LAT LON"),
-        (["walk.txt", "a.gpx", "--first-fix", "48", "11"], "--heading: is missing"),
-        (
-            ["walk.txt", "a.gpx", "--first-fix", "48", "--heading", "1"],
-            "--first-fix: holds 1 numbers; give LAT LON or LAT LON ALT",
-        ),
-        (
-            ["walk.txt", "a.gpx", "--first-fix", "148", "11", "--heading", "1"],
-            "--first-fix: 148 11 is no place on the earth; give LAT LON",
-        ),
     ],
 )
 def test_a_mistake_is_one_line(trajectory, tmp_path, capsys, arguments, expected):
@@ -274,7 +161,7 @@ def test_a_mistake_is_one_line(trajectory, tmp_path, capsys, arguments, expected
         (tmp_path / name).write_text(text)
     before = sorted(tmp_path.iterdir())
     with pytest.raises(SystemExit) as left:
-        console.run(lambda: main(["export", *arguments]))
+        app.main(["data", "export", *arguments])
     out, err = capsys.readouterr()
     assert (left.value.code, out) == (2, "") and err.count("\n") == 1 and expected in err, err
     assert sorted(tmp_path.iterdir()) == before

@@ -497,7 +497,7 @@ def write_walk(path, seconds=6.0, rate=50):
 
 def test_a_recording_is_replayed(workdir, replay, tmp_path, capsys):
     time = write_walk(tmp_path / "walk.csv")
-    replay("--workdir", workdir, "--csv", "walk.csv", "--out", tmp_path / "out" / "found.txt")
+    replay("--weights", workdir, "--csv", "walk.csv", "--out", tmp_path / "out" / "found.txt")
     out, err = capsys.readouterr()
     assert (
         err == "" and "real-time factor" in out and out.count("p99") == 2 and "DIVERGED" not in out
@@ -514,7 +514,7 @@ def test_a_recording_is_replayed(workdir, replay, tmp_path, capsys):
 
 def test_a_faster_recording_is_replayed_through_the_low_pass(workdir, replay, tmp_path, capsys):
     time = write_walk(tmp_path / "walk.csv", rate=120)
-    replay("--workdir", workdir, "--csv", "walk.csv")
+    replay("--weights", workdir, "--csv", "walk.csv")
     out, err = capsys.readouterr()
     assert err == "" and "DIVERGED" not in out and "Hz to 50 Hz: poses come 433 ms later" in out
     found = np.loadtxt(tmp_path / "walk_trajectory.txt")
@@ -529,7 +529,7 @@ def test_a_faster_recording_is_replayed_through_the_low_pass(workdir, replay, tm
         (["--cvs", "walk.csv"], "--cvs: unknown option; did you mean --csv?"),
         ([], "--csv: is missing"),
         (["--csv", "none.csv"], "none.csv: cannot be read"),
-        (["--csv", "walk.csv", "--workdir", "nowhere"], "nowhere: holds no run"),
+        (["--csv", "walk.csv", "--weights", "nowhere"], "nowhere: no such weights"),
         (["--csv", "backward.csv"], "backward.csv: field 'time' does not increase"),
         (["--csv", "ms.csv"], "ms.csv row 2: time: "),
         (["--csv", "short.csv"], "short.csv: ends before the device was still for 1 s"),
@@ -554,7 +554,7 @@ def test_mistakes_of_a_replay_are_one_line(workdir, replay, tmp_path, capsys, ar
     )
     before = sorted(tmp_path.rglob("*"))
     with pytest.raises(SystemExit) as left:
-        replay(*(arguments if "--workdir" in arguments else [*arguments, "--workdir", workdir]))
+        replay(*(arguments if "--weights" in arguments else [*arguments, "--weights", workdir]))
     out, err = capsys.readouterr()
     assert left.value.code == 2 and out == "" and len(err.splitlines()) == 1 and words in err
     assert sorted(tmp_path.rglob("*")) == before

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from gnio_jax import interop, models
-from gnio_jax.commands import console
-from gnio_jax.commands import interop as interop_command
+from gnio_jax.commands import app
 from gnio_jax.config import DataConfig, FilterSettings
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import filter_setup
@@ -299,8 +298,8 @@ def file(tmp_path_factory):
 
 
 def command(monkeypatch, *arguments):
-    monkeypatch.setattr(sys, "argv", ["interop", *map(str, arguments)])
-    console.run(interop_command.main)
+    monkeypatch.setattr(sys, "argv", ["gnio", "interop", *map(str, arguments)])
+    app.main()
 
 
 def test_a_run_is_made_of_them(file, tmp_path, monkeypatch, capsys, loaded):

@@ -238,7 +238,6 @@ def test_noise_on_the_line_is_no_text(gnio, run, recorded, monkeypatch, tmp_path
         ([], ["udp:nine"], "udp:nine: names no port; write udp:5555"),
         ([], ["nowhere.csv"], "nowhere.csv"),
         ([], ["nowhere.csv", "--speed", "-1"], "--speed: must not be negative"),
-        ([], ["--accel-sign", "ios"], "--accel-sign: is of a recording"),
         ([], ["--rerun", "live.txt"], "--rerun"),
         (["0,0,0,0,0,0,1.01"] * 30, [], "standard input: its accelerometer reads 1.01"),
         (

@@ -10,7 +10,7 @@ import os
 import signal
 import sys
 
-from gnio_jax.commands import app, console
+from gnio_jax.commands import app
 from gnio_jax.models import registry
 from gnio_jax.training import loop
 from tests.support.tiny_network import Tiny
@@ -28,7 +28,7 @@ def main(name, step, *arguments):
         return group
 
     loop._run_steps = interrupted
-    console.run(lambda: app.options.execute(app.GNIO, ["train", *arguments], "gnio"))
+    app.main(["train", *arguments])
 
 
 if __name__ == "__main__":

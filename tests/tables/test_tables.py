@@ -10,12 +10,12 @@ import yaml
 
 from gnio_jax import calibration, models
 from gnio_jax import config as configuration
-from gnio_jax.commands import tables as commands
 from gnio_jax.comparison import figures
 from gnio_jax.config import CalibrateConfig, DataConfig, ModelConfig, OptimConfig, TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.tables import complexity
 from gnio_jax.training import loop
+from tests.support.command_lines import run as gnio
 from tests.support.runs import shared_programs
 from tests.support.tlio_files import write_sequence
 
@@ -43,7 +43,7 @@ def made(tmp_path_factory):
 
 def test_a_table_from_nothing_and_again_without_training(made, monkeypatch, capsys):
     root, arguments = made
-    commands.main(["comparison", *arguments])
+    gnio("tables", "comparison", *arguments)
     text = (root / "out" / "comparison_test_integrate.md").read_text(encoding="utf-8")
     assert "2 seeds" in text and "| gnio |" in text and text in capsys.readouterr().out
     table = list(
@@ -76,12 +76,12 @@ def test_a_table_from_nothing_and_again_without_training(made, monkeypatch, caps
     monkeypatch.setattr(loop, "train_seeds", never)
     monkeypatch.setattr(figures.evaluation, "evaluate", never)
     (root / "out" / "comparison_test_integrate.md").unlink()
-    commands.main(["comparison", *arguments])
+    gnio("tables", "comparison", *arguments)
     assert (root / "out" / "comparison_test_integrate.md").read_text(encoding="utf-8") == text
-    commands.main(["standing", *arguments])
+    gnio("tables", "standing", *arguments)
     text = (root / "out" / "standing_test_integrate.md").read_text(encoding="utf-8")
     assert "most attended prototype tells" in text and "| gnio | walking |" in text
-    commands.main(["trajectories", *arguments, "--sequences", "c"])
+    gnio("tables", "trajectories", *arguments, "--sequences", "c")
     for name in (
         "standing_test_integrate",
         "standing_test_integrate_gnio_gate",
@@ -92,12 +92,12 @@ def test_a_table_from_nothing_and_again_without_training(made, monkeypatch, caps
     page = (root / "out" / "trajectories_test_integrate.html").read_text(encoding="utf-8")
     assert 'class="swatch"' in page and "</span>gnio</h2>" in page
     with pytest.raises(InputError, match="no sequence 'x' in split 'test'; there are: b, c"):
-        commands.main(["trajectories", *arguments, "--sequences", "x"])
+        gnio("tables", "trajectories", *arguments, "--sequences", "x")
     changed = yaml.safe_load((root / "base.yaml").read_text())
     changed["optim"]["learning_rate"] = 2e-3
     (root / "other.yaml").write_text(yaml.safe_dump(changed))
     with pytest.raises(InputError, match=r"'optim' was .* and is now"):
-        commands.main(["comparison", *arguments, "--base", str(root / "other.yaml")])
+        gnio("tables", "comparison", *arguments, "--base", str(root / "other.yaml"))
 
 
 def test_every_run_is_calibrated_before_it_is_measured(made, monkeypatch, capsys):
@@ -111,8 +111,8 @@ def test_every_run_is_calibrated_before_it_is_measured(made, monkeypatch, capsys
     monkeypatch.setattr(calibration, "calibrate", quickly)
     root, arguments = made
     arguments = [*arguments, "--seeds", "1", "--estimator", "ekf"]
-    commands.main(["comparison", *arguments])
-    commands.main(["comparison", *arguments, "--calibrate"])
+    gnio("tables", "comparison", *arguments)
+    gnio("tables", "comparison", *arguments, "--calibrate")
     told = capsys.readouterr()
     assert "calibrating gnio_s0" in told.err and "gnio calibrate on val;" in told.out
     plain, calibrated = (
@@ -133,7 +133,7 @@ def test_a_signal_ends_the_table_and_says_how_to_go_on(made, monkeypatch, capsys
     root, arguments = made
     monkeypatch.setattr(loop, "train_seeds", lambda *_, **__: [loop.Outcome(root, None, 15)])
     with pytest.raises(SystemExit) as left:
-        commands.main(["gates", *arguments, "--out", str(root / "elsewhere")])
+        gnio("tables", "gates", *arguments, "--out", str(root / "elsewhere"))
     assert left.value.code == 128 + 15 and "goes on from here" in capsys.readouterr().err
 
 
@@ -149,7 +149,7 @@ def test_a_signal_ends_the_table_and_says_how_to_go_on(made, monkeypatch, capsys
 )
 def test_mistakes_are_named(made, more, words):
     with pytest.raises(InputError, match=words):
-        commands.main(["comparison", *made[1], *more])
+        gnio("tables", "comparison", *made[1], *more)
 
 
 def test_every_network_has_a_colour_and_a_place_in_the_tables():

@@ -175,7 +175,6 @@ def test_what_is_refused(mistake, runs, tmp_path):
     members = logger_files.sensor_logger()
     walk = logger_files.zipped(tmp_path / "walk.zip", members)
     given = ("track", walk, *weights)
-    assert "--first-fix" in mistake(*given, "--format", "gpx")
     thesis = tmp_path / "mine" / "thesis.txt"
     thesis.parent.mkdir()
     thesis.write_text("mine")

@@ -10,12 +10,14 @@ import numpy as np
 import pytest
 
 from gnio_jax import config as configuration
-from gnio_jax.commands import train as command
+from gnio_jax.commands.options import Call, read
+from gnio_jax.commands.train import experiment, train
 from gnio_jax.config import DataConfig, ModelConfig, OptimConfig, TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.models import registry
 from gnio_jax.reporting import Silence
 from gnio_jax.training import checkpoint, loop, step, together
+from tests.support.command_lines import run as gnio
 from tests.support.runs import shared_programs
 from tests.support.tiny_network import Tiny
 from tests.support.tlio_files import write_splits
@@ -206,16 +208,17 @@ def test_the_command_names_each_run_and_how_to_go_on(config, tmp_path, monkeypat
 
     monkeypatch.setattr(loop, "train_seeds", train_seeds)
     run = str(tmp_path / "run")
-    command.main(["--workdir", run, "--seeds", "1", "2", "--optim.epochs", "5"], "gnio train")
+    gnio("train", "--workdir", run, "--seeds", "1", "2", "--optim.epochs", "5")
     out = capsys.readouterr().out.splitlines()
     assert [line.split()[-1] for line in out] == [f"{run}_s1", f"{run}_s2"]
     configuration.save(Path(f"{run}_s1") / "config.yaml", given[0][0])
     with pytest.raises(SystemExit):
-        command.main(["--workdir", run, "--seeds", "1", "2", "--resume"], "gnio train")
+        gnio("train", "--workdir", run, "--seeds", "1", "2", "--resume")
     assert f"--workdir {run} --seeds 1 2 --resume" in capsys.readouterr().err
     assert [seeds for _, seeds, _ in given] == [(1, 2)] * 2 and given[1][2]
     assert given[1][0].optim.epochs == 5
     monkeypatch.chdir(tmp_path)
     configuration.save(Path("runs/synthetic_gnio_s1/config.yaml"), given[0][0])
-    found = command.defaults(command.TrainOptions(seeds=(1, 2), resume=True))
+    call = Call("gnio train", ["--seeds", "1", "2", "--resume"])
+    found = experiment(read(train, call), call)
     assert found.optim.epochs == 5 and found.workdir is None

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from gnio_jax import config as configuration
-from gnio_jax.commands import evaluate
-from gnio_jax.commands.train import TrainOptions, defaults
+from gnio_jax.commands.options import Call, read
+from gnio_jax.commands.train import experiment, train
 from gnio_jax.config import (
     CorrelatedError,
     DataConfig,
@@ -40,6 +40,7 @@ from gnio_jax.training import (
     through_filter,
 )
 from tests.support import drawn_run
+from tests.support.command_lines import run as gnio
 from tests.support.compiling import quick
 from tests.support.filter_settings import changed
 from tests.support.tiny_network import Tiny
@@ -177,15 +178,16 @@ def test_stopped_and_resumed_gives_the_same_bits(recording, finished, tmp_path, 
 
 
 def test_evaluation_takes_what_the_filter_has_learnt(finished, capsys):
-    evaluate.main(["--workdir", str(finished), "--no-plots"])
+    gnio("evaluate", "--workdir", str(finished), "--no-plots")
     learnt_values = configuration.plain(checkpoint.load_run(finished).config.filter)
     metrics = json.loads((finished / "eval" / "tlio_test_ekf" / "metrics.json").read_text())
     assert metrics["settings"]["filter"] == learnt_values
     assert learnt_values["noise"]["gyro_density"] != OPTIONS.noise.gyro_density
-    # The latest checkpoint's are the defaults where that is asked for.
-    latest = checkpoint.load_run(finished, "latest").config.filter
-    asked = evaluate.EvaluateOptions(workdir=str(finished), checkpoint="latest")
-    assert evaluate.defaults(asked).filter == latest
+    # The latest checkpoint's are taken where that is asked for.
+    latest = configuration.plain(checkpoint.load_run(finished, "latest").config.filter)
+    gnio("evaluate", "--workdir", str(finished), "--no-plots", "--checkpoint", "latest")
+    metrics = (finished / "eval" / "tlio_test_ekf_latest" / "metrics.json").read_text()
+    assert json.loads(metrics)["settings"]["filter"] == latest
 
 
 def test_a_copy_with_other_options_has_them(finished, tmp_path):
@@ -382,13 +384,10 @@ def test_options_survive_their_unconstrained_numbers():
 
 def test_a_later_stage_starts_from_what_the_filter_has_learnt(recording, finished, training):
     """The command makes the filter of that run the default; what it asks for wins."""
-    asked = TrainOptions(
-        init_from=str(finished),
-        through_filter=THROUGH,
-        filter=changed(OPTIONS, start={"velocity": 0.3}),
-    )
+    words = ["--init-from", str(finished), "--through-filter.learn", *THROUGH.learn]
     run = initial.initial_run(tiny(recording, "unused", init_from=str(finished)))
-    begins = defaults(asked).filter
+    call = Call("gnio train", words)
+    begins = experiment(read(train, call), call).filter
     assert begins == run.config.filter != OPTIONS
     config = tiny(recording, "unused", filter=changed(begins, start={"velocity": 0.3}))
     state = training._replace(config=config).new_state(run)

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
+from gnio_jax.config import ImportOptions
 from gnio_jax.data.importing import units
 from gnio_jax.data.importing.asl import read_asl
 from gnio_jax.data.importing.bags import KINDS
@@ -43,80 +44,69 @@ from gnio_jax.types import Sequence
 SLOW = 50.0
 """Hz below which the impacts of steps are lost; networks are trained on 100 and more (ours)."""
 
+NOTHING_STATED = ImportOptions()
 _COLUMNS = ("time", "accel_time", *GYRO, *ACCEL)
 
 
 def import_recording(
     path: str | os.PathLike[str],
-    columns: Mapping[str, str] | None = None,
+    options: ImportOptions = NOTHING_STATED,
     *,
-    accel_path: str | os.PathLike[str] | None = None,
-    time_unit: str | None = None,
-    gyro_unit: str | None = None,
-    accel_unit: str | None = None,
-    accel_sign: str | None = None,
-    order: str = "sort",
     rate: float | None = None,
-    separator: str | None = None,
     name: str | None = None,
-    imu_topic: str | None = None,
-    accel_topic: str | None = None,
-    reference_topic: str | None = None,
 ) -> Imported:
     """A recording as a `Sequence` on a uniform clock.
 
     `path`
         A zip, folder or workbook of Sensor Logger or phyphox, a bag or MCAP, a folder of EuRoC's
-        layout, or a CSV: the gyro's file, and the accelerometer's unless `accel_path` is given;
-        lines that begin with # are comments.
-    `columns`
-        Of a CSV, from our names to the file's: `time`, `gyro_x..z`, `accel_x..z`, and `accel_time`
-        if the accelerometer's time is another column. What is not mapped is looked up by our name.
-        "a+b" is the sum of two columns (gravity and user acceleration). In a file whose header
-        names nothing, or that has none, all are places counted from "0".
-    `time_unit`, `gyro_unit`, `accel_unit`
-        None takes what the format or the header says, e.g. "(rad/s)", and else detects it: s, ms,
-        us or ns by the rate of an IMU, 10 to 2000 Hz; rad/s or deg/s by `units.gyro_scale`; m/s2, g
-        or mg by the magnitude of gravity. What is ambiguous is refused.
-    `accel_sign`
-        "android": at rest, level, the up axis reads +1 g; "ios": it reads −1 g and everything is
-        negated; "detect" assumes that the screen (+z) points up more than down over the recording.
-        None takes what the format says, Android's for a CSV. Nothing in the data alone tells it.
-    `order`
-        Rows out of order are sorted and rows that are there twice dropped ("sort"), or refused.
+        layout, or a CSV: the gyro's file, and the accelerometer's unless `options.accel_path` is
+        given; lines that begin with # are comments.
+    `options`
+        What the recording does not say of itself. What `options.columns` leaves out is looked up by
+        our name. Rows out of order are sorted, of rows with one stamp the first counts, and a CSV's
+        separator is the most frequent of comma, semicolon and tab, or blanks.
     `rate`
         Hz of the result; None keeps the faster sensor's own.
-    `separator`
-        Of a CSV's columns; None takes the most frequent of comma, semicolon and tab, or blanks
-        where there is none of them.
     `name`
         Of the sequence; None takes that of the file.
-    `imu_topic`, `accel_topic`, `reference_topic`
-        Of a bag, see `ros.Topics`.
 
     Two sensors with stamps of their own are put on the faster one's over the time that both cover,
     by cubic splines. Raises `InputError` naming file, field and remedy.
     """
-    _check_choice("time_unit", time_unit, PER_SECOND)
-    _check_choice("gyro_unit", gyro_unit, units.TO_RAD_PER_SECOND)
-    _check_choice("accel_unit", accel_unit, units.TO_METRES_PER_SECOND_SQUARED)
-    _check_choice("accel_sign", accel_sign, units.SIGNS)
-    _check_choice("order", order, ("sort", "refuse"))
+    _check_choice("time_unit", options.time_unit, PER_SECOND)
+    _check_choice("gyro_unit", options.gyro_unit, units.TO_RAD_PER_SECOND)
+    _check_choice("accel_unit", options.accel_unit, units.TO_METRES_PER_SECOND_SQUARED)
+    _check_choice("accel_sign", options.accel_sign, units.SIGNS)
     if rate is not None and not 1.0 <= rate <= RATES[1]:
         raise InputError(
             "rate", f"{rate:g} Hz is no rate to resample to", f"give 1 to {RATES[1]:g} Hz"
         )
+    columns = _columns_of(options.columns)
     path = Path(path)
-    kind = "csv" if columns or accel_path is not None else recognise(path)
-    topics = Topics(imu_topic, accel_topic, reference_topic)
+    kind = "csv" if columns or options.accel_path is not None else recognise(path)
+    topics = Topics(options.imu_topic, options.accel_topic, options.reference_topic)
     if any(topics) and kind not in KINDS:
         raise InputError(path, "has no topics", "a topic is one of a ROS bag or an MCAP")
     if kind == "csv":
-        source = _read_csv(path, accel_path, dict(columns or {}), separator)
+        source = _read_csv(path, options.accel_path, columns)
     else:
         source = _read_other(path, kind, topics)
-    stated = Units(time_unit, gyro_unit, accel_unit, accel_sign)
-    return _imported(source, stated, order, rate, name or path.stem)
+    stated = Units(options.time_unit, options.gyro_unit, options.accel_unit, options.accel_sign)
+    return _imported(source, stated, rate, name or path.stem)
+
+
+def _columns_of(given: tuple[str, ...]) -> dict[str, str]:
+    """From our names to the file's, of words such as "gyro_x=wx"."""
+    columns = {}
+    for word in given:
+        ours, equals, theirs = word.partition("=")
+        if not (equals and theirs):
+            raise InputError("columns", f"'{word}' names no column", "write gyro_x=NAME")
+        if ours not in _COLUMNS:
+            known = f"known names: {', '.join(_COLUMNS)}"
+            raise InputError("columns", f"unknown name '{ours}'", known)
+        columns[ours] = theirs
+    return columns
 
 
 def _read_other(path: Path, kind: str, topics: Topics) -> Source:
@@ -131,10 +121,10 @@ def _read_other(path: Path, kind: str, topics: Topics) -> Source:
             return read_bag(path, kind, topics)
 
 
-def _imported(source: Source, stated: Units, order: str, rate: float | None, name: str) -> Imported:
+def _imported(source: Source, stated: Units, rate: float | None, name: str) -> Imported:
     """What any format comes to: `stated` wins over what the format says of its units."""
     notes = list(source.notes)
-    imu = _joined(source, stated, order, notes)
+    imu = _joined(source, stated, notes)
     sequence = _without_reference(imu, name, source.gyro.path)
     own = rounded_rate(imu.time)
     target = rate or own
@@ -174,12 +164,12 @@ def _check_motion_is_one(sequence: Sequence, track: Track) -> None:
         )
 
 
-def _joined(source: Source, stated: Units, order: str, notes: list[str]) -> Joined:
+def _joined(source: Source, stated: Units, notes: list[str]) -> Joined:
     """Both sensors on one clock, in SI units and with Android's sign."""
     gyro_file, accel_file, known = source.gyro, source.accel, source.units
     time_unit = stated.time or known.time
-    gyro = read_stream(gyro_file, time_unit, order, notes)
-    accel = read_stream(accel_file, time_unit, order, notes)
+    gyro = read_stream(gyro_file, time_unit, notes)
+    accel = read_stream(accel_file, time_unit, notes)
     _check_length(gyro, accel, source.path)
     scale = units.accel_scale(accel.values, stated.accel or known.accel, accel_file.path, notes)
     imu = join(gyro, _scaled(accel, scale), gyro_file.path, accel_file.path, notes)
@@ -219,22 +209,18 @@ def _read_csv(
     gyro_path: Path,
     accel_path: str | os.PathLike[str] | None,
     columns: dict[str, str],
-    separator: str | None,
 ) -> Source:
     """One file, or one of each sensor, with the columns that the user names."""
-    if unknown := sorted(set(columns) - set(_COLUMNS)):
-        known = ", ".join(sorted(_COLUMNS))
-        raise InputError("columns", f"unknown name '{unknown[0]}'", f"known names: {known}")
     time = columns.get("time", "time")
     gyro_axes, accel_axes = (
         tuple(columns.get(axis, axis) for axis in axes) for axes in (GYRO, ACCEL)
     )
-    table = read_table(gyro_path, separator, (time, *gyro_axes))
+    table = read_table(gyro_path, (time, *gyro_axes))
     gyro = SensorFile("gyro", gyro_path, table, time, gyro_axes)
     accel = SensorFile("accel", gyro_path, table, columns.get("accel_time", time), accel_axes)
     if accel_path is not None:
         own = Path(accel_path)
-        accel_table = read_table(own, separator, (accel.time, *accel_axes))
+        accel_table = read_table(own, (accel.time, *accel_axes))
         accel = accel._replace(path=own, table=accel_table)
     known = Units(
         gyro=units.common_unit(gyro.axes, units.TO_RAD_PER_SECOND),

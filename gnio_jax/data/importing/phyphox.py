@@ -109,7 +109,7 @@ def _tables(path: Path) -> list[_Table]:
             archives.check_announced(sum(member.file_size for member in members), path)
             return _of_workbook(path, "openpyxl")
         return _of_archive(path)
-    return [_Table(path, read_table(path, None, ()))]
+    return [_Table(path, read_table(path, ()))]
 
 
 def _of_archive(path: Path) -> list[_Table]:
@@ -119,7 +119,7 @@ def _of_archive(path: Path) -> list[_Table]:
         for name in names:
             if _sets(archives.labels(path, name)):
                 content = archives.content(path, name)
-                tables.append(_Table(path / name, read_table(path / name, None, (), content)))
+                tables.append(_Table(path / name, read_table(path / name, (), content)))
     return tables
 
 
@@ -148,7 +148,7 @@ def _events(path: Path) -> pd.DataFrame:
     for name in named:
         if name == EVENTS or name.endswith(f"/{EVENTS}"):
             try:
-                return read_table(path / name, None, (), archives.content(path, name))
+                return read_table(path / name, (), archives.content(path, name))
             except InputError:
                 return pd.DataFrame()
     return pd.DataFrame()

@@ -49,7 +49,7 @@ class _Export(NamedTuple):
 
     def table(self, sensor: str) -> pd.DataFrame:
         place = self.path / self.names[sensor]
-        return read_table(place, ",", (), content=archives.content(self.path, self.names[sensor]))
+        return read_table(place, (), content=archives.content(self.path, self.names[sensor]))
 
     def file(self, sensor: str) -> Path:
         return self.path / self.names[sensor]

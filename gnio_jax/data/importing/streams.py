@@ -15,7 +15,7 @@ from gnio_jax.data.parsing.stamps import PER_SECOND, RATES, in_order, time_unit
 from gnio_jax.data.parsing.tables import open_text
 from gnio_jax.data.readers.text import numbers, read_csv
 from gnio_jax.data.resampling import longest_bridge
-from gnio_jax.data.validation import check_finite, check_gaps, check_increasing
+from gnio_jax.data.validation import check_finite, check_gaps
 from gnio_jax.errors import InputError
 from gnio_jax.numerics import interpolate, neighbours
 
@@ -87,23 +87,22 @@ class Layout(NamedTuple):
     """The cells of the first row, without quotes."""
 
 
-def read_table(
-    path: Path, separator: str | None, columns: tuple[str, ...], content: bytes | None = None
-) -> pd.DataFrame:
+def read_table(path: Path, columns: tuple[str, ...], content: bytes | None = None) -> pd.DataFrame:
     """A logger's table; without a header where all `columns` are places.
 
-    `separator` None takes the most frequent of comma, semicolon and tab, or blanks where there is
-    none of them. `content` is what the file holds where it is part of an archive.
+    `content` is what the file holds where it is part of an archive.
     """
-    layout = table_layout(path, separator, content)
+    layout = table_layout(path, content)
     header = not (columns and all(name.isdigit() for name in columns))
     table = read_csv(path, layout.separator, header, content, layout.decimal)
     table.columns = [_label(label) for label in table.columns]
     return table
 
 
-def table_layout(path: Path, separator: str | None = None, content: bytes | None = None) -> Layout:
-    """The layout of a table, from its first rows. Raises `InputError` for what is no text."""
+def table_layout(path: Path, content: bytes | None = None) -> Layout:
+    """The layout of a table, from its first rows: it is separated by the most frequent of comma,
+    semicolon and tab, or by blanks where there is none of them. Raises `InputError` for what is no
+    text."""
     try:
         with open_text(path, content) as file:
             rows = (line for line in file if line.strip() and not line.startswith("#"))
@@ -112,9 +111,8 @@ def table_layout(path: Path, separator: str | None = None, content: bytes | None
         raise InputError(path, f"cannot be read ({error.strerror})") from None
     except UnicodeDecodeError as error:
         raise InputError(path, f"is no text ({error})", "export the recording as CSV") from None
-    if separator is None:
-        separator = max((",", ";", "\t"), key=first.count)
-        separator = separator if separator in first else " "
+    separator = max((",", ";", "\t"), key=first.count)
+    separator = separator if separator in first else " "
     comma = separator != "," and any(re.search(r"\d,\d", row) for row in others)
     decimal = "," if comma else "."
     labels = first.split(None if separator == " " else separator)
@@ -146,11 +144,11 @@ def _stamps(table: pd.DataFrame, name: str, path: Path) -> Num[np.ndarray, " n"]
 # --- one sensor
 
 
-def read_stream(source: SensorFile, unit: str | None, order: str, notes: list[str]) -> Stream:
+def read_stream(source: SensorFile, unit: str | None, notes: list[str]) -> Stream:
     """A sensor's samples in order.
 
-    `unit` of the stamps, None detects it; `order` "refuse" refuses rows out of order instead of
-    sorting them. What was detected or repaired is added to `notes`. Raises `InputError`.
+    `unit` of the stamps, None detects it. What was detected or repaired is added to `notes`. Raises
+    `InputError`.
     """
     sensor, path = source.sensor, source.path
     stamps = _stamps(source.table, source.time, path)
@@ -162,8 +160,6 @@ def read_stream(source: SensorFile, unit: str | None, order: str, notes: list[st
     stamps = stamps - first
     unit = unit or _detected_unit(stamps, source, notes)
     time = stamps / PER_SECOND[unit]
-    if order == "refuse":
-        check_increasing(time, path)
     time, values = _sorted(time, values, source, notes)
     rate = 1.0 / float(np.median(np.diff(time)))
     if not RATES[0] * 0.99 <= rate <= RATES[1] * 1.01:

@@ -1,9 +1,7 @@
 """Trajectories in the formats of other programs.
 
 - `tum`: `t x y z qx qy qz qw`, as `gnio evaluate` writes it (evo).
-- `kitti`: the 3 × 4 matrix [R p] of each pose in rows of twelve numbers, without stamps (evo).
 - `csv`: with the columns of our own dataset `csv`.
-- `geojson`, `gpx`: on the earth, where a first fix is known (`geographic`).
 - `mcap`: `nav_msgs/Odometry`, `nav_msgs/Path` and TF for Foxglove and ROS 2 (`ros`).
 """
 
@@ -17,21 +15,17 @@ from jaxtyping import Float
 from gnio_jax.data.readers.text import numbers, read_csv
 from gnio_jax.data.validation import check_finite, check_increasing, check_unit_norm
 from gnio_jax.errors import InputError, require_packages
-from gnio_jax.evaluation.exporting.geographic import FirstFix, write_geojson, write_gpx
 from gnio_jax.evaluation.exporting.ros import check_stamps, write_mcap
 from gnio_jax.evaluation.metrics import Trajectory
 from gnio_jax.evaluation.metrics.trajectory import finite_poses
 from gnio_jax.evaluation.tum import write_tum
 from gnio_jax.files import replacing
-from gnio_jax.numerics import matrix_from_quaternion, wxyz_from_xyzw
+from gnio_jax.numerics import wxyz_from_xyzw
 
 SUFFIXES = {
     ".tum": "tum",
     ".txt": "tum",
-    ".kitti": "kitti",
     ".csv": "csv",
-    ".geojson": "geojson",
-    ".gpx": "gpx",
     ".mcap": "mcap",
 }
 FORMATS = tuple(dict.fromkeys(SUFFIXES.values()))
@@ -43,14 +37,13 @@ def export(
     path: Path,
     trajectory: Trajectory,
     kind: str | None = None,
-    fix: FirstFix | None = None,
     covariance: Float[np.ndarray, "n 3 3"] | None = None,
 ) -> int:
     """Write a trajectory, whole or not at all, and return its number of poses.
 
     Rows that are not finite are left out. `kind` is one of `FORMATS`; None takes that of the
-    suffix. `fix` places the first pose on the earth (geojson, gpx). `covariance` is that of the
-    positions, m², an `Estimate.position_covariance` (mcap). Raises `InputError`.
+    suffix. `covariance` is that of the positions, m², an `Estimate.position_covariance` (mcap).
+    Raises `InputError`.
     """
     kind = kind or SUFFIXES.get(path.suffix.lower())
     if kind not in FORMATS:
@@ -59,31 +52,22 @@ def export(
     if not known.any():
         raise InputError(path, "the trajectory has no pose", "evaluate the recording again")
     poses = Trajectory(*(field[known] for field in trajectory))
-    check_format(path, kind, fix)
+    check_format(path, kind)
     if kind == "mcap":
         check_stamps(path, poses)
     with replacing(path) as temporary:
         match kind:
             case "tum":
                 write_tum(temporary, poses)
-            case "kitti":
-                _write_kitti(temporary, poses)
             case "csv":
                 _write_csv(temporary, poses)
-            case "geojson":
-                write_geojson(temporary, poses, fix, path.stem)
-            case "gpx":
-                write_gpx(temporary, poses, fix, path.stem)
             case _:
                 write_mcap(temporary, poses, None if covariance is None else covariance[known])
     return len(poses.time)
 
 
-def check_format(where: object, kind: str, fix: FirstFix | None) -> None:
-    """Raise `InputError` for a format that needs a first fix, or packages that are missing."""
-    if kind in ("geojson", "gpx") and fix is None:
-        remedy = "give --first-fix LAT LON --heading DEG"
-        raise InputError(where, f"{kind} needs a place on the earth", remedy)
+def check_format(where: object, kind: str) -> None:
+    """Raise `InputError` for a format whose packages are missing."""
     if kind == "mcap":
         require_packages(where, "bags", "mcap", "rosbags")
 
@@ -102,12 +86,6 @@ def read_trajectory(path: Path) -> Trajectory:
     everywhere = np.ones(len(rows), dtype=bool)
     wxyz = check_unit_norm(wxyz_from_xyzw(xyzw), everywhere, "qx qy qz qw", path)
     return Trajectory(time[:, 0], position, wxyz)
-
-
-def _write_kitti(path: Path, poses: Trajectory) -> None:
-    rotation = matrix_from_quaternion(poses.orientation)
-    matrices = np.concatenate([rotation, poses.position[:, :, None]], axis=2)
-    np.savetxt(path, matrices.reshape(-1, 12), fmt="%.9f")
 
 
 def _write_csv(path: Path, poses: Trajectory) -> None:

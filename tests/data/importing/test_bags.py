@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from gnio_jax.data.importing import bags, import_recording
+from gnio_jax.data.importing import bags
 from gnio_jax.errors import InputError
 from tests.support import bag_files, known_walk
 from tests.support.bag_files import EPOCH, KINDS, LOGGED, Maker, imu, poses, text, write
+from tests.support.importing import import_recording
 
 ONE = (Rotation.identity(), np.zeros(3))
 MOUNT = (Rotation.from_euler("zyx", [0.5, -1.1, 2.0]), np.array([0.1, -0.3, 0.25]))

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gnio_jax.data.importing import import_recording
 from gnio_jax.errors import InputError
 from tests.support import bag_files, logger_files
+from tests.support.importing import import_recording
 
 KINDS = ("walk.zip", "walk.xlsx", "walk.xls", "rosbag1", "mcap", "db3")
 

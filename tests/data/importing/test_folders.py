@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from gnio_jax.data.importing import import_recording
 from gnio_jax.errors import InputError
 from tests.support import asl_files, known_walk
 from tests.support.asl_files import EPOCH, Mount
+from tests.support.importing import import_recording
 
 LEVER = Mount(Rotation.from_euler("zyx", [0.4, 0.2, -0.9]), np.array([0.2, -0.1, 0.3]))
 

@@ -6,10 +6,11 @@ import numpy as np
 import openpyxl
 import pytest
 
-from gnio_jax.data.importing import archives, import_recording
+from gnio_jax.data.importing import archives
 from gnio_jax.data.importing.units import named_unit
 from gnio_jax.errors import InputError
 from tests.support import known_walk, logger_files
+from tests.support.importing import import_recording
 from tests.support.logger_files import (
     DELAY,
     EPOCH,

@@ -1,0 +1,123 @@
+"""`gnio data import`, `gnio data export`: what other programs have written, and what they read."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import tyro
+
+from gnio_jax.commands import console, options
+from gnio_jax.config import ImportOptions
+from gnio_jax.errors import InputError
+
+HDF5 = (".h5", ".hdf5")
+
+
+@dataclass(frozen=True)
+class ImportFile:
+    """What `gnio data import` is asked for."""
+
+    file: tyro.conf.Positional[Path]
+    """The recording: a file or folder; of two CSVs the gyro's."""
+    out: Path
+    """HDF5 file to write, NAME.h5."""
+    rate: float | None = None
+    """Rate of the result, Hz; by default that of the faster sensor."""
+    name: str | None = None
+    """Name of the sequence; by default that of the file OUT."""
+    recording: tyro.conf.OmitArgPrefixes[ImportOptions] = ImportOptions()  # noqa: RUF009 - it is frozen
+
+
+@dataclass(frozen=True)
+class ExportFile:
+    """What `gnio data export` is asked for."""
+
+    trajectory: tyro.conf.Positional[Path]
+    """File in TUM format."""
+    out: tyro.conf.Positional[Path]
+    """File to write: .mcap, .csv or .tum."""
+    format: Literal["tum", "csv", "mcap"] | None = None
+    """Format, where the ending of OUT does not tell it."""
+
+
+def import_file(asked: ImportFile, _call: options.Call) -> None:
+    """A recording of a phone or robot as the package's HDF5.
+
+    The format is recognised by the content: a zip or folder of Sensor Logger or phyphox, a ROS bag
+    or MCAP, a folder of EuRoC's layout, a CSV. Units are those of the format or of a header, or
+    they are detected; what was assumed is printed. A recording without a reference is evaluated
+    with --init static.
+
+    examples:
+      {prog} walk.zip --out recordings/walk.h5
+      {prog} walk.bag --imu-topic /imu --out recordings/walk.h5
+      {prog} robot.csv --columns time=stamp gyro_x=wx gyro_y=wy gyro_z=wz accel_x=ax \\
+          accel_y=ay accel_z=az --time-unit ms --out recordings/robot.h5
+      {prog} Gyroscope.csv --accel-path Accelerometer.csv --columns "time=Time (s)" \\
+          "gyro_x=X (rad/s)" "gyro_y=Y (rad/s)" "gyro_z=Z (rad/s)" "accel_x=X (m/s^2)" \\
+          "accel_y=Y (m/s^2)" "accel_z=Z (m/s^2)" --out recordings/walk.h5
+      {prog} ios.csv --accel-sign ios --gyro-unit deg/s --rate 100 --out recordings/ios.h5
+    """
+    if asked.out.suffix.lower() not in HDF5:
+        raise InputError("--out", f"'{asked.out}' is no name of an HDF5 file", "name it NAME.h5")
+    if asked.out.is_dir():
+        raise InputError("--out", f"'{asked.out}' is a folder", "name a file in it, NAME.h5")
+    from gnio_jax.data.checking import impressions  # late: mistakes do not wait for JAX
+    from gnio_jax.data.importing.kept import write_imported
+    from gnio_jax.data.readers import csv_files
+
+    recording = _read(asked.file, asked.recording, asked.rate, asked.name or asked.out.stem)
+    write_imported(asked.out, recording)
+    sequence, folder = recording.sequence, asked.out.parent
+    notes = [*recording.notes, *impressions(sequence)]
+    lists = [split for split in csv_files.SPLITS if (folder / f"{split}.txt").is_file()]
+    if lists:
+        line = f"add the line {asked.out.stem} to {lists[-1]}.txt, or it is not read"
+        notes.append(f"{folder} has lists: {line}")
+    output = console.stdout()
+    output.print(f"{asked.out}: {sequence.name}", soft_wrap=True)
+    for note in notes:
+        output.print(f"  {note}", soft_wrap=True)
+    start = "" if sequence.valid.any() else " --init static"
+    following = f"gnio evaluate --dataset csv --data-root {folder} --split test{start}"
+    output.print(f"next: {following}", soft_wrap=True)
+
+
+def read_any(file: Path, stated: ImportOptions) -> Any:
+    """An `importing.Imported` of the file; our own HDF5 is read as it is."""
+    from gnio_jax.data.importing.kept import read_imported
+
+    return read_imported(file) if file.suffix.lower() in HDF5 else _read(file, stated)
+
+
+def _read(
+    file: Path, stated: ImportOptions, rate: float | None = None, name: str | None = None
+) -> Any:
+    """The recording as an `importing.Imported`, whose notes have the warnings too."""
+    from gnio_jax.data.importing import import_recording
+
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        found = import_recording(file, stated, rate=rate, name=name)
+    warned = (str(warning.message) for warning in caught)
+    return found._replace(notes=(*found.notes, *warned))
+
+
+def export_file(asked: ExportFile, _call: options.Call) -> None:
+    """A trajectory that gnio evaluate or gnio track left, in the format of another program.
+
+    examples:
+      {prog} trajectories/walk.txt walk.mcap        Foxglove, ROS 2
+      {prog} trajectories/walk.txt walk.csv
+    """
+    if asked.out.is_dir():
+        raise InputError("OUT", f"'{asked.out}' is a folder", "name a file in it")
+    from gnio_jax.evaluation import exporting  # late: mistakes do not wait for JAX
+
+    trajectory = exporting.read_trajectory(asked.trajectory)
+    count = exporting.export(asked.out, trajectory, asked.format)
+    seconds = trajectory.time[-1] - trajectory.time[0]
+    console.stdout().print(f"{asked.out}: {count} poses, {seconds:.1f} s", soft_wrap=True)
