@@ -89,8 +89,8 @@ class Pose(NamedTuple):
 
 PoseVector = Float[Array, "l"]
 """A `Pose` without its time, so that one transfer from the device is enough: rotation, velocity,
-position, biases, covariance, accepted, nis, healthy."""
-_SIZES = (9, 3, 3, 3, 3, 225, 1, 1, 1)
+position, biases, covariance, and the flags accepted, nis and healthy."""
+_SIZES = (9, 3, 3, 3, 3, 225, 3)
 _SPLITS = np.cumsum(_SIZES)[:-1]
 
 
@@ -259,16 +259,22 @@ class Tracker:
 
     def _as_pose(self, vector: PoseVector, ahead: int) -> Pose:
         """On the host, at the end of the interval of the last sample taken, or of one `ahead`."""
-        rotation, *vectors, covariance, accepted, nis, healthy = np.split(np.array(vector), _SPLITS)
+        rotation, velocity, position, gyro_bias, accel_bias, covariance, flags = np.split(
+            np.array(vector), _SPLITS
+        )
+        accepted, nis, healthy = flags.tolist()
         samples = self._stream.taken + ahead
         return Pose(
-            self._stream.origin + samples * self._config.dt,
-            rotation.reshape(3, 3),
-            *vectors,
-            covariance.reshape(15, 15),
-            accepted.item(),
-            nis.item(),
-            bool(healthy.item() > 0),
+            time=self._stream.origin + samples * self._config.dt,
+            rotation=rotation.reshape(3, 3),
+            velocity=velocity,
+            position=position,
+            gyro_bias=gyro_bias,
+            accel_bias=accel_bias,
+            covariance=covariance.reshape(15, 15),
+            accepted=accepted,
+            nis=nis,
+            healthy=healthy > 0,
         )
 
 
@@ -373,16 +379,13 @@ def look_ahead(
 
     Its covariance is P + S C Sᵀ where errors are considered: both parts take the same transition.
     """
-    rotation, velocity, position, *biases, covariance, accepted, nis, healthy = jnp.split(
-        pose, _SPLITS
-    )
+    rotation, velocity, position, *biases, covariance, flags = jnp.split(pose, _SPLITS)
     start = Mean(rotation.reshape(3, 3), velocity, position, *biases)
     imu, _, memory = bridge(row[None, GYRO], row[None, ACCEL], row[None, VALID] > 0, memory, config)
     ahead = integrate(start, imu, noise, config.dt)
     transition = jnp.concatenate([ahead.transition, jnp.eye(15, dtype=pose.dtype)[BIASES]])
     covariance = transition @ covariance.reshape(15, 15) @ transition.T + ahead.noise
     mean = Mean(ahead.rotation, ahead.velocity, ahead.position, *biases)
-    flags = jnp.concatenate([accepted, nis, healthy])
     return _pose_vector(mean, 0.5 * (covariance + covariance.T), flags), memory
 
 
