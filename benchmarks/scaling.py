@@ -1,7 +1,6 @@
 """Windows per second over devices and processes of this machine, and where GPUs would stop scaling.
 
     python -m benchmarks.scaling [--width 16] [--batch 128] [--layouts 1x1 1x2 2x1 2x2]
-    python -m benchmarks.scaling --residency [--width 16] [--batch 128] [--hours 5]
     python -m benchmarks.scaling --model
 
 A layout is PROCESSESxDEVICES on localhost. Strong scaling keeps the batch; weak scaling gives every
@@ -9,10 +8,6 @@ device a batch of its own. All devices share this machine's cores, so that the w
 that of one device and what it loses is the cost of sharing: partitions, sums, processes. Each
 layout runs in processes of its own, in turn. Compile time is not counted; the best of the repeats
 counts.
-
-`--residency` compares recordings on the device with recordings on the disk (`data.residency`), each
-in a process of its own: windows/s, and the memory that the process has besides the program and
-mapped files. Windows of 200 samples start every 20 samples.
 
 `--model` counts the sums over devices in the compiled step of the paper's network and prints what
 they would cost on 8, 64 and 512 GPUs. It is a model on paper, with its assumptions; nothing of it
@@ -27,7 +22,6 @@ import socket
 import subprocess
 import sys
 import time
-from pathlib import Path
 from typing import NamedTuple
 
 import jax
@@ -36,17 +30,10 @@ import numpy as np
 from flax import linen as nn
 
 from benchmarks.train_step import recordings
+from gnio_jax import parallel
 from gnio_jax.config import ModelConfig, OptimConfig, TrainConfig
-from gnio_jax.data import cache
-from gnio_jax.data.on_disk import source_on_disk
-from gnio_jax.data.windows import WindowSource, joined
-from gnio_jax.scaling import devices
-from gnio_jax.scaling.meeting import Meeting
-from gnio_jax.scaling.processes import is_first, meet
-from gnio_jax.training import optimizer as optimizers
-from gnio_jax.training.checkpoint import create_model
-from gnio_jax.training.step import create_state, train_steps
-from gnio_jax.training.supply import FromHost, OnDevice
+from gnio_jax.training import optimizer
+from gnio_jax.training.window_task import create_model, initial_state, train_steps
 
 STEPS = 8
 """Steps per dispatch."""
@@ -75,21 +62,20 @@ def configuration(width: int, batch: int) -> TrainConfig:
 def prepared(config: TrainConfig, model: nn.Module):
     """A function that takes a state through STEPS steps, the state, and its program."""
     samples = config.data.seen
-    optimizer = optimizers.create(config.optim, config.loss, 1000)
-    source = devices.everywhere(jax.device_get(recordings(samples, config.optim.batch_size)))
-    state = devices.everywhere(create_state(model, optimizer, jax.random.key(0), samples))
-    order = devices.everywhere(np.arange(source.start.shape[0], dtype=np.int32))
+    source = parallel.everywhere(jax.device_get(recordings(samples, config.optim.batch_size)))
+    state = initial_state(model, jax.random.key(0), samples)
+    adam = optimizer.adam(config.optim, config.loss, 1000)
+    state = parallel.everywhere(state._replace(opt_state=adam.init(state.params)))
+    order = parallel.everywhere(np.arange(source.start.shape[0], dtype=np.int32))
     given = (source, order, jnp.int32(0), jnp.int32(STEPS), jnp.float32(1), jax.random.key(1))
-    static = {"model": model, "optimizer": optimizer, "config": config}
+    static = {"model": model, "config": config, "steps_per_epoch": 1000}
     return lambda state: train_steps(state, *given, **static), state, (given, static)
 
 
 def work(arguments: argparse.Namespace) -> None:
     """Measure in one of the processes of a layout; the first prints windows/s and memory."""
-    count, own, coordinator = arguments.worker
-    devices.cpu_devices(arguments.devices)
-    meet(Meeting(coordinator, int(count), int(own)) if int(count) > 1 else Meeting())
-    with devices.sharing(devices.chosen(arguments.devices)):
+    parallel.initialise(arguments.worker, arguments.devices)
+    with parallel.sharing(arguments.devices):
         config = configuration(arguments.width, arguments.batch)
         run, state, _ = prepared(config, create_model(config))
         best = math.inf
@@ -98,7 +84,7 @@ def work(arguments: argparse.Namespace) -> None:
             state, progress = run(state)
             jax.block_until_ready(progress)
             best = min(best, time.perf_counter() - began)
-    if is_first():
+    if parallel.is_first():
         memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
         print(f"{STEPS * arguments.batch / best:.0f} {memory:.0f}")
 
@@ -113,7 +99,7 @@ def measured(layout: str, width: int, batch: int, repeats: int) -> tuple[float, 
     command += ["--width", str(width), "--batch", str(batch), "--repeats", str(repeats)]
     started = [
         subprocess.Popen(
-            [*command, "--worker", str(processes), str(k), coordinator],
+            [*command, "--worker", f"{coordinator},{processes},{k}"],
             stdout=subprocess.PIPE,
             text=True,
         )
@@ -143,75 +129,14 @@ def measure(arguments: argparse.Namespace) -> None:
             )
 
 
-def supplied_steps(arguments: argparse.Namespace) -> None:
-    """Measure with the recordings where `arguments.supply` says; print windows/s and MiB."""
-    config = configuration(arguments.width, arguments.batch)
-    network, samples = create_model(config), config.data.seen
-    optimizer = optimizers.create(config.optim, config.loss, 1000)
-    state = create_state(network, optimizer, jax.random.key(0), samples)
-    size, supply = config.optim.batch_size, OnDevice()
-    parts = (hour(samples) for _ in range(arguments.hours))
-    if arguments.supply == "host":
-        supply, source = FromHost(size, samples, 0), source_on_disk(parts, cache.folder())
-    else:
-        source = devices.everywhere(joined(parts))
-    order = np.random.default_rng(0).permutation(len(source.start)).astype(np.int32)
-    epoch = supply.epoch(source, jnp.asarray(order))
-    static = {"model": network, "optimizer": optimizer, "config": config, "steps_per_epoch": 1000}
-    best = math.inf
-    for repeat in range(arguments.repeats + 1):  # the first compiles
-        began = time.perf_counter()
-        for part in epoch.parts(repeat * 4 * STEPS, 4 * STEPS):
-            numbers = jnp.int32(part.first), jnp.int32(part.count), jnp.float32(1)
-            given = (part.source, part.order, *numbers, jax.random.key(1))
-            state, progress = train_steps(state, *given, **static)
-            jax.block_until_ready(progress)
-        best = min(best, time.perf_counter() - began)
-    print(f"{4 * STEPS * size / best:.0f} {own_memory():.0f}")
-
-
-def hour(samples: int) -> WindowSource:
-    """Random numbers in the shape of an hour of recording at 200 Hz."""
-    rng, rows = np.random.default_rng(0), 720_000
-    start = np.arange(0, rows - samples, samples // 10, dtype=np.int32)
-    count = len(start)
-    return WindowSource(
-        imu=rng.standard_normal((rows, 6), np.float32),
-        start=start,
-        rotation=np.tile(np.eye(3, dtype=np.float32), (count, 1, 1)),
-        displacement=rng.standard_normal((count, 3), np.float32),
-        step=np.zeros((rows, 3), np.float32),
-        unyaw=np.tile(np.float32([1, 0]), (count, 1)),
-        visited=np.arange(count, dtype=np.int32),
-    )
-
-
-def own_memory() -> float:
-    """MiB of this process that are no file's."""
-    lines = Path("/proc/self/status").read_text().splitlines()
-    return next(int(line.split()[1]) / 1024 for line in lines if line.startswith("RssAnon"))
-
-
-def compare_residencies(arguments: argparse.Namespace) -> None:
-    """The table of both residencies."""
-    print(f"width {arguments.width}, batch {arguments.batch}, {arguments.hours} h at 200 Hz:")
-    for supply in ("device", "host"):
-        command = [sys.executable, "-m", "benchmarks.scaling", "--supply", supply]
-        for name in ("width", "batch", "repeats", "hours"):
-            command += [f"--{name}", str(getattr(arguments, name))]
-        done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
-        rate, memory = (float(word) for word in done.stdout.split()[-2:])
-        print(f"  {supply:>6s}  {rate:8,.0f} windows/s  {memory:6,.0f} MiB", flush=True)
-
-
 def model(batch: int) -> None:
     """Time of a step of the paper's network on many GPUs, from its operations and its sums."""
-    devices.cpu_devices(2)
+    parallel.initialise(devices=2)
     # A small batch compiles in seconds; operations of a window and sums of a step are the same.
     config = configuration(64, 16)
     network = create_model(config).clone(winograd=False)  # as on a GPU
     flops = flops_per_window(config, network)
-    with devices.sharing(devices.chosen(2)):
+    with parallel.sharing(2):
         _, state, (given, static) = prepared(config, network)
         text = train_steps.lower(state, *given, **static).compile().as_text()
     sums = [
@@ -282,19 +207,12 @@ def main() -> None:
     parser.add_argument("--batch", type=int, default=128)
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--layouts", nargs="+", default=["1x1", "1x2", "2x1", "2x2"])
-    parser.add_argument("--hours", type=int, default=5)
-    parser.add_argument("--residency", action="store_true")
     parser.add_argument("--model", action="store_true")
-    parser.add_argument("--supply", choices=["device", "host"], help=argparse.SUPPRESS)
-    parser.add_argument("--worker", nargs=3, help=argparse.SUPPRESS)
+    parser.add_argument("--worker", help=argparse.SUPPRESS)
     parser.add_argument("--devices", type=int, default=1, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.worker:
         work(arguments)
-    elif arguments.supply:
-        supplied_steps(arguments)
-    elif arguments.residency:
-        compare_residencies(arguments)
     elif arguments.model:
         model(1024)
     else:

@@ -23,18 +23,18 @@ import numpy as np
 from benchmarks import baseline
 from gnio_jax.config import DataConfig, ModelConfig, OptimConfig, TrainConfig
 from gnio_jax.data.windows import WindowSource, gather
-from gnio_jax.training import optimizer as optimizers
-from gnio_jax.training.batch_statistics import (
+from gnio_jax.training import optimizer
+from gnio_jax.training.losses import loss_stage, losses
+from gnio_jax.training.window_task import (
+    create_model,
     estimate_statistics,
-    statistics_batches,
+    initial_state,
     statistics_order,
+    train_steps,
 )
-from gnio_jax.training.checkpoint import create_model
-from gnio_jax.training.losses import losses, stage
-from gnio_jax.training.step import create_state, train_steps
 
-STEPS = 4
-"""Steps per dispatch, as in the training loop."""
+STEPS, STEPS_PER_EPOCH = 4, 1000
+"""Steps per dispatch, as in the training loop, and those of the schedule."""
 
 
 def recordings(samples: int, batch: int) -> WindowSource:
@@ -61,8 +61,9 @@ def ours(config: TrainConfig):
     """
     size, samples = config.optim.batch_size, config.data.seen
     source, model = recordings(samples, size), create_model(config)
-    optimizer = optimizers.create(config.optim, config.loss, 1000)
-    holder = [create_state(model, optimizer, jax.random.key(0), samples)]
+    state = initial_state(model, jax.random.key(0), samples)
+    adam = optimizer.adam(config.optim, config.loss, STEPS_PER_EPOCH)
+    holder = [state._replace(opt_state=adam.init(state.params))]
     order, key = jnp.arange(source.start.shape[0], dtype=jnp.int32), jax.random.key(1)
     fixed = jax.jit(gather, static_argnums=2)(source, order[:size], samples)
 
@@ -77,8 +78,8 @@ def ours(config: TrainConfig):
             factor,
             key,
             model=model,
-            optimizer=optimizer,
             config=config,
+            steps_per_epoch=STEPS_PER_EPOCH,
         )
         jax.block_until_ready(progress)
         return STEPS
@@ -90,7 +91,8 @@ def ours(config: TrainConfig):
             train=True,
             mutable=["batch_stats"],
         )
-        return losses(prediction, windows, config.loss, stage(config.loss, 0, 1000)).total, changed
+        stage = loss_stage(config.loss, 0, STEPS_PER_EPOCH)
+        return losses(prediction, windows, config.loss, stage).total, changed
 
     gradient = jax.jit(jax.grad(objective, has_aux=True))
     params, batch_stats = jax.tree.map(jnp.copy, (holder[0].params, holder[0].batch_stats))
@@ -103,7 +105,7 @@ def ours(config: TrainConfig):
         order = statistics_order(key, source, config)
         estimated = estimate_statistics(holder[0], source, order, key, model=model, config=config)
         jax.block_until_ready(estimated.batch_stats)
-        return statistics_batches(source, config)
+        return len(order) // size
 
     return {"whole step": whole, "bare gradient": bare, "batch of statistics": statistics}
 

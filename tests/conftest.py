@@ -47,7 +47,7 @@ gc.set_threshold(100_000, 50, 100)
 # The files that take longest, in this order: begun first, they leave no worker alone at the end.
 LONGEST = (
     "training/test_statistics.py",
-    "scaling/test_processes.py",
+    "test_parallel.py",
     "test_installed.py",
     "tables/test_tables.py",
     "training/test_through_filter.py",
@@ -62,7 +62,6 @@ LONGEST = (
     "evaluation/test_estimation.py",
     "filtering/test_smoother.py",
     "test_docs.py",
-    "training/test_supply.py",
     "data/test_fuzz.py",
     "models/test_gnio.py",
 )

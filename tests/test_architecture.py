@@ -9,7 +9,7 @@ import pytest
 PACKAGE = Path(__file__).parents[1] / "gnio_jax"
 
 BASE = {"config", "cores", "decimation", "errors", "files", "geometry", "numerics", "reporting"}
-BASE |= {"scaling", "types", "windows"}
+BASE |= {"parallel", "types", "windows"}
 ROOMS = {
     "data": BASE,
     "models": BASE,
@@ -37,7 +37,6 @@ LIBRARIES = {
     "flax": {"models", "training", "evaluation", "interop"},
     "jax2onnx": {"deployment.conversion"},
     "mcap": {"data.importing.bags", "evaluation.exporting.ros"},
-    "grain": {"training.supply"},
     "matplotlib": {"data", "evaluation", "comparison", "tables", "tracking"},
     "onnx": {"deployment"},
     "onnxruntime": {"deployment"},
@@ -48,7 +47,7 @@ LIBRARIES = {
     "rich.console.Console": {"commands"},
     "rich.progress": {"commands"},
     "safetensors": {"pretrained.arrays"},
-    "tensorboardX": {"training.log"},
+    "tensorboardX": {"training.run_folder"},
     "tyro": {"commands", "config"},
 }
 """Libraries that only these rooms or modules import."""

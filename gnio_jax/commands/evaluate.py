@@ -11,13 +11,12 @@ import tyro
 
 from gnio_jax import config as configuration
 from gnio_jax.commands import console, options
-from gnio_jax.commands.together import MeetingOptions
 from gnio_jax.config import EvaluateConfig, FilterSettings
 from gnio_jax.cores import usable_cores
 
 
 @dataclass(frozen=True)
-class EvaluateOptions(EvaluateConfig, MeetingOptions):
+class EvaluateOptions(EvaluateConfig):
     """What `gnio evaluate` is asked for, and what it takes from the run."""
 
     set: Annotated[
@@ -25,6 +24,9 @@ class EvaluateOptions(EvaluateConfig, MeetingOptions):
     ] = ()
     """A setting of the run's filter by its name in YAML; it may be given several times."""
     batch_size: tyro.conf.Suppress[tyro.conf.Fixed[int]] = EvaluateConfig.batch_size
+    distributed: Annotated[str | None, tyro.conf.arg(metavar="HOST:PORT,PROCESSES,ID")] = None
+    """Where process 0 listens, how many processes there are, and the number of this one; Slurm,
+    Open MPI and Kubernetes need nothing."""
     filter: tyro.conf.Suppress[tyro.conf.Fixed[FilterSettings]] = field(
         default_factory=FilterSettings
     )
@@ -49,20 +51,19 @@ def evaluate(asked: EvaluateOptions, call: options.Call) -> None:
     asked = dataclasses.replace(asked, workdir=str(workdir))
     import jax  # late: mistakes do not wait for it
 
-    from gnio_jax import evaluation, filtering
+    from gnio_jax import evaluation, filtering, parallel
     from gnio_jax.evaluation import table
     from gnio_jax.evaluation.run import run_config
-    from gnio_jax.scaling import processes
 
     jax.config.update("jax_enable_x64", True)  # for the filter; the network states its float32
     filtering.cores_as_devices()
-    processes.meet(asked.meeting(), "evaluate")
+    parallel.initialise(asked.distributed)
     if (workdir / "config.yaml").is_file():
         asked = dataclasses.replace(asked, filter=run_config(workdir, asked.checkpoint).filter)
     asked = configuration.assign(asked, asked.set)
-    with processes.running(), console.terminal(shown=processes.is_first()) as terminal:
+    with console.terminal(shown=parallel.is_first()) as terminal:
         found, folder = evaluation.evaluate(asked, terminal.progress, usable_cores(), str(call))
-    if not processes.is_first():
+    if not parallel.is_first():
         return
     output = console.stdout()
     output.print(table.render(found))

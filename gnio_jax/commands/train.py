@@ -11,13 +11,12 @@ import tyro
 
 from gnio_jax import config as configuration
 from gnio_jax.commands import console, options
-from gnio_jax.commands.together import MeetingOptions
 from gnio_jax.config import ConsideredStd, FilterSettings, TrainConfig
 from gnio_jax.cores import usable_cores
 
 
 @dataclass(frozen=True)
-class TrainOptions(TrainConfig, MeetingOptions):
+class TrainOptions(TrainConfig):
     """What `gnio train` is asked for: an experiment, and where its settings come from."""
 
     config: Annotated[str | None, tyro.conf.arg(metavar="FILE")] = None
@@ -33,6 +32,9 @@ class TrainOptions(TrainConfig, MeetingOptions):
     devices: int | None = None
     """Devices of each process that share a batch; by default all of its GPUs, or the one that a CPU
     is."""
+    distributed: Annotated[str | None, tyro.conf.arg(metavar="HOST:PORT,PROCESSES,ID")] = None
+    """Where process 0 listens, how many processes there are, and the number of this one; Slurm,
+    Open MPI and Kubernetes need nothing."""
     filter: tyro.conf.Suppress[tyro.conf.Fixed[FilterSettings]] = field(
         default_factory=FilterSettings
     )
@@ -59,16 +61,13 @@ def train(asked: TrainOptions, call: options.Call) -> None:
       {prog} --config through_filter_oxiod --init-from runs/oxiod_calibrated --workdir runs/through
     """
     config = experiment(asked, call)
-    from gnio_jax import filtering, pretrained  # late: mistakes do not wait for JAX
-    from gnio_jax.scaling import devices, processes
-    from gnio_jax.training import loop, run_folder
+    from gnio_jax import filtering, parallel, pretrained  # late: mistakes do not wait for JAX
+    from gnio_jax.training import loop
 
     if config.through_filter.learn:
         filtering.cores_as_devices()  # the filter's operations are too small for several cores
-    elif asked.devices:
-        devices.cpu_devices(asked.devices)
-    processes.meet(asked.meeting(), f"train {run_folder.identity(config)}")
-    with processes.running(), console.terminal(shown=processes.is_first()) as terminal:
+    parallel.initialise(asked.distributed, asked.devices)
+    with console.terminal(shown=parallel.is_first()) as terminal:
         load = pretrained.load_pretrained
         given = (asked.resume, terminal, usable_cores(), asked.devices, load)
         try:
@@ -80,7 +79,7 @@ def train(asked: TrainOptions, call: options.Call) -> None:
             terminal.line(str(error))
             sys.exit(1)
     stopped_by = next((each.stopped_by for each in outcomes if each.stopped_by), None)
-    if not processes.is_first():
+    if not parallel.is_first():
         pass
     elif stopped_by:
         workdir = configuration.default_workdir(config)
@@ -90,7 +89,11 @@ def train(asked: TrainOptions, call: options.Call) -> None:
     else:
         for outcome in outcomes:
             following = f"{call.prog.replace('train', 'evaluate')} --workdir {outcome.workdir}"
-            print(f"best on validation {outcome.best_loss:.4g}; look at it with: {following}")
+            if outcome.best_loss is None:
+                problem = "no epoch had a figure on validation that is a number"
+                print(f"{outcome.workdir}: {problem}", file=sys.stderr)
+            else:
+                print(f"best on validation {outcome.best_loss:.4g}; look at it with: {following}")
     if stopped_by:
         sys.exit(128 + stopped_by)
 

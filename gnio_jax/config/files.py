@@ -333,8 +333,7 @@ def validate(config: TrainConfig, source: str = "config") -> TrainConfig:
     place = Place(source)
     for name, hint, value in named(config):
         _check_bounds(hint, value, place.below(name))
-    for name in ("data", "optim", "through_filter"):
-        getattr(config, name).check(place.below(name))
+    config.data.check(place.below("data"))
     config.check(place)
     return config
 
@@ -476,6 +475,14 @@ def _of_today(fields: dict, source: str) -> dict:
         if count != 1:
             data["train_split"] = f"{data.get('train_split', 'train')}-{left_out}of{count}"
         new["data"] = data
+    augment = new.get("augment")
+    if isinstance(augment, dict) and augment.keys() & {"gyro_noise", "accel_noise"}:
+        kept = {name: each for name, each in augment.items() if not name.endswith("_noise")}
+        kept["noise"] = [augment.get("gyro_noise", 0.0), augment.get("accel_noise", 0.0)]
+        new["augment"] = kept
+    if "checkpoint_every_seconds" in fields and isinstance(new.get("loss"), dict):
+        # A whole config.yaml of an earlier version, whose likelihood always had this bound.
+        new["loss"] = {"outlier_sigmas": 10.0, **new["loss"]}
     if isinstance(new.get("filter"), dict):
         new["filter"] = _filter_of_today(new["filter"])
     return new

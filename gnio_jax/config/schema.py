@@ -50,7 +50,6 @@ SHARE = Bound(lambda value: 0 <= value < 1, "must be at least 0 and below 1")
 Positive = Annotated[float, ABOVE_ZERO]
 NonNegative = Annotated[float, NOT_NEGATIVE]
 Finite = Annotated[float, Bound(math.isfinite, "must be finite")]
-Fraction = Annotated[float, Bound(lambda value: 0 < value < 1, "must be between 0 and 1")]
 Probability = Annotated[float, SHARE]
 Count = Annotated[int, Bound(lambda value: 1 <= value < 2**31, "must be at least 1 and below 2^31")]
 NonNegativeCount = Annotated[
@@ -90,10 +89,6 @@ class DataConfig:
     were not learnt from (ours)."""
     val_split: str = "val"
     """Split of the dataset for validation, which chooses the best checkpoint."""
-    residency: Literal["device", "host", "auto"] = "device"
-    """Where recordings lie in training on windows: on the device, or on the disk, from which
-    batches are read ahead; auto: on the disk if they take more than half of the device's memory.
-    The numbers are the same (ours)."""
 
     @property
     def window(self) -> int:
@@ -146,10 +141,8 @@ class AugmentConfig:
     """Largest tilt of gravity about a random horizontal axis, degrees."""
     yaw: bool = True
     """Turn window and target by a random yaw; through the filter, piece and reference."""
-    gyro_noise: NonNegative = 0.0
-    """Standard deviation of white gyro noise, rad/s."""
-    accel_noise: NonNegative = 0.0
-    """Standard deviation of white accelerometer noise, m/s²."""
+    noise: tuple[NonNegative, NonNegative] = (0.0, 0.0)
+    """Standard deviations of white noise of gyro (rad/s) and accelerometer (m/s²)."""
     shift_samples: NonNegativeCount = 0
     """Shift a training window by up to this many samples either way, where the recording allows it
     (RoNIN, DeepILS)."""
@@ -164,7 +157,7 @@ class ModelConfig:
     """Network in the registry of `gnio_jax.models`."""
     width: Count | None = None
     """Channels of the first encoder group; the others follow (gnio, tlio, ronin_resnet, deepils:
-    64)."""
+    64). Features of a sample (ctin: 96)."""
     bank_size: NonNegativeCount | None = None
     """Prototypes in the Motion Bank; 0 leaves the bank out (gnio: 64)."""
     bank_std: Positive | None = None
@@ -210,6 +203,9 @@ class LossConfig:
     alone (TLIO: 10)."""
     log_std_floor: Finite | None = None
     """Smallest log standard deviation in the likelihood (TLIO: log 1e-3); none by default."""
+    outlier_sigmas: Positive | None = None
+    """Standard deviations beyond which the likelihood of an error grows only with its logarithm
+    (ours, e.g. 10); none by default, as in the paper."""
 
 
 @dataclass(frozen=True)
@@ -218,32 +214,23 @@ class OptimConfig:
     networks."""
 
     schedule: Literal["cosine", "constant", "plateau"] = "cosine"
-    """Learning rate after the warm-up: cosine decay to the last step, constant, or reduced whenever
-    the validation error no longer falls."""
+    """Learning rate after the warm-up: cosine decay to 1e-6 at the last step, constant, or a tenth
+    whenever the squared error on the validation split has not fallen for 10 epochs (RoNIN,
+    DeepILS)."""
     epochs: Count = 200
     """Passes over the training windows."""
     batch_size: Count = 1024
     """Windows per step."""
-    accumulate: Count = 1
-    """Parts of a batch whose gradients are computed one after another and averaged: less memory for
-    the same step. In training, batch normalisation then sees a part."""
     learning_rate: Positive = 1e-4
     """Peak learning rate, reached after the warm-up."""
     start_learning_rate: NonNegative = 1e-6
     """Learning rate at the first step."""
-    end_learning_rate: NonNegative = 1e-6
-    """Learning rate at the last step."""
     warmup_epochs: NonNegative = 5.0
     """Epochs of linear warm-up; a run shorter than twice this warms up for its first half."""
     clip_norm: Positive | None = None
     """Largest global norm of the gradient; none by default."""
     weight_decay: NonNegative = 0.0
     """Factor of the parameter that is added to its gradient, before Adam (CTIN: 1e-6)."""
-    plateau_epochs: Count = 10
-    """Epochs without a smaller squared error on the validation split before the learning rate falls
-    (RoNIN, DeepILS); for the plateau schedule."""
-    plateau_factor: Fraction = 0.1
-    """Factor applied to the learning rate on a plateau; for the plateau schedule."""
     best_by: Literal["loss", "squared_error"] = "loss"
     """Mean over the validation split that chooses the best checkpoint: the loss, or the squared
     error of the displacement. The choice begins anew where `loss.nll_from_epoch` or
@@ -252,21 +239,6 @@ class OptimConfig:
     """Augmented training windows from which the statistics of batch normalisation are estimated
     before every validation and checkpoint (ours); 0 keeps the running averages of the last
     steps."""
-    ema_decay: Probability = 0.0
-    """Share of the averaged parameters that a step keeps, e.g. 0.999 (ours): the averages are
-    validated, kept as best and evaluated, while training goes on without them. 0 averages
-    nothing."""
-
-    def check(self, at: Place) -> None:
-        """Running statistics of batch normalisation are not those of averaged parameters. Parts of
-        a batch have one size."""
-        if self.batch_size % self.accumulate:
-            remedy = f"it must divide {at.below('batch_size').section}, which is {self.batch_size}"
-            at.refuse("accumulate", f"is {self.accumulate}", remedy)
-        if self.ema_decay and not self.statistics_windows:
-            problem = f"is set without {at.below('statistics_windows').section}"
-            remedy = "averaged parameters want statistics of their own: set it, e.g. to 16384"
-            at.refuse("ema_decay", problem, remedy)
 
 
 class CorrelatedError(NamedTuple):
@@ -381,8 +353,8 @@ Part = Literal["noise", "measurement", "start", "uncertainty", "head", "encoder"
 @dataclass(frozen=True)
 class ThroughFilter:
     """Training with the network in the filter's loop (ours), from the weights of `init_from`. The
-    section `optim` counts pieces instead of windows; `loss` is for windows alone, and so is
-    `augment` but for its `yaw`."""
+    section `optim` counts segments of recordings instead of windows; `loss` is for windows alone,
+    and so is `augment` but for its `yaw`."""
 
     learn: tuple[Part, ...] = ()
     """Parts that learn; none: the network is trained on windows. noise: the filter's densities and
@@ -390,21 +362,10 @@ class ThroughFilter:
     start: the standard deviations at the start; uncertainty, head, encoder: the network's; all:
     everything. A filter option that is 0 stays 0."""
     piece_seconds: Positive = 60.0
-    """Length of the pieces of recordings that are filtered, s."""
-    truncate_seconds: Positive = 10.0
-    """The filter's state is carried on without gradient after every so many seconds."""
-    start_spread: NonNegative = 1.0
-    """Each piece starts off the reference by errors drawn from the filter's initial standard
-    deviations times this; 0 starts at the reference."""
-    gate_softness: NonNegative = 2.0
-    """Slope of the χ² gate in training (`FilterConfig.gate_softness`); validation has the gate that
-    evaluation has."""
+    """Length of the segments of recordings that are filtered, s."""
     filter_learning_rate: Positive = 0.03
     """Peak learning rate of the logarithms of the filter's options; the network's is
     optim.learning_rate. Both have its schedule."""
-    skip_above: Positive = 1000.0
-    """A step is skipped, and counted in the log, when the norm of its gradient is above this, or
-    anything in it is not finite, or the filter diverged."""
     displacement_weight: NonNegative = 100.0
     """Weight of the relative error of displacements over 1, 5, 10, 30 and 60 s."""
     yaw_weight: NonNegative = 1000.0
@@ -416,12 +377,6 @@ class ThroughFilter:
     covariance."""
     window_weight: NonNegative = 100.0
     """Weight of the squared error of each window's displacement."""
-
-    def check(self, at: Place) -> None:
-        """Truncation divides the piece."""
-        ratio = self.piece_seconds / self.truncate_seconds
-        if not _is_whole(ratio) or ratio < 1:
-            at.refuse("truncate_seconds", f"must divide the piece of {self.piece_seconds:g} s")
 
 
 @dataclass(frozen=True)
@@ -447,12 +402,10 @@ class TrainConfig:
     optim: OptimConfig = field(default_factory=OptimConfig)
     filter: FilterSettings = field(default_factory=FilterSettings)
     through_filter: ThroughFilter = field(default_factory=ThroughFilter)
-    checkpoint_every_seconds: NonNegative = 600.0
-    """Longest time between checkpoints within an epoch, s; every epoch ends with one anyway."""
 
     def check(self, at: Place) -> None:
         """Four headings are averaged only if training shows windows of every heading. A network
-        that learns through the filter has weights, and its pieces are whole strides and longer
+        that learns through the filter has weights, and its segments are whole strides and longer
         than a window and its context. A network that predicts every sample takes no context."""
         if self.data.context and self.model.name == "ctin":
             remedy = "it predicts every sample it sees: set it to 0"
@@ -467,19 +420,15 @@ class TrainConfig:
         through = self.through_filter
         if not through.learn:
             return
-        if self.optim.ema_decay:
-            at.refuse("optim.ema_decay", "is for training on windows alone", "set it to 0")
-        if self.optim.accumulate > 1:
-            at.refuse("optim.accumulate", "is for training on windows alone", "set it to 1")
-        if self.data.residency == "host":
-            at.refuse("data.residency", "is for training on windows alone", "set it to device")
-        for name in ("piece_seconds", "truncate_seconds"):
-            if not _is_whole(getattr(through, name) / self.data.stride_seconds):
-                problem = f"is not a whole number of strides of {self.data.stride_seconds:g} s"
-                at.refuse(f"through_filter.{name}", problem)
-        if through.gate_softness > 0 and self.filter.mahalanobis_fail_scale > 0:
-            problem = "makes no sense beside filter.mahalanobis_fail_scale"
-            at.refuse("through_filter.gate_softness", problem, "set one of them to 0")
+        if not _is_whole(through.piece_seconds / self.data.stride_seconds):
+            problem = f"is not a whole number of strides of {self.data.stride_seconds:g} s"
+            at.refuse("through_filter.piece_seconds", problem)
+        if through.piece_seconds < 1:
+            problem = "must be at least 1 s, the shortest horizon of its losses"
+            at.refuse("through_filter.piece_seconds", problem)
+        if self.filter.mahalanobis_fail_scale > 0:
+            problem = "makes no sense beside the soft gate of training through the filter"
+            at.refuse("filter.mahalanobis_fail_scale", problem, "set it to 0")
         seen = self.data.context_seconds + self.data.window_seconds
         if through.piece_seconds < seen + 2 * self.data.stride_seconds:
             problem = f"must be longer than the {seen:g} s that the network sees"

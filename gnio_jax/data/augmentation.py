@@ -91,8 +91,8 @@ def augment(key: PRNGKeyArray, windows: Windows, config: AugmentConfig) -> Windo
         windows = tilt(tilt_key, windows, config.tilt_degrees)
     if config.yaw:
         windows = yaw(yaw_key, windows)
-    if config.gyro_noise or config.accel_noise:
-        windows = noise(noise_key, windows, config.gyro_noise, config.accel_noise)
+    if any(config.noise):
+        windows = noise(noise_key, windows, *config.noise)
     return windows
 
 

@@ -6,7 +6,7 @@ Windows are cut and rotated inside the jitted step (`gnio_jax.windows.cut_window
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import jax
@@ -51,11 +51,6 @@ class WindowSource(NamedTuple):
     """Numbers of the windows an epoch visits: all of them, unless they are to be shifted (see
     `shift_windows`)."""
 
-    def moved(self, rows: int, windows: int) -> WindowSource:
-        """The same behind so many rows and windows of other recordings."""
-        count = np.int32(windows)
-        return self._replace(start=self.start + np.int32(rows), visited=self.visited + count)
-
 
 def window_source(
     sequences: Iterable[Sequence], config: DataConfig, stride: int, shift: int = 0
@@ -68,26 +63,8 @@ def window_source(
     (biases zero). Differences of positions are taken in float64, before they are stored in float32.
     Raises `InputError` when not a single window fits.
     """
-    return joined(window_parts(sequences, config, stride, shift))
-
-
-def joined(parts: Iterable[WindowSource]) -> WindowSource:
-    """The windows of `parts`, one part for each recording, end to end."""
     found: list[WindowSource] = []
     rows = windows = 0
-    for part in parts:
-        found.append(part.moved(rows, windows))
-        rows += len(part.imu)
-        windows += len(part.start)
-    return WindowSource(*(np.concatenate(field) for field in zip(*found, strict=True)))
-
-
-def window_parts(
-    sequences: Iterable[Sequence], config: DataConfig, stride: int, shift: int = 0
-) -> Iterator[WindowSource]:
-    """The windows of each sequence that has any, rows and numbers counted from 0: `window_source`
-    in parts. Raises `InputError` at the end when there was none."""
-    found = False
     for sequence in sequences:
         if sequence.waypoints is not None:
             raise InputError(
@@ -95,11 +72,15 @@ def window_parts(
             )
         start = _valid_starts(sequence, config.seen, 1 if shift else stride)
         if start.size:
-            found = True
-            yield _source_of(sequence, start, config, stride)
+            part = _source_of(sequence, start, config, stride)
+            moved = part.start + np.int32(rows), part.visited + np.int32(windows)
+            found.append(part._replace(start=moved[0], visited=moved[1]))
+            rows += len(part.imu)
+            windows += len(part.start)
     if not found:
         length = f"{config.context_seconds + config.window_seconds:g} s"
         raise InputError("data", f"no window of {length} with a valid reference in any sequence")
+    return WindowSource(*(np.concatenate(field) for field in zip(*found, strict=True)))
 
 
 def _valid_starts(sequence: Sequence, length: int, stride: int) -> Starts:
@@ -143,37 +124,6 @@ def gather(source: WindowSource, which: Int[jax.Array, "b"], length: int) -> Win
         imu=cut_windows(source.imu, start, source.rotation[which], length),
         displacement=source.displacement[which],
         steps=jnp.stack([cosine * x + sine * y, cosine * y - sine * x, z], axis=-1),
-    )
-
-
-def excerpt(
-    source: WindowSource, which: Int[np.ndarray, "b"], length: int, shift: int
-) -> WindowSource:
-    """What `gather` and `shift_windows` read for the windows `which`, and no more, on the host.
-
-    Window number `which[i]` is number `visited[i]` of the excerpt, among those up to `shift`
-    samples later or earlier. Where the recording has no window at a distance, the one in the middle
-    stands in: `shift_windows` sees that it is not at that distance.
-    """
-    distances = np.arange(-shift, shift + 1, dtype=np.int32)
-    around = np.clip(which[:, None] + distances, 0, len(source.start) - 1)
-    distance = source.start[around] - source.start[which][:, None]
-    around = np.where(distance == distances, around, which[:, None])
-    distance = np.where(distance == distances, distance, 0)
-    span = length + 2 * shift
-    rows = source.start[which][:, None] - shift + np.arange(span)
-    rows = np.clip(rows, 0, len(source.imu) - 1).reshape(-1)
-    begin = np.arange(len(which))[:, None] * span + shift
-    middle = np.arange(len(which)) * len(distances) + shift
-    numbers = around.reshape(-1)
-    return WindowSource(
-        imu=source.imu[rows],
-        start=(begin + distance).reshape(-1).astype(np.int32),
-        rotation=source.rotation[numbers],
-        displacement=source.displacement[numbers],
-        step=source.step[rows],
-        unyaw=source.unyaw[numbers],
-        visited=middle.astype(np.int32),
     )
 
 

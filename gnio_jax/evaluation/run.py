@@ -30,7 +30,7 @@ from gnio_jax.evaluation.report import DEFINITIONS, Report, write
 from gnio_jax.evaluation.scores import score
 from gnio_jax.evaluation.setup import Setup, resolve
 from gnio_jax.files import replacing_folder
-from gnio_jax.scaling.processes import all_or_none, is_first
+from gnio_jax.parallel import is_first
 
 PAGE = "report.html"
 OnStage = Callable[[str, float], None]
@@ -84,18 +84,17 @@ def evaluate(
     Raises `InputError` for options that do not fit together, a workdir without the checkpoint,
     unknown or missing data, or sequences that cannot be estimated this way.
     """
-    with all_or_none():
-        job = _set_up(config)
-        trained, setup = job.trained, job.setup
-        sequences = data.load(
-            job.dataset, job.data_root, config.split, workers, lambda x: progress("reading", x)
-        )
+    job = _set_up(config)
+    trained, setup = job.trained, job.setup
+    sequences = data.load(
+        job.dataset, job.data_root, config.split, workers, lambda x: progress("reading", x)
+    )
 
-        prepared, left_out = prepare(sequences, trained.data, setup)
-        if not prepared:
-            name, reason = next(iter(left_out.items()))
-            problem = f"no sequence of split '{config.split}' can be estimated ({name}: {reason})"
-            raise InputError(f"dataset {job.dataset}", problem)
+    prepared, left_out = prepare(sequences, trained.data, setup)
+    if not prepared:
+        name, reason = next(iter(left_out.items()))
+        problem = f"no sequence of split '{config.split}' can be estimated ({name}: {reason})"
+        raise InputError(f"dataset {job.dataset}", problem)
 
     how = (trained.data, job.options, setup, config.batch_size)
     estimates = estimate(prepared, job.network, *how, lambda x: progress("estimating", x))
@@ -116,12 +115,11 @@ def evaluate(
     )
 
     folder = job.workdir / "eval" / folder_name(config, job.dataset, trained)
-    with all_or_none():
-        if is_first():
-            drawn = Drawn(trained, command) if config.plots else None
-            _write(folder, report, estimates, drawn, progress)
-            if config.rerun:
-                _write_rerun(Path(config.rerun), estimates, prepared, config.alignment)
+    if is_first():
+        drawn = Drawn(trained, command) if config.plots else None
+        _write(folder, report, estimates, drawn, progress)
+        if config.rerun:
+            _write_rerun(Path(config.rerun), estimates, prepared, config.alignment)
     return Evaluation(report, folder)
 
 

@@ -14,8 +14,7 @@ from jaxtyping import Bool, Float
 
 from gnio_jax.cores import usable_cores
 from gnio_jax.numerics import filled_up
-from gnio_jax.scaling.devices import cpu_devices
-from gnio_jax.scaling.processes import several
+from gnio_jax.parallel import cpu_devices
 from gnio_jax.types import Array
 
 T = TypeVar("T")
@@ -88,7 +87,7 @@ def over_sequences(function: Callable[..., T], shared: int = 0) -> Callable[...,
     device by `jax.device_put(x, device)`: JAX refuses those (ValueError).
 
     In several processes (`jax.distributed`) each of them gives all sequences, and
-    `scaling.processes.on_host` gives each of them all results.
+    `parallel.on_host` gives each of them all results.
 
     On a machine without a GPU JAX sees one device however many cores there are, and the filter's
     operations are too small for XLA to split each among cores: call `cores_as_devices` first.
@@ -98,7 +97,7 @@ def over_sequences(function: Callable[..., T], shared: int = 0) -> Callable[...,
         own = arguments[shared:]
         count = jax.tree.leaves(own)[0].shape[0]
         # Every process takes part, also where there are fewer sequences than devices.
-        devices = jax.devices() if several() else jax.devices()[:count]
+        devices = jax.devices() if jax.process_count() > 1 else jax.devices()[:count]
         batched = jax.vmap(function, in_axes=(None,) * shared + (0,) * len(own))
         if len(devices) == 1:
             return batched(*arguments)

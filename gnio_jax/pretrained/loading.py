@@ -9,8 +9,9 @@ from gnio_jax import models
 from gnio_jax.errors import InputError
 from gnio_jax.pretrained import arrays, package
 from gnio_jax.pretrained.finding import find
-from gnio_jax.training import learnt
-from gnio_jax.training.checkpoint import Run, create_model, load_run
+from gnio_jax.training.checkpoint import Run, load_run
+from gnio_jax.training.filter_task import filter_numbers
+from gnio_jax.training.window_task import create_model
 
 
 def load_pretrained(which: str | Path) -> Run:
@@ -49,5 +50,5 @@ def _load_package(place: Path) -> Run:
     content = found.files[package.WEIGHTS]
     variables = arrays.from_bytes(content, template, place / package.WEIGHTS)
     learns = bool(config.through_filter.learn)
-    numbers = learnt.filter_numbers(config.filter) if learns else {}
+    numbers = filter_numbers(config.filter) if learns else {}
     return Run(config, model, variables, found.about.epoch, found.about.step, numbers)

@@ -63,8 +63,8 @@ def run_cell(cell: Cell, options: TablesConfig, reporter: Reporter, workers: int
 
 
 def train(config: TrainConfig, seeds: Sequence[int], reporter: Reporter, workers: int = 1) -> None:
-    """Train the runs of `config` with these seeds together to their end, as far as they are not
-    there yet."""
+    """Train the runs of `config` with these seeds to their end, as far as they are not there
+    yet."""
     states: dict[str, list[int]] = {"begun": [], "new": [], "finished": []}
     for each in configuration.with_seeds(config, seeds):
         states[_standing(each)].append(each.seed)
@@ -76,8 +76,8 @@ def train(config: TrainConfig, seeds: Sequence[int], reporter: Reporter, workers
         outcomes = loop.train_seeds(
             config, states[standing], standing == "begun", reporter, workers
         )
-        if outcomes[0].stopped_by:
-            raise Interrupted(outcomes[0].stopped_by)
+        if outcomes[-1].stopped_by:
+            raise Interrupted(outcomes[-1].stopped_by)
 
 
 def _standing(config: TrainConfig) -> Literal["new", "begun", "finished"]:
@@ -86,7 +86,7 @@ def _standing(config: TrainConfig) -> Literal["new", "begun", "finished"]:
     workdir = Path(config.workdir or "")
     if not (workdir / "config.yaml").exists():
         return "new"
-    run_folder.prepare(config, resume=True)  # refuses other settings
+    run_folder.refuse_other_run(config, resume=True)  # refuses other settings
     log = workdir / "metrics.jsonl"
     rows = log.read_text(encoding="utf-8").count("\n") if log.exists() else 0
     return "finished" if rows >= config.optim.epochs else "begun"

@@ -1,15 +1,16 @@
-"""Losses of a piece that went through the filter: of its path, of what the filter says of its own
-errors, and of the displacements it was told.
+"""Losses of a filtered segment: of its path, of the filter's own covariance, and of the network's
+displacements.
 
-Each is a pure function of arrays, differentiable, and a mean over the piece. The scale-free errors
-have the form of KITTI's benchmark (Geiger et al. 2012) and of AI-IMU's training (Brossard et al.
-2020, §IV-C).
+Each is a pure function of arrays, differentiable, and a mean over the segment. The scale-free
+errors have the form of KITTI's benchmark (Geiger et al. 2012) and of AI-IMU's training (Brossard et
+al. 2020, §IV-C).
 """
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
+import chex
 import jax
 import jax.numpy as jnp
 from jaxtyping import Float
@@ -18,11 +19,11 @@ from gnio_jax import geometry
 from gnio_jax.config import ThroughFilter
 from gnio_jax.filtering import FilterConfig, FilterHistory
 from gnio_jax.filtering.history import POSITION, VELOCITY
-from gnio_jax.training.pieces import Path
+from gnio_jax.training.segments import Path
 from gnio_jax.types import Array
 
 HORIZON_SECONDS = (1.0, 5.0, 10.0, 30.0, 60.0)
-"""Times over which relative errors are taken, as far as a piece reaches."""
+"""Times over which relative errors are taken, as far as a segment reaches."""
 DISTANCE_FLOOR = 1.0
 """Added in squares to the distance that an error is divided by, m: standing still is no singular
 point (ours)."""
@@ -30,10 +31,10 @@ VELOCITY_POSITION = slice(VELOCITY.start, POSITION.stop)
 
 
 class FilterLosses(NamedTuple):
-    """Losses of one piece, or means over several."""
+    """Losses of one segment, or means over several."""
 
     total: Float[Array, ""]
-    """What training minimises."""
+    """The objective of training."""
     displacement: Float[Array, "h"]
     """`relative_displacement` of each horizon."""
     yaw: Float[Array, "h"]
@@ -47,7 +48,7 @@ class FilterLosses(NamedTuple):
 
 
 def horizons(config: FilterConfig, intervals: int) -> list[int]:
-    """The horizons within a piece of `intervals` clone intervals, in clone intervals."""
+    """The horizons within a segment of `intervals` clone intervals, in clone intervals."""
     counts = [round(seconds / config.clone_seconds) for seconds in HORIZON_SECONDS]
     return [count for count in counts if 1 <= count <= intervals]
 
@@ -59,12 +60,14 @@ def filter_losses(
     config: FilterConfig,
     weights: ThroughFilter,
 ) -> FilterLosses:
-    """All losses of a piece, and their sum with the weights.
+    """All losses of a segment, and their sum with the weights.
 
     `estimate` begins with the filter's start; `history` has the whole core covariance.
     """
-    assert history.covariance is not None
-    counts = horizons(config, len(truth.position) - 1)
+    intervals = len(truth.position) - 1
+    chex.assert_shape(history.covariance, (intervals, 15, 15))
+    assert history.covariance is not None  # for type checkers
+    counts = horizons(config, intervals)
     displacement = jnp.stack([relative_displacement(estimate, truth, count) for count in counts])
     yaw = jnp.stack([relative_yaw(estimate, truth, count) for count in counts])
     innovation = innovation_nll(history.log_likelihood)
@@ -178,9 +181,10 @@ def window_error(
 ) -> Float[jax.Array, ""]:
     """Squared error of the measured displacements, summed over the axes, mean over the windows, m².
 
-    Row k spans from the (k − W)-th clone to the k-th; rows of NaN are none. The network tells a
-    displacement in the yaw frame of the filter's own attitude, and sees nothing of that attitude's
-    yaw error; so the truth is turned by that error before it is told in the same frame.
+    Row k spans from the (k − W)-th clone to the k-th; rows of NaN are none. The network's
+    displacement is expressed in the yaw frame of the filter's own attitude, and the network sees
+    nothing of that attitude's yaw error; so the truth is turned by that error before it is
+    expressed in the same frame.
     """
     first, last = slice(1, -clones_per_window), slice(1 + clones_per_window, None)
     moved = truth.position[last] - truth.position[first]
@@ -190,8 +194,8 @@ def window_error(
     # By the yaw error, then into the filter's own yaw frame: one turn about z.
     c, s = own_cosine * cosine + own_sine * sine, own_cosine * sine - own_sine * cosine
     x, y = c * moved[:, 0] - s * moved[:, 1], s * moved[:, 0] + c * moved[:, 1]
-    told = displacement[clones_per_window:]
-    error = told - jnp.stack([x, y, moved[:, 2]], axis=1)
-    present = jnp.all(jnp.isfinite(told), axis=1)
+    measured = displacement[clones_per_window:]
+    error = measured - jnp.stack([x, y, moved[:, 2]], axis=1)
+    present = jnp.all(jnp.isfinite(measured), axis=1)
     squared = jnp.sum(jnp.where(present[:, None], error, 0.0) ** 2, axis=1)
     return jnp.sum(squared) / jnp.maximum(jnp.sum(present), 1)

@@ -1,52 +1,38 @@
-"""The training loop, top to bottom: set-up, epochs of dispatches, validation, log, checkpoints.
-
-It trains any number of seeds of an experiment together. Each is a run with a folder of its own; one
-seed is the case of length one.
-"""
+"""The training loop, top to bottom: one run after another; epochs of dispatches, validation, log,
+checkpoints."""
 
 from __future__ import annotations
 
-import itertools
+import math
+import signal
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 
 from gnio_jax import config as configuration
+from gnio_jax import parallel
 from gnio_jax.config import TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.reporting import Lines, Reporter, Silence
-from gnio_jax.scaling.devices import BATCH, SEEDS, chosen, sharing
-from gnio_jax.scaling.processes import agreed, all_or_none, is_first, several
-from gnio_jax.training import run_folder
-from gnio_jax.training.checkpoint import Checkpoints, Run, exists, load_run
-from gnio_jax.training.initial import initial_run
-from gnio_jax.training.kinds import Training
-from gnio_jax.training.log import Log
-from gnio_jax.training.seed_runs import (
-    BEGINNING,
-    Group,
-    SeedRun,
-    after_steps,
-    improves,
-    learning_rate,
-    next_epoch,
-    row_of,
-    speed,
-    stuck_head,
-    summary,
-)
-from gnio_jax.training.setup import set_up
-from gnio_jax.training.step import TrainState
-from gnio_jax.training.stopping import Stop, stop_signals
-from gnio_jax.training.together import together
+from gnio_jax.training import checkpoint, filter_task, optimizer, run_folder, window_task
+from gnio_jax.training.checkpoint import Checkpoints, Position, Run, load_run
+from gnio_jax.training.filter_task import FilterTask
+from gnio_jax.training.run_folder import Log
+from gnio_jax.training.window_task import Progress, Row, WindowTask
 
 DISPATCH_SECONDS = 0.5
 """Steps are dispatched in runs of about this long: few round trips, and still a lively progress bar
 and a quick stop."""
+CHECKPOINT_SECONDS = 600.0
+"""Longest time between checkpoints within an epoch; every epoch ends with one anyway."""
+NO_GRADIENT = 1e-9
+"""Norm of a gradient, mean of an epoch, of which Adam, whose ε is 1e-8, makes next to no step."""
+
+Task = WindowTask | FilterTask
 
 
 class Outcome(NamedTuple):
@@ -56,7 +42,7 @@ class Outcome(NamedTuple):
     best_loss: float | None
     """Smallest value on the validation split of what `optim.best_by` names."""
     stopped_by: int | None
-    """Signal that ended it early; its state is saved."""
+    """Signal that ended it early, or the seeds after it; its state is saved."""
 
 
 def train(
@@ -68,27 +54,22 @@ def train(
     load_initial: Callable[[str], Run] = load_run,
 ) -> Outcome:
     """Train the network of `config` and leave checkpoints and logs in its work folder: on windows,
-    or through the filter where `config.through_filter` says what learns.
+    or through the filter where `config.through_filter` names what is trained.
 
     With `resume` the run goes on from its latest checkpoint as if it had never stopped: parameters,
-    optimizer, order of the windows or pieces, and random draws are functions of the seed and the
+    optimizer, order of the windows or segments, and random draws are functions of the seed and the
     step. Resume rules, in order: the settings must be those of config.yaml; without a checkpoint
     yet the run starts over; log rows after the checkpoint are dropped. SIGTERM and Ctrl-C save and
-    return; a loss that is not finite raises `FloatingPointError` naming the step (through the
-    filter such a step is skipped). `workers` processes read recordings that are slow to read
-    (`data.load`). A batch of windows is shared out among `devices` devices of each process, by
-    default all (`scaling.devices.chosen`); how many there are changes the results by rounding
-    alone, also in a run that is resumed. `load_initial` reads what `config.init_from` names, by
-    default the folder of a run; `gnio_jax.load_pretrained` also takes packages of weights. Raises
-    `InputError` where that is not of the same network, and where the devices cannot share a batch
-    evenly.
+    return; a loss or gradient that is not finite raises `FloatingPointError` naming the step
+    (through the filter such a step is skipped). `workers` processes read recordings that are slow
+    to read (`data.load`). A batch of windows is shared out among `devices` devices of each process
+    (`parallel.sharing`); how many there are changes the results by rounding alone, also in a run
+    that is resumed. `load_initial` reads what `config.init_from` names, by default the folder of a
+    run; `gnio_jax.load_pretrained` also takes packages of weights. Raises `InputError` where that
+    is not of the same network, for settings that do not fit together, for a folder that holds
+    another run, and where the devices cannot share a batch evenly.
     """
-    _check_devices(config, devices)
-    through_filter = bool(config.through_filter.learn)
-    sharers = jax.devices()[:1] if through_filter else chosen(devices)
-    # Whatever the process has: no float64 but for the filter, and the same random draws.
-    with jax.enable_x64(through_filter), sharing(sharers, BATCH):
-        (outcome,) = _train([config], resume, reporter or Lines(), workers, load_initial)
+    (outcome,) = _train_all([config], [resume], reporter, workers, devices, load_initial)
     return outcome
 
 
@@ -101,210 +82,246 @@ def train_seeds(
     devices: int | None = None,
     load_initial: Callable[[str], Run] = load_run,
 ) -> list[Outcome]:
-    """Train `config` with each of these seeds together, as `train` would in the work folders
-    WORKDIR_s0, WORKDIR_s1, ... (`config.with_seeds`).
+    """Train `config` with each of these seeds, one run after the other, as `train` would in the
+    work folders WORKDIR_s0, WORKDIR_s1, ... (`config.with_seeds`).
 
-    Recordings are read once, and the seeds share what is compiled. `devices` devices, by default
-    all, share the seeds out among them: a device has whole seeds, and a batch is not shared. Each
-    run has the numbers that it has alone, to rounding; it may be resumed alone, and `resume` takes
-    runs that were trained alone, also those that stand at different steps. Raises
-    `FloatingPointError` and `InputError` as `train`, and `InputError` in several processes, for no
-    seed, and for one that is named twice.
+    Recordings are read once and steps are compiled once. With `resume` finished runs are skipped,
+    begun ones continue from their latest checkpoint, missing ones start. A signal ends the run that
+    it interrupts, and those after it do not begin: they have no outcome. Raises as `train`, and
+    `InputError` for no seed, and for one that is named twice.
     """
     configs = configuration.with_seeds(config, seeds)
-    if len(configs) > 1 and several():
-        remedy = "start one process, or each seed as a run of its own"
-        raise InputError("--seeds", "run in one process, on all of its devices", remedy)
-    _check_devices(config, devices)
-    through_filter = bool(config.through_filter.learn)
-    sharers = jax.devices()[:1] if through_filter else chosen(devices)[: len(configs)]
-    with jax.enable_x64(through_filter), sharing(sharers, SEEDS):
-        return _train(configs, resume, reporter or Lines(), workers, load_initial)
-
-
-def _check_devices(config: TrainConfig, devices: int | None) -> None:
-    """Training through the filter shares its pieces out by itself."""
-    if config.through_filter.learn and several():
-        problem = "runs in one process, on all of its devices"
-        raise InputError("training through the filter", problem, "start one process")
-    if config.through_filter.learn and devices is not None:
-        raise InputError("--devices", "is for training on windows", "leave it out")
-
-
-def _train(
-    configs: list[TrainConfig],
-    resume: bool,
-    reporter: Reporter,
-    workers: int,
-    load_initial: Callable[[str], Run],
-) -> list[Outcome]:
-    """Set the runs up, and train them."""
-    reporter = reporter if is_first() else Silence()
-    for config in configs:
-        configuration.validate(config)
-    with all_or_none():
-        workdirs = [run_folder.prepare(config, resume) for config in configs]
-    resuming = agreed(*(resume and is_first() and exists(workdir) for workdir in workdirs))
-    with all_or_none():
-        start = None if all(resuming) else initial_run(configs[0], load_initial)
-        first = set_up(configs[0], reporter, workers)
-        trainings = [first, *(first.with_seed(config.seed) for config in configs[1:])]
-        states = [training.new_state(start) for training in trainings]
-        _describe(trainings, workdirs, states[0], reporter)
-        for config, workdir in zip(configs, workdirs, strict=True):
-            run_folder.write_settings(workdir, config, first.splits, resume)
-    run_folder.compare_processes(configs[0], first.splits, first.recordings, states[0].variables)
-    with stop_signals() as stop, ExitStack() as opened:
-        runs = []
-        for config, workdir, training in zip(configs, workdirs, trainings, strict=True):
-            name = f"seed {config.seed}: " if len(configs) > 1 else ""
-            checkpoints = opened.enter_context(Checkpoints(workdir))
-            runs.append(SeedRun(name, workdir, training, checkpoints, BEGINNING))
-        for k in range(len(runs)):
-            if resuming[k]:
-                runs[k], states[k] = _restored(runs[k], states[k], reporter)
-        runs = _train_all(runs, states, stop, reporter)
-        return [Outcome(run.workdir, run.position.best_loss, stop.signum) for run in runs]
-
-
-def _restored(run: SeedRun, template: TrainState, reporter: Reporter) -> tuple[SeedRun, TrainState]:
-    """A run at its latest checkpoint."""
-    state, position = run.checkpoints.restore(template)
-    reporter.line(f"{run.name}resuming at step {position.step}")
-    return run._replace(position=position), state
+    begun = [(configuration.default_workdir(each) / "config.yaml").exists() for each in configs]
+    resumes = [resume and (there or not any(begun)) for there in begun]
+    return _train_all(configs, resumes, reporter, workers, devices, load_initial)
 
 
 def _train_all(
-    runs: list[SeedRun], states: list[TrainState], stop: Stop, reporter: Reporter
-) -> list[SeedRun]:
-    """Train the runs that stand at the same step together, to their end."""
-    ended = {}
-    for group in _at_the_same_step(runs, states):
-        for run in _train_group(group, stop, reporter).runs:
-            ended[run.workdir] = run
-    return [ended[run.workdir] for run in runs]
-
-
-def _describe(
-    trainings: list[Training], workdirs: list[Path], state: TrainState, reporter: Reporter
-) -> None:
-    trainings[0].describe(state, workdirs[0], reporter)
-    for training, workdir in zip(trainings[1:], workdirs[1:], strict=True):
-        reporter.line(f"together with seed {training.config.seed} → {workdir}")
-
-
-def _at_the_same_step(runs: list[SeedRun], states: list[TrainState]) -> Iterator[Group]:
-    """Runs that are resumed may stand at different steps, e.g. where they were killed while some
-    had saved. Those that are behind come first."""
-    in_order = sorted(zip(runs, states, strict=True), key=lambda each: each[0].position.step)
-    for _, same in itertools.groupby(in_order, key=lambda each: each[0].position.step):
-        members, their_states = zip(*same, strict=True)
-        program = together([run.training for run in members])
-        yield Group(members, program, program.joined(their_states))
-
-
-def _train_group(group: Group, stop: Stop, reporter: Reporter) -> Group:
-    """Train to the end, or until asked to stop."""
-    training, position = group.training, group.runs[0].position
-    with ExitStack() as opened:
-        logs = [
-            opened.enter_context(Log(run.workdir, position.epoch, position.step))
-            for run in group.runs
-        ]
-        for epoch in range(position.epoch, training.config.optim.epochs):
-            if stop.signum:
-                break
-            group, rate = _run_epoch(group, epoch, stop, reporter)
-            if group.step < (epoch + 1) * training.steps_per_epoch:
-                break  # stopped on the way, and saved
-
-            group = _end_epoch(group, epoch, rate, logs, reporter)
-            stop.agree()
-    return group
-
-
-def _run_epoch(group: Group, epoch: int, stop: Stop, reporter: Reporter) -> tuple[Group, float]:
-    """Finish epoch `epoch`, or save and return when asked to stop; with the windows or pieces of a
-    seed per second of these steps."""
-    training = group.training
-    order, steps = group.together.order(epoch), training.steps_per_epoch
-    began = saved = time.perf_counter()
-    seconds, first = [run.position.seconds for run in group.runs], group.step - epoch * steps
-    done, dispatch, rate = first, 1, 0.0
-    while done < steps:
-        count = min(dispatch, steps - done)
-        tick = time.perf_counter()
-        group = _run_steps(group, order, epoch, done, count)
-        clock = time.perf_counter()
-        dispatch = max(1, min(2 * dispatch, round(DISPATCH_SECONDS * count / (clock - tick))))
-        due = int(clock - saved > training.config.checkpoint_every_seconds)
-        dispatch, due = agreed(dispatch, due)  # the clocks of the processes differ
-        stop.agree()
-        done += count
-        group = group.at(
-            [
-                run.position._replace(seconds=before + clock - began)
-                for run, before in zip(group.runs, seconds, strict=True)
-            ]
-        )
-        rate = (done - first) * training.config.optim.batch_size / (clock - began)
-        _report(group, epoch, done, rate, reporter)
-        if done < steps and (stop.signum or due):
-            group._replace(states=group.together.settled(group.states)).save()
-            saved = time.perf_counter()
-            if stop.signum:
-                break
-    return group, rate
-
-
-def _run_steps(group: Group, order: Any, epoch: int, first: int, count: int) -> Group:
-    """Take `count` steps of an epoch from its step `first` on, in one dispatch."""
-    factors = [run.position.plateau.factor for run in group.runs]
-    states, found = group.together.take_steps(group.states, order, first, count, factors)
-    step = epoch * group.training.steps_per_epoch + first + count
-    positions = [
-        after_steps(run, progress, epoch, step)
-        for run, progress in zip(group.runs, found, strict=True)
+    configs: Sequence[TrainConfig],
+    resumes: Sequence[bool],
+    reporter: Reporter | None,
+    workers: int,
+    devices: int | None,
+    load_initial: Callable[[str], Run],
+) -> list[Outcome]:
+    """Train runs that differ in nothing but their seeds and folders, one after the other."""
+    reporter = (reporter or Lines()) if parallel.is_first() else Silence()
+    workdirs = [
+        run_folder.refuse_other_run(configuration.validate(config), resume)
+        for config, resume in zip(configs, resumes, strict=True)
     ]
-    return group._replace(states=states).at(positions)
+    through_filter = bool(configs[0].through_filter.learn)
+    if through_filter and devices is not None:
+        raise InputError("--devices", "is for training on windows", "leave it out")
+    if through_filter and jax.process_count() > 1:
+        problem = "runs in one process, on all of its devices"
+        raise InputError("training through the filter", problem, "start one process")
+    module = filter_task if through_filter else window_task
+    # Segments are shared out by `filtering.over_sequences`, not as a batch of windows is. Whatever
+    # the process has set: no float64 but for the filter.
+    sharers = 1 if through_filter else devices
+    outcomes: list[Outcome] = []
+    with jax.enable_x64(through_filter), parallel.sharing(sharers), _stop_signals() as stop:
+        resumed = all(resumes) and all(map(checkpoint.exists, workdirs))
+        start = None if resumed else run_folder.initial_run(configs[0], load_initial)
+        task = module.set_up(configs[0], reporter, workers)
+        train_split, val_split = configs[0].data.train_split, configs[0].data.val_split
+        both = sorted(set(task.splits[train_split]) & set(task.splits[val_split]))
+        if both:
+            reporter.line(
+                f"warning: {', '.join(both[:3])}{' ...' if both[3:] else ''} in {train_split} and "
+                f"in {val_split}: the best checkpoint is chosen by recordings that it was trained "
+                "on; separate the two splits"
+            )
+        for config, resume in zip(configs, resumes, strict=True):
+            outcomes.append(_train(task.with_config(config), start, resume, stop, reporter))
+            if stop.signum and len(outcomes) < len(configs):
+                outcomes[-1] = outcomes[-1]._replace(stopped_by=stop.signum)  # others are missing
+                break
+    return outcomes
 
 
-def _end_epoch(
-    group: Group, epoch: int, rate: float, logs: Sequence[Log], reporter: Reporter
-) -> Group:
-    """Validate, and write the row and the checkpoints of each run."""
-    states = group.together.settled(group.states)
-    states, found = group.together.validate(states, group.step)
-    group = group._replace(states=states)
-    positions = []
-    for run, state, figures, log in zip(
-        group.runs, group.together.apart(states), found, logs, strict=True
-    ):
-        row = row_of(run, epoch, figures, rate)
-        by_loss = run.training.config.optim.best_by == "loss"
-        merit = row["val_loss" if by_loss else "val_mse"]
-        improved = improves(run.training, run.position, merit)
-        best = merit if improved else None
-        position = next_epoch(run.training, epoch, run.position, row, best)
-        log.add(row)
-        reporter.line(summary(run, row) + ("  best" if improved else ""))
-        if warning := stuck_head(row):
-            reporter.line(run.name + warning)
-        if improved:
-            run.checkpoints.save("best", state, position)
-        run.checkpoints.save("latest", state, position)
-        positions.append(position)
-    return group.at(positions)
+def _train(task: Task, start: Run | None, resume: bool, stop: _Stop, reporter: Reporter) -> Outcome:
+    """One run, to its end or until a signal."""
+    optim, steps = task.config.optim, task.steps_per_epoch
+    state, at = task.initial_state(start and start.variables), Position()
+    with run_folder.opened(task.config, task.splits, resume) as workdir:
+        run_folder.compare_processes(
+            task.config, task.splits, (task.source, task.held_out), state.variables
+        )
+        for line in task.description(state, workdir):
+            reporter.line(line)
+        with Checkpoints(workdir) as checkpoints:
+            if resume and checkpoint.exists(workdir):
+                state, at = checkpoints.restore(state)
+                reporter.line(f"resuming at step {at.step}")
+            with Log(workdir, at.epoch, at.step) as log:
+                saved = time.perf_counter()
+                for epoch in range(at.epoch, optim.epochs):
+                    order, end = task.order(epoch), (epoch + 1) * steps
+                    began, before, first, dispatch, rate = time.perf_counter(), at, at.step, 1, 0.0
+                    while at.step < end:
+                        count, tick = min(dispatch, end - at.step), time.perf_counter()
+                        state, progress = task.take_steps(
+                            state, order, at.step - epoch * steps, count, at.plateau.factor
+                        )
+                        at = _after_steps(at, count, jax.device_get(progress), workdir)
+                        clock = time.perf_counter()
+                        at = at._replace(seconds=before.seconds + clock - began)
+                        rate = (at.step - first) * optim.batch_size / (clock - began)
+                        wished = round(DISPATCH_SECONDS * count / (clock - tick))
+                        # Clocks differ between processes, and a signal reaches one of them.
+                        dispatch, due, signum = parallel.largest(
+                            max(1, min(2 * dispatch, wished)),
+                            int(clock - saved > CHECKPOINT_SECONDS),
+                            stop.received,
+                        )
+                        reporter.progress(
+                            "training", at.step / (optim.epochs * steps), _figures(task, at, rate)
+                        )
+                        if at.step < end and (due or signum):
+                            checkpoints.save("latest", task.with_statistics(state), at)
+                            saved = clock
+                        if at.step < end and signum:
+                            stop.signum = signum
+                            return Outcome(workdir, at.best, signum)
+                    state, validation = task.validate(task.with_statistics(state), at.step)
+                    row = _row(task, at, validation, rate)
+                    improved, at = _after_epoch(task, at, row)
+                    log.add(row)
+                    reporter.line(_summary(task, row) + ("  best" if improved else ""))
+                    if warning := stuck_head(row):
+                        reporter.line(warning)
+                    if improved:
+                        checkpoints.save("best", state, at)
+                    checkpoints.save("latest", state, at)
+                    (stop.signum,) = parallel.largest(stop.received)
+                    if stop.signum and epoch + 1 < optim.epochs:
+                        return Outcome(workdir, at.best, stop.signum)
+    return Outcome(workdir, at.best, None)
 
 
-def _report(group: Group, epoch: int, done: int, rate: float, reporter: Reporter) -> None:
-    """The progress of the runs: the mean loss of the epoch so far, over the seeds too, and what all
-    of them do in a second."""
-    training, step = group.training, group.step
-    steps = training.config.optim.epochs * training.steps_per_epoch
-    losses = [training.training_figures(run.position.loss_sums, done)["loss"] for run in group.runs]
-    numbers = (
-        f"{step}/{steps}  epoch {epoch + 1}  loss {sum(losses) / len(losses):.4g}  "
-        f"lr {learning_rate(group.runs[0]):.2e}  {speed(training, rate * len(losses))}"
+def _after_steps(at: Position, count: int, progress: Progress, workdir: Path) -> Position:
+    """Where a run stands after `count` more steps. Raises `FloatingPointError` where one of them
+    failed."""
+    if progress.failed_step >= 0:
+        raise FloatingPointError(
+            f"{workdir}: the loss or its gradient is not finite at step "
+            f"{int(progress.failed_step)} (epoch {at.epoch}); lower optim.learning_rate, set "
+            "optim.clip_norm, or look at the data"
+        )
+    sums = {name: at.sums.get(name, 0.0) + float(more) for name, more in progress.sums.items()}
+    return at._replace(step=at.step + count, sums=sums)
+
+
+def _after_epoch(task: Task, at: Position, row: Row) -> tuple[bool, Position]:
+    """Whether the epoch of `row` is the best one so far, and where the next one starts.
+
+    The choice begins anew with the epoch that changes what is trained, and again with the first
+    whole one after it: losses before and after do not compare, and what has just begun to learn has
+    learnt little. NaN is never the best.
+    """
+    optim = task.config.optim
+    merit = row["val_loss" if optim.best_by == "loss" else "val_mse"]
+    before = at.step - 2 * task.steps_per_epoch
+    changed = any(before < change < at.step for change in task.changes)
+    best = None if changed else at.best
+    improved = not math.isnan(merit) and (best is None or merit < best)
+    plateau = optimizer.watch(at.plateau, row["val_mse"], optim)
+    best = merit if improved else best
+    return improved, at._replace(epoch=at.epoch + 1, best=best, sums={}, plateau=plateau)
+
+
+def _means(sums: dict[str, float], steps: int) -> Row:
+    """Means over the steps that were not skipped, and the number of those that were."""
+    skipped = round(sums.get("skipped", 0))
+    means: Row = {name: total / max(1, steps - skipped) for name, total in sums.items()}
+    return means | ({"skipped": skipped} if "skipped" in sums else {})
+
+
+def _row(task: Task, at: Position, validation: Row, rate: float) -> Row:
+    """The log's row of a finished epoch: means of training (as its steps met them) and the figures
+    of validation."""
+    means = _means(at.sums, task.steps_per_epoch)
+    norms = {name: means.pop(name) for name in at.sums if name.startswith("gradient_norm/")}
+    return {
+        "epoch": at.epoch,
+        "step": at.step,
+        **means,
+        **validation,
+        "learning_rate": task.learning_rate(at.step) * at.plateau.factor,
+        f"{task.unit}_per_second": rate,
+        "seconds": at.seconds,
+        **norms,
+    }
+
+
+def _figures(task: Task, at: Position, rate: float) -> str:
+    """The figures beside the progress bar: the mean loss of the epoch so far, and the speed."""
+    steps = task.steps_per_epoch
+    loss = _means(at.sums, at.step - at.epoch * steps)["loss"]
+    return (
+        f"{at.step}/{task.config.optim.epochs * steps}  epoch {at.epoch + 1}  loss {loss:.4g}  "
+        f"lr {task.learning_rate(at.step) * at.plateau.factor:.2e}  {_speed(task, rate)}"
     )
-    reporter.progress("training", step / steps, numbers)
+
+
+def _summary(task: Task, row: Row) -> str:
+    """The line of a finished epoch."""
+    return (
+        f"epoch {row['epoch'] + 1:4d}/{task.config.optim.epochs}  "
+        f"loss {row['loss']:.4g}  val {row['val_loss']:.4g}  val rmse {row['val_rmse']:.4f} m  "
+        f"{task.remark(row)}lr {row['learning_rate']:.2e}  "
+        f"{_speed(task, row[f'{task.unit}_per_second'])}"
+    )
+
+
+def _speed(task: Task, rate: float) -> str:
+    return f"{rate:,.0f} {task.unit}/s" if rate >= 10 else f"{rate:.2g} {task.unit}/s"
+
+
+def stuck_head(row: Row) -> str | None:
+    """A warning where hardly a gradient reached a layer of the head in the epoch of `row`.
+
+    A training that diverges may leave the network there: where every scale s = softplus(·)
+    underflows to 0, so do the gradients of gate and encoder, and d̂ = 0 for good. A loss of 0 has
+    not begun yet (`LossConfig.nll_from_epoch`).
+    """
+    norms = {name: row[name] for name in row if name.startswith("gradient_norm/head/")}
+    layers = [name for name, norm in norms.items() if norm < NO_GRADIENT]
+    if not layers or row["loss"] == 0:
+        return None
+    named = ", ".join(name.removeprefix("gradient_norm/") for name in layers)
+    return (
+        f"warning: no gradient reached {named} in this epoch, the network learns no more; "
+        "start over with a lower optim.learning_rate, or with optim.clip_norm"
+    )
+
+
+class _Stop:
+    """Whether a signal has asked the run to stop; 0 where none has."""
+
+    received = 0
+    """The signal that this process has been sent."""
+    signum = 0
+    """The signal that one of the processes has been sent, once all of them know."""
+
+
+@contextmanager
+def _stop_signals() -> Iterator[_Stop]:
+    """Note SIGTERM and Ctrl-C instead of leaving; a second Ctrl-C leaves at once."""
+    stop = _Stop()
+
+    def note(signum: int, _: object) -> None:
+        if stop.received == signal.SIGINT == signum:
+            raise KeyboardInterrupt
+        stop.received = signum
+
+    before: dict[Any, Any] = {
+        signum: signal.signal(signum, note) for signum in (signal.SIGTERM, signal.SIGINT)
+    }
+    try:
+        yield stop
+    finally:
+        for signum, handler in before.items():
+            signal.signal(signum, handler)

@@ -1,11 +1,12 @@
-"""Training objectives: GNIO's weighted sum of squared error and likelihood (paper §III-F), and
-those of the networks beside it."""
+"""Training objectives on windows: GNIO's weighted sum of squared error and likelihood (paper
+§III-F), and that of CTIN."""
 
 from __future__ import annotations
 
 import math
 from typing import NamedTuple
 
+import chex
 import jax
 import jax.numpy as jnp
 from jaxtyping import Bool, Float, Int
@@ -13,26 +14,27 @@ from jaxtyping import Bool, Float, Int
 from gnio_jax.config import LossConfig
 from gnio_jax.types import Prediction, Windows
 
+TASK_LOG_STD_FLOOR = -math.log(2.0)
+"""Lower bound of CTIN's learnt log δ_v and log δ_c: no term has a weight above 2 (ours). Without it
+the loss has no lower bound: a likelihood of densities below 0, which a good network reaches, draws
+log δ_c to −∞, and its weight grows until the error of the velocity plays no part."""
 _NEVER = 2**31 - 1
 
 
-OUTLIER = 10.0
-"""Standard deviations beyond which the likelihood takes an error for an outlier (ours)."""
-
-
 class Losses(NamedTuple):
-    """Means over a batch."""
+    """Means over a batch, sums over the axes that the network predicts."""
 
     total: Float[jax.Array, ""]
-    """What training minimises."""
+    """The objective of training."""
     mse: Float[jax.Array, ""]
-    """‖d − d̂‖², summed over the axes, m²."""
+    """‖d − d̂‖², m²."""
     nll: Float[jax.Array, ""]
-    """½ (d − d̂)ᵀ Σ̂⁻¹ (d − d̂) + ½ log det Σ̂, without the constant."""
+    """½ (d − d̂)ᵀ Σ̂⁻¹ (d − d̂) + ½ log det Σ̂, without its constant (paper §III-F), with the bounds
+    that `LossConfig` gives."""
 
 
 class Stage(NamedTuple):
-    """What of the objective the progress of training decides."""
+    """What of the objective depends on the progress of training."""
 
     nll_weight: Float[jax.Array, ""]
     """λ_NLL, or zero before `LossConfig.nll_from_epoch`."""
@@ -52,7 +54,7 @@ def switches(config: LossConfig, steps_per_epoch: int) -> tuple[int, int]:
     return likelihood, max(likelihood, uncertainty) if weighted else uncertainty
 
 
-def stage(config: LossConfig, step: Int[jax.Array, ""] | int, steps_per_epoch: int) -> Stage:
+def loss_stage(config: LossConfig, step: Int[jax.Array, ""] | int, steps_per_epoch: int) -> Stage:
     """The stage at a step."""
     likelihood, uncertainty = switches(config, steps_per_epoch)
     step = jnp.asarray(step)
@@ -60,17 +62,24 @@ def stage(config: LossConfig, step: Int[jax.Array, ""] | int, steps_per_epoch: i
     return Stage(nll_weight, step >= uncertainty)
 
 
-def losses(prediction: Prediction, windows: Windows, config: LossConfig, stage: Stage) -> Losses:
-    """The losses of a batch.
+def losses(
+    prediction: Prediction, windows: Windows, config: LossConfig, stage: Stage, axes: int = 3
+) -> Losses:
+    """The losses of a batch, over the first `axes` axes: 2 for a network without the vertical.
 
-    Raises `ValueError` if the loss wants more than the network says (a velocity for every sample).
+    Raises `ValueError` if the loss wants more than the network predicts (a velocity for every
+    sample).
     """
-    error = windows.displacement - prediction.displacement
-    log_std = _held(prediction.log_std, stage)
+    given = (prediction.displacement, prediction.log_std, windows.displacement)
+    chex.assert_equal_shape(given)
+    chex.assert_shape(given, (None, 3))
+    error = (windows.displacement - prediction.displacement)[:, :axes]
+    log_std = _held(prediction.log_std, stage)[:, :axes]
     mse = jnp.mean(jnp.sum(error**2, axis=-1))
-    nll = _nll(error, log_std, config)
+    nll = gaussian_nll(error, log_std, config)
     if config.name == "velocity_and_covariance":
-        return Losses(_velocity_and_covariance(prediction, windows, config, stage), mse, nll)
+        total = _velocity_and_covariance(prediction, windows, config, stage, axes)
+        return Losses(total, mse, nll)
     total = config.mse_weight * mse + stage.nll_weight * nll
     if config.mae_weight:
         total = total + config.mae_weight * jnp.mean(jnp.sum(jnp.abs(error), axis=-1))
@@ -78,25 +87,28 @@ def losses(prediction: Prediction, windows: Windows, config: LossConfig, stage: 
 
 
 def _velocity_and_covariance(
-    prediction: Prediction, windows: Windows, config: LossConfig, stage: Stage
+    prediction: Prediction, windows: Windows, config: LossConfig, stage: Stage, axes: int
 ) -> Float[jax.Array, ""]:
-    """CTIN's L_v / 2δ_v² + L_c / 2δ_c² + log δ_v δ_c (its eq. 9–11), δ being learnt.
+    """CTIN's L_v / 2δ_v² + L_c / 2δ_c² + log δ_v δ_c (its eq. 9–11), with learnt δ.
 
     L_v is the squared error of each sample's velocity plus that of the position to which they add
     up, L_c the likelihood of the velocities. Velocities are metres per window. Ours: means over the
-    samples, sums over the axes.
+    samples, sums over the axes, and the lower bound of both log δ.
     """
-    said = prediction.diagnostics
-    if not {"velocity", "velocity_log_std", "task_log_std"} <= said.keys():
+    found = prediction.diagnostics
+    if not {"velocity", "velocity_log_std", "task_log_std"} <= found.keys():
         raise ValueError(
             "loss 'velocity_and_covariance' wants a velocity for every sample, "
             "which only the network 'ctin' gives"
         )
-    error = windows.steps * windows.steps.shape[1] - said["velocity"]
-    position = windows.displacement - prediction.displacement
+    # Of a context before the window CTIN would predict velocities that the target does not have.
+    chex.assert_equal_shape([windows.steps, found["velocity"], found["velocity_log_std"]])
+    error = (windows.steps * windows.steps.shape[1] - found["velocity"])[..., :axes]
+    position = (windows.displacement - prediction.displacement)[:, :axes]
     velocity_loss = jnp.mean(jnp.sum(error**2, axis=-1)) + jnp.mean(jnp.sum(position**2, axis=-1))
-    covariance_loss = _nll(error, _held(said["velocity_log_std"], stage), config)
-    log_v, log_c = said["task_log_std"][0]
+    log_std = _held(found["velocity_log_std"], stage)[..., :axes]
+    covariance_loss = gaussian_nll(error, log_std, config)
+    log_v, log_c = jnp.maximum(found["task_log_std"][0], TASK_LOG_STD_FLOOR)
     return (
         0.5 * jnp.exp(-2 * log_v) * velocity_loss
         + 0.5 * jnp.exp(-2 * log_c) * covariance_loss
@@ -105,19 +117,22 @@ def _velocity_and_covariance(
     )
 
 
-def _nll(
-    error: Float[jax.Array, "*b 3"], log_std: Float[jax.Array, "*b 3"], config: LossConfig
+def gaussian_nll(
+    error: Float[jax.Array, "*b d"], log_std: Float[jax.Array, "*b d"], config: LossConfig
 ) -> Float[jax.Array, ""]:
-    """Mean over the windows of ½ (e/σ)² + log σ, summed over the axes (paper §III-F, eq. of L_NLL).
+    """Mean over the windows of ½ (e/σ)² + log σ, summed over the axes (paper §III-F, L_NLL).
 
-    Ours: (e/σ)² grows only with its logarithm beyond `OUTLIER`². One window with a tiny σ would
-    else have a gradient without bound, which Adam's second moment remembers for a thousand steps.
+    With `outlier_sigmas` = k (ours) (e/σ)² grows only with its logarithm beyond k²: one window with
+    a tiny σ has else a gradient without bound, which Adam's second moment remembers for a thousand
+    steps.
     """
     if config.log_std_floor is not None:
         log_std = jnp.maximum(log_std, config.log_std_floor)
-    squared, bound = error**2 * jnp.exp(-2 * log_std), OUTLIER**2
-    beyond = bound * (1 + jnp.log(jnp.maximum(squared, bound) / bound))
-    normalised = jnp.where(squared > bound, beyond, squared)
+    normalised = error**2 * jnp.exp(-2 * log_std)
+    if config.outlier_sigmas is not None:
+        bound = config.outlier_sigmas**2
+        beyond = bound * (1 + jnp.log(jnp.maximum(normalised, bound) / bound))
+        normalised = jnp.where(normalised > bound, beyond, normalised)
     return jnp.mean(jnp.sum(0.5 * normalised + log_std, axis=-1))
 
 

@@ -1,108 +1,102 @@
-"""The folder of a run: its settings, and the recordings that it learns from."""
+"""The folder of a run: its settings, the recordings it is trained on, its log, and the weights that
+it starts from."""
 
 from __future__ import annotations
 
 import dataclasses
+import fcntl
 import hashlib
+import json
+import os
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 import yaml
+from tensorboardX.event_file_writer import EventsWriter
+from tensorboardX.proto import event_pb2
+from tensorboardX.summary import scalar
 
 from gnio_jax import config as configuration
+from gnio_jax import parallel
 from gnio_jax.config import TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.files import write_text
-from gnio_jax.scaling.processes import is_first, require_same, several
+from gnio_jax.training.checkpoint import Run
+from gnio_jax.training.window_task import Row, create_model
 
-MAY_CHANGE = ("workdir", "data_root", "init_from", "checkpoint_every_seconds")
+MAY_CHANGE = ("workdir", "data_root", "init_from")
 """Settings that a resumed run may change: where things lie, not what is computed."""
 
+# Made when the module is imported, so type checkers do not know them.
+_Event, _SessionLog = (getattr(event_pb2, name) for name in ("Event", "SessionLog"))
 
-def prepare(config: TrainConfig, resume: bool) -> Path:
+
+# Settings and recordings
+# ------------------------------------------------------------------------------------------------
+
+
+def refuse_other_run(config: TrainConfig, resume: bool) -> Path:
     """The work folder of a run that `config` may start or continue; nothing is written.
 
     Raises `InputError` for a folder that holds a run already, and with `resume` for one that holds
-    none, or one with other settings. Of several processes the first one alone sees the folder.
+    none, or one with other settings. Of several processes the first one alone looks.
     """
     workdir = configuration.default_workdir(config)
-    if not is_first():
-        return workdir
     kept = workdir / "config.yaml"
-    if not resume and kept.exists():
-        remedy = "continue it with --resume, or choose another --workdir"
-        raise InputError(workdir, "already holds a run", remedy)
-    if resume and not kept.exists():
+    if not parallel.is_first():
+        return workdir
+    if not resume:
+        if kept.exists():
+            remedy = "continue it with --resume, or choose another --workdir"
+            raise InputError(workdir, "already holds a run", remedy)
+        return workdir
+    if not kept.exists():
         problem = "holds no run to resume (config.yaml is missing)"
         raise InputError(workdir, problem, "start it without --resume")
-    if resume:
-        _refuse_other_settings(config, kept)
-    return workdir
-
-
-def _refuse_other_settings(config: TrainConfig, kept: Path) -> None:
     ours, theirs = (dataclasses.asdict(c) for c in (config, configuration.load(kept)))
-    theirs["data"]["residency"] = ours["data"]["residency"]  # where things lie, too
     for name in ours:
         if name not in MAY_CHANGE and ours[name] != theirs[name]:
             problem = f"'{name}' was {theirs[name]} and is now {ours[name]}"
             raise InputError(kept, problem, "resume with the same settings")
+    return workdir
 
 
-def write_settings(
-    workdir: Path, config: TrainConfig, splits: dict[str, list[str]], resume: bool
-) -> None:
-    """Write config.yaml and splits.yaml of a new run; compare the splits of a resumed one.
+@contextmanager
+def opened(config: TrainConfig, splits: dict[str, list[str]], resume: bool) -> Iterator[Path]:
+    """The work folder, with the config.yaml and splits.yaml of a new run, for one training at a
+    time: the folder is locked as long as the context lasts, or the process.
 
-    Raises `InputError` when the run was begun with other recordings.
+    Raises `InputError` where another process trains in it, and for a resumed run that was begun
+    with other recordings. Of several processes the first one writes.
     """
-    if not is_first():
+    workdir = configuration.default_workdir(config)
+    if not parallel.is_first():
+        yield workdir
         return
     workdir.mkdir(parents=True, exist_ok=True)
-    if not resume:
-        configuration.save(workdir / "config.yaml", config)
-    path = workdir / "splits.yaml"
-    if path.exists():
-        _refuse_other_recordings(path, splits)
-    else:
-        write_text(path, yaml.safe_dump(splits, sort_keys=False, allow_unicode=True))
-
-
-def compare_processes(
-    config: TrainConfig, splits: dict[str, list[str]], recordings: Any, variables: Any
-) -> None:
-    """Raise `InputError` unless all processes have the same settings, recordings and weights to
-    begin with: other ones would compute something else, or wait for each other for ever.
-
-    Trees of arrays are compared by their shapes and a sample of their rows.
-    """
-    if not several():
-        return
-    settings = bytes.fromhex(identity(config))
-    require_same("settings", settings, "start all with the same options, also --config")
-    same_data = "give all of them the same data"
-    require_same("recordings", _digest(splits), same_data)
-    require_same("samples of the same recordings", _digest(_sampled(recordings)), same_data)
-    same_run = "give all of them the same run in --init-from"
-    require_same("weights to begin with", _digest(_sampled(variables)), same_run)
-
-
-def identity(config: TrainConfig) -> str:
-    """The same for all processes of a run, wherever its files lie for each."""
-    settings = {k: v for k, v in dataclasses.asdict(config).items() if k not in MAY_CHANGE}
-    return _digest(settings).hex()
-
-
-def _sampled(tree: Any) -> list[Any]:
-    """Shape, and the bytes of some rows, of each array of a tree."""
-    leaves = [np.atleast_1d(leaf) for leaf in jax.tree.leaves(tree)]
-    return [(leaf.shape, leaf[:: len(leaf) // 999 + 1].tobytes()) for leaf in leaves]
-
-
-def _digest(value: Any) -> bytes:
-    return hashlib.sha256(repr(value).encode()).digest()
+    folder = os.open(workdir, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            problem = "another process is training in it"
+            raise InputError(workdir, problem, "choose another --workdir") from None
+        refuse_other_run(config, resume)  # another one may have begun while the data was read
+        if not resume:
+            configuration.save(workdir / "config.yaml", config)
+        path = workdir / "splits.yaml"
+        if path.exists():
+            _refuse_other_recordings(path, splits)
+        else:
+            write_text(path, yaml.safe_dump(splits, sort_keys=False, allow_unicode=True))
+        yield workdir
+    finally:
+        os.close(folder)
 
 
 def _refuse_other_recordings(path: Path, splits: dict[str, list[str]]) -> None:
@@ -123,3 +117,143 @@ def _refuse_other_recordings(path: Path, splits: dict[str, list[str]]) -> None:
                 f"({len(changed)} differ{what})"
             )
             raise InputError(path, problem, "resume with the same data")
+
+
+def compare_processes(
+    config: TrainConfig, splits: dict[str, list[str]], recordings: Any, variables: Any
+) -> None:
+    """Raise `InputError` in every process unless all have the same settings, recordings and weights
+    to begin with: other ones would compute something else, or wait for each other for ever.
+
+    Trees of arrays are compared by their shapes and a sample of their rows.
+    """
+    if jax.process_count() == 1:
+        return
+
+    def sampled(tree: Any) -> list[Any]:
+        leaves = [np.atleast_1d(leaf) for leaf in jax.tree.leaves(parallel.on_host(tree))]
+        return [(leaf.shape, leaf[:: len(leaf) // 999 + 1].tobytes()) for leaf in leaves]
+
+    settings = {k: v for k, v in dataclasses.asdict(config).items() if k not in MAY_CHANGE}
+    for what, value, remedy in (
+        ("settings", settings, "start all with the same options, also --config"),
+        ("recordings", (splits, sampled(recordings)), "give all of them the same data"),
+        ("weights to begin with", sampled(variables), "give all the same run in --init-from"),
+    ):
+        digest = hashlib.sha256(repr(value).encode()).digest()
+        number = int.from_bytes(digest[:4], "big") >> 1
+        greatest, least = parallel.largest(number, -number)
+        if greatest != -least:
+            raise InputError("--distributed", f"the processes have different {what}", remedy)
+
+
+# The weights at the start
+# ------------------------------------------------------------------------------------------------
+
+
+def initial_run(config: TrainConfig, load: Callable[[str], Run]) -> Run | None:
+    """The run that `config.init_from` names, if any, as `load` reads it.
+
+    Raises `InputError` for a folder without a run, and for one whose network is not that of
+    `config`; also if training through the filter has none to start from. A calibrated uncertainty
+    may follow a plain head, since its parameters are the same.
+    """
+    if config.init_from is None and config.through_filter.learn:
+        problem = "needs the weights of a network that has been trained on windows"
+        remedy = "name its run with --init-from"
+        raise InputError("config", f"field 'through_filter.learn' {problem}", remedy)
+    if config.init_from is None:
+        return None
+    run = load(config.init_from)
+    theirs, ours = (_description(each) for each in (run.config, config))
+    head_to_calibrated = ("head", "calibrated")
+    if (theirs.get("model.uncertainty"), ours.get("model.uncertainty")) == head_to_calibrated:
+        ours["model.uncertainty"] = "head"
+    for name in theirs | ours:
+        if theirs.get(name) != ours.get(name):
+            problem = f"its {name} is {theirs.get(name)}, and here it is {ours.get(name)}"
+            raise InputError(config.init_from, problem, "describe the same network")
+    return run
+
+
+def _description(config: TrainConfig) -> dict[str, Any]:
+    """What makes a network the same: its name and options, and the windows that it reads."""
+    model = create_model(config)
+    model = getattr(model, "network", model)  # what an equivariant construction is made around
+    options = {
+        f"model.{field.name}": getattr(model, field.name)
+        for field in dataclasses.fields(model)
+        if field.name not in ("parent", "name")
+    }
+    windows = {
+        f"data.{name}": getattr(config.data, name)
+        for name in ("rate", "window_seconds", "context_seconds", "window_rotation")
+    }
+    named = {f"model.{name}": getattr(config.model, name) for name in ("name", "equivariance")}
+    return {**named, **options, **windows}
+
+
+# The log
+# ------------------------------------------------------------------------------------------------
+
+
+class Log:
+    """A row of figures for each finished epoch, in metrics.jsonl and TensorBoard. A resumed run
+    drops those after its checkpoint and writes them again. Of several processes the first one
+    writes them."""
+
+    def __init__(self, workdir: Path, epoch: int, step: int):
+        self._path = workdir / "metrics.jsonl"
+        self._rows, self._board = [], None
+        if parallel.is_first():
+            exists = self._path.exists()
+            lines = self._path.read_text(encoding="utf-8").splitlines() if exists else []
+            self._rows = [row for row in map(json.loads, lines) if row["epoch"] < epoch]
+            self._board = _Board(workdir / "tensorboard", step)
+
+    def __enter__(self) -> Log:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._board is not None:
+            self._board.close()
+
+    def add(self, row: Row) -> None:
+        """Write the row of an epoch."""
+        if self._board is None:
+            return
+        self._rows.append(row)
+        write_text(self._path, "".join(json.dumps(row) + "\n" for row in self._rows))
+        self._board.add(row)
+
+
+class _Board:
+    """A TensorBoard event file, written row by row.
+
+    tensorboardX's own SummaryWriter writes in a thread, which dies where the disk is full; then
+    the run would wait for it for ever.
+    """
+
+    def __init__(self, folder: Path, step: int):
+        """Rows from `step` on that other files of the folder hold are void."""
+        folder.mkdir(parents=True, exist_ok=True)
+        self._folder = folder
+        self._file = EventsWriter(str(folder / "events"))
+        start = _SessionLog(status=_SessionLog.START)
+        self._file.write_event(_Event(wall_time=time.time(), step=step, session_log=start))
+
+    def add(self, row: Row) -> None:
+        try:
+            for name, value in row.items():
+                event = _Event(wall_time=time.time(), step=row["step"], summary=scalar(name, value))
+                self._file.write_event(event)
+            self._file.flush()
+        except OSError as error:
+            error.filename = str(self._folder)
+            raise
+
+    def close(self) -> None:
+        try:
+            self._file.close()
+        except OSError:
+            pass  # `add` has raised it, or something worse has happened

@@ -19,6 +19,7 @@ from gnio_jax.commands.train import experiment
 from gnio_jax.commands.train import train as command
 from gnio_jax.config import DataConfig, FilterSettings, ModelConfig, TrainConfig
 from gnio_jax.errors import InputError
+from gnio_jax.training import optimizer
 from tests.support import tiny_run
 from tests.support.filter_settings import changed
 
@@ -152,11 +153,8 @@ def test_the_papers_configs_are_the_papers():
             and config.optim.epochs == 200
             and config.optim.warmup_epochs == 5
         )
-        assert (
-            config.optim.start_learning_rate,
-            config.optim.learning_rate,
-            config.optim.end_learning_rate,
-        ) == (1e-6, 1e-4, 1e-6)
+        rates = (config.optim.start_learning_rate, config.optim.learning_rate)
+        assert (*rates, optimizer.END_LEARNING_RATE) == (1e-6, 1e-4, 1e-6)
         assert (config.loss.mse_weight, config.loss.nll_weight) == (1e2, 1e-4)
         assert config.data.stride * 10 == config.data.window == config.data.rate
 

@@ -78,8 +78,7 @@ def read(text):
         ("filter: {noise: {correlation: {share: 1}}}", "must be at least 0 and below 1, found 1.0"),
         ("filter: {noise: {gyro_densty: 1}}", "did you mean 'filter.noise.gyro_density'?"),
         (
-            "data: {window_seconds: 0.5}\n"
-            "through_filter: {learn: [noise], piece_seconds: 0.7, truncate_seconds: 0.7}",
+            "data: {window_seconds: 0.5}\nthrough_filter: {learn: [noise], piece_seconds: 0.7}",
             "field 'through_filter.piece_seconds' must be at least 1 s",
         ),
     ],

@@ -13,7 +13,7 @@ from gnio_jax.commands import app
 from gnio_jax.errors import InputError
 from gnio_jax.pretrained.finding import SHIPPED
 from gnio_jax.training import checkpoint
-from gnio_jax.training.initial import initial_run
+from gnio_jax.training.run_folder import initial_run
 from tests.support.compiling import quick
 
 MAXIMUM = 5e6

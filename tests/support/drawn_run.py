@@ -8,7 +8,7 @@ import numpy as np
 from gnio_jax import config as configuration
 from gnio_jax import models
 from gnio_jax.training import checkpoint
-from gnio_jax.training.step import TrainState
+from gnio_jax.training.window_task import TrainState, create_model
 
 
 def save(folder, config, draw):
@@ -18,7 +18,7 @@ def save(folder, config, draw):
     """
     configuration.save(folder / "config.yaml", config)
     random = np.random.default_rng(0)
-    shapes = models.variable_shapes(checkpoint.create_model(config), config.data.window)
+    shapes = models.variable_shapes(create_model(config), config.data.window)
     drawn = {
         kind: jax.tree.map(
             lambda leaf, kind=kind: jnp.asarray(np.float32(draw(random, kind, leaf.shape))), tree
@@ -27,5 +27,5 @@ def save(folder, config, draw):
     }
     state = TrainState(jnp.int32(0), drawn["params"], drawn["batch_stats"], {})
     with checkpoint.Checkpoints(folder) as checkpoints:
-        checkpoints.save("best", state, checkpoint.Position(1, 0, 1.0, (0.0, 0.0, 0.0), 1.0))
+        checkpoints.save("best", state, checkpoint.Position(epoch=1, best=1.0))
     return folder

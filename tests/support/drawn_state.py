@@ -6,16 +6,21 @@ import functools
 import jax
 import numpy as np
 
-from gnio_jax.training import step
+from gnio_jax.training import optimizer, window_task
 
 
-def drawn_state(model, optimizer, window, ema_decay=0.0):
-    """As `step.create_state` in shapes and types. Kernels are normal, the smaller the more numbers
-    they sum, and those of the heads next to nothing; the optimizer has seen nothing."""
-    create = functools.partial(step.create_state, model, optimizer)
-    shapes = jax.eval_shape(
-        lambda key: create(key, window=window, ema_decay=ema_decay), jax.random.key(0)
-    )
+def fresh_state(model, config, steps_per_epoch, key):
+    """As a task on windows begins."""
+    state = window_task.initial_state(model, key, config.data.seen)
+    adam = optimizer.adam(config.optim, config.loss, steps_per_epoch)
+    return state._replace(opt_state=adam.init(state.params))
+
+
+def drawn_state(model, config, steps_per_epoch):
+    """As `fresh_state` in shapes and types. Kernels are normal, the smaller the more numbers they
+    sum, and those of the heads next to nothing; the optimizer has seen nothing."""
+    create = functools.partial(fresh_state, model, config, steps_per_epoch)
+    shapes = jax.eval_shape(create, jax.random.key(0))
     random = np.random.default_rng(0)
 
     def parameter(path, leaf):
@@ -34,6 +39,5 @@ def drawn_state(model, optimizer, window, ema_decay=0.0):
         params=params,
         batch_stats=jax.tree_util.tree_map_with_path(statistic, shapes.batch_stats),
         opt_state=jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), shapes.opt_state),
-        average=None if shapes.average is None else jax.tree.map(np.copy, params),
     )
     return jax.device_put(drawn)

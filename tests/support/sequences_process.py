@@ -1,20 +1,17 @@
 """Five sequences through `over_sequences` in one of several processes; the result goes into a file.
 
-python -m tests.support.sequences_process COORDINATOR PROCESSES PROCESS_ID FILE
+python -m tests.support.sequences_process HOST:PORT,PROCESSES,ID FILE
 """
 
 import sys
 
 import numpy as np
 
-from gnio_jax.scaling.devices import cpu_devices
-from gnio_jax.scaling.meeting import Meeting
-from gnio_jax.scaling.processes import meet, on_host, running
+from gnio_jax import parallel
 
 
-def main(coordinator, processes, process_id, file):
-    cpu_devices(2)
-    meet(Meeting(coordinator, int(processes), int(process_id)))
+def main(distributed, file):
+    parallel.initialise(distributed, devices=2)
     import jax
     import jax.numpy as jnp
 
@@ -24,10 +21,9 @@ def main(coordinator, processes, process_id, file):
         return scale * jnp.cumsum(steps, axis=0), jnp.max(steps)
 
     steps = np.random.default_rng(0).normal(size=(5, 7, 3)).astype(np.float32)
-    with running():
-        many = jax.jit(over_sequences(walk, shared=1))
-        path, largest = on_host(many(np.float32(2), steps))
-        one, _ = on_host(many(np.float32(2), steps[:1]))
+    many = jax.jit(over_sequences(walk, shared=1))
+    path, largest = parallel.on_host(many(np.float32(2), steps))
+    one, _ = parallel.on_host(many(np.float32(2), steps[:1]))
     np.savez(file, path=path, largest=largest, one=one)
 
 

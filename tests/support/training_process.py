@@ -1,9 +1,9 @@
 """`gnio train` in a process that may send itself a signal in the middle of an epoch.
 
-    python -m tests.support.training_process SIGTERM 15 --workdir RUN ...
+    python -m tests.support.training_process SIGTERM 15 0 --workdir RUN ...
 
-The words after signal and step are those of `gnio train`; `never 0` sends none. The network may be
-`tiny`.
+The words after signal, step and 1 for a checkpoint after every step, else 0, are those of
+`gnio train`; `never 0` sends none. The network may be `tiny`.
 """
 
 import os
@@ -16,18 +16,20 @@ from gnio_jax.training import loop
 from tests.support.tiny_network import Tiny
 
 
-def main(name, step, *arguments):
-    run_steps = loop._run_steps
+def main(name, step, every, *arguments):
+    after_steps = loop._after_steps
     loop.DISPATCH_SECONDS = 0  # one step at a time
+    if every == "1":
+        loop.CHECKPOINT_SECONDS = 0
     registry._MODELS["tiny"] = Tiny
 
     def interrupted(*given):
-        group = run_steps(*given)
-        if name != "never" and group.step >= int(step):
+        at = after_steps(*given)
+        if name != "never" and at.step >= int(step):
             os.kill(os.getpid(), signal.Signals[name])
-        return group
+        return at
 
-    loop._run_steps = interrupted
+    loop._after_steps = interrupted
     app.main(["train", *arguments])
 
 

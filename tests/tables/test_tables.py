@@ -16,7 +16,6 @@ from gnio_jax.errors import InputError
 from gnio_jax.tables import complexity
 from gnio_jax.training import loop
 from tests.support.command_lines import run as gnio
-from tests.support.runs import shared_programs
 from tests.support.tlio_files import write_sequence
 
 
@@ -37,8 +36,7 @@ def made(tmp_path_factory):
     configuration.save(root / "base.yaml", base)
     folders = ["--base", root / "base.yaml", "--data-root", root / "data", "--out", root / "out"]
     choices = ["--seeds", 2, "--methods", "gnio", "--split", "test", "--estimator", "integrate"]
-    with shared_programs():
-        yield root, [str(argument) for argument in [*folders, *choices]]
+    yield root, [str(argument) for argument in [*folders, *choices]]
 
 
 def test_a_table_from_nothing_and_again_without_training(made, monkeypatch, capsys):

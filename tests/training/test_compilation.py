@@ -10,10 +10,11 @@ import pytest
 
 from gnio_jax.config import DataConfig, ModelConfig, OptimConfig, TrainConfig
 from gnio_jax.data.windows import WindowSource
-from gnio_jax.training import optimizer, step, validation
-from gnio_jax.training.checkpoint import create_model
-from gnio_jax.training.losses import stage
+from gnio_jax.training import window_task
+from gnio_jax.training.losses import loss_stage
+from gnio_jax.training.window_task import create_model
 from tests.support.compiling import quick
+from tests.support.drawn_state import fresh_state
 from tests.support.tiny_network import Tiny
 
 CONFIG = TrainConfig(
@@ -51,27 +52,26 @@ def test_a_step_of_training_and_a_validation():
     """Other windows, another order, more steps, another learning rate, another stage."""
     with jax.enable_x64(False):
         model = Tiny()  # a trace of another is no different
-        tx = optimizer.create(CONFIG.optim, CONFIG.loss, WINDOWS // 2)
         fixed = dict(model=model, config=CONFIG)
-        train = once(step.train_steps, static_argnames=("model", "optimizer", "config"))
-        validate = once(validation.validate, static_argnames=("model", "config"))
-        train = functools.partial(train, **fixed, optimizer=tx)
+        names = ("model", "config", "steps_per_epoch")
+        train = once(window_task.train_steps, static_argnames=names)
+        validate = once(window_task.validate, static_argnames=names[:2])
+        train = functools.partial(train, **fixed, steps_per_epoch=WINDOWS // 2)
         validate = functools.partial(validate, **fixed)
-        state = step.create_state(model, tx, jax.random.key(0), CONFIG.data.window)
+        state = fresh_state(model, CONFIG, WINDOWS // 2, jax.random.key(0))
         for epoch, (first, count, factor) in enumerate([(0, 1, 1.0), (1, 2, 0.5)]):
             windows = source(epoch)
-            order = step.epoch_order(jax.random.key(1), epoch, windows)
+            order = window_task.epoch_order(jax.random.key(1), epoch, windows)
             numbers = jnp.int32(first), jnp.int32(count), jnp.float32(factor)
             state, progress = train(state, windows, order, *numbers, jax.random.key(2))
-            found = validate(state, windows, stage(CONFIG.loss, state.step, WINDOWS // 2))
+            found = validate(state, windows, loss_stage(CONFIG.loss, state.step, WINDOWS // 2))
             chex.assert_tree_all_finite((progress.sums, found.losses))
         assert int(state.step) == 3
 
 
 def test_no_type_of_a_fresh_state_is_weak():
     """Steps give types that are none: the second one would be compiled anew."""
-    model, tx = create_model(CONFIG), optimizer.create(CONFIG.optim, CONFIG.loss, WINDOWS // 2)
     with jax.enable_x64(False):
-        create = functools.partial(step.create_state, model, tx, window=CONFIG.data.window)
+        create = functools.partial(fresh_state, create_model(CONFIG), CONFIG, WINDOWS // 2)
         fresh = jax.eval_shape(create, jax.random.key(0))
     assert not [leaf for leaf in jax.tree.leaves(fresh) if leaf.weak_type]

@@ -1,4 +1,4 @@
-"""Losses of a filtered piece against plain NumPy and SciPy, row by row."""
+"""Losses of a filtered segment against plain NumPy and SciPy, row by row."""
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +9,7 @@ from scipy.stats import multivariate_normal
 from gnio_jax.config import ThroughFilter
 from gnio_jax.filtering import FilterConfig, FilterHistory
 from gnio_jax.training import filter_losses
-from gnio_jax.training.pieces import Path
+from gnio_jax.training.segments import Path
 from tests.support.compiling import quick
 
 K, W = 40, 5

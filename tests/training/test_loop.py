@@ -22,19 +22,8 @@ from gnio_jax.config import DataConfig, LossConfig, ModelConfig, OptimConfig, Tr
 from gnio_jax.data import windows
 from gnio_jax.errors import InputError
 from gnio_jax.models import registry
-from gnio_jax.training import (
-    batch_statistics,
-    checkpoint,
-    kinds,
-    loop,
-    on_windows,
-    optimizer,
-    seed_runs,
-    step,
-    validation,
-)
+from gnio_jax.training import checkpoint, loop, optimizer, run_folder, window_task
 from gnio_jax.training.losses import Losses
-from tests.support.runs import shared_programs
 from tests.support.tiny_network import Tiny
 from tests.support.tlio_files import write_splits
 
@@ -68,9 +57,8 @@ def same(a, b):
 
 
 @pytest.fixture(scope="module", autouse=True)
-def one_compilation():
-    """Of the smallest network."""
-    with pytest.MonkeyPatch.context() as patch, shared_programs():
+def registered():
+    with pytest.MonkeyPatch.context() as patch:
         patch.setitem(registry._MODELS, "tiny", Tiny)
         yield
 
@@ -114,10 +102,9 @@ def windows_of(recording, split, config):
     return jax.device_put(windows.window_source(sequences, config.data, 5))
 
 
-@pytest.mark.parametrize("kept", ["finished", "averaged"])
-def test_validation_is_the_plain_mean_over_every_window(recording, kept, request):
-    """With the parameters that evaluation loads, averages or not."""
-    workdir, _ = request.getfixturevalue(kept)
+def test_validation_is_the_plain_mean_over_every_window(recording, finished):
+    """With the parameters that evaluation loads."""
+    workdir, _ = finished
     run = checkpoint.load_run(workdir, "latest")
     source = windows_of(recording, "val", run.config)
     which = np.arange(source.start.shape[0], dtype=np.int32)
@@ -132,82 +119,6 @@ def test_validation_is_the_plain_mean_over_every_window(recording, kept, request
     row = json.loads((workdir / "metrics.jsonl").read_text().splitlines()[-1])
     assert row["val_mse"] == pytest.approx(mse, rel=1e-4)
     assert len(every.displacement) % 16 != 0  # so that the filled-up last batch is part of the test
-
-
-def averaging(recording, workdir):
-    config = tiny(recording, workdir)
-    return dataclasses.replace(config, optim=dataclasses.replace(config.optim, ema_decay=0.9))
-
-
-@pytest.fixture(scope="module")
-def averaged(recording, tmp_path_factory):
-    """The same run, keeping an average of its parameters."""
-    workdir = tmp_path_factory.mktemp("averaged") / "run"
-    return workdir, loop.train(averaging(recording, workdir))
-
-
-def resumed_state(config):
-    """The state with which a run would go on."""
-    model = checkpoint.create_model(config)
-    tx = optimizer.create(config.optim, config.loss, 1)
-    template = step.create_state(model, tx, jax.random.key(0), 50, config.optim.ema_decay)
-    with checkpoint.Checkpoints(Path(config.workdir)) as checkpoints:
-        return jax.tree.map(np.asarray, checkpoints.restore(template)[0])
-
-
-def test_averages_are_evaluated_and_training_goes_on_without_them(recording, finished, averaged):
-    workdir, _ = averaged
-    loaded, plain = parameters(workdir), parameters(finished[0])
-    state = resumed_state(averaging(recording, workdir))
-    assert same(state.average, loaded["params"]) and not same(state.params, loaded["params"])
-    misses = [
-        sum(np.sum((a - b) ** 2) for a, b in zip(*map(jax.tree.leaves, pair), strict=True))
-        for pair in ((state.params, plain["params"]), (loaded["params"], plain["params"]))
-    ]
-    assert misses[0] < 1e-3 * misses[1]  # its steps are those of the run without
-    config = kinds.compiled(checkpoint.load_run(workdir).config)
-    model, key = checkpoint.create_model(config), jax.random.key(0)
-    with jax.enable_x64(False):
-        source, key = windows_of(recording, "train", config), jax.random.fold_in(key, 3)
-        estimated = batch_statistics.estimate_statistics(
-            step.evaluated(jax.tree.map(jnp.asarray, state)),
-            source,
-            batch_statistics.statistics_order(key, source, config),
-            key,
-            model=model,
-            config=config,
-        )
-    assert same(estimated.batch_stats, loaded["batch_stats"])
-    assert not same(plain["batch_stats"], loaded["batch_stats"])
-
-
-def test_a_run_that_averages_is_resumed_to_the_bit(recording, averaged, tmp_path, monkeypatch):
-    real, calls = step.train_steps, []
-
-    def stopping(*arguments, **options):
-        calls.append(1)
-        if len(calls) == 4:
-            os.kill(os.getpid(), signal.SIGTERM)
-        return real(*arguments, **options)
-
-    monkeypatch.setattr(on_windows, "train_steps", stopping)
-    monkeypatch.setattr(loop, "DISPATCH_SECONDS", 0.01)
-    config = averaging(recording, tmp_path / "run")
-    assert loop.train(config).stopped_by == signal.SIGTERM
-    assert loop.train(config, resume=True).stopped_by is None
-    for which in ("latest", "best"):
-        assert same(parameters(tmp_path / "run", which), parameters(averaged[0], which))
-    states = [resumed_state(averaging(recording, at)) for at in (tmp_path / "run", averaged[0])]
-    assert same(*states)
-
-
-def test_averages_want_statistics_of_their_own(recording):
-    optim = OptimConfig(ema_decay=0.9, statistics_windows=0)
-    with pytest.raises(InputError, match=r"optim\.ema_decay' is set without optim\.statistics_"):
-        configuration.validate(tiny(recording, "", optim=optim))
-    optim = OptimConfig(ema_decay=1.0)
-    with pytest.raises(InputError, match=r"optim\.ema_decay' must be at least 0 and below 1"):
-        configuration.validate(tiny(recording, "", optim=optim))
 
 
 def test_a_run_is_not_resumed_with_other_recordings(recording, finished, tmp_path):
@@ -238,7 +149,7 @@ def test_stopping_within_an_epoch_and_resuming_gives_the_same_bits(
     recording, finished, tmp_path, monkeypatch, dispatches
 ):
     calls = []
-    real = step.train_steps
+    real = window_task.train_steps
 
     def stopping(*arguments, **options):
         calls.append(1)
@@ -246,7 +157,7 @@ def test_stopping_within_an_epoch_and_resuming_gives_the_same_bits(
             os.kill(os.getpid(), signal.SIGTERM)
         return real(*arguments, **options)
 
-    monkeypatch.setattr(on_windows, "train_steps", stopping)
+    monkeypatch.setattr(window_task, "train_steps", stopping)
     monkeypatch.setattr(loop, "DISPATCH_SECONDS", 0.01)
     outcome = loop.train(tiny(recording, tmp_path / "run"))
     assert outcome.stopped_by == signal.SIGTERM
@@ -274,7 +185,7 @@ def test_stopping_within_an_epoch_and_resuming_gives_the_same_bits(
 
 def command(recording, workdir):
     return [
-        *[sys.executable, "-m", "tests.support.training_process", "never", "0"],
+        *[sys.executable, "-m", "tests.support.training_process", "never", "0", "0"],
         "--dataset",
         "tlio",
         "--data-root",
@@ -334,7 +245,7 @@ def test_killed_at_any_moment_and_resumed_gives_the_same_bits(recording, finishe
 
 
 def test_a_loss_that_is_not_finite_stops_with_its_step(recording, tmp_path, monkeypatch):
-    real, found = windows.window_source, []
+    real, found = window_task.window_source, []
 
     def spoiled(*arguments):
         source = real(*arguments)
@@ -345,13 +256,14 @@ def test_a_loss_that_is_not_finite_stops_with_its_step(recording, tmp_path, monk
             )
         )
 
-    monkeypatch.setattr(windows, "window_source", spoiled)
+    monkeypatch.setattr(window_task, "window_source", spoiled)
     config = tiny(recording, tmp_path / "run")
     with pytest.raises(FloatingPointError, match=r"not finite at step \d+ \(epoch 0\)") as raised:
         loop.train(config)
     order_key = jax.random.split(jax.random.key(config.seed), 3)[1]
     expected = (
-        int(np.flatnonzero(np.asarray(step.epoch_order(order_key, 0, found[0])) == 77)[0]) // 16
+        int(np.flatnonzero(np.asarray(window_task.epoch_order(order_key, 0, found[0])) == 77)[0])
+        // 16
     )
     assert f"at step {expected} " in str(raised.value)
 
@@ -376,13 +288,11 @@ def test_a_head_that_no_gradient_reaches_is_told_of(recording, finished, tmp_pat
         "more; start over with a lower optim.learning_rate, or with optim.clip_norm"
     ]
     rows = (finished[0] / "metrics.jsonl").read_text().splitlines()
-    assert not any(seed_runs.stuck_head(json.loads(row)) for row in rows)
+    assert not any(loop.stuck_head(json.loads(row)) for row in rows)
     # Steps that Adam's ε swallows are none, and a loss that has not begun is no mistake.
     row = json.loads(rows[-1])
-    assert "head/kernel" in (
-        seed_runs.stuck_head({**row, "gradient_norm/head/kernel": 1e-12}) or ""
-    )
-    assert seed_runs.stuck_head({**row, "gradient_norm/head/kernel": 0.0, "loss": 0.0}) is None
+    assert "head/kernel" in (loop.stuck_head({**row, "gradient_norm/head/kernel": 1e-12}) or "")
+    assert loop.stuck_head({**row, "gradient_norm/head/kernel": 0.0, "loss": 0.0}) is None
 
 
 def test_two_stage_loss_without_float64(recording, tmp_path, monkeypatch):
@@ -399,8 +309,8 @@ def test_two_stage_loss_without_float64(recording, tmp_path, monkeypatch):
 
         return spying
 
-    monkeypatch.setattr(on_windows, "train_steps", spy(step.train_steps))
-    monkeypatch.setattr(on_windows, "validate", spy(validation.validate))
+    monkeypatch.setattr(window_task, "train_steps", spy(window_task.train_steps))
+    monkeypatch.setattr(window_task, "validate", spy(window_task.validate))
     loop.train(
         tiny(
             recording,
@@ -409,12 +319,8 @@ def test_two_stage_loss_without_float64(recording, tmp_path, monkeypatch):
             optim=OptimConfig(epochs=1, batch_size=16),
         )
     )
-    template = step.create_state(
-        checkpoint.create_model(tiny(recording, "")),
-        optimizer.create(OptimConfig(), LossConfig(), 1),
-        jax.random.split(jax.random.key(0), 3)[0],
-        50,
-    )
+    key = jax.random.split(jax.random.key(0), 3)[0]
+    template = window_task.initial_state(Tiny(), key, 50)
     trained = parameters(tmp_path / "run")["params"]
     assert same(trained["uncertainty"], jax.tree.map(np.asarray, template.params["uncertainty"]))
     assert not same(trained["head"], jax.tree.map(np.asarray, template.params["head"]))
@@ -470,30 +376,95 @@ def test_runs_that_cannot_be_loaded(finished, tmp_path):
         checkpoint.load_run(other)
 
 
-def test_the_best_checkpoint_begins_anew_where_what_is_trained_changes(
+class Cliff(Tiny):
+    """A network whose loss is finite everywhere, and whose gradient is not for a batch with a
+    window that no one walks."""
+
+    def __call__(self, windows, train=False):
+        found = super().__call__(windows, train)
+        wild = jnp.any(jnp.abs(windows) > 1e3)
+        root = jax.lax.cond(
+            wild, lambda d: jnp.sqrt(0 * d), lambda d: 0 * d, found.displacement[:, 0] ** 2
+        )
+        return found._replace(displacement=found.displacement.at[:, 0].add(root))
+
+
+def test_a_gradient_that_is_not_finite_leaves_the_last_good_checkpoint(
     recording, tmp_path, monkeypatch
 ):
-    """Losses before and after a switch do not compare: the first epoch's would win for ever.
+    """In the last step of an epoch, whose loss is finite: neither `latest` nor `best` takes the
+    parameters that it spoils."""
+    real, size, steps = window_task.window_source, 16, 13
 
-    What is trained plays no part: the steps only count."""
-    said = iter([])
+    def orders(seed, source):
+        key = window_task.keys_of(seed).order
+        return [np.asarray(window_task.epoch_order(key, epoch, source)) for epoch in (0, 1)]
 
-    def counted(state, source, order, first, count, *_, **__):
-        nothing = Losses(*[jnp.float32(0)] * 3)
-        return state._replace(step=state.step + count), step.Progress(nothing, {}, jnp.int32(-1))
+    def spoiled(sequences, *options):
+        """A window that epoch 0 does not visit, and epoch 1 visits last, sees rows of its own."""
+        source = real(sequences, *options)
+        if len(source.start) // size != steps:
+            return source  # of validation
+        first, second = orders(seed, source)
+        late = set(second[(steps - 1) * size : steps * size]) - set(first[: steps * size])
+        if not late:
+            return source
+        found.append(seed)
+        rows = np.full((50, 6), 2e3, np.float32)
+        start = source.start.copy()
+        start[late.pop()] = len(source.imu)
+        imu, step = (
+            np.concatenate([a, rows[:, :k]]) for a, k in ((source.imu, 6), (source.step, 3))
+        )
+        return source._replace(imu=imu, step=step, start=start)
 
-    def validated(*_, **__):
-        loss, mse = next(said)
+    found, seed = [], 0
+    with jax.enable_x64(False):
+        probe = windows_of(recording, "train", tiny(recording, ""))
+        while not set(orders(seed, probe)[1][-28:-12]) - set(orders(seed, probe)[0][:-12]):
+            seed += 1
+    monkeypatch.setattr(window_task, "window_source", spoiled)
+    monkeypatch.setitem(registry._MODELS, "tiny", Cliff)
+    config = tiny(recording, tmp_path / "run", seed=seed)
+    with pytest.raises(
+        FloatingPointError, match=f"gradient is not finite at step {2 * steps - 1} "
+    ):
+        loop.train(config)
+    assert found == [seed]
+    for which in ("latest", "best"):
+        run = checkpoint.load_run(tmp_path / "run", which)
+        assert run.step == steps
+        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(run.variables))
+
+
+class Counted:
+    """Training of which only the steps count, with figures of validation as they are given."""
+
+    def __init__(self, monkeypatch, figures):
+        self.figures, self.factors = iter(figures), []
+        monkeypatch.setattr(window_task, "train_steps", self.train_steps)
+        monkeypatch.setattr(window_task, "validate", self.validate)
+
+    def train_steps(self, state, source, order, first, count, factor, *_, **__):
+        self.factors.append(float(factor))
+        sums = dict.fromkeys(("loss", "mse", "nll"), jnp.float32(0))
+        return state._replace(step=state.step + count), window_task.Progress(sums, jnp.int32(-1))
+
+    def validate(self, *_, **__):
+        loss, mse = next(self.figures)
         one = jnp.ones(3, jnp.float32)
-        return validation.Validation(
+        return window_task.Validation(
             Losses(jnp.float32(loss), jnp.float32(mse), jnp.float32(0)), one, one
         )
 
-    monkeypatch.setattr(on_windows, "train_steps", counted)
-    monkeypatch.setattr(on_windows, "validate", validated)
+
+def test_the_best_checkpoint_begins_anew_where_what_is_trained_changes(
+    recording, tmp_path, monkeypatch
+):
+    """Losses before and after a switch do not compare: the first epoch's would win for ever."""
     for criterion, best, epoch in (("loss", 6.0, 4), ("squared_error", 4.0, 3)):
         # before, with the switch, the first whole epoch, one more
-        said = iter([(-100.0, 1.0), (-50.0, 2.0), (7.0, 4.0), (6.0, 5.0)])
+        Counted(monkeypatch, [(-100.0, 1.0), (-50.0, 2.0), (7.0, 4.0), (6.0, 5.0)])
         config = tiny(
             recording, tmp_path / criterion, loss=LossConfig(nll_weight=1.0, nll_from_epoch=1.5)
         )
@@ -505,3 +476,132 @@ def test_the_best_checkpoint_begins_anew_where_what_is_trained_changes(
         )
         assert loop.train(config).best_loss == best
         assert checkpoint.load_run(tmp_path / criterion).epoch == epoch
+
+
+def plateau_config(recording, workdir, epochs):
+    optim = OptimConfig("plateau", epochs=epochs, batch_size=16, statistics_windows=0)
+    return tiny(recording, workdir, optim=optim)
+
+
+def test_nan_on_validation_is_never_the_best(recording, tmp_path, monkeypatch):
+    nan = float("nan")
+    Counted(monkeypatch, [(nan, nan), (3.0, 3.0), (nan, nan), (2.0, 2.0), (4.0, 4.0)])
+    outcome = loop.train(plateau_config(recording, tmp_path / "run", 5))
+    assert outcome.best_loss == 2.0
+    assert checkpoint.load_run(tmp_path / "run").epoch == 4
+    Counted(monkeypatch, [(nan, nan)])
+    assert loop.train(plateau_config(recording, tmp_path / "none", 1)).best_loss is None
+    with pytest.raises(InputError, match="best: holds no checkpoint"):
+        checkpoint.load_run(tmp_path / "none")
+
+
+def test_a_rate_that_has_fallen_stays_fallen_in_a_resumed_run(recording, tmp_path, monkeypatch):
+    """The plateau's factor, best value and idle epochs are kept with the checkpoint."""
+    monkeypatch.setattr(optimizer, "PLATEAU_EPOCHS", 1)
+    figures = [(1.0, 1.0), *[(2.0, 2.0)] * 5]  # the rate falls after epochs 2 and 4
+    alone = Counted(monkeypatch, figures)
+    loop.train(plateau_config(recording, tmp_path / "alone", 6))
+    by_epoch = sorted(set(alone.factors), reverse=True)
+    assert by_epoch == [1.0, pytest.approx(0.1), pytest.approx(0.01)]
+
+    stopped = Counted(monkeypatch, figures[:4])
+    validate = stopped.validate
+
+    calls = []
+
+    def last_stops(*given, **options):
+        calls.append(1)
+        if len(calls) == 4:
+            os.kill(os.getpid(), signal.SIGTERM)
+        return validate(*given, **options)
+
+    monkeypatch.setattr(window_task, "validate", last_stops)
+    config = plateau_config(recording, tmp_path / "resumed", 6)
+    assert loop.train(config).stopped_by == signal.SIGTERM
+    resumed = Counted(monkeypatch, figures[4:])
+    assert loop.train(config, resume=True).stopped_by is None
+    assert resumed.factors[0] == pytest.approx(0.1) and resumed.factors[-1] == pytest.approx(0.01)
+    rows = [
+        [json.loads(line)["learning_rate"] for line in open(tmp_path / name / "metrics.jsonl")]
+        for name in ("alone", "resumed")
+    ]
+    assert rows[0] == rows[1]
+
+
+def test_a_signal_in_the_last_validation_finds_a_run_that_is_complete(
+    recording, tmp_path, monkeypatch
+):
+    counted = Counted(monkeypatch, [(1.0, 1.0)])
+    validate = counted.validate
+
+    def stopped(*given, **options):
+        os.kill(os.getpid(), signal.SIGTERM)
+        return validate(*given, **options)
+
+    monkeypatch.setattr(window_task, "validate", stopped)
+    assert loop.train(plateau_config(recording, tmp_path / "run", 1)).stopped_by is None
+
+
+def test_a_run_that_ends_before_its_uncertainty_learns_is_warned_of(
+    recording, tmp_path, monkeypatch, capsys
+):
+    """And the line of an epoch shows the parts of its loss."""
+    Counted(monkeypatch, [(1.0, 1.0)])
+    config = plateau_config(recording, tmp_path / "run", 1)
+    loop.train(dataclasses.replace(config, loss=LossConfig(log_std_from_epoch=10.0)))
+    lines = capsys.readouterr().err.splitlines()
+    assert (
+        "warning: the uncertainty learns only from step 130 on, and the run ends at step 13; "
+        "raise optim.epochs or lower loss.log_std_from_epoch"
+    ) in lines
+    (epoch,) = [line for line in lines if line.startswith("epoch")]
+    assert "mse 0 nll 0  val mse 1 nll 0" in epoch
+
+
+def test_a_recording_in_both_splits_is_warned_of(recording, tmp_path, monkeypatch, capsys):
+    Counted(monkeypatch, [(1.0, 1.0)] * 2)
+    loop.train(plateau_config(recording, tmp_path / "apart", 1))
+    assert "warning" not in capsys.readouterr().err
+    shutil.copytree(recording, tmp_path / "data")
+    (tmp_path / "data" / "val_list.txt").write_text("c\nb\n")
+    config = plateau_config(recording, tmp_path / "run", 1)
+    loop.train(dataclasses.replace(config, data_root=str(tmp_path / "data")))
+    assert "warning: b in train and in val: the best checkpoint" in capsys.readouterr().err
+
+
+def test_two_trainings_in_one_folder(recording, tmp_path, monkeypatch):
+    """The second one is refused when both have passed the door before either has written, also
+    where both resume."""
+    Counted(monkeypatch, [(1.0, 1.0)] * 3)
+    config = plateau_config(recording, tmp_path / "run", 2)
+    splits = {"train": ["a", "b"], "val": ["c"]}
+    with run_folder.opened(config, splits, resume=False):
+        written = (tmp_path / "run" / "config.yaml").read_bytes()
+        other = dataclasses.replace(config, seed=1)
+        with pytest.raises(InputError, match="run: another process is training in it"):
+            with run_folder.opened(other, splits, resume=False):
+                pass
+        with pytest.raises(InputError, match="run: another process is training in it"):
+            loop.train(config, resume=True)
+    with pytest.raises(InputError, match="run: already holds a run"):
+        with run_folder.opened(other, splits, resume=False):
+            pass
+    assert (tmp_path / "run" / "config.yaml").read_bytes() == written
+
+
+def test_parameters_that_are_not_finite_are_not_loaded(finished, tmp_path):
+    run = checkpoint.load_run(finished[0])
+    run.variables["params"]["head"]["bias"] = jnp.full(3, jnp.nan, jnp.float32)
+    configuration.save(tmp_path / "config.yaml", run.config)
+    checkpoint.write_best(tmp_path, run)
+    with pytest.raises(InputError, match="best: holds parameters that are not finite"):
+        checkpoint.load_run(tmp_path)
+
+
+def test_a_second_run_compiles_nothing(recording, finished, tmp_path):
+    """Of the same settings with another seed, in the same process."""
+    programs = window_task.train_steps._cache_size(), window_task.validate._cache_size()
+    optim = dataclasses.replace(tiny(recording, "").optim)
+    loop.train(tiny(recording, tmp_path / "run", seed=4, optim=optim))
+    after = window_task.train_steps._cache_size(), window_task.validate._cache_size()
+    assert after == programs

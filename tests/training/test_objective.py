@@ -10,10 +10,9 @@ import pytest
 
 from gnio_jax.config import LossConfig, ModelConfig, OptimConfig, TrainConfig
 from gnio_jax.models.heads import CalibratedUncertainty
-from gnio_jax.training import losses, on_windows, optimizer
+from gnio_jax.training import losses, optimizer, window_task
 from gnio_jax.training.losses import Losses
-from gnio_jax.training.step import TrainState
-from gnio_jax.training.validation import Validation, calibrated, isotropic
+from gnio_jax.training.window_task import TrainState, Validation, calibrated, isotropic
 from gnio_jax.types import Prediction, Windows
 
 
@@ -31,11 +30,10 @@ def target(displacement, steps=4):
 STEPS_PER_EPOCH = 7
 
 
-@functools.partial(jax.jit, static_argnames=("config", "epoch"))
-def found_losses(prediction, windows, config, epoch=0):
-    return losses.losses(
-        prediction, windows, config, losses.stage(config, epoch * STEPS_PER_EPOCH, STEPS_PER_EPOCH)
-    )
+@functools.partial(jax.jit, static_argnames=("config", "epoch", "axes"))
+def found_losses(prediction, windows, config, epoch=0, axes=3):
+    stage = losses.loss_stage(config, epoch * STEPS_PER_EPOCH, STEPS_PER_EPOCH)
+    return losses.losses(prediction, windows, config, stage, axes)
 
 
 def test_losses_by_hand():
@@ -92,7 +90,7 @@ def test_switches_are_steps():
         0,
     )
     assert losses.switches(LossConfig(log_std_from_epoch=1e9), 300) == (0, 2**31 - 1)
-    seen = [losses.stage(config, step, 8) for step in range(12)]
+    seen = [losses.loss_stage(config, step, 8) for step in range(12)]
     assert [float(stage.nll_weight) > 0 for stage in seen] == [step >= 4 for step in range(12)]
     assert [bool(stage.log_std_learns) for stage in seen] == [step >= 10 for step in range(12)]
 
@@ -123,8 +121,6 @@ def test_velocity_and_covariance_by_hand():
                 error = 5 * steps[b, t, axis] - velocity[b, t, axis]
                 speed += error**2 / 10
                 squared = error**2 / np.exp(2 * log_std[b, t, axis])
-                if squared > 100:  # an outlier
-                    squared = 100 * (1 + np.log(squared / 100))
                 covariance += (squared / 2 + log_std[b, t, axis]) / 10
         place += ((steps[b].sum(0) - velocity[b].mean(0)) ** 2).sum() / 2
     expected = (speed + place) / (2 * np.exp(0.6)) + covariance / (2 * np.exp(-0.8)) + 0.3 - 0.4
@@ -132,6 +128,64 @@ def test_velocity_and_covariance_by_hand():
     np.testing.assert_allclose(found_losses(prediction, windows, config).total, expected, rtol=1e-5)
     with pytest.raises(ValueError, match="velocity for every sample"):
         found_losses(prediction._replace(diagnostics={}), windows, config)
+
+
+def ctins(task_log_std, log_std, error=0.1):
+    """A window of five samples whose predicted velocities are wrong by `error` along each axis."""
+    shape = (1, 5, 3)
+    diagnostics = {
+        "velocity": jnp.full(shape, error, jnp.float32),
+        "velocity_log_std": jnp.full(shape, log_std, jnp.float32),
+        "task_log_std": jnp.array([task_log_std], jnp.float32),
+    }
+    nothing = jnp.zeros((1, 3), jnp.float32)
+    return Prediction(jnp.full((1, 3), error, jnp.float32), nothing, diagnostics)
+
+
+def test_the_weights_of_ctins_loss_are_bounded():
+    """σ = 0.3 m per window: the likelihood of the velocities is negative, and the lower δ_c, the
+    lower the loss would be without a bound. No gradient draws δ_c there, nor is one infinite."""
+    config, walked = LossConfig(name="velocity_and_covariance"), target([[0.0, 0, 0]], steps=5)
+
+    @jax.jit
+    def value_and_slope(log_c):
+        value = lambda c: found_losses(ctins([0.0, c], np.log(0.3)), walked, config).total  # noqa: E731
+        return jax.value_and_grad(value)(log_c)
+
+    floor = losses.TASK_LOG_STD_FLOOR
+    lowest, _ = value_and_slope(jnp.float32(floor))
+    for log_c in (floor - 1, -10.0, -60.0):
+        value, slope = value_and_slope(jnp.float32(log_c))
+        assert value == lowest and slope == 0
+    assert value_and_slope(jnp.float32(floor + 0.5))[0] > lowest
+
+
+def test_ctin_with_two_axes_is_not_blamed_for_the_vertical():
+    """Its velocity along z is always 0: how the walker climbs changes nothing."""
+    level, climbing = target([[0.3, -0.2, 0.0]], steps=5), target([[0.3, -0.2, 0.7]], steps=5)
+    prediction = ctins([0.1, 0.2], -1.0)
+    for name in ("velocity_and_covariance", "weighted_sum"):
+        config = LossConfig(name=name, mae_weight=1.0)
+        both = [found_losses(prediction, each, config, axes=2) for each in (level, climbing)]
+        assert both[0] == both[1]
+        one_more = found_losses(prediction, climbing, config, axes=3)
+        assert one_more.total > both[1].total and one_more.mse > both[1].mse
+
+
+def test_a_prediction_of_another_shape_is_refused():
+    """(b, 1) would be broadcast in silence."""
+    for shape in ((2, 1), (1, 3)):
+        prediction = Prediction(jnp.zeros((2, 3)), jnp.zeros(shape))
+        stage = losses.loss_stage(LossConfig(), 0, 1)
+        with pytest.raises(AssertionError, match="shape"):
+            losses.losses(prediction, target([[0.0, 0, 0]] * 2), LossConfig(), stage)
+
+
+def test_nan_on_validation_is_never_the_best_of_the_plateau():
+    config, plateau = OptimConfig(schedule="plateau"), optimizer.Plateau()
+    for error in (float("nan"), 1.0, float("nan"), 0.5):
+        plateau = optimizer.watch(plateau, error, config)
+    assert plateau == optimizer.Plateau(1.0, 0.5, 0)
 
 
 def test_floor_limits_what_the_likelihood_sees():
@@ -167,8 +221,10 @@ def test_no_decay_after_the_warm_up():
     ) == pytest.approx(1e-4)
 
 
-def test_plateau_waits_for_its_epochs_and_starts_counting_anew():
-    config = OptimConfig(schedule="plateau", plateau_epochs=2, plateau_factor=0.5)
+def test_plateau_waits_for_its_epochs_and_starts_counting_anew(monkeypatch):
+    monkeypatch.setattr(optimizer, "PLATEAU_EPOCHS", 2)
+    monkeypatch.setattr(optimizer, "PLATEAU_FACTOR", 0.5)
+    config = OptimConfig(schedule="plateau")
     # a fall by less than a ten-thousandth is none
     errors = [1.0, 0.9, 0.9, 0.89999, 0.95, 0.8, 0.8, 0.8, 0.8, 0.8, 0.8, 0.8]
     factors, plateau = [], optimizer.Plateau()
@@ -216,11 +272,11 @@ def test_constants_of_an_equivariant_network_are_the_same_along_both_axes(
     state = TrainState(jnp.int32(7), {}, stats, ())
     errors = jnp.array([1.0, 4.0, 9.0], jnp.float32)
     found = Validation(Losses(*[jnp.float32(0)] * 3), errors, errors)
-    monkeypatch.setattr(on_windows.WindowTraining, "_errors", lambda *_: found)
+    monkeypatch.setattr(window_task, "validate", lambda *_, **__: found)
     config = TrainConfig(model=ModelConfig(equivariance=equivariance))
-    nothing = dict.fromkeys(on_windows.WindowTraining._fields)
-    training = on_windows.WindowTraining(**nothing | {"config": config, "steps_per_epoch": 7})
-    constants = training.validate(state, 7)[0].batch_stats["uncertainty"]["log_std"]
+    nothing = dict.fromkeys(window_task.WindowTask._fields)
+    task = window_task.WindowTask(**nothing | {"config": config, "steps_per_epoch": 7})
+    constants = task.validate(state, 7)[0].batch_stats["uncertainty"]["log_std"]
     wanted = [1.0, 4.0, 9.0] if equivariance == "none" else [2.5, 2.5, 9.0]
     np.testing.assert_allclose(np.exp(2 * constants), wanted, rtol=1e-6)
     np.testing.assert_allclose(isotropic(found).axis_normalised, [2.5, 2.5, 9.0], rtol=1e-6)
@@ -256,7 +312,7 @@ def test_a_held_uncertainty_is_not_counted(held_loss):
     """PyTorch's Adam does not count steps in which a parameter has no gradient: at the release the
     moments are those of a first step."""
     config = OptimConfig(epochs=10)
-    tx = optimizer.create(config, held_loss, 3)
+    tx, rate = optimizer.adam(config, held_loss, 3), optimizer.schedule(config, 3)
     params = {
         part: {"w": jnp.array([1.0, -2.0, 3.0], jnp.float32)} for part in ("encoder", "log_std")
     }
@@ -264,7 +320,7 @@ def test_a_held_uncertainty_is_not_counted(held_loss):
     expected = {part: [np.array([1.0, -2.0, 3.0]), np.zeros(3), np.zeros(3), 0] for part in params}
     rng = np.random.default_rng(0)
     for step in range(12):
-        held = not bool(losses.stage(held_loss, step, 3).log_std_learns)
+        held = not bool(losses.loss_stage(held_loss, step, 3).log_std_learns)
         assert held == (step < 6)
         gradient = {
             part: np.zeros(3) if held and part == "log_std" else rng.standard_normal(3)
@@ -276,7 +332,7 @@ def test_a_held_uncertainty_is_not_counted(held_loss):
             params,
             log_std_learns=jnp.bool_(not held),
         )
-        params = optax.apply_updates(params, change)
+        params = optax.apply_updates(params, optax.tree.scale(-rate(step), change))
         for part, (w, m, v, count) in expected.items():
             if held and part == "log_std":
                 continue
@@ -293,7 +349,7 @@ def test_a_held_uncertainty_is_not_counted(held_loss):
 @pytest.mark.parametrize("clip, decay", [(None, 0.0), (0.5, 0.0), (0.5, 0.03)])
 def test_adam_against_numpy(clip, decay):
     config = OptimConfig(epochs=10, clip_norm=clip, weight_decay=decay)
-    tx = optimizer.create(config, LossConfig(), 3)
+    tx, schedule = optimizer.adam(config, LossConfig(), 3), optimizer.schedule(config, 3)
     params = {"w": jnp.array([1.0, -2.0, 3.0], jnp.float32)}
     state, learn = tx.init(params), jax.jit(tx.update)
     w, m, v = np.array([1.0, -2.0, 3.0]), np.zeros(3), np.zeros(3)
@@ -301,7 +357,7 @@ def test_adam_against_numpy(clip, decay):
     for step in range(20):
         gradient = rng.standard_normal(3)
         update, state = learn({"w": jnp.asarray(gradient, jnp.float32)}, state, params)
-        params = optax.apply_updates(params, update)
+        params = optax.apply_updates(params, optax.tree.scale(-schedule(step), update))
         if clip:
             gradient = gradient * min(1, clip / np.linalg.norm(gradient))
         gradient = gradient + decay * w
@@ -313,15 +369,24 @@ def test_adam_against_numpy(clip, decay):
     np.testing.assert_allclose(params["w"], w, atol=1e-6)
 
 
-@jax.jit
-def value_and_slopes(log_std, error):
+@functools.partial(jax.jit, static_argnames="config")
+def value_and_slopes(log_std, error, config):
     """The likelihood of one window, and its derivatives."""
 
     def likelihood(log_std, error):
         prediction = Prediction(jnp.zeros((1, 3)), jnp.array([[log_std, 0, 0]]), {})
-        return found_losses(prediction, target([[error, 0, 0]]), LossConfig()).nll
+        return found_losses(prediction, target([[error, 0, 0]]), config).nll
 
     return jax.value_and_grad(likelihood, (0, 1))(log_std, error)
+
+
+@pytest.mark.parametrize("error", [0.0, 0.5, 0.999, 1.0, 1.001, 30.0])
+def test_the_likelihood_is_the_papers_without_bound(error):
+    """σ = 0.1 m: ½ e²/σ² + log σ, and its slopes 1 − e²/σ² and e/σ², also at 300 σ."""
+    value, (slope, by_error) = value_and_slopes(np.log(0.1), error, LossConfig())
+    np.testing.assert_allclose(value, 50 * error**2 + np.log(0.1), rtol=1e-5)
+    np.testing.assert_allclose(slope, 1 - 100 * error**2, rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(by_error, 100 * error, rtol=1e-5)
 
 
 @pytest.mark.parametrize("error", [0.0, 0.5, 0.999, 1.0, 1.001, 30.0])
@@ -329,7 +394,8 @@ def test_an_outlier_pulls_at_the_uncertainty_no_more_than_ten_standard_deviation
     """σ = 0.1 m: the likelihood is the normal one up to 1 m; value and slope are steady there."""
     log_std = np.log(0.1)
     squared = (error / 0.1) ** 2
-    value, (slope, by_error) = value_and_slopes(log_std, error)
+    config = LossConfig(outlier_sigmas=10.0)
+    value, (slope, by_error) = value_and_slopes(log_std, error, config)
     counted = squared if squared <= 100 else 100 * (1 + np.log(squared / 100))
     np.testing.assert_allclose(value, 0.5 * counted + log_std, rtol=1e-5)
     np.testing.assert_allclose(slope, 1 - min(squared, 100.0), rtol=1e-4, atol=1e-4)

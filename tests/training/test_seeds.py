@@ -1,4 +1,4 @@
-"""Seeds that are trained together: runs with the numbers that each has alone."""
+"""Seeds that are trained in turn: runs with the numbers that each has alone."""
 
 import dataclasses
 import json
@@ -6,6 +6,7 @@ import signal
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -16,9 +17,8 @@ from gnio_jax.config import DataConfig, ModelConfig, OptimConfig, TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.models import registry
 from gnio_jax.reporting import Silence
-from gnio_jax.training import checkpoint, loop, step, together
+from gnio_jax.training import checkpoint, loop, window_task
 from tests.support.command_lines import run as gnio
-from tests.support.runs import shared_programs
 from tests.support.tiny_network import Tiny
 from tests.support.tlio_files import write_splits
 
@@ -38,8 +38,8 @@ class Told(Silence):
 
 
 @pytest.fixture(scope="module", autouse=True)
-def one_compilation():
-    with pytest.MonkeyPatch.context() as patch, shared_programs():
+def registered():
+    with pytest.MonkeyPatch.context() as patch:
         patch.setitem(registry._MODELS, "tiny", Tiny)
         yield
 
@@ -96,9 +96,9 @@ def assert_same_runs(workdirs, others, rtol):
 def test_every_seed_is_an_ordinary_run(config, alone, tmp_path):
     """Its folder, its settings, its parameters to the bit; recordings are read and steps compiled
     once."""
-    told, programs = Told(), step.train_steps._cache_size()
+    told, programs = Told(), window_task.train_steps._cache_size()
     outcomes = loop.train_seeds(at(config, tmp_path / "run"), SEEDS, reporter=told)
-    assert step.train_steps._cache_size() == programs
+    assert window_task.train_steps._cache_size() == programs
     assert [outcome.workdir.name for outcome in outcomes] == ["run_s3", "run_s0", "run_s7"]
     for seed, outcome in zip(SEEDS, outcomes, strict=True):
         kept = configuration.load(outcome.workdir / "config.yaml")
@@ -111,69 +111,62 @@ def test_every_seed_is_an_ordinary_run(config, alone, tmp_path):
     losses = [rows(workdir)[-1]["val_loss"] for workdir in alone]
     assert len(set(losses)) == 3
     assert len([line for line in told.lines if line.startswith("reading")]) == 1
-    assert len([line for line in told.lines if line.startswith("seed 7: epoch")]) == 2
+    assert len([line for line in told.lines if line.startswith("epoch")]) == 6
 
 
-@pytest.mark.parametrize("backend", ["cpu", "gpu"])
-def test_seeds_side_by_side_have_the_same_numbers(config, alone, tmp_path, monkeypatch, backend):
-    """Three seeds on two devices, one after the other on each, as on a CPU, or batched."""
-    monkeypatch.setattr(together.jax, "default_backend", lambda: backend)
-    used = []
-    joined = together.SideBySide.joined
+def test_a_signal_saves_the_run_and_the_seeds_go_on(config, alone, tmp_path, monkeypatch):
+    """Stopped within an epoch of the second seed, and once more at the end of it."""
+    real = window_task.train_steps
 
-    def noted(*given):
-        used.append(joined(*given))
-        return used[-1]
-
-    monkeypatch.setattr(together.SideBySide, "joined", noted)
-    outcomes = loop.train_seeds(at(config, tmp_path / "run"), SEEDS, devices=2)
-    for leaf in jax.tree.leaves(used[0].step):
-        assert leaf.shape == (4,) and leaf.sharding.spec[0] == "seeds"
-    assert_same_runs([outcome.workdir for outcome in outcomes], alone, rtol=1e-5)
-
-
-def test_a_signal_saves_all_and_each_goes_on_alone_or_together(
-    config, alone, tmp_path, monkeypatch
-):
-    """Stopped together within an epoch; then one of them finished alone, so that the others are
-    behind it."""
-    run_steps = loop._run_steps
-
-    def stopped(*given):
-        group = run_steps(*given)
-        if group.step == STEPS + 2:
+    def stopping(state, *given, **options):
+        state, progress = real(state, *given, **options)
+        if run_of["seed"] == 0 and int(state.step) in run_of["steps"]:
             signal.raise_signal(signal.SIGTERM)
-        return group
+        return state, progress
+
+    run_of = {"seed": None, "steps": [STEPS + 2]}
+    opened = loop.run_folder.opened
+
+    def noted(config, *given):
+        run_of["seed"] = config.seed
+        return opened(config, *given)
 
     config = at(config, tmp_path / "run")
+    workdirs = [Path(each.workdir) for each in configuration.with_seeds(config, SEEDS)]
     with monkeypatch.context() as patch:
         patch.setattr(loop, "DISPATCH_SECONDS", 0)
-        patch.setattr(loop, "_run_steps", stopped)
+        patch.setattr(window_task, "train_steps", stopping)
+        patch.setattr(loop.run_folder, "opened", noted)
         outcomes = loop.train_seeds(config, SEEDS)
-    workdirs = [outcome.workdir for outcome in outcomes]
-    assert [outcome.stopped_by for outcome in outcomes] == [signal.SIGTERM] * 3
-    latest = [checkpoint.load_run(workdir, "latest").step for workdir in workdirs]
-    assert latest == [STEPS + 2] * 3
-    loop.train(configuration.with_seeds(config, SEEDS)[1], resume=True)
+        assert [outcome.stopped_by for outcome in outcomes] == [None, signal.SIGTERM]
+        latest = [checkpoint.load_run(workdir, "latest").step for workdir in workdirs[:2]]
+        assert latest == [2 * STEPS, STEPS + 2] and not workdirs[2].exists()
+        run_of["steps"] = [2 * STEPS]
+        outcomes = loop.train_seeds(config, SEEDS, resume=True)
+        # The second run is complete, and a seed is missing.
+        assert [outcome.stopped_by for outcome in outcomes] == [None, signal.SIGTERM]
+        assert checkpoint.load_run(workdirs[1], "latest").step == 2 * STEPS
+        assert not workdirs[2].exists()
     told = Told()
     outcomes = loop.train_seeds(config, SEEDS, resume=True, reporter=told)
     assert [outcome.stopped_by for outcome in outcomes] == [None] * 3
-    assert f"seed 0: resuming at step {2 * STEPS}" in told.lines
-    assert f"seed 7: resuming at step {STEPS + 2}" in told.lines
+    assert told.lines.count(f"resuming at step {2 * STEPS}") == 2
     assert_same_runs(workdirs, alone, rtol=1e-6)
 
 
-def test_a_loss_that_is_not_finite_names_its_seed(config, tmp_path, monkeypatch):
-    take_steps = together.InTurn.take_steps
+def test_a_loss_that_is_not_finite_names_its_run(config, tmp_path, monkeypatch):
+    def failing(state, source, order, first, count, *_, **__):
+        sums = dict.fromkeys(("loss", "mse", "nll"), jnp.float32(0))
+        return state, window_task.Progress(sums, jnp.int32(5))
 
-    def failing(*given):
-        states, progress = take_steps(*given)
-        failed = progress[1]._replace(failed_step=np.int32(5))
-        return states, [progress[0], failed, progress[2]]
-
-    monkeypatch.setattr(together.InTurn, "take_steps", failing)
-    with pytest.raises(FloatingPointError, match=r"^seed 0: the loss .* at step 5 "):
+    monkeypatch.setattr(window_task, "train_steps", failing)
+    with pytest.raises(FloatingPointError, match=r"run_s3: the loss .* at step 5 "):
         loop.train_seeds(at(config, tmp_path / "run"), SEEDS)
+
+
+def test_no_begun_run_is_nothing_to_resume(config, tmp_path):
+    with pytest.raises(InputError, match="run_s3: holds no run to resume"):
+        loop.train_seeds(at(config, tmp_path / "run"), SEEDS, resume=True)
 
 
 @pytest.mark.parametrize(
@@ -189,12 +182,6 @@ def test_mistakes(config, tmp_path, seeds, expected):
     with pytest.raises(InputError, match=expected):
         loop.train_seeds(at(config, tmp_path / "run"), seeds)
     assert [path.name for path in tmp_path.iterdir()] == ["run_s0"]
-
-
-def test_seeds_of_several_processes_are_refused(config, monkeypatch):
-    monkeypatch.setattr(loop, "several", lambda: True)
-    with pytest.raises(InputError, match="--seeds: run in one process"):
-        loop.train_seeds(config, (0, 1))
 
 
 def test_the_command_names_each_run_and_how_to_go_on(config, tmp_path, monkeypatch, capsys):

@@ -12,16 +12,16 @@ import pytest
 from gnio_jax import data, models
 from gnio_jax.config import DataConfig, LossConfig, ModelConfig, OptimConfig, TrainConfig
 from gnio_jax.data import windows
-from gnio_jax.training import batch_statistics, losses, optimizer, step, validation
-from gnio_jax.training.checkpoint import create_model
+from gnio_jax.training import losses, window_task
+from gnio_jax.training.window_task import create_model
 from tests.support import tiny_run
 from tests.support.compiling import lightly_optimised, quick
-from tests.support.drawn_state import drawn_state
+from tests.support.drawn_state import drawn_state, fresh_state
 
 CONFIG = TrainConfig(
     data=DataConfig(rate=50.0),
     model=ModelConfig(width=8),
-    loss=LossConfig(nll_weight=1.0),
+    loss=LossConfig(nll_weight=1.0, outlier_sigmas=10.0),
     optim=OptimConfig(
         epochs=4, batch_size=64, learning_rate=3e-3, start_learning_rate=1e-4, warmup_epochs=0.5
     ),
@@ -32,10 +32,9 @@ FEW = dataclasses.replace(
 )
 """With statistics of three batches."""
 
-NAMES = ("model", "optimizer", "config")
-STEPS = lightly_optimised(step.train_steps.__wrapped__, static_argnames=NAMES)
-FEW_STEPS = quick(step.train_steps.__wrapped__, static_argnames=NAMES)
-CREATE = quick(step.create_state, static_argnames=("model", "optimizer", "window"))
+NAMES = ("model", "config", "steps_per_epoch")
+STEPS = lightly_optimised(window_task.train_steps.__wrapped__, static_argnames=NAMES)
+CREATE = quick(fresh_state, static_argnames=NAMES)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -57,40 +56,33 @@ def source_of(split, stride, rate=CONFIG.data.rate):
     )
 
 
-@functools.cache
-def model_and_optimizer(config, steps):
-    """The same objects for every seed: they are static in the compiled step."""
-    return create_model(config), optimizer.create(config.optim, config.loss, steps)
-
-
 def fresh(config, source, seed=0):
     """Network and fresh state."""
-    model, tx = model_and_optimizer(config, source.visited.shape[0] // config.optim.batch_size)
+    model, steps = create_model(config), source.visited.shape[0] // config.optim.batch_size
     with jax.enable_x64(False):
-        return model, CREATE(model, tx, jax.random.key(seed), config.data.window)
+        return model, CREATE(model, config, steps, jax.random.key(seed))
 
 
 def drawn(config, source):
     """The same with parameters that NumPy has drawn, where it does not matter how they begin."""
-    model, tx = model_and_optimizer(config, source.visited.shape[0] // config.optim.batch_size)
+    model, steps = create_model(config), source.visited.shape[0] // config.optim.batch_size
     with jax.enable_x64(False):
-        return model, drawn_state(model, tx, config.data.window, config.optim.ema_decay)
+        return model, drawn_state(model, config, steps)
 
 
-def trainer(config, source, seed=0, train_steps=STEPS):
+def trainer(config, source, seed=0):
     """A function that takes `count` steps from a state, and the number of steps in an epoch."""
     steps = source.visited.shape[0] // config.optim.batch_size
-    model, tx = model_and_optimizer(config, steps)
     with jax.enable_x64(False):
         key = jax.random.key(seed)
 
     @functools.cache
     def order(epoch):
-        return step.epoch_order(key, epoch, source)
+        return window_task.epoch_order(key, epoch, source)
 
     def take(state, epoch, first, count):
         with jax.enable_x64(False):
-            return train_steps(
+            return STEPS(
                 state,
                 source,
                 order(epoch),
@@ -98,9 +90,9 @@ def trainer(config, source, seed=0, train_steps=STEPS):
                 jnp.int32(count),
                 jnp.float32(1),
                 key,
-                model=model,
-                optimizer=tx,
+                model=create_model(config),
                 config=config,
+                steps_per_epoch=steps,
             )
 
     return take, steps
@@ -127,8 +119,8 @@ def run(seed):
 def estimated(model, state, source, config=CONFIG, key=0):
     with jax.enable_x64(False):
         key = jax.random.key(key)
-        order = batch_statistics.statistics_order(key, source, config)
-        return batch_statistics.estimate_statistics(
+        order = window_task.statistics_order(key, source, config)
+        return window_task.estimate_statistics(
             state, source, order, key, model=model, config=config
         )
 
@@ -148,7 +140,7 @@ def squared_errors(model, state, source, config=CONFIG):
 
     @jax.jit
     def one(state, key, which):
-        drawn, dropout = step.draw_windows(key, source, which, config)
+        drawn, dropout = window_task.draw_windows(key, source, which, config)
         variables = {"params": state.params, "batch_stats": state.batch_stats}
         training, _ = model.apply(
             variables, drawn.imu, train=True, mutable=["batch_stats"], rngs={"dropout": dropout}
@@ -177,12 +169,12 @@ def test_training_windows_err_in_inference_mode_as_in_training_mode(trained):
 def test_statistics_are_means_over_batches(trained):
     """Of the first normalisation, against NumPy: its input is a convolution of drawn windows."""
     model, _, state, source = trained
-    assert batch_statistics.statistics_batches(source, FEW) == 3
+    assert len(window_task.statistics_order(jax.random.key(7), source, FEW)) == 3 * 64
     found = estimated(model, state, source, FEW, key=7).batch_stats["encoder"]["stem_bn"]
     kernel = np.asarray(state.params["encoder"]["stem_conv"]["kernel"], np.float64)
     order_key, draw_key = jax.random.split(jax.random.key(7))
     order = np.asarray(jax.random.permutation(order_key, source.visited))[: 3 * 64].reshape(3, 64)
-    draw = jax.jit(step.draw_windows, static_argnames="config")
+    draw = jax.jit(window_task.draw_windows, static_argnames="config")
     means, variances = [], []
     for number, which in enumerate(order):
         with jax.enable_x64(False):
@@ -218,15 +210,11 @@ def test_an_estimate_depends_on_parameters_and_key_alone(trained):
         one.batch_stats["encoder"]["stem_bn"]["mean"],
         third.batch_stats["encoder"]["stem_bn"]["mean"],
     )
-    assert (
-        batch_statistics.statistics_batches(
-            source,
-            dataclasses.replace(
-                FEW, optim=dataclasses.replace(FEW.optim, statistics_windows=10**9)
-            ),
-        )
-        == source.visited.shape[0] // 64
+    optim = dataclasses.replace(FEW.optim, statistics_windows=10**9)
+    most = window_task.statistics_order(
+        jax.random.key(0), source, dataclasses.replace(FEW, optim=optim)
     )
+    assert len(most) == source.visited.shape[0] // 64 * 64  # no more than an epoch has
 
 
 def test_constants_of_the_uncertainty_are_left_alone():
@@ -241,31 +229,9 @@ def test_constants_of_the_uncertainty_are_left_alone():
     found = estimated(model, state, source, config).batch_stats
     np.testing.assert_array_equal(found["uncertainty"]["log_factor"], [0.5, -1.0, 2.0])
     assert not np.array_equal(found["norm"]["mean"], state.batch_stats["norm"]["mean"])
-    assert batch_statistics.normalises(state) and not batch_statistics.normalises(
+    assert window_task.normalises(state) and not window_task.normalises(
         state._replace(batch_stats={"uncertainty": found["uncertainty"]})
     )
-
-
-def test_the_average_of_the_parameters_against_numpy():
-    """Over recorded steps, however they are dispatched; nothing is kept where it is off."""
-    optim = dataclasses.replace(CONFIG.optim, ema_decay=0.8)
-    config = dataclasses.replace(CONFIG, model=ModelConfig("tiny"), optim=optim)
-    source = source_of("val", 25)
-    take, _ = trainer(config, source, train_steps=FEW_STEPS)
-    seen, states = [], [drawn(config, source)[1]]
-    for number in range(6):
-        states.append(take(states[-1], 0, number, 1)[0])
-        seen.append(jax.tree.map(np.float64, states[-1].params))
-        weights = 0.8 ** np.arange(number + 1)[::-1]
-        wanted = jax.tree.map(lambda *x: np.average(x, axis=0, weights=weights), *seen)  # noqa: B023
-        close = functools.partial(np.testing.assert_allclose, rtol=1e-5, atol=1e-6)
-        jax.tree.map(close, states[-1].average, wanted)
-        assert step.evaluated(states[-1]).params is states[-1].average
-    at_once, _ = take(states[0], 0, 0, 6)
-    jax.tree.map(np.testing.assert_array_equal, at_once, states[-1])
-    plain = dataclasses.replace(config, optim=CONFIG.optim)
-    _, without = drawn(plain, source)
-    assert without.average is None and step.evaluated(without) is without
 
 
 def test_the_uncertainty_fits_the_errors_after_training(trained):
@@ -276,8 +242,8 @@ def test_the_uncertainty_fits_the_errors_after_training(trained):
     for state in (first, run(1)[-1]):
         with jax.enable_x64(False):
             state = estimated(model, state, source)
-            said = validation.validate(
-                state, held_out, losses.stage(CONFIG.loss, 0, 1), model=model, config=CONFIG
+            said = window_task.validate(
+                state, held_out, losses.loss_stage(CONFIG.loss, 0, 1), model=model, config=CONFIG
             )
         found.append(said.axis_normalised)
     typical = np.exp(np.mean(np.log(found), axis=0))
@@ -285,16 +251,15 @@ def test_the_uncertainty_fits_the_errors_after_training(trained):
 
 
 @functools.partial(lightly_optimised, static_argnames=(*NAMES, "count"))
-def norms_of_the_head(state, source, orders, key, count, model, optimizer, config):
+def norms_of_the_head(state, source, orders, key, count, model, config, steps_per_epoch):
     """The norm of its gradient in each of the first `count` steps: (count,)."""
-    steps = orders.shape[1] // config.optim.batch_size
 
     def one_step(state, number):
-        order, first = orders[number // steps], number % steps
+        order, first = orders[number // steps_per_epoch], number % steps_per_epoch
         given = state, source, order, first, jnp.int32(1), jnp.float32(1), key
-        options = {"model": model, "optimizer": optimizer, "config": config}
-        state, progress = step.train_steps.__wrapped__(*given, **options)
-        return state, progress.gradient_norms["uncertainty"]
+        options = {"model": model, "config": config, "steps_per_epoch": steps_per_epoch}
+        state, progress = window_task.train_steps.__wrapped__(*given, **options)
+        return state, progress.sums["gradient_norm/uncertainty"]
 
     return jax.lax.scan(one_step, state, jnp.arange(count, dtype=jnp.int32))[1]
 
@@ -324,16 +289,16 @@ def test_no_spike_in_the_gradient_of_the_uncertainty(width, seeds, count):
         CONFIG,
         data=DataConfig(rate=20.0),
         model=ModelConfig(width=width),
-        loss=LossConfig(),
+        loss=LossConfig(outlier_sigmas=10.0),
         optim=optim,
     )
-    options = dict(zip(NAMES, (*model_and_optimizer(config, steps), config), strict=True))
+    options = dict(zip(NAMES, (create_model(config), config, steps), strict=True))
     for seed in seeds:
         _, state = fresh(config, source, seed)
         with jax.enable_x64(False):
             key = jax.random.key(seed)
-            orders = [step.epoch_order(key, epoch, source) for epoch in range(-(-count // steps))]
-            orders = np.stack(orders)
+            epochs = range(-(-count // steps))
+            orders = np.stack([window_task.epoch_order(key, epoch, source) for epoch in epochs])
             norms = np.asarray(norms_of_the_head(state, source, orders, key, count, **options))
         assert norms.max() < 100 * np.median(norms), (seed, norms.max(), np.median(norms))
 

@@ -29,16 +29,7 @@ from gnio_jax.errors import InputError
 from gnio_jax.filtering.settings import with_free_parameters
 from gnio_jax.models import registry
 from gnio_jax.reporting import Lines
-from gnio_jax.training import (
-    checkpoint,
-    filter_step,
-    initial,
-    kinds,
-    learnt,
-    loop,
-    on_windows,
-    through_filter,
-)
+from gnio_jax.training import checkpoint, filter_task, loop, run_folder, window_task
 from tests.support import drawn_run
 from tests.support.command_lines import run as gnio
 from tests.support.compiling import quick
@@ -55,7 +46,6 @@ OPTIONS = FilterSettings(
 THROUGH = ThroughFilter(
     learn=LEARN,
     piece_seconds=2.0,
-    truncate_seconds=1.0,
     filter_learning_rate=0.2,
     displacement_weight=1.0,
     yaw_weight=1.0,
@@ -69,6 +59,7 @@ THROUGH = ThroughFilter(
 def registered():
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(registry._MODELS, "tiny", Tiny)
+        patch.setattr(filter_task, "TRUNCATE_SECONDS", 1.0)
         yield
 
 
@@ -124,12 +115,12 @@ def same(a, b):
 
 def test_a_run_logs_its_losses_and_what_the_filter_knows_of_its_errors(finished):
     found = rows(finished)
-    # 12 s have five pieces of 2 s, since the sample at the end of each is needed; two walks.
+    # 12 s have five segments of 2 s, since the sample at the end of each is needed; two walks.
     assert [(row["epoch"], row["step"]) for row in found] == [(0, 2), (1, 4)]
     for row in found:
         parts = ("displacement", "yaw", "innovation", "state", "mse")
         assert row["loss"] == pytest.approx(sum(row[part] for part in parts), rel=1e-6)
-        assert row["skipped"] == 0 and row["pieces_per_second"] > 0
+        assert row["skipped"] == 0 and row["segments_per_second"] > 0
         assert row["val_rmse"] == pytest.approx(row["val_mse"] ** 0.5)
         assert row["val_nis"] > 0 and row["val_nees"] > 0
         assert row["gradient_norm/head"] > 0 and row["gradient_norm/filter/noise.gyro_density"] > 0
@@ -153,17 +144,17 @@ def test_what_is_not_to_learn_stays_to_the_bit(recording, finished):
 
 
 def test_stopped_and_resumed_gives_the_same_bits(recording, finished, tmp_path, monkeypatch):
-    real = filter_step.train_steps
+    real = filter_task.train_steps
 
     def stopping(*arguments, **options):
         os.kill(os.getpid(), signal.SIGTERM)
         return real(*arguments, **options)
 
-    monkeypatch.setattr(through_filter, "train_steps", stopping)
+    monkeypatch.setattr(filter_task, "train_steps", stopping)
     run = tmp_path / "run"
     assert loop.train(tiny(recording, run)).stopped_by == signal.SIGTERM
     assert checkpoint.load_run(run, "latest").step == 1
-    monkeypatch.setattr(through_filter, "train_steps", real)
+    monkeypatch.setattr(filter_task, "train_steps", real)
     # The weights that it started from are not needed any more.
     resumed = tiny(recording, run, init_from="gone")
     assert loop.train(resumed, resume=True).stopped_by is None
@@ -173,7 +164,7 @@ def test_stopped_and_resumed_gives_the_same_bits(recording, finished, tmp_path, 
         assert same(ours.variables, theirs.variables) and same(ours.filter, theirs.filter)
     for ours, theirs in zip(rows(run), rows(finished), strict=True):
         for row in (ours, theirs):
-            row.pop("pieces_per_second"), row.pop("seconds")
+            row.pop("segments_per_second"), row.pop("seconds")
         assert ours == pytest.approx(theirs, rel=1e-9)
 
 
@@ -209,7 +200,7 @@ def test_a_copy_with_other_options_has_them(finished, tmp_path):
 def training(recording, tmp_path_factory):
     """The data and the steps of a run that is never written."""
     with jax.enable_x64(True):
-        return through_filter.set_up(tiny(recording, tmp_path_factory.mktemp("unused")), Lines())
+        return filter_task.set_up(tiny(recording, tmp_path_factory.mktemp("unused")), Lines())
 
 
 def oracle(state):
@@ -224,7 +215,8 @@ def oracle(state):
 
 
 def new_state(training):
-    return oracle(training.new_state(initial.initial_run(training.config)))
+    start = run_folder.initial_run(training.config, checkpoint.load_run)
+    return oracle(training.initial_state(start.variables))
 
 
 def test_wild_steps_are_skipped_and_counted(training):
@@ -241,15 +233,29 @@ def test_wild_steps_are_skipped_and_counted(training):
         state, progress = wild.take_steps(state, order, 0, 1, 1.0)
         assert int(state.step) == 1 and int(progress.failed_step) == -1
         assert same(before, (state.variables, state.opt_state))
-        assert [float(x) for x in progress.sums] == [0, 0, 0, 0, 0, 0, 1]
-        assert all(float(norm) == 0 for norm in progress.gradient_norms.values())
-        figures = training.training_figures((6.0, *[0.0] * 5, 2.0), 5)
-        assert figures["loss"] == 2.0 and figures["skipped"] == 2
+        assert progress.sums.pop("skipped") == 1
+        assert len(progress.sums) > 6 and all(each == 0 for each in progress.sums.values())
+        assert loop._means({"loss": 6.0, "skipped": 2.0}, 5) == {"loss": 2.0, "skipped": 2}
 
 
-def test_training_pieces_are_turned_by_any_yaw(training):
+def test_a_skipped_step_does_not_shift_the_schedule(training):
+    """The rate that the log gives for a step is the one that is in force, whatever was skipped
+    before: the same step is taken after a skip."""
+    order = jnp.repeat(training.source.earliest[:5], 2)
+    rates = [training.learning_rate(step) for step in range(4)]
+    assert len(set(rates)) == 4
+    state = new_state(training)
+    lost = training.source.accel.at[:].set(np.nan)
+    wild = training._replace(source=training.source._replace(accel=lost))
+    skipped, _ = wild.take_steps(new_state(training), order, 0, 1, 1.0)
+    state = state._replace(step=jnp.int32(1))
+    taken = [training.take_steps(each, order, 1, 1, 1.0)[0] for each in (state, skipped)]
+    assert same(taken[0].variables, taken[1].variables)
+
+
+def test_training_segments_are_turned_by_any_yaw(training):
     starts = jnp.zeros(64, jnp.int32)
-    draw = jax.jit(filter_step.training_pieces, static_argnames="config")
+    draw = jax.jit(filter_task.training_segments, static_argnames="config")
     as_walked, turned = (
         draw(
             jax.random.key(0),
@@ -274,7 +280,7 @@ def test_no_call_to_lapack_waits_for_a_worker(training):
     """Where each core is a device, its batched calls in the step deadlock."""
     state = new_state(training)
     order, config = training.source.earliest, training.config
-    lowered = filter_step.train_steps.trace(
+    lowered = filter_task.train_steps.trace(
         state,
         training.source,
         jnp.resize(order, 10),
@@ -283,7 +289,8 @@ def test_no_call_to_lapack_waits_for_a_worker(training):
         jnp.float32(1),
         jax.random.key(0),
         model=training.model,
-        config=kinds.compiled(config),
+        config=window_task.without_place(config),
+        steps_per_epoch=2,
     )
     assert "cholesky" not in str(lowered.jaxpr) and "triangular_solve" not in str(lowered.jaxpr)
 
@@ -301,27 +308,28 @@ def test_noise_is_recovered(training):
         state = new_state(training)
         for epoch in range(2):
             state, progress = noisy.take_steps(state, noisy.order(epoch), 0, 2, 1.0)
-            assert progress.sums.skipped == 0
-        found = learnt.learnt_options(OPTIONS, state.filter)
+            assert progress.sums["skipped"] == 0
+        found = filter_task.trained_settings(OPTIONS, state.filter)
         for name in ("gyro_density", "accel_density"):
             ratio = getattr(found.noise, name) / getattr(OPTIONS.noise, name)
             assert ratio > 1.2 if share > 1 else ratio < 0.8, (name, share, ratio)
 
 
-def test_gradient_against_differences(training):
-    """Over pieces that are not truncated; by a number of each kind and a weight of the network."""
-    through = dataclasses.replace(THROUGH, learn=("all",), truncate_seconds=2.0)
+def test_gradient_against_differences(training, monkeypatch):
+    """Without truncation; by a number of each kind and a weight of the network."""
+    assert filter_task.filter_config(training.config, training=True).truncate_every == 10
+    monkeypatch.setattr(filter_task, "TRUNCATE_SECONDS", 2.0)
+    through = dataclasses.replace(THROUGH, learn=("all",))
     config = dataclasses.replace(training.config, through_filter=through)
-    assert filter_step.filter_config(training.config, training=True).truncate_every == 10
     state = new_state(training)
     starts = training.source.earliest[:2]
-    draw = jax.jit(filter_step.draw_pieces, static_argnames="config")
+    draw = jax.jit(filter_task.draw_segments, static_argnames="config")
     batch = draw(jax.random.key(5), training.source, starts, config)
-    chosen = learnt.chosen(state.variables, through.learn)
+    chosen = filter_task.trainable(state.variables, through.learn)
     # The network computes in float32 whatever it is given.
     chosen["filter"] = {name: jnp.float64(number) for name, number in chosen["filter"].items()}
     evaluated = quick(
-        functools.partial(filter_step.gradient_of_pieces, model=training.model, config=config)
+        functools.partial(filter_task.gradient_of_segments, model=training.model, config=config)
     )
     gradient, losses, healthy = evaluated(state.variables, chosen, *batch)
     assert bool(healthy) and np.isfinite(losses.total)
@@ -346,25 +354,27 @@ def test_gradient_against_differences(training):
 
 def test_parts_are_modules_and_options_by_name(training):
     variables = new_state(training).variables
-    assert learnt.chosen(variables, ("uncertainty",)).keys() == {"params"}
-    chosen = {name: learnt.chosen(variables, (name,)) for name in ("encoder", "head", "noise")}
+    assert filter_task.trainable(variables, ("uncertainty",)).keys() == {"params"}
+    chosen = {
+        name: filter_task.trainable(variables, (name,)) for name in ("encoder", "head", "noise")
+    }
     assert chosen["encoder"]["params"].keys() == {"encoder", "norm"}
     assert chosen["head"]["params"].keys() == {"head"}
     assert chosen["noise"] == {
-        "filter": {n: variables["filter"][n] for n in learnt.FILTER_PARTS["noise"]}
+        "filter": {n: variables["filter"][n] for n in filter_task.FILTER_PARTS["noise"]}
     }
-    assert learnt.chosen(variables, ("measurement",)).keys() == {"filter"}
-    everything = learnt.chosen(variables, ("all",))
+    assert filter_task.trainable(variables, ("measurement",)).keys() == {"filter"}
+    everything = filter_task.trainable(variables, ("all",))
     assert everything["params"].keys() == variables["params"].keys()
     assert everything["filter"].keys() == variables["filter"].keys()
-    parts = {learnt.module_part(name) for name in ("log_std", "displacement", "bank")}
+    parts = {filter_task.module_part(name) for name in ("log_std", "displacement", "bank")}
     assert parts == {"uncertainty", "head", "encoder"}  # TLIO's names, and the bank
 
 
 def test_options_survive_their_unconstrained_numbers():
-    numbers = learnt.filter_numbers(OPTIONS)
+    numbers = filter_task.filter_numbers(OPTIONS)
     assert "start.tilt" not in numbers and "considered.scale" not in numbers
-    assert learnt.learnt_options(OPTIONS, numbers) == OPTIONS
+    assert filter_task.trained_settings(OPTIONS, numbers) == OPTIONS
     given, found = (
         dict(jax.tree_util.tree_leaves_with_path(each))
         for each in (OPTIONS, with_free_parameters(OPTIONS, numbers))
@@ -378,19 +388,20 @@ def test_options_survive_their_unconstrained_numbers():
     assert moved.noise.correlation.share == 0.5
     np.testing.assert_allclose(moved.start.velocity, np.e, rtol=1e-7)
     # A share is never rounded to 1, which no setting may be.
-    nearly = learnt.learnt_options(OPTIONS, {"noise.correlation.share": jnp.float32(20)})
+    nearly = filter_task.trained_settings(OPTIONS, {"noise.correlation.share": jnp.float32(20)})
     assert nearly.noise.correlation.share == 0.9999
 
 
 def test_a_later_stage_starts_from_what_the_filter_has_learnt(recording, finished, training):
     """The command makes the filter of that run the default; what it asks for wins."""
     words = ["--init-from", str(finished), "--through-filter.learn", *THROUGH.learn]
-    run = initial.initial_run(tiny(recording, "unused", init_from=str(finished)))
+    asked_for = tiny(recording, "unused", init_from=str(finished))
+    run = run_folder.initial_run(asked_for, checkpoint.load_run)
     call = Call("gnio train", words)
     begins = experiment(read(train, call), call).filter
     assert begins == run.config.filter != OPTIONS
     config = tiny(recording, "unused", filter=changed(begins, start={"velocity": 0.3}))
-    state = training._replace(config=config).new_state(run)
+    state = training.with_config(config).initial_state(run.variables)
     assert same(state.params, run.variables["params"])
     other = state.filter.pop("start.velocity")
     np.testing.assert_allclose(other, np.log(0.3), rtol=1e-6)
@@ -401,7 +412,8 @@ def test_a_later_stage_starts_from_what_the_filter_has_learnt(recording, finishe
 def test_training_on_windows_starts_from_a_runs_weights(recording):
     config = tiny(recording, "unused", through_filter=ThroughFilter())
     with jax.enable_x64(False):
-        state = on_windows.set_up(config, Lines()).new_state(initial.initial_run(config))
+        start = run_folder.initial_run(config, checkpoint.load_run)
+        state = window_task.set_up(config, Lines()).initial_state(start.variables)
     theirs = checkpoint.load_run(recording / "initial").variables
     assert same(state.params, theirs["params"]) and state.filter == {}
     assert same(state.batch_stats["norm"], theirs["batch_stats"]["norm"])
@@ -419,26 +431,29 @@ def test_training_on_windows_starts_from_a_runs_weights(recording):
         ),
         ({"model": ModelConfig(name="tlio")}, "its model.name is tiny, and here it is tlio"),
         (
-            {"through_filter": dataclasses.replace(THROUGH, truncate_seconds=1.5)},
-            r"'through_filter.truncate_seconds' must divide the piece of 2 s",
+            {"through_filter": dataclasses.replace(THROUGH, piece_seconds=1.25)},
+            r"'through_filter.piece_seconds' is not a whole number of strides of 0.1 s",
         ),
         (
-            {"through_filter": dataclasses.replace(THROUGH, truncate_seconds=0.25)},
-            r"'through_filter.truncate_seconds' is not a whole number of strides of 0.1 s",
+            {"through_filter": ThroughFilter(LEARN, 0.7)},
+            r"'through_filter.piece_seconds' must be at least 1 s, the shortest horizon",
         ),
         (
-            {"through_filter": ThroughFilter(LEARN, 0.4, 0.4)},
-            r"'through_filter.piece_seconds' must be longer than the 0.4 s that the network sees",
+            {
+                "through_filter": ThroughFilter(LEARN, 1.0),
+                "data": DataConfig(rate=50.0, window_seconds=1.0),
+            },
+            r"'through_filter.piece_seconds' must be longer than the 1 s that the network sees",
         ),
         (
-            {"through_filter": ThroughFilter(LEARN, 60.0, 10.0)},
-            r"no piece of 3000 samples .*lower through_filter.piece_seconds",
+            {"through_filter": ThroughFilter(LEARN, 60.0)},
+            r"no segment of 3000 samples .*lower through_filter.piece_seconds",
         ),
         (
             {"filter": dataclasses.replace(OPTIONS, mahalanobis_fail_scale=10.0)},
-            r"'through_filter.gate_softness' makes no sense beside",
+            r"'filter.mahalanobis_fail_scale' makes no sense beside the soft gate",
         ),
-        ({"optim": OptimConfig(batch_size=64)}, "is 64, but there are only 10 pieces"),
+        ({"optim": OptimConfig(batch_size=64)}, "is 64, but there are only 10 segments"),
     ],
 )
 def test_mistakes(recording, tmp_path, changes, expected):

@@ -39,7 +39,7 @@ from gnio_jax.filtering.config import YawFrame
 from gnio_jax.filtering.history import GYRO_BIAS, POSITION
 from gnio_jax.filtering.settings import FilterSetup
 from gnio_jax.numerics import filled_up, quaternion_from_matrix
-from gnio_jax.scaling.processes import on_host
+from gnio_jax.parallel import on_host
 from gnio_jax.types import Array
 
 SHORTEST = 16

@@ -1,7 +1,7 @@
-"""Pieces of recordings for training through the filter: where they begin, what is known of them,
-and how wrong the filter's start is.
+"""Segments of recordings for training through the filter: where they begin, their reference, and
+how wrong the filter's start is.
 
-The recordings lie on the device once, end to end, and pieces are cut inside the jitted step.
+The recordings lie on the device once, end to end, and segments are cut inside the jitted step.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from gnio_jax.numerics import finite_rows, matrix_from_quaternion, spans
 from gnio_jax.types import Array, Sequence
 
 
-class PieceSource(NamedTuple):
-    """All recordings of a split, end to end, and where pieces may begin in them. float64."""
+class SegmentSource(NamedTuple):
+    """All recordings of a split, end to end, and where segments may begin in them. float64."""
 
     gyro: Float[Array, "t 3"]
     """rad/s, raw."""
@@ -35,7 +35,7 @@ class PieceSource(NamedTuple):
     position: Float[Array, "t 3"]
     """Reference, m."""
     earliest: Int[Array, "p"]
-    """First row at which each piece of an epoch may begin …"""
+    """First row at which each segment of an epoch may begin …"""
     latest: Int[Array, "p"]
     """… and the last one."""
 
@@ -51,8 +51,8 @@ class Path(NamedTuple):
     """m."""
 
 
-class Piece(NamedTuple):
-    """One piece of K clone intervals of n samples."""
+class Segment(NamedTuple):
+    """One segment of K clone intervals of n samples."""
 
     gyro: Float[Array, "s 3"]
     """rad/s, raw, s = K·n."""
@@ -77,16 +77,16 @@ class StartErrors(NamedTuple):
     """The same, m/s²."""
 
 
-def piece_source(sequences: Iterable[Sequence], samples: int) -> PieceSource:
-    """Recordings (all at one rate) and the pieces of `samples` samples that fit in them.
+def segment_source(sequences: Iterable[Sequence], samples: int) -> SegmentSource:
+    """Recordings (all at one rate) and the segments of `samples` samples that fit in them.
 
-    A piece needs a trusted reference at each of its samples and at the one after them. A stretch of
-    L such samples has as many pieces as fit in it side by side. They may overlap: piece j of m
-    begins anywhere in the j-th of m equal shares of the rows at which a piece can begin, so that
-    every epoch meets the whole stretch, cut elsewhere. Raises `InputError` when not a single piece
-    fits.
+    A segment needs a trusted reference at each of its samples and at the one after them. A stretch
+    of L such samples has as many segments as fit in it side by side. They may overlap: segment j of
+    m begins anywhere in the j-th of m equal shares of the rows at which a segment can begin, so
+    that every epoch meets the whole stretch, cut elsewhere. Raises `InputError` when not a single
+    segment fits.
     """
-    parts: list[PieceSource] = []
+    parts: list[SegmentSource] = []
     rows = 0
     for sequence in sequences:
         part = _source_of(sequence, samples)
@@ -95,13 +95,13 @@ def piece_source(sequences: Iterable[Sequence], samples: int) -> PieceSource:
         parts.append(part._replace(earliest=part.earliest + rows, latest=part.latest + rows))
         rows += len(part.gyro)
     if not parts:
-        problem = f"no piece of {samples} samples has a valid reference in any sequence"
+        problem = f"no segment of {samples} samples has a valid reference in any sequence"
         raise InputError("data", problem, "lower through_filter.piece_seconds")
-    return PieceSource(*(np.concatenate(field) for field in zip(*parts, strict=True)))
+    return SegmentSource(*(np.concatenate(field) for field in zip(*parts, strict=True)))
 
 
-def _source_of(sequence: Sequence, samples: int) -> PieceSource:
-    """One recording's pieces, rows counted from 0."""
+def _source_of(sequence: Sequence, samples: int) -> SegmentSource:
+    """One recording's segments, rows counted from 0."""
     known = sequence.valid & finite_rows(sequence.velocity)
     if sequence.imu_valid is not None:  # a line across a gap is nothing to learn from
         known = known & sequence.imu_valid
@@ -117,7 +117,7 @@ def _source_of(sequence: Sequence, samples: int) -> PieceSource:
         latest.append(shares[1:] - 1)
     orientation = np.where(known[:, None], sequence.orientation, [1.0, 0.0, 0.0, 0.0])
     nothing = [np.zeros(0, np.int64)]
-    return PieceSource(
+    return SegmentSource(
         gyro=sequence.gyro,
         accel=sequence.accel,
         rotation=matrix_from_quaternion(orientation),
@@ -128,16 +128,18 @@ def _source_of(sequence: Sequence, samples: int) -> PieceSource:
     )
 
 
-def random_starts(key: PRNGKeyArray, source: PieceSource) -> Int[jax.Array, "p"]:
-    """First rows of the pieces of an epoch, in random order; a function of `key` alone."""
+def random_starts(key: PRNGKeyArray, source: SegmentSource) -> Int[jax.Array, "p"]:
+    """First rows of the segments of an epoch, in random order; a function of `key` alone."""
     where_key, order_key = jax.random.split(key)
     earliest, latest = jnp.asarray(source.earliest), jnp.asarray(source.latest)
     starts = jax.random.randint(where_key, earliest.shape, earliest, latest + 1, jnp.int32)
     return jax.random.permutation(order_key, starts)
 
 
-def cut_piece(source: PieceSource, start: Int[jax.Array, ""], intervals: int, stride: int) -> Piece:
-    """The piece of `intervals` clone intervals of `stride` samples that begins at row `start`.
+def cut_segment(
+    source: SegmentSource, start: Int[jax.Array, ""], intervals: int, stride: int
+) -> Segment:
+    """The segment of `intervals` clone intervals of `stride` samples that begins at row `start`.
     Jittable."""
     samples = intervals * stride
 
@@ -150,16 +152,16 @@ def cut_piece(source: PieceSource, start: Int[jax.Array, ""], intervals: int, st
         for signal in (source.gyro, source.accel)
     )
     truth = (at_clones(signal) for signal in (source.rotation, source.velocity, source.position))
-    return Piece(gyro, accel, Path(*truth))
+    return Segment(gyro, accel, Path(*truth))
 
 
-def turned_piece(piece: Piece, angle: Float[jax.Array, ""]) -> Piece:
-    """The piece as if it had been walked in a world turned by `angle` (rad) about the vertical. The
-    IMU's samples are the same. Jittable."""
+def turned_segment(segment: Segment, angle: Float[jax.Array, ""]) -> Segment:
+    """The segment as if it had been walked in a world turned by `angle` (rad) about the vertical.
+    The IMU's samples are the same. Jittable."""
     turn = geometry.exp(jnp.stack([jnp.zeros_like(angle), jnp.zeros_like(angle), angle]))
-    rotation, velocity, position = piece.truth
+    rotation, velocity, position = segment.truth
     truth = Path(jnp.einsum("ij,kjl->kil", turn, rotation), velocity @ turn.T, position @ turn.T)
-    return piece._replace(truth=truth)
+    return segment._replace(truth=truth)
 
 
 def draw_start_errors(key: PRNGKeyArray, std: InitialStd, spread: float) -> StartErrors:

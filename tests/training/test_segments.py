@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from gnio_jax.errors import InputError
 from gnio_jax.filtering import InitialStd
-from gnio_jax.training import pieces
+from gnio_jax.training import segments
 from gnio_jax.types import Sequence
 
 SAMPLES = 20
@@ -26,15 +26,15 @@ def sequence(length, seed=0, invalid=()):
     return found._replace(position=found.position + lost, orientation=orientation + lost)
 
 
-def test_pieces_lie_in_trusted_stretches_and_cover_them_over_epochs():
+def test_segments_lie_in_trusted_stretches_and_cover_them_over_epochs():
     broken = sequence(150, invalid=[45, 46, 110])
     parts = [sequence(SAMPLES), broken, sequence(SAMPLES + 1, 1)]
-    source = pieces.piece_source(parts, SAMPLES)
+    source = segments.segment_source(parts, SAMPLES)
     # Stretches of 45, 63 and 39 samples, one short of 20, and one that just suffices.
     assert len(source.earliest) == 2 + 3 + 1 + 0 + 1
 
     keys = jax.vmap(jax.random.key)(jnp.arange(400))
-    starts = jax.vmap(pieces.random_starts, in_axes=(0, None))(keys, source)
+    starts = jax.vmap(segments.random_starts, in_axes=(0, None))(keys, source)
     starts = np.sort(starts, axis=1)
     valid = np.concatenate([parts[1].valid, parts[2].valid])
     for start in np.unique(starts):
@@ -44,58 +44,58 @@ def test_pieces_lie_in_trusted_stretches_and_cover_them_over_epochs():
     possible = [s for s in possible if not s < 150 <= s + SAMPLES]
     assert set(np.unique(starts)) == set(possible)
     # An epoch is a function of its key, and its order is not that of the rows.
-    again = pieces.random_starts(jax.random.key(3), source)
+    again = segments.random_starts(jax.random.key(3), source)
     np.testing.assert_array_equal(np.sort(again), starts[3])
     assert (np.asarray(again) != starts[3]).any()
 
 
-def test_no_piece_lies_across_a_gap_of_the_imu():
+def test_no_segment_lies_across_a_gap_of_the_imu():
     there = np.ones(150, bool)
     there[[45, 46, 110]] = False
     holed = sequence(150)._replace(imu_valid=there)
     found, expected = (
-        pieces.piece_source([each], SAMPLES)
+        segments.segment_source([each], SAMPLES)
         for each in (holed, sequence(150, invalid=[45, 46, 110]))
     )
     np.testing.assert_array_equal(found.earliest, expected.earliest)
     np.testing.assert_array_equal(found.latest, expected.latest)
 
 
-def test_a_piece_holds_its_samples_and_the_truth_at_its_clones():
+def test_a_segment_holds_its_samples_and_the_truth_at_its_clones():
     whole = sequence(150, seed=2)
-    source = pieces.piece_source([whole], SAMPLES)
-    piece = jax.jit(lambda start: pieces.cut_piece(source, start, 5, 4))(jnp.int32(7))
-    np.testing.assert_array_equal(piece.gyro, whole.gyro[7:27])
-    np.testing.assert_array_equal(piece.accel, whole.accel[7:27])
+    source = segments.segment_source([whole], SAMPLES)
+    segment = jax.jit(lambda start: segments.cut_segment(source, start, 5, 4))(jnp.int32(7))
+    np.testing.assert_array_equal(segment.gyro, whole.gyro[7:27])
+    np.testing.assert_array_equal(segment.accel, whole.accel[7:27])
     ends = np.arange(7, 28, 4)
-    np.testing.assert_array_equal(piece.truth.velocity, whole.velocity[ends])
-    np.testing.assert_array_equal(piece.truth.position, whole.position[ends])
+    np.testing.assert_array_equal(segment.truth.velocity, whole.velocity[ends])
+    np.testing.assert_array_equal(segment.truth.position, whole.position[ends])
     rotation = Rotation.from_quat(whole.orientation[ends], scalar_first=True).as_matrix()
-    np.testing.assert_allclose(piece.truth.rotation, rotation, atol=1e-12)
+    np.testing.assert_allclose(segment.truth.rotation, rotation, atol=1e-12)
 
 
-def test_a_turned_piece_is_the_same_walk_in_a_turned_world():
-    source = pieces.piece_source([sequence(150, seed=2)], SAMPLES)
-    piece = pieces.cut_piece(source, jnp.int32(7), 5, 4)
-    found = jax.jit(pieces.turned_piece)(piece, jnp.float64(0.7))
+def test_a_turned_segment_is_the_same_walk_in_a_turned_world():
+    source = segments.segment_source([sequence(150, seed=2)], SAMPLES)
+    segment = segments.cut_segment(source, jnp.int32(7), 5, 4)
+    found = jax.jit(segments.turned_segment)(segment, jnp.float64(0.7))
     turn = Rotation.from_euler("z", 0.7).as_matrix()
-    np.testing.assert_array_equal(found.gyro, piece.gyro)
-    np.testing.assert_array_equal(found.accel, piece.accel)
-    np.testing.assert_allclose(found.truth.rotation, turn @ piece.truth.rotation, atol=1e-12)
+    np.testing.assert_array_equal(found.gyro, segment.gyro)
+    np.testing.assert_array_equal(found.accel, segment.accel)
+    np.testing.assert_allclose(found.truth.rotation, turn @ segment.truth.rotation, atol=1e-12)
     for name in ("velocity", "position"):
-        expected = np.asarray(getattr(piece.truth, name)) @ turn.T
+        expected = np.asarray(getattr(segment.truth, name)) @ turn.T
         np.testing.assert_allclose(getattr(found.truth, name), expected, atol=1e-12)
 
 
-def test_no_piece_at_all_is_a_mistake():
-    with pytest.raises(InputError, match=r"no piece of 20 samples .*piece_seconds"):
-        pieces.piece_source([sequence(SAMPLES)], SAMPLES)
+def test_no_segment_at_all_is_a_mistake():
+    with pytest.raises(InputError, match=r"no segment of 20 samples .*piece_seconds"):
+        segments.segment_source([sequence(SAMPLES)], SAMPLES)
 
 
 def test_start_errors_have_the_priors_deviations():
     std = InitialStd(0.1, 0.2, 0.3, 0.4, 0.5, 0.6)
     keys = jax.random.split(jax.random.key(0), 20_000)
-    draw = jax.jit(jax.vmap(lambda key: pieces.draw_start_errors(key, std, 2.0)))
+    draw = jax.jit(jax.vmap(lambda key: segments.draw_start_errors(key, std, 2.0)))
     found = jax.tree.map(lambda x: np.asarray(x).std(0), draw(keys))
     np.testing.assert_allclose(found.rotation, [0.2, 0.2, 0.4], rtol=0.03)
     for name, value in (("velocity", 0.3), ("position", 0.4), ("gyro_bias", 0.5)):
@@ -105,9 +105,9 @@ def test_start_errors_have_the_priors_deviations():
 
 def test_a_start_is_turned_in_the_world():
     whole = sequence(40, seed=3)
-    source = pieces.piece_source([whole], SAMPLES)
-    truth = pieces.cut_piece(source, jnp.int32(0), 5, 4).truth
+    source = segments.segment_source([whole], SAMPLES)
+    truth = segments.cut_segment(source, jnp.int32(0), 5, 4).truth
     nothing = jnp.zeros(3)
-    errors = pieces.StartErrors(jnp.array([0.1, -0.2, 0.3]), nothing, nothing, nothing, nothing)
+    errors = segments.StartErrors(jnp.array([0.1, -0.2, 0.3]), nothing, nothing, nothing, nothing)
     expected = Rotation.from_rotvec([0.1, -0.2, 0.3]).as_matrix() @ np.asarray(truth.rotation[0])
-    np.testing.assert_allclose(pieces.start_rotation(truth, errors), expected, atol=1e-12)
+    np.testing.assert_allclose(segments.start_rotation(truth, errors), expected, atol=1e-12)

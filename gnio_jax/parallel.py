@@ -1,0 +1,182 @@
+"""Devices and processes that share a batch (docs/scaling.md).
+
+Within `sharing` every device of every process holds the parameters and the recordings, and works on
+its share of a batch. The compiler inserts the sums over devices: of the gradient, and of the
+statistics of batch normalisation, which are those of the whole batch. With one device and one
+process the functions here give back what they are given.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any, TypeVar
+
+import jax
+import numpy as np
+from jax.experimental import multihost_utils
+from jax.sharding import AxisType, NamedSharding, PartitionSpec
+
+from gnio_jax.errors import InputError
+
+Tree = TypeVar("Tree")
+
+BATCH = "batch"
+"""Name of the mesh's axis along which devices share a batch."""
+
+
+def initialise(distributed: str | None = None, devices: int | None = None) -> None:
+    """Connect this process with the others of its run, before JAX's first computation.
+
+    distributed: "HOST:PORT,PROCESSES,ID": where process 0 listens, how many processes there are,
+    and the number of this one. Slurm, Open MPI and Kubernetes say this themselves; without either
+    the process is alone. devices: how many devices a CPU is. Raises `InputError` for a text of
+    another form, and where the processes do not meet.
+    """
+    if devices is not None:
+        cpu_devices(devices)
+    given: tuple[str, int, int] | None = None
+    if distributed is not None:
+        host_port, *numbers = distributed.split(",")
+        host, _, port = host_port.rpartition(":")
+        if not (host and len(numbers) == 2 and all(map(str.isdecimal, [port, *numbers]))):
+            problem = f"must be HOST:PORT,PROCESSES,ID, found '{distributed}'"
+            raise InputError("--distributed", problem, "such as 10.0.0.1:4321,2,0")
+        given = host_port, int(numbers[0]), int(numbers[1])
+        if not given[2] < given[1]:
+            problem = f"gives this process the number {given[2]} of {given[1]}"
+            raise InputError("--distributed", problem, "count the processes from 0")
+    tasks = {os.environ.get(name) for name in ("SLURM_STEP_NUM_TASKS", "OMPI_COMM_WORLD_SIZE")}
+    launched = "JOB_COMPLETION_INDEX" in os.environ or bool(tasks - {None, "", "1"})
+    alone = given[1] == 1 if given else not launched
+    if alone or jax.distributed.is_initialized():
+        return
+    jax.config.update("jax_cpu_collectives_implementation", "gloo")
+    try:
+        # A process that has failed does not wait five minutes for the others.
+        jax.distributed.initialize(*given or (), shutdown_timeout_seconds=15)
+    except (RuntimeError, ValueError) as error:
+        problem = f"the processes did not meet ({' '.join(str(error).split())[:150]})"
+        remedy = "give all of them the same HOST:PORT,PROCESSES and each an ID of its own"
+        raise InputError("--distributed", problem, remedy) from None
+
+
+def cpu_devices(count: int) -> None:
+    """Let JAX see `count` devices on a CPU, unless a number is set already.
+
+    Raises RuntimeError after JAX's first computation, when the number can no longer change.
+    """
+    # JAX makes its settings when it is imported, so its types do not know this one.
+    given = jax.config.jax_num_cpu_devices  # pyright: ignore[reportAttributeAccessIssue]
+    if given >= 0 or "xla_force_host_platform_device_count" in os.environ.get("XLA_FLAGS", ""):
+        return
+    jax.config.update("jax_num_cpu_devices", count)
+
+
+# Processes
+# ------------------------------------------------------------------------------------------------
+
+
+def is_first() -> bool:
+    """Whether this is the process that writes files and lines."""
+    return jax.process_index() == 0
+
+
+def largest(*numbers: int) -> tuple[int, ...]:
+    """The largest that any process gives, number by number: what only one of them knows (its clock,
+    a signal) all of them then know. Numbers have 31 bits."""
+    if jax.process_count() == 1:
+        return numbers
+    given: Any = multihost_utils.process_allgather(np.array(numbers, np.int32))
+    return tuple(int(each) for each in given.max(axis=0))
+
+
+def on_host(tree: Tree) -> Tree:
+    """The whole of what a compiled program over all devices gives, in every process's memory."""
+    if jax.process_count() == 1:
+        return jax.device_get(tree)
+    return multihost_utils.process_allgather(tree, tiled=True)
+
+
+# Devices
+# ------------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def sharing(limit: int | None = None) -> Iterator[None]:
+    """Share batches out among the devices of all processes: `limit` of each, or all.
+
+    Without a limit a CPU is one device, which uses all cores. Raises `InputError` where a process
+    has fewer devices than `limit`, and for a limit below 1.
+    """
+    if limit is None and jax.default_backend() == "cpu":
+        limit = 1
+    if limit is not None and limit < 1:
+        raise InputError("--devices", f"must be at least 1, found {limit}")
+    chosen = []
+    for process in range(jax.process_count()):
+        own = jax.local_devices(process)
+        if limit is not None and limit > len(own):
+            problem = f"is {limit}, but process {process} has {len(own)}"
+            raise InputError("--devices", problem, "lower it")
+        chosen += own[:limit]
+    if len(chosen) == 1:
+        yield
+        return
+    mesh = jax.make_mesh((len(chosen),), (BATCH,), (AxisType.Auto,), devices=chosen)
+    with jax.set_mesh(mesh):
+        yield
+
+
+def count() -> int:
+    """Devices that share a batch. Known while a program is compiled."""
+    return jax.sharding.get_abstract_mesh().shape.get(BATCH, 1)
+
+
+def described() -> str:
+    """The devices in words: "cpu", "8 × gpu", "16 × gpu in 2 processes"."""
+    platform, processes = jax.devices()[0].platform, jax.process_count()
+    number = f"{count()} × " if count() > 1 else ""
+    return f"{number}{platform}" + (f" in {processes} processes" if processes > 1 else "")
+
+
+def everywhere(tree: Tree) -> Tree:
+    """Host arrays on each of the devices. Every process must give the same ones, and nobody may
+    write to them afterwards: on a CPU their memory may be shared."""
+    mesh = jax.sharding.get_mesh()
+
+    def placed(leaf: Any) -> jax.Array:
+        if mesh.empty:
+            return fresh_copy(leaf)
+        host = np.asarray(leaf)
+        sharding = NamedSharding(mesh, PartitionSpec())
+        return jax.make_array_from_process_local_data(sharding, host, host.shape)
+
+    return jax.tree.map(placed, tree)
+
+
+def fresh_copy(leaf: Any) -> jax.Array:
+    """A copy of an array that is bound to no device: one compiled step takes it wherever the array
+    lay before.
+
+    `jnp.array` compiles a program for each shape, so the many shapes of a network's state go by way
+    of the host. Parts of recordings do not: JAX frees late what it shares with NumPy.
+    """
+    return jax.device_put(np.array(leaf)) if isinstance(leaf, jax.Array) else jax.numpy.array(leaf)
+
+
+def split(tree: Tree) -> Tree:
+    """In a compiled program: the rows of these arrays are shared out among the devices."""
+    return _constrained(tree, PartitionSpec(BATCH))
+
+
+def replicated(tree: Tree) -> Tree:
+    """In a compiled program: each device has the whole of these arrays."""
+    return _constrained(tree, PartitionSpec())
+
+
+def _constrained(tree: Tree, spec: PartitionSpec) -> Tree:
+    if count() == 1:
+        return tree
+    return jax.tree.map(lambda leaf: jax.lax.with_sharding_constraint(leaf, spec), tree)

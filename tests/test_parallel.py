@@ -1,0 +1,362 @@
+"""A batch that devices and processes share: the same numbers as on one device of one process. Runs
+in several processes on localhost are stopped and killed, and go on in another number of them."""
+
+import dataclasses
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.sharding import PartitionSpec
+
+from gnio_jax import parallel
+from gnio_jax.config import DataConfig, ModelConfig, OptimConfig, ThroughFilter, TrainConfig
+from gnio_jax.errors import InputError
+from gnio_jax.reporting import Silence
+from gnio_jax.training import loop, run_folder, window_task
+from tests.support.drawn_state import drawn_state
+from tests.support.tlio_files import write_sequence, write_splits
+
+ROOT = Path(__file__).parents[1]
+OPTIONS = (
+    "--dataset tlio --data.rate 50 --model.name tiny --optim.epochs 2 --optim.batch-size 32 "
+    "--optim.learning-rate 1e-3 --optim.warmup-epochs 1 --optim.statistics-windows 64"
+).split()
+STEPS = 6
+"""Of an epoch."""
+LIMIT = 300
+"""Seconds after which a test gives up; the machine may be busy."""
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    """A TLIO folder of three short walks."""
+    return write_splits(tmp_path_factory.mktemp("tlio"))
+
+
+class Server:
+    """What starts the processes; all share what they compile."""
+
+    def __init__(self, folder):
+        environment = {**os.environ, "JAX_PLATFORMS": "cpu"}
+        environment["GNIO_CACHE"] = str(folder / "recordings")
+        environment.setdefault("JAX_COMPILATION_CACHE_DIR", str(folder / "cache"))
+        self.folder, self.started = folder, 0
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "tests.support.training_server"],
+            cwd=ROOT,
+            env=environment,
+            stdin=subprocess.PIPE,
+            text=True,
+            start_new_session=True,  # so that it ends with all that it has started
+        )
+
+    def start(self, module, *arguments):
+        """Begin a process; returns the place of what it writes."""
+        self.started += 1
+        files = self.folder / str(self.started)
+        asked = {"module": module, "arguments": list(arguments), "files": str(files)}
+        self.process.stdin.write(json.dumps(asked) + "\n")
+        self.process.stdin.flush()
+        return files
+
+
+def free_address():
+    """A port of this machine at which nothing listens."""
+    with socket.socket() as free:
+        free.bind(("localhost", 0))
+        return f"localhost:{free.getsockname()[1]}"
+
+
+def end_of(files):
+    """(status, lines on stderr) of a process, once it has ended."""
+    until = time.monotonic() + LIMIT
+    while not files.with_suffix(".status").exists():
+        assert time.monotonic() < until, files.with_suffix(".err").read_text()
+        time.sleep(0.05)
+    status = int(files.with_suffix(".status").read_text())
+    return status, files.with_suffix(".err").read_text().splitlines()
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory):
+    found = Server(tmp_path_factory.mktemp("server"))
+    yield found
+    os.killpg(found.process.pid, signal.SIGKILL)
+    found.process.wait()
+
+
+class Group:
+    """Processes that train together."""
+
+    def __init__(self, recording, server, workdir, processes, devices, *more, **special):
+        """special: what process k does otherwise, as `send={k: (signal, step)}`;
+        `more_of={k: options}`; `every`: a checkpoint after every step."""
+        coordinator = free_address()
+        self.processes = []
+        for k in range(processes):
+            name, step = special.get("send", {}).get(k, ("never", 0))
+            command = [name, str(step), str(int(special.get("every", False))), *OPTIONS]
+            command += ["--data-root", str(recording), "--workdir", str(workdir)]
+            if processes > 1:
+                command += ["--distributed", f"{coordinator},{processes},{k}"]
+            command += ["--devices", str(devices), *more, *special.get("more_of", {}).get(k, ())]
+            self.processes.append(server.start("training", *command))
+
+    def end(self):
+        """(status, lines on stderr) of each process."""
+        return [end_of(process) for process in self.processes]
+
+
+@pytest.fixture(scope="module")
+def run(recording, server):
+    def start(*arguments, **special):
+        return Group(recording, server, *arguments, **special)
+
+    return start
+
+
+def rows(workdir):
+    return [json.loads(line) for line in (workdir / "metrics.jsonl").read_text().splitlines()]
+
+
+def assert_same_run(workdir, other):
+    """The losses of both, and what they have learnt."""
+    ours, theirs = rows(workdir), rows(other)
+    assert [row["step"] for row in ours] == [row["step"] for row in theirs]
+    for name in ("loss", "val_loss", "val_mse", "val_nll"):
+        np.testing.assert_allclose(
+            [row[name] for row in ours], [row[name] for row in theirs], rtol=1e-4
+        )
+
+
+@pytest.fixture(scope="module")
+def alone(run, tmp_path_factory):
+    """One process with one device, uninterrupted."""
+    workdir = tmp_path_factory.mktemp("alone") / "run"
+    (end,) = run(workdir, 1, 1).end()
+    assert end[0] == 0, end
+    return workdir
+
+
+@pytest.mark.parametrize("processes, devices", [(1, 8), (2, 4), (4, 2)])
+def test_processes_and_devices_change_nothing_but_rounding(
+    run, alone, tmp_path, processes, devices
+):
+    ends = run(tmp_path / "run", processes, devices).end()
+    assert [status for status, _ in ends] == [0] * processes, ends
+    said = [line for _, lines in ends[1:] for line in lines if "[Gloo]" not in line]
+    assert not said, "the first process alone writes lines"
+    assert_same_run(tmp_path / "run", alone)
+
+
+def test_processes_that_do_not_belong_together_are_refused(run, tmp_path):
+    """One has other settings: none of them trains."""
+    ends = run(tmp_path / "run", 2, 1, more_of={1: ("--optim.epochs", "3")}).end()
+    assert [status for status, _ in ends] == [2, 2], ends
+    for _, lines in ends:
+        assert "--distributed: the processes have different settings; start all" in lines[-1]
+
+
+def test_a_run_goes_on_in_other_numbers_of_processes_and_devices(run, alone, tmp_path):
+    """4 × 2 until one of them is sent SIGTERM, 2 × 1 until one of them is killed, then 1 × 1."""
+    workdir = tmp_path / "run"
+    stopped = run(workdir, 4, 2, send={2: ("SIGTERM", STEPS + 2)}).end()
+    assert [status for status, _ in stopped] == [128 + signal.SIGTERM] * 4, stopped
+    first = latest(workdir)
+    assert first == STEPS + 2
+
+    group = run(workdir, 2, 1, "--resume", send={1: ("SIGKILL", first + 2)}, every=True)
+    survivor, killed = group.end()
+    assert killed[0] == -signal.SIGKILL
+    assert survivor[0] != 0, survivor
+    second = latest(workdir)
+    assert first < second < 2 * STEPS  # saved after every step
+
+    # What a process leaves that is killed while it saves.
+    (workdir / "checkpoints" / "latest" / f"{second + 1}.orbax-checkpoint-tmp").mkdir()
+    (end,) = run(workdir, 1, 1, "--resume").end()
+    assert end[0] == 0, end
+    assert f"resuming at step {second}" in end[1]
+    assert_same_run(workdir, alone)
+
+
+def latest(workdir):
+    (step,) = (workdir / "checkpoints" / "latest").glob("[0-9]*")
+    return int(step.name)
+
+
+def test_processes_share_sequences_and_each_has_all_results(server, tmp_path):
+    """Four devices in two processes, and five sequences: in order, and the same ones."""
+    coordinator = free_address()
+    each = [
+        server.start("sequences", f"{coordinator},2,{k}", str(tmp_path / f"{k}.npz"))
+        for k in range(2)
+    ]
+    assert [end_of(files)[0] for files in each] == [0, 0]
+    steps = np.random.default_rng(0).normal(size=(5, 7, 3)).astype(np.float32)
+    for k in range(2):
+        found = np.load(tmp_path / f"{k}.npz")
+        np.testing.assert_allclose(found["path"], 2 * np.cumsum(steps, axis=1), rtol=1e-5)
+        np.testing.assert_array_equal(found["largest"], steps.max(axis=(1, 2)))
+        np.testing.assert_array_equal(found["one"], found["path"][:1])
+
+
+# Devices of one process
+# ------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory):
+    root = tmp_path_factory.mktemp("tlio")
+    for name in "ab":
+        write_sequence(root / name)
+    for split, name in (("train", "a"), ("val", "b"), ("test", "b")):
+        (root / f"{split}_list.txt").write_text(f"{name}\n")
+    optim = OptimConfig(epochs=2, batch_size=16, learning_rate=1e-3, statistics_windows=32)
+    model = ModelConfig(width=2, bank_size=3)
+    data = DataConfig(rate=50.0)
+    return TrainConfig("tlio", str(root), data=data, model=model, optim=optim)
+
+
+def trained(config):
+    """Losses and gradient norms of each of five steps, figures of validation, parameters."""
+    task = window_task.set_up(config, Silence())
+    drawn = drawn_state(task.model, config, task.steps_per_epoch)
+    state, order, found = parallel.everywhere(drawn), task.order(0), []
+    for first in range(5):
+        state, progress = task.take_steps(state, order, first, 1, 1.0)
+        found.append(progress.sums)
+    state, row = task.validate(task.with_statistics(state), 5)
+    return jax.device_get((found, row, state.batch_stats)), state
+
+
+@pytest.fixture(scope="module")
+def on_two(small):
+    with parallel.sharing(2):
+        return trained(small)
+
+
+def test_two_devices_learn_what_one_learns(small, on_two):
+    """Statistics of batch normalisation are those of the whole batch, or nothing would agree."""
+    alone, _ = trained(small)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, 2e-4, 1e-5), on_two[0], alone)
+
+
+def test_each_device_has_the_state_and_its_part_of_the_batch(small, on_two):
+    _, state = on_two
+    for leaf in jax.tree.leaves(state):
+        assert leaf.sharding.is_fully_replicated and len(leaf.devices()) == 2
+    with parallel.sharing(2):
+        task = window_task.set_up(small, Silence())
+        which = parallel.everywhere(np.arange(16, dtype=np.int32))
+        key = jax.random.key(0)
+        draw = jax.jit(lambda: window_task.draw_windows(key, task.source, which, small))
+        windows, _ = draw()
+    assert windows.imu.sharding.spec[0] == "batch"
+    assert [shard.data.shape[0] for shard in windows.imu.addressable_shards] == [8, 8]
+
+
+def test_a_cpu_is_one_device_unless_asked_for_more():
+    with parallel.sharing():
+        assert parallel.count() == 1
+    for limit, expected in ((3, "--devices: is 3, but process 0 has 2"), (0, "--devices: must be")):
+        with pytest.raises(InputError, match=expected), parallel.sharing(limit):
+            pass
+
+
+def test_a_batch_that_cannot_be_shared_evenly_is_refused(small):
+    optim = dataclasses.replace(small.optim, batch_size=15)
+    changed = dataclasses.replace(small, optim=optim, data_root="nowhere")
+    with parallel.sharing(2), pytest.raises(InputError, match="2 devices cannot"):
+        window_task.set_up(changed, Silence())  # before it reads anything
+
+
+def test_through_the_filter_there_is_no_number_of_devices():
+    config = TrainConfig(through_filter=ThroughFilter(("head",)))
+    with pytest.raises(InputError, match="--devices: is for training on windows; leave it out"):
+        loop.train(config, devices=2)
+
+
+def test_processes_with_other_samples_or_weights_are_refused(monkeypatch):
+    """As if another process had sent the numbers of the first call."""
+    monkeypatch.setattr(jax, "process_count", lambda: 2)
+    monkeypatch.setattr(parallel, "on_host", lambda tree: tree)
+    sent = []
+
+    def compare(samples, weights):
+        tree = {"imu": samples, "start": np.arange(3)}
+        run_folder.compare_processes(TrainConfig(), {"train": ["a"]}, tree, {"scale": weights})
+
+    monkeypatch.setattr(parallel, "largest", lambda *given: sent.append(given) or given)
+    samples, weights = np.arange(12.0).reshape(4, 3), jnp.float32(1)
+    compare(samples, weights)
+    assert len(sent) == 3
+    for other, what in (
+        ((samples, weights), None),
+        ((samples[:3], weights), "recordings"),
+        ((samples + 1e-9, weights), "recordings"),
+        ((samples, jnp.float32(2)), "weights to begin with"),
+    ):
+        first = iter(sent)
+        largest = lambda *given: tuple(map(max, given, next(first)))  # noqa: B023, E731
+        monkeypatch.setattr(parallel, "largest", largest)
+        if what is None:
+            compare(*other)
+            continue
+        with pytest.raises(InputError, match=f"the processes have different {what}; give all"):
+            compare(*other)
+
+
+@pytest.mark.parametrize(
+    "text, expected",
+    [
+        ("localhost:1,2", "must be HOST:PORT,PROCESSES,ID, found 'localhost:1,2'; such as 10"),
+        ("localhost,2,0", "must be HOST:PORT,PROCESSES,ID"),
+        (":4321,2,0", "must be HOST:PORT,PROCESSES,ID"),
+        ("localhost:port,2,0", "must be HOST:PORT,PROCESSES,ID"),
+        ("localhost:4321,two,0", "must be HOST:PORT,PROCESSES,ID"),
+        ("localhost:4321,2,-1", "must be HOST:PORT,PROCESSES,ID"),
+        ("localhost:4321,2,2", "gives this process the number 2 of 2; count the processes from 0"),
+        ("localhost:99999,2,0", "the processes did not meet"),
+    ],
+)
+def test_a_wrong_text_is_one_line(text, expected):
+    with pytest.raises(InputError, match=f"--distributed: {expected}") as told:
+        parallel.initialise(text)
+    assert "\n" not in str(told.value)
+
+
+def test_one_process_meets_nobody(monkeypatch):
+    """Also with a launcher's variable that is empty, or says 1."""
+    monkeypatch.setattr(jax.distributed, "initialize", lambda *_, **__: pytest.fail("it meets"))
+    for count in ("", "1"):
+        monkeypatch.setenv("SLURM_STEP_NUM_TASKS", count)
+        parallel.initialise()
+    parallel.initialise("localhost:4321,1,0")
+    monkeypatch.setattr(jax.config, "update", lambda *_: None)
+    found = []
+    monkeypatch.setattr(jax.distributed, "initialize", lambda *given, **_: found.append(given))
+    monkeypatch.setenv("SLURM_STEP_NUM_TASKS", "2")
+    parallel.initialise()
+    parallel.initialise("localhost:4321,2,1")
+    assert found == [(), ("localhost:4321", 2, 1)]
+
+
+def test_with_one_device_nothing_is_placed_nor_constrained():
+    rows = jnp.arange(6)
+    with parallel.sharing(1):
+        assert parallel.count() == 1 and parallel.described() == "cpu"
+        assert parallel.split(rows) is rows and parallel.replicated(rows) is rows
+        assert parallel.everywhere(np.arange(6)).sharding == rows.sharding
+    with parallel.sharing(2):
+        assert parallel.count() == 2 and parallel.described() == "2 × cpu"
+        assert parallel.everywhere(np.arange(6)).sharding.spec == PartitionSpec()
