@@ -36,6 +36,7 @@ from gnio_jax.filtering.state import (
     BIASES,
     CLONE,
     CORRELATED,
+    LOCAL,
     MOVE,
     OFFSET,
     THETA,
@@ -116,16 +117,23 @@ def _interval_noise(
     dt: float,
 ) -> Float[Array, "15 15"]:
     """Q of θ, v, p, b_g, b_a, from N_l and from Φ_m[:, b] for m ≥ 1."""
-    n = effect.shape[2]
+    n, dtype = effect.shape[2], effect.dtype
     gyro_variance = noise.gyro_density**2 / dt + gap.gyro_variance
     accel_variance = noise.accel_density**2 / dt + gap.accel_variance
     walk = jnp.repeat(jnp.stack([noise.gyro_bias_walk, noise.accel_bias_walk]) ** 2 * dt, 3)
-    white = jnp.repeat(jnp.stack([gyro_variance, accel_variance]), 3, axis=0)
-    # Both sums of Q as one product of 9 rows.
-    columns = jnp.concatenate([effect, by_bias], axis=2)
-    walks = jnp.broadcast_to(walk[:, None], (6, n - 1))
-    variances = jnp.concatenate([white, walks], axis=1)
-    motion = (columns * variances[None]).reshape(9, -1) @ columns.reshape(9, -1).T
+    # The gyro's noise and the walks as one product of 9 rows.
+    of_gyro = effect[:, :3]
+    left = [of_gyro, by_bias]
+    right = [of_gyro * gyro_variance[None, None], by_bias * walk[None, :, None]]
+    left, right = (
+        jnp.concatenate([part.reshape(9, -1) for part in parts], axis=1) for parts in (left, right)
+    )
+    # The accelerometer's noise is isotropic, so that its rotations drop out of R Rᵀ: each sample
+    # adds one number for each pair of v and p.
+    gains = np.stack([np.zeros(n), np.ones(n), (n - 0.5 - np.arange(n)) * dt])
+    pairs = dt**2 * np.einsum("il,jl->ijl", gains, gains).astype(dtype)
+    of_accel = jnp.kron(pairs @ accel_variance, np.eye(3, dtype=dtype))
+    motion = left @ right.T + of_accel
     mixed = jnp.sum(by_bias, axis=2) * walk[None]
     motion_rows = jnp.concatenate([motion, mixed], axis=1)
     bias_rows = jnp.concatenate([mixed.T, jnp.diag(n * walk)], axis=1)
@@ -145,11 +153,11 @@ class Transition(NamedTuple):
     def __call__(self, rows: Float[Array, "n m"]) -> Float[Array, "n m"]:
         """F rows. Where the anchor moves, a' = a + o and s' = o, and the interval starts from
         o = 0."""
+        of_offset = np.isin(np.arange(LOCAL.stop), np.r_[OFFSET]).astype(rows.dtype)
+        motion = (self.motion * (1 - self.anchored * of_offset)[None]) @ rows[LOCAL]
         moved = self.anchored * rows[OFFSET]
-        local = [rows[: OFFSET.start], rows[OFFSET] - moved, rows[BIASES]]
         anchor, move = rows[ANCHOR] + moved, (1 - self.anchored) * rows[MOVE] + moved
         correlated = self.decay[:, None] * rows[CORRELATED]
-        motion = self.motion @ jnp.concatenate(local)
         return jnp.concatenate([motion, rows[BIASES], anchor, move, correlated])
 
 

@@ -209,8 +209,9 @@ def project(
     entry = CLONE * oldest
     core_oldest = jax.lax.dynamic_slice_in_dim(state.cross_covariance, entry, CLONE, 1)
     oldest_clones = jax.lax.dynamic_slice_in_dim(state.clone_covariance, entry, CLONE, 0)
-    core = matmul(linear.core, state.core_covariance) + matmul(linear.oldest, core_oldest.T)
-    clones = matmul(linear.core, state.cross_covariance) + matmul(linear.oldest, oldest_clones)
+    # H P by dots: spelt out, the sums would read the blocks of H anew for every entry.
+    core = linear.core @ state.core_covariance + linear.oldest @ core_oldest.T
+    clones = linear.core @ state.cross_covariance + linear.oldest @ oldest_clones
     of_oldest = jax.lax.dynamic_slice_in_dim(clones, entry, CLONE, 1)
     spread = matmul(core, linear.core.T) + matmul(of_oldest, linear.oldest.T)
     rows = linear.residual[:, None], core, clones, linear.core, linear.oldest
