@@ -61,5 +61,5 @@ class MotionBank(nn.Module):
     def memory(self) -> tuple[Float[Array, "h m k"], Float[Array, "h k m"]]:
         """Keys (heads, m, d / heads) and values (heads, d / heads, m) of the prototypes: as the
         products with one window read them."""
-        keys, values = self.key(self.prototypes), self.value(self.prototypes)
-        return keys.transpose(1, 0, 2), values.transpose(1, 2, 0)
+        keys = self.key(self.prototypes).transpose(1, 0, 2)
+        return keys, self.value(self.prototypes).transpose(1, 2, 0)
