@@ -28,8 +28,8 @@ from benchmarks import baseline
 from gnio_jax import data
 from gnio_jax.data.dataset import Recording
 from gnio_jax.data.hdf5 import read_hdf5, write_hdf5
+from gnio_jax.data.loading import read_recording
 from gnio_jax.data.readers.text import numbers, read_csv
-from gnio_jax.data.reading import read_recording
 from gnio_jax.types import Sequence
 from tests.support.layouts import LAYOUTS
 

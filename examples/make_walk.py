@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gnio_jax.data.readers.randomised import random_walk
+from gnio_jax.data.simulated.walks import random_walk
 
 SEED = 32
 HEADER = "time,gyro_x,gyro_y,gyro_z,accel_x,accel_y,accel_z"

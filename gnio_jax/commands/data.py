@@ -64,7 +64,7 @@ def show_list(asked: ListOptions, _call: options.Call) -> None:
       {prog}
       GNIO_DATA=~/recordings {prog}
     """
-    from gnio_jax.data import registry  # late: mistakes do not wait for JAX
+    from gnio_jax import data  # late: mistakes do not wait for JAX
 
     here = Table(title="Datasets", title_justify="left", show_lines=True)
     for column in ("dataset", "Hz", "splits", "licence", "found here"):
@@ -73,8 +73,8 @@ def show_list(asked: ListOptions, _call: options.Call) -> None:
     sources = Table(title=title, title_justify="left", show_lines=True)
     for column in ("dataset", "where", "layout"):
         sources.add_column(column, overflow="fold")
-    for name in registry.names():
-        dataset = registry.get(name)
+    for name in data.names():
+        dataset = data.get(name)
         splits = ", ".join(dataset.splits)
         here.add_row(name, f"{dataset.rate:g}", splits, dataset.licence, _found_here(dataset))
         sources.add_row(name, dataset.source, dataset.layout if dataset.needs_root else "–")
@@ -88,11 +88,11 @@ def show_list(asked: ListOptions, _call: options.Call) -> None:
 
 def _found_here(dataset: Any) -> str:
     """Of a `Dataset`: its folder and the recordings of each split."""
-    from gnio_jax.data import registry
-    from gnio_jax.data.reading import find_recordings
+    from gnio_jax import data
+    from gnio_jax.data.loading import find_recordings
 
     try:
-        root = registry.find_root(dataset.name) if dataset.needs_root else Path(".")
+        root = data.find_root(dataset.name) if dataset.needs_root else Path(".")
     except InputError:
         return "not found"
     place = f"{root}: " if dataset.needs_root else "computed: "
@@ -120,11 +120,11 @@ def check(asked: CheckOptions, _call: options.Call) -> None:
         raise InputError("--json", f"{asked.json} is a folder", "name a file")
     if asked.plots is not None and asked.plots.exists() and not asked.plots.is_dir():
         raise InputError("--plots", f"{asked.plots} is a file", "name a folder")
-    from gnio_jax.data import checking  # late: mistakes do not wait for JAX
+    from gnio_jax.data import loading  # late: mistakes do not wait for JAX
 
     dataset, root = _find(asked.name, asked.data_root)
     with console.terminal() as terminal:
-        checked = checking.check(
+        rows, notes = loading.check(
             dataset,
             root,
             asked.split,
@@ -146,11 +146,11 @@ def check(asked: CheckOptions, _call: options.Call) -> None:
             no_wrap=not text,
             min_width=width,
         )
-    for row in checked.sequences:
+    for row in rows:
         table.add_row(*_figures(row), style="red" if row.reason else None)
     output.print(table)
-    _print_reasons({row.name: row.reason for row in checked.sequences if row.reason}, checked.notes)
-    used, count = checked.used(), len(checked.sequences)
+    _print_reasons({row.name: row.reason for row in rows if row.reason}, notes)
+    used, count = [row for row in rows if not row.reason], len(rows)
     hours = sum(row.check.duration for row in used if row.check) / 3600
     output.print(f"{len(used)} of {count} sequences are used, {hours:.2f} h")
     if asked.json:
@@ -158,8 +158,8 @@ def check(asked: CheckOptions, _call: options.Call) -> None:
             "dataset": dataset.name,
             "root": str(root) if dataset.needs_root else None,
             "split": asked.split,
-            "sequences": checking.figures(checked),
-            "notes": checked.notes,
+            "sequences": {row.name: _json(row) for row in rows},
+            "notes": notes,
         }
         write_text(asked.json, json.dumps(found, indent=2, ensure_ascii=False) + "\n")
     if asked.plots:
@@ -183,10 +183,10 @@ _FIGURES = (
 
 
 def _figures(row: Any) -> list[str]:
-    """The cells of a `CheckedSequence`."""
+    """The cells of a `loading.Checked`."""
     found = row.check
     if found is None:
-        return [row.name, row.split, *["–"] * 7, "left out"]
+        return [row.name, ", ".join(row.splits), *["–"] * 7, "left out"]
     numbers = (
         found.gyro_consistency_degrees,
         found.median_speed,
@@ -195,7 +195,7 @@ def _figures(row: Any) -> list[str]:
     gravity = [round(value, 2) + 0.0 for value in found.gravity_mean]  # no −0.00
     return [
         row.name,
-        row.split,
+        ", ".join(row.splits),
         f"{found.duration:.1f}",
         f"{found.rate:.1f}",
         "–" if any(map(math.isnan, gravity)) else " ".join(f"{value:.2f}" for value in gravity),
@@ -203,6 +203,22 @@ def _figures(row: Any) -> list[str]:
         f"{found.share_valid:.1%}",
         "left out" if row.reason else "used",
     ]
+
+
+def _json(row: Any) -> dict[str, Any]:
+    """A `loading.Checked` for a JSON file, which knows no array and no NaN."""
+
+    def plain(value: Any) -> Any:
+        if isinstance(value, float) and math.isnan(value):
+            return None
+        return [plain(each) for each in value] if hasattr(value, "__len__") else value
+
+    figures = row.check._asdict() if row.check else {}
+    figures = {
+        name: list(value) if name == "failures" else plain(value) for name, value in figures.items()
+    }
+    state = {"split": ", ".join(row.splits), "used": not row.reason, "reason": row.reason}
+    return state | figures
 
 
 def convert(asked: ConvertOptions, _call: options.Call) -> None:
@@ -219,11 +235,11 @@ def convert(asked: ConvertOptions, _call: options.Call) -> None:
     if asked.rate is not None and not 1.0 <= asked.rate <= 10000.0:
         problem = f"{asked.rate:g} Hz is no rate to resample to"
         raise InputError("--rate", problem, "give 1 to 10000 Hz")
-    from gnio_jax.data import conversion  # late: mistakes do not wait for JAX
+    from gnio_jax.data import loading  # late: mistakes do not wait for JAX
 
     dataset, root = _find(asked.name, asked.data_root)
     with console.terminal() as terminal:
-        result = conversion.convert(
+        result = loading.convert(
             dataset,
             root,
             asked.out,
@@ -232,31 +248,22 @@ def convert(asked: ConvertOptions, _call: options.Call) -> None:
             None,
             lambda share: terminal.progress("converting", share),
         )
-    done = result.recordings.values()
-    left_out = {name: reason for one in done for name, reason in one.left_out.items()}
-    _print_reasons(left_out, [*result.notes, *(note for one in done for note in one.notes)])
-    kept = sum(len(one.kept) for one in done)
-    if not kept:
-        problem = f"none of {len(done)} recordings can be used"
-        raise InputError(root, problem, "see the reasons above")
-    hours = sum(one.seconds for one in done) / 3600
-    counts = ", ".join(f"{split} {len(result.sequences(split))}" for split in result.splits)
-    again = sum(len(one.kept) for one in done if one.there_already)
-    there = f"; {again} of them were there already" if again else ""
+    _print_reasons(result.left_out, result.notes)
+    counts = ", ".join(f"{split} {len(stems)}" for split, stems in result.sequences.items())
     output = console.stdout()
-    summary = f"{asked.out}: {kept} sequences, {hours:.2f} h ({counts}){there}"
+    summary = f"{asked.out}: {result.files} sequences, {result.hours:.2f} h ({counts})"
     output.print(summary, soft_wrap=True)
-    learnable = {"train", "val"} <= result.splits.keys()
+    learnable = {"train", "val"} <= result.sequences.keys()
     following = "gnio train --dataset csv" if learnable else "gnio data check csv"
     output.print(f"next: {following} --data-root {asked.out}", soft_wrap=True)
 
 
 def _find(name: str, data_root: str | None) -> tuple[Any, Path]:
     """A dataset and its folder."""
-    from gnio_jax.data import registry
+    from gnio_jax import data
 
-    dataset = registry.get(name)
-    return dataset, registry.find_root(name, data_root) if dataset.needs_root else Path(".")
+    dataset = data.get(name)
+    return dataset, data.find_root(name, data_root) if dataset.needs_root else Path(".")
 
 
 def _print_reasons(left_out: dict[str, str], notes: list[str]) -> None:

@@ -83,12 +83,12 @@ def _devices() -> dict[str, str]:
 
 def _datasets() -> dict[str, str]:
     """Those whose folder is there."""
-    from gnio_jax.data import registry
+    from gnio_jax import data
 
     found = {}
-    for name in registry.names():
+    for name in data.names():
         with contextlib.suppress(InputError):
-            here = str(registry.find_root(name)) if registry.get(name).needs_root else "computed"
+            here = str(data.find_root(name)) if data.get(name).needs_root else "computed"
             found[f"dataset {name}"] = here
     return found
 
@@ -110,10 +110,10 @@ def _weights() -> dict[str, str]:
 def _caches() -> dict[str, str]:
     import jax
 
-    from gnio_jax.data import cache
+    from gnio_jax.data.hdf5 import cache_folder
 
     compiled = jax.config.values["jax_compilation_cache_dir"]
     return {
         "compiled programs": compiled or "not kept: the cache's folder cannot be written",
-        "recordings read": str(cache.folder()),
+        "recordings read": str(cache_folder()),
     }

@@ -65,7 +65,7 @@ def import_file(asked: ImportFile, _call: options.Call) -> None:
         raise InputError("--out", f"'{asked.out}' is no name of an HDF5 file", "name it NAME.h5")
     if asked.out.is_dir():
         raise InputError("--out", f"'{asked.out}' is a folder", "name a file in it, NAME.h5")
-    from gnio_jax.data.checking import impressions  # late: mistakes do not wait for JAX
+    from gnio_jax.data.importing import impressions  # late: mistakes do not wait for JAX
     from gnio_jax.data.importing.kept import write_imported
     from gnio_jax.data.readers import csv_files
 

@@ -1,11 +1,11 @@
 """Every dataset as a list of `Sequence`: `load(name, root, split)`, `names()`."""
 
-from gnio_jax.data.dataset import Dataset
-from gnio_jax.data.folds import Fold, folds, group, parse_fold
+from gnio_jax.data.dataset import Dataset, find_root, get, names
 from gnio_jax.data.hdf5 import read_hdf5, write_hdf5
-from gnio_jax.data.plausibility import SelfCheck, self_check
-from gnio_jax.data.registry import find_root, get, load, load_each, names
+from gnio_jax.data.loading import load, load_each
 from gnio_jax.data.resampling import resample
+from gnio_jax.data.self_check import SelfCheck, self_check
+from gnio_jax.data.splits import Fold, folds, group, parse_fold
 from gnio_jax.data.validation import validate
 from gnio_jax.types import Sequence
 

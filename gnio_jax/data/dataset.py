@@ -1,11 +1,14 @@
-"""What a reader says of its dataset: which recordings there are, and how each is read.
+"""What a reader says of its dataset, the datasets by name, and where the folder of each is.
 
-Reading itself (cache, self-check, splits, processes) is `reading`'s; see `registry.load`.
+A new dataset is one module in `readers` that ends with `DATASET = Dataset(...)`, and one line in
+`readers/__init__.py`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import difflib
+import os
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -21,19 +24,18 @@ class Refusal(InputError):
 
 
 class Recording(NamedTuple):
-    """One recording that was found, but not yet read. Can be sent to another process."""
+    """One recording that was found, but not yet read. It can be sent to another process."""
 
     name: str
     """Unique within a dataset; the name of its sequence, if it yields one."""
     read: Callable[[], list[Sequence]]
-    """Makes its sequences: one, or the pieces between its gaps. They are validated and on a uniform
-    clock, but not self-checked. Raises `InputError` where a file is damaged, `Refusal` where the
-    recording is of no use."""
+    """Makes its sequences: one, or the segments between its gaps. They are validated and on a
+    uniform clock, but not self-checked. Raises `InputError` where a file is damaged, `Refusal`
+    where the recording is of no use."""
     files: tuple[Path, ...] = ()
     """The files that its sequences are made of."""
-    version: str = ""
-    """Not empty: `read` is slow, and its sequences are kept in the cache under the state of `files`
-    and this text, which changes whenever `read` would make other sequences of the same files."""
+    slow: bool = False
+    """Whether `read` is slow. Then the cache keeps its result, and processes share the work."""
     attributes: dict[str, Any] = {}
     """What lists and splits say of it; joins the attributes of its sequences."""
     form: str = ""
@@ -53,7 +55,7 @@ def _listed(read: Callable[[], Sequence]) -> list[Sequence]:
 
 @dataclass(frozen=True)
 class Dataset:
-    """One dataset; every reader ends with `DATASET = Dataset(...)`."""
+    """One dataset."""
 
     name: str
     """The name of `--dataset`."""
@@ -75,14 +77,71 @@ class Dataset:
     self-checked when it is loaded."""
     pedestrian: bool = True
     """False for drones and vehicles: the self-check then finds no speed implausible."""
-    min_correlation: float | None = 0.3
-    """Correlation of the horizontal accelerations that the self-check asks for; None where
-    positions are those of another body, or smoothed."""
+    correlates: bool = True
+    """False where the horizontal accelerations of the positions need not correlate with the
+    accelerometer's: the positions are those of another body, or smoothed."""
     needs_reference: bool = True
     """False where recordings without any reference are of use."""
     list_splits: Callable[[Path], tuple[str, ...]] | None = None
     """root -> splits, where lists at the root name them; there may be others than `splits`."""
+    folders: tuple[str, ...] = ()
+    """Names that its folder may have; by default the dataset's own name."""
 
     def splits_at(self, root: Path) -> tuple[str, ...]:
         """The splits that may be asked for at this root."""
         return self.list_splits(root) if self.list_splits else self.splits
+
+
+# --- by name
+
+
+def _datasets() -> dict[str, Dataset]:
+    from gnio_jax.data.readers import DATASETS  # the readers import this module
+
+    return DATASETS
+
+
+def names() -> list[str]:
+    """Names of the known datasets."""
+    return sorted(_datasets())
+
+
+def get(name: str) -> Dataset:
+    """The dataset of that name; raises `InputError` that lists the known ones."""
+    if name not in _datasets():
+        known = f"known datasets: {', '.join(names())}"
+        raise InputError(
+            "dataset", f"unknown name '{name}'", f"{did_you_mean(name, names())}{known}"
+        )
+    return _datasets()[name]
+
+
+def did_you_mean(word: str, known: Iterable[str]) -> str:
+    """The beginning of a remedy that names the closest of the known words, if one is close."""
+    close = difflib.get_close_matches(word, list(known), n=1)
+    return f"did you mean '{close[0]}'? " if close else ""
+
+
+def find_root(name: str, root: str | os.PathLike[str] | None = None) -> Path:
+    """The folder of dataset `name`: `root` if given, else $GNIO_DATA/<name>, else data/<name>.
+
+    Raises `InputError` when it is missing, saying how to name it, where the public set is had and
+    which layout is expected.
+    """
+    dataset = get(name)
+    if root is not None:
+        candidates = [Path(root)]
+    else:
+        own = [os.environ["GNIO_DATA"]] if os.environ.get("GNIO_DATA") else []
+        folders = dataset.folders or (name,)
+        candidates = [Path(base) / folder for base in (*own, "data") for folder in folders]
+    for candidate in candidates:
+        if candidate.is_dir():
+            return candidate
+    looked = ", ".join(dict.fromkeys(str(candidate) for candidate in candidates))
+    raise InputError(
+        looked,
+        f"no folder of dataset '{name}'",
+        f"give --data-root, or set GNIO_DATA to its parent; get it from {dataset.source}; "
+        f"expected layout: {dataset.layout}",
+    )

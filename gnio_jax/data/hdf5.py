@@ -1,10 +1,19 @@
-"""Sequences as HDF5, the package's own file format."""
+"""Sequences as HDF5, the package's own file format, and the cache, whose entries are such files.
+
+The cache keeps what is slow to make: parsed text, aligned clocks. Its folder is $GNIO_CACHE, else
+$XDG_CACHE_HOME/gnio-jax, else ~/.cache/gnio-jax; it may be deleted at any time.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import functools
+import hashlib
+import json
 import os
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import h5py
 import numpy as np
@@ -12,38 +21,29 @@ import numpy as np
 from gnio_jax.data.validation import validate
 from gnio_jax.errors import InputError
 from gnio_jax.files import replacing
-from gnio_jax.types import Sequence
+from gnio_jax.types import Sequence, Waypoints
 
 _FORMAT = "gnio-jax sequence 1"
 _OPTIONAL_FIELDS = ("device_orientation", "imu_valid")
 _FIELDS = ("time", "gyro", "accel", "orientation", "position", "velocity", "valid")
+LARGEST_RATIO = 100
+"""A compressed field may be so many times larger in memory than in the file."""
 _ATTRIBUTE_TYPES = (str, bool, int, float, np.bool_, np.integer, np.floating)
+
+
+# --- a file of one sequence
 
 
 def write_hdf5(path: str | os.PathLike[str], sequence: Sequence) -> None:
     """Write `sequence` as HDF5, whole or not at all.
 
-    One dataset per field (contiguous, so that it can be memory-mapped), `name` and `format` as
-    attributes of the file, its attributes on the group `attributes`. Raises `InputError` for an
-    attribute that is no text, number or boolean.
+    The file holds one dataset for each field (contiguous, so that it can be memory-mapped), `name`
+    and `format` as attributes, and the sequence's attributes on the group `attributes`. Waypoints
+    are the group `waypoints`. Raises `InputError` for an attribute that is no text, number or
+    boolean.
     """
     with replacing(path) as temporary, h5py.File(temporary, "w") as file:
-        file.attrs["format"] = _FORMAT
-        file.attrs["name"] = sequence.name
-        for field in _FIELDS:
-            file.create_dataset(field, data=getattr(sequence, field))
-        for field in _OPTIONAL_FIELDS:
-            if getattr(sequence, field) is not None:
-                file.create_dataset(field, data=getattr(sequence, field))
-        group = file.create_group("attributes")
-        for key, value in sequence.attributes.items():
-            if not isinstance(value, _ATTRIBUTE_TYPES):
-                raise InputError(
-                    path,
-                    f"attribute '{key}' is {type(value).__name__}",
-                    "attributes are text, numbers or booleans",
-                )
-            group.attrs[key] = value
+        _write(file, sequence, path)
 
 
 def read_hdf5(path: str | os.PathLike[str]) -> Sequence:
@@ -52,7 +52,7 @@ def read_hdf5(path: str | os.PathLike[str]) -> Sequence:
     path = Path(path)
     try:
         with h5py.File(path, "r") as file:
-            sequence = _sequence_of(file, path)
+            sequence = _read(file, path)
     except FileNotFoundError:
         raise InputError(path, "no such file") from None
     except InputError:
@@ -66,35 +66,147 @@ def read_hdf5(path: str | os.PathLike[str]) -> Sequence:
     return validate(sequence, path)
 
 
-def _sequence_of(file: h5py.File, path: Path) -> Sequence:
-    if file.attrs.get("format") != _FORMAT:
+def _write(group: h5py.Group, sequence: Sequence, path: object) -> None:
+    group.attrs["format"] = _FORMAT
+    group.attrs["name"] = sequence.name
+    for field in (*_FIELDS, *_OPTIONAL_FIELDS):
+        if getattr(sequence, field) is not None:
+            group.create_dataset(field, data=getattr(sequence, field))
+    if sequence.waypoints is not None:
+        waypoints = group.create_group("waypoints")
+        for field, values in sequence.waypoints._asdict().items():
+            waypoints.create_dataset(field, data=values)
+    attributes = group.create_group("attributes")
+    for key, value in sequence.attributes.items():
+        if not isinstance(value, _ATTRIBUTE_TYPES):
+            raise InputError(
+                path,
+                f"attribute '{key}' is {type(value).__name__}",
+                "attributes are text, numbers or booleans",
+            )
+        attributes.attrs[key] = value
+
+
+def _read(group: h5py.Group, path: Path) -> Sequence:
+    if group.attrs.get("format") != _FORMAT:
         raise InputError(
             path,
-            f"is not a '{_FORMAT}' file (format: {file.attrs.get('format')!r})",
+            f"is not a '{_FORMAT}' file (format: {group.attrs.get('format')!r})",
             "convert the recording with gnio data convert",
         )
-    values: dict[str, Any] = {}
-    for field in _FIELDS:
-        if field not in file:
-            raise InputError(path, f"field '{field}' is missing", "convert the recording again")
-        values[field] = _array(file, field, path)
+    values: dict[str, Any] = {field: _array(group, field, path) for field in _FIELDS}
     for field in _OPTIONAL_FIELDS:
-        if field in file:
-            values[field] = _array(file, field, path)
-    stored = file["attributes"].attrs if "attributes" in file else {}
+        if field in group:
+            values[field] = _array(group, field, path)
+    if "waypoints" in group:
+        fields = (_array(group, f"waypoints/{field}", path) for field in Waypoints._fields)
+        values["waypoints"] = Waypoints(*fields)
+    stored = group["attributes"].attrs if "attributes" in group else {}
     attributes = {
         key: value.item() if isinstance(value, np.generic) else value
         for key, value in stored.items()
     }
-    return Sequence(name=str(file.attrs.get("name", path.stem)), attributes=attributes, **values)
+    return Sequence(name=str(group.attrs.get("name", path.stem)), attributes=attributes, **values)
 
 
-def _array(file: h5py.File, field: str, path: Path) -> np.ndarray:
-    """Booleans of what is valid, float64 of every other field."""
-    value: Any = file[field][()]  # pyright: ignore[reportIndexIssue]
+def _array(group: h5py.Group, field: str, path: Path) -> np.ndarray:
+    """Booleans of what is valid, float64 of every other field.
+
+    A field lies in the file itself: a link to another place is refused, and so is a field that
+    would be far larger in memory than in the file.
+    """
+    if isinstance(group.get(field, getlink=True), h5py.ExternalLink | h5py.SoftLink):
+        raise InputError(path, f"field '{field}' is a link", "convert the recording again")
+    stored = group.get(field)
+    if stored is None:
+        raise InputError(path, f"field '{field}' is missing", "convert the recording again")
     kind, content = ("b", "booleans") if field.endswith("valid") else ("f", "numbers")
-    if not isinstance(value, np.ndarray) or value.dtype.kind != kind:
+    if not isinstance(stored, h5py.Dataset) or stored.dtype.kind != kind or not stored.shape:
         raise InputError(
             path, f"field '{field}' is not an array of {content}", "convert the recording again"
         )
+    most = LARGEST_RATIO * stored.id.get_storage_size() + 1_000_000
+    if stored.external or stored.is_virtual or stored.nbytes > most:
+        problem = f"field '{field}' would take {stored.nbytes} bytes, which the file does not hold"
+        raise InputError(path, problem, "convert the recording again")
+    value = stored[()]
     return value if kind == "b" else value.astype(np.float64, copy=False)
+
+
+# --- the cache
+
+
+class Reading(NamedTuple):
+    """What reading a recording gave. Problems and warnings are values, since they may come from
+    another process or from the cache."""
+
+    sequences: list[Sequence]
+    """Empty where the recording cannot be used."""
+    notes: tuple[str, ...] = ()
+    """What the reader warned of, and why another form was used."""
+    refusals: tuple[str, ...] = ()
+    """Why the recording is of no use, one reason for each of its forms; empty if it is of use."""
+    damage: InputError | None = None
+    """What is wrong with its files; None if nothing is."""
+
+
+def cache_folder() -> Path:
+    """Where the cache lies; it need not exist."""
+    if chosen := os.environ.get("GNIO_CACHE"):
+        return Path(chosen)
+    base = os.environ.get("XDG_CACHE_HOME")
+    return (Path(base) if base else Path.home() / ".cache") / "gnio-jax"
+
+
+def cache_entry(name: str, files: Iterable[str | os.PathLike[str]]) -> Path:
+    """The file that keeps the reading of the recording `name` (with its form) from these files.
+
+    It has another name as soon as a file has another path, size or modification time, or a source
+    file of the package that takes part in reading is another. Raises `InputError` for a file that
+    is missing.
+    """
+    states = []
+    for file in files:
+        path = Path(file).absolute()
+        try:
+            status = path.stat()
+        except OSError as error:
+            raise InputError(path, f"cannot be read ({error.strerror})") from None
+        states.append([str(path), status.st_size, status.st_mtime_ns])
+    key = hashlib.sha256(json.dumps([_sources(), name, states]).encode()).hexdigest()[:32]
+    return cache_folder() / f"{key}.h5"
+
+
+@functools.cache
+def _sources() -> str:
+    """A digest of the source files that decide what a recording becomes."""
+    package = Path(__file__).parents[1]
+    base = [package / f"{name}.py" for name in ("decimation", "numerics", "types")]
+    digest = hashlib.sha256()
+    for path in [*base, *sorted((package / "data").rglob("*.py"))]:
+        digest.update(path.read_bytes())
+    return digest.hexdigest()
+
+
+def write_reading(entry: Path, reading: Reading) -> None:
+    """Keep a reading without damage, whole or not at all. Where nothing can be written, recordings
+    are read every time."""
+    with contextlib.suppress(OSError), replacing(entry) as temporary:
+        with h5py.File(temporary, "w") as file:
+            file.attrs["notes"] = json.dumps(reading.notes)
+            file.attrs["refusals"] = json.dumps(reading.refusals)
+            for number, sequence in enumerate(reading.sequences):
+                _write(file.create_group(f"{number:04}"), sequence, entry)
+
+
+def read_reading(entry: Path) -> Reading | None:
+    """A reading that was kept; None where there is no sound one."""
+    try:
+        with h5py.File(entry, "r") as file:
+            sequences = [validate(_read(file[number], entry), entry) for number in sorted(file)]
+            notes, refusals = (
+                tuple(json.loads(file.attrs[name])) for name in ("notes", "refusals")
+            )
+    except Exception:  # a damaged file makes the parser fail in any way
+        return None
+    return Reading(sequences, notes, refusals) if sequences or refusals else None

@@ -12,7 +12,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
 
-from gnio_jax.data.plausibility import SelfCheck, gyro_windows
+from gnio_jax.data.self_check import SelfCheck, gyro_windows
 from gnio_jax.files import replacing, shown_name
 from gnio_jax.numerics import finite_rows, spans
 from gnio_jax.types import Sequence

@@ -9,8 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from gnio_jax.config import DataConfig
-from gnio_jax.data.readers.gait import person
-from gnio_jax.data.readers.synthetic import pedestrian
+from gnio_jax.data.simulated.walks import pedestrian
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation.inference import Network
 from gnio_jax.evaluation.metrics import ate
@@ -57,7 +56,7 @@ def draw_walk(windows: DataConfig, seconds: float) -> Walk:
     """A pedestrian at the network's rate."""
     n, rate = windows.stride, windows.rate
     samples = int(seconds * rate) // n * n
-    drawn = pedestrian(SEED, person(PERSON), PLACEMENT, seconds=samples / rate + 1, rate=rate)
+    drawn = pedestrian(SEED, PERSON, PLACEMENT, seconds=samples / rate + 1, rate=rate)
     rotation = matrix_from_quaternion(drawn.orientation[0])
     start = {"rotation": rotation, "velocity": drawn.velocity[0], "position": drawn.position[0]}
     return Walk(

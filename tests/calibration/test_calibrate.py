@@ -15,7 +15,7 @@ from gnio_jax.calibration import evidence
 from gnio_jax.calibration.fit import std_factors
 from gnio_jax.commands import app
 from gnio_jax.config import CalibrateConfig, DataConfig, ModelConfig, TrainConfig, plain
-from gnio_jax.data.readers import synthetic
+from gnio_jax.data.simulated import walks as simulated
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import Estimate, Trajectory
 from gnio_jax.training import checkpoint
@@ -38,10 +38,7 @@ def run(tmp_path_factory):
 @pytest.fixture
 def two_walks(monkeypatch):
     """Every split has two short walks; the splits that were read."""
-    walks = [
-        synthetic.pedestrian(seed, synthetic.person(seed), "handheld", 14.0, 50.0)
-        for seed in (1, 2)
-    ]
+    walks = [simulated.pedestrian(seed, seed, "handheld", 14.0, 50.0) for seed in (1, 2)]
     read = []
     monkeypatch.setattr(data, "load", lambda name, root, split, *_: read.append(split) or walks)
     return read

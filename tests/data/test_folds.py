@@ -7,7 +7,7 @@ import pytest
 
 from gnio_jax import data
 from gnio_jax.config import DataConfig, TrainConfig
-from gnio_jax.data import registry
+from gnio_jax.data import loading
 from gnio_jax.errors import InputError
 from gnio_jax.reporting import Lines
 from gnio_jax.training import window_task
@@ -50,7 +50,7 @@ def test_folds_share_the_time_and_keep_groups_whole():
 
 @pytest.mark.parametrize("number", [0, 1, 2])
 def test_a_split_may_be_a_fold_or_all_but_that(monkeypatch, number):
-    monkeypatch.setattr(registry, "read_each", lambda *_: iter(RECORDINGS))
+    monkeypatch.setattr(loading, "read_split", lambda *_: iter(RECORDINGS))
     fold_of = data.folds(RECORDINGS, 3)
     without, alone = (
         [s.name for s in data.load("synthetic", None, f"train{sign}{number}of3")] for sign in "-+"
@@ -61,7 +61,7 @@ def test_a_split_may_be_a_fold_or_all_but_that(monkeypatch, number):
 
 
 def test_training_reads_the_fold_that_its_split_names(monkeypatch):
-    monkeypatch.setattr(registry, "read_each", lambda *_: iter(RECORDINGS))
+    monkeypatch.setattr(loading, "read_split", lambda *_: iter(RECORDINGS))
     config = TrainConfig(data=DataConfig(rate=50.0, train_split="train-1of3"))
     read = [s.name for s in window_task.read_split(config, "train-1of3", Lines(), 1, {})]
     assert read == [s.name for s in data.load("synthetic", None, "train-1of3")]
@@ -77,7 +77,7 @@ def test_training_reads_the_fold_that_its_split_names(monkeypatch):
     ],
 )
 def test_a_fold_that_is_not_there_is_a_mistake(monkeypatch, split, problem):
-    monkeypatch.setattr(registry, "read_each", lambda *_: iter(RECORDINGS))
+    monkeypatch.setattr(loading, "read_split", lambda *_: iter(RECORDINGS))
     with pytest.raises(InputError, match=problem):
         data.load("synthetic", None, split)
 

@@ -12,8 +12,7 @@ import pytest
 from gnio_jax import filtering
 from gnio_jax.commands import app
 from gnio_jax.config import DataConfig, ModelConfig, TrainConfig
-from gnio_jax.data.readers.gait import person
-from gnio_jax.data.readers.synthetic import pedestrian
+from gnio_jax.data.simulated.walks import pedestrian
 from gnio_jax.evaluation import inference_network
 from gnio_jax.numerics import matrix_from_quaternion
 from gnio_jax.tracking.run import tracking_filter
@@ -81,7 +80,7 @@ def package(run):
 @pytest.fixture(scope="package")
 def walked():
     rate = CONFIG.data.rate
-    drawn, second = pedestrian(5, person(5), seconds=SECONDS - 1, rate=rate), round(rate)
+    drawn, second = pedestrian(5, 5, seconds=SECONDS - 1, rate=rate), round(rate)
     gravity = matrix_from_quaternion(drawn.orientation[0]).T @ [0, 0, GRAVITY]
     gyro = np.concatenate([np.zeros((second, 3)), drawn.gyro])
     return Walked(gyro + BIAS, np.concatenate([np.tile(gravity, (second, 1)), drawn.accel]))

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from gnio_jax.data.readers import synthetic
+from gnio_jax.data.simulated import walks as simulated
 from gnio_jax.evaluation import Trajectory, never_moves, report, score
 from tests.support.estimates import SETTINGS, estimate
 from tests.support.estimators import RATE
@@ -15,14 +15,14 @@ def walks():
     # shortest.
     lengths = {1: 18.0, 2: 11.3, 3: 16.0}
     return [
-        synthetic.pedestrian(seed, synthetic.person(seed), "handheld", seconds, RATE)
+        simulated.pedestrian(seed, seed, "handheld", seconds, RATE)
         for seed, seconds in lengths.items()
     ]
 
 
 @pytest.fixture(scope="module")
 def clean():
-    return synthetic.pedestrian(5, synthetic.person(5), "pocket", 18.0, RATE, imu_errors=False)
+    return simulated.pedestrian(5, 5, "pocket", 18.0, RATE, imu_errors=False)
 
 
 @pytest.fixture(scope="module")

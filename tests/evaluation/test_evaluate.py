@@ -14,7 +14,7 @@ import pytest
 from gnio_jax import data
 from gnio_jax.commands import console
 from gnio_jax.config import DataConfig, EvaluateConfig, ModelConfig, TrainConfig
-from gnio_jax.data.readers import synthetic
+from gnio_jax.data.simulated import walks as simulated
 from gnio_jax.evaluation import report, run
 from tests.support import drawn_run
 from tests.support.filter_settings import changed
@@ -46,7 +46,7 @@ def command(monkeypatch):
     """evaluate.py's own main on short walks: (arguments) -> None."""
     lengths = {1: 15.0, 2: 14.0, 3: 0.5}
     walks = [
-        synthetic.pedestrian(seed, synthetic.person(seed), "handheld", seconds, 50.0)
+        simulated.pedestrian(seed, seed, "handheld", seconds, 50.0)
         for seed, seconds in lengths.items()
     ]
     load = data.load
@@ -120,7 +120,7 @@ def test_end_to_end(workdir, command, capsys, tmp_path):
 def test_a_void_filter_is_in_the_files(workdir, monkeypatch):
     """Accelerations in the wrong unit: the sequence says so, and no figure is of it."""
     walks = [
-        synthetic.pedestrian(seed, synthetic.person(seed), "handheld", seconds, 50.0)
+        simulated.pedestrian(seed, seed, "handheld", seconds, 50.0)
         for seed, seconds in ((1, 15.0), (2, 14.0))  # one program with those of the command
     ]
     walks[0] = walks[0]._replace(accel=1e3 * walks[0].accel)

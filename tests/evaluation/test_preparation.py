@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gnio_jax import evaluation
-from gnio_jax.data.readers import synthetic
+from gnio_jax.data.simulated import walks as simulated
 from gnio_jax.evaluation import Setup
 from tests.support.estimators import CONFIG, OPTIONS, RATE, rotations
 
@@ -67,7 +67,7 @@ def test_short_sequences_are_left_out_by_name(walks):
 
 
 def test_other_rates_are_resampled():
-    walk = synthetic.pedestrian(1, synthetic.person(1), "handheld", 6.0, 200.0)
+    walk = simulated.pedestrian(1, 1, "handheld", 6.0, 200.0)
     (prepared,), _ = evaluation.prepare([walk], CONFIG)
     assert np.median(np.diff(prepared.sequence.time)) == pytest.approx(1 / RATE)
 

@@ -12,8 +12,8 @@ from scipy.interpolate import CubicSpline
 from scipy.signal import firwin
 
 from gnio_jax import filtering, geometry
-from gnio_jax.data.readers import synthetic
 from gnio_jax.data.resampling import resample
+from gnio_jax.data.simulated import walks as simulated
 from gnio_jax.filtering import Tracker
 from gnio_jax.filtering import tracker as online
 from gnio_jax.filtering.resampler import Stream, create_grid
@@ -258,7 +258,7 @@ def predict(windows):
 @functools.cache
 def walk(rate):
     """17 s on foot, shaken at 180, 188 and 199 Hz: at 200 Hz aliases to 20, 12 and 1 Hz."""
-    made = synthetic.pedestrian(4, synthetic.person(4), seconds=17.0, rate=float(rate))
+    made = simulated.pedestrian(4, 4, seconds=17.0, rate=float(rate))
     shake = np.sin(2 * np.pi * made.time[:, None] * [188.0, 199.0, 180.0] + [1.0, 2.0, 0.5])
     return made._replace(gyro=made.gyro + 2.0 * shake, accel=made.accel + 15.0 * shake[:, ::-1])
 

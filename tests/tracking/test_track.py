@@ -215,7 +215,7 @@ def test_our_own_file_with_holes(gnio, mistake, runs, tmp_path):
             assert (runs.parent / "tracks" / "_.._walk" / "summary.json").is_file()
         else:
             told = mistake(*given)
-            assert "walk: field 'time' has a gap of 3.210 s after row 199, longer than 1 s" in told
+            assert "walk: field 'time' has a gap of 3.210 s after row 200, longer than 1 s" in told
             # The same on a clock that runs through the hole.
             write_hdf5(tmp_path / "walk.h5", resample(sequence, 100.0))
             assert "walk: field 'time' has a gap of 3.210 s" in mistake(*given)

@@ -34,9 +34,9 @@ from gnio_jax.data.importing.streams import (
     read_table,
 )
 from gnio_jax.data.parsing.stamps import PER_SECOND, RATES, rounded_rate
-from gnio_jax.data.plausibility import self_check
 from gnio_jax.data.readers.csv_files import ACCEL, GYRO
 from gnio_jax.data.resampling import resample
+from gnio_jax.data.self_check import self_check
 from gnio_jax.data.validation import WINDOW_SECONDS, validate
 from gnio_jax.errors import InputError
 from gnio_jax.types import Sequence
@@ -254,3 +254,23 @@ def _without_reference(imu: Joined, name: str, source: Path) -> Sequence:
         attributes={"dataset": "csv", "group": name, "truth": "none", "start_time": imu.start},
     )
     return validate(sequence, source)
+
+
+def impressions(sequence: Sequence) -> list[str]:
+    """What a person can compare with what was recorded: length, strength, rest."""
+    time = sequence.time
+    step = float(np.median(np.diff(time)))
+    accel, gyro = (np.linalg.norm(field, axis=1) for field in (sequence.accel, sequence.gyro))
+    pull = f"{np.median(accel):.2f} m/s² in the median, {accel.min():.2f} to {accel.max():.2f}"
+    lines = [
+        f"{time[-1] - time[0]:.1f} s at {1.0 / step:.4g} Hz",
+        f"|accel| {pull}",
+        f"|gyro| {np.median(gyro):.2f} rad/s in the median, up to {gyro.max():.2f}",
+    ]
+    span = max(round(0.5 / step), 1)
+    count = len(accel) // span
+    if count:
+        accel, gyro = (norm[: count * span].reshape(count, span) for norm in (accel, gyro))
+        still = (accel.std(axis=1) < 0.2) & (gyro.mean(axis=1) < 0.1)
+        lines.append(f"it rests {still.mean():.0%} of the time")
+    return lines

@@ -1,1 +1,33 @@
-"""Published layouts, one per file: which recordings there are, and how one is read."""
+"""One module for each published layout: its files, columns, units, frames, splits and traps."""
+
+from gnio_jax.data.dataset import Dataset
+from gnio_jax.data.readers import (
+    blackbird,
+    csv_files,
+    euroc,
+    idol,
+    kitti,
+    oxiod,
+    ridi,
+    ronin,
+    tlio,
+)
+from gnio_jax.data.simulated.walks import RANDOMISED, SYNTHETIC
+
+DATASETS: dict[str, Dataset] = {
+    dataset.name: dataset
+    for dataset in (
+        blackbird.DATASET,
+        csv_files.DATASET,
+        *euroc.DATASETS,
+        idol.DATASET,
+        kitti.DATASET,
+        oxiod.DATASET,
+        RANDOMISED,
+        ridi.DATASET,
+        ronin.DATASET,
+        SYNTHETIC,
+        tlio.DATASET,
+    )
+}
+"""Every dataset by its name."""

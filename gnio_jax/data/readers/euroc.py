@@ -43,8 +43,6 @@ from gnio_jax.errors import InputError
 from gnio_jax.types import Sequence
 
 RATE = 200.0
-VERSION = "asl 3"
-"""Changes whenever other sequences would come of the same files: it is part of the cache's key."""
 SPLITS = ("train", "val", "test", "seen", "unseen")
 EUROC_SPLITS = {
     "train": ("MH_01_easy", "MH_02_easy", "MH_03_medium", "V1_01_easy", "V1_03_difficult"),
@@ -94,7 +92,7 @@ def _recording(folder: Path, about: Dataset) -> Recording:
     sensors = [folder / "mav0" / sensor for sensor in ("imu0", *REFERENCES)]
     files = [sensor / name for sensor in sensors for name in ("data.csv", "sensor.yaml")]
     return single(short_name(folder.name), _read_by_name, folder, about.name)._replace(
-        files=tuple(path for path in files if path.is_file()), version=f"{VERSION} {about.name}"
+        files=tuple(path for path in files if path.is_file()), slow=True, form=about.name
     )
 
 

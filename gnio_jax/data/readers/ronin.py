@@ -300,5 +300,5 @@ DATASET = Dataset(
     layout="<root>/**/<sequence>/{data.hdf5,info.json} and "
     "<root>/lists/list_{train,val,test_seen,test_unseen}.txt",
     licence="RoNIN data licence: non-commercial research only",
-    min_correlation=None,  # the chest's accelerations are not the phone's
+    correlates=False,  # the chest's accelerations are not the phone's
 )

@@ -8,8 +8,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from gnio_jax import data
-from gnio_jax.data.plausibility import self_check
 from gnio_jax.data.readers import blackbird
+from gnio_jax.data.self_check import self_check
 from gnio_jax.errors import InputError
 from gnio_jax.numerics import rotations
 from tests.support import known_walk

@@ -7,8 +7,8 @@ import pytest
 
 from gnio_jax import data
 from gnio_jax.data.hdf5 import write_hdf5
-from gnio_jax.data.plausibility import self_check
 from gnio_jax.data.readers import csv_files as csv
+from gnio_jax.data.self_check import self_check
 from gnio_jax.errors import InputError
 from gnio_jax.numerics import rotations
 from tests.support import known_walk

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from gnio_jax import data
-from gnio_jax.data.plausibility import self_check
 from gnio_jax.data.readers import kitti
+from gnio_jax.data.self_check import self_check
 from gnio_jax.errors import InputError
 from gnio_jax.numerics import rotations
 from tests.support import kitti_files as files

@@ -15,9 +15,9 @@ from scipy.spatial.transform import Rotation
 
 from gnio_jax import data
 from gnio_jax.data.dataset import Refusal
-from gnio_jax.data.plausibility import self_check
+from gnio_jax.data.loading import read_recording
 from gnio_jax.data.readers import oxiod
-from gnio_jax.data.reading import read_recording
+from gnio_jax.data.self_check import self_check
 from gnio_jax.errors import InputError
 from gnio_jax.numerics import rotations
 from tests.support import oxiod_files as files

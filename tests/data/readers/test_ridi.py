@@ -11,8 +11,8 @@ import pytest
 
 from gnio_jax import data
 from gnio_jax.data.dataset import Refusal
-from gnio_jax.data.plausibility import self_check
 from gnio_jax.data.readers import ridi
+from gnio_jax.data.self_check import self_check
 from gnio_jax.errors import InputError
 from gnio_jax.numerics import rotations
 from tests.support import known_walk as walk

@@ -42,9 +42,6 @@ from gnio_jax.data.readers.oxiod.walks import LARGE_SCALE, LAYOUT, RATE, Walk, f
 from gnio_jax.errors import InputError
 from gnio_jax.types import Sequence
 
-VERSION = "oxiod 8"
-"""Changes whenever other sequences would come of the same files: it is part of the cache's key."""
-
 __all__ = [
     "DATASET",
     "SPLITS",
@@ -90,9 +87,7 @@ def recordings(root: Path, split: str) -> list[Recording]:
 def recording_of(walk: Walk) -> Recording:
     """`raw` before `syn`, which is read where `raw` is refused."""
     forms = [
-        single(walk.name, build, walk, kind)._replace(
-            files=walk.files[kind], version=VERSION, form=kind
-        )
+        single(walk.name, build, walk, kind)._replace(files=walk.files[kind], slow=True, form=kind)
         for kind in ("raw", "syn")
         if kind in walk.files
     ]

@@ -1,18 +1,25 @@
 """The self-check against walks whose figures are known in closed form."""
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from gnio_jax import data
-from gnio_jax.data.plausibility import check_sequence, each_plausible, gyro_windows, self_check
+from gnio_jax.data.dataset import Recording
+from gnio_jax.data.loading import read_split
+from gnio_jax.data.self_check import check_sequence, gyro_windows, self_check
 from gnio_jax.errors import InputError
+from gnio_jax.types import Waypoints
 from tests.support.circle import changed, circle
 
 
 def keep_plausible(sequences, dataset):
-    return list(each_plausible(sequences, dataset))
+    """What loading keeps of a dataset that is these sequences."""
+    recordings = [Recording(each.name, lambda each=each: [each]) for each in sequences]
+    dataset = dataclasses.replace(dataset, recordings=lambda root, split: recordings)
+    return list(read_split(dataset, Path("."), "test"))
 
 
 def asking(**options):
@@ -193,16 +200,17 @@ def test_windows_of_the_gyro_tell_when_it_is_off():
 def test_positions_of_another_body_need_not_correlate():
     sequence = circle()
     mirrored = sequence._replace(position=sequence.position * [-1, 1, 1])
-    assert self_check(mirrored, min_correlation=None).failures == ()
-    assert keep_plausible([mirrored], asking(min_correlation=None)) == [mirrored]
+    assert self_check(mirrored, correlates=False).failures == ()
+    (kept,) = keep_plausible([mirrored], asking(correlates=False))
+    assert kept.name == mirrored.name
     with (
         pytest.warns(UserWarning, match="correlates by only"),
         pytest.raises(InputError, match="none of 1"),
     ):
         keep_plausible([mirrored], asking())
     # A converted recording brings along what its own dataset asks.
-    chest = mirrored._replace(attributes={"check_min_correlation": -1.0, "check_pedestrian": True})
-    assert keep_plausible([chest], asking()) == [chest]
+    chest = mirrored._replace(attributes={"check_correlation": False, "check_pedestrian": True})
+    assert len(keep_plausible([chest], asking())) == 1
     running = chest._replace(velocity=chest.velocity * 4)
     assert any(
         "too fast" in failure
@@ -215,7 +223,7 @@ def test_a_recording_without_a_reference_is_kept_where_none_is_needed():
     bare = sequence._replace(
         valid=np.zeros_like(sequence.valid), position=sequence.position * np.nan
     )
-    assert keep_plausible([bare], asking(needs_reference=False)) == [bare]
+    assert len(keep_plausible([bare], asking(needs_reference=False))) == 1
     assert check_sequence(bare, asking()).failures == ("no sample has a valid reference",)
 
 
@@ -223,7 +231,7 @@ def test_keep_plausible_names_what_it_leaves_out():
     good = circle()
     upside = good._replace(name="upside", accel=-good.accel)
     with pytest.warns(UserWarning, match=r"upside: left out .* mean of R·accel") as caught:
-        assert keep_plausible([upside, good], asking()) == [good]
+        assert [each.name for each in keep_plausible([upside, good], asking())] == [good.name]
     assert len(caught) == 1
     with (
         pytest.warns(UserWarning, match="upside"),
@@ -231,4 +239,23 @@ def test_keep_plausible_names_what_it_leaves_out():
     ):
         keep_plausible([upside], asking())
     fast = good._replace(velocity=good.velocity * 4)
-    assert keep_plausible([fast], asking(pedestrian=False)) == [fast]
+    assert len(keep_plausible([fast], asking(pedestrian=False))) == 1
+
+
+def test_waypoints_are_asked_for_gravity_and_speed_alone():
+    """A walk in a circle, of which a map has the place every five seconds."""
+    walked = circle(seconds=40.0)
+    rows = np.arange(0, 4000, 500)
+    taps = Waypoints(walked.time[rows], walked.position[rows, :2])
+    bare = walked._replace(
+        valid=np.zeros_like(walked.valid), position=walked.position * np.nan, waypoints=taps
+    )
+    check = self_check(bare)
+    assert check.failures == () and check.share_valid == 0.0
+    np.testing.assert_allclose(check.gravity_mean, [0, 0, 9.81], atol=0.1)
+    legs = 2 * 1.2 / 0.4 * np.sin(0.4 * 5.0 / 2)  # chords of the circle
+    assert check.median_speed == pytest.approx(legs / 5.0, rel=1e-6)
+    fast = bare._replace(waypoints=Waypoints(taps.time, 4 * taps.position))
+    assert "too fast" in self_check(fast).failures[0]
+    weak = bare._replace(accel=bare.accel * 0.9)
+    assert "off (0, 0, 9.81)" in self_check(weak).failures[0]

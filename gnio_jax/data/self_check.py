@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -11,13 +9,12 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from gnio_jax.data.dataset import Dataset
-from gnio_jax.errors import InputError
 from gnio_jax.numerics import (
     convolved,
+    cumulative_rotation,
+    integrate_gyro,
     last_true,
     midpoints,
-    quaternion_product,
-    quaternions,
     rotations,
     spans,
 )
@@ -41,7 +38,7 @@ class SelfCheck(NamedTuple):
     """Hz, from the median interval."""
     gravity_mean: Float[np.ndarray, "3"]
     """Mean of R·accel in the world less the mean acceleration of the reference, (v_end −
-    v_start)/T, m/s²: (0, 0, 9.81)."""
+    v_start)/T, m/s²: (0, 0, 9.81). Of waypoints its length stands in z."""
     gyro_consistency_degrees: float
     """Median angle between gyro-integrated and reference rotation over 10 s windows, one constant
     bias removed. NaN for what is shorter than two windows: the bias would take up whatever is
@@ -59,11 +56,12 @@ class SelfCheck(NamedTuple):
 def self_check(
     sequence: Sequence,
     pedestrian: bool = True,
+    correlates: bool = True,
     window_seconds: float = WINDOW_SECONDS,
     max_gravity_error: float = 0.5,
     max_gyro_degrees: float = 5.0,
     max_speed: float = 3.0,
-    min_correlation: float | None = 0.3,
+    min_correlation: float = 0.3,
 ) -> SelfCheck:
     """Do IMU and reference describe the same motion? `sequence` must be on a uniform clock.
 
@@ -71,12 +69,16 @@ def self_check(
     `max_gravity_error` m/s²; gyro off the reference orientation by more than `max_gyro_degrees` in
     the median window; a pedestrian whose median speed exceeds `max_speed` m/s; a horizontal
     acceleration above 0.2 m/s² rms that correlates with that of the positions by less than
-    `min_correlation` (None asks for nothing). Standing still is no failure: it is what the gate is
-    for. Neither is being too short for the gyro's windows.
+    `min_correlation`, where the dataset says that it `correlates`. Standing still is no failure: it
+    is what the gate is for. Neither is being too short for the gyro's windows. Of waypoints only
+    gravity and the speed between them can be asked.
     """
-    if not sequence.valid.any():
+    if sequence.waypoints is None and not sequence.valid.any():
         return _without_reference(sequence)
-    check, strength, has_windows = _measure(sequence, window_seconds)
+    if sequence.waypoints is None:
+        check, strength, has_windows = _measure(sequence, window_seconds)
+    else:
+        check, strength, has_windows = _measure_waypoints(sequence, window_seconds), 0.0, True
     gravity_error = float(np.linalg.norm(check.gravity_mean - [0.0, 0.0, GRAVITY]))
     correlation = check.accel_correlation_horizontal
     failures = []
@@ -95,7 +97,7 @@ def self_check(
     if pedestrian and check.median_speed > max_speed:
         failures.append(f"median speed is {check.median_speed:.1f} m/s, too fast for a pedestrian")
     # The correlation is NaN when the positions do not move at all.
-    if min_correlation is not None and strength > LIVELY and not correlation >= min_correlation:
+    if correlates and strength > LIVELY and not correlation >= min_correlation:
         failures.append(
             f"horizontal acceleration of the positions correlates by only {correlation:.2f} "
             "with R·accel"
@@ -134,6 +136,31 @@ def _measure(sequence: Sequence, window_seconds: float) -> _Measured:
     return _Measured(check, strength, starts.size > 0)
 
 
+def _measure_waypoints(sequence: Sequence, window_seconds: float) -> SelfCheck:
+    """The figures of a recording that has waypoints in the place of poses.
+
+    The mean specific force over a window, in the frame of its gyro-integrated attitude, is as long
+    as gravity: a walker gains hardly any velocity in it. Its direction is not known.
+    """
+    time, (stamps, position) = sequence.time, sequence.waypoints
+    step = float(np.median(np.diff(time)))
+    force = integrate_gyro(sequence.gyro, step).apply(sequence.accel)
+    length = min(round(window_seconds / step), len(time))
+    summed = np.concatenate([np.zeros((1, 3)), np.cumsum(force, axis=0)])
+    means = (summed[length:] - summed[:-length]) / length
+    legs = np.linalg.norm(np.diff(position, axis=0), axis=1) / np.diff(stamps)
+    return SelfCheck(
+        duration=float(time[-1] - time[0]),
+        rate=1.0 / step,
+        gravity_mean=np.array([0.0, 0.0, np.median(np.linalg.norm(means, axis=1))]),
+        gyro_consistency_degrees=np.nan,
+        median_speed=float(np.median(legs)),
+        accel_correlation_horizontal=np.nan,
+        share_valid=0.0,
+        failures=(),
+    )
+
+
 def _without_reference(sequence: Sequence) -> SelfCheck:
     return SelfCheck(
         duration=float(sequence.time[-1] - sequence.time[0]),
@@ -150,39 +177,16 @@ def _without_reference(sequence: Sequence) -> SelfCheck:
 def check_sequence(sequence: Sequence, dataset: Dataset) -> SelfCheck:
     """`self_check` with what the dataset asks.
 
-    What a converted recording brings along as `check_pedestrian` and `check_min_correlation` wins:
-    its own dataset asked it.
+    What a converted recording brings along as `check_pedestrian` and `check_correlation` wins: its
+    own dataset asked it.
     """
-    pedestrian = bool(sequence.attributes.get("check_pedestrian", dataset.pedestrian))
-    asked = sequence.attributes.get("check_min_correlation", dataset.min_correlation)
-    min_correlation = None if asked is None or asked <= -1.0 else float(asked)
-    check = self_check(sequence, pedestrian, min_correlation=min_correlation)
+    asked = {
+        "pedestrian": bool(sequence.attributes.get("check_pedestrian", dataset.pedestrian)),
+        "correlates": bool(sequence.attributes.get("check_correlation", dataset.correlates)),
+    }
+    check = self_check(sequence, **asked)
     needed = dataset.needs_reference or sequence.valid.any()
     return check if needed else check._replace(failures=())
-
-
-def each_plausible(sequences: Iterable[Sequence], dataset: Dataset) -> Iterator[Sequence]:
-    """The sequences that pass the self-check of their dataset; a warning names each other one with
-    the reason.
-
-    None is kept in memory. Raises `InputError` at the end when there was none.
-    """
-    kept, refused = 0, []
-    for sequence in sequences:
-        failures = check_sequence(sequence, dataset).failures
-        if failures:
-            reasons = "; ".join(failures)
-            warnings.warn(f"{sequence.name}: left out by the self-check: {reasons}", stacklevel=2)
-            refused.append(sequence.name)
-        else:
-            kept += 1
-            yield sequence
-    if not kept:
-        raise InputError(
-            ", ".join(refused[:3]) or "no sequence",
-            f"none of {len(refused)} sequences passes the physical self-check",
-            "see the warnings above; check units, frames and time offset of the recordings",
-        )
 
 
 def _held_attitude(sequence: Sequence) -> Float[np.ndarray, "n 4"]:
@@ -227,13 +231,13 @@ def gyro_windows(
     # exp(J b) R ≈ rotation integrated from gyro + b, J = R_startᵀ Σ R_k dt
     summed = np.concatenate([np.zeros((1, 3, 3)), np.cumsum(rotation * step, axis=0)])
     jacobian = np.einsum("wji,wjk->wik", rotation[starts], summed[starts + length] - summed[starts])
-    samples = starts[:, None] + np.arange(length)
     # A rate sampled at the stamps is worth most at the middle of the interval it drives.
     middle = midpoints(sequence.gyro)
 
     def error(bias: np.ndarray) -> np.ndarray:
-        integrated = _product_of_rows((middle - bias) * step, samples)
-        return (integrated * reference.inv()).as_rotvec()
+        turned = cumulative_rotation(Rotation.from_rotvec((middle - bias) * step))
+        turned = turned[starts].inv() * turned[starts + length]
+        return (turned * reference.inv()).as_rotvec()
 
     bias = np.zeros(3)
     for _ in range(2):
@@ -244,7 +248,7 @@ def gyro_windows(
 def _bias_correction(
     error: Float[np.ndarray, "w 3"], jacobian: Float[np.ndarray, "w 3 3"]
 ) -> Float[np.ndarray, "3"]:
-    """The bias b of least Σ|error − J b|: one broken window must not bend it."""
+    """The bias b of least Σ|error − J b|, a sum of norms: one broken window must not bend it."""
     correction = np.zeros(3)
     for _ in range(10):
         weight = 1.0 / np.maximum(np.linalg.norm(error - jacobian @ correction, axis=1), 1e-3)
@@ -252,22 +256,6 @@ def _bias_correction(
         moment = np.einsum("w,wji,wj->i", weight, jacobian, error)
         correction = np.linalg.lstsq(normal, moment, rcond=1e-9)[0]
     return correction
-
-
-def _product_of_rows(angles: Float[np.ndarray, "n 3"], samples: np.ndarray) -> Rotation:
-    """Product over each row of `samples` of the rotations by the vectors `angles`.
-
-    Neighbours are multiplied until one rotation a row is left.
-    """
-    # (wxyz, rows, length): long inner loops
-    factors = quaternions(Rotation.from_rotvec(angles)).T[:, samples]
-    while factors.shape[2] > 1:
-        if factors.shape[2] % 2:
-            identity = np.zeros((4, len(samples), 1))
-            identity[0] = 1.0
-            factors = np.concatenate([factors, identity], axis=2)
-        factors = quaternion_product(factors[:, :, 0::2], factors[:, :, 1::2], axis=0)
-    return rotations(factors[:, :, 0].T)
 
 
 # --- accelerometer

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from gnio_jax import data
-from gnio_jax.data.readers import randomised, simulated_phone
-from gnio_jax.data.readers.random_gait import CARRYING, random_errors, random_motion
+from gnio_jax.data.simulated import walks as simulated
+from gnio_jax.data.simulated.walker import CARRYING, MANY_PEOPLE, draw_motion
 from tests.support.strap_down import matrices, strap_down
 
 RATE = 100.0
@@ -13,16 +13,15 @@ RATE = 100.0
 
 @pytest.fixture(scope="module")
 def walks():
-    return [randomised.random_walk(seed, 40.0) for seed in range(40)]
+    return [simulated.random_walk(seed, 40.0) for seed in range(40)]
 
 
 def error_free(seed, placement, seconds=60.0):
     rng = np.random.default_rng(seed)
     time = np.arange(round(seconds * RATE) + 1) / RATE
-    walk = random_motion(rng, CARRYING[placement], time, 1 / RATE)
-    samples = simulated_phone.imu(rng, walk, 1 / RATE, random_errors(rng), with_errors=False)
-    device = simulated_phone.device_attitude(rng, walk, 1 / RATE)
-    return simulated_phone.phone_sequence("walk", walk, samples, device, {})
+    walk = draw_motion(rng, MANY_PEOPLE, placement, time, 1 / RATE)
+    phone = simulated.PHONE
+    return simulated.walk_sequence(rng, "walk", walk, 1 / RATE, phone, {}, imu_errors=False)
 
 
 @pytest.mark.parametrize("placement", list(CARRYING))
@@ -42,13 +41,39 @@ def test_every_walk_passes_the_self_check(walks):
 
 
 def test_a_seed_is_a_walk_and_splits_share_none(walks):
-    again = randomised.random_walk(7, 40.0)
+    again = simulated.random_walk(7, 40.0)
     np.testing.assert_array_equal(again.accel, walks[7].accel)
     assert again.attributes == walks[7].attributes
     names = [
-        {r.name for r in randomised.recordings(None, split)} for split in ("train", "val", "test")
+        {r.name for r in simulated.RANDOMISED.recordings(None, split)}
+        for split in ("train", "val", "test")
     ]
     assert sum(map(len, names)) == len(set.union(*names)) == 600 + 40 + 24
+
+
+# seed -> where the walk of 20 s ends (m), and the sums of |accel| and |gyro| over its samples.
+KNOWN = {
+    200000: (
+        [-15.987564707673124, 2.143442584612825, -0.031023060489223764],
+        [2188.972821880198, 19507.96905872019, 2362.0737368805467],
+        [674.5280856928983, 1185.0200491000644, 700.2600224902284],
+    ),
+    200005: (
+        [17.12432209650229, -16.86730792811519, -0.010144025394450723],
+        [6223.273728834688, 14162.67213369514, 17453.21575709797],
+        [530.6952463129243, 1902.1382035068507, 1480.27912035227],
+    ),
+}
+
+
+@pytest.mark.parametrize("seed", list(KNOWN))
+def test_a_seed_is_the_walk_that_it_has_always_been(seed):
+    """Published networks were trained on these walks."""
+    walk = simulated.random_walk(seed, 20.0)
+    end, accel, gyro = KNOWN[seed]
+    np.testing.assert_allclose(walk.position[-1], end, rtol=1e-9)
+    np.testing.assert_allclose(np.abs(walk.accel).sum(axis=0), accel, rtol=1e-9)
+    np.testing.assert_allclose(np.abs(walk.gyro).sum(axis=0), gyro, rtol=1e-9)
 
 
 def test_all_ways_of_carrying_occur(walks):

@@ -1,0 +1,476 @@
+"""How people walk and carry a phone: a walk whose every part is drawn from ranges.
+
+The plan of a walk is a smooth speed, heading and slope: standing, strolling, walking, running,
+turning, climbing and descending stairs. The gait is on top of it. The amplitude and the phase of
+every harmonic, the blow of the heel and the swing of the phone are drawn for each walk (domain
+randomisation). What is left for a network to rely on is what all walkers share: bounce and cadence
+grow with the speed, and the trunk is fastest where it is lowest, which distinguishes forward from
+backward. In a run it is slowest there.
+
+`MANY_PEOPLE` has wide ranges. The trunk follows the inverted pendulum (Zijlstra & Hof, 2003). How
+much of its motion reaches a hand, a pocket and a bag, and how hard the heel strikes there, was set
+so that the spectra of the simulated accelerations cover those of OxIOD's training and validation
+sessions; no network learns from these. `FEW_PEOPLE` has narrow ranges about the same middle, from
+which a small network learns in a minute. All ranges are ours.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from scipy.interpolate import make_interp_spline
+from scipy.spatial.transform import Rotation
+
+from gnio_jax.numerics import about_z, convolved
+
+Range = tuple[float, float]
+Ranges = tuple[Range, Range, Range]
+Wave = Callable[[np.ndarray], np.ndarray]
+
+
+class Carrying(NamedTuple):
+    """How a phone is carried, as ranges to draw from. Three ranges are forward, left, up, or roll,
+    pitch, yaw. Accelerations and rates are root mean squares in a slow walk (`_STEP`, `_CADENCE`).
+    """
+
+    share: float
+    """Probability."""
+    surge: Range
+    """Gain of the trunk's fore-aft motion at step frequency."""
+    surge_phase: Range
+    """Mean and standard deviation of its phase against the inverted pendulum, rad."""
+    bounce: Range
+    """Gain of the trunk's vertical motion at step frequency."""
+    harmonics: Range
+    """Acceleration at twice the step frequency against that at step frequency."""
+    stride: Ranges
+    """Acceleration at stride frequency, m/s²."""
+    strike: Range
+    """Acceleration of the blow of the heel, m/s²."""
+    stride_rate: Ranges
+    """Angular rate at stride frequency, rad/s."""
+    step_rate: Ranges
+    """Angular rate at step frequency, rad/s."""
+    grip: Range
+    """Slow wandering of the attitude, rad."""
+    tilt: Range
+    """Rotation about the phone's x axis (its short side), rad: 0 is screen up, π/2 upright."""
+    turned: float
+    """Probability that the tilt is the negative one (upside down in a pocket)."""
+    roll: float
+    """Standard deviation of the rotation about the phone's y axis, rad."""
+    lever: Ranges
+    """From the walker's axis to the phone, m; left is the side of the phone."""
+
+
+CARRYING = {
+    "handheld": Carrying(
+        share=0.4,
+        surge=(0.4, 1.1),
+        surge_phase=(-0.2, 0.25),
+        bounce=(0.7, 1.6),
+        harmonics=(0.05, 0.5),
+        stride=((0.05, 0.35), (0.2, 0.6), (0.02, 0.2)),
+        strike=(0.05, 0.4),
+        stride_rate=((0.02, 0.3), (0.02, 0.3), (0.02, 0.3)),
+        step_rate=((0.02, 0.25), (0.02, 0.3), (0.02, 0.15)),
+        grip=(0.03, 0.15),
+        tilt=(-0.1, 1.3),
+        turned=0.0,
+        roll=0.2,
+        lever=((0.1, 0.4), (-0.1, 0.2), (0.0, 0.3)),
+    ),
+    "pocket": Carrying(
+        share=0.25,
+        surge=(0.8, 2.2),
+        surge_phase=(-0.2, 0.35),
+        bounce=(0.6, 1.7),
+        harmonics=(0.3, 0.9),
+        stride=((0.1, 0.6), (0.2, 0.7), (0.05, 0.35)),
+        strike=(0.3, 2.2),
+        stride_rate=((0.1, 0.7), (0.3, 1.2), (0.1, 0.8)),
+        step_rate=((0.05, 0.5), (0.1, 0.6), (0.05, 0.5)),
+        grip=(0.01, 0.06),
+        tilt=(1.0, 2.1),
+        turned=0.5,
+        roll=0.35,
+        lever=((-0.1, 0.15), (0.1, 0.2), (-0.3, 0.0)),
+    ),
+    "bag": Carrying(
+        share=0.2,
+        surge=(0.05, 1.2),
+        surge_phase=(0.0, 1.0),
+        bounce=(0.7, 1.7),
+        harmonics=(0.1, 0.9),
+        stride=((0.1, 1.0), (0.1, 0.6), (0.05, 0.5)),
+        strike=(0.1, 1.5),
+        stride_rate=((0.05, 0.6), (0.05, 0.8), (0.05, 0.6)),
+        step_rate=((0.02, 0.4), (0.02, 0.4), (0.02, 0.3)),
+        grip=(0.02, 0.12),
+        tilt=(-3.1, 3.1),
+        turned=0.0,
+        roll=0.5,
+        lever=((-0.2, 0.1), (0.05, 0.3), (-0.5, 0.1)),
+    ),
+    "chest": Carrying(
+        share=0.15,
+        surge=(0.7, 1.2),
+        surge_phase=(-0.1, 0.2),
+        bounce=(0.8, 1.4),
+        harmonics=(0.2, 0.8),
+        stride=((0.03, 0.2), (0.15, 0.5), (0.02, 0.15)),
+        strike=(0.1, 1.0),
+        stride_rate=((0.02, 0.3), (0.02, 0.2), (0.05, 0.4)),
+        step_rate=((0.02, 0.2), (0.02, 0.3), (0.02, 0.2)),
+        grip=(0.01, 0.04),
+        tilt=(1.2, 1.8),
+        turned=0.2,
+        roll=0.15,
+        lever=((0.05, 0.2), (-0.1, 0.1), (0.1, 0.3)),
+    ),
+}
+"""How phones are carried, by name."""
+
+STANDING_START = 3.0
+"""s that every walk begins with."""
+_STEP, _CADENCE = 0.55, 1.5
+"""Step length (m) and step frequency (Hz) of the slow walk that the amplitudes belong to."""
+
+
+class Activity(NamedTuple):
+    """What a walker does for a while."""
+
+    share: float
+    """Probability that it comes next."""
+    speed: Range
+    """m/s."""
+    seconds: Range
+    """s."""
+    rise: float
+    """m climbed for each m walked."""
+    running: float
+    """0 walks, 1 runs."""
+
+
+class Population(NamedTuple):
+    """The ranges that a walk is drawn from."""
+
+    activities: dict[str, Activity]
+    carrying: dict[str, Carrying]
+    cadence: Range
+    """Gain of the step frequency at a given speed."""
+    idle: Range
+    """Slow wandering of the phone's place, which standing does not stop, m."""
+
+
+def _narrow(ranges: Any, share: float) -> Any:
+    """A range, or a tuple of them, with this share of its width about the same middle."""
+    if isinstance(ranges[0], tuple):
+        return tuple(_narrow(each, share) for each in ranges)
+    low, high = ranges
+    return (
+        0.5 * (1 + share) * low + 0.5 * (1 - share) * high,
+        0.5 * (1 - share) * low + 0.5 * (1 + share) * high,
+    )
+
+
+def _narrow_carrying(carried: Carrying, share: float) -> Carrying:
+    values = carried._asdict()
+    ranges = {name: _narrow(value, share) for name, value in values.items() if type(value) is tuple}
+    # The surge of the trunk reaches the phone wherever it is: it says which way the walker goes.
+    mean, std = carried.surge_phase
+    return carried._replace(**ranges)._replace(
+        surge=(0.9, 1.1), surge_phase=(mean, share * std), turned=0.0, roll=share * carried.roll
+    )
+
+
+MANY_PEOPLE = Population(
+    activities={
+        "walk": Activity(0.60, (0.5, 1.7), (5.0, 25.0), 0.0, 0.0),
+        "stroll": Activity(0.08, (0.2, 0.5), (4.0, 10.0), 0.0, 0.0),
+        "run": Activity(0.12, (1.0, 3.2), (5.0, 15.0), 0.0, 1.0),
+        "stand": Activity(0.10, (0.0, 0.0), (3.0, 8.0), 0.0, 0.0),
+        "upstairs": Activity(0.05, (0.4, 0.65), (5.0, 10.0), 0.6, 0.0),
+        "downstairs": Activity(0.05, (0.45, 0.7), (5.0, 10.0), -0.6, 0.0),
+    },
+    carrying=CARRYING,
+    cadence=(0.86, 1.16),
+    idle=(0.001, 0.006),
+)
+"""Everything is drawn from wide ranges."""
+
+FEW_PEOPLE = Population(
+    activities={
+        "walk": Activity(0.50, (1.0, 1.6), (8.0, 20.0), 0.0, 0.0),
+        "stroll": Activity(0.15, (0.5, 0.8), (6.0, 12.0), 0.0, 0.0),
+        "run": Activity(0.11, (2.2, 3.2), (6.0, 10.0), 0.0, 1.0),
+        "stand": Activity(0.12, (0.0, 0.0), (4.0, 8.0), 0.0, 0.0),
+        "upstairs": Activity(0.06, (0.45, 0.6), (6.0, 10.0), 0.6, 0.0),
+        "downstairs": Activity(0.06, (0.5, 0.65), (6.0, 10.0), -0.6, 0.0),
+    },
+    carrying={name: _narrow_carrying(each, 0.2) for name, each in CARRYING.items()},
+    cadence=_narrow((0.86, 1.16), 0.2),
+    idle=(0.001, 0.003),
+)
+"""The same middles, a fifth of the widths."""
+
+
+class Plan(NamedTuple):
+    """Where a person goes, smoothly."""
+
+    speed: Float[np.ndarray, " n"]
+    """m/s."""
+    heading: Float[np.ndarray, " n"]
+    """rad."""
+    rise: Float[np.ndarray, " n"]
+    """m climbed for each m walked."""
+    running: Float[np.ndarray, " n"]
+    """0 walks, 1 runs."""
+
+
+class Motion(NamedTuple):
+    """True motion of the phone; one more pose than samples, since the last one drives an interval,
+    too."""
+
+    time: Float[np.ndarray, " n"]
+    """s."""
+    position: Float[np.ndarray, "n 3"]
+    """m, from the first pose."""
+    velocity: Float[np.ndarray, "n 3"]
+    """m/s."""
+    attitude: Rotation
+    """Phone → world."""
+
+
+def draw_motion(
+    rng: np.random.Generator,
+    people: Population,
+    placement: str,
+    time: Float[np.ndarray, " n"],
+    dt: float,
+    who: int | None = None,
+) -> Motion:
+    """The motion of a phone on a walk that is drawn from `people`; `time` (s) is uniform with the
+    step `dt`. `placement` is a way of `people.carrying`.
+
+    The gait of the walker number `who` is the same in every walk; without a number it is drawn from
+    `rng` too. Position and velocity are value and derivative of one spline.
+    """
+    own = rng if who is None else np.random.default_rng([7, who])
+    carried = people.carrying[placement]
+    planned = _plan(rng, people.activities, time, dt)
+    walking = step_frequency(planned.speed, own.uniform(*people.cadence))
+    hurried = own.uniform(2.3, 2.8) + 0.1 * planned.speed
+    cadence = walking + planned.running * (hurried - walking)
+    cadence = cadence * (1.0 + 0.03 * wander(rng, time, 1, 1.0, 0.05, 0.5)[:, 0])
+    phase = 2.0 * np.pi * integral(time, cadence) + rng.uniform(0.0, 2.0 * np.pi)
+    length = planned.speed / cadence
+    offset = _trunk(rng, own, carried, time, planned, length, phase)
+    offset = offset + _strides(rng, own, carried.stride, time, planned.running, length, phase)
+    offset = offset + _strikes(own, carried, dt, length, cadence, phase)
+    lever = np.array([rng.uniform(*each) for each in carried.lever])
+    lever[1] *= rng.choice([-1.0, 1.0])
+    offset = offset + lever + wander(rng, time, 3, rng.uniform(*people.idle), 0.1, 0.8)
+    swing = _swing(rng, own, carried, time, length, phase)
+
+    # The yaw of the mounting is anything: where the phone points is no hint of where its owner
+    # goes.
+    tilt = rng.uniform(*carried.tilt)
+    if rng.random() < carried.turned:
+        tilt = -tilt
+    roll = np.clip(carried.roll * rng.standard_normal(), -1.0, 1.0)
+    mounting = Rotation.from_euler("ZXY", [rng.uniform(-np.pi, np.pi), tilt, roll])
+
+    speed, heading, rise, _ = planned
+    course = np.stack([speed * np.cos(heading), speed * np.sin(heading), speed * rise], axis=1)
+    turn = about_z(heading)
+    path = make_interp_spline(time, integral(time, course) + turn.apply(offset), k=5)
+    position, velocity = path(time), path.derivative()(time)
+    attitude = turn * Rotation.from_rotvec(swing) * mounting
+    return Motion(time, position - position[0], velocity, attitude)
+
+
+def step_frequency(speed: Float[np.ndarray, " n"], gain: float = 1.0) -> Float[np.ndarray, " n"]:
+    """Steps of a walker in a second (Hz) at a speed (m/s): 1.8 at 1.3 m/s."""
+    return gain * (1.1 + 0.55 * speed)
+
+
+def _plan(
+    rng: np.random.Generator,
+    activities: dict[str, Activity],
+    time: Float[np.ndarray, " n"],
+    dt: float,
+) -> Plan:
+    """A walk through random activities, round bends and corners."""
+    speed, rise, running = (np.zeros_like(time) for _ in range(3))
+    names, chances = list(activities), [each.share for each in activities.values()]
+    clock = STANDING_START
+    while clock < time[-1]:
+        activity = activities[rng.choice(names, p=chances)]
+        end = clock + rng.uniform(*activity.seconds)
+        during = (time >= clock) & (time < end)
+        speed[during] = rng.uniform(*activity.speed)
+        rise[during], running[during] = activity.rise, activity.running
+        clock = end
+    speed = smooth_steps(speed, rng.uniform(1.6, 3.0), dt)
+    speed = speed * (1.0 + 0.06 * wander(rng, time, 1, 1.0, 0.05, 0.4)[:, 0])
+    turn_rate = smooth_steps(_turn_rate(rng, time), 0.8, dt)
+    # At most 2.5 m/s² sideways.
+    most = 2.5 / np.maximum(speed, 0.5)
+    turn_rate = most * np.tanh(turn_rate / most)
+    turn_rate = (
+        turn_rate + 0.15 * np.minimum(speed, 1.0) * wander(rng, time, 1, 1.0, 0.05, 0.4)[:, 0]
+    )
+    heading = integral(time, turn_rate) + rng.uniform(-np.pi, np.pi)
+    return Plan(speed, heading, smooth_steps(rise, 2.4, dt), smooth_steps(running, 1.6, dt))
+
+
+def _turn_rate(rng: np.random.Generator, time: Float[np.ndarray, " n"]) -> np.ndarray:
+    """Straight stretches, bends and corners, rad/s."""
+    rate = np.zeros_like(time)
+    clock = STANDING_START
+    while clock < time[-1]:
+        side, kind = rng.choice([-1.0, 1.0]), rng.choice(3, p=[0.35, 0.45, 0.2])
+        value = (0.0, rng.uniform(0.1, 0.9), rng.uniform(0.8, 1.8))[kind]
+        end = clock + (rng.uniform(2.0, 8.0), rng.uniform(2.0, 12.0), rng.uniform(0.8, 2.0))[kind]
+        rate[(time >= clock) & (time < end)] = side * value
+        clock = end
+    return rate
+
+
+def _trunk(
+    rng: np.random.Generator,
+    own: np.random.Generator,
+    carried: Carrying,
+    time: Float[np.ndarray, " n"],
+    planned: Plan,
+    length: Float[np.ndarray, " n"],
+    phase: Float[np.ndarray, " n"],
+) -> Float[np.ndarray, "n 3"]:
+    """What reaches the phone of the trunk's fore-aft and vertical motion at step frequency, m."""
+    bounce = own.uniform(*carried.bounce) * 0.28 * length**2 / (8.0 * own.uniform(0.8, 1.0))
+    surge = own.uniform(*carried.surge) * 0.016 * length / 0.7
+    mean, std = carried.surge_phase
+    # A walker is fastest where the trunk is lowest, a runner is slowest there.
+    forward_phase = phase + mean + std * own.standard_normal() + np.pi * planned.running
+    surge = surge * (1.0 - 0.4 * planned.running)
+    forward = surge * _harmonics(own, carried.harmonics, forward_phase, np.sin, 0.6)
+    up = bounce * _harmonics(own, carried.harmonics, phase, lambda x: -np.cos(x), np.pi + 0.4)
+    stairs = planned.rise / 0.6
+    up = up + 0.02 * stairs * np.sin(phase) + 0.006 * stairs**2 * np.cos(2 * phase)
+    varied = 1.0 + 0.08 * wander(rng, time, 2, 1.0, 0.1, 1.0)
+    return np.stack([forward * varied[:, 0], np.zeros_like(forward), up * varied[:, 1]], axis=1)
+
+
+def _harmonics(
+    rng: np.random.Generator, ratio: Range, phase: np.ndarray, wave: Wave, second: float
+) -> np.ndarray:
+    """A wave at step frequency with its second and third harmonic. `ratio` is that of the
+    accelerations; the phase of the second harmonic is about `second`."""
+    twice, thrice = rng.uniform(*ratio), rng.uniform(*ratio) * rng.uniform(0.0, 0.6)
+    start = second + 0.7 * rng.standard_normal()
+    anywhere = rng.uniform(0.0, 2.0 * np.pi)
+    return (
+        wave(phase)
+        + twice / 4.0 * wave(2.0 * phase + start)
+        + thrice / 9.0 * wave(3.0 * phase + anywhere)
+    )
+
+
+def _growth(length: np.ndarray) -> np.ndarray:
+    """Amplitude of a swing against that of the slow walk."""
+    return length / (length + 0.5) * (_STEP + 0.5) / _STEP
+
+
+def _strides(
+    rng: np.random.Generator,
+    own: np.random.Generator,
+    ranges: Ranges,
+    time: np.ndarray,
+    running: np.ndarray,
+    length: np.ndarray,
+    phase: np.ndarray,
+) -> Float[np.ndarray, "n 3"]:
+    """Motion at stride frequency: the sway of the trunk, an arm or a bag that swings, m."""
+    accel = np.sqrt(2.0) * np.array([own.uniform(*each) for each in ranges])
+    amplitude = accel / (np.pi * _CADENCE) ** 2
+    start = own.uniform(0.0, 2.0 * np.pi, size=3)
+    wave = np.sin(phase[:, None] / 2.0 + start) * (1.0 + 0.1 * wander(rng, time, 3, 1.0, 0.1, 1.0))
+    return amplitude * wave * (_growth(length) * (1.0 + 0.5 * running))[:, None]
+
+
+def _strikes(
+    own: np.random.Generator,
+    carried: Carrying,
+    dt: float,
+    length: np.ndarray,
+    cadence: np.ndarray,
+    phase: np.ndarray,
+) -> Float[np.ndarray, "n 3"]:
+    """The blow of each heel: an oscillation that rises and dies within a fraction of a step, m."""
+    since = np.mod(phase, 2.0 * np.pi) / (2.0 * np.pi * cadence)
+    decay, frequency = own.uniform(0.02, 0.06), own.uniform(4.0, 14.0, size=3)
+    angle = 2.0 * np.pi * frequency * since[:, None] + own.uniform(0.0, 0.8, size=3)
+    envelope = (since / decay) ** 2 * np.exp(2.0 - 2.0 * since / decay)
+    blow = envelope[:, None] * np.sin(angle) * (length / _STEP)[:, None]
+    # Left and right heels differ.
+    blow = (
+        blow
+        * (1.0 + own.uniform(0.0, 0.4) * np.sin(np.floor(phase / (2.0 * np.pi)) * np.pi + 0.5))[
+            :, None
+        ]
+    )
+    accel = np.gradient(np.gradient(blow, dt, axis=0), dt, axis=0)
+    strength = own.uniform(*carried.strike) * own.uniform(0.4, 1.0, size=3)
+    return blow * strength / np.maximum(np.sqrt(np.mean(accel**2, axis=0)), 1e-9)
+
+
+def _swing(
+    rng: np.random.Generator,
+    own: np.random.Generator,
+    carried: Carrying,
+    time: np.ndarray,
+    length: np.ndarray,
+    phase: np.ndarray,
+) -> Float[np.ndarray, "n 3"]:
+    """Roll, pitch and yaw of the phone against the walker, rad."""
+    total = wander(rng, time, 3, rng.uniform(*carried.grip), 0.01, 0.15)
+    for ranges, rate in ((carried.stride_rate, 0.5), (carried.step_rate, 1.0)):
+        speed = np.sqrt(2.0) * np.array([own.uniform(*each) for each in ranges])
+        amplitude = speed / (2.0 * np.pi * _CADENCE * rate)
+        start = own.uniform(0.0, 2.0 * np.pi, size=3)
+        total = total + amplitude * np.sin(phase[:, None] * rate + start) * _growth(length)[:, None]
+    return total
+
+
+def wander(
+    rng: np.random.Generator,
+    time: np.ndarray,
+    width: int,
+    rms: float,
+    lowest: float,
+    highest: float,
+) -> np.ndarray:
+    """Smooth aimless motion (n, width): eight sinusoids between two frequencies (Hz) with a root
+    mean square of `rms` together."""
+    frequency = rng.uniform(lowest, highest, size=(8, width))
+    start = rng.uniform(0.0, 2.0 * np.pi, size=(8, width))
+    result = np.zeros((len(time), width))
+    for f, s in zip(frequency, start, strict=True):
+        result += np.sin(2.0 * np.pi * time[:, None] * f + s)
+    return result * rms * np.sqrt(2.0 / 8.0)
+
+
+def smooth_steps(values: np.ndarray, seconds: float, dt: float) -> np.ndarray:
+    """Steps turned into ramps of `seconds` with three continuous derivatives."""
+    half = round(seconds / dt / 2)
+    kernel = np.hanning(2 * half + 3)[1:-1] ** 2
+    return convolved(np.pad(values, half, mode="edge"), kernel / kernel.sum())
+
+
+def integral(time: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Integral over time from the first stamp, exact for the cubic spline through the values."""
+    return make_interp_spline(time, values, k=3).antiderivative()(time)

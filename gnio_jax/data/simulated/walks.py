@@ -1,0 +1,228 @@
+"""Computed walks with a known truth: a few walks for the demo and the tests, and ten hours of
+walks of many people.
+
+The motion of the phone is `walker.draw_motion`'s. Sample k of the IMU is the mean over the interval
+that it drives, gyro_k = log(R_kᵀ R_{k+1}) / dt and accel_k = R_kᵀ ((v_{k+1} − v_k) / dt − g), so
+that integrating the noise-free IMU sample by sample returns the trajectory.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from gnio_jax.data.dataset import Dataset, Recording, single
+from gnio_jax.data.simulated.walker import (
+    CARRYING,
+    FEW_PEOPLE,
+    MANY_PEOPLE,
+    Motion,
+    draw_motion,
+    wander,
+)
+from gnio_jax.numerics import about_z, quaternions, turns_between
+from gnio_jax.types import GRAVITY, Sequence
+
+
+class SensorErrors(NamedTuple):
+    """White noise and random walk of an IMU as densities, constant biases by their length."""
+
+    gyro_density: float
+    """rad/s/√Hz."""
+    accel_density: float
+    """m/s²/√Hz."""
+    gyro_bias_walk: float
+    """rad/s/√s."""
+    accel_bias_walk: float
+    """m/s²/√s."""
+    gyro_bias: tuple[float, float]
+    """Range of the length of the gyro bias, rad/s."""
+    accel_bias: tuple[float, float]
+    """Range of the length of the accelerometer bias, m/s²."""
+
+
+PHONE = SensorErrors(
+    gyro_density=9e-5,
+    accel_density=1.5e-3,
+    gyro_bias_walk=1e-6,
+    accel_bias_walk=1e-4,
+    gyro_bias=(1e-4, 4e-4),
+    accel_bias=(0.05, 0.10),
+)
+"""A phone's IMU after a rest-period calibration of its gyro."""
+
+
+def pedestrian(
+    seed: int,
+    who: int,
+    placement: str = "handheld",
+    seconds: float = 120.0,
+    rate: float = 200.0,
+    imu_errors: bool = True,
+) -> Sequence:
+    """A walk of the person number `who`, for `seconds` at `rate` Hz, of which all but the gait is
+    drawn from `seed`. It starts with 3 s of standing.
+
+    Without `imu_errors` the IMU has neither bias nor noise. The true biases, at the start, are
+    among the attributes.
+    """
+    rng = np.random.default_rng([seed])
+    time, dt = np.arange(round(seconds * rate) + 1) / rate, 1.0 / rate
+    walk = draw_motion(rng, FEW_PEOPLE, placement, time, dt, who)
+    about = {"dataset": "synthetic", "placement": placement, "seed": seed}
+    about |= {"subject": f"person {who}", "licence": SYNTHETIC.licence}
+    return walk_sequence(rng, f"synthetic_{seed}_{placement}", walk, dt, PHONE, about, imu_errors)
+
+
+def random_walk(seed: int, seconds: float = 60.0, rate: float = 100.0) -> Sequence:
+    """A walk of `seconds` at `rate` Hz of which everything is drawn from `seed`: walker, gait, way
+    to carry the phone and IMU, from a good one to a poor one. It starts with 3 s of standing. The
+    true biases, at the start, are among the attributes."""
+    rng = np.random.default_rng([11, seed])
+    names = list(CARRYING)
+    placement = str(rng.choice(names, p=[CARRYING[name].share for name in names]))
+    count, dt = round(seconds * rate), 1.0 / rate
+
+    def log_uniform(low: float, high: float) -> float:
+        return float(np.exp(rng.uniform(np.log(low), np.log(high))))
+
+    errors = SensorErrors(
+        gyro_density=log_uniform(5e-5, 4e-4),
+        accel_density=log_uniform(1e-3, 5e-3),
+        gyro_bias_walk=log_uniform(1e-6, 3e-5),
+        accel_bias_walk=log_uniform(5e-5, 5e-4),
+        gyro_bias=(0.0, 0.01),
+        accel_bias=(0.0, 0.25),
+    )
+    walk = draw_motion(rng, MANY_PEOPLE, placement, np.arange(count + 1) * dt, dt)
+    about = {"dataset": "randomised", "placement": placement, "seed": seed}
+    about |= {"licence": RANDOMISED.licence}
+    return walk_sequence(rng, f"randomised_{seed}", walk, dt, errors, about)
+
+
+def walk_sequence(
+    rng: np.random.Generator,
+    name: str,
+    walk: Motion,
+    dt: float,
+    errors: SensorErrors,
+    attributes: dict[str, object],
+    imu_errors: bool = True,
+) -> Sequence:
+    """The sequence of a simulated walk. The errors of its IMU, which are drawn in any case, and the
+    true biases at the start join its attributes."""
+    gyro = turns_between(walk.attitude) / dt
+    force = np.diff(walk.velocity, axis=0) / dt + np.array([0.0, 0.0, GRAVITY])
+    accel = walk.attitude[:-1].inv().apply(force)
+    count = len(gyro)
+    gyro_bias, gyro_error = _sensor_error(
+        rng, count, dt, errors.gyro_bias, errors.gyro_density, errors.gyro_bias_walk
+    )
+    accel_bias, accel_error = _sensor_error(
+        rng, count, dt, errors.accel_bias, errors.accel_density, errors.accel_bias_walk
+    )
+    device = device_attitude(rng, walk, dt)
+    attributes = {"device": "simulated phone", "truth": "simulated", **attributes}
+    attributes["gyro_density"] = errors.gyro_density * imu_errors
+    attributes["accel_density"] = errors.accel_density * imu_errors
+    for axis, letter in enumerate("xyz"):
+        attributes[f"gyro_bias_{letter}"] = float(gyro_bias[axis] * imu_errors)
+        attributes[f"accel_bias_{letter}"] = float(accel_bias[axis] * imu_errors)
+    return Sequence(
+        name=name,
+        time=walk.time[:-1],
+        gyro=gyro + gyro_error if imu_errors else gyro,
+        accel=accel + accel_error if imu_errors else accel,
+        orientation=quaternions(walk.attitude[:-1]),
+        position=walk.position[:-1],
+        velocity=walk.velocity[:-1],
+        valid=np.ones(count, dtype=bool),
+        device_orientation=quaternions(device),
+        attributes=attributes,
+    )
+
+
+def _sensor_error(
+    rng: np.random.Generator,
+    count: int,
+    dt: float,
+    length: tuple[float, float],
+    density: float,
+    walk: float,
+) -> tuple[np.ndarray, np.ndarray]:
+    """(constant bias (3,), its sum with random walk and white noise (count, 3))."""
+    direction = rng.standard_normal(3)
+    bias = direction / np.linalg.norm(direction) * rng.uniform(*length)
+    walked = np.cumsum(rng.standard_normal((count, 3)), axis=0) * walk * np.sqrt(dt)
+    return bias, bias + walked + rng.standard_normal((count, 3)) * density / np.sqrt(dt)
+
+
+def device_attitude(rng: np.random.Generator, walk: Motion, dt: float) -> Rotation:
+    """The phone's own estimate: a yaw from anywhere that drifts by some degrees, a degree of tilt
+    error."""
+    count = len(walk.time) - 1
+    drift = np.cumsum(rng.standard_normal(count)) * np.radians(0.4) * np.sqrt(dt)
+    drift = drift + rng.uniform(-np.pi, np.pi)
+    tilt = wander(rng, walk.time[:-1], 2, np.radians(0.7), 0.01, 0.05)
+    tilt_error = np.concatenate([tilt, np.zeros((count, 1))], axis=1)
+    return about_z(drift) * Rotation.from_rotvec(tilt_error) * walk.attitude[:-1]
+
+
+# --- the datasets
+
+# split: (first seed of its sequences, first person, number of people, number of sequences,
+# seconds); no person is in two splits.
+_FEW = {
+    "train": (1000, 0, 12, 24, 120.0),
+    "val": (2000, 100, 4, 4, 60.0),
+    "test": (3000, 200, 6, 6, 120.0),
+}
+# split: (first seed, number of walks, seconds).
+_MANY = {"train": (100_000, 600, 60.0), "val": (200_000, 40, 60.0), "test": (300_000, 24, 120.0)}
+
+
+def _few_recordings(root: Path | None, split: str) -> list[Recording]:
+    """The walks of few people, not yet computed."""
+    del root
+    seed, first_person, people, count, seconds = _FEW[split]
+    placements, walks = list(CARRYING), []
+    for index in range(count):
+        who = first_person + index % people
+        # Shifted by one per round of people, so that nobody carries the phone in one place only.
+        where = placements[(index + index // people) % len(placements)]
+        name = f"synthetic_{seed + index}_{where}"
+        walks.append(single(name, pedestrian, seed + index, who, where, seconds))
+    return walks
+
+
+def _many_recordings(root: Path | None, split: str) -> list[Recording]:
+    """The walks of many people, not yet computed."""
+    del root
+    first, count, seconds = _MANY[split]
+    seeds = range(first, first + count)
+    return [single(f"randomised_{seed}", random_walk, seed, seconds) for seed in seeds]
+
+
+SYNTHETIC = Dataset(
+    name="synthetic",
+    recordings=_few_recordings,
+    splits=tuple(_FEW),
+    rate=200.0,
+    source="computed by gnio_jax.data.simulated",
+    layout="no files are needed",
+    licence="Apache-2.0, as this package",
+    needs_root=False,
+)
+RANDOMISED = Dataset(
+    name="randomised",
+    recordings=_many_recordings,
+    splits=tuple(_MANY),
+    rate=100.0,
+    source="computed by gnio_jax.data.simulated",
+    layout="no files are needed",
+    licence="Apache-2.0, as this package",
+    needs_root=False,
+)

@@ -1,0 +1,470 @@
+"""Names, roots and splits; every recording is read one way, and who reads it makes no difference;
+the cache is made anew when, and only when, files or readers change."""
+
+from __future__ import annotations
+
+import dataclasses
+import multiprocessing
+import operator
+import os
+import warnings
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gnio_jax import data
+from gnio_jax.data import hdf5
+from gnio_jax.data.dataset import Recording, Refusal, single
+from gnio_jax.data.loading import (
+    check_recording,
+    find_recordings,
+    in_processes,
+    read_recording,
+    read_split,
+)
+from gnio_jax.data.readers import DATASETS
+from gnio_jax.errors import InputError
+from tests.support.circle import circle
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_import_for_all(tmp_path_factory):
+    """The processes come from one that has imported the package, in place of importing it each.
+
+    They share its environment, and so one cache: every test has files of its own. Processes as the
+    package starts them are those of the tests of OxIOD.
+    """
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload([__name__])
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("GNIO_CACHE", str(tmp_path_factory.mktemp("cache")))
+        patch.setattr(multiprocessing, "get_context", lambda _: context)
+        yield
+
+
+# What other processes run must have a name there.
+
+
+def walk(name, warning="", refusal="", damage=""):
+    if warning:
+        warnings.warn(warning, stacklevel=2)
+    if refusal:
+        raise Refusal(f"{name}.csv", refusal, "leave it out")
+    if damage:
+        raise InputError(f"{name}.csv", damage, "copy it again")
+    return circle(seconds=4.0)._replace(name=name)
+
+
+def upside_down(name):
+    sequence = walk(name)
+    return sequence._replace(accel=-sequence.accel)
+
+
+def slow(tmp_path, name, read=walk, **options):
+    """A recording of one file that is worth caching."""
+    file = tmp_path / f"{name}.csv"
+    file.write_text(name)
+    recording = single(name, read, name, **options)
+    return recording._replace(files=(file,), slow=True, attributes={"lists": "three"})
+
+
+def dataset(*recordings):
+    return dataclasses.replace(data.get("tlio"), recordings=lambda root, split: list(recordings))
+
+
+def outcome(about, workers):
+    """(names, warnings, error) of a split."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        try:
+            names, error = [s.name for s in read_split(about, Path("root"), "test", workers)], ""
+        except InputError as mistake:
+            names, error = [], str(mistake)
+    return names, [(str(note.message), note.category) for note in caught], error
+
+
+def six(tmp_path):
+    form = slow(tmp_path, "e", refusal="field 'time' is ruined")
+    return [
+        slow(tmp_path, "a"),
+        slow(tmp_path, "b", warning="b.csv: a gap was cut off"),
+        slow(tmp_path, "c", refusal="its clock is ruined"),
+        single("d", walk, "d", warning="d.csv: is short"),
+        form._replace(form="raw", fallback=slow(tmp_path, "e2")._replace(name="e", form="syn")),
+        slow(tmp_path, "f", upside_down),
+    ]
+
+
+@pytest.mark.parametrize("damage", [False, True])
+def test_sequences_warnings_and_errors_do_not_depend_on_the_workers(tmp_path, damage):
+    found = []
+    for workers in (1, 2):
+        folder = tmp_path / f"by {workers}"
+        folder.mkdir()
+        recordings = six(folder)
+        if damage:
+            recordings.insert(4, slow(folder, "g", damage="field 'gyro' is NaN"))
+        found += [outcome(dataset(*recordings), workers) for _ in range(2)]  # cold and cached
+    names, notes, error = found[0]
+    assert found == [found[0]] * 4
+    told = [
+        "b.csv: a gap was cut off",
+        "c: left out: c.csv: its clock is ruined; leave it out",
+        "d.csv: is short",
+    ]
+    if damage:
+        assert names == [] and error == "g.csv: field 'gyro' is NaN; copy it again"
+    else:
+        assert names == ["a", "b", "d", "e2"] and error == ""
+        told.append("e: syn is used: e.csv: field 'time' is ruined; leave it out")
+        assert notes[-1][0].startswith("f: left out by the self-check: mean of R·accel")
+        notes = notes[:-1]
+    assert notes == [(text, UserWarning) for text in told]
+
+
+def test_only_what_is_slow_to_read_is_given_to_processes(tmp_path):
+    """A function without a name elsewhere cannot be sent to a process: it was read here."""
+    local = Recording("local", lambda: [walk("local")])
+    shares = []
+    about = dataset(local, slow(tmp_path, "a"), slow(tmp_path, "b"))
+    sequences = list(read_split(about, tmp_path, "test", 2, shares.append))
+    assert [sequence.name for sequence in sequences] == ["local", "a", "b"]
+    assert shares == [0.5, 1.0]
+    kept = [
+        Recording(name, lambda: pytest.fail("built"), (tmp_path / f"{name}.csv",), slow=True)
+        for name in "ab"
+    ]
+    again = read_split(dataset(local, *kept), tmp_path, "test", 2, shares.append)
+    assert len(list(again)) == 3
+    assert shares == [0.5, 1.0]
+
+
+def test_a_recording_carries_what_lists_say_of_it(tmp_path):
+    for _ in range(2):
+        (sequence,) = read_recording(slow(tmp_path, "a")).sequences
+        assert sequence.attributes == {"dataset": "test", "lists": "three"}
+
+
+def test_a_split_of_which_nothing_is_left(tmp_path):
+    about = dataset(slow(tmp_path, "c", refusal="ruined"), Recording("none", list))
+    names, notes, error = outcome(about, 1)
+    assert names == [] and [text for text, _ in notes] == [
+        "c: left out: c.csv: ruined; leave it out"
+    ]
+    assert (
+        error
+        == "root: none of the 2 recordings of split 'test' can be used; see the warnings above"
+    )
+
+
+def test_a_check_tells_what_is_wrong_and_raises_nothing(tmp_path):
+    about = dataset()
+    recordings = {recording.name: recording for recording in six(tmp_path)}
+    checked = {name: check_recording(entry, about) for name, entry in recordings.items()}
+    reason = {name: row.reason for name, ((row,), _) in checked.items()}
+    assert reason["a"] == reason["b"] == reason["e"] == ""
+    assert checked["a"][0][0].check.failures == ()
+    assert checked["b"][1].notes == ("b.csv: a gap was cut off",)
+    assert reason["c"] == "c.csv: its clock is ruined; leave it out"
+    assert "syn is used" in checked["e"][1].notes[0]
+    assert "mean of R·accel" in reason["f"]
+    ((nothing,), _) = check_recording(Recording("none", list), about)
+    assert nothing.reason == "no segment of it is long enough" and nothing.check is None
+    ((damaged,), _) = check_recording(slow(tmp_path, "g", damage="field 'gyro' is NaN"), about)
+    assert damaged.reason == "g.csv: field 'gyro' is NaN; copy it again"
+
+
+def test_the_recordings_of_all_splits_are_found_once(tmp_path):
+    shared, own = single("shared", walk, "shared"), single("own", walk, "own")
+
+    def recordings(root, split):
+        warnings.warn(f"{root}: is incomplete", stacklevel=2)
+        if split == "val":
+            raise InputError(root, "has no list val", "expected layout: any")
+        return [shared, own] if split == "train" else [shared]
+
+    about = dataclasses.replace(dataset(), recordings=recordings)
+    found = find_recordings(about, Path("root"), "all")
+    assert list(found.recordings) == ["shared", "own"]
+    assert found.splits == {"train": ("shared", "own"), "test": ("shared",)}
+    assert found.notes == [
+        "root: is incomplete",
+        "nothing in split val: root: has no list val",
+    ]
+    with pytest.raises(InputError, match="has no list val"):
+        find_recordings(about, Path("root"), "val")
+    with pytest.raises(
+        InputError, match="unknown split 'dev'; known splits: train, val, test, all"
+    ):
+        find_recordings(about, Path("root"), "dev")
+    with pytest.raises(InputError, match="split 'all' of dataset 'tlio' holds no recording"):
+        find_recordings(dataset(), Path("root"), "all")
+
+
+def test_work_by_processes_comes_back_in_order():
+    shares = []
+    items = [(base, 2) for base in range(5)]
+    for workers in (1, 2, 7):
+        assert list(in_processes(pow, items, workers, shares.append)) == [0, 1, 4, 9, 16]
+    np.testing.assert_allclose(shares, [0.2, 0.4, 0.6, 0.8, 1.0] * 3)
+    assert list(in_processes(pow, [], 2)) == []
+
+
+def test_few_results_are_held_however_slow_the_reader_is():
+    """Who takes one result after the other never makes more than two beyond the workers."""
+    begun = []
+
+    class Items(list):
+        def __iter__(self):
+            for item in super().__iter__():
+                begun.append(item)
+                yield item
+
+    results = in_processes(pow, Items([(2, power) for power in range(12)]), 2)
+    for taken in range(1, 13):
+        assert next(results) == 2 ** (taken - 1)
+        assert len(begun) <= taken + 3
+    assert len(begun) == 12
+
+
+def test_a_process_that_dies_is_told_in_one_line():
+    items = [(partial(os._exit, 3),), (partial(int, 1),)]
+    # What is called needs no import of the package in a process.
+    with pytest.raises(InputError, match="--workers: a process died, perhaps for want of memory"):
+        list(in_processes(operator.call, items, 2))
+
+
+def test_a_process_that_dies_while_the_next_one_starts_is_told_too(monkeypatch):
+    submit, started = ProcessPoolExecutor.submit, []
+
+    def once(pool, *item):
+        if started:
+            raise OSError("handle is closed")
+        started.append(item)
+        return submit(pool, *item)
+
+    monkeypatch.setattr(ProcessPoolExecutor, "submit", once)
+    with pytest.raises(InputError, match="--workers: a process died"):
+        list(in_processes(pow, [(2, 2), (3, 2)], 2))
+
+
+def test_what_the_function_cannot_open_is_its_own_error(tmp_path):
+    with pytest.raises(FileNotFoundError, match="nowhere"):
+        list(in_processes(os.stat, [(tmp_path / "nowhere",), (tmp_path,)], 2))
+
+
+def die_in_a_child(name):
+    if multiprocessing.parent_process() is not None:
+        os._exit(3)
+    return walk(name)
+
+
+def test_what_a_dead_process_left_is_read_here(tmp_path):
+    recordings = [slow(tmp_path, name, die_in_a_child) for name in ("a", "b", "c")]
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        found = list(read_split(dataset(*recordings), tmp_path, "test", workers=2))
+    assert [sequence.name for sequence in found] == ["a", "b", "c"] and not caught
+
+
+# --- the cache
+
+
+class Reader:
+    """Counts its calls; makes a sequence whose first position says which one it was."""
+
+    def __init__(self, error=None, warning="", names=("walk",)):
+        self.calls, self.error, self.warning, self.names = 0, error, warning, names
+
+    def __call__(self):
+        self.calls += 1
+        if self.warning:
+            warnings.warn(self.warning, stacklevel=1)
+        if self.error is not None:
+            raise self.error
+        walked = circle(seconds=1.0)
+        moved = walked.position + self.calls
+        return [walked._replace(name=name, position=moved) for name in self.names]
+
+
+@pytest.fixture
+def cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("GNIO_CACHE", str(tmp_path / "cache"))
+    return tmp_path / "cache"
+
+
+@pytest.fixture
+def source(tmp_path, cache):
+    path = tmp_path / "imu.csv"
+    path.write_text("1,2,3")
+    return path
+
+
+def call(reader, *files, name="walk"):
+    """Which call of `reader` made what reading gives."""
+    (sequence,) = read_recording(Recording(name, reader, files, slow=True)).sequences
+    return round(float(sequence.position[0, 0] - circle(seconds=1.0).position[0, 0]))
+
+
+def test_the_second_reading_is_what_the_first_made(source, cache):
+    reader = Reader()
+    assert call(reader, source) == 1 and len(list(cache.iterdir())) == 1
+    assert call(reader, source) == 1 and reader.calls == 1
+    assert call(reader, source, name="other") == 2
+
+
+def test_a_changed_file_or_package_is_read_again(source, tmp_path, monkeypatch):
+    reader = Reader()
+    assert call(reader, source) == 1
+    status = source.stat()
+    os.utime(source, ns=(status.st_atime_ns, status.st_mtime_ns + 1))
+    assert call(reader, source) == 2
+    source.write_text("1,2,3,4")
+    os.utime(source, ns=(status.st_atime_ns, status.st_mtime_ns))
+    assert call(reader, source) == 3
+    other = tmp_path / "vi.csv"
+    other.write_text("x")
+    assert call(reader, source, other) == call(reader, source, other) == 4
+    monkeypatch.setattr(hdf5, "_sources", lambda: "of another version")
+    assert call(reader, source, other) == 5
+
+
+def test_the_sources_that_decide_what_is_read_are_part_of_the_key(monkeypatch, tmp_path):
+    hdf5._sources.cache_clear()
+    before, read = hdf5._sources(), Path.read_bytes
+    for name in ("resampling.py", "numerics.py", "tlio.py"):
+        hdf5._sources.cache_clear()
+        changed = lambda path, name=name: read(path) + (b"#" if path.name == name else b"")  # noqa: E731
+        monkeypatch.setattr(Path, "read_bytes", changed)
+        assert hdf5._sources() != before, name
+    monkeypatch.undo()
+    hdf5._sources.cache_clear()
+    assert hdf5._sources() == before
+
+
+def test_a_damaged_entry_is_made_anew(source, cache):
+    reader = Reader()
+    call(reader, source)
+    (entry,) = cache.iterdir()
+    entry.write_bytes(entry.read_bytes()[:300])
+    assert call(reader, source) == 2
+    assert call(reader, source) == 2 and reader.calls == 2
+
+
+def test_a_refusal_is_remembered_and_damage_is_not(source, cache):
+    reader = Reader(Refusal(source, "field 'time' is ruined", "leave it out"))
+    recording = Recording("walk", reader, (source,), slow=True)
+    for _ in range(2):
+        reading = read_recording(recording)
+        assert reading.refusals == (f"{source}: field 'time' is ruined; leave it out",)
+        assert not reading.sequences and reader.calls == 1
+    (entry,) = cache.iterdir()
+    entry.write_text("{")
+    assert read_recording(recording).refusals and reader.calls == 2
+
+    broken = Reader(InputError(source, "field 'gyro' is NaN"))
+    for calls in (1, 2):
+        reading = read_recording(Recording("other", broken, (source,), slow=True))
+        assert str(reading.damage).endswith("field 'gyro' is NaN") and broken.calls == calls
+
+
+def test_what_the_reader_warned_of_is_kept_with_every_segment(source):
+    reader = Reader(warning="imu.csv: a gap was cut off", names=("b", "a", "c"))
+    recording = Recording("walk", reader, (source,), slow=True)
+    for _ in range(2):
+        reading = read_recording(recording)
+        assert reading.notes == ("imu.csv: a gap was cut off",) and reader.calls == 1
+        assert [sequence.name for sequence in reading.sequences] == ["b", "a", "c"]
+        assert all(each.attributes == {"dataset": "test"} for each in reading.sequences)
+
+
+def test_a_cache_that_cannot_be_written_is_no_error(source, monkeypatch):
+    monkeypatch.setenv("GNIO_CACHE", str(source / "below a file"))
+    reader = Reader()
+    assert call(reader, source) == 1 and call(reader, source) == 2
+
+
+def test_a_missing_file_is_named(cache, tmp_path):
+    reading = read_recording(Recording("walk", Reader(), (tmp_path / "nowhere.csv",), slow=True))
+    assert "nowhere.csv: cannot be read" in str(reading.damage)
+
+
+def test_where_the_cache_lies(monkeypatch, tmp_path):
+    monkeypatch.setenv("GNIO_CACHE", "/a/b")
+    assert str(hdf5.cache_folder()) == "/a/b"
+    monkeypatch.delenv("GNIO_CACHE")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert hdf5.cache_folder() == tmp_path / "gnio-jax"
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    monkeypatch.setenv("HOME", "/home/walker")
+    assert str(hdf5.cache_folder()) == "/home/walker/.cache/gnio-jax"
+
+
+# --- names, roots and splits
+
+
+def test_every_dataset_says_what_a_user_must_know():
+    assert data.names() == sorted(data.names())
+    assert {"oxiod", "synthetic", "tlio"} <= set(data.names())
+    for name in data.names():
+        dataset = data.get(name)
+        assert dataset.name == name and dataset.splits and dataset.rate > 0
+        assert callable(dataset.recordings)
+        assert dataset.source and dataset.layout and dataset.licence
+
+
+def test_unknown_names_and_splits_list_the_known_ones():
+    unknown = r"unknown name 'tloi'; did you mean 'tlio'\? known datasets: .*synthetic, tlio"
+    with pytest.raises(InputError, match=unknown):
+        data.load("tloi")
+    unknown = r"unknown split 'vel'; did you mean 'val'\? known splits: train, val, test"
+    with pytest.raises(InputError, match=unknown):
+        data.load("tlio", split="vel")
+
+
+def test_the_root_is_the_argument_then_the_environment_then_the_working_folder(
+    tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("GNIO_DATA", raising=False)
+    with pytest.raises(InputError) as error:
+        data.find_root("tlio")
+    text, about = str(error.value), data.get("tlio")
+    assert text.startswith("data/tlio") and "--data-root" in text
+    assert about.source in text and about.layout in text
+
+    here = tmp_path / "data" / "tlio"
+    here.mkdir(parents=True)
+    assert data.find_root("tlio").resolve() == here
+    elsewhere = tmp_path / "elsewhere"
+    monkeypatch.setenv("GNIO_DATA", str(elsewhere))
+    assert data.find_root("tlio").resolve() == here
+    (elsewhere / "tlio_layout").mkdir(parents=True)
+    assert data.find_root("tlio") == elsewhere / "tlio_layout"
+    (elsewhere / "tlio").mkdir()
+    assert data.find_root("tlio") == elsewhere / "tlio"
+    assert data.find_root("tlio", str(here)) == here
+    with pytest.raises(InputError, match=r"nowhere: no folder of dataset 'tlio'"):
+        data.find_root("tlio", tmp_path / "nowhere")
+
+
+def test_a_split_without_a_sequence_is_an_error(tmp_path, monkeypatch):
+    monkeypatch.setitem(DATASETS, "tlio", dataset())
+    with pytest.raises(InputError, match="split 'test' of dataset 'tlio' holds no sequence"):
+        data.load("tlio", tmp_path)
+
+
+def test_two_sequences_of_one_name_are_refused(tmp_path, monkeypatch):
+    twice = [single(name, walk, "walk") for name in ("monday", "tuesday")]
+    monkeypatch.setitem(DATASETS, "tlio", dataset(*twice))
+    with pytest.raises(InputError, match="two sequences of split 'test' have the name 'walk'"):
+        data.load("tlio", tmp_path)
+
+
+def test_the_computed_set_needs_no_folder(monkeypatch, tmp_path):
+    monkeypatch.delenv("GNIO_DATA", raising=False)
+    monkeypatch.chdir(tmp_path)
+    assert len(data.load("synthetic", split="val")) == 4
