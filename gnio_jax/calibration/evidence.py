@@ -40,7 +40,7 @@ class Source(NamedTuple):
 def load_run(workdir: Path, config: CalibrateConfig) -> Run:
     """A run with its network as it is to be calibrated. Raises `InputError` as
     `checkpoint.load_run` and `checkpoint.averaged_over_headings` do."""
-    run = checkpoint.load_run(workdir, config.checkpoint)
+    run = checkpoint.load_run(workdir)
     if not config.average_headings:
         return run
     return checkpoint.averaged_over_headings(run, f"--average-headings with {workdir}")

@@ -36,6 +36,8 @@ from gnio_jax.filtering.batch import padded_masks
 from gnio_jax.numerics import filled_up
 from gnio_jax.training import checkpoint
 
+MOST_STEPS = 60
+"""Of the search for the settings (L-BFGS)."""
 ABOUT = "calibration.json"
 """What was fitted to what: the mark of a calibrated run."""
 
@@ -86,8 +88,8 @@ def calibrate(
         windows,
         settings,
         paths,
-        lambda calls: progress("fitting", min(1.0, calls / (1.3 * config.steps))),
-        config.steps,
+        lambda calls: progress("fitting", min(1.0, calls / (1.3 * MOST_STEPS))),
+        MOST_STEPS,
     )
     progress("considering", 0.0)
     truth = _true_positions(evidence.prepared, windows.stride)
@@ -114,8 +116,6 @@ def _fitted(config: CalibrateConfig) -> list[str]:
     """The settings of the groups that are asked for, each once."""
     if not config.fit:
         raise InputError("--fit", "names nothing", f"name some of {', '.join(GROUPS)}")
-    if config.steps < 1:
-        raise InputError("--steps", f"must be at least 1, found {config.steps}")
     return [path for group in dict.fromkeys(config.fit) for path in GROUPS[group]]
 
 
@@ -176,7 +176,6 @@ def _write(
     found, settings = calibration.fit, calibration.considered.settings
     about: dict[str, Any] = {
         "run": str(workdir),
-        "checkpoint": config.checkpoint,
         "split": split,
         "out_of_fold": list(config.out_of_fold),
         "average_headings": config.average_headings,

@@ -26,7 +26,7 @@ def tables(asked: TablesConfig, _call: options.Call) -> None:
       {prog} bank-size --base ...                    size of the Motion Bank, entropy of attention
       {prog} bank-spread --base ...                  how far apart its prototypes start
       {prog} uncertainty --base ...                  what makes the uncertainty fit for the filter
-      {prog} trajectories --base ...                   all methods over the reference, one picture
+      {prog} trajectories --base ...                 all methods over the reference, one picture
       {prog} standing --base ...                     errors at rest and in slow walking
     """
     import jax  # late: mistakes do not wait for it

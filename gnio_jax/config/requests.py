@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from gnio_jax.config.schema import Count, FilterSettings
+from gnio_jax.config.schema import FilterSettings
 
 Table = Literal[
     "complexity",
@@ -97,10 +97,6 @@ class CalibrateConfig:
     average_headings: bool = False
     """Average the network over four headings, as model.equivariance: four_headings does, whatever
     the run says. The network must have learnt from walks turned by a random yaw."""
-    checkpoint: Literal["best", "latest"] = "best"
-    """Which checkpoint of the run."""
-    steps: Count = 60
-    """Most steps of the search (L-BFGS)."""
 
 
 @dataclass(frozen=True)
@@ -124,8 +120,6 @@ class TablesConfig:
     """Runs of every row: seeds 0, 1, 2, ..."""
     epochs: int | None = None
     """Epochs of every run, instead of the config's."""
-    width: int | None = None
-    """Width of the convolutional networks, instead of the config's model.width."""
     methods: str = "tlio,ronin_resnet,deepils,ctin,imot,gnio"
     """Networks of comparison, trajectories and standing, separated by commas; the first is the one
     that the others are compared with."""

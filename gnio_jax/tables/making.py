@@ -59,7 +59,6 @@ def base_config(options: TablesConfig) -> TrainConfig:
         base,
         data_root=options.data_root or base.data_root,
         workdir=None,
-        model=dataclasses.replace(base.model, width=options.width or base.model.width),
         optim=dataclasses.replace(base.optim, epochs=options.epochs or base.optim.epochs),
     )
     if base.model.name != "gnio":
