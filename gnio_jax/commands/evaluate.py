@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -11,7 +11,7 @@ import tyro
 
 from gnio_jax import config as configuration
 from gnio_jax.commands import console, options
-from gnio_jax.config import EvaluateConfig, FilterSettings
+from gnio_jax.config import EvaluateConfig
 from gnio_jax.cores import usable_cores
 
 
@@ -23,13 +23,9 @@ class EvaluateOptions(EvaluateConfig):
         tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="filter.FIELD=VALUE")
     ] = ()
     """A setting of the run's filter by its name in YAML; it may be given several times."""
-    batch_size: tyro.conf.Suppress[tyro.conf.Fixed[int]] = EvaluateConfig.batch_size
     distributed: Annotated[str | None, tyro.conf.arg(metavar="HOST:PORT,PROCESSES,ID")] = None
     """Where process 0 listens, how many processes there are, and the number of this one; Slurm,
     Open MPI and Kubernetes need nothing."""
-    filter: tyro.conf.Suppress[tyro.conf.Fixed[FilterSettings]] = field(
-        default_factory=FilterSettings
-    )
 
 
 def evaluate(asked: EvaluateOptions, call: options.Call) -> None:

@@ -245,6 +245,8 @@ def _fields(kind: type) -> Iterator[tuple[dataclasses.Field, Any, tuple[Any, ...
         hint, markers = hints[field.name], ()
         if typing.get_origin(hint) is Annotated:
             hint, *markers = typing.get_args(hint)
+        if configuration.FILE_ONLY in markers:
+            markers = (tyro.conf.Suppress, tyro.conf.Fixed)
         yield field, hint, tuple(markers)
 
 

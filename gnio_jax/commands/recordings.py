@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import tyro
 
@@ -38,9 +38,7 @@ class ExportFile:
     trajectory: tyro.conf.Positional[Path]
     """File in TUM format."""
     out: tyro.conf.Positional[Path]
-    """File to write: .mcap, .csv or .tum."""
-    format: Literal["tum", "csv", "mcap"] | None = None
-    """Format, where the ending of OUT does not tell it."""
+    """File to write; its ending tells the format: .mcap, .csv or .tum."""
 
 
 def import_file(asked: ImportFile, _call: options.Call) -> None:
@@ -118,6 +116,6 @@ def export_file(asked: ExportFile, _call: options.Call) -> None:
     from gnio_jax.evaluation import exporting  # late: mistakes do not wait for JAX
 
     trajectory = exporting.read_trajectory(asked.trajectory)
-    count = exporting.export(asked.out, trajectory, asked.format)
+    count = exporting.export(asked.out, trajectory)
     seconds = trajectory.time[-1] - trajectory.time[0]
     console.stdout().print(f"{asked.out}: {count} poses, {seconds:.1f} s", soft_wrap=True)

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import sys
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Annotated
 
 import tyro
 
 from gnio_jax import config as configuration
 from gnio_jax.commands import console, options
-from gnio_jax.config import ConsideredStd, FilterSettings, TrainConfig
+from gnio_jax.config import ConsideredStd, TrainConfig
 from gnio_jax.cores import usable_cores
 
 
@@ -35,9 +35,6 @@ class TrainOptions(TrainConfig):
     distributed: Annotated[str | None, tyro.conf.arg(metavar="HOST:PORT,PROCESSES,ID")] = None
     """Where process 0 listens, how many processes there are, and the number of this one; Slurm,
     Open MPI and Kubernetes need nothing."""
-    filter: tyro.conf.Suppress[tyro.conf.Fixed[FilterSettings]] = field(
-        default_factory=FilterSettings
-    )
 
 
 def train(asked: TrainOptions, call: options.Call) -> None:

@@ -30,6 +30,7 @@ from gnio_jax.config.requests import (
     TablesConfig,
 )
 from gnio_jax.config.schema import (
+    FILE_ONLY,
     AugmentConfig,
     ConsideredStd,
     CorrelatedError,
@@ -45,6 +46,7 @@ from gnio_jax.config.schema import (
 )
 
 __all__ = [
+    "FILE_ONLY",
     "AugmentConfig",
     "CalibrateConfig",
     "CompareConfig",

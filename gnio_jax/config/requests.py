@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from gnio_jax.config.schema import FilterSettings
+from gnio_jax.config.schema import FILE_ONLY, FilterSettings
 
 Table = Literal[
     "complexity",
@@ -60,14 +60,14 @@ class EvaluateConfig:
     not at all, or least squares."""
     checkpoint: Literal["best", "latest"] = "best"
     """Which checkpoint of the run."""
-    batch_size: int = 16
+    batch_size: Annotated[int, FILE_ONLY] = 16
     """Recordings estimated side by side."""
     plots: bool = True
     """Draw the trajectories, errors, displacements and the errors' distribution, and write
     report.html."""
     rerun: str | None = None
     """File to write for the viewer Rerun, NAME.rrd: paths, covariances, IMU, gate."""
-    filter: FilterSettings = field(default_factory=FilterSettings)
+    filter: Annotated[FilterSettings, FILE_ONLY] = field(default_factory=FilterSettings)
     """Noise and start of the filter; by default the run's own."""
 
 

@@ -39,6 +39,8 @@ class Bound(NamedTuple):
     """How the message goes on after the field's name."""
 
 
+FILE_ONLY = "file only"
+"""Of a field that is no option of a command line; --set reaches it."""
 Number = Any
 """A float in a file. Inside a JAX program it may be an array, so type checkers take anything."""
 
@@ -203,7 +205,7 @@ class LossConfig:
     alone (TLIO: 10)."""
     log_std_floor: Finite | None = None
     """Smallest log standard deviation in the likelihood (TLIO: log 1e-3); none by default."""
-    outlier_sigmas: Positive | None = None
+    outlier_sigmas: Annotated[Positive | None, FILE_ONLY] = None
     """Standard deviations beyond which the likelihood of an error grows only with its logarithm
     (ours, e.g. 10); none by default, as in the paper."""
 
@@ -400,7 +402,7 @@ class TrainConfig:
     model: ModelConfig = field(default_factory=ModelConfig)
     loss: LossConfig = field(default_factory=LossConfig)
     optim: OptimConfig = field(default_factory=OptimConfig)
-    filter: FilterSettings = field(default_factory=FilterSettings)
+    filter: Annotated[FilterSettings, FILE_ONLY] = field(default_factory=FilterSettings)
     through_filter: ThroughFilter = field(default_factory=ThroughFilter)
 
     def check(self, at: Place) -> None:

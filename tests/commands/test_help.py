@@ -88,8 +88,8 @@ def test_nobody_is_asked_for_too_much():
         )
         for words, command in commands()
     }
-    assert counts[("train",)] <= 75
-    assert sum(counts.values()) <= 169, counts
+    assert counts[("train",)] <= 60
+    assert sum(counts.values()) <= 150, counts
 
 
 @pytest.mark.parametrize("words", [("data", "list"), ("weights",), ("data", "check", "synthetic")])
