@@ -64,21 +64,17 @@ class Replayed:
 def read(path: Path) -> Recorded:
     """Read a CSV or HDF5. Raises `InputError` if a stamp is missing or does not increase."""
     from gnio_jax.data.hdf5 import read_hdf5
-    from gnio_jax.data.readers.text import numbers, read_csv
+    from gnio_jax.data.parsing.tables import read_text
     from gnio_jax.data.validation import check_increasing
 
     if path.suffix.lower() in (".h5", ".hdf5"):
         sequence = read_hdf5(path)
         return Recorded(sequence.time, sequence.gyro, sequence.accel)
-    table = read_csv(path)
-    stamps = numbers(table, ["time"], path)[:, 0]
-    present = np.isfinite(stamps)
-    if not present.all():
-        row = int(np.argmin(present)) + 1
-        raise InputError(path, f"field 'time' is empty in row {row}", "every sample needs a time")
+    table = read_text(path)
+    stamps = table.take("time")  # every sample needs one
     check_increasing(stamps, path)
-    gyro = numbers(table, [f"gyro_{axis}" for axis in "xyz"], path)
-    accel = numbers(table, [f"accel_{axis}" for axis in "xyz"], path)
+    # A sensor that missed a sample leaves its columns empty.
+    gyro, accel = table.axes("gyro_", gaps=True), table.axes("accel_", gaps=True)
     return Recorded(stamps, gyro, accel)
 
 

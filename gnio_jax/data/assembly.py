@@ -76,6 +76,7 @@ def assemble(
     divide: bool = False,
     whole: bool = False,
     max_speed: float = np.inf,
+    max_drift: float = np.inf,
 ) -> list[Sequence]:
     """The recording at `rate` Hz (None: the faster sensor's own, to four digits), validated but not
     self-checked.
@@ -91,6 +92,9 @@ def assemble(
         Keeps the IMU before the first pose and after the last, which else is cut away.
     `max_speed`
         m/s: around steps of the position that are faster, poses without a velocity are not valid.
+    `max_drift`
+        m: where position and integrated velocity of the poses disagree by more within a second,
+        they are not valid.
 
     Raises `InputError` naming the file where one is damaged, and `Refusal` for a recording of no
     use: without a window of IMU and reference.
@@ -116,7 +120,7 @@ def assemble(
             "cut the recording there",
         )
     rate = rate or max(rounded_rate(gyro.time), rounded_rate(accel.time))
-    pieces = [_on_clock(streams, rate, *span, max_speed) for span in found]
+    pieces = [_on_clock(streams, rate, *span, max_speed, max_drift) for span in found]
     return _kept(streams, pieces, found, whole)
 
 
@@ -168,15 +172,16 @@ def _checked(poses: Poses) -> Poses:
     """Poses that come with a velocity are taken as they are: they move as something does."""
     if poses.velocity is None:
         return poses
-    time, position = poses.time, poses.position
-    step = np.abs(np.diff(position, axis=0)).max(axis=1)
+    time = poses.time
+    farthest_step = np.maximum(FASTEST * np.diff(time), LARGEST_STEP)[:, None]
     wrong = (
-        ("velocity", np.abs(poses.velocity).max(axis=1) > FASTEST, f"is beyond {FASTEST:g} m/s"),
-        ("position", np.abs(position).max(axis=1) > FARTHEST, f"is beyond {FARTHEST:g} m"),
-        ("position", step > np.maximum(FASTEST * np.diff(time), LARGEST_STEP), "jumps"),
+        ("velocity", np.abs(poses.velocity) > FASTEST, f"is beyond {FASTEST:g} m/s"),
+        ("position", np.abs(poses.position) > FARTHEST, f"is beyond {FARTHEST:g} m"),
+        ("position", np.abs(np.diff(poses.position, axis=0)) > farthest_step, "jumps"),
     )
-    for field, rows, problem in wrong:
-        if rows.any():
+    for field, found, problem in wrong:
+        if found.any():
+            rows = found.any(axis=1)
             raise InputError(
                 poses.source,
                 f"field '{field}' {problem} in {rows.sum()} rows, first at "
@@ -226,7 +231,7 @@ def _check_overlap(time: np.ndarray, source: str, imu: np.ndarray) -> None:
 
 
 def _on_clock(
-    streams: Streams, rate: float, first: float, last: float, max_speed: float
+    streams: Streams, rate: float, first: float, last: float, max_speed: float, max_drift: float
 ) -> Sequence:
     gyro, accel, poses = streams.gyro, streams.accel, streams.poses
     own = gyro.time[(gyro.time >= first) & (gyro.time <= last)]
@@ -243,7 +248,7 @@ def _on_clock(
         measured = a & b
     reference = _nothing(len(clock))
     if poses is not None:
-        reference = reference_at(clock, rates, poses, max_speed)
+        reference = reference_at(clock, rates, poses, max_speed, max_drift)
     known = reference.valid[:, None]
     device, waypoints = streams.device, streams.waypoints
     return Sequence(
@@ -283,6 +288,8 @@ def _kept(
     holds = [_longest(streams, piece, whole) >= shortest for piece in pieces]
     gaps = [after[0] - before[1] for before, after in itertools.pairwise(found)]
     problem = f"no {WINDOW_SECONDS:g} s of it have an IMU and a reference that can be trusted"
+    if streams.poses is not None and streams.poses.velocity is not None:
+        problem += " (gaps, jumps, or a velocity that is not that of the position)"
     if gaps:
         problem = (
             f"field 'time' has gaps longer than {WINDOW_SECONDS:g} s ({len(gaps)}, "

@@ -39,8 +39,6 @@ SHORTEST_RUN = 8
 LARGEST_JUMP = 0.02
 """m by which a step of the position may contradict the reference's own velocity, and smoothed
 positions the seen ones."""
-LARGEST_DRIFT = 0.5
-"""m within a second by which position and integrated velocity may disagree."""
 JUMP_MARGIN = 0.1
 """s around a jump of the position that are not believed."""
 COURSE_SECONDS, FLIP_DEGREES = 3.0, 15.0
@@ -83,45 +81,51 @@ def reference_at(
     gyro: Float[np.ndarray, "m 3"],
     poses: Poses,
     max_speed: float = np.inf,
+    max_drift: float = np.inf,
 ) -> Reference:
     """The poses of the IMU at the uniform stamps `clock` (s), `gyro` (rad/s) being its samples.
 
-    Not valid across gaps, around steps of the position above `max_speed` (m/s), and where position
-    and velocity contradict each other.
+    Not valid across gaps, where poses without a velocity step faster than `max_speed` (m/s), and
+    where the velocity, integrated over a second, is off the position by more than `max_drift` (m).
     """
     if poses.velocity is not None:
-        found = _with_velocity(clock, poses)
-        return found._replace(valid=found.valid & ~_drifts(clock, found))
+        return _with_velocity(clock, poses, max_drift)
     return _fused(clock, gyro, poses) if poses.noisy else _smooth(clock, poses, max_speed)
 
 
-def _with_velocity(clock: Float[np.ndarray, " m"], poses: Poses) -> Reference:
-    """Splines within unbroken runs. A run ends where the position contradicts the velocity."""
+def _with_velocity(clock: Float[np.ndarray, " m"], poses: Poses, max_drift: float) -> Reference:
+    """Splines within unbroken runs. A run ends where the position contradicts the velocity, since
+    nothing is known between two such poses."""
     stamps, speed = poses.time, poses.velocity
     assert speed is not None
-    steps = np.diff(stamps)
-    moved = midpoints(speed) * steps[:, None]
-    contradiction = np.linalg.norm(np.diff(poses.position, axis=0) - moved, axis=1)
-    # Over long steps the trapezium is only a rough integral of the velocity.
-    broken = (steps > _longest(stamps)) | (contradiction > LARGEST_JUMP + 2.0 * steps**2)
-    arm = poses.attitude.apply(poses.lever)
-    if not broken.any() and len(clock) == len(stamps) and np.abs(clock - stamps).max() <= 1e-6:
+    steps, same = np.diff(stamps), _same(stamps, clock)
+    broken = steps > _longest(stamps)
+    if not same:
+        moved = midpoints(speed) * steps[:, None]
+        contradiction = np.linalg.norm(np.diff(poses.position, axis=0) - moved, axis=1)
+        # Over long steps the trapezium is only a rough integral of the velocity.
+        broken |= contradiction > LARGEST_JUMP + 2.0 * steps**2
+    orientation, position, velocity = (np.full((len(clock), w), np.nan) for w in (4, 3, 3))
+    valid = np.zeros(len(clock), dtype=bool)
+    for run, rows in runs_within(stamps, broken, clock, SHORTEST_RUN):
+        valid[rows] = True
+        if same:
+            continue
+        own = stamps[run] - stamps[run.start]
+        at = np.clip(clock[rows] - stamps[run.start], 0.0, own[-1])
+        orientation[rows] = quaternions(RotationSpline(own, poses.attitude[run])(at))
+        position[rows] = CubicSpline(own, poses.position[run], axis=0)(at)
+        velocity[rows] = CubicSpline(own, speed[run], axis=0)(at)
+    if same:
         orientation, position, velocity = quaternions(poses.attitude), poses.position, speed
-        valid = np.ones(len(clock), dtype=bool)
-    else:
-        orientation, position, velocity = (np.full((len(clock), w), np.nan) for w in (4, 3, 3))
-        valid = np.zeros(len(clock), dtype=bool)
-        for run, rows in runs_within(stamps, broken, clock, SHORTEST_RUN):
-            own = stamps[run] - stamps[run.start]
-            at = np.clip(clock[rows] - stamps[run.start], 0.0, own[-1])
-            orientation[rows] = quaternions(RotationSpline(own, poses.attitude[run])(at))
-            position[rows] = CubicSpline(own, poses.position[run], axis=0)(at)
-            velocity[rows] = CubicSpline(own, speed[run], axis=0)(at)
-            valid[rows] = True
+    if np.isfinite(max_drift):
+        near = ~_drifts(stamps, poses.position, speed, max_drift)
+        valid &= known_at(stamps, near, clock, _longest(stamps))
     if poses.lever.any():
-        longest = _longest(stamps)
+        arm, longest = poses.attitude.apply(poses.lever), _longest(stamps)
+        turning = CubicSpline(stamps - stamps[0], arm, axis=0)(stamps - stamps[0], 1)
         position = position + splined(stamps, arm, clock, longest)
-        velocity = velocity + splined(stamps, _derivative(stamps, arm), clock, longest)
+        velocity = velocity + splined(stamps, turning, clock, longest)
     return Reference(orientation, position, velocity, valid)
 
 
@@ -129,14 +133,18 @@ def _smooth(clock: Float[np.ndarray, " m"], poses: Poses, max_speed: float) -> R
     """Splines, of attitudes too: at 30 Hz the shorter arc between two of them errs by half a degree
     in a walker's hand. The velocity is that of the smoothed positions."""
     stamps, longest = poses.time, _longest(poses.time)
-    wxyz = quaternions(poses.attitude)
-    orientation = slerped(stamps, wxyz, clock)
-    for run, rows in runs_within(stamps, np.diff(stamps) > longest, clock):
-        own = stamps[run] - stamps[run.start]
-        at = np.clip(clock[rows] - stamps[run.start], 0.0, own[-1])
-        orientation[rows] = quaternions(RotationSpline(own, poses.attitude[run])(at))
+    broken, wxyz = np.diff(stamps) > longest, quaternions(poses.attitude)
+    if _same(stamps, clock):
+        orientation = wxyz.copy()
+    else:
+        orientation = slerped(stamps, wxyz, clock)
+        for run, rows in runs_within(stamps, broken, clock):
+            own = stamps[run] - stamps[run.start]
+            at = np.clip(clock[rows] - stamps[run.start], 0.0, own[-1])
+            orientation[rows] = quaternions(RotationSpline(own, poses.attitude[run])(at))
     position = splined(stamps, poses.position, clock, longest)
-    position = position + rotations(orientation).apply(poses.lever)
+    if poses.lever.any():
+        position = position + rotations(orientation).apply(poses.lever)
     step = float(np.median(np.diff(clock)))
     fast = np.linalg.norm(np.diff(position, axis=0), axis=1) > max_speed * step
     jumps = np.concatenate([fast, [False]]) | np.concatenate([[False], fast])
@@ -175,29 +183,32 @@ def _fused(
     return Reference(quaternions(fused), smoothed, velocity, valid)
 
 
+def _same(stamps: Float[np.ndarray, " n"], clock: Float[np.ndarray, " m"]) -> bool:
+    """True where the clock is that of the poses, to 1 µs: a spline would give the poses again."""
+    return len(clock) == len(stamps) and bool(np.abs(clock - stamps).max() <= 1e-6)
+
+
 def _longest(stamps: Float[np.ndarray, " n"]) -> float:
     """s between two poses up to which what lies between them can be trusted."""
     return max(LONGEST_BRIDGE, LOST_POSES * float(np.median(np.diff(stamps))))
 
 
-def _derivative(
-    stamps: Float[np.ndarray, " n"], values: Float[np.ndarray, "n 3"]
-) -> Float[np.ndarray, "n 3"]:
-    return CubicSpline(stamps - stamps[0], values, axis=0)(stamps - stamps[0], 1)
-
-
-def _drifts(clock: Float[np.ndarray, " m"], found: Reference) -> Bool[np.ndarray, " m"]:
-    """True in every second in which position and integrated velocity disagree by more than
-    `LARGEST_DRIFT`, as where a satellite receiver corrects itself by jumps."""
-    steps = np.diff(clock)
+def _drifts(
+    stamps: Float[np.ndarray, " n"],
+    position: Float[np.ndarray, "n 3"],
+    velocity: Float[np.ndarray, "n 3"],
+    most: float,
+) -> Bool[np.ndarray, " n"]:
+    """True in every second in which position and integrated velocity disagree by more than `most`
+    (m), as where a satellite receiver corrects itself by jumps."""
+    steps = np.diff(stamps)
     second = round(1.0 / float(np.median(steps)))
-    if len(clock) <= second:
-        return np.zeros(len(clock), dtype=bool)
-    moved = np.diff(found.position, axis=0) - midpoints(found.velocity) * steps[:, None]
-    both = found.valid[1:] & found.valid[:-1]
-    error = np.concatenate([np.zeros((1, 3)), np.cumsum(np.where(both[:, None], moved, 0.0), 0)])
-    far = np.linalg.norm(error[second:] - error[:-second], axis=1) > LARGEST_DRIFT
-    middle = np.zeros(len(clock), dtype=bool)
+    middle = np.zeros(len(stamps), dtype=bool)
+    if len(stamps) <= second:
+        return middle
+    moved = np.diff(position, axis=0) - midpoints(velocity) * steps[:, None]
+    error = np.concatenate([np.zeros((1, 3)), np.cumsum(moved, axis=0)])
+    far = np.linalg.norm(error[second:] - error[:-second], axis=1) > most
     middle[second // 2 : second // 2 + len(far)] = far
     return within(middle, second // 2)
 
@@ -315,10 +326,11 @@ def smooth_positions(
     """Positions (m), velocities (m/s) and which measurements were believed.
 
     The positions minimise Σ w |p − z|² + λ Σ |Δ³p|² (Whittaker's smoother): the response falls to
-    one half at `cutoff` Hz and stays 1 to 0.1 % below a third of it. Weights fall with the
-    residual, which removes single jumps; where nothing was measured the smoother bridges with the
-    smoothest acceleration.
+    one half at `cutoff` Hz, a quarter of the rate at most, and stays 1 to 0.1 % below a third of
+    it. Weights fall with the residual, which removes single jumps; where nothing was measured the
+    smoother bridges with the smoothest acceleration.
     """
+    cutoff = min(cutoff, 0.25 / step)
     smoothness = (2.0 * np.sin(np.pi * cutoff * step)) ** -6 * _third_difference_bands(
         len(position)
     )
@@ -332,7 +344,8 @@ def smooth_positions(
         distance = np.linalg.norm(filled - smoothed, axis=1)
         scale = max(4.0 * float(np.median(distance[good])), 2e-3) if good.any() else 1.0
         weight = good / (1.0 + (distance / scale) ** 2) ** 2
-    return smoothed, np.gradient(smoothed, step, axis=0), good & (weight > 0.1)
+    velocity = np.gradient(smoothed, step, axis=0, edge_order=2)
+    return smoothed, velocity, good & (weight > 0.1)
 
 
 def _third_difference_bands(n: int) -> Float[np.ndarray, "4 n"]:

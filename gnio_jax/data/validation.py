@@ -36,6 +36,8 @@ def validate(sequence: Sequence, source: object) -> Sequence:
     check_accel(sequence.accel, source)
     check_gyro(sequence.gyro, source)
     for field in ("orientation", "position", "velocity"):
+        if np.isfinite(getattr(sequence, field)).all():
+            continue
         bad = sequence.valid & ~np.isfinite(getattr(sequence, field)).all(axis=1)
         if bad.any():
             raise InputError(
@@ -106,8 +108,9 @@ def _check_waypoints(sequence: Sequence, source: object) -> None:
 
 def check_finite(values: Float[np.ndarray, "n ..."], field: str, source: object) -> None:
     """Raise `InputError` where a column that must be complete holds NaN or Inf."""
-    bad = ~np.isfinite(values).reshape(len(values), -1).all(axis=1)
-    if bad.any():
+    finite = np.isfinite(values)
+    if not finite.all():
+        bad = ~finite.reshape(len(values), -1).all(axis=1)
         raise InputError(
             source,
             f"field '{field}' is NaN or Inf in {bad.sum()} rows, first in row {np.argmax(bad) + 1}",
@@ -171,8 +174,9 @@ def _check_range(
     source: object,
     time: np.ndarray | None,
 ) -> None:
-    beyond = (np.abs(values) > most).any(axis=1)
-    if beyond.any():
+    size = np.abs(values)
+    if size.max() > most:
+        beyond = (size > most).any(axis=1)
         row = int(np.argmax(beyond))
         first = (
             f"in row {row + 1}" if time is None else f"{time[row] - time[0]:.3f} s after the start"

@@ -474,7 +474,7 @@ def test_import_of_a_file_for_each_sensor(place, capsys):
     run("data", "import", "gyro.csv", "--accel-path", "accel.csv", *out, *units)
     assert "gyro and accel have stamps of their own: accel interpolated" in capsys.readouterr().out
     (sequence,) = data.load("csv", place / "own", "test")
-    assert sequence.name == "walk 2" and len(sequence.time) == 1899
+    assert sequence.name == "two" and len(sequence.time) == 1899  # that of its file
     inner = slice(20, -20)
     np.testing.assert_allclose(
         sequence.accel[inner], walk.force(sequence.time + 0.01)[inner], atol=2e-3

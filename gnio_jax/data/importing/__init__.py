@@ -34,7 +34,7 @@ from gnio_jax.data.importing.streams import (
     read_table,
 )
 from gnio_jax.data.parsing.stamps import PER_SECOND, RATES, rounded_rate
-from gnio_jax.data.readers.csv_files import ACCEL, GYRO
+from gnio_jax.data.readers.csv_files import ACCEL, GYRO, check_columns
 from gnio_jax.data.resampling import resample
 from gnio_jax.data.self_check import self_check
 from gnio_jax.data.validation import WINDOW_SECONDS, validate
@@ -216,6 +216,12 @@ def _read_csv(
         tuple(columns.get(axis, axis) for axis in axes) for axes in (GYRO, ACCEL)
     )
     table = read_table(gyro_path, (time, *gyro_axes))
+    wanted = {"time": time, **dict(zip(GYRO, gyro_axes, strict=True))}
+    of_accel = {"accel_time": columns.get("accel_time", time)}
+    of_accel |= dict(zip(ACCEL, accel_axes, strict=True))
+    # "a+b" is the sum of two columns.
+    wanted |= {} if accel_path is not None else of_accel
+    check_columns(gyro_path, table.columns, {n: c for n, c in wanted.items() if "+" not in c})
     gyro = SensorFile("gyro", gyro_path, table, time, gyro_axes)
     accel = SensorFile("accel", gyro_path, table, columns.get("accel_time", time), accel_axes)
     if accel_path is not None:

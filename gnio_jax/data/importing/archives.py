@@ -11,7 +11,7 @@ from collections import defaultdict
 from pathlib import Path, PurePosixPath
 
 from gnio_jax.data.importing.streams import table_layout
-from gnio_jax.data.readers.parsing import parsed_as
+from gnio_jax.data.parsing.tables import parsed_as
 from gnio_jax.errors import InputError
 
 LARGEST = 512 * 2**20

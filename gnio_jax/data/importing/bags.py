@@ -14,8 +14,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from gnio_jax.data.parsing.tables import shortened
-from gnio_jax.data.readers.parsing import parsed_as
+from gnio_jax.data.parsing.tables import parsed_as, shortened
 from gnio_jax.errors import InputError, require_packages
 
 LARGEST_CHUNK = 1 << 30

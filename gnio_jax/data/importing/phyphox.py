@@ -36,8 +36,7 @@ from gnio_jax.data.importing import archives
 from gnio_jax.data.importing.source import Source, Units
 from gnio_jax.data.importing.streams import SensorFile, read_table
 from gnio_jax.data.importing.units import named_unit
-from gnio_jax.data.readers.parsing import parsed_as
-from gnio_jax.data.readers.text import numbers
+from gnio_jax.data.parsing.tables import Table, parsed_as
 from gnio_jax.errors import InputError, require_packages
 from gnio_jax.numerics import interpolate
 
@@ -248,15 +247,17 @@ def _accelerometer(found: list[_Set], path: Path, tables: list[_Table]) -> _Set:
 def _sum(linear: _Set, gravity: _Set) -> _Set:
     """Both added on the stamps of `linear`; gravity, which turns slowly, by lines (ours)."""
     values = linear.table.values
-    stamps = numbers(values, [linear.time], linear.table.path)[:, 0]
-    down = numbers(gravity.table.values, [gravity.time, *gravity.axes], gravity.table.path)
+    stamps = Table(linear.table.path, values).take(linear.time, gaps=True)
+    down = Table(gravity.table.path, gravity.table.values).take(
+        gravity.time, *gravity.axes, gaps=True
+    )
     down = down[np.isfinite(down).all(axis=1)]
     inside = (stamps >= down[:, 0].min(initial=np.inf)) & (
         stamps <= down[:, 0].max(initial=-np.inf)
     )
     added = interpolate(stamps[inside], down[:, 0], down[:, 1:]) if inside.any() else 0.0
     values = values[inside].reset_index(drop=True)
-    total = numbers(values, linear.axes, linear.table.path) + added
+    total = Table(linear.table.path, values).take(*linear.axes, gaps=True) + added
     values = values.assign(**dict(zip(linear.axes, total.T, strict=True)))
     return linear._replace(kind="accel", table=linear.table._replace(values=values))
 

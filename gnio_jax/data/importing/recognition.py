@@ -9,7 +9,7 @@ from gnio_jax.data.importing import archives
 from gnio_jax.data.importing.phyphox import is_phyphox
 from gnio_jax.data.importing.sensor_logger import is_sensor_logger
 from gnio_jax.data.importing.streams import table_layout
-from gnio_jax.data.readers.parsing import parsed_as
+from gnio_jax.data.parsing.tables import parsed_as
 from gnio_jax.errors import InputError
 
 FORMATS = ("csv", "sensor_logger", "phyphox", "rosbag1", "rosbag2", "mcap", "euroc")

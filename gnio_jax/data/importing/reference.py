@@ -7,19 +7,10 @@ from jaxtyping import Float
 
 from gnio_jax.data.importing.source import Track
 from gnio_jax.data.parsing.stamps import in_order
-from gnio_jax.data.readers.reference import (
-    LOST_POSES,
-    SHORTEST_RUN,
-    Poses,
-    Reference,
-    fused,
-    interpolated,
-    poses_at,
-)
-from gnio_jax.data.reference import smooth_positions
+from gnio_jax.data.reference import SHORTEST_RUN, Poses, reference_at
 from gnio_jax.data.validation import check_motion, check_unit_norm, validate
 from gnio_jax.errors import InputError
-from gnio_jax.numerics import finite_rows, quaternions, rotations
+from gnio_jax.numerics import finite_rows, rotations
 from gnio_jax.types import Sequence
 
 FAST_TRACKER = 20.0
@@ -60,20 +51,20 @@ def with_reference(sequence: Sequence, start: float, track: Track) -> Sequence:
     reference; NaN and not valid where there is none.
 
     Poses from `FAST_TRACKER` Hz, and those with velocities, are laid on the clock as those of the
-    data sets are (`readers.reference`); slower ones follow splines. Raises `InputError` where both
+    data sets are (`data.reference`); slower ones follow splines. Raises `InputError` where both
     hardly overlap, or the reference moves as nothing does.
     """
     poses = track.poses._replace(time=track.poses.time + (track.start - start))
     _check_overlap(sequence.time - sequence.time[0], poses, track)
-    step = float(np.median(np.diff(sequence.time)))
-    clocked = sequence._replace(time=sequence.time - sequence.time[0])
     usual = float(np.median(np.diff(poses.time)))
-    if poses.velocity is not None:
-        found = interpolated(clocked.time, poses, track.shifted)
-    elif usual <= 1.0 / FAST_TRACKER:
-        found = fused(clocked, step, poses)
-    else:
-        found = _splined(clocked.time, poses, usual)
+    poses = poses._replace(noisy=usual <= 1.0 / FAST_TRACKER)
+    found = reference_at(sequence.time - sequence.time[0], sequence.gyro, poses)
+    if not found.valid.any():
+        raise InputError(
+            track.path,
+            f"the reference {track.name} can be trusted nowhere while the IMU was recorded",
+            "look for its gaps, and whether its velocity is that of its position",
+        )
     known = found.valid[:, None]
     result = sequence._replace(
         orientation=np.where(known, found.orientation, np.nan),
@@ -95,11 +86,3 @@ def _check_overlap(clock: np.ndarray, poses: Poses, track: Track) -> None:
             f"not overlap the IMU (0 to {clock[-1]:.1f} s)",
             "both must be stamped by one clock",
         )
-
-
-def _splined(clock: np.ndarray, poses: Poses, usual: float) -> Reference:
-    """Slow poses by splines; the velocity is that of the smoothed positions."""
-    position, attitude, good = poses_at(clock, poses, LOST_POSES * usual)
-    step = float(np.median(np.diff(clock)))
-    _, velocity, believed = smooth_positions(position, good, step)
-    return Reference(quaternions(attitude), position, velocity, good & believed)

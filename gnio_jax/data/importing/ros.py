@@ -20,7 +20,7 @@ from gnio_jax.data.importing.bags import Bag, Topic, listed, opened
 from gnio_jax.data.importing.reference import poses_of
 from gnio_jax.data.importing.source import Source, Track, Units
 from gnio_jax.data.importing.streams import SensorFile
-from gnio_jax.data.readers.asl import SensorPose, moved_to
+from gnio_jax.data.readers.euroc import SensorPose, moved_to
 from gnio_jax.errors import InputError
 
 IMU = "sensor_msgs/msg/Imu"

@@ -32,7 +32,7 @@ import pandas as pd
 from gnio_jax.data.importing import archives
 from gnio_jax.data.importing.source import Source, Units
 from gnio_jax.data.importing.streams import SensorFile, read_table
-from gnio_jax.data.readers.text import numbers
+from gnio_jax.data.parsing.tables import Table
 from gnio_jax.errors import InputError
 from gnio_jax.numerics import interpolate
 
@@ -142,15 +142,16 @@ def _with_gravity(export: _Export) -> SensorFile:
     motion, gravity = export.table("Accelerometer"), export.table("Gravity")
     path = export.file("Accelerometer")
     clock = "time" if "time" in motion.columns else "seconds_elapsed"
-    stamps = numbers(motion, [clock], path)[:, 0]
-    down = numbers(gravity, [clock, *_AXES], export.file("Gravity"))
+    stamps = Table(path, motion).take(clock, gaps=True)
+    down = Table(export.file("Gravity"), gravity).take(clock, *_AXES, gaps=True)
     down = down[np.isfinite(down).all(axis=1)]
     if len(down) < 2:
         raise InputError(export.file("Gravity"), f"holds {len(down)} samples", "record for longer")
     down = down[np.argsort(down[:, 0], kind="stable")]
     inside = (stamps >= down[0, 0]) & (stamps <= down[-1, 0])
     table = motion[inside].reset_index(drop=True)
-    total = numbers(table, _AXES, path) + interpolate(stamps[inside], down[:, 0], down[:, 1:])
+    added = interpolate(stamps[inside], down[:, 0], down[:, 1:])
+    total = Table(path, table).take(*_AXES, gaps=True) + added
     table = table.assign(**dict(zip(_AXES, total.T, strict=True)))
     return SensorFile("accel", path, table, clock, _AXES)
 

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from gnio_jax.data.importing.streams import SensorFile
-from gnio_jax.data.readers.reference import Poses
+from gnio_jax.data.reference import Poses
 
 
 class Units(NamedTuple):
@@ -35,8 +35,6 @@ class Track(NamedTuple):
     """Of the IMU in a z-up world."""
     named: bool = False
     """The user asked for it: what is wrong with it is an error, and else a note."""
-    shifted: bool = False
-    """The poses were moved along a lever: their velocity is another point's."""
 
 
 class Source(NamedTuple):

@@ -12,8 +12,7 @@ from jaxtyping import Bool, Float, Num
 from scipy.interpolate import CubicSpline
 
 from gnio_jax.data.parsing.stamps import PER_SECOND, RATES, in_order, time_unit
-from gnio_jax.data.parsing.tables import open_text
-from gnio_jax.data.readers.text import numbers, read_csv
+from gnio_jax.data.parsing.tables import Table, open_text, read_text
 from gnio_jax.data.resampling import longest_bridge
 from gnio_jax.data.validation import check_finite, check_gaps
 from gnio_jax.errors import InputError
@@ -94,7 +93,7 @@ def read_table(path: Path, columns: tuple[str, ...], content: bytes | None = Non
     """
     layout = table_layout(path, content)
     header = not (columns and all(name.isdigit() for name in columns))
-    table = read_csv(path, layout.separator, header, content, layout.decimal)
+    table = read_text(path, layout.separator, header, content, layout.decimal).columns
     table.columns = [_label(label) for label in table.columns]
     return table
 
@@ -129,7 +128,7 @@ def _column(table: pd.DataFrame, name: str, path: Path) -> Float[np.ndarray, " n
     if name not in table.columns and "+" in name:
         parts = (_column(table, part.strip(), path) for part in name.split("+"))
         return sum(parts, np.zeros(len(table)))
-    return numbers(table, [name], path)[:, 0]
+    return Table(path, table).take(name, gaps=True)
 
 
 def _stamps(table: pd.DataFrame, name: str, path: Path) -> Num[np.ndarray, " n"]:

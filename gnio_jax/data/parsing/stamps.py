@@ -86,6 +86,21 @@ def seconds(
     return np.asarray((stamps - start) / PER_SECOND[unit], dtype=np.float64)
 
 
+def distinct(
+    stamps: Real[np.ndarray, " n"], source: object, field: str = "time"
+) -> Int[np.ndarray, " m"]:
+    """The first row of each stamp, in their order, of a logger that writes some rows late and some
+    twice. Raises `InputError` where fewer than half of the rows have a stamp of their own."""
+    rows = np.unique(stamps, return_index=True)[1]
+    if len(rows) < 0.5 * len(stamps):
+        raise InputError(
+            source,
+            f"field '{field}' holds only {len(rows)} different stamps in {len(stamps)} rows",
+            "copy it again",
+        )
+    return rows
+
+
 class InOrder(NamedTuple):
     """Rows in the order of their stamps."""
 

@@ -9,9 +9,6 @@ from __future__ import annotations
 
 import io
 import json
-import struct
-import zipfile
-import zlib
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -26,12 +23,8 @@ from gnio_jax.data.validation import UNIT_NORM_TOLERANCE
 from gnio_jax.errors import InputError
 from gnio_jax.numerics import rotations, wxyz_from_xyzw
 
-DAMAGE = (
-    *(OSError, EOFError, ValueError, TypeError, LookupError, ArithmeticError, RuntimeError),
-    *(AttributeError, SyntaxError, NotImplementedError),
-    *(zipfile.BadZipFile, zlib.error, struct.error),
-)
-"""What the parsers of damaged files raise. Lack of memory and failed assertions are no damage."""
+OURS = (AssertionError, NameError, ImportError)
+"""What no damaged file makes a parser raise: it is a mistake of ours, or of the installation."""
 
 
 def shortened(text: object, most: int = 80) -> str:
@@ -51,11 +44,13 @@ def parsed_as(path: Path, kind: str) -> Iterator[None]:
         yield
     except InputError:
         raise
+    except OURS:
+        raise
     except MemoryError:
         raise InputError(
             path, f"does not fit the memory as {kind}", "if it should, copy it again"
         ) from None
-    except DAMAGE as error:
+    except Exception as error:  # a damaged file makes a parser fail in any other way
         raise InputError(
             path,
             f"cannot be read as {kind}, it may be cut short ({shortened(error, 200)})",
@@ -88,16 +83,9 @@ class Table(NamedTuple):
         for `gaps`, where one is NaN or infinite.
         """
         if width is not None:
-            values = self._numbers(names[0])
-            rows = len(values) if values.ndim else 0
-            if values.shape != (rows, width):
-                self._refuse_shape(names[0], values, f"(N, {width})")
+            values = self._of_shape(names[0], (width,))
         else:
-            found = [self._numbers(name) for name in names]
-            for name, column in zip(names, found, strict=True):
-                if column.ndim != 1:
-                    self._refuse_shape(name, column, "(N,)")
-            values = np.stack(found, axis=1)
+            values = np.stack([self._of_shape(name, ()) for name in names], axis=1)
         if not gaps:
             self.check_complete(values, names)
         return values[:, 0] if width is None and len(names) == 1 else values
@@ -115,24 +103,29 @@ class Table(NamedTuple):
         return self.take(name)
 
     def rotations(
-        self, *names: Any, width: int | None = None, scalar_first: bool = True
+        self,
+        *names: Any,
+        width: int | None = None,
+        scalar_first: bool = True,
+        rows: slice | Bool[np.ndarray, " n"] = slice(None),
     ) -> Rotation:
-        """Rotations of unit quaternions, every row's. Raises `InputError` as `take` does, and where
-        a norm is off 1 by more than `UNIT_NORM_TOLERANCE`."""
-        wxyz = self.take(*names, width=width)
-        if not scalar_first:
-            wxyz = wxyz_from_xyzw(wxyz)
-        norm = np.linalg.norm(wxyz, axis=1)
-        bad = np.abs(norm - 1.0) > UNIT_NORM_TOLERANCE
+        """Rotations of unit quaternions in these rows. Raises `InputError` as `take` does, and
+        where a norm is off 1 by more than `UNIT_NORM_TOLERANCE`."""
+        wxyz = self.take(*names, width=width, gaps=True)
+        own = np.arange(len(wxyz))[rows]
+        norm = np.linalg.norm(wxyz[own], axis=1)
+        bad = ~(np.abs(norm - 1.0) <= UNIT_NORM_TOLERANCE)
         if bad.any():
-            row = int(np.argmax(bad))
+            first = int(np.argmax(bad))
+            if not np.isfinite(norm[first]):
+                self.check_complete(wxyz, names)
             raise InputError(
                 self.path,
                 f"{self._named(names)} not a unit quaternion in {bad.sum()} rows, first in row "
-                f"{self.row(row)} (norm {norm[row]:.4g})",
+                f"{self.row(int(own[first]))} (norm {norm[first]:.4g})",
                 "check the column order and normalize, or copy it again",
             )
-        return rotations(wxyz)
+        return rotations(wxyz[own] if scalar_first else wxyz_from_xyzw(wxyz[own]))
 
     def row(self, index: int) -> int:
         """The row of the file, from 1, that holds entry `index` of every column."""
@@ -191,12 +184,20 @@ class Table(NamedTuple):
                 f"{self.row(index)}, no number",
             ) from None
 
-    def _refuse_shape(self, name: Any, values: np.ndarray, expected: str) -> None:
-        raise InputError(
-            self.path,
-            f"{self.kind} '{name}' has shape {values.shape}, expected {expected}",
-            "copy it again",
-        )
+    def _of_shape(self, name: Any, axes: tuple[int, ...]) -> np.ndarray:
+        """A column with as many rows as the first, two or more, and these axes."""
+        values = self._numbers(name)
+        if isinstance(self.columns, pd.DataFrame):
+            return values  # the columns of a frame are of one shape
+        rows = np.shape(next(iter(self.columns.values())))[:1] or (0,)
+        if values.shape != rows + axes or rows[0] < 2:
+            expected = rows + axes if rows[0] >= 2 else f"at least two rows of {axes or 'numbers'}"
+            raise InputError(
+                self.path,
+                f"{self.kind} '{name}' has shape {values.shape}, expected {expected}",
+                "copy it again",
+            )
+        return values
 
     def _named(self, names: tuple[Any, ...]) -> str:
         joined = "', '".join(str(name) for name in names)

@@ -3,8 +3,8 @@
 A CSV has a header that names, in any order, `time` s, `gyro_x..z` rad/s, `accel_x..z` m/s²
 (specific force), and optionally a reference: `qw..qz` (body→world), `px..pz` m, `vx..vz` m/s in a
 z-up world; other columns are ignored. Any rate. Without a reference the sequence holds NaN there
-and `valid` is False; velocities that are not given are differenced from the positions. Rows with an
-empty reference are not valid.
+and `valid` is False; velocities that are not given are those of the smoothed positions. Rows may
+leave the reference empty: up to 0.1 s of that are bridged, more is not valid.
 
 `gnio_jax.data.importing` brings the files of a phone's logger into this form.
 """
@@ -13,28 +13,23 @@ from __future__ import annotations
 
 import os
 import re
+from collections.abc import Iterable, Mapping
+from functools import partial
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
-from jaxtyping import Bool, Float
-from scipy.interpolate import CubicSpline
+from jaxtyping import Float
 
-from gnio_jax.data.dataset import Dataset, Recording, single
+from gnio_jax.data.assembly import Poses, Samples, Streams, assemble
+from gnio_jax.data.dataset import Dataset, Recording
 from gnio_jax.data.hdf5 import read_hdf5
 from gnio_jax.data.parsing.stamps import check_seconds, rounded_rate
-from gnio_jax.data.readers.text import numbers, read_csv
+from gnio_jax.data.parsing.tables import Table, read_text, shortened
 from gnio_jax.data.resampling import resample
 from gnio_jax.data.splits import listed
-from gnio_jax.data.validation import (
-    check_finite,
-    check_gaps,
-    check_increasing,
-    check_motion,
-    validate,
-)
+from gnio_jax.data.validation import check_gaps, check_increasing, check_motion
 from gnio_jax.errors import InputError
-from gnio_jax.numerics import finite_rows, spans
+from gnio_jax.numerics import finite_rows, quaternions
 from gnio_jax.types import Sequence
 
 SPLITS = ("train", "val", "test")
@@ -64,18 +59,31 @@ def recordings(root: Path, split: str) -> list[Recording]:
             raise InputError(
                 path, f"has the name of {named[path.stem]}", "rename or remove one of them"
             )
-    return [single(name, read_recording, path) for name, path in sorted(named.items())]
+    return [Recording(name, partial(read, path)) for name, path in sorted(named.items())]
 
 
 def list_splits(root: Path) -> tuple[str, ...]:
-    """The splits that the lists <root>/<split>.txt name; `test` alone where there is none."""
-    lists = {path.stem for path in root.glob("*.txt") if re.fullmatch("[a-z][a-z0-9_]*", path.stem)}
+    """The splits that the lists <root>/<split>.txt name; `test` alone where there is none. A text
+    of another name that names no recording there is no list."""
+    lists = {path.stem for path in root.glob("*.txt") if _is_list(path)}
     usual = [split for split in SPLITS if split in lists]
     return (*usual, *sorted(lists - set(SPLITS))) or ("test",)
 
 
+def _is_list(path: Path) -> bool:
+    if path.stem in SPLITS:
+        return True
+    if not re.fullmatch("[a-z][a-z0-9_]*", path.stem):
+        return False
+    try:
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+        return any(_find(path.parent, line.strip()) for line in lines if line.strip())
+    except (OSError, UnicodeDecodeError):
+        return False
+
+
 def _files(root: Path, split: str) -> list[Path]:
-    if split not in SPLITS and not (root / f"{split}.txt").is_file():
+    if split not in SPLITS and not _is_list(root / f"{split}.txt"):
         raise InputError(
             root,
             f"unknown split '{split}'",
@@ -110,77 +118,112 @@ def _find(root: Path, entry: str) -> Path | None:
 # --- how one is read
 
 
-def read_recording(path: str | os.PathLike[str]) -> Sequence:
-    """One recording, on a uniform clock of its own rate. Raises `InputError` naming file and
-    field."""
+def read(path: str | os.PathLike[str]) -> list[Sequence]:
+    """One recording, on a uniform clock of its own rate, named after its file. Raises `InputError`
+    naming file and field."""
     path = Path(path)
-    if path.suffix.lower() in _HDF5:
-        sequence = read_hdf5(path)
-        check_seconds(sequence.time, path)
-        check_gaps(sequence.time, path)
-    else:
-        sequence = validate(_read_csv(path), path)
+    if path.suffix.lower() not in _HDF5:
+        return assemble(_streams(read_text(path)), whole=True)
+    sequence = read_hdf5(path)._replace(name=path.stem)
+    check_seconds(sequence.time, path)
+    check_gaps(sequence.time, path)
     check_motion(sequence, path)
-    return resample(sequence, rounded_rate(sequence.time))
+    return [resample(sequence, rounded_rate(sequence.time))]
 
 
-def _read_csv(path: Path) -> Sequence:
-    table = read_csv(path)
-    _check_columns(table, path)
-    time = numbers(table, ["time"], path)[:, 0]
-    gyro, accel = numbers(table, GYRO, path), numbers(table, ACCEL, path)
-    for field, values in (("time", time), ("gyro", gyro), ("accel", accel)):
-        check_finite(values, field, path)
+def _streams(table: Table) -> Streams:
+    path = table.path
+    check_columns(path, table.columns, {name: name for name in ("time", *GYRO, *ACCEL)})
+    time, gyro, accel = table.take("time"), table.take(*GYRO), table.take(*ACCEL)
     check_increasing(time, path)
     check_seconds(time, path)
-    check_gaps(time, path)
-    reference = {
-        field: numbers(table, columns, path)
-        if columns[0] in table.columns
-        else np.full((len(time), len(columns)), np.nan)
-        for field, columns in REFERENCE.items()
-    }
-    valid = finite_rows(reference["orientation"]) & finite_rows(reference["position"])
-    if "vx" not in table.columns:
-        reference["velocity"] = _differenced(time, reference["position"], valid)
-    valid = valid & finite_rows(reference["velocity"])
-    truth = "given" if valid.any() else "none"
-    return Sequence(
-        name=path.stem,
-        time=time,
-        gyro=gyro,
-        accel=accel,
-        valid=valid,
-        attributes={"dataset": "csv", "group": path.stem, "truth": truth},
-        **reference,
+    poses = reference(table, time)
+    known = np.zeros(len(time), dtype=bool)
+    if poses is None and REFERENCE["orientation"][0] in table.columns:
+        known = finite_rows(table.take(*REFERENCE["orientation"], gaps=True))
+    device = None
+    if known.any():  # an attitude alone is no reference: it is the device's own
+        attitude = quaternions(table.rotations(*REFERENCE["orientation"], rows=known))
+        device = Samples(time[known], attitude, str(path))
+    about = {"dataset": "csv", "group": path.stem, "truth": "none" if poses is None else "given"}
+    return Streams(
+        path.stem,
+        str(path),
+        Samples(time, gyro, str(path)),
+        Samples(time, accel, str(path)),
+        about,
+        poses=poses,
+        device=device,
     )
 
 
-def _check_columns(table: pd.DataFrame, path: Path) -> None:
-    """A field of the reference has all its columns, or none."""
+def reference(table: Table, time: Float[np.ndarray, " n"]) -> Poses | None:
+    """The poses in a table's columns `REFERENCE`, at the stamps `time` (s) of its rows; None where
+    it has none. A field of the reference has all its columns, or none."""
     for field, columns in REFERENCE.items():
         present = [name for name in columns if name in table.columns]
         if present and len(present) < len(columns):
             missing = next(name for name in columns if name not in table.columns)
             raise InputError(
-                path,
+                table.path,
                 f"column '{missing}' is missing while '{present[0]}' is there",
                 f"the {field} of a reference has {', '.join(columns)}",
             )
+    given = {
+        field: table.take(*columns, gaps=True)
+        for field, columns in REFERENCE.items()
+        if columns[0] in table.columns
+    }
+    if not {"orientation", "position"} <= given.keys():
+        return None
+    known = np.all([finite_rows(values) for values in given.values()], axis=0)
+    if not known.any():
+        return None
+    return Poses(
+        time[known],
+        table.rotations(*REFERENCE["orientation"], rows=known),
+        given["position"][known],
+        given["velocity"][known] if "velocity" in given else None,
+        source=str(table.path),
+    )
 
 
-def _differenced(
-    time: Float[np.ndarray, " n"], position: Float[np.ndarray, "n 3"], known: Bool[np.ndarray, " n"]
-) -> Float[np.ndarray, "n 3"]:
-    """Velocities within stretches of known positions, NaN where fewer than two are in a row."""
-    velocity = np.full_like(position, np.nan)
-    for start, stop in spans(known):
-        own, place = time[start:stop], position[start:stop]
-        if len(own) >= 4:
-            velocity[start:stop] = CubicSpline(own, place, axis=0)(own, 1)
-        elif len(own) >= 2:
-            velocity[start:stop] = np.gradient(place, own, axis=0)
-    return velocity
+def check_columns(path: Path, found: Iterable[object], wanted: Mapping[str, str]) -> None:
+    """Raise `InputError` where a file lacks columns, `wanted` being our names and the file's: all
+    that are missing at once, and how to name them."""
+    names = [str(name) for name in found]
+    missing = [ours for ours, theirs in wanted.items() if theirs not in names]
+    if not missing:
+        return
+    listed_names = ", ".join(f"'{wanted[ours]}'" for ours in missing)
+    options = " ".join(
+        f"--columns.{ours.replace('_', '-')} {_guess(ours, names)}" for ours in missing
+    )
+    raise InputError(
+        path,
+        f"column{'s' if len(missing) > 1 else ''} {listed_names} "
+        f"{'are' if len(missing) > 1 else 'is'} missing; found: {shortened(', '.join(names), 600)}",
+        f"name them: gnio data import {path.name} {options}",
+    )
+
+
+_LIKE = {
+    "time": r"(unix_?)?(time.*|stamps?|t)(_?(s|ms|us|ns))?",
+    "accel_time": r"(accel|acc)_?(time.*|stamps?|t)",
+    "gyro": r"(gyro\w*|gyr|g|omega|angular\w*|rotation\w*|w)[_ .]*",
+    "accel": r"(accel\w*|acce|acc|linear\w*|a)[_ .]*",
+}
+"""What loggers call the columns, without unit and in small letters; the axis follows."""
+
+
+def _guess(ours: str, names: list[str]) -> str:
+    """The column that is likely meant, or a word in its place."""
+    sensor, _, axis = ours.partition("_")
+    pattern = _LIKE[ours] if ours in _LIKE else _LIKE[sensor] + axis
+    for name in names:
+        if re.fullmatch(pattern, re.sub(r"\s*[\[(].*", "", name).strip().lower()):
+            return f"'{name}'" if " " in name else name
+    return "COLUMN"
 
 
 DATASET = Dataset(

@@ -10,7 +10,7 @@ beside `imu0` a reference, the first of
 - `mocap0/data.csv`: stamp ns, position m, quaternion wxyz: what the tracker saw at 120 Hz, with
   noise (0.1°, 0.4 mm), flips near its gaps, and gaps of seconds, or of minutes where TUM-VI leaves
   the room. The gyro carries the orientation, a smoother the position (half response at 12 Hz), and
-  velocity is its derivative (`reference.fused`).
+  velocity is its derivative (`reference.reference_at`).
 
 Either is valid only within gaps of 0.1 s and away from jumps; elsewhere the sequence holds NaN. A
 recording is cut to the span of its reference and put on a uniform 200 Hz clock (TUM-VI's IMU runs
@@ -31,15 +31,19 @@ import os
 import re
 from functools import partial
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
+import yaml
+from scipy.spatial.transform import Rotation
 
-from gnio_jax.data.dataset import Dataset, Recording, single
-from gnio_jax.data.readers.asl import ImuFile, moved_to, read_imu, read_poses, sensor_pose
-from gnio_jax.data.readers.reference import Poses, fused, interpolated
-from gnio_jax.data.resampling import resample
-from gnio_jax.data.validation import validate
+from gnio_jax.data.assembly import Poses, Samples, Streams, assemble
+from gnio_jax.data.dataset import Dataset, Recording
+from gnio_jax.data.parsing.stamps import first_stamp, seconds
+from gnio_jax.data.parsing.tables import Table, read_text, shortened
+from gnio_jax.data.reference import LONGEST_BRIDGE, SHORTEST_RUN
 from gnio_jax.errors import InputError
+from gnio_jax.numerics import finite_rows
 from gnio_jax.types import Sequence
 
 RATE = 200.0
@@ -63,6 +67,21 @@ TUMVI_SPLITS = {
 }
 
 REFERENCES = ("state_groundtruth_estimate0", "mocap0")
+LONGEST_LEVER = 100.0
+"""m; no sensor is further away from its body."""
+
+STAMP = "timestamp"
+GYRO, ACCEL, _POSITION, _VELOCITY = (
+    tuple(f"{name}_{axis}" for axis in "xyz") for name in ("w_rs_s", "a_rs_s", "p_rs_r", "v_rs_r")
+)
+_QUATERNION = tuple(f"q_rs_{axis}" for axis in "wxyz")
+_SHORT = {
+    "time": STAMP,
+    **dict(zip(("px", "py", "pz"), _POSITION, strict=True)),
+    **dict(zip(("qw", "qx", "qy", "qz"), _QUATERNION, strict=True)),
+    **dict(zip(("vx", "vy", "vz"), _VELOCITY, strict=True)),
+}
+"""Other names in use, and the authors', both without unit and in small letters."""
 
 
 def recordings(root: Path, split: str, dataset: str = "euroc") -> list[Recording]:
@@ -91,14 +110,18 @@ def _about(dataset: str) -> Dataset:
 def _recording(folder: Path, about: Dataset) -> Recording:
     sensors = [folder / "mav0" / sensor for sensor in ("imu0", *REFERENCES)]
     files = [sensor / name for sensor in sensors for name in ("data.csv", "sensor.yaml")]
-    return single(short_name(folder.name), _read_by_name, folder, about.name)._replace(
-        files=tuple(path for path in files if path.is_file()), slow=True, form=about.name
+    return Recording(
+        short_name(folder.name),
+        partial(_read_by_name, folder, about.name),
+        files=tuple(path for path in files if path.is_file()),
+        slow=True,
+        form=about.name,
     )
 
 
-def _read_by_name(folder: Path, dataset: str) -> Sequence:
+def _read_by_name(folder: Path, dataset: str) -> list[Sequence]:
     """Another process has a `Dataset` of its own: only the name goes there."""
-    return read_sequence(folder, _about(dataset))
+    return read(folder, _about(dataset))
 
 
 def find_sequences(root: Path, about: Dataset) -> dict[str, Path]:
@@ -130,88 +153,161 @@ def _split_of(name: str, splits: dict[str, tuple[str, ...]]) -> str:
     return next((split for split, names in splits.items() if name in names), "test")
 
 
-def read_sequence(folder: str | os.PathLike[str], about: Dataset | None = None) -> Sequence:
-    """One sequence of its folder (the one that holds `mav0`), not yet self-checked. Raises
-    `InputError` naming file and field."""
+# --- one sequence
+
+
+def read(folder: str | os.PathLike[str], about: Dataset | None = None) -> list[Sequence]:
+    """One sequence of its folder (the one that holds `mav0`). Raises `InputError` naming file and
+    field."""
     folder, about = Path(folder), about or EUROC
     mav = folder / "mav0"
     path = mav / "imu0" / "data.csv"
-    imu = read_imu(path, RATE)
-    sensor = _reference_sensor(mav)
-    truth = sensor / "data.csv"
-    lever = sensor_pose(mav / "imu0" / "sensor.yaml").seen_from(sensor_pose(sensor / "sensor.yaml"))
-    poses = moved_to(lever, read_poses(truth, imu.start))
-    inside = _overlap(imu, poses, truth)
-    first = imu.time[inside][0]
-    clocked = _on_clock(imu.time[inside] - first, imu.samples[inside], path)
-    poses = poses._replace(time=poses.time - first)
-    if poses.velocity is None:
-        reference = fused(clocked, 1.0 / RATE, poses)
-    else:
-        shifted = float(np.linalg.norm(lever.translation)) > 1e-9
-        reference = interpolated(clocked.time, poses, shifted)
-    valid = reference.valid & clocked.valid
+    table = read_table(path)
+    stamps = table.stamps(STAMP)
+    start = first_stamp(stamps, "ns", path)
+    time = seconds(stamps, start)
+    poses = read_reference(mav, start)
+    if poses is None:
+        raise InputError(
+            mav,
+            f"has no reference ({' or '.join(REFERENCES)})/data.csv",
+            "bring a recording without one into the dataset 'csv'",
+        )
     name = short_name(folder.name)
-    sequence = clocked._replace(
-        name=name,
-        orientation=np.where(valid[:, None], reference.orientation, np.nan),
-        position=np.where(valid[:, None], reference.position, np.nan),
-        velocity=np.where(valid[:, None], reference.velocity, np.nan),
-        valid=valid,
-        attributes={
+    streams = Streams(
+        name,
+        str(path),
+        Samples(time, table.take(*GYRO), str(path)),
+        Samples(time, table.take(*ACCEL), str(path)),
+        {
             "dataset": about.name,
             "group": name,
             "placement": "drone" if about is EUROC else "handheld",
-            "truth": "motion capture" if poses.velocity is None else "tracker and IMU, smoothed",
-            "start_time": (imu.start + round(first * 1e9)) * 1e-9,
+            "truth": "motion capture" if poses.noisy else "tracker and IMU, smoothed",
             "licence": about.licence,
-            **imu.repairs,
         },
+        start * 1e-9,
+        poses,
     )
-    return validate(sequence, truth)
+    return assemble(streams, RATE, native=RATE)
 
 
-def _reference_sensor(mav: Path) -> Path:
-    """Folder of the first reference that is there."""
-    for kind in REFERENCES:
-        if (mav / kind / "data.csv").is_file():
-            return mav / kind
-    raise InputError(
-        mav,
-        f"has no reference ({' or '.join(REFERENCES)})/data.csv",
-        "bring a recording without one into the dataset 'csv'",
-    )
+def read_table(path: Path) -> Table:
+    """A data.csv, its columns by the authors' names without unit, in small letters."""
+    table = read_text(path)
+    plain = (re.sub(r"[\[(].*", "", str(name)).strip().lower() for name in table.columns)
+    names = [_SHORT.get(name, name) for name in plain]
+    known = {STAMP, *GYRO, *ACCEL, *_POSITION, *_QUATERNION, *_VELOCITY}
+    given = zip(names, table.columns, strict=True)
+    labels = [theirs if theirs in known else name for theirs, name in given]
+    return table._replace(columns=table.columns.set_axis(labels, axis=1))
 
 
-def _overlap(imu: ImuFile, poses: Poses, truth: Path) -> np.ndarray:
-    """Which rows of the IMU lie between the first pose and the last."""
-    first, last = poses.time[[0, -1]]
-    inside = (imu.time >= first - 1e-9) & (imu.time <= last + 1e-9)
-    if inside.sum() < 2:
+def read_reference(mav: Path, start: float | int) -> Poses | None:
+    """Poses of the IMU by the first reference that is there, in s after the stamp `start` (ns);
+    rows without a pose are left out."""
+    sensor = next((mav / name for name in REFERENCES if (mav / name / "data.csv").is_file()), None)
+    if sensor is None:
+        return None
+    path = sensor / "data.csv"
+    table = read_table(path)
+    stamps = table.stamps(STAMP)
+    first_stamp(stamps, "ns", path)
+    position, quaternion = table.take(*_POSITION, gaps=True), table.take(*_QUATERNION, gaps=True)
+    velocity = table.take(*_VELOCITY, gaps=True) if _VELOCITY[0] in table.columns else None
+    seen = finite_rows(position) & finite_rows(quaternion)
+    if velocity is not None:
+        seen &= finite_rows(velocity)
+    if seen.sum() < SHORTEST_RUN:
+        raise InputError(path, f"holds {seen.sum()} poses", "copy it again")
+    time = seconds(stamps[seen], start)
+    if (usual := float(np.median(np.abs(np.diff(time))))) > LONGEST_BRIDGE:
         raise InputError(
-            truth,
-            f"field 'time' ({first:.1f} to {last:.1f} s) does not overlap the IMU's "
-            f"(0 to {imu.time[-1]:.1f} s)",
-            "the stamps of both must be unix time in ns",
+            path,
+            f"field 'time' runs at {1 / usual:.3g} Hz, too slow for a reference",
+            f"give at least {1 / LONGEST_BRIDGE:g} Hz",
         )
-    return inside
-
-
-def _on_clock(time: np.ndarray, samples: np.ndarray, path: Path) -> Sequence:
-    """The IMU at 200 Hz; `valid` where it has no gap. The reference is a placeholder."""
-    count = len(time)
-    nothing = np.zeros((count, 3))
-    sequence = Sequence(
-        name="",
-        time=time,
-        gyro=samples[:, :3],
-        accel=samples[:, 3:],
-        orientation=np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)),
-        position=nothing,
-        velocity=nothing,
-        valid=np.ones(count, dtype=bool),
+    poses = Poses(
+        time,
+        table.rotations(*_QUATERNION, rows=seen),
+        position[seen],
+        None if velocity is None else velocity[seen],
+        noisy=velocity is None,
+        source=str(path),
     )
-    return resample(validate(sequence, path), RATE)
+    tracked = sensor_pose(sensor / "sensor.yaml")
+    return moved_to(sensor_pose(mav / "imu0" / "sensor.yaml").seen_from(tracked), poses)
+
+
+# --- where a sensor sits
+
+
+class SensorPose(NamedTuple):
+    """T_BS of a sensor."""
+
+    rotation: Rotation = Rotation.identity()
+    """Sensor → body."""
+    translation: np.ndarray = np.zeros(3)
+    """Of the sensor in the body, m."""
+
+    def seen_from(self, other: SensorPose) -> SensorPose:
+        """This sensor in the frame of another one."""
+        inverse = other.rotation.inv()
+        lever = inverse.apply(self.translation - other.translation)
+        return SensorPose(inverse * self.rotation, lever)
+
+
+def sensor_pose(path: Path) -> SensorPose:
+    """T_BS of a sensor.yaml; the identity where there is no file or it names none."""
+    content = _yaml(path) if path.is_file() else None
+    entry = content.get("T_BS") if isinstance(content, dict) else None
+    if entry is None:
+        return SensorPose()
+    try:
+        rows = entry["data"] if isinstance(entry, dict) else entry
+        # One by one, since aliases can make a few lines of YAML a list of billions.
+        values = [float(x) for row in rows for x in (row if isinstance(row, list) else [row])]
+        matrix = np.array(values).reshape(4, 4)
+        turn, translation = matrix[:3, :3], matrix[:3, 3]
+        orthogonal = np.abs(turn @ turn.T - np.eye(3)).max() <= 1e-3
+        if not (orthogonal and np.isfinite(turn).all() and np.linalg.det(turn) >= 0):
+            raise ValueError("its rotation is none")
+        if not np.linalg.norm(translation) < LONGEST_LEVER:
+            raise ValueError(f"its translation is beyond {LONGEST_LEVER:g} m")
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        raise InputError(
+            path,
+            f"field 'T_BS' is no pose ({error})",
+            "it holds cols, rows and data of a 4 × 4 matrix",
+        ) from None
+    return SensorPose(Rotation.from_matrix(turn), translation)
+
+
+def moved_to(imu: SensorPose, poses: Poses) -> Poses:
+    """Poses of the IMU, which sits at `imu` in the tracked sensor's frame."""
+    lever = imu.rotation.inv().apply(imu.translation)
+    return poses._replace(attitude=poses.attitude * imu.rotation, lever=lever)
+
+
+def _yaml(path: Path) -> Any:
+    try:
+        # Some exports carry OpenCV's header and tag, which are no YAML.
+        text = re.sub(
+            r"^%YAML.*$|!!opencv-matrix", "", path.read_text(encoding="utf-8"), flags=re.MULTILINE
+        )
+        return yaml.safe_load(text)
+    except (  # tags fail in any way
+        OSError,
+        ValueError,
+        TypeError,
+        LookupError,
+        AttributeError,
+        RecursionError,
+        yaml.YAMLError,
+    ) as error:
+        raise InputError(
+            path, f"cannot be read as YAML ({shortened(error, 200)})", "copy it again"
+        ) from None
 
 
 EUROC = Dataset(

@@ -34,26 +34,20 @@ import warnings
 from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
-from gnio_jax.data.dataset import Dataset, Recording, single
-from gnio_jax.data.readers.oxts import Motion, read_oxts
-from gnio_jax.data.readers.parsing import float_columns, parsed_as
-from gnio_jax.data.resampling import resample
-from gnio_jax.data.validation import (
-    check_finite,
-    check_gaps,
-    check_increasing,
-    check_rate,
-    validate,
-)
+from gnio_jax.data.assembly import Poses, Samples, Streams, assemble
+from gnio_jax.data.dataset import Dataset, Recording
+from gnio_jax.data.parsing.stamps import in_order
+from gnio_jax.data.parsing.tables import read_npz, shortened
+from gnio_jax.data.validation import FASTEST, check_increasing, check_rate
 from gnio_jax.errors import InputError
-from gnio_jax.numerics import midpoints, quaternions, stretches, within
-from gnio_jax.types import Sequence
+from gnio_jax.numerics import stretches
+from gnio_jax.types import FASTEST_TURN, STRONGEST_FORCE, Sequence
 
 RATE = 100.0
 SPLITS = ("train", "val", "test")
@@ -67,9 +61,20 @@ SHORTEST_PIECE = 3.0
 """s; what is shorter holds too few windows to be worth a sequence."""
 LARGEST_JUMP = 0.5
 """m within a second by which position and integrated velocity may disagree."""
+EARTH_RADIUS = 6378137.0
+"""m, of the sphere of the projection."""
 
 _DRIVE = re.compile(r"\d{4}_\d{2}_\d{2}_drive_\d{4}")
-_ARRAYS = {"t": None, "p_gt": 3, "ang_gt": 3, "v_gt": 3, "u": 6}
+_STAMP = re.compile(r"\d{4}-\d\d-\d\d[ T]\d\d:\d\d:\d\d(\.\d+)?")
+_PACKET = re.compile(r"[0-9]+\.txt")
+_VALUES = (
+    "lat lon alt roll pitch yaw vn ve vf vl vu ax ay az af al au wx wy wz wf wl wu "
+    "pos_accuracy vel_accuracy navstat numsats posmode velmode orimode"
+).split()
+_MOST = np.array(
+    [85.0, 180.0, 1e5, *[10.0] * 3, *[FASTEST] * 5, *[STRONGEST_FORCE] * 6, *[FASTEST_TURN] * 3]
+)
+"""Magnitudes of the values up to `wz` beyond which a packet is damaged; the rest is not used."""
 
 
 class Drive(NamedTuple):
@@ -90,7 +95,9 @@ def recordings(root: Path, split: str) -> list[Recording]:
         if share_of(drive.name) == split and drive.oxts:
             found.append(Recording(drive.name, partial(read_packets, drive.oxts)))
         elif share_of(drive.name) == split:
-            found += [single(_piece_name(path), read_piece, path) for path in drive.pieces]
+            found += [
+                Recording(_piece_name(path), partial(read_piece, path)) for path in drive.pieces
+            ]
     if not found:
         raise InputError(
             root,
@@ -147,19 +154,64 @@ def _by_drive(named: Iterable[tuple[str, Path]]) -> dict[str, list[Path]]:
 
 
 def read_packets(oxts: str | os.PathLike[str]) -> list[Sequence]:
-    """The pieces of a drive of its folder `oxts`, not yet self-checked. Raises `InputError` naming
-    file and field."""
+    """The pieces of a drive of its folder `oxts`.
+
+    Packets without a stamp are left out, rows are sorted, of equal stamps the first is kept. World:
+    east, north, up from the first packet (`project`). Raises `InputError` naming file and field.
+    """
     oxts = Path(oxts)
-    motion, start, repairs = read_oxts(oxts, RATE, DATASET.layout)
-    drive = _drive_of(oxts)
+    times, drive = oxts / "timestamps.txt", _drive_of(oxts)
+    rows, packets = _packets(oxts / "data")
+    stamps = _stamps(times)
+    if rows.max() >= len(stamps):
+        raise InputError(
+            times,
+            f"holds {len(stamps)} stamps, but there is a packet {rows.max()}",
+            "copy the drive again",
+        )
+    known = ~np.isnat(stamps[rows])
+    if known.sum() < 2:
+        raise InputError(times, f"gives {known.sum()} packets a stamp", "copy the drive again")
+    stamps, packets = stamps[rows][known], packets[known]
+    start = stamps.min()
+    time = (stamps - start).astype(np.int64) * 1e-9
+    order, repairs = in_order(time, packets, times)
+    time, packets = time[order], packets[order]
+    if np.median(np.diff(time)) > 0.05:
+        raise InputError(
+            times,
+            f"field 'time' runs at {1 / np.median(np.diff(time)):.3g} Hz, as the _sync export does",
+            "get the _extract archive, which carries the 100 Hz of the IMU",
+        )
+    check_rate(time, RATE, times)
+
+    def values(*names: str) -> Float[np.ndarray, "n w"]:
+        return packets[:, [_VALUES.index(name) for name in names]]
+
+    position = project(*values("lat", "lon", "alt").T)
+    attitude = Rotation.from_euler("ZYX", values("yaw", "pitch", "roll"))
+    velocity = values("ve", "vn", "vu")
+    gyro, accel = values("wx", "wy", "wz"), values("ax", "ay", "az")
     sequences, short = [], 0
-    for number, rows in enumerate(stretches(np.diff(motion.time) > LONGEST_GAP)):
-        piece = motion.part(rows)
-        if piece.time[-1] - piece.time[0] < SHORTEST_PIECE:
+    for number, own in enumerate(stretches(np.diff(time) > LONGEST_GAP)):
+        if time[own.stop - 1] - time[own.start] < SHORTEST_PIECE:
             short += 1
             continue
-        about = {"start_time": start, **repairs}
-        sequences.append(_sequence(f"{drive}_extract{number}", drive, piece, oxts, about))
+        poses = Poses(time[own], attitude[own], position[own], velocity[own], source=str(oxts))
+        sequences += assemble(
+            Streams(
+                f"{drive}_extract{number}",
+                str(oxts),
+                Samples(time[own], gyro[own], str(oxts)),
+                Samples(time[own], accel[own], str(oxts)),
+                _attributes(drive) | repairs,
+                float(start.astype(np.int64) * 1e-9),
+                poses,
+            ),
+            RATE,
+            native=RATE,
+            max_drift=LARGEST_JUMP,
+        )
     if short:
         warnings.warn(
             f"{oxts}: {short} pieces between missing packets are shorter than "
@@ -169,20 +221,31 @@ def read_packets(oxts: str | os.PathLike[str]) -> list[Sequence]:
     return sequences
 
 
-def read_piece(path: str | os.PathLike[str]) -> Sequence:
-    """One npz, not yet self-checked. Raises `InputError` naming file and field."""
+def read_piece(path: str | os.PathLike[str]) -> list[Sequence]:
+    """The sequence of one npz. Raises `InputError` naming file and field."""
     path = Path(path)
-    with parsed_as(path, "npz"), np.load(path, allow_pickle=False) as file:
-        fields = float_columns(file, _ARRAYS, path)
-    for name, values in fields.items():
-        check_finite(values, name, path)
-    time, imu = fields["t"], fields["u"]
+    table = read_npz(path)
+    time, imu = table.take("t"), table.take("u", width=6)
     check_increasing(time, path)
-    check_rate(time, RATE, path)
-    check_gaps(time, path)
-    attitude = Rotation.from_euler("ZYX", fields["ang_gt"][:, ::-1])
-    motion = Motion(time, imu[:, :3], imu[:, 3:], attitude, fields["p_gt"], fields["v_gt"])
-    return _sequence(_piece_name(path), _drive_of(path), motion, path, {})
+    position, velocity, angles = (table.take(n, width=3) for n in ("p_gt", "v_gt", "ang_gt"))
+    attitude = Rotation.from_euler("ZYX", angles[:, ::-1])
+    gyro, accel = (Samples(time, part, str(path)) for part in np.split(imu, 2, axis=1))
+    poses = Poses(time, attitude, position, velocity, source=str(path))
+    about = _attributes(_drive_of(path))
+    streams = Streams(_piece_name(path), str(path), gyro, accel, about, poses=poses)
+    return assemble(streams, RATE, native=RATE, max_drift=LARGEST_JUMP)
+
+
+def _attributes(drive: str) -> dict[str, Any]:
+    return {
+        "dataset": "kitti",
+        "group": drive,
+        "session": drive[:10],
+        "placement": "car",
+        "truth": "INS with RTK-GPS (OXTS RT3003)",
+        "imu_compensated": "reference",
+        "licence": DATASET.licence,
+    }
 
 
 def _piece_name(path: Path) -> str:
@@ -194,43 +257,82 @@ def _drive_of(path: Path) -> str:
     return match[0] if match else path.parent.name
 
 
-def _sequence(
-    name: str, drive: str, motion: Motion, source: Path, attributes: dict[str, float]
-) -> Sequence:
-    sequence = Sequence(
-        name=name,
-        time=motion.time,
-        gyro=motion.gyro,
-        accel=motion.accel,
-        orientation=quaternions(motion.attitude),
-        position=motion.position,
-        velocity=motion.velocity,
-        valid=np.ones(len(motion.time), dtype=bool),
-        attributes={
-            "dataset": "kitti",
-            "group": drive,
-            "session": drive[:10],
-            "placement": "car",
-            "truth": "INS with RTK-GPS (OXTS RT3003)",
-            "imu_compensated": "reference",
-            "licence": DATASET.licence,
-            **attributes,
-        },
-    )
-    sequence = resample(validate(sequence, source), RATE)
-    return sequence._replace(valid=~_jumps(sequence))
+def project(
+    latitude: Float[np.ndarray, " n"],
+    longitude: Float[np.ndarray, " n"],
+    altitude: Float[np.ndarray, " n"],
+) -> Float[np.ndarray, "n 3"]:
+    """East, north, up (m) from the first point, of degrees and metres: Mercator's projection with
+    the scale of the first latitude."""
+    scale = np.cos(np.radians(latitude[0])) * EARTH_RADIUS
+    east = scale * np.radians(longitude)
+    north = scale * np.log(np.tan(np.pi / 4 + np.radians(latitude) / 2))
+    position = np.stack([east, north, altitude], axis=1)
+    return position - position[0]
 
 
-def _jumps(sequence: Sequence) -> Bool[np.ndarray, " n"]:
-    """True in every second in which position and integrated velocity disagree by more than
-    `LARGEST_JUMP`."""
-    second = round(RATE)
-    steps = midpoints(sequence.velocity) * np.diff(sequence.time)[:, None]
-    error = sequence.position - np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
-    far = np.linalg.norm(error[second:] - error[:-second], axis=1) > LARGEST_JUMP
-    middle = np.zeros(len(error), dtype=bool)
-    middle[second // 2 : second // 2 + len(far)] = far
-    return within(middle, second // 2)
+def _packets(folder: Path) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, "n 30"]]:
+    """Numbers of the packets, and their values."""
+    # Plain names, not paths: at 100 Hz these are tens of thousands of files.
+    names = sorted(filter(_PACKET.fullmatch, os.listdir(folder))) if folder.is_dir() else []
+    if len(names) < 2:
+        raise InputError(folder, "holds no packets <row>.txt", f"expected layout: {DATASET.layout}")
+    table = np.empty((len(names), len(_VALUES)))
+    for row, name in enumerate(names):
+        table[row] = _packet(os.path.join(folder, name))
+    absurd = ~(np.abs(table[:, : len(_MOST)]) <= _MOST)  # NaN, too
+    if absurd.any():
+        row, index = np.argwhere(absurd)[0]
+        raise InputError(
+            folder / names[row],
+            f"field '{_VALUES[index]}' is {table[row, index]:g}, expected within ±{_MOST[index]:g}",
+            "copy it again",
+        )
+    return np.array([int(name.removesuffix(".txt")) for name in names]), table
+
+
+def _packet(path: str) -> list[float]:
+    try:
+        with open(path, "rb") as file:
+            values = file.read().split()
+    except OSError as error:
+        raise InputError(path, f"cannot be read ({error.strerror})") from None
+    if len(values) != len(_VALUES):
+        raise InputError(
+            path,
+            f"holds {len(values)} values, expected {len(_VALUES)} ({_VALUES[0]} ... {_VALUES[-1]})",
+            "it may be cut short: copy it again",
+        )
+    try:
+        return [float(value) for value in values]
+    except ValueError as error:
+        raise InputError(
+            path, f"holds what is no number ({shortened(error, 200)})", "copy it again"
+        ) from None
+
+
+def _stamps(path: Path) -> np.ndarray:
+    """datetime64[ns] of each line, NaT for an empty one (a packet without a stamp)."""
+    try:
+        lines = path.read_text(encoding="utf-8").rstrip().splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(
+            path, f"cannot be read ({getattr(error, 'strerror', None) or error})"
+        ) from None
+    stamps = np.full(len(lines), np.datetime64("NaT"), dtype="datetime64[ns]")
+    for row, line in enumerate(lines):
+        if line.strip():
+            try:
+                if not _STAMP.fullmatch(line.strip()):  # NumPy takes "now" for a stamp, too
+                    raise ValueError
+                stamps[row] = np.datetime64(line.strip(), "ns")
+            except ValueError:
+                raise InputError(
+                    path,
+                    f"line {row + 1} ('{shortened(line.strip())}') is no stamp",
+                    "stamps look like 2011-09-26 14:02:22.484109563",
+                ) from None
+    return stamps
 
 
 DATASET = Dataset(

@@ -28,7 +28,7 @@ from scipy.spatial.transform import Rotation
 
 from gnio_jax.data.assembly import Poses, Samples, Streams, assemble
 from gnio_jax.data.dataset import Dataset, Recording
-from gnio_jax.data.parsing.stamps import first_stamp, seconds
+from gnio_jax.data.parsing.stamps import distinct, first_stamp, seconds
 from gnio_jax.data.parsing.tables import Table, read_text
 from gnio_jax.data.splits import find_folders, find_list, held_out, listed
 from gnio_jax.errors import InputError
@@ -141,48 +141,49 @@ def _from_table(folder: Path) -> Streams:
     path = folder / _TABLE
     table = read_text(path)
     stamps = table.stamps("time")
-    start = first_stamp(stamps, "ns", path)
-    time = seconds(stamps, start)
-    imu = (Samples(time, table.axes(f"{name}_"), str(path)) for name in ("gyro", "acce"))
-    attitude, device = (_rotations(table, name) for name in ("ori", "rv"))
-    poses = Poses(time, attitude, table.axes("pos_"), source=str(path))
+    start, rows = first_stamp(stamps, "ns", path), distinct(stamps, path)
+    time = seconds(stamps[rows], start)
+    gyro, accel = (Samples(time, table.axes(name)[rows], str(path)) for name in ("gyro_", "acce_"))
+    attitude, device = (
+        table.rotations(*(name + axis for axis in "wxyz"))[rows] for name in ("ori_", "rv_")
+    )
+    poses = Poses(time, attitude, table.axes("pos_")[rows], source=str(path))
     own = Samples(time, quaternions(device), str(path))
-    return _streams(folder, path, *imu, start, poses, own, "Tango")
-
-
-def _rotations(table: Table, name: str) -> Rotation:
-    return table.rotations(*(f"{name}_{axis}" for axis in "wxyz"))
+    return _streams(folder, path, gyro, accel, start, poses, own, "Tango")
 
 
 def _from_text_files(folder: Path) -> Streams:
     arcore = (folder / _ARCORE).is_file()
-    gyro, accel, pose = (
-        _text(folder / name, width)
-        for name, width in (
-            ("gyro.txt", 3),
-            ("acce.txt", 3),
-            (_ARCORE if arcore else "pose.txt", 7),
-        )
-    )
+    gyro, accel = _text(folder / "gyro.txt", 3), _text(folder / "acce.txt", 3)
+    pose = _text(folder / (_ARCORE if arcore else "pose.txt"), 7)
     start = first_stamp(gyro.stamps(0), "ns", gyro.path)
     first_stamp(accel.stamps(0), "ns", accel.path)
 
+    def rows(table: Table) -> tuple[np.ndarray, np.ndarray]:
+        """(seconds, rows of the file) of a sensor's stamps."""
+        stamps = table.stamps(0)
+        own = distinct(stamps, table.path)
+        return seconds(stamps[own], start), own
+
     def samples(table: Table) -> Samples:
-        return Samples(seconds(table.stamps(0), start), table.take(1, 2, 3), str(table.path))
+        time, own = rows(table)
+        return Samples(time, table.take(1, 2, 3)[own], str(table.path))
 
     upright = Rotation.from_euler("x", 90.0 if arcore else 0.0, degrees=True)  # of a y-up world
+    time, own = rows(pose)
     poses = Poses(
-        seconds(pose.stamps(0), start),
-        upright * pose.rotations(4, 5, 6, 7, scalar_first=False),
-        upright.apply(pose.take(1, 2, 3)),
+        time,
+        upright * pose.rotations(4, 5, 6, 7, scalar_first=False)[own],
+        upright.apply(pose.take(1, 2, 3)[own]),
         ends_pieces=True,
         source=str(pose.path),
     )
     device, path = None, folder / "orientation.txt"
     if path.is_file():
         game = _text(path, 4)
-        attitude = quaternions(game.rotations(1, 2, 3, 4, scalar_first=False))
-        device = Samples(seconds(game.stamps(0), start), attitude, str(path))
+        time, own = rows(game)
+        attitude = game.rotations(1, 2, 3, 4, scalar_first=False)[own]
+        device = Samples(time, quaternions(attitude), str(path))
     system = "ARCore" if arcore else "Tango"
     return _streams(folder, folder, samples(gyro), samples(accel), start, poses, device, system)
 

@@ -12,15 +12,15 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from gnio_jax.data.readers.text import numbers, read_csv
-from gnio_jax.data.validation import check_finite, check_increasing, check_unit_norm
+from gnio_jax.data.parsing.tables import read_text
+from gnio_jax.data.validation import check_increasing
 from gnio_jax.errors import InputError, require_packages
 from gnio_jax.evaluation.exporting.ros import check_stamps, write_mcap
 from gnio_jax.evaluation.metrics import Trajectory
 from gnio_jax.evaluation.metrics.trajectory import finite_poses
 from gnio_jax.evaluation.tum import write_tum
 from gnio_jax.files import replacing
-from gnio_jax.numerics import wxyz_from_xyzw
+from gnio_jax.numerics import quaternions
 
 SUFFIXES = {
     ".tum": "tum",
@@ -74,18 +74,15 @@ def check_format(where: object, kind: str) -> None:
 
 def read_trajectory(path: Path) -> Trajectory:
     """A trajectory in TUM format. Raises `InputError` for anything else."""
-    table = read_csv(path, separator=" ", header=False)
-    if table.shape[1] != 8:
+    table = read_text(path, separator=" ", header=False)
+    if table.width() != 8:
         raise InputError(
-            path, f"has {table.shape[1]} columns, not the 8 of TUM's format", f"they are {_TUM}"
+            path, f"has {table.width()} columns, not the 8 of TUM's format", f"they are {_TUM}"
         )
-    rows = numbers(table, range(8), path)
-    check_finite(rows, _TUM, path)
-    time, position, xyzw = np.split(rows, [1, 4], axis=1)
-    check_increasing(time[:, 0], path)
-    everywhere = np.ones(len(rows), dtype=bool)
-    wxyz = check_unit_norm(wxyz_from_xyzw(xyzw), everywhere, "qx qy qz qw", path)
-    return Trajectory(time[:, 0], position, wxyz)
+    time, position = table.take(0), table.take(1, 2, 3)
+    check_increasing(time, path)
+    attitude = table.rotations(4, 5, 6, 7, scalar_first=False)
+    return Trajectory(time, position, quaternions(attitude))
 
 
 def _write_csv(path: Path, poses: Trajectory) -> None:

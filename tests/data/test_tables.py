@@ -1,0 +1,81 @@
+"""Tables of every format: what is missing, no number or incomplete is named by file, column and
+row."""
+
+from __future__ import annotations
+
+import h5py
+import numpy as np
+import pytest
+
+from gnio_jax.data.parsing.tables import Table, parsed_as, read_hdf5_fields, read_npz, read_text
+from gnio_jax.errors import InputError
+
+
+def test_a_header_is_the_first_line_or_the_last_comment_above_numbers(tmp_path):
+    path = tmp_path / "table.csv"
+    for text in ("a, b\n1, 2\n", "# by hand\na,b\n1,2\n", "# by hand\n\n#a [ns],b\n1,2\n#3,4\n"):
+        path.write_text(text)
+        table = read_text(path)
+        assert [str(name).partition(" ")[0] for name in table.columns] == ["a", "b"]
+        np.testing.assert_array_equal(table.take(*table.columns), [[1.0, 2.0]])
+    path.write_text(",a,b\n0,1,2\n")  # pandas' index has no name
+    np.testing.assert_array_equal(read_text(path).take("a", "b"), [[1.0, 2.0]])
+    path.write_text("# one, two\n1,5;2\n3,5;4\n")
+    np.testing.assert_array_equal(
+        read_text(path, ";", header=False, decimal=",").take(0, 1), [[1.5, 2.0], [3.5, 4.0]]
+    )
+
+
+def test_stamps_keep_their_digits(tmp_path):
+    path = tmp_path / "table.csv"
+    path.write_text("time,x\n1403636580838555648,1\n1403636580843555648,2\n")
+    np.testing.assert_array_equal(
+        read_text(path).stamps("time"), [1403636580838555648, 1403636580843555648]
+    )
+
+
+def test_fields_of_binary_files_have_one_length_and_hold_numbers(tmp_path):
+    fields = {"time": np.arange(5.0), "imu": np.ones((5, 6)), "short": np.ones((4, 3))}
+    fields |= {"words": np.array([b"one"] * 5), "single": np.arange(5, dtype=np.float32)}
+    fields["imu"][3, 2] = np.nan
+    np.savez(tmp_path / "a.npz", **fields)
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        for name, values in fields.items():
+            file[f"group/{name}"] = values
+    names = [f"group/{name}" for name in fields]
+    for table, prefix in (
+        (read_npz(tmp_path / "a.npz"), ""),
+        (read_hdf5_fields(tmp_path / "a.h5", names), "group/"),
+    ):
+        assert table.take(f"{prefix}single").dtype == np.float64
+        assert np.isnan(table.take(f"{prefix}imu", width=6, gaps=True)).sum() == 1
+        for name, width, words in (
+            ("imu", 6, "is NaN or Inf in 1 rows, first in row 4"),
+            ("imu", 3, r"has shape \(5, 6\), expected \(5, 3\)"),
+            ("short", 3, r"has shape \(4, 3\), expected \(5, 3\)"),
+            ("words", None, "holds .*expected numbers"),
+            ("gone", None, "is missing; found: "),
+        ):
+            with pytest.raises(InputError, match=f"field '{prefix}{name}' {words}"):
+                table.take(f"{prefix}{name}", width=width)
+
+
+def test_rotations_name_the_row_that_is_none(tmp_path):
+    wxyz = np.tile([1.0, 0.0, 0.0, 0.0], (5, 1))
+    wxyz[3] = 0.0
+    table = Table(tmp_path / "a.npz", {"q": wxyz}, "field")
+    with pytest.raises(InputError, match=r"field 'q' is not a unit quaternion in 1 rows.* row 4 "):
+        table.rotations("q", width=4)
+    known = wxyz.any(axis=1)
+    assert len(table.rotations("q", width=4, rows=known)) == 4
+
+
+def test_a_mistake_of_ours_and_a_lack_of_memory_are_no_damage(tmp_path):
+    path = tmp_path / "a.npz"
+    for error in (AssertionError, NameError, ImportError):
+        with pytest.raises(error), parsed_as(path, "npz"):
+            raise error("ours")
+    with pytest.raises(InputError, match="does not fit the memory as npz"), parsed_as(path, "npz"):
+        raise MemoryError
+    with pytest.raises(InputError, match="may be cut short"), parsed_as(path, "npz"):
+        raise EOFError
