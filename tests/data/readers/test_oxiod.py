@@ -37,9 +37,8 @@ def compare(sequence, truth, time):
     Vicon's own."""
     keep = sequence.valid
     position = np.linalg.norm(sequence.position - files.position(time, truth), axis=1)[keep]
-    attitude = np.degrees(
-        (rotations(sequence.orientation) * files.attitude(time, truth).inv()).magnitude()
-    )[keep]
+    known = files.attitude(time, truth)[keep]
+    attitude = np.degrees((rotations(sequence.orientation[keep]) * known.inv()).magnitude())
     walked = np.linalg.norm(np.diff(files.position(time, truth), axis=0), axis=1).sum()
     return position, attitude, walked
 
@@ -82,7 +81,7 @@ def test_raw_walk_comes_back(tmp_path, skew):
     truth = files.Truth(skew=skew)
     files.write_raw(dataset(tmp_path, "handheld", "data1"), 3, truth)
     (walk,) = oxiod.find_walks(tmp_path)
-    sequence = oxiod.build(walk, "raw")
+    (sequence,) = oxiod.build(walk, "raw")
     a = sequence.attributes
     time = sequence.time + (a["start_time"] - files.EPOCH)
 
@@ -101,7 +100,8 @@ def test_raw_walk_comes_back(tmp_path, skew):
     whole = sequence.valid[100:] & sequence.valid[:-100]
     assert np.linalg.norm(step - known, axis=1)[whole].max() < 0.015
     assert np.abs(sequence.velocity - files.velocity(time, truth))[sequence.valid].max() < 0.06
-    assert np.median(np.abs(sequence.velocity - files.velocity(time, truth))) < 0.01
+    off = np.abs(sequence.velocity - files.velocity(time, truth))[sequence.valid]
+    assert np.median(off) < 0.01 and np.sqrt((off**2).mean()) < 0.02
     assert sequence.valid.mean() > 0.97
 
     rms, shift = imu_error(sequence.gyro - truth.gyro_bias, files.rate, time, truth)
@@ -114,6 +114,8 @@ def test_raw_walk_comes_back(tmp_path, skew):
         np.broadcast_to([0, 0, 1.1], (len(time) - 100, 3)), abs=5e-3
     )
     assert self_check(sequence).failures == ()
+    # CoreMotion has taken off its own estimate of the bias: tables of results say so.
+    assert a["imu_compensated"] == "CoreMotion's gyro bias"
 
 
 @pytest.mark.parametrize("kind", ["raw", "syn"])
@@ -123,7 +125,7 @@ def test_the_accelerometers_delay_is_taken_out(tmp_path, kind, delay):
     write = files.write_raw if kind == "raw" else files.write_syn
     write(dataset(tmp_path, "handheld", "data1"), 1, truth, seconds=25)
     (walk,) = oxiod.find_walks(tmp_path)
-    sequence = oxiod.build(walk, kind)
+    (sequence,) = oxiod.build(walk, kind)
     assert sequence.attributes["accel_delay_removed"] == pytest.approx(delay, abs=1e-3)
     start = sequence.attributes["start_time"]
     time = sequence.time + start - (files.EPOCH if kind == "raw" else 0.0)
@@ -133,9 +135,10 @@ def test_the_accelerometers_delay_is_taken_out(tmp_path, kind, delay):
         slope = np.abs(known(time + 1e-3, truth) - known(time - 1e-3, truth)) / 2e-3
         assert (error < 3e-3 + 3e-3 * slope).all()
     # The rows that the accelerometer had not yet, or no longer, measured are gone.
-    imu = oxiod.read_imu(walk.files[kind][0], kind)
-    first, last = start - imu.epoch, start - imu.epoch + sequence.time[-1]
-    assert first + delay > imu.time[0] - 2e-3 and last + delay < imu.time[-1] + 2e-3
+    phone = oxiod.read_phone(walk.files[kind][0], kind)
+    first, last = start - phone.start, start - phone.start + sequence.time[-1]
+    time = phone.accel.time
+    assert first + delay > time[0] - 2e-3 and last + delay < time[-1] + 2e-3
 
 
 @pytest.mark.parametrize("offset", [1.2, 1.9])
@@ -144,7 +147,7 @@ def test_a_walk_that_repeats_its_turns_comes_back(tmp_path, offset):
     truth = files.Truth(eight=9.66, offset=offset)
     files.write_raw(dataset(tmp_path, "handheld", "data2"), 1, truth, seconds=38)
     (walk,) = oxiod.find_walks(tmp_path)
-    sequence = oxiod.build(walk, "raw")
+    (sequence,) = oxiod.build(walk, "raw")
     assert sequence.attributes["lag"] == pytest.approx(-offset, abs=3e-3)
     check_estimates(sequence, truth)
     time = sequence.time + (sequence.attributes["start_time"] - files.EPOCH)
@@ -190,7 +193,7 @@ def test_a_walk_that_fits_at_two_lags_is_refused_by_name(tmp_path):
     [
         ({"lever": np.array([0.1, 0.5, -0.2])}, "the lever arm would be 0.5"),
         ({"accel_delay": 0.2}, "the accel's delay would be 0.2 s"),
-        ({"up": np.array([np.sin(0.15), 0.0, np.cos(0.15)])}, "the world's tilt would be 8.5"),
+        ({"up": np.array([np.sin(0.15), 0.0, np.cos(0.15)])}, "the world's tilt would be 8.6"),
         ({"gyro_bias": np.array([0.1, -0.1, 0.1])}, "the gyro's bias would be 0.17"),
     ],
     ids=["lever", "delay", "tilt", "bias"],
@@ -210,7 +213,7 @@ def test_syn_walk_comes_back(tmp_path):
     truth = files.Truth(lag_rows=-12.4)
     files.write_syn(dataset(tmp_path, "pocket", "data1"), 1, truth, seconds=40)
     (walk,) = oxiod.find_walks(tmp_path)
-    sequence = oxiod.build(walk, "syn")
+    (sequence,) = oxiod.build(walk, "syn")
     time = sequence.time + sequence.attributes["start_time"]
     # Vicon's row i shows what the phone's row i + lag does.
     assert sequence.attributes["lag"] * 100 == pytest.approx(truth.lag_rows, abs=0.3)
@@ -239,6 +242,7 @@ def test_nexus_events_come_back(tmp_path):
     rms, shift = imu_error(sequence.accel, files.force, time, truth)
     assert rms < 1e-3 and shift < 2e-4
     assert sequence.device_orientation is None and sequence.attributes["device"] == "nexus 5"
+    assert sequence.attributes["imu_compensated"] == "no"
     check_estimates(sequence, truth)
 
 
@@ -335,64 +339,54 @@ def test_lists_gone_wrong(copy):
         data.load("oxiod", copy, "test")
 
 
-def walks(tmp_path, counts):
-    """Walks without contents: {"scene/dataN": minutes of each}."""
-    made = []
-    for session, minutes in counts.items():
-        scene, folder = session.split("/")
-        for number, length in enumerate(minutes, start=1):
-            path = tmp_path / scene / folder / f"imu{number}.csv"
-            path.parent.mkdir(parents=True, exist_ok=True)
-            with path.open("wb") as file:
-                file.truncate(int(length * 60 * 100 * 140))
-            made.append(oxiod.Walk(scene, folder, number, {"syn": (path, path)}, scene))
-    return made
+def walks(*names):
+    """Walks without files, by their "scene/session/number"."""
+    parts = [name.split("/") for name in names]
+    return [oxiod.Walk(scene, folder, int(number), {}, "") for scene, folder, number in parts]
+
+
+ROOM = walks(
+    *(f"handheld/data{n}/{k}" for n in range(1, 6) for k in (1, 2)),
+    *("pocket/data1/1", "handbag/data2/4", "trolley/data1/7", "trolley/data2/3", "running/data1/6"),
+    *(f"multi users/user{n}/4" for n in range(2, 6)),
+    *(f"multi devices/{device}/1" for device in ("iPhone 5", "iPhone 6", "nexus 5")),
+)
+
+
+def sessions(split, made, root):
+    return {walk.session for walk in oxiod.select(made, split, root)}
 
 
 def test_sessions_are_shared_out_whole(tmp_path):
-    made = walks(
-        tmp_path,
-        {
-            **{f"handheld/data{n}": [4, 4, 3] for n in range(1, 6)},
-            "pocket/data1": [4],
-            "running/data1": [5, 5],
-            "trolley/data1": [4, 4],
-            "trolley/data2": [3, 3, 3],
-            "multi users/user2": [4, 4],
-            "multi users/user3": [4],
-            "multi users/user4": [4],
-        },
-    )
-    shares = oxiod.share_out(made)
-    assert shares == oxiod.share_out(made)
-    assert set(shares) == {walk.session for walk in made}
-    total = sum(walk.minutes for walk in made)
-    for split, share in (("train", 0.7), ("val", 0.1), ("test", 0.2)):
-        here = [walk for walk in made if shares[walk.session] == split]
-        assert sum(walk.minutes for walk in here) / total == pytest.approx(share, abs=0.1)
-        assert {"handheld", "multi users"} <= {walk.scene for walk in here}
-        assert {walk.name for walk in oxiod.select(made, f"sessions_{split}", tmp_path)} == {
-            walk.name for walk in here
-        }
-    assert (
-        shares["pocket/data1"] == shares["running/data1"] == "train"
-    )  # the only session of its scene
-    assert {shares["trolley/data1"], shares["trolley/data2"]} == {"train", "test"}
+    parts = [sessions(f"sessions_{split}", ROOM, tmp_path) for split in ("train", "val", "test")]
+    assert set.union(*parts) == {walk.session for walk in ROOM}
+    assert sum(map(len, parts)) == len(set.union(*parts))
+    train, val, test = parts
+    scenes = {session.partition("/")[0] for session in train}
+    assert {"handheld", "trolley", "multi users", "multi devices"} <= scenes
+    assert val == {"multi users/user4", "handheld/data4"}
+    assert {"multi users/user2", "multi devices/nexus 5", "trolley/data1"} < test
 
 
-def test_validation_holds_out_whole_sessions_but_no_scene(tmp_path):
-    made = walks(
-        tmp_path,
-        {
-            "handheld/data1": [4, 4],
-            "handheld/data2": [4],
-            "pocket/data1": [4],
-            "running/data1": [5, 5],
-        },
-    )
-    held = oxiod.held_out_sessions(made)
-    assert held and held < {"handheld/data1", "handheld/data2"}
-    assert oxiod.held_out_sessions(made[2:]) == set()
+def test_what_is_held_out_does_not_depend_on_what_a_copy_holds(tmp_path):
+    place = tmp_path / "handheld"
+    place.mkdir()
+    (place / "Train.txt").write_text("data1\ndata2\ndata3\ndata4")
+    for split in ("sessions_train", "sessions_val", "sessions_test", "train", "val"):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            whole = {walk.name for walk in oxiod.select(ROOM, split, tmp_path)}
+            for part in (ROOM[::2], ROOM[1::2], ROOM[:7], ROOM[7:]):
+                here = {walk.name for walk in oxiod.select(part, split, tmp_path)}
+                assert here == whole & {walk.name for walk in part}, split
+
+
+def test_validation_holds_out_whole_sessions_of_the_training_lists(tmp_path):
+    for scene, entries in (("handheld", "data1\ndata4"), ("trolley", "data1/imu7.csv\ndata2")):
+        (tmp_path / scene).mkdir()
+        (tmp_path / scene / "Train.txt").write_text(entries)
+    assert sessions("val", ROOM, tmp_path) == {"handheld/data4", "trolley/data1"}
+    assert sessions("train", ROOM, tmp_path) == {"handheld/data1", "trolley/data2"}
 
 
 def damaged(path, how):
@@ -429,6 +423,8 @@ def damaged(path, how):
         ]
     elif how == "short":
         lines = lines[:300]
+    elif how == "header":
+        lines.insert(0, "time" + ",name" * 15)
     elif how == "words":
         lines[500] = lines[500].replace(lines[500].split(",")[4], "none")
     path.write_text("\n".join(lines) + "\n")
@@ -438,12 +434,13 @@ def damaged(path, how):
     ("how", "message"),
     [
         ("column missing", "has 15 columns, expected 16"),
-        ("NaN", "'rotation_rate_y' is NaN"),
-        ("cut short", "cut short in 1 rows, first in row 1300"),
+        ("NaN", "'rotation_rate_y' is NaN or Inf in 1 rows, first in row 1001"),
+        ("cut short", "is NaN or Inf in 1 rows, first in row 1300"),
+        ("header", "'time' holds 'time' in its row 1, no number"),
         ("m/s²", "'gravity' has length 9.8, expected 1 G"),
         ("deg/s", "'gyro' looks like deg/s"),
         ("short", "holds 300 rows"),
-        ("words", "holds what is no number"),
+        ("words", "'rotation_rate_x' holds 'none' in its row 501, no number"),
     ],
 )
 def test_damaged_phone_files_are_refused_by_name_and_reason(tmp_path, how, message):
@@ -451,7 +448,8 @@ def test_damaged_phone_files_are_refused_by_name_and_reason(tmp_path, how, messa
     path = dataset(tmp_path, "pocket", "data1") / "syn" / "imu1.csv"
     damaged(path, how)
     with pytest.raises(InputError) as caught:
-        oxiod.read_imu(path, "syn")
+        (walk,) = oxiod.find_walks(tmp_path)
+        oxiod.build(walk, "syn")
     assert (
         str(path) in str(caught.value)
         and message in str(caught.value)
@@ -516,7 +514,8 @@ def test_reading_again_uses_the_cache_and_spawned_workers_agree(copy, monkeypatc
     spawned = data.load("oxiod", copy, "test", workers=2, progress=shares.append)
     assert shares == [0.5, 1.0]
     assert all(
-        np.allclose(a.position, b.position, atol=1e-9) for a, b in zip(alone, spawned, strict=True)
+        np.allclose(a.position, b.position, atol=1e-9, equal_nan=True)
+        for a, b in zip(alone, spawned, strict=True)
     )
 
 
@@ -557,7 +556,7 @@ def test_real_recordings_are_plausible(recordings, name, kind, yaw, lever_y):
     if not (recordings / "oxiod").is_dir():
         pytest.skip("no oxiod below GNIO_DATA")
     (walk,) = [walk for walk in oxiod.find_walks(recordings / "oxiod") if walk.name == name]
-    sequence = oxiod.build(walk, kind)
+    (sequence,) = oxiod.build(walk, kind)
     check = self_check(sequence)
     assert check.failures == ()
     assert check.gravity_mean == pytest.approx([0, 0, 9.81], abs=0.12)
@@ -568,13 +567,9 @@ def test_real_recordings_are_plausible(recordings, name, kind, yaw, lever_y):
     assert sequence.attributes["lever_y"] == pytest.approx(lever_y, abs=0.01)
     assert sequence.attributes["accel_residual"] < 0.12
     # Delayed or mirrored truth would show here: the phone's gravity is that of the reference.
+    reference, own = sequence.orientation, sequence.device_orientation
     own, reference = (
-        rotations(
-            sequence.device_orientation
-            if sequence.device_orientation is not None
-            else sequence.orientation
-        ),
-        rotations(sequence.orientation),
+        rotations(each[sequence.valid]) for each in (reference if own is None else own, reference)
     )
     up = np.array([0.0, 0.0, 1.0])
     angle = np.degrees(
@@ -611,3 +606,5 @@ def test_real_splits_share_no_walk(recordings):
         and not sessions["val"] & sessions["test"]
     )
     assert splits["test"] == {"running_data1_7", "trolley_data2_6"}
+    assert sessions["val"] == {"multi users/user4"}
+    assert sessions["test"] == {"multi users/user2", "multi devices/nexus 5", "trolley/data1"}

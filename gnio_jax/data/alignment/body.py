@@ -1,0 +1,603 @@
+"""Where an IMU sits on a tracked body, and by how much their clocks differ.
+
+An optical tracker gives the poses of a *marker body* on its own clock in its own, slightly tilted
+world. The IMU is bolted somewhere else on that body, turned against it, on another clock. `align`
+estimates all of it at once from one recording. With the tracker's attitude R and position p of the
+marker body at its time t, the two equations are, in the marker body,
+
+    ω(t)                        = Rx (gyro(t + lag(t)) − b_g)
+    Rᵀ (p̈ + R̈ l + g u)          = Rx (accel(t + lag(t) + δ) − b_a)
+
+ω comes from differences of the tracked attitude, p̈ and R̈ from second differences. The unknowns are
+the extrinsic rotation Rx (IMU → marker body), the lever arm l (in the marker body), the biases b_g
+and b_a, the upward direction u in the tracker's world, a lag that is piecewise linear in time, and
+a delay δ of the accelerometer against the gyro (phones filter it: 10 to 50 ms).
+
+Both sides pass the same Gaussian filter once, before anything is fitted; the lag moves so slowly
+that it commutes with the filter. First guesses of the lag are the peaks of the correlation of the
+magnitudes of both angular rates, ranked by how well one rotation explains the angular rates
+(Wahba's problem). A robust least-squares fit starts from each of the best, and the one that leaves
+least of the signals' power unexplained is repeated with all its knots. The model of the errors and
+the choice of the fit are ours.
+"""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.interpolate import CubicSpline
+from scipy.ndimage import gaussian_filter1d
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from gnio_jax.data.assembly import Samples, Streams
+from gnio_jax.data.reference import LOST_POSES, Poses
+from gnio_jax.data.resampling import known_at, splined
+from gnio_jax.numerics import (
+    hat,
+    interpolate,
+    levelling,
+    midpoints,
+    quaternions,
+    robust_std,
+    rotations,
+    turns_between,
+    within,
+)
+from gnio_jax.types import GRAVITY
+
+RATE = 100.0
+"""Hz of the clocks on which both sides are filtered."""
+FILTER_SECONDS = 0.03
+"""Standard deviation of the Gaussian filter: a pass band of 5 Hz holds the motion of a gait."""
+ROW_SECONDS = 0.05
+"""Errors are taken this far apart: the filter leaves little between them."""
+THINNED = 3
+"""Every so many of them choose between first guesses."""
+MARGIN = 0.2
+"""s at the ends of the IMU's samples that are not used: the filter's reach and the delay."""
+SHORTEST_OVERLAP = 10.0
+"""s of usable poses below which nothing is fitted."""
+LONGEST_BRIDGE = 0.1
+"""s between two of the IMU's samples up to which a spline stands in."""
+
+STARTS = 3
+"""Peaks of the correlation from which a fit starts, with a knot of the lag per 30 s."""
+SAME_LAG = 0.15
+"""s by which two fits may differ in lag and be one: less than half a step of a runner."""
+FASTEST_TURN = 6.0
+"""rad/s; flips of the tracker make rates that no hand makes, so rates are compared up to here."""
+TRUSTED_SHARE = 0.9
+"""Share of the rows by whose errors a fit is judged; the worst are the tracker's flips."""
+
+PRIOR_STD = np.repeat([0.05, 0.15, 0.2, 0.05, 0.05], [3, 3, 3, 2, 1])
+"""Weak priors around zero settle what a recording cannot tell: biases of a phone (rad/s, m/s²), a
+lever on the hand (m), a world that is nearly level (rad), the accelerometer's delay (s)."""
+TURN_STEP, LAG_STEP = 0.2, 0.05
+"""rad and s within which the errors are about linear; with `PRIOR_STD` the trust region's scale."""
+LAG_BEND_STD = 0.02
+"""s; clocks run straight: second difference of the lag from knot to knot."""
+BLOCK_SECONDS = 2.0
+"""Errors within this time share an offset."""
+LONGEST_POSE_LAG = 0.4
+"""s, to either side, by which poses of the IMU's own body may be late."""
+POSE_LAG_FILTER_SECONDS = 0.05
+"""Standard deviation of the Gaussian filter of both angular rates in `pose_lag`."""
+OUTLIER = 10.0
+"""Robust standard deviations beyond which a row takes no part in the next fit."""
+
+TURN, GYRO_BIAS, ACCEL_BIAS = slice(0, 3), slice(3, 6), slice(6, 9)
+LEVER, TILT, DELAY, LAG = slice(9, 12), slice(12, 14), 14, slice(15, None)
+"""Where the unknowns stand in a fit's vector: the turn from the first guess of the rotation (a
+rotation vector, rad), biases, lever, horizontal part of the upward direction over its vertical
+part, the accelerometer's delay, and the lag at each knot."""
+
+
+class TooLittle(ValueError):
+    """Too little of the track overlaps the IMU's recording."""
+
+
+class BodyFit(NamedTuple):
+    """What `align` estimates; SI units."""
+
+    extrinsic: Rotation
+    """IMU → marker body."""
+    lever: Float[np.ndarray, "3"]
+    """From the marker body's origin to the IMU, in the marker body, m."""
+    up: Float[np.ndarray, "3"]
+    """Unit vector against gravity in the tracker's world."""
+    gyro_bias: Float[np.ndarray, "3"]
+    accel_bias: Float[np.ndarray, "3"]
+    knots: Float[np.ndarray, " k"]
+    """Knots of the lag on the tracker's clock, s."""
+    lag: Float[np.ndarray, " k"]
+    """Time of the IMU minus time of the tracker for the same event, at the knots, s."""
+    accel_delay: float
+    """How much later than the gyro the accelerometer reports the same event, s."""
+    gyro_residual: float
+    """Robust standard deviation of the filtered angular rate's error, rad/s."""
+    accel_residual: float
+    """Robust standard deviation of the filtered acceleration's error, m/s²."""
+    gyro_unexplained: float
+    """Power of the filtered angular rate's error over that of the tracker's angular rate; 0 is a
+    perfect fit, 1 explains nothing."""
+    accel_unexplained: float
+    """The same of the acceleration, without gravity."""
+    runner_up: float
+    """What this fit leaves unexplained over what the best fit with another lag does; 0 where there
+    is no other, 1 where both are as good."""
+    poses: Poses
+    """The tracker's poses as those of the IMU, noisy still: its attitude in a level world on its
+    own clock, with the lever to it. Poses that contradict its acceleration grossly are left out."""
+
+
+def align(
+    imu: Streams,
+    track: Poses,
+    knot_seconds: float = 30.0,
+    around: float = 0.0,
+    search_seconds: float = 5.0,
+) -> BodyFit:
+    """The mounting of an IMU on a body whose noisy poses are `track`, both on clocks of their own.
+
+    `knot_seconds` is the spacing of the lag's knots; first guesses of the lag lie within
+    `search_seconds` of `around` (s). Raises `TooLittle` where too little of the track is usable.
+    Whether the best fit is a good one is the caller's to judge, by `gyro_unexplained`,
+    `accel_unexplained` and `runner_up`.
+    """
+    motion = _motion(imu, track)
+    thinned, knots = motion.rows(slice(None, None, THINNED)), uniform_knots(track.time, 30.0)
+    candidates = []
+    for lag in _ranked_lags(motion, around, search_seconds)[:STARTS]:
+        with suppress(TooLittle):
+            unknowns = np.concatenate([np.zeros(LAG.start), np.full(len(knots), lag)])
+            candidates.append(_fit(thinned, knots, _wahba(motion, lag), unknowns))
+    if not candidates:
+        raise TooLittle(f"less than {SHORTEST_OVERLAP:g} s of the track overlap the IMU's samples")
+    best = min(candidates, key=lambda fit: fit.unexplained)
+    lag = best.unknowns[LAG]
+    others = [
+        fit.unexplained
+        for fit in candidates
+        if abs(float(np.mean(fit.unknowns[LAG] - lag))) > SAME_LAG
+    ]
+    finer = uniform_knots(track.time, knot_seconds)
+    unknowns = np.concatenate([best.unknowns[: LAG.start], np.interp(finer, knots, lag)])
+    fit = _fit(motion, finer, best.extrinsic, unknowns)
+    return _body_fit(fit, track, best.unexplained / min(others) if others else 0.0)
+
+
+def without_jumps(poses: Poses, fastest_turn: float, fastest: float, around: float = 0.1) -> Poses:
+    """The poses that are not within `around` (s) of a step faster than `fastest_turn` (rad/s) or
+    `fastest` (m/s), which nobody makes."""
+    steps = np.diff(poses.time)
+    angle = np.linalg.norm(turns_between(poses.attitude), axis=1)
+    distance = np.linalg.norm(np.diff(poses.position, axis=0), axis=1)
+    jumps = np.flatnonzero((angle > fastest_turn * steps) | (distance > fastest * steps))
+    # A pose is near a jump that has not ended long before it and begins before long.
+    ended = np.searchsorted(poses.time[jumps + 1], poses.time - around)
+    begun = np.searchsorted(poses.time[jumps], poses.time + around, side="right")
+    rows = np.flatnonzero(ended == begun)
+    return poses._replace(
+        time=poses.time[rows], attitude=poses.attitude[rows], position=poses.position[rows]
+    )
+
+
+class _Motion(NamedTuple):
+    """Both sides of the equations, filtered: the tracker's in `time`, the IMU's at any time."""
+
+    time: Float[np.ndarray, " n"]
+    """s, on the tracker's clock, `ROW_SECONDS` apart, where its poses are reliable."""
+    rate: Float[np.ndarray, "n 3"]
+    """ω, rad/s."""
+    acceleration: Float[np.ndarray, "n 3"]
+    """Rᵀ p̈, m/s²."""
+    lever_gain: Float[np.ndarray, "n 3 3"]
+    """Rᵀ R̈, 1/s²."""
+    to_body: Float[np.ndarray, "n 3 3"]
+    """Rᵀ."""
+    gyro: CubicSpline
+    """rad/s, by the IMU's time."""
+    accel: CubicSpline
+    """m/s², by the IMU's time."""
+
+    def rows(self, rows: np.ndarray | slice) -> _Motion:
+        """The tracker's side in some rows."""
+        return _Motion(*(signal[rows] for signal in self[:5]), self.gyro, self.accel)
+
+    def covered(self, time: Float[np.ndarray, " m"]) -> np.ndarray:
+        """Which of the IMU's times lie within its samples."""
+        first = max(self.gyro.x[0], self.accel.x[0]) + MARGIN
+        last = min(self.gyro.x[-1], self.accel.x[-1]) - MARGIN
+        return (time > first) & (time < last)
+
+
+def _motion(imu: Streams, track: Poses) -> _Motion:
+    clock = np.arange(track.time[0], track.time[-1], 1.0 / RATE)
+    longest = LOST_POSES * float(np.median(np.diff(track.time)))
+    sigma = FILTER_SECONDS * RATE
+    place = splined(track.time, track.position, clock, longest)
+    wxyz = quaternions(track.attitude)  # q and −q are one rotation: neighbours get one sign
+    wxyz *= np.cumprod(np.where((wxyz * np.roll(wxyz, 1, 0)).sum(1) < 0, -1.0, 1.0))[:, None]
+    turned = rotations(splined(track.time, wxyz, clock, longest))
+    attitude, turning = turned.as_matrix(), turns_between(turned) * RATE
+    to_body = attitude.transpose(0, 2, 1)
+    rate = np.concatenate([turning[:1], midpoints(turning), turning[-1:]])
+    signals = (
+        rate,
+        np.einsum("nij,nj->ni", to_body, second_difference(place, 1.0 / RATE)),
+        to_body @ second_difference(attitude, 1.0 / RATE),
+        to_body,
+    )
+    seen = known_at(track.time, np.ones(len(track.time), dtype=bool), clock, longest)
+    reliable = ~within(~seen, int(np.ceil(3 * sigma)))
+    rows = np.flatnonzero(reliable)[:: round(ROW_SECONDS * RATE)]
+    if len(rows) * ROW_SECONDS < SHORTEST_OVERLAP:
+        raise TooLittle(f"less than {SHORTEST_OVERLAP:g} s of the track hold poses in a row")
+    filtered = (smooth(signal, sigma)[rows] for signal in signals)
+    return _Motion(clock[rows], *filtered, _filtered(imu.gyro), _filtered(imu.accel))
+
+
+def _filtered(samples: Samples) -> CubicSpline:
+    """Samples as a function of time, filtered on a uniform clock."""
+    clock = np.arange(samples.time[0], samples.time[-1], 1.0 / RATE)
+    values = splined(samples.time, samples.values, clock, LONGEST_BRIDGE)
+    return CubicSpline(clock, smooth(values, FILTER_SECONDS * RATE), axis=0)
+
+
+# --- first guesses
+
+
+def _ranked_lags(motion: _Motion, around: float, search_seconds: float) -> list[float]:
+    """Lags (s) at which the magnitudes of both angular rates correlate better than nearby, the most
+    plausible first.
+
+    Whoever walks in rounds or in figures of eight makes several such peaks, and the highest need
+    not be the right one.
+    """
+    # It takes half a second to import.
+    from scipy.signal import correlate, correlation_lags, find_peaks
+
+    felt_time = motion.gyro.x - around
+    grid = np.arange(
+        min(motion.time[0], felt_time[0]), max(motion.time[-1], felt_time[-1]), 1.0 / RATE
+    )
+    seen, felt = (
+        np.interp(grid, time, np.minimum(np.linalg.norm(rate, axis=1), FASTEST_TURN), 0.0, 0.0)
+        for time, rate in ((motion.time, motion.rate), (felt_time, motion.gyro(motion.gyro.x)))
+    )
+    score = correlate(felt - felt.mean(), seen - seen.mean(), method="fft")
+    lags = correlation_lags(len(grid), len(grid)) / RATE
+    near = np.abs(lags) <= search_seconds
+    # A peak may lie at the end of the search.
+    padded = np.pad(score[near], 1, constant_values=-np.inf)
+    peaks, _ = find_peaks(padded, distance=max(round(SAME_LAG * RATE), 1))
+    return sorted(lags[near][peaks - 1] + around, key=lambda lag: _unexplained_turning(motion, lag))
+
+
+def _unexplained_turning(motion: _Motion, lag: float) -> float:
+    """Share of the tracker's angular rate that the IMU's does not explain at a constant lag, after
+    the rotation that explains most; infinite where too little overlaps."""
+    try:
+        rotation = _wahba(motion, lag)
+    except TooLittle:
+        return np.inf
+    rows = motion.covered(motion.time + lag)
+    seen, felt = motion.rate[rows], motion.gyro(motion.time[rows] + lag)
+    return unexplained(seen - rotation.apply(felt), seen)
+
+
+def _wahba(motion: _Motion, lag: float) -> Rotation:
+    """The rotation that lays the angular rates on each other best at a constant lag."""
+    rows = motion.covered(motion.time + lag)
+    if rows.sum() * ROW_SECONDS < SHORTEST_OVERLAP:
+        raise TooLittle
+    felt = motion.gyro(motion.time[rows] + lag)
+    return Rotation.align_vectors(motion.rate[rows], felt)[0]
+
+
+# --- the fit
+
+
+class _Fit(NamedTuple):
+    extrinsic: Rotation
+    unknowns: Float[np.ndarray, " u"]
+    """As the slices above say; `TURN` is taken up in `extrinsic`."""
+    knots: Float[np.ndarray, " k"]
+    motion: _Motion
+    """In the rows that the IMU covers at the start."""
+    gyro: Float[np.ndarray, "n 3"]
+    """Errors of the angular rate in these rows, rad/s."""
+    accel: Float[np.ndarray, "n 3"]
+    """Errors of the acceleration, m/s²."""
+
+    @property
+    def unexplained(self) -> float:
+        """Geometric mean of the shares of both signals' power: with noise of unknown size the fit
+        with the least is likeliest."""
+        turning = unexplained(self.gyro, self.motion.rate)
+        return float(np.sqrt(turning * unexplained(self.accel, self.motion.acceleration)))
+
+
+def _fit(
+    motion: _Motion,
+    knots: Float[np.ndarray, " k"],
+    extrinsic: Rotation,
+    unknowns: Float[np.ndarray, " u"],
+) -> _Fit:
+    """The unknowns that explain both signals best, from a first guess.
+
+    Two rounds: scale of the errors, variance of their offsets (`_Noise`) and outliers are those of
+    the round before, or of the guess. Raises `TooLittle`.
+    """
+    hats = hat_functions(motion.time, knots)
+    covered = motion.covered(motion.time + hats @ unknowns[LAG])
+    motion, hats = motion.rows(covered), hats[covered]
+    if np.minimum(np.diff(motion.time, append=np.inf), 1.0).sum() < SHORTEST_OVERLAP:
+        raise TooLittle(f"less than {SHORTEST_OVERLAP:g} s of the track overlap the IMU's samples")
+    for _ in range(2):
+        extrinsic, unknowns = _improved(motion, hats, extrinsic, unknowns)
+    return _Fit(extrinsic, unknowns, knots, motion, *errors(motion, hats, extrinsic, unknowns))
+
+
+def _improved(
+    motion: _Motion,
+    hats: Float[np.ndarray, "n k"],
+    guess: Rotation,
+    unknowns: Float[np.ndarray, " u"],
+) -> tuple[Rotation, Float[np.ndarray, " u"]]:
+    """Extrinsic rotation and other unknowns of one robust fit."""
+    found = errors(motion, hats, guess, unknowns)
+    scales = max(robust_std(found[0]), 1e-4), max(robust_std(found[1]), 1e-3)
+    off = [np.linalg.norm(e, axis=1) / s for e, s in zip(found, scales, strict=True)]
+    kept = np.maximum(*off) < OUTLIER
+    motion, hats = motion.rows(kept), hats[kept]
+    noises = [_noise(motion.time, e[kept], s) for e, s in zip(found, scales, strict=True)]
+
+    def residuals(change: Float[np.ndarray, " u"]) -> Float[np.ndarray, " r"]:
+        x = unknowns + change
+        both = zip(noises, errors(motion, hats, guess, x), strict=True)
+        bends = np.diff(x[LAG], 2) / LAG_BEND_STD
+        return np.concatenate([*(n.whitened(e) for n, e in both), x[3:15] / PRIOR_STD, bends])
+
+    def derivatives(change: Float[np.ndarray, " u"]) -> Float[np.ndarray, "r u"]:
+        x = unknowns + change
+        both = zip(noises, jacobians(motion, hats, guess, x), strict=True)
+        unit = np.eye(len(x))
+        bends = np.diff(unit[LAG], 2, axis=0) / LAG_BEND_STD
+        prior = unit[3:15] / PRIOR_STD[:, None]
+        return np.concatenate([*(n.whitened(e) for n, e in both), prior, bends])
+
+    x = (
+        unknowns
+        + least_squares(
+            residuals,
+            np.zeros(len(unknowns)),
+            derivatives,
+            loss="cauchy",
+            f_scale=3.0,
+            x_scale=np.concatenate(
+                [np.full(3, TURN_STEP), PRIOR_STD, np.full(len(hats[0]), LAG_STEP)]
+            ),
+            ftol=1e-5,
+            max_nfev=20,
+        ).x
+    )
+    extrinsic = guess * Rotation.from_rotvec(x[TURN])
+    return extrinsic, np.concatenate([np.zeros(3), x[3:]])
+
+
+def errors(
+    motion: _Motion, hats: Float[np.ndarray, "n k"], guess: Rotation, x: Float[np.ndarray, " u"]
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+    """Errors of both equations in the marker body, the tracker's side minus the IMU's: rad/s and
+    m/s²."""
+    extrinsic = guess * Rotation.from_rotvec(x[TURN])
+    there = motion.time + hats @ x[LAG]
+    rate = motion.gyro(there) - x[GYRO_BIAS]
+    force = motion.accel(there + x[DELAY]) - x[ACCEL_BIAS]
+    seen = motion.acceleration + motion.lever_gain @ x[LEVER]
+    seen = seen + GRAVITY * motion.to_body @ upward(x[TILT])
+    return motion.rate - extrinsic.apply(rate), seen - extrinsic.apply(force)
+
+
+def jacobians(
+    motion: _Motion, hats: Float[np.ndarray, "n k"], guess: Rotation, x: Float[np.ndarray, " u"]
+) -> tuple[Float[np.ndarray, "n 3 u"], Float[np.ndarray, "n 3 u"]]:
+    """Derivatives of `errors` by the unknowns."""
+    rotation = (guess * Rotation.from_rotvec(x[TURN])).as_matrix()
+    # Of the rotation vector, to the second order of the turn.
+    turned = np.eye(3) - hat(x[TURN]) / 2.0 + hat(x[TURN]) @ hat(x[TURN]) / 6.0
+    there = motion.time + hats @ x[LAG]
+    late = there + x[DELAY]
+    gyro, accel = (np.zeros((len(hats), 3, len(x))) for _ in range(2))
+    gyro[:, :, TURN] = rotation @ hat(motion.gyro(there) - x[GYRO_BIAS]) @ turned
+    gyro[:, :, GYRO_BIAS] = rotation
+    gyro[:, :, LAG] = -(motion.gyro(there, 1) @ rotation.T)[:, :, None] * hats[:, None, :]
+    accel[:, :, TURN] = rotation @ hat(motion.accel(late) - x[ACCEL_BIAS]) @ turned
+    accel[:, :, ACCEL_BIAS] = rotation
+    accel[:, :, LEVER] = motion.lever_gain
+    up = upward(x[TILT])
+    by_tilt = up[2] * np.eye(3)[:, :2] - up[2] * np.outer(up, up[:2])
+    accel[:, :, TILT] = GRAVITY * motion.to_body @ by_tilt
+    accel[:, :, DELAY] = -motion.accel(late, 1) @ rotation.T
+    accel[:, :, LAG] = accel[:, :, DELAY, None] * hats[:, None, :]
+    return gyro, accel
+
+
+class _Noise(NamedTuple):
+    """Errors that are white but for an offset that each block of them shares."""
+
+    scale: float
+    """Standard deviation of the white part."""
+    starts: Int[np.ndarray, " b"]
+    """First row of each block."""
+    counts: Int[np.ndarray, " b"]
+    """Rows of each block."""
+    spread: Float[np.ndarray, " b"]
+    """Standard deviation of each block's mean over `scale`."""
+
+    def whitened(self, values: Float[np.ndarray, "n 3 *u"]) -> Float[np.ndarray, "r *u"]:
+        """Errors, or their derivatives, as uncorrelated rows of unit variance."""
+        values = values / self.scale
+        ones = (1,) * (values.ndim - 1)
+        mean = np.add.reduceat(values, self.starts) / self.counts.reshape(-1, *ones)
+        inner = values - np.repeat(mean, self.counts, axis=0)
+        whole = np.concatenate([inner, mean / self.spread.reshape(-1, *ones)])
+        return whole.reshape(-1, *values.shape[2:])
+
+
+def _noise(time: np.ndarray, error: Float[np.ndarray, "n 3"], scale: float) -> _Noise:
+    """A gyro's bias drifts, and a tracker's attitude is off by some tenths of a degree that depend
+    on the place: white noise would take a minute at rest for thousands of proofs of one
+    direction."""
+    _, starts, counts = np.unique(
+        np.floor(time / BLOCK_SECONDS), return_index=True, return_counts=True
+    )
+    mean = np.add.reduceat(error / scale, starts) / counts[:, None]
+    return _Noise(scale, starts, counts, np.sqrt(robust_std(mean) ** 2 + 1.0 / counts))
+
+
+def _body_fit(fit: _Fit, track: Poses, runner_up: float) -> BodyFit:
+    x, motion, extrinsic = fit.unknowns, fit.motion, fit.extrinsic
+    up = upward(x[TILT])
+    # A track that contradicts the accelerometer grossly has jumped.
+    contradiction = np.linalg.norm(fit.accel, axis=1)
+    jumps = motion.time[contradiction > max(6.0, 8.0 * robust_std(fit.accel))]
+    near = np.searchsorted(jumps, track.time - 0.1) < np.searchsorted(jumps, track.time + 0.1)
+    kept = np.flatnonzero(~near)
+    level, time = levelling(up), track.time[kept]
+    poses = Poses(
+        time=time + np.interp(time, fit.knots, x[LAG]),
+        attitude=level * track.attitude[kept] * extrinsic,
+        position=level.apply(track.position[kept]),
+        lever=extrinsic.inv().apply(x[LEVER]),
+        noisy=True,
+        source=track.source,
+    )
+    return BodyFit(
+        extrinsic=extrinsic,
+        lever=x[LEVER],
+        up=up,
+        gyro_bias=x[GYRO_BIAS],
+        accel_bias=x[ACCEL_BIAS],
+        knots=fit.knots,
+        lag=x[LAG],
+        accel_delay=float(x[DELAY]),
+        gyro_residual=robust_std(fit.gyro),
+        accel_residual=robust_std(fit.accel),
+        gyro_unexplained=unexplained(fit.gyro, motion.rate),
+        accel_unexplained=unexplained(fit.accel, motion.acceleration),
+        runner_up=runner_up,
+        poses=poses,
+    )
+
+
+def upward(tilt: Float[np.ndarray, "2"]) -> Float[np.ndarray, "3"]:
+    """Unit vector whose horizontal part over its vertical part is `tilt`."""
+    return np.array([*tilt, 1.0]) / np.sqrt(1.0 + tilt @ tilt)
+
+
+def unexplained(error: Float[np.ndarray, "n 3"], signal: Float[np.ndarray, "n 3"]) -> float:
+    """Power of the errors over that of the signal, on the `TRUSTED_SHARE` of the rows with the
+    smallest errors."""
+    square = (error**2).sum(axis=1)
+    trusted = square <= np.quantile(square, TRUSTED_SHARE)
+    return float(max(square[trusted].sum(), 1e-12) / max((signal[trusted] ** 2).sum(), 1e-12))
+
+
+# --- the lag alone, of poses that are the IMU's own
+
+
+class PoseLag(NamedTuple):
+    """What `pose_lag` estimates."""
+
+    lag: float
+    """By how much a pose is stamped later than the IMU's sample of the same event, s."""
+    correlation: float
+    """Of the angular rates once the lag is taken out, all axes together; 1 where nothing turns and
+    nothing can be found out."""
+
+
+def pose_lag(
+    time: Float[np.ndarray, " n"],
+    gyro: Float[np.ndarray, "n 3"],
+    stamps: Float[np.ndarray, " m"],
+    attitude: Rotation,
+) -> PoseLag:
+    """By how much poses of the IMU's body are late, from the angular rates of both.
+
+    `time`, `stamps` s; `gyro` rad/s; `attitude` m rotations body→world. The lag that lets gyro(t) −
+    bias and rate(t + lag) differ least, in a robust sense, both smoothed over 0.05 s (σ); among
+    multiples of 10 ms first, then by least squares.
+    """
+    steps = np.diff(stamps)
+    near = steps <= LOST_POSES / RATE
+    turning = (turns_between(attitude) / steps[:, None])[near]
+    middle = midpoints(stamps)
+    clock = np.arange(max(time[0], middle[0]), min(time[-1], middle[-1]), 1.0 / RATE)
+    felt, tracked = (
+        smooth(interpolate(clock, own, rate), POSE_LAG_FILTER_SECONDS * RATE)
+        for own, rate in ((time, gyro), (middle[near], turning))
+    )
+    inner = slice(round((LONGEST_POSE_LAG + 0.1) * RATE), -round((LONGEST_POSE_LAG + 0.1) * RATE))
+    tracked, clock, felt = CubicSpline(clock, tracked, axis=0), clock[inner], felt[inner]
+    turns = np.linalg.norm(felt - np.median(felt, axis=0), axis=1) if len(felt) else np.zeros(1)
+    if len(clock) < 5 * RATE or float(np.median(turns)) < 0.02:
+        return PoseLag(0.0, 1.0)
+
+    def error(unknowns: Float[np.ndarray, "4"]) -> Float[np.ndarray, "n 3"]:
+        return felt - unknowns[1:] - tracked(clock + unknowns[0])
+
+    def without_bias(lag: float) -> Float[np.ndarray, "4"]:
+        return np.array([lag, *np.median(error(np.array([lag, 0.0, 0.0, 0.0])), axis=0)])
+
+    hundredths = round(LONGEST_POSE_LAG * 100)
+    starts = [without_bias(i / 100.0) for i in range(-hundredths, hundredths + 1)]
+    start = min(starts, key=lambda unknowns: float(np.abs(error(unknowns)).mean()))
+    most = np.array([LONGEST_POSE_LAG + 0.05, np.inf, np.inf, np.inf])
+    best = least_squares(
+        lambda unknowns: error(unknowns).ravel(),
+        start,
+        loss="cauchy",
+        f_scale=max(3.0 * robust_std(error(start)), 1e-6),
+        x_scale="jac",
+        bounds=(-most, most),
+    ).x
+    first, second = (rate - rate.mean(axis=0) for rate in (felt, tracked(clock + best[0])))
+    power = np.sqrt((first**2).sum() * (second**2).sum())
+    return PoseLag(float(best[0]), float((first * second).sum() / power))
+
+
+# --- shared with `positions`
+
+
+def smooth(values: np.ndarray, sigma: float) -> np.ndarray:
+    """Rows filtered by a Gaussian of `sigma` samples; the ends are held."""
+    return gaussian_filter1d(values, sigma, axis=0, mode="nearest")
+
+
+def second_difference(values: Float[np.ndarray, "n *w"], step: float) -> Float[np.ndarray, "n *w"]:
+    """Second derivative of uniform samples by central differences; the ends repeat their
+    neighbours.
+
+    It is zero to the last bit of a constant, unlike a sampled derivative of a Gaussian.
+    """
+    inner = (values[2:] - 2.0 * values[1:-1] + values[:-2]) / step**2
+    return np.concatenate([inner[:1], inner, inner[-1:]])
+
+
+def uniform_knots(time: Float[np.ndarray, " n"], spacing: float) -> Float[np.ndarray, " k"]:
+    """Knots over a clock, evenly spaced by at most `spacing` (s)."""
+    intervals = max(int(np.ceil((time[-1] - time[0]) / spacing)), 1)
+    return np.linspace(time[0], time[-1], intervals + 1)
+
+
+def hat_functions(
+    time: Float[np.ndarray, " n"], knots: Float[np.ndarray, " k"]
+) -> Float[np.ndarray, "n k"]:
+    """Basis of piecewise linear functions of time: each is 1 at one knot and 0 at the others."""
+    return np.clip(1.0 - np.abs((time[:, None] - knots) / (knots[1] - knots[0])), 0.0, 1.0)

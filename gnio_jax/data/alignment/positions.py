@@ -1,0 +1,276 @@
+"""A phone and the positions of another device that moves with it, whose attitude is unknown.
+
+`align_positions` finds by how much the clocks of both differ and which way the phone points in the
+tracker's level world, from accelerations alone: those of the phone, turned by its own integrated
+gyro, against the second difference of the positions.
+
+The first guess of the lag is the one at which both accelerations correlate best. The vertical ones
+need no heading and show every step; the horizontal ones, compared within stretches in which the
+yaw hardly drifts, tell one step from the next. Then one robust least-squares fit finds a rotation
+and a lag, both of which vary slowly. All of this is ours.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.interpolate import CubicSpline
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from gnio_jax.data.alignment.body import (
+    LAG_BEND_STD,
+    LONGEST_BRIDGE,
+    RATE,
+    SAME_LAG,
+    TooLittle,
+    hat_functions,
+    second_difference,
+    smooth,
+    uniform_knots,
+)
+from gnio_jax.data.assembly import Samples, Streams
+from gnio_jax.data.reference import Poses, smooth_positions
+from gnio_jax.data.resampling import known_at, slerped, splined
+from gnio_jax.numerics import (
+    about_z,
+    integrate_gyro,
+    midpoints,
+    robust_std,
+    rotations,
+    slerp,
+    turns_between,
+    within,
+)
+from gnio_jax.types import GRAVITY
+
+STEP_FILTER_SECONDS, SLOW_FILTER_SECONDS = 0.08, 0.25
+"""Standard deviations of the Gaussian filters: one keeps the steps, whose vertical acceleration
+tells the lag; the other leaves no gait, which differs between two devices in two hands."""
+SHORTEST_OVERLAP = 20.0
+"""s of usable positions below which nothing is fitted."""
+STRETCH_SECONDS = 15.0
+"""Length of the stretches whose horizontal accelerations are compared: in it the yaw hardly
+drifts."""
+LAG_STEP = 0.02
+"""s between the constant lags that are tried."""
+TURN_KNOT_SECONDS, LAG_KNOT_SECONDS = 10.0, 30.0
+"""Spacing of the knots of the rotation and of the lag."""
+DRIFT_STD = np.array([0.05, 0.05, 0.02])
+"""rad by which the gyro's drift about x, y and z may change from one interval of 10 s to the next:
+0.005 rad/s in tilt and 0.002 rad/s in yaw."""
+STEPS = 0.3, 0.03
+"""rad and s within which the fit is about linear: the trust region's scale."""
+UPWARD = np.array([0.0, 0.0, GRAVITY])
+"""What an accelerometer at rest feels in a level world, m/s²."""
+CUTOFF = 2.0
+"""Hz, half response of the smoother of the positions: what is faster is the tracker's noise and the
+sway of the other device."""
+
+
+class PositionsFit(NamedTuple):
+    """What `align_positions` estimates; SI units."""
+
+    lag: Float[np.ndarray, " k"]
+    """Time of the IMU minus time of the tracker for the same event, at knots over the recording,
+    s."""
+    yaw_drift: float
+    """Range of the yaw by which the device's own attitude is off, rad."""
+    correlation: float
+    """Of the vertical accelerations at the best constant lag."""
+    runner_up: float
+    """What the best constant lag leaves unexplained over what the second best does; 1 where both
+    are as good."""
+    poses: Poses
+    """Of the IMU, on its own clock: its attitude, with the tracker's smoothed positions and their
+    velocities."""
+
+
+class _Signals(NamedTuple):
+    """Accelerations of both, in level worlds."""
+
+    clock: Float[np.ndarray, " n"]
+    """The IMU's, uniform, s."""
+    felt: Float[np.ndarray, "n 3"]
+    """By the device's own attitude, without gravity, m/s²."""
+    grid: Float[np.ndarray, " m"]
+    """The tracker's clock, uniform, s."""
+    tracked: Float[np.ndarray, "m 3"]
+    """Second difference of the positions, m/s²."""
+    good: Bool[np.ndarray, " m"]
+    """False near positions that are missing, and where the tracker relocalised."""
+
+
+def align_positions(imu: Streams, track: Samples, search_seconds: float = 4.0) -> PositionsFit:
+    """Attitude and clock of an IMU, whose device gives an attitude of its own, against positions
+    (m) in a level world.
+
+    That attitude takes part of each stride's acceleration for gravity: up to 6° of tilt, and it
+    drifts in yaw. Over minutes, though, gravity tells it the gyro's bias in tilt. Raises
+    `TooLittle` where both share less than 20 s.
+    """
+    assert imu.device is not None
+    first = max(each.time[0] for each in (imu.gyro, imu.accel, imu.device))
+    last = min(each.time[-1] for each in (imu.gyro, imu.accel, imu.device))
+    clock = np.arange(first, last, 1.0 / RATE)
+    gyro, accel = (
+        splined(each.time, each.values, clock, LONGEST_BRIDGE) for each in (imu.gyro, imu.accel)
+    )
+    device = rotations(slerped(imu.device.time, imu.device.values, clock))
+
+    grid = np.arange(track.time[0], track.time[-1], 1.0 / RATE)
+    position = splined(track.time, track.values, grid, LONGEST_BRIDGE)
+    seen = known_at(track.time, np.ones(len(track.time), dtype=bool), grid, LONGEST_BRIDGE)
+    tracked = second_difference(position, 1.0 / RATE)
+    # Accelerations that no pedestrian makes are jumps.
+    strength = np.linalg.norm(smooth(tracked, STEP_FILTER_SECONDS * RATE), axis=1)
+    jumps = strength > 8.0 * max(float(np.median(strength)), 0.1)
+    good = ~within(~seen | jumps, round(2 * SLOW_FILTER_SECONDS * RATE))
+    signals = _Signals(clock, device.apply(accel) - UPWARD, grid, tracked, good)
+    lag, correlation, runner_up = _constant_lag(signals, search_seconds)
+
+    bias = (midpoints(gyro) - turns_between(device) * RATE).mean(axis=0)
+    integrated = integrate_gyro(gyro - bias, 1.0 / RATE)
+    knots = uniform_knots(clock, TURN_KNOT_SECONDS)
+    # The device's attitude about each knot, turned to the tracker's yaw, is the first guess.
+    drifting = device * integrated.inv()
+    at_knots = [drifting[np.abs(clock - knot) <= 1.0].mean() for knot in knots]
+    yaw = _yaw(signals, knots, lag)
+    guess = about_z(yaw) * Rotation.concatenate(at_knots)
+    lags = np.full(len(uniform_knots(clock, LAG_KNOT_SECONDS)), lag)
+    correction, lags = _fit(signals, accel, integrated, knots, guess, lags)
+
+    attitude = slerp(clock, knots, correction) * integrated
+    there = clock - np.interp(clock, uniform_knots(clock, LAG_KNOT_SECONDS), lags)
+    shared = np.flatnonzero((there >= grid[0]) & (there <= grid[-1]))
+    there = there[shared]
+    place, velocity, kept = smooth_positions(
+        splined(grid, position, there, LONGEST_BRIDGE),
+        np.interp(there, grid, (seen & ~jumps).astype(float)) > 0.99,
+        1.0 / RATE,
+        CUTOFF,
+    )
+    rows = shared[kept]
+    poses = Poses(clock[rows], attitude[rows], place[kept], velocity[kept], source=track.source)
+    return PositionsFit(lags, float(np.ptp(yaw)), correlation, runner_up, poses)
+
+
+def _constant_lag(signals: _Signals, search_seconds: float) -> tuple[float, float, float]:
+    """(best constant lag, correlation of the vertical accelerations at it, what it leaves
+    unexplained over what the next best peak leaves)."""
+    from scipy.signal import find_peaks  # takes half a second to import
+
+    felt = smooth(signals.felt, STEP_FILTER_SECONDS * RATE)
+    tracked = smooth(signals.tracked, STEP_FILTER_SECONDS * RATE)
+    stretch = np.floor((signals.grid - signals.grid[0]) / STRETCH_SECONDS).astype(int)
+
+    def correlations(lag: float) -> tuple[float, float]:
+        """Of the vertical accelerations, and of the horizontal ones whatever the yaw of each
+        stretch (the mean square, by the time that both share)."""
+        there = signals.grid + lag
+        rows = signals.good & (there > signals.clock[0]) & (there < signals.clock[-1])
+        if rows.sum() < SHORTEST_OVERLAP * RATE:
+            return 0.0, 0.0
+        own = np.stack([np.interp(there[rows], signals.clock, each) for each in felt.T], axis=1)
+        seen, number = tracked[rows], stretch[rows]
+        along, across, power, other = (
+            np.bincount(number, values)
+            for values in (
+                (own[:, :2] * seen[:, :2]).sum(axis=1),
+                own[:, 0] * seen[:, 1] - own[:, 1] * seen[:, 0],
+                (own[:, :2] ** 2).sum(axis=1),
+                (seen[:, :2] ** 2).sum(axis=1),
+            )
+        )
+        level = (along**2 + across**2) / np.maximum(power * other, 1e-12)
+        vertical = float(np.corrcoef(own[:, 2], seen[:, 2])[0, 1])
+        return vertical, float(np.average(level, weights=np.bincount(number) + 1e-9))
+
+    most = round(search_seconds / LAG_STEP)
+    lags = np.arange(-most, most + 1) * LAG_STEP
+    found = np.array([correlations(lag) for lag in lags])
+    if not found.any():
+        raise TooLittle(f"less than {SHORTEST_OVERLAP:g} s of positions overlap the IMU's samples")
+    # A negative correlation explains nothing.
+    explained = 0.5 * (np.maximum(found[:, 0], 0.0) ** 2 + found[:, 1])
+    best = int(np.argmax(explained))
+    peaks, _ = find_peaks(np.pad(explained, 1, constant_values=-np.inf))
+    others = [explained[i] for i in peaks - 1 if abs(lags[i] - lags[best]) > SAME_LAG]
+    runner_up = (1.0 - explained[best]) / (1.0 - max(others)) if others else 0.0
+    return float(lags[best]), float(found[best, 0]), float(runner_up)
+
+
+def _yaw(signals: _Signals, knots: Float[np.ndarray, " k"], lag: float) -> Float[np.ndarray, " k"]:
+    """Yaw (rad) from the device's world to the tracker's about each knot, by the slow horizontal
+    accelerations of one and a half stretches to either side."""
+    felt = smooth(signals.felt, SLOW_FILTER_SECONDS * RATE)
+    tracked = smooth(signals.tracked, SLOW_FILTER_SECONDS * RATE)
+    there = signals.grid + lag
+    rows = signals.good & (there > signals.clock[0]) & (there < signals.clock[-1])
+    there, seen = there[rows], tracked[rows]
+    own = np.stack([np.interp(there, signals.clock, each) for each in felt.T], axis=1)
+    along = (own[:, :2] * seen[:, :2]).sum(axis=1)
+    across = own[:, 0] * seen[:, 1] - own[:, 1] * seen[:, 0]
+    near = np.abs(there[:, None] - knots) < 1.5 * STRETCH_SECONDS
+    return np.unwrap(np.arctan2(across @ near, along @ near))
+
+
+def _fit(
+    signals: _Signals,
+    accel: Float[np.ndarray, "n 3"],
+    integrated: Rotation,
+    knots: Float[np.ndarray, " k"],
+    correction: Rotation,
+    lags: Float[np.ndarray, " l"],
+) -> tuple[Rotation, Float[np.ndarray, " l"]]:
+    """The corrections of the integrated gyro at the knots and the lags at theirs that lead the
+    accelerations onto each other, from a first guess.
+
+    The vertical accelerations of the steps, by the device's own attitude, decide about the lag; the
+    slow ones, in all axes, about the attitude.
+    """
+    clock, count = signals.clock, len(knots)
+    there = clock - lags.mean()
+    inside = (there > signals.grid[0] + 1.0) & (there < signals.grid[-1] - 1.0)
+    usable = inside & (np.interp(there, signals.grid, signals.good.astype(float)) > 0.99)
+    step, slow = STEP_FILTER_SECONDS * RATE, SLOW_FILTER_SECONDS * RATE
+    rises = CubicSpline(signals.grid, smooth(signals.tracked[:, 2], step))
+    tracked = CubicSpline(signals.grid, smooth(signals.tracked, slow), axis=0)
+    at_steps, at_slow = (np.flatnonzero(usable)[:: round(sigma)] for sigma in (step, slow))
+    felt_rises = smooth(signals.felt[:, 2], step)[at_steps]
+    lag_knots = uniform_knots(clock, LAG_KNOT_SECONDS)
+    step_hats, slow_hats = (hat_functions(clock[rows], lag_knots) for rows in (at_steps, at_slow))
+    turn_hats = hat_functions(clock[at_slow], knots)
+
+    for _ in range(3):
+        turned = (slerp(clock, knots, correction) * integrated).apply(accel)
+        force = smooth(turned, slow)[at_slow]
+
+        def errors(x: Float[np.ndarray, " u"], force=force, lags=lags) -> list[np.ndarray]:
+            turns, lag = x[: 3 * count].reshape(count, 3), lags + x[3 * count :]
+            felt = Rotation.from_rotvec(turn_hats @ turns).apply(force) - UPWARD
+            of_steps = rises(clock[at_steps] - step_hats @ lag) - felt_rises
+            return [of_steps, tracked(clock[at_slow] - slow_hats @ lag) - felt]
+
+        start = np.zeros(3 * count + len(lags))
+        scales = [max(robust_std(error), 1e-3) for error in errors(start)]
+
+        def residuals(
+            x, errors=errors, scales=scales, guess=correction, lags=lags
+        ) -> Float[np.ndarray, " r"]:
+            # Neighbouring rows are correlated by the filter.
+            parts = [(e / s).ravel() / 1.6 for e, s in zip(errors(x), scales, strict=True)]
+            now = Rotation.from_rotvec(x[: 3 * count].reshape(count, 3)) * guess
+            drift = np.diff((now[1:] * now[:-1].inv()).as_rotvec(), axis=0) / DRIFT_STD
+            bends = np.diff(lags + x[3 * count :], 2) / LAG_BEND_STD
+            return np.concatenate([*parts, drift.ravel(), bends])
+
+        reach = np.repeat(STEPS, [3 * count, len(lags)])
+        change = least_squares(
+            residuals, start, loss="cauchy", f_scale=2.0, x_scale=reach, ftol=1e-4, max_nfev=20
+        ).x
+        correction = Rotation.from_rotvec(change[: 3 * count].reshape(count, 3)) * correction
+        lags = lags + change[3 * count :]
+    return correction, lags

@@ -1,0 +1,205 @@
+"""An IMU on a tracked body: known mountings must come back, whatever the rates of its sensors."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from gnio_jax.data import alignment
+from gnio_jax.data.alignment import body
+from gnio_jax.data.assembly import Poses, Samples, Streams
+from tests.support import known_walk as walk
+from tests.support.idol_files import BIAS
+
+EXTRINSIC = Rotation.from_euler("ZXY", [-170.0, 3.0, 2.0], degrees=True)
+LEVER = np.array([-0.02, 0.08, 0.01])
+TILT = np.array([0.02, -0.01])
+
+
+def upward(tilt):
+    return np.array([*tilt, 1.0]) / np.linalg.norm([*tilt, 1.0])
+
+
+def imu(gyro_hz=100.0, accel_hz=100.0, lag=0.0, late=0.0, bias=0.0, start=-2.0, stop=42.0):
+    """An IMU whose clock is `lag` (s) ahead of the tracker's, and whose accelerometer reports an
+    event `late` (s)."""
+    gyro, accel = (np.arange(start, stop, 1.0 / rate) for rate in (gyro_hz, accel_hz))
+    return Streams(
+        "walk",
+        "walk",
+        Samples(gyro + lag, walk.rate(gyro) + bias, "gyro"),
+        Samples(accel + lag, walk.force(accel - late), "accel"),
+    )
+
+
+def tracked(hz=100.0):
+    """The marker body of that IMU, in a tilted world."""
+    time = np.arange(0.0, 40.0, 1.0 / hz)
+    tilted = Rotation.align_vectors(upward(TILT)[None], [[0.0, 0.0, 1.0]])[0]
+    attitude = tilted * walk.attitude(time) * EXTRINSIC.inv()
+    position = tilted.apply(walk.position(time)) - attitude.apply(LEVER)
+    return Poses(time, attitude, position, noisy=True)
+
+
+@pytest.mark.parametrize(
+    ("gyro_hz", "accel_hz", "track_hz"), [(100.0, 100.0, 100.0), (90.3, 107.1, 60.0)]
+)
+def test_a_known_mounting_is_found_on_a_late_clock(gyro_hz, accel_hz, track_hz):
+    bias = np.array([0.01, -0.005, 0.02])
+    streams = imu(gyro_hz, accel_hz, lag=0.7, late=0.02, bias=bias)
+    track = tracked(track_hz)
+    found = alignment.align(streams, track)
+    assert np.degrees((found.extrinsic * EXTRINSIC.inv()).magnitude()) < 0.1
+    np.testing.assert_allclose(found.lever, LEVER, atol=5e-3)
+    np.testing.assert_allclose(found.up, upward(TILT), atol=2e-3)
+    np.testing.assert_allclose(found.gyro_bias, bias, atol=1e-3)
+    np.testing.assert_allclose(found.lag, 0.7, atol=3e-3)
+    assert found.accel_delay == pytest.approx(0.02, abs=3e-3)
+    assert found.gyro_unexplained < 0.01 and found.accel_unexplained < 0.01
+    assert found.runner_up < 0.5
+    # The poses are those of the IMU, in a level world, on its clock.
+    poses = found.poses
+    assert poses.noisy and len(poses.time) == len(track.time)
+    event = poses.time - 0.7
+    turned = poses.attitude * walk.attitude(event).inv()
+    yaw = Rotation.from_euler("z", turned.mean().as_euler("ZXY")[0])
+    assert np.degrees((turned * yaw.inv()).magnitude()).max() < 0.3
+    place = poses.position + poses.attitude.apply(poses.lever)
+    np.testing.assert_allclose(place, yaw.apply(walk.position(event)), atol=0.02)
+
+
+def test_first_guesses_lie_around_what_is_known():
+    # Seconds between the clocks of two devices are known where their files say so.
+    found = alignment.align(imu(lag=31.4), tracked(), around=31.2, search_seconds=0.5)
+    np.testing.assert_allclose(found.lag, 31.4, atol=3e-3)
+    assert np.degrees((found.extrinsic * EXTRINSIC.inv()).magnitude()) < 0.1
+
+
+def test_a_jump_of_the_tracker_bends_nothing_and_its_poses_are_left_out():
+    track = tracked()
+    jumped = (track.time > 20.0) & (track.time < 20.3)
+    track.position[jumped] += [0.4, 0.2, 0.1]
+    found = alignment.align(imu(), track)
+    np.testing.assert_allclose(found.lever, LEVER, atol=5e-3)
+    np.testing.assert_allclose(found.lag, 0.0, atol=3e-3)
+    kept = found.poses.time - found.lag.mean()
+    assert np.abs(kept[:, None] - [20.0, 20.3]).min() > 0.05
+    assert len(track.time) - 150 < len(kept) < len(track.time) - 20
+
+
+def test_too_short_an_overlap_is_refused():
+    with pytest.raises(alignment.TooLittle, match="less than 10 s of the track overlap"):
+        alignment.align(imu(stop=7.0), tracked())
+
+
+def test_a_track_of_single_poses_is_refused():
+    track = tracked()
+    rows = np.flatnonzero(np.arange(len(track.time)) % 40 < 4)
+    seldom = Poses(track.time[rows], track.attitude[rows], track.position[rows], noisy=True)
+    with pytest.raises(alignment.TooLittle, match="poses in a row"):
+        alignment.align(imu(), seldom)
+
+
+def test_poses_near_flips_and_jumps_are_dropped():
+    time = np.arange(0.0, 5.0, 0.01)
+    angles = np.zeros(len(time))
+    angles[100:103] = np.radians(30.0)
+    position = np.zeros((len(time), 3))
+    position[300:] += [0.0, 0.5, 0.0]
+    poses = Poses(time, Rotation.from_rotvec(angles[:, None] * [0.0, 1.0, 0.0]), position)
+    kept = alignment.without_jumps(poses, np.radians(600.0), 10.0)
+    times = set(np.round(kept.time, 2))
+    lost = set(np.round(time, 2)) - times
+    assert lost == {round(0.01 * i, 2) for i in (*range(89, 114), *range(289, 311))}
+    untouched = alignment.without_jumps(poses._replace(time=time * 100), 1e3, 1e3)
+    assert len(untouched.time) == len(time)
+
+
+# --- parts
+
+
+def test_the_jacobians_are_the_differences_of_the_errors():
+    motion = body._motion(imu(), tracked())
+    knots = body.uniform_knots(motion.time, 15.0)
+    rows = slice(10, -10, 7)
+    motion, hats = motion.rows(rows), body.hat_functions(motion.time, knots)[rows]
+    lag = np.array([0.01, -0.02, 0.03, 0.0])
+    turn, biases = np.array([0.1, -0.2, 0.1]), np.array([0.01, -0.02, 0.005, 0.1, 0.05, -0.08])
+    x = np.concatenate([turn, biases, LEVER + 0.03, [0.2, -0.1], [0.013], lag])
+    found = body.jacobians(motion, hats, EXTRINSIC, x)
+    for column, step in enumerate(1e-5 * np.eye(len(x))):
+        pairs = zip(
+            found,
+            body.errors(motion, hats, EXTRINSIC, x + step),
+            body.errors(motion, hats, EXTRINSIC, x - step),
+            strict=True,
+        )
+        for jacobian, after, before in pairs:
+            expected = (after - before) / 2e-5
+            tolerance = 2e-3 * np.abs(expected).max() + 1e-6
+            np.testing.assert_allclose(jacobian[:, :, column], expected, atol=tolerance, rtol=0)
+
+
+def test_whitened_errors_have_the_covariance_of_white_noise_with_shared_offsets():
+    counts, spread, scale = np.array([3, 5]), np.array([0.9, 0.8]), 0.1
+    noise = body._Noise(scale, np.array([0, 3]), counts, spread)
+    blocks = [np.eye(n) + (s**2 - 1 / n) for n, s in zip(counts, spread, strict=True)]
+    covariance = np.zeros((8, 8))
+    covariance[:3, :3], covariance[3:, 3:] = scale**2 * blocks[0], scale**2 * blocks[1]
+    errors = np.random.default_rng(0).standard_normal((8, 3))
+    expected = np.einsum("ik,ij,jk->", errors, np.linalg.inv(covariance), errors)
+    assert (noise.whitened(errors) ** 2).sum() == pytest.approx(expected, rel=1e-12)
+    jacobian = np.random.default_rng(1).standard_normal((8, 3, 2))
+    np.testing.assert_allclose(noise.whitened(jacobian)[:, 1], noise.whitened(jacobian[..., 1]))
+
+
+def test_hat_functions_are_linear_interpolation():
+    time = np.linspace(2.0, 33.0, 400)
+    knots = body.uniform_knots(time, 10.0)
+    assert len(knots) == 5 and np.diff(knots).max() <= 10.0
+    assert knots[0] == 2.0 and knots[-1] == 33.0
+    values = np.random.default_rng(0).standard_normal(len(knots))
+    hats = body.hat_functions(time, knots)
+    np.testing.assert_allclose(hats @ values, np.interp(time, knots, values), atol=1e-12)
+
+
+def test_second_difference_is_exact_for_a_parabola_and_zero_for_a_constant():
+    time = np.arange(0.0, 5.0, 0.01)
+    parabola = np.stack([0.5 * 3.0 * time**2, 7.0 - time], axis=1)
+    np.testing.assert_allclose(
+        body.second_difference(parabola, 0.01), np.tile([3.0, 0.0], (len(time), 1)), atol=1e-9
+    )
+    assert (body.second_difference(np.full((9, 1), np.pi), 0.01) == 0.0).all()
+
+
+def test_the_worst_tenth_of_the_rows_is_not_held_against_a_fit():
+    signal = np.ones((100, 3))
+    error = 0.1 * signal
+    error[:9] = 100.0
+    assert body.unexplained(error, signal) == pytest.approx(0.01)
+
+
+# --- the lag alone
+
+
+@pytest.mark.parametrize("lag", [-0.12, 0.0, 0.033, 0.187])
+def test_lag_from_noisy_rates_with_a_bias(lag):
+    noise = np.random.default_rng(1)
+    time = np.arange(0, 60, 0.01)
+    gyro = walk.rate(time) + BIAS + noise.normal(0, 0.02, (len(time), 3))
+    gyro[2000:2020] += 8.0  # a knock
+    poses = walk.attitude(time - lag) * Rotation.from_rotvec(
+        noise.normal(0, np.radians(0.05), (len(time), 3))
+    )
+    keep = (time < 30) | (time > 30.4)
+    fit = alignment.pose_lag(time, gyro, time[keep], poses[keep])
+    assert fit.lag == pytest.approx(lag, abs=3e-3) and fit.correlation > 0.5
+
+
+def test_what_stands_still_has_no_lag():
+    time = np.arange(0, 20, 0.01)
+    gyro = np.full((len(time), 3), 0.01) + np.random.default_rng(0).normal(0, 0.005, (len(time), 3))
+    assert alignment.pose_lag(time, gyro, time, Rotation.identity(len(time))) == alignment.PoseLag(
+        0.0, 1.0
+    )

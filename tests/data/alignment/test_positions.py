@@ -1,0 +1,62 @@
+"""A phone and tracked positions, against a walk in closed form."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from gnio_jax import numerics
+from gnio_jax.data import alignment
+from gnio_jax.data.assembly import Samples, Streams
+from tests.support import known_walk as walk
+
+
+def phone(seconds, lag=0.0, drift=0.0, tilt=(0.0, 0.0)):
+    """A phone whose clock is `lag` (s) ahead, and whose own attitude is tilted and drifts in yaw
+    (rad/s)."""
+    time = np.arange(0.0, seconds, 0.01)
+    yaw = np.multiply.outer(-0.5 - drift * time, [0.0, 0.0, 1.0])
+    own = Rotation.from_rotvec(yaw) * Rotation.from_euler("xy", tilt)
+    device = numerics.quaternions(own * walk.attitude(time))
+    gyro = walk.rate(time) + np.array([0.004, -0.002, 0.003])
+    return Streams(
+        "walk",
+        "walk",
+        Samples(time + lag, gyro, "gyro"),
+        Samples(time + lag, walk.force(time), "accel"),
+        device=Samples(time + lag, device, "attitude"),
+    )
+
+
+def test_clock_and_attitude_are_found_and_a_relocalisation_does_not_matter():
+    time = np.arange(3.0, 120.0, 0.01)
+    position = walk.position(time)
+    position[6000:] += [2.0, -1.0, 0.3]  # the tracker relocalised
+    streams = phone(125.0, lag=1.3, drift=0.003, tilt=(0.05, -0.03))
+    found = alignment.align_positions(streams, Samples(time, position, "track"))
+    np.testing.assert_allclose(found.lag, 1.3, atol=0.01)
+    assert found.correlation > 0.95 and found.runner_up < 1.0
+    assert found.yaw_drift == pytest.approx(0.003 * 120, abs=0.06)
+    poses = found.poses
+    event = poses.time - 1.3
+    error = (poses.attitude * walk.attitude(event).inv()).as_rotvec()
+    inner = (event > 6.0) & (event < 117.0) & (np.abs(event - 63.0) > 2.0)
+    assert np.degrees(np.linalg.norm(error[inner, :2], axis=1)).max() < 0.7
+    assert np.degrees(np.abs(error[inner, 2])).max() < 2.0
+    inner &= event < 60.0
+    assert np.abs(poses.position - walk.position(event))[inner].max() < 0.02
+    # Its steps, 1.8 Hz, are beyond the smoother's cutoff in part.
+    assert np.abs(poses.velocity - walk.velocity(event))[inner].max() < 0.2
+
+
+def test_positions_of_another_walk_do_not_correlate():
+    time = np.arange(0.0, 100.0, 0.01)
+    other = Samples(time, walk.position(1.3 * time), "track")
+    assert alignment.align_positions(phone(100.0), other).correlation < 0.5
+
+
+def test_too_short_an_overlap_is_refused():
+    time = np.arange(0.0, 19.0, 0.01)
+    with pytest.raises(alignment.TooLittle, match="less than 20 s"):
+        alignment.align_positions(phone(19.0), Samples(time, walk.position(time), "track"))
