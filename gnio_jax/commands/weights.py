@@ -160,7 +160,7 @@ def export(asked: ExportOptions, _call: options.Call) -> None:
     out = asked.out or Path("exports") / f"{name}_onnx"
     with console.terminal() as terminal:
         terminal.progress("exporting and measuring", 0.0)
-        found = deployment.export_run(asked.run, out, "onnx")
+        found = deployment.export_run(asked.run, out)
     output = console.stdout()
     for file, size in found.bytes.items():
         output.print(f"  {out / file}  {size / 1e6:.2f} MB", soft_wrap=True)
