@@ -54,7 +54,9 @@ def test_help_ends_with_examples_that_are_understood(words, capsys):
         understood(shlex.split(call)[1:])
 
 
-@pytest.mark.parametrize(("words", "command"), list(commands()), ids=str)
+@pytest.mark.parametrize(
+    ("words", "command"), list(commands()), ids=[" ".join(w) for w, _ in commands()]
+)
 def test_help_explains_every_option(words, command, capsys):
     kind, text = options.options_type(command), shown(capsys, *words, "-H")
     for option in options.options_of(kind):
