@@ -206,7 +206,13 @@ class _Motion(NamedTuple):
 
     def rows(self, rows: np.ndarray | slice) -> _Motion:
         """The tracker's side in some rows."""
-        return _Motion(*(signal[rows] for signal in self[:5]), self.gyro, self.accel)
+        return self._replace(
+            time=self.time[rows],
+            rate=self.rate[rows],
+            acceleration=self.acceleration[rows],
+            lever_gain=self.lever_gain[rows],
+            to_body=self.to_body[rows],
+        )
 
     def covered(self, time: Float[np.ndarray, " m"]) -> np.ndarray:
         """Which of the IMU's times lie within its samples."""
@@ -226,19 +232,22 @@ def _motion(imu: Streams, track: Poses) -> _Motion:
     attitude, turning = turned.as_matrix(), turns_between(turned) * RATE
     to_body = attitude.transpose(0, 2, 1)
     rate = np.concatenate([turning[:1], midpoints(turning), turning[-1:]])
-    signals = (
-        rate,
-        np.einsum("nij,nj->ni", to_body, second_difference(place, 1.0 / RATE)),
-        to_body @ second_difference(attitude, 1.0 / RATE),
-        to_body,
-    )
     seen = known_at(track.time, np.ones(len(track.time), dtype=bool), clock, longest)
     reliable = ~within(~seen, int(np.ceil(3 * sigma)))
     rows = np.flatnonzero(reliable)[:: round(ROW_SECONDS * RATE)]
     if len(rows) * ROW_SECONDS < SHORTEST_OVERLAP:
         raise TooLittle(f"less than {SHORTEST_OVERLAP:g} s of the track hold poses in a row")
-    filtered = (smooth(signal, sigma)[rows] for signal in signals)
-    return _Motion(clock[rows], *filtered, _filtered(imu.gyro), _filtered(imu.accel))
+    acceleration = np.einsum("nij,nj->ni", to_body, second_difference(place, 1.0 / RATE))
+    lever_gain = to_body @ second_difference(attitude, 1.0 / RATE)
+    return _Motion(
+        time=clock[rows],
+        rate=smooth(rate, sigma)[rows],
+        acceleration=smooth(acceleration, sigma)[rows],
+        lever_gain=smooth(lever_gain, sigma)[rows],
+        to_body=smooth(to_body, sigma)[rows],
+        gyro=_filtered(imu.gyro),
+        accel=_filtered(imu.accel),
+    )
 
 
 def _filtered(samples: Samples) -> CubicSpline:

@@ -244,12 +244,14 @@ def _fit(
     step_hats, slow_hats = (hat_functions(clock[rows], lag_knots) for rows in (at_steps, at_slow))
     turn_hats = hat_functions(clock[at_slow], knots)
 
-    for _ in range(3):
+    def improved(
+        correction: Rotation, lags: Float[np.ndarray, " l"]
+    ) -> tuple[Rotation, Float[np.ndarray, " l"]]:
         turned = (slerp(clock, knots, correction) * integrated).apply(accel)
         force = smooth(turned, slow)[at_slow]
 
-        def errors(x: Float[np.ndarray, " u"], force=force, lags=lags) -> list[np.ndarray]:
-            turns, lag = x[: 3 * count].reshape(count, 3), lags + x[3 * count :]
+        def errors(change: Float[np.ndarray, " u"]) -> list[np.ndarray]:
+            turns, lag = change[: 3 * count].reshape(count, 3), lags + change[3 * count :]
             felt = Rotation.from_rotvec(turn_hats @ turns).apply(force) - UPWARD
             of_steps = rises(clock[at_steps] - step_hats @ lag) - felt_rises
             return [of_steps, tracked(clock[at_slow] - slow_hats @ lag) - felt]
@@ -257,20 +259,21 @@ def _fit(
         start = np.zeros(3 * count + len(lags))
         scales = [max(robust_std(error), 1e-3) for error in errors(start)]
 
-        def residuals(
-            x, errors=errors, scales=scales, guess=correction, lags=lags
-        ) -> Float[np.ndarray, " r"]:
+        def residuals(change: Float[np.ndarray, " u"]) -> Float[np.ndarray, " r"]:
             # Neighbouring rows are correlated by the filter.
-            parts = [(e / s).ravel() / 1.6 for e, s in zip(errors(x), scales, strict=True)]
-            now = Rotation.from_rotvec(x[: 3 * count].reshape(count, 3)) * guess
+            parts = [(e / s).ravel() / 1.6 for e, s in zip(errors(change), scales, strict=True)]
+            now = Rotation.from_rotvec(change[: 3 * count].reshape(count, 3)) * correction
             drift = np.diff((now[1:] * now[:-1].inv()).as_rotvec(), axis=0) / DRIFT_STD
-            bends = np.diff(lags + x[3 * count :], 2) / LAG_BEND_STD
+            bends = np.diff(lags + change[3 * count :], 2) / LAG_BEND_STD
             return np.concatenate([*parts, drift.ravel(), bends])
 
         reach = np.repeat(STEPS, [3 * count, len(lags)])
         change = least_squares(
             residuals, start, loss="cauchy", f_scale=2.0, x_scale=reach, ftol=1e-4, max_nfev=20
         ).x
-        correction = Rotation.from_rotvec(change[: 3 * count].reshape(count, 3)) * correction
-        lags = lags + change[3 * count :]
+        turns = Rotation.from_rotvec(change[: 3 * count].reshape(count, 3))
+        return turns * correction, lags + change[3 * count :]
+
+    for _ in range(3):
+        correction, lags = improved(correction, lags)
     return correction, lags
