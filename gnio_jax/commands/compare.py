@@ -24,10 +24,9 @@ def compare(asked: CompareConfig, _call: options.Call) -> None:
     runs/plain for runs/plain_s0, runs/plain_s1, ..., runs/plain_calibrated for
     runs/plain_s0_calibrated, ...
 
-    Walks of one person or session are not independent, so the 95 % interval of a difference draws
-    whole people or sessions anew. An interval on both sides of zero says that the recordings do not
-    tell the two apart; with few people or sessions one beside zero does not say that they do. It
-    knows nothing of other seeds: ± is their standard deviation.
+    Walks of one person or session are not independent, so the 95 % interval of a difference is
+    Student's t over people or sessions. An interval on both sides of zero says that the recordings
+    do not tell the two apart. It knows nothing of other seeds: ± is their standard deviation.
 
     examples:
       {prog} runs/plain runs/context --split sessions_test

@@ -10,7 +10,8 @@ import numpy as np
 from jaxtyping import Float
 
 from gnio_jax.comparison.figures import Figures
-from gnio_jax.evaluation import metrics, report
+from gnio_jax.evaluation import report
+from gnio_jax.evaluation.statistics import interval
 
 Errors = Mapping[str, Float[np.ndarray, "_"]]
 """Sequence -> a metric with every seed: (seeds,), infinite where the estimate diverged."""
@@ -24,7 +25,7 @@ class Difference(NamedTuple):
     """Row minus first, over sequences, of the means over seeds; None without such a sequence, and
     where it is withheld."""
     interval: tuple[float, float] | None
-    """95 % of the mean, groups drawn anew (`metrics.bootstrap`); None for a single group."""
+    """95 % of the mean, over groups (`statistics.interval`); None for a single group."""
     gain: float | None
     """% by which the row's mean is smaller; None as `mean` is."""
     better: int
@@ -118,7 +119,7 @@ def difference(
     drawn = [group_of[name] for name in shared]
     return Difference(
         mean=float((ours - theirs).mean()),
-        interval=metrics.bootstrap(ours - theirs, drawn),
+        interval=interval(ours - theirs, drawn),
         gain=100 * (1 - float(ours.mean() / theirs.mean())) if theirs.mean() else None,
         better=sum(one < other for one, other in far),
         compared=len(shared),

@@ -137,6 +137,7 @@ def _summary(scores: Scores) -> dict[str, Any]:
         "mean": {**_finite(summary.mean), "diverged": len(scores.diverged)},
         "median": _finite(summary.median),
         "interval": interval,
+        "groups": summary.groups,
         "n": summary.count,
         "diverged": summary.diverged,
     }

@@ -65,7 +65,9 @@ def _grid(report: Report) -> Table:
         add(name, measured[name].values, last=name == names[-1])
     add(_mean_of(scores), summary.mean, "bold")
     add("median", summary.median)
-    add("95 % interval", summary.interval)
+    groups = [summary.groups[name] for name in shown if summary.interval.get(name)]
+    over = f" ({max(groups)} groups)" if groups else ""
+    add(f"95 % interval{over}", summary.interval)
     if scores.diverged:
         grid.add_row("diverged", *_counts(summary.diverged, shown), style="bold red")
     grid.add_row("n", *_counts(summary.count, shown), style="dim", end_section=True)

@@ -12,7 +12,7 @@ from gnio_jax.files import with_ending, write_csv, write_text
 from gnio_jax.tables.experiments import Experiment
 from gnio_jax.tables.summary import COLUMNS, TableRow
 
-INTERVAL = "The interval draws whole groups of sequences (people or sessions) anew; there are {}."
+INTERVAL = "The 95 % interval is Student's t over people or sessions; there are {}."
 DIVERGED = (
     "† Over the sequences on which no seed diverged. The median counts a diverged one as infinite. "
     "Gain and difference are over the sequences in which neither row diverged. A row that would be "

@@ -60,7 +60,7 @@ class TableRow(NamedTuple):
     difference: float | None
     """Of `ate` to the first row: mean over sequences of the means over seeds, m."""
     interval: tuple[float, float] | None
-    """95 % of the difference, groups drawn anew (`metrics.bootstrap`); none for the first row or a
+    """95 % of the difference, over groups (`statistics.interval`); none for the first row or a
     single group."""
     extra: dict[str, float]
     """Figures that belong to this table alone."""

@@ -14,7 +14,7 @@ def test_table_says_what_matters(made):
         "room 1/walk",
         "ATE 2-D",
         "mean",
-        "95 % interval",
+        "95 % interval (",
         "never_moves",
         "window orientation: filter",
         "initial state: reference",

@@ -25,12 +25,12 @@ def test_statistics_by_hand():
         and two.published_gain == pytest.approx(25.0)
     )
     assert "stationary_drift" not in one.seeds
-    # Differences of the sequences: −0.5, −0.5, −3.5. Of 27 equally likely draws of three, the
-    # mean's extremes have 1/27 (3.7 %) and 8/27.
-    assert two.interval == pytest.approx((-3.5, -0.5))
+    # Differences of the sequences: −0.5, −0.5, −3.5, of a standard error of 1.
+    reach = 4.30265  # t of two degrees of freedom
+    assert two.interval == pytest.approx((-1.5 - reach, -1.5 + reach), rel=1e-5)
     text = markdown.render(experiment, [one, two], ["a note"])
     assert (
-        "| B | 1.50 ± 0.71 | 1.50 | 1.50 ± 0.71 | 0.5 | ↓ 50.0 % | -1.50 (-3.50 to -0.50) "
+        "| B | 1.50 ± 0.71 | 1.50 | 1.50 ± 0.71 | 0.5 | ↓ 50.0 % | -1.50 (-5.80 to +2.80) "
         "| 1.80 | ↓ 25.0 % |"
     ) in text
     assert "| A | 3.00 ± 0.00 | 2.50 | 3.00 ± 0.00 | – |  |  | 2.40 |  |" in text
@@ -53,8 +53,9 @@ def test_sequences_are_paired_by_name():
     *_, row, text = compared(first, second)
     assert (row.compared, row.sequences) == (2, 4)
     assert row.difference == pytest.approx(-1.5) and row.gain == pytest.approx(50.0)
-    assert row.interval == pytest.approx((-2.0, -1.0))
-    assert "↓ 50.0 % | -1.50 (-2.00 to -1.00) over 2 of 4 |" in text
+    # −1 and −2: a standard error of 0.5, and one degree of freedom.
+    assert row.interval == pytest.approx((-1.5 - 6.3531, -1.5 + 6.3531), rel=1e-4)
+    assert "↓ 50.0 % | -1.50 (-7.85 to +4.85) over 2 of 4 |" in text
     second.figures[0]["sequences"] = {"other": {"ate": 1.0, "group": "other"}}
     *_, row, text = compared(first, second)
     assert (row.gain, row.difference, row.interval) == (None, None, None)
@@ -106,8 +107,8 @@ def test_the_median_is_infinite_where_half_diverged():
         assert row.median == median and cells in text
 
 
-def test_intervals_draw_groups():
-    """Two sessions of three walks: a draw is one session twice or both, whatever their walks."""
+def test_groups_are_what_is_independent():
+    """Two sessions of three walks: means of −0.9 and −2.9."""
 
     def row_and_text(first_groups, second_groups):
         first = result("a", [[5.0] * 6], groups=first_groups)
@@ -115,10 +116,11 @@ def test_intervals_draw_groups():
         return compared(first, second)[1:]
 
     row, text = row_and_text("xxxyyy", "xxxyyy")
-    assert row.groups == 2 and row.interval == pytest.approx((-2.9, -0.9))
+    assert row.groups == 2
+    assert row.interval == pytest.approx((-1.9 - 12.7062, -1.9 + 12.7062), rel=1e-5)
     assert "there are 2." in text
     row, text = row_and_text("xxxxxx", "xxxxxx")
     assert row.groups == 1 and row.interval is None
-    assert "↓ 38.0 % | -1.90 | –" in text and "interval draws" not in text
+    assert "↓ 38.0 % | -1.90 | –" in text and "Student" not in text
     alone, _ = row_and_text("abcdef", "abcdef")
-    assert alone.groups == 6 and -2.9 < alone.interval[0] < alone.interval[1] < -0.9
+    assert alone.groups == 6 and -3.1 < alone.interval[0] < alone.interval[1] < -0.7

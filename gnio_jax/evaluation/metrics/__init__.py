@@ -23,7 +23,7 @@ from gnio_jax.evaluation.metrics.movement import (
     stationary_drift,
 )
 from gnio_jax.evaluation.metrics.relative import rpe, rpe_se3, rte, rte_distance, rte_ronin
-from gnio_jax.evaluation.metrics.summary import Summary, bootstrap, summarise
+from gnio_jax.evaluation.metrics.summary import Summary, summarise
 from gnio_jax.evaluation.metrics.trajectory import Trajectory, Undefined
 
 __all__ = [
@@ -37,7 +37,6 @@ __all__ = [
     "ate",
     "ate_mean",
     "ate_ronin",
-    "bootstrap",
     "coverage",
     "diverged",
     "drift",

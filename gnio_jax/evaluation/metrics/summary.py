@@ -1,15 +1,14 @@
-"""Metrics over the sequences of a set: means, medians, bootstrap intervals."""
+"""Metrics over the sequences of a set: means, medians, intervals."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
 
 from gnio_jax.evaluation.metrics.measures import diverged
+from gnio_jax.evaluation.statistics import interval
 
 
 class Summary(NamedTuple):
@@ -22,8 +21,9 @@ class Summary(NamedTuple):
     median: dict[str, float | None]
     """Over all that have the metric: of an error, infinite where half of them diverged."""
     interval: dict[str, tuple[float, float] | None]
-    """Bootstrap 95 % interval of a finite mean, groups (people, sessions) drawn with replacement.
-    """
+    """95 % interval of a finite mean over groups (people, sessions): `statistics.interval`."""
+    groups: dict[str, int]
+    """Groups that the interval is over."""
     count: dict[str, int]
     """Sequences in the mean."""
     diverged: dict[str, int]
@@ -33,45 +33,24 @@ class Summary(NamedTuple):
 def summarise(
     measures: Mapping[str, Mapping[str, float | None]],
     groups: Mapping[str, Any],
-    seed: int = 0,
-    draws: int = 2000,
 ) -> Summary:
-    """Mean, median and bootstrap 95 % interval of every metric over sequences, each sequence
-    counted once.
+    """Mean, median and 95 % interval of every metric over sequences, each sequence counted once.
 
     `measures` is sequence -> metric -> value, `groups` sequence -> the person or session it belongs
-    to: recordings of one are not independent, so whole groups are drawn (`bootstrap`). A sequence
-    that `diverged` is left out of the mean, interval and count of every metric alike. The same seed
-    gives the same interval.
+    to: recordings of one are not independent. A sequence that `diverged` is left out of the mean,
+    interval and count of every metric alike.
     """
     lost = {name for name, values in measures.items() if diverged(values)}
     metrics = list(dict.fromkeys(metric for values in measures.values() for metric in values))
-    summary = Summary({}, {}, {}, {}, {})
+    summary = Summary({}, {}, {}, {}, {}, {})
     for metric in metrics:
         present = [name for name, values in measures.items() if values.get(metric) is not None]
         numbers = np.array([measures[name][metric] for name in present], float)
         kept = np.array([name not in lost for name in present], bool)
         summary.count[metric], summary.diverged[metric] = int(kept.sum()), int((~kept).sum())
-        mean = summary.mean[metric] = float(numbers[kept].mean()) if kept.any() else None
+        summary.mean[metric] = float(numbers[kept].mean()) if kept.any() else None
         summary.median[metric] = float(np.median(numbers)) if present else None
         drawn = [groups[name] for name in present if name not in lost]
-        interval = bootstrap(numbers[kept], drawn, seed, draws) if mean != math.inf else None
-        summary.interval[metric] = interval
+        summary.interval[metric] = interval(numbers[kept], drawn)
+        summary.groups[metric] = len({str(group) for group in drawn})
     return summary
-
-
-def bootstrap(
-    values: Float[np.ndarray, "n"], groups: Iterable[Any], seed: int = 0, draws: int = 2000
-) -> tuple[float, float] | None:
-    """95 % interval of the mean of `values`, whole groups drawn with replacement.
-
-    `groups` holds the group of each value. A draw's mean is over its values, so a large group
-    weighs more than a small one. None for fewer than two groups.
-    """
-    members, group = np.unique([str(name) for name in groups], return_inverse=True)
-    if len(members) < 2:
-        return None
-    sums, sizes = np.bincount(group, values), np.bincount(group)
-    drawn = np.random.default_rng(seed).integers(0, len(members), (draws, len(members)))
-    low, high = np.percentile(sums[drawn].sum(1) / sizes[drawn].sum(1), [2.5, 97.5])
-    return float(low), float(high)
