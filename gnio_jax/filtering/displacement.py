@@ -42,7 +42,6 @@ from gnio_jax.filtering.update import (
     lower_triangular,
     oldest_offset,
     project,
-    where_present,
 )
 from gnio_jax.types import Array
 
@@ -76,14 +75,14 @@ class Displacement:
         linear, defined = linearise_displacement(self, state, step)
         present = self.present & (state.step >= config.clones)
         tested = present & defined
-        linear = where_present(linear, present)
-        correction, nis, volume = project(state, linear, step.oldest)
+        correction, nis, volume = project(state, linear, step.oldest, present)
         now = state.step * config.samples_per_clone
         gate, weight = innovation_gate(state.gate, config, now, now - config.window, nis, tested)
         accepted, factor = weight > 0, _covariance_factor(weight, tested, config)
         if factor is not None:
             larger = linear.covariance + (factor - 1) * self.covariance
-            correction, _, _ = project(state, linear._replace(covariance=larger), step.oldest)
+            weaker = linear._replace(covariance=larger)
+            correction, _, _ = project(state, weaker, step.oldest, present)
             accepted = tested
         outcome = Outcome(present, tested, linear.residual, nis, volume, weight, accepted)
         state, correction = correct(state, correction, accepted, step.newest)
@@ -173,8 +172,7 @@ def linearise_displacement(
         step,
         residual,
         covariance,
-        position=to_yaw_frame,
-        oldest_position=-to_yaw_frame,
+        since_oldest=to_yaw_frame,
         oldest_rotation=by_yaw[:, None] * yaw_row[None],
         correlated=correlated,
     )

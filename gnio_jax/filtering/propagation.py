@@ -144,21 +144,28 @@ class Transition(NamedTuple):
     """F, the linear map of the core's error over one clone interval."""
 
     motion: Float[Array, "9 15"]
-    """`Interval.transition`."""
+    """Rows θ, v, o of the new error, over θ, v, o, b_g, b_a before the anchor moved."""
     decay: Float[Array, "e"]
     """Factors of the temporally correlated errors (`correlation_decay`)."""
     anchored: Float[Array, ""]
     """1 where the anchor moved up to the position at the start of the interval, else 0."""
 
     def __call__(self, rows: Float[Array, "n m"]) -> Float[Array, "n m"]:
-        """F rows. Where the anchor moves, a' = a + o and s' = o, and the interval starts from
-        o = 0."""
-        of_offset = np.isin(np.arange(LOCAL.stop), np.r_[OFFSET]).astype(rows.dtype)
-        motion = (self.motion * (1 - self.anchored * of_offset)[None]) @ rows[LOCAL]
+        """F rows. Where the anchor moves, a' = a + o and s' = o."""
         moved = self.anchored * rows[OFFSET]
         anchor, move = rows[ANCHOR] + moved, (1 - self.anchored) * rows[MOVE] + moved
         correlated = self.decay[:, None] * rows[CORRELATED]
+        motion = self.motion @ rows[LOCAL]
         return jnp.concatenate([motion, rows[BIASES], anchor, move, correlated])
+
+
+def core_transition(
+    interval: Interval, decay: Float[Array, "e"], anchored: Float[Array, ""]
+) -> Transition:
+    """F over an interval that starts from the anchor, with o = 0, where that has just moved."""
+    of_offset = np.isin(np.arange(LOCAL.stop), np.r_[OFFSET]).astype(interval.transition.dtype)
+    kept = 1 - anchored * of_offset
+    return Transition(interval.transition * kept[None], decay, anchored)
 
 
 def correlation_decay(

@@ -22,7 +22,13 @@ from gnio_jax.filtering.network import (
     predicted_displacement,
     prediction_shapes,
 )
-from gnio_jax.filtering.propagation import Transition, correlation_decay, integrate, propagate
+from gnio_jax.filtering.propagation import (
+    Transition,
+    core_transition,
+    correlation_decay,
+    integrate,
+    propagate,
+)
 from gnio_jax.filtering.state import FilterState, core_covariance, move_anchor, unroll_clones
 from gnio_jax.filtering.update import Correction, Measurement, Outcome, Step
 from gnio_jax.filtering.zero_velocity import ZeroVelocity
@@ -207,7 +213,7 @@ def clone_step(
     local = state.mean._replace(position=state.offset)
     interval = _integrate(local, imu, noise, config.dt)
     decay = correlation_decay(noise.correlation, config.clone_seconds, dtype)
-    transition = Transition(interval.transition, decay, anchored)
+    transition = core_transition(interval, decay, anchored)
     state = _propagate(state, interval, transition, slot)
 
     displacement, diagnostics = measure(state, oldest)

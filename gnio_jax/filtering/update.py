@@ -41,11 +41,25 @@ from gnio_jax.filtering.state import (
     CORRELATED,
     GYRO_BIAS,
     MOVE,
+    OFFSET,
+    THETA,
     VELOCITY,
     FilterState,
 )
 from gnio_jax.geometry import contract_left, contract_right, matmul
 from gnio_jax.types import Array
+
+PARTS = {
+    "rotation": THETA,
+    "velocity": VELOCITY,
+    "offset": OFFSET,
+    "gyro_bias": GYRO_BIAS,
+    "accel_bias": ACCEL_BIAS,
+    "anchor": ANCHOR,
+    "move": MOVE,
+    "correlated": CORRELATED,
+}
+"""Where each part of the core's error lies."""
 
 
 class Linearised(NamedTuple):
@@ -53,8 +67,8 @@ class Linearised(NamedTuple):
 
     residual: Float[Array, "m"]
     """r, measured − predicted."""
-    core: Float[Array, "m n"]
-    """H over the core's error."""
+    core: dict[str, Float[Array, "m _"]]
+    """The blocks of H over the core's error that are not zero, by the names of `PARTS`."""
     oldest: Float[Array, "m 6"]
     """H over θ and o of the oldest clone."""
     covariance: Float[Array, "m m"]
@@ -133,29 +147,42 @@ def linearise(
     gyro_bias: Any = None,
     accel_bias: Any = None,
     oldest_rotation: Any = None,
-    oldest_position: Any = None,
+    since_oldest: Any = None,
     correlated: Any = None,
 ) -> Linearised:
     """A measurement from the blocks of its Jacobian H, the derivative of the predicted value.
 
     Each block is (m, 3): by the rotation's error δθ (rad, world frame, R ← exp(δθ) R), by velocity,
-    position and the biases of the present, by the rotation and position of the oldest clone, and by
-    the temporally correlated error, where there is one. Those that are left out are zero.
+    position and the biases of the present, by the rotation of the oldest clone, by the position
+    since the oldest clone, p_j − p_i, and by the temporally correlated error, where there is one.
+    Those that are left out are zero.
     """
     rows, dtype = residual.shape[0], state.offset.dtype
-
-    def block(value: Any) -> Array:
-        return np.zeros((rows, 3), dtype) if value is None else jnp.asarray(value, dtype)
-
-    here, there = block(position), block(oldest_position)
-    core = [block(rotation), block(velocity), here, block(gyro_bias), block(accel_bias)]
-    # p = a + o; the oldest clone's position is a − s + o_i where it still has the anchor before.
-    core += [here + there, -anchors_apart(step.oldest, dtype) * there]
-    core += [block(correlated)] if len(state.correlated) else []
-    oldest = [block(oldest_rotation), there]
+    blocks = {
+        "rotation": rotation,
+        "velocity": velocity,
+        "offset": position,
+        "gyro_bias": gyro_bias,
+        "accel_bias": accel_bias,
+        "anchor": position,  # p = a + o
+        "correlated": correlated,
+    }
+    core = {name: jnp.asarray(of, dtype) for name, of in blocks.items() if of is not None}
+    oldest = [np.zeros((rows, 3), dtype)] * 2
+    if oldest_rotation is not None:
+        oldest[0] = jnp.asarray(oldest_rotation, dtype)
+    if since_oldest is not None:
+        # p_j − p_i = o + s − o_i where the oldest clone still has the anchor before, else o − o_i.
+        since = jnp.asarray(since_oldest, dtype)
+        core["offset"] = core["offset"] + since if "offset" in core else since
+        core["move"] = anchors_apart(step.oldest, dtype) * since
+        oldest[1] = -since
+    for name, block in core.items():
+        chex.assert_shape(block, (rows, 3), custom_message=f"linearise: {name}")
+    chex.assert_shape(covariance, (rows, rows), custom_message="linearise: covariance")
     return Linearised(
         jnp.asarray(residual, dtype),
-        jnp.concatenate(core, axis=1),
+        core,
         jnp.concatenate(oldest, axis=1),
         jnp.asarray(covariance, dtype),
     )
@@ -180,44 +207,47 @@ def measure(
     rᵀ S⁻¹ r is above `threshold` is refused (e.g. a quantile of χ² with m degrees of freedom)."""
     finite = [jnp.all(jnp.isfinite(part)) for part in (linear.residual, linear.covariance)]
     present = finite[0] & finite[1]
-    linear = where_present(linear, present)
-    correction, nis, volume = project(state, linear, step.oldest)
+    # NaN stays out of the arithmetic, and out of the derivatives.
+    residual = jnp.where(present, linear.residual, 0.0)
+    covariance = jnp.where(present, linear.covariance, 0.0)
+    linear = linear._replace(residual=residual, covariance=covariance)
+    correction, nis, volume = project(state, linear, step.oldest, present)
     accepted = present & (nis <= threshold)
-    weight = accepted.astype(nis.dtype)
-    outcome = Outcome(present, present, linear.residual, nis, volume, weight, accepted)
+    outcome = Outcome(
+        present, present, linear.residual, nis, volume, accepted.astype(nis.dtype), accepted
+    )
     state, correction = correct(state, correction, accepted, step.newest)
     return state, outcome, correction
 
 
-def where_present(linear: Linearised, present: Bool[Array, ""]) -> Linearised:
-    """Without a measurement zeros and R = I, so that NaN stays out of the arithmetic, and out of
-    the derivatives."""
-    rows = linear.residual.shape[0]
-    shape = [(rows,), (rows, linear.core.shape[1]), (rows, CLONE), (rows, rows)]
-    chex.assert_shape(
-        linear, shape, custom_message="Linearised: residual, core, oldest, covariance"
-    )
-    eye = np.eye(rows, dtype=linear.covariance.dtype)
-    known = jax.tree.map(lambda part: jnp.where(present, part, 0.0), linear)
-    return known._replace(covariance=jnp.where(present, linear.covariance, eye))
-
-
 def project(
-    state: FilterState, linear: Linearised, oldest: Array | int
+    state: FilterState, linear: Linearised, oldest: Array | int, present: Bool[Array, ""]
 ) -> tuple[Correction, Float[Array, ""], Float[Array, ""]]:
-    """The correction by a measurement that is accepted, rᵀ S⁻¹ r and √det S."""
-    entry = CLONE * oldest
+    """The correction by a measurement that is accepted, rᵀ S⁻¹ r and √det S. Where none is
+    `present`, S is the identity and rᵀ S⁻¹ r is 0."""
+    entry, parts = CLONE * oldest, [PARTS[name] for name in linear.core]
     core_oldest = jax.lax.dynamic_slice_in_dim(state.cross_covariance, entry, CLONE, 1)
     oldest_clones = jax.lax.dynamic_slice_in_dim(state.clone_covariance, entry, CLONE, 0)
-    # H P by dots: spelt out, the sums would read the blocks of H anew for every entry.
-    core = linear.core @ state.core_covariance + linear.oldest @ core_oldest.T
-    clones = linear.core @ state.cross_covariance + linear.oldest @ oldest_clones
+    # H P from the rows of P that H touches.
+    jacobian = jnp.concatenate([*linear.core.values(), linear.oldest], axis=1)
+    of_core = [*(state.core_covariance[part] for part in parts), core_oldest.T]
+    of_clones = [*(state.cross_covariance[part] for part in parts), oldest_clones]
+    core = matmul(jacobian, jnp.concatenate(of_core))
+    clones = matmul(jacobian, jnp.concatenate(of_clones))
     of_oldest = jax.lax.dynamic_slice_in_dim(clones, entry, CLONE, 1)
-    spread = matmul(core, linear.core.T) + matmul(of_oldest, linear.oldest.T)
-    rows = linear.residual[:, None], core, clones, linear.core, linear.oldest
-    (residual, *whitened), volume = whiten(spread + linear.covariance, rows)
-    correction = Correction(residual[:, 0], *whitened)
-    return correction, jnp.dot(correction.residual, correction.residual), volume
+    touched = jnp.concatenate([*(core[:, part] for part in parts), of_oldest], axis=1)
+    spread = matmul(touched, jacobian.T) + linear.covariance
+    spread = jnp.where(present, spread, jnp.eye(len(spread), dtype=spread.dtype))
+    rows = linear.residual[:, None], core, clones, jacobian
+    (residual, core, clones, jacobian), volume = whiten(spread, rows)
+    core_jacobian, column = jnp.zeros_like(core), 0
+    for part, block in zip(parts, linear.core.values(), strict=True):
+        end = column + block.shape[1]
+        core_jacobian = core_jacobian.at[:, part].set(jacobian[:, column:end])
+        column = end
+    correction = Correction(residual[:, 0], core, clones, core_jacobian, jacobian[:, column:])
+    nis = jnp.dot(correction.residual, correction.residual)
+    return correction, jnp.where(present, nis, 0.0), volume
 
 
 def correct(

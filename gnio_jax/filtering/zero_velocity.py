@@ -22,7 +22,6 @@ from gnio_jax.filtering.update import (
     correct,
     linearise,
     project,
-    where_present,
 )
 from gnio_jax.types import GRAVITY, Array
 
@@ -44,8 +43,7 @@ class ZeroVelocity(NamedTuple):
         eye = np.eye(3, dtype=state.velocity.dtype)
         covariance = config.zero_velocity_std**2 * eye
         linear = linearise(state, step, -state.velocity, covariance, velocity=eye)
-        linear = where_present(linear, quiet)
-        correction, nis, volume = project(state, linear, step.oldest)
+        correction, nis, volume = project(state, linear, step.oldest, quiet)
         fits = nis <= config.gate_threshold
         active = gate_activity(state.gate, config, state.step * config.samples_per_clone).active
         tested = quiet & active & step.before[0].tested

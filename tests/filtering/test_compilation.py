@@ -14,7 +14,7 @@ from gnio_jax.filtering import scan, smoother
 from gnio_jax.filtering import tracker as online
 from gnio_jax.filtering.displacement import scaled_displacement
 from gnio_jax.filtering.gaps import Imu
-from gnio_jax.filtering.propagation import Transition, integrate, propagate
+from gnio_jax.filtering.propagation import core_transition, integrate, propagate
 from gnio_jax.filtering.update import Step
 from gnio_jax.types import Prediction
 from gnio_jax.windows import WINDOW_CUTS, cut_window
@@ -156,7 +156,7 @@ class Variants(chex.TestCase):
     def test_propagate(self):
         def interval(state, gyro, accel, anchored):
             moved = integrate(state.mean, Imu(gyro, accel, None), NOISE, DT)
-            transition = Transition(moved.transition, jnp.zeros(0), anchored)
+            transition = core_transition(moved, jnp.zeros(0), anchored)
             return propagate(state, moved, transition, 1)
 
         given = start(), *map(jnp.asarray, signals(0, intervals=1)), jnp.ones(())

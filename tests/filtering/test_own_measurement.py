@@ -59,8 +59,7 @@ class Between(NamedTuple):
             step,
             residual,
             self.covariance,
-            position=to_yaw,
-            oldest_position=-to_yaw,
+            since_oldest=to_yaw,
             oldest_rotation=by_yaw[:, None] * jax.grad(yaw_of)(jnp.zeros(3))[None],
         )
         return filtering.measure(state, linear, step)

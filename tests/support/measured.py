@@ -9,7 +9,6 @@ import numpy as np
 from gnio_jax import filtering
 from gnio_jax.filtering.displacement import Displacement, linearise_displacement
 from gnio_jax.filtering.gaps import Imu
-from gnio_jax.filtering.state import OFFSET
 from gnio_jax.filtering.update import Step
 
 CONFIG = filtering.FilterConfig(0.01, 1, 1)
@@ -33,5 +32,5 @@ def displacement_residual(rotation, moved, displacement, frame="given"):
     measured = Displacement(displacement, jnp.eye(3), jnp.bool_(True), frame)
     step = Step(NO_IMU, 1, 0, CONFIG, filtering.NoiseModel())
     linear, defined = linearise_displacement(measured, state, step)
-    jacobian = jnp.concatenate([linear.oldest, linear.core[:, OFFSET]], axis=1)
+    jacobian = jnp.concatenate([linear.oldest, linear.core["offset"]], axis=1)
     return Residual(linear.residual, jacobian, defined)
