@@ -73,14 +73,23 @@ def import_file(asked: ImportFile, _call: options.Call) -> None:
     notes = [*recording.notes, *impressions(sequence)]
     lists = [split for split in csv_files.SPLITS if (folder / f"{split}.txt").is_file()]
     if lists:
-        line = f"add the line {asked.out.stem} to {lists[-1]}.txt, or it is not read"
+        line = f"add the line {asked.out.name} to {lists[-1]}.txt, or it is not read"
         notes.append(f"{folder} has lists: {line}")
     output = console.stdout()
     output.print(f"{asked.out}: {sequence.name}", soft_wrap=True)
     for note in notes:
         output.print(f"  {note}", soft_wrap=True)
+    for warning in recording.warnings:
+        output.print(f"warning: {warning}", soft_wrap=True)
     start = "" if sequence.valid.any() else " --init static"
     following = f"gnio evaluate --dataset csv --data-root {folder} --split test{start}"
+    if not lists and any(folder.glob("*.csv")):
+        output.print(
+            f"  {folder} holds CSV files too: gnio evaluate would read them as recordings; write "
+            "the imported ones to a folder of their own",
+            soft_wrap=True,
+        )
+        following = f"gnio track {asked.out}"
     output.print(f"next: {following}", soft_wrap=True)
 
 

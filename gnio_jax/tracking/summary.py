@@ -113,7 +113,7 @@ def summarise(
         notes=(*recording.notes, *prepared.notes),
     )
     own_rate = 1.0 / float(np.median(np.diff(sequence.time)))
-    found = _warnings(summary, own_rate, 1.0 / ekf.config.dt)
+    found = [*recording.warnings, *_warnings(summary, own_rate, 1.0 / ekf.config.dt)]
     holes = prepared.imu_valid is not None
     if holes or any(GAPS in note for note in recording.notes):
         where = "" if holes else " (see above)"
@@ -160,7 +160,7 @@ def _warnings(summary: Summary, own_rate: float, rate: float) -> list[str]:
     if own_rate < 0.99 * rate:
         found.append(
             f"rate: recorded at {own_rate:.4g} Hz, the network has learnt at {rate:g} Hz: "
-            "what lies between the samples is guessed"
+            f"what lies above {own_rate / 2.0:.3g} Hz is guessed"
         )
     if summary.rest >= LYING:
         found.append(f"rest: it lies still {summary.rest:.0%} of the time, and is held there")

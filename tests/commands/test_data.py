@@ -12,7 +12,8 @@ import pytest
 from matplotlib import image
 
 from gnio_jax import data
-from gnio_jax.commands import app
+from gnio_jax.commands import app, recordings
+from gnio_jax.config import ImportOptions
 from gnio_jax.data import loading
 from gnio_jax.data.readers import DATASETS, tlio
 from gnio_jax.data.readers import csv_files as csv
@@ -460,10 +461,23 @@ def test_import_of_a_phones_file_returns_the_walk(place, capsys):
     again = ["--out", "own/again.h5", "--rate", "50"]
     run("data", "import", "ios.csv", *again, *columns, *units)
     assert (
-        "own has lists: add the line again to test.txt, or it is not read"
+        "own has lists: add the line again.h5 to test.txt, or it is not read"
         in capsys.readouterr().out
     )
     assert data.read_hdf5(place / "own" / "again.h5").time.shape == (1000,)
+
+
+def test_what_follows_an_import_beside_its_own_csv_can_be_followed(place, capsys):
+    """As recordings of the folder, walk.csv and walk.h5 would have one name."""
+    write_phone(place / "walk.csv", (*csv.GYRO, *csv.ACCEL), accel=-1.0)
+    run("data", "import", "walk.csv", "--out", "walk.h5")
+    *_, warning, note, following = capsys.readouterr().out.splitlines()
+    assert warning.startswith("warning: sign: gravity reads on -z in walk.csv")
+    assert "gnio evaluate would read them as recordings" in note
+    assert following == "next: gnio track walk.h5"
+    with pytest.raises(InputError, match="has the name of"):
+        data.load("csv", place, "test")
+    assert recordings.read_any(place / "walk.h5", ImportOptions()).sequence.name == "walk"
 
 
 def test_import_of_a_file_for_each_sensor(place, capsys):

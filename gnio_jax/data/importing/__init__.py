@@ -13,6 +13,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 
 from gnio_jax.config import ImportOptions
 from gnio_jax.data.importing import units
@@ -33,8 +34,11 @@ from gnio_jax.data.importing.streams import (
     read_stream,
     read_table,
 )
-from gnio_jax.data.parsing.stamps import PER_SECOND, RATES, rounded_rate
-from gnio_jax.data.readers.csv_files import ACCEL, GYRO, check_columns
+from gnio_jax.data.parsing.stamps import PER_SECOND, RATES, rounded_rate, seconds
+from gnio_jax.data.parsing.stamps import time_unit as detect_time_unit
+from gnio_jax.data.parsing.tables import Table
+from gnio_jax.data.readers.csv_files import ACCEL, GYRO, check_columns, reference
+from gnio_jax.data.reference import SHORTEST_RUN
 from gnio_jax.data.resampling import resample
 from gnio_jax.data.self_check import self_check
 from gnio_jax.data.validation import WINDOW_SECONDS, validate
@@ -83,12 +87,17 @@ def import_recording(
         )
     columns = _columns_of(options.columns)
     path = Path(path)
+    for file in (path, options.accel_path):
+        if file is not None and file.exists() and not (file.is_file() or file.is_dir()):
+            raise InputError(
+                file, "can be read only once, as a pipe can", "save the recording as a file"
+            )
     kind = "csv" if columns or options.accel_path is not None else recognise(path)
     topics = Topics(options.imu_topic, options.accel_topic, options.reference_topic)
     if any(topics) and kind not in KINDS:
         raise InputError(path, "has no topics", "a topic is one of a ROS bag or an MCAP")
     if kind == "csv":
-        source = _read_csv(path, options.accel_path, columns)
+        source = _read_csv(path, options.accel_path, columns, options.time_unit)
     else:
         source = _read_other(path, kind, topics)
     stated = Units(options.time_unit, options.gyro_unit, options.accel_unit, options.accel_sign)
@@ -123,8 +132,8 @@ def _read_other(path: Path, kind: str, topics: Topics) -> Source:
 
 def _imported(source: Source, stated: Units, rate: float | None, name: str) -> Imported:
     """What any format comes to: `stated` wins over what the format says of its units."""
-    notes = list(source.notes)
-    imu = _joined(source, stated, notes)
+    notes, warnings = list(source.notes), []
+    imu = _joined(source, stated, notes, warnings)
     sequence = _without_reference(imu, name, source.gyro.path)
     own = rounded_rate(imu.time)
     target = rate or own
@@ -137,7 +146,7 @@ def _imported(source: Source, stated: Units, rate: float | None, name: str) -> I
     sequence = resample(sequence, target)
     if source.track is not None:
         sequence = _with_track(sequence, imu.start, source.track, notes)
-    return Imported(sequence, tuple(notes))
+    return Imported(sequence, tuple(notes), tuple(warnings))
 
 
 def _with_track(sequence: Sequence, start: float, track: Track, notes: list[str]) -> Sequence:
@@ -164,7 +173,7 @@ def _check_motion_is_one(sequence: Sequence, track: Track) -> None:
         )
 
 
-def _joined(source: Source, stated: Units, notes: list[str]) -> Joined:
+def _joined(source: Source, stated: Units, notes: list[str], warnings: list[str]) -> Joined:
     """Both sensors on one clock, in SI units and with Android's sign."""
     gyro_file, accel_file, known = source.gyro, source.accel, source.units
     time_unit = stated.time or known.time
@@ -186,7 +195,12 @@ def _joined(source: Source, stated: Units, notes: list[str]) -> Joined:
         )
     force = units.signed(imu.accel, sign, accel_file.path, notes)
     imu = imu._replace(accel=force)
-    units.note_gravity(imu, accel_file.path, notes)
+    upward = units.note_gravity(imu, accel_file.path, notes)
+    if upward == "-z" and stated.sign is None and known.sign_is_assumed:
+        warnings.append(
+            f"sign: gravity reads on -z in {accel_file.path.name}: the screen points down, or this "
+            "is iOS's sign and the track is wrong: compare with --accel-sign ios"
+        )
     return imu
 
 
@@ -209,6 +223,7 @@ def _read_csv(
     gyro_path: Path,
     accel_path: str | os.PathLike[str] | None,
     columns: dict[str, str],
+    time_unit: str | None,
 ) -> Source:
     """One file, or one of each sensor, with the columns that the user names."""
     time = columns.get("time", "time")
@@ -232,12 +247,42 @@ def _read_csv(
         gyro=units.common_unit(gyro.axes, units.TO_RAD_PER_SECOND),
         accel=units.common_unit(accel.axes, units.TO_METRES_PER_SECOND_SQUARED),
         sign="android",
+        sign_is_assumed=True,
     )
     pairs = ((gyro, known.gyro), (accel, known.accel))
     notes = [
         f"{one.path.name}: {one.sensor} in {unit}, by its header" for one, unit in pairs if unit
     ]
-    return Source(gyro_path, gyro, accel, known, notes=tuple(notes))
+    track = None
+    try:
+        track = _csv_reference(gyro_path, table, time, time_unit)
+    except InputError as error:
+        notes.append(f"no reference is taken: {error}")
+    return Source(gyro_path, gyro, accel, known, track, tuple(notes))
+
+
+def _csv_reference(path: Path, frame: pd.DataFrame, time: str, unit: str | None) -> Track | None:
+    """The reference in the package's own columns, on the gyro's stamps."""
+    table = Table(path, frame)
+    stamps = table.stamps(time)
+    first = stamps.min().item()
+    unit = unit or detect_time_unit(stamps - first).unit
+    if unit is None:  # the gyro's own stamps are refused for this
+        return None
+    poses = reference(table, seconds(stamps, first, unit))
+    if poses is None:
+        return None
+    rows = np.unique(poses.time, return_index=True)[1]
+    if len(rows) < SHORTEST_RUN:
+        raise InputError(path, f"holds {len(rows)} poses", f"{SHORTEST_RUN} are the fewest")
+    velocity = None if poses.velocity is None else poses.velocity[rows]
+    poses = poses._replace(
+        time=poses.time[rows],
+        attitude=poses.attitude[rows],
+        position=poses.position[rows],
+        velocity=velocity,
+    )
+    return Track(path, "given", float(first) / PER_SECOND[unit], poses)
 
 
 def _scaled(stream: Stream, scale: float) -> Stream:

@@ -8,8 +8,8 @@ from typing import NamedTuple
 from gnio_jax.data.hdf5 import read_hdf5, write_hdf5
 from gnio_jax.types import Sequence
 
-_NOTES = "import_notes"
-"""Attribute of the file: one note a line."""
+_NOTES, _WARNINGS = "import_notes", "import_warnings"
+"""Attributes of the file: one note or warning a line."""
 
 
 class Imported(NamedTuple):
@@ -19,20 +19,28 @@ class Imported(NamedTuple):
     """On a uniform clock, with a reference where the recording has one."""
     notes: tuple[str, ...]
     """What was detected, assumed or repaired, one sentence each, to be shown to the user."""
+    warnings: tuple[str, ...] = ()
+    """What may make everything wrong that is computed from it, one sentence each."""
 
 
 def write_imported(path: str | os.PathLike[str], recording: Imported) -> None:
     """Write the sequence and its notes as `write_hdf5` does."""
     sequence = recording.sequence
-    notes = "\n".join(" ".join(note.split()) for note in recording.notes)
-    attributes = {**sequence.attributes, _NOTES: notes} if notes else sequence.attributes
-    write_hdf5(path, sequence._replace(attributes=attributes))
+    said = {_NOTES: recording.notes, _WARNINGS: recording.warnings}
+    kept = {
+        name: "\n".join(" ".join(line.split()) for line in lines)
+        for name, lines in said.items()
+        if lines
+    }
+    write_hdf5(path, sequence._replace(attributes=sequence.attributes | kept))
 
 
 def read_imported(path: str | os.PathLike[str]) -> Imported:
-    """A sequence and its notes, of which a file that no import wrote has none. Raises `InputError`
-    as `read_hdf5` does."""
+    """A sequence, its notes and warnings; a file that no import wrote has neither. Raises
+    `InputError` as `read_hdf5` does."""
     sequence = read_hdf5(path)
     attributes = dict(sequence.attributes)
-    notes = str(attributes.pop(_NOTES, "")).splitlines()
-    return Imported(sequence._replace(attributes=attributes), tuple(notes))
+    notes, warnings = (
+        tuple(str(attributes.pop(name, "")).splitlines()) for name in (_NOTES, _WARNINGS)
+    )
+    return Imported(sequence._replace(attributes=attributes), notes, warnings)

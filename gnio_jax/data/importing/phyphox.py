@@ -220,8 +220,12 @@ def _columns(table: _Table) -> list[_Set]:
 def _only(sets: list[_Set], path: Path) -> _Set:
     if len(sets) > 1:
         names = ", ".join(f"{one.table.path.name} ({one.axes[0]})" for one in sets)
+        table = sets[0].table.path
+        in_tables = "leave the table of one of them in it, or export that one alone"
         raise InputError(
-            path, f"holds {len(sets)} sets of a sensor: {names}", "name the columns of one"
+            path,
+            f"holds {len(sets)} sets of a sensor: {names}",
+            "name the columns of one by --columns" if table == path else in_tables,
         )
     return sets[0]
 
@@ -252,6 +256,7 @@ def _sum(linear: _Set, gravity: _Set) -> _Set:
         gravity.time, *gravity.axes, gaps=True
     )
     down = down[np.isfinite(down).all(axis=1)]
+    down = down[np.argsort(down[:, 0], kind="stable")]
     inside = (stamps >= down[:, 0].min(initial=np.inf)) & (
         stamps <= down[:, 0].max(initial=-np.inf)
     )

@@ -43,21 +43,18 @@ def poses_of(
         )
     everywhere = np.ones(len(time), dtype=bool)
     wxyz = check_unit_norm(pose[:, 3:], everywhere, "orientation", source)
-    return Poses(time, rotations(wxyz), pose[:, :3])
+    return Poses(time, rotations(wxyz), pose[:, :3], noisy=rate >= FAST_TRACKER)
 
 
 def with_reference(sequence: Sequence, start: float, track: Track) -> Sequence:
     """`sequence`, on a uniform clock that begins at the stamp `start` (s), with the track as its
     reference; NaN and not valid where there is none.
 
-    Poses from `FAST_TRACKER` Hz, and those with velocities, are laid on the clock as those of the
-    data sets are (`data.reference`); slower ones follow splines. Raises `InputError` where both
-    hardly overlap, or the reference moves as nothing does.
+    The poses are laid on the clock as those of the data sets are (`data.reference`). Raises
+    `InputError` where both hardly overlap, or the reference moves as nothing does.
     """
     poses = track.poses._replace(time=track.poses.time + (track.start - start))
     _check_overlap(sequence.time - sequence.time[0], poses, track)
-    usual = float(np.median(np.diff(poses.time)))
-    poses = poses._replace(noisy=usual <= 1.0 / FAST_TRACKER)
     found = reference_at(sequence.time - sequence.time[0], sequence.gyro, poses)
     if not found.valid.any():
         raise InputError(

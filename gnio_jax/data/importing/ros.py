@@ -269,6 +269,11 @@ def _track(
         )
     headers = samples.headers and all(pose.stamp for _, pose in rows)
     stamps = np.array([pose.stamp if headers else time for time, pose in rows], dtype=np.int64)
+    if samples.headers and not headers:
+        notes.append(
+            f"{path.name}: {topic} has no stamps of its own and is stamped by the bag, the IMU by "
+            "its headers: the reference is off by the delay between these two clocks"
+        )
     start = int(stamps.min())
     values = np.array([pose.values for _, pose in rows], dtype=np.float64)
     name = f"{topic}:{child}" if child else topic

@@ -20,6 +20,8 @@ class Units(NamedTuple):
     """m/s2, g or mg."""
     sign: str | None = None
     """Of the accelerometer: android or ios (see `units.signed`)."""
+    sign_is_assumed: bool = False
+    """Nothing says that the sign is this one."""
 
 
 class Track(NamedTuple):

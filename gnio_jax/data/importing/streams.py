@@ -18,8 +18,6 @@ from gnio_jax.data.validation import check_finite, check_gaps
 from gnio_jax.errors import InputError
 from gnio_jax.numerics import interpolate, neighbours
 
-LONGEST_SPLINE = 0.1
-"""s between samples, beyond which a spline swings: a line is drawn."""
 MOST_REPEATED = 0.01
 """Share of the rows that may repeat a stamp: stamps rounded to a coarse unit fall together now and
 then."""
@@ -305,6 +303,7 @@ def _values_at(
     """By a cubic spline, and by lines across gaps; and what lies in a gap."""
     values = CubicSpline(stream.time, stream.values, axis=0)(time)
     left, right = neighbours(stream.time, time)
-    gap = stream.time[right] - stream.time[left] > LONGEST_SPLINE
+    longest = longest_bridge(1.0 / float(np.median(np.diff(stream.time))))
+    gap = stream.time[right] - stream.time[left] > longest
     values[gap] = interpolate(time[gap], stream.time, stream.values)
     return values, gap & (time != stream.time[left]) & (time != stream.time[right])

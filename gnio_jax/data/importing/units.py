@@ -180,8 +180,9 @@ def signed(
     return -accel if sign == "ios" else accel
 
 
-def note_gravity(imu: Joined, path: Path, notes: list[str]) -> None:
-    """What the quietest second says of gravity. Raises `InputError` where that is far off."""
+def note_gravity(imu: Joined, path: Path, notes: list[str]) -> str:
+    """What the quietest second says of gravity, as notes; the axis that reads most of it is
+    returned, as "+z". Raises `InputError` where gravity is far off."""
     accel = imu.accel
     second = min(max(round(1.0 / float(np.median(np.diff(imu.time)))), 2), len(accel))
     starts = range(0, len(accel) - second + 1, max(second // 2, 1))
@@ -204,3 +205,4 @@ def note_gravity(imu: Joined, path: Path, notes: list[str]) -> None:
             f"{path.name}: that is off gravity by {force - GRAVITY:+.2f} m/s²: "
             "the accelerometer may need calibration"
         )
+    return upward

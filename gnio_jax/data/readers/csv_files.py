@@ -196,14 +196,12 @@ def check_columns(path: Path, found: Iterable[object], wanted: Mapping[str, str]
     if not missing:
         return
     listed_names = ", ".join(f"'{wanted[ours]}'" for ours in missing)
-    options = " ".join(
-        f"--columns.{ours.replace('_', '-')} {_guess(ours, names)}" for ours in missing
-    )
+    words = " ".join(f"{ours}={_guess(ours, names)}" for ours in missing)
     raise InputError(
         path,
         f"column{'s' if len(missing) > 1 else ''} {listed_names} "
         f"{'are' if len(missing) > 1 else 'is'} missing; found: {shortened(', '.join(names), 600)}",
-        f"name them: gnio data import {path.name} {options}",
+        f"name them: gnio data import {path.name} --columns {words}",
     )
 
 

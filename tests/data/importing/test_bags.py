@@ -69,6 +69,8 @@ def test_every_kind_of_reference(tmp_path, kind):
         np.testing.assert_allclose(sequence.position[100:-100], late, atol=2e-3)
     else:
         compare_reference(sequence, 2e-3)
+    mixed = "/pose has no stamps of its own and is stamped by the bag, the IMU by its headers"
+    assert any(mixed in note for note in notes) == (kind == "Pose")
     joined = kind == "TransformStamped"
     assert any("taken as one" in note for note in notes) != joined
 

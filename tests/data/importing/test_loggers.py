@@ -312,6 +312,20 @@ def test_phyphox_of_an_earlier_release_in_another_language_in_degrees(tmp_path):
     sets["Gravity"] = (later, down, axes("Gravity", "m/s^2"))
     sequence, _ = import_recording(zipped(tmp_path / "sum.zip", phyphox(sets=sets)))
     compare(sequence)
+    mixed = np.random.default_rng(0).permutation(len(later))
+    sets["Gravity"] = (later[mixed], down[mixed], axes("Gravity", "m/s^2"))
+    sequence, _ = import_recording(zipped(tmp_path / "mixed.zip", phyphox(sets=sets)))
+    compare(sequence)
+
+
+def test_of_two_tables_of_a_sensor_the_remedy_can_be_followed(tmp_path):
+    sets = phyphox_sets()
+    sets["Second"] = (*sets["Gyroscope"][:2], axes("Gyroscope", "deg/s"))
+    path = zipped(tmp_path / "walk.zip", phyphox(sets=sets))
+    refused(path, "holds 2 sets of a sensor: .*; leave the table of one of them in it")
+    members = phyphox(sets=sets)
+    del members["Second.csv"]
+    compare(import_recording(zipped(path, members)).sequence)
 
 
 def test_phyphox_in_one_file(tmp_path):
