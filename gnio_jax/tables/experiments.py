@@ -75,7 +75,8 @@ def method(network: str, base: TrainConfig) -> TrainConfig:
 
 
 def loss(network: str, base: TrainConfig) -> LossConfig:
-    """The published loss of a network; GNIO's is that of the experiment."""
+    """The published loss of a network; GNIO's is that of the experiment, and so is the bound on
+    outliers of every likelihood."""
     match network:
         case "gnio":
             return base.loss
@@ -85,11 +86,13 @@ def loss(network: str, base: TrainConfig) -> LossConfig:
                 nll_weight=1.0,
                 log_std_from_epoch=held_epochs(base.optim),
                 log_std_floor=-6.907755,
+                outlier_sigmas=base.loss.outlier_sigmas,
             )
         case "deepils":
             return LossConfig(mse_weight=1.0, mae_weight=1.0, nll_weight=0.0)
         case "ctin":
-            return LossConfig(name="velocity_and_covariance")
+            bound = base.loss.outlier_sigmas
+            return LossConfig(name="velocity_and_covariance", outlier_sigmas=bound)
         case _:
             return LossConfig(mse_weight=1.0, nll_weight=0.0)
 

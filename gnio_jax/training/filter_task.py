@@ -60,7 +60,7 @@ from gnio_jax.training.segments import (
     start_rotation,
     turned_segment,
 )
-from gnio_jax.training.window_task import Keys, Progress, Row, TrainState, without_place
+from gnio_jax.training.window_task import Progress, Row, Task, TrainState
 
 CHECKPOINT_EVERY = 20
 """Clone intervals between the states that the backward pass keeps."""
@@ -302,13 +302,12 @@ def train_steps(
         trained = trainable(variables, config.through_filter.learn)
         gradient, losses, healthy = gradient_of_segments(variables, trained, *batch, model, config)
 
+        direction: Any
         direction, opt_state = adam.update(gradient, state.opt_state, trained)
-        update = {
-            name: optax.tree.scale(-jnp.float32(learning_rates[name](state.step)), tree)
-            for name, tree in direction.items()
-        }
-        update = optax.tree.scale(factor, update)
-        taken = merged(variables, optax.apply_updates(trained, update))
+        for name, tree in direction.items():
+            rate = -jnp.float32(learning_rates[name](state.step))
+            direction[name] = optax.tree.scale(factor, optax.tree.scale(rate, tree))
+        taken = merged(variables, optax.apply_updates(trained, direction))
 
         tame = optax.tree.norm(gradient) <= SKIP_ABOVE  # false for NaN
         tame = tame & healthy & jnp.isfinite(losses.total)
@@ -406,27 +405,11 @@ def validate(
 # ------------------------------------------------------------------------------------------------
 
 
-class FilterTask(NamedTuple):
-    """A run's settings, network and recordings: all of it but its state. See
-    `window_task.WindowTask` for what each member means to the loop."""
+class FilterTask(Task):
+    """Training through the filter: `source` and `held_out` are `SegmentSource`s. See
+    `window_task.WindowTask` for what each method means to the loop."""
 
-    config: TrainConfig
-    model: nn.Module
-    source: SegmentSource
-    """Training segments, on the device."""
-    held_out: SegmentSource
-    """Validation segments."""
-    splits: dict[str, list[str]]
-    steps_per_epoch: int
-    unit: str = "segments"
-    changes: tuple[int, ...] = ()
-
-    def with_config(self, config: TrainConfig) -> FilterTask:
-        return self._replace(config=config)
-
-    @property
-    def keys(self) -> Keys:
-        return window_task.keys_of(self.config.seed)
+    unit = "segments"
 
     def initial_state(self, start: Any | None) -> TrainState:
         window = self.config.data.seen
@@ -450,9 +433,6 @@ class FilterTask(NamedTuple):
             f"{optim.batch_size} segments an epoch, {optim.epochs} epochs → {workdir}"
         )
 
-    def learning_rate(self, step: int) -> float:
-        return float(optimizer.schedule(self.config.optim, self.steps_per_epoch)(step))
-
     def order(self, epoch: int) -> Int[jax.Array, "p"]:
         return random_starts(jax.random.fold_in(self.keys.order, epoch), self.source)
 
@@ -467,8 +447,7 @@ class FilterTask(NamedTuple):
             jnp.int32(count),
             jnp.float32(factor),
             self.keys.step,
-            model=self.model,
-            config=without_place(self.config),
+            **self.compiled_for,
             steps_per_epoch=self.steps_per_epoch,
         )
         if len(jax.devices()) > 1:
@@ -483,8 +462,7 @@ class FilterTask(NamedTuple):
 
     def validate(self, state: TrainState, step: int) -> tuple[TrainState, Row]:
         """The loss is infinite where the filter diverges."""
-        fixed = {"model": self.model, "config": without_place(self.config)}
-        found = validate(state, self.held_out, self.keys.statistics, **fixed)
+        found = validate(state, self.held_out, self.keys.statistics, **self.compiled_for)
         losses = jax.device_get(found.losses)
         sound = bool(found.healthy) and math.isfinite(losses.total)
         return state, {

@@ -3,6 +3,7 @@ checkpoints."""
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import signal
 import time
@@ -134,7 +135,9 @@ def _train_all(
                 "on; separate the two splits"
             )
         for config, resume in zip(configs, resumes, strict=True):
-            outcomes.append(_train(task.with_config(config), start, resume, stop, reporter))
+            outcomes.append(
+                _train(dataclasses.replace(task, config=config), start, resume, stop, reporter)
+            )
             if stop.signum and len(outcomes) < len(configs):
                 outcomes[-1] = outcomes[-1]._replace(stopped_by=stop.signum)  # others are missing
                 break

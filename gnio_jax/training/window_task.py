@@ -11,6 +11,7 @@ import dataclasses
 import functools
 import math
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -353,32 +354,49 @@ class Keys(NamedTuple):
     statistics: jax.Array
 
 
-class WindowTask(NamedTuple):
-    """A run's settings, network and recordings: all of it but its state."""
+@dataclass(frozen=True)
+class Task:
+    """A run's settings, network and recordings: all of it but its state. Both tasks are one."""
 
     config: TrainConfig
     model: nn.Module
-    source: WindowSource
-    """Training windows, on the devices."""
-    held_out: WindowSource
-    """Validation windows, likewise."""
+    source: Any
+    """What the task is trained on, on the devices: windows or segments."""
+    held_out: Any
+    """Those of validation, likewise."""
     splits: dict[str, list[str]]
     """Names of the recordings of each split."""
     steps_per_epoch: int
-    unit: str = "windows"
+    unit = "windows"
     """What a batch consists of, in the plural."""
-
-    def with_config(self, config: TrainConfig) -> WindowTask:
-        """The same task with the seed and the folders of another run."""
-        return self._replace(config=config)
 
     @property
     def keys(self) -> Keys:
+        """Random keys of the run."""
         return keys_of(self.config.seed)
+
+    @property
+    def compiled_for(self) -> dict[str, Any]:
+        """The static arguments of the jitted functions. Runs in several folders and with several
+        seeds share the programs."""
+        anywhere = {"workdir": None, "data_root": None, "init_from": None, "seed": 0}
+        return {"model": self.model, "config": dataclasses.replace(self.config, **anywhere)}
 
     @property
     def changes(self) -> tuple[int, ...]:
         """Steps at which what is trained changes: losses before and after do not compare."""
+        return ()
+
+    def learning_rate(self, step: int) -> float:
+        """Learning rate of a step by the schedule."""
+        return float(optimizer.schedule(self.config.optim, self.steps_per_epoch)(step))
+
+
+class WindowTask(Task):
+    """Training on windows: `source` and `held_out` are `WindowSource`s."""
+
+    @property
+    def changes(self) -> tuple[int, ...]:
         return switches(self.config.loss, self.steps_per_epoch)
 
     def initial_state(self, start: Any | None) -> TrainState:
@@ -410,10 +428,6 @@ class WindowTask(NamedTuple):
             elif step > 0:
                 yield f"{what} from step {step:,} of {total:,} on"
 
-    def learning_rate(self, step: int) -> float:
-        """Learning rate of a step by the schedule."""
-        return float(optimizer.schedule(self.config.optim, self.steps_per_epoch)(step))
-
     def order(self, epoch: int) -> Int[jax.Array, "m"]:
         """The windows that an epoch visits, in order: a function of the seed and the epoch."""
         return epoch_order(self.keys.order, epoch, self.source)
@@ -430,8 +444,7 @@ class WindowTask(NamedTuple):
             jnp.int32(count),
             jnp.float32(factor),
             self.keys.step,
-            model=self.model,
-            config=without_place(self.config),
+            **self.compiled_for,
             steps_per_epoch=self.steps_per_epoch,
         )
 
@@ -442,19 +455,17 @@ class WindowTask(NamedTuple):
             return state
         key = self.keys.statistics
         order = statistics_order(key, self.source, self.config)
-        fixed = {"model": self.model, "config": without_place(self.config)}
-        return estimate_statistics(state, self.source, order, key, **fixed)
+        return estimate_statistics(state, self.source, order, key, **self.compiled_for)
 
     def validate(self, state: TrainState, step: int) -> tuple[TrainState, Row]:
         """The state as it is kept after `step` steps, with its uncertainty calibrated where it has
         constants for that, and its figures on the validation split."""
         stage = loss_stage(self.config.loss, step - 1, self.steps_per_epoch)
-        fixed = {"model": self.model, "config": without_place(self.config)}
-        found = validate(state, self.held_out, stage, **fixed)
+        found = validate(state, self.held_out, stage, **self.compiled_for)
         if calibrates(state):
             equivariant = self.config.model.equivariance != "none"
             state = calibrated(state, isotropic(found) if equivariant else found)
-            found = validate(state, self.held_out, stage, **fixed)
+            found = validate(state, self.held_out, stage, **self.compiled_for)
         loss, mse, nll = (float(each) for each in found.losses)
         row: Row = {"val_loss": loss, "val_mse": mse, "val_nll": nll, "val_rmse": math.sqrt(mse)}
         normalised = zip("xyz", found.axis_normalised, strict=True)
@@ -513,12 +524,6 @@ def keys_of(seed: int) -> Keys:
     """The keys of a run."""
     key = jax.random.key(seed)
     return Keys(*jax.random.split(key, 3), statistics=jax.random.fold_in(key, 3))
-
-
-def without_place(config: TrainConfig) -> TrainConfig:
-    """The settings that compiled steps depend on: runs in several folders and with several seeds
-    share the programs."""
-    return dataclasses.replace(config, workdir=None, data_root=None, init_from=None, seed=0)
 
 
 def initial_state(model: nn.Module, key: PRNGKeyArray, window: int) -> TrainState:

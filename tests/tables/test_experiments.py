@@ -5,6 +5,7 @@ import dataclasses
 import pytest
 
 from gnio_jax import config as configuration
+from gnio_jax.config import LossConfig
 from gnio_jax.tables import experiments
 from gnio_jax.training.window_task import create_model
 from tests.support.tables import BASE
@@ -131,7 +132,8 @@ def test_losses_and_regularisation_are_those_of_the_published_recipes(network):
         return
     recipe = configuration.validate(configuration.load(f"configs/baselines/{network}.yaml"))
     assert recipe.model.name == network
-    published = dataclasses.replace(BASE, optim=dataclasses.replace(BASE.optim, epochs=200))
+    optim, loss = dataclasses.replace(BASE.optim, epochs=200), LossConfig(outlier_sigmas=10.0)
+    published = dataclasses.replace(BASE, optim=optim, loss=loss)
     assert experiments.loss(network, published) == recipe.loss
     assert (row.optim.clip_norm, row.optim.weight_decay) == (
         recipe.optim.clip_norm,

@@ -14,6 +14,7 @@ from gnio_jax.training import losses, optimizer, window_task
 from gnio_jax.training.losses import Losses
 from gnio_jax.training.window_task import TrainState, Validation, calibrated, isotropic
 from gnio_jax.types import Prediction, Windows
+from tests.support.tiny_network import Tiny
 
 
 def target(displacement, steps=4):
@@ -274,8 +275,7 @@ def test_constants_of_an_equivariant_network_are_the_same_along_both_axes(
     found = Validation(Losses(*[jnp.float32(0)] * 3), errors, errors)
     monkeypatch.setattr(window_task, "validate", lambda *_, **__: found)
     config = TrainConfig(model=ModelConfig(equivariance=equivariance))
-    nothing = dict.fromkeys(window_task.WindowTask._fields)
-    task = window_task.WindowTask(**nothing | {"config": config, "steps_per_epoch": 7})
+    task = window_task.WindowTask(config, Tiny(), None, None, {}, 7)
     constants = task.validate(state, 7)[0].batch_stats["uncertainty"]["log_std"]
     wanted = [1.0, 4.0, 9.0] if equivariance == "none" else [2.5, 2.5, 9.0]
     np.testing.assert_allclose(np.exp(2 * constants), wanted, rtol=1e-6)

@@ -227,7 +227,7 @@ def test_wild_steps_are_skipped_and_counted(training):
     lost = training.source.accel.at[first + 30].set(np.nan)
     jumps = training.source.position.at[first + 50 :].add(1e6)
     for spoiled in ({"accel": lost}, {"position": jumps}):
-        wild = training._replace(source=training.source._replace(**spoiled))
+        wild = dataclasses.replace(training, source=training.source._replace(**spoiled))
         state = new_state(training)
         before = jax.tree.map(np.array, (state.variables, state.opt_state))
         state, progress = wild.take_steps(state, order, 0, 1, 1.0)
@@ -246,7 +246,7 @@ def test_a_skipped_step_does_not_shift_the_schedule(training):
     assert len(set(rates)) == 4
     state = new_state(training)
     lost = training.source.accel.at[:].set(np.nan)
-    wild = training._replace(source=training.source._replace(accel=lost))
+    wild = dataclasses.replace(training, source=training.source._replace(accel=lost))
     skipped, _ = wild.take_steps(new_state(training), order, 0, 1, 1.0)
     state = state._replace(step=jnp.int32(1))
     taken = [training.take_steps(each, order, 1, 1, 1.0)[0] for each in (state, skipped)]
@@ -279,7 +279,7 @@ def test_training_segments_are_turned_by_any_yaw(training):
 def test_no_call_to_lapack_waits_for_a_worker(training):
     """Where each core is a device, its batched calls in the step deadlock."""
     state = new_state(training)
-    order, config = training.source.earliest, training.config
+    order = training.source.earliest
     lowered = filter_task.train_steps.trace(
         state,
         training.source,
@@ -288,8 +288,7 @@ def test_no_call_to_lapack_waits_for_a_worker(training):
         jnp.int32(1),
         jnp.float32(1),
         jax.random.key(0),
-        model=training.model,
-        config=window_task.without_place(config),
+        **training.compiled_for,
         steps_per_epoch=2,
     )
     assert "cholesky" not in str(lowered.jaxpr) and "triangular_solve" not in str(lowered.jaxpr)
@@ -304,7 +303,9 @@ def test_noise_is_recovered(training):
     for share in (3.0, 1 / 3):
         gyro = training.source.gyro + share * OPTIONS.noise.gyro_density * white[0]
         accel = training.source.accel + share * OPTIONS.noise.accel_density * white[1]
-        noisy = training._replace(source=training.source._replace(gyro=gyro, accel=accel))
+        noisy = dataclasses.replace(
+            training, source=training.source._replace(gyro=gyro, accel=accel)
+        )
         state = new_state(training)
         for epoch in range(2):
             state, progress = noisy.take_steps(state, noisy.order(epoch), 0, 2, 1.0)
@@ -401,7 +402,7 @@ def test_a_later_stage_starts_from_what_the_filter_has_learnt(recording, finishe
     begins = experiment(read(train, call), call).filter
     assert begins == run.config.filter != OPTIONS
     config = tiny(recording, "unused", filter=changed(begins, start={"velocity": 0.3}))
-    state = training.with_config(config).initial_state(run.variables)
+    state = dataclasses.replace(training, config=config).initial_state(run.variables)
     assert same(state.params, run.variables["params"])
     other = state.filter.pop("start.velocity")
     np.testing.assert_allclose(other, np.log(0.3), rtol=1e-6)
