@@ -140,8 +140,11 @@ def test_the_command_writes_what_the_suffix_says(trajectory, tmp_path, capsys):
         (["words.txt", "a.csv"], "words.txt: "),
         (["short.txt", "a.csv"], "short.txt: has 4 columns, not the 8 of TUM's format"),
         (["back.txt", "a.csv"], "back.txt: field 'time' does not increase"),
-        (["turn.txt", "a.csv"], "turn.txt: field 'qx qy qz qw' is not a unit quaternion"),
-        (["nan.txt", "a.csv"], "nan.txt: field 't x y z qx qy qz qw' is NaN or Inf"),
+        (
+            ["turn.txt", "a.csv"],
+            "turn.txt: columns 'qx', 'qy', 'qz', 'qw' are not a unit quaternion",
+        ),
+        (["nan.txt", "a.csv"], "nan.txt: column 'x' is NaN or Inf in 1 rows, first in row 2"),
         (["early.txt", "a.mcap"], "a.mcap: stamps begin at -1 s; ROS has none below 0"),
         (["late.txt", "a.mcap"], "a.mcap: stamps end at 1.7e+18 s; ROS counts seconds in 32 bits"),
     ],

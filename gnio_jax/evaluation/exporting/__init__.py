@@ -79,9 +79,10 @@ def read_trajectory(path: Path) -> Trajectory:
         raise InputError(
             path, f"has {table.width()} columns, not the 8 of TUM's format", f"they are {_TUM}"
         )
-    time, position = table.take(0), table.take(1, 2, 3)
+    table = table._replace(columns=table.columns.set_axis(_TUM.split(), axis=1))
+    time, position = table.take("t"), table.take("x", "y", "z")
     check_increasing(time, path)
-    attitude = table.rotations(4, 5, 6, 7, scalar_first=False)
+    attitude = table.rotations("qx", "qy", "qz", "qw", scalar_first=False)
     return Trajectory(time, position, quaternions(attitude))
 
 
