@@ -32,9 +32,10 @@ def initialise(distributed: str | None = None, devices: int | None = None) -> No
     distributed: "HOST:PORT,PROCESSES,ID": where process 0 listens, how many processes there are,
     and the number of this one. Slurm, Open MPI and Kubernetes say this themselves; without either
     the process is alone. devices: how many devices a CPU is. Raises `InputError` for a text of
-    another form, and where the processes do not meet.
+    another form, for less than one device, and where the processes do not meet.
     """
     if devices is not None:
+        _check_devices(devices)
         cpu_devices(devices)
     given: tuple[str, int, int] | None = None
     if distributed is not None:
@@ -103,6 +104,11 @@ def on_host(tree: Tree) -> Tree:
 # ------------------------------------------------------------------------------------------------
 
 
+def _check_devices(number: int) -> None:
+    if number < 1:
+        raise InputError("--devices", f"must be at least 1, found {number}")
+
+
 @contextmanager
 def sharing(limit: int | None = None) -> Iterator[None]:
     """Share batches out among the devices of all processes: `limit` of each, or all.
@@ -112,8 +118,8 @@ def sharing(limit: int | None = None) -> Iterator[None]:
     """
     if limit is None and jax.default_backend() == "cpu":
         limit = 1
-    if limit is not None and limit < 1:
-        raise InputError("--devices", f"must be at least 1, found {limit}")
+    if limit is not None:
+        _check_devices(limit)
     chosen = []
     for process in range(jax.process_count()):
         own = jax.local_devices(process)

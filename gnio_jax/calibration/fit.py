@@ -202,7 +202,8 @@ def fit_innovations(
     evaluate(np.array(list(free_parameters(fitted, names).values())))
     warnings = []
     if found.nit >= most_steps:
-        warnings.append(f"the fit ended at its limit of {most_steps} steps; raise --steps")
+        limit = f"the fit ended at its limit of {most_steps} steps"
+        warnings.append(f"{limit}, short of the best settings; name fewer groups in --fit")
     warnings += unphysical(fitted, names)
     return Fit(fitted, before, evidences[-1], int(found.nit), tuple(warnings))
 

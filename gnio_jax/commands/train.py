@@ -105,7 +105,11 @@ def experiment(asked: TrainOptions, call: options.Call) -> TrainConfig:
     first = configuration.with_seeds(asked, asked.seeds)[0] if asked.seeds else asked
     kept = configuration.default_workdir(first) / "config.yaml"
     resumes = asked.resume and kept.exists()
-    file = configuration.find(asked.config) if asked.config else kept if resumes else None
+    file = None
+    if asked.config is not None:
+        file = configuration.find(asked.config)
+    elif resumes:
+        file = kept
     content = None if file is None else configuration.read(file)  # once: it may be a pipe
 
     def settled(base: TrainConfig) -> TrainConfig:

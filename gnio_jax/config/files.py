@@ -3,6 +3,7 @@ the experiments that come with the package lie."""
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import difflib
 import math
@@ -419,6 +420,8 @@ def _yaml(content: str, source: str) -> Any:
         problem = "it is nested too deeply"
     except (yaml.YAMLError, ValueError) as error:  # ValueError: too many digits, wrong tags
         problem = " ".join(str(error).split())
+    except (AttributeError, LookupError, TypeError):  # of PyYAML, for a tag on other content
+        problem = "a tag does not fit what stands behind it"
     raise InputError(source, f"is not YAML ({problem})")
 
 
@@ -490,11 +493,14 @@ def _of_today(fields: dict, source: str) -> dict:
 
 def _filter_of_today(old: dict) -> dict:
     """The section `filter` of an earlier version's file, which was flat and in degrees."""
+    if old.keys() & {"noise", "start", "considered"}:
+        return old  # it is of this version: a flat name in it is unknown
     new: dict[str, Any] = {}
     for name, value in old.items():
         field = name.removesuffix("_degrees").removesuffix("_std").removeprefix("considered_")
         if name.endswith("_degrees") and type(value) in (int, float):
-            value = value * (math.pi / 180)
+            with contextlib.suppress(OverflowError):  # it is refused as too large below
+                value = value * (math.pi / 180)
         if name in _hints(FilterSettings) or name.startswith(("std_factor_", "window_error_")):
             new[name] = value
         elif name.startswith("considered_"):

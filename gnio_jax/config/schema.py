@@ -142,7 +142,7 @@ class AugmentConfig:
     tilt_degrees: NonNegative = 5.0
     """Largest tilt of gravity about a random horizontal axis, degrees."""
     yaw: bool = True
-    """Turn window and target by a random yaw; through the filter, piece and reference."""
+    """Turn window and target by a random yaw; through the filter, segment and reference."""
     noise: tuple[NonNegative, NonNegative] = (0.0, 0.0)
     """Standard deviations of white noise of gyro (rad/s) and accelerometer (m/s²)."""
     shift_samples: NonNegativeCount = 0
@@ -360,9 +360,9 @@ class ThroughFilter:
 
     learn: tuple[Part, ...] = ()
     """Parts that learn; none: the network is trained on windows. noise: the filter's densities and
-    bias walks; measurement: the factors of the network's covariance and the errors that last;
-    start: the standard deviations at the start; uncertainty, head, encoder: the network's; all:
-    everything. A filter option that is 0 stays 0."""
+    bias walks; measurement: the factors of the network's covariance and the correlation of its
+    errors; start: the standard deviations at the start; uncertainty, head, encoder: the network's;
+    all: everything. A filter option that is 0 stays 0."""
     piece_seconds: Positive = 60.0
     """Length of the segments of recordings that are filtered, s."""
     filter_learning_rate: Positive = 0.03
@@ -425,8 +425,8 @@ class TrainConfig:
         if not _is_whole(through.piece_seconds / self.data.stride_seconds):
             problem = f"is not a whole number of strides of {self.data.stride_seconds:g} s"
             at.refuse("through_filter.piece_seconds", problem)
-        if through.piece_seconds < 1:
-            problem = "must be at least 1 s, the shortest horizon of its losses"
+        if through.piece_seconds < SHORTEST_HORIZON:
+            problem = f"must be at least {SHORTEST_HORIZON:g} s, the shortest horizon of its losses"
             at.refuse("through_filter.piece_seconds", problem)
         if self.filter.mahalanobis_fail_scale > 0:
             problem = "makes no sense beside the soft gate of training through the filter"
@@ -434,7 +434,4 @@ class TrainConfig:
         seen = self.data.context_seconds + self.data.window_seconds
         if through.piece_seconds < seen + 2 * self.data.stride_seconds:
             problem = f"must be longer than the {seen:g} s that the network sees"
-            at.refuse("through_filter.piece_seconds", problem)
-        if through.piece_seconds < SHORTEST_HORIZON:
-            problem = f"must be at least {SHORTEST_HORIZON:g} s, the shortest time of its losses"
             at.refuse("through_filter.piece_seconds", problem)

@@ -1,7 +1,9 @@
 """Fitted settings against the noises that simulated walks were made with and the errors that
 positions were drawn with, and the gradient against differences."""
 
+import dataclasses
 import functools
+import re
 
 import jax
 import numpy as np
@@ -20,7 +22,7 @@ from gnio_jax.calibration.fit import (
     unphysical,
 )
 from gnio_jax.calibration.fit import fit_innovations as fit
-from gnio_jax.config import CorrelatedError, FilterSettings
+from gnio_jax.config import CalibrateConfig, CorrelatedError, FilterSettings
 from gnio_jax.errors import InputError
 from gnio_jax.filtering.settings import free_parameters
 from tests.support.calibration_walks import (
@@ -89,7 +91,10 @@ def test_a_second_calibration_compiles_nothing_and_a_fit_that_ends_early_is_told
     """Of other walks, with other factors of the axes and another start."""
     given = walks()
     first = fit(given, DATA, TRUE, PATHS, lambda calls: None, most_steps=1)
-    assert first.warnings == ("the fit ended at its limit of 1 steps; raise --steps",)
+    (warning,) = first.warnings
+    assert warning.startswith("the fit ended at its limit of 1 steps, ") and "--fit" in warning
+    options = {f"--{field.name.replace('_', '-')}" for field in dataclasses.fields(CalibrateConfig)}
+    assert set(re.findall(r"--[a-z-]+", warning)) <= options  # no remedy that there is not
     programs = SEARCH._cache_size()
     others = given._replace(displacement=1.01 * given.displacement)
     settings = changed(TRUE, noise={"std_factor": (0.7, 1.0, 1.0)}, start={"velocity": 0.2})

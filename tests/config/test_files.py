@@ -43,6 +43,12 @@ def read(text):
         ("seed: 2020-13-45", "field 'seed' must be a whole number, found '2020-13-45'"),
         ("seed: !!timestamp 2020-13-45", "is not YAML (month must be in 1..12)"),
         ("seed: !!int 0b_", "is not YAML ("),
+        ("seed: !!map [1, 2]", "is not YAML (a tag does not fit what stands behind it)"),
+        ("seed: !!set [1]", "is not YAML (a tag does not fit"),
+        ("seed: !!int ''", "is not YAML (a tag does not fit"),
+        ("data: {rate: !!float ''}", "is not YAML (a tag does not fit"),
+        ("augment: {yaw: !!bool maybe}", "is not YAML (a tag does not fit"),
+        ("seed: !!timestamp today", "is not YAML (a tag does not fit"),
         ("seed: " + "9" * 400, "field 'seed' must be "),
         ("seed: " + "9" * 5000, "is not YAML (Exceeds the limit"),
         ("seed: 99999999999999999999999", "field 'seed' must be "),
@@ -286,6 +292,9 @@ def test_an_old_file_may_leave_fields_out():
         ("filter: {heading_error_std_degrees: 2.0}", "'filter.heading_error_std_degrees' is 2.0"),
         ("filter: {tilt_std_degrees: a}", "field 'filter.start.tilt' must be a number, found 'a'"),
         ("filter: {gyro_density: -1.0}", "field 'filter.noise.gyro_density' must be positive"),
+        (f"filter: {{yaw_std_degrees: 1{'0' * 400}}}", "'filter.start.yaw' is larger than any"),
+        ("filter: {noise: 3, gyro_density: 1e-4}", "unknown field 'filter.gyro_density'"),
+        ("filter: {gyro_density: 1e-4, start: [1]}", "unknown field 'filter.gyro_density'"),
     ],
 )
 def test_an_old_file_that_asks_for_what_is_gone_is_refused(text, problem):
