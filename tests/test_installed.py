@@ -123,7 +123,7 @@ def test_help_and_version_need_no_jax(gnio):
         "interop",
         "doctor",
     ):
-        assert f"    {word} " in shown.stdout
+        assert f"\n  {word} " in shown.stdout
     check = (
         "import sys, gnio_jax\nfrom gnio_jax.commands import app\n"
         "heavy = {'jax', 'flax', 'orbax', 'matplotlib', 'pandas', 'scipy'} & set(sys.modules)\n"

@@ -6,6 +6,7 @@ import json
 import math
 import os
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -66,21 +67,20 @@ def show_list(asked: ListOptions, _call: options.Call) -> None:
     """
     from gnio_jax import data  # late: mistakes do not wait for JAX
 
-    here = Table(title="Datasets", title_justify="left", show_lines=True)
-    for column in ("dataset", "Hz", "splits", "licence", "found here"):
-        here.add_column(column, overflow="fold", justify="right" if column == "Hz" else "left")
-    title = "Where they are had, and the layout that is expected"
-    sources = Table(title=title, title_justify="left", show_lines=True)
-    for column in ("dataset", "where", "layout"):
-        sources.add_column(column, overflow="fold")
+    grid = Table.grid(padding=(0, 2))
+    grid.add_column(no_wrap=True)
+    grid.add_column(overflow="fold")
     for name in data.names():
         dataset = data.get(name)
         splits = ", ".join(dataset.splits)
-        here.add_row(name, f"{dataset.rate:g}", splits, dataset.licence, _found_here(dataset))
-        sources.add_row(name, dataset.source, dataset.layout if dataset.needs_root else "–")
+        about = f"{dataset.rate:g} Hz; splits {splits}; {dataset.licence}"
+        grid.add_row(name, about, style="bold")
+        grid.add_row("  here", _found_here(dataset))
+        grid.add_row("  source", dataset.source)
+        if dataset.needs_root:
+            grid.add_row("  layout", dataset.layout)
     output = console.stdout()
-    output.print(here)
-    output.print(sources)
+    output.print(grid)
     bases = [os.environ["GNIO_DATA"]] if os.environ.get("GNIO_DATA") else []
     other = "another place is named by --data-root, or GNIO_DATA for all of them"
     output.print(f"looked in {' and '.join([*bases, 'data'])}; {other}")
@@ -124,28 +124,16 @@ def check(asked: CheckOptions, _call: options.Call) -> None:
 
     dataset, root = _find(asked.name, asked.data_root)
     with console.terminal() as terminal:
-        rows, notes = loading.check(
-            dataset,
-            root,
-            asked.split,
-            asked.plots,
-            None,
-            lambda share: terminal.progress("checking", share),
-        )
+        progress = partial(terminal.progress, "checking")
+        rows, notes = loading.check(dataset, root, asked.split, asked.plots, None, progress)
     place = f" at {root}" if dataset.needs_root else ""
-    title = f"{dataset.name}{place}, split {asked.split}"
-    output = console.stdout()
-    table = Table(title=title, title_justify="left")
+    table = Table(title=f"{dataset.name}{place}, split {asked.split}", title_justify="left")
+    for column in ("sequence", "split"):
+        table.add_column(column, overflow="fold")
     for column in _FIGURES:
-        text = column in ("sequence", "split", "")
-        width = 14 if column == "sequence" else None
-        table.add_column(
-            column,
-            overflow="fold",
-            justify="left" if text else "right",
-            no_wrap=not text,
-            min_width=width,
-        )
+        table.add_column(column, justify="right", no_wrap=True)
+    table.add_column("", no_wrap=True)
+    output = console.stdout()
     for row in rows:
         table.add_row(*_figures(row), style="red" if row.reason else None)
     output.print(table)
@@ -169,8 +157,6 @@ def check(asked: CheckOptions, _call: options.Call) -> None:
 
 
 _FIGURES = (
-    "sequence",
-    "split",
     "s",
     "Hz",
     "mean of R·accel\nm/s²",
@@ -178,28 +164,29 @@ _FIGURES = (
     "speed\nm/s",
     "accel\ncorr.",
     "valid",
-    "",
 )
 
 
 def _figures(row: Any) -> list[str]:
     """The cells of a `loading.Checked`."""
-    found = row.check
+    found, splits = row.check, ", ".join(row.splits)
     if found is None:
-        return [row.name, ", ".join(row.splits), *["–"] * 7, "left out"]
-    numbers = (
-        found.gyro_consistency_degrees,
-        found.median_speed,
-        found.accel_correlation_horizontal,
-    )
-    gravity = [round(value, 2) + 0.0 for value in found.gravity_mean]  # no −0.00
+        return [row.name, splits, *["–"] * len(_FIGURES), "left out"]
+
+    def cell(*values: float) -> str:
+        if any(map(math.isnan, values)):
+            return "–"
+        return " ".join(f"{round(value, 2) + 0.0:.2f}" for value in values)  # no −0.00
+
     return [
         row.name,
-        ", ".join(row.splits),
+        splits,
         f"{found.duration:.1f}",
         f"{found.rate:.1f}",
-        "–" if any(map(math.isnan, gravity)) else " ".join(f"{value:.2f}" for value in gravity),
-        *("–" if math.isnan(number) else f"{number:.2f}" for number in numbers),
+        cell(*found.gravity_mean),
+        cell(found.gyro_consistency_degrees),
+        cell(found.median_speed),
+        cell(found.accel_correlation_horizontal),
         f"{found.share_valid:.1%}",
         "left out" if row.reason else "used",
     ]
@@ -239,15 +226,9 @@ def convert(asked: ConvertOptions, _call: options.Call) -> None:
 
     dataset, root = _find(asked.name, asked.data_root)
     with console.terminal() as terminal:
-        result = loading.convert(
-            dataset,
-            root,
-            asked.out,
-            asked.split,
-            asked.rate,
-            None,
-            lambda share: terminal.progress("converting", share),
-        )
+        progress = partial(terminal.progress, "converting")
+        out, split, rate = asked.out, asked.split, asked.rate
+        result = loading.convert(dataset, root, out, split, rate, None, progress)
     _print_reasons(result.left_out, result.notes)
     counts = ", ".join(f"{split} {len(stems)}" for split, stems in result.sequences.items())
     output = console.stdout()

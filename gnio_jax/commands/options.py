@@ -49,6 +49,7 @@ class Group(NamedTuple):
     """A program whose first word is the name of a command."""
 
     help: str
+    """What it is, and behind the line "examples:" some."""
     commands: dict[str, str | Group]
     """Name -> "module:function" of this room. Only the module of a command that is called is
     imported, so a mistake does not wait for the others."""
@@ -88,7 +89,7 @@ def run(program: Group | str | Command, call: Call) -> None:
     while isinstance(program, Group):
         word = call.argv[0] if call.argv else ""
         if word in HELP:
-            print(program.help.format(prog=call.prog))
+            print(_overview(program, call.prog))
             return
         if word.startswith(COMPLETION):
             tyro.cli(_union(program), args=call.argv, prog=call.prog, registry=REGISTRY)
@@ -100,6 +101,24 @@ def run(program: Group | str | Command, call: Call) -> None:
         program, call = program.commands[word], Call(f"{call.prog} {word}", call.argv[1:])
     command = function(program) if isinstance(program, str) else program
     command(read(command, call), call)
+
+
+def _overview(group: Group, prog: str) -> str:
+    """The help of a group: what each command does, in the first line of its own help."""
+    about, _, examples = group.help.format(prog=prog).partition("\nexamples:\n")
+    lines = []
+    for name, command in group.commands.items():
+        is_group = isinstance(command, Group)
+        text = command.help if is_group else inspect.getdoc(function(command)) or ""
+        lines.append(f"  {name:<11}{text.partition(chr(10))[0]}")
+    return "\n".join(
+        [
+            f"{about}\nusage: {prog} COMMAND [OPTIONS]\n",
+            *lines,
+            f"\nexamples:\n{examples}",
+            f"\n{prog} COMMAND --help explains a command, with examples at its end.",
+        ]
+    )
 
 
 def _union(group: Group) -> Any:
@@ -228,8 +247,8 @@ def options_of(kind: type, prefix: str = "") -> Iterator[Option]:
             inner = prefix if tyro.conf.OmitArgPrefixes in markers else f"{prefix}{word}."
             yield from options_of(typing.cast(type, hint), inner)
         elif tyro.conf.Positional in markers:
-            named = [each.metavar for each in markers if getattr(each, "metavar", None)]
-            yield Option(*named or [word.upper()], hint, _words(hint), required)
+            named = (each.metavar for each in markers if getattr(each, "metavar", None))
+            yield Option(next(named, word.upper()), hint, _words(hint), required)
         elif tyro.conf.UseAppendAction in markers:
             yield Option(name, typing.get_args(hint)[0], 1, required)
         else:
@@ -313,6 +332,7 @@ def _value_or_null(found: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
 
 
 def _shown(default: str) -> str:
+    """A default in the help, as far as the option or its text does not tell it."""
     return {"None": "", "": "", "False": "", "True": "(on by default)"}.get(
         default, f"(default: {default})"
     )

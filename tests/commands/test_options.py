@@ -67,9 +67,9 @@ def test_numbers_are_those_of_yaml():
 @pytest.mark.parametrize(
     ("words", "expected"),
     [
-        ([], "command: is missing; give one of train, evaluate, calibrate, compare, tables"),
+        ([], "command: is missing; give one of track, live, train, evaluate, calibrate"),
         (["trian"], "command: unknown 'trian'; did you mean 'train'?"),
-        (["--verbose"], "command: unknown '--verbose'; give one of train, evaluate"),
+        (["--verbose"], "command: unknown '--verbose'; give one of track, live"),
         (["data"], "command: is missing; give one of list, check, convert, import"),
         (["data", "chek"], "command: unknown 'chek'; did you mean 'check'?"),
         (
