@@ -8,8 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gnio_jax.data.importing import units
-from gnio_jax.data.importing.streams import Joined
+from gnio_jax.data.parsing import units
 from gnio_jax.errors import InputError
 from gnio_jax.live.samples import Sample, Scale
 from gnio_jax.live.sources import Source
@@ -62,9 +61,9 @@ def _check_gravity(samples: list[Sample], name: str) -> None:
     raise InputError(name, problem, f"{remedy}; gravity must be in it")
 
 
-def _joined(samples: list[Sample]) -> Joined:
+def _joined(samples: list[Sample]) -> units.Imu:
     """In order, as the check of a recording wants them."""
     rows = np.array([[sample.time, *sample.gyro, *sample.accel] for sample in samples])
     rows = rows[np.unique(rows[:, 0], return_index=True)[1]]
     time = rows[:, 0] - rows[0, 0]
-    return Joined(float(rows[0, 0]), time, rows[:, 1:4], rows[:, 4:7])
+    return units.Imu(time, rows[:, 1:4], rows[:, 4:7])

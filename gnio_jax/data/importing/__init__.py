@@ -16,7 +16,6 @@ import numpy as np
 import pandas as pd
 
 from gnio_jax.config import ImportOptions
-from gnio_jax.data.importing import units
 from gnio_jax.data.importing.asl import read_asl
 from gnio_jax.data.importing.bags import KINDS
 from gnio_jax.data.importing.kept import Imported
@@ -34,6 +33,7 @@ from gnio_jax.data.importing.streams import (
     read_stream,
     read_table,
 )
+from gnio_jax.data.parsing import units
 from gnio_jax.data.parsing.stamps import PER_SECOND, RATES, rounded_rate, seconds
 from gnio_jax.data.parsing.stamps import time_unit as detect_time_unit
 from gnio_jax.data.parsing.tables import Table
@@ -182,10 +182,10 @@ def _joined(source: Source, stated: Units, notes: list[str], warnings: list[str]
     _check_length(gyro, accel, source.path)
     scale = units.accel_scale(accel.values, stated.accel or known.accel, accel_file.path, notes)
     imu = join(gyro, _scaled(accel, scale), gyro_file.path, accel_file.path, notes)
-    scale = units.gyro_scale(imu, stated.gyro or known.gyro, gyro_file.path, notes)
+    scale = units.gyro_scale(_imu(imu), stated.gyro or known.gyro, gyro_file.path, notes)
     imu = imu._replace(gyro=imu.gyro * scale)
     if stated.gyro is None and known.gyro is not None:
-        units.check_rad_per_second(imu, gyro_file.path)
+        units.check_rad_per_second(_imu(imu), gyro_file.path)
     sign = stated.sign or known.sign
     if sign is None:
         raise InputError(
@@ -195,7 +195,7 @@ def _joined(source: Source, stated: Units, notes: list[str], warnings: list[str]
         )
     force = units.signed(imu.accel, sign, accel_file.path, notes)
     imu = imu._replace(accel=force)
-    upward = units.note_gravity(imu, accel_file.path, notes)
+    upward = units.note_gravity(_imu(imu), accel_file.path, notes)
     if upward == "-z" and stated.sign is None and known.sign_is_assumed:
         warnings.append(
             f"sign: gravity reads on -z in {accel_file.path.name}: the screen points down, or this "
@@ -287,6 +287,10 @@ def _csv_reference(path: Path, frame: pd.DataFrame, time: str, unit: str | None)
 
 def _scaled(stream: Stream, scale: float) -> Stream:
     return stream._replace(values=stream.values * scale)
+
+
+def _imu(joined: Joined) -> units.Imu:
+    return units.Imu(joined.time, joined.gyro, joined.accel)
 
 
 def _without_reference(imu: Joined, name: str, source: Path) -> Sequence:

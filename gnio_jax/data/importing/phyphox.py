@@ -35,8 +35,8 @@ import pandas as pd
 from gnio_jax.data.importing import archives
 from gnio_jax.data.importing.source import Source, Units
 from gnio_jax.data.importing.streams import SensorFile, read_table
-from gnio_jax.data.importing.units import named_unit
 from gnio_jax.data.parsing.tables import Table, parsed_as
+from gnio_jax.data.parsing.units import named_unit
 from gnio_jax.errors import InputError, require_packages
 from gnio_jax.numerics import interpolate
 

@@ -7,7 +7,7 @@ import openpyxl
 import pytest
 
 from gnio_jax.data.importing import archives
-from gnio_jax.data.importing.units import named_unit
+from gnio_jax.data.parsing.units import named_unit
 from gnio_jax.errors import InputError
 from tests.support import known_walk, logger_files
 from tests.support.importing import import_recording

@@ -1,4 +1,4 @@
-"""Units and signs that a logger's data tell, or that are refused as ambiguous."""
+"""Units and signs that a header or the data tell, or that are refused as ambiguous."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ import numpy as np
 from jaxtyping import Float
 from scipy.ndimage import gaussian_filter1d
 
-from gnio_jax.data.importing.streams import Joined
 from gnio_jax.errors import InputError
 from gnio_jax.numerics import interpolate
 from gnio_jax.types import GRAVITY, STANDARD_G
@@ -57,6 +56,15 @@ def common_unit(labels: Iterable[str], known: Iterable[str]) -> str | None:
     return found.pop() if len(found) == 1 and found <= set(known) else None
 
 
+class Imu(NamedTuple):
+    """Both sensors at the same stamps."""
+
+    time: Float[np.ndarray, " n"]
+    """s."""
+    gyro: Float[np.ndarray, "n 3"]
+    accel: Float[np.ndarray, "n 3"]
+
+
 def accel_scale(
     accel: Float[np.ndarray, "n 3"], unit: str | None, path: Path, notes: list[str]
 ) -> float:
@@ -75,7 +83,7 @@ def accel_scale(
     return TO_METRES_PER_SECOND_SQUARED[fitting[0]]
 
 
-def gyro_scale(imu: Joined, unit: str | None, path: Path, notes: list[str]) -> float:
+def gyro_scale(imu: Imu, unit: str | None, path: Path, notes: list[str]) -> float:
     """rad/s of one unit; None detects the unit. `imu.accel` is in m/s².
 
     Beyond `GYRO_RANGE` it is deg/s; else the turning of gravity in the accelerometer tells where
@@ -108,7 +116,7 @@ def gyro_scale(imu: Joined, unit: str | None, path: Path, notes: list[str]) -> f
     return TO_RAD_PER_SECOND[unit]
 
 
-def check_rad_per_second(imu: Joined, path: Path) -> None:
+def check_rad_per_second(imu: Imu, path: Path) -> None:
     """Raise `InputError` where a gyro that a format or header gives a unit does not turn as gravity
     does, but by the factor between rad and deg. `imu` is in SI units by that statement."""
     turning, factor = _turning_of_gravity(imu), TO_RAD_PER_SECOND["deg/s"]
@@ -132,7 +140,7 @@ class _Turning(NamedTuple):
     correlation: float
 
 
-def _turning_of_gravity(imu: Joined) -> _Turning:
+def _turning_of_gravity(imu: Imu) -> _Turning:
     step = float(np.median(np.diff(imu.time)))
     clock = np.arange(imu.time[0], imu.time[-1], step)
     if len(clock) < 3.0 / step:
@@ -180,7 +188,7 @@ def signed(
     return -accel if sign == "ios" else accel
 
 
-def note_gravity(imu: Joined, path: Path, notes: list[str]) -> str:
+def note_gravity(imu: Imu, path: Path, notes: list[str]) -> str:
     """What the quietest second says of gravity, as notes; the axis that reads most of it is
     returned, as "+z". Raises `InputError` where gravity is far off."""
     accel = imu.accel
