@@ -416,8 +416,10 @@ class FilterTask(Task):
         state = window_task.initial_state(self.model, self.keys.init, window)
         state = state._replace(filter=filter_numbers(self.config.filter))
         if start is not None:
-            # The filter is that of the settings, not that of the run.
-            found = window_task.overlaid(state.variables, {**start, "filter": {}})
+            # The filter is that of the settings, not that of the run. Copies: the steps take the
+            # memory of their state, and another seed starts from the same weights.
+            start = jax.tree.map(parallel.fresh_copy, {**start, "filter": {}})
+            found = window_task.overlaid(state.variables, start)
             state = state._replace(params=found["params"], batch_stats=found["batch_stats"])
         trained = trainable(state.variables, self.config.through_filter.learn)
         chex.assert_type(jax.tree.leaves(trained), jnp.float32)

@@ -30,6 +30,7 @@ from gnio_jax.filtering.settings import with_free_parameters
 from gnio_jax.models import registry
 from gnio_jax.reporting import Lines
 from gnio_jax.training import checkpoint, filter_task, loop, run_folder, window_task
+from gnio_jax.training.filter_losses import FilterLosses
 from tests.support import drawn_run
 from tests.support.command_lines import run as gnio
 from tests.support.compiling import quick
@@ -219,6 +220,16 @@ def new_state(training):
     return oracle(training.initial_state(start.variables))
 
 
+def test_each_seed_has_the_weights_of_the_run(training):
+    """The steps take the memory of their state; that of the weights, which the next seed starts
+    from, is another."""
+    start = run_folder.initial_run(training.config, checkpoint.load_run)
+    state = training.initial_state(start.variables)
+    for leaf in jax.tree.leaves(state):
+        leaf.delete()
+    assert not any(leaf.is_deleted() for leaf in jax.tree.leaves(start.variables))
+
+
 def test_wild_steps_are_skipped_and_counted(training):
     """A sample that is no number; a reference that jumps, whose gradient is finite and far too
     large."""
@@ -236,6 +247,31 @@ def test_wild_steps_are_skipped_and_counted(training):
         assert progress.sums.pop("skipped") == 1
         assert len(progress.sums) > 6 and all(each == 0 for each in progress.sums.values())
         assert loop._means({"loss": 6.0, "skipped": 2.0}, 5) == {"loss": 2.0, "skipped": 2}
+
+
+@pytest.mark.parametrize(
+    "number, healthy, total, skipped",
+    [(1, True, 1.0, 0), (2, False, 1.0, 1), (3, True, np.inf, 1)],
+)
+def test_a_step_is_skipped_where_the_filter_diverged_or_the_loss_is_infinite(
+    training, monkeypatch, number, healthy, total, skipped
+):
+    """Whatever its gradient."""
+
+    def found(variables, trained, *_):
+        losses = FilterLosses(*[jnp.float64(0)] * len(FilterLosses._fields))
+        gradient = jax.tree.map(jnp.ones_like, trained)
+        return gradient, losses._replace(total=jnp.float64(total)), jnp.bool_(healthy)
+
+    monkeypatch.setattr(filter_task, "gradient_of_segments", found)
+    optim = dataclasses.replace(training.config.optim, epochs=100 + number)  # compiled for itself
+    task = dataclasses.replace(training, config=dataclasses.replace(training.config, optim=optim))
+    order = jnp.repeat(training.source.earliest[:5], 2)
+    state = new_state(training)
+    before = jax.tree.map(np.array, (state.variables, state.opt_state))
+    state, progress = task.take_steps(state, order, 0, 1, 1.0)
+    assert progress.sums["skipped"] == skipped
+    assert same(before, (state.variables, state.opt_state)) == bool(skipped)
 
 
 def test_a_skipped_step_does_not_shift_the_schedule(training):
