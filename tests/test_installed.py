@@ -15,7 +15,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 SMALL = [
-    *("--model.width", "2", "--model.bank-size", "3", "--model.bank-heads", "2"),
+    *("--model.width", "2", "--model.bank-size", "3"),
     *("--optim.epochs", "1", "--data.train-split", "val", "--data.stride-seconds", "0.5"),
     *("--data.train-stride-seconds", "1", "--data.rate", "20"),
 ]

@@ -151,6 +151,7 @@ def _source(asked: LiveOptions) -> tuple[Any, float | None, tuple[str, ...]]:
     if asked.speed < 0:
         raise InputError("--speed", f"must not be negative, found {asked.speed:g}")
     stated = ImportOptions(gyro_unit=asked.gyro_unit, accel_unit=asked.accel_unit)
-    sequence, notes = read_any(Path(asked.source), stated)
+    sequence, notes, warned = read_any(Path(asked.source), stated)
     rate = 1 / float(np.median(np.diff(sequence.time)))
-    return following.from_recording(sequence, asked.speed), asked.imu_rate or rate, notes
+    played = following.from_recording(sequence, asked.speed)
+    return played, asked.imu_rate or rate, (*warned, *notes)

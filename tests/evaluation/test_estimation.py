@@ -112,7 +112,7 @@ def test_perfect_displacements_leave_little_error(walks, setup, ate):
     prepared, _ = evaluation.prepare(walks[::2], CONFIG, setup._replace(gyro_bias="reference"))
     for found in evaluation.perfect_displacements(prepared, CONFIG, OPTIONS, setup):
         values = metrics.measure(found.trajectory, found.reference).values
-        assert values["ate"] < ate and values["path_length_ratio"] == pytest.approx(1, abs=0.03)
+        assert values["ate"] < ate and values["path_length_ratio"] == pytest.approx(1, abs=0.04)
 
 
 def test_true_displacements_lack_nothing_that_was_calibrated(walks):

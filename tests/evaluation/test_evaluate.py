@@ -81,8 +81,7 @@ def test_end_to_end(workdir, command, capsys, tmp_path):
     )
     assert found["settings"]["coupling"] == "tight" and found["settings"]["epoch"] == 1
     assert found["settings"]["filter"]["start"]["velocity"] == 0.7
-    # Nothing says whose these walks are, so each is on its own.
-    assert [one["group"] for one in found["sequences"].values()] == list(found["sequences"])
+    assert [one["group"] for one in found["sequences"].values()] == ["person 1", "person 2"]
     assert (
         found["mean"]["ate"] > 0
         and found["reference_rows"]["perfect_displacements"]["mean"]["ate"] < 0.1
@@ -180,7 +179,6 @@ def test_folders_tell_choices_apart():
         ),
         (["--set", "filter.noise.gyro_density=-1"], "'filter.noise.gyro_density' must be positive"),
         (["--set", "filter.noise.gyro_densty=1"], "did you mean 'filter.noise.gyro_density'?"),
-        (["--batch-size", "0"], "--batch-size: must be at least 1"),
         (["--orientation", "device"], "leave it out"),
         (["--checkpoint", "latest"], "holds no checkpoint"),
         (["--dataset", "tlio", "--data-root", "/nowhere"], "/nowhere"),

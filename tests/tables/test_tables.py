@@ -10,6 +10,7 @@ import yaml
 
 from gnio_jax import calibration, models
 from gnio_jax import config as configuration
+from gnio_jax.calibration import run as calibration_run
 from gnio_jax.comparison import figures
 from gnio_jax.config import CalibrateConfig, DataConfig, ModelConfig, OptimConfig, TrainConfig
 from gnio_jax.errors import InputError
@@ -104,9 +105,10 @@ def test_every_run_is_calibrated_before_it_is_measured(made, monkeypatch, capsys
 
     def quickly(config, **more):
         assert config == CalibrateConfig(config.workdir, config.out)
-        return calibrate(dataclasses.replace(config, fit=("measurement",), steps=2), **more)
+        return calibrate(dataclasses.replace(config, fit=("measurement",)), **more)
 
     monkeypatch.setattr(calibration, "calibrate", quickly)
+    monkeypatch.setattr(calibration_run, "MOST_STEPS", 2)
     root, arguments = made
     arguments = [*arguments, "--seeds", "1", "--estimator", "ekf"]
     gnio("tables", "comparison", *arguments)
