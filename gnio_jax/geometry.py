@@ -35,6 +35,7 @@ _GENERATORS = np.array(
 reduction can end as a library call."""
 
 
+@jax.custom_jvp
 def hat(v: Vector) -> Matrix:
     """The cross-product matrix: hat(v) w = v × w."""
     return (
@@ -44,6 +45,13 @@ def hat(v: Vector) -> Matrix:
     )
 
 
+@hat.defjvp
+def _hat_jvp(primals: tuple, tangents: tuple) -> tuple[Matrix, Matrix]:
+    (v,), (dv,) = primals, tangents
+    return hat(v), jnp.sum(_GENERATORS.astype(v.dtype) * dv[:, None, None], axis=0)
+
+
+@jax.custom_jvp
 def _series(squared: Scalar) -> tuple[Scalar, Scalar, Scalar]:
     """sin θ/θ, (1 − cos θ)/θ² and (θ − sin θ)/θ³ from θ².
 
@@ -69,6 +77,23 @@ def _small_or_safe(squared: Scalar) -> tuple[jax.Array, Scalar, Scalar]:
     """Whether θ² is small; θ² where it is, else 0; θ² where it is not, else 1."""
     small = squared < 1e-2
     return small, jnp.where(small, squared, 0.0), jnp.where(small, 1.0, squared)
+
+
+@_series.defjvp
+def _series_jvp(primals: tuple, tangents: tuple) -> tuple[tuple, tuple]:
+    """With c_n = Σ_k (−θ²)^k / (2k + n)!, the three are c_1, c_2, c_3, and by θ² the derivative of
+    c_n is (n c_{n+2} − c_{n+1}) / 2."""
+    (squared,), (d_squared,) = primals, tangents
+    sine, versine, excess = _series(squared)
+    small, x, safe = _small_or_safe(squared)
+    fourth = jnp.where(
+        small, 1 / 24 - x / 720 * (1 - x / 56 * (1 - x / 90)), (0.5 - versine) / safe
+    )
+    fifth = jnp.where(
+        small, 1 / 120 - x / 5040 * (1 - x / 72 * (1 - x / 110)), (1 / 6 - excess) / safe
+    )
+    slopes = 0.5 * (excess - versine), fourth - 0.5 * excess, 0.5 * (3 * fifth - fourth)
+    return (sine, versine, excess), tuple(slope * d_squared for slope in slopes)
 
 
 def _polynomial(phi: Vector, squared: Scalar, first: Scalar, second: Scalar) -> Matrix:

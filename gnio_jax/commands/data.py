@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -198,7 +199,7 @@ def _json(row: Any) -> dict[str, Any]:
     def plain(value: Any) -> Any:
         if isinstance(value, float) and math.isnan(value):
             return None
-        return [plain(each) for each in value] if hasattr(value, "__len__") else value
+        return [plain(each) for each in value] if isinstance(value, Iterable) else value
 
     figures = row.check._asdict() if row.check else {}
     figures = {

@@ -13,6 +13,7 @@ from gnio_jax import config as configuration
 from gnio_jax.commands import console, options
 from gnio_jax.config import ConsideredStd, TrainConfig
 from gnio_jax.cores import usable_cores
+from gnio_jax.errors import InputError
 
 
 @dataclass(frozen=True)
@@ -57,6 +58,8 @@ def train(asked: TrainOptions, call: options.Call) -> None:
       {prog} --config quickstart --set filter.noise.gyro_density=1e-3 --set optim.clip_norm=null
       {prog} --config through_filter_oxiod --init-from runs/oxiod_calibrated --workdir runs/through
     """
+    if "--seeds" in call.argv and not asked.seeds:
+        raise InputError("--seeds", "names no seed", "give some, e.g. 0 1 2")
     config = experiment(asked, call)
     from gnio_jax import filtering, parallel, pretrained  # late: mistakes do not wait for JAX
     from gnio_jax.training import loop

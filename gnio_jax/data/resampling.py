@@ -180,7 +180,7 @@ def splined(
     share = near.share[:, None]
     line = (1.0 - share) * values[near.left] + share * values[near.right]
     result = np.where(share > 0, line, values[near.left])
-    rows = slice(None) if good is None else np.flatnonzero(good)
+    rows = np.arange(len(time)) if good is None else np.flatnonzero(good)
     time, values = time[rows], values[rows]
     if len(time) < SHORTEST_SPLINE:
         return result

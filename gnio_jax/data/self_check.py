@@ -142,6 +142,7 @@ def _measure_waypoints(sequence: Sequence, window_seconds: float) -> SelfCheck:
     The mean specific force over a window, in the frame of its gyro-integrated attitude, is as long
     as gravity: a walker gains hardly any velocity in it. Its direction is not known.
     """
+    assert sequence.waypoints is not None
     time, (stamps, position) = sequence.time, sequence.waypoints
     step = float(np.median(np.diff(time)))
     force = integrate_gyro(sequence.gyro, step).apply(sequence.accel)

@@ -147,9 +147,9 @@ b_a, or its diagonal."""
 def _smooth(
     inputs: Inputs, displacement: Array, covariance: Array, config: FilterConfig, frame: YawFrame
 ) -> SmoothedHistory:
-    state, *signals, measurements, noise = inputs
+    state, gyro, accel, imu_valid, measurements, noise = inputs
     given = scaled_displacements(displacement, covariance, noise, frame)
-    stream, _, _ = bridge(*signals, state.imu, config)
+    stream, _, _ = bridge(gyro, accel, imu_valid, state.imu, config)
     numbers, by_interval = intervals(stream, config)
     rows = _Row(numbers % config.clones, by_interval, given, measurements)
     size, dtype = sum(state.cross_covariance.shape), state.offset.dtype

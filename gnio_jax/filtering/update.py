@@ -167,8 +167,10 @@ def linearise(
         "anchor": position,  # p = a + o
         "correlated": correlated,
     }
-    core = {name: jnp.asarray(of, dtype) for name, of in blocks.items() if of is not None}
-    oldest = [np.zeros((rows, 3), dtype)] * 2
+    core: dict[str, Array] = {
+        name: jnp.asarray(of, dtype) for name, of in blocks.items() if of is not None
+    }
+    oldest: list[Array] = [np.zeros((rows, 3), dtype)] * 2
     if oldest_rotation is not None:
         oldest[0] = jnp.asarray(oldest_rotation, dtype)
     if since_oldest is not None:

@@ -222,14 +222,14 @@ def _after_epoch(task: Task, at: Position, row: Row) -> tuple[bool, Position]:
 
     The choice begins anew with the epoch that changes what is trained, and again with the first
     whole one after it: losses before and after do not compare, and what has just begun to learn has
-    learnt little. NaN is never the best.
+    learnt little. NaN and infinity are never the best.
     """
     optim = task.config.optim
     merit = row["val_loss" if optim.best_by == "loss" else "val_mse"]
     before = at.step - 2 * task.steps_per_epoch
     changed = any(before < change < at.step for change in task.changes)
     best = None if changed else at.best
-    improved = not math.isnan(merit) and (best is None or merit < best)
+    improved = math.isfinite(merit) and (best is None or merit < best)
     plateau = optimizer.watch(at.plateau, row["val_mse"], optim)
     best = merit if improved else best
     return improved, at._replace(epoch=at.epoch + 1, best=best, sums={}, plateau=plateau)

@@ -58,6 +58,7 @@ def mistake(monkeypatch, capsys, tmp_path, *arguments):
         (["--datset", "tlio"], "--datset: unknown option; did you mean --dataset?"),
         (["--config", ""], ".: cannot be read"),
         (["--devices", "0"], "--devices: must be at least 1, found 0"),
+        (["--seeds"], "--seeds: names no seed"),
         (["--optim.epoch", "3"], "--optim.epoch: unknown option; did you mean --optim.epochs?"),
         (["--optim.epochs", "three"], "--optim.epochs: must be a whole number, found 'three'"),
         (

@@ -483,8 +483,8 @@ def plateau_config(recording, workdir, epochs):
     return tiny(recording, workdir, optim=optim)
 
 
-def test_nan_on_validation_is_never_the_best(recording, tmp_path, monkeypatch):
-    nan = float("nan")
+@pytest.mark.parametrize("nan", [float("nan"), float("inf")])
+def test_nan_on_validation_is_never_the_best(recording, tmp_path, monkeypatch, nan):
     Counted(monkeypatch, [(nan, nan), (3.0, 3.0), (nan, nan), (2.0, 2.0), (4.0, 4.0)])
     outcome = loop.train(plateau_config(recording, tmp_path / "run", 5))
     assert outcome.best_loss == 2.0

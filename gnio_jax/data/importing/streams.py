@@ -91,9 +91,8 @@ def read_table(path: Path, columns: tuple[str, ...], content: bytes | None = Non
     """
     layout = table_layout(path, content)
     header = not (columns and all(name.isdigit() for name in columns))
-    table = read_text(path, layout.separator, header, content, layout.decimal).columns
-    table.columns = [_label(label) for label in table.columns]
-    return table
+    table = read_text(path, layout.separator, header, content, layout.decimal)
+    return pd.DataFrame(table.columns).rename(columns=_label)
 
 
 def table_layout(path: Path, content: bytes | None = None) -> Layout:

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
-from jaxtyping import Num
+from jaxtyping import Bool, Float, Num
 from scipy.spatial.transform import Rotation
 
 from gnio_jax.data.validation import UNIT_NORM_TOLERANCE
@@ -70,6 +70,10 @@ class Table(NamedTuple):
     """Lines before the first row, of a text file."""
     content: bytes | None = None
     """What a text file holds where it is part of an archive."""
+
+    def renamed(self, names: Iterable[str]) -> Table:
+        """The columns of a text under these names, in their order."""
+        return self._replace(columns=pd.DataFrame(self.columns).set_axis([*names], axis=1))
 
     def width(self) -> int:
         """How many columns there are."""

@@ -200,7 +200,7 @@ def read_table(path: Path) -> Table:
     known = {STAMP, *GYRO, *ACCEL, *_POSITION, *_QUATERNION, *_VELOCITY}
     given = zip(names, table.columns, strict=True)
     labels = [theirs if theirs in known else name for theirs, name in given]
-    return table._replace(columns=table.columns.set_axis(labels, axis=1))
+    return table.renamed(labels)
 
 
 def read_reference(mav: Path, start: float | int) -> Poses | None:

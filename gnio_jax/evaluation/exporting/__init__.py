@@ -79,7 +79,7 @@ def read_trajectory(path: Path) -> Trajectory:
         raise InputError(
             path, f"has {table.width()} columns, not the 8 of TUM's format", f"they are {_TUM}"
         )
-    table = table._replace(columns=table.columns.set_axis(_TUM.split(), axis=1))
+    table = table.renamed(_TUM.split())
     time, position = table.take("t"), table.take("x", "y", "z")
     check_increasing(time, path)
     attitude = table.rotations("qx", "qy", "qz", "qw", scalar_first=False)
