@@ -204,9 +204,10 @@ def _read_form(form: Recording) -> Reading:
 
 def _must_be_made(recording: Recording) -> bool:
     """Whether reading is slow: its sequences are not in the cache."""
+    if not recording.slow:
+        return False
     try:
-        entry = cache_entry(f"{recording.name} {recording.form}", recording.files)
-        return recording.slow and not entry.is_file()
+        return not cache_entry(f"{recording.name} {recording.form}", recording.files).is_file()
     except InputError:  # a file is gone: reading will say so
         return False
 
