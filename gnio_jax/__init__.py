@@ -11,6 +11,7 @@ from typing import Any
 
 __all__ = [
     "__version__",
+    "apps",
     "calibration",
     "comparison",
     "config",

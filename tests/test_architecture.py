@@ -25,9 +25,12 @@ ROOMS = {
     "tracking": BASE | {"data", "filtering", "training", "evaluation", "pretrained"},
     "live": BASE | {"data", "filtering", "training", "evaluation", "tracking"},
     "deployment": BASE | {"data", "filtering", "training", "evaluation", "pretrained", "tracking"},
+    "apps": BASE
+    | {"data", "models", "filtering", "training", "evaluation", "calibration", "pretrained"}
+    | {"tracking"},
     "commands": BASE
     | {"data", "filtering", "training", "evaluation", "calibration", "interop", "comparison"}
-    | {"tables", "pretrained", "tracking", "live", "deployment"},
+    | {"tables", "apps", "pretrained", "tracking", "live", "deployment"},
     **{name: BASE for name in BASE},
 }
 """Rooms and top-level modules, and what each may import of the package besides itself."""
