@@ -1,5 +1,6 @@
 # make demo   train on the embedded synthetic pedestrians, evaluate, show the table and the pictures
 # make test   install everything the tests need, and run them on every core
+# make test-all   the tests that are marked slow, too: continuous integration runs these
 # make lint   ruff and pyright
 # make docs   the documentation as a site, in site/index.html; its notebooks run
 # make links  ask every external link of the pages if it answers; needs a network
@@ -27,7 +28,7 @@ SHARED_OUT := --dist loadfile --no-loadscope-reorder
 # No rules but these.
 MAKEFLAGS += --no-builtin-rules
 
-.PHONY: demo test lint docs links clean
+.PHONY: demo test test-all lint docs links clean
 
 demo: $(VENV)/.package
 	rm -rf $(DEMO)
@@ -36,6 +37,9 @@ demo: $(VENV)/.package
 	$(BIN)/gnio evaluate --workdir $(DEMO)
 
 test: $(VENV)/.with-$(EXTRAS)
+	$(TEST_ENVIRONMENT) $(BIN)/python -m pytest -n $(JOBS) $(SHARED_OUT) -m 'not slow' $(PYTEST_ARGS)
+
+test-all: $(VENV)/.with-$(EXTRAS)
 	$(TEST_ENVIRONMENT) $(BIN)/python -m pytest -n $(JOBS) $(SHARED_OUT) $(PYTEST_ARGS)
 
 lint: $(VENV)/.with-test,dev

@@ -5,6 +5,7 @@ compiler optimises nothing, here and in the processes that tests start.
 """
 
 import atexit
+import ctypes
 import gc
 import os
 from importlib.metadata import version
@@ -79,20 +80,34 @@ def pytest_collection_modifyitems(items):
     items.sort(key=lambda item: places.get(item.path, len(LONGEST)))
 
 
+MOST_MEMORY, MOST_MAPS = 1.2e9, 30_000
+"""Bytes of a worker, and its memory maps: Linux grants a process 65,530, and XLA crashes without a
+word where they end."""
+
+
 @pytest.fixture(scope="module", autouse=True)
 def programs_that_fit():
-    """Compiled programs are let go before they use up the 65,530 memory maps that Linux grants a
-    process: XLA crashes without a word.
+    """Compiled programs are let go before they fill the memory.
 
     What stays, no collection of garbage looks at again.
     """
     yield
-    maps = Path("/proc/self/maps")
-    if maps.exists() and maps.read_bytes().count(b"\n") > 30_000:
+    if used_too_much():
         gc.unfreeze()
         jax.clear_caches()
+        gc.collect()
+        ctypes.CDLL(None).malloc_trim(0)  # what is free returns to the system
     gc.collect()
     gc.freeze()
+
+
+def used_too_much():
+    """Whether this worker holds more than it should; never, where there is no /proc to ask."""
+    here = Path("/proc/self")
+    if not here.exists():
+        return False
+    resident = int((here / "statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    return resident > MOST_MEMORY or (here / "maps").read_bytes().count(b"\n") > MOST_MAPS
 
 
 @pytest.fixture(scope="session")
