@@ -61,9 +61,9 @@ def _check_gravity(samples: list[Sample], name: str) -> None:
     raise InputError(name, problem, f"{remedy}; gravity must be in it")
 
 
-def _joined(samples: list[Sample]) -> units.Imu:
+def _joined(samples: list[Sample]) -> units.Motion:
     """In order, as the check of a recording wants them."""
     rows = np.array([[sample.time, *sample.gyro, *sample.accel] for sample in samples])
     rows = rows[np.unique(rows[:, 0], return_index=True)[1]]
     time = rows[:, 0] - rows[0, 0]
-    return units.Imu(time, rows[:, 1:4], rows[:, 4:7])
+    return units.Motion(time, rows[:, 1:4], rows[:, 4:7])

@@ -2,48 +2,60 @@
 of EuRoC's layout, or any CSV.
 
 The steps: the format by the content (`recognition`), the samples of each sensor and the reference
-as the reader of the format gives them (a `source.Source`), both sensors in order and on one clock
-(`streams`), units and signs (`units`), one uniform clock, and the reference on it (`reference`).
+as the reader of the format gives them (a `recording.Recording`), order, units and signs, and the
+one path of all recordings to a sequence (`data.assembly`).
 """
 
 from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from fractions import Fraction
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
-import pandas as pd
+from jaxtyping import Float
 
 from gnio_jax.config import ImportOptions
+from gnio_jax.data.assembly import Samples, Streams, assemble
 from gnio_jax.data.importing.asl import read_asl
 from gnio_jax.data.importing.bags import KINDS
 from gnio_jax.data.importing.kept import Imported
 from gnio_jax.data.importing.phyphox import read_phyphox
 from gnio_jax.data.importing.recognition import recognise
-from gnio_jax.data.importing.reference import with_reference
+from gnio_jax.data.importing.recording import (
+    Recording,
+    Sensor,
+    Track,
+    Units,
+    read_table,
+    sensor_of,
+)
 from gnio_jax.data.importing.ros import Topics, read_bag
 from gnio_jax.data.importing.sensor_logger import read_sensor_logger
-from gnio_jax.data.importing.source import Source, Track, Units
-from gnio_jax.data.importing.streams import (
-    Joined,
-    SensorFile,
-    Stream,
-    join,
-    read_stream,
-    read_table,
-)
 from gnio_jax.data.parsing import units
-from gnio_jax.data.parsing.stamps import PER_SECOND, RATES, rounded_rate, seconds
-from gnio_jax.data.parsing.stamps import time_unit as detect_time_unit
+from gnio_jax.data.parsing.stamps import (
+    PER_SECOND,
+    RATES,
+    first_stamp,
+    in_order,
+    rounded_rate,
+    seconds,
+    time_unit,
+)
 from gnio_jax.data.parsing.tables import Table
 from gnio_jax.data.readers.csv_files import ACCEL, GYRO, check_columns, reference
 from gnio_jax.data.reference import SHORTEST_RUN
-from gnio_jax.data.resampling import resample
+from gnio_jax.data.resampling import longest_bridge
 from gnio_jax.data.self_check import self_check
-from gnio_jax.data.validation import WINDOW_SECONDS, validate
+from gnio_jax.data.validation import WINDOW_SECONDS, check_finite
 from gnio_jax.errors import InputError
+from gnio_jax.numerics import interpolate
 from gnio_jax.types import Sequence
+
+GAPS = "lacks samples"
+"""What a note of holes in a recording says."""
 
 SLOW = 50.0
 """Hz below which the impacts of steps are lost; networks are trained on 100 and more (ours)."""
@@ -74,8 +86,8 @@ def import_recording(
     `name`
         Of the sequence; None takes that of the file.
 
-    Two sensors with stamps of their own are put on the faster one's over the time that both cover,
-    by cubic splines. Raises `InputError` naming file, field and remedy.
+    Two sensors with stamps of their own are put on one clock over the time that both cover, by
+    cubic splines. Raises `InputError` naming file, field and remedy.
     """
     _check_choice("time_unit", options.time_unit, PER_SECOND)
     _check_choice("gyro_unit", options.gyro_unit, units.TO_RAD_PER_SECOND)
@@ -118,7 +130,7 @@ def _columns_of(given: tuple[str, ...]) -> dict[str, str]:
     return columns
 
 
-def _read_other(path: Path, kind: str, topics: Topics) -> Source:
+def _read_other(path: Path, kind: str, topics: Topics) -> Recording:
     match kind:
         case "sensor_logger":
             return read_sensor_logger(path)
@@ -130,30 +142,192 @@ def _read_other(path: Path, kind: str, topics: Topics) -> Source:
             return read_bag(path, kind, topics)
 
 
-def _imported(source: Source, stated: Units, rate: float | None, name: str) -> Imported:
+# --- one sensor
+
+
+class _Clocked(NamedTuple):
+    """One sensor's samples in order."""
+
+    time: Float[np.ndarray, " n"]
+    """s since `first`."""
+    values: Float[np.ndarray, "n 3"]
+    first: Fraction
+    """s: the first stamp, exactly, since unix time in a float is good to a quarter of a
+    microsecond."""
+    unit: str
+
+
+def _clocked(sensor: Sensor, unit: str | None, notes: list[str]) -> _Clocked:
+    """`unit` is that of the stamps, None detects it. What was detected or repaired is added to
+    `notes`. Raises `InputError`."""
+    name, file = sensor.name, sensor.file
+    stamps, values = sensor.stamps, sensor.values
+    empty = np.isnan(values).all(axis=1)
+    if empty.any() and not empty.all():
+        # Loggers that write every sensor into one table leave the others' columns empty.
+        notes.append(
+            f"{file.name}: {empty.sum()} of {len(empty)} rows have no {name} and are not its "
+            "samples"
+        )
+        stamps, values = stamps[~empty], values[~empty]
+    if len(stamps) < 2:
+        problem = f"holds {len(stamps)} samples of field '{name}'"
+        raise InputError(file, problem, "record for longer")
+    check_finite(stamps.astype(np.float64), "time", file)
+    check_finite(values, name, file)
+    detected, rate = time_unit(stamps - stamps.min())
+    if unit is None and detected is None:
+        raise InputError(
+            file,
+            f"the unit of field 'time' is ambiguous (in seconds {name} would run at {rate:.3g} Hz)",
+            "state it: s, ms, us or ns",
+        )
+    if unit is None:
+        notes.append(
+            f"{file.name}: time of {name} taken as {detected}, "
+            f"by which it runs at {rate * PER_SECOND[detected]:.4g} Hz"
+        )
+    unit = unit or detected
+    rate *= PER_SECOND[unit]
+    if not RATES[0] * 0.99 <= rate <= RATES[1] * 1.01:
+        raise InputError(
+            file,
+            f"field 'time' makes {name} run at {rate:.3g} Hz with the unit {unit}",
+            f"an IMU runs at {RATES[0]:g} to {RATES[1]:g} Hz",
+        )
+    first = first_stamp(stamps, unit, file)
+    time = seconds(stamps, first, unit)
+    rows, repairs = in_order(time, values, f"{file}: {name}")
+    time, values = time[rows], values[rows]
+    if backward := repairs.get("rows_sorted"):
+        notes.append(
+            f"{file.name}: {name} had {backward:.0f} steps back in time; its rows were sorted"
+        )
+    if repeated := repairs.get("rows_repeated"):
+        notes.append(f"{file.name}: {repeated:.0f} rows of {name} repeat a stamp and were dropped")
+    if len(time) < 2:
+        raise InputError(file, f"holds 1 sample of field '{name}'", "record for longer")
+    holes = np.diff(time)[np.diff(time) > longest_bridge(rate)]
+    if holes.size:
+        notes.append(
+            f"{file.name}: {name} {GAPS} {holes.size} times, "
+            f"for up to {holes.max():.2f} s; bridged linearly"
+        )
+    return _Clocked(time, values, Fraction(first) / int(PER_SECOND[unit]), unit)
+
+
+# --- both sensors and the reference
+
+
+def _imported(source: Recording, stated: Units, rate: float | None, name: str) -> Imported:
     """What any format comes to: `stated` wins over what the format says of its units."""
     notes, warnings = list(source.notes), []
-    imu = _joined(source, stated, notes, warnings)
-    sequence = _without_reference(imu, name, source.gyro.path)
-    own = rounded_rate(imu.time)
-    target = rate or own
-    notes.append(f"put on a uniform clock of {target:g} Hz")
+    gyro, accel = (
+        _clocked(sensor, stated.time or source.units.time, notes)
+        for sensor in (source.gyro, source.accel)
+    )
+    accel = accel._replace(time=accel.time + float(accel.first - gyro.first))
+    _check_overlap(source, gyro, accel, notes)
+    rates, forces = _in_si(source, stated, gyro, accel, notes, warnings)
+    own = max(rounded_rate(gyro.time), rounded_rate(accel.time))
+    notes.append(f"put on a uniform clock of {rate or own:g} Hz")
     if own < SLOW:
         notes.append(
             f"it was recorded at {own:g} Hz, which is slow: steps need {SLOW:g} Hz, and the "
             "networks were trained on 100 Hz and more"
         )
-    sequence = resample(sequence, target)
+    streams = Streams(
+        name,
+        str(source.path),
+        Samples(gyro.time, rates, str(source.gyro.file)),
+        Samples(accel.time, forces, str(source.accel.file)),
+        {"dataset": "csv", "group": name, "truth": "none"},
+        float(gyro.first),
+    )
+    (sequence,) = assemble(streams, rate, whole=True)
     if source.track is not None:
-        sequence = _with_track(sequence, imu.start, source.track, notes)
+        sequence = _with_track(sequence, streams, source.track, gyro, notes)
     return Imported(sequence, tuple(notes), tuple(warnings))
 
 
-def _with_track(sequence: Sequence, start: float, track: Track, notes: list[str]) -> Sequence:
+def _check_overlap(source: Recording, gyro: _Clocked, accel: _Clocked, notes: list[str]) -> None:
+    """Raise `InputError` where both sensors share less than the network's window."""
+    first, last = max(gyro.time[0], accel.time[0]), min(gyro.time[-1], accel.time[-1])
+    shortest = min(float(each.time[-1] - each.time[0]) for each in (gyro, accel))
+    if shortest < WINDOW_SECONDS:
+        raise InputError(
+            source.path,
+            f"lasts {shortest:.2f} s, less than the network's window of {WINDOW_SECONDS:g} s",
+            "record for longer",
+        )
+    if last - first < WINDOW_SECONDS:
+        raise InputError(
+            source.accel.file,
+            f"field 'time' overlaps by {max(last - first, 0.0):.3g} s "
+            f"with that of gyro in {source.gyro.file.name}",
+            "the files must be of one recording and one clock",
+        )
+    if not np.array_equal(gyro.time, accel.time):
+        both = max(gyro.time[-1], accel.time[-1]) - min(gyro.time[0], accel.time[0])
+        notes.append(
+            "gyro and accel have stamps of their own: both are interpolated, "
+            f"{both - (last - first):.2f} s cut that only one of them covers"
+        )
+
+
+def _in_si(
+    source: Recording,
+    stated: Units,
+    gyro: _Clocked,
+    accel: _Clocked,
+    notes: list[str],
+    warnings: list[str],
+) -> tuple[np.ndarray, np.ndarray]:
+    """(gyro rad/s, accel m/s² with Android's sign), each on its own stamps."""
+    known, gyro_file, accel_file = source.units, source.gyro.file, source.accel.file
+    unit = stated.accel or known.accel
+    force = accel.values * units.accel_scale(accel.values, unit, accel_file, notes)
+    inside = (gyro.time >= accel.time[0]) & (gyro.time <= accel.time[-1])
+    time = gyro.time[inside]
+    motion = units.Motion(time, gyro.values[inside], interpolate(time, accel.time, force))
+    unit = stated.gyro or known.gyro
+    scale = units.gyro_scale(motion, unit, gyro_file, notes)
+    if stated.gyro is None and known.gyro is not None:
+        units.check_rad_per_second(motion._replace(gyro=motion.gyro * scale), gyro_file)
+    sign = stated.sign or known.sign
+    if sign is None:
+        raise InputError(
+            accel_file,
+            "the sign of field 'accel' depends on the phone's system, which is not known here",
+            "state it: android, ios or detect",
+        )
+    force = units.signed(force, sign, accel_file, notes)
+    upward = units.note_gravity(accel.time, force, accel_file, notes)
+    if upward == "-z" and stated.sign is None and known.sign_is_assumed:
+        warnings.append(
+            f"sign: gravity reads on -z in {accel_file.name}: the screen points down, or this "
+            "is iOS's sign and the track is wrong: compare with --accel-sign ios"
+        )
+    return gyro.values * scale, force
+
+
+def _with_track(
+    sequence: Sequence, streams: Streams, track: Track, gyro: _Clocked, notes: list[str]
+) -> Sequence:
     """With the reference, where it can be one and describes the motion of the IMU."""
+    later = float(Fraction(track.first) / int(PER_SECOND[gyro.unit]) - gyro.first)
+    poses = track.poses._replace(time=track.poses.time + later)
+    about = streams.attributes | {"truth": track.name}
     try:
-        result = with_reference(sequence, start, track)
-        _check_motion_is_one(result, track)
+        rate = rounded_rate(sequence.time)
+        (result,) = assemble(streams._replace(poses=poses, attributes=about), rate, whole=True)
+        # What the self-check would leave out is no reference.
+        if failures := self_check(result, pedestrian=False).failures:
+            raise InputError(
+                poses.source,
+                f"the reference {track.name} does not fit the IMU ({'; '.join(failures)})",
+                "its frame must be the IMU's, its world z-up, its clock the same",
+            )
     except InputError as error:
         if track.named:
             raise
@@ -163,68 +337,15 @@ def _with_track(sequence: Sequence, start: float, track: Track, notes: list[str]
     return result
 
 
-def _check_motion_is_one(sequence: Sequence, track: Track) -> None:
-    """Raise `InputError` where the self-check would leave the sequence out."""
-    if failures := self_check(sequence, pedestrian=False).failures:
-        raise InputError(
-            track.path,
-            f"the reference {track.name} does not fit the IMU ({'; '.join(failures)})",
-            "its frame must be the IMU's, its world z-up, its clock the same",
-        )
-
-
-def _joined(source: Source, stated: Units, notes: list[str], warnings: list[str]) -> Joined:
-    """Both sensors on one clock, in SI units and with Android's sign."""
-    gyro_file, accel_file, known = source.gyro, source.accel, source.units
-    time_unit = stated.time or known.time
-    gyro = read_stream(gyro_file, time_unit, notes)
-    accel = read_stream(accel_file, time_unit, notes)
-    _check_length(gyro, accel, source.path)
-    scale = units.accel_scale(accel.values, stated.accel or known.accel, accel_file.path, notes)
-    imu = join(gyro, _scaled(accel, scale), gyro_file.path, accel_file.path, notes)
-    scale = units.gyro_scale(_imu(imu), stated.gyro or known.gyro, gyro_file.path, notes)
-    imu = imu._replace(gyro=imu.gyro * scale)
-    if stated.gyro is None and known.gyro is not None:
-        units.check_rad_per_second(_imu(imu), gyro_file.path)
-    sign = stated.sign or known.sign
-    if sign is None:
-        raise InputError(
-            accel_file.path,
-            "the sign of field 'accel' depends on the phone's system, which is not known here",
-            "state it: android, ios or detect",
-        )
-    force = units.signed(imu.accel, sign, accel_file.path, notes)
-    imu = imu._replace(accel=force)
-    upward = units.note_gravity(_imu(imu), accel_file.path, notes)
-    if upward == "-z" and stated.sign is None and known.sign_is_assumed:
-        warnings.append(
-            f"sign: gravity reads on -z in {accel_file.path.name}: the screen points down, or this "
-            "is iOS's sign and the track is wrong: compare with --accel-sign ios"
-        )
-    return imu
-
-
-def _check_length(gyro: Stream, accel: Stream, path: Path) -> None:
-    seconds = float(min(gyro.time[-1], accel.time[-1]))
-    if seconds < WINDOW_SECONDS:
-        raise InputError(
-            path,
-            f"lasts {seconds:.2f} s, less than the network's window of {WINDOW_SECONDS:g} s",
-            "record for longer",
-        )
-
-
-def _check_choice(option: str, value: str | None, choices: Mapping[str, float] | tuple) -> None:
-    if value is not None and value not in choices:
-        raise InputError(option, f"unknown value '{value}'", f"known: {', '.join(choices)}")
+# --- a CSV
 
 
 def _read_csv(
     gyro_path: Path,
     accel_path: str | os.PathLike[str] | None,
     columns: dict[str, str],
-    time_unit: str | None,
-) -> Source:
+    time_unit_of_file: str | None,
+) -> Recording:
     """One file, or one of each sensor, with the columns that the user names."""
     time = columns.get("time", "time")
     gyro_axes, accel_axes = (
@@ -237,78 +358,46 @@ def _read_csv(
     # "a+b" is the sum of two columns.
     wanted |= {} if accel_path is not None else of_accel
     check_columns(gyro_path, table.columns, {n: c for n, c in wanted.items() if "+" not in c})
-    gyro = SensorFile("gyro", gyro_path, table, time, gyro_axes)
-    accel = SensorFile("accel", gyro_path, table, columns.get("accel_time", time), accel_axes)
-    if accel_path is not None:
-        own = Path(accel_path)
-        accel_table = read_table(own, (accel.time, *accel_axes))
-        accel = accel._replace(path=own, table=accel_table)
+    gyro = sensor_of("gyro", table, time, gyro_axes)
+    of_accel_file = table if accel_path is None else None
+    if of_accel_file is None:
+        columns_of_accel = (columns.get("accel_time", time), *accel_axes)
+        of_accel_file = read_table(Path(accel_path), columns_of_accel)
+    accel = sensor_of("accel", of_accel_file, columns.get("accel_time", time), accel_axes)
     known = Units(
-        gyro=units.common_unit(gyro.axes, units.TO_RAD_PER_SECOND),
-        accel=units.common_unit(accel.axes, units.TO_METRES_PER_SECOND_SQUARED),
+        gyro=units.common_unit(gyro_axes, units.TO_RAD_PER_SECOND),
+        accel=units.common_unit(accel_axes, units.TO_METRES_PER_SECOND_SQUARED),
         sign="android",
         sign_is_assumed=True,
     )
     pairs = ((gyro, known.gyro), (accel, known.accel))
-    notes = [
-        f"{one.path.name}: {one.sensor} in {unit}, by its header" for one, unit in pairs if unit
-    ]
+    notes = [f"{one.file.name}: {one.name} in {unit}, by its header" for one, unit in pairs if unit]
     track = None
     try:
-        track = _csv_reference(gyro_path, table, time, time_unit)
+        track = _csv_reference(table, gyro, time_unit_of_file)
     except InputError as error:
         notes.append(f"no reference is taken: {error}")
-    return Source(gyro_path, gyro, accel, known, track, tuple(notes))
+    return Recording(gyro_path, gyro, accel, known, track, tuple(notes))
 
 
-def _csv_reference(path: Path, frame: pd.DataFrame, time: str, unit: str | None) -> Track | None:
+def _csv_reference(table: Table, gyro: Sensor, unit: str | None) -> Track | None:
     """The reference in the package's own columns, on the gyro's stamps."""
-    table = Table(path, frame)
-    stamps = table.stamps(time)
-    first = stamps.min().item()
-    unit = unit or detect_time_unit(stamps - first).unit
-    if unit is None:  # the gyro's own stamps are refused for this
-        return None
-    poses = reference(table, seconds(stamps, first, unit))
+    if not np.isfinite(gyro.stamps).all() or len(gyro.stamps) < 2:
+        return None  # the gyro is refused for this
+    first = gyro.stamps.min().item()
+    unit = unit or time_unit(gyro.stamps - first).unit
+    poses = reference(table, seconds(gyro.stamps, first, unit)) if unit else None
     if poses is None:
         return None
-    rows = np.unique(poses.time, return_index=True)[1]
-    if len(rows) < SHORTEST_RUN:
-        raise InputError(path, f"holds {len(rows)} poses", f"{SHORTEST_RUN} are the fewest")
-    velocity = None if poses.velocity is None else poses.velocity[rows]
-    poses = poses._replace(
-        time=poses.time[rows],
-        attitude=poses.attitude[rows],
-        position=poses.position[rows],
-        velocity=velocity,
-    )
-    return Track(path, "given", float(first) / PER_SECOND[unit], poses)
+    if len(poses.time) < SHORTEST_RUN:
+        problem = f"holds {len(poses.time)} poses"
+        raise InputError(table.path, problem, f"{SHORTEST_RUN} are the fewest")
+    return Track("given", poses, first)
 
 
-def _scaled(stream: Stream, scale: float) -> Stream:
-    return stream._replace(values=stream.values * scale)
-
-
-def _imu(joined: Joined) -> units.Imu:
-    return units.Imu(joined.time, joined.gyro, joined.accel)
-
-
-def _without_reference(imu: Joined, name: str, source: Path) -> Sequence:
-    count = len(imu.time)
-    nothing = np.full((count, 3), np.nan)
-    sequence = Sequence(
-        name=name,
-        time=imu.time,
-        gyro=imu.gyro,
-        accel=imu.accel,
-        orientation=np.full((count, 4), np.nan),
-        position=nothing,
-        velocity=nothing,
-        valid=np.zeros(count, dtype=bool),
-        imu_valid=imu.valid,
-        attributes={"dataset": "csv", "group": name, "truth": "none", "start_time": imu.start},
-    )
-    return validate(sequence, source)
+def _check_choice(option: str, value: str | None, choices: Mapping[str, float] | tuple) -> None:
+    if value is not None and value not in choices:
+        raise InputError(option, f"unknown value '{value}'", f"known: {', '.join(choices)}")
 
 
 def impressions(sequence: Sequence) -> list[str]:

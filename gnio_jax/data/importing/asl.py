@@ -7,28 +7,23 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from gnio_jax.data.importing.source import Source, Track, Units
-from gnio_jax.data.importing.streams import SensorFile
+from gnio_jax.data.importing.recording import Recording, Track, Units, sensor_of
 from gnio_jax.data.readers.euroc import ACCEL, GYRO, STAMP, read_reference, read_table
 
 
-def read_asl(path: Path) -> Source:
+def read_asl(path: Path) -> Recording:
     """The folder `mav0`, or the one that holds it."""
     mav = path / "mav0" if (path / "mav0").is_dir() else path
-    file = mav / "imu0" / "data.csv"
-    table = read_table(file)
-    table.take(*GYRO, *ACCEL, gaps=True)
+    table = read_table(mav / "imu0" / "data.csv")
     gyro, accel = (
-        SensorFile(name, file, table.columns, STAMP, axes)
-        for name, axes in (("gyro", GYRO), ("accel", ACCEL))
+        sensor_of(name, table, STAMP, axes) for name, axes in (("gyro", GYRO), ("accel", ACCEL))
     )
-    start = int(table.stamps(STAMP).min())
-    track, poses = None, read_reference(mav, start)
+    first = gyro.stamps.min().item()
+    track, poses = None, read_reference(mav, first)
     if poses is not None:
-        file = Path(poses.source)
-        track = Track(file, file.parent.name, start / 1e9, poses)
+        track = Track(Path(poses.source).parent.name, poses, first)
     found = f"reference {track.name}" if track else "no reference"
-    return Source(
+    return Recording(
         path,
         gyro,
         accel,

@@ -33,22 +33,21 @@ import numpy as np
 import pandas as pd
 
 from gnio_jax.data.importing import archives
-from gnio_jax.data.importing.source import Source, Units
-from gnio_jax.data.importing.streams import SensorFile, read_table
+from gnio_jax.data.importing.recording import (
+    Recording,
+    Sensor,
+    Units,
+    added,
+    read_table,
+    sensor_of,
+)
 from gnio_jax.data.parsing.tables import Table, parsed_as
 from gnio_jax.data.parsing.units import named_unit
 from gnio_jax.errors import InputError, require_packages
-from gnio_jax.numerics import interpolate
 
 EVENTS = "meta/time.csv"
 """When the experiment was started and paused."""
 _AXIS = re.compile(r"\b([xyz])\b", re.IGNORECASE)
-
-
-class _Table(NamedTuple):
-    path: Path
-    """As messages name it."""
-    values: pd.DataFrame
 
 
 class _Set(NamedTuple):
@@ -57,12 +56,12 @@ class _Set(NamedTuple):
     kind: str
     """gyro, accel, linear (without gravity) or gravity."""
     unit: str
-    table: _Table
+    table: Table
     time: str
     axes: tuple[str, ...]
 
-    def sensor(self, name: str) -> SensorFile:
-        return SensorFile(name, self.table.path, self.table.values, self.time, self.axes)
+    def sensor(self, name: str) -> Sensor:
+        return sensor_of(name, self.table, self.time, self.axes)
 
 
 def is_phyphox(tables: Iterable[Sequence[str]]) -> bool:
@@ -72,20 +71,20 @@ def is_phyphox(tables: Iterable[Sequence[str]]) -> bool:
     )
 
 
-def read_phyphox(path: Path) -> Source:
+def read_phyphox(path: Path) -> Recording:
     """A recording of its zip, folder, CSV or workbook. Raises `InputError` where a sensor is
     missing or there is only acceleration without gravity."""
     tables = _tables(path)
     found = [one for table in tables for one in _columns(table)]
     if not (gyros := [one for one in found if one.kind == "gyro"]):
         raise _missing("gyro", path, tables)
-    gyro, accel = _only(gyros, path), _accelerometer(found, path, tables)
-    names = f"{gyro.table.path.name} in {gyro.unit}, {accel.table.path.name} in {accel.unit}"
-    return Source(
+    gyro, (accel, unit) = _only(gyros, path), _accelerometer(found, path, tables)
+    names = f"{gyro.table.path.name} in {gyro.unit}, {accel.file.name} in {unit}"
+    return Recording(
         path,
         gyro.sensor("gyro"),
-        accel.sensor("accel"),
-        Units("s", gyro.unit, accel.unit, "android"),
+        accel,
+        Units("s", gyro.unit, unit, "android"),
         notes=(f"{path.name}: phyphox; time in s, {names}, by their headers",),
     )
 
@@ -93,7 +92,7 @@ def read_phyphox(path: Path) -> Source:
 # --- tables
 
 
-def _tables(path: Path) -> list[_Table]:
+def _tables(path: Path) -> list[Table]:
     if path.is_dir():
         return _of_archive(path)
     with path.open("rb") as file:
@@ -108,21 +107,21 @@ def _tables(path: Path) -> list[_Table]:
             archives.check_announced(sum(member.file_size for member in members), path)
             return _of_workbook(path, "openpyxl")
         return _of_archive(path)
-    return [_Table(path, read_table(path, ()))]
+    return [read_table(path, ())]
 
 
-def _of_archive(path: Path) -> list[_Table]:
+def _of_archive(path: Path) -> list[Table]:
     _check_pauses(_events(path), path)
     tables = []
     for names in archives.csv_names(path).values():
         for name in names:
             if _sets(archives.labels(path, name)):
                 content = archives.content(path, name)
-                tables.append(_Table(path / name, read_table(path / name, (), content)))
+                tables.append(read_table(path / name, (), content))
     return tables
 
 
-def _of_workbook(path: Path, engine: str) -> list[_Table]:
+def _of_workbook(path: Path, engine: str) -> list[Table]:
     require_packages(path, "excel", engine)
     with parsed_as(path, "a workbook"), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of styles
@@ -133,7 +132,7 @@ def _of_workbook(path: Path, engine: str) -> list[_Table]:
     for values in sheets.values():
         _check_pauses(values, path)
     return [
-        _Table(path / str(name), values)
+        Table(path / str(name), values)
         for name, values in sheets.items()
         if _sets([str(label) for label in values.columns])
     ]
@@ -147,7 +146,7 @@ def _events(path: Path) -> pd.DataFrame:
     for name in named:
         if name == EVENTS or name.endswith(f"/{EVENTS}"):
             try:
-                return read_table(path / name, (), archives.content(path, name))
+                return read_table(path / name, (), archives.content(path, name)).columns
             except InputError:
                 return pd.DataFrame()
     return pd.DataFrame()
@@ -204,8 +203,8 @@ def _kind(name: str, unit: str) -> str:
     return next((kind for kind in ("linear", "gravity") if name.startswith(kind)), "accel")
 
 
-def _columns(table: _Table) -> list[_Set]:
-    labels = [str(label) for label in table.values.columns]
+def _columns(table: Table) -> list[_Set]:
+    labels = [str(label) for label in table.columns]
     time = next((label for label in labels if _is_time(label)), None)
     if time is None:
         raise InputError(table.path, "has no column of time in s", "export it again")
@@ -230,15 +229,17 @@ def _only(sets: list[_Set], path: Path) -> _Set:
     return sets[0]
 
 
-def _accelerometer(found: list[_Set], path: Path, tables: list[_Table]) -> _Set:
-    """The set with gravity in it, or the sum of the two without."""
+def _accelerometer(found: list[_Set], path: Path, tables: list[Table]) -> tuple[Sensor, str]:
+    """The set with gravity in it, or the sum of the two without; and its unit."""
     by_kind = {
         kind: [one for one in found if one.kind == kind] for kind in ("accel", "linear", "gravity")
     }
     if by_kind["accel"]:
-        return _only(by_kind["accel"], path)
+        one = _only(by_kind["accel"], path)
+        return one.sensor("accel"), one.unit
     if by_kind["linear"] and by_kind["gravity"]:
-        return _sum(_only(by_kind["linear"], path), _only(by_kind["gravity"], path))
+        linear, gravity = (_only(by_kind[kind], path) for kind in ("linear", "gravity"))
+        return added(linear.sensor("accel"), gravity.sensor("gravity")), linear.unit
     if by_kind["linear"]:
         raise InputError(
             by_kind["linear"][0].table.path,
@@ -248,26 +249,7 @@ def _accelerometer(found: list[_Set], path: Path, tables: list[_Table]) -> _Set:
     raise _missing("accelerometer", path, tables)
 
 
-def _sum(linear: _Set, gravity: _Set) -> _Set:
-    """Both added on the stamps of `linear`; gravity, which turns slowly, by lines (ours)."""
-    values = linear.table.values
-    stamps = Table(linear.table.path, values).take(linear.time, gaps=True)
-    down = Table(gravity.table.path, gravity.table.values).take(
-        gravity.time, *gravity.axes, gaps=True
-    )
-    down = down[np.isfinite(down).all(axis=1)]
-    down = down[np.argsort(down[:, 0], kind="stable")]
-    inside = (stamps >= down[:, 0].min(initial=np.inf)) & (
-        stamps <= down[:, 0].max(initial=-np.inf)
-    )
-    added = interpolate(stamps[inside], down[:, 0], down[:, 1:]) if inside.any() else 0.0
-    values = values[inside].reset_index(drop=True)
-    total = Table(linear.table.path, values).take(*linear.axes, gaps=True) + added
-    values = values.assign(**dict(zip(linear.axes, total.T, strict=True)))
-    return linear._replace(kind="accel", table=linear.table._replace(values=values))
-
-
-def _missing(sensor: str, path: Path, tables: list[_Table]) -> InputError:
+def _missing(sensor: str, path: Path, tables: list[Table]) -> InputError:
     names = ", ".join(table.path.name for table in tables) or "no table of a sensor"
     return InputError(
         path,

@@ -13,20 +13,26 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import pandas as pd
+from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from gnio_jax.data.importing.bags import Bag, Topic, listed, opened
-from gnio_jax.data.importing.reference import poses_of
-from gnio_jax.data.importing.source import Source, Track, Units
-from gnio_jax.data.importing.streams import SensorFile
+from gnio_jax.data.importing.recording import Recording, Sensor, Track, Units
+from gnio_jax.data.parsing.stamps import seconds
 from gnio_jax.data.readers.euroc import SensorPose, moved_to
+from gnio_jax.data.reference import SHORTEST_RUN, Poses
+from gnio_jax.data.validation import check_unit_norm
 from gnio_jax.errors import InputError
+from gnio_jax.numerics import finite_rows, rotations
 
 IMU = "sensor_msgs/msg/Imu"
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
 _TF1 = "tf/msg/tfMessage"
-_GYRO, _ACCEL = ("wx", "wy", "wz"), ("ax", "ay", "az")
+FAST_TRACKER = 20.0
+"""Hz from which a tracker's noise is smoothed and the gyro carries its attitude; below it its poses
+are taken as they are (ours)."""
+SLOWEST = 4.0
+"""Hz below which a reference says too little of a walk (ours)."""
 
 
 class _Pose(NamedTuple):
@@ -98,7 +104,7 @@ class Topics(NamedTuple):
     """Of poses; "/tf:CHILD_FRAME" of transforms."""
 
 
-def read_bag(path: Path, kind: str, topics: Topics) -> Source:
+def read_bag(path: Path, kind: str, topics: Topics) -> Recording:
     """The IMU of a bag, and its reference where there is one.
 
     One topic of `sensor_msgs/Imu` is taken without being named, and so is one of poses; of several
@@ -129,10 +135,10 @@ def read_bag(path: Path, kind: str, topics: Topics) -> Source:
             if topics.reference is not None:
                 raise
             notes.append(f"{path.name}: no reference is taken: {error}")
-    return Source(
+    return Recording(
         path,
-        SensorFile("gyro", path, samples.table, "stamp", _GYRO),
-        SensorFile("accel", path, forces.table, "stamp", _ACCEL),
+        samples.sensor,
+        forces.sensor,
         Units("ns", "rad/s", None, "android"),
         track,
         tuple(notes),
@@ -227,7 +233,7 @@ def _sample(message: Any) -> tuple[float, ...]:
 class _Samples(NamedTuple):
     """An IMU topic."""
 
-    table: pd.DataFrame
+    sensor: Sensor
     frame: str
     headers: bool
     """Stamped by its headers."""
@@ -245,9 +251,10 @@ def _samples(found: _Collected, topic: Topic, sensor: str, path: Path) -> _Sampl
         )
     stamps, logged, values = zip(*found.imu[topic.name], strict=True)
     headers = all(stamps)
-    table = pd.DataFrame(np.array(values, dtype=np.float64), columns=[*_GYRO, *_ACCEL])
-    table["stamp"] = np.array(stamps if headers else logged, dtype=np.int64)
-    return _Samples(table, first.header.frame_id, headers)
+    axes = slice(0, 3) if sensor == "gyro" else slice(3, 6)
+    own = np.array(stamps if headers else logged, dtype=np.int64)
+    measured = np.array(values, dtype=np.float64)[:, axes]
+    return _Samples(Sensor(sensor, path, own, measured), first.header.frame_id, headers)
 
 
 # --- reference
@@ -277,7 +284,7 @@ def _track(
     start = int(stamps.min())
     values = np.array([pose.values for _, pose in rows], dtype=np.float64)
     name = f"{topic}:{child}" if child else topic
-    poses = poses_of((stamps - start) * 1e-9, values, f"{path}: topic {name}")
+    poses = _poses(seconds(stamps, start), values, f"{path}: topic {name}")
     body, imu = rows[0][1].child, samples.frame
     place = _place(body, imu, found.mounted)
     if place is None:
@@ -287,7 +294,24 @@ def _track(
         )
     elif body != imu:
         notes.append(f"{path.name}: {name} moved from '{body}' to '{imu}' by /tf_static")
-    return Track(path, name, start / 1e9, moved_to(place or SensorPose(), poses))
+    return Track(name, moved_to(place or SensorPose(), poses), start)
+
+
+def _poses(time: Float[np.ndarray, " n"], rows: Float[np.ndarray, "n 7"], source: str) -> Poses:
+    """Poses from stamps (s) and rows of position (m) and quaternion wxyz, in any order; rows that
+    are not finite are left out. Raises `InputError` where they are too few, too slow, or no unit
+    quaternions."""
+    seen = finite_rows(rows)
+    time, rows = time[seen], rows[seen]
+    if len(time) < SHORTEST_RUN:
+        raise InputError(source, f"holds {len(time)} poses", "name another reference")
+    rate = 1.0 / max(float(np.median(np.diff(np.sort(time)))), 1e-9)
+    if rate < SLOWEST:
+        remedy = f"a reference needs {SLOWEST:g} Hz"
+        raise InputError(source, f"its poses come at {rate:.3g} Hz", remedy)
+    wxyz = check_unit_norm(rows[:, 3:], np.ones(len(time), dtype=bool), "orientation", source)
+    noisy = rate >= FAST_TRACKER
+    return Poses(time, rotations(wxyz), rows[:, :3], noisy=noisy, source=source)
 
 
 def _mounting(message: Any) -> dict[tuple[str, str], SensorPose]:

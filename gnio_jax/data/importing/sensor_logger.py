@@ -26,15 +26,17 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
-import numpy as np
-import pandas as pd
-
 from gnio_jax.data.importing import archives
-from gnio_jax.data.importing.source import Source, Units
-from gnio_jax.data.importing.streams import SensorFile, read_table
+from gnio_jax.data.importing.recording import (
+    Recording,
+    Sensor,
+    Units,
+    added,
+    read_table,
+    sensor_of,
+)
 from gnio_jax.data.parsing.tables import Table
 from gnio_jax.errors import InputError
-from gnio_jax.numerics import interpolate
 
 _AXES = ("x", "y", "z")
 _GYROS = ("Gyroscope", "GyroscopeUncalibrated")
@@ -47,12 +49,13 @@ class _Export(NamedTuple):
     names: dict[str, str]
     """Sensor, which is the file's name without suffix -> file."""
 
-    def table(self, sensor: str) -> pd.DataFrame:
+    def table(self, sensor: str) -> Table:
         place = self.path / self.names[sensor]
         return read_table(place, (), content=archives.content(self.path, self.names[sensor]))
 
-    def file(self, sensor: str) -> Path:
-        return self.path / self.names[sensor]
+    def sensor(self, name: str, kind: str) -> Sensor:
+        table = self.table(name)
+        return sensor_of(kind, table, _clock(table), _AXES)
 
 
 class _Device(NamedTuple):
@@ -74,7 +77,11 @@ def is_sensor_logger(tables: Iterable[Sequence[str]]) -> bool:
     return any("seconds_elapsed" in labels for labels in tables)
 
 
-def read_sensor_logger(path: Path) -> Source:
+def _clock(table: Table) -> str:
+    return "time" if "time" in table.columns else "seconds_elapsed"
+
+
+def read_sensor_logger(path: Path) -> Recording:
     """A recording of its zip or folder. Raises `InputError` where a sensor is missing."""
     export = _export(path)
     gyro = next((sensor for sensor in _GYROS if sensor in export.names), None)
@@ -83,13 +90,12 @@ def read_sensor_logger(path: Path) -> Source:
     device = _device(export)
     accel, unit, how = _accelerometer(export)
     shown = {"ios": "iOS", "android": "Android"}.get(device.platform or "", "unknown system")
-    clock = "time" if "time" in accel.table.columns else "seconds_elapsed"
-    unit_of_time = "ns" if clock == "time" else "s"
+    unit_of_time = "ns" if _clock(export.table(gyro)) == "time" else "s"
     found = f"time in {unit_of_time}, {gyro} in rad/s, {how}"
-    return Source(
+    return Recording(
         path,
-        SensorFile("gyro", export.file(gyro), export.table(gyro), clock, _AXES),
-        accel._replace(time=clock),
+        export.sensor(gyro, "gyro"),
+        accel,
         Units(unit_of_time, "rad/s", unit, device.sign),
         notes=(f"{path.name}: Sensor Logger ({shown}); {found}",),
     )
@@ -112,48 +118,25 @@ def _export(path: Path) -> _Export:
     return _Export(path, next(iter((recordings or groups).values())))
 
 
-def _accelerometer(export: _Export) -> tuple[SensorFile, str | None, str]:
+def _accelerometer(export: _Export) -> tuple[Sensor, str | None, str]:
     """The specific force (with the system's sign), its unit if that is known, and what it is."""
     if "TotalAcceleration" in export.names:
-        return _whole("TotalAcceleration", export), "m/s2", "TotalAcceleration in m/s2"
+        total = export.sensor("TotalAcceleration", "accel")
+        return total, "m/s2", "TotalAcceleration in m/s2"
     if {"Accelerometer", "Gravity"} <= export.names.keys():
-        return _with_gravity(export), "m/s2", "Accelerometer + Gravity in m/s2"
+        # iOS gives both of one sample; on Android their stamps differ.
+        motion, gravity = (export.sensor(name, "accel") for name in ("Accelerometer", "Gravity"))
+        return added(motion, gravity), "m/s2", "Accelerometer + Gravity in m/s2"
     if "AccelerometerUncalibrated" in export.names:
-        return _whole("AccelerometerUncalibrated", export), None, "AccelerometerUncalibrated"
+        raw = export.sensor("AccelerometerUncalibrated", "accel")
+        return raw, None, "AccelerometerUncalibrated"
     if "Accelerometer" in export.names:
         raise InputError(
-            export.file("Accelerometer"),
+            export.path / export.names["Accelerometer"],
             "is without gravity, and there is no Gravity.csv",
             "switch on Gravity (or Total Acceleration) in the app and record again",
         )
     raise _missing("accelerometer", export)
-
-
-def _whole(sensor: str, export: _Export) -> SensorFile:
-    return SensorFile("accel", export.file(sensor), export.table(sensor), "time", _AXES)
-
-
-def _with_gravity(export: _Export) -> SensorFile:
-    """Accelerometer + Gravity, on the accelerometer's stamps.
-
-    iOS gives both of one sample. Where the stamps differ gravity, which turns slowly, is
-    interpolated linearly (ours).
-    """
-    motion, gravity = export.table("Accelerometer"), export.table("Gravity")
-    path = export.file("Accelerometer")
-    clock = "time" if "time" in motion.columns else "seconds_elapsed"
-    stamps = Table(path, motion).take(clock, gaps=True)
-    down = Table(export.file("Gravity"), gravity).take(clock, *_AXES, gaps=True)
-    down = down[np.isfinite(down).all(axis=1)]
-    if len(down) < 2:
-        raise InputError(export.file("Gravity"), f"holds {len(down)} samples", "record for longer")
-    down = down[np.argsort(down[:, 0], kind="stable")]
-    inside = (stamps >= down[0, 0]) & (stamps <= down[-1, 0])
-    table = motion[inside].reset_index(drop=True)
-    added = interpolate(stamps[inside], down[:, 0], down[:, 1:])
-    total = Table(path, table).take(*_AXES, gaps=True) + added
-    table = table.assign(**dict(zip(_AXES, total.T, strict=True)))
-    return SensorFile("accel", path, table, clock, _AXES)
 
 
 def _device(export: _Export) -> _Device:

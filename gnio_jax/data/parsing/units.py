@@ -43,6 +43,15 @@ STEPS = 1.0
 """m/s²: steps make the magnitude of the specific force vary by more (standard deviation)."""
 
 
+class Motion(NamedTuple):
+    """What both sensors of an IMU measured at the same stamps."""
+
+    time: Float[np.ndarray, " n"]
+    """s, increasing."""
+    gyro: Float[np.ndarray, "n 3"]
+    accel: Float[np.ndarray, "n 3"]
+
+
 def named_unit(label: str) -> str | None:
     """The unit that a column's header names at its end, in round or square brackets: "rad/s" of
     "Gyroscope x (rad/s)"; None where it names none that is known."""
@@ -54,15 +63,6 @@ def common_unit(labels: Iterable[str], known: Iterable[str]) -> str | None:
     """The unit, one of `known`, that all `labels` name."""
     found = {named_unit(label) for label in labels}
     return found.pop() if len(found) == 1 and found <= set(known) else None
-
-
-class Imu(NamedTuple):
-    """Both sensors at the same stamps."""
-
-    time: Float[np.ndarray, " n"]
-    """s."""
-    gyro: Float[np.ndarray, "n 3"]
-    accel: Float[np.ndarray, "n 3"]
 
 
 def accel_scale(
@@ -83,7 +83,7 @@ def accel_scale(
     return TO_METRES_PER_SECOND_SQUARED[fitting[0]]
 
 
-def gyro_scale(imu: Imu, unit: str | None, path: Path, notes: list[str]) -> float:
+def gyro_scale(imu: Motion, unit: str | None, path: Path, notes: list[str]) -> float:
     """rad/s of one unit; None detects the unit. `imu.accel` is in m/s².
 
     Beyond `GYRO_RANGE` it is deg/s; else the turning of gravity in the accelerometer tells where
@@ -116,7 +116,7 @@ def gyro_scale(imu: Imu, unit: str | None, path: Path, notes: list[str]) -> floa
     return TO_RAD_PER_SECOND[unit]
 
 
-def check_rad_per_second(imu: Imu, path: Path) -> None:
+def check_rad_per_second(imu: Motion, path: Path) -> None:
     """Raise `InputError` where a gyro that a format or header gives a unit does not turn as gravity
     does, but by the factor between rad and deg. `imu` is in SI units by that statement."""
     turning, factor = _turning_of_gravity(imu), TO_RAD_PER_SECOND["deg/s"]
@@ -140,7 +140,7 @@ class _Turning(NamedTuple):
     correlation: float
 
 
-def _turning_of_gravity(imu: Imu) -> _Turning:
+def _turning_of_gravity(imu: Motion) -> _Turning:
     step = float(np.median(np.diff(imu.time)))
     clock = np.arange(imu.time[0], imu.time[-1], step)
     if len(clock) < 3.0 / step:
@@ -188,11 +188,12 @@ def signed(
     return -accel if sign == "ios" else accel
 
 
-def note_gravity(imu: Imu, path: Path, notes: list[str]) -> str:
+def note_gravity(
+    time: Float[np.ndarray, " n"], accel: Float[np.ndarray, "n 3"], path: Path, notes: list[str]
+) -> str:
     """What the quietest second says of gravity, as notes; the axis that reads most of it is
     returned, as "+z". Raises `InputError` where gravity is far off."""
-    accel = imu.accel
-    second = min(max(round(1.0 / float(np.median(np.diff(imu.time)))), 2), len(accel))
+    second = min(max(round(1.0 / float(np.median(np.diff(time)))), 2), len(accel))
     starts = range(0, len(accel) - second + 1, max(second // 2, 1))
     seconds = [accel[start : start + second] for start in starts]
     quietest = min(seconds, key=lambda rows: float(rows.var(axis=0).sum())).mean(axis=0)

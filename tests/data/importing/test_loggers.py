@@ -159,7 +159,7 @@ def test_gravity_of_other_stamps_is_interpolated(tmp_path):
         ),
         (
             sensor_logger() | {"Gyroscope.csv": "time,seconds_elapsed,z,y,x\n1,2,a,b,c\n"},
-            "Gyroscope.csv: column 'x' holds 'c' in its row 1, no number",
+            "Gyroscope.csv: column 'x' holds 'c' in its row 2, no number",
         ),
         (sensor_logger(seconds=0.5), "walk.zip: lasts 0.49 s, less than the network's window"),
         (
