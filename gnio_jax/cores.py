@@ -6,6 +6,8 @@ import os
 
 
 def usable_cores() -> int:
-    """Cores that this process may run on: what its affinity (a batch system's share, `taskset`)
-    leaves it, where there is one."""
+    """The number of cores that this process may run on.
+
+    A batch system or `taskset` may have limited it to some of them.
+    """
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

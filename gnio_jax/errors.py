@@ -1,4 +1,4 @@
-"""The error a user can mend. It imports nothing, so that options are checked without JAX."""
+"""Errors that a user can mend. Nothing here imports JAX, so that options are checked quickly."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import importlib
 
 
 class InputError(ValueError):
-    """A mistake a user can mend: its text is one line naming the place, the problem and the remedy.
+    """A mistake that a user can mend. Its text is one line: the place, the problem, the remedy.
 
     The command lines print it on stderr and leave with exit status 2.
     """

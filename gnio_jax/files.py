@@ -1,4 +1,4 @@
-"""Files and folders are written whole or not at all; names in files and pictures."""
+"""Files and folders that are written whole or not at all, and names of recordings in them."""
 
 from __future__ import annotations
 
@@ -15,10 +15,9 @@ from pathlib import Path
 
 @contextmanager
 def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Yield a temporary path beside `path`; on success it takes the place of `path`, on failure it
-    is removed.
+    """Yield a temporary path beside `path`, which it replaces on success. On failure it is removed.
 
-    The folder is created when missing. A reader sees the old file or the whole new one.
+    The folder is created when it is missing. A reader sees the old file or the whole new one.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -40,7 +39,7 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 
 def check_writable(path: str | os.PathLike[str]) -> None:
-    """Raise `OSError` now where no file could be written at `path` later."""
+    """Raise `OSError` now if no file could be written at `path` later."""
     path = Path(path)
     if path.is_dir():
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
@@ -49,12 +48,12 @@ def check_writable(path: str | os.PathLike[str]) -> None:
 
 
 def check_writable_folder(folder: Path) -> None:
-    """Raise `OSError` now where nothing could be written into `folder` later."""
+    """Raise `OSError` now if nothing could be written into `folder` later."""
     _check_writable_folder(folder, ".probe.", "")
 
 
 def _check_writable_folder(folder: Path, prefix: str, suffix: str) -> None:
-    """Try it. A folder that is missing is not made: its nearest parent must take one."""
+    """Write a file for a moment. A missing folder is not created: its nearest parent is tried."""
     parents = (folder.absolute(), *folder.absolute().parents)
     there = next(parent for parent in parents if parent.exists())
     try:
@@ -67,7 +66,7 @@ def _check_writable_folder(folder: Path, prefix: str, suffix: str) -> None:
 
 
 def with_ending(path: Path, ending: str) -> Path:
-    """`path` with an ending more: a name may hold points (`Path.with_suffix` would cut it)."""
+    """`path` with one more ending. `Path.with_suffix` would cut a name that contains a point."""
     return path.with_name(path.name + ending)
 
 
@@ -87,13 +86,15 @@ def write_csv(path: str | os.PathLike[str], rows: Iterable[Iterable[object]]) ->
 
 
 def file_stem(name: str) -> str:
-    """The name of a sequence as the name of a file."""
+    """The name of a sequence, made fit for the name of a file."""
     return re.sub(r"[^\w.+-]+", "_", name).lstrip(".") or "_"
 
 
 def shown_name(name: str, length: int = 60) -> str:
-    """A name of a file or a recording as text of a picture: its end where it is long, a $ as it
-    stands (Matplotlib would read mathematics)."""
+    """The name of a file or a recording as text of a picture.
+
+    A long name is cut to its end. A $ is escaped, since Matplotlib would read mathematics.
+    """
     text = name.encode("utf-8", "backslashreplace").decode()  # a name may hold any bytes
     text = text if len(text) <= length else f"…{text[1 - length :]}"
     return text.replace("$", r"\$")
@@ -101,8 +102,8 @@ def shown_name(name: str, length: int = 60) -> str:
 
 @contextmanager
 def replacing_folder(path: Path) -> Iterator[Path]:
-    """Yield an empty folder beside `path`; on success it takes the place of `path`, on failure it
-    is removed and `path` stays."""
+    """Yield an empty folder beside `path`. On success it replaces `path`; on failure it is removed
+    and `path` stays."""
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
     try:

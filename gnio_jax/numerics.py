@@ -1,8 +1,8 @@
 """Numerics of the host, in NumPy and float64: rotations, interpolation and masks.
 
-Loaders and metrics use these; what runs on a device is in `geometry`, whose names are the same
-where the function is the same. Quaternions are wxyz, body→world, as everywhere in the package;
-SciPy's xyzw never leaves this file. A stack of rotations is SciPy's `Rotation`.
+Loaders and metrics use these functions. Those that run on a device are in `geometry`, under the
+same names where they do the same. Quaternions are wxyz, body→world, as everywhere in the package.
+A stack of rotations is SciPy's `Rotation`.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 
 def filled_up(values: np.ndarray, rows: int, filling: float | None = None) -> np.ndarray:
-    """`values` with copies of the last row, or rows of `filling`, at the end: `rows` in all."""
+    """`values` extended to `rows` rows by copies of the last one, or by rows of `filling`."""
     last = values[-1:] if filling is None else np.full((1, *values.shape[1:]), filling)
     return np.concatenate([values, np.repeat(last, rows - len(values), axis=0)])
 
@@ -27,9 +27,9 @@ def filled_up(values: np.ndarray, rows: int, filling: float | None = None) -> np
 def convolved(
     values: Float[np.ndarray, "n *w"], kernel: Float[np.ndarray, " k"]
 ) -> Float[np.ndarray, "m *w"]:
-    """Columns of n rows by a kernel of k ≤ n, where they overlap wholly: m = n − k + 1.
+    """Convolve columns of n rows with a kernel of k ≤ n, where they overlap wholly: m = n − k + 1.
 
-    SciPy's `fftconvolve`, whose import would take longer than most of what it computes here.
+    `scipy.signal.fftconvolve` gives the same, but its import takes longer than most calls here.
     """
     rows, taps = len(values), len(kernel)
     length = fft.next_fast_len(rows + taps - 1, real=True)
@@ -42,23 +42,23 @@ def convolved(
 
 
 def wxyz_from_xyzw(xyzw: Float[np.ndarray, "*k 4"]) -> Float[np.ndarray, "*k 4"]:
-    """The same quaternions with the scalar first, as this package has them."""
+    """The same quaternions with the scalar first, the order of this package."""
     return xyzw[..., [3, 0, 1, 2]]
 
 
 def xyzw_from_wxyz(wxyz: Float[np.ndarray, "*k 4"]) -> Float[np.ndarray, "*k 4"]:
-    """The same quaternions with the scalar last, as SciPy, ROS and the TUM format have them."""
+    """The same quaternions with the scalar last, the order of ROS and of the TUM format."""
     return wxyz[..., [1, 2, 3, 0]]
 
 
 def rotations(wxyz: Float[np.ndarray, "*k 4"]) -> Rotation:
     """SciPy's rotations of quaternions, which are scaled to unit length."""
-    return Rotation.from_quat(xyzw_from_wxyz(wxyz))
+    return Rotation.from_quat(wxyz, scalar_first=True)
 
 
 def quaternions(rotation: Rotation) -> Float[np.ndarray, "*k 4"]:
     """Unit quaternions of SciPy's rotations."""
-    return wxyz_from_xyzw(rotation.as_quat())
+    return rotation.as_quat(scalar_first=True)
 
 
 def quaternion_product(left: np.ndarray, right: np.ndarray, axis: int = -1) -> np.ndarray:
@@ -140,8 +140,8 @@ def levelling(up: Float[np.ndarray, "3"]) -> Rotation:
     """The smallest rotation that turns `up` (any length) onto z; the half turn about x where `up`
     points down (ours).
 
-    It levels a tilted world in which the mean specific force is `up`, and changes its yaw least.
-    `geometry.level` is another rotation: it also sets the yaw to 0.
+    It levels a tilted world in which the mean specific force is `up`, with the least change of yaw.
+    `geometry.level` is another rotation, which also sets the yaw to 0.
     """
     axis = np.cross(up, [0.0, 0.0, 1.0])
     sine = float(np.linalg.norm(axis))
@@ -190,8 +190,11 @@ def midpoints(values: Float[np.ndarray, "n *w"]) -> Float[np.ndarray, "m *w"]:
 def neighbours(
     stamps: Real[np.ndarray, " n"], time: Real[np.ndarray, " m"]
 ) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"]]:
-    """Rows (left, right = left + 1) of increasing stamps between which each time lies; beyond the
-    ends the outermost pair. A time that equals a stamp has it on its right, but the first stamp."""
+    """Rows (left, right = left + 1) of the increasing stamps between which each time lies.
+
+    Beyond the ends it is the outermost pair. A time that equals a stamp has that stamp on its
+    right, except for the first stamp.
+    """
     right = np.clip(np.searchsorted(stamps, time), 1, len(stamps) - 1)
     return right - 1, right
 
@@ -199,14 +202,14 @@ def neighbours(
 def interpolate(
     time: Real[np.ndarray, " m"], stamps: Real[np.ndarray, " n"], values: Float[np.ndarray, "n w"]
 ) -> Float[np.ndarray, "m w"]:
-    """`np.interp` of each column: linear between increasing stamps; the ends are held."""
+    """`np.interp` of each column: linear between increasing stamps, constant beyond the ends."""
     return np.stack([np.interp(time, stamps, column) for column in values.T], axis=1)
 
 
 def slerp(
     time: Real[np.ndarray, " m"], stamps: Real[np.ndarray, " n"], attitude: Rotation
 ) -> Rotation:
-    """Attitudes on the shorter arc between increasing stamps; the ends are held."""
+    """Attitudes on the shorter arc between increasing stamps, constant beyond the ends."""
     return Slerp(stamps, attitude)(np.clip(time, stamps[0], stamps[-1]))
 
 
@@ -239,8 +242,10 @@ def outer_span(mask: Bool[np.ndarray, " n"]) -> slice:
 
 
 def stretches(broken: Bool[np.ndarray, " m"]) -> list[slice]:
-    """The rows of a series in unbroken stretches; `broken` says of each interval between two
-    neighbours whether the series is cut there (one row more than intervals)."""
+    """The unbroken stretches of a series as slices of its rows.
+
+    `broken` is True for each of the m intervals between m + 1 rows at which the series is cut.
+    """
     edges = [0, *(np.flatnonzero(broken) + 1).tolist(), len(broken) + 1]
     return [slice(first, last) for first, last in itertools.pairwise(edges)]
 
@@ -251,6 +256,6 @@ def within(mask: Bool[np.ndarray, " n"], reach: int) -> Bool[np.ndarray, " n"]:
 
 
 def last_true(mask: Bool[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
-    """Row of the latest True at or before each row; before the first True that one's row."""
+    """Row of the latest True at or before each row. Before the first True it is the first's row."""
     rows = np.arange(len(mask))
     return np.maximum.accumulate(np.where(mask, rows, int(np.argmax(mask))))

@@ -1,9 +1,9 @@
 """Devices and processes that share a batch (docs/scaling.md).
 
 Within `sharing` every device of every process holds the parameters and the recordings, and works on
-its share of a batch. The compiler inserts the sums over devices: of the gradient, and of the
+its share of a batch. The compiler inserts the sums over devices for the gradient and for the
 statistics of batch normalisation, which are those of the whole batch. With one device and one
-process the functions here give back what they are given.
+process the functions here return their arguments.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ def initialise(distributed: str | None = None, devices: int | None = None) -> No
     """Connect this process with the others of its run, before JAX's first computation.
 
     distributed: "HOST:PORT,PROCESSES,ID": where process 0 listens, how many processes there are,
-    and the number of this one. Slurm, Open MPI and Kubernetes say this themselves; without either
-    the process is alone. devices: how many devices a CPU is. Raises `InputError` for a text of
-    another form, for less than one device, and where the processes do not meet.
+    and the number of this one. Slurm, Open MPI and Kubernetes provide this themselves; without
+    either, the process runs alone. devices: as how many devices a CPU appears. Raises `InputError`
+    for a text of another form, for less than one device, and if the processes do not meet.
     """
     if devices is not None:
         _check_devices(devices)
@@ -80,13 +80,15 @@ def cpu_devices(count: int) -> None:
 
 
 def is_first() -> bool:
-    """Whether this is the process that writes files and lines."""
+    """Whether this process writes the files and prints the lines."""
     return jax.process_index() == 0
 
 
 def largest(*numbers: int) -> tuple[int, ...]:
-    """The largest that any process gives, number by number: what only one of them knows (its clock,
-    a signal) all of them then know. Numbers have 31 bits."""
+    """The largest value over all processes, number by number. Numbers have 31 bits.
+
+    So all processes know what only one of them knew, such as its clock or a signal.
+    """
     if jax.process_count() == 1:
         return numbers
     given: Any = multihost_utils.process_allgather(np.array(numbers, np.int32))
@@ -94,7 +96,7 @@ def largest(*numbers: int) -> tuple[int, ...]:
 
 
 def on_host(tree: Tree) -> Tree:
-    """The whole of what a compiled program over all devices gives, in every process's memory."""
+    """The results of a compiled program over all devices, whole, in the memory of every process."""
     if jax.process_count() == 1:
         return jax.device_get(tree)
     return multihost_utils.process_allgather(tree, tiled=True)
@@ -111,10 +113,10 @@ def _check_devices(number: int) -> None:
 
 @contextmanager
 def sharing(limit: int | None = None) -> Iterator[None]:
-    """Share batches out among the devices of all processes: `limit` of each, or all.
+    """Share batches among `limit` devices of each process, or among all of them.
 
-    Without a limit a CPU is one device, which uses all cores. Raises `InputError` where a process
-    has fewer devices than `limit`, and for a limit below 1.
+    Without a limit a CPU is one device, which uses all cores. Raises `InputError` if a process has
+    fewer devices than `limit`, and for a limit below 1.
     """
     if limit is None and jax.default_backend() == "cpu":
         limit = 1
@@ -136,7 +138,7 @@ def sharing(limit: int | None = None) -> Iterator[None]:
 
 
 def count() -> int:
-    """Devices that share a batch. Known while a program is compiled."""
+    """The number of devices that share a batch. It is known while a program is compiled."""
     return jax.sharding.get_abstract_mesh().shape.get(BATCH, 1)
 
 
@@ -148,8 +150,11 @@ def described() -> str:
 
 
 def everywhere(tree: Tree) -> Tree:
-    """Host arrays on each of the devices. Every process must give the same ones, and nobody may
-    write to them afterwards: on a CPU their memory may be shared."""
+    """Copy host arrays to each of the devices.
+
+    Every process must give the same arrays. They must not be written to afterwards: on a CPU the
+    memory may be shared.
+    """
     mesh = jax.sharding.get_mesh()
 
     def placed(leaf: Any) -> jax.Array:
@@ -163,22 +168,21 @@ def everywhere(tree: Tree) -> Tree:
 
 
 def fresh_copy(leaf: Any) -> jax.Array:
-    """A copy of an array that is bound to no device: one compiled step takes it wherever the array
-    lay before.
+    """A copy of an array that is bound to no device, so that any compiled step takes it.
 
-    `jnp.array` compiles a program for each shape, so the many shapes of a network's state go by way
-    of the host. Parts of recordings do not: JAX frees late what it shares with NumPy.
+    `jnp.array` compiles a program for each shape, so the many shapes of a network's state go
+    through the host. Parts of recordings do not, because JAX frees late what it shares with NumPy.
     """
     return jax.device_put(np.array(leaf)) if isinstance(leaf, jax.Array) else jax.numpy.array(leaf)
 
 
 def split(tree: Tree) -> Tree:
-    """In a compiled program: the rows of these arrays are shared out among the devices."""
+    """In a compiled program: share the rows of these arrays among the devices."""
     return _constrained(tree, PartitionSpec(BATCH))
 
 
 def replicated(tree: Tree) -> Tree:
-    """In a compiled program: each device has the whole of these arrays."""
+    """In a compiled program: give each device the whole of these arrays."""
     return _constrained(tree, PartitionSpec())
 
 

@@ -1,5 +1,4 @@
-"""How a long computation tells what it does. The command lines pass a terminal; a library call
-needs nothing."""
+"""How a long computation reports its progress: to a terminal, as plain lines, or not at all."""
 
 from __future__ import annotations
 
@@ -9,19 +8,19 @@ from typing import Protocol, runtime_checkable
 
 @runtime_checkable
 class Reporter(Protocol):
-    """Receives lines of text, and the progress of the stage that runs."""
+    """It receives lines of text and the progress of the current stage."""
 
     def line(self, text: str) -> None:
-        """One line for a person."""
+        """Show one line of text."""
         ...
 
     def progress(self, stage: str, share: float, numbers: str = "") -> None:
-        """What is being done, the share of it that is done (0 to 1), and its figures."""
+        """Show that `stage` is done to the given share (0 to 1), with its current figures."""
         ...
 
 
 class Silence:
-    """Says nothing: of several processes one alone speaks."""
+    """It shows nothing: a library call, or a process of several that is not the first."""
 
     def line(self, text: str) -> None:
         pass
@@ -31,7 +30,7 @@ class Silence:
 
 
 class Lines:
-    """Plain lines on stderr, without a progress bar."""
+    """It prints plain lines on stderr and shows no progress bar."""
 
     def line(self, text: str) -> None:
         print(text, file=sys.stderr)

@@ -1,4 +1,4 @@
-"""The values that cross a room's door: what every dataset, network and estimator agrees on.
+"""The types that datasets, networks and estimators share.
 
 Units are SI (s, rad, m), quaternions are wxyz, the world is z-up with gravity (0, 0, -9.81) m/s².
 """
@@ -26,18 +26,18 @@ STANDARD_G = 9.80665
 
 
 class Waypoints(NamedTuple):
-    """Where a walker was at a few moments, in the place of a pose at every sample."""
+    """Known positions at a few moments, instead of a pose at every sample."""
 
     time: Float[np.ndarray, "k"]
     """Increasing stamps on the clock of the sequence, s."""
     position: Float[np.ndarray, "k 2"]
-    """Horizontal, in the world of a map, m."""
+    """Horizontal position, expressed in the frame of a map, m."""
 
 
 class Sequence(NamedTuple):
     """One recording: IMU and reference on one uniform clock. Host arrays in float64.
 
-    A recording without (part of) a reference holds NaN there and `valid` is False.
+    Where the reference is missing, its arrays hold NaN and `valid` is False.
     """
 
     name: str
@@ -54,17 +54,17 @@ class Sequence(NamedTuple):
     velocity: Float[np.ndarray, "n 3"]
     """Reference velocity in the world, m/s."""
     valid: Bool[np.ndarray, "n"]
-    """True where the reference can be trusted; windows that touch a False are never cut."""
+    """True where the reference can be trusted. No window is cut that contains a False."""
     device_orientation: Float[np.ndarray, "n 4"] | None = None
-    """The device's own body→world estimate (its yaw is arbitrary), where it gives one."""
+    """The device's own estimate of its attitude, body→world with arbitrary yaw, if it gives one."""
     imu_valid: Bool[np.ndarray, "n"] | None = None
-    """False where `gyro` and `accel` are no measurement but a line across a gap; None: all are
-    there. The filter bridges and coasts there, and believes nothing (`filtering.gaps`)."""
+    """False where `gyro` and `accel` were interpolated across a gap; None if nothing is missing.
+    The filter takes no measurement there (`filtering.gaps`)."""
     waypoints: Waypoints | None = None
-    """The reference of a recording without poses; what needs a pose refuses it by name."""
+    """The reference of a recording without poses. What needs poses refuses the recording."""
     attributes: dict[str, Any] = {}
-    """Where it comes from: dataset, session, group, subject, device, placement, truth, licence, ...
-    (str/float/bool)."""
+    """The origin: dataset, session, group, subject, device, placement, truth, licence, ...
+    (str, float or bool)."""
 
 
 class Windows(NamedTuple):
@@ -75,17 +75,17 @@ class Windows(NamedTuple):
     displacement: Float[Array, "b 3"]
     """Displacement over the window in the same frame, m."""
     steps: Float[Array, "b n 3"]
-    """Its parts, from each sample's stamp to the next, m: what a network that predicts a velocity
-    for every sample learns from."""
+    """Its parts, from each sample's stamp to the next, m. A network that predicts a velocity for
+    every sample is trained with them."""
 
 
 class Prediction(NamedTuple):
-    """What every network says of a window."""
+    """What every network predicts for a window."""
 
     displacement: Float[Array, "*b 3"]
     """m, in the gravity-aligned zero-yaw frame of the window's start."""
     log_std: Float[Array, "*b 3"]
     """Logarithm of the standard deviation of `displacement`, per axis."""
     diagnostics: dict[str, Array] = {}
-    """What people want to look at: `gate`, `scale` (b, 3), `attention` (b, heads, m), where a model
+    """Internal values to look at: `gate`, `scale` (b, 3), `attention` (b, heads, m), if the model
     has them."""
