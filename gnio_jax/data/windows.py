@@ -1,11 +1,14 @@
-"""Training windows: recordings that are stored once, and an index of where windows start.
+"""Training windows: recordings that are stored once, an index of where windows start, and their
+random changes.
 
 Overlapping windows are never copied: a second of IMU belongs to ten windows and is stored once.
-Windows are cut and rotated inside the jitted step (`gnio_jax.windows.cut_windows`).
+`window_source` prepares the recordings on the host. `gather`, `shift_windows` and `augment` act
+inside the jitted step, and `gnio_jax.windows` says what a window is.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from typing import NamedTuple
 
@@ -14,14 +17,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int, PRNGKeyArray
 
-from gnio_jax.config import DataConfig
+from gnio_jax import geometry
+from gnio_jax.config import AugmentConfig, DataConfig
 from gnio_jax.errors import InputError
 from gnio_jax.numerics import rotations, yaw
 from gnio_jax.types import Array, Sequence, Windows
 from gnio_jax.windows import (
-    Starts,
     align_recording,
     cut_windows,
+    rotate_channels,
+    rotate_vectors,
     true_displacement,
     window_rows,
     window_starts,
@@ -67,14 +72,12 @@ def window_source(
     rows = windows = 0
     for sequence in sequences:
         if sequence.waypoints is not None:
-            raise InputError(
-                sequence.name, "has waypoints, no poses", "windows need a pose at every sample"
-            )
-        start = _valid_starts(sequence, config.seen, 1 if shift else stride)
-        if start.size:
-            part = _source_of(sequence, start, config, stride)
-            moved = part.start + np.int32(rows), part.visited + np.int32(windows)
-            found.append(part._replace(start=moved[0], visited=moved[1]))
+            problem = "has waypoints, no poses"
+            raise InputError(sequence.name, problem, "windows need a pose at every sample")
+        part = _recording_windows(sequence, config, stride, 1 if shift else stride)
+        if part.start.size:
+            start, visited = part.start + np.int32(rows), part.visited + np.int32(windows)
+            found.append(part._replace(start=start, visited=visited))
             rows += len(part.imu)
             windows += len(part.start)
     if not found:
@@ -83,21 +86,18 @@ def window_source(
     return WindowSource(*(np.concatenate(field) for field in zip(*found, strict=True)))
 
 
-def _valid_starts(sequence: Sequence, length: int, stride: int) -> Starts:
-    """Starts of the windows whose reference is valid throughout and at the sample after them, and
-    whose IMU was measured throughout."""
-    start = window_starts(len(sequence.time), length, stride)
-    start = start[without_any(~sequence.valid, start, length + 1)]
-    mask = sequence.imu_valid
-    return start if mask is None else start[without_any(~mask, start, length)]
-
-
-def _source_of(sequence: Sequence, start: Starts, config: DataConfig, stride: int) -> WindowSource:
-    """One recording's windows, rows and numbers counted from 0."""
+def _recording_windows(
+    sequence: Sequence, config: DataConfig, stride: int, spacing: int
+) -> WindowSource:
+    """One recording's windows `spacing` samples apart, of which an epoch visits those at `stride`;
+    rows and numbers count from 0."""
+    start = window_starts(len(sequence.time), config.seen, spacing)
+    start = start[without_any(~sequence.valid, start, config.seen + 1)]
+    if sequence.imu_valid is not None:
+        start = start[without_any(~sequence.imu_valid, start, config.seen)]
     # An invalid row may hold NaN; no window touches it, so any rotation will do there.
     orientation = np.where(sequence.valid[:, None], sequence.orientation, [1.0, 0.0, 0.0, 0.0])
-    attitude = rotations(orientation).as_matrix()
-    after_context = start + config.context
+    attitude, after_context = rotations(orientation).as_matrix(), start + config.context
     imu, rotation = align_recording(
         sequence.accel, sequence.gyro, attitude, after_context, config.window_rotation
     )
@@ -140,3 +140,47 @@ def shift_windows(
     candidate = jnp.clip(which + shift, 0, source.start.shape[0] - 1)
     in_recording = source.start[candidate] - source.start[which] == shift
     return jnp.where(in_recording, candidate, which)
+
+
+def augment(key: PRNGKeyArray, windows: Windows, config: AugmentConfig) -> Windows:
+    """The random changes that `config` (static) switches on, in TLIO's order, each by its own key;
+    GNIO's paper is silent on them.
+
+    A constant bias for each window, uniform in ± its half-width on each axis. A tilt by up to
+    `tilt_degrees` about a random horizontal axis, a wrong direction of gravity, under which the
+    target stays. A uniform yaw of window and target together: the network must not depend on the
+    choice of heading. White noise last. float32 throughout.
+    """
+    bias_key, tilt_key, yaw_key, noise_key = jax.random.split(key, 4)
+    imu, count = windows.imu, len(windows.imu)
+    if config.gyro_bias or config.accel_bias:
+        offset = _uniform(bias_key, (count, 1, 6), -1.0, 1.0)
+        imu = imu + offset * _channels(config.gyro_bias, config.accel_bias)
+    if config.tilt_degrees:
+        heading_key, angle_key = jax.random.split(tilt_key)
+        heading = _uniform(heading_key, (count,), 0.0, 2 * math.pi)
+        angle = _uniform(angle_key, (count,), 0.0, math.radians(config.tilt_degrees))
+        axis = jnp.stack([jnp.cos(heading), jnp.sin(heading), jnp.zeros_like(heading)], axis=1)
+        imu = rotate_channels(jax.vmap(geometry.exp)(angle[:, None] * axis), imu)
+    windows = windows._replace(imu=imu)
+    if config.yaw:
+        turn = jax.vmap(geometry.rotation_z)(_uniform(yaw_key, (count,), 0.0, 2 * math.pi))
+        windows = Windows(
+            rotate_channels(turn, imu),
+            rotate_vectors(turn, windows.displacement[:, None, None])[:, 0, 0],
+            rotate_vectors(turn, windows.steps[:, :, None])[:, :, 0],
+        )
+    if any(config.noise):
+        noise = jax.random.normal(noise_key, imu.shape, jnp.float32)
+        windows = windows._replace(imu=windows.imu + noise * _channels(*config.noise))
+    return windows
+
+
+def _channels(gyro: float, accel: float) -> Float[jax.Array, "1 1 6"]:
+    """One number for each sensor's three channels."""
+    return jnp.array([[[accel] * 3 + [gyro] * 3]], jnp.float32)
+
+
+def _uniform(key: PRNGKeyArray, shape: tuple[int, ...], low: float, high: float) -> jax.Array:
+    # Plain numbers as limits would be float64 inside where that is switched on.
+    return jax.random.uniform(key, shape, jnp.float32, jnp.float32(low), jnp.float32(high))

@@ -24,8 +24,7 @@ from jaxtyping import Float, Int, PRNGKeyArray
 
 from gnio_jax import data, models, parallel
 from gnio_jax.config import TrainConfig
-from gnio_jax.data.augmentation import augment
-from gnio_jax.data.windows import WindowSource, gather, shift_windows, window_source
+from gnio_jax.data.windows import WindowSource, augment, gather, shift_windows, window_source
 from gnio_jax.errors import InputError
 from gnio_jax.models.layers import MOMENTUM
 from gnio_jax.reporting import Reporter

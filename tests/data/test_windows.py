@@ -1,6 +1,6 @@
 """The gather against a brute-force window cutter that goes sample by sample with SciPy."""
 
-import functools
+import dataclasses
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +9,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from gnio_jax.config import AugmentConfig, DataConfig
-from gnio_jax.data import augmentation as augment
 from gnio_jax.data import windows
 from gnio_jax.errors import InputError
 from gnio_jax.types import Sequence, Windows
@@ -20,6 +19,8 @@ CONFIG = DataConfig(rate=20.0, window_seconds=1.0, stride_seconds=0.1)
 # One program each, in place of one for every operation.
 gather = jax.jit(windows.gather, static_argnums=2)
 shift_windows = jax.jit(windows.shift_windows, static_argnums=3)
+augment = jax.jit(windows.augment, static_argnums=2)
+OFF = AugmentConfig(gyro_bias=0.0, accel_bias=0.0, tilt_degrees=0.0, yaw=False)
 
 
 def tumbling(count, seed, invalid=()):
@@ -143,9 +144,14 @@ def batch(count=4000, length=5):
     return Windows(draw(count, length, 6), draw(count, 3), draw(count, length, 3))
 
 
+def augmented(before, **options):
+    """With these changes alone."""
+    return augment(KEY, before, dataclasses.replace(OFF, **options))
+
+
 def test_bias_is_constant_in_a_window_uniform_over_windows_and_spares_the_target():
     before = batch()
-    after = jax.jit(functools.partial(augment.bias, gyro=0.05, accel=0.2))(KEY, before)
+    after = augmented(before, gyro_bias=0.05, accel_bias=0.2)
     offset = np.asarray(after.imu - before.imu)
     np.testing.assert_allclose(offset, np.broadcast_to(offset[:, :1], offset.shape), atol=1e-6)
     for channels, half_width in [(slice(0, 3), 0.2), (slice(3, 6), 0.05)]:
@@ -167,7 +173,7 @@ def recovered(before, after, index):
 
 def test_tilt_turns_accel_and_gyro_about_a_horizontal_axis_by_at_most_its_angle():
     before = batch(300)
-    after = jax.jit(functools.partial(augment.tilt, degrees=5.0))(KEY, before)
+    after = augmented(before, tilt_degrees=5.0)
     vectors = np.array([recovered(before, after, i) for i in range(300)])
     angle = np.degrees(np.linalg.norm(vectors, axis=1))
     assert np.abs(vectors[:, 2]).max() < 1e-4 and angle.max() <= 5.01
@@ -179,32 +185,25 @@ def test_tilt_turns_accel_and_gyro_about_a_horizontal_axis_by_at_most_its_angle(
 
 def test_yaw_turns_window_and_target_by_the_same_angle_about_the_vertical():
     before = batch(300)
-    after = jax.jit(augment.yaw)(KEY, before)
+    after = augmented(before, yaw=True)
     vectors = np.array([recovered(before, after, i) for i in range(300)])
     assert np.abs(vectors[:, :2]).max() < 2e-3
-    np.testing.assert_allclose(
-        Rotation.from_rotvec(vectors).apply(before.displacement), after.displacement, atol=2e-3
-    )
-    np.testing.assert_allclose(
-        Rotation.from_rotvec(vectors).apply(before.steps[:, 2]), after.steps[:, 2], atol=2e-3
-    )
+    turn = Rotation.from_rotvec(vectors)
+    np.testing.assert_allclose(turn.apply(before.displacement), after.displacement, atol=2e-3)
+    np.testing.assert_allclose(turn.apply(before.steps[:, 2]), after.steps[:, 2], atol=2e-3)
     assert abs(np.exp(1j * vectors[:, 2]).mean()) < 0.15
 
 
 def test_noise_has_the_stated_deviation():
     before = batch()
-    after = jax.jit(functools.partial(augment.noise, gyro=0.01, accel=0.1))(KEY, before)
-    difference = np.asarray(after.imu - before.imu)
+    difference = np.asarray(augmented(before, noise=(0.01, 0.1)).imu - before.imu)
     np.testing.assert_allclose(difference.std(axis=(0, 1)), [0.1] * 3 + [0.01] * 3, rtol=0.02)
 
 
 def test_switched_off_augmentation_changes_nothing_and_draws_depend_on_the_key_alone():
     before = batch(10)
-    off = AugmentConfig(gyro_bias=0.0, accel_bias=0.0, tilt_degrees=0.0, yaw=False)
-    augmented = jax.jit(augment.augment, static_argnums=2)
-    after = augmented(KEY, before, off)
-    np.testing.assert_array_equal(after.imu, before.imu)
+    np.testing.assert_array_equal(augment(KEY, before, OFF).imu, before.imu)
     keys = KEY, KEY, jax.random.key(4)
-    first, again, other = (augmented(key, before, AugmentConfig()) for key in keys)
+    first, again, other = (augment(key, before, AugmentConfig()) for key in keys)
     np.testing.assert_array_equal(first.imu, again.imu)
     assert not np.allclose(first.imu, other.imu, atol=1e-3)
