@@ -18,7 +18,7 @@ import numpy as np
 import tyro
 
 from gnio_jax.commands import console, options
-from gnio_jax.data.importing import InputError
+from gnio_jax.errors import InputError
 
 
 @dataclass(frozen=True)

@@ -63,8 +63,8 @@ def import_file(asked: ImportFile, _call: options.Call) -> None:
         raise InputError("--out", f"'{asked.out}' is no name of an HDF5 file", "name it NAME.h5")
     if asked.out.is_dir():
         raise InputError("--out", f"'{asked.out}' is a folder", "name a file in it, NAME.h5")
-    from gnio_jax.data.importing import impressions  # late: mistakes do not wait for JAX
-    from gnio_jax.data.importing.kept import write_imported
+    from gnio_jax.apps.importing import impressions  # late: mistakes do not wait for JAX
+    from gnio_jax.apps.importing.kept import write_imported
     from gnio_jax.data.readers import csv_files
 
     recording = _read(asked.file, asked.recording, asked.rate, asked.name or asked.out.stem)
@@ -95,7 +95,7 @@ def import_file(asked: ImportFile, _call: options.Call) -> None:
 
 def read_any(file: Path, stated: ImportOptions) -> Any:
     """An `importing.Imported` of the file; our own HDF5 is read as it is."""
-    from gnio_jax.data.importing.kept import read_imported
+    from gnio_jax.apps.importing.kept import read_imported
 
     return read_imported(file) if file.suffix.lower() in HDF5 else _read(file, stated)
 
@@ -104,7 +104,7 @@ def _read(
     file: Path, stated: ImportOptions, rate: float | None = None, name: str | None = None
 ) -> Any:
     """The recording as an `importing.Imported`, whose notes have the warnings too."""
-    from gnio_jax.data.importing import import_recording
+    from gnio_jax.apps.importing import import_recording
 
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")

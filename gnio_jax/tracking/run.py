@@ -9,8 +9,8 @@ from typing import NamedTuple
 import numpy as np
 
 from gnio_jax import data
+from gnio_jax.apps.importing import Imported
 from gnio_jax.config import DataConfig, InitialStd
-from gnio_jax.data.importing import Imported
 from gnio_jax.data.resampling import longest_bridge
 from gnio_jax.data.validation import WINDOW_SECONDS, check_gaps
 from gnio_jax.errors import InputError

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gnio_jax.data.importing import GAPS, Imported
+from gnio_jax.apps.importing import GAPS, Imported
 from gnio_jax.evaluation import Estimate, metrics
 from gnio_jax.evaluation.metrics.trajectory import finite_poses
 from gnio_jax.evaluation.preparation import ROUGH_START, Prepared

@@ -485,7 +485,9 @@ def test_import_of_a_file_for_each_sensor(place, capsys):
     units = ["--gyro-unit", "rad/s", "--time-unit", "s"]
     out = ["--out", "own/two.h5", "--name", "walk 2"]
     run("data", "import", "gyro.csv", "--accel-path", "accel.csv", *out, *units)
-    assert "gyro and accel have stamps of their own: accel interpolated" in capsys.readouterr().out
+    assert (
+        "gyro and accel have stamps of their own: both are interpolated" in capsys.readouterr().out
+    )
     (sequence,) = data.load("csv", place / "own", "test")
     assert sequence.name == "two" and len(sequence.time) == 1899  # that of its file
     inner = slice(20, -20)

@@ -2,8 +2,8 @@
 
 from typing import NamedTuple
 
+from gnio_jax.apps import importing
 from gnio_jax.config import ImportOptions
-from gnio_jax.data import importing
 from gnio_jax.types import Sequence
 
 

@@ -6,7 +6,7 @@ z-up world; other columns are ignored. Any rate. Without a reference the sequenc
 and `valid` is False; velocities that are not given are those of the smoothed positions. Rows may
 leave the reference empty: up to 0.1 s of that are bridged, more is not valid.
 
-`gnio_jax.data.importing` brings the files of a phone's logger into this form.
+`gnio data import` brings the files of a phone's logger into this form.
 """
 
 from __future__ import annotations

@@ -5,10 +5,10 @@ from __future__ import annotations
 import zipfile
 from pathlib import Path
 
-from gnio_jax.data.importing import archives
-from gnio_jax.data.importing.phyphox import is_phyphox
-from gnio_jax.data.importing.recording import table_layout
-from gnio_jax.data.importing.sensor_logger import is_sensor_logger
+from gnio_jax.apps.importing import archives
+from gnio_jax.apps.importing.phyphox import is_phyphox
+from gnio_jax.apps.importing.recording import table_layout
+from gnio_jax.apps.importing.sensor_logger import is_sensor_logger
 from gnio_jax.data.parsing.tables import parsed_as
 from gnio_jax.errors import InputError
 

@@ -17,14 +17,12 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from gnio_jax.config import ImportOptions
-from gnio_jax.data.assembly import Samples, Streams, assemble
-from gnio_jax.data.importing.asl import read_asl
-from gnio_jax.data.importing.bags import KINDS
-from gnio_jax.data.importing.kept import Imported
-from gnio_jax.data.importing.phyphox import read_phyphox
-from gnio_jax.data.importing.recognition import recognise
-from gnio_jax.data.importing.recording import (
+from gnio_jax.apps.importing.asl import read_asl
+from gnio_jax.apps.importing.bags import KINDS
+from gnio_jax.apps.importing.kept import Imported
+from gnio_jax.apps.importing.phyphox import read_phyphox
+from gnio_jax.apps.importing.recognition import recognise
+from gnio_jax.apps.importing.recording import (
     Recording,
     Sensor,
     Track,
@@ -32,8 +30,10 @@ from gnio_jax.data.importing.recording import (
     read_table,
     sensor_of,
 )
-from gnio_jax.data.importing.ros import Topics, read_bag
-from gnio_jax.data.importing.sensor_logger import read_sensor_logger
+from gnio_jax.apps.importing.ros import Topics, read_bag
+from gnio_jax.apps.importing.sensor_logger import read_sensor_logger
+from gnio_jax.config import ImportOptions
+from gnio_jax.data.assembly import Samples, Streams, assemble
 from gnio_jax.data.parsing import units
 from gnio_jax.data.parsing.stamps import (
     PER_SECOND,

@@ -7,8 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from gnio_jax import data
+from gnio_jax.apps import importing
 from gnio_jax.config import ImportOptions
-from gnio_jax.data import importing
 from gnio_jax.data.hdf5 import write_hdf5
 from gnio_jax.errors import InputError
 from tests.support import known_walk

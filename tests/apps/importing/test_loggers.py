@@ -6,7 +6,7 @@ import numpy as np
 import openpyxl
 import pytest
 
-from gnio_jax.data.importing import archives
+from gnio_jax.apps.importing import archives
 from gnio_jax.data.parsing.units import named_unit
 from gnio_jax.errors import InputError
 from tests.support import known_walk, logger_files

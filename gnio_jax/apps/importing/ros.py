@@ -16,8 +16,8 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from gnio_jax.data.importing.bags import Bag, Topic, listed, opened
-from gnio_jax.data.importing.recording import Recording, Sensor, Track, Units
+from gnio_jax.apps.importing.bags import Bag, Topic, listed, opened
+from gnio_jax.apps.importing.recording import Recording, Sensor, Track, Units
 from gnio_jax.data.parsing.stamps import seconds
 from gnio_jax.data.readers.euroc import SensorPose, moved_to
 from gnio_jax.data.reference import SHORTEST_RUN, Poses

@@ -8,7 +8,7 @@ import threading
 import numpy as np
 import pytest
 
-from gnio_jax.data.importing.kept import read_imported, write_imported
+from gnio_jax.apps.importing.kept import read_imported, write_imported
 from gnio_jax.data.readers import csv_files
 from gnio_jax.errors import InputError
 from tests.support.csv_writers import AXES, imu, write, write_native

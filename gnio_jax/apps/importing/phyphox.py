@@ -32,8 +32,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from gnio_jax.data.importing import archives
-from gnio_jax.data.importing.recording import (
+from gnio_jax.apps.importing import archives
+from gnio_jax.apps.importing.recording import (
     Recording,
     Sensor,
     Units,

@@ -10,7 +10,7 @@ import zipfile
 from collections import defaultdict
 from pathlib import Path, PurePosixPath
 
-from gnio_jax.data.importing.recording import table_layout
+from gnio_jax.apps.importing.recording import table_layout
 from gnio_jax.data.parsing.tables import parsed_as
 from gnio_jax.errors import InputError
 

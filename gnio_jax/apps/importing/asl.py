@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from gnio_jax.data.importing.recording import Recording, Track, Units, sensor_of
+from gnio_jax.apps.importing.recording import Recording, Track, Units, sensor_of
 from gnio_jax.data.readers.euroc import ACCEL, GYRO, STAMP, read_reference, read_table
 
 

@@ -26,8 +26,8 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
-from gnio_jax.data.importing import archives
-from gnio_jax.data.importing.recording import (
+from gnio_jax.apps.importing import archives
+from gnio_jax.apps.importing.recording import (
     Recording,
     Sensor,
     Units,

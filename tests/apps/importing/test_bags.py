@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from gnio_jax.data.importing import bags
+from gnio_jax.apps.importing import bags
 from gnio_jax.errors import InputError
 from tests.support import bag_files, known_walk
 from tests.support.bag_files import EPOCH, KINDS, LOGGED, Maker, imu, poses, text, write
