@@ -116,7 +116,7 @@ def replay(tracker, recorded: Recorded, path: Path, realtime: bool, progress) ->
 def write_trajectory(out: Path, name: str, poses: list) -> np.ndarray:
     """Write the TUM file and the picture; returns the positions (poses, 3)."""
     from gnio_jax.evaluation import Estimate, Trajectory, plots
-    from gnio_jax.evaluation.tum import write_tum
+    from gnio_jax.evaluation.trajectory import write_tum
     from gnio_jax.files import replacing
 
     position = np.array([pose.position for pose in poses])

@@ -168,6 +168,6 @@ figure.tight_layout()
 # careful. `gnio calibrate` fits it ([Read the tables](../tables.md)).
 
 # %%
-ate = evaluation.metrics.absolute.ate(np.asarray(history.position), truth)
+ate = evaluation.metrics.ate(np.asarray(history.position), truth)
 print(f"ATE {ate:.2f} m, NIS / 3 {np.nanmean(history.nis) / 3:.2f}")
 print(f"accepted {np.nanmean(history.accepted):.0%}")

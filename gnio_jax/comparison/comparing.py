@@ -8,11 +8,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from gnio_jax.comparison import figures, pairs, rows
-from gnio_jax.comparison.figures import COMPARED, Recordings
+from gnio_jax.comparison.figures import Recordings
 from gnio_jax.comparison.pairs import Difference
 from gnio_jax.comparison.rows import Row
 from gnio_jax.config import CompareConfig
 from gnio_jax.errors import InputError
+from gnio_jax.evaluation.metrics import NAMES
 from gnio_jax.reporting import Lines, Reporter
 
 USUAL = ("ate", "rpe_1s", "yaw_rmse", "path_length_ratio", "nis", "nees")
@@ -82,8 +83,8 @@ def _check_metrics(wanted: tuple[str, ...] | None) -> None:
     if wanted == ():
         raise InputError("--metrics", "names no metric", "leave it out for the usual ones")
     for word in wanted or ():
-        if word not in COMPARED:
-            remedy = f"name RUNS before it; there are: {', '.join(COMPARED)}"
+        if word not in NAMES:
+            remedy = f"name RUNS before it; there are: {', '.join(NAMES)}"
             raise InputError("--metrics", f"no metric '{word}'", remedy)
 
 
@@ -104,7 +105,7 @@ def _metrics(found: list[Row], wanted: tuple[str, ...] | None) -> list[str]:
     there = {metric for row in found for seed in row.seeds for metric in seed["mean"]}
     for metric in wanted or ():
         if metric not in there:
-            has = ", ".join(name for name in COMPARED if name in there)
+            has = ", ".join(name for name in NAMES if name in there)
             raise InputError("--metrics", f"no row has '{metric}'", f"there are: {has}")
     return list(wanted) if wanted else [metric for metric in USUAL if metric in there]
 

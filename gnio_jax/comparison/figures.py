@@ -17,8 +17,6 @@ from gnio_jax.evaluation.metrics import NAMES
 from gnio_jax.evaluation.run import folder_name, run_config
 from gnio_jax.reporting import Reporter
 
-COMPARED = (*NAMES, "accepted")
-"""Metrics of a sequence that can be compared."""
 OPTIONAL_NAMES = ("estimator", "alignment", "checkpoint", "coupling", "orientation_source")
 """Settings that are words where they are given."""
 Figures = dict[str, Any]
@@ -142,7 +140,7 @@ def _is_whole(figures: Figures) -> bool:
 def _has_metrics(sequence: dict[str, Any]) -> bool:
     """Whether the metrics of a sequence are finite numbers or null, and the reasons of null are
     words. What else is said of it is not compared."""
-    values = [value for name, value in sequence.items() if name in (*COMPARED, "duration")]
+    values = [value for name, value in sequence.items() if name in (*NAMES, "duration")]
     reasons = sequence.get("undefined", {})
     return all(value is None or math.isfinite(value) for value in values) and all(
         isinstance(reason, str) for reason in reasons.values()

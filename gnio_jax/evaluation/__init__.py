@@ -14,20 +14,13 @@ from gnio_jax.evaluation.inference import (
     predict_windows,
     true_displacements,
 )
-from gnio_jax.evaluation.metrics import (
-    Measures,
-    Summary,
-    Trajectory,
-    Undefined,
-    align,
-    measure,
-    summarise,
-)
+from gnio_jax.evaluation.metrics import Measures, measure
 from gnio_jax.evaluation.preparation import Prepared, prepare
 from gnio_jax.evaluation.report import Report
 from gnio_jax.evaluation.run import Evaluation, evaluate
 from gnio_jax.evaluation.scores import Scores, score
 from gnio_jax.evaluation.setup import Setup, resolve
+from gnio_jax.evaluation.trajectory import Trajectory, Undefined, align
 from gnio_jax.filtering.settings import FilterSetup, filter_setup
 
 __all__ = [
@@ -40,7 +33,6 @@ __all__ = [
     "Report",
     "Scores",
     "Setup",
-    "Summary",
     "Trajectory",
     "Undefined",
     "align",
@@ -56,6 +48,5 @@ __all__ = [
     "prepare",
     "resolve",
     "score",
-    "summarise",
     "true_displacements",
 ]

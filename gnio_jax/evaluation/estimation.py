@@ -21,7 +21,6 @@ from gnio_jax.evaluation.inference import (
     predict_windows,
     true_displacements,
 )
-from gnio_jax.evaluation.metrics import Trajectory
 from gnio_jax.evaluation.preparation import Prepared
 from gnio_jax.evaluation.setup import (
     DEFAULT_SETUP,
@@ -30,6 +29,7 @@ from gnio_jax.evaluation.setup import (
     no_progress,
     resolve,
 )
+from gnio_jax.evaluation.trajectory import Trajectory
 from gnio_jax.filtering import ConsideredStd
 from gnio_jax.filtering.settings import FilterSetup, filter_setup
 from gnio_jax.types import Prediction

@@ -2,39 +2,22 @@
 
 from __future__ import annotations
 
-import numpy as np
-
-from gnio_jax.evaluation import metrics
 from gnio_jax.evaluation.estimators.result import Estimate
-from gnio_jax.evaluation.metrics import AlignmentMethod, Trajectory, Undefined
-from gnio_jax.numerics import rotation_z
+from gnio_jax.evaluation.trajectory import Alignment, in_frame_of, turned_covariance
 
 SIGMAS = 3.0
 """Size of the ellipses that are shown, in standard deviations."""
 
 
-def in_the_references_frame(estimate: Estimate, alignment: AlignmentMethod = "origin") -> Estimate:
-    """With trajectory and covariance of the position aligned; unchanged where that is impossible.
-
-    The covariance is turned about the vertical alone, which is what alignment turns of a level
-    world.
-    """
-    aligned = _aligned(estimate.trajectory, estimate.reference, alignment)
+def in_the_references_frame(estimate: Estimate, alignment: Alignment = "origin") -> Estimate:
+    """With trajectory and covariance aligned; unchanged where that is impossible."""
+    aligned = in_frame_of(estimate.trajectory, estimate.reference, alignment)
     covariance = estimate.position_covariance
-    if covariance is not None and aligned is not estimate.trajectory:
-        before, after = estimate.trajectory.orientation, aligned.orientation
-        turn = rotation_z(metrics.relative_yaw(after, before))
-        covariance = turn @ covariance @ np.swapaxes(turn, 1, 2)
+    if covariance is not None:
+        covariance = turned_covariance(covariance, estimate.trajectory, aligned)
     return estimate._replace(trajectory=aligned, position_covariance=covariance)
 
 
 def with_the_reference_in_its_frame(estimate: Estimate) -> Estimate:
     """With the reference moved so that both start alike; unchanged where there is none."""
-    return estimate._replace(reference=_aligned(estimate.reference, estimate.trajectory, "origin"))
-
-
-def _aligned(path: Trajectory, to: Trajectory, how: AlignmentMethod) -> Trajectory:
-    try:
-        return metrics.align(path, to, how)
-    except Undefined:
-        return path
+    return estimate._replace(reference=in_frame_of(estimate.reference, estimate.trajectory))

@@ -19,9 +19,9 @@ from matplotlib.ticker import PercentFormatter
 from gnio_jax.evaluation import metrics
 from gnio_jax.evaluation.estimators.result import Estimate
 from gnio_jax.evaluation.frames import in_the_references_frame
-from gnio_jax.evaluation.metrics import AlignmentMethod
 from gnio_jax.evaluation.report import Report, file_names
 from gnio_jax.evaluation.setup import OnShare, no_progress
+from gnio_jax.evaluation.trajectory import Alignment, relative_yaw
 from gnio_jax.files import shown_name
 from gnio_jax.numerics import finite_rows, rotation_z, spans
 from gnio_jax.windows import true_displacement
@@ -75,7 +75,7 @@ def trajectory(
     estimate: Estimate,
     ate: float | None = None,
     ate_2d: float | None = None,
-    alignment: AlignmentMethod = "origin",
+    alignment: Alignment = "origin",
 ) -> Figure:
     """Plan view of the estimate over the reference, both axes to the same scale."""
     figure = Figure(figsize=(6.4, 6.4), layout="constrained")
@@ -212,7 +212,7 @@ def error_cdf(estimates: list[Estimate], report: Report) -> Figure:
     return figure
 
 
-def _draw_sample_errors(axes: Axes, estimates: list[Estimate], alignment: AlignmentMethod) -> int:
+def _draw_sample_errors(axes: Axes, estimates: list[Estimate], alignment: Alignment) -> int:
     """Returns the number of sequences that have a reference."""
     samples = []
     for e in estimates:
@@ -283,7 +283,7 @@ def _error_in_filter_frame(estimate: Estimate) -> Float[np.ndarray, "k 3"]:
     """Position error of the start-aligned estimate, m, in the frame of the filter's covariance."""
     aligned = in_the_references_frame(estimate).trajectory
     start, aligned_start = (path.orientation[:1] for path in (estimate.trajectory, aligned))
-    turn = rotation_z(metrics.relative_yaw(start, aligned_start)[0])
+    turn = rotation_z(relative_yaw(start, aligned_start)[0])
     return (aligned.position - estimate.reference.position) @ turn.T
 
 

@@ -12,8 +12,8 @@ from gnio_jax import data
 from gnio_jax.config import DataConfig, FilterSettings
 from gnio_jax.config.schema import TLIO_STD
 from gnio_jax.errors import InputError
-from gnio_jax.evaluation.metrics import Trajectory
 from gnio_jax.evaluation.setup import DEFAULT_SETUP, Setup, resolve
+from gnio_jax.evaluation.trajectory import Trajectory
 from gnio_jax.filtering import InitialStd, level_state
 from gnio_jax.filtering.settings import filter_setup
 from gnio_jax.filtering.start import rest_at_start

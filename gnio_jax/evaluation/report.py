@@ -12,17 +12,24 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gnio_jax.evaluation import metrics
 from gnio_jax.evaluation.curves_file import write_curves
 from gnio_jax.evaluation.estimators.result import Estimate
 from gnio_jax.evaluation.scores import Scores
-from gnio_jax.evaluation.tum import write_tum
+from gnio_jax.evaluation.trajectory import write_tum
 
 DEFINITIONS = 2
 """What the figures of metrics.json mean, in its `settings`. Raise it with every change after which
 a file's figures cannot stand beside newer ones: another definition of a metric, of who counts as
 diverged or of a mean, or something in the file that tables need. Those of 1 have no groups, and
 yaw errors that are differences of Euler yaws."""
+
+
+INFINITE = (
+    "the estimate is not finite",
+    "the error is too large",
+    "the filter's covariance is not positive definite",
+)
+"""How the reasons of infinite metrics begin."""
 
 
 class Report(NamedTuple):
@@ -111,7 +118,14 @@ def read_metric(sequence: Mapping[str, Any], metric: str) -> float | None:
     not defined, infinite where its reason says so."""
     value = sequence.get(metric)
     reason = sequence.get("undefined", {}).get(metric, "")
-    return math.inf if value is None and metrics.is_infinite(reason) else value
+    return math.inf if value is None and reason.startswith(INFINITE) else value
+
+
+def diverged(values: Mapping[str, float | None]) -> bool:
+    """Whether the estimate of a sequence diverged: its `ate` is infinite or, where there is none
+    for want of a reference, anything else is."""
+    error = values.get("ate")
+    return math.inf in values.values() if error is None else math.isinf(error)
 
 
 def definitions(figures: Mapping[str, Any]) -> int:
@@ -123,7 +137,7 @@ def definitions(figures: Mapping[str, Any]) -> int:
 
 def _sequences(scores: Scores) -> dict[str, dict[str, Any]]:
     return {
-        name: {**_finite(m.values), **({"undefined": m.undefined} if m.undefined else {})}
+        name: {**_finite(m.values), **({"undefined": m.reasons} if m.reasons else {})}
         for name, m in scores.sequences.items()
     }
 
@@ -148,7 +162,7 @@ def _without_mean(scores: Scores) -> dict[str, str]:
     found = {}
     for name, value in _finite(scores.summary.mean).items():
         if value is None:
-            reasons = (m.undefined.get(name) for m in scores.sequences.values())
+            reasons = (m.reasons.get(name) for m in scores.sequences.values())
             found[name] = next(filter(None, reasons), "no estimate that did not diverge")
     return found
 

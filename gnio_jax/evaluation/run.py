@@ -24,11 +24,11 @@ from gnio_jax.evaluation.estimators.result import Estimate
 from gnio_jax.evaluation.exporting import rerun_file
 from gnio_jax.evaluation.frames import in_the_references_frame
 from gnio_jax.evaluation.inference import Network, inference_network
-from gnio_jax.evaluation.metrics import AlignmentMethod
 from gnio_jax.evaluation.preparation import Prepared, prepare
 from gnio_jax.evaluation.report import DEFINITIONS, Report, write
 from gnio_jax.evaluation.scores import score
 from gnio_jax.evaluation.setup import Setup, resolve
+from gnio_jax.evaluation.trajectory import Alignment
 from gnio_jax.files import replacing_folder
 from gnio_jax.parallel import is_first
 
@@ -144,7 +144,7 @@ def _write(
 
 
 def _write_rerun(
-    path: Path, estimates: list[Estimate], prepared: list[Prepared], alignment: AlignmentMethod
+    path: Path, estimates: list[Estimate], prepared: list[Prepared], alignment: Alignment
 ) -> None:
     """The estimates in the frames of their references, with the IMU that they are of."""
     logged = [

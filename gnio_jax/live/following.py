@@ -15,7 +15,7 @@ from gnio_jax.data.resampling import longest_bridge
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import Trajectory, inference_network
 from gnio_jax.evaluation.preparation import ROUGH_START
-from gnio_jax.evaluation.tum import write_tum
+from gnio_jax.evaluation.trajectory import write_tum
 from gnio_jax.files import replacing
 from gnio_jax.filtering import Pose, Tracker
 from gnio_jax.live.samples import Sample

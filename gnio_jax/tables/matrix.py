@@ -16,9 +16,8 @@ from gnio_jax import calibration
 from gnio_jax import config as configuration
 from gnio_jax.comparison.figures import how, of_run
 from gnio_jax.config import CalibrateConfig, TablesConfig, TrainConfig
-from gnio_jax.evaluation import metrics, report
-from gnio_jax.evaluation.metrics import Trajectory
-from gnio_jax.evaluation.tum import read_tum
+from gnio_jax.evaluation import report
+from gnio_jax.evaluation.trajectory import Trajectory, align, read_tum
 from gnio_jax.reporting import Reporter
 from gnio_jax.tables.experiments import Cell
 from gnio_jax.training import loop, run_folder
@@ -144,5 +143,5 @@ def _plan_view(estimate: Trajectory, reference: Trajectory) -> PlanView:
         np.where(present[:, None], part[rows], np.nan)
         for part in (estimate.position, estimate.orientation)
     )
-    aligned = metrics.align(Trajectory(reference.time, *poses), reference)
+    aligned = align(Trajectory(reference.time, *poses), reference)
     return PlanView(reference.position[:, :2], aligned.position[:, :2])

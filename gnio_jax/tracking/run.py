@@ -20,7 +20,7 @@ from gnio_jax.evaluation.exporting import rerun_file
 from gnio_jax.evaluation.frames import with_the_reference_in_its_frame
 from gnio_jax.evaluation.preparation import Prepared, measured_rows
 from gnio_jax.evaluation.setup import OnShare, Setup, no_progress
-from gnio_jax.evaluation.tum import write_tum
+from gnio_jax.evaluation.trajectory import write_tum
 from gnio_jax.files import check_writable_folder, replacing_folder
 from gnio_jax.tracking.filter import tracking_filter
 from gnio_jax.tracking.summary import Summary, as_json, summarise

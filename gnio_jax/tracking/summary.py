@@ -9,7 +9,6 @@ import numpy as np
 
 from gnio_jax.apps.importing import GAPS, Imported
 from gnio_jax.evaluation import Estimate, metrics
-from gnio_jax.evaluation.metrics.trajectory import finite_poses
 from gnio_jax.evaluation.preparation import ROUGH_START, Prepared
 from gnio_jax.evaluation.scores import score
 from gnio_jax.filtering.config import FilterConfig
@@ -87,7 +86,7 @@ def summarise(
     ekf: FilterSetup,
 ) -> Summary:
     """The figures of a finished track. An estimate that diverged is told of up to there."""
-    sequence, healthy = recording.sequence, finite_poses(estimate.trajectory)
+    sequence, healthy = recording.sequence, estimate.trajectory.known
     last = int(np.flatnonzero(healthy)[-1])
     position, time = estimate.trajectory.position[: last + 1, :2], estimate.trajectory.time
     assert estimate.position_covariance is not None and estimate.accepted is not None

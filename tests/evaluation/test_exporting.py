@@ -12,8 +12,8 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from gnio_jax.commands import app
 from gnio_jax.errors import InputError
-from gnio_jax.evaluation.exporting import export, read_trajectory
-from gnio_jax.evaluation.metrics import Trajectory
+from gnio_jax.evaluation.exporting import export
+from gnio_jax.evaluation.trajectory import Trajectory, read_tum
 from tests.support import known_walk
 
 START = 1_700_000_000.25
@@ -38,7 +38,7 @@ def test_csv_and_tum_have_the_poses(tmp_path):
     expected = np.column_stack([TIME, poses.position, poses.orientation])
     np.testing.assert_allclose(rows, expected, atol=1e-9)
     export(tmp_path / "walk.tum", poses)
-    again = read_trajectory(tmp_path / "walk.tum")
+    again = read_tum(tmp_path / "walk.tum")
     for field, own in zip(again, poses, strict=True):
         np.testing.assert_allclose(field, own, atol=1e-9)
 
@@ -138,7 +138,7 @@ def test_the_command_writes_what_the_suffix_says(trajectory, tmp_path, capsys):
         (["walk.txt", "a.dat"], "a.dat: its name tells no format; known: .tum, .txt, .csv"),
         (["walk.txt", "folder"], "OUT: 'folder' is a folder; name a file in it"),
         (["words.txt", "a.csv"], "words.txt: "),
-        (["short.txt", "a.csv"], "short.txt: has 4 columns, not the 8 of TUM's format"),
+        (["short.txt", "a.csv"], "short.txt: has 4 columns, not the 8 of the TUM format"),
         (["back.txt", "a.csv"], "back.txt: field 'time' does not increase"),
         (
             ["turn.txt", "a.csv"],

@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from gnio_jax.evaluation import report, score
-from gnio_jax.evaluation.tum import write_tum
+from gnio_jax.evaluation.trajectory import write_tum
 from tests.support.estimates import SETTINGS
 
 

@@ -12,7 +12,7 @@ from gnio_jax import live, tracking
 from gnio_jax.commands import app, console
 from gnio_jax.config import DataConfig, ModelConfig, TrainConfig
 from gnio_jax.errors import InputError
-from gnio_jax.evaluation.tum import read_tum
+from gnio_jax.evaluation.trajectory import read_tum
 from gnio_jax.filtering import ConsideredStd, Pose, Tracker
 from gnio_jax.filtering import tracker as trackers
 from gnio_jax.live import following, rerun_stream

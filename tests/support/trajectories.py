@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from gnio_jax.evaluation.metrics import Trajectory
+from gnio_jax.evaluation.trajectory import Trajectory
 
 STEP = 0.1
 

@@ -4,8 +4,7 @@ import numpy as np
 
 from gnio_jax import config as configuration
 from gnio_jax.config import CalibrateConfig
-from gnio_jax.evaluation.metrics import Trajectory
-from gnio_jax.evaluation.tum import write_tum
+from gnio_jax.evaluation.trajectory import Trajectory, write_tum
 from gnio_jax.reporting import Lines
 from gnio_jax.tables import matrix
 from gnio_jax.tables.experiments import Cell

@@ -16,7 +16,7 @@ from gnio_jax.commands import app, console
 from gnio_jax.config import DataConfig, ModelConfig, TrainConfig
 from gnio_jax.data.hdf5 import write_hdf5
 from gnio_jax.data.resampling import resample
-from gnio_jax.evaluation.exporting import read_trajectory
+from gnio_jax.evaluation.trajectory import read_tum
 from gnio_jax.tracking import choose_weights, picture
 from gnio_jax.tracking.summary import Summary, _warnings
 from gnio_jax.types import Sequence
@@ -91,7 +91,7 @@ def test_a_bag_with_a_reference(gnio, runs, tmp_path):
     page = (out / "report.html").read_text(encoding="utf-8")
     assert "expected error at the end" in page and f"--out {out}" in page
     assert (out / "track.png").read_bytes().startswith(b"\x89PNG")
-    path, summary = read_trajectory(out / "trajectory.txt"), summary_of(out)
+    path, summary = read_tum(out / "trajectory.txt"), summary_of(out)
     # In the recording's own clock, from its first sample on, to whole strides.
     np.testing.assert_allclose(path.time[0], bag_files.EPOCH * 1e-9, atol=1e-6)
     np.testing.assert_allclose(np.diff(path.time), 0.1, atol=1e-6)
@@ -101,7 +101,7 @@ def test_a_bag_with_a_reference(gnio, runs, tmp_path):
     length = np.linalg.norm(np.diff(seconds, axis=0), axis=1).sum()
     np.testing.assert_allclose(summary["path_length"], length, atol=1e-6)
     np.testing.assert_allclose(summary["from_start"], np.hypot(*path.position[-1, :2]), atol=1e-6)
-    reference = read_trajectory(out / "reference.txt")
+    reference = read_tum(out / "reference.txt")
     place = known_walk.position(reference.time - bag_files.EPOCH * 1e-9)
     np.testing.assert_allclose(reference.position, place, atol=5e-3)
     # The error with the starts aligned, by hand.
@@ -135,7 +135,7 @@ def test_a_phone_on_a_table_stays_there(gnio, runs, tmp_path):
     table = csv(tmp_path / "table.csv", time, gyro, accel)
     out = tmp_path / "track"
     told = gnio("track", table, "--weights", runs / "mute", "--out", out, "--gyro-unit", "rad/s")
-    path = read_trajectory(out / "trajectory.txt")
+    path = read_tum(out / "trajectory.txt")
     assert np.linalg.norm(path.position, axis=1).max() < 0.05
     turned = Rotation.from_quat(path.orientation[-1], scalar_first=True).magnitude()
     assert turned < np.radians(0.5)  # the bias, 1.5° in this time, is that of the rest
@@ -160,7 +160,7 @@ def test_the_newest_run_a_slow_logger_and_our_own_file(gnio, runs, tmp_path, mon
     assert len(of_gaps) == 3 and set(of_gaps) <= set(again.splitlines())
     assert summary_of(tmp_path / "again")["notes"] == summary_of(folder)["notes"]
     ours, theirs = (
-        read_trajectory(place / "trajectory.txt").position for place in (tmp_path / "again", folder)
+        read_tum(place / "trajectory.txt").position for place in (tmp_path / "again", folder)
     )
     np.testing.assert_allclose(ours, theirs, atol=1e-4)
 

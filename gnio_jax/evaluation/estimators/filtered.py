@@ -17,9 +17,9 @@ from jaxtyping import Float
 
 from gnio_jax.evaluation.estimators.result import Estimate
 from gnio_jax.evaluation.inference import Network, keep_diagnostics
-from gnio_jax.evaluation.metrics import Trajectory
 from gnio_jax.evaluation.preparation import Prepared
 from gnio_jax.evaluation.setup import OnShare, no_progress
+from gnio_jax.evaluation.trajectory import Trajectory
 from gnio_jax.filtering import (
     ConsideredStd,
     FilterConfig,

@@ -7,8 +7,8 @@ from jaxtyping import Float
 
 from gnio_jax.config import DataConfig
 from gnio_jax.evaluation.estimators.result import Estimate, at_window_ends
-from gnio_jax.evaluation.metrics import Trajectory
 from gnio_jax.evaluation.preparation import Prepared
+from gnio_jax.evaluation.trajectory import Trajectory
 from gnio_jax.numerics import finite_rows, quaternion_from_matrix, yaw_rotation
 from gnio_jax.types import Prediction
 

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from gnio_jax.evaluation.metrics import Trajectory
+from gnio_jax.evaluation.trajectory import Trajectory
 from gnio_jax.types import Array
 
 

@@ -12,15 +12,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from gnio_jax.data.parsing.tables import read_text
-from gnio_jax.data.validation import check_increasing
 from gnio_jax.errors import InputError, require_packages
 from gnio_jax.evaluation.exporting.ros import check_stamps, write_mcap
-from gnio_jax.evaluation.metrics import Trajectory
-from gnio_jax.evaluation.metrics.trajectory import finite_poses
-from gnio_jax.evaluation.tum import write_tum
+from gnio_jax.evaluation.trajectory import Trajectory, write_tum
 from gnio_jax.files import replacing
-from gnio_jax.numerics import quaternions
 
 SUFFIXES = {
     ".tum": "tum",
@@ -29,8 +24,6 @@ SUFFIXES = {
     ".mcap": "mcap",
 }
 FORMATS = tuple(dict.fromkeys(SUFFIXES.values()))
-
-_TUM = "t x y z qx qy qz qw"
 
 
 def export(
@@ -48,7 +41,7 @@ def export(
     kind = kind or SUFFIXES.get(path.suffix.lower())
     if kind not in FORMATS:
         raise InputError(path, "its name tells no format", f"known: {', '.join(SUFFIXES)}")
-    known = finite_poses(trajectory) & np.isfinite(trajectory.time)
+    known = trajectory.known & np.isfinite(trajectory.time)
     if not known.any():
         raise InputError(path, "the trajectory has no pose", "evaluate the recording again")
     poses = Trajectory(*(field[known] for field in trajectory))
@@ -70,20 +63,6 @@ def check_format(where: object, kind: str) -> None:
     """Raise `InputError` for a format whose packages are missing."""
     if kind == "mcap":
         require_packages(where, "bags", "mcap", "rosbags")
-
-
-def read_trajectory(path: Path) -> Trajectory:
-    """A trajectory in TUM format. Raises `InputError` for anything else."""
-    table = read_text(path, separator=" ", header=False)
-    if table.width() != 8:
-        raise InputError(
-            path, f"has {table.width()} columns, not the 8 of TUM's format", f"they are {_TUM}"
-        )
-    table = table.renamed(_TUM.split())
-    time, position = table.take("t"), table.take("x", "y", "z")
-    check_increasing(time, path)
-    attitude = table.rotations("qx", "qy", "qz", "qw", scalar_first=False)
-    return Trajectory(time, position, quaternions(attitude))
 
 
 def _write_csv(path: Path, poses: Trajectory) -> None:

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from gnio_jax.errors import InputError
-from gnio_jax.evaluation.metrics import Trajectory
+from gnio_jax.evaluation.trajectory import Trajectory
 from gnio_jax.numerics import rotations
 
 LAST_STAMP = 2.0**31

@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from gnio_jax.evaluation.estimators.result import Estimate
 from gnio_jax.evaluation.frames import SIGMAS, in_the_references_frame
-from gnio_jax.evaluation.metrics import AlignmentMethod
+from gnio_jax.evaluation.trajectory import Alignment
 from gnio_jax.numerics import finite_rows
 
 
@@ -49,7 +49,7 @@ class Curves(NamedTuple):
     """Largest of the stretch that the row stands for."""
 
 
-def curves(estimate: Estimate, alignment: AlignmentMethod, rows: int) -> Curves:
+def curves(estimate: Estimate, alignment: Alignment, rows: int) -> Curves:
     """The curves of an estimate in at most `rows` rows, evenly spaced in time."""
     estimate = in_the_references_frame(estimate, alignment)
     path, reference = estimate.trajectory, estimate.reference.position

@@ -7,9 +7,9 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from gnio_jax.evaluation.estimators.result import Estimate
-from gnio_jax.evaluation.metrics import AlignmentMethod
 from gnio_jax.evaluation.report import Report
 from gnio_jax.evaluation.table import COLUMNS
+from gnio_jax.evaluation.trajectory import Alignment
 
 Figures = Mapping[str, float | None]
 """Metric -> value; None where it is not defined, infinite where the estimate diverged."""
@@ -23,7 +23,7 @@ class Entry(NamedTuple):
     about: dict[str, str]
     """How the figures were made, in words: the command, alignment, orientation, ..."""
     estimates: list[Estimate]
-    alignment: AlignmentMethod
+    alignment: Alignment
     figures: dict[str, Figures]
     """Sequence -> its metrics."""
     summary: dict[str, Figures] = {}

@@ -8,13 +8,17 @@ from typing import Any
 
 import numpy as np
 
-from gnio_jax.evaluation import metrics
 from gnio_jax.evaluation.curves_file import with_curves
 from gnio_jax.evaluation.estimators.result import Estimate
 from gnio_jax.evaluation.html.entry import Entry, Figures, about, label, remarks
-from gnio_jax.evaluation.metrics import Trajectory
-from gnio_jax.evaluation.report import DEFINITIONS, definitions, file_names, read_metric
-from gnio_jax.evaluation.tum import read_tum
+from gnio_jax.evaluation.report import (
+    DEFINITIONS,
+    definitions,
+    diverged,
+    file_names,
+    read_metric,
+)
+from gnio_jax.evaluation.trajectory import Trajectory, read_tum
 
 SAME = ("dataset", "split", "model", "checkpoint", "step")
 """Settings in which evaluations are alike that stand side by side."""
@@ -56,7 +60,7 @@ def read_entry(folder: Path, name: str | None = None) -> Entry:
         remarks(
             {name: values["notes"] for name, values in sequences.items() if "notes" in values},
             figures["left_out"],
-            [name for name, values in measured.items() if metrics.diverged(values)],
+            [name for name, values in measured.items() if diverged(values)],
         ),
     )
 

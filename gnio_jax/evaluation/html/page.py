@@ -18,8 +18,8 @@ from gnio_jax.evaluation.estimators.result import Estimate
 from gnio_jax.evaluation.html import figures
 from gnio_jax.evaluation.html.curves import curves
 from gnio_jax.evaluation.html.entry import Entry, Figures, cell, shown
-from gnio_jax.evaluation.metrics import Trajectory
 from gnio_jax.evaluation.table import COLUMNS
+from gnio_jax.evaluation.trajectory import Trajectory
 from gnio_jax.files import write_text
 
 ROWS, FEWEST_ROWS = 9000, 150

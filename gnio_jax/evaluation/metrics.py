@@ -1,0 +1,475 @@
+"""Errors of a trajectory, each under a name that says which definition of the field it is.
+
+Positions are (n, d) arrays in metres whose rows are `step` seconds apart, with d = 3, or 2 for the
+horizontal metrics. A row of the reference that cannot be trusted is NaN and counts nowhere, and
+neither does a displacement that starts or ends there. A metric without a value raises `Undefined`
+with the reason. `measure` computes all of them. Everything is NumPy in float64.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.special import gammaincinv
+
+from gnio_jax.evaluation.trajectory import (
+    Alignment,
+    Quaternions,
+    Trajectory,
+    Undefined,
+    align,
+    relative_yaw,
+)
+from gnio_jax.numerics import finite_rows, matrix_from_quaternion, rotation_z, spans
+
+Positions = Float[np.ndarray, "n d"]
+
+STANDING_SPEED = 0.05
+"""Mean speed over one second below which the reference stands still, m/s."""
+STANDING_SECONDS = 2.0
+"""Shortest stretch that counts as standing still, s."""
+LEAST_PATH = 1.0
+"""Length of the reference below which `drift` and `path_length_ratio` say nothing, m."""
+LEAST_SECONDS = 10.0
+"""Time below which `yaw_drift` says nothing of an hour, s."""
+
+
+# Errors of positions
+# --------------------------------------------------------------------------------------------------
+
+
+def ate(estimate: Positions, reference: Positions) -> float:
+    """Absolute trajectory error sqrt(mean ‖p̂ − p‖²), m (TUM/evo's APE, RNIN, TLIO's filter)."""
+    return _rms(_trusted_errors(estimate, reference))
+
+
+def ate_mean(estimate: Positions, reference: Positions) -> float:
+    """Mean ‖p̂ − p‖, m (TLIO's test of the network)."""
+    return float(np.mean(np.linalg.norm(_trusted_errors(estimate, reference), axis=1)))
+
+
+def drift(estimate: Positions, reference: Positions, step: float) -> float:
+    """Error at the last trusted row over the length of the reference's path, % (position drift
+    error, PDE). The error has grown over the whole path, so its holes are bridged by straight
+    lines."""
+    error, rows = _trusted_errors(estimate, reference)[-1], np.arange(len(reference))
+    known = finite_rows(reference)
+    bridged = [np.interp(rows, rows[known], axis[known]) for axis in reference.T]
+    return float(100 * np.linalg.norm(error) / _path_of_reference(np.stack(bridged, 1), step))
+
+
+def rte(estimate: Positions, reference: Positions, step: float, seconds: float = 60.0) -> float:
+    """Relative trajectory error: RMS of the error of displacements over `seconds`, from every row,
+    m (RoNIN's T-RTE, RNIN).
+
+    Displacements are compared in the world, without aligning their starts. Where the trusted rows
+    span less than `seconds`, it is the error at their end relative to their start, scaled to
+    `seconds` (RoNIN's rule).
+    """
+    error, apart = estimate - reference, round(seconds / step)
+    rows = np.flatnonzero(finite_rows(reference))
+    if len(rows) < 2:
+        raise Undefined("a single trusted row" if len(rows) else "no trusted reference")
+    span = int(rows[-1] - rows[0])
+    if span < apart:
+        return float(np.linalg.norm(error[rows[-1]] - error[rows[0]]) * apart / span)
+    return _rms_of_pairs(error[apart:] - error[:-apart], finite_rows(reference), apart, seconds)
+
+
+def rte_distance(estimate: Positions, reference: Positions, metres: float) -> float:
+    """RMS of the error of displacements over `metres` walked, from every row, m (D-RTE of CTIN and
+    iMoT).
+
+    A displacement ends at the first row by which the reference has walked `metres`. Its path is
+    summed from row to row, within an unbroken stretch of the reference.
+    """
+    errors = [np.zeros((0, estimate.shape[1]))]
+    for start, stop in spans(finite_rows(reference)):
+        truth, error = reference[start:stop], (estimate - reference)[start:stop]
+        walked = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(truth, axis=0), axis=1))])
+        end = np.searchsorted(walked, walked + metres - 1e-9)
+        begin = np.flatnonzero(end < len(walked))
+        errors.append(error[end[begin]] - error[begin])
+    return _rms(np.concatenate(errors), f"no unbroken reference of {metres:g} m")
+
+
+def rpe(
+    estimate: Trajectory, reference: Trajectory, step: float, seconds: float, dims: int = 3
+) -> float:
+    """Relative pose error: RMS of R_z(−ψ_i)(p̂_j − p̂_i) − (p_j − p_i) over pairs `seconds` apart,
+    from every row, m (TLIO).
+
+    ψ is the yaw error at the start (`relative_yaw`), so a wrong heading of the whole trajectory
+    costs nothing. With `dims` 2 it is of the horizontal part.
+    """
+    apart = _rows_apart(estimate, step, seconds)
+    yaw = relative_yaw(estimate.orientation[:-apart], reference.orientation[:-apart])
+    return _rms_of_moves(rotation_z(-yaw), estimate, reference, apart, seconds, dims)
+
+
+def rpe_se3(
+    estimate: Trajectory, reference: Trajectory, step: float, seconds: float = 1.0, dims: int = 3
+) -> float:
+    """The translation part of the relative pose error with the full attitude at the start aligned,
+    over all pairs, m (TUM, evo): RMS of R_i R̂_iᵀ (p̂_j − p̂_i) − (p_j − p_i)."""
+    apart = _rows_apart(estimate, step, seconds)
+    ours, true = (matrix_from_quaternion(x.orientation[:-apart]) for x in (estimate, reference))
+    turn = true @ np.swapaxes(ours, 1, 2)
+    return _rms_of_moves(turn, estimate, reference, apart, seconds, dims)
+
+
+def _rms_of_moves(
+    turn: Float[np.ndarray, "m 3 3"],
+    estimate: Trajectory,
+    reference: Trajectory,
+    apart: int,
+    seconds: float,
+    dims: int,
+) -> float:
+    """RMS of the estimated displacements, turned, minus the true ones; over the pairs whose start
+    has a trusted orientation too."""
+    moved, true = (x.position[apart:] - x.position[:-apart] for x in (estimate, reference))
+    error = np.einsum("nij,nj->ni", turn, moved) - true
+    error = error[:, :dims]
+    oriented = finite_rows(reference.orientation[:-apart])
+    return _rms_of_pairs(error, finite_rows(reference.position), apart, seconds, oriented)
+
+
+def _rows_apart(estimate: Trajectory, step: float, seconds: float) -> int:
+    apart = round(seconds / step)
+    if apart >= len(estimate.time):
+        raise Undefined(f"no two trusted rows {seconds:g} s apart")
+    return apart
+
+
+def _rms_of_pairs(
+    error: Float[np.ndarray, "m d"],
+    trusted: Bool[np.ndarray, "n"],
+    apart: int,
+    seconds: float,
+    counted: Bool[np.ndarray, "m"] | bool = True,
+) -> float:
+    pairs = trusted[apart:] & trusted[:-apart] & counted
+    return _rms(error[pairs], f"no two trusted rows {seconds:g} s apart")
+
+
+def _rms(errors: Float[np.ndarray, "m d"], reason: str = "") -> float:
+    """Root mean square norm. Raises `Undefined(reason)` without a row."""
+    if not len(errors):
+        raise Undefined(reason)
+    return float(np.sqrt(np.mean(np.sum(errors**2, 1))))
+
+
+def _trusted_errors(estimate: Positions, reference: Positions) -> Float[np.ndarray, "m d"]:
+    trusted = finite_rows(reference)
+    if not trusted.any():
+        raise Undefined("no trusted reference")
+    return (estimate - reference)[trusted]
+
+
+# Paths
+# --------------------------------------------------------------------------------------------------
+
+
+def path_length(position: Positions, step: float, seconds: float = 1.0) -> float:
+    """Length of the polygon through the rows `seconds` apart and the last row, m. Sides that touch
+    an untrusted row are left out.
+
+    Summed from row to row, the noise of positions would count as walking: 5 mm at 10 Hz make 3 m a
+    minute.
+    """
+    if len(position) < 2:
+        raise Undefined("a single row")
+    apart = max(1, round(seconds / step))
+    corners = np.unique(np.append(np.arange(0, len(position), apart), len(position) - 1))
+    return float(np.nansum(np.linalg.norm(np.diff(position[corners], axis=0), axis=1)))
+
+
+def path_length_ratio(estimate: Positions, reference: Positions, step: float) -> float:
+    """Estimated over true `path_length` where the reference is trusted: 1 is right, 0 is an
+    estimate that never moved."""
+    length = _path_of_reference(reference, step)
+    trusted = np.where(finite_rows(reference)[:, None], estimate, np.nan)
+    return path_length(trusted, step) / length
+
+
+def _path_of_reference(reference: Positions, step: float) -> float:
+    length = path_length(reference, step)
+    if length < LEAST_PATH:
+        raise Undefined(f"the reference path is {length:.2f} m long, under {LEAST_PATH:g} m")
+    return length
+
+
+def standing(reference: Positions, step: float) -> Bool[np.ndarray, "n"]:
+    """Rows of stretches of at least 2 s in which every displacement over 1 s is below 0.05 m. One
+    second forgives the noise of the reference and the swaying of a person who stands (ours)."""
+    apart, still = max(1, round(1.0 / step)), np.zeros(len(reference), bool)
+    if len(reference) <= apart:
+        return still
+    with np.errstate(invalid="ignore"):
+        moved = np.linalg.norm(reference[apart:] - reference[:-apart], axis=1)
+        slow = moved < STANDING_SPEED * apart * step
+    for start, stop in spans(slow):
+        if (stop - 1 - start + apart) * step >= STANDING_SECONDS - 1e-9:
+            still[start : stop + apart] = True
+    return still & finite_rows(reference)
+
+
+def stationary_drift(estimate: Positions, reference: Positions, step: float) -> float:
+    """Metres that the estimate walks (`path_length`) per minute in which the reference stands still
+    (`standing`): what a gate on the displacement is for (GNIO)."""
+    stretches = [each for each in spans(standing(reference, step)) if each[1] - each[0] > 1]
+    if not stretches:
+        raise Undefined(f"the reference never stands still for {STANDING_SECONDS:g} s")
+    walked = sum(path_length(estimate[start:stop], step) for start, stop in stretches)
+    seconds = sum((stop - 1 - start) * step for start, stop in stretches)
+    return float(walked / (seconds / 60))
+
+
+# Yaw
+# --------------------------------------------------------------------------------------------------
+
+
+def yaw_rmse(estimate: Quaternions, reference: Quaternions) -> float:
+    """Root mean square of the yaw error (`relative_yaw`), degrees (TLIO)."""
+    error = relative_yaw(estimate, reference)[_oriented(reference)]
+    return float(np.degrees(np.sqrt(np.mean(error**2))))
+
+
+def yaw_drift(estimate: Quaternions, reference: Quaternions, step: float) -> float:
+    """Absolute change of the unwrapped yaw error (`relative_yaw`) from the first to the last
+    trusted row, degrees per hour (TLIO)."""
+    rows = _oriented(reference)
+    error = np.unwrap(relative_yaw(estimate, reference)[rows])
+    hours = (rows[-1] - rows[0]) * step / 3600
+    if hours < LEAST_SECONDS / 3600:
+        raise Undefined(f"trusted for less than {LEAST_SECONDS:g} s")
+    return float(abs(np.degrees(error[-1] - error[0])) / hours)
+
+
+def _oriented(reference: Quaternions) -> Int[np.ndarray, "m"]:
+    rows = np.flatnonzero(finite_rows(reference))
+    if not len(rows):
+        raise Undefined("no trusted reference")
+    return rows
+
+
+# Consistency of the filter
+# --------------------------------------------------------------------------------------------------
+
+
+def normalised_squared(
+    error: Float[np.ndarray, "n d"], covariance: Float[np.ndarray, "n d d"]
+) -> Float[np.ndarray, "n"]:
+    """eᵀ P⁻¹ e of each row, infinite where P is not finite and positive definite.
+
+    Such a P claims to know some direction exactly, which no error agrees with. It is judged to the
+    rounding of float64 after scaling to unit variances, so that units do not matter (ours).
+    """
+    variance = np.einsum("nii->ni", covariance)
+    sound = np.isfinite(covariance).all((1, 2)) & (variance > 0).all(1)
+    std = np.sqrt(variance[sound])
+    value, vector = np.linalg.eigh(covariance[sound] / (std[:, :, None] * std[:, None, :]))
+    definite = value[:, 0] > value.shape[1] * np.finfo(float).eps * value[:, -1]
+    projected = np.einsum("nji,nj->ni", vector, error[sound] / std)
+    squared = np.full(len(error), np.inf)
+    value = np.where(definite[:, None], value, 1.0)
+    squared[sound] = np.where(definite, (projected**2 / value).sum(1), np.inf)
+    return squared
+
+
+def mean_normalised(squared: Float[np.ndarray, "n"], dims: int) -> float:
+    """Mean of normalised squared errors over their expectation: 1 is consistent, above 1 the filter
+    is overconfident (Bar-Shalom). It is NEES for errors of the position, NIS for innovations."""
+    return float(np.mean(_present(squared)) / dims)
+
+
+def coverage(squared: Float[np.ndarray, "n"], dims: int, level: float = 0.95) -> float:
+    """Share of rows inside the χ² region of probability `level`, %: 95 is consistent."""
+    quantile = 2 * gammaincinv(dims / 2, level)  # `scipy.stats` takes half a second to import
+    return float(100 * np.mean(_present(squared) <= quantile))
+
+
+def accepted_share(accepted: Float[np.ndarray, "n"]) -> float:
+    """Share of the measurements that the filter used, %."""
+    return float(100 * np.mean(_present(accepted)))
+
+
+def _present(values: Float[np.ndarray, "n"]) -> Float[np.ndarray, "m"]:
+    present = values[~np.isnan(values)]
+    if not len(present):
+        raise Undefined("no measurement or no trusted reference")
+    return present
+
+
+# All metrics of a sequence
+# --------------------------------------------------------------------------------------------------
+
+
+class Filtered(NamedTuple):
+    """What a filter knows beside its trajectory, one row for each row of the trajectory."""
+
+    covariance: Float[np.ndarray, "n 3 3"]
+    """Of the position, in the filter's own world, m²."""
+    nis: Float[np.ndarray, "n"]
+    """Normalised innovation squared; NaN where there was no measurement."""
+    accepted: Float[np.ndarray, "n"]
+    """1 if the measurement was used, 0 if it was rejected, NaN if there was none."""
+
+
+class Compared(NamedTuple):
+    """An estimate beside its reference, as the metrics see it."""
+
+    raw: Trajectory
+    """As the estimator gives it."""
+    aligned: Trajectory
+    """Under the alignment that was asked for."""
+    started: Trajectory
+    """Under alignment `origin`."""
+    reference: Trajectory
+    step: float
+    """Time between rows, s."""
+    filtered: Filtered | None
+    dims: int = 3
+
+    def of(self, path: Trajectory) -> Positions:
+        return path.position[:, : self.dims]
+
+    def of_filter(self) -> Filtered:
+        assert self.filtered is not None
+        return self.filtered
+
+    def nees(self) -> Float[np.ndarray, "n"]:
+        """eᵀ P⁻¹ e of the position: the error of the start-aligned estimate, turned back into the
+        filter's world. NaN without a reference, and where P is zero, as at a start that was given
+        as exact."""
+        yaw = relative_yaw(self.raw.orientation[:1], self.started.orientation[:1])[0]
+        error = (self.started.position - self.reference.position) @ rotation_z(yaw).T
+        covariance, dims = self.of_filter().covariance, self.dims
+        good = finite_rows(error) & (np.einsum("nii->ni", covariance) != 0).all(1)
+        squared = np.full(len(error), np.nan)
+        squared[good] = normalised_squared(error[good, :dims], covariance[good, :dims, :dims])
+        return squared
+
+
+Metric = Callable[[Compared], float]
+
+SPATIAL: dict[str, Metric] = {
+    "ate": lambda c: ate(c.of(c.aligned), c.of(c.reference)),
+    "ate_ronin": lambda c: ate(c.of(c.aligned), c.of(c.reference)) / math.sqrt(c.dims),
+    "ate_mean": lambda c: ate_mean(c.of(c.aligned), c.of(c.reference)),
+    "rte_60s": lambda c: rte(c.of(c.aligned), c.of(c.reference), c.step),
+    "rte_60s_ronin": lambda c: rte(c.of(c.aligned), c.of(c.reference), c.step) / math.sqrt(c.dims),
+    "rte_1m": lambda c: rte_distance(c.of(c.aligned), c.of(c.reference), 1.0),
+    "rte_10m": lambda c: rte_distance(c.of(c.aligned), c.of(c.reference), 10.0),
+    "rpe_1s": lambda c: rpe(c.raw, c.reference, c.step, 1.0, c.dims),
+    "rpe_10s": lambda c: rpe(c.raw, c.reference, c.step, 10.0, c.dims),
+    "rpe_se3": lambda c: rpe_se3(c.raw, c.reference, c.step, 1.0, c.dims),
+    "drift": lambda c: drift(c.of(c.aligned), c.of(c.reference), c.step),
+    "path_length_ratio": lambda c: path_length_ratio(c.of(c.raw), c.of(c.reference), c.step),
+    "stationary_drift": lambda c: stationary_drift(c.of(c.raw), c.of(c.reference), c.step),
+}
+"""In 3-D, and in 2-D as `<name>_2d`. Those of `_ronin` average over components too: they are the
+others over √d (RoNIN, DeepILS)."""
+NEES: dict[str, Metric] = {
+    "nees": lambda c: mean_normalised(c.nees(), c.dims),
+    "nees_coverage": lambda c: coverage(c.nees(), c.dims),
+}
+"""In 3-D and in 2-D, of a filter."""
+OTHERS: dict[str, Metric] = {
+    "yaw_rmse": lambda c: yaw_rmse(c.aligned.orientation, c.reference.orientation),
+    "yaw_drift": lambda c: yaw_drift(c.raw.orientation, c.reference.orientation, c.step),
+}
+OF_FILTER: dict[str, Metric] = {
+    "nis": lambda c: mean_normalised(c.of_filter().nis, 3),
+    "nis_coverage": lambda c: coverage(c.of_filter().nis, 3),
+    "accepted": lambda c: accepted_share(c.of_filter().accepted),
+}
+"""They need no reference."""
+NAMES = (*(name + tag for tag in ("", "_2d") for name in SPATIAL | NEES), *OTHERS, *OF_FILTER)
+SHARES = {"nees_coverage", "nees_coverage_2d", "nis_coverage", "accepted"}
+"""Metrics that are small when they are bad: 0 for an estimate that diverged."""
+
+
+class Measures(NamedTuple):
+    """The metrics of one sequence."""
+
+    values: dict[str, float | None]
+    """Metric → value: None where it is not defined, infinite where the estimate diverged."""
+    reasons: dict[str, str]
+    """Metric → why it is None or infinite, or the 0 of an estimate that diverged."""
+    diverged: bool
+    """Whether the estimate is not finite throughout, or so far off that its `ate` is infinite. An
+    infinite NEES alone is a bad covariance."""
+
+
+def measure(
+    estimate: Trajectory,
+    reference: Trajectory,
+    alignment: Alignment = "origin",
+    filtered: Filtered | None = None,
+) -> Measures:
+    """Every metric of one sequence. `reference` has the estimate's stamps.
+
+    `ate*`, `rte*`, `drift` and `yaw_rmse` see the estimate under `alignment`, which is fitted in
+    3-D for the horizontal ones too. NEES is taken with the start aligned, because the filter's
+    covariance is relative to its start. An estimate with a row that is not finite has diverged:
+    every metric that a finite one would have is infinite, and the shares are 0.
+    """
+    trusted = finite_rows(reference.position)[:, None]
+    poses = (np.where(trusted, part, np.nan) for part in reference[1:])
+    reference = Trajectory(reference.time, *poses)
+    path, lost = estimate, ""
+    if not estimate.known.all():
+        since = estimate.time[np.argmin(estimate.known)] - estimate.time[0]
+        lost = f"the estimate is not finite from {since:.1f} s on"
+        # Which metrics there would be depends on the reference: one at rest finds out.
+        level = np.tile([1.0, 0, 0, 0], (len(estimate.time), 1))
+        path = Trajectory(estimate.time, np.zeros_like(estimate.position), level)
+    aligned, started, missing = path, path, ""
+    try:
+        aligned, started = align(path, reference, alignment), align(path, reference)
+    except Undefined as undefined:
+        missing = str(undefined)
+    step = float(np.median(np.diff(path.time))) if len(path.time) > 1 else 1.0
+    compared = Compared(path, aligned, started, reference, step, filtered)
+    values: dict[str, float | None] = {"duration": float(path.time[-1] - path.time[0])}
+    reasons: dict[str, str] = {}
+
+    def put(name: str, metric: Metric, seen: Compared, lost: str = lost) -> None:
+        try:
+            if missing and name not in OF_FILTER:
+                raise Undefined(missing)
+            with np.errstate(over="ignore", invalid="ignore"):
+                value = metric(seen)
+            if reason := lost or ("" if math.isfinite(value) else _why_infinite(name)):
+                value, reasons[name] = (0.0 if name in SHARES else math.inf), reason
+            values[name] = value
+        except Undefined as undefined:
+            values[name], reasons[name] = None, str(undefined)
+
+    put("path_length", lambda c: path_length(c.of(c.reference), c.step), compared, lost="")
+    for name, metric, seen in _metrics(compared):
+        put(name, metric, seen)
+    return Measures(values, reasons, bool(lost) or values["ate"] == math.inf)
+
+
+def _metrics(compared: Compared) -> Iterator[tuple[str, Metric, Compared]]:
+    """Name, metric and what it is of, in the order of the files."""
+    has_filter = compared.filtered is not None
+    for dims, tag in ((3, ""), (2, "_2d")):
+        seen = compared._replace(dims=dims)
+        for name, metric in (SPATIAL | NEES if has_filter else SPATIAL).items():
+            yield name + tag, metric, seen
+    for name, metric in (OTHERS | OF_FILTER if has_filter else OTHERS).items():
+        yield name, metric, compared
+
+
+def _why_infinite(name: str) -> str:
+    if name.startswith("nees"):
+        return "the filter's covariance is not positive definite"
+    return "the error is too large for a number"

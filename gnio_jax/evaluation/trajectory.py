@@ -1,0 +1,136 @@
+"""Trajectories: what they are, how one is aligned with another, and the TUM format of evo."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from gnio_jax.data.parsing.tables import read_text
+from gnio_jax.data.validation import check_increasing
+from gnio_jax.errors import InputError
+from gnio_jax.numerics import (
+    finite_rows,
+    quaternion_from_matrix,
+    quaternion_product,
+    quaternions,
+    rotation_z,
+    xyzw_from_wxyz,
+)
+
+Quaternions = Float[np.ndarray, "n 4"]
+Alignment = Literal["origin", "none", "yaw_position", "se3"]
+TUM = "t x y z qx qy qz qw"
+
+
+class Undefined(ValueError):
+    """A metric or an alignment has no value for this trajectory. The text is the reason."""
+
+
+class Trajectory(NamedTuple):
+    """Poses at uniform times. A row that is not known is NaN."""
+
+    time: Float[np.ndarray, "n"]
+    """Stamps, s."""
+    position: Float[np.ndarray, "n 3"]
+    """In the world (z up), m."""
+    orientation: Quaternions
+    """Body→world, unit quaternions wxyz."""
+
+    @property
+    def known(self) -> Bool[np.ndarray, "n"]:
+        """Rows whose position and orientation are finite."""
+        return finite_rows(self.position) & finite_rows(self.orientation)
+
+
+def relative_yaw(estimate: Quaternions, reference: Quaternions) -> Float[np.ndarray, "n"]:
+    """Yaw error of attitudes R̂ against R, rad in (−π, π].
+
+    It is the angle ψ that minimises ‖R̂ − R_z(ψ) R‖. With E = R̂ Rᵀ the square of that norm is
+    6 − 2 (cos ψ (E00 + E11) + sin ψ (E10 − E01) + E22), so ψ = atan2(E10 − E01, E00 + E11): the
+    twist of E about z, whatever the attitude of the phone. Between level attitudes it is the
+    difference of their yaws. It is 0 where E is half a turn about a horizontal axis, where every ψ
+    is as near (ours), and NaN where an input is.
+    """
+    (a, b, c, d), (w, x, y, z) = estimate.T, reference.T
+    scalar, vertical = a * w + b * x + c * y + d * z, d * w - a * z + c * x - b * y
+    return np.arctan2(2 * scalar * vertical, scalar**2 - vertical**2)
+
+
+def align(estimate: Trajectory, reference: Trajectory, how: Alignment = "origin") -> Trajectory:
+    """The estimate moved into the frame of the reference by one rigid motion.
+
+    The motion is fitted to the rows that both trajectories know. `origin` matches position and yaw
+    of the first of them, which is what a user of odometry knows. `yaw_position` is the
+    least-squares motion of four degrees of freedom, which inertial odometry cannot observe. `se3`
+    is that of all six, without scale (Horn/Kabsch, as evo). `none` changes nothing. Raises
+    `Undefined` if there is no such row, or fewer than three for `se3`.
+    """
+    if how == "none":
+        return estimate
+    trusted = reference.known if how == "origin" else finite_rows(reference.position)
+    if not trusted.any():
+        raise Undefined("no trusted reference")
+    rows = np.flatnonzero(trusted & estimate.known)
+    if not len(rows):
+        raise Undefined("the estimate is not finite in any trusted row")
+    if how == "se3" and len(rows) < 3:
+        raise Undefined("fewer than three trusted rows to align")
+    if how == "origin":
+        rows = rows[:1]
+    source, target = estimate.position[rows].mean(0), reference.position[rows].mean(0)
+    a, b = estimate.position[rows] - source, reference.position[rows] - target
+    if how == "origin":
+        turn = rotation_z(relative_yaw(reference.orientation[rows], estimate.orientation[rows])[0])
+    elif how == "yaw_position":
+        sine = a[:, 0] @ b[:, 1] - a[:, 1] @ b[:, 0]
+        cosine = a[:, 0] @ b[:, 0] + a[:, 1] @ b[:, 1]
+        turn = rotation_z(np.arctan2(sine, cosine))
+    else:
+        u, _, vt = np.linalg.svd(b.T @ a)
+        turn = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt  # no reflection
+    return Trajectory(
+        estimate.time,
+        (estimate.position - source) @ turn.T + target,
+        quaternion_product(quaternion_from_matrix(turn), estimate.orientation),
+    )
+
+
+def in_frame_of(path: Trajectory, other: Trajectory, how: Alignment = "origin") -> Trajectory:
+    """`align`, to look at two trajectories together: `path` as it is where that is impossible."""
+    try:
+        return align(path, other, how)
+    except Undefined:
+        return path
+
+
+def turned_covariance(
+    covariance: Float[np.ndarray, "n 3 3"], before: Trajectory, after: Trajectory
+) -> Float[np.ndarray, "n 3 3"]:
+    """Covariances of positions, m², after an alignment. They are turned about the vertical alone,
+    which is what an alignment turns of a level world."""
+    if after is before:
+        return covariance
+    turn = rotation_z(relative_yaw(after.orientation, before.orientation))
+    return turn @ covariance @ np.swapaxes(turn, 1, 2)
+
+
+def write_tum(path: Path, trajectory: Trajectory) -> None:
+    """Write a line `t x y z qx qy qz qw` (s, m, body→world) for every row that is known."""
+    poses = [trajectory.time, trajectory.position, xyzw_from_wxyz(trajectory.orientation)]
+    np.savetxt(path, np.column_stack(poses)[trajectory.known], fmt="%.9f", header=TUM)
+
+
+def read_tum(path: Path) -> Trajectory:
+    """Read a file in TUM format. Raises `InputError` for anything else."""
+    table = read_text(path, separator=" ", header=False)
+    if table.width() != 8:
+        problem = f"has {table.width()} columns, not the 8 of the TUM format"
+        raise InputError(path, problem, f"they are {TUM}")
+    table = table.renamed(TUM.split())
+    time = table.take("t")
+    check_increasing(time, path)
+    attitude = table.rotations("qx", "qy", "qz", "qw", scalar_first=False)
+    return Trajectory(time, table.axes(""), quaternions(attitude))

@@ -1,0 +1,131 @@
+"""Yaw errors, alignments and the TUM format: against SciPy, searches and known motions."""
+
+import numpy as np
+import pytest
+from scipy.optimize import minimize_scalar
+from scipy.spatial.transform import Rotation
+
+from gnio_jax.errors import InputError
+from gnio_jax.evaluation import metrics
+from gnio_jax.evaluation.trajectory import Undefined, align, read_tum, relative_yaw, write_tum
+from gnio_jax.numerics import matrix_from_quaternion
+from tests.support.trajectories import PITCHES, lost, masked, moved_by, perturbed, quaternions, walk
+
+
+def test_origin_undoes_a_yaw_and_a_shift():
+    truth = walk(tilt=0.3)
+    estimate = moved_by(truth, Rotation.from_euler("z", -2.0), [5.0, -3.0, 1.0])
+    aligned = align(estimate, masked(truth, slice(0, 7)), "origin")
+    np.testing.assert_allclose(aligned.position, truth.position, atol=1e-9)
+    np.testing.assert_allclose(
+        matrix_from_quaternion(aligned.orientation),
+        matrix_from_quaternion(truth.orientation),
+        atol=1e-9,
+    )
+    assert align(estimate, truth, "none") is estimate
+
+
+def test_se3_against_scipy():
+    truth = walk(tilt=0.3)
+    estimate = moved_by(perturbed(truth), Rotation.from_rotvec([0.4, -0.9, 1.7]), [5.0, -3.0, 1.0])
+    a, b = estimate.position - estimate.position.mean(0), truth.position - truth.position.mean(0)
+    best, _ = Rotation.align_vectors(b, a)
+    np.testing.assert_allclose(
+        align(estimate, truth, "se3").position,
+        best.apply(a) + truth.position.mean(0),
+        atol=1e-8,
+    )
+
+
+def test_se3_never_mirrors():
+    random = np.random.default_rng(4)
+    truth = walk()._replace(position=random.normal(size=(900, 3)))
+    estimate = truth._replace(position=truth.position * [1, 1, -1])
+    a, b = estimate.position - estimate.position.mean(0), truth.position - truth.position.mean(0)
+    best, _ = Rotation.align_vectors(b, a)
+    np.testing.assert_allclose(
+        align(estimate, truth, "se3").position,
+        best.apply(a) + truth.position.mean(0),
+        atol=1e-8,
+    )
+
+
+def test_yaw_position_is_the_least_over_yaw():
+    truth = walk(tilt=0.3)
+    estimate = moved_by(perturbed(truth), Rotation.from_euler("z", 2.5), [5.0, -3.0, 1.0])
+    found = metrics.ate(align(estimate, truth, "yaw_position").position, truth.position)
+    centred, target = (
+        estimate.position - estimate.position.mean(0),
+        truth.position - truth.position.mean(0),
+    )
+    costs = [
+        metrics.ate(Rotation.from_euler("z", angle).apply(centred), target)
+        for angle in np.linspace(-np.pi, np.pi, 3001)
+    ]
+    assert found == pytest.approx(min(costs), rel=1e-3) and found <= min(costs) + 1e-12
+    assert metrics.ate(align(estimate, truth, "se3").position, truth.position) <= found
+
+
+@pytest.mark.parametrize("how", ["origin", "yaw_position", "se3"])
+def test_alignment_sees_finite_rows_alone(how):
+    truth = walk(tilt=0.3)
+    estimate = moved_by(truth, Rotation.from_euler("z", 1.2), [5.0, -3.0, 1.0])
+    found = align(lost(estimate, 500), truth, how)
+    np.testing.assert_allclose(found.position[:500], truth.position[:500], atol=1e-9)
+    assert np.isnan(found.position[500:]).all()
+    with pytest.raises(Undefined, match="not finite in any trusted row"):
+        align(lost(estimate, 500), masked(truth, slice(0, 500)), how)
+
+
+@pytest.mark.parametrize("pitch", PITCHES)
+def test_yaw_of_a_tilted_phone_is_the_turn_about_the_vertical(pitch):
+    """Against SciPy's minimum of ‖R̂ − R_z(ψ) R‖, with half a degree of tilt error too."""
+    random = np.random.default_rng(pitch)
+    headings = random.uniform(-3, 3, 12)
+    truth = Rotation.from_euler("ZY", np.column_stack([headings, np.full(12, np.radians(pitch))]))
+    yaws = np.concatenate([random.uniform(-3, 3, 10), [0.0, np.pi]])
+    tilt = Rotation.from_rotvec(np.column_stack([random.normal(0, 0.01, (12, 2)), np.zeros(12)]))
+    estimate = Rotation.from_euler("z", yaws[:, None]) * tilt * truth
+
+    def nearest(r_hat, r):
+        def cost(angle):
+            return np.linalg.norm(r_hat - Rotation.from_euler("z", angle).as_matrix() @ r) ** 2
+
+        start = min(np.linspace(-np.pi, np.pi, 73), key=cost)
+        return minimize_scalar(cost, (start - 0.1, start, start + 0.1), tol=1e-9).x
+
+    pairs = zip(estimate.as_matrix(), truth.as_matrix(), strict=True)
+    expected = [nearest(*pair) for pair in pairs]
+    found = relative_yaw(quaternions(estimate), quaternions(truth))
+    assert np.abs(found).max() <= np.pi
+    np.testing.assert_allclose(np.exp(1j * found), np.exp(1j * np.array(expected)), atol=1e-6)
+    np.testing.assert_allclose(np.exp(1j * found), np.exp(1j * yaws), atol=1e-12)
+
+
+def test_yaw_of_level_phones_is_the_difference_of_their_yaws():
+    angles = np.random.default_rng(0).uniform(-np.pi, np.pi, (2, 50))
+    level = (quaternions(Rotation.from_euler("z", of_one[:, None])) for of_one in angles)
+    found = relative_yaw(*level)
+    np.testing.assert_allclose(np.exp(1j * found), np.exp(1j * (angles[0] - angles[1])), atol=1e-12)
+
+
+def test_yaw_is_finite_where_it_has_no_value():
+    """Half a turn about a horizontal axis: no yaw is nearer than another. NaN stays NaN."""
+    level, over = np.array([[1.0, 0, 0, 0]]), np.array([[0.0, np.sqrt(0.5), np.sqrt(0.5), 0]])
+    np.testing.assert_array_equal(relative_yaw(over, level), 0.0)
+    assert np.isnan(relative_yaw(level, level * np.nan)).all()
+
+
+def test_tum_files(tmp_path):
+    """What is written is read back, but for the rows that are not known; evo's order of columns."""
+    path = lost(walk(n=40, tilt=0.3), 30)
+    path.orientation[5] = np.nan
+    write_tum(tmp_path / "a.txt", path)
+    found, kept = read_tum(tmp_path / "a.txt"), np.r_[0:5, 6:30]
+    for one, other in zip(found, path, strict=True):
+        np.testing.assert_allclose(one, other[kept], atol=1e-8)
+    row = np.loadtxt(tmp_path / "a.txt")[3]
+    np.testing.assert_allclose(row[[7, 4, 5, 6]], path.orientation[3], atol=1e-8)
+    (tmp_path / "b.txt").write_text("1 2 3\n4 5 6\n")
+    with pytest.raises(InputError, match="not the 8 of the TUM format"):
+        read_tum(tmp_path / "b.txt")
