@@ -17,13 +17,12 @@ from gnio_jax.evaluation.estimators.result import Estimate
 from gnio_jax.evaluation.scores import Scores
 from gnio_jax.evaluation.trajectory import write_tum
 
-DEFINITIONS = 2
+DEFINITIONS = 3
 """What the figures of metrics.json mean, in its `settings`. Raise it with every change after which
 a file's figures cannot stand beside newer ones: another definition of a metric, of who counts as
 diverged or of a mean, or something in the file that tables need. Those of 1 have no groups, and
-yaw errors that are differences of Euler yaws."""
-
-
+yaw errors that are differences of Euler yaws; those of 2 have a drift over the trusted part of the
+path."""
 INFINITE = (
     "the estimate is not finite",
     "the error is too large",
