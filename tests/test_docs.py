@@ -23,7 +23,13 @@ from tests.support import pages, tiny_run
 from tests.support.command_lines import understood
 
 SMALLER = {
-    "README.md": {"width=16": "width=2", "6000": "220", "6001": "221", "300": "11"},
+    "README.md": {
+        "width=16": "width=2",
+        "6000": "220",
+        "6001": "221",
+        "300": "11",
+        "range(15)": "range(2)",
+    },
     "docs/differentiable_filter.md": {"20 * 100": "20 * 25", "range(20)": "range(5)"},
     "docs/notebooks/learn_noise.py": {"SECONDS = 30": "SECONDS = 2", "STEPS = 150": "STEPS = 2"},
 }
@@ -64,9 +70,10 @@ def code_of(page):
 
 def test_the_example_of_the_readme(one_walk, capsys):
     run("README.md", code_of("README.md"))
-    printed = capsys.readouterr().out
-    assert "(11, 3)" in printed and "nan" not in printed
-    assert len(re.findall(r"-?\d\.\d+e[-+]\d+|-?\d+\.\d+", printed.splitlines()[-1])) == 4
+    shape, *steps = capsys.readouterr().out.splitlines()
+    assert shape == "(11, 3)"
+    losses, densities = np.array([line.split() for line in steps], float).T
+    assert losses[1] < losses[0] and densities[1] < densities[0] < 1e-2
 
 
 def test_the_loop_of_ones_own(one_walk, capsys):
