@@ -12,6 +12,7 @@ from gnio_jax.commands import app
 from gnio_jax.comparison import comparing, figures, pairs, picture, rows, text
 from gnio_jax.config import CompareConfig
 from gnio_jax.errors import InputError
+from gnio_jax.evaluation import report
 
 GROUPS = {"a": "ann", "b": "ann", "c": "bob"}
 
@@ -30,7 +31,12 @@ def write(run, ates, name="oxiod_test_ekf", drop=(), groups=GROUPS, more=None, *
     finite = [ate for ate in ates.values() if math.isfinite(ate)]
     mean = {"ate": np.mean(finite), "rpe_1s": np.mean(finite) / 10, **(more or {})}
     found = {
-        "settings": {"dataset": "oxiod", "split": "test", "definitions": 2, **settings},
+        "settings": {
+            "dataset": "oxiod",
+            "split": "test",
+            "definitions": report.DEFINITIONS,
+            **settings,
+        },
         "sequences": sequences,
         "mean": {
             **{key: value for key, value in mean.items() if key not in drop},

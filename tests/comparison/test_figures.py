@@ -51,7 +51,12 @@ def test_figures_of_another_filter_or_damaged_ones_are_made_anew(tmp_path, monke
     path.parent.mkdir(parents=True)
     options = configuration.plain(BASE.filter)
     whole = {
-        "settings": {"dataset": "tlio", "split": "test", "definitions": 2, "filter": options},
+        "settings": {
+            "dataset": "tlio",
+            "split": "test",
+            "definitions": report.DEFINITIONS,
+            "filter": options,
+        },
         "sequences": {"a": {"ate": 1.0, "group": "x", "notes": ["it began while it moved"]}},
         "mean": {"ate": 1.0, "diverged": 0},
     }
@@ -90,7 +95,12 @@ def test_integrate_takes_no_filter_and_pictures_are_drawn_anew(tmp_path, monkeyp
     (folder / "plots").mkdir(parents=True)
     options = {**dataclasses.asdict(BASE.filter), "gravity": 9.0}
     whole = {
-        "settings": {"dataset": "tlio", "split": "test", "definitions": 2, "filter": options},
+        "settings": {
+            "dataset": "tlio",
+            "split": "test",
+            "definitions": report.DEFINITIONS,
+            "filter": options,
+        },
         "sequences": {"a": {"ate": 1.0, "group": "x"}},
         "mean": {"ate": 1.0, "diverged": 0},
     }
