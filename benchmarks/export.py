@@ -22,7 +22,8 @@ import numpy as np
 
 jax.config.update("jax_enable_x64", True)
 
-from gnio_jax import deployment, filtering, pretrained  # noqa: E402
+from gnio_jax import deployment, filtering  # noqa: E402
+from gnio_jax.apps import packages  # noqa: E402
 from gnio_jax.deployment import accuracy, driver  # noqa: E402
 from gnio_jax.deployment.flat_state import start_arrays  # noqa: E402
 from gnio_jax.evaluation import inference_network  # noqa: E402
@@ -35,7 +36,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=60.0, help="length of the walk")
     parser.add_argument("--threads", type=int, default=1, help="of ONNX Runtime")
     arguments = parser.parse_args()
-    run = pretrained.load_pretrained(arguments.run)
+    run = packages.load_pretrained(arguments.run)
     print(f"{jax.devices()[0].device_kind}, jax {jax.__version__}, {run.config.model}")
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "models"

@@ -195,9 +195,9 @@ def follow(asked: Replay, _call: options.Call) -> None:
     path = Path(asked.csv)
     recorded = read(path)
 
-    from gnio_jax import tracking
+    from gnio_jax.apps import packages
 
-    run = tracking.choose_weights(asked.weights).run
+    run = packages.load_pretrained(asked.weights)
     if len(recorded.time) < 2:
         raise InputError(path, "holds a single sample", "record a walk of some seconds")
     with console.terminal() as terminal:

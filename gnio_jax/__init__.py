@@ -24,7 +24,6 @@ __all__ = [
     "live",
     "load_pretrained",
     "models",
-    "pretrained",
     "tables",
     "tracking",
     "training",
@@ -35,7 +34,7 @@ def __getattr__(name: str) -> Any:
     if name == "__version__":
         return importlib.metadata.version("gnio-jax")
     if name == "load_pretrained":
-        return importlib.import_module("gnio_jax.pretrained").load_pretrained
+        return importlib.import_module("gnio_jax.apps.packages").load_pretrained
     if name in __all__:
         return importlib.import_module(f"gnio_jax.{name}")
     raise AttributeError(f"module 'gnio_jax' has no attribute '{name}'")

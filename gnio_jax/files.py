@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import errno
+import hashlib
 import os
 import re
 import shutil
@@ -83,6 +84,11 @@ def write_csv(path: str | os.PathLike[str], rows: Iterable[Iterable[object]]) ->
         open(temporary, "w", newline="", encoding="utf-8", errors="backslashreplace") as file,
     ):
         csv.writer(file).writerows(rows)
+
+
+def fingerprint(content: bytes) -> dict[str, int | str]:
+    """Size and SHA-256 of a file, as manifests have them."""
+    return {"bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
 
 
 def file_stem(name: str) -> str:

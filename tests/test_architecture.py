@@ -21,16 +21,14 @@ ROOMS = {
     "comparison": BASE | {"evaluation"},
     "tables": BASE
     | {"data", "models", "filtering", "training", "evaluation", "calibration", "comparison"},
-    "pretrained": BASE | {"models", "training"},
-    "tracking": BASE | {"data", "filtering", "training", "evaluation", "pretrained", "apps"},
-    "live": BASE | {"data", "filtering", "training", "evaluation", "tracking"},
-    "deployment": BASE | {"data", "filtering", "training", "evaluation", "pretrained", "tracking"},
+    "tracking": BASE | {"data", "filtering", "training", "evaluation", "apps"},
+    "live": BASE | {"apps", "data", "filtering", "training", "evaluation", "tracking"},
+    "deployment": BASE | {"data", "filtering", "training", "evaluation", "apps", "tracking"},
     "apps": BASE
-    | {"data", "models", "filtering", "training", "evaluation", "calibration", "pretrained"}
-    | {"tracking"},
+    | {"data", "models", "filtering", "training", "evaluation", "calibration", "tracking"},
     "commands": BASE
     | {"data", "filtering", "training", "evaluation", "calibration", "interop", "comparison"}
-    | {"tables", "apps", "pretrained", "tracking", "live", "deployment"},
+    | {"tables", "apps", "tracking", "live", "deployment"},
     **{name: BASE for name in BASE},
 }
 """Rooms and top-level modules, and what each may import of the package besides itself."""
@@ -49,7 +47,7 @@ LIBRARIES = {
     "rosbags": {"apps.importing.bags", "evaluation.exporting.ros"},
     "rich.console.Console": {"commands"},
     "rich.progress": {"commands"},
-    "safetensors": {"pretrained.arrays"},
+    "safetensors": {"apps.packages"},
     "tensorboardX": {"training.run_folder"},
     "tyro": {"commands", "config"},
 }

@@ -14,7 +14,8 @@ import pytest
 
 import gnio_jax
 from gnio_jax import config as configuration
-from gnio_jax import data, models, pretrained
+from gnio_jax import data, models
+from gnio_jax.apps import packages
 from gnio_jax.config import DataConfig, ModelConfig, TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.models import registry
@@ -93,8 +94,8 @@ def test_weights_that_are_loaded(tmp_path, monkeypatch):
     names = {"gnio_jax": gnio_jax, "windows": np.zeros((2, 50, 6), np.float32)}
     with tiny_run.known():
         folder = tiny_run.save(tmp_path / "run", config)
-        about = pretrained.Description("mine", "nobody's walks", "CC0")
-        pretrained.publish(folder, tmp_path / "mine", about)
+        about = packages.Description("mine", "nobody's walks", "CC0")
+        packages.publish(folder, tmp_path / "mine", about)
         run("docs/weights.md", code_of("docs/weights.md"), names)
     assert names["prediction"].displacement.shape == (2, 3)
 

@@ -95,10 +95,10 @@ def _datasets() -> dict[str, str]:
 
 def _weights() -> dict[str, str]:
     from gnio_jax import config as configuration
-    from gnio_jax import pretrained
+    from gnio_jax.apps import packages
 
     found = {}
-    for name, find in (("weights", pretrained.packages), ("newest run", configuration.newest_run)):
+    for name, find in (("weights", packages.packages), ("newest run", configuration.newest_run)):
         try:
             place = find()
             found[name] = ", ".join(place) if isinstance(place, dict) else str(place)

@@ -69,11 +69,11 @@ def live(asked: LiveOptions, _call: options.Call) -> None:
     import jax  # late: mistakes do not wait for it
 
     from gnio_jax import live as following
-    from gnio_jax import tracking
+    from gnio_jax.apps import packages
     from gnio_jax.live import rerun_stream
 
     jax.config.update("jax_enable_x64", True)  # for the filter; the network states its float32
-    weights = tracking.choose_weights(asked.weights)
+    weights = packages.choose(asked.weights)
     source, rate, notes = _source(asked)
     if asked.out:
         check_writable(asked.out)  # or the trajectory would be lost at the end

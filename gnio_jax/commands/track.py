@@ -52,10 +52,11 @@ def track(asked: TrackOptions, call: options.Call) -> None:
     import jax  # late: mistakes do not wait for it
 
     from gnio_jax import tracking
+    from gnio_jax.apps import packages
 
     jax.config.update("jax_enable_x64", True)  # for the filter; the network states its float32
     recording = read_any(asked.file, asked.recording)
-    weights = tracking.choose_weights(asked.weights)
+    weights = packages.choose(asked.weights)
     out = asked.out or Path("tracks") / _folder_name(recording.sequence.name)
     with console.terminal() as terminal:
         terminal.progress("compiling and tracking", 0.0)

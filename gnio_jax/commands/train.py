@@ -61,14 +61,15 @@ def train(asked: TrainOptions, call: options.Call) -> None:
     if "--seeds" in call.argv and not asked.seeds:
         raise InputError("--seeds", "names no seed", "give some, e.g. 0 1 2")
     config = experiment(asked, call)
-    from gnio_jax import filtering, parallel, pretrained  # late: mistakes do not wait for JAX
+    from gnio_jax import filtering, parallel  # late: mistakes do not wait for JAX
+    from gnio_jax.apps import packages
     from gnio_jax.training import loop
 
     if config.through_filter.learn:
         filtering.cores_as_devices()  # the filter's operations are too small for several cores
     parallel.initialise(asked.distributed, asked.devices)
     with console.terminal(shown=parallel.is_first()) as terminal:
-        load = pretrained.load_pretrained
+        load = packages.load_pretrained
         given = (asked.resume, terminal, usable_cores(), asked.devices, load)
         try:
             if asked.seeds:
@@ -128,9 +129,10 @@ def experiment(asked: TrainOptions, call: options.Call) -> TrainConfig:
     config = settled(TrainConfig())
     if not config.through_filter.learn or config.init_from is None:
         return config
-    from gnio_jax import filtering, pretrained
+    from gnio_jax import filtering
+    from gnio_jax.apps import packages
 
     filtering.cores_as_devices()  # before the checkpoint's arrays settle the devices
-    learnt = pretrained.load_pretrained(config.init_from).config.filter
+    learnt = packages.load_pretrained(config.init_from).config.filter
     begins = dataclasses.replace(learnt, considered=ConsideredStd())
     return settled(TrainConfig(filter=begins))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import tyro
 from rich import box
@@ -67,54 +67,45 @@ def weights(asked: WeightsOptions, _call: options.Call) -> None:
     """
     if asked.name is None and asked.out is not None:
         raise InputError(f"--out {asked.out}", "is for one package", "name it before --out")
-    from gnio_jax import pretrained  # late: mistakes do not wait for JAX
+    from gnio_jax.apps import packages  # late: mistakes do not wait for JAX
 
     output = console.stdout()
     if asked.name is None:
         _list_packages()
     elif asked.out is None:
-        output.print(pretrained.card_of(asked.name).rstrip(), soft_wrap=True)
+        output.print(packages.card_of(asked.name), soft_wrap=True)
     else:
-        pretrained.write_run(asked.name, asked.out)
+        packages.write_run(asked.name, asked.out)
         following = f"gnio evaluate --workdir {asked.out} --dataset ..."
         output.print(f"run: {asked.out}; next: {following}", soft_wrap=True)
 
 
 def _list_packages() -> None:
     """A line per package; one that is damaged has its fault in its line."""
-    from gnio_jax import pretrained
+    from gnio_jax.apps import packages
 
-    found = pretrained.packages()
-    output = console.stdout()
-    if not found:
-        output.print("no packages; gnio publish makes one of a run, $GNIO_WEIGHTS says where")
-        return
+    output, damaged = console.stdout(), []
     grid = Table(box=box.SIMPLE_HEAD)
-    for heading in ("name", "size", "network", "trained on", "licence", "key metric"):
+    for heading in ("name", "size", "network", "trained on", "licence", "measured"):
         grid.add_column(heading, overflow="fold")
-    damaged = []
-    for name, place in found.items():
+    for name, place in packages.packages().items():
         try:
-            about = pretrained.about(place)
+            about = packages.read_about(place)
         except InputError as error:
             damaged.append(str(error))
             continue
-        size = f"{about.bytes / 1e6:.2f} MB"
-        grid.add_row(name, size, about.network, about.data, about.license, _metric(about.metric))
-    output.print(grid)
+        size, measured = f"{about.weights['bytes'] / 1e6:.2f} MB", about.measured or "–"
+        grid.add_row(name, size, about.network, about.data, about.license, measured)
+    if grid.row_count:
+        output.print(grid)
+    elif not damaged:
+        output.print("no packages; gnio publish makes one of a run, $GNIO_WEIGHTS says where")
     for line in damaged:
         output.print(line, soft_wrap=True)
 
 
-def _metric(metric: Any) -> str:
-    if metric is None:
-        return "–"
-    interval = "" if metric.low is None else f" ({metric.low:.2f}–{metric.high:.2f})"
-    return f"ATE 2-D {metric.value:.2f} m{interval}, {metric.of}"
-
-
 def publish(asked: PublishOptions, _call: options.Call) -> None:
-    """A package of a run: weights, configuration, model card, checksums.
+    """A package of a run: weights, settings, model card, checksums.
 
     It holds no data, and no code that is run when it is loaded. The figures of the run's
     evaluations go with it, so evaluate before you publish.
@@ -125,15 +116,15 @@ def publish(asked: PublishOptions, _call: options.Call) -> None:
       {prog} runs/mine --out mine.zip --data "..." --license "..." --fails "Running." "In a car."
       gnio track walk.zip --weights mine.zip
     """
-    from gnio_jax import pretrained  # late: mistakes do not wait for JAX
+    from gnio_jax.apps import packages  # late: mistakes do not wait for JAX
 
     name = asked.name or asked.out.name.removesuffix(".zip")
-    said = pretrained.Description(name, asked.data, asked.license, asked.fails)
-    about = pretrained.publish(asked.run, asked.out, said)
+    said = packages.Description(name, asked.data, asked.license, asked.fails)
+    about = packages.publish(asked.run, asked.out, said)
     output = console.stdout()
-    size = f"{about.bytes / 1e6:.2f} MB"
+    size = f"{about.weights['bytes'] / 1e6:.2f} MB"
     output.print(f"{asked.out}: {about.name}, network {about.network}, {size}", soft_wrap=True)
-    if about.metric is None:
+    if not about.measured:
         line = "the run holds no evaluation, so the card has no figures: gnio evaluate"
         output.print(f"warning: {line} --workdir {asked.run}", soft_wrap=True)
     output.print(f"next: gnio track RECORDING --weights {asked.out}", soft_wrap=True)

@@ -7,7 +7,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import NamedTuple
 
-from gnio_jax import pretrained
+from gnio_jax.apps import packages
 from gnio_jax.deployment import accuracy, conversion, driver
 from gnio_jax.deployment.accuracy import Deviation
 from gnio_jax.deployment.flat_state import start_arrays
@@ -44,8 +44,8 @@ def export_run(which: str | Path, out: Path, seconds: float = SECONDS) -> Export
     if out.exists() and not (out.is_dir() and not any(out.iterdir())):
         raise InputError(out, "is there already", "name another --out, or remove it")
     require_packages("gnio export", "onnx", *PACKAGES)
-    place = pretrained.find(which)
-    run = pretrained.load_pretrained(place)
+    place = packages.find(which)
+    run = packages.load_pretrained(place)
     network, setup = inference_network(run.model, run.variables), tracking_filter(run)
     made = programs(network, setup)
     with replacing_folder(out) as folder, ExitStack() as at_end:

@@ -1,12 +1,11 @@
 """A trajectory from one's own recording: what `gnio track` does.
 
-`weights` chooses the network, `run` walks from the recording to the folder of results: start,
+`run` walks from the recording to the folder of results: start,
 filter with the network in its loop, files. `summary` says how far to trust the track, `picture`
 draws it.
 """
 
 from gnio_jax.tracking.run import Tracked, track
 from gnio_jax.tracking.summary import Summary
-from gnio_jax.tracking.weights import Weights, choose_weights
 
-__all__ = ["Summary", "Tracked", "Weights", "choose_weights", "track"]
+__all__ = ["Summary", "Tracked", "track"]

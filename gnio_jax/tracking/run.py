@@ -10,6 +10,7 @@ import numpy as np
 
 from gnio_jax import data
 from gnio_jax.apps.importing import Imported
+from gnio_jax.apps.packages import Weights
 from gnio_jax.config import DataConfig, InitialStd
 from gnio_jax.data.resampling import longest_bridge
 from gnio_jax.data.validation import WINDOW_SECONDS, check_gaps
@@ -24,7 +25,6 @@ from gnio_jax.evaluation.trajectory import write_tum
 from gnio_jax.files import check_writable_folder, replacing_folder
 from gnio_jax.tracking.filter import tracking_filter
 from gnio_jax.tracking.summary import Summary, as_json, summarise
-from gnio_jax.tracking.weights import Weights
 from gnio_jax.types import Sequence
 
 START = Setup(init="static", gyro_bias="rest")

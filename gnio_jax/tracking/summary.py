@@ -8,12 +8,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gnio_jax.apps.importing import GAPS, Imported
+from gnio_jax.apps.packages import Weights
 from gnio_jax.evaluation import Estimate, metrics
 from gnio_jax.evaluation.preparation import ROUGH_START, Prepared
 from gnio_jax.evaluation.scores import score
 from gnio_jax.filtering.config import FilterConfig
 from gnio_jax.filtering.settings import FilterSetup
-from gnio_jax.tracking.weights import Weights
 from gnio_jax.types import GRAVITY
 
 LYING = 0.95
@@ -33,8 +33,7 @@ class Summary(NamedTuple):
     recording: str
     weights: str
     trained_on: str
-    measured: str
-    """The error that was measured of these weights elsewhere, in words; may be empty."""
+    """And the error that was measured of these weights, where one was."""
     start_time: float
     """Of the recording's own clock, s."""
     seconds: float
@@ -73,7 +72,7 @@ class Summary(NamedTuple):
         return [
             f"expected error at the end {self.expected_error:.1f} m{of_path} by the filter, "
             f"{counted}",
-            f"trained on {self.trained_on}{self.measured and ', ' + self.measured}",
+            f"trained on {self.trained_on}",
             "place and heading are relative to the start",
         ]
 
@@ -96,8 +95,7 @@ def summarise(
     summary = Summary(
         recording=sequence.name,
         weights=weights.name,
-        trained_on=weights.trained_on,
-        measured=weights.measured,
+        trained_on=weights.about,
         start_time=float(sequence.attributes.get("start_time", 0.0)),
         seconds=float(time[last] - time[0]),
         path_length=metrics.path_length(position, float(time[1] - time[0])) if last else 0.0,

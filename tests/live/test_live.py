@@ -8,7 +8,8 @@ import sys
 import numpy as np
 import pytest
 
-from gnio_jax import live, tracking
+from gnio_jax import live
+from gnio_jax.apps import packages
 from gnio_jax.commands import app, console
 from gnio_jax.config import DataConfig, ModelConfig, TrainConfig
 from gnio_jax.errors import InputError
@@ -82,7 +83,7 @@ def test_a_stream_gives_the_trackers_poses(gnio, run, recorded, tmp_path):
     # A line a second, the last one repeated at the end.
     assert sum(line.lstrip()[0].isdigit() for line in told.splitlines()) == 6
 
-    tracker, expected = live.create_tracker(tracking.choose_weights(str(run)).run, RATE), []
+    tracker, expected = live.create_tracker(packages.load_pretrained(run), RATE), []
     for time, gyro, accel in zip(*recorded, strict=True):
         pose = tracker.push(time, gyro, accel)
         expected += [] if pose is None else [pose]
@@ -93,7 +94,7 @@ def test_a_stream_gives_the_trackers_poses(gnio, run, recorded, tmp_path):
 
 def test_the_tracker_of_a_calibrated_run_considers_what_its_track_does(run, monkeypatch):
     options = changed(considered={"scale": 0.1, "heading": np.pi / 2})
-    found = tracking.choose_weights(str(run)).run
+    found = packages.load_pretrained(run)
     calibrated = found._replace(config=dataclasses.replace(found.config, filter=options))
     passed = []
 

@@ -13,7 +13,8 @@ import signal
 import sys
 from pathlib import Path
 
-from gnio_jax import filtering, pretrained  # noqa: F401
+from gnio_jax import filtering  # noqa: F401
+from gnio_jax.apps import packages  # noqa: F401
 from gnio_jax.files import write_text
 from gnio_jax.training import loop  # noqa: F401
 from tests.support import sequences_process, training_process

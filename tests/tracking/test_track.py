@@ -5,19 +5,17 @@ All recordings last six seconds, so that they share one compiled filter.
 
 import importlib.util
 import json
-import shutil
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from gnio_jax import pretrained
 from gnio_jax.commands import app, console
 from gnio_jax.config import DataConfig, ModelConfig, TrainConfig
 from gnio_jax.data.hdf5 import write_hdf5
 from gnio_jax.data.resampling import resample
 from gnio_jax.evaluation.trajectory import read_tum
-from gnio_jax.tracking import choose_weights, picture
+from gnio_jax.tracking import picture
 from gnio_jax.tracking.summary import Summary, _warnings
 from gnio_jax.types import Sequence
 from tests.support import bag_files, known_walk, logger_files, tiny_run
@@ -146,7 +144,7 @@ def test_a_phone_on_a_table_stays_there(gnio, runs, tmp_path):
 def test_the_newest_run_a_slow_logger_and_our_own_file(gnio, runs, tmp_path, monkeypatch):
     time = np.delete(np.arange(120), np.s_[60:70]) / 20
     slow = csv(tmp_path / "slow.csv", time, known_walk.rate(time), known_walk.force(time))
-    monkeypatch.setattr("gnio_jax.pretrained.finding.SHIPPED", tmp_path)
+    monkeypatch.setattr("gnio_jax.apps.packages.SHIPPED", tmp_path)
     told = gnio("track", slow)
     folder = runs.parent / "tracks" / "slow"
     assert summary_of(folder)["weights"] == "walker"
@@ -229,29 +227,6 @@ def test_an_out_that_cannot_be_written_is_found_first(mistake, runs, tmp_path, m
     assert f"{tmp_path / 'walk.zip'}: " in mistake(*given, walk / "track")
 
 
-def test_what_was_measured_of_a_run(runs, tmp_path):
-    run = shutil.copytree(runs / "walker", tmp_path / "walker")
-    assert choose_weights(str(run)).measured == ""
-    figures = {
-        "settings": {"dataset": "synthetic", "split": "test", "estimator": "ekf"},
-        "sequences": {"a": {}},
-        "mean": {"ate_2d": 1.26},
-        "interval": {"ate_2d": None},
-        "n": {"ate_2d": 1},
-    }
-    path = run / "eval" / "synthetic_test_ekf" / "metrics.json"
-    path.parent.mkdir(parents=True)
-    path.write_text(json.dumps(figures))
-    said = "whose ATE 2-D is 1.3 m on synthetic_test_ekf"
-    assert choose_weights(str(run)).measured == said
-    package = tmp_path / "net.zip"
-    pretrained.publish(run, package, pretrained.Description("net", "walks", "CC0"))
-    weights = choose_weights(str(package))
-    assert (weights.name, weights.trained_on, weights.measured) == ("net", "walks", said)
-    path.write_text("{")  # what is damaged keeps nobody from tracking
-    assert choose_weights(str(run)).measured == ""
-
-
 def test_an_ellipse_is_the_contour_of_its_covariance():
     covariance = np.array([[4.0, 1.5], [1.5, 1.0]])
     shape = picture.ellipse(np.array([2.0, -1.0]), covariance, sigmas=3.0)
@@ -265,8 +240,7 @@ def test_the_line_says_what_is_counted():
     summary = Summary(
         recording="walk",
         weights="net",
-        trained_on="walks",
-        measured="whose ATE 2-D is 1.1 m on test",
+        trained_on="walks, whose ATE 2-D is 1.1 m on test",
         start_time=0.0,
         seconds=100.0,
         path_length=80.0,

@@ -11,7 +11,8 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Imu
 from tf2_ros import TransformBroadcaster
 
-from gnio_jax import live, tracking
+from gnio_jax import live
+from gnio_jax.apps import packages
 from gnio_odometry.bridge import Bridge
 
 SENSOR_DATA = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -32,7 +33,7 @@ class GnioOdometry(Node):
         self._odom = self.declare_parameter("odom_frame", "odom").value
         self._imu = self.declare_parameter("imu_frame", "imu_link").value
         publish_tf = self.declare_parameter("publish_tf", True).value
-        run = tracking.choose_weights(weights).run
+        run = packages.load_pretrained(weights)
         self._bridge = Bridge(live.create_tracker(run, rate or None, rest))
         self._publisher = self.create_publisher(Odometry, "odometry", 10)
         self._transforms = TransformBroadcaster(self) if publish_tf else None

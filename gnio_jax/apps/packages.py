@@ -1,0 +1,463 @@
+"""Trained networks that are passed on: a package is made of a run, found by name, loaded as a run.
+
+A package is a folder or a zip of two files: `weights.safetensors` with the arrays, and
+`manifest.json` with the settings, the model card and the SHA-256 of the weights and of itself. All
+of it is checked before anything is used. Nothing is unpacked to the disk, and nothing is executed.
+docs/weights.md has the format.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import json
+import os
+import zipfile
+import zlib
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, NamedTuple, get_type_hints
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from safetensors import SafetensorError
+from safetensors.numpy import load, save
+
+from gnio_jax import config as configuration
+from gnio_jax import models
+from gnio_jax.config import TrainConfig
+from gnio_jax.errors import InputError
+from gnio_jax.files import file_stem, fingerprint, replacing, replacing_folder
+from gnio_jax.training import checkpoint
+from gnio_jax.training.checkpoint import Run, Which
+from gnio_jax.training.filter_task import filter_numbers
+from gnio_jax.training.window_task import create_model
+
+SHIPPED = Path(__file__).parents[1] / "weights"
+"""The packages that come with gnio-jax."""
+VARIABLE = "GNIO_WEIGHTS"
+"""Folders of packages, separated as in $PATH."""
+FORMAT, VERSION = "gnio-package", 2
+MANIFEST, WEIGHTS = "manifest.json", "weights.safetensors"
+LARGEST_MANIFEST, LARGEST_WEIGHTS = 2**20, 2**32
+"""Bytes (ours): a zip of some megabytes may say that it unpacks to any size."""
+SHOWN = {
+    "ate_2d": ("ATE 2-D (m)", 2),
+    "rte_60s_2d": ("RTE 60 s 2-D (m)", 2),
+    "path_length_ratio_2d": ("path ratio", 2),
+    "yaw_rmse": ("yaw (°)", 1),
+    "nees_coverage_2d": ("NEES < 95 % (%)", 0),
+}
+"""Metrics of the card, with heading and digits. Networks are listed by the first."""
+_DAMAGED = "the package is damaged: fetch or publish it again"
+
+
+class About(NamedTuple):
+    """What the manifest says of a package."""
+
+    name: str
+    network: str
+    """In the registry of `gnio_jax.models`."""
+    data: str
+    """What the network was trained on, in its publisher's words."""
+    license: str
+    epoch: int
+    step: int
+    measured: str
+    """The error by which networks are listed, in words; empty where the run held no evaluation."""
+    made_by: str
+    """The program that published it, with its version."""
+    card: list
+    """Lines of the model card, Markdown."""
+    config: dict
+    """The settings, as config.yaml of a run has them."""
+    weights: dict
+    """Size and SHA-256 of `weights.safetensors`, as `files.fingerprint` gives them."""
+
+
+class Weights(NamedTuple):
+    """A network that is ready to track."""
+
+    name: str
+    run: Run
+    about: str
+    """What it was trained on, and the error that was measured of it."""
+
+
+# Where packages are found
+# --------------------------------------------------------------------------------------------------
+
+
+def is_package(place: Path) -> bool:
+    """Whether a folder or file is meant to be a package; its content is not looked at."""
+    return (place.is_file() and place.suffix == ".zip") or (place / MANIFEST).is_file()
+
+
+def packages() -> dict[str, Path]:
+    """Packages by name (that of the folder, or of the zip without its suffix), those of gnio-jax
+    first. Raises `InputError` for a folder of $GNIO_WEIGHTS that is missing."""
+    folders = [Path(each) for each in os.environ.get(VARIABLE, "").split(os.pathsep) if each]
+    found: dict[str, Path] = {}
+    for folder in (SHIPPED, *folders):
+        if not folder.is_dir():
+            raise InputError(f"${VARIABLE}", f"'{folder}' is no folder", "name folders of packages")
+        for place in filter(is_package, sorted(folder.iterdir())):
+            found.setdefault(place.name.removesuffix(".zip"), place)
+    return found
+
+
+def find(which: str | Path | None = None) -> Path:
+    """The package or run of a path or a name; None: the first of gnio-jax, else the newest run
+    below runs/. Raises `InputError` for neither."""
+    known = packages()
+    if which is None:
+        shipped = [place for place in known.values() if place.parent == SHIPPED]
+        return shipped[0] if shipped else configuration.newest_run()
+    path = Path(which)
+    if is_package(path) or (path / "config.yaml").is_file():
+        return path
+    if str(which) in known:
+        return known[str(which)]
+    if path.exists():
+        problem = f"holds neither a package ({MANIFEST}) nor a run (config.yaml)"
+        raise InputError(path, problem, "gnio publish makes a package of a run")
+    close = difflib.get_close_matches(str(which), known, n=1)
+    names = f"known names: {', '.join(known) or 'none'}; give a folder, a zip or a name"
+    hint = f"did you mean '{close[0]}'?" if close else names
+    raise InputError(which, "no such weights", hint)
+
+
+def choose(which: str | Path | None = None) -> Weights:
+    """The weights of a name, package or run, as `find` finds them. Raises `InputError`."""
+    place = find(which)
+    if is_package(place):
+        about, content = read(place)
+        name, trained_on, measured = about.name, about.data, about.measured
+        run = _run_of(place, about, content)
+    else:
+        run = checkpoint.load_run(place)
+        data = run.config.data
+        name, trained_on = place.name, f"dataset {run.config.dataset}, split {data.train_split}"
+        try:
+            measured = _measured(_figures(place), run.config.dataset)
+        except InputError:
+            measured = ""  # a damaged evaluation keeps nobody from tracking
+    return Weights(name, run, f"{trained_on}, whose {measured}" if measured else trained_on)
+
+
+# Reading
+# --------------------------------------------------------------------------------------------------
+
+
+def load_pretrained(which: str | Path | None = None) -> Run:
+    """The network of `which` with its variables and configuration.
+
+    `which` is the folder or zip of a package, the folder of a run, or the name of a package that
+    gnio-jax or a folder of $GNIO_WEIGHTS holds; None is the default of `gnio track`.
+    `Run.model.apply(run.variables, windows)` gives a `Prediction` of windows (b, N, 6), float32,
+    [accel m/s², gyro rad/s] in the gravity frame at `run.config.data.rate`; `run.config.filter` are
+    the filter's settings as they were calibrated or trained. Raises `InputError`.
+    """
+    place = find(which)
+    return _run_of(place, *read(place)) if is_package(place) else checkpoint.load_run(place)
+
+
+def card_of(which: str | Path) -> str:
+    """The model card of a package, Markdown. Raises `InputError`, also for a run, which has
+    none."""
+    place = find(which)
+    if not is_package(place):
+        raise InputError(place, "is a run and has no model card", "gnio publish makes a package")
+    return "\n".join(map(str, read_about(place).card))
+
+
+def write_run(which: str | Path, workdir: Path) -> None:
+    """Make a run of a package, which all commands take: its settings, and its weights as the best
+    checkpoint. The folder is written whole or not at all. Raises `InputError` as `load_pretrained`
+    does, and for a folder that is there already."""
+    if workdir.exists():
+        raise InputError(workdir, "is there already", "name another folder")
+    run = load_pretrained(which)
+    run = run._replace(config=dataclasses.replace(run.config, workdir=str(workdir)))
+    with replacing_folder(workdir) as new:
+        configuration.save(new / "config.yaml", run.config)
+        checkpoint.write_best(new, run)
+
+
+def read(place: Path) -> tuple[About, bytes]:
+    """A package: what it says of itself, and its weights. Raises `InputError` if it is damaged."""
+    about = read_about(place)
+    content = _content(place, WEIGHTS, LARGEST_WEIGHTS)
+    if fingerprint(content) != about.weights:
+        problem = f"'{WEIGHTS}' is not the file that the manifest describes (SHA-256 differs)"
+        raise InputError(place, problem, _DAMAGED)
+    return about, content
+
+
+def read_about(place: Path) -> About:
+    """What a package says of itself; only its manifest is read. Raises `InputError`."""
+    try:
+        found = json.loads(_content(place, MANIFEST, LARGEST_MANIFEST))
+    except (ValueError, RecursionError) as error:  # InputError, too, is a ValueError
+        if isinstance(error, InputError):
+            raise
+        raise InputError(place, f"'{MANIFEST}' is no JSON ({error})", _DAMAGED) from None
+    if not isinstance(found, dict) or found.get("format") != FORMAT:
+        raise InputError(place, f"'{MANIFEST}' is not that of a package", _DAMAGED)
+    if found.get("version") != VERSION:
+        problem = f"has format version {found.get('version')!r}; this program reads {VERSION}"
+        raise InputError(place, problem, "publish its run again, or install the other gnio-jax")
+    if _digest(found) != found.get("sha256"):
+        raise InputError(place, f"'{MANIFEST}' was changed (SHA-256 differs)", _DAMAGED)
+    for name, kind in get_type_hints(About).items():
+        value = found.get(name)
+        if type(value) is not kind or (kind is int and not 0 <= value < 2**31):
+            raise InputError(place, f"'{MANIFEST}' has no '{name}', or a wrong one", _DAMAGED)
+    if found["weights"].keys() != {"bytes", "sha256"}:
+        raise InputError(place, f"'{MANIFEST}' does not describe '{WEIGHTS}'", _DAMAGED)
+    return About(*(found[name] for name in About._fields))
+
+
+def _digest(manifest: dict[str, Any]) -> str:
+    """The SHA-256 of all that a manifest says, but for this digest."""
+    rest = {name: value for name, value in manifest.items() if name != "sha256"}
+    return fingerprint(json.dumps(rest, sort_keys=True).encode())["sha256"]
+
+
+def _content(place: Path, name: str, most: int) -> bytes:
+    """The bytes of a file, which must not be more than `most`."""
+    try:
+        if place.is_dir():
+            with (place / name).open("rb") as file:
+                content = file.read(most + 1)
+        else:
+            with zipfile.ZipFile(place) as archive, archive.open(name) as file:
+                content = file.read(most + 1)
+    except (FileNotFoundError, KeyError):
+        raise InputError(place, f"'{name}' is missing", _DAMAGED) from None
+    except (OSError, zipfile.BadZipFile, zlib.error, EOFError, RuntimeError) as error:
+        raise InputError(place, f"'{name}' cannot be read ({error})", _DAMAGED) from None
+    if len(content) > most:
+        raise InputError(place, f"'{name}' is larger than {most} bytes", _DAMAGED)
+    return content
+
+
+def _run_of(place: Path, about: About, content: bytes) -> Run:
+    source = str(place / MANIFEST)
+    config = configuration.parse(json.dumps(about.config), source)
+    config = configuration.validate(config, source)
+    model = create_model(config)
+    shapes = models.variable_shapes(model, config.data.seen)
+    template = {"params": shapes["params"], "batch_stats": shapes.get("batch_stats", {})}
+    variables = from_bytes(content, template, place / WEIGHTS)
+    numbers = filter_numbers(config.filter) if config.through_filter.learn else {}
+    return Run(config, model, variables, about.epoch, about.step, numbers)
+
+
+def to_bytes(variables: Any) -> bytes:
+    """Variables as a safetensors file; the name of an array is its path, `params/head/kernel`."""
+    return save({name: np.asarray(leaf, np.float32) for name, leaf in _named(variables).items()})
+
+
+def from_bytes(content: bytes, template: Any, where: object) -> Any:
+    """The variables of a file in the structure of `template` (arrays or shapes). Raises
+    `InputError` where a name or a shape differs, or a value is not finite."""
+    try:
+        tensors = load(content)
+    except (SafetensorError, ValueError, KeyError) as error:
+        problem = f"cannot be read ({str(error)[:120]})"
+        raise InputError(where, problem, "it must be a safetensors file") from None
+    wanted = _named(template)
+    for name in sorted(wanted.keys() | tensors.keys()):
+        found, own = (tree[name].shape if name in tree else None for tree in (tensors, wanted))
+        if found != own:
+            problem = f"'{name}' has shape {found}; the configured network has {own}"
+            raise InputError(where, problem, "weights and settings must be of one run")
+        if not np.isfinite(tensors[name]).all():
+            raise InputError(where, f"'{name}' holds values that are not finite")
+    leaves = [jnp.asarray(tensors[name], jnp.float32) for name in wanted]
+    return jax.tree.unflatten(jax.tree.structure(template), leaves)
+
+
+def _named(tree: Any) -> dict[str, Any]:
+    leaves = jax.tree_util.tree_leaves_with_path(tree)
+    return {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in leaves}
+
+
+# Publishing
+# --------------------------------------------------------------------------------------------------
+
+
+class Description(NamedTuple):
+    """What only the publisher knows."""
+
+    name: str
+    data: str
+    """What the network was trained on: recordings, devices, people, carrying positions."""
+    license: str
+    """Under which the data may be used and the weights passed on."""
+    fails: tuple[str, ...] = ()
+    """Where it is known to fail, a sentence each."""
+
+
+def publish(workdir: Path, out: Path, said: Description, which: Which = "best") -> About:
+    """Make a package of a run at `out`: a zip if its name ends so, else a folder, which takes the
+    place of an older package. It is written whole or not at all, and folders of this machine are
+    left out of its settings.
+
+    Raises `InputError` for a run that cannot be loaded, a name that is none of a file, empty texts,
+    or something at `out` that is no package.
+    """
+    if said.name != file_stem(said.name):
+        remedy = "use letters, digits, '.', '_', '+' and '-'"
+        raise InputError("--name", f"'{said.name}' is no name of a folder", remedy)
+    for option in ("data", "license"):
+        if not getattr(said, option).strip():
+            raise InputError(f"--{option}", "is empty", "say it in a sentence: others rely on it")
+    if out.exists() and not (out.is_dir() and not any(out.iterdir())) and not _has_manifest(out):
+        raise InputError(out, "is there already and is no package", "name another --out")
+    run = checkpoint.load_run(workdir, which)
+    figures, made_by = _figures(workdir), f"gnio-jax {version('gnio-jax')}"
+    content = to_bytes(run.variables)
+    own = dataclasses.replace(run.config, workdir=None, data_root=None, init_from=None)
+    about = About(
+        said.name,
+        run.config.model.name,
+        said.data,
+        said.license,
+        run.epoch,
+        run.step,
+        _measured(figures, run.config.dataset),
+        made_by,
+        _card(said, run, made_by, figures, (workdir / "calibration.json").is_file()),
+        configuration.plain(own),
+        fingerprint(content),
+    )
+    manifest = {"format": FORMAT, "version": VERSION, **about._asdict()}
+    manifest["sha256"] = _digest(manifest)
+    text = json.dumps(manifest, indent=1, allow_nan=False, ensure_ascii=False) + "\n"
+    files = {MANIFEST: text.encode(), WEIGHTS: content}
+    if out.suffix == ".zip":
+        with replacing(out) as temporary, zipfile.ZipFile(temporary, "w") as archive:
+            for name, each in files.items():
+                # A date of its own would make other bytes of the same package.
+                archive.writestr(zipfile.ZipInfo(name), each, zipfile.ZIP_DEFLATED)
+    else:
+        with replacing_folder(out) as folder:
+            for name, each in files.items():
+                (folder / name).write_bytes(each)
+    return about
+
+
+def _has_manifest(place: Path) -> bool:
+    """Whether it holds the manifest of a package, of any version."""
+    try:
+        return f'"{FORMAT}"'.encode() in _content(place, MANIFEST, LARGEST_MANIFEST)
+    except InputError:
+        return False
+
+
+def _figures(workdir: Path) -> dict[str, dict[str, Any]]:
+    """Evaluation -> metrics.json, of every evaluation that a run holds. Raises `InputError`."""
+    found = {}
+    for path in sorted(workdir.glob("eval/*/metrics.json")):
+        try:
+            figures = json.loads(path.read_text(encoding="utf-8"))
+            for name in ("settings", "sequences", "mean", "interval", "groups"):
+                figures[name].items()
+        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+            problem = f"cannot be read ({error})"
+            raise InputError(path, problem, "evaluate again, or remove it") from None
+        found[path.parent.name] = figures
+    return found
+
+
+def _measured(figures: dict[str, dict[str, Any]], dataset: str) -> str:
+    """The error by which networks are listed, in words, of the first evaluation that has it: with
+    the filter before without, on the run's own dataset before others, on a test split before
+    others. Empty where none has it."""
+
+    def rank(name: str) -> tuple[bool, bool, bool, int, str]:
+        how = figures[name]["settings"]
+        own, tested = how.get("dataset") == dataset, "test" in str(how.get("split"))
+        return how.get("estimator") != "ekf", not own, not tested, len(name), name
+
+    key = next(iter(SHOWN))
+    for name in sorted(figures, key=rank):
+        if figures[name]["mean"].get(key) is not None:
+            return f"ATE 2-D is {_cell(figures[name], key)} m on {name}"
+    return ""
+
+
+def _cell(figures: dict[str, Any], metric: str) -> str:
+    """The mean over the sequences with its 95 % interval."""
+    value, interval = figures["mean"].get(metric), figures["interval"].get(metric)
+    _, digits = SHOWN[metric]
+    if value is None:
+        return "–"
+    low, high = interval or (None, None)
+    around = "" if low is None else f" ({low:.{digits}f} to {high:.{digits}f})"
+    return f"{value:.{digits}f}{around}"
+
+
+def _card(
+    said: Description,
+    run: Run,
+    made_by: str,
+    figures: dict[str, dict[str, Any]],
+    calibrated: bool,
+) -> list[str]:
+    """The model card, lines of Markdown."""
+    config, windows = run.config, run.config.data
+    return [
+        f"# {said.name}",
+        "",
+        f"Network `{config.model.name}` for neural inertial odometry by {made_by}: windows of "
+        f"{windows.window_seconds:g} s at {windows.rate:g} Hz, a displacement every "
+        f"{windows.stride_seconds:g} s. Epoch {run.epoch}, step {run.step}.",
+        *("", "```", f"gnio track RECORDING --weights {said.name}", "```"),
+        *(
+            "",
+            "## Data and licence",
+            "",
+            f"Trained on: {said.data}",
+            "",
+            f"Licence: {said.license}",
+        ),
+        *("", "## Recipe", "", *_recipe(said.name, config, calibrated)),
+        *("", "## Figures", "", *_table(figures)),
+        *("", "## Where it fails", ""),
+        *(f"- {each}" for each in said.fails),
+        *([] if said.fails else ["Its publisher has not said. Try it on recordings like yours."]),
+    ]
+
+
+def _recipe(name: str, config: TrainConfig, calibrated: bool) -> list[str]:
+    begun = f" --init-from runs/{Path(config.init_from).name}" if config.init_from else ""
+    steps = [f"gnio train --config config.yaml --workdir runs/{name}{begun}"]
+    steps += [f"gnio calibrate --workdir runs/{name}"] if calibrated else []
+    considered = [each for each, std in config.filter.considered._asdict().items() if std > 0]
+    return [
+        *("```", *steps, "```", ""),
+        f"Dataset `{config.dataset}`, seed {config.seed}; `gnio weights {name} --out runs/{name}` "
+        "writes config.yaml with all settings, those of the filter as they are used. Consider "
+        f"covariance of the filter: {', '.join(considered) or 'none'}.",
+    ]
+
+
+def _table(figures: dict[str, dict[str, Any]]) -> list[str]:
+    """Lines of Markdown: a row per evaluation, means with their 95 % intervals."""
+    if not figures:
+        return ["The run holds no evaluation."]
+    headings = ["evaluation", "sequences", "groups", *(heading for heading, _ in SHOWN.values())]
+    rows = [headings, ["---", *["---:"] * (len(headings) - 1)]]
+    for name, found in figures.items():
+        groups = str(found["groups"].get("ate_2d", "–"))
+        cells = [_cell(found, metric) for metric in SHOWN]
+        rows.append([name, str(len(found["sequences"])), groups, *cells])
+    return [
+        *(f"| {' | '.join(row)} |" for row in rows),
+        "",
+        "Means over sequences, with 95 % intervals over groups (people, sessions).",
+    ]

@@ -1,0 +1,300 @@
+"""Packages of networks: what goes in comes out, and what was changed on the way is refused."""
+
+import dataclasses
+import hashlib
+import json
+import shutil
+import struct
+import zipfile
+
+import jax
+import numpy as np
+import pytest
+
+import gnio_jax
+from gnio_jax import config as configuration
+from gnio_jax.apps import packages
+from gnio_jax.apps.packages import SHIPPED, Description
+from gnio_jax.commands import app, console
+from gnio_jax.config import DataConfig, ModelConfig, TrainConfig
+from gnio_jax.errors import InputError
+from gnio_jax.training import checkpoint
+from gnio_jax.training.run_folder import initial_run
+from tests.support import tiny_run
+from tests.support.compiling import quick
+from tests.support.filter_settings import changed
+
+CONFIG = TrainConfig(
+    dataset="synthetic",
+    data_root="/home/somebody/recordings",
+    init_from="runs/earlier",
+    seed=7,
+    data=DataConfig(rate=50.0),
+    model=ModelConfig(name="tiny"),
+    filter=changed(noise={"std_factor": (1.7, 1.0, 1.0)}, considered={"scale": 0.02}),
+)
+FIGURES = {
+    "settings": {"dataset": "synthetic", "split": "test", "estimator": "ekf"},
+    "sequences": {"a": {}, "b": {}},
+    "mean": {"ate_2d": 1.234, "yaw_rmse": None},
+    "interval": {"ate_2d": [0.9, 1.6], "yaw_rmse": None},
+    "groups": {"ate_2d": 2},
+}
+SAID = Description("walk", "simulated walks", "CC0", ("Running | jumping.",))
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A run of the smallest network, with the figures of one evaluation."""
+    with tiny_run.known():
+        folder = tiny_run.save(tmp_path_factory.mktemp("trained") / "walk", CONFIG)
+        evaluation = folder / "eval" / "synthetic_test_ekf"
+        evaluation.mkdir(parents=True)
+        (evaluation / "metrics.json").write_text(json.dumps(FIGURES))
+        yield folder
+
+
+@pytest.fixture(scope="module")
+def published(run, tmp_path_factory):
+    """A folder of packages: `walk`, and `small.zip`."""
+    folder = tmp_path_factory.mktemp("packages")
+    packages.publish(run, folder / "walk", SAID)
+    packages.publish(run, folder / "small.zip", SAID._replace(name="small"))
+    return folder
+
+
+@pytest.fixture
+def package(published, tmp_path):
+    return shutil.copytree(published / "walk", tmp_path / "walk")
+
+
+@pytest.fixture
+def gnio(monkeypatch, capsys):
+    def call(*arguments):
+        console.run(lambda: app.main(list(map(str, arguments))))
+        return capsys.readouterr().out
+
+    return call
+
+
+def refused(place, *words):
+    with pytest.raises(InputError) as caught:
+        gnio_jax.load_pretrained(place)
+    told = str(caught.value)
+    assert "\n" not in told and all(word in told for word in words), told
+
+
+def with_changes(package, **changes):
+    """The manifest changed by one who knows how its digest is made."""
+    path = package / "manifest.json"
+    manifest = json.loads(path.read_text()) | changes
+    rest = {name: value for name, value in manifest.items() if name != "sha256"}
+    text = json.dumps(rest, sort_keys=True).encode()
+    path.write_text(json.dumps({**rest, "sha256": hashlib.sha256(text).hexdigest()}))
+
+
+@pytest.mark.parametrize("name", ["walk", "small.zip"])
+def test_a_package_is_the_run(run, published, name):
+    own, loaded = checkpoint.load_run(run), gnio_jax.load_pretrained(published / name)
+    jax.tree.map(np.testing.assert_array_equal, loaded.variables, own.variables)
+    assert loaded.config == dataclasses.replace(CONFIG, data_root=None, init_from=None)
+    assert loaded.model == own.model and (loaded.epoch, loaded.step) == (own.epoch, own.step)
+
+
+def test_the_files_are_what_other_programs_read(run, published):
+    """The weights by the format's own description: a length, a header of JSON, the bytes."""
+    folder = published / "walk"
+    assert sorted(path.name for path in folder.iterdir()) == ["manifest.json", packages.WEIGHTS]
+    content, text = (folder / packages.WEIGHTS).read_bytes(), (folder / "manifest.json").read_text()
+    (length,) = struct.unpack("<Q", content[:8])
+    entry = json.loads(content[8 : 8 + length])["params/encoder/kernel"]
+    assert entry["dtype"] == "F32"
+    kernel = np.frombuffer(content[8 + length :][slice(*entry["data_offsets"])], np.float32)
+    own = checkpoint.load_run(run).variables["params"]["encoder"]["kernel"]
+    np.testing.assert_array_equal(kernel.reshape(entry["shape"]), own)
+    weights = {"bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
+    assert json.loads(text)["weights"] == weights
+    assert "somebody" not in text
+    with zipfile.ZipFile(published / "small.zip") as archive:
+        assert archive.read(packages.WEIGHTS) == content
+
+
+def test_the_card_has_what_the_publisher_and_the_evaluations_say(published):
+    card = packages.card_of(published / "walk")
+    for words in (
+        "Trained on: simulated walks",
+        "Licence: CC0",
+        "- Running | jumping.",
+        "gnio train --config config.yaml --workdir runs/walk --init-from runs/earlier",
+        "Dataset `synthetic`, seed 7",
+        "covariance of the filter: scale.",
+        "| synthetic_test_ekf | 2 | 2 | 1.23 (0.90 to 1.60) |",
+    ):
+        assert words in card
+    assert "calibrate" not in card
+
+
+@pytest.mark.parametrize("name", [packages.WEIGHTS, packages.MANIFEST])
+def test_a_changed_byte(package, name):
+    content = bytearray((package / name).read_bytes())
+    at = content.index(b"simulated") if name == packages.MANIFEST else len(content) // 2
+    content[at] ^= 1
+    (package / name).write_bytes(content)
+    refused(package, f"'{name}'", "SHA-256")
+
+
+def test_what_else_is_damaged(package, tmp_path):
+    good = json.loads((package / "manifest.json").read_text())
+    for changes, words in (
+        ({"version": 1}, ("format version 1", "publish its run again")),
+        ({"format": "other"}, ("not that of a package",)),
+        ({"license": None}, ("no 'license'",)),
+        ({"network": ["tlio"]}, ("no 'network'",)),
+        ({"weights": {}}, ("does not describe",)),
+        ({"weights": {"bytes": 2**40, "sha256": ""}}, ("SHA-256",)),
+        *(({"step": step}, ("no 'step'",)) for step in (1.5, -5, "../..", 10**20, True)),
+        ({"epoch": {}}, ("no 'epoch'",)),
+        ({"config": {"seed": "one"}}, ("manifest.json", "seed")),
+    ):
+        with_changes(package, **good | changes)
+        refused(package, *words)
+    for text in ("{", "[" * 100_000):
+        (package / "manifest.json").write_text(text)
+        refused(package, "no JSON")
+    (package / "manifest.json").write_text(json.dumps(good))
+    (package / packages.WEIGHTS).unlink()
+    refused(package, "'weights.safetensors' is missing")
+    broken = tmp_path / "broken.zip"
+    broken.write_bytes(b"PK no zip")
+    refused(broken, "cannot be read")
+
+
+def test_a_file_that_is_too_large_is_not_read(package, monkeypatch):
+    """As a zip of some megabytes may unpack to any size."""
+    monkeypatch.setattr(packages, "LARGEST_WEIGHTS", 100)
+    refused(package, "'weights.safetensors' is larger than 100 bytes")
+
+
+def test_weights_of_another_network(package):
+    content = packages.to_bytes({"params": {"head": {"kernel": np.zeros((4, 3), np.float32)}}})
+    (package / packages.WEIGHTS).write_bytes(content)
+    weights = {"bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
+    with_changes(package, weights=weights)
+    refused(package, "'batch_stats/norm/mean' has shape None", "(4,)")
+
+
+def test_names_are_found_and_listed(published, run, monkeypatch, tmp_path, gnio):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(packages, "SHIPPED", tmp_path)
+    assert "no packages" in gnio("weights")
+    refused("walk", "known names: none")
+    monkeypatch.setenv("GNIO_WEIGHTS", str(published))
+    assert list(packages.packages()) == ["small", "walk"]
+    assert gnio_jax.load_pretrained("small").config.seed == 7
+    assert gnio_jax.load_pretrained(run).config == CONFIG
+    refused("wolk", "did you mean 'walk'?")
+    refused(tmp_path, "neither a package")
+    listed = " ".join(gnio("weights").split())
+    for words in ("walk", "small", "simulated walks", "CC0", "1.23 (0.90", "MB"):
+        assert words in listed
+    monkeypatch.setenv("GNIO_WEIGHTS", str(tmp_path / "nowhere"))
+    refused("walk", "$GNIO_WEIGHTS", "nowhere")
+
+
+def test_the_default_is_shipped_or_the_newest_run(published, run, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(packages, "SHIPPED", published)
+    assert packages.find() == published / "small.zip"
+    monkeypatch.setattr(packages, "SHIPPED", tmp_path)
+    with pytest.raises(InputError, match="runs: holds no run"):
+        packages.find()
+    shutil.copytree(run, tmp_path / "runs" / "walk")
+    assert packages.find().name == "walk"
+
+
+def test_what_was_measured_of_weights(published, run, tmp_path):
+    measured = "whose ATE 2-D is 1.23 (0.90 to 1.60) m on synthetic_test_ekf"
+    assert packages.choose(published / "walk").about == f"simulated walks, {measured}"
+    own = shutil.copytree(run, tmp_path / "walk")
+    assert packages.choose(own).about == f"dataset synthetic, split train, {measured}"
+    (own / "eval" / "synthetic_test_ekf" / "metrics.json").write_text("{")
+    assert packages.choose(own).about == "dataset synthetic, split train"  # and it tracks
+
+
+def test_the_command(run, tmp_path, gnio, capsys):
+    out = tmp_path / "mine.zip"
+    given = ["publish", run, "--out", out, "--data", "walks \x1b[2J", "--license", "CC0"]
+    told = gnio(*given, "--fails", "Running.", "Cars.")
+    assert f"{out}: mine, network tiny" in told and "gnio track RECORDING --weights" in told
+    assert packages.read_about(out).license == "CC0"
+    assert "\x1b" not in gnio("weights", out)  # of a stranger's card nothing reaches the terminal
+    gnio(*given)  # in the place of the first
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "thesis.txt").write_text("mine")
+    (tmp_path / "other" / "manifest.json").write_text("{}")
+    for wrong, words in (
+        (["--out", tmp_path / "other"], "is no package"),
+        (["--name", "a/b"], "no name of a folder"),
+        (["--license", " "], "--license: is empty"),
+    ):
+        with pytest.raises(SystemExit, match="2"):
+            gnio(*given, *wrong)
+        told = capsys.readouterr().err
+        assert words in told and told.count("\n") == 1
+    assert (tmp_path / "other" / "thesis.txt").read_text() == "mine"
+
+
+# The network that comes with gnio-jax
+# --------------------------------------------------------------------------------------------------
+
+
+def test_the_shipped_network_is_the_default_and_small(monkeypatch):
+    monkeypatch.delenv("GNIO_WEIGHTS", raising=False)
+    place = SHIPPED / "pedestrian"
+    assert packages.find() == place
+    assert sum(file.stat().st_size for file in place.iterdir()) < 5e6
+    about = packages.read_about(place)
+    assert "randomised" in about.data and "Apache-2.0" in about.license
+    for words in ("gnio calibrate", "seed 0", "oxiod_sessions_test_ekf | 7 | 3 |", "Runs come out"):
+        assert words in packages.card_of("pedestrian")
+
+
+def test_the_shipped_network_answers():
+    """The arrays are those that were published first; a phone that lies still goes nowhere."""
+    digest = hashlib.sha256((SHIPPED / "pedestrian" / packages.WEIGHTS).read_bytes()).hexdigest()
+    assert digest == "d59ec21e288f700d712d1ad9a932a0d706a6e6373ef35e5fb5f3d393d5f5eb27"
+    run = gnio_jax.load_pretrained("pedestrian")
+    assert run.config.dataset == "randomised" and run.config.model.name == "gnio"
+    still = np.zeros((1, run.config.data.seen, 6), np.float32)
+    still[..., 2] = 9.81
+    prediction = quick(run.model.apply)(run.variables, still)
+    assert np.linalg.norm(prediction.displacement) < 0.05
+
+
+def test_a_run_of_a_package_is_the_same_network(tmp_path, gnio):
+    out = tmp_path / "runs" / "pedestrian"
+    assert f"gnio evaluate --workdir {out}" in gnio("weights", "pedestrian", "--out", out)
+    found, packed = checkpoint.load_run(out), gnio_jax.load_pretrained("pedestrian")
+    assert found.config == dataclasses.replace(packed.config, workdir=str(out))
+    assert (found.epoch, found.step) == (packed.epoch, packed.step)
+    jax.tree.map(np.testing.assert_array_equal, found.variables, packed.variables)
+    with pytest.raises(InputError, match="is there already; name another folder"):
+        packages.write_run("pedestrian", out)
+
+
+def test_a_card_is_shown(gnio, capsys, tmp_path):
+    shown = gnio("weights", "pedestrian")
+    assert shown.strip() == packages.card_of("pedestrian").strip()
+    with pytest.raises(SystemExit, match="2"):
+        gnio("weights", "--out", tmp_path / "run")
+    assert "is for one package; name it before --out" in capsys.readouterr().err
+
+
+def test_training_starts_from_a_package_by_its_name():
+    config = configuration.load("pedestrian")
+    config = dataclasses.replace(config, init_from="pedestrian")
+    run = initial_run(config, gnio_jax.load_pretrained)
+    assert run is not None and run.step > 0
+    other = dataclasses.replace(config, model=dataclasses.replace(config.model, width=8))
+    with pytest.raises(InputError, match=r"pedestrian: its model.width is 16.* describe the same"):
+        initial_run(other, gnio_jax.load_pretrained)
