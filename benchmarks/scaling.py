@@ -32,8 +32,8 @@ from flax import linen as nn
 from benchmarks.train_step import recordings
 from gnio_jax import parallel
 from gnio_jax.config import ModelConfig, OptimConfig, TrainConfig
-from gnio_jax.training import optimizer
-from gnio_jax.training.window_task import create_model, initial_state, train_steps
+from gnio_jax.training.task import create_model, train_steps
+from gnio_jax.training.window_task import WindowTask
 
 STEPS = 8
 """Steps per dispatch."""
@@ -63,13 +63,11 @@ def prepared(config: TrainConfig, model: nn.Module):
     """A function that takes a state through STEPS steps, the state, and its program."""
     samples = config.data.seen
     source = parallel.everywhere(jax.device_get(recordings(samples, config.optim.batch_size)))
-    state = initial_state(model, jax.random.key(0), samples)
-    adam = optimizer.adam(config.optim, config.loss, 1000)
-    state = parallel.everywhere(state._replace(opt_state=adam.init(state.params)))
+    task = WindowTask(model, config, 1000)
+    state = task.initial_state(jax.random.key(0), None)
     order = parallel.everywhere(np.arange(source.start.shape[0], dtype=np.int32))
     given = (source, order, jnp.int32(0), jnp.int32(STEPS), jnp.float32(1), jax.random.key(1))
-    static = {"model": model, "config": config, "steps_per_epoch": 1000}
-    return lambda state: train_steps(state, *given, **static), state, (given, static)
+    return lambda state: train_steps(state, *given, task=task), state, (given, {"task": task})
 
 
 def work(arguments: argparse.Namespace) -> None:

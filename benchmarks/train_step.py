@@ -23,15 +23,9 @@ import numpy as np
 from benchmarks import baseline
 from gnio_jax.config import DataConfig, ModelConfig, OptimConfig, TrainConfig
 from gnio_jax.data.windows import WindowSource, gather
-from gnio_jax.training import optimizer
 from gnio_jax.training.losses import loss_stage, losses
-from gnio_jax.training.window_task import (
-    create_model,
-    estimate_statistics,
-    initial_state,
-    statistics_order,
-    train_steps,
-)
+from gnio_jax.training.task import create_model, train_steps
+from gnio_jax.training.window_task import WindowTask, estimate_statistics, statistics_order
 
 STEPS, STEPS_PER_EPOCH = 4, 1000
 """Steps per dispatch, as in the training loop, and those of the schedule."""
@@ -61,26 +55,15 @@ def ours(config: TrainConfig):
     """
     size, samples = config.optim.batch_size, config.data.seen
     source, model = recordings(samples, size), create_model(config)
-    state = initial_state(model, jax.random.key(0), samples)
-    adam = optimizer.adam(config.optim, config.loss, STEPS_PER_EPOCH)
-    holder = [state._replace(opt_state=adam.init(state.params))]
+    task = WindowTask(model, config, STEPS_PER_EPOCH)
+    holder = [task.initial_state(jax.random.key(0), None)]
     order, key = jnp.arange(source.start.shape[0], dtype=jnp.int32), jax.random.key(1)
     fixed = jax.jit(gather, static_argnums=2)(source, order[:size], samples)
 
     def whole():
         first, count, factor = jnp.int32(0), jnp.int32(STEPS), jnp.float32(1)
-        holder[0], progress = train_steps(
-            holder[0],
-            source,
-            order,
-            first,
-            count,
-            factor,
-            key,
-            model=model,
-            config=config,
-            steps_per_epoch=STEPS_PER_EPOCH,
-        )
+        given = source, order, first, count, factor, key
+        holder[0], progress = train_steps(holder[0], *given, task=task)
         jax.block_until_ready(progress)
         return STEPS
 
@@ -103,7 +86,7 @@ def ours(config: TrainConfig):
 
     def statistics():
         order = statistics_order(key, source, config)
-        estimated = estimate_statistics(holder[0], source, order, key, model=model, config=config)
+        estimated = estimate_statistics(holder[0], source, order, key, task=task)
         jax.block_until_ready(estimated.batch_stats)
         return len(order) // size
 

@@ -19,7 +19,7 @@ from gnio_jax.apps import packages
 from gnio_jax.config import DataConfig, ModelConfig, TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.models import registry
-from gnio_jax.training.window_task import create_model
+from gnio_jax.training.task import create_model
 from tests.support import pages, tiny_run
 from tests.support.command_lines import understood
 

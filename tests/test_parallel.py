@@ -21,7 +21,9 @@ from gnio_jax import parallel
 from gnio_jax.config import DataConfig, ModelConfig, OptimConfig, ThroughFilter, TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.reporting import Silence
-from gnio_jax.training import loop, run_folder, window_task
+from gnio_jax.training import loop, run_folder
+from gnio_jax.training.task import Recordings, keys_of, set_up
+from gnio_jax.training.window_task import WindowTask
 from tests.support.drawn_state import drawn_state
 from tests.support.tlio_files import write_sequence, write_splits
 
@@ -229,13 +231,14 @@ def small(tmp_path_factory):
 
 def trained(config):
     """Losses and gradient norms of each of five steps, figures of validation, parameters."""
-    task = window_task.set_up(config, Silence())
-    drawn = drawn_state(task.model, config, task.steps_per_epoch)
-    state, order, found = parallel.everywhere(drawn), task.order(0), []
+    task, (source, held_out, _) = set_up(WindowTask, config, Silence())
+    drawn, keys = drawn_state(task.model, config, task.steps_per_epoch), keys_of(config.seed)
+    state, order, found = parallel.everywhere(drawn), task.order(keys.order, 0, source), []
     for first in range(5):
-        state, progress = task.take_steps(state, order, first, 1, 1.0)
+        state, progress = task.take_steps(state, source, order, first, 1, 1.0, keys.step)
         found.append(progress.sums)
-    state, row = task.validate(task.with_statistics(state), 5)
+    state = task.with_statistics(state, source, keys.statistics)
+    state, row = task.validate(state, held_out, keys.statistics)
     return jax.device_get((found, row, state.batch_stats)), state
 
 
@@ -256,10 +259,10 @@ def test_each_device_has_the_state_and_its_part_of_the_batch(small, on_two):
     for leaf in jax.tree.leaves(state):
         assert leaf.sharding.is_fully_replicated and len(leaf.devices()) == 2
     with parallel.sharing(2):
-        task = window_task.set_up(small, Silence())
+        task, (source, *_) = set_up(WindowTask, small, Silence())
         which = parallel.everywhere(np.arange(16, dtype=np.int32))
         key = jax.random.key(0)
-        draw = jax.jit(lambda: window_task.draw_windows(key, task.source, which, small))
+        draw = jax.jit(lambda: task.draw(key, source, which))
         windows, _ = draw()
     assert windows.imu.sharding.spec[0] == "batch"
     assert [shard.data.shape[0] for shard in windows.imu.addressable_shards] == [8, 8]
@@ -277,7 +280,7 @@ def test_a_batch_that_cannot_be_shared_evenly_is_refused(small):
     optim = dataclasses.replace(small.optim, batch_size=15)
     changed = dataclasses.replace(small, optim=optim, data_root="nowhere")
     with parallel.sharing(2), pytest.raises(InputError, match="2 devices cannot"):
-        window_task.set_up(changed, Silence())  # before it reads anything
+        set_up(WindowTask, changed, Silence())  # before it reads anything
 
 
 def test_through_the_filter_there_is_no_number_of_devices():
@@ -294,7 +297,8 @@ def test_processes_with_other_samples_or_weights_are_refused(monkeypatch):
 
     def compare(samples, weights):
         tree = {"imu": samples, "start": np.arange(3)}
-        run_folder.compare_processes(TrainConfig(), {"train": ["a"]}, tree, {"scale": weights})
+        recordings = Recordings(tree, {}, {"train": ["a"]})
+        run_folder.compare_processes(TrainConfig(), recordings, {"scale": weights})
 
     monkeypatch.setattr(parallel, "largest", lambda *given: sent.append(given) or given)
     samples, weights = np.arange(12.0).reshape(4, 3), jnp.float32(1)

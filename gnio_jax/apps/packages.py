@@ -32,7 +32,7 @@ from gnio_jax.files import file_stem, fingerprint, replacing, replacing_folder
 from gnio_jax.training import checkpoint
 from gnio_jax.training.checkpoint import Run, Which
 from gnio_jax.training.filter_task import filter_numbers
-from gnio_jax.training.window_task import create_model
+from gnio_jax.training.task import create_model
 
 SHIPPED = Path(__file__).parents[1] / "weights"
 """The packages that come with gnio-jax."""

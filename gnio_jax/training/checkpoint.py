@@ -26,7 +26,7 @@ from gnio_jax.config import TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.training.filter_task import filter_numbers, trained_settings
 from gnio_jax.training.optimizer import Plateau
-from gnio_jax.training.window_task import TrainState, create_model
+from gnio_jax.training.task import TrainState, create_model
 
 Which = Literal["best", "latest"]
 METADATA = 2**17

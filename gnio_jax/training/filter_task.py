@@ -12,14 +12,11 @@ import dataclasses
 import functools
 import math
 from collections.abc import Iterable, Iterator
-from pathlib import Path as FilePath
 from typing import Any, NamedTuple
 
 import chex
 import jax
 import jax.numpy as jnp
-import numpy as np
-import optax
 from flax import linen as nn
 from jaxtyping import Bool, Float, Int, PRNGKeyArray
 
@@ -40,8 +37,7 @@ from gnio_jax.filtering.settings import (
     with_free_parameters,
     with_written_parameters,
 )
-from gnio_jax.reporting import Reporter
-from gnio_jax.training import optimizer, window_task
+from gnio_jax.training import optimizer
 from gnio_jax.training.filter_losses import (
     HORIZON_SECONDS,
     FilterLosses,
@@ -60,7 +56,7 @@ from gnio_jax.training.segments import (
     start_rotation,
     turned_segment,
 )
-from gnio_jax.training.window_task import Progress, Row, Task, TrainState
+from gnio_jax.training.task import BatchLosses, Progress, Row, Task, Trainable, TrainState, size_of
 
 CHECKPOINT_EVERY = 20
 """Clone intervals between the states that the backward pass keeps."""
@@ -72,9 +68,6 @@ deviations times this."""
 GATE_SOFTNESS = 2.0
 """Slope of the χ² gate in training (`FilterConfig.gate_softness`); validation has the gate that
 evaluation has."""
-SKIP_ABOVE = 1000.0
-"""A step is skipped, and counted in the log, when the norm of its gradient is above this, or
-anything in it is not finite, or the filter diverged."""
 
 
 # What is trained
@@ -95,9 +88,6 @@ DIGITS = 5
 """That float32 keeps of a value whose logarithm it holds."""
 HEADS = ("head", "displacement")
 """Names of the networks' modules from which the displacement comes."""
-
-Trainable = dict[str, dict[str, Any]]
-"""Variables that are trained, by collection: "params" and "filter"; none of them empty."""
 
 
 def filter_numbers(settings: FilterSettings) -> dict[str, Float[jax.Array, ""]]:
@@ -134,14 +124,6 @@ def module_part(module: str) -> str:
     if module in optimizer.UNCERTAINTY:
         return "uncertainty"
     return "head" if module in HEADS else "encoder"
-
-
-def merged(variables: Any, trained: Trainable) -> Any:
-    """All variables, with those that are trained in their places."""
-    return {
-        collection: {**tree, **trained.get(collection, {})}
-        for collection, tree in variables.items()
-    }
 
 
 # The filter over segments
@@ -248,138 +230,17 @@ def draw_segments(
     return segments, jax.vmap(lambda key: draw_start_errors(key, std, START_SPREAD))(keys)
 
 
-def training_segments(
-    key: PRNGKeyArray, source: SegmentSource, starts: Int[jax.Array, "b"], config: TrainConfig
-) -> tuple[Segment, StartErrors]:
-    """`draw_segments`, with `augment.yaw` each turned by a random yaw: the filter finds the same
-    path but for the turn, and the network sees windows of another heading."""
-    segments, errors = draw_segments(key, source, starts, config)
-    if config.augment.yaw:
-        count, key = starts.shape[0], jax.random.fold_in(key, 1)
-        angles = jax.random.uniform(key, (count,), jnp.float64, -jnp.pi, jnp.pi)
-        segments = jax.vmap(turned_segment)(segments, angles)
-    return segments, errors
-
-
-# The step
+# Validation
 # ------------------------------------------------------------------------------------------------
 
 
-@functools.partial(
-    jax.jit, static_argnames=("model", "config", "steps_per_epoch"), donate_argnames="state"
-)
-def train_steps(
-    state: TrainState,
-    source: SegmentSource,
-    order: Int[jax.Array, "p"],
-    first: Int[jax.Array, ""],
-    count: Int[jax.Array, ""],
-    factor: Float[jax.Array, ""],
-    key: PRNGKeyArray,
-    *,
-    model: nn.Module,
-    config: TrainConfig,
-    steps_per_epoch: int,
-) -> tuple[TrainState, Progress]:
-    """Take `count` steps of an epoch, whose segments begin at the rows `order`, from its step
-    number `first` on; see `window_task.train_steps`."""
-    size = config.optim.batch_size
-    chex.assert_rank(order, 1)
-    chex.assert_axis_dimension_gteq(order, 0, size)
-    chex.assert_shape([first, count, factor, state.step], ())
-    adam = optimizer.adam_through_filter(config.optim)
-    ratio = config.through_filter.filter_learning_rate / config.optim.learning_rate
-    learning_rates = {
-        "params": optimizer.schedule(config.optim, steps_per_epoch),
-        "filter": optimizer.schedule(config.optim, steps_per_epoch, ratio),
-    }
-
-    def one_step(i: jax.Array, carry: tuple[TrainState, Progress]) -> tuple[TrainState, Progress]:
-        state, progress = carry
-        starts = jax.lax.dynamic_slice(order, ((first + i) * size,), (size,))
-        batch = training_segments(jax.random.fold_in(key, state.step), source, starts, config)
-        variables = state.variables
-        trained = trainable(variables, config.through_filter.learn)
-        gradient, losses, healthy = gradient_of_segments(variables, trained, *batch, model, config)
-
-        direction: Any
-        direction, opt_state = adam.update(gradient, state.opt_state, trained)
-        for name, tree in direction.items():
-            rate = -jnp.float32(learning_rates[name](state.step))
-            direction[name] = optax.tree.scale(factor, optax.tree.scale(rate, tree))
-        taken = merged(variables, optax.apply_updates(trained, direction))
-
-        tame = optax.tree.norm(gradient) <= SKIP_ABOVE  # false for NaN
-        tame = tame & healthy & jnp.isfinite(losses.total)
-        variables, opt_state = jax.tree.map(
-            lambda new, old: jnp.where(tame, new, old),
-            (taken, opt_state),
-            (variables, state.opt_state),
-        )
-        figures = named_means(losses) | gradient_norms(gradient)
-        figures = {name: jnp.where(tame, each, 0.0) for name, each in figures.items()}
-        figures["skipped"] = jnp.where(tame, 0.0, 1.0)
-        progress = progress._replace(sums=jax.tree.map(jnp.add, progress.sums, figures))
-        network = variables["params"], variables["batch_stats"]
-        state = TrainState(jnp.add(state.step, 1), *network, opt_state, variables["filter"])
-        return state, progress
-
-    losses = FilterLosses(*[jnp.float64(0)] * len(FilterLosses._fields))
-    norms = gradient_norms(trainable(state.variables, config.through_filter.learn))
-    sums = named_means(losses) | jax.tree.map(jnp.zeros_like, norms) | {"skipped": jnp.float64(0)}
-    start = (state, Progress(sums, jnp.int32(-1)))
-    return jax.lax.fori_loop(jnp.int32(0), count, one_step, start)
-
-
-def gradient_of_segments(
-    variables: Any,
-    trained: Trainable,
-    segments: Segment,
-    errors: StartErrors,
-    model: nn.Module,
-    config: TrainConfig,
-) -> tuple[Trainable, FilterLosses, Bool[jax.Array, ""]]:
-    """Gradient of the mean loss of the segments by what is trained, the mean losses, and whether
-    the filter diverged in none of them."""
-    chex.assert_type([segments.gyro, segments.accel], jnp.float64)
-    ekf = filter_config(config, training=True)
-
-    def objective(trained: Trainable) -> tuple[jax.Array, tuple[FilterLosses, jax.Array]]:
-        found = filter_segments(merged(variables, trained), segments, errors, model, config, ekf)
-        losses = jax.tree.map(lambda each: jnp.mean(each, axis=0), found.losses)
-        return losses.total, (losses, jnp.all(found.healthy))
-
-    gradient, (losses, healthy) = jax.grad(objective, has_aux=True)(trained)
-    chex.assert_trees_all_equal_structs(gradient, trained)
-    return gradient, losses, healthy
-
-
-def named_means(losses: FilterLosses) -> dict[str, Float[jax.Array, ""]]:
-    """The losses under the names of the log, those of several horizons as their mean."""
-    names = {"total": "loss", "window": "mse"}
-    return {names.get(name, name): jnp.mean(each) for name, each in losses._asdict().items()}
-
-
-def gradient_norms(gradient: Trainable) -> dict[str, Float[jax.Array, ""]]:
-    """Norm of the gradient by each part that is trained: modules of the network
-    (`gradient_norm/head`), numbers of the filter (`gradient_norm/filter/noise.gyro_density`)."""
-    named = dict(gradient.get("params", {}))
-    named |= {f"filter/{name}": leaf for name, leaf in gradient.get("filter", {}).items()}
-    return {f"gradient_norm/{name}": optax.tree.norm(part) for name, part in named.items()}
-
-
-@functools.partial(jax.jit, static_argnames=("model", "config"))
+@functools.partial(jax.jit, static_argnames="task")
 def validate(
-    state: TrainState,
-    source: SegmentSource,
-    key: PRNGKeyArray,
-    *,
-    model: nn.Module,
-    config: TrainConfig,
+    state: TrainState, source: SegmentSource, key: PRNGKeyArray, *, task: FilterTask
 ) -> Filtered:
     """Means over the segments of `source`, each at its earliest place, with the gate that
     evaluation has. The errors of the starts depend on `key` alone. `healthy`: all were."""
-    count = source.earliest.shape[0]
+    config, count = task.config, source.earliest.shape[0]
     size = min(config.optim.batch_size, count)
     batches = -(-count // size)
     # The last batch is filled up with segments of weight zero.
@@ -389,7 +250,7 @@ def validate(
     segments, errors = draw_segments(key, source, jnp.asarray(source.earliest)[which], config)
 
     def one_batch(batch: tuple[Segment, StartErrors, jax.Array]) -> Filtered:
-        found = filter_segments(state.variables, batch[0], batch[1], model, config, ekf)
+        found = filter_segments(state.variables, batch[0], batch[1], task.model, config, ekf)
         found = found._replace(healthy=found.healthy.astype(jnp.float64))
         return jax.tree.map(lambda each: jnp.tensordot(batch[2], each, 1), found)
 
@@ -406,112 +267,93 @@ def validate(
 
 
 class FilterTask(Task):
-    """Training through the filter: `source` and `held_out` are `SegmentSource`s. See
-    `window_task.WindowTask` for what each method means to the loop."""
+    """Training through the filter, on segments, which a `SegmentSource` holds."""
 
     unit = "segments"
+    figures = ("loss", "mse", "displacement", "yaw", "innovation", "state")
+    skip_above = 1000.0
 
-    def initial_state(self, start: Any | None) -> TrainState:
-        window = self.config.data.seen
-        state = window_task.initial_state(self.model, self.keys.init, window)
-        state = state._replace(filter=filter_numbers(self.config.filter))
-        if start is not None:
-            # The filter is that of the settings, not that of the run. Copies: the steps take the
-            # memory of their state, and another seed starts from the same weights.
-            start = jax.tree.map(parallel.fresh_copy, {**start, "filter": {}})
-            found = window_task.overlaid(state.variables, start)
-            state = state._replace(params=found["params"], batch_stats=found["batch_stats"])
-        trained = trainable(state.variables, self.config.through_filter.learn)
-        chex.assert_type(jax.tree.leaves(trained), jnp.float32)
-        adam = optimizer.adam_through_filter(self.config.optim)
-        return state._replace(opt_state=adam.init(trained))
+    @staticmethod
+    def source_of(
+        sequences: Iterable[Sequence], config: TrainConfig, training: bool
+    ) -> SegmentSource:
+        return segment_source(sequences, intervals(config) * config.data.stride)
+
+    @staticmethod
+    def count(source: SegmentSource) -> int:
+        return source.earliest.shape[0]
 
     def description(self, state: TrainState, workdir: FilePath) -> Iterator[str]:
-        optim, through = self.config.optim, self.config.through_filter
-        trained = window_task.size_of(trainable(state.variables, through.learn))
+        optim, learn = self.config.optim, self.config.through_filter.learn
         yield (
-            f"{self.config.model.name} in the filter's loop: {' and '.join(through.learn)} learn, "
-            f"{trained:,} numbers, on {jax.devices()[0].platform}, {self.steps_per_epoch} steps of "
-            f"{optim.batch_size} segments an epoch, {optim.epochs} epochs → {workdir}"
+            f"{self.config.model.name} in the filter's loop: {' and '.join(learn)} learn, "
+            f"{size_of(self.trainable(state.variables)):,} numbers, on "
+            f"{jax.devices()[0].platform}, {self.steps_per_epoch} steps of {optim.batch_size} "
+            f"segments an epoch, {optim.epochs} epochs → {workdir}"
         )
 
-    def order(self, epoch: int) -> Int[jax.Array, "p"]:
-        return random_starts(jax.random.fold_in(self.keys.order, epoch), self.source)
+    def filter_numbers(self) -> dict[str, Any]:
+        return filter_numbers(self.config.filter)
 
-    def take_steps(
-        self, state: TrainState, order: Int[jax.Array, "p"], first: int, count: int, factor: float
-    ) -> tuple[TrainState, Progress]:
-        state, progress = train_steps(
-            state,
-            self.source,
-            order,
-            jnp.int32(first),
-            jnp.int32(count),
-            jnp.float32(factor),
-            self.keys.step,
-            **self.compiled_for,
-            steps_per_epoch=self.steps_per_epoch,
-        )
+    def trainable(self, variables: Any) -> Trainable:
+        return trainable(variables, self.config.through_filter.learn)
+
+    def order(self, key: PRNGKeyArray, epoch: int, source: SegmentSource) -> Int[jax.Array, "p"]:
+        """First rows of the segments."""
+        return random_starts(jax.random.fold_in(key, epoch), source)
+
+    def draw(
+        self, key: PRNGKeyArray, source: SegmentSource, which: Int[jax.Array, "b"]
+    ) -> tuple[Segment, StartErrors]:
+        """`draw_segments`, with `augment.yaw` each turned by a random yaw: the filter finds the
+        same path but for the turn, and the network sees windows of another heading."""
+        segments, errors = draw_segments(key, source, which, self.config)
+        if self.config.augment.yaw:
+            count, key = which.shape[0], jax.random.fold_in(key, 1)
+            angles = jax.random.uniform(key, (count,), jnp.float64, -jnp.pi, jnp.pi)
+            segments = jax.vmap(turned_segment)(segments, angles)
+        return segments, errors
+
+    def losses(
+        self, variables: Any, batch: tuple[Segment, StartErrors], step: Int[jax.Array, ""]
+    ) -> BatchLosses:
+        """Means over the segments, those of several horizons over these too."""
+        segments, errors = batch
+        chex.assert_type([segments.gyro, segments.accel], jnp.float64)
+        ekf = filter_config(self.config, training=True)
+        found = filter_segments(variables, segments, errors, self.model, self.config, ekf)
+        means = {name: jnp.mean(each) for name, each in found.losses._asdict().items()}
+        figures = {"loss": means.pop("total"), "mse": means.pop("window"), **means}
+        return BatchLosses(figures, variables["batch_stats"], jnp.all(found.healthy))
+
+    def take_steps(self, *given: Any) -> tuple[TrainState, Progress]:
+        state, progress = super().take_steps(*given)
         if len(jax.devices()) > 1:
             # Where the segments were shared out, the state now lies on all devices, and the next
             # step would be compiled once more for that.
             state = jax.tree.map(parallel.fresh_copy, state)
         return state, progress
 
-    def with_statistics(self, state: TrainState) -> TrainState:
-        """As it is: the statistics of batch normalisation are frozen."""
-        return state
-
-    def validate(self, state: TrainState, step: int) -> tuple[TrainState, Row]:
+    def validate(
+        self, state: TrainState, held_out: SegmentSource, key: PRNGKeyArray
+    ) -> tuple[TrainState, Row]:
         """The loss is infinite where the filter diverges."""
-        found = validate(state, self.held_out, self.keys.statistics, **self.compiled_for)
+        found = validate(state, held_out, key, task=self)
         losses = jax.device_get(found.losses)
         sound = bool(found.healthy) and math.isfinite(losses.total)
-        return state, {
+        row: Row = {
             "val_loss": float(losses.total) if sound else math.inf,
             "val_mse": float(losses.window),
             "val_rmse": math.sqrt(losses.window),
             "val_innovation": float(losses.innovation),
             "val_state": float(losses.state),
-            **_by_horizon("val_displacement_error", losses.displacement),
-            **_by_horizon("val_yaw_error", losses.yaw),
-            "val_nis": float(found.nis),
-            "val_nees": float(found.nees),
         }
+        # Roots of the squared errors of each horizon: shares of the distance, rad per metre.
+        for name in ("displacement", "yaw"):
+            for seconds, square in zip(HORIZON_SECONDS, getattr(losses, name), strict=False):
+                row[f"val_{name}_error/{seconds:g}s"] = math.sqrt(square)
+        return state, row | {"val_nis": float(found.nis), "val_nees": float(found.nees)}
 
     def remark(self, row: Row) -> str:
         skipped = f"{row['skipped']} skipped  " if row["skipped"] else ""
         return f"nis/3 {row['val_nis']:.2f}  nees/3 {row['val_nees']:.2f}  {skipped}"
-
-
-def _by_horizon(name: str, squares: np.ndarray) -> Row:
-    """Roots of the squared errors of each horizon: shares of the distance, rad per metre."""
-    seconds = HORIZON_SECONDS[: len(squares)]
-    both = zip(seconds, squares, strict=True)
-    return {f"{name}/{each:g}s": math.sqrt(square) for each, square in both}
-
-
-def set_up(config: TrainConfig, reporter: Reporter, workers: int = 1) -> FilterTask:
-    """Load the recordings and find the segments in them.
-
-    Raises `InputError` for options that the network does not have, missing data, recordings that
-    are too short, and a batch that is larger than the split. `workers` processes read recordings
-    that are slow to read.
-    """
-    model = window_task.create_model(config)  # mistakes in its options do not wait for the data
-    train, val = config.data.train_split, config.data.val_split
-    reporter.line(f"reading {config.dataset}: {train} and {val}")
-
-    def segments(split: str) -> tuple[SegmentSource, list[str]]:
-        samples: dict[str, int] = {}
-        sequences = window_task.read_split(config, split, reporter, workers, samples)
-        source = segment_source(sequences, intervals(config) * config.data.stride)
-        contents = f"{source.earliest.shape[0]:,} segments"
-        reporter.line(window_task.described_split(config, split, samples, contents))
-        return jax.device_put(source), list(samples)
-
-    source, trained = segments(train)
-    held_out, validated = segments(val)
-    splits = {train: trained, val: validated}
-    steps = window_task.steps_in_epoch(source.earliest.shape[0], "segments", config)
-    return FilterTask(config, model, source, held_out, splits, steps)

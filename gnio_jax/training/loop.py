@@ -3,12 +3,12 @@ checkpoints."""
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import signal
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,11 +19,12 @@ from gnio_jax import parallel
 from gnio_jax.config import TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.reporting import Lines, Reporter, Silence
-from gnio_jax.training import checkpoint, filter_task, optimizer, run_folder, window_task
+from gnio_jax.training import checkpoint, optimizer, run_folder
 from gnio_jax.training.checkpoint import Checkpoints, Position, Run, load_run
 from gnio_jax.training.filter_task import FilterTask
 from gnio_jax.training.run_folder import Log
-from gnio_jax.training.window_task import Progress, Row, WindowTask
+from gnio_jax.training.task import Progress, Recordings, Row, Task, keys_of, set_up
+from gnio_jax.training.window_task import WindowTask
 
 DISPATCH_SECONDS = 0.5
 """Steps are dispatched in runs of about this long: few round trips, and still a lively progress bar
@@ -32,8 +33,6 @@ CHECKPOINT_SECONDS = 600.0
 """Longest time between checkpoints within an epoch; every epoch ends with one anyway."""
 NO_GRADIENT = 1e-9
 """Norm of a gradient, mean of an epoch, of which Adam, whose ε is 1e-8, makes next to no step."""
-
-Task = WindowTask | FilterTask
 
 
 class Outcome(NamedTuple):
@@ -117,7 +116,7 @@ def _train_all(
     if through_filter and jax.process_count() > 1:
         problem = "runs in one process, on all of its devices"
         raise InputError("training through the filter", problem, "start one process")
-    module = filter_task if through_filter else window_task
+    kind = FilterTask if through_filter else WindowTask
     # Segments are shared out by `filtering.over_sequences`, not as a batch of windows is. Whatever
     # the process has set: no float64 but for the filter.
     sharers = 1 if through_filter else devices
@@ -125,9 +124,10 @@ def _train_all(
     with jax.enable_x64(through_filter), parallel.sharing(sharers), _stop_signals() as stop:
         resumed = all(resumes) and all(map(checkpoint.exists, workdirs))
         start = None if resumed else run_folder.initial_run(configs[0], load_initial)
-        task = module.set_up(configs[0], reporter, workers)
+        task, recordings = set_up(kind, configs[0], reporter, workers)
         train_split, val_split = configs[0].data.train_split, configs[0].data.val_split
-        both = sorted(set(task.splits[train_split]) & set(task.splits[val_split]))
+        splits = recordings.splits
+        both = sorted(set(splits[train_split]) & set(splits[val_split]))
         if both:
             reporter.line(
                 f"warning: {', '.join(both[:3])}{' ...' if both[3:] else ''} in {train_split} and "
@@ -135,23 +135,30 @@ def _train_all(
                 "on; separate the two splits"
             )
         for config, resume in zip(configs, resumes, strict=True):
-            outcomes.append(
-                _train(dataclasses.replace(task, config=config), start, resume, stop, reporter)
-            )
+            outcomes.append(_train(task, recordings, config, start, resume, stop, reporter))
             if stop.signum and len(outcomes) < len(configs):
                 outcomes[-1] = outcomes[-1]._replace(stopped_by=stop.signum)  # others are missing
                 break
     return outcomes
 
 
-def _train(task: Task, start: Run | None, resume: bool, stop: _Stop, reporter: Reporter) -> Outcome:
+def _train(
+    task: Task,
+    recordings: Recordings,
+    config: TrainConfig,
+    start: Run | None,
+    resume: bool,
+    stop: _Stop,
+    reporter: Reporter,
+) -> Outcome:
     """One run, to its end or until a signal."""
-    optim, steps = task.config.optim, task.steps_per_epoch
-    state, at = task.initial_state(start and start.variables), Position()
-    with run_folder.opened(task.config, task.splits, resume) as workdir:
-        run_folder.compare_processes(
-            task.config, task.splits, (task.source, task.held_out), state.variables
-        )
+    optim, steps, keys = config.optim, task.steps_per_epoch, keys_of(config.seed)
+    with_statistics = partial(task.with_statistics, source=recordings.source, key=keys.statistics)
+    # Copies: steps take the memory of their state, and the next seed starts from `start` too.
+    state = parallel.everywhere(task.initial_state(keys.init, start and start.variables))
+    at = Position()
+    with run_folder.opened(config, recordings.splits, resume) as workdir:
+        run_folder.compare_processes(config, recordings, state.variables)
         for line in task.description(state, workdir):
             reporter.line(line)
         with Checkpoints(workdir) as checkpoints:
@@ -161,12 +168,19 @@ def _train(task: Task, start: Run | None, resume: bool, stop: _Stop, reporter: R
             with Log(workdir, at.epoch, at.step) as log:
                 saved = time.perf_counter()
                 for epoch in range(at.epoch, optim.epochs):
-                    order, end = task.order(epoch), (epoch + 1) * steps
+                    order = task.order(keys.order, epoch, recordings.source)
+                    end = (epoch + 1) * steps
                     began, before, first, dispatch, rate = time.perf_counter(), at, at.step, 1, 0.0
                     while at.step < end:
                         count, tick = min(dispatch, end - at.step), time.perf_counter()
                         state, progress = task.take_steps(
-                            state, order, at.step - epoch * steps, count, at.plateau.factor
+                            state,
+                            recordings.source,
+                            order,
+                            at.step - epoch * steps,
+                            count,
+                            at.plateau.factor,
+                            keys.step,
                         )
                         at = _after_steps(at, count, jax.device_get(progress), workdir)
                         clock = time.perf_counter()
@@ -183,12 +197,14 @@ def _train(task: Task, start: Run | None, resume: bool, stop: _Stop, reporter: R
                             "training", at.step / (optim.epochs * steps), _figures(task, at, rate)
                         )
                         if at.step < end and (due or signum):
-                            checkpoints.save("latest", task.with_statistics(state), at)
+                            checkpoints.save("latest", with_statistics(state), at)
                             saved = clock
                         if at.step < end and signum:
                             stop.signum = signum
                             return Outcome(workdir, at.best, signum)
-                    state, validation = task.validate(task.with_statistics(state), at.step)
+                    state, validation = task.validate(
+                        with_statistics(state), recordings.held_out, keys.statistics
+                    )
                     row = _row(task, at, validation, rate)
                     improved, at = _after_epoch(task, at, row)
                     log.add(row)

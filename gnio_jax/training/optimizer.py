@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import jax
 import optax
 
-from gnio_jax.config import LossConfig, OptimConfig
+from gnio_jax.config import LossConfig, OptimConfig, TrainConfig
 from gnio_jax.training.losses import switches
 
 END_LEARNING_RATE = 1e-6
@@ -72,13 +72,15 @@ def adam(
     return optax.with_extra_args_support(optax.chain(*parts))
 
 
-def adam_through_filter(config: OptimConfig) -> optax.GradientTransformationExtraArgs:
-    """`adam` for the network's parameters, and one for the filter's numbers, which do not decay.
-    The gradient of each is clipped apart."""
-    of_filter = dataclasses.replace(config, weight_decay=0.0)
+def create(config: TrainConfig, steps_per_epoch: int) -> optax.GradientTransformationExtraArgs:
+    """The optimizer of what is trained, by collection: `adam` for the network's parameters, and
+    through the filter one for the filter's numbers, which do not decay. The gradient of each is
+    clipped apart."""
+    if not config.through_filter.learn:
+        return adam(config.optim, config.loss, steps_per_epoch)
     each = {
-        "params": adam(config, LossConfig(), 1),
-        "filter": adam(of_filter, LossConfig(), 1),
+        "params": adam(config.optim, LossConfig(), 1),
+        "filter": adam(dataclasses.replace(config.optim, weight_decay=0.0), LossConfig(), 1),
     }
     return optax.partition(
         each,
@@ -86,11 +88,21 @@ def adam_through_filter(config: OptimConfig) -> optax.GradientTransformationExtr
     )
 
 
-def _labels_of_modules(params: Any) -> Any:
-    def label(path: tuple, _: jax.Array) -> str:
-        return "held" if path[0].key in UNCERTAINTY else "learns"
+def learning_rates(config: TrainConfig, steps_per_epoch: int) -> dict[str, optax.Schedule]:
+    """The schedule of each collection that may be trained."""
+    ratio = config.through_filter.filter_learning_rate / config.optim.learning_rate
+    return {
+        "params": schedule(config.optim, steps_per_epoch),
+        "filter": schedule(config.optim, steps_per_epoch, ratio),
+    }
 
-    return jax.tree_util.tree_map_with_path(label, params)
+
+def _labels_of_modules(trained: Any) -> Any:
+    def label(path: tuple, _: jax.Array) -> str:
+        _, module, *_ = path
+        return "held" if module.key in UNCERTAINTY else "learns"
+
+    return jax.tree_util.tree_map_with_path(label, trained)
 
 
 class Plateau(NamedTuple):

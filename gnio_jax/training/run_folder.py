@@ -27,7 +27,7 @@ from gnio_jax.config import TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.files import write_text
 from gnio_jax.training.checkpoint import Run
-from gnio_jax.training.window_task import Row, create_model
+from gnio_jax.training.task import Recordings, Row, create_model
 
 MAY_CHANGE = ("workdir", "data_root", "init_from")
 """Settings that a resumed run may change: where things lie, not what is computed."""
@@ -119,9 +119,7 @@ def _refuse_other_recordings(path: Path, splits: dict[str, list[str]]) -> None:
             raise InputError(path, problem, "resume with the same data")
 
 
-def compare_processes(
-    config: TrainConfig, splits: dict[str, list[str]], recordings: Any, variables: Any
-) -> None:
+def compare_processes(config: TrainConfig, recordings: Recordings, variables: Any) -> None:
     """Raise `InputError` in every process unless all have the same settings, recordings and weights
     to begin with: other ones would compute something else, or wait for each other for ever.
 
@@ -137,7 +135,11 @@ def compare_processes(
     settings = {k: v for k, v in dataclasses.asdict(config).items() if k not in MAY_CHANGE}
     for what, value, remedy in (
         ("settings", settings, "start all with the same options, also --config"),
-        ("recordings", (splits, sampled(recordings)), "give all of them the same data"),
+        (
+            "recordings",
+            (recordings.splits, sampled(recordings[:2])),
+            "give all of them the same data",
+        ),
         ("weights to begin with", sampled(variables), "give all the same run in --init-from"),
     ):
         digest = hashlib.sha256(repr(value).encode()).digest()

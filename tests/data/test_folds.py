@@ -10,7 +10,7 @@ from gnio_jax.config import DataConfig, TrainConfig
 from gnio_jax.data import loading
 from gnio_jax.errors import InputError
 from gnio_jax.reporting import Lines
-from gnio_jax.training import window_task
+from gnio_jax.training.task import read_split
 from gnio_jax.types import Sequence
 
 
@@ -63,7 +63,7 @@ def test_a_split_may_be_a_fold_or_all_but_that(monkeypatch, number):
 def test_training_reads_the_fold_that_its_split_names(monkeypatch):
     monkeypatch.setattr(loading, "read_split", lambda *_: iter(RECORDINGS))
     config = TrainConfig(data=DataConfig(rate=50.0, train_split="train-1of3"))
-    read = [s.name for s in window_task.read_split(config, "train-1of3", Lines(), 1, {})]
+    read = [s.name for s in read_split(config, "train-1of3", Lines(), 1, {})]
     assert read == [s.name for s in data.load("synthetic", None, "train-1of3")]
     assert 0 < len(read) < len(RECORDINGS)
 

@@ -14,7 +14,7 @@ from gnio_jax import models
 from gnio_jax.config import AugmentConfig, ModelConfig, TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.models import equivariance
-from gnio_jax.training.window_task import create_model
+from gnio_jax.training.task import create_model
 from tests.support.compiling import quick
 
 SAMPLES = 32

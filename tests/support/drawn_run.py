@@ -8,7 +8,7 @@ import numpy as np
 from gnio_jax import config as configuration
 from gnio_jax import models
 from gnio_jax.training import checkpoint
-from gnio_jax.training.window_task import TrainState, create_model
+from gnio_jax.training.task import TrainState, create_model
 
 
 def save(folder, config, draw):

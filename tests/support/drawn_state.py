@@ -6,14 +6,12 @@ import functools
 import jax
 import numpy as np
 
-from gnio_jax.training import optimizer, window_task
+from gnio_jax.training.window_task import WindowTask
 
 
 def fresh_state(model, config, steps_per_epoch, key):
     """As a task on windows begins."""
-    state = window_task.initial_state(model, key, config.data.seen)
-    adam = optimizer.adam(config.optim, config.loss, steps_per_epoch)
-    return state._replace(opt_state=adam.init(state.params))
+    return WindowTask(model, config, steps_per_epoch).initial_state(key, None)
 
 
 def drawn_state(model, config, steps_per_epoch):

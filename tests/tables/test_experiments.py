@@ -7,7 +7,7 @@ import pytest
 from gnio_jax import config as configuration
 from gnio_jax.config import LossConfig
 from gnio_jax.tables import experiments
-from gnio_jax.training.window_task import create_model
+from gnio_jax.training.task import create_model
 from tests.support.tables import BASE
 
 

@@ -10,9 +10,10 @@ import pytest
 
 from gnio_jax.config import DataConfig, ModelConfig, OptimConfig, TrainConfig
 from gnio_jax.data.windows import WindowSource
-from gnio_jax.training import window_task
+from gnio_jax.training import task, window_task
 from gnio_jax.training.losses import loss_stage
-from gnio_jax.training.window_task import create_model
+from gnio_jax.training.task import create_model
+from gnio_jax.training.window_task import WindowTask
 from tests.support.compiling import quick
 from tests.support.drawn_state import fresh_state
 from tests.support.tiny_network import Tiny
@@ -52,16 +53,14 @@ def test_a_step_of_training_and_a_validation():
     """Other windows, another order, more steps, another learning rate, another stage."""
     with jax.enable_x64(False):
         model = Tiny()  # a trace of another is no different
-        fixed = dict(model=model, config=CONFIG)
-        names = ("model", "config", "steps_per_epoch")
-        train = once(window_task.train_steps, static_argnames=names)
-        validate = once(window_task.validate, static_argnames=names[:2])
-        train = functools.partial(train, **fixed, steps_per_epoch=WINDOWS // 2)
-        validate = functools.partial(validate, **fixed)
+        training = WindowTask(model, CONFIG, WINDOWS // 2)
+        train = functools.partial(once(task.train_steps, static_argnames="task"), task=training)
+        validate = once(window_task.validate, static_argnames="task")
+        validate = functools.partial(validate, task=training)
         state = fresh_state(model, CONFIG, WINDOWS // 2, jax.random.key(0))
         for epoch, (first, count, factor) in enumerate([(0, 1, 1.0), (1, 2, 0.5)]):
             windows = source(epoch)
-            order = window_task.epoch_order(jax.random.key(1), epoch, windows)
+            order = training.order(jax.random.key(1), epoch, windows)
             numbers = jnp.int32(first), jnp.int32(count), jnp.float32(factor)
             state, progress = train(state, windows, order, *numbers, jax.random.key(2))
             found = validate(state, windows, loss_stage(CONFIG.loss, state.step, WINDOWS // 2))

@@ -14,7 +14,7 @@ import pytest
 from gnio_jax.errors import InputError
 from gnio_jax.training.checkpoint import Checkpoints, Position
 from gnio_jax.training.run_folder import Log
-from gnio_jax.training.window_task import TrainState
+from gnio_jax.training.task import TrainState
 
 
 def state(step):

@@ -22,8 +22,10 @@ from gnio_jax.config import DataConfig, LossConfig, ModelConfig, OptimConfig, Tr
 from gnio_jax.data import windows
 from gnio_jax.errors import InputError
 from gnio_jax.models import registry
-from gnio_jax.training import checkpoint, loop, optimizer, run_folder, window_task
+from gnio_jax.training import checkpoint, loop, optimizer, run_folder, task, window_task
 from gnio_jax.training.losses import Losses
+from gnio_jax.training.window_task import WindowTask
+from tests.support.drawn_state import fresh_state
 from tests.support.tiny_network import Tiny
 from tests.support.tlio_files import write_splits
 
@@ -149,7 +151,7 @@ def test_stopping_within_an_epoch_and_resuming_gives_the_same_bits(
     recording, finished, tmp_path, monkeypatch, dispatches
 ):
     calls = []
-    real = window_task.train_steps
+    real = task.train_steps
 
     def stopping(*arguments, **options):
         calls.append(1)
@@ -157,7 +159,7 @@ def test_stopping_within_an_epoch_and_resuming_gives_the_same_bits(
             os.kill(os.getpid(), signal.SIGTERM)
         return real(*arguments, **options)
 
-    monkeypatch.setattr(window_task, "train_steps", stopping)
+    monkeypatch.setattr(task, "train_steps", stopping)
     monkeypatch.setattr(loop, "DISPATCH_SECONDS", 0.01)
     outcome = loop.train(tiny(recording, tmp_path / "run"))
     assert outcome.stopped_by == signal.SIGTERM
@@ -262,7 +264,7 @@ def test_a_loss_that_is_not_finite_stops_with_its_step(recording, tmp_path, monk
         loop.train(config)
     order_key = jax.random.split(jax.random.key(config.seed), 3)[1]
     expected = (
-        int(np.flatnonzero(np.asarray(window_task.epoch_order(order_key, 0, found[0])) == 77)[0])
+        int(np.flatnonzero(np.asarray(WindowTask.order(None, order_key, 0, found[0])) == 77)[0])
         // 16
     )
     assert f"at step {expected} " in str(raised.value)
@@ -309,7 +311,7 @@ def test_two_stage_loss_without_float64(recording, tmp_path, monkeypatch):
 
         return spying
 
-    monkeypatch.setattr(window_task, "train_steps", spy(window_task.train_steps))
+    monkeypatch.setattr(task, "train_steps", spy(task.train_steps))
     monkeypatch.setattr(window_task, "validate", spy(window_task.validate))
     loop.train(
         tiny(
@@ -320,7 +322,7 @@ def test_two_stage_loss_without_float64(recording, tmp_path, monkeypatch):
         )
     )
     key = jax.random.split(jax.random.key(0), 3)[0]
-    template = window_task.initial_state(Tiny(), key, 50)
+    template = fresh_state(Tiny(), tiny(recording, ""), 1, key)
     trained = parameters(tmp_path / "run")["params"]
     assert same(trained["uncertainty"], jax.tree.map(np.asarray, template.params["uncertainty"]))
     assert not same(trained["head"], jax.tree.map(np.asarray, template.params["head"]))
@@ -397,8 +399,8 @@ def test_a_gradient_that_is_not_finite_leaves_the_last_good_checkpoint(
     real, size, steps = window_task.window_source, 16, 13
 
     def orders(seed, source):
-        key = window_task.keys_of(seed).order
-        return [np.asarray(window_task.epoch_order(key, epoch, source)) for epoch in (0, 1)]
+        key = task.keys_of(seed).order
+        return [np.asarray(WindowTask.order(None, key, epoch, source)) for epoch in (0, 1)]
 
     def spoiled(sequences, *options):
         """A window that epoch 0 does not visit, and epoch 1 visits last, sees rows of its own."""
@@ -442,13 +444,13 @@ class Counted:
 
     def __init__(self, monkeypatch, figures):
         self.figures, self.factors = iter(figures), []
-        monkeypatch.setattr(window_task, "train_steps", self.train_steps)
+        monkeypatch.setattr(task, "train_steps", self.train_steps)
         monkeypatch.setattr(window_task, "validate", self.validate)
 
     def train_steps(self, state, source, order, first, count, factor, *_, **__):
         self.factors.append(float(factor))
         sums = dict.fromkeys(("loss", "mse", "nll"), jnp.float32(0))
-        return state._replace(step=state.step + count), window_task.Progress(sums, jnp.int32(-1))
+        return state._replace(step=state.step + count), task.Progress(sums, jnp.int32(-1))
 
     def validate(self, *_, **__):
         loss, mse = next(self.figures)
@@ -600,8 +602,8 @@ def test_parameters_that_are_not_finite_are_not_loaded(finished, tmp_path):
 
 def test_a_second_run_compiles_nothing(recording, finished, tmp_path):
     """Of the same settings with another seed, in the same process."""
-    programs = window_task.train_steps._cache_size(), window_task.validate._cache_size()
+    programs = task.train_steps._cache_size(), window_task.validate._cache_size()
     optim = dataclasses.replace(tiny(recording, "").optim)
     loop.train(tiny(recording, tmp_path / "run", seed=4, optim=optim))
-    after = window_task.train_steps._cache_size(), window_task.validate._cache_size()
+    after = task.train_steps._cache_size(), window_task.validate._cache_size()
     assert after == programs

@@ -9,10 +9,12 @@ import optax
 import pytest
 
 from gnio_jax.config import LossConfig, ModelConfig, OptimConfig, TrainConfig
+from gnio_jax.data.windows import WindowSource
 from gnio_jax.models.heads import CalibratedUncertainty
 from gnio_jax.training import losses, optimizer, window_task
 from gnio_jax.training.losses import Losses
-from gnio_jax.training.window_task import TrainState, Validation, calibrated, isotropic
+from gnio_jax.training.task import TrainState
+from gnio_jax.training.window_task import Validation, calibrated, isotropic
 from gnio_jax.types import Prediction, Windows
 from tests.support.tiny_network import Tiny
 
@@ -275,8 +277,10 @@ def test_constants_of_an_equivariant_network_are_the_same_along_both_axes(
     found = Validation(Losses(*[jnp.float32(0)] * 3), errors, errors)
     monkeypatch.setattr(window_task, "validate", lambda *_, **__: found)
     config = TrainConfig(model=ModelConfig(equivariance=equivariance))
-    task = window_task.WindowTask(config, Tiny(), None, None, {}, 7)
-    constants = task.validate(state, 7)[0].batch_stats["uncertainty"]["log_std"]
+    task = window_task.WindowTask(Tiny(), config, 7)
+    held_out = WindowSource(*[jnp.zeros(0)] * len(WindowSource._fields))
+    kept, _ = task.validate(state, held_out, jax.random.key(0))
+    constants = kept.batch_stats["uncertainty"]["log_std"]
     wanted = [1.0, 4.0, 9.0] if equivariance == "none" else [2.5, 2.5, 9.0]
     np.testing.assert_allclose(np.exp(2 * constants), wanted, rtol=1e-6)
     np.testing.assert_allclose(isotropic(found).axis_normalised, [2.5, 2.5, 9.0], rtol=1e-6)
@@ -316,7 +320,7 @@ def test_a_held_uncertainty_is_not_counted(held_loss):
     params = {
         part: {"w": jnp.array([1.0, -2.0, 3.0], jnp.float32)} for part in ("encoder", "log_std")
     }
-    state, update = tx.init(params), jax.jit(tx.update)
+    state, update = tx.init({"params": params}), jax.jit(tx.update)
     expected = {part: [np.array([1.0, -2.0, 3.0]), np.zeros(3), np.zeros(3), 0] for part in params}
     rng = np.random.default_rng(0)
     for step in range(12):
@@ -327,12 +331,12 @@ def test_a_held_uncertainty_is_not_counted(held_loss):
             for part in params
         }
         change, state = update(
-            jax.tree.map(lambda g: {"w": jnp.asarray(g, jnp.float32)}, gradient),
+            {"params": {name: {"w": jnp.float32(g)} for name, g in gradient.items()}},
             state,
-            params,
+            {"params": params},
             log_std_learns=jnp.bool_(not held),
         )
-        params = optax.apply_updates(params, optax.tree.scale(-rate(step), change))
+        params = optax.apply_updates(params, optax.tree.scale(-rate(step), change["params"]))
         for part, (w, m, v, count) in expected.items():
             if held and part == "log_std":
                 continue

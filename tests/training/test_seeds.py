@@ -17,7 +17,7 @@ from gnio_jax.config import DataConfig, ModelConfig, OptimConfig, TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.models import registry
 from gnio_jax.reporting import Silence
-from gnio_jax.training import checkpoint, loop, window_task
+from gnio_jax.training import checkpoint, loop, task
 from tests.support.command_lines import run as gnio
 from tests.support.tiny_network import Tiny
 from tests.support.tlio_files import write_splits
@@ -96,9 +96,9 @@ def assert_same_runs(workdirs, others, rtol):
 def test_every_seed_is_an_ordinary_run(config, alone, tmp_path):
     """Its folder, its settings, its parameters to the bit; recordings are read and steps compiled
     once."""
-    told, programs = Told(), window_task.train_steps._cache_size()
+    told, programs = Told(), task.train_steps._cache_size()
     outcomes = loop.train_seeds(at(config, tmp_path / "run"), SEEDS, reporter=told)
-    assert window_task.train_steps._cache_size() == programs
+    assert task.train_steps._cache_size() == programs
     assert [outcome.workdir.name for outcome in outcomes] == ["run_s3", "run_s0", "run_s7"]
     for seed, outcome in zip(SEEDS, outcomes, strict=True):
         kept = configuration.load(outcome.workdir / "config.yaml")
@@ -116,7 +116,7 @@ def test_every_seed_is_an_ordinary_run(config, alone, tmp_path):
 
 def test_a_signal_saves_the_run_and_the_seeds_go_on(config, alone, tmp_path, monkeypatch):
     """Stopped within an epoch of the second seed, and once more at the end of it."""
-    real = window_task.train_steps
+    real = task.train_steps
 
     def stopping(state, *given, **options):
         state, progress = real(state, *given, **options)
@@ -135,7 +135,7 @@ def test_a_signal_saves_the_run_and_the_seeds_go_on(config, alone, tmp_path, mon
     workdirs = [Path(each.workdir) for each in configuration.with_seeds(config, SEEDS)]
     with monkeypatch.context() as patch:
         patch.setattr(loop, "DISPATCH_SECONDS", 0)
-        patch.setattr(window_task, "train_steps", stopping)
+        patch.setattr(task, "train_steps", stopping)
         patch.setattr(loop.run_folder, "opened", noted)
         outcomes = loop.train_seeds(config, SEEDS)
         assert [outcome.stopped_by for outcome in outcomes] == [None, signal.SIGTERM]
@@ -157,9 +157,9 @@ def test_a_signal_saves_the_run_and_the_seeds_go_on(config, alone, tmp_path, mon
 def test_a_loss_that_is_not_finite_names_its_run(config, tmp_path, monkeypatch):
     def failing(state, source, order, first, count, *_, **__):
         sums = dict.fromkeys(("loss", "mse", "nll"), jnp.float32(0))
-        return state, window_task.Progress(sums, jnp.int32(5))
+        return state, task.Progress(sums, jnp.int32(5))
 
-    monkeypatch.setattr(window_task, "train_steps", failing)
+    monkeypatch.setattr(task, "train_steps", failing)
     with pytest.raises(FloatingPointError, match=r"run_s3: the loss .* at step 5 "):
         loop.train_seeds(at(config, tmp_path / "run"), SEEDS)
 

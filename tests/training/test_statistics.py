@@ -12,8 +12,9 @@ import pytest
 from gnio_jax import data, models
 from gnio_jax.config import DataConfig, LossConfig, ModelConfig, OptimConfig, TrainConfig
 from gnio_jax.data import windows
-from gnio_jax.training import losses, window_task
-from gnio_jax.training.window_task import create_model
+from gnio_jax.training import losses, task, window_task
+from gnio_jax.training.task import create_model
+from gnio_jax.training.window_task import WindowTask
 from tests.support import tiny_run
 from tests.support.compiling import lightly_optimised, quick
 from tests.support.drawn_state import drawn_state, fresh_state
@@ -33,7 +34,7 @@ FEW = dataclasses.replace(
 """With statistics of three batches."""
 
 NAMES = ("model", "config", "steps_per_epoch")
-STEPS = lightly_optimised(window_task.train_steps.__wrapped__, static_argnames=NAMES)
+STEPS = lightly_optimised(task.train_steps.__wrapped__, static_argnames="task")
 CREATE = quick(fresh_state, static_argnames=NAMES)
 
 
@@ -78,7 +79,7 @@ def trainer(config, source, seed=0):
 
     @functools.cache
     def order(epoch):
-        return window_task.epoch_order(key, epoch, source)
+        return WindowTask.order(None, key, epoch, source)
 
     def take(state, epoch, first, count):
         with jax.enable_x64(False):
@@ -90,9 +91,7 @@ def trainer(config, source, seed=0):
                 jnp.int32(count),
                 jnp.float32(1),
                 key,
-                model=create_model(config),
-                config=config,
-                steps_per_epoch=steps,
+                task=WindowTask(create_model(config), config, steps),
             )
 
     return take, steps
@@ -121,7 +120,7 @@ def estimated(model, state, source, config=CONFIG, key=0):
         key = jax.random.key(key)
         order = window_task.statistics_order(key, source, config)
         return window_task.estimate_statistics(
-            state, source, order, key, model=model, config=config
+            state, source, order, key, task=WindowTask(model, config, 1)
         )
 
 
@@ -140,7 +139,7 @@ def squared_errors(model, state, source, config=CONFIG):
 
     @jax.jit
     def one(state, key, which):
-        drawn, dropout = window_task.draw_windows(key, source, which, config)
+        drawn, dropout = WindowTask(model, config, 1).draw(key, source, which)
         variables = {"params": state.params, "batch_stats": state.batch_stats}
         training, _ = model.apply(
             variables, drawn.imu, train=True, mutable=["batch_stats"], rngs={"dropout": dropout}
@@ -174,12 +173,12 @@ def test_statistics_are_means_over_batches(trained):
     kernel = np.asarray(state.params["encoder"]["stem_conv"]["kernel"], np.float64)
     order_key, draw_key = jax.random.split(jax.random.key(7))
     order = np.asarray(jax.random.permutation(order_key, source.visited))[: 3 * 64].reshape(3, 64)
-    draw = jax.jit(window_task.draw_windows, static_argnames="config")
+    draw = jax.jit(WindowTask(model, FEW, 1).draw)
     means, variances = [], []
     for number, which in enumerate(order):
         with jax.enable_x64(False):
             imu = np.asarray(
-                draw(jax.random.fold_in(draw_key, number), source, jnp.asarray(which), FEW)[0].imu,
+                draw(jax.random.fold_in(draw_key, number), source, jnp.asarray(which))[0].imu,
                 np.float64,
             )
         padded = np.pad(imu, ((0, 0), (3, 3), (0, 0)))
@@ -243,22 +242,25 @@ def test_the_uncertainty_fits_the_errors_after_training(trained):
         with jax.enable_x64(False):
             state = estimated(model, state, source)
             said = window_task.validate(
-                state, held_out, losses.loss_stage(CONFIG.loss, 0, 1), model=model, config=CONFIG
+                state,
+                held_out,
+                losses.loss_stage(CONFIG.loss, 0, 1),
+                task=WindowTask(model, CONFIG, 1),
             )
         found.append(said.axis_normalised)
     typical = np.exp(np.mean(np.log(found), axis=0))
     assert np.all((typical > 0.5) & (typical < 2.5)), found
 
 
-@functools.partial(lightly_optimised, static_argnames=(*NAMES, "count"))
-def norms_of_the_head(state, source, orders, key, count, model, config, steps_per_epoch):
+@functools.partial(lightly_optimised, static_argnames=("count", "training"))
+def norms_of_the_head(state, source, orders, key, count, training):
     """The norm of its gradient in each of the first `count` steps: (count,)."""
 
     def one_step(state, number):
-        order, first = orders[number // steps_per_epoch], number % steps_per_epoch
+        steps = training.steps_per_epoch
+        order, first = orders[number // steps], number % steps
         given = state, source, order, first, jnp.int32(1), jnp.float32(1), key
-        options = {"model": model, "config": config, "steps_per_epoch": steps_per_epoch}
-        state, progress = window_task.train_steps.__wrapped__(*given, **options)
+        state, progress = task.train_steps.__wrapped__(*given, task=training)
         return state, progress.sums["gradient_norm/uncertainty"]
 
     return jax.lax.scan(one_step, state, jnp.arange(count, dtype=jnp.int32))[1]
@@ -292,14 +294,14 @@ def test_no_spike_in_the_gradient_of_the_uncertainty(width, seeds, count):
         loss=LossConfig(outlier_sigmas=10.0),
         optim=optim,
     )
-    options = dict(zip(NAMES, (create_model(config), config, steps), strict=True))
+    training = WindowTask(create_model(config), config, steps)
     for seed in seeds:
         _, state = fresh(config, source, seed)
         with jax.enable_x64(False):
             key = jax.random.key(seed)
             epochs = range(-(-count // steps))
-            orders = np.stack([window_task.epoch_order(key, epoch, source) for epoch in epochs])
-            norms = np.asarray(norms_of_the_head(state, source, orders, key, count, **options))
+            orders = np.stack([training.order(key, epoch, source) for epoch in epochs])
+            norms = np.asarray(norms_of_the_head(state, source, orders, key, count, training))
         assert norms.max() < 100 * np.median(norms), (seed, norms.max(), np.median(norms))
 
 

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from gnio_jax import config as configuration
+from gnio_jax import parallel
 from gnio_jax.commands.options import Call, read
 from gnio_jax.commands.train import experiment, train
 from gnio_jax.config import (
@@ -29,8 +30,9 @@ from gnio_jax.errors import InputError
 from gnio_jax.filtering.settings import with_free_parameters
 from gnio_jax.models import registry
 from gnio_jax.reporting import Lines
-from gnio_jax.training import checkpoint, filter_task, loop, run_folder, window_task
-from gnio_jax.training.filter_losses import FilterLosses
+from gnio_jax.training import checkpoint, filter_task, loop, run_folder, task
+from gnio_jax.training.filter_task import FilterTask
+from gnio_jax.training.window_task import WindowTask
 from tests.support import drawn_run
 from tests.support.command_lines import run as gnio
 from tests.support.compiling import quick
@@ -124,7 +126,10 @@ def test_a_run_logs_its_losses_and_what_the_filter_knows_of_its_errors(finished)
         assert row["skipped"] == 0 and row["segments_per_second"] > 0
         assert row["val_rmse"] == pytest.approx(row["val_mse"] ** 0.5)
         assert row["val_nis"] > 0 and row["val_nees"] > 0
-        assert row["gradient_norm/head"] > 0 and row["gradient_norm/filter/noise.gyro_density"] > 0
+        assert (
+            row["gradient_norm/head/bias"] > 0
+            and row["gradient_norm/filter/noise.gyro_density"] > 0
+        )
         val = row["val_mse"] + row["val_innovation"] + row["val_state"]
         val += row["val_displacement_error/1s"] ** 2 + row["val_yaw_error/1s"] ** 2
         assert row["val_loss"] == pytest.approx(val, rel=1e-6)
@@ -145,17 +150,17 @@ def test_what_is_not_to_learn_stays_to_the_bit(recording, finished):
 
 
 def test_stopped_and_resumed_gives_the_same_bits(recording, finished, tmp_path, monkeypatch):
-    real = filter_task.train_steps
+    real = task.train_steps
 
     def stopping(*arguments, **options):
         os.kill(os.getpid(), signal.SIGTERM)
         return real(*arguments, **options)
 
-    monkeypatch.setattr(filter_task, "train_steps", stopping)
+    monkeypatch.setattr(task, "train_steps", stopping)
     run = tmp_path / "run"
     assert loop.train(tiny(recording, run)).stopped_by == signal.SIGTERM
     assert checkpoint.load_run(run, "latest").step == 1
-    monkeypatch.setattr(filter_task, "train_steps", real)
+    monkeypatch.setattr(task, "train_steps", real)
     # The weights that it started from are not needed any more.
     resumed = tiny(recording, run, init_from="gone")
     assert loop.train(resumed, resume=True).stopped_by is None
@@ -198,10 +203,17 @@ def test_a_copy_with_other_options_has_them(finished, tmp_path):
 
 
 @pytest.fixture(scope="module")
-def training(recording, tmp_path_factory):
-    """The data and the steps of a run that is never written."""
+def training(recording):
+    """Task and segments of a run that is never written."""
     with jax.enable_x64(True):
-        return filter_task.set_up(tiny(recording, tmp_path_factory.mktemp("unused")), Lines())
+        found, recordings = task.set_up(FilterTask, tiny(recording, "unused"), Lines())
+    return found, recordings.source
+
+
+@pytest.fixture(scope="module")
+def start(recording):
+    """The variables that training starts from."""
+    return checkpoint.load_run(recording / "initial").variables
 
 
 def oracle(state):
@@ -215,33 +227,40 @@ def oracle(state):
     return state._replace(params=params)
 
 
-def new_state(training):
-    start = run_folder.initial_run(training.config, checkpoint.load_run)
-    return oracle(training.initial_state(start.variables))
+KEYS = task.keys_of(0)
 
 
-def test_each_seed_has_the_weights_of_the_run(training):
+def begun(training, start):
+    """The oracle at step 0, in memory of its own."""
+    return oracle(parallel.everywhere(training.initial_state(KEYS.init, start)))
+
+
+def take(training, state, source, first, count=1):
+    """Steps of an epoch as long as the task's, with the first five segments: compiled once."""
+    order = jnp.repeat(source.earliest[:5], 2)
+    return training.take_steps(state, source, order, first, count, 1.0, KEYS.step)
+
+
+def test_each_seed_has_the_weights_of_the_run(training, start):
     """The steps take the memory of their state; that of the weights, which the next seed starts
     from, is another."""
-    start = run_folder.initial_run(training.config, checkpoint.load_run)
-    state = training.initial_state(start.variables)
+    state = parallel.everywhere(training[0].initial_state(KEYS.init, start))
     for leaf in jax.tree.leaves(state):
         leaf.delete()
-    assert not any(leaf.is_deleted() for leaf in jax.tree.leaves(start.variables))
+    assert not any(leaf.is_deleted() for leaf in jax.tree.leaves(start))
 
 
-def test_wild_steps_are_skipped_and_counted(training):
+def test_wild_steps_are_skipped_and_counted(training, start):
     """A sample that is no number; a reference that jumps, whose gradient is finite and far too
     large."""
-    order = jnp.repeat(training.source.earliest[:5], 2)  # as long as an epoch: compiled once
-    first = int(order[0])
-    lost = training.source.accel.at[first + 30].set(np.nan)
-    jumps = training.source.position.at[first + 50 :].add(1e6)
+    training, source = training
+    first = int(source.earliest[0])
+    lost = source.accel.at[first + 30].set(np.nan)
+    jumps = source.position.at[first + 50 :].add(1e6)
     for spoiled in ({"accel": lost}, {"position": jumps}):
-        wild = dataclasses.replace(training, source=training.source._replace(**spoiled))
-        state = new_state(training)
+        state = begun(training, start)
         before = jax.tree.map(np.array, (state.variables, state.opt_state))
-        state, progress = wild.take_steps(state, order, 0, 1, 1.0)
+        state, progress = take(training, state, source._replace(**spoiled), 0)
         assert int(state.step) == 1 and int(progress.failed_step) == -1
         assert same(before, (state.variables, state.opt_state))
         assert progress.sums.pop("skipped") == 1
@@ -254,55 +273,49 @@ def test_wild_steps_are_skipped_and_counted(training):
     [(1, True, 1.0, 0), (2, False, 1.0, 1), (3, True, np.inf, 1)],
 )
 def test_a_step_is_skipped_where_the_filter_diverged_or_the_loss_is_infinite(
-    training, monkeypatch, number, healthy, total, skipped
+    training, start, monkeypatch, number, healthy, total, skipped
 ):
     """Whatever its gradient."""
+    training, source = training
 
-    def found(variables, trained, *_):
-        losses = FilterLosses(*[jnp.float64(0)] * len(FilterLosses._fields))
+    def found(trained, *_):
+        figures = dict.fromkeys(FilterTask.figures, jnp.float64(0)) | {"loss": jnp.float64(total)}
         gradient = jax.tree.map(jnp.ones_like, trained)
-        return gradient, losses._replace(total=jnp.float64(total)), jnp.bool_(healthy)
+        return gradient, task.BatchLosses(figures, state.batch_stats, jnp.bool_(healthy))
 
-    monkeypatch.setattr(filter_task, "gradient_of_segments", found)
+    monkeypatch.setattr(task, "gradient_of", found)
     optim = dataclasses.replace(training.config.optim, epochs=100 + number)  # compiled for itself
-    task = dataclasses.replace(training, config=dataclasses.replace(training.config, optim=optim))
-    order = jnp.repeat(training.source.earliest[:5], 2)
-    state = new_state(training)
+    other = dataclasses.replace(training, config=dataclasses.replace(training.config, optim=optim))
+    state = begun(training, start)
     before = jax.tree.map(np.array, (state.variables, state.opt_state))
-    state, progress = task.take_steps(state, order, 0, 1, 1.0)
+    state, progress = take(other, state, source, 0)
     assert progress.sums["skipped"] == skipped
     assert same(before, (state.variables, state.opt_state)) == bool(skipped)
 
 
-def test_a_skipped_step_does_not_shift_the_schedule(training):
+def test_a_skipped_step_does_not_shift_the_schedule(training, start):
     """The rate that the log gives for a step is the one that is in force, whatever was skipped
     before: the same step is taken after a skip."""
-    order = jnp.repeat(training.source.earliest[:5], 2)
+    training, source = training
     rates = [training.learning_rate(step) for step in range(4)]
     assert len(set(rates)) == 4
-    state = new_state(training)
-    lost = training.source.accel.at[:].set(np.nan)
-    wild = dataclasses.replace(training, source=training.source._replace(accel=lost))
-    skipped, _ = wild.take_steps(new_state(training), order, 0, 1, 1.0)
+    state, other = (begun(training, start) for _ in range(2))
+    lost = source._replace(accel=source.accel.at[:].set(np.nan))
+    skipped, _ = take(training, other, lost, 0)
     state = state._replace(step=jnp.int32(1))
-    taken = [training.take_steps(each, order, 1, 1, 1.0)[0] for each in (state, skipped)]
+    taken = [take(training, each, source, 1)[0] for each in (state, skipped)]
     assert same(taken[0].variables, taken[1].variables)
 
 
 def test_training_segments_are_turned_by_any_yaw(training):
-    starts = jnp.zeros(64, jnp.int32)
-    draw = jax.jit(filter_task.training_segments, static_argnames="config")
-    as_walked, turned = (
-        draw(
-            jax.random.key(0),
-            training.source,
-            starts,
-            config=dataclasses.replace(
-                training.config, augment=dataclasses.replace(training.config.augment, yaw=yaw)
-            ),
-        )
-        for yaw in (False, True)
-    )
+    training, source = training
+    found = []
+    for yaw in (False, True):
+        augment = dataclasses.replace(training.config.augment, yaw=yaw)
+        config = dataclasses.replace(training.config, augment=augment)
+        draw = jax.jit(dataclasses.replace(training, config=config).draw)
+        found.append(draw(jax.random.key(0), source, jnp.zeros(64, jnp.int32)))
+    as_walked, turned = found
     np.testing.assert_array_equal(as_walked[0].gyro, turned[0].gyro)
     np.testing.assert_array_equal(as_walked[1].velocity, turned[1].velocity)
     before, after = (np.asarray(found[0].truth.velocity[:, 0]) for found in (as_walked, turned))
@@ -312,39 +325,28 @@ def test_training_segments_are_turned_by_any_yaw(training):
     assert abs(np.exp(1j * angle).mean()) < 0.4  # all round the circle
 
 
-def test_no_call_to_lapack_waits_for_a_worker(training):
+def test_no_call_to_lapack_waits_for_a_worker(training, start):
     """Where each core is a device, its batched calls in the step deadlock."""
-    state = new_state(training)
-    order = training.source.earliest
-    lowered = filter_task.train_steps.trace(
-        state,
-        training.source,
-        jnp.resize(order, 10),
-        jnp.int32(0),
-        jnp.int32(1),
-        jnp.float32(1),
-        jax.random.key(0),
-        **training.compiled_for,
-        steps_per_epoch=2,
-    )
+    training, source = training
+    state, order = training.initial_state(KEYS.init, start), jnp.resize(source.earliest, 10)
+    numbers = jnp.int32(0), jnp.int32(1), jnp.float32(1)
+    lowered = task.train_steps.trace(state, source, order, *numbers, KEYS.step, task=training)
     assert "cholesky" not in str(lowered.jaxpr) and "triangular_solve" not in str(lowered.jaxpr)
 
 
-def test_noise_is_recovered(training):
+def test_noise_is_recovered(training, start):
     """In the four steps of a run, towards that of the data: three times the first guess, or a third
     of it."""
-    white = np.sqrt(50.0) * np.random.default_rng(0).standard_normal(
-        (2, len(training.source.gyro), 3)
-    )
+    training, source = training
+    white = np.sqrt(50.0) * np.random.default_rng(0).standard_normal((2, len(source.gyro), 3))
     for share in (3.0, 1 / 3):
-        gyro = training.source.gyro + share * OPTIONS.noise.gyro_density * white[0]
-        accel = training.source.accel + share * OPTIONS.noise.accel_density * white[1]
-        noisy = dataclasses.replace(
-            training, source=training.source._replace(gyro=gyro, accel=accel)
-        )
-        state = new_state(training)
+        gyro = source.gyro + share * OPTIONS.noise.gyro_density * white[0]
+        accel = source.accel + share * OPTIONS.noise.accel_density * white[1]
+        noisy = source._replace(gyro=gyro, accel=accel)
+        state = begun(training, start)
         for epoch in range(2):
-            state, progress = noisy.take_steps(state, noisy.order(epoch), 0, 2, 1.0)
+            order = training.order(KEYS.order, epoch, noisy)
+            state, progress = training.take_steps(state, noisy, order, 0, 2, 1.0, KEYS.step)
             assert progress.sums["skipped"] == 0
         found = filter_task.trained_settings(OPTIONS, state.filter)
         for name in ("gyro_density", "accel_density"):
@@ -352,24 +354,23 @@ def test_noise_is_recovered(training):
             assert ratio > 1.2 if share > 1 else ratio < 0.8, (name, share, ratio)
 
 
-def test_gradient_against_differences(training, monkeypatch):
+def test_gradient_against_differences(training, start, monkeypatch):
     """Without truncation; by a number of each kind and a weight of the network."""
+    training, source = training
     assert filter_task.filter_config(training.config, training=True).truncate_every == 10
     monkeypatch.setattr(filter_task, "TRUNCATE_SECONDS", 2.0)
     through = dataclasses.replace(THROUGH, learn=("all",))
     config = dataclasses.replace(training.config, through_filter=through)
-    state = new_state(training)
-    starts = training.source.earliest[:2]
+    state = begun(training, start)
     draw = jax.jit(filter_task.draw_segments, static_argnames="config")
-    batch = draw(jax.random.key(5), training.source, starts, config)
+    batch = draw(jax.random.key(5), source, source.earliest[:2], config)
     chosen = filter_task.trainable(state.variables, through.learn)
     # The network computes in float32 whatever it is given.
     chosen["filter"] = {name: jnp.float64(number) for name, number in chosen["filter"].items()}
-    evaluated = quick(
-        functools.partial(filter_task.gradient_of_segments, model=training.model, config=config)
-    )
-    gradient, losses, healthy = evaluated(state.variables, chosen, *batch)
-    assert bool(healthy) and np.isfinite(losses.total)
+    of_all = dataclasses.replace(training, config=config)
+    evaluated = quick(functools.partial(task.gradient_of, step=jnp.int32(0), task=of_all))
+    gradient, found = evaluated(chosen, state.variables, batch)
+    assert bool(found.healthy) and np.isfinite(found.figures["loss"])
     places = [(("filter", name), (), 1e-4, 1e-4) for name in sorted(chosen["filter"])]
     places += [(("params", "head", "bias"), (0,), 3e-3, 1e-2)]
     for path, index, step, tolerance in places:
@@ -381,16 +382,16 @@ def test_gradient_against_differences(training, monkeypatch):
                 ),
                 chosen,
             )
-            return float(evaluated(state.variables, moved, *batch)[1].total)
+            return float(evaluated(moved, state.variables, batch)[1].figures["loss"])
 
-        found = functools.reduce(lambda tree, key: tree[key], path, gradient)[index]
+        slope = functools.reduce(lambda tree, key: tree[key], path, gradient)[index]
         expected = (at(step) - at(-step)) / (2 * step)
         assert expected != 0, path
-        np.testing.assert_allclose(found, expected, rtol=tolerance, atol=1e-7, err_msg=str(path))
+        np.testing.assert_allclose(slope, expected, rtol=tolerance, atol=1e-7, err_msg=str(path))
 
 
-def test_parts_are_modules_and_options_by_name(training):
-    variables = new_state(training).variables
+def test_parts_are_modules_and_options_by_name(training, start):
+    variables = training[0].initial_state(KEYS.init, start).variables
     assert filter_task.trainable(variables, ("uncertainty",)).keys() == {"params"}
     chosen = {
         name: filter_task.trainable(variables, (name,)) for name in ("encoder", "head", "noise")
@@ -438,7 +439,8 @@ def test_a_later_stage_starts_from_what_the_filter_has_learnt(recording, finishe
     begins = experiment(read(train, call), call).filter
     assert begins == run.config.filter != OPTIONS
     config = tiny(recording, "unused", filter=changed(begins, start={"velocity": 0.3}))
-    state = dataclasses.replace(training, config=config).initial_state(run.variables)
+    later = dataclasses.replace(training[0], config=config)
+    state = later.initial_state(KEYS.init, run.variables)
     assert same(state.params, run.variables["params"])
     other = state.filter.pop("start.velocity")
     np.testing.assert_allclose(other, np.log(0.3), rtol=1e-6)
@@ -450,7 +452,8 @@ def test_training_on_windows_starts_from_a_runs_weights(recording):
     config = tiny(recording, "unused", through_filter=ThroughFilter())
     with jax.enable_x64(False):
         start = run_folder.initial_run(config, checkpoint.load_run)
-        state = window_task.set_up(config, Lines()).initial_state(start.variables)
+        training, _ = task.set_up(WindowTask, config, Lines())
+        state = training.initial_state(KEYS.init, start.variables)
     theirs = checkpoint.load_run(recording / "initial").variables
     assert same(state.params, theirs["params"]) and state.filter == {}
     assert same(state.batch_stats["norm"], theirs["batch_stats"]["norm"])

@@ -1,0 +1,387 @@
+"""What training on windows and training through the filter have in common: state, step, set-up.
+
+A `Task` says what is trained, draws its batches and gives their losses. `train_steps` is the one
+jitted step: gradient, guard, update, all on the device.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar, NamedTuple
+
+import chex
+import jax
+import jax.numpy as jnp
+import optax
+from flax import linen as nn
+from jaxtyping import Bool, Float, Int, PRNGKeyArray
+
+from gnio_jax import data, models, parallel
+from gnio_jax.config import TrainConfig
+from gnio_jax.errors import InputError
+from gnio_jax.reporting import Reporter
+from gnio_jax.training import optimizer
+from gnio_jax.training.losses import loss_stage
+from gnio_jax.types import Sequence
+
+Row = dict[str, int | float]
+"""Figures of an epoch by name, as the log keeps them."""
+Trainable = dict[str, dict[str, Any]]
+"""Variables that are trained, by collection: "params" and "filter"; none of them empty."""
+
+
+class TrainState(NamedTuple):
+    """All that changes from step to step. Random numbers are functions of the seed and `step`."""
+
+    step: Int[jax.Array, ""]
+    params: Any
+    batch_stats: Any
+    opt_state: Any
+    filter: Any = {}
+    """Numbers of the filter that may be trained (`filter_task.filter_numbers`); none on windows."""
+
+    @property
+    def variables(self) -> dict[str, Any]:
+        """Variables by collection: the network's, and "filter" where there are any."""
+        network = {"params": self.params, "batch_stats": self.batch_stats}
+        return network | ({"filter": self.filter} if self.filter else {})
+
+
+class BatchLosses(NamedTuple):
+    """What a task says of a batch."""
+
+    figures: dict[str, Float[jax.Array, ""]]
+    """`loss`, which is minimised, and its parts by the names of the log."""
+    batch_stats: Any
+    """Statistics of batch normalisation after the batch."""
+    healthy: Bool[jax.Array, ""]
+    """False where the filter diverged: the loss then says nothing."""
+
+
+class Progress(NamedTuple):
+    """Figures of the steps of one dispatch."""
+
+    sums: dict[str, Float[jax.Array, ""]]
+    """Summed over the steps: `loss` and its parts, and `gradient_norm/<part>` (`gradient_norms`);
+    of a task that skips steps, their number `skipped`, and no figures of them."""
+    failed_step: Int[jax.Array, ""]
+    """First step whose loss or gradient was not finite, and was not skipped; −1: none."""
+
+
+class Keys(NamedTuple):
+    """Random keys of a run: functions of its seed alone."""
+
+    init: jax.Array
+    order: jax.Array
+    step: jax.Array
+    statistics: jax.Array
+
+
+def keys_of(seed: int) -> Keys:
+    """The keys of a run."""
+    key = jax.random.key(seed)
+    return Keys(*jax.random.split(key, 3), statistics=jax.random.fold_in(key, 3))
+
+
+class Recordings(NamedTuple):
+    """What a task is trained on and validated with."""
+
+    source: Any
+    """Windows or segments of the training split, on the devices."""
+    held_out: Any
+    """Those of the validation split, likewise."""
+    splits: dict[str, list[str]]
+    """Names of the recordings of each split."""
+
+
+@dataclass(frozen=True)
+class Task(ABC):
+    """What is trained, and by which losses. It is compiled into the jitted functions, and equal for
+    runs that differ in their seeds and folders."""
+
+    model: nn.Module
+    config: TrainConfig
+    """Settings without seed and folders."""
+    steps_per_epoch: int
+
+    unit: ClassVar[str]
+    """What a batch consists of, in the plural."""
+    figures: ClassVar[tuple[str, ...]]
+    """Names of the losses of a batch."""
+    skip_above: ClassVar[float | None] = None
+    """Norm of the gradient above which a step is skipped, as is one whose loss or gradient is not
+    finite, or for which the filter diverged. None: the first step that is not finite ends the run.
+    """
+
+    @staticmethod
+    @abstractmethod
+    def source_of(sequences: Iterable[Sequence], config: TrainConfig, training: bool) -> Any:
+        """The windows or segments of recordings at the network's rate, on the host."""
+
+    @staticmethod
+    @abstractmethod
+    def count(source: Any) -> int:
+        """How many of them an epoch visits."""
+
+    @abstractmethod
+    def description(self, state: TrainState, workdir: Path) -> Iterator[str]:
+        """Lines about what will be trained, and a warning where a part of it never will be."""
+
+    def filter_numbers(self) -> dict[str, Any]:
+        """The collection "filter" at step 0, whatever run training starts from."""
+        return {}
+
+    @abstractmethod
+    def trainable(self, variables: Any) -> Trainable:
+        """Those of the variables that are trained."""
+
+    @property
+    def changes(self) -> tuple[int, ...]:
+        """Steps at which what is trained changes: losses before and after do not compare."""
+        return ()
+
+    @abstractmethod
+    def order(self, key: PRNGKeyArray, epoch: int, source: Any) -> Int[jax.Array, "m"]:
+        """What an epoch visits, in order: a function of `key` and the epoch."""
+
+    @abstractmethod
+    def draw(self, key: PRNGKeyArray, source: Any, which: Int[jax.Array, "b"]) -> Any:
+        """A batch of training: those entries `which` of an order, changed by draws from `key`."""
+
+    @abstractmethod
+    def losses(self, variables: Any, batch: Any, step: Int[jax.Array, ""]) -> BatchLosses:
+        """The losses of a batch in a step of training."""
+
+    def with_statistics(self, state: TrainState, source: Any, key: PRNGKeyArray) -> TrainState:
+        """The state as it is validated and kept: with the statistics of its batch normalisations
+        estimated anew, if asked for."""
+        return state
+
+    @abstractmethod
+    def validate(
+        self, state: TrainState, held_out: Any, key: PRNGKeyArray
+    ) -> tuple[TrainState, Row]:
+        """The state as it is kept, with its uncertainty calibrated where it has constants for that,
+        and its figures on the validation split."""
+
+    @abstractmethod
+    def remark(self, row: Row) -> str:
+        """What the line of an epoch says besides loss, speed and rate."""
+
+    def initial_state(self, key: PRNGKeyArray, start: Any | None) -> TrainState:
+        """The state at step 0: with drawn parameters, or with the variables `start` of a run."""
+        variables = models.initialise(self.model, key, self.config.data.seen)
+        if start is not None:
+            variables = overlaid(variables, start)
+        statistics = variables.get("batch_stats", {})
+        state = TrainState(jnp.int32(0), variables["params"], statistics, (), self.filter_numbers())
+        trained = self.trainable(state.variables)
+        chex.assert_type(jax.tree.leaves(trained), jnp.float32)
+        adam = optimizer.create(self.config, self.steps_per_epoch)
+        return state._replace(opt_state=adam.init(trained))
+
+    def learning_rate(self, step: int) -> float:
+        """The network's learning rate of a step by the schedule."""
+        return float(optimizer.schedule(self.config.optim, self.steps_per_epoch)(step))
+
+    def take_steps(
+        self,
+        state: TrainState,
+        source: Any,
+        order: Int[jax.Array, "m"],
+        first: int,
+        count: int,
+        factor: float,
+        key: PRNGKeyArray,
+    ) -> tuple[TrainState, Progress]:
+        """`train_steps`. The old state is used up."""
+        numbers = jnp.int32(first), jnp.int32(count), jnp.float32(factor)
+        return train_steps(state, source, order, *numbers, key, task=self)
+
+
+# The step
+# ------------------------------------------------------------------------------------------------
+
+
+@functools.partial(jax.jit, static_argnames="task", donate_argnames="state")
+def train_steps(
+    state: TrainState,
+    source: Any,
+    order: Int[jax.Array, "m"],
+    first: Int[jax.Array, ""],
+    count: Int[jax.Array, ""],
+    factor: Float[jax.Array, ""],
+    key: PRNGKeyArray,
+    *,
+    task: Task,
+) -> tuple[TrainState, Progress]:
+    """Take `count` steps of an epoch, from its step number `first` on, in one dispatch.
+
+    order: what the epoch visits of `source`; factor: scales the scheduled learning rate
+    (`optimizer.Plateau`). `count` is traced: however an epoch is cut into dispatches it is the same
+    compiled program, so a run that was interrupted and resumed has the same parameters to the bit.
+    """
+    size = task.config.optim.batch_size
+    chex.assert_rank(order, 1)
+    chex.assert_axis_dimension_gteq(order, 0, size)  # a shorter order would be read twice
+    chex.assert_shape([first, count, factor, state.step], ())
+    adam = optimizer.create(task.config, task.steps_per_epoch)
+    learning_rates = optimizer.learning_rates(task.config, task.steps_per_epoch)
+
+    def one_step(i: jax.Array, carry: tuple[TrainState, Progress]) -> tuple[TrainState, Progress]:
+        state, progress = carry
+        which = jax.lax.dynamic_slice(order, ((first + i) * size,), (size,))
+        batch = task.draw(jax.random.fold_in(key, state.step), source, which)
+        variables = state.variables
+        trained = task.trainable(variables)
+        gradient, found = gradient_of(trained, variables, batch, state.step, task)
+        stage = loss_stage(task.config.loss, state.step, task.steps_per_epoch)
+        update: Any
+        update, opt_state = adam.update(
+            gradient, state.opt_state, trained, log_std_learns=stage.log_std_learns
+        )
+        for name, direction in update.items():
+            rate = -jnp.float32(learning_rates[name](state.step))
+            update[name] = optax.tree.scale(factor, optax.tree.scale(rate, direction))
+        taken = merged(variables, optax.apply_updates(trained, update))
+        new = TrainState(
+            state.step, taken["params"], found.batch_stats, opt_state, taken.get("filter", {})
+        )
+
+        # Loss and gradient are looked at before the update is kept: a gradient that is not finite
+        # must not reach a checkpoint, though its loss is.
+        figures = found.figures | gradient_norms(gradient)
+        sound = found.healthy & jnp.isfinite(jnp.stack(list(figures.values()))).all()
+        failed_step = progress.failed_step
+        if task.skip_above is None:
+            failed_step = jnp.where(~sound & (failed_step < 0), state.step, failed_step)
+        else:
+            sound = sound & (optax.tree.norm(gradient) <= task.skip_above)
+            new = jax.tree.map(lambda new, old: jnp.where(sound, new, old), new, state)
+            figures = {name: jnp.where(sound, each, 0.0) for name, each in figures.items()}
+            figures["skipped"] = jnp.where(sound, 0.0, 1.0)
+        sums = jax.tree.map(jnp.add, progress.sums, figures)
+        new = new._replace(step=jnp.add(state.step, 1))
+        return parallel.replicated(new), Progress(sums, failed_step)
+
+    names = [*task.figures, *gradient_norms(task.trainable(state.variables))]
+    names += [] if task.skip_above is None else ["skipped"]
+    start = (state, Progress({name: jnp.zeros((), float) for name in names}, jnp.int32(-1)))
+    return jax.lax.fori_loop(jnp.int32(0), count, one_step, start)
+
+
+def gradient_of(
+    trained: Trainable, variables: Any, batch: Any, step: Int[jax.Array, ""], task: Task
+) -> tuple[Trainable, BatchLosses]:
+    """Gradient of the loss of a batch by what is trained, and the losses."""
+
+    def objective(trained: Trainable) -> tuple[jax.Array, BatchLosses]:
+        found = task.losses(merged(variables, trained), batch, step)
+        return found.figures["loss"], found
+
+    gradient, found = jax.grad(objective, has_aux=True)(trained)
+    chex.assert_trees_all_equal_structs(gradient, trained)
+    return gradient, found
+
+
+def merged(variables: Any, trained: Trainable) -> Any:
+    """All variables, with those that are trained in their places."""
+    return {
+        collection: {**tree, **trained.get(collection, {})}
+        for collection, tree in variables.items()
+    }
+
+
+def gradient_norms(gradient: Trainable) -> dict[str, Float[jax.Array, ""]]:
+    """Norm of the gradient by each part that is trained: modules of the network
+    (`gradient_norm/encoder`), of a head each of its layers (`gradient_norm/head/scale`), numbers of
+    the filter (`gradient_norm/filter/noise.gyro_density`)."""
+    squares: dict[str, list[jax.Array]] = {}
+    for path, leaf in jax.tree_util.tree_leaves_with_path(gradient):
+        collection, *names = [str(entry.key) for entry in path]
+        part = "/".join(names[: 2 if names[0] == "head" else 1])
+        part = part if collection == "params" else f"{collection}/{part}"
+        squares.setdefault(f"gradient_norm/{part}", []).append(jnp.sum(leaf**2))
+    return {part: jnp.sqrt(sum(found)) for part, found in squares.items()}
+
+
+# Set-up
+# ------------------------------------------------------------------------------------------------
+
+
+def set_up(
+    kind: type[Task], config: TrainConfig, reporter: Reporter, workers: int = 1
+) -> tuple[Task, Recordings]:
+    """Load the recordings and find the windows or segments in them.
+
+    Raises `InputError` for options that the network does not have, missing data, recordings that
+    are too short, a batch that is larger than the split, and one that the devices cannot share
+    evenly. `workers` processes read recordings that are slow to read.
+    """
+    model = create_model(config)  # a mistake in its options does not wait for the data
+    size, devices = config.optim.batch_size, parallel.count()
+    if size % devices:
+        problem = f"is {size}, which {devices} devices cannot share evenly"
+        remedy = f"make it a multiple of {devices}, or use fewer --devices"
+        raise InputError("optim.batch_size", problem, remedy)
+    train, val = config.data.train_split, config.data.val_split
+    reporter.line(f"reading {config.dataset}: {train} and {val}")
+    sources, counts, splits = [], [], {}
+    for split in (train, val):
+        samples: dict[str, int] = {}
+        sequences = read_split(config, split, reporter, workers, samples)
+        source = kind.source_of(sequences, config, training=not sources)
+        sources.append(parallel.everywhere(source))
+        counts.append(kind.count(source))
+        splits[split] = list(samples)
+        hours = sum(samples.values()) / config.data.rate / 3600
+        contents = f"{hours:.2f} h, {counts[-1]:,} {kind.unit}"
+        reporter.line(f"  {split}: {len(samples)} sequences, {contents}")
+    if counts[0] < size:
+        problem = f"is {size}, but there are only {counts[0]} {kind.unit}"
+        raise InputError("optim.batch_size", problem, "lower it")
+    anywhere = dataclasses.replace(config, workdir=None, data_root=None, init_from=None, seed=0)
+    return kind(model, anywhere, counts[0] // size), Recordings(*sources, splits)
+
+
+def create_model(config: TrainConfig) -> nn.Module:
+    """The network that `config.model` describes; what that leaves open is the network's own."""
+    given = {key: value for key, value in vars(config.model).items() if value is not None}
+    return models.create(**given)
+
+
+def overlaid(tree: dict[str, Any], other: dict[str, Any]) -> dict[str, Any]:
+    """`tree` with the leaves that `other` has in the same places."""
+    return {
+        name: overlaid(leaf, other.get(name, {}))
+        if isinstance(leaf, dict)
+        else other.get(name, leaf)
+        for name, leaf in tree.items()
+    }
+
+
+def read_split(
+    config: TrainConfig, split: str, reporter: Reporter, workers: int, samples: dict[str, int]
+) -> Iterator[Sequence]:
+    """The recordings of a split at the network's rate, one after another. The number of samples of
+    each is noted in `samples` by its name."""
+    for sequence in data.load_each(
+        config.dataset,
+        config.data_root,
+        split,
+        workers,
+        lambda share: reporter.progress(f"reading {split}", share),
+    ):
+        resampled = data.resample(sequence, config.data.rate)
+        samples[resampled.name] = len(resampled.time)
+        yield resampled
+
+
+def size_of(parameters: Any) -> int:
+    """Numbers in a tree of arrays."""
+    return sum(leaf.size for leaf in jax.tree.leaves(parameters))
