@@ -22,10 +22,10 @@ import numpy as np
 
 jax.config.update("jax_enable_x64", True)
 
-from gnio_jax import deployment, filtering  # noqa: E402
+from gnio_jax import filtering  # noqa: E402
 from gnio_jax.apps import packages  # noqa: E402
-from gnio_jax.deployment import accuracy, driver  # noqa: E402
-from gnio_jax.deployment.flat_state import start_arrays  # noqa: E402
+from gnio_jax.apps.onnx import accuracy, driver, export_run  # noqa: E402
+from gnio_jax.apps.onnx.flat_state import start_arrays  # noqa: E402
 from gnio_jax.evaluation import inference_network  # noqa: E402
 from gnio_jax.tracking.run import tracking_filter  # noqa: E402
 
@@ -40,7 +40,7 @@ def main() -> None:
     print(f"{jax.devices()[0].device_kind}, jax {jax.__version__}, {run.config.model}")
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "models"
-        deployment.export_run(arguments.run, out)
+        export_run(arguments.run, out)
         models = driver.open_models(out, arguments.threads)
         drawn = accuracy.draw_walk(run.config.data, arguments.seconds)
         setup = tracking_filter(run)

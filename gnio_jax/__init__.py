@@ -16,7 +16,6 @@ __all__ = [
     "comparison",
     "config",
     "data",
-    "deployment",
     "evaluation",
     "filtering",
     "geometry",

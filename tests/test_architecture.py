@@ -23,24 +23,24 @@ ROOMS = {
     | {"data", "models", "filtering", "training", "evaluation", "calibration", "comparison"},
     "tracking": BASE | {"data", "filtering", "training", "evaluation", "apps"},
     "live": BASE | {"apps", "data", "filtering", "training", "evaluation", "tracking"},
-    "deployment": BASE | {"data", "filtering", "training", "evaluation", "apps", "tracking"},
     "apps": BASE
     | {"data", "models", "filtering", "training", "evaluation", "calibration", "tracking"},
     "commands": BASE
     | {"data", "filtering", "training", "evaluation", "calibration", "interop", "comparison"}
-    | {"tables", "apps", "tracking", "live", "deployment"},
+    | {"tables", "apps", "tracking", "live"},
     **{name: BASE for name in BASE},
 }
 """Rooms and top-level modules, and what each may import of the package besides itself."""
 
+ONNX = {"apps.onnx.conversion", "apps.onnx.driver"}
 LIBRARIES = {
     "bokeh": {"evaluation.html.figures", "evaluation.html.page"},
     "flax": {"models", "training", "evaluation", "interop"},
-    "jax2onnx": {"deployment.conversion"},
+    "jax2onnx": {"apps.onnx.conversion"},
     "mcap": {"apps.importing.bags", "evaluation.exporting.ros"},
     "matplotlib": {"data", "evaluation", "comparison", "tables", "tracking"},
-    "onnx": {"deployment"},
-    "onnxruntime": {"deployment"},
+    "onnx": ONNX,
+    "onnxruntime": ONNX,
     "optax": {"training"},
     "orbax": {"training.checkpoint"},
     "rerun": {"evaluation.exporting.rerun_file", "live.rerun_stream"},

@@ -144,14 +144,14 @@ def export(asked: ExportOptions, _call: options.Call) -> None:
     """
     import jax  # late: mistakes do not wait for it
 
-    from gnio_jax import deployment
+    from gnio_jax.apps import onnx
 
     jax.config.update("jax_enable_x64", True)  # for the filter; the network states its float32
     name = Path(asked.run).name.removesuffix(".zip")
     out = asked.out or Path("exports") / f"{name}_onnx"
     with console.terminal() as terminal:
         terminal.progress("exporting and measuring", 0.0)
-        found = deployment.export_run(asked.run, out)
+        found = onnx.export_run(asked.run, out)
     output = console.stdout()
     for file, size in found.bytes.items():
         output.print(f"  {out / file}  {size / 1e6:.2f} MB", soft_wrap=True)

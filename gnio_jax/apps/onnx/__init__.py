@@ -2,11 +2,10 @@
 
 `run` exports a run. `programs` are the functions that are exported, `flat_state` the state of the
 filter as named arrays, and `conversion` turns the functions into models. `driver` is the loop
-around the models, `accuracy` measures how far they are from the package, `manifest` writes
-`export.json`.
-docs/deployment.md explains the loop.
+around the models, `accuracy` measures how far they are from the package. docs/deployment.md
+explains the loop.
 """
 
-from gnio_jax.deployment.run import Exported, export_run
+from gnio_jax.apps.onnx.run import Exported, export_run
 
 __all__ = ["Exported", "export_run"]

@@ -19,8 +19,8 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from gnio_jax.deployment import flat_state
-from gnio_jax.deployment.flat_state import PREFIX, DeployedState, from_arrays, to_arrays
+from gnio_jax.apps.onnx import flat_state
+from gnio_jax.apps.onnx.flat_state import PREFIX, DeployedState, from_arrays, to_arrays
 from gnio_jax.evaluation.inference import Network
 from gnio_jax.filtering import Pose, level_state
 from gnio_jax.filtering.displacement import scaled_displacement

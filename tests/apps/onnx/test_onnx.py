@@ -1,5 +1,6 @@
 """ONNX models, driven as a program without JAX drives them."""
 
+import hashlib
 import json
 import os
 import shutil
@@ -12,16 +13,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from gnio_jax.apps.onnx import accuracy, driver
+from gnio_jax.apps.onnx.flat_state import start_arrays
+from gnio_jax.apps.onnx.run import PACKAGES
 from gnio_jax.commands import app, console
-from gnio_jax.deployment import accuracy, driver
-from gnio_jax.deployment.flat_state import start_arrays
-from gnio_jax.deployment.run import PACKAGES
 from gnio_jax.filtering.start import rest_state
 from gnio_jax.tracking.run import tracking_filter
 from gnio_jax.training.checkpoint import load_run
-from tests.deployment.conftest import BIAS, CONFIG, SECONDS
+from tests.apps.onnx.conftest import BIAS, CONFIG, SECONDS
 
-EXAMPLE = Path(__file__).parents[2] / "examples" / "onnx"
+EXAMPLE = Path(__file__).parents[3] / "examples" / "onnx"
 REST = round(CONFIG.data.rate)
 """Samples."""
 
@@ -82,6 +83,9 @@ def test_the_filter_is_in_float64_and_every_tensor_is_described(models):
     names = {"network.onnx", "filter_start.onnx", "filter_window.onnx", "filter_step.onnx"}
     assert manifest["files"].keys() == names == {path.name for path in folder.glob("*.onnx")}
     for name, described in manifest["files"].items():
+        content = (folder / name).read_bytes()
+        assert described["bytes"] == len(content)
+        assert described["sha256"] == hashlib.sha256(content).hexdigest()
         session = driver.open_session(folder / name)
         for kind, tensors in (("inputs", session.get_inputs()), ("outputs", session.get_outputs())):
             assert [each["name"] for each in described[kind]] == [each.name for each in tensors]

@@ -9,22 +9,22 @@ therefore traced here, and jax2onnx sees primitives of JAX alone: what is conver
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 from jax.extend.core import jaxpr_as_fun
 
-from gnio_jax.deployment.programs import Program
+from gnio_jax.apps.onnx.programs import Program
 from gnio_jax.filtering.settings import FilterSetup
 
 OPSET = 18
 """Of the ONNX operators: ONNX Runtime 1.14 or newer reads it."""
 
 
-def to_model(program: Program, setup: FilterSetup) -> Any:
-    """An `onnx.ModelProto` whose inputs and outputs have the program's names, shapes and types.
+def to_model(program: Program, setup: FilterSetup) -> bytes:
+    """The file of a model, weights included, whose inputs and outputs have the program's names,
+    shapes and types.
 
     float64 stays float64. The metadata have the numbers that the loop around the models needs.
     Raises what jax2onnx raises for an operation that it does not know.
@@ -56,15 +56,8 @@ def to_model(program: Program, setup: FilterSetup) -> Any:
         "log_std_min": f"{setup.config.log_std_min:.17g}",
     }
     onnx.helper.set_model_props(model, metadata)
-    return model
-
-
-def write(model: Any, path: Path) -> None:
-    """One file, weights included, once it is found to be valid."""
-    import onnx
-
     onnx.checker.check_model(model)
-    onnx.save(model, path)
+    return model.SerializeToString()
 
 
 def _name_ends(graph: Any, program: Program) -> None:
