@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import difflib
 import importlib
+from collections.abc import Callable, Iterable
 
 
 class InputError(ValueError):
@@ -18,6 +20,15 @@ class InputError(ValueError):
 
     def __reduce__(self) -> tuple[type[InputError], tuple[str, str, str]]:
         return type(self), self.parts  # so that it can come from another process
+
+
+def did_you_mean(
+    word: str, known: Iterable[str], shown: Callable[[str], object] = str, cutoff: float = 0.6
+) -> str:
+    """The beginning of a remedy that names the closest of the known words, as `shown` writes it;
+    empty where none is close."""
+    close = difflib.get_close_matches(word, list(known), n=1, cutoff=cutoff)
+    return f"did you mean '{shown(close[0])}'? " if close else ""
 
 
 def require_packages(where: object, extra: str, *names: str) -> None:

@@ -9,7 +9,6 @@ docs/weights.md has the format.
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import json
 import os
 import zipfile
@@ -27,7 +26,7 @@ from safetensors.numpy import load, save
 from gnio_jax import config as configuration
 from gnio_jax import models
 from gnio_jax.config import TrainConfig
-from gnio_jax.errors import InputError
+from gnio_jax.errors import InputError, did_you_mean
 from gnio_jax.files import file_stem, fingerprint, replacing, replacing_folder
 from gnio_jax.training import checkpoint
 from gnio_jax.training.checkpoint import Run, Which
@@ -122,10 +121,9 @@ def find(which: str | Path | None = None) -> Path:
     if path.exists():
         problem = f"holds neither a package ({MANIFEST}) nor a run (config.yaml)"
         raise InputError(path, problem, "gnio publish makes a package of a run")
-    close = difflib.get_close_matches(str(which), known, n=1)
     names = f"known names: {', '.join(known) or 'none'}; give a folder, a zip or a name"
-    hint = f"did you mean '{close[0]}'?" if close else names
-    raise InputError(which, "no such weights", hint)
+    hint = did_you_mean(str(which), known).strip()
+    raise InputError(which, "no such weights", hint or names)
 
 
 def choose(which: str | Path | None = None) -> Weights:

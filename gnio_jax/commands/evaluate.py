@@ -13,6 +13,7 @@ from gnio_jax import config as configuration
 from gnio_jax.commands import console, options
 from gnio_jax.config import EvaluateConfig
 from gnio_jax.cores import usable_cores
+from gnio_jax.errors import InputError
 
 
 @dataclass(frozen=True)
@@ -43,6 +44,10 @@ def evaluate(asked: EvaluateOptions, call: options.Call) -> None:
       {prog} --workdir runs/tlio --estimator integrate --orientation device
       {prog} --workdir runs/tlio --set filter.noise.measurement_scale=1
     """
+    for setting in asked.set:
+        if not setting.startswith(("filter.", "batch_size=")):
+            remedy = "write filter.FIELD=VALUE; the rest are options, see --help"
+            raise InputError(f"--set {setting}", "is no setting of the filter", remedy)
     workdir = Path(asked.workdir or configuration.newest_run())
     asked = dataclasses.replace(asked, workdir=str(workdir))
     import jax  # late: mistakes do not wait for it

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import ast
 import dataclasses
-import difflib
 import importlib
 import inspect
 import itertools
@@ -34,7 +33,7 @@ from tyro.constructors import (
 )
 
 from gnio_jax import config as configuration
-from gnio_jax.errors import InputError
+from gnio_jax.errors import InputError, did_you_mean
 
 HELP, HELP_VERBOSE = ("-h", "--help"), ("-H", "--help-verbose")
 COMPLETION = "--tyro-"
@@ -94,9 +93,8 @@ def run(program: Group | str | Command, call: Call) -> None:
         if word.startswith(COMPLETION):
             tyro.cli(_union(program), args=call.argv, prog=call.prog, registry=REGISTRY)
         if word not in program.commands:
-            close = difflib.get_close_matches(word, program.commands, n=1)
-            remedy = f"give one of {', '.join(program.commands)}; --help explains them"
-            remedy = f"did you mean '{close[0]}'?" if close else remedy
+            known = f"give one of {', '.join(program.commands)}; --help explains them"
+            remedy = did_you_mean(word, program.commands).strip() or known
             raise InputError("command", f"unknown '{word}'" if word else "is missing", remedy)
         program, call = program.commands[word], Call(f"{call.prog} {word}", call.argv[1:])
     command = function(program) if isinstance(program, str) else program
@@ -217,13 +215,14 @@ def check(kind: type, argv: Sequence[str]) -> None:
 
 def _find(name: str, known: dict[str, Option]) -> Option:
     """The option of this name. `-` and `_` are the same."""
-    option = known.get(name.replace("_", "-"))
-    if option is None:
-        close = difflib.get_close_matches(name.replace("_", "-"), known, n=1, cutoff=0.5)
-        close += [each for each in known if each.endswith("." + name.lstrip("-"))]
-        remedy = f"did you mean {close[0]}?" if close else "--help lists the known ones"
-        raise InputError(name, "unknown option", remedy)
-    return option
+    spelled = name.replace("_", "-")
+    if spelled not in known:
+        inner = {each.rpartition(".")[2]: each for each in known if "." in each}
+        hint = did_you_mean(spelled, known, cutoff=0.5) or did_you_mean(
+            spelled.lstrip("-"), inner, inner.get
+        )
+        raise InputError(name, "unknown option", hint.strip() or "--help lists the known ones")
+    return known[spelled]
 
 
 def _is_value(word: str) -> bool:

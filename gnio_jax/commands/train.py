@@ -106,27 +106,24 @@ def experiment(asked: TrainOptions, call: options.Call) -> TrainConfig:
     neither file nor --set says otherwise. What that filter considers belongs to its own covariance,
     not to the one that will be trained.
     """
-    first = configuration.with_seeds(asked, asked.seeds)[0] if asked.seeds else asked
-    kept = configuration.default_workdir(first) / "config.yaml"
-    resumes = asked.resume and kept.exists()
-    file = None
-    if asked.config is not None:
-        file = configuration.find(asked.config)
-    elif resumes:
-        file = kept
+    file = None if asked.config is None else configuration.find(asked.config)
     content = None if file is None else configuration.read(file)  # once: it may be a pipe
 
     def settled(base: TrainConfig) -> TrainConfig:
         found = base if content is None else configuration.parse(content, str(file), base)
-        if asked.seeds:
-            found = dataclasses.replace(found, workdir=asked.workdir)  # not that of the first seed
         given = options.read(train, call, TrainOptions(**vars(found)))
         chosen = TrainConfig(**{name: getattr(given, name) for name in vars(base)})
         return configuration.assign(chosen, asked.set)
 
-    if resumes:
-        return settled(TrainConfig(filter=configuration.load(kept).filter))
     config = settled(TrainConfig())
+    first = configuration.with_seeds(config, asked.seeds)[0] if asked.seeds else config
+    kept = configuration.default_workdir(first) / "config.yaml"
+    if asked.resume and kept.exists():
+        begun = configuration.load(kept)
+        if file is None:
+            file, content = kept, configuration.text(begun)
+        resumed = settled(TrainConfig(filter=begun.filter))
+        return dataclasses.replace(resumed, workdir=config.workdir)  # not that of the first seed
     if not config.through_filter.learn or config.init_from is None:
         return config
     from gnio_jax import filtering

@@ -3,9 +3,7 @@ the experiments that come with the package lie."""
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
-import difflib
 import math
 import re
 import reprlib
@@ -19,8 +17,15 @@ import yaml
 from yaml.composer import ComposerError
 from yaml.constructor import ConstructorError
 
-from gnio_jax.config.schema import Bound, FilterSettings, InitialStd, NoiseModel, Place, TrainConfig
-from gnio_jax.errors import InputError
+from gnio_jax.config.schema import (
+    Bound,
+    ConsideredStd,
+    InitialStd,
+    NoiseModel,
+    Place,
+    TrainConfig,
+)
+from gnio_jax.errors import InputError, did_you_mean
 from gnio_jax.files import write_text
 
 Section = TypeVar("Section")
@@ -56,9 +61,8 @@ def find(config: str | Path) -> Path:
     if path.exists():  # a pipe is read, and a folder that is no run is refused as one
         return path / "config.yaml" if (path / "config.yaml").is_file() else path
     by_stem = {Path(name).stem: name for name in packaged}
-    close = difflib.get_close_matches(path.stem, by_stem, n=1)
-    hint = f"did you mean '{by_stem[close[0]]}'? " if close else ""
     known = f"give a file, or one of the package's own: {', '.join(packaged)}"
+    hint = did_you_mean(path.stem, by_stem, by_stem.get)
     raise InputError(config, "no such config file", hint + known)
 
 
@@ -132,8 +136,8 @@ def parse(content: str, source: str, base: TrainConfig | None = None) -> TrainCo
     fields = _yaml(content, source)
     if fields is None:
         raise InputError(source, "is empty", "write settings into it, e.g. seed: 0")
-    if isinstance(fields, dict):
-        fields = _of_today(fields, source)
+    if isinstance(fields, dict) and _is_of_earlier_version(fields):
+        fields = _of_earlier_version(fields, source)
     return _section(base or TrainConfig(), fields, Place(source))
 
 
@@ -188,11 +192,10 @@ def _section(base: Any, content: Any, place: Place) -> Any:
     hints = _hints(base)
     for key in content:
         if key not in hints:
-            close = difflib.get_close_matches(str(key), hints, n=1)
+            hint = did_you_mean(str(key), hints, lambda name: place.below(name).section)
+            name = place.below(_shown(key).strip("'")).section
             known = f"known fields: {', '.join(hints)}"
-            remedy = f"did you mean '{place.below(close[0]).section}'?" if close else known
-            name = place.below(reprlib.repr(key).strip("'")).section
-            raise InputError(place.source, f"unknown field '{name}'", remedy)
+            raise InputError(place.source, f"unknown field '{name}'", hint.strip() or known)
     fields = {
         key: _value(hints[key], value, place.below(key), getattr(base, key))
         for key, value in content.items()
@@ -428,94 +431,66 @@ def _yaml(content: str, source: str) -> Any:
 # Files of earlier versions
 # ------------------------------------------------------------------------------------------------
 
-_ANY = object()
-_GONE = {
-    "filter": {
-        "scale_error_std": 0.0,
-        "heading_error_std_degrees": 0.0,
-        "walk_error_seconds": _ANY,
-    },
-    "data": {"residency": _ANY},
-    "model": {"dtype": "float32", "bank_heads": None, "dropout": None},
-    "optim": {
-        "accumulate": 1,
-        "ema_decay": 0.0,
-        "end_learning_rate": 1e-6,
-        "plateau_epochs": 10,
-        "plateau_factor": 0.1,
-    },
-    "through_filter": {
-        "truncate_seconds": 10.0,
-        "start_spread": 1.0,
-        "gate_softness": 2.0,
-        "skip_above": 1000.0,
-    },
-    "": {"checkpoint_every_seconds": _ANY},
+_MOVED = {
+    **{name: f"noise.{name}" for name in NoiseModel._fields},
+    **{f"{name}_std": f"start.{name}" for name in InitialStd._fields},
+    **{f"considered_{name}_std": f"considered.{name}" for name in ConsideredStd._fields},
 }
-"""Fields that are no more, by section, and the value with which each changed nothing."""
+"""Settings of the filter, which was one flat section with angles in degrees."""
+_GONE = {
+    "data.residency": ...,
+    "model.dtype": "float32",
+    "model.bank_heads": None,
+    "model.dropout": None,
+    "optim.accumulate": 1,
+    "optim.ema_decay": 0.0,
+    "optim.end_learning_rate": 1e-6,
+    "optim.plateau_epochs": 10,
+    "optim.plateau_factor": 0.1,
+    "filter.scale_error_std": 0.0,
+    "filter.heading_error_std_degrees": 0.0,
+    "filter.walk_error_seconds": ...,
+    "through_filter.truncate_seconds": 10.0,
+    "through_filter.start_spread": 1.0,
+    "through_filter.gate_softness": 2.0,
+    "through_filter.skip_above": 1000.0,
+}
+"""Settings that are no more, and the value with which each changed nothing; `...` is any."""
 
 
-def _of_today(fields: dict, source: str) -> dict:
-    """The settings of an earlier version's file as this version has them.
-
-    Raises `InputError` where they ask for what there is no more.
-    """
-    hints, new = _hints(TrainConfig), dict(fields)
-    for section, gone in _GONE.items():
-        inner = new.get(section) if section else new
-        if not isinstance(inner, dict):
-            continue
-        known = _hints(hints[section]) if section else hints
-        kept = {name: each for name, each in inner.items() if name in known or name not in gone}
-        for name in inner.keys() - kept.keys():
-            if gone[name] is not _ANY and inner[name] != gone[name]:
-                problem = f"is {_shown(inner[name])}, and there is no such setting any more"
-                Place(source, section).refuse(name, problem, "leave it out")
-        new = new | {section: kept} if section else kept
-    if isinstance(new.get("data"), dict) and "folds" in new["data"]:
-        data = dict(new["data"])
-        count, left_out = data.pop("folds"), data.pop("left_out", 0)
-        if count != 1:
-            data["train_split"] = f"{data.get('train_split', 'train')}-{left_out}of{count}"
-        new["data"] = data
-    augment = new.get("augment")
-    if isinstance(augment, dict) and augment.keys() & {"gyro_noise", "accel_noise"}:
-        kept = {name: each for name, each in augment.items() if not name.endswith("_noise")}
-        kept["noise"] = [augment.get("gyro_noise", 0.0), augment.get("accel_noise", 0.0)]
-        new["augment"] = kept
-    if "checkpoint_every_seconds" in fields and isinstance(new.get("loss"), dict):
-        # A whole config.yaml of an earlier version, whose likelihood always had this bound.
-        new["loss"] = {"outlier_sigmas": 10.0, **new["loss"]}
-    if isinstance(new.get("filter"), dict):
-        new["filter"] = _filter_of_today(new["filter"])
-    return new
+def _is_of_earlier_version(fields: dict[str, Any]) -> bool:
+    """Whether it is the config.yaml that an earlier version left: a whole one."""
+    sections = [name for name, hint in _hints(TrainConfig).items() if _is_section(_kinds(hint)[0])]
+    whole = all(isinstance(fields.get(name), dict) for name in sections)
+    return whole and "checkpoint_every_seconds" in fields
 
 
-def _filter_of_today(old: dict) -> dict:
-    """The section `filter` of an earlier version's file, which was flat and in degrees."""
-    if old.keys() & {"noise", "start", "considered"}:
-        return old  # it is of this version: a flat name in it is unknown
-    new: dict[str, Any] = {}
-    for name, value in old.items():
-        field = name.removesuffix("_degrees").removesuffix("_std").removeprefix("considered_")
-        if name.endswith("_degrees") and type(value) in (int, float):
-            with contextlib.suppress(OverflowError):  # it is refused as too large below
-                value = value * (math.pi / 180)
-        if name in _hints(FilterSettings) or name.startswith(("std_factor_", "window_error_")):
-            new[name] = value
-        elif name.startswith("considered_"):
-            new.setdefault("considered", {})[field] = value
-        elif field in InitialStd._fields and field != name:
-            new.setdefault("start", {})[field] = value
-        elif name in NoiseModel._fields:
-            new.setdefault("noise", {})[name] = value
-        else:
-            new[name] = value
-    factors = [new.pop(f"std_factor_{axis}", None) for axis in "xyz"]
-    if factors != [None, None, None]:
-        own = [1.0 if each is None else each for each in factors]
-        new.setdefault("noise", {})["std_factor"] = own
-    share, seconds = new.pop("window_error_share", None), new.pop("window_error_seconds", 0.5)
+def _of_earlier_version(old: dict[str, Any], source: str) -> dict[str, Any]:
+    """The settings of an earlier version's config.yaml in this version's names. Raises `InputError`
+    where they ask for what there is no more."""
+    new = {name: dict(each) if isinstance(each, dict) else each for name, each in old.items()}
+    del new["checkpoint_every_seconds"]
+    for path, neutral in _GONE.items():
+        section, field = path.split(".")
+        value = new[section].pop(field, neutral)
+        if neutral is not ... and value != neutral:
+            problem = f"is {_shown(value)}, and there is no such setting any more"
+            Place(source, section).refuse(field, problem, "train the run again without it")
+    data, augment, flat = new["data"], new["augment"], new["filter"]
+    count, left_out = data.pop("folds", 1), data.pop("left_out", 0)
+    if count != 1:
+        data["train_split"] = f"{data.get('train_split', 'train')}-{left_out}of{count}"
+    augment["noise"] = [augment.pop("gyro_noise", 0.0), augment.pop("accel_noise", 0.0)]
+    new["loss"]["outlier_sigmas"] = 10.0  # which the likelihood always had
+    new["filter"] = sections = {"noise": {}, "start": {}, "considered": {}}
+    share, seconds = flat.pop("window_error_share", 0.0), flat.pop("window_error_seconds", 0.5)
+    sections["noise"]["std_factor"] = [flat.pop(f"std_factor_{axis}", 1.0) for axis in "xyz"]
     if share:
-        new.setdefault("noise", {})["correlation"] = {"share": share, "seconds": seconds}
+        sections["noise"]["correlation"] = {"share": share, "seconds": seconds}
+    for name, value in flat.items():
+        path = _MOVED.get(name.removesuffix("_degrees"), name)
+        section, _, field = path.rpartition(".")
+        if name.endswith("_degrees"):
+            value = _value(float, value, Place(source, f"filter.{name}")) * (math.pi / 180)
+        (sections[section] if section else sections)[field] = value
     return new

@@ -6,15 +6,14 @@ A new dataset is one module in `readers` that ends with `DATASET = Dataset(...)`
 
 from __future__ import annotations
 
-import difflib
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from gnio_jax.errors import InputError
+from gnio_jax.errors import InputError, did_you_mean
 from gnio_jax.types import Sequence
 
 
@@ -114,12 +113,6 @@ def get(name: str) -> Dataset:
             "dataset", f"unknown name '{name}'", f"{did_you_mean(name, names())}{known}"
         )
     return _datasets()[name]
-
-
-def did_you_mean(word: str, known: Iterable[str]) -> str:
-    """The beginning of a remedy that names the closest of the known words, if one is close."""
-    close = difflib.get_close_matches(word, list(known), n=1)
-    return f"did you mean '{close[0]}'? " if close else ""
 
 
 def find_root(name: str, root: str | os.PathLike[str] | None = None) -> Path:

@@ -17,12 +17,12 @@ from pathlib import Path
 from typing import NamedTuple, TypeVar
 
 from gnio_jax.cores import usable_cores
-from gnio_jax.data.dataset import Dataset, Recording, Refusal, did_you_mean, find_root, get
+from gnio_jax.data.dataset import Dataset, Recording, Refusal, find_root, get
 from gnio_jax.data.hdf5 import Reading, cache_entry, read_reading, write_hdf5, write_reading
 from gnio_jax.data.resampling import resample
 from gnio_jax.data.self_check import SelfCheck, check_sequence
 from gnio_jax.data.splits import parse_fold
-from gnio_jax.errors import InputError
+from gnio_jax.errors import InputError, did_you_mean
 from gnio_jax.files import file_stem, replacing_folder, write_text
 from gnio_jax.types import Sequence
 

@@ -7,7 +7,6 @@ The fields of a module are its options, their types the choices (`Literal`) or b
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import functools
 from collections.abc import Iterable
 from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
@@ -17,7 +16,7 @@ import jax.numpy as jnp
 from flax import linen as nn
 from jaxtyping import PRNGKeyArray
 
-from gnio_jax.errors import InputError
+from gnio_jax.errors import InputError, did_you_mean
 from gnio_jax.models.convolution import winograd_pays
 from gnio_jax.models.ctin import CTIN
 from gnio_jax.models.deepils import DeepILS
@@ -114,8 +113,7 @@ def _check(place: str, option: str, kind: Any, value: Any) -> None:
 def _remedy(given: object, known: Iterable[Any], title: str) -> str:
     """The known names, the closest to what was given first."""
     known = [str(each) for each in known]
-    close = difflib.get_close_matches(str(given), known, n=1)
-    return (f"did you mean '{close[0]}'? " if close else "") + f"{title}: {', '.join(known)}"
+    return did_you_mean(str(given), known) + f"{title}: {', '.join(known)}"
 
 
 def initialise(model: nn.Module, key: PRNGKeyArray, window: int = 200) -> Any:

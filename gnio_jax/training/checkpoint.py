@@ -29,6 +29,8 @@ from gnio_jax.training.optimizer import Plateau
 from gnio_jax.training.task import TrainState, create_model
 
 Which = Literal["best", "latest"]
+VERSION = 2
+"""Of what a checkpoint holds besides the network's variables, which every version has alike."""
 METADATA = 2**17
 """Bytes that a checkpoint takes besides its arrays, at most."""
 
@@ -129,7 +131,13 @@ class Checkpoints:
             raise InputError(where, "holds no checkpoint", "start the run without --resume")
         template = jax.device_get(template)
         wanted = {"variables": template.variables, "optimizer": template.opt_state}
-        meta = _checked_meta(manager, step, wanted["variables"], where)
+        meta = _read_meta(manager, step, where)
+        if meta.get("version") != VERSION:
+            problem = "is of an earlier version of gnio-jax, whose optimizer had another state"
+            run = where.parents[1]
+            remedy = f"begin another run from its weights: --init-from {run} --workdir ..."
+            raise InputError(where / str(step), problem, remedy)
+        _check_shapes(meta, wanted["variables"], where)
         found = _read_arrays(manager, step, wanted, where)
         network = found["variables"]["params"], found["variables"]["batch_stats"]
         numbers = found["variables"].get("filter", {})
@@ -174,7 +182,12 @@ def load_run(workdir: Path | str, which: Which = "best") -> Run:
         template["filter"] = filter_numbers(config.filter)
     with _manager(where, create=False) as manager:
         step = manager.latest_step()
-        meta = _checked_meta(manager, step, template, where)
+        meta = _read_meta(manager, step, where)
+        if config.through_filter.learn and meta.get("version") != VERSION:
+            problem = "is of an earlier version of gnio-jax, whose filter had other numbers"
+            remedy = f"train it again from the run that it began with, {config.init_from}"
+            raise InputError(where / str(step), problem, remedy)
+        _check_shapes(meta, template, where)
         variables = _read_arrays(manager, step, {"variables": template}, where)["variables"]
     chex.assert_trees_all_equal_shapes_and_dtypes(variables, template)
     try:
@@ -202,7 +215,11 @@ def averaged_over_headings(run: Run, source: str) -> Run:
 
 def _items(variables: Any, position: Position) -> dict[str, Any]:
     """What every checkpoint holds."""
-    meta = {"position": position._asdict(), "shapes": _shapes(variables)}
+    meta = {
+        "version": VERSION,
+        "position": position._asdict(),
+        "shapes": _shapes(variables),
+    }
     return {"variables": ocp.args.StandardSave(variables), "meta": ocp.args.JsonSave(meta)}
 
 
@@ -227,16 +244,18 @@ def _read_arrays(
         raise _damaged(where / str(step), error) from None
 
 
-def _checked_meta(
-    manager: ocp.CheckpointManager, step: int, variables: Any, where: Path
-) -> dict[str, Any]:
-    """The metadata of a checkpoint whose variables have the shapes of `variables`."""
+def _read_meta(manager: ocp.CheckpointManager, step: int, where: Path) -> dict[str, Any]:
+    """The metadata of a checkpoint."""
     try:
         meta = manager.restore(step, args=ocp.args.Composite(meta=ocp.args.JsonRestore()))["meta"]
-        found = meta["shapes"]
+        return {**meta, "shapes": meta["shapes"], "position": meta["position"]}
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise _damaged(where / str(step), error) from None
-    wanted = _shapes(variables)
+
+
+def _check_shapes(meta: dict[str, Any], variables: Any, where: Path) -> None:
+    """Raise `InputError` unless the checkpoint's variables have the shapes of `variables`."""
+    found, wanted = meta["shapes"], _shapes(variables)
     for name in sorted(wanted.keys() | found.keys()):
         if wanted.get(name) != found.get(name):
             problem = (
@@ -245,7 +264,6 @@ def _checked_meta(
             )
             remedy = "model.width and the other model fields must be those of the run"
             raise InputError(where, problem, remedy)
-    return meta
 
 
 def _damaged(checkpoint: Path, error: Exception) -> InputError:

@@ -18,7 +18,7 @@ from gnio_jax.config import LossConfig, OptimConfig, TrainConfig
 from gnio_jax.training.losses import switches
 
 END_LEARNING_RATE = 1e-6
-"""Learning rate at the last step of the cosine."""
+"""Learning rate at the last step of the cosine, unless its peak is lower."""
 PLATEAU_EPOCHS, PLATEAU_FACTOR = 10, 0.1
 """The learning rate is multiplied by this factor after more than so many epochs without a smaller
 squared error on the validation split (RoNIN, DeepILS)."""
@@ -42,7 +42,7 @@ def schedule(config: OptimConfig, steps_per_epoch: int, scale: float = 1.0) -> o
         peak_value=peak,
         warmup_steps=warmup_steps,
         decay_steps=config.epochs * steps_per_epoch,  # Optax counts the warm-up in
-        end_value=scale * END_LEARNING_RATE,
+        end_value=min(scale * END_LEARNING_RATE, peak),
     )
 
 

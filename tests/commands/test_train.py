@@ -55,11 +55,11 @@ def mistake(monkeypatch, capsys, tmp_path, *arguments):
                 "oxiod, randomised, ridi, ronin, synthetic, tlio, tumvi"
             ),
         ),
-        (["--datset", "tlio"], "--datset: unknown option; did you mean --dataset?"),
+        (["--datset", "tlio"], "--datset: unknown option; did you mean '--dataset'?"),
         (["--config", ""], ".: cannot be read"),
         (["--devices", "0"], "--devices: must be at least 1, found 0"),
         (["--seeds"], "--seeds: names no seed"),
-        (["--optim.epoch", "3"], "--optim.epoch: unknown option; did you mean --optim.epochs?"),
+        (["--optim.epoch", "3"], "--optim.epoch: unknown option; did you mean '--optim.epochs'?"),
         (["--optim.epochs", "three"], "--optim.epochs: must be a whole number, found 'three'"),
         (
             ["--model.gate", "relu"],
@@ -221,6 +221,19 @@ def test_training_through_the_filter_begins_with_the_filter_of_the_run(tmp_path)
     shutil.rmtree(run)
     assert asked(*given, "--resume").filter == wanted
     assert asked(*given[2:], "--resume").filter == wanted
+
+
+def test_a_run_is_resumed_where_the_file_says_that_it_is(tmp_path):
+    """With the filter that it has, and for seeds in folders beside it."""
+    file, run = tmp_path / "own.yaml", tmp_path / "run"
+    file.write_text(f"workdir: {run}\noptim: {{epochs: 3}}\n")
+    own = changed(noise={"gyro_density": 0.02})
+    configuration.save(run / "config.yaml", TrainConfig(filter=own))
+    found = asked("--config", str(file), "--resume")
+    assert (found.workdir, found.filter, found.optim.epochs) == (str(run), own, 3)
+    assert asked("--config", str(file), "--seeds", "1", "2").workdir == str(run)
+    by_name = asked("--set", f"workdir={run}", "--resume")
+    assert (by_name.workdir, by_name.filter) == (str(run), own)
 
 
 def test_a_config_may_come_from_a_pipe(tmp_path):

@@ -378,6 +378,19 @@ def test_runs_that_cannot_be_loaded(finished, tmp_path):
         checkpoint.load_run(other)
 
 
+def test_a_run_of_an_earlier_version_is_evaluated_and_not_resumed(recording, finished, tmp_path):
+    """Its weights are read; the optimizer's state was another."""
+    run = tmp_path / "run"
+    shutil.copytree(finished[0], run)
+    for file in run.glob("checkpoints/*/*/meta/metadata"):
+        meta = json.loads(file.read_text())
+        assert meta.pop("version") == checkpoint.VERSION
+        file.write_text(json.dumps(meta))
+    assert same(parameters(run, "best"), parameters(finished[0], "best"))
+    with pytest.raises(InputError, match=r"is of an earlier version of .*; begin .* --init-from"):
+        loop.train(tiny(recording, run), resume=True)
+
+
 class Cliff(Tiny):
     """A network whose loss is finite everywhere, and whose gradient is not for a batch with a
     window that no one walks."""

@@ -350,6 +350,13 @@ def test_a_held_uncertainty_is_not_counted(held_loss):
             np.testing.assert_allclose(params[part]["w"], expected[part][0], rtol=1e-6, atol=2e-7)
 
 
+def test_a_rate_below_the_end_of_the_cosine_does_not_rise():
+    config = OptimConfig(epochs=10, learning_rate=5e-7, start_learning_rate=0.0)
+    rates = np.array([optimizer.schedule(config, 3)(step) for step in range(31)])
+    np.testing.assert_allclose(rates[15:], 5e-7, rtol=1e-6)
+    assert (np.diff(rates) > -1e-12).all() and rates.max() <= 5.0001e-7
+
+
 @pytest.mark.parametrize("clip, decay", [(None, 0.0), (0.5, 0.0), (0.5, 0.03)])
 def test_adam_against_numpy(clip, decay):
     config = OptimConfig(epochs=10, clip_norm=clip, weight_decay=decay)

@@ -4,6 +4,7 @@ import dataclasses
 import functools
 import json
 import os
+import shutil
 import signal
 
 import jax
@@ -200,6 +201,18 @@ def test_a_copy_with_other_options_has_them(finished, tmp_path):
     found = checkpoint.load_run(tmp_path)
     assert found.config.filter == options and same(found.variables, run.variables)
     assert (found.step, found.epoch) == (run.step, run.epoch)
+
+
+def test_what_an_earlier_version_has_trained_is_told(finished, tmp_path):
+    """The filter's numbers had other names then."""
+    run = tmp_path / "run"
+    shutil.copytree(finished, run)
+    for file in run.glob("checkpoints/best/*/meta/metadata"):
+        meta = json.loads(file.read_text())
+        del meta["version"]
+        file.write_text(json.dumps(meta))
+    with pytest.raises(InputError, match=r"is of an earlier version of .*; train it again from"):
+        checkpoint.load_run(run)
 
 
 @pytest.fixture(scope="module")
