@@ -16,7 +16,6 @@ from gnio_jax.evaluation.estimators.result import Estimate
 from gnio_jax.evaluation.preparation import Prepared
 from gnio_jax.training import checkpoint
 from gnio_jax.training.checkpoint import Run
-from gnio_jax.types import Sequence
 
 OnStage = Callable[[str, float], None]
 """Called with the stage and the share of it that is done."""
@@ -52,35 +51,27 @@ def sources(run: Run, config: CalibrateConfig) -> tuple[str, list[Source]]:
     Raises `InputError` for a split that is neither the run's validation nor its training split, and
     for runs that are not the folds of one experiment.
     """
+    split, own = run.config.data.train_split, run.config.data.val_split
     if not config.out_of_fold:
-        return _split(config, run.config), [Source(run, None)]
+        if config.split not in (None, own, split):
+            problem = "is neither the validation nor the training split of the run"
+            remedy = f"give {own} or {split}: what is tested must not have been fitted"
+            raise InputError(f"--split {config.split}", problem, remedy)
+        return config.split or own, [Source(run, None)]
     if config.split:
         problem = "is of no use with --out-of-fold, which takes the training split"
         raise InputError(f"--split {config.split}", problem)
     runs = [load_run(Path(folder), config) for folder in config.out_of_fold]
     for folder, fold_run in zip(config.out_of_fold, runs, strict=True):
         _check_alike(folder, fold_run.config, run.config)
-    found = [each.config.data.train_split for each in runs]
-    split, count = run.config.data.train_split, len(runs)
+    found, count = [each.config.data.train_split for each in runs], len(runs)
     unseen = {
         f"{split}-{k}of{count}": data.Fold(split, k, count, left_out=False) for k in range(count)
     }
     if count < 2 or sorted(found) != sorted(unseen):
         remedy = f"train one run for each of --data.train-split {split}-0ofK, {split}-1ofK, ..."
-        raise InputError("--out-of-fold", f"learnt from the splits {', '.join(found)}", remedy)
+        raise InputError("--out-of-fold", f"were trained on the splits {', '.join(found)}", remedy)
     return split, [Source(each, unseen[name]) for each, name in zip(runs, found, strict=True)]
-
-
-def _split(config: CalibrateConfig, run: TrainConfig) -> str:
-    split = config.split or run.data.val_split
-    allowed = (run.data.val_split, run.data.train_split)
-    if split not in allowed:
-        raise InputError(
-            f"--split {split}",
-            "is neither the validation nor the training split of the run",
-            f"give {' or '.join(allowed)}: what is tested must not have been fitted",
-        )
-    return split
 
 
 def _check_alike(folder: str, fold_run: TrainConfig, run: TrainConfig) -> None:
@@ -115,7 +106,16 @@ def gather(
     )
     found = Evidence([], [])
     for number, source in enumerate(asked):
-        prepared = _prepared(source, sequences, split)
+        trained, where = source.run.config.data, f"dataset {own.dataset}, split '{split}'"
+        recordings = sequences
+        if source.fold is not None:
+            where = f"{where}, fold {source.fold.number}"
+            recordings = source.fold.select(sequences)
+        with_reference = [each for each in recordings if each.valid.any()]
+        prepared, _ = prepare(with_reference, trained, Setup())
+        if not prepared:
+            problem = "has no recording with a reference that is long enough to be fitted"
+            raise InputError(where, problem)
         network = inference_network(source.run.model, source.run.variables)
         estimates = estimate(
             prepared,
@@ -127,17 +127,3 @@ def gather(
         found.prepared.extend(prepared)
         found.estimates.extend(estimates)
     return found
-
-
-def _prepared(source: Source, sequences: list[Sequence], split: str) -> list[Prepared]:
-    config = source.run.config
-    asked = sequences if source.fold is None else source.fold.select(sequences)
-    with_reference = [each for each in asked if each.valid.any()]
-    where = f"dataset {config.dataset}, split '{split}'"
-    if source.fold is not None:
-        where = f"{where}, fold {source.fold.number}"
-    prepared, _ = prepare(with_reference, config.data, Setup())
-    if not prepared:
-        problem = "has no recording with a reference that is long enough to be fitted"
-        raise InputError(where, problem)
-    return prepared

@@ -1,5 +1,5 @@
 """What a calibration fits: the factors of the axes, the filter's noises to the likelihood of its
-innovations, and the errors that it only considers to the errors of its positions."""
+innovations, and its consider covariance to the errors of its positions."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ GROUPS = {
 }
 """The settings that each group of `--fit` has."""
 CONSIDERED = ConsideredStd(gyro_bias=1e-3, scale=0.05, heading=math.radians(5.0), slope=0.02)
-"""Where the fit of the considered errors begins (ours)."""
+"""Where the fit of the consider covariance begins (ours)."""
 PHYSICAL = {
     "noise.gyro_density": (1e-6, 0.1),
     "noise.accel_density": (1e-5, 1.0),
@@ -66,7 +66,7 @@ PHYSICAL = {
     "start.accel_bias": (0.0, 2.0),
 }
 """Between which values the sensors of phones and headsets and the errors of networks lie, with room
-on both sides (ours). A fitted value outside says that the recordings did not determine it."""
+on both sides (ours). The recordings did not determine a fitted value that is outside."""
 PRIOR_STD = 2.0
 """Standard deviation of each fitted number about its start, in its own logarithm or logit (ours).
 The recordings outweigh it by far in all that they determine; what they do not determine stays where
@@ -76,7 +76,7 @@ DIGITS = 4
 CHECKPOINT_EVERY = 50
 """Clone intervals between the states that the backward pass keeps."""
 FAILED = 1e6
-"""What the search sees where the filter fails: it turns back."""
+"""The objective where the filter fails: the search turns back from there."""
 NO_GATE = 1e9
 """Threshold of a χ² gate that lets everything through: one that rejects would reward a noise so
 small that everything is rejected."""
@@ -85,7 +85,7 @@ INDEPENDENT_SECONDS = 10.0
 LEAST_WINDOWS = 100
 """Below this many windows with a reference no factors of the axes are fitted (ours)."""
 LEAST_FACTOR = 1e-3
-"""No axis is surer than this of what the network predicts (ours)."""
+"""The factor of no axis is below this (ours)."""
 
 
 def std_factors(
@@ -287,7 +287,7 @@ def _prior(free: Float[Array, "u"], start: Float[Array, "u"]) -> Float[Array, ""
 
 
 class Considered(NamedTuple):
-    """The errors to be considered."""
+    """The standard deviations of the errors that the filter does not estimate."""
 
     settings: FilterSettings
     before: float

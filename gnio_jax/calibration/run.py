@@ -10,10 +10,9 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Float
 
 from gnio_jax import config as configuration
-from gnio_jax.calibration.evidence import Evidence, OnStage, gather, load_run, sources
+from gnio_jax.calibration.evidence import OnStage, gather, load_run, sources
 from gnio_jax.calibration.fit import (
     DIGITS,
     GROUPS,
@@ -26,7 +25,7 @@ from gnio_jax.calibration.fit import (
     start_of_fit,
     std_factors,
 )
-from gnio_jax.config import CalibrateConfig, ConsideredStd, DataConfig, FilterSettings
+from gnio_jax.config import CalibrateConfig, ConsideredStd, FilterSettings
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import true_displacements
 from gnio_jax.evaluation.estimators.result import Estimate
@@ -62,14 +61,16 @@ def calibrate(
     Three steps (ours). First each axis gets the factor that makes the network's standard deviations
     those of its errors, window by window against the reference. Then the settings of `config.fit`
     are those that make the innovations of the filter most likely, in which the reference has no
-    part but the start. Last, the errors that the filter considers but does not estimate are those
-    that make the errors of its positions most likely; they change no trajectory.
+    part but the start. Last, the consider covariance is the one that makes the errors of the
+    filter's positions most likely; it changes no trajectory.
 
     The recordings are those of the validation split, or those of the training split, each with the
     displacements of a network whose training left it out. Raises `InputError` for a split that is
     neither, an output folder that is there already, and missing data.
     """
-    paths = _fitted(config)
+    if not config.fit:
+        raise InputError("--fit", "names nothing", f"name some of {', '.join(GROUPS)}")
+    paths = [path for group in dict.fromkeys(config.fit) for path in GROUPS[group]]
     workdir = Path(config.workdir) if config.workdir else configuration.newest_run()
     run = load_run(workdir, config)
     folder = _folder(config, workdir)
@@ -79,10 +80,15 @@ def calibrate(
     nothing = ConsideredStd()  # it changes no estimate, and is found last
     uncalibrated = dataclasses.replace(run.config.filter, noise=noise, considered=nothing)
     start_of_fit(uncalibrated, paths)  # its mistakes do not wait for the data
-    evidence = gather(split, asked, config, uncalibrated, progress, workers)
-    noise = noise._replace(std_factor=_factors(evidence, windows, split))
+    prepared, estimates = gather(split, asked, config, uncalibrated, progress, workers)
+    try:
+        factors = std_factors(estimates, [true_displacements(each, windows) for each in prepared])
+    except ValueError as error:
+        raise InputError(f"split '{split}'", str(error)) from None
+    x, y, z = (float(f"{factor:.{DIGITS}g}") for factor in factors)  # as they are written down
+    noise = noise._replace(std_factor=(x, y, z))
     settings = start_of_fit(dataclasses.replace(uncalibrated, noise=noise), paths)
-    walks = _walks(*evidence, windows.stride)
+    walks = _walks(prepared, estimates, windows.stride)
     found = fit_innovations(
         walks,
         windows,
@@ -92,31 +98,15 @@ def calibrate(
         MOST_STEPS,
     )
     progress("considering", 0.0)
-    truth = _true_positions(evidence.prepared, windows.stride)
+    references = (each.reference(windows.stride).position[1:] for each in prepared)
+    rows = walks.displacement.shape[1]
+    truth = np.stack([filled_up(each, rows, np.nan) for each in references])
     positions = filtered_positions(walks, truth, windows, found.settings)
     considered = fit_considered(positions, windows.stride_seconds, found.settings)
     progress("considering", 1.0)
-    recordings = len(evidence.prepared)
-    calibration = Calibration(run.config.filter, found, considered, recordings, folder)
+    calibration = Calibration(run.config.filter, found, considered, len(prepared), folder)
     _write(calibration, workdir, run, config, split)
     return calibration
-
-
-def _factors(evidence: Evidence, windows: DataConfig, split: str) -> tuple[float, float, float]:
-    """The factors of the axes, as they are written down."""
-    truths = [true_displacements(each, windows) for each in evidence.prepared]
-    try:
-        x, y, z = std_factors(evidence.estimates, truths)
-    except ValueError as error:
-        raise InputError(f"split '{split}'", str(error)) from None
-    return float(f"{x:.{DIGITS}g}"), float(f"{y:.{DIGITS}g}"), float(f"{z:.{DIGITS}g}")
-
-
-def _fitted(config: CalibrateConfig) -> list[str]:
-    """The settings of the groups that are asked for, each once."""
-    if not config.fit:
-        raise InputError("--fit", "names nothing", f"name some of {', '.join(GROUPS)}")
-    return [path for group in dict.fromkeys(config.fit) for path in GROUPS[group]]
 
 
 def _folder(config: CalibrateConfig, workdir: Path) -> Path:
@@ -154,15 +144,6 @@ def _walks(prepared: list[Prepared], estimates: list[Estimate], stride: int) -> 
     walks = jax.tree.map(lambda *column: np.stack(column), *rows)
     masks = (each.imu_valid for each in prepared)
     return walks._replace(imu_valid=padded_masks(masks, strides * stride))
-
-
-def _true_positions(prepared: list[Prepared], stride: int) -> Float[np.ndarray, "w k 3"]:
-    """At the ends of the strides, m, filled up like the walks; NaN where the reference is not
-    trusted."""
-    rows = max(each.strides(stride) for each in prepared)
-    return np.stack(
-        [filled_up(each.reference(stride).position[1:], rows, np.nan) for each in prepared]
-    )
 
 
 def _write(

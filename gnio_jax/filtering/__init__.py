@@ -4,13 +4,7 @@ network in the loop.
 Needs only JAX and the geometry: the network is any function from windows to a `Prediction`.
 """
 
-from gnio_jax.config import (
-    ConsideredStd,
-    CorrelatedError,
-    FilterSettings,
-    InitialStd,
-    NoiseModel,
-)
+from gnio_jax.config import ConsideredStd, CorrelatedError, FilterSettings, InitialStd, NoiseModel
 from gnio_jax.filtering.batch import cores_as_devices, over_sequences
 from gnio_jax.filtering.config import FilterConfig
 from gnio_jax.filtering.consider import considered_covariance, sensitivity

@@ -1,5 +1,5 @@
-"""Many sequences at once: those of like lengths together, vmapped, and shared out among the devices
-of all processes."""
+"""Many sequences at once: batches of like lengths, vmapped, and shared out among the devices of all
+processes."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Batch(NamedTuple):
 
 
 def batches(intervals: Sequence[int], size: int, padded: Callable[[int], int]) -> list[Batch]:
-    """Recordings of like lengths together, which need little padding, the longest first.
+    """Batches of recordings of like lengths, which need little padding, the longest first.
 
     intervals: length of each recording in clone intervals; `padded` gives the length of a batch
     from that of its longest member. It should know few lengths: each is a compilation. All batches
@@ -53,12 +53,9 @@ def padded_signals(
     What is appended comes after the recording and changes nothing before it: no rotation, and the
     last specific force.
     """
-    pairs = [
-        (filled_up(gyro[:samples], samples, 0.0), filled_up(accel[:samples], samples))
-        for gyro, accel in recordings
-    ]
-    gyro, accel = zip(*pairs, strict=True)
-    return np.stack(gyro), np.stack(accel)
+    gyro, accel = zip(*recordings, strict=True)
+    turns = [filled_up(each[:samples], samples, 0.0) for each in gyro]
+    return np.stack(turns), np.stack([filled_up(each[:samples], samples) for each in accel])
 
 
 def padded_masks(
@@ -77,17 +74,16 @@ def padded_masks(
 
 
 def over_sequences(function: Callable[..., T], shared: int = 0) -> Callable[..., T]:
-    """`jax.vmap(function)` whose sequences are shared out among all devices of all processes; to be
-    jitted, and differentiable like it.
+    """`jax.vmap(function)` whose sequences are shared out among all devices of all processes. It is
+    to be jitted, and is differentiable like it.
 
     The first `shared` arguments (parameters, noise) are the same for every sequence; the leaves of
     all others, and of the result, have the sequences as their leading axis. A number of sequences
     that does not divide evenly is filled up with the last one, whose additional results are
-    dropped. With one device, or one sequence, it is `jax.vmap`. Arguments must not be bound to a
-    device by `jax.device_put(x, device)`: JAX refuses those (ValueError).
-
-    In several processes (`jax.distributed`) each of them gives all sequences, and
-    `parallel.on_host` gives each of them all results.
+    dropped. With one device, or one sequence, it is `jax.vmap`. JAX refuses arguments that are
+    bound to a device by `jax.device_put(x, device)` (ValueError). In several processes
+    (`jax.distributed`) each of them gives all sequences, and `parallel.on_host` gives each of them
+    all results.
 
     On a machine without a GPU JAX sees one device however many cores there are, and the filter's
     operations are too small for XLA to split each among cores: call `cores_as_devices` first.
@@ -101,7 +97,10 @@ def over_sequences(function: Callable[..., T], shared: int = 0) -> Callable[...,
         batched = jax.vmap(function, in_axes=(None,) * shared + (0,) * len(own))
         if len(devices) == 1:
             return batched(*arguments)
-        filled = jax.tree.map(lambda leaf: _repeat_last(leaf, -count % len(devices)), own)
+        times = -count % len(devices)
+        filled = jax.tree.map(
+            lambda leaf: jnp.concatenate([leaf, jnp.repeat(leaf[-1:], times, axis=0)]), own
+        )
         everywhere, shared_out = PartitionSpec(), PartitionSpec("sequence")
         spread = jax.shard_map(
             batched,
@@ -115,18 +114,11 @@ def over_sequences(function: Callable[..., T], shared: int = 0) -> Callable[...,
     return mapped
 
 
-def _repeat_last(leaf: Array, times: int) -> Array:
-    """With the last row repeated `times` times behind it."""
-    if not times:
-        return leaf
-    return jnp.concatenate([jnp.asarray(leaf), jnp.repeat(leaf[-1:], times, axis=0)])
-
-
 def cores_as_devices() -> None:
     """Let JAX see every core that this process may use as a device of its own, unless a number of
     CPU devices is set already.
 
     Programs that do not spread anything go on running on the first device, with all cores. Raises
-    RuntimeError after JAX's first computation, when the devices are settled.
+    RuntimeError after JAX's first computation, when their number can no longer change.
     """
     cpu_devices(usable_cores())

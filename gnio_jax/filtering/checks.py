@@ -8,19 +8,20 @@ Values are only known outside `jax.jit`. Inside it shapes and precisions are che
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
+from jax.tree_util import keystr, tree_map_with_path
 
 from gnio_jax.config import NoiseModel
+from gnio_jax.config.files import bounds, named
 from gnio_jax.filtering.config import FilterConfig
 from gnio_jax.filtering.state import FilterState, state_shapes, with_correlated_error
 from gnio_jax.types import FASTEST_TURN, STRONGEST_FORCE, Array
-
-BATCH_REMEDY = "for a batch of sequences use jax.vmap"
 
 
 class Inputs(NamedTuple):
@@ -58,9 +59,10 @@ def checked_array(name: str, value: Any, shape: tuple[int, ...], config: FilterC
 
 
 def check_shape(name: str, value: Any, shape: tuple[int, ...]) -> None:
-    found = jnp.shape(value)
-    if found != shape:
-        raise ValueError(f"{name}: the shape must be {shape}, found {found}; {BATCH_REMEDY}")
+    """Refuse an array of another shape."""
+    if (found := jnp.shape(value)) != shape:
+        remedy = "for a batch of sequences use jax.vmap"
+        raise ValueError(f"{name}: the shape must be {shape}, found {found}; {remedy}")
 
 
 def on_device(value: Any) -> jax.Array:
@@ -71,46 +73,21 @@ def on_device(value: Any) -> jax.Array:
     return jnp.asarray(value)
 
 
-def check_finite(name: str, value: jax.Array, remedy: str = "") -> None:
-    """Refuse rows that are not finite, naming the first."""
-    if not isinstance(value, Tracer):
-        finite = np.isfinite(np.asarray(value)).reshape(len(value), -1).all(1)
-        _refuse_rows(name, ~finite, "rows are not finite", remedy)
-
-
-def check_positive_definite(name: str, value: jax.Array) -> None:
-    """Refuse matrices (k, d, d) that are not symmetric and positive definite, naming the first;
-    those with a NaN pass."""
-    if isinstance(value, Tracer):
-        return
-    matrices = np.asarray(value, np.float64)
-    known = np.asarray(np.isfinite(matrices).all((1, 2)))
-    clean = np.where(known[:, None, None], matrices, np.eye(matrices.shape[1]))
-    largest = np.abs(clean).max((1, 2))
-    asymmetric = np.abs(clean - clean.transpose(0, 2, 1)).max((1, 2)) > 1e-6 * largest
-    bad = asymmetric | (np.linalg.eigvalsh(clean)[:, 0] <= 0)
-    _refuse_rows(name, bad, "are not symmetric and positive definite", "")
-
-
-def _refuse_rows(name: str, bad: np.ndarray, problem: str, remedy: str) -> None:
-    if bad.any():
-        found = f"{bad.sum()} of {len(bad)} {problem}, the first is row {bad.argmax()}"
-        raise ValueError(f"{name}: {found}" + (f"; {remedy}" if remedy else ""))
-
-
-def check_measurable(
-    name: str, value: jax.Array, largest: float, unit: str, valid: Any = None
+def check_rows(
+    name: str, value: jax.Array, bad: Callable[[np.ndarray], np.ndarray], problem: str
 ) -> None:
-    """Refuse finite values, of the rows that are `valid`, which no IMU measures, naming the first
-    such row."""
-    if isinstance(value, Tracer) or isinstance(valid, Tracer):
-        return
-    size = np.abs(np.asarray(value)).max(1)
-    bad = np.isfinite(size) & (size > largest)
-    bad = bad if valid is None else bad & np.asarray(valid)
-    if bad.any():
-        problem = f"is beyond {largest:g} {unit} in {bad.sum()} of {len(bad)} rows"
-        raise ValueError(f"{name}: {problem}, the first is row {bad.argmax()}")
+    """Refuse an array of which some rows are `bad`, naming the first."""
+    if not isinstance(value, Tracer):
+        rows = bad(np.asarray(value, np.float64))
+        if rows.any():
+            found = f"{rows.sum()} of {len(rows)} rows {problem}"
+            raise ValueError(f"{name}: {found}, the first is row {rows.argmax()}")
+
+
+def check_finite(name: str, value: jax.Array) -> None:
+    """Refuse rows that are not finite."""
+    axes = tuple(range(1, value.ndim))
+    check_rows(name, value, lambda rows: ~np.isfinite(rows).all(axes), "are not finite")
 
 
 def check_rotation(name: str, value: jax.Array) -> None:
@@ -121,14 +98,22 @@ def check_rotation(name: str, value: jax.Array) -> None:
             raise ValueError(f"{name}: is not a rotation matrix")
 
 
-def check_not_negative(name: str, value: Any) -> None:
-    """Refuse what is not one number, or a number that is negative or not finite."""
-    if jnp.shape(value) != ():
-        raise ValueError(f"{name}: must be one number, found shape {jnp.shape(value)}")
-    if not isinstance(value, Tracer):
-        number = float(np.asarray(value))
-        if not (math.isfinite(number) and number >= 0):
-            raise ValueError(f"{name}: must be a number that is not negative, found {number}")
+def check_number(name: str, value: Any, least: float, unit: str) -> None:
+    """Refuse what is not a finite Python number of at least `least`."""
+    if not (isinstance(value, int | float) and least <= value < math.inf):
+        raise ValueError(f"{name}: must be a number of at least {least:g} {unit}, found {value!r}")
+
+
+def check_numbers(name: str, settings: Any) -> None:
+    """Refuse a tuple of settings (`NoiseModel`, `InitialStd`, `ConsideredStd`) with a number
+    outside the bounds of its field."""
+    for field, hint, value in named(settings, f"{name}."):
+        for number in value if isinstance(value, tuple) else (value,):
+            if np.shape(number) != ():
+                raise ValueError(f"{field}: must be one number, found shape {np.shape(number)}")
+            for bound in bounds(hint):
+                if not (number is None or isinstance(number, Tracer) or bound.holds(float(number))):
+                    raise ValueError(f"{field}: {bound.problem}, found {float(number)}")
 
 
 # The arguments of a run
@@ -153,46 +138,40 @@ def checked_inputs(
         raise ValueError(
             f"gyro: the samples must be a multiple of samples_per_clone = {n}, found {samples}"
         )
-    gyro = checked_array("gyro", gyro, (samples, 3), config)
-    accel = checked_array("accel", accel, (samples, 3), config)
-    if imu_valid is None:
-        remedy = "name the missing samples with imu_valid to have them bridged"
-        check_finite("gyro", gyro, remedy)
-        check_finite("accel", accel, remedy)
-    else:
+    if imu_valid is not None:
         imu_valid = on_device(imu_valid)
         if imu_valid.shape != (samples,) or imu_valid.dtype != jnp.bool_:
             found = f"{imu_valid.dtype} of shape {imu_valid.shape}"
             raise ValueError(f"imu_valid: must be {samples} booleans, found {found}")
-    check_measurable("gyro", gyro, FASTEST_TURN, "rad/s", imu_valid)
-    check_measurable("accel", accel, STRONGEST_FORCE, "m/s²", imu_valid)
+
+    def checked_signal(name: str, value: Any, largest: float, unit: str) -> jax.Array:
+        """Finite where there is no mask, and what an IMU can measure where a sample is there."""
+        value = checked_array(name, value, (samples, 3), config)
+        if imu_valid is None:
+            check_finite(name, value)
+        if not isinstance(imu_valid, Tracer):
+            there = True if imu_valid is None else np.asarray(imu_valid)
+            problem = f"are beyond {largest:g} {unit}"
+            check_rows(name, value, lambda rows: (np.abs(rows) > largest).any(1) & there, problem)
+        return value.astype(dtype)
+
+    gyro = checked_signal("gyro", gyro, FASTEST_TURN, "rad/s")
+    accel = checked_signal("accel", accel, STRONGEST_FORCE, "m/s²")
 
     def checked_rows(path: Any, value: Any) -> jax.Array:
-        value, name = on_device(value), "measurements" + jax.tree_util.keystr(path)
-        check_shape(name, value, (samples // n, *value.shape[1:]))
+        value = on_device(value)
+        check_shape(f"measurements{keystr(path)}", value, (samples // n, *value.shape[1:]))
         return value.astype(dtype) if jnp.issubdtype(value.dtype, jnp.floating) else value
 
-    measurements = jax.tree_util.tree_map_with_path(checked_rows, measurements)
-    signals = gyro.astype(dtype), accel.astype(dtype), imu_valid
-    return Inputs(state, *signals, measurements, checked_noise(noise, dtype))
+    measurements = tree_map_with_path(checked_rows, measurements)
+    return Inputs(state, gyro, accel, imu_valid, measurements, checked_noise(noise, dtype))
 
 
 def checked_noise(noise: NoiseModel, dtype: Any) -> NoiseModel:
     """`noise` in one precision."""
-    for path, value in jax.tree_util.tree_leaves_with_path(noise):
-        check_not_negative("noise" + jax.tree_util.keystr(path), value)
+    check_numbers("noise", noise)
     if len(noise.std_factor) != 3:
         raise ValueError("noise.std_factor: must be three numbers, for x, y and z")
-    positive = {"measurement_scale": noise.measurement_scale, "std_factor": noise.std_factor}
-    if noise.correlation is not None:
-        positive["correlation.seconds"] = noise.correlation.seconds
-        share = noise.correlation.share
-        if not isinstance(share, Tracer) and not float(share) < 1:
-            raise ValueError(f"noise.correlation.share: must be below 1, found {float(share)}")
-    for name, values in positive.items():
-        for value in jax.tree.leaves(values):
-            if not isinstance(value, Tracer) and float(value) == 0:
-                raise ValueError(f"noise.{name}: must be positive, found {float(value)}")
     return jax.tree.map(lambda value: jnp.asarray(value, dtype), noise)
 
 
@@ -209,38 +188,42 @@ def checked_state(state: FilterState, config: FilterConfig, noise: NoiseModel) -
     wanted = state_shapes(config, noise, jnp.float32 if config.allow_float32 else jnp.float64)
 
     def checked_leaf(path: Any, value: Any, like: jax.ShapeDtypeStruct) -> jax.Array:
-        name = "state" + jax.tree_util.keystr(path)
+        name = f"state{keystr(path)}"
         if jnp.issubdtype(like.dtype, jnp.floating):
             return checked_array(name, value, like.shape, config).astype(state.offset.dtype)
         check_shape(name, value, like.shape)
         return jnp.asarray(value, like.dtype)
 
-    checked = jax.tree_util.tree_map_with_path(checked_leaf, state, wanted)
-    if not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(checked)):
-        _check_state_values(checked)
-    return checked
-
-
-def _check_state_values(state: FilterState) -> None:
-    for name, value in state._asdict().items():
-        # The IMU's memory is NaN before the first sample.
+    checked = tree_map_with_path(checked_leaf, state, wanted)
+    if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(checked)):
+        return checked
+    for name, value in checked._asdict().items():
+        # The memories of the gate and the IMU may hold anything, NaN too.
         if isinstance(value, jax.Array) and value.ndim and value.size:
             check_finite(f"state.{name}", value)
-    core = np.asarray(state.core_covariance, np.float64)
-    variances = np.diag(core)
-    scale = np.sqrt(np.abs(variances)) + 1e-150
-    correlations = core / np.outer(scale, scale)
-    if np.linalg.eigvalsh(correlations)[0] < -1e-5 or (variances < 0).any():
+    core = np.asarray(checked.core_covariance, np.float64)
+    scale = np.sqrt(np.abs(np.diag(core))) + 1e-150
+    if np.linalg.eigvalsh(core / np.outer(scale, scale))[0] < -1e-5 or (np.diag(core) < 0).any():
         raise ValueError("state.core_covariance: is not positive definite")
-    check_rotation("state.rotation", state.rotation)
+    check_rotation("state.rotation", checked.rotation)
+    return checked
 
 
 def checked_displacements(
     displacement: Any, covariance: Any, inputs: Inputs, config: FilterConfig
 ) -> tuple[jax.Array, jax.Array]:
-    """A displacement and its covariance for every clone interval of a run, in its precision."""
+    """A displacement and its covariance for every clone interval of a run, in its precision. Those
+    with a NaN are not checked."""
     dtype, count = inputs.gyro.dtype, len(inputs.gyro) // config.samples_per_clone
-    displacement = checked_array("displacement", displacement, (count, 3), config)
-    covariance = checked_array("covariance", covariance, (count, 3, 3), config)
-    check_positive_definite("covariance", covariance.astype(dtype))
-    return displacement.astype(dtype), covariance.astype(dtype)
+
+    def improper(matrices: np.ndarray) -> np.ndarray:
+        known = np.isfinite(matrices).all((1, 2), keepdims=True)
+        clean = np.where(known, matrices, np.eye(3))
+        skew = np.abs(clean - clean.transpose(0, 2, 1)).max((1, 2))
+        asymmetric = skew > 1e-6 * np.abs(clean).max((1, 2))
+        return asymmetric | (np.linalg.eigvalsh(clean)[:, 0] <= 0)
+
+    displacement = checked_array("displacement", displacement, (count, 3), config).astype(dtype)
+    covariance = checked_array("covariance", covariance, (count, 3, 3), config).astype(dtype)
+    check_rows("covariance", covariance, improper, "are not symmetric and positive definite")
+    return displacement, covariance

@@ -10,14 +10,7 @@ from typing import Literal, no_type_check
 import numpy as np
 
 from gnio_jax.config.files import checked_value
-from gnio_jax.config.schema import (
-    Count,
-    Finite,
-    NonNegative,
-    NonNegativeCount,
-    Place,
-    Positive,
-)
+from gnio_jax.config.schema import Count, Finite, NonNegative, NonNegativeCount, Place, Positive
 from gnio_jax.windows import WINDOW_CUTS, WindowCut
 
 YawFrame = Literal["own", "given"]
@@ -43,8 +36,8 @@ class FilterConfig:
     context_samples: NonNegativeCount = dataclasses.field(default=0, kw_only=True)
     """IMU samples C before a measurement's window that the network sees too (ours)."""
     mahalanobis_fail_scale: NonNegative = 0.0
-    """0 skips a rejected measurement; above 0 its covariance is multiplied by this and it is
-    applied."""
+    """0 skips a rejected measurement; above 0 it is applied with its covariance multiplied by
+    this."""
     history: Literal["diagonal", "core"] = "diagonal"
     """Keep the diagonal of the core covariance at every interval, or the whole 15×15 block too."""
     log_std_min: Finite = -4.0
@@ -67,19 +60,19 @@ class FilterConfig:
     active, a rest that does not fit is refused, whatever `mahalanobis_fail_scale` and
     `gate_softness`."""
     rest_gyro: NonNegative = 0.05
-    """Quiet: no |gyro − b_g| above this, rad/s …"""
+    """Bound of |gyro − b_g| in every sample of a quiet IMU, rad/s."""
     rest_accel: NonNegative = 0.3
-    """… and no | |accel − b_a| − g | above this, m/s² …"""
+    """Bound of | |accel − b_a| − g | in every sample of a quiet IMU, m/s²."""
     rest_seconds: NonNegative = 0.5
-    """… for this long, s."""
+    """How long the IMU is quiet before its velocity is measured as zero, s."""
     bridge_seconds: NonNegative = 0.1
     """Missing IMU samples hold the last one for this long, s; after it attitude and velocity coast,
     and windows are no measurements."""
     gap_gyro_std: NonNegative = 1.0
-    """Standard deviation of the rate that a gap may hide, rad/s; of a held sample as much less as
-    it is younger than `bridge_seconds`."""
+    """Standard deviation of the rate that a gap may hide, rad/s. That of a held sample grows with
+    its age to this, at `bridge_seconds`."""
     gap_accel_std: NonNegative = 3.0
-    """The same of the acceleration, m/s²."""
+    """Standard deviation of the acceleration that a gap may hide, m/s²."""
     checkpoint_every: NonNegativeCount = 0
     """Clone intervals between the states kept for the backward pass, all else being computed again:
     memory for time. 0 keeps everything."""
@@ -91,12 +84,11 @@ class FilterConfig:
     start (paper eq. 1 read literally), or cut and rotate it as TLIO's tracker does: one sample
     earlier, the network's input with the biases that the IMU comes with."""
     speed_limit: Positive = 100.0
-    """No carrier is faster, m/s: an estimate that is has diverged, and is not `healthy` from then
-    on (ours)."""
+    """No carrier is faster, m/s: an estimate that exceeds it has diverged, and is not `healthy`
+    from then on (ours)."""
     allow_float32: bool = False
-    """Run in float32 where the state is, to about four digits of every standard deviation over an
-    hour. Without it float32 is an error, not a surprise; smoothing and derivatives want float64
-    anyway."""
+    """Run in float32 where the state is float32: every standard deviation keeps about four digits
+    over an hour. Without this float32 is refused. Smoothing and derivatives want float64 anyway."""
 
     def __post_init__(self) -> None:
         for name, hint in inspect.get_annotations(type(self), eval_str=True).items():

@@ -30,7 +30,7 @@ from jaxtyping import Float
 
 from gnio_jax import geometry
 from gnio_jax.config import ConsideredStd
-from gnio_jax.filtering.checks import check_not_negative
+from gnio_jax.filtering.checks import check_numbers
 from gnio_jax.filtering.displacement import Displacement
 from gnio_jax.filtering.history import FilterHistory
 from gnio_jax.filtering.scan import Measure
@@ -47,18 +47,12 @@ STILL = 1e-6
 """Added in squares to the length of a displacement, m: standing still is no singular point."""
 
 
-def check_considered(std: ConsideredStd) -> None:
-    """Raise `ValueError` where a standard deviation is negative or not finite."""
-    for name, value in std._asdict().items():
-        check_not_negative(f"considered.{name}", value)
-
-
 def considered_covariance(
     sensitivity: Float[Array, "k d 6"], std: ConsideredStd
 ) -> Float[jax.Array, "k d d"]:
     """S C Sᵀ, to be added to P; of as many rows of S as are given. Raises `ValueError` for a
     standard deviation that is negative or not finite."""
-    check_considered(std)
+    check_numbers("considered", std)
     bias, *others = std
     each = jnp.stack([jnp.asarray(value) for value in (bias, bias, bias, *others)])
     root = sensitivity * each[None, None]
@@ -137,9 +131,7 @@ def step_with_tangents(
     """
 
     def moved(floating: Tangents, c: Float[Array, "6"]) -> tuple[Tangents, tuple[FilterState, T]]:
-        def measure_disturbed(
-            state: FilterState, oldest: Array | int
-        ) -> tuple[Displacement, dict[str, Array]]:
+        def measure_disturbed(state: FilterState, oldest: Array | int) -> tuple[Displacement, dict]:
             measured, diagnostics = measure(jax.lax.stop_gradient(state), oldest)
             displacement = disturbed(measured.displacement[None], c)[0]
             return dataclasses.replace(measured, displacement=displacement), diagnostics
@@ -153,24 +145,21 @@ def step_with_tangents(
         after, found = step(whole, measure_disturbed)
         return _floating(after), (after, found)
 
-    point, dtype = (_floating(state), jnp.zeros(ENTRIES, state.offset.dtype)), state.offset.dtype
+    every_entry = jnp.eye(ENTRIES, dtype=state.offset.dtype)
+    point = _floating(state), jnp.zeros_like(every_entry[0])
 
     def along(tangent: Tangents, direction: Float[Array, "6"]) -> tuple:
         _, after, found = jax.jvp(moved, point, (tangent, direction), has_aux=True)
         return after, found
 
     # Only the tangents are mapped over: the step itself is made once.
-    every_entry = jnp.eye(ENTRIES, dtype=dtype)
     after, (state, found) = jax.vmap(along, out_axes=(0, None))(tangents, every_entry)
     return state, found, after
 
 
 def core_sensitivity(mean: Mean, tangents: Tangents) -> Float[jax.Array, "15 6"]:
     """S of θ, v, p, b_g, b_a."""
-    of_position = tangents.anchor + tangents.offset
-    of_biases = tangents.gyro_bias, tangents.accel_bias
-    of_mean = Mean(tangents.rotation, tangents.velocity, of_position, *of_biases)
-    last = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1)[None], of_mean)
+    last = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1)[None], tangents.mean)
     return _of_error(mean.rotation[None], last)[0]
 
 

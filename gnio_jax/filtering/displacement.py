@@ -8,16 +8,15 @@ window and Σ = L Lᵀ the network's covariance,
     d = u + L (c b + √(1 − c²) w),   w ~ N(0, I) white,
 
 where b (3) is a first-order Gauss–Markov process of variance 1 and time constant τ, three more
-entries of the state. The covariance of each measurement alone stays Σ, but what an average of them
-can tell is bounded. If the error of a window were the sum of independent errors of its W strides,
-its correlation would fall linearly to zero at the window's length; the exponential with half that
-length for τ has the same integral, and so the same error of a long sum, for three entries in the
-place of 3 W.
+entries of the state. The covariance of each measurement alone stays Σ, but the information of an
+average of them is bounded. If the error of a window were the sum of independent errors of its W
+strides, its correlation would fall linearly to zero at the window's length; the exponential with
+half that length for τ has the same integral, and so the same error of a long sum, for three entries
+in the place of 3 W.
 """
 
 from __future__ import annotations
 
-import functools
 from dataclasses import dataclass, field
 from typing import no_type_check
 
@@ -40,8 +39,8 @@ from gnio_jax.filtering.update import (
     correct,
     linearise,
     lower_triangular,
-    oldest_offset,
     project,
+    since_oldest,
 )
 from gnio_jax.types import Array
 
@@ -56,71 +55,62 @@ expressed in a given frame is not used."""
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Displacement:
-    """Displacement from the oldest to the newest clone, expressed in the yaw frame of the oldest.
-    Finite also where there is none."""
+    """Displacement from the oldest to the newest clone, expressed in the yaw frame of the oldest,
+    or K of them. Finite also where there is none."""
 
-    displacement: Float[Array, "3"]
+    displacement: Float[Array, "*k 3"]
     """m"""
-    covariance: Float[Array, "3 3"]
+    covariance: Float[Array, "*k 3 3"]
     """After scaling, m²; positive definite also where there is none."""
-    present: Bool[Array, ""]
+    present: Bool[Array, "*k"]
     frame: YawFrame = field(metadata={"static": True})
     """Whose attitude of the oldest clone defines the yaw frame: see `FilterConfig`."""
 
     def update(self, state: FilterState, step: Step) -> tuple[FilterState, Outcome, Correction]:
         """Nothing changes without a measurement, before the ring is full, at gimbal lock, or where
-        the χ² gate rejects it. `mahalanobis_fail_scale` or `gate_softness` apply what is rejected
-        or weakly believed with a larger covariance."""
+        the χ² gate rejects it. With `mahalanobis_fail_scale` or `gate_softness` it is applied with
+        a larger covariance instead."""
         config = step.config
         linear, defined = linearise_displacement(self, state, step)
         present = self.present & (state.step >= config.clones)
         tested = present & defined
-        correction, nis, volume = project(state, linear, step.oldest, present)
+        outcome, correction = project(state, linear, step.oldest, present)
         now = state.step * config.samples_per_clone
-        gate, weight = innovation_gate(state.gate, config, now, now - config.window, nis, tested)
+        nis, oldest = outcome.nis, now - config.window
+        gate, weight = innovation_gate(state.gate, config, now, oldest, nis, tested)
         accepted, factor = weight > 0, _covariance_factor(weight, tested, config)
         if factor is not None:
-            larger = linear.covariance + (factor - 1) * self.covariance
-            weaker = linear._replace(covariance=larger)
-            correction, _, _ = project(state, weaker, step.oldest, present)
+            weaker = linear._replace(covariance=linear.covariance + (factor - 1) * self.covariance)
+            _, correction = project(state, weaker, step.oldest, present)
             accepted = tested
-        outcome = Outcome(present, tested, linear.residual, nis, volume, weight, accepted)
+        outcome = outcome._replace(tested=tested, weight=weight, accepted=accepted)
         state, correction = correct(state, correction, accepted, step.newest)
         return state._replace(gate=gate), outcome, correction
 
 
 def scaled_displacement(
-    displacement: Float[Array, "3"],
-    covariance: Float[Array, "3 3"],
+    displacement: Float[Array, "*k 3"],
+    covariance: Float[Array, "*k 3 3"],
     noise: NoiseModel,
     frame: YawFrame,
 ) -> Displacement:
-    """A displacement, m, with its covariance, m², scaled by `measurement_scale` and `std_factor`. A
-    NaN in either is no measurement; it is kept out of the arithmetic, or the derivatives would be
-    NaN too."""
-    present = jnp.all(jnp.isfinite(displacement)) & jnp.all(jnp.isfinite(covariance))
-    eye = jnp.eye(3, dtype=covariance.dtype)
-    factor = jnp.stack(jax.tree.map(jnp.asarray, noise.std_factor)).astype(covariance.dtype)
-    scale = jnp.asarray(noise.measurement_scale, covariance.dtype)
-    scale = scale * (factor[:, None] * factor[None])
-    known = jnp.where(present, covariance, eye)
+    """A displacement, m, with its covariance, m², scaled by `measurement_scale` and `std_factor`,
+    or K of them. A NaN in either is no measurement; it is kept out of the arithmetic, or the
+    derivatives would be NaN too."""
+    dtype, shape = covariance.dtype, covariance.shape
+    finite = jnp.isfinite(covariance).all((-2, -1))
+    present = jnp.isfinite(displacement).all(-1) & finite
+    eye = jnp.broadcast_to(jnp.eye(3, dtype=dtype), shape)
+    factor = jnp.stack(jax.tree.map(jnp.asarray, noise.std_factor)).astype(dtype)
+    scale = jnp.asarray(noise.measurement_scale, dtype) * (factor[:, None] * factor[None])
+    there = present[..., None, None]
+    known = jnp.where(there, covariance, eye)
     return Displacement(
-        displacement=jnp.where(present, displacement, 0.0),
-        covariance=jnp.where(present, scale * known, eye),
+        displacement=jnp.where(present[..., None], displacement, 0.0),
+        covariance=jnp.where(there, jnp.broadcast_to(scale, shape) * known, eye),
         present=present,
         frame=frame,
     )
-
-
-def scaled_displacements(
-    displacement: Float[Array, "k 3"],
-    covariance: Float[Array, "k 3 3"],
-    noise: NoiseModel,
-    frame: YawFrame,
-) -> Displacement:
-    """K of them, stacked."""
-    scaled = functools.partial(scaled_displacement, noise=noise, frame=frame)
-    return jax.vmap(scaled)(displacement, covariance)
 
 
 def linearise_displacement(
@@ -129,8 +119,8 @@ def linearise_displacement(
     """r = d − R_γ(R_i)ᵀ (p_j − p_i) of the oldest clone i and the newest j, linearised, and whether
     its Jacobian is defined (no gimbal lock).
 
-    H[p_j] = R_γᵀ, H[p_i] = −R_γᵀ, and H[θ_i] = R_γᵀ hat(p_j − p_i) e_z hᵀ: only the yaw of R_i
-    matters, and h is how it depends on δθ. Where d is expressed in a given frame, it is TLIO's
+    H[p_j − p_i] = R_γᵀ, and H[θ_i] = R_γᵀ hat(p_j − p_i) e_z hᵀ: only the yaw of R_i matters, and h
+    is how it depends on δθ. Where d is expressed in a given frame, it is TLIO's
     h = (cos y tan q, sin y tan q, 1) with the yaw y and the pitch q of R_i = Rz(y) Ry(q) Rx. At
     gimbal lock tan q is taken as 0.
 
@@ -144,7 +134,7 @@ def linearise_displacement(
     """
     rotation = state.clone_rotation[step.oldest]
     to_yaw_frame = geometry.yaw_rotation(rotation).T
-    moved = to_yaw_frame @ (state.offset - oldest_offset(state, step.oldest))
+    moved = to_yaw_frame @ since_oldest(state, step.oldest)
     zero, one = jnp.zeros_like(moved[0]), jnp.ones_like(moved[0])
     if measurement.frame == "own":
         defined, yaw_row = jnp.bool_(True), jnp.stack([zero, zero, one])
@@ -156,27 +146,15 @@ def linearise_displacement(
         yaw_row = jnp.stack([scale * rotation[0, 0], scale * rotation[1, 0], one])
     # R_γᵀ hat(p_j − p_i) e_z = (R_γᵀ (p_j − p_i)) × e_z, since the yaw leaves e_z as it is.
     by_yaw = jnp.stack([moved[1], -moved[0], zero])
+    jacobian = {"since_oldest": to_yaw_frame, "oldest_rotation": by_yaw[:, None] * yaw_row[None]}
 
-    residual, covariance, correlated = (
-        measurement.displacement - moved,
-        measurement.covariance,
-        None,
-    )
+    residual, covariance = measurement.displacement - moved, measurement.covariance
     correlation = step.noise.correlation
     if correlation is not None:
-        correlated = correlation.share * lower_triangular(cholesky(covariance))
-        residual = residual - geometry.matmul(correlated, state.correlated[:, None])[:, 0]
-        covariance = (1 - correlation.share**2) * covariance
-    linear = linearise(
-        state,
-        step,
-        residual,
-        covariance,
-        since_oldest=to_yaw_frame,
-        oldest_rotation=by_yaw[:, None] * yaw_row[None],
-        correlated=correlated,
-    )
-    return linear, defined
+        jacobian["correlated"] = correlation.share * lower_triangular(cholesky(covariance))
+        predicted = geometry.matmul(jacobian["correlated"], state.correlated[:, None])[:, 0]
+        residual, covariance = residual - predicted, (1 - correlation.share**2) * covariance
+    return linearise(state, residual, covariance, **jacobian), defined
 
 
 def _covariance_factor(

@@ -22,7 +22,7 @@ from gnio_jax.types import Array
 
 
 class Gap(NamedTuple):
-    """How far n samples can be believed."""
+    """How certain n samples are."""
 
     gyro_variance: Float[Array, "*n"]
     """Added to the variance of the white noise, (rad/s)²."""
@@ -44,7 +44,7 @@ class Imu(NamedTuple):
 
 
 def no_gap(n: int, dtype: np.dtype) -> Gap:
-    """For n samples none of which is missing."""
+    """The gap of n samples where none is missing."""
     return Gap(np.zeros(n, dtype), np.zeros(n, dtype), np.ones(n, dtype))
 
 

@@ -1,4 +1,4 @@
-"""The χ² gate on innovations (after TLIO): which measurements the filter believes.
+"""The χ² gate on innovations (after TLIO): which measurements the filter accepts.
 
 It has nothing to do with the gate of the network's head, which scales a displacement.
 """
@@ -47,7 +47,7 @@ def innovation_gate(
     `now` and `oldest` are the samples of the newest and the oldest clone. Where no measurement is
     `tested`, an earlier last success moves along (ours): absence is not staleness, or the first
     second after any hole would pass unchecked. TLIO has a measurement at every clone. Comparisons
-    are strict, as "more than" and "older" say; at the very end of a pause the gate is active again.
+    are strict ("more than", "older"); at the very end of a pause the gate is active again.
     With `gate_softness` the active gate weighs instead (ours); its memory still takes what is above
     the threshold for a failure.
     """
@@ -61,15 +61,11 @@ def innovation_gate(
         weight = jnp.where(tested, jnp.where(active, slope, 1.0), 0.0)
     nothing_tested = ~tested & (memory.last_success >= 0)
     waited = config.samples_per_clone * nothing_tested.astype(jnp.int32)
-    pause_end = now + _pause_samples(config)
+    # Until a pause is over, rounded up whatever rounding does to pause / dt.
+    pause_end = now - int(np.floor(-config.pause_seconds / config.dt + 1e-6))
     memory = GateState(
         converged=memory.converged,
         last_success=jnp.where(passed, now, memory.last_success + waited),
         pause_end=jnp.where(tested & stale, pause_end, memory.pause_end),
     )
     return memory, weight
-
-
-def _pause_samples(config: FilterConfig) -> int:
-    """Samples until a pause is over, rounded up, whatever rounding does to pause / dt."""
-    return -int(np.floor(-config.pause_seconds / config.dt + 1e-6))

@@ -49,29 +49,29 @@ class FilterHistory(NamedTuple):
     covariance: Float[Array, "k 15 15"] | None
     """The whole core block where `FilterConfig.history` is "core", else None."""
     accepted: Float[Array, "k"]
-    """1 an update was applied (also one with scaled covariance), 0 none was (gate or gimbal lock),
-    NaN no measurement."""
+    """1 where an update was applied (also one with scaled covariance), 0 where none was (gate or
+    gimbal lock), NaN where no measurement."""
     gate_passed: Float[Array, "k"]
-    """1 the χ² gate let the measurement through as it is, 0 it did not, between them its weight
-    (`gate_softness`), NaN no measurement."""
+    """1 where the χ² gate let the measurement through as it is, 0 where it did not, between them
+    its weight (`gate_softness`), NaN where no measurement."""
     nis: Float[Array, "k"]
     """Normalised innovation squared, rᵀ S⁻¹ r; NaN where no measurement."""
     log_likelihood: Float[Array, "k"]
     """ln N(r; 0, S) of the innovation, r in m; NaN where no measurement. Their sum is the evidence
     for the noise model."""
     at_rest: Float[Array, "k"]
-    """1 the velocity was measured as zero (`zero_velocity_std`), else 0, also where the χ² test
-    refused that."""
+    """1 where the velocity was measured as zero (`zero_velocity_std`), else 0, also where the χ²
+    test refused that."""
     imu_gap: Float[Array, "k"]
     """Age of the oldest held IMU sample of the interval, s; 0 where none was missing. Above
     `bridge_seconds` the filter coasted."""
     healthy: Float[Array, "k"]
     """0 from the first row on where the state is not finite, a variance is negative or the speed
-    above `FilterConfig.speed_limit`: bad input that could not be seen before, and all after it is
-    void. The final state remembers it, and a later run from that begins with 0."""
+    above `FilterConfig.speed_limit`. The input was bad, and all after it is void. The final state
+    remembers it, and a later run from that begins with 0."""
     others: tuple[Outcome, ...]
-    """What became of the measurements beside the displacement, their leaves stacked over K: of the
-    velocity at rest where `zero_velocity_std` is above 0, then of the caller's `measurements`."""
+    """What became of the measurements beside the displacement, stacked over K: of the velocity at
+    rest where `zero_velocity_std` is above 0, then of the caller's `measurements`."""
     diagnostics: dict[str, Array]
     """The network's diagnostics stacked over K, NaN where it had no window; empty without a
     network."""
@@ -98,10 +98,7 @@ class StepRecord(NamedTuple):
 
 
 def finished_history(
-    records: StepRecord,
-    imu_gap: Float[Array, "k"],
-    healthy: Bool[Array, ""],
-    config: FilterConfig,
+    records: StepRecord, imu_gap: Float[Array, "k"], healthy: Bool[Array, ""], config: FilterConfig
 ) -> FilterHistory:
     """The history of K stacked records from a state that was `healthy` or not."""
     (update, *others), covariance = records.outcomes, records.covariance

@@ -7,11 +7,12 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from gnio_jax.config import NoiseModel
 from gnio_jax.filtering.config import FilterConfig
 from gnio_jax.filtering.displacement import Displacement, scaled_displacement
+from gnio_jax.filtering.gaps import Imu
 from gnio_jax.filtering.state import FilterState
 from gnio_jax.types import Array, Prediction
 from gnio_jax.windows import cut_window
@@ -26,33 +27,61 @@ def prediction_shapes(predict: Predict, config: FilterConfig) -> Prediction:
     needs."""
     found = jax.eval_shape(predict, jax.ShapeDtypeStruct((1, config.seen, 6), jnp.float32))
     if not isinstance(found, Prediction):
-        raise ValueError(
-            f"predict: must return a gnio_jax.types.Prediction, found {type(found).__name__}"
-        )
+        kind = type(found).__name__
+        raise ValueError(f"predict: must return a gnio_jax.types.Prediction, found {kind}")
     for name, value in [("displacement", found.displacement), ("log_std", found.log_std)]:
         if value.shape != (1, 3):
             raise ValueError(f"predict: {name} must be (1, 3) for one window, found {value.shape}")
     for name, value in found.diagnostics.items():
         if value.shape[:1] != (1,):
-            raise ValueError(
-                f"predict: diagnostics['{name}'] must have a leading axis of one window, "
-                f"found {value.shape}"
-            )
+            problem = f"must have a leading axis of one window, found {value.shape}"
+            raise ValueError(f"predict: diagnostics['{name}'] {problem}")
     return found
 
 
-def predict_window(
-    predict: Predict,
-    state: FilterState,
-    oldest: Array | int,
-    gyro: Float[Array, "r 3"],
-    accel: Float[Array, "r 3"],
-    config: FilterConfig,
-) -> Prediction:
-    """The network's prediction for one window (`network_window`), without the leading axis of
-    one."""
-    prediction = predict(network_window(state, oldest, gyro, accel, config))
-    return jax.tree.map(lambda leaf: _as_floating(leaf[0]), prediction)
+def network_measurement(
+    predict: Predict, config: FilterConfig, noise: NoiseModel
+) -> Callable[..., tuple[Displacement, dict[str, Array]]]:
+    """The displacement that the network measures, with its diagnostics, as a function
+
+        measure(has_window, latest, state, oldest)
+
+    where `latest()` gives the last `config.reach` raw samples, and `oldest` is the slot of the
+    oldest clone. The network is called where `has_window`. There is no measurement elsewhere, nor
+    from a window in which the filter coasted.
+    """
+    shapes = prediction_shapes(predict, config)
+
+    def measure(
+        has_window: Bool[Array, ""],
+        latest: Callable[[], Imu],
+        state: FilterState,
+        oldest: Array | int,
+    ) -> tuple[Displacement, dict[str, Array]]:
+        def infer() -> Prediction:
+            gyro, accel, gap = latest()
+            found = predict(network_window(state, oldest, gyro, accel, config))
+            found = jax.tree.map(lambda leaf: _as_floating(leaf[0]), found)
+            if gap is None:
+                return found
+            whole = jnp.all(gap.used > 0)
+            return found._replace(displacement=jnp.where(whole, found.displacement, jnp.nan))
+
+        def nothing() -> Prediction:
+            return jax.tree.map(
+                lambda leaf: jnp.full(leaf.shape[1:], jnp.nan, _as_floating(leaf).dtype), shapes
+            )
+
+        found = jax.lax.cond(has_window, infer, nothing)
+        # The covariance is diag(exp 2u), u raised to `log_std_min`.
+        dtype = state.offset.dtype
+        log_std = jnp.maximum(found.log_std.astype(dtype), config.log_std_min)
+        covariance = jnp.diag(jnp.exp(2 * log_std))
+        displacement = found.displacement.astype(dtype)
+        frame = config.displacement_frame
+        return scaled_displacement(displacement, covariance, noise, frame), found.diagnostics
+
+    return measure
 
 
 def network_window(
@@ -72,24 +101,6 @@ def network_window(
         rotation, gyro, accel, *biases, config.cut, config.dt, config.context_samples
     )
     return window[None].astype(jnp.float32)
-
-
-def no_prediction(shapes: Prediction) -> Prediction:
-    """NaN in the shapes of one window's prediction."""
-    return jax.tree.map(
-        lambda leaf: jnp.full(leaf.shape[1:], jnp.nan, _as_floating(leaf).dtype), shapes
-    )
-
-
-def predicted_displacement(
-    prediction: Prediction, config: FilterConfig, noise: NoiseModel, dtype: Any
-) -> Displacement:
-    """The measurement that the filter makes of a prediction: covariance diag(exp 2u), u raised to
-    `log_std_min`, before scaling. It is expressed in the yaw frame that `config` names."""
-    log_std = jnp.maximum(prediction.log_std.astype(dtype), config.log_std_min)
-    covariance = jnp.diag(jnp.exp(2 * log_std))
-    displacement = prediction.displacement.astype(dtype)
-    return scaled_displacement(displacement, covariance, noise, config.displacement_frame)
 
 
 def _as_floating(value: Any) -> Any:

@@ -123,10 +123,10 @@ def _interval_noise(
     walk = jnp.repeat(jnp.stack([noise.gyro_bias_walk, noise.accel_bias_walk]) ** 2 * dt, 3)
     # The gyro's noise and the walks as one product of 9 rows.
     of_gyro = effect[:, :3]
-    left = [of_gyro, by_bias]
     right = [of_gyro * gyro_variance[None, None], by_bias * walk[None, :, None]]
     left, right = (
-        jnp.concatenate([part.reshape(9, -1) for part in parts], axis=1) for parts in (left, right)
+        jnp.concatenate([part.reshape(9, -1) for part in parts], axis=1)
+        for parts in ([of_gyro, by_bias], right)
     )
     # The accelerometer's noise is isotropic, so that its rotations drop out of R Rᵀ: each sample
     # adds one number for each pair of v and p.

@@ -17,39 +17,34 @@ that. A single lost sample is no hole. All of this happens on the host.
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from scipy.interpolate import CubicSpline
 
+from gnio_jax import numerics
 from gnio_jax.decimation import decimation_factor, low_pass
+from gnio_jax.filtering.checks import check_number
 
 GYRO, ACCEL, VALID = slice(0, 3), slice(3, 6), 6
 """Columns of grid samples: rad/s, m/s², and 1, or NaN and 0 where the sample is missing."""
 
 LONGEST_GAP = 60.0
-"""A stamp further than this from the one before is taken for a mistake (of its unit, most often),
-s."""
+"""A stamp further than this from the one before is a mistake, most often of its unit, s."""
 LONGEST_TRUSTED = 1.0
-"""A stamp further than this from the one before is believed once a second one agrees with it, s
-(ours): a clock may be wrong for one sample."""
+"""A stamp further than this from the one before counts once a second one agrees with it, s (ours):
+a clock may be wrong for one sample."""
 
-_CLOSEST = 0.25
-"""Of the IMU's interval: before the low-pass a sample that comes sooner after another is left out
-(ours), or noise would make the spline swing."""
-_LINE = 1.75
-"""Of the IMU's interval: samples further apart are joined by a line (ours). There the spline has no
-hold, and swings the higher the wider the gap; a lost sample of a vibration is enough for that."""
-_LOST = 2.5
-"""Of the IMU's interval: samples no further apart belong to one run (ours), so that the loss of a
-single one does not end it."""
-_STOP = 5.0
-"""Of the grid's interval: what is longer is a stop of the IMU and says nothing of its rate (ours).
-Shorter ones may be jitter."""
-_RATE_CHECK = 100
-"""Every so many grid samples the IMU's rate is held against `imu_rate`: by the number of stamps
-till then, which jitter hardly changes. The time in which the IMU stopped does not count."""
+# In intervals of the IMU (ours). A sample that comes sooner after another is left out before the
+# low-pass, or noise would make the spline swing. Samples further apart than a line's length are
+# joined by a line: there the spline has no hold. Those no further apart than a lost sample makes
+# them belong to one run.
+_CLOSEST, _LINE, _LOST = 0.25, 1.75, 2.5
+
+# In intervals of the grid (ours). A longer interval is a stop of the IMU, which does not count for
+# its rate; a shorter one may be jitter. The rate is known from so many grid samples on.
+_STOP, _RATE_KNOWN = 5.0, 100
 _TOO_FAST = 1.05
 """Times the fastest rate that the low-pass is made for."""
 _BEFORE = 4
@@ -80,31 +75,19 @@ class Grid(NamedTuple):
         """Samples further apart belong to two runs, s."""
         return max(self.hole, _LOST / self.imu_rate) if self.factor > 1 else self.hole
 
-    @property
-    def fastest(self) -> float:
-        """Above this rate of the IMU, Hz, vibrations alias all the same."""
-        return 1.5 * self.imu_rate if self.factor > 1 else 1 / self.dt
 
-
-def create_grid(dt: float, hole: Any = None, imu_rate: Any = None) -> Grid:
+def create_grid(dt: float, hole: float | None = None, imu_rate: float | None = None) -> Grid:
     """For a filter with a sample every `dt` s and an IMU of `imu_rate` Hz, by default 1/dt.
 
     `hole` is 1.5 dt by default. Raises `ValueError`.
     """
     hole = 1.5 * dt if hole is None else hole
-    if not (is_finite_number(hole) and hole >= dt):
-        raise ValueError(f"hole: must be a time of at least dt = {dt:g} s, found {hole!r}")
     imu_rate = 1 / dt if imu_rate is None else imu_rate
-    if not (is_finite_number(imu_rate) and imu_rate > 0):
-        raise ValueError(f"imu_rate: must be a rate in Hz, found {imu_rate!r}")
+    check_number("hole", hole, dt, "s")
+    check_number("imu_rate", imu_rate, 1e-9, "Hz")
     factor = decimation_factor(imu_rate, 1 / dt)
     taps = low_pass(factor) if factor > 1 else np.ones(1)
     return Grid(dt, float(hole), float(imu_rate), factor, taps)
-
-
-def is_finite_number(value: Any) -> bool:
-    """Whether `value` is a Python number, and finite."""
-    return isinstance(value, int | float) and math.isfinite(value)
 
 
 def grid_rows(
@@ -121,30 +104,24 @@ def grid_rows(
     were there, as far as the grid samples depend on them. Stamps closer than `slack` (s) to a time
     are that time.
     """
-    numbers = first + np.arange(count)
-    if len(stamps) == 0 or count == 0:
-        values = np.full((count, 6), np.nan)
-    elif grid.factor == 1:
-        values = _interpolated(stamps, samples, numbers * grid.dt, grid.hole, slack)
-    else:
-        values = _low_passed(stamps, samples, numbers * grid.factor, grid, slack)
+    values = np.full((count, 6), np.nan)
+    if len(stamps) and count:
+        of_rows = _interpolated if grid.factor == 1 else _low_passed
+        values = of_rows(stamps, samples, first + np.arange(count), grid, slack)
     return np.concatenate([values, np.isfinite(values[:, :1])], axis=1)
 
 
 def _interpolated(
-    stamps: Float[np.ndarray, "m"],
-    samples: Float[np.ndarray, "m 6"],
-    times: Float[np.ndarray, "count"],
-    hole: float,
-    slack: float,
-) -> Float[np.ndarray, "count 6"]:
-    """The samples at these times: those that lie there, or lines between two that are no hole
-    apart, else NaN."""
+    stamps: np.ndarray, samples: np.ndarray, numbers: np.ndarray, grid: Grid, slack: float
+) -> np.ndarray:
+    """The samples at the times of these grid samples: those that lie there, or lines between two
+    that are no hole apart, else NaN."""
+    times = numbers * grid.dt
     after = np.searchsorted(stamps, times - slack)
     before, inner = np.maximum(after - 1, 0), np.minimum(after, len(stamps) - 1)
     apart, ended = stamps[inner] - stamps[before], after == len(stamps)
     equal = (stamps[inner] <= times + slack) & ~ended
-    between = (after > 0) & (apart <= hole) & ~ended
+    between = (after > 0) & (apart <= grid.hole) & ~ended
     share = (times - stamps[before]) / np.where(apart > 0, apart, 1.0)
     values = samples[before] + share[:, None] * (samples[inner] - samples[before])
     values[equal] = samples[inner[equal]]
@@ -153,18 +130,14 @@ def _interpolated(
 
 
 def _low_passed(
-    stamps: Float[np.ndarray, "m"],
-    samples: Float[np.ndarray, "m 6"],
-    centres: Int[np.ndarray, "count"],
-    grid: Grid,
-    slack: float,
-) -> Float[np.ndarray, "count 6"]:
-    """The FIR at these points of the fine grid, run by run of samples; NaN between the runs."""
-    half, step = len(grid.taps) // 2, grid.dt / grid.factor
-    # The points of the fine grid that all centres together depend on.
+    stamps: np.ndarray, samples: np.ndarray, numbers: np.ndarray, grid: Grid, slack: float
+) -> np.ndarray:
+    """The FIR about these grid samples, run by run of samples; NaN between the runs."""
+    half, step, centres = len(grid.taps) // 2, grid.dt / grid.factor, numbers * grid.factor
+    # The points of the fine grid that all centres depend on.
     lowest, highest = centres[0] - half, centres[-1] + half
     values = np.full((len(centres), 6), np.nan)
-    for run in np.split(np.arange(len(stamps)), np.flatnonzero(np.diff(stamps) > grid.longest) + 1):
+    for run in numerics.stretches(np.diff(stamps) > grid.longest):
         time = stamps[run]
         begin, end = math.ceil((time[0] - slack) / step), math.floor((time[-1] + slack) / step)
         low, high = max(begin, lowest), min(end, highest)
@@ -188,13 +161,10 @@ def _low_passed(
 
 
 def _curve(
-    time: Float[np.ndarray, "m"],
-    samples: Float[np.ndarray, "m 6"],
-    points: Float[np.ndarray, "p"],
-    imu_rate: float,
-) -> Float[np.ndarray, "p 6"]:
+    time: np.ndarray, samples: np.ndarray, points: np.ndarray, imu_rate: float
+) -> np.ndarray:
     """A run read at some points of it: a spline, and lines where samples are far apart."""
-    lines = np.stack([np.interp(points, time, column) for column in samples.T], axis=1)
+    lines = numerics.interpolate(points, time, samples)
     if len(time) < 4:
         return lines
     wide = np.diff(time) > _LINE / imu_rate
@@ -234,7 +204,7 @@ class Stream:
             self.origin = time
             self._append(0.0, sample)
             return
-        stamp, newest = time - self.origin, self._newest
+        stamp, newest, come = time - self.origin, self._newest, [(time - self.origin, sample)]
         if stamp <= newest:
             raise ValueError(f"time: must increase, found {time!r} after {self.origin + newest!r}")
         if stamp - newest > LONGEST_GAP:
@@ -243,13 +213,13 @@ class Stream:
                 f"{LONGEST_GAP:g} s; stamps are in seconds, and after a long stop a new tracker "
                 "starts better"
             )
-        waiting, come = self._unproven, [(stamp, sample)]
         if stamp - newest > LONGEST_TRUSTED:
+            waiting = self._unproven
             if waiting is None or not 0 < stamp - waiting[0] <= LONGEST_TRUSTED:
                 self._unproven = stamp, sample
                 return
             come.insert(0, waiting)
-        self._intervals, self._covered = self._measured_rate([each for each, _ in come])
+        self._check_rate([each for each, _ in come])
         self._unproven = None
         for each in come:
             self._append(*each)
@@ -289,21 +259,20 @@ class Stream:
         largest = max(abs(self.origin), abs(self.origin + stamp))
         return 1e-6 * self.grid.dt + 4 * math.ulp(largest)
 
-    def _measured_rate(self, stamps: list[float]) -> tuple[int, float]:
-        """The intervals and their sum after these stamps. Raises `ValueError` if the samples come
-        so much faster than `imu_rate` that vibrations would alias."""
-        grid, period = self.grid, _RATE_CHECK * self.grid.dt
-        intervals, covered, before = self._intervals, self._covered, self._newest
-        for stamp in stamps:
-            interval, before, slack = stamp - before, stamp, self._slack(stamp)
-            if interval > max(grid.hole, _STOP * grid.dt):
-                continue
-            due = (covered + interval + slack) // period > (covered + slack) // period
-            intervals, covered = intervals + 1, covered + interval
-            if due and (rate := intervals / covered) > _TOO_FAST * grid.fastest:
-                raise ValueError(
-                    f"imu_rate: the samples come at {rate:.4g} Hz, the tracker was made for "
-                    f"{grid.imu_rate:.4g} Hz: vibrations would alias; make it with "
-                    f"imu_rate={rate:.4g}"
-                )
-        return intervals, covered
+    def _check_rate(self, stamps: list[float]) -> None:
+        """Count the intervals before these stamps. Raises `ValueError` if the samples come so much
+        faster than `imu_rate` that vibrations would alias: by the number of stamps so far, which
+        jitter hardly changes."""
+        grid, intervals, covered = self.grid, self._intervals, self._covered
+        fastest = 1.5 * grid.imu_rate if grid.factor > 1 else 1 / grid.dt
+        for interval in np.diff([self._newest, *stamps]).tolist():
+            if interval <= max(grid.hole, _STOP * grid.dt):
+                intervals, covered = intervals + 1, covered + interval
+        known = round(covered / grid.dt, 3) >= _RATE_KNOWN
+        rate = intervals / covered if known else 0.0
+        if rate > _TOO_FAST * fastest:
+            raise ValueError(
+                f"imu_rate: the samples come at {rate:.4g} Hz, the tracker was made for "
+                f"{grid.imu_rate:.4g} Hz: vibrations would alias; make it with imu_rate={rate:.4g}"
+            )
+        self._intervals, self._covered = intervals, covered

@@ -13,15 +13,10 @@ import jax.numpy as jnp
 from gnio_jax.config import NoiseModel
 from gnio_jax.filtering.checks import Inputs, checked_displacements, checked_inputs
 from gnio_jax.filtering.config import FilterConfig, YawFrame
-from gnio_jax.filtering.displacement import Displacement, scaled_displacements
+from gnio_jax.filtering.displacement import Displacement, scaled_displacement
 from gnio_jax.filtering.gaps import Imu, bridge
 from gnio_jax.filtering.history import FilterHistory, StepRecord, finished_history
-from gnio_jax.filtering.network import (
-    no_prediction,
-    predict_window,
-    predicted_displacement,
-    prediction_shapes,
-)
+from gnio_jax.filtering.network import Predict, network_measurement
 from gnio_jax.filtering.propagation import (
     Transition,
     core_transition,
@@ -32,7 +27,7 @@ from gnio_jax.filtering.propagation import (
 from gnio_jax.filtering.state import FilterState, core_covariance, move_anchor, unroll_clones
 from gnio_jax.filtering.update import Correction, Measurement, Outcome, Step
 from gnio_jax.filtering.zero_velocity import ZeroVelocity
-from gnio_jax.types import Array, Prediction
+from gnio_jax.types import Array
 
 
 def run_filter(
@@ -79,12 +74,12 @@ def run_filter(
 def _run_filter(
     inputs: Inputs, displacement: Array, covariance: Array, config: FilterConfig, frame: YawFrame
 ) -> tuple[FilterState, FilterHistory]:
-    given = scaled_displacements(displacement, covariance, inputs.noise, frame)
+    given = scaled_displacement(displacement, covariance, inputs.noise, frame)
     return _scan(lambda number, stream, given, *_: (given, {}), inputs, given, config)
 
 
 def run_odometry(
-    predict: Callable[[Any], Prediction],
+    predict: Predict,
     state: FilterState,
     gyro: Any,
     accel: Any,
@@ -110,30 +105,20 @@ def run_odometry(
     Raises `ValueError` as `run_filter` does, or for a `predict` that returns something else.
     """
     inputs = checked_inputs(state, gyro, accel, imu_valid, measurements, config, noise)
-    nothing = no_prediction(prediction_shapes(predict, config))
-
-    def infer(number: Array, stream: Imu, state: FilterState, oldest: Array) -> Prediction:
-        first = (number + 1) * config.samples_per_clone - config.reach
-        seen = jax.tree.map(
-            lambda signal: jax.lax.dynamic_slice_in_dim(signal, first, config.reach), stream
-        )
-        prediction = predict_window(predict, state, oldest, seen.gyro, seen.accel, config)
-        if seen.gap is None:
-            return prediction
-        whole = jnp.all(seen.gap.used > 0)
-        return prediction._replace(displacement=jnp.where(whole, prediction.displacement, jnp.nan))
+    of_window = network_measurement(predict, config, inputs.noise)
 
     def measure(
         number: Array, stream: Imu, _: None, state: FilterState, oldest: Array
     ) -> tuple[Displacement, dict]:
+        def latest() -> Imu:
+            first = (number + 1) * config.samples_per_clone - config.reach
+            return jax.tree.map(
+                lambda signal: jax.lax.dynamic_slice_in_dim(signal, first, config.reach), stream
+            )
+
         # The number is the scan's own counter, the same for every sequence of a batch, so that this
         # stays a branch under vmap.
-        has_window = number >= config.first_measured
-        given = number, stream, state, oldest
-        prediction = jax.lax.cond(has_window, infer, lambda *_: nothing, *given)
-        dtype = stream.gyro.dtype
-        measurement = predicted_displacement(prediction, config, inputs.noise, dtype)
-        return measurement, prediction.diagnostics
+        return of_window(number >= config.first_measured, latest, state, oldest)
 
     return _scan(measure, inputs, None, config)
 
@@ -254,12 +239,11 @@ def _take(
     measurement: Measurement, state: FilterState, step: Step
 ) -> tuple[FilterState, Outcome, Correction]:
     """The measurement's update."""
-    kept = jax.checkpoint(
-        lambda measurement, state: measurement.update(state, step),
-        policy=_keep,
-        prevent_cse=False,
-    )
-    return kept(measurement, state)
+
+    def update(measurement: Measurement, state: FilterState) -> tuple:
+        return measurement.update(state, step)
+
+    return jax.checkpoint(update, policy=_keep, prevent_cse=False)(measurement, state)
 
 
 # A scan whose backward pass is bounded
@@ -273,10 +257,9 @@ def blocked_scan(
     computes the steps between them again, and which hands the carry on without gradient after
     every `truncate_every`-th step. 0: it keeps every carry, and never cuts the gradient."""
     run = functools.partial(jax.lax.scan, step)
-    rows = jax.tree.leaves(inputs)[0].shape[0]
-    longest = min(truncate_every, rows) or rows
-    if 0 < checkpoint_every < longest:
-        run = in_blocks(jax.checkpoint(run, prevent_cse=False), run, checkpoint_every)
+    rows = len(jax.tree.leaves(inputs)[0])
+    if 0 < checkpoint_every < min(truncate_every or rows, rows):
+        run = in_blocks(jax.checkpoint(run, prevent_cse=False), checkpoint_every)
     if truncate_every:
         within = run
 
@@ -284,24 +267,23 @@ def blocked_scan(
             carry, out = within(carry, block)
             return jax.lax.stop_gradient(carry), out
 
-        run = in_blocks(cut, cut, longest)
+        run = in_blocks(cut, min(truncate_every, rows))
     return run(carry, inputs)
 
 
-def in_blocks(run: Callable, run_rest: Callable, every: int) -> Callable:
-    """A scan over blocks of `every` rows of its inputs, each by `run(carry, block)`, then by
-    `run_rest` over the rows that are left over."""
+def in_blocks(run: Callable, every: int) -> Callable:
+    """A scan by `run(carry, block)` over blocks of `every` rows of its inputs, and then over the
+    rows that are left over."""
 
     def scan(carry: Any, inputs: Any) -> tuple[Any, Any]:
-        length = jax.tree.leaves(inputs)[0].shape[0]
-        count = length // every
+        count, left_over = divmod(len(jax.tree.leaves(inputs)[0]), every)
         whole = count * every
         blocks = jax.tree.map(lambda x: x[:whole].reshape(count, every, *x.shape[1:]), inputs)
         carry, out = jax.lax.scan(run, carry, blocks)
         out = jax.tree.map(lambda y: y.reshape(whole, *y.shape[2:]), out)
-        if length > whole:
-            carry, rest = run_rest(carry, jax.tree.map(lambda x: x[whole:], inputs))
-            out = jax.tree.map(lambda y, z: jnp.concatenate([y, z]), out, rest)
+        if left_over:
+            carry, last = run(carry, jax.tree.map(lambda x: x[whole:], inputs))
+            out = jax.tree.map(lambda y, z: jnp.concatenate([y, z]), out, last)
         return carry, out
 
     return scan

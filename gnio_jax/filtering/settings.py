@@ -8,18 +8,9 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax.tree_util import keystr, tree_leaves_with_path, tree_map_with_path
+from jax.tree_util import keystr, tree_leaves_with_path
 
-from gnio_jax.config import (
-    ConsideredStd,
-    CorrelatedError,
-    DataConfig,
-    FilterSettings,
-    InitialStd,
-    NoiseModel,
-)
-from gnio_jax.config.files import bounds, named
-from gnio_jax.config.schema import SHARE
+from gnio_jax.config import ConsideredStd, DataConfig, FilterSettings, InitialStd, NoiseModel
 from gnio_jax.filtering.config import FilterConfig
 
 jax.tree_util.register_dataclass(
@@ -28,6 +19,8 @@ jax.tree_util.register_dataclass(
     meta_fields=["mahalanobis_fail_scale", "window_rotation"],
 )
 
+SHARE = "noise.correlation.share"
+"""The number that lies between 0 and 1; the others are positive."""
 LARGEST_SHARE = 0.9999
 """Largest share that is written down: rounding must not make it 1."""
 
@@ -70,10 +63,9 @@ def free_parameters(settings: FilterSettings, paths: Iterable[str]) -> dict[str,
     number that is 0 is switched off, and has none.
     """
     wanted = tuple(paths)
-    values = {_name(path): value for path, value in tree_leaves_with_path(settings)}
     return {
-        name: math.log(value) - (math.log1p(-value) if name in _SHARES else 0.0)
-        for name, value in values.items()
+        name: math.log(value) - (math.log1p(-value) if name == SHARE else 0.0)
+        for name, value in _numbers(settings).items()
         if value > 0 and any(is_below(name, path) for path in wanted)
     }
 
@@ -85,15 +77,11 @@ def is_below(name: str, path: str) -> bool:
 
 def with_free_parameters(settings: FilterSettings, free: Mapping[str, Any]) -> FilterSettings:
     """The settings with the values, float64, of these free parameters. Differentiable."""
-
-    def value(path: Any, old: Any) -> Any:
-        name = _name(path)
-        if name not in free:
-            return old
+    names, structure = _numbers(settings), jax.tree.structure(settings)
+    for name in names.keys() & free.keys():
         number = jnp.asarray(free[name], jnp.float64)
-        return jax.nn.sigmoid(number) if name in _SHARES else jnp.exp(number)
-
-    return tree_map_with_path(value, settings)
+        names[name] = jax.nn.sigmoid(number) if name == SHARE else jnp.exp(number)
+    return jax.tree.unflatten(structure, names.values())
 
 
 def with_written_parameters(
@@ -101,26 +89,14 @@ def with_written_parameters(
 ) -> FilterSettings:
     """The settings with the values of these free parameters as they are written down, as floats of
     so many digits."""
-
-    def value(path: Any, old: Any) -> Any:
-        name = _name(path)
-        if name not in free:
-            return old
-        number = float(free[name])
-        natural = 1 / (1 + math.exp(-number)) if name in _SHARES else math.exp(number)
-        written = float(f"{natural:.{digits}g}")
-        return min(written, LARGEST_SHARE) if name in _SHARES else written
-
-    return tree_map_with_path(value, settings)
+    names = _numbers(with_free_parameters(settings, free))
+    for name in names.keys() & free.keys():
+        written = float(f"{float(names[name]):.{digits}g}")
+        names[name] = min(written, LARGEST_SHARE) if name == SHARE else written
+    return jax.tree.unflatten(jax.tree.structure(settings), names.values())
 
 
-def _name(path: Any) -> str:
-    return keystr(path, simple=True, separator=".")
-
-
-_SHARES = {
-    name
-    for name, hint, _ in named(FilterSettings(NoiseModel(correlation=CorrelatedError())))
-    if SHARE in bounds(hint)
-}
-"""Numbers that lie between 0 and 1, as their bounds say; the others are positive."""
+def _numbers(settings: FilterSettings) -> dict[str, Any]:
+    """The numbers of the settings by their paths."""
+    leaves = tree_leaves_with_path(settings)
+    return {keystr(path, simple=True, separator="."): value for path, value in leaves}

@@ -28,7 +28,6 @@ by δθ, a second-order term, is left out as in the filter.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -40,24 +39,23 @@ from gnio_jax import geometry
 from gnio_jax.config import NoiseModel
 from gnio_jax.filtering.checks import Inputs, checked_displacements, checked_inputs
 from gnio_jax.filtering.config import FilterConfig, YawFrame
-from gnio_jax.filtering.displacement import Displacement, scaled_displacements
-from gnio_jax.filtering.gaps import Imu, bridge
+from gnio_jax.filtering.displacement import scaled_displacement
+from gnio_jax.filtering.gaps import bridge
 from gnio_jax.filtering.propagation import Transition, put
 from gnio_jax.filtering.scan import StepTrace, clone_step, intervals
 from gnio_jax.filtering.state import (
     ACCEL_BIAS,
-    ANCHOR,
     CLONE,
     CORE,
     GYRO_BIAS,
-    LOCAL,
     OFFSET,
     THETA,
     VELOCITY,
     FilterState,
     Mean,
+    with_position,
 )
-from gnio_jax.filtering.update import Correction, Measurement
+from gnio_jax.filtering.update import Correction, Measurement, measurable_errors
 from gnio_jax.geometry import matmul
 from gnio_jax.types import Array
 
@@ -105,30 +103,19 @@ def smooth(
     touched. Works under `jax.jit`, `jax.vmap` and `jax.grad`.
 
     Memory: about K · (18 m + 500) numbers, m = 21 + 6 (W + 1): 25 kB for each interval at W = 20,
-    in float64. With `config.checkpoint_every` = E the filter's states, m² numbers each, are kept at
-    every E-th interval only, and E intervals at a time are filtered once more on the way back: (K /
-    E) · m² + E · (18 m + 500). Smoothed variances are differences: in float32 one that is lowered
-    by many orders of magnitude, as at the start, has few digits left and can come out below zero.
+    in float64. Smoothed variances are differences: in float32 one that is lowered by many orders of
+    magnitude, as at the start, has few digits left and can come out below zero.
     """
     inputs = checked_inputs(state, gyro, accel, imu_valid, measurements, config, noise)
     measured = checked_displacements(displacement, covariance, inputs, config)
     return _smooth(inputs, *measured, config, frame)
 
 
-class _Row(NamedTuple):
-    """What a step forward takes, or K of them stacked."""
-
-    slot: Int[Array, "*k"]
-    """Of the ring, for the clone at the end of the interval."""
-    imu: Imu
-    displacement: Displacement
-    measurements: tuple[Measurement, ...]
-
-
 class _ForwardStep(NamedTuple):
     """What the way back needs of one step forward."""
 
     slot: Int[Array, "*k"]
+    """Of the ring, for the clone at the end of the interval."""
     mean: Mean
     """After the step."""
     covariance: Array
@@ -138,90 +125,39 @@ class _ForwardStep(NamedTuple):
     trace: StepTrace
 
 
-_Smoothed = tuple[Mean, Array]
-"""The smoothed estimate after one step, or K of them stacked, and the covariance of θ, v, p, b_g,
-b_a, or its diagonal."""
-
-
 @functools.partial(jax.jit, static_argnames=("config", "frame"))
 def _smooth(
     inputs: Inputs, displacement: Array, covariance: Array, config: FilterConfig, frame: YawFrame
 ) -> SmoothedHistory:
     state, gyro, accel, imu_valid, measurements, noise = inputs
-    given = scaled_displacements(displacement, covariance, noise, frame)
+    given = scaled_displacement(displacement, covariance, noise, frame)
     stream, _, _ = bridge(gyro, accel, imu_valid, state.imu, config)
     numbers, by_interval = intervals(stream, config)
-    rows = _Row(numbers % config.clones, by_interval, given, measurements)
+    rows = numbers % config.clones, by_interval, given, measurements
     size, dtype = sum(state.cross_covariance.shape), state.offset.dtype
     nothing = Adjoint(jnp.zeros(size, dtype), jnp.zeros((size, size), dtype))
-    forward = functools.partial(_forward, config=config, noise=noise)
+
+    def forward(state: FilterState, row: tuple) -> tuple[FilterState, _ForwardStep]:
+        slot, imu, given, others = row
+        state, record, trace = clone_step(
+            state, imu, slot, lambda *_: (given, {}), config, noise, others
+        )
+        cross = with_position(
+            jnp.concatenate([state.core_covariance, state.cross_covariance], axis=1)
+        )
+        return state, _ForwardStep(slot, record.mean, record.covariance, cross, trace)
+
+    _, steps = jax.lax.scan(forward, state, rows)
     backward = functools.partial(_backward, config=config)
-
-    def there_and_back(
-        state: FilterState, adjoint: Adjoint, rows: _Row
-    ) -> tuple[Adjoint, _Smoothed]:
-        _, steps = jax.lax.scan(forward, state, rows)
-        return jax.lax.scan(backward, adjoint, steps, reverse=True)
-
-    every = config.checkpoint_every
-    if every == 0 or every >= len(numbers):
-        _, smoothed = there_and_back(state, nothing, rows)
-    else:
-        smoothed = _smooth_in_blocks(there_and_back, forward, state, nothing, rows, every)
-    (mean, found), whole = smoothed, config.history == "core"
+    _, (mean, found) = jax.lax.scan(backward, nothing, steps, reverse=True)
+    whole = config.history == "core"
     diagonal = jnp.diagonal(found, axis1=1, axis2=2) if whole else found
     return SmoothedHistory(*mean, diagonal, found if whole else None)
 
 
-def _smooth_in_blocks(
-    there_and_back: Callable[..., tuple[Adjoint, _Smoothed]],
-    forward: Callable,
-    state: FilterState,
-    adjoint: Adjoint,
-    rows: _Row,
-    every: int,
-) -> _Smoothed:
-    """Keep the state before every block of `every` steps, and filter each block once more on the
-    way back."""
-    there_and_back = jax.checkpoint(there_and_back, prevent_cse=False)
-    count, left_over = divmod(len(rows.slot), every)
-    whole = count * every
-    blocks = jax.tree.map(lambda x: x[:whole].reshape(count, every, *x.shape[1:]), rows)
-
-    def filter_block(state: FilterState, block: _Row) -> tuple[FilterState, FilterState]:
-        return jax.lax.scan(forward, state, block)[0], state
-
-    def smooth_block(adjoint: Adjoint, start: tuple) -> tuple[Adjoint, _Smoothed]:
-        state, block = start
-        return there_and_back(state, adjoint, block)
-
-    last, starts = jax.lax.scan(filter_block, state, blocks)
-    rest = None
-    if left_over:
-        adjoint, rest = there_and_back(last, adjoint, jax.tree.map(lambda x: x[whole:], rows))
-    _, smoothed = jax.lax.scan(smooth_block, adjoint, (starts, blocks), reverse=True)
-    smoothed = jax.tree.map(lambda y: y.reshape(whole, *y.shape[2:]), smoothed)
-    if rest is None:
-        return smoothed
-    return jax.tree.map(lambda y, z: jnp.concatenate([y, z]), smoothed, rest)
-
-
-def _forward(
-    state: FilterState, row: _Row, config: FilterConfig, noise: NoiseModel
-) -> tuple[FilterState, _ForwardStep]:
-    """One step of the filter, and what the way back needs of it."""
-    slot, imu, displacement, measurements = row
-    state, record, trace = clone_step(
-        state, imu, slot, lambda *_: (displacement, {}), config, noise, measurements
-    )
-    rows = jnp.concatenate([state.core_covariance, state.cross_covariance], axis=1)
-    cross = rows[LOCAL].at[OFFSET].add(rows[ANCHOR])  # p = a + o
-    return state, _ForwardStep(slot, record.mean, record.covariance, cross, trace)
-
-
 def _backward(
     adjoint: Adjoint, step: _ForwardStep, config: FilterConfig
-) -> tuple[Adjoint, _Smoothed]:
+) -> tuple[Adjoint, tuple[Mean, Array]]:
     """The smoothed estimate after a step, and the adjoint before it."""
     over = step.cross @ adjoint.matrix
     error = -(step.cross @ adjoint.vector)
@@ -236,7 +172,7 @@ def _backward(
         gyro_bias=step.mean.gyro_bias + error[GYRO_BIAS],
         accel_bias=step.mean.accel_bias + error[ACCEL_BIAS],
     )
-    oldest = CLONE * ((step.slot + 1) % config.clones)
+    oldest = (step.slot + 1) % config.clones
     for correction in reversed(step.trace.corrections):
         adjoint = _before_update(adjoint, correction, oldest)
     adjoint = _before_propagation(adjoint, step.trace.transition, step.slot)
@@ -251,10 +187,16 @@ class Adjoint(NamedTuple):
 
 
 def _before_update(adjoint: Adjoint, correction: Correction, oldest: Int[Array, ""]) -> Adjoint:
-    """Back over an update; `oldest` is where the oldest clone lies among the clones."""
+    """Back over an update; `oldest` is the slot of the oldest clone."""
+
+    def measured(core: Array, clones: Array) -> dict[str, Array]:
+        parts = measurable_errors(core, clones, oldest)
+        return {name: parts[name] for name in correction.jacobian}
+
     rows = jnp.concatenate([correction.core, correction.clones], axis=1)
-    of_clones = put(jnp.zeros_like(correction.clones), correction.oldest_jacobian, 0, oldest)
-    jacobian = jnp.concatenate([correction.core_jacobian, of_clones], axis=1)
+    blocks = {name: block.T for name, block in correction.jacobian.items()}
+    transposed = jax.linear_transpose(measured, correction.core.T, correction.clones.T)
+    jacobian = jnp.concatenate(transposed(blocks)).T
     over = rows @ adjoint.matrix
     # Λ − Mᵀ G − Gᵀ M with G = Y Λ − ½ (Y Λ Yᵀ + I) M
     half = 0.5 * (matmul(over, rows.T) + np.eye(len(rows), dtype=over.dtype))

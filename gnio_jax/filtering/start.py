@@ -24,12 +24,7 @@ from jaxtyping import Float
 from gnio_jax import geometry
 from gnio_jax.config import InitialStd
 from gnio_jax.config.schema import TLIO_STD
-from gnio_jax.filtering.checks import (
-    check_finite,
-    check_not_negative,
-    check_rotation,
-    checked_array,
-)
+from gnio_jax.filtering.checks import check_finite, check_numbers, check_rotation, checked_array
 from gnio_jax.filtering.config import FilterConfig
 from gnio_jax.filtering.state import FilterState, Mean, without_clones
 from gnio_jax.numerics import finite_rows
@@ -73,23 +68,19 @@ def initial_state(
     check_rotation("rotation", rotation)
     dtype = rotation.dtype
 
-    def vector(name: str, value: Any) -> jax.Array:
+    vectors = []
+    for name, value in [
+        ("velocity", velocity),
+        ("position", position),
+        ("gyro_bias", gyro_bias),
+        ("accel_bias", accel_bias),
+    ]:
         if name.endswith("bias") and jnp.ndim(value) == 0:
             value = jnp.full(3, value, dtype)
-        value = checked_array(name, value, (3,), config).astype(dtype)
-        check_finite(name, value)
-        return value
-
-    pose = Mean(
-        rotation,
-        vector("velocity", velocity),
-        vector("position", position),
-        vector("gyro_bias", gyro_bias),
-        vector("accel_bias", accel_bias),
-    )
-    for name, value in std._asdict().items():
-        check_not_negative(f"std.{name}", value)
-    return without_clones(pose, std, config.clones)
+        vectors.append(checked_array(name, value, (3,), config).astype(dtype))
+        check_finite(name, vectors[-1])
+    check_numbers("std", std)
+    return without_clones(Mean(rotation, *vectors), std, config.clones)
 
 
 def level_state(
@@ -121,24 +112,14 @@ def level_state(
     bounds = config.rest_gyro, config.rest_accel
     long_enough = samples >= round(REST_SECONDS / config.dt)
     bias_std = jnp.asarray(std.accel_bias)
-    level = _levelled(gyro, accel, config.dt, bias_std, independent, bounds, long_enough)
-    if not isinstance(level.up, Tracer) and (size := np.linalg.norm(level.up)) < LEAST_GRAVITY:
+    rotation, gyro_bias, tilt_std, velocity_std, up = _levelled(
+        gyro, accel, config.dt, bias_std, independent, bounds, long_enough
+    )
+    if not isinstance(up, Tracer) and (size := np.linalg.norm(up)) < LEAST_GRAVITY:
         problem = f"shows no gravity, its mean is {size:.2g} m/s²"
         raise ValueError(f"accel: {problem}; it must be in m/s² and include gravity")
-    std = std._replace(tilt=level.tilt_std, velocity=level.velocity_std)
-    nothing = np.zeros(3, accel.dtype)
-    return initial_state(config, level.rotation, nothing, nothing, level.gyro_bias, std=std)
-
-
-class _Level(NamedTuple):
-    """What the samples of a level start show."""
-
-    rotation: Array
-    gyro_bias: Array
-    tilt_std: Array
-    velocity_std: Array
-    up: Array
-    """Mean acceleration, m/s²."""
+    std, nothing = std._replace(tilt=tilt_std, velocity=velocity_std), np.zeros(3, accel.dtype)
+    return initial_state(config, rotation, nothing, nothing, gyro_bias, std=std)
 
 
 # One program, as in `without_clones`.
@@ -151,8 +132,9 @@ def _levelled(
     independent: Any,
     quiet_below: tuple[Any, Any],
     long_enough: Any,
-) -> _Level:
-    """Attitude from gravity, the gyro's bias, and the standard deviations of tilt and velocity."""
+) -> tuple[Array, Array, Array, Array, Array]:
+    """Attitude from gravity, the gyro's bias, the standard deviations of tilt and velocity, and the
+    mean acceleration, m/s²."""
     of_gyro, of_accel = jnp.var(gyro, axis=0), jnp.var(accel, axis=0)
     on_a_table = jnp.all(of_gyro <= REST_GYRO_STD**2) & jnp.all(of_accel <= REST_ACCEL_STD**2)
     gyro_bias = jnp.where(on_a_table & long_enough, gyro.mean(0), 0.0)
@@ -164,13 +146,7 @@ def _levelled(
     mean_error = jnp.sqrt(bias_std**2 + variance / independent)
     # Bounded before the root, whose slope at zero is infinite.
     velocity = jnp.clip(_SPEED_OF_SPREAD**2 * variance, _STILL_STD**2, _MOVING_STD**2)
-    return _Level(
-        rotation=geometry.level(up),
-        gyro_bias=gyro_bias,
-        tilt_std=mean_error / GRAVITY,
-        velocity_std=jnp.sqrt(velocity),
-        up=up,
-    )
+    return geometry.level(up), gyro_bias, mean_error / GRAVITY, jnp.sqrt(velocity), up
 
 
 class Rest(NamedTuple):
@@ -198,17 +174,3 @@ def rest_at_start(
         rest += second
     bias = gyro[:rest][there[:rest]].mean(0) if rest else np.zeros(3)
     return Rest(np.asarray(bias, np.float64), rest * dt)
-
-
-def rest_state(
-    config: FilterConfig,
-    gyro: Float[np.ndarray, "m 3"],
-    accel: Float[np.ndarray, "m 3"],
-    std: InitialStd = TLIO_STD,
-) -> FilterState:
-    """Start from the first samples, raw, in which the device should lie still: `level_state` of the
-    first second, and the gyro's bias where it rests (`rest_at_start`)."""
-    second = slice(max(round(REST_SECONDS / config.dt), 2))
-    state = level_state(config, gyro[second], accel[second], std)
-    bias = rest_at_start(gyro, accel, config.dt).gyro_bias
-    return state._replace(gyro_bias=jnp.asarray(bias, state.gyro_bias.dtype))

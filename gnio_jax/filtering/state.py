@@ -127,7 +127,7 @@ class FilterState(NamedTuple):
     """False for good once it was False: see `FilterHistory.healthy`."""
 
     @property
-    def position(self) -> Float[Array, "3"]:
+    def position(self) -> Float[Array, "*k 3"]:
         """World frame, m."""
         return self.anchor + self.offset
 
@@ -174,8 +174,7 @@ def without_clones(pose: Mean, std: InitialStd, clones: int) -> FilterState:
 
 
 def with_correlated_error(state: FilterState) -> FilterState:
-    """With a correlated error of which nothing is known but its variance of 1. A state that has one
-    stays as it is."""
+    """The state with a correlated error of variance 1. A state that has one stays as it is."""
     if len(state.correlated):
         return state
     variance = np.diag(np.repeat([0.0, 1.0], [CORE, 3])).astype(state.offset.dtype)
@@ -198,17 +197,15 @@ def state_shapes(config: FilterConfig, noise: NoiseModel, dtype: Any) -> FilterS
     return jax.eval_shape(start)
 
 
+def with_position(rows: Float[Array, "n k"]) -> Float[Array, "15 k"]:
+    """Rows of θ, v, p, b_g, b_a from those of the core's error: p = a + o."""
+    position = rows[OFFSET] + rows[ANCHOR]
+    return jnp.concatenate([rows[: OFFSET.start], position, rows[BIASES]])
+
+
 def core_covariance(covariance: Float[Array, "n n"]) -> Float[Array, "15 15"]:
-    """Covariance of θ, v, p, b_g, b_a from that of the core's error: p = a + o."""
-    both = covariance + _onto_offset(covariance[ANCHOR], 0)
-    return (both + _onto_offset(both[:, ANCHOR], 1))[LOCAL, LOCAL]
-
-
-def _onto_offset(part: Array, axis: int) -> Array:
-    """Padded with zeros, along `axis`, to where the offset lies."""
-    around = [(0, 0), (0, 0)]
-    around[axis] = (OFFSET.start, part.shape[1 - axis] - OFFSET.stop)
-    return jnp.pad(part, around)
+    """Covariance of θ, v, p, b_g, b_a from that of the core's error."""
+    return with_position(with_position(covariance).T).T
 
 
 # The ring of clones and its anchor

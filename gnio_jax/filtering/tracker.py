@@ -13,7 +13,6 @@ latency: `Tracker.delay`, some 22 samples of the filter, 0.11 s at 200 Hz.
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import math
 from collections.abc import Callable
@@ -26,11 +25,10 @@ from jaxtyping import Float, Int
 
 from gnio_jax.config import ConsideredStd, InitialStd, NoiseModel
 from gnio_jax.config.schema import TLIO_STD
-from gnio_jax.filtering.checks import checked_noise, checked_state
+from gnio_jax.filtering.checks import check_number, check_numbers, checked_noise, checked_state
 from gnio_jax.filtering.config import FilterConfig
 from gnio_jax.filtering.consider import (
     Tangents,
-    check_considered,
     considered_covariance,
     core_sensitivity,
     start_tangents,
@@ -39,17 +37,11 @@ from gnio_jax.filtering.consider import (
 from gnio_jax.filtering.displacement import Displacement
 from gnio_jax.filtering.gaps import Imu, bridge
 from gnio_jax.filtering.history import FilterHistory, finished_history
-from gnio_jax.filtering.network import (
-    Predict,
-    no_prediction,
-    predict_window,
-    predicted_displacement,
-    prediction_shapes,
-)
+from gnio_jax.filtering.network import Predict, network_measurement
 from gnio_jax.filtering.propagation import integrate
-from gnio_jax.filtering.resampler import ACCEL, GYRO, VALID, Stream, create_grid, is_finite_number
+from gnio_jax.filtering.resampler import ACCEL, GYRO, VALID, Stream, create_grid
 from gnio_jax.filtering.scan import Measure, clone_step
-from gnio_jax.filtering.start import initial_state, rest_state
+from gnio_jax.filtering.start import initial_state, level_state
 from gnio_jax.filtering.state import (
     BIASES,
     FilterState,
@@ -58,7 +50,7 @@ from gnio_jax.filtering.state import (
     core_covariance,
     unroll_clones,
 )
-from gnio_jax.types import FASTEST_TURN, STRONGEST_FORCE, Array, Prediction
+from gnio_jax.types import FASTEST_TURN, STRONGEST_FORCE, Array
 
 
 class Pose(NamedTuple):
@@ -77,21 +69,23 @@ class Pose(NamedTuple):
     accel_bias: Float[np.ndarray, "3"]
     """m/s²"""
     covariance: Float[np.ndarray, "15 15"]
-    """Of the error in θ (world frame, left), v, p, b_g, b_a, considered errors included."""
+    """Of the error in θ (world frame, left), v, p, b_g, b_a, consider covariance included."""
     accepted: float
-    """Of the last clone step: 1 its measurement was used, 0 it was not, NaN there was none."""
+    """1 where the last clone step used its measurement, 0 where not, NaN where it had none."""
     nis: float
-    """Of the last clone step: rᵀ S⁻¹ r of its measurement; NaN where there was none."""
+    """rᵀ S⁻¹ r of the measurement of the last clone step; NaN where it had none."""
     healthy: bool
     """False once a clone step left a state that is not finite, a negative variance or a speed above
-    `FilterConfig.speed_limit`: all since is void."""
+    `FilterConfig.speed_limit`. All poses since then are void."""
 
 
-PoseVector = Float[Array, "l"]
-"""A `Pose` without its time, so that one transfer from the device is enough: rotation, velocity,
-position, biases, covariance, and the flags accepted, nis and healthy."""
-_SIZES = (9, 3, 3, 3, 3, 225, 3)
-_SPLITS = np.cumsum(_SIZES)[:-1]
+class Estimate(NamedTuple):
+    """A `Pose` on the device, without its time."""
+
+    mean: Mean
+    covariance: Float[Array, "15 15"]
+    flags: Float[Array, "3"]
+    """accepted, nis and healthy."""
 
 
 class Core(NamedTuple):
@@ -106,7 +100,7 @@ class Core(NamedTuple):
     intervals: Int[Array, ""]
     """Clone steps so far."""
     tangents: Tangents | None
-    """Derivatives of the filter by the errors that are considered; None where there are none."""
+    """Derivatives of the filter by the errors that it does not estimate; None: there are none."""
 
 
 class Tracker:
@@ -115,7 +109,7 @@ class Tracker:
     - predict, config, noise: as `run_odometry` takes them.
     - state: the start, at the time of the first sample (`initial_state`, `level_state`, or what a
       run left). None: it is made of the first `rest_seconds`, in which the device must lie still
-      (`rest_state`); until then there is no pose, and then these samples are filtered, too. A
+      (`level_state`); until then there is no pose, and then these samples are filtered, too. A
       sample that is missing, or without any acceleration, begins the rest anew.
     - rest_seconds, std: length of that rest, s, and the standard deviations of that start.
     - hole: samples further apart than this leave the grid samples between them missing, s; None:
@@ -123,8 +117,8 @@ class Tracker:
     - imu_rate: Hz, nominal, of the samples that will come; None: 1/dt. A faster IMU is band-limited
       as `data.resample` does it, and poses come later by `delay`. The stamps could tell the rate,
       but no pose could be given before, and jitter would decide on the delay.
-    - considered: errors that the covariances of the poses count in and the filter does not estimate
-      (see `considered`); constant since the start. None: there are none.
+    - considered: errors that the filter does not estimate, constant since the start, whose consider
+      covariance is added to that of the poses (see `consider`). None: there are none.
 
     Everything is compiled here, so that no sample waits for a compiler. Poses are new arrays, which
     later samples do not touch. Not for several threads at once. Raises `ValueError` naming an
@@ -133,7 +127,7 @@ class Tracker:
 
     def __init__(
         self,
-        predict: Callable[[Any], Prediction],
+        predict: Predict,
         config: FilterConfig,
         noise: NoiseModel,
         state: FilterState | None = None,
@@ -144,13 +138,9 @@ class Tracker:
         imu_rate: float | None = None,
         considered: ConsideredStd | None = None,
     ):
-        if not (is_finite_number(rest_seconds) and round(rest_seconds / config.dt) >= 2):
-            raise ValueError(
-                f"rest_seconds: must be a time of at least two samples of {config.dt:g} s, "
-                f"found {rest_seconds!r}"
-            )
+        check_number("rest_seconds", rest_seconds, 1.5 * config.dt, "s")
         if considered is not None:
-            check_considered(considered)
+            check_numbers("considered", considered)
         self._config, self._std, self._considered = config, std, considered
         self._rest = round(rest_seconds / config.dt)
         self._stream = Stream(create_grid(config.dt, hole, imu_rate))
@@ -161,7 +151,9 @@ class Tracker:
             nothing = jnp.zeros(3, dtype)
             start = initial_state(config, jnp.eye(3, dtype=dtype), nothing, nothing, std=std)
         core = self._start(start)
-        self._programs = compile_programs(predict, core, config, self._noise, considered)
+        self._advance, self._look_ahead = compile_programs(
+            predict, core, config, self._noise, considered
+        )
         if state is None:
             self._core = None
 
@@ -175,24 +167,20 @@ class Tracker:
 
         Raises `ValueError` naming the argument if the time does not increase, or by more than
         `LONGEST_GAP`, or a shape is wrong, or a value is beyond what an IMU measures; then nothing
-        has changed. So does an IMU that is so much faster than `imu_rate` that it would alias;
-        every hundred grid samples that is looked at. So does a rest without gravity, whose samples
+        has changed. It raises it, too, from the hundredth grid sample on where the IMU is so much
+        faster than `imu_rate` that it would alias, and for a rest without gravity, whose samples
         are left out.
         """
-        sample = _three_numbers("gyro", gyro, FASTEST_TURN, "rad/s")
-        sample += _three_numbers("accel", accel, STRONGEST_FORCE, "m/s²")
-        self._stream.push(_finite_seconds(time), sample)
+        self._stream.push(*_checked_sample(time, gyro, accel))
         if self._core is None:
             self._start_from_rest()
-        n, vector = self._config.samples_per_clone, None
+        n, made = self._config.samples_per_clone, False
         while self._core is not None and self._stream.known >= n:
             rows = self._stream.rows(n).astype(self._core.window.dtype)
             self._stream.take(n)
-            self._core, vector = self._programs.advance(self._core, rows)
-        if vector is None:
-            return None
-        self._vector, self._ahead = vector, None
-        return self._as_pose(vector, 0)
+            self._core, estimate = self._advance(self._core, rows)
+            self._ahead, made = (0, estimate, self._core.filter.imu), True
+        return self._as_pose() if made else None
 
     def pose(self) -> Pose | None:
         """The pose after the newest grid sample; between clone steps by integrating the samples
@@ -203,12 +191,12 @@ class Tracker:
         """
         if self._core is None:
             return None
-        done, vector, memory = self._ahead or (0, self._vector, self._core.filter.imu)
+        done, estimate, memory = self._ahead
         known = self._stream.known
         for row in self._stream.rows(known)[done:].astype(self._core.window.dtype):
-            vector, memory = self._programs.look_ahead(vector, memory, row)
-        self._ahead = known, vector, memory
-        return self._as_pose(vector, known)
+            estimate, memory = self._look_ahead(estimate, memory, row)
+        self._ahead = known, estimate, memory
+        return self._as_pose()
 
     def filter_state(self) -> FilterState | None:
         """The filter after the last clone step, as `run_odometry` would return it; None while there
@@ -235,7 +223,7 @@ class Tracker:
                 self._stream.take(int(unusable[-1]) + 1)
                 continue
             try:
-                state = rest_state(self._config, rows[:, GYRO], rows[:, ACCEL], self._std)
+                state = level_state(self._config, rows[:, GYRO], rows[:, ACCEL], self._std)
             except ValueError:  # It shows no gravity: the next samples may.
                 self._stream.take(self._rest)
                 raise
@@ -249,40 +237,20 @@ class Tracker:
         # Copies: the compiled step takes the memory of its argument, which may not be shared, not
         # even between two of its fields.
         core = _copied(Core(state, window, jnp.int32(0), tangents))
-        flags = jnp.stack([jnp.nan, jnp.nan, state.healthy])
-        covariance = core_covariance(state.core_covariance)
+        flags = jnp.stack([jnp.nan, jnp.nan, state.healthy]).astype(window.dtype)
         self._core: Core | None = core
-        self._vector = _pose_vector(state.mean, covariance, flags, tangents, self._considered)
-        self._ahead: tuple[int, PoseVector, ImuMemory] | None = None
-        """How many known samples `pose` has integrated, its vector and IMU memory after them."""
+        estimate = estimated(state, flags, tangents, self._considered)
+        self._ahead: tuple[int, Estimate, ImuMemory] = 0, estimate, core.filter.imu
+        """How many known samples `pose` has integrated, and what that gave."""
         return core
 
-    def _as_pose(self, vector: PoseVector, ahead: int) -> Pose:
-        """On the host, at the end of the interval of the last sample taken, or of one `ahead`."""
-        rotation, velocity, position, gyro_bias, accel_bias, covariance, flags = np.split(
-            np.array(vector), _SPLITS
-        )
+    def _as_pose(self) -> Pose:
+        """The newest estimate on the host, at the end of the interval of its last sample."""
+        ahead, estimate, _ = self._ahead
+        mean, covariance, flags = jax.tree.map(np.array, estimate)
         accepted, nis, healthy = flags.tolist()
-        samples = self._stream.taken + ahead
-        return Pose(
-            time=self._stream.origin + samples * self._config.dt,
-            rotation=rotation.reshape(3, 3),
-            velocity=velocity,
-            position=position,
-            gyro_bias=gyro_bias,
-            accel_bias=accel_bias,
-            covariance=covariance.reshape(15, 15),
-            accepted=accepted,
-            nis=nis,
-            healthy=healthy > 0,
-        )
-
-
-class Programs(NamedTuple):
-    """The compiled programs of a tracker."""
-
-    advance: Callable[[Core, np.ndarray], tuple[Core, jax.Array]]
-    look_ahead: Callable[[PoseVector, ImuMemory, np.ndarray], tuple[jax.Array, ImuMemory]]
+        time = self._stream.origin + (self._stream.taken + ahead) * self._config.dt
+        return Pose(time, *mean, covariance, accepted, nis, healthy > 0)
 
 
 def compile_programs(
@@ -291,19 +259,17 @@ def compile_programs(
     config: FilterConfig,
     noise: NoiseModel,
     considered: ConsideredStd | None,
-) -> Programs:
-    """Compile `advance` and `look_ahead` for cores like this one."""
-    config = dataclasses.replace(config, history="core")
+) -> tuple[Callable[..., tuple[Core, Estimate]], Callable[..., tuple[Estimate, ImuMemory]]]:
+    """`advance` and `look_ahead`, compiled for cores like this one."""
     of_type = functools.partial(jax.ShapeDtypeStruct, dtype=core.window.dtype)
     step = functools.partial(
         advance, predict=predict, config=config, noise=noise, considered=considered
     )
     ahead = functools.partial(look_ahead, config=config, noise=noise)
-    rows, row, vector = (config.samples_per_clone, 7), (7,), (sum(_SIZES),)
-    return Programs(
-        jax.jit(step, donate_argnums=0).lower(core, of_type(rows)).compile(),
-        jax.jit(ahead).lower(of_type(vector), core.filter.imu, of_type(row)).compile(),
-    )
+    compiled = jax.jit(step, donate_argnums=0).lower(core, of_type((config.samples_per_clone, 7)))
+    _, estimate = compiled.out_info
+    of_row = jax.jit(ahead).lower(estimate, core.filter.imu, of_type((7,)))
+    return compiled.compile(), of_row.compile()
 
 
 def advance(
@@ -313,28 +279,22 @@ def advance(
     config: FilterConfig,
     noise: NoiseModel,
     considered: ConsideredStd | None,
-) -> tuple[Core, PoseVector]:
+) -> tuple[Core, Estimate]:
     """One clone step, as `run_odometry` makes it, from the n grid samples (gyro, accel, valid) of
-    its interval; and its pose.
-
-    `config.history` must be "core". Where the window is no measurement the network is not called.
-    """
+    its interval. Where the window is no measurement the network is not called."""
     valid = rows[:, VALID] > 0
     imu, age, memory = bridge(rows[:, GYRO], rows[:, ACCEL], valid, core.filter.imu, config)
     assert imu.gap is not None
-    latest = jnp.concatenate([imu.gyro, imu.accel, imu.gap.used[:, None]], axis=1)
-    window = jnp.concatenate([core.window[config.samples_per_clone :], latest])
+    newest = jnp.concatenate([imu.gyro, imu.accel, imu.gap.used[:, None]], axis=1)
+    window = jnp.concatenate([core.window[config.samples_per_clone :], newest])
     complete = (core.intervals >= config.clones_per_window) & jnp.all(window[:, VALID] > 0)
-    shapes = prediction_shapes(predict, config)
+    of_window = network_measurement(predict, config, noise)
 
-    def infer(state: FilterState, oldest: Array) -> Prediction:
-        return predict_window(predict, state, oldest, window[:, GYRO], window[:, ACCEL], config)
+    def latest() -> Imu:
+        return Imu(window[:, GYRO], window[:, ACCEL], None)
 
     def measure(state: FilterState, oldest: Array | int) -> tuple[Displacement, dict]:
-        prediction = jax.lax.cond(
-            complete, infer, lambda *_: no_prediction(shapes), state, jnp.asarray(oldest)
-        )
-        return predicted_displacement(prediction, config, noise, rows.dtype), {}
+        return of_window(complete, latest, state, oldest)[0], {}
 
     def step(state: FilterState, measure: Measure) -> tuple[FilterState, FilterHistory]:
         slot = core.intervals % config.clones
@@ -345,11 +305,9 @@ def advance(
     else:
         state, history, tangents = step_with_tangents(step, core.filter, core.tangents, measure)
     state = state._replace(imu=memory._replace(quiet=state.imu.quiet))
-    mean = Mean(*(getattr(history, name)[0] for name in Mean._fields))
     flags = jnp.stack([history.accepted[0], history.nis[0], history.healthy[0]])
-    assert history.covariance is not None
-    vector = _pose_vector(mean, history.covariance[0], flags, tangents, considered)
-    return Core(state, window, core.intervals + 1, tangents), vector
+    estimate = estimated(state, flags, tangents, considered)
+    return Core(state, window, core.intervals + 1, tangents), estimate
 
 
 def advance_filter(
@@ -369,63 +327,64 @@ def advance_filter(
 
 
 def look_ahead(
-    pose: PoseVector,
+    estimate: Estimate,
     memory: ImuMemory,
     row: Float[Array, "7"],
     config: FilterConfig,
     noise: NoiseModel,
-) -> tuple[PoseVector, ImuMemory]:
-    """The pose and the memory of the IMU after one more grid sample, by integration alone.
+) -> tuple[Estimate, ImuMemory]:
+    """The estimate and the memory of the IMU after one more grid sample, by integration alone.
 
-    Its covariance is P + S C Sᵀ where errors are considered: both parts take the same transition.
+    A consider covariance takes the same transition as the filter's own.
     """
-    rotation, velocity, position, *biases, covariance, flags = jnp.split(pose, _SPLITS)
-    start = Mean(rotation.reshape(3, 3), velocity, position, *biases)
+    mean, covariance, flags = estimate
     imu, _, memory = bridge(row[None, GYRO], row[None, ACCEL], row[None, VALID] > 0, memory, config)
-    ahead = integrate(start, imu, noise, config.dt)
-    transition = jnp.concatenate([ahead.transition, jnp.eye(15, dtype=pose.dtype)[BIASES]])
-    covariance = transition @ covariance.reshape(15, 15) @ transition.T + ahead.noise
-    mean = Mean(ahead.rotation, ahead.velocity, ahead.position, *biases)
-    return _pose_vector(mean, 0.5 * (covariance + covariance.T), flags), memory
+    ahead = integrate(mean, imu, noise, config.dt)
+    transition = jnp.concatenate([ahead.transition, jnp.eye(15, dtype=row.dtype)[BIASES]])
+    covariance = transition @ covariance @ transition.T + ahead.noise
+    mean = Mean(ahead.rotation, ahead.velocity, ahead.position, *mean[3:])
+    return Estimate(mean, 0.5 * (covariance + covariance.T), flags), memory
 
 
-def _pose_vector(
-    mean: Mean,
-    covariance: Float[Array, "15 15"],
+def estimated(
+    state: FilterState,
     flags: Float[Array, "3"],
-    tangents: Tangents | None = None,
-    considered: ConsideredStd | None = None,
-) -> PoseVector:
-    """With the errors that are considered added to the covariance."""
+    tangents: Tangents | None,
+    considered: ConsideredStd | None,
+) -> Estimate:
+    """The state's estimate; the consider covariance is added to its own."""
+    covariance = core_covariance(state.core_covariance)
     if tangents is not None and considered is not None:
-        sensitivity = core_sensitivity(mean, tangents)
+        sensitivity = core_sensitivity(state.mean, tangents)
         covariance = covariance + considered_covariance(sensitivity[None], considered)[0]
-    parts = (*mean, covariance, flags)
-    return jnp.concatenate([jnp.ravel(part).astype(covariance.dtype) for part in parts])
+    return Estimate(state.mean, covariance, flags)
 
 
-def _finite_seconds(time: Any) -> float:
+def _checked_sample(time: Any, gyro: Any, accel: Any) -> tuple[float, tuple[float, ...]]:
+    """The time, and gyro and accel in one tuple."""
     try:
         seconds = float(time)
     except (TypeError, ValueError):
         seconds = math.nan
     if not math.isfinite(seconds):
         raise ValueError(f"time: must be a finite number of seconds, found {time!r}")
-    return seconds
-
-
-def _three_numbers(name: str, value: Any, largest: float, unit: str) -> tuple[float, ...]:
-    try:
-        array = np.asarray(value, np.float64)
-    except (TypeError, ValueError):
-        raise ValueError(f"{name}: must be three numbers, found {value!r}") from None
-    if array.shape != (3,):
-        raise ValueError(f"{name}: must be three numbers, found shape {array.shape}")
-    numbers = tuple(array.tolist())
-    if any(largest < abs(number) < math.inf for number in numbers):
-        problem = f"no IMU measures more than {largest:g} {unit}"
-        raise ValueError(f"{name}: {problem}, found {max(map(abs, numbers)):g}")
-    return numbers
+    numbers: list[float] = []
+    for name, value, largest, unit in [
+        ("gyro", gyro, FASTEST_TURN, "rad/s"),
+        ("accel", accel, STRONGEST_FORCE, "m/s²"),
+    ]:
+        try:
+            three = np.asarray(value, np.float64)
+        except (TypeError, ValueError):
+            three = np.empty(0)
+        if three.shape != (3,):
+            raise ValueError(f"{name}: must be three numbers, found {value!r}")
+        numbers += three.tolist()
+        size = max((abs(each) for each in numbers[-3:] if math.isfinite(each)), default=0.0)
+        if size > largest:
+            problem = f"no IMU measures more than {largest:g} {unit}"
+            raise ValueError(f"{name}: {problem}, found {size:g}")
+    return seconds, tuple(numbers)
 
 
 def _copied(tree: Any) -> Any:

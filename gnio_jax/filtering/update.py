@@ -4,8 +4,8 @@ A measurement of m = 1 to 3 numbers is linearised at the present estimate to
 
     r = H δ + w,   w ~ N(0, R),
 
-where r is the residual (measured − predicted) and δ the error of the state. H touches the core and
-the oldest clone; the newest clone is the core's own pose. With S = H P Hᵀ + R = L Lᵀ and
+where r is the residual (measured − predicted) and δ the error of the state. H touches few parts of
+the error (`PARTS`), so that H P needs few rows of P. With S = H P Hᵀ + R = L Lᵀ and
 Y = L⁻¹ H P the gain is Yᵀ L⁻¹, the correction of the error Yᵀ L⁻¹ r, and P ← P − Yᵀ Y, symmetric
 to the last bit.
 
@@ -49,28 +49,23 @@ from gnio_jax.filtering.state import (
 from gnio_jax.geometry import contract_left, contract_right, matmul
 from gnio_jax.types import Array
 
-PARTS = {
-    "rotation": THETA,
-    "velocity": VELOCITY,
-    "offset": OFFSET,
-    "gyro_bias": GYRO_BIAS,
-    "accel_bias": ACCEL_BIAS,
-    "anchor": ANCHOR,
-    "move": MOVE,
-    "correlated": CORRELATED,
-}
-"""Where each part of the core's error lies."""
+PARTS = (
+    *("rotation", "velocity", "position", "gyro_bias", "accel_bias", "correlated"),
+    *("oldest_rotation", "since_oldest"),
+)
+"""The parts of the error that a measurement may depend on, each with 3 entries: of the present the
+rotation δθ (rad, world frame, R ← exp(δθ) R), velocity, position, both biases, and the temporally
+correlated error of the displacements, where there is one; the rotation of the oldest clone; and the
+position since that clone, p_j − p_i."""
 
 
 class Linearised(NamedTuple):
     """r = H δ + w."""
 
     residual: Float[Array, "m"]
-    """r, measured − predicted."""
-    core: dict[str, Float[Array, "m _"]]
-    """The blocks of H over the core's error that are not zero, by the names of `PARTS`."""
-    oldest: Float[Array, "m 6"]
-    """H over θ and o of the oldest clone."""
+    """r, measured − predicted. A NaN here or in R means that there is no measurement."""
+    jacobian: dict[str, Float[Array, "m 3"]]
+    """The blocks of H that are not zero, by the names of `PARTS`."""
     covariance: Float[Array, "m m"]
     """R."""
 
@@ -79,8 +74,7 @@ class Outcome(NamedTuple):
     """What became of a measurement."""
 
     present: Bool[Array, ""]
-    """Whether there was one. What follows is zero or False where there was none, and √det S is 1.
-    """
+    """Whether there was one. Without one all that follows is zero or False, but √det S is 1."""
     tested: Bool[Array, ""]
     """Whether a χ² test judged it."""
     residual: Float[Array, "m"]
@@ -96,8 +90,8 @@ class Outcome(NamedTuple):
 
 
 class Correction(NamedTuple):
-    """What an update did to the error e: e ← e − Yᵀ L⁻¹ r, where L⁻¹ r = L⁻¹ (H e + w). All is zero
-    where no update was made. Smoothing undoes it."""
+    """What an update did to the error e: e ← e − Yᵀ L⁻¹ r, where L⁻¹ r = L⁻¹ (H e + w). All entries
+    are zero where no update was made. Smoothing undoes it."""
 
     residual: Float[Array, "m"]
     """L⁻¹ r."""
@@ -105,10 +99,8 @@ class Correction(NamedTuple):
     """Y against the core …"""
     clones: Float[Array, "m c"]
     """… and against the clones."""
-    core_jacobian: Float[Array, "m n"]
-    """L⁻¹ H over the core …"""
-    oldest_jacobian: Float[Array, "m 6"]
-    """… and over the oldest clone; it is zero over the others."""
+    jacobian: dict[str, Float[Array, "m 3"]]
+    """The blocks of L⁻¹ H."""
 
 
 class Step(NamedTuple):
@@ -135,59 +127,44 @@ class Measurement(Protocol):
     def update(self, state: FilterState, step: Step) -> tuple[FilterState, Outcome, Correction]: ...
 
 
-def linearise(
-    state: FilterState,
-    step: Step,
-    residual: Float[Array, "m"],
-    covariance: Float[Array, "m m"],
-    *,
-    rotation: Any = None,
-    velocity: Any = None,
-    position: Any = None,
-    gyro_bias: Any = None,
-    accel_bias: Any = None,
-    oldest_rotation: Any = None,
-    since_oldest: Any = None,
-    correlated: Any = None,
-) -> Linearised:
-    """A measurement from the blocks of its Jacobian H, the derivative of the predicted value.
+def linearise(state: FilterState, residual: Any, covariance: Any, **jacobian: Any) -> Linearised:
+    """A measurement with the residual r (m,) and the covariance R (m, m), in the state's precision.
 
-    Each block is (m, 3): by the rotation's error δθ (rad, world frame, R ← exp(δθ) R), by velocity,
-    position and the biases of the present, by the rotation of the oldest clone, by the position
-    since the oldest clone, p_j − p_i, and by the temporally correlated error, where there is one.
-    Those that are left out are zero.
+    `jacobian` has the blocks (m, 3) of H, the derivative of the predicted value, by the names of
+    `PARTS`; those that are left out are zero. Raises `ValueError` for another name.
     """
-    rows, dtype = residual.shape[0], state.offset.dtype
-    blocks = {
-        "rotation": rotation,
-        "velocity": velocity,
-        "offset": position,
-        "gyro_bias": gyro_bias,
-        "accel_bias": accel_bias,
-        "anchor": position,  # p = a + o
-        "correlated": correlated,
-    }
-    core: dict[str, Array] = {
-        name: jnp.asarray(of, dtype) for name, of in blocks.items() if of is not None
-    }
-    oldest: list[Array] = [np.zeros((rows, 3), dtype)] * 2
-    if oldest_rotation is not None:
-        oldest[0] = jnp.asarray(oldest_rotation, dtype)
-    if since_oldest is not None:
-        # p_j − p_i = o + s − o_i where the oldest clone still has the anchor before, else o − o_i.
-        since = jnp.asarray(since_oldest, dtype)
-        core["offset"] = core["offset"] + since if "offset" in core else since
-        core["move"] = anchors_apart(step.oldest, dtype) * since
-        oldest[1] = -since
-    for name, block in core.items():
-        chex.assert_shape(block, (rows, 3), custom_message=f"linearise: {name}")
-    chex.assert_shape(covariance, (rows, rows), custom_message="linearise: covariance")
-    return Linearised(
+    if unknown := set(jacobian) - set(PARTS):
+        raise ValueError(f"linearise: {min(unknown)}: is none of {', '.join(PARTS)}")
+    dtype = state.offset.dtype
+    linear = Linearised(
         jnp.asarray(residual, dtype),
-        core,
-        jnp.concatenate(oldest, axis=1),
+        {name: jnp.asarray(block, dtype) for name, block in jacobian.items()},
         jnp.asarray(covariance, dtype),
     )
+    rows = linear.residual.shape[0]
+    for name, block in linear.jacobian.items():
+        chex.assert_shape(block, (rows, 3), custom_message=f"linearise: {name}")
+    chex.assert_shape(linear.covariance, (rows, rows), custom_message="linearise: covariance")
+    return linear
+
+
+def measurable_errors(
+    core: Float[Array, "n k"], clones: Float[Array, "c k"], oldest: Array | int
+) -> dict[str, Float[Array, "3 k"]]:
+    """`PARTS` of k errors of core and clones. p = a + o. p_j − p_i = o + s − o_i where the oldest
+    clone still has the anchor before, else it is o − o_i."""
+    of_oldest = jax.lax.dynamic_slice_in_dim(clones, CLONE * oldest, CLONE)
+    present = core[OFFSET] + anchors_apart(oldest, core.dtype) * core[MOVE]
+    return {
+        "rotation": core[THETA],
+        "velocity": core[VELOCITY],
+        "position": core[OFFSET] + core[ANCHOR],
+        "gyro_bias": core[GYRO_BIAS],
+        "accel_bias": core[ACCEL_BIAS],
+        "correlated": core[CORRELATED],
+        "oldest_rotation": of_oldest[CLONE_THETA],
+        "since_oldest": present - of_oldest[CLONE_OFFSET],
+    }
 
 
 def anchors_apart(oldest: Array | int, dtype: np.dtype) -> Float[Array, ""]:
@@ -196,10 +173,10 @@ def anchors_apart(oldest: Array | int, dtype: np.dtype) -> Float[Array, ""]:
     return jnp.where(jnp.asarray(oldest) == 0, 0.0, 1.0).astype(dtype)
 
 
-def oldest_offset(state: FilterState, oldest: Array | int) -> Float[Array, "3"]:
-    """Position of the oldest clone from the core's anchor, m."""
-    apart = anchors_apart(oldest, state.move.dtype)
-    return state.clone_offset[oldest] - apart * state.move
+def since_oldest(state: FilterState, oldest: Array | int) -> Float[Array, "3"]:
+    """Position since the oldest clone, p_j − p_i, in the world frame, m."""
+    present = state.offset + anchors_apart(oldest, state.move.dtype) * state.move
+    return present - state.clone_offset[oldest]
 
 
 def measure(
@@ -209,47 +186,37 @@ def measure(
     rᵀ S⁻¹ r is above `threshold` is refused (e.g. a quantile of χ² with m degrees of freedom)."""
     finite = [jnp.all(jnp.isfinite(part)) for part in (linear.residual, linear.covariance)]
     present = finite[0] & finite[1]
-    # NaN stays out of the arithmetic, and out of the derivatives.
-    residual = jnp.where(present, linear.residual, 0.0)
-    covariance = jnp.where(present, linear.covariance, 0.0)
-    linear = linear._replace(residual=residual, covariance=covariance)
-    correction, nis, volume = project(state, linear, step.oldest, present)
-    accepted = present & (nis <= threshold)
-    outcome = Outcome(
-        present, present, linear.residual, nis, volume, accepted.astype(nis.dtype), accepted
-    )
+    outcome, correction = project(state, linear, step.oldest, present)
+    accepted = present & (outcome.nis <= threshold)
+    outcome = outcome._replace(weight=accepted.astype(outcome.nis.dtype), accepted=accepted)
     state, correction = correct(state, correction, accepted, step.newest)
     return state, outcome, correction
 
 
 def project(
     state: FilterState, linear: Linearised, oldest: Array | int, present: Bool[Array, ""]
-) -> tuple[Correction, Float[Array, ""], Float[Array, ""]]:
-    """The correction by a measurement that is accepted, rᵀ S⁻¹ r and √det S. Where none is
-    `present`, S is the identity and rᵀ S⁻¹ r is 0."""
-    entry, parts = CLONE * oldest, [PARTS[name] for name in linear.core]
-    core_oldest = jax.lax.dynamic_slice_in_dim(state.cross_covariance, entry, CLONE, 1)
-    oldest_clones = jax.lax.dynamic_slice_in_dim(state.clone_covariance, entry, CLONE, 0)
-    # H P from the rows of P that H touches.
-    jacobian = jnp.concatenate([*linear.core.values(), linear.oldest], axis=1)
-    of_core = [*(state.core_covariance[part] for part in parts), core_oldest.T]
-    of_clones = [*(state.cross_covariance[part] for part in parts), oldest_clones]
-    core = matmul(jacobian, jnp.concatenate(of_core))
-    clones = matmul(jacobian, jnp.concatenate(of_clones))
-    of_oldest = jax.lax.dynamic_slice_in_dim(clones, entry, CLONE, 1)
-    touched = jnp.concatenate([*(core[:, part] for part in parts), of_oldest], axis=1)
-    spread = matmul(touched, jacobian.T) + linear.covariance
+) -> tuple[Outcome, Correction]:
+    """What becomes of a measurement that is accepted where it is `present`. Where it is not, r is
+    zero and S the identity: NaN stays out of the arithmetic, and out of the derivatives."""
+    jacobian = jnp.concatenate(list(linear.jacobian.values()), axis=1)
+
+    def touched(core: Array, clones: Array) -> Array:
+        parts = measurable_errors(core, clones, oldest)
+        return jnp.concatenate([parts[name] for name in linear.jacobian])
+
+    core = matmul(jacobian, touched(state.core_covariance, state.cross_covariance.T))
+    clones = matmul(jacobian, touched(state.cross_covariance, state.clone_covariance))
+    spread = matmul(jacobian, touched(core.T, clones.T)) + linear.covariance
     spread = jnp.where(present, spread, jnp.eye(len(spread), dtype=spread.dtype))
-    rows = linear.residual[:, None], core, clones, jacobian
-    (residual, core, clones, jacobian), volume = whiten(spread, rows)
-    core_jacobian, column = jnp.zeros_like(core), 0
-    for part, block in zip(parts, linear.core.values(), strict=True):
-        end = column + block.shape[1]
-        core_jacobian = core_jacobian.at[:, part].set(jacobian[:, column:end])
-        column = end
-    correction = Correction(residual[:, 0], core, clones, core_jacobian, jacobian[:, column:])
-    nis = jnp.dot(correction.residual, correction.residual)
-    return correction, jnp.where(present, nis, 0.0), volume
+    residual = jnp.where(present, linear.residual, 0.0)
+    (white, core, clones, jacobian), volume = whiten(
+        spread, (residual[:, None], core, clones, jacobian)
+    )
+    blocks = jnp.split(jacobian, len(linear.jacobian), axis=1)
+    by_name = dict(zip(linear.jacobian, blocks, strict=True))
+    weight = present.astype(volume.dtype)
+    outcome = Outcome(present, present, residual, jnp.sum(white**2), volume, weight, present)
+    return outcome, Correction(white[:, 0], core, clones, by_name)
 
 
 def correct(

@@ -15,14 +15,7 @@ from gnio_jax.filtering.config import FilterConfig
 from gnio_jax.filtering.gaps import Imu
 from gnio_jax.filtering.gate import gate_activity
 from gnio_jax.filtering.state import FilterState
-from gnio_jax.filtering.update import (
-    Correction,
-    Outcome,
-    Step,
-    correct,
-    linearise,
-    project,
-)
+from gnio_jax.filtering.update import Correction, Outcome, Step, correct, linearise, project
 from gnio_jax.types import GRAVITY, Array
 
 
@@ -30,26 +23,26 @@ class ZeroVelocity(NamedTuple):
     """Measures a velocity of zero, with `zero_velocity_std`, while the IMU is quiet."""
 
     def update(self, state: FilterState, step: Step) -> tuple[FilterState, Outcome, Correction]:
-        """A quiet IMU may also glide at constant velocity, and a displacement of the same interval
-        can tell. So where one was tested and the gate is active, this measurement has to pass the
-        same χ² test. Elsewhere the filter may be wrong about its velocity, and rest can correct it:
-        after the start, after a series of rejections, and where there are no displacements.
+        """A quiet IMU may also glide at constant velocity, which a displacement of the same
+        interval shows. So where one was tested and the gate is active, this measurement has to pass
+        the same χ² test. Elsewhere the filter may be wrong about its velocity, and rest can correct
+        it: after the start, after a series of rejections, and where there are no displacements.
         Without them the gate never becomes stale, and a rest refused once would be refused for
-        ever. The gate's memory is that of the displacements alone: a false rest must not open
-        their gate, nor keep it shut.
+        ever. The gate's memory is that of the displacements alone: a false rest must not open their
+        gate, nor keep it shut.
         """
         config = step.config
         state, quiet = detect_rest(state, step.imu, config)
         eye = np.eye(3, dtype=state.velocity.dtype)
         covariance = config.zero_velocity_std**2 * eye
-        linear = linearise(state, step, -state.velocity, covariance, velocity=eye)
-        correction, nis, volume = project(state, linear, step.oldest, quiet)
-        fits = nis <= config.gate_threshold
+        linear = linearise(state, -state.velocity, covariance, velocity=eye)
+        outcome, correction = project(state, linear, step.oldest, quiet)
+        fits = outcome.nis <= config.gate_threshold
         active = gate_activity(state.gate, config, state.step * config.samples_per_clone).active
         tested = quiet & active & step.before[0].tested
         accepted = quiet & (~tested | fits)
-        weight = accepted.astype(nis.dtype)
-        outcome = Outcome(quiet, tested, linear.residual, nis, volume, weight, accepted)
+        weight = accepted.astype(outcome.nis.dtype)
+        outcome = outcome._replace(tested=tested, weight=weight, accepted=accepted)
         state, correction = correct(state, correction, accepted, step.newest)
         return state, outcome, correction
 

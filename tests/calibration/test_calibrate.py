@@ -211,8 +211,12 @@ def test_each_session_is_judged_by_the_network_that_left_it_out(run, two_walks, 
 @pytest.mark.parametrize(
     ("folders", "split", "problem"),
     [
-        ([0], None, "--out-of-fold: learnt from the splits train-0of2; train one run for each of"),
-        ([0, 0], None, "learnt from the splits train-0of2, train-0of2"),
+        (
+            [0],
+            None,
+            "--out-of-fold: were trained on the splits train-0of2; train one run for each of",
+        ),
+        ([0, 0], None, "were trained on the splits train-0of2, train-0of2"),
         ([0, 1], "train", "--split train: is of no use with --out-of-fold"),
     ],
 )

@@ -1,5 +1,7 @@
 """Values that cannot be: refused by name at the door, and reported inside `jit`."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,111 +13,146 @@ from gnio_jax.filtering.state import with_correlated_error
 from tests.support import scekf_numpy
 from tests.support.short_walk import CLONES, CONFIG, DT, INTERVALS, NOISE, WALK, N, run, start
 
+POSE, GYRO, ACCEL, DISPLACEMENT, COVARIANCE = WALK
+SAMPLES, NAN = len(GYRO), float("nan")
 
-def spoilt(name):
-    _, gyro, accel, d, c = WALK
-    given = dict(
-        state=start(),
-        gyro=gyro.copy(),
-        accel=accel.copy(),
-        displacement=d,
-        covariance=c.copy(),
-        config=CONFIG,
-        noise=NOISE,
-    )
-    if name == "gyro":
-        given["gyro"][7, 1] = np.nan
-    elif name == "accel":
-        given["accel"][9] = np.inf
-    elif name == "covariance":
-        given["covariance"][10] = -np.eye(3)
-    elif name == "covariance skew":
-        given["covariance"][10, 0, 1] += 1.0
-    elif name == "imu_valid":
-        given["imu_valid"] = np.ones(len(gyro), int)
-    elif name == "imu_valid length":
-        given["imu_valid"] = np.ones(3, bool)
-    elif name == "state.core_covariance":
-        given["state"] = start()._replace(core_covariance=start().core_covariance - jnp.eye(21))
-    elif name == "state.rotation":
-        given["state"] = start()._replace(rotation=2 * jnp.eye(3))
-    elif name == "state.correlated":
-        given["noise"] = NOISE._replace(correlation=filtering.CorrelatedError())
-        state = with_correlated_error(start())
-        given["state"] = state._replace(correlated=state.correlated.at[1].set(jnp.nan))
-    elif name.startswith("state."):
-        field = name.removeprefix("state.")
-        value = getattr(start(), field)
-        given["state"] = start()._replace(**{field: value.at[..., -1].set(jnp.nan)})
-    elif name == "noise.accel_density":
-        given["noise"] = NOISE._replace(accel_density=-1.0)
-    elif name == "noise.gyro_bias_walk":
-        given["noise"] = NOISE._replace(gyro_bias_walk=np.nan)
-    return given
+
+def put(array, at, value):
+    array = np.array(array)
+    array[at] = value
+    return array
+
+
+def wrong():
+    """Arguments of a run that cannot be, and how the message begins."""
+    state, correlated = start(), NOISE._replace(correlation=filtering.CorrelatedError())
+    yield "gyro: 1 of 300 rows", {"gyro": put(GYRO, (7, 1), NAN)}
+    yield "gyro: the samples must be a multiple", {"gyro": GYRO[:-1]}
+    yield "gyro", {"gyro": GYRO[:0]}
+    yield "gyro", {"gyro": GYRO[:, 0]}
+    yield "gyro", {"gyro": np.zeros((SAMPLES, 4))}
+    yield "gyro: the filter runs in float64", {"gyro": GYRO.astype(np.float32)}
+    yield "gyro", {"gyro": GYRO.astype(int)}
+    yield "accel: 1 of 300 rows", {"accel": put(ACCEL, 9, np.inf)}
+    fast, strong = put(GYRO, (7, 1), -101.0), put(ACCEL, (9, 2), 1001.0)
+    yield "gyro: 1 of 300 rows are beyond 100 rad/s, the first is row 7", {"gyro": fast}
+    yield "accel: 1 of 300 rows are beyond 1000 m/s², the first is row 9", {"accel": strong}
+    only_this = np.arange(SAMPLES) == 7  # what is missing may be anything
+    yield "gyro: 1 of 300 rows are beyond", {"gyro": fast, "imu_valid": only_this}
+    yield "accel: the shape", {"accel": ACCEL[N:]}
+    yield "accel: the shape", {"accel": np.stack([ACCEL, ACCEL])}
+    yield "displacement: the shape", {"displacement": DISPLACEMENT[1:]}
+    yield "displacement", {"displacement": DISPLACEMENT.astype(np.float32)}
+    yield "covariance: the shape", {"covariance": COVARIANCE[:, 0]}
+    yield "covariance: 1 of 60 rows", {"covariance": put(COVARIANCE, 10, -np.eye(3))}
+    yield "covariance: 1 of 60 rows", {"covariance": put(COVARIANCE, (10, 0, 1), 1.0)}
+    yield "imu_valid: must be 300 booleans", {"imu_valid": np.ones(SAMPLES, int)}
+    yield "imu_valid", {"imu_valid": np.ones(3, bool)}
+    yield "noise.accel_density", {"noise": NOISE._replace(accel_density=-1.0)}
+    yield "noise.gyro_bias_walk", {"noise": NOISE._replace(gyro_bias_walk=NAN)}
+    yield "noise.gyro_density", {"noise": NOISE._replace(gyro_density=np.zeros(3))}
+    yield "noise.measurement_scale", {"noise": NOISE._replace(measurement_scale=0.0)}
+    yield "noise.std_factor", {"noise": NOISE._replace(std_factor=(1.0, 0.0, 1.0))}
+    other = filtering.initial_state(filtering.FilterConfig(DT, N, 3), *POSE)
+    yield r"state.clone_rotation: the shape must be \(5, 3, 3\)", {"state": other}
+    less = state.core_covariance - jnp.eye(21)
+    yield "state.core_covariance", {"state": state._replace(core_covariance=less)}
+    yield "state.rotation", {"state": state._replace(rotation=2 * jnp.eye(3))}
+    lost = with_correlated_error(state)._replace(correlated=np.array([0.0, NAN, 0.0]))
+    yield "state.correlated", {"state": lost, "noise": correlated}
+    for field in (
+        *("velocity", "offset", "gyro_bias", "accel_bias", "anchor", "move", "clone_rotation"),
+        *("clone_offset", "cross_covariance", "clone_covariance"),
+    ):
+        spoilt = put(getattr(state, field), (..., -1), NAN)
+        yield f"state.{field}", {"state": state._replace(**{field: spoilt})}
+
+
+def arguments(**others):
+    names = ("gyro", "accel", "displacement", "covariance")
+    given = dict(zip(names, WALK[1:], strict=True))
+    return {"state": start(), **given, "config": CONFIG, "noise": NOISE, **others}
+
+
+def test_arguments_that_cannot_be_are_refused_by_name():
+    for words, spoilt in wrong():
+        with pytest.raises(ValueError, match=f"^{words}"):
+            filtering.run_filter(**arguments(**spoilt))
+    given = arguments(gyro=put(GYRO, (7, 1), -101.0), imu_valid=np.arange(SAMPLES) != 7)
+    filtering.run_filter(**given)
+    for too in ("covariance: 1 of", "noise.accel_density", "imu_valid: must"):
+        spoilt = next(each for words, each in wrong() if words.startswith(too))
+        with pytest.raises(ValueError, match=f"^{too}"):
+            filtering.smooth(**arguments(**spoilt))
 
 
 @pytest.mark.parametrize(
-    "name",
+    "field, value",
     [
-        "gyro",
-        "accel",
-        "covariance",
-        "covariance skew",
-        "imu_valid",
-        "imu_valid length",
-        "state.core_covariance",
-        "state.rotation",
-        "state.velocity",
-        "state.offset",
-        "state.gyro_bias",
-        "state.accel_bias",
-        "state.anchor",
-        "state.move",
-        "state.correlated",
-        "state.clone_rotation",
-        "state.clone_offset",
-        "state.cross_covariance",
-        "state.clone_covariance",
-        "noise.accel_density",
-        "noise.gyro_bias_walk",
-    ],
-)
-def test_impossible_values_are_refused_by_name(name):
-    with pytest.raises(ValueError, match=f"^{name.split(' skew')[0].split(' length')[0]}"):
-        filtering.run_filter(**spoilt(name))
-
-
-@pytest.mark.parametrize(
-    "field,value",
-    [
-        ("velocity", np.nan),
-        ("position", np.inf),
-        ("gyro_bias", np.nan),
         ("rotation", 2 * np.eye(3)),
+        ("rotation", np.eye(4)),
+        ("velocity", np.full(3, NAN)),
+        ("velocity", np.zeros(2)),
+        ("position", np.full(3, np.inf)),
+        ("position", np.zeros((1, 3))),
+        ("gyro_bias", np.full(3, NAN)),
+        ("accel_bias", np.zeros((3, 1))),
         ("std.tilt", -1.0),
-        ("std.yaw", np.nan),
+        ("std.yaw", np.zeros(3)),
     ],
 )
 def test_an_impossible_start_is_refused_by_name(field, value):
-    given = dict(
-        rotation=np.eye(3), velocity=np.zeros(3), position=np.zeros(3), gyro_bias=np.zeros(3)
-    )
-    if field.startswith("std."):
-        given["std"] = filtering.InitialStd(**{field[4:]: value})
-    else:
-        given[field] = given[field] + value if field != "rotation" else value
+    given = dict(zip(("rotation", "velocity", "position"), POSE, strict=True))
+    name, _, part = field.partition(".")
+    given[name] = filtering.InitialStd(**{part: value}) if part else value
     with pytest.raises(ValueError, match=f"^{field}:"):
         filtering.initial_state(CONFIG, **given)
 
 
-@pytest.mark.parametrize("name", ["gyro", "covariance"])
-def test_inside_jit_the_history_says_so(name):
-    given = spoilt(name)
-    config, rest = given.pop("config"), given
-    _, history = jax.jit(lambda given: filtering.run_filter(config=config, **given))(rest)
-    healthy = np.asarray(history.healthy)
-    bad = 1 if name == "gyro" else 10
-    assert (healthy[:bad] == 1).all() and (healthy[bad:] == 0).all()
+def test_settings_that_make_no_sense_are_refused_by_name():
+    for name, values in {
+        "dt": (0.0, NAN, "0.01", True),
+        "samples_per_clone": (0, 2.5),
+        "clones_per_window": (0, True),
+        "mahalanobis_fail_scale": (-1.0,),
+        "history": ("all",),
+        "log_std_min": (float("-inf"),),
+        "gate_threshold": (0.0,),
+        "convergence_seconds": (-1.0,),
+        "success_seconds": (-1.0,),
+        "pause_seconds": (-1.0,),
+        "speed_limit": (0.0, np.inf),
+        "window_rotation": ("none",),
+        "allow_float32": (1,),
+    }.items():
+        for value in values:
+            given = {"dt": 0.01, "samples_per_clone": 2, "clones_per_window": 3, name: value}
+            with pytest.raises(ValueError, match=f"^FilterConfig: field '{name}' "):
+                filtering.FilterConfig(**given)
+
+
+def test_the_precision_is_asked_for():
+    """float32 only where the settings allow it; without x64 the message says how to switch it
+    on."""
+    single = [part.astype(np.float32) for part in POSE]
+    with pytest.raises(ValueError, match=r"^rotation: .*float64, found float32.*allow_float32"):
+        filtering.initial_state(CONFIG, *single)
+    with jax.enable_x64(False), pytest.raises(ValueError, match="jax_enable_x64"):
+        filtering.initial_state(CONFIG, *POSE)
+    config = dataclasses.replace(CONFIG, allow_float32=True)
+    state = filtering.initial_state(config, *single)
+    found = filtering.run_filter(**arguments(state=state, config=config))
+    floating = [x for x in jax.tree.leaves(found) if jnp.issubdtype(x.dtype, jnp.floating)]
+    assert all(leaf.dtype == jnp.float32 for leaf in floating)
+
+
+@pytest.mark.parametrize("name, bad", [("gyro", 1), ("covariance", 10)])
+def test_inside_jit_the_history_reports_it(name, bad):
+    spoilt = next(each for words, each in wrong() if words.startswith(f"{name}: 1 of"))
+    given = arguments(**spoilt)
+    config = given.pop("config")
+    _, history = jax.jit(lambda given: filtering.run_filter(config=config, **given))(given)
+    np.testing.assert_array_equal(history.healthy, np.arange(INTERVALS) < bad)
 
 
 def test_log_likelihood_is_that_of_the_innovation():

@@ -1,23 +1,14 @@
 """The filter's programs compile once per shape, and their parts agree with and without jit."""
 
-import functools
-
 import chex
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from absl.testing import parameterized
-from scipy.spatial.transform import Rotation
 
-from gnio_jax import filtering, geometry
+from gnio_jax import filtering
 from gnio_jax.filtering import scan, smoother
 from gnio_jax.filtering import tracker as online
-from gnio_jax.filtering.displacement import scaled_displacement
-from gnio_jax.filtering.gaps import Imu
-from gnio_jax.filtering.propagation import core_transition, integrate, propagate
-from gnio_jax.filtering.update import Step
 from gnio_jax.types import Prediction
-from gnio_jax.windows import WINDOW_CUTS, cut_window
 from tests.support.compiling import quick
 
 N, CLONES, DT = 2, 2, 0.01
@@ -112,71 +103,3 @@ def test_tracker(monkeypatch):
     assert sum(pose is not None for pose in poses) > 5
     tracker._start(tracker.filter_state())
     assert np.isfinite(tracker.pose().position).all()
-
-
-# With and without jit
-# ------------------------------------------------------------------------------------------------
-
-
-variants = functools.partial(
-    chex.all_variants, with_device=False, without_device=False, with_pmap=False
-)
-ATTITUDE = Rotation.from_euler("xyz", [0.4, -0.7, 2.5]).as_matrix()
-VECTOR = np.array([0.3, -0.2, 0.9])
-
-
-def assert_agree(found, wanted):
-    chex.assert_trees_all_close(found, wanted, rtol=1e-12, atol=1e-14)
-
-
-class Variants(chex.TestCase):
-    """Each function plainly called against its variants, jitted and not."""
-
-    @variants
-    @parameterized.named_parameters(
-        ("exp", geometry.exp, VECTOR),
-        ("exp_at_zero", geometry.exp, 0 * VECTOR),
-        ("right_jacobian", geometry.right_jacobian, VECTOR),
-        ("orthonormalize", geometry.orthonormalize, ATTITUDE + 1e-6),
-        ("level", geometry.level, VECTOR),
-        ("yaw_rotation", geometry.yaw_rotation, ATTITUDE),
-    )
-    def test_geometry(self, function, value):
-        value = jnp.asarray(value)
-        assert_agree(self.variant(function)(value), function(value))
-
-    @variants
-    @parameterized.named_parameters(*((cut, cut) for cut in WINDOW_CUTS))
-    def test_cut_window(self, name):
-        cut = functools.partial(cut_window, cut=WINDOW_CUTS[name], dt=DT)
-        given = jnp.asarray(ATTITUDE), *map(jnp.asarray, signals(0)), 0.1 * VECTOR, VECTOR
-        assert_agree(self.variant(cut)(*given), cut(*given))
-
-    @variants
-    def test_propagate(self):
-        def interval(state, gyro, accel, anchored):
-            moved = integrate(state.mean, Imu(gyro, accel, None), NOISE, DT)
-            transition = core_transition(moved, jnp.zeros(0), anchored)
-            return propagate(state, moved, transition, 1)
-
-        given = start(), *map(jnp.asarray, signals(0, intervals=1)), jnp.ones(())
-        assert_agree(self.variant(interval)(*given), interval(*given))
-
-    @variants
-    def test_update(self):
-        state = start()._replace(
-            step=jnp.int32(5),
-            clone_offset=jnp.asarray([[-1.0, 0, 0], [-0.5, 0, 0], [0, 0, 0]]),
-            clone_covariance=0.1 * jnp.eye(18),
-        )
-        imu = Imu(*map(jnp.asarray, signals(0, intervals=1)), None)
-
-        def correct(state, displacement):
-            noise = NOISE._replace(measurement_scale=1.0)
-            measurement = scaled_displacement(displacement, 0.01 * jnp.eye(3), noise, "given")
-            return measurement.update(state, Step(imu, 2, 0, CONFIG, noise))
-
-        displacement = jnp.array([1.1, 0.1, 0.0])
-        found = self.variant(correct)(state, displacement)
-        assert_agree(found, correct(state, displacement))
-        assert bool(found[1].accepted)

@@ -12,7 +12,6 @@ from scipy.spatial.transform import Rotation
 from gnio_jax import filtering
 from gnio_jax.filtering import tracker as online
 from gnio_jax.filtering.consider import disturbed
-from gnio_jax.filtering.state import core_covariance
 from gnio_jax.types import Prediction
 from tests.support.checks import checked_at_first
 from tests.support.walks import errors, simulate
@@ -25,7 +24,6 @@ NOISE = filtering.NoiseModel(
 )
 START = filtering.InitialStd(gyro_bias=1e-4, velocity=0.1)
 STD = filtering.ConsideredStd(gyro_bias=0.02, scale=0.1, heading=0.08, slope=0.05)
-COVARIANCE = slice(21, 246)
 """Of a tracker's vector of a pose."""
 SPREAD = np.array([*[STD.gyro_bias] * 3, *STD[1:]])
 
@@ -183,7 +181,8 @@ TOLD = Told()
 @functools.cache
 def compiled():
     """The program of every tracker below."""
-    return filtering.Tracker(TOLD, CONFIG, NOISE, started(0), considered=STD)._programs
+    tracker = filtering.Tracker(TOLD, CONFIG, NOISE, started(0), considered=STD)
+    return tracker._advance, tracker._look_ahead
 
 
 @pytest.fixture
@@ -249,23 +248,13 @@ def test_the_tracker_has_the_covariance_of_the_whole_run(built):
     assert calls == HALF * (STRIDES - CLONES)  # of the derivatives none calls it again
 
 
-def test_the_trackers_covariance_is_that_of_its_errors(built):
-    runs, _ = walks()
-    poses, _ = tracked()
-    error = runs.position[:HALF] - np.array([[pose.position for pose in row] for row in poses])
-    covariance = np.array([[pose.covariance[6:9, 6:9] for pose in row] for row in poses])
-    squares = np.einsum("rki,rkij,rkj->rk", error, np.linalg.inv(covariance), error)
-    assert squares[:, CLONES::10].mean() / 3 == pytest.approx(1, abs=0.35)
-
-
-def without_considered(tracker, covariance):
+def without_considered(tracker):
     """The covariance of the tracker's pose, from P alone after its last clone step."""
-    vector, stream = np.array(tracker._vector), tracker._stream
-    vector[COVARIANCE] = covariance.ravel()
-    memory = tracker._core.filter.imu
+    state, stream = tracker._core.filter, tracker._stream
+    estimate, memory = online.estimated(state, jnp.zeros(3), None, None), state.imu
     for row in stream.rows(stream.known):
-        vector, memory = tracker._programs.look_ahead(vector, memory, row)
-    return np.asarray(vector)[COVARIANCE].reshape(15, 15)
+        estimate, memory = tracker._look_ahead(estimate, memory, row)
+    return np.asarray(estimate.covariance)
 
 
 def test_what_is_added_is_the_change_of_the_tracker(built):
@@ -290,8 +279,7 @@ def test_what_is_added_is_the_change_of_the_tracker(built):
             column = np.concatenate([turn, *rest]) / (2 * step) * SPREAD[entry]
             wanted[place] += np.outer(column, column)
     for place, (tracker, pose) in enumerate(visited()):
-        alone = core_covariance(tracker.filter_state().core_covariance)
-        added = pose.covariance - without_considered(tracker, np.asarray(alone))
+        added = pose.covariance - without_considered(tracker)
         std = np.sqrt(np.diag(pose.covariance))
         assert np.abs((added - wanted[place]) / np.outer(std, std)).max() < 1e-6, place
         assert np.abs(added / np.outer(std, std)).max() > 0.5
@@ -307,8 +295,10 @@ def test_a_start_from_rest_considers_from_its_first_pose_on(built):
 
 def test_a_negative_size_is_refused():
     wrong = STD._replace(scale=-1.0)
-    with pytest.raises(ValueError, match=r"^considered\.scale: must be a number that is not neg"):
+    with pytest.raises(ValueError, match=r"^considered\.scale: must be finite and not neg"):
         filtering.Tracker(TOLD, CONFIG, NOISE, started(0), considered=wrong)
+    with pytest.raises(ValueError, match=r"^considered\.slope"):
+        filtering.considered_covariance(np.ones((2, 15, 6)), STD._replace(slope=np.nan))
 
 
 # The smoother
@@ -384,8 +374,3 @@ def test_the_smoothers_covariance_is_that_of_its_errors():
 
     assert nees(found.covariance[:HALF] - added) > 5
     assert nees(found.covariance) == pytest.approx(1, abs=0.35)
-
-
-def test_sizes_that_make_no_sense_are_refused():
-    with pytest.raises(ValueError, match=r"^considered\.slope"):
-        filtering.considered_covariance(np.ones((2, 15, 6)), STD._replace(slope=np.nan))

@@ -15,7 +15,7 @@ from gnio_jax.filtering.displacement import Displacement, linearise_displacement
 from gnio_jax.filtering.gaps import Imu
 from gnio_jax.filtering.propagation import integrate
 from gnio_jax.filtering.state import CLONE, OFFSET, THETA, VELOCITY, Mean
-from gnio_jax.filtering.update import Step, retract
+from gnio_jax.filtering.update import Step, measurable_errors, retract
 from gnio_jax.types import Prediction
 from gnio_jax.windows import cut_window
 from tests.support.compiling import optimised, quick
@@ -39,13 +39,7 @@ PARTS = {
 def program():
     """(std, covariance of a measurement, start and signals of each run) -> final states and
     histories."""
-    config = filtering.FilterConfig(
-        DT,
-        N,
-        CLONES,
-        gate_threshold=1e9,
-        history="core",
-    )
+    config = filtering.FilterConfig(DT, N, CLONES, gate_threshold=1e9, history="core")
 
     def run(std, spread, rotation, velocity, position, gyro, accel, displacement):
         start = filtering.initial_state(config, rotation, velocity, position, std=std)
@@ -203,12 +197,17 @@ def test_measurement_jacobian_is_the_derivative_of_the_retraction():
     measured = Displacement(jnp.zeros(3), jnp.eye(3), jnp.bool_(True), "given")
     step = Step(NO_IMU, newest, oldest, config, filtering.NoiseModel())
     linear, _ = quick(lambda: linearise_displacement(measured, state, step))()
-    found = np.zeros((3, 4 * CLONE + 15))
-    found[:, CLONE * oldest : CLONE * (oldest + 1)] = linear.oldest
-    # The core's offset is that of the newest clone.
-    found[:, CLONE * newest + 3 : CLONE * (newest + 1)] = linear.core["offset"]
-    found[:, -3:] = linear.core["move"]
-    assert set(linear.core) == {"offset", "move"}
+    assert set(linear.jacobian) == {"since_oldest", "oldest_rotation"}
+
+    def linearised(errors):
+        # The core's offset is that of the newest clone.
+        clones = errors[:-15]
+        core = jnp.zeros(21).at[OFFSET.start :].set(errors[-15:])
+        core = core.at[OFFSET].set(clones[CLONE * newest + 3 : CLONE * (newest + 1)])
+        parts = measurable_errors(core[:, None], clones[:, None], oldest)
+        return sum(block @ parts[name][:, 0] for name, block in linear.jacobian.items())
+
+    found = jax.jacfwd(linearised)(jnp.zeros(4 * CLONE + 15))
     np.testing.assert_allclose(
         found, quick(jax.jacfwd(predicted))(jnp.zeros(4 * CLONE + 15)), atol=1e-6
     )

@@ -264,18 +264,12 @@ def test_the_factor_of_each_axis_scales_the_covariance():
 
 
 @pytest.mark.parametrize(
-    ("field", "value", "problem"),
-    [
-        ("share", 1.0, "must be below 1"),
-        ("share", -0.1, "must be a number that is not negative"),
-        ("seconds", 0.0, "must be positive"),
-        ("seconds", -1.0, "must be a number that is not negative"),
-    ],
+    ("field", "value"), [("share", 1.0), ("share", -0.1), ("seconds", 0.0), ("seconds", -1.0)]
 )
-def test_sizes_that_make_no_sense_are_refused(field, value, problem):
+def test_sizes_that_make_no_sense_are_refused(field, value):
     start, *signals = walk()
     noise = NOISE._replace(correlation=ERRORS._replace(**{field: value}))
-    with pytest.raises(ValueError, match=rf"noise\.correlation\.{field}: {problem}"):
+    with pytest.raises(ValueError, match=rf"^noise\.correlation\.{field}: must be"):
         filtering.run_filter(filtering.initial_state(CONFIG, *start), *signals, CONFIG, noise)
 
 

@@ -19,11 +19,7 @@ def test_gate_boundaries_count_samples():
     def step(memory, now, nis=20.0, oldest=100, tested=True):
         memory = filtering.GateState(*[jnp.asarray(value) for value in memory])
         memory, passed = gate(
-            memory,
-            jnp.asarray(now),
-            jnp.asarray(oldest),
-            jnp.asarray(nis),
-            jnp.asarray(tested),
+            memory, jnp.asarray(now), jnp.asarray(oldest), jnp.asarray(nis), jnp.asarray(tested)
         )
         return tuple(int(value) for value in memory), passed == 1
 

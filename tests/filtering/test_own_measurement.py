@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from gnio_jax import filtering, geometry
-from gnio_jax.filtering.update import oldest_offset
+from gnio_jax.filtering.update import since_oldest
 from tests.support.compiling import quick
 from tests.support.random_walk import random_walk
 from tests.support.whole_covariance import covariance
@@ -32,7 +32,7 @@ class Height(NamedTuple):
     def update(self, state, step):
         residual = jnp.stack([self.height - state.position[2]])
         linear = filtering.linearise(
-            state, step, residual, self.std[None, None] ** 2, position=[[0.0, 0.0, 1.0]]
+            state, residual, self.std[None, None] ** 2, position=[[0.0, 0.0, 1.0]]
         )
         return filtering.measure(state, linear, step, threshold=10.8)
 
@@ -46,7 +46,7 @@ class Between(NamedTuple):
     def update(self, state, step):
         rotation = state.clone_rotation[step.oldest]
         to_yaw = geometry.yaw_rotation(rotation).T
-        moved = to_yaw @ (state.offset - oldest_offset(state, step.oldest))
+        moved = to_yaw @ since_oldest(state, step.oldest)
 
         def yaw_of(theta):
             turned = geometry.exp(theta) @ rotation
@@ -56,7 +56,6 @@ class Between(NamedTuple):
         residual = jnp.where(state.step > CLONES, self.displacement - moved, jnp.nan)
         linear = filtering.linearise(
             state,
-            step,
             residual,
             self.covariance,
             since_oldest=to_yaw,
@@ -173,6 +172,8 @@ def test_rows_that_are_missing_are_refused_by_name():
     measured = (Height(np.zeros(INTERVALS - 1), np.ones(INTERVALS)),)
     with pytest.raises(ValueError, match=r"^measurements\[0\]\.height: the shape must be \(30,\)"):
         run.__wrapped__()(DISPLACEMENT, measured)
+    with pytest.raises(ValueError, match=r"^linearise: height: is none of rotation, velocity"):
+        filtering.linearise(start(), [0.0], [[1.0]], height=[[0.0, 0.0, 1.0]])
 
 
 def test_known_displacements_are_those_of_the_filter():

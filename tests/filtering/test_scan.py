@@ -210,33 +210,6 @@ def test_gimbal_lock_is_no_update():
         assert_close(getattr(history, field), wanted[field], 1e-9)
 
 
-def test_vmap_and_jit_equal_single():
-    config = GATED()
-    walks = [
-        random_walk(
-            seed, n=5, clones=4, intervals=40, dt=0.02, nan_rows=(9 + seed,), outliers=(20 + seed,)
-        )
-        for seed in (1, 2, 3)
-    ]
-    noise = filtering.NoiseModel()
-
-    def run(R, v, p, *signals):
-        return filtering.run_filter(
-            filtering.initial_state(config, R, v, p, std=STD), *signals, config, noise
-        )
-
-    arguments = [(*start, *signals) for start, *signals in walks]
-    single = [run(*one) for one in arguments]
-    batch = jax.jit(jax.vmap(run))(*[np.stack(column) for column in zip(*arguments, strict=True)])
-    batch = jax.device_get(batch)  # indexed in JAX, every leaf would be two programs
-    for index, one in enumerate(single):
-        jax.tree.map(
-            lambda many, alone, index=index: assert_close(many[index], alone, 1e-10, 1e-9),
-            batch,
-            one,
-        )
-
-
 def test_covariance_stays_symmetric_and_positive():
     walk = random_walk(1, n=5, clones=4, intervals=80, dt=0.02, nan_rows=MISSING, outliers=OUTLIERS)
     state, _, _ = both(walk, GATED())

@@ -13,6 +13,7 @@ from gnio_jax import filtering
 from gnio_jax.types import Prediction
 from tests.support import scekf_numpy
 from tests.support.compiling import lightly_optimised, quick
+from tests.support.manifold import differences, integrate, minus, plus
 from tests.support.walks import errors, simulate, yaw_matrix
 
 N, CLONES, INTERVALS, DT = 4, 3, 14, 0.05
@@ -25,45 +26,6 @@ PRIOR = np.repeat(
     [STD.tilt, STD.yaw, STD.velocity, STD.position, STD.gyro_bias, STD.accel_bias],
     [2, 1, 3, 3, 3, 3],
 )
-
-
-# States x = (R, v, p, b_g, b_a) have any axes in front, those of differences among them.
-# ------------------------------------------------------------------------------------------------
-
-
-def rotated(rotvec):
-    return Rotation.from_rotvec(rotvec.reshape(-1, 3)).as_matrix().reshape(*rotvec.shape, 3)
-
-
-def plus(x, delta):
-    """x and δ (…, 15): exp(δθ) R, the rest adds."""
-    theta, *rest = np.split(delta, 5, axis=-1)
-    return rotated(theta) @ x[0], *[part + d for part, d in zip(x[1:], rest, strict=True)]
-
-
-def minus(x, y):
-    turn = x[0] @ np.swapaxes(y[0], -1, -2)
-    theta = Rotation.from_matrix(turn.reshape(-1, 3, 3)).as_rotvec().reshape(turn.shape[:-1])
-    return np.concatenate([theta, *[a - b for a, b in zip(x[1:], y[1:], strict=True)]], axis=-1)
-
-
-def integrate(x, gyro, accel, disturbance=None):
-    """x over some samples; disturbance (…, samples, 12) of the readings and of the steps of the
-    biases."""
-    R, v, p, bg, ba = x
-    none = np.zeros((len(gyro), 12)) if disturbance is None else disturbance
-    for j in range(len(gyro)):
-        w, a, wg, wa = np.split(none[..., j, :], 4, axis=-1)
-        dv = (R @ (accel[j] - a - ba)[..., None])[..., 0] * DT
-        p = p + v * DT + 0.5 * dv * DT + 0.5 * scekf_numpy.G * DT**2
-        v, R = v + dv + scekf_numpy.G * DT, R @ rotated((gyro[j] - w - bg) * DT)
-        bg, ba = bg + wg, ba + wa
-    return R, v, p, bg, ba
-
-
-def differences(function, size, step=1e-6):
-    """Central ones of a function of (…, size), for all columns at once."""
-    return (function(step * np.eye(size)) - function(-step * np.eye(size))).T / (2 * step)
 
 
 def displaced(past, now):
@@ -94,7 +56,7 @@ def walk(seed, still=0, intervals=INTERVALS):
     for j in range(samples):
         gyro[j], accel[j] = rate[j] + x[3], x[0].T @ (force[j] - scekf_numpy.G) + x[4]
         steps = np.r_[np.zeros(6), np.repeat(WALK * np.sqrt(DT), 3)] * rng.normal(size=12)
-        x = integrate(x, gyro[j : j + 1], accel[j : j + 1], steps[None])
+        x = integrate(x, gyro[j : j + 1], accel[j : j + 1], DT, steps[None])
         if (j + 1) % N == 0:
             truth.append(x)
     gyro, accel = (
@@ -119,10 +81,10 @@ def most_probable(start, gyro, accel, measurements, stops):
     """
     x = [start]
     for k in range(INTERVALS):
-        x.append(integrate(x[-1], gyro[k * N : (k + 1) * N], accel[k * N : (k + 1) * N]))
+        x.append(integrate(x[-1], gyro[k * N : (k + 1) * N], accel[k * N : (k + 1) * N], DT))
     factors = [((0,), lambda x: minus(x, start), np.diag(PRIOR**2))]
     for k in range(INTERVALS):
-        signals = gyro[k * N : (k + 1) * N], accel[k * N : (k + 1) * N]
+        signals = gyro[k * N : (k + 1) * N], accel[k * N : (k + 1) * N], DT
         ideal = integrate(x[k], *signals)
         reach = differences(
             lambda w, x=x[k], s=signals, i=ideal: minus(integrate(x, *s, w.reshape(-1, N, 12)), i),
@@ -138,11 +100,7 @@ def most_probable(start, gyro, accel, measurements, stops):
         )
     for k, (d, R) in measurements.items():
         factors.append(
-            (
-                (k + 1 - CLONES, k + 1),
-                lambda past, now, d=d: d - displaced(past, now),
-                R,
-            )
+            ((k + 1 - CLONES, k + 1), lambda past, now, d=d: d - displaced(past, now), R)
         )
     for k, std in stops.items():
         factors.append(((k + 1,), lambda now: now[1], std**2 * np.eye(3)))
@@ -176,28 +134,20 @@ def rows_of(history):
 
 REJECTED, MISSING = 9, (6, 7)
 CONFIG = functools.partial(
-    filtering.FilterConfig,
-    DT,
-    N,
-    CLONES,
-    convergence_seconds=0.0,
-    success_seconds=5.0,
+    filtering.FilterConfig, DT, N, CLONES, convergence_seconds=0.0, success_seconds=5.0
 )
 NOISE = filtering.NoiseModel.per_sample(*WHITE, DT, *WALK)._replace(measurement_scale=2.0)
 
 
 @pytest.mark.parametrize("case", ["rejected", "scaled", "weighted"])
 def test_equals_least_squares_over_all_states(case):
-    """Missing rows in all cases; a rejected row; one applied with scaled covariance, in blocks of
-    intervals and two left over; a gate with a slope, and rest."""
+    """Missing rows in all cases; a rejected row; one applied with scaled covariance; a gate with a
+    slope, and rest."""
     options = {
         "rejected": dict(history="core"),
-        "scaled": dict(history="core", mahalanobis_fail_scale=7.0, checkpoint_every=4),
+        "scaled": dict(history="core", mahalanobis_fail_scale=7.0),
         "weighted": dict(
-            gate_softness=3.0,
-            gate_threshold=4.0,
-            zero_velocity_std=5 * SMALL,
-            rest_seconds=0.5,
+            gate_softness=3.0, gate_threshold=4.0, zero_velocity_std=5 * SMALL, rest_seconds=0.5
         ),
     }[case]
     config = CONFIG(**options)
@@ -332,13 +282,7 @@ def test_long_walks_come_closer_to_the_truth_and_say_by_how_much():
     runs = simulate(2, RUNS, LONG, STEP, WINDOW, RATE, DENSITIES, std, SIGMA)
     runs.displacement[:, 100:108] = np.nan
     config = filtering.FilterConfig(
-        RATE,
-        STEP,
-        WINDOW,
-        gate_threshold=1e9,
-        history="core",
-        gap_gyro_std=0.5,
-        gap_accel_std=2.0,
+        RATE, STEP, WINDOW, gate_threshold=1e9, history="core", gap_gyro_std=0.5, gap_accel_std=2.0
     )
     valid = np.ones((RUNS, LONG * STEP), bool)
     valid[1, 1000:1005] = valid[2, 1500:1530] = False
@@ -402,36 +346,3 @@ def test_gradient():
     np.testing.assert_allclose(
         gradient, [(loss(x + e)[0] - loss(x - e)[0]) / 2e-3 for e in steps], rtol=1e-4
     )
-
-
-def test_refuses_at_the_door():
-    _, start, gyro, accel, displacement, covariance = walk(8)
-    config = CONFIG()
-    state = filtering.initial_state(config, *start, STD)
-    good = dict(
-        state=state,
-        gyro=gyro,
-        accel=accel,
-        displacement=displacement,
-        covariance=covariance,
-        config=config,
-        noise=NOISE,
-    )
-    not_positive = np.where(np.arange(INTERVALS)[:, None, None] == 5, -np.eye(3), covariance)
-    for wrong, message in [
-        (dict(gyro=gyro[:-1]), "gyro: the samples must be a multiple"),
-        (dict(accel=accel[1:]), "accel: the shape"),
-        (dict(displacement=displacement[1:]), "displacement: the shape"),
-        (dict(covariance=covariance[:, :2]), "covariance: the shape"),
-        (dict(covariance=not_positive), "covariance: 1 of 14"),
-        (dict(gyro=gyro.astype(np.float32)), "gyro: the filter runs in float64"),
-        (
-            dict(accel=np.where(np.arange(len(accel))[:, None] == 7, np.nan, accel)),
-            "accel: 1 of 56 rows",
-        ),
-        (dict(imu_valid=np.ones(3, bool)), "imu_valid: must be 56 booleans"),
-        (dict(noise=NOISE._replace(gyro_density=-1.0)), "noise.gyro_density"),
-        (dict(state=state._replace(velocity=np.zeros(2))), "state.velocity"),
-    ]:
-        with pytest.raises(ValueError, match=message):
-            filtering.smooth(**{**good, **wrong})

@@ -32,5 +32,7 @@ def displacement_residual(rotation, moved, displacement, frame="given"):
     measured = Displacement(displacement, jnp.eye(3), jnp.bool_(True), frame)
     step = Step(NO_IMU, 1, 0, CONFIG, filtering.NoiseModel())
     linear, defined = linearise_displacement(measured, state, step)
-    jacobian = jnp.concatenate([linear.oldest, linear.core["offset"]], axis=1)
+    by_moved = linear.jacobian["since_oldest"]
+    by_rotation = linear.jacobian["oldest_rotation"]
+    jacobian = jnp.concatenate([by_rotation, -by_moved, by_moved], axis=1)
     return Residual(linear.residual, jacobian, defined)

@@ -13,11 +13,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from gnio_jax import filtering
 from gnio_jax.apps.onnx import accuracy, driver
 from gnio_jax.apps.onnx.flat_state import start_arrays
 from gnio_jax.apps.onnx.run import PACKAGES
 from gnio_jax.commands import app, console
-from gnio_jax.filtering.start import rest_state
 from gnio_jax.tracking.run import tracking_filter
 from gnio_jax.training.checkpoint import load_run
 from tests.apps.onnx.conftest import BIAS, CONFIG, SECONDS
@@ -38,7 +38,7 @@ def found(models, walked):
 def from_rest(setup, walked):
     """The start of `gnio track` and `gnio live`."""
     gyro, accel = walked.gyro[:REST], walked.accel[:REST]
-    return rest_state(setup.config, gyro, accel, setup.initial_std)
+    return filtering.level_state(setup.config, gyro, accel, setup.initial_std)
 
 
 def test_a_minute_is_that_of_the_package(found, walked, package):
