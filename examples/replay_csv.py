@@ -127,9 +127,8 @@ def write_trajectory(out: Path, name: str, poses: list) -> np.ndarray:
     )
     with replacing(out) as temporary:
         write_tum(temporary, estimated)
-    estimate = Estimate(name, estimated, no_reference)
-    with replacing(out.with_suffix(".png")) as temporary:
-        plots.save(temporary, plots.trajectory(estimate, alignment="none"))
+    seen = plots.view(Estimate(name, estimated, no_reference), alignment="none")
+    plots.save(out.with_suffix(".png"), plots.sequence(seen))
     return position
 
 

@@ -13,7 +13,6 @@ __all__ = [
     "__version__",
     "apps",
     "calibration",
-    "comparison",
     "config",
     "data",
     "evaluation",

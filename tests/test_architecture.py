@@ -18,15 +18,13 @@ ROOMS = {
     "evaluation": BASE | {"data", "models", "filtering", "training"},
     "calibration": BASE | {"data", "filtering", "training", "evaluation"},
     "interop": BASE | {"models", "training"},
-    "comparison": BASE | {"evaluation"},
-    "tables": BASE
-    | {"data", "models", "filtering", "training", "evaluation", "calibration", "comparison"},
+    "tables": BASE | {"data", "models", "training", "evaluation", "calibration"},
     "tracking": BASE | {"data", "filtering", "training", "evaluation", "apps"},
     "live": BASE | {"apps", "data", "filtering", "training", "evaluation", "tracking"},
     "apps": BASE
     | {"data", "models", "filtering", "training", "evaluation", "calibration", "tracking"},
     "commands": BASE
-    | {"data", "filtering", "training", "evaluation", "calibration", "interop", "comparison"}
+    | {"data", "filtering", "training", "evaluation", "calibration", "interop"}
     | {"tables", "apps", "tracking", "live"},
     **{name: BASE for name in BASE},
 }
@@ -34,11 +32,11 @@ ROOMS = {
 
 ONNX = {"apps.onnx.conversion", "apps.onnx.driver"}
 LIBRARIES = {
-    "bokeh": {"evaluation.html.figures", "evaluation.html.page"},
+    "bokeh": {"evaluation.page"},
     "flax": {"models", "training", "evaluation", "interop"},
     "jax2onnx": {"apps.onnx.conversion"},
     "mcap": {"apps.importing.bags", "evaluation.exporting.ros"},
-    "matplotlib": {"data", "evaluation", "comparison", "tables", "tracking"},
+    "matplotlib": {"data", "evaluation.plots", "tables.plots"},
     "onnx": ONNX,
     "onnxruntime": ONNX,
     "optax": {"training"},

@@ -37,30 +37,28 @@ def compare(asked: CompareConfig, _call: options.Call) -> None:
         _check_out(asked.out)  # or what was evaluated for it would be lost
     import jax  # late: mistakes do not wait for it
 
-    from gnio_jax import comparison, filtering
-    from gnio_jax.comparison import picture, text
+    from gnio_jax import filtering
+    from gnio_jax.apps import compare as comparison
 
     jax.config.update("jax_enable_x64", True)  # for the filter; the network states its float32
     filtering.cores_as_devices()
     with console.terminal() as terminal:
         found = comparison.compare(asked, terminal, usable_cores())
     output = console.stdout()
-    output.print(f"{text.title(found)}\n", soft_wrap=True)
+    output.print(f"{comparison.title(found)}\n", soft_wrap=True)
     table = Table(box=box.SIMPLE_HEAD, header_style="bold")
     table.add_column(overflow="fold", min_width=16)  # names have the width that is left
-    for name in text.HEADER[2:]:
+    for name in comparison.HEADER[2:]:
         table.add_column(name, justify="right")
-    for metric, *cells in text.lines(found):
+    for metric, *cells in comparison.lines(found):
         if metric:
             table.add_row(metric, style="bold")
         table.add_row(f"  {cells[0]}", *cells[1:])
     output.print(table)
-    for line in text.explanations(found):
+    for line in comparison.explanations(found):
         output.print(line)
     if asked.out is not None:
-        figure = picture.draw(found)
-        text.write(Path(asked.out), found)
-        picture.save(with_ending(Path(asked.out), ".png"), figure)
+        comparison.write(Path(asked.out), found)
         output.print(f"\nresults: {asked.out}.md, .csv, .png", soft_wrap=True)
 
 

@@ -53,7 +53,7 @@ def evaluate(asked: EvaluateOptions, call: options.Call) -> None:
     import jax  # late: mistakes do not wait for it
 
     from gnio_jax import evaluation, filtering, parallel
-    from gnio_jax.evaluation import table
+    from gnio_jax.evaluation import tabulate
     from gnio_jax.evaluation.run import run_config
 
     jax.config.update("jax_enable_x64", True)  # for the filter; the network states its float32
@@ -67,12 +67,11 @@ def evaluate(asked: EvaluateOptions, call: options.Call) -> None:
     if not parallel.is_first():
         return
     output = console.stdout()
-    output.print(table.render(found))
+    output.print(tabulate.render(found))
     output.print(f"results: {folder}", soft_wrap=True)
     if asked.rerun:
         output.print(f"for Rerun: {asked.rerun}", soft_wrap=True)
     if asked.plots:
         output.print(f"page: {folder / 'report.html'} (open it in a browser)", soft_wrap=True)
-        names = "<name>_{trajectory,error,displacement}.png"
-        pictures = f"{folder / 'plots' / 'error_cdf.png'}, and there of each sequence {names}"
+        pictures = f"{folder / 'plots' / 'error_cdf.png'}, and there <name>.png of each sequence"
         output.print(f"pictures: {pictures}", soft_wrap=True)

@@ -24,23 +24,21 @@ def tables(asked: TablesConfig, _call: options.Call) -> None:
       {prog} components --base gnio_oxiod_small --data-root DIR --split sessions_test
       {prog} gates --base ... --epochs 3             gate and scale functions, their gradients
       {prog} bank-size --base ...                    size of the Motion Bank, entropy of attention
-      {prog} bank-spread --base ...                  how far apart its prototypes start
-      {prog} uncertainty --base ...                  what makes the uncertainty fit for the filter
       {prog} trajectories --base ...                 all methods over the reference, one picture
       {prog} standing --base ...                     errors at rest and in slow walking
     """
     import jax  # late: mistakes do not wait for it
 
     from gnio_jax import filtering
-    from gnio_jax.tables import making, matrix
+    from gnio_jax.tables import make, runs
 
     # For the filter; training and the networks state their float32.
     jax.config.update("jax_enable_x64", True)
     filtering.cores_as_devices()
     try:
         with console.terminal() as terminal:
-            text = making.make(asked, terminal, usable_cores())
-    except matrix.Interrupted as stopped:
+            text = make.make(asked, terminal, usable_cores())
+    except runs.Interrupted as stopped:
         print("stopped and saved; the same command goes on from here", file=sys.stderr)
         sys.exit(128 + stopped.signum)
     console.stdout().print(text, soft_wrap=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -81,7 +80,7 @@ def _folder_name(name: str) -> str:
 
 def _table(summary: Any) -> Table:
     """Two columns: figure and value."""
-    from gnio_jax.evaluation.table import COLUMNS
+    from gnio_jax.evaluation import tabulate
     from gnio_jax.tracking.summary import ERRORS
 
     grid = Table(box=box.SIMPLE_HEAD, title_style="bold", title_justify="left")
@@ -95,7 +94,7 @@ def _table(summary: Any) -> Table:
     if summary.accepted is not None:
         grid.add_row("displacements used", f"{summary.accepted:.0%}")
     for name in ERRORS if summary.errors else ():
-        column, value = COLUMNS[name], summary.errors.get(name)
-        text = "–" if value is None or not math.isfinite(value) else f"{value:.{column.digits}f}"
+        column = tabulate.column(name)
+        text = tabulate.number(summary.errors.get(name), column.digits)
         grid.add_row(f"{column.heading} (against the reference)", f"{text} {column.unit}".strip())
     return grid

@@ -17,8 +17,6 @@ Table = Literal[
     "components",
     "gates",
     "bank-size",
-    "bank-spread",
-    "uncertainty",
     "trajectories",
     "standing",
 ]
@@ -104,8 +102,7 @@ class TablesConfig:
     """What `gnio tables` is asked for."""
 
     table: tyro.conf.Positional[Annotated[Table, tyro.conf.arg(metavar="TABLE")]]
-    """complexity, comparison, components, gates, bank-size, bank-spread, uncertainty, trajectories
-    or standing."""
+    """complexity, comparison, components, gates, bank-size, trajectories or standing."""
     base: str = "quickstart"
     """Config whose recordings, budget and augmentation every row has (not for complexity)."""
     data_root: str | None = None

@@ -17,8 +17,9 @@ from gnio_jax.evaluation.inference import (
 from gnio_jax.evaluation.metrics import Measures, measure
 from gnio_jax.evaluation.preparation import Prepared, prepare
 from gnio_jax.evaluation.report import Report
+from gnio_jax.evaluation.report import read as load
 from gnio_jax.evaluation.run import Evaluation, evaluate
-from gnio_jax.evaluation.scores import Scores, score
+from gnio_jax.evaluation.scores import score
 from gnio_jax.evaluation.setup import Setup, resolve
 from gnio_jax.evaluation.trajectory import Trajectory, Undefined, align
 from gnio_jax.filtering.settings import FilterSetup, filter_setup
@@ -31,7 +32,6 @@ __all__ = [
     "Network",
     "Prepared",
     "Report",
-    "Scores",
     "Setup",
     "Trajectory",
     "Undefined",
@@ -41,6 +41,7 @@ __all__ = [
     "evaluate",
     "filter_setup",
     "inference_network",
+    "load",
     "measure",
     "never_moves",
     "perfect_displacements",

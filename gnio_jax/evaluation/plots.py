@@ -1,4 +1,4 @@
-"""Pictures of an evaluation. Every function returns a `Figure` and keeps no state.
+"""Pictures of results. Every function returns a `Figure` and keeps no state.
 
 Colours are those of Okabe and Ito, which the colour-blind can tell apart; the reference is black
 throughout. Matplotlib is imported here, so import this module only where something is drawn.
@@ -6,86 +6,196 @@ throughout. Matplotlib is imported here, so import this module only where someth
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Ellipse
 from matplotlib.ticker import PercentFormatter
 
-from gnio_jax.evaluation import metrics
+from gnio_jax.evaluation import metrics, statistics
 from gnio_jax.evaluation.estimators.result import Estimate
-from gnio_jax.evaluation.frames import in_the_references_frame
+from gnio_jax.evaluation.frames import in_the_references_frame, with_the_reference_in_its_frame
 from gnio_jax.evaluation.report import Report, file_names
 from gnio_jax.evaluation.setup import OnShare, no_progress
-from gnio_jax.evaluation.trajectory import Alignment, relative_yaw
-from gnio_jax.files import shown_name
-from gnio_jax.numerics import finite_rows, rotation_z, spans
-from gnio_jax.windows import true_displacement
+from gnio_jax.evaluation.statistics import Scores
+from gnio_jax.evaluation.trajectory import Alignment
+from gnio_jax.files import replacing, shown_name
+from gnio_jax.numerics import finite_rows, spans
 
 BLUE, VERMILION, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#8C8C8C"
+PURPLE, ORANGE, SKY, YELLOW = "#CC79A7", "#E69F00", "#56B4E9", "#F0E442"
+COLOURS = (BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY)
+"""One for each run, method or row."""
 AXES = {"x": BLUE, "y": VERMILION, "z": GREEN}
 REFERENCE = "black"
 STANDING = "#E8E8E8"
-GRID = "#D9D9D9"
+GRID = "#DDDDDD"
 DOTS_PER_INCH = 120
 START: dict[str, Any] = {"marker": "o", "ls": "", "mfc": "white", "ms": 8, "mew": 1.8}
 END: dict[str, Any] = {"marker": "s", "ls": "", "ms": 7}
+MARKERS = "os^Dv"
+"""Where there are more rows than colours, the next marker."""
+SIGMAS = 3.0
+"""Size of the ellipses and bands, in standard deviations."""
+ELLIPSES = 12
+"""On a map, at even times."""
 
 
-def save_all(
-    folder: Path,
-    estimates: list[Estimate],
-    report: Report,
-    window_seconds: float,
-    progress: OnShare = no_progress,
-) -> None:
-    """Every picture as a PNG in `folder`: three for each sequence (`<name>_trajectory`, `_error`,
-    `_displacement`) and `error_cdf`."""
-    folder.mkdir(parents=True, exist_ok=True)
-    alignment = report.settings["alignment"]
-    stems = file_names([e.name for e in estimates])
-    for done, (stem, estimate) in enumerate(zip(stems, estimates, strict=True)):
-        progress(done / len(estimates))
-        values = report.scores.sequences[estimate.name].values
-        figure = trajectory(estimate, values.get("ate"), values.get("ate_2d"), alignment)
-        save(folder / f"{stem}_trajectory.png", figure)
-        if np.isfinite(estimate.reference.position).any():
-            save(folder / f"{stem}_error.png", position_error(estimate))
-        if estimate.displacement is not None and np.isfinite(estimate.displacement).any():
-            save(folder / f"{stem}_displacement.png", displacement(estimate, window_seconds))
-    if any(np.isfinite(e.reference.position).any() for e in estimates):
-        save(folder / "error_cdf.png", error_cdf(estimates, report))
+# What is drawn of an estimate
+# --------------------------------------------------------------------------------------------------
 
 
-def save(path: Path, figure: Figure) -> None:
-    """Write one figure."""
-    FigureCanvasAgg(figure)
-    figure.savefig(path, dpi=DOTS_PER_INCH)
+class View(NamedTuple):
+    """A trajectory and its reference in one frame, and what network and filter gave beside it.
+
+    There are n rows, one for each row of the estimate. What is not known is NaN.
+    """
+
+    name: str
+    time: Float[np.ndarray, "n"]
+    """From the start, s."""
+    position: Float[np.ndarray, "n 3"]
+    """Of the estimate, m."""
+    reference: Float[np.ndarray, "n 3"]
+    """Position, m."""
+    covariance: Float[np.ndarray, "n 3 3"]
+    """Of the estimate's position, m²."""
+    gate: Float[np.ndarray, "n 3"]
+    """Of the network, along the axes of the window's yaw frame."""
+    scale: Float[np.ndarray, "n 3"]
+    """Of the network."""
+    std: Float[np.ndarray, "n 3"]
+    """Standard deviation of the displacement, m."""
+    nis: Float[np.ndarray, "n"]
+    """Normalised innovation squared."""
+    accepted: Float[np.ndarray, "n"]
+    """1 where the filter used the displacement, 0 where it refused it."""
+
+    @property
+    def step(self) -> float:
+        """Time between two rows, s."""
+        return float(np.median(np.diff(self.time))) if len(self.time) > 1 else 1.0
+
+    @property
+    def known(self) -> bool:
+        """Whether there is a reference."""
+        return bool(np.isfinite(self.reference).any())
+
+
+def view(estimate: Estimate, alignment: Alignment | None = "origin") -> View:
+    """An estimate in the frame of its reference; without an `alignment` the reference is moved so
+    that it starts as the estimate does."""
+    if alignment is None:
+        seen = with_the_reference_in_its_frame(estimate)
+    else:
+        seen = in_the_references_frame(estimate, alignment)
+    rows = len(seen.trajectory.time)
+
+    def whole(values: np.ndarray | None, *shape: int) -> np.ndarray:
+        return np.full((rows, *shape), np.nan) if values is None else values
+
+    return View(
+        seen.name,
+        seen.trajectory.time - seen.trajectory.time[0],
+        seen.trajectory.position,
+        seen.reference.position,
+        whole(seen.position_covariance, 3, 3),
+        whole(seen.diagnostics.get("gate"), 3),
+        whole(seen.diagnostics.get("scale"), 3),
+        whole(seen.displacement_std, 3),
+        whole(seen.nis),
+        whole(seen.accepted),
+    )
+
+
+class Ellipses(NamedTuple):
+    """Contours of horizontal covariances at `SIGMAS`, one for each row; NaN where one is not
+    finite."""
+
+    major: Float[np.ndarray, "n"]
+    """Semi-axis, m."""
+    minor: Float[np.ndarray, "n"]
+    """Semi-axis, m."""
+    angle: Float[np.ndarray, "n"]
+    """Of the major axis, from x towards y, rad."""
+
+
+def ellipses(covariance: Float[np.ndarray, "n 3 3"]) -> Ellipses:
+    """The contours of the horizontal parts of covariances of positions, m²."""
+    horizontal = covariance[:, :2, :2]
+    known = finite_rows(horizontal.reshape(-1, 4))
+    variance, axes = np.linalg.eigh(np.where(known[:, None, None], horizontal, np.eye(2)))
+    minor, major = SIGMAS * np.sqrt(np.maximum(variance, 0.0)).T
+    angle = np.arctan2(axes[:, 1, 1], axes[:, 0, 1])
+    return Ellipses(*(np.where(known, part, np.nan) for part in (major, minor, angle)))
+
+
+def speed(position: Float[np.ndarray, "n 3"], step: float) -> Float[np.ndarray, "n"]:
+    """Horizontal speed, m/s, as a mean over the second around each row."""
+    apart = max(1, round(1.0 / step))
+    found = np.full(len(position), np.nan)
+    if len(position) > apart:
+        moved = np.linalg.norm((position[apart:] - position[:-apart])[:, :2], axis=1)
+        found[apart // 2 :][: len(moved)] = moved / (apart * step)
+    return found
 
 
 # One sequence
 # --------------------------------------------------------------------------------------------------
 
 
-def trajectory(
-    estimate: Estimate,
-    ate: float | None = None,
-    ate_2d: float | None = None,
-    alignment: Alignment = "origin",
-) -> Figure:
-    """Plan view of the estimate over the reference, both axes to the same scale."""
-    figure = Figure(figsize=(6.4, 6.4), layout="constrained")
-    axes = figure.add_subplot()
-    path = in_the_references_frame(estimate, alignment).trajectory.position
-    reference = estimate.reference.position
-    axes.plot(reference[:, 0], reference[:, 1], color=REFERENCE, lw=1.6, label="reference")
-    axes.plot(path[:, 0], path[:, 1], color=BLUE, lw=1.4, label="estimate")
-    for track, colour in ((reference, REFERENCE), (path, BLUE)):
-        good = track[np.isfinite(track).all(1)]
+def sequence(seen: View, title: str = "") -> Figure:
+    """Map on the left; on the right, over time, the errors with the filter's 3σ, the speed, and the
+    gate of the network or else which displacements the filter used."""
+    strips: list[Callable[[Axes, View], None]] = [_draw_speed]
+    if seen.known or np.isfinite(seen.covariance).any():
+        strips = [_draw_error, functools.partial(_draw_error, vertical=True), *strips]
+    if np.isfinite(seen.gate).any():
+        strips.append(_draw_gate)
+    elif np.isfinite(seen.accepted).any():
+        strips.append(_draw_accepted)
+    figure = Figure(figsize=(12.6, 6.8), layout="constrained")
+    grid = figure.add_gridspec(len(strips), 2, width_ratios=(1.1, 1.0))
+    _draw_map(figure.add_subplot(grid[:, 0]), seen)
+    still = metrics.standing(seen.reference, seen.step)
+    for row, draw in enumerate(strips):
+        axes = figure.add_subplot(grid[row, 1])
+        _shade(axes, seen.time, still)
+        draw(axes, seen)
+        axes.set_xlim(seen.time[0], max(seen.time[-1], seen.time[0] + 1e-3))
+        axes.tick_params(labelbottom=draw is strips[-1])
+        # Beside the strip, where it hides nothing.
+        axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize=9, frameon=False)
+        finish(axes)
+    figure.axes[-1].set_xlabel("time (s)")
+    figure.suptitle(title or shown_name(seen.name), fontsize=11)
+    return figure
+
+
+def _draw_map(axes: Axes, seen: View) -> None:
+    """Plan view, both axes to the same scale."""
+    if seen.known:
+        axes.plot(*seen.reference[:, :2].T, color=REFERENCE, lw=1.6, label="reference")
+    axes.plot(*seen.position[:, :2].T, color=BLUE, lw=1.4, label="estimate")
+    shapes = ellipses(seen.covariance)
+    there = np.flatnonzero(np.isfinite(shapes.major) & finite_rows(seen.position))
+    if len(there):
+        for row in there[np.linspace(0, len(there) - 1, ELLIPSES).astype(int)]:
+            size, angle = (2 * shapes.major[row], 2 * shapes.minor[row]), shapes.angle[row]
+            shape = Ellipse(tuple(seen.position[row, :2]), *size, angle=float(np.degrees(angle)))
+            shape.set(facecolor=BLUE, edgecolor=BLUE, alpha=0.13)
+            axes.add_patch(shape)
+        axes.plot([], [], color=BLUE, lw=6, alpha=0.2, label="3σ")
+    for path, colour in ((seen.reference, REFERENCE), (seen.position, BLUE)):
+        good = path[finite_rows(path)]
         if len(good):
             axes.plot(*good[0, :2], color=colour, zorder=4, **START)
             axes.plot(*good[-1, :2], color=colour, zorder=4, **END)
@@ -95,112 +205,80 @@ def trajectory(
     axes.margins(0.08)
     axes.set_xlabel("x (m)")
     axes.set_ylabel("y (m)")
-    errors = [
-        f"ATE {ate:.2f} m" if ate is not None else "",
-        f"{ate_2d:.2f} m in 2-D" if ate_2d is not None else "",
-    ]
-    lines = [shown_name(estimate.name), ", ".join(filter(None, errors))]
-    axes.set_title("\n".join(filter(None, lines)), fontsize=11)
     axes.legend(loc="best", ncols=2, fontsize=9, framealpha=0.9)
     finish(axes)
-    return figure
 
 
-def position_error(estimate: Estimate) -> Figure:
-    """Position error over time on each axis, start aligned, with the filter's ±3σ where there is a
-    filter."""
-    figure = Figure(figsize=(8.4, 6.0), layout="constrained")
-    panels = figure.subplots(3, 1, sharex=True)
-    time = estimate.trajectory.time - estimate.trajectory.time[0]
-    error = _error_in_filter_frame(estimate)
-    still = metrics.standing(estimate.reference.position, float(np.median(np.diff(time))))
-    for k, (panel, (name, colour)) in enumerate(zip(panels, AXES.items(), strict=True)):
-        _shade(panel, time, still)
-        if estimate.std is not None:
-            bound = 3 * estimate.std[:, 6 + k]
-            panel.fill_between(time, -bound, bound, color=colour, alpha=0.16, lw=0, label="±3σ")
-        panel.plot(time, error[:, k], color=colour, lw=1.2, label="error")
-        panel.axhline(0, color=REFERENCE, lw=0.6)
-        panel.set_ylabel(f"{name} (m)")
-    panels[0].set_title(f"{shown_name(estimate.name)}: position error", fontsize=11)
-    _finish_over_time(panels, time)
-    return figure
+def _draw_error(axes: Axes, seen: View, vertical: bool = False) -> None:
+    """Of the position, with the filter's 3σ behind it; without a reference the 3σ alone."""
+    bound, colour, name = ellipses(seen.covariance).major, BLUE, "horizontal"
+    error = np.linalg.norm((seen.position - seen.reference)[:, :2], axis=1)
+    if vertical:
+        bound = SIGMAS * np.sqrt(np.maximum(seen.covariance[:, 2, 2], 0.0))
+        error, colour, name = (seen.position - seen.reference)[:, 2], GREEN, "vertical"
+    if np.isfinite(bound).any():
+        low = -bound if vertical else np.zeros_like(bound)
+        axes.fill_between(seen.time, low, bound, color=colour, alpha=0.16, lw=0, label="3σ")
+    if seen.known:
+        axes.plot(seen.time, error, color=colour, lw=1.2, label="error")
+    axes.axhline(0, color=REFERENCE, lw=0.6)
+    axes.set_ylabel(f"{name}\n{'error' if seen.known else '3σ'} (m)")
 
 
-def displacement(estimate: Estimate, window_seconds: float) -> Figure:
-    """What the network predicts, at the middle of each window: speed, displacement and gate; grey
-    where the reference stands still."""
-    assert estimate.displacement is not None
-    gate = estimate.diagnostics.get("gate")
-    rows, height = (2, 5.6) if gate is None else (3, 7.6)
-    figure = Figure(figsize=(8.4, height), layout="constrained")
-    panels = figure.subplots(rows, 1, sharex=True)
-    time = estimate.trajectory.time - estimate.trajectory.time[0]
-    step = float(np.median(np.diff(time)))
-    still = metrics.standing(estimate.reference.position, step)
-    for panel in panels:
-        _shade(panel, time, still)
-    middle = time - window_seconds / 2
-    truth = _true_displacement(estimate, round(window_seconds / step))
-    _draw_speed(panels[0], middle, truth, estimate.displacement, window_seconds)
-    title = f"{shown_name(estimate.name)}: displacement of the window, at its middle"
-    panels[0].set_title(title, fontsize=11)
-    _draw_displacement(panels[1], middle, truth, estimate.displacement)
-    if gate is not None:
-        _draw_gate(panels[2], middle, gate)
-    _finish_over_time(panels, time)
-    return figure
-
-
-def _draw_speed(
-    axes: Axes,
-    time: Float[np.ndarray, "k"],
-    truth: Float[np.ndarray, "k 3"],
-    predicted: Float[np.ndarray, "k 3"],
-    seconds: float,
-) -> None:
-    true_speed = np.linalg.norm(truth, axis=1) / seconds
-    axes.plot(time, true_speed, color=REFERENCE, lw=1.4, label="reference")
-    speed = np.linalg.norm(predicted, axis=1) / seconds
-    axes.plot(time, speed, color=BLUE, lw=1.1, label="network")
-    axes.set_ylabel("speed (m/s)")
+def _draw_speed(axes: Axes, seen: View) -> None:
+    if seen.known:
+        true = speed(seen.reference, seen.step)
+        axes.plot(seen.time, true, color=REFERENCE, lw=1.4, label="reference")
+    axes.plot(seen.time, speed(seen.position, seen.step), color=BLUE, lw=1.1, label="estimate")
+    axes.set_ylabel("horizontal\nspeed (m/s)")
     axes.set_ylim(bottom=0)
 
 
-def _draw_displacement(
-    axes: Axes,
-    time: Float[np.ndarray, "k"],
-    truth: Float[np.ndarray, "k 3"],
-    predicted: Float[np.ndarray, "k 3"],
-) -> None:
+def _draw_gate(axes: Axes, seen: View) -> None:
     for k, (name, colour) in enumerate(AXES.items()):
-        label = f"{name}, reference"
-        axes.plot(time, truth[:, k], color=colour, lw=3.0, alpha=0.35, label=label)
-    for k, (name, colour) in enumerate(AXES.items()):
-        axes.plot(time, predicted[:, k], color=colour, lw=1.0, label=name)
-    axes.set_ylabel("displacement (m)")
-
-
-def _draw_gate(axes: Axes, time: Float[np.ndarray, "k"], gate: Float[np.ndarray, "k 3"]) -> None:
-    for k, (name, colour) in enumerate(AXES.items()):
-        axes.plot(time, gate[:, k], color=colour, lw=1.1, label=name)
+        axes.plot(seen.time, seen.gate[:, k], color=colour, lw=1.1, label=name)
     axes.axhline(0, color=REFERENCE, lw=0.6)
-    lowest = -1.05 if np.nanmin(gate) < 0 else -0.05
-    axes.set_ylim(lowest, 1.05)
+    axes.set_ylim(-1.05 if np.nanmin(seen.gate) < 0 else -0.05, 1.05)
     axes.set_ylabel("gate γ (–)")
+
+
+def _draw_accepted(axes: Axes, seen: View) -> None:
+    axes.plot(seen.time, seen.accepted, color=BLUE, lw=1.0, label="used")
+    axes.set_ylim(-0.05, 1.05)
+    axes.set_ylabel("displacement")
 
 
 # A set of sequences
 # --------------------------------------------------------------------------------------------------
 
 
-def error_cdf(estimates: list[Estimate], report: Report) -> Figure:
+def error_cdf(views: list[View], report: Report) -> Figure:
     """Distribution of errors over the set: of every sample's horizontal position, and of the
     sequences' ATE beside the reference rows."""
     figure = Figure(figsize=(9.6, 4.4), layout="constrained")
     left, right = figure.subplots(1, 2, sharey=True)
-    sequences = _draw_sample_errors(left, estimates, report.settings["alignment"])
-    _draw_sequence_errors(right, report)
+    known = [seen for seen in views if seen.known]
+    errors = [
+        np.linalg.norm((seen.position - seen.reference)[finite_rows(seen.reference), :2], axis=1)
+        for seen in known
+    ]
+    for error in errors:
+        _step(left, error, color=BLUE, lw=0.7, alpha=0.25)
+    if errors:
+        _step(left, np.concatenate(errors), color=BLUE, lw=2.2, label="all samples")
+    left.plot([], [], color=BLUE, lw=0.7, alpha=0.5, label="one sequence")
+    left.set_xlabel("horizontal position error (m)")
+    left.set_ylabel("share with at most this error")
+    left.yaxis.set_major_formatter(PercentFormatter(1.0))
+    scored = {"this network": report.scores, **report.reference_rows}
+    styles = ((BLUE, "-"), (VERMILION, "--"), (GREEN, "-."))
+    for (name, scores), (colour, style) in zip(scored.items(), styles, strict=False):
+        found = (measures.values.get("ate_2d") for measures in scores.values())
+        values = np.array([value for value in found if value is not None])
+        if len(values):
+            label = f"{name.replace('_', ' ')} (median {np.median(values):.2f} m)"
+            _step(right, values, color=colour, lw=1.8, ls=style, label=label)
+    right.set_xlabel("ATE in 2-D of a sequence (m)")
     for axes in (left, right):
         axes.set_ylim(0, 1.02)
         axes.set_xlim(left=0)
@@ -208,39 +286,8 @@ def error_cdf(estimates: list[Estimate], report: Report) -> Figure:
         finish(axes)
     settings = report.settings
     subject = f"{settings['dataset']} {settings['split']}: {settings['estimator']}"
-    figure.suptitle(f"{subject}, {sequences} sequences", fontsize=11)
+    figure.suptitle(f"{subject}, {len(known)} sequences", fontsize=11)
     return figure
-
-
-def _draw_sample_errors(axes: Axes, estimates: list[Estimate], alignment: Alignment) -> int:
-    """Returns the number of sequences that have a reference."""
-    samples = []
-    for e in estimates:
-        path = in_the_references_frame(e, alignment).trajectory.position
-        error = np.linalg.norm((path - e.reference.position)[:, :2], axis=1)
-        error = error[finite_rows(e.reference.position)]
-        if len(error):
-            _step(axes, error, color=BLUE, lw=0.7, alpha=0.25)
-            samples.append(error)
-    if samples:
-        _step(axes, np.concatenate(samples), color=BLUE, lw=2.2, label="all samples")
-    axes.plot([], [], color=BLUE, lw=0.7, alpha=0.5, label="one sequence")
-    axes.set_xlabel("horizontal position error (m)")
-    axes.set_ylabel("share with at most this error")
-    axes.yaxis.set_major_formatter(PercentFormatter(1.0))
-    return len(samples)
-
-
-def _draw_sequence_errors(axes: Axes, report: Report) -> None:
-    scored = {"this network": report.scores, **report.reference_rows}
-    styles = ((BLUE, "-"), (VERMILION, "--"), (GREEN, "-."))
-    for (name, scores), (colour, style) in zip(scored.items(), styles, strict=False):
-        errors = (m.values.get("ate_2d") for m in scores.sequences.values())
-        values = np.array([error for error in errors if error is not None])
-        if len(values):
-            label = f"{name.replace('_', ' ')} (median {np.median(values):.2f} m)"
-            _step(axes, values, color=colour, lw=1.8, ls=style, label=label)
-    axes.set_xlabel("ATE in 2-D of a sequence (m)")
 
 
 def _step(axes: Axes, values: Float[np.ndarray, "k"], **style: Any) -> None:
@@ -251,47 +298,94 @@ def _step(axes: Axes, values: Float[np.ndarray, "k"], **style: Any) -> None:
     axes.step(np.concatenate([[0.0], x]), share, where="post", **style)
 
 
+def paired(
+    rows: Mapping[str, Sequence[Scores]], metric: str, groups: Mapping[str, str], heading: str
+) -> Figure:
+    """A metric of every sequence with every row: the mean over seeds a dot, each seed a fainter
+    stroke, rows one below the other. A line per sequence, sorted by the first row; beside its name
+    the person or session it belongs to, and a mark where a row diverged, which then has no dot."""
+    lost = [statistics.lost(seeds) for seeds in rows.values()]
+    tables = [statistics.values(seeds, metric) for seeds in rows.values()]
+    first = {name: float(np.mean(own)) for name, own in tables[0].items()}
+    names = sorted(
+        dict.fromkeys(name for table in tables for name in table),
+        key=lambda name: (name in first, first.get(name, 0.0), name),
+    )
+    height = 0.24 + 0.08 * len(rows)
+    figure = Figure(figsize=(8.0, 2.0 + height * len(names)), layout="constrained")
+    axes, legend = figure.add_subplot(), {}
+    palette = (GREY, *COLOURS)
+    for number, (label, table, diverged) in enumerate(zip(rows, tables, lost, strict=True)):
+        colour = palette[number % len(palette)]
+        marker = MARKERS[number // len(palette) % len(MARKERS)]
+        shift = 0.6 * (0.5 - number / max(len(rows) - 1, 1))  # equal values would hide each other
+        places = [place + shift for place, name in enumerate(names) if name in table]
+        values = [table[n] * (np.nan if n in diverged else 1.0) for n in names if n in table]
+        means = [np.mean(own) if np.isfinite(own).all() else np.nan for own in values]
+        (dots,) = axes.plot(means, places, marker, ms=6, color=colour, zorder=3)
+        for place, own in zip(places, values, strict=True):
+            if len(own) > 1:
+                axes.plot(own, [place] * len(own), "|", ms=8, color=colour, alpha=0.6)
+        # Matplotlib leaves out what begins with an underscore: a space of no width goes before it.
+        text = shown_name(label, 100)
+        legend["\u200b" + text if text.startswith("_") else text] = dots
+    marked = {name for diverged in lost for name in diverged}
+    ticks = [f"{shown_name(name, 40)}  ({shown_name(groups[name], 20)})" for name in names]
+    ticks = [
+        tick + (" †" if name in marked else "") for tick, name in zip(ticks, names, strict=True)
+    ]
+    axes.set_yticks(range(len(names)), ticks, fontsize=8)
+    axes.set_xlabel(heading)
+    if marked & {*names}:
+        legend["† an estimate diverged"] = Line2D([], [], ls="")
+    columns = 2 if max(map(len, legend)) < 40 else 1
+    style = {"fontsize": 8, "frameon": False, "loc": "outside lower center", "ncols": columns}
+    figure.legend(legend.values(), legend.keys(), **style)
+    finish(axes)
+    return figure
+
+
+def save_all(
+    folder: Path, views: list[View], report: Report, progress: OnShare = no_progress
+) -> None:
+    """Every picture as a PNG in `folder`: one for each sequence, and `error_cdf`."""
+    folder.mkdir(parents=True, exist_ok=True)
+    stems = file_names([seen.name for seen in views])
+    for done, (stem, seen) in enumerate(zip(stems, views, strict=True)):
+        progress(done / len(views))
+        values = report.scores[seen.name].values
+        errors = [
+            f"{heading} {values[name]:.2f} m"
+            for name, heading in (("ate", "ATE"), ("ate_2d", "in 2-D"))
+            if values.get(name) is not None
+        ]
+        title = ": ".join(filter(None, (shown_name(seen.name), ", ".join(errors))))
+        save(folder / f"{stem}.png", sequence(seen, title))
+    if any(seen.known for seen in views):
+        save(folder / "error_cdf.png", error_cdf(views, report))
+
+
 # Parts of a picture
 # --------------------------------------------------------------------------------------------------
 
 
-def finish(axes: Axes, grid: str = GRID) -> None:
+def save(path: Path, figure: Figure) -> None:
+    """Write one figure as a PNG, whole or not at all."""
+    FigureCanvasAgg(figure)
+    with replacing(path) as temporary:
+        figure.savefig(temporary, dpi=DOTS_PER_INCH)
+
+
+def finish(axes: Axes) -> None:
     """Grid behind the lines, no frame above and to the right."""
-    axes.grid(True, color=grid, lw=0.6)
+    axes.grid(True, color=GRID, lw=0.6)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
 
 
-def _finish_over_time(panels: np.ndarray, time: Float[np.ndarray, "k"]) -> None:
-    """Legends beside the panels, where they hide nothing, and the common time axis."""
-    for panel in panels:
-        panel.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize=9, frameon=False)
-        finish(panel)
-    panels[-1].set_xlabel("time (s)")
-    panels[-1].set_xlim(time[0], time[-1])
-
-
-def _shade(axes: Axes, time: Float[np.ndarray, "k"], still: Bool[np.ndarray, "k"]) -> None:
+def _shade(axes: Axes, time: Float[np.ndarray, "n"], still: Bool[np.ndarray, "n"]) -> None:
     """Grey where the reference stands still; once in the legend."""
     for number, (start, stop) in enumerate(spans(still)):
         begin, end = float(time[start]), float(time[stop - 1])
         label = "standing still" if not number else None
         axes.axvspan(begin, end, color=STANDING, lw=0, zorder=0, label=label)
-
-
-def _error_in_filter_frame(estimate: Estimate) -> Float[np.ndarray, "k 3"]:
-    """Position error of the start-aligned estimate, m, in the frame of the filter's covariance."""
-    aligned = in_the_references_frame(estimate).trajectory
-    start, aligned_start = (path.orientation[:1] for path in (estimate.trajectory, aligned))
-    turn = rotation_z(relative_yaw(start, aligned_start)[0])
-    return (aligned.position - estimate.reference.position) @ turn.T
-
-
-def _true_displacement(estimate: Estimate, rows: int) -> Float[np.ndarray, "k 3"]:
-    """Of the reference over the window that ends at each row, in the yaw frame of its start, m."""
-    reference = estimate.reference
-    found = np.full_like(reference.position, np.nan)
-    if rows < len(found):
-        start = np.arange(len(found) - rows)
-        found[rows:] = true_displacement(reference.orientation, reference.position, start, rows)
-    return found

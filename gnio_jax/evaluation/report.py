@@ -1,75 +1,133 @@
-"""The figures of an evaluation in files: JSON and CSV for programs, TUM trajectories for evo."""
+"""The results of an evaluation as a folder: what is written, and how it is read back.
+
+metrics.json      settings, every metric of every sequence, means, intervals, reference rows
+metrics.csv       a line per sequence, a column per metric
+trajectories/     estimates in TUM format, for evo
+references/       references in TUM format
+plots/            a picture per sequence, and the distribution of the errors
+report.html       a page with map, curves and a time slider
+"""
 
 from __future__ import annotations
 
-import csv
 import json
 import math
-import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from gnio_jax.evaluation.curves_file import write_curves
+from gnio_jax import config as configuration
+from gnio_jax.config import TrainConfig
+from gnio_jax.errors import InputError
+from gnio_jax.evaluation import statistics
 from gnio_jax.evaluation.estimators.result import Estimate
-from gnio_jax.evaluation.scores import Scores
-from gnio_jax.evaluation.trajectory import write_tum
+from gnio_jax.evaluation.metrics import Measures
+from gnio_jax.evaluation.setup import OnShare, no_progress
+from gnio_jax.evaluation.statistics import Scores, Summary
+from gnio_jax.evaluation.trajectory import Trajectory, read_tum, write_tum
+from gnio_jax.files import file_stem, replacing_folder, write_csv
 
 DEFINITIONS = 3
 """What the figures of metrics.json mean, in its `settings`. Raise it with every change after which
-a file's figures cannot stand beside newer ones: another definition of a metric, of who counts as
-diverged or of a mean, or something in the file that tables need. Those of 1 have no groups, and
-yaw errors that are differences of Euler yaws; those of 2 have a drift over the trusted part of the
-path."""
-INFINITE = (
-    "the estimate is not finite",
-    "the error is too large",
-    "the filter's covariance is not positive definite",
-)
-"""How the reasons of infinite metrics begin."""
+a file's figures cannot stand beside newer ones: another definition of a metric, of what counts as
+diverged or of a mean, or something in the file that tables need."""
+PAGE = "report.html"
+REMEDY = "evaluate the run anew with gnio evaluate"
+BESIDE = ("infinite", "reasons", "diverged", "group", "notes")
+"""What metrics.json says of a sequence besides its metrics."""
 
 
 class Report(NamedTuple):
-    """Everything the files say."""
+    """Everything that metrics.json says, before it is written and after it was read."""
 
     settings: dict[str, Any]
-    """What changes the meaning of the figures, for the reader of the table and of the JSON."""
-    scores: Scores
-    reference_rows: dict[str, Scores]
-    """`never_moves` and `perfect_displacements`."""
+    """What changes the meaning of the figures."""
+    scores: dict[str, Measures]
+    """By sequence."""
+    reference_rows: dict[str, dict[str, Measures]]
+    """`never_moves` and `perfect_displacements`, by sequence."""
+    groups: dict[str, str]
+    """Sequence → person or session."""
     notes: dict[str, list[str]]
-    """Sequence -> what a reader should know of its start and of its filter."""
+    """Sequence → what a reader should know of its start and of its filter."""
     left_out: dict[str, str]
-    """Sequence -> why it has no figures."""
+    """Sequence → why it has no figures."""
+
+    @property
+    def diverged(self) -> list[str]:
+        """Sequences whose estimate diverged."""
+        return [name for name, own in self.scores.items() if own.diverged]
+
+    def summary(self, row: str | None = None) -> dict[str, Summary]:
+        """Each metric over the sequences, of this evaluation or of one of its reference rows."""
+        scores = self.scores if row is None else self.reference_rows[row]
+        metrics = dict.fromkeys(metric for own in scores.values() for metric in own.values)
+        return {name: statistics.summarise([scores], name, self.groups) for name in metrics}
 
 
-def write(folder: Path, report: Report, estimates: list[Estimate]) -> None:
-    """metrics.json, metrics.csv, trajectories/ and references/ (TUM format) and curves/ into an
-    empty folder (see `files.replacing_folder`)."""
-    text = json.dumps(as_json(report), indent=2, allow_nan=False, ensure_ascii=False)
-    (folder / "metrics.json").write_text(text + "\n", encoding="utf-8")
-    _write_csv(folder / "metrics.csv", report.scores)
-    for kind in ("trajectories", "references", "curves"):
-        (folder / kind).mkdir()
-    for stem, e in zip(file_names([e.name for e in estimates]), estimates, strict=True):
-        write_tum(folder / "trajectories" / f"{stem}.txt", e.trajectory)
-        write_curves(folder / "curves" / f"{stem}.npz", e)
-        if np.isfinite(e.reference.position).any():
-            write_tum(folder / "references" / f"{stem}.txt", e.reference)
+# Written
+# --------------------------------------------------------------------------------------------------
 
 
-def _write_csv(path: Path, scores: Scores) -> None:
-    """A line per sequence, a column per metric; empty where it has no value."""
-    measured = scores.sequences
-    columns = list(dict.fromkeys(metric for m in measured.values() for metric in m.values))
-    with open(path, "w", newline="", encoding="utf-8") as file:
-        lines = csv.writer(file)
-        lines.writerow(["sequence", *columns])
-        for name, m in measured.items():
-            values = (m.values.get(column) for column in columns)
-            lines.writerow([name, *("" if value is None else repr(value) for value in values)])
+def write(
+    folder: Path,
+    report: Report,
+    estimates: list[Estimate],
+    trained: TrainConfig,
+    command: str = "",
+    plots: bool = True,
+    progress: OnShare = no_progress,
+) -> None:
+    """Write the folder of an evaluation, whole or not at all.
+
+    Pictures and page are made with `plots`. Those that an earlier evaluation left are made anew in
+    any case: they are neither lost nor of other figures. `trained` is the configuration of the run
+    and `command` how this was called, for the page.
+    """
+    drawn = plots or (folder / PAGE).exists()
+    with replacing_folder(folder) as new:
+        text = json.dumps(as_json(report), indent=2, allow_nan=False, ensure_ascii=False)
+        (new / "metrics.json").write_text(text + "\n", encoding="utf-8")
+        columns = list(dict.fromkeys(x for own in report.scores.values() for x in own.values))
+        rows = ([name, *map(own.values.get, columns)] for name, own in report.scores.items())
+        write_csv(new / "metrics.csv", [["sequence", *columns], *rows])
+        for kind in ("trajectories", "references"):
+            (new / kind).mkdir()
+        for stem, each in zip(file_names(list(report.scores)), estimates, strict=True):
+            write_tum(new / "trajectories" / f"{stem}.txt", each.trajectory)
+            if each.reference.known.any():
+                write_tum(new / "references" / f"{stem}.txt", each.reference)
+        if drawn:
+            # Bokeh and Matplotlib take seconds to import.
+            from gnio_jax.evaluation import page
+            from gnio_jax.evaluation import plots as pictures
+
+            alignment = report.settings["alignment"]
+            views = [pictures.view(each, alignment) for each in estimates]
+            pictures.save_all(new / "plots", views, report, progress)
+            run = page.of_report(report, views, command, configuration.text(trained))
+            title = f"{report.settings['dataset']} {report.settings['split']}: {run.name}"
+            page.write(new / PAGE, title, [run, *page.beside(folder, report.settings)])
+
+
+def as_json(report: Report) -> dict[str, Any]:
+    """The report as plain values. JSON has no infinity: what is not finite is null, and `infinite`
+    names those metrics of a sequence that are infinite."""
+    sequences = _sequences(report.scores)
+    for name, sequence in sequences.items():
+        sequence |= {"group": report.groups[name], "notes": report.notes.get(name, [])}
+    return {
+        "settings": report.settings,
+        "sequences": sequences,
+        **_summaries(report.summary()),
+        "reference_rows": {
+            row: {"sequences": _sequences(scores), **_summaries(report.summary(row))}
+            for row, scores in report.reference_rows.items()
+        },
+        "left_out": report.left_out,
+    }
 
 
 def file_names(names: list[str]) -> list[str]:
@@ -77,95 +135,126 @@ def file_names(names: list[str]) -> list[str]:
     `_`."""
     stems: list[str] = []
     for name in names:
-        stem = re.sub(r"[^\w.=+-]+", "_", name).strip("._") or "sequence"
+        stem = file_stem(name)
         while stem in stems:
             stem += "_"
         stems.append(stem)
     return stems
 
 
-# metrics.json
-# --------------------------------------------------------------------------------------------------
-
-
-def as_json(report: Report) -> dict[str, Any]:
-    """The whole report as plain values; a metric without a finite value is None, with a reason.
-
-    `mean` is over the sequences that did not diverge; its `diverged` counts those that did, the
-    report's `diverged` by metric.
-    """
-    sequences = _sequences(report.scores)
-    for name, group in report.scores.groups.items():
-        sequences[name]["group"] = group
-    for name, notes in report.notes.items():
-        sequences[name]["notes"] = notes
-    return {
-        "settings": report.settings,
-        "sequences": sequences,
-        **_summary(report.scores),
-        "undefined": _without_mean(report.scores),
-        "reference_rows": {
-            label: {"sequences": _sequences(scores), **_summary(scores)}
-            for label, scores in report.reference_rows.items()
-        },
-        "left_out": report.left_out,
-    }
-
-
-def read_metric(sequence: Mapping[str, Any], metric: str) -> float | None:
-    """A metric of one of the `sequences` of metrics.json, as `Measures` has it: None where it is
-    not defined, infinite where its reason says so."""
-    value = sequence.get(metric)
-    reason = sequence.get("undefined", {}).get(metric, "")
-    return math.inf if value is None and reason.startswith(INFINITE) else value
-
-
-def diverged(values: Mapping[str, float | None]) -> bool:
-    """Whether the estimate of a sequence diverged: its `ate` is infinite or, where there is none
-    for want of a reference, anything else is."""
-    error = values.get("ate")
-    return math.inf in values.values() if error is None else math.isinf(error)
-
-
-def definitions(figures: Mapping[str, Any]) -> int:
-    """`DEFINITIONS` of a metrics.json. In files that do not say it, those of 2 are the ones with
-    groups."""
-    grouped = all("group" in sequence for sequence in figures["sequences"].values())
-    return figures["settings"].get("definitions", 2 if grouped else 1)
-
-
 def _sequences(scores: Scores) -> dict[str, dict[str, Any]]:
     return {
-        name: {**_finite(m.values), **({"undefined": m.reasons} if m.reasons else {})}
-        for name, m in scores.sequences.items()
+        name: {
+            **_finite(own.values),
+            "infinite": [metric for metric, value in own.values.items() if value == math.inf],
+            "reasons": own.reasons,
+            "diverged": own.diverged,
+        }
+        for name, own in scores.items()
     }
 
 
-def _summary(scores: Scores) -> dict[str, Any]:
-    summary = scores.summary
-    interval = {
-        name: None if value is None else list(value) for name, value in summary.interval.items()
-    }
+def _summaries(found: Mapping[str, Summary]) -> dict[str, dict[str, Any]]:
+    """Each statistic of all metrics."""
+    names = {"interval": "interval", "n": "sequences", "groups": "groups", "diverged": "diverged"}
     return {
-        "mean": {**_finite(summary.mean), "diverged": len(scores.diverged)},
-        "median": _finite(summary.median),
-        "interval": interval,
-        "groups": summary.groups,
-        "n": summary.count,
-        "diverged": summary.diverged,
+        "mean": _finite({metric: of.mean for metric, of in found.items()}),
+        "median": _finite({metric: of.median for metric, of in found.items()}),
+        **{
+            key: {metric: getattr(of, field) for metric, of in found.items()}
+            for key, field in names.items()
+        },
     }
-
-
-def _without_mean(scores: Scores) -> dict[str, str]:
-    """Metric -> reason, for those without a finite mean."""
-    found = {}
-    for name, value in _finite(scores.summary.mean).items():
-        if value is None:
-            reasons = (m.reasons.get(name) for m in scores.sequences.values())
-            found[name] = next(filter(None, reasons), "no estimate that did not diverge")
-    return found
 
 
 def _finite(values: Mapping[str, float | None]) -> dict[str, float | None]:
-    """JSON has no infinity."""
     return {name: None if value == math.inf else value for name, value in values.items()}
+
+
+# Read back
+# --------------------------------------------------------------------------------------------------
+
+
+def read(folder: Path) -> Report:
+    """The figures of an evaluation, as its metrics.json has them.
+
+    Raises `InputError` if the folder holds none, they are damaged, or they were written by a
+    version whose figures mean something else.
+    """
+    path = folder / "metrics.json"
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+        settings, sequences = found["settings"], found["sequences"]
+        if settings.get("definitions") != DEFINITIONS:
+            problem = "was written by another version, whose figures mean something else"
+            raise InputError(path, problem, REMEDY)
+        names = ("dataset", "split", "estimator", "alignment")
+        if not sequences or not all(isinstance(settings[name], str) for name in names):
+            raise ValueError
+        return Report(
+            settings,
+            {name: _measures(own) for name, own in sequences.items()},
+            {
+                row: {name: _measures(own) for name, own in of["sequences"].items()}
+                for row, of in found["reference_rows"].items()
+            },
+            {name: _text(own["group"]) for name, own in sequences.items()},
+            {name: [*map(_text, own["notes"])] for name, own in sequences.items() if own["notes"]},
+            {name: _text(reason) for name, reason in found["left_out"].items()},
+        )
+    except InputError:
+        raise
+    except (FileNotFoundError, NotADirectoryError):
+        remedy = "name a run, or a folder below its eval/"
+        raise InputError(folder, "is neither a run nor an evaluation", remedy) from None
+    except (ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RecursionError):
+        raise InputError(path, "is not a metrics.json of an evaluation", REMEDY) from None
+
+
+def read_trajectories(folder: Path, names: list[str]) -> dict[str, tuple[Trajectory, Trajectory]]:
+    """Estimate and reference of each of an evaluation's sequences, at the estimate's stamps.
+
+    `names` are all of them, in the order of its metrics.json. A row that the reference does not
+    know is NaN. The estimate ends where it diverged.
+    """
+    found = {}
+    for name, stem in zip(names, file_names(names), strict=True):
+        path = read_tum(folder / "trajectories" / f"{stem}.txt")
+        rows = len(path.time)
+        reference = Trajectory(path.time, np.full((rows, 3), np.nan), np.full((rows, 4), np.nan))
+        file = folder / "references" / f"{stem}.txt"
+        if file.exists():
+            true = read_tum(file)
+            stamps = (np.round(each.time, 6) for each in (path, true))
+            _, here, there = np.intersect1d(*stamps, return_indices=True)
+            reference.position[here] = true.position[there]
+            reference.orientation[here] = true.orientation[there]
+        found[name] = path, reference
+    return found
+
+
+def _measures(sequence: Mapping[str, Any]) -> Measures:
+    """Raises `ValueError` and others for what `_sequences` does not write."""
+    values: dict[str, float | None] = {}
+    for name in sequence.keys() - set(BESIDE):
+        value = sequence[name]
+        if value is not None and not (type(value) in (int, float) and math.isfinite(value)):
+            raise ValueError
+        values[name] = value
+    for name in sequence["infinite"]:
+        if values[name] is not None:
+            raise ValueError
+        values[name] = math.inf
+    reasons = {name: _text(reason) for name, reason in sequence["reasons"].items()}
+    if not isinstance(sequence["diverged"], bool):
+        raise ValueError
+    # In the order of the file.
+    return Measures(
+        {name: values[name] for name in sequence if name in values}, reasons, sequence["diverged"]
+    )
+
+
+def _text(value: Any) -> str:
+    if not isinstance(value, str):
+        raise ValueError
+    return value

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import jax
+import numpy as np
 
 from gnio_jax import config as configuration
 from gnio_jax import data
@@ -29,10 +30,9 @@ from gnio_jax.evaluation.report import DEFINITIONS, Report, write
 from gnio_jax.evaluation.scores import score
 from gnio_jax.evaluation.setup import Setup, resolve
 from gnio_jax.evaluation.trajectory import Alignment
-from gnio_jax.files import replacing_folder
 from gnio_jax.parallel import is_first
+from gnio_jax.types import Sequence
 
-PAGE = "report.html"
 OnStage = Callable[[str, float], None]
 """Called with the stage and the share of it that is done."""
 
@@ -58,13 +58,6 @@ class Job(NamedTuple):
     setup: Setup
     dataset: str
     data_root: str | None
-
-
-class Drawn(NamedTuple):
-    """What pictures and page show besides the results."""
-
-    trained: TrainConfig
-    command: str
 
 
 def evaluate(
@@ -102,45 +95,25 @@ def evaluate(
         prepared, *how, lambda x: progress("estimating with perfect displacements", x)
     )
 
-    groups = {sequence.name: data.group(sequence) for sequence in sequences}
     report = Report(
-        _settings(config, job, prepared),
-        score(estimates, groups, config.alignment),
+        _settings(config, job, sequences, prepared),
+        score(estimates, config.alignment),
         {
-            "never_moves": score(never_moves(estimates), groups, config.alignment),
-            "perfect_displacements": score(ideal, groups, config.alignment),
+            "never_moves": score(never_moves(estimates), config.alignment),
+            "perfect_displacements": score(ideal, config.alignment),
         },
+        {each.sequence.name: str(data.group(each.sequence)) for each in prepared},
         {e.name: list(e.notes) for e in estimates if e.notes},
         left_out,
     )
 
     folder = job.workdir / "eval" / folder_name(config, job.dataset, trained)
     if is_first():
-        drawn = Drawn(trained, command) if config.plots else None
-        _write(folder, report, estimates, drawn, progress)
+        drawing = lambda x: progress("drawing", x)  # noqa: E731
+        write(folder, report, estimates, trained, command, config.plots, drawing)
         if config.rerun:
             _write_rerun(Path(config.rerun), estimates, prepared, config.alignment)
     return Evaluation(report, folder)
-
-
-def _write(
-    folder: Path,
-    report: Report,
-    estimates: list[Estimate],
-    drawn: Drawn | None,
-    progress: OnStage,
-) -> None:
-    """Leave the results in `folder`, with pictures and a page if `drawn`."""
-    with replacing_folder(folder) as new:
-        write(new, report, estimates)
-        if drawn is not None:
-            from gnio_jax.evaluation import plots  # Matplotlib takes a second to import
-
-            window = drawn.trained.data.window_seconds
-            plots.save_all(
-                new / "plots", estimates, report, window, lambda x: progress("drawing", x)
-            )
-            _write_page(new / PAGE, folder, report, estimates, drawn)
 
 
 def _write_rerun(
@@ -152,18 +125,6 @@ def _write_rerun(
         for estimate, each in zip(estimates, prepared, strict=True)
     ]
     rerun_file.write_rerun(path, logged)
-
-
-def _write_page(
-    path: Path, folder: Path, report: Report, estimates: list[Estimate], drawn: Drawn
-) -> None:
-    """The page of this evaluation and of those beside its `folder`."""
-    from gnio_jax.evaluation import html  # Bokeh takes a second to import
-
-    settings = configuration.text(drawn.trained)
-    entry = html.of_evaluation(report, estimates, drawn.command, settings)
-    title = f"{report.settings['dataset']} {report.settings['split']}: {entry.name}"
-    html.write_report(path, title, [entry, *html.beside(folder, report.settings)])
 
 
 def folder_name(config: EvaluateConfig, dataset: str, trained: TrainConfig) -> str:
@@ -252,13 +213,19 @@ def _load_run(
     return run.config, inference_network(run.model, run.variables), provenance
 
 
-def _settings(config: EvaluateConfig, job: Job, prepared: list[Prepared]) -> dict[str, Any]:
+def _settings(
+    config: EvaluateConfig, job: Job, sequences: list[Sequence], prepared: list[Prepared]
+) -> dict[str, Any]:
     """What changes the meaning of the figures."""
+    needs_root = data.get(job.dataset).needs_root
+    root = str(data.find_root(job.dataset, job.data_root).resolve()) if needs_root else None
     setup, windows = job.setup, job.trained.data
     compensated = {str(p.sequence.attributes.get("imu_compensated", "no")) for p in prepared}
     return {
         "dataset": job.dataset,
+        "data_root": root,
         "split": config.split,
+        "recordings": {each.name: round(float(np.ptp(each.time)), 3) for each in sequences},
         "estimator": setup.estimator,
         "coupling": setup.coupling if setup.estimator == "ekf" else None,
         "orientation_source": setup.orientation,

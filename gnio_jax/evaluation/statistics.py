@@ -1,20 +1,119 @@
-"""The interval of a mean over sequences, of which those of one person or session are not
-independent."""
+"""Means over sequences and seeds, their intervals, and differences paired by sequence.
+
+Sequences of one person or session are not independent: they form a group, and an interval treats
+the groups as what was drawn. An estimate that diverged leaves every mean and every difference, with
+all its metrics and all seeds, and is counted beside them.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
-from typing import Any
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 from scipy.special import stdtrit
 
+from gnio_jax.evaluation.metrics import Measures
+
+Scores = Mapping[str, Measures]
+"""Sequence → its metrics."""
+Interval = tuple[float, float]
+
+
+class Summary(NamedTuple):
+    """One metric over the sequences that have it with every seed."""
+
+    mean: float | None
+    """Over the sequences whose estimate diverged with no seed; None without one. Infinite where one
+    of them is (NEES, with a covariance that is not positive definite)."""
+    seeds: list[float]
+    """The same for each seed."""
+    median: float | None
+    """Over all sequences and seeds: of an error, infinite where half of them diverged."""
+    interval: Interval | None
+    """95 % interval of the mean."""
+    sequences: int
+    """In the mean."""
+    groups: int
+    """That the sequences of the mean belong to."""
+    diverged: int
+    """Estimates of `estimates` that diverged."""
+    estimates: int
+    """Sequences × seeds."""
+
+    @property
+    def std(self) -> float | None:
+        """Standard deviation over seeds; None for one seed, or without a finite mean."""
+        if len(self.seeds) < 2 or not np.isfinite(self.seeds).all():
+            return None
+        return float(np.std(self.seeds, ddof=1))
+
+
+class Difference(NamedTuple):
+    """A metric of one row minus that of another, over the sequences that both have with every seed,
+    finite, and with no seed diverged."""
+
+    mean: float | None
+    """Of the means over seeds. None without such a sequence, and where it is withheld."""
+    interval: Interval | None
+    """95 % interval of the mean."""
+    gain: float | None
+    """By how much the row's mean is smaller, %."""
+    better: int
+    """Sequences on which the row is nearer to the best value, as a mean over seeds."""
+    compared: int
+    sequences: int
+    """That either row has with any seed."""
+    groups: int
+    """That the compared sequences belong to."""
+    withheld: bool = False
+    """The row would be better, but a larger share of its estimates diverged: it is not better."""
+
+
+def values(seeds: Sequence[Scores], metric: str) -> dict[str, Float[np.ndarray, "seeds"]]:
+    """A metric of the sequences that have it with every seed."""
+    tables = [{name: own.values.get(metric) for name, own in scores.items()} for scores in seeds]
+    return {
+        name: np.array([table[name] for table in tables], float)
+        for name in tables[0]
+        if all(table.get(name) is not None for table in tables)
+    }
+
+
+def lost(seeds: Sequence[Scores]) -> dict[str, int]:
+    """Sequence → number of seeds with which its estimate diverged, where there are any."""
+    found: dict[str, int] = {}
+    for scores in seeds:
+        for name, own in scores.items():
+            if own.diverged:
+                found[name] = found.get(name, 0) + 1
+    return found
+
+
+def summarise(seeds: Sequence[Scores], metric: str, groups: Mapping[str, Any]) -> Summary:
+    """Mean, median and interval of a metric. Each sequence counts once."""
+    found, diverged = values(seeds, metric), lost(seeds)
+    every = np.concatenate([*found.values()]) if found else np.zeros(0)
+    kept = [name for name in found if name not in diverged]
+    rows = np.array([found[name] for name in kept]).reshape(len(kept), len(seeds))
+    drawn = [groups[name] for name in kept]
+    return Summary(
+        mean=float(rows.mean()) if kept else None,
+        seeds=rows.mean(0).tolist() if kept else [],
+        median=float(np.median(every)) if found else None,
+        interval=interval(rows.mean(1), drawn) if kept else None,
+        sequences=len(kept),
+        groups=len({str(group) for group in drawn}),
+        diverged=sum(diverged.get(name, 0) for name in found),
+        estimates=len(every),
+    )
+
 
 def interval(
     values: Float[np.ndarray, "n"], groups: Iterable[Any], level: float = 0.95
-) -> tuple[float, float] | None:
+) -> Interval | None:
     """The interval that holds the mean of the population with probability `level`.
 
     `groups` holds the group (person, session) of each value. Groups are taken to be drawn at
@@ -39,3 +138,71 @@ def interval(
     reach = float(stdtrit(count - 1, 0.5 + level / 2)) * error
     found = mean - reach, mean + reach
     return found if all(map(math.isfinite, found)) else None
+
+
+def compare(
+    own: Sequence[Scores],
+    other: Sequence[Scores],
+    metric: str,
+    groups: Mapping[str, Any],
+    best: float = 0.0,
+) -> Difference:
+    """How a row differs from another in a metric whose best value is `best`. The rows may have
+    different numbers of seeds."""
+    of_own, of_other = values(own, metric), values(other, metric)
+    diverged = lost(own) | lost(other)
+    shared = [
+        name
+        for name in of_own.keys() & of_other.keys()
+        if name not in diverged and np.isfinite([*of_own[name], *of_other[name]]).all()
+    ]
+    either = {
+        name
+        for scores in (*own, *other)
+        for name, measures in scores.items()
+        if measures.values.get(metric) is not None
+    }
+    drawn = [groups[name] for name in sorted(shared)]
+    counts = {"compared": len(shared), "sequences": len(either), "groups": len(set(drawn))}
+    nothing = Difference(None, None, None, 0, **counts)
+    if not shared:
+        return nothing
+    rows = [[of[name] for name in sorted(shared)] for of in (of_own, of_other)]
+    ours, theirs = (np.array([seeds.mean() for seeds in row]) for row in rows)
+    near, far = (np.array([np.abs(seeds - best).mean() for seeds in row]) for row in rows)
+    if near.sum() < far.sum() and _share_lost(own) > _share_lost(other):
+        return nothing._replace(withheld=True)
+    return nothing._replace(
+        mean=float((ours - theirs).mean()),
+        interval=interval(ours - theirs, drawn),
+        gain=100 * (1 - float(ours.mean() / theirs.mean())) if theirs.mean() else None,
+        better=int((near < far).sum()),
+    )
+
+
+def _share_lost(seeds: Sequence[Scores]) -> float:
+    """Of the estimates that have an `ate`, infinite or not, those that diverged."""
+    scored = [
+        own.diverged for of in seeds for own in of.values() if own.values.get("ate") is not None
+    ]
+    return float(np.mean(scored)) if scored else 0.0
+
+
+class Cell(NamedTuple):
+    """A metric of one row of a table."""
+
+    mean: Summary
+    difference: Difference | None
+    """To the first row; None for the first itself, and without the metric."""
+
+
+def cells(
+    rows: Sequence[Sequence[Scores]], metric: str, groups: Mapping[str, Any], best: float = 0.0
+) -> list[Cell]:
+    """A metric of every row of a table, each with its seeds, compared with the first row."""
+    found = [Cell(summarise(rows[0], metric, groups), None)]
+    for row in rows[1:]:
+        measured = any(own.values.get(metric) is not None for of in row for own in of.values())
+        difference = compare(row, rows[0], metric, groups, best) if measured else None
+        found.append(Cell(summarise(row, metric, groups), difference))
+    return found

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from gnio_jax import data, evaluation
-from gnio_jax.evaluation import Setup
+from gnio_jax.evaluation import Setup, tabulate
 from gnio_jax.training import checkpoint
 
 ACTIVITIES = ("standing", "slow", "walking", "running", "stairs")
@@ -28,7 +28,8 @@ class PredictedWindows(NamedTuple):
     """Displacement, m."""
     displacement: Float[np.ndarray, "m 3"]
     """The network's, m."""
-    log_std: Float[np.ndarray, "m 3"]
+    std: Float[np.ndarray, "m 3"]
+    """Standard deviation, with the factors that `gnio calibrate` found, m."""
     diagnostics: dict[str, np.ndarray]
     """`gate`, `scale` (m, 3) and `attention` (m, heads, prototypes), where the network has them."""
     activity: Int[np.ndarray, "m"]
@@ -49,11 +50,12 @@ def predict_split(workdir: Path, split: str) -> PredictedWindows:
     )
     truth = np.concatenate([evaluation.true_displacements(each, config) for each in prepared])
     displacement = np.concatenate([p.displacement for p in predictions])
+    log_std = np.concatenate([p.log_std for p in predictions])
     trusted = np.isfinite(truth).all(1) & np.isfinite(displacement).all(1)
     return PredictedWindows(
         truth[trusted],
         displacement[trusted],
-        np.concatenate([p.log_std for p in predictions])[trusted],
+        np.exp(log_std[trusted]) * run.config.filter.noise.std_factor,
         {
             name: np.concatenate([p.diagnostics[name] for p in predictions])[trusted]
             for name in predictions[0].diagnostics
@@ -86,7 +88,7 @@ def by_activity(windows: PredictedWindows) -> dict[str, dict[str, float]]:
         if not rows.any():
             continue
         error = windows.displacement[rows] - windows.truth[rows]
-        normalised = error / np.exp(windows.log_std[rows])
+        normalised = error / windows.std[rows]
         figures[name] = {
             "windows": float(rows.sum()),
             "error": float(np.sqrt((error**2).sum(1).mean())),
@@ -98,6 +100,32 @@ def by_activity(windows: PredictedWindows) -> dict[str, dict[str, float]]:
                 values = windows.diagnostics[key][rows, HORIZONTAL]
                 figures[name][key] = float(np.median(np.abs(values)))
     return figures
+
+
+def mean_over_seeds(seeds: list[PredictedWindows]) -> dict[str, dict[str, float]]:
+    """The figures of each activity, as means over the seeds."""
+    figures = [by_activity(seed) for seed in seeds]
+    return {
+        name: {key: float(np.mean([of[name][key] for of in figures])) for key in own}
+        for name, own in figures[0].items()
+    }
+
+
+def render(by_method: dict[str, dict[str, dict[str, float]]]) -> str:
+    """Networks × activities as Markdown."""
+    columns = {
+        "error": "rms error m",
+        "normalised": "error / σ, rms",
+        "length": "median length m",
+        "gate": "median gate",
+        "scale": "median scale",
+    }
+    table = [
+        [method, name, f"{own['windows']:.0f}", *(tabulate.number(own.get(x), 3) for x in columns)]
+        for method, figures in by_method.items()
+        for name, own in figures.items()
+    ]
+    return tabulate.markdown(["network", "windows of", "n", *columns.values()], table)
 
 
 class AttentionEntropy(NamedTuple):

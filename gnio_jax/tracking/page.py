@@ -7,29 +7,27 @@ from pathlib import Path
 
 from gnio_jax import config as configuration
 from gnio_jax.config import TrainConfig
-from gnio_jax.evaluation import Estimate, html
-from gnio_jax.evaluation.frames import with_the_reference_in_its_frame
+from gnio_jax.evaluation import page, tabulate
+from gnio_jax.evaluation.plots import View
 from gnio_jax.tracking.summary import Summary
 
 
-def write(
-    path: Path, estimate: Estimate, summary: Summary, config: TrainConfig, command: str = ""
-) -> None:
+def write(path: Path, seen: View, summary: Summary, config: TrainConfig, command: str = "") -> None:
     """Write the page; `config` is of the run whose weights track, `command` how it was called."""
-    html.write_report(path, summary.recording, [entry(estimate, summary, config, command)])
+    page.write(path, summary.recording, [run(seen, summary, config, command)])
 
 
-def entry(estimate: Estimate, summary: Summary, config: TrainConfig, command: str) -> html.Entry:
-    """What the page is told. The reference is moved into the frame of the track."""
+def run(seen: View, summary: Summary, config: TrainConfig, command: str) -> page.Run:
+    """What the page is told."""
     about = {
         "command": command,
         "walked": f"{summary.path_length:.1f} m in {summary.seconds:.0f} s, "
         f"ends {summary.from_start:.1f} m from the start",
         "expected error at the end": f"{summary.expected_error:.1f} m by the filter",
         "weights": f"{summary.weights}, trained on {summary.trained_on}",
-        "orientation source": "filter",
+        "window orientation": "filter",
         "alignment": "start position and yaw" if summary.errors else "",
-        "windows": html.windows_in_words(dataclasses.asdict(config.data)),
+        "windows": tabulate.windows(dataclasses.asdict(config.data)),
     }
     figures = summary.errors or {
         "duration": summary.seconds,
@@ -37,12 +35,11 @@ def entry(estimate: Estimate, summary: Summary, config: TrainConfig, command: st
         "accepted": None if summary.accepted is None else 100.0 * summary.accepted,
     }
     warnings = [f"warning: {each}" for each in summary.warnings]
-    return html.Entry(
+    return page.Run(
         "track",
         {name: text for name, text in about.items() if text},
-        [with_the_reference_in_its_frame(estimate)],
-        "none",
-        {estimate.name: figures},
+        [seen],
+        {seen.name: figures},
         remarks=(*warnings, summary.limits, *summary.notes),
         settings=configuration.text(config),
     )

@@ -22,7 +22,7 @@ from gnio_jax.evaluation.frames import with_the_reference_in_its_frame
 from gnio_jax.evaluation.preparation import Prepared, measured_rows
 from gnio_jax.evaluation.setup import OnShare, Setup, no_progress
 from gnio_jax.evaluation.trajectory import write_tum
-from gnio_jax.files import check_writable_folder, replacing_folder
+from gnio_jax.files import check_writable_folder, replacing_folder, shown_name
 from gnio_jax.tracking.filter import tracking_filter
 from gnio_jax.tracking.summary import Summary, as_json, summarise
 from gnio_jax.types import Sequence
@@ -66,11 +66,18 @@ def track(
     network = inference_network(weights.run.model, weights.run.variables)
     (estimate,) = run_filters([prepared], network, ekf, 1, progress)
     summary = summarise(estimate, prepared, recording, weights, ekf)
-    from gnio_jax.tracking import page  # Bokeh takes a second to import
+    # Bokeh and Matplotlib take seconds to import.
+    from gnio_jax.evaluation import plots
+    from gnio_jax.tracking import page
 
+    seen = plots.view(estimate, alignment=None)
+    length = f"{summary.path_length:.0f} m in {summary.seconds:.0f} s"
+    expected = f"expected error at the end {summary.expected_error:.1f} m"
+    title = f"{shown_name(summary.recording)}: {length}, {expected}"
     with replacing_folder(out) as folder:
         _write(folder, estimate, summary, formats)
-        page.write(folder / PAGE, estimate, summary, weights.run.config, command)
+        plots.save(folder / PICTURE, plots.sequence(seen, title))
+        page.write(folder / PAGE, seen, summary, weights.run.config, command)
     if rerun is not None:
         seen = with_the_reference_in_its_frame(estimate)
         rerun_file.write_rerun(rerun, [rerun_file.Logged(seen, prepared.sequence)])
@@ -117,8 +124,6 @@ def _write(
     summary: Summary,
     formats: tuple[str, ...],
 ) -> None:
-    from gnio_jax.tracking import picture  # Matplotlib takes a second to import
-
     text = json.dumps(as_json(summary), indent=2, allow_nan=False, ensure_ascii=False)
     (folder / SUMMARY).write_text(text + "\n", encoding="utf-8")
     own_clock = _stamped(estimate.trajectory, summary.start_time)
@@ -128,7 +133,6 @@ def _write(
     for kind in formats:
         path = folder / f"trajectory.{kind}"
         exporting.export(path, own_clock, kind, estimate.position_covariance)
-    picture.save(folder / PICTURE, picture.draw(estimate, summary))
 
 
 def _stamped(trajectory: Trajectory, start: float) -> Trajectory:

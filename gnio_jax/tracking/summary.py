@@ -135,7 +135,7 @@ def as_json(summary: Summary) -> dict[str, Any]:
 def _errors(estimate: Estimate) -> dict[str, float | None]:
     if not np.isfinite(estimate.reference.position).any():
         return {}
-    return score([estimate], {estimate.name: estimate.name}).sequences[estimate.name].values
+    return score([estimate])[estimate.name].values
 
 
 def _rest(prepared: Prepared, config: FilterConfig) -> float:

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from gnio_jax.data.simulated import walks as simulated
-from gnio_jax.evaluation import Trajectory, never_moves, report, score
+from gnio_jax.evaluation import Trajectory, never_moves, score
+from gnio_jax.evaluation.report import Report
 from tests.support.estimates import SETTINGS, estimate
 from tests.support.estimators import RATE
 
@@ -36,11 +37,11 @@ def estimates():
 
 @pytest.fixture(scope="module")
 def made(estimates):
-    groups = {e.name: e.name[:4] for e in estimates}
-    return report.Report(
+    return Report(
         SETTINGS,
-        score(estimates, groups),
-        {"never_moves": score(never_moves(estimates), groups)},
+        score(estimates),
+        {"never_moves": score(never_moves(estimates))},
+        {e.name: e.name[:4] for e in estimates},
         {"blind": ["start: rough"]},
         {"short": "0.5 s"},
     )
@@ -54,5 +55,5 @@ def with_divergence(estimates):
     lost = Trajectory(lost.time, *(np.where(there, part, np.nan) for part in lost[1:]))
     of = [estimates[0], estimates[1]._replace(trajectory=lost), estimates[2], estimate("room 3", 3)]
     groups = {"room 1/walk": "A", "room 1:walk": "B", "blind": "C", "room 3": "D"}
-    still = {"never_moves": score(never_moves(of), groups)}
-    return of, report.Report(SETTINGS, score(of, groups), still, {}, {})
+    still = {"never_moves": score(never_moves(of))}
+    return of, Report(SETTINGS, score(of), still, groups, {}, {})

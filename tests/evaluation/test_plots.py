@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from gnio_jax.evaluation import Trajectory, plots
-from tests.support.estimates import SETTINGS
+from tests.support.estimates import SETTINGS, estimate
+from tests.support.reports import LOST, measures
 
 
 @pytest.fixture(autouse=True)
@@ -12,20 +13,100 @@ def few_dots(monkeypatch):
     monkeypatch.setattr(plots, "DOTS_PER_INCH", 30)
 
 
-@pytest.mark.parametrize("alignment", ["origin", "yaw_position", "se3"])
-def test_the_distribution_of_errors_counts_what_diverged(with_divergence, alignment):
-    of, found = with_divergence
-    figure = plots.error_cdf(of, found._replace(settings=SETTINGS | {"alignment": alignment}))
-    left, right = figure.axes
-    of_one, of_all = left.get_lines()[1], left.get_lines()[3]
-    assert of_one.get_ydata()[-1] == pytest.approx(0.5)  # the lost walk: 200 of 400 samples
-    assert of_all.get_label() == "all samples"
-    assert of_all.get_ydata()[-1] == pytest.approx(1000 / 1200)
-    assert right.get_lines()[0].get_ydata()[-1] == pytest.approx(2 / 3)
+def labels(axes):
+    return [text.get_text() for text in axes.get_legend().get_texts()]
 
 
-def test_what_diverged_is_drawn(tmp_path, with_divergence):
-    plots.save_all(tmp_path, *with_divergence, 1.0)
+# What is drawn
+# --------------------------------------------------------------------------------------------------
+
+
+def test_ellipses_are_contours_of_their_covariance():
+    covariance = np.array([[[4.0, 1.5, 0], [1.5, 1.0, 0], [0, 0, 9]], np.full((3, 3), np.nan)])
+    found = plots.ellipses(covariance)
+    angle = np.linspace(0, 2 * np.pi, 25)
+    along, across = found.major[0] * np.cos(angle), found.minor[0] * np.sin(angle)
+    cosine, sine = np.cos(found.angle[0]), np.sin(found.angle[0])
+    points = np.stack([cosine * along - sine * across, sine * along + cosine * across], 1)
+    inverse = np.linalg.inv(covariance[0, :2, :2])
+    distance = np.einsum("ki,ij,kj->k", points, inverse, points)
+    np.testing.assert_allclose(distance, 9.0)
+    assert found.major[0] > found.minor[0] and np.isnan(found.major[1])
+
+
+def test_an_estimate_is_seen_in_the_frame_of_the_reference(estimates):
+    """The estimate is turned by 90° and moved: alignment takes that back, for the ellipse too."""
+    walk = estimates[0]
+    walk = walk._replace(position_covariance=walk.position_covariance * np.array([1.0, 4.0, 1.0]))
+    path, half = walk.trajectory, np.sqrt(0.5)
+    turned = np.stack([-path.position[:, 1], path.position[:, 0], path.position[:, 2]], 1)
+    w, x, y, z = path.orientation.T
+    attitude = half * np.stack([w - z, x - y, y + x, z + w], 1)  # a quarter turn from the left
+    covariance = walk.position_covariance[:, [1, 0, 2]][:, :, [1, 0, 2]]
+    moved = walk._replace(
+        trajectory=Trajectory(path.time, turned + 5.0, attitude), position_covariance=covariance
+    )
+    whole, found = plots.view(walk), plots.view(moved)
+    np.testing.assert_allclose(found.position, whole.position, atol=1e-9)
+    angles = [plots.ellipses(seen.covariance).angle for seen in (whole, found)]
+    np.testing.assert_allclose(np.abs(np.sin(angles)), 1.0, atol=1e-6)
+    # By hand: the starts are one, and so are the yaws.
+    shift = path.position[0] - walk.reference.position[0]
+    np.testing.assert_allclose(whole.position, path.position - shift, atol=1e-9)
+    np.testing.assert_array_equal(whole.reference, walk.reference.position)
+    # A track stays where it is, and its reference comes to it.
+    own = plots.view(moved, alignment=None)
+    np.testing.assert_array_equal(own.position, moved.trajectory.position)
+    np.testing.assert_allclose(own.reference[0], moved.trajectory.position[0], atol=1e-9)
+
+
+def test_the_speed_is_a_mean_over_a_second():
+    time = np.arange(50) * 0.1
+    path = np.stack([1.5 * time, np.zeros(50), 9.0 * time], 1)
+    found = plots.speed(path, 0.1)
+    np.testing.assert_allclose(found[5:45], 1.5)
+    assert np.isnan(found[:5]).all() and np.isnan(found[45:]).all()
+    assert np.isnan(plots.speed(path[:3], 0.1)).all()
+
+
+# One sequence
+# --------------------------------------------------------------------------------------------------
+
+
+def test_the_picture_of_a_sequence(estimates):
+    seen = plots.view(estimates[0])
+    figure = plots.sequence(seen, "walk: ATE 1.23 m")
+    plan, horizontal, vertical, speed, gate = figure.axes
+    assert figure.get_suptitle() == "walk: ATE 1.23 m" and plan.get_aspect() == 1.0
+    assert labels(plan) == ["reference", "estimate", "3σ", "start", "end"]
+    reference, path = plan.get_lines()[:2]
+    np.testing.assert_array_equal(reference.get_xydata(), seen.reference[:, :2])
+    np.testing.assert_array_equal(path.get_xydata(), seen.position[:, :2])
+    assert len(plan.patches) == plots.ELLIPSES
+    error = np.linalg.norm((seen.position - seen.reference)[:, :2], axis=1)
+    np.testing.assert_allclose(horizontal.get_lines()[0].get_ydata(), error)
+    bands = [axes.collections[0].get_paths()[0].vertices[:, 1] for axes in (horizontal, vertical)]
+    bound = 3 * 0.03 * np.sqrt(400)
+    assert bands[0].max() == pytest.approx(bound) and bands[0].min() == 0
+    assert bands[1].max() == pytest.approx(bound) and bands[1].min() == pytest.approx(-bound)
+    assert np.nanmax(speed.get_lines()[0].get_ydata()) == pytest.approx(1.6, abs=0.02)
+    assert labels(gate)[-3:] == ["x", "y", "z"] and gate.get_xlabel() == "time (s)"
+    shaded = [patch for patch in speed.patches if patch.get_width() > 1]
+    assert len(shaded) == 1 and shaded[0].get_x() == pytest.approx(15, abs=0.5)
+    assert shaded[0].get_width() == pytest.approx(7, abs=1)
+
+
+def test_without_a_reference_nothing_is_called_an_error(estimates):
+    """And without a gate it is shown which displacements were used; without a filter neither."""
+    blind = estimates[2]._replace(diagnostics={})
+    figure = plots.sequence(plots.view(blind, alignment=None))
+    plan, horizontal, vertical, speed, used = figure.axes
+    assert "reference" not in labels(plan) and labels(horizontal) == ["3σ"]
+    assert horizontal.get_ylabel() == "horizontal\n3σ (m)"
+    assert vertical.get_ylabel() == "vertical\n3σ (m)" and labels(speed) == ["estimate"]
+    assert labels(used) == ["used"]
+    bare = plots.view(blind._replace(position_covariance=None, accepted=None))
+    assert len(plots.sequence(bare).axes) == 2
 
 
 def test_an_estimate_lost_before_the_reference_begins_is_drawn(estimates):
@@ -35,56 +116,60 @@ def test_an_estimate_lost_before_the_reference_begins_is_drawn(estimates):
         Trajectory(of.time, *(np.where(there, part, np.nan) for part in of[1:]))
         for of, there in ((whole.trajectory, rows < 5), (whole.reference, rows >= 10))
     )
-    figure = plots.position_error(whole._replace(trajectory=path, reference=reference))
-    for axes in figure.axes:
+    figure = plots.sequence(plots.view(whole._replace(trajectory=path, reference=reference)))
+    for axes in figure.axes[1:3]:
         assert np.isnan(axes.get_lines()[0].get_ydata()).all()
         assert np.isfinite(axes.collections[0].get_paths()[0].vertices).all()
 
 
-def test_plots_are_drawn(tmp_path, estimates, made):
-    plots.save_all(tmp_path, estimates, made, 1.0)
-    names = {path.name for path in tmp_path.iterdir()}
-    assert names == {
-        "error_cdf.png",
-        *(
-            f"{stem}_{kind}.png"
-            for stem in ("room_1_walk", "room_1_walk_")
-            for kind in ("trajectory", "error", "displacement")
-        ),
-        "blind_trajectory.png",
-        "blind_displacement.png",
-    }
-    assert all((tmp_path / name).read_bytes()[:4] == b"\x89PNG" for name in names)
+# A set of sequences
+# --------------------------------------------------------------------------------------------------
 
 
-def test_plots_say_what_they_show(estimates):
-    figure = plots.trajectory(estimates[0], 1.234, 1.1)
+@pytest.mark.parametrize("alignment", ["origin", "yaw_position", "se3"])
+def test_the_distribution_of_errors_counts_what_diverged(with_divergence, alignment):
+    of, made = with_divergence
+    views = [plots.view(each, alignment) for each in of]
+    figure = plots.error_cdf(views, made._replace(settings=SETTINGS | {"alignment": alignment}))
+    left, right = figure.axes
+    of_one, of_all = left.get_lines()[1], left.get_lines()[3]
+    assert of_one.get_ydata()[-1] == pytest.approx(0.5)  # the lost walk: 200 of 400 samples
+    assert of_all.get_label() == "all samples"
+    assert of_all.get_ydata()[-1] == pytest.approx(1000 / 1200)
+    assert right.get_lines()[0].get_ydata()[-1] == pytest.approx(2 / 3)
+
+
+def test_one_picture_for_each_sequence(tmp_path, estimates, made, with_divergence):
+    plots.save_all(tmp_path / "a", [plots.view(each) for each in estimates], made)
+    names = {path.name for path in (tmp_path / "a").iterdir()}
+    assert names == {"error_cdf.png", "room_1_walk.png", "room_1_walk_.png", "blind.png"}
+    assert all((tmp_path / "a" / name).read_bytes()[:4] == b"\x89PNG" for name in names)
+    of, lost = with_divergence
+    plots.save_all(tmp_path / "b", [plots.view(each) for each in of], lost)
+
+
+def test_a_short_walk_and_a_name_of_any_bytes_are_drawn(tmp_path):
+    seen = plots.view(estimate("a$x^$\udcff", 0))
+    parts = {name: part[:3] for name, part in seen._asdict().items() if name != "name"}
+    plots.save(tmp_path / "p.png", plots.sequence(seen._replace(**parts)))
+    assert (tmp_path / "p.png").exists()
+
+
+def test_rows_side_by_side():
+    """Dots of what diverged are not there; its name is marked. Names that Matplotlib would read
+    otherwise stand as they are."""
+    seeds = [[1.0, 5.0], [3.0, 7.0]]
+    first = [{n: measures(ate=x) for n, x in zip("ab", row, strict=True)} for row in seeds]
+    second = [{"a": measures(ate=LOST), "b": measures(ate=2.0), "c": measures(ate=4.0)}]
+    rows = {"a$x^$": first, "_under": second, "\udcff_x": second}
+    figure = plots.paired(
+        rows, "ate", dict(zip("abc", ("ann", "bob", "bob"), strict=True)), "ATE (m)"
+    )
     (axes,) = figure.axes
-    assert (
-        "1.23 m" in axes.get_title() and axes.get_aspect() == 1.0 and axes.get_xlabel() == "x (m)"
-    )
-    reference, path = axes.get_lines()[:2]
-    np.testing.assert_array_equal(reference.get_xydata(), estimates[0].reference.position[:, :2])
-    np.testing.assert_allclose(
-        path.get_xydata()[0], estimates[0].reference.position[0, :2], atol=1e-12
-    )
-
-    figure = plots.displacement(estimates[0], 1.0)
-    assert [a.get_ylabel() for a in figure.axes] == [
-        "speed (m/s)",
-        "displacement (m)",
-        "gate γ (–)",
-    ]
-    truth, speed = figure.axes[0].get_lines()[:2]
-    assert np.nanmax(truth.get_ydata()) == pytest.approx(1.6, abs=0.02)
-    np.testing.assert_allclose(speed.get_xdata(), np.arange(400) * 0.1 - 0.5, atol=1e-6)
-    shaded = figure.axes[0].patches
-    assert (
-        len(shaded) == 1
-        and shaded[0].get_x() == pytest.approx(15, abs=0.5)
-        and shaded[0].get_width() == pytest.approx(7, abs=1)
-    )
-
-    error = plots.position_error(estimates[0])
-    band = error.axes[0].collections[0].get_paths()[0].vertices
-    assert band[:, 1].max() == pytest.approx(3 * 0.03 * np.sqrt(400))
+    ticks = [label.get_text() for label in axes.get_yticklabels()]
+    assert ticks == ["c  (bob)", "a  (ann) †", "b  (bob)"]
+    dots = [line for line in axes.get_lines() if line.get_marker() == "o"]
+    assert list(dots[0].get_xdata()) == [2.0, 6.0]
+    np.testing.assert_array_equal(dots[1].get_xdata(), [4.0, np.nan, 2.0])
+    shown = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert shown == [r"a\$x^\$", "\u200b_under", r"\udcff_x", "† an estimate diverged"]

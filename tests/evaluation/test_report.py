@@ -2,73 +2,104 @@
 
 import csv
 import json
+import math
+import re
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from gnio_jax.evaluation import report, score
+from gnio_jax import evaluation
+from gnio_jax.config import TrainConfig
+from gnio_jax.errors import InputError
+from gnio_jax.evaluation import Trajectory, report, score
 from gnio_jax.evaluation.trajectory import write_tum
 from tests.support.estimates import SETTINGS
 
 
-def test_files_parse_back(tmp_path, estimates, made):
-    report.write(tmp_path, made, estimates)
+def write(folder, made, estimates, **options):
+    """The folder, by default without pictures, and its metrics.json."""
+    report.write(folder, made, estimates, TrainConfig(), plots=options.pop("plots", False))
 
     def strict(constant):
         raise AssertionError(f"{constant} is not JSON")
 
-    found = json.loads((tmp_path / "metrics.json").read_text(), parse_constant=strict)
+    return json.loads((folder / "metrics.json").read_text(), parse_constant=strict)
+
+
+def rows(folder):
+    with open(folder / "metrics.csv", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_files_parse_back(tmp_path, estimates, made):
+    found = write(tmp_path / "e", made, estimates)
     assert found["sequences"].keys() == {"room 1/walk", "room 1:walk", "blind"}
     first = found["sequences"]["room 1/walk"]
-    assert (
-        first["ate"] == made.scores.sequences["room 1/walk"].values["ate"]
-        and "undefined" not in first
-    )
+    assert first["ate"] == made.scores["room 1/walk"].values["ate"]
+    assert first["reasons"] == {} and first["infinite"] == [] and first["diverged"] is False
     assert first["accepted"] == pytest.approx(90, abs=0.5) and first["nis"] == 1.0
     blind = found["sequences"]["blind"]
-    assert (
-        blind["ate"] is None
-        and blind["undefined"]["ate"] == "no trusted reference"
-        and blind["notes"] == ["start: rough"]
-    )
-    assert blind["nis"] == 1.0
-    assert found["mean"]["ate"] == pytest.approx(
-        np.mean([found["sequences"][f"room 1{c}walk"]["ate"] for c in "/:"])
-    )
-    assert (
-        found["n"]["ate"] == 2
-        and found["interval"]["ate"] is None
-        and len(found["interval"]["nis"]) == 2
-    )
-    assert found["settings"]["orientation_source"] == "filter" and found["left_out"] == {
-        "short": "0.5 s"
-    }
+    assert blind["ate"] is None and blind["reasons"]["ate"] == "no trusted reference"
+    assert blind["notes"] == ["start: rough"] and blind["nis"] == 1.0
+    ates = [found["sequences"][f"room 1{c}walk"]["ate"] for c in "/:"]
+    assert found["mean"]["ate"] == pytest.approx(np.mean(ates))
+    assert found["n"]["ate"] == 2 and found["interval"]["ate"] is None
+    assert len(found["interval"]["nis"]) == 2 and found["left_out"] == {"short": "0.5 s"}
+    assert found["settings"]["orientation_source"] == "filter"
     assert found["reference_rows"]["never_moves"]["mean"]["path_length_ratio"] == 0
+    lines = rows(tmp_path / "e")
+    assert float(lines[0]["ate"]) == first["ate"]
+    assert lines[2]["ate"] == "" and lines[2]["sequence"] == "blind"
 
-    with open(tmp_path / "metrics.csv", newline="") as file:
-        rows = list(csv.DictReader(file))
-    assert (
-        float(rows[0]["ate"]) == first["ate"]
-        and rows[2]["ate"] == ""
-        and rows[2]["sequence"] == "blind"
-    )
+
+@pytest.mark.parametrize("which", ["made", "with_divergence"])
+def test_what_is_written_is_read_back_whole(tmp_path, request, estimates, which):
+    """Infinite figures too."""
+    found = request.getfixturevalue(which)
+    of, wanted = (estimates, found) if which == "made" else found
+    write(tmp_path / "e", wanted, of)
+    assert evaluation.load(tmp_path / "e") == wanted
 
 
 def test_tum_files(tmp_path, estimates, made):
-    report.write(tmp_path, made, estimates)
-    files = sorted(path.name for path in (tmp_path / "trajectories").iterdir())
+    write(tmp_path / "e", made, estimates)
+    files = sorted(path.name for path in (tmp_path / "e" / "trajectories").iterdir())
     assert files == ["blind.txt", "room_1_walk.txt", "room_1_walk_.txt"]
-    assert sorted(path.name for path in (tmp_path / "references").iterdir()) == files[1:]
-    rows = np.loadtxt(tmp_path / "trajectories" / "room_1_walk.txt")
+    references = sorted(path.name for path in (tmp_path / "e" / "references").iterdir())
+    assert references == files[1:]
+    table = np.loadtxt(tmp_path / "e" / "trajectories" / "room_1_walk.txt")
     path = estimates[0].trajectory
-    np.testing.assert_allclose(rows[:, 0], path.time, rtol=0, atol=1e-6)
-    np.testing.assert_allclose(rows[:, 1:4], path.position, atol=1e-9)
-    turns = Rotation.from_quat(rows[:, 4:]), Rotation.from_quat(path.orientation, scalar_first=True)
+    np.testing.assert_allclose(table[:, 0], path.time, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(table[:, 1:4], path.position, atol=1e-9)
+    turns = (
+        Rotation.from_quat(table[:, 4:]),
+        Rotation.from_quat(path.orientation, scalar_first=True),
+    )
     np.testing.assert_allclose(turns[0].as_matrix(), turns[1].as_matrix(), atol=1e-8)
     broken = path._replace(position=np.where(np.arange(400)[:, None] < 390, path.position, np.nan))
     write_tum(tmp_path / "broken.txt", broken)
     assert np.loadtxt(tmp_path / "broken.txt").shape == (390, 8)
+
+
+def test_trajectories_are_read_back_at_their_own_stamps(tmp_path, estimates, made):
+    """The reference where it is known, the estimate up to where it diverged."""
+    whole, rows = estimates[0], np.arange(400)
+    holes, ends = (rows >= 20) & (rows < 30), rows >= 390
+
+    def without(of, gone):
+        parts = (np.where(gone[:, None], np.nan, part) for part in of[1:])
+        return Trajectory(of.time, *parts)
+
+    path, reference = without(whole.trajectory, ends), without(whole.reference, holes)
+    of = [whole._replace(trajectory=path, reference=reference), *estimates[1:]]
+    write(tmp_path / "e", made, of)
+    found = report.read_trajectories(tmp_path / "e", list(made.scores))
+    read, true = found["room 1/walk"]
+    assert len(read.time) == 390
+    np.testing.assert_allclose(read.position, path.position[:390], atol=1e-8)
+    np.testing.assert_allclose(true.position, reference.position[:390], atol=1e-8)
+    assert not found["blind"][1].known.any()
 
 
 def test_evo_reads_the_trajectories(tmp_path, estimates, made):
@@ -76,61 +107,44 @@ def test_evo_reads_the_trajectories(tmp_path, estimates, made):
     from evo.core import metrics as evo
     from evo.tools import file_interface
 
-    report.write(tmp_path, made, estimates)
+    write(tmp_path / "e", made, estimates)
     pair = [
-        file_interface.read_tum_trajectory_file(tmp_path / kind / "room_1_walk.txt")
+        file_interface.read_tum_trajectory_file(tmp_path / "e" / kind / "room_1_walk.txt")
         for kind in ("references", "trajectories")
     ]
     metric = evo.APE(evo.PoseRelation.translation_part)
     metric.process_data(tuple(pair))
-    ours = score(estimates[:1], {"room 1/walk": 0}, "none").sequences["room 1/walk"].values["ate"]
+    ours = score(estimates[:1], "none")["room 1/walk"].values["ate"]
     assert ours == pytest.approx(metric.get_statistic(evo.StatisticsType.rmse), rel=1e-7)
 
 
 def test_divergence_is_in_the_files(tmp_path, with_divergence):
-    of, found = with_divergence
-    report.write(tmp_path, found, of)
-    read = json.loads((tmp_path / "metrics.json").read_text())
-    lost = read["sequences"]["room 1:walk"]
-    assert lost["ate"] is None
-    assert lost["undefined"]["ate"] == "the estimate is not finite from 20.0 s on"
-    assert {name: one["group"] for name, one in read["sequences"].items()} == found.scores.groups
-    assert read["mean"]["diverged"] == 1 and read["diverged"]["ate"] == 1 and read["n"]["ate"] == 2
-    ates = [read["sequences"][name]["ate"] for name in ("room 1/walk", "room 3")]
-    assert read["mean"]["ate"] == pytest.approx(np.mean(ates))
-    assert read["median"]["ate"] == max(ates)  # of two finite and an infinite one
+    of, made = with_divergence
+    found = write(tmp_path / "e", made, of)
+    lost = found["sequences"]["room 1:walk"]
+    assert lost["ate"] is None and "ate" in lost["infinite"] and lost["diverged"] is True
+    assert lost["reasons"]["ate"] == "the estimate is not finite from 20.0 s on"
+    assert {name: own["group"] for name, own in found["sequences"].items()} == made.groups
+    assert found["diverged"]["ate"] == 1 and found["n"]["ate"] == 2
+    ates = [found["sequences"][name]["ate"] for name in ("room 1/walk", "room 3")]
+    assert found["mean"]["ate"] == pytest.approx(np.mean(ates))
+    assert found["median"]["ate"] == max(ates)  # of two finite and an infinite one
     middle, reach = np.mean(ates), 12.7062 * np.ptp(ates) / 2  # t of one degree of freedom
-    assert read["interval"]["ate"] == pytest.approx([middle - reach, middle + reach], rel=1e-4)
-    assert read["groups"]["ate"] == 2
-    values = {name: report.read_metric(one, "ate") for name, one in read["sequences"].items()}
-    assert values == {name: m.values["ate"] for name, m in found.scores.sequences.items()}
-    assert values["room 1:walk"] == np.inf and values["blind"] is None
-    with open(tmp_path / "metrics.csv", newline="") as file:
-        assert [row["ate"] for row in csv.DictReader(file)][1:3] == ["inf", ""]
-    assert read["reference_rows"]["never_moves"]["mean"]["diverged"] == 0
+    assert found["interval"]["ate"] == pytest.approx([middle - reach, middle + reach], rel=1e-4)
+    assert found["groups"]["ate"] == 2
+    assert [row["ate"] for row in rows(tmp_path / "e")][1:3] == ["inf", ""]
+    assert found["reference_rows"]["never_moves"]["diverged"]["ate"] == 0
 
 
 def test_every_column_is_of_the_same_sequences(with_divergence):
     """The lost walk is in no mean, not even with its coverage, what was accepted or its path."""
-    _, found = with_divergence
-    summary, sequences = found.scores.summary, found.scores.sequences
+    _, made = with_divergence
+    summary = made.summary()
     for name in ("nees_coverage", "nis_coverage", "accepted", "path_length", "duration", "ate"):
-        values = [sequences[walk].values[name] for walk in ("room 1/walk", "blind", "room 3")]
+        values = [made.scores[walk].values[name] for walk in ("room 1/walk", "blind", "room 3")]
         there = [value for value in values if value is not None]
-        assert summary.mean[name] == pytest.approx(np.mean(there)) and summary.count[name] == len(
-            there
-        )
-        assert summary.diverged[name] == 1
-
-
-def test_every_estimate_lost_has_a_reason_for_every_mean(tmp_path, with_divergence):
-    lost = [with_divergence[0][1]]
-    found = report.Report(SETTINGS, score(lost, {lost[0].name: "B"}), {}, {}, {})
-    report.write(tmp_path, found, lost)
-    read = json.loads((tmp_path / "metrics.json").read_text())
-    assert all(value is None for name, value in read["mean"].items() if name != "diverged")
-    assert read["undefined"].keys() == read["mean"].keys() - {"diverged"}
-    assert read["undefined"]["path_length"] == "no estimate that did not diverge"
+        assert summary[name].mean == pytest.approx(np.mean(there))
+        assert summary[name].sequences == len(there) and summary[name].diverged == 1
 
 
 def test_a_bad_covariance_is_no_divergence(tmp_path, estimates):
@@ -138,9 +152,78 @@ def test_a_bad_covariance_is_no_divergence(tmp_path, estimates):
     bad = estimates[0].position_covariance.copy()
     bad[200:] = np.nan
     of = [estimates[0]._replace(position_covariance=bad), estimates[1]]
-    found = report.Report(SETTINGS, score(of, {e.name: e.name for e in of}), {}, {}, {})
-    assert found.scores.diverged == [] and found.scores.summary.count["ate"] == 2
-    report.write(tmp_path, found, of)
-    read = json.loads((tmp_path / "metrics.json").read_text())
-    assert read["mean"]["diverged"] == 0 and read["mean"]["ate"] > 0
-    assert read["mean"]["nees"] is None and "not positive definite" in read["undefined"]["nees"]
+    groups = {e.name: e.name for e in of}
+    made = report.Report(SETTINGS, score(of), {}, groups, {}, {})
+    assert made.diverged == [] and made.summary()["ate"].sequences == 2
+    found = write(tmp_path / "e", made, of)
+    first = found["sequences"]["room 1/walk"]
+    assert found["diverged"]["nees"] == 0 and found["mean"]["ate"] > 0
+    assert found["mean"]["nees"] is None and "nees" in first["infinite"]
+    assert "not positive definite" in first["reasons"]["nees"]
+
+
+def test_no_page_is_lost_and_none_is_of_other_figures(tmp_path, estimates, made):
+    """Figures that are made anew without pictures take those that were there along."""
+    folder = tmp_path / "e"
+    write(folder, made, estimates)
+    assert not (folder / "report.html").exists() and not (folder / "plots").exists()
+    write(folder, made, estimates, plots=True)
+    evaluation.load(folder)
+    drawn = {path.name for path in (folder / "plots").iterdir()}
+    further = [estimates[0]._replace(trajectory=estimates[1].trajectory), *estimates[1:]]
+    again = made._replace(scores=score(further))
+    write(folder, again, further)
+    ate = again.scores["room 1/walk"].values["ate"]
+    assert f"<td>{ate:.2f}</td>" in (folder / "report.html").read_text(encoding="utf-8")
+    assert ate != made.scores["room 1/walk"].values["ate"]
+    assert {path.name for path in (folder / "plots").iterdir()} == drawn
+
+
+@pytest.mark.parametrize(
+    ("where", "value"),
+    [
+        (("sequences", "blind", "reasons"), ["x"]),
+        (("sequences", "blind", "reasons"), ""),
+        (("sequences", "blind", "reasons"), {"ate": 5}),
+        (("sequences", "blind", "group"), None),
+        (("sequences", "blind", "nis"), 10**400),
+        (("sequences", "blind", "nis"), math.inf),
+        (("sequences", "blind", "nis"), "1.0"),
+        (("sequences", "blind", "infinite"), ["nis"]),
+        (("sequences", "blind", "infinite"), None),
+        (("sequences", "blind", "diverged"), "no"),
+        (("sequences", "blind", "notes"), [5]),
+        (("settings", "split"), 5),
+        (("settings",), []),
+        (("sequences",), {}),
+        (("sequences",), [[1]]),
+        (("left_out",), {"short": None}),
+    ],
+)
+def test_a_damaged_file_is_refused(tmp_path, estimates, made, where, value):
+    found = inner = write(tmp_path / "e", made, estimates)
+    for name in where[:-1]:
+        inner = inner[name]
+    inner[where[-1]] = value
+    path = tmp_path / "e" / "metrics.json"
+    path.write_text(json.dumps(found))
+    with pytest.raises(InputError, match=r"is not a metrics\.json of an evaluation"):
+        report.read(path.parent)
+
+
+def test_what_is_no_evaluation_is_named(tmp_path, estimates, made):
+    found = write(tmp_path / "e", made, estimates)
+    path = tmp_path / "e" / "metrics.json"
+    for definitions in (report.DEFINITIONS - 1, None):
+        found["settings"]["definitions"] = definitions
+        path.write_text(json.dumps(found))
+        with pytest.raises(InputError, match=re.escape("written by another version")):
+            report.read(path.parent)
+    for broken in ("[" * 100_000, "nothing", "\xff"):
+        path.write_bytes(broken.encode("latin-1"))
+        with pytest.raises(InputError, match=r"is not a metrics\.json of an evaluation"):
+            report.read(path.parent)
+    path.unlink()
+    for folder in (tmp_path, path, tmp_path / "nowhere"):
+        with pytest.raises(InputError, match="is neither a run nor an evaluation"):
+            report.read(folder)

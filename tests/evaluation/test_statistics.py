@@ -1,10 +1,27 @@
-"""The interval of a mean over groups: against SciPy, by hand, and how often it covers the truth."""
+"""Means, intervals and differences: against SciPy, by hand, and how often they cover the truth."""
 
 import numpy as np
 import pytest
 from scipy import stats
 
-from gnio_jax.evaluation.statistics import interval
+from gnio_jax.evaluation.metrics import Measures
+from gnio_jax.evaluation.statistics import compare, interval, summarise
+from tests.support.reports import LOST, measures
+
+
+def seeds_of(ates, names=None):
+    """`ates`: (seeds, sequences)."""
+    return [
+        {name: measures(ate=ate) for name, ate in zip(names or "abcdefgh", row, strict=False)}
+        for row in ates
+    ]
+
+
+ALONE = {name: name for name in "abcdefgh"}
+
+
+# The interval
+# --------------------------------------------------------------------------------------------------
 
 
 def test_with_a_group_for_each_value_it_is_students_interval():
@@ -42,3 +59,164 @@ def test_it_covers_the_mean_as_often_as_it_says(groups):
         low, high = interval(people[names] + 0.5 * random.normal(size=len(names)), names)
         missed += not low <= 0.0 <= high
     assert 0.03 < missed / trials < 0.07
+
+
+# Means
+# --------------------------------------------------------------------------------------------------
+
+
+def test_divergence_never_improves_a_summary():
+    """The worst of six errors diverge: the mean is of the others and counts them, the median gets
+    no smaller, and is infinite with half."""
+    errors = [1.0, 2.0, 3.0, 4.0, 5.0, 60.0]
+    groups = dict(zip("abcdef", "xxxyyy", strict=True))
+    found = [
+        summarise(seeds_of([errors[: 6 - bad] + [LOST] * bad]), "ate", groups)
+        for bad in (0, 1, 3, 6)
+    ]
+    assert [s.diverged for s in found] == [0, 1, 3, 6]
+    assert [s.sequences for s in found] == [6, 5, 3, 0]
+    assert [s.estimates for s in found] == [6] * 4
+    assert [s.median for s in found] == [3.5, 3.5, np.inf, np.inf]
+    assert [s.mean for s in found] == [12.5, 3.0, 2.0, None]
+    # Of 1, 2, 3 and 4, 5: sums of deviations −3 and 3, standard error √2 √18 / 5, t of 1 degree.
+    reach = 12.7062 * np.sqrt(2 * 18) / 5
+    assert found[1].interval == pytest.approx((3 - reach, 3 + reach), rel=1e-5)
+    assert found[1].groups == 2
+    assert [s.interval for s in found[2:]] == [None, None]  # one group is left, or none
+
+
+def test_divergence_is_of_the_sequence_and_leaves_every_mean():
+    """Of four: whole, lost, whole with a bad covariance, without a reference and lost."""
+    fields = ("ate", "nees", "nees_coverage", "accepted", "path_length")
+    rows = {
+        "a": (1.0, 2.0, 90.0, 80.0, 10.0),
+        "b": (LOST, LOST, 0.0, 5.0, 500.0),
+        "c": (3.0, LOST, 0.0, 70.0, 20.0),
+    }
+    scores = {name: measures(**dict(zip(fields, row, strict=True))) for name, row in rows.items()}
+    scores["d"] = Measures({"ate": None, "nis": LOST, "accepted": 3.0}, {}, True)
+    found = {metric: summarise([scores], metric, ALONE) for metric in (*fields, "nis")}
+    means = {
+        "ate": 2.0,
+        "nees": np.inf,
+        "nees_coverage": 45.0,
+        "accepted": 75.0,
+        "path_length": 15.0,
+    }
+    assert {metric: of.mean for metric, of in found.items()} == means | {"nis": None}
+    assert {m: of.sequences for m, of in found.items()} == dict.fromkeys(fields, 2) | {"nis": 0}
+    lost = dict.fromkeys(fields, 1) | {"nis": 1, "accepted": 2}
+    assert {metric: of.diverged for metric, of in found.items()} == lost
+    assert found["nees"].interval is None
+    reach = 12.7062 * 5  # t of one degree of freedom
+    assert found["accepted"].interval == pytest.approx((75 - reach, 75 + reach), rel=1e-4)
+    assert found["ate"].median == 3.0 and found["nees"].median == np.inf
+
+
+def test_groups_are_what_is_independent():
+    names = [f"{group}{k}" for group in "xy" for k in range(5)]
+    ates = [value + 0.001 * k for value in (1.0, 3.0) for k in range(5)]
+    seeds = seeds_of([ates], names)
+    found = summarise(seeds, "ate", {name: name[0] for name in names})
+    assert found.mean == pytest.approx(2.002) == found.median and found.groups == 2
+    # The means of the groups are 1.002 and 3.002; their standard error is 1.
+    assert found.interval == pytest.approx((2.002 - 12.7062, 2.002 + 12.7062), rel=1e-5)
+    assert summarise(seeds, "ate", dict.fromkeys(names, "one")).interval is None
+    assert summarise(seeds, "rte", ALONE).mean is None
+
+
+def test_seeds_are_averaged_over_the_sequences_that_all_have():
+    """Or ± would be of the walk that one seed lacks."""
+    found = summarise(seeds_of([[1.0, 2.0, 9.0], [3.0, 4.0]]), "ate", ALONE)
+    assert found.seeds == [1.5, 3.5] and found.mean == 2.5 and found.std == pytest.approx(2**0.5)
+    whole = seeds_of([[1.0, 2.0], [3.0, 4.0]])
+    whole[1]["a"] = measures(ate=None)
+    assert summarise(whole, "ate", ALONE).seeds == [2.0, 4.0]
+
+
+@pytest.mark.parametrize(
+    "ates, median",
+    [
+        ([[1.0, 2.0], [3.0, LOST]], 2.5),
+        ([[1.0, LOST], [3.0, LOST]], np.inf),
+        ([[LOST, LOST], [1.0, 1.0]], np.inf),
+        ([[LOST, LOST], [LOST, LOST]], np.inf),
+    ],
+)
+def test_the_median_is_infinite_where_half_diverged(ates, median):
+    assert summarise(seeds_of(ates), "ate", ALONE).median == median
+
+
+# Differences
+# --------------------------------------------------------------------------------------------------
+
+
+def test_a_difference_by_hand():
+    """Means over seeds 2, 2, 5 against 1.5 each: −0.5, −0.5, −3.5, of a standard error of 1."""
+    first = seeds_of([[1.0, 2.0, 6.0], [3.0, 2.0, 4.0]])
+    found = compare(seeds_of([[1.0, 1.0, 1.0], [2.0, 2.0, 2.0]]), first, "ate", ALONE)
+    assert found.mean == pytest.approx(-1.5) and found.gain == pytest.approx(50.0)
+    reach = 4.30265  # t of two degrees of freedom
+    assert found.interval == pytest.approx((-1.5 - reach, -1.5 + reach), rel=1e-5)
+    assert (found.better, found.compared, found.sequences, found.groups) == (3, 3, 3, 3)
+
+
+def test_sequences_are_paired_by_name():
+    """The second row lacks a sequence and has another: what both have is compared, in any order."""
+    first, second = seeds_of([[9.0, 2.0, 4.0]]), seeds_of([[50.0, 2.0, 1.0]], "hcb")
+    found = compare(second, first, "ate", ALONE)
+    assert (found.compared, found.sequences) == (2, 4)
+    assert found.mean == pytest.approx(-1.5) and found.gain == pytest.approx(50.0)
+    # −1 and −2: a standard error of 0.5, and one degree of freedom.
+    assert found.interval == pytest.approx((-1.5 - 6.3531, -1.5 + 6.3531), rel=1e-4)
+    found = compare(seeds_of([[1.0]], "h"), first, "ate", ALONE)
+    assert (found.mean, found.gain, found.interval, found.compared) == (None, None, None, 0)
+
+
+def test_rows_that_diverged_in_other_sequences_are_no_better_than_each_other():
+    """Equal errors in every sequence that both finished."""
+    pair = seeds_of([[LOST, 2.0, 9.0, 4.0]]), seeds_of([[1.0, 2.0, LOST, 4.0]])
+    for first, second in (pair, pair[::-1]):
+        found = compare(second, first, "ate", ALONE)
+        assert (found.compared, found.sequences) == (2, 4)
+        assert found.gain == 0 and found.mean == 0 and found.interval == (0, 0)
+
+
+@pytest.mark.parametrize("seeds", [1, 3])
+@pytest.mark.parametrize("share", [1.0, 0.5])
+def test_a_row_is_never_better_for_having_diverged(seeds, share):
+    """Its hardest sequence diverges with one seed; its other errors are as small or smaller."""
+    ates = np.array([1.0, 2.0, 3.0, 40.0])
+    wrong = np.tile(share * ates, (seeds, 1))
+    wrong[0, 3] = LOST
+    first, own = seeds_of([list(ates)] * seeds), seeds_of(wrong.tolist())
+    found = compare(own, first, "ate", ALONE)
+    assert found.compared == 3 and found.withheld == (share < 1)
+    assert (found.mean, found.interval) == ((0, (0, 0)) if share == 1 else (None, None))
+    back = compare(first, own, "ate", ALONE)  # the other way about it may lose
+    assert back.gain == pytest.approx(100 * (1 - 1 / share))
+    assert back.mean == pytest.approx((1 - share) * 2)
+
+
+def test_of_rows_with_different_numbers_of_seeds_the_shares_that_diverged_count():
+    """One of four against one of eight: the smaller number of divergences is the larger share."""
+    first = seeds_of([[1.0, 2.0, 3.0, LOST], [1.0, 2.0, 3.0, 4.0]])
+    assert compare(seeds_of([[0.5, 1.0, 1.5, LOST]]), first, "ate", ALONE).withheld
+    twice = seeds_of([[1.0, 2.0, 3.0, LOST]])
+    assert not compare(seeds_of([[0.5, 1.0, 1.5, LOST]] * 2), twice, "ate", ALONE).withheld
+
+
+def test_better_is_nearer_to_the_best_value():
+    """Each seed for itself: 0.7 and 1.4 are no 1.05."""
+    first, own = seeds_of([[0.7], [1.4]]), seeds_of([[0.9]])
+    assert compare(own, first, "ate", ALONE, best=1.0).better == 1
+    assert compare(first, own, "ate", ALONE, best=1.0).better == 0
+
+
+def test_other_metrics_of_a_lost_estimate_are_in_no_difference():
+    """Although they may have values."""
+    own = [{"a": measures(ate=LOST, rpe=0.1), "b": measures(ate=1.0, rpe=0.2)}]
+    first = [{"a": measures(ate=1.0, rpe=0.5), "b": measures(ate=2.0, rpe=0.1)}]
+    found = compare(own, first, "rpe", ALONE)
+    assert found.compared == 1 and found.mean == pytest.approx(0.1)

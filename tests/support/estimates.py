@@ -4,10 +4,13 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from gnio_jax.evaluation import Estimate, Trajectory
+from gnio_jax.evaluation.report import DEFINITIONS
 
 SETTINGS = {
     "dataset": "made",
+    "data_root": None,
     "split": "test",
+    "recordings": {},
     "estimator": "ekf",
     "coupling": "tight",
     "orientation_source": "filter",
@@ -15,6 +18,7 @@ SETTINGS = {
     "gyro_bias": "zero",
     "imu_compensated": "no",
     "alignment": "origin",
+    "definitions": DEFINITIONS,
 }
 
 

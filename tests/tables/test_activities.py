@@ -23,7 +23,7 @@ def test_figures_of_windows_by_hand():
     predicted = activities.PredictedWindows(
         np.zeros((2, 3)),
         np.array([[0.3, 0, 0.4], [0.0, 0.1, 0]]),
-        np.full((2, 3), np.log(0.1)),
+        np.full((2, 3), 0.1),
         {"gate": np.array([[-0.2, 0.4, 9.0], [1.0, 1.0, 9.0]]), "attention": attention},
         np.array([0, 2]),
     )

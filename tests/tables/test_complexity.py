@@ -2,7 +2,9 @@
 
 import pytest
 
-from gnio_jax.tables import complexity
+from gnio_jax import models
+from gnio_jax.reporting import Lines
+from gnio_jax.tables import make
 
 
 def multiply_adds(convolutions, dense, padding):
@@ -45,10 +47,19 @@ def test_complexity_against_a_hand_count(network, parameters, published):
         published, rel=2e-3
     )
     by_hand = multiply_adds([*encoder(), *convolutions], dense, padding=False)
-    found = complexity.measure(network, batches=(1,), seconds=0.05)
+    found = make.measure(network, batches=(1,), seconds=0.05)
     assert found.parameters == parameters
     assert 1e9 * found.gflops == pytest.approx(
         2 * by_hand, rel=0.02
     )  # additions, ReLUs and the like besides
     assert found.latency[1] > 0
-    assert network in complexity.markdown([found], "a machine")
+
+
+def test_the_table_names_every_network(tmp_path, monkeypatch):
+    monkeypatch.setattr(
+        make, "measure", lambda name: make.Complexity(name, 5, float("nan"), {1: 2.0, 128: 0.5})
+    )
+    text = make.make_complexity(tmp_path, Lines())
+    assert "| gnio | 5 | – | 2.00 | 0.50 | 4.90 M | 0.08 |" in text
+    assert set(make.NETWORKS) == set(models.names())
+    assert (tmp_path / "complexity.md").read_text(encoding="utf-8") in text

@@ -8,7 +8,7 @@ from gnio_jax import config as configuration
 from gnio_jax.config import LossConfig
 from gnio_jax.tables import experiments
 from gnio_jax.training.task import create_model
-from tests.support.tables import BASE
+from tests.support.reports import BASE
 
 
 @pytest.mark.parametrize(
@@ -17,7 +17,6 @@ from tests.support.tables import BASE
         experiments.components,
         experiments.gates,
         experiments.bank_sizes,
-        experiments.bank_spread,
         lambda base: experiments.comparison(base, "test"),
     ],
 )
@@ -45,25 +44,6 @@ def test_rows_differ_in_the_network_alone(make):
     assert len(set(map(str, seen.values()))) == len(seen)
 
 
-def test_remedies_change_the_uncertainty_alone():
-    """The constant comes from the validation split: the heads beside it are calibrated there too,
-    but for the published one."""
-    constant, calibrated, likelihood, published = (
-        cell.config for cell in experiments.remedies(BASE).cells
-    )
-    assert [c.model.uncertainty for c in (constant, calibrated, likelihood)] == [
-        "constant",
-        "calibrated",
-        "calibrated",
-    ]
-    assert create_model(published).uncertainty == "head"
-    assert (published.loss.nll_weight, likelihood.loss.nll_weight) == (1e-4, 1.0)
-    assert dataclasses.replace(likelihood, loss=published.loss) == calibrated
-    for row in (constant, calibrated):
-        assert create_model(row) is not None
-        assert dataclasses.replace(row, model=published.model) == published
-
-
 @pytest.mark.parametrize(
     "epochs, batch, held",
     [(200, 128, 10), (200, 1024, 10), (24, 1024, 10), (24, 128, 1.25), (8, 1024, 4), (2, 512, 1)],
@@ -82,8 +62,6 @@ def test_cells_of_one_name_are_one_run_in_every_table():
             experiments.components,
             experiments.gates,
             experiments.bank_sizes,
-            experiments.bank_spread,
-            experiments.remedies,
         )
     ]
     made = [

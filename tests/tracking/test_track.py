@@ -15,7 +15,6 @@ from gnio_jax.config import DataConfig, ModelConfig, TrainConfig
 from gnio_jax.data.hdf5 import write_hdf5
 from gnio_jax.data.resampling import resample
 from gnio_jax.evaluation.trajectory import read_tum
-from gnio_jax.tracking import picture
 from gnio_jax.tracking.summary import Summary, _warnings
 from gnio_jax.types import Sequence
 from tests.support import bag_files, known_walk, logger_files, tiny_run
@@ -225,15 +224,6 @@ def test_an_out_that_cannot_be_written_is_found_first(mistake, runs, tmp_path, m
     walk = logger_files.zipped(tmp_path / "walk.zip", logger_files.sensor_logger())
     given = ("track", walk, "--weights", runs / "walker", "--out")
     assert f"{tmp_path / 'walk.zip'}: " in mistake(*given, walk / "track")
-
-
-def test_an_ellipse_is_the_contour_of_its_covariance():
-    covariance = np.array([[4.0, 1.5], [1.5, 1.0]])
-    shape = picture.ellipse(np.array([2.0, -1.0]), covariance, sigmas=3.0)
-    contour = shape.get_transform().transform(shape.get_path().vertices) - [2.0, -1.0]
-    distance = np.einsum("ki,ij,kj->k", contour, np.linalg.inv(covariance), contour)
-    on_curve = distance[:-1][::3]  # the points of its splines that are no control points
-    np.testing.assert_allclose(on_curve, 9.0, rtol=1e-6)
 
 
 def test_the_line_says_what_is_counted():

@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 import yaml
 
-from gnio_jax import calibration, models
+from gnio_jax import calibration
 from gnio_jax import config as configuration
 from gnio_jax.calibration import run as calibration_run
-from gnio_jax.comparison import figures
 from gnio_jax.config import CalibrateConfig, DataConfig, ModelConfig, OptimConfig, TrainConfig
 from gnio_jax.errors import InputError
-from gnio_jax.tables import complexity
+from gnio_jax.evaluation import kept
 from gnio_jax.training import loop
 from tests.support.command_lines import run as gnio
 from tests.support.tlio_files import write_sequence
@@ -45,35 +44,22 @@ def test_a_table_from_nothing_and_again_without_training(made, monkeypatch, caps
     gnio("tables", "comparison", *arguments)
     text = (root / "out" / "comparison_test_integrate.md").read_text(encoding="utf-8")
     assert "2 seeds" in text and "| gnio |" in text and text in capsys.readouterr().out
-    table = list(
-        csv.DictReader((root / "out" / "comparison_test_integrate.csv").open(encoding="utf-8"))
-    )
-    seeds = [
-        json.loads(
-            (
-                root
-                / "out"
-                / "runs"
-                / f"gnio_s{seed}"
-                / "eval"
-                / "tlio_test_integrate"
-                / "metrics.json"
-            ).read_text()
-        )
+    with (root / "out" / "comparison_test_integrate.csv").open(encoding="utf-8") as file:
+        (line,) = (row for row in csv.DictReader(file) if row["metric"] == "ate")
+    folders = [
+        root / "out" / "runs" / f"gnio_s{seed}" / "eval" / "tlio_test_integrate"
         for seed in range(2)
     ]
-    assert float(table[0]["ate"]) == pytest.approx(np.mean([seed["mean"]["ate"] for seed in seeds]))
-    assert float(table[0]["ate_std"]) == pytest.approx(
-        np.std([seed["mean"]["ate"] for seed in seeds], ddof=1)
-    )
-    assert seeds[0]["mean"]["ate"] != seeds[1]["mean"]["ate"]
+    ates = [json.loads((each / "metrics.json").read_text())["mean"]["ate"] for each in folders]
+    assert float(line["mean"]) == pytest.approx(np.mean(ates)) and ates[0] != ates[1]
+    assert float(line["std"]) == pytest.approx(np.std(ates, ddof=1))
     assert (root / "out" / "comparison_test_integrate.png").read_bytes()[:4] == b"\x89PNG"
 
     def never(*_, **__):
         raise AssertionError("done already")
 
     monkeypatch.setattr(loop, "train_seeds", never)
-    monkeypatch.setattr(figures.evaluation, "evaluate", never)
+    monkeypatch.setattr(kept, "evaluate", never)
     (root / "out" / "comparison_test_integrate.md").unlink()
     gnio("tables", "comparison", *arguments)
     assert (root / "out" / "comparison_test_integrate.md").read_text(encoding="utf-8") == text
@@ -119,7 +105,10 @@ def test_every_run_is_calibrated_before_it_is_measured(made, monkeypatch, capsys
         (root / "out" / f"comparison_test_ekf{name}.csv").read_text()
         for name in ("", "_calibrated")
     )
-    (before,), (after,) = (list(csv.DictReader(text.splitlines())) for text in (plain, calibrated))
+    before, after = (
+        {row["metric"]: row["mean"] for row in csv.DictReader(text.splitlines())}
+        for text in (plain, calibrated)
+    )
     trained, run = (
         configuration.load(root / "out" / "runs" / name / "config.yaml")
         for name in ("gnio_s0", "gnio_s0_calibrated")
@@ -150,7 +139,3 @@ def test_a_signal_ends_the_table_and_says_how_to_go_on(made, monkeypatch, capsys
 def test_mistakes_are_named(made, more, words):
     with pytest.raises(InputError, match=words):
         gnio("tables", "comparison", *made[1], *more)
-
-
-def test_every_network_has_a_colour_and_a_place_in_the_tables():
-    assert set(complexity.NETWORKS) == set(models.names())

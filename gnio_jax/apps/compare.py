@@ -1,0 +1,321 @@
+"""Runs side by side: what a change has changed, sequence by sequence, and how sure that is.
+
+find (the evaluations that the rows name) → check → make what is missing → compare → text
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from gnio_jax.config import CompareConfig, EvaluateConfig
+from gnio_jax.errors import InputError
+from gnio_jax.evaluation import kept, statistics, tabulate
+from gnio_jax.evaluation.kept import IDENTITY
+from gnio_jax.evaluation.metrics import NAMES
+from gnio_jax.evaluation.report import REMEDY, Report, read
+from gnio_jax.evaluation.statistics import Cell
+from gnio_jax.files import with_ending
+from gnio_jax.reporting import Lines, Reporter
+
+USUAL = ("ate", "rpe_1s", "yaw_rmse", "path_length_ratio", "nis", "nees")
+"""Metrics that are compared where none are named."""
+HEADER = ("metric", "row", "mean", "difference (95 %)", "better in")
+SUMMED = "integrate"
+"""The estimator that has no filter."""
+SEED = re.compile(r"_s(\d+)(?=(_calibrated)?$)")
+"""In the name of a run."""
+
+
+class Source(NamedTuple):
+    """An evaluation of a row: one that is there, or that of a run."""
+
+    path: Path
+    """As it was named."""
+    run: Path
+    folder: Path
+    identity: dict[str, Any]
+    """Of `kept.IDENTITY`."""
+    asked: kept.Kept | None
+    """Of a run that is named, how it is evaluated."""
+
+
+class Row(NamedTuple):
+    """One configuration, with its seeds."""
+
+    label: str
+    runs: list[str]
+    """Their names."""
+    reports: list[Report]
+
+    @property
+    def seeds(self) -> list[statistics.Scores]:
+        return [report.scores for report in self.reports]
+
+    @property
+    def way(self) -> str:
+        """How its trajectories are estimated."""
+        return " and ".join(dict.fromkeys(tabulate.way(each.settings) for each in self.reports))
+
+
+class Comparison(NamedTuple):
+    """What a comparison shows."""
+
+    rows: list[Row]
+    groups: dict[str, str]
+    """Sequence → person or session."""
+    cells: dict[str, list[Cell]]
+    """Metric → a cell for each row."""
+
+
+def compare(
+    config: CompareConfig, reporter: Reporter | None = None, workers: int = 1
+) -> Comparison:
+    """Read the rows' evaluations, make those that are missing, and compare them.
+
+    `workers` processes read recordings that are slow to read. Raises `InputError` for rows that
+    cannot be compared and metrics that none of them has, before it evaluates where that can be
+    known.
+    """
+    reporter = reporter or Lines()
+    if config.metrics == ():
+        raise InputError("--metrics", "names no metric", "leave it out for the usual ones")
+    for word in config.metrics or ():
+        if word not in NAMES:
+            remedy = f"name RUNS before it; there are: {', '.join(NAMES)}"
+            raise InputError("--metrics", f"no metric '{word}'", remedy)
+    if len(config.rows) < 2:
+        remedy = "name the run to compare with first, and all of them before --metrics"
+        raise InputError("RUNS", "needs two or more", remedy)
+    found = [[_source(path, config) for path in find(word)] for word in config.rows]
+    sources = [source for row in found for source in row]
+    _check_sources(sources)
+    rows = [
+        Row(
+            label,
+            [source.run.name for source in row],
+            [
+                kept.made(each.asked, reporter, workers) if each.asked else read(each.folder)
+                for each in row
+            ],
+        )
+        for label, row in zip(_labels(config.rows), found, strict=True)
+    ]
+    reports = [report for row in rows for report in row.reports]
+    _check_recordings([source.folder for source in sources], reports)
+    groups = {name: group for report in reports for name, group in report.groups.items()}
+    cells = {
+        metric: statistics.cells(
+            [row.seeds for row in rows], metric, groups, tabulate.column(metric).best
+        )
+        for metric in _metrics(rows, config.metrics)
+    }
+    return Comparison(rows, groups, cells)
+
+
+def _metrics(rows: list[Row], wanted: tuple[str, ...] | None) -> list[str]:
+    """Those that are wanted; by default the usual ones that some row has."""
+    seeds = [scores for row in rows for scores in row.seeds]
+    there = {metric for scores in seeds for own in scores.values() for metric in own.values}
+    for metric in wanted or ():
+        if metric not in there:
+            has = ", ".join(name for name in NAMES if name in there)
+            raise InputError("--metrics", f"no row has '{metric}'", f"there are: {has}")
+    return list(wanted) if wanted else [metric for metric in USUAL if metric in there]
+
+
+# The evaluations
+# --------------------------------------------------------------------------------------------------
+
+
+def find(word: str) -> list[Path]:
+    """The runs, or folders of evaluations, that `word` names: itself, or the seeds of it.
+
+    A name without a seed stands for all its seeds, in their order: `runs/gnio` for `runs/gnio_s0`,
+    `runs/gnio_s1` and so on, `runs/gnio_calibrated` for `runs/gnio_s0_calibrated` and so on. Raises
+    `InputError` where there is nothing, where some seeds have such a path and others do not, and
+    where two have the same number.
+    """
+    path = Path(word)
+    if path.exists():
+        return [path]
+    seeds: dict[int, Path] = {}
+    parent = next((folder for folder in path.parents if folder.exists()), path.parent)
+    name, *rest = path.relative_to(parent).parts
+    for run in sorted(path.parent for path in parent.glob("*/config.yaml")):
+        seed = SEED.search(run.name)
+        if seed and run.name[: seed.start()] + run.name[seed.end() :] == name:
+            if other := seeds.get(int(seed[1])):
+                raise InputError(word, f"has a seed twice: {other}, {run}", "rename one")
+            seeds[int(seed[1])] = run
+    paths = [seeds[seed].joinpath(*rest) for seed in sorted(seeds)]
+    missing = [each for each in paths if not each.exists()]
+    if missing and len(missing) < len(paths):
+        problem = f"is there for {len(paths) - len(missing)} of {len(paths)} seeds"
+        raise InputError(word, problem, f"missing: {', '.join(map(str, missing))}")
+    if not paths or missing:
+        remedy = "name a run, the folder of an evaluation, or a run of several seeds without _s0"
+        if "eval" in path.parts:
+            remedy = "make it with gnio evaluate, whose help names the options"
+        raise InputError(word, "is not there", remedy)
+    return paths
+
+
+def _source(path: Path, config: CompareConfig) -> Source:
+    """The evaluation of a run with all options as by default, or the one that is named itself."""
+    if (path / "config.yaml").is_file():
+        asked = kept.look(
+            EvaluateConfig(
+                str(path),
+                data_root=config.data_root,
+                split=config.split,
+                estimator=config.estimator,
+                plots=False,
+            )
+        )
+        return Source(path, path, asked.folder, asked.identity, asked)
+    report = read(path)
+    run = Path(os.path.abspath(path)).parent.parent
+    if path.resolve().parent.name == "eval" and (problem := kept.out_of_date(report, run)):
+        raise InputError(path, problem, REMEDY)
+    return Source(path, run, path, {name: report.settings.get(name) for name in IDENTITY}, None)
+
+
+def _check_sources(sources: list[Source]) -> None:
+    """Raise `InputError` where an evaluation stands twice, and where rows are of other recordings
+    or measured in another way."""
+    taken: dict[Path, Path] = {}
+    first = sources[0]
+    for source in sources:
+        if other := taken.get(source.folder.resolve()):
+            same = source.path == other
+            problem = "is named twice" if same else f"is the same evaluation as {other}"
+            raise InputError(source.path, problem, "name each once")
+        taken[source.folder.resolve()] = source.path
+    for source in sources:
+        for name, own in source.identity.items():
+            if own == first.identity[name]:
+                continue
+            words = name.replace("_", " ")
+            remedy = f"compare evaluations of one {words}"
+            split = next((each.identity["split"] for each in sources if each.asked is None), "")
+            if name == "split" and split:
+                remedy = f"give --split {split} for the runs, or {remedy}"
+            problem = f"is of {words} {own}, the first row of {first.identity[name]}"
+            raise InputError(source.path, problem, remedy)
+
+
+def _check_recordings(folders: list[Path], reports: list[Report]) -> None:
+    """Raise `InputError` where recordings of one name have other lengths, or belong to different
+    people or sessions: the seeds of a row are compared too."""
+    known: dict[str, tuple[Path, str, float]] = {}
+    for folder, report in zip(folders, reports, strict=True):
+        for name, group in report.groups.items():
+            seconds = report.settings["recordings"][name]
+            first, *other = known.setdefault(name, (folder, group, seconds))
+            remedy = f"evaluate it again, or {first}"
+            if group != other[0]:
+                problem = f"sequence {name} is of {group} here, of {other[0]} in {first}"
+                raise InputError(folder, problem, remedy)
+            if abs(seconds - other[1]) > 0.01:
+                problem = f"sequence {name} takes {seconds:g} s here, {other[1]:g} s in {first}"
+                raise InputError(folder, problem, remedy)
+
+
+def _labels(words: tuple[str, ...]) -> list[str]:
+    """The rows' names without the folders that all begin with, and those that all end with."""
+    paths = [Path(os.path.abspath(word)) for word in words]
+    common = os.path.commonpath([path.parent for path in paths])
+    parts = [path.relative_to(common).parts for path in paths]
+    while len({each[-1] for each in parts}) == 1 and all(len(each) > 1 for each in parts):
+        parts = [each[:-1] for each in parts]
+    return [str(Path(*each)) for each in parts]
+
+
+# Text
+# --------------------------------------------------------------------------------------------------
+
+
+def title(found: Comparison) -> str:
+    """Recordings, how the trajectories are estimated, and the first row."""
+    ways, settings = {row.way for row in found.rows}, found.rows[0].reports[0].settings
+    how = f", {ways.pop()}" if len(ways) == 1 else ""
+    head = f"{settings['dataset']} {settings['split']}{how}"
+    return f"{head}; differences to {found.rows[0].label}, paired by sequence"
+
+
+def lines(found: Comparison) -> list[list[str]]:
+    """The cells of `HEADER`: each metric's rows one below the other."""
+    table = []
+    for metric, cells in found.cells.items():
+        column = tabulate.column(metric)
+        for place, (row, (mean, difference)) in enumerate(zip(found.rows, cells, strict=True)):
+            compared = difference and difference.compared and not difference.withheld
+            table.append(
+                [
+                    "" if place else column.title,
+                    row.label,
+                    tabulate.mean(mean, column.digits),
+                    tabulate.difference(difference, column.digits),
+                    f"{difference.better} of {difference.compared}" if compared else "",
+                ]
+            )
+    return table
+
+
+def explanations(found: Comparison) -> list[str]:
+    """What a reader must know of the figures."""
+    rows, cells = found.rows, [cell for of in found.cells.values() for cell in of]
+    said = ["One seed each: what another seed would give is not known."]
+    if any(len(row.runs) > 1 for row in rows):
+        seeds = "; ".join(
+            f"{row.label}: {', '.join(row.runs) if len(row.runs) > 1 else 'one'}" for row in rows
+        )
+        said = [f"Seeds of {seeds}. ± is their standard deviation."]
+    if len({row.way for row in rows}) > 1:
+        ways = "; ".join(f"{row.label}: {row.way}" for row in rows)
+        said.append(f"The rows are not estimated alike. {ways}.")
+    if options := filter_options(found):
+        said.append(f"The rows differ in options of the filter: {', '.join(options)}.")
+    return said + tabulate.marks(cells)
+
+
+def filter_options(found: Comparison) -> list[str]:
+    """Names of the filter's options in which a row differs from the first, where both have one."""
+    first, *others = (
+        [each.settings["filter"] for each in row.reports if each.settings["estimator"] != SUMMED]
+        for row in found.rows
+    )
+    pairs = [(own, other) for row in others for own in first for other in row]
+    return sorted({x for own, other in pairs for x in own | other if own.get(x) != other.get(x)})
+
+
+def write(path: Path, found: Comparison) -> None:
+    """`path`.md, `path`.csv and `path`.png."""
+    from gnio_jax.evaluation import plots  # Matplotlib takes a second to import
+
+    text = f"{title(found)}\n\n{tabulate.markdown(HEADER, lines(found))}\n"
+    text += "\n\n".join(explanations(found))
+    settings = found.rows[0].reports[0].settings
+    table = [
+        {
+            "dataset": settings["dataset"],
+            "split": settings["split"],
+            "estimated": row.way,
+            "metric": metric,
+            "row": row.label,
+            "seeds": len(row.runs),
+            **tabulate.plain(cell),
+        }
+        for metric, cells in found.cells.items()
+        for row, cell in zip(found.rows, cells, strict=True)
+    ]
+    tabulate.write(path, text, table)
+    drawn = [metric for metric, cells in found.cells.items() if any(c.mean.seeds for c in cells)]
+    rows = {row.label: row.seeds for row in found.rows}
+    metric = next(iter(drawn or found.cells))
+    picture = plots.paired(rows, metric, found.groups, tabulate.column(metric).title)
+    picture.axes[0].set_title(f"{settings['dataset']} {settings['split']}", fontsize=11)
+    plots.save(with_ending(path, ".png"), picture)

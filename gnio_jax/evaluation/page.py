@@ -1,0 +1,416 @@
+"""The page of an evaluation or a track: one file, which a browser opens without a network.
+
+It has a map, strips over time, a slider and the table of measures. Bokeh draws the figures from
+columns which the selector of sequences exchanges (`page.js`). Bokeh is imported here, so import
+this module only where a page is written.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from importlib import resources
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from bokeh.document import Document
+from bokeh.embed import components
+from bokeh.layouts import gridplot
+from bokeh.models import ColumnDataSource, CustomJS, DataRange1d, Range1d
+from bokeh.plotting import figure as new_figure
+from bokeh.resources import Resources
+from jaxtyping import Float
+from jinja2 import Environment
+
+from gnio_jax.errors import InputError
+from gnio_jax.evaluation import plots, tabulate
+from gnio_jax.evaluation.estimators.result import Estimate
+from gnio_jax.evaluation.plots import AXES, BLUE, COLOURS, GREEN, VERMILION, View
+from gnio_jax.evaluation.report import Report, read, read_trajectories
+from gnio_jax.evaluation.tabulate import COLUMNS
+from gnio_jax.files import write_text
+
+ROWS, FEWEST_ROWS = 9000, 150
+"""Rows that a page holds, over all runs and sequences, and those that a sequence has at least.
+Fifteen minutes at ten rows a second are whole; what is longer is thinned."""
+SAME = ("dataset", "split", "data_root", "recordings", "model", "checkpoint", "step")
+"""Settings in which evaluations are alike that stand side by side; `imu_only` has no network, and
+only the first four."""
+STRIPS = {"gate": "gate γ (–)", "scale": "scale (–)", "std": "σ of network (m)"}
+"""Curves with a value for each axis of the window's yaw frame, and their labels."""
+LEVELS = (("mean", 3.0, GREEN), ("refused above", 11.345, VERMILION))
+"""Of the NIS of three axes: the mean of χ², and what the filter refuses by default."""
+MAP_HEIGHT, STRIP_HEIGHT, LABEL_HEIGHT, LEFT = 560, 158, 30, 62
+LONG = 1e6
+"""Longer than a recording, s."""
+GO_THERE = """
+const slider = document.getElementById("time");
+slider.value = cb_obj.x;
+slider.dispatchEvent(new Event("input"));
+"""
+"""A tap on a strip moves the slider."""
+Figures = Mapping[str, float | None]
+"""Metric → value: None where it is not defined, infinite where the estimate diverged."""
+Columns = dict[str, Float[np.ndarray, "k"]]
+"""What the figures draw of a sequence, by name."""
+
+
+class Run(NamedTuple):
+    """One run on the page."""
+
+    name: str
+    """Short: what tells it from the other runs."""
+    about: dict[str, str]
+    """How the figures were made, in words: the command, alignment, orientation, ..."""
+    views: list[View]
+    figures: dict[str, Figures]
+    """By sequence."""
+    summary: dict[str, Figures] = {}
+    """Row below the sequences (mean, median, ...) → its metrics."""
+    remarks: tuple[str, ...] = ()
+    """What a reader should know."""
+    settings: str = ""
+    """Everything that was configured, as text of several lines."""
+
+
+# What the page shows of an evaluation
+# --------------------------------------------------------------------------------------------------
+
+
+def of_report(
+    report: Report, views: list[View], command: str = "", settings: str = "", name: str = ""
+) -> Run:
+    """An evaluation; `settings` is the configuration of its run."""
+    made, own = report.settings, report.summary()
+    rows = {
+        "mean": {metric: of.mean for metric, of in own.items()},
+        "median": {metric: of.median for metric, of in own.items()},
+    }
+    for row in report.reference_rows:
+        means = {metric: of.mean for metric, of in report.summary(row).items()}
+        rows[row.replace("_", " ")] = means
+    recordings = {"recordings": f"{made['dataset']}, split {made['split']}"}
+    return Run(
+        name or tabulate.way(made),
+        ({"command": command} if command else {}) | recordings | tabulate.about(made),
+        views,
+        {sequence: measures.values for sequence, measures in report.scores.items()},
+        rows,
+        tuple(tabulate.remarks(report)),
+        settings,
+    )
+
+
+def of_folder(folder: Path, report: Report, name: str) -> Run:
+    """An evaluation that was read back: its paths and figures, without what network and filter gave
+    over time."""
+    paths = read_trajectories(folder, list(report.scores))
+    alignment = report.settings["alignment"]
+    views = [plots.view(Estimate(sequence, *own), alignment) for sequence, own in paths.items()]
+    return of_report(report, views, name=name)
+
+
+def beside(folder: Path, settings: Mapping[str, Any]) -> list[Run]:
+    """The other evaluations of the same recordings by the same network, beside `folder`. What
+    cannot be read, or was measured otherwise, is left away."""
+    found: dict[str, Run | None] = {tabulate.way(settings): None}
+    for other in sorted(path.parent for path in folder.parent.glob("*/metrics.json")):
+        try:
+            report = read(other)
+            own = report.settings
+            same = SAME if own["estimator"] != "imu_only" else SAME[:4]
+            if other != folder and all(own.get(name) == settings.get(name) for name in same):
+                name = other.name if tabulate.way(own) in found else tabulate.way(own)
+                found[name] = of_folder(other, report, name)
+        except (InputError, OSError):
+            continue
+    return [run for run in found.values() if run is not None]
+
+
+# The file
+# --------------------------------------------------------------------------------------------------
+
+
+def write(path: Path, title: str, runs: list[Run]) -> None:
+    """Write the page of some runs of the same recordings, whole or not at all.
+
+    The first run gives the sequences and the curves of network and filter; of the others there are
+    paths, errors and figures. At most `len(COLOURS)` runs are shown.
+    """
+    write_text(path, render(title, runs[: len(COLOURS)]))
+
+
+def render(title: str, runs: list[Run]) -> str:
+    """The page as text. It loads nothing, and its policy forbids it to."""
+    sequences = [seen.name for seen in runs[0].views]
+    rows = max(FEWEST_ROWS, ROWS // (len(runs) * len(sequences)))
+    document, names = _document(runs, [_held(run, sequences, rows) for run in runs])
+    script, figures = components(document.roots)
+    shown = [x for x in COLUMNS if any(x in own for run in runs for own in run.figures.values())]
+    page = Environment(autoescape=True).from_string(_file("page.html"))
+    about = runs[0].about
+    return page.render(
+        title=title,
+        subtitle="; ".join(f"{name}: {text}" for name, text in about.items() if name != "command"),
+        command=about.get("command"),
+        sequences=sequences,
+        runs=[run._asdict() | {"colour": COLOURS[place]} for place, run in enumerate(runs)],
+        headings=[COLUMNS[metric] for metric in shown],
+        measures=_measures(runs, sequences, shown),
+        figures=dict(zip(names, figures, strict=True)),
+        library=Resources(mode="inline", components=["bokeh"]).render_js(),
+        script=script,
+    )
+
+
+def _measures(runs: list[Run], sequences: list[str], shown: list[str]) -> list[dict[str, Any]]:
+    """A line for each sequence and run, then those about all sequences. `place` is that of the
+    sequence among the page's."""
+    below = dict.fromkeys(name for run in runs for name in run.summary)
+    lines = [(place, name, "figures") for place, name in enumerate(sequences)]
+    return [
+        {
+            "place": place,
+            "name": name,
+            "run": run.name,
+            "colour": colour,
+            "cells": [tabulate.number(values.get(x), COLUMNS[x].digits) for x in shown],
+        }
+        for place, name, part in [*lines, *((None, name, "summary") for name in below)]
+        for run, colour in zip(runs, COLOURS, strict=False)
+        if (values := getattr(run, part).get(name)) is not None
+    ]
+
+
+def _file(name: str) -> str:
+    return resources.files(__package__).joinpath(name).read_text(encoding="utf-8")
+
+
+# Columns
+# --------------------------------------------------------------------------------------------------
+
+
+def _held(run: Run, sequences: list[str], rows: int) -> list[Columns]:
+    """The columns of each sequence, of one set of names; a row of NaN where the run lacks it."""
+    found = {seen.name: columns(seen, rows) for seen in run.views}
+    names = dict.fromkeys(name for own in found.values() for name in own)
+    held = []
+    for own in (found.get(sequence, {}) for sequence in sequences):
+        nothing = np.full(len(own.get("time", "-")), np.nan, np.float32)
+        held.append({name: own.get(name, nothing) for name in names})
+    return held
+
+
+def columns(seen: View, rows: int) -> Columns:
+    """The curves of a sequence in float32, in at most `rows` rows, evenly spaced in time."""
+    step = -(-len(seen.time) // rows)
+    path, reference = seen.position, seen.reference
+    found = {
+        "time": seen.time,
+        "x": path[:, 0],
+        "y": path[:, 1],
+        "reference_x": reference[:, 0],
+        "reference_y": reference[:, 1],
+        "error": np.linalg.norm((path - reference)[:, :2], axis=1),
+        "distance": walked(reference if seen.known else path, seen.time, seen.step),
+        **plots.ellipses(seen.covariance)._asdict(),
+    }
+    for name in STRIPS:
+        values = getattr(seen, name)
+        if np.isfinite(values).any():
+            found |= {f"{name}_{axis}": values[:, k] for k, axis in enumerate(AXES)}
+    found = {name: values[::step] for name, values in found.items()}
+    if np.isfinite(seen.nis).any():
+        # The largest of each `step` rows: a thinned curve keeps its peaks.
+        peaks = np.full(-(-len(seen.nis) // step) * step, -np.inf)
+        peaks[: len(seen.nis)] = np.where(np.isnan(seen.nis), -np.inf, seen.nis)
+        largest = peaks.reshape(-1, step).max(axis=1)
+        found["nis"] = np.where(np.isneginf(largest), np.nan, largest)
+    return {name: values.astype(np.float32) for name, values in found.items()}
+
+
+def walked(
+    position: Float[np.ndarray, "n 3"], time: Float[np.ndarray, "n"], step: float
+) -> Float[np.ndarray, "n"]:
+    """Horizontal distance along a path, m: through points 1 s apart, as `metrics.path_length`, so
+    that the noise of positions is not counted as walking. A stretch that is not known adds none."""
+    apart = max(1, round(1.0 / step))
+    corners = np.unique(np.append(np.arange(0, len(time), apart), len(time) - 1))
+    sides = np.linalg.norm(np.diff(position[corners, :2], axis=0), axis=1)
+    total = np.concatenate([[0.0], np.cumsum(np.nan_to_num(sides))])
+    return np.interp(time, time[corners], total)
+
+
+def frame(runs: list[Run], sequence: str) -> dict[str, list[float]]:
+    """Corners of what the map shows of a sequence: the paths of all runs, and the ellipses of the
+    first, which may reach over the paths by the size of these."""
+    views = [seen for run in runs for seen in run.views if seen.name == sequence]
+    parts = [part[:, :2] for seen in views for part in (seen.position, seen.reference)]
+    points = np.concatenate(parts)
+    points = points[np.isfinite(points).all(1)] if np.isfinite(points).any() else np.zeros((1, 2))
+    low, high = points.min(0), points.max(0)
+    size = max(float((high - low).max()), 1.0)
+    variance = np.diagonal(views[0].covariance, axis1=1, axis2=2)[:, :2]
+    reach = np.nan_to_num(plots.SIGMAS * np.sqrt(np.maximum(variance, 0.0)))
+    ends = [np.nan_to_num(views[0].position[:, :2] + side * reach) for side in (-1.0, 1.0)]
+    low = np.maximum(np.minimum(ends[0].min(0), low), low - size)
+    high = np.minimum(np.maximum(ends[1].max(0), high), high + size)
+    return {"x": [float(low[0]), float(high[0])], "y": [float(low[1]), float(high[1])]}
+
+
+# The figures
+# --------------------------------------------------------------------------------------------------
+
+
+class Sources(NamedTuple):
+    """What the figures draw; `page.js` puts the columns of another sequence in their place."""
+
+    paths: list[ColumnDataSource]
+    """Of each run; the first has the curves of network and filter too."""
+    marks: ColumnDataSource
+    """A row for each run, at the time of the slider."""
+    starts: ColumnDataSource
+    """Where each run begins."""
+    corners: ColumnDataSource
+    """Of the map."""
+
+
+def _document(runs: list[Run], held: list[list[Columns]]) -> tuple[Document, list[str]]:
+    """Bokeh's document, with the script that fills its figures when they are drawn, and the names
+    of its figures."""
+    colours, one = list(COLOURS[: len(runs)]), [1.0] * len(runs)
+    marks = ("time", "distance", "x", "y", "reference_x", "reference_y", "width", "height", "angle")
+    sources = Sources(
+        [ColumnDataSource({name: [1.0, 2.0] for name in of_run[0]}) for of_run in held],
+        ColumnDataSource(dict.fromkeys(marks, one) | {"colour": colours}),
+        ColumnDataSource({"x": one, "y": one, "colour": colours}),
+        ColumnDataSource({"x": [0.0, 1.0], "y": [0.0, 1.0]}),
+    )
+    first, there = sources.paths[0], held[0][0].keys()
+    known = any(seen.known for seen in runs[0].views)
+    times, distances = Range1d(0.0, 1.0), Range1d(0.0, 1.0)
+    drawn = [
+        (path, run.name, own) for path, run, own in zip(sources.paths, runs, colours, strict=True)
+    ]
+    figures: dict[str, Any] = {"map": _draw_map(drawn, sources, known)}
+    errors = [(path, "error", name, colour) for path, name, colour in drawn if known]
+    label = "error (m)" if known else "3σ (m)"
+    if known:
+        figures["distance"] = _draw_strip(sources, distances, label, errors, "distance", band=True)
+    strips = [_draw_strip(sources, times, label, errors, band=True)]
+    for name, label in STRIPS.items():
+        if f"{name}_x" in there:
+            curves = [(first, f"{name}_{axis}", axis, colour) for axis, colour in AXES.items()]
+            strips.append(_draw_strip(sources, times, label, curves))
+    if "nis" in there:
+        curve = [(first, "nis", "NIS", BLUE)]
+        strips.append(_draw_strip(sources, times, "NIS (–)", curve, levels=LEVELS))
+    strips[-1].xaxis.axis_label, strips[-1].height = "time (s)", STRIP_HEIGHT + LABEL_HEIGHT
+    figures["strips"] = gridplot(
+        [[strip] for strip in strips],
+        sizing_mode="stretch_width",
+        toolbar_location="right",
+        toolbar_options={"logo": None},
+    )
+    document = Document()
+    for root in figures.values():
+        document.add_root(root)
+    arguments = {
+        **sources._asdict(),
+        "columns": [[ColumnDataSource(own) for own in of_run] for of_run in held],
+        "frames": [frame(runs, seen.name) for seen in runs[0].views],
+        "plan": figures["map"],
+        "times": times,
+        "distances": distances,
+    }
+    document.js_on_event("document_ready", CustomJS(args=arguments, code=_file("page.js")))
+    return document, list(figures)
+
+
+def _draw_map(drawn: list[tuple[Any, str, str]], sources: Sources, known: bool) -> new_figure:
+    """Plan view, both axes to the same scale. `drawn` is source, name and colour of each run."""
+    plan = new_figure(
+        height=MAP_HEIGHT,
+        sizing_mode="stretch_width",
+        match_aspect=True,
+        tools="pan,wheel_zoom,box_zoom,reset,save",
+        active_scroll="wheel_zoom",
+        x_axis_label="x (m)",
+        y_axis_label="y (m)",
+    )
+    # What the slider moves does not move the map's frame.
+    corners = plan.scatter("x", "y", source=sources.corners, alpha=0.0)
+    plan.x_range, plan.y_range = DataRange1d(renderers=[corners]), DataRange1d(renderers=[corners])
+    if known:
+        black = {"color": "black", "line_width": 2.0, "legend_label": "reference"}
+        plan.line("reference_x", "reference_y", source=sources.paths[0], **black)
+    for path, name, colour in drawn:
+        plan.line("x", "y", source=path, color=colour, line_width=1.8, legend_label=name)
+    contour = {"line_color": "colour", "fill_color": "colour", "fill_alpha": 0.12}
+    size = ("width", "height", "angle")
+    plan.ellipse("x", "y", *size, source=sources.marks, legend_label="3σ", **contour)
+    begin = {"line_color": "colour", "line_width": 2.0, "fill_color": "white", "size": 9}
+    plan.scatter("x", "y", source=sources.starts, legend_label="start", **begin)
+    now = {"source": sources.marks, "line_color": "white", "line_width": 2.0}
+    plan.scatter("x", "y", size=11, fill_color="colour", **now)
+    if known:
+        plan.scatter("reference_x", "reference_y", size=9, fill_color="black", **now)
+    return _finish(plan, grid_x=True)
+
+
+def _draw_strip(
+    sources: Sources,
+    x_range: Range1d,
+    label: str,
+    curves: list[tuple[ColumnDataSource, str, str, str]],
+    along: str = "time",
+    band: bool = False,
+    levels: tuple[tuple[str, float, str], ...] = (),
+) -> new_figure:
+    """Curves over time or distance: of each its source, column, name and colour. A `band` is the
+    filter's 3σ behind errors; `levels` are marked on an axis of powers."""
+    strip = new_figure(
+        height=STRIP_HEIGHT,
+        sizing_mode="stretch_width",
+        x_range=x_range,
+        y_axis_type="log" if levels else "linear",
+        y_axis_label=label,
+        tools="xpan,xwheel_zoom,reset,save",
+    )
+    if band:
+        grey = {"color": "#BBBBBB", "alpha": 0.35, "legend_label": "3σ"}
+        strip.varea(along, 0.0, "major", source=sources.paths[0], **grey)
+    for source, name, text, colour in curves:
+        style = {"color": colour, "line_width": 1.3, "legend_label": text}
+        strip.line(along, name, source=source, **style)
+    for text, level, colour in levels:
+        style = {"color": colour, "legend_label": f"{text} {level:.3g}"}
+        strip.line([0.0, LONG], [level, level], **style)
+    strip.y_range = DataRange1d(renderers=list(strip.renderers))
+    strip.vspan(along, source=sources.marks, line_color="#444444", line_width=1.2)
+    if along == "time":
+        strip.js_on_event("tap", CustomJS(code=GO_THERE))
+    else:
+        strip.xaxis.axis_label, strip.height = "distance walked (m)", STRIP_HEIGHT + LABEL_HEIGHT
+    return _finish(strip)
+
+
+def _finish(figure: new_figure, grid_x: bool = False) -> new_figure:
+    """Dark text on white, a light grid, a legend that hides what is clicked."""
+    figure.min_border_left = LEFT
+    figure.toolbar.logo = None
+    figure.outline_line_color = None
+    figure.axis.axis_label_text_font_style = "normal"
+    figure.axis.axis_label_text_color = figure.axis.major_label_text_color = "#222222"
+    figure.axis.minor_tick_line_color = None
+    figure.grid.grid_line_color = plots.GRID
+    figure.xgrid.visible = grid_x
+    legend = figure.legend[0]
+    legend.click_policy = "hide"
+    legend.orientation = "horizontal"
+    legend.label_text_font_size = "12px"
+    legend.margin = 3
+    legend.background_fill_alpha = 0.0
+    legend.border_line_color = None
+    figure.add_layout(legend, "above")
+    return figure

@@ -1,0 +1,285 @@
+"""Results as text: columns and cells of all tables, the table on the screen, Markdown, CSV."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from rich import box
+from rich.console import Group
+from rich.table import Table
+from rich.text import Text
+
+from gnio_jax.evaluation.report import Report
+from gnio_jax.evaluation.statistics import Cell, Difference, Summary
+from gnio_jax.files import with_ending, write_csv, write_text
+
+
+class Column(NamedTuple):
+    """How a metric is written."""
+
+    heading: str
+    unit: str = ""
+    digits: int = 2
+    best: float = 0.0
+    """The best value there is."""
+
+    @property
+    def title(self) -> str:
+        """Heading, unit, and the best value where that is not 0."""
+        best = f"best {self.best:g}" if self.best else ""
+        remarks = ", ".join(filter(None, (self.unit, best)))
+        return f"{self.heading} ({remarks})" if remarks else self.heading
+
+
+COLUMNS = {
+    "duration": Column("time", "s", 0),
+    "path_length": Column("path", "m", 0),
+    "ate": Column("ATE", "m"),
+    "rte_60s": Column("RTE 60 s", "m"),
+    "rpe_1s": Column("RPE 1 s", "m", 3),
+    "yaw_rmse": Column("yaw", "°", 1),
+    "path_length_ratio": Column("path ratio", best=1.0),
+    "stationary_drift": Column("standing", "m/min", 1),
+    "nees": Column("NEES/3", best=1.0),
+    "nees_coverage": Column("NEES<95 %", "%", 0, 95.0),
+    "nis": Column("NIS/3", best=1.0),
+    "nis_coverage": Column("NIS<95 %", "%", 0, 95.0),
+    "accepted": Column("accepted", "%", 0, 100.0),
+}
+SCREEN = ("ate", "rte_60s", "rpe_1s", "yaw_rmse", "path_length_ratio", "nees_coverage")
+"""What the table on the screen has: it fits into 80 columns. The files hold all metrics."""
+DIVERGED = (
+    "∞: the estimate diverged. It counts in medians, with infinite errors and coverages of 0; "
+    "means, intervals and n are in every column of the others alone, so they cannot be compared "
+    "with those of another run"
+)
+
+
+def column(metric: str) -> Column:
+    """How any metric is written: a horizontal one as the spatial one."""
+    spatial = COLUMNS.get(metric.removesuffix("_2d"))
+    if spatial is None:
+        return Column(metric, "", 3)
+    return spatial if metric in COLUMNS else spatial._replace(heading=f"{spatial.heading} 2-D")
+
+
+# Cells
+# --------------------------------------------------------------------------------------------------
+
+
+def number(value: float | None, digits: int, sign: str = "") -> str:
+    """One figure; – where it is not defined, ∞ where the estimate diverged."""
+    if value is None or math.isnan(value):
+        return "–"
+    if math.isinf(value):
+        return "∞"
+    return f"{value:{sign}.{digits}f}" if abs(value) < 10 ** (7 - digits) else f"{value:{sign}.1e}"
+
+
+def mean(found: Summary, digits: int) -> str:
+    """Mean over sequences ± standard deviation over seeds, and † with how many diverged."""
+    text = number(found.mean, digits)
+    if found.std is not None:
+        text += f" ± {number(found.std, digits)}"
+    return f"{text} † {found.diverged}/{found.estimates}" if found.diverged else text
+
+
+def difference(found: Difference | None, digits: int) -> str:
+    """Difference, its interval, and over how many sequences if not over all. Nothing of the first
+    row."""
+    if found is None:
+        return ""
+    if found.mean is None:
+        return "– ‡" if found.withheld else "–"
+    low, high = found.interval or (0.0, 0.0)
+    # As many digits as show two of the interval's half width, at most three more than the mean's.
+    size = (high - low) / 2 or abs(found.mean)
+    needed = 1 - math.floor(math.log10(size)) if size else digits
+    digits = min(max(digits, needed), digits + 3)
+    reach = f" ({low:+.{digits}f} to {high:+.{digits}f})" if found.interval else ""
+    over = f" over {found.compared}" if found.compared < found.sequences else ""
+    return f"{found.mean:+.{digits}f}{reach}{over}"
+
+
+def plain(cell: Cell) -> dict[str, float | int | None]:
+    """The figures of a cell under the names that every CSV has for them."""
+    mean, found = cell
+    low, high = (found and found.interval) or (None, None)
+    return {
+        "mean": mean.mean,
+        "std": mean.std,
+        "median": mean.median,
+        "diverged": mean.diverged,
+        "estimates": mean.estimates,
+        "difference": found and found.mean,
+        "difference_low": low,
+        "difference_high": high,
+        "gain_percent": found and found.gain,
+        "better": None if found is None or found.withheld else found.better,
+        "compared": found and found.compared,
+        "sequences": found and found.sequences,
+        "groups": found and found.groups,
+    }
+
+
+def marks(cells: Sequence[Cell]) -> list[str]:
+    """What the marks of a table mean, and how its intervals were made."""
+    means, found = [cell.mean for cell in cells], [c.difference for c in cells if c.difference]
+    drawn = " or ".join(map(str, sorted({each.groups for each in found if each.interval})))
+    applies = {
+        f"The interval is Student's t over people or sessions; there are {drawn}.": bool(drawn),
+        "No interval: the sequences compared are of one person or session.": any(
+            each.groups == 1 and not each.withheld for each in found
+        ),
+        "A difference is over the sequences that both rows have with every seed, and on which no "
+        "error is infinite; a mean is over all that a row has with every seed.": any(
+            each.compared < each.sequences for each in found
+        ),
+        "† So many of all estimates diverged. A mean leaves out their sequences.": any(
+            each.diverged for each in means
+        ),
+        "‡ Would be better than the first row, but diverged more often: it is not better.": any(
+            each.withheld for each in found
+        ),
+        "∞: an error is too large for a number.": any(np.isinf(each.seeds).any() for each in means),
+        "–: there is no such value with every seed, or nothing to compare it with.": any(
+            each.mean is None for each in means
+        ),
+    }
+    return [line for line, there in applies.items() if there]
+
+
+# How the figures were made
+# --------------------------------------------------------------------------------------------------
+
+
+def way(settings: Mapping[str, Any]) -> str:
+    """How trajectories were estimated: the estimator, and what is not as usual."""
+    loose = settings.get("coupling") == "loose"
+    own_attitude = settings["estimator"] == "imu_only" or settings.get("coupling") == "tight"
+    parts = {
+        settings["estimator"]: True,
+        "loose coupling": loose,
+        f"{settings.get('orientation_source')} orientation": not own_attitude,
+        f"{settings.get('initial_state')} start": settings.get("initial_state") != "reference",
+        f"gyro bias: {settings.get('gyro_bias')}": settings.get("gyro_bias") != "zero",
+        f"{settings['alignment']} alignment": settings["alignment"] != "origin",
+        f"{settings.get('checkpoint')} checkpoint": settings.get("checkpoint") == "latest",
+    }
+    return ", ".join(text for text, applies in parts.items() if applies)
+
+
+def about(settings: Mapping[str, Any]) -> dict[str, str]:
+    """The choices behind the figures, in words."""
+    found = {
+        "window orientation": settings.get("orientation_source"),
+        "initial state": settings.get("initial_state"),
+        "gyro bias": settings.get("gyro_bias"),
+        "IMU compensated": settings.get("imu_compensated"),
+        "alignment": settings["alignment"],
+    }
+    if settings.get("model"):
+        network = f"{settings['model']}, checkpoint {settings['checkpoint']}"
+        found["network"] = f"{network}, step {settings['step']}"
+        found["windows"] = windows(settings)
+    return {name: str(value) for name, value in found.items() if value}
+
+
+def windows(settings: Mapping[str, Any]) -> str:
+    """What the network sees, from fields of `DataConfig`."""
+    text = f"{settings['window_seconds']:g} s at {settings['rate']:g} Hz"
+    context = settings["context_seconds"]
+    return f"{text}, and {context:g} s before" if context else text
+
+
+def remarks(report: Report) -> list[str]:
+    """What a reader should know of sequences: each note once, with the sequences it is of, what was
+    left out and why, what diverged."""
+    of: dict[str, list[str]] = {}
+    for name, notes in report.notes.items():
+        for note in notes:
+            of.setdefault(note, []).append(name)
+    lines = [
+        f"{', '.join(names) if len(names) < 4 else f'{len(names)} sequences'}: {note}"
+        for note, names in of.items()
+    ]
+    lines += [f"left out: {name}: {reason}" for name, reason in report.left_out.items()]
+    return lines + [f"{name}: the estimate diverged, and is in no mean" for name in report.diverged]
+
+
+# Files
+# --------------------------------------------------------------------------------------------------
+
+
+def markdown(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Cells as a Markdown table."""
+    lines = [header, ["---"] * len(header), *rows]
+    escaped = [[" ".join(cell.split()).replace("|", "\\|") for cell in cells] for cells in lines]
+    return "".join(f"| {' | '.join(cells)} |\n" for cells in escaped)
+
+
+def write(path: Path, text: str, rows: Sequence[Mapping[str, Any]]) -> None:
+    """`path`.md with a text, and `path`.csv with rows, empty where there is no value."""
+    write_text(with_ending(path, ".md"), text.rstrip() + "\n")
+    write_csv(with_ending(path, ".csv"), [[*rows[0]], *([*row.values()] for row in rows)])
+
+
+# The table of an evaluation on the screen
+# --------------------------------------------------------------------------------------------------
+
+
+def render(report: Report) -> Group:
+    """The table of an evaluation and what belongs under it, for `rich.console.Console.print`: a row
+    per sequence, then those of the set, then the reference rows."""
+    summary = report.summary()
+    shown = [name for name in SCREEN if name in summary]
+    title = f"{report.settings['dataset']} {report.settings['split']}: {way(report.settings)}"
+    grid = Table(title=title, title_style="bold", title_justify="left", box=box.SIMPLE_HEAD)
+    grid.add_column("sequence", overflow="fold", min_width=12)  # a name is never cut
+    for name in shown:
+        # Two short lines. Not as markup, which the console of results does not read.
+        heading, unit, *_ = COLUMNS[name]
+        lines = (
+            f"{heading.removesuffix(f' {unit}')}\n{unit}" if unit else heading.replace(" ", "\n")
+        )
+        grid.add_column(Text(lines), justify="right", no_wrap=True)
+
+    def add(label: str, cells: Iterable[str], style: str = "", last: bool = False) -> None:
+        grid.add_row(Text(label), *cells, style=style, end_section=last)
+
+    def numbers(values: Mapping[str, float | None]) -> list[str]:
+        return [number(values.get(name), COLUMNS[name].digits) for name in shown]
+
+    for place, (name, own) in enumerate(report.scores.items(), start=1):
+        add(name, numbers(own.values), last=place == len(report.scores))
+    lost = report.diverged
+    add(_mean_of(lost), numbers({name: of.mean for name, of in summary.items()}), "bold")
+    add("median", numbers({name: of.median for name, of in summary.items()}))
+    intervals = {name: of.interval or (None, None) for name, of in summary.items()}
+    add("95 % from", numbers({name: low for name, (low, _) in intervals.items()}))
+    add("95 % to", numbers({name: high for name, (_, high) in intervals.items()}))
+    add("n", [str(summary[name].sequences) for name in shown], "dim")
+    add("groups", [str(summary[name].groups) for name in shown], "dim", last=True)
+    for row, scores in report.reference_rows.items():
+        own = [name for name, measures in scores.items() if measures.diverged]
+        label = f"{row} ({_mean_of(own)})" if own else row
+        add(label, numbers({name: of.mean for name, of in report.summary(row).items()}), "italic")
+    how = "; ".join(f"{name}: {text}" for name, text in about(report.settings).items())
+    signs = "reference rows are means; – is not defined (the reason is in metrics.json)"
+    any_lost = lost or any(
+        own.diverged for of in report.reference_rows.values() for own in of.values()
+    )
+    warnings = [DIVERGED] if any_lost else []
+    return Group(
+        grid,
+        *(Text(line, style="dim") for line in (how, signs)),
+        *(Text(line, style="yellow") for line in (*warnings, *remarks(report))),
+    )
+
+
+def _mean_of(lost: Sequence[str]) -> str:
+    return f"mean without {len(lost)} diverged" if lost else "mean"

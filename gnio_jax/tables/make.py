@@ -1,0 +1,397 @@
+"""Each of the paper's tables, from its options to its files."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from gnio_jax import config as configuration
+from gnio_jax import models
+from gnio_jax.config import TablesConfig, TrainConfig
+from gnio_jax.cores import usable_cores
+from gnio_jax.errors import InputError
+from gnio_jax.evaluation import statistics, tabulate
+from gnio_jax.evaluation.statistics import Cell as Figure
+from gnio_jax.files import with_ending, write_text
+from gnio_jax.reporting import Lines, Reporter
+from gnio_jax.tables import activities, experiments
+from gnio_jax.tables.experiments import Experiment
+from gnio_jax.tables.runs import Result, run_cell
+
+METRICS = (
+    *("ate", "ate_2d", "ate_ronin_2d", "rpe_1s", "rte_60s", "path_length_ratio"),
+    *("stationary_drift", "nis", "nees"),
+)
+"""Of every table. The first is what rows are compared by."""
+Extra = Mapping[str, Mapping[str, float]]
+"""Figures that belong to one table alone: name of a cell → heading → value."""
+
+
+def make(options: TablesConfig, reporter: Reporter | None = None, workers: int = 1) -> str:
+    """Make a table: train and evaluate what is missing, write the files, return what to show.
+
+    `workers` processes read recordings that are slow to read. Raises `InputError` for options that
+    make no sense, and `runs.Interrupted` after a signal.
+    """
+    reporter = reporter or Lines()
+    if options.table == "complexity":
+        return make_complexity(Path(options.out), reporter)
+    if options.seeds < 1:
+        raise InputError("--seeds", f"must be at least 1, found {options.seeds}")
+    base = base_config(options)
+    match options.table:
+        case "components":
+            experiment = experiments.components(base)
+        case "gates":
+            experiment = experiments.gates(base)
+        case "bank-size":
+            experiment = experiments.bank_sizes(base)
+        case _:
+            experiment = experiments.comparison(base, options.split, networks(options))
+    if options.table == "trajectories":
+        options = dataclasses.replace(options, seeds=1)
+    results = [run_cell(cell, options, reporter, workers) for cell in experiment.cells]
+    name = f"{options.table}_{options.split}_{options.estimator}"
+    path = Path(options.out) / (f"{name}_calibrated" if options.calibrate else name)
+    said = notes(base, options, experiment)
+    if options.table == "trajectories":
+        return make_trajectories(path, options, results)
+    if options.table == "standing":
+        return make_standing(path, options, experiment, results, said)
+    return make_table(path, options, experiment, results, said)
+
+
+def base_config(options: TablesConfig) -> TrainConfig:
+    """The experiment that the rows vary. Raises `InputError` for one that cannot be varied."""
+    base = configuration.load(options.base)
+    base = dataclasses.replace(
+        base,
+        data_root=options.data_root or base.data_root,
+        workdir=None,
+        optim=dataclasses.replace(base.optim, epochs=options.epochs or base.optim.epochs),
+    )
+    if base.model.name != "gnio":
+        remedy = "give a config of gnio: the others are made from it"
+        raise InputError(options.base, f"is of the network '{base.model.name}'", remedy)
+    return configuration.validate(base, options.base)
+
+
+def networks(options: TablesConfig) -> tuple[str, ...]:
+    """The networks named by --methods."""
+    names = _words(options.methods)
+    known = f"known: {', '.join(models.names())}"
+    for name in names:
+        if name not in models.names():
+            raise InputError("--methods", f"no network '{name}'", known)
+    if not names:
+        raise InputError("--methods", "names no network", known)
+    return names
+
+
+def _words(text: str) -> tuple[str, ...]:
+    return tuple(word.strip() for word in text.split(",") if word.strip())
+
+
+def notes(base: TrainConfig, options: TablesConfig, experiment: Experiment) -> str:
+    """What a reader must know of the figures."""
+    calibrated = f", gnio calibrate on {base.data.val_split}" if options.calibrate else ""
+    budget = (
+        f"{base.optim.epochs} epochs of batches of {base.optim.batch_size}, learning rate "
+        f"{base.optim.learning_rate:g}, width {base.model.width or 64}, {base.data.rate:g} Hz, "
+        f"{options.seeds} seeds{calibrated}"
+    )
+    return (
+        f"{base.dataset} {options.split}, {options.estimator}; every row: {budget}; on "
+        f"{hardware()}. ± is the standard deviation over seeds; the difference to the first row "
+        "is over sequences."
+        f"\n\nPublished: {experiment.source}; the paper does not define its ATE."
+    )
+
+
+def hardware() -> str:
+    """What it runs on."""
+    device, cores = jax.devices()[0], usable_cores()
+    if device.platform != "cpu":
+        return device.device_kind
+    return f"{cores} CPU core{'s' if cores > 1 else ''}"
+
+
+# Rows side by side
+# --------------------------------------------------------------------------------------------------
+
+
+def make_table(
+    path: Path, options: TablesConfig, experiment: Experiment, results: list[Result], said: str
+) -> str:
+    """comparison, components, gates, bank-size: the files, and the text to show."""
+    from gnio_jax.tables import plots  # Matplotlib takes a second to import
+
+    extra: dict[str, dict[str, float]] = {}
+    if options.table == "gates":
+        norms = {each.cell.name: np.array([*map(scale_gradients, each.runs)]) for each in results}
+        extra = {
+            name: {"gradient of the scale, mean": own.mean(), "largest epoch": own.max()}
+            for name, own in norms.items()
+        }
+        plots.save(path.with_name(f"{path.name}_gradients.png"), plots.gradients(results, norms))
+    if options.table == "bank-size":
+        extra = {
+            each.cell.name: _entropies(each, options.split)
+            for each in results
+            if each.cell.config.model.bank_size != 0
+        }
+    figures = figures_of(results)
+    plots.save(with_ending(path, ".png"), plots.table(experiment, results, figures["ate"]))
+    text = f"## {experiment.title}\n\n{said}\n\n{render(experiment, figures, extra)}"
+    tabulate.write(path, text, csv_rows(experiment, results, figures, extra))
+    return f"{text}\nresults: {path}.md, .csv, .png"
+
+
+def scale_gradients(run: Path) -> list[float]:
+    """Norm of the gradient of the scale's layer in every epoch of a run, a mean over its steps."""
+    lines = (run / "metrics.jsonl").read_text(encoding="utf-8").splitlines()
+    return [json.loads(line)["gradient_norm/head/scale"] for line in lines]
+
+
+def _entropies(result: Result, split: str) -> dict[str, float]:
+    """Entropy of the attention, as means over the seeds."""
+    predicted = [activities.predict_split(run, split) for run in result.runs]
+    found = [activities.entropy(windows.diagnostics["attention"]) for windows in predicted]
+    of_window, of_mean = np.mean(found, axis=0)
+    return {"entropy of a window": of_window, "of their mean": of_mean}
+
+
+def figures_of(results: list[Result]) -> dict[str, list[Figure]]:
+    """Metric → the figures of every row, compared with the first; metrics that no row has are left
+    out."""
+    reports = [report for result in results for report in result.reports]
+    groups = {name: group for report in reports for name, group in report.groups.items()}
+    seeds = [result.seeds for result in results]
+    found = {
+        metric: statistics.cells(seeds, metric, groups, tabulate.column(metric).best)
+        for metric in METRICS
+    }
+    return {
+        metric: own
+        for metric, own in found.items()
+        if metric == "ate" or any(c.mean.seeds for c in own)
+    }
+
+
+def render(experiment: Experiment, figures: Mapping[str, list[Figure]], extra: Extra) -> str:
+    """The table as Markdown, then what its marks mean."""
+    headings = list(dict.fromkeys(name for own in extra.values() for name in own))
+    columns = {metric: tabulate.column(metric) for metric in figures}
+    header = ["", *(column.title for column in columns.values()), "median ATE (m)", *headings]
+    header += ["gain", "difference of ATE, m (95 %)", "published (m)", "its gain"]
+    first, table = experiment.cells[0], []
+    for place, cell in enumerate(experiment.cells):
+        row = {metric: own[place] for metric, own in figures.items()}
+        mean, difference = row["ate"]
+        gains = (
+            difference and difference.gain,
+            None if None in (cell.published, first.published) else _gain(cell, first),
+        )
+        own = extra.get(cell.name, {})
+        ours, published = (arrow(gain) if place else "" for gain in gains)
+        table.append(
+            [
+                cell.label,
+                *(tabulate.mean(row[metric].mean, columns[metric].digits) for metric in row),
+                tabulate.number(mean.median, 2),
+                *(f"{own[name]:.3g}" if name in own else "–" for name in headings),
+                ours,
+                tabulate.difference(difference, 2),
+                tabulate.number(cell.published, 2),
+                published,
+            ]
+        )
+    marks = "".join(f"\n{line}\n" for line in tabulate.marks(figures["ate"]))
+    return tabulate.markdown(header, table) + marks
+
+
+def _gain(cell: experiments.Cell, first: experiments.Cell) -> float:
+    """By how much the published figure is smaller than the first row's, %."""
+    assert cell.published is not None and first.published is not None
+    return 100 * (1 - cell.published / first.published)
+
+
+def arrow(gain: float | None) -> str:
+    """As the paper prints gains: ↓ and the share by which the error is smaller, ↑ by which it is
+    larger."""
+    if gain is None:
+        return "–"
+    if round(gain, 1) == 0:
+        return "0 %"
+    return f"{'↓' if gain > 0 else '↑'} {abs(gain):.1f} %"
+
+
+def csv_rows(
+    experiment: Experiment,
+    results: list[Result],
+    figures: Mapping[str, list[Figure]],
+    extra: Extra,
+) -> list[dict[str, Any]]:
+    """A line for each row and metric."""
+    lines = []
+    for place, cell in enumerate(experiment.cells):
+        head = {
+            "row": cell.name,
+            "label": cell.label,
+            "seeds": len(results[place].runs),
+            "published": cell.published,
+        }
+        own = {metric: tabulate.plain(found[place]) for metric, found in figures.items()}
+        empty = dict.fromkeys(own["ate"])
+        own |= {name: empty | {"mean": value} for name, value in extra.get(cell.name, {}).items()}
+        lines += [{**head, "metric": metric, **values} for metric, values in own.items()]
+    return lines
+
+
+# All methods over the reference, and windows by what the walker did
+# --------------------------------------------------------------------------------------------------
+
+
+def make_trajectories(path: Path, options: TablesConfig, results: list[Result]) -> str:
+    """All methods over the reference in one picture and one page, with the first seed of each."""
+    # Bokeh and Matplotlib take seconds to import.
+    from gnio_jax.evaluation import page
+    from gnio_jax.tables import plots
+
+    runs = [page.of_folder(each.folders[0], each.reports[0], each.cell.label) for each in results]
+    known = {seen.name: seen for seen in runs[0].views if seen.known}
+    wanted = _words(options.sequences) if options.sequences else tuple(known)[:8]
+    for name in wanted:
+        if name not in known:
+            problem = f"no sequence '{name}' in split '{options.split}'"
+            raise InputError("--sequences", problem, f"there are: {', '.join(known)}")
+    plots.save(with_ending(path, ".png"), plots.trajectories(wanted, runs))
+    made = results[0].reports[0].settings
+    title = f"{made['dataset']} {options.split}: {options.estimator} of all methods"
+    page.write(with_ending(path, ".html"), title, runs)
+    return f"picture: {path}.png\npage: {path}.html"
+
+
+def make_standing(
+    path: Path, options: TablesConfig, experiment: Experiment, results: list[Result], said: str
+) -> str:
+    """Errors at rest and in slow walking, gate and attention: where the gate's claim stands."""
+    from gnio_jax.tables import plots  # Matplotlib takes a second to import
+
+    lines, by_method = [], {}
+    for result in results:
+        seeds = [activities.predict_split(run, options.split) for run in result.runs]
+        by_method[result.cell.name] = activities.mean_over_seeds(seeds)
+        beside = f"{path.name}_{result.cell.name}"
+        if "gate" in seeds[0].diagnostics:
+            plots.save(path.with_name(f"{beside}_gate.png"), plots.gate(seeds[0]))
+        if "attention" in seeds[0].diagnostics:
+            told, chance = np.mean([activities.information(seed) for seed in seeds], axis=0)
+            words = (
+                f"the most attended prototype tells {told:.2f} bits of the activity, "
+                f"by chance it would be {chance:.2f}"
+            )
+            lines.append(f"{result.cell.label}: {words}.\n\n")
+            picture = plots.attention(*activities.attention_by_activity(seeds[0]), words)
+            plots.save(path.with_name(f"{beside}_attention.png"), picture)
+    plots.save(with_ending(path, ".png"), plots.standing(by_method))
+    table = render(experiment, figures_of(results), {})
+    head = f"## {experiment.title}\n\n{said}\n\n{''.join(lines)}"
+    text = f"{head}{table}\n{activities.render(by_method)}"
+    write_text(with_ending(path, ".md"), text)
+    return f"{text}\nresults: {path}.md, .png and the pictures beside them"
+
+
+# Complexity
+# --------------------------------------------------------------------------------------------------
+
+NETWORKS = ("tlio", "ronin_resnet", "deepils", "ctin", "imot", "imot_text", "gnio")
+PAPERS_COST = {
+    "tlio": (5.42, 0.08),
+    "deepils": (2.29, 0.03),
+    "ctin": (0.56, 7.27),
+    "imot": (14.49, 7.79),
+    "gnio": (4.90, 0.08),
+}
+"""Parameters in millions and the column "GFLOPs", as the paper prints them."""
+SAMPLES, BATCHES, SECONDS = 200, (1, 128), 3.0
+"""Of a window; windows of a call; for which a call is timed."""
+
+
+class Complexity(NamedTuple):
+    """What one network costs."""
+
+    network: str
+    parameters: int
+    gflops: float
+    """Floating-point operations of one window in the compiled program, 10⁹; NaN where the compiler
+    does not count them."""
+    latency: dict[int, float]
+    """Batch → time per window, ms, median."""
+
+
+def make_complexity(out: Path, reporter: Reporter) -> str:
+    """Parameters, operations and latency of every network, beside the paper's columns."""
+    table = []
+    for network in NETWORKS:
+        reporter.line(f"timing {network}")
+        found = measure(network)
+        millions, gflops = PAPERS_COST.get(network, (None, None))
+        table.append(
+            [
+                network,
+                f"{found.parameters:,}",
+                tabulate.number(found.gflops, 3),
+                *(tabulate.number(each, 2) for each in found.latency.values()),
+                "–" if millions is None else f"{millions:.2f} M",
+                tabulate.number(gflops, 2),
+            ]
+        )
+    header = ["", "parameters", "GFLOP / window"]
+    header += [f"ms / window, batch {batch}" for batch in BATCHES]
+    text = (
+        f"## Complexity\n\nOne window of {SAMPLES} samples, float32, on {hardware()}. The paper's "
+        "CNN rows are 2 × multiply-adds of one window, as is the measured column, which leaves out "
+        "the taps in the padding. Its transformer rows repeat those papers' own "
+        '"GFLOPs/s", another quantity; compare the measured column. Its GNIO has no bank: '
+        "4,901,385 parameters, 4,934,153 with it. DeepILS and RoNIN are counted with three "
+        "outputs.\n\n" + tabulate.markdown([*header, "paper: parameters", 'paper: "GFLOPs"'], table)
+    )
+    path = out / "complexity.md"
+    write_text(path, text)
+    return f"{text}\nresults: {path}"
+
+
+def measure(
+    network: str, batches: tuple[int, ...] = BATCHES, seconds: float = SECONDS
+) -> Complexity:
+    """Cost of a network's inference, batch norms folded, on this machine; each latency is timed for
+    about `seconds`."""
+    model = models.create(network)
+    variables = models.initialise(model, jax.random.key(0), SAMPLES)
+    frozen, inference = models.inference_variables(model, variables), models.Inference(model)
+    latency, operations = {}, math.nan
+    for batch in batches:
+        drawn = np.random.default_rng(0).standard_normal((batch, SAMPLES, 6))
+        windows = jnp.asarray(drawn, jnp.float32)
+        compiled = jax.jit(inference).lower(frozen, windows).compile()
+        if batch == batches[0]:
+            operations = (compiled.cost_analysis() or {}).get("flops", math.nan) / batch
+        jax.block_until_ready(compiled(frozen, windows))
+        times: list[float] = []
+        while sum(times) < seconds and len(times) < 500:
+            began = time.perf_counter()
+            jax.block_until_ready(compiled(frozen, windows))
+            times.append(time.perf_counter() - began)
+        latency[batch] = 1e3 * float(np.median(times)) / batch
+    parameters = sum(leaf.size for leaf in jax.tree.leaves(variables["params"]))
+    return Complexity(network, parameters, operations / 1e9, latency)

@@ -1,0 +1,204 @@
+"""Pictures of the tables. Import it only where one is drawn (Matplotlib)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from jaxtyping import Float
+from matplotlib.figure import Figure
+
+from gnio_jax.evaluation import statistics
+from gnio_jax.evaluation.page import Run
+from gnio_jax.evaluation.plots import (
+    BLUE,
+    COLOURS,
+    GREEN,
+    GREY,
+    ORANGE,
+    PURPLE,
+    REFERENCE,
+    SKY,
+    START,
+    VERMILION,
+    YELLOW,
+    finish,
+    save,
+)
+from gnio_jax.evaluation.statistics import Cell
+from gnio_jax.tables.activities import ACTIVITIES, HORIZONTAL, PredictedWindows
+from gnio_jax.tables.experiments import Experiment
+from gnio_jax.tables.runs import Result
+
+__all__ = ["attention", "gate", "gradients", "save", "standing", "table", "trajectories"]
+
+METHODS = {
+    "tlio": BLUE,
+    "gnio": GREEN,
+    "ronin_resnet": ORANGE,
+    "deepils": PURPLE,
+    "ctin": VERMILION,
+    "imot": SKY,
+    "imot_text": YELLOW,
+}
+"""TLIO blue and GNIO green, as in the paper's figure."""
+
+
+def table(experiment: Experiment, results: list[Result], ates: list[Cell]) -> Figure:
+    """`ate` of each row: every seed a dot, their mean a bar, sequences behind it; beside it what
+    the paper printed. Of what diverged there is no dot: the row's label says how many."""
+    published = [cell.published for cell in experiment.cells]
+    beside = any(value is not None for value in published)
+    size = (9.0 if beside else 6.4, 1.4 + 0.45 * len(results))
+    figure = Figure(figsize=size, layout="constrained")
+    ratios = (2, 1) if beside else (1,)
+    panels = np.atleast_1d(figure.subplots(1, len(ratios), sharey=True, width_ratios=ratios))
+    ours, names = panels[0], []
+    for place, (result, (mean, _)) in enumerate(zip(results, ates, strict=True)):
+        lost = statistics.lost(result.seeds)
+        found = statistics.values(result.seeds, "ate")
+        sequences = [own.mean() for name, own in found.items() if name not in lost]
+        labels = ("sequence", "seed, mean over sequences") if place == 0 else (None, None)
+        ours.barh(place, mean.mean or 0.0, color=GREEN, alpha=0.35, height=0.6)
+        above = np.full(len(sequences), place) + 0.2
+        ours.plot(sequences, above, "|", color=GREY, ms=7, label=labels[0])
+        seeds = np.full(len(mean.seeds), place)
+        ours.plot(mean.seeds, seeds, "o", color="black", ms=4, label=labels[1])
+        diverged = f"\n({mean.diverged} of {mean.estimates} diverged)" if mean.diverged else ""
+        names.append(result.cell.label + diverged)
+    ours.set_yticks(range(len(results)), names)
+    ours.invert_yaxis()
+    ours.set(xlabel="ATE, here (m)", title=experiment.title)
+    ours.set_xlim(left=0)
+    for place, value in enumerate(published):
+        if value is not None:
+            panels[1].barh(place, value, color=BLUE, alpha=0.35, height=0.6)
+            panels[1].text(value, place, f" {value:.2f}", va="center", fontsize=8)
+    if beside:
+        panels[1].set(xlabel="published (m), on other data", title="paper")
+        panels[1].margins(x=0.2)
+    style = {"fontsize": 8, "frameon": False, "loc": "outside lower center", "ncols": 2}
+    figure.legend(*ours.get_legend_handles_labels(), **style)
+    for axes in panels:
+        finish(axes)
+    return figure
+
+
+def gradients(
+    results: list[Result], norms: Mapping[str, Float[np.ndarray, "seeds epochs"]]
+) -> Figure:
+    """Norm of the gradient of the scale's layer over training, one line per row: the mean over
+    seeds, their range shaded."""
+    figure = Figure(figsize=(6.8, 4.2), layout="constrained")
+    axes = figure.add_subplot()
+    for result, colour in zip(results, COLOURS, strict=False):
+        own = norms[result.cell.name]
+        epochs = np.arange(1, own.shape[1] + 1)
+        axes.semilogy(epochs, own.mean(0), color=colour, label=result.cell.label)
+        axes.fill_between(epochs, own.min(0), own.max(0), color=colour, alpha=0.15, lw=0)
+    axes.set(
+        xlabel="epoch",
+        ylabel="norm of the gradient of the scale's layer",
+        title="How steadily the scale learns",
+    )
+    axes.yaxis.set_major_formatter("{x:g}")
+    axes.yaxis.set_minor_formatter("{x:g}")
+    axes.legend(fontsize=8, frameon=False)
+    finish(axes)
+    return figure
+
+
+def trajectories(names: Sequence[str], runs: Sequence[Run], columns: int = 4) -> Figure:
+    """All methods over the reference, a panel for each of the sequences `names`."""
+    columns = min(columns, len(names))
+    lines = -(-len(names) // columns)
+    figure = Figure(figsize=(3.6 * columns, 3.6 * lines + 0.5), layout="constrained")
+    panels = np.atleast_1d(figure.subplots(lines, columns)).ravel()
+    handles = {}
+    for axes, name in zip(panels, names, strict=False):
+        views = {run.name: seen for run in runs for seen in run.views if seen.name == name}
+        reference = next(iter(views.values())).reference[:, :2]
+        (handles["reference"],) = axes.plot(*reference.T, color=REFERENCE, lw=1.8)
+        for number, (method, seen) in enumerate(views.items()):
+            colour = METHODS.get(method, COLOURS[number % len(COLOURS)])
+            (handles[method],) = axes.plot(*seen.position[:, :2].T, color=colour, lw=1.1)
+        first = reference[np.isfinite(reference).all(1)][0]
+        axes.plot(*first, color=REFERENCE, zorder=4, **START)
+        axes.set_aspect("equal", adjustable="datalim")
+        axes.set_title(name, fontsize=9)
+        finish(axes)
+    for axes in panels[len(names) :]:
+        axes.set_visible(False)
+    columns = min(8, len(handles))
+    style = {"fontsize": 9, "frameon": False, "loc": "outside upper center", "ncols": columns}
+    figure.legend(handles.values(), handles.keys(), **style)
+    figure.supxlabel("x (m)", fontsize=9)
+    figure.supylabel("y (m)", fontsize=9)
+    return figure
+
+
+def gate(windows: PredictedWindows) -> Figure:
+    """Distribution of the gate, the scale and their product, horizontal axes, at rest and in
+    motion."""
+    figure = Figure(figsize=(10.0, 3.4), layout="constrained")
+    quantities = {
+        "|gate|": np.abs(windows.diagnostics["gate"]),
+        "scale (m)": np.abs(windows.diagnostics["scale"]),
+        "|scale × gate| (m)": np.abs(windows.displacement),
+    }
+    standing_still, slow = (ACTIVITIES.index(name) for name in ("standing", "slow"))
+    rows = {
+        "standing": (windows.activity == standing_still, VERMILION),
+        "slow": (windows.activity == slow, GREY),
+        "moving": (windows.activity > slow, BLUE),
+    }
+    for axes, (name, values) in zip(figure.subplots(1, 3), quantities.items(), strict=True):
+        horizontal = values[:, HORIZONTAL]
+        largest = 1.0 if name == "|gate|" else max(np.percentile(horizontal, 99), 1e-3)
+        edges = np.linspace(0, largest, 41)
+        for label, (chosen, colour) in rows.items():
+            if chosen.any():
+                share = np.histogram(horizontal[chosen], edges)[0] / (2 * chosen.sum())
+                count = f"{label} ({chosen.sum():,})"
+                axes.stairs(share, edges, color=colour, lw=1.6, label=count)
+        axes.set(xlabel=name, ylabel="share of windows and axes")
+        finish(axes)
+    figure.axes[0].legend(fontsize=8, frameon=False)
+    return figure
+
+
+def attention(names: list[str], lifts: Float[np.ndarray, "a p"], words: str) -> Figure:
+    """How much more attention each prototype gets in each activity than on average; prototypes in
+    the order of the activity they favour."""
+    order = np.lexsort((-lifts.max(0), lifts.argmax(0)))
+    figure = Figure(figsize=(9.0, 1.6 + 0.4 * len(names)), layout="constrained")
+    axes = figure.add_subplot()
+    limit = max(abs(np.log2(np.clip(lifts, 0.25, 4))).max(), 1e-3)
+    image = axes.imshow(
+        np.log2(np.maximum(lifts[:, order], 1e-6)),
+        aspect="auto",
+        cmap="RdBu_r",
+        vmin=-limit,
+        vmax=limit,
+    )
+    axes.set_yticks(range(len(names)), names)
+    axes.set(xlabel="prototype, sorted by the activity it favours", title=words)
+    axes.title.set_fontsize(9)
+    figure.colorbar(image, ax=axes, label="log₂ of attention over its mean")
+    return figure
+
+
+def standing(by_method: dict[str, dict[str, dict[str, float]]]) -> Figure:
+    """Error of a window's displacement by what the walker did, one line of dots per method."""
+    names = [name for name in ACTIVITIES if any(name in figures for figures in by_method.values())]
+    figure = Figure(figsize=(7.2, 4.0), layout="constrained")
+    axes = figure.add_subplot()
+    for number, (method, figures) in enumerate(by_method.items()):
+        places = np.arange(len(names)) + 0.1 * (number - (len(by_method) - 1) / 2)
+        values = [figures.get(name, {}).get("error", np.nan) for name in names]
+        axes.semilogy(places, values, "o", color=METHODS.get(method, GREY), label=method)
+    axes.set_xticks(range(len(names)), names)
+    axes.set(ylabel="rms error of a window's displacement (m)", title="By what the walker did")
+    axes.legend(fontsize=8, frameon=False)
+    finish(axes)
+    return figure

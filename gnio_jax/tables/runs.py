@@ -1,0 +1,123 @@
+"""The runs of a table's row: its seeds are trained, then calibrated and evaluated one after the
+other. Nothing is done twice, and what was interrupted goes on."""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from gnio_jax import calibration, data
+from gnio_jax import config as configuration
+from gnio_jax.config import CalibrateConfig, EvaluateConfig, TablesConfig, TrainConfig
+from gnio_jax.errors import InputError
+from gnio_jax.evaluation import kept
+from gnio_jax.evaluation.report import Report
+from gnio_jax.evaluation.statistics import Scores
+from gnio_jax.reporting import Reporter
+from gnio_jax.tables.experiments import Cell
+from gnio_jax.training import loop, run_folder
+
+
+class Interrupted(Exception):
+    """A signal asked a training run to stop; it is saved, and the same command continues it."""
+
+    def __init__(self, signum: int):
+        super().__init__(signum)
+        self.signum = signum
+
+
+class Result(NamedTuple):
+    """A cell after all its seeds."""
+
+    cell: Cell
+    reports: list[Report]
+    runs: list[Path]
+    """Their work folders."""
+    folders: list[Path]
+    """Of their evaluations."""
+
+    @property
+    def seeds(self) -> list[Scores]:
+        return [report.scores for report in self.reports]
+
+
+def run_cell(cell: Cell, options: TablesConfig, reporter: Reporter, workers: int = 1) -> Result:
+    """Train, calibrate if that is asked for, and evaluate a cell with seeds 0 … seeds−1 below
+    OUT/runs.
+
+    A run that is finished is not trained again, one that was interrupted goes on, a calibration and
+    an evaluation that are there are read. Raises `InputError` if a folder holds a run with other
+    settings or of other recordings, and `Interrupted` after a signal. `workers` processes read
+    recordings that are slow to read.
+    """
+    workdir = Path(options.out) / "runs" / cell.name
+    config, seeds = dataclasses.replace(cell.config, workdir=str(workdir)), range(options.seeds)
+    train(config, seeds, reporter, workers)
+    runs = [Path(each.workdir or "") for each in configuration.with_seeds(config, seeds)]
+    if options.calibrate:
+        runs = [calibrated(run, reporter, workers) for run in runs]
+    root, split, estimator = config.data_root, options.split, options.estimator
+    looked = [
+        kept.look(
+            EvaluateConfig(str(run), data_root=root, split=split, estimator=estimator, plots=False)
+        )
+        for run in runs
+    ]
+    reports = [kept.made(each, reporter, workers) for each in looked]
+    return Result(cell, reports, runs, [each.folder for each in looked])
+
+
+def train(config: TrainConfig, seeds: Sequence[int], reporter: Reporter, workers: int = 1) -> None:
+    """Train the runs of `config` with these seeds to their end, as far as they are not there
+    yet."""
+    states: dict[str, list[int]] = {"begun": [], "new": [], "finished": []}
+    for each in configuration.with_seeds(config, seeds):
+        states[_state(each)].append(each.seed)
+    for state in ("begun", "new"):
+        if not states[state]:
+            continue
+        numbers = ", ".join(f"s{seed}" for seed in states[state])
+        reporter.line(f"── {configuration.default_workdir(config).name} {numbers}")
+        outcomes = loop.train_seeds(config, states[state], state == "begun", reporter, workers)
+        if outcomes[-1].stopped_by:
+            raise Interrupted(outcomes[-1].stopped_by)
+
+
+def _state(config: TrainConfig) -> str:
+    """How far the run of `config` is: new, begun or finished. Raises `InputError` if its folder
+    holds one with other settings or of other recordings."""
+    workdir = Path(config.workdir or "")
+    file = workdir / "config.yaml"
+    if not file.exists():
+        return "new"
+    run_folder.refuse_other_run(config, resume=True)
+    if data.get(config.dataset).needs_root:
+        roots = [
+            data.find_root(config.dataset, root).resolve()
+            for root in (configuration.load(file).data_root, config.data_root)
+        ]
+        if roots[0] != roots[1]:
+            problem = f"was trained on the recordings of {roots[0]}, not of {roots[1]}"
+            raise InputError(file, problem, "give another --out")
+    log = workdir / "metrics.jsonl"
+    rows = log.read_text(encoding="utf-8").count("\n") if log.exists() else 0
+    return "finished" if rows >= config.optim.epochs else "begun"
+
+
+def calibrated(workdir: Path, reporter: Reporter, workers: int = 1) -> Path:
+    """The run's best checkpoint with its filter fitted to its validation split: the calibrated run
+    that is there if it is of that checkpoint, else a new one."""
+
+    def best(run: Path) -> list[str]:
+        return sorted(step.name for step in (run / "checkpoints" / "best").glob("[0-9]*"))
+
+    folder = workdir.with_name(f"{workdir.name}_calibrated")
+    if folder.exists() and best(folder) == best(workdir):
+        return folder
+    reporter.line(f"calibrating {workdir.name}")
+    shutil.rmtree(folder, ignore_errors=True)
+    calibration.calibrate(CalibrateConfig(str(workdir), out=str(folder)), workers=workers)
+    return folder

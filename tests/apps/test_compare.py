@@ -1,0 +1,326 @@
+"""Comparisons of made-up evaluations, by hand."""
+
+import csv
+
+import numpy as np
+import pytest
+
+from gnio_jax import config as configuration
+from gnio_jax.apps import compare as comparison
+from gnio_jax.commands import app
+from gnio_jax.config import CompareConfig, TrainConfig
+from gnio_jax.errors import InputError
+from gnio_jax.evaluation import kept, tabulate
+from tests.support.reports import LOST, report_of, write_report, write_run
+
+GROUPS = {"a": "ann", "b": "ann", "c": "bob"}
+FILTER = configuration.plain(TrainConfig().filter)
+
+
+def write(run, ates, name="synthetic_test_ekf", drop=(), groups=GROUPS, more=None, **settings):
+    """An evaluation of a run; `ates`, `groups`, `more` and `drop` as in `report_of`."""
+    made = report_of(ates, groups, more, drop, **{"filter": FILTER, **settings})
+    return write_report(write_run(run) / "eval" / name, made)
+
+
+def compare(*words, metrics=("ate",), **options):
+    return comparison.compare(CompareConfig(tuple(map(str, words)), metrics=metrics, **options))
+
+
+def second(found, metric="ate"):
+    """The difference of the second row."""
+    difference = found.cells[metric][1].difference
+    assert difference is not None
+    return difference
+
+
+@pytest.fixture
+def runs(tmp_path):
+    """`plain` with two seeds and `new` with one."""
+    write(tmp_path / "plain_s0", {"a": 1.0, "b": 2.0, "c": 5.0})
+    write(tmp_path / "plain_s1", {"a": 3.0, "b": 2.0, "c": 7.0})
+    write(tmp_path / "new_s0", {"a": 1.0, "b": 3.0, "c": 3.0})
+    return tmp_path
+
+
+def test_by_hand(runs):
+    """Means over seeds 2, 2, 6 against 1, 3, 3: differences −1 and +1 of ann and −3 of bob. The
+    sums of the deviations from −1 are 2 and −2, so the standard error is √2 √8 / 3."""
+    found = compare(runs / "plain", runs / "new")
+    plain, new = found.cells["ate"]
+    assert [row.label for row in found.rows] == ["plain", "new"] and plain.difference is None
+    assert plain.mean.seeds == pytest.approx([8 / 3, 4.0])
+    assert new.mean.seeds == pytest.approx([7 / 3])
+    difference = second(found)
+    assert difference.mean == pytest.approx(-1.0) and difference.gain == pytest.approx(30.0)
+    reach = 12.7062 * 4 / 3  # t of one degree of freedom
+    assert difference.interval == pytest.approx((-1 - reach, -1 + reach), rel=1e-5)
+    assert (difference.better, difference.compared, difference.groups) == (2, 3, 2)
+    assert comparison.lines(found) == [
+        ["ATE (m)", "plain", "3.33 ± 0.94", "", ""],
+        ["", "new", "2.33", "-1.00 (-17.94 to +15.94)", "2 of 3"],
+    ]
+    said = comparison.explanations(found)
+    assert said[0].startswith("Seeds of plain: plain_s0, plain_s1; new: one.")
+    assert "there are 2." in said[1]
+    assert (
+        comparison.title(found) == "synthetic test, ekf; differences to plain, paired by sequence"
+    )
+
+
+def test_what_diverged_is_in_no_difference(runs):
+    """What is lost counts among the estimates that have the metric."""
+    write(runs / "lost", {"a": 1.5, "b": LOST, "c": 3.0})
+    found = compare(runs / "new_s0", runs / "lost")
+    assert second(found).compared == 2 and second(found).mean == pytest.approx(0.25)
+    line = comparison.lines(found)[1]
+    assert line[2] == "2.25 † 1/3" and line[3].endswith("over 2")
+    assert any(said.startswith("†") for said in comparison.explanations(found))
+
+
+def test_what_diverged_more_often_is_not_better(runs, tmp_path):
+    """The walks that are left may be the easy ones."""
+    write(runs / "lost", {"a": 0.5, "b": LOST, "c": 3.0})
+    found = compare(runs / "new_s0", runs / "lost")
+    assert second(found).withheld and second(found).mean is None
+    assert comparison.lines(found)[1] == ["", "lost", "1.75 † 1/3", "– ‡", ""]
+    assert any(said.startswith("‡ Would be better") for said in comparison.explanations(found))
+    comparison.write(tmp_path / "both", found)
+    table = list(csv.DictReader((tmp_path / "both.csv").open(encoding="utf-8")))
+    wanted = ("difference", "better", "compared", "estimates")
+    assert [table[1][name] for name in wanted] == ["", "", "2", "3"]
+    assert [table[0][name] for name in ("better", "compared", "groups")] == ["", "", ""]
+    assert second(compare(runs / "lost", runs / "new_s0")).mean == pytest.approx(0.25)
+
+
+def test_marks_are_explained(runs):
+    """An infinite NEES is no divergence, a metric may be missing, rows may share no sequence or
+    belong to one person."""
+    write(runs / "bad", {"a": 1.0, "b": 3.0, "c": 3.0}, more={"nees": LOST})
+    write(runs / "good", {"a": 1.0, "b": 3.0, "c": 3.0}, more={"nees": 1.0})
+    found = compare(runs / "good", runs / "bad", metrics=("nees", "ate"))
+    assert comparison.lines(found)[1] == ["", "bad", "∞", "–", ""]
+    assert any(line.startswith("∞") for line in comparison.explanations(found))
+    write(runs / "other", {"a": 1.0, "b": 1.0, "c": 1.0}, drop=("rpe_1s",))
+    found = compare(runs / "plain", runs / "other", runs / "new", metrics=("rpe_1s",))
+    assert comparison.lines(found)[1] == ["", "other", "–", "", ""]
+    assert comparison.lines(found)[2][3].startswith("-0.100")
+    found = compare(runs / "other", runs / "new", metrics=("rpe_1s",))
+    assert comparison.lines(found)[1][3] == "–"  # nothing to compare with
+    write(runs / "one", {"a": 1.0})
+    write(runs / "two", {"c": 2.0})
+    found = compare(runs / "one", runs / "two")
+    assert comparison.lines(found)[1] == ["", "two", "2.00", "–", ""]
+    said = comparison.explanations(found)
+    assert any("both rows have" in line for line in said)
+    assert not any("No interval" in line for line in said)
+    write(runs / "ann", {"a": 1.0, "b": 1.0})
+    write(runs / "anns", {"a": 2.0, "b": 2.0})
+    found = compare(runs / "ann", runs / "anns")
+    assert comparison.lines(found)[1][3] == "+1.00"
+    assert any(line.startswith("No interval") for line in comparison.explanations(found))
+
+
+def test_a_comparison_knows_which_value_is_best(runs, monkeypatch):
+    column = tabulate.COLUMNS["ate"]._replace(best=4.0)
+    monkeypatch.setitem(tabulate.COLUMNS, "ate", column)
+    found = compare(runs / "plain_s0", runs / "new")  # |1, 2, 5 − 4| against |1, 3, 3 − 4|
+    assert comparison.lines(found)[0][0] == "ATE (m, best 4)" and second(found).better == 1
+
+
+def test_without_metrics_the_usual_ones_that_are_there(runs):
+    assert list(compare(runs / "plain", runs / "new", metrics=None).cells) == ["ate", "rpe_1s"]
+
+
+# Rows
+# --------------------------------------------------------------------------------------------------
+
+
+def test_names_without_a_seed_stand_for_all_seeds(tmp_path):
+    names = ("net_s0", "net_s10", "net_s2", "net_s0_calibrated", "net_s2_calibrated")
+    for name in (*names, "net_small_s1"):
+        (tmp_path / name / "eval" / "x").mkdir(parents=True)
+        (tmp_path / name / "config.yaml").touch()
+    (tmp_path / "net_s4").mkdir()  # no run
+    (tmp_path / "net_s5").touch()
+
+    def found(word):
+        return [str(path.relative_to(tmp_path)) for path in comparison.find(str(tmp_path / word))]
+
+    assert found("net") == ["net_s0", "net_s2", "net_s10"]
+    assert found("net_calibrated") == ["net_s0_calibrated", "net_s2_calibrated"]
+    assert found("net_s2") == ["net_s2"]
+    assert found("net/eval/x") == [f"net_s{k}/eval/x" for k in (0, 2, 10)]
+    for word in ("net/eval/y", "nothing"):
+        with pytest.raises(InputError, match="is not there"):
+            found(word)
+
+
+def test_a_name_may_look_like_a_seed(tmp_path):
+    for name in ("galaxy_s8_w8_s0", "galaxy_s8_w8_s1", "galaxy_s8_w9"):
+        write_run(tmp_path / name)
+    assert len(comparison.find(str(tmp_path / "galaxy_s8_w8"))) == 2
+    with pytest.raises(InputError, match="is not there"):
+        comparison.find(str(tmp_path / "galaxy_w9"))
+    write_run(tmp_path / "galaxy_s8_w8_s01")
+    with pytest.raises(InputError, match="has a seed twice"):
+        comparison.find(str(tmp_path / "galaxy_s8_w8"))
+
+
+def test_runs_are_evaluated_where_they_are_not_yet_and_read_once(runs, monkeypatch):
+    made, read, run_config = [], [], kept.run_config
+
+    def evaluate(config, progress, workers):
+        made.append((config.workdir, config.split, config.estimator, workers))
+        name = config.workdir.removeprefix(f"{runs}/")
+        write(runs / name, {"a": 4.0}, "synthetic_val_ekf", split="val")
+
+    monkeypatch.setattr(kept, "evaluate", evaluate)
+    monkeypatch.setattr(
+        kept, "run_config", lambda run, which: read.append(run.name) or run_config(run, which)
+    )
+    config = CompareConfig((f"{runs}/plain", f"{runs}/new"), split="val", metrics=("ate",))
+    found = comparison.compare(config, workers=3)
+    names = ["plain_s0", "plain_s1", "new_s0"]
+    assert made == [(f"{runs}/{name}", "val", "ekf", 3) for name in names] and read == names
+    assert second(found).mean == 0
+    comparison.compare(config)
+    assert len(made) == 3
+
+
+def test_evaluations_by_their_folders(runs, monkeypatch):
+    """Two estimators of one run, side by side, also named from inside."""
+    made = {"estimator": "integrate", "coupling": None, "orientation_source": "reference"}
+    other = write(runs / "new_s0", {"a": 2.0, "b": 4.0, "c": 4.0}, "summed", **made)
+    found = compare(runs / "new", other)
+    assert second(found).mean == pytest.approx(1.0)
+    assert [row.label for row in found.rows] == ["new", "new_s0/eval/summed"]
+    said = comparison.explanations(found)
+    assert said[0].startswith("One seed each") and "integrate, reference orientation" in said[1]
+    folders = [runs / f"{name}_s0" / "eval" / "synthetic_test_ekf" for name in ("plain", "new")]
+    assert [row.label for row in compare(*folders).rows] == ["plain_s0", "new_s0"]
+    monkeypatch.chdir(runs / "new_s0" / "eval")
+    found = compare("synthetic_test_ekf", "summed")
+    assert [row.runs for row in found.rows] == [["new_s0"], ["new_s0"]]
+
+
+def test_options_of_the_filter_that_differ_are_told(runs):
+    """Not where no filter runs."""
+    for name, gravity, density in (("here", 9.8, 1), ("there", 9.7, 1.0)):
+        options = {"gravity": gravity, "accel_density": density}
+        write(runs / name, {"a": 1.0}, "own", filter=options)
+        write(runs / name, {"a": 1.0}, "summed", filter=options, estimator="integrate")
+    found = compare(runs / "here/eval/own", runs / "there/eval/own")
+    assert "The rows differ in options of the filter: gravity." in comparison.explanations(found)
+    found = compare(runs / "here/eval/summed", runs / "there/eval/summed")
+    assert comparison.filter_options(found) == []
+
+
+def test_figures_of_other_recordings_are_never_compared(tmp_path, monkeypatch):
+    """A run that was evaluated on the folder A is evaluated anew for a comparison on B, and
+    evaluations of A and B are refused, though their recordings have the same names."""
+    for name in ("A", "B"):
+        (tmp_path / name).mkdir()
+    config = TrainConfig(dataset="tlio", data_root=str(tmp_path / "A"))
+    for name in ("one", "two"):
+        write_run(tmp_path / name)
+        configuration.save(tmp_path / name / "config.yaml", config)
+
+    def evaluate(config, *_):
+        root = str(config.data_root)
+        name = config.workdir.removeprefix(f"{tmp_path}/")
+        made = {"dataset": "tlio", "data_root": root, "filter": FILTER}
+        ate = 1.0 if root.endswith("A") else 2.0
+        write_report(
+            tmp_path / name / "eval" / "tlio_test_ekf", report_of({"a": ate}, GROUPS, **made)
+        )
+
+    monkeypatch.setattr(kept, "evaluate", evaluate)
+    on_a = kept.EvaluateConfig(f"{tmp_path}/one", data_root=f"{tmp_path}/A")
+    evaluate(on_a)
+    found = compare(tmp_path / "one", tmp_path / "two", data_root=str(tmp_path / "B"))
+    assert [cell.mean.mean for cell in found.cells["ate"]] == [2.0, 2.0]
+    evaluate(on_a)
+    folders = [tmp_path / name / "eval" / "tlio_test_ekf" for name in ("one", "two")]
+    with pytest.raises(InputError, match=r"is of data root .*B, the first row of .*A"):
+        compare(*folders)
+
+
+def test_refusals(runs):
+    def refused(*words, metrics=None, **options):
+        with pytest.raises(InputError) as error:
+            compare(*(runs / word for word in words), metrics=metrics, **options)
+        return str(error.value)
+
+    own = "eval/synthetic_test_ekf"
+    assert "needs two or more" in refused("plain")
+    assert "is not there" in refused("plain", "gone")
+    assert "no row has 'nis'; there are: ate, rpe_1s" in refused("plain", "new", metrics=("nis",))
+    assert "no metric 'new'; name RUNS before it" in refused("plain", metrics=("ate", "new"))
+    assert "names no metric" in refused("plain", "new", metrics=())
+    assert "plain_s1: is named twice" in refused("plain", "plain_s1")
+    assert "new_s0: is named twice" in refused("new", "new")
+    seen = f"seen/{own}"
+    write(runs / "seen", {"a": 1.0}, split="seen")
+    assert "is of split seen, the first row of test; give --split seen" in refused("plain", seen)
+    assert "plain_s0: is of split test, the first row of seen; give --split seen" in refused(
+        seen, "plain"
+    )
+    write(runs / "groups", {"a": 1.0, "b": 1.0}, groups={**GROUPS, "b": "eve"})
+    assert f"sequence b is of eve here, of ann in {runs}/plain_s0/" in refused("plain", "groups")
+    for name, seconds in (("short", 60.0), ("long", 60.1), ("mix_s0", 60.0), ("mix_s1", 600.0)):
+        write(runs / name, {"a": 1.0}, recordings={"a": seconds})
+    told = refused("short", "long")
+    assert f"sequence a takes 60.1 s here, 60 s in {runs}/short/" in told
+    assert f"mix_s1/{own}: sequence a takes 600 s here" in refused("mix", "new")
+    for seed in (0, 1):
+        (runs / f"linked_s{seed}").symlink_to(runs / "new_s0")
+    assert "linked_s1: is the same evaluation as" in refused("linked", "plain")
+    assert "is the same evaluation as" in refused("new_s0", f"new_s0/{own}")
+    write(runs / "new_s0", {"a": 0.5}, "aligned", alignment="se3")
+    assert "is of alignment se3, the first row of origin" in refused("plain", "new_s0/eval/aligned")
+    (runs / "untrained").mkdir()
+    (runs / "untrained" / "config.yaml").write_text("dataset: synthetic\n")
+    assert "checkpoints/best: holds no checkpoint" in refused("untrained", "plain")
+    write(runs / "old", {"a": 1.0}, definitions=1)
+    assert "another version" in refused("plain", f"old/{own}")
+    write(runs / "left", {"a": 1.0}, step=6)
+    assert "of a checkpoint that the run has no more" in refused("plain", f"left/{own}")
+    assert "neither a run nor an evaluation" in refused("plain", "new_s0/eval")
+    (runs / "plain_s1" / own).rename(runs / "elsewhere")
+    assert "is there for 1 of 2 seeds; missing: " in refused("seen", f"plain/{own}")
+
+
+# The command
+# --------------------------------------------------------------------------------------------------
+
+
+def test_the_command_shows_and_writes(runs, capsys):
+    out = runs / "results" / "v1.5"
+    (runs / "new_s0").rename(runs / "pipe|x")
+    words = [f"{runs}/plain", f"{runs}/pipe|x", "--metrics", "ate", "rpe_1s", "--out", str(out)]
+    app.main(["compare", *words])
+    shown = capsys.readouterr().out
+    assert "-1.00 (-17.94 to +15.94)" in shown and str(out) in shown
+    table = list(csv.DictReader((out.parent / "v1.5.csv").open(encoding="utf-8")))
+    assert [(line["metric"], line["row"]) for line in table] == [
+        (metric, row) for metric in ("ate", "rpe_1s") for row in ("plain", "pipe|x")
+    ]
+    assert float(table[1]["difference"]) == pytest.approx(-1.0) and table[0]["difference"] == ""
+    assert float(table[0]["std"]) == pytest.approx(np.std([8 / 3, 4.0], ddof=1))
+    text = (out.parent / "v1.5.md").read_text("utf-8")
+    assert "| ATE (m) | plain | 3.33 ± 0.94 |" in text and r"|  | pipe\|x | 2.33 |" in text
+    assert (out.parent / "v1.5.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize("out", [".", "..", "results/", "", "c", "x.md", "a_file/x", "y" * 248])
+def test_a_name_that_cannot_be_written_is_told_first(runs, out, monkeypatch, capsys):
+    monkeypatch.chdir(runs)
+    (runs / "c.csv").mkdir()
+    (runs / "a_file").touch()
+    before = sorted(runs.iterdir())
+    with pytest.raises(SystemExit) as left:
+        app.main(["compare", "plain", "new", "--out", out])
+    assert left.value.code == 2 and sorted(runs.iterdir()) == before
+    said = capsys.readouterr()
+    assert not said.out and len(said.err.splitlines()) == 1

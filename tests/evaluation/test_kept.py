@@ -1,0 +1,107 @@
+"""Which evaluations that are there may stand for a run."""
+
+import dataclasses
+
+import pytest
+
+from gnio_jax import config as configuration
+from gnio_jax.config import EvaluateConfig
+from gnio_jax.errors import InputError
+from gnio_jax.evaluation import kept, report
+from gnio_jax.reporting import Lines
+from tests.support.reports import BASE, report_of, write_report, write_run
+
+
+@pytest.fixture
+def run(tmp_path):
+    """A run on the recordings of a folder, and what its evaluation says of itself."""
+    (tmp_path / "data").mkdir()
+    config = dataclasses.replace(BASE, data_root=str(tmp_path / "data"))
+    write_run(tmp_path / "run")
+    configuration.save(tmp_path / "run" / "config.yaml", config)
+    return tmp_path / "run"
+
+
+def evaluation(run, **settings):
+    """As it is when it may stand for the run."""
+    own = {
+        "dataset": "tlio",
+        "data_root": str(run.parent / "data"),
+        "step": 7,
+        "filter": configuration.plain(BASE.filter),
+        **settings,
+    }
+    folder = run / "eval" / f"tlio_test_{settings.get('estimator', 'ekf')}"
+    return write_report(folder, report_of({"a": 1.0}, {"a": "x"}, **own))
+
+
+def look(run, **options):
+    return kept.look(EvaluateConfig(str(run), plots=False, **options))
+
+
+def test_what_is_there_is_taken(run, monkeypatch):
+    folder = evaluation(run)
+    found = look(run)
+    assert (found.folder, found.problem) == (folder, "")
+    monkeypatch.setattr(kept, "evaluate", None)
+    assert kept.made(found, Lines()) == report.read(folder)
+
+
+@pytest.mark.parametrize(
+    "settings, problem",
+    [
+        ({"definitions": report.DEFINITIONS - 1}, "another version"),
+        ({"definitions": report.DEFINITIONS + 1}, "another version"),
+        ({"step": 6}, "of a checkpoint that the run has no more"),
+        ({"filter": {**configuration.plain(BASE.filter), "gravity": 9.0}}, "of another filter"),
+        ({"split": "val"}, "of split val, not test"),
+        ({"alignment": "se3"}, "of alignment se3"),
+        ({"data_root": "/elsewhere"}, "of data root /elsewhere"),
+    ],
+)
+def test_what_means_something_else_is_made_anew(run, monkeypatch, settings, problem):
+    folder = evaluation(run, **settings)
+    lines, made = [], []
+
+    def evaluate(config, progress, workers):
+        made.append(config)
+        evaluation(run)
+
+    monkeypatch.setattr(kept, "evaluate", evaluate)
+    monkeypatch.setattr(Lines, "line", lambda self, text: lines.append(text))
+    found = look(run)
+    assert problem in found.problem and found.report is None
+    assert kept.made(found, Lines()) == report.read(folder) and len(made) == 1
+    assert made[0].filter == BASE.filter and problem in lines[0]
+    assert look(run).problem == ""
+
+
+def test_damaged_figures_are_made_anew(run):
+    folder = evaluation(run)
+    text = (folder / "metrics.json").read_text()
+    for broken in (text[:40], "{}", "[]"):
+        (folder / "metrics.json").write_text(broken)
+        assert "is not a metrics.json" in look(run).problem
+
+
+def test_recordings_of_another_folder_are_never_taken(run, tmp_path):
+    """A run that was evaluated on A has no figures on B, whatever the recordings are called."""
+    evaluation(run)
+    (tmp_path / "other").mkdir()
+    found = look(run, data_root=str(tmp_path / "other"))
+    assert found.report is None and found.identity["data_root"] == str(tmp_path / "other")
+    (tmp_path / "link").symlink_to(tmp_path / "data")
+    assert look(run, data_root=str(tmp_path / "link")).problem == ""
+
+
+def test_integrate_takes_no_filter(run):
+    """An evaluation of `integrate` with other options of the filter means the same."""
+    evaluation(run, estimator="integrate", filter={"gravity": 9.0})
+    assert look(run, estimator="integrate").problem == ""
+
+
+def test_a_run_without_a_checkpoint_is_refused_before_the_work(run):
+    (run / "checkpoints" / "best" / "7").rmdir()
+    with pytest.raises(InputError, match="holds no checkpoint"):
+        look(run)
+    assert look(run, estimator="imu_only").problem == "it is not evaluated yet"

@@ -1,0 +1,122 @@
+"""The table on the screen names what matters, and fits into it."""
+
+import pytest
+from rich.console import Console
+
+from gnio_jax.commands.console import stdout
+from gnio_jax.evaluation import tabulate
+from gnio_jax.evaluation.statistics import Difference, Summary
+
+
+def text(report, width=80):
+    console = Console(width=width, record=True, file=open("/dev/null", "w"))
+    console.print(tabulate.render(report))
+    return console.export_text()
+
+
+def rows(report, width=80):
+    """First cell -> the line's words."""
+    lines = [line for line in text(report, width).splitlines() if line.startswith("  ")]
+    return {line.split("  ")[1].strip(): line.split() for line in lines}
+
+
+def test_the_table_says_what_matters(made):
+    shown = " ".join(text(made).split())
+    for words in (
+        "made test: ekf",
+        "room 1/walk",
+        "never_moves",
+        "window orientation: filter",
+        "initial state: reference",
+        "gyro bias: zero",
+        "IMU compensated: no",
+        "blind: start: rough",
+        "left out: short",
+        "–",
+    ):
+        assert words in shown
+    table, summary = rows(made), made.summary()
+    assert f"{summary['ate'].mean:.2f}" in table["mean"]
+    assert table["blind"][1:4] == ["–"] * 3
+    low, _ = summary["nees_coverage"].interval or (None, None)
+    assert table["95 % from"][-1] == tabulate.number(low, 0)
+
+
+@pytest.mark.parametrize("name", ["w", "2023-11-25T12-30_person-17_pocket_left_stairs_down"])
+@pytest.mark.parametrize("value", [0.5, 123456.7])
+def test_the_table_fits_into_80_columns_and_shortens_no_name(made, name, value):
+    """Also with large errors: what a reader asks first is there for every sequence."""
+    measured = made.scores["room 1/walk"]
+    values = {metric: value for metric in measured.values}
+    scores = {name: measured._replace(values=values), "b": measured}
+    rows_below = {"never_moves": scores, "perfect_displacements": scores}
+    report = made._replace(
+        scores=scores, reference_rows=rows_below, groups={name: "x", "b": "y"}, notes={}
+    )
+    lines = text(report).splitlines()
+    assert max(map(len, lines)) <= 80 and not any("…" in line for line in lines)
+    heads = " ".join("\n".join(lines[:6]).split())
+    for words in ("ATE", "RTE 60 s", "RPE 1 s", "yaw", "path", "ratio", "NEES<95"):
+        assert words in heads
+    column = "".join(line[:30].split("  ")[1].strip() for line in lines if line.startswith("  "))
+    assert name in column
+    assert all(len(rows(report)[row]) == len(tabulate.SCREEN) + 1 for row in ("b", "mean"))
+
+
+def test_divergence_is_in_the_table(made, with_divergence):
+    table = rows(with_divergence[1], 120)
+    assert "mean without 1 diverged" in table and "mean" not in table
+    assert table["room 1:walk"].count("∞") == 5
+    shown = " ".join(text(with_divergence[1]).split())
+    assert "∞: the estimate diverged" in shown
+    assert "room 1:walk: the estimate diverged, and is in no mean" in shown
+    assert "diverged" not in text(made)
+
+
+def test_headings_are_words_on_the_console_of_results(made, capsys):
+    stdout().print(tabulate.render(made))
+    shown = capsys.readouterr().out
+    assert "ATE" in shown and "[dim]" not in shown and "[bold]" not in shown
+
+
+def test_how_the_trajectories_were_estimated_in_words(made):
+    def way(**settings):
+        return tabulate.way(made.settings | settings)
+
+    assert way() == "ekf" == way(checkpoint="best")
+    assert way(estimator="imu_only", coupling=None) == "imu_only"
+    loose = {"coupling": "loose", "orientation_source": "device"}
+    assert way(**loose) == "ekf, loose coupling, device orientation"
+    summed = {"estimator": "integrate", "coupling": None, "orientation_source": "reference"}
+    assert way(**summed) == "integrate, reference orientation"
+    told = way(initial_state="static", gyro_bias="rest", alignment="se3", checkpoint="latest")
+    assert told == "ekf, static start, gyro bias: rest, se3 alignment, latest checkpoint"
+
+
+def test_the_windows_are_told_with_their_context():
+    windows = {"window_seconds": 1.0, "rate": 100.0, "context_seconds": 0.0}
+    assert tabulate.windows(windows) == "1 s at 100 Hz"
+    with_context = tabulate.windows({**windows, "context_seconds": 0.5})
+    assert with_context == "1 s at 100 Hz, and 0.5 s before"
+
+
+def test_a_difference_has_the_digits_of_its_interval():
+    """A mean of 3.0 ° may differ by 0.0045 °."""
+    found = Difference(0.00452, (0.00213, 0.00709), None, 1, 2, 2, 2)
+    assert tabulate.difference(found, 1) == "+0.0045 (+0.0021 to +0.0071)"
+    assert tabulate.difference(found._replace(interval=None, sequences=3), 1) == "+0.0045 over 2"
+    assert tabulate.difference(found._replace(mean=None, withheld=True), 1) == "– ‡"
+
+
+def test_a_mean_has_its_seeds_and_what_diverged():
+    found = Summary(2.25, [1.5, 3.0], 2.0, None, 3, 2, 0, 8)
+    assert tabulate.mean(found, 2) == "2.25 ± 1.06"
+    assert tabulate.mean(found._replace(seeds=[2.25], diverged=1), 2) == "2.25 † 1/8"
+    assert tabulate.mean(found._replace(mean=None, seeds=[]), 2) == "–"
+
+
+def test_metrics_are_written_alike_in_3d_and_2d():
+    assert tabulate.column("ate_2d").title == "ATE 2-D (m)"
+    assert tabulate.column("nees_coverage_2d").best == 95.0
+    assert tabulate.column("path_length_ratio").title == "path ratio (best 1)"
+    assert tabulate.column("rpe_se3").title == "rpe_se3"

@@ -1,0 +1,60 @@
+"""Made-up reports of evaluations, from metrics alone."""
+
+import json
+
+import numpy as np
+
+from gnio_jax.config import ModelConfig, OptimConfig, TrainConfig
+from gnio_jax.evaluation import report
+from gnio_jax.evaluation.metrics import Measures
+from gnio_jax.evaluation.report import Report
+
+BASE = TrainConfig(dataset="tlio", model=ModelConfig(width=4), optim=OptimConfig(epochs=40))
+LOST = np.inf
+"""An `ate` of an estimate that diverged."""
+SETTINGS = {
+    "dataset": "synthetic",
+    "data_root": None,
+    "split": "test",
+    "estimator": "ekf",
+    "coupling": "tight",
+    "orientation_source": "filter",
+    "initial_state": "reference",
+    "gyro_bias": "zero",
+    "imu_compensated": "no",
+    "alignment": "origin",
+    "checkpoint": "best",
+    "filter": {},
+    "definitions": report.DEFINITIONS,
+}
+
+
+def measures(**values):
+    """Of a sequence; infinite where it diverged."""
+    return Measures(values, {}, values.get("ate") == LOST)
+
+
+def report_of(ates, groups, more=None, drop=(), **settings):
+    """A report: `ate` of sequence -> m, `rpe_1s` a tenth of it. `groups` are those of the
+    sequences; `more`: other metrics of each; `drop`: metrics that it lacks."""
+    scores = {}
+    for name, ate in ates.items():
+        values = {"ate": ate, "rpe_1s": ate / 10, **(more or {})}
+        scores[name] = measures(**{key: x for key, x in values.items() if key not in drop})
+    seconds = {name: 60.0 for name in ates}
+    settings = {**SETTINGS, "recordings": seconds, **settings}
+    return Report(settings, scores, {}, {name: groups[name] for name in ates}, {}, {})
+
+
+def write_report(folder, made):
+    """Its metrics.json."""
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "metrics.json").write_text(json.dumps(report.as_json(made)), encoding="utf-8")
+    return folder
+
+
+def write_run(folder, text="dataset: synthetic\n", step=7):
+    """A run with a best checkpoint, as far as comparisons look at one."""
+    (folder / "checkpoints" / "best" / str(step)).mkdir(parents=True, exist_ok=True)
+    (folder / "config.yaml").write_text(text)
+    return folder

@@ -1,0 +1,49 @@
+"""Runs that are there already."""
+
+import dataclasses
+
+import pytest
+
+from gnio_jax import config as configuration
+from gnio_jax.config import CalibrateConfig
+from gnio_jax.errors import InputError
+from gnio_jax.reporting import Lines
+from gnio_jax.tables import runs
+from tests.support.reports import BASE, write_run
+
+
+def test_a_calibration_is_of_the_best_checkpoint(tmp_path, monkeypatch):
+    run, made = tmp_path / "gnio_s0", []
+
+    def calibrate(config, workers):
+        made.append(config)
+        (best,) = (run / "checkpoints" / "best").iterdir()
+        (tmp_path / config.out / "checkpoints" / "best" / best.name).mkdir(parents=True)
+
+    monkeypatch.setattr(runs.calibration, "calibrate", calibrate)
+    (run / "checkpoints" / "best" / "7").mkdir(parents=True)
+    for _ in range(2):
+        assert runs.calibrated(run, Lines()) == tmp_path / "gnio_s0_calibrated"
+    assert made == [CalibrateConfig(str(run), out=str(tmp_path / "gnio_s0_calibrated"))]
+    # The run goes on and finds a better checkpoint: what was fitted to the old one is replaced.
+    (run / "checkpoints" / "best" / "7").rename(run / "checkpoints" / "best" / "9")
+    runs.calibrated(run, Lines())
+    (kept,) = (tmp_path / "gnio_s0_calibrated" / "checkpoints" / "best").iterdir()
+    assert len(made) == 2 and kept.name == "9"
+
+
+def test_a_run_of_other_recordings_is_refused(tmp_path, monkeypatch):
+    """Its settings are the same, and so may be the names of the recordings."""
+    for name in ("A", "B"):
+        (tmp_path / name).mkdir()
+    workdir = tmp_path / "gnio"
+    config = dataclasses.replace(BASE, data_root=str(tmp_path / "A"), workdir=str(workdir))
+    (kept,) = configuration.with_seeds(config, [0])
+    write_run(tmp_path / "gnio_s0")
+    configuration.save(tmp_path / "gnio_s0" / "config.yaml", kept)
+    (tmp_path / "gnio_s0" / "metrics.jsonl").write_text("{}\n" * BASE.optim.epochs)
+    monkeypatch.setattr(runs.loop, "train_seeds", None)
+    runs.train(config, [0], Lines())
+    other = dataclasses.replace(config, data_root=str(tmp_path / "B"))
+    with pytest.raises(InputError, match=r"was trained on the recordings of .*A, not of .*B"):
+        runs.train(other, [0], Lines())
