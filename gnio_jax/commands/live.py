@@ -16,7 +16,6 @@ import numpy as np
 import tyro
 
 from gnio_jax.commands import console, options
-from gnio_jax.commands.recordings import read_any
 from gnio_jax.config import ImportOptions
 from gnio_jax.errors import InputError
 from gnio_jax.files import check_writable
@@ -150,8 +149,10 @@ def _source(asked: LiveOptions) -> tuple[Any, float | None, tuple[str, ...]]:
         return following.checked_units(messages), asked.imu_rate, ()
     if asked.speed < 0:
         raise InputError("--speed", f"must not be negative, found {asked.speed:g}")
+    from gnio_jax.apps.importing import read_imported
+
     stated = ImportOptions(gyro_unit=asked.gyro_unit, accel_unit=asked.accel_unit)
-    sequence, notes, warned = read_any(Path(asked.source), stated)
+    sequence, notes, warned = read_imported(Path(asked.source), stated)
     rate = 1 / float(np.median(np.diff(sequence.time)))
     played = following.from_recording(sequence, asked.speed)
     return played, asked.imu_rate or rate, (*warned, *notes)

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import tyro
 
@@ -63,14 +61,14 @@ def import_file(asked: ImportFile, _call: options.Call) -> None:
         raise InputError("--out", f"'{asked.out}' is no name of an HDF5 file", "name it NAME.h5")
     if asked.out.is_dir():
         raise InputError("--out", f"'{asked.out}' is a folder", "name a file in it, NAME.h5")
-    from gnio_jax.apps.importing import impressions  # late: mistakes do not wait for JAX
-    from gnio_jax.apps.importing.kept import write_imported
+    from gnio_jax.apps import importing  # late: mistakes do not wait for JAX
     from gnio_jax.data.readers import csv_files
 
-    recording = _read(asked.file, asked.recording, asked.rate, asked.name or asked.out.stem)
-    write_imported(asked.out, recording)
+    name = asked.name or asked.out.stem
+    recording = importing.import_recording(asked.file, asked.recording, rate=asked.rate, name=name)
+    importing.write_imported(asked.out, recording)
     sequence, folder = recording.sequence, asked.out.parent
-    notes = [*recording.notes, *impressions(sequence)]
+    notes = [*recording.notes, *importing.impressions(sequence)]
     lists = [split for split in csv_files.SPLITS if (folder / f"{split}.txt").is_file()]
     if lists:
         line = f"add the line {asked.out.name} to {lists[-1]}.txt, or it is not read"
@@ -91,26 +89,6 @@ def import_file(asked: ImportFile, _call: options.Call) -> None:
         )
         following = f"gnio track {asked.out}"
     output.print(f"next: {following}", soft_wrap=True)
-
-
-def read_any(file: Path, stated: ImportOptions) -> Any:
-    """An `importing.Imported` of the file; our own HDF5 is read as it is."""
-    from gnio_jax.apps.importing.kept import read_imported
-
-    return read_imported(file) if file.suffix.lower() in HDF5 else _read(file, stated)
-
-
-def _read(
-    file: Path, stated: ImportOptions, rate: float | None = None, name: str | None = None
-) -> Any:
-    """The recording as an `importing.Imported`, whose notes have the warnings too."""
-    from gnio_jax.apps.importing import import_recording
-
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        found = import_recording(file, stated, rate=rate, name=name)
-    warned = (str(warning.message) for warning in caught)
-    return found._replace(notes=(*found.notes, *warned))
 
 
 def export_file(asked: ExportFile, _call: options.Call) -> None:

@@ -11,7 +11,6 @@ from rich import box
 from rich.table import Table
 
 from gnio_jax.commands import console, options
-from gnio_jax.commands.recordings import read_any
 from gnio_jax.config import ImportOptions
 from gnio_jax.files import file_stem
 
@@ -52,9 +51,10 @@ def track(asked: TrackOptions, call: options.Call) -> None:
 
     from gnio_jax import tracking
     from gnio_jax.apps import packages
+    from gnio_jax.apps.importing import read_imported
 
     jax.config.update("jax_enable_x64", True)  # for the filter; the network states its float32
-    recording = read_any(asked.file, asked.recording)
+    recording = read_imported(asked.file, asked.recording)
     weights = packages.choose(asked.weights)
     out = asked.out or Path("tracks") / _folder_name(recording.sequence.name)
     with console.terminal() as terminal:

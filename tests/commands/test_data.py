@@ -12,8 +12,8 @@ import pytest
 from matplotlib import image
 
 from gnio_jax import data
-from gnio_jax.commands import app, recordings
-from gnio_jax.config import ImportOptions
+from gnio_jax.apps.importing import read_imported
+from gnio_jax.commands import app
 from gnio_jax.data import loading
 from gnio_jax.data.readers import DATASETS, tlio
 from gnio_jax.data.readers import csv_files as csv
@@ -476,7 +476,7 @@ def test_what_follows_an_import_beside_its_own_csv_can_be_followed(place, capsys
     assert following == "next: gnio track walk.h5"
     with pytest.raises(InputError, match="has the name of"):
         data.load("csv", place, "test")
-    assert recordings.read_any(place / "walk.h5", ImportOptions()).sequence.name == "walk"
+    assert read_imported(place / "walk.h5").sequence.name == "walk"
 
 
 def test_import_of_a_file_for_each_sensor(place, capsys):

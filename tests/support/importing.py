@@ -1,22 +1,15 @@
 """`import_recording` with what the recording does not say given by name."""
 
-from typing import NamedTuple
+import pytest
 
 from gnio_jax.apps import importing
 from gnio_jax.config import ImportOptions
-from gnio_jax.types import Sequence
-
-
-class Found(NamedTuple):
-    """An `Imported` but for its warnings."""
-
-    sequence: Sequence
-    notes: tuple[str, ...]
+from gnio_jax.errors import InputError
 
 
 def import_recording(path, columns=None, rate=None, name=None, **stated):
     """`columns`: from our names to the file's; `stated`: the other fields of `ImportOptions`."""
-    return Found(*imported(path, columns, rate, name, **stated)[:2])
+    return imported(path, columns, rate, name, **stated)[:2]
 
 
 def imported(path, columns=None, rate=None, name=None, **stated):
@@ -24,3 +17,10 @@ def imported(path, columns=None, rate=None, name=None, **stated):
     words = tuple(f"{ours}={theirs}" for ours, theirs in (columns or {}).items())
     options = ImportOptions(columns=words, **stated)
     return importing.import_recording(path, options, rate=rate, name=name)
+
+
+def refused(path, words, *columns, **stated):
+    """It is, in one line that holds the `words`."""
+    with pytest.raises(InputError, match=words) as caught:
+        import_recording(path, *columns, **stated)
+    assert "\n" not in str(caught.value)

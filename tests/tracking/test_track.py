@@ -166,7 +166,7 @@ def test_what_is_refused(mistake, runs, tmp_path):
     time = np.arange(50) / 100
     short = csv(tmp_path / "short.csv", time, known_walk.rate(time), known_walk.force(time))
     weights = ("--weights", runs / "walker")
-    assert "lasts 0.49 s" in mistake("track", short, *weights)
+    assert "were recorded for 0.49 s" in mistake("track", short, *weights)
     time = np.arange(104) / 100
     short = csv(tmp_path / "short.csv", time, known_walk.rate(time), known_walk.force(time))
     assert "too short for a window and a stride" in mistake("track", short, *weights)

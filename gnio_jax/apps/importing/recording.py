@@ -1,25 +1,45 @@
-"""What the reader of each format gives of a recording, and tables as loggers write them."""
+"""A recording as the reader of its format gives it, and the way from there to a `Sequence`: rows in
+order, units and signs, the one clock of all recordings (`data.assembly`), the reference."""
 
 from __future__ import annotations
 
 import re
+from fractions import Fraction
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Num
 
+from gnio_jax.data.assembly import Poses, Samples, Streams, assemble
+from gnio_jax.data.parsing import units
+from gnio_jax.data.parsing.stamps import (
+    PER_SECOND,
+    RATES,
+    first_stamp,
+    in_order,
+    rounded_rate,
+    seconds,
+    time_unit,
+)
 from gnio_jax.data.parsing.tables import Table, open_text, read_text
-from gnio_jax.data.reference import Poses
+from gnio_jax.data.resampling import longest_bridge
+from gnio_jax.data.self_check import self_check
+from gnio_jax.data.validation import WINDOW_SECONDS, check_finite
 from gnio_jax.errors import InputError
 from gnio_jax.numerics import interpolate
+from gnio_jax.types import Sequence
 
+GAPS = "lacks samples"
+"""What a note of holes in a recording says."""
+SLOW = 50.0
+"""Hz below which the impacts of steps are lost; networks are trained on 100 and more (ours)."""
 DECIMAL_ROWS = 20
 """Rows by which a decimal comma is told: in some all numbers may be whole."""
 
 
 class Units(NamedTuple):
-    """What a format says of its numbers. None: it does not say, and the data must tell."""
+    """What a format or the user states. None: nothing is stated, and the data must tell."""
 
     time: str | None = None
     """s, ms, us or ns."""
@@ -28,7 +48,7 @@ class Units(NamedTuple):
     accel: str | None = None
     """m/s2, g or mg."""
     sign: str | None = None
-    """Of the accelerometer: android or ios (see `units.signed`)."""
+    """Of the accelerometer: android, ios or detect (see `units.signed`)."""
     sign_is_assumed: bool = False
     """Nothing says that the sign is this one."""
 
@@ -44,14 +64,14 @@ class Sensor(NamedTuple):
 
 
 class Track(NamedTuple):
-    """A reference trajectory, on the clock of the IMU's stamps."""
+    """A reference trajectory by the clock of the IMU's stamps."""
 
     name: str
     """The file or topic, as the sequence's attribute `truth` has it."""
     poses: Poses
-    """Of the IMU in a z-up world, in s after the stamp `first`."""
-    first: float | int
-    """In the unit of the gyro's stamps."""
+    """Of the IMU in a z-up world, in s after `start`."""
+    start: Fraction
+    """s."""
     named: bool = False
     """The user asked for it: what is wrong with it is an error, and else a note."""
 
@@ -69,6 +89,20 @@ class Recording(NamedTuple):
     """What was recognised, chosen or left out, one sentence each."""
 
 
+class Imported(NamedTuple):
+    """A recording on a uniform clock."""
+
+    sequence: Sequence
+    """With a reference where the recording has one."""
+    notes: tuple[str, ...]
+    """What was detected, assumed or repaired, one sentence each, to be shown to the user."""
+    warnings: tuple[str, ...] = ()
+    """What may make everything wrong that is computed from it, one sentence each."""
+
+
+# --- from a table to the samples of a sensor
+
+
 class Layout(NamedTuple):
     """How the rows of a text table are written."""
 
@@ -80,21 +114,10 @@ class Layout(NamedTuple):
     """The cells of the first row, without quotes."""
 
 
-def read_table(path: Path, columns: tuple[str, ...], content: bytes | None = None) -> Table:
-    """A logger's table; without a header where all `columns` are places.
-
-    `content` is what the file holds where it is part of an archive.
-    """
-    layout = table_layout(path, content)
-    header = not (columns and all(name.isdigit() for name in columns))
-    table = read_text(path, layout.separator, header, content, layout.decimal)
-    return table.renamed(_label(label) for label in table.columns)
-
-
 def table_layout(path: Path, content: bytes | None = None) -> Layout:
     """The layout of a table, from its first rows: it is separated by the most frequent of comma,
-    semicolon and tab, or by blanks where there is none of them. Raises `InputError` for what is no
-    text."""
+    semicolon and tab, or by blanks where there is none of them. `content` is what the file holds
+    where it is part of an archive. Raises `InputError` for what is no text."""
     try:
         with open_text(path, content) as file:
             rows = (line for line in file if line.strip() and not line.startswith("#"))
@@ -106,9 +129,16 @@ def table_layout(path: Path, content: bytes | None = None) -> Layout:
     separator = max((",", ";", "\t"), key=first.count)
     separator = separator if separator in first else " "
     comma = separator != "," and any(re.search(r"\d,\d", row) for row in others)
-    decimal = "," if comma else "."
     labels = first.split(None if separator == " " else separator)
-    return Layout(separator, decimal, tuple(_label(label) for label in labels))
+    return Layout(separator, "," if comma else ".", tuple(_label(label) for label in labels))
+
+
+def read_table(path: Path, columns: tuple[str, ...] = (), content: bytes | None = None) -> Table:
+    """A logger's table; without a header where all `columns` that are wanted are places."""
+    layout = table_layout(path, content)
+    header = not (columns and all(name.isdigit() for name in columns))
+    table = read_text(path, layout.separator, header, content, layout.decimal)
+    return table.renamed(_label(label) for label in table.columns)
 
 
 def _label(text: object) -> str:
@@ -116,14 +146,13 @@ def _label(text: object) -> str:
     return str(text).strip("\ufeff \"'\n\r")
 
 
-def sensor_of(name: str, table: Table, time: str, axes: tuple[str, ...]) -> Sensor:
-    """The samples in the columns `time` and `axes` (x, y, z) of a table; a column of stamps or an
-    axis may be "a+b", the sum of two columns."""
+def sensor_of(name: str, table: Table, time: str, *axes: str) -> Sensor:
+    """The samples in the columns `time` and `axes` (x, y, z) of a table; each may be "a+b", the sum
+    of two columns."""
     whole = time in table.columns and table.columns[time].dtype.kind in "iu"
     # Columns that are shorter than others end in NaN, which is no sample.
     stamps = table.stamps(time) if whole else _column(table, time)
-    values = np.stack([_column(table, axis) for axis in axes], axis=1)
-    return Sensor(name, table.path, stamps, values)
+    return Sensor(name, table.path, stamps, np.stack([_column(table, a) for a in axes], axis=1))
 
 
 def _column(table: Table, name: str) -> Float[np.ndarray, " n"]:
@@ -132,17 +161,174 @@ def _column(table: Table, name: str) -> Float[np.ndarray, " n"]:
     return table.take(name, gaps=True)
 
 
-def added(motion: Sensor, gravity: Sensor) -> Sensor:
-    """The accelerometer's reading of acceleration without gravity, on the stamps of `motion`, and
-    of gravity, which turns slowly and is interpolated linearly (ours)."""
-    seen = np.isfinite(gravity.values).all(axis=1) & np.isfinite(gravity.stamps)
-    if seen.sum() < 2:
-        raise InputError(gravity.file, f"holds {seen.sum()} samples", "record for longer")
-    first = np.nanmin(motion.stamps)  # as integers ns of unix time have more digits than a float
-    time, stamps = ((each - first).astype(np.float64) for each in (motion.stamps, gravity.stamps))
-    order = np.flatnonzero(seen)[np.argsort(stamps[seen], kind="stable")]
-    inside = (time >= stamps[order[0]]) & (time <= stamps[order[-1]])
-    down = interpolate(time[inside], stamps[order], gravity.values[order])
-    return motion._replace(
-        name="accel", stamps=motion.stamps[inside], values=motion.values[inside] + down
+# --- from the samples of both sensors to a sequence
+
+
+def as_sequence(source: Recording, stated: Units, rate: float | None, name: str) -> Imported:
+    """What any format comes to; `stated` wins over what the format says of its units. Raises
+    `InputError`."""
+    notes, warnings = list(source.notes), []
+    unit = stated.time or source.units.time
+    gyro, accel = (_clocked(sensor, unit, notes) for sensor in (source.gyro, source.accel))
+    accel = accel._replace(time=accel.time + float(accel.start - gyro.start))
+    first, last = max(gyro.time[0], accel.time[0]), min(gyro.time[-1], accel.time[-1])
+    if last - first < WINDOW_SECONDS:
+        raise InputError(
+            source.path,
+            f"both sensors were recorded for {max(last - first, 0.0):.2f} s, less than the "
+            f"network's window of {WINDOW_SECONDS:g} s",
+            "record for longer, both by one clock",
+        )
+    if not np.array_equal(gyro.time, accel.time):
+        both = max(gyro.time[-1], accel.time[-1]) - min(gyro.time[0], accel.time[0])
+        notes.append(
+            "gyro and accel have stamps of their own: both are interpolated, "
+            f"{both - (last - first):.2f} s cut that only one of them covers"
+        )
+    rates, forces = _in_si(source, stated, gyro, accel, notes, warnings)
+    own = max(rounded_rate(gyro.time), rounded_rate(accel.time))
+    notes.append(f"put on a uniform clock of {rate or own:g} Hz")
+    if own < SLOW:
+        notes.append(
+            f"it was recorded at {own:g} Hz, which is slow: steps need {SLOW:g} Hz, and the "
+            "networks were trained on 100 Hz and more"
+        )
+    streams = Streams(
+        name,
+        str(source.path),
+        Samples(gyro.time, rates, str(source.gyro.file)),
+        Samples(accel.time, forces, str(source.accel.file)),
+        {"dataset": "csv", "group": name, "truth": "none"},
+        float(gyro.start),
     )
+    (sequence,) = assemble(streams, rate, whole=True)
+    if source.track is not None:
+        sequence = _with_track(sequence, streams, source.track, gyro.start, notes)
+    return Imported(sequence, tuple(notes), tuple(warnings))
+
+
+class _Clocked(NamedTuple):
+    """One sensor's samples in order."""
+
+    time: Float[np.ndarray, " n"]
+    """s since `start`."""
+    values: Float[np.ndarray, "n 3"]
+    start: Fraction
+    """s: the first stamp, exactly, since unix time in a float is good to a quarter of a
+    microsecond."""
+
+
+def _clocked(sensor: Sensor, unit: str | None, notes: list[str]) -> _Clocked:
+    """`unit` is that of the stamps, None detects it. What was detected or repaired is added to
+    `notes`."""
+    name, file, stamps, values = sensor
+    empty = np.isnan(values).all(axis=1)
+    if empty.any() and not empty.all():
+        # Loggers that write every sensor into one table leave the others' columns empty.
+        notes.append(
+            f"{file.name}: {empty.sum()} of {len(empty)} rows have no {name} and are not its "
+            "samples"
+        )
+        stamps, values = stamps[~empty], values[~empty]
+    if (count := len(np.unique(stamps))) < 2:
+        problem = f"holds {count} stamps of field '{name}'"
+        raise InputError(file, problem, "record for longer")
+    check_finite(stamps.astype(np.float64), "time", file)
+    check_finite(values, name, file)
+    detected, rate = time_unit(stamps - stamps.min())
+    if unit is None and detected is None:
+        raise InputError(
+            file,
+            f"the unit of field 'time' is ambiguous (in seconds {name} would run at {rate:.3g} Hz)",
+            "state it: s, ms, us or ns",
+        )
+    if unit is None:
+        unit = detected
+        notes.append(
+            f"{file.name}: time of {name} taken as {unit}, "
+            f"by which it runs at {rate * PER_SECOND[unit]:.4g} Hz"
+        )
+    rate *= PER_SECOND[unit]
+    if not RATES[0] * 0.99 <= rate <= RATES[1] * 1.01:
+        raise InputError(
+            file,
+            f"field 'time' makes {name} run at {rate:.3g} Hz with the unit {unit}",
+            f"an IMU runs at {RATES[0]:g} to {RATES[1]:g} Hz",
+        )
+    first = first_stamp(stamps, unit, file)
+    time = seconds(stamps, first, unit)
+    rows, repairs = in_order(time, values, f"{file}: {name}")
+    time, values = time[rows], values[rows]
+    if backward := repairs.get("rows_sorted"):
+        notes.append(
+            f"{file.name}: {name} had {backward:.0f} steps back in time; its rows were sorted"
+        )
+    if repeated := repairs.get("rows_repeated"):
+        notes.append(f"{file.name}: {repeated:.0f} rows of {name} repeat a stamp and were dropped")
+    holes = np.diff(time)[np.diff(time) > longest_bridge(rate)]
+    if holes.size:
+        notes.append(
+            f"{file.name}: {name} {GAPS} {holes.size} times, "
+            f"for up to {holes.max():.2f} s; bridged linearly"
+        )
+    return _Clocked(time, values, Fraction(first) / int(PER_SECOND[unit]))
+
+
+def _in_si(
+    source: Recording,
+    stated: Units,
+    gyro: _Clocked,
+    accel: _Clocked,
+    notes: list[str],
+    warnings: list[str],
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "m 3"]]:
+    """(gyro rad/s, accel m/s² with Android's sign), each on its own stamps."""
+    known, gyro_file, accel_file = source.units, source.gyro.file, source.accel.file
+    unit = stated.accel or known.accel
+    force = accel.values * units.accel_scale(accel.values, unit, accel_file, notes)
+    inside = (gyro.time >= accel.time[0]) & (gyro.time <= accel.time[-1])
+    time = gyro.time[inside]
+    motion = units.Motion(time, gyro.values[inside], interpolate(time, accel.time, force))
+    scale = units.gyro_scale(motion, stated.gyro or known.gyro, gyro_file, notes)
+    if stated.gyro is None and known.gyro is not None:
+        units.check_rad_per_second(motion._replace(gyro=motion.gyro * scale), gyro_file)
+    sign = stated.sign or known.sign
+    if sign is None:
+        raise InputError(
+            accel_file,
+            "the sign of field 'accel' depends on the phone's system, which is not known here",
+            "state it: android, ios or detect",
+        )
+    force = units.signed(force, sign, accel_file, notes)
+    upward = units.note_gravity(accel.time, force, accel_file, notes)
+    if upward == "-z" and stated.sign is None and known.sign_is_assumed:
+        warnings.append(
+            f"sign: gravity reads on -z in {accel_file.name}: the screen points down, or this "
+            "is iOS's sign and the track is wrong: compare with --accel-sign ios"
+        )
+    return gyro.values * scale, force
+
+
+def _with_track(
+    sequence: Sequence, streams: Streams, track: Track, start: Fraction, notes: list[str]
+) -> Sequence:
+    """With the reference, where it can be one and describes the motion of the IMU."""
+    poses = track.poses._replace(time=track.poses.time + float(track.start - start))
+    about = streams.attributes | {"truth": track.name}
+    try:
+        rate = rounded_rate(sequence.time)
+        (result,) = assemble(streams._replace(poses=poses, attributes=about), rate, whole=True)
+        # What the self-check would leave out is no reference.
+        if failures := self_check(result, pedestrian=False).failures:
+            raise InputError(
+                poses.source,
+                f"the reference {track.name} does not fit the IMU ({'; '.join(failures)})",
+                "its frame must be the IMU's, its world z-up, its clock the same",
+            )
+    except InputError as error:
+        if track.named:
+            raise
+        notes.append(f"no reference is taken: {error}")
+        return sequence
+    notes.append(f"reference from {track.name}, {result.valid.mean():.0%} of the time")
+    return result

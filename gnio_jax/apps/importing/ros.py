@@ -1,4 +1,9 @@
-"""The IMU and the reference of a bag: topics, frames and stamps.
+"""The IMU and the reference of a robot's recording: rosbag1, rosbag2 (a folder, or its .db3), MCAP.
+
+The library `rosbags` reads both kinds of bag and decodes messages, `mcap` reads MCAP, of ROS 1 too;
+both are in the extra `bags`. Messages are decoded by their standard definitions (ROS 1 Noetic,
+ROS 2 Humble), which are those of all distributions for the types that are read here; what a bag
+says of its own types is not needed.
 
 Conventions of ROS: `sensor_msgs/Imu` is in rad/s and m/s² with gravity (REP 145; a driver that
 gives g is recognised by its magnitude), poses map the body to a z-up world (REP 103). A first
@@ -8,89 +13,43 @@ Samples are stamped by their headers, the sensor's clock; where headers are empt
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import os
+from collections.abc import Callable, Collection, Iterable, Iterator
+from contextlib import ExitStack, contextmanager
+from fractions import Fraction
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
-from scipy.spatial.transform import Rotation
 
-from gnio_jax.apps.importing.bags import Bag, Topic, listed, opened
 from gnio_jax.apps.importing.recording import Recording, Sensor, Track, Units
 from gnio_jax.data.parsing.stamps import seconds
+from gnio_jax.data.parsing.tables import parsed_as, shortened
 from gnio_jax.data.readers.euroc import SensorPose, moved_to
 from gnio_jax.data.reference import SHORTEST_RUN, Poses
-from gnio_jax.data.validation import check_unit_norm
-from gnio_jax.errors import InputError
+from gnio_jax.data.validation import UNIT_NORM_TOLERANCE, check_unit_norm
+from gnio_jax.errors import InputError, require_packages
 from gnio_jax.numerics import finite_rows, rotations
 
-IMU = "sensor_msgs/msg/Imu"
-TRANSFORMS = "tf2_msgs/msg/TFMessage"
-_TF1 = "tf/msg/tfMessage"
+KINDS = {"rosbag1": "a ROS 1 bag", "rosbag2": "a ROS 2 bag", "mcap": "an MCAP"}
+MCAP_MAGIC = b"\x89MCAP0\r\n"
+"""First and last bytes of a whole MCAP (mcap.dev/spec)."""
+LARGEST_CHUNK = 1 << 30
+"""Bytes to which a chunk of an MCAP may unpack; recorders cut them at some MiB (ours)."""
 FAST_TRACKER = 20.0
 """Hz from which a tracker's noise is smoothed and the gyro carries its attitude; below it its poses
 are taken as they are (ours)."""
 SLOWEST = 4.0
 """Hz below which a reference says too little of a walk (ours)."""
-
-
-class _Pose(NamedTuple):
-    """One pose of a message."""
-
-    stamp: int
-    """ns, 0 where the message has none."""
-    child: str
-    """Frame of the body, "" where the message does not say."""
-    values: tuple[float, ...]
-    """Position m, quaternion wxyz."""
-
-
-def _stamp(header: Any) -> int:
-    return header.stamp.sec * 10**9 + header.stamp.nanosec
-
-
-def _pose(position: Any, turn: Any) -> tuple[float, ...]:
-    return position.x, position.y, position.z, turn.w, turn.x, turn.y, turn.z
-
-
-def _plain(message: Any) -> list[_Pose]:
-    return [_Pose(0, "", _pose(message.position, message.orientation))]
-
-
-def _stamped(message: Any) -> list[_Pose]:
-    pose = message.pose
-    return [_Pose(_stamp(message.header), "", _pose(pose.position, pose.orientation))]
-
-
-def _with_covariance(message: Any) -> list[_Pose]:
-    pose, child = message.pose.pose, getattr(message, "child_frame_id", "")
-    return [_Pose(_stamp(message.header), child, _pose(pose.position, pose.orientation))]
-
-
-def _transform(message: Any) -> list[_Pose]:
-    moved = message.transform
-    values = _pose(moved.translation, moved.rotation)
-    return [_Pose(_stamp(message.header), message.child_frame_id, values)]
-
-
-def _transforms(message: Any) -> list[_Pose]:
-    return [pose for one in message.transforms for pose in _transform(one)]
-
-
-_POSES: dict[str, Callable[[Any], list[_Pose]]] = {
-    "geometry_msgs/msg/Pose": _plain,
-    "geometry_msgs/msg/PoseStamped": _stamped,
-    "geometry_msgs/msg/PoseWithCovarianceStamped": _with_covariance,
-    "nav_msgs/msg/Odometry": _with_covariance,
-    "geometry_msgs/msg/TransformStamped": _transform,
-    TRANSFORMS: _transforms,
-    _TF1: _transforms,
-}
-"""What each type of a reference says."""
-
-
-# --- topics
+IMU = "sensor_msgs/msg/Imu"
+TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
+POSES = (
+    "geometry_msgs/msg/Pose",
+    "geometry_msgs/msg/PoseStamped",
+    "geometry_msgs/msg/PoseWithCovarianceStamped",
+    "geometry_msgs/msg/TransformStamped",
+    "nav_msgs/msg/Odometry",
+)
 
 
 class Topics(NamedTuple):
@@ -105,187 +64,337 @@ class Topics(NamedTuple):
 
 
 def read_bag(path: Path, kind: str, topics: Topics) -> Recording:
-    """The IMU of a bag, and its reference where there is one.
+    """The IMU of a bag of one of `KINDS`, and its reference where there is one.
 
     One topic of `sensor_msgs/Imu` is taken without being named, and so is one of poses; of several
     the IMU must be named, and of the poses none is taken. Raises `InputError` that names the topics
     there are.
     """
-    with opened(path, kind) as bag:
+    notes: list[str] = []
+    with _opened(path, kind) as bag:
         imu = _imu_topic(bag, topics.imu)
         other = imu if topics.accel is None else _imu_topic(bag, topics.accel)
-        reference, child, notes = _reference_topic(bag, topics.reference)
-        static = [topic.name for topic in bag.topics if topic.name.endswith("tf_static")]
-        found = _collected(bag, {imu.name, other.name}, reference, static)
-    samples, forces = _samples(found, imu, "gyro", path), _samples(found, other, "accel", path)
-    if samples.headers != forces.headers:
+        reference, child = _reference_topic(bag, topics.reference, notes)
+        found = _collected(bag, {imu.name, other.name}, reference)
+    gyro, accel = _sensor(found, imu.name, "gyro", path), _sensor(found, other.name, "accel", path)
+    by_headers = _by_headers(found.samples[imu.name])
+    if by_headers != _by_headers(found.samples[other.name]):
         raise InputError(
             path, f"topics {imu.name} and {other.name} have other clocks", "name other topics"
         )
-    clock = "headers" if samples.headers else "bag: its headers have no time"
+    clock = "headers" if by_headers else "bag: its headers have no time"
     named = f"{imu.name} ({imu.count} messages)"
     named += f", accel {other.name} ({other.count} messages)" if other != imu else ""
     notes.insert(0, f"{path.name}: IMU {named}, stamped by its {clock}")
     track = None
     if reference is not None:
         try:
-            track = _track(found, reference.name, child, samples, path, notes)
+            frame = found.first[imu.name].header.frame_id
+            track = _track(found, reference.name, child, frame, by_headers, path, notes)
             track = track._replace(named=topics.reference is not None)
         except InputError as error:
             if topics.reference is not None:
                 raise
             notes.append(f"{path.name}: no reference is taken: {error}")
-    return Recording(
-        path,
-        samples.sensor,
-        forces.sensor,
-        Units("ns", "rad/s", None, "android"),
-        track,
-        tuple(notes),
+    known = Units("ns", "rad/s", None, "android")
+    return Recording(path, gyro, accel, known, track, tuple(notes))
+
+
+# --- the libraries
+
+
+class _Topic(NamedTuple):
+    name: str
+    type: str
+    """As in ROS 2: sensor_msgs/msg/Imu."""
+    count: int
+    """Messages."""
+
+
+class _Bag(NamedTuple):
+    """An open recording."""
+
+    path: Path
+    topics: dict[str, _Topic]
+    messages: Callable[[Collection[str]], Iterator[tuple[str, int, Any]]]
+    """(topic, when it was recorded ns, decoded message) of each message of some topics. What fails
+    in a library on the way is an `InputError`."""
+
+
+@contextmanager
+def _opened(path: Path, kind: str) -> Iterator[_Bag]:
+    require_packages(path, "bags", "rosbags", "mcap")
+    with ExitStack() as stack:
+        with parsed_as(path, KINDS[kind]):
+            bag = _mcap(path, stack) if kind == "mcap" else _rosbag(path, kind, stack)
+        yield bag
+
+
+def _rosbag(path: Path, kind: str, stack: ExitStack) -> _Bag:
+    from rosbags import rosbag1, rosbag2
+
+    reader = stack.enter_context((rosbag1 if kind == "rosbag1" else rosbag2).Reader(path))
+    decode = _decoder("ros1" if kind == "rosbag1" else "cdr")
+
+    def messages(names: Collection[str]) -> Iterator[tuple[str, int, Any]]:
+        with parsed_as(path, KINDS[kind]):
+            chosen = [one for one in reader.connections if one.topic in names]
+            for connection, time, data in reader.messages(connections=chosen):
+                yield connection.topic, time, decode(data, connection.msgtype)
+
+    found = ((one.topic, one.msgtype, one.msgcount) for one in reader.connections)
+    return _Bag(path, _joined(found), messages)
+
+
+def _mcap(path: Path, stack: ExitStack) -> _Bag:
+    from mcap.reader import make_reader
+
+    file = stack.enter_context(path.open("rb"))
+    file.seek(-min(len(MCAP_MAGIC), path.stat().st_size), os.SEEK_END)
+    if file.read() != MCAP_MAGIC:
+        raise InputError(path, "is cut short, its end is missing", "mend it with mcap recover")
+    file.seek(0)
+    reader = make_reader(file, validate_crcs=True)
+    summary = reader.get_summary()
+    if summary is None or summary.statistics is None:
+        raise InputError(path, "has no summary of its topics", "write one with mcap recover")
+    if any(chunk.uncompressed_size > LARGEST_CHUNK for chunk in summary.chunk_indexes):
+        raise InputError(path, "holds a chunk that unpacks to gigabytes", "record it anew")
+    counts = summary.statistics.channel_message_counts
+    names = {0: ""} | {number: schema.name for number, schema in summary.schemas.items()}
+    topics = _joined(
+        (channel.topic, names[channel.schema_id], counts.get(number, 0))
+        for number, channel in summary.channels.items()
     )
+    encodings = {channel.topic: channel.message_encoding for channel in summary.channels.values()}
+
+    def messages(names: Collection[str]) -> Iterator[tuple[str, int, Any]]:
+        for name in names:
+            if encodings[name] not in ("cdr", "ros1"):
+                raise InputError(
+                    path,
+                    f"topic {name} is encoded as {encodings[name] or 'nothing known'}",
+                    "record it as ROS 2 (cdr) or ROS 1 messages",
+                )
+        decoders = {name: _decoder(encodings[name]) for name in names}
+        with parsed_as(path, KINDS["mcap"]):
+            for _, channel, message in reader.iter_messages(names):
+                topic = channel.topic
+                decoded = decoders[topic](message.data, topics[topic].type)
+                yield topic, message.log_time, decoded
+
+    return _Bag(path, topics, messages)
 
 
-def _imu_topic(bag: Bag, name: str | None) -> Topic:
-    found = [topic for topic in bag.topics if topic.type == IMU and topic.count]
+def _joined(found: Iterable[tuple[str, str, int]]) -> dict[str, _Topic]:
+    """The topics of connections or channels, of which a topic may have several: (topic, type,
+    messages) of each."""
+    topics: dict[str, _Topic] = {}
+    for topic, kind, count in found:
+        package, _, rest = kind.partition("/")
+        kind = f"{package}/msg/{rest}" if rest and "/" not in rest else kind
+        count += topics[topic].count if topic in topics else 0
+        topics[topic] = _Topic(topic, kind, count)
+    return topics
+
+
+def _decoder(encoding: str) -> Callable[[bytes, str], Any]:
+    from rosbags.typesys import Stores, get_typestore
+
+    if encoding == "ros1":
+        return get_typestore(Stores.ROS1_NOETIC).deserialize_ros1
+    return get_typestore(Stores.ROS2_HUMBLE).deserialize_cdr
+
+
+# --- topics
+
+
+def _imu_topic(bag: _Bag, name: str | None) -> _Topic:
+    found = [topic for topic in bag.topics.values() if topic.type == IMU and topic.count]
     if name is not None:
         chosen = _named(bag, name)
         if chosen.type != IMU:
-            raise InputError(
-                bag.path, f"topic {name} is {chosen.type}, no IMU", f"IMU topics: {listed(found)}"
-            )
+            remedy = f"IMU topics: {_listed(found)}"
+            raise InputError(bag.path, f"topic {name} is {chosen.type}, no IMU", remedy)
         return chosen
     if not found:
-        raise InputError(
-            bag.path, "has no topic of sensor_msgs/Imu", f"its topics: {listed(bag.topics)}"
-        )
+        remedy = f"its topics: {_listed(bag.topics.values())}"
+        raise InputError(bag.path, "has no topic of sensor_msgs/Imu", remedy)
     if len(found) > 1:
-        raise InputError(
-            bag.path, f"has {len(found)} IMU topics", f"choose one by --imu-topic: {listed(found)}"
-        )
+        remedy = f"choose one by --imu-topic: {_listed(found)}"
+        raise InputError(bag.path, f"has {len(found)} IMU topics", remedy)
     return found[0]
 
 
-def _named(bag: Bag, name: str) -> Topic:
-    for topic in bag.topics:
-        if topic.name == name:
-            return topic
-    raise InputError(bag.path, f"has no topic '{name}'", f"its topics: {listed(bag.topics)}")
+def _named(bag: _Bag, name: str) -> _Topic:
+    if name not in bag.topics:
+        remedy = f"its topics: {_listed(bag.topics.values())}"
+        raise InputError(bag.path, f"has no topic '{name}'", remedy)
+    return bag.topics[name]
 
 
-def _reference_topic(bag: Bag, name: str | None) -> tuple[Topic | None, str, list[str]]:
-    """The topic, the child frame that is asked for ("" for any), and what was chosen."""
-    found = [topic for topic in bag.topics if topic.type in _POSES and topic.count]
+def _listed(topics: Iterable[_Topic]) -> str:
+    names = [f"{topic.name} ({topic.type.replace('/msg/', '/')})" for topic in topics]
+    return shortened(", ".join(names) or "none", 400)
+
+
+def _reference_topic(bag: _Bag, name: str | None, notes: list[str]) -> tuple[_Topic | None, str]:
+    """The topic, and the child frame that is asked for ("" for any)."""
+    found = [t for t in bag.topics.values() if t.type in (*POSES, *TRANSFORMS) and t.count]
     if name is not None:
         topic, _, child = name.partition(":")
         chosen = _named(bag, topic)
-        if chosen.type not in _POSES:
-            raise InputError(
-                bag.path, f"topic {topic} is {chosen.type}, no pose", f"poses: {listed(found)}"
-            )
-        return chosen, child, []
-    own = [topic for topic in found if topic.type not in (TRANSFORMS, _TF1)]
+        if chosen.type not in (*POSES, *TRANSFORMS):
+            remedy = f"poses: {_listed(found)}"
+            raise InputError(bag.path, f"topic {topic} is {chosen.type}, no pose", remedy)
+        return chosen, child
+    own = [topic for topic in found if topic.type in POSES]
     if len(own) == 1:
-        return own[0], "", []
-    if not found:
-        return None, "", []
-    note = f"{bag.path.name}: no reference is taken; --reference-topic may be {listed(found)}"
-    return None, "", [note]
+        return own[0], ""
+    if found:
+        notes.append(
+            f"{bag.path.name}: no reference is taken; --reference-topic may be {_listed(found)}"
+        )
+    return None, ""
 
 
 # --- messages
 
 
+class _Pose(NamedTuple):
+    """One pose of a message."""
+
+    stamp: int
+    """ns, 0 where the message has none."""
+    parent: str
+    child: str
+    """Frame of the body, "" where the message does not say."""
+    values: tuple[float, ...]
+    """Position m, quaternion wxyz."""
+
+
 class _Collected(NamedTuple):
     """What is kept of a bag: numbers, since decoded messages take a kilobyte each."""
 
-    imu: dict[str, list[tuple[int, int, tuple[float, ...]]]]
-    """Topic -> stamp of the header and of the bag, ns; gyro rad/s and accel of each sample."""
     first: dict[str, Any]
-    """Topic -> the first message of an IMU."""
+    """IMU topic -> its first message."""
+    samples: dict[str, list[tuple[Any, ...]]]
+    """IMU topic -> (stamp of the header ns, stamp of the bag ns, gyro rad/s, accel) of each."""
     poses: list[tuple[int, _Pose]]
     """Stamp of the bag, ns, and pose of each pose of the reference."""
     mounted: dict[tuple[str, str], SensorPose]
     """(parent, child) -> the child in the parent, of static transforms."""
 
 
-def _collected(bag: Bag, imus: set[str], reference: Topic | None, static: list[str]) -> _Collected:
-    found = _Collected({name: [] for name in imus}, {}, [], {})
-    names = {*imus, *static, *([reference.name] if reference else [])}
-    for message in bag.messages(names):
-        content = message.content
-        if message.topic in imus:
-            found.first.setdefault(message.topic, content)
-            sample = _stamp(content.header), message.log_time, _sample(content)
-            found.imu[message.topic].append(sample)
-        if reference is not None and message.topic == reference.name:
-            poses = _POSES[reference.type](content)
-            found.poses.extend((message.log_time, pose) for pose in poses)
-        if message.topic in static:
-            found.mounted.update(_mounting(content))
+def _collected(bag: _Bag, imus: set[str], reference: _Topic | None) -> _Collected:
+    static = {name for name in bag.topics if name.endswith("tf_static")}
+    of_poses = set() if reference is None else {reference.name}
+    found = _Collected({}, {name: [] for name in imus}, [], {})
+    for topic, logged, message in bag.messages(imus | static | of_poses):
+        if topic in imus:
+            found.first.setdefault(topic, message)
+            rate, force = message.angular_velocity, message.linear_acceleration
+            values = rate.x, rate.y, rate.z, force.x, force.y, force.z
+            found.samples[topic].append((_stamp(message), logged, *values))
+        if topic in of_poses:
+            found.poses.extend((logged, pose) for pose in _poses(message))
+        if topic in static:
+            for pose in _poses(message):
+                place, turn = np.array(pose.values[:3]), np.array(pose.values[3:])
+                if abs(np.linalg.norm(turn) - 1.0) < UNIT_NORM_TOLERANCE:  # else it joins nothing
+                    frames = _frame(pose.parent), _frame(pose.child)
+                    found.mounted[frames] = SensorPose(rotations(turn), place)
     return found
 
 
-def _sample(message: Any) -> tuple[float, ...]:
-    rate, force = message.angular_velocity, message.linear_acceleration
-    return rate.x, rate.y, rate.z, force.x, force.y, force.z
+def _stamp(message: Any) -> int:
+    if not hasattr(message, "header"):
+        return 0
+    return message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
 
 
-class _Samples(NamedTuple):
-    """An IMU topic."""
+def _poses(message: Any) -> Iterator[_Pose]:
+    """Those of a message of any type of `POSES` and `TRANSFORMS`."""
+    if hasattr(message, "transforms"):
+        for one in message.transforms:
+            yield from _poses(one)
+        return
+    parent = message.header.frame_id if hasattr(message, "header") else ""
+    child = getattr(message, "child_frame_id", "")
+    pose = message
+    while hasattr(pose, "pose"):  # stamped, with covariance, or both
+        pose = pose.pose
+    if hasattr(pose, "transform"):
+        place, turn = pose.transform.translation, pose.transform.rotation
+    else:
+        place, turn = pose.position, pose.orientation
+    values = place.x, place.y, place.z, turn.w, turn.x, turn.y, turn.z
+    yield _Pose(_stamp(message), parent, child, values)
 
-    sensor: Sensor
-    frame: str
-    headers: bool
-    """Stamped by its headers."""
+
+def _by_headers(samples: list[tuple[Any, ...]]) -> bool:
+    return all(sample[0] for sample in samples)
 
 
-def _samples(found: _Collected, topic: Topic, sensor: str, path: Path) -> _Samples:
-    """The topic's samples, of which it must have the sensor."""
-    if not found.imu[topic.name]:
-        raise InputError(path, f"topic {topic.name} has no messages", "record it anew")
-    first = found.first[topic.name]
+def _sensor(found: _Collected, topic: str, sensor: str, path: Path) -> Sensor:
+    """The samples of a topic, which must have this sensor."""
+    if not found.samples[topic]:
+        raise InputError(path, f"topic {topic} has no messages", "record it anew")
+    first = found.first[topic]
     gyro, accel = first.angular_velocity_covariance, first.linear_acceleration_covariance
     if (gyro if sensor == "gyro" else accel)[0] == -1.0:
-        raise InputError(
-            path, f"topic {topic.name} says that it has no {sensor}", "name another topic"
-        )
-    stamps, logged, values = zip(*found.imu[topic.name], strict=True)
-    headers = all(stamps)
-    axes = slice(0, 3) if sensor == "gyro" else slice(3, 6)
-    own = np.array(stamps if headers else logged, dtype=np.int64)
-    measured = np.array(values, dtype=np.float64)[:, axes]
-    return _Samples(Sensor(sensor, path, own, measured), first.header.frame_id, headers)
+        raise InputError(path, f"topic {topic} says that it has no {sensor}", "name another topic")
+    headers, logged, *values = zip(*found.samples[topic], strict=True)
+    stamps = headers if _by_headers(found.samples[topic]) else logged
+    axes = values[:3] if sensor == "gyro" else values[3:]
+    rows = np.array(axes, dtype=np.float64).T
+    return Sensor(sensor, path, np.array(stamps, dtype=np.int64), rows)
 
 
-# --- reference
+# --- the reference
 
 
 def _track(
-    found: _Collected, topic: str, child: str, samples: _Samples, path: Path, notes: list[str]
+    found: _Collected,
+    topic: str,
+    child: str,
+    imu: str,
+    by_headers: bool,
+    path: Path,
+    notes: list[str],
 ) -> Track:
-    """The poses of a topic, as those of the IMU."""
-    rows = found.poses
-    children = sorted({pose.child for _, pose in rows})
-    if child:
-        rows = [(time, pose) for time, pose in rows if pose.child == child]
+    """The poses of a topic, or of its frame `child`, as those of the frame `imu`; the IMU is
+    stamped `by_headers`, or by the bag."""
+    rows = [(logged, pose) for logged, pose in found.poses if child in ("", pose.child)]
+    children = sorted({pose.child for _, pose in found.poses})
     if not rows or (len(children) > 1 and not child):
         raise InputError(
             path,
             f"topic {topic} moves the frames {', '.join(children) or 'none'}",
             f"name one: --reference-topic {topic}:FRAME",
         )
-    headers = samples.headers and all(pose.stamp for _, pose in rows)
-    stamps = np.array([pose.stamp if headers else time for time, pose in rows], dtype=np.int64)
-    if samples.headers and not headers:
+    stamped = by_headers and all(pose.stamp for _, pose in rows)
+    stamps = np.array([pose.stamp if stamped else logged for logged, pose in rows], dtype=np.int64)
+    if by_headers and not stamped:
         notes.append(
             f"{path.name}: {topic} has no stamps of its own and is stamped by the bag, the IMU by "
             "its headers: the reference is off by the delay between these two clocks"
         )
-    start = int(stamps.min())
-    values = np.array([pose.values for _, pose in rows], dtype=np.float64)
     name = f"{topic}:{child}" if child else topic
-    poses = _poses(seconds(stamps, start), values, f"{path}: topic {name}")
-    body, imu = rows[0][1].child, samples.frame
+    source, start = f"{path}: topic {name}", int(stamps.min())
+    values = np.array([pose.values for _, pose in rows], dtype=np.float64)
+    seen = finite_rows(values)
+    time, values = seconds(stamps[seen], start), values[seen]
+    if len(time) < SHORTEST_RUN:
+        raise InputError(source, f"holds {len(time)} poses", "name another reference")
+    rate = 1.0 / max(float(np.median(np.diff(np.sort(time)))), 1e-9)
+    if rate < SLOWEST:
+        remedy = f"a reference needs {SLOWEST:g} Hz"
+        raise InputError(source, f"its poses come at {rate:.3g} Hz", remedy)
+    wxyz = check_unit_norm(values[:, 3:], np.ones(len(time), dtype=bool), "orientation", source)
+    noisy = rate >= FAST_TRACKER
+    poses = Poses(time, rotations(wxyz), values[:, :3], noisy=noisy, source=source)
+    body = rows[0][1].child
     place = _place(body, imu, found.mounted)
     if place is None:
         notes.append(
@@ -294,37 +403,11 @@ def _track(
         )
     elif body != imu:
         notes.append(f"{path.name}: {name} moved from '{body}' to '{imu}' by /tf_static")
-    return Track(name, moved_to(place or SensorPose(), poses), start)
-
-
-def _poses(time: Float[np.ndarray, " n"], rows: Float[np.ndarray, "n 7"], source: str) -> Poses:
-    """Poses from stamps (s) and rows of position (m) and quaternion wxyz, in any order; rows that
-    are not finite are left out. Raises `InputError` where they are too few, too slow, or no unit
-    quaternions."""
-    seen = finite_rows(rows)
-    time, rows = time[seen], rows[seen]
-    if len(time) < SHORTEST_RUN:
-        raise InputError(source, f"holds {len(time)} poses", "name another reference")
-    rate = 1.0 / max(float(np.median(np.diff(np.sort(time)))), 1e-9)
-    if rate < SLOWEST:
-        remedy = f"a reference needs {SLOWEST:g} Hz"
-        raise InputError(source, f"its poses come at {rate:.3g} Hz", remedy)
-    wxyz = check_unit_norm(rows[:, 3:], np.ones(len(time), dtype=bool), "orientation", source)
-    noisy = rate >= FAST_TRACKER
-    return Poses(time, rotations(wxyz), rows[:, :3], noisy=noisy, source=source)
-
-
-def _mounting(message: Any) -> dict[tuple[str, str], SensorPose]:
-    """(parent, child) -> the child in the parent, of the transforms of a message."""
-    mounted = {}
-    for one in message.transforms:
-        *place, w, x, y, z = _transform(one)[0].values
-        pose = SensorPose(Rotation.from_quat([x, y, z, w]), np.array(place))
-        mounted[_frame(one.header.frame_id), _frame(one.child_frame_id)] = pose
-    return mounted
+    return Track(name, moved_to(place or SensorPose(), poses), Fraction(start, 10**9))
 
 
 def _frame(name: str) -> str:
+    """ROS 1 allows a slash before a frame's name."""
     return name.lstrip("/")
 
 
@@ -335,18 +418,11 @@ def _place(body: str, imu: str, mounted: dict[tuple[str, str], SensorPose]) -> S
     while todo:
         here = todo.pop()
         for (parent, child), pose in mounted.items():
-            for near, far, step in ((parent, child, pose), (child, parent, _inverse(pose))):
+            inverse = SensorPose().seen_from(pose)
+            for near, far, step in ((parent, child, pose), (child, parent, inverse)):
                 if near == here and far not in reached:
-                    reached[far] = _product(reached[here], step)
+                    known = reached[here]
+                    lever = known.translation + known.rotation.apply(step.translation)
+                    reached[far] = SensorPose(known.rotation * step.rotation, lever)
                     todo.append(far)
     return reached.get(_frame(imu))
-
-
-def _inverse(pose: SensorPose) -> SensorPose:
-    return SensorPose().seen_from(pose)
-
-
-def _product(first: SensorPose, second: SensorPose) -> SensorPose:
-    """`second`, given in the frame of `first`, in the frame of what `first` is given in."""
-    place = first.translation + first.rotation.apply(second.translation)
-    return SensorPose(first.rotation * second.rotation, place)

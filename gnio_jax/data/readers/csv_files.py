@@ -133,7 +133,9 @@ def read(path: str | os.PathLike[str]) -> list[Sequence]:
 
 def _streams(table: Table) -> Streams:
     path = table.path
-    check_columns(path, table.columns, {name: name for name in ("time", *GYRO, *ACCEL)})
+    wanted = {name: name for name in ("time", *GYRO, *ACCEL)}
+    remedy = f"name them: gnio data import {path.name} --out own/{path.stem}.h5 --columns"
+    check_columns(path, table.columns, wanted, remedy)
     time, gyro, accel = table.take("time"), table.take(*GYRO), table.take(*ACCEL)
     check_increasing(time, path)
     check_seconds(time, path)
@@ -188,9 +190,11 @@ def reference(table: Table, time: Float[np.ndarray, " n"]) -> Poses | None:
     )
 
 
-def check_columns(path: Path, found: Iterable[object], wanted: Mapping[str, str]) -> None:
+def check_columns(
+    path: Path, found: Iterable[object], wanted: Mapping[str, str], remedy: str
+) -> None:
     """Raise `InputError` where a file lacks columns, `wanted` being our names and the file's: all
-    that are missing at once, and how to name them."""
+    that are missing at once, and after `remedy` the words that name them."""
     names = [str(name) for name in found]
     missing = [ours for ours, theirs in wanted.items() if theirs not in names]
     if not missing:
@@ -201,7 +205,7 @@ def check_columns(path: Path, found: Iterable[object], wanted: Mapping[str, str]
         path,
         f"column{'s' if len(missing) > 1 else ''} {listed_names} "
         f"{'are' if len(missing) > 1 else 'is'} missing; found: {shortened(', '.join(names), 600)}",
-        f"name them: gnio data import {path.name} --columns {words}",
+        f"{remedy} {words}",
     )
 
 

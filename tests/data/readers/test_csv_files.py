@@ -255,6 +255,6 @@ def test_all_columns_that_are_missing_are_told_with_the_command(tmp_path):
     assert str(caught.value) == (
         f"{path}: columns 'time', 'gyro_x', 'gyro_y', 'gyro_z', 'accel_x', 'accel_y', 'accel_z' "
         "are missing; found: timestamp_ms, wx, wy, wz, Acc X (g), acc_y, what; name them: "
-        "gnio data import robot.csv --columns time=timestamp_ms gyro_x=wx gyro_y=wy gyro_z=wz "
-        "accel_x='Acc X (g)' accel_y=acc_y accel_z=COLUMN"
+        "gnio data import robot.csv --out own/robot.h5 --columns time=timestamp_ms gyro_x=wx "
+        "gyro_y=wy gyro_z=wz accel_x='Acc X (g)' accel_y=acc_y accel_z=COLUMN"
     )

@@ -1,4 +1,5 @@
-"""A folder of EuRoC's layout, at any rate and with or without a reference; what is no recording."""
+"""A folder of EuRoC's layout; what is no recording; damaged files, which are read, or refused in
+one line."""
 
 from __future__ import annotations
 
@@ -8,11 +9,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from gnio_jax.errors import InputError
-from tests.support import asl_files, known_walk
+from tests.support import asl_files, bag_files, known_walk, logger_files
 from tests.support.asl_files import EPOCH, Mount
-from tests.support.importing import import_recording
+from tests.support.importing import import_recording, refused
 
 LEVER = Mount(Rotation.from_euler("zyx", [0.4, 0.2, -0.9]), np.array([0.2, -0.1, 0.3]))
+KINDS = ("walk.zip", "walk.xlsx", "walk.xls", "rosbag1", "mcap", "db3")
 
 
 def compare(sequence, atol):
@@ -24,7 +26,7 @@ def compare(sequence, atol):
     np.testing.assert_allclose(sequence.position[rows], known_walk.position(time), atol=atol)
     speed = known_walk.velocity(time)
     np.testing.assert_allclose(sequence.velocity[rows], speed, atol=20 * atol)
-    turned = Rotation.from_quat(sequence.orientation[rows][:, [1, 2, 3, 0]]).inv()
+    turned = Rotation.from_quat(sequence.orientation[rows], scalar_first=True).inv()
     assert (turned * known_walk.attitude(time)).magnitude().max() < 10 * atol
 
 
@@ -43,25 +45,18 @@ def test_an_estimate_is_moved_to_the_imu(tmp_path, mount):
 def test_mocap_without_velocities(tmp_path):
     asl_files.write_imu(tmp_path / "mav0")
     asl_files.write_mocap(tmp_path / "mav0", mount=LEVER)
-    sequence, _ = import_recording(tmp_path / "mav0")
-    compare(sequence, 2e-3)
+    compare(import_recording(tmp_path / "mav0")[0], 2e-3)
 
 
-def test_no_reference(tmp_path):
+def test_no_reference_and_no_column(tmp_path):
+    """A column is named as the authors do."""
     asl_files.write_imu(tmp_path / "mav0", seconds=3.0)
     sequence, notes = import_recording(tmp_path, rate=100.0)
     assert not sequence.valid.any() and len(sequence.time) == 300
     assert "EuRoC's layout (ns, rad/s, m/s2), no reference" in notes[0]
-
-
-def test_a_column_that_is_missing_is_named_as_the_authors_do(tmp_path):
-    asl_files.write_imu(tmp_path / "mav0", seconds=3.0)
     path = tmp_path / "mav0" / "imu0" / "data.csv"
     path.write_text(path.read_text().replace("a_RS_S_y", "b"))
-    with pytest.raises(
-        InputError, match=r"data.csv: column 'a_rs_s_y' is missing; found: timestamp"
-    ):
-        import_recording(tmp_path)
+    refused(tmp_path, "data.csv: column 'a_rs_s_y' is missing; found: timestamp")
 
 
 def test_what_is_no_recording(tmp_path):
@@ -82,6 +77,43 @@ def test_what_is_no_recording(tmp_path):
         "bag": "bag: cannot be read as a ROS 2 bag",
         "gone": "gone: cannot be read .No such file",
     }.items():
-        with pytest.raises(InputError, match=words) as caught:
-            import_recording(tmp_path / name)
-        assert "\n" not in str(caught.value)
+        refused(tmp_path / name, words)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """Kind -> a path of it."""
+    folder = tmp_path_factory.mktemp("whole")
+    logger_files.workbooks(folder, logger_files.phyphox_sets(seconds=2.0))
+    found = {name: folder / name for name in ("walk.xlsx", "walk.xls")}
+    members = logger_files.sensor_logger("ios", seconds=2.0)
+    found["walk.zip"] = logger_files.zipped(folder / "walk.zip", members)
+    for kind in ("rosbag1", "mcap", "db3"):
+        (folder / kind).mkdir()
+        entries = bag_files.imu(bag_files.Maker(kind), seconds=2.0)
+        found[kind] = bag_files.write(folder / kind, kind, entries)
+    return found
+
+
+def damaged(data, seed):
+    """64 bytes anywhere, or 4 near the beginning or the end, are others."""
+    random = np.random.default_rng(seed)
+    width = (64, 4, 4)[seed % 3]
+    near = (random.integers(len(data) - 64), random.integers(400), len(data) - 8 - seed * 9)
+    start = int(near[seed % 3])
+    noise = random.integers(0, 256, width, dtype=np.uint8).tobytes()
+    return data[:start] + noise + data[start + width :]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_damaged_file(tmp_path, whole, kind, capfd):
+    data, path = whole[kind].read_bytes(), tmp_path / whole[kind].name
+    messages = []
+    for seed in range(9):
+        path.write_bytes(damaged(data, seed))
+        try:
+            import_recording(path)
+        except InputError as error:
+            messages.append(str(error))
+    assert messages and "\n" not in "".join(messages)
+    assert capfd.readouterr() == ("", "")

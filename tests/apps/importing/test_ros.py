@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from gnio_jax.apps.importing import bags
-from gnio_jax.errors import InputError
+from gnio_jax.apps.importing import ros
 from tests.support import bag_files, known_walk
 from tests.support.bag_files import EPOCH, KINDS, LOGGED, Maker, imu, poses, text, write
-from tests.support.importing import import_recording
+from tests.support.importing import import_recording, refused
 
 ONE = (Rotation.identity(), np.zeros(3))
 MOUNT = (Rotation.from_euler("zyx", [0.5, -1.1, 2.0]), np.array([0.1, -0.3, 0.25]))
@@ -32,12 +31,6 @@ def compare_reference(sequence, atol, inner=50):
     wxyz = sequence.orientation[rows]
     turned = Rotation.from_quat(wxyz[:, [1, 2, 3, 0]]).inv() * known_walk.attitude(time)
     assert turned.magnitude().max() < 10 * atol
-
-
-def refused(path, words, **options):
-    with pytest.raises(InputError, match=words) as caught:
-        import_recording(path, **options)
-    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -198,6 +191,22 @@ def test_a_reference_that_is_none_is_left_out_unless_it_was_named(tmp_path):
     assert any("shares nothing with the IMU's" in note for note in notes)
 
 
+class Bug(Exception):
+    """Of ours."""
+
+
+@pytest.mark.parametrize("error", [Bug, MemoryError])
+@pytest.mark.parametrize("kind", ["rosbag1", "mcap"])
+def test_only_what_a_library_cannot_read_is_called_damage(tmp_path, monkeypatch, error, kind):
+    def fails(_):
+        raise error
+
+    path = write(tmp_path, kind, imu(Maker(kind), seconds=2.0))
+    monkeypatch.setattr(ros, "_stamp", fails)
+    with pytest.raises(error):
+        import_recording(path)
+
+
 def test_a_reference_that_does_not_fit_the_imu_is_none(tmp_path):
     """Its world lies on its side."""
     make = Maker()
@@ -224,7 +233,7 @@ def test_a_bag_cut_short_is_one_line(tmp_path, kind, kept):
 
 def test_a_chunk_that_unpacks_to_gigabytes_is_refused(tmp_path, monkeypatch):
     path = write(tmp_path, "mcap", imu(Maker(), seconds=2.0))
-    monkeypatch.setattr(bags, "LARGEST_CHUNK", 20_000)
+    monkeypatch.setattr(ros, "LARGEST_CHUNK", 20_000)
     refused(path, r"walk.mcap: holds a chunk that unpacks to gigabytes")
 
 
