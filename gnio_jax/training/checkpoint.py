@@ -11,6 +11,7 @@ import errno
 import logging
 import os
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -199,6 +200,48 @@ def load_run(workdir: Path | str, which: Which = "best") -> Run:
     numbers = variables.pop("filter", {})
     config = dataclasses.replace(config, filter=trained_settings(config.filter, numbers))
     return Run(config, model, variables, meta["position"]["epoch"], step, numbers)
+
+
+def initial_run(config: TrainConfig, load: Callable[[str], Run]) -> Run | None:
+    """The run that `config.init_from` names, if any, as `load` reads it.
+
+    Raises `InputError` for a folder without a run, and for one whose network is not that of
+    `config`; also if training through the filter has none to start from. A calibrated uncertainty
+    may follow a plain head, since its parameters are the same.
+    """
+    if config.init_from is None and config.through_filter.learn:
+        problem = "needs the weights of a network that has been trained on windows"
+        remedy = "name its run with --init-from"
+        raise InputError("config", f"field 'through_filter.learn' {problem}", remedy)
+    if config.init_from is None:
+        return None
+    run = load(config.init_from)
+    theirs, ours = (_description(each) for each in (run.config, config))
+    head_to_calibrated = ("head", "calibrated")
+    if (theirs.get("model.uncertainty"), ours.get("model.uncertainty")) == head_to_calibrated:
+        ours["model.uncertainty"] = "head"
+    for name in theirs | ours:
+        if theirs.get(name) != ours.get(name):
+            problem = f"its {name} is {theirs.get(name)}, and here it is {ours.get(name)}"
+            raise InputError(config.init_from, problem, "describe the same network")
+    return run
+
+
+def _description(config: TrainConfig) -> dict[str, Any]:
+    """What makes a network the same: its name and options, and the windows that it reads."""
+    model = create_model(config)
+    model = getattr(model, "network", model)  # what an equivariant construction is made around
+    options = {
+        f"model.{field.name}": getattr(model, field.name)
+        for field in dataclasses.fields(model)
+        if field.name not in ("parent", "name")
+    }
+    windows = {
+        f"data.{name}": getattr(config.data, name)
+        for name in ("rate", "window_seconds", "context_seconds", "window_rotation")
+    }
+    named = {f"model.{name}": getattr(config.model, name) for name in ("name", "equivariance")}
+    return {**named, **options, **windows}
 
 
 def averaged_over_headings(run: Run, source: str) -> Run:

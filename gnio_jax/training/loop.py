@@ -23,7 +23,14 @@ from gnio_jax.training import checkpoint, optimizer, run_folder
 from gnio_jax.training.checkpoint import Checkpoints, Position, Run, load_run
 from gnio_jax.training.filter_task import FilterTask
 from gnio_jax.training.run_folder import Log
-from gnio_jax.training.task import Progress, Recordings, Row, Task, keys_of, set_up
+from gnio_jax.training.task import (
+    Progress,
+    Recordings,
+    Row,
+    Task,
+    keys_of,
+    set_up,
+)
 from gnio_jax.training.window_task import WindowTask
 
 DISPATCH_SECONDS = 0.5
@@ -119,21 +126,12 @@ def _train_all(
     kind = FilterTask if through_filter else WindowTask
     # Segments are shared out by `filtering.over_sequences`, not as a batch of windows is. Whatever
     # the process has set: no float64 but for the filter.
-    sharers = 1 if through_filter else devices
     outcomes: list[Outcome] = []
-    with jax.enable_x64(through_filter), parallel.sharing(sharers), _stop_signals() as stop:
+    sharing = parallel.sharing(1 if through_filter else devices)
+    with jax.enable_x64(through_filter), sharing, _stop_signals() as stop:
         resumed = all(resumes) and all(map(checkpoint.exists, workdirs))
-        start = None if resumed else run_folder.initial_run(configs[0], load_initial)
+        start = None if resumed else checkpoint.initial_run(configs[0], load_initial)
         task, recordings = set_up(kind, configs[0], reporter, workers)
-        train_split, val_split = configs[0].data.train_split, configs[0].data.val_split
-        splits = recordings.splits
-        both = sorted(set(splits[train_split]) & set(splits[val_split]))
-        if both:
-            reporter.line(
-                f"warning: {', '.join(both[:3])}{' ...' if both[3:] else ''} in {train_split} and "
-                f"in {val_split}: the best checkpoint is chosen by recordings that it was trained "
-                "on; separate the two splits"
-            )
         for config, resume in zip(configs, resumes, strict=True):
             outcomes.append(_train(task, recordings, config, start, resume, stop, reporter))
             if stop.signum and len(outcomes) < len(configs):
@@ -157,8 +155,7 @@ def _train(
     # Copies: steps take the memory of their state, and the next seed starts from `start` too.
     state = parallel.everywhere(task.initial_state(keys.init, start and start.variables))
     at = Position()
-    with run_folder.opened(config, recordings.splits, resume) as workdir:
-        run_folder.compare_processes(config, recordings, state.variables)
+    with run_folder.opened(config, recordings, state.variables, resume) as workdir:
         for line in task.description(state, workdir):
             reporter.line(line)
         with Checkpoints(workdir) as checkpoints:

@@ -1,5 +1,4 @@
-"""The folder of a run: its settings, the recordings it is trained on, its log, and the weights that
-it starts from."""
+"""The folder of a run: its settings, the recordings it is trained on, and its log."""
 
 from __future__ import annotations
 
@@ -9,7 +8,7 @@ import hashlib
 import json
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -26,8 +25,7 @@ from gnio_jax import parallel
 from gnio_jax.config import TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.files import write_text
-from gnio_jax.training.checkpoint import Run
-from gnio_jax.training.task import Recordings, Row, create_model
+from gnio_jax.training.task import Recordings, Row
 
 MAY_CHANGE = ("workdir", "data_root", "init_from")
 """Settings that a resumed run may change: where things lie, not what is computed."""
@@ -67,13 +65,17 @@ def refuse_other_run(config: TrainConfig, resume: bool) -> Path:
 
 
 @contextmanager
-def opened(config: TrainConfig, splits: dict[str, list[str]], resume: bool) -> Iterator[Path]:
+def opened(
+    config: TrainConfig, recordings: Recordings, variables: Any, resume: bool
+) -> Iterator[Path]:
     """The work folder, with the config.yaml and splits.yaml of a new run, for one training at a
     time: the folder is locked as long as the context lasts, or the process.
 
-    Raises `InputError` where another process trains in it, and for a resumed run that was begun
-    with other recordings. Of several processes the first one writes.
+    Raises `InputError` where another process trains in it, for a resumed run that was begun with
+    other recordings, and as `compare_processes` does for the variables at step 0. Of several
+    processes the first one writes.
     """
+    compare_processes(config, recordings, variables)
     workdir = configuration.default_workdir(config)
     if not parallel.is_first():
         yield workdir
@@ -91,9 +93,10 @@ def opened(config: TrainConfig, splits: dict[str, list[str]], resume: bool) -> I
             configuration.save(workdir / "config.yaml", config)
         path = workdir / "splits.yaml"
         if path.exists():
-            _refuse_other_recordings(path, splits)
+            _refuse_other_recordings(path, recordings.splits)
         else:
-            write_text(path, yaml.safe_dump(splits, sort_keys=False, allow_unicode=True))
+            text = yaml.safe_dump(recordings.splits, sort_keys=False, allow_unicode=True)
+            write_text(path, text)
         yield workdir
     finally:
         os.close(folder)
@@ -147,52 +150,6 @@ def compare_processes(config: TrainConfig, recordings: Recordings, variables: An
         greatest, least = parallel.largest(number, -number)
         if greatest != -least:
             raise InputError("--distributed", f"the processes have different {what}", remedy)
-
-
-# The weights at the start
-# ------------------------------------------------------------------------------------------------
-
-
-def initial_run(config: TrainConfig, load: Callable[[str], Run]) -> Run | None:
-    """The run that `config.init_from` names, if any, as `load` reads it.
-
-    Raises `InputError` for a folder without a run, and for one whose network is not that of
-    `config`; also if training through the filter has none to start from. A calibrated uncertainty
-    may follow a plain head, since its parameters are the same.
-    """
-    if config.init_from is None and config.through_filter.learn:
-        problem = "needs the weights of a network that has been trained on windows"
-        remedy = "name its run with --init-from"
-        raise InputError("config", f"field 'through_filter.learn' {problem}", remedy)
-    if config.init_from is None:
-        return None
-    run = load(config.init_from)
-    theirs, ours = (_description(each) for each in (run.config, config))
-    head_to_calibrated = ("head", "calibrated")
-    if (theirs.get("model.uncertainty"), ours.get("model.uncertainty")) == head_to_calibrated:
-        ours["model.uncertainty"] = "head"
-    for name in theirs | ours:
-        if theirs.get(name) != ours.get(name):
-            problem = f"its {name} is {theirs.get(name)}, and here it is {ours.get(name)}"
-            raise InputError(config.init_from, problem, "describe the same network")
-    return run
-
-
-def _description(config: TrainConfig) -> dict[str, Any]:
-    """What makes a network the same: its name and options, and the windows that it reads."""
-    model = create_model(config)
-    model = getattr(model, "network", model)  # what an equivariant construction is made around
-    options = {
-        f"model.{field.name}": getattr(model, field.name)
-        for field in dataclasses.fields(model)
-        if field.name not in ("parent", "name")
-    }
-    windows = {
-        f"data.{name}": getattr(config.data, name)
-        for name in ("rate", "window_seconds", "context_seconds", "window_rotation")
-    }
-    named = {f"model.{name}": getattr(config.model, name) for name in ("name", "equivariance")}
-    return {**named, **options, **windows}
 
 
 # The log

@@ -342,6 +342,13 @@ def set_up(
         hours = sum(samples.values()) / config.data.rate / 3600
         contents = f"{hours:.2f} h, {counts[-1]:,} {kind.unit}"
         reporter.line(f"  {split}: {len(samples)} sequences, {contents}")
+    both = sorted(set(splits[train]) & set(splits[val]))
+    if both:
+        reporter.line(
+            f"warning: {', '.join(both[:3])}{' ...' if both[3:] else ''} in {train} and in {val}: "
+            "the best checkpoint is chosen by recordings that it was trained on; separate the two "
+            "splits"
+        )
     if counts[0] < size:
         problem = f"is {size}, but there are only {counts[0]} {kind.unit}"
         raise InputError("optim.batch_size", problem, "lower it")

@@ -19,7 +19,6 @@ from gnio_jax.commands import app, console
 from gnio_jax.config import DataConfig, ModelConfig, TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.training import checkpoint
-from gnio_jax.training.run_folder import initial_run
 from tests.support import tiny_run
 from tests.support.compiling import quick
 from tests.support.filter_settings import changed
@@ -293,8 +292,8 @@ def test_a_card_is_shown(gnio, capsys, tmp_path):
 def test_training_starts_from_a_package_by_its_name():
     config = configuration.load("pedestrian")
     config = dataclasses.replace(config, init_from="pedestrian")
-    run = initial_run(config, gnio_jax.load_pretrained)
+    run = checkpoint.initial_run(config, gnio_jax.load_pretrained)
     assert run is not None and run.step > 0
     other = dataclasses.replace(config, model=dataclasses.replace(config.model, width=8))
     with pytest.raises(InputError, match=r"pedestrian: its model.width is 16.* describe the same"):
-        initial_run(other, gnio_jax.load_pretrained)
+        checkpoint.initial_run(other, gnio_jax.load_pretrained)

@@ -24,6 +24,7 @@ from gnio_jax.errors import InputError
 from gnio_jax.models import registry
 from gnio_jax.training import checkpoint, loop, optimizer, run_folder, task, window_task
 from gnio_jax.training.losses import Losses
+from gnio_jax.training.task import Recordings
 from gnio_jax.training.window_task import WindowTask
 from tests.support.drawn_state import fresh_state
 from tests.support.tiny_network import Tiny
@@ -589,17 +590,17 @@ def test_two_trainings_in_one_folder(recording, tmp_path, monkeypatch):
     where both resume."""
     Counted(monkeypatch, [(1.0, 1.0)] * 3)
     config = plateau_config(recording, tmp_path / "run", 2)
-    splits = {"train": ["a", "b"], "val": ["c"]}
-    with run_folder.opened(config, splits, resume=False):
+    recordings = Recordings(None, None, {"train": ["a", "b"], "val": ["c"]})
+    with run_folder.opened(config, recordings, {}, resume=False):
         written = (tmp_path / "run" / "config.yaml").read_bytes()
         other = dataclasses.replace(config, seed=1)
         with pytest.raises(InputError, match="run: another process is training in it"):
-            with run_folder.opened(other, splits, resume=False):
+            with run_folder.opened(other, recordings, {}, resume=False):
                 pass
         with pytest.raises(InputError, match="run: another process is training in it"):
             loop.train(config, resume=True)
     with pytest.raises(InputError, match="run: already holds a run"):
-        with run_folder.opened(other, splits, resume=False):
+        with run_folder.opened(other, recordings, {}, resume=False):
             pass
     assert (tmp_path / "run" / "config.yaml").read_bytes() == written
 

@@ -31,7 +31,7 @@ from gnio_jax.errors import InputError
 from gnio_jax.filtering.settings import with_free_parameters
 from gnio_jax.models import registry
 from gnio_jax.reporting import Lines
-from gnio_jax.training import checkpoint, filter_task, loop, run_folder, task
+from gnio_jax.training import checkpoint, filter_task, loop, task
 from gnio_jax.training.filter_task import FilterTask
 from gnio_jax.training.window_task import WindowTask
 from tests.support import drawn_run
@@ -447,7 +447,7 @@ def test_a_later_stage_starts_from_what_the_filter_has_learnt(recording, finishe
     """The command makes the filter of that run the default; what it asks for wins."""
     words = ["--init-from", str(finished), "--through-filter.learn", *THROUGH.learn]
     asked_for = tiny(recording, "unused", init_from=str(finished))
-    run = run_folder.initial_run(asked_for, checkpoint.load_run)
+    run = checkpoint.initial_run(asked_for, checkpoint.load_run)
     call = Call("gnio train", words)
     begins = experiment(read(train, call), call).filter
     assert begins == run.config.filter != OPTIONS
@@ -464,7 +464,7 @@ def test_a_later_stage_starts_from_what_the_filter_has_learnt(recording, finishe
 def test_training_on_windows_starts_from_a_runs_weights(recording):
     config = tiny(recording, "unused", through_filter=ThroughFilter())
     with jax.enable_x64(False):
-        start = run_folder.initial_run(config, checkpoint.load_run)
+        start = checkpoint.initial_run(config, checkpoint.load_run)
         training, _ = task.set_up(WindowTask, config, Lines())
         state = training.initial_state(KEYS.init, start.variables)
     theirs = checkpoint.load_run(recording / "initial").variables
