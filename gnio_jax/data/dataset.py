@@ -21,6 +21,9 @@ class Refusal(InputError):
     """A recording cannot be used, though its files can be read: a ruined clock, or a reference that
     does not fit the IMU. The recording is left out with a warning, and the cache remembers why."""
 
+    def __init__(self, where: object, problem: str, remedy: str = "leave it out"):
+        super().__init__(where, problem, remedy)
+
 
 class Recording(NamedTuple):
     """One recording that was found, but not yet read. It can be sent to another process."""

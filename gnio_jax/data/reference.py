@@ -1,8 +1,8 @@
 """Tracked poses on the clock of an IMU.
 
-Trackers stamp their poses on a clock of their own, at 4 to 200 Hz, with gaps and jumps. Poses that
-come with a velocity follow splines, and so do smooth poses without one, whose velocity is that of
-their smoothed positions. Of noisy poses the gyro carries the attitude, and a smoother the position.
+Trackers stamp their poses on a clock of their own, at 4 to 200 Hz, with gaps and jumps. Smooth
+poses follow splines; where they come without a velocity, it is that of the smoothed positions. Of
+noisy poses the gyro carries the attitude, and a smoother the position.
 """
 
 from __future__ import annotations
@@ -11,12 +11,11 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.interpolate import CubicSpline
 from scipy.linalg import solveh_banded
 from scipy.ndimage import gaussian_filter1d
-from scipy.spatial.transform import Rotation, RotationSpline
+from scipy.spatial.transform import Rotation
 
-from gnio_jax.data.resampling import known_at, runs_within, slerped, splined
+from gnio_jax.data.resampling import known_at, runs_within, splined
 from gnio_jax.numerics import (
     integrate_gyro,
     interpolate,
@@ -66,6 +65,14 @@ class Poses(NamedTuple):
     source: str = ""
     """File, for messages."""
 
+    def rows(self, rows: np.ndarray | slice) -> Poses:
+        """The poses in some rows."""
+        velocity = None if self.velocity is None else self.velocity[rows]
+        place, attitude = self.position[rows], self.attitude[rows]
+        return self._replace(
+            time=self.time[rows], attitude=attitude, position=place, velocity=velocity
+        )
+
 
 class Reference(NamedTuple):
     """The reference of a sequence, at its stamps; anything where not `valid`."""
@@ -88,70 +95,61 @@ def reference_at(
     Not valid across gaps, where poses without a velocity step faster than `max_speed` (m/s), and
     where the velocity, integrated over a second, is off the position by more than `max_drift` (m).
     """
+    return (
+        _fused(clock, gyro, poses) if poses.noisy else _splined(clock, poses, max_speed, max_drift)
+    )
+
+
+def _splined(
+    clock: Float[np.ndarray, " m"], poses: Poses, max_speed: float, max_drift: float
+) -> Reference:
+    """Splines within unbroken runs. A run also ends where the position contradicts the velocity,
+    since nothing is known between two such poses."""
+    stamps, step = poses.time, float(np.median(np.diff(clock)))
+    steps = np.diff(stamps)
+    broken = steps > longest_trusted(stamps)
+    parts = [one_sign(quaternions(poses.attitude)), poses.position]
     if poses.velocity is not None:
-        return _with_velocity(clock, poses, max_drift)
-    return _fused(clock, gyro, poses) if poses.noisy else _smooth(clock, poses, max_speed)
-
-
-def _with_velocity(clock: Float[np.ndarray, " m"], poses: Poses, max_drift: float) -> Reference:
-    """Splines within unbroken runs. A run ends where the position contradicts the velocity, since
-    nothing is known between two such poses."""
-    stamps, speed = poses.time, poses.velocity
-    assert speed is not None
-    steps, same = np.diff(stamps), _same(stamps, clock)
-    broken = steps > _longest(stamps)
-    if not same:
-        moved = midpoints(speed) * steps[:, None]
+        parts.append(poses.velocity)
+        moved = midpoints(poses.velocity) * steps[:, None]
         contradiction = np.linalg.norm(np.diff(poses.position, axis=0) - moved, axis=1)
         # Over long steps the trapezium is only a rough integral of the velocity.
         broken |= contradiction > LARGEST_JUMP + 2.0 * steps**2
-    orientation, position, velocity = (np.full((len(clock), w), np.nan) for w in (4, 3, 3))
+    # Attitudes, too: at 30 Hz the shorter arc between two of them errs by half a degree in a
+    # walker's hand. The spline of quaternions is as exact there as one of rotations.
+    values = splined(stamps, np.concatenate(parts, axis=1), clock, broken)
+    orientation, position, velocity = np.split(values, [4, 7], axis=1)
+    orientation = orientation / np.linalg.norm(orientation, axis=1, keepdims=True)
     valid = np.zeros(len(clock), dtype=bool)
-    for run, rows in runs_within(stamps, broken, clock, SHORTEST_RUN):
+    for _, rows in runs_within(stamps, broken, clock, SHORTEST_RUN):
         valid[rows] = True
-        if same:
-            continue
-        own = stamps[run] - stamps[run.start]
-        at = np.clip(clock[rows] - stamps[run.start], 0.0, own[-1])
-        orientation[rows] = quaternions(RotationSpline(own, poses.attitude[run])(at))
-        position[rows] = CubicSpline(own, poses.position[run], axis=0)(at)
-        velocity[rows] = CubicSpline(own, speed[run], axis=0)(at)
-    if same:
-        orientation, position, velocity = quaternions(poses.attitude), poses.position, speed
-    if np.isfinite(max_drift):
-        near = ~_drifts(stamps, poses.position, speed, max_drift)
-        valid &= known_at(stamps, near, clock, _longest(stamps))
     if poses.lever.any():
-        arm, longest = poses.attitude.apply(poses.lever), _longest(stamps)
-        turning = CubicSpline(stamps - stamps[0], arm, axis=0)(stamps - stamps[0], 1)
-        position = position + splined(stamps, arm, clock, longest)
-        velocity = velocity + splined(stamps, turning, clock, longest)
+        arm = rotations(orientation).apply(poses.lever)
+        position = position + arm
+        if poses.velocity is not None:
+            velocity = velocity + np.gradient(arm, step, axis=0, edge_order=2)
+    if poses.velocity is None:
+        fast = np.linalg.norm(np.diff(position, axis=0), axis=1) > max_speed * step
+        jumps = np.concatenate([fast, [False]]) | np.concatenate([[False], fast])
+        valid &= ~within(jumps, max(round(JUMP_MARGIN / step), 1))
+        _, velocity, _ = smooth_positions(position, valid, step)
+    elif np.isfinite(max_drift):
+        valid &= ~_drifts(position, velocity, step, max_drift)
     return Reference(orientation, position, velocity, valid)
 
 
-def _smooth(clock: Float[np.ndarray, " m"], poses: Poses, max_speed: float) -> Reference:
-    """Splines, of attitudes too: at 30 Hz the shorter arc between two of them errs by half a degree
-    in a walker's hand. The velocity is that of the smoothed positions."""
-    stamps, longest = poses.time, _longest(poses.time)
-    broken, wxyz = np.diff(stamps) > longest, quaternions(poses.attitude)
-    if _same(stamps, clock):
-        orientation = wxyz.copy()
-    else:
-        orientation = slerped(stamps, wxyz, clock)
-        for run, rows in runs_within(stamps, broken, clock):
-            own = stamps[run] - stamps[run.start]
-            at = np.clip(clock[rows] - stamps[run.start], 0.0, own[-1])
-            orientation[rows] = quaternions(RotationSpline(own, poses.attitude[run])(at))
-    position = splined(stamps, poses.position, clock, longest)
-    if poses.lever.any():
-        position = position + rotations(orientation).apply(poses.lever)
-    step = float(np.median(np.diff(clock)))
-    fast = np.linalg.norm(np.diff(position, axis=0), axis=1) > max_speed * step
-    jumps = np.concatenate([fast, [False]]) | np.concatenate([[False], fast])
-    seen = known_at(stamps, np.ones(len(stamps), dtype=bool), clock, longest)
-    good = seen & ~within(jumps, max(round(JUMP_MARGIN / step), 1))
-    _, velocity, _ = smooth_positions(position, good, step)
-    return Reference(orientation, position, velocity, good)
+def _drifts(
+    position: Float[np.ndarray, "m 3"], velocity: Float[np.ndarray, "m 3"], step: float, most: float
+) -> Bool[np.ndarray, " m"]:
+    """True in every second in which position and integrated velocity disagree by more than `most`
+    (m), as where a satellite receiver corrects itself by jumps."""
+    second = round(1.0 / step)
+    moved = np.cumsum(midpoints(velocity) * step, axis=0)
+    error = position - np.concatenate([np.zeros((1, 3)), moved])
+    far = np.linalg.norm(error[second:] - error[:-second], axis=1) > most
+    middle = np.zeros(len(position), dtype=bool)
+    middle[second // 2 : second // 2 + len(far)] = far
+    return within(middle, second // 2)
 
 
 def _fused(
@@ -159,84 +157,36 @@ def _fused(
 ) -> Reference:
     """The gyro carries the attitude between the tracker's, and a smoother the position."""
     usual, step = LOST_POSES * float(np.median(np.diff(poses.time))), float(clock[1] - clock[0])
-    stamps, attitude, position = _in_runs(poses, usual)
-    everywhere = np.ones(len(stamps), dtype=bool)
+    bridge = longest_trusted(poses.time)
+    # Single poses between gaps are those that the tracker hardly saw.
+    runs = stretches(np.diff(poses.time) > usual)
+    sure = [np.arange(run.start, run.stop) for run in runs if run.stop - run.start >= SHORTEST_RUN]
+    poses = poses.rows(np.concatenate(sure)) if sure else poses
+    stamps, everywhere = poses.time, np.ones(len(poses.time), dtype=bool)
     measured = known_at(stamps, everywhere, clock, usual)
     if measured.sum() < SHORTEST_RUN:
-        nothing = np.full((len(clock), 3), np.nan)
-        return Reference(
-            np.full((len(clock), 4), np.nan), nothing, nothing, np.zeros(len(clock), dtype=bool)
-        )
-    bridged = known_at(stamps, everywhere, clock, _longest(poses.time))
-    turned = slerp(clock, stamps, attitude)
+        nothing = np.full((len(clock), 4), np.nan)
+        return Reference(nothing, nothing[:, :3], nothing[:, :3], np.zeros(len(clock), dtype=bool))
+    turned = slerp(clock, stamps, poses.attitude)
     # The gyro's constant bias would bend the correction at its ends.
-    rate = gyro - _gyro_bias(gyro, turned, measured, step)
+    both = measured[:-1] & measured[1:]
+    drift = (midpoints(gyro) - turns_between(turned) / step)[both]
+    rate = gyro - np.median(drift, axis=0) if len(drift) else gyro
     fused, believed = fuse_attitude(integrate_gyro(rate, step), turned, measured, step)
     arm = fused.apply(poses.lever)
-    smoothed, velocity, kept = smooth_positions(
-        splined(stamps, position, clock, usual) + arm, measured & believed, step
-    )
+    place = splined(stamps, poses.position, clock, np.diff(stamps) > usual) + arm
+    smoothed, velocity, kept = smooth_positions(place, measured & believed, step)
     # Where few poses are left between gaps the smoother may swing; it must stay with what was seen.
-    straight = interpolate(clock, stamps, position) + arm
+    straight = interpolate(clock, stamps, poses.position) + arm
     close = np.linalg.norm(smoothed - straight, axis=1) < LARGEST_JUMP
+    bridged = known_at(stamps, everywhere, clock, bridge)
     valid = np.asarray(bridged & close & (believed & kept | ~measured))
     return Reference(quaternions(fused), smoothed, velocity, valid)
 
 
-def _same(stamps: Float[np.ndarray, " n"], clock: Float[np.ndarray, " m"]) -> bool:
-    """True where the clock is that of the poses, to 1 µs: a spline would give the poses again."""
-    return len(clock) == len(stamps) and bool(np.abs(clock - stamps).max() <= 1e-6)
-
-
-def _longest(stamps: Float[np.ndarray, " n"]) -> float:
+def longest_trusted(stamps: Float[np.ndarray, " n"]) -> float:
     """s between two poses up to which what lies between them can be trusted."""
     return max(LONGEST_BRIDGE, LOST_POSES * float(np.median(np.diff(stamps))))
-
-
-def _drifts(
-    stamps: Float[np.ndarray, " n"],
-    position: Float[np.ndarray, "n 3"],
-    velocity: Float[np.ndarray, "n 3"],
-    most: float,
-) -> Bool[np.ndarray, " n"]:
-    """True in every second in which position and integrated velocity disagree by more than `most`
-    (m), as where a satellite receiver corrects itself by jumps."""
-    steps = np.diff(stamps)
-    second = round(1.0 / float(np.median(steps)))
-    middle = np.zeros(len(stamps), dtype=bool)
-    if len(stamps) <= second:
-        return middle
-    moved = np.diff(position, axis=0) - midpoints(velocity) * steps[:, None]
-    error = np.concatenate([np.zeros((1, 3)), np.cumsum(moved, axis=0)])
-    far = np.linalg.norm(error[second:] - error[:-second], axis=1) > most
-    middle[second // 2 : second // 2 + len(far)] = far
-    return within(middle, second // 2)
-
-
-def _in_runs(poses: Poses, usual: float) -> tuple[np.ndarray, Rotation, np.ndarray]:
-    """(stamps, attitudes, positions) of the poses that follow each other within `usual` (s): single
-    poses between gaps are those that the tracker hardly saw."""
-    runs = [
-        np.arange(run.start, run.stop)
-        for run in stretches(np.diff(poses.time) > usual)
-        if run.stop - run.start >= SHORTEST_RUN
-    ]
-    rows = np.concatenate(runs) if runs else np.arange(len(poses.time))
-    return poses.time[rows], poses.attitude[rows], poses.position[rows]
-
-
-def _gyro_bias(
-    gyro: Float[np.ndarray, "m 3"],
-    attitude: Rotation,
-    measured: Bool[np.ndarray, " m"],
-    step: float,
-) -> Float[np.ndarray, "3"]:
-    """Median difference of the gyro and the attitude's rate where both ends of an interval were
-    measured, rad/s."""
-    both = measured[:-1] & measured[1:]
-    if not both.any():
-        return np.zeros(3)
-    return np.median((midpoints(gyro) - turns_between(attitude) / step)[both], axis=0)
 
 
 # --- attitude from a gyro whose slow drift a tracker corrects
@@ -258,60 +208,33 @@ def fuse_attitude(
     correction is interpolated, so that the gyro bridges the gap.
     """
     correction = quaternions(measured * integrated.inv())
-    correction[good] = _one_sign(correction[good])
-    believed = good
-    course = _filled(correction, good)
-    for _ in range(4):
-        correction, angle = _against(correction, course)
-        believed = _enough(good & (angle < np.radians(FLIP_DEGREES)), good)
-        course = _course(correction, angle, believed, np.radians(1.0), COURSE_SECONDS / step)
-    for _ in range(3):
-        correction, angle = _against(correction, course)
-        believed = _enough(believed & (angle < np.pi), good)
-        course = _course(correction, angle, believed, np.radians(0.3), seconds / step)
+    correction[good] = one_sign(correction[good])
+    rows = np.arange(len(good))
+
+    def filled(believed: Bool[np.ndarray, " n"]) -> Float[np.ndarray, "n 4"]:
+        return interpolate(rows, np.flatnonzero(believed), correction[believed])
+
+    course, believed = filled(good), good
+    for flip, sigma, least in [
+        *[(np.radians(FLIP_DEGREES), COURSE_SECONDS / step, np.radians(1.0))] * 4,
+        *[(np.pi, seconds / step, np.radians(0.3))] * 3,
+    ]:
+        correction *= np.where((correction * course).sum(axis=1) < 0, -1.0, 1.0)[:, None]
+        angle = 2.0 * np.arccos(np.clip((correction * course).sum(axis=1), -1.0, 1.0))
+        # Once flips are told, they stay so; a course that loses four fifths of all is none.
+        near = (good if flip < np.pi else believed) & (angle < flip)
+        believed = near if near.sum() > 0.2 * good.sum() else good
+        scale = max(3.0 * float(np.median(angle[believed])), least)
+        weight = np.where(believed, 1.0 / (1.0 + (angle / scale) ** 2) ** 2, 1.0)[:, None]
+        course = gaussian_filter1d(weight * filled(believed), sigma, axis=0, mode="nearest")
+        course /= np.linalg.norm(course, axis=1, keepdims=True)
     return rotations(course) * integrated, believed
 
 
-def _one_sign(wxyz: Float[np.ndarray, "m 4"]) -> Float[np.ndarray, "m 4"]:
+def one_sign(wxyz: Float[np.ndarray, "m 4"]) -> Float[np.ndarray, "m 4"]:
     """The same rotations; q and −q are one, and neighbours get the same sign."""
     opposite = (wxyz[1:] * wxyz[:-1]).sum(axis=1) < 0
     return wxyz * np.cumprod(np.concatenate([[1.0], np.where(opposite, -1.0, 1.0)]))[:, None]
-
-
-def _against(
-    wxyz: Float[np.ndarray, "n 4"], course: Float[np.ndarray, "n 4"]
-) -> tuple[Float[np.ndarray, "n 4"], Float[np.ndarray, " n"]]:
-    """The same rotations with the course's sign, and by what angle (rad) they are off it."""
-    wxyz = wxyz * np.where((wxyz * course).sum(axis=1) < 0, -1.0, 1.0)[:, None]
-    return wxyz, 2.0 * np.arccos(np.clip((wxyz * course).sum(axis=1), -1.0, 1.0))
-
-
-def _enough(near: Bool[np.ndarray, " n"], good: Bool[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
-    """The samples near the course; all good ones if it has lost more than four fifths of them."""
-    return near if near.sum() > 0.2 * good.sum() else good
-
-
-def _course(
-    correction: Float[np.ndarray, "n 4"],
-    angle: Float[np.ndarray, " n"],
-    believed: Bool[np.ndarray, " n"],
-    least_scale: float,
-    sigma: float,
-) -> Float[np.ndarray, "n 4"]:
-    """Quaternions of the correction filtered over `sigma` samples, those far off the last course
-    (`angle`, rad) counting less."""
-    scale = max(3.0 * float(np.median(angle[believed])), least_scale)
-    weight = np.where(believed, 1.0 / (1.0 + (angle / scale) ** 2) ** 2, 1.0)
-    course = gaussian_filter1d(
-        weight[:, None] * _filled(correction, believed), sigma, axis=0, mode="nearest"
-    )
-    return course / np.linalg.norm(course, axis=1, keepdims=True)
-
-
-def _filled(values: Float[np.ndarray, "n w"], good: Bool[np.ndarray, " n"]) -> np.ndarray:
-    """Rows that are not good, interpolated between those that are."""
-    rows = np.flatnonzero(good)
-    return interpolate(np.arange(len(good)), rows, values[rows])
 
 
 # --- positions and velocities of a noisy tracker
@@ -331,9 +254,13 @@ def smooth_positions(
     smoother bridges with the smoothest acceleration.
     """
     cutoff = min(cutoff, 0.25 / step)
-    smoothness = (2.0 * np.sin(np.pi * cutoff * step)) ** -6 * _third_difference_bands(
-        len(position)
-    )
+    # Δ³ᵀΔ³ in SciPy's upper banded form: bands[3 − d, j] couples j and j − d.
+    stencil, count = np.array([-1.0, 3.0, -3.0, 1.0]), len(position)
+    smoothness = np.zeros((4, count))
+    for a in range(4):
+        for b in range(a, 4):
+            smoothness[3 - (b - a), b : count - 3 + b] += stencil[a] * stencil[b]
+    smoothness *= (2.0 * np.sin(np.pi * cutoff * step)) ** -6
     filled = np.where(good[:, None], position, 0.0)
     weight = good.astype(float)
     smoothed = filled
@@ -346,13 +273,3 @@ def smooth_positions(
         weight = good / (1.0 + (distance / scale) ** 2) ** 2
     velocity = np.gradient(smoothed, step, axis=0, edge_order=2)
     return smoothed, velocity, good & (weight > 0.1)
-
-
-def _third_difference_bands(n: int) -> Float[np.ndarray, "4 n"]:
-    """Δ³ᵀΔ³ in SciPy's upper banded form: bands[3 − d, j] couples j and j − d."""
-    stencil = np.array([-1.0, 3.0, -3.0, 1.0])
-    bands = np.zeros((4, n))
-    for a in range(4):
-        for b in range(a, 4):
-            bands[3 - (b - a), b : n - 3 + b] += stencil[a] * stencil[b]
-    return bands

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
@@ -19,6 +18,8 @@ SPLINE_INTERVALS = 3.5
 would swing, and a line is drawn (ours)."""
 SHORTEST_SPLINE = 4
 """Samples in a row below which straight lines stand in for a spline."""
+SAME_STAMP = 1e-6
+"""s."""
 
 
 def longest_bridge(rate: float) -> float:
@@ -43,37 +44,29 @@ def uniform_clock(first: float, last: float, rate: float) -> Float[np.ndarray, "
     return clock
 
 
-class Resampled(NamedTuple):
-    """An IMU's samples on another clock."""
-
-    values: Float[np.ndarray, "m w"]
-    measured: Bool[np.ndarray, " m"]
-    """False in gaps longer than `longest_bridge`, where `values` are a line, and beyond the
-    ends."""
-
-
 def resampled(
     time: Float[np.ndarray, " n"],
     values: Float[np.ndarray, "n w"],
     clock: Float[np.ndarray, " m"],
     rate: float,
-) -> Resampled:
-    """An IMU's samples at the uniform stamps `clock` of `rate` Hz.
+) -> tuple[Float[np.ndarray, "m w"], Bool[np.ndarray, " m"]]:
+    """(An IMU's samples at the uniform stamps `clock` of `rate` Hz, which of these are measured.)
 
-    Going to a lower rate they are band-limited first (zero-phase FIR, pass band to 0.8 of the new
-    Nyquist frequency), or vibrations would alias into the gait band.
+    Going to a lower rate the samples are band-limited first (zero-phase FIR, pass band to 0.8 of
+    the new Nyquist frequency), or vibrations would alias into the gait band. In gaps longer than
+    `longest_bridge` they are a line and not measured, and beyond the ends they are held.
     """
     step = float(np.median(np.diff(time)))
-    factor, longest = decimation_factor(1.0 / step, rate), SPLINE_INTERVALS * step
+    factor, broken = decimation_factor(1.0 / step, rate), np.diff(time) > SPLINE_INTERVALS * step
     measured = known_at(time, np.ones(len(time), dtype=bool), clock, longest_bridge(1.0 / step))
     if factor == 1:
-        return Resampled(splined(time, values, clock, longest), measured)
+        return splined(time, values, clock, broken), measured
     fine = clock[0] + np.arange((len(clock) - 1) * factor + 1) / (rate * factor)
-    fine = splined(time, values, np.minimum(fine, time[-1]), longest)
+    fine = splined(time, values, np.minimum(fine, time[-1]), broken)
     taps = low_pass(factor)
     half = len(taps) // 2
     padded = np.pad(fine, ((half, half), (0, 0)), mode="reflect", reflect_type="odd")
-    return Resampled(convolved(padded, taps)[::factor], measured)
+    return convolved(padded, taps)[::factor], measured
 
 
 def resample(sequence: Sequence, rate: float) -> Sequence:
@@ -89,7 +82,8 @@ def resample(sequence: Sequence, rate: float) -> Sequence:
         return sequence
     clock = uniform_clock(time[0], time[-1], rate)
     step = float(np.median(np.diff(time)))
-    longest, bridge = SPLINE_INTERVALS * step, longest_bridge(1.0 / step)
+    bridge = longest_bridge(1.0 / step)
+    broken = (np.diff(time) > SPLINE_INTERVALS * step) | ~(valid[1:] & valid[:-1])
     imu = np.concatenate([sequence.gyro, sequence.accel], axis=1)
     imu, measured = resampled(time, imu, clock, rate)
     if sequence.imu_valid is not None:
@@ -100,8 +94,8 @@ def resample(sequence: Sequence, rate: float) -> Sequence:
         gyro=imu[:, :3],
         accel=imu[:, 3:],
         orientation=slerped(time, sequence.orientation, clock),
-        position=splined(time, sequence.position, clock, longest, valid),
-        velocity=splined(time, sequence.velocity, clock, longest, valid),
+        position=splined(time, sequence.position, clock, broken),
+        velocity=splined(time, sequence.velocity, clock, broken),
         valid=known_at(time, valid, clock, bridge),
         device_orientation=None if device is None else slerped(time, device, clock),
         imu_valid=None if measured.all() else measured,
@@ -111,29 +105,17 @@ def resample(sequence: Sequence, rate: float) -> Sequence:
 # --- between samples
 
 
-class Between(NamedTuple):
-    """The samples around each stamp of a clock; one and the same where a stamp is a sample's own to
-    1 µs, and beyond the ends."""
-
-    left: np.ndarray
-    """Rows."""
-    right: np.ndarray
-    """Rows."""
-    span: np.ndarray
-    """s between the two."""
-    share: np.ndarray
-    """Where the stamp lies between them, 0 to 1."""
-
-
-def between(time: Float[np.ndarray, " n"], clock: Float[np.ndarray, " m"]) -> Between:
-    """The samples at `time` around each stamp of `clock`."""
+def between(
+    time: Float[np.ndarray, " n"], clock: Float[np.ndarray, " m"]
+) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"], Float[np.ndarray, " m"]]:
+    """(left row, right row, share of the way) of each stamp of `clock` between samples; left and
+    right are one where the stamp is a sample's own to 1 µs."""
     right = np.clip(np.searchsorted(time, clock), 1, len(time) - 1)
-    left = right - 1
-    left = np.where(time[right] - clock <= 1e-6, right, left)
-    right = np.where(clock - time[left] <= 1e-6, left, right)
+    left = np.where(time[right] - clock <= SAME_STAMP, right, right - 1)
+    right = np.where(clock - time[left] <= SAME_STAMP, left, right)
     span = time[right] - time[left]
     share = np.divide(clock - time[left], span, out=np.zeros_like(clock), where=span > 0)
-    return Between(left, right, span, share)
+    return left, right, np.clip(share, 0.0, 1.0)
 
 
 def known_at(
@@ -143,9 +125,9 @@ def known_at(
     longest: float,
 ) -> Bool[np.ndarray, " m"]:
     """Where a clock lies between known samples that are no more than `longest` (s) apart."""
-    near = between(time, clock)
-    covered = (clock >= time[0] - 1e-6) & (clock <= time[-1] + 1e-6)
-    return known[near.left] & known[near.right] & (near.span <= longest) & covered
+    left, right, _ = between(time, clock)
+    covered = (clock >= time[0] - SAME_STAMP) & (clock <= time[-1] + SAME_STAMP)
+    return known[left] & known[right] & (time[right] - time[left] <= longest) & covered
 
 
 def runs_within(
@@ -158,8 +140,8 @@ def runs_within(
     `shortest` samples."""
     for run in stretches(broken):
         if run.stop - run.start >= shortest:
-            start = np.searchsorted(clock, time[run.start] - 1e-6)
-            stop = np.searchsorted(clock, time[run.stop - 1] + 1e-6, side="right")
+            start = np.searchsorted(clock, time[run.start] - SAME_STAMP)
+            stop = np.searchsorted(clock, time[run.stop - 1] + SAME_STAMP, side="right")
             if stop > start:
                 yield run, slice(int(start), int(stop))
 
@@ -168,25 +150,19 @@ def splined(
     time: Float[np.ndarray, " n"],
     values: Float[np.ndarray, "n w"],
     clock: Float[np.ndarray, " m"],
-    longest: float,
-    good: Bool[np.ndarray, " n"] | None = None,
+    broken: Bool[np.ndarray, " i"],
 ) -> Float[np.ndarray, "m w"]:
-    """Cubic splines within runs of good samples at most `longest` (s) apart, straight lines between
-    the runs, and the outermost values beyond the ends.
+    """Cubic splines within runs of samples, straight lines where the interval between two is
+    `broken`, and the outermost values beyond the ends.
 
     A spline would carry an outlier or a gap into its surroundings.
     """
-    near = between(time, clock)
-    share = near.share[:, None]
-    line = (1.0 - share) * values[near.left] + share * values[near.right]
-    result = np.where(share > 0, line, values[near.left])
-    rows = np.arange(len(time)) if good is None else np.flatnonzero(good)
-    time, values = time[rows], values[rows]
-    if len(time) < SHORTEST_SPLINE:
-        return result
-    broken = np.diff(time) > longest
-    if good is not None:
-        broken |= np.diff(rows) > 1
+    if len(clock) == len(time) and np.abs(clock - time).max() <= SAME_STAMP:
+        return values
+    left, right, share = between(time, clock)
+    share = share[:, None]
+    lines = (1.0 - share) * values[left] + share * values[right]
+    result = np.where(share > 0, lines, values[left])
     for run, there in runs_within(time, broken, clock):
         # A spline starts at 0, or large stamps would cost its coefficients digits.
         own = time[run] - time[run.start]
@@ -200,11 +176,11 @@ def slerped(
 ) -> Float[np.ndarray, "m 4"]:
     """Attitudes on the shorter arc between samples, whatever the signs of the quaternions; NaN
     beside a NaN, and the outermost ones beyond the ends."""
-    near = between(time, clock)
+    left, right, share = between(time, clock)
     result = np.full((len(clock), 4), np.nan)
-    known = finite_rows(wxyz[near.left]) & finite_rows(wxyz[near.right])
+    known = finite_rows(wxyz[left]) & finite_rows(wxyz[right])
     if known.any():
-        start, end = rotations(wxyz[near.left[known]]), rotations(wxyz[near.right[known]])
-        turn = (start.inv() * end).as_rotvec() * np.clip(near.share, 0.0, 1.0)[known, None]
+        start, end = rotations(wxyz[left[known]]), rotations(wxyz[right[known]])
+        turn = (start.inv() * end).as_rotvec() * share[known, None]
         result[known] = quaternions(start * Rotation.from_rotvec(turn))
     return result

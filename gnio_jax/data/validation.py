@@ -36,16 +36,11 @@ def validate(sequence: Sequence, source: object) -> Sequence:
     check_accel(sequence.accel, source)
     check_gyro(sequence.gyro, source)
     for field in ("orientation", "position", "velocity"):
-        if np.isfinite(getattr(sequence, field)).all():
-            continue
-        bad = sequence.valid & ~np.isfinite(getattr(sequence, field)).all(axis=1)
-        if bad.any():
-            raise InputError(
-                source,
-                f"field '{field}' is NaN or Inf in {bad.sum()} rows marked valid, "
-                f"first in row {np.argmax(bad) + 1}",
-                "mark these rows invalid",
-            )
+        finite = np.isfinite(getattr(sequence, field))
+        if not finite.all():
+            bad = sequence.valid & ~finite.all(axis=1)
+            _refuse(bad, field, "is NaN or Inf", source, "mark these rows invalid")
+    _check_motion(sequence, source)
     _check_waypoints(sequence, source)
     orientation = check_unit_norm(sequence.orientation, sequence.valid, "orientation", source)
     device = sequence.device_orientation
@@ -55,32 +50,49 @@ def validate(sequence: Sequence, source: object) -> Sequence:
     return sequence._replace(orientation=orientation, device_orientation=device)
 
 
+def _refuse(
+    bad: Bool[np.ndarray, " n"], field: str, problem: str, source: object, remedy: str
+) -> None:
+    """Raise `InputError` where a row is bad; rows are named from 1."""
+    if bad.any():
+        rows = f"in {bad.sum()} rows, first in row {np.argmax(bad) + 1}"
+        raise InputError(source, f"field '{field}' {problem} {rows}", remedy)
+
+
 def _check_shapes(sequence: Sequence, source: object) -> None:
     """Files give these shapes, so that a wrong one is a user's error."""
-    time, valid = sequence.time, sequence.valid
+    time = sequence.time
     count = time.shape[0] if time.ndim == 1 else -1
     if count < 2:
-        raise InputError(
-            source, f"field 'time' must hold at least two stamps, found shape {time.shape}"
-        )
+        problem = f"field 'time' must hold at least two stamps, found shape {time.shape}"
+        raise InputError(source, problem)
     widths = {"gyro": 3, "accel": 3, "orientation": 4, "position": 3, "velocity": 3}
-    if sequence.device_orientation is not None:
-        widths["device_orientation"] = 4
-    for field, width in widths.items():
-        shape = getattr(sequence, field).shape
-        if shape != (count, width):
-            raise InputError(
-                source,
-                f"field '{field}' has shape {shape}, expected {(count, width)} "
-                f"as field 'time' has {count} stamps",
-            )
-    for field, mask in (("valid", valid), ("imu_valid", sequence.imu_valid)):
+    for field, width in (widths | {"device_orientation": 4}).items():
+        values = getattr(sequence, field)
+        if values is not None and values.shape != (count, width):
+            problem = f"field '{field}' has shape {values.shape}, expected {(count, width)}"
+            raise InputError(source, f"{problem} as field 'time' has {count} stamps")
+    for field in ("valid", "imu_valid"):
+        mask = getattr(sequence, field)
         if mask is not None and (mask.shape != (count,) or mask.dtype != np.bool_):
-            raise InputError(
-                source,
-                f"field '{field}' must be {count} booleans, "
-                f"found {mask.dtype} of shape {mask.shape}",
-            )
+            found = f"{mask.dtype} of shape {mask.shape}"
+            raise InputError(source, f"field '{field}' must be {count} booleans, found {found}")
+
+
+def _check_motion(sequence: Sequence, source: object) -> None:
+    """Raise `InputError` where the valid reference moves as nothing does."""
+    valid, position = sequence.valid, sequence.position
+    if not valid.any():
+        return
+    remedy = "repair these rows or mark them invalid"
+    fast = valid & (np.abs(sequence.velocity) > FASTEST).any(axis=1)
+    _refuse(fast, "velocity", f"is beyond {FASTEST:g} m/s", source, remedy)
+    far = valid & (np.abs(position) > FARTHEST).any(axis=1)
+    _refuse(far, "position", f"is beyond {FARTHEST:g} m", source, remedy)
+    farthest_step = np.maximum(FASTEST * np.diff(sequence.time), LARGEST_STEP)[:, None]
+    jump = (np.abs(np.diff(position, axis=0)) > farthest_step).any(axis=1)
+    jump = np.concatenate([[False], valid[1:] & valid[:-1] & jump])
+    _refuse(jump, "position", "jumps", source, remedy)
 
 
 def _check_waypoints(sequence: Sequence, source: object) -> None:
@@ -88,7 +100,7 @@ def _check_waypoints(sequence: Sequence, source: object) -> None:
     if sequence.waypoints is None:
         return
     time, position = sequence.waypoints
-    count, clock = len(time), sequence.time
+    count, clock, step = len(time), sequence.time, sequence.time[1] - sequence.time[0]
     problem = ""
     if time.ndim != 1 or position.shape != (count, 2):
         problem = f"have the shapes {time.shape} and {position.shape}, expected (k,) and (k, 2)"
@@ -98,10 +110,8 @@ def _check_waypoints(sequence: Sequence, source: object) -> None:
         problem = "are not all finite"
     elif not (np.diff(time) > 0).all():
         problem = "do not increase in time"
-    else:
-        step = clock[1] - clock[0]
-        if time[0] < clock[0] - step or time[-1] > clock[-1] + step:
-            problem = f"({time[0]:.2f} to {time[-1]:.2f} s) are not all on the IMU's clock"
+    elif time[0] < clock[0] - step or time[-1] > clock[-1] + step:
+        problem = f"({time[0]:.2f} to {time[-1]:.2f} s) are not all on the IMU's clock"
     if problem:
         raise InputError(source, f"field 'waypoints' {problem}", "repair or leave out these")
 
@@ -111,24 +121,14 @@ def check_finite(values: Float[np.ndarray, "n ..."], field: str, source: object)
     finite = np.isfinite(values)
     if not finite.all():
         bad = ~finite.reshape(len(values), -1).all(axis=1)
-        raise InputError(
-            source,
-            f"field '{field}' is NaN or Inf in {bad.sum()} rows, first in row {np.argmax(bad) + 1}",
-            "repair or cut the recording there",
-        )
+        _refuse(bad, field, "is NaN or Inf", source, "repair or cut the recording there")
 
 
 def check_increasing(time: Float[np.ndarray, "n"], source: object) -> None:
     """Raise `InputError` where the stamps (s) do not increase."""
-    backward = np.flatnonzero(np.diff(time) <= 0)
-    if backward.size:
-        row = int(backward[0]) + 1
-        raise InputError(
-            source,
-            f"field 'time' does not increase in {backward.size} rows, first in row {row + 1} "
-            f"({time[row - 1]:.6f} s, then {time[row]:.6f} s)",
-            "sort the rows and drop repeated ones",
-        )
+    backward = np.concatenate([[False], np.diff(time) <= 0])
+    remedy = "sort the rows and drop repeated ones"
+    _refuse(backward, "time", "does not increase", source, remedy)
 
 
 def check_gyro(
@@ -138,11 +138,8 @@ def check_gyro(
     their stamps `time` (s), or else by their rows."""
     turn = float(np.median(np.linalg.norm(gyro, axis=1)))
     if turn > 20.0:
-        raise InputError(
-            source,
-            f"field 'gyro' looks like deg/s (median magnitude {turn:.3g})",
-            "convert it to rad/s (× π/180)",
-        )
+        problem = f"field 'gyro' looks like deg/s (median magnitude {turn:.3g})"
+        raise InputError(source, problem, "convert it to rad/s (× π/180)")
     _check_range("gyro", gyro, FASTEST_TURN, "rad/s", source, time)
 
 
@@ -151,18 +148,15 @@ def check_accel(
 ) -> None:
     """The same of an accelerometer, m/s², gravity included."""
     force = float(np.median(np.linalg.norm(accel, axis=1)))
-    problem, remedy = "", ""
+    problem, remedy = "", "give the specific force in m/s², gravity included"
     if 0.5 < force < 2.0:
-        problem = f"looks like G (median magnitude {force:.3g})"
-        remedy = "convert it to m/s² (× 9.80665)"
+        problem, remedy = "looks like G", "convert it to m/s² (× 9.80665)"
     elif force < 5.0:  # a walker's linear acceleration is 1–4 m/s²
-        problem = f"has no gravity in it (median magnitude {force:.3g} m/s²)"
-        remedy = "give the specific force, gravity included"
+        problem = "has no gravity in it"
     elif force > 50.0:
-        problem = f"is not in m/s² (median magnitude {force:.3g})"
-        remedy = "convert it to m/s²"
+        problem = "is not in m/s²"
     if problem:
-        raise InputError(source, f"field 'accel' {problem}", remedy)
+        raise InputError(source, f"field 'accel' {problem} (median magnitude {force:.3g})", remedy)
     _check_range("accel", accel, STRONGEST_FORCE, "m/s²", source, time)
 
 
@@ -178,49 +172,12 @@ def _check_range(
     if size.max() > most:
         beyond = (size > most).any(axis=1)
         row = int(np.argmax(beyond))
-        first = (
-            f"in row {row + 1}" if time is None else f"{time[row] - time[0]:.3f} s after the start"
-        )
-        raise InputError(
-            source,
-            f"field '{field}' is beyond {most:g} {unit} in {beyond.sum()} rows, first {first}",
-            "no such sensor measures that: repair or cut the recording there",
-        )
-
-
-def check_motion(sequence: Sequence, source: object) -> None:
-    """Raise `InputError` where the valid reference moves as nothing does.
-
-    For datasets whose reference is taken as it is.
-    """
-    valid, position = sequence.valid, sequence.position
-    fast = valid & (np.abs(sequence.velocity).max(axis=1) > FASTEST)
-    if fast.any():
-        raise InputError(
-            source,
-            f"field 'velocity' is beyond {FASTEST:g} m/s in {fast.sum()} rows, "
-            f"first in row {np.argmax(fast) + 1}",
-            "repair these rows or mark them invalid",
-        )
-    far = valid & (np.abs(position).max(axis=1) > FARTHEST)
-    if far.any():
-        raise InputError(
-            source,
-            f"field 'position' is beyond {FARTHEST:g} m in {far.sum()} rows, "
-            f"first in row {np.argmax(far) + 1}",
-            "give metres in a local world, or mark these rows invalid",
-        )
-    step = np.abs(np.diff(position, axis=0)).max(axis=1)
-    farthest_step = np.maximum(FASTEST * np.diff(sequence.time), LARGEST_STEP)
-    jump = valid[1:] & valid[:-1] & (step > farthest_step)
-    if jump.any():
-        row = int(np.argmax(jump)) + 1
-        raise InputError(
-            source,
-            f"field 'position' jumps in {jump.sum()} rows, first in row {row + 1} "
-            f"(by {step[row - 1]:.3g} m)",
-            "repair these rows or mark them invalid",
-        )
+        first = f"in row {row + 1}"
+        if time is not None:
+            first = f"{time[row] - time[0]:.3f} s after the start"
+        problem = f"field '{field}' is beyond {most:g} {unit} in {beyond.sum()} rows, first {first}"
+        remedy = "no such sensor measures that: repair or cut the recording there"
+        raise InputError(source, problem, remedy)
 
 
 def check_unit_norm(
@@ -232,15 +189,8 @@ def check_unit_norm(
     """
     norm = np.linalg.norm(wxyz, axis=1)
     error = np.where(where, np.abs(norm - 1.0), 0.0)
-    bad = error > UNIT_NORM_TOLERANCE
-    if bad.any():
-        row = int(np.argmax(bad))
-        raise InputError(
-            source,
-            f"field '{field}' is not a unit quaternion in {bad.sum()} rows, first in row {row + 1} "
-            f"(norm {norm[row]:.4g})",
-            "check the column order and normalize, or mark the rows invalid",
-        )
+    remedy = "check the column order and normalize, or mark the rows invalid"
+    _refuse(error > UNIT_NORM_TOLERANCE, field, "is not a unit quaternion", source, remedy)
     # What is exact to rounding stays bit for bit, so that writing and reading again changes
     # nothing.
     rounded = error > 1e-12
@@ -250,23 +200,6 @@ def check_unit_norm(
     return np.where(rounded[:, None], normalized, wxyz)
 
 
-def check_rate(
-    time: Float[np.ndarray, "n"], nominal: float, source: object, tolerance: float = 0.05
-) -> float:
-    """Rate (Hz) of the stamps (s) by their median interval.
-
-    Raises `InputError` when it is off `nominal` by more than the share `tolerance`.
-    """
-    rate = float(1.0 / np.median(np.diff(time)))
-    if not abs(rate / nominal - 1.0) <= tolerance:
-        raise InputError(
-            source,
-            f"field 'time' runs at {rate:.4g} Hz, expected about {nominal:g} Hz",
-            "check the unit of the stamps, or resample the recording",
-        )
-    return rate
-
-
 def check_gaps(
     time: Float[np.ndarray, "n"], source: object, longest: float = WINDOW_SECONDS
 ) -> None:
@@ -274,9 +207,5 @@ def check_gaps(
     gaps = np.diff(time)
     if gaps.size and gaps.max() > longest:
         row = int(np.argmax(gaps))
-        raise InputError(
-            source,
-            f"field 'time' has a gap of {gaps[row]:.3f} s after row {row + 1}, "
-            f"longer than {longest:g} s",
-            "cut the recording there",
-        )
+        problem = f"field 'time' has a gap of {gaps[row]:.3f} s after row {row + 1}"
+        raise InputError(source, f"{problem}, longer than {longest:g} s", "cut the recording there")

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from gnio_jax.data.validation import check_gaps, check_rate, validate
+from gnio_jax.data.validation import check_gaps, validate
 from gnio_jax.errors import InputError
 from tests.support.circle import changed, circle
 
@@ -29,6 +29,9 @@ BAD = [
     (changed(GOOD, "orientation", 5, np.nan), "'orientation'", "row 6"),
     (changed(GOOD, "position", 5, np.nan), "'position'", "mark these rows invalid"),
     (changed(GOOD, "velocity", 5, np.inf), "'velocity'", "row 6"),
+    (changed(GOOD, "velocity", 5, 400.0), "'velocity'", "row 6"),
+    (changed(GOOD, "position", 5, 1e9), "'position'", "row 6"),
+    (changed(GOOD, "position", 5, 12.0), "'position'", "jumps in 2 rows, first in row 6"),
     (
         changed(GOOD._replace(device_orientation=GOOD.orientation), "device_orientation", 5, 2.0),
         "'device_orientation'",
@@ -65,18 +68,9 @@ def test_validate_normalizes_rounded_quaternions_and_keeps_exact_ones_bit_for_bi
     )
 
 
-def test_check_rate_and_gaps():
+def test_a_gap_longer_than_a_window_is_refused():
     time = np.arange(100) / 202.3
-    assert check_rate(time, 200.0, "walk.csv") == pytest.approx(202.3)
-    with pytest.raises(
-        InputError, match=r"walk\.csv: field 'time' runs at 202\.3 Hz, expected about 100 Hz"
-    ):
-        check_rate(time, 100.0, "walk.csv")
-    with pytest.raises(InputError, match=r"field 'time'"):  # milliseconds taken for seconds
-        check_rate(time * 1e3, 200.0, "walk.csv")
     check_gaps(time, "walk.csv")
     time[50:] += 1.2
-    with pytest.raises(
-        InputError, match=r"walk\.csv: field 'time' has a gap of 1\.205 s after row 50"
-    ):
+    with pytest.raises(InputError, match=r"walk\.csv: field 'time' .* 1\.205 s after row 50"):
         check_gaps(time, "walk.csv")

@@ -27,14 +27,14 @@ from contextlib import suppress
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from gnio_jax.data.assembly import Samples, Streams
-from gnio_jax.data.reference import LOST_POSES, Poses
+from gnio_jax.data.reference import LONGEST_BRIDGE, LOST_POSES, Poses, one_sign
 from gnio_jax.data.resampling import known_at, splined
 from gnio_jax.numerics import (
     hat,
@@ -61,8 +61,6 @@ MARGIN = 0.2
 """s at the ends of the IMU's samples that are not used: the filter's reach and the delay."""
 SHORTEST_OVERLAP = 10.0
 """s of usable poses below which nothing is fitted."""
-LONGEST_BRIDGE = 0.1
-"""s between two of the IMU's samples up to which a spline stands in."""
 
 STARTS = 3
 """Peaks of the correlation from which a fit starts, with a knot of the lag per 30 s."""
@@ -148,13 +146,14 @@ def align(
     Whether the best fit is a good one is the caller's to judge, by `gyro_unexplained`,
     `accel_unexplained` and `runner_up`.
     """
-    motion = _motion(imu, track)
-    thinned, knots = motion.rows(slice(None, None, THINNED)), uniform_knots(track.time, 30.0)
+    felt = _Felt(_filtered(imu.gyro), _filtered(imu.accel))
+    seen = _seen(track)
+    thinned, knots = seen.rows(slice(None, None, THINNED)), uniform_knots(track.time, 30.0)
     candidates = []
-    for lag in _ranked_lags(motion, around, search_seconds)[:STARTS]:
+    for lag, extrinsic in _first_guesses(seen, felt, around, search_seconds)[:STARTS]:
         with suppress(TooLittle):
             unknowns = np.concatenate([np.zeros(LAG.start), np.full(len(knots), lag)])
-            candidates.append(_fit(thinned, knots, _wahba(motion, lag), unknowns))
+            candidates.append(_fit(thinned, felt, knots, extrinsic, unknowns))
     if not candidates:
         raise TooLittle(f"less than {SHORTEST_OVERLAP:g} s of the track overlap the IMU's samples")
     best = min(candidates, key=lambda fit: fit.unexplained)
@@ -166,8 +165,41 @@ def align(
     ]
     finer = uniform_knots(track.time, knot_seconds)
     unknowns = np.concatenate([best.unknowns[: LAG.start], np.interp(finer, knots, lag)])
-    fit = _fit(motion, finer, best.extrinsic, unknowns)
-    return _body_fit(fit, track, best.unexplained / min(others) if others else 0.0)
+    fit = _fit(seen, felt, finer, best.extrinsic, unknowns)
+    x, up = fit.unknowns, upward(fit.unknowns[TILT])
+    return BodyFit(
+        extrinsic=fit.extrinsic,
+        lever=x[LEVER],
+        up=up,
+        gyro_bias=x[GYRO_BIAS],
+        accel_bias=x[ACCEL_BIAS],
+        knots=finer,
+        lag=x[LAG],
+        accel_delay=float(x[DELAY]),
+        gyro_residual=robust_std(fit.gyro),
+        accel_residual=robust_std(fit.accel),
+        gyro_unexplained=unexplained(fit.gyro, fit.seen.rate),
+        accel_unexplained=unexplained(fit.accel, fit.seen.acceleration),
+        runner_up=best.unexplained / min(others) if others else 0.0,
+        poses=_poses_of_the_imu(fit, finer, track, levelling(up)),
+    )
+
+
+def _poses_of_the_imu(
+    fit: _Fit, knots: Float[np.ndarray, " k"], track: Poses, level: Rotation
+) -> Poses:
+    # A track that contradicts the accelerometer grossly has jumped.
+    contradiction = np.linalg.norm(fit.accel, axis=1)
+    jumps = fit.seen.time[contradiction > max(6.0, 8.0 * robust_std(fit.accel))]
+    near = np.searchsorted(jumps, track.time - 0.1) < np.searchsorted(jumps, track.time + 0.1)
+    kept = track.rows(np.flatnonzero(~near))
+    return kept._replace(
+        time=kept.time + np.interp(kept.time, knots, fit.unknowns[LAG]),
+        attitude=level * kept.attitude * fit.extrinsic,
+        position=level.apply(kept.position),
+        lever=fit.extrinsic.inv().apply(fit.unknowns[LEVER]),
+        noisy=True,
+    )
 
 
 def without_jumps(poses: Poses, fastest_turn: float, fastest: float, around: float = 0.1) -> Poses:
@@ -180,17 +212,17 @@ def without_jumps(poses: Poses, fastest_turn: float, fastest: float, around: flo
     # A pose is near a jump that has not ended long before it and begins before long.
     ended = np.searchsorted(poses.time[jumps + 1], poses.time - around)
     begun = np.searchsorted(poses.time[jumps], poses.time + around, side="right")
-    rows = np.flatnonzero(ended == begun)
-    return poses._replace(
-        time=poses.time[rows], attitude=poses.attitude[rows], position=poses.position[rows]
-    )
+    return poses.rows(np.flatnonzero(ended == begun))
 
 
-class _Motion(NamedTuple):
-    """Both sides of the equations, filtered: the tracker's in `time`, the IMU's at any time."""
+# --- both sides of the equations, filtered
+
+
+class _Seen(NamedTuple):
+    """The tracker's side where its poses are reliable."""
 
     time: Float[np.ndarray, " n"]
-    """s, on the tracker's clock, `ROW_SECONDS` apart, where its poses are reliable."""
+    """s, on the tracker's clock, `ROW_SECONDS` apart."""
     rate: Float[np.ndarray, "n 3"]
     """ω, rad/s."""
     acceleration: Float[np.ndarray, "n 3"]
@@ -199,113 +231,91 @@ class _Motion(NamedTuple):
     """Rᵀ R̈, 1/s²."""
     to_body: Float[np.ndarray, "n 3 3"]
     """Rᵀ."""
+
+    def rows(self, rows: np.ndarray | slice) -> _Seen:
+        return _Seen(*(values[rows] for values in self))
+
+
+class _Felt(NamedTuple):
+    """The IMU's side, at any time of its clock (s)."""
+
     gyro: CubicSpline
-    """rad/s, by the IMU's time."""
+    """rad/s."""
     accel: CubicSpline
-    """m/s², by the IMU's time."""
+    """m/s²."""
 
-    def rows(self, rows: np.ndarray | slice) -> _Motion:
-        """The tracker's side in some rows."""
-        return self._replace(
-            time=self.time[rows],
-            rate=self.rate[rows],
-            acceleration=self.acceleration[rows],
-            lever_gain=self.lever_gain[rows],
-            to_body=self.to_body[rows],
-        )
-
-    def covered(self, time: Float[np.ndarray, " m"]) -> np.ndarray:
-        """Which of the IMU's times lie within its samples."""
+    def covers(self, time: Float[np.ndarray, " m"]) -> Bool[np.ndarray, " m"]:
         first = max(self.gyro.x[0], self.accel.x[0]) + MARGIN
         last = min(self.gyro.x[-1], self.accel.x[-1]) - MARGIN
         return (time > first) & (time < last)
 
 
-def _motion(imu: Streams, track: Poses) -> _Motion:
-    clock = np.arange(track.time[0], track.time[-1], 1.0 / RATE)
-    longest = LOST_POSES * float(np.median(np.diff(track.time)))
-    sigma = FILTER_SECONDS * RATE
-    place = splined(track.time, track.position, clock, longest)
-    wxyz = quaternions(track.attitude)  # q and −q are one rotation: neighbours get one sign
-    wxyz *= np.cumprod(np.where((wxyz * np.roll(wxyz, 1, 0)).sum(1) < 0, -1.0, 1.0))[:, None]
-    turned = rotations(splined(track.time, wxyz, clock, longest))
-    attitude, turning = turned.as_matrix(), turns_between(turned) * RATE
-    to_body = attitude.transpose(0, 2, 1)
-    rate = np.concatenate([turning[:1], midpoints(turning), turning[-1:]])
-    seen = known_at(track.time, np.ones(len(track.time), dtype=bool), clock, longest)
-    reliable = ~within(~seen, int(np.ceil(3 * sigma)))
-    rows = np.flatnonzero(reliable)[:: round(ROW_SECONDS * RATE)]
+def _seen(track: Poses) -> _Seen:
+    clock, steps = np.arange(track.time[0], track.time[-1], 1.0 / RATE), np.diff(track.time)
+    longest, sigma = LOST_POSES * float(np.median(steps)), FILTER_SECONDS * RATE
+    known = known_at(track.time, np.ones(len(track.time), dtype=bool), clock, longest)
+    rows = np.flatnonzero(~within(~known, int(np.ceil(3 * sigma))))[:: round(ROW_SECONDS * RATE)]
     if len(rows) * ROW_SECONDS < SHORTEST_OVERLAP:
         raise TooLittle(f"less than {SHORTEST_OVERLAP:g} s of the track hold poses in a row")
-    acceleration = np.einsum("nij,nj->ni", to_body, second_difference(place, 1.0 / RATE))
-    lever_gain = to_body @ second_difference(attitude, 1.0 / RATE)
-    return _Motion(
-        time=clock[rows],
-        rate=smooth(rate, sigma)[rows],
-        acceleration=smooth(acceleration, sigma)[rows],
-        lever_gain=smooth(lever_gain, sigma)[rows],
-        to_body=smooth(to_body, sigma)[rows],
-        gyro=_filtered(imu.gyro),
-        accel=_filtered(imu.accel),
+    poses = np.concatenate([one_sign(quaternions(track.attitude)), track.position], axis=1)
+    wxyz, place = np.split(splined(track.time, poses, clock, steps > longest), [4], axis=1)
+    attitude = rotations(wxyz)
+    turning, matrices = turns_between(attitude) * RATE, attitude.as_matrix()
+    to_body = matrices.transpose(0, 2, 1)
+    sides = (
+        np.concatenate([turning[:1], midpoints(turning), turning[-1:]]),
+        np.einsum("nij,nj->ni", to_body, second_difference(place, 1.0 / RATE)),
+        to_body @ second_difference(matrices, 1.0 / RATE),
+        to_body,
     )
+    return _Seen(clock[rows], *(smooth(side, sigma)[rows] for side in sides))
 
 
 def _filtered(samples: Samples) -> CubicSpline:
     """Samples as a function of time, filtered on a uniform clock."""
     clock = np.arange(samples.time[0], samples.time[-1], 1.0 / RATE)
-    values = splined(samples.time, samples.values, clock, LONGEST_BRIDGE)
+    values = splined(samples.time, samples.values, clock, np.diff(samples.time) > LONGEST_BRIDGE)
     return CubicSpline(clock, smooth(values, FILTER_SECONDS * RATE), axis=0)
 
 
 # --- first guesses
 
 
-def _ranked_lags(motion: _Motion, around: float, search_seconds: float) -> list[float]:
-    """Lags (s) at which the magnitudes of both angular rates correlate better than nearby, the most
-    plausible first.
+def _first_guesses(
+    seen: _Seen, felt: _Felt, around: float, search_seconds: float
+) -> list[tuple[float, Rotation]]:
+    """(lag s, extrinsic rotation) where the magnitudes of both angular rates correlate better than
+    nearby, the most plausible first.
 
     Whoever walks in rounds or in figures of eight makes several such peaks, and the highest need
-    not be the right one.
+    not be the right one: a constant lag is judged by the share of the turning that it leaves
+    unexplained, after the rotation that explains most (Wahba's problem).
     """
     # It takes half a second to import.
     from scipy.signal import correlate, correlation_lags, find_peaks
 
-    felt_time = motion.gyro.x - around
-    grid = np.arange(
-        min(motion.time[0], felt_time[0]), max(motion.time[-1], felt_time[-1]), 1.0 / RATE
-    )
-    seen, felt = (
+    shifted = felt.gyro.x - around
+    first, last = min(seen.time[0], shifted[0]), max(seen.time[-1], shifted[-1])
+    grid = np.arange(first, last, 1.0 / RATE)
+    tracked, own = (
         np.interp(grid, time, np.minimum(np.linalg.norm(rate, axis=1), FASTEST_TURN), 0.0, 0.0)
-        for time, rate in ((motion.time, motion.rate), (felt_time, motion.gyro(motion.gyro.x)))
+        for time, rate in ((seen.time, seen.rate), (shifted, felt.gyro(felt.gyro.x)))
     )
-    score = correlate(felt - felt.mean(), seen - seen.mean(), method="fft")
+    score = correlate(own - own.mean(), tracked - tracked.mean(), method="fft")
     lags = correlation_lags(len(grid), len(grid)) / RATE
     near = np.abs(lags) <= search_seconds
     # A peak may lie at the end of the search.
     padded = np.pad(score[near], 1, constant_values=-np.inf)
     peaks, _ = find_peaks(padded, distance=max(round(SAME_LAG * RATE), 1))
-    return sorted(lags[near][peaks - 1] + around, key=lambda lag: _unexplained_turning(motion, lag))
-
-
-def _unexplained_turning(motion: _Motion, lag: float) -> float:
-    """Share of the tracker's angular rate that the IMU's does not explain at a constant lag, after
-    the rotation that explains most; infinite where too little overlaps."""
-    try:
-        rotation = _wahba(motion, lag)
-    except TooLittle:
-        return np.inf
-    rows = motion.covered(motion.time + lag)
-    seen, felt = motion.rate[rows], motion.gyro(motion.time[rows] + lag)
-    return unexplained(seen - rotation.apply(felt), seen)
-
-
-def _wahba(motion: _Motion, lag: float) -> Rotation:
-    """The rotation that lays the angular rates on each other best at a constant lag."""
-    rows = motion.covered(motion.time + lag)
-    if rows.sum() * ROW_SECONDS < SHORTEST_OVERLAP:
-        raise TooLittle
-    felt = motion.gyro(motion.time[rows] + lag)
-    return Rotation.align_vectors(motion.rate[rows], felt)[0]
+    guesses = []
+    for lag in lags[near][peaks - 1] + around:
+        rows = felt.covers(seen.time + lag)
+        if rows.sum() * ROW_SECONDS >= SHORTEST_OVERLAP:
+            rate, turning = felt.gyro(seen.time[rows] + lag), seen.rate[rows]
+            rotation = Rotation.align_vectors(turning, rate)[0]
+            guesses.append((unexplained(turning - rotation.apply(rate), turning), lag, rotation))
+    guesses.sort(key=lambda guess: guess[0])
+    return [(lag, rotation) for _, lag, rotation in guesses]
 
 
 # --- the fit
@@ -315,8 +325,7 @@ class _Fit(NamedTuple):
     extrinsic: Rotation
     unknowns: Float[np.ndarray, " u"]
     """As the slices above say; `TURN` is taken up in `extrinsic`."""
-    knots: Float[np.ndarray, " k"]
-    motion: _Motion
+    seen: _Seen
     """In the rows that the IMU covers at the start."""
     gyro: Float[np.ndarray, "n 3"]
     """Errors of the angular rate in these rows, rad/s."""
@@ -327,12 +336,13 @@ class _Fit(NamedTuple):
     def unexplained(self) -> float:
         """Geometric mean of the shares of both signals' power: with noise of unknown size the fit
         with the least is likeliest."""
-        turning = unexplained(self.gyro, self.motion.rate)
-        return float(np.sqrt(turning * unexplained(self.accel, self.motion.acceleration)))
+        turning = unexplained(self.gyro, self.seen.rate)
+        return float(np.sqrt(turning * unexplained(self.accel, self.seen.acceleration)))
 
 
 def _fit(
-    motion: _Motion,
+    seen: _Seen,
+    felt: _Felt,
     knots: Float[np.ndarray, " k"],
     extrinsic: Rotation,
     unknowns: Float[np.ndarray, " u"],
@@ -342,97 +352,89 @@ def _fit(
     Two rounds: scale of the errors, variance of their offsets (`_Noise`) and outliers are those of
     the round before, or of the guess. Raises `TooLittle`.
     """
-    hats = hat_functions(motion.time, knots)
-    covered = motion.covered(motion.time + hats @ unknowns[LAG])
-    motion, hats = motion.rows(covered), hats[covered]
-    if np.minimum(np.diff(motion.time, append=np.inf), 1.0).sum() < SHORTEST_OVERLAP:
+    hats = hat_functions(seen.time, knots)
+    covered = felt.covers(seen.time + hats @ unknowns[LAG])
+    seen, hats = seen.rows(covered), hats[covered]
+    if np.minimum(np.diff(seen.time, append=np.inf), 1.0).sum() < SHORTEST_OVERLAP:
         raise TooLittle(f"less than {SHORTEST_OVERLAP:g} s of the track overlap the IMU's samples")
+    reach = np.concatenate([np.full(3, TURN_STEP), PRIOR_STD, np.full(len(knots), LAG_STEP)])
+    unit = np.eye(len(unknowns))
+    found = errors(seen, felt, hats, extrinsic, unknowns)
     for _ in range(2):
-        extrinsic, unknowns = _improved(motion, hats, extrinsic, unknowns)
-    return _Fit(extrinsic, unknowns, knots, motion, *errors(motion, hats, extrinsic, unknowns))
+        scales = max(robust_std(found[0]), 1e-4), max(robust_std(found[1]), 1e-3)
+        off = [np.linalg.norm(e, axis=1) / s for e, s in zip(found, scales, strict=True)]
+        kept = np.maximum(*off) < OUTLIER
+        noises = [_noise(seen.time[kept], e[kept], s) for e, s in zip(found, scales, strict=True)]
+        guess, start, rows, inner = extrinsic, unknowns, seen.rows(kept), hats[kept]
 
+        def whitened(sides: tuple, x: np.ndarray, noises: list[_Noise] = noises) -> np.ndarray:
+            """Both sides' rows, and those of the priors, of the errors or of their derivatives."""
+            scaled = (noise.whitened(each) for noise, each in zip(noises, sides, strict=True))
+            prior = x[3:15] / PRIOR_STD.reshape(-1, *[1] * (x.ndim - 1))
+            return np.concatenate([*scaled, prior, np.diff(x[LAG], 2, axis=0) / LAG_BEND_STD])
 
-def _improved(
-    motion: _Motion,
-    hats: Float[np.ndarray, "n k"],
-    guess: Rotation,
-    unknowns: Float[np.ndarray, " u"],
-) -> tuple[Rotation, Float[np.ndarray, " u"]]:
-    """Extrinsic rotation and other unknowns of one robust fit."""
-    found = errors(motion, hats, guess, unknowns)
-    scales = max(robust_std(found[0]), 1e-4), max(robust_std(found[1]), 1e-3)
-    off = [np.linalg.norm(e, axis=1) / s for e, s in zip(found, scales, strict=True)]
-    kept = np.maximum(*off) < OUTLIER
-    motion, hats = motion.rows(kept), hats[kept]
-    noises = [_noise(motion.time, e[kept], s) for e, s in zip(found, scales, strict=True)]
-
-    def residuals(change: Float[np.ndarray, " u"]) -> Float[np.ndarray, " r"]:
-        x = unknowns + change
-        both = zip(noises, errors(motion, hats, guess, x), strict=True)
-        bends = np.diff(x[LAG], 2) / LAG_BEND_STD
-        return np.concatenate([*(n.whitened(e) for n, e in both), x[3:15] / PRIOR_STD, bends])
-
-    def derivatives(change: Float[np.ndarray, " u"]) -> Float[np.ndarray, "r u"]:
-        x = unknowns + change
-        both = zip(noises, jacobians(motion, hats, guess, x), strict=True)
-        unit = np.eye(len(x))
-        bends = np.diff(unit[LAG], 2, axis=0) / LAG_BEND_STD
-        prior = unit[3:15] / PRIOR_STD[:, None]
-        return np.concatenate([*(n.whitened(e) for n, e in both), prior, bends])
-
-    x = (
-        unknowns
-        + least_squares(
-            residuals,
+        change = least_squares(
+            lambda change, at=(rows, felt, inner, guess), x=start: whitened(
+                errors(*at, x + change), x + change
+            ),
             np.zeros(len(unknowns)),
-            derivatives,
+            lambda change, at=(rows, felt, inner, guess), x=start: whitened(
+                jacobians(*at, x + change), unit
+            ),
             loss="cauchy",
             f_scale=3.0,
-            x_scale=np.concatenate(
-                [np.full(3, TURN_STEP), PRIOR_STD, np.full(len(hats[0]), LAG_STEP)]
-            ),
+            x_scale=reach,
             ftol=1e-5,
             max_nfev=20,
         ).x
-    )
-    extrinsic = guess * Rotation.from_rotvec(x[TURN])
-    return extrinsic, np.concatenate([np.zeros(3), x[3:]])
+        extrinsic = guess * Rotation.from_rotvec((start + change)[TURN])
+        unknowns = np.concatenate([np.zeros(3), (start + change)[3:]])
+        found = errors(seen, felt, hats, extrinsic, unknowns)
+    return _Fit(extrinsic, unknowns, seen, *found)
 
 
 def errors(
-    motion: _Motion, hats: Float[np.ndarray, "n k"], guess: Rotation, x: Float[np.ndarray, " u"]
+    seen: _Seen,
+    felt: _Felt,
+    hats: Float[np.ndarray, "n k"],
+    guess: Rotation,
+    x: Float[np.ndarray, " u"],
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
     """Errors of both equations in the marker body, the tracker's side minus the IMU's: rad/s and
     m/s²."""
     extrinsic = guess * Rotation.from_rotvec(x[TURN])
-    there = motion.time + hats @ x[LAG]
-    rate = motion.gyro(there) - x[GYRO_BIAS]
-    force = motion.accel(there + x[DELAY]) - x[ACCEL_BIAS]
-    seen = motion.acceleration + motion.lever_gain @ x[LEVER]
-    seen = seen + GRAVITY * motion.to_body @ upward(x[TILT])
-    return motion.rate - extrinsic.apply(rate), seen - extrinsic.apply(force)
+    there = seen.time + hats @ x[LAG]
+    rate = felt.gyro(there) - x[GYRO_BIAS]
+    force = felt.accel(there + x[DELAY]) - x[ACCEL_BIAS]
+    tracked = seen.acceleration + seen.lever_gain @ x[LEVER]
+    tracked = tracked + GRAVITY * seen.to_body @ upward(x[TILT])
+    return seen.rate - extrinsic.apply(rate), tracked - extrinsic.apply(force)
 
 
 def jacobians(
-    motion: _Motion, hats: Float[np.ndarray, "n k"], guess: Rotation, x: Float[np.ndarray, " u"]
+    seen: _Seen,
+    felt: _Felt,
+    hats: Float[np.ndarray, "n k"],
+    guess: Rotation,
+    x: Float[np.ndarray, " u"],
 ) -> tuple[Float[np.ndarray, "n 3 u"], Float[np.ndarray, "n 3 u"]]:
-    """Derivatives of `errors` by the unknowns."""
+    """Derivatives of `errors` by the unknowns: differences would take three times as long."""
     rotation = (guess * Rotation.from_rotvec(x[TURN])).as_matrix()
     # Of the rotation vector, to the second order of the turn.
     turned = np.eye(3) - hat(x[TURN]) / 2.0 + hat(x[TURN]) @ hat(x[TURN]) / 6.0
-    there = motion.time + hats @ x[LAG]
+    there = seen.time + hats @ x[LAG]
     late = there + x[DELAY]
     gyro, accel = (np.zeros((len(hats), 3, len(x))) for _ in range(2))
-    gyro[:, :, TURN] = rotation @ hat(motion.gyro(there) - x[GYRO_BIAS]) @ turned
+    gyro[:, :, TURN] = rotation @ hat(felt.gyro(there) - x[GYRO_BIAS]) @ turned
     gyro[:, :, GYRO_BIAS] = rotation
-    gyro[:, :, LAG] = -(motion.gyro(there, 1) @ rotation.T)[:, :, None] * hats[:, None, :]
-    accel[:, :, TURN] = rotation @ hat(motion.accel(late) - x[ACCEL_BIAS]) @ turned
+    gyro[:, :, LAG] = -(felt.gyro(there, 1) @ rotation.T)[:, :, None] * hats[:, None, :]
+    accel[:, :, TURN] = rotation @ hat(felt.accel(late) - x[ACCEL_BIAS]) @ turned
     accel[:, :, ACCEL_BIAS] = rotation
-    accel[:, :, LEVER] = motion.lever_gain
+    accel[:, :, LEVER] = seen.lever_gain
     up = upward(x[TILT])
     by_tilt = up[2] * np.eye(3)[:, :2] - up[2] * np.outer(up, up[:2])
-    accel[:, :, TILT] = GRAVITY * motion.to_body @ by_tilt
-    accel[:, :, DELAY] = -motion.accel(late, 1) @ rotation.T
+    accel[:, :, TILT] = GRAVITY * seen.to_body @ by_tilt
+    accel[:, :, DELAY] = -felt.accel(late, 1) @ rotation.T
     accel[:, :, LAG] = accel[:, :, DELAY, None] * hats[:, None, :]
     return gyro, accel
 
@@ -468,41 +470,6 @@ def _noise(time: np.ndarray, error: Float[np.ndarray, "n 3"], scale: float) -> _
     )
     mean = np.add.reduceat(error / scale, starts) / counts[:, None]
     return _Noise(scale, starts, counts, np.sqrt(robust_std(mean) ** 2 + 1.0 / counts))
-
-
-def _body_fit(fit: _Fit, track: Poses, runner_up: float) -> BodyFit:
-    x, motion, extrinsic = fit.unknowns, fit.motion, fit.extrinsic
-    up = upward(x[TILT])
-    # A track that contradicts the accelerometer grossly has jumped.
-    contradiction = np.linalg.norm(fit.accel, axis=1)
-    jumps = motion.time[contradiction > max(6.0, 8.0 * robust_std(fit.accel))]
-    near = np.searchsorted(jumps, track.time - 0.1) < np.searchsorted(jumps, track.time + 0.1)
-    kept = np.flatnonzero(~near)
-    level, time = levelling(up), track.time[kept]
-    poses = Poses(
-        time=time + np.interp(time, fit.knots, x[LAG]),
-        attitude=level * track.attitude[kept] * extrinsic,
-        position=level.apply(track.position[kept]),
-        lever=extrinsic.inv().apply(x[LEVER]),
-        noisy=True,
-        source=track.source,
-    )
-    return BodyFit(
-        extrinsic=extrinsic,
-        lever=x[LEVER],
-        up=up,
-        gyro_bias=x[GYRO_BIAS],
-        accel_bias=x[ACCEL_BIAS],
-        knots=fit.knots,
-        lag=x[LAG],
-        accel_delay=float(x[DELAY]),
-        gyro_residual=robust_std(fit.gyro),
-        accel_residual=robust_std(fit.accel),
-        gyro_unexplained=unexplained(fit.gyro, motion.rate),
-        accel_unexplained=unexplained(fit.accel, motion.acceleration),
-        runner_up=runner_up,
-        poses=poses,
-    )
 
 
 def upward(tilt: Float[np.ndarray, "2"]) -> Float[np.ndarray, "3"]:
@@ -543,42 +510,44 @@ def pose_lag(
     bias and rate(t + lag) differ least, in a robust sense, both smoothed over 0.05 s (σ); among
     multiples of 10 ms first, then by least squares.
     """
-    steps = np.diff(stamps)
+    steps, middle = np.diff(stamps), midpoints(stamps)
     near = steps <= LOST_POSES / RATE
+    if not near.any():
+        return PoseLag(0.0, 1.0)
     turning = (turns_between(attitude) / steps[:, None])[near]
-    middle = midpoints(stamps)
     clock = np.arange(max(time[0], middle[0]), min(time[-1], middle[-1]), 1.0 / RATE)
     felt, tracked = (
         smooth(interpolate(clock, own, rate), POSE_LAG_FILTER_SECONDS * RATE)
         for own, rate in ((time, gyro), (middle[near], turning))
     )
-    inner = slice(round((LONGEST_POSE_LAG + 0.1) * RATE), -round((LONGEST_POSE_LAG + 0.1) * RATE))
-    tracked, clock, felt = CubicSpline(clock, tracked, axis=0), clock[inner], felt[inner]
-    turns = np.linalg.norm(felt - np.median(felt, axis=0), axis=1) if len(felt) else np.zeros(1)
-    if len(clock) < 5 * RATE or float(np.median(turns)) < 0.02:
+    margin = round((LONGEST_POSE_LAG + 0.1) * RATE)
+    tracked = CubicSpline(clock, tracked, axis=0)
+    clock, felt = clock[margin:-margin], felt[margin:-margin]
+    if len(clock) < 5 * RATE:
+        return PoseLag(0.0, 1.0)
+    if float(np.median(np.linalg.norm(felt - np.median(felt, axis=0), axis=1))) < 0.02:
         return PoseLag(0.0, 1.0)
 
-    def error(unknowns: Float[np.ndarray, "4"]) -> Float[np.ndarray, "n 3"]:
-        return felt - unknowns[1:] - tracked(clock + unknowns[0])
+    def error(lag: float, bias: Float[np.ndarray, "3"] | float = 0.0) -> Float[np.ndarray, "n 3"]:
+        return felt - bias - tracked(clock + lag)
 
-    def without_bias(lag: float) -> Float[np.ndarray, "4"]:
-        return np.array([lag, *np.median(error(np.array([lag, 0.0, 0.0, 0.0])), axis=0)])
+    def off(lag: float) -> float:
+        return float(np.abs(error(lag, np.median(error(lag), axis=0))).mean())
 
-    hundredths = round(LONGEST_POSE_LAG * 100)
-    starts = [without_bias(i / 100.0) for i in range(-hundredths, hundredths + 1)]
-    start = min(starts, key=lambda unknowns: float(np.abs(error(unknowns)).mean()))
-    most = np.array([LONGEST_POSE_LAG + 0.05, np.inf, np.inf, np.inf])
+    most = round(LONGEST_POSE_LAG * 100)
+    lag = min((i / 100.0 for i in range(-most, most + 1)), key=off)
+    bias = np.median(error(lag), axis=0)
     best = least_squares(
-        lambda unknowns: error(unknowns).ravel(),
-        start,
+        lambda unknowns: error(unknowns[0], unknowns[1:]).ravel(),
+        np.array([lag, *bias]),
         loss="cauchy",
-        f_scale=max(3.0 * robust_std(error(start)), 1e-6),
+        f_scale=max(3.0 * robust_std(error(lag, bias)), 1e-6),
         x_scale="jac",
-        bounds=(-most, most),
-    ).x
-    first, second = (rate - rate.mean(axis=0) for rate in (felt, tracked(clock + best[0])))
+        bounds=([lag - 0.05, *[-np.inf] * 3], [lag + 0.05, *[np.inf] * 3]),
+    ).x[0]
+    first, second = (rate - rate.mean(axis=0) for rate in (felt, tracked(clock + best)))
     power = np.sqrt((first**2).sum() * (second**2).sum())
-    return PoseLag(float(best[0]), float((first * second).sum() / power))
+    return PoseLag(float(best), float((first * second).sum() / power))
 
 
 # --- shared with `positions`

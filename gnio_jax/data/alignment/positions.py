@@ -22,7 +22,6 @@ from scipy.spatial.transform import Rotation
 
 from gnio_jax.data.alignment.body import (
     LAG_BEND_STD,
-    LONGEST_BRIDGE,
     RATE,
     SAME_LAG,
     TooLittle,
@@ -32,7 +31,7 @@ from gnio_jax.data.alignment.body import (
     uniform_knots,
 )
 from gnio_jax.data.assembly import Samples, Streams
-from gnio_jax.data.reference import Poses, smooth_positions
+from gnio_jax.data.reference import LONGEST_BRIDGE, Poses, smooth_positions
 from gnio_jax.data.resampling import known_at, slerped, splined
 from gnio_jax.numerics import (
     about_z,
@@ -116,12 +115,13 @@ def align_positions(imu: Streams, track: Samples, search_seconds: float = 4.0) -
     last = min(each.time[-1] for each in (imu.gyro, imu.accel, imu.device))
     clock = np.arange(first, last, 1.0 / RATE)
     gyro, accel = (
-        splined(each.time, each.values, clock, LONGEST_BRIDGE) for each in (imu.gyro, imu.accel)
+        splined(each.time, each.values, clock, np.diff(each.time) > LONGEST_BRIDGE)
+        for each in (imu.gyro, imu.accel)
     )
     device = rotations(slerped(imu.device.time, imu.device.values, clock))
 
     grid = np.arange(track.time[0], track.time[-1], 1.0 / RATE)
-    position = splined(track.time, track.values, grid, LONGEST_BRIDGE)
+    position = splined(track.time, track.values, grid, np.diff(track.time) > LONGEST_BRIDGE)
     seen = known_at(track.time, np.ones(len(track.time), dtype=bool), grid, LONGEST_BRIDGE)
     tracked = second_difference(position, 1.0 / RATE)
     # Accelerations that no pedestrian makes are jumps.
@@ -147,7 +147,7 @@ def align_positions(imu: Streams, track: Samples, search_seconds: float = 4.0) -
     shared = np.flatnonzero((there >= grid[0]) & (there <= grid[-1]))
     there = there[shared]
     place, velocity, kept = smooth_positions(
-        splined(grid, position, there, LONGEST_BRIDGE),
+        splined(grid, position, there, np.diff(grid) > LONGEST_BRIDGE),
         np.interp(there, grid, (seen & ~jumps).astype(float)) > 0.99,
         1.0 / RATE,
         CUTOFF,

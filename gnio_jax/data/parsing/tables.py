@@ -11,16 +11,17 @@ import io
 import json
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
-from jaxtyping import Bool, Float, Num
+from jaxtyping import Bool, Int, Num
 from scipy.spatial.transform import Rotation
 
 from gnio_jax.data.validation import UNIT_NORM_TOLERANCE
-from gnio_jax.errors import InputError
+from gnio_jax.errors import InputError, require_packages
 from gnio_jax.numerics import rotations, wxyz_from_xyzw
 
 OURS = (AssertionError, NameError, ImportError)
@@ -30,10 +31,13 @@ OURS = (AssertionError, NameError, ImportError)
 def shortened(text: object, most: int = 80) -> str:
     """What a file says, as far as a message can quote it: one line of printable characters, at most
     `most` of them."""
-    line = "".join(
-        character if character.isprintable() else "\ufffd" for character in str(text)[: 4 * most]
-    )
+    line = "".join(c if c.isprintable() else "\ufffd" for c in str(text)[: 4 * most])
     return line if len(str(text)) <= most else line[: most - 3] + "..."
+
+
+def damaged(path: object, problem: str) -> InputError:
+    """The error of a file whose content cannot be what was published."""
+    return InputError(path, problem, "copy it again")
 
 
 @contextmanager
@@ -42,20 +46,14 @@ def parsed_as(path: Path, kind: str) -> Iterator[None]:
     belongs within, or a mistake of ours would be called damage of the file."""
     try:
         yield
-    except InputError:
-        raise
-    except OURS:
+    except (InputError, *OURS):
         raise
     except MemoryError:
-        raise InputError(
-            path, f"does not fit the memory as {kind}", "if it should, copy it again"
-        ) from None
+        problem = f"does not fit the memory as {kind}"
+        raise InputError(path, problem, "if it should, copy it again") from None
     except Exception as error:  # a damaged file makes a parser fail in any other way
-        raise InputError(
-            path,
-            f"cannot be read as {kind}, it may be cut short ({shortened(error, 200)})",
-            "copy it again",
-        ) from None
+        reason = f"it may be cut short ({shortened(error, 200)})"
+        raise damaged(path, f"cannot be read as {kind}, {reason}") from None
 
 
 class Table(NamedTuple):
@@ -86,13 +84,18 @@ class Table(NamedTuple):
         Raises `InputError` where one is missing, holds no numbers or has another shape, and, but
         for `gaps`, where one is NaN or infinite.
         """
-        if width is not None:
-            values = self._of_shape(names[0], (width,))
-        else:
-            values = np.stack([self._of_shape(name, ()) for name in names], axis=1)
-        if not gaps:
-            self.check_complete(values, names)
-        return values[:, 0] if width is None and len(names) == 1 else values
+        axes = () if width is None else (width,)
+        parts = [self._numbers(name, axes) for name in names]
+        values = np.stack(parts, axis=1) if len(parts) > 1 else parts[0]
+        finite = np.isfinite(values)
+        if not gaps and not finite.all():
+            row, *place = (int(i) for i in np.argwhere(~finite)[0])
+            name = names[place[0]] if len(names) > 1 else names[0]
+            count = (~finite.reshape(len(finite), -1)).any(axis=1).sum()
+            problem = f"is NaN or Inf in {count} rows, first in row {self.row(row)}"
+            remedy = "repair or cut the recording there"
+            raise InputError(self.path, f"{self.kind} '{name}' {problem}", remedy)
+        return values
 
     def axes(self, prefix: str, letters: str = "xyz", gaps: bool = False) -> np.ndarray:
         """The columns `prefix` + letter side by side."""
@@ -102,16 +105,15 @@ class Table(NamedTuple):
         """A column of stamps, complete. Integers stay: ns of unix time have more digits than a
         float."""
         column = self._column(name)
-        if column.ndim == 1 and column.dtype.kind in "iu":
-            return np.asarray(column)
-        return self.take(name)
+        whole = column.ndim == 1 and column.dtype.kind in "iu"
+        return np.asarray(column) if whole else self.take(name)
 
     def rotations(
         self,
         *names: Any,
         width: int | None = None,
         scalar_first: bool = True,
-        rows: slice | Bool[np.ndarray, " n"] = slice(None),
+        rows: slice | Bool[np.ndarray, " n"] | Int[np.ndarray, " m"] = slice(None),
     ) -> Rotation:
         """Rotations of unit quaternions in these rows. Raises `InputError` as `take` does, and
         where a norm is off 1 by more than `UNIT_NORM_TOLERANCE`."""
@@ -121,14 +123,12 @@ class Table(NamedTuple):
         bad = ~(np.abs(norm - 1.0) <= UNIT_NORM_TOLERANCE)
         if bad.any():
             first = int(np.argmax(bad))
-            if not np.isfinite(norm[first]):
-                self.check_complete(wxyz, names)
-            raise InputError(
-                self.path,
-                f"{self._named(names)} not a unit quaternion in {bad.sum()} rows, first in row "
-                f"{self.row(int(own[first]))} (norm {norm[first]:.4g})",
-                "check the column order and normalize, or copy it again",
-            )
+            named = "', '".join(map(str, names))
+            are = f"s '{named}' are" if len(names) > 1 else f" '{named}' is"
+            place = f"first in row {self.row(int(own[first]))} (norm {norm[first]:.4g})"
+            problem = f"{self.kind}{are} not a unit quaternion in {bad.sum()} rows, {place}"
+            remedy = "check the column order and normalize, or copy it again"
+            raise InputError(self.path, problem, remedy)
         return rotations(wxyz[own] if scalar_first else wxyz_from_xyzw(wxyz[own]))
 
     def row(self, index: int) -> int:
@@ -138,22 +138,7 @@ class Table(NamedTuple):
         with open_text(self.path, self.content) as file:
             lines = enumerate(file, 1)
             rows = (n for n, line in lines if n > self.before and _is_data(line))
-            return next((n for k, n in enumerate(rows) if k == index), self.before + index + 1)
-
-    def check_complete(self, values: Float[np.ndarray, "n w"], names: Iterable[Any]) -> None:
-        """Raise `InputError` where a value is not finite; the columns have these names, or all of
-        them the one."""
-        finite = np.isfinite(values)
-        if finite.all():
-            return
-        bad, named = ~finite, list(names)
-        row, place = (int(i) for i in np.argwhere(bad)[0])
-        name, count = named[place % len(named)], bad.any(axis=1).sum()
-        raise InputError(
-            self.path,
-            f"{self.kind} '{name}' is NaN or Inf in {count} rows, first in row {self.row(row)}",
-            "repair or cut the recording there",
-        )
+            return next(islice(rows, index, None), self.before + index + 1)
 
     def _column(self, name: Any) -> Any:
         if name not in self.columns:
@@ -161,51 +146,29 @@ class Table(NamedTuple):
             raise InputError(self.path, f"{self.kind} '{name}' is missing", f"found: {known}")
         column = self.columns[name]
         if isinstance(column, pd.DataFrame):
-            raise InputError(
-                self.path, f"column '{name}' is there {column.shape[1]} times", "leave one"
-            )
+            times = column.shape[1]
+            raise InputError(self.path, f"column '{name}' is there {times} times", "leave one")
         return column
 
-    def _numbers(self, name: Any) -> np.ndarray:
-        column = self._column(name)
-        if isinstance(column, np.ndarray):
-            if column.dtype.kind not in "fiu":
-                raise InputError(
-                    self.path,
-                    f"{self.kind} '{name}' holds {column.dtype}, expected numbers",
-                    "copy it again",
-                )
-            return column.astype(np.float64)
-        try:
-            return column.to_numpy(dtype=np.float64, na_value=np.nan)
-        except (TypeError, ValueError, OverflowError):  # Python's integers have no end
-            cells = pd.to_numeric(column.astype(str), errors="coerce")
-            bad = ~np.isfinite(pd.Series(cells, dtype=np.float64).to_numpy())
-            index = int(np.argmax(bad & column.notna().to_numpy()))
-            raise InputError(
-                self.path,
-                f"{self.kind} '{name}' holds '{shortened(column.iloc[index])}' in its row "
-                f"{self.row(index)}, no number",
-            ) from None
-
-    def _of_shape(self, name: Any, axes: tuple[int, ...]) -> np.ndarray:
-        """A column with as many rows as the first, two or more, and these axes."""
-        values = self._numbers(name)
-        if isinstance(self.columns, pd.DataFrame):
-            return values  # the columns of a frame are of one shape
+    def _numbers(self, name: Any, axes: tuple[int, ...]) -> np.ndarray:
+        """A column, with as many rows as the first, two or more, and these axes."""
+        column, what = self._column(name), f"{self.kind} '{name}'"
+        if not isinstance(column, np.ndarray):
+            try:  # the columns of a frame are of one length
+                return column.to_numpy(dtype=np.float64, na_value=np.nan)
+            except (TypeError, ValueError, OverflowError):  # Python's integers have no end
+                cells = pd.to_numeric(column.astype(str), errors="coerce")
+                bad = ~np.isfinite(pd.Series(cells, dtype=np.float64).to_numpy())
+                row = int(np.argmax(bad & column.notna().to_numpy()))
+                cell = f"'{shortened(column.iloc[row])}' in its row {self.row(row)}"
+                raise InputError(self.path, f"{what} holds {cell}, no number") from None
+        if column.dtype.kind not in "fiu":
+            raise damaged(self.path, f"{what} holds {column.dtype}, expected numbers")
         rows = np.shape(next(iter(self.columns.values())))[:1] or (0,)
-        if values.shape != rows + axes or rows[0] < 2:
+        if column.shape != rows + axes or rows[0] < 2:
             expected = rows + axes if rows[0] >= 2 else f"at least two rows of {axes or 'numbers'}"
-            raise InputError(
-                self.path,
-                f"{self.kind} '{name}' has shape {values.shape}, expected {expected}",
-                "copy it again",
-            )
-        return values
-
-    def _named(self, names: tuple[Any, ...]) -> str:
-        joined = "', '".join(str(name) for name in names)
-        return f"{self.kind}s '{joined}' are" if len(names) > 1 else f"{self.kind} '{joined}' is"
+            raise damaged(self.path, f"{what} has shape {column.shape}, expected {expected}")
+        return column.astype(np.float64)
 
 
 # --- text
@@ -224,6 +187,7 @@ def read_text(
     header: bool = True,
     content: bytes | None = None,
     decimal: str = ".",
+    widths: tuple[int, ...] = (),
 ) -> Table:
     """The columns of a text file by their names (stripped of blanks), or by their places from 0
     without a `header`.
@@ -231,19 +195,27 @@ def read_text(
     Lines that begin with '#' are comments. The first other line names the columns, unless it holds
     a number: then the last comment before it does. `separator` " " stands for any run of blanks.
     `content` is what the file holds where it is part of an archive; `path` is then its name in
-    messages. Raises `InputError` naming the file when it is missing, empty or no table.
+    messages. Raises `InputError` naming the file when it is missing, empty or no table, or where
+    its number of columns is none of `widths`.
     """
     try:
-        comments, first = _before_data(path, content)
-        names, before = "", len(comments)
-        if header:
-            names = next((line for line in reversed(comments) if line.startswith("#")), first)
-            if not _holds_a_number(first, separator, decimal):
-                names, before = first, before + 1
+        before, first = [], ""
+        with open_text(path, content) as file:
+            for line in file:
+                if _is_data(line):
+                    first = line
+                    break
+                before.append(line)
+        cells, skipped = _cells(first, separator), len(before)
+        if header and not any(_is_number(cell, decimal) for cell in cells):
+            skipped += 1
+        elif header:
+            comments = (line for line in reversed(before) if line.startswith("#"))
+            cells = _cells(next(comments, first).lstrip("#"), separator)
         frame = pd.read_csv(
             path if content is None else io.BytesIO(content),
             header=None,
-            skiprows=before,
+            skiprows=skipped,
             comment="#",
             sep=r"\s+" if separator == " " else separator,
             skipinitialspace=True,
@@ -253,60 +225,36 @@ def read_text(
         )
     except OSError as error:
         raise InputError(path, f"cannot be read ({error.strerror})") from None
-    except InputError:
-        raise
     except pd.errors.EmptyDataError:
-        raise InputError(path, "holds no row", "copy it again") from None
+        raise damaged(path, "holds no row") from None
     except (UnicodeDecodeError, pd.errors.ParserError, ValueError) as error:
-        raise InputError(
-            path,
-            f"is no table of text ({shortened(error, 200)})",
-            "it may be cut short or damaged: copy it again",
-        ) from None
+        reason = f"it may be cut short or damaged ({shortened(error, 200)})"
+        raise damaged(path, f"is no table of text, {reason}") from None
+    width = frame.shape[1]
+    if widths and width not in widths:
+        raise damaged(path, f"has {width} columns, expected {' or '.join(map(str, widths))}")
     if header:
-        frame.columns = _labels(names, separator, frame.shape[1], path)
-    return Table(path, frame, before=before, content=content)
+        labels = cells[:-1] if len(cells) == width + 1 and not cells[-1] else cells
+        if len(labels) != width:
+            raise damaged(path, f"its header names {len(labels)} columns, its rows have {width}")
+        frame.columns = labels
+    return Table(path, frame, before=skipped, content=content)
 
 
 def _is_data(line: str) -> bool:
     return not line.startswith("#") and bool(line.strip())
 
 
-def _before_data(path: Path, content: bytes | None) -> tuple[list[str], str]:
-    """(lines of comments and blanks before the first line that is neither, that line)."""
-    before = []
-    with open_text(path, content) as file:
-        for line in file:
-            if _is_data(line):
-                return before, line
-            before.append(line)
-    raise InputError(path, "holds no row", "copy it again")
-
-
 def _cells(line: str, separator: str) -> list[str]:
-    return line.strip().split(None if separator == " " else separator)
+    return [cell.strip() for cell in line.strip().split(None if separator == " " else separator)]
 
 
-def _holds_a_number(line: str, separator: str, decimal: str) -> bool:
-    for cell in _cells(line, separator):
-        try:
-            float(cell.replace(decimal, "."))
-        except ValueError:
-            continue
-        return True
-    return False
-
-
-def _labels(names: str, separator: str, width: int, path: Path) -> list[str]:
-    """The names of `width` columns."""
-    labels = [cell.strip() for cell in _cells(names.lstrip("#"), separator)]
-    if len(labels) == width + 1 and not labels[-1]:
-        labels = labels[:-1]
-    if len(labels) != width:
-        raise InputError(
-            path, f"its header names {len(labels)} columns, its rows have {width}", "copy it again"
-        )
-    return labels
+def _is_number(cell: str, decimal: str) -> bool:
+    try:
+        float(cell.replace(decimal, "."))
+    except ValueError:
+        return False
+    return True
 
 
 # --- other formats
@@ -337,26 +285,17 @@ def read_npy(path: Path, names: Mapping[str, slice], width: int) -> Table:
         # Mapped, since a damaged header may name more rows than there is memory.
         table = np.load(path, mmap_mode="r", allow_pickle=False)
     if table.ndim != 2 or table.shape[1] != width or table.dtype.kind != "f" or len(table) < 2:
-        raise InputError(
-            path,
-            f"holds {table.dtype} of shape {table.shape}, expected floats (N, {width})",
-            "copy it again",
-        )
-    return Table(
-        path, {name: np.asarray(table[:, place]) for name, place in names.items()}, "field"
-    )
+        problem = f"holds {table.dtype} of shape {table.shape}, expected floats (N, {width})"
+        raise damaged(path, problem)
+    fields = {name: np.asarray(table[:, place]) for name, place in names.items()}
+    return Table(path, fields, "field")
 
 
 def read_feather(path: Path) -> Table:
     """The columns of a feather file; needs pyarrow."""
-    try:
-        from pyarrow import feather
-    except ImportError:
-        raise InputError(
-            path,
-            "feather files need pyarrow, which is not installed",
-            "pip install 'gnio-jax[idol]'",
-        ) from None
+    require_packages(path, "idol", "pyarrow")
+    from pyarrow import feather
+
     if not path.exists():
         raise InputError(path, "no such file")
     with parsed_as(path, "feather"):
@@ -371,7 +310,7 @@ def json_object(path: Path, remedy: str = "copy it again") -> dict[str, Any]:
     except OSError as error:
         raise InputError(path, f"cannot be read ({error.strerror})", remedy) from None
     except (ValueError, RecursionError) as error:
-        raise InputError(path, f"is no JSON ({shortened(error, 200)})", "copy it again") from None
+        raise damaged(path, f"is no JSON ({shortened(error, 200)})") from None
     if not isinstance(content, dict):
-        raise InputError(path, "is no JSON object", "copy it again")
+        raise damaged(path, "is no JSON object")
     return content

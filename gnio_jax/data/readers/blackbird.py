@@ -22,12 +22,11 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from gnio_jax.data.assembly import Poses, Samples, Streams, assemble
+from gnio_jax.data.assembly import Poses, Streams, assemble
 from gnio_jax.data.dataset import Dataset, Recording
-from gnio_jax.data.parsing.tables import read_hdf5_fields, read_text
+from gnio_jax.data.parsing.tables import damaged, read_hdf5_fields, read_text
 from gnio_jax.data.splits import listed
 from gnio_jax.data.validation import FASTEST, check_increasing, check_unit_norm
-from gnio_jax.errors import InputError
 from gnio_jax.numerics import rotations, wxyz_from_xyzw
 from gnio_jax.types import Sequence
 
@@ -70,13 +69,6 @@ def read(folder: str | os.PathLike[str], name: str | None = None) -> list[Sequen
 
     upside_down = attitude.apply(accel).mean(axis=0)[2] < 0
     turn = Rotation.from_rotvec([np.pi if upside_down else 0.0, 0.0, 0.0])
-    poses = Poses(
-        time,
-        turn * attitude,
-        turn.apply(pose[:, :3]),
-        None if velocity is None else turn.apply(velocity),
-        source=str(path),
-    )
     about = {
         "dataset": "blackbird",
         "group": folder.parent.name,
@@ -88,15 +80,10 @@ def read(folder: str | os.PathLike[str], name: str | None = None) -> list[Sequen
         "imu_compensated": "constant bias",
         "licence": DATASET.licence,
     }
-    streams = Streams(
-        name or folder.name,
-        str(path),
-        Samples(time, gyro, str(path)),
-        Samples(time, accel, str(path)),
-        about,
-        float(stamps[0]),
-        poses,
-    )
+    velocity = velocity if velocity is None else turn.apply(velocity)
+    poses = Poses(time, turn * attitude, turn.apply(pose[:, :3]), velocity, source=str(path))
+    streams = Streams.of_imu(name or folder.name, path, time, gyro, accel)
+    streams = streams._replace(attributes=about, start=float(stamps[0]), poses=poses)
     return assemble(streams, RATE, native=RATE)
 
 
@@ -104,25 +91,16 @@ def _velocity(path: Path, stamps: Float[np.ndarray, " n"]) -> Float[np.ndarray, 
     """The velocities of the text beside the table; None where there is no text or it has none."""
     if not path.is_file():
         return None
-    table = read_text(path, separator=" ", header=False)
-    if table.width() not in (8, 11):
-        raise InputError(
-            path,
-            f"has {table.width()} columns, expected 8 (stamp, position, quaternion) or 11 "
-            "(and velocity)",
-            "copy it again",
-        )
+    # Stamp, position, quaternion and, in some, velocity.
+    table = read_text(path, separator=" ", header=False, widths=(8, 11))
     if table.width() == 8:
         return None
     own, velocity = table.take(0), table.take(8, 9, 10)
     if len(own) != len(stamps) or np.abs(own - stamps).max() > 1e-3:
-        raise InputError(
-            path,
-            f"field 'ts' is not that of {_TABLE} beside it ({len(own)} and {len(stamps)} rows)",
-            "copy both again",
-        )
+        rows = f"{len(own)} and {len(stamps)} rows"
+        raise damaged(path, f"field 'ts' is not that of {_TABLE} beside it ({rows})")
     if np.abs(velocity).max() > FASTEST:
-        raise InputError(path, f"field 'velocity' is beyond {FASTEST:g} m/s", "copy it again")
+        raise damaged(path, f"field 'velocity' is beyond {FASTEST:g} m/s")
     return velocity
 
 

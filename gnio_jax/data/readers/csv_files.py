@@ -27,7 +27,7 @@ from gnio_jax.data.parsing.stamps import check_seconds, rounded_rate
 from gnio_jax.data.parsing.tables import Table, read_text, shortened
 from gnio_jax.data.resampling import resample
 from gnio_jax.data.splits import listed
-from gnio_jax.data.validation import check_gaps, check_increasing, check_motion
+from gnio_jax.data.validation import check_gaps, check_increasing
 from gnio_jax.errors import InputError
 from gnio_jax.numerics import finite_rows, quaternions
 from gnio_jax.types import Sequence
@@ -53,12 +53,25 @@ def recordings(root: Path, split: str) -> list[Recording]:
 
     Raises `InputError` where two files would go by the same name.
     """
+    root = Path(root)
+    if split not in SPLITS and not _is_list(root / f"{split}.txt"):
+        known = f"known splits: {', '.join(SPLITS)}, or that of a list {split}.txt there"
+        raise InputError(root, f"unknown split '{split}'", known)
+    layout = f"expected layout: {DATASET.layout}"
+    if split not in SPLITS or any((root / f"{name}.txt").is_file() for name in SPLITS):
+        paths = listed(root / f"{split}.txt", partial(_find, root), root, DATASET.layout)
+    else:
+        files = (path for path in root.glob("[!.]*") if path.suffix.lower() in _FILES)
+        paths = sorted(path for path in files if path.is_file())
+        if not paths:
+            raise InputError(root, "holds no recording (*.csv, *.h5, *.hdf5)", layout)
+        if split != "test":
+            remedy = f"without lists every recording is in split 'test'; {layout}"
+            raise InputError(root, f"has no list {split}.txt", remedy)
     named: dict[str, Path] = {}
-    for path in _files(Path(root), split):
-        if named.setdefault(path.stem, path) != path:
-            raise InputError(
-                path, f"has the name of {named[path.stem]}", "rename or remove one of them"
-            )
+    for path in paths:
+        if (other := named.setdefault(path.stem, path)) != path:
+            raise InputError(path, f"has the name of {other}", "rename or remove one of them")
     return [Recording(name, partial(read, path)) for name, path in sorted(named.items())]
 
 
@@ -71,10 +84,8 @@ def list_splits(root: Path) -> tuple[str, ...]:
 
 
 def _is_list(path: Path) -> bool:
-    if path.stem in SPLITS:
-        return True
-    if not re.fullmatch("[a-z][a-z0-9_]*", path.stem):
-        return False
+    if path.stem in SPLITS or not re.fullmatch("[a-z][a-z0-9_]*", path.stem):
+        return path.stem in SPLITS
     try:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
         return any(_find(path.parent, line.strip()) for line in lines if line.strip())
@@ -82,37 +93,11 @@ def _is_list(path: Path) -> bool:
         return False
 
 
-def _files(root: Path, split: str) -> list[Path]:
-    if split not in SPLITS and not _is_list(root / f"{split}.txt"):
-        raise InputError(
-            root,
-            f"unknown split '{split}'",
-            f"known splits: {', '.join(SPLITS)}, or that of a list {split}.txt there",
-        )
-    if split not in SPLITS or any((root / f"{name}.txt").is_file() for name in SPLITS):
-        return listed(root / f"{split}.txt", lambda entry: _find(root, entry), root, DATASET.layout)
-    paths = sorted(
-        path for path in root.glob("[!.]*") if path.suffix.lower() in _FILES and path.is_file()
-    )
-    if not paths:
-        raise InputError(
-            root, "holds no recording (*.csv, *.h5, *.hdf5)", f"expected layout: {DATASET.layout}"
-        )
-    if split != "test":
-        raise InputError(
-            root,
-            f"has no list {split}.txt",
-            f"without lists every recording is in split 'test'; expected layout: {DATASET.layout}",
-        )
-    return paths
-
-
 def _find(root: Path, entry: str) -> Path | None:
     """The file of a list's entry, which may lack the suffix."""
     candidates = [root / entry, *(root / f"{entry}{suffix}" for suffix in _FILES)]
-    return next(
-        (path for path in candidates if path.is_file() and path.suffix.lower() in _FILES), None
-    )
+    files = (path for path in candidates if path.suffix.lower() in _FILES and path.is_file())
+    return next(files, None)
 
 
 # --- how one is read
@@ -127,59 +112,43 @@ def read(path: str | os.PathLike[str]) -> list[Sequence]:
     sequence = read_hdf5(path)._replace(name=path.stem)
     check_seconds(sequence.time, path)
     check_gaps(sequence.time, path)
-    check_motion(sequence, path)
     return [resample(sequence, rounded_rate(sequence.time))]
 
 
 def _streams(table: Table) -> Streams:
-    path = table.path
+    path, attitude = table.path, REFERENCE["orientation"]
     wanted = {name: name for name in ("time", *GYRO, *ACCEL)}
     remedy = f"name them: gnio data import {path.name} --out own/{path.stem}.h5 --columns"
     check_columns(path, table.columns, wanted, remedy)
-    time, gyro, accel = table.take("time"), table.take(*GYRO), table.take(*ACCEL)
+    time = table.take("time")
+    streams = Streams.of_imu(path.stem, path, time, table.take(*GYRO), table.take(*ACCEL))
     check_increasing(time, path)
     check_seconds(time, path)
-    poses = reference(table, time)
-    known = np.zeros(len(time), dtype=bool)
-    if poses is None and REFERENCE["orientation"][0] in table.columns:
-        known = finite_rows(table.take(*REFERENCE["orientation"], gaps=True))
-    device = None
-    if known.any():  # an attitude alone is no reference: it is the device's own
-        attitude = quaternions(table.rotations(*REFERENCE["orientation"], rows=known))
-        device = Samples(time[known], attitude, str(path))
-    about = {"dataset": "csv", "group": path.stem, "truth": "none" if poses is None else "given"}
-    return Streams(
-        path.stem,
-        str(path),
-        Samples(time, gyro, str(path)),
-        Samples(time, accel, str(path)),
-        about,
-        poses=poses,
-        device=device,
-    )
+    poses, device = reference(table, time), None
+    if poses is None and attitude[0] in table.columns:
+        known = finite_rows(table.take(*attitude, gaps=True))
+        if known.any():  # an attitude alone is no reference: it is the device's own
+            own = quaternions(table.rotations(*attitude, rows=known))
+            device = Samples(time[known], own, str(path))
+    about = {"dataset": "csv", "group": path.stem, "truth": "given" if poses else "none"}
+    return streams._replace(poses=poses, device=device, attributes=about)
 
 
 def reference(table: Table, time: Float[np.ndarray, " n"]) -> Poses | None:
     """The poses in a table's columns `REFERENCE`, at the stamps `time` (s) of its rows; None where
     it has none. A field of the reference has all its columns, or none."""
+    given = {}
     for field, columns in REFERENCE.items():
         present = [name for name in columns if name in table.columns]
-        if present and len(present) < len(columns):
-            missing = next(name for name in columns if name not in table.columns)
-            raise InputError(
-                table.path,
-                f"column '{missing}' is missing while '{present[0]}' is there",
-                f"the {field} of a reference has {', '.join(columns)}",
-            )
-    given = {
-        field: table.take(*columns, gaps=True)
-        for field, columns in REFERENCE.items()
-        if columns[0] in table.columns
-    }
-    if not {"orientation", "position"} <= given.keys():
-        return None
-    known = np.all([finite_rows(values) for values in given.values()], axis=0)
-    if not known.any():
+        if present:
+            for name in columns:
+                if name not in table.columns:
+                    problem = f"column '{name}' is missing while '{present[0]}' is there"
+                    remedy = f"the {field} of a reference has {', '.join(columns)}"
+                    raise InputError(table.path, problem, remedy)
+            given[field] = table.take(*columns, gaps=True)
+    known = np.all([finite_rows(values) for values in given.values()] or [[False]], axis=0)
+    if not {"orientation", "position"} <= given.keys() or not known.any():
         return None
     return Poses(
         time[known],
@@ -197,16 +166,12 @@ def check_columns(
     that are missing at once, and after `remedy` the words that name them."""
     names = [str(name) for name in found]
     missing = [ours for ours, theirs in wanted.items() if theirs not in names]
-    if not missing:
-        return
-    listed_names = ", ".join(f"'{wanted[ours]}'" for ours in missing)
-    words = " ".join(f"{ours}={_guess(ours, names)}" for ours in missing)
-    raise InputError(
-        path,
-        f"column{'s' if len(missing) > 1 else ''} {listed_names} "
-        f"{'are' if len(missing) > 1 else 'is'} missing; found: {shortened(', '.join(names), 600)}",
-        f"{remedy} {words}",
-    )
+    if missing:
+        lacking = ", ".join(f"'{wanted[ours]}'" for ours in missing)
+        are = "columns {} are" if len(missing) > 1 else "column {} is"
+        words = " ".join(f"{ours}={_guess(ours, names)}" for ours in missing)
+        problem = f"{are.format(lacking)} missing; found: {shortened(', '.join(names), 600)}"
+        raise InputError(path, problem, f"{remedy} {words}")
 
 
 _LIKE = {

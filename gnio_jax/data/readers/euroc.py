@@ -37,10 +37,10 @@ import numpy as np
 import yaml
 from scipy.spatial.transform import Rotation
 
-from gnio_jax.data.assembly import Poses, Samples, Streams, assemble
+from gnio_jax.data.assembly import Poses, Streams, assemble
 from gnio_jax.data.dataset import Dataset, Recording
 from gnio_jax.data.parsing.stamps import first_stamp, seconds
-from gnio_jax.data.parsing.tables import Table, read_text, shortened
+from gnio_jax.data.parsing.tables import Table, damaged, parsed_as, read_text
 from gnio_jax.data.reference import LONGEST_BRIDGE, SHORTEST_RUN
 from gnio_jax.errors import InputError
 from gnio_jax.numerics import finite_rows
@@ -95,11 +95,8 @@ def recordings(root: Path, split: str, dataset: str = "euroc") -> list[Recording
         if _split_of(name, known) == wanted
     ]
     if not chosen:
-        raise InputError(
-            root,
-            f"holds no sequence of split '{split}'",
-            f"its sequences are {', '.join(known[wanted])}",
-        )
+        remedy = f"its sequences are {', '.join(known[wanted])}"
+        raise InputError(root, f"holds no sequence of split '{split}'", remedy)
     return [_recording(folder, about) for folder in chosen]
 
 
@@ -160,35 +157,24 @@ def read(folder: str | os.PathLike[str], about: Dataset | None = None) -> list[S
     """One sequence of its folder (the one that holds `mav0`). Raises `InputError` naming file and
     field."""
     folder, about = Path(folder), about or EUROC
-    mav = folder / "mav0"
+    mav, name = folder / "mav0", short_name(folder.name)
     path = mav / "imu0" / "data.csv"
     table = read_table(path)
     stamps = table.stamps(STAMP)
     start = first_stamp(stamps, "ns", path)
-    time = seconds(stamps, start)
-    poses = read_reference(mav, start)
+    time, poses = seconds(stamps, start), read_reference(mav, start)
     if poses is None:
-        raise InputError(
-            mav,
-            f"has no reference ({' or '.join(REFERENCES)})/data.csv",
-            "bring a recording without one into the dataset 'csv'",
-        )
-    name = short_name(folder.name)
-    streams = Streams(
-        name,
-        str(path),
-        Samples(time, table.take(*GYRO), str(path)),
-        Samples(time, table.take(*ACCEL), str(path)),
-        {
-            "dataset": about.name,
-            "group": name,
-            "placement": "drone" if about is EUROC else "handheld",
-            "truth": "motion capture" if poses.noisy else "tracker and IMU, smoothed",
-            "licence": about.licence,
-        },
-        start * 1e-9,
-        poses,
-    )
+        problem = f"has no reference ({' or '.join(REFERENCES)})/data.csv"
+        raise InputError(mav, problem, "bring a recording without one into the dataset 'csv'")
+    attributes = {
+        "dataset": about.name,
+        "group": name,
+        "placement": "drone" if about is EUROC else "handheld",
+        "truth": "motion capture" if poses.noisy else "tracker and IMU, smoothed",
+        "licence": about.licence,
+    }
+    streams = Streams.of_imu(name, path, time, table.take(*GYRO), table.take(*ACCEL))
+    streams = streams._replace(attributes=attributes, start=start * 1e-9, poses=poses)
     return assemble(streams, RATE, native=RATE)
 
 
@@ -219,14 +205,11 @@ def read_reference(mav: Path, start: float | int) -> Poses | None:
     if velocity is not None:
         seen &= finite_rows(velocity)
     if seen.sum() < SHORTEST_RUN:
-        raise InputError(path, f"holds {seen.sum()} poses", "copy it again")
+        raise damaged(path, f"holds {seen.sum()} poses")
     time = seconds(stamps[seen], start)
     if (usual := float(np.median(np.abs(np.diff(time))))) > LONGEST_BRIDGE:
-        raise InputError(
-            path,
-            f"field 'time' runs at {1 / usual:.3g} Hz, too slow for a reference",
-            f"give at least {1 / LONGEST_BRIDGE:g} Hz",
-        )
+        problem = f"field 'time' runs at {1 / usual:.3g} Hz, too slow for a reference"
+        raise InputError(path, problem, f"give at least {1 / LONGEST_BRIDGE:g} Hz")
     poses = Poses(
         time,
         table.rotations(*_QUATERNION, rows=seen),
@@ -275,11 +258,8 @@ def sensor_pose(path: Path) -> SensorPose:
         if not np.linalg.norm(translation) < LONGEST_LEVER:
             raise ValueError(f"its translation is beyond {LONGEST_LEVER:g} m")
     except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise InputError(
-            path,
-            f"field 'T_BS' is no pose ({error})",
-            "it holds cols, rows and data of a 4 × 4 matrix",
-        ) from None
+        remedy = "it holds cols, rows and data of a 4 × 4 matrix"
+        raise InputError(path, f"field 'T_BS' is no pose ({error})", remedy) from None
     return SensorPose(Rotation.from_matrix(turn), translation)
 
 
@@ -290,24 +270,10 @@ def moved_to(imu: SensorPose, poses: Poses) -> Poses:
 
 
 def _yaml(path: Path) -> Any:
-    try:
+    with parsed_as(path, "YAML"):  # tags fail in any way
         # Some exports carry OpenCV's header and tag, which are no YAML.
-        text = re.sub(
-            r"^%YAML.*$|!!opencv-matrix", "", path.read_text(encoding="utf-8"), flags=re.MULTILINE
-        )
-        return yaml.safe_load(text)
-    except (  # tags fail in any way
-        OSError,
-        ValueError,
-        TypeError,
-        LookupError,
-        AttributeError,
-        RecursionError,
-        yaml.YAMLError,
-    ) as error:
-        raise InputError(
-            path, f"cannot be read as YAML ({shortened(error, 200)})", "copy it again"
-        ) from None
+        text = path.read_text(encoding="utf-8")
+        return yaml.safe_load(re.sub(r"(?m)^%YAML.*$|!!opencv-matrix", "", text))
 
 
 EUROC = Dataset(

@@ -22,26 +22,20 @@ import os
 import warnings
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from gnio_jax.data.alignment import PoseLag, pose_lag
+from gnio_jax.data.alignment import pose_lag
 from gnio_jax.data.assembly import Poses, Samples, Streams, assemble
 from gnio_jax.data.dataset import Dataset, Recording, Refusal
 from gnio_jax.data.parsing.stamps import distinct
-from gnio_jax.data.parsing.tables import Table, json_object, read_feather, shortened
+from gnio_jax.data.parsing.tables import Table, damaged, json_object, read_feather, shortened
 from gnio_jax.data.splits import held_out
-from gnio_jax.data.validation import (
-    UNIT_NORM_TOLERANCE,
-    WINDOW_SECONDS,
-    check_rate,
-    check_unit_norm,
-)
+from gnio_jax.data.validation import UNIT_NORM_TOLERANCE, WINDOW_SECONDS
 from gnio_jax.errors import InputError
-from gnio_jax.numerics import finite_rows, levelling, rotations
+from gnio_jax.numerics import finite_rows, levelling
 from gnio_jax.types import STANDARD_G, Sequence
 
 RATE = 100.0
@@ -76,11 +70,8 @@ def recordings(root: Path, split: str) -> list[Recording]:
     people = {walk.attributes["subject"] for walk in chosen if walk.name in held}
     chosen = [walk for walk in chosen if (walk.name in held) == (split == "val")]
     if not chosen:
-        raise InputError(
-            root,
-            f"split '{split}' would be empty: {len(held)} recordings are held out for validation",
-            "complete the data, or choose another split",
-        )
+        problem = f"split '{split}' would be empty: {len(held)} recordings are held out"
+        raise InputError(root, problem, "complete the data, or choose another split")
     note = {"held_out": ", ".join(sorted(people))}
     return [walk._replace(attributes=walk.attributes | note) for walk in chosen]
 
@@ -91,40 +82,33 @@ def find_walks(root: Path, folder: str) -> list[Recording]:
     walks: list[Recording] = []
     nameless: list[Path] = []
     for building in _BUILDINGS:
-        places = (sorted(root.glob(f"{depth}{building}/{folder}")) for depth in ("", "*/", "*/*/"))
-        place = next((found[0] for found in places if found), None)
-        if place is None:
-            continue
-        metadata = place / "metadata.json"
-        about = json_object(metadata) if metadata.is_file() else {}
-        for path in sorted(place.glob("*.feather"), key=lambda path: (len(path.stem), path.stem)):
-            entry = about.get(path.stem)
-            entry = entry if isinstance(entry, dict) else {}
-            person = entry.get("subjectID")
-            if person is None:
-                nameless.append(path)
-            walks.append(_recording(path, person, entry.get("calibration", "unknown")))
+        depths = ("", "*/", "*/*/")
+        places = [p for depth in depths for p in sorted(root.glob(f"{depth}{building}/{folder}"))]
+        for place in places[:1]:
+            metadata = place / "metadata.json"
+            about = json_object(metadata) if metadata.is_file() else {}
+            for path in sorted(place.glob("*.feather"), key=lambda p: (len(p.stem), p.stem)):
+                entry = about.get(path.stem)
+                entry = entry if isinstance(entry, dict) else {}
+                subject = _name(path)
+                if (person := entry.get("subjectID")) is None:
+                    nameless.append(path)
+                else:
+                    subject = shortened(f"subject{person}")
+                # When the rig was turned about its axes: start, end, ...
+                known = {"calibration": shortened(entry.get("calibration", "unknown"))}
+                known |= {"subject": subject, "group": subject}
+                walks.append(
+                    Recording(_name(path), partial(read, path), (path,), True, attributes=known)
+                )
     if not walks:
-        raise InputError(
-            root,
-            f"holds no recording in building*/{folder}",
-            f"get it from {DATASET.source}; expected layout: {DATASET.layout}",
-        )
+        remedy = f"get it from {DATASET.source}; expected layout: {DATASET.layout}"
+        raise InputError(root, f"holds no recording in building*/{folder}", remedy)
     if nameless:
-        warnings.warn(
-            f"{root}: metadata.json does not name the subject of {len(nameless)} recordings, "
-            f"e.g. {nameless[0]}; each counts as a person of its own",
-            stacklevel=3,
-        )
+        problem = f"metadata.json does not name the subject of {len(nameless)} recordings"
+        each = "each counts as a person of its own"
+        warnings.warn(f"{root}: {problem}, e.g. {nameless[0]}; {each}", stacklevel=3)
     return walks
-
-
-def _recording(path: Path, person: Any, calibration: Any) -> Recording:
-    """`calibration` says when the rig was turned about its axes: start, end, ..."""
-    name = _name(path)
-    subject = name if person is None else shortened(f"subject{person}")
-    about = {"subject": subject, "group": subject, "calibration": shortened(calibration)}
-    return Recording(name, partial(read, path), files=(path,), slow=True, attributes=about)
 
 
 def _name(path: Path) -> str:
@@ -144,96 +128,60 @@ def read(path: str | os.PathLike[str]) -> list[Sequence]:
     path = Path(path)
     table = read_feather(path)
     stamps = table.take("timestamp")
-    rows = distinct(stamps, path, "timestamp")
-    start = float(np.median(stamps))
+    rows, start = distinct(stamps, path, "timestamp"), float(np.median(stamps))
     time = stamps[rows] - start
-    check_rate(time, RATE, path)
     gyro, accel = table.axes("iphoneGyro", "XYZ")[rows], table.axes("iphoneAcc", "XYZ")[rows]
     pull = float(np.median(np.linalg.norm(accel, axis=1)))
     if not 0.5 < pull < 2.0:
-        raise InputError(
-            path,
-            f"columns 'iphoneAcc' have a median length of {pull:.3g}, expected about 1 (G)",
-            "copy it again",
-        )
+        problem = f"columns 'iphoneAcc' have a median length of {pull:.3g}, expected about 1 (G)"
+        raise damaged(path, problem)
     orientation = table.axes("orient", "WXYZ", gaps=True)[rows]
     position = table.axes("processedPos", "XYZ", gaps=True)[rows]
     # A quaternion of zeros is no attitude, as little as NaN is.
     known = orientation.any(axis=1) & finite_rows(orientation) & finite_rows(position)
     if known.sum() < max(10 * RATE, 0.5 * len(rows)):
-        raise Refusal(
-            path,
-            f"columns 'orient', 'processedPos' hold a pose in only {known.sum()} of "
-            f"{len(rows)} rows",
-            "leave it out",
-        )
-    rig = rotations(check_unit_norm(orientation[known], np.full(known.sum(), True), "orient", path))
-    level = _levelling(rig, table.axes("stencilAcc", "XYZ", gaps=True)[rows][known], path)
+        problem = f"hold a pose in only {known.sum()} of {len(rows)} rows"
+        raise Refusal(path, f"columns 'orient', 'processedPos' {problem}")
+    rig = table.rotations(*(f"orient{axis}" for axis in "WXYZ"), rows=rows[known])
+
+    # The map is levelled by the rig's own accelerometer.
+    felt = table.axes("stencilAcc", "XYZ", gaps=True)[rows][known]
+    if (measured := finite_rows(felt)).sum() < 10 * RATE:
+        raise Refusal(path, f"columns 'stencilAcc' hold numbers in only {measured.sum()} rows")
+    level = levelling(rig[measured].apply(felt[measured]).mean(axis=0))
+    if (tilt := float(np.degrees(level.magnitude()))) > MAX_TILT:
+        problem = f"gravity by 'orient' and 'stencilAcc' is {tilt:.0f}° off the vertical"
+        raise Refusal(path, problem)
     attitude = level * rig * PHONE_TO_RIG
-    fit = _lag(time, gyro, known, attitude, path)
-    streams = Streams(
-        _name(path),
-        str(path),
-        Samples(time, gyro, str(path)),
-        Samples(time, -STANDARD_G * accel, str(path)),
-        {
-            "dataset": "idol",
-            "group": _name(path),
-            "subject": "unknown",
-            "building": path.parent.parent.name,
-            "device": "iPhone 8",
-            "placement": "handheld rig",
-            "truth": "lidar-visual-inertial odometry (Kaarta Stencil)",
-            "imu_compensated": "no",
-            "licence": DATASET.licence,
-            "lag": fit.lag,
-            "rate_correlation": fit.correlation,
-            "tilt_degrees": float(np.degrees(level.magnitude())),
-        },
-        start,
-        Poses(time[known] - fit.lag, attitude, level.apply(position[known]), source=str(path)),
+
+    # A gap tells nothing of the lag, however long it is: here it lasts as long as a window.
+    closed = np.concatenate([[0.0], np.cumsum(np.minimum(np.diff(time), WINDOW_SECONDS))])
+    fit = pose_lag(closed, gyro, closed[known], attitude)
+    if not fit.correlation >= 0.5:  # NaN when the poses do not turn at all
+        problem = f"do not turn as 'iphoneGyro' does (they correlate by {fit.correlation:.2f})"
+        raise Refusal(path, f"columns 'orient' {problem}")
+    about = {
+        "dataset": "idol",
+        "group": _name(path),
+        "subject": "unknown",
+        "building": path.parent.parent.name,
+        "device": "iPhone 8",
+        "placement": "handheld rig",
+        "truth": "lidar-visual-inertial odometry (Kaarta Stencil)",
+        "imu_compensated": "no",
+        "licence": DATASET.licence,
+        "lag": fit.lag,
+        "rate_correlation": fit.correlation,
+        "tilt_degrees": tilt,
+    }
+    place = level.apply(position[known])
+    streams = Streams.of_imu(_name(path), path, time, gyro, -STANDARD_G * accel)._replace(
+        attributes=about,
+        start=start,
+        poses=Poses(time[known] - fit.lag, attitude, place, source=str(path)),
         device=_device(table, time, rows),
     )
     return assemble(streams, RATE, native=RATE, divide=True, max_speed=FASTEST_WALKER)
-
-
-def _levelling(rig: Rotation, accel: Float[np.ndarray, "k 3"], path: Path) -> Rotation:
-    """The rotation of the map that makes gravity vertical, by the rig's own accelerometer."""
-    measured = finite_rows(accel)
-    if measured.sum() < 10 * RATE:
-        raise Refusal(
-            path, f"columns 'stencilAcc' hold numbers in only {measured.sum()} rows", "leave it out"
-        )
-    level = levelling(rig[measured].apply(accel[measured]).mean(axis=0))
-    tilt = np.degrees(level.magnitude())
-    if tilt > MAX_TILT:
-        raise Refusal(
-            path,
-            f"gravity by 'orient' and 'stencilAcc' is {tilt:.0f}° off the vertical",
-            "leave it out",
-        )
-    return level
-
-
-def _lag(
-    time: Float[np.ndarray, " n"],
-    gyro: Float[np.ndarray, "n 3"],
-    known: np.ndarray,
-    attitude: Rotation,
-    path: Path,
-) -> PoseLag:
-    # A gap tells nothing of the lag, however long it is: here it lasts as long as a window.
-    steps = np.minimum(np.diff(time), WINDOW_SECONDS)
-    closed = np.concatenate([[0.0], np.cumsum(steps)])
-    fit = pose_lag(closed, gyro, closed[known], attitude)
-    if not fit.correlation >= 0.5:  # NaN when the poses do not turn at all
-        raise Refusal(
-            path,
-            f"columns 'orient' do not turn as 'iphoneGyro' does (they correlate by "
-            f"{fit.correlation:.2f})",
-            "leave it out",
-        )
-    return fit
 
 
 def _device(table: Table, time: Float[np.ndarray, " n"], rows: np.ndarray) -> Samples | None:

@@ -31,20 +31,19 @@ import hashlib
 import os
 import re
 import warnings
-from collections.abc import Iterable
+from collections import defaultdict
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
-from gnio_jax.data.assembly import Poses, Samples, Streams, assemble
+from gnio_jax.data.assembly import Poses, Streams, assemble
 from gnio_jax.data.dataset import Dataset, Recording
 from gnio_jax.data.parsing.stamps import in_order
-from gnio_jax.data.parsing.tables import read_npz, shortened
-from gnio_jax.data.validation import FASTEST, check_increasing, check_rate
+from gnio_jax.data.parsing.tables import damaged, read_npz, shortened
+from gnio_jax.data.validation import FASTEST, check_increasing
 from gnio_jax.errors import InputError
 from gnio_jax.numerics import stretches
 from gnio_jax.types import FASTEST_TURN, STRONGEST_FORCE, Sequence
@@ -77,33 +76,20 @@ _MOST = np.array(
 """Magnitudes of the values up to `wz` beyond which a packet is damaged; the rest is not used."""
 
 
-class Drive(NamedTuple):
-    """Where one drive lies in this copy."""
-
-    name: str
-    """<date>_drive_<number>."""
-    oxts: Path | None
-    """Folder of the text packets."""
-    pieces: tuple[Path, ...]
-    """Its npz files; not read where there are packets."""
+# --- the drives
 
 
 def recordings(root: Path, split: str) -> list[Recording]:
     """The drives of a split, or their pieces where these are files of their own."""
     found = []
-    for drive in find_drives(Path(root)):
-        if share_of(drive.name) == split and drive.oxts:
-            found.append(Recording(drive.name, partial(read_packets, drive.oxts)))
-        elif share_of(drive.name) == split:
-            found += [
-                Recording(_piece_name(path), partial(read_piece, path)) for path in drive.pieces
-            ]
+    for drive, paths in find_drives(Path(root)).items():
+        if share_of(drive) == split and paths[0].is_dir():
+            found.append(Recording(drive, partial(read_packets, paths[0])))
+        elif share_of(drive) == split:
+            found += [Recording(_piece_name(path), partial(read_piece, path)) for path in paths]
     if not found:
-        raise InputError(
-            root,
-            f"none of its drives falls into split '{split}'",
-            "drives are drawn by their names; take another split or more drives",
-        )
+        problem = f"none of its drives falls into split '{split}'"
+        raise InputError(root, problem, "take another split or more drives")
     return found
 
 
@@ -113,41 +99,31 @@ def share_of(drive: str) -> str:
     return "train" if place < 0.7 else "val" if place < 0.8 else "test"
 
 
-def find_drives(root: Path) -> list[Drive]:
-    """Every drive below `root`. Raises `InputError` where there is none, or only the 10 Hz
-    export."""
-    places = [path for depth in ("", "*/", "*/*/", "*/*/*/") for path in root.glob(f"{depth}oxts")]
-    folders = _by_drive((path.parent.name, path) for path in places if path.is_dir())
-    pieces = _by_drive((path.name, path) for path in root.glob("*.npz"))
-    drives, slow = [], []
-    for name in sorted({*folders, *pieces}):
-        quick = [oxts for oxts in folders.get(name, []) if not oxts.parent.name.endswith("_sync")]
-        if quick or name in pieces:
-            drives.append(Drive(name, quick[0] if quick else None, tuple(pieces.get(name, []))))
-        else:
-            slow.append(name)
-    few = f"{', '.join(slow[:3])}{', ...' if len(slow) > 3 else ''}"
-    remedy = "get its _extract archive, which carries the 100 Hz of the IMU"
-    if slow and not drives:
-        raise InputError(root, f"holds only the 10 Hz export (_sync), of {few}", remedy)
-    if slow:
-        warnings.warn(
-            f"{root}: {len(slow)} drives are there only as the 10 Hz export (_sync) and are left "
-            f"out: {', '.join(slow[:3])}; {remedy}",
-            stacklevel=3,
-        )
+def find_drives(root: Path) -> dict[str, list[Path]]:
+    """Drive -> its folder of packets, or else its npz files. Raises `InputError` where there is no
+    drive, or only the 10 Hz export."""
+    drives, slow = defaultdict[str, list[Path]](list), set()
+    for depth in ("", "*/", "*/*/", "*/*/*/"):
+        for path in sorted(root.glob(f"{depth}oxts")):
+            match = _DRIVE.search(path.parent.name)
+            if match and path.is_dir() and path.parent.name.endswith("_sync"):
+                slow.add(match[0])
+            elif match and path.is_dir() and match[0] not in drives:
+                drives[match[0]].append(path)
+    packets = set(drives)
+    for path in sorted(root.glob("*.npz")):
+        if (match := _DRIVE.search(path.name)) and match[0] not in packets:
+            drives[match[0]].append(path)
+    if missing := sorted(slow - drives.keys()):
+        remedy = "get the _extract archives, which carry the 100 Hz of the IMU"
+        problem = f"{len(missing)} drives are there only as the 10 Hz export (_sync)"
+        problem += f": {shortened(', '.join(missing))}"
+        if not drives:
+            raise InputError(root, problem, remedy)
+        warnings.warn(f"{root}: {problem}; left out; {remedy}", stacklevel=3)
     if not drives:
         raise InputError(root, "holds no drive of KITTI", f"expected layout: {DATASET.layout}")
-    return drives
-
-
-def _by_drive(named: Iterable[tuple[str, Path]]) -> dict[str, list[Path]]:
-    """Paths by the drive that their names tell; the nearest to the root first."""
-    found: dict[str, list[Path]] = {}
-    for name, path in sorted(named, key=lambda entry: (len(entry[1].parts), entry[1])):
-        if match := _DRIVE.search(name):
-            found.setdefault(match[0], []).append(path)
-    return found
+    return dict(sorted(drives.items()))
 
 
 # --- one drive
@@ -160,64 +136,42 @@ def read_packets(oxts: str | os.PathLike[str]) -> list[Sequence]:
     east, north, up from the first packet (`project`). Raises `InputError` naming file and field.
     """
     oxts = Path(oxts)
-    times, drive = oxts / "timestamps.txt", _drive_of(oxts)
+    times, drive = oxts / "timestamps.txt", _drive_of(oxts.parent.name)
     rows, packets = _packets(oxts / "data")
     stamps = _stamps(times)
     if rows.max() >= len(stamps):
-        raise InputError(
-            times,
-            f"holds {len(stamps)} stamps, but there is a packet {rows.max()}",
-            "copy the drive again",
-        )
+        raise damaged(times, f"holds {len(stamps)} stamps, but there is a packet {rows.max()}")
     known = ~np.isnat(stamps[rows])
     if known.sum() < 2:
-        raise InputError(times, f"gives {known.sum()} packets a stamp", "copy the drive again")
+        raise damaged(times, f"gives {known.sum()} packets a stamp")
     stamps, packets = stamps[rows][known], packets[known]
     start = stamps.min()
     time = (stamps - start).astype(np.int64) * 1e-9
     order, repairs = in_order(time, packets, times)
     time, packets = time[order], packets[order]
     if np.median(np.diff(time)) > 0.05:
-        raise InputError(
-            times,
-            f"field 'time' runs at {1 / np.median(np.diff(time)):.3g} Hz, as the _sync export does",
-            "get the _extract archive, which carries the 100 Hz of the IMU",
-        )
-    check_rate(time, RATE, times)
+        problem = f"runs at {1 / np.median(np.diff(time)):.3g} Hz, as the _sync export does"
+        raise InputError(times, f"field 'time' {problem}", "get the _extract archive")
 
     def values(*names: str) -> Float[np.ndarray, "n w"]:
         return packets[:, [_VALUES.index(name) for name in names]]
 
-    position = project(*values("lat", "lon", "alt").T)
     attitude = Rotation.from_euler("ZYX", values("yaw", "pitch", "roll"))
-    velocity = values("ve", "vn", "vu")
+    position, velocity = project(*values("lat", "lon", "alt").T), values("ve", "vn", "vu")
+    poses = Poses(time, attitude, position, velocity, source=str(oxts))
     gyro, accel = values("wx", "wy", "wz"), values("ax", "ay", "az")
     sequences, short = [], 0
     for number, own in enumerate(stretches(np.diff(time) > LONGEST_GAP)):
         if time[own.stop - 1] - time[own.start] < SHORTEST_PIECE:
             short += 1
             continue
-        poses = Poses(time[own], attitude[own], position[own], velocity[own], source=str(oxts))
-        sequences += assemble(
-            Streams(
-                f"{drive}_extract{number}",
-                str(oxts),
-                Samples(time[own], gyro[own], str(oxts)),
-                Samples(time[own], accel[own], str(oxts)),
-                _attributes(drive) | repairs,
-                float(start.astype(np.int64) * 1e-9),
-                poses,
-            ),
-            RATE,
-            native=RATE,
-            max_drift=LARGEST_JUMP,
-        )
+        streams = Streams.of_imu(
+            f"{drive}_extract{number}", oxts, time[own], gyro[own], accel[own]
+        )._replace(start=float(start.astype(np.int64) * 1e-9), poses=poses.rows(own))
+        sequences += _assembled(streams, drive, repairs)
     if short:
-        warnings.warn(
-            f"{oxts}: {short} pieces between missing packets are shorter than "
-            f"{SHORTEST_PIECE:g} s; left out",
-            stacklevel=2,
-        )
+        problem = f"{short} pieces between missing packets are shorter than {SHORTEST_PIECE:g} s"
+        warnings.warn(f"{oxts}: {problem}; left out", stacklevel=2)
     return sequences
 
 
@@ -229,15 +183,13 @@ def read_piece(path: str | os.PathLike[str]) -> list[Sequence]:
     check_increasing(time, path)
     position, velocity, angles = (table.take(n, width=3) for n in ("p_gt", "v_gt", "ang_gt"))
     attitude = Rotation.from_euler("ZYX", angles[:, ::-1])
-    gyro, accel = (Samples(time, part, str(path)) for part in np.split(imu, 2, axis=1))
+    streams = Streams.of_imu(_piece_name(path), path, time, imu[:, :3], imu[:, 3:])
     poses = Poses(time, attitude, position, velocity, source=str(path))
-    about = _attributes(_drive_of(path))
-    streams = Streams(_piece_name(path), str(path), gyro, accel, about, poses=poses)
-    return assemble(streams, RATE, native=RATE, max_drift=LARGEST_JUMP)
+    return _assembled(streams._replace(poses=poses), _drive_of(path.stem), {})
 
 
-def _attributes(drive: str) -> dict[str, Any]:
-    return {
+def _assembled(streams: Streams, drive: str, repairs: dict[str, float]) -> list[Sequence]:
+    about = {
         "dataset": "kitti",
         "group": drive,
         "session": drive[:10],
@@ -246,15 +198,17 @@ def _attributes(drive: str) -> dict[str, Any]:
         "imu_compensated": "reference",
         "licence": DATASET.licence,
     }
+    streams = streams._replace(attributes=about | repairs)
+    return assemble(streams, RATE, native=RATE, max_drift=LARGEST_JUMP)
 
 
 def _piece_name(path: Path) -> str:
     return re.sub(r"^(train|val|test)__", "", path.stem)
 
 
-def _drive_of(path: Path) -> str:
-    match = _DRIVE.search(str(path.name if path.suffix == ".npz" else path.parent.name))
-    return match[0] if match else path.parent.name
+def _drive_of(name: str) -> str:
+    match = _DRIVE.search(name)
+    return match[0] if match else name
 
 
 def project(
@@ -277,61 +231,47 @@ def _packets(folder: Path) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, "n 
     names = sorted(filter(_PACKET.fullmatch, os.listdir(folder))) if folder.is_dir() else []
     if len(names) < 2:
         raise InputError(folder, "holds no packets <row>.txt", f"expected layout: {DATASET.layout}")
-    table = np.empty((len(names), len(_VALUES)))
-    for row, name in enumerate(names):
-        table[row] = _packet(os.path.join(folder, name))
+    table = np.array([_packet(os.path.join(folder, name)) for name in names])
     absurd = ~(np.abs(table[:, : len(_MOST)]) <= _MOST)  # NaN, too
     if absurd.any():
         row, index = np.argwhere(absurd)[0]
-        raise InputError(
-            folder / names[row],
-            f"field '{_VALUES[index]}' is {table[row, index]:g}, expected within ±{_MOST[index]:g}",
-            "copy it again",
-        )
+        problem = f"field '{_VALUES[index]}' is {table[row, index]:g}"
+        raise damaged(folder / names[row], f"{problem}, expected within ±{_MOST[index]:g}")
     return np.array([int(name.removesuffix(".txt")) for name in names]), table
 
 
 def _packet(path: str) -> list[float]:
     try:
         with open(path, "rb") as file:
-            values = file.read().split()
+            values = [float(value) for value in file.read().split()]
     except OSError as error:
         raise InputError(path, f"cannot be read ({error.strerror})") from None
-    if len(values) != len(_VALUES):
-        raise InputError(
-            path,
-            f"holds {len(values)} values, expected {len(_VALUES)} ({_VALUES[0]} ... {_VALUES[-1]})",
-            "it may be cut short: copy it again",
-        )
-    try:
-        return [float(value) for value in values]
     except ValueError as error:
-        raise InputError(
-            path, f"holds what is no number ({shortened(error, 200)})", "copy it again"
-        ) from None
+        raise damaged(path, f"holds what is no number ({shortened(error, 200)})") from None
+    if len(values) != len(_VALUES):
+        raise damaged(
+            path, f"holds {len(values)} values, expected {len(_VALUES)}; it may be cut short"
+        )
+    return values
 
 
 def _stamps(path: Path) -> np.ndarray:
     """datetime64[ns] of each line, NaT for an empty one (a packet without a stamp)."""
     try:
-        lines = path.read_text(encoding="utf-8").rstrip().splitlines()
+        lines = [line.strip() for line in path.read_text(encoding="utf-8").rstrip().splitlines()]
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(
-            path, f"cannot be read ({getattr(error, 'strerror', None) or error})"
-        ) from None
+        problem = f"cannot be read ({getattr(error, 'strerror', None) or error})"
+        raise InputError(path, problem) from None
     stamps = np.full(len(lines), np.datetime64("NaT"), dtype="datetime64[ns]")
     for row, line in enumerate(lines):
-        if line.strip():
-            try:
-                if not _STAMP.fullmatch(line.strip()):  # NumPy takes "now" for a stamp, too
-                    raise ValueError
-                stamps[row] = np.datetime64(line.strip(), "ns")
-            except ValueError:
-                raise InputError(
-                    path,
-                    f"line {row + 1} ('{shortened(line.strip())}') is no stamp",
-                    "stamps look like 2011-09-26 14:02:22.484109563",
-                ) from None
+        try:
+            if line and not _STAMP.fullmatch(line):  # NumPy takes "now" for a stamp, too
+                raise ValueError
+            stamps[row] = np.datetime64(line or "NaT", "ns")
+        except ValueError:
+            problem = f"line {row + 1} ('{shortened(line)}') is no stamp"
+            remedy = "stamps look like 2011-09-26 14:02:22.484109563"
+            raise InputError(path, problem, remedy) from None
     return stamps
 
 

@@ -64,9 +64,8 @@ def recordings(root: Path, split: str) -> list[Recording]:
     folders = find_folders(root, _is_recording)
     if split == "all":
         if not folders:
-            raise InputError(
-                root, "holds no recording of RIDI", f"expected layout: {DATASET.layout}"
-            )
+            layout = f"expected layout: {DATASET.layout}"
+            raise InputError(root, "holds no recording of RIDI", layout)
         return [_recording(folder, {}) for _, folder in sorted(folders.items())]
     path = find_list(root, _LISTS[split])
     chosen = listed(path, lambda entry: folders.get(_name(entry)), root, DATASET.layout)
@@ -75,12 +74,8 @@ def recordings(root: Path, split: str) -> list[Recording]:
     held = held_out_of_train(path)
     chosen = [folder for folder in chosen if (folder.name in held) == (split == "val")]
     if not chosen:
-        raise InputError(
-            path,
-            f"split '{split}' would be empty: {len(held)} sequences of this list are held out "
-            "for validation",
-            "complete the data, or choose another split",
-        )
+        problem = f"split '{split}' would be empty: {len(held)} sequences of this list are held out"
+        raise InputError(path, problem, "complete the data, or choose another split")
     subjects = ", ".join(sorted({_subject(name) for name in held}))
     return [_recording(folder, {"held_out": subjects}) for folder in chosen]
 
@@ -126,15 +121,36 @@ def read(folder: str | os.PathLike[str]) -> list[Sequence]:
     """One recording of its folder, at 200 Hz, from its table or else from the recorder's text
     files, divided where its IMU or odometry has a gap longer than a window.
 
-    `device_orientation` is the game rotation vector, turned to begin at the reference's attitude.
-    Raises `InputError` naming file and field.
+    `device_orientation` is the game rotation vector, turned to begin at the reference's attitude,
+    since its yaw is arbitrary. Raises `InputError` naming file and field.
     """
     folder = Path(folder)
-    table = (folder / _TABLE).is_file()
-    streams = _from_table(folder) if table else _from_text_files(folder)
-    native = NATIVE_RATE if table else None
-    pieces = assemble(streams, RATE, native=native, divide=True, max_speed=FASTEST_WALKER)
-    return [_device_from_reference(piece) for piece in pieces]
+    table, arcore = (folder / _TABLE).is_file(), (folder / _ARCORE).is_file()
+    streams = _from_table(folder) if table else _from_text_files(folder, arcore)
+    words = re.findall("|".join(_PLACEMENTS), folder.name)
+    about = {
+        "dataset": "ridi",
+        "group": _subject(folder.name),
+        "subject": _subject(folder.name),
+        "device": "Android phone" if arcore and not table else "Tango phone",
+        "placement": _PLACEMENTS[words[0]] if words else "unknown",
+        "truth": f"{'ARCore' if arcore and not table else 'Tango'} VIO of the phone itself",
+        "imu_compensated": "no",
+        "licence": DATASET.licence,
+    }
+    pieces = assemble(
+        streams._replace(attributes=about),
+        RATE,
+        native=NATIVE_RATE if table else None,
+        divide=True,
+        max_speed=FASTEST_WALKER,
+    )
+    for number, piece in enumerate(pieces):
+        if piece.device_orientation is not None:
+            own, first = rotations(piece.device_orientation), int(np.argmax(piece.valid))
+            turned = rotations(piece.orientation[first]) * own[first].inv() * own
+            pieces[number] = piece._replace(device_orientation=quaternions(turned))
+    return pieces
 
 
 def _from_table(folder: Path) -> Streams:
@@ -143,24 +159,30 @@ def _from_table(folder: Path) -> Streams:
     stamps = table.stamps("time")
     start, rows = first_stamp(stamps, "ns", path), distinct(stamps, path)
     time = seconds(stamps[rows], start)
-    gyro, accel = (Samples(time, table.axes(name)[rows], str(path)) for name in ("gyro_", "acce_"))
+    gyro, accel, position = (table.axes(name)[rows] for name in ("gyro_", "acce_", "pos_"))
     attitude, device = (
         table.rotations(*(name + axis for axis in "wxyz"))[rows] for name in ("ori_", "rv_")
     )
-    poses = Poses(time, attitude, table.axes("pos_")[rows], source=str(path))
-    own = Samples(time, quaternions(device), str(path))
-    return _streams(folder, path, gyro, accel, start, poses, own, "Tango")
+    return Streams.of_imu(folder.name, path, time, gyro, accel)._replace(
+        start=start * 1e-9,
+        poses=Poses(time, attitude, position, source=str(path)),
+        device=Samples(time, quaternions(device), str(path)),
+    )
 
 
-def _from_text_files(folder: Path) -> Streams:
-    arcore = (folder / _ARCORE).is_file()
-    gyro, accel = _text(folder / "gyro.txt", 3), _text(folder / "acce.txt", 3)
-    pose = _text(folder / (_ARCORE if arcore else "pose.txt"), 7)
+def _from_text_files(folder: Path, arcore: bool) -> Streams:
+    """Each file has a clock of its own; time 0 is the gyro's first stamp."""
+
+    def text(name: str) -> Table:
+        return read_text(folder / name, separator=" ", header=False)
+
+    gyro, accel = text("gyro.txt"), text("acce.txt")
+    pose = text(_ARCORE if arcore else "pose.txt")
     start = first_stamp(gyro.stamps(0), "ns", gyro.path)
     first_stamp(accel.stamps(0), "ns", accel.path)
 
     def rows(table: Table) -> tuple[np.ndarray, np.ndarray]:
-        """(seconds, rows of the file) of a sensor's stamps."""
+        """(s, rows of the file in order)."""
         stamps = table.stamps(0)
         own = distinct(stamps, table.path)
         return seconds(stamps[own], start), own
@@ -178,60 +200,14 @@ def _from_text_files(folder: Path) -> Streams:
         ends_pieces=True,
         source=str(pose.path),
     )
-    device, path = None, folder / "orientation.txt"
-    if path.is_file():
-        game = _text(path, 4)
+    device = None
+    if (folder / "orientation.txt").is_file():
+        game = text("orientation.txt")
         time, own = rows(game)
         attitude = game.rotations(1, 2, 3, 4, scalar_first=False)[own]
-        device = Samples(time, quaternions(attitude), str(path))
-    system = "ARCore" if arcore else "Tango"
-    return _streams(folder, folder, samples(gyro), samples(accel), start, poses, device, system)
-
-
-def _text(path: Path, width: int) -> Table:
-    """A text file of stamps (ns) and so many values."""
-    table = read_text(path, separator=" ", header=False)
-    if table.width() < width + 1:
-        raise InputError(
-            path,
-            f"has {table.width()} columns, expected the time and {width} values",
-            "copy it again",
-        )
-    return table
-
-
-def _streams(
-    folder: Path,
-    source: Path,
-    gyro: Samples,
-    accel: Samples,
-    start: float | int,
-    poses: Poses,
-    device: Samples | None,
-    system: str,
-) -> Streams:
-    words = re.findall("|".join(_PLACEMENTS), folder.name)
-    about = {
-        "dataset": "ridi",
-        "group": _subject(folder.name),
-        "subject": _subject(folder.name),
-        "device": "Tango phone" if system == "Tango" else "Android phone",
-        "placement": _PLACEMENTS[words[0]] if words else "unknown",
-        "truth": f"{system} VIO of the phone itself",
-        "imu_compensated": "no",
-        "licence": DATASET.licence,
-    }
-    return Streams(folder.name, str(source), gyro, accel, about, start * 1e-9, poses, device=device)
-
-
-def _device_from_reference(piece: Sequence) -> Sequence:
-    """The device's own attitude, turned to that of the reference at the first valid sample: its yaw
-    is arbitrary."""
-    if piece.device_orientation is None:
-        return piece
-    own, first = rotations(piece.device_orientation), int(np.argmax(piece.valid))
-    turned = rotations(piece.orientation[first]) * own[first].inv() * own
-    return piece._replace(device_orientation=quaternions(turned))
+        device = Samples(time, quaternions(attitude), str(game.path))
+    streams = Streams(folder.name, str(folder), samples(gyro), samples(accel))
+    return streams._replace(start=start * 1e-9, poses=poses, device=device)
 
 
 DATASET = Dataset(

@@ -26,10 +26,9 @@ from jaxtyping import Float
 
 from gnio_jax.data.assembly import Poses, Samples, Streams, assemble
 from gnio_jax.data.dataset import Dataset, Recording
-from gnio_jax.data.parsing.tables import json_object, read_hdf5_fields, shortened
+from gnio_jax.data.parsing.tables import damaged, json_object, read_hdf5_fields, shortened
 from gnio_jax.data.splits import find_folders, find_list, listed
 from gnio_jax.data.validation import UNIT_NORM_TOLERANCE, check_increasing
-from gnio_jax.errors import InputError
 from gnio_jax.numerics import integrate_gyro, quaternions, rotations
 from gnio_jax.types import Sequence
 
@@ -89,8 +88,7 @@ def read(folder: str | os.PathLike[str], choose: bool = False) -> list[Sequence]
     accel = accel * _vector(info, "imu_acce_scale", 3, about)
     on_chest = _vector(info, "start_calibration", 4, about)
     if abs(np.linalg.norm(on_chest) - 1.0) > UNIT_NORM_TOLERANCE:
-        problem = "field 'start_calibration' is not a unit quaternion"
-        raise InputError(about, problem, "copy it again")
+        raise damaged(about, "field 'start_calibration' is not a unit quaternion")
 
     source, error = "game_rv", info.get(_ERRORS["game_rv"])
     if choose:
@@ -102,27 +100,10 @@ def read(folder: str | os.PathLike[str], choose: bool = False) -> list[Sequence]
         followed = game[0] * integrate_gyro(gyro, np.diff(time))
     orientation = chest[0] * rotations(on_chest) * followed[0].inv() * followed
 
-    first = _start_frame(info, len(time), about)
-    kept = slice(first, None)
-    time, start = time[kept] - time[first], float(time[first])
-    streams = Streams(
-        folder.name,
-        str(path),
-        Samples(time, gyro[kept], str(path)),
-        Samples(time, accel[kept], str(path)),
-        _attributes(folder.name, info, source, error),
-        start,
-        Poses(time, orientation[kept], position[kept], source=str(path)),
-        device=Samples(time, quaternions(game[kept]), str(path)),
-    )
-    return assemble(streams, RATE, native=RATE, max_speed=FASTEST_WALKER)
-
-
-def _attributes(name: str, info: dict[str, Any], source: str, error: Any) -> dict[str, Any]:
     attributes = {
         "dataset": "ronin",
-        "group": name.partition("_")[0],
-        "subject": name.partition("_")[0],
+        "group": folder.name.partition("_")[0],
+        "subject": folder.name.partition("_")[0],
         "device": shortened(info.get("device", "unknown")),
         "placement": "free",
         "truth": "tango on the chest (positions)",
@@ -133,7 +114,17 @@ def _attributes(name: str, info: dict[str, Any], source: str, error: Any) -> dic
     }
     if isinstance(error, int | float) and abs(error) <= 360.0:
         attributes["orientation_error_degrees"] = float(error)
-    return attributes
+    first = _start_frame(info, len(time), about)
+    kept, start = slice(first, None), float(time[first])
+    time = time[kept] - start
+    streams = Streams.of_imu(folder.name, path, time, gyro[kept], accel[kept])
+    streams = streams._replace(
+        attributes=attributes,
+        start=start,
+        poses=Poses(time, orientation[kept], position[kept], source=str(path)),
+        device=Samples(time, quaternions(game[kept]), str(path)),
+    )
+    return assemble(streams, RATE, native=RATE, max_speed=FASTEST_WALKER)
 
 
 # --- info.json
@@ -155,18 +146,14 @@ def _choice(info: dict[str, Any], has_ekf: bool, path: Path) -> tuple[str, float
 def _start_frame(info: dict[str, Any], rows: int, path: Path) -> int:
     start = _vector(info, "start_frame", 1, path)[0] if "start_frame" in info else 0.0
     if not 0 <= start < rows - 1 or start != int(start):
-        raise InputError(
-            path,
-            f"field 'start_frame' is {start:g}, the recording has {rows} rows",
-            "copy it again",
-        )
+        raise damaged(path, f"field 'start_frame' is {start:g}, the recording has {rows} rows")
     return int(start)
 
 
 def _vector(info: dict[str, Any], name: str, length: int, path: Path) -> Float[np.ndarray, "d"]:
     """A field that holds so many finite numbers, or one alone."""
     if info.get(name) is None:
-        raise InputError(path, f"field '{name}' is missing", "copy it again")
+        raise damaged(path, f"field '{name}' is missing")
     given = [info[name]] if length == 1 else info[name]
     values = np.empty(0)
     numbers = isinstance(given, list) and all(type(each) in (int, float) for each in given)
@@ -175,7 +162,7 @@ def _vector(info: dict[str, Any], name: str, length: int, path: Path) -> Float[n
         values = np.array([float(each) if abs(each) < 1e300 else np.inf for each in given])
     if values.shape != (length,) or not np.isfinite(values).all():
         what = "is no number" if length == 1 else f"does not hold {length} numbers"
-        raise InputError(path, f"field '{name}' {what}", "copy it again")
+        raise damaged(path, f"field '{name}' {what}")
     return values
 
 

@@ -14,7 +14,7 @@ import re
 from functools import partial
 from pathlib import Path
 
-from gnio_jax.data.assembly import Poses, Samples, Streams, assemble
+from gnio_jax.data.assembly import Poses, Streams, assemble
 from gnio_jax.data.dataset import Dataset, Recording
 from gnio_jax.data.parsing.stamps import first_stamp, seconds
 from gnio_jax.data.parsing.tables import json_object, read_npy, shortened
@@ -56,12 +56,11 @@ def read(folder: str | os.PathLike[str]) -> list[Sequence]:
     time = seconds(stamps, start, "us")
     check_increasing(time, path)
     attitude = table.rotations(_ATTITUDE, width=4, scalar_first=False)
-    gyro, accel = (
-        Samples(time, attitude.inv().apply(table.take(name, width=3)), str(path))
-        for name in (_GYRO, _ACCEL)
+    gyro, accel, position, velocity = (
+        table.take(name, width=3) for name in (_GYRO, _ACCEL, _POSITION, _VELOCITY)
     )
-    position, velocity = (table.take(name, width=3) for name in (_POSITION, _VELOCITY))
-    poses = Poses(time, attitude, position, velocity, source=str(path))
+    to_body = attitude.inv()
+    streams = Streams.of_imu(folder.name, path, time, to_body.apply(gyro), to_body.apply(accel))
     about = {
         "dataset": "tlio",
         "group": folder.name,
@@ -70,7 +69,8 @@ def read(folder: str | os.PathLike[str]) -> list[Sequence]:
         "imu_compensated": "reference",
         "licence": DATASET.licence,
     }
-    streams = Streams(folder.name, str(path), gyro, accel, about, start * 1e-6, poses)
+    poses = Poses(time, attitude, position, velocity, source=str(path))
+    streams = streams._replace(attributes=about, start=start * 1e-6, poses=poses)
     return assemble(streams, RATE, native=RATE)
 
 

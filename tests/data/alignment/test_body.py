@@ -120,19 +120,20 @@ def test_poses_near_flips_and_jumps_are_dropped():
 
 
 def test_the_jacobians_are_the_differences_of_the_errors():
-    motion = body._motion(imu(), tracked())
-    knots = body.uniform_knots(motion.time, 15.0)
+    streams, seen = imu(), body._seen(tracked())
+    felt = body._Felt(body._filtered(streams.gyro), body._filtered(streams.accel))
+    knots = body.uniform_knots(seen.time, 15.0)
     rows = slice(10, -10, 7)
-    motion, hats = motion.rows(rows), body.hat_functions(motion.time, knots)[rows]
+    seen, hats = seen.rows(rows), body.hat_functions(seen.time, knots)[rows]
     lag = np.array([0.01, -0.02, 0.03, 0.0])
     turn, biases = np.array([0.1, -0.2, 0.1]), np.array([0.01, -0.02, 0.005, 0.1, 0.05, -0.08])
     x = np.concatenate([turn, biases, LEVER + 0.03, [0.2, -0.1], [0.013], lag])
-    found = body.jacobians(motion, hats, EXTRINSIC, x)
+    found = body.jacobians(seen, felt, hats, EXTRINSIC, x)
     for column, step in enumerate(1e-5 * np.eye(len(x))):
         pairs = zip(
             found,
-            body.errors(motion, hats, EXTRINSIC, x + step),
-            body.errors(motion, hats, EXTRINSIC, x - step),
+            body.errors(seen, felt, hats, EXTRINSIC, x + step),
+            body.errors(seen, felt, hats, EXTRINSIC, x - step),
             strict=True,
         )
         for jacobian, after, before in pairs:

@@ -118,11 +118,7 @@ def test_a_gap_is_marked(tmp_path):
 def test_a_piece_shorter_than_a_window_is_lost_and_the_other_keeps_the_name(tmp_path):
     table = frame(seconds=12.0, lag=0.1).iloc[:13]
     table = pd.concat([table, frame(seconds=walk.SECONDS, lag=0.1, start=16.02)])
-    message = (
-        r"14\.feather: field 'time' has gaps longer than 1 s \(1, up to 15\.9 s\); kept: 35\.9 of "
-        r"51\.9 s, building3_known_14 \(16\.0 to 51\.9 s\); lost: 15\.9 s in gaps, 0\.1 s in "
-        r"pieces without a whole window"
-    )
+    message = r"14\.feather: .*\(1, up to 15\.9 s\); kept: 35\.9 of 51\.9 s, 1 of 2 pieces"
     with pytest.warns(UserWarning, match=message):
         sequence = read_whole(write(tmp_path, table, "building3/known", 14))
     time = compare(sequence)
@@ -145,8 +141,6 @@ def test_a_hole_of_two_seconds_costs_two_seconds(tmp_path, lag):
             pieces = data.load("idol", tmp_path, "known")
         (warning,) = [str(warning.message) for warning in caught]
         assert "field 'time' has gaps longer than 1 s (1, up to 2.3 s); kept: 35." in warning
-        assert "building1_known_3_piece1 (0.0 to 19.0 s), building1_known_3_piece2 (" in warning
-        assert warning.endswith("lost: 2.3 s in gaps")
         assert sum(piece.valid.sum() for piece in pieces) / 100.0 >= 35.0
         assert [piece.name for piece in pieces] == [f"building1_known_3_piece{k}" for k in (1, 2)]
         assert {piece.attributes["group"] for piece in pieces} == {"subject7"}
@@ -368,7 +362,7 @@ def scaling(prefix, factor):
             "columns 'iphoneAcc' have a median length of 9.94, expected about 1 (G)",
         ),
         (scaling("iphoneGyro", 57.3), "field 'gyro' looks like deg/s"),
-        (setting("orientW", 60, 3.0), "field 'orient' is not a unit quaternion in 1 rows"),
+        (setting("orientW", 60, 3.0), "not a unit quaternion in 1 rows"),
         (scaling("processedPosX", np.nan), "hold a pose in only 0 of 1500 rows"),
         (scaling("stencilAcc", np.nan), "columns 'stencilAcc' hold numbers in only 0 rows"),
         (scaling("iphoneAcc", -1.0), None),
@@ -405,7 +399,7 @@ def test_without_pyarrow_it_says_what_to_install(tmp_path, monkeypatch):
     path = write(tmp_path, frame(seconds=15.0))
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     with pytest.raises(
-        InputError, match=r"3\.feather: feather files need pyarrow.*pip install 'gnio-jax\[idol\]'"
+        InputError, match=r"3\.feather: needs the package pyarrow.*pip install 'gnio-jax\[idol\]'"
     ):
         read_whole(path)
 

@@ -76,7 +76,7 @@ def test_a_drive_in_both_layouts_is_read_once_and_the_slow_export_is_named(tmp_p
     files.write_drive(tmp_path, TEST, export="sync", rate=10.0)
     with pytest.warns(
         UserWarning,
-        match=rf"1 drives are there only as the 10 Hz export \(_sync\) and are left out: {TEST}",
+        match=rf"1 drives are there only as the 10 Hz export \(_sync\): {TEST}",
     ):
         (sequence,) = data.load("kitti", tmp_path, "train")
     assert "start_time" in sequence.attributes  # of the packets
@@ -226,7 +226,7 @@ def test_wrong_rates_and_units_are_refused(tmp_path):
     odd = files.write_drive(tmp_path / "odd", TRAIN, rate=50.0)
     refused(
         lambda: kitti.read_packets(odd),
-        odd / "timestamps.txt",
+        odd,
         "'time'",
         "50 Hz, expected about 100 Hz",
     )
@@ -282,7 +282,7 @@ def test_a_cut_short_piece_and_an_empty_root_are_refused(tmp_path):
     refused(
         lambda: data.load("kitti", tmp_path, "train"),
         tmp_path,
-        "only the 10 Hz export (_sync)",
+        "only as the 10 Hz export (_sync)",
         TRAIN,
         "_extract",
     )

@@ -114,10 +114,9 @@ def test_of_a_recording_with_a_gap_both_pieces_are_kept(tmp_path):
     with pytest.warns(UserWarning) as caught:
         pieces = ridi.read(path.parent.parent)
     (warning,) = caught
-    assert str(warning.message) == (
-        f"{path}: field 'time' has gaps longer than 1 s (1, up to 4.4 s); kept: 31.6 of 36.0 s, "
-        "huayi_bag2_piece1 (0.0 to 9.0 s), huayi_bag2_piece2 (13.4 to 36.0 s); lost: 4.4 s in gaps"
-    )
+    assert str(path) in str(warning.message)
+    assert "(1, up to 4.4 s); kept: 31.6 of 36.0 s, 2 of 2 pieces" in str(warning.message)
+    assert [piece.name for piece in pieces] == ["huayi_bag2_piece1", "huayi_bag2_piece2"]
     for sequence, begin, seconds in zip(pieces, (0.0, 13.4), (9.0, 22.6), strict=True):
         time = compare(sequence)
         check_device(sequence, begin=begin)
@@ -133,7 +132,7 @@ def test_a_hole_of_two_seconds_costs_two_seconds(tmp_path):
     time = np.arange(int(38.0 * 202.3)) / 202.3
     write_table(tmp_path, "dan_bag1", time=time[(time < 19.0) | (time > 21.3)])
     for _ in range(2):
-        with pytest.warns(UserWarning, match=r"kept: 35\.7 of 38\.0 s, .*; lost: 2\.3 s in gaps"):
+        with pytest.warns(UserWarning, match=r"kept: 35\.7 of 38\.0 s, .*"):
             pieces = data.load("ridi", tmp_path, "all")
         assert sum(piece.valid.sum() for piece in pieces) / 200.0 >= 35.0
         for piece in pieces:
@@ -436,7 +435,7 @@ def with_value(time, values, row, column, value):
         (
             columns_of("acce.txt", lambda time, values: [time, values[:, :2]]),
             "acce.txt",
-            "has 3 columns, expected the time and 3 values",
+            "column '3' is missing",
         ),
         (
             columns_of("pose.txt", lambda time, values: with_value(time, values, 90, 6, 2.0)),
