@@ -13,7 +13,6 @@ from gnio_jax import config as configuration
 from gnio_jax.commands import console, options
 from gnio_jax.config import ConsideredStd, TrainConfig
 from gnio_jax.cores import usable_cores
-from gnio_jax.errors import InputError
 
 
 @dataclass(frozen=True)
@@ -59,7 +58,7 @@ def train(asked: TrainOptions, call: options.Call) -> None:
       {prog} --config through_filter_oxiod --init-from runs/oxiod_calibrated --workdir runs/through
     """
     if "--seeds" in call.argv and not asked.seeds:
-        raise InputError("--seeds", "names no seed", "give some, e.g. 0 1 2")
+        configuration.with_seeds(asked, asked.seeds)  # says so
     config = experiment(asked, call)
     from gnio_jax import filtering, parallel  # late: mistakes do not wait for JAX
     from gnio_jax.apps import packages
@@ -69,13 +68,10 @@ def train(asked: TrainOptions, call: options.Call) -> None:
         filtering.cores_as_devices()  # the filter's operations are too small for several cores
     parallel.initialise(asked.distributed, asked.devices)
     with console.terminal(shown=parallel.is_first()) as terminal:
-        load = packages.load_pretrained
-        given = (asked.resume, terminal, usable_cores(), asked.devices, load)
+        configs = configuration.with_seeds(config, asked.seeds) if asked.seeds else [config]
+        given = terminal, usable_cores(), asked.devices, packages.load_pretrained
         try:
-            if asked.seeds:
-                outcomes = loop.train_seeds(config, asked.seeds, *given)
-            else:
-                outcomes = [loop.train(config, *given)]
+            outcomes = loop.train_all(configs, asked.resume, *given)
         except FloatingPointError as error:
             terminal.line(str(error))
             sys.exit(1)

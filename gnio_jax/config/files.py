@@ -431,7 +431,7 @@ def _yaml(content: str, source: str) -> Any:
 # Files of earlier versions
 # ------------------------------------------------------------------------------------------------
 
-_MOVED = {
+_MOVED: dict[str, str] = {
     **{name: f"noise.{name}" for name in NoiseModel._fields},
     **{f"{name}_std": f"start.{name}" for name in InitialStd._fields},
     **{f"considered_{name}_std": f"considered.{name}" for name in ConsideredStd._fields},

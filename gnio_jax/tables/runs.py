@@ -81,7 +81,8 @@ def train(config: TrainConfig, seeds: Sequence[int], reporter: Reporter, workers
             continue
         numbers = ", ".join(f"s{seed}" for seed in states[state])
         reporter.line(f"── {configuration.default_workdir(config).name} {numbers}")
-        outcomes = loop.train_seeds(config, states[state], state == "begun", reporter, workers)
+        configs = configuration.with_seeds(config, states[state])
+        outcomes = loop.train_all(configs, state == "begun", reporter, workers)
         if outcomes[-1].stopped_by:
             raise Interrupted(outcomes[-1].stopped_by)
 

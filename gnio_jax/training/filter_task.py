@@ -12,19 +12,18 @@ import dataclasses
 import functools
 import math
 from collections.abc import Iterable, Iterator
+from pathlib import Path as FilePath
 from typing import Any, NamedTuple
 
 import chex
 import jax
 import jax.numpy as jnp
-from flax import linen as nn
 from jaxtyping import Bool, Float, Int, PRNGKeyArray
 
 from gnio_jax import models, parallel
 from gnio_jax.config import FilterSettings, TrainConfig
 from gnio_jax.filtering import (
     FilterConfig,
-    FilterHistory,
     initial_state,
     over_sequences,
     run_odometry,
@@ -57,6 +56,7 @@ from gnio_jax.training.segments import (
     turned_segment,
 )
 from gnio_jax.training.task import BatchLosses, Progress, Row, Task, Trainable, TrainState, size_of
+from gnio_jax.types import Sequence
 
 CHECKPOINT_EVERY = 20
 """Clone intervals between the states that the backward pass keeps."""
@@ -142,92 +142,9 @@ class Filtered(NamedTuple):
     """Mean normalised error squared of the position over its degrees of freedom."""
 
 
-def filter_config(config: TrainConfig, training: bool) -> FilterConfig:
-    """The filter of a segment: in training with a gate that has a slope and a gradient that is cut,
-    else as evaluation has it."""
-    ekf = filter_setup(config.data, config.filter).config
-    if not training:
-        return ekf
-    return dataclasses.replace(
-        ekf,
-        gate_softness=GATE_SOFTNESS,
-        checkpoint_every=CHECKPOINT_EVERY,
-        truncate_every=round(TRUNCATE_SECONDS / config.data.stride_seconds),
-    )
-
-
 def intervals(config: TrainConfig) -> int:
     """Clone intervals in a segment."""
     return round(config.through_filter.piece_seconds / config.data.stride_seconds)
-
-
-def run_segment(
-    program: tuple[models.InferenceVariables, dict[str, Any]],
-    segment: Segment,
-    errors: StartErrors,
-    model: nn.Module,
-    config: TrainConfig,
-    ekf: FilterConfig,
-) -> tuple[Path, FilterHistory]:
-    """The filter over one segment with the network in its loop: its path, the start included.
-
-    program: the network's variables as inference takes them, and free parameters of the filter.
-    """
-    variables, numbers = program
-    settings = with_free_parameters(config.filter, numbers)
-    truth = segment.truth
-    start = initial_state(
-        ekf,
-        start_rotation(truth, errors),
-        truth.velocity[0] + errors.velocity,
-        truth.position[0] + errors.position,
-        errors.gyro_bias,
-        errors.accel_bias,
-        settings.start,
-    )
-    predict = functools.partial(models.Inference(model), variables)
-    _, history = run_odometry(predict, start, segment.gyro, segment.accel, ekf, settings.noise)
-    path = Path(
-        jnp.concatenate([start.rotation[None], history.rotation]),
-        jnp.concatenate([start.velocity[None], history.velocity]),
-        jnp.concatenate([start.position[None], history.position]),
-    )
-    return path, history
-
-
-def filter_segments(
-    variables: Any,
-    segments: Segment,
-    errors: StartErrors,
-    model: nn.Module,
-    config: TrainConfig,
-    ekf: FilterConfig,
-) -> Filtered:
-    """What becomes of each of a batch of segments, shared out among the devices."""
-    network = {name: tree for name, tree in variables.items() if name != "filter"}
-    program = models.inference_variables(model, network), variables["filter"]
-
-    def one(program: Any, segment: Segment, errors: StartErrors) -> Filtered:
-        path, history = run_segment(program, segment, errors, model, config, ekf)
-        found = filter_losses(path, segment.truth, history, ekf, config.through_filter)
-        error = segment.truth.position[1:] - history.position
-        assert history.covariance is not None  # for type checkers
-        squares = normalised_squares(error, history.covariance[:, POSITION, POSITION])
-        nis = jnp.nanmean(history.nis) / 3
-        return Filtered(found, history.healthy[-1] > 0, nis, jnp.mean(squares) / 3)
-
-    return over_sequences(one, shared=1)(program, segments, errors)
-
-
-def draw_segments(
-    key: PRNGKeyArray, source: SegmentSource, starts: Int[jax.Array, "b"], config: TrainConfig
-) -> tuple[Segment, StartErrors]:
-    """The segments that begin at rows `starts`, and how wrong the filter starts in each."""
-    count, stride = intervals(config), config.data.stride
-    segments = jax.vmap(lambda start: cut_segment(source, start, count, stride))(starts)
-    std = config.filter.start
-    keys = jax.random.split(key, starts.shape[0])
-    return segments, jax.vmap(lambda key: draw_start_errors(key, std, START_SPREAD))(keys)
 
 
 # Validation
@@ -246,11 +163,11 @@ def validate(
     # The last batch is filled up with segments of weight zero.
     which = jnp.minimum(jnp.arange(batches * size), count - 1)
     weight = (jnp.arange(batches * size) < count).astype(jnp.float64) / count
-    ekf = filter_config(config, training=False)
-    segments, errors = draw_segments(key, source, jnp.asarray(source.earliest)[which], config)
+    ekf = filter_setup(config.data, config.filter).config
+    segments, errors = task.segments(key, source, jnp.asarray(source.earliest)[which])
 
     def one_batch(batch: tuple[Segment, StartErrors, jax.Array]) -> Filtered:
-        found = filter_segments(state.variables, batch[0], batch[1], task.model, config, ekf)
+        found = task.filtered(state.variables, batch[0], batch[1], ekf)
         found = found._replace(healthy=found.healthy.astype(jnp.float64))
         return jax.tree.map(lambda each: jnp.tensordot(batch[2], each, 1), found)
 
@@ -305,9 +222,9 @@ class FilterTask(Task):
     def draw(
         self, key: PRNGKeyArray, source: SegmentSource, which: Int[jax.Array, "b"]
     ) -> tuple[Segment, StartErrors]:
-        """`draw_segments`, with `augment.yaw` each turned by a random yaw: the filter finds the
-        same path but for the turn, and the network sees windows of another heading."""
-        segments, errors = draw_segments(key, source, which, self.config)
+        """`segments`, with `augment.yaw` each turned by a random yaw: the filter finds the same
+        path but for the turn, and the network sees windows of another heading."""
+        segments, errors = self.segments(key, source, which)
         if self.config.augment.yaw:
             count, key = which.shape[0], jax.random.fold_in(key, 1)
             angles = jax.random.uniform(key, (count,), jnp.float64, -jnp.pi, jnp.pi)
@@ -320,11 +237,65 @@ class FilterTask(Task):
         """Means over the segments, those of several horizons over these too."""
         segments, errors = batch
         chex.assert_type([segments.gyro, segments.accel], jnp.float64)
-        ekf = filter_config(self.config, training=True)
-        found = filter_segments(variables, segments, errors, self.model, self.config, ekf)
+        found = self.filtered(variables, segments, errors, self.softened())
         means = {name: jnp.mean(each) for name, each in found.losses._asdict().items()}
         figures = {"loss": means.pop("total"), "mse": means.pop("window"), **means}
         return BatchLosses(figures, variables["batch_stats"], jnp.all(found.healthy))
+
+    def softened(self) -> FilterConfig:
+        """The filter in training: its gate has a slope, and its gradient is cut."""
+        return dataclasses.replace(
+            filter_setup(self.config.data, self.config.filter).config,
+            gate_softness=GATE_SOFTNESS,
+            checkpoint_every=CHECKPOINT_EVERY,
+            truncate_every=round(TRUNCATE_SECONDS / self.config.data.stride_seconds),
+        )
+
+    def segments(
+        self, key: PRNGKeyArray, source: SegmentSource, starts: Int[jax.Array, "b"]
+    ) -> tuple[Segment, StartErrors]:
+        """The segments that begin at rows `starts`, and how wrong the filter starts in each."""
+        count, stride = intervals(self.config), self.config.data.stride
+        segments = jax.vmap(lambda start: cut_segment(source, start, count, stride))(starts)
+        std, keys = self.config.filter.start, jax.random.split(key, starts.shape[0])
+        return segments, jax.vmap(lambda key: draw_start_errors(key, std, START_SPREAD))(keys)
+
+    def filtered(
+        self, variables: Any, segments: Segment, errors: StartErrors, ekf: FilterConfig
+    ) -> Filtered:
+        """What becomes of each of a batch of segments, with the network in the filter's loop; they
+        are shared out among the devices."""
+        network = {name: tree for name, tree in variables.items() if name != "filter"}
+        frozen = models.inference_variables(self.model, network)
+
+        def one(program: Any, segment: Segment, errors: StartErrors) -> Filtered:
+            frozen, numbers = program
+            settings, truth = with_free_parameters(self.config.filter, numbers), segment.truth
+            start = initial_state(
+                ekf,
+                start_rotation(truth, errors),
+                truth.velocity[0] + errors.velocity,
+                truth.position[0] + errors.position,
+                errors.gyro_bias,
+                errors.accel_bias,
+                settings.start,
+            )
+            predict = functools.partial(models.Inference(self.model), frozen)
+            signals = segment.gyro, segment.accel
+            _, history = run_odometry(predict, start, *signals, ekf, settings.noise)
+            path = Path(
+                jnp.concatenate([start.rotation[None], history.rotation]),
+                jnp.concatenate([start.velocity[None], history.velocity]),
+                jnp.concatenate([start.position[None], history.position]),
+            )
+            found = filter_losses(path, truth, history, ekf, self.config.through_filter)
+            assert history.covariance is not None  # for type checkers
+            error = truth.position[1:] - history.position
+            squares = normalised_squares(error, history.covariance[:, POSITION, POSITION])
+            nis = jnp.nanmean(history.nis) / 3
+            return Filtered(found, history.healthy[-1] > 0, nis, jnp.mean(squares) / 3)
+
+        return over_sequences(one, shared=1)((frozen, variables["filter"]), segments, errors)
 
     def take_steps(self, *given: Any) -> tuple[TrainState, Progress]:
         state, progress = super().take_steps(*given)

@@ -76,43 +76,28 @@ def train(
     is not of the same network, for settings that do not fit together, for a folder that holds
     another run, and where the devices cannot share a batch evenly.
     """
-    (outcome,) = _train_all([config], [resume], reporter, workers, devices, load_initial)
+    (outcome,) = train_all([config], resume, reporter, workers, devices, load_initial)
     return outcome
 
 
-def train_seeds(
-    config: TrainConfig,
-    seeds: Sequence[int],
+def train_all(
+    configs: Sequence[TrainConfig],
     resume: bool = False,
     reporter: Reporter | None = None,
     workers: int = 1,
     devices: int | None = None,
     load_initial: Callable[[str], Run] = load_run,
 ) -> list[Outcome]:
-    """Train `config` with each of these seeds, one run after the other, as `train` would in the
-    work folders WORKDIR_s0, WORKDIR_s1, ... (`config.with_seeds`).
+    """`train` experiments that differ in nothing but their seeds and folders (`config.with_seeds`),
+    one after the other. Recordings are read once and steps are compiled once.
 
-    Recordings are read once and steps are compiled once. With `resume` finished runs are skipped,
-    begun ones continue from their latest checkpoint, missing ones start. A signal ends the run that
-    it interrupts, and those after it do not begin: they have no outcome. Raises as `train`, and
-    `InputError` for no seed, and for one that is named twice.
+    With `resume` finished runs are skipped, begun ones continue from their latest checkpoint,
+    missing ones start. A signal ends the run that it interrupts, and those after it do not begin:
+    they have no outcome.
     """
-    configs = configuration.with_seeds(config, seeds)
+    reporter = (reporter or Lines()) if parallel.is_first() else Silence()
     begun = [(configuration.default_workdir(each) / "config.yaml").exists() for each in configs]
     resumes = [resume and (there or not any(begun)) for there in begun]
-    return _train_all(configs, resumes, reporter, workers, devices, load_initial)
-
-
-def _train_all(
-    configs: Sequence[TrainConfig],
-    resumes: Sequence[bool],
-    reporter: Reporter | None,
-    workers: int,
-    devices: int | None,
-    load_initial: Callable[[str], Run],
-) -> list[Outcome]:
-    """Train runs that differ in nothing but their seeds and folders, one after the other."""
-    reporter = (reporter or Lines()) if parallel.is_first() else Silence()
     workdirs = [
         run_folder.refuse_other_run(configuration.validate(config), resume)
         for config, resume in zip(configs, resumes, strict=True)

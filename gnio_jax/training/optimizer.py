@@ -99,8 +99,7 @@ def learning_rates(config: TrainConfig, steps_per_epoch: int) -> dict[str, optax
 
 def _labels_of_modules(trained: Any) -> Any:
     def label(path: tuple, _: jax.Array) -> str:
-        _, module, *_ = path
-        return "held" if module.key in UNCERTAINTY else "learns"
+        return "held" if path[1].key in UNCERTAINTY else "learns"  # after the collection
 
     return jax.tree_util.tree_map_with_path(label, trained)
 

@@ -353,7 +353,7 @@ def set_up(
         problem = f"is {size}, but there are only {counts[0]} {kind.unit}"
         raise InputError("optim.batch_size", problem, "lower it")
     anywhere = dataclasses.replace(config, workdir=None, data_root=None, init_from=None, seed=0)
-    return kind(model, anywhere, counts[0] // size), Recordings(*sources, splits)
+    return kind(model, anywhere, counts[0] // size), Recordings(sources[0], sources[1], splits)
 
 
 def create_model(config: TrainConfig) -> nn.Module:

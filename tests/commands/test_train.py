@@ -4,7 +4,6 @@ nothing left behind."""
 import dataclasses
 import os
 import shutil
-import subprocess
 import sys
 import threading
 from pathlib import Path
@@ -55,16 +54,9 @@ def mistake(monkeypatch, capsys, tmp_path, *arguments):
                 "oxiod, randomised, ridi, ronin, synthetic, tlio, tumvi"
             ),
         ),
-        (["--datset", "tlio"], "--datset: unknown option; did you mean '--dataset'?"),
         (["--config", ""], ".: cannot be read"),
         (["--devices", "0"], "--devices: must be at least 1, found 0"),
         (["--seeds"], "--seeds: names no seed"),
-        (["--optim.epoch", "3"], "--optim.epoch: unknown option; did you mean '--optim.epochs'?"),
-        (["--optim.epochs", "three"], "--optim.epochs: must be a whole number, found 'three'"),
-        (
-            ["--model.gate", "relu"],
-            "--model.gate: must be one of tanh, sigmoid or null, found 'relu'",
-        ),
         (["--model.name", "gnoi"], "model 'gnoi': unknown; did you mean 'gnio'?"),
         (
             ["--model.name", "ctin", "--model.width", "90"],
@@ -86,36 +78,10 @@ def test_mistakes(monkeypatch, capsys, tmp_path, arguments, expected):
     assert expected in mistake(monkeypatch, capsys, tmp_path, *arguments)
 
 
-@pytest.mark.parametrize(
-    "content, expected",
-    [
-        ("optim: {epohcs: 3}", "unknown field 'optim.epohcs'; did you mean 'optim.epochs'?"),
-        ("optim: {learning_rate: a}", "field 'optim.learning_rate' must be a number, found 'a'"),
-        ("optim: {epochs: '3'}", "field 'optim.epochs' must be a whole number, found '3'"),
-        ("optim: {epochs: 2.5}", "field 'optim.epochs' must be a whole number, found 2.5"),
-        ("augment: {yaw: 1}", "field 'augment.yaw' must be true or false, found 1"),
-        (
-            "model: {head: gatd}",
-            "field 'model.head' must be one of gated, linear or null, found 'gatd'",
-        ),
-        (
-            "through_filter: {learn: noise}",
-            "field 'through_filter.learn' must be a list, found 'noise'",
-        ),
-        (
-            "through_filter: {learn: [noise, gate]}",
-            "field 'through_filter.learn' must be one of noise, measurement, start, ",
-        ),
-        ("optim: 3", "optim must be a mapping"),
-        ("- 1", "must be a mapping"),
-        ("a: [", "is not YAML"),
-        ("!!python/object/apply:os.system ['true']", "is not YAML"),
-    ],
-)
-def test_configs(monkeypatch, capsys, tmp_path, content, expected):
-    (tmp_path / "my.yaml").write_text(content)
+def test_a_mistake_in_a_file_names_it(monkeypatch, capsys, tmp_path):
+    (tmp_path / "my.yaml").write_text("optim: {epohcs: 3}")
     line = mistake(monkeypatch, capsys, tmp_path, "--config", "my.yaml")
-    assert line.startswith("my.yaml: ") and expected in line
+    assert line == "my.yaml: unknown field 'optim.epohcs'; did you mean 'optim.epochs'?"
 
 
 def test_every_config_of_the_repository_is_valid_and_names_its_command():
@@ -167,26 +133,6 @@ def test_a_config_survives_its_file(tmp_path):
         config = configuration.load(ROOT / "configs" / f"{name}.yaml")
         configuration.save(tmp_path / "kept.yaml", config)
         assert configuration.load(tmp_path / "kept.yaml") == config
-
-
-def test_help_teaches():
-    shown = subprocess.run(
-        [sys.executable, "train.py", "--help-verbose"],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=True,
-    ).stdout
-    for word in (
-        "--dataset",
-        "--resume",
-        "--config",
-        "--optim.epochs",
-        "--data.window-rotation",
-        "linear warm-up",
-        "Prototypes in the",
-    ):
-        assert word in " ".join(shown.split()), word
 
 
 def asked(*words):

@@ -58,7 +58,7 @@ def test_a_table_from_nothing_and_again_without_training(made, monkeypatch, caps
     def never(*_, **__):
         raise AssertionError("done already")
 
-    monkeypatch.setattr(loop, "train_seeds", never)
+    monkeypatch.setattr(loop, "train_all", never)
     monkeypatch.setattr(kept, "evaluate", never)
     (root / "out" / "comparison_test_integrate.md").unlink()
     gnio("tables", "comparison", *arguments)
@@ -120,7 +120,7 @@ def test_every_run_is_calibrated_before_it_is_measured(made, monkeypatch, capsys
 
 def test_a_signal_ends_the_table_and_says_how_to_go_on(made, monkeypatch, capsys):
     root, arguments = made
-    monkeypatch.setattr(loop, "train_seeds", lambda *_, **__: [loop.Outcome(root, None, 15)])
+    monkeypatch.setattr(loop, "train_all", lambda *_, **__: [loop.Outcome(root, None, 15)])
     with pytest.raises(SystemExit) as left:
         gnio("tables", "gates", *arguments, "--out", str(root / "elsewhere"))
     assert left.value.code == 128 + 15 and "goes on from here" in capsys.readouterr().err

@@ -42,7 +42,7 @@ def test_a_run_of_other_recordings_is_refused(tmp_path, monkeypatch):
     write_run(tmp_path / "gnio_s0")
     configuration.save(tmp_path / "gnio_s0" / "config.yaml", kept)
     (tmp_path / "gnio_s0" / "metrics.jsonl").write_text("{}\n" * BASE.optim.epochs)
-    monkeypatch.setattr(runs.loop, "train_seeds", None)
+    monkeypatch.setattr(runs.loop, "train_all", None)
     runs.train(config, [0], Lines())
     other = dataclasses.replace(config, data_root=str(tmp_path / "B"))
     with pytest.raises(InputError, match=r"was trained on the recordings of .*A, not of .*B"):

@@ -97,7 +97,8 @@ def test_every_seed_is_an_ordinary_run(config, alone, tmp_path):
     """Its folder, its settings, its parameters to the bit; recordings are read and steps compiled
     once."""
     told, programs = Told(), task.train_steps._cache_size()
-    outcomes = loop.train_seeds(at(config, tmp_path / "run"), SEEDS, reporter=told)
+    configs = configuration.with_seeds(at(config, tmp_path / "run"), SEEDS)
+    outcomes = loop.train_all(configs, reporter=told)
     assert task.train_steps._cache_size() == programs
     assert [outcome.workdir.name for outcome in outcomes] == ["run_s3", "run_s0", "run_s7"]
     for seed, outcome in zip(SEEDS, outcomes, strict=True):
@@ -131,24 +132,24 @@ def test_a_signal_saves_the_run_and_the_seeds_go_on(config, alone, tmp_path, mon
         run_of["seed"] = config.seed
         return opened(config, *given)
 
-    config = at(config, tmp_path / "run")
-    workdirs = [Path(each.workdir) for each in configuration.with_seeds(config, SEEDS)]
+    configs = configuration.with_seeds(at(config, tmp_path / "run"), SEEDS)
+    workdirs = [Path(each.workdir) for each in configs]
     with monkeypatch.context() as patch:
         patch.setattr(loop, "DISPATCH_SECONDS", 0)
         patch.setattr(task, "train_steps", stopping)
         patch.setattr(loop.run_folder, "opened", noted)
-        outcomes = loop.train_seeds(config, SEEDS)
+        outcomes = loop.train_all(configs)
         assert [outcome.stopped_by for outcome in outcomes] == [None, signal.SIGTERM]
         latest = [checkpoint.load_run(workdir, "latest").step for workdir in workdirs[:2]]
         assert latest == [2 * STEPS, STEPS + 2] and not workdirs[2].exists()
         run_of["steps"] = [2 * STEPS]
-        outcomes = loop.train_seeds(config, SEEDS, resume=True)
+        outcomes = loop.train_all(configs, resume=True)
         # The second run is complete, and a seed is missing.
         assert [outcome.stopped_by for outcome in outcomes] == [None, signal.SIGTERM]
         assert checkpoint.load_run(workdirs[1], "latest").step == 2 * STEPS
         assert not workdirs[2].exists()
     told = Told()
-    outcomes = loop.train_seeds(config, SEEDS, resume=True, reporter=told)
+    outcomes = loop.train_all(configs, resume=True, reporter=told)
     assert [outcome.stopped_by for outcome in outcomes] == [None] * 3
     assert told.lines.count(f"resuming at step {2 * STEPS}") == 2
     assert_same_runs(workdirs, alone, rtol=1e-6)
@@ -161,12 +162,13 @@ def test_a_loss_that_is_not_finite_names_its_run(config, tmp_path, monkeypatch):
 
     monkeypatch.setattr(task, "train_steps", failing)
     with pytest.raises(FloatingPointError, match=r"run_s3: the loss .* at step 5 "):
-        loop.train_seeds(at(config, tmp_path / "run"), SEEDS)
+        loop.train_all(configuration.with_seeds(at(config, tmp_path / "run"), SEEDS))
 
 
 def test_no_begun_run_is_nothing_to_resume(config, tmp_path):
     with pytest.raises(InputError, match="run_s3: holds no run to resume"):
-        loop.train_seeds(at(config, tmp_path / "run"), SEEDS, resume=True)
+        configs = configuration.with_seeds(at(config, tmp_path / "run"), SEEDS)
+        loop.train_all(configs, resume=True)
 
 
 @pytest.mark.parametrize(
@@ -180,7 +182,7 @@ def test_no_begun_run_is_nothing_to_resume(config, tmp_path):
 def test_mistakes(config, tmp_path, seeds, expected):
     configuration.save(tmp_path / "run_s0" / "config.yaml", config)
     with pytest.raises(InputError, match=expected):
-        loop.train_seeds(at(config, tmp_path / "run"), seeds)
+        loop.train_all(configuration.with_seeds(at(config, tmp_path / "run"), seeds))
     assert [path.name for path in tmp_path.iterdir()] == ["run_s0"]
 
 
@@ -188,24 +190,24 @@ def test_the_command_names_each_run_and_how_to_go_on(config, tmp_path, monkeypat
     """And a resumed command takes the settings of the first seed's run."""
     given = []
 
-    def train_seeds(config, seeds, resume, *_):
-        given.append((config, seeds, resume))
-        runs = [Path(each.workdir) for each in configuration.with_seeds(config, seeds)]
-        return [loop.Outcome(run, 0.5, signal.SIGTERM if resume else None) for run in runs]
+    def train_all(configs, resume, *_):
+        given.append((configs, resume))
+        stopped_by = signal.SIGTERM if resume else None
+        return [loop.Outcome(Path(each.workdir), 0.5, stopped_by) for each in configs]
 
-    monkeypatch.setattr(loop, "train_seeds", train_seeds)
+    monkeypatch.setattr(loop, "train_all", train_all)
     run = str(tmp_path / "run")
     gnio("train", "--workdir", run, "--seeds", "1", "2", "--optim.epochs", "5")
     out = capsys.readouterr().out.splitlines()
     assert [line.split()[-1] for line in out] == [f"{run}_s1", f"{run}_s2"]
-    configuration.save(Path(f"{run}_s1") / "config.yaml", given[0][0])
+    configuration.save(Path(f"{run}_s1") / "config.yaml", given[0][0][0])
     with pytest.raises(SystemExit):
         gnio("train", "--workdir", run, "--seeds", "1", "2", "--resume")
     assert f"--workdir {run} --seeds 1 2 --resume" in capsys.readouterr().err
-    assert [seeds for _, seeds, _ in given] == [(1, 2)] * 2 and given[1][2]
-    assert given[1][0].optim.epochs == 5
+    assert [[each.seed for each in configs] for configs, _ in given] == [[1, 2]] * 2
+    assert given[1][1] and given[1][0][0].optim.epochs == 5
     monkeypatch.chdir(tmp_path)
-    configuration.save(Path("runs/synthetic_gnio_s1/config.yaml"), given[0][0])
+    configuration.save(Path("runs/synthetic_gnio_s1/config.yaml"), given[0][0][0])
     call = Call("gnio train", ["--seeds", "1", "2", "--resume"])
     found = experiment(read(train, call), call)
     assert found.optim.epochs == 5 and found.workdir is None

@@ -370,17 +370,16 @@ def test_noise_is_recovered(training, start):
 def test_gradient_against_differences(training, start, monkeypatch):
     """Without truncation; by a number of each kind and a weight of the network."""
     training, source = training
-    assert filter_task.filter_config(training.config, training=True).truncate_every == 10
+    assert training.softened().truncate_every == 10
     monkeypatch.setattr(filter_task, "TRUNCATE_SECONDS", 2.0)
     through = dataclasses.replace(THROUGH, learn=("all",))
     config = dataclasses.replace(training.config, through_filter=through)
     state = begun(training, start)
-    draw = jax.jit(filter_task.draw_segments, static_argnames="config")
-    batch = draw(jax.random.key(5), source, source.earliest[:2], config)
+    of_all = dataclasses.replace(training, config=config)
+    batch = jax.jit(of_all.segments)(jax.random.key(5), source, source.earliest[:2])
     chosen = filter_task.trainable(state.variables, through.learn)
     # The network computes in float32 whatever it is given.
     chosen["filter"] = {name: jnp.float64(number) for name, number in chosen["filter"].items()}
-    of_all = dataclasses.replace(training, config=config)
     evaluated = quick(functools.partial(task.gradient_of, step=jnp.int32(0), task=of_all))
     gradient, found = evaluated(chosen, state.variables, batch)
     assert bool(found.healthy) and np.isfinite(found.figures["loss"])
