@@ -24,16 +24,20 @@ class ListOptions:
     """What `gnio data list` is asked for: nothing."""
 
 
-@dataclass(frozen=True)
-class CheckOptions:
-    """What `gnio data check` is asked for."""
-
+@dataclass(frozen=True, kw_only=True)
+class _Dataset:
     name: tyro.conf.Positional[str]
     """Name of the dataset, csv for recordings of your own."""
     data_root: str | None = None
     """Folder of the dataset; by default $GNIO_DATA/NAME, then data/NAME."""
     split: str = "all"
     """A split, or all of them."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CheckOptions(_Dataset):
+    """What `gnio data check` is asked for."""
+
     plots: Path | None = None
     """Folder for a picture of each recording: trajectory, speed, |accel|, gyro against reference,
     and where it is not valid."""
@@ -41,18 +45,12 @@ class CheckOptions:
     """File for the figures."""
 
 
-@dataclass(frozen=True)
-class ConvertOptions:
+@dataclass(frozen=True, kw_only=True)
+class ConvertOptions(_Dataset):
     """What `gnio data convert` is asked for."""
 
-    name: tyro.conf.Positional[str]
-    """Name of the dataset."""
     out: tyro.conf.Positional[Path]
     """Folder for the result."""
-    data_root: str | None = None
-    """Folder of the dataset; by default $GNIO_DATA/NAME, then data/NAME."""
-    split: str = "all"
-    """A split, or all of them."""
     rate: float | None = None
     """Rate of the result, Hz; by default each recording's own."""
 
@@ -197,16 +195,13 @@ def _json(row: Any) -> dict[str, Any]:
     """A `loading.Checked` for a JSON file, which knows no array and no NaN."""
 
     def plain(value: Any) -> Any:
-        if isinstance(value, float) and math.isnan(value):
-            return None
-        return [plain(each) for each in value] if isinstance(value, Iterable) else value
+        if isinstance(value, Iterable) and not isinstance(value, str):
+            return [plain(each) for each in value]
+        return None if isinstance(value, float) and math.isnan(value) else value
 
     figures = row.check._asdict() if row.check else {}
-    figures = {
-        name: list(value) if name == "failures" else plain(value) for name, value in figures.items()
-    }
     state = {"split": ", ".join(row.splits), "used": not row.reason, "reason": row.reason}
-    return state | figures
+    return state | {name: plain(value) for name, value in figures.items()}
 
 
 def convert(asked: ConvertOptions, _call: options.Call) -> None:
@@ -228,8 +223,7 @@ def convert(asked: ConvertOptions, _call: options.Call) -> None:
     dataset, root = _find(asked.name, asked.data_root)
     with console.terminal() as terminal:
         progress = partial(terminal.progress, "converting")
-        out, split, rate = asked.out, asked.split, asked.rate
-        result = loading.convert(dataset, root, out, split, rate, None, progress)
+        result = loading.convert(dataset, root, asked.out, asked.split, asked.rate, None, progress)
     _print_reasons(result.left_out, result.notes)
     counts = ", ".join(f"{split} {len(stems)}" for split, stems in result.sequences.items())
     output = console.stdout()

@@ -64,30 +64,29 @@ def import_file(asked: ImportFile, _call: options.Call) -> None:
     from gnio_jax.apps import importing  # late: mistakes do not wait for JAX
     from gnio_jax.data.readers import csv_files
 
-    name = asked.name or asked.out.stem
+    name, folder = asked.name or asked.out.stem, asked.out.parent
     recording = importing.import_recording(asked.file, asked.recording, rate=asked.rate, name=name)
     importing.write_imported(asked.out, recording)
-    sequence, folder = recording.sequence, asked.out.parent
-    notes = [*recording.notes, *importing.impressions(sequence)]
+    sequence = recording.sequence
+    lines = [*recording.notes, *importing.impressions(sequence)]
+    start = "" if sequence.valid.any() else " --init static"
+    following = f"gnio evaluate --dataset csv --data-root {folder} --split test{start}"
     lists = [split for split in csv_files.SPLITS if (folder / f"{split}.txt").is_file()]
     if lists:
         line = f"add the line {asked.out.name} to {lists[-1]}.txt, or it is not read"
-        notes.append(f"{folder} has lists: {line}")
+        lines.append(f"{folder} has lists: {line}")
+    elif any(folder.glob("*.csv")):
+        following = f"gnio track {asked.out}"
+        lines.append(
+            f"{folder} holds CSV files too: gnio evaluate would read them as recordings; write "
+            "the imported ones to a folder of their own"
+        )
     output = console.stdout()
     output.print(f"{asked.out}: {sequence.name}", soft_wrap=True)
-    for note in notes:
-        output.print(f"  {note}", soft_wrap=True)
+    for line in lines:
+        output.print(f"  {line}", soft_wrap=True)
     for warning in recording.warnings:
         output.print(f"warning: {warning}", soft_wrap=True)
-    start = "" if sequence.valid.any() else " --init static"
-    following = f"gnio evaluate --dataset csv --data-root {folder} --split test{start}"
-    if not lists and any(folder.glob("*.csv")):
-        output.print(
-            f"  {folder} holds CSV files too: gnio evaluate would read them as recordings; write "
-            "the imported ones to a folder of their own",
-            soft_wrap=True,
-        )
-        following = f"gnio track {asked.out}"
     output.print(f"next: {following}", soft_wrap=True)
 
 

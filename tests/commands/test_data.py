@@ -470,7 +470,7 @@ def test_what_follows_an_import_beside_its_own_csv_can_be_followed(place, capsys
     """As recordings of the folder, walk.csv and walk.h5 would have one name."""
     write_phone(place / "walk.csv", (*csv.GYRO, *csv.ACCEL), accel=-1.0)
     run("data", "import", "walk.csv", "--out", "walk.h5")
-    *_, warning, note, following = capsys.readouterr().out.splitlines()
+    *_, note, warning, following = capsys.readouterr().out.splitlines()
     assert warning.startswith("warning: sign: gravity reads on -z in walk.csv")
     assert "gnio evaluate would read them as recordings" in note
     assert following == "next: gnio track walk.h5"
@@ -519,7 +519,7 @@ OUT, HEADS = ["--out", "x.h5"], ["--data-root", "heads"]
             "dataset tlio: unknown split 'tset'; known splits: train, val, test, all",
         ),
         (["check", "ridi", *HEADS], "heads: holds no recording of RIDI"),
-        (["check", "tlio", "--plot", "x"], "--plot: unknown option; did you mean --plots?"),
+        (["check", "tlio", "--plot", "x"], "--plot: unknown option; did you mean '--plots'?"),
         (["check", "tlio", *HEADS, "--json", "heads"], "--json: heads is a folder"),
         (
             ["check", "tlio", *HEADS, "--plots", "heads/test_list.txt"],
