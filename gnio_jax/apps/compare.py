@@ -200,9 +200,9 @@ def _check_sources(sources: list[Source]) -> None:
                 continue
             words = name.replace("_", " ")
             remedy = f"compare evaluations of one {words}"
-            split = next((each.identity["split"] for each in sources if each.asked is None), "")
-            if name == "split" and split:
-                remedy = f"give --split {split} for the runs, or {remedy}"
+            given = next((each.identity[name] for each in sources if each.asked is None), own)
+            if name in ("split", "data_root") and any(each.asked for each in sources):
+                remedy = f"give --{name.replace('_', '-')} {given} for the runs, or {remedy}"
             problem = f"is of {words} {own}, the first row of {first.identity[name]}"
             raise InputError(source.path, problem, remedy)
 

@@ -8,6 +8,7 @@ import shutil
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 
 from gnio_jax import config as configuration
@@ -30,7 +31,7 @@ from gnio_jax.evaluation import true_displacements
 from gnio_jax.evaluation.estimators.result import Estimate
 from gnio_jax.evaluation.preparation import Prepared
 from gnio_jax.files import replacing_folder, write_text
-from gnio_jax.filtering.batch import padded_masks, padded_signals
+from gnio_jax.filtering.batch import padded_masks
 from gnio_jax.numerics import filled_up
 from gnio_jax.training import checkpoint
 
@@ -124,23 +125,25 @@ def _walks(prepared: list[Prepared], estimates: list[Estimate], stride: int) -> 
     come after all displacements and change nothing before them."""
     strides = max(each.strides(stride) for each in prepared)
 
-    def filled(values: list[np.ndarray | None], filling: float) -> np.ndarray:
-        rows = [filled_up(each[1:], strides, filling) for each in values if each is not None]
-        return np.stack(rows)
+    def of_recording(each: Prepared, estimate: Estimate) -> Walks:
+        gyro, accel = each.sequence.gyro[:-1], each.sequence.accel[:-1]
+        assert estimate.displacement is not None and estimate.displacement_std is not None
+        std = filled_up(estimate.displacement_std[1:], strides, 1.0)
+        return Walks(
+            each.start.rotation,
+            each.start.velocity,
+            each.start.position,
+            each.gyro_bias,
+            gyro=filled_up(gyro, strides * stride),
+            accel=filled_up(accel, strides * stride),
+            displacement=filled_up(estimate.displacement[1:], strides, np.nan),
+            std=np.nan_to_num(std, nan=1.0),
+        )
 
-    signals = ((each.sequence.gyro[:-1], each.sequence.accel[:-1]) for each in prepared)
-    gyro, accel = padded_signals(signals, strides * stride)
-    return Walks(
-        rotation=np.stack([each.start.rotation for each in prepared]),
-        velocity=np.stack([each.start.velocity for each in prepared]),
-        position=np.stack([each.start.position for each in prepared]),
-        gyro_bias=np.stack([each.gyro_bias for each in prepared]),
-        gyro=gyro,
-        accel=accel,
-        displacement=filled([each.displacement for each in estimates], np.nan),
-        std=np.nan_to_num(filled([each.displacement_std for each in estimates], 1.0), nan=1.0),
-        imu_valid=padded_masks((each.imu_valid for each in prepared), strides * stride),
-    )
+    rows = [of_recording(*pair) for pair in zip(prepared, estimates, strict=True)]
+    walks = jax.tree.map(lambda *column: np.stack(column), *rows)
+    masks = (each.imu_valid for each in prepared)
+    return walks._replace(imu_valid=padded_masks(masks, strides * stride))
 
 
 def _write(

@@ -188,8 +188,11 @@ def read(folder: Path) -> Report:
         if settings.get("definitions") != DEFINITIONS:
             problem = "was written by another version, whose figures mean something else"
             raise InputError(path, problem, REMEDY)
-        names = ("dataset", "split", "estimator", "alignment")
-        if not sequences or not all(isinstance(settings[name], str) for name in names):
+        known = [
+            isinstance(settings[x], str) for x in ("dataset", "split", "estimator", "alignment")
+        ]
+        known += [math.isfinite(settings["recordings"][name]) for name in sequences]
+        if not sequences or not all(known) or not isinstance(settings["filter"], dict):
             raise ValueError
         return Report(
             settings,

@@ -128,17 +128,9 @@ def render(by_method: dict[str, dict[str, dict[str, float]]]) -> str:
     return tabulate.markdown(["network", "windows of", "n", *columns.values()], table)
 
 
-class AttentionEntropy(NamedTuple):
-    """Shares of the entropy of a uniform attention, log p."""
-
-    of_window: float
-    """Mean over windows and heads."""
-    of_mean: float
-    """Of the mean attention over the windows."""
-
-
-def entropy(attention: Float[np.ndarray, "m h p"]) -> AttentionEntropy:
-    """How widely the attention spreads over the prototypes.
+def entropy(attention: Float[np.ndarray, "m h p"]) -> tuple[float, float]:
+    """How widely the attention spreads over the prototypes: the entropy of a window, as a mean over
+    windows and heads, and that of the mean over the windows, as shares of log p.
 
     Both near 1: every window sees all prototypes alike. The first small, the second large: windows
     choose, and choose differently.
@@ -148,7 +140,7 @@ def entropy(attention: Float[np.ndarray, "m h p"]) -> AttentionEntropy:
         -(weights * np.log(np.maximum(weights, 1e-12))).sum(-1).mean() / largest
         for weights in (attention, attention.mean(0))
     )
-    return AttentionEntropy(float(of_window), float(of_mean))
+    return float(of_window), float(of_mean)
 
 
 def attention_by_activity(

@@ -274,7 +274,9 @@ def make_trajectories(path: Path, options: TablesConfig, results: list[Result]) 
         if name not in known:
             problem = f"no sequence '{name}' in split '{options.split}'"
             raise InputError("--sequences", problem, f"there are: {', '.join(known)}")
-    plots.save(with_ending(path, ".png"), plots.trajectories(wanted, runs))
+    plots.save(
+        with_ending(path, ".png"), plots.trajectories(wanted, {run.name: run.views for run in runs})
+    )
     made = results[0].reports[0].settings
     title = f"{made['dataset']} {options.split}: {options.estimator} of all methods"
     page.write(with_ending(path, ".html"), title, runs)

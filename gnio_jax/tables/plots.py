@@ -9,7 +9,6 @@ from jaxtyping import Float
 from matplotlib.figure import Figure
 
 from gnio_jax.evaluation import statistics
-from gnio_jax.evaluation.page import Run
 from gnio_jax.evaluation.plots import (
     BLUE,
     COLOURS,
@@ -22,6 +21,7 @@ from gnio_jax.evaluation.plots import (
     START,
     VERMILION,
     YELLOW,
+    View,
     finish,
     save,
 )
@@ -108,7 +108,9 @@ def gradients(
     return figure
 
 
-def trajectories(names: Sequence[str], runs: Sequence[Run], columns: int = 4) -> Figure:
+def trajectories(
+    names: Sequence[str], methods: Mapping[str, Sequence[View]], columns: int = 4
+) -> Figure:
     """All methods over the reference, a panel for each of the sequences `names`."""
     columns = min(columns, len(names))
     lines = -(-len(names) // columns)
@@ -116,7 +118,7 @@ def trajectories(names: Sequence[str], runs: Sequence[Run], columns: int = 4) ->
     panels = np.atleast_1d(figure.subplots(lines, columns)).ravel()
     handles = {}
     for axes, name in zip(panels, names, strict=False):
-        views = {run.name: seen for run in runs for seen in run.views if seen.name == name}
+        views = {x: seen for x, own in methods.items() for seen in own if seen.name == name}
         reference = next(iter(views.values())).reference[:, :2]
         (handles["reference"],) = axes.plot(*reference.T, color=REFERENCE, lw=1.8)
         for number, (method, seen) in enumerate(views.items()):

@@ -244,6 +244,8 @@ def test_figures_of_other_recordings_are_never_compared(tmp_path, monkeypatch):
     folders = [tmp_path / name / "eval" / "tlio_test_ekf" for name in ("one", "two")]
     with pytest.raises(InputError, match=r"is of data root .*B, the first row of .*A"):
         compare(*folders)
+    with pytest.raises(InputError, match=r"give --data-root .*B for the runs"):
+        compare(tmp_path / "one", folders[1])
 
 
 def test_refusals(runs):

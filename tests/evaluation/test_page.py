@@ -188,7 +188,7 @@ def test_evaluations_beside_are_read_back(tmp_path, estimates, made):
         "other": settings | {"step": 8},
         "another": settings | {"split": "val"},
         "elsewhere": settings | {"data_root": "/elsewhere"},
-        "longer": settings | {"recordings": {"room 1/walk": 50.0}},
+        "longer": settings | {"recordings": {**SETTINGS["recordings"], "blind": 50.0}},
     }
     for name, each in of.items():
         report.write(

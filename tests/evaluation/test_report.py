@@ -194,6 +194,8 @@ def test_no_page_is_lost_and_none_is_of_other_figures(tmp_path, estimates, made)
         (("sequences", "blind", "diverged"), "no"),
         (("sequences", "blind", "notes"), [5]),
         (("settings", "split"), 5),
+        (("settings", "recordings"), {}),
+        (("settings", "filter"), 5),
         (("settings",), []),
         (("sequences",), {}),
         (("sequences",), [[1]]),
