@@ -247,10 +247,11 @@ class Tracker:
     def _as_pose(self) -> Pose:
         """The newest estimate on the host, at the end of the interval of its last sample."""
         ahead, estimate, _ = self._ahead
-        mean, covariance, flags = jax.tree.map(np.array, estimate)
-        accepted, nis, healthy = flags.tolist()
+        mean, covariance, numbers = jax.tree.map(np.array, estimate)
+        accepted, nis, healthy = numbers.tolist()
         time = self._stream.origin + (self._stream.taken + ahead) * self._config.dt
-        return Pose(time, *mean, covariance, accepted, nis, healthy > 0)
+        flags = {"accepted": accepted, "nis": nis, "healthy": healthy > 0}
+        return Pose(time, *mean, covariance=covariance, **flags)
 
 
 def compile_programs(

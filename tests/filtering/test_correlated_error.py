@@ -50,33 +50,20 @@ def test_as_a_plain_filter_has_them(fail_scale):
     config = dataclasses.replace(CONFIG, mahalanobis_fail_scale=fail_scale)
     final, history = filtered(config)
     start, gyro, accel, displacement, spread = walk()
-    wanted = scekf_numpy.run_from(
-        filtering.initial_state(config, *start),
-        NOISE,
-        DT,
-        gyro,
-        accel,
-        displacement,
-        spread,
-        n=N,
-        clones=CLONES,
-        convergence=0.6,
-        scale=2.0,
-        fail_scale=fail_scale,
-        lasting=ERRORS._asdict(),
-    )
+    state = filtering.initial_state(config, *start)
+    wanted = scekf_numpy.run_from(state, NOISE, config, gyro, accel, displacement, spread)
     assert np.nansum(wanted["accepted"] == 0) == (fail_scale == 0)  # the outlier
-    assert np.abs(wanted["lasting"][-1]).min() > 1e-3
+    assert np.abs(wanted["correlated"][-1]).min() > 1e-3
     for name in ("accepted", "gate_passed"):
         np.testing.assert_array_equal(getattr(history, name), wanted[name])
     for name in ("rotation", "velocity", "position", "gyro_bias", "accel_bias", "innovation"):
         np.testing.assert_allclose(getattr(history, name), wanted[name], atol=1e-9, err_msg=name)
-    np.testing.assert_allclose(final.correlated, wanted["lasting"][-1], atol=1e-9)
+    np.testing.assert_allclose(final.correlated, wanted["correlated"][-1], atol=1e-9)
     np.testing.assert_allclose(history.nis, wanted["nis"], rtol=1e-7)
     np.testing.assert_allclose(history.covariance, wanted["covariance"], rtol=1e-6, atol=1e-12)
     np.testing.assert_allclose(
         final.core_covariance[CORRELATED, CORRELATED],
-        wanted["lasting_covariance"][-1],
+        wanted["correlated_covariance"][-1],
         rtol=1e-7,
         atol=1e-12,
     )
@@ -104,10 +91,8 @@ def test_they_are_as_large_at_all_times():
 
 
 RUNS, SIGMA, LONG = 48, 0.05, 500
-LASTING_WALK = CorrelatedError(0.9, 0.5)
-MODEL = filtering.NoiseModel(
-    5e-4, 5e-3, 1e-6, 2e-5, measurement_scale=1.0, correlation=LASTING_WALK
-)
+OF_WALK = CorrelatedError(0.9, 0.5)
+MODEL = filtering.NoiseModel(5e-4, 5e-3, 1e-6, 2e-5, measurement_scale=1.0, correlation=OF_WALK)
 STD = filtering.InitialStd(0.02, 0.01, 0.3, 1e-3, 1e-3, 0.02)
 
 
@@ -115,7 +100,7 @@ STD = filtering.InitialStd(0.02, 0.01, 0.3, 1e-3, 1e-3, 0.02)
 def simulated():
     """Walks whose displacements have errors as the model has them, drawn in NumPy."""
     runs = simulate(2, RUNS, LONG, 10, 10, 0.01, MODEL, STD, 0.0)
-    rng, (share, seconds) = np.random.default_rng(3), LASTING_WALK
+    rng, (share, seconds) = np.random.default_rng(3), OF_WALK
     decay = np.exp(-0.1 / seconds)
     state, seen = rng.normal(size=(RUNS, 3)), np.array(runs.displacement)
     for k in range(LONG):
@@ -139,7 +124,7 @@ def batched():
 
 
 @functools.cache
-def estimated(errors_=LASTING_WALK):
+def estimated(errors_=OF_WALK):
     runs = simulated()
     history = batched()(MODEL._replace(correlation=errors_), *runs[:6])
     error, covariance = errors(runs, history), np.asarray(history.covariance)
@@ -160,7 +145,7 @@ def test_the_filter_is_as_certain_as_it_may_be():
 
 def test_taken_for_white_they_make_it_too_certain():
     """Without any size they change nothing, as above: one program for both filters."""
-    error, covariance, _ = estimated(LASTING_WALK._replace(share=0.0))
+    error, covariance, _ = estimated(OF_WALK._replace(share=0.0))
     position = slice(6, 9)
     assert normalised(error[..., position], covariance[..., position, position]) > 4
     with_them, _, _ = estimated()

@@ -100,9 +100,8 @@ def by_hand(config, cut, gyro, accel):
             rows.append(np.concatenate([unyaw @ R @ a, unyaw @ R @ w]))
         return predict_numpy(np.array(rows))
 
-    options = {"n": N, "clones": CLONES, "convergence": 0.6, "scale": 2.0, "measure": measure}
-    frame = config.displacement_frame
-    return scekf_numpy.run_from(start(config), NOISE, DT, gyro, accel, frame=frame, **options)
+    options = {"measure": measure, "frame": config.displacement_frame}
+    return scekf_numpy.run_from(start(config), NOISE, config, gyro, accel, **options)
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,7 @@
 """The filter against recorded runs of TLIO's tracker and against a plain NumPy filter."""
 
 import functools
+import itertools
 from pathlib import Path
 
 import jax
@@ -75,60 +76,24 @@ def test_recorded_runs(name):
 STD = filtering.InitialStd(
     tilt=0.02, yaw=0.01, velocity=0.3, position=0.02, gyro_bias=2e-3, accel_bias=0.05
 )
-NOISE = dict(sigma_gyro=4e-3, sigma_accel=2e-2, walk_gyro=2e-3, walk_accel=3e-3)
 
 
-def both(walk, config, chunks=None):
+def both(walk, config, chunks=()):
     """The filter (in pieces, where `chunks` says so) and the oracle over one walk, from wrong
     initial biases."""
-    (R, v, p), gyro, accel, displacement, covariance = walk
-    bg, ba = np.array([1e-4, -2e-4, 3e-4]), np.array([0.01, 0.02, -0.01])
-    state = filtering.initial_state(config, R, v, p, bg, ba, STD)
-    noise = filtering.NoiseModel.per_sample(
-        NOISE["sigma_gyro"],
-        NOISE["sigma_accel"],
-        config.dt,
-        NOISE["walk_gyro"],
-        NOISE["walk_accel"],
+    pose, *signals = walk
+    start = filtering.initial_state(
+        config, *pose, np.array([1e-4, -2e-4, 3e-4]), np.array([0.01, 0.02, -0.01]), STD
     )
-    histories, begin = [], 0
-    for end in [*(chunks or []), len(displacement)]:
-        n = config.samples_per_clone
-        state, history = filtering.run_filter(
-            state,
-            gyro[begin * n : end * n],
-            accel[begin * n : end * n],
-            displacement[begin:end],
-            covariance[begin:end],
-            config,
-            noise,
-        )
+    noise = filtering.NoiseModel.per_sample(4e-3, 2e-2, config.dt, 2e-3, 3e-3)
+    n, state, histories = config.samples_per_clone, start, []
+    for begin, end in itertools.pairwise([0, *chunks, len(signals[2])]):
+        samples, rows = slice(begin * n, end * n), slice(begin, end)
+        cut = [each[part] for each, part in zip(signals, [samples] * 2 + [rows] * 2, strict=True)]
+        state, history = filtering.run_filter(state, *cut, config, noise)
         histories.append(history)
-        begin = end
     history = jax.tree.map(lambda *parts: np.concatenate(parts), *histories)
-    wanted = scekf_numpy.run(
-        gyro,
-        accel,
-        displacement,
-        covariance,
-        R,
-        v,
-        p,
-        dt=config.dt,
-        n=config.samples_per_clone,
-        clones=config.clones_per_window,
-        bg=bg,
-        ba=ba,
-        std=STD._asdict(),
-        scale=noise.measurement_scale,
-        fail_scale=config.mahalanobis_fail_scale,
-        threshold=config.gate_threshold,
-        convergence=config.convergence_seconds,
-        success=config.success_seconds,
-        pause=config.pause_seconds,
-        **NOISE,
-    )
-    return state, history, wanted
+    return state, history, scekf_numpy.run_from(start, noise, config, *signals, std=STD._asdict())
 
 
 def assert_same(history, wanted, absolute=1e-9):

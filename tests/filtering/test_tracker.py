@@ -264,7 +264,7 @@ def test_between_clones_it_integrates_the_imu(tracker):
         pose = tracker.pose()
         samples, none = slice(1, m + 1), (np.full((1, 3), np.nan), np.zeros((1, 3, 3)))
         wanted = scekf_numpy.run_from(
-            state, NOISE, DT, gyro[samples], accel[samples], *none, n=m, clones=9
+            state, NOISE, CONFIG, gyro[samples], accel[samples], *none, n=m, clones=9
         )
         assert pose.time == pytest.approx((m + 1) * DT)
         for name in ("rotation", "velocity", "position", "covariance"):

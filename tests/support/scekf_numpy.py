@@ -48,21 +48,29 @@ def yaw_matrix(R):
     return Rotation.from_euler("z", yaw).as_matrix()
 
 
-def run_from(state, noise, dt, gyro, accel, displacement=None, covariance=None, **options):
-    """`run` from a filter's state, with its `NoiseModel`."""
+def run_from(state, noise, config, gyro, accel, displacement=None, covariance=None, **others):
+    """`run` from a filter's state, with its `NoiseModel` and its `FilterConfig`; `others` are given
+    beside or instead of theirs."""
     mean = {"R": state.rotation, "v": state.velocity, "p": state.position}
-    biases = {"bg": state.gyro_bias, "ba": state.accel_bias}
-    return run(
-        gyro,
-        accel,
-        displacement,
-        covariance,
-        **{name: np.asarray(value) for name, value in (mean | biases).items()},
-        dt=dt,
-        sigma_gyro=noise.gyro_density / np.sqrt(dt),
-        sigma_accel=noise.accel_density / np.sqrt(dt),
-        **options,
+    mean |= {"bg": state.gyro_bias, "ba": state.accel_bias}
+    options = dict(
+        dt=config.dt,
+        n=config.samples_per_clone,
+        clones=config.clones_per_window,
+        sigma_gyro=noise.gyro_density / np.sqrt(config.dt),
+        sigma_accel=noise.accel_density / np.sqrt(config.dt),
+        walk_gyro=noise.gyro_bias_walk,
+        walk_accel=noise.accel_bias_walk,
+        scale=noise.measurement_scale,
+        fail_scale=config.mahalanobis_fail_scale,
+        threshold=config.gate_threshold,
+        convergence=config.convergence_seconds,
+        success=config.success_seconds,
+        pause=config.pause_seconds,
+        correlated=None if noise.correlation is None else noise.correlation._asdict(),
     )
+    mean = {name: np.asarray(value) for name, value in mean.items()}
+    return run(gyro, accel, displacement, covariance, **mean, **(options | others))
 
 
 def run(
@@ -92,13 +100,13 @@ def run(
     pause=1.0,
     measure=None,
     frame="given",
-    lasting=None,
+    correlated=None,
 ):
     """Returns a dict of histories.
 
     measure(k, clone_rotation, bg, ba), where given, supplies displacement and covariance at step k.
     frame "own": the displacement turns with the filter's own attitude, whose yaw then cancels.
-    lasting: share and seconds of the temporally correlated part of a window's error."""
+    correlated: share and seconds of the temporally correlated part of a window's error."""
     bg, ba = np.zeros(3) if bg is None else bg, np.zeros(3) if ba is None else ba
     P = np.diag(
         np.repeat(
@@ -114,10 +122,10 @@ def run(
         )
         ** 2
     )
-    errors = np.zeros(0 if lasting is None else 3)
+    errors = np.zeros(0 if correlated is None else 3)
     decay, spread = np.ones(len(errors)), np.ones(len(errors))
-    if lasting is not None:
-        decay = np.exp(-n * dt / lasting["seconds"]) * np.ones(3)
+    if correlated is not None:
+        decay = np.exp(-n * dt / correlated["seconds"]) * np.ones(3)
     core = 15 + len(errors)
     P = np.block(
         [
@@ -185,14 +193,14 @@ def run(
                 of_clone = slice(core, core + 3), slice(core + 3, core + 6)
                 H[:, of_clone[0]], H[:, of_clone[1]] = Ry.T @ skew(p - pi) @ Hz, -Ry.T
                 H[:, -3:] = Ry.T
-                expected, noise, lasting_part = Ry.T @ (p - pi), scale * C, 0
-                if lasting is not None:
-                    share, root = lasting["share"], np.linalg.cholesky(noise)
+                expected, noise, correlated_part = Ry.T @ (p - pi), scale * C, 0
+                if correlated is not None:
+                    share, root = correlated["share"], np.linalg.cholesky(noise)
                     H[:, 15:18] = share * root
                     expected = expected + share * root @ errors
-                    lasting_part = share**2 * noise
+                    correlated_part = share**2 * noise
                 r = d - expected
-                S = H @ P @ H.T + noise - lasting_part
+                S = H @ P @ H.T + noise - correlated_part
                 nis = r @ np.linalg.solve(S, r)
                 row.update(
                     nis=nis,
@@ -214,7 +222,7 @@ def run(
                         last_success, pause_end, active = None, now + round(pause / dt), False
                     if active and nis > threshold:
                         if fail_scale > 0:
-                            S = H @ P @ H.T + fail_scale * noise - lasting_part
+                            S = H @ P @ H.T + fail_scale * noise - correlated_part
                             row["accepted"] = 1.0
                     else:
                         last_success = now
@@ -242,7 +250,7 @@ def run(
         if not tried and last_success is not None:  # absence is not staleness
             last_success += n
         row.update(rotation=R, velocity=v, position=p, gyro_bias=bg, accel_bias=ba)
-        row.update(lasting=errors, lasting_covariance=P[15:core, 15:core])
+        row.update(correlated=errors, correlated_covariance=P[15:core, 15:core])
         row.update(covariance=P[:15, :15], covariance_diagonal=np.diag(P)[:15])
         for name, value in row.items():
             out.setdefault(name, []).append(value)
