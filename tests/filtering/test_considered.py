@@ -24,7 +24,6 @@ NOISE = filtering.NoiseModel(
 )
 START = filtering.InitialStd(gyro_bias=1e-4, velocity=0.1)
 STD = filtering.ConsideredStd(gyro_bias=0.02, scale=0.1, heading=0.08, slope=0.05)
-"""Of a tracker's vector of a pose."""
 SPREAD = np.array([*[STD.gyro_bias] * 3, *STD[1:]])
 
 
