@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 from gnio_jax.config import CompareConfig, EvaluateConfig
 from gnio_jax.errors import InputError
-from gnio_jax.evaluation import kept, statistics, tabulate
+from gnio_jax.evaluation import kept, tabulate
 from gnio_jax.evaluation.kept import IDENTITY
 from gnio_jax.evaluation.metrics import NAMES
 from gnio_jax.evaluation.report import REMEDY, Report, read
@@ -51,10 +51,6 @@ class Row(NamedTuple):
     reports: list[Report]
 
     @property
-    def seeds(self) -> list[statistics.Scores]:
-        return [report.scores for report in self.reports]
-
-    @property
     def way(self) -> str:
         """How its trajectories are estimated."""
         return " and ".join(dict.fromkeys(tabulate.way(each.settings) for each in self.reports))
@@ -64,8 +60,6 @@ class Comparison(NamedTuple):
     """What a comparison shows."""
 
     rows: list[Row]
-    groups: dict[str, str]
-    """Sequence → person or session."""
     cells: dict[str, list[Cell]]
     """Metric → a cell for each row."""
 
@@ -105,25 +99,18 @@ def compare(
     ]
     reports = [report for row in rows for report in row.reports]
     _check_recordings([source.folder for source in sources], reports)
-    groups = {name: group for report in reports for name, group in report.groups.items()}
-    cells = {
-        metric: statistics.cells(
-            [row.seeds for row in rows], metric, groups, tabulate.column(metric).best
-        )
-        for metric in _metrics(rows, config.metrics)
-    }
-    return Comparison(rows, groups, cells)
+    cells = tabulate.cells([row.reports for row in rows], _metrics(reports, config.metrics))
+    return Comparison(rows, cells)
 
 
-def _metrics(rows: list[Row], wanted: tuple[str, ...] | None) -> list[str]:
+def _metrics(reports: list[Report], wanted: tuple[str, ...] | None) -> tuple[str, ...]:
     """Those that are wanted; by default the usual ones that some row has."""
-    seeds = [scores for row in rows for scores in row.seeds]
-    there = {metric for scores in seeds for own in scores.values() for metric in own.values}
+    there = {x for report in reports for own in report.scores.values() for x in own.values}
     for metric in wanted or ():
         if metric not in there:
             has = ", ".join(name for name in NAMES if name in there)
             raise InputError("--metrics", f"no row has '{metric}'", f"there are: {has}")
-    return list(wanted) if wanted else [metric for metric in USUAL if metric in there]
+    return wanted or tuple(metric for metric in USUAL if metric in there)
 
 
 # The evaluations
@@ -299,23 +286,13 @@ def write(path: Path, found: Comparison) -> None:
     text = f"{title(found)}\n\n{tabulate.markdown(HEADER, lines(found))}\n"
     text += "\n\n".join(explanations(found))
     settings = found.rows[0].reports[0].settings
-    table = [
-        {
-            "dataset": settings["dataset"],
-            "split": settings["split"],
-            "estimated": row.way,
-            "metric": metric,
-            "row": row.label,
-            "seeds": len(row.runs),
-            **tabulate.plain(cell),
-        }
-        for metric, cells in found.cells.items()
-        for row, cell in zip(found.rows, cells, strict=True)
+    recordings = {name: settings[name] for name in ("dataset", "split")}
+    heads = [
+        {**recordings, "estimated": row.way, "row": row.label, "seeds": len(row.runs)}
+        for row in found.rows
     ]
-    tabulate.write(path, text, table)
+    tabulate.write(path, text, tabulate.records(heads, found.cells))
     drawn = [metric for metric, cells in found.cells.items() if any(c.mean.seeds for c in cells)]
-    rows = {row.label: row.seeds for row in found.rows}
-    metric = next(iter(drawn or found.cells))
-    picture = plots.paired(rows, metric, found.groups, tabulate.column(metric).title)
-    picture.axes[0].set_title(f"{settings['dataset']} {settings['split']}", fontsize=11)
+    rows = {row.label: row.reports for row in found.rows}
+    picture = plots.paired(rows, next(iter(drawn or found.cells)))
     plots.save(with_ending(path, ".png"), picture)

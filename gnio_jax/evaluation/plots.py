@@ -20,12 +20,11 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Ellipse
 from matplotlib.ticker import PercentFormatter
 
-from gnio_jax.evaluation import metrics, statistics
+from gnio_jax.evaluation import metrics, statistics, tabulate
 from gnio_jax.evaluation.estimators.result import Estimate
 from gnio_jax.evaluation.frames import in_the_references_frame, with_the_reference_in_its_frame
 from gnio_jax.evaluation.report import Report, file_names
 from gnio_jax.evaluation.setup import OnShare, no_progress
-from gnio_jax.evaluation.statistics import Scores
 from gnio_jax.evaluation.trajectory import Alignment
 from gnio_jax.files import replacing, shown_name
 from gnio_jax.numerics import finite_rows, spans
@@ -298,14 +297,15 @@ def _step(axes: Axes, values: Float[np.ndarray, "k"], **style: Any) -> None:
     axes.step(np.concatenate([[0.0], x]), share, where="post", **style)
 
 
-def paired(
-    rows: Mapping[str, Sequence[Scores]], metric: str, groups: Mapping[str, str], heading: str
-) -> Figure:
+def paired(rows: Mapping[str, Sequence[Report]], metric: str) -> Figure:
     """A metric of every sequence with every row: the mean over seeds a dot, each seed a fainter
     stroke, rows one below the other. A line per sequence, sorted by the first row; beside its name
     the person or session it belongs to, and a mark where a row diverged, which then has no dot."""
-    lost = [statistics.lost(seeds) for seeds in rows.values()]
-    tables = [statistics.values(seeds, metric) for seeds in rows.values()]
+    seeds = [[report.scores for report in row] for row in rows.values()]
+    lost = [statistics.lost(row) for row in seeds]
+    tables = [statistics.values(row, metric) for row in seeds]
+    groups = {n: own for row in rows.values() for each in row for n, own in each.groups.items()}
+    settings = next(iter(rows.values()))[0].settings
     first = {name: float(np.mean(own)) for name, own in tables[0].items()}
     names = sorted(
         dict.fromkeys(name for table in tables for name in table),
@@ -335,7 +335,8 @@ def paired(
         tick + (" †" if name in marked else "") for tick, name in zip(ticks, names, strict=True)
     ]
     axes.set_yticks(range(len(names)), ticks, fontsize=8)
-    axes.set_xlabel(heading)
+    axes.set_xlabel(tabulate.column(metric).title)
+    axes.set_title(f"{settings['dataset']} {settings['split']}", fontsize=11)
     if marked & {*names}:
         legend["† an estimate diverged"] = Line2D([], [], ls="")
     columns = 2 if max(map(len, legend)) < 40 else 1

@@ -196,6 +196,12 @@ class Cell(NamedTuple):
     """To the first row; None for the first itself, and without the metric."""
 
 
+def of_seeds(found: list[float]) -> Summary:
+    """A figure that is not one of sequences, with each seed."""
+    mean = float(np.mean(found)) if found else None
+    return Summary(mean, found, None, None, 0, 0, 0, len(found))
+
+
 def cells(
     rows: Sequence[Sequence[Scores]], metric: str, groups: Mapping[str, Any], best: float = 0.0
 ) -> list[Cell]:

@@ -13,6 +13,7 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
+from gnio_jax.evaluation import statistics
 from gnio_jax.evaluation.report import Report
 from gnio_jax.evaluation.statistics import Cell, Difference, Summary
 from gnio_jax.files import with_ending, write_csv, write_text
@@ -71,13 +72,13 @@ def column(metric: str) -> Column:
 # --------------------------------------------------------------------------------------------------
 
 
-def number(value: float | None, digits: int, sign: str = "") -> str:
+def number(value: float | None, digits: int) -> str:
     """One figure; – where it is not defined, ∞ where the estimate diverged."""
     if value is None or math.isnan(value):
         return "–"
     if math.isinf(value):
         return "∞"
-    return f"{value:{sign}.{digits}f}" if abs(value) < 10 ** (7 - digits) else f"{value:{sign}.1e}"
+    return f"{value:.{digits}f}" if abs(value) < 10 ** (7 - digits) else f"{value:.1e}"
 
 
 def mean(found: Summary, digits: int) -> str:
@@ -105,25 +106,39 @@ def difference(found: Difference | None, digits: int) -> str:
     return f"{found.mean:+.{digits}f}{reach}{over}"
 
 
-def plain(cell: Cell) -> dict[str, float | int | None]:
-    """The figures of a cell under the names that every CSV has for them."""
-    mean, found = cell
-    low, high = (found and found.interval) or (None, None)
-    return {
-        "mean": mean.mean,
-        "std": mean.std,
-        "median": mean.median,
-        "diverged": mean.diverged,
-        "estimates": mean.estimates,
-        "difference": found and found.mean,
-        "difference_low": low,
-        "difference_high": high,
-        "gain_percent": found and found.gain,
-        "better": None if found is None or found.withheld else found.better,
-        "compared": found and found.compared,
-        "sequences": found and found.sequences,
-        "groups": found and found.groups,
-    }
+def cells(rows: Sequence[Sequence[Report]], metrics: Iterable[str]) -> dict[str, list[Cell]]:
+    """Metric → a cell for each row, whose seeds are reports; compared with the first row."""
+    groups = {name: own for row in rows for each in row for name, own in each.groups.items()}
+    seeds = [[each.scores for each in row] for row in rows]
+    return {name: statistics.cells(seeds, name, groups, column(name).best) for name in metrics}
+
+
+def records(
+    heads: Sequence[Mapping[str, Any]], figures: Mapping[str, Sequence[Cell]]
+) -> list[dict[str, Any]]:
+    """The lines of a CSV, one for each metric and row: the head of the row, then its figures."""
+    lines = []
+    for metric, own in figures.items():
+        for head, (over, found) in zip(heads, own, strict=True):
+            low, high = (found and found.interval) or (None, None)
+            line = {
+                "metric": metric,
+                "mean": over.mean,
+                "std": over.std,
+                "median": over.median,
+                "diverged": over.diverged,
+                "estimates": over.estimates,
+                "difference": found and found.mean,
+                "difference_low": low,
+                "difference_high": high,
+                "gain_percent": found and found.gain,
+                "better": None if found is None or found.withheld else found.better,
+                "compared": found and found.compared,
+                "sequences": found and found.sequences,
+                "groups": found and found.groups,
+            }
+            lines.append({**head, **line})
+    return lines
 
 
 def marks(cells: Sequence[Cell]) -> list[str]:

@@ -39,7 +39,7 @@ PUBLISHED = {
 """Published ATE, m (paper, table II), by dataset and split, then by network."""
 
 
-class Cell(NamedTuple):
+class Row(NamedTuple):
     """One row of a table before it is run."""
 
     name: str
@@ -56,7 +56,7 @@ class Experiment(NamedTuple):
     title: str
     source: str
     """Where the published figures are and what they were measured on."""
-    cells: list[Cell]
+    rows: list[Row]
 
 
 # One row
@@ -122,8 +122,8 @@ def comparison(base: TrainConfig, split: str, networks: tuple[str, ...] = METHOD
     source = "no published figure for this split"
     if published:
         source = f"paper, table II: ATE on {base.dataset} {split}"
-    cells = [Cell(name, name, method(name, base), published.get(name)) for name in networks]
-    return Experiment("Networks", source, cells)
+    rows = [Row(name, name, method(name, base), published.get(name)) for name in networks]
+    return Experiment("Networks", source, rows)
 
 
 def components(base: TrainConfig) -> Experiment:
@@ -135,11 +135,11 @@ def components(base: TrainConfig) -> Experiment:
         "Components",
         "paper, component ablation: RMSE on TLIO's set",
         [
-            Cell("tlio", "baseline (TLIO)", method("tlio", base), 2.40),
-            Cell("gnio_bank-0_linear", "encoder + linear head", plain),
-            Cell("gnio_linear", "+ bank", bank, 1.98),
-            Cell("gnio_bank-0", "+ gated head", gated, 1.84),
-            Cell("gnio", "+ bank + gated head", method("gnio", base), 1.66),
+            Row("tlio", "baseline (TLIO)", method("tlio", base), 2.40),
+            Row("gnio_bank-0_linear", "encoder + linear head", plain),
+            Row("gnio_linear", "+ bank", bank, 1.98),
+            Row("gnio_bank-0", "+ gated head", gated, 1.84),
+            Row("gnio", "+ bank + gated head", method("gnio", base), 1.66),
         ],
     )
 
@@ -148,12 +148,12 @@ def gates(base: TrainConfig) -> Experiment:
     """Activations of gate and scale, without the bank: the paper's best row equals its gate-only
     row."""
 
-    def row(gate: str, scale: str, published: float) -> Cell:
+    def row(gate: str, scale: str, published: float) -> Row:
         name, options = f"gnio_bank-0_{gate}_{scale}", {"gate": gate, "scale": scale}
         if (gate, scale) == ("tanh", "softplus"):  # the defaults: the row of `components`
             name, options = "gnio_bank-0", {}
         config = variant(base, bank_size=0, **options)
-        return Cell(name, f"{gate} × {scale}", config, published)
+        return Row(name, f"{gate} × {scale}", config, published)
 
     return Experiment(
         "Gate and scale",
@@ -172,19 +172,19 @@ def gates(base: TrainConfig) -> Experiment:
 def bank_sizes(base: TrainConfig) -> Experiment:
     """Prototypes in the bank, with the linear head: the paper's m = 64 equals its bank-only row."""
 
-    def row(size: int, published: float | None) -> Cell:
+    def row(size: int, published: float | None) -> Row:
         config = variant(base, head="linear", bank_size=size)
-        return Cell(f"gnio_bank-{size}_linear", f"m = {size}", config, published)
+        return Row(f"gnio_bank-{size}_linear", f"m = {size}", config, published)
 
     return Experiment(
         "Bank size",
         "paper, size of the bank: RMSE on TLIO's set, with the linear head",
         [
-            Cell("gnio_bank-0_linear", "no bank", variant(base, bank_size=0, head="linear")),
+            Row("gnio_bank-0_linear", "no bank", variant(base, bank_size=0, head="linear")),
             row(16, 2.07),
             row(32, None),
             # The default size: the row of `components`.
-            Cell("gnio_linear", "m = 64", variant(base, head="linear"), 1.98),
+            Row("gnio_linear", "m = 64", variant(base, head="linear"), 1.98),
             row(128, 2.07),
         ],
     )

@@ -8,11 +8,12 @@ import math
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from gnio_jax import config as configuration
 from gnio_jax import models
@@ -20,20 +21,18 @@ from gnio_jax.config import TablesConfig, TrainConfig
 from gnio_jax.cores import usable_cores
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import statistics, tabulate
-from gnio_jax.evaluation.statistics import Cell as Figure
+from gnio_jax.evaluation.statistics import Cell
 from gnio_jax.files import with_ending, write_text
 from gnio_jax.reporting import Lines, Reporter
 from gnio_jax.tables import activities, experiments
 from gnio_jax.tables.experiments import Experiment
-from gnio_jax.tables.runs import Result, run_cell
+from gnio_jax.tables.runs import Result, run_row
 
 METRICS = (
     *("ate", "ate_2d", "ate_ronin_2d", "rpe_1s", "rte_60s", "path_length_ratio"),
     *("stationary_drift", "nis", "nees"),
 )
 """Of every table. The first is what rows are compared by."""
-Extra = Mapping[str, Mapping[str, float]]
-"""Figures that belong to one table alone: name of a cell → heading → value."""
 
 
 def make(options: TablesConfig, reporter: Reporter | None = None, workers: int = 1) -> str:
@@ -59,7 +58,7 @@ def make(options: TablesConfig, reporter: Reporter | None = None, workers: int =
             experiment = experiments.comparison(base, options.split, networks(options))
     if options.table == "trajectories":
         options = dataclasses.replace(options, seeds=1)
-    results = [run_cell(cell, options, reporter, workers) for cell in experiment.cells]
+    results = [run_row(row, options, reporter, workers) for row in experiment.rows]
     name = f"{options.table}_{options.split}_{options.estimator}"
     path = Path(options.out) / (f"{name}_calibrated" if options.calibrate else name)
     said = notes(base, options, experiment)
@@ -135,24 +134,23 @@ def make_table(
     """comparison, components, gates, bank-size: the files, and the text to show."""
     from gnio_jax.tables import plots  # Matplotlib takes a second to import
 
-    extra: dict[str, dict[str, float]] = {}
-    if options.table == "gates":
-        norms = {each.cell.name: np.array([*map(scale_gradients, each.runs)]) for each in results}
-        extra = {
-            name: {"gradient of the scale, mean": own.mean(), "largest epoch": own.max()}
-            for name, own in norms.items()
-        }
-        plots.save(path.with_name(f"{path.name}_gradients.png"), plots.gradients(results, norms))
-    if options.table == "bank-size":
-        extra = {
-            each.cell.name: _entropies(each, options.split)
-            for each in results
-            if each.cell.config.model.bank_size != 0
-        }
     figures = figures_of(results)
+    if options.table == "gates":
+        norms = [np.array([scale_gradients(run) for run in each.runs]) for each in results]
+        plots.save(path.with_name(f"{path.name}_gradients.png"), plots.gradients(results, norms))
+        figures |= _over_seeds("gradient of the scale, mean", [own.mean(1) for own in norms])
+        figures |= _over_seeds("gradient of the scale, largest", [own.max(1) for own in norms])
+    if options.table == "bank-size":
+        entropies = [_entropies(each, options.split) for each in results]
+        figures |= _over_seeds("entropy of a window", [own[:, 0] for own in entropies])
+        figures |= _over_seeds("entropy of their mean", [own[:, 1] for own in entropies])
     plots.save(with_ending(path, ".png"), plots.table(experiment, results, figures["ate"]))
-    text = f"## {experiment.title}\n\n{said}\n\n{render(experiment, figures, extra)}"
-    tabulate.write(path, text, csv_rows(experiment, results, figures, extra))
+    text = f"## {experiment.title}\n\n{said}\n\n{render(experiment, figures)}"
+    heads = [
+        {"row": row.name, "label": row.label, "seeds": options.seeds, "published": row.published}
+        for row in experiment.rows
+    ]
+    tabulate.write(path, text, tabulate.records(heads, figures))
     return f"{text}\nresults: {path}.md, .csv, .png"
 
 
@@ -162,67 +160,51 @@ def scale_gradients(run: Path) -> list[float]:
     return [json.loads(line)["gradient_norm/head/scale"] for line in lines]
 
 
-def _entropies(result: Result, split: str) -> dict[str, float]:
-    """Entropy of the attention, as means over the seeds."""
-    predicted = [activities.predict_split(run, split) for run in result.runs]
-    found = [activities.entropy(windows.diagnostics["attention"]) for windows in predicted]
-    of_window, of_mean = np.mean(found, axis=0)
-    return {"entropy of a window": of_window, "of their mean": of_mean}
+def _entropies(result: Result, split: str) -> Float[np.ndarray, "seeds 2"]:
+    """Entropies of the attention of each run; none of a network without a bank."""
+    if result.row.config.model.bank_size == 0:
+        return np.zeros((0, 2))
+    windows = [activities.predict_split(run, split) for run in result.runs]
+    return np.array([activities.entropy(each.diagnostics["attention"]) for each in windows])
 
 
-def figures_of(results: list[Result]) -> dict[str, list[Figure]]:
-    """Metric → the figures of every row, compared with the first; metrics that no row has are left
-    out."""
-    reports = [report for result in results for report in result.reports]
-    groups = {name: group for report in reports for name, group in report.groups.items()}
-    seeds = [result.seeds for result in results]
-    found = {
-        metric: statistics.cells(seeds, metric, groups, tabulate.column(metric).best)
-        for metric in METRICS
-    }
+def _over_seeds(name: str, rows: list[Float[np.ndarray, "_"]]) -> dict[str, list[Cell]]:
+    """A figure that belongs to this table alone, of each row with its seeds."""
+    return {name: [Cell(statistics.of_seeds(own.tolist()), None) for own in rows]}
+
+
+def figures_of(results: list[Result]) -> dict[str, list[Cell]]:
+    """Metric → the figures of every row, compared with the first, where a row has some."""
+    found = tabulate.cells([result.reports for result in results], METRICS)
     return {
         metric: own
         for metric, own in found.items()
-        if metric == "ate" or any(c.mean.seeds for c in own)
+        if metric == "ate" or any(figure.mean.seeds for figure in own)
     }
 
 
-def render(experiment: Experiment, figures: Mapping[str, list[Figure]], extra: Extra) -> str:
+def render(experiment: Experiment, figures: Mapping[str, list[Cell]]) -> str:
     """The table as Markdown, then what its marks mean."""
-    headings = list(dict.fromkeys(name for own in extra.values() for name in own))
-    columns = {metric: tabulate.column(metric) for metric in figures}
-    header = ["", *(column.title for column in columns.values()), "median ATE (m)", *headings]
-    header += ["gain", "difference of ATE, m (95 %)", "published (m)", "its gain"]
-    first, table = experiment.cells[0], []
-    for place, cell in enumerate(experiment.cells):
-        row = {metric: own[place] for metric, own in figures.items()}
-        mean, difference = row["ate"]
-        gains = (
-            difference and difference.gain,
-            None if None in (cell.published, first.published) else _gain(cell, first),
-        )
-        own = extra.get(cell.name, {})
-        ours, published = (arrow(gain) if place else "" for gain in gains)
+    columns = {name: tabulate.column(name) for name in figures}
+    header = ["", *(column.title for column in columns.values()), "median ATE (m)", "gain"]
+    header += ["difference of ATE, m (95 %)", "published (m)", "its gain"]
+    table, first = [], experiment.rows[0].published
+    for place, row in enumerate(experiment.rows):
+        mean, difference = figures["ate"][place]
+        published = None if None in (row.published, first) else 100 * (1 - row.published / first)
         table.append(
             [
-                cell.label,
-                *(tabulate.mean(row[metric].mean, columns[metric].digits) for metric in row),
+                row.label,
+                *(tabulate.mean(figures[x][place].mean, own.digits) for x, own in columns.items()),
                 tabulate.number(mean.median, 2),
-                *(f"{own[name]:.3g}" if name in own else "–" for name in headings),
-                ours,
+                arrow(difference and difference.gain) if place else "",
                 tabulate.difference(difference, 2),
-                tabulate.number(cell.published, 2),
-                published,
+                tabulate.number(row.published, 2),
+                arrow(published) if place else "",
             ]
         )
     marks = "".join(f"\n{line}\n" for line in tabulate.marks(figures["ate"]))
     return tabulate.markdown(header, table) + marks
-
-
-def _gain(cell: experiments.Cell, first: experiments.Cell) -> float:
-    """By how much the published figure is smaller than the first row's, %."""
-    assert cell.published is not None and first.published is not None
-    return 100 * (1 - cell.published / first.published)
 
 
 def arrow(gain: float | None) -> str:
@@ -235,28 +217,6 @@ def arrow(gain: float | None) -> str:
     return f"{'↓' if gain > 0 else '↑'} {abs(gain):.1f} %"
 
 
-def csv_rows(
-    experiment: Experiment,
-    results: list[Result],
-    figures: Mapping[str, list[Figure]],
-    extra: Extra,
-) -> list[dict[str, Any]]:
-    """A line for each row and metric."""
-    lines = []
-    for place, cell in enumerate(experiment.cells):
-        head = {
-            "row": cell.name,
-            "label": cell.label,
-            "seeds": len(results[place].runs),
-            "published": cell.published,
-        }
-        own = {metric: tabulate.plain(found[place]) for metric, found in figures.items()}
-        empty = dict.fromkeys(own["ate"])
-        own |= {name: empty | {"mean": value} for name, value in extra.get(cell.name, {}).items()}
-        lines += [{**head, "metric": metric, **values} for metric, values in own.items()]
-    return lines
-
-
 # All methods over the reference, and windows by what the walker did
 # --------------------------------------------------------------------------------------------------
 
@@ -267,7 +227,7 @@ def make_trajectories(path: Path, options: TablesConfig, results: list[Result]) 
     from gnio_jax.evaluation import page
     from gnio_jax.tables import plots
 
-    runs = [page.of_folder(each.folders[0], each.reports[0], each.cell.label) for each in results]
+    runs = [page.of_folder(each.folders[0], each.reports[0], each.row.label) for each in results]
     known = {seen.name: seen for seen in runs[0].views if seen.known}
     wanted = _words(options.sequences) if options.sequences else tuple(known)[:8]
     for name in wanted:
@@ -292,8 +252,8 @@ def make_standing(
     lines, by_method = [], {}
     for result in results:
         seeds = [activities.predict_split(run, options.split) for run in result.runs]
-        by_method[result.cell.name] = activities.mean_over_seeds(seeds)
-        beside = f"{path.name}_{result.cell.name}"
+        by_method[result.row.name] = activities.mean_over_seeds(seeds)
+        beside = f"{path.name}_{result.row.name}"
         if "gate" in seeds[0].diagnostics:
             plots.save(path.with_name(f"{beside}_gate.png"), plots.gate(seeds[0]))
         if "attention" in seeds[0].diagnostics:
@@ -302,11 +262,11 @@ def make_standing(
                 f"the most attended prototype tells {told:.2f} bits of the activity, "
                 f"by chance it would be {chance:.2f}"
             )
-            lines.append(f"{result.cell.label}: {words}.\n\n")
+            lines.append(f"{result.row.label}: {words}.\n\n")
             picture = plots.attention(*activities.attention_by_activity(seeds[0]), words)
             plots.save(path.with_name(f"{beside}_attention.png"), picture)
     plots.save(with_ending(path, ".png"), plots.standing(by_method))
-    table = render(experiment, figures_of(results), {})
+    table = render(experiment, figures_of(results))
     head = f"## {experiment.title}\n\n{said}\n\n{''.join(lines)}"
     text = f"{head}{table}\n{activities.render(by_method)}"
     write_text(with_ending(path, ".md"), text)

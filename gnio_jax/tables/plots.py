@@ -47,7 +47,7 @@ METHODS = {
 def table(experiment: Experiment, results: list[Result], ates: list[Cell]) -> Figure:
     """`ate` of each row: every seed a dot, their mean a bar, sequences behind it; beside it what
     the paper printed. Of what diverged there is no dot: the row's label says how many."""
-    published = [cell.published for cell in experiment.cells]
+    published = [row.published for row in experiment.rows]
     beside = any(value is not None for value in published)
     size = (9.0 if beside else 6.4, 1.4 + 0.45 * len(results))
     figure = Figure(figsize=size, layout="constrained")
@@ -65,7 +65,7 @@ def table(experiment: Experiment, results: list[Result], ates: list[Cell]) -> Fi
         seeds = np.full(len(mean.seeds), place)
         ours.plot(mean.seeds, seeds, "o", color="black", ms=4, label=labels[1])
         diverged = f"\n({mean.diverged} of {mean.estimates} diverged)" if mean.diverged else ""
-        names.append(result.cell.label + diverged)
+        names.append(result.row.label + diverged)
     ours.set_yticks(range(len(results)), names)
     ours.invert_yaxis()
     ours.set(xlabel="ATE, here (m)", title=experiment.title)
@@ -84,17 +84,14 @@ def table(experiment: Experiment, results: list[Result], ates: list[Cell]) -> Fi
     return figure
 
 
-def gradients(
-    results: list[Result], norms: Mapping[str, Float[np.ndarray, "seeds epochs"]]
-) -> Figure:
+def gradients(results: list[Result], norms: Sequence[Float[np.ndarray, "seeds epochs"]]) -> Figure:
     """Norm of the gradient of the scale's layer over training, one line per row: the mean over
     seeds, their range shaded."""
     figure = Figure(figsize=(6.8, 4.2), layout="constrained")
     axes = figure.add_subplot()
-    for result, colour in zip(results, COLOURS, strict=False):
-        own = norms[result.cell.name]
+    for result, own, colour in zip(results, norms, COLOURS, strict=False):
         epochs = np.arange(1, own.shape[1] + 1)
-        axes.semilogy(epochs, own.mean(0), color=colour, label=result.cell.label)
+        axes.semilogy(epochs, own.mean(0), color=colour, label=result.row.label)
         axes.fill_between(epochs, own.min(0), own.max(0), color=colour, alpha=0.15, lw=0)
     axes.set(
         xlabel="epoch",

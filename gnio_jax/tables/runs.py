@@ -17,7 +17,7 @@ from gnio_jax.evaluation import kept
 from gnio_jax.evaluation.report import Report
 from gnio_jax.evaluation.statistics import Scores
 from gnio_jax.reporting import Reporter
-from gnio_jax.tables.experiments import Cell
+from gnio_jax.tables.experiments import Row
 from gnio_jax.training import loop, run_folder
 
 
@@ -30,9 +30,9 @@ class Interrupted(Exception):
 
 
 class Result(NamedTuple):
-    """A cell after all its seeds."""
+    """A row after all its seeds."""
 
-    cell: Cell
+    row: Row
     reports: list[Report]
     runs: list[Path]
     """Their work folders."""
@@ -44,8 +44,8 @@ class Result(NamedTuple):
         return [report.scores for report in self.reports]
 
 
-def run_cell(cell: Cell, options: TablesConfig, reporter: Reporter, workers: int = 1) -> Result:
-    """Train, calibrate if that is asked for, and evaluate a cell with seeds 0 … seeds−1 below
+def run_row(row: Row, options: TablesConfig, reporter: Reporter, workers: int = 1) -> Result:
+    """Train, calibrate if that is asked for, and evaluate a row with seeds 0 … seeds−1 below
     OUT/runs.
 
     A run that is finished is not trained again, one that was interrupted goes on, a calibration and
@@ -53,8 +53,8 @@ def run_cell(cell: Cell, options: TablesConfig, reporter: Reporter, workers: int
     settings or of other recordings, and `Interrupted` after a signal. `workers` processes read
     recordings that are slow to read.
     """
-    workdir = Path(options.out) / "runs" / cell.name
-    config, seeds = dataclasses.replace(cell.config, workdir=str(workdir)), range(options.seeds)
+    workdir = Path(options.out) / "runs" / row.name
+    config, seeds = dataclasses.replace(row.config, workdir=str(workdir)), range(options.seeds)
     train(config, seeds, reporter, workers)
     runs = [Path(each.workdir or "") for each in configuration.with_seeds(config, seeds)]
     if options.calibrate:
@@ -67,7 +67,7 @@ def run_cell(cell: Cell, options: TablesConfig, reporter: Reporter, workers: int
         for run in runs
     ]
     reports = [kept.made(each, reporter, workers) for each in looked]
-    return Result(cell, reports, runs, [each.folder for each in looked])
+    return Result(row, reports, runs, [each.folder for each in looked])
 
 
 def train(config: TrainConfig, seeds: Sequence[int], reporter: Reporter, workers: int = 1) -> None:
@@ -96,12 +96,10 @@ def _state(config: TrainConfig) -> str:
         return "new"
     run_folder.refuse_other_run(config, resume=True)
     if data.get(config.dataset).needs_root:
-        roots = [
-            data.find_root(config.dataset, root).resolve()
-            for root in (configuration.load(file).data_root, config.data_root)
-        ]
-        if roots[0] != roots[1]:
-            problem = f"was trained on the recordings of {roots[0]}, not of {roots[1]}"
+        theirs = Path(configuration.load(file).data_root or data.find_root(config.dataset))
+        ours = data.find_root(config.dataset, config.data_root)
+        if theirs.is_dir() and theirs.resolve() != ours.resolve():  # else the folder has moved
+            problem = f"was trained on the recordings of {theirs}, not of {ours}"
             raise InputError(file, problem, "give another --out")
     log = workdir / "metrics.jsonl"
     rows = log.read_text(encoding="utf-8").count("\n") if log.exists() else 0

@@ -8,7 +8,7 @@ import pytest
 from gnio_jax import config as configuration
 from gnio_jax.apps import compare as comparison
 from gnio_jax.commands import app
-from gnio_jax.config import CompareConfig, TrainConfig
+from gnio_jax.config import CompareConfig, EvaluateConfig, TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import kept, tabulate
 from tests.support.reports import LOST, report_of, write_report, write_run
@@ -226,22 +226,20 @@ def test_figures_of_other_recordings_are_never_compared(tmp_path, monkeypatch):
         write_run(tmp_path / name)
         configuration.save(tmp_path / name / "config.yaml", config)
 
+    def asked(run, root):
+        return EvaluateConfig(str(tmp_path / run), data_root=str(tmp_path / root))
+
     def evaluate(config, *_):
-        root = str(config.data_root)
-        name = config.workdir.removeprefix(f"{tmp_path}/")
-        made = {"dataset": "tlio", "data_root": root, "filter": FILTER}
-        ate = 1.0 if root.endswith("A") else 2.0
-        write_report(
-            tmp_path / name / "eval" / "tlio_test_ekf", report_of({"a": ate}, GROUPS, **made)
-        )
+        made = {"dataset": "tlio", "data_root": config.data_root, "filter": FILTER}
+        ate = 1.0 if config.data_root.endswith("A") else 2.0
+        write_report(kept.look(config).folder, report_of({"a": ate}, GROUPS, **made))
 
     monkeypatch.setattr(kept, "evaluate", evaluate)
-    on_a = kept.EvaluateConfig(f"{tmp_path}/one", data_root=f"{tmp_path}/A")
-    evaluate(on_a)
+    evaluate(asked("one", "A"))
     found = compare(tmp_path / "one", tmp_path / "two", data_root=str(tmp_path / "B"))
     assert [cell.mean.mean for cell in found.cells["ate"]] == [2.0, 2.0]
-    evaluate(on_a)
-    folders = [tmp_path / name / "eval" / "tlio_test_ekf" for name in ("one", "two")]
+    evaluate(asked("one", "A"))
+    folders = [kept.look(asked(*of)).folder for of in (("one", "A"), ("two", "B"))]
     with pytest.raises(InputError, match=r"is of data root .*B, the first row of .*A"):
         compare(*folders)
     with pytest.raises(InputError, match=r"give --data-root .*B for the runs"):

@@ -5,7 +5,7 @@ import pytest
 
 from gnio_jax.evaluation import Trajectory, plots
 from tests.support.estimates import SETTINGS, estimate
-from tests.support.reports import LOST, measures
+from tests.support.reports import LOST, report_of
 
 
 @pytest.fixture(autouse=True)
@@ -158,14 +158,13 @@ def test_a_short_walk_and_a_name_of_any_bytes_are_drawn(tmp_path):
 def test_rows_side_by_side():
     """Dots of what diverged are not there; its name is marked. Names that Matplotlib would read
     otherwise stand as they are."""
-    seeds = [[1.0, 5.0], [3.0, 7.0]]
-    first = [{n: measures(ate=x) for n, x in zip("ab", row, strict=True)} for row in seeds]
-    second = [{"a": measures(ate=LOST), "b": measures(ate=2.0), "c": measures(ate=4.0)}]
-    rows = {"a$x^$": first, "_under": second, "\udcff_x": second}
-    figure = plots.paired(
-        rows, "ate", dict(zip("abc", ("ann", "bob", "bob"), strict=True)), "ATE (m)"
-    )
+    groups = {"a": "ann", "b": "bob", "c": "bob"}
+    seeds = ({"a": 1.0, "b": 5.0}, {"a": 3.0, "b": 7.0})
+    first = [report_of(ates, groups) for ates in seeds]
+    second = [report_of({"a": LOST, "b": 2.0, "c": 4.0}, groups)]
+    figure = plots.paired({"a$x^$": first, "_under": second, "\udcff_x": second}, "ate")
     (axes,) = figure.axes
+    assert axes.get_xlabel() == "ATE (m)" and axes.get_title() == "synthetic test"
     ticks = [label.get_text() for label in axes.get_yticklabels()]
     assert ticks == ["c  (bob)", "a  (ann) †", "b  (bob)"]
     dots = [line for line in axes.get_lines() if line.get_marker() == "o"]

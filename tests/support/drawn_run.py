@@ -26,5 +26,6 @@ def save(folder, config, draw):
         for kind, tree in shapes.items()
     }
     state = TrainState(jnp.int32(0), drawn["params"], drawn["batch_stats"], {})
-    checkpoint.save(folder, "best", state, checkpoint.Position(epoch=1, best=1.0))
+    with checkpoint.Checkpoints(folder) as checkpoints:
+        checkpoints.save("best", state, checkpoint.Position(epoch=1, best=1.0))
     return folder

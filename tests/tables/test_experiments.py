@@ -24,20 +24,20 @@ def test_rows_differ_in_the_network_alone(make):
     """Every row can be built, two are never the same, those of a name are; loss and regularisation
     apart, only the network differs. Every checkpoint is chosen by one criterion."""
     seen = {}
-    for cell in make(BASE).cells:
-        assert create_model(cell.config) is not None
-        assert seen.setdefault(cell.name, cell.config) == cell.config
+    for row in make(BASE).rows:
+        assert create_model(row.config) is not None
+        assert seen.setdefault(row.name, row.config) == row.config
         optim = dataclasses.replace(
-            cell.config.optim, clip_norm=BASE.optim.clip_norm, weight_decay=BASE.optim.weight_decay
+            row.config.optim, clip_norm=BASE.optim.clip_norm, weight_decay=BASE.optim.weight_decay
         )
         assert optim.best_by == "squared_error"
         same = dataclasses.replace(
             BASE, optim=dataclasses.replace(BASE.optim, best_by="squared_error")
         )
         assert (
-            dataclasses.replace(cell.config, model=BASE.model, loss=BASE.loss, optim=optim) == same
+            dataclasses.replace(row.config, model=BASE.model, loss=BASE.loss, optim=optim) == same
         )
-        assert cell.config.model.name != "gnio" or (cell.config.loss, cell.config.optim) == (
+        assert row.config.model.name != "gnio" or (row.config.loss, row.config.optim) == (
             same.loss,
             same.optim,
         )
@@ -55,7 +55,7 @@ def test_tlio_is_held_for_the_published_steps_or_half_of_the_run(epochs, batch, 
     assert experiments.method("tlio", base).loss.log_std_from_epoch == held
 
 
-def test_cells_of_one_name_are_one_run_in_every_table():
+def test_rows_of_one_name_are_one_run_in_every_table():
     tables = [
         make(BASE)
         for make in (
@@ -64,32 +64,28 @@ def test_cells_of_one_name_are_one_run_in_every_table():
             experiments.bank_sizes,
         )
     ]
-    made = [
-        cell for table in (*tables, experiments.comparison(BASE, "test")) for cell in table.cells
-    ]
+    made = [row for table in (*tables, experiments.comparison(BASE, "test")) for row in table.rows]
     by_name = {}
-    for cell in made:
-        assert by_name.setdefault(cell.name, cell.config) == cell.config
+    for row in made:
+        assert by_name.setdefault(row.name, row.config) == row.config
     assert len(by_name) < len(made)
 
 
 def test_rows_are_the_published_configurations():
-    gates = {cell.label: cell.config.model for cell in experiments.gates(BASE).cells}
+    gates = {row.label: row.config.model for row in experiments.gates(BASE).rows}
     assert (
         all(model.bank_size == 0 for model in gates.values()) and gates["tanh × exp"].scale == "exp"
     )
-    banks = {cell.label: cell.config.model for cell in experiments.bank_sizes(BASE).cells}
+    banks = {row.label: row.config.model for row in experiments.bank_sizes(BASE).rows}
     assert all(model.head == "linear" for model in banks.values())
-    assert [create_model(cell.config).bank_size for cell in experiments.bank_sizes(BASE).cells] == [
+    assert [create_model(row.config).bank_size for row in experiments.bank_sizes(BASE).rows] == [
         0,
         16,
         32,
         64,
         128,
     ]
-    parts = [
-        (cell.config.model.name, cell.published) for cell in experiments.components(BASE).cells
-    ]
+    parts = [(row.config.model.name, row.published) for row in experiments.components(BASE).rows]
     assert parts == [("tlio", 2.40), ("gnio", None), ("gnio", 1.98), ("gnio", 1.84), ("gnio", 1.66)]
 
 

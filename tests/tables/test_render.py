@@ -5,8 +5,9 @@ import csv
 import pytest
 
 from gnio_jax.evaluation import tabulate
+from gnio_jax.evaluation.statistics import Cell, of_seeds
 from gnio_jax.tables import make, plots
-from gnio_jax.tables.experiments import Cell, Experiment
+from gnio_jax.tables.experiments import Experiment, Row
 from gnio_jax.tables.runs import Result
 from tests.support.reports import BASE, LOST, report_of
 
@@ -17,11 +18,11 @@ def result(name, ates, published=None, groups="xyz"):
     of = dict(zip(names, groups, strict=False))
     reports = [report_of(dict(zip(names, row, strict=True)), of) for row in ates]
     runs = [f"{name}_s{seed}" for seed in range(len(ates))]
-    return Result(Cell(name, name.upper(), BASE, published), reports, runs, runs)
+    return Result(Row(name, name.upper(), BASE, published), reports, runs, runs)
 
 
 def table_of(*results):
-    return Experiment("Title", "source", [each.cell for each in results])
+    return Experiment("Title", "source", [each.row for each in results])
 
 
 def test_a_table_by_hand():
@@ -31,12 +32,13 @@ def test_a_table_by_hand():
     ]
     figures = make.figures_of(results)
     assert list(figures) == ["ate", "rpe_1s"]
-    text = make.render(table_of(*results), figures, {"b": {"more": 0.5}})
+    figures |= {"more": [Cell(of_seeds([]), None), Cell(of_seeds([0.25, 0.75]), None)]}
+    text = make.render(table_of(*results), figures)
     assert (
-        "| B | 1.50 ± 0.71 | 0.150 ± 0.071 | 1.50 | 0.5 | ↓ 50.0 % | -1.50 (-5.80 to +2.80) "
-        "| 1.80 | ↓ 25.0 % |"
+        "| B | 1.50 ± 0.71 | 0.150 ± 0.071 | 0.500 ± 0.354 | 1.50 | ↓ 50.0 % "
+        "| -1.50 (-5.80 to +2.80) | 1.80 | ↓ 25.0 % |"
     ) in text
-    assert "| A | 3.00 ± 0.00 | 0.300 ± 0.000 | 2.50 | – |  |  | 2.40 |  |" in text
+    assert "| A | 3.00 ± 0.00 | 0.300 ± 0.000 | – | 2.50 |  |  | 2.40 |  |" in text
     assert "there are 3." in text and "†" not in text
 
 
@@ -49,12 +51,13 @@ def test_what_diverged_is_in_the_files_and_the_picture(tmp_path):
         result("d", [[0.5, 1.0, LOST]]),
     ]
     experiment, figures = table_of(*results), make.figures_of(results)
-    text = make.render(experiment, figures, {})
+    text = make.render(experiment, figures)
     assert "| B | 8.00 † 2/3 |" in text and "| ↑ 100.0 % | +4.00 over 1 |" in text
     assert "| C | – † 3/3 | – † 3/3 | ∞ | – | – |" in text and "| – | – ‡ |" in text
     for mark in ("† So many", "‡ Would be better", "A difference is over"):
         assert mark in text
-    tabulate.write(tmp_path / "t", text, make.csv_rows(experiment, results, figures, {}))
+    heads = [{"row": each.row.name} for each in results]
+    tabulate.write(tmp_path / "t", text, tabulate.records(heads, figures))
     with open(tmp_path / "t.csv", newline="", encoding="utf-8") as file:
         one, two, three, four = (row for row in csv.DictReader(file) if row["metric"] == "ate")
     assert (one["median"], one["diverged"], one["estimates"]) == ("2.0", "0", "3")
@@ -69,17 +72,6 @@ def test_what_diverged_is_in_the_files_and_the_picture(tmp_path):
     labels = [label.get_text() for label in axes.get_yticklabels()]
     assert labels == ["A", "B\n(2 of 3 diverged)", "C\n(3 of 3 diverged)"]
     assert [bar.get_width() for bar in axes.patches] == [pytest.approx(7 / 3), 8.0, 0.0]
-
-
-def test_figures_of_one_table_alone_have_lines_of_their_own_in_the_csv():
-    results = [result("a", [[1.0, 2.0]])]
-    lines = make.csv_rows(table_of(*results), results, make.figures_of(results), {"a": {"x": 3.0}})
-    assert [(line["metric"], line["mean"]) for line in lines] == [
-        ("ate", 1.5),
-        ("rpe_1s", pytest.approx(0.15)),
-        ("x", 3.0),
-    ]
-    assert len({tuple(line) for line in lines}) == 1
 
 
 def test_arrows_point_as_the_error_goes():
