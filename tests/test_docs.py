@@ -112,13 +112,35 @@ def test_a_head_of_ones_own(monkeypatch):
     assert found.displacement.shape == (2, 3)
 
 
+def test_a_dataset_of_two_csv_files(walks, tmp_path):
+    """A walk in the layout of the example is read back."""
+    walk = data.resample(walks[0], 100.0)
+    (tmp_path / "anna_1").mkdir()
+    (tmp_path / "test.txt").write_text("anna_1\n", encoding="utf-8")
+    columns = {
+        "imu": ("time,gyro_x,gyro_y,gyro_z,accel_x,accel_y,accel_z", walk.gyro, walk.accel),
+        "poses": ("time,qw,qx,qy,qz,px,py,pz", walk.orientation, walk.position),
+    }
+    for name, (header, *parts) in columns.items():
+        rows = np.column_stack([walk.time, *parts])
+        path = tmp_path / "anna_1" / f"{name}.csv"
+        np.savetxt(path, rows, delimiter=",", header=header, comments="")
+    names = run("CONTRIBUTING.md", code_of("CONTRIBUTING.md"))
+    (recording,) = names["DATASET"].recordings(tmp_path, "test")
+    (found,) = recording.read()
+    assert (found.name, data.group(found)) == ("anna_1", "anna")
+    np.testing.assert_allclose(found.position, walk.position, atol=1e-6)
+    np.testing.assert_allclose(found.gyro, walk.gyro, atol=1e-9)
+    assert found.valid.all() and not data.self_check(found).failures
+
+
 def test_the_imports_of_the_reference():
     run("docs/api/index.md", code_of("docs/api/index.md"))
 
 
 def test_every_block_that_runs_has_a_test():
     tested = {"README.md", "docs/differentiable_filter.md", "docs/networks.md", "docs/weights.md"}
-    tested |= {"docs/api/index.md"}
+    tested |= {"docs/api/index.md", "CONTRIBUTING.md"}
     assert {block.page for block in RUN} == tested
 
 
