@@ -9,7 +9,6 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -44,15 +43,6 @@ class Recording(NamedTuple):
     """Which of several forms of the recording this is, as messages name it."""
     fallback: Recording | None = None
     """Another form of the same recording, read where this one is refused."""
-
-
-def single(name: str, read: Callable[..., Sequence], *arguments: Any, **options: Any) -> Recording:
-    """The recording that is one sequence, `read(*arguments, **options)`."""
-    return Recording(name, partial(_listed, partial(read, *arguments, **options)))
-
-
-def _listed(read: Callable[[], Sequence]) -> list[Sequence]:
-    return [read()]
 
 
 @dataclass(frozen=True)
@@ -125,19 +115,14 @@ def find_root(name: str, root: str | os.PathLike[str] | None = None) -> Path:
     which layout is expected.
     """
     dataset = get(name)
+    bases = [base for base in (os.environ.get("GNIO_DATA"), "data") if base]
+    candidates = [Path(base) / folder for base in bases for folder in dataset.folders or (name,)]
     if root is not None:
         candidates = [Path(root)]
-    else:
-        own = [os.environ["GNIO_DATA"]] if os.environ.get("GNIO_DATA") else []
-        folders = dataset.folders or (name,)
-        candidates = [Path(base) / folder for base in (*own, "data") for folder in folders]
     for candidate in candidates:
         if candidate.is_dir():
             return candidate
     looked = ", ".join(dict.fromkeys(str(candidate) for candidate in candidates))
-    raise InputError(
-        looked,
-        f"no folder of dataset '{name}'",
-        f"give --data-root, or set GNIO_DATA to its parent; get it from {dataset.source}; "
-        f"expected layout: {dataset.layout}",
-    )
+    remedy = f"give --data-root, or set GNIO_DATA to its parent; get it from {dataset.source}"
+    layout = f"expected layout: {dataset.layout}"
+    raise InputError(looked, f"no folder of dataset '{name}'", f"{remedy}; {layout}")

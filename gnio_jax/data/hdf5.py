@@ -58,55 +58,39 @@ def read_hdf5(path: str | os.PathLike[str]) -> Sequence:
     except InputError:
         raise
     except Exception as error:  # a damaged file makes the parser fail in any way
-        raise InputError(
-            path,
-            f"cannot be read as HDF5, it may be cut short ({error})",
-            "convert or copy it again",
-        ) from None
+        problem = f"cannot be read as HDF5, it may be cut short ({error})"
+        raise InputError(path, problem, "convert or copy it again") from None
     return validate(sequence, path)
 
 
 def _write(group: h5py.Group, sequence: Sequence, path: object) -> None:
-    group.attrs["format"] = _FORMAT
-    group.attrs["name"] = sequence.name
+    group.attrs["format"], group.attrs["name"] = _FORMAT, sequence.name
     for field in (*_FIELDS, *_OPTIONAL_FIELDS):
         if getattr(sequence, field) is not None:
             group.create_dataset(field, data=getattr(sequence, field))
     if sequence.waypoints is not None:
-        waypoints = group.create_group("waypoints")
         for field, values in sequence.waypoints._asdict().items():
-            waypoints.create_dataset(field, data=values)
-    attributes = group.create_group("attributes")
+            group.create_dataset(f"waypoints/{field}", data=values)
+    attributes = group.create_group("attributes").attrs
     for key, value in sequence.attributes.items():
         if not isinstance(value, _ATTRIBUTE_TYPES):
-            raise InputError(
-                path,
-                f"attribute '{key}' is {type(value).__name__}",
-                "attributes are text, numbers or booleans",
-            )
-        attributes.attrs[key] = value
+            problem = f"attribute '{key}' is {type(value).__name__}"
+            raise InputError(path, problem, "attributes are text, numbers or booleans")
+        attributes[key] = value
 
 
 def _read(group: h5py.Group, path: Path) -> Sequence:
-    if group.attrs.get("format") != _FORMAT:
-        raise InputError(
-            path,
-            f"is not a '{_FORMAT}' file (format: {group.attrs.get('format')!r})",
-            "convert the recording with gnio data convert",
-        )
-    values: dict[str, Any] = {field: _array(group, field, path) for field in _FIELDS}
-    for field in _OPTIONAL_FIELDS:
-        if field in group:
-            values[field] = _array(group, field, path)
+    if (form := group.attrs.get("format")) != _FORMAT:
+        problem = f"is not a '{_FORMAT}' file (format: {form!r})"
+        raise InputError(path, problem, "convert the recording with gnio data convert")
+    fields = (*_FIELDS, *(field for field in _OPTIONAL_FIELDS if field in group))
+    values: dict[str, Any] = {field: _array(group, field, path) for field in fields}
     if "waypoints" in group:
-        fields = (_array(group, f"waypoints/{field}", path) for field in Waypoints._fields)
-        values["waypoints"] = Waypoints(*fields)
+        parts = (_array(group, f"waypoints/{field}", path) for field in Waypoints._fields)
+        values["waypoints"] = Waypoints(*parts)
     stored = group["attributes"].attrs if "attributes" in group else {}
-    attributes = {
-        key: value.item() if isinstance(value, np.generic) else value
-        for key, value in stored.items()
-    }
-    return Sequence(name=str(group.attrs.get("name", path.stem)), attributes=attributes, **values)
+    plain = {k: v.item() if isinstance(v, np.generic) else v for k, v in stored.items()}
+    return Sequence(name=str(group.attrs.get("name", path.stem)), attributes=plain, **values)
 
 
 def _array(group: h5py.Group, field: str, path: Path) -> np.ndarray:
@@ -115,20 +99,21 @@ def _array(group: h5py.Group, field: str, path: Path) -> np.ndarray:
     A field lies in the file itself: a link to another place is refused, and so is a field that
     would be far larger in memory than in the file.
     """
-    if isinstance(group.get(field, getlink=True), h5py.ExternalLink | h5py.SoftLink):
-        raise InputError(path, f"field '{field}' is a link", "convert the recording again")
-    stored = group.get(field)
-    if stored is None:
-        raise InputError(path, f"field '{field}' is missing", "convert the recording again")
     kind, content = ("b", "booleans") if field.endswith("valid") else ("f", "numbers")
-    if not isinstance(stored, h5py.Dataset) or stored.dtype.kind != kind or not stored.shape:
-        raise InputError(
-            path, f"field '{field}' is not an array of {content}", "convert the recording again"
-        )
-    most = LARGEST_RATIO * stored.id.get_storage_size() + 1_000_000
-    if stored.external or stored.is_virtual or stored.nbytes > most:
-        problem = f"field '{field}' would take {stored.nbytes} bytes, which the file does not hold"
-        raise InputError(path, problem, "convert the recording again")
+    link, problem = group.get(field, getlink=True), ""
+    stored = None if isinstance(link, h5py.ExternalLink | h5py.SoftLink) else group.get(field)
+    if stored is None:
+        problem = "is missing, or a link"
+    elif not isinstance(stored, h5py.Dataset) or stored.dtype.kind != kind or not stored.shape:
+        problem = f"is not an array of {content}"
+    elif (
+        stored.external
+        or stored.is_virtual
+        or stored.nbytes > LARGEST_RATIO * stored.id.get_storage_size() + 1_000_000
+    ):
+        problem = f"would take {stored.nbytes} bytes, which the file does not hold"
+    if problem:
+        raise InputError(path, f"field '{field}' {problem}", "convert the recording again")
     value = stored[()]
     return value if kind == "b" else value.astype(np.float64, copy=False)
 

@@ -9,7 +9,7 @@ import os
 import signal
 import warnings
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from itertools import islice
@@ -68,15 +68,12 @@ def load_each(
     progress: Progress = lambda share: None,
 ) -> Iterator[Sequence]:
     """The sequences of `load` one after another, for those that do not fit the memory together."""
-    fold = parse_fold(split)
-    if fold is not None:
+    if fold := parse_fold(split):
         return iter(fold.select(load_each(name, root, fold.split, workers, progress)))
     dataset = get(name)
     # Where lists at the root name the splits, the reader knows them.
-    if split not in dataset.splits and dataset.list_splits is None:
-        known = f"known splits: {', '.join(dataset.splits)}"
-        remedy = did_you_mean(split, dataset.splits) + known
-        raise InputError(f"dataset {name}", f"unknown split '{split}'", remedy)
+    if dataset.list_splits is None:
+        _check_split(dataset, split, dataset.splits)
     folder = find_root(name, root) if dataset.needs_root else Path(root or ".")
     return read_split(dataset, folder, split, workers, progress)
 
@@ -91,9 +88,8 @@ def read_split(
     """`load_each` of a dataset that is at hand."""
     recordings = dataset.recordings(root, split)
     if not recordings:
-        problem = f"split '{split}' of dataset '{dataset.name}' holds no sequence"
-        raise InputError(root, problem, f"expected layout: {dataset.layout}")
-    read_any, names, left_out = False, set(), []
+        raise _nothing(dataset, root, split, "sequence")
+    names, left_out = set(), []
     for recording, reading in zip(
         recordings, _read_all(recordings, workers, progress), strict=True
     ):
@@ -104,7 +100,6 @@ def read_split(
         if reading.damage is not None:
             raise reading.damage
         for sequence in reading.sequences:
-            read_any = True
             if sequence.name in names:
                 problem = f"two sequences of split '{split}' have the name '{sequence.name}'"
                 raise InputError(root, problem, "rename or remove one of them")
@@ -116,44 +111,41 @@ def read_split(
                 left_out.append(sequence.name)
             else:
                 yield sequence
-    if not read_any:
+    if not names:
         problem = f"none of the {len(recordings)} recordings of split '{split}' can be used"
         raise InputError(root, problem, "see the warnings above")
     if len(left_out) == len(names):
-        raise InputError(
-            ", ".join(left_out[:3]),
-            f"none of {len(left_out)} sequences passes the physical self-check",
-            "see the warnings above; check units, frames and time offset of the recordings",
-        )
+        problem = f"none of {len(left_out)} sequences passes the physical self-check"
+        remedy = "see the warnings above; check units, frames and time offset of the recordings"
+        raise InputError(", ".join(left_out[:3]), problem, remedy)
+
+
+def _nothing(dataset: Dataset, root: Path, split: str, what: str) -> InputError:
+    problem = f"split '{split}' of dataset '{dataset.name}' holds no {what}"
+    return InputError(root, problem, f"expected layout: {dataset.layout}")
+
+
+def _check_split(dataset: Dataset, split: str, known: Iterable[str]) -> None:
+    if split not in known:
+        remedy = f"{did_you_mean(split, known)}known splits: {', '.join(known)}"
+        raise InputError(f"dataset {dataset.name}", f"unknown split '{split}'", remedy)
 
 
 def _read_all(recordings: list[Recording], workers: int, progress: Progress) -> Iterator[Reading]:
-    """The reading of each of them, in their order."""
-    # What is quick to read is not worth a process, and the pipe that its sequences come through.
+    """The reading of each of them, in their order: by processes of what is slow to read and not in
+    the cache. What is quick is not worth a process, and the pipe that its sequences come through.
+    """
     slow = [each for each in recordings if workers > 1 and _must_be_made(each)]
-    readings = _read_slow(slow, workers, progress)
-    waiting = iter(slow)
-    following = next(waiting, None)
+    readings = in_processes(read_recording, [(each,) for each in slow], workers, progress)
+    sent, died = {id(each) for each in slow}, False
     for recording in recordings:
-        if recording is following:
-            yield next(readings)
-            following = next(waiting, None)
-        else:
-            yield read_recording(recording)
-
-
-def _read_slow(recordings: list[Recording], workers: int, progress: Progress) -> Iterator[Reading]:
-    """Readings by `workers` processes. Where one of them dies, this process reads what is left."""
-    done = 0
-    try:
-        items = [(recording,) for recording in recordings]
-        for reading in in_processes(read_recording, items, workers, progress):
-            done += 1
-            yield reading
-    except ProcessDied:
-        for number, recording in enumerate(recordings[done:], done + 1):
-            progress(number / len(recordings))
-            yield read_recording(recording)
+        if id(recording) in sent and not died:
+            try:
+                yield next(readings)
+                continue
+            except ProcessDied:  # this process reads what is left
+                died = True
+        yield read_recording(recording)
 
 
 # --- one recording
@@ -162,23 +154,19 @@ def _read_slow(recordings: list[Recording], workers: int, progress: Progress) ->
 def read_recording(recording: Recording) -> Reading:
     """Read a recording, or its fallback where it is refused, through the cache."""
     form: Recording | None = recording
-    refusals: tuple[str, ...] = ()
-    notes: tuple[str, ...] = ()
+    before = Reading([])
     while form is not None:
         found = _read_form(form)
-        notes += found.notes
+        notes, refusals = before.notes + found.notes, before.refusals
         if found.damage is not None:
-            return Reading([], notes, refusals, found.damage)
+            return found._replace(notes=notes, refusals=refusals)
         if found.sequences:
-            used = f"{recording.name}: {form.form} is used"
-            sequences = [
-                each._replace(attributes=each.attributes | form.attributes)
-                for each in found.sequences
-            ]
-            return Reading(sequences, notes + tuple(f"{used}: {reason}" for reason in refusals))
-        refusals += found.refusals
-        form = form.fallback
-    return Reading([], notes, refusals)
+            notes += tuple(f"{recording.name}: {form.form} is used: {why}" for why in refusals)
+            about = form.attributes
+            sequences = [e._replace(attributes=e.attributes | about) for e in found.sequences]
+            return Reading(sequences, notes)
+        before, form = Reading([], notes, refusals + found.refusals), form.fallback
+    return before
 
 
 def _read_form(form: Recording) -> Reading:
@@ -204,10 +192,9 @@ def _read_form(form: Recording) -> Reading:
 
 def _must_be_made(recording: Recording) -> bool:
     """Whether reading is slow: its sequences are not in the cache."""
-    if not recording.slow:
-        return False
     try:
-        return not cache_entry(f"{recording.name} {recording.form}", recording.files).is_file()
+        name = f"{recording.name} {recording.form}"
+        return recording.slow and not cache_entry(name, recording.files).is_file()
     except InputError:  # a file is gone: reading will say so
         return False
 
@@ -243,12 +230,8 @@ def in_processes(
         return
     # Processes are spawned: a fork after JAX has started its threads can hang. Ctrl-C is this
     # process's to answer.
-    pool = ProcessPoolExecutor(
-        workers,
-        mp_context=multiprocessing.get_context("spawn"),
-        initializer=signal.signal,
-        initargs=(signal.SIGINT, signal.SIG_IGN),
-    )
+    spawn, ignore = multiprocessing.get_context("spawn"), (signal.SIGINT, signal.SIG_IGN)
+    pool = ProcessPoolExecutor(workers, spawn, initializer=signal.signal, initargs=ignore)
 
     def submit(item: tuple) -> Future[Result]:
         try:
@@ -273,7 +256,7 @@ def in_processes(
             pool.shutdown(wait=False, cancel_futures=True)
 
 
-# --- the recordings of a whole dataset: finding and checking
+# --- the recordings of a whole dataset: finding, checking, writing
 
 
 class Found(NamedTuple):
@@ -294,12 +277,8 @@ def find_recordings(dataset: Dataset, root: Path, wanted: str) -> Found:
     unknown split, or when none of the splits holds a recording.
     """
     known = dataset.splits_at(root)
-    if wanted != "all" and wanted not in known:
-        problem, remedy = f"unknown split '{wanted}'", f"known splits: {', '.join(known)}, all"
-        raise InputError(f"dataset {dataset.name}", problem, remedy)
-    found = Found({}, {}, [])
-    mistakes: list[InputError] = []
-    empty: dict[str, list[str]] = {}
+    _check_split(dataset, wanted, dict.fromkeys((*known, "all")))
+    found, mistakes = Found({}, {}, []), {}
     for split in known if wanted == "all" else (wanted,):
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
@@ -309,19 +288,18 @@ def find_recordings(dataset: Dataset, root: Path, wanted: str) -> Found:
                 for recording in here:
                     found.recordings.setdefault(recording.name, recording)
             except InputError as error:
-                mistakes.append(error)
-                reason = str(error).partition("; expected layout")[0]
-                empty.setdefault(reason, []).append(split)
-        texts = [str(each.message) for each in caught]
-        found.notes.extend(dict.fromkeys(text for text in texts if text not in found.notes))
+                mistakes[split] = error
+        for text in (str(each.message) for each in caught):
+            found.notes.extend([text] if text not in found.notes else [])
     if not found.recordings and mistakes:
         # Where a split takes everything, it says best why there is nothing.
-        raise mistakes[-1 if "all" in known else 0]
+        raise mistakes.get("all", next(iter(mistakes.values())))
     if not found.recordings:
-        problem = f"split '{wanted}' of dataset '{dataset.name}' holds no recording"
-        raise InputError(root, problem, f"expected layout: {dataset.layout}")
-    for reason, splits in empty.items():
-        found.notes.append(f"nothing in split {', '.join(splits)}: {reason}")
+        raise _nothing(dataset, root, wanted, "recording")
+    reasons = {split: str(e).partition("; expected layout")[0] for split, e in mistakes.items()}
+    for reason in dict.fromkeys(reasons.values()):
+        splits = ", ".join(split for split, each in reasons.items() if each == reason)
+        found.notes.append(f"nothing in split {splits}: {reason}")
     return found
 
 
@@ -352,13 +330,11 @@ def check(
     """
     recordings, splits, notes = find_recordings(dataset, root, split)
     items = [(recording, dataset, pictures) for recording in recordings.values()]
-    checked = []
-    for name, (rows, told) in zip(
-        recordings, in_processes(_check_and_draw, items, workers, progress), strict=True
-    ):
+    results, checked = in_processes(_check_and_draw, items, workers, progress), []
+    for name, (rows, told) in zip(recordings, results, strict=True):
         own = [each for each, names in splits.items() if name in names]
-        own = [each for each in own if each != "all" or len(own) == 1]
-        checked += [Checked(row.name, tuple(own), row.check, row.reason) for row in rows]
+        own = tuple(each for each in own if each != "all" or len(own) == 1)
+        checked += [row._replace(splits=own) for row in rows]
         notes += [note for note in told if note not in notes]
     return checked, notes
 
@@ -381,16 +357,12 @@ def check_recording(recording: Recording, dataset: Dataset) -> tuple[list[Checke
     """Read a recording and check its sequences; what is wrong with it is reported, not raised."""
     reading = read_recording(recording)
     checks = [(sequence.name, check_sequence(sequence, dataset)) for sequence in reading.sequences]
-    rows = [Checked(name, (), check, "; ".join(check.failures)) for name, check in checks]
-    if not rows:
-        reasons = [str(reading.damage)] if reading.damage is not None else [*reading.refusals]
-        reasons = [reason.removeprefix(f"{recording.name}: ") for reason in reasons]
-        reason = "; ".join(reasons) or "no segment of it is long enough"
-        rows = [Checked(recording.name, (), None, reason)]
-    return rows, reading
-
-
-# --- any dataset as the package's HDF5
+    if checks:
+        return [Checked(name, (), c, "; ".join(c.failures)) for name, c in checks], reading
+    reasons = reading.refusals if reading.damage is None else (str(reading.damage),)
+    reason = "; ".join(each.removeprefix(f"{recording.name}: ") for each in reasons)
+    row = Checked(recording.name, (), None, reason or "no segment of it is long enough")
+    return [row], reading
 
 
 class Converted(NamedTuple):
@@ -434,9 +406,8 @@ def convert(
     stems, left_out, hours = {}, {}, 0.0
     with replacing_folder(out) as folder:
         items = [(recording, dataset, folder, rate) for recording in recordings.values()]
-        for name, (rows, told) in zip(
-            recordings, in_processes(_convert, items, workers, progress), strict=True
-        ):
+        results = in_processes(_check_and_write, items, workers, progress)
+        for name, (rows, told) in zip(recordings, results, strict=True):
             used = [row for row in rows if not row.reason]
             stems[name] = [file_stem(row.name) for row in used]
             left_out |= {row.name: row.reason for row in rows if row.reason}
@@ -445,14 +416,13 @@ def convert(
         if not any(stems.values()):
             problem = f"none of {len(recordings)} recordings can be used"
             raise InputError(root, problem, "; ".join(list(left_out.values())[:3]))
-        lists = {
-            each: [stem for name in names for stem in stems[name]] for each, names in splits.items()
-        }
-        for each, files in lists.items():
-            if files:
-                write_text(folder / f"{each}.txt", "".join(f"{stem}\n" for stem in files))
+        lists = {}
+        for each, names in splits.items():
+            lists[each] = [stem for name in names for stem in stems[name]]
+            if lists[each]:
+                write_text(folder / f"{each}.txt", "".join(f"{stem}\n" for stem in lists[each]))
             else:
-                problem = f"none of its {len(splits[each])} recordings can be used"
+                problem = f"none of its {len(names)} recordings can be used"
                 notes.append(f"split '{each}' has no list: {problem}")
         write_text(folder / CONVERSION, json.dumps(settings, indent=2) + "\n")
     return Converted(lists, sum(map(len, stems.values())), hours, left_out, notes)
@@ -462,7 +432,7 @@ def _check_target(out: Path, settings: dict) -> None:
     """Raise `InputError` where a conversion must not be written to `out`."""
     if out.exists() and not out.is_dir():
         raise InputError(out, "is a file", "name a folder")
-    if "root" in settings and str(out.resolve()) == settings["root"]:
+    if settings.get("root") == str(out.resolve()):
         raise InputError(out, "is the folder that is read", "choose another one for the result")
     if not out.is_dir() or not any(out.iterdir()):
         return
@@ -475,18 +445,16 @@ def _check_target(out: Path, settings: dict) -> None:
         raise InputError(out, f"holds another conversion ({named})", "choose another folder")
 
 
-def _convert(
+def _check_and_write(
     recording: Recording, dataset: Dataset, folder: Path, rate: float | None
 ) -> tuple[list[Checked], tuple[str, ...]]:
-    """Write the sequences of a recording that pass the self-check."""
+    """The rows of one recording, whose sequences that pass are written, and the reader's notes."""
     rows, reading = check_recording(recording, dataset)
+    # What the dataset asks of its recordings, for the self-check of the converted ones.
+    asked = {"check_pedestrian": dataset.pedestrian, "check_correlation": dataset.correlates}
     for sequence, row in zip(reading.sequences, rows, strict=False):
-        if row.reason:
-            continue
-        sequence = sequence if rate is None else resample(sequence, rate)
-        # What the dataset asks of its recordings, for the self-check of the converted ones.
-        asked = {"check_pedestrian": dataset.pedestrian, "check_correlation": dataset.correlates}
-        attributes = asked | sequence.attributes
-        path = folder / f"{file_stem(sequence.name)}.h5"
-        write_hdf5(path, sequence._replace(attributes=attributes))
+        if not row.reason:
+            sequence = sequence._replace(attributes=asked | sequence.attributes)
+            sequence = sequence if rate is None else resample(sequence, rate)
+            write_hdf5(folder / f"{file_stem(sequence.name)}.h5", sequence)
     return rows, reading.notes

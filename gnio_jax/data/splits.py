@@ -32,23 +32,17 @@ def find_folders(root: Path, is_recording: Callable[[Path], bool]) -> dict[str, 
     found: dict[str, Path] = {}
     seen, again = set(), []
     for place, folders, _ in os.walk(root, followlinks=True):
-        real = os.path.realpath(place)
-        folder = Path(place)
+        real, folder = os.path.realpath(place), Path(place)
         recording = is_recording(folder)
         if real in seen or recording:
             folders.clear()
         folders.sort()
-        if recording and real not in seen:
-            if folder.name in found:
-                again.append(folder)
-            found.setdefault(folder.name, folder)
+        if recording and real not in seen and found.setdefault(folder.name, folder) != folder:
+            again.append(folder)
         seen.add(real)
     if again:
-        warnings.warn(
-            f"{root}: {len(again)} recordings are there twice, e.g. {again[0]}; "
-            f"{found[again[0].name]} is used",
-            stacklevel=3,
-        )
+        problem = f"{len(again)} recordings are there twice, e.g. {again[0]}"
+        warnings.warn(f"{root}: {problem}; {found[again[0].name]} is used", stacklevel=3)
     return found
 
 
@@ -91,40 +85,27 @@ def listed(
     Absent entries are warned of with their count. Raises `InputError` when the list cannot be read
     or names nothing that is present.
     """
-    path = Path(path)
+    path, layout = Path(path), f"expected layout: {layout}"
     try:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or error
-        raise InputError(
-            path, f"the list cannot be read ({reason})", f"expected layout: {layout}"
-        ) from None
-    entries = list(
-        dict.fromkeys(line.strip() for line in lines if line.strip() and not line.startswith("#"))
-    )
-    found = {entry: _found(find, entry) for entry in entries}
-    present = [place for place in found.values() if place is not None]
-    absent = [entry for entry, place in found.items() if place is None]
-    if not present:
-        raise InputError(
-            path,
-            f"none of its {len(entries)} sequences is below {root}",
-            f"expected layout: {layout}",
-        )
+        raise InputError(path, f"the list cannot be read ({reason})", layout) from None
+    named = (line.strip() for line in lines if line.strip() and not line.startswith("#"))
+    found: dict[str, Path | None] = {}
+    for entry in named:
+        try:
+            found[entry] = find(entry)
+        except OSError:  # too long for a name, for one
+            found[entry] = None
+    absent = [shortened(entry) for entry, place in found.items() if place is None]
+    if len(absent) == len(found):
+        raise InputError(path, f"none of its {len(found)} sequences is below {root}", layout)
     if absent:
-        some = ", ".join([*map(shortened, absent[:3]), *(["..."] if len(absent) > 3 else [])])
-        warnings.warn(
-            f"{path}: {len(absent)} of {len(entries)} listed sequences are absent: {some}",
-            stacklevel=3,
-        )
-    return present
-
-
-def _found(find: Callable[[str], Path | None], entry: str) -> Path | None:
-    try:
-        return find(entry)
-    except OSError:  # too long for a name, for one
-        return None
+        some = ", ".join([*absent[:3], *(["..."] if len(absent) > 3 else [])])
+        problem = f"{len(absent)} of {len(found)} listed sequences are absent: {some}"
+        warnings.warn(f"{path}: {problem}", stacklevel=3)
+    return [place for place in found.values() if place is not None]
 
 
 # --- folds

@@ -17,7 +17,7 @@ import pytest
 
 from gnio_jax import data
 from gnio_jax.data import hdf5
-from gnio_jax.data.dataset import Recording, Refusal, single
+from gnio_jax.data.dataset import Recording, Refusal
 from gnio_jax.data.loading import (
     check_recording,
     find_recordings,
@@ -56,6 +56,15 @@ def walk(name, warning="", refusal="", damage=""):
     if damage:
         raise InputError(f"{name}.csv", damage, "copy it again")
     return circle(seconds=4.0)._replace(name=name)
+
+
+def alone(read, *arguments, **options):
+    return [read(*arguments, **options)]
+
+
+def single(name, read, *arguments, **options):
+    """The recording that is one sequence."""
+    return Recording(name, partial(alone, read, *arguments, **options))
 
 
 def upside_down(name):

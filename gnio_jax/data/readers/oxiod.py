@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -36,10 +36,10 @@ from gnio_jax.data.alignment import (
     align_positions,
     without_jumps,
 )
-from gnio_jax.data.alignment.body import hat_functions
+from gnio_jax.data.alignment.body import hat_functions, uniform_knots
 from gnio_jax.data.assembly import Poses, Samples, Streams, assemble
 from gnio_jax.data.dataset import Dataset, Recording, Refusal
-from gnio_jax.data.parsing.tables import Table, read_text, shortened
+from gnio_jax.data.parsing.tables import Table, damaged, read_text, shortened
 from gnio_jax.data.validation import check_accel, check_gyro
 from gnio_jax.errors import InputError
 from gnio_jax.numerics import quaternions
@@ -79,30 +79,23 @@ FASTEST_TURN, FASTEST, FASTEST_TANGO = np.radians(600.0), 10.0, 5.0
 
 # What a fit of phone and tracker may find. In brackets: the largest figure of the real pairs, raw
 # and syn, that were at hand.
-MOST_TURNING_UNEXPLAINED = 0.1
-"""Share of the turning's power that a fit may leave (0.010). Another walk's Vicon leaves 0.6 and
-more."""
-MOST_ACCELERATION_UNEXPLAINED = 0.5
-"""The same of the acceleration (0.19, on a trolley, which shakes more than it accelerates)."""
+MOST_UNEXPLAINED = {"turning": 0.1, "acceleration": 0.5}
+"""Shares of the signals' power that a fit may leave (0.010; 0.19, on a trolley, which shakes more
+than it accelerates). Another walk's Vicon leaves 0.6 of the turning and more."""
 CLOSEST_RUNNER_UP = 0.5
 """What the best fit leaves unexplained over what the best fit with another lag does (0.14); 1 where
 both are as good."""
 LONGEST_LAG = {"raw": 5.0, "syn": 1.0}
 """s. The clocks of raw files were set apart (0.29 here, 1.7 in others of the set, and as far as the
 search goes); the rows of syn files were matched by the authors (0.29)."""
-LONGEST_DRIFT = 1.0
-"""s between the smallest and the largest lag of a walk: clocks drift by 1 ms in some seconds
-(0.26)."""
-LONGEST_ACCEL_DELAY = 0.15
-"""s: phones filter the accelerometer over some samples (0.052)."""
-LONGEST_LEVER = 0.3
-"""m between the IMU and the marker body's origin, which is the phone with markers on it (0.12)."""
-LARGEST_TILT = 5.0
-"""Degrees by which the world of a calibrated tracker leans (0.8)."""
-LARGEST_GYRO_BIAS = 0.1
-"""rad/s: a phone's gyro that nothing has calibrated (0.02)."""
-LARGEST_ACCEL_BIAS = 0.6
-"""m/s²: 60 mG, a bad accelerometer (0.17)."""
+LIMITS = {
+    "lag's drift": (1.0, "s"),  # clocks drift by 1 ms in some seconds (0.26)
+    "accel's delay": (0.15, "s"),  # phones filter the accelerometer over some samples (0.052)
+    "lever arm": (0.3, "m"),  # the marker body is the phone with markers on it (0.12)
+    "world's tilt": (5.0, "°"),  # the world of a calibrated tracker (0.8)
+    "gyro's bias": (0.1, "rad/s"),  # a phone's gyro that nothing has calibrated (0.02)
+    "accel's bias": (0.6, "m/s²"),  # 60 mG, a bad accelerometer (0.17)
+}
 MIN_CORRELATION = 0.5
 """Of the vertical accelerations of phone and Tango: 0.90 and more in step, at most 0.20 out of
 it."""
@@ -173,11 +166,8 @@ def find_walks(root: Path) -> list[Walk]:
 
 def _scene_folders(root: Path, scene: str) -> list[Path]:
     """The folder of a scene, or none."""
-    for depth in ("", "*/", "*/*/"):
-        found = sorted(path for path in root.glob(f"{depth}{scene}") if path.is_dir())
-        if found:
-            return found[:1]
-    return []
+    places = (path for depth in ("", "*/", "*/*/") for path in sorted(root.glob(f"{depth}{scene}")))
+    return [path for path in places if path.is_dir()][:1]
 
 
 def _walks_of(scene: str, folder: Path) -> list[Walk]:
@@ -185,22 +175,15 @@ def _walks_of(scene: str, folder: Path) -> list[Walk]:
     # `raw` of the large scale is another format, without Tango's pairs.
     for kind in ("syn",) if scene == LARGE_SCALE else ("raw", "syn"):
         for imu in sorted((folder / kind).glob("imu*.csv")):
-            match = re.fullmatch(r"imu(\d+)\.csv", imu.name)
-            if match is None:
-                continue
-            beside = (imu.with_name(f"{name}{match[1]}.csv") for name in _TRUTHS)
-            truth = next((path for path in beside if path.is_file()), None)
-            if truth is None:
-                warnings.warn(
-                    f"{imu}: has no vi, hand or tango file beside it; left out", stacklevel=2
-                )
-                continue
-            files.setdefault(int(match[1]), {})[kind] = (imu, truth)
-    placement_of = _placements(scene, folder)
-    return [
-        Walk(scene, folder.name, number, kinds, placement_of(number))
-        for number, kinds in sorted(files.items())
-    ]
+            if match := re.fullmatch(r"imu(\d+)\.csv", imu.name):
+                beside = (imu.with_name(f"{name}{match[1]}.csv") for name in _TRUTHS)
+                if truth := next((path for path in beside if path.is_file()), None):
+                    files.setdefault(int(match[1]), {})[kind] = (imu, truth)
+                else:
+                    problem = "has no vi, hand or tango file beside it; left out"
+                    warnings.warn(f"{imu}: {problem}", stacklevel=2)
+    placement = _placements(scene, folder)
+    return [Walk(scene, folder.name, n, kinds, placement(n)) for n, kinds in sorted(files.items())]
 
 
 def _placements(scene: str, folder: Path) -> Callable[[int], str]:
@@ -211,12 +194,9 @@ def _placements(scene: str, folder: Path) -> Callable[[int], str]:
         return lambda number: "handheld" if scene in by_hand else scene
     notes = [path for path in folder.glob("*/*.txt") if path.stem.lower() == "readme"]
     text = notes[0].read_text(encoding="utf-8", errors="replace") if notes else ""
-    spans = [
-        (int(first), int(last), name)
-        for first, last, name in re.findall(r"(\d+)\s*-\s*(\d+)\s*:\s*(\w+)", text)
-    ]
+    spans = re.findall(r"(\d+)\s*-\s*(\d+)\s*:\s*(\w+)", text)
     return lambda number: next(
-        (name for first, last, name in spans if first <= number <= last), "unknown"
+        (name for first, last, name in spans if int(first) <= number <= int(last)), "unknown"
     )
 
 
@@ -240,28 +220,20 @@ def recordings(root: Path, split: str) -> list[Recording]:
     """
     chosen = select(find_walks(root), split, root)
     if not chosen:
-        raise InputError(
-            root,
-            f"no recording of split '{split}' is present",
-            "see the warnings above, or choose another split",
-        )
+        remedy = "see the warnings above, or choose another split"
+        raise InputError(root, f"no recording of split '{split}' is present", remedy)
     return [recording_of(walk) for walk in chosen]
 
 
 def recording_of(walk: Walk) -> Recording:
     """`raw` before `syn`, which is read where `raw` is refused."""
-    forms = [
-        Recording(
-            walk.name,
-            partial(build, walk, kind),
-            files=walk.files[kind],
-            slow=True,
-            form=kind,
-        )
-        for kind in ("raw", "syn")
-        if kind in walk.files
-    ]
-    return forms[0]._replace(fallback=forms[1]) if len(forms) == 2 else forms[0]
+    found = None
+    for kind in ("syn", "raw"):
+        if kind in walk.files:
+            read, files = partial(build, walk, kind), walk.files[kind]
+            found = Recording(walk.name, read, files, slow=True, form=kind, fallback=found)
+    assert found is not None
+    return found
 
 
 def select(walks: list[Walk], split: str, root: Path) -> list[Walk]:
@@ -271,65 +243,44 @@ def select(walks: list[Walk], split: str, root: Path) -> list[Walk]:
     if split == "large_scale":
         return [walk for walk in walks if walk.scene == LARGE_SCALE]
     if split.startswith("sessions_"):
-        held = {"val": SESSIONS_VAL, "test": SESSIONS_TEST}
+        held = {"sessions_val": SESSIONS_VAL, "sessions_test": SESSIONS_TEST}
+        of = {session: name for name, sessions in held.items() for session in sessions}
         room = [walk for walk in walks if walk.scene != LARGE_SCALE]
-        if chosen := held.get(split.removeprefix("sessions_")):
-            return [walk for walk in room if walk.session in chosen]
-        return [walk for walk in room if walk.session not in SESSIONS_VAL | SESSIONS_TEST]
-    single_user = [walk for walk in walks if walk.scene in SINGLE_USER]
+        return [walk for walk in room if of.get(walk.session, "sessions_train") == split]
     if split in ("test", "seen"):
-        return _on_lists(single_user, "Test.txt", root)
-    listed = _on_lists(single_user, "Train.txt", root)
+        return _on_lists(walks, "Test.txt", root)
+    listed = _on_lists(walks, "Train.txt", root)
     return [walk for walk in listed if (walk.session in VALIDATION) == (split == "val")]
 
 
 def _on_lists(walks: list[Walk], name: str, root: Path) -> list[Walk]:
-    """The walks that the scenes' lists `name` name."""
-    paths = {
-        scene: place / name
-        for scene in SINGLE_USER
-        for place in _scene_folders(root, scene)
-        if (place / name).is_file()
-    }
-    if not paths:
+    """The walks that the lists `name` of the single-user scenes name, by lines `dataN` (all its
+    walks) and `dataN/imuK.csv`. The last line may lack its end."""
+    folders = {scene: place for scene in SINGLE_USER for place in _scene_folders(root, scene)}
+    lists = {s: place / name for s, place in folders.items() if (place / name).is_file()}
+    if not lists:
         raise InputError(root, f"no scene has its list {name}", f"expected layout: {LAYOUT}")
     chosen: list[Walk] = []
     absent = 0
-    for scene, path in paths.items():
-        in_scene = [walk for walk in walks if walk.scene == scene]
-        for folder, number in _entries(path):
-            here = [
-                walk
-                for walk in in_scene
-                if walk.folder == folder and (number is None or walk.number == number)
-            ]
+    for scene, path in lists.items():
+        text = path.read_text(encoding="utf-8", errors="replace")
+        entries = [line.strip().replace("\\", "/") for line in text.splitlines() if line.strip()]
+        if not entries:
+            raise damaged(path, "the list is empty")
+        for entry in entries:
+            match = re.fullmatch(r"(data\d+)(?:/(?:imu)?(\d+)(?:\.csv)?)?", entry)
+            if not match:
+                problem = f"entry '{shortened(entry)}' is neither dataN nor dataN/imuK.csv"
+                raise damaged(path, problem)
+            session = f"{scene}/{match[1]}"
+            number = None if match[2] is None else int(match[2])
+            here = [w for w in walks if w.session == session and number in (None, w.number)]
             absent += not here
             chosen += [walk for walk in here if walk not in chosen]
     if absent:
-        warnings.warn(
-            f"{root}: {absent} entries of the lists {name} are not in this copy", stacklevel=2
-        )
+        problem = f"{absent} entries of the lists {name} are not in this copy"
+        warnings.warn(f"{root}: {problem}", stacklevel=2)
     return chosen
-
-
-def _entries(path: Path) -> Iterator[tuple[str, int | None]]:
-    """(folder, number) of the lines `dataN` (all its walks: no number) and `dataN/imuK.csv`.
-
-    The last line may lack its end.
-    """
-    text = path.read_text(encoding="utf-8", errors="replace")
-    entries = [line.strip().replace("\\", "/") for line in text.splitlines() if line.strip()]
-    if not entries:
-        raise InputError(path, "the list is empty", "copy it again")
-    for entry in entries:
-        match = re.fullmatch(r"(data\d+)(?:/(?:imu)?(\d+)(?:\.csv)?)?", entry)
-        if not match:
-            raise InputError(
-                path,
-                f"entry '{shortened(entry)}' is neither dataN nor dataN/imuK.csv",
-                "copy the list again",
-            )
-        yield match[1], None if match[2] is None else int(match[2])
 
 
 # --- one walk
@@ -349,37 +300,95 @@ def build(walk: Walk, kind: str) -> list[Sequence]:
         about = walk.attributes(kind) | streams.attributes
         (sequence,) = assemble(streams._replace(name=walk.name, attributes=about), RATE)
     except TooLittle as error:
-        problem = f"cannot be aligned with the phone ({error})"
-        raise Refusal(truth_path, problem, "leave it out") from None
+        raise Refusal(truth_path, f"cannot be aligned with the phone ({error})") from None
     except InputError as error:
         raise Refusal(*error.parts) from None
-    if sequence.valid.sum() < SHORTEST * RATE:
-        seconds = sequence.valid.sum() / RATE
-        raise Refusal(truth_path, f"only {seconds:.1f} s have a usable reference", "leave it out")
+    if (seconds := sequence.valid.sum() / RATE) < SHORTEST:
+        raise Refusal(truth_path, f"only {seconds:.1f} s have a usable reference")
     return [sequence]
 
 
 def _on_vicon(phone: Streams, path: Path, kind: str) -> Streams:
-    """The phone with Vicon's poses as its own, and without the accelerometer's delay."""
+    """The phone with Vicon's poses as its own, and without the accelerometer's delay. Raises
+    `Refusal` where the best fit does not explain the motion, or finds what cannot be of a phone on
+    a marker body."""
     fit = align(phone, read_vicon(path, kind, phone.start), knot_seconds=LAG_KNOTS[kind])
-    _check_fit(fit, kind, path)
+    remedy = "check that both files are of one walk"
+    shares = {"turning": fit.gyro_unexplained, "acceleration": fit.accel_unexplained}
+    for what, share in shares.items():
+        if not share <= MOST_UNEXPLAINED[what]:
+            problem = f"does not move as the phone does: {share:.0%} of the power of its {what}"
+            most = f"stays unexplained, at most {MOST_UNEXPLAINED[what]:.0%} is plausible"
+            raise Refusal(path, f"{problem} {most}", remedy)
+    if not fit.runner_up <= CLOSEST_RUNNER_UP:
+        problem = "fits the phone at two lags alike, for the walk repeats itself"
+        raise Refusal(
+            path, f"{problem} ({fit.runner_up:.0%} as unexplained by one as by the other)"
+        )
+    found = {
+        "lag": float(np.abs(fit.lag).max()),
+        "lag's drift": float(np.ptp(fit.lag)),
+        "accel's delay": abs(fit.accel_delay),
+        "lever arm": float(np.linalg.norm(fit.lever)),
+        "world's tilt": _degrees_off(fit.up[2]),
+        "gyro's bias": float(np.linalg.norm(fit.gyro_bias)),
+        "accel's bias": float(np.linalg.norm(fit.accel_bias)),
+    }
+    for what, (most, unit) in ({"lag": (LONGEST_LAG[kind], "s")} | LIMITS).items():
+        if not found[what] <= most:
+            value = f"the {what} would be {found[what]:.3g} {unit}, at most {most:g} {unit}"
+            problem = f"fits the phone only with what cannot be: {value} is plausible"
+            raise Refusal(path, problem, remedy)
     accel = phone.accel._replace(time=phone.accel.time - fit.accel_delay)
     return phone._replace(accel=accel, poses=fit.poses, attributes=phone.attributes | _figures(fit))
+
+
+def _degrees_off(cosine: float) -> float:
+    return float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
+
+
+def _figures(fit: BodyFit) -> dict[str, str | float]:
+    """What the attributes keep of a fit."""
+    vectors = {"lever": fit.lever, "gyro_bias": fit.gyro_bias, "accel_bias": fit.accel_bias}
+    return {
+        "truth": "vicon",
+        "lag": float(np.mean(fit.lag)),
+        "lag_drift": float(np.ptp(fit.lag)),
+        "accel_delay_removed": fit.accel_delay,
+        "gyro_unexplained": fit.gyro_unexplained,
+        "accel_unexplained": fit.accel_unexplained,
+        "runner_up": fit.runner_up,
+        "extrinsic_yaw_degrees": float(fit.extrinsic.as_euler("ZXY", degrees=True)[0]),
+        "extrinsic_tilt_degrees": _degrees_off(fit.extrinsic.as_matrix()[2, 2]),
+        "tilt_x": float(fit.up[0] / fit.up[2]),
+        "tilt_y": float(fit.up[1] / fit.up[2]),
+        "gyro_residual": fit.gyro_residual,
+        "accel_residual": fit.accel_residual,
+        **{f"{name}_{'xyz'[i]}": float(v[i]) for name, v in vectors.items() for i in range(3)},
+    }
 
 
 def _on_tango(phone: Streams, path: Path, kind: str) -> Streams:
     """The phone with Tango's positions as its own."""
     if phone.device is None:
-        raise Refusal(path, "goes with a phone that gives no attitude", "leave it out")
-    fit = align_positions(phone, read_tango(path))
+        raise Refusal(path, "goes with a phone that gives no attitude")
+    fit: PositionsFit = align_positions(phone, read_tango(path))
     lag, problem = float(np.abs(fit.lag).max()), ""
     if not fit.correlation >= MIN_CORRELATION:
         problem = f"vertical accelerations correlate by {fit.correlation:.2f}"
     elif not lag <= LONGEST_LAG[kind]:
         problem = f"by {lag:.2f} s, at most {LONGEST_LAG[kind]:g} s is plausible"
     if problem:
-        raise Refusal(path, f"Tango is out of step with the phone ({problem})", "leave it out")
-    return phone._replace(poses=fit.poses, attributes=phone.attributes | _tango_figures(fit))
+        raise Refusal(path, f"Tango is out of step with the phone ({problem})")
+    about = {
+        "truth": "tango",
+        "lag": float(np.mean(fit.lag)),
+        "lag_drift": float(np.ptp(fit.lag)),
+        "yaw_drift_degrees": float(np.degrees(fit.yaw_drift)),
+        "vertical_correlation": fit.correlation,
+        "runner_up": fit.runner_up,
+    }
+    return phone._replace(poses=fit.poses, attributes=phone.attributes | about)
 
 
 # --- the phone's text
@@ -387,48 +396,37 @@ def _on_tango(phone: Streams, path: Path, kind: str) -> Streams:
 
 def read_phone(path: Path, kind: str) -> Streams:
     """A phone's file, without name. iPhone: 16 columns, accelerations in G with iOS's sign, so that
-    specific force = −(gravity + user_acc)·9.80665. Nexus: rows of one sensor each (`raw`), or 10
-    columns (`syn`), m/s² already.
+    specific force = −(gravity + user_acc)·9.80665; CoreMotion has taken its estimate of their bias
+    off the rotation rates. Nexus: rows of one sensor each (`raw`), or 10 columns (`syn`), m/s²
+    already.
 
     Of kind "raw" the stamps are unix time; of kind "syn" they are destroyed, and rows are 1/100 s
     apart. Raises `InputError`.
     """
-    table = _read_table(path, {16: _IPHONE, 10: _NEXUS, 5: _NEXUS_EVENTS})
+    table = _read_table(path, _IPHONE, _NEXUS, _NEXUS_EVENTS)
     if "type" in table.columns:
         return _nexus_events(table)
-    if "gravity_x" in table.columns:
-        values = table.take(*_IPHONE[:13])
-        stamps, start = np.arange(len(values)) / RATE, 0.0
-        if kind == "raw":  # the stamps are right, the order of some rows is not
-            values = values[np.argsort(values[:, 0], kind="stable")]
-            start = float(values[0, 0])
-            stamps = values[:, 0] - start
-        return _iphone(stamps, values[:, 1:], start, path)
-    values = table.take(*_NEXUS[:7])[:, 1:]
-    awake = values[:, 3:].any(axis=1)  # the gyro starts some rows after the accelerometer
-    both = _sampled(np.flatnonzero(awake) / RATE, values[awake], path)
-    gyro, accel = both._replace(values=both.values[:, 3:]), both._replace(values=both.values[:, :3])
-    return Streams("", str(path), gyro, accel, {"imu_compensated": "no"})
-
-
-def _iphone(stamps: np.ndarray, values: np.ndarray, start: float, path: Path) -> Streams:
-    """`values` are roll, pitch, yaw (rad), rotation rate (rad/s), gravity and user acceleration
-    (G). CoreMotion's rotation rates have its estimate of their bias taken off."""
-    rows = _sampled(stamps, values, path)
+    if "gravity_x" not in table.columns:
+        values = table.take(*_NEXUS[:7])[:, 1:]
+        awake = values[:, 3:].any(axis=1)  # the gyro starts some rows after the accelerometer
+        rows = _sampled(np.flatnonzero(awake) / RATE, values[awake], path)
+        streams = Streams.of_imu("", path, rows.time, rows.values[:, 3:], rows.values[:, :3])
+        return streams._replace(attributes={"imu_compensated": "no"})
+    values = table.take(*_IPHONE[:13])
+    stamps, start = np.arange(len(values)) / RATE, 0.0
+    if kind == "raw":  # the stamps are right, the order of some rows is not
+        values = values[np.argsort(values[:, 0], kind="stable")]
+        start = float(values[0, 0])
+        stamps = values[:, 0] - start
+    rows = _sampled(stamps, values[:, 1:], path)
     angles, rate, gravity, user_acc = np.split(rows.values, 4, axis=1)
     length = float(np.median(np.linalg.norm(gravity, axis=1)))
     if not 0.9 < length < 1.1:
-        raise InputError(
-            path,
-            f"field 'gravity' has length {length:.3g}, expected 1 G",
-            "check the column order",
-        )
+        problem = f"field 'gravity' has length {length:.3g}, expected 1 G"
+        raise InputError(path, problem, "check the column order")
     attitude = Rotation.from_euler("ZXY", angles[:, [2, 1, 0]])  # R_z(yaw) R_x(pitch) R_y(roll)
-    return Streams(
-        "",
-        str(path),
-        gyro=rows._replace(values=rate),
-        accel=rows._replace(values=-(gravity + user_acc) * STANDARD_G),
+    streams = Streams.of_imu("", path, rows.time, rate, -(gravity + user_acc) * STANDARD_G)
+    return streams._replace(
         attributes={"imu_compensated": "CoreMotion's gyro bias"},
         start=start,
         device=rows._replace(values=quaternions(attitude)),
@@ -440,33 +438,24 @@ def _nexus_events(table: Table) -> Streams:
     stamps, kind, *_ = table.take("time", "type").T
     values, start = table.take("x", "y", "z"), float(stamps.min()) / 1e3
     sensors = []
-    for number, name in ((1, "acc"), (4, "gyro")):
+    for number in (4, 1):
         rows = np.flatnonzero(kind == number)
         if len(rows) < SHORTEST * RATE:
-            raise InputError(
-                table.path,
-                f"holds {len(rows)} rows of type {number} ({name}), less than {SHORTEST:g} s",
-                "copy it again",
-            )
+            problem = f"holds {len(rows)} rows of type {number}, less than {SHORTEST:g} s"
+            raise damaged(table.path, problem)
         rows = rows[np.argsort(stamps[rows], kind="stable")]
         time = restored_clock(stamps[rows] / 1e3 - start, table.path)
         sensors.append(Samples(time, values[rows], str(table.path)))
-    accel, gyro = sensors
-    return Streams("", str(table.path), gyro, accel, {"imu_compensated": "no"}, start)
+    return Streams("", str(table.path), *sensors, {"imu_compensated": "no"}, start)
 
 
-def _read_table(path: Path, names: dict[int, list[str]]) -> Table:
+def _read_table(path: Path, *layouts: list[str]) -> Table:
     """A file without header as a table with the names of its number of columns."""
-    table = read_text(path, header=False)
-    width = len(table.columns.keys())
-    if width not in names:
-        expected = " or ".join(str(count) for count in names)
-        raise InputError(path, f"has {width} columns, expected {expected}", "copy it again")
-    rows = len(table.columns[0])
-    if rows < SHORTEST * RATE:
-        raise InputError(path, f"holds {rows} rows, less than {SHORTEST:g} s", "copy it again")
-    named = {name: table.columns[place] for place, name in enumerate(names[width])}
-    return table._replace(columns=named)
+    named = {len(names): names for names in layouts}
+    table = read_text(path, header=False, widths=tuple(named))
+    if (rows := len(table.columns[0])) < SHORTEST * RATE:
+        raise damaged(path, f"holds {rows} rows, less than {SHORTEST:g} s")
+    return table.renamed(named[table.width()])
 
 
 def _sampled(stamps: np.ndarray, values: np.ndarray, path: Path) -> Samples:
@@ -486,40 +475,30 @@ def restored_clock(stamps: Float[np.ndarray, " n"], path: Path) -> Float[np.ndar
     The times are piecewise linear in the number of the sample, lost ones counted, with a knot per
     30 s. Raises `InputError` when the stamps cannot come from a uniform clock.
     """
+    remedy, problem = "use the syn files", ""
     if len(stamps) < 2:
-        raise InputError(path, "holds one row over and over", "use the syn files")
+        raise InputError(path, "holds one row over and over", remedy)
     steps = np.diff(stamps)
     typical, average = float(np.median(steps)), (stamps[-1] - stamps[0]) / len(steps)
     if not 0.002 < typical < 0.05 or not 0.002 < average:
-        raise InputError(
-            path,
-            f"field 'time' is ruined (median step {typical:.3g} s, {average:.3g} s on average)",
-            "use the syn files",
-        )
-    if steps.max() > 1.0:
-        raise InputError(
-            path,
-            f"field 'time' has a gap of {steps.max():.2f} s after "
-            f"{stamps[np.argmax(steps)] - stamps[0]:.2f} s",
-            "cut the recording there",
-        )
+        problem = f"is ruined (median step {typical:.3g} s, {average:.3g} s on average)"
+    elif steps.max() > 1.0:
+        problem = f"has a gap of {steps.max():.2f} s"
+    if problem:
+        raise InputError(path, f"field 'time' {problem}", remedy)
     period = float(np.mean(steps[steps < 2.5 * typical]))
     # Lost rows leave a step behind, which is counted by its length.
     lost = np.where(steps > 2.6 * period, np.round(steps / period) - 1.0, 0.0)
     number = np.arange(len(stamps)) + np.concatenate([[0.0], np.cumsum(lost)])
-    intervals = max(int((stamps[-1] - stamps[0]) / 30.0), 1)
-    hats = hat_functions(number, np.linspace(number[0], number[-1], intervals + 1))
+    hats = hat_functions(number, uniform_knots(number, 30.0 / period))
     weight = np.ones(len(stamps))
     for _ in range(3):  # a few late stamps must not bend the line
         at_knots = np.linalg.lstsq(hats * weight[:, None], stamps * weight, rcond=None)[0]
         error = stamps - hats @ at_knots
         weight = 1.0 / np.sqrt(1.0 + (error / 0.01) ** 2)
     if error.std() > 0.02 or np.any(np.diff(at_knots) <= 0):
-        raise InputError(
-            path,
-            f"field 'time' is not that of a uniform clock (off by {error.std() * 1e3:.0f} ms rms)",
-            "use the syn files",
-        )
+        problem = f"field 'time' is not that of a uniform clock (off by {error.std():.3f} s rms)"
+        raise InputError(path, problem, remedy)
     return hats @ at_knots
 
 
@@ -532,147 +511,51 @@ def read_vicon(path: Path, kind: str, start: float) -> Poses:
     Time is in s since `start` (unix ns in `raw`), or since the first row, 1/100 s apart (`syn`,
     where it is destroyed). Raises `InputError`.
     """
-    table = _read_table(path, {9: _TRACKER})
+    table = _read_table(path, _TRACKER)
     values = table.take(*_TRACKER[2:], gaps=True)
     time = np.arange(len(values)) / RATE
     if kind == "raw":
-        stamps = table.take("time")
-        time = stamps / 1e9 - start
+        time = table.take("time") / 1e9 - start
         if not abs(float(np.median(time))) < 3600.0 or np.ptp(time) < SHORTEST:
-            raise InputError(
-                path,
-                "field 'time' is ruined or not of the phone's hour "
-                f"(median {np.median(stamps):.6g} ns)",
-                "use the syn files",
-            )
+            problem = "field 'time' is ruined or not of the phone's hour"
+            raise InputError(path, problem, "use the syn files")
         order = np.argsort(time, kind="stable")
         time, values = time[order], values[order]
-    known = np.isfinite(values).all(axis=1)
+    known = np.isfinite(values).all(axis=1) & _is_fresh(values)
     known &= np.abs(np.linalg.norm(values[:, 3:], axis=1) - 1.0) < 0.01
-    own_stamp = np.concatenate([[True], np.diff(time) > 0])
-    rows = _enough(known & _is_fresh(values) & own_stamp, "a pose", path)
-    position = values[rows, :3]
-    if np.ptp(position, axis=0).max() > WIDEST:
-        raise InputError(
-            path,
-            f"field 'translation' spans more than {WIDEST:g} m, it looks like mm",
-            "convert it to m",
-        )
-    poses = Poses(
-        time[rows], Rotation.from_quat(values[rows, 3:]), position, noisy=True, source=str(path)
-    )
+    known &= np.concatenate([[True], np.diff(time) > 0])
+    rows = _enough(known, 0.5, "rows hold a pose", path)
+    place, attitude = values[rows, :3], Rotation.from_quat(values[rows, 3:])
+    if np.ptp(place, axis=0).max() > WIDEST:
+        problem = f"field 'translation' spans more than {WIDEST:g} m, it looks like mm"
+        raise InputError(path, problem, "convert it to m")
+    poses = Poses(time[rows], attitude, place, noisy=True, source=str(path))
     good = without_jumps(poses, FASTEST_TURN, FASTEST)
-    if len(good.time) < 0.3 * len(values):
-        problem = f"only {len(good.time)} of {len(values)} poses are plausible"
-        raise InputError(path, problem, "copy it again")
+    _enough(np.isin(time, good.time), 0.3, "poses are plausible", path)
     return good
 
 
 def read_tango(path: Path) -> Samples:
     """Tango's positions (m) without held rows and jumps. Rows are 1/100 s apart; the stamps are
     rounded to a second in some files. Raises `InputError`."""
-    values = _read_table(path, {9: _TRACKER}).take(*_TRACKER[2:5], gaps=True)
-    rows = _enough(_is_fresh(values) & np.isfinite(values).all(axis=1), "a position", path)
+    values = _read_table(path, _TRACKER).take(*_TRACKER[2:5], gaps=True)
+    usable = _is_fresh(values) & np.isfinite(values).all(axis=1)
+    rows = _enough(usable, 0.5, "rows hold a position", path)
     steps = np.linalg.norm(np.diff(values[rows], axis=0), axis=1)
     jumps = np.flatnonzero(steps > FASTEST_TANGO * np.diff(rows) / RATE)
     # The rows on both sides of a jump, and 0.1 s around them.
-    near = np.searchsorted(rows[jumps + 1], rows - 10) < np.searchsorted(
-        rows[jumps], rows + 10, "right"
-    )
-    return Samples(rows[~near] / RATE, values[rows[~near]], str(path))
+    ended = np.searchsorted(rows[jumps + 1], rows - 10)
+    begun = np.searchsorted(rows[jumps], rows + 10, "right")
+    rows = rows[ended == begun]
+    return Samples(rows / RATE, values[rows], str(path))
 
 
-def _enough(usable: Bool[np.ndarray, " n"], what: str, path: Path) -> np.ndarray:
+def _enough(usable: Bool[np.ndarray, " n"], share: float, what: str, path: Path) -> np.ndarray:
+    """The usable rows; raises `InputError` where they are less than this share."""
     rows = np.flatnonzero(usable)
-    if len(rows) < 0.5 * len(usable):
-        raise InputError(
-            path, f"only {len(rows)} of {len(usable)} rows hold {what}", "copy it again"
-        )
+    if len(rows) < share * len(usable):
+        raise damaged(path, f"only {len(rows)} of {len(usable)} {what}")
     return rows
-
-
-# --- what a fit may find
-
-
-def _check_fit(fit: BodyFit, kind: str, path: Path) -> None:
-    """Raise `Refusal` where the best fit does not explain the motion, or finds what cannot be of a
-    phone on a marker body."""
-    remedy = "check that both files are of one walk"
-    shares = (
-        ("turning", fit.gyro_unexplained, MOST_TURNING_UNEXPLAINED),
-        ("acceleration", fit.accel_unexplained, MOST_ACCELERATION_UNEXPLAINED),
-    )
-    for what, share, most in shares:
-        if not share <= most:
-            raise Refusal(
-                path,
-                f"does not move as the phone does: {share:.0%} of the power of its "
-                f"{what} stays unexplained, at most {most:.0%} is plausible",
-                remedy,
-            )
-    if not fit.runner_up <= CLOSEST_RUNNER_UP:
-        raise Refusal(
-            path,
-            "fits the phone at two lags alike, for the walk repeats itself (one leaves "
-            f"{fit.runner_up:.0%} of what the other leaves unexplained)",
-            "leave it out",
-        )
-    bounds = (
-        ("lag", float(np.abs(fit.lag).max()), LONGEST_LAG[kind], "s"),
-        ("lag's drift", float(np.ptp(fit.lag)), LONGEST_DRIFT, "s"),
-        ("accel's delay", abs(fit.accel_delay), LONGEST_ACCEL_DELAY, "s"),
-        ("lever arm", float(np.linalg.norm(fit.lever)), LONGEST_LEVER, "m"),
-        ("world's tilt", _degrees_off(fit.up[2]), LARGEST_TILT, "°"),
-        ("gyro's bias", float(np.linalg.norm(fit.gyro_bias)), LARGEST_GYRO_BIAS, "rad/s"),
-        ("accel's bias", float(np.linalg.norm(fit.accel_bias)), LARGEST_ACCEL_BIAS, "m/s²"),
-    )
-    for what, value, most, unit in bounds:
-        if not value <= most:
-            raise Refusal(
-                path,
-                f"fits the phone only with what cannot be: the {what} would be "
-                f"{value:.3g} {unit}, at most {most:g} {unit} is plausible",
-                remedy,
-            )
-
-
-def _degrees_off(cosine: float) -> float:
-    return float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
-
-
-def _figures(fit: BodyFit) -> dict[str, str | float]:
-    vectors = {"lever": fit.lever, "gyro_bias": fit.gyro_bias, "accel_bias": fit.accel_bias}
-    return {
-        "truth": "vicon",
-        "lag": float(np.mean(fit.lag)),
-        "lag_drift": float(np.ptp(fit.lag)),
-        "accel_delay_removed": fit.accel_delay,
-        "gyro_unexplained": fit.gyro_unexplained,
-        "accel_unexplained": fit.accel_unexplained,
-        "runner_up": fit.runner_up,
-        "extrinsic_yaw_degrees": float(fit.extrinsic.as_euler("ZXY", degrees=True)[0]),
-        "extrinsic_tilt_degrees": _degrees_off(fit.extrinsic.as_matrix()[2, 2]),
-        "tilt_x": float(fit.up[0] / fit.up[2]),
-        "tilt_y": float(fit.up[1] / fit.up[2]),
-        "gyro_residual": fit.gyro_residual,
-        "accel_residual": fit.accel_residual,
-        **{
-            f"{name}_{axis}": float(value)
-            for name, vector in vectors.items()
-            for axis, value in zip("xyz", vector, strict=True)
-        },
-    }
-
-
-def _tango_figures(fit: PositionsFit) -> dict[str, str | float]:
-    return {
-        "truth": "tango",
-        "lag": float(np.mean(fit.lag)),
-        "lag_drift": float(np.ptp(fit.lag)),
-        "yaw_drift_degrees": float(np.degrees(fit.yaw_drift)),
-        "vertical_correlation": fit.correlation,
-        "runner_up": fit.runner_up,
-    }
 
 
 DATASET = Dataset(

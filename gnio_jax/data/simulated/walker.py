@@ -170,11 +170,8 @@ def _narrow(ranges: Any, share: float) -> Any:
     """A range, or a tuple of them, with this share of its width about the same middle."""
     if isinstance(ranges[0], tuple):
         return tuple(_narrow(each, share) for each in ranges)
-    low, high = ranges
-    return (
-        0.5 * (1 + share) * low + 0.5 * (1 - share) * high,
-        0.5 * (1 - share) * low + 0.5 * (1 + share) * high,
-    )
+    low, high = 0.5 * (1 + share), 0.5 * (1 - share)
+    return (low * ranges[0] + high * ranges[1], high * ranges[0] + low * ranges[1])
 
 
 def _narrow_carrying(carried: Carrying, share: float) -> Carrying:
@@ -182,9 +179,8 @@ def _narrow_carrying(carried: Carrying, share: float) -> Carrying:
     ranges = {name: _narrow(value, share) for name, value in values.items() if type(value) is tuple}
     # The surge of the trunk reaches the phone wherever it is: it says which way the walker goes.
     mean, std = carried.surge_phase
-    return carried._replace(**ranges)._replace(
-        surge=(0.9, 1.1), surge_phase=(mean, share * std), turned=0.0, roll=share * carried.roll
-    )
+    ranges |= {"surge": (0.9, 1.1), "surge_phase": (mean, share * std)}
+    return carried._replace(**ranges, turned=0.0, roll=share * carried.roll)
 
 
 MANY_PEOPLE = Population(
@@ -231,6 +227,24 @@ class Plan(NamedTuple):
     """0 walks, 1 runs."""
 
 
+class Steps(NamedTuple):
+    """The walker's steps along the plan."""
+
+    time: Float[np.ndarray, " n"]
+    """s."""
+    plan: Plan
+    length: Float[np.ndarray, " n"]
+    """Of a step, m."""
+    cadence: Float[np.ndarray, " n"]
+    """Steps in a second, Hz."""
+    phase: Float[np.ndarray, " n"]
+    """2π for each step."""
+
+    def growth(self) -> Float[np.ndarray, "n 1"]:
+        """Amplitude of a swing against that of the slow walk."""
+        return (self.length / (self.length + 0.5) * (_STEP + 0.5) / _STEP)[:, None]
+
+
 class Motion(NamedTuple):
     """True motion of the phone; one more pose than samples, since the last one drives an interval,
     too."""
@@ -267,14 +281,14 @@ def draw_motion(
     cadence = walking + planned.running * (hurried - walking)
     cadence = cadence * (1.0 + 0.03 * wander(rng, time, 1, 1.0, 0.05, 0.5)[:, 0])
     phase = 2.0 * np.pi * integral(time, cadence) + rng.uniform(0.0, 2.0 * np.pi)
-    length = planned.speed / cadence
-    offset = _trunk(rng, own, carried, time, planned, length, phase)
-    offset = offset + _strides(rng, own, carried.stride, time, planned.running, length, phase)
-    offset = offset + _strikes(own, carried, dt, length, cadence, phase)
+    steps = Steps(time, planned, planned.speed / cadence, cadence, phase)
+    offset = _trunk(rng, own, carried, steps)
+    offset = offset + _strides(rng, own, carried, steps)
+    offset = offset + _strikes(own, carried, steps, dt)
     lever = np.array([rng.uniform(*each) for each in carried.lever])
     lever[1] *= rng.choice([-1.0, 1.0])
     offset = offset + lever + wander(rng, time, 3, rng.uniform(*people.idle), 0.1, 0.8)
-    swing = _swing(rng, own, carried, time, length, phase)
+    swing = _swing(rng, own, carried, steps)
 
     # The yaw of the mounting is anything: where the phone points is no hint of where its owner
     # goes.
@@ -342,15 +356,10 @@ def _turn_rate(rng: np.random.Generator, time: Float[np.ndarray, " n"]) -> np.nd
 
 
 def _trunk(
-    rng: np.random.Generator,
-    own: np.random.Generator,
-    carried: Carrying,
-    time: Float[np.ndarray, " n"],
-    planned: Plan,
-    length: Float[np.ndarray, " n"],
-    phase: Float[np.ndarray, " n"],
+    rng: np.random.Generator, own: np.random.Generator, carried: Carrying, steps: Steps
 ) -> Float[np.ndarray, "n 3"]:
     """What reaches the phone of the trunk's fore-aft and vertical motion at step frequency, m."""
+    time, planned, length, _, phase = steps
     bounce = own.uniform(*carried.bounce) * 0.28 * length**2 / (8.0 * own.uniform(0.8, 1.0))
     surge = own.uniform(*carried.surge) * 0.016 * length / 0.7
     mean, std = carried.surge_phase
@@ -373,90 +382,57 @@ def _harmonics(
     twice, thrice = rng.uniform(*ratio), rng.uniform(*ratio) * rng.uniform(0.0, 0.6)
     start = second + 0.7 * rng.standard_normal()
     anywhere = rng.uniform(0.0, 2.0 * np.pi)
-    return (
-        wave(phase)
-        + twice / 4.0 * wave(2.0 * phase + start)
-        + thrice / 9.0 * wave(3.0 * phase + anywhere)
-    )
-
-
-def _growth(length: np.ndarray) -> np.ndarray:
-    """Amplitude of a swing against that of the slow walk."""
-    return length / (length + 0.5) * (_STEP + 0.5) / _STEP
+    overtones = thrice / 9.0 * wave(3.0 * phase + anywhere)
+    return wave(phase) + twice / 4.0 * wave(2.0 * phase + start) + overtones
 
 
 def _strides(
-    rng: np.random.Generator,
-    own: np.random.Generator,
-    ranges: Ranges,
-    time: np.ndarray,
-    running: np.ndarray,
-    length: np.ndarray,
-    phase: np.ndarray,
+    rng: np.random.Generator, own: np.random.Generator, carried: Carrying, steps: Steps
 ) -> Float[np.ndarray, "n 3"]:
     """Motion at stride frequency: the sway of the trunk, an arm or a bag that swings, m."""
-    accel = np.sqrt(2.0) * np.array([own.uniform(*each) for each in ranges])
+    accel = np.sqrt(2.0) * np.array([own.uniform(*each) for each in carried.stride])
     amplitude = accel / (np.pi * _CADENCE) ** 2
-    start = own.uniform(0.0, 2.0 * np.pi, size=3)
-    wave = np.sin(phase[:, None] / 2.0 + start) * (1.0 + 0.1 * wander(rng, time, 3, 1.0, 0.1, 1.0))
-    return amplitude * wave * (_growth(length) * (1.0 + 0.5 * running))[:, None]
+    start, phase = own.uniform(0.0, 2.0 * np.pi, size=3), steps.phase[:, None] / 2.0
+    wave = np.sin(phase + start) * (1.0 + 0.1 * wander(rng, steps.time, 3, 1.0, 0.1, 1.0))
+    return amplitude * wave * (steps.growth() * (1.0 + 0.5 * steps.plan.running[:, None]))
 
 
 def _strikes(
-    own: np.random.Generator,
-    carried: Carrying,
-    dt: float,
-    length: np.ndarray,
-    cadence: np.ndarray,
-    phase: np.ndarray,
+    own: np.random.Generator, carried: Carrying, steps: Steps, dt: float
 ) -> Float[np.ndarray, "n 3"]:
     """The blow of each heel: an oscillation that rises and dies within a fraction of a step, m."""
-    since = np.mod(phase, 2.0 * np.pi) / (2.0 * np.pi * cadence)
+    since = np.mod(steps.phase, 2.0 * np.pi) / (2.0 * np.pi * steps.cadence)
     decay, frequency = own.uniform(0.02, 0.06), own.uniform(4.0, 14.0, size=3)
     angle = 2.0 * np.pi * frequency * since[:, None] + own.uniform(0.0, 0.8, size=3)
     envelope = (since / decay) ** 2 * np.exp(2.0 - 2.0 * since / decay)
-    blow = envelope[:, None] * np.sin(angle) * (length / _STEP)[:, None]
+    blow = envelope[:, None] * np.sin(angle) * (steps.length / _STEP)[:, None]
     # Left and right heels differ.
-    blow = (
-        blow
-        * (1.0 + own.uniform(0.0, 0.4) * np.sin(np.floor(phase / (2.0 * np.pi)) * np.pi + 0.5))[
-            :, None
-        ]
-    )
+    side = np.sin(np.floor(steps.phase / (2.0 * np.pi)) * np.pi + 0.5)
+    blow = blow * (1.0 + own.uniform(0.0, 0.4) * side)[:, None]
     accel = np.gradient(np.gradient(blow, dt, axis=0), dt, axis=0)
     strength = own.uniform(*carried.strike) * own.uniform(0.4, 1.0, size=3)
     return blow * strength / np.maximum(np.sqrt(np.mean(accel**2, axis=0)), 1e-9)
 
 
 def _swing(
-    rng: np.random.Generator,
-    own: np.random.Generator,
-    carried: Carrying,
-    time: np.ndarray,
-    length: np.ndarray,
-    phase: np.ndarray,
+    rng: np.random.Generator, own: np.random.Generator, carried: Carrying, steps: Steps
 ) -> Float[np.ndarray, "n 3"]:
     """Roll, pitch and yaw of the phone against the walker, rad."""
-    total = wander(rng, time, 3, rng.uniform(*carried.grip), 0.01, 0.15)
+    total = wander(rng, steps.time, 3, rng.uniform(*carried.grip), 0.01, 0.15)
     for ranges, rate in ((carried.stride_rate, 0.5), (carried.step_rate, 1.0)):
         speed = np.sqrt(2.0) * np.array([own.uniform(*each) for each in ranges])
         amplitude = speed / (2.0 * np.pi * _CADENCE * rate)
         start = own.uniform(0.0, 2.0 * np.pi, size=3)
-        total = total + amplitude * np.sin(phase[:, None] * rate + start) * _growth(length)[:, None]
+        total = total + amplitude * np.sin(steps.phase[:, None] * rate + start) * steps.growth()
     return total
 
 
 def wander(
-    rng: np.random.Generator,
-    time: np.ndarray,
-    width: int,
-    rms: float,
-    lowest: float,
-    highest: float,
+    rng: np.random.Generator, time: np.ndarray, width: int, rms: float, low: float, high: float
 ) -> np.ndarray:
     """Smooth aimless motion (n, width): eight sinusoids between two frequencies (Hz) with a root
     mean square of `rms` together."""
-    frequency = rng.uniform(lowest, highest, size=(8, width))
+    frequency = rng.uniform(low, high, size=(8, width))
     start = rng.uniform(0.0, 2.0 * np.pi, size=(8, width))
     result = np.zeros((len(time), width))
     for f, s in zip(frequency, start, strict=True):

@@ -8,13 +8,15 @@ that integrating the noise-free IMU sample by sample returns the trajectory.
 
 from __future__ import annotations
 
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from gnio_jax.data.dataset import Dataset, Recording, single
+from gnio_jax.data.dataset import Dataset, Recording
 from gnio_jax.data.simulated.walker import (
     CARRYING,
     FEW_PEOPLE,
@@ -184,26 +186,30 @@ _FEW = {
 _MANY = {"train": (100_000, 600, 60.0), "val": (200_000, 40, 60.0), "test": (300_000, 24, 120.0)}
 
 
-def _few_recordings(root: Path | None, split: str) -> list[Recording]:
+def _few_recordings(_: Path | None, split: str) -> list[Recording]:
     """The walks of few people, not yet computed."""
-    del root
     seed, first_person, people, count, seconds = _FEW[split]
     placements, walks = list(CARRYING), []
     for index in range(count):
         who = first_person + index % people
         # Shifted by one per round of people, so that nobody carries the phone in one place only.
         where = placements[(index + index // people) % len(placements)]
-        name = f"synthetic_{seed + index}_{where}"
-        walks.append(single(name, pedestrian, seed + index, who, where, seconds))
+        computed = partial(_alone, pedestrian, seed + index, who, where, seconds)
+        walks.append(Recording(f"synthetic_{seed + index}_{where}", computed))
     return walks
 
 
-def _many_recordings(root: Path | None, split: str) -> list[Recording]:
+def _many_recordings(_: Path | None, split: str) -> list[Recording]:
     """The walks of many people, not yet computed."""
-    del root
     first, count, seconds = _MANY[split]
-    seeds = range(first, first + count)
-    return [single(f"randomised_{seed}", random_walk, seed, seconds) for seed in seeds]
+    return [
+        Recording(f"randomised_{seed}", partial(_alone, random_walk, seed, seconds))
+        for seed in range(first, first + count)
+    ]
+
+
+def _alone(compute: Any, *arguments: Any) -> list[Sequence]:
+    return [compute(*arguments)]
 
 
 SYNTHETIC = Dataset(
@@ -216,13 +222,6 @@ SYNTHETIC = Dataset(
     licence="Apache-2.0, as this package",
     needs_root=False,
 )
-RANDOMISED = Dataset(
-    name="randomised",
-    recordings=_many_recordings,
-    splits=tuple(_MANY),
-    rate=100.0,
-    source="computed by gnio_jax.data.simulated",
-    layout="no files are needed",
-    licence="Apache-2.0, as this package",
-    needs_root=False,
+RANDOMISED = replace(
+    SYNTHETIC, name="randomised", recordings=_many_recordings, splits=tuple(_MANY), rate=100.0
 )
