@@ -26,6 +26,11 @@ LIVELY = 0.2
 """m/s² rms of horizontal acceleration, above which the positions must show it, too."""
 TRIANGLE_SECONDS = 0.1
 """Half the width of the triangles over which accelerations are compared, s."""
+MOST_GRAVITY_ERROR, MOST_GYRO_DEGREES = 0.5, 5.0
+"""m/s² by which the mean of R·accel may be off gravity, and by how much the gyro may be off the
+reference's rotation in the median window."""
+FASTEST_MEDIAN, LEAST_CORRELATION = 3.0, 0.3
+"""m/s of a pedestrian's median speed, and correlation of the horizontal accelerations."""
 
 
 class SelfCheck(NamedTuple):
@@ -53,126 +58,54 @@ class SelfCheck(NamedTuple):
     """What is implausible, one sentence each; empty when the sequence may be used."""
 
 
-def self_check(
-    sequence: Sequence,
-    pedestrian: bool = True,
-    correlates: bool = True,
-    window_seconds: float = WINDOW_SECONDS,
-    max_gravity_error: float = 0.5,
-    max_gyro_degrees: float = 5.0,
-    max_speed: float = 3.0,
-    min_correlation: float = 0.3,
-) -> SelfCheck:
+def self_check(sequence: Sequence, pedestrian: bool = True, correlates: bool = True) -> SelfCheck:
     """Do IMU and reference describe the same motion? `sequence` must be on a uniform clock.
 
-    Fails: mean of R·accel off (0, 0, 9.81) and the reference's own mean acceleration by
-    `max_gravity_error` m/s²; gyro off the reference orientation by more than `max_gyro_degrees` in
-    the median window; a pedestrian whose median speed exceeds `max_speed` m/s; a horizontal
-    acceleration above 0.2 m/s² rms that correlates with that of the positions by less than
-    `min_correlation`, where the dataset says that it `correlates`. Standing still is no failure: it
-    is what the gate is for. Neither is being too short for the gyro's windows. Of waypoints only
-    gravity and the speed between them can be asked.
+    Fails: mean of R·accel off (0, 0, 9.81) and the reference's own mean acceleration by more than
+    0.5 m/s²; gyro off the reference orientation by more than 5° in the median window; a pedestrian
+    whose median speed exceeds 3 m/s; a horizontal acceleration above 0.2 m/s² rms that correlates
+    with that of the positions by less than 0.3, where the dataset says that it `correlates`.
+    Standing still is no failure: it is what the gate is for. Neither is being too short for the
+    gyro's windows. Of waypoints only gravity and the speed between them can be asked.
     """
-    if sequence.waypoints is None and not sequence.valid.any():
-        return _without_reference(sequence)
-    if sequence.waypoints is None:
-        check, strength, has_windows = _measure(sequence, window_seconds)
-    else:
-        check, strength, has_windows = _measure_waypoints(sequence, window_seconds), 0.0, True
-    gravity_error = float(np.linalg.norm(check.gravity_mean - [0.0, 0.0, GRAVITY]))
-    correlation = check.accel_correlation_horizontal
-    failures = []
-    if not gravity_error <= max_gravity_error:
-        mean = ", ".join(f"{value:.2f}" for value in check.gravity_mean)
-        failures.append(
-            f"mean of R·accel is ({mean}) m/s², off (0, 0, 9.81) by {gravity_error:.2f}"
-        )
-    if not has_windows and check.duration >= 2.0 * window_seconds:
-        failures.append(f"no window of {window_seconds:g} s has a valid reference at its ends")
-    elif check.gyro_consistency_degrees > max_gyro_degrees:
-        failures.append(
-            f"gyro is off the reference orientation by {check.gyro_consistency_degrees:.1f}° "
-            f"in the median window of {window_seconds:g} s"
-        )
-    if pedestrian and check.median_speed > max_speed:
-        failures.append(f"median speed is {check.median_speed:.1f} m/s, too fast for a pedestrian")
-    # The correlation is NaN when the positions do not move at all.
-    if correlates and strength > LIVELY and not correlation >= min_correlation:
-        failures.append(
-            f"horizontal acceleration of the positions correlates by only {correlation:.2f} "
-            "with R·accel"
-        )
-    return check._replace(failures=tuple(failures))
-
-
-class _Measured(NamedTuple):
-    check: SelfCheck
-    """The figures, without failures."""
-    strength: float
-    """Horizontal acceleration by the accelerometer, m/s² rms."""
-    has_windows: bool
-    """True if the gyro could be integrated over at least one window."""
-
-
-def _measure(sequence: Sequence, window_seconds: float) -> _Measured:
-    time, valid = sequence.time, sequence.valid
-    step = float(np.median(np.diff(time)))
-    force = rotations(_held_attitude(sequence)).apply(sequence.accel)
-    starts, gyro_errors = gyro_windows(sequence, window_seconds)
-    # Windows that overlap throughout are one window, and one bias explains one window whatever it
-    # holds.
-    apart = starts.size > 0 and float(np.ptp(starts)) > window_seconds - 0.5 * step
-    correlation, strength = _accel_correlation(sequence, force, step)
+    step = float(np.median(np.diff(sequence.time)))
     check = SelfCheck(
-        duration=float(time[-1] - time[0]),
-        rate=1.0 / step,
-        gravity_mean=force[valid].mean(axis=0) - _mean_acceleration(sequence, step),
-        gyro_consistency_degrees=float(np.median(gyro_errors)) if apart else float("nan"),
-        median_speed=float(np.median(np.linalg.norm(sequence.velocity[valid], axis=1))),
-        accel_correlation_horizontal=correlation,
-        share_valid=float(valid.mean()),
-        failures=(),
-    )
-    return _Measured(check, strength, starts.size > 0)
-
-
-def _measure_waypoints(sequence: Sequence, window_seconds: float) -> SelfCheck:
-    """The figures of a recording that has waypoints in the place of poses.
-
-    The mean specific force over a window, in the frame of its gyro-integrated attitude, is as long
-    as gravity: a walker gains hardly any velocity in it. Its direction is not known.
-    """
-    assert sequence.waypoints is not None
-    time, (stamps, position) = sequence.time, sequence.waypoints
-    step = float(np.median(np.diff(time)))
-    force = integrate_gyro(sequence.gyro, step).apply(sequence.accel)
-    length = min(round(window_seconds / step), len(time))
-    summed = np.concatenate([np.zeros((1, 3)), np.cumsum(force, axis=0)])
-    means = (summed[length:] - summed[:-length]) / length
-    legs = np.linalg.norm(np.diff(position, axis=0), axis=1) / np.diff(stamps)
-    return SelfCheck(
-        duration=float(time[-1] - time[0]),
-        rate=1.0 / step,
-        gravity_mean=np.array([0.0, 0.0, np.median(np.linalg.norm(means, axis=1))]),
-        gyro_consistency_degrees=np.nan,
-        median_speed=float(np.median(legs)),
-        accel_correlation_horizontal=np.nan,
-        share_valid=0.0,
-        failures=(),
-    )
-
-
-def _without_reference(sequence: Sequence) -> SelfCheck:
-    return SelfCheck(
         duration=float(sequence.time[-1] - sequence.time[0]),
-        rate=1.0 / float(np.median(np.diff(sequence.time))),
+        rate=1.0 / step,
         gravity_mean=np.full(3, np.nan),
         gyro_consistency_degrees=np.nan,
         median_speed=np.nan,
         accel_correlation_horizontal=np.nan,
-        share_valid=0.0,
-        failures=("no sample has a valid reference",),
+        share_valid=float(sequence.valid.mean()),
+        failures=(),
     )
+    strength, has_windows = 0.0, True
+    if sequence.waypoints is not None:
+        check = _with_waypoints(check, sequence, step)
+    elif not sequence.valid.any():
+        return check._replace(failures=("no sample has a valid reference",))
+    else:
+        check, strength, has_windows = _with_reference(check, sequence, step)
+    gravity_error = float(np.linalg.norm(check.gravity_mean - [0.0, 0.0, GRAVITY]))
+    correlation, degrees = check.accel_correlation_horizontal, check.gyro_consistency_degrees
+    failures = []
+    if not gravity_error <= MOST_GRAVITY_ERROR:
+        mean = ", ".join(f"{value:.2f}" for value in check.gravity_mean)
+        off = f"off (0, 0, 9.81) by {gravity_error:.2f}"
+        failures.append(f"mean of R·accel is ({mean}) m/s², {off}")
+    window = f"window of {WINDOW_SECONDS:g} s"
+    if not has_windows and check.duration >= 2.0 * WINDOW_SECONDS:
+        failures.append(f"no {window} has a valid reference at its ends")
+    elif degrees > MOST_GYRO_DEGREES:
+        off = f"off the reference orientation by {degrees:.1f}°"
+        failures.append(f"gyro is {off} in the median {window}")
+    if pedestrian and check.median_speed > FASTEST_MEDIAN:
+        failures.append(f"median speed is {check.median_speed:.1f} m/s, too fast for a pedestrian")
+    # The correlation is NaN when the positions do not move at all.
+    if correlates and strength > LIVELY and not correlation >= LEAST_CORRELATION:
+        problem = f"correlates by only {correlation:.2f} with R·accel"
+        failures.append(f"horizontal acceleration of the positions {problem}")
+    return check._replace(failures=tuple(failures))
 
 
 def check_sequence(sequence: Sequence, dataset: Dataset) -> SelfCheck:
@@ -181,30 +114,61 @@ def check_sequence(sequence: Sequence, dataset: Dataset) -> SelfCheck:
     What a converted recording brings along as `check_pedestrian` and `check_correlation` wins: its
     own dataset asked it.
     """
-    asked = {
-        "pedestrian": bool(sequence.attributes.get("check_pedestrian", dataset.pedestrian)),
-        "correlates": bool(sequence.attributes.get("check_correlation", dataset.correlates)),
-    }
-    check = self_check(sequence, **asked)
+    about = sequence.attributes
+    pedestrian = bool(about.get("check_pedestrian", dataset.pedestrian))
+    check = self_check(
+        sequence, pedestrian, bool(about.get("check_correlation", dataset.correlates))
+    )
     needed = dataset.needs_reference or sequence.valid.any()
     return check if needed else check._replace(failures=())
 
 
-def _held_attitude(sequence: Sequence) -> Float[np.ndarray, "n 4"]:
-    """The last valid attitude of each sample.
+def _with_reference(
+    check: SelfCheck, sequence: Sequence, step: float
+) -> tuple[SelfCheck, float, bool]:
+    """(figures, horizontal acceleration by the accelerometer m/s² rms, whether the gyro could be
+    integrated over at least one window)."""
+    valid, velocity = sequence.valid, sequence.velocity
+    force = rotations(_held_attitude(sequence)).apply(sequence.accel)
+    # The reference's mean acceleration, by the velocities at the ends of its valid stretches.
+    first, stop = spans(valid).T
+    seconds = float((stop - 1 - first).sum()) * step
+    gained = (velocity[stop - 1] - velocity[first]).sum(axis=0)
+    starts, gyro_errors = gyro_windows(sequence)
+    # Windows that overlap throughout are one window, and one bias explains one window whatever it
+    # holds.
+    apart = starts.size > 0 and float(np.ptp(starts)) > WINDOW_SECONDS - 0.5 * step
+    correlation, strength = _accel_correlation(sequence, force, step)
+    check = check._replace(
+        gravity_mean=force[valid].mean(axis=0) - gained / max(seconds, step),
+        gyro_consistency_degrees=float(np.median(gyro_errors)) if apart else np.nan,
+        median_speed=float(np.median(np.linalg.norm(velocity[valid], axis=1))),
+        accel_correlation_horizontal=correlation,
+    )
+    return check, strength, starts.size > 0
 
-    Invalid rows are left out of every mean and only bridge the gyro's windows.
+
+def _with_waypoints(check: SelfCheck, sequence: Sequence, step: float) -> SelfCheck:
+    """The figures of a recording that has waypoints in the place of poses.
+
+    The mean specific force over a window, in the frame of its gyro-integrated attitude, is as long
+    as gravity: a walker gains hardly any velocity in it. Its direction is not known.
     """
+    assert sequence.waypoints is not None
+    stamps, position = sequence.waypoints
+    force = integrate_gyro(sequence.gyro, step).apply(sequence.accel)
+    length = min(round(WINDOW_SECONDS / step), len(force))
+    summed = np.concatenate([np.zeros((1, 3)), np.cumsum(force, axis=0)])
+    means = np.linalg.norm((summed[length:] - summed[:-length]) / length, axis=1)
+    legs = np.linalg.norm(np.diff(position, axis=0), axis=1) / np.diff(stamps)
+    gravity = np.array([0.0, 0.0, np.median(means)])
+    return check._replace(gravity_mean=gravity, median_speed=float(np.median(legs)))
+
+
+def _held_attitude(sequence: Sequence) -> Float[np.ndarray, "n 4"]:
+    """The last valid attitude of each sample. Invalid rows are left out of every mean and only
+    bridge the gyro's windows."""
     return sequence.orientation[last_true(sequence.valid)]
-
-
-def _mean_acceleration(sequence: Sequence, step: float) -> Float[np.ndarray, "3"]:
-    """Of the reference over its valid stretches, by the velocities at their ends, m/s²."""
-    first, stop = spans(sequence.valid).T
-    last = stop - 1
-    seconds = float((last - first).sum()) * step
-    gained = (sequence.velocity[last] - sequence.velocity[first]).sum(axis=0)
-    return gained / seconds if seconds > 0 else np.zeros(3)
 
 
 # --- gyro

@@ -187,7 +187,7 @@ def _csv_reference(table: Table, gyro: Sensor, unit: str | None) -> Track | None
     if not np.isfinite(gyro.stamps).all() or len(gyro.stamps) < 2:
         return None  # the gyro is refused for this
     first = gyro.stamps.min().item()
-    unit = unit or time_unit(gyro.stamps - first).unit
+    unit = unit or time_unit(gyro.stamps - first)[0]
     poses = reference(table, seconds(gyro.stamps, first, unit)) if unit else None
     if unit is None or poses is None:
         return None

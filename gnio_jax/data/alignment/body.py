@@ -30,7 +30,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d
-from scipy.optimize import least_squares
+from scipy.optimize import least_squares, minimize_scalar
 from scipy.spatial.transform import Rotation
 
 from gnio_jax.data.assembly import Samples, Streams
@@ -358,39 +358,55 @@ def _fit(
     if np.minimum(np.diff(seen.time, append=np.inf), 1.0).sum() < SHORTEST_OVERLAP:
         raise TooLittle(f"less than {SHORTEST_OVERLAP:g} s of the track overlap the IMU's samples")
     reach = np.concatenate([np.full(3, TURN_STEP), PRIOR_STD, np.full(len(knots), LAG_STEP)])
-    unit = np.eye(len(unknowns))
     found = errors(seen, felt, hats, extrinsic, unknowns)
     for _ in range(2):
         scales = max(robust_std(found[0]), 1e-4), max(robust_std(found[1]), 1e-3)
         off = [np.linalg.norm(e, axis=1) / s for e, s in zip(found, scales, strict=True)]
         kept = np.maximum(*off) < OUTLIER
         noises = [_noise(seen.time[kept], e[kept], s) for e, s in zip(found, scales, strict=True)]
-        guess, start, rows, inner = extrinsic, unknowns, seen.rows(kept), hats[kept]
-
-        def whitened(sides: tuple, x: np.ndarray, noises: list[_Noise] = noises) -> np.ndarray:
-            """Both sides' rows, and those of the priors, of the errors or of their derivatives."""
-            scaled = (noise.whitened(each) for noise, each in zip(noises, sides, strict=True))
-            prior = x[3:15] / PRIOR_STD.reshape(-1, *[1] * (x.ndim - 1))
-            return np.concatenate([*scaled, prior, np.diff(x[LAG], 2, axis=0) / LAG_BEND_STD])
-
-        change = least_squares(
-            lambda change, at=(rows, felt, inner, guess), x=start: whitened(
-                errors(*at, x + change), x + change
-            ),
-            np.zeros(len(unknowns)),
-            lambda change, at=(rows, felt, inner, guess), x=start: whitened(
-                jacobians(*at, x + change), unit
-            ),
-            loss="cauchy",
-            f_scale=3.0,
-            x_scale=reach,
-            ftol=1e-5,
-            max_nfev=20,
-        ).x
-        extrinsic = guess * Rotation.from_rotvec((start + change)[TURN])
-        unknowns = np.concatenate([np.zeros(3), (start + change)[3:]])
+        problem = _Problem(seen.rows(kept), felt, hats[kept], extrinsic, noises, unknowns)
+        unknowns = (
+            unknowns
+            + least_squares(
+                problem.residuals,
+                np.zeros(len(unknowns)),
+                problem.derivatives,
+                loss="cauchy",
+                f_scale=3.0,
+                x_scale=reach,
+                ftol=1e-5,
+                max_nfev=20,
+            ).x
+        )
+        extrinsic = extrinsic * Rotation.from_rotvec(unknowns[TURN])
+        unknowns[TURN] = 0.0
         found = errors(seen, felt, hats, extrinsic, unknowns)
     return _Fit(extrinsic, unknowns, seen, *found)
+
+
+class _Problem(NamedTuple):
+    """One round of least squares, whose unknowns are changes from `start`."""
+
+    seen: _Seen
+    felt: _Felt
+    hats: Float[np.ndarray, "n k"]
+    guess: Rotation
+    noises: list[_Noise]
+    start: Float[np.ndarray, " u"]
+
+    def residuals(self, change: Float[np.ndarray, " u"]) -> Float[np.ndarray, " r"]:
+        x = self.start + change
+        return self._whitened(errors(*self[:4], x), x)
+
+    def derivatives(self, change: Float[np.ndarray, " u"]) -> Float[np.ndarray, "r u"]:
+        x = self.start + change
+        return self._whitened(jacobians(*self[:4], x), np.eye(len(x)))
+
+    def _whitened(self, sides: tuple[np.ndarray, np.ndarray], x: np.ndarray) -> np.ndarray:
+        """Rows of both sides and of the priors: of the errors, or of their derivatives."""
+        rows = (noise.whitened(side) for noise, side in zip(self.noises, sides, strict=True))
+        prior = (x[3:15].T / PRIOR_STD).T
+        return np.concatenate([*rows, prior, np.diff(x[LAG], 2, axis=0) / LAG_BEND_STD])
 
 
 def errors(
@@ -440,7 +456,9 @@ def jacobians(
 
 
 class _Noise(NamedTuple):
-    """Errors that are white but for an offset that each block of them shares."""
+    """Errors that are white but for an offset that each block of them shares: a gyro's bias drifts,
+    and a tracker's attitude is off by some tenths of a degree that depend on the place. White noise
+    would take a minute at rest for thousands of proofs of one direction."""
 
     scale: float
     """Standard deviation of the white part."""
@@ -453,8 +471,7 @@ class _Noise(NamedTuple):
 
     def whitened(self, values: Float[np.ndarray, "n 3 *u"]) -> Float[np.ndarray, "r *u"]:
         """Errors, or their derivatives, as uncorrelated rows of unit variance."""
-        values = values / self.scale
-        ones = (1,) * (values.ndim - 1)
+        values, ones = values / self.scale, (1,) * (values.ndim - 1)
         mean = np.add.reduceat(values, self.starts) / self.counts.reshape(-1, *ones)
         inner = values - np.repeat(mean, self.counts, axis=0)
         whole = np.concatenate([inner, mean / self.spread.reshape(-1, *ones)])
@@ -462,12 +479,8 @@ class _Noise(NamedTuple):
 
 
 def _noise(time: np.ndarray, error: Float[np.ndarray, "n 3"], scale: float) -> _Noise:
-    """A gyro's bias drifts, and a tracker's attitude is off by some tenths of a degree that depend
-    on the place: white noise would take a minute at rest for thousands of proofs of one
-    direction."""
-    _, starts, counts = np.unique(
-        np.floor(time / BLOCK_SECONDS), return_index=True, return_counts=True
-    )
+    blocks = np.floor(time / BLOCK_SECONDS)
+    _, starts, counts = np.unique(blocks, return_index=True, return_counts=True)
     mean = np.add.reduceat(error / scale, starts) / counts[:, None]
     return _Noise(scale, starts, counts, np.sqrt(robust_std(mean) ** 2 + 1.0 / counts))
 
@@ -507,8 +520,7 @@ def pose_lag(
     """By how much poses of the IMU's body are late, from the angular rates of both.
 
     `time`, `stamps` s; `gyro` rad/s; `attitude` m rotations body→world. The lag that lets gyro(t) −
-    bias and rate(t + lag) differ least, in a robust sense, both smoothed over 0.05 s (σ); among
-    multiples of 10 ms first, then by least squares.
+    bias and rate(t + lag) differ least in the mean of their sizes, both smoothed over 0.05 s (σ).
     """
     steps, middle = np.diff(stamps), midpoints(stamps)
     near = steps <= LOST_POSES / RATE
@@ -528,26 +540,17 @@ def pose_lag(
     if float(np.median(np.linalg.norm(felt - np.median(felt, axis=0), axis=1))) < 0.02:
         return PoseLag(0.0, 1.0)
 
-    def error(lag: float, bias: Float[np.ndarray, "3"] | float = 0.0) -> Float[np.ndarray, "n 3"]:
-        return felt - bias - tracked(clock + lag)
-
     def off(lag: float) -> float:
-        return float(np.abs(error(lag, np.median(error(lag), axis=0))).mean())
+        error = felt - tracked(clock + lag)
+        return float(np.abs(error - np.median(error, axis=0)).mean())
 
     most = round(LONGEST_POSE_LAG * 100)
     lag = min((i / 100.0 for i in range(-most, most + 1)), key=off)
-    bias = np.median(error(lag), axis=0)
-    best = least_squares(
-        lambda unknowns: error(unknowns[0], unknowns[1:]).ravel(),
-        np.array([lag, *bias]),
-        loss="cauchy",
-        f_scale=max(3.0 * robust_std(error(lag, bias)), 1e-6),
-        x_scale="jac",
-        bounds=([lag - 0.05, *[-np.inf] * 3], [lag + 0.05, *[np.inf] * 3]),
-    ).x[0]
+    near = (lag - 0.01, lag + 0.01)
+    best = float(minimize_scalar(off, bounds=near, method="bounded", options={"xatol": 1e-4}).x)
     first, second = (rate - rate.mean(axis=0) for rate in (felt, tracked(clock + best)))
     power = np.sqrt((first**2).sum() * (second**2).sum())
-    return PoseLag(float(best), float((first * second).sum() / power))
+    return PoseLag(best, float((first * second).sum() / power))
 
 
 # --- shared with `positions`

@@ -23,24 +23,16 @@ MOST_APART = 10
 two clocks lie among each other (ours). A block of rows in the wrong place has three."""
 
 
-class TimeUnit(NamedTuple):
-    """What the steps of stamps say of their unit."""
-
-    unit: str | None
-    """The one by which they are an IMU's; None if there is none."""
-    rate: float
-    """Hz, if they were seconds."""
-
-
-def time_unit(stamps: Real[np.ndarray, " n"]) -> TimeUnit:
-    """The unit by which the stamps run at `RATES`; the ranges of the units do not overlap."""
+def time_unit(stamps: Real[np.ndarray, " n"]) -> tuple[str | None, float]:
+    """(unit by which the stamps run at `RATES` or None, Hz if they were seconds); the ranges of the
+    units do not overlap."""
     steps = np.diff(np.sort(stamps))
     steps = steps[steps > 0]
     step = float(np.median(steps)) if steps.size else np.inf
     # A rate at the very edge is inside, whatever the last digit of its stamps.
     lowest, highest = RATES[0] * (1 - 1e-6), RATES[1] * (1 + 1e-6)
     units = [unit for unit, count in PER_SECOND.items() if lowest <= count / step <= highest]
-    return TimeUnit(units[0] if units else None, 1.0 / step)
+    return units[0] if units else None, 1.0 / step
 
 
 def check_seconds(time: Float[np.ndarray, " n"], source: object) -> None:
@@ -51,9 +43,8 @@ def check_seconds(time: Float[np.ndarray, " n"], source: object) -> None:
     hint = f"an IMU runs at {RATES[0]:g} to {RATES[1]:g} Hz"
     if unit is not None:
         hint = f"it looks like {unit}: divide it by {PER_SECOND[unit]:g}"
-    raise InputError(
-        source, f"field 'time' is not in seconds (as such its rate would be {rate:.3g} Hz)", hint
-    )
+    problem = f"field 'time' is not in seconds (as such its rate would be {rate:.3g} Hz)"
+    raise InputError(source, problem, hint)
 
 
 def rounded_rate(time: Float[np.ndarray, " n"]) -> float:
@@ -93,11 +84,8 @@ def distinct(
     twice. Raises `InputError` where fewer than half of the rows have a stamp of their own."""
     rows = np.unique(stamps, return_index=True)[1]
     if len(rows) < 0.5 * len(stamps):
-        raise InputError(
-            source,
-            f"field '{field}' holds only {len(rows)} different stamps in {len(stamps)} rows",
-            "copy it again",
-        )
+        problem = f"holds only {len(rows)} different stamps in {len(stamps)} rows"
+        raise InputError(source, f"field '{field}' {problem}", "copy it again")
     return rows
 
 
@@ -126,21 +114,14 @@ def in_order(
     backward = int((steps < 0).sum())
     if (np.abs(np.diff(order)) > 1).sum() > MOST_APART * max(backward, 1):
         row = int(np.argmin(steps))
-        raise InputError(
-            source,
-            f"field 'time' jumps back by {-steps[row]:.2f} s after {time[row]:.6f} s, and what "
-            "follows overlaps what was before",
-            "its clock was set: cut the recording there",
-        )
+        problem = f"field 'time' jumps back by {-steps[row]:.2f} s after {time[row]:.6f} s"
+        problem += ", and what follows overlaps what was before"
+        raise InputError(source, problem, "its clock was set: cut the recording there")
     again = np.concatenate([[False], np.diff(time[order]) == 0])
-    other_values = (np.diff(values[order], axis=0) != 0).any(axis=1)
-    conflicts = int((again[1:] & other_values).sum())
-    if conflicts > max(MOST_REPEATED * len(time), 1):
-        raise InputError(
-            source,
-            f"field 'time' gives {conflicts} of {len(time)} rows the stamp of another row with "
-            f"other values, first at {time[order][1:][again[1:] & other_values][0]:.6f} s",
-            "give stamps fine enough to tell the samples apart",
-        )
+    other = np.concatenate([[False], (np.diff(values[order], axis=0) != 0).any(axis=1)]) & again
+    if other.sum() > max(MOST_REPEATED * len(time), 1):
+        problem = f"gives {other.sum()} of {len(time)} rows the stamp of another row with other"
+        problem = f"field 'time' {problem} values, first at {time[order][other][0]:.6f} s"
+        raise InputError(source, problem, "give stamps fine enough to tell the samples apart")
     counts = {"rows_sorted": float(backward), "rows_repeated": float(again.sum())}
     return InOrder(order[~again], {name: count for name, count in counts.items() if count})

@@ -74,11 +74,9 @@ def accel_scale(
     size = float(np.median(np.linalg.norm(accel, axis=1)))
     fitting = [name for name, (low, high) in GRAVITY_RANGES.items() if low <= size <= high]
     if not fitting:
-        raise InputError(
-            path,
-            f"the unit of field 'accel' is ambiguous (median magnitude {size:.3g})",
-            "state it, and give the specific force, gravity included",
-        )
+        problem = f"the unit of field 'accel' is ambiguous (median magnitude {size:.3g})"
+        remedy = "state it, and give the specific force, gravity included"
+        raise InputError(path, problem, remedy)
     notes.append(f"{path.name}: accel taken as {fitting[0]} (median magnitude {size:.3g})")
     return TO_METRES_PER_SECOND_SQUARED[fitting[0]]
 
@@ -93,25 +91,20 @@ def gyro_scale(imu: Motion, unit: str | None, path: Path, notes: list[str]) -> f
     if unit is not None:
         return TO_RAD_PER_SECOND[unit]
     peak = float(np.percentile(np.linalg.norm(imu.gyro, axis=1), 99.9))
-    turning = _turning_of_gravity(imu)
-    share, degrees = turning.slope, turning.slope / TO_RAD_PER_SECOND["deg/s"]
+    slope, told = _turning_of_gravity(imu)
+    found = {"rad/s": slope, "deg/s": slope / TO_RAD_PER_SECOND["deg/s"]}
+    fitting = [name for name, share in found.items() if told and 0.5 < share < 2.0]
+    shaken = float(np.linalg.norm(imu.accel, axis=1).std()) > STEPS
     if peak > GYRO_RANGE:
         unit, reason = "deg/s", f"it reaches {peak:.3g}, beyond any phone's range in rad/s"
-    elif turning.correlation > 0.5 and 0.5 < share < 2.0:
-        unit, reason = "rad/s", f"gravity turns by {share:.2f} of it"
-    elif turning.correlation > 0.5 and 0.5 < degrees < 2.0:
-        unit, reason = "deg/s", f"gravity turns by {share:.3f} of it"
-    elif peak <= CARRIED_TURN and float(np.linalg.norm(imu.accel, axis=1).std()) > STEPS:
-        unit, reason = (
-            "rad/s",
-            f"it reaches {peak:.3g}, and what is carried turns faster than {CARRIED_TURN:g} deg/s",
-        )
+    elif fitting:
+        unit, reason = fitting[0], f"gravity turns by {slope:.2g} of it"
+    elif peak <= CARRIED_TURN and shaken:
+        reason = f"what is carried turns faster than {CARRIED_TURN:g} deg/s"
+        unit, reason = "rad/s", f"it reaches {peak:.3g}, and {reason}"
     else:
-        raise InputError(
-            path,
-            f"the unit of field 'gyro' is ambiguous (it reaches {peak:.3g})",
-            "state it: rad/s or deg/s",
-        )
+        problem = f"the unit of field 'gyro' is ambiguous (it reaches {peak:.3g})"
+        raise InputError(path, problem, "state it: rad/s or deg/s")
     notes.append(f"{path.name}: gyro taken as {unit} ({reason})")
     return TO_RAD_PER_SECOND[unit]
 
@@ -119,32 +112,21 @@ def gyro_scale(imu: Motion, unit: str | None, path: Path, notes: list[str]) -> f
 def check_rad_per_second(imu: Motion, path: Path) -> None:
     """Raise `InputError` where a gyro that a format or header gives a unit does not turn as gravity
     does, but by the factor between rad and deg. `imu` is in SI units by that statement."""
-    turning, factor = _turning_of_gravity(imu), TO_RAD_PER_SECOND["deg/s"]
-    if turning.correlation <= 0.5:
-        return
-    for share, looks in ((turning.slope / factor, "deg/s"), (turning.slope * factor, "rad/s")):
-        if 0.5 < share < 2.0:
-            raise InputError(
-                path,
-                f"its gyro looks like {looks}, which it does not say "
-                f"(gravity turns by {turning.slope:.3g} of it)",
-                "state the unit of the gyro: rad/s or deg/s",
-            )
+    (slope, told), factor = _turning_of_gravity(imu), TO_RAD_PER_SECOND["deg/s"]
+    for share, looks in ((slope / factor, "deg/s"), (slope * factor, "rad/s")):
+        if told and 0.5 < share < 2.0:
+            turns = f"gravity turns by {slope:.3g} of it"
+            problem = f"its gyro looks like {looks}, which it does not say ({turns})"
+            raise InputError(path, problem, "state the unit of the gyro: rad/s or deg/s")
 
 
-class _Turning(NamedTuple):
-    """The change of the smoothed specific force over a second against −∫ω × f."""
-
-    slope: float
-    """1 where ω is in rad/s; 0 where gravity does not turn."""
-    correlation: float
-
-
-def _turning_of_gravity(imu: Motion) -> _Turning:
+def _turning_of_gravity(imu: Motion) -> tuple[float, bool]:
+    """(slope, whether it tells the unit) of the change of the smoothed specific force over a second
+    against −∫ω × f: 1 where ω is in rad/s. It tells where both correlate by more than 0.5."""
     step = float(np.median(np.diff(imu.time)))
     clock = np.arange(imu.time[0], imu.time[-1], step)
     if len(clock) < 3.0 / step:
-        return _Turning(0.0, 0.0)
+        return 0.0, False
     force, rate = (
         gaussian_filter1d(interpolate(clock, imu.time, values), 0.5 / step, axis=0)
         for values in (imu.accel, imu.gyro)
@@ -158,9 +140,9 @@ def _turning_of_gravity(imu: Motion) -> _Turning:
     power, strength = float((expected**2).sum()), float((change**2).sum())
     # Where gravity has not moved there is only noise and vibration.
     if power == 0.0 or strength / len(change) < 0.1**2:
-        return _Turning(0.0, 0.0)
+        return 0.0, False
     both = float((change * expected).sum())
-    return _Turning(both / power, both / np.sqrt(power * strength))
+    return both / power, both / np.sqrt(power * strength) > 0.5
 
 
 def signed(
@@ -174,15 +156,12 @@ def signed(
     if sign == "detect":
         up = float(np.median(accel[:, 2]) / np.median(np.linalg.norm(accel, axis=1)))
         if abs(up) < 0.5:
-            raise InputError(
-                path,
-                f"the sign of field 'accel' is ambiguous (its z axis carries {up:.2f} of gravity)",
-                "state it: android or ios",
-            )
+            carried = f"its z axis carries {up:.2f} of gravity"
+            problem = f"the sign of field 'accel' is ambiguous ({carried})"
+            raise InputError(path, problem, "state it: android or ios")
         sign, name = ("android", "Android") if up > 0 else ("ios", "iOS")
-        notes.append(
-            f"{path.name}: accel taken with {name}'s sign, assuming that the screen points up"
-        )
+        assumed = "assuming that the screen points up"
+        notes.append(f"{path.name}: accel taken with {name}'s sign, {assumed}")
     if sign == "ios":
         notes.append(f"{path.name}: accel negated (iOS's sign)")
     return -accel if sign == "ios" else accel
@@ -200,18 +179,12 @@ def note_gravity(
     axis = int(np.argmax(np.abs(quietest)))
     force = float(np.linalg.norm(quietest))
     upward = f"{'-' if quietest[axis] < 0 else '+'}{'xyz'[axis]}"
-    notes.append(
-        f"{path.name}: in the quietest second accel reads {force:.2f} m/s², mostly on {upward}"
-    )
     if abs(force - GRAVITY) > 2.0:
-        raise InputError(
-            path,
-            f"field 'accel' reads {force:.2f} m/s² in its quietest second, far from gravity",
-            "check its unit, and that gravity is in it",
-        )
+        problem = f"field 'accel' reads {force:.2f} m/s² in its quietest second, far from gravity"
+        raise InputError(path, problem, "check its unit, and that gravity is in it")
+    reads = f"accel reads {force:.2f} m/s², mostly on {upward}"
+    notes.append(f"{path.name}: in the quietest second {reads}")
     if abs(force - GRAVITY) > 0.5:
-        notes.append(
-            f"{path.name}: that is off gravity by {force - GRAVITY:+.2f} m/s²: "
-            "the accelerometer may need calibration"
-        )
+        off = f"that is off gravity by {force - GRAVITY:+.2f} m/s²"
+        notes.append(f"{path.name}: {off}: the accelerometer may need calibration")
     return upward
