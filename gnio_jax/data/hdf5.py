@@ -101,9 +101,10 @@ def _array(group: h5py.Group, field: str, path: Path) -> np.ndarray:
     """
     kind, content = ("b", "booleans") if field.endswith("valid") else ("f", "numbers")
     link, problem = group.get(field, getlink=True), ""
-    stored = None if isinstance(link, h5py.ExternalLink | h5py.SoftLink) else group.get(field)
+    elsewhere = isinstance(link, h5py.ExternalLink | h5py.SoftLink)
+    stored = None if elsewhere else group.get(field)
     if stored is None:
-        problem = "is missing, or a link"
+        problem = "is a link" if elsewhere else "is missing"
     elif not isinstance(stored, h5py.Dataset) or stored.dtype.kind != kind or not stored.shape:
         problem = f"is not an array of {content}"
     elif (

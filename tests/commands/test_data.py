@@ -516,7 +516,7 @@ OUT, HEADS = ["--out", "x.h5"], ["--data-root", "heads"]
         (["check", "tlio", "--data-root", "nowhere"], "nowhere: no folder of dataset 'tlio'"),
         (
             ["check", "tlio", *HEADS, "--split", "tset"],
-            "dataset tlio: unknown split 'tset'; known splits: train, val, test, all",
+            "dataset tlio: unknown split 'tset'; did you mean 'test'?",
         ),
         (["check", "ridi", *HEADS], "heads: holds no recording of RIDI"),
         (["check", "tlio", "--plot", "x"], "--plot: unknown option; did you mean '--plots'?"),

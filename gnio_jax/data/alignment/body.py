@@ -547,7 +547,7 @@ def pose_lag(
     most = round(LONGEST_POSE_LAG * 100)
     lag = min((i / 100.0 for i in range(-most, most + 1)), key=off)
     near = (lag - 0.01, lag + 0.01)
-    best = float(minimize_scalar(off, bounds=near, method="bounded", options={"xatol": 1e-4}).x)
+    best = float(minimize_scalar(off, bounds=near, method="bounded", options={"xatol": 1e-5}).x)
     first, second = (rate - rate.mean(axis=0) for rate in (felt, tracked(clock + best)))
     power = np.sqrt((first**2).sum() * (second**2).sum())
     return PoseLag(best, float((first * second).sum() / power))

@@ -142,7 +142,7 @@ def _turning_of_gravity(imu: Motion) -> tuple[float, bool]:
     if power == 0.0 or strength / len(change) < 0.1**2:
         return 0.0, False
     both = float((change * expected).sum())
-    return both / power, both / np.sqrt(power * strength) > 0.5
+    return both / power, bool(both > 0.5 * np.sqrt(power * strength))
 
 
 def signed(

@@ -12,7 +12,8 @@ from gnio_jax.data.self_check import self_check
 from gnio_jax.errors import InputError
 from gnio_jax.numerics import rotations
 from tests.support import known_walk
-from tests.support.csv_writers import AXES, SECONDS, compare_imu, write_native
+from tests.support.csv_writers import SECONDS, compare_imu, write_native
+from tests.support.refusals import refused
 
 G = 9.80665
 
@@ -133,19 +134,9 @@ def set_value(name, row, value):
     return change
 
 
-def scale(names, factor):
+def times(factor):
     def change(columns):
-        for name in names:
-            columns[name] = columns[name] * factor
-
-    return change
-
-
-def hole_of(seconds):
-    def change(columns):
-        columns["time"] = np.where(
-            np.arange(len(columns["time"])) < 600, columns["time"], columns["time"] + seconds
-        )
+        columns["time"] = columns["time"] * factor
 
     return change
 
@@ -153,53 +144,31 @@ def hole_of(seconds):
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"drop": ("gyro_y",)}, ("column 'gyro_y' is missing", "found: ")),
-        ({"drop": ("time",)}, ("column 'time' is missing",)),
         ({"drop": ("qx",)}, ("column 'qx' is missing while 'qw' is there",)),
         ({"drop": ("pz",)}, ("column 'pz' is missing",)),
-        ({"spoil": set_value("accel_x", 5, np.nan)}, ("column 'accel_x'", "row 7")),
-        ({"spoil": set_value("gyro_x", 6, np.inf)}, ("column 'gyro_x'", "row 8")),
         ({"spoil": set_value("time", 7, 0.0)}, ("field 'time'", "does not increase", "row 8")),
         (
             {"spoil": set_value("qw", 8, 3.0)},
             ("columns 'qw', 'qx', 'qy', 'qz'", "not a unit quaternion", "row 10"),
         ),
-        ({"spoil": hole_of(2.0)}, ("field 'time'", "gap of 2.01")),
         (
-            {"spoil": scale(["time"], 1e3)},
+            {"spoil": times(1e3)},
             ("field 'time'", "not in seconds", "looks like ms: divide it by 1000"),
         ),
-        ({"spoil": scale(["time"], 1e9)}, ("field 'time'", "looks like ns: divide it by 1e+09")),
+        ({"spoil": times(1e9)}, ("field 'time'", "looks like ns: divide it by 1e+09")),
         (
-            {"spoil": scale(["time"], 20.0)},
+            {"spoil": times(20.0)},
             ("field 'time'", "not in seconds", "an IMU runs at 10 to 2000 Hz"),
         ),
-        ({"spoil": scale(AXES[3:], 1 / G)}, ("field 'accel'", "looks like G")),
-        ({"spoil": scale(AXES[:3], 180 / np.pi)}, ("field 'gyro'", "looks like deg/s")),
     ],
 )
 def test_a_bad_file_is_refused_by_name_and_field(tmp_path, options, words):
     path = write_native(tmp_path / "walk.csv", **options)
-    with pytest.raises(InputError) as error:
-        csv.read(path)
-    text = str(error.value)
-    assert (
-        text.startswith(f"{path}: ") and "\n" not in text and all(word in text for word in words)
-    ), text
+    refused(lambda: csv.read(path), path, *words)
 
 
-def test_damaged_files_and_empty_folders_are_refused(tmp_path):
-    with pytest.raises(InputError, match="holds no recording"):
-        data.load("csv", tmp_path, "test")
-    path = tmp_path / "a.h5"
-    write_hdf5(path, *csv.read(write_native(tmp_path / "a.csv")))
-    path.write_bytes(path.read_bytes()[:3000])
-    with pytest.raises(InputError, match=r"a\.h5: cannot be read as HDF5, it may be cut short"):
-        csv.read(path)
-    text = (tmp_path / "a.csv").read_text().splitlines()
-    (tmp_path / "a.csv").write_text("\n".join([*text[:9], "three" + text[9]]))
-    with pytest.raises(InputError, match=r"a\.csv: column 'time' holds .*three.* in its row 10"):
-        csv.read(tmp_path / "a.csv")
+def test_an_empty_folder_is_refused(tmp_path):
+    refused(lambda: data.load("csv", tmp_path, "test"), tmp_path, "holds no recording")
 
 
 def test_a_comment_above_the_header_is_a_comment(tmp_path):
@@ -237,14 +206,6 @@ def test_a_text_that_names_no_recording_is_no_list(tmp_path):
     (tmp_path / "winter.txt").write_text("walk\n")
     assert csv.list_splits(tmp_path) == ("winter",)
     assert [s.name for s in data.load("csv", tmp_path, "winter")] == ["walk"]
-
-
-def test_recordings_go_by_the_names_of_their_files(tmp_path):
-    (sequence,) = csv.read(write_native(tmp_path / "walk.csv"))
-    (tmp_path / "walk.csv").unlink()
-    for name in ("monday", "tuesday"):
-        write_hdf5(tmp_path / f"{name}.h5", sequence)
-    assert [s.name for s in data.load("csv", tmp_path, "test")] == ["monday", "tuesday"]
 
 
 def test_all_columns_that_are_missing_are_told_with_the_command(tmp_path):

@@ -493,13 +493,6 @@ def test_damaged_truth_is_refused_and_one_bad_recording_is_left_out(copy):
         data.load("oxiod", copy, "test")
 
 
-def test_a_root_without_recordings(tmp_path):
-    with pytest.raises(InputError, match=r"no folder of dataset 'oxiod'.*deepio"):
-        data.load("oxiod", tmp_path / "nowhere", "train")
-    with pytest.raises(InputError, match="holds no recording of OxIOD"):
-        data.load("oxiod", tmp_path, "train")
-
-
 def test_reading_again_uses_the_cache_and_spawned_workers_agree(copy, monkeypatch):
     alone = data.load("oxiod", copy, "test")
     with monkeypatch.context() as patch:

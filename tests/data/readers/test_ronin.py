@@ -14,6 +14,7 @@ from gnio_jax.data.readers import ronin
 from gnio_jax.errors import InputError
 from gnio_jax.numerics import rotations
 from tests.support import known_walk as walk
+from tests.support.refusals import refused
 from tests.support.ronin_files import (
     FIRST,
     chest,
@@ -238,69 +239,17 @@ def setting(name, rows, value):
     return change
 
 
-def replacing(name, function):
-    def change(fields):
-        fields[name] = function(fields[name])
-
-    return change
-
-
 @pytest.mark.parametrize(
-    ("change", "field", "problem"),
+    ("change", "words"),
     [
-        (
-            lambda fields: fields.pop("synced/gyro_uncalib"),
-            "'synced/gyro_uncalib'",
-            "is missing; found: synced/time, synced/acce",
-        ),
-        (lambda fields: fields.pop("pose/tango_pos"), "'pose/tango_pos'", "is missing"),
-        (setting("synced/acce", (5, 1), np.nan), "'synced/acce'", "row 6"),
-        (setting("synced/gyro_uncalib", (6, 1), np.inf), "'synced/gyro_uncalib'", "row 7"),
-        (setting("pose/tango_pos", (7, 1), np.nan), "'pose/tango_pos'", "row 8"),
-        (setting("synced/time", 8, np.nan), "'synced/time'", "row 9"),
-        (setting("synced/time", 9, FIRST), "'time'", "does not increase"),
-        (
-            setting("synced/time", slice(2000, None), FIRST + 12.0 + np.arange(2000) / 200),
-            "'time'",
-            "gap of 2.005 s",
-        ),
-        (replacing("synced/time", lambda time: time * 1e3), "'time'", "expected about 200 Hz"),
-        (setting("synced/game_rv", 10, 0.0), "'synced/game_rv'", "not a unit quaternion"),
-        (setting("pose/tango_ori", 0, 2.0), "'pose/tango_ori'", "not a unit quaternion"),
-        (
-            replacing("synced/acce", lambda values: values[:-1]),
-            "'synced/acce'",
-            "shape (3999, 3), expected (4000, 3)",
-        ),
-        (
-            replacing("synced/game_rv", lambda values: values[:, :3]),
-            "'synced/game_rv'",
-            "expected (4000, 4)",
-        ),
-        (
-            replacing("synced/time", lambda values: values[:, None]),
-            "'synced/time'",
-            "has shape (4000, 1), expected (4000,)",
-        ),
-        (replacing("synced/acce", lambda values: values / 9.81), "'accel'", "looks like G"),
-        (
-            replacing("synced/gyro_uncalib", lambda values: values * 100),
-            "'gyro'",
-            "looks like deg/s",
-        ),
+        (setting("synced/time", 9, FIRST), ("'time'", "does not increase")),
+        (setting("synced/game_rv", 10, 0.0), ("'synced/game_rv'", "not a unit quaternion")),
+        (setting("pose/tango_ori", 0, 2.0), ("'pose/tango_ori'", "not a unit quaternion")),
     ],
 )
-def test_a_bad_table_is_refused_by_file_and_field(tmp_path, change, field, problem):
+def test_a_bad_table_is_refused_by_file_and_field(tmp_path, change, words):
     folder = write(tmp_path / "a001_1", seconds=20.0, spoil=change)
-    with pytest.raises(InputError) as caught:
-        ronin.read(folder)
-    text = str(caught.value)
-    assert (
-        text.startswith(f"{folder / 'data.hdf5'}: ")
-        and field in text
-        and problem in text
-        and "\n" not in text
-    )
+    refused(lambda: ronin.read(folder), folder / "data.hdf5", *words)
 
 
 @pytest.mark.parametrize(
@@ -334,15 +283,7 @@ def test_a_bad_table_is_refused_by_file_and_field(tmp_path, change, field, probl
 )
 def test_bad_information_is_refused_by_file_and_field(tmp_path, change, field, problem):
     folder = write(tmp_path / "a001_1", seconds=20.0, spoil_info=change)
-    with pytest.raises(InputError) as caught:
-        ronin.read(folder, choose=True)
-    text = str(caught.value)
-    assert (
-        text.startswith(f"{folder / 'info.json'}: ")
-        and field in text
-        and problem in text
-        and "\n" not in text
-    )
+    refused(lambda: ronin.read(folder, choose=True), folder / "info.json", field, problem)
 
 
 def test_what_only_training_asks_for_may_be_missing_in_a_test(tmp_path):
@@ -352,31 +293,3 @@ def test_what_only_training_asks_for_may_be_missing_in_a_test(tmp_path):
         spoil_info=lambda info: info.update(grv_ori_error="unknown"),
     )
     assert "orientation_error_degrees" not in ronin.read(folder)[0].attributes
-
-
-def test_damaged_files_are_refused(tmp_path):
-    folder = write(tmp_path / "a001_1", seconds=20.0)
-    table, info = folder / "data.hdf5", folder / "info.json"
-
-    def fails(path, words):
-        with pytest.raises(InputError) as caught:
-            ronin.read(folder)
-        assert (
-            str(caught.value).startswith(f"{path}: ")
-            and words in str(caught.value)
-            and "\n" not in str(caught.value)
-        )
-
-    whole = table.read_bytes()
-    for size in (0, 100, len(whole) // 2, len(whole) - 8):
-        table.write_bytes(whole[:size])
-        fails(table, "cut short")
-    table.unlink()
-    fails(table, "cannot be read as HDF5")
-    table.write_bytes(whole)
-    text = info.read_text()
-    for wrong, words in ((text[:50], "is no JSON"), ("[]", "is no JSON object")):
-        info.write_text(wrong)
-        fails(info, words)
-    info.unlink()
-    fails(info, "cannot be read")
