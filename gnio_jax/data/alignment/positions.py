@@ -36,6 +36,7 @@ from gnio_jax.data.resampling import known_at, slerped, splined
 from gnio_jax.numerics import (
     about_z,
     integrate_gyro,
+    interpolate,
     midpoints,
     robust_std,
     rotations,
@@ -88,18 +89,29 @@ class PositionsFit(NamedTuple):
 
 
 class _Signals(NamedTuple):
-    """Accelerations of both, in level worlds."""
+    """Accelerations of both in level worlds, m/s², on uniform clocks of their own, s."""
 
     clock: Float[np.ndarray, " n"]
-    """The IMU's, uniform, s."""
     felt: Float[np.ndarray, "n 3"]
-    """By the device's own attitude, without gravity, m/s²."""
+    """By the device's own attitude, without gravity."""
     grid: Float[np.ndarray, " m"]
-    """The tracker's clock, uniform, s."""
     tracked: Float[np.ndarray, "m 3"]
-    """Second difference of the positions, m/s²."""
+    """Second difference of the positions."""
     good: Bool[np.ndarray, " m"]
     """False near positions that are missing, and where the tracker relocalised."""
+
+    def filtered(self, seconds: float) -> _Signals:
+        """Both accelerations behind a Gaussian filter."""
+        felt, tracked = (smooth(each, seconds * RATE) for each in (self.felt, self.tracked))
+        return self._replace(felt=felt, tracked=tracked)
+
+    def in_step(self, lag: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """(good rows of the grid that the IMU covers at a constant lag, what was felt there, what
+        was tracked there)."""
+        there = self.grid + lag
+        covered = self.good & (there > self.clock[0]) & (there < self.clock[-1])
+        rows = np.flatnonzero(covered)
+        return rows, interpolate(there[rows], self.clock, self.felt), self.tracked[rows]
 
 
 def align_positions(imu: Streams, track: Samples, search_seconds: float = 4.0) -> PositionsFit:
@@ -111,17 +123,17 @@ def align_positions(imu: Streams, track: Samples, search_seconds: float = 4.0) -
     `TooLittle` where both share less than 20 s.
     """
     assert imu.device is not None
-    first = max(each.time[0] for each in (imu.gyro, imu.accel, imu.device))
-    last = min(each.time[-1] for each in (imu.gyro, imu.accel, imu.device))
+    streams = (imu.gyro, imu.accel, imu.device)
+    first, last = max(each.time[0] for each in streams), min(each.time[-1] for each in streams)
     clock = np.arange(first, last, 1.0 / RATE)
     gyro, accel = (
         splined(each.time, each.values, clock, np.diff(each.time) > LONGEST_BRIDGE)
-        for each in (imu.gyro, imu.accel)
+        for each in streams[:2]
     )
     device = rotations(slerped(imu.device.time, imu.device.values, clock))
 
-    grid = np.arange(track.time[0], track.time[-1], 1.0 / RATE)
-    position = splined(track.time, track.values, grid, np.diff(track.time) > LONGEST_BRIDGE)
+    grid, broken = np.arange(track.time[0], track.time[-1], 1.0 / RATE), np.diff(track.time)
+    position = splined(track.time, track.values, grid, broken > LONGEST_BRIDGE)
     seen = known_at(track.time, np.ones(len(track.time), dtype=bool), grid, LONGEST_BRIDGE)
     tracked = second_difference(position, 1.0 / RATE)
     # Accelerations that no pedestrian makes are jumps.
@@ -131,24 +143,23 @@ def align_positions(imu: Streams, track: Samples, search_seconds: float = 4.0) -
     signals = _Signals(clock, device.apply(accel) - UPWARD, grid, tracked, good)
     lag, correlation, runner_up = _constant_lag(signals, search_seconds)
 
-    bias = (midpoints(gyro) - turns_between(device) * RATE).mean(axis=0)
-    integrated = integrate_gyro(gyro - bias, 1.0 / RATE)
+    integrated = integrate_gyro(gyro - _gyro_bias(gyro, device), 1.0 / RATE)
     knots = uniform_knots(clock, TURN_KNOT_SECONDS)
     # The device's attitude about each knot, turned to the tracker's yaw, is the first guess.
     drifting = device * integrated.inv()
     at_knots = [drifting[np.abs(clock - knot) <= 1.0].mean() for knot in knots]
     yaw = _yaw(signals, knots, lag)
     guess = about_z(yaw) * Rotation.concatenate(at_knots)
-    lags = np.full(len(uniform_knots(clock, LAG_KNOT_SECONDS)), lag)
+    lag_knots = uniform_knots(clock, LAG_KNOT_SECONDS)
+    lags = np.full(len(lag_knots), lag)
     correction, lags = _fit(signals, accel, integrated, knots, guess, lags)
 
     attitude = slerp(clock, knots, correction) * integrated
-    there = clock - np.interp(clock, uniform_knots(clock, LAG_KNOT_SECONDS), lags)
+    there = clock - np.interp(clock, lag_knots, lags)
     shared = np.flatnonzero((there >= grid[0]) & (there <= grid[-1]))
-    there = there[shared]
     place, velocity, kept = smooth_positions(
-        splined(grid, position, there, np.diff(grid) > LONGEST_BRIDGE),
-        np.interp(there, grid, (seen & ~jumps).astype(float)) > 0.99,
+        splined(grid, position, there[shared], np.diff(grid) > LONGEST_BRIDGE),
+        np.interp(there[shared], grid, (seen & ~jumps).astype(float)) > 0.99,
         1.0 / RATE,
         CUTOFF,
     )
@@ -157,36 +168,38 @@ def align_positions(imu: Streams, track: Samples, search_seconds: float = 4.0) -
     return PositionsFit(lags, float(np.ptp(yaw)), correlation, runner_up, poses)
 
 
+def _gyro_bias(gyro: Float[np.ndarray, "n 3"], device: Rotation) -> Float[np.ndarray, "3"]:
+    """What the gyro turns by beyond the device's attitude, rad/s, but for a constant drift of that
+    about the vertical, which is the device's own fault."""
+    beyond = midpoints(gyro) - turns_between(device) * RATE
+    up = device[:-1].inv().apply([0.0, 0.0, 1.0])
+    system = len(up) * np.eye(4)
+    system[:3, 3] = system[3, :3] = up.sum(axis=0)
+    right = np.append(beyond.sum(axis=0), (beyond * up).sum())
+    return np.linalg.lstsq(system, right, rcond=1e-6)[0][:3]
+
+
 def _constant_lag(signals: _Signals, search_seconds: float) -> tuple[float, float, float]:
     """(best constant lag, correlation of the vertical accelerations at it, what it leaves
     unexplained over what the next best peak leaves)."""
     from scipy.signal import find_peaks  # takes half a second to import
 
-    felt = smooth(signals.felt, STEP_FILTER_SECONDS * RATE)
-    tracked = smooth(signals.tracked, STEP_FILTER_SECONDS * RATE)
+    signals = signals.filtered(STEP_FILTER_SECONDS)
     stretch = np.floor((signals.grid - signals.grid[0]) / STRETCH_SECONDS).astype(int)
 
     def correlations(lag: float) -> tuple[float, float]:
         """Of the vertical accelerations, and of the horizontal ones whatever the yaw of each
         stretch (the mean square, by the time that both share)."""
-        there = signals.grid + lag
-        rows = signals.good & (there > signals.clock[0]) & (there < signals.clock[-1])
-        if rows.sum() < SHORTEST_OVERLAP * RATE:
+        rows, own, seen = signals.in_step(lag)
+        if len(rows) < SHORTEST_OVERLAP * RATE:
             return 0.0, 0.0
-        own = np.stack([np.interp(there[rows], signals.clock, each) for each in felt.T], axis=1)
-        seen, number = tracked[rows], stretch[rows]
+        powers = ((own[:, :2] ** 2).sum(axis=1), (seen[:, :2] ** 2).sum(axis=1))
         along, across, power, other = (
-            np.bincount(number, values)
-            for values in (
-                (own[:, :2] * seen[:, :2]).sum(axis=1),
-                own[:, 0] * seen[:, 1] - own[:, 1] * seen[:, 0],
-                (own[:, :2] ** 2).sum(axis=1),
-                (seen[:, :2] ** 2).sum(axis=1),
-            )
+            np.bincount(stretch[rows], values) for values in (*_both_ways(own, seen), *powers)
         )
         level = (along**2 + across**2) / np.maximum(power * other, 1e-12)
         vertical = float(np.corrcoef(own[:, 2], seen[:, 2])[0, 1])
-        return vertical, float(np.average(level, weights=np.bincount(number) + 1e-9))
+        return vertical, float(np.average(level, weights=np.bincount(stretch[rows]) + 1e-9))
 
     most = round(search_seconds / LAG_STEP)
     lags = np.arange(-most, most + 1) * LAG_STEP
@@ -202,18 +215,18 @@ def _constant_lag(signals: _Signals, search_seconds: float) -> tuple[float, floa
     return float(lags[best]), float(found[best, 0]), float(runner_up)
 
 
+def _both_ways(own: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Horizontal dot and cross product of each row."""
+    along = (own[:, :2] * seen[:, :2]).sum(axis=1)
+    return along, own[:, 0] * seen[:, 1] - own[:, 1] * seen[:, 0]
+
+
 def _yaw(signals: _Signals, knots: Float[np.ndarray, " k"], lag: float) -> Float[np.ndarray, " k"]:
     """Yaw (rad) from the device's world to the tracker's about each knot, by the slow horizontal
     accelerations of one and a half stretches to either side."""
-    felt = smooth(signals.felt, SLOW_FILTER_SECONDS * RATE)
-    tracked = smooth(signals.tracked, SLOW_FILTER_SECONDS * RATE)
-    there = signals.grid + lag
-    rows = signals.good & (there > signals.clock[0]) & (there < signals.clock[-1])
-    there, seen = there[rows], tracked[rows]
-    own = np.stack([np.interp(there, signals.clock, each) for each in felt.T], axis=1)
-    along = (own[:, :2] * seen[:, :2]).sum(axis=1)
-    across = own[:, 0] * seen[:, 1] - own[:, 1] * seen[:, 0]
-    near = np.abs(there[:, None] - knots) < 1.5 * STRETCH_SECONDS
+    rows, own, seen = signals.filtered(SLOW_FILTER_SECONDS).in_step(lag)
+    near = np.abs(signals.grid[rows, None] + lag - knots) < 1.5 * STRETCH_SECONDS
+    along, across = _both_ways(own, seen)
     return np.unwrap(np.arctan2(across @ near, along @ near))
 
 
