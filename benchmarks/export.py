@@ -26,7 +26,7 @@ from gnio_jax import filtering  # noqa: E402
 from gnio_jax.apps import packages  # noqa: E402
 from gnio_jax.apps.onnx import accuracy, driver, export_run  # noqa: E402
 from gnio_jax.apps.onnx.flat_state import start_arrays  # noqa: E402
-from gnio_jax.evaluation import inference_network  # noqa: E402
+from gnio_jax.models import Network  # noqa: E402
 from gnio_jax.tracking.run import tracking_filter  # noqa: E402
 
 
@@ -59,7 +59,7 @@ def main() -> None:
 def measure(run: Any, models: driver.Models, drawn: accuracy.Walk) -> dict[str, list[float]]:
     """Seconds of each part of each clone interval that has a window."""
     setup = tracking_filter(run)
-    network = inference_network(run.model, run.variables)
+    network = Network.of(run.model, run.variables)
     apply = jax.jit(
         lambda window: network.apply(network.variables, window)._replace(diagnostics={})
     )

@@ -3,7 +3,15 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from typing import Protocol, runtime_checkable
+
+Progress = Callable[[float], None]
+"""Called with the share of a stage that is done, from 0 to 1."""
+
+
+def silent(share: float) -> None:
+    """A `Progress` that tells nobody."""
 
 
 @runtime_checkable

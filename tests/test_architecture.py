@@ -16,11 +16,11 @@ ROOMS = {
     "filtering": BASE,
     "training": BASE | {"data", "models", "filtering"},
     "evaluation": BASE | {"data", "models", "filtering", "training"},
-    "calibration": BASE | {"data", "filtering", "training", "evaluation"},
+    "calibration": BASE | {"data", "models", "filtering", "training", "evaluation"},
     "interop": BASE | {"models", "training"},
     "tables": BASE | {"data", "models", "training", "evaluation", "calibration"},
-    "tracking": BASE | {"data", "filtering", "training", "evaluation", "apps"},
-    "live": BASE | {"apps", "data", "filtering", "training", "evaluation", "tracking"},
+    "tracking": BASE | {"data", "models", "filtering", "training", "evaluation", "apps"},
+    "live": BASE | {"apps", "data", "models", "filtering", "training", "evaluation", "tracking"},
     "apps": BASE
     | {"data", "models", "filtering", "training", "evaluation", "calibration", "tracking"},
     "commands": BASE

@@ -122,7 +122,7 @@ print("root mean square error of a second:", np.asarray(error).round(3), "m")
 # true pose here; `gnio track` starts from gravity.
 
 # %%
-setup = evaluation.filter_setup(run.config.data, run.config.filter)
+setup = filtering.filter_setup(run.config.data, run.config.filter)
 rotation = geometry.matrix_from_quaternion(jnp.asarray(walk.orientation[0]))
 start = filtering.initial_state(setup.config, rotation, walk.velocity[0], walk.position[0])
 n = setup.config.samples_per_clone

@@ -11,9 +11,9 @@ from typing import NamedTuple
 from gnio_jax import data
 from gnio_jax.config import CalibrateConfig, FilterSettings, TrainConfig
 from gnio_jax.errors import InputError
-from gnio_jax.evaluation import Setup, estimate, inference_network, prepare
-from gnio_jax.evaluation.estimators.result import Estimate
-from gnio_jax.evaluation.preparation import Prepared
+from gnio_jax.evaluation import Estimate, Recording, estimate, prepare
+from gnio_jax.filtering import filter_setup
+from gnio_jax.models import Network
 from gnio_jax.training import checkpoint
 from gnio_jax.training.checkpoint import Run
 
@@ -24,7 +24,7 @@ OnStage = Callable[[str, float], None]
 class Evidence(NamedTuple):
     """Recordings and the estimates of a network for each, in one order."""
 
-    prepared: list[Prepared]
+    recordings: list[Recording]
     estimates: list[Estimate]
 
 
@@ -112,18 +112,18 @@ def gather(
             where = f"{where}, fold {source.fold.number}"
             recordings = source.fold.select(sequences)
         with_reference = [each for each in recordings if each.valid.any()]
-        prepared, _ = prepare(with_reference, trained, Setup())
+        prepared, _ = prepare(with_reference, trained, settings.start)
         if not prepared:
             problem = "has no recording with a reference that is long enough to be fitted"
             raise InputError(where, problem)
-        network = inference_network(source.run.model, source.run.variables)
+        network = Network.of(source.run.model, source.run.variables)
         estimates = estimate(
             prepared,
             network,
             own.data,
-            settings,
+            filter_setup(own.data, settings),
             progress=lambda share, n=number: progress("estimating", (n + share) / len(asked)),
         )
-        found.prepared.extend(prepared)
+        found.recordings.extend(prepared)
         found.estimates.extend(estimates)
     return found

@@ -18,7 +18,7 @@ from scipy.optimize import minimize
 
 from gnio_jax.config import CorrelatedError, DataConfig, FilterSettings, flat
 from gnio_jax.errors import InputError
-from gnio_jax.evaluation.estimators.result import Estimate
+from gnio_jax.evaluation import Estimate
 from gnio_jax.filtering import (
     ConsideredStd,
     FilterConfig,
@@ -99,9 +99,10 @@ def std_factors(
     """
     found = []
     for estimate, truth in zip(estimates, truths, strict=True):
-        assert estimate.displacement is not None and estimate.displacement_std is not None
-        last = slice(len(estimate.displacement) - len(truth), None)
-        found.append((estimate.displacement[last] - truth) / estimate.displacement_std[last])
+        displacements = estimate.displacements
+        assert displacements is not None
+        last = slice(len(displacements.value) - len(truth), None)
+        found.append((displacements.value[last] - truth) / displacements.std[last])
     normalised = np.concatenate(found)
     normalised = normalised[np.isfinite(normalised).all(1)]
     if len(normalised) < LEAST_WINDOWS:

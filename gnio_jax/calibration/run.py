@@ -27,9 +27,7 @@ from gnio_jax.calibration.fit import (
 )
 from gnio_jax.config import CalibrateConfig, ConsideredStd, FilterSettings
 from gnio_jax.errors import InputError
-from gnio_jax.evaluation import true_displacements
-from gnio_jax.evaluation.estimators.result import Estimate
-from gnio_jax.evaluation.preparation import Prepared
+from gnio_jax.evaluation import Estimate, Recording
 from gnio_jax.files import replacing_folder, write_text
 from gnio_jax.filtering.batch import padded_masks
 from gnio_jax.numerics import filled_up
@@ -80,15 +78,15 @@ def calibrate(
     nothing = ConsideredStd()  # it changes no estimate, and is found last
     uncalibrated = dataclasses.replace(run.config.filter, noise=noise, considered=nothing)
     start_of_fit(uncalibrated, paths)  # its mistakes do not wait for the data
-    prepared, estimates = gather(split, asked, config, uncalibrated, progress, workers)
+    recordings, estimates = gather(split, asked, config, uncalibrated, progress, workers)
     try:
-        factors = std_factors(estimates, [true_displacements(each, windows) for each in prepared])
+        factors = std_factors(estimates, [each.displacement for each in recordings])
     except ValueError as error:
         raise InputError(f"split '{split}'", str(error)) from None
     x, y, z = (float(f"{factor:.{DIGITS}g}") for factor in factors)  # as they are written down
     noise = noise._replace(std_factor=(x, y, z))
     settings = start_of_fit(dataclasses.replace(uncalibrated, noise=noise), paths)
-    walks = _walks(prepared, estimates, windows.stride)
+    walks = _walks(recordings, estimates, windows.stride)
     found = fit_innovations(
         walks,
         windows,
@@ -98,13 +96,13 @@ def calibrate(
         MOST_STEPS,
     )
     progress("considering", 0.0)
-    references = (each.reference(windows.stride).position[1:] for each in prepared)
+    references = (each.reference.position[1:] for each in recordings)
     rows = walks.displacement.shape[1]
     truth = np.stack([filled_up(each, rows, np.nan) for each in references])
     positions = filtered_positions(walks, truth, windows, found.settings)
     considered = fit_considered(positions, windows.stride_seconds, found.settings)
     progress("considering", 1.0)
-    calibration = Calibration(run.config.filter, found, considered, len(prepared), folder)
+    calibration = Calibration(run.config.filter, found, considered, len(recordings), folder)
     _write(calibration, workdir, run, config, split)
     return calibration
 
@@ -120,29 +118,26 @@ def _folder(config: CalibrateConfig, workdir: Path) -> Path:
     return folder
 
 
-def _walks(prepared: list[Prepared], estimates: list[Estimate], stride: int) -> Walks:
+def _walks(recordings: list[Recording], estimates: list[Estimate], stride: int) -> Walks:
     """The recordings with the network's displacements, filled up to the longest: with samples that
     come after all displacements and change nothing before them."""
-    strides = max(each.strides(stride) for each in prepared)
+    strides = max(each.strides for each in recordings)
 
-    def of_recording(each: Prepared, estimate: Estimate) -> Walks:
-        gyro, accel = each.sequence.gyro[:-1], each.sequence.accel[:-1]
-        assert estimate.displacement is not None and estimate.displacement_std is not None
-        std = filled_up(estimate.displacement_std[1:], strides, 1.0)
+    def of_recording(each: Recording, estimate: Estimate) -> Walks:
+        found = estimate.displacements
+        assert found is not None
+        std = filled_up(found.std[1:], strides, 1.0)
         return Walks(
-            each.start.rotation,
-            each.start.velocity,
-            each.start.position,
-            each.gyro_bias,
-            gyro=filled_up(gyro, strides * stride),
-            accel=filled_up(accel, strides * stride),
-            displacement=filled_up(estimate.displacement[1:], strides, np.nan),
+            *each.start[:-1],
+            gyro=filled_up(each.gyro, strides * stride),
+            accel=filled_up(each.accel, strides * stride),
+            displacement=filled_up(found.value[1:], strides, np.nan),
             std=np.nan_to_num(std, nan=1.0),
         )
 
-    rows = [of_recording(*pair) for pair in zip(prepared, estimates, strict=True)]
+    rows = [of_recording(*pair) for pair in zip(recordings, estimates, strict=True)]
     walks = jax.tree.map(lambda *column: np.stack(column), *rows)
-    masks = (each.imu_valid for each in prepared)
+    masks = (each.imu_valid for each in recordings)
     return walks._replace(imu_valid=padded_masks(masks, strides * stride))
 
 

@@ -3,7 +3,7 @@ the text of `--help`."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -65,8 +65,12 @@ class EvaluateConfig:
     report.html."""
     rerun: str | None = None
     """File to write for the viewer Rerun, NAME.rrd: paths, covariances, IMU, gate."""
-    filter: Annotated[FilterSettings, FILE_ONLY] = field(default_factory=FilterSettings)
+    filter: Annotated[FilterSettings | None, FILE_ONLY] = None
     """Noise and start of the filter; by default the run's own."""
+    set: Annotated[
+        tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="filter.FIELD=VALUE")
+    ] = ()
+    """A setting of the filter by its name in YAML; it may be given several times."""
 
 
 @dataclass(frozen=True)

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
-from gnio_jax import data
-from gnio_jax.config import EvaluateConfig, plain
+from gnio_jax import config as configuration
+from gnio_jax.config import EvaluateConfig, TrainConfig, plain
 from gnio_jax.errors import InputError
+from gnio_jax.evaluation.evaluate import evaluate, folder_name, resolve
 from gnio_jax.evaluation.report import Report, read
-from gnio_jax.evaluation.run import evaluate, folder_name, run_config
 from gnio_jax.reporting import Reporter
 
 IDENTITY = ("dataset", "data_root", "split", "alignment")
@@ -21,7 +20,7 @@ class Kept(NamedTuple):
     """An evaluation of a run, before it is asked whether it has to be made."""
 
     config: EvaluateConfig
-    """With the filter of the run."""
+    """As `evaluate.resolve` leaves it."""
     folder: Path
     identity: dict[str, Any]
     """Of `IDENTITY`."""
@@ -38,26 +37,36 @@ def look(config: EvaluateConfig) -> Kept:
     """
     workdir = Path(config.workdir or "")
     run = run_config(workdir, config.checkpoint)
-    dataset = config.dataset or run.dataset
-    root = config.data_root or (run.data_root if dataset == run.dataset else None)
-    config = dataclasses.replace(config, dataset=dataset, data_root=root, filter=run.filter)
-    folder = workdir / "eval" / folder_name(config, dataset, run)
-    if data.get(dataset).needs_root:
-        root = str(data.find_root(dataset, root).resolve())
-    identity = dict(zip(IDENTITY, (dataset, root, config.split, config.alignment), strict=True))
+    config = resolve(config, run)
+    folder = workdir / "eval" / folder_name(config, run)
+    identity = {name: getattr(config, name) for name in IDENTITY}
     report, problem = None, "it is not evaluated yet"
     if (folder / "metrics.json").exists():
         try:
             report = read(folder)
             problem = _differs(report, identity) or out_of_date(report, workdir)
-            if config.estimator != "integrate" and report.settings["filter"] != plain(run.filter):
+            own = report.settings["filter"]
+            if config.estimator != "integrate" and own != plain(config.filter):
                 problem = problem or "its figures are of another filter than the run's"
         except InputError as error:
             problem = f"its figures cannot be used: {error}"
     best = workdir / "checkpoints" / config.checkpoint
-    if problem and config.estimator != "imu_only" and not any(best.glob("[0-9]*")):
+    if problem and not any(best.glob("[0-9]*")):
         raise InputError(best, "holds no checkpoint", "let gnio train finish its first epoch")
     return Kept(config, folder, identity, None if problem else report, problem)
+
+
+def run_config(workdir: Path, which: Literal["best", "latest"] = "best") -> TrainConfig:
+    """The settings of a run; the filter's as this checkpoint has learnt them, if they did.
+
+    Raises `InputError` if they did and there is no checkpoint.
+    """
+    config = configuration.load(workdir / "config.yaml")
+    if not config.through_filter.learn:
+        return config
+    from gnio_jax.training import checkpoint  # Orbax takes seconds to import
+
+    return checkpoint.load_run(workdir, which).config
 
 
 def made(kept: Kept, reporter: Reporter, workers: int = 1) -> Report:
@@ -67,7 +76,7 @@ def made(kept: Kept, reporter: Reporter, workers: int = 1) -> Report:
     config = kept.config
     run = Path(config.workdir or "").name
     reporter.line(f"evaluating {run} on {config.split} ({config.estimator}): {kept.problem}")
-    evaluate(config, reporter.progress, workers)
+    evaluate(config, reporter, workers)
     return read(kept.folder)
 
 

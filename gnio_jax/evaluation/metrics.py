@@ -9,8 +9,8 @@ with the reason. `measure` computes all of them. Everything is NumPy in float64.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
-from typing import NamedTuple
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -473,3 +473,11 @@ def _why_infinite(name: str) -> str:
     if name.startswith("nees"):
         return "the filter's covariance is not positive definite"
     return "the error is too large for a number"
+
+
+def score(estimates: Iterable[Any], alignment: Alignment = "origin") -> dict[str, Measures]:
+    """Every metric of every `Estimate`, by sequence."""
+    return {
+        each.name: measure(each.trajectory, each.reference, alignment, each.filtered)
+        for each in estimates
+    }

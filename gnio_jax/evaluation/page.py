@@ -24,7 +24,7 @@ from jinja2 import Environment
 
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import plots, tabulate
-from gnio_jax.evaluation.estimators.result import Estimate
+from gnio_jax.evaluation.estimate import Estimate
 from gnio_jax.evaluation.plots import AXES, BLUE, COLOURS, GREEN, VERMILION, View
 from gnio_jax.evaluation.report import Report, read, read_trajectories
 from gnio_jax.evaluation.tabulate import COLUMNS

@@ -21,13 +21,14 @@ from matplotlib.patches import Ellipse
 from matplotlib.ticker import PercentFormatter
 
 from gnio_jax.evaluation import metrics, statistics, tabulate
-from gnio_jax.evaluation.estimators.result import Estimate
-from gnio_jax.evaluation.frames import in_the_references_frame, with_the_reference_in_its_frame
+from gnio_jax.evaluation.estimate import Estimate, in_one_frame
+from gnio_jax.evaluation.infer import Displacements
+from gnio_jax.evaluation.metrics import Filtered
 from gnio_jax.evaluation.report import Report, file_names
-from gnio_jax.evaluation.setup import OnShare, no_progress
 from gnio_jax.evaluation.trajectory import Alignment
 from gnio_jax.files import replacing, shown_name
 from gnio_jax.numerics import finite_rows, spans
+from gnio_jax.reporting import Progress, silent
 
 BLUE, VERMILION, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#8C8C8C"
 PURPLE, ORANGE, SKY, YELLOW = "#CC79A7", "#E69F00", "#56B4E9", "#F0E442"
@@ -92,26 +93,21 @@ class View(NamedTuple):
 def view(estimate: Estimate, alignment: Alignment | None = "origin") -> View:
     """An estimate in the frame of its reference; without an `alignment` the reference is moved so
     that it starts as the estimate does."""
-    if alignment is None:
-        seen = with_the_reference_in_its_frame(estimate)
-    else:
-        seen = in_the_references_frame(estimate, alignment)
+    seen = in_one_frame(estimate, alignment)
     rows = len(seen.trajectory.time)
-
-    def whole(values: np.ndarray | None, *shape: int) -> np.ndarray:
-        return np.full((rows, *shape), np.nan) if values is None else values
+    found = seen.displacements or Displacements(*np.full((2, rows, 3), np.nan))
+    filtered = seen.filtered or Filtered(np.full((rows, 3, 3), np.nan), *np.full((2, rows), np.nan))
 
     return View(
         seen.name,
         seen.trajectory.time - seen.trajectory.time[0],
         seen.trajectory.position,
         seen.reference.position,
-        whole(seen.position_covariance, 3, 3),
-        whole(seen.diagnostics.get("gate"), 3),
-        whole(seen.diagnostics.get("scale"), 3),
-        whole(seen.displacement_std, 3),
-        whole(seen.nis),
-        whole(seen.accepted),
+        filtered.covariance,
+        *(found.diagnostics.get(name, np.full((rows, 3), np.nan)) for name in ("gate", "scale")),
+        found.std,
+        filtered.nis,
+        filtered.accepted,
     )
 
 
@@ -346,9 +342,7 @@ def paired(rows: Mapping[str, Sequence[Report]], metric: str) -> Figure:
     return figure
 
 
-def save_all(
-    folder: Path, views: list[View], report: Report, progress: OnShare = no_progress
-) -> None:
+def save_all(folder: Path, views: list[View], report: Report, progress: Progress = silent) -> None:
     """Every picture as a PNG in `folder`: one for each sequence, and `error_cdf`."""
     folder.mkdir(parents=True, exist_ok=True)
     stems = file_names([seen.name for seen in views])

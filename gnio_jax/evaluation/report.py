@@ -22,12 +22,12 @@ from gnio_jax import config as configuration
 from gnio_jax.config import TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import statistics
-from gnio_jax.evaluation.estimators.result import Estimate
+from gnio_jax.evaluation.estimate import Estimate
 from gnio_jax.evaluation.metrics import Measures
-from gnio_jax.evaluation.setup import OnShare, no_progress
 from gnio_jax.evaluation.statistics import Scores, Summary
 from gnio_jax.evaluation.trajectory import Trajectory, read_tum, write_tum
 from gnio_jax.files import file_stem, replacing_folder, write_csv
+from gnio_jax.reporting import Progress, silent
 
 DEFINITIONS = 3
 """What the figures of metrics.json mean, in its `settings`. Raise it with every change after which
@@ -78,7 +78,7 @@ def write(
     trained: TrainConfig,
     command: str = "",
     plots: bool = True,
-    progress: OnShare = no_progress,
+    progress: Progress = silent,
 ) -> None:
     """Write the folder of an evaluation, whole or not at all.
 

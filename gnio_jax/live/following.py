@@ -13,13 +13,14 @@ from scipy.spatial.transform import Rotation
 
 from gnio_jax.data.resampling import longest_bridge
 from gnio_jax.errors import InputError
-from gnio_jax.evaluation import Trajectory, inference_network
-from gnio_jax.evaluation.preparation import ROUGH_START
+from gnio_jax.evaluation import Trajectory
+from gnio_jax.evaluation.prepare import ROUGH_START
 from gnio_jax.evaluation.trajectory import write_tum
 from gnio_jax.files import replacing
 from gnio_jax.filtering import Pose, Tracker
 from gnio_jax.live.samples import Sample
 from gnio_jax.live.sources import Source
+from gnio_jax.models import Network
 from gnio_jax.tracking.filter import tracking_filter
 from gnio_jax.training.checkpoint import Run
 
@@ -54,7 +55,7 @@ def create_tracker(run: Run, imu_rate: float | None = None, rest_seconds: float 
     that is shorter than two samples.
     """
     setup = tracking_filter(run)
-    network = inference_network(run.model, run.variables)
+    network = Network.of(run.model, run.variables)
 
     def predict(windows: Any) -> Any:
         return network.apply(network.variables, windows)

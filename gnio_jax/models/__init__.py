@@ -1,11 +1,12 @@
 """Networks: windows of IMU samples in, `Prediction` out."""
 
-from gnio_jax.models.inference import Inference, InferenceVariables, inference_variables
+from gnio_jax.models.inference import Inference, InferenceVariables, Network, inference_variables
 from gnio_jax.models.registry import create, initialise, names, register, variable_shapes
 
 __all__ = [
     "Inference",
     "InferenceVariables",
+    "Network",
     "create",
     "inference_variables",
     "initialise",

@@ -8,6 +8,7 @@ products as the whole encoder.
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -36,6 +37,21 @@ class Inference:
 
     def __call__(self, ready: InferenceVariables, windows: jax.Array) -> Prediction:
         return self.model.apply(ready.variables, windows, **ready.constants)  # type: ignore[return-value]
+
+
+class Network(NamedTuple):
+    """A network with its parameters."""
+
+    apply: Callable[[Any, Any], Prediction]
+    """(variables, windows (b, N, 6) float32) -> `Prediction`; hashable, as a Flax module's `apply`
+    is."""
+    variables: Any
+
+    @classmethod
+    def of(cls, model: nn.Module, variables: Any) -> Network:
+        """A network made ready for inference: what depends on its parameters alone is computed
+        here, once."""
+        return cls(Inference(model), inference_variables(model, variables))
 
 
 @functools.partial(jax.jit, static_argnames="model")

@@ -10,7 +10,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from gnio_jax import data, evaluation
-from gnio_jax.evaluation import Setup, tabulate
+from gnio_jax.evaluation import tabulate
+from gnio_jax.models import Network
 from gnio_jax.training import checkpoint
 
 ACTIVITIES = ("standing", "slow", "walking", "running", "stairs")
@@ -41,24 +42,23 @@ def predict_split(workdir: Path, split: str) -> PredictedWindows:
     run = checkpoint.load_run(workdir)
     config = run.config.data
     sequences = data.load(run.config.dataset, run.config.data_root, split)
-    setup = Setup("integrate", orientation="reference")
-    prepared, _ = evaluation.prepare(sequences, config, setup)
-    network = evaluation.inference_network(run.model, run.variables)
-    attitudes = [evaluation.attitude(each, config, "reference") for each in prepared]
-    predictions = evaluation.predict_windows(
-        network, prepared, attitudes, config, diagnostics=DIAGNOSTICS
+    recordings, _ = evaluation.prepare(sequences, config, orientation="reference")
+    network = Network.of(run.model, run.variables)
+    predicted = evaluation.infer(network, recordings, config, diagnostics=DIAGNOSTICS)
+    # A row for each stride: those before the end of the first window have neither.
+    given = [evaluation.given_displacements(each, 0.0) for each in recordings]
+    truth, displacement = (
+        np.concatenate([each.value for each in rows]) for rows in (given, predicted)
     )
-    truth = np.concatenate([evaluation.true_displacements(each, config) for each in prepared])
-    displacement = np.concatenate([p.displacement for p in predictions])
-    log_std = np.concatenate([p.log_std for p in predictions])
+    std = np.concatenate([each.std for each in predicted])
     trusted = np.isfinite(truth).all(1) & np.isfinite(displacement).all(1)
     return PredictedWindows(
         truth[trusted],
         displacement[trusted],
-        np.exp(log_std[trusted]) * run.config.filter.noise.std_factor,
+        std[trusted] * run.config.filter.noise.std_factor,
         {
-            name: np.concatenate([p.diagnostics[name] for p in predictions])[trusted]
-            for name in predictions[0].diagnostics
+            name: np.concatenate([each.diagnostics[name] for each in predicted])[trusted]
+            for name in predicted[0].diagnostics
         },
         activity(truth[trusted], config.window_seconds),
     )

@@ -8,28 +8,23 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gnio_jax import data
 from gnio_jax.apps.importing import Imported
 from gnio_jax.apps.packages import Weights
-from gnio_jax.config import DataConfig, InitialStd
 from gnio_jax.data.resampling import longest_bridge
 from gnio_jax.data.validation import WINDOW_SECONDS, check_gaps
 from gnio_jax.errors import InputError
-from gnio_jax.evaluation import Estimate, Trajectory, exporting, inference_network, prepare
-from gnio_jax.evaluation.estimators.filtered import run_filters
+from gnio_jax.evaluation import Estimate, Trajectory, estimate, exporting, prepare
+from gnio_jax.evaluation.estimate import in_one_frame
 from gnio_jax.evaluation.exporting import rerun_file
-from gnio_jax.evaluation.frames import with_the_reference_in_its_frame
-from gnio_jax.evaluation.preparation import Prepared, measured_rows
-from gnio_jax.evaluation.setup import OnShare, Setup, no_progress
+from gnio_jax.evaluation.prepare import measured_rows
 from gnio_jax.evaluation.trajectory import write_tum
 from gnio_jax.files import check_writable_folder, replacing_folder, shown_name
+from gnio_jax.models import Network
+from gnio_jax.reporting import Progress, silent
 from gnio_jax.tracking.filter import tracking_filter
 from gnio_jax.tracking.summary import Summary, as_json, summarise
 from gnio_jax.types import Sequence
 
-START = Setup(init="static", gyro_bias="rest")
-"""Level from the gravity of the first second, the velocity zero as surely as that second is quiet,
-the gyro's bias from a rest at the start if there is one."""
 SUMMARY, TRAJECTORY, REFERENCE = "summary.json", "trajectory.txt", "reference.txt"
 PICTURE, PAGE = "track.png", "report.html"
 
@@ -47,7 +42,7 @@ def track(
     weights: Weights,
     out: Path,
     formats: tuple[str, ...] = (),
-    progress: OnShare = no_progress,
+    progress: Progress = silent,
     command: str = "",
     rerun: Path | None = None,
 ) -> Tracked:
@@ -62,26 +57,33 @@ def track(
     if rerun is not None:
         rerun_file.check_file(rerun)
     ekf = tracking_filter(weights.run)
-    prepared = _prepared(recording.sequence, weights.run.config.data, ekf.initial_std)
-    network = inference_network(weights.run.model, weights.run.variables)
-    (estimate,) = run_filters([prepared], network, ekf, 1, progress)
-    summary = summarise(estimate, prepared, recording, weights, ekf)
+    windows, sequence = weights.run.config.data, recording.sequence
+    _check_bridged(sequence)
+    # Level from the gravity of the first second, its velocity as surely zero as that second is
+    # quiet, the gyro's bias from a rest at the start. A reference starts nothing.
+    how = {"init": "static", "gyro_bias": "rest", "from_first": True}
+    ready, left_out = prepare([sequence], windows, ekf.initial_std, **how)
+    if not ready:
+        raise InputError(sequence.name, left_out[sequence.name], "record for longer")
+    network = Network.of(weights.run.model, weights.run.variables)
+    (found,) = estimate(ready, network, windows, ekf, 1, progress)
+    summary = summarise(found, ready[0], recording, weights, ekf)
     # Bokeh and Matplotlib take seconds to import.
     from gnio_jax.evaluation import plots
     from gnio_jax.tracking import page
 
-    seen = plots.view(estimate, alignment=None)
+    seen = plots.view(found, alignment=None)
     length = f"{summary.path_length:.0f} m in {summary.seconds:.0f} s"
     expected = f"expected error at the end {summary.expected_error:.1f} m"
     title = f"{shown_name(summary.recording)}: {length}, {expected}"
     with replacing_folder(out) as folder:
-        _write(folder, estimate, summary, formats)
+        _write(folder, found, summary, formats)
         plots.save(folder / PICTURE, plots.sequence(seen, title))
         page.write(folder / PAGE, seen, summary, weights.run.config, command)
     if rerun is not None:
-        seen = with_the_reference_in_its_frame(estimate)
-        rerun_file.write_rerun(rerun, [rerun_file.Logged(seen, prepared.sequence)])
-    return Tracked(estimate, summary, out)
+        logged = rerun_file.Logged(in_one_frame(found, alignment=None), ready[0])
+        rerun_file.write_rerun(rerun, [logged])
+    return Tracked(found, summary, out)
 
 
 def _check(out: Path, formats: tuple[str, ...]) -> None:
@@ -99,23 +101,13 @@ def _may_be_replaced(out: Path) -> bool:
     return track or (out.is_dir() and not any(out.iterdir()))
 
 
-def _prepared(sequence: Sequence, windows: DataConfig, std: InitialStd) -> Prepared:
-    """The whole recording at the network's rate. A reference starts nothing: it comes in again to
-    be compared with. Raises `InputError` for a hole that nothing bridges: what was walked in it is
-    in no sample."""
+def _check_bridged(sequence: Sequence) -> None:
+    """Raise `InputError` for a hole that nothing bridges: what was walked in it is in no sample."""
     check_gaps(sequence.time, sequence.name)
     # Lines of an earlier resampling; each clock has widened a hole by up to a sample at each end.
     there = np.union1d(sequence.time[measured_rows(sequence)], sequence.time[[0, -1]])
     bridged = longest_bridge(1.0 / float(np.median(np.diff(sequence.time))))
     check_gaps(there, sequence.name, WINDOW_SECONDS + bridged)
-    sequence = data.resample(sequence, windows.rate)
-    blind = sequence._replace(valid=np.zeros_like(sequence.valid))
-    prepared, left_out = prepare([blind], windows, START, std)
-    if not prepared:
-        raise InputError(sequence.name, left_out[sequence.name], "record for longer")
-    cut = prepared[0].sequence
-    valid = sequence.valid[: len(cut.time)]
-    return prepared[0]._replace(sequence=cut._replace(valid=valid))
 
 
 def _write(
@@ -132,7 +124,8 @@ def _write(
         write_tum(folder / REFERENCE, _stamped(estimate.reference, summary.start_time))
     for kind in formats:
         path = folder / f"trajectory.{kind}"
-        exporting.export(path, own_clock, kind, estimate.position_covariance)
+        filtered = estimate.filtered
+        exporting.export(path, own_clock, kind, filtered and filtered.covariance)
 
 
 def _stamped(trajectory: Trajectory, start: float) -> Trajectory:

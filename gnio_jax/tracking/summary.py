@@ -9,9 +9,8 @@ import numpy as np
 
 from gnio_jax.apps.importing import GAPS, Imported
 from gnio_jax.apps.packages import Weights
-from gnio_jax.evaluation import Estimate, metrics
-from gnio_jax.evaluation.preparation import ROUGH_START, Prepared
-from gnio_jax.evaluation.scores import score
+from gnio_jax.evaluation import Estimate, Recording, metrics
+from gnio_jax.evaluation.prepare import ROUGH_START
 from gnio_jax.filtering.config import FilterConfig
 from gnio_jax.filtering.settings import FilterSetup
 from gnio_jax.types import GRAVITY
@@ -79,7 +78,7 @@ class Summary(NamedTuple):
 
 def summarise(
     estimate: Estimate,
-    prepared: Prepared,
+    ready: Recording,
     recording: Imported,
     weights: Weights,
     ekf: FilterSetup,
@@ -88,10 +87,11 @@ def summarise(
     sequence, healthy = recording.sequence, estimate.trajectory.known
     last = int(np.flatnonzero(healthy)[-1])
     position, time = estimate.trajectory.position[: last + 1, :2], estimate.trajectory.time
-    assert estimate.position_covariance is not None and estimate.accepted is not None
-    used = estimate.accepted[: last + 1]
+    filtered = estimate.filtered
+    assert filtered is not None
+    used = filtered.accepted[: last + 1]
     used = used[np.isfinite(used)]
-    horizontal = np.diagonal(estimate.position_covariance[last])[:2]
+    horizontal = np.diagonal(filtered.covariance[last])[:2]
     summary = Summary(
         recording=sequence.name,
         weights=weights.name,
@@ -102,24 +102,24 @@ def summarise(
         from_start=float(np.linalg.norm(position[-1] - position[0])),
         expected_error=float(np.sqrt(horizontal.sum())),
         considered=ekf.considered is not None,
-        rest=_rest(prepared, ekf.config),
+        rest=_rest(ready, ekf.config),
         accepted=float(used.mean()) if len(used) else None,
         errors=_errors(estimate),
         warnings=(),
-        notes=(*recording.notes, *prepared.notes),
+        notes=(*recording.notes, *ready.notes),
     )
     own_rate = 1.0 / float(np.median(np.diff(sequence.time)))
     found = [*recording.warnings, *_warnings(summary, own_rate, 1.0 / ekf.config.dt)]
-    holes = prepared.imu_valid is not None
+    holes = ready.imu_valid is not None
     if holes or any(GAPS in note for note in recording.notes):
         where = "" if holes else " (see above)"
         found.append(
             f"gaps: samples are missing{where}, and what happened there is guessed: from there on "
             "heading and place are less certain than the filter says"
         )
-    if (prepared.start.velocity_std or 0.0) > ROUGH_START:
+    if ready.start.std.velocity > ROUGH_START:
         found.append("start: it moves in its first second, so its velocity and tilt are rough")
-    diverged = (note for note in estimate.notes if note not in prepared.notes)
+    diverged = (note for note in estimate.notes if note not in ready.notes)
     return summary._replace(warnings=(*found, *diverged))
 
 
@@ -135,19 +135,18 @@ def as_json(summary: Summary) -> dict[str, Any]:
 def _errors(estimate: Estimate) -> dict[str, float | None]:
     if not np.isfinite(estimate.reference.position).any():
         return {}
-    return score([estimate])[estimate.name].values
+    return metrics.score([estimate])[estimate.name].values
 
 
-def _rest(prepared: Prepared, config: FilterConfig) -> float:
+def _rest(ready: Recording, config: FilterConfig) -> float:
     """Share of the strides in which the IMU is as quiet as the filter's rest; a line across a gap
     is not."""
-    sequence, n = prepared.sequence, config.samples_per_clone
-    turn = np.linalg.norm(sequence.gyro[:-1] - prepared.gyro_bias, axis=1)
-    pull = np.abs(np.linalg.norm(sequence.accel[:-1], axis=1) - GRAVITY)
+    turn = np.linalg.norm(ready.gyro - ready.start.gyro_bias, axis=1)
+    pull = np.abs(np.linalg.norm(ready.accel, axis=1) - GRAVITY)
     quiet = (turn < config.rest_gyro) & (pull < config.rest_accel)
-    if prepared.imu_valid is not None:
-        quiet = quiet & prepared.imu_valid
-    return float(quiet.reshape(-1, n).all(axis=1).mean())
+    if ready.imu_valid is not None:
+        quiet = quiet & ready.imu_valid
+    return float(quiet.reshape(-1, config.samples_per_clone).all(axis=1).mean())
 
 
 def _warnings(summary: Summary, own_rate: float, rate: float) -> list[str]:

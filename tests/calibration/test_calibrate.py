@@ -18,7 +18,7 @@ from gnio_jax.commands import app
 from gnio_jax.config import CalibrateConfig, DataConfig, ModelConfig, TrainConfig, plain
 from gnio_jax.data.simulated import walks as simulated
 from gnio_jax.errors import InputError
-from gnio_jax.evaluation import Estimate, Trajectory
+from gnio_jax.evaluation import Displacements, Estimate, Trajectory
 from gnio_jax.training import checkpoint
 from tests.support import tiny_run
 from tests.support.filter_settings import changed
@@ -151,13 +151,8 @@ def estimate(error, std):
     rows = len(error) + 2
     path = Trajectory(np.arange(rows), np.zeros((rows, 3)), np.zeros((rows, 4)))
     before = np.full((2, 3), np.nan)
-    return Estimate(
-        "walk",
-        path,
-        path,
-        displacement=np.concatenate([before, 1.0 + error]),
-        displacement_std=np.concatenate([before, std]),
-    )
+    found = (np.concatenate([before, each]) for each in (1.0 + error, std))
+    return Estimate("walk", path, path, Displacements(*found))
 
 
 def test_the_factors_are_those_of_the_errors():
@@ -198,14 +193,14 @@ def test_each_session_is_judged_by_the_network_that_left_it_out(run, two_walks, 
     walks = data.load("synthetic", None, "train")
     fold_of = data.folds(walks, 2)
     assert sorted(fold_of.values()) == [0, 1]
-    for prepared, estimate in zip(*found, strict=True):
-        walk = prepared.sequence
-        fold = fold_of[data.group(walk)]
+    for recording, estimate in zip(*found, strict=True):
+        fold = fold_of[recording.group]
         alone = evidence.Source(asked[fold].run, None)
         both = evidence.gather("train", [alone], config, loaded.config.filter, lambda *_: None, 1)
-        expected = {p.sequence.name: e for p, e in zip(*both, strict=True)}[walk.name]
+        expected = {p.name: e for p, e in zip(*both, strict=True)}[recording.name]
         # To rounding: batches of other sizes are other programs. The networks differ by far more.
-        np.testing.assert_allclose(estimate.displacement, expected.displacement, atol=1e-5)
+        own, wanted = estimate.displacements.value, expected.displacements.value
+        np.testing.assert_allclose(own, wanted, atol=1e-5)
 
 
 @pytest.mark.parametrize(

@@ -257,9 +257,9 @@ def test_every_piece_with_a_window_is_kept_and_named():
         len(windows.window_source([piece], config, stride=10).start) >= 1 for piece in pieces
     )
     prepared, short = evaluation.prepare(pieces, config)
-    assert [each.sequence.name for each in prepared] == ["walk_piece1", "walk_piece3"]
+    assert [each.name for each in prepared] == ["walk_piece1", "walk_piece3"]
     assert list(short) == ["walk_piece2"]
-    assert all(np.diff(each.sequence.time).max() < 0.011 for each in prepared)
+    assert all(np.diff(each.time).max() < 0.11 for each in prepared)
     with pytest.raises(InputError, match=r"^walk\.csv: field 'time' has a gap of 2\.000 s after 5"):
         assemble(level(time, time), 100.0)
 

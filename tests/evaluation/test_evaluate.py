@@ -15,7 +15,9 @@ from gnio_jax import data
 from gnio_jax.commands import console
 from gnio_jax.config import DataConfig, EvaluateConfig, ModelConfig, TrainConfig
 from gnio_jax.data.simulated import walks as simulated
-from gnio_jax.evaluation import report, run
+from gnio_jax.errors import InputError
+from gnio_jax.evaluation import evaluate, report
+from gnio_jax.evaluation.evaluate import folder_name, resolve
 from tests.support import drawn_run
 from tests.support.filter_settings import changed
 
@@ -81,6 +83,8 @@ def test_end_to_end(workdir, command, capsys, tmp_path):
     )
     assert found["settings"]["coupling"] == "tight" and found["settings"]["epoch"] == 1
     assert found["settings"]["filter"]["start"]["velocity"] == 0.7
+    assert found["settings"]["data_root"] is None
+    assert found["settings"]["recordings"]["synthetic_1_handheld"] == pytest.approx(15.0, abs=0.05)
     assert [one["group"] for one in found["sequences"].values()] == ["person 1", "person 2"]
     assert (
         found["mean"]["ate"] > 0
@@ -124,24 +128,24 @@ def test_a_void_filter_is_in_the_files(workdir, monkeypatch):
     ]
     walks[0] = walks[0]._replace(accel=1e3 * walks[0].accel)
     monkeypatch.setattr(data, "load", lambda *_: walks)
-    _, folder = run.evaluate(
-        EvaluateConfig(str(workdir), estimator="imu_only", plots=False, filter=TRAINED.filter)
-    )
-    found = json.loads((folder / "metrics.json").read_text())
+    done = evaluate(EvaluateConfig(str(workdir), estimator="imu_only", plots=False))
+    found = json.loads((done.folder / "metrics.json").read_text())
     void, whole = found["sequences"].values()
     assert void["notes"] == ["filter: not healthy from 0.1 s on, and all after it is void"]
     assert void["ate"] is None and "not finite from 0.1 s on" in void["reasons"]["ate"]
     assert found["diverged"]["ate"] == 1 and found["mean"]["ate"] == whole["ate"]
     assert found["settings"]["definitions"] == report.DEFINITIONS
-    rows = [np.loadtxt(path, ndmin=2) for path in sorted((folder / "trajectories").iterdir())]
+    rows = [np.loadtxt(path, ndmin=2) for path in sorted((done.folder / "trajectories").iterdir())]
     assert [len(each) for each in rows] == [1, 140]
+
+
+def name_of(run=TRAINED, **options):
+    return folder_name(resolve(EvaluateConfig("w", **options), run), run)
 
 
 def test_folders_tell_choices_apart():
     def name(**options):
-        return run.folder_name(
-            EvaluateConfig("w", **({"filter": TRAINED.filter} | options)), "tlio", TRAINED
-        )
+        return name_of(**options).replace("synthetic", "tlio")
 
     assert name() == "tlio_test_ekf" == name(orientation="filter")
     assert name(coupling="loose", orientation="reference") == "tlio_test_ekf_loose"
@@ -167,18 +171,53 @@ def test_folders_tell_choices_apart():
     )
 
 
+def test_recordings_of_another_folder_have_a_folder_of_their_own(tmp_path, monkeypatch):
+    """The run's own recordings are those of A; B1 and B2 bear one name."""
+    roots = [tmp_path / name for name in ("A", "1/B", "2/B", "csv")]
+    for root in roots:
+        root.mkdir(parents=True)
+    monkeypatch.chdir(tmp_path)
+    run = dataclasses.replace(TRAINED, dataset="csv", data_root="A")
+    names = [name_of(run, data_root=str(root)) for root in roots]
+    assert names[0] == name_of(run) == name_of(run, data_root="A/../A") == "csv_test_ekf"
+    assert len(set(names)) == 4 and all("_B-" in name for name in names[1:3])
+    # A run on other recordings: where nothing is usual, a folder of the dataset's own name is.
+    names = [name_of(data_root=str(root), dataset="csv") for root in roots]
+    assert len(set(names)) == 4 and names[3] == "csv_test_ekf"
+    assert resolve(EvaluateConfig("w", dataset="csv", data_root="A"), TRAINED).data_root == str(
+        tmp_path / "A"
+    )
+    assert resolve(EvaluateConfig("w", data_root="A"), TRAINED).data_root is None  # it is computed
+
+
+def test_what_is_not_asked_for_is_the_runs():
+    found = resolve(EvaluateConfig("w", set=("filter.noise.measurement_scale=3",)), TRAINED)
+    assert found.dataset == "synthetic" and found.orientation == "filter"
+    assert found.filter == changed(TRAINED.filter, noise={"measurement_scale": 3.0})
+    assert resolve(EvaluateConfig("w", coupling="loose"), TRAINED).orientation == "reference"
+    own = changed(start={"velocity": 0.2})
+    assert resolve(EvaluateConfig("w", filter=own), TRAINED).filter == own
+    for options in (
+        {"orientation": "reference"},
+        {"estimator": "imu_only", "orientation": "device"},
+    ):
+        with pytest.raises(InputError, match="leave it out"):
+            resolve(EvaluateConfig("w", **options), TRAINED)
+
+
 @pytest.mark.parametrize(
     "arguments, words",
     [
         (["--dataset", "synthetik"], "did you mean 'synthetic'?"),
         (["--split", "tset"], "unknown split 'tset'"),
-        (["--estimater", "ekf"], "--estimater: unknown option; did you mean --estimator?"),
+        (["--estimater", "ekf"], "--estimater: unknown option; did you mean '--estimator'?"),
         (
             ["--estimator", "kalman"],
             "--estimator: must be one of ekf, integrate, imu_only, found 'kalman'",
         ),
         (["--set", "filter.noise.gyro_density=-1"], "'filter.noise.gyro_density' must be positive"),
         (["--set", "filter.noise.gyro_densty=1"], "did you mean 'filter.noise.gyro_density'?"),
+        (["--set", "workdir=B"], "'workdir=B': is not a setting of the filter"),
         (["--orientation", "device"], "leave it out"),
         (["--checkpoint", "latest"], "holds no checkpoint"),
         (["--dataset", "tlio", "--data-root", "/nowhere"], "/nowhere"),

@@ -10,7 +10,7 @@ from gnio_jax.config import TrainConfig
 from gnio_jax.evaluation import Estimate, Trajectory, never_moves, page, plots, report, score
 from gnio_jax.evaluation.report import Report
 from tests.support import browser
-from tests.support.estimates import SETTINGS, estimate
+from tests.support.estimates import SETTINGS, estimate, with_covariance
 
 EVIL = "</script><script>alert('x')</script><b onmouseover=alert(1)>&amp; $$x$$"
 BLUE, BLACK = (0, 114, 178), (0, 0, 0)
@@ -31,8 +31,8 @@ def run_of(estimates, *more, **named):
 def walks():
     walk = estimate("walk", 0)
     # The ellipse is twice as long along y; gates that tell the axes apart.
-    covariance = walk.position_covariance * np.array([1.0, 4.0, 1.0])
-    return [walk._replace(position_covariance=covariance), estimate(EVIL, 1)]
+    covariance = walk.filtered.covariance * np.array([1.0, 4.0, 1.0])
+    return [with_covariance(walk, covariance), estimate(EVIL, 1)]
 
 
 @pytest.fixture(scope="module")
@@ -59,7 +59,7 @@ def written(runs, tmp_path_factory):
 def test_thinned_curves_keep_the_largest_innovation(walks):
     nis = np.full(400, 2.0)
     nis[[0, 201]], nis[3:6] = [np.nan, 70.0], np.nan
-    seen = plots.view(walks[0]._replace(nis=nis))
+    seen = plots.view(walks[0]._replace(filtered=walks[0].filtered._replace(nis=nis)))
     found = page.columns(seen, 150)
     assert len(found["time"]) == 134 and found["time"][1] == pytest.approx(0.3)
     np.testing.assert_allclose(found["x"][:3], seen.position[:9:3, 0], rtol=1e-6)
@@ -79,15 +79,13 @@ def test_the_distance_walked_is_not_of_noise():
 
 def test_the_map_has_room_for_the_ellipses_and_no_more_than_the_walk_again(walks):
     walk = walks[0]
-    small, seen = (
-        run_of([walk._replace(position_covariance=p * walk.position_covariance)]) for p in (0, 1)
-    )
+    small, seen = (run_of([with_covariance(walk, p * walk.filtered.covariance)]) for p in (0, 1))
     bare, room = (page.frame([run], "walk") for run in (small, seen))
-    half = 3 * np.sqrt(walk.position_covariance[:, 0, 0])
+    half = 3 * np.sqrt(walk.filtered.covariance[:, 0, 0])
     wide = seen.views[0].position[:, 0]
     assert room["x"] == pytest.approx([(wide - half).min(), (wide + half).max()])
     assert bare["x"][0] > room["x"][0] and bare["x"][1] < room["x"][1]
-    huge = run_of([walk._replace(position_covariance=1e6 * walk.position_covariance)])
+    huge = run_of([with_covariance(walk, 1e6 * walk.filtered.covariance)])
     size = max(np.ptp(bare["x"]), np.ptp(bare["y"]))
     found = page.frame([huge], "walk")
     assert found["x"] == pytest.approx([bare["x"][0] - size, bare["x"][1] + size])

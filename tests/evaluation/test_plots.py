@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gnio_jax.evaluation import Trajectory, plots
-from tests.support.estimates import SETTINGS, estimate
+from tests.support.estimates import SETTINGS, estimate, with_covariance
 from tests.support.reports import LOST, report_of
 
 
@@ -37,15 +37,14 @@ def test_ellipses_are_contours_of_their_covariance():
 def test_an_estimate_is_seen_in_the_frame_of_the_reference(estimates):
     """The estimate is turned by 90° and moved: alignment takes that back, for the ellipse too."""
     walk = estimates[0]
-    walk = walk._replace(position_covariance=walk.position_covariance * np.array([1.0, 4.0, 1.0]))
+    walk = with_covariance(walk, walk.filtered.covariance * np.array([1.0, 4.0, 1.0]))
     path, half = walk.trajectory, np.sqrt(0.5)
     turned = np.stack([-path.position[:, 1], path.position[:, 0], path.position[:, 2]], 1)
     w, x, y, z = path.orientation.T
     attitude = half * np.stack([w - z, x - y, y + x, z + w], 1)  # a quarter turn from the left
-    covariance = walk.position_covariance[:, [1, 0, 2]][:, :, [1, 0, 2]]
-    moved = walk._replace(
-        trajectory=Trajectory(path.time, turned + 5.0, attitude), position_covariance=covariance
-    )
+    covariance = walk.filtered.covariance[:, [1, 0, 2]][:, :, [1, 0, 2]]
+    moved = with_covariance(walk, covariance)
+    moved = moved._replace(trajectory=Trajectory(path.time, turned + 5.0, attitude))
     whole, found = plots.view(walk), plots.view(moved)
     np.testing.assert_allclose(found.position, whole.position, atol=1e-9)
     angles = [plots.ellipses(seen.covariance).angle for seen in (whole, found)]
@@ -98,14 +97,15 @@ def test_the_picture_of_a_sequence(estimates):
 
 def test_without_a_reference_nothing_is_called_an_error(estimates):
     """And without a gate it is shown which displacements were used; without a filter neither."""
-    blind = estimates[2]._replace(diagnostics={})
+    blind = estimates[2]
+    blind = blind._replace(displacements=blind.displacements._replace(diagnostics={}))
     figure = plots.sequence(plots.view(blind, alignment=None))
     plan, horizontal, vertical, speed, used = figure.axes
     assert "reference" not in labels(plan) and labels(horizontal) == ["3σ"]
     assert horizontal.get_ylabel() == "horizontal\n3σ (m)"
     assert vertical.get_ylabel() == "vertical\n3σ (m)" and labels(speed) == ["estimate"]
     assert labels(used) == ["used"]
-    bare = plots.view(blind._replace(position_covariance=None, accepted=None))
+    bare = plots.view(blind._replace(filtered=None))
     assert len(plots.sequence(bare).axes) == 2
 
 

@@ -14,7 +14,7 @@ from gnio_jax.config import TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import Trajectory, report, score
 from gnio_jax.evaluation.trajectory import write_tum
-from tests.support.estimates import SETTINGS
+from tests.support.estimates import SETTINGS, with_covariance
 
 
 def write(folder, made, estimates, **options):
@@ -149,9 +149,9 @@ def test_every_column_is_of_the_same_sequences(with_divergence):
 
 def test_a_bad_covariance_is_no_divergence(tmp_path, estimates):
     """Its trajectory stays in the means; only its NEES is infinite."""
-    bad = estimates[0].position_covariance.copy()
+    bad = estimates[0].filtered.covariance.copy()
     bad[200:] = np.nan
-    of = [estimates[0]._replace(position_covariance=bad), estimates[1]]
+    of = [with_covariance(estimates[0], bad), estimates[1]]
     groups = {e.name: e.name for e in of}
     made = report.Report(SETTINGS, score(of), {}, groups, {}, {})
     assert made.diverged == [] and made.summary()["ate"].sequences == 2

@@ -7,19 +7,19 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from gnio_jax.errors import InputError
+from gnio_jax.evaluation import Recording
 from gnio_jax.evaluation.exporting import rerun_file
-from gnio_jax.types import Sequence
 from tests.support.estimates import estimate
 from tests.support.rerun_files import columns_of
 
 
 def recording_of(walk, rate=50.0):
-    """An IMU that runs a second before the walk and a second after it."""
-    time = np.arange(-rate, 41 * rate) / rate + walk.trajectory.time[0]
-    n = len(time)
-    gyro, accel = (np.sin(np.outer(time - time[0], [1.0, 2.0, 3.0]) + k) for k in (0.0, 1.0))
-    nothing, level = np.zeros((n, 3)), np.tile([1.0, 0.0, 0.0, 0.0], (n, 1))
-    return Sequence(walk.name, time, gyro, accel, level, nothing, nothing, np.ones(n, bool))
+    """The IMU of a walk."""
+    stamps = walk.trajectory.time
+    time = np.arange(round(rate * (stamps[-1] - stamps[0]))) / rate
+    gyro, accel = (np.sin(np.outer(time, [1.0, 2.0, 3.0]) + k) for k in (0.0, 1.0))
+    unseen = dict.fromkeys(Recording._fields)
+    return Recording(**unseen | {"name": walk.name, "time": stamps, "gyro": gyro, "accel": accel})
 
 
 def seconds(column):
@@ -30,7 +30,9 @@ def test_the_file_is_read_back(tmp_path):
     pytest.importorskip("rerun", reason="needs rerun-sdk")
     walk, blind = estimate("room 1/walk", 0), estimate("blind", 1, truth=False)
     covariance = np.array([[4.0, 1.5, 0.2], [1.5, 1.0, 0.1], [0.2, 0.1, 0.5]])
-    walk = walk._replace(position_covariance=np.tile(covariance, (400, 1, 1)))
+    walk = walk._replace(
+        filtered=walk.filtered._replace(covariance=np.tile(covariance, (400, 1, 1)))
+    )
     path = tmp_path / "walks.rrd"
     logged = [rerun_file.Logged(each, recording_of(each)) for each in (walk, blind)]
     rerun_file.write_rerun(path, logged)
@@ -47,12 +49,14 @@ def test_the_file_is_read_back(tmp_path):
     axes = Rotation.from_quat(turn).as_matrix()
     np.testing.assert_allclose(axes @ np.diag(np.square(size) / 9) @ axes.T, covariance, atol=1e-5)
     gate = found["/room_1_walk/gate"]
-    rows = ~np.isnan(walk.displacement[:, 0])
+    rows = ~np.isnan(walk.displacements.value[:, 0])
     np.testing.assert_allclose(seconds(gate["time"]), 0.1 * np.flatnonzero(rows), atol=1e-6)
-    np.testing.assert_allclose(gate["Scalars:scalars"], walk.diagnostics["gate"][rows])
+    np.testing.assert_allclose(
+        gate["Scalars:scalars"], walk.displacements.diagnostics["gate"][rows]
+    )
     gyro = found["/room_1_walk/imu/gyro"]
-    np.testing.assert_allclose(seconds(gyro["time"])[[0, -1]], [0.0, 40.98], atol=1e-6)
-    np.testing.assert_allclose(gyro["Scalars:scalars"], recording_of(walk).gyro[50:])
+    np.testing.assert_allclose(seconds(gyro["time"])[[0, -1]], [0.0, 39.88], atol=1e-6)
+    np.testing.assert_allclose(gyro["Scalars:scalars"], recording_of(walk).gyro)
 
 
 def test_what_is_refused_before_the_work(tmp_path, monkeypatch):

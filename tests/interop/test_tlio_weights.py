@@ -13,7 +13,7 @@ from gnio_jax import interop, models
 from gnio_jax.commands import app
 from gnio_jax.config import DataConfig, FilterSettings
 from gnio_jax.errors import InputError
-from gnio_jax.evaluation import filter_setup
+from gnio_jax.filtering import filter_setup
 from gnio_jax.training import checkpoint
 from tests.support import tlio_weights
 

@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from gnio_jax.evaluation import Estimate, Trajectory
+from gnio_jax.evaluation import Displacements, Estimate, Filtered, Trajectory
 from gnio_jax.evaluation.report import DEFINITIONS
 
 SETTINGS = {
@@ -21,6 +21,10 @@ SETTINGS = {
     "alignment": "origin",
     "definitions": DEFINITIONS,
 }
+
+
+def with_covariance(estimate, covariance):
+    return estimate._replace(filtered=estimate.filtered._replace(covariance=covariance))
 
 
 def estimate(name, seed, n=400, truth=True):
@@ -41,11 +45,11 @@ def estimate(name, seed, n=400, truth=True):
         name,
         Trajectory(time, moved, orientation),
         reference,
-        displacement,
-        np.full((n, 3), 0.3),
-        {"gate": np.tanh(displacement)},
+        Displacements(displacement, np.full((n, 3), 0.3), {"gate": np.tanh(displacement)}),
+        Filtered(
+            spread[:, None, None] ** 2 * np.eye(3),
+            np.where(np.isnan(accepted), np.nan, 3.0),
+            accepted,
+        ),
         std=np.repeat(spread[:, None], 15, 1),
-        position_covariance=spread[:, None, None] ** 2 * np.eye(3),
-        accepted=accepted,
-        nis=np.where(np.isnan(accepted), np.nan, 3.0),
     )

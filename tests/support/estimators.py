@@ -1,18 +1,22 @@
-"""A "network" that shows what it was given, and the setups that tests of estimators share."""
+"""A "network" that shows what it was given, and the ways to a trajectory."""
+
+import math
 
 import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from gnio_jax import evaluation
 from gnio_jax.config import DataConfig, FilterSettings
-from gnio_jax.evaluation import Network, Setup
+from gnio_jax.evaluation import given_displacements, infer, no_displacements, perfect, prepare
+from gnio_jax.evaluation.estimate import PERFECT_STD
+from gnio_jax.filtering import filter_setup
+from gnio_jax.models import Network
 from gnio_jax.types import Prediction
 
 RATE = 50.0
 CONFIG = DataConfig(rate=RATE)
 OPTIONS = FilterSettings()
-INTEGRATE = Setup("integrate")
-LOOSE = Setup(coupling="loose")
 
 
 def sensed(variables, windows):
@@ -35,6 +39,43 @@ def network(gain, log_std, log_std_gain=1.0, constant=(0.0, 0.0, 0.0)):
 
 
 NETWORK = network(0.05, -3.0)
+
+
+def ready(walks, config=CONFIG, **how):
+    """The walks prepared, none of them left out; how: options of `prepare`."""
+    recordings, left_out = prepare(walks, config, **how)
+    assert not left_out
+    return recordings
+
+
+def tight(recordings, network=NETWORK, config=CONFIG, options=OPTIONS, **how):
+    """The filter with the network in it; how: options of `estimate`."""
+    return evaluation.estimate(recordings, network, config, filter_setup(config, options), **how)
+
+
+def loose(recordings, network=NETWORK, config=CONFIG, options=OPTIONS, **how):
+    """The filter with displacements that were inferred before."""
+    ekf = filter_setup(config, options)
+    found = infer(network, recordings, config, least_std=math.exp(ekf.config.log_std_min))
+    return evaluation.estimate(recordings, found, config, ekf, **how)
+
+
+def summed(recordings, network=NETWORK, config=CONFIG):
+    """The sum of the network's displacements."""
+    return evaluation.estimate(recordings, infer(network, recordings, config), config, None)
+
+
+def imu_only(recordings, config=CONFIG, options=OPTIONS):
+    """The filter without displacements."""
+    nothing = [no_displacements(each) for each in recordings]
+    return evaluation.estimate(recordings, nothing, config, filter_setup(config, options))
+
+
+def with_truth(recordings, config=CONFIG, options=OPTIONS, filtered=True, **how):
+    """The filter, or the sum of displacements, with those of the reference."""
+    truth = [given_displacements(each, PERFECT_STD) for each in recordings]
+    ekf = perfect(filter_setup(config, options)) if filtered else None
+    return evaluation.estimate(recordings, truth, config, ekf, **how)
 
 
 def rotations(wxyz):

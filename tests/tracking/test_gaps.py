@@ -10,9 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from gnio_jax.config import DataConfig, ModelConfig, TrainConfig
 from gnio_jax.data.resampling import resample
-from gnio_jax.evaluation import prepare
-from gnio_jax.evaluation.estimators.filtered import Measurements, run_filters
-from gnio_jax.evaluation.setup import Setup
+from gnio_jax.evaluation import estimate, no_displacements, prepare
 from gnio_jax.filtering import InitialStd
 from gnio_jax.tracking.filter import GAP_ACCEL_STD, GAP_GYRO_STD, tracking_filter
 from gnio_jax.training.checkpoint import Run
@@ -54,7 +52,7 @@ def recordings():
 
 @pytest.fixture(scope="module")
 def prepared():
-    found, left_out = prepare(recordings(), WINDOWS, Setup())
+    found, left_out = prepare(recordings(), WINDOWS, FILTER.initial_std)
     assert not left_out
     return found
 
@@ -63,12 +61,12 @@ def ends(prepared):
     """Errors of the position where the hole ends, and their covariances, with z left out."""
     n = FILTER.config.samples_per_clone
     row = round(HOLE[1] * RATE) // n
-    mute = [Measurements(*np.full((2, each.strides(n), 3), np.nan)) for each in prepared]
-    estimates = run_filters(prepared, mute, FILTER, DRAWS)
+    mute = [no_displacements(each) for each in prepared]
+    estimates = estimate(prepared, mute, WINDOWS, FILTER, DRAWS)
     time = np.array([float(each.name) + HOLE[1] for each in estimates])
     error = np.array([each.trajectory.position[row] for each in estimates])
     error = error - known_walk.position(time)
-    covariance = np.array([each.position_covariance[row] for each in estimates])
+    covariance = np.array([each.filtered.covariance[row] for each in estimates])
     return error[:, :2], covariance[:, :2, :2], estimates
 
 
@@ -80,7 +78,7 @@ def test_the_true_end_of_a_hole_lies_within_what_the_filter_says(prepared):
     error, covariance, _ = ends(prepared)
     nees = normalised(error, covariance)
     assert 0.4 < nees.mean() < 1.6 and (2 * nees < 11.8).mean() > 0.97  # 99.7 % of χ² with 2
-    believed = [each._replace(sequence=each.sequence._replace(imu_valid=None)) for each in prepared]
+    believed = [each._replace(imu_valid=None) for each in prepared]
     error, covariance, _ = ends(believed)  # the lines across the hole taken for measurements
     assert normalised(error, covariance).mean() > 100.0
 
@@ -88,9 +86,9 @@ def test_the_true_end_of_a_hole_lies_within_what_the_filter_says(prepared):
 def test_the_covariance_over_a_hole_is_that_of_a_held_and_of_no_sample(prepared):
     """Sample by sample, in NumPy: held for 0.1 s, then neither turn nor force, only doubt."""
     one = prepared[0]
-    _, _, (estimate, *_) = ends(prepared)
+    _, _, (found, *_) = ends(prepared)
     n, dt, row = FILTER.config.samples_per_clone, 1 / RATE, round(HOLE[1] * RATE)
-    noise, mask = FILTER.noise, one.sequence.imu_valid
+    noise, mask = FILTER.noise, one.imu_valid
     first = int(np.argmin(mask))
     np.testing.assert_array_equal(np.flatnonzero(~mask), np.arange(first, row))
     assert first == round(HOLE[0] * RATE) + 1
@@ -100,13 +98,13 @@ def test_the_covariance_over_a_hole_is_that_of_a_held_and_of_no_sample(prepared)
     doubt_before = 0.0
     for k in range(row):
         age = 0 if mask[k] else k - first + 1
-        held = one.sequence.gyro[k], one.sequence.accel[k]
+        held = one.gyro[k], one.accel[k]
         if age:
-            held = one.sequence.gyro[first - 1], one.sequence.accel[first - 1]
+            held = one.gyro[first - 1], one.accel[first - 1]
         used = age <= 5
         doubt = np.minimum(np.arange(1, age + 1) / 5, 1.0).sum()
         extra, doubt_before = doubt**2 - doubt_before**2 if age else 0.0, doubt
-        turn = (held[0] - one.gyro_bias) * dt * used
+        turn = (held[0] - one.start.gyro_bias) * dt * used
         push = R @ held[1] * dt * used
         A = np.eye(15)
         A[3:6, :3] = -cross(push)
@@ -126,7 +124,7 @@ def test_the_covariance_over_a_hole_is_that_of_a_held_and_of_no_sample(prepared)
         P[9:12, 9:12] += np.eye(3) * noise.gyro_bias_walk**2 * dt
         P[12:, 12:] += np.eye(3) * noise.accel_bias_walk**2 * dt
         R = R @ step
-    np.testing.assert_allclose(estimate.std[row // n], np.sqrt(np.diag(P)), rtol=0.01)
+    np.testing.assert_allclose(found.std[row // n], np.sqrt(np.diag(P)), rtol=0.01)
 
 
 def cross(v):

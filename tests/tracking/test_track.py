@@ -220,7 +220,7 @@ def test_our_own_file_with_holes(gnio, mistake, runs, tmp_path):
 
 
 def test_an_out_that_cannot_be_written_is_found_first(mistake, runs, tmp_path, monkeypatch):
-    monkeypatch.setattr("gnio_jax.tracking.run.run_filters", lambda *_: pytest.fail("too late"))
+    monkeypatch.setattr("gnio_jax.tracking.run.estimate", lambda *_: pytest.fail("too late"))
     walk = logger_files.zipped(tmp_path / "walk.zip", logger_files.sensor_logger())
     given = ("track", walk, "--weights", runs / "walker", "--out")
     assert f"{tmp_path / 'walk.zip'}: " in mistake(*given, walk / "track")

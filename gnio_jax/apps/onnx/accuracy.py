@@ -11,10 +11,10 @@ from jaxtyping import Float
 from gnio_jax.config import DataConfig
 from gnio_jax.data.simulated.walks import pedestrian
 from gnio_jax.errors import InputError
-from gnio_jax.evaluation.inference import Network
 from gnio_jax.evaluation.metrics import ate
 from gnio_jax.filtering import FilterHistory, initial_state, run_odometry
 from gnio_jax.filtering.settings import FilterSetup
+from gnio_jax.models import Network
 from gnio_jax.numerics import matrix_from_quaternion
 from gnio_jax.types import Prediction
 

@@ -21,7 +21,6 @@ import jax.numpy as jnp
 
 from gnio_jax.apps.onnx import flat_state
 from gnio_jax.apps.onnx.flat_state import PREFIX, DeployedState, from_arrays, to_arrays
-from gnio_jax.evaluation.inference import Network
 from gnio_jax.filtering import Pose, level_state
 from gnio_jax.filtering.displacement import scaled_displacement
 from gnio_jax.filtering.gaps import Imu
@@ -30,6 +29,7 @@ from gnio_jax.filtering.resampler import ACCEL, GYRO
 from gnio_jax.filtering.settings import FilterSetup
 from gnio_jax.filtering.start import REST_SECONDS
 from gnio_jax.filtering.tracker import advance_filter
+from gnio_jax.models import Network
 from gnio_jax.types import Array
 
 NETWORK, START, WINDOW, STEP = "network", "filter_start", "filter_window", "filter_step"

@@ -20,10 +20,10 @@ from gnio_jax.apps.onnx.flat_state import start_arrays
 from gnio_jax.apps.onnx.programs import Program, programs
 from gnio_jax.config.files import plain
 from gnio_jax.errors import InputError, require_packages
-from gnio_jax.evaluation.inference import inference_network
 from gnio_jax.files import fingerprint, replacing_folder
 from gnio_jax.filtering import initial_state
 from gnio_jax.filtering.settings import FilterSetup
+from gnio_jax.models import Network
 from gnio_jax.tracking.run import tracking_filter
 
 PACKAGES = ("jax2onnx", "onnx", "onnxruntime")
@@ -63,7 +63,7 @@ def export_run(which: str | Path, out: Path, seconds: float = SECONDS) -> Export
     require_packages("gnio export", "onnx", *PACKAGES)
     place = packages.find(which)
     run = packages.load_pretrained(place)
-    network, setup = inference_network(run.model, run.variables), tracking_filter(run)
+    network, setup = Network.of(run.model, run.variables), tracking_filter(run)
     with replacing_folder(out) as folder, ExitStack() as at_end:
         at_end.callback(logging.disable, logging.root.manager.disable)
         logging.disable(logging.WARNING)  # Converters log what they do about every other node.

@@ -12,16 +12,16 @@ import numpy as np
 from jaxtyping import Float
 
 from gnio_jax.errors import InputError, require_packages
-from gnio_jax.evaluation.estimators.result import Estimate
-from gnio_jax.evaluation.frames import SIGMAS
+from gnio_jax.evaluation import Estimate, Recording
 from gnio_jax.evaluation.report import file_names
 from gnio_jax.files import replacing
 from gnio_jax.numerics import finite_rows, quaternion_from_matrix, xyzw_from_wxyz
-from gnio_jax.types import Sequence
 
 OPTION = "--rerun"
 BLACK, BLUE, VERMILION, GREEN = (0, 0, 0), (0, 114, 178), (213, 94, 0), (0, 158, 115)
 AXES = ("x", "y", "z")
+SIGMAS = 3.0
+"""Size of the ellipsoids, in standard deviations."""
 
 
 class Logged(NamedTuple):
@@ -29,8 +29,8 @@ class Logged(NamedTuple):
 
     estimate: Estimate
     """In the frame in which it is looked at, and so its reference."""
-    sequence: Sequence
-    """The recording that was estimated, whose IMU is shown."""
+    recording: Recording
+    """Its IMU is shown."""
 
 
 def check_file(path: Path) -> None:
@@ -57,7 +57,7 @@ def write_rerun(path: Path, logged: list[Logged], name: str = "gnio") -> None:
         for stem, each in zip(stems, logged, strict=True):
             _log_paths(recording, stem, each.estimate)
             _log_network_and_filter(recording, stem, each.estimate)
-            _log_imu(recording, stem, each.sequence, float(each.estimate.trajectory.time[0]))
+            _log_imu(recording, stem, each.recording)
         recording.disconnect()
 
 
@@ -79,8 +79,8 @@ def _log_paths(recording: Any, stem: str, estimate: Estimate) -> None:
     )
     time = _times(path.time[rows] - path.time[0])
     recording.send_columns(f"{stem}/pose", [time], pose)
-    if estimate.position_covariance is not None:
-        half_sizes, axes = ellipsoids(estimate.position_covariance[rows])
+    if estimate.filtered is not None:
+        half_sizes, axes = ellipsoids(estimate.filtered.covariance[rows])
         contour = rerun.Ellipsoids3D.columns(
             centers=path.position[rows], half_sizes=half_sizes, quaternions=xyzw_from_wxyz(axes)
         )
@@ -99,23 +99,23 @@ def ellipsoids(
 def _log_network_and_filter(recording: Any, stem: str, estimate: Estimate) -> None:
     """Gate, scale and σ of the network, the innovations of the filter."""
     time = estimate.trajectory.time - estimate.trajectory.time[0]
+    found, filtered = estimate.displacements, estimate.filtered
     curves = {
-        "gate": estimate.diagnostics.get("gate"),
-        "scale": estimate.diagnostics.get("scale"),
-        "network_std": estimate.displacement_std,
-        "nis": None if estimate.nis is None else estimate.nis[:, None],
+        **({} if found is None else found.diagnostics),
+        "network_std": found and found.std,
+        "nis": filtered and filtered.nis[:, None],
     }
     for name, values in curves.items():
         if values is not None:
             _log_curves(recording, f"{stem}/{name}", time, values)
 
 
-def _log_imu(recording: Any, stem: str, sequence: Sequence, start: float) -> None:
-    """Gyro, rad/s, and accelerometer, m/s², from the start of the estimate on."""
-    rows = sequence.time >= start
-    time = sequence.time[rows] - start
-    for name, values in (("gyro", sequence.gyro), ("accel", sequence.accel)):
-        _log_curves(recording, f"{stem}/imu/{name}", time, values[rows])
+def _log_imu(log: Any, stem: str, recording: Recording) -> None:
+    """Gyro, rad/s, and accelerometer, m/s²."""
+    seconds = recording.time[-1] - recording.time[0]
+    time = np.linspace(0.0, seconds, len(recording.gyro), endpoint=False)
+    for name, values in (("gyro", recording.gyro), ("accel", recording.accel)):
+        _log_curves(log, f"{stem}/imu/{name}", time, values)
 
 
 def _log_curves(

@@ -13,7 +13,7 @@ from gnio_jax import filtering
 from gnio_jax.commands import app
 from gnio_jax.config import DataConfig, ModelConfig, TrainConfig
 from gnio_jax.data.simulated.walks import pedestrian
-from gnio_jax.evaluation import inference_network
+from gnio_jax.models import Network
 from gnio_jax.numerics import matrix_from_quaternion
 from gnio_jax.tracking.run import tracking_filter
 from gnio_jax.training.checkpoint import load_run
@@ -65,7 +65,7 @@ def package(run):
     """The odometry of the package over the walk, from a state made of its setup."""
     loaded = load_run(run)
     setup = tracking_filter(loaded)
-    network = inference_network(loaded.model, loaded.variables)
+    network = Network.of(loaded.model, loaded.variables)
 
     def predict(windows):
         return network.apply(network.variables, windows)._replace(diagnostics={})

@@ -1,0 +1,337 @@
+"""Trajectories of prepared recordings.
+
+The filter runs with the network in it (tight coupling), with displacements that were inferred
+before (loose coupling), or without any; without a filter displacements are summed. A trajectory has
+a row at the start and one at the end of every stride. The filter runs in float64 (JAX's x64 must be
+on), the network in float32.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from gnio_jax.config import DataConfig
+from gnio_jax.evaluation.infer import Displacements, keep
+from gnio_jax.evaluation.metrics import Filtered
+from gnio_jax.evaluation.prepare import Recording, Start
+from gnio_jax.evaluation.trajectory import Alignment, Trajectory, in_frame_of, turned_covariance
+from gnio_jax.filtering import (
+    ConsideredStd,
+    FilterConfig,
+    FilterHistory,
+    FilterState,
+    NoiseModel,
+    considered_covariance,
+    initial_state,
+    over_sequences,
+    run_filter,
+    run_odometry,
+    sensitivity,
+)
+from gnio_jax.filtering.batch import Batch, batches, padded_masks, padded_signals
+from gnio_jax.filtering.history import GYRO_BIAS, POSITION
+from gnio_jax.filtering.settings import FilterSetup
+from gnio_jax.models import Network
+from gnio_jax.numerics import filled_up, finite_rows, quaternion_from_matrix, yaw_rotation
+from gnio_jax.reporting import Progress, silent
+from gnio_jax.types import Array
+
+PERFECT_STD = 0.01
+"""Standard deviation of the true displacements that a `perfect` filter is given, m per axis."""
+SHORTEST = 16
+"""No batch is padded to less than about this many strides."""
+
+
+class Estimate(NamedTuple):
+    """A trajectory with what the estimator knows beside it: K + 1 rows for K strides.
+
+    Row k is at the end of stride k, which is `Recording.time[k]`. A measurement stands in the row
+    in which its window ends.
+    """
+
+    name: str
+    trajectory: Trajectory
+    """NaN from where the filter was not healthy any more: it has diverged."""
+    reference: Trajectory
+    """At the same rows; NaN where it cannot be trusted."""
+    displacements: Displacements | None = None
+    """With the standard deviations that the filter used, or those of the network without one."""
+    filtered: Filtered | None = None
+    velocity: Float[np.ndarray, "k 3"] | None = None
+    """m/s."""
+    std: Float[np.ndarray, "k 15"] | None = None
+    """Standard deviation of the filter's error in θ, v, p, b_g, b_a."""
+    notes: tuple[str, ...] = ()
+    """What a reader of the result should know."""
+
+
+def estimate(
+    recordings: list[Recording],
+    source: Network | list[Displacements],
+    windows: DataConfig,
+    ekf: FilterSetup | None,
+    batch_size: int = 16,
+    progress: Progress = silent,
+) -> list[Estimate]:
+    """Trajectories of the recordings, by the filter, or by the sum of displacements where `ekf` is
+    None.
+
+    `source` is the network, which then runs inside the filter, or the displacements of each
+    recording. The filter runs over `batch_size` recordings side by side; other batches give the
+    same trajectories to rounding.
+    """
+    if ekf is None:
+        assert not isinstance(source, Network)
+        return [integrate(*pair, windows) for pair in zip(recordings, source, strict=True)]
+    found: dict[int, Estimate] = {}
+    strides = [each.strides for each in recordings]
+    for batch in _batches(strides, batch_size):
+        history = jax.device_get(_filter_batch(batch, recordings, source, ekf))
+        for place, i in enumerate(dict.fromkeys(batch.members)):
+            own = jax.tree.map(lambda leaf, p=place, k=strides[i]: leaf[p, :k], history)
+            if not isinstance(source, Network):
+                own = own._replace(diagnostics=source[i].diagnostics)
+            found[i] = _of_history(recordings[i], own, ekf)
+        progress(sum(strides[i] for i in found) / sum(strides))
+    return [found[i] for i in range(len(recordings))]
+
+
+def never_moves(estimates: list[Estimate]) -> list[Estimate]:
+    """The start pose throughout: what an estimator must beat, above all in a small room."""
+    still = []
+    for each in estimates:
+        time, *poses = each.trajectory
+        path = Trajectory(time, *(np.repeat(part[:1], len(part), 0) for part in poses))
+        still.append(Estimate(each.name, path, each.reference))
+    return still
+
+
+def perfect(ekf: FilterSetup) -> FilterSetup:
+    """The filter for true displacements, which lack nothing: without anything that was calibrated
+    for a network."""
+    noise = ekf.noise._replace(std_factor=(1.0, 1.0, 1.0), measurement_scale=1.0, correlation=None)
+    considered = ekf.considered and ConsideredStd(gyro_bias=ekf.considered.gyro_bias)
+    return ekf._replace(noise=noise, considered=considered)
+
+
+def in_one_frame(estimate: Estimate, alignment: Alignment | None = "origin") -> Estimate:
+    """Estimate and reference in one frame, to be looked at together: the estimate with its
+    covariance aligned, or without an `alignment` the reference moved so that both start alike.
+    Unchanged where that is impossible."""
+    if alignment is None:
+        reference = in_frame_of(estimate.reference, estimate.trajectory)
+        return estimate._replace(reference=reference)
+    aligned, filtered = in_frame_of(estimate.trajectory, estimate.reference, alignment), None
+    if estimate.filtered is not None:
+        covariance = turned_covariance(estimate.filtered.covariance, estimate.trajectory, aligned)
+        filtered = estimate.filtered._replace(covariance=covariance)
+    return estimate._replace(trajectory=aligned, filtered=filtered)
+
+
+# The filter over many recordings
+# --------------------------------------------------------------------------------------------------
+
+
+class Inputs(NamedTuple):
+    """What the filter is driven by, with the recordings along the leading axis."""
+
+    start: Start
+    gyro: Array
+    """(b, K·n, 3), rad/s."""
+    accel: Array
+    """(b, K·n, 3), m/s²."""
+    imu_valid: Array | None
+    """(b, K·n); None: every sample was measured."""
+    given: Displacements | None
+    """(b, K, 3); None where the network is in the filter."""
+
+
+def _batches(strides: list[int], batch_size: int) -> list[Batch]:
+    """Batches of one size, as full as they can be. Their lengths are few (the longest recording's
+    times powers of 0.8), and none is padded by more than a quarter."""
+    count = max(1, math.ceil(len(strides) / batch_size))
+
+    def padded(longest: int) -> int:
+        length = max(strides)
+        while 0.8 * length >= longest and length > SHORTEST:
+            length = math.ceil(0.8 * length)
+        return length
+
+    return batches(strides, max(1, math.ceil(len(strides) / count)), padded)
+
+
+def _filter_batch(
+    batch: Batch,
+    recordings: list[Recording],
+    source: Network | list[Displacements],
+    ekf: FilterSetup,
+) -> FilterHistory:
+    """The filter over one batch, whose recordings are padded to a common length."""
+    members = [recordings[i] for i in batch.members]
+    samples, given, network = batch.intervals * ekf.config.samples_per_clone, None, None
+    if isinstance(source, Network):
+        network = source
+    else:
+        own = [source[i] for i in batch.members]
+        given = _stacked([_measurements(each, batch.intervals, ekf.config) for each in own])
+    inputs = Inputs(
+        _stacked([each.start for each in members]),
+        *padded_signals(((each.gyro, each.accel) for each in members), samples),
+        padded_masks((each.imu_valid for each in members), samples),
+        given,
+    )
+    variables, apply = (network.variables, network.apply) if network else (None, None)
+    return _run(variables, inputs, ekf.noise, ekf.considered, apply=apply, config=ekf.config)
+
+
+def _measurements(found: Displacements, rows: int, config: FilterConfig) -> Displacements:
+    """As the filter takes them: it has no clone at the start of the first window."""
+    value = np.array(found.value)
+    value[: config.clones_per_window] = np.nan
+    return Displacements(*(filled_up(each, rows, np.nan) for each in (value, found.std)))
+
+
+@functools.partial(jax.jit, static_argnames=("apply", "config"))
+def _run(
+    variables: Any,
+    inputs: Inputs,
+    noise: NoiseModel,
+    considered: ConsideredStd | None,
+    *,
+    apply: Callable | None,
+    config: FilterConfig,
+) -> FilterHistory:
+    """One compiled run over all recordings of a batch. Of its covariances that of the position is
+    kept, with the errors that the filter considers."""
+
+    def run(own: Inputs) -> FilterHistory:
+        signals, fixed = (own.gyro, own.accel), (config, noise, own.imu_valid)
+        state = initial_state(config, *own.start[:-1], std=own.start.std)
+        if apply is None:
+            assert own.given is not None
+            frame, covariance = "given", jax.vmap(jnp.diag)(own.given.std**2)
+            history = run_filter(state, *signals, own.given.value, covariance, *fixed)[1]
+        else:
+            frame = config.displacement_frame
+            predict = functools.partial(_predict, apply, variables)
+            history = run_odometry(predict, state, *signals, *fixed)[1]
+        diagonal, whole = history.covariance_diagonal, history.covariance
+        assert whole is not None
+        position = whole[:, POSITION, POSITION]
+        if considered is not None:
+            displacement, covariance = history.given(noise)
+
+            def repeated(state: FilterState, displacement: Array) -> FilterHistory:
+                return run_filter(state, *signals, displacement, covariance, *fixed, frame)[1]
+
+            found = sensitivity(repeated, state, displacement)
+            added = considered_covariance(found, considered)
+            diagonal = diagonal + jnp.diagonal(added, axis1=1, axis2=2)
+            position = position + added[:, POSITION, POSITION]
+        return history._replace(covariance_diagonal=diagonal, covariance=position)
+
+    return over_sequences(run)(inputs)
+
+
+def _predict(apply: Callable, variables: Any, windows: Array) -> Any:
+    return keep(apply(variables, windows))
+
+
+def _of_history(recording: Recording, history: FilterHistory, ekf: FilterSetup) -> Estimate:
+    """The history of one recording after a row for its start. It is void where it is not
+    healthy."""
+    start, notes = recording.start, recording.notes
+    healthy = _after(1.0, history.healthy) > 0
+    if not healthy.all():
+        since = recording.time[np.argmin(healthy)] - recording.time[0]
+        notes = (*notes, f"filter: not healthy from {since:.1f} s on, and all after it is void")
+    position = _after(start.position, history.position)
+    orientation = quaternion_from_matrix(_after(start.rotation, history.rotation))
+    poses = (np.where(healthy[:, None], part, np.nan) for part in (position, orientation))
+    std = np.repeat(np.array(start.std), [2, 1, 3, 3, 3, 3])
+    if ekf.considered is not None:
+        std[GYRO_BIAS] = np.hypot(std[GYRO_BIAS], ekf.considered.gyro_bias)
+    return Estimate(
+        recording.name,
+        Trajectory(recording.time, *poses),
+        recording.reference,
+        Displacements(
+            _after(np.nan, history.displacement),
+            _after(np.nan, history.measurement_std),
+            {name: _after(np.nan, value) for name, value in history.diagnostics.items()},
+        ),
+        Filtered(
+            _after(np.diag(std[POSITION] ** 2), history.covariance),
+            _after(np.nan, history.nis),
+            _after(np.nan, history.accepted),
+        ),
+        velocity=_after(start.velocity, history.velocity),
+        std=_after(std, np.sqrt(np.maximum(history.covariance_diagonal, 0.0))),
+        notes=notes,
+    )
+
+
+def _after(first: Any, rest: Any) -> np.ndarray:
+    """`rest` after a row of `first`."""
+    row = np.broadcast_to(np.asarray(first, float), rest.shape[1:])
+    return np.concatenate([row[None], rest])
+
+
+def _stacked(trees: list[Any]) -> Any:
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *trees)
+
+
+# The sum of displacements
+# --------------------------------------------------------------------------------------------------
+
+
+def integrate(recording: Recording, found: Displacements, windows: DataConfig) -> Estimate:
+    """The path whose every stride is what the windows over it predict, on average, as RoNIN-type
+    baselines do."""
+    n, clones = windows.stride, windows.window // windows.stride
+    assert recording.attitude is not None
+    ends = n * np.arange(clones, recording.strides + 1)  # of the windows, in samples
+    to_world = yaw_rotation(recording.attitude[ends - windows.window])
+    steps = np.einsum("mij,mj->mi", to_world, found.value[clones - 1 :]) / clones
+    moved = np.cumsum(mean_over_windows(steps, recording.strides, clones), 0)
+    position = recording.start.position + np.concatenate([np.zeros((1, 3)), moved])
+    orientation = quaternion_from_matrix(recording.attitude[::n])
+    return Estimate(
+        recording.name,
+        Trajectory(recording.time, position, orientation),
+        recording.reference,
+        jax.tree.map(lambda leaf: _after(np.nan, leaf), found),
+        notes=recording.notes,
+    )
+
+
+def mean_over_windows(
+    steps: Float[np.ndarray, "m 3"], strides: int, window: int
+) -> Float[np.ndarray, "k 3"]:
+    """Movement in each stride: the mean of displacement × stride/window (`steps`) over the windows
+    that cover it. Window i covers strides i … i + `window` − 1.
+
+    Taking the one window that starts (or ends) at the stride instead puts the whole trajectory half
+    a window ahead of (or behind) its time: 0.6 m at walking speed. A stride without any window
+    keeps the movement of the one before; those before all windows (the context of the first) take
+    that of the first that has one.
+    """
+    good = finite_rows(steps)
+    sums = np.concatenate([np.zeros((1, 3)), np.cumsum(np.where(good[:, None], steps, 0.0), 0)])
+    counts = np.concatenate([[0], np.cumsum(good)])
+    stride = np.arange(strides)
+    first = np.clip(stride - window + 1, 0, len(steps))
+    last = np.minimum(stride + 1, len(steps))
+    covering = (counts[last] - counts[first])[:, None]
+    moved = np.zeros((strides, 3))
+    np.divide(sums[last] - sums[first], covering, out=moved, where=covering > 0)
+    covered = covering[:, 0] > 0
+    return moved[np.maximum.accumulate(np.where(covered, stride, int(np.argmax(covered))))]

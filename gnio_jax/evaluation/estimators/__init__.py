@@ -1,1 +1,0 @@
-"""The two ways to a trajectory: through the filter, and by summing displacements."""

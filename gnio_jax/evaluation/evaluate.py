@@ -1,0 +1,224 @@
+"""One evaluation, from a run and its options to a folder of results.
+
+    prepare → infer → estimate → score → report
+
+Each stage is one file of this folder and one call here. It takes what the stages before it have
+made, and no stage calls an earlier one.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+import zlib
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from gnio_jax import config as configuration
+from gnio_jax import data
+from gnio_jax.config import EvaluateConfig, TrainConfig
+from gnio_jax.errors import InputError
+from gnio_jax.evaluation.estimate import PERFECT_STD, Estimate, estimate, never_moves, perfect
+from gnio_jax.evaluation.infer import given_displacements, infer, no_displacements
+from gnio_jax.evaluation.metrics import score
+from gnio_jax.evaluation.prepare import Recording, prepare
+from gnio_jax.evaluation.report import DEFINITIONS, Report, write
+from gnio_jax.filtering.settings import filter_setup
+from gnio_jax.models import Network
+from gnio_jax.reporting import Reporter, Silence
+from gnio_jax.types import Sequence
+
+SILENCE = Silence()
+
+
+class Evaluation(NamedTuple):
+    """What `evaluate` found."""
+
+    report: Report
+    estimates: list[Estimate]
+    recordings: list[Recording]
+    folder: Path
+    """Where the results are."""
+
+
+def evaluate(
+    config: EvaluateConfig,
+    reporter: Reporter = SILENCE,
+    workers: int = 1,
+    command: str = "",
+) -> Evaluation:
+    """Estimate every sequence of a split with the network of a run, measure the errors, and leave
+    the results in a folder of the run.
+
+    The folder is written whole or not at all, and replaces that of an earlier evaluation with the
+    same options. `workers` processes read what is slow to read; `command` is how this was called,
+    for the page. Raises `InputError` for options that do not fit together, a run without the
+    checkpoint, missing data, and a split of which no sequence can be estimated.
+    """
+    from gnio_jax.training.checkpoint import load_run  # Orbax takes seconds to import
+
+    workdir = Path(config.workdir or configuration.newest_run())
+    run = load_run(workdir, config.checkpoint)
+    config = resolve(config, run.config)
+    windows, ekf = run.config.data, filter_setup(run.config.data, config.filter)
+    stage = functools.partial(functools.partial, reporter.progress)
+
+    sequences = data.load(config.dataset, config.data_root, config.split, workers, stage("reading"))
+    recordings, left_out = prepare(
+        sequences,
+        windows,
+        ekf.initial_std,
+        init=config.init,
+        gyro_bias=config.gyro_bias,
+        orientation=config.orientation if _infers(config) else None,
+    )
+    if not recordings:
+        name, reason = next(iter(left_out.items()))
+        problem = f"no sequence of split '{config.split}' can be estimated ({name}: {reason})"
+        raise InputError(f"dataset {config.dataset}", problem)
+
+    network = Network.of(run.model, run.variables)
+    if _infers(config):
+        least_std = math.exp(ekf.config.log_std_min) if config.estimator == "ekf" else 0.0
+        source = infer(network, recordings, windows, stage("inferring"), least_std=least_std)
+    elif config.estimator == "imu_only":
+        source = [no_displacements(each) for each in recordings]
+    else:
+        source = network
+    truth = [given_displacements(each, PERFECT_STD) for each in recordings]
+
+    filters = (None, None) if config.estimator == "integrate" else (ekf, perfect(ekf))
+    batch, to_perfect = config.batch_size, stage("estimating with perfect displacements")
+    estimates = estimate(recordings, source, windows, filters[0], batch, stage("estimating"))
+    ideal = estimate(recordings, truth, windows, filters[1], batch, to_perfect)
+
+    report = Report(
+        {**_settings(config, run.config, sequences), "epoch": run.epoch, "step": run.step},
+        score(estimates, config.alignment),
+        {
+            "never_moves": score(never_moves(estimates), config.alignment),
+            "perfect_displacements": score(ideal, config.alignment),
+        },
+        {each.name: each.group for each in recordings},
+        {each.name: list(each.notes) for each in estimates if each.notes},
+        left_out,
+    )
+    folder = workdir / "eval" / folder_name(config, run.config)
+    write(folder, report, estimates, run.config, command, config.plots, stage("drawing"))
+    return Evaluation(report, estimates, recordings, folder)
+
+
+def resolve(config: EvaluateConfig, run: TrainConfig) -> EvaluateConfig:
+    """What is asked for, with what it takes from the run: dataset, folder of the data, orientation
+    of the windows, and the filter with what `config.set` changes of it. `run` is the configuration
+    of the run. Raises `InputError` for options that do not fit together."""
+    if config.batch_size < 1:
+        raise InputError("--batch-size", f"must be at least 1, found {config.batch_size}")
+    orientation, usual = config.orientation, "reference" if _infers(config) else "filter"
+    if usual == "filter" and orientation not in (None, usual):
+        what = "imu_only" if config.estimator == "imu_only" else "the tight coupling"
+        problem = f"{what} uses the filter's own attitude"
+        remedy = "leave it out, or choose --coupling loose or --estimator integrate"
+        raise InputError(f"--orientation {orientation}", problem, remedy)
+    for assignment in config.set:
+        if not assignment.startswith("filter."):
+            remedy = "write filter.FIELD=VALUE, e.g. filter.noise.measurement_scale=1"
+            raise InputError(f"'{assignment}'", "is not a setting of the filter", remedy)
+    changed = dataclasses.replace(run, filter=config.filter or run.filter)
+    changed = configuration.validate(configuration.assign(changed, config.set), "command line")
+    dataset, root = config.dataset or run.dataset, None
+    if data.get(dataset).needs_root:
+        given = config.data_root or (run.data_root if dataset == run.dataset else None)
+        root = str(data.find_root(dataset, given).resolve())
+    return dataclasses.replace(
+        config,
+        dataset=dataset,
+        data_root=root,
+        orientation=orientation or usual,
+        filter=changed.filter,
+        set=(),
+    )
+
+
+def _infers(config: EvaluateConfig) -> bool:
+    """Whether the network runs over all windows before the estimator."""
+    loose = config.estimator == "ekf" and config.coupling == "loose"
+    return loose or config.estimator == "integrate"
+
+
+def folder_name(config: EvaluateConfig, run: TrainConfig) -> str:
+    """<dataset>_<split>_<estimator>, then every choice of a resolved `config` that is not the
+    default: other figures never take the place of these."""
+    usual = "reference" if _infers(config) else "filter"
+    parts = [config.dataset, config.split, config.estimator]
+    if config.estimator == "ekf" and config.coupling != "tight":
+        parts.append(config.coupling)
+    if config.orientation != usual:
+        parts.append(f"{config.orientation}-orientation")
+    if config.init != "reference":
+        parts.append(f"{config.init}-init")
+    if config.gyro_bias != "zero":
+        parts.append(f"{config.gyro_bias}-bias")
+    if config.alignment != "origin":
+        parts.append(f"{config.alignment}-alignment")
+    if config.checkpoint != "best":
+        parts.append(config.checkpoint)
+    if config.data_root and not _is_usual_root(config.dataset, config.data_root, run):
+        root = Path(config.data_root)
+        parts.append(f"{root.name}-{zlib.crc32(str(root).encode()):08x}-root")
+    if config.estimator != "integrate":
+        trained, own = configuration.flat(run.filter), configuration.flat(config.filter)
+        for name in {**trained, **own}:
+            if (value := own.get(name)) != trained.get(name):
+                numbers = value if isinstance(value, tuple) else (value,)
+                text = ",".join(f"{x:g}" if isinstance(x, float) else str(x) for x in numbers)
+                parts.append(f"{name}-{text}")
+    return "_".join(map(str, parts))
+
+
+def _is_usual_root(dataset: str, root: str, run: TrainConfig) -> bool:
+    """Whether a folder of data is the one that an evaluation takes where none is named, or bears
+    the name of its dataset where there is no such folder."""
+    try:
+        own = run.data_root if dataset == run.dataset else None
+        return Path(root) == data.find_root(dataset, own).resolve()
+    except InputError:
+        return Path(root).name in (data.get(dataset).folders or (dataset,))
+
+
+def _settings(
+    config: EvaluateConfig, run: TrainConfig, sequences: list[Sequence]
+) -> dict[str, Any]:
+    """What changes the meaning of the figures, and what they are of."""
+    compensated = {str(each.attributes.get("imu_compensated", "no")) for each in sequences}
+    windows = run.data
+    return {
+        "dataset": config.dataset,
+        "data_root": config.data_root,
+        "split": config.split,
+        "recordings": {each.name: round(float(np.ptp(each.time)), 3) for each in sequences},
+        "estimator": config.estimator,
+        "coupling": config.coupling if config.estimator == "ekf" else None,
+        "orientation_source": config.orientation,
+        "initial_state": config.init,
+        "gyro_bias": config.gyro_bias,
+        "imu_compensated": " and ".join(sorted(compensated)),
+        "alignment": config.alignment,
+        "model": run.model.name,
+        "checkpoint": config.checkpoint,
+        "rate": windows.rate,
+        "window_seconds": windows.window_seconds,
+        "context_seconds": windows.context_seconds,
+        "stride_seconds": windows.stride_seconds,
+        "window_rotation": windows.window_rotation,
+        "filter": configuration.plain(config.filter),
+        "perfect_displacements_std": PERFECT_STD if config.estimator != "integrate" else None,
+        "definitions": DEFINITIONS,
+        "device": jax.devices()[0].device_kind,
+        "version": version("gnio-jax"),
+    }

@@ -1,0 +1,136 @@
+"""The network's displacement of every window of the recordings, cut with a given attitude."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from gnio_jax.config import DataConfig
+from gnio_jax.evaluation.prepare import Recording
+from gnio_jax.models import Network
+from gnio_jax.reporting import Progress, silent
+from gnio_jax.types import Array, Prediction
+from gnio_jax.windows import align_recording, cut_windows, window_starts, without_any
+
+WINDOWS_PER_CALL = 512
+DIAGNOSTICS = ("gate", "scale")
+"""The network's diagnostics that are kept for every window. Attention is too large for that."""
+
+
+class Displacements(NamedTuple):
+    """Displacements over windows, a row for each stride of a recording: that of the window that
+    ends with the stride. NaN where there is none."""
+
+    value: Float[Array, "k 3"]
+    """m, expressed in the yaw frame of the window's start."""
+    std: Float[Array, "k 3"]
+    """m."""
+    diagnostics: dict[str, Float[Array, "k ..."]] = {}
+
+
+def given_displacements(recording: Recording, std: float) -> Displacements:
+    """The displacements of the reference, with a standard deviation in m."""
+    value = _at_window_ends(recording.displacement, recording)
+    return Displacements(value, np.full_like(value, std))
+
+
+def no_displacements(recording: Recording) -> Displacements:
+    nothing = np.full((recording.strides, 3), np.nan)
+    return Displacements(nothing, nothing)
+
+
+def infer(
+    network: Network,
+    recordings: list[Recording],
+    windows: DataConfig,
+    progress: Progress = silent,
+    diagnostics: tuple[str, ...] = DIAGNOSTICS,
+    least_std: float = 0.0,
+) -> list[Displacements]:
+    """What the network predicts for every window of the recordings, which are cut with
+    `Recording.attitude`, in large batches over all of them. Float64 on the host.
+
+    A window that touches a sample which was not measured has no displacement. `diagnostics` are
+    those that are kept, as far as the network has them. `least_std` is the smallest standard
+    deviation that the estimator takes, m (`FilterConfig.log_std_min`).
+    """
+    parts, starts, turns = [], [], []
+    for each in recordings:
+        assert each.attitude is not None
+        start = window_starts(len(each.gyro) + 1, windows.seen, windows.stride)
+        imu, turn = align_recording(
+            each.accel,
+            each.gyro - each.start.gyro_bias,
+            each.attitude[:-1],
+            start + windows.context,
+            windows.window_rotation,
+        )
+        starts.append(start + sum(map(len, parts)))
+        parts.append(imu)
+        turns.append(turn)
+    samples = jnp.asarray(np.concatenate(parts))
+    start, turn = np.concatenate(starts).astype(np.int32), np.concatenate(turns)
+    total, size, found = len(start), min(WINDOWS_PER_CALL, len(start)), []
+    for begin in range(0, total, size):
+        # The last batch is filled up with the last window, so that one program serves all.
+        batch = np.minimum(np.arange(begin, begin + size), total - 1)
+        arguments = network.variables, samples, start[batch], turn[batch]
+        fixed = {"apply": network.apply, "length": windows.seen, "diagnostics": diagnostics}
+        found.append(jax.device_get(_predict(*arguments, **fixed)))
+        progress(min(1.0, (begin + size) / total))
+    whole = jax.tree.map(lambda *x: np.concatenate(x)[:total].astype(np.float64), *found)
+    ends = np.cumsum([0, *map(len, starts)])
+    return [
+        _of_recording(each, jax.tree.map(lambda x, own=own: x[own], whole), windows, least_std)
+        for each, own in zip(recordings, map(slice, ends[:-1], ends[1:]), strict=True)
+    ]
+
+
+@functools.partial(jax.jit, static_argnames=("apply", "length", "diagnostics"))
+def _predict(
+    variables: Any,
+    samples: Float[Array, "t 6"],
+    start: Array,
+    turn: Float[Array, "b 3 3"],
+    *,
+    apply: Callable,
+    length: int,
+    diagnostics: tuple[str, ...],
+) -> Prediction:
+    return keep(apply(variables, cut_windows(samples, start, turn, length)), diagnostics)
+
+
+def keep(prediction: Prediction, names: tuple[str, ...] = DIAGNOSTICS) -> Prediction:
+    """The prediction with the named diagnostics only, as far as it has them."""
+    kept = {name: value for name, value in prediction.diagnostics.items() if name in names}
+    return prediction._replace(diagnostics=kept)
+
+
+def _of_recording(
+    recording: Recording, found: Prediction, windows: DataConfig, least_std: float
+) -> Displacements:
+    """The predictions for the windows of one recording."""
+    value = np.asarray(found.displacement)
+    if recording.imu_valid is not None:
+        start = window_starts(len(recording.gyro) + 1, windows.seen, windows.stride)
+        whole = without_any(~recording.imu_valid, start, windows.seen)
+        value = np.where(whole[:, None], value, np.nan)
+    std = np.maximum(np.exp(found.log_std), least_std)
+    return Displacements(
+        *(_at_window_ends(each, recording) for each in (value, std)),
+        {name: _at_window_ends(each, recording) for name, each in found.diagnostics.items()},
+    )
+
+
+def _at_window_ends(
+    values: Float[Array, "m *d"], recording: Recording
+) -> Float[np.ndarray, "k *d"]:
+    """Values of the last m windows in the last m rows of a recording, NaN before."""
+    missing = np.full((recording.strides - len(values), *values.shape[1:]), np.nan)
+    return np.concatenate([missing, values])

@@ -1,0 +1,264 @@
+"""Sequences made ready for an estimator: at the network's rate, in whole strides, with a start."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Literal, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.spatial.transform import Rotation
+
+from gnio_jax import data
+from gnio_jax.config import DataConfig, FilterSettings
+from gnio_jax.config.schema import TLIO_STD
+from gnio_jax.errors import InputError
+from gnio_jax.evaluation.trajectory import Trajectory
+from gnio_jax.filtering import InitialStd, level_state
+from gnio_jax.filtering.settings import filter_config
+from gnio_jax.filtering.start import rest_at_start
+from gnio_jax.numerics import (
+    cumulative_rotation,
+    finite_rows,
+    last_true,
+    matrix_from_quaternion,
+    rotations,
+    yaw_rotation,
+)
+from gnio_jax.types import Sequence
+from gnio_jax.windows import true_displacement, window_starts
+
+REFERENCE_BIAS_SECONDS = 10.0
+"""How long `gyro_bias="reference"` looks at the reference, s."""
+ROUGH_START = 0.4
+"""Standard deviation of the first velocity above which a static start is only rough, m/s (ours):
+nobody stands still there."""
+
+Init = Literal["reference", "static"]
+BiasSource = Literal["zero", "rest", "reference"]
+Orientation = Literal["filter", "device", "reference"]
+Matrices = Float[np.ndarray, "t 3 3"]
+
+
+class Start(NamedTuple):
+    """Where the filter starts, and how well that is known."""
+
+    rotation: Float[np.ndarray, "3 3"]
+    """Body→world."""
+    velocity: Float[np.ndarray, "3"]
+    """m/s."""
+    position: Float[np.ndarray, "3"]
+    """m."""
+    gyro_bias: Float[np.ndarray, "3"]
+    """First estimate, rad/s."""
+    std: InitialStd
+
+
+class Recording(NamedTuple):
+    """A sequence ready for an estimator: K strides of n samples."""
+
+    name: str
+    group: str
+    """Person or session: recordings of one are not independent of each other."""
+    time: Float[np.ndarray, "k1"]
+    """Stamps of the start and of the end of each stride, K + 1, s."""
+    gyro: Float[np.ndarray, "t 3"]
+    """K·n samples, rad/s."""
+    accel: Float[np.ndarray, "t 3"]
+    """K·n samples, m/s²."""
+    imu_valid: Bool[np.ndarray, "t"] | None
+    """Which samples were measured; None: all."""
+    start: Start
+    attitude: Matrices | None
+    """Body→world at every sample and at the end of the last, K·n + 1, for windows that are not cut
+    inside the filter."""
+    reference: Trajectory
+    """At `time`; NaN where it cannot be trusted."""
+    displacement: Float[np.ndarray, "m 3"]
+    """Of the reference over each window, a stride apart, m, expressed in the yaw frame of the
+    window's start; NaN where the reference cannot be trusted."""
+    notes: tuple[str, ...]
+    """What a reader of the result should know."""
+
+    @property
+    def strides(self) -> int:
+        """K."""
+        return len(self.time) - 1
+
+
+def prepare(
+    sequences: Iterable[Sequence],
+    windows: DataConfig,
+    std: InitialStd = TLIO_STD,
+    *,
+    init: Init = "reference",
+    gyro_bias: BiasSource = "zero",
+    orientation: Orientation | None = None,
+    from_first: bool = False,
+) -> tuple[list[Recording], dict[str, str]]:
+    """Recordings to estimate, and the names of the sequences that are left out with the reason.
+
+    A recording begins at the first sample with a trusted reference; with `from_first`, and where
+    there is no reference, at its first sample. `std` is the filter's initial uncertainty, of which
+    a static start replaces tilt and velocity by what it finds. `orientation` is the source of
+    `Recording.attitude`; None makes none. Raises `InputError` for a sequence that lacks what these
+    choices need.
+    """
+    recordings, left_out = [], {}
+    for sequence in sequences:
+        if sequence.waypoints is not None:
+            remedy = "nothing can be compared with a track yet"
+            raise InputError(sequence.name, "has waypoints, no poses", remedy)
+        sequence = data.resample(sequence, windows.rate)
+        known = finite_rows(sequence.position) & finite_rows(sequence.orientation)
+        sequence = sequence._replace(valid=sequence.valid & known)
+        _check(sequence, init, gyro_bias, orientation)
+        first = 0 if from_first else int(np.argmax(sequence.valid))
+        strides = (len(sequence.time) - 1 - first) // windows.stride
+        whole = _cut(sequence, slice(first, first + strides * windows.stride + 1))
+        measured = measured_rows(whole)
+        if strides <= windows.seen // windows.stride or len(measured) < windows.seen:
+            seconds = len(measured_rows(_cut(sequence, slice(first, None)))) / windows.rate
+            problem = f"{seconds:.2f} s measured from its first trusted sample on"
+            left_out[sequence.name] = f"{problem}, too short for a window and a stride"
+            continue
+        bias, bias_note = _gyro_bias(whole, measured, windows.rate, gyro_bias)
+        start, start_note = _start(whole, measured, windows, bias, std, init)
+        trusted = whole.valid[:, None]
+        poses = [np.where(trusted, part, np.nan) for part in (whole.position, whole.orientation)]
+        ends = slice(None, None, windows.stride)
+        recordings.append(
+            Recording(
+                name=sequence.name,
+                group=str(data.group(sequence)),
+                time=whole.time[ends],
+                gyro=whole.gyro[:-1],
+                accel=whole.accel[:-1],
+                imu_valid=_mask(whole),
+                start=start,
+                attitude=orientation and _attitude(whole, start, windows.rate, orientation),
+                reference=Trajectory(whole.time[ends], *(part[ends] for part in poses)),
+                displacement=true_displacement(
+                    poses[1],
+                    poses[0],
+                    window_starts(len(whole.time), windows.window, windows.stride),
+                    windows.window,
+                ),
+                notes=tuple(filter(None, (bias_note, start_note))),
+            )
+        )
+    return recordings, left_out
+
+
+def measured_rows(sequence: Sequence) -> Int[np.ndarray, "m"]:
+    """Rows of the IMU that were measured, and are no line across a gap."""
+    mask = sequence.imu_valid
+    return np.arange(len(sequence.time)) if mask is None else np.flatnonzero(mask)
+
+
+def _check(
+    sequence: Sequence, init: Init, gyro_bias: BiasSource, orientation: Orientation | None
+) -> None:
+    """Raise `InputError` where the sequence lacks what the choices need."""
+    if orientation == "device" and sequence.device_orientation is None:
+        remedy = "give --orientation filter or reference"
+        raise InputError(sequence.name, "has no device orientation", remedy)
+    if sequence.valid.any():
+        return
+    if init == "reference" or gyro_bias == "reference":
+        wanted = "--init static" if init == "reference" else "--gyro-bias zero"
+        raise InputError(sequence.name, "has no reference to start from", f"give {wanted}")
+    if orientation == "reference":
+        remedy = "give --orientation filter or device"
+        raise InputError(sequence.name, "has no reference orientation", remedy)
+
+
+def _cut(sequence: Sequence, rows: slice) -> Sequence:
+    """Some samples of a sequence."""
+    arrays = {k: v[rows] for k, v in sequence._asdict().items() if isinstance(v, np.ndarray)}
+    return sequence._replace(**arrays)
+
+
+def _mask(sequence: Sequence) -> Bool[np.ndarray, "t"] | None:
+    mask = sequence.imu_valid
+    return None if mask is None or mask.all() else mask[:-1]
+
+
+def _start(
+    sequence: Sequence,
+    measured: Int[np.ndarray, "m"],
+    windows: DataConfig,
+    gyro_bias: Float[np.ndarray, "3"],
+    std: InitialStd,
+    init: Init,
+) -> tuple[Start, str]:
+    """The start, and what a reader should know of it."""
+    if init == "reference":
+        velocity = sequence.velocity[0]
+        velocity = velocity if np.isfinite(velocity).all() else np.zeros(3)
+        rotation = matrix_from_quaternion(sequence.orientation[0])
+        return Start(rotation, velocity, sequence.position[0], gyro_bias, std), ""
+    second = measured[measured < round(windows.rate)]
+    if 2 * len(second) < round(windows.rate):  # most of the first second was not measured
+        second = measured[: round(windows.rate)]
+    config = filter_config(windows, FilterSettings())
+    level = level_state(config, sequence.gyro[second], sequence.accel[second], std)
+    found = np.sqrt(np.diag(level.core_covariance))
+    tilt_std, velocity_std = float(found[0]), float(found[3])
+    std = std._replace(tilt=tilt_std, velocity=velocity_std)
+    start = Start(np.asarray(level.rotation), np.zeros(3), np.zeros(3), gyro_bias, std)
+    if velocity_std <= ROUGH_START:
+        return start, ""
+    known = f"velocity to {velocity_std:.1f} m/s, tilt to {np.degrees(tilt_std):.0f}°"
+    return start, f"start: not standing still, known to one sigma: {known}"
+
+
+def _gyro_bias(
+    sequence: Sequence, measured: Int[np.ndarray, "m"], rate: float, source: BiasSource
+) -> tuple[Float[np.ndarray, "3"], str]:
+    """First estimate of the gyro bias, rad/s, and where it is from."""
+    if source == "zero":
+        return np.zeros(3), ""
+    if source == "rest":
+        # A line across a gap is as quiet as a table: what was not measured is no rest.
+        gyro, accel = np.full((2, len(sequence.time), 3), np.nan)
+        gyro[measured], accel[measured] = sequence.gyro[measured], sequence.accel[measured]
+        rest = rest_at_start(gyro, accel, 1.0 / rate)
+        if not rest.seconds:
+            return np.zeros(3), "gyro bias: no rest at the start, so it starts from zero"
+        return rest.gyro_bias, f"gyro bias: mean of {rest.seconds:g} s of rest at the start"
+    rows = np.arange(min(round(REFERENCE_BIAS_SECONDS * rate), len(sequence.time) - 1))
+    rows = np.intersect1d(rows[sequence.valid[rows] & sequence.valid[rows + 1]], measured)
+    if len(rows) < rate:
+        return np.zeros(3), "gyro bias: under 1 s of reference at the start, so it starts from zero"
+    before, after = (rotations(sequence.orientation[each]) for each in (rows, rows + 1))
+    true_rate = (before.inv() * after).as_rotvec() * rate
+    note = f"gyro bias: {len(rows) / rate:g} s against the reference orientation"
+    return (sequence.gyro[rows] - true_rate).mean(0), note
+
+
+def _attitude(sequence: Sequence, start: Start, rate: float, source: Orientation) -> Matrices:
+    """Body→world at every sample.
+
+    `filter` is the gyro integrated from the start; `device` is the device's own estimate, turned
+    about z to the yaw of the start. Where reference or device are missing, the gyro carries on from
+    the last known attitude. Raises `InputError` where they are missing at the start.
+    """
+    turns = Rotation.from_rotvec((sequence.gyro[:-1] - start.gyro_bias) / rate)
+    integrated = start.rotation @ cumulative_rotation(turns).as_matrix()
+    if source == "filter":
+        return integrated
+    given = sequence.orientation if source == "reference" else sequence.device_orientation
+    assert given is not None  # `_check` has seen it
+    known = finite_rows(given) & (sequence.valid if source == "reference" else True)
+    if not known[0]:
+        problem = f"has no {source} orientation at its start"
+        raise InputError(sequence.name, problem, "give --orientation filter")
+    # What is not trusted may hold anything, also what is no rotation.
+    rotation = matrix_from_quaternion(np.where(known[:, None], given, np.nan))
+    if source == "device":
+        ours, its = yaw_rotation(np.stack([start.rotation, rotation[0]]))
+        rotation = ours @ its.T @ rotation
+    last = last_true(known)
+    turned_since = np.einsum("tji,tjk->tik", integrated[last], integrated)
+    return np.where(known[:, None, None], rotation, rotation[last] @ turned_since)

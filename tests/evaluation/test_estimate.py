@@ -1,0 +1,301 @@
+"""Estimators against plain loops over samples and windows, and against what they must give with
+perfect inputs."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from gnio_jax import evaluation
+from gnio_jax.config.schema import TLIO_STD
+from gnio_jax.evaluation import infer, metrics
+from gnio_jax.evaluation.estimate import PERFECT_STD, _run, mean_over_windows
+from gnio_jax.filtering import CorrelatedError
+from tests.support.estimators import (
+    CONFIG,
+    NETWORK,
+    OPTIONS,
+    RATE,
+    imu_only,
+    loose,
+    network,
+    ready,
+    rotations,
+    summed,
+    tight,
+    unyaw,
+    with_truth,
+)
+from tests.support.filter_settings import changed
+
+
+def test_imu_only_is_strap_down_integration(walks):
+    recording, other = ready(walks[::2])
+    (found, _) = imu_only([recording, other])
+    rotation, velocity, position = (
+        rotations(walks[0].orientation[0]).as_matrix(),
+        walks[0].velocity[0],
+        walks[0].position[0],
+    )
+    dt, gravity, path, attitudes = 1 / RATE, np.array([0, 0, -9.81]), [position], [rotation]
+    for k in range(len(recording.gyro)):
+        step = rotation @ walks[0].accel[k] * dt
+        position = position + velocity * dt + 0.5 * step * dt + 0.5 * gravity * dt**2
+        velocity = velocity + step + gravity * dt
+        rotation = rotation @ Rotation.from_rotvec(walks[0].gyro[k] * dt).as_matrix()
+        if (k + 1) % CONFIG.stride == 0:
+            path.append(position)
+            attitudes.append(rotation)
+    np.testing.assert_allclose(found.trajectory.position, path, atol=1e-9)
+    np.testing.assert_allclose(
+        rotations(found.trajectory.orientation).as_matrix(), attitudes, atol=1e-10
+    )
+    np.testing.assert_array_equal(
+        found.trajectory.time, walks[0].time[:: CONFIG.stride][: len(path)]
+    )
+    np.testing.assert_array_equal(
+        found.reference.position, walks[0].position[:: CONFIG.stride][: len(path)]
+    )
+    assert np.isnan(found.filtered.accepted).all() and found.std.shape == (len(path), 15)
+
+
+def test_integration_against_a_loop(walks):
+    recordings = ready(walks[:1], orientation="reference")
+    (found,), (predicted,) = summed(recordings), infer(NETWORK, recordings, CONFIG)
+    turns = rotations(walks[0].orientation).as_matrix()
+    first = CONFIG.window // CONFIG.stride - 1  # the stride in which the first window ends
+    position, path = walks[0].position[0], [walks[0].position[0]]
+    for stride in range(recordings[0].strides):
+        covering = [i for i in range(recordings[0].strides - first) if i <= stride < i + 10]
+        moves = [
+            unyaw(turns[i * CONFIG.stride]).T
+            @ predicted.value[i + first]
+            * CONFIG.stride
+            / CONFIG.window
+            for i in covering
+        ]
+        position = position + np.mean(moves, axis=0)
+        path.append(position)
+    np.testing.assert_allclose(found.trajectory.position, path, atol=1e-9)
+    np.testing.assert_array_equal(found.displacements.value[1:], predicted.value)
+    assert np.isnan(found.displacements.value[:10]).all()
+    assert found.std is None and found.filtered is None
+
+
+def test_a_stride_without_a_window_goes_on_as_before():
+    steps = np.array(
+        [[1.0, 0, 0], [1.0, 0, 0], [np.nan] * 3, [np.nan] * 3, [np.nan] * 3, [2.0, 0, 0]]
+    )
+    moved = mean_over_windows(steps, 7, 2)[:, 0]
+    np.testing.assert_allclose(moved, [1, 1, 1, 1, 1, 2, 2])
+
+
+def test_strides_before_the_first_window_take_its_movement():
+    steps = np.array([[np.nan] * 3, [np.nan] * 3, [1.0, 0, 0], [3.0, 0, 0]])
+    moved = mean_over_windows(steps, 5, 2)[:, 0]
+    np.testing.assert_allclose(moved, [1, 1, 1, 2, 3])
+
+
+@pytest.mark.parametrize(
+    "how, filtered, ate",
+    [
+        ({}, True, 0.03),
+        ({"init": "static"}, True, 0.1),
+        ({"orientation": "reference"}, False, 0.1),
+        ({"orientation": "filter"}, False, 0.1),
+        ({"orientation": "device"}, False, 0.3),
+    ],
+)
+def test_perfect_displacements_leave_little_error(walks, how, filtered, ate):
+    for found in with_truth(ready(walks[::2], gyro_bias="reference", **how), filtered=filtered):
+        values = metrics.measure(found.trajectory, found.reference).values
+        assert values["ate"] < ate and values["path_length_ratio"] == pytest.approx(1, abs=0.04)
+
+
+def test_true_displacements_lack_nothing_that_was_calibrated(walks):
+    recordings = ready(walks[::2], gyro_bias="reference")
+    calibrated = changed(
+        OPTIONS,
+        noise={
+            "std_factor": (3.0, 1.0, 1.0),
+            "measurement_scale": 40.0,
+            "correlation": CorrelatedError(),
+        },
+    )
+    both = (with_truth(recordings, options=options) for options in (OPTIONS, calibrated))
+    for plain, found in zip(*both, strict=True):
+        np.testing.assert_array_equal(found.trajectory.position, plain.trajectory.position)
+        std = found.displacements.std[-1]
+        np.testing.assert_allclose(std, PERFECT_STD, rtol=1e-12)
+
+
+SCALE = OPTIONS.noise.measurement_scale
+
+
+def told_the_same(recordings, options):
+    """By a network that does not look at its windows."""
+    alike = network(0.0, -2.0, log_std_gain=0.0, constant=(0.9, 0.2, 0.02))
+    return tight(recordings, alike, options=options)
+
+
+@pytest.mark.parametrize(
+    "run", [lambda recordings, options: with_truth(recordings, options=options), told_the_same]
+)
+def test_what_is_considered_widens_the_covariance_and_moves_nothing(walks, run):
+    """By ∂p/∂b_g of the filter, here of a run whose gyro is off by a little."""
+    recordings = ready(walks[::2], gyro_bias="reference")
+    options = changed(OPTIONS, considered={"gyro_bias": 1e-3})
+    (plain, _), (found, _) = (run(recordings, each) for each in (OPTIONS, options))
+    np.testing.assert_array_equal(found.trajectory.position, plain.trajectory.position)
+    moved = []
+    for axis in 1e-5 * np.eye(3):
+        ahead, behind = (
+            run([with_gyro_bias(each, each.start.gyro_bias + off) for each in recordings], OPTIONS)
+            for off in (axis, -axis)
+        )
+        moved.append((ahead[0].trajectory.position - behind[0].trajectory.position) / 2e-5)
+    added = 1e-6 * sum(m[:, :, None] * m[:, None, :] for m in moved)
+    wanted = plain.filtered.covariance + added
+    assert added[-1].max() > 1e-6
+    np.testing.assert_allclose(found.filtered.covariance, wanted, rtol=1e-2, atol=1e-7)
+    std = np.sqrt(np.diagonal(wanted, axis1=1, axis2=2))
+    np.testing.assert_allclose(found.std[:, 6:9], std, rtol=1e-2)
+    at_start = np.hypot(plain.std[0, 9:12], 1e-3)  # a constant bias is there from the start
+    np.testing.assert_allclose(found.std[0, 9:12], at_start, rtol=1e-12)
+
+
+def with_gyro_bias(recording, bias):
+    return recording._replace(start=recording.start._replace(gyro_bias=bias))
+
+
+def test_integration_is_neither_ahead_nor_behind(clean):
+    (found,) = with_truth(ready([clean], orientation="reference"), filtered=False)
+    path, truth = found.trajectory.position, found.reference.position
+    errors = {
+        shift: metrics.ate(path[10:-10], truth[10 + shift : len(truth) - 10 + shift])
+        for shift in range(-3, 4)
+    }
+    assert min(errors, key=errors.get) == 0
+
+
+def same(a, b, tolerance):
+    assert a.name == b.name
+    jax.tree.map(
+        lambda one, other: np.testing.assert_allclose(one, other, atol=tolerance), a[1:-1], b[1:-1]
+    )
+
+
+def test_batches_change_nothing(walks):
+    recordings = ready(walks[::2])
+    for each, in_batch in zip(recordings, tight(recordings), strict=True):
+        (alone,) = tight([each], batch_size=1)
+        same(alone, in_batch, 1e-5)
+        np.testing.assert_allclose(
+            alone.trajectory.position, in_batch.trajectory.position, atol=1e-6
+        )
+        gates = (one.displacements.diagnostics["gate"] for one in (alone, in_batch))
+        np.testing.assert_allclose(*gates, atol=1e-6)
+
+
+def test_one_program_serves_every_scale_and_every_source_of_displacements(walks):
+    """A standard deviation is a number of the run, and so is where displacements are from."""
+    recordings = ready(walks[::2], orientation="reference")
+    (_, one), _, _ = tight(recordings), loose(recordings), imu_only(recordings)
+    programs = _run._cache_size()
+    options = changed(OPTIONS, noise={"measurement_scale": SCALE * 9})
+    (_, scaled) = tight(recordings, options=options)
+    loose(recordings, options=options), with_truth(recordings, options=options)
+    assert _run._cache_size() == programs
+    std, first_std = scaled.displacements.std, one.displacements.std
+    first = np.isfinite(first_std).all(axis=1).argmax()  # a later window is seen turned
+    np.testing.assert_allclose(std[first], 3 * first_std[first], rtol=1e-12)
+    np.testing.assert_allclose(first_std[first], np.exp(-3.0) * SCALE**0.5, rtol=0.5)
+    options = changed(OPTIONS, noise={"std_factor": (3.0, 3.0, 3.0)})
+    (_, same_filter) = tight(recordings, options=options)
+    same(scaled, same_filter, 1e-9)
+
+
+@pytest.mark.parametrize(
+    "disturbed, factor, row", [(slice(450, 451), 1e5, 91), (slice(None), 1e3, 1)]
+)
+def test_what_the_filter_calls_void_has_diverged(walks, disturbed, factor, row):
+    """One leap of the accelerometer, or a wrong unit: all numbers stay finite."""
+    accel = walks[0].accel.copy()
+    accel[disturbed] *= factor
+    void, whole = tight(ready([walks[0]._replace(accel=accel), walks[2]]))
+    assert np.isfinite(void.velocity).all()
+    assert np.argmax(np.linalg.norm(void.velocity, axis=1) > 100) == row
+    for field in void.trajectory[1:]:
+        assert np.isfinite(field[:row]).all() and np.isnan(field[row:]).all()
+    words = f"filter: not healthy from {row / 10:.1f} s on, and all after it is void"
+    assert void.notes == (words,) and whole.notes == ()
+    scores = evaluation.score([void, whole])
+    assert [name for name, own in scores.items() if own.diverged] == [void.name]
+
+
+def test_many_batches_of_unlike_lengths(walks):
+    """The ladder of padded lengths, a batch that is filled up, the order of the answers, the
+    progress."""
+    recordings, told = ready(walks), []
+    together = with_truth(recordings)
+    pairs = with_truth(recordings, batch_size=2, progress=told.append)
+    for each, a, b in zip(recordings, together, pairs, strict=True):
+        assert a.name == each.name and len(a.trajectory.time) == len(each.time)
+        same(a, b, 1e-9)
+    assert told == sorted(told) and len(told) == 2 and told[-1] == 1.0
+
+
+@pytest.mark.parametrize("context, first", [(0.0, 11), (0.2, 12)])
+def test_tight_and_loose_see_the_same_windows(clean, context, first):
+    """With an exact IMU the filter's attitude is the reference's, as long as no measurement
+    disturbs it."""
+    config = dataclasses.replace(CONFIG, context_seconds=context)
+    recordings, quiet = ready([clean], config, orientation="reference"), network(0.1, 4.0)
+    (inside,) = tight(recordings, quiet, config, batch_size=1)
+    (before,) = loose(recordings, quiet, config, batch_size=1)
+    one, other = inside.displacements, before.displacements
+    assert np.isnan(one.value[:first]).all() and np.isfinite(one.value[first:]).all()
+    np.testing.assert_array_equal(np.isnan(one.value), np.isnan(other.value))
+    np.testing.assert_allclose(one.value[first:], other.value[first:], atol=2e-3)
+    np.testing.assert_allclose(one.std[first:], other.std[first:], rtol=2e-2)
+    gates = (each.diagnostics["gate"][first:] for each in (one, other))
+    np.testing.assert_allclose(*gates, atol=2e-2)
+    np.testing.assert_allclose(inside.trajectory.position, before.trajectory.position, atol=2e-2)
+    # Else the agreement would say nothing.
+    assert np.std(one.value[first:], axis=0).max() > 0.01
+
+
+def test_loose_measurements_have_the_same_least_std(clean):
+    (found,) = loose(ready([clean], orientation="reference"), network(0.0, -90.0), batch_size=1)
+    np.testing.assert_allclose(found.displacements.std[11:], np.exp(-4) * np.sqrt(10), rtol=1e-6)
+
+
+def test_the_filter_starts_as_sure_as_its_options_say(walks):
+    """Of a start from the reference all of it, of a static one what that does not find."""
+    std = TLIO_STD._replace(yaw=0.3, gyro_bias=0.02, accel_bias=0.2)
+    for how in ({}, {"init": "static"}):
+        recordings = ready(walks[:1], std=std, **how)
+        (found,) = imu_only(recordings)
+        own = recordings[0].start.std
+        assert (own.yaw, own.gyro_bias) == (0.3, 0.02)
+        wanted = np.repeat(np.array(own), [2, 1, 3, 3, 3, 3])
+        np.testing.assert_allclose(found.std[0], wanted, rtol=1e-12)
+
+
+def test_no_reference_is_fine_with_a_static_start(walks):
+    nowhere = walks[0]._replace(
+        valid=np.zeros(len(walks[0].time), bool),
+        position=np.full_like(walks[0].position, np.nan),
+        orientation=np.full_like(walks[0].orientation, np.nan),
+    )
+    (found,) = summed(ready([nowhere], orientation="filter", init="static"))
+    assert np.isfinite(found.trajectory.position).all() and np.isnan(found.reference.position).all()
+
+
+def test_never_moves(walks):
+    (still,) = evaluation.never_moves(summed(ready(walks[:1], orientation="reference")))
+    assert (still.trajectory.position == walks[0].position[0]).all()
+    assert still.displacements is None and still.filtered is None
+    assert metrics.measure(still.trajectory, still.reference).values["path_length_ratio"] == 0

@@ -1,0 +1,78 @@
+"""The network's windows against plain loops."""
+
+import numpy as np
+import pytest
+
+from gnio_jax.config import DataConfig
+from gnio_jax.evaluation import infer
+from tests.support.estimators import CONFIG, NETWORK, RATE, ready, rotations, summed, unyaw
+
+
+@pytest.mark.parametrize(
+    "reading, context", [("per_sample", 0.0), ("single", 0.0), ("per_sample", 0.4)]
+)
+def test_windows_are_cut_with_the_given_attitude(walks, reading, context):
+    config = DataConfig(rate=RATE, window_rotation=reading, context_seconds=context)
+    recordings = ready(walks[:2], config, orientation="reference")
+    for walk, found, each in zip(
+        walks[:2], infer(NETWORK, recordings, config), recordings, strict=True
+    ):
+        turns = rotations(walk.orientation).as_matrix()
+        assert found.value.shape == found.std.shape == (each.strides, 3)
+        first = config.seen // config.stride - 1  # the stride in which the first window ends
+        assert np.isnan(found.value[:first]).all() and np.isfinite(found.value[first:]).all()
+        for row in range(first, each.strides, 17):
+            end = (row + 1) * config.stride
+            start, rows = end - config.window, range(end - config.seen, end)
+            means = [
+                np.mean(
+                    [
+                        unyaw(turns[start])
+                        @ turns[j if reading == "per_sample" else start]
+                        @ signal[j]
+                        for j in rows
+                    ],
+                    axis=0,
+                )
+                for signal in (walk.accel, walk.gyro)
+            ]
+            np.testing.assert_allclose(found.value[row], 0.05 * means[0], atol=2e-6)
+            np.testing.assert_allclose(np.log(found.std[row]), means[1] - 3, atol=1e-5)
+        assert set(found.diagnostics) == {"gate"}
+
+
+def test_the_first_gyro_bias_is_taken_off_the_windows_and_the_attitude(clean):
+    """A gyro with a bias that is known from the start is as good as one without."""
+    bias = np.array([0.1, -0.05, 0.02])
+    biased = clean._replace(gyro=clean.gyro + bias)
+    (plain,), (found,) = (
+        ready([walk], gyro_bias="reference", orientation="filter") for walk in (clean, biased)
+    )
+    np.testing.assert_allclose(found.start.gyro_bias - plain.start.gyro_bias, bias, atol=1e-12)
+    np.testing.assert_allclose(found.attitude, plain.attitude, atol=1e-9)
+    a, b = infer(NETWORK, [plain, found], CONFIG)
+    np.testing.assert_allclose(a.std, b.std, rtol=1e-5)
+
+
+def test_no_standard_deviation_is_below_the_least(walks):
+    recordings = ready(walks[:1], orientation="reference")
+    (plain,), (found,) = (infer(NETWORK, recordings, CONFIG, least_std=x) for x in (0.0, 0.05))
+    np.testing.assert_array_equal(found.std, np.maximum(plain.std, 0.05))
+    assert np.nanmin(plain.std) < 0.05 < np.nanmax(plain.std)
+
+
+def test_a_displacement_across_a_gap_of_the_imu_is_none(walks):
+    there = np.ones(len(walks[0].time), bool)
+    there[203:240] = False
+    config = DataConfig(rate=RATE, context_seconds=0.4)
+    sequences = [walks[0]._replace(imu_valid=there), walks[0]]
+    recordings = ready(sequences, config, orientation="reference")
+    holed, whole = infer(NETWORK, recordings, config)
+    for row, (found, expected) in enumerate(zip(holed.value, whole.value, strict=True)):
+        end = (row + 1) * config.stride
+        if end >= config.seen and there[end - config.seen : end].all():
+            np.testing.assert_array_equal(found, expected)
+        else:
+            assert np.isnan(found).all()
+    (path, *_) = summed(recordings, config=config)
+    assert np.isfinite(path.trajectory.position).all()

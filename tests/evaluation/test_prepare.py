@@ -1,0 +1,188 @@
+"""Starts, biases and cuts of recordings against what is known of them."""
+
+import numpy as np
+import pytest
+
+from gnio_jax import evaluation
+from gnio_jax.config.schema import TLIO_STD
+from gnio_jax.data.simulated import walks as simulated
+from gnio_jax.errors import InputError
+from gnio_jax.numerics import yaw
+from tests.support.estimators import CONFIG, RATE, ready, rotations
+
+
+def test_start_is_the_first_trusted_sample(walks):
+    hidden = walks[0]._replace(valid=np.arange(len(walks[0].time)) >= 137)
+    (recording,) = ready([hidden])
+    assert recording.time[0] == walks[0].time[137]
+    np.testing.assert_array_equal(recording.start.position, walks[0].position[137])
+    np.testing.assert_allclose(
+        recording.start.rotation, rotations(walks[0].orientation[137]).as_matrix(), atol=1e-12
+    )
+    assert len(recording.gyro) == recording.strides * CONFIG.stride
+
+
+@pytest.fixture(scope="module")
+def swaying(clean):
+    """The walk with a phone in a hand that is never as quiet as a table."""
+    sway = 0.03 * np.sin(2 * np.pi * 1.5 * clean.time)
+    return clean._replace(gyro=clean.gyro + sway[:, None])
+
+
+def test_static_start_is_level(clean):
+    (recording,) = ready([clean], init="static")
+    truth = rotations(clean.orientation[0]).as_matrix()
+    assert np.degrees(np.arccos(recording.start.rotation[2] @ truth[2])) < 3.0  # it sways
+    assert abs(np.arctan2(recording.start.rotation[1, 0], recording.start.rotation[0, 0])) < 1e-12
+    assert (
+        not recording.start.velocity.any()
+        and not recording.start.position.any()
+        and not recording.notes
+    )
+    moving = clean._replace(valid=np.arange(len(clean.time)) > 600)
+    (recording,) = ready([moving], init="static")
+    assert "not standing still" in recording.notes[0]
+
+
+def test_gyro_bias_from_reference_and_from_rest(walks, swaying):
+    true = np.array([walks[0].attributes[f"gyro_bias_{axis}"] for axis in "xyz"])
+    biased = walks[0]._replace(gyro=walks[0].gyro + np.array([0.004, -0.02, 0.01]))
+    (recording,) = ready([biased], gyro_bias="reference")
+    np.testing.assert_allclose(
+        recording.start.gyro_bias, true + np.array([0.004, -0.02, 0.01]), atol=1e-4
+    )
+    assert "10 s against the reference" in recording.notes[0]
+
+    (recording,) = ready([swaying], gyro_bias="rest")
+    assert not recording.start.gyro_bias.any() and "no rest" in recording.notes[0]
+    random, bias = np.random.default_rng(0), np.array([0.01, -0.02, 0.005])
+    resting = swaying._replace(gyro=swaying.gyro.copy(), accel=swaying.accel.copy())
+    resting.gyro[:120] = bias + random.normal(0, 1e-3, (120, 3))
+    resting.accel[:120] = swaying.accel[:120].mean(0) + random.normal(0, 0.01, (120, 3))
+    (recording,) = ready([resting], gyro_bias="rest")
+    np.testing.assert_allclose(recording.start.gyro_bias, bias, atol=5e-4)
+    assert "2 s of rest" in recording.notes[0]
+
+
+def test_short_sequences_are_left_out_by_name(walks):
+    short = walks[0]._replace(
+        name="short", valid=np.arange(len(walks[0].time)) > len(walks[0].time) - 52
+    )
+    prepared, left_out = evaluation.prepare([short, walks[1]], CONFIG)
+    assert [each.name for each in prepared] == [walks[1].name]
+    problem = "1.02 s measured from its first trusted sample on"
+    assert left_out == {"short": f"{problem}, too short for a window and a stride"}
+
+
+def test_other_rates_are_resampled():
+    walk = simulated.pedestrian(1, 1, "handheld", 6.0, 200.0)
+    (recording,) = ready([walk])
+    assert np.diff(recording.time) == pytest.approx(CONFIG.stride / RATE)
+
+
+def with_hole(sequence, rows):
+    """The IMU follows lines over the rows, and says so."""
+    there = np.ones(len(sequence.time), bool)
+    there[rows] = False
+    before = np.flatnonzero(there)
+    lines = (
+        np.column_stack([np.interp(np.arange(len(there)), before, c[there]) for c in each.T])
+        for each in (sequence.gyro, sequence.accel)
+    )
+    gyro, accel = lines
+    return sequence._replace(gyro=gyro, accel=accel, imu_valid=there)
+
+
+def test_a_line_across_a_gap_is_no_rest(clean):
+    """A walker whose log lacks its first second rests no more than any other."""
+    shake = 3 * np.sin(np.arange(len(clean.time)))[:, None] * [0.0, 1.0, 1.0]
+    shaken = clean._replace(accel=clean.accel + shake, gyro=clean.gyro + shake / 3)
+    holed = with_hole(shaken, slice(1, round(RATE)))
+    (recording,) = ready([holed], init="static", gyro_bias="rest")
+    assert not recording.start.gyro_bias.any() and "no rest" in recording.notes[0]
+    assert recording.start.std.velocity == 1.0 and recording.start.std.tilt > 0.01
+
+
+def test_a_rest_that_lacks_some_samples_is_a_rest(swaying):
+    """What was measured of it counts, and the line does not."""
+    rest, second = np.array([0.01, -0.02, 0.005]), round(RATE)
+    resting = swaying._replace(gyro=swaying.gyro.copy(), accel=swaying.accel.copy())
+    resting.gyro[:second], resting.accel[:second] = rest, swaying.accel[:second].mean(0)
+    holed = with_hole(resting, slice(5, 5 + second // 3))
+    holed.gyro[10:15] += 1.0
+    (recording,) = ready([holed], init="static", gyro_bias="rest")
+    np.testing.assert_allclose(recording.start.gyro_bias, rest, atol=1e-12)
+    assert "mean of 1 s of rest" in recording.notes[0] and recording.start.std.velocity < 0.1
+
+
+def test_a_gap_says_nothing_of_the_bias(walks):
+    """The reference is there, the gyro is not."""
+    true = np.array([walks[0].attributes[f"gyro_bias_{axis}"] for axis in "xyz"])
+    holed = with_hole(walks[0], slice(100, 150))
+    holed.gyro[100:150] += 3.0
+    (recording,) = ready([holed], gyro_bias="reference")
+    np.testing.assert_allclose(recording.start.gyro_bias, true, atol=1e-4)
+
+
+def test_what_was_hardly_measured_is_left_out(walks):
+    lost = with_hole(walks[0], slice(30, None))
+    prepared, left_out = evaluation.prepare([lost], CONFIG)
+    assert not prepared and "0.60 s measured from its first" in left_out[lost.name]
+
+
+def test_a_static_start_is_as_far_off_level_as_the_accelerometer_may_be(clean):
+    """By the standard deviation of its bias that the filter has, not by another."""
+    tilts = []
+    for bias in (0.02, 0.2):
+        (recording,) = ready([clean], std=TLIO_STD._replace(accel_bias=bias), init="static")
+        tilts.append(recording.start.std.tilt)
+        assert recording.start.std.accel_bias == bias
+    spread = np.sqrt(tilts[0] ** 2 - (0.02 / 9.81) ** 2)
+    assert tilts[1] == pytest.approx(np.hypot(spread, 0.2 / 9.81), rel=1e-3)
+
+
+def test_a_recording_begins_at_its_first_sample_if_that_is_asked_for(walks):
+    hidden = walks[0]._replace(valid=np.arange(len(walks[0].time)) >= 137)
+    (recording,) = ready([hidden], init="static", from_first=True)
+    assert recording.time[0] == walks[0].time[0] and not recording.start.position.any()
+    known = np.isfinite(recording.reference.position).all(1)
+    np.testing.assert_array_equal(known, recording.time >= walks[0].time[137])
+
+
+def test_what_a_sequence_lacks_is_named_with_the_remedy(walks):
+    nowhere = walks[0]._replace(valid=np.zeros(len(walks[0].time), bool))
+    for how, remedy in [
+        ({}, "--init static"),
+        ({"init": "static", "gyro_bias": "reference"}, "--gyro-bias zero"),
+        ({"init": "static", "orientation": "reference"}, "--orientation filter"),
+    ]:
+        with pytest.raises(InputError, match=remedy):
+            ready([nowhere], **how)
+    with pytest.raises(InputError, match="no device orientation"):
+        ready([walks[0]._replace(device_orientation=None)], orientation="device")
+
+
+def test_the_devices_attitude_has_the_yaw_of_the_start(walks):
+    (recording,) = ready(walks[:1], orientation="device")
+    own = rotations(walks[0].device_orientation[: len(recording.attitude)]).as_matrix()
+    turn = recording.attitude[0] @ own[0].T
+    np.testing.assert_allclose(turn[2], [0, 0, 1], atol=1e-12)
+    np.testing.assert_allclose(recording.attitude, turn @ own, atol=1e-12)
+    start = rotations(walks[0].orientation[:1]).as_matrix()
+    np.testing.assert_allclose(yaw(recording.attitude[:1]), yaw(start), atol=1e-12)
+
+
+def test_the_gyro_bridges_an_attitude_that_is_missing(walks):
+    gap = walks[0]._replace(orientation=walks[0].orientation.copy(), valid=walks[0].valid.copy())
+    gap.orientation[200:260], gap.valid[190:260] = np.nan, False
+    (recording,) = ready([gap], orientation="reference")
+    bridged = recording.attitude
+    truth = rotations(walks[0].orientation[: len(bridged)]).as_matrix()
+    np.testing.assert_allclose(bridged[:190], truth[:190], atol=1e-12)
+    np.testing.assert_allclose(bridged[260:], truth[260:], atol=1e-12)
+    # 1.4 s of gyro with its bias.
+    np.testing.assert_allclose(bridged[190:260], truth[190:260], atol=0.03)
+    zeros = gap._replace(orientation=walks[0].orientation.copy())
+    zeros.orientation[200:260] = 0.0  # what is not trusted need be no rotation
+    (other,) = ready([zeros], orientation="reference")
+    np.testing.assert_array_equal(other.attitude, bridged)
