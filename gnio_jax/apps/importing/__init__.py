@@ -13,6 +13,7 @@ from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 
 from gnio_jax.apps.importing import loggers, ros
 from gnio_jax.apps.importing.recording import GAPS as GAPS
@@ -177,8 +178,16 @@ def _read_csv(path: Path, options: ImportOptions) -> Recording:
 def _table(path: Path, named: dict[str, str]) -> Table:
     """The table of a file that has these columns: our name and the file's of each."""
     table = read_table(path, tuple(named.values()))
+    labels = pd.Series([str(label) for label in table.columns])
     single = {ours: theirs for ours, theirs in named.items() if "+" not in theirs}
-    check_columns(path, table.columns, single, "name them: --columns")
+    if (
+        pd.to_numeric(labels, errors="coerce").notna().all()
+        and not labels.isin(single.values()).any()
+    ):
+        places = " ".join(f"{ours}={place}" for place, ours in enumerate(named))
+        remedy = f"count its columns from 0, as in --columns {places}"
+        raise InputError(path, f"has {len(labels)} columns of numbers and no header", remedy)
+    check_columns(path, labels, single, "name them: --columns")
     return table
 
 
