@@ -174,19 +174,16 @@ def test_degrees_where_the_format_says_radians_are_refused(tmp_path):
     np.testing.assert_allclose(sequence.gyro, turning, atol=1e-6)
 
 
-def test_a_member_that_lies_about_its_size_is_refused(tmp_path):
+def test_a_zip_cut_short_or_with_a_member_that_lies_about_its_size_is_one_line(tmp_path):
+    whole = zipped(tmp_path / "walk.zip", sensor_logger()).read_bytes()
+    for kept in (0.02, 0.5, 0.99):
+        (tmp_path / "walk.zip").write_bytes(whole[: int(kept * len(whole))])
+        refused(tmp_path / "walk.zip", "walk.zip: cannot be read as a zip, it may be cut short")
     path = tmp_path / "bomb.zip"
     path.write_bytes(lying_zip(sensor_logger(), "Gyroscope.csv", 3 * 2**30))
     refused(path, "Gyroscope.csv: unpacks to 3072 MiB; no table may exceed 512 MiB")
     path.write_bytes(lying_zip(sensor_logger(), "Gyroscope.csv", 5000))
     refused(path, "bomb.zip: cannot be read as a zip, it may be cut short")
-
-
-@pytest.mark.parametrize("kept", [0.02, 0.5, 0.99])
-def test_a_zip_cut_short_is_one_line(tmp_path, kept):
-    whole = zipped(tmp_path / "walk.zip", sensor_logger()).read_bytes()
-    (tmp_path / "walk.zip").write_bytes(whole[: int(kept * len(whole))])
-    refused(tmp_path / "walk.zip", "walk.zip: cannot be read as a zip, it may be cut short")
 
 
 # --- phyphox
