@@ -162,7 +162,8 @@ def _source(path: Path, config: CompareConfig) -> Source:
                 plots=False,
             )
         )
-        return Source(path, path, asked.folder, asked.identity, asked)
+        identity = {name: getattr(asked.config, name) for name in IDENTITY}
+        return Source(path, path, asked.folder, identity, asked)
     report = read(path)
     run = Path(os.path.abspath(path)).parent.parent
     if path.resolve().parent.name == "eval" and (problem := kept.out_of_date(report, run)):
@@ -239,14 +240,16 @@ def lines(found: Comparison) -> list[list[str]]:
     for metric, cells in found.cells.items():
         column = tabulate.column(metric)
         for place, (row, (mean, difference)) in enumerate(zip(found.rows, cells, strict=True)):
-            compared = difference and difference.compared and not difference.withheld
+            better = ""
+            if difference and difference.compared and not difference.withheld:
+                better = f"{difference.better} of {difference.compared}"
             table.append(
                 [
                     "" if place else column.title,
                     row.label,
                     tabulate.mean(mean, column.digits),
                     tabulate.difference(difference, column.digits),
-                    f"{difference.better} of {difference.compared}" if compared else "",
+                    better,
                 ]
             )
     return table

@@ -61,8 +61,8 @@ class EvaluateConfig:
     batch_size: Annotated[int, FILE_ONLY] = 16
     """Recordings estimated side by side."""
     plots: bool = True
-    """Draw the trajectories, errors, displacements and the errors' distribution, and write
-    report.html."""
+    """Draw every sequence and the errors' distribution, and write report.html. Those of an earlier
+    evaluation are made anew in any case."""
     rerun: str | None = None
     """File to write for the viewer Rerun, NAME.rrd: paths, covariances, IMU, gate."""
     filter: Annotated[FilterSettings | None, FILE_ONLY] = None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 from gnio_jax import config as configuration
 from gnio_jax.config import EvaluateConfig, TrainConfig, plain
@@ -22,8 +22,6 @@ class Kept(NamedTuple):
     config: EvaluateConfig
     """As `evaluate.resolve` leaves it."""
     folder: Path
-    identity: dict[str, Any]
-    """Of `IDENTITY`."""
     report: Report | None
     """What is there, if it is what is asked for."""
     problem: str
@@ -39,21 +37,17 @@ def look(config: EvaluateConfig) -> Kept:
     run = run_config(workdir, config.checkpoint)
     config = resolve(config, run)
     folder = workdir / "eval" / folder_name(config, run)
-    identity = {name: getattr(config, name) for name in IDENTITY}
     report, problem = None, "it is not evaluated yet"
     if (folder / "metrics.json").exists():
         try:
             report = read(folder)
-            problem = _differs(report, identity) or out_of_date(report, workdir)
-            own = report.settings["filter"]
-            if config.estimator != "integrate" and own != plain(config.filter):
-                problem = problem or "its figures are of another filter than the run's"
+            problem = _differs(report, config) or out_of_date(report, workdir)
         except InputError as error:
             problem = f"its figures cannot be used: {error}"
     best = workdir / "checkpoints" / config.checkpoint
     if problem and not any(best.glob("[0-9]*")):
         raise InputError(best, "holds no checkpoint", "let gnio train finish its first epoch")
-    return Kept(config, folder, identity, None if problem else report, problem)
+    return Kept(config, folder, None if problem else report, problem)
 
 
 def run_config(workdir: Path, which: Literal["best", "latest"] = "best") -> TrainConfig:
@@ -88,8 +82,11 @@ def out_of_date(report: Report, workdir: Path) -> str:
     return ""
 
 
-def _differs(report: Report, identity: dict[str, Any]) -> str:
-    for name, wanted in identity.items():
-        if (own := report.settings.get(name)) != wanted:
+def _differs(report: Report, config: EvaluateConfig) -> str:
+    """Why figures are not what is asked for; empty where they are."""
+    for name in IDENTITY:
+        if (own := report.settings.get(name)) != (wanted := getattr(config, name)):
             return f"its figures are of {name.replace('_', ' ')} {own}, not {wanted}"
+    if config.estimator != "integrate" and report.settings["filter"] != plain(config.filter):
+        return "its figures are of another filter than the run's"
     return ""

@@ -228,8 +228,8 @@ def read_trajectories(folder: Path, names: list[str]) -> dict[str, tuple[Traject
         file = folder / "references" / f"{stem}.txt"
         if file.exists():
             true = read_tum(file)
-            stamps = (np.round(each.time, 6) for each in (path, true))
-            _, here, there = np.intersect1d(*stamps, return_indices=True)
+            stamps = np.round(path.time, 6), np.round(true.time, 6)
+            _, here, there = np.intersect1d(stamps[0], stamps[1], return_indices=True)
             reference.position[here] = true.position[there]
             reference.orientation[here] = true.orientation[there]
         found[name] = path, reference

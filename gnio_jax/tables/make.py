@@ -191,7 +191,7 @@ def render(experiment: Experiment, figures: Mapping[str, list[Cell]]) -> str:
     table, first = [], experiment.rows[0].published
     for place, row in enumerate(experiment.rows):
         mean, difference = figures["ate"][place]
-        published = None if None in (row.published, first) else 100 * (1 - row.published / first)
+        published = 100 * (1 - row.published / first) if row.published and first else None
         table.append(
             [
                 row.label,

@@ -89,7 +89,7 @@ def test_recordings_of_another_folder_are_never_taken(run, tmp_path):
     evaluation(run)
     (tmp_path / "other").mkdir()
     found = look(run, data_root=str(tmp_path / "other"))
-    assert found.report is None and found.identity["data_root"] == str(tmp_path / "other")
+    assert found.report is None and found.config.data_root == str(tmp_path / "other")
     (tmp_path / "link").symlink_to(tmp_path / "data")
     assert look(run, data_root=str(tmp_path / "link")).problem == ""
 
