@@ -13,12 +13,13 @@ import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from scipy.optimize import minimize
 
 from gnio_jax.config import CorrelatedError, DataConfig, FilterSettings, flat
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import Estimate
+from gnio_jax.evaluation.estimate import Inputs
 from gnio_jax.filtering import (
     ConsideredStd,
     FilterConfig,
@@ -110,29 +111,6 @@ def std_factors(
     return np.maximum(np.sqrt(np.mean(normalised**2, axis=0)), LEAST_FACTOR)
 
 
-class Walks(NamedTuple):
-    """Recordings with the network's displacements, padded to one length. Axis 0: the recording."""
-
-    rotation: Float[np.ndarray, "w 3 3"]
-    """At the start, body → world."""
-    velocity: Float[np.ndarray, "w 3"]
-    """At the start, m/s."""
-    position: Float[np.ndarray, "w 3"]
-    """At the start, m."""
-    gyro_bias: Float[np.ndarray, "w 3"]
-    """First estimate, rad/s."""
-    gyro: Float[np.ndarray, "w t 3"]
-    """rad/s."""
-    accel: Float[np.ndarray, "w t 3"]
-    """m/s²."""
-    displacement: Float[np.ndarray, "w k 3"]
-    """Of the network, m, in the filter's own yaw frame; NaN where there is none."""
-    std: Float[np.ndarray, "w k 3"]
-    """Of the network, m; 1 where there is none."""
-    imu_valid: Bool[np.ndarray, "w t"] | None = None
-    """Which samples are there; None: all."""
-
-
 class Fit(NamedTuple):
     """Where the likelihood of the innovations is largest."""
 
@@ -164,7 +142,7 @@ def start_of_fit(settings: FilterSettings, paths: Sequence[str]) -> FilterSettin
 
 
 def fit_innovations(
-    walks: Walks,
+    walks: Inputs,
     windows: DataConfig,
     settings: FilterSettings,
     paths: Sequence[str],
@@ -234,7 +212,7 @@ def innovation_config(windows: DataConfig, settings: FilterSettings) -> FilterCo
 
 def innovation_objective(
     free: Float[Array, "u"],
-    walks: Walks,
+    walks: Inputs,
     start: Float[Array, "u"],
     settings: FilterSettings,
     *,
@@ -245,19 +223,19 @@ def innovation_objective(
     the part of it that is −log-likelihood of all innovations over their number. The rest is the
     prior about `start`, which keeps those in place that the walks do not determine."""
     chex.assert_equal_shape([free, start])
-    chex.assert_equal_shape([walks.displacement, walks.std])
 
-    def of_walk(settings: FilterSettings, walk: Walks) -> Array:
-        run, state = _repeated(walk, settings, config)
-        history = run(state, walk.displacement)
+    def of_walk(settings: FilterSettings, walk: Inputs) -> Array:
+        run, state, displacement = _repeated(walk, settings, config)
+        history = run(state, displacement)
         # What the walk is filled up with comes after its last displacement, and may run away.
-        present = jnp.isfinite(walk.displacement).all(axis=1)
+        present = jnp.isfinite(displacement).all(axis=1)
         healthy = jnp.all((history.healthy > 0) | ~present)
         return jnp.where(healthy, jnp.nansum(history.log_likelihood), jnp.nan)
 
     settings = with_free_parameters(settings, dict(zip(names, free, strict=True)))
     evidence = jnp.sum(over_sequences(of_walk, shared=1)(settings, walks))
-    count = jnp.isfinite(walks.displacement).all(axis=2).sum()
+    assert walks.given is not None
+    count = jnp.isfinite(walks.given.value).all(axis=2).sum()
     return (_prior(free, start) - evidence) / count, -evidence / count
 
 
@@ -267,19 +245,19 @@ _value_and_gradient = jax.jit(
 
 
 def _repeated(
-    walk: Walks, settings: FilterSettings, config: FilterConfig
-) -> tuple[Callable[[FilterState, Array], FilterHistory], FilterState]:
-    """The run over one walk without the network, from a start and the displacements, and its
-    start."""
-    pose = (walk.rotation, walk.velocity, walk.position, walk.gyro_bias)
-    state = initial_state(config, *pose, std=settings.start)
-    covariance = jax.vmap(jnp.diag)(walk.std**2)
+    walk: Inputs, settings: FilterSettings, config: FilterConfig
+) -> tuple[Callable[[FilterState, Array], FilterHistory], FilterState, Array]:
+    """The run over one walk without the network, from a start and the displacements; its start and
+    its displacements."""
+    state = initial_state(config, *walk.start[:-1], std=settings.start)
+    assert walk.given is not None
+    covariance = jax.vmap(jnp.diag)(walk.given.std**2)
     fixed = config, settings.noise, walk.imu_valid, config.displacement_frame
 
     def run(state: FilterState, displacement: Array) -> FilterHistory:
         return run_filter(state, walk.gyro, walk.accel, displacement, covariance, *fixed)[1]
 
-    return run, state
+    return run, state, jnp.asarray(walk.given.value)
 
 
 def _prior(free: Float[Array, "u"], start: Float[Array, "u"]) -> Float[Array, ""]:
@@ -346,7 +324,7 @@ def fit_considered(
 
 
 def filtered_positions(
-    walks: Walks, truth: Float[np.ndarray, "w k 3"], windows: DataConfig, settings: FilterSettings
+    walks: Inputs, truth: Float[np.ndarray, "w k 3"], windows: DataConfig, settings: FilterSettings
 ) -> Positions:
     """The positions of a filter over the walks, where it is healthy.
 
@@ -362,14 +340,14 @@ def filtered_positions(
 
 @functools.partial(jax.jit, static_argnames="config")
 def _filtered(
-    walks: Walks, settings: FilterSettings, *, config: FilterConfig
+    walks: Inputs, settings: FilterSettings, *, config: FilterConfig
 ) -> tuple[Array, Array, Array, Array]:
     """Of every walk: where the filter is healthy, its positions, their covariances and S."""
 
-    def of_walk(settings: FilterSettings, walk: Walks) -> tuple[Any, ...]:
-        run, state = _repeated(walk, settings, config)
-        history = run(state, walk.displacement)
-        found = sensitivity(run, state, walk.displacement)
+    def of_walk(settings: FilterSettings, walk: Inputs) -> tuple[Any, ...]:
+        run, state, displacement = _repeated(walk, settings, config)
+        history = run(state, displacement)
+        found = sensitivity(run, state, displacement)
         assert history.covariance is not None
         covariance = history.covariance[:, POSITION, POSITION]
         return history.healthy, history.position, covariance, found[:, POSITION]

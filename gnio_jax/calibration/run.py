@@ -8,7 +8,6 @@ import shutil
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 
 from gnio_jax import config as configuration
@@ -18,7 +17,6 @@ from gnio_jax.calibration.fit import (
     GROUPS,
     Considered,
     Fit,
-    Walks,
     filtered_positions,
     fit_considered,
     fit_innovations,
@@ -27,9 +25,10 @@ from gnio_jax.calibration.fit import (
 )
 from gnio_jax.config import CalibrateConfig, ConsideredStd, FilterSettings
 from gnio_jax.errors import InputError
-from gnio_jax.evaluation import Estimate, Recording
+from gnio_jax.evaluation import Displacements
+from gnio_jax.evaluation.estimate import filter_inputs
 from gnio_jax.files import replacing_folder, write_text
-from gnio_jax.filtering.batch import padded_masks
+from gnio_jax.filtering.settings import filter_config
 from gnio_jax.numerics import filled_up
 from gnio_jax.training import checkpoint
 
@@ -86,7 +85,10 @@ def calibrate(
     x, y, z = (float(f"{factor:.{DIGITS}g}") for factor in factors)  # as they are written down
     noise = noise._replace(std_factor=(x, y, z))
     settings = start_of_fit(dataclasses.replace(uncalibrated, noise=noise), paths)
-    walks = _walks(recordings, estimates, windows.stride)
+    strides = max(each.strides for each in recordings)
+    # The first row of an estimate is its start.
+    given = [Displacements(*(x[1:] for x in each.displacements[:2])) for each in estimates]
+    walks = filter_inputs(recordings, given, strides, filter_config(windows, settings))
     found = fit_innovations(
         walks,
         windows,
@@ -97,8 +99,7 @@ def calibrate(
     )
     progress("considering", 0.0)
     references = (each.reference.position[1:] for each in recordings)
-    rows = walks.displacement.shape[1]
-    truth = np.stack([filled_up(each, rows, np.nan) for each in references])
+    truth = np.stack([filled_up(each, strides, np.nan) for each in references])
     positions = filtered_positions(walks, truth, windows, found.settings)
     considered = fit_considered(positions, windows.stride_seconds, found.settings)
     progress("considering", 1.0)
@@ -116,29 +117,6 @@ def _folder(config: CalibrateConfig, workdir: Path) -> Path:
     if folder.exists():
         raise InputError(folder, "is there already", "remove it, or give another --out")
     return folder
-
-
-def _walks(recordings: list[Recording], estimates: list[Estimate], stride: int) -> Walks:
-    """The recordings with the network's displacements, filled up to the longest: with samples that
-    come after all displacements and change nothing before them."""
-    strides = max(each.strides for each in recordings)
-
-    def of_recording(each: Recording, estimate: Estimate) -> Walks:
-        found = estimate.displacements
-        assert found is not None
-        std = filled_up(found.std[1:], strides, 1.0)
-        return Walks(
-            *each.start[:-1],
-            gyro=filled_up(each.gyro, strides * stride),
-            accel=filled_up(each.accel, strides * stride),
-            displacement=filled_up(found.value[1:], strides, np.nan),
-            std=np.nan_to_num(std, nan=1.0),
-        )
-
-    rows = [of_recording(*pair) for pair in zip(recordings, estimates, strict=True)]
-    walks = jax.tree.map(lambda *column: np.stack(column), *rows)
-    masks = (each.imu_valid for each in recordings)
-    return walks._replace(imu_valid=padded_masks(masks, strides * stride))
 
 
 def _write(

@@ -175,28 +175,38 @@ def _filter_batch(
     ekf: FilterSetup,
 ) -> FilterHistory:
     """The filter over one batch, whose recordings are padded to a common length."""
+    network = source if isinstance(source, Network) else Network(None, None)
+    given = None if isinstance(source, Network) else [source[i] for i in batch.members]
     members = [recordings[i] for i in batch.members]
-    samples, given, network = batch.intervals * ekf.config.samples_per_clone, None, None
-    if isinstance(source, Network):
-        network = source
-    else:
-        own = [source[i] for i in batch.members]
-        given = _stacked([_measurements(each, batch.intervals, ekf.config) for each in own])
-    inputs = Inputs(
-        _stacked([each.start for each in members]),
-        *padded_signals(((each.gyro, each.accel) for each in members), samples),
-        padded_masks((each.imu_valid for each in members), samples),
-        given,
+    inputs = filter_inputs(members, given, batch.intervals, ekf.config)
+    fixed = {"apply": network.apply, "config": ekf.config}
+    return _run(network.variables, inputs, ekf.noise, ekf.considered, **fixed)
+
+
+def filter_inputs(
+    recordings: list[Recording],
+    given: list[Displacements] | None,
+    strides: int,
+    config: FilterConfig,
+) -> Inputs:
+    """The recordings side by side, filled up to so many strides with what changes nothing before
+    it. Rows of `given` without a displacement get a standard deviation of 1 m, which has a
+    derivative and no effect."""
+    samples, stacked = strides * config.samples_per_clone, None
+    if given is not None:
+        rows = []
+        for each in given:
+            value = np.array(each.value)
+            value[: config.clones_per_window] = np.nan  # the filter has no clone there
+            std = np.nan_to_num(each.std, nan=1.0)
+            rows.append(Displacements(filled_up(value, strides, np.nan), filled_up(std, strides)))
+        stacked = _stacked(rows)
+    return Inputs(
+        _stacked([each.start for each in recordings]),
+        *padded_signals(((each.gyro, each.accel) for each in recordings), samples),
+        padded_masks((each.imu_valid for each in recordings), samples),
+        stacked,
     )
-    variables, apply = (network.variables, network.apply) if network else (None, None)
-    return _run(variables, inputs, ekf.noise, ekf.considered, apply=apply, config=ekf.config)
-
-
-def _measurements(found: Displacements, rows: int, config: FilterConfig) -> Displacements:
-    """As the filter takes them: it has no clone at the start of the first window."""
-    value = np.array(found.value)
-    value[: config.clones_per_window] = np.nan
-    return Displacements(*(filled_up(each, rows, np.nan) for each in (value, found.std)))
 
 
 @functools.partial(jax.jit, static_argnames=("apply", "config"))

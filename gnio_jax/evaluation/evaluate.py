@@ -26,14 +26,23 @@ from gnio_jax.errors import InputError
 from gnio_jax.evaluation.estimate import PERFECT_STD, Estimate, estimate, never_moves, perfect
 from gnio_jax.evaluation.infer import given_displacements, infer, no_displacements
 from gnio_jax.evaluation.metrics import score
-from gnio_jax.evaluation.prepare import Recording, prepare
+from gnio_jax.evaluation.prepare import Orientation, Recording, prepare
 from gnio_jax.evaluation.report import DEFINITIONS, Report, write
 from gnio_jax.filtering.settings import filter_setup
 from gnio_jax.models import Network
-from gnio_jax.reporting import Reporter, Silence
+from gnio_jax.reporting import Progress, Reporter, Silence
 from gnio_jax.types import Sequence
 
 SILENCE = Silence()
+NAMED = {
+    "coupling": "{}",
+    "orientation": "{}-orientation",
+    "init": "{}-init",
+    "gyro_bias": "{}-bias",
+    "alignment": "{}-alignment",
+    "checkpoint": "{}",
+}
+"""Choices that are part of a folder's name where they are not the default."""
 
 
 class Evaluation(NamedTuple):
@@ -66,7 +75,9 @@ def evaluate(
     run = load_run(workdir, config.checkpoint)
     config = resolve(config, run.config)
     windows, ekf = run.config.data, filter_setup(run.config.data, config.filter)
-    stage = functools.partial(functools.partial, reporter.progress)
+
+    def stage(name: str) -> Progress:
+        return functools.partial(reporter.progress, name)
 
     sequences = data.load(config.dataset, config.data_root, config.split, workers, stage("reading"))
     recordings, left_out = prepare(
@@ -92,17 +103,17 @@ def evaluate(
         source = network
     truth = [given_displacements(each, PERFECT_STD) for each in recordings]
 
-    filters = (None, None) if config.estimator == "integrate" else (ekf, perfect(ekf))
-    batch, to_perfect = config.batch_size, stage("estimating with perfect displacements")
-    estimates = estimate(recordings, source, windows, filters[0], batch, stage("estimating"))
-    ideal = estimate(recordings, truth, windows, filters[1], batch, to_perfect)
+    own, ideal = (None, None) if config.estimator == "integrate" else (ekf, perfect(ekf))
+    batch, perfecting = config.batch_size, stage("estimating with perfect displacements")
+    estimates = estimate(recordings, source, windows, own, batch, stage("estimating"))
+    floor = estimate(recordings, truth, windows, ideal, batch, perfecting)
 
     report = Report(
         {**_settings(config, run.config, sequences), "epoch": run.epoch, "step": run.step},
         score(estimates, config.alignment),
         {
             "never_moves": score(never_moves(estimates), config.alignment),
-            "perfect_displacements": score(ideal, config.alignment),
+            "perfect_displacements": score(floor, config.alignment),
         },
         {each.name: each.group for each in recordings},
         {each.name: list(each.notes) for each in estimates if each.notes},
@@ -119,8 +130,8 @@ def resolve(config: EvaluateConfig, run: TrainConfig) -> EvaluateConfig:
     of the run. Raises `InputError` for options that do not fit together."""
     if config.batch_size < 1:
         raise InputError("--batch-size", f"must be at least 1, found {config.batch_size}")
-    orientation, usual = config.orientation, "reference" if _infers(config) else "filter"
-    if usual == "filter" and orientation not in (None, usual):
+    orientation = config.orientation or _usual_orientation(config)
+    if not _infers(config) and orientation != "filter":
         what = "imu_only" if config.estimator == "imu_only" else "the tight coupling"
         problem = f"{what} uses the filter's own attitude"
         remedy = "leave it out, or choose --coupling loose or --estimator integrate"
@@ -139,7 +150,8 @@ def resolve(config: EvaluateConfig, run: TrainConfig) -> EvaluateConfig:
         config,
         dataset=dataset,
         data_root=root,
-        orientation=orientation or usual,
+        coupling=config.coupling if config.estimator == "ekf" else "tight",
+        orientation=orientation,
         filter=changed.filter,
         set=(),
     )
@@ -151,23 +163,17 @@ def _infers(config: EvaluateConfig) -> bool:
     return loose or config.estimator == "integrate"
 
 
+def _usual_orientation(config: EvaluateConfig) -> Orientation:
+    return "reference" if _infers(config) else "filter"
+
+
 def folder_name(config: EvaluateConfig, run: TrainConfig) -> str:
     """<dataset>_<split>_<estimator>, then every choice of a resolved `config` that is not the
     default: other figures never take the place of these."""
-    usual = "reference" if _infers(config) else "filter"
+    usual = vars(EvaluateConfig(orientation=_usual_orientation(config)))
+    own = vars(config)
     parts = [config.dataset, config.split, config.estimator]
-    if config.estimator == "ekf" and config.coupling != "tight":
-        parts.append(config.coupling)
-    if config.orientation != usual:
-        parts.append(f"{config.orientation}-orientation")
-    if config.init != "reference":
-        parts.append(f"{config.init}-init")
-    if config.gyro_bias != "zero":
-        parts.append(f"{config.gyro_bias}-bias")
-    if config.alignment != "origin":
-        parts.append(f"{config.alignment}-alignment")
-    if config.checkpoint != "best":
-        parts.append(config.checkpoint)
+    parts += [text.format(own[x]) for x, text in NAMED.items() if own[x] != usual[x]]
     if config.data_root and not _is_usual_root(config.dataset, config.data_root, run):
         root = Path(config.data_root)
         parts.append(f"{root.name}-{zlib.crc32(str(root).encode()):08x}-root")

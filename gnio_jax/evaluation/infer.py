@@ -123,7 +123,8 @@ def _of_recording(
         value = np.where(whole[:, None], value, np.nan)
     std = np.maximum(np.exp(found.log_std), least_std)
     return Displacements(
-        *(_at_window_ends(each, recording) for each in (value, std)),
+        _at_window_ends(value, recording),
+        _at_window_ends(std, recording),
         {name: _at_window_ends(each, recording) for name, each in found.diagnostics.items()},
     )
 

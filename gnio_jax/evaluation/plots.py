@@ -95,16 +95,17 @@ def view(estimate: Estimate, alignment: Alignment | None = "origin") -> View:
     that it starts as the estimate does."""
     seen = in_one_frame(estimate, alignment)
     rows = len(seen.trajectory.time)
-    found = seen.displacements or Displacements(*np.full((2, rows, 3), np.nan))
-    filtered = seen.filtered or Filtered(np.full((rows, 3, 3), np.nan), *np.full((2, rows), np.nan))
-
+    none = np.full((rows, 3), np.nan)
+    found = seen.displacements or Displacements(none, none)
+    filtered = seen.filtered or Filtered(np.full((rows, 3, 3), np.nan), none[:, 0], none[:, 0])
     return View(
         seen.name,
         seen.trajectory.time - seen.trajectory.time[0],
         seen.trajectory.position,
         seen.reference.position,
         filtered.covariance,
-        *(found.diagnostics.get(name, np.full((rows, 3), np.nan)) for name in ("gate", "scale")),
+        found.diagnostics.get("gate", none),
+        found.diagnostics.get("scale", none),
         found.std,
         filtered.nis,
         filtered.accepted,

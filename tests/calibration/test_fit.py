@@ -24,6 +24,7 @@ from gnio_jax.calibration.fit import (
 from gnio_jax.calibration.fit import fit_innovations as fit
 from gnio_jax.config import CalibrateConfig, CorrelatedError, FilterSettings
 from gnio_jax.errors import InputError
+from gnio_jax.evaluation import Displacements
 from gnio_jax.filtering.settings import free_parameters
 from tests.support.calibration_walks import (
     DATA,
@@ -96,7 +97,7 @@ def test_a_second_calibration_compiles_nothing_and_a_fit_that_ends_early_is_told
     options = {f"--{field.name.replace('_', '-')}" for field in dataclasses.fields(CalibrateConfig)}
     assert set(re.findall(r"--[a-z-]+", warning)) <= options  # no remedy that there is not
     programs = SEARCH._cache_size()
-    others = given._replace(displacement=1.01 * given.displacement)
+    others = given._replace(given=given.given._replace(value=1.01 * given.given.value))
     settings = changed(TRUE, noise={"std_factor": (0.7, 1.0, 1.0)}, start={"velocity": 0.2})
     fit(others, DATA, settings, PATHS, lambda calls: None, most_steps=1)
     assert programs > 0 and SEARCH._cache_size() == programs
@@ -134,8 +135,9 @@ def test_a_walk_may_be_filled_up_and_a_filter_that_fails_is_named():
     falling = given._replace(
         gyro=np.where(after, 0.0, given.gyro),
         accel=np.where(after, push, given.accel),
-        displacement=np.where(nothing, np.nan, given.displacement),
-        std=np.where(nothing, 1.0, given.std),
+        given=Displacements(
+            np.where(nothing, np.nan, given.given.value), np.where(nothing, 1.0, given.given.std)
+        ),
     )
     short = first_strides(given, known)
     alone = objective(short, TRUE, PATHS)(start(TRUE, PATHS))[1]

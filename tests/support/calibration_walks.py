@@ -5,8 +5,10 @@ import functools
 import numpy as np
 
 from gnio_jax import filtering
-from gnio_jax.calibration.fit import Walks
 from gnio_jax.config import DataConfig
+from gnio_jax.evaluation import Displacements
+from gnio_jax.evaluation.estimate import Inputs
+from gnio_jax.evaluation.prepare import Start
 from tests.support.filter_settings import changed
 from tests.support.walks import simulate
 
@@ -29,9 +31,10 @@ def _simulated():
 def walks():
     """Their displacements err by `SIGMA`, while the network says a third of it."""
     runs = _simulated()
-    start = (runs.rotation0, runs.velocity0, runs.position0, np.zeros((8, 3)))
-    told = np.full_like(runs.displacement, SIGMA / 3)
-    return Walks(*start, runs.gyro, runs.accel, runs.displacement, told)
+    std = filtering.InitialStd(*np.ones((6, 8)))  # a fit takes that of the settings
+    start = Start(runs.rotation0, runs.velocity0, runs.position0, np.zeros((8, 3)), std)
+    given = Displacements(runs.displacement, np.full_like(runs.displacement, SIGMA / 3))
+    return Inputs(start, runs.gyro, runs.accel, None, given)
 
 
 def walks_with_truth():
@@ -42,5 +45,5 @@ def walks_with_truth():
 def first_strides(given, strides):
     """The walks up to there."""
     samples = {name: getattr(given, name)[:, : N * strides] for name in ("gyro", "accel")}
-    told = {name: getattr(given, name)[:, :strides] for name in ("displacement", "std")}
-    return given._replace(**samples, **told)
+    rows = Displacements(*(each[:, :strides] for each in given.given[:2]))
+    return given._replace(**samples, given=rows)
