@@ -51,7 +51,7 @@ slider.dispatchEvent(new Event("input"));
 """A tap on a strip moves the slider."""
 Figures = Mapping[str, float | None]
 """Metric → value: None where it is not defined, infinite where the estimate diverged."""
-Columns = dict[str, Float[np.ndarray, "k"]]
+Columns = dict[str, Float[np.ndarray, "_"]]
 """What the figures draw of a sequence, by name."""
 
 
