@@ -30,18 +30,10 @@ import gnio_jax
 from gnio_jax.errors import InputError
 
 _DISK_ERRORS = {
-    errno.EACCES,
-    errno.EPERM,
-    errno.ENOSPC,
-    errno.EFBIG,
-    errno.EIO,
-    errno.EROFS,
-    errno.EDQUOT,
-    errno.EEXIST,
-    errno.EISDIR,
-    errno.ENOTDIR,
-    errno.ENAMETOOLONG,
+    *(errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC, errno.EFBIG, errno.EDQUOT, errno.EIO),
+    *(errno.EEXIST, errno.EISDIR, errno.ENOTDIR, errno.ENAMETOOLONG),
 }
+"""Of a place that may not be written, that has no room, and of a name that does not fit."""
 _READER_LEFT = 141
 _COMPILE_SECONDS = "0.1"
 """s. What takes longer to compile is kept; JAX itself keeps what takes a second."""

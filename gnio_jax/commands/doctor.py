@@ -42,9 +42,7 @@ def doctor(asked: DoctorOptions, _call: options.Call) -> None:
         "python": f"{platform.python_version()} on {platform.system()} {platform.machine()}",
         "packages": ", ".join(map(_version, PACKAGES)),
         **_devices(),
-        **_datasets(),
-        **_weights(),
-        **_caches(),
+        **_places(),
     }
     if asked.json:
         print(json_format.dumps(found, indent=2, ensure_ascii=False))
@@ -81,39 +79,28 @@ def _devices() -> dict[str, str]:
     return found
 
 
-def _datasets() -> dict[str, str]:
-    """Those whose folder is there."""
+def _places() -> dict[str, str]:
+    """Datasets whose folder is there, weights, runs, caches."""
+    import jax
+
+    from gnio_jax import config as configuration
     from gnio_jax import data
+    from gnio_jax.apps import packages
+    from gnio_jax.data.hdf5 import cache_folder
 
     found = {}
     for name in data.names():
         with contextlib.suppress(InputError):
             here = str(data.find_root(name)) if data.get(name).needs_root else "computed"
             found[f"dataset {name}"] = here
-    return found
-
-
-def _weights() -> dict[str, str]:
-    from gnio_jax import config as configuration
-    from gnio_jax.apps import packages
-
-    found = {}
-    for name, find in (("weights", packages.packages), ("newest run", configuration.newest_run)):
-        try:
-            place = find()
-            found[name] = ", ".join(place) if isinstance(place, dict) else str(place)
-        except InputError as error:
-            found[name] = f"none: {error}"
-    return found
-
-
-def _caches() -> dict[str, str]:
-    import jax
-
-    from gnio_jax.data.hdf5 import cache_folder
-
+    try:
+        found["weights"] = ", ".join(packages.packages())
+    except InputError as error:
+        found["weights"] = f"none: {error}"
+    try:
+        found["newest run"] = str(configuration.newest_run())
+    except InputError as error:
+        found["newest run"] = f"none: {error}"
     compiled = jax.config.values["jax_compilation_cache_dir"]
-    return {
-        "compiled programs": compiled or "not kept: the cache's folder cannot be written",
-        "recordings read": str(cache_folder()),
-    }
+    found["compiled programs"] = compiled or "not kept: the cache's folder cannot be written"
+    return found | {"recordings read": str(cache_folder())}

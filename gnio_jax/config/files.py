@@ -161,13 +161,11 @@ def assign(config: Section, assignments: Sequence[str]) -> Section:
 
 def value_from_words(hint: Any, words: Sequence[str], name: str) -> Any:
     """The value of a field of the type `hint` from the words of a command line behind the option
-    `name`, checked as the values of a file are; a flag has no word and is true.
+    `name`, checked as the values of a file are.
 
     Raises `InputError` that names the option.
     """
     kinds = _kinds(hint)
-    if bool in kinds and not words:
-        return True
     several = [kind for kind in kinds if typing.get_origin(kind) is tuple]
     wanted = _kinds(typing.get_args(several[0])[0]) if several else kinds
     is_text = not {Any, float, int, bool} & set(wanted)
@@ -487,8 +485,8 @@ def _of_earlier_version(old: dict[str, Any], source: str) -> dict[str, Any]:
     sections["noise"]["std_factor"] = [flat.pop(f"std_factor_{axis}", 1.0) for axis in "xyz"]
     if share:
         sections["noise"]["correlation"] = {"share": share, "seconds": seconds}
-    for name, value in flat.items():
-        path = _MOVED.get(name.removesuffix("_degrees"), name)
+    for name, value in zip(map(str, flat), flat.values(), strict=True):
+        path = _MOVED.get(name.removesuffix("_degrees")) or name
         section, _, field = path.rpartition(".")
         if name.endswith("_degrees"):
             value = _value(float, value, Place(source, f"filter.{name}")) * (math.pi / 180)

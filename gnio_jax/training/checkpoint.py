@@ -76,87 +76,64 @@ def exists(workdir: Path, which: Which = "latest") -> bool:
     return folder.is_dir() and any(child.name.isdigit() for child in folder.iterdir())
 
 
-class Checkpoints:
-    """The two series of a run; a context manager, because Orbax keeps threads that want closing.
+def save(workdir: Path, which: Which, state: TrainState, position: Position) -> None:
+    """Write a checkpoint at `position.step`, `latest` with the optimizer's state; one that is
+    already there for this step is the same and stays.
 
-    In several processes, all of which have the same state and see the same folder, `save` and
-    `restore` are for all of them to call; Orbax writes from the first.
+    In several processes, all of which have the same state and see the same folder, all of them call
+    it, and Orbax writes from the first. Arrays are written from the host's memory: a checkpoint
+    does not know on which devices they lay, and fits any. Raises `OSError` naming the folder where
+    it has no room; the checkpoint before stays.
     """
-
-    def __init__(self, workdir: Path):
-        self._folders = {which: workdir / "checkpoints" / which for which in ("latest", "best")}
-        self._managers = {
-            which: _manager(folder, create=True) for which, folder in self._folders.items()
-        }
-
-    def __enter__(self) -> Checkpoints:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for manager in self._managers.values():
-            manager.close()
-
-    def save(self, which: Which, state: TrainState, position: Position) -> None:
-        """Write a checkpoint at `position.step`; one that is already there for this step is the
-        same and stays.
-
-        Arrays are written from the host's memory: a checkpoint does not know on which devices they
-        lay, and fits any. Raises `OSError` naming the folder where it has no room; the checkpoint
-        before stays.
-        """
-        manager, folder = self._managers[which], self._folders[which]
-        if position.step in manager.all_steps():
-            return
-        state = jax.device_get(state)
-        size = sum(leaf.nbytes for leaf in jax.tree.leaves(state))
-        try:
+    folder, state = _folder(workdir, which), jax.device_get(state)
+    meta = {
+        "version": VERSION,
+        "position": position._asdict(),
+        "shapes": _shapes(state.variables),
+    }
+    items: dict[str, Any] = {
+        "variables": ocp.args.StandardSave(state.variables),
+        "meta": ocp.args.JsonSave(meta),
+    }
+    if which == "latest":
+        items["optimizer"] = ocp.args.StandardSave(state.opt_state)
+    size = sum(leaf.nbytes for leaf in jax.tree.leaves(state))
+    try:
+        with _manager(folder, create=True) as manager:
+            if position.step in manager.all_steps():
+                return
             # Orbax raises where the disk is full, too, but after the tracebacks of many threads.
             if shutil.disk_usage(folder).free < size + METADATA:
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-            items = _items(state.variables, position)
-            if which == "latest":
-                items["optimizer"] = ocp.args.StandardSave(state.opt_state)
             manager.save(position.step, args=ocp.args.Composite(**items))
-        except OSError as error:
-            error.filename = error.filename or str(folder)
-            raise
-
-    def restore(self, template: TrainState) -> tuple[TrainState, Position]:
-        """The latest state, in the structure of `template`, as `parallel.everywhere` places it.
-
-        Raises `InputError` if it does not fit.
-        """
-        manager, where = self._managers["latest"], self._folders["latest"]
-        step = manager.latest_step()
-        if step is None:
-            raise InputError(where, "holds no checkpoint", "start the run without --resume")
-        template = jax.device_get(template)
-        wanted = {"variables": template.variables, "optimizer": template.opt_state}
-        meta = _read_meta(manager, step, where)
-        if meta.get("version") != VERSION:
-            problem = "is of an earlier version of gnio-jax, whose optimizer had another state"
-            run = where.parents[1]
-            remedy = f"begin another run from its weights: --init-from {run} --workdir ..."
-            raise InputError(where / str(step), problem, remedy)
-        _check_shapes(meta, wanted["variables"], where)
-        found = _read_arrays(manager, step, wanted, where)
-        network = found["variables"]["params"], found["variables"]["batch_stats"]
-        numbers = found["variables"].get("filter", {})
-        state = TrainState(jnp.int32(step), *network, found["optimizer"], numbers)
-        chex.assert_trees_all_equal_shapes_and_dtypes(state, template)
-        position = Position(**meta["position"])
-        return parallel.everywhere(state), position._replace(plateau=Plateau(*position.plateau))
+    except OSError as error:
+        error.filename = error.filename or str(folder)
+        raise
 
 
 def write_best(workdir: Path, run: Run) -> None:
     """A checkpoint `best` with the variables of a run, and with the filter of its config where one
     was trained."""
-    variables = dict(run.variables)
-    if run.config.through_filter.learn:
-        variables["filter"] = filter_numbers(run.config.filter)
-    items = _items(jax.device_get(variables), Position(run.epoch, run.step))
-    with _manager(workdir / "checkpoints" / "best", create=True) as manager:
-        manager.save(run.step, args=ocp.args.Composite(**items))
+    numbers = filter_numbers(run.config.filter) if run.config.through_filter.learn else {}
+    network = run.variables["params"], run.variables.get("batch_stats", {})
+    state = TrainState(jnp.int32(run.step), *network, opt_state=(), filter=numbers)
+    save(workdir, "best", state, Position(run.epoch, run.step))
+
+
+def restore(workdir: Path, template: TrainState) -> tuple[TrainState, Position]:
+    """The latest state, in the structure of `template`, as `parallel.everywhere` places it.
+
+    Raises `InputError` if it does not fit, or is of an earlier version.
+    """
+    template = jax.device_get(template)
+    wanted = {"variables": template.variables, "optimizer": template.opt_state}
+    remedy = f"begin another run from its weights: --init-from {workdir} --workdir ..."
+    position, found = _read(workdir, "latest", wanted, remedy)
+    network = found["variables"]["params"], found["variables"]["batch_stats"]
+    numbers = found["variables"].get("filter", {})
+    state = TrainState(jnp.int32(position.step), *network, found["optimizer"], numbers)
+    chex.assert_trees_all_equal_shapes_and_dtypes(state, template)
+    return parallel.everywhere(state), position
 
 
 def load_run(workdir: Path | str, which: Which = "best") -> Run:
@@ -172,34 +149,25 @@ def load_run(workdir: Path | str, which: Which = "best") -> Run:
     config = configuration.validate(
         configuration.load(workdir / "config.yaml"), str(workdir / "config.yaml")
     )
-    where = workdir / "checkpoints" / which
-    if not exists(workdir, which):
-        remedy = "let gnio train finish its first epoch, or name another run"
-        raise InputError(where, "holds no checkpoint", remedy)
     model = create_model(config)
     template = models.variable_shapes(model, config.data.seen)
     template = {"params": template["params"], "batch_stats": template.get("batch_stats", {})}
     if config.through_filter.learn:
         template["filter"] = filter_numbers(config.filter)
-    with _manager(where, create=False) as manager:
-        step = manager.latest_step()
-        meta = _read_meta(manager, step, where)
-        if config.through_filter.learn and meta.get("version") != VERSION:
-            problem = "is of an earlier version of gnio-jax, whose filter had other numbers"
-            remedy = f"train it again from the run that it began with, {config.init_from}"
-            raise InputError(where / str(step), problem, remedy)
-        _check_shapes(meta, template, where)
-        variables = _read_arrays(manager, step, {"variables": template}, where)["variables"]
+    remedy = f"train it again from the run that it began with, {config.init_from}"
+    position, found = _read(workdir, which, {"variables": template}, remedy)
+    variables = found["variables"]
     chex.assert_trees_all_equal_shapes_and_dtypes(variables, template)
     try:
         chex.assert_tree_all_finite(variables)
     except AssertionError:
         remedy = "evaluate another run, or train it again with a lower optim.learning_rate"
+        where = _folder(workdir, which)
         raise InputError(where, "holds parameters that are not finite", remedy) from None
     variables = jax.tree.map(parallel.fresh_copy, variables)
     numbers = variables.pop("filter", {})
     config = dataclasses.replace(config, filter=trained_settings(config.filter, numbers))
-    return Run(config, model, variables, meta["position"]["epoch"], step, numbers)
+    return Run(config, model, variables, position.epoch, position.step, numbers)
 
 
 def initial_run(config: TrainConfig, load: Callable[[str], Run]) -> Run | None:
@@ -256,17 +224,12 @@ def averaged_over_headings(run: Run, source: str) -> Run:
     return run._replace(config=config, model=create_model(config))
 
 
-def _items(variables: Any, position: Position) -> dict[str, Any]:
-    """What every checkpoint holds."""
-    meta = {
-        "version": VERSION,
-        "position": position._asdict(),
-        "shapes": _shapes(variables),
-    }
-    return {"variables": ocp.args.StandardSave(variables), "meta": ocp.args.JsonSave(meta)}
+def _folder(workdir: Path, which: Which) -> Path:
+    return workdir / "checkpoints" / which
 
 
 def _manager(folder: Path, create: bool) -> ocp.CheckpointManager:
+    """Orbax's view of a series, a context manager: it keeps threads that want closing."""
     options = ocp.CheckpointManagerOptions(
         max_to_keep=1,
         enable_async_checkpointing=False,
@@ -276,42 +239,50 @@ def _manager(folder: Path, create: bool) -> ocp.CheckpointManager:
     return ocp.CheckpointManager(folder.absolute(), options=options)
 
 
-def _read_arrays(
-    manager: ocp.CheckpointManager, step: int, templates: dict[str, Any], where: Path
-) -> Any:
-    """The items of a checkpoint that these templates name. Raises `InputError` for damaged ones."""
-    items = {name: ocp.args.StandardRestore(tree) for name, tree in templates.items()}
-    try:
-        return manager.restore(step, args=ocp.args.Composite(**items))
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise _damaged(where / str(step), error) from None
+def _read(
+    workdir: Path, which: Which, templates: dict[str, Any], remedy: str
+) -> tuple[Position, dict[str, Any]]:
+    """The position of a checkpoint, and the items that these templates name.
 
+    Raises `InputError` where there is none, for a damaged one, for variables of other shapes, and
+    with this remedy for one of an earlier version, if it is asked for the state of an optimizer or
+    numbers of the filter.
+    """
+    where = _folder(workdir, which)
+    if not exists(workdir, which):
+        wait = "let gnio train finish its first epoch, or name another run"
+        raise InputError(where, "holds no checkpoint", wait)
+    with _manager(where, create=False) as manager:
+        step = manager.latest_step()
 
-def _read_meta(manager: ocp.CheckpointManager, step: int, where: Path) -> dict[str, Any]:
-    """The metadata of a checkpoint."""
-    try:
-        meta = manager.restore(step, args=ocp.args.Composite(meta=ocp.args.JsonRestore()))["meta"]
-        return {**meta, "shapes": meta["shapes"], "position": meta["position"]}
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise _damaged(where / str(step), error) from None
+        def restored(items: dict[str, Any]) -> Any:
+            try:
+                return manager.restore(step, args=ocp.args.Composite(**items))
+            except (OSError, ValueError, KeyError, TypeError) as error:
+                problem = f"cannot be read ({str(error)[:120]})"
+                damaged = InputError(where / str(step), problem, "the checkpoint is damaged")
+                raise damaged from None
 
-
-def _check_shapes(meta: dict[str, Any], variables: Any, where: Path) -> None:
-    """Raise `InputError` unless the checkpoint's variables have the shapes of `variables`."""
-    found, wanted = meta["shapes"], _shapes(variables)
-    for name in sorted(wanted.keys() | found.keys()):
-        if wanted.get(name) != found.get(name):
-            problem = (
-                f"'{name}' has shape {found.get(name)} in the checkpoint "
-                f"and {wanted.get(name)} in the configured model"
-            )
-            remedy = "model.width and the other model fields must be those of the run"
-            raise InputError(where, problem, remedy)
-
-
-def _damaged(checkpoint: Path, error: Exception) -> InputError:
-    problem = f"cannot be read ({str(error)[:120]})"
-    return InputError(checkpoint, problem, "the checkpoint is damaged")
+        meta = restored({"meta": ocp.args.JsonRestore()})["meta"]
+        older = meta.get("version") != VERSION
+        if older and ("optimizer" in templates or "filter" in templates["variables"]):
+            problem = "is of an earlier version of gnio-jax, with other states beside the weights"
+            raise InputError(where / str(step), problem, remedy)
+        wanted, kept = _shapes(templates["variables"]), meta["shapes"]
+        for name in sorted(wanted.keys() | kept.keys()):
+            if wanted.get(name) != kept.get(name):
+                problem = (
+                    f"'{name}' has shape {kept.get(name)} in the checkpoint "
+                    f"and {wanted.get(name)} in the configured model"
+                )
+                same = "model.width and the other model fields must be those of the run"
+                raise InputError(where, problem, same)
+        found = restored({n: ocp.args.StandardRestore(tree) for n, tree in templates.items()})
+        found = {name: found[name] for name in templates}
+    position = meta["position"]
+    if older:  # its weights are as today's
+        return Position(position["epoch"], position["step"]), found
+    return Position(**position | {"plateau": Plateau(*position["plateau"])}), found
 
 
 def _shapes(variables: Any) -> dict[str, list[int]]:

@@ -20,7 +20,7 @@ from gnio_jax.config import TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.reporting import Lines, Reporter, Silence
 from gnio_jax.training import checkpoint, optimizer, run_folder
-from gnio_jax.training.checkpoint import Checkpoints, Position, Run, load_run
+from gnio_jax.training.checkpoint import Position, Run, load_run
 from gnio_jax.training.filter_task import FilterTask
 from gnio_jax.training.run_folder import Log
 from gnio_jax.training.task import (
@@ -108,15 +108,15 @@ def train_all(
     if through_filter and jax.process_count() > 1:
         problem = "runs in one process, on all of its devices"
         raise InputError("training through the filter", problem, "start one process")
-    kind = FilterTask if through_filter else WindowTask
+    outcomes: list[Outcome] = []
     # Segments are shared out by `filtering.over_sequences`, not as a batch of windows is. Whatever
     # the process has set: no float64 but for the filter.
-    outcomes: list[Outcome] = []
     sharing = parallel.sharing(1 if through_filter else devices)
     with jax.enable_x64(through_filter), sharing, _stop_signals() as stop:
         resumed = all(resumes) and all(map(checkpoint.exists, workdirs))
         start = None if resumed else checkpoint.initial_run(configs[0], load_initial)
-        task, recordings = set_up(kind, configs[0], reporter, workers)
+        chosen = FilterTask if through_filter else WindowTask
+        task, recordings = set_up(chosen, configs[0], reporter, workers)
         for config, resume in zip(configs, resumes, strict=True):
             outcomes.append(_train(task, recordings, config, start, resume, stop, reporter))
             if stop.signum and len(outcomes) < len(configs):
@@ -143,62 +143,61 @@ def _train(
     with run_folder.opened(config, recordings, state.variables, resume) as workdir:
         for line in task.description(state, workdir):
             reporter.line(line)
-        with Checkpoints(workdir) as checkpoints:
-            if resume and checkpoint.exists(workdir):
-                state, at = checkpoints.restore(state)
-                reporter.line(f"resuming at step {at.step}")
-            with Log(workdir, at.epoch, at.step) as log:
-                saved = time.perf_counter()
-                for epoch in range(at.epoch, optim.epochs):
-                    order = task.order(keys.order, epoch, recordings.source)
-                    end = (epoch + 1) * steps
-                    began, before, first, dispatch, rate = time.perf_counter(), at, at.step, 1, 0.0
-                    while at.step < end:
-                        count, tick = min(dispatch, end - at.step), time.perf_counter()
-                        state, progress = task.take_steps(
-                            state,
-                            recordings.source,
-                            order,
-                            at.step - epoch * steps,
-                            count,
-                            at.plateau.factor,
-                            keys.step,
-                        )
-                        at = _after_steps(at, count, jax.device_get(progress), workdir)
-                        clock = time.perf_counter()
-                        at = at._replace(seconds=before.seconds + clock - began)
-                        rate = (at.step - first) * optim.batch_size / (clock - began)
-                        wished = round(DISPATCH_SECONDS * count / (clock - tick))
-                        # Clocks differ between processes, and a signal reaches one of them.
-                        dispatch, due, signum = parallel.largest(
-                            max(1, min(2 * dispatch, wished)),
-                            int(clock - saved > CHECKPOINT_SECONDS),
-                            stop.received,
-                        )
-                        reporter.progress(
-                            "training", at.step / (optim.epochs * steps), _figures(task, at, rate)
-                        )
-                        if at.step < end and (due or signum):
-                            checkpoints.save("latest", with_statistics(state), at)
-                            saved = clock
-                        if at.step < end and signum:
-                            stop.signum = signum
-                            return Outcome(workdir, at.best, signum)
-                    state, validation = task.validate(
-                        with_statistics(state), recordings.held_out, keys.statistics
+        if resume and checkpoint.exists(workdir):
+            state, at = checkpoint.restore(workdir, state)
+            reporter.line(f"resuming at step {at.step}")
+        with Log(workdir, at.epoch, at.step) as log:
+            saved = time.perf_counter()
+            for epoch in range(at.epoch, optim.epochs):
+                order = task.order(keys.order, epoch, recordings.source)
+                end = (epoch + 1) * steps
+                began, before, first, dispatch, rate = time.perf_counter(), at, at.step, 1, 0.0
+                while at.step < end:
+                    count, tick = min(dispatch, end - at.step), time.perf_counter()
+                    state, progress = task.take_steps(
+                        state,
+                        recordings.source,
+                        order,
+                        at.step - epoch * steps,
+                        count,
+                        at.plateau.factor,
+                        keys.step,
                     )
-                    row = _row(task, at, validation, rate)
-                    improved, at = _after_epoch(task, at, row)
-                    log.add(row)
-                    reporter.line(_summary(task, row) + ("  best" if improved else ""))
-                    if warning := stuck_head(row):
-                        reporter.line(warning)
-                    if improved:
-                        checkpoints.save("best", state, at)
-                    checkpoints.save("latest", state, at)
-                    (stop.signum,) = parallel.largest(stop.received)
-                    if stop.signum and epoch + 1 < optim.epochs:
-                        return Outcome(workdir, at.best, stop.signum)
+                    at = _after_steps(at, count, jax.device_get(progress), workdir)
+                    clock = time.perf_counter()
+                    at = at._replace(seconds=before.seconds + clock - began)
+                    rate = (at.step - first) * optim.batch_size / (clock - began)
+                    wished = round(DISPATCH_SECONDS * count / (clock - tick))
+                    # Clocks differ between processes, and a signal reaches one of them.
+                    dispatch, due, signum = parallel.largest(
+                        max(1, min(2 * dispatch, wished)),
+                        int(clock - saved > CHECKPOINT_SECONDS),
+                        stop.received,
+                    )
+                    reporter.progress(
+                        "training", at.step / (optim.epochs * steps), _figures(task, at, rate)
+                    )
+                    if at.step < end and (due or signum):
+                        checkpoint.save(workdir, "latest", with_statistics(state), at)
+                        saved = clock
+                    if at.step < end and signum:
+                        stop.signum = signum
+                        return Outcome(workdir, at.best, signum)
+                state, validation = task.validate(
+                    with_statistics(state), recordings.held_out, keys.statistics
+                )
+                row = _row(task, at, validation, rate)
+                improved, at = _after_epoch(task, at, row)
+                log.add(row)
+                reporter.line(_summary(task, row) + ("  best" if improved else ""))
+                if warning := stuck_head(row):
+                    reporter.line(warning)
+                if improved:
+                    checkpoint.save(workdir, "best", state, at)
+                checkpoint.save(workdir, "latest", state, at)
+                (stop.signum,) = parallel.largest(stop.received)
+                if stop.signum and epoch + 1 < optim.epochs:
+                    return Outcome(workdir, at.best, stop.signum)
     return Outcome(workdir, at.best, None)
 
 

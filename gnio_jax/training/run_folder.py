@@ -9,7 +9,7 @@ import json
 import os
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -159,60 +159,44 @@ def compare_processes(config: TrainConfig, recordings: Recordings, variables: An
 class Log:
     """A row of figures for each finished epoch, in metrics.jsonl and TensorBoard. A resumed run
     drops those after its checkpoint and writes them again. Of several processes the first one
-    writes them."""
+    writes them.
+
+    tensorboardX's own SummaryWriter writes in a thread, which dies where the disk is full; then
+    the run would wait for it for ever. So its events are written here, one by one.
+    """
 
     def __init__(self, workdir: Path, epoch: int, step: int):
-        self._path = workdir / "metrics.jsonl"
-        self._rows, self._board = [], None
+        self._path, self._board = workdir / "metrics.jsonl", workdir / "tensorboard"
+        self._rows, self._events = [], None
         if parallel.is_first():
             exists = self._path.exists()
             lines = self._path.read_text(encoding="utf-8").splitlines() if exists else []
             self._rows = [row for row in map(json.loads, lines) if row["epoch"] < epoch]
-            self._board = _Board(workdir / "tensorboard", step)
+            self._board.mkdir(parents=True, exist_ok=True)
+            self._events = EventsWriter(str(self._board / "events"))
+            # Events of other files from this step on are void.
+            start = _SessionLog(status=_SessionLog.START)
+            self._events.write_event(_Event(wall_time=time.time(), step=step, session_log=start))
 
     def __enter__(self) -> Log:
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self._board is not None:
-            self._board.close()
+        if self._events is not None:
+            with suppress(OSError):  # `add` has raised it, or something worse has happened
+                self._events.close()
 
     def add(self, row: Row) -> None:
         """Write the row of an epoch."""
-        if self._board is None:
+        if self._events is None:
             return
         self._rows.append(row)
         write_text(self._path, "".join(json.dumps(row) + "\n" for row in self._rows))
-        self._board.add(row)
-
-
-class _Board:
-    """A TensorBoard event file, written row by row.
-
-    tensorboardX's own SummaryWriter writes in a thread, which dies where the disk is full; then
-    the run would wait for it for ever.
-    """
-
-    def __init__(self, folder: Path, step: int):
-        """Rows from `step` on that other files of the folder hold are void."""
-        folder.mkdir(parents=True, exist_ok=True)
-        self._folder = folder
-        self._file = EventsWriter(str(folder / "events"))
-        start = _SessionLog(status=_SessionLog.START)
-        self._file.write_event(_Event(wall_time=time.time(), step=step, session_log=start))
-
-    def add(self, row: Row) -> None:
         try:
             for name, value in row.items():
                 event = _Event(wall_time=time.time(), step=row["step"], summary=scalar(name, value))
-                self._file.write_event(event)
-            self._file.flush()
+                self._events.write_event(event)
+            self._events.flush()
         except OSError as error:
-            error.filename = str(self._folder)
+            error.filename = str(self._board)
             raise
-
-    def close(self) -> None:
-        try:
-            self._file.close()
-        except OSError:
-            pass  # `add` has raised it, or something worse has happened

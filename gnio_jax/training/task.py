@@ -315,7 +315,7 @@ def gradient_norms(gradient: Trainable) -> dict[str, Float[jax.Array, ""]]:
 
 
 def set_up(
-    kind: type[Task], config: TrainConfig, reporter: Reporter, workers: int = 1
+    task: type[Task], config: TrainConfig, reporter: Reporter, workers: int = 1
 ) -> tuple[Task, Recordings]:
     """Load the recordings and find the windows or segments in them.
 
@@ -335,12 +335,12 @@ def set_up(
     for split in (train, val):
         samples: dict[str, int] = {}
         sequences = read_split(config, split, reporter, workers, samples)
-        source = kind.source_of(sequences, config, training=not sources)
+        source = task.source_of(sequences, config, training=not sources)
         sources.append(parallel.everywhere(source))
-        counts.append(kind.count(source))
+        counts.append(task.count(source))
         splits[split] = list(samples)
         hours = sum(samples.values()) / config.data.rate / 3600
-        contents = f"{hours:.2f} h, {counts[-1]:,} {kind.unit}"
+        contents = f"{hours:.2f} h, {counts[-1]:,} {task.unit}"
         reporter.line(f"  {split}: {len(samples)} sequences, {contents}")
     both = sorted(set(splits[train]) & set(splits[val]))
     if both:
@@ -350,10 +350,10 @@ def set_up(
             "splits"
         )
     if counts[0] < size:
-        problem = f"is {size}, but there are only {counts[0]} {kind.unit}"
+        problem = f"is {size}, but there are only {counts[0]} {task.unit}"
         raise InputError("optim.batch_size", problem, "lower it")
     anywhere = dataclasses.replace(config, workdir=None, data_root=None, init_from=None, seed=0)
-    return kind(model, anywhere, counts[0] // size), Recordings(sources[0], sources[1], splits)
+    return task(model, anywhere, counts[0] // size), Recordings(sources[0], sources[1], splits)
 
 
 def create_model(config: TrainConfig) -> nn.Module:

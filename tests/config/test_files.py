@@ -190,7 +190,6 @@ def test_an_assignment_that_makes_no_sense_is_named(assignment, problem):
         (tuple[int, ...], ["1", "2"], (1, 2)),
         (tuple[str, ...], ["1", "true"], ("1", "true")),
         (tuple[int, ...], [], ()),
-        (bool, [], True),
         (bool, ["false"], False),
     ],
 )

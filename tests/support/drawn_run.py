@@ -26,6 +26,5 @@ def save(folder, config, draw):
         for kind, tree in shapes.items()
     }
     state = TrainState(jnp.int32(0), drawn["params"], drawn["batch_stats"], {})
-    with checkpoint.Checkpoints(folder) as checkpoints:
-        checkpoints.save("best", state, checkpoint.Position(epoch=1, best=1.0))
+    checkpoint.save(folder, "best", state, checkpoint.Position(epoch=1, best=1.0))
     return folder

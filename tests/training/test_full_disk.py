@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from gnio_jax.errors import InputError
-from gnio_jax.training.checkpoint import Checkpoints, Position
+from gnio_jax.training import checkpoint, run_folder
 from gnio_jax.training.run_folder import Log
 from gnio_jax.training.task import TrainState
 
@@ -22,10 +22,6 @@ def state(step):
     rng = np.random.default_rng(step)
     draw = lambda: {"weights": jnp.asarray(rng.normal(size=9000).astype(np.float32))}  # noqa: E731
     return TrainState(jnp.int32(step), draw(), {}, draw())
-
-
-def position(step):
-    return Position(step=step)
 
 
 @contextmanager
@@ -39,46 +35,47 @@ def files_of_at_most(size):
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
+def save(run, step):
+    checkpoint.save(run, "latest", state(step), checkpoint.Position(step=step))
+
+
 @pytest.fixture
-def checkpoints(tmp_path):
-    with Checkpoints(tmp_path) as found:
-        found.save("latest", state(1), position(1))
-        yield found
+def run(tmp_path):
+    save(tmp_path, 1)
+    return tmp_path
 
 
-def assert_kept(checkpoints):
-    restored, where = checkpoints.restore(state(0))
+def assert_kept(run):
+    restored, where = checkpoint.restore(run, state(0))
     assert where.step == 1
     jax.tree.map(np.testing.assert_array_equal, restored, state(1))
 
 
 @pytest.mark.parametrize("size, error", [(100, OSError), (10_000, ValueError)])
-def test_a_write_that_fails_keeps_the_checkpoint(checkpoints, tmp_path, size, error):
+def test_a_write_that_fails_keeps_the_checkpoint(run, size, error):
     """In the metadata, which Python writes, and in the arrays, where Orbax raises ValueError."""
     with files_of_at_most(size), pytest.raises(error) as told:
-        checkpoints.save("latest", state(2), position(2))
+        save(run, 2)
     if error is OSError:
         assert told.value.errno == errno.EFBIG
-        assert str(tmp_path / "checkpoints" / "latest") in told.value.filename
+        assert str(run / "checkpoints" / "latest") in told.value.filename
     else:
         assert f"os_error_code='{errno.EFBIG}'" in str(told.value)
-    assert_kept(checkpoints)
-    checkpoints.save("latest", state(3), position(3))  # where there is room again
-    assert checkpoints.restore(state(0))[1].step == 3
+    assert_kept(run)
+    save(run, 3)  # where there is room again
+    assert checkpoint.restore(run, state(0))[1].step == 3
 
 
-def test_a_disk_without_room_is_told_before_anything_is_written(
-    checkpoints, tmp_path, monkeypatch, capfd
-):
+def test_a_disk_without_room_is_told_before_anything_is_written(run, monkeypatch, capfd):
     usage = namedtuple("usage", "total used free")
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage(10**9, 10**9 - 60_000, 60_000))
     with pytest.raises(OSError) as told:
-        checkpoints.save("latest", state(2), position(2))
+        save(run, 2)
     assert told.value.errno == errno.ENOSPC
-    assert told.value.filename == str(tmp_path / "checkpoints" / "latest")
-    assert [child.name for child in (tmp_path / "checkpoints" / "latest").iterdir()] == ["1"]
+    assert told.value.filename == str(run / "checkpoints" / "latest")
+    assert [child.name for child in (run / "checkpoints" / "latest").iterdir()] == ["1"]
     assert capfd.readouterr() == ("", "")
-    assert_kept(checkpoints)
+    assert_kept(run)
 
 
 def test_a_log_that_cannot_be_written_names_its_place(tmp_path):
@@ -90,28 +87,26 @@ def test_a_log_that_cannot_be_written_names_its_place(tmp_path):
     assert len((tmp_path / "metrics.jsonl").read_text().splitlines()) == 1
 
 
-def test_a_board_that_cannot_be_written_names_its_place(tmp_path):
+def test_a_board_that_cannot_be_written_names_its_place(tmp_path, monkeypatch):
     """It ends the run: nothing waits for a thread that the disk has stopped."""
+    monkeypatch.setattr(run_folder, "write_text", lambda *_: None)  # which would fail first
     many = {f"gradient_norm/{i}": 1.0 for i in range(100)}
     with Log(tmp_path, 0, 0) as log:
         with files_of_at_most(6000), pytest.raises(OSError) as told:
             for step in range(20):
-                log._board.add({"step": step, **many})
+                log.add({"epoch": step, "step": step, **many})
     assert told.value.filename == str(tmp_path / "tensorboard")
 
 
-def test_arrays_that_are_cut_short_are_told(tmp_path):
-    with Checkpoints(tmp_path) as checkpoints:
-        checkpoints.save("latest", state(1), position(1))
-        for file in (tmp_path / "checkpoints" / "latest" / "1" / "optimizer" / "d").iterdir():
-            file.write_bytes(file.read_bytes()[:20])
-        with pytest.raises(InputError, match=r"latest/1: cannot be read .* is damaged"):
-            checkpoints.restore(state(0))
+def test_arrays_that_are_cut_short_are_told(run):
+    for file in (run / "checkpoints" / "latest" / "1" / "optimizer" / "d").iterdir():
+        file.write_bytes(file.read_bytes()[:20])
+    with pytest.raises(InputError, match=r"latest/1: cannot be read .* is damaged"):
+        checkpoint.restore(run, state(0))
 
 
 def test_what_a_killed_process_left_is_removed(tmp_path):
     rest = tmp_path / "checkpoints" / "latest" / "7.orbax-checkpoint-tmp"
     rest.mkdir(parents=True)
-    with Checkpoints(tmp_path) as checkpoints:
-        checkpoints.save("latest", state(1), position(1))
+    save(tmp_path, 1)
     assert not rest.exists()

@@ -26,6 +26,7 @@ from gnio_jax.training import checkpoint, loop, optimizer, run_folder, task, win
 from gnio_jax.training.losses import Losses
 from gnio_jax.training.task import Recordings
 from gnio_jax.training.window_task import WindowTask
+from tests.support import tiny_run
 from tests.support.drawn_state import fresh_state
 from tests.support.tiny_network import Tiny
 from tests.support.tlio_files import write_splits
@@ -61,8 +62,7 @@ def same(a, b):
 
 @pytest.fixture(scope="module", autouse=True)
 def registered():
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(registry._MODELS, "tiny", Tiny)
+    with tiny_run.known():
         yield
 
 

@@ -15,11 +15,10 @@ from gnio_jax.commands.options import Call, read
 from gnio_jax.commands.train import experiment, train
 from gnio_jax.config import DataConfig, ModelConfig, OptimConfig, TrainConfig
 from gnio_jax.errors import InputError
-from gnio_jax.models import registry
 from gnio_jax.reporting import Silence
 from gnio_jax.training import checkpoint, loop, task
+from tests.support import tiny_run
 from tests.support.command_lines import run as gnio
-from tests.support.tiny_network import Tiny
 from tests.support.tlio_files import write_splits
 
 SEEDS = (3, 0, 7)
@@ -39,8 +38,7 @@ class Told(Silence):
 
 @pytest.fixture(scope="module", autouse=True)
 def registered():
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(registry._MODELS, "tiny", Tiny)
+    with tiny_run.known():
         yield
 
 

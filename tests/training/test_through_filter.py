@@ -487,10 +487,6 @@ def test_training_on_windows_starts_from_a_runs_weights(recording):
             r"'through_filter.piece_seconds' is not a whole number of strides of 0.1 s",
         ),
         (
-            {"through_filter": ThroughFilter(LEARN, 0.7)},
-            r"'through_filter.piece_seconds' must be at least 1 s, the shortest horizon",
-        ),
-        (
             {
                 "through_filter": ThroughFilter(LEARN, 1.0),
                 "data": DataConfig(rate=50.0, window_seconds=1.0),
