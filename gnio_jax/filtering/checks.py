@@ -108,7 +108,7 @@ def check_numbers(name: str, settings: Any) -> None:
     """Refuse a tuple of settings (`NoiseModel`, `InitialStd`, `ConsideredStd`) with a number
     outside the bounds of its field."""
     for field, hint, value in named(settings, f"{name}."):
-        for number in value if isinstance(value, tuple) else (value,):
+        for number in value if isinstance(value, tuple | list) else (value,):
             if np.shape(number) != ():
                 raise ValueError(f"{field}: must be one number, found shape {np.shape(number)}")
             for bound in bounds(hint):

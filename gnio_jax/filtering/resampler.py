@@ -16,6 +16,7 @@ that. A single lost sample is no hole. All of this happens on the host.
 
 from __future__ import annotations
 
+import itertools
 import math
 from typing import NamedTuple
 
@@ -265,9 +266,9 @@ class Stream:
         jitter hardly changes."""
         grid, intervals, covered = self.grid, self._intervals, self._covered
         fastest = 1.5 * grid.imu_rate if grid.factor > 1 else 1 / grid.dt
-        for interval in np.diff([self._newest, *stamps]).tolist():
-            if interval <= max(grid.hole, _STOP * grid.dt):
-                intervals, covered = intervals + 1, covered + interval
+        for before, stamp in itertools.pairwise([self._newest, *stamps]):
+            if stamp - before <= max(grid.hole, _STOP * grid.dt):
+                intervals, covered = intervals + 1, covered + stamp - before
         known = round(covered / grid.dt, 3) >= _RATE_KNOWN
         rate = intervals / covered if known else 0.0
         if rate > _TOO_FAST * fastest:
