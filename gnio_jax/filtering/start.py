@@ -13,6 +13,7 @@ What counts as rest depends on what is concluded from it:
 
 from __future__ import annotations
 
+import functools
 from typing import Any, NamedTuple
 
 import jax
@@ -108,12 +109,8 @@ def level_state(
         raise ValueError(f"accel: at least two samples are needed, found {samples}")
     check_finite("gyro", gyro)
     check_finite("accel", accel)
-    independent = max(1.0, 2 * samples * config.dt)
-    bounds = config.rest_gyro, config.rest_accel
-    long_enough = samples >= round(REST_SECONDS / config.dt)
-    bias_std = jnp.asarray(std.accel_bias)
     rotation, gyro_bias, tilt_std, velocity_std, up = _levelled(
-        gyro, accel, config.dt, bias_std, independent, bounds, long_enough
+        gyro, accel, jnp.asarray(std.accel_bias), config
     )
     if not isinstance(up, Tracer) and (size := np.linalg.norm(up)) < LEAST_GRAVITY:
         problem = f"shows no gravity, its mean is {size:.2g} m/s²"
@@ -123,26 +120,23 @@ def level_state(
 
 
 # One program, as in `without_clones`.
-@jax.jit
+@functools.partial(jax.jit, static_argnames="config")
 def _levelled(
-    gyro: Array,
-    accel: Array,
-    dt: Any,
-    bias_std: Array,
-    independent: Any,
-    quiet_below: tuple[Any, Any],
-    long_enough: Any,
+    gyro: Array, accel: Array, bias_std: Array, config: FilterConfig
 ) -> tuple[Array, Array, Array, Array, Array]:
     """Attitude from gravity, the gyro's bias, the standard deviations of tilt and velocity, and the
     mean acceleration, m/s²."""
     of_gyro, of_accel = jnp.var(gyro, axis=0), jnp.var(accel, axis=0)
     on_a_table = jnp.all(of_gyro <= REST_GYRO_STD**2) & jnp.all(of_accel <= REST_ACCEL_STD**2)
+    long_enough = len(gyro) >= round(REST_SECONDS / config.dt)
     gyro_bias = jnp.where(on_a_table & long_enough, gyro.mean(0), 0.0)
-    quiet = (of_gyro.sum() < quiet_below[0] ** 2) & (of_accel.sum() < quiet_below[1] ** 2)
-    attitudes = geometry.integrate_turns(jnp.eye(3, dtype=gyro.dtype), gyro[:-1] * dt)
+    quiet = of_gyro.sum() < config.rest_gyro**2
+    quiet = quiet & (of_accel.sum() < config.rest_accel**2)
+    attitudes = geometry.integrate_turns(jnp.eye(3, dtype=gyro.dtype), gyro[:-1] * config.dt)
     # A quiet gyro shows its bias alone.
     accel = jnp.where(quiet, accel, jnp.einsum("ijn,nj->ni", attitudes, accel))
     variance, up = jnp.sum(jnp.var(accel, axis=0)), accel.mean(0)
+    independent = max(1.0, 2 * len(gyro) * config.dt)
     mean_error = jnp.sqrt(bias_std**2 + variance / independent)
     # Bounded before the root, whose slope at zero is infinite.
     velocity = jnp.clip(_SPEED_OF_SPREAD**2 * variance, _STILL_STD**2, _MOVING_STD**2)

@@ -25,7 +25,7 @@ from jaxtyping import Float, Int
 
 from gnio_jax.config import ConsideredStd, InitialStd, NoiseModel
 from gnio_jax.config.schema import TLIO_STD
-from gnio_jax.filtering.checks import check_number, check_numbers, checked_noise, checked_state
+from gnio_jax.filtering.checks import check_number, checked_noise, checked_state
 from gnio_jax.filtering.config import FilterConfig
 from gnio_jax.filtering.consider import (
     Tangents,
@@ -139,8 +139,6 @@ class Tracker:
         considered: ConsideredStd | None = None,
     ):
         check_number("rest_seconds", rest_seconds, 1.5 * config.dt, "s")
-        if considered is not None:
-            check_numbers("considered", considered)
         self._config, self._std, self._considered = config, std, considered
         self._rest = round(rest_seconds / config.dt)
         self._stream = Stream(create_grid(config.dt, hole, imu_rate))

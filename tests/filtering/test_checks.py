@@ -6,12 +6,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.stats import multivariate_normal
 
 from gnio_jax import filtering
 from gnio_jax.filtering.state import with_correlated_error
-from tests.support import scekf_numpy
-from tests.support.short_walk import CLONES, CONFIG, DT, INTERVALS, NOISE, WALK, N, run, start
+from tests.support.short_walk import CONFIG, DT, INTERVALS, NOISE, WALK, N, start
 
 POSE, GYRO, ACCEL, DISPLACEMENT, COVARIANCE = WALK
 SAMPLES, NAN = len(GYRO), float("nan")
@@ -153,31 +151,3 @@ def test_inside_jit_the_history_reports_it(name, bad):
     config = given.pop("config")
     _, history = jax.jit(lambda given: filtering.run_filter(config=config, **given))(given)
     np.testing.assert_array_equal(history.healthy, np.arange(INTERVALS) < bad)
-
-
-def test_log_likelihood_is_that_of_the_innovation():
-    (R, v, p), gyro, accel, d, c = WALK
-    _, history = run()
-    noise = filtering.NoiseModel()
-    wanted = scekf_numpy.run(
-        gyro,
-        accel,
-        d,
-        c,
-        R,
-        v,
-        p,
-        dt=DT,
-        n=N,
-        clones=CLONES,
-        sigma_gyro=noise.gyro_density / np.sqrt(DT),
-        sigma_accel=noise.accel_density / np.sqrt(DT),
-        scale=2.0,
-    )
-    found = np.asarray(history.log_likelihood)
-    assert np.isnan(found[:CLONES]).all()
-    for k in range(CLONES, INTERVALS):
-        expected = multivariate_normal.logpdf(
-            wanted["innovation"][k], cov=wanted["innovation_covariance"][k]
-        )
-        np.testing.assert_allclose(found[k], expected, rtol=1e-7)

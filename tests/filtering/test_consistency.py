@@ -12,9 +12,7 @@ from scipy.stats import chi2
 
 from gnio_jax import filtering, geometry
 from gnio_jax.filtering.displacement import Displacement, linearise_displacement
-from gnio_jax.filtering.gaps import Imu
-from gnio_jax.filtering.propagation import integrate
-from gnio_jax.filtering.state import CLONE, OFFSET, THETA, VELOCITY, Mean
+from gnio_jax.filtering.state import CLONE, OFFSET
 from gnio_jax.filtering.update import Step, measurable_errors, retract
 from gnio_jax.types import Prediction
 from gnio_jax.windows import cut_window
@@ -148,37 +146,6 @@ def random_state(config, seed=0):
         offset=jnp.asarray(offsets[-1]),
         move=jnp.asarray(rng.normal(size=3)),
         step=jnp.int32(clones),
-    )
-
-
-def vee(rotation):
-    """The rotation vector of a rotation near the identity, to first order."""
-    return jnp.stack([rotation[2, 1], rotation[0, 2], rotation[1, 0]])
-
-
-def test_transition_is_the_derivative_of_the_retraction():
-    config = filtering.FilterConfig(0.05, 6, 3)
-    state = random_state(config)
-    rng = np.random.default_rng(1)
-    imu = Imu(
-        jnp.asarray(4 * rng.normal(size=(6, 3))), jnp.asarray(8 * rng.normal(size=(6, 3))), None
-    )
-
-    def end(error):
-        start = Mean(
-            rotation=geometry.exp(error[THETA]) @ state.rotation,
-            velocity=state.velocity + error[VELOCITY],
-            position=state.position + error[OFFSET],
-            gyro_bias=state.gyro_bias + error[9:12],
-            accel_bias=state.accel_bias + error[12:15],
-        )
-        motion = integrate(start, imu, filtering.NoiseModel(), config.dt)
-        turn = vee(motion.rotation @ reference.rotation.T)
-        return jnp.concatenate([turn, motion.velocity, motion.position])
-
-    reference = quick(lambda: integrate(state.mean, imu, filtering.NoiseModel(), config.dt))()
-    np.testing.assert_allclose(
-        reference.transition, quick(jax.jacfwd(end))(jnp.zeros(15)), atol=1e-6
     )
 
 

@@ -4,18 +4,13 @@ import dataclasses
 
 import jax.numpy as jnp
 import numpy as np
-import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from gnio_jax import filtering
 from gnio_jax.filtering import Tracker
-from gnio_jax.filtering.displacement import Displacement
-from gnio_jax.filtering.state import OFFSET
-from gnio_jax.filtering.update import Step
 from gnio_jax.types import Prediction
 from tests.support.compiling import quick
-from tests.support.measured import NO_IMU
 from tests.support.random_walk import random_walk
 
 N, CLONES, DT = 4, 4, 0.02
@@ -198,35 +193,3 @@ def said(history, speed):
     healthy = np.asarray(history.healthy) == 1
     assert not healthy[~plausible].any()
     np.testing.assert_array_equal(healthy, np.logical_and.accumulate(healthy))
-
-
-@pytest.mark.parametrize(
-    "options, converged, accepted, corrected",
-    [
-        (dict(), True, False, False),
-        (dict(), False, True, True),
-        (dict(mahalanobis_fail_scale=2.0), True, True, True),
-        (dict(mahalanobis_fail_scale=1e6), True, True, False),
-        (dict(gate_softness=1.0), False, True, True),
-        (dict(gate_softness=1.0), True, True, False),
-    ],
-    ids=["rejected", "gate open", "scaled", "scaled away", "weighted 1", "weighted 1e-6"],
-)
-def test_a_displacement_corrects_as_much_as_the_gate_lets_it(
-    options, converged, accepted, corrected
-):
-    """Five metres of which the filter takes all, half, or nothing to speak of."""
-    config = dataclasses.replace(PLAIN, convergence_seconds=10.0, **options)
-    state = filtering.initial_state(config, *WALK[0])
-    known = state.core_covariance.at[OFFSET, OFFSET].set(0.01 * jnp.eye(3))
-    state = state._replace(core_covariance=known)
-    gate = filtering.GateState(jnp.bool_(converged), jnp.int32(95), jnp.int32(0))
-    state = state._replace(step=jnp.int32(20), gate=gate)
-    measurement = Displacement(
-        jnp.array([3.0, -4.0, 0.0]), 0.01 * jnp.eye(3), jnp.bool_(True), "given"
-    )
-    step = Step(NO_IMU, 0, 1, config, NOISE)
-    _, outcome, made = measurement.update(state, step)
-    assert float(outcome.nis) > 50 and bool(outcome.accepted) == accepted
-    moved = float(jnp.linalg.norm((made.residual @ made.core)[OFFSET]))
-    assert bool(outcome.tested) and (moved > 1.0 if corrected else moved < 0.01)

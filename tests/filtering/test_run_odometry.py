@@ -46,30 +46,6 @@ def program(config):
     return jax.jit(run)
 
 
-def test_a_repeated_run_is_the_one_with_the_other_noise():
-    """Where the network says the same whatever it sees."""
-    gyro, accel = recording(0)
-    noise = NOISE._replace(measurement_scale=3.0, std_factor=(2.0, 1.0, 0.5))
-
-    def constant(windows):
-        return Prediction(
-            jnp.array([[0.3, -0.1, 0.02]], jnp.float32), jnp.full((1, 3), -2.0, jnp.float32), {}
-        )
-
-    run = jax.jit(
-        lambda noise: filtering.run_odometry(constant, start(), gyro, accel, CONFIG, noise)[1]
-    )
-    before = run(noise)
-    other = noise._replace(gyro_density=1e-2, std_factor=(1.5, 0.7, 2.0))
-    given = before.given(noise)
-    _, found = filtering.run_filter(start(), gyro, accel, *given, CONFIG, other, frame="own")
-    wanted = run(other)
-    for name in ("position", "rotation", "nis", "measurement_std", "log_likelihood"):
-        ours, theirs = getattr(found, name), getattr(wanted, name)
-        np.testing.assert_allclose(ours, theirs, rtol=1e-9, atol=1e-12, err_msg=name)
-    assert np.abs(wanted.position - before.position).max() > 1e-3
-
-
 def predict_numpy(window):
     pooled = (np.linspace(0.5, 1.5, len(window))[:, None] * window).mean(0) @ PARAMETERS
     return pooled, np.diag(np.exp(2 * np.maximum(-2.0 + 0.1 * pooled, -4.0)))

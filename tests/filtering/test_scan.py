@@ -102,6 +102,11 @@ def assert_same(history, wanted, absolute=1e-9):
     for field in (*MEAN, "innovation", "displacement"):
         assert_close(getattr(history, field), wanted[field], absolute)
     assert_close(history.nis, wanted["nis"], 0, 1e-6)
+    measured = np.isfinite(wanted["nis"])
+    spread = wanted["innovation_covariance"][measured]
+    likelihood = np.where(measured, -0.5 * wanted["nis"], np.nan)
+    likelihood[measured] -= 0.5 * np.linalg.slogdet(2 * np.pi * spread)[1]
+    assert_close(history.log_likelihood, likelihood, 0, 1e-6)
     assert_close(history.covariance_diagonal, wanted["covariance_diagonal"], 0, 1e-7)
     sigma = np.sqrt(wanted["covariance_diagonal"])
     scale = sigma[:, :, None] * sigma[:, None, :]
