@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Float, Int
 
 from gnio_jax.apps.importing.recording import Recording, Sensor, Track, Units
 from gnio_jax.data.parsing.stamps import seconds
@@ -75,22 +76,21 @@ def read_bag(path: Path, kind: str, topics: Topics) -> Recording:
         imu = _imu_topic(bag, topics.imu)
         other = imu if topics.accel is None else _imu_topic(bag, topics.accel)
         reference, child = _reference_topic(bag, topics.reference, notes)
-        found = _collected(bag, {imu.name, other.name}, reference)
-    gyro, accel = _sensor(found, imu.name, "gyro", path), _sensor(found, other.name, "accel", path)
-    by_headers = _by_headers(found.samples[imu.name])
-    if by_headers != _by_headers(found.samples[other.name]):
+        samples, poses, mounted = _collected(bag, {imu.name, other.name}, reference)
+    of_gyro, of_accel = samples[imu.name], samples[other.name]
+    gyro, accel = of_gyro.sensor("gyro", imu.name, path), of_accel.sensor("accel", other.name, path)
+    if of_gyro.by_headers != of_accel.by_headers:
         raise InputError(
             path, f"topics {imu.name} and {other.name} have other clocks", "name other topics"
         )
-    clock = "headers" if by_headers else "bag: its headers have no time"
+    clock = "headers" if of_gyro.by_headers else "bag: its headers have no time"
     named = f"{imu.name} ({imu.count} messages)"
     named += f", accel {other.name} ({other.count} messages)" if other != imu else ""
     notes.insert(0, f"{path.name}: IMU {named}, stamped by its {clock}")
     track = None
     if reference is not None:
         try:
-            frame = found.first[imu.name].header.frame_id
-            track = _track(found, reference.name, child, frame, by_headers, path, notes)
+            track = _track(poses, mounted, reference.name, child, of_gyro, path, notes)
             track = track._replace(named=topics.reference is not None)
         except InputError as error:
             if topics.reference is not None:
@@ -210,13 +210,9 @@ def _decoder(encoding: str) -> Callable[[bytes, str], Any]:
 
 
 def _imu_topic(bag: _Bag, name: str | None) -> _Topic:
-    found = [topic for topic in bag.topics.values() if topic.type == IMU and topic.count]
     if name is not None:
-        chosen = _named(bag, name)
-        if chosen.type != IMU:
-            remedy = f"IMU topics: {_listed(found)}"
-            raise InputError(bag.path, f"topic {name} is {chosen.type}, no IMU", remedy)
-        return chosen
+        return _named(bag, name, (IMU,), "IMU")
+    found = _of_types(bag, (IMU,))
     if not found:
         remedy = f"its topics: {_listed(bag.topics.values())}"
         raise InputError(bag.path, "has no topic of sensor_msgs/Imu", remedy)
@@ -226,36 +222,40 @@ def _imu_topic(bag: _Bag, name: str | None) -> _Topic:
     return found[0]
 
 
-def _named(bag: _Bag, name: str) -> _Topic:
-    if name not in bag.topics:
-        remedy = f"its topics: {_listed(bag.topics.values())}"
-        raise InputError(bag.path, f"has no topic '{name}'", remedy)
-    return bag.topics[name]
-
-
-def _listed(topics: Iterable[_Topic]) -> str:
-    names = [f"{topic.name} ({topic.type.replace('/msg/', '/')})" for topic in topics]
-    return shortened(", ".join(names) or "none", 400)
-
-
 def _reference_topic(bag: _Bag, name: str | None, notes: list[str]) -> tuple[_Topic | None, str]:
     """The topic, and the child frame that is asked for ("" for any)."""
-    found = [t for t in bag.topics.values() if t.type in (*POSES, *TRANSFORMS) and t.count]
     if name is not None:
         topic, _, child = name.partition(":")
-        chosen = _named(bag, topic)
-        if chosen.type not in (*POSES, *TRANSFORMS):
-            remedy = f"poses: {_listed(found)}"
-            raise InputError(bag.path, f"topic {topic} is {chosen.type}, no pose", remedy)
-        return chosen, child
-    own = [topic for topic in found if topic.type in POSES]
-    if len(own) == 1:
-        return own[0], ""
+        return _named(bag, topic, (*POSES, *TRANSFORMS), "pose"), child
+    poses, found = _of_types(bag, POSES), _of_types(bag, (*POSES, *TRANSFORMS))
+    if len(poses) == 1:
+        return poses[0], ""
     if found:
         notes.append(
             f"{bag.path.name}: no reference is taken; --reference-topic may be {_listed(found)}"
         )
     return None, ""
+
+
+def _of_types(bag: _Bag, types: tuple[str, ...]) -> list[_Topic]:
+    return [topic for topic in bag.topics.values() if topic.type in types and topic.count]
+
+
+def _named(bag: _Bag, name: str, types: tuple[str, ...], what: str) -> _Topic:
+    """The topic of this name, which must be of one of the types."""
+    if name not in bag.topics:
+        remedy = f"its topics: {_listed(bag.topics.values())}"
+        raise InputError(bag.path, f"has no topic '{name}'", remedy)
+    chosen = bag.topics[name]
+    if chosen.type not in types:
+        remedy = f"{what} topics: {_listed(_of_types(bag, types))}"
+        raise InputError(bag.path, f"topic {name} is {chosen.type}, no {what}", remedy)
+    return chosen
+
+
+def _listed(topics: Iterable[_Topic]) -> str:
+    names = [f"{topic.name} ({topic.type.replace('/msg/', '/')})" for topic in topics]
+    return shortened(", ".join(names) or "none", 400)
 
 
 # --- messages
@@ -266,6 +266,8 @@ class _Pose(NamedTuple):
 
     stamp: int
     """ns, 0 where the message has none."""
+    logged: int
+    """Stamp of the bag, ns."""
     parent: str
     child: str
     """Frame of the body, "" where the message does not say."""
@@ -273,38 +275,70 @@ class _Pose(NamedTuple):
     """Position m, quaternion wxyz."""
 
 
-class _Collected(NamedTuple):
-    """What is kept of a bag: numbers, since decoded messages take a kilobyte each."""
+class _Imu(NamedTuple):
+    """An IMU topic: numbers, since decoded messages take a kilobyte each."""
 
-    first: dict[str, Any]
-    """IMU topic -> its first message."""
-    samples: dict[str, list[tuple[Any, ...]]]
-    """IMU topic -> (stamp of the header ns, stamp of the bag ns, gyro rad/s, accel) of each."""
-    poses: list[tuple[int, _Pose]]
-    """Stamp of the bag, ns, and pose of each pose of the reference."""
-    mounted: dict[tuple[str, str], SensorPose]
-    """(parent, child) -> the child in the parent, of static transforms."""
+    first: Any
+    """Its first message."""
+    headers: Int[np.ndarray, " n"]
+    """Stamps of the headers, ns."""
+    logged: Int[np.ndarray, " n"]
+    """Stamps of the bag, ns."""
+    values: Float[np.ndarray, "n 6"]
+    """Gyro rad/s, accel."""
+
+    @property
+    def by_headers(self) -> bool:
+        """Stamped by its headers; else they are empty, and the bag's stamps are taken."""
+        return bool(self.headers.all())
+
+    def sensor(self, name: str, topic: str, path: Path) -> Sensor:
+        """Its gyro or accel, which the topic must have."""
+        first = self.first
+        gyro, accel = first.angular_velocity_covariance, first.linear_acceleration_covariance
+        if (gyro if name == "gyro" else accel)[0] == -1.0:
+            problem = f"topic {topic} says that it has no {name}"
+            raise InputError(path, problem, "name another topic")
+        stamps = self.headers if self.by_headers else self.logged
+        axes = slice(0, 3) if name == "gyro" else slice(3, 6)
+        return Sensor(name, path, stamps, self.values[:, axes])
 
 
-def _collected(bag: _Bag, imus: set[str], reference: _Topic | None) -> _Collected:
+_Mounted = dict[tuple[str, str], SensorPose]
+"""(parent, child) -> the child in the parent, of static transforms."""
+
+
+def _collected(
+    bag: _Bag, imus: set[str], reference: _Topic | None
+) -> tuple[dict[str, _Imu], list[_Pose], _Mounted]:
+    """(the IMU topics, the poses of the reference, the static transforms)."""
     static = {name for name in bag.topics if name.endswith("tf_static")}
     of_poses = set() if reference is None else {reference.name}
-    found = _Collected({}, {name: [] for name in imus}, [], {})
+    first: dict[str, Any] = {}
+    rows: dict[str, list[tuple[Any, ...]]] = {name: [] for name in imus}
+    poses: list[_Pose] = []
+    mounted: _Mounted = {}
     for topic, logged, message in bag.messages(imus | static | of_poses):
         if topic in imus:
-            found.first.setdefault(topic, message)
+            first.setdefault(topic, message)
             rate, force = message.angular_velocity, message.linear_acceleration
             values = rate.x, rate.y, rate.z, force.x, force.y, force.z
-            found.samples[topic].append((_stamp(message), logged, *values))
+            rows[topic].append((_stamp(message), logged, *values))
         if topic in of_poses:
-            found.poses.extend((logged, pose) for pose in _poses(message))
+            poses.extend(_poses(message, logged))
         if topic in static:
-            for pose in _poses(message):
+            for pose in _poses(message, logged):
                 place, turn = np.array(pose.values[:3]), np.array(pose.values[3:])
                 if abs(np.linalg.norm(turn) - 1.0) < UNIT_NORM_TOLERANCE:  # else it joins nothing
                     frames = _frame(pose.parent), _frame(pose.child)
-                    found.mounted[frames] = SensorPose(rotations(turn), place)
-    return found
+                    mounted[frames] = SensorPose(rotations(turn), place)
+    found = {}
+    for topic in imus:
+        if not rows[topic]:
+            raise InputError(bag.path, f"topic {topic} has no messages", "record it anew")
+        headers, logged, *values = (np.array(column) for column in zip(*rows[topic], strict=True))
+        found[topic] = _Imu(first[topic], headers, logged, np.stack(values, axis=1).astype(float))
+    return found, poses, mounted
 
 
 def _stamp(message: Any) -> int:
@@ -313,11 +347,11 @@ def _stamp(message: Any) -> int:
     return message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
 
 
-def _poses(message: Any) -> Iterator[_Pose]:
+def _poses(message: Any, logged: int) -> Iterator[_Pose]:
     """Those of a message of any type of `POSES` and `TRANSFORMS`."""
     if hasattr(message, "transforms"):
         for one in message.transforms:
-            yield from _poses(one)
+            yield from _poses(one, logged)
         return
     parent = message.header.frame_id if hasattr(message, "header") else ""
     child = getattr(message, "child_frame_id", "")
@@ -329,60 +363,40 @@ def _poses(message: Any) -> Iterator[_Pose]:
     else:
         place, turn = pose.position, pose.orientation
     values = place.x, place.y, place.z, turn.w, turn.x, turn.y, turn.z
-    yield _Pose(_stamp(message), parent, child, values)
-
-
-def _by_headers(samples: list[tuple[Any, ...]]) -> bool:
-    return all(sample[0] for sample in samples)
-
-
-def _sensor(found: _Collected, topic: str, sensor: str, path: Path) -> Sensor:
-    """The samples of a topic, which must have this sensor."""
-    if not found.samples[topic]:
-        raise InputError(path, f"topic {topic} has no messages", "record it anew")
-    first = found.first[topic]
-    gyro, accel = first.angular_velocity_covariance, first.linear_acceleration_covariance
-    if (gyro if sensor == "gyro" else accel)[0] == -1.0:
-        raise InputError(path, f"topic {topic} says that it has no {sensor}", "name another topic")
-    headers, logged, *values = zip(*found.samples[topic], strict=True)
-    stamps = headers if _by_headers(found.samples[topic]) else logged
-    axes = values[:3] if sensor == "gyro" else values[3:]
-    rows = np.array(axes, dtype=np.float64).T
-    return Sensor(sensor, path, np.array(stamps, dtype=np.int64), rows)
+    yield _Pose(_stamp(message), logged, parent, child, values)
 
 
 # --- the reference
 
 
 def _track(
-    found: _Collected,
+    poses: list[_Pose],
+    mounted: _Mounted,
     topic: str,
     child: str,
-    imu: str,
-    by_headers: bool,
+    imu: _Imu,
     path: Path,
     notes: list[str],
 ) -> Track:
-    """The poses of a topic, or of its frame `child`, as those of the frame `imu`; the IMU is
-    stamped `by_headers`, or by the bag."""
-    rows = [(logged, pose) for logged, pose in found.poses if child in ("", pose.child)]
-    children = sorted({pose.child for _, pose in found.poses})
+    """The poses of a topic, or of its frame `child`, as those of the IMU's frame."""
+    rows = [pose for pose in poses if child in ("", pose.child)]
+    children = sorted({pose.child for pose in poses})
     if not rows or (len(children) > 1 and not child):
         raise InputError(
             path,
             f"topic {topic} moves the frames {', '.join(children) or 'none'}",
             f"name one: --reference-topic {topic}:FRAME",
         )
-    stamped = by_headers and all(pose.stamp for _, pose in rows)
-    stamps = np.array([pose.stamp if stamped else logged for logged, pose in rows], dtype=np.int64)
-    if by_headers and not stamped:
+    stamped = imu.by_headers and all(pose.stamp for pose in rows)
+    stamps = np.array([pose.stamp if stamped else pose.logged for pose in rows], dtype=np.int64)
+    if imu.by_headers and not stamped:
         notes.append(
             f"{path.name}: {topic} has no stamps of its own and is stamped by the bag, the IMU by "
             "its headers: the reference is off by the delay between these two clocks"
         )
     name = f"{topic}:{child}" if child else topic
     source, start = f"{path}: topic {name}", int(stamps.min())
-    values = np.array([pose.values for _, pose in rows], dtype=np.float64)
+    values = np.array([pose.values for pose in rows], dtype=np.float64)
     seen = finite_rows(values)
     time, values = seconds(stamps[seen], start), values[seen]
     if len(time) < SHORTEST_RUN:
@@ -393,17 +407,17 @@ def _track(
         raise InputError(source, f"its poses come at {rate:.3g} Hz", remedy)
     wxyz = check_unit_norm(values[:, 3:], np.ones(len(time), dtype=bool), "orientation", source)
     noisy = rate >= FAST_TRACKER
-    poses = Poses(time, rotations(wxyz), values[:, :3], noisy=noisy, source=source)
-    body = rows[0][1].child
-    place = _place(body, imu, found.mounted)
+    given = Poses(time, rotations(wxyz), values[:, :3], noisy=noisy, source=source)
+    body, frame = rows[0].child, imu.first.header.frame_id
+    place = _place(body, frame, mounted)
     if place is None:
         notes.append(
             f"{path.name}: {name} gives the poses of '{body or 'an unnamed frame'}', the IMU is in "
-            f"'{imu}', and no static transform joins them: taken as one"
+            f"'{frame}', and no static transform joins them: taken as one"
         )
-    elif body != imu:
-        notes.append(f"{path.name}: {name} moved from '{body}' to '{imu}' by /tf_static")
-    return Track(name, moved_to(place or SensorPose(), poses), Fraction(start, 10**9))
+    elif body != frame:
+        notes.append(f"{path.name}: {name} moved from '{body}' to '{frame}' by /tf_static")
+    return Track(name, moved_to(place or SensorPose(), given), Fraction(start, 10**9))
 
 
 def _frame(name: str) -> str:
@@ -411,7 +425,7 @@ def _frame(name: str) -> str:
     return name.lstrip("/")
 
 
-def _place(body: str, imu: str, mounted: dict[tuple[str, str], SensorPose]) -> SensorPose | None:
+def _place(body: str, imu: str, mounted: _Mounted) -> SensorPose | None:
     """The frame `imu` in the frame `body`, along the static transforms; None where they do not
     join."""
     reached, todo = {_frame(body): SensorPose()}, [_frame(body)]

@@ -127,7 +127,7 @@ def test_topics_are_chosen_and_named(tmp_path):
     compare_imu(sequence)
     assert len(sequence.time) == 1200 and not sequence.valid.any()
     given = {"imu_topic": "/imu/data", "reference_topic": "/chatter"}
-    refused(path, "topic /chatter is std_msgs/msg/String, no pose", **given)
+    refused(path, "/chatter is std_msgs/msg/String, no pose; pose topics: /a", **given)
     compare_reference(import_recording(path, **given | {"reference_topic": "/b"})[0], INNER, 2e-3)
 
 
