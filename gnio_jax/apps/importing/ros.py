@@ -125,9 +125,19 @@ class _Bag(NamedTuple):
 def _opened(path: Path, kind: str) -> Iterator[_Bag]:
     require_packages(path, "bags", "rosbags", "mcap")
     with ExitStack() as stack:
-        with parsed_as(path, KINDS[kind]):
+        with _reading(path, kind):
             bag = _mcap(path, stack) if kind == "mcap" else _rosbag(path, kind, stack)
         yield bag
+
+
+@contextmanager
+def _reading(path: Path, kind: str) -> Iterator[None]:
+    """What the libraries raise within is damage of the file: rosbags asserts what it expects."""
+    with parsed_as(path, KINDS[kind]):
+        try:
+            yield
+        except AssertionError as error:
+            raise ValueError(f"unexpected content {error}".strip()) from error
 
 
 def _rosbag(path: Path, kind: str, stack: ExitStack) -> _Bag:
@@ -137,7 +147,7 @@ def _rosbag(path: Path, kind: str, stack: ExitStack) -> _Bag:
     decode = _decoder("ros1" if kind == "rosbag1" else "cdr")
 
     def messages(names: Collection[str]) -> Iterator[tuple[str, int, Any]]:
-        with parsed_as(path, KINDS[kind]):
+        with _reading(path, kind):
             chosen = [one for one in reader.connections if one.topic in names]
             for connection, time, data in reader.messages(connections=chosen):
                 yield connection.topic, time, decode(data, connection.msgtype)
@@ -177,7 +187,7 @@ def _mcap(path: Path, stack: ExitStack) -> _Bag:
                     "record it as ROS 2 (cdr) or ROS 1 messages",
                 )
         decoders = {name: _decoder(encodings[name]) for name in names}
-        with parsed_as(path, KINDS["mcap"]):
+        with _reading(path, "mcap"):
             for _, channel, message in reader.iter_messages(names):
                 topic = channel.topic
                 decoded = decoders[topic](message.data, topics[topic].type)

@@ -180,6 +180,16 @@ def test_a_bag_cut_short_is_one_line(tmp_path, kind, kept):
     refused(path, f"{path.name}: (cannot be read as a ROS . bag, it may be|is) cut short")
 
 
+def test_a_bag_whose_index_counts_wrongly_is_one_line(tmp_path):
+    """`rosbags` asserts what it expects of an index."""
+    path = write(tmp_path, "rosbag1", imu(Maker("rosbag1"), seconds=2.0))
+    data = bytearray(path.read_bytes())
+    index = data.index(b"op=\x04")  # a record of this kind, in whose header the count stands
+    data[data.index(b"count=", index - 60) + 6] ^= 1
+    path.write_bytes(data)
+    refused(path, "walk.bag: cannot be read as a ROS 1 bag, it may be cut short")
+
+
 class Bug(Exception):
     """Of ours."""
 
