@@ -80,7 +80,7 @@ def read(path: Path) -> Recorded:
 
 def create_tracker(run, recorded: Recorded, rest_seconds: float):
     """The compiled tracker of a trained run, which starts from rest."""
-    from gnio_jax import live
+    from gnio_jax.apps import live
 
     try:
         return live.create_tracker(run, 1 / recorded.interval, rest_seconds)

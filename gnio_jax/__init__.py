@@ -19,7 +19,6 @@ __all__ = [
     "filtering",
     "geometry",
     "interop",
-    "live",
     "load_pretrained",
     "models",
     "tables",

@@ -20,12 +20,11 @@ ROOMS = {
     "interop": BASE | {"models", "training"},
     "tables": BASE | {"data", "models", "training", "evaluation", "calibration"},
     "tracking": BASE | {"data", "models", "filtering", "training", "evaluation", "apps"},
-    "live": BASE | {"apps", "data", "models", "filtering", "training", "evaluation", "tracking"},
     "apps": BASE
     | {"data", "models", "filtering", "training", "evaluation", "calibration", "tracking"},
     "commands": BASE
     | {"data", "filtering", "training", "evaluation", "calibration", "interop"}
-    | {"tables", "apps", "tracking", "live"},
+    | {"tables", "apps", "tracking"},
     **{name: BASE for name in BASE},
 }
 """Rooms and top-level modules, and what each may import of the package besides itself."""
@@ -41,7 +40,7 @@ LIBRARIES = {
     "onnxruntime": ONNX,
     "optax": {"training"},
     "orbax": {"training.checkpoint"},
-    "rerun": {"evaluation.exporting.rerun_file", "live.rerun_stream"},
+    "rerun": {"evaluation.exporting.rerun_file", "apps.rerun"},
     "rosbags": {"apps.importing.ros", "evaluation.exporting.ros"},
     "rich.console.Console": {"commands"},
     "rich.progress": {"commands"},

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import io
+import math
 import signal
+import socket
 import sys
 import threading
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -21,6 +24,8 @@ from gnio_jax.errors import InputError
 from gnio_jax.files import check_writable
 
 UDP = "udp:"
+DRAWN_EVERY = 0.125
+"""s. A drawing looks at the whole path: one for each pose would fall behind a long stream."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +33,7 @@ class LiveOptions:
     """What `gnio live` is asked for."""
 
     source: tyro.conf.Positional[str] = "-"
-    """- for standard input, udp:PORT on this machine, or a recording."""
+    """- for standard input; udp:PORT from this machine, udp:0.0.0.0:PORT from any; a recording."""
     weights: str | None = None
     """Name, package or run folder; by default the network that comes with gnio-jax, else the newest
     run below runs/."""
@@ -41,79 +46,175 @@ class LiveOptions:
     accel_unit: Literal["m/s2", "g", "mg"] | None = None
     """Unit of the accelerometer; m/s2 of a stream, of a recording what it says."""
     imu_rate: float | None = None
-    """Samples per second that will come, Hz; by default the network's, or the recording's."""
+    """Samples per second that will come, Hz; by default it is measured."""
     rest_seconds: float = 1.0
     """How long the device lies still at the start, s."""
     speed: float = 1.0
     """Of a recording: how many times as fast as it was taken; 0 as fast as can be."""
     silence: float | None = None
-    """Of datagrams: end after so many seconds without one."""
+    """Of datagrams: end when after the first nothing has come for so many seconds."""
 
 
 def live(asked: LiveOptions, _call: options.Call) -> None:
     """Follow an IMU live: where its carrier is now.
 
     A stream has a line for each sample, time,gyro x,y,z,accel x,y,z, or a JSON object with time,
-    gyro and accel, in s, rad/s and m/s², +9.81 upwards at rest. Keep the device still for the first
-    second: tilt, velocity and the gyro's bias are taken from it. In a terminal the path is drawn,
-    elsewhere a line is printed each second. Ctrl-C or SIGTERM ends it (status 130, 143); the
-    trajectory is written all the same. A recording whose units or columns must be named goes
-    through gnio data import first.
+    gyro and accel, in s, rad/s and m/s², +9.81 upwards at rest. Its rate is measured. When it says
+    ready, keep the device still for a second: tilt, velocity and the gyro's bias are taken from
+    it. In a terminal the path is drawn, elsewhere a line is printed each second. Ctrl-C or SIGTERM
+    ends it (status 130, 143); the trajectory is written all the same. A recording whose units or
+    columns must be named goes through gnio data import first.
 
     examples:
       phone_stream | {prog} --weights runs/mine      lines on standard input
-      {prog} udp:5555 --imu-rate 200                 the same lines as datagrams on this machine
+      {prog} udp:0.0.0.0:5555                        the same lines as datagrams, from a phone
       {prog} walk.zip --speed 4                      a recording or bag, four times as fast
     """
+    inbox = _listen(asked) if asked.source.startswith(UDP) else None  # before all that takes time
+    if asked.speed < 0:
+        raise InputError("--speed", f"must not be negative, found {asked.speed:g}")
     import jax  # late: mistakes do not wait for it
 
-    from gnio_jax import live as following
-    from gnio_jax.apps import packages
-    from gnio_jax.live import rerun_stream
+    from gnio_jax.apps import live as following
+    from gnio_jax.apps import packages, rerun
+    from gnio_jax.apps.importing import read_imported
 
     jax.config.update("jax_enable_x64", True)  # for the filter; the network states its float32
-    weights = packages.choose(asked.weights)
-    source, rate, notes = _source(asked)
+    datagrams = following.Datagrams(inbox, asked.source) if inbox else None
     if asked.out:
         check_writable(asked.out)  # or the trajectory would be lost at the end
     if asked.rerun:
-        rerun_stream.check(asked.rerun)
-    found = following.Follower(following.longest_untold(weights.run, rate))
+        rerun.check(asked.rerun)
+    weights = packages.choose(asked.weights)
+    run, output = weights.run, console.stdout()
+
+    def say(line: str) -> None:
+        output.print(line, soft_wrap=True)
+
+    say(f"following {asked.source} with {weights.name}; Ctrl-C ends it")
+    stream, rate = None, 0.0
+    if datagrams is None and asked.source != "-":
+        stated = ImportOptions(gyro_unit=asked.gyro_unit, accel_unit=asked.accel_unit)
+        sequence, notes, warned = read_imported(Path(asked.source), stated)
+        for note in (*warned, *notes):
+            say(f"  {note}")
+        stream = following.from_recording(sequence, asked.speed)
+        rate = asked.imu_rate or 1 / float(np.median(np.diff(sequence.time)))
     with console.terminal() as terminal:
         terminal.progress("compiling", 0.0)
         try:
-            tracker = following.create_tracker(weights.run, rate, asked.rest_seconds)
+            tracker = following.create_tracker(run, rest_seconds=asked.rest_seconds)
         except ValueError as error:
-            raise InputError("--imu-rate or --rest-seconds", str(error)) from None
-    output = console.stdout()
-    output.print(f"following {source.name} with {weights.name}; Ctrl-C ends it", soft_wrap=True)
-    for note in notes:
-        output.print(f"  {note}", soft_wrap=True)
+            raise InputError("--rest-seconds", str(error)) from None
+    found = following.Followed()
+
+    def begin(imu_rate: float) -> None:
+        following.expect(tracker, found, run, imu_rate)
+        own = run.config.data.rate
+        lower = f"; the network was trained at {own:g} Hz, and what lies between is guessed"
+        say(f"  samples come at {imu_rate:.4g} Hz{lower if imu_rate < 0.99 * own else ''}")
+
+    if stream is None:
+        scale = following.scale_of(asked.gyro_unit, asked.accel_unit)
+        say(f"ready: hold still now, for {asked.rest_seconds:g} s")
+        if datagrams is None:
+            if isinstance(sys.stdin, io.TextIOWrapper):
+                sys.stdin.reconfigure(errors="replace")  # noise on a line is no text
+            stream = following.lines_of(sys.stdin, scale=scale)
+        else:
+            at_rest = following.begins_at_rest(run)
+            stream = datagrams.source(scale, asked.silence, say, at_rest)
+        stream = following.measured(stream, begin, asked.imu_rate)
+    else:
+        following.expect(tracker, found, run, rate)
     stopped: list[tuple[str, int]] = []
     with contextlib.ExitStack() as running:
-        stream = running.enter_context(rerun_stream.streaming(asked.rerun)) if asked.rerun else None
-        show = running.enter_context(following.shown(output))
+        sent = running.enter_context(rerun.streaming(asked.rerun)) if asked.rerun else None
+        show = running.enter_context(_shown(output))
         running.enter_context(_signals(stopped))
 
         def on_pose(found: Any) -> None:
-            if stream is not None:
-                stream.add(found.poses[-1])
+            if sent is not None:
+                sent.add(found.pose)
             show(found)
 
-        following.follow(tracker.push, source, found, on_pose)
+        following.follow(tracker.push, stream, found, on_pose)
     for warning in found.warnings():
-        output.print(f"warning: {warning}", soft_wrap=True)
-    if found.poses:
-        output.print(following.line(found.poses), soft_wrap=True)
+        say(f"warning: {warning}")
+    if found.pose is not None:
+        say(following.line(found))
         if asked.out:
-            following.write_trajectory(asked.out, found.poses)
-            output.print(f"trajectory: {asked.out}", soft_wrap=True)
+            following.write_trajectory(asked.out, found)
+            say(f"trajectory: {asked.out}")
     for word, status in stopped:
         print(word, file=sys.stderr)
         raise SystemExit(status)
-    if not found.poses:
-        problem = f"ended before the device was still for {asked.rest_seconds:g} s"
-        raise InputError(source.name, problem, "let it run longer, or lower --rest-seconds")
+    if found.pose is None:
+        raise _no_start(found, stream.name, asked.rest_seconds)
+
+
+def _listen(asked: LiveOptions) -> socket.socket:
+    """The socket of udp:PORT, which this machine alone reaches, or of udp:ADDRESS:PORT."""
+    host, _, port = asked.source.removeprefix(UDP).rpartition(":")
+    if not (port.isascii() and port.isdecimal() and 0 < int(port[:6]) < 2**16):
+        raise InputError(asked.source, "names no port", "write udp:5555 or udp:0.0.0.0:5555")
+    if asked.silence is not None and not 0 <= asked.silence <= threading.TIMEOUT_MAX:
+        raise InputError("--silence", f"{asked.silence:g} s is no time to wait")
+    inbox = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    try:
+        inbox.bind((host or "127.0.0.1", int(port)))
+    except OSError as error:
+        inbox.close()
+        problem = f"cannot listen there ({error})"
+        raise InputError(asked.source, problem, "choose another port or address") from None
+    return inbox
+
+
+def _no_start(found: Any, name: str, rest_seconds: float) -> InputError:
+    """Why there is no pose."""
+    if found.samples == 0:
+        return InputError(name, "ended without a single sample", "is it sent to this place?")
+    seconds, samples = found.last - found.first, found.samples
+    problem = f"ended after {samples} samples in {seconds:.1f} s, before {rest_seconds:g} s of rest"
+    remedy = "let it run longer, or lower --rest-seconds"
+    if seconds > 2 * rest_seconds:
+        problem = f"has no {rest_seconds:g} s without a missing sample in {seconds:.1f} s"
+        remedy = "send every sample, or lower --rest-seconds"
+    return InputError(name, problem, remedy)
+
+
+@contextlib.contextmanager
+def _shown(output: Any) -> Iterator[Callable[[Any], None]]:
+    """What is called after each clone step: it draws on the `rich` console of a terminal, and
+    prints a line each second on another one."""
+    from gnio_jax.apps import live as following
+
+    shown = -math.inf
+
+    def print_each_second(found: Any) -> None:
+        nonlocal shown
+        if found.pose.time >= shown + 1.0 - 1e-6:
+            output.print(following.line(found), soft_wrap=True)
+            shown = found.pose.time
+
+    if not output.is_terminal:
+        yield print_each_second
+        return
+    from rich.live import Live
+    from rich.text import Text
+
+    with Live(console=output, refresh_per_second=8, transient=True) as screen:
+
+        def draw(found: Any) -> None:
+            nonlocal shown
+            if time.monotonic() - shown < DRAWN_EVERY:
+                return
+            columns, rows = max(10, output.width - 2), max(5, output.height - 4)
+            drawn = following.drawing(found.trajectory.position, columns, rows)
+            screen.update(Text(f"{drawn}\n{following.line(found)}"))
+            shown = time.monotonic()
+
+        yield draw
 
 
 @contextlib.contextmanager
@@ -127,32 +228,3 @@ def _signals(stopped: list[tuple[str, int]]) -> Iterator[None]:
         if leaving.code != 128 + signal.SIGTERM:
             raise
         stopped.append(("terminated", 128 + signal.SIGTERM))
-
-
-def _source(asked: LiveOptions) -> tuple[Any, float | None, tuple[str, ...]]:
-    """Where samples come from, their rate where it is known, and what was assumed of them."""
-    from gnio_jax import live as following
-
-    scale = following.scale_of(asked.gyro_unit, asked.accel_unit)
-    if asked.source == "-":
-        if isinstance(sys.stdin, io.TextIOWrapper):
-            sys.stdin.reconfigure(errors="replace")  # noise on a line is no text
-        lines = following.lines_of(sys.stdin, scale=scale)
-        return following.checked_units(lines), asked.imu_rate, ()
-    if asked.source.startswith(UDP):
-        port = asked.source.removeprefix(UDP)
-        if not (port.isdecimal() and int(port[:6]) > 0):
-            raise InputError(asked.source, "names no port", "write udp:5555")
-        if asked.silence is not None and not 0 <= asked.silence <= threading.TIMEOUT_MAX:
-            raise InputError("--silence", f"{asked.silence:g} s is no time to wait")
-        messages = following.datagrams(int(port), asked.silence, scale)
-        return following.checked_units(messages), asked.imu_rate, ()
-    if asked.speed < 0:
-        raise InputError("--speed", f"must not be negative, found {asked.speed:g}")
-    from gnio_jax.apps.importing import read_imported
-
-    stated = ImportOptions(gyro_unit=asked.gyro_unit, accel_unit=asked.accel_unit)
-    sequence, notes, warned = read_imported(Path(asked.source), stated)
-    rate = 1 / float(np.median(np.diff(sequence.time)))
-    played = following.from_recording(sequence, asked.speed)
-    return played, asked.imu_rate or rate, (*warned, *notes)

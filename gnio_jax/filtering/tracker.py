@@ -155,6 +155,11 @@ class Tracker:
         if state is None:
             self._core = None
 
+    def expect(self, imu_rate: float, hole: float | None = None) -> None:
+        """Take samples of another `imu_rate` and `hole`, before the first of them: a stream may
+        tell its rate only when it has begun. Nothing is compiled again."""
+        self._stream = Stream(create_grid(self._config.dt, hole, imu_rate))
+
     def push(self, time: Any, gyro: Any, accel: Any) -> Pose | None:
         """Take one sample: time s, gyro (3,) rad/s, accel (3,) m/s², raw, in the body frame; a
         value that is not finite: missing.

@@ -11,8 +11,7 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Imu
 from tf2_ros import TransformBroadcaster
 
-from gnio_jax import live
-from gnio_jax.apps import packages
+from gnio_jax.apps import live, packages
 from gnio_odometry.bridge import Bridge
 
 SENSOR_DATA = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)

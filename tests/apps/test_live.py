@@ -3,20 +3,21 @@
 import dataclasses
 import io
 import signal
+import socket
 import sys
+import time
+import tracemalloc
 
 import numpy as np
 import pytest
 
-from gnio_jax import live
-from gnio_jax.apps import packages
+from gnio_jax.apps import live, packages, rerun
 from gnio_jax.commands import app, console
 from gnio_jax.config import DataConfig, ModelConfig, TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation.trajectory import read_tum
 from gnio_jax.filtering import ConsideredStd, Pose, Tracker
 from gnio_jax.filtering import tracker as trackers
-from gnio_jax.live import following, rerun_stream
 from gnio_jax.types import Sequence
 from tests.support import known_walk, tiny_run
 from tests.support.filter_settings import changed
@@ -84,8 +85,8 @@ def test_a_stream_gives_the_trackers_poses(gnio, run, recorded, tmp_path):
     assert sum(line.lstrip()[0].isdigit() for line in told.splitlines()) == 6
 
     tracker, expected = live.create_tracker(packages.load_pretrained(run), RATE), []
-    for time, gyro, accel in zip(*recorded, strict=True):
-        pose = tracker.push(time, gyro, accel)
+    for sample in zip(*recorded, strict=True):
+        pose = tracker.push(*sample)
         expected += [] if pose is None else [pose]
     found = read_tum(out)
     np.testing.assert_allclose(found.time, [pose.time for pose in expected], atol=1e-8)
@@ -102,10 +103,20 @@ def test_the_tracker_of_a_calibrated_run_considers_what_its_track_does(run, monk
         passed.append(considered)
         return Tracker.__new__(Tracker)
 
-    monkeypatch.setattr(following, "Tracker", noted)
+    monkeypatch.setattr(live, "Tracker", noted)
     live.create_tracker(calibrated, RATE)
     live.create_tracker(found, RATE)
     assert passed == [ConsideredStd(0.0, 0.1, np.pi / 2, 0.0), None]
+
+
+def nowhere():
+    zero = np.zeros(3)
+    return Pose(0.0, np.eye(3), zero, zero, zero, zero, np.eye(15), 1.0, 1.0, True)
+
+
+def lengths(found):
+    """Of the gaps, s."""
+    return [length for _, length in found.gaps]
 
 
 class Refusing:
@@ -120,23 +131,23 @@ class Refusing:
     [("HTTP/1.1 400", "is no sample"), ("5,0,0,0,0,0,9", "time: must increase")],
 )
 def test_a_stream_of_nonsense_ends_with_one_line(line, problem):
-    found = live.Follower()
+    found = live.Followed()
     source = live.lines_of([line] * 500, "udp:5555")
     with pytest.raises(InputError, match=f"udp:5555: has no sample in its first 100.*{problem}"):
         live.follow(Refusing().push, source, found, lambda found: None)
-    assert found.refused == 100 and found.poses == []
+    assert found.refused == 100 and found.pose is None
 
 
 @pytest.mark.parametrize("line", ['{{"time": {}, "accel": [0, 0, 9.8]}}', "{},0,0,0.1,,,"])
 def test_a_stream_of_one_sensor_ends_with_one_line(line):
     """Also where the other one goes by a name that is not known."""
     lines = [line.format(k / 100) for k in range(3000)]
-    source, found = live.lines_of(lines, "udp:5555"), live.Follower()
+    source, found = live.lines_of(lines, "udp:5555"), live.Followed()
     with pytest.raises(InputError, match=r"udp:5555: has no sample with both sensors in its first"):
         live.follow(Clocked().push, source, found, print)
     assert found.last == pytest.approx(10.0, abs=0.2)
     whole = [f"{k / 100},0,0,0.1,0,0,9.8" for k in range(900, 1200)]
-    live.follow(Clocked().push, live.lines_of([*lines[:900], *whole]), live.Follower(), print)
+    live.follow(Clocked().push, live.lines_of([*lines[:900], *whole]), live.Followed(), print)
 
 
 class Clocked:
@@ -155,11 +166,11 @@ def test_a_clock_that_is_set_back_ends_the_stream():
     """After a glitch the samples are taken again; where no later one can be, nothing waits."""
     lines = [f"{time},0,0,0,0,0,9.81" for time in np.arange(50) / 100]
     lines = [*lines[:30], *lines[:20], *lines[30:], *lines * 100]
-    found, tracker = live.Follower(), Clocked()
+    found, tracker = live.Followed(), Clocked()
     live.follow(tracker.push, live.lines_of(lines), found, lambda found: None)
     assert tracker.stamps == [k / 100 for k in range(50)] and found.lost
     assert found.in_a_row == 1000 and found.refused == 1020
-    assert found.newest_reason.startswith("time: must increase")
+    assert found.reasons[1].startswith("time: must increase")
 
 
 def test_gaps_are_told(gnio, run, recorded):
@@ -185,33 +196,70 @@ def test_one_stamp_in_the_future_costs_its_sample_alone(run, recorded, gnio):
 def test_gaps_of_a_recording_are_told(recorded):
     time, gyro, accel = recorded
     valid = (time < 3.0) | (time > 3.5)
-    found = live.Follower(0.1)
-    found.poses.append(None)
+    found = live.Followed(0.1)
+    found.pose = nowhere()
     nothing, level = np.full_like(gyro, np.nan), np.full((len(time), 4), np.nan)
     none = np.zeros(len(time), bool)
     sequence = Sequence("walk", time, gyro, accel, level, nothing, nothing, none, imu_valid=valid)
     source = live.from_recording(sequence, speed=0.0)
     live.follow(lambda *sample: None, source, found, lambda found: None)
-    assert found.gaps == pytest.approx([0.54], abs=0.021) and found.samples == len(time)
+    assert lengths(found) == pytest.approx([0.54], abs=0.021) and found.samples == len(time)
     # What is missing at the end never ends.
-    found = live.Follower(0.1)
-    found.poses.append(None)
+    found = live.Followed(0.1)
+    found.pose = nowhere()
     source = live.from_recording(sequence._replace(imu_valid=time < 3.0), speed=0.0)
     live.follow(lambda *sample: None, source, found, lambda found: None)
-    assert found.gaps == pytest.approx([2.0], abs=0.021)
+    assert lengths(found) == pytest.approx([2.0], abs=0.021)
+
+
+def rate_of(lines, imu_rate=None, name="udp:5"):
+    """What is measured of a stream, whose samples all come through."""
+    rates = []
+    source = live.measured(live.lines_of(lines, name), rates.append, imu_rate)
+    assert len(list(source.samples)) == len(lines)
+    return rates[0] if rates else None
 
 
 def test_stamps_in_milliseconds_are_told():
     """Within the tracker's longest gap they are no mistake to it, and nothing would ever come."""
     lines = [f"{10 * k},0,0,0,0,0,9.81" for k in range(100)]
     with pytest.raises(InputError, match=r"udp:5: its samples come 10 s apart.*seconds, not in ms"):
-        live.follow(Clocked().push, live.lines_of(lines, "udp:5"), live.Follower(), print)
-    turned = [f"{10 * k},0,0,0,,," for k in range(100)]
-    with pytest.raises(InputError, match="its samples come 10 s apart"):
-        live.follow(Clocked().push, live.lines_of(turned), live.Follower(), print)
+        rate_of(lines)
     # A pause is none.
-    lines = [f"{k / 100 + 30 * (k > 5)},0,0,0,0,0,9.81" for k in range(100)]
-    live.follow(Clocked().push, live.lines_of(lines), live.Follower(), print)
+    assert rate_of([f"{k / 100 + 30 * (k > 5)},0,0,0,0,0,9.81" for k in range(100)]) is not None
+
+
+@pytest.mark.parametrize("rate", [25, 50, 66, 100, 200])
+def test_the_rate_is_measured_over_the_first_second(rate):
+    """Also where a tenth of the samples is lost, and where the stamps jitter."""
+    random = np.random.default_rng(0)
+    stamps = np.arange(3 * rate) / rate + 1.7e9
+    stamps = stamps[random.random(len(stamps)) > 0.1]
+    stamps += random.uniform(-0.1, 0.1, len(stamps)) / rate
+    lines = [f"{stamp!r},0,0,0,0,0,9.81" for stamp in stamps.tolist()]
+    assert rate_of(lines) == pytest.approx(rate, rel=0.05)
+    assert rate_of(lines, 1.2 * rate) == 1.2 * rate
+    with pytest.raises(InputError, match=r"Hz by their stamps; leave out --imu-rate .*measured"):
+        rate_of(lines, 2.0 * rate)
+
+
+@pytest.mark.parametrize("rate", [25, 40])
+def test_a_stream_slower_than_the_network_is_followed(gnio, run, rate, tmp_path):
+    """Its poses are those of the same walk at the network's own rate, as far as lines can be."""
+    found = {}
+    for each in (rate, 50):
+        time = np.arange(0, 5, 1 / each)
+        still = time[:, None] < 1.0
+        down = known_walk.force(np.array([1.0]))
+        accel = np.where(still, 9.81 * down / np.linalg.norm(down), known_walk.force(time))
+        walk = time, np.where(still, 0.0, known_walk.rate(time)), accel
+        told = gnio(as_lines(walk), "--weights", run, "--out", tmp_path / "live.txt")
+        assert f"samples come at {each} Hz" in told
+        assert ("trained at 50 Hz" in told) == (each < 50)
+        found[each] = read_tum(tmp_path / "live.txt")
+    rows = np.searchsorted(found[50].time, found[rate].time - 1e-3)
+    error = found[rate].position - found[50].position[rows]
+    assert len(rows) > 35 and np.abs(error).max() < 0.3
 
 
 def test_what_cannot_be_written_is_found_before_the_stream(gnio, capsys, run, tmp_path):
@@ -234,7 +282,8 @@ def test_noise_on_the_line_is_no_text(gnio, run, recorded, monkeypatch, tmp_path
     ("lines", "arguments", "problem"),
     [
         ([], ["udp:²"], "udp:²: names no port; write udp:5555"),
-        ([], ["udp:0"], "udp:0: names no port; write udp:5555"),
+        ([], ["udp:0.0.0.0:0"], "udp:0.0.0.0:0: names no port; write udp:5555"),
+        ([], ["udp:203.0.113.1:5555"], "udp:203.0.113.1:5555: cannot listen there"),
         ([], ["udp:5555", "--silence", "-1"], "--silence: -1 s is no time to wait"),
         ([], ["udp:nine"], "udp:nine: names no port; write udp:5555"),
         ([], ["nowhere.csv"], "nowhere.csv"),
@@ -244,7 +293,7 @@ def test_noise_on_the_line_is_no_text(gnio, run, recorded, monkeypatch, tmp_path
         (
             [],
             ["--rest-seconds", "0"],
-            "--imu-rate or --rest-seconds: rest_seconds: must be a number of",
+            "--rest-seconds: rest_seconds: must be a number of",
         ),
     ],
 )
@@ -255,15 +304,24 @@ def test_mistakes_are_one_line(gnio, capsys, run, lines, arguments, problem):
     assert told.count("\n") == 1 and problem in told
 
 
-def test_a_stream_that_ends_at_once_has_no_trajectory(gnio, capsys, run, monkeypatch):
-    monkeypatch.setattr(live, "create_tracker", lambda *_: Refusing())
+def test_a_stream_that_ends_at_once_has_no_trajectory(gnio, capsys, run):
     with pytest.raises(SystemExit, match="2"):
-        gnio(["0,0,0,0,0,0,9.81"], "--weights", run)
+        gnio([], "--weights", run)
     told = capsys.readouterr().err
-    assert told == (
-        "standard input: ended before the device was still for 1 s; "
-        "let it run longer, or lower --rest-seconds\n"
-    )
+    assert told == ("standard input: ended without a single sample; is it sent to this place?\n")
+
+
+@pytest.mark.parametrize(
+    ("samples", "problem"),
+    [(30, "ended after 30 samples in 0.6 s, before 1 s of rest"), (200, "has no 1 s without a")],
+)
+def test_a_stream_without_a_start_is_told_why(gnio, capsys, run, recorded, samples, problem):
+    lines = as_lines(recorded)[:samples]
+    if samples == 200:  # every second lacks three samples
+        lines = [line for k, line in enumerate(lines) if k % 40 > 2]
+    with pytest.raises(SystemExit, match="2"):
+        gnio(lines, "--weights", run)
+    assert f"standard input: {problem}" in capsys.readouterr().err
 
 
 def test_a_recording_is_played(gnio, run, recorded, tmp_path):
@@ -271,7 +329,7 @@ def test_a_recording_is_played(gnio, run, recorded, tmp_path):
     walk = tmp_path / "walk.csv"
     np.savetxt(walk, np.column_stack(recorded), delimiter=",", header=header, comments="")
     told = gnio([], walk, "--speed", "0", "--weights", run)
-    assert told.startswith("following walk with run") and "walked" in told
+    assert told.startswith(f"following {walk} with run") and "walked" in told
 
 
 def test_a_recording_played_gives_the_track_of_it(gnio, run, recorded, monkeypatch, tmp_path):
@@ -344,10 +402,10 @@ def test_a_gyro_that_turns_gravity_as_degrees_would_is_told():
     time = np.arange(0, 12, 0.02)
     walk = time, np.degrees(known_walk.rate(time)), known_walk.force(time)
     with pytest.raises(InputError, match=r"udp:5: its gyro looks like deg/s.*state the unit"):
-        list(live.checked_units(live.lines_of(as_lines(walk), "udp:5")).samples)
-    scale = live.scale_of("deg/s", None)
-    source = live.checked_units(live.lines_of(as_lines(walk), "udp:5", scale))
-    np.testing.assert_allclose([s.gyro for s in source.samples], known_walk.rate(time), atol=1e-9)
+        rate_of(as_lines(walk))
+    source = live.lines_of(as_lines(walk), "udp:5", live.scale_of("deg/s", None))
+    found = list(live.measured(source, print).samples)
+    np.testing.assert_allclose([s.gyro for s in found], known_walk.rate(time), atol=1e-9)
 
 
 def test_a_start_in_motion_is_told(gnio, run, recorded):
@@ -380,20 +438,28 @@ def test_what_a_diverged_filter_says_is_not_kept(gnio, run, recorded, monkeypatc
     np.testing.assert_allclose(read_tum(tmp_path / "live.txt").position[:, 0], np.arange(1, 6))
 
 
-def test_a_diverged_filter_is_not_shown(tmp_path):
-    pytest.importorskip("rerun", reason="needs rerun-sdk")
+@pytest.mark.parametrize("target", ["live.rrd", "viewer"])
+def test_a_diverged_filter_is_not_shown(tmp_path, monkeypatch, target):
+    """Of the others all are drawn, the last ones too."""
+    sdk = pytest.importorskip("rerun", reason="needs rerun-sdk")
+    path = tmp_path / "live.rrd"
+    if target == "viewer":  # what it is sent goes into the file
+        monkeypatch.setattr(sdk.RecordingStream, "spawn", lambda recording: recording.save(path))
     tracker = Diverging()
-    with rerun_stream.streaming(str(tmp_path / "live.rrd")) as stream:
+    with rerun.streaming(target if target == "viewer" else str(path)) as stream:
         for _ in range(9):
             stream.add(tracker.push(None, None, None))
-    moved = columns_of(tmp_path / "live.rrd")["/live/pose"]["Transform3D:translation"]
+    found = columns_of(path)
+    moved = found["/live/pose"]["Transform3D:translation"]
     np.testing.assert_allclose(np.array(moved)[:, 0, 0], np.arange(1, 6))
+    drawn = found["/live/estimate/0000"]["LineStrips3D:strips"][-1][0]
+    np.testing.assert_allclose(np.array(drawn)[:, 0], np.arange(1, 6))
 
 
 def test_the_file_for_rerun(gnio, run, recorded, monkeypatch, tmp_path):
     pytest.importorskip("rerun", reason="needs rerun-sdk")
-    monkeypatch.setattr(rerun_stream, "LINE_EVERY", 3)
-    monkeypatch.setattr(rerun_stream, "LONGEST_PIECE", 9)
+    monkeypatch.setattr(rerun, "LINE_EVERY", 3)
+    monkeypatch.setattr(rerun, "LONGEST_PIECE", 9)
     given = ("--weights", run, "--out", tmp_path / "live.txt", "--rerun", tmp_path / "live.rrd")
     gnio(as_lines(recorded), *given)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["live.rrd", "live.txt"]
@@ -409,3 +475,89 @@ def test_the_file_for_rerun(gnio, run, recorded, monkeypatch, tmp_path):
     line = np.concatenate([pieces[0], *(piece[1:] for piece in pieces[1:])])
     np.testing.assert_allclose(line, path.position, atol=1e-5)
     assert len(found["/live/ellipsoid"]["Ellipsoids3D:half_sizes"]) == len(path.time)
+
+
+# Datagrams
+# --------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def port():
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+def datagrams(port):
+    inbox = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    inbox.bind(("127.0.0.1", port))
+    return live.Datagrams(inbox, f"udp:{port}")
+
+
+def send(port, messages):
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        for message in messages:
+            sender.sendto(message, ("127.0.0.1", port))
+    time.sleep(0.2)  # until the thread has them
+
+
+def test_datagrams_keep_their_order_and_end_with_the_silence(port):
+    """What comes before the source is asked for is kept: a filter is compiled meanwhile."""
+    listening = datagrams(port)
+    lines = [[f"{k + j / 10},0,0,0,0,0,9.81" for j in range(3)] for k in range(5)]
+    send(port, [*("\n".join(each).encode() for each in lines), b"\xff\xfe"])
+    found = list(listening.source(silence=0.3, at_rest=lambda samples: True).samples)
+    assert [s.time for s in found[:-1]] == [k + j / 10 for k in range(5) for j in range(3)]
+    assert found[-1] is None
+
+
+@pytest.mark.parametrize("turns", [0.0, 3.0])
+def test_what_came_before_counts_where_it_rests(run, port, turns):
+    """A phone that is carried about until one is told to hold it still begins anew."""
+    stamps, said = np.arange(100) / 50, []
+    lines = [f"{t},{turns * np.sin(9 * t)},0,0,{turns * np.sin(9 * t)},0,9.81" for t in stamps]
+    listening = datagrams(port)
+    send(port, [line.encode() for line in lines])
+    at_rest = live.begins_at_rest(packages.load_pretrained(run))
+    source = listening.source(silence=0.2, say=said.append, at_rest=at_rest)
+    send(port, [b"2.0,0,0,0,0,0,9.81"])
+    assert len(list(source.samples)) == (1 if turns else 101)
+    assert said == ["100 datagrams came before, while it moved, and are left out"] * bool(turns)
+
+
+def test_it_is_said_where_nothing_comes(port, monkeypatch):
+    """The silence counts from the first datagram on."""
+    monkeypatch.setattr(live, "QUIET_SECONDS", 0.3)
+    said = []
+
+    def say(line):
+        said.append(line)
+        if len(said) == 1:
+            send(port, [b"0.0,0,0,0,0,0,9.81"])
+
+    found = list(datagrams(port).source(silence=0.5, say=say).samples)
+    assert len(found) == 1 and all(f"nothing has come on udp:{port} for" in each for each in said)
+
+
+# Hours
+# --------------------------------------------------------------------------------------------------
+
+
+def test_the_memory_of_ten_hours():
+    """Of 360,000 poses the path is kept: 64 bytes each."""
+    pose, found = nowhere(), live.Followed()
+    tracemalloc.start()
+    for k in range(20_000):
+        live._add(found, pose._replace(time=k / 10, covariance=np.eye(15)))
+    kept, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert kept < 1.3 * 64 * 20_000 and len(found.trajectory.time) == 20_000
+
+
+def test_the_way_is_that_of_a_track():
+    """Horizontal, through points 1 s apart, and up to the newest pose."""
+    found = live.Followed()
+    for k in range(26):  # to and fro within each second, and up
+        place = np.array([k / 10, 0.3 * (k % 10 == 4), k / 10])
+        live._add(found, nowhere()._replace(time=k / 10, position=place))
+    assert "walked 2.5 m" in live.line(found)

@@ -5,8 +5,8 @@ Needs `gnio-jax[rerun]`. The places are those of the file of an evaluation.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterator
-from contextlib import contextmanager
 from datetime import timedelta
 from pathlib import Path
 from typing import Any
@@ -36,22 +36,21 @@ def check(target: str) -> None:
         check_file(Path(target))
 
 
-@contextmanager
+@contextlib.contextmanager
 def streaming(target: str) -> Iterator[RerunStream]:
     """To the viewer, which is started, or into the file NAME.rrd, whole or not at all."""
     import rerun
 
     recording = rerun.RecordingStream("gnio-jax")
-    if target == VIEWER:
-        recording.spawn()
-        yield RerunStream(recording)
-        recording.flush()
-        return
-    with replacing(Path(target)) as temporary:
-        recording.save(temporary)
+    with contextlib.ExitStack() as file:
+        if target == VIEWER:
+            recording.spawn()
+        else:
+            recording.save(file.enter_context(replacing(Path(target))))
         stream = RerunStream(recording)
         yield stream
         stream.finish()
+        recording.flush()
         recording.disconnect()
 
 

