@@ -26,8 +26,8 @@ from gnio_jax import filtering  # noqa: E402
 from gnio_jax.apps import packages  # noqa: E402
 from gnio_jax.apps.onnx import accuracy, driver, export_run  # noqa: E402
 from gnio_jax.apps.onnx.flat_state import start_arrays  # noqa: E402
+from gnio_jax.apps.track import tracking_filter  # noqa: E402
 from gnio_jax.models import Network  # noqa: E402
-from gnio_jax.tracking.run import tracking_filter  # noqa: E402
 
 
 def main() -> None:

@@ -22,7 +22,6 @@ __all__ = [
     "load_pretrained",
     "models",
     "tables",
-    "tracking",
     "training",
 ]
 

@@ -19,12 +19,10 @@ ROOMS = {
     "calibration": BASE | {"data", "models", "filtering", "training", "evaluation"},
     "interop": BASE | {"models", "training"},
     "tables": BASE | {"data", "models", "training", "evaluation", "calibration"},
-    "tracking": BASE | {"data", "models", "filtering", "training", "evaluation", "apps"},
-    "apps": BASE
-    | {"data", "models", "filtering", "training", "evaluation", "calibration", "tracking"},
+    "apps": BASE | {"data", "models", "filtering", "training", "evaluation", "calibration"},
     "commands": BASE
     | {"data", "filtering", "training", "evaluation", "calibration", "interop"}
-    | {"tables", "apps", "tracking"},
+    | {"tables", "apps"},
     **{name: BASE for name in BASE},
 }
 """Rooms and top-level modules, and what each may import of the package besides itself."""
@@ -34,14 +32,14 @@ LIBRARIES = {
     "bokeh": {"evaluation.page"},
     "flax": {"models", "training", "evaluation", "interop"},
     "jax2onnx": {"apps.onnx.conversion"},
-    "mcap": {"apps.importing.ros", "evaluation.exporting.ros"},
+    "mcap": {"apps.importing.ros", "apps.export"},
     "matplotlib": {"data", "evaluation.plots", "tables.plots"},
     "onnx": ONNX,
     "onnxruntime": ONNX,
     "optax": {"training"},
     "orbax": {"training.checkpoint"},
-    "rerun": {"evaluation.exporting.rerun_file", "apps.rerun"},
-    "rosbags": {"apps.importing.ros", "evaluation.exporting.ros"},
+    "rerun": {"apps.rerun"},
+    "rosbags": {"apps.importing.ros", "apps.export"},
     "rich.console.Console": {"commands"},
     "rich.progress": {"commands"},
     "safetensors": {"apps.packages"},

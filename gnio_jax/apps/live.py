@@ -25,6 +25,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from gnio_jax.apps.track import tracking_filter
 from gnio_jax.data.parsing import units
 from gnio_jax.data.resampling import longest_bridge
 from gnio_jax.errors import InputError
@@ -37,7 +38,6 @@ from gnio_jax.filtering import Pose, Tracker
 from gnio_jax.filtering.start import level_state
 from gnio_jax.models import Network
 from gnio_jax.numerics import quaternion_from_matrix
-from gnio_jax.tracking.filter import tracking_filter
 from gnio_jax.training.checkpoint import Run
 from gnio_jax.types import FASTEST_TURN, STRONGEST_FORCE, Sequence
 

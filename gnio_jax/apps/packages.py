@@ -25,8 +25,10 @@ from safetensors.numpy import load, save
 
 from gnio_jax import config as configuration
 from gnio_jax import models
-from gnio_jax.config import TrainConfig
 from gnio_jax.errors import InputError, did_you_mean
+from gnio_jax.evaluation import report, tabulate
+from gnio_jax.evaluation.report import Report
+from gnio_jax.evaluation.statistics import summarise
 from gnio_jax.files import file_stem, fingerprint, replacing, replacing_folder
 from gnio_jax.training import checkpoint
 from gnio_jax.training.checkpoint import Run, Which
@@ -41,14 +43,8 @@ FORMAT, VERSION = "gnio-package", 2
 MANIFEST, WEIGHTS = "manifest.json", "weights.safetensors"
 LARGEST_MANIFEST, LARGEST_WEIGHTS = 2**20, 2**32
 """Bytes (ours): a zip of some megabytes may say that it unpacks to any size."""
-SHOWN = {
-    "ate_2d": ("ATE 2-D (m)", 2),
-    "rte_60s_2d": ("RTE 60 s 2-D (m)", 2),
-    "path_length_ratio_2d": ("path ratio", 2),
-    "yaw_rmse": ("yaw (°)", 1),
-    "nees_coverage_2d": ("NEES < 95 % (%)", 0),
-}
-"""Metrics of the card, with heading and digits. Networks are listed by the first."""
+SHOWN = ("ate_2d", "rte_60s_2d", "path_length_ratio_2d", "yaw_rmse", "nees_coverage_2d")
+"""Metrics of the card. Networks are listed by the first."""
 _DAMAGED = "the package is damaged: fetch or publish it again"
 
 
@@ -328,7 +324,7 @@ def publish(workdir: Path, out: Path, said: Description, which: Which = "best") 
         run.step,
         _measured(figures, run.config.dataset),
         made_by,
-        _card(said, run, made_by, figures, (workdir / "calibration.json").is_file()),
+        _card(said, run, made_by, figures, (workdir / "calibration.json").is_file()).split("\n"),
         configuration.plain(own),
         fingerprint(content),
     )
@@ -356,106 +352,90 @@ def _has_manifest(place: Path) -> bool:
         return False
 
 
-def _figures(workdir: Path) -> dict[str, dict[str, Any]]:
-    """Evaluation -> metrics.json, of every evaluation that a run holds. Raises `InputError`."""
-    found = {}
-    for path in sorted(workdir.glob("eval/*/metrics.json")):
-        try:
-            figures = json.loads(path.read_text(encoding="utf-8"))
-            for name in ("settings", "sequences", "mean", "interval", "groups"):
-                figures[name].items()
-        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-            problem = f"cannot be read ({error})"
-            raise InputError(path, problem, "evaluate again, or remove it") from None
-        found[path.parent.name] = figures
-    return found
+def _figures(workdir: Path) -> dict[str, Report]:
+    """Every evaluation that a run holds, by its folder's name. Raises `InputError`."""
+    places = sorted(path.parent for path in workdir.glob("eval/*/metrics.json"))
+    return {place.name: report.read(place) for place in places}
 
 
-def _measured(figures: dict[str, dict[str, Any]], dataset: str) -> str:
+def _measured(figures: dict[str, Report], dataset: str) -> str:
     """The error by which networks are listed, in words, of the first evaluation that has it: with
     the filter before without, on the run's own dataset before others, on a test split before
     others. Empty where none has it."""
 
     def rank(name: str) -> tuple[bool, bool, bool, int, str]:
-        how = figures[name]["settings"]
-        own, tested = how.get("dataset") == dataset, "test" in str(how.get("split"))
-        return how.get("estimator") != "ekf", not own, not tested, len(name), name
+        how = figures[name].settings
+        own, tested = how["dataset"] == dataset, "test" in how["split"]
+        return how["estimator"] != "ekf", not own, not tested, len(name), name
 
-    key = next(iter(SHOWN))
     for name in sorted(figures, key=rank):
-        if figures[name]["mean"].get(key) is not None:
-            return f"ATE 2-D is {_cell(figures[name], key)} m on {name}"
+        if (error := _cell(figures[name], SHOWN[0])) != tabulate.number(None, 0):
+            return f"{tabulate.column(SHOWN[0]).heading} is {error} m on {name}"
     return ""
 
 
-def _cell(figures: dict[str, Any], metric: str) -> str:
+def _cell(figures: Report, metric: str) -> str:
     """The mean over the sequences with its 95 % interval."""
-    value, interval = figures["mean"].get(metric), figures["interval"].get(metric)
-    _, digits = SHOWN[metric]
-    if value is None:
-        return "–"
-    low, high = interval or (None, None)
-    around = "" if low is None else f" ({low:.{digits}f} to {high:.{digits}f})"
-    return f"{value:.{digits}f}{around}"
+    found = summarise([figures.scores], metric, figures.groups)
+    digits = tabulate.column(metric).digits
+    text = tabulate.number(found.mean, digits)
+    if found.interval is None:
+        return text
+    low, high = (tabulate.number(each, digits) for each in found.interval)
+    return f"{text} ({low} to {high})"
 
 
 def _card(
-    said: Description,
-    run: Run,
-    made_by: str,
-    figures: dict[str, dict[str, Any]],
-    calibrated: bool,
-) -> list[str]:
-    """The model card, lines of Markdown."""
-    config, windows = run.config, run.config.data
-    return [
-        f"# {said.name}",
-        "",
-        f"Network `{config.model.name}` for neural inertial odometry by {made_by}: windows of "
-        f"{windows.window_seconds:g} s at {windows.rate:g} Hz, a displacement every "
-        f"{windows.stride_seconds:g} s. Epoch {run.epoch}, step {run.step}.",
-        *("", "```", f"gnio track RECORDING --weights {said.name}", "```"),
-        *(
-            "",
-            "## Data and licence",
-            "",
-            f"Trained on: {said.data}",
-            "",
-            f"Licence: {said.license}",
-        ),
-        *("", "## Recipe", "", *_recipe(said.name, config, calibrated)),
-        *("", "## Figures", "", *_table(figures)),
-        *("", "## Where it fails", ""),
-        *(f"- {each}" for each in said.fails),
-        *([] if said.fails else ["Its publisher has not said. Try it on recordings like yours."]),
-    ]
-
-
-def _recipe(name: str, config: TrainConfig, calibrated: bool) -> list[str]:
+    said: Description, run: Run, made_by: str, figures: dict[str, Report], calibrated: bool
+) -> str:
+    """The model card, Markdown."""
+    config, windows, name = run.config, run.config.data, said.name
     begun = f" --init-from runs/{Path(config.init_from).name}" if config.init_from else ""
     steps = [f"gnio train --config config.yaml --workdir runs/{name}{begun}"]
     steps += [f"gnio calibrate --workdir runs/{name}"] if calibrated else []
+    recipe = "\n".join(("```", *steps, "```"))
     considered = [each for each, std in config.filter.considered._asdict().items() if std > 0]
-    return [
-        *("```", *steps, "```", ""),
-        f"Dataset `{config.dataset}`, seed {config.seed}; `gnio weights {name} --out runs/{name}` "
-        "writes config.yaml with all settings, those of the filter as they are used. Consider "
-        f"covariance of the filter: {', '.join(considered) or 'none'}.",
+    header = ["evaluation", "sequences", "groups", *(tabulate.column(x).title for x in SHOWN)]
+    rows = [
+        [
+            place,
+            str(len(found.scores)),
+            str(len(set(found.groups.values()))),
+            *(_cell(found, metric) for metric in SHOWN),
+        ]
+        for place, found in figures.items()
     ]
+    means = "Means over sequences, with 95 % intervals over groups (people, sessions)."
+    table = f"{tabulate.markdown(header, rows)}\n{means}"
+    fails = said.fails or ("Its publisher has not said. Try it on recordings like yours.",)
+    return f"""# {name}
 
+Network `{config.model.name}` for neural inertial odometry by {made_by}: windows of \
+{windows.window_seconds:g} s at {windows.rate:g} Hz, a displacement every \
+{windows.stride_seconds:g} s. Epoch {run.epoch}, step {run.step}.
 
-def _table(figures: dict[str, dict[str, Any]]) -> list[str]:
-    """Lines of Markdown: a row per evaluation, means with their 95 % intervals."""
-    if not figures:
-        return ["The run holds no evaluation."]
-    headings = ["evaluation", "sequences", "groups", *(heading for heading, _ in SHOWN.values())]
-    rows = [headings, ["---", *["---:"] * (len(headings) - 1)]]
-    for name, found in figures.items():
-        groups = str(found["groups"].get("ate_2d", "–"))
-        cells = [_cell(found, metric) for metric in SHOWN]
-        rows.append([name, str(len(found["sequences"])), groups, *cells])
-    return [
-        *(f"| {' | '.join(row)} |" for row in rows),
-        "",
-        "Means over sequences, with 95 % intervals over groups (people, sessions).",
-    ]
+```
+gnio track RECORDING --weights {name}
+```
+
+## Data and licence
+
+Trained on: {said.data}
+
+Licence: {said.license}
+
+## Recipe
+
+{recipe}
+
+Dataset `{config.dataset}`, seed {config.seed}; `gnio weights {name} --out runs/{name}` writes \
+config.yaml with all settings, those of the filter as they are used. Consider covariance of the \
+filter: {", ".join(considered) or "none"}.
+
+## Figures
+
+{table if figures else "The run holds no evaluation."}
+
+## Where it fails
+
+{chr(10).join(f"- {each}" for each in fails)}"""

@@ -1,6 +1,6 @@
-"""The trajectory in the viewer Rerun (rerun.io) while it grows, or in a file for it.
+"""Results for the viewer Rerun (rerun.io): as a file, or sent while a trajectory grows.
 
-Needs `gnio-jax[rerun]`. The places are those of the file of an evaluation.
+Needs `gnio-jax[rerun]`.
 """
 
 from __future__ import annotations
@@ -9,31 +9,130 @@ import contextlib
 from collections.abc import Iterator
 from datetime import timedelta
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
-from gnio_jax.errors import require_packages
-from gnio_jax.evaluation.exporting.rerun_file import BLUE, OPTION, check_file, ellipsoids
+from gnio_jax.errors import InputError, require_packages
+from gnio_jax.evaluation import Estimate, Recording
+from gnio_jax.evaluation.report import file_names
 from gnio_jax.files import replacing
 from gnio_jax.filtering import Pose
-from gnio_jax.numerics import quaternion_from_matrix, xyzw_from_wxyz
+from gnio_jax.numerics import finite_rows, quaternion_from_matrix, xyzw_from_wxyz
 
-VIEWER = "viewer"
-"""In the place of a file's name: show it now."""
+OPTION, VIEWER = "--rerun", "viewer"
+"""The viewer stands in the place of a file's name: show it now."""
+BLACK, BLUE, VERMILION, GREEN = (0, 0, 0), (0, 114, 178), (213, 94, 0), (0, 158, 115)
+SIGMAS = 3.0
+"""Size of the ellipsoids, in standard deviations."""
 LINE_EVERY = 10
-"""Poses between two drawings of the newest piece of the path."""
+"""Poses between two drawings of the newest piece of a path that grows."""
 LONGEST_PIECE = 600
 """Poses. A piece is sent anew when it grows: with the whole path that would be ever more."""
-PLACE = "live"
 
 
-def check(target: str) -> None:
+class Logged(NamedTuple):
+    """One sequence of a file."""
+
+    estimate: Estimate
+    """In the frame in which it is looked at, and so its reference."""
+    recording: Recording
+    """Its IMU is shown."""
+
+
+def check(target: str | Path) -> None:
     """Refuse, before the work, what cannot be shown or written. Raises `InputError`."""
+    require_packages(OPTION, "rerun", "rerun")
     if target == VIEWER:
-        require_packages(OPTION, "rerun", "rerun")
-    else:
-        check_file(Path(target))
+        return
+    path = Path(target)
+    if path.suffix.lower() != ".rrd":
+        raise InputError(OPTION, f"'{path}' is no name of Rerun's files", "name it NAME.rrd")
+    if path.is_dir():
+        raise InputError(OPTION, f"'{path}' is a folder", "name a file in it, NAME.rrd")
+
+
+def write(path: Path, logged: list[Logged]) -> None:
+    """Write the sequences as one recording of Rerun, whole or not at all.
+
+    Each has a folder of its own, named as its files. Times are those from its start, s.
+    """
+    import rerun
+
+    stems = file_names([each.estimate.name for each in logged])
+    with replacing(path) as temporary:
+        log = rerun.RecordingStream("gnio-jax", recording_id="gnio")
+        log.save(temporary)
+        log.log("/", rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        for stem, (estimate, recording) in zip(stems, logged, strict=True):
+            _log_paths(log, stem, estimate)
+            time = estimate.trajectory.time - estimate.trajectory.time[0]
+            found, filtered = estimate.displacements, estimate.filtered
+            curves = {
+                **({} if found is None else found.diagnostics),
+                "network_std": found and found.std,
+                "nis": filtered and filtered.nis[:, None],
+            }
+            for name, values in curves.items():
+                _log_curves(log, f"{stem}/{name}", time, values)
+            samples = np.linspace(0.0, time[-1], len(recording.gyro), endpoint=False)
+            _log_curves(log, f"{stem}/imu/gyro", samples, recording.gyro)
+            _log_curves(log, f"{stem}/imu/accel", samples, recording.accel)
+        log.disconnect()
+
+
+def _log_paths(log: Any, stem: str, estimate: Estimate) -> None:
+    """Both paths as lines; the pose of the estimate and its 3σ ellipsoid over time."""
+    import rerun
+
+    path, reference = estimate.trajectory, estimate.reference
+    for kind, line, colour in (("reference", reference, BLACK), ("estimate", path, BLUE)):
+        points = line.position[finite_rows(line.position)]
+        if len(points):
+            strip = rerun.LineStrips3D([points], colors=[colour])
+            log.log(f"{stem}/{kind}", strip, static=True)
+    rows = path.known
+    if not rows.any():
+        return
+    pose = rerun.Transform3D.columns(
+        translation=path.position[rows], quaternion=xyzw_from_wxyz(path.orientation[rows])
+    )
+    time = rerun.TimeColumn("time", duration=path.time[rows] - path.time[0])
+    log.send_columns(f"{stem}/pose", [time], pose)
+    if estimate.filtered is not None:
+        sizes, axes = _ellipsoids(estimate.filtered.covariance[rows])
+        contour = rerun.Ellipsoids3D.columns(
+            centers=path.position[rows], half_sizes=sizes, quaternions=axes
+        )
+        log.send_columns(f"{stem}/ellipsoid", [time], contour)
+
+
+def _ellipsoids(
+    covariance: Float[np.ndarray, "k 3 3"],
+) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k 4"]]:
+    """Half sizes, m, and attitudes (xyzw) of the contours of covariances (m²) at `SIGMAS`."""
+    variance, axes = np.linalg.eigh(covariance)
+    axes = axes * np.linalg.det(axes)[:, None, None]  # rotations, no reflections
+    attitudes = xyzw_from_wxyz(quaternion_from_matrix(axes))
+    return SIGMAS * np.sqrt(np.maximum(variance, 0.0)), attitudes
+
+
+def _log_curves(log: Any, place: str, time: Float[np.ndarray, "n"], values: Any) -> None:
+    """Curves (n, w) over time, where they are known; none for None."""
+    import rerun
+
+    if values is None or not (known := finite_rows(values)).any():
+        return
+    names = ["x", "y", "z"] if values.shape[1] == 3 else [place.rpartition("/")[2]]
+    colours = [BLUE, VERMILION, GREEN][: len(names)]
+    log.log(place, rerun.SeriesLines(names=names, colors=colours), static=True)
+    column = rerun.TimeColumn("time", duration=time[known])
+    log.send_columns(place, [column], rerun.Scalars.columns(scalars=values[known]))
+
+
+# While a trajectory grows
+# --------------------------------------------------------------------------------------------------
 
 
 @contextlib.contextmanager
@@ -41,30 +140,30 @@ def streaming(target: str) -> Iterator[RerunStream]:
     """To the viewer, which is started, or into the file NAME.rrd, whole or not at all."""
     import rerun
 
-    recording = rerun.RecordingStream("gnio-jax")
+    log = rerun.RecordingStream("gnio-jax")
     with contextlib.ExitStack() as file:
         if target == VIEWER:
-            recording.spawn()
+            log.spawn()
         else:
-            recording.save(file.enter_context(replacing(Path(target))))
-        stream = RerunStream(recording)
+            log.save(file.enter_context(replacing(Path(target))))
+        stream = RerunStream(log)
         yield stream
         stream.finish()
-        recording.flush()
-        recording.disconnect()
+        log.flush()
+        log.disconnect()
 
 
 class RerunStream:
-    """What has been sent of a trajectory."""
+    """What has been sent of a trajectory. Its places are those of a file's sequence `live`."""
 
-    def __init__(self, recording: Any):
+    def __init__(self, log: Any):
         import rerun
 
-        self._recording = recording
+        self._log = log
         self._piece: list[np.ndarray] = []
         self._pieces = 0
         self._start: float | None = None
-        recording.log("/", rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        log.log("/", rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
 
     def add(self, pose: Pose) -> None:
         """Send the pose, its 3σ ellipsoid and its NIS; now and then the path. Nothing of a filter
@@ -73,19 +172,16 @@ class RerunStream:
 
         if not pose.healthy:
             return
-        recording = self._recording
+        log = self._log
         self._start = pose.time if self._start is None else self._start
-        recording.set_time("time", duration=timedelta(seconds=pose.time - self._start))
+        log.set_time("time", duration=timedelta(seconds=pose.time - self._start))
         quaternion = xyzw_from_wxyz(quaternion_from_matrix(pose.rotation[None]))[0]
-        moved = rerun.Transform3D(translation=pose.position, quaternion=quaternion)
-        recording.log(f"{PLACE}/pose", moved)
-        half_sizes, axes = ellipsoids(pose.covariance[None, 6:9, 6:9])
-        contour = rerun.Ellipsoids3D(
-            centers=[pose.position], half_sizes=half_sizes, quaternions=xyzw_from_wxyz(axes)
-        )
-        recording.log(f"{PLACE}/ellipsoid", contour)
+        log.log("live/pose", rerun.Transform3D(translation=pose.position, quaternion=quaternion))
+        sizes, axes = _ellipsoids(pose.covariance[None, 6:9, 6:9])
+        contour = rerun.Ellipsoids3D(centers=[pose.position], half_sizes=sizes, quaternions=axes)
+        log.log("live/ellipsoid", contour)
         if np.isfinite(pose.nis):
-            recording.log(f"{PLACE}/nis", rerun.Scalars([pose.nis]))
+            log.log("live/nis", rerun.Scalars([pose.nis]))
         self._piece.append(np.array(pose.position))
         if len(self._piece) % LINE_EVERY == 0:
             self._draw()
@@ -99,6 +195,6 @@ class RerunStream:
         import rerun
 
         line = rerun.LineStrips3D([np.array(self._piece)], colors=[BLUE])
-        self._recording.log(f"{PLACE}/estimate/{self._pieces:04d}", line, static=True)
+        self._log.log(f"live/estimate/{self._pieces:04d}", line, static=True)
         if len(self._piece) >= LONGEST_PIECE:
             self._piece, self._pieces = self._piece[-1:], self._pieces + 1

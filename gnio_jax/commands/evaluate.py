@@ -27,12 +27,12 @@ def evaluate(asked: EvaluateConfig, call: options.Call) -> None:
     import jax  # late: mistakes do not wait for it
 
     from gnio_jax import evaluation, filtering
+    from gnio_jax.apps import rerun
     from gnio_jax.evaluation import tabulate
     from gnio_jax.evaluation.estimate import in_one_frame
-    from gnio_jax.evaluation.exporting import rerun_file
 
     if asked.rerun:
-        rerun_file.check_file(Path(asked.rerun))
+        rerun.check(asked.rerun)
     jax.config.update("jax_enable_x64", True)  # for the filter; the network states its float32
     filtering.cores_as_devices()
     with console.terminal() as terminal:
@@ -43,10 +43,10 @@ def evaluate(asked: EvaluateConfig, call: options.Call) -> None:
     if asked.rerun:
         pairs = zip(found.estimates, found.recordings, strict=True)
         logged = [
-            rerun_file.Logged(in_one_frame(estimate, asked.alignment), recording)
+            rerun.Logged(in_one_frame(estimate, asked.alignment), recording)
             for estimate, recording in pairs
         ]
-        rerun_file.write_rerun(Path(asked.rerun), logged)
+        rerun.write(Path(asked.rerun), logged)
         output.print(f"for Rerun: {asked.rerun}", soft_wrap=True)
     if asked.plots:
         output.print(f"page: {found.folder / 'report.html'} (open it in a browser)", soft_wrap=True)

@@ -73,6 +73,7 @@ def live(asked: LiveOptions, _call: options.Call) -> None:
     inbox = _listen(asked) if asked.source.startswith(UDP) else None  # before all that takes time
     if asked.speed < 0:
         raise InputError("--speed", f"must not be negative, found {asked.speed:g}")
+    console.compile_quickly()
     import jax  # late: mistakes do not wait for it
 
     from gnio_jax.apps import live as following

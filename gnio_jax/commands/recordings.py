@@ -99,10 +99,10 @@ def export_file(asked: ExportFile, _call: options.Call) -> None:
     """
     if asked.out.is_dir():
         raise InputError("OUT", f"'{asked.out}' is a folder", "name a file in it")
-    from gnio_jax.evaluation import exporting  # late: mistakes do not wait for JAX
+    from gnio_jax.apps.export import export  # late: mistakes do not wait for JAX
     from gnio_jax.evaluation.trajectory import read_tum
 
     trajectory = read_tum(asked.trajectory)
-    count = exporting.export(asked.out, trajectory)
+    count = export(asked.out, trajectory)
     seconds = trajectory.time[-1] - trajectory.time[0]
     console.stdout().print(f"{asked.out}: {count} poses, {seconds:.1f} s", soft_wrap=True)

@@ -14,6 +14,9 @@ from gnio_jax.commands import console, options
 from gnio_jax.config import ImportOptions
 from gnio_jax.files import file_stem
 
+ERRORS = ("ate", "ate_2d", "rte_60s", "rpe_1s", "yaw_rmse", "path_length_ratio")
+"""What is shown of the errors against a reference; summary.json has them all."""
+
 
 @dataclass(frozen=True)
 class TrackOptions:
@@ -47,10 +50,11 @@ def track(asked: TrackOptions, call: options.Call) -> None:
       {prog} robot.csv --columns time=stamp gyro_x=wx gyro_y=wy gyro_z=wz accel_x=ax accel_y=ay \\
           accel_z=az
     """
+    console.compile_quickly()
     import jax  # late: mistakes do not wait for it
 
-    from gnio_jax import tracking
     from gnio_jax.apps import packages
+    from gnio_jax.apps import track as tracking
     from gnio_jax.apps.importing import read_imported
 
     jax.config.update("jax_enable_x64", True)  # for the filter; the network states its float32
@@ -59,9 +63,8 @@ def track(asked: TrackOptions, call: options.Call) -> None:
     out = asked.out or Path("tracks") / _folder_name(recording.sequence.name)
     with console.terminal() as terminal:
         terminal.progress("compiling and tracking", 0.0)
-        found = tracking.track(
-            recording, weights, out, asked.format, command=str(call), rerun=asked.rerun
-        )
+        how = {"command": str(call), "rerun_file": asked.rerun}
+        found = tracking.track(recording, weights, out, asked.format, **how)
     output = console.stdout()
     for note in found.summary.notes:
         output.print(f"  {note}", soft_wrap=True)
@@ -81,7 +84,6 @@ def _folder_name(name: str) -> str:
 def _table(summary: Any) -> Table:
     """Two columns: figure and value."""
     from gnio_jax.evaluation import tabulate
-    from gnio_jax.tracking.summary import ERRORS
 
     grid = Table(box=box.SIMPLE_HEAD, title_style="bold", title_justify="left")
     grid.add_column(f"{summary.recording}, by {summary.weights}", overflow="fold")
@@ -90,7 +92,7 @@ def _table(summary: Any) -> Table:
     grid.add_row("path", f"{summary.path_length:.1f} m")
     grid.add_row("end from start", f"{summary.from_start:.1f} m")
     grid.add_row("expected error at the end", f"{summary.expected_error:.1f} m")
-    grid.add_row("at rest", f"{summary.rest:.0%}")
+    grid.add_row("at rest (quieter than a hand)", f"{summary.rest:.0%}")
     if summary.accepted is not None:
         grid.add_row("displacements used", f"{summary.accepted:.0%}")
     for name in ERRORS if summary.errors else ():

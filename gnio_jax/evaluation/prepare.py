@@ -225,7 +225,8 @@ def _gyro_bias(
         gyro[measured], accel[measured] = sequence.gyro[measured], sequence.accel[measured]
         rest = rest_at_start(gyro, accel, 1.0 / rate)
         if not rest.seconds:
-            return np.zeros(3), "gyro bias: no rest at the start, so it starts from zero"
+            note = "gyro bias: no rest at the start (quieter than a hand), so it starts from zero"
+            return np.zeros(3), note
         return rest.gyro_bias, f"gyro bias: mean of {rest.seconds:g} s of rest at the start"
     rows = np.arange(min(round(REFERENCE_BIAS_SECONDS * rate), len(sequence.time) - 1))
     rows = np.intersect1d(rows[sequence.valid[rows] & sequence.valid[rows + 1]], measured)

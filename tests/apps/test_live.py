@@ -432,7 +432,7 @@ class Diverging:
 
 @pytest.mark.filterwarnings("error")
 def test_what_a_diverged_filter_says_is_not_kept(gnio, run, recorded, monkeypatch, tmp_path):
-    monkeypatch.setattr(live, "create_tracker", lambda *_: Diverging())
+    monkeypatch.setattr(live, "create_tracker", lambda *_, **__: Diverging())
     told = gnio(as_lines(recorded)[:9], "--weights", run, "--out", tmp_path / "live.txt")
     assert "THE FILTER DIVERGED" in told and "nan" not in told
     np.testing.assert_allclose(read_tum(tmp_path / "live.txt").position[:, 0], np.arange(1, 6))

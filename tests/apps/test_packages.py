@@ -18,6 +18,8 @@ from gnio_jax.apps.packages import SHIPPED, Description
 from gnio_jax.commands import app, console
 from gnio_jax.config import DataConfig, ModelConfig, TrainConfig
 from gnio_jax.errors import InputError
+from gnio_jax.evaluation import report
+from gnio_jax.evaluation.metrics import Measures
 from gnio_jax.training import checkpoint
 from tests.support import tiny_run
 from tests.support.compiling import quick
@@ -32,13 +34,14 @@ CONFIG = TrainConfig(
     model=ModelConfig(name="tiny"),
     filter=changed(noise={"std_factor": (1.7, 1.0, 1.0)}, considered={"scale": 0.02}),
 )
-FIGURES = {
-    "settings": {"dataset": "synthetic", "split": "test", "estimator": "ekf"},
-    "sequences": {"a": {}, "b": {}},
-    "mean": {"ate_2d": 1.234, "yaw_rmse": None},
-    "interval": {"ate_2d": [0.9, 1.6], "yaw_rmse": None},
-    "groups": {"ate_2d": 2},
+SETTINGS = {"dataset": "synthetic", "split": "test", "estimator": "ekf", "alignment": "origin"}
+SETTINGS |= {"recordings": {"a": 60.0, "b": 60.0}, "filter": {}, "definitions": report.DEFINITIONS}
+SCORES = {
+    name: Measures({"ate_2d": error, "yaw_rmse": None}, {"yaw_rmse": "no reference"}, False)
+    for name, error in (("a", 1.2), ("b", 1.3))
 }
+MEASURED = "ATE 2-D is 1.25 (0.61 to 1.89) m on synthetic_test_ekf"
+"""12.706 (Student's t, one degree of freedom) times 0.05 m around the mean."""
 SAID = Description("walk", "simulated walks", "CC0", ("Running | jumping.",))
 
 
@@ -49,7 +52,8 @@ def run(tmp_path_factory):
         folder = tiny_run.save(tmp_path_factory.mktemp("trained") / "walk", CONFIG)
         evaluation = folder / "eval" / "synthetic_test_ekf"
         evaluation.mkdir(parents=True)
-        (evaluation / "metrics.json").write_text(json.dumps(FIGURES))
+        figures = report.Report(SETTINGS, SCORES, {}, {"a": "ann", "b": "bob"}, {}, {})
+        (evaluation / "metrics.json").write_text(json.dumps(report.as_json(figures)))
         yield folder
 
 
@@ -127,7 +131,7 @@ def test_the_card_has_what_the_publisher_and_the_evaluations_say(published):
         "gnio train --config config.yaml --workdir runs/walk --init-from runs/earlier",
         "Dataset `synthetic`, seed 7",
         "covariance of the filter: scale.",
-        "| synthetic_test_ekf | 2 | 2 | 1.23 (0.90 to 1.60) |",
+        "| synthetic_test_ekf | 2 | 2 | 1.25 (0.61 to 1.89) | – |",
     ):
         assert words in card
     assert "calibrate" not in card
@@ -194,7 +198,7 @@ def test_names_are_found_and_listed(published, run, monkeypatch, tmp_path, gnio)
     refused("wolk", "did you mean 'walk'?")
     refused(tmp_path, "neither a package")
     listed = " ".join(gnio("weights").split())
-    for words in ("walk", "small", "simulated walks", "CC0", "1.23 (0.90", "MB"):
+    for words in ("walk", "small", "simulated walks", "CC0", "1.25 (0.61", "MB"):
         assert words in listed
     monkeypatch.setenv("GNIO_WEIGHTS", str(tmp_path / "nowhere"))
     refused("walk", "$GNIO_WEIGHTS", "nowhere")
@@ -212,10 +216,9 @@ def test_the_default_is_shipped_or_the_newest_run(published, run, monkeypatch, t
 
 
 def test_what_was_measured_of_weights(published, run, tmp_path):
-    measured = "whose ATE 2-D is 1.23 (0.90 to 1.60) m on synthetic_test_ekf"
-    assert packages.choose(published / "walk").about == f"simulated walks, {measured}"
+    assert packages.choose(published / "walk").about == f"simulated walks, whose {MEASURED}"
     own = shutil.copytree(run, tmp_path / "walk")
-    assert packages.choose(own).about == f"dataset synthetic, split train, {measured}"
+    assert packages.choose(own).about == f"dataset synthetic, split train, whose {MEASURED}"
     (own / "eval" / "synthetic_test_ekf" / "metrics.json").write_text("{")
     assert packages.choose(own).about == "dataset synthetic, split train"  # and it tracks
 

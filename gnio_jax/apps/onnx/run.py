@@ -18,13 +18,13 @@ from gnio_jax.apps.onnx import accuracy, conversion, driver
 from gnio_jax.apps.onnx.accuracy import Deviation
 from gnio_jax.apps.onnx.flat_state import start_arrays
 from gnio_jax.apps.onnx.programs import Program, programs
+from gnio_jax.apps.track import tracking_filter
 from gnio_jax.config.files import plain
 from gnio_jax.errors import InputError, require_packages
 from gnio_jax.files import fingerprint, replacing_folder
 from gnio_jax.filtering import initial_state
 from gnio_jax.filtering.settings import FilterSetup
 from gnio_jax.models import Network
-from gnio_jax.tracking.run import tracking_filter
 
 PACKAGES = ("jax2onnx", "onnx", "onnxruntime")
 SECONDS = 60.0

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from gnio_jax import filtering
+from gnio_jax.apps.track import tracking_filter
 from gnio_jax.commands import app
 from gnio_jax.config import DataConfig, ModelConfig, TrainConfig
 from gnio_jax.data.simulated.walks import pedestrian
 from gnio_jax.models import Network
 from gnio_jax.numerics import matrix_from_quaternion
-from gnio_jax.tracking.run import tracking_filter
 from gnio_jax.training.checkpoint import load_run
 from gnio_jax.types import GRAVITY
 from tests.support import drawn_run

@@ -17,8 +17,8 @@ from gnio_jax import filtering
 from gnio_jax.apps.onnx import accuracy, driver
 from gnio_jax.apps.onnx.flat_state import start_arrays
 from gnio_jax.apps.onnx.run import PACKAGES
+from gnio_jax.apps.track import tracking_filter
 from gnio_jax.commands import app, console
-from gnio_jax.tracking.run import tracking_filter
 from gnio_jax.training.checkpoint import load_run
 from tests.apps.onnx.conftest import BIAS, CONFIG, SECONDS
 

@@ -10,9 +10,9 @@ from mcap.reader import make_reader
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from gnio_jax.apps.export import export
 from gnio_jax.commands import app
 from gnio_jax.errors import InputError
-from gnio_jax.evaluation.exporting import export
 from gnio_jax.evaluation.trajectory import Trajectory, read_tum
 from tests.support import known_walk
 

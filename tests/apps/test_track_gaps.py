@@ -8,11 +8,11 @@ import pytest
 from flax import linen as nn
 from scipy.spatial.transform import Rotation
 
+from gnio_jax.apps.track import GAP_ACCEL_STD, GAP_GYRO_STD, tracking_filter
 from gnio_jax.config import DataConfig, ModelConfig, TrainConfig
 from gnio_jax.data.resampling import resample
 from gnio_jax.evaluation import estimate, no_displacements, prepare
 from gnio_jax.filtering import InitialStd
-from gnio_jax.tracking.filter import GAP_ACCEL_STD, GAP_GYRO_STD, tracking_filter
 from gnio_jax.training.checkpoint import Run
 from gnio_jax.types import Sequence
 from tests.support import known_walk

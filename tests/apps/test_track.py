@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from gnio_jax.apps.track import Summary, _warnings
 from gnio_jax.commands import app, console
 from gnio_jax.config import DataConfig, ModelConfig, TrainConfig
 from gnio_jax.data.hdf5 import write_hdf5
 from gnio_jax.data.resampling import resample
 from gnio_jax.evaluation.trajectory import read_tum
-from gnio_jax.tracking.summary import Summary, _warnings
 from gnio_jax.types import Sequence
 from tests.support import bag_files, known_walk, logger_files, tiny_run
 
@@ -148,7 +148,7 @@ def test_the_newest_run_a_slow_logger_and_our_own_file(gnio, runs, tmp_path, mon
     folder = runs.parent / "tracks" / "slow"
     assert summary_of(folder)["weights"] == "walker"
     assert "lacks samples 1 times, for up to 0.55 s" in told and "warning: gaps:" in told
-    rate = "rate: recorded at 20 Hz, the network has learnt at 50 Hz: what lies above 10 Hz is"
+    rate = "rate: recorded at 20 Hz, the network was trained at 50 Hz: what lies above 10 Hz is"
     assert f"warning: {rate} guessed" in told
     assert "warning: start: it moves in its first second" in told
     gnio("data", "import", slow, "--out", tmp_path / "slow.h5")
@@ -219,36 +219,35 @@ def test_our_own_file_with_holes(gnio, mistake, runs, tmp_path):
             assert "walk: field 'time' has a gap of 3.210 s" in mistake(*given)
 
 
-def test_an_out_that_cannot_be_written_is_found_first(mistake, runs, tmp_path, monkeypatch):
-    monkeypatch.setattr("gnio_jax.tracking.run.estimate", lambda *_: pytest.fail("too late"))
+def test_what_cannot_be_written_is_found_before_the_work(mistake, runs, tmp_path, monkeypatch):
+    """Also stamps that ROS cannot hold."""
+    monkeypatch.setattr("gnio_jax.apps.track.prepare", lambda *_, **__: pytest.fail("too late"))
     walk = logger_files.zipped(tmp_path / "walk.zip", logger_files.sensor_logger())
-    given = ("track", walk, "--weights", runs / "walker", "--out")
-    assert f"{tmp_path / 'walk.zip'}: " in mistake(*given, walk / "track")
+    weights = ("--weights", runs / "walker")
+    assert f"{tmp_path / 'walk.zip'}: " in mistake("track", walk, *weights, "--out", walk / "track")
+    time = np.arange(300) / 100
+    for start, words in ((-5.0, "stamps begin at -5 s"), (3e9, "ROS counts seconds in 32 bits")):
+        rows = time + start, known_walk.rate(time), known_walk.force(time)
+        odd = csv(tmp_path / "odd.csv", *rows)
+        assert words in mistake("track", odd, *weights, "--format", "mcap", "--time-unit", "s")
 
 
-def test_the_line_says_what_is_counted():
-    summary = Summary(
-        recording="walk",
-        weights="net",
-        trained_on="walks, whose ATE 2-D is 1.1 m on test",
-        start_time=0.0,
-        seconds=100.0,
-        path_length=80.0,
-        from_start=1.0,
-        expected_error=2.0,
-        considered=True,
-        rest=0.0,
-        accepted=1.0,
-        errors={},
-        warnings=(),
-        notes=(),
-    )
-    line = summary.limits
-    assert "80.0 m in 100 s" in line and "2.0 m (2.5% of the path)" in line
-    assert "errors considered" in line and "expect more" not in line
-    assert "trained on walks, whose ATE 2-D is 1.1 m on test" in line
-    assert "of the path" not in summary._replace(path_length=0.3).limits
-    for accepted, told in ((0.95, []), (0.71, ["gate: the filter refused 29% of"])):
-        warned = _warnings(summary._replace(accepted=accepted), own_rate=100.0, rate=100.0)
-        assert [line[: len(words)] for line, words in zip(warned, told, strict=True)] == told
-    assert "\n" not in line
+SUMMARY = Summary("walk", "net", "walks", 0.0, 100.0, 80.0, 1.0, 2.0, 0.0, 1.0, {}, (), (), "")
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({}, None),
+        ({"accepted": 0.95}, None),
+        ({"accepted": 0.71}, "gate: the filter refused 29% of"),
+        ({"rest": 0.97}, "rest: it lies still 97% of the time"),
+        ({"path_length": 400.0}, "speed: 4.0 m/s in the mean"),
+        ({"errors": {"nees_coverage_2d": 88.0}}, None),
+        ({"errors": {"nees_coverage_2d": None}}, None),
+        ({"errors": {"nees_coverage_2d": 7.0}}, "errors: larger than the filter says: its 95 %"),
+    ],
+)
+def test_what_is_worth_a_warning(changes, words):
+    found = _warnings(SUMMARY._replace(**changes), own_rate=100.0, rate=100.0)
+    assert [line[: len(words)] for line in found] == [words] if words else found == []

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from gnio_jax.apps import rerun
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import Recording
-from gnio_jax.evaluation.exporting import rerun_file
 from tests.support.estimates import estimate
 from tests.support.rerun_files import columns_of
 
@@ -34,8 +34,8 @@ def test_the_file_is_read_back(tmp_path):
         filtered=walk.filtered._replace(covariance=np.tile(covariance, (400, 1, 1)))
     )
     path = tmp_path / "walks.rrd"
-    logged = [rerun_file.Logged(each, recording_of(each)) for each in (walk, blind)]
-    rerun_file.write_rerun(path, logged)
+    logged = [rerun.Logged(each, recording_of(each)) for each in (walk, blind)]
+    rerun.write(path, logged)
     assert [each.name for each in tmp_path.iterdir()] == ["walks.rrd"]
     found = columns_of(path)
     assert "/blind/estimate" in found and "/blind/reference" not in found
@@ -62,10 +62,10 @@ def test_the_file_is_read_back(tmp_path):
 def test_what_is_refused_before_the_work(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "rerun", None)  # as if it were not installed
     with pytest.raises(InputError, match=r"--rerun: needs the package rerun; .*gnio-jax\[rerun\]"):
-        rerun_file.check_file(tmp_path / "a.rrd")
+        rerun.check(tmp_path / "a.rrd")
     monkeypatch.setitem(sys.modules, "rerun", pytest)
     with pytest.raises(InputError, match=r"name it NAME\.rrd"):
-        rerun_file.check_file(tmp_path / "a.txt")
+        rerun.check(tmp_path / "a.txt")
     (tmp_path / "b.rrd").mkdir()
     with pytest.raises(InputError, match="is a folder"):
-        rerun_file.check_file(tmp_path / "b.rrd")
+        rerun.check(tmp_path / "b.rrd")

@@ -1,0 +1,158 @@
+"""Trajectories in the formats of other programs.
+
+- `tum`: `t x y z qx qy qz qw`, as `gnio evaluate` writes it (evo).
+- `csv`: with the columns of our own dataset `csv`.
+- `mcap`: ROS 2 messages, which Foxglove, rviz and `ros2 bag play` read: `/odometry`
+  (nav_msgs/Odometry) and `/tf` (tf2_msgs/TFMessage) at every pose, `/path` (nav_msgs/Path) with the
+  whole trajectory at the first stamp. The schemas are embedded (`ros2msg`), so that no message
+  package is needed. Frames by REP 105: `odom`, fixed and z-up, in which the path drifts, and `imu`,
+  the recording's body.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from gnio_jax.errors import InputError, require_packages
+from gnio_jax.evaluation.trajectory import Trajectory, write_tum
+from gnio_jax.files import replacing
+from gnio_jax.numerics import rotations
+
+SUFFIXES = {".tum": "tum", ".txt": "tum", ".csv": "csv", ".mcap": "mcap"}
+FORMATS = tuple(dict.fromkeys(SUFFIXES.values()))
+LAST_STAMP = 2.0**31
+"""s, builtin_interfaces/Time."""
+WORLD, BODY = "odom", "imu"
+TOPICS = {
+    "/odometry": "nav_msgs/msg/Odometry",
+    "/path": "nav_msgs/msg/Path",
+    "/tf": "tf2_msgs/msg/TFMessage",
+}
+
+
+def export(
+    path: Path,
+    trajectory: Trajectory,
+    kind: str | None = None,
+    covariance: Float[np.ndarray, "n 3 3"] | None = None,
+) -> int:
+    """Write a trajectory, whole or not at all, and return its number of poses.
+
+    Rows that are not finite are left out. `kind` is one of `FORMATS`; None takes that of the
+    suffix. `covariance` is that of the positions, m² (mcap). Raises `InputError`.
+    """
+    kind = kind or SUFFIXES.get(path.suffix.lower())
+    if kind not in FORMATS:
+        raise InputError(path, "its name tells no format", f"known: {', '.join(SUFFIXES)}")
+    known = trajectory.known & np.isfinite(trajectory.time)
+    if not known.any():
+        raise InputError(path, "the trajectory has no pose", "evaluate the recording again")
+    poses = Trajectory(*(field[known] for field in trajectory))
+    check(path, kind, poses.time)
+    with replacing(path) as temporary:
+        match kind:
+            case "tum":
+                write_tum(temporary, poses)
+            case "csv":
+                rows = np.column_stack([poses.time, poses.position, poses.orientation])
+                names = "time,px,py,pz,qw,qx,qy,qz"
+                options = {"fmt": "%.9f", "delimiter": ",", "header": names, "comments": ""}
+                np.savetxt(temporary, rows, **options)
+            case _:
+                _write_mcap(temporary, poses, None if covariance is None else covariance[known])
+    return len(poses.time)
+
+
+def check(where: object, kind: str, time: Float[np.ndarray, "n"]) -> None:
+    """Raise `InputError`, before the work, for a format whose packages are missing or that cannot
+    hold these stamps, s."""
+    if kind != "mcap":
+        return
+    require_packages(where, "bags", "mcap", "rosbags")
+    if time[0] < 0.0:
+        raise InputError(where, f"stamps begin at {time[0]:g} s", "ROS has none below 0")
+    if time[-1] >= LAST_STAMP:
+        remedy = "ROS counts seconds in 32 bits: give stamps in s"
+        raise InputError(where, f"stamps end at {time[-1]:g} s", remedy)
+
+
+def _write_mcap(
+    path: Path, poses: Trajectory, covariance: Float[np.ndarray, "n 3 3"] | None
+) -> None:
+    from mcap.writer import Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start(profile="ros2", library="gnio-jax")
+        channels = {}
+        for topic, name in TOPICS.items():
+            text, _ = store.generate_msgdef(name, ros_version=2)
+            schema = writer.register_schema(name, "ros2msg", text.encode())
+            channels[topic] = writer.register_channel(topic, "cdr", schema)
+        for topic, stamp, message in _messages(poses, covariance, store.types):
+            data = bytes(store.serialize_cdr(message, TOPICS[topic]))
+            writer.add_message(channels[topic], stamp, data, stamp)
+        writer.finish()
+
+
+def _messages(
+    poses: Trajectory, covariance: Float[np.ndarray, "n 3 3"] | None, types: dict[str, Any]
+) -> Iterator[tuple[str, int, Any]]:
+    """Topic, stamp (ns) and message: the path, then odometry and transform of each pose, in
+    order. Zeros stand for a covariance that is not known (ours)."""
+
+    def make(name: str, *fields: Any) -> Any:
+        package, _, message = name.partition("/")
+        return types[f"{package}/msg/{message}"](*fields)
+
+    def header(stamp: int) -> Any:
+        time = make("builtin_interfaces/Time", stamp // 10**9, stamp % 10**9)
+        return make("std_msgs/Header", time, WORLD)
+
+    def pose(row: int) -> Any:
+        w, *xyz = poses.orientation[row].tolist()
+        point = make("geometry_msgs/Point", *poses.position[row].tolist())
+        return make("geometry_msgs/Pose", point, make("geometry_msgs/Quaternion", *xyz, w))
+
+    def vector(values: Float[np.ndarray, "3"]) -> Any:
+        return make("geometry_msgs/Vector3", *values.tolist())
+
+    stamps = np.round(poses.time * 1e9).astype(np.int64).tolist()
+    places = [pose(row) for row in range(len(stamps))]
+    path = [
+        make("geometry_msgs/PoseStamped", header(stamp), place)
+        for stamp, place in zip(stamps, places, strict=True)
+    ]
+    yield "/path", stamps[0], make("nav_msgs/Path", header(stamps[0]), path)
+    velocity, rate = _body_motion(poses)
+    for row, (stamp, place) in enumerate(zip(stamps, places, strict=True)):
+        spread = np.zeros((6, 6))
+        if covariance is not None and np.isfinite(covariance[row]).all():
+            spread[:3, :3] = covariance[row]
+        placed = make("geometry_msgs/PoseWithCovariance", place, spread.ravel())
+        twist = make("geometry_msgs/Twist", vector(velocity[row]), vector(rate[row]))
+        moving = make("geometry_msgs/TwistWithCovariance", twist, np.zeros(36))
+        yield "/odometry", stamp, make("nav_msgs/Odometry", header(stamp), BODY, placed, moving)
+        moved = make("geometry_msgs/Transform", vector(poses.position[row]), place.orientation)
+        transform = make("geometry_msgs/TransformStamped", header(stamp), BODY, moved)
+        yield "/tf", stamp, make("tf2_msgs/TFMessage", [transform])
+
+
+def _body_motion(
+    poses: Trajectory,
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+    """Velocity (m/s) and angular rate (rad/s) in the body, by differences of the poses."""
+    count = len(poses.time)
+    if count < 2:
+        return np.zeros((count, 3)), np.zeros((count, 3))
+    attitude = rotations(poses.orientation)
+    velocity = np.gradient(poses.position, poses.time, axis=0)
+    turn = (attitude[:-1].inv() * attitude[1:]).as_rotvec() / np.diff(poses.time)[:, None]
+    return attitude.inv().apply(velocity), np.concatenate([turn, turn[-1:]])

@@ -1,0 +1,306 @@
+"""The trajectory of one's own recording, and how far to trust it: what `gnio track` does.
+
+recording + weights → prepare → estimate → summarise → folder
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from gnio_jax import config as configuration
+from gnio_jax.apps import export, rerun
+from gnio_jax.apps.importing import GAPS, Imported
+from gnio_jax.apps.packages import Weights
+from gnio_jax.config import TrainConfig
+from gnio_jax.data.resampling import longest_bridge
+from gnio_jax.data.validation import WINDOW_SECONDS, check_gaps
+from gnio_jax.errors import InputError
+from gnio_jax.evaluation import Estimate, Recording, estimate, metrics, prepare
+from gnio_jax.evaluation.estimate import in_one_frame
+from gnio_jax.evaluation.prepare import ROUGH_START, measured_rows
+from gnio_jax.evaluation.trajectory import write_tum
+from gnio_jax.files import check_writable_folder, replacing_folder, shown_name
+from gnio_jax.filtering.settings import FilterSetup, filter_setup
+from gnio_jax.models import Network
+from gnio_jax.reporting import Progress, silent
+from gnio_jax.training.checkpoint import Run
+from gnio_jax.types import GRAVITY, Sequence
+
+ZERO_VELOCITY_STD = 0.02
+"""m/s that the filter measures while the IMU is quiet (ours): what lies on a table stays there."""
+GAP_GYRO_STD, GAP_ACCEL_STD = 0.8, 0.8
+"""rad/s and m/s²: what a carrier does unseen where samples are missing. Over a second walkers turn
+by 0.5 to 0.8 rad and change their velocity by 0.5 to 0.7 m/s, root mean square of each axis, on
+OxIOD and on simulated walks; over two and three by less for each second (ours)."""
+LYING = 0.95
+"""Share of rest from which a recording is said to lie still (ours)."""
+REFUSED = 0.15
+"""Share of refused displacements that is worth a warning (ours). On people that a network has not
+met it refuses 0 to 5 %; walks of a kind that it has not met went wrong by 20 sigma with 29 %."""
+FASTEST = 3.0
+"""Mean speed above which nobody walks, m/s; the self-check of recordings has the same."""
+COVERED = 50.0
+"""% of the rows in which the 95 % region of the filter must hold the reference (ours)."""
+NAMES = ("summary.json", "trajectory.txt", "track.png")
+"""Files that every track has."""
+
+
+class Summary(NamedTuple):
+    """What is said of a track."""
+
+    recording: str
+    weights: str
+    trained_on: str
+    """And the error that was measured of these weights, where one was."""
+    start_time: float
+    """Of the recording's own clock, s."""
+    seconds: float
+    path_length: float
+    """Horizontal, through points 1 s apart, m."""
+    from_start: float
+    """Horizontal distance of the end from the start, m."""
+    expected_error: float
+    """Horizontal at the end, root mean square by the filter's covariance, m."""
+    rest: float
+    """Share of the time in which the IMU is quieter than a hand."""
+    accepted: float | None
+    """Share of the displacements that the filter used; None if there was none."""
+    errors: dict[str, float | None]
+    """Metrics against the reference, start aligned; empty where there is none."""
+    warnings: tuple[str, ...]
+    notes: tuple[str, ...]
+    """What the import and the start detected, assumed or repaired."""
+    limits: str
+    """How far to trust the track, in one line."""
+
+
+class Tracked(NamedTuple):
+    """What `track` found and where it is."""
+
+    estimate: Estimate
+    summary: Summary
+    folder: Path
+
+
+def tracking_filter(run: Run) -> FilterSetup:
+    """The run's own filter, for which rest is a measurement too, and which grows uncertain like a
+    walker where samples are missing. `gnio live` and `gnio export` have the same."""
+    setup = filter_setup(run.config.data, run.config.filter)
+    config = dataclasses.replace(
+        setup.config,
+        zero_velocity_std=ZERO_VELOCITY_STD,
+        gap_gyro_std=GAP_GYRO_STD,
+        gap_accel_std=GAP_ACCEL_STD,
+    )
+    return setup._replace(config=config)
+
+
+def track(
+    recording: Imported,
+    weights: Weights,
+    out: Path,
+    formats: tuple[str, ...] = (),
+    progress: Progress = silent,
+    command: str = "",
+    rerun_file: Path | None = None,
+) -> Tracked:
+    """Track a recording and leave trajectory, picture, page and summary in the folder `out`.
+
+    The trajectory starts at the origin with yaw zero; its stamps are the recording's own. The start
+    is level by the gravity of the first second, its velocity zero as surely as that second is
+    quiet, with the gyro's bias of a rest at the start. A reference starts nothing: it is only
+    compared with. `formats` are further ones of `export.FORMATS`, `command` is how this was called,
+    for the page, `rerun_file` a file to write for the viewer Rerun. The folder is written whole or
+    not at all and takes the place of an earlier track. Raises `InputError`.
+    """
+    sequence, config = recording.sequence, weights.run.config
+    start_time = float(sequence.attributes.get("start_time", 0.0))
+    _check(out)
+    for kind in formats:
+        export.check("--format", kind, sequence.time + start_time)
+    if rerun_file is not None:
+        rerun.check(rerun_file)
+    _check_bridged(sequence)
+    ekf = tracking_filter(weights.run)
+    how = {"init": "static", "gyro_bias": "rest", "from_first": True}
+    ready, left_out = prepare([sequence], config.data, ekf.initial_std, **how)
+    if not ready:
+        raise InputError(sequence.name, left_out[sequence.name], "record for longer")
+    network = Network.of(weights.run.model, weights.run.variables)
+    (found,) = estimate(ready, network, config.data, ekf, 1, progress)
+    summary = summarise(found, ready[0], recording, weights, ekf)
+    with replacing_folder(out) as folder:
+        _write_figures(folder, found, summary, formats)
+        _draw(folder, found, summary, config, command)
+    if rerun_file is not None:
+        rerun.write(rerun_file, [rerun.Logged(in_one_frame(found, alignment=None), ready[0])])
+    return Tracked(found, summary, out)
+
+
+def _check(out: Path) -> None:
+    """Refuse a folder that is neither an earlier track nor empty, and one that cannot be made."""
+    track = all((out / name).is_file() for name in NAMES)
+    if out.exists() and not (track or (out.is_dir() and not any(out.iterdir()))):
+        raise InputError(out, "is there already and is no track", "name another --out")
+    check_writable_folder(out.parent)
+
+
+def _check_bridged(sequence: Sequence) -> None:
+    """Raise `InputError` for a hole that nothing bridges: what was walked in it is in no sample."""
+    check_gaps(sequence.time, sequence.name)
+    # Lines of an earlier resampling; each clock has widened a hole by up to a sample at each end.
+    there = np.union1d(sequence.time[measured_rows(sequence)], sequence.time[[0, -1]])
+    bridged = longest_bridge(1.0 / float(np.median(np.diff(sequence.time))))
+    check_gaps(there, sequence.name, WINDOW_SECONDS + bridged)
+
+
+def summarise(
+    found: Estimate, ready: Recording, recording: Imported, weights: Weights, ekf: FilterSetup
+) -> Summary:
+    """The figures of a finished track, up to where it diverged if it did."""
+    filtered, sequence = found.filtered, recording.sequence
+    assert filtered is not None
+    last = int(np.flatnonzero(found.trajectory.known)[-1])
+    position, time = found.trajectory.position[: last + 1, :2], found.trajectory.time
+    seconds, length = float(time[last] - time[0]), 0.0
+    if last:
+        length = metrics.path_length(position, float(time[1] - time[0]))
+    used = filtered.accepted[: last + 1]
+    used = used[np.isfinite(used)]
+    error = float(np.sqrt(np.trace(filtered.covariance[last, :2, :2])))
+    share = f" ({error / length:.1%} of the path)" if length >= 1.0 else ""
+    counted = "with consider covariance"
+    if ekf.considered is None:
+        counted = "without consider covariance (gnio calibrate fits it), so expect more"
+    summary = Summary(
+        recording=sequence.name,
+        weights=weights.name,
+        trained_on=weights.about,
+        start_time=float(sequence.attributes.get("start_time", 0.0)),
+        seconds=seconds,
+        path_length=length,
+        from_start=float(np.linalg.norm(position[-1] - position[0])),
+        expected_error=error,
+        rest=_share_at_rest(ready, ekf),
+        accepted=float(used.mean()) if len(used) else None,
+        errors={},
+        warnings=(),
+        notes=(*recording.notes, *ready.notes),
+        limits=f"limits: {length:.1f} m in {seconds:.0f} s; expected error at the end "
+        f"{error:.1f} m{share} by the filter, {counted}; trained on {weights.about}; place and "
+        "heading are relative to the start",
+    )
+    if np.isfinite(found.reference.position).any():
+        summary = summary._replace(errors=metrics.score([found])[found.name].values)
+    own_rate = 1.0 / float(np.median(np.diff(sequence.time)))
+    warnings = [*recording.warnings, *_warnings(summary, own_rate, 1.0 / ekf.config.dt)]
+    holes = ready.imu_valid is not None
+    if holes or any(GAPS in note for note in recording.notes):
+        where = "" if holes else " (see above)"
+        warnings.append(
+            f"gaps: samples are missing{where}, and what happened there is guessed: from there on "
+            "heading and place are less certain than the filter says"
+        )
+    if ready.start.std.velocity > ROUGH_START:
+        warnings.append("start: it moves in its first second, so its velocity and tilt are rough")
+    diverged = (note for note in found.notes if note not in ready.notes)
+    return summary._replace(warnings=(*warnings, *diverged))
+
+
+def _warnings(summary: Summary, own_rate: float, rate: float) -> list[str]:
+    """What makes the track worth less than its figures."""
+    accepted = 1.0 if summary.accepted is None else summary.accepted
+    covered = summary.errors.get("nees_coverage_2d")
+    speed = summary.path_length / max(summary.seconds, 1e-9)
+    found = {
+        f"rate: recorded at {own_rate:.4g} Hz, the network was trained at {rate:g} Hz: what lies "
+        f"above {own_rate / 2.0:.3g} Hz is guessed": own_rate < 0.99 * rate,
+        f"rest: it lies still {summary.rest:.0%} of the time, and is held there": (
+            summary.rest >= LYING
+        ),
+        f"gate: the filter refused {1.0 - accepted:.0%} of the network's displacements: the motion "
+        "is unlike what the network was trained on": accepted < 1.0 - REFUSED,
+        f"speed: {speed:.1f} m/s in the mean is faster than people walk: the track is wrong": (
+            speed > FASTEST
+        ),
+        f"errors: larger than the filter says: its 95 % region holds the reference in "
+        f"{covered or 0.0:.0f} % of the rows": covered is not None and covered < COVERED,
+    }
+    return [text for text, applies in found.items() if applies]
+
+
+def _share_at_rest(ready: Recording, ekf: FilterSetup) -> float:
+    """Share of the strides in which the IMU is as quiet as the filter's rest; a line across a gap
+    is not."""
+    turn = np.linalg.norm(ready.gyro - ready.start.gyro_bias, axis=1)
+    pull = np.abs(np.linalg.norm(ready.accel, axis=1) - GRAVITY)
+    quiet = (turn < ekf.config.rest_gyro) & (pull < ekf.config.rest_accel)
+    if ready.imu_valid is not None:
+        quiet = quiet & ready.imu_valid
+    return float(quiet.reshape(-1, ekf.config.samples_per_clone).all(axis=1).mean())
+
+
+def _write_figures(
+    folder: Path, found: Estimate, summary: Summary, formats: tuple[str, ...]
+) -> None:
+    """Summary and trajectories, which have the stamps of the recording's own clock."""
+    finite = {
+        name: value if value is not None and math.isfinite(value) else None
+        for name, value in summary.errors.items()
+    }
+    plain = summary._asdict() | {"errors": finite}
+    text = json.dumps(plain, indent=2, allow_nan=False, ensure_ascii=False)
+    (folder / "summary.json").write_text(text + "\n", encoding="utf-8")
+    path, reference = (
+        each._replace(time=each.time + summary.start_time)
+        for each in (found.trajectory, found.reference)
+    )
+    write_tum(folder / "trajectory.txt", path)
+    if np.isfinite(reference.position).any():
+        write_tum(folder / "reference.txt", reference)
+    for kind in formats:
+        covariance = found.filtered and found.filtered.covariance
+        export.export(folder / f"trajectory.{kind}", path, kind, covariance)
+
+
+def _draw(
+    folder: Path, found: Estimate, summary: Summary, config: TrainConfig, command: str
+) -> None:
+    """The picture and the page, which are those of an evaluation's sequence."""
+    from gnio_jax.evaluation import page, plots, tabulate  # they take a second to import
+
+    seen = plots.view(found, alignment=None)
+    length = f"{summary.path_length:.1f} m in {summary.seconds:.0f} s"
+    expected = f"{summary.expected_error:.1f} m"
+    title = f"{shown_name(summary.recording)}: {length}, expected error at the end {expected}"
+    plots.save(folder / "track.png", plots.sequence(seen, title))
+    about = {
+        "command": command,
+        "walked": f"{length}, ends {summary.from_start:.1f} m from the start",
+        "expected error at the end": f"{expected} by the filter",
+        "weights": f"{summary.weights}, trained on {summary.trained_on}",
+        "window orientation": "filter",
+        "alignment": "start position and yaw" if summary.errors else "",
+        "windows": tabulate.windows(dataclasses.asdict(config.data)),
+    }
+    figures = summary.errors or {
+        "duration": summary.seconds,
+        "path_length": summary.path_length,
+        "accepted": None if summary.accepted is None else 100.0 * summary.accepted,
+    }
+    warnings = (f"warning: {each}" for each in summary.warnings)
+    run = page.Run(
+        "track",
+        {name: text for name, text in about.items() if text},
+        [seen],
+        {seen.name: figures},
+        remarks=(*warnings, summary.limits, *summary.notes),
+        settings=configuration.text(config),
+    )
+    page.write(folder / "report.html", summary.recording, [run])
