@@ -115,6 +115,7 @@ def _array(group: h5py.Group, field: str, path: Path) -> np.ndarray:
         problem = f"would take {stored.nbytes} bytes, which the file does not hold"
     if problem:
         raise InputError(path, f"field '{field}' {problem}", "convert the recording again")
+    assert isinstance(stored, h5py.Dataset)
     value = stored[()]
     return value if kind == "b" else value.astype(np.float64, copy=False)
 

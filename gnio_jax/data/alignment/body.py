@@ -30,7 +30,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d
-from scipy.optimize import least_squares, minimize_scalar
+from scipy.optimize import fminbound, least_squares
 from scipy.spatial.transform import Rotation
 
 from gnio_jax.data.assembly import Samples, Streams
@@ -546,8 +546,7 @@ def pose_lag(
 
     most = round(LONGEST_POSE_LAG * 100)
     lag = min((i / 100.0 for i in range(-most, most + 1)), key=off)
-    near = (lag - 0.01, lag + 0.01)
-    best = float(minimize_scalar(off, bounds=near, method="bounded", options={"xatol": 1e-5}).x)
+    best = float(fminbound(off, lag - 0.01, lag + 0.01, xtol=1e-5))
     first, second = (rate - rate.mean(axis=0) for rate in (felt, tracked(clock + best)))
     power = np.sqrt((first**2).sum() * (second**2).sum())
     return PoseLag(best, float((first * second).sum() / power))

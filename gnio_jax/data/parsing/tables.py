@@ -89,8 +89,8 @@ class Table(NamedTuple):
         values = np.stack(parts, axis=1) if len(parts) > 1 else parts[0]
         finite = np.isfinite(values)
         if not gaps and not finite.all():
-            row, *place = (int(i) for i in np.argwhere(~finite)[0])
-            name = names[place[0]] if len(names) > 1 else names[0]
+            row, *place = np.argwhere(~finite)[0].tolist()
+            name = names[place[0] if len(names) > 1 else 0]
             count = (~finite.reshape(len(finite), -1)).any(axis=1).sum()
             problem = f"is NaN or Inf in {count} rows, first in row {self.row(row)}"
             remedy = "repair or cut the recording there"

@@ -446,7 +446,8 @@ def _nexus_events(table: Table) -> Streams:
         rows = rows[np.argsort(stamps[rows], kind="stable")]
         time = restored_clock(stamps[rows] / 1e3 - start, table.path)
         sensors.append(Samples(time, values[rows], str(table.path)))
-    return Streams("", str(table.path), *sensors, {"imu_compensated": "no"}, start)
+    gyro, accel = sensors
+    return Streams("", str(table.path), gyro, accel, {"imu_compensated": "no"}, start)
 
 
 def _read_table(path: Path, *layouts: list[str]) -> Table:

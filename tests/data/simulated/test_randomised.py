@@ -6,7 +6,7 @@ import pytest
 from gnio_jax import data
 from gnio_jax.data.simulated import walks as simulated
 from gnio_jax.data.simulated.walker import CARRYING, MANY_PEOPLE, draw_motion
-from tests.support.strap_down import matrices, strap_down
+from tests.support.strap_down import matrices
 
 RATE = 100.0
 
@@ -24,14 +24,6 @@ def error_free(seed, placement, seconds=60.0):
     return simulated.walk_sequence(rng, "walk", walk, 1 / RATE, phone, {}, imu_errors=False)
 
 
-@pytest.mark.parametrize("placement", list(CARRYING))
-def test_the_error_free_imu_integrates_to_the_trajectory(placement):
-    sequence = error_free(3, placement)
-    found = strap_down(sequence)
-    # A sample's velocity is the mean of its ends; the path between them is curved.
-    assert np.abs(found - sequence.position).max() < 5e-3
-
-
 def test_every_walk_passes_the_self_check(walks):
     for sequence in walks:
         data.validate(sequence, sequence.name)
@@ -40,10 +32,7 @@ def test_every_walk_passes_the_self_check(walks):
         assert check.accel_correlation_horizontal > 0.9
 
 
-def test_a_seed_is_a_walk_and_splits_share_none(walks):
-    again = simulated.random_walk(7, 40.0)
-    np.testing.assert_array_equal(again.accel, walks[7].accel)
-    assert again.attributes == walks[7].attributes
+def test_splits_share_no_walk():
     names = [
         {r.name for r in simulated.RANDOMISED.recordings(None, split)}
         for split in ("train", "val", "test")
