@@ -172,16 +172,7 @@ def test_splits(copy):
         data.load("ronin", copy, "tests")
 
 
-def test_lists_and_copies_gone_wrong(copy):
-    lists = copy / "ronin" / "lists"
-    (lists / "list_val.txt").write_text("a009_1")
-    with pytest.raises(
-        InputError, match=r"list_val\.txt: none of its 1 sequences is below .*expected layout"
-    ):
-        data.load("ronin", copy, "val")
-    (lists / "list_val.txt").unlink()
-    with pytest.raises(InputError, match=r"list_val\.txt: the list cannot be read .*lists/list_"):
-        data.load("ronin", copy, "val")
+def test_of_copies_the_first_is_taken(copy):
     write(copy / "train_dataset_2" / "a006_2", seconds=20.0)
     with pytest.warns(
         UserWarning,

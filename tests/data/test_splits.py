@@ -1,4 +1,5 @@
-"""Folds: groups stay whole, the time is shared fairly, and training lacks what is left out."""
+"""Lists name recordings, and who is absent is counted; folds keep groups whole, share the time
+fairly, and training lacks what is left out."""
 
 import itertools
 
@@ -8,6 +9,7 @@ import pytest
 from gnio_jax import data
 from gnio_jax.config import DataConfig, TrainConfig
 from gnio_jax.data import loading
+from gnio_jax.data.splits import find_list, listed
 from gnio_jax.errors import InputError
 from gnio_jax.reporting import Lines
 from gnio_jax.training.task import read_split
@@ -21,6 +23,27 @@ def recording(name, seconds, **attributes):
     valid = np.ones(len(time), bool)
     found = Sequence(name, time, nothing, nothing, quaternion, nothing, nothing, valid)
     return found._replace(attributes=attributes)
+
+
+def test_lists_may_lack_recordings_and_their_last_newline_but_not_everything(tmp_path):
+    path = tmp_path / "lists" / "train.txt"
+    path.parent.mkdir()
+    (tmp_path / "b").mkdir()
+
+    def find(entry):
+        return tmp_path / entry if (tmp_path / entry).is_dir() else None
+
+    assert find_list(tmp_path, "train.txt") == tmp_path / "train.txt"  # for messages
+    path.write_text("\ufeff# mine\na\n b \n\nb\nc\nd\ne")
+    assert find_list(tmp_path, "train.txt") == path
+    with pytest.warns(UserWarning, match=r"train\.txt: 4 of 5 .* absent: a, c, d, \.\.\.$"):
+        assert listed(path, find, tmp_path, "any") == [tmp_path / "b"]
+    path.write_text("a\n" + 5000 * "x")  # too long for a name
+    with pytest.raises(InputError, match=r"none of its 2 sequences is below .*expected layout"):
+        listed(path, find, tmp_path, "any")
+    path.unlink()
+    with pytest.raises(InputError, match=r"train\.txt: the list cannot be read"):
+        listed(path, find, tmp_path, "any")
 
 
 # Groups of 50, 40, 30, 20 and 20 s.
