@@ -258,18 +258,18 @@ def lines(found: Comparison) -> list[list[str]]:
 def explanations(found: Comparison) -> list[str]:
     """What a reader must know of the figures."""
     rows, cells = found.rows, [cell for of in found.cells.values() for cell in of]
-    said = ["One seed each: what another seed would give is not known."]
+    remarks = ["One seed each: what another seed would give is not known."]
     if any(len(row.runs) > 1 for row in rows):
         seeds = "; ".join(
             f"{row.label}: {', '.join(row.runs) if len(row.runs) > 1 else 'one'}" for row in rows
         )
-        said = [f"Seeds of {seeds}. ± is their standard deviation."]
+        remarks = [f"Seeds of {seeds}. ± is their standard deviation."]
     if len({row.way for row in rows}) > 1:
         ways = "; ".join(f"{row.label}: {row.way}" for row in rows)
-        said.append(f"The rows are not estimated alike. {ways}.")
+        remarks.append(f"The rows are not estimated alike. {ways}.")
     if options := filter_options(found):
-        said.append(f"The rows differ in options of the filter: {', '.join(options)}.")
-    return said + tabulate.marks(cells)
+        remarks.append(f"The rows differ in options of the filter: {', '.join(options)}.")
+    return remarks + tabulate.marks(cells)
 
 
 def filter_options(found: Comparison) -> list[str]:

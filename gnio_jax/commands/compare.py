@@ -25,8 +25,8 @@ def compare(asked: CompareConfig, _call: options.Call) -> None:
     runs/plain_s0_calibrated, ...
 
     Walks of one person or session are not independent, so the 95 % interval of a difference is
-    Student's t over people or sessions. An interval on both sides of zero says that the recordings
-    do not tell the two apart. It knows nothing of other seeds: ± is their standard deviation.
+    Student's t over people or sessions. Where it holds zero, the recordings do not show which of
+    the two is better. It knows nothing of other seeds: ± is their standard deviation.
 
     examples:
       {prog} runs/plain runs/context --split sessions_test

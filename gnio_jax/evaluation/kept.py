@@ -13,7 +13,7 @@ from gnio_jax.evaluation.report import Report, read
 from gnio_jax.reporting import Reporter
 
 IDENTITY = ("dataset", "data_root", "split", "alignment")
-"""Settings that say which recordings an evaluation is of, and how its errors are measured."""
+"""Settings by which recordings and errors of two evaluations are the same."""
 
 
 class Kept(NamedTuple):

@@ -34,8 +34,7 @@ ROWS, FEWEST_ROWS = 9000, 150
 """Rows that a page holds, over all runs and sequences, and those that a sequence has at least.
 Fifteen minutes at ten rows a second are whole; what is longer is thinned."""
 SAME = ("dataset", "split", "data_root", "recordings", "model", "checkpoint", "step")
-"""Settings in which evaluations are alike that stand side by side; `imu_only` has no network, and
-only the first four."""
+"""Settings in which evaluations are alike that stand side by side."""
 STRIPS = {"gate": "gate γ (–)", "scale": "scale (–)", "std": "σ of network (m)"}
 """Curves with a value for each axis of the window's yaw frame, and their labels."""
 LEVELS = (("mean", 3.0, GREEN), ("refused above", 11.345, VERMILION))
@@ -59,7 +58,7 @@ class Run(NamedTuple):
     """One run on the page."""
 
     name: str
-    """Short: what tells it from the other runs."""
+    """Short: how it differs from the other runs."""
     about: dict[str, str]
     """How the figures were made, in words: the command, alignment, orientation, ..."""
     views: list[View]
@@ -118,8 +117,7 @@ def beside(folder: Path, settings: Mapping[str, Any]) -> list[Run]:
         try:
             report = read(other)
             own = report.settings
-            same = SAME if own["estimator"] != "imu_only" else SAME[:4]
-            if other != folder and all(own.get(name) == settings.get(name) for name in same):
+            if other != folder and all(own.get(name) == settings.get(name) for name in SAME):
                 name = other.name if tabulate.way(own) in found else tabulate.way(own)
                 found[name] = of_folder(other, report, name)
         except (InputError, OSError):
@@ -155,31 +153,13 @@ def render(title: str, runs: list[Run]) -> str:
         command=about.get("command"),
         sequences=sequences,
         runs=[run._asdict() | {"colour": COLOURS[place]} for place, run in enumerate(runs)],
-        headings=[COLUMNS[metric] for metric in shown],
-        measures=_measures(runs, sequences, shown),
+        below=list(dict.fromkeys(name for run in runs for name in run.summary)),
+        columns={metric: COLUMNS[metric] for metric in shown},
+        number=tabulate.number,
         figures=dict(zip(names, figures, strict=True)),
         library=Resources(mode="inline", components=["bokeh"]).render_js(),
         script=script,
     )
-
-
-def _measures(runs: list[Run], sequences: list[str], shown: list[str]) -> list[dict[str, Any]]:
-    """A line for each sequence and run, then those about all sequences. `place` is that of the
-    sequence among the page's."""
-    below = dict.fromkeys(name for run in runs for name in run.summary)
-    lines = [(place, name, "figures") for place, name in enumerate(sequences)]
-    return [
-        {
-            "place": place,
-            "name": name,
-            "run": run.name,
-            "colour": colour,
-            "cells": [tabulate.number(values.get(x), COLUMNS[x].digits) for x in shown],
-        }
-        for place, name, part in [*lines, *((None, name, "summary") for name in below)]
-        for run, colour in zip(runs, COLOURS, strict=False)
-        if (values := getattr(run, part).get(name)) is not None
-    ]
 
 
 def _file(name: str) -> str:

@@ -36,11 +36,11 @@ diverged or of a mean, or something in the file that tables need."""
 PAGE = "report.html"
 REMEDY = "evaluate the run anew with gnio evaluate"
 BESIDE = ("infinite", "reasons", "diverged", "group", "notes")
-"""What metrics.json says of a sequence besides its metrics."""
+"""What metrics.json has of a sequence besides its metrics."""
 
 
 class Report(NamedTuple):
-    """Everything that metrics.json says, before it is written and after it was read."""
+    """The content of metrics.json, before it is written and after it was read."""
 
     settings: dict[str, Any]
     """What changes the meaning of the figures."""

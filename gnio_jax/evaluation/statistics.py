@@ -111,21 +111,15 @@ def summarise(seeds: Sequence[Scores], metric: str, groups: Mapping[str, Any]) -
     )
 
 
-def interval(
-    values: Float[np.ndarray, "n"], groups: Iterable[Any], level: float = 0.95
-) -> Interval | None:
-    """The interval that holds the mean of the population with probability `level`.
+def interval(values: Float[np.ndarray, "n"], groups: Iterable[Any]) -> Interval | None:
+    """95 % interval of the mean of a population of groups, such as people or sessions.
 
-    `groups` holds the group (person, session) of each value. Groups are taken to be drawn at
-    random, so the standard error is the cluster-robust one,
-
-        s = sqrt(G / (G − 1) Σ_g (Σ_{i in g} (x_i − x̄))²) / n
-
-    for G groups and n values (Liang and Zeger 1986), and the quantile is Student's t with G − 1
-    degrees of freedom. For groups of like sizes it covers the mean as often as it says, also where
-    groups are few: a percentile bootstrap over 2, 3, 6 and 10 groups misses it in 50, 25, 15 and
-    10 % of the cases. None for fewer than two groups, and where a value or the interval is not
-    finite.
+    `groups` holds the group of each value. Groups are taken to be drawn at random, so the standard
+    error is the cluster-robust one, sqrt(G / (G − 1) Σ_g (Σ_{i in g} (x_i − x̄))²) / n for G groups
+    and n values (Liang and Zeger 1986), and the quantile is Student's t with G − 1 degrees of
+    freedom. It covers the mean as often as it should for groups of like sizes, also for few: a
+    percentile bootstrap over 2, 3, 6 and 10 groups misses it in 50, 25, 15 and 10 % of the cases.
+    None for fewer than two groups, and where a value or the interval is not finite.
     """
     members, group = np.unique([str(name) for name in groups], return_inverse=True)
     count = len(members)
@@ -135,7 +129,7 @@ def interval(
         mean = float(values.mean())
         sums = np.bincount(group, values - mean)
         error = math.sqrt(count / (count - 1)) * float(np.linalg.norm(sums)) / len(values)
-    reach = float(stdtrit(count - 1, 0.5 + level / 2)) * error
+    reach = float(stdtrit(count - 1, 0.975)) * error
     found = mean - reach, mean + reach
     return found if all(map(math.isfinite, found)) else None
 
@@ -151,23 +145,23 @@ def compare(
     different numbers of seeds."""
     of_own, of_other = values(own, metric), values(other, metric)
     diverged = lost(own) | lost(other)
-    shared = [
+    shared = sorted(
         name
         for name in of_own.keys() & of_other.keys()
         if name not in diverged and np.isfinite([*of_own[name], *of_other[name]]).all()
-    ]
+    )
     either = {
         name
         for scores in (*own, *other)
         for name, measures in scores.items()
         if measures.values.get(metric) is not None
     }
-    drawn = [groups[name] for name in sorted(shared)]
+    drawn = [groups[name] for name in shared]
     counts = {"compared": len(shared), "sequences": len(either), "groups": len(set(drawn))}
     nothing = Difference(None, None, None, 0, **counts)
     if not shared:
         return nothing
-    rows = [[of[name] for name in sorted(shared)] for of in (of_own, of_other)]
+    rows = [[of[name] for name in shared] for of in (of_own, of_other)]
     ours, theirs = (np.array([seeds.mean() for seeds in row]) for row in rows)
     near, far = (np.array([np.abs(seeds - best).mean() for seeds in row]) for row in rows)
     if near.sum() < far.sum() and _share_lost(own) > _share_lost(other):
@@ -193,22 +187,10 @@ class Cell(NamedTuple):
 
     mean: Summary
     difference: Difference | None
-    """To the first row; None for the first itself, and without the metric."""
+    """To the first row; None for the first itself."""
 
 
 def of_seeds(found: list[float]) -> Summary:
     """A figure that is not one of sequences, with each seed."""
     mean = float(np.mean(found)) if found else None
     return Summary(mean, found, None, None, 0, 0, 0, len(found))
-
-
-def cells(
-    rows: Sequence[Sequence[Scores]], metric: str, groups: Mapping[str, Any], best: float = 0.0
-) -> list[Cell]:
-    """A metric of every row of a table, each with its seeds, compared with the first row."""
-    found = [Cell(summarise(rows[0], metric, groups), None)]
-    for row in rows[1:]:
-        measured = any(own.values.get(metric) is not None for of in row for own in of.values())
-        difference = compare(row, rows[0], metric, groups, best) if measured else None
-        found.append(Cell(summarise(row, metric, groups), difference))
-    return found

@@ -109,8 +109,15 @@ def difference(found: Difference | None, digits: int) -> str:
 def cells(rows: Sequence[Sequence[Report]], metrics: Iterable[str]) -> dict[str, list[Cell]]:
     """Metric → a cell for each row, whose seeds are reports; compared with the first row."""
     groups = {name: own for row in rows for each in row for name, own in each.groups.items()}
-    seeds = [[each.scores for each in row] for row in rows]
-    return {name: statistics.cells(seeds, name, groups, column(name).best) for name in metrics}
+    first, *others = ([each.scores for each in row] for row in rows)
+    found = {}
+    for metric in metrics:
+        best = column(metric).best
+        found[metric] = [Cell(statistics.summarise(first, metric, groups), None)]
+        for own in others:
+            difference = statistics.compare(own, first, metric, groups, best)
+            found[metric].append(Cell(statistics.summarise(own, metric, groups), difference))
+    return found
 
 
 def records(

@@ -127,8 +127,8 @@ def comparison(base: TrainConfig, split: str, networks: tuple[str, ...] = METHOD
 
 
 def components(base: TrainConfig) -> Experiment:
-    """Bank and gated head apart and together. The paper's baseline is TLIO's own network; the plain
-    linear head on GNIO's pooled features is printed beside it."""
+    """Bank and gated head, each alone and both. The paper's baseline is TLIO's own network; the
+    plain linear head on GNIO's pooled features is printed beside it."""
     plain = variant(base, bank_size=0, head="linear")
     bank, gated = variant(base, head="linear"), variant(base, bank_size=0)
     return Experiment(

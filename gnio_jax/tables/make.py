@@ -61,12 +61,12 @@ def make(options: TablesConfig, reporter: Reporter | None = None, workers: int =
     results = [run_row(row, options, reporter, workers) for row in experiment.rows]
     name = f"{options.table}_{options.split}_{options.estimator}"
     path = Path(options.out) / (f"{name}_calibrated" if options.calibrate else name)
-    said = notes(base, options, experiment)
+    remarks = notes(base, options, experiment)
     if options.table == "trajectories":
         return make_trajectories(path, options, results)
     if options.table == "standing":
-        return make_standing(path, options, experiment, results, said)
-    return make_table(path, options, experiment, results, said)
+        return make_standing(path, options, experiment, results, remarks)
+    return make_table(path, options, experiment, results, remarks)
 
 
 def base_config(options: TablesConfig) -> TrainConfig:
@@ -129,7 +129,7 @@ def hardware() -> str:
 
 
 def make_table(
-    path: Path, options: TablesConfig, experiment: Experiment, results: list[Result], said: str
+    path: Path, options: TablesConfig, experiment: Experiment, results: list[Result], remarks: str
 ) -> str:
     """comparison, components, gates, bank-size: the files, and the text to show."""
     from gnio_jax.tables import plots  # Matplotlib takes a second to import
@@ -145,7 +145,7 @@ def make_table(
         figures |= _over_seeds("entropy of a window", [own[:, 0] for own in entropies])
         figures |= _over_seeds("entropy of their mean", [own[:, 1] for own in entropies])
     plots.save(with_ending(path, ".png"), plots.table(experiment, results, figures["ate"]))
-    text = f"## {experiment.title}\n\n{said}\n\n{render(experiment, figures)}"
+    text = f"## {experiment.title}\n\n{remarks}\n\n{render(experiment, figures)}"
     heads = [
         {"row": row.name, "label": row.label, "seeds": options.seeds, "published": row.published}
         for row in experiment.rows
@@ -244,7 +244,7 @@ def make_trajectories(path: Path, options: TablesConfig, results: list[Result]) 
 
 
 def make_standing(
-    path: Path, options: TablesConfig, experiment: Experiment, results: list[Result], said: str
+    path: Path, options: TablesConfig, experiment: Experiment, results: list[Result], remarks: str
 ) -> str:
     """Errors at rest and in slow walking, gate and attention: where the gate's claim stands."""
     from gnio_jax.tables import plots  # Matplotlib takes a second to import
@@ -257,9 +257,9 @@ def make_standing(
         if "gate" in seeds[0].diagnostics:
             plots.save(path.with_name(f"{beside}_gate.png"), plots.gate(seeds[0]))
         if "attention" in seeds[0].diagnostics:
-            told, chance = np.mean([activities.information(seed) for seed in seeds], axis=0)
+            bits, chance = np.mean([activities.information(seed) for seed in seeds], axis=0)
             words = (
-                f"the most attended prototype tells {told:.2f} bits of the activity, "
+                f"the most attended prototype carries {bits:.2f} bits about the activity, "
                 f"by chance it would be {chance:.2f}"
             )
             lines.append(f"{result.row.label}: {words}.\n\n")
@@ -267,7 +267,7 @@ def make_standing(
             plots.save(path.with_name(f"{beside}_attention.png"), picture)
     plots.save(with_ending(path, ".png"), plots.standing(by_method))
     table = render(experiment, figures_of(results))
-    head = f"## {experiment.title}\n\n{said}\n\n{''.join(lines)}"
+    head = f"## {experiment.title}\n\n{remarks}\n\n{''.join(lines)}"
     text = f"{head}{table}\n{activities.render(by_method)}"
     write_text(with_ending(path, ".md"), text)
     return f"{text}\nresults: {path}.md, .png and the pictures beside them"
@@ -292,13 +292,12 @@ SAMPLES, BATCHES, SECONDS = 200, (1, 128), 3.0
 class Complexity(NamedTuple):
     """What one network costs."""
 
-    network: str
     parameters: int
     gflops: float
     """Floating-point operations of one window in the compiled program, 10⁹; NaN where the compiler
     does not count them."""
-    latency: dict[int, float]
-    """Batch → time per window, ms, median."""
+    latency: list[float]
+    """Time per window of each size of a batch, ms, median."""
 
 
 def make_complexity(out: Path, reporter: Reporter) -> str:
@@ -313,7 +312,7 @@ def make_complexity(out: Path, reporter: Reporter) -> str:
                 network,
                 f"{found.parameters:,}",
                 tabulate.number(found.gflops, 3),
-                *(tabulate.number(each, 2) for each in found.latency.values()),
+                *(tabulate.number(each, 2) for each in found.latency),
                 "–" if millions is None else f"{millions:.2f} M",
                 tabulate.number(gflops, 2),
             ]
@@ -341,7 +340,8 @@ def measure(
     model = models.create(network)
     variables = models.initialise(model, jax.random.key(0), SAMPLES)
     frozen, inference = models.inference_variables(model, variables), models.Inference(model)
-    latency, operations = {}, math.nan
+    latency: list[float] = []
+    operations = math.nan
     for batch in batches:
         drawn = np.random.default_rng(0).standard_normal((batch, SAMPLES, 6))
         windows = jnp.asarray(drawn, jnp.float32)
@@ -354,6 +354,6 @@ def measure(
             began = time.perf_counter()
             jax.block_until_ready(compiled(frozen, windows))
             times.append(time.perf_counter() - began)
-        latency[batch] = 1e3 * float(np.median(times)) / batch
+        latency.append(1e3 * float(np.median(times)) / batch)
     parameters = sum(leaf.size for leaf in jax.tree.leaves(variables["params"]))
-    return Complexity(network, parameters, operations / 1e9, latency)
+    return Complexity(parameters, operations / 1e9, latency)

@@ -8,23 +8,9 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.figure import Figure
 
+from gnio_jax.evaluation import plots as style
 from gnio_jax.evaluation import statistics
-from gnio_jax.evaluation.plots import (
-    BLUE,
-    COLOURS,
-    GREEN,
-    GREY,
-    ORANGE,
-    PURPLE,
-    REFERENCE,
-    SKY,
-    START,
-    VERMILION,
-    YELLOW,
-    View,
-    finish,
-    save,
-)
+from gnio_jax.evaluation.plots import View, finish, save
 from gnio_jax.evaluation.statistics import Cell
 from gnio_jax.tables.activities import ACTIVITIES, HORIZONTAL, PredictedWindows
 from gnio_jax.tables.experiments import Experiment
@@ -33,20 +19,20 @@ from gnio_jax.tables.runs import Result
 __all__ = ["attention", "gate", "gradients", "save", "standing", "table", "trajectories"]
 
 METHODS = {
-    "tlio": BLUE,
-    "gnio": GREEN,
-    "ronin_resnet": ORANGE,
-    "deepils": PURPLE,
-    "ctin": VERMILION,
-    "imot": SKY,
-    "imot_text": YELLOW,
+    "tlio": style.BLUE,
+    "gnio": style.GREEN,
+    "ronin_resnet": style.ORANGE,
+    "deepils": style.PURPLE,
+    "ctin": style.VERMILION,
+    "imot": style.SKY,
+    "imot_text": style.YELLOW,
 }
 """TLIO blue and GNIO green, as in the paper's figure."""
 
 
 def table(experiment: Experiment, results: list[Result], ates: list[Cell]) -> Figure:
     """`ate` of each row: every seed a dot, their mean a bar, sequences behind it; beside it what
-    the paper printed. Of what diverged there is no dot: the row's label says how many."""
+    the paper printed. What diverged has no dot: the row's label has its number."""
     published = [row.published for row in experiment.rows]
     beside = any(value is not None for value in published)
     size = (9.0 if beside else 6.4, 1.4 + 0.45 * len(results))
@@ -59,9 +45,9 @@ def table(experiment: Experiment, results: list[Result], ates: list[Cell]) -> Fi
         found = statistics.values(result.seeds, "ate")
         sequences = [own.mean() for name, own in found.items() if name not in lost]
         labels = ("sequence", "seed, mean over sequences") if place == 0 else (None, None)
-        ours.barh(place, mean.mean or 0.0, color=GREEN, alpha=0.35, height=0.6)
+        ours.barh(place, mean.mean or 0.0, color=style.GREEN, alpha=0.35, height=0.6)
         above = np.full(len(sequences), place) + 0.2
-        ours.plot(sequences, above, "|", color=GREY, ms=7, label=labels[0])
+        ours.plot(sequences, above, "|", color=style.GREY, ms=7, label=labels[0])
         seeds = np.full(len(mean.seeds), place)
         ours.plot(mean.seeds, seeds, "o", color="black", ms=4, label=labels[1])
         diverged = f"\n({mean.diverged} of {mean.estimates} diverged)" if mean.diverged else ""
@@ -72,13 +58,13 @@ def table(experiment: Experiment, results: list[Result], ates: list[Cell]) -> Fi
     ours.set_xlim(left=0)
     for place, value in enumerate(published):
         if value is not None:
-            panels[1].barh(place, value, color=BLUE, alpha=0.35, height=0.6)
+            panels[1].barh(place, value, color=style.BLUE, alpha=0.35, height=0.6)
             panels[1].text(value, place, f" {value:.2f}", va="center", fontsize=8)
     if beside:
         panels[1].set(xlabel="published (m), on other data", title="paper")
         panels[1].margins(x=0.2)
-    style = {"fontsize": 8, "frameon": False, "loc": "outside lower center", "ncols": 2}
-    figure.legend(*ours.get_legend_handles_labels(), **style)
+    form = {"fontsize": 8, "frameon": False, "loc": "outside lower center", "ncols": 2}
+    figure.legend(*ours.get_legend_handles_labels(), **form)
     for axes in panels:
         finish(axes)
     return figure
@@ -89,7 +75,7 @@ def gradients(results: list[Result], norms: Sequence[Float[np.ndarray, "seeds ep
     seeds, their range shaded."""
     figure = Figure(figsize=(6.8, 4.2), layout="constrained")
     axes = figure.add_subplot()
-    for result, own, colour in zip(results, norms, COLOURS, strict=False):
+    for result, own, colour in zip(results, norms, style.COLOURS, strict=False):
         epochs = np.arange(1, own.shape[1] + 1)
         axes.semilogy(epochs, own.mean(0), color=colour, label=result.row.label)
         axes.fill_between(epochs, own.min(0), own.max(0), color=colour, alpha=0.15, lw=0)
@@ -117,20 +103,20 @@ def trajectories(
     for axes, name in zip(panels, names, strict=False):
         views = {x: seen for x, own in methods.items() for seen in own if seen.name == name}
         reference = next(iter(views.values())).reference[:, :2]
-        (handles["reference"],) = axes.plot(*reference.T, color=REFERENCE, lw=1.8)
+        (handles["reference"],) = axes.plot(*reference.T, color=style.REFERENCE, lw=1.8)
         for number, (method, seen) in enumerate(views.items()):
-            colour = METHODS.get(method, COLOURS[number % len(COLOURS)])
+            colour = METHODS.get(method, style.COLOURS[number % len(style.COLOURS)])
             (handles[method],) = axes.plot(*seen.position[:, :2].T, color=colour, lw=1.1)
         first = reference[np.isfinite(reference).all(1)][0]
-        axes.plot(*first, color=REFERENCE, zorder=4, **START)
+        axes.plot(*first, color=style.REFERENCE, zorder=4, **style.START)
         axes.set_aspect("equal", adjustable="datalim")
         axes.set_title(name, fontsize=9)
         finish(axes)
     for axes in panels[len(names) :]:
         axes.set_visible(False)
     columns = min(8, len(handles))
-    style = {"fontsize": 9, "frameon": False, "loc": "outside upper center", "ncols": columns}
-    figure.legend(handles.values(), handles.keys(), **style)
+    form = {"fontsize": 9, "frameon": False, "loc": "outside upper center", "ncols": columns}
+    figure.legend(handles.values(), handles.keys(), **form)
     figure.supxlabel("x (m)", fontsize=9)
     figure.supylabel("y (m)", fontsize=9)
     return figure
@@ -147,9 +133,9 @@ def gate(windows: PredictedWindows) -> Figure:
     }
     standing_still, slow = (ACTIVITIES.index(name) for name in ("standing", "slow"))
     rows = {
-        "standing": (windows.activity == standing_still, VERMILION),
-        "slow": (windows.activity == slow, GREY),
-        "moving": (windows.activity > slow, BLUE),
+        "standing": (windows.activity == standing_still, style.VERMILION),
+        "slow": (windows.activity == slow, style.GREY),
+        "moving": (windows.activity > slow, style.BLUE),
     }
     for axes, (name, values) in zip(figure.subplots(1, 3), quantities.items(), strict=True):
         horizontal = values[:, HORIZONTAL]
@@ -195,7 +181,7 @@ def standing(by_method: dict[str, dict[str, dict[str, float]]]) -> Figure:
     for number, (method, figures) in enumerate(by_method.items()):
         places = np.arange(len(names)) + 0.1 * (number - (len(by_method) - 1) / 2)
         values = [figures.get(name, {}).get("error", np.nan) for name in names]
-        axes.semilogy(places, values, "o", color=METHODS.get(method, GREY), label=method)
+        axes.semilogy(places, values, "o", color=METHODS.get(method, style.GREY), label=method)
     axes.set_xticks(range(len(names)), names)
     axes.set(ylabel="rms error of a window's displacement (m)", title="By what the walker did")
     axes.legend(fontsize=8, frameon=False)

@@ -103,7 +103,7 @@ def test_marks_are_explained(runs):
     assert any(line.startswith("∞") for line in comparison.explanations(found))
     write(runs / "other", {"a": 1.0, "b": 1.0, "c": 1.0}, drop=("rpe_1s",))
     found = compare(runs / "plain", runs / "other", runs / "new", metrics=("rpe_1s",))
-    assert comparison.lines(found)[1] == ["", "other", "–", "", ""]
+    assert comparison.lines(found)[1] == ["", "other", "–", "–", ""]
     assert comparison.lines(found)[2][3].startswith("-0.100")
     found = compare(runs / "other", runs / "new", metrics=("rpe_1s",))
     assert comparison.lines(found)[1][3] == "–"  # nothing to compare with

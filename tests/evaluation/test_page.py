@@ -181,7 +181,7 @@ def test_evaluations_beside_are_read_back(tmp_path, estimates, made):
         "summed": settings
         | {"estimator": "integrate", "coupling": None, "orientation_source": "device"},
         "again": settings,
-        "imu": settings | {"estimator": "imu_only", "coupling": None, "model": None, "step": None},
+        "imu": settings | {"estimator": "imu_only", "coupling": None},
         "older": settings | {"definitions": 1},
         "other": settings | {"step": 8},
         "another": settings | {"split": "val"},

@@ -14,6 +14,7 @@ from gnio_jax.calibration import run as calibration_run
 from gnio_jax.config import CalibrateConfig, DataConfig, ModelConfig, OptimConfig, TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import kept
+from gnio_jax.tables import activities
 from gnio_jax.training import loop
 from tests.support.command_lines import run as gnio
 from tests.support.tlio_files import write_sequence
@@ -65,7 +66,7 @@ def test_a_table_from_nothing_and_again_without_training(made, monkeypatch, caps
     assert (root / "out" / "comparison_test_integrate.md").read_text(encoding="utf-8") == text
     gnio("tables", "standing", *arguments)
     text = (root / "out" / "standing_test_integrate.md").read_text(encoding="utf-8")
-    assert "most attended prototype tells" in text and "| gnio | walking |" in text
+    assert "most attended prototype carries" in text and "| gnio | walking |" in text
     gnio("tables", "trajectories", *arguments, "--sequences", "c")
     for name in (
         "standing_test_integrate",
@@ -116,6 +117,13 @@ def test_every_run_is_calibrated_before_it_is_measured(made, monkeypatch, capsys
     assert run.filter.noise.measurement_scale != 10 and run.filter.considered.gyro_bias > 0
     assert run.model == trained.model
     assert float(after["nis"]) > 0 and after["nis"] != before["nis"]
+    # What the windows are measured by has the factors that calibration found.
+    raw, fitted = (
+        activities.predict_split(root / "out" / "runs" / name, "test").std
+        for name in ("gnio_s0", "gnio_s0_calibrated")
+    )
+    np.testing.assert_allclose(fitted, raw * run.filter.noise.std_factor, rtol=1e-6)
+    assert abs(np.log(run.filter.noise.std_factor)).max() > 0.01
 
 
 def test_a_signal_ends_the_table_and_says_how_to_go_on(made, monkeypatch, capsys):
