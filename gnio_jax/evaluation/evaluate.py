@@ -69,6 +69,7 @@ def evaluate(
     for the page. Raises `InputError` for options that do not fit together, a run without the
     checkpoint, missing data, and a split of which no sequence can be estimated.
     """
+    _check(config)
     from gnio_jax.training.checkpoint import load_run  # Orbax takes seconds to import
 
     workdir = Path(config.workdir or configuration.newest_run())
@@ -124,22 +125,25 @@ def evaluate(
     return Evaluation(report, estimates, recordings, folder)
 
 
-def resolve(config: EvaluateConfig, run: TrainConfig) -> EvaluateConfig:
-    """What is asked for, with what it takes from the run: dataset, folder of the data, orientation
-    of the windows, and the filter with what `config.set` changes of it. `run` is the configuration
-    of the run. Raises `InputError` for options that do not fit together."""
+def _check(config: EvaluateConfig) -> None:
+    """Raise `InputError` for options that cannot be, whatever the run is."""
     if config.batch_size < 1:
         raise InputError("--batch-size", f"must be at least 1, found {config.batch_size}")
-    orientation = config.orientation or _usual_orientation(config)
-    if not _infers(config) and orientation != "filter":
+    if not _infers(config) and config.orientation not in (None, "filter"):
         what = "imu_only" if config.estimator == "imu_only" else "the tight coupling"
         problem = f"{what} uses the filter's own attitude"
         remedy = "leave it out, or choose --coupling loose or --estimator integrate"
-        raise InputError(f"--orientation {orientation}", problem, remedy)
+        raise InputError(f"--orientation {config.orientation}", problem, remedy)
     for assignment in config.set:
         if not assignment.startswith("filter."):
             remedy = "write filter.FIELD=VALUE, e.g. filter.noise.measurement_scale=1"
-            raise InputError(f"'{assignment}'", "is not a setting of the filter", remedy)
+            raise InputError(f"--set {assignment}", "is no setting of the filter", remedy)
+
+
+def resolve(config: EvaluateConfig, run: TrainConfig) -> EvaluateConfig:
+    """What is asked for, with what it takes from the run: dataset, folder of the data, orientation
+    of the windows, and the filter with what `config.set` changes of it. `run` is the configuration
+    of the run. Raises `InputError` for an unknown dataset, missing data and impossible settings."""
     changed = dataclasses.replace(run, filter=config.filter or run.filter)
     changed = configuration.validate(configuration.assign(changed, config.set), "command line")
     dataset, root = config.dataset or run.dataset, None
@@ -151,7 +155,7 @@ def resolve(config: EvaluateConfig, run: TrainConfig) -> EvaluateConfig:
         dataset=dataset,
         data_root=root,
         coupling=config.coupling if config.estimator == "ekf" else "tight",
-        orientation=orientation,
+        orientation=config.orientation or _usual_orientation(config),
         filter=changed.filter,
         set=(),
     )

@@ -7,8 +7,7 @@ from gnio_jax.commands import train
 from gnio_jax.commands.options import Call, read
 from gnio_jax.config import TrainConfig
 from gnio_jax.errors import InputError
-from gnio_jax.evaluation.evaluate import resolve
-from tests.support.command_lines import run, understood
+from tests.support.command_lines import run
 
 
 def parse(*arguments):
@@ -99,6 +98,7 @@ def test_numbers_are_those_of_yaml():
             ["data", "check", "tlio", "--splt", "a"],
             "--splt: unknown option; did you mean '--split'?",
         ),
+        (["evaluate", "--set", "workdir=B"], "--set workdir=B: is no setting of the filter; write"),
         (["tables", "gatse"], "TABLE: must be one of complexity, comparison"),
         (["compare"], "RUNS: is missing; give it as a word"),
         (["interop", "a", "b", "c"], "'c': is not an option"),
@@ -107,12 +107,6 @@ def test_numbers_are_those_of_yaml():
 )
 def test_a_mistake_is_one_line(words, expected):
     assert expected in mistake(*words)
-
-
-def test_evaluate_sets_nothing_but_the_filter():
-    asked = understood(["evaluate", "--set", "workdir=B"])
-    with pytest.raises(InputError, match="'workdir=B': is not a setting of the filter; write"):
-        resolve(asked, TrainConfig())
 
 
 def test_options_win_over_the_file_and_the_file_over_the_default(tmp_path):
