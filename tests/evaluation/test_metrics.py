@@ -188,9 +188,10 @@ def test_stationary_drift():
     moving = truth[401:700]
     with pytest.raises(Undefined, match="never stands"):
         metrics.stationary_drift(moving, moving, STEP)
-    brief = np.zeros((40, 3))
-    brief[:, 0] = np.r_[np.arange(12), np.full(15, 11), np.arange(11, 24)] * STEP  # still for 1.5 s
-    assert not metrics.standing(brief, STEP).any()
+    for rows in (20, 21):  # still for 1.9 and for 2 s
+        brief = np.zeros((60, 3))
+        brief[:, 0] = np.r_[np.arange(15), np.full(rows, 15), np.arange(16, 61 - rows)] * STEP
+        assert metrics.standing(brief, STEP).sum() == (0 if rows == 20 else 21)
 
 
 def test_yaw_errors_wrap():
@@ -243,6 +244,7 @@ def test_nees_of_a_consistent_filter():
     assert metrics.coverage(squared, 3) == pytest.approx(95, abs=0.7)
     assert metrics.mean_normalised(4 * squared, 3) == pytest.approx(4.0, abs=0.1)
     assert metrics.coverage(np.array([1.0, np.nan, 7.8, 7.9]), 3) == pytest.approx(200 / 3)
+    assert metrics.coverage(np.array([5.98, 6.0]), 2) == 50  # of 95 % with two degrees of freedom
 
 
 def test_nees_does_not_depend_on_the_frame():
