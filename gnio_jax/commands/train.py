@@ -105,20 +105,20 @@ def experiment(asked: TrainOptions, call: options.Call) -> TrainConfig:
     file = None if asked.config is None else configuration.find(asked.config)
     content = None if file is None else configuration.read(file)  # once: it may be a pipe
 
-    def settled(base: TrainConfig) -> TrainConfig:
+    def combined(base: TrainConfig) -> TrainConfig:
         found = base if content is None else configuration.parse(content, str(file), base)
         given = options.read(train, call, TrainOptions(**vars(found)))
         chosen = TrainConfig(**{name: getattr(given, name) for name in vars(base)})
         return configuration.assign(chosen, asked.set)
 
-    config = settled(TrainConfig())
+    config = combined(TrainConfig())
     first = configuration.with_seeds(config, asked.seeds)[0] if asked.seeds else config
     kept = configuration.default_workdir(first) / "config.yaml"
     if asked.resume and kept.exists():
         begun = configuration.load(kept)
         if file is None:
             file, content = kept, configuration.text(begun)
-        resumed = settled(TrainConfig(filter=begun.filter))
+        resumed = combined(TrainConfig(filter=begun.filter))
         return dataclasses.replace(resumed, workdir=config.workdir)  # not that of the first seed
     if not config.through_filter.learn or config.init_from is None:
         return config
@@ -126,6 +126,6 @@ def experiment(asked: TrainOptions, call: options.Call) -> TrainConfig:
     from gnio_jax.apps import packages
 
     filtering.cores_as_devices()  # before the checkpoint's arrays settle the devices
-    learnt = packages.load_pretrained(config.init_from).config.filter
-    begins = dataclasses.replace(learnt, considered=ConsideredStd())
-    return settled(TrainConfig(filter=begins))
+    trained = packages.load_pretrained(config.init_from).config.filter
+    begins = dataclasses.replace(trained, considered=ConsideredStd())
+    return combined(TrainConfig(filter=begins))

@@ -165,9 +165,9 @@ def value_from_words(hint: Any, words: Sequence[str], name: str) -> Any:
 
     Raises `InputError` that names the option.
     """
-    kinds = _kinds(hint)
-    several = [kind for kind in kinds if typing.get_origin(kind) is tuple]
-    wanted = _kinds(typing.get_args(several[0])[0]) if several else kinds
+    alternatives = _alternatives(hint)
+    several = [kind for kind in alternatives if typing.get_origin(kind) is tuple]
+    wanted = _alternatives(typing.get_args(several[0])[0]) if several else alternatives
     is_text = not {Any, float, int, bool} & set(wanted)
 
     def value(word: str) -> Any:
@@ -205,10 +205,10 @@ def _section(base: Any, content: Any, place: Place) -> Any:
 
 def _value(hint: Any, content: Any, place: Place, base: Any = None) -> Any:
     """The value of a field, if it has the field's type; a section takes the rest from `base`."""
-    kinds = _kinds(hint)
-    if content is None and type(None) in kinds:
+    alternatives = _alternatives(hint)
+    if content is None and type(None) in alternatives:
         return None
-    for kind in kinds:
+    for kind in alternatives:
         if _is_section(kind):
             return _section(kind() if base is None else base, content, place)
         if typing.get_origin(kind) is tuple:
@@ -254,7 +254,7 @@ def _spell(hint: Any) -> str:
             return "one of " + ", ".join(members)
         return f"a list of {spell(members[0])}" if members else _SPELLING[kind]
 
-    return " or ".join(map(spell, _kinds(hint)))
+    return " or ".join(map(spell, _alternatives(hint)))
 
 
 # Types of fields
@@ -272,13 +272,13 @@ def _hints(section: Any) -> dict[str, Any]:
     return typing.get_type_hints(kind, include_extras=True)
 
 
-def _kinds(hint: Any) -> list[Any]:
+def _alternatives(hint: Any) -> list[Any]:
     """The types that a value may have, without what is annotated to them."""
     if typing.get_origin(hint) is Annotated:
-        return _kinds(typing.get_args(hint)[0])
+        return _alternatives(typing.get_args(hint)[0])
     # `Literal[...] | None` is a typing.Union, `int | None` is a types.UnionType.
     if isinstance(hint, types.UnionType) or typing.get_origin(hint) is typing.Union:
-        return [kind for member in typing.get_args(hint) for kind in _kinds(member)]
+        return [kind for member in typing.get_args(hint) for kind in _alternatives(member)]
     return [hint]
 
 
@@ -458,7 +458,7 @@ _GONE = {
 
 def _is_of_earlier_version(fields: dict[str, Any]) -> bool:
     """Whether it is the config.yaml that an earlier version left: a whole one."""
-    sections = [name for name, hint in _hints(TrainConfig).items() if _is_section(_kinds(hint)[0])]
+    sections = [name for name, value in vars(TrainConfig()).items() if _is_section(type(value))]
     whole = all(isinstance(fields.get(name), dict) for name in sections)
     return whole and "checkpoint_every_seconds" in fields
 

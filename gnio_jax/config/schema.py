@@ -191,7 +191,7 @@ class LossConfig:
     name: Literal["weighted_sum", "velocity_and_covariance"] = "weighted_sum"
     """Weighted sum of squared error, absolute error and negative log-likelihood of the
     displacement, with the weights below; or CTIN's loss: errors of velocity and position and the
-    likelihood of each sample's velocity, weighted by two learnt parameters."""
+    likelihood of each sample's velocity, weighted by two trainable parameters."""
     mse_weight: NonNegative = 1e2
     """λ_MSE."""
     mae_weight: NonNegative = 0.0

@@ -15,9 +15,9 @@ from gnio_jax.config import LossConfig
 from gnio_jax.types import Prediction, Windows
 
 TASK_LOG_STD_FLOOR = -math.log(2.0)
-"""Lower bound of CTIN's learnt log δ_v and log δ_c: no term has a weight above 2 (ours). Without it
-the loss has no lower bound: a likelihood of densities below 0, which a good network reaches, draws
-log δ_c to −∞, and its weight grows until the error of the velocity plays no part."""
+"""Lower bound of CTIN's trainable log δ_v and log δ_c: no term has a weight above 2 (ours). Without
+it the loss has no lower bound: a likelihood of densities below 0, which a good network reaches,
+draws log δ_c to −∞, and its weight grows until the error of the velocity plays no part."""
 _NEVER = 2**31 - 1
 
 
@@ -89,7 +89,7 @@ def losses(
 def _velocity_and_covariance(
     prediction: Prediction, windows: Windows, config: LossConfig, stage: Stage, axes: int
 ) -> Float[jax.Array, ""]:
-    """CTIN's L_v / 2δ_v² + L_c / 2δ_c² + log δ_v δ_c (its eq. 9–11), with learnt δ.
+    """CTIN's L_v / 2δ_v² + L_c / 2δ_c² + log δ_v δ_c (its eq. 9–11), with trainable δ.
 
     L_v is the squared error of each sample's velocity plus that of the position to which they add
     up, L_c the likelihood of the velocities. Velocities are metres per window. Ours: means over the

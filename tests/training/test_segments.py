@@ -1,4 +1,4 @@
-"""Pieces of recordings: where they may begin, what they hold, and how wrong a start is."""
+"""Segments of recordings: where they may begin, what they hold, and how wrong a start is."""
 
 import jax
 import jax.numpy as jnp
