@@ -86,8 +86,9 @@ def calibrate(
     noise = noise._replace(std_factor=(x, y, z))
     settings = start_of_fit(dataclasses.replace(uncalibrated, noise=noise), paths)
     strides = max(each.strides for each in recordings)
-    # The first row of an estimate is its start.
-    given = [Displacements(*(x[1:] for x in each.displacements[:2])) for each in estimates]
+    # The first row of an estimate is its start. That of a network has displacements.
+    predicted = [each.displacements for each in estimates if each.displacements is not None]
+    given = [Displacements(*(x[1:] for x in each[:2])) for each in predicted]
     walks = filter_inputs(recordings, given, strides, filter_config(windows, settings))
     found = fit_innovations(
         walks,
