@@ -8,6 +8,7 @@ first second, in which the device must lie still anyway.
 
 from __future__ import annotations
 
+import dataclasses
 import heapq
 import itertools
 import json
@@ -384,8 +385,9 @@ def begins_at_rest(run: Run) -> Callable[[list[Sample]], bool]:
         first = [each for each in samples if each.time - samples[0].time < FIRST_SECONDS]
         if len(first) < FIRST_SAMPLES or samples[-1].time - samples[0].time < FIRST_SECONDS:
             return True  # too little has come: the rest may go on
-        signals = np.array([each.gyro for each in first]), np.array([each.accel for each in first])
-        state = level_state(setup.config, *signals, setup.initial_std)
+        rows = np.array([(each.time, *each.gyro, *each.accel) for each in first])
+        config = dataclasses.replace(setup.config, dt=float(np.median(np.diff(rows[:, 0]))))
+        state = level_state(config, rows[:, 1:4], rows[:, 4:], setup.initial_std)
         return float(state.core_covariance[VELOCITY.start, VELOCITY.start]) <= ROUGH_START**2
 
     return at_rest
