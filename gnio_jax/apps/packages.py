@@ -206,7 +206,7 @@ def read_about(place: Path) -> About:
         raise InputError(place, f"'{MANIFEST}' was changed (SHA-256 differs)", _DAMAGED)
     for name, kind in get_type_hints(About).items():
         value = found.get(name)
-        if type(value) is not kind or (kind is int and not 0 <= value < 2**31):
+        if type(value) is not kind or (isinstance(value, int) and not 0 <= value < 2**31):
             raise InputError(place, f"'{MANIFEST}' has no '{name}', or a wrong one", _DAMAGED)
     if found["weights"].keys() != {"bytes", "sha256"}:
         raise InputError(place, f"'{MANIFEST}' does not describe '{WEIGHTS}'", _DAMAGED)
@@ -216,7 +216,7 @@ def read_about(place: Path) -> About:
 def _digest(manifest: dict[str, Any]) -> str:
     """The SHA-256 of all that a manifest says, but for this digest."""
     rest = {name: value for name, value in manifest.items() if name != "sha256"}
-    return fingerprint(json.dumps(rest, sort_keys=True).encode())["sha256"]
+    return str(fingerprint(json.dumps(rest, sort_keys=True).encode())["sha256"])
 
 
 def _content(place: Path, name: str, most: int) -> bytes:

@@ -4,8 +4,8 @@ jax2onnx replaces layers of Flax and functions of jax.numpy by its own while it 
 therefore traced here, and jax2onnx sees primitives of JAX alone: what is converted is what runs.
 """
 
-# The extra `onnx` need not be installed where types are checked.
-# pyright: reportMissingImports=false
+# The extra `onnx` need not be installed where types are checked, and this folder has its name.
+# pyright: reportMissingImports=false, reportAttributeAccessIssue=false
 
 from __future__ import annotations
 
