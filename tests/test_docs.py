@@ -37,6 +37,8 @@ SMALLER = {
 """Fewer samples and steps than on the page: page -> what stands there -> what runs."""
 HELP = {"--help", "--tyro-write-completion", "COMMAND"}
 """Words that leave with a text; COMMAND stands for any command."""
+NEW_FILES = {"gnio_jax/data/readers/mine.py", "tests/support/mine_files.py"}
+"""What CONTRIBUTING asks a reader to write."""
 RUN = [block for block in pages.python_blocks() if not block.reason]
 NOT_RUN = [block for block in pages.python_blocks() if block.reason]
 NOTEBOOKS = sorted((pages.ROOT / "docs" / "notebooks").glob("*.py"))
@@ -285,6 +287,15 @@ def test_the_names_of_the_package_are_those_of_the_reference():
     assert sorted(named) == sorted(gnio_jax.__all__)
     assert {room for room, _ in rooms_with_public_names()} <= {*gnio_jax.__all__}
     assert all(hasattr(gnio_jax, name) for name in gnio_jax.__all__)
+
+
+@pytest.mark.parametrize("page", pages.pages(), ids=lambda page: page.name)
+def test_a_file_that_a_page_names_is_there(page):
+    """`room/file.py`, from the root or within the package; a placeholder has another form."""
+    named = re.findall(r"`([a-z_]+/[a-z_/]+\.(?:py|yaml|md))`", page.read_text(encoding="utf-8"))
+    homes = (pages.ROOT, pages.ROOT / "gnio_jax")
+    lost = [name for name in named if not any((home / name).is_file() for home in homes)]
+    assert {*lost} <= NEW_FILES, lost
 
 
 def test_no_page_needs_a_script_from_a_network():
