@@ -193,7 +193,8 @@ def read_text(
     without a `header`.
 
     Lines that begin with '#' are comments. The first other line names the columns, unless it holds
-    a number: then the last comment before it does. `separator` " " stands for any run of blanks.
+    a number: then the last comment before it that has as many cells does, or else the numbers are
+    the names. `separator` " " stands for any run of blanks.
     `content` is what the file holds where it is part of an archive; `path` is then its name in
     messages. Raises `InputError` naming the file when it is missing, empty or no table, or where
     its number of columns is none of `widths`.
@@ -210,8 +211,10 @@ def read_text(
         if header and not any(_is_number(cell, decimal) for cell in cells):
             skipped += 1
         elif header:
-            comments = (line for line in reversed(before) if line.startswith("#"))
-            cells = _cells(next(comments, first).lstrip("#"), separator)
+            comments = [line.lstrip("#") for line in reversed(before) if line.startswith("#")]
+            names = (_cells(line, separator) for line in comments)
+            widths_of_names = (len(cells), len(cells) + 1)  # some end with a separator
+            cells = next((each for each in names if len(each) in widths_of_names), cells)
         frame = pd.read_csv(
             path if content is None else io.BytesIO(content),
             header=None,

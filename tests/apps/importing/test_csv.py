@@ -264,7 +264,6 @@ def test_files_without_a_header_are_read_by_the_places_of_their_columns(tmp_path
     compare_imu(sequence)
     words = r"gyro\.txt: column '4' is missing; found: 0, 1, 2, 3"
     refused(paths[0], words, columns | {"gyro_z": "4"}, accel_path=paths[1])
-    paths[0].write_text("".join(paths[0].read_text().splitlines(True)[1:]))
     words = "has 4 columns of numbers and no header; .* time=0 gyro_x=1 gyro_y=2 gyro_z=3$"
     refused(paths[0], words, accel_path=paths[1])
 
