@@ -21,6 +21,9 @@ SMALL = [
 ]
 
 
+pytestmark = pytest.mark.slow  # a wheel is built and installed
+
+
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory):
     """The wheel, built from a copy of what the build reads."""

@@ -149,6 +149,7 @@ def alone(run, tmp_path_factory):
     return workdir
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("processes, devices", [(1, 8), (2, 4), (4, 2)])
 def test_processes_and_devices_change_nothing_but_rounding(
     run, alone, tmp_path, processes, devices
@@ -168,6 +169,7 @@ def test_processes_that_do_not_belong_together_are_refused(run, tmp_path):
         assert "--distributed: the processes have different settings; start all" in lines[-1]
 
 
+@pytest.mark.slow
 def test_a_run_goes_on_in_other_numbers_of_processes_and_devices(run, alone, tmp_path):
     """4 × 2 until one of them is sent SIGTERM, 2 × 1 until one of them is killed, then 1 × 1."""
     workdir = tmp_path / "run"

@@ -543,6 +543,7 @@ def test_it_is_said_where_nothing_comes(port, monkeypatch):
 # --------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_memory_of_ten_hours():
     """Of 360,000 poses the path is kept: 64 bytes each."""
     pose, found = nowhere(), live.Followed()

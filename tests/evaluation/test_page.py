@@ -247,6 +247,7 @@ def share_near(picture, places, colour, reach=2):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(browser.NAME is None, reason="no Chromium here (apt-get install chromium)")
 def test_in_a_browser(written, walks):
     """It opens from the disk, asks for nothing, draws both paths where they are, and the slider
@@ -286,6 +287,7 @@ def test_in_a_browser(written, walks):
     assert told_of_other.startswith("20.0 s") and told_of_other != told
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(browser.NAME is None, reason="no Chromium here (apt-get install chromium)")
 def test_on_a_phone(written):
     """One column, and only the table of measures is wider than the screen, which scrolls alone."""

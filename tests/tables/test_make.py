@@ -40,6 +40,7 @@ def made(tmp_path_factory):
     yield root, [str(argument) for argument in [*folders, *choices]]
 
 
+@pytest.mark.slow
 def test_a_table_from_nothing_and_again_without_training(made, monkeypatch, capsys):
     root, arguments = made
     gnio("tables", "comparison", *arguments)
@@ -86,6 +87,7 @@ def test_a_table_from_nothing_and_again_without_training(made, monkeypatch, caps
         gnio("tables", "comparison", *arguments, "--base", str(root / "other.yaml"))
 
 
+@pytest.mark.slow
 def test_every_run_is_calibrated_before_it_is_measured(made, monkeypatch, capsys):
     """As `gnio calibrate` does by default, of which one unknown and two steps are enough here."""
     calibrate = calibration.calibrate

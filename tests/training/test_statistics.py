@@ -267,7 +267,12 @@ def norms_of_the_head(state, source, orders, key, count, training):
 
 
 @pytest.mark.parametrize(
-    "width, seeds, count", [(16, range(4), 200), (32, range(1), 200), (64, range(1), 60)]
+    "width, seeds, count",
+    [
+        (16, range(4), 200),
+        pytest.param(32, range(1), 200, marks=pytest.mark.slow),
+        pytest.param(64, range(1), 60, marks=pytest.mark.slow),
+    ],
 )
 def test_no_spike_in_the_gradient_of_the_uncertainty(width, seeds, count):
     """In the first steps the largest norm of the gradient of the head stays within 100 times the
