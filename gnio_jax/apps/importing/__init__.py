@@ -180,10 +180,8 @@ def _table(path: Path, named: dict[str, str]) -> Table:
     table = read_table(path, tuple(named.values()))
     labels = pd.Series([str(label) for label in table.columns])
     single = {ours: theirs for ours, theirs in named.items() if "+" not in theirs}
-    if (
-        pd.to_numeric(labels, errors="coerce").notna().all()
-        and not labels.isin(single.values()).any()
-    ):
+    numbers = np.asarray(pd.to_numeric(labels, errors="coerce"), float)
+    if np.isfinite(numbers).all() and not labels.isin(single.values()).any():
         places = " ".join(f"{ours}={place}" for place, ours in enumerate(named))
         remedy = f"count its columns from 0, as in --columns {places}"
         raise InputError(path, f"has {len(labels)} columns of numbers and no header", remedy)
