@@ -235,12 +235,6 @@ def spans(mask: Bool[np.ndarray, " n"]) -> Int[np.ndarray, "k 2"]:
     return edges.reshape(-1, 2)
 
 
-def outer_span(mask: Bool[np.ndarray, " n"]) -> slice:
-    """From the first True to the last; empty where there is none."""
-    rows = np.flatnonzero(mask)
-    return slice(int(rows[0]), int(rows[-1]) + 1) if rows.size else slice(0, 0)
-
-
 def stretches(broken: Bool[np.ndarray, " m"]) -> list[slice]:
     """The unbroken stretches of a series as slices of its rows.
 

@@ -203,10 +203,6 @@ def test_spans_are_the_runs_of_true(mask):
         assert (start == 0 or not mask[start - 1]) and (stop == len(mask) or not mask[stop])
         again[start:stop] = True
     np.testing.assert_array_equal(again, mask)
-    rows = np.flatnonzero(mask)
-    outer = numerics.outer_span(mask)
-    expected = (rows[0], rows[-1] + 1) if rows.size else (0, 0)
-    assert (outer.start, outer.stop) == expected
 
 
 def test_stretches_are_the_rows_between_breaks():

@@ -38,8 +38,8 @@ class Source(NamedTuple):
     folder: Path
     identity: dict[str, Any]
     """Of `kept.IDENTITY`."""
-    asked: kept.Kept | None
-    """Of a run that is named, how it is evaluated."""
+    found: Report | kept.Kept
+    """The figures of an evaluation that is named; of a run, how it is evaluated."""
 
 
 class Row(NamedTuple):
@@ -91,7 +91,9 @@ def compare(
             label,
             [source.run.name for source in row],
             [
-                kept.made(each.asked, reporter, workers) if each.asked else read(each.folder)
+                each.found
+                if isinstance(each.found, Report)
+                else kept.made(each.found, reporter, workers)
                 for each in row
             ],
         )
@@ -168,7 +170,8 @@ def _source(path: Path, config: CompareConfig) -> Source:
     run = Path(os.path.abspath(path)).parent.parent
     if path.resolve().parent.name == "eval" and (problem := kept.out_of_date(report, run)):
         raise InputError(path, problem, REMEDY)
-    return Source(path, run, path, {name: report.settings.get(name) for name in IDENTITY}, None)
+    identity = {name: report.settings.get(name) for name in IDENTITY}
+    return Source(path, run, path, identity, report)
 
 
 def _check_sources(sources: list[Source]) -> None:
@@ -188,8 +191,9 @@ def _check_sources(sources: list[Source]) -> None:
                 continue
             words = name.replace("_", " ")
             remedy = f"compare evaluations of one {words}"
-            given = next((each.identity[name] for each in sources if each.asked is None), own)
-            if name in ("split", "data_root") and any(each.asked for each in sources):
+            made = [each.identity[name] for each in sources if isinstance(each.found, Report)]
+            if name in ("split", "data_root") and len(made) < len(sources):
+                given = made[0] if made else own
                 remedy = f"give --{name.replace('_', '-')} {given} for the runs, or {remedy}"
             problem = f"is of {words} {own}, the first row of {first.identity[name]}"
             raise InputError(source.path, problem, remedy)

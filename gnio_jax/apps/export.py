@@ -21,7 +21,7 @@ from jaxtyping import Float
 from gnio_jax.errors import InputError, require_packages
 from gnio_jax.evaluation.trajectory import Trajectory, write_tum
 from gnio_jax.files import replacing
-from gnio_jax.numerics import rotations
+from gnio_jax.numerics import rotations, turns_between
 
 SUFFIXES = {".tum": "tum", ".txt": "tum", ".csv": "csv", ".mcap": "mcap"}
 FORMATS = tuple(dict.fromkeys(SUFFIXES.values()))
@@ -154,5 +154,5 @@ def _body_motion(
         return np.zeros((count, 3)), np.zeros((count, 3))
     attitude = rotations(poses.orientation)
     velocity = np.gradient(poses.position, poses.time, axis=0)
-    turn = (attitude[:-1].inv() * attitude[1:]).as_rotvec() / np.diff(poses.time)[:, None]
+    turn = turns_between(attitude) / np.diff(poses.time)[:, None]
     return attitude.inv().apply(velocity), np.concatenate([turn, turn[-1:]])

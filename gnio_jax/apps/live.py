@@ -620,11 +620,12 @@ def line(found: Followed) -> str:
     """The newest pose in words. The way is horizontal, through points 1 s apart, as that of `gnio
     track` is."""
     assert found.pose is not None
-    (x, y, z), time = found.pose.position, found.trajectory.time
+    (x, y, z), path = found.pose.position, found.trajectory
+    time = path.time
     sigma = float(np.sqrt(np.maximum(np.trace(found.pose.covariance[6:8, 6:8]), 0.0)))
     walked = 0.0
     if len(time) > 1:
-        walked = path_length(found.trajectory.position[:, :2], float(np.median(np.diff(time))))
+        walked = path_length(path.position[:, :2], float(np.median(np.diff(time))))
     health = "" if found.pose.healthy else "  THE FILTER DIVERGED"
     return (
         f"{found.pose.time - time[0]:7.1f} s  x {x:+8.2f}  y {y:+8.2f}  z {z:+7.2f} m  "

@@ -201,9 +201,11 @@ def as_sequence(source: Recording, stated: Units, rate: float | None, name: str)
         {"dataset": "csv", "group": name, "truth": "none"},
         float(gyro.start),
     )
-    (sequence,) = assemble(streams, rate, whole=True)
+    sequence = None
     if source.track is not None:
-        sequence = _with_track(sequence, streams, source.track, gyro.start, notes)
+        sequence = _with_track(streams, rate, source.track, gyro.start, notes)
+    if sequence is None:
+        (sequence,) = assemble(streams, rate, whole=True)
     return Imported(sequence, tuple(notes), tuple(warnings))
 
 
@@ -310,13 +312,13 @@ def _in_si(
 
 
 def _with_track(
-    sequence: Sequence, streams: Streams, track: Track, start: Fraction, notes: list[str]
-) -> Sequence:
-    """With the reference, where it can be one and describes the motion of the IMU."""
+    streams: Streams, rate: float | None, track: Track, start: Fraction, notes: list[str]
+) -> Sequence | None:
+    """The recording with the reference; None where it can be none, or does not describe the motion
+    of the IMU."""
     poses = track.poses._replace(time=track.poses.time + float(track.start - start))
     about = streams.attributes | {"truth": track.name}
     try:
-        rate = rounded_rate(sequence.time)
         (result,) = assemble(streams._replace(poses=poses, attributes=about), rate, whole=True)
         # What the self-check would leave out is no reference.
         if failures := self_check(result, pedestrian=False).failures:
@@ -329,6 +331,6 @@ def _with_track(
         if track.named:
             raise
         notes.append(f"no reference is taken: {error}")
-        return sequence
+        return None
     notes.append(f"reference from {track.name}, {result.valid.mean():.0%} of the time")
     return result
