@@ -196,10 +196,8 @@ def filter_inputs(
     if given is not None:
         rows = []
         for each in given:
-            value = np.array(each.value)
-            value[: config.clones_per_window] = np.nan  # the filter has no clone there
-            std = np.nan_to_num(each.std, nan=1.0)
-            rows.append(Displacements(filled_up(value, strides, np.nan), filled_up(std, strides)))
+            std = filled_up(np.nan_to_num(each.std, nan=1.0), strides)
+            rows.append(Displacements(filled_up(each.value, strides, np.nan), std))
         stacked = _stacked(rows)
     return Inputs(
         _stacked([each.start for each in recordings]),
