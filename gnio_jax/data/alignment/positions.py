@@ -132,8 +132,8 @@ def align_positions(imu: Streams, track: Samples, search_seconds: float = 4.0) -
     )
     device = rotations(slerped(imu.device.time, imu.device.values, clock))
 
-    grid, broken = np.arange(track.time[0], track.time[-1], 1.0 / RATE), np.diff(track.time)
-    position = splined(track.time, track.values, grid, broken > LONGEST_BRIDGE)
+    grid = np.arange(track.time[0], track.time[-1], 1.0 / RATE)
+    position = splined(track.time, track.values, grid, np.diff(track.time) > LONGEST_BRIDGE)
     seen = known_at(track.time, np.ones(len(track.time), dtype=bool), grid, LONGEST_BRIDGE)
     tracked = second_difference(position, 1.0 / RATE)
     # Accelerations that no pedestrian makes are jumps.

@@ -42,7 +42,7 @@ def test_clock_and_attitude_are_found_and_a_relocalisation_does_not_matter():
     event = poses.time - 1.3
     error = (poses.attitude * walk.attitude(event).inv()).as_rotvec()
     inner = (event > 6.0) & (event < 117.0) & (np.abs(event - 63.0) > 2.0)
-    assert np.degrees(np.linalg.norm(error[inner, :2], axis=1)).max() < 0.5
+    assert np.degrees(np.linalg.norm(error[inner, :2], axis=1)).max() < 0.05
     assert np.degrees(np.abs(error[inner, 2])).max() < 2.0
     inner &= event < 60.0
     assert np.abs(poses.position - walk.position(event))[inner].max() < 0.02
