@@ -4,22 +4,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from gnio_jax.evaluation import Displacements, Estimate, Filtered, Trajectory
-from gnio_jax.evaluation.report import DEFINITIONS
+from tests.support import reports
 
-SETTINGS = {
+SETTINGS = reports.SETTINGS | {
     "dataset": "made",
-    "data_root": None,
-    "split": "test",
     "recordings": dict.fromkeys(("room 1/walk", "room 1:walk", "blind", "room 3"), 40.0),
-    "filter": {},
-    "estimator": "ekf",
-    "coupling": "tight",
-    "orientation_source": "filter",
-    "initial_state": "reference",
-    "gyro_bias": "zero",
-    "imu_compensated": "no",
-    "alignment": "origin",
-    "definitions": DEFINITIONS,
 }
 
 
