@@ -247,6 +247,25 @@ def direction(
     return jnp.where(undefined, 1.0, x / norm), jnp.where(undefined, 0.0, y / norm)
 
 
+def planar_alignment(
+    source: Float[jax.Array, "k 2"],
+    target: Float[jax.Array, "k 2"],
+    weight: Float[jax.Array, "k"],
+) -> tuple[Float[jax.Array, "2 2"], Float[jax.Array, "2"]]:
+    """Rotation Q and shift t of the plane with the least Σ w ‖target − (Q source + t)‖².
+
+    With both points a, b taken from their weighted means, the angle of Q is that of the vector
+    (Σ w a · b, Σ w a × b). Where its length is 0, as for a single point or points in one place, Q
+    is the identity with zero derivative; the sum of `weight` must be positive.
+    """
+    share = weight[:, None] / jnp.sum(weight)
+    means = jnp.sum(share * source, axis=0), jnp.sum(share * target, axis=0)
+    a, b = share * (source - means[0][None]), target - means[1][None]
+    cosine, sine = direction(jnp.sum(a * b), jnp.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]))
+    rotation = jnp.stack([cosine, -sine, sine, cosine]).reshape(2, 2)
+    return rotation, means[1] - matmul(rotation, means[0][:, None])[:, 0]
+
+
 def yaw_direction(rotation: Matrix) -> tuple[Scalar, Scalar]:
     """(cos, sin) of the yaw of `rotation`, yaw = atan2(R[1,0], R[0,0]).
 

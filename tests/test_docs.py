@@ -85,7 +85,8 @@ def test_the_loop_of_ones_own(one_walk, capsys):
     lines = [line.split() for line in capsys.readouterr().out.splitlines()]
     losses = [float(loss) for _, loss in lines[:5]]
     assert losses[-1] < losses[0]
-    nees, without, filtered, smoothed = (float(line[-1]) for line in lines[5:])
+    nees, without, filtered, smoothed = (float(line[-1]) for line in lines[5:9])
+    assert " ".join(lines[9]) == "taken 3 of 3"
     assert nees < 3 and smoothed < filtered < without
 
 

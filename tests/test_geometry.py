@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from jaxtyping import TypeCheckError
 from scipy.linalg import expm
+from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from gnio_jax import geometry
@@ -228,3 +229,45 @@ def test_yaw_at_gimbal_lock_is_zero_with_zero_derivative():
 def test_shapes_are_checked_while_the_tests_run():
     with pytest.raises(TypeCheckError, match=r"geometry\.exp"):
         geometry.exp(jnp.zeros(4))
+
+
+@jax.jit
+def alignment(x, y, weight):
+    """Rotation and shift in one array (6,), and its derivatives by x."""
+
+    def flat(x):
+        return jnp.concatenate([part.ravel() for part in geometry.planar_alignment(x, y, weight)])
+
+    return flat(x), jax.jacrev(flat)(x).reshape(6, -1)
+
+
+@pytest.mark.parametrize("collinear", [False, True])
+def test_planar_alignment(collinear):
+    """Against SciPy's least squares over angle and shift, and its derivatives against
+    differences."""
+    rng = np.random.default_rng(0)
+    weight = rng.uniform(0.1, 2, 6)
+    x = np.outer(rng.normal(size=6), [2.0, 1.0]) if collinear else rng.normal(size=(6, 2))
+    turned = lambda x, angle: x @ Rotation.from_euler("z", angle).as_matrix()[:2, :2].T  # noqa: E731
+    y = turned(x, 2.5) + [30.0, -4.0] + 0.1 * rng.normal(size=x.shape)
+    error = lambda p: (np.sqrt(weight)[:, None] * (y - turned(x, p[0]) - p[1:])).ravel()  # noqa: E731
+    angle, *shift = least_squares(error, [2.0, 0.0, 0.0], xtol=1e-15, gtol=1e-15).x
+    found, derivatives = alignment(x, y, weight)
+    wanted = [*turned(np.eye(2), angle).T.ravel(), *shift]
+    np.testing.assert_allclose(found, wanted, atol=1e-6)
+    slopes = differences(lambda x: alignment(x.reshape(6, 2), y, weight)[0], x.ravel())
+    np.testing.assert_allclose(derivatives, slopes, atol=1e-7)
+
+
+def test_planar_alignment_without_a_direction():
+    """One point, points in one place, and targets in one place: a shift alone, with derivatives of
+    its own."""
+    rng = np.random.default_rng(1)
+    x, same = rng.normal(size=(3, 2)), np.tile([1.0, 2.0], (3, 1))
+    alone, alike = np.array([0, 1.0, 0]), np.ones(3)
+    for source, target, weight in [(x, x + 5, alone), (same, x, alike), (x, same, alike)]:
+        found, derivatives = alignment(source, target, weight)
+        np.testing.assert_array_equal(found[:4], np.eye(2).ravel())
+        np.testing.assert_allclose(found[4:], np.average(target - source, 0, weight), atol=1e-12)
+        wanted = -np.kron(weight / weight.sum(), np.eye(2))
+        np.testing.assert_allclose(derivatives, np.vstack([np.zeros((4, 6)), wanted]), atol=1e-12)

@@ -9,6 +9,7 @@ from gnio_jax.filtering.batch import cores_as_devices, over_sequences
 from gnio_jax.filtering.config import FilterConfig
 from gnio_jax.filtering.consider import considered_covariance, sensitivity
 from gnio_jax.filtering.displacement import displacements
+from gnio_jax.filtering.fix import Fix, fixes_on_intervals
 from gnio_jax.filtering.history import FilterHistory
 from gnio_jax.filtering.scan import run_filter, run_odometry
 from gnio_jax.filtering.settings import FilterSetup, filter_setup
@@ -26,6 +27,7 @@ __all__ = [
     "FilterSettings",
     "FilterSetup",
     "FilterState",
+    "Fix",
     "GateState",
     "InitialStd",
     "Linearised",
@@ -39,6 +41,7 @@ __all__ = [
     "cores_as_devices",
     "displacements",
     "filter_setup",
+    "fixes_on_intervals",
     "initial_state",
     "level_state",
     "linearise",

@@ -73,11 +73,12 @@ def walk(seed, still=0, intervals=INTERVALS):
     return truth, start, gyro, accel, displacement, covariance
 
 
-def most_probable(start, gyro, accel, measurements, stops):
+def most_probable(start, gyro, accel, measurements, stops, fixes=()):
     """Gauss-Newton over all states: those at the end of every interval, and their covariances.
 
     measurements: {k: (displacement, covariance)} as they are to be applied; stops: {k: standard
-    deviation of a velocity of zero}.
+    deviation of a velocity of zero}; fixes: (k, position (m,), covariance, seconds before the end
+    of interval k).
     """
     x = [start]
     for k in range(INTERVALS):
@@ -104,6 +105,14 @@ def most_probable(start, gyro, accel, measurements, stops):
         )
     for k, std in stops.items():
         factors.append(((k + 1,), lambda now: now[1], std**2 * np.eye(3)))
+    for k, z, R, before in fixes:
+        factors.append(
+            (
+                (k + 1,),
+                lambda now, z=z, before=before: z - (now[2] - before * now[1])[..., : len(z)],
+                R,
+            )
+        )
 
     for _ in range(4):
         information, gradient = np.zeros((15 * len(x), 15 * len(x))), np.zeros(15 * len(x))
@@ -132,36 +141,56 @@ def rows_of(history):
     ]
 
 
-REJECTED, MISSING = 9, (6, 7)
+REJECTED, MISSING, FAR = 9, (6, 7), 11
 CONFIG = functools.partial(
     filtering.FilterConfig, DT, N, CLONES, convergence_seconds=0.0, success_seconds=5.0
 )
 NOISE = filtering.NoiseModel.per_sample(*WHITE, DT, *WALK)._replace(measurement_scale=2.0)
 
 
-@pytest.mark.parametrize("case", ["rejected", "scaled", "weighted"])
+def drawn_fixes(truth):
+    """(k, position, covariance, seconds before the end of interval k) of some intervals, before
+    there is a window too; the one of interval `FAR` is a metre off."""
+    rng, fixes = np.random.default_rng(8), []
+    for k, before in [(1, 0.03), (4, -0.08), (8, 0.0), (FAR, 0.05), (12, 0.09)]:
+        root = SMALL * (np.eye(2) + 0.3 * rng.normal(size=(2, 2)))
+        z = (truth[k + 1][2] - before * truth[k + 1][1])[:2] + root @ rng.normal(size=2)
+        fixes.append((k, z + (k == FAR), root @ root.T, before))
+    return fixes
+
+
+def laid(fixes, config):
+    """As the filter takes them."""
+    rows, position, covariance, before = (np.stack(column) for column in zip(*fixes, strict=True))
+    time = (rows + 1) * config.clone_seconds - before
+    return (filtering.fixes_on_intervals(time, position, covariance, INTERVALS, config),)
+
+
+@pytest.mark.parametrize("case", ["rejected", "scaled", "weighted", "fixes"])
 def test_equals_least_squares_over_all_states(case):
     """Missing rows in all cases; a rejected row; one applied with scaled covariance; a gate with a
-    slope, and rest."""
+    slope, and rest; a rejected row beside fixes of position, one of which is refused."""
     options = {
         "rejected": dict(history="core"),
         "scaled": dict(history="core", mahalanobis_fail_scale=7.0),
+        "fixes": dict(history="core"),
         "weighted": dict(
             gate_softness=3.0, gate_threshold=4.0, zero_velocity_std=5 * SMALL, rest_seconds=0.5
         ),
     }[case]
     config = CONFIG(**options)
-    _, start, gyro, accel, displacement, covariance = walk(3, still=5 if case == "weighted" else 0)
+    truth, start, gyro, accel, displacement, covariance = walk(3, still=5 * (case == "weighted"))
     displacement[list(MISSING), 1] = np.nan
     if case != "weighted":
         displacement[REJECTED] += 12 * SMALL
     state = filtering.initial_state(config, *start, STD)
     arguments = state, gyro, accel, displacement, covariance
+    fixes = drawn_fixes(truth) if case == "fixes" else []
+    others = {"measurements": laid(fixes, config)} if fixes else {}
 
     def both(*arguments):
-        return filtering.run_filter(*arguments, config, NOISE)[1], filtering.smooth(
-            *arguments, config, NOISE
-        )
+        _, filtered = filtering.run_filter(*arguments, config, NOISE, **others)
+        return filtered, filtering.smooth(*arguments, config, NOISE, **others)
 
     # What "rejected" compiles serves the tests below, too.
     filtered, smoothed = (both if case == "rejected" else quick(both))(*arguments)
@@ -174,14 +203,19 @@ def test_equals_least_squares_over_all_states(case):
         factor = 1 / weight
     else:
         assert [k for k in present if not weight[k]] == [REJECTED]
-        factor = np.where(weight > 0, 1.0, {"rejected": np.inf, "scaled": 7.0}[case])
+        factor = np.where(weight > 0, 1.0, 7.0 if case == "scaled" else np.inf)
+    if fixes:
+        (outcome,) = filtered.others
+        applied = np.flatnonzero(outcome.accepted)
+        assert [k for k, *_ in fixes if k not in applied] == [FAR]
+        fixes = [each for each in fixes if each[0] in applied]
     measurements = {
         k: (displacement[k], 2.0 * factor[k] * covariance[k])
         for k in present
         if np.isfinite(factor[k])
     }
     wanted, spread = most_probable(
-        start, gyro, accel, measurements, {k: config.zero_velocity_std for k in stops}
+        start, gyro, accel, measurements, {k: config.zero_velocity_std for k in stops}, fixes
     )
 
     sigma = np.sqrt(np.diagonal(spread, axis1=1, axis2=2))

@@ -7,6 +7,7 @@ filter's tests.
 
 import numpy as np
 from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
 
 G = np.array([0.0, 0.0, -9.81])
 TLIO_STD = dict(
@@ -46,6 +47,22 @@ def yaw_matrix(R):
     """From SciPy's extrinsic Euler angles."""
     yaw = Rotation.from_matrix(R).as_euler("xyz")[2]
     return Rotation.from_euler("z", yaw).as_matrix()
+
+
+def update(state, P, H, r, S):
+    """State and covariance after a measurement with the residual r."""
+    R, v, p, bg, ba, errors, ring = state
+    core = 15 + len(errors)
+    K = np.linalg.solve(S, H @ P).T
+    P = P - K @ H @ P
+    delta = K @ r
+    ring = [
+        [Rotation.from_rotvec(e[:3]).as_matrix() @ Rc, pc + e[3:]]
+        for e, (Rc, pc) in zip(delta[core:].reshape(-1, 6), ring, strict=True)
+    ]
+    turned = Rotation.from_rotvec(delta[:3]).as_matrix() @ R
+    moved = v + delta[3:6], p + delta[6:9], bg + delta[9:12], ba + delta[12:15]
+    return (turned, *moved, errors + delta[15:core], ring), 0.5 * (P + P.T)
 
 
 def run_from(state, noise, config, gyro, accel, displacement=None, covariance=None, **others):
@@ -101,12 +118,15 @@ def run(
     measure=None,
     frame="given",
     correlated=None,
+    fixes={},
 ):
     """Returns a dict of histories.
 
     measure(k, clone_rotation, bg, ba), where given, supplies displacement and covariance at step k.
     frame "own": the displacement turns with the filter's own attitude, whose yaw then cancels.
-    correlated: share and seconds of the temporally correlated part of a window's error."""
+    correlated: share and seconds of the temporally correlated part of a window's error.
+    fixes: {k: (position (2,) or (3,), covariance, seconds before the end of step k, standard
+    deviation of its time)}, refused above the 99 % of χ²."""
     bg, ba = np.zeros(3) if bg is None else bg, np.zeros(3) if ba is None else ba
     P = np.diag(
         np.repeat(
@@ -228,22 +248,21 @@ def run(
                         last_success = now
                         row["accepted"] = row["gate_passed"] = 1.0
                     if row["accepted"]:
-                        K = np.linalg.solve(S, H @ P).T
-                        P = P - K @ H @ P
-                        P = 0.5 * (P + P.T)
-                        delta = K @ r
-                        R = Rotation.from_rotvec(delta[:3]).as_matrix() @ R
-                        v, p, bg, ba = (
-                            v + delta[3:6],
-                            p + delta[6:9],
-                            bg + delta[9:12],
-                            ba + delta[12:15],
-                        )
-                        ring = [
-                            [Rotation.from_rotvec(e[:3]).as_matrix() @ Rc, pc + e[3:]]
-                            for e, (Rc, pc) in zip(delta[core:].reshape(-1, 6), ring, strict=True)
-                        ]
-                        errors = errors + delta[15:core]
+                        state, P = update((R, v, p, bg, ba, errors, ring), P, H, r, S)
+                        R, v, p, bg, ba, errors, ring = state
+        row["fix_nis"] = np.nan
+        if k in fixes:
+            z, C, before, late = fixes[k]
+            H = np.zeros((len(z), len(P)))
+            H[:, 6 : 6 + len(z)] = np.eye(len(z))
+            H[:, 3 : 3 + len(z)] = -before * np.eye(len(z))
+            r = z - (p - before * v)[: len(z)]
+            S = H @ P @ H.T + C + late**2 * np.outer(v, v)[: len(z), : len(z)]
+            row["fix_nis"] = r @ np.linalg.solve(S, r)
+            if row["fix_nis"] <= chi2.ppf(0.99, len(z)):
+                state, P = update((R, v, p, bg, ba, errors, ring), P, H, r, S)
+                R, v, p, bg, ba, errors, ring = state
+        if len(ring) == clones + 1:
             ring.pop(0)
             keep = np.r_[0:core, core + 6 : len(P)]
             P = P[np.ix_(keep, keep)]
