@@ -41,6 +41,8 @@ EXAMPLES = {
     "euroc": 40,
     "tumvi": 40,
     "kitti packets": 40,
+    "tyrex Nexus": 8,
+    "tyrex iPhone": 8,
 }
 """Of the slower layouts; 60 of the others."""
 
@@ -50,7 +52,7 @@ def test_an_undamaged_recording_is_read(name):
     result, said = check(name, [])
     assert not isinstance(result, InputError), said
     (sequence,) = result
-    assert sequence.valid.mean() > 0.9 and said == ""
+    assert (sequence.valid.mean() > 0.9 or sequence.waypoints is not None) and said == ""
 
 
 @pytest.mark.parametrize("name", LAYOUTS)

@@ -18,11 +18,13 @@ from tests.support import (
     blackbird_files,
     csv_writers,
     idol_files,
+    indoor_location_files,
     kitti_files,
     known_walk,
     oxiod_files,
     ridi_files,
     ronin_files,
+    tyrex_files,
 )
 
 
@@ -134,6 +136,18 @@ def _blackbird(root: Path, seconds: float) -> None:
     (root / "test.txt").write_text("# flights\nclover/yawForward/maxSpeed5p0/test\n")
 
 
+def _tyrex(name: str) -> Callable[[Path, float], None]:
+    def write(root: Path, seconds: float) -> None:
+        tyrex_files.write(root, name, seconds)
+
+    return write
+
+
+def _indoor_location(root: Path, seconds: float) -> None:
+    taps = np.array([-0.1, 0.4 * seconds, 0.7 * seconds, seconds])
+    indoor_location_files.write(root, indoor_location_files.lines(seconds, taps))
+
+
 def _csv(root: Path, seconds: float) -> None:
     csv_writers.write_native(
         root / "walk.csv", np.arange(round(seconds * 100)) / 100, velocity=True
@@ -187,6 +201,9 @@ LAYOUTS = {
     ),
     "kitti npz": Layout("kitti", "train", _kitti_npz),
     "blackbird": Layout("blackbird", "test", _blackbird),
+    "tyrex Nexus": Layout("tyrex", "train", _tyrex(tyrex_files.NEXUS), shortest=20.0),
+    "tyrex iPhone": Layout("tyrex", "test", _tyrex(tyrex_files.IPHONE), shortest=20.0),
+    "indoor_location": Layout("indoor_location", "test", _indoor_location),
     "csv": Layout("csv", "test", _csv),
     "hdf5": Layout("csv", "test", _hdf5),
 }

@@ -6,11 +6,13 @@ from gnio_jax.data.readers import (
     csv_files,
     euroc,
     idol,
+    indoor_location,
     kitti,
     oxiod,
     ridi,
     ronin,
     tlio,
+    tyrex,
 )
 from gnio_jax.data.simulated.walks import RANDOMISED, SYNTHETIC
 
@@ -21,6 +23,7 @@ DATASETS: dict[str, Dataset] = {
         csv_files.DATASET,
         *euroc.DATASETS,
         idol.DATASET,
+        indoor_location.DATASET,
         kitti.DATASET,
         oxiod.DATASET,
         RANDOMISED,
@@ -28,6 +31,7 @@ DATASETS: dict[str, Dataset] = {
         ronin.DATASET,
         SYNTHETIC,
         tlio.DATASET,
+        tyrex.DATASET,
     )
 }
 """Every dataset by its name."""

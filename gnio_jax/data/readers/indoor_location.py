@@ -1,0 +1,208 @@
+"""Indoor Location Competition 2.0 (Microsoft Research and XYZ10, 2021): walks through the floors of
+malls with a phone held flat before the body. There is no pose, but waypoints that were tapped.
+
+Layout: `<site>/<floor>/path_data_files/<id>.txt`. Lines that begin with '#' name device, sensors,
+start and end; every other is `unix ms, type, values` between tabs: TYPE_ACCELEROMETER (m/s²,
+Android's sign) and TYPE_GYROSCOPE (rad/s), each xyz and an accuracy, and TYPE_WAYPOINT, x and y in
+m of the floor's map. All else is passed over. Where a newline is missing, two lines stand in one;
+they are divided before the second's stamp.
+
+Both sensors of the phone share their stamps, whole ms at about 50 Hz, and come back at 50 Hz.
+Walkers are not named; a floor is a `group`.
+
+A sequence has `waypoints` and no poses (`data.waypoints` makes some). Surveyors walk straight from
+tap to tap, and a tap is up to a second early or late; the first comes 0.1 to 0.4 s before the first
+sample. A tap within a second of the IMU's ends is taken at the end.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from gnio_jax.data.assembly import Samples, Streams, assemble
+from gnio_jax.data.dataset import Dataset, Recording, Refusal
+from gnio_jax.data.parsing.stamps import distinct, first_stamp, seconds
+from gnio_jax.data.parsing.tables import damaged, shortened
+from gnio_jax.data.validation import FARTHEST, FEWEST_WAYPOINTS
+from gnio_jax.errors import InputError
+from gnio_jax.types import Sequence
+
+RATE = 50.0
+"""Hz."""
+FLOORS = {"B1": "train", "F1": "train", "F2": "train", "F3": "val", "F4": "test"}
+"""Floor -> split. Other floors are in `all` alone."""
+TAP_SECONDS = 1.0
+"""s by which a tap may be early or late."""
+
+_GYRO, _ACCEL, _WAYPOINT = "TYPE_GYROSCOPE", "TYPE_ACCELEROMETER", "TYPE_WAYPOINT"
+_VALUES = {_GYRO: 3, _ACCEL: 3, _WAYPOINT: 2}
+"""Numbers of a line that are read."""
+_MERGED = re.compile(r"(?<!^)(?=\d{13}\tTYPE_)")
+"""Where a line begins within another; stamps of unix ms have 13 digits until the year 2286."""
+
+
+def recordings(root: Path, split: str) -> list[Recording]:
+    """The recordings of a split: whole floors. `all` is every walk below the root."""
+    root = Path(root)
+    paths = sorted(root.glob("**/path_data_files/*.txt"), key=lambda path: path.parts[-3:])
+    if not paths:
+        layout = f"expected layout: {DATASET.layout}"
+        raise InputError(root, "holds no recording of indoor_location", layout)
+    chosen = [path for path in paths if split in ("all", FLOORS.get(_floor(path)))]
+    if not chosen:
+        floors = ", ".join(floor for floor, own in FLOORS.items() if own == split)
+        problem = f"holds no walk of split '{split}'"
+        raise InputError(root, problem, f"it consists of the floors {floors}; complete the data")
+    return [
+        Recording(_name(path), partial(read, path), files=(path,), slow=True) for path in chosen
+    ]
+
+
+def _floor(path: Path) -> str:
+    return path.parent.parent.name
+
+
+def _name(path: Path) -> str:
+    return f"{path.parent.parent.parent.name}_{_floor(path)}_{path.stem}"
+
+
+# --- one walk
+
+
+def read(path: str | os.PathLike[str]) -> list[Sequence]:
+    """One walk of its file, at 50 Hz, with waypoints in the place of poses.
+
+    Raises `InputError` naming file and field, and `Refusal` for a walk of fewer waypoints than can
+    be used.
+    """
+    path = Path(path)
+    header, rows = read_lines(path)
+    sensors = {}
+    for kind in (_GYRO, _ACCEL):
+        stamps, _ = rows[kind]
+        if len(stamps) < 2:
+            raise damaged(path, f"holds {len(stamps)} lines of {kind}")
+        sensors[kind] = distinct(stamps, path, kind)
+    start = first_stamp(rows[_GYRO][0], "ms", path, _GYRO)
+    first_stamp(rows[_ACCEL][0], "ms", path, _ACCEL)
+    gyro, accel = (
+        Samples(seconds(stamps[sensors[kind]], start, "ms"), values[sensors[kind]], str(path))
+        for kind, (stamps, values) in rows.items()
+        if kind != _WAYPOINT
+    )
+    device = re.search(r"Brand:(\S+)\s+Model:(\S+)", header)
+    about = {
+        "dataset": "indoor_location",
+        "group": f"{path.parent.parent.parent.name}_{_floor(path)}",
+        "subject": "unknown",
+        "device": " ".join(device.groups()) if device else "Android phone",
+        "placement": "handheld",
+        "truth": "waypoints",
+        "imu_compensated": "Android's gyro bias",
+        "licence": DATASET.licence,
+    }
+    streams = Streams(
+        _name(path),
+        str(path),
+        gyro,
+        accel,
+        about,
+        start * 1e-3,
+        waypoints=_taps(path, rows[_WAYPOINT], start, gyro, accel),
+    )
+    return assemble(streams, RATE)
+
+
+def _taps(
+    path: Path, rows: tuple[np.ndarray, np.ndarray], start: int, gyro: Samples, accel: Samples
+) -> Samples:
+    """The waypoints, s since `start`, on the IMU's clock."""
+    stamps, place = rows
+    if len(stamps):
+        own = distinct(stamps, path, _WAYPOINT)
+        stamps, place = stamps[own], place[own]
+    time = seconds(stamps, start, "ms")
+    first, last = max(gyro.time[0], accel.time[0]), min(gyro.time[-1], accel.time[-1])
+    off = np.maximum(first - time, time - last)
+    if (off > TAP_SECONDS).any():
+        problem = f"field '{_WAYPOINT}' has {np.sum(off > TAP_SECONDS)} of {len(time)} stamps"
+        problem += f" beyond the IMU's, by up to {off.max():.1f} s"
+        raise InputError(path, problem, "check that all lines are of one phone and one walk")
+    time, own = np.unique(np.clip(time, first, last), return_index=True)
+    if len(time) < FEWEST_WAYPOINTS:
+        problem = f"field '{_WAYPOINT}' holds {len(time)}, at least {FEWEST_WAYPOINTS} are needed"
+        raise Refusal(path, problem)
+    return Samples(time, place[own], str(path))
+
+
+def read_lines(path: Path) -> tuple[str, dict[str, tuple[np.ndarray, np.ndarray]]]:
+    """(lines that begin with '#', kind of line -> stamps (unix ms, integers) and values).
+
+    Raises `InputError` where a line is cut short, or the file holds two recordings.
+    """
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except OSError as error:
+        raise InputError(path, f"cannot be read ({error.strerror})") from None
+    except UnicodeDecodeError as error:
+        raise damaged(path, f"is no text ({shortened(error)})") from None
+    lines = [*_lines(text)]
+    header = "\n".join(line for _, line in lines if line.startswith("#"))
+    starts = header.count("startTime:")
+    if starts > 1:
+        problem = f"field 'startTime' is there {starts} times: it holds several recordings"
+        raise InputError(path, problem, "divide it")
+    found: dict[str, tuple[list[int], list[list[float]]]] = {kind: ([], []) for kind in _VALUES}
+    for number, line in lines:
+        if not line.strip() or line.startswith("#"):
+            continue
+        cells = line.split("\t")
+        kind = cells[1] if len(cells) > 1 else ""
+        if not kind.startswith("TYPE_"):
+            problem = f"line {number} is '{shortened(line, 40)}', expected time, type and values"
+            raise damaged(path, problem)
+        if kind not in _VALUES:
+            continue
+        stamps, values = found[kind]
+        numbers = cells[2 : 2 + _VALUES[kind]]
+        try:
+            stamp, row = int(cells[0]), [float(cell) for cell in numbers]
+            if len(row) < _VALUES[kind] or not 0 <= stamp < 10**13:
+                raise ValueError
+        except ValueError:
+            problem = f"field '{kind}' is cut short or damaged in line {number}"
+            raise damaged(path, f"{problem} ('{shortened(line, 60)}')") from None
+        stamps.append(stamp)
+        values.append(row)
+    rows = {
+        kind: (np.array(stamps, dtype=np.int64), np.array(values).reshape(-1, _VALUES[kind]))
+        for kind, (stamps, values) in found.items()
+    }
+    for kind, (_, values) in rows.items():
+        if not (np.abs(values) < FARTHEST).all():
+            raise damaged(path, f"field '{kind}' holds NaN, Inf or what nothing measures")
+    return header, rows
+
+
+def _lines(text: str) -> Iterator[tuple[int, str]]:
+    """(number from 1, line), lines that were merged divided."""
+    for number, line in enumerate(text.split("\n"), 1):
+        parts = _MERGED.split(line) if line.count("TYPE_") > 1 else (line,)
+        yield from ((number, part) for part in parts)
+
+
+DATASET = Dataset(
+    name="indoor_location",
+    recordings=recordings,
+    splits=("train", "val", "test", "all"),
+    rate=RATE,
+    source="https://github.com/location-competition/indoor-location-competition-20",
+    layout="<root>/**/<site>/<floor>/path_data_files/<id>.txt",
+    licence="MIT",
+)

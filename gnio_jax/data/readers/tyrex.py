@@ -1,0 +1,354 @@
+"""Tyrex: two people who carry three phones in eight ways through a room with Qualisys cameras
+(Michel, Genevès, Fourati, Layaïda, *Attitude estimation for indoor navigation and augmented reality
+with smartphones*, Pervasive and Mobile Computing 2018).
+
+Layout: `datasets/{android,ios}/<Person>_<Device>_<Dist|NoDist>_<Way>/` with `accelerometer.txt`,
+`gyroscope.txt`, `timeAlignment.txt` and, of an iPhone, `description.txt`; the tracker's poses are
+`datasets/qualisys/<same name>.mat` (MATLAB 5). `Dist` walks pass magnets, which no IMU minds.
+
+- Nexus 5: stamps in s of the record, both sensors at 200 Hz, the accelerometer in m/s² with
+  Android's sign; the gyro's file has the system's estimate of the bias beside the raw rate.
+- iPhone 4S and 5: stamps in s since the phone was booted, the record begins at `BootTime`; each
+  sensor at a rate of its own (90 to 107 Hz); the accelerometer in G with Apple's sign.
+- Qualisys: 60 Hz, mm, rotations body → world column by column, NaN where the body was lost. Its
+  time is the record's plus the number in `timeAlignment.txt`, to 0.03 s.
+
+**Every gyro is raw**: no bias is taken off, and 0.1 rad/s remain on an iPhone 5.
+
+The tracked body is a handle on the phone, whose axes are the phone's to a few degrees and whose
+origin is some cm away. `alignment.align` finds the mounting, the level and the clocks from each
+walk, as of OxIOD; poses at 60 Hz are too slow to be differenced in a hand that swings, and so the
+gyro carries the attitude between them. A fit that does not explain the motion is refused.
+
+Everything comes back at 100 Hz.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from gnio_jax.data.alignment import BodyFit, TooLittle, align, without_jumps
+from gnio_jax.data.assembly import Poses, Samples, Streams, assemble
+from gnio_jax.data.dataset import Dataset, Recording, Refusal
+from gnio_jax.data.parsing.stamps import distinct
+from gnio_jax.data.parsing.tables import damaged, parsed_as, read_text, shortened
+from gnio_jax.data.reference import LONGEST_BRIDGE
+from gnio_jax.data.resampling import known_at
+from gnio_jax.data.splits import find_folders
+from gnio_jax.data.validation import check_accel, check_gyro
+from gnio_jax.errors import InputError
+from gnio_jax.types import STANDARD_G, Sequence
+
+RATE = 100.0
+"""Hz."""
+DEVICES = {"Nexus5": "Nexus 5", "iPhone4S": "iPhone 4S", "iPhone5": "iPhone 5"}
+"""Names of the folders, and of the phones."""
+TRAINS = "Guillaume"
+"""The person whose walks are `train`."""
+WAYS = {
+    "AR": "held up",
+    "Texting": "texting",
+    "Phoning": "at the ear",
+    "FrontPocket": "front pocket",
+    "BackPocket": "back pocket",
+    "Swinging": "swinging hand",
+    "RunningHand": "running, in the hand",
+    "RunningPocket": "running, in the pocket",
+}
+"""Names of the folders, and the ways to carry as the attribute `placement` has them."""
+
+LONGEST_RECORD = 3600.0
+"""s; a record lasts two minutes."""
+WIDEST = (0.2, 100.0)
+"""m that the walks in a room span at least and at most; what spans less is not in mm."""
+FASTEST_TURN, FASTEST = np.radians(2000.0), 10.0
+"""rad/s (the gyros' own range) and m/s: a tracker that shows more has jumped."""
+LAG_SEARCH = 0.3
+"""s by which `timeAlignment.txt` may be wrong (0.04)."""
+LAG_KNOTS = 60.0
+"""s between the knots of the lag: the clocks run straight."""
+
+# What a fit of phone and tracker may find. In brackets: the largest figure of the 84 walks.
+MOST_UNEXPLAINED = {"turning": 0.1, "acceleration": 0.5}
+"""Shares of the signals' power that a fit may leave."""
+LIMITS = {
+    "lever arm": (0.3, "m"),
+    "world's tilt": (5.0, "°"),
+    "handle's turn": (20.0, "°"),
+    "gyro's bias": (0.2, "rad/s"),
+    "accel's delay": (0.15, "s"),
+}
+
+_NAME = re.compile(rf"(\w+?)_({'|'.join(DEVICES)})_(Dist|NoDist)_(\w+)")
+
+
+class Walk(NamedTuple):
+    """One walk: the folder of its phone, and what its name says."""
+
+    folder: Path
+    person: str
+    device: str
+    magnets: bool
+    way: str
+
+    @property
+    def track(self) -> Path:
+        """The tracker's file."""
+        return self.folder.parents[1] / "qualisys" / f"{self.folder.name}.mat"
+
+
+def walk_of(folder: Path) -> Walk | None:
+    """The walk of a folder, by its name; None of another folder."""
+    match = _NAME.fullmatch(folder.name)
+    if match is None:
+        return None
+    person, device, magnets, way = match.groups()
+    return Walk(folder, person, DEVICES[device], magnets == "Dist", way)
+
+
+def recordings(root: Path, split: str) -> list[Recording]:
+    """The recordings of a split that are present, wherever below the root.
+
+    `train`: the walks of one person. The other's validate where magnets lie beside the path
+    (`val`), and test where none do (`test`, running included). `all` is every walk, and
+    `all-0of2`, `all+0of2` divide it by person.
+    """
+    root = Path(root)
+    found = find_folders(root, lambda folder: walk_of(folder) is not None)
+    walks = [walk for folder in found.values() if (walk := walk_of(folder)) is not None]
+    if not walks:
+        layout = f"expected layout: {DATASET.layout}"
+        raise InputError(root, "holds no recording of Tyrex", layout)
+    walks = sorted((w for w in walks if split in ("all", _split(w))), key=lambda w: w.folder.name)
+    if not walks:
+        people = f"'{TRAINS}' trains, everybody else validates and tests"
+        raise InputError(root, f"holds no walk of split '{split}'", f"complete the data: {people}")
+    return [_recording(walk) for walk in walks]
+
+
+def _split(walk: Walk) -> str:
+    if walk.person == TRAINS:
+        return "train"
+    return "val" if walk.magnets else "test"
+
+
+def _recording(walk: Walk) -> Recording:
+    files = ("accelerometer.txt", "gyroscope.txt", "description.txt", "timeAlignment.txt")
+    paths = (*(walk.folder / name for name in files), walk.track)
+    present = tuple(path for path in paths if path.is_file())
+    return Recording(walk.folder.name, partial(read, walk.folder), present, slow=True)
+
+
+# --- one walk
+
+
+def read(folder: str | os.PathLike[str]) -> list[Sequence]:
+    """One walk of its phone's folder. Raises `InputError` naming file and field, and `Refusal`
+    where phone and tracker do not move alike."""
+    folder = Path(folder)
+    walk = walk_of(folder)
+    if walk is None:
+        problem = "is not named <Person>_<Device>_<Dist|NoDist>_<Way>"
+        raise InputError(folder, problem, "give the folder its published name")
+    phone, track = read_phone(walk), read_track(walk.track, _offset(folder))
+    try:
+        fit = align(phone, _recorded(track, phone), LAG_KNOTS, search_seconds=LAG_SEARCH)
+    except TooLittle as error:
+        raise Refusal(walk.track, f"cannot be aligned with the phone ({error})") from None
+    _check_fit(fit, walk)
+    about = {
+        "dataset": "tyrex",
+        "group": walk.person,
+        "subject": walk.person,
+        "device": walk.device,
+        "placement": WAYS.get(walk.way, walk.way),
+        "gait": "running" if walk.way.startswith("Running") else "walking",
+        "truth": "Qualisys",
+        "imu_compensated": "no",
+        "licence": DATASET.licence,
+        "lag": float(np.mean(fit.lag)),
+        "accel_delay_removed": fit.accel_delay,
+        "gyro_unexplained": fit.gyro_unexplained,
+        "accel_unexplained": fit.accel_unexplained,
+        "gyro_bias": float(np.linalg.norm(fit.gyro_bias)),
+    }
+    accel = phone.accel._replace(time=phone.accel.time - fit.accel_delay)
+    streams = phone._replace(accel=accel, poses=fit.poses, attributes=about)
+    return assemble(streams, RATE, divide=True)
+
+
+def _recorded(track: Poses, phone: Streams) -> Poses:
+    """The poses that no gap of the phone touches: three records pause for 4 to 24 s."""
+    covered = np.ones(len(track.time), dtype=bool)
+    for sensor in (phone.gyro, phone.accel):
+        own = np.ones(len(sensor.time), dtype=bool)
+        for shift in (-LAG_SEARCH, 0.0, LAG_SEARCH):
+            covered &= known_at(sensor.time, own, track.time + shift, LONGEST_BRIDGE)
+    if covered.sum() < 2:
+        problem = "field 'time' shares nothing with the phone's"
+        raise InputError(track.source, problem, "check that both files are of one walk")
+    return track.rows(np.flatnonzero(covered))
+
+
+def _check_fit(fit: BodyFit, walk: Walk) -> None:
+    remedy = "check that both files are of one walk"
+    shares = {"turning": fit.gyro_unexplained, "acceleration": fit.accel_unexplained}
+    for what, share in shares.items():
+        if not share <= MOST_UNEXPLAINED[what]:
+            problem = f"does not move as the phone does: {share:.0%} of the power of its {what}"
+            most = f"stays unexplained, at most {MOST_UNEXPLAINED[what]:.0%} is plausible"
+            raise Refusal(walk.track, f"{problem} {most}", remedy)
+    found = {
+        "lever arm": float(np.linalg.norm(fit.lever)),
+        "world's tilt": float(np.degrees(np.arccos(np.clip(fit.up[2], -1.0, 1.0)))),
+        "handle's turn": float(np.degrees(fit.extrinsic.magnitude())),
+        "gyro's bias": float(np.linalg.norm(fit.gyro_bias)),
+        "accel's delay": abs(fit.accel_delay),
+    }
+    for what, (most, unit) in LIMITS.items():
+        if not found[what] <= most:
+            value = f"the {what} would be {found[what]:.3g} {unit}, at most {most:g} {unit}"
+            problem = f"fits the phone only with what cannot be: {value} is plausible"
+            raise Refusal(walk.track, problem, remedy)
+
+
+# --- the phone's text
+
+
+def read_phone(walk: Walk) -> Streams:
+    """Both sensors, in s of the record, as SI units in the phone's axes. Raises `InputError`."""
+    apple = walk.device.startswith("iPhone")
+    start = _boot_time(walk.folder / "description.txt") if apple else 0.0
+    sensors = []
+    for name, widths in (("gyroscope.txt", (4,) if apple else (7,)), ("accelerometer.txt", (4,))):
+        path = walk.folder / name
+        table = read_text(path, separator=" ", header=False, widths=widths)
+        stamps, values = table.take(0), table.take(1, 2, 3)
+        rows = distinct(stamps, path)
+        time = stamps[rows] - start
+        if not np.abs(time).max() <= LONGEST_RECORD:
+            farthest = time[np.argmax(np.abs(time))]
+            problem = f"field 'time' (column 0) lies {farthest:.3g} s from the record's start"
+            remedy = "check that its stamps and BootTime are of one phone" if apple else ""
+            raise InputError(path, problem, remedy or "cut the rows of other times")
+        sensors.append(Samples(time, values[rows], str(path)))
+    gyro, accel = sensors
+    if apple:
+        accel = accel._replace(values=-STANDARD_G * accel.values)
+    check_accel(accel.values, accel.source, accel.time)
+    check_gyro(gyro.values, gyro.source, gyro.time)
+    return Streams(walk.folder.name, str(walk.folder), gyro, accel)
+
+
+def _boot_time(path: Path) -> float:
+    """s since boot at which an iPhone's record began."""
+    found = re.search(r"BootTime\s*=\s*(\d{1,12}(?:\.\d{1,9})?)", _text(path))
+    if found is None:
+        raise damaged(path, "field 'BootTime' is missing")
+    return float(found[1])
+
+
+def _offset(folder: Path) -> float:
+    """s by which the tracker's time is ahead of the record's."""
+    path = folder / "timeAlignment.txt"
+    text = _text(path).strip()
+    try:
+        offset = float(text)
+    except ValueError:
+        offset = np.nan
+    if not abs(offset) <= LONGEST_RECORD:
+        raise damaged(path, f"holds '{shortened(text)}', expected one number of seconds")
+    return offset
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8-sig", errors="replace")
+    except OSError as error:
+        raise InputError(path, f"cannot be read ({error.strerror})") from None
+
+
+# --- the tracker's MATLAB file
+
+
+def read_track(path: Path, offset: float) -> Poses:
+    """Poses of the handle (m, body → world) where it was seen, in s of the record; `offset` is the
+    tracker's time minus the record's, s. Raises `InputError`."""
+    from scipy.io import loadmat  # it takes a quarter of a second to import
+
+    if not path.is_file():
+        raise InputError(path, "no such file", f"expected layout: {DATASET.layout}")
+    with parsed_as(path, "MATLAB 5"):
+        content = loadmat(path, simplify_cells=True)
+    structs = [value for name, value in content.items() if not name.startswith("__")]
+    struct = structs[0] if len(structs) == 1 and isinstance(structs[0], dict) else {}
+    bodies = struct.get("RigidBodies")
+    if not isinstance(bodies, dict) or "Positions" not in bodies or "Rotations" not in bodies:
+        problem = "field 'RigidBodies' with Positions and Rotations is missing"
+        raise InputError(path, problem, "export it from QTM with its one rigid body (6DOF)")
+    rate = _numbers(path, struct, "FrameRate", ())
+    place, matrices = (
+        _numbers(path, bodies, name, (width, -1))
+        for name, width in (("Positions", 3), ("Rotations", 9))
+    )
+    if not 1.0 <= rate <= 1000.0:
+        raise damaged(path, f"field 'FrameRate' is {float(rate):.3g} Hz, expected 60")
+    if place.shape[1] != matrices.shape[1]:
+        problem = f"fields 'Positions' and 'Rotations' hold {place.shape[1]} and"
+        raise damaged(path, f"{problem} {matrices.shape[1]} frames")
+    seen = np.flatnonzero(np.isfinite(place).all(axis=0) & np.isfinite(matrices).all(axis=0))
+    if len(seen) < 0.5 * place.shape[1]:
+        raise damaged(path, f"only {len(seen)} of {place.shape[1]} frames hold a pose")
+    place = place[:, seen].T * 1e-3
+    turns = matrices[:, seen].T.reshape(-1, 3, 3).transpose(0, 2, 1)  # column by column
+    off = np.abs(turns.transpose(0, 2, 1) @ turns - np.eye(3)).max(axis=(1, 2))
+    bad = ~(off <= 1e-3) | ~(np.linalg.det(turns) > 0)
+    if bad.any():
+        frame = f"first in frame {seen[np.argmax(bad)] + 1}"
+        raise damaged(path, f"field 'Rotations' is no rotation in {bad.sum()} frames, {frame}")
+    poses = Poses(seen / float(rate) - offset, Rotation.from_matrix(turns), place, noisy=True)
+    good = without_jumps(poses, FASTEST_TURN, FASTEST)._replace(source=str(path))
+    if len(good.time) < 0.5 * len(seen):
+        raise damaged(path, f"only {len(good.time)} of {len(seen)} poses are plausible")
+    least, most = WIDEST
+    if not least <= (span := float(np.ptp(good.position, axis=0).max())) <= most:
+        problem = f"field 'Positions' spans {span:.3g} m as mm, expected {least:g} to {most:g} m"
+        raise InputError(path, problem, "give it in mm")
+    return good
+
+
+def _numbers(path: Path, fields: dict[str, Any], name: str, shape: tuple[int, ...]) -> np.ndarray:
+    """A field as float64 of this shape; −1 stands for any number from 2 on."""
+    try:
+        values = np.asarray(fields.get(name), dtype=np.float64)
+    except (TypeError, ValueError):
+        values = np.zeros((0, 0, 0))
+    fits = values.ndim == len(shape) and all(
+        found == wanted or (wanted < 0 and found >= 2)
+        for found, wanted in zip(values.shape, shape, strict=False)
+    )
+    if not fits:
+        wanted = str(shape).replace("-1", "n")
+        problem = f"field '{name}' has shape {values.shape} of numbers, expected {wanted}"
+        raise InputError(path, problem, "export it from QTM with its one rigid body (6DOF)")
+    return values
+
+
+DATASET = Dataset(
+    name="tyrex",
+    recordings=recordings,
+    splits=("train", "val", "test", "all"),
+    rate=RATE,
+    source="http://tyrex.inria.fr/mobile/benchmarks-attitude/",
+    layout="<root>/**/{android,ios}/<Person>_<Device>_<Dist|NoDist>_<Way>/"
+    "{accelerometer,gyroscope,timeAlignment}.txt (iPhones: description.txt) and "
+    "<root>/**/qualisys/<same name>.mat",
+    licence="CeCILL 2.1",
+)

@@ -1,0 +1,128 @@
+"""Indoor Location: a known walk written in the competition's layout, traps included, must come back
+with its waypoints; real walks must be physical."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gnio_jax import data
+from gnio_jax.data.dataset import Refusal
+from gnio_jax.data.readers import indoor_location
+from gnio_jax.data.self_check import self_check
+from tests.support import known_walk as walk
+from tests.support.indoor_location_files import NAME, START, TAPS, lines, write
+from tests.support.refusals import refused
+
+
+def check_walk(sequence):
+    time = sequence.time
+    np.testing.assert_allclose(np.diff(time), 0.02, rtol=1e-6)
+    inner = slice(5, -5)  # stamps are whole ms, and splines err at their ends
+    np.testing.assert_allclose(sequence.gyro[inner], walk.rate(time)[inner], atol=0.02)
+    np.testing.assert_allclose(sequence.accel[inner], walk.force(time)[inner], atol=0.1)
+    taps = sequence.waypoints
+    np.testing.assert_allclose(taps.time, np.maximum(TAPS, 0.0), atol=1e-9)
+    np.testing.assert_allclose(taps.position, walk.position(TAPS)[:, :2], atol=1e-6)
+
+
+def test_a_walk_comes_back_with_its_waypoints(tmp_path):
+    (sequence,) = indoor_location.read(write(tmp_path))
+    check_walk(sequence)
+    assert not sequence.valid.any() and np.isnan(sequence.position).all()
+    assert sequence.name == f"site1_F4_{NAME}"
+    about = sequence.attributes
+    assert about["start_time"] == pytest.approx(START / 1e3, abs=1e-4)
+    assert about["group"] == "site1_F4" and about["device"] == "OPPO PBCM10"
+    assert about["truth"] == "waypoints"
+    check = self_check(sequence)
+    assert check.failures == () and np.isnan(check.accel_correlation_horizontal)
+
+
+def test_floors_make_the_splits(tmp_path):
+    for number, floor in enumerate(("B1", "F1", "F2", "F3", "F4", "F9")):
+        write(tmp_path, ["#"], floor, str(number))
+    found = {
+        split: [each.name.split("_")[1] for each in indoor_location.recordings(tmp_path, split)]
+        for split in ("train", "val", "test", "all")
+    }
+    assert found == {
+        "train": ["B1", "F1", "F2"],
+        "val": ["F3"],
+        "test": ["F4"],
+        "all": ["B1", "F1", "F2", "F3", "F4", "F9"],
+    }
+    (tmp_path / "site1" / "F3" / "path_data_files" / "3.txt").unlink()
+    refused(lambda: indoor_location.recordings(tmp_path, "val"), tmp_path, "'val'", "F3")
+    refused(lambda: indoor_location.recordings(tmp_path / "site1/F3", "all"), tmp_path, "layout")
+
+
+def test_lines_without_a_newline_between_them_are_divided(tmp_path):
+    text = lines()
+    tap = next(i for i, line in enumerate(text[50:], 50) if "WAYPOINT" in line)
+    for row in (tap, tap - 40, 20):
+        text[row : row + 2] = [text[row] + text[row + 1]]
+    (sequence,) = indoor_location.read(write(tmp_path, text))
+    check_walk(sequence)
+
+
+def test_rows_out_of_order_and_repeated_are_mended(tmp_path):
+    text = lines()
+    text[200:200] = text[200:230]
+    text[400], text[403] = text[403], text[400]
+    (sequence,) = indoor_location.read(write(tmp_path, text))
+    check_walk(sequence)
+
+
+@pytest.mark.parametrize("count", [0, 1, 2])
+def test_a_walk_of_few_waypoints_is_of_no_use(tmp_path, count):
+    path = write(tmp_path, lines(taps=TAPS[:count]))
+    with pytest.raises(Refusal, match=f"'TYPE_WAYPOINT' holds {count}, at least 3"):
+        indoor_location.read(path)
+    with pytest.raises(data.InputError), pytest.warns(UserWarning, match=f"left out: .*{NAME}"):
+        data.load("indoor_location", tmp_path, "test")
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda text: [*text[:99], text[99][:-20]], ("is cut short", "in line 100")),
+        (lambda text: [*text[:99], "15746"], ("line 100 is '15746'",)),
+        (lambda text: text + text, ("'startTime' is there 2 times",)),
+        (lambda text: [x for x in text if "GYRO" not in x], ("0 lines of TYPE_GYROSCOPE",)),
+        (
+            lambda text: [
+                x.replace(str(START)[:7], "1574999") if "WAYPOINT" in x else x for x in text
+            ],
+            ("'TYPE_WAYPOINT' has 2 of 2 stamps", "one phone"),
+        ),
+        (
+            lambda text: [
+                x.replace(str(START)[:7], "1574999") if "ACCEL" in x else x for x in text
+            ],
+            ("'TYPE_WAYPOINT'", "one phone"),
+        ),
+        (
+            lambda text: [x.replace("\t0.", "\tnan\t0.") if "GYRO" in x else x for x in text],
+            ("'TYPE_GYROSCOPE' holds NaN",),
+        ),
+    ],
+)
+def test_a_damaged_file_is_refused_by_its_field(tmp_path, change, words):
+    path = write(tmp_path, change(lines(12.0)))
+    refused(lambda: indoor_location.read(path), path, *words)
+
+
+@pytest.mark.recordings
+def test_real_walks_are_physical(recordings):
+    root = recordings / "indoor_location"
+    if not root.is_dir():
+        pytest.skip("real recordings: no indoor_location/")
+    for each in indoor_location.recordings(root, "val")[:5]:
+        try:
+            (sequence,) = each.read()
+        except Refusal:
+            continue
+        check = self_check(sequence)
+        assert check.failures == () and 0.3 < check.median_speed < 1.6
+        assert np.linalg.norm(check.gravity_mean) == pytest.approx(9.81, abs=0.3)
