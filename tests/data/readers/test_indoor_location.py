@@ -10,6 +10,7 @@ from gnio_jax import data
 from gnio_jax.data.dataset import Refusal
 from gnio_jax.data.readers import indoor_location
 from gnio_jax.data.self_check import self_check
+from gnio_jax.errors import InputError
 from tests.support import known_walk as walk
 from tests.support.indoor_location_files import NAME, START, TAPS, lines, write
 from tests.support.refusals import refused
@@ -54,7 +55,8 @@ def test_floors_make_the_splits(tmp_path):
     }
     (tmp_path / "site1" / "F3" / "path_data_files" / "3.txt").unlink()
     refused(lambda: indoor_location.recordings(tmp_path, "val"), tmp_path, "'val'", "F3")
-    refused(lambda: indoor_location.recordings(tmp_path / "site1/F3", "all"), tmp_path, "layout")
+    nothing = tmp_path / "site1" / "F3"
+    refused(lambda: indoor_location.recordings(nothing, "all"), nothing, "expected layout")
 
 
 def test_lines_without_a_newline_between_them_are_divided(tmp_path):
@@ -79,7 +81,7 @@ def test_a_walk_of_few_waypoints_is_of_no_use(tmp_path, count):
     path = write(tmp_path, lines(taps=TAPS[:count]))
     with pytest.raises(Refusal, match=f"'TYPE_WAYPOINT' holds {count}, at least 3"):
         indoor_location.read(path)
-    with pytest.raises(data.InputError), pytest.warns(UserWarning, match=f"left out: .*{NAME}"):
+    with pytest.raises(InputError), pytest.warns(UserWarning, match=f"left out: .*{NAME}"):
         data.load("indoor_location", tmp_path, "test")
 
 
