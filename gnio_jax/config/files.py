@@ -336,6 +336,7 @@ def validate(config: TrainConfig, source: str = "config") -> TrainConfig:
     for name, hint, value in named(config):
         _check_bounds(hint, value, place.below(name))
     config.data.check(place.below("data"))
+    config.augment.check(place.below("augment"))
     config.check(place)
     return config
 

@@ -148,6 +148,18 @@ class AugmentConfig:
     shift_samples: NonNegativeCount = 0
     """Shift a training window by up to this many samples either way, where the recording allows it
     (RoNIN, DeepILS)."""
+    low_pass_share: Probability = 0.0
+    """Share of the windows of which both sensors pass a random low-pass, drawn anew for every
+    window: a phone's bandwidth must not tell the network whose walk it sees (ours, e.g. 0.5)."""
+    low_pass_hertz: tuple[Positive, Positive] = (4.0, 25.0)
+    """Lowest and highest cut-off of that low-pass, a Butterworth of order 1 to 3, Hz."""
+    scale: tuple[Probability, Probability] = (0.0, 0.0)
+    """Half-widths of a window's uniform scale errors of gyro and accelerometer (ours)."""
+
+    def check(self, at: Place) -> None:
+        """The lowest cut-off is no higher than the highest."""
+        if self.low_pass_hertz[0] > self.low_pass_hertz[1]:
+            at.refuse("low_pass_hertz", "begins above its end", "give the lower frequency first")
 
 
 @dataclass(frozen=True)

@@ -2,8 +2,8 @@
 random changes.
 
 Overlapping windows are never copied: a second of IMU belongs to ten windows and is stored once.
-`window_source` prepares the recordings on the host. `gather`, `shift_windows` and `augment` act
-inside the jitted step, and `gnio_jax.windows` says what a window is.
+`window_source` prepares the recordings on the host. `shift_windows`, `gather`, `low_pass` and
+`augment` act inside the jitted step, and `gnio_jax.windows` says what a window is.
 """
 
 from __future__ import annotations
@@ -24,7 +24,6 @@ from gnio_jax.numerics import rotations, yaw
 from gnio_jax.types import Array, Sequence, Windows
 from gnio_jax.windows import (
     align_recording,
-    cut_windows,
     rotate_channels,
     rotate_vectors,
     true_displacement,
@@ -52,6 +51,8 @@ class WindowSource(NamedTuple):
     has none."""
     unyaw: Float[Array, "m 2"]
     """Cosine and sine of the yaw that `rotation` removes: from the world to the window's frame."""
+    recording: Int[Array, "m 2"]
+    """First and last row of the recording that each window is cut from."""
     visited: Int[Array, "v"]
     """Numbers of the windows an epoch visits: all of them, unless they are to be shifted (see
     `shift_windows`)."""
@@ -76,8 +77,13 @@ def window_source(
             raise InputError(sequence.name, problem, "windows need a pose at every sample")
         part = _recording_windows(sequence, config, stride, 1 if shift else stride)
         if part.start.size:
-            start, visited = part.start + np.int32(rows), part.visited + np.int32(windows)
-            found.append(part._replace(start=start, visited=visited))
+            found.append(
+                part._replace(
+                    start=part.start + np.int32(rows),
+                    recording=part.recording + np.int32(rows),
+                    visited=part.visited + np.int32(windows),
+                )
+            )
             rows += len(part.imu)
             windows += len(part.start)
     if not found:
@@ -110,18 +116,28 @@ def _recording_windows(
         displacement=displacement.astype(np.float32),
         step=np.diff(sequence.position, axis=0, append=np.nan).astype(np.float32),
         unyaw=np.column_stack([np.cos(heading), np.sin(heading)]).astype(np.float32),
+        recording=np.tile(np.int32([0, len(imu) - 1]), (len(start), 1)),
         visited=np.flatnonzero(start % stride == 0).astype(np.int32),
     )
 
 
-def gather(source: WindowSource, which: Int[jax.Array, "b"], length: int) -> Windows:
-    """Windows number `which` of `source`, each `length` samples, in their own frames. Jittable."""
+def gather(
+    source: WindowSource, which: Int[jax.Array, "b"], length: int, margin: int = 0
+) -> Windows:
+    """Windows number `which` of `source`, each `length` samples, in their own frames. Jittable.
+
+    `imu` has `margin` more samples on either side, for `low_pass`; where the recording ends, its
+    last sample is repeated.
+    """
     start = source.start[which]
+    rows = window_rows(start - margin, margin + length + margin)
+    first, last = source.recording[which].T[:, :, None]
+    imu = source.imu[jnp.clip(rows, first, last) if margin else rows]
     cosine, sine = source.unyaw[which][:, :, None].swapaxes(0, 1)
     # The compiler drops the steps where nobody looks at them.
     x, y, z = jnp.moveaxis(source.step[window_rows(start, length)], -1, 0)
     return Windows(
-        imu=cut_windows(source.imu, start, source.rotation[which], length),
+        imu=rotate_channels(source.rotation[which], imu),
         displacement=source.displacement[which],
         steps=jnp.stack([cosine * x + sine * y, cosine * y - sine * x, z], axis=-1),
     )
@@ -142,17 +158,57 @@ def shift_windows(
     return jnp.where(in_recording, candidate, which)
 
 
+def low_pass(key: PRNGKeyArray, windows: Windows, config: AugmentConfig, rate: float) -> Windows:
+    """Windows without the margins of `low_pass_margin`, a random share of them low-passed (ours).
+
+    What the filter of a phone leaves of the spectrum must not tell the network which dataset it
+    looks at. Accelerometer and gyro pass the same Butterworth magnitude
+    |H(f)| = 1/√(1 + (f/f_c)^2n), of order n from 1 to 3 and cut-off f_c uniform in its logarithm,
+    drawn anew for every window. Its phase is zero although a phone's filter is causal: readers
+    align the clocks of IMU and reference by their motion, which takes out a constant delay, and a
+    delay of the IMU alone would set the window against its displacement. The samples are those of
+    `gather`, already rotated: attitude changes slowly beside 4 Hz, gravity stays as it is, and
+    biases, tilt and yaw may come after the filter.
+    """
+    margin = low_pass_margin(config, rate)
+    if not margin:
+        return windows
+    imu = windows.imu
+    count, length, _ = imu.shape
+    share_key, order_key, cutoff_key = jax.random.split(key, 3)
+    chosen = _uniform(share_key, (count,), 0.0, 1.0) < config.low_pass_share
+    order = jax.random.randint(order_key, (count,), 1, 4, jnp.int32)
+    low, high = map(math.log, config.low_pass_hertz)
+    cutoff = jnp.exp(_uniform(cutoff_key, (count,), low, high))
+    frequency = np.fft.rfftfreq(length, 1 / rate).astype(np.float32)
+    power = (frequency[None] / cutoff[:, None]) ** (2 * order[:, None])
+    spectrum = jnp.fft.rfft(imu, axis=1) * jax.lax.rsqrt(1 + power)[:, :, None]
+    smooth = jnp.fft.irfft(spectrum, length, axis=1)
+    imu = jnp.where(chosen[:, None, None], smooth, imu)
+    return windows._replace(imu=imu[:, margin:-margin])
+
+
+def low_pass_margin(config: AugmentConfig, rate: float) -> int:
+    """Samples on either side of a window that `low_pass` needs: 0.25 s, beyond which lies less than
+    2 % of the impulse response of every filter from 4 Hz on. 0 without the filter."""
+    return math.ceil(0.25 * rate) if config.low_pass_share else 0
+
+
 def augment(key: PRNGKeyArray, windows: Windows, config: AugmentConfig) -> Windows:
     """The random changes that `config` (static) switches on, in TLIO's order, each by its own key;
     GNIO's paper is silent on them.
 
-    A constant bias for each window, uniform in ± its half-width on each axis. A tilt by up to
+    A scale factor of each sensor (ours). A constant bias for each window, uniform in ± its
+    half-width on each axis. A tilt by up to
     `tilt_degrees` about a random horizontal axis, a wrong direction of gravity, under which the
     target stays. A uniform yaw of window and target together: the network must not depend on the
     choice of heading. White noise last. float32 throughout.
     """
     bias_key, tilt_key, yaw_key, noise_key = jax.random.split(key, 4)
     imu, count = windows.imu, len(windows.imu)
+    if any(config.scale):
+        error = _uniform(jax.random.fold_in(key, 4), (count, 1, 2), -1.0, 1.0)
+        imu = imu * (1 + jnp.repeat(error, 3, axis=2) * _channels(*config.scale))
     if config.gyro_bias or config.accel_bias:
         offset = _uniform(bias_key, (count, 1, 6), -1.0, 1.0)
         imu = imu + offset * _channels(config.gyro_bias, config.accel_bias)

@@ -20,7 +20,15 @@ from jaxtyping import Float, Int, PRNGKeyArray
 
 from gnio_jax import parallel
 from gnio_jax.config import TrainConfig
-from gnio_jax.data.windows import WindowSource, augment, gather, shift_windows, window_source
+from gnio_jax.data.windows import (
+    WindowSource,
+    augment,
+    gather,
+    low_pass,
+    low_pass_margin,
+    shift_windows,
+    window_source,
+)
 from gnio_jax.models.layers import MOMENTUM
 from gnio_jax.training.losses import Losses, Stage, loss_stage, losses, switches
 from gnio_jax.training.task import BatchLosses, Row, Task, Trainable, TrainState, size_of
@@ -80,14 +88,16 @@ class WindowTask(Task):
     def draw(
         self, key: PRNGKeyArray, source: WindowSource, which: Int[jax.Array, "b"]
     ) -> tuple[Windows, PRNGKeyArray]:
-        """The windows `which`, shifted and augmented, and a key for the network's dropout. Each
-        device cuts its share of them."""
+        """The windows `which`, shifted, low-passed and augmented, and a key for the network's
+        dropout. Each device cuts its share of them."""
         chex.assert_equal_shape_prefix([source.start, source.rotation, source.displacement], 1)
         augment_key, dropout_key, shift_key = jax.random.split(key, 3)
-        shift = self.config.augment.shift_samples
-        which = shift_windows(shift_key, source, parallel.split(which), shift)
-        windows = gather(source, parallel.split(which), self.config.data.seen)
-        return parallel.split(augment(augment_key, windows, self.config.augment)), dropout_key
+        data, changes = self.config.data, self.config.augment
+        margin = low_pass_margin(changes, data.rate)
+        which = shift_windows(shift_key, source, parallel.split(which), changes.shift_samples)
+        windows = gather(source, parallel.split(which), data.seen, margin)
+        windows = low_pass(jax.random.fold_in(key, 3), windows, changes, data.rate)
+        return parallel.split(augment(augment_key, windows, changes)), dropout_key
 
     def losses(
         self, variables: Any, batch: tuple[Windows, PRNGKeyArray], step: Int[jax.Array, ""]

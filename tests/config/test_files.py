@@ -62,6 +62,10 @@ def read(text):
         ("through_filter: {learn: noise}", "'through_filter.learn' must be a list, found 'noise'"),
         ("optim: {epochs: '3'}", "field 'optim.epochs' must be a whole number, found '3'"),
         ("augment: {yaw: 1}", "field 'augment.yaw' must be true or false, found 1"),
+        (
+            "augment: {low_pass_hertz: [25, 4]}",
+            "field 'augment.low_pass_hertz' begins above its end",
+        ),
         ("augment: {yaw: yes}", "field 'augment.yaw' must be true or false, found 'yes'"),
         ("data: {rate: .inf}", "field 'data.rate' must be a number, found '.inf'"),
         ("data: {rate: !!float .inf}", "field 'data.rate' must be positive and finite, found inf"),

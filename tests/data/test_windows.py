@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy import signal, stats
 from scipy.spatial.transform import Rotation
 
 from gnio_jax.config import AugmentConfig, DataConfig
@@ -17,9 +18,10 @@ KEY = jax.random.key(3)
 CONFIG = DataConfig(rate=20.0, window_seconds=1.0, stride_seconds=0.1)
 
 # One program each, in place of one for every operation.
-gather = jax.jit(windows.gather, static_argnums=2)
+gather = jax.jit(windows.gather, static_argnums=(2, 3))
 shift_windows = jax.jit(windows.shift_windows, static_argnums=3)
 augment = jax.jit(windows.augment, static_argnums=2)
+low_pass = jax.jit(windows.low_pass, static_argnums=(2, 3))
 OFF = AugmentConfig(gyro_bias=0.0, accel_bias=0.0, tilt_degrees=0.0, yaw=False)
 
 
@@ -200,9 +202,79 @@ def test_noise_has_the_stated_deviation():
     np.testing.assert_allclose(difference.std(axis=(0, 1)), [0.1] * 3 + [0.01] * 3, rtol=0.02)
 
 
+def test_scale_is_common_to_the_axes_of_a_sensor_and_spares_the_target():
+    before = batch()
+    after = augmented(before, scale=(0.01, 0.03))
+    for channels, half_width in [(slice(0, 3), 0.03), (slice(3, 6), 0.01)]:
+        old, new = np.asarray(before.imu)[..., channels], np.asarray(after.imu)[..., channels]
+        error = np.einsum("bnc,bnc->b", new, old) / np.einsum("bnc,bnc->b", old, old) - 1
+        np.testing.assert_allclose(new, old * (1 + error[:, None, None]), atol=1e-5)
+        assert stats.kstest(error / half_width, "uniform", (-1, 2)).pvalue > 1e-3
+    np.testing.assert_array_equal(after.displacement, before.displacement)
+
+
+def magnitude(order, cutoff, frequency):
+    """Of an analog Butterworth, by SciPy."""
+    return abs(signal.freqs(*signal.butter(order, cutoff, analog=True), worN=frequency)[1])
+
+
+def test_low_pass_draws_order_and_cutoff_for_each_window_and_both_sensors_alike():
+    """Sines of whole periods in a window and its margins: a filter changes their size alone. The
+    ratio of two of them gives order and cut-off away, and SciPy has their sizes for those."""
+    config = dataclasses.replace(OFF, low_pass_share=0.6, low_pass_hertz=(4.0, 25.0))
+    time, frequency = np.arange(100) / 100, np.array([10, 20, 0, 20, 10, 0])
+    sines = np.sin(2 * np.pi * frequency * time[:, None] + 1)
+    imu = jnp.asarray(np.tile(sines, (3000, 1, 1)), jnp.float32)
+    before = Windows(imu, jnp.ones((3000, 3)), jnp.ones((3000, 50, 3)))
+    after = low_pass(KEY, before, config, 100.0)
+    np.testing.assert_array_equal(after.displacement, before.displacement)
+    inner = sines[25:-25]
+    size = np.einsum("bnc,nc->bc", after.imu, inner) / np.sum(inner**2, axis=0)
+    np.testing.assert_allclose(after.imu, size[:, None] * inner, atol=1e-5)  # no phase
+    np.testing.assert_allclose(size[:, :3], size[:, [4, 3, 5]], atol=1e-5)
+    np.testing.assert_allclose(size[:, 2], 1, atol=1e-5)  # gravity
+    size = size[size[:, 1] < 0.9999, :2]
+    assert len(size) / 3000 == pytest.approx(0.6, abs=0.03)
+    odds = 1 / size**2 - 1  # (f / cut-off)^(2 order)
+    order = np.round(np.log2(odds[:, 1] / odds[:, 0]) / 2)
+    cutoff = 20 / odds[:, 1] ** (1 / (2 * order))
+    np.testing.assert_allclose(
+        np.bincount(order.astype(int))[1:] / len(order), [1 / 3] * 3, atol=0.04
+    )
+    assert stats.kstest(np.log(cutoff / 4) / np.log(25 / 4), "uniform").pvalue > 1e-3
+    for i in range(10):
+        expected = magnitude(order[i], cutoff[i], [10.0, 20.0])
+        np.testing.assert_allclose(size[i], expected, rtol=1e-2)
+
+
+def test_low_pass_of_a_window_is_that_of_its_whole_recording():
+    """Its neighbours in the recording belong to the filter, those of another recording do not."""
+    level = np.tile([1.0, 0.0, 0.0, 0.0], (90, 1))
+    parts = [tumbling(90, seed)._replace(orientation=level) for seed in range(2)]
+    parts[1] = parts[1]._replace(accel=parts[1].accel + 100)
+    source = jax.device_put(windows.window_source(parts, CONFIG, 2))
+    which = jnp.arange(len(source.start), dtype=jnp.int32)
+    config = dataclasses.replace(OFF, low_pass_share=0.999999, low_pass_hertz=(4.0, 4.0))
+    margin = windows.low_pass_margin(config, 20.0)
+    found = low_pass(KEY, gather(source, which, 20, margin), config, 20.0)
+    np.testing.assert_array_equal(found.displacement, source.displacement)
+    expected = []
+    for order in (1, 2, 3):
+        rows = []
+        for part in parts:
+            imu = np.pad(np.hstack([part.accel, part.gyro]), ((50, 50), (0, 0)), "edge")
+            size = magnitude(order, 4.0, np.maximum(np.fft.rfftfreq(190, 1 / 20), 1e-9))
+            smooth = np.fft.irfft(size[:, None] * np.fft.rfft(imu, axis=0), 190, axis=0)[50:-50]
+            rows += [smooth[i : i + 20] for i in range(0, 70, 2)]
+        expected.append(rows)
+    error = np.abs(np.asarray(found.imu) - np.array(expected)).max(axis=(2, 3))
+    assert error.min(axis=0).max() < 0.1 and len(set(error.argmin(axis=0))) == 3
+
+
 def test_switched_off_augmentation_changes_nothing_and_draws_depend_on_the_key_alone():
     before = batch(10)
     np.testing.assert_array_equal(augment(KEY, before, OFF).imu, before.imu)
+    np.testing.assert_array_equal(low_pass(KEY, before, AugmentConfig(), 100.0).imu, before.imu)
     keys = KEY, KEY, jax.random.key(4)
     first, again, other = (augment(key, before, AugmentConfig()) for key in keys)
     np.testing.assert_array_equal(first.imu, again.imu)

@@ -40,8 +40,9 @@ def source(seed):
     rotation = np.tile(np.eye(3, dtype=np.float32), (WINDOWS, 1, 1))
     unyaw = np.tile(np.float32([1, 0]), (WINDOWS, 1))
     displacement, step = draw(WINDOWS, 3), draw(rows, 3)
-    windows = WindowSource(draw(rows, 6), number, rotation, displacement, step, unyaw, number)
-    return jax.device_put(windows)
+    recording = np.tile(np.int32([0, rows - 1]), (WINDOWS, 1))
+    windows = draw(rows, 6), number, rotation, displacement, step, unyaw, recording, number
+    return jax.device_put(WindowSource(*windows))
 
 
 def once(function, **options):
