@@ -7,6 +7,7 @@ from gnio_jax.data.resampling import resample
 from gnio_jax.data.self_check import SelfCheck, self_check
 from gnio_jax.data.splits import Fold, folds, group, parse_fold
 from gnio_jax.data.validation import validate
+from gnio_jax.data.waypoints import with_poses
 from gnio_jax.types import Sequence
 
 __all__ = [
@@ -26,5 +27,6 @@ __all__ = [
     "resample",
     "self_check",
     "validate",
+    "with_poses",
     "write_hdf5",
 ]

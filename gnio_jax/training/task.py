@@ -375,8 +375,8 @@ def overlaid(tree: dict[str, Any], other: dict[str, Any]) -> dict[str, Any]:
 def read_split(
     config: TrainConfig, split: str, reporter: Reporter, workers: int, samples: dict[str, int]
 ) -> Iterator[Sequence]:
-    """The recordings of a split at the network's rate, one after another. The number of samples of
-    each is noted in `samples` by its name."""
+    """The recordings of a split at the network's rate, one after another, with poses where they
+    come with waypoints. The number of samples of each is noted in `samples` by its name."""
     for sequence in data.load_each(
         config.dataset,
         config.data_root,
@@ -385,6 +385,12 @@ def read_split(
         lambda share: reporter.progress(f"reading {split}", share),
     ):
         resampled = data.resample(sequence, config.data.rate)
+        if resampled.waypoints is not None:
+            try:
+                resampled = data.with_poses(resampled)
+            except InputError as error:
+                reporter.line(f"warning: {error}")
+                continue
         samples[resampled.name] = len(resampled.time)
         yield resampled
 

@@ -1,0 +1,198 @@
+"""From waypoints to poses: what a walk with a phone before the body says of its every sample.
+
+Surveyors hold a phone flat before them, and its +y axis (the long side, away from the body) points
+where they walk. So between two taps the path is known but for its scale and a small turn: the gyro,
+levelled slowly by gravity, gives the direction, and the bounce of the steps the speed, which is
+none where they pause. That dead reckoning is laid on the taps leg by leg. All of it is ours.
+
+Points of the plane are complex numbers here: x + iy, and the ratio of two legs is a scale and a
+turn.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Complex, Float
+from scipy.ndimage import gaussian_filter1d
+from scipy.spatial.transform import Rotation
+
+from gnio_jax.data.dataset import Refusal
+from gnio_jax.numerics import about_z, integrate_gyro, levelling, quaternions, spans
+from gnio_jax.types import Sequence, Waypoints
+
+LEVEL_SECONDS = 4.0
+"""Standard deviation of the filter of the specific force that levels the gyro's attitude, s: over
+its reach a walker gains no velocity to speak of."""
+BOUNCE_SECONDS, SWAY_SECONDS = 0.4, 1.5
+"""s: standard deviations of the filter under which the size of the vertical acceleration is the
+bounce, and of the one whose output is no bounce but the walker's slower motion."""
+STEPPING = 0.3
+"""m/s² rms of bounce, below which nobody walks; and the share of a walk's usual bounce below which
+the walker stands. At twice that share the speed is the bounce's square root (chosen by waypoints
+left out, on the training floors)."""
+
+SHORTEST_LEG, FASTEST_LEG = 1.0, 2.5
+"""m and m/s: a leg beyond these is not a walk from tap to tap."""
+MOST_TURN, LEAST_STRAIGHT = np.radians(45.0), 0.5
+"""rad by which a leg may be off the phone's direction, and how far it must come of its reckoned
+length: beyond these the phone was not held ahead."""
+FEWEST_LEGS = 2
+"""Below which no walk's yaw is believed."""
+MOST_RESIDUAL = 20.0
+"""Degrees by which the y axis may be off the median leg."""
+SHORTEST_SECONDS = 1.0
+"""s of poses in a row below which a walk is of no use."""
+
+
+class Legs(NamedTuple):
+    """Dead reckoning of a walk by its phone, beside its waypoints."""
+
+    velocity: Complex[np.ndarray, " n"]
+    """Along the y axis, in a level frame of any yaw; 1 is the walk's usual speed."""
+    way: Complex[np.ndarray, " n"]
+    """Its integral, s."""
+    ratio: Complex[np.ndarray, " k"]
+    """Of each leg on the map to the reckoned one, m/s: its scale, and the turn onto the map."""
+    fits: Bool[np.ndarray, " k"]
+    """Whether the reckoned leg is the one on the map but for scale and a small turn."""
+    yaw: float
+    """The walk's turn onto the map, rad."""
+    residual: float
+    """Median size of what the legs' turns differ from it, degrees."""
+
+
+def with_poses(sequence: Sequence) -> Sequence:
+    """A sequence with waypoints as one with poses, valid on its legs.
+
+    Positions are in the map's frame, z is 0. Not valid are legs on which nobody walked with the
+    phone ahead (`Legs.fits`), what lies before the first tap and after the last, and what was not
+    measured. The attribute `yaw_residual_degrees` is the median angle between y axis and legs.
+
+    Raises `Refusal` where that is above `MOST_RESIDUAL`, or too little of the walk is left.
+    """
+    waypoints = sequence.waypoints
+    assert waypoints is not None
+    time, step = sequence.time, float(np.median(np.diff(sequence.time)))
+    level = levelled(sequence.gyro, sequence.accel, step)
+    legs = reckoned(level, sequence.accel, time, waypoints)
+    if legs.fits.sum() < FEWEST_LEGS:
+        problem = f"somebody walked {legs.fits.sum()} of its {len(legs.fits)} legs with the phone"
+        raise Refusal(sequence.name, f"{problem} ahead, at least {FEWEST_LEGS} are needed")
+    if not legs.residual <= MOST_RESIDUAL:
+        problem = f"the phone's y axis is {legs.residual:.0f}° off the median leg"
+        raise Refusal(sequence.name, f"{problem}, at most {MOST_RESIDUAL:g}° is plausible")
+    leg = np.clip(np.searchsorted(waypoints.time, time, side="right") - 1, 0, len(legs.fits) - 1)
+    valid = (time >= waypoints.time[0]) & (time <= waypoints.time[-1]) & legs.fits[leg]
+    if sequence.imu_valid is not None:
+        valid &= sequence.imu_valid
+    starts, stops = spans(valid).T
+    if (stops - starts).max(initial=0) * step < SHORTEST_SECONDS:
+        raise Refusal(sequence.name, f"no {SHORTEST_SECONDS:g} s of it lie on a leg")
+    corner = _plane(waypoints.position)[:-1] - legs.ratio * _at(waypoints.time, time, legs.way)[:-1]
+    place, velocity = corner[leg] + legs.ratio[leg] * legs.way, legs.ratio[leg] * legs.velocity
+    known = valid[:, None]
+    orientation = quaternions(about_z(np.full(len(time), legs.yaw)) * level)
+    about = {"reference": "waypoints", "yaw_residual_degrees": legs.residual}
+    return sequence._replace(
+        orientation=np.where(known, orientation, np.nan),
+        position=np.where(known, _space(place), np.nan),
+        velocity=np.where(known, _space(velocity), np.nan),
+        valid=valid,
+        waypoints=None,
+        attributes=sequence.attributes | about,
+    )
+
+
+def levelled(
+    gyro: Float[np.ndarray, "n 3"], accel: Float[np.ndarray, "n 3"], step: float
+) -> Rotation:
+    """Attitudes body → a level world of any yaw: the integrated gyro, its slow tilt taken out.
+
+    In the frame of the first attitude the specific force, filtered over `LEVEL_SECONDS`, points up;
+    each sample is turned by the smallest rotation that lays it on z. `step` is the interval, s.
+    """
+    turned = integrate_gyro(gyro, step)
+    force = turned.apply(accel)
+    level = levelling(force.mean(axis=0))
+    up = gaussian_filter1d(level.apply(force), LEVEL_SECONDS / step, axis=0, mode="nearest")
+    axis = np.cross(up, [0.0, 0.0, 1.0])
+    sine = np.linalg.norm(axis, axis=1)
+    angle = np.arctan2(sine, up[:, 2])
+    scale = np.divide(angle, sine, out=np.zeros_like(sine), where=sine > 0)
+    return Rotation.from_rotvec(axis * scale[:, None]) * level * turned
+
+
+def reckoned(
+    level: Rotation,
+    accel: Float[np.ndarray, "n 3"],
+    time: Float[np.ndarray, " n"],
+    waypoints: Waypoints,
+) -> Legs:
+    """Dead reckoning between the taps. level: attitudes of `levelled` at the uniform stamps `time`
+    (s); accel: specific force, m/s².
+
+    The yaw is that of the legs that were walked, weighted by their lengths, and the less the
+    further they are off (Cauchy's weights about the weighted median).
+    """
+    step = float(np.median(np.diff(time)))
+    ahead = _plane(level.apply([0.0, 1.0, 0.0]))
+    ahead = ahead / np.maximum(np.abs(ahead), 1e-9)
+    speed = _speed(level.apply(accel)[:, 2], step)
+    way, length = _integral(ahead * speed, step), _integral(speed, step)
+    walked, far = (np.diff(_at(waypoints.time, time, each)) for each in (way, length))
+    chord = np.diff(_plane(waypoints.position))
+    on_foot = (np.abs(chord) >= SHORTEST_LEG) & (np.abs(walked) > LEAST_STRAIGHT * far)
+    on_foot &= (np.abs(chord) <= FASTEST_LEG * np.diff(waypoints.time)) & (np.abs(walked) > 1e-3)
+    ratio = np.divide(chord, walked, out=np.ones_like(chord), where=on_foot)
+    if not on_foot.any():
+        return Legs(ahead * speed, way, ratio, on_foot, 0.0, np.inf)
+    turn, weight = np.angle(ratio[on_foot]), np.abs(chord[on_foot])
+    # The weighted median on a circle is one of the angles.
+    apart = np.abs(_wrapped(turn[:, None] - turn[None]))
+    yaw = float(turn[np.argmin((apart * weight[:, None]).sum(axis=0))])
+    for _ in range(10):
+        off = _wrapped(turn - yaw)
+        scale = max(float(np.median(np.abs(off))), np.radians(3.0))
+        share = weight / (1.0 + (off / scale) ** 2)
+        yaw += float((share * off).sum() / share.sum())
+    fits = on_foot & (np.abs(_wrapped(np.angle(ratio) - yaw)) <= MOST_TURN)
+    residual = float(np.degrees(np.median(np.abs(_wrapped(turn - yaw)))))
+    return Legs(ahead * speed, way, ratio, fits, yaw, residual)
+
+
+def _speed(vertical: Float[np.ndarray, " n"], step: float) -> Float[np.ndarray, " n"]:
+    """Speed over the walk's usual one, by the bounce of the vertical specific force (m/s²): an
+    inverted pendulum's grows with the square of the speed."""
+    fast = vertical - gaussian_filter1d(vertical, SWAY_SECONDS / step, mode="nearest")
+    bounce = np.sqrt(gaussian_filter1d(fast**2, BOUNCE_SECONDS / step, mode="nearest"))
+    walking = bounce > STEPPING
+    if not walking.any():
+        return np.zeros_like(bounce)
+    relative = np.minimum(bounce / np.median(bounce[walking]), 2.0)
+    return np.sqrt(relative) * np.clip(relative / STEPPING - 1.0, 0.0, 1.0)
+
+
+def _integral(values: np.ndarray, step: float) -> np.ndarray:
+    return np.concatenate([[0.0], np.cumsum(0.5 * step * (values[1:] + values[:-1]))])
+
+
+def _at(
+    stamps: Float[np.ndarray, " k"], time: Float[np.ndarray, " n"], values: np.ndarray
+) -> np.ndarray:
+    """Values along the plane, or real ones, at other stamps."""
+    return np.asarray(np.interp(stamps, time, values))
+
+
+def _plane(values: Float[np.ndarray, "n w"]) -> Complex[np.ndarray, " n"]:
+    return values[:, 0] + 1j * values[:, 1]
+
+
+def _space(values: Complex[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
+    return np.stack([values.real, values.imag, np.zeros(len(values))], axis=1)
+
+
+def _wrapped(angle: np.ndarray) -> np.ndarray:
+    """Angles (rad) in [−π, π)."""
+    return np.mod(angle + np.pi, 2.0 * np.pi) - np.pi

@@ -1,0 +1,136 @@
+"""Waypoints turned into poses: against computed walks whose truth is known, and taps that err."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gnio_jax.config import DataConfig, TrainConfig
+from gnio_jax.data import loading
+from gnio_jax.data.dataset import Refusal
+from gnio_jax.data.waypoints import levelled, with_poses
+from gnio_jax.data.windows import window_source
+from gnio_jax.numerics import rotations
+from gnio_jax.reporting import Lines
+from gnio_jax.training.task import read_split
+from gnio_jax.types import Waypoints
+from tests.support.surveyor import RATE, survey
+
+
+def off_truth(found, truth):
+    """(angle, position, velocity) errors where the poses are valid: degrees, m, m/s."""
+    valid = found.valid
+    error = rotations(found.orientation[valid]) * rotations(truth.orientation[valid]).inv()
+    flat = slice(None), slice(0, 2)
+    return (
+        np.degrees(error.magnitude()),
+        np.linalg.norm((found.position - truth.position)[valid][flat], axis=1),
+        np.linalg.norm((found.velocity - truth.velocity)[valid][flat], axis=1),
+    )
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_exact_taps_give_the_attitude_and_the_path(seed):
+    walk = survey(seed)
+    found = with_poses(walk.tapped(np.zeros(9)))
+    angle, place, speed = off_truth(found, walk.truth)
+    # The phone is aimed up to some degrees beside the path, and the yaw is off by as much.
+    assert np.median(angle) < 7.0 and angle.max() < 12.0
+    assert np.sqrt((place**2).mean()) < 0.2 and np.sqrt((speed**2).mean()) < 0.3
+    inside = (found.time >= walk.ends[0]) & (found.time <= walk.ends[-1])
+    np.testing.assert_array_equal(found.valid, inside)
+    assert np.isnan(found.position[~inside]).all() and found.waypoints is None
+    assert found.attributes["yaw_residual_degrees"] < 6.0
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_taps_a_second_early_or_late_move_positions_but_hardly_the_yaw(seed):
+    walk = survey(seed)
+    late = np.random.default_rng(seed).uniform(-1.0, 1.0, 9)
+    angle, place, speed = off_truth(with_poses(walk.tapped(late)), walk.truth)
+    assert np.median(angle) < 9.0
+    # As far as the walker comes in the second.
+    assert place.max() < 1.6 and np.sqrt((place**2).mean()) < 0.9
+    assert np.sqrt((speed**2).mean()) < 0.6
+
+
+def test_gravity_levels_a_gyro_that_drifts():
+    truth = survey(5).truth
+    biased = truth.gyro + np.array([0.01, -0.008, 0.0])  # 20° over the walk
+    attitude = levelled(biased, truth.accel, 1 / RATE)
+    up, known = (r.inv().apply([0.0, 0.0, 1.0]) for r in (attitude, rotations(truth.orientation)))
+    tilt = np.degrees(np.arccos(np.clip((up * known).sum(axis=1), -1.0, 1.0)))
+    assert np.median(tilt) < 1.5 and tilt.max() < 5.0
+
+
+def test_a_surveyor_who_pauses_is_not_thought_to_creep():
+    walk = survey(8, pause=6.0)
+    found = with_poses(walk.tapped(np.zeros(9)))
+    assert found.valid.mean() > 0.95
+    _, place, speed = off_truth(found, walk.truth)
+    # At a constant speed along the leg it would be 3 m.
+    assert place.max() < 1.0 and np.sqrt((speed**2).mean()) < 0.3
+
+
+def test_a_tap_again_where_the_surveyor_stands_is_no_leg():
+    walk = survey(6, pause=6.0)
+    ends = np.sort(np.concatenate([walk.ends, walk.ends[[3, 6]] - 6.0]))
+    tapped = walk._replace(ends=ends).tapped(np.zeros(11))
+    found = with_poses(tapped)
+    standing = (found.time > ends[3] + 0.05) & (found.time < ends[4] - 0.05)
+    assert standing.any() and not found.valid[standing].any()
+    angle, place, _ = off_truth(found, walk.truth)
+    assert np.median(angle) < 9.0 and place.max() < 0.8
+
+
+def test_waypoints_that_nobody_walks_between_are_not_valid():
+    walk = survey(7)
+    tapped = walk.tapped(np.zeros(9))
+    time, place = tapped.waypoints
+    # A tap that follows another after 0.2 s, 40 m away and back.
+    time, place = np.insert(time, 4, time[4] - 0.2), np.insert(place, 4, place[4] + 40.0, axis=0)
+    found = with_poses(tapped._replace(waypoints=Waypoints(time, place)))
+    near = (found.time > time[3] + 0.05) & (found.time < time[5] - 0.05)
+    assert not found.valid[near].any()
+    _, place, speed = off_truth(found, walk.truth)
+    assert place.max() < 1.0 and speed.max() < 2.0
+
+
+def test_samples_that_were_not_measured_have_no_pose():
+    walk = survey(1)
+    lost = (walk.truth.time > 5.0) & (walk.truth.time < 5.5)
+    found = with_poses(walk.tapped(np.zeros(9))._replace(imu_valid=~lost))
+    assert not found.valid[lost].any() and found.valid.sum() > 0.8 * len(found.valid)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda k, place: place[:, ::-1], "y axis is .*° off the median leg"),
+        (lambda k, place: place * 0.0, "walked 0 of its 8 legs"),
+        (lambda k, place: place * 10.0, "walked 0 of its 8 legs"),
+    ],
+)
+def test_a_walk_whose_legs_do_not_fit_the_phone_is_refused(change, words):
+    tapped = survey(2).tapped(np.zeros(9))
+    time, place = tapped.waypoints
+    broken = tapped._replace(waypoints=Waypoints(time, change(np.arange(9), place)))
+    with pytest.raises(Refusal, match=words) as caught:
+        with_poses(broken)
+    assert str(caught.value).startswith("survey 2: ")
+
+
+def test_training_cuts_windows_from_such_walks_and_leaves_out_the_others(monkeypatch, capsys):
+    good, bad = (survey(seed).tapped(np.zeros(9)) for seed in (0, 1))
+    time, place = bad.waypoints
+    bad = bad._replace(waypoints=Waypoints(time, 0.0 * place))
+    monkeypatch.setattr(loading, "read_split", lambda *_: iter([bad, good]))
+    config, samples = TrainConfig(data=DataConfig(rate=100.0)), {}
+    (read,) = read_split(config, "train", Lines(), 1, samples)
+    assert read.name == "survey 0" and [*samples] == ["survey 0"]
+    assert "warning: survey 1: somebody walked 0 of its 8 legs" in capsys.readouterr().err
+    source = window_source([read], config.data, 100)
+    assert len(source.start) > 30
+    # A second of walking, in the frame of each window.
+    far = np.linalg.norm(source.displacement[:, :2], axis=1) * 100 / config.data.window
+    assert 0.8 < np.median(far) < 1.5
