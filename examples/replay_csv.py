@@ -15,7 +15,6 @@ os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
 
 import jax
 import numpy as np
-import tyro
 
 from gnio_jax.commands import console, options
 from gnio_jax.errors import InputError
@@ -30,7 +29,7 @@ class Replay:
     run below runs/."""
     out: str | None = None
     """File of the trajectory; by default <recording>_trajectory.txt in the working folder."""
-    realtime: tyro.conf.FlagCreatePairsOff[bool] = False
+    realtime: bool = False
     """Push each sample at its own time, as if the recording happened now."""
     rest_seconds: float = 1.0
     """How long the device is still at the start, s."""

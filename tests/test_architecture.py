@@ -44,7 +44,6 @@ LIBRARIES = {
     "rich.progress": {"commands"},
     "safetensors": {"apps.packages"},
     "tensorboardX": {"training.run_folder"},
-    "tyro": {"commands", "config"},
 }
 """Libraries that only these rooms or modules import."""
 

@@ -35,7 +35,7 @@ SMALLER = {
     "docs/notebooks/learn_noise.py": {"SECONDS = 30": "SECONDS = 2", "STEPS = 150": "STEPS = 2"},
 }
 """Fewer samples and steps than on the page: page -> what stands there -> what runs."""
-HELP = {"--help", "--tyro-write-completion", "COMMAND"}
+HELP = {"--help", "--completion", "COMMAND"}
 """Words that leave with a text; COMMAND stands for any command."""
 NEW_FILES = {"gnio_jax/data/readers/mine.py", "tests/support/mine_files.py"}
 """What CONTRIBUTING asks a reader to write."""
@@ -206,7 +206,7 @@ def test_a_command_line_is_understood(line, monkeypatch):
         settings = understood(line.words)
     except InputError as error:
         # A sentence may leave out what the option or the command is about.
-        assert line.quoted and re.search("is missing|needs a value", str(error)), error
+        assert line.quoted and re.search("is missing|expected .*argument", str(error)), error
         return
     for option in ("config", "base"):
         name = getattr(settings, option, None)

@@ -9,12 +9,12 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-import tyro
 from rich.table import Table
 
 from gnio_jax.commands import console, options
+from gnio_jax.config.schema import UNNAMED
 from gnio_jax.errors import InputError
 from gnio_jax.files import write_text
 
@@ -26,7 +26,7 @@ class ListOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class _Dataset:
-    name: tyro.conf.Positional[str]
+    name: Annotated[str, UNNAMED]
     """Name of the dataset, csv for recordings of your own."""
     data_root: str | None = None
     """Folder of the dataset; by default $GNIO_DATA/NAME, then data/NAME."""
@@ -49,7 +49,7 @@ class CheckOptions(_Dataset):
 class ConvertOptions(_Dataset):
     """What `gnio data convert` is asked for."""
 
-    out: tyro.conf.Positional[Path]
+    out: Annotated[Path, UNNAMED]
     """Folder for the result."""
     rate: float | None = None
     """Rate of the result, Hz; by default each recording's own."""

@@ -9,7 +9,6 @@ import platform
 from dataclasses import dataclass
 from pathlib import Path
 
-import tyro
 from rich.table import Table
 
 from gnio_jax.commands import console, options
@@ -22,7 +21,7 @@ PACKAGES = ("jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "numpy", "scip
 class DoctorOptions:
     """What `gnio doctor` is asked for."""
 
-    json: tyro.conf.FlagCreatePairsOff[bool] = False
+    json: bool = False
     """Print it as JSON."""
 
 

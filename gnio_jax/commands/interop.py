@@ -4,20 +4,20 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-
-import tyro
+from typing import Annotated
 
 from gnio_jax.commands import options
 from gnio_jax.config import DataConfig
+from gnio_jax.config.schema import UNNAMED
 
 
 @dataclass(frozen=True)
 class InteropOptions:
     """What `gnio interop` is asked for."""
 
-    checkpoint: tyro.conf.Positional[Path]
+    checkpoint: Annotated[Path, UNNAMED]
     """File of the weights."""
-    workdir: tyro.conf.Positional[Path]
+    workdir: Annotated[Path, UNNAMED]
     """Folder of the run, which is made."""
     rate: float = 200.0
     """Samples per second that the network was trained with, Hz (imu_freq in TLIO's

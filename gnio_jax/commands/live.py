@@ -13,13 +13,13 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
-import tyro
 
 from gnio_jax.commands import console, options
 from gnio_jax.config import ImportOptions
+from gnio_jax.config.schema import UNNAMED
 from gnio_jax.errors import InputError
 from gnio_jax.files import check_writable
 
@@ -32,7 +32,7 @@ DRAWN_EVERY = 0.125
 class LiveOptions:
     """What `gnio live` is asked for."""
 
-    source: tyro.conf.Positional[str] = "-"
+    source: Annotated[str, UNNAMED] = "-"
     """- for standard input; udp:PORT from this machine, udp:0.0.0.0:PORT from any; a recording."""
     weights: str | None = None
     """Name, package or run folder; by default the network that comes with gnio-jax, else the newest

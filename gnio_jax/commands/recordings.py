@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-
-import tyro
+from typing import Annotated
 
 from gnio_jax.commands import console, options
 from gnio_jax.config import ImportOptions
+from gnio_jax.config.schema import UNNAMED
 from gnio_jax.errors import InputError
 
 HDF5 = (".h5", ".hdf5")
@@ -18,7 +18,7 @@ HDF5 = (".h5", ".hdf5")
 class ImportFile:
     """What `gnio data import` is asked for."""
 
-    file: tyro.conf.Positional[Path]
+    file: Annotated[Path, UNNAMED]
     """The recording: a file or folder; of two CSVs the gyro's."""
     out: Path
     """HDF5 file to write, NAME.h5."""
@@ -26,16 +26,16 @@ class ImportFile:
     """Rate of the result, Hz; by default that of the faster sensor."""
     name: str | None = None
     """Name of the sequence; by default that of the file OUT."""
-    recording: tyro.conf.OmitArgPrefixes[ImportOptions] = ImportOptions()  # noqa: RUF009 - it is frozen
+    recording: Annotated[ImportOptions, UNNAMED] = ImportOptions()  # noqa: RUF009 - it is frozen
 
 
 @dataclass(frozen=True)
 class ExportFile:
     """What `gnio data export` is asked for."""
 
-    trajectory: tyro.conf.Positional[Path]
+    trajectory: Annotated[Path, UNNAMED]
     """File in TUM format."""
-    out: tyro.conf.Positional[Path]
+    out: Annotated[Path, UNNAMED]
     """File to write; its ending tells the format: .mcap, .csv or .tum."""
 
 

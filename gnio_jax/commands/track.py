@@ -6,12 +6,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import tyro
 from rich import box
 from rich.table import Table
 
 from gnio_jax.commands import console, options
 from gnio_jax.config import ImportOptions
+from gnio_jax.config.schema import UNNAMED
 from gnio_jax.files import file_stem
 
 ERRORS = ("ate", "ate_2d", "rte_60s", "rpe_1s", "yaw_rmse", "path_length_ratio")
@@ -22,18 +22,18 @@ ERRORS = ("ate", "ate_2d", "rte_60s", "rpe_1s", "yaw_rmse", "path_length_ratio")
 class TrackOptions:
     """What `gnio track` is asked for."""
 
-    file: tyro.conf.Positional[Path]
+    file: Annotated[Path, UNNAMED]
     """The recording: a file or folder; of two CSVs the gyro's."""
     weights: str | None = None
     """Name, package or run folder; by default the network that comes with gnio-jax, else the newest
     run below runs/."""
     out: Path | None = None
     """Folder for the results; by default tracks/ and the recording's name."""
-    format: Annotated[tuple[Literal["csv", "mcap"], ...], tyro.conf.arg(metavar="{csv,mcap}")] = ()
+    format: tuple[Literal["csv", "mcap"], ...] = ()
     """Further formats of the trajectory, one or both."""
     rerun: Path | None = None
     """File to write for the viewer Rerun, NAME.rrd: paths, covariances, IMU, gate."""
-    recording: tyro.conf.OmitArgPrefixes[ImportOptions] = ImportOptions()  # noqa: RUF009 - it is frozen
+    recording: Annotated[ImportOptions, UNNAMED] = ImportOptions()  # noqa: RUF009 - it is frozen
 
 
 def track(asked: TrackOptions, call: options.Call) -> None:

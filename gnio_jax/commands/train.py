@@ -7,11 +7,10 @@ import sys
 from dataclasses import dataclass
 from typing import Annotated
 
-import tyro
-
 from gnio_jax import config as configuration
 from gnio_jax.commands import console, options
 from gnio_jax.config import ConsideredStd, TrainConfig
+from gnio_jax.config.schema import Words
 from gnio_jax.cores import usable_cores
 
 
@@ -19,20 +18,18 @@ from gnio_jax.cores import usable_cores
 class TrainOptions(TrainConfig):
     """What `gnio train` is asked for: an experiment, and where its settings come from."""
 
-    config: Annotated[str | None, tyro.conf.arg(metavar="FILE")] = None
+    config: Annotated[str | None, Words("FILE")] = None
     """YAML file of settings, or the name of one that comes with the package."""
-    set: Annotated[
-        tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="SECTION.FIELD=VALUE")
-    ] = ()
+    set: Annotated[tuple[str, ...], Words("SECTION.FIELD=VALUE", repeated=True)] = ()
     """A setting by its name in YAML; it may be given several times."""
-    resume: tyro.conf.FlagCreatePairsOff[bool] = False
+    resume: bool = False
     """Continue the run in the work folder from its latest checkpoint."""
     seeds: tuple[int, ...] = ()
     """Seeds to train one after the other, in the place of --seed: WORKDIR_s0, WORKDIR_s1, ..."""
     devices: int | None = None
     """Devices of each process that share a batch; by default all of its GPUs, or the one that a CPU
     is."""
-    distributed: Annotated[str | None, tyro.conf.arg(metavar="HOST:PORT,PROCESSES,ID")] = None
+    distributed: Annotated[str | None, Words("HOST:PORT,PROCESSES,ID")] = None
     """Where process 0 listens, how many processes there are, and the number of this one; Slurm,
     Open MPI and Kubernetes need nothing."""
 

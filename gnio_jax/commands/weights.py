@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-import tyro
 from rich import box
 from rich.table import Table
 
 from gnio_jax.commands import console, options
+from gnio_jax.config.schema import UNNAMED
 from gnio_jax.errors import InputError
 
 
@@ -18,7 +18,7 @@ from gnio_jax.errors import InputError
 class WeightsOptions:
     """What `gnio weights` is asked for."""
 
-    name: tyro.conf.Positional[str | None] = None
+    name: Annotated[str | None, UNNAMED] = None
     """Name, folder or zip of a package; by default all are listed."""
     out: Path | None = None
     """Folder for a run of the package; by default its model card is shown."""
@@ -28,7 +28,7 @@ class WeightsOptions:
 class PublishOptions:
     """What `gnio publish` is asked for."""
 
-    run: tyro.conf.Positional[Path]
+    run: Annotated[Path, UNNAMED]
     """Folder of the run; its best checkpoint is taken."""
     out: Path
     """Folder to write, or NAME.zip."""
@@ -36,7 +36,7 @@ class PublishOptions:
     """What it was trained on: recordings, devices, people, carrying positions."""
     license: str
     """Under which the data may be used and the weights passed on."""
-    fails: Annotated[tuple[str, ...], tyro.conf.arg(metavar="TEXT ...")] = ()
+    fails: tuple[str, ...] = ()
     """Where it is known to fail, a sentence each."""
     name: str | None = None
     """Name of the package; by default that of OUT."""
@@ -46,7 +46,7 @@ class PublishOptions:
 class ExportOptions:
     """What `gnio export` is asked for."""
 
-    run: tyro.conf.Positional[str]
+    run: Annotated[str, UNNAMED]
     """Folder of the run, a package or its name."""
     out: Path | None = None
     """Folder to write; by default exports/NAME_onnx, with the name of RUN."""

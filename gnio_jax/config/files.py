@@ -35,8 +35,8 @@ _SPELLING = {
     float: "a number",
     int: "a whole number",
     str: "text",
+    Path: "text",
     bool: "true or false",
-    type(None): "null",
 }
 
 # The experiments and the runs
@@ -161,25 +161,19 @@ def assign(config: Section, assignments: Sequence[str]) -> Section:
 
 def value_from_words(hint: Any, words: Sequence[str], name: str) -> Any:
     """The value of a field of the type `hint` from the words of a command line behind the option
-    `name`, checked as the values of a file are.
+    `name`: a word for each value of a tuple, else one. Words are texts as they are, and numbers as
+    YAML writes them; null is none.
 
     Raises `InputError` that names the option.
     """
-    alternatives = _alternatives(hint)
-    several = [kind for kind in alternatives if typing.get_origin(kind) is tuple]
-    wanted = _alternatives(typing.get_args(several[0])[0]) if several else alternatives
-    is_text = not {Any, float, int, bool} & set(wanted)
-
-    def value(word: str) -> Any:
-        if is_text:
-            return None if word == "null" and type(None) in wanted else word
-        return _yaml(word, name)
-
-    if several:
-        return _value(hint, [value(word) for word in words], Place(name))
-    if len(words) != 1:
-        raise InputError(name, f"needs one value, which must be {_spell(hint)}")
-    return _value(hint, value(words[0]), Place(name))
+    kind, may_be_none = kind_of(hint)
+    several = typing.get_origin(kind) is tuple
+    item = kind_of(typing.get_args(kind)[0])[0] if several else kind
+    if item in (str, Path) or typing.get_origin(item) is Literal:
+        content = [None if word == "null" and may_be_none else word for word in words]
+    else:
+        content = [_yaml(word, name) for word in words]
+    return checked_value(hint, content if several else content[0], Place(name))
 
 
 def _section(base: Any, content: Any, place: Place) -> Any:
@@ -187,7 +181,7 @@ def _section(base: Any, content: Any, place: Place) -> Any:
     if not isinstance(content, dict):
         problem = f"{place.section or 'the file'} must be a mapping of fields"
         raise InputError(place.source, f"{problem}, found {_shown(content)}")
-    hints = _hints(base)
+    hints = typing.get_type_hints(type(base), include_extras=True)
     for key in content:
         if key not in hints:
             hint = did_you_mean(str(key), hints, lambda name: place.below(name).section)
@@ -195,91 +189,77 @@ def _section(base: Any, content: Any, place: Place) -> Any:
             known = f"known fields: {', '.join(hints)}"
             raise InputError(place.source, f"unknown field '{name}'", hint.strip() or known)
     fields = {
-        key: _value(hints[key], value, place.below(key), getattr(base, key))
+        key: checked_value(hints[key], value, place.below(key), getattr(base, key))
         for key, value in content.items()
     }
-    if dataclasses.is_dataclass(base):
-        return dataclasses.replace(base, **fields)
-    return base._replace(**fields)
+    if isinstance(base, tuple):
+        return base._replace(**fields)  # type: ignore
+    return dataclasses.replace(base, **fields)
 
 
-def _value(hint: Any, content: Any, place: Place, base: Any = None) -> Any:
-    """The value of a field, if it has the field's type; a section takes the rest from `base`."""
-    alternatives = _alternatives(hint)
-    if content is None and type(None) in alternatives:
+def checked_value(hint: Any, content: Any, place: Place, base: Any = None) -> Any:
+    """The value of a field of the type `hint`, if it has this type and is within its bounds; a
+    section takes what is not in `content` from `base`. Raises `InputError`."""
+    kind, may_be_none = kind_of(hint)
+    origin, members = typing.get_origin(kind), typing.get_args(kind)
+    if content is None and may_be_none:
         return None
-    for kind in alternatives:
-        if _is_section(kind):
-            return _section(kind() if base is None else base, content, place)
-        if typing.get_origin(kind) is tuple:
-            return _tuple(typing.get_args(kind), content, place)
-        if typing.get_origin(kind) is Literal:
-            if isinstance(content, str) and content in typing.get_args(kind):
-                return content
-        elif kind in (float, Any) and type(content) in (int, float):
-            try:
-                return float(content)
-            except OverflowError:
-                _refuse(place, "is larger than any number of floating point")
-        elif type(content) is kind:
-            return content
-    _refuse(place, f"must be {_spell(hint)}, found {_shown(content)}")
-
-
-def _tuple(members: tuple[Any, ...], content: Any, place: Place) -> tuple:
-    """The values of a list: as many as there are `members`, or any number of the first."""
-    if not isinstance(content, list):
-        _refuse(place, f"must be a list, found {_shown(content)}")
-    if members[1:] != (Ellipsis,) and len(content) != len(members):
-        _refuse(place, f"must be a list of {len(members)} values, found {_shown(content)}")
-    return tuple(_value(members[0], each, place) for each in content)
-
-
-def _refuse(place: Place, problem: str) -> typing.NoReturn:
-    name = f"field '{place.section}' " if place.section else ""
-    raise InputError(place.source, name + problem)
+    if is_section(kind):
+        return _section(kind() if base is None else base, content, place)
+    if origin is tuple and isinstance(content, list | tuple):
+        if ... not in members and len(content) != len(members):
+            place.refuse("", f"must be a list of {len(members)} values, found {_shown(content)}")
+        value = tuple(checked_value(members[0], each, place) for each in content)
+    elif kind in (float, Any) and type(content) in (int, float):
+        try:
+            value = float(content)
+        except OverflowError:
+            place.refuse("", "is larger than any number of floating point")
+    elif kind is Path and isinstance(content, str):
+        value = Path(content)
+    elif content in members if origin is Literal else type(content) is kind:
+        value = content
+    else:
+        or_null = " or null" if may_be_none else ""
+        place.refuse("", f"must be {_spelled(kind)}{or_null}, found {_shown(content)}")
+    for bound in bounds(hint):
+        for number in value if isinstance(value, tuple) else (value,):
+            if not bound.holds(number):
+                place.refuse("", f"{bound.problem}, found {_shown(value)}")
+    return value
 
 
 def _shown(value: Any) -> str:
     """A value in a message, however long or deep it is."""
-    return reprlib.repr(value)
+    return reprlib.repr(list(value) if isinstance(value, tuple) else value)
 
 
-def _spell(hint: Any) -> str:
+def _spelled(kind: Any) -> str:
     """A type in words."""
-
-    def spell(kind: Any) -> str:
-        members = typing.get_args(kind)
-        if typing.get_origin(kind) is Literal:
-            return "one of " + ", ".join(members)
-        return f"a list of {spell(members[0])}" if members else _SPELLING[kind]
-
-    return " or ".join(map(spell, _alternatives(hint)))
+    origin, members = typing.get_origin(kind), typing.get_args(kind)
+    if origin is tuple:
+        return "a list"
+    return f"one of {', '.join(members)}" if origin is Literal else _SPELLING[kind]
 
 
 # Types of fields
 # ------------------------------------------------------------------------------------------------
 
 
-def _is_section(kind: Any) -> bool:
+def kind_of(hint: Any) -> tuple[Any, bool]:
+    """The type of a field's value without what is annotated to it, and whether it may be None."""
+    if typing.get_origin(hint) is Annotated:
+        return kind_of(typing.get_args(hint)[0])
+    # `Literal[...] | None` is a typing.Union, `int | None` is a types.UnionType.
+    if typing.get_origin(hint) in (types.UnionType, typing.Union):
+        first, _ = typing.get_args(hint)  # the other one is None
+        return kind_of(first)[0], True
+    return hint, False
+
+
+def is_section(kind: Any) -> bool:
     """Whether fields of this type are sections: dataclasses, or the tuples of the filter."""
     return dataclasses.is_dataclass(kind) or hasattr(kind, "_fields")
-
-
-def _hints(section: Any) -> dict[str, Any]:
-    """The fields of a section and their types."""
-    kind = section if isinstance(section, type) else type(section)
-    return typing.get_type_hints(kind, include_extras=True)
-
-
-def _alternatives(hint: Any) -> list[Any]:
-    """The types that a value may have, without what is annotated to them."""
-    if typing.get_origin(hint) is Annotated:
-        return _alternatives(typing.get_args(hint)[0])
-    # `Literal[...] | None` is a typing.Union, `int | None` is a types.UnionType.
-    if isinstance(hint, types.UnionType) or typing.get_origin(hint) is typing.Union:
-        return [kind for member in typing.get_args(hint) for kind in _alternatives(member)]
-    return [hint]
 
 
 def bounds(hint: Any) -> Iterator[Bound]:
@@ -291,40 +271,19 @@ def bounds(hint: Any) -> Iterator[Bound]:
             yield from bounds(argument)
 
 
-def flat(section: Any) -> dict[str, Any]:
-    """The settings of a section by names such as noise.gyro_density."""
-    return {name: value for name, _, value in named(section)}
-
-
 def named(section: Any, prefix: str = "") -> Iterator[tuple[str, Any, Any]]:
-    """Name, type and value of each setting of a section."""
-    for field, hint in _hints(section).items():
+    """Name, such as noise.gyro_density, type and value of each setting of a section."""
+    for field, hint in typing.get_type_hints(type(section), include_extras=True).items():
         name, value = prefix + field, getattr(section, field)
-        if _is_section(type(value)):
+        if is_section(type(value)):
             yield from named(value, f"{name}.")
         else:
             yield name, hint, value
 
 
-# Checks
-# ------------------------------------------------------------------------------------------------
-
-
-def checked_value(hint: Any, value: Any, place: Place) -> Any:
-    """The value of a field of the type `hint`, if it has this type and is within its bounds.
-
-    Raises `InputError`.
-    """
-    value = _value(hint, value, place)
-    _check_bounds(hint, value, place)
-    return value
-
-
-def _check_bounds(hint: Any, value: Any, place: Place) -> None:
-    for bound in bounds(hint):
-        for number in value if isinstance(value, tuple) else (value,):
-            if number is not None and not bound.holds(number):
-                _refuse(place, f"{bound.problem}, found {_shown(value)}")
+def flat(section: Any) -> dict[str, Any]:
+    """The settings of a section by names such as noise.gyro_density."""
+    return {name: value for name, _, value in named(section)}
 
 
 def validate(config: TrainConfig, source: str = "config") -> TrainConfig:
@@ -334,7 +293,7 @@ def validate(config: TrainConfig, source: str = "config") -> TrainConfig:
     """
     place = Place(source)
     for name, hint, value in named(config):
-        _check_bounds(hint, value, place.below(name))
+        checked_value(hint, value, place.below(name))
     config.data.check(place.below("data"))
     config.augment.check(place.below("augment"))
     config.check(place)
@@ -357,8 +316,8 @@ def text(config: TrainConfig) -> str:
 
 def plain(value: Any) -> Any:
     """Settings as the dictionaries, lists and numbers that YAML and JSON know."""
-    if _is_section(type(value)):
-        return {name: plain(getattr(value, name)) for name in _hints(value)}
+    if is_section(type(value)):
+        return {name: plain(getattr(value, name)) for name in typing.get_type_hints(type(value))}
     return list(value) if isinstance(value, tuple) else value
 
 
@@ -397,21 +356,14 @@ class _Dumper(yaml.SafeDumper):
 
 
 _WHOLE = "(0|[1-9][0-9]*)"
-_RESOLVERS = (
-    ("null", r"^(null|Null|NULL|~|)$", ["n", "N", "~", ""]),
-    ("bool", r"^(true|True|TRUE|false|False|FALSE)$", list("tTfF")),
-    ("int", rf"^[-+]?{_WHOLE}$", list("-+0123456789")),
-    (
-        "float",
-        rf"^[-+]?({_WHOLE}?\.[0-9]+|{_WHOLE}\.?)([eE][-+]?[0-9]+)?$",
-        list("-+.0123456789"),
-    ),
-)
-"""Which plain words are not text, in order: tag, form, first letters."""
-
-for _kind in (_Loader, _Dumper):
-    for _tag, _form, _letters in _RESOLVERS:
-        _kind.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(_form), _letters)
+for _tag, _form in {
+    "null": "null|Null|NULL|~|",
+    "bool": "true|True|TRUE|false|False|FALSE",
+    "int": f"[-+]?{_WHOLE}",
+    "float": rf"[-+]?({_WHOLE}?\.[0-9]+|{_WHOLE}\.?)([eE][-+]?[0-9]+)?",
+}.items():  # which plain words are not text; the first that fits
+    for _kind in (_Loader, _Dumper):
+        _kind.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(f"^({_form})$"), None)
 
 
 def _yaml(content: str, source: str) -> Any:
@@ -459,7 +411,7 @@ _GONE = {
 
 def _is_of_earlier_version(fields: dict[str, Any]) -> bool:
     """Whether it is the config.yaml that an earlier version left: a whole one."""
-    sections = [name for name, value in vars(TrainConfig()).items() if _is_section(type(value))]
+    sections = [name for name, value in vars(TrainConfig()).items() if is_section(type(value))]
     whole = all(isinstance(fields.get(name), dict) for name in sections)
     return whole and "checkpoint_every_seconds" in fields
 
@@ -490,6 +442,6 @@ def _of_earlier_version(old: dict[str, Any], source: str) -> dict[str, Any]:
         path = _MOVED.get(name.removesuffix("_degrees")) or name
         section, _, field = path.rpartition(".")
         if name.endswith("_degrees"):
-            value = _value(float, value, Place(source, f"filter.{name}")) * (math.pi / 180)
+            value = checked_value(float, value, Place(source, f"filter.{name}")) * (math.pi / 180)
         (sections[section] if section else sections)[field] = value
     return new

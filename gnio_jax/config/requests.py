@@ -7,9 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-import tyro
-
-from gnio_jax.config.schema import FILE_ONLY, FilterSettings
+from gnio_jax.config.schema import FILE_ONLY, FilterSettings, Words
 
 Table = Literal[
     "complexity",
@@ -67,9 +65,7 @@ class EvaluateConfig:
     """File to write for the viewer Rerun, NAME.rrd: paths, covariances, IMU, gate."""
     filter: Annotated[FilterSettings | None, FILE_ONLY] = None
     """Noise and start of the filter; by default the run's own."""
-    set: Annotated[
-        tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="filter.FIELD=VALUE")
-    ] = ()
+    set: Annotated[tuple[str, ...], Words("filter.FIELD=VALUE", repeated=True)] = ()
     """A setting of the filter by its name in YAML; it may be given several times."""
 
 
@@ -105,7 +101,7 @@ class CalibrateConfig:
 class TablesConfig:
     """What `gnio tables` is asked for."""
 
-    table: tyro.conf.Positional[Annotated[Table, tyro.conf.arg(metavar="TABLE")]]
+    table: Annotated[Table, Words("TABLE", named=False)]
     """complexity, comparison, components, gates, bank-size, trajectories or standing."""
     base: str = "quickstart"
     """Config whose recordings, budget and augmentation every row has (not for complexity)."""
@@ -134,7 +130,7 @@ class TablesConfig:
 class CompareConfig:
     """What `gnio compare` is asked for."""
 
-    rows: tyro.conf.Positional[Annotated[tuple[str, ...], tyro.conf.arg(metavar="RUNS")]]
+    rows: Annotated[tuple[str, ...], Words("RUNS", named=False)]
     """Runs, the one to compare with first. A name without its seed stands for all seeds: runs/gnio
     for runs/gnio_s0, runs/gnio_s1, ... The folder of an evaluation stands for itself."""
     split: str = "test"
@@ -157,7 +153,7 @@ class ImportOptions:
     """What a recording does not say of itself. By default its format or its header says it, or it
     is detected; what is ambiguous is refused."""
 
-    columns: Annotated[tuple[str, ...], tyro.conf.arg(metavar="OURS=THEIRS ...")] = ()
+    columns: Annotated[tuple[str, ...], Words("OURS=THEIRS")] = ()
     """Of a CSV, our name and the file's of each column that has another: time=stamp gyro_x=wx ...
     Ours are time, gyro_x..z, accel_x..z, and accel_time if the accelerometer's time is another
     column. "a+b" is the sum of two columns (gravity and user acceleration). Without a header, the

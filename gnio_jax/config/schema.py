@@ -26,8 +26,9 @@ class Place(NamedTuple):
         return Place(self.source, f"{self.section}.{name}" if self.section else name)
 
     def refuse(self, field: str, problem: str, remedy: str = "") -> NoReturn:
-        """Raise the `InputError` of a field of this section."""
-        raise InputError(self.source, f"field '{self.below(field).section}' {problem}", remedy)
+        """Raise the `InputError` of a field of this section; of the place itself if it is empty."""
+        name = self.below(field).section if field else self.section
+        raise InputError(self.source, f"field '{name}' {problem}" if name else problem, remedy)
 
 
 class Bound(NamedTuple):
@@ -39,8 +40,20 @@ class Bound(NamedTuple):
     """How the message goes on after the field's name."""
 
 
+class Words(NamedTuple):
+    """How the words of a command line give a field, where they are not --name VALUE."""
+
+    metavar: str = ""
+    """What stands for the value in the help, where its type would say too little."""
+    named: bool = True
+    """Without its name, as in gnio track FILE; of a section, its fields without the section's."""
+    repeated: bool = False
+    """A list that is given one by one: --set a=1 --set b=2."""
+
+
 FILE_ONLY = "file only"
 """Of a field that is no option of a command line; --set reaches it."""
+UNNAMED = Words(named=False)
 Number = Any
 """A float in a file. Inside a JAX program it may be an array, so type checkers take anything."""
 
@@ -370,7 +383,7 @@ class ThroughFilter:
     section `optim` counts segments of recordings instead of windows; `loss` is for windows alone,
     and so is `augment` but for its `yaw`."""
 
-    learn: tuple[Part, ...] = ()
+    learn: Annotated[tuple[Part, ...], Words("PART")] = ()
     """Parts that learn; none: the network is trained on windows. noise: the filter's densities and
     bias walks; measurement: the factors of the network's covariance and the correlation of its
     errors; start: the standard deviations at the start; uncertainty, head, encoder: the network's;

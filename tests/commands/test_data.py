@@ -535,7 +535,7 @@ OUT, HEADS = ["--out", "x.h5"], ["--data-root", "heads"]
         ),
         (
             ["convert", "tlio", "x", "--rate"],
-            "--rate: needs one value, which must be a number or null",
+            "--rate: expected one argument",
         ),
         (
             ["convert", "tlio", "x", *HEADS, "--split", "tset"],
@@ -555,7 +555,7 @@ OUT, HEADS = ["--out", "x.h5"], ["--data-root", "heads"]
             "ours: holds another conversion (dataset tlio, rate 50.0); choose another folder",
         ),
         (["import", *OUT], "FILE: is missing"),
-        (["import", "walk.csv"], "--out: is missing; give --out OUT"),
+        (["import", "walk.csv"], "--out: is missing; give --out"),
         (["import", "none.csv", *OUT], "none.csv: cannot be read (No such file or directory)"),
         (
             ["import", "walk.csv", "--out", "x.csv"],

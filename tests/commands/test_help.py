@@ -1,12 +1,11 @@
 """Every help explains all options, ends with examples that are understood, and nobody is asked for
 too many."""
 
-import dataclasses
 import re
 import shlex
+import subprocess
 
 import pytest
-import tyro
 
 from gnio_jax import config
 from gnio_jax.commands import options
@@ -30,8 +29,8 @@ def plain(text):
 
 
 def joined(text):
-    """The words of a help text, without its boxes."""
-    return " ".join(re.sub("[│╭╮╰╯─]", " ", text).split())
+    """The words of a help text, in one line. A word may be broken at its hyphen."""
+    return " ".join(re.sub(r"-\n +", "-", text).split())
 
 
 @pytest.fixture(autouse=True)
@@ -58,14 +57,12 @@ def test_help_ends_with_examples_that_are_understood(words, capsys):
     ("words", "command"), list(commands()), ids=[" ".join(w) for w, _ in commands()]
 )
 def test_help_explains_every_option(words, command, capsys):
-    kind, text = options.options_type(command), shown(capsys, *words, "-H")
-    for option in options.options_of(kind):
-        assert re.search(rf"[ \[]{re.escape(option.name)}[ ,\]\n]", text), option.name
+    text = shown(capsys, *words, "-H")
     assert "None" not in text  # what is not given is told in words
-    for field, hint, markers in options._fields(kind):
-        if tyro.conf.Suppress not in markers and not dataclasses.is_dataclass(hint):
-            meaning = options._comments(kind)[field.name]
-            assert " ".join(meaning.split()[:6]) in joined(text), field.name
+    for option in options.options_of(options.options_type(command)):
+        for name in filter(None, (option.name, option.negation)):
+            assert re.search(rf"[ \[]{re.escape(name)}[ ,\]\n]", text), name
+        assert options.comment(option) in joined(text), option.name
 
 
 def test_help_of_the_overviews_names_every_command(capsys):
@@ -82,10 +79,26 @@ def test_help_of_train_names_the_configs(capsys):
     assert "--optim.epochs INT Passes over the training windows. (default: 200)" in text
 
 
+def test_bash_completes_commands_and_options(capsys):
+    run("--completion")
+    script = capsys.readouterr().out
+    for typed, completed in (
+        (["tr"], ["track", "train"]),
+        (["data", "ch"], ["check"]),
+        (["data", "check", "oxiod", "--p"], ["--plots"]),
+        (["train", "--augment.no"], ["--augment.no-yaw", "--augment.noise"]),
+        (["doctor", "runs/"], []),
+    ):
+        words = f"COMP_WORDS=({shlex.join(['gnio', *typed])}); COMP_CWORD={len(typed)}; _gnio"
+        shell = ["bash", "-c", f'{script}\n{words}; echo "${{COMPREPLY[@]}}"']
+        shown = subprocess.run(shell, capture_output=True, text=True, timeout=60)
+        assert sorted(shown.stdout.split()) == completed and shown.stderr == ""
+
+
 def test_nobody_is_asked_for_too_much():
     counts = {
         words: sum(
-            option.name.startswith("--") and "no-" not in option.name
+            option.name.startswith("--")
             for option in options.options_of(options.options_type(command))
         )
         for words, command in commands()

@@ -56,13 +56,13 @@ def mistake(monkeypatch, capsys, tmp_path, *arguments):
         ),
         (["--config", ""], ".: cannot be read"),
         (["--devices", "0"], "--devices: must be at least 1, found 0"),
-        (["--seeds"], "--seeds: names no seed"),
+        (["--seeds"], "--seeds: expected at least one"),
         (["--model.name", "gnoi"], "model 'gnoi': unknown; did you mean 'gnio'?"),
         (
             ["--model.name", "ctin", "--model.width", "90"],
             "model 'ctin': width must be even and a multiple of the 8 heads, found 90",
         ),
-        (["--data.rate", "0"], "field 'data.rate' must be positive"),
+        (["--data.rate", "0"], "--data.rate: must be positive"),
         (["--data.stride-seconds", "0.3"], "field 'data.stride_seconds' must divide the window"),
         (["--data.context-seconds", "0.25"], "field 'data.stride_seconds' must divide the context"),
         (

@@ -206,7 +206,7 @@ def test_words_of_a_command_line_are_values(hint, words, value):
     ("hint", "words", "problem"),
     [
         (int, ["3.5"], "--x: must be a whole number, found 3.5"),
-        (int, [], "--x: needs one value, which must be a whole number"),
+        (int, ["0x10"], "--x: must be a whole number, found '0x10'"),
         (float, [".inf"], "--x: must be a number, found '.inf'"),
         (tuple[int, ...], ["1", "a"], "--x: must be a whole number, found 'a'"),
     ],
