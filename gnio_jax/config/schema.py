@@ -164,9 +164,9 @@ class AugmentConfig:
     low_pass_share: Probability = 0.0
     """Share of the windows of which both sensors pass a random low-pass, drawn anew for every
     window: a phone's bandwidth must not tell the network whose walk it sees (ours, e.g. 0.5)."""
-    low_pass_hertz: tuple[Positive, Positive] = (4.0, 25.0)
+    low_pass_hertz: Annotated[tuple[Positive, Positive], FILE_ONLY] = (4.0, 25.0)
     """Lowest and highest cut-off of that low-pass, a Butterworth of order 1 to 3, Hz."""
-    scale: tuple[Probability, Probability] = (0.0, 0.0)
+    scale: Annotated[tuple[Probability, Probability], FILE_ONLY] = (0.0, 0.0)
     """Half-widths of a window's uniform scale errors of gyro and accelerometer (ours)."""
 
     def check(self, at: Place) -> None:
@@ -250,7 +250,7 @@ class OptimConfig:
     """Windows per step."""
     learning_rate: Positive = 1e-4
     """Peak learning rate, reached after the warm-up."""
-    start_learning_rate: NonNegative = 1e-6
+    start_learning_rate: Annotated[NonNegative, FILE_ONLY] = 1e-6
     """Learning rate at the first step."""
     warmup_epochs: NonNegative = 5.0
     """Epochs of linear warm-up; a run shorter than twice this warms up for its first half."""
