@@ -20,7 +20,10 @@ from gnio_jax.evaluation.statistics import Cell
 from gnio_jax.files import with_ending
 from gnio_jax.reporting import Lines, Reporter
 
-USUAL = ("ate", "rpe_1s", "yaw_rmse", "path_length_ratio", "nis", "nees")
+USUAL = (
+    *("ate", "rpe_1s", "yaw_rmse", "path_length_ratio"),
+    *("leg_ratio", "leg_error", "waypoint_rms", "nis", "nees"),
+)
 """Metrics that are compared where none are named."""
 HEADER = ("metric", "row", "mean", "difference (95 %)", "better in")
 SUMMED = "integrate"

@@ -42,7 +42,7 @@ from gnio_jax.filtering.settings import FilterSetup
 from gnio_jax.models import Network
 from gnio_jax.numerics import filled_up, finite_rows, quaternion_from_matrix, yaw_rotation
 from gnio_jax.reporting import Progress, silent
-from gnio_jax.types import Array
+from gnio_jax.types import Array, Waypoints
 
 PERFECT_STD = 0.01
 """Standard deviation of the true displacements that a `perfect` filter is given, m per axis."""
@@ -71,6 +71,8 @@ class Estimate(NamedTuple):
     """Standard deviation of the filter's error in θ, v, p, b_g, b_a."""
     notes: tuple[str, ...] = ()
     """What a reader of the result should know."""
+    waypoints: Waypoints | None = None
+    """The reference of a sequence without poses, in a frame of their own."""
 
 
 def estimate(
@@ -110,7 +112,7 @@ def never_moves(estimates: list[Estimate]) -> list[Estimate]:
     for each in estimates:
         time, *poses = each.trajectory
         path = Trajectory(time, *(np.repeat(part[:1], len(part), 0) for part in poses))
-        still.append(Estimate(each.name, path, each.reference))
+        still.append(Estimate(each.name, path, each.reference, waypoints=each.waypoints))
     return still
 
 
@@ -124,12 +126,16 @@ def perfect(ekf: FilterSetup) -> FilterSetup:
 
 def in_one_frame(estimate: Estimate, alignment: Alignment | None = "origin") -> Estimate:
     """Estimate and reference in one frame, to be looked at together: the estimate with its
-    covariance aligned, or without an `alignment` the reference moved so that both start alike.
-    Unchanged where that is impossible."""
-    if alignment is None:
+    covariance aligned, or without an `alignment` the reference moved so that both start alike. To
+    waypoints it is aligned in their own way. Unchanged where that is impossible."""
+    filtered = None
+    if estimate.waypoints is not None:
+        aligned = in_frame_of(estimate.trajectory, estimate.waypoints)
+    elif alignment is None:
         reference = in_frame_of(estimate.reference, estimate.trajectory)
         return estimate._replace(reference=reference)
-    aligned, filtered = in_frame_of(estimate.trajectory, estimate.reference, alignment), None
+    else:
+        aligned = in_frame_of(estimate.trajectory, estimate.reference, alignment)
     if estimate.filtered is not None:
         covariance = turned_covariance(estimate.filtered.covariance, estimate.trajectory, aligned)
         filtered = estimate.filtered._replace(covariance=covariance)
@@ -284,6 +290,7 @@ def _of_history(recording: Recording, history: FilterHistory, ekf: FilterSetup) 
         velocity=_after(start.velocity, history.velocity),
         std=_after(std, np.sqrt(np.maximum(history.covariance_diagonal, 0.0))),
         notes=notes,
+        waypoints=recording.waypoints,
     )
 
 
@@ -318,6 +325,7 @@ def integrate(recording: Recording, found: Displacements, windows: DataConfig) -
         recording.reference,
         jax.tree.map(lambda leaf: _after(np.nan, leaf), found),
         notes=recording.notes,
+        waypoints=recording.waypoints,
     )
 
 

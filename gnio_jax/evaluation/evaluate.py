@@ -28,6 +28,7 @@ from gnio_jax.evaluation.infer import given_displacements, infer, no_displacemen
 from gnio_jax.evaluation.metrics import score
 from gnio_jax.evaluation.prepare import Orientation, Recording, prepare
 from gnio_jax.evaluation.report import DEFINITIONS, Report, write
+from gnio_jax.evaluation.trajectory import Alignment
 from gnio_jax.filtering.settings import filter_setup
 from gnio_jax.models import Network
 from gnio_jax.reporting import Progress, Reporter, Silence
@@ -81,6 +82,7 @@ def evaluate(
         return functools.partial(reporter.progress, name)
 
     sequences = data.load(config.dataset, config.data_root, config.split, workers, stage("reading"))
+    _check_alignment(sequences, config.alignment)
     recordings, left_out = prepare(
         sequences,
         windows,
@@ -102,20 +104,19 @@ def evaluate(
         source = [no_displacements(each) for each in recordings]
     else:
         source = network
-    truth = [given_displacements(each, PERFECT_STD) for each in recordings]
+    posed = [each for each in recordings if each.waypoints is None]
+    truth = [given_displacements(each, PERFECT_STD) for each in posed]
 
     own, ideal = (None, None) if config.estimator == "integrate" else (ekf, perfect(ekf))
     batch, perfecting = config.batch_size, stage("estimating with perfect displacements")
     estimates = estimate(recordings, source, windows, own, batch, stage("estimating"))
-    floor = estimate(recordings, truth, windows, ideal, batch, perfecting)
+    floor = estimate(posed, truth, windows, ideal, batch, perfecting)
+    compared = {"never_moves": never_moves(estimates), "perfect_displacements": floor}
 
     report = Report(
         {**_settings(config, run.config, sequences), "epoch": run.epoch, "step": run.step},
         score(estimates, config.alignment),
-        {
-            "never_moves": score(never_moves(estimates), config.alignment),
-            "perfect_displacements": score(floor, config.alignment),
-        },
+        {row: score(of, config.alignment) for row, of in compared.items() if of},
         {each.name: each.group for each in recordings},
         {each.name: list(each.notes) for each in estimates if each.notes},
         left_out,
@@ -138,6 +139,14 @@ def _check(config: EvaluateConfig) -> None:
         if not assignment.startswith("filter."):
             remedy = "write filter.FIELD=VALUE, e.g. filter.noise.measurement_scale=1"
             raise InputError(f"--set {assignment}", "is no setting of the filter", remedy)
+
+
+def _check_alignment(sequences: list[Sequence], alignment: Alignment) -> None:
+    """Raise `InputError` where waypoints cannot be compared with in the way that is asked for."""
+    for each in sequences:
+        if each.waypoints is not None and alignment not in ("origin", "yaw_position"):
+            remedy = "leave it out: one turn about z and one shift are fitted"
+            raise InputError(each.name, f"has waypoints, and no --alignment {alignment}", remedy)
 
 
 def resolve(config: EvaluateConfig, run: TrainConfig) -> EvaluateConfig:
@@ -207,6 +216,7 @@ def _settings(
     """What changes the meaning of the figures, and what they are of."""
     compensated = {str(each.attributes.get("imu_compensated", "no")) for each in sequences}
     windows = run.data
+    tapped = all(each.waypoints is not None for each in sequences)
     return {
         "dataset": config.dataset,
         "data_root": config.data_root,
@@ -215,7 +225,8 @@ def _settings(
         "estimator": config.estimator,
         "coupling": config.coupling if config.estimator == "ekf" else None,
         "orientation_source": config.orientation,
-        "initial_state": config.init,
+        "initial_state": "static" if tapped else config.init,
+        **({"reference": "waypoints"} if tapped else {}),
         "gyro_bias": config.gyro_bias,
         "imu_compensated": " and ".join(sorted(compensated)),
         "alignment": config.alignment,

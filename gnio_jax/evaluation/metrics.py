@@ -22,9 +22,12 @@ from gnio_jax.evaluation.trajectory import (
     Trajectory,
     Undefined,
     align,
+    align_to_waypoints,
+    positions_at,
     relative_yaw,
 )
 from gnio_jax.numerics import finite_rows, matrix_from_quaternion, rotation_z, spans
+from gnio_jax.types import Waypoints
 
 Positions = Float[np.ndarray, "n d"]
 
@@ -34,6 +37,8 @@ STANDING_SECONDS = 2.0
 """Shortest stretch that counts as standing still, s."""
 LEAST_PATH = 1.0
 """Length of the reference below which `drift` and `path_length_ratio` say nothing, m."""
+LEAST_LEG = 1.0
+"""Length of a leg below which the ratio of lengths says nothing, m."""
 LEAST_SECONDS = 10.0
 """Time below which `yaw_drift` says nothing of an hour, s."""
 
@@ -230,6 +235,39 @@ def stationary_drift(estimate: Positions, reference: Positions, step: float) -> 
     return float(walked / (seconds / 60))
 
 
+# Legs: the straight lines from a waypoint to the next
+# --------------------------------------------------------------------------------------------------
+
+
+def leg_ratio(estimate: Positions, waypoints: Positions) -> float:
+    """Median over the legs of estimated over true length (ours): 1 is right. The estimate's leg is
+    the straight line between its positions at the two times. One tap too late makes one leg longer
+    and the other shorter, which hardly moves a median. Legs under 1 m are left out."""
+    ours, true = (np.linalg.norm(np.diff(x, axis=0), axis=1) for x in (estimate, waypoints))
+    long = true >= LEAST_LEG
+    if not long.any():
+        raise Undefined(f"no leg of {LEAST_LEG:g} m")
+    return float(np.median(ours[long] / true[long]))
+
+
+def leg_path_ratio(estimate: Positions, waypoints: Positions) -> float:
+    """Length of the estimate's polygon through the times of the waypoints over that of the
+    waypoints: the path ratio of a walk that is straight between them."""
+    if (length := _length(waypoints)) < LEAST_PATH:
+        raise Undefined(f"the legs are {length:.2f} m long together, under {LEAST_PATH:g} m")
+    return _length(estimate) / length
+
+
+def leg_error(estimate: Positions, waypoints: Positions) -> float:
+    """RMS error of the legs as vectors, m. Where one leg is wrong, those after it are not."""
+    return _rms(np.diff(estimate - waypoints, axis=0))
+
+
+def _length(corners: Positions) -> float:
+    """Of a polygon, m."""
+    return float(np.linalg.norm(np.diff(corners, axis=0), axis=1).sum())
+
+
 # Yaw
 # --------------------------------------------------------------------------------------------------
 
@@ -334,10 +372,18 @@ class Compared(NamedTuple):
     step: float
     """Time between rows, s."""
     filtered: Filtered | None
+    waypoints: Waypoints | None = None
     dims: int = 3
 
     def of(self, path: Trajectory) -> Positions:
         return path.position[:, : self.dims]
+
+    def at_waypoints(self) -> tuple[Positions, Positions]:
+        """The aligned estimate's positions, and the waypoints that are within it."""
+        assert self.waypoints is not None
+        passed = positions_at(self.aligned, self.waypoints.time)
+        known = finite_rows(passed)
+        return passed[known], self.waypoints.position[known]
 
     def of_filter(self) -> Filtered:
         assert self.filtered is not None
@@ -390,7 +436,21 @@ OF_FILTER: dict[str, Metric] = {
     "accepted": lambda c: accepted_share(c.of_filter().accepted),
 }
 """They need no reference."""
-NAMES = (*(name + tag for tag in ("", "_2d") for name in SPATIAL | NEES), *OTHERS, *OF_FILTER)
+OF_WAYPOINTS: dict[str, Metric] = {
+    "leg_ratio": lambda c: leg_ratio(*c.at_waypoints()),
+    "leg_path_ratio": lambda c: leg_path_ratio(*c.at_waypoints()),
+    "leg_error": lambda c: leg_error(*c.at_waypoints()),
+    "waypoint_rms": lambda c: ate(*c.at_waypoints()),
+}
+"""Horizontal, of a sequence with waypoints: it has these in the place of all that need poses."""
+NAMES = (
+    *(name + tag for tag in ("", "_2d") for name in SPATIAL | NEES),
+    *OTHERS,
+    *OF_FILTER,
+    *OF_WAYPOINTS,
+)
+POSITION_ERRORS = ("ate", "waypoint_rms")
+"""One of them is the error of the positions of a sequence."""
 SHARES = {"nees_coverage", "nees_coverage_2d", "nis_coverage", "accepted"}
 """Metrics that are small when they are bad: 0 for an estimate that diverged."""
 
@@ -403,8 +463,8 @@ class Measures(NamedTuple):
     reasons: dict[str, str]
     """Metric → why it is None or infinite, or the 0 of an estimate that diverged."""
     diverged: bool
-    """Whether the estimate is not finite throughout, or so far off that its `ate` is infinite. An
-    infinite NEES alone is a bad covariance."""
+    """Whether the estimate is not finite throughout, or so far off that the error of its positions
+    is infinite. An infinite NEES alone is a bad covariance."""
 
 
 def measure(
@@ -412,8 +472,11 @@ def measure(
     reference: Trajectory,
     alignment: Alignment = "origin",
     filtered: Filtered | None = None,
+    waypoints: Waypoints | None = None,
 ) -> Measures:
-    """Every metric of one sequence. `reference` has the estimate's stamps.
+    """Every metric of one sequence. `reference` has the estimate's stamps. With `waypoints` there
+    is no other reference: the estimate is turned and shifted to them (`align_to_waypoints`), and
+    the metrics are those of `OF_WAYPOINTS` and of the filter.
 
     `ate*`, `rte*`, `drift` and `yaw_rmse` see the estimate under `alignment`, which is fitted in
     3-D for the horizontal ones too. NEES is taken with the start aligned, because the filter's
@@ -432,11 +495,14 @@ def measure(
         path = Trajectory(estimate.time, np.zeros_like(estimate.position), level)
     aligned, started, missing = path, path, ""
     try:
-        aligned, started = align(path, reference, alignment), align(path, reference)
+        if waypoints is not None:
+            aligned = align_to_waypoints(path, waypoints)
+        else:
+            aligned, started = align(path, reference, alignment), align(path, reference)
     except Undefined as undefined:
         missing = str(undefined)
     step = float(np.median(np.diff(path.time))) if len(path.time) > 1 else 1.0
-    compared = Compared(path, aligned, started, reference, step, filtered)
+    compared = Compared(path, aligned, started, reference, step, filtered, waypoints)
     values: dict[str, float | None] = {"duration": float(path.time[-1] - path.time[0])}
     reasons: dict[str, str] = {}
 
@@ -452,15 +518,24 @@ def measure(
         except Undefined as undefined:
             values[name], reasons[name] = None, str(undefined)
 
-    put("path_length", lambda c: path_length(c.of(c.reference), c.step), compared, lost="")
+    if waypoints is None:
+        put("path_length", lambda c: path_length(c.of(c.reference), c.step), compared, lost="")
+    else:
+        put("path_length", lambda c: _length(c.at_waypoints()[1]), compared, lost="")
+        put("legs", lambda c: float(len(c.at_waypoints()[1]) - 1), compared, lost="")
     for name, metric, seen in _metrics(compared):
         put(name, metric, seen)
-    return Measures(values, reasons, bool(lost) or values["ate"] == math.inf)
+    far = any(values.get(name) == math.inf for name in POSITION_ERRORS)
+    return Measures(values, reasons, bool(lost) or far)
 
 
 def _metrics(compared: Compared) -> Iterator[tuple[str, Metric, Compared]]:
     """Name, metric and what it is of, in the order of the files."""
     has_filter = compared.filtered is not None
+    if compared.waypoints is not None:
+        for name, metric in (OF_WAYPOINTS | OF_FILTER if has_filter else OF_WAYPOINTS).items():
+            yield name, metric, compared
+        return
     for dims, tag in ((3, ""), (2, "_2d")):
         seen = compared._replace(dims=dims)
         for name, metric in (SPATIAL | NEES if has_filter else SPATIAL).items():
@@ -478,6 +553,8 @@ def _why_infinite(name: str) -> str:
 def score(estimates: Iterable[Any], alignment: Alignment = "origin") -> dict[str, Measures]:
     """Every metric of every `Estimate`, by sequence."""
     return {
-        each.name: measure(each.trajectory, each.reference, alignment, each.filtered)
+        each.name: measure(
+            each.trajectory, each.reference, alignment, each.filtered, each.waypoints
+        )
         for each in estimates
     }

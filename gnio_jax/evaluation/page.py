@@ -24,9 +24,8 @@ from jinja2 import Environment
 
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import plots, tabulate
-from gnio_jax.evaluation.estimate import Estimate
 from gnio_jax.evaluation.plots import AXES, BLUE, COLOURS, GREEN, VERMILION, View
-from gnio_jax.evaluation.report import Report, read, read_trajectories
+from gnio_jax.evaluation.report import Report, read, read_estimates
 from gnio_jax.evaluation.tabulate import COLUMNS
 from gnio_jax.files import write_text
 
@@ -40,6 +39,7 @@ STRIPS = {"gate": "gate γ (–)", "scale": "scale (–)", "std": "σ of network
 LEVELS = (("mean", 3.0, GREEN), ("refused above", 11.345, VERMILION))
 """Of the NIS of three axes: the mean of χ², and what the filter refuses by default."""
 MAP_HEIGHT, STRIP_HEIGHT, LABEL_HEIGHT, LEFT = 560, 158, 30, 62
+WAYPOINT = {"marker": "x", "color": "black", "line_width": 2.0}
 LONG = 1e6
 """Longer than a recording, s."""
 GO_THERE = """
@@ -103,9 +103,8 @@ def of_report(
 def of_folder(folder: Path, report: Report, name: str) -> Run:
     """An evaluation that was read back: its paths and figures, without what network and filter gave
     over time."""
-    paths = read_trajectories(folder, list(report.scores))
-    alignment = report.settings["alignment"]
-    views = [plots.view(Estimate(sequence, *own), alignment) for sequence, own in paths.items()]
+    estimates = read_estimates(folder, list(report.scores))
+    views = [plots.view(each, report.settings["alignment"]) for each in estimates]
     return of_report(report, views, name=name)
 
 
@@ -200,6 +199,13 @@ def columns(seen: View, rows: int) -> Columns:
         if np.isfinite(values).any():
             found |= {f"{name}_{axis}": values[:, k] for k, axis in enumerate(AXES)}
     found = {name: values[::step] for name, values in found.items()}
+    if len(seen.taps.time):
+        # In the row that is nearest in time: a row without a waypoint is NaN.
+        rows = np.abs(found["time"][:, None] - seen.taps.time).argmin(0)
+        passed = {"waypoint_x": seen.taps.position[:, 0], "waypoint_y": seen.taps.position[:, 1]}
+        for name, values in (passed | {"waypoint_error": seen.taps.error}).items():
+            found[name] = np.full(len(found["time"]), np.nan)
+            found[name][rows] = values
     if np.isfinite(seen.nis).any():
         # The largest of each `step` rows: a thinned curve keeps its peaks.
         peaks = np.full(-(-len(seen.nis) // step) * step, -np.inf)
@@ -225,7 +231,11 @@ def frame(runs: list[Run], sequence: str) -> dict[str, list[float]]:
     """Corners of what the map shows of a sequence: the paths of all runs, and the ellipses of the
     first, which may reach over the paths by the size of these."""
     views = [seen for run in runs for seen in run.views if seen.name == sequence]
-    parts = [part[:, :2] for seen in views for part in (seen.position, seen.reference)]
+    parts = [
+        part[:, :2]
+        for seen in views
+        for part in (seen.position, seen.reference, seen.taps.position)
+    ]
     points = np.concatenate(parts)
     points = points[np.isfinite(points).all(1)] if np.isfinite(points).any() else np.zeros((1, 2))
     low, high = points.min(0), points.max(0)
@@ -268,16 +278,17 @@ def _document(runs: list[Run], held: list[list[Columns]]) -> tuple[Document, lis
     )
     first, there = sources.paths[0], held[0][0].keys()
     known = any(seen.known for seen in runs[0].views)
+    tapped = "waypoint_x" in there
     times, distances = Range1d(0.0, 1.0), Range1d(0.0, 1.0)
     drawn = [
         (path, run.name, own) for path, run, own in zip(sources.paths, runs, colours, strict=True)
     ]
-    figures: dict[str, Any] = {"map": _draw_map(drawn, sources, known)}
+    figures: dict[str, Any] = {"map": _draw_map(drawn, sources, known, tapped)}
     errors = [(path, "error", name, colour) for path, name, colour in drawn if known]
-    label = "error (m)" if known else "3σ (m)"
+    label = "error (m)" if known or tapped else "3σ (m)"
     if known:
         figures["distance"] = _draw_strip(sources, distances, label, errors, "distance", band=True)
-    strips = [_draw_strip(sources, times, label, errors, band=True)]
+    strips = [_draw_strip(sources, times, label, errors, band=True, tapped=tapped)]
     for name, label in STRIPS.items():
         if f"{name}_x" in there:
             curves = [(first, f"{name}_{axis}", axis, colour) for axis, colour in AXES.items()]
@@ -307,8 +318,11 @@ def _document(runs: list[Run], held: list[list[Columns]]) -> tuple[Document, lis
     return document, list(figures)
 
 
-def _draw_map(drawn: list[tuple[Any, str, str]], sources: Sources, known: bool) -> new_figure:
-    """Plan view, both axes to the same scale. `drawn` is source, name and colour of each run."""
+def _draw_map(
+    drawn: list[tuple[Any, str, str]], sources: Sources, known: bool, tapped: bool
+) -> new_figure:
+    """Plan view, both axes to the same scale. `drawn` is source, name and colour of each run. Where
+    there are waypoints, lines join them to the first run at their times."""
     plan = new_figure(
         height=MAP_HEIGHT,
         sizing_mode="stretch_width",
@@ -324,6 +338,11 @@ def _draw_map(drawn: list[tuple[Any, str, str]], sources: Sources, known: bool) 
     if known:
         black = {"color": "black", "line_width": 2.0, "legend_label": "reference"}
         plan.line("reference_x", "reference_y", source=sources.paths[0], **black)
+    if tapped:
+        ends = {"x0": "x", "y0": "y", "x1": "waypoint_x", "y1": "waypoint_y"}
+        label = {"source": sources.paths[0], "legend_label": "waypoint, error"}
+        plan.segment(**ends, color=VERMILION, line_width=1.2, **label)
+        plan.scatter("waypoint_x", "waypoint_y", size=9, **WAYPOINT, **label)
     for path, name, colour in drawn:
         plan.line("x", "y", source=path, color=colour, line_width=1.8, legend_label=name)
     contour = {"line_color": "colour", "fill_color": "colour", "fill_alpha": 0.12}
@@ -345,10 +364,12 @@ def _draw_strip(
     curves: list[tuple[ColumnDataSource, str, str, str]],
     along: str = "time",
     band: bool = False,
+    tapped: bool = False,
     levels: tuple[tuple[str, float, str], ...] = (),
 ) -> new_figure:
     """Curves over time or distance: of each its source, column, name and colour. A `band` is the
-    filter's 3σ behind errors; `levels` are marked on an axis of powers."""
+    filter's 3σ behind errors, to which those at waypoints (`tapped`) belong; `levels` are marked on
+    an axis of powers."""
     strip = new_figure(
         height=STRIP_HEIGHT,
         sizing_mode="stretch_width",
@@ -363,6 +384,9 @@ def _draw_strip(
     for source, name, text, colour in curves:
         style = {"color": colour, "line_width": 1.3, "legend_label": text}
         strip.line(along, name, source=source, **style)
+    if tapped:
+        label = {"source": sources.paths[0], "legend_label": "at waypoints"}
+        strip.scatter(along, "waypoint_error", size=8, **WAYPOINT, **label)
     for text, level, colour in levels:
         style = {"color": colour, "legend_label": f"{text} {level:.3g}"}
         strip.line([0.0, LONG], [level, level], **style)

@@ -25,10 +25,11 @@ from gnio_jax.evaluation.estimate import Estimate, in_one_frame
 from gnio_jax.evaluation.infer import Displacements
 from gnio_jax.evaluation.metrics import Filtered
 from gnio_jax.evaluation.report import Report, file_names
-from gnio_jax.evaluation.trajectory import Alignment
+from gnio_jax.evaluation.trajectory import Alignment, positions_at
 from gnio_jax.files import replacing, shown_name
 from gnio_jax.numerics import finite_rows, spans
 from gnio_jax.reporting import Progress, silent
+from gnio_jax.types import Waypoints
 
 BLUE, VERMILION, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#8C8C8C"
 PURPLE, ORANGE, SKY, YELLOW = "#CC79A7", "#E69F00", "#56B4E9", "#F0E442"
@@ -41,16 +42,36 @@ GRID = "#DDDDDD"
 DOTS_PER_INCH = 120
 START: dict[str, Any] = {"marker": "o", "ls": "", "mfc": "white", "ms": 8, "mew": 1.8}
 END: dict[str, Any] = {"marker": "s", "ls": "", "ms": 7}
+TAP: dict[str, Any] = {"marker": "x", "ls": "", "ms": 7, "mew": 1.8}
 MARKERS = "os^Dv"
 """Where there are more rows than colours, the next marker."""
 SIGMAS = 3.0
 """Size of the ellipses and bands, in standard deviations."""
 ELLIPSES = 12
 """On a map, at even times."""
+TITLE = {"ate": "ATE", "ate_2d": "in 2-D", "waypoint_rms": "rms at waypoints"}
+"""Errors in the title of a sequence."""
+NO_WAYPOINTS = Waypoints(np.zeros(0), np.zeros((0, 2)))
 
 
 # What is drawn of an estimate
 # --------------------------------------------------------------------------------------------------
+
+
+class Taps(NamedTuple):
+    """The waypoints of a sequence, k of them; none where it has poses."""
+
+    time: Float[np.ndarray, "k"]
+    """From the start, s."""
+    position: Float[np.ndarray, "k 2"]
+    """m."""
+    passed: Float[np.ndarray, "k 2"]
+    """Where the estimate is at these times, m."""
+
+    @property
+    def error(self) -> Float[np.ndarray, "k"]:
+        """Distance of the two, m."""
+        return np.linalg.norm(self.passed - self.position, axis=1)
 
 
 class View(NamedTuple):
@@ -78,6 +99,7 @@ class View(NamedTuple):
     """Normalised innovation squared."""
     accepted: Float[np.ndarray, "n"]
     """1 where the filter used the displacement, 0 where it refused it."""
+    taps: Taps
 
     @property
     def step(self) -> float:
@@ -89,6 +111,14 @@ class View(NamedTuple):
         """Whether there is a reference."""
         return bool(np.isfinite(self.reference).any())
 
+    @property
+    def errors(self) -> Float[np.ndarray, "_"]:
+        """Horizontal, where there is a reference, m."""
+        if not self.known:
+            return self.taps.error
+        error = (self.position - self.reference)[finite_rows(self.reference), :2]
+        return np.linalg.norm(error, axis=1)
+
 
 def view(estimate: Estimate, alignment: Alignment | None = "origin") -> View:
     """An estimate in the frame of its reference; without an `alignment` the reference is moved so
@@ -98,9 +128,10 @@ def view(estimate: Estimate, alignment: Alignment | None = "origin") -> View:
     none = np.full((rows, 3), np.nan)
     found = seen.displacements or Displacements(none, none)
     filtered = seen.filtered or Filtered(np.full((rows, 3, 3), np.nan), none[:, 0], none[:, 0])
+    begin, (stamps, waypoints) = seen.trajectory.time[0], seen.waypoints or NO_WAYPOINTS
     return View(
         seen.name,
-        seen.trajectory.time - seen.trajectory.time[0],
+        seen.trajectory.time - begin,
         seen.trajectory.position,
         seen.reference.position,
         filtered.covariance,
@@ -109,6 +140,7 @@ def view(estimate: Estimate, alignment: Alignment | None = "origin") -> View:
         found.std,
         filtered.nis,
         filtered.accepted,
+        Taps(stamps - begin, waypoints, positions_at(seen.trajectory, stamps)),
     )
 
 
@@ -154,6 +186,8 @@ def sequence(seen: View, title: str = "") -> Figure:
     strips: list[Callable[[Axes, View], None]] = [_draw_speed]
     if seen.known or np.isfinite(seen.covariance).any():
         strips = [_draw_error, functools.partial(_draw_error, vertical=True), *strips]
+    elif len(seen.taps.time):
+        strips = [_draw_error, *strips]
     if np.isfinite(seen.gate).any():
         strips.append(_draw_gate)
     elif np.isfinite(seen.accepted).any():
@@ -181,6 +215,11 @@ def _draw_map(axes: Axes, seen: View) -> None:
     if seen.known:
         axes.plot(*seen.reference[:, :2].T, color=REFERENCE, lw=1.6, label="reference")
     axes.plot(*seen.position[:, :2].T, color=BLUE, lw=1.4, label="estimate")
+    if len(seen.taps.time):
+        axes.plot(*seen.taps.position.T, color=REFERENCE, zorder=5, label="waypoint", **TAP)
+        for ends in np.stack([seen.taps.position, seen.taps.passed], 1):
+            axes.plot(*ends.T, color=VERMILION, lw=1.0, zorder=3)
+        axes.plot([], [], color=VERMILION, lw=1.0, label="error at its time")
     shapes = ellipses(seen.covariance)
     there = np.flatnonzero(np.isfinite(shapes.major) & finite_rows(seen.position))
     if len(there):
@@ -217,14 +256,21 @@ def _draw_error(axes: Axes, seen: View, vertical: bool = False) -> None:
         axes.fill_between(seen.time, low, bound, color=colour, alpha=0.16, lw=0, label="3σ")
     if seen.known:
         axes.plot(seen.time, error, color=colour, lw=1.2, label="error")
+    tapped = len(seen.taps.time) > 0 and not vertical
+    if tapped:
+        axes.plot(seen.taps.time, seen.taps.error, color=REFERENCE, label="at waypoints", **TAP)
     axes.axhline(0, color=REFERENCE, lw=0.6)
-    axes.set_ylabel(f"{name}\n{'error' if seen.known else '3σ'} (m)")
+    axes.set_ylabel(f"{name}\n{'error' if seen.known or tapped else '3σ'} (m)")
 
 
 def _draw_speed(axes: Axes, seen: View) -> None:
     if seen.known:
         true = speed(seen.reference, seen.step)
         axes.plot(seen.time, true, color=REFERENCE, lw=1.4, label="reference")
+    if len(seen.taps.time):
+        lengths = np.linalg.norm(np.diff(seen.taps.position, axis=0), axis=1)
+        legs = lengths / np.diff(seen.taps.time)
+        axes.stairs(legs, seen.taps.time, baseline=None, color=REFERENCE, lw=1.4, label="legs")
     axes.plot(seen.time, speed(seen.position, seen.step), color=BLUE, lw=1.1, label="estimate")
     axes.set_ylabel("horizontal\nspeed (m/s)")
     axes.set_ylim(bottom=0)
@@ -250,14 +296,11 @@ def _draw_accepted(axes: Axes, seen: View) -> None:
 
 def error_cdf(views: list[View], report: Report) -> Figure:
     """Distribution of errors over the set: of every sample's horizontal position, and of the
-    sequences' ATE beside the reference rows."""
+    sequences' ATE beside the reference rows. Of a sequence with waypoints they are its errors there
+    and their root mean square."""
     figure = Figure(figsize=(9.6, 4.4), layout="constrained")
     left, right = figure.subplots(1, 2, sharey=True)
-    known = [seen for seen in views if seen.known]
-    errors = [
-        np.linalg.norm((seen.position - seen.reference)[finite_rows(seen.reference), :2], axis=1)
-        for seen in known
-    ]
+    errors = [seen.errors for seen in views if len(seen.errors)]
     for error in errors:
         _step(left, error, color=BLUE, lw=0.7, alpha=0.25)
     if errors:
@@ -269,12 +312,14 @@ def error_cdf(views: list[View], report: Report) -> Figure:
     scored = {"this network": report.scores, **report.reference_rows}
     styles = ((BLUE, "-"), (VERMILION, "--"), (GREEN, "-."))
     for (name, scores), (colour, style) in zip(scored.items(), styles, strict=False):
-        found = (measures.values.get("ate_2d") for measures in scores.values())
+        found = [own.values.get(x) for own in scores.values() for x in ("ate_2d", "waypoint_rms")]
         values = np.array([value for value in found if value is not None])
         if len(values):
             label = f"{name.replace('_', ' ')} (median {np.median(values):.2f} m)"
             _step(right, values, color=colour, lw=1.8, ls=style, label=label)
-    right.set_xlabel("ATE in 2-D of a sequence (m)")
+    tapped = any(len(seen.taps.time) for seen in views)
+    at_waypoints = ", or rms at waypoints" if tapped else ""
+    right.set_xlabel(f"ATE in 2-D{at_waypoints} of a sequence (m)")
     for axes in (left, right):
         axes.set_ylim(0, 1.02)
         axes.set_xlim(left=0)
@@ -282,7 +327,7 @@ def error_cdf(views: list[View], report: Report) -> Figure:
         finish(axes)
     settings = report.settings
     subject = f"{settings['dataset']} {settings['split']}: {settings['estimator']}"
-    figure.suptitle(f"{subject}, {len(known)} sequences", fontsize=11)
+    figure.suptitle(f"{subject}, {len(errors)} sequences", fontsize=11)
     return figure
 
 
@@ -352,12 +397,12 @@ def save_all(folder: Path, views: list[View], report: Report, progress: Progress
         values = report.scores[seen.name].values
         errors = [
             f"{heading} {values[name]:.2f} m"
-            for name, heading in (("ate", "ATE"), ("ate_2d", "in 2-D"))
+            for name, heading in TITLE.items()
             if values.get(name) is not None
         ]
         title = ": ".join(filter(None, (shown_name(seen.name), ", ".join(errors))))
         save(folder / f"{stem}.png", sequence(seen, title))
-    if any(seen.known for seen in views):
+    if any(len(seen.errors) for seen in views):
         save(folder / "error_cdf.png", error_cdf(views, report))
 
 

@@ -25,7 +25,7 @@ from gnio_jax.numerics import (
     rotations,
     yaw_rotation,
 )
-from gnio_jax.types import Sequence
+from gnio_jax.types import Sequence, Waypoints
 from gnio_jax.windows import true_displacement, window_starts
 
 REFERENCE_BIAS_SECONDS = 10.0
@@ -33,6 +33,10 @@ REFERENCE_BIAS_SECONDS = 10.0
 ROUGH_START = 0.4
 """Standard deviation of the first velocity above which a static start is only rough, m/s (ours):
 nobody stands still there."""
+OF_WAYPOINTS = (
+    "waypoints, no poses: it starts level, with yaw and position zero, and is compared after one "
+    "turn about z and one shift"
+)
 
 Init = Literal["reference", "static"]
 BiasSource = Literal["zero", "rest", "reference"]
@@ -79,6 +83,8 @@ class Recording(NamedTuple):
     window's start; NaN where the reference cannot be trusted."""
     notes: tuple[str, ...]
     """What a reader of the result should know."""
+    waypoints: Waypoints | None = None
+    """The reference of a sequence without poses."""
 
     @property
     def strides(self) -> int:
@@ -100,15 +106,13 @@ def prepare(
 
     A recording begins at the first sample with a trusted reference; with `from_first`, and where
     there is no reference, at its first sample. `std` is the filter's initial uncertainty, of which
-    a static start replaces tilt and velocity by what it finds. `orientation` is the source of
+    a static start replaces tilt and velocity by what it finds. A sequence with waypoints has no
+    pose to start from, and its start is static whatever `init` is. `orientation` is the source of
     `Recording.attitude`; None makes none. Raises `InputError` for a sequence that lacks what these
     choices need.
     """
     recordings, left_out = [], {}
     for sequence in sequences:
-        if sequence.waypoints is not None:
-            remedy = "nothing can be compared with a track yet"
-            raise InputError(sequence.name, "has waypoints, no poses", remedy)
         sequence = data.resample(sequence, windows.rate)
         known = finite_rows(sequence.position) & finite_rows(sequence.orientation)
         sequence = sequence._replace(valid=sequence.valid & known)
@@ -123,7 +127,9 @@ def prepare(
             left_out[sequence.name] = f"{problem}, too short for a window and a stride"
             continue
         bias, bias_note = _gyro_bias(whole, measured, windows.rate, gyro_bias)
-        start, start_note = _start(whole, measured, windows, bias, std, init)
+        tapped = whole.waypoints is not None
+        own_init = "static" if tapped else init
+        start, start_note = _start(whole, measured, windows, bias, std, own_init)
         trusted = whole.valid[:, None]
         poses = [np.where(trusted, part, np.nan) for part in (whole.position, whole.orientation)]
         ends = slice(None, None, windows.stride)
@@ -144,7 +150,8 @@ def prepare(
                     window_starts(len(whole.time), windows.window, windows.stride),
                     windows.window,
                 ),
-                notes=tuple(filter(None, (bias_note, start_note))),
+                notes=tuple(filter(None, (OF_WAYPOINTS * tapped, bias_note, start_note))),
+                waypoints=whole.waypoints,
             )
         )
     return recordings, left_out
@@ -164,6 +171,12 @@ def _check(
         remedy = "give --orientation filter or reference"
         raise InputError(sequence.name, "has no device orientation", remedy)
     if sequence.valid.any():
+        return
+    if sequence.waypoints is not None:
+        wanted = "--gyro-bias zero" if gyro_bias == "reference" else ""
+        wanted = "--orientation filter" if orientation == "reference" else wanted
+        if wanted:
+            raise InputError(sequence.name, "has waypoints, no poses", f"give {wanted}")
         return
     if init == "reference" or gyro_bias == "reference":
         wanted = "--init static" if init == "reference" else "--gyro-bias zero"
@@ -209,7 +222,8 @@ def _start(
     start = Start(np.asarray(level.rotation), np.zeros(3), np.zeros(3), gyro_bias, std)
     if velocity_std <= ROUGH_START:
         return start, ""
-    known = f"velocity to {velocity_std:.1f} m/s, tilt to {np.degrees(tilt_std):.0f}°"
+    tilt = float(f"{np.degrees(tilt_std):.1g}")  # of many sequences few different notes
+    known = f"velocity to {velocity_std:.1f} m/s, tilt to {tilt:g}°"
     return start, f"start: not standing still, known to one sigma: {known}"
 
 

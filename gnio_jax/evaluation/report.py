@@ -4,6 +4,7 @@ metrics.json      settings, every metric of every sequence, means, intervals, re
 metrics.csv       a line per sequence, a column per metric
 trajectories/     estimates in TUM format, for evo
 references/       references in TUM format
+waypoints/        references of sequences without poses: t x y
 plots/            a picture per sequence, and the distribution of the errors
 report.html       a page with map, curves and a time slider
 """
@@ -25,7 +26,13 @@ from gnio_jax.evaluation import statistics
 from gnio_jax.evaluation.estimate import Estimate
 from gnio_jax.evaluation.metrics import Measures
 from gnio_jax.evaluation.statistics import Scores, Summary
-from gnio_jax.evaluation.trajectory import Trajectory, read_tum, write_tum
+from gnio_jax.evaluation.trajectory import (
+    Trajectory,
+    read_tum,
+    read_waypoints,
+    write_tum,
+    write_waypoints,
+)
 from gnio_jax.files import file_stem, replacing_folder, write_csv
 from gnio_jax.reporting import Progress, silent
 
@@ -99,6 +106,9 @@ def write(
             write_tum(new / "trajectories" / f"{stem}.txt", each.trajectory)
             if each.reference.known.any():
                 write_tum(new / "references" / f"{stem}.txt", each.reference)
+            if each.waypoints is not None:
+                (new / "waypoints").mkdir(exist_ok=True)
+                write_waypoints(new / "waypoints" / f"{stem}.txt", each.waypoints)
         if drawn:
             # Bokeh and Matplotlib take seconds to import.
             from gnio_jax.evaluation import page
@@ -214,13 +224,13 @@ def read(folder: Path) -> Report:
         raise InputError(path, "is not a metrics.json of an evaluation", REMEDY) from None
 
 
-def read_trajectories(folder: Path, names: list[str]) -> dict[str, tuple[Trajectory, Trajectory]]:
+def read_estimates(folder: Path, names: list[str]) -> list[Estimate]:
     """Estimate and reference of each of an evaluation's sequences, at the estimate's stamps.
 
     `names` are all of them, in the order of its metrics.json. A row that the reference does not
     know is NaN. The estimate ends where it diverged.
     """
-    found = {}
+    found = []
     for name, stem in zip(names, file_names(names), strict=True):
         path = read_tum(folder / "trajectories" / f"{stem}.txt")
         rows = len(path.time)
@@ -232,7 +242,9 @@ def read_trajectories(folder: Path, names: list[str]) -> dict[str, tuple[Traject
             _, here, there = np.intersect1d(stamps[0], stamps[1], return_indices=True)
             reference.position[here] = true.position[there]
             reference.orientation[here] = true.orientation[there]
-        found[name] = path, reference
+        file = folder / "waypoints" / f"{stem}.txt"
+        waypoints = read_waypoints(file) if file.exists() else None
+        found.append(Estimate(name, path, reference, waypoints=waypoints))
     return found
 
 

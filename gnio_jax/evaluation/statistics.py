@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.special import stdtrit
 
-from gnio_jax.evaluation.metrics import Measures
+from gnio_jax.evaluation.metrics import POSITION_ERRORS, Measures
 
 Scores = Mapping[str, Measures]
 """Sequence → its metrics."""
@@ -175,9 +175,12 @@ def compare(
 
 
 def _share_lost(seeds: Sequence[Scores]) -> float:
-    """Of the estimates that have an `ate`, infinite or not, those that diverged."""
+    """Of the estimates whose positions have an error, infinite or not, those that diverged."""
     scored = [
-        own.diverged for of in seeds for own in of.values() if own.values.get("ate") is not None
+        own.diverged
+        for of in seeds
+        for own in of.values()
+        if any(own.values.get(name) is not None for name in POSITION_ERRORS)
     ]
     return float(np.mean(scored)) if scored else 0.0
 

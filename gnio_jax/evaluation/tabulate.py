@@ -50,9 +50,27 @@ COLUMNS = {
     "nis": Column("NIS/3", best=1.0),
     "nis_coverage": Column("NIS<95 %", "%", 0, 95.0),
     "accepted": Column("accepted", "%", 0, 100.0),
+    "legs": Column("legs", digits=0),
+    "leg_ratio": Column("leg ratio", best=1.0),
+    "leg_path_ratio": Column("legs' path ratio", best=1.0),
+    "leg_error": Column("leg error", "m"),
+    "waypoint_rms": Column("waypoint rms", "m"),
 }
 SCREEN = ("ate", "rte_60s", "rpe_1s", "yaw_rmse", "path_length_ratio", "nees_coverage")
 """What the table on the screen has: it fits into 80 columns. The files hold all metrics."""
+WAYPOINT_SCREEN = (
+    "path_length",
+    "legs",
+    "leg_ratio",
+    "leg_path_ratio",
+    "leg_error",
+    "waypoint_rms",
+)
+"""The same of sequences with waypoints in the place of poses."""
+MIXED_SCREEN = (*SCREEN[:3], *WAYPOINT_SCREEN[-3:])
+"""The same where a split has both."""
+LONGEST_HEADING = 9
+"""Letters; a longer one is broken on the screen."""
 DIVERGED = (
     "∞: the estimate diverged. It counts in medians, with infinite errors and coverages of 0; "
     "means, intervals and n are in every column of the others alone, so they cannot be compared "
@@ -204,6 +222,8 @@ def about(settings: Mapping[str, Any]) -> dict[str, str]:
         "IMU compensated": settings.get("imu_compensated"),
         "alignment": settings["alignment"],
     }
+    if settings.get("reference") == "waypoints":
+        found["alignment"] = "one turn and one shift to the waypoints"
     if settings.get("model"):
         network = f"{settings['model']}, checkpoint {settings['checkpoint']}"
         found["network"] = f"{network}, step {settings['step']}"
@@ -258,17 +278,21 @@ def render(report: Report) -> Group:
     """The table of an evaluation and what belongs under it, for `rich.console.Console.print`: a row
     per sequence, then those of the set, then the reference rows."""
     summary = report.summary()
-    shown = [name for name in SCREEN if name in summary]
+    screen = SCREEN
+    if "waypoint_rms" in summary:
+        screen = MIXED_SCREEN if "ate" in summary else WAYPOINT_SCREEN
+    shown = [name for name in screen if name in summary]
     title = f"{report.settings['dataset']} {report.settings['split']}: {way(report.settings)}"
     grid = Table(title=title, title_style="bold", title_justify="left", box=box.SIMPLE_HEAD)
     grid.add_column("sequence", overflow="fold", min_width=12)  # a name is never cut
     for name in shown:
-        # Two short lines. Not as markup, which the console of results does not read.
+        # Short lines. Not as markup, which the console of results does not read.
         heading, unit, *_ = COLUMNS[name]
-        lines = (
-            f"{heading.removesuffix(f' {unit}')}\n{unit}" if unit else heading.replace(" ", "\n")
-        )
-        grid.add_column(Text(lines), justify="right", no_wrap=True)
+        words = heading.removesuffix(f" {unit}") if unit else heading
+        if not unit or len(words) > LONGEST_HEADING:
+            words = words.replace(" ", "\n")
+        lines = filter(None, (words, unit))
+        grid.add_column(Text("\n".join(lines)), justify="right", no_wrap=True)
 
     def add(label: str, cells: Iterable[str], style: str = "", last: bool = False) -> None:
         grid.add_row(Text(label), *cells, style=style, end_section=last)

@@ -19,10 +19,15 @@ from gnio_jax.numerics import (
     rotation_z,
     xyzw_from_wxyz,
 )
+from gnio_jax.types import Waypoints
 
 Quaternions = Float[np.ndarray, "n 4"]
 Alignment = Literal["origin", "none", "yaw_position", "se3"]
 TUM = "t x y z qx qy qz qw"
+TXY = "t x y"
+NEAR = 0.2
+"""How far beyond the ends of a trajectory a waypoint may lie and count at the end, s (ours). A
+person taps no more exactly, and a trajectory ends with a whole stride."""
 
 
 class Undefined(ValueError):
@@ -85,12 +90,53 @@ def align(estimate: Trajectory, reference: Trajectory, how: Alignment = "origin"
     if how == "origin":
         turn = rotation_z(relative_yaw(reference.orientation[rows], estimate.orientation[rows])[0])
     elif how == "yaw_position":
-        sine = a[:, 0] @ b[:, 1] - a[:, 1] @ b[:, 0]
-        cosine = a[:, 0] @ b[:, 0] + a[:, 1] @ b[:, 1]
-        turn = rotation_z(np.arctan2(sine, cosine))
+        turn = _best_turn(a, b)
     else:
         u, _, vt = np.linalg.svd(b.T @ a)
         turn = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt  # no reflection
+    return _moved(estimate, turn, source, target)
+
+
+def align_to_waypoints(estimate: Trajectory, waypoints: Waypoints) -> Trajectory:
+    """The estimate turned about z and shifted horizontally so that it is nearest to the waypoints
+    at their times, in least squares.
+
+    Where all waypoints, or all estimated positions, are one place, no turn is better than another,
+    and none is made. Raises `Undefined` if fewer than two waypoints are within the estimate.
+    """
+    passed = positions_at(estimate, waypoints.time)
+    known = finite_rows(passed)
+    if known.sum() < 2:
+        raise Undefined("fewer than two waypoints are within the estimate")
+    source, target = passed[known].mean(0), waypoints.position[known].mean(0)
+    turn = _best_turn(passed[known] - source, waypoints.position[known] - target)
+    return _moved(estimate, turn, np.append(source, 0.0), np.append(target, 0.0))
+
+
+def positions_at(path: Trajectory, stamps: Float[np.ndarray, "k"]) -> Float[np.ndarray, "k 2"]:
+    """Horizontal positions at moments, on straight lines between the rows, m. NaN beside a row that
+    is not known and at moments further than `NEAR` from the trajectory."""
+    x, y = (np.interp(stamps, path.time, axis) for axis in path.position[:, :2].T)
+    within = (stamps >= path.time[0] - NEAR) & (stamps <= path.time[-1] + NEAR)
+    return np.where(within[:, None], np.stack([x, y], 1), np.nan)
+
+
+def _best_turn(
+    source: Float[np.ndarray, "k _"], target: Float[np.ndarray, "k _"]
+) -> Float[np.ndarray, "3 3"]:
+    """The turn about z that brings centred points nearest to others, in least squares."""
+    sine = source[:, 0] @ target[:, 1] - source[:, 1] @ target[:, 0]
+    cosine = source[:, 0] @ target[:, 0] + source[:, 1] @ target[:, 1]
+    return rotation_z(np.arctan2(sine, cosine))
+
+
+def _moved(
+    estimate: Trajectory,
+    turn: Float[np.ndarray, "3 3"],
+    source: Float[np.ndarray, "3"],
+    target: Float[np.ndarray, "3"],
+) -> Trajectory:
+    """The trajectory turned about `source`, which comes to `target`."""
     return Trajectory(
         estimate.time,
         (estimate.position - source) @ turn.T + target,
@@ -98,9 +144,14 @@ def align(estimate: Trajectory, reference: Trajectory, how: Alignment = "origin"
     )
 
 
-def in_frame_of(path: Trajectory, other: Trajectory, how: Alignment = "origin") -> Trajectory:
-    """`align`, to look at two trajectories together: `path` as it is where that is impossible."""
+def in_frame_of(
+    path: Trajectory, other: Trajectory | Waypoints, how: Alignment = "origin"
+) -> Trajectory:
+    """`align`, to look at a trajectory beside another or beside waypoints (`align_to_waypoints`):
+    `path` as it is where that is impossible."""
     try:
+        if isinstance(other, Waypoints):
+            return align_to_waypoints(path, other)
         return align(path, other, how)
     except Undefined:
         return path
@@ -115,6 +166,21 @@ def turned_covariance(
         return covariance
     turn = rotation_z(relative_yaw(after.orientation, before.orientation))
     return turn @ covariance @ np.swapaxes(turn, 1, 2)
+
+
+def write_waypoints(path: Path, waypoints: Waypoints) -> None:
+    """Write a line `t x y` (s, m) for every waypoint."""
+    np.savetxt(path, np.column_stack(waypoints), fmt="%.9f", header=TXY)
+
+
+def read_waypoints(path: Path) -> Waypoints:
+    """Read what `write_waypoints` wrote. Raises `InputError` for anything else."""
+    table = read_text(path, separator=" ", header=False)
+    if table.width() != 3:
+        raise InputError(path, f"has {table.width()} columns, not 3", f"they are {TXY}")
+    table = table.renamed(TXY.split())
+    check_increasing(table.take("t"), path)
+    return Waypoints(table.take("t"), np.stack([table.take("x"), table.take("y")], 1))
 
 
 def write_tum(path: Path, trajectory: Trajectory) -> None:

@@ -16,9 +16,10 @@ from gnio_jax.commands import console
 from gnio_jax.config import DataConfig, EvaluateConfig, ModelConfig, TrainConfig
 from gnio_jax.data.simulated import walks as simulated
 from gnio_jax.errors import InputError
-from gnio_jax.evaluation import evaluate, report
+from gnio_jax.evaluation import evaluate, plots, report
 from gnio_jax.evaluation.evaluate import folder_name, resolve
 from tests.support import drawn_run
+from tests.support.estimators import with_waypoints
 from tests.support.filter_settings import changed
 
 ROOT = Path(__file__).parents[2]
@@ -137,6 +138,41 @@ def test_a_void_filter_is_in_the_files(workdir, monkeypatch):
     assert found["settings"]["definitions"] == report.DEFINITIONS
     rows = [np.loadtxt(path, ndmin=2) for path in sorted((done.folder / "trajectories").iterdir())]
     assert [len(each) for each in rows] == [1, 140]
+
+
+def test_walks_with_waypoints_beside_one_with_poses_and_alone(workdir, monkeypatch, tmp_path):
+    posed, other = (
+        simulated.pedestrian(seed, seed, "handheld", seconds, 50.0)
+        for seed, seconds in ((1, 15.0), (2, 14.0))  # one program with those of the command
+    )
+    tapped, walks = with_waypoints(other), [posed, with_waypoints(other)]
+    monkeypatch.setattr(data, "load", lambda *_: walks)
+    monkeypatch.setattr(plots, "DOTS_PER_INCH", 30)
+    done = evaluate(EvaluateConfig(str(workdir)))
+    found = json.loads((done.folder / "metrics.json").read_text())
+    first, second = found["sequences"].values()
+    assert "ate" in first and "leg_ratio" not in first and "reference" not in found["settings"]
+    assert "ate" not in second and second["legs"] == 3 and second["waypoint_rms"] > 0
+    assert second["nis"] > 0 and "waypoints, no poses" in second["notes"][0]
+    rows = found["reference_rows"]
+    assert rows["never_moves"]["mean"]["leg_ratio"] == 0
+    assert [*rows["perfect_displacements"]["sequences"]] == [posed.name]
+    drawn = [f"{name}.png" for name in (posed.name, tapped.name, "error_cdf")]
+    assert sorted(x.name for x in (done.folder / "plots").iterdir()) == sorted(drawn)
+    assert "at waypoints" in (done.folder / "report.html").read_text(encoding="utf-8")
+    assert [x.name for x in (done.folder / "waypoints").iterdir()] == [f"{tapped.name}.txt"]
+
+    walks[:] = [tapped]
+    alone = evaluate(EvaluateConfig(str(workdir), estimator="imu_only", plots=False)).report
+    assert alone.settings["reference"] == "waypoints"
+    assert alone.settings["initial_state"] == "static"
+    assert list(alone.reference_rows) == ["never_moves"]
+    for refused, remedy in (
+        ({"alignment": "se3"}, "leave it out"),
+        ({"estimator": "integrate"}, "--orientation filter"),
+    ):
+        with pytest.raises(InputError, match=f"^{tapped.name}: has waypoints.*{remedy}"):
+            evaluate(EvaluateConfig(str(workdir), plots=False, **refused))
 
 
 def name_of(run=TRAINED, **options):

@@ -150,7 +150,7 @@ def test_one_picture_for_each_sequence(tmp_path, estimates, made, with_divergenc
 
 def test_a_short_walk_and_a_name_of_any_bytes_are_drawn(tmp_path):
     seen = plots.view(estimate("a$x^$\udcff", 0))
-    parts = {name: part[:3] for name, part in seen._asdict().items() if name != "name"}
+    parts = {x: getattr(seen, x)[:3] for x in seen._fields if x not in ("name", "taps")}
     plots.save(tmp_path / "p.png", plots.sequence(seen._replace(**parts)))
     assert (tmp_path / "p.png").exists()
 

@@ -94,12 +94,12 @@ def test_trajectories_are_read_back_at_their_own_stamps(tmp_path, estimates, mad
     path, reference = without(whole.trajectory, ends), without(whole.reference, holes)
     of = [whole._replace(trajectory=path, reference=reference), *estimates[1:]]
     write(tmp_path / "e", made, of)
-    found = report.read_trajectories(tmp_path / "e", list(made.scores))
-    read, true = found["room 1/walk"]
+    first, _, blind = report.read_estimates(tmp_path / "e", list(made.scores))
+    read, true = first.trajectory, first.reference
     assert len(read.time) == 390
     np.testing.assert_allclose(read.position, path.position[:390], atol=1e-8)
     np.testing.assert_allclose(true.position, reference.position[:390], atol=1e-8)
-    assert not found["blind"][1].known.any()
+    assert not blind.reference.known.any() and blind.waypoints is None
 
 
 def test_evo_reads_the_trajectories(tmp_path, estimates, made):

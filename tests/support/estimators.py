@@ -12,7 +12,7 @@ from gnio_jax.evaluation import given_displacements, infer, no_displacements, pe
 from gnio_jax.evaluation.estimate import PERFECT_STD
 from gnio_jax.filtering import filter_setup
 from gnio_jax.models import Network
-from gnio_jax.types import Prediction
+from gnio_jax.types import Prediction, Waypoints
 
 RATE = 50.0
 CONFIG = DataConfig(rate=RATE)
@@ -39,6 +39,16 @@ def network(gain, log_std, log_std_gain=1.0, constant=(0.0, 0.0, 0.0)):
 
 
 NETWORK = network(0.05, -3.0)
+
+
+def with_waypoints(sequence, times=(0.5, 4.0, 7.0, 10.0)):
+    """A computed walk, of which waypoints alone are known."""
+    rows = np.searchsorted(sequence.time - sequence.time[0], times)
+    return sequence._replace(
+        valid=np.zeros_like(sequence.valid),
+        **{x: getattr(sequence, x) * np.nan for x in ("orientation", "position", "velocity")},
+        waypoints=Waypoints(sequence.time[rows], sequence.position[rows, :2]),
+    )
 
 
 def ready(walks, config=CONFIG, **how):
