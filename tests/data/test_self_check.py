@@ -78,6 +78,25 @@ def test_self_check_says_what_is_implausible(spoil, reason):
     assert any(reason in failure for failure in failures)
 
 
+@pytest.mark.parametrize(("turn", "passes"), [(0.1, False), (2.0, True)])
+def test_a_gyro_may_be_off_by_a_percent_of_what_it_turns(turn, passes):
+    # A drift that no constant bias explains: 8° in the median window, in which a slow walker turns
+    # 57° and a fast one 1146°.
+    sequence = circle(seconds=60.0, turn=turn)
+    drift = np.radians(0.06) * (sequence.time - 30.0)
+    check = self_check(sequence._replace(gyro=sequence.gyro + drift[:, None] * [0.0, 0.0, 1.0]))
+    assert 7.0 < check.gyro_consistency_degrees < 9.0
+    said = [failure for failure in check.failures if "in which it turns 57°" in failure]
+    assert (check.failures == ()) == passes and len(said) == (not passes)
+
+
+def test_a_clipped_accelerometer_is_named_as_the_reason():
+    sequence = circle()
+    sequence = sequence._replace(accel=0.9 * sequence.accel, attributes={"accel_clipped": 0.21})
+    (failure,) = self_check(sequence).failures
+    assert "mean of R·accel" in failure and "clips in 21% of the samples" in failure
+
+
 def test_self_check_spares_the_fast_who_do_not_walk_and_those_who_stand():
     sequence = circle()
     assert (

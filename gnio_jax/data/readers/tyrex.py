@@ -13,7 +13,8 @@ Layout: `datasets/{android,ios}/<Person>_<Device>_<Dist|NoDist>_<Way>/` with `ac
 - Qualisys: 60 Hz, mm, rotations body → world column by column, NaN where the body was lost. Its
   time is the record's plus the number in `timeAlignment.txt`, to 0.03 s.
 
-**Every gyro is raw**: no bias is taken off, and 0.1 rad/s remain on an iPhone 5.
+**Every gyro is raw**: no bias is taken off, and 0.1 rad/s remain on an iPhone 5. Runners reach the
+2 G at which two of the accelerometers clip (`accel_clipped`).
 
 The tracked body is a handle on the phone, whose axes are the phone's to a few degrees and whose
 origin is some cm away. `alignment.align` finds the mounting, the level and the clocks from each
@@ -32,6 +33,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from gnio_jax.data.alignment import BodyFit, TooLittle, align, without_jumps
@@ -66,6 +68,8 @@ WAYS = {
 
 LONGEST_RECORD = 3600.0
 """s; a record lasts two minutes."""
+CLIPS = (1.95, 2.15)
+"""G between which the accelerometers of Nexus 5 and iPhone 4S clip; the iPhone 5's reaches 6 G."""
 WIDEST = (0.2, 100.0)
 """m that the walks in a room span at least and at most; what spans less is not in mm."""
 FASTEST_TURN, FASTEST = np.radians(2000.0), 10.0
@@ -173,6 +177,7 @@ def read(folder: str | os.PathLike[str]) -> list[Sequence]:
         "truth": "Qualisys",
         "imu_compensated": "no",
         "licence": DATASET.licence,
+        "accel_clipped": clipped(phone.accel.values),
         "lag": float(np.mean(fit.lag)),
         "accel_delay_removed": fit.accel_delay,
         "gyro_unexplained": fit.gyro_unexplained,
@@ -217,6 +222,13 @@ def _check_fit(fit: BodyFit, walk: Walk) -> None:
             value = f"the {what} would be {found[what]:.3g} {unit}, at most {most:g} {unit}"
             problem = f"fits the phone only with what cannot be: {value} is plausible"
             raise Refusal(walk.track, problem, remedy)
+
+
+def clipped(accel: Float[np.ndarray, "n 3"]) -> float:
+    """Share of the samples (m/s²) at the ends of an accelerometer's range; 0 where it reaches
+    beyond `CLIPS`."""
+    felt = np.abs(accel).max(axis=1) / STANDARD_G
+    return float((felt > CLIPS[0]).mean()) if felt.max() < CLIPS[1] else 0.0
 
 
 # --- the phone's text
