@@ -3,7 +3,8 @@
 Surveyors hold a phone flat before them, and its +y axis (the long side, away from the body) points
 where they walk. So between two taps the path is known but for its scale and a small turn: the gyro,
 levelled slowly by gravity, gives the direction, and the bounce of the steps the speed, which is
-none where they pause. That dead reckoning is laid on the taps leg by leg. All of it is ours.
+none where they pause. That dead reckoning is laid on the waypoints leg by leg, after taps that are
+early or late were moved to where it fits best. All of it is ours.
 
 Points of the plane are complex numbers here: x + iy, and the ratio of two legs is a scale and a
 turn.
@@ -38,6 +39,9 @@ SHORTEST_LEG, FASTEST_LEG = 1.0, 2.5
 MOST_TURN, LEAST_STRAIGHT = np.radians(45.0), 0.5
 """rad by which a leg may be off the phone's direction, and how far it must come of its reckoned
 length: beyond these the phone was not held ahead."""
+TAP_STD, LEG_STD = 0.5, (0.2, 0.05)
+"""s by which a tap is early or late; m, and share of its length, by which a leg differs from the
+reckoned one (standard deviations)."""
 FEWEST_LEGS = 2
 """Below which no walk's yaw is believed."""
 MOST_RESIDUAL = 20.0
@@ -46,13 +50,26 @@ SHORTEST_SECONDS = 1.0
 """s of poses in a row below which a walk is of no use."""
 
 
-class Legs(NamedTuple):
-    """Dead reckoning of a walk by its phone, beside its waypoints."""
+class Walk(NamedTuple):
+    """Dead reckoning by the phone alone, in a level frame of any yaw."""
 
+    time: Float[np.ndarray, " n"]
+    """s."""
     velocity: Complex[np.ndarray, " n"]
-    """Along the y axis, in a level frame of any yaw; 1 is the walk's usual speed."""
+    """Along the y axis; 1 is the walk's usual speed."""
     way: Complex[np.ndarray, " n"]
     """Its integral, s."""
+    length: Float[np.ndarray, " n"]
+    """The integral of its size, s."""
+
+    def at(self, stamps: Float[np.ndarray, " k"], values: np.ndarray) -> np.ndarray:
+        """Values at its samples, at other stamps (s)."""
+        return np.asarray(np.interp(stamps, self.time, values))
+
+
+class Legs(NamedTuple):
+    """A walk's dead reckoning beside its waypoints."""
+
     ratio: Complex[np.ndarray, " k"]
     """Of each leg on the map to the reckoned one, m/s: its scale, and the turn onto the map."""
     fits: Bool[np.ndarray, " k"]
@@ -68,15 +85,18 @@ def with_poses(sequence: Sequence) -> Sequence:
 
     Positions are in the map's frame, z is 0. Not valid are legs on which nobody walked with the
     phone ahead (`Legs.fits`), what lies before the first tap and after the last, and what was not
-    measured. The attribute `yaw_residual_degrees` is the median angle between y axis and legs.
+    measured. The attribute `yaw_residual_degrees` is the median angle between y axis and legs, and
+    `taps_moved_seconds` by how much `settled` moved the taps (rms).
 
     Raises `Refusal` where that is above `MOST_RESIDUAL`, or too little of the walk is left.
     """
-    waypoints = sequence.waypoints
-    assert waypoints is not None
+    tapped = sequence.waypoints
+    assert tapped is not None
     time, step = sequence.time, float(np.median(np.diff(sequence.time)))
     level = levelled(sequence.gyro, sequence.accel, step)
-    legs = reckoned(level, sequence.accel, time, waypoints)
+    walk = reckoned(level, sequence.accel, time)
+    waypoints = settled(walk, tapped)
+    legs = legs_on(walk, waypoints)
     if legs.fits.sum() < FEWEST_LEGS:
         problem = f"somebody walked {legs.fits.sum()} of its {len(legs.fits)} legs with the phone"
         raise Refusal(sequence.name, f"{problem} ahead, at least {FEWEST_LEGS} are needed")
@@ -90,11 +110,12 @@ def with_poses(sequence: Sequence) -> Sequence:
     starts, stops = spans(valid).T
     if (stops - starts).max(initial=0) * step < SHORTEST_SECONDS:
         raise Refusal(sequence.name, f"no {SHORTEST_SECONDS:g} s of it lie on a leg")
-    corner = _plane(waypoints.position)[:-1] - legs.ratio * _at(waypoints.time, time, legs.way)[:-1]
-    place, velocity = corner[leg] + legs.ratio[leg] * legs.way, legs.ratio[leg] * legs.velocity
+    start = _plane(waypoints.position)[:-1] - legs.ratio * walk.at(waypoints.time, walk.way)[:-1]
+    place, velocity = start[leg] + legs.ratio[leg] * walk.way, legs.ratio[leg] * walk.velocity
     known = valid[:, None]
     orientation = quaternions(about_z(np.full(len(time), legs.yaw)) * level)
-    about = {"reference": "waypoints", "yaw_residual_degrees": legs.residual}
+    moved = float(np.sqrt(np.mean((waypoints.time - tapped.time) ** 2)))
+    about = {"yaw_residual_degrees": legs.residual, "taps_moved_seconds": moved}
     return sequence._replace(
         orientation=np.where(known, orientation, np.nan),
         position=np.where(known, _space(place), np.nan),
@@ -125,29 +146,30 @@ def levelled(
 
 
 def reckoned(
-    level: Rotation,
-    accel: Float[np.ndarray, "n 3"],
-    time: Float[np.ndarray, " n"],
-    waypoints: Waypoints,
-) -> Legs:
-    """Dead reckoning between the taps. level: attitudes of `levelled` at the uniform stamps `time`
-    (s); accel: specific force, m/s².
-
-    The yaw is that of the legs that were walked, weighted by their lengths, and the less the
-    further they are off (Cauchy's weights about the weighted median).
-    """
+    level: Rotation, accel: Float[np.ndarray, "n 3"], time: Float[np.ndarray, " n"]
+) -> Walk:
+    """Dead reckoning by attitudes of `levelled` and the specific force `accel` (m/s²) at the
+    uniform stamps `time` (s)."""
     step = float(np.median(np.diff(time)))
     ahead = _plane(level.apply([0.0, 1.0, 0.0]))
     ahead = ahead / np.maximum(np.abs(ahead), 1e-9)
     speed = _speed(level.apply(accel)[:, 2], step)
-    way, length = _integral(ahead * speed, step), _integral(speed, step)
-    walked, far = (np.diff(_at(waypoints.time, time, each)) for each in (way, length))
+    return Walk(time, ahead * speed, _integral(ahead * speed, step), _integral(speed, step))
+
+
+def legs_on(walk: Walk, waypoints: Waypoints) -> Legs:
+    """The dead reckoning laid on the waypoints.
+
+    The yaw is that of the legs that were walked, weighted by their lengths, and the less the
+    further they are off (Cauchy's weights about the weighted median).
+    """
+    walked, far = (np.diff(walk.at(waypoints.time, each)) for each in (walk.way, walk.length))
     chord = np.diff(_plane(waypoints.position))
     on_foot = (np.abs(chord) >= SHORTEST_LEG) & (np.abs(walked) > LEAST_STRAIGHT * far)
     on_foot &= (np.abs(chord) <= FASTEST_LEG * np.diff(waypoints.time)) & (np.abs(walked) > 1e-3)
     ratio = np.divide(chord, walked, out=np.ones_like(chord), where=on_foot)
     if not on_foot.any():
-        return Legs(ahead * speed, way, ratio, on_foot, 0.0, np.inf)
+        return Legs(ratio, on_foot, 0.0, np.inf)
     turn, weight = np.angle(ratio[on_foot]), np.abs(chord[on_foot])
     # The weighted median on a circle is one of the angles.
     apart = np.abs(_wrapped(turn[:, None] - turn[None]))
@@ -159,7 +181,36 @@ def reckoned(
         yaw += float((share * off).sum() / share.sum())
     fits = on_foot & (np.abs(_wrapped(np.angle(ratio) - yaw)) <= MOST_TURN)
     residual = float(np.degrees(np.median(np.abs(_wrapped(turn - yaw)))))
-    return Legs(ahead * speed, way, ratio, fits, yaw, residual)
+    return Legs(ratio, fits, yaw, residual)
+
+
+def settled(walk: Walk, waypoints: Waypoints) -> Waypoints:
+    """The waypoints when the walker passed them, rather than when they were tapped.
+
+    Whoever taps late makes one leg long and the next one short. Taps move by as much as lets one
+    scale and one turn explain the walk's legs best, by robust least squares; `TAP_STD` holds them.
+    Those of a walk whose legs do not fit stay.
+    """
+    from scipy.optimize import least_squares  # it takes a fifth of a second to import
+
+    legs, (stamps, position) = legs_on(walk, waypoints), waypoints
+    if legs.fits.sum() < FEWEST_LEGS:
+        return waypoints
+    chord, first, last = np.diff(_plane(position)), walk.time[0], walk.time[-1]
+    std = LEG_STD[0] + LEG_STD[1] * np.abs(chord)
+
+    def errors(unknowns: np.ndarray) -> np.ndarray:
+        """Of the legs that fit, and of the taps, in standard deviations."""
+        (log_scale, turn), moved = unknowns[:2], unknowns[2:]
+        passed = walk.at(np.clip(stamps + moved, first, last), walk.way)
+        off = (chord - np.exp(log_scale + 1j * turn) * np.diff(passed)) / std
+        return np.concatenate([off.real[legs.fits], off.imag[legs.fits], moved / TAP_STD])
+
+    scale = float(np.median(np.abs(legs.ratio[legs.fits])))
+    guess = np.concatenate([[np.log(scale), legs.yaw], np.zeros(len(stamps))])
+    found = least_squares(errors, guess, loss="soft_l1", max_nfev=30).x
+    time = np.clip(stamps + found[2:], first, last)
+    return Waypoints(time, position) if (np.diff(time) > 0).all() else waypoints
 
 
 def _speed(vertical: Float[np.ndarray, " n"], step: float) -> Float[np.ndarray, " n"]:
@@ -176,13 +227,6 @@ def _speed(vertical: Float[np.ndarray, " n"], step: float) -> Float[np.ndarray, 
 
 def _integral(values: np.ndarray, step: float) -> np.ndarray:
     return np.concatenate([[0.0], np.cumsum(0.5 * step * (values[1:] + values[:-1]))])
-
-
-def _at(
-    stamps: Float[np.ndarray, " k"], time: Float[np.ndarray, " n"], values: np.ndarray
-) -> np.ndarray:
-    """Values along the plane, or real ones, at other stamps."""
-    return np.asarray(np.interp(stamps, time, values))
 
 
 def _plane(values: Float[np.ndarray, "n w"]) -> Complex[np.ndarray, " n"]:

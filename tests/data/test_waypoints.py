@@ -38,20 +38,22 @@ def test_exact_taps_give_the_attitude_and_the_path(seed):
     assert np.median(angle) < 7.0 and angle.max() < 12.0
     assert np.sqrt((place**2).mean()) < 0.2 and np.sqrt((speed**2).mean()) < 0.3
     inside = (found.time >= walk.ends[0]) & (found.time <= walk.ends[-1])
-    np.testing.assert_array_equal(found.valid, inside)
-    assert np.isnan(found.position[~inside]).all() and found.waypoints is None
+    assert (found.valid != inside).mean() < 0.01
+    assert np.isnan(found.position[~found.valid]).all() and found.waypoints is None
+    assert found.attributes["taps_moved_seconds"] < 0.1
     assert found.attributes["yaw_residual_degrees"] < 6.0
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_taps_a_second_early_or_late_move_positions_but_hardly_the_yaw(seed):
+def test_taps_a_second_early_or_late_are_moved_to_where_they_belong(seed):
     walk = survey(seed)
     late = np.random.default_rng(seed).uniform(-1.0, 1.0, 9)
-    angle, place, speed = off_truth(with_poses(walk.tapped(late)), walk.truth)
+    found = with_poses(walk.tapped(late))
+    angle, place, speed = off_truth(found, walk.truth)
     assert np.median(angle) < 9.0
-    # As far as the walker comes in the second.
-    assert place.max() < 1.6 and np.sqrt((place**2).mean()) < 0.9
-    assert np.sqrt((speed**2).mean()) < 0.6
+    # A walker comes 1.1 m in the second; with the taps as they are the path is 0.55 m off (rms).
+    assert np.sqrt((place**2).mean()) < 0.4 and np.sqrt((speed**2).mean()) < 0.3
+    assert found.attributes["taps_moved_seconds"] > 0.2
 
 
 def test_gravity_levels_a_gyro_that_drifts():
