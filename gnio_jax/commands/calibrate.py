@@ -28,35 +28,28 @@ def calibrate(asked: CalibrateConfig, _call: options.Call) -> None:
       {prog} --workdir runs/oxiod --average-headings
       {prog} --workdir runs/oxiod --out-of-fold runs/fold0 runs/fold1
     """
-    import jax  # late: mistakes do not wait for it
+    from gnio_jax import calibration  # late: mistakes do not wait for JAX
 
-    from gnio_jax import calibration, filtering
-
-    jax.config.update("jax_enable_x64", True)  # for the filter; the network states its float32
-    filtering.cores_as_devices()
+    console.prepare_filter()
     with console.terminal() as terminal:
         found = calibration.calibrate(asked, terminal.progress, usable_cores())
-    output = console.stdout()
-    table = Table("filter", "before", "calibrated")
-    before = configuration.flat(found.before)
+    table, before = Table("filter", "before", "calibrated"), configuration.flat(found.before)
     for name, value in configuration.flat(found.considered.settings).items():
         if value != before.get(name):
             table.add_row(name, _spelled(before.get(name)), _spelled(value))
-    output.print(table)
-    output.print(
+    console.say(table)
+    console.say(
         "-log-likelihood of an innovation, from the factors of the axes to the end of the fit: "
         f"{found.fit.before:.4f} -> {found.fit.after:.4f} "
-        f"({found.recordings} recordings, {found.fit.steps} steps)",
-        soft_wrap=True,
+        f"({found.recordings} recordings, {found.fit.steps} steps)"
     )
-    output.print(
+    console.say(
         "squared error of the position over the variance that the filter reports, per axis: "
-        f"{found.considered.before:.2f} -> {found.considered.after:.2f} with consider covariance",
-        soft_wrap=True,
+        f"{found.considered.before:.2f} -> {found.considered.after:.2f} with consider covariance"
     )
     for warning in found.fit.warnings:
         console.warn(warning)
-    output.print(f"look at it with: gnio evaluate --workdir {found.folder}", soft_wrap=True)
+    console.say(f"look at it with: gnio evaluate --workdir {found.folder}")
 
 
 def _spelled(value: Any) -> str:

@@ -35,17 +35,12 @@ def compare(asked: CompareConfig, _call: options.Call) -> None:
     """
     if asked.out is not None:
         _check_out(asked.out)  # or what was evaluated for it would be lost
-    import jax  # late: mistakes do not wait for it
+    from gnio_jax.apps import compare as comparison  # late: mistakes do not wait for JAX
 
-    from gnio_jax import filtering
-    from gnio_jax.apps import compare as comparison
-
-    jax.config.update("jax_enable_x64", True)  # for the filter; the network states its float32
-    filtering.cores_as_devices()
+    console.prepare_filter()
     with console.terminal() as terminal:
         found = comparison.compare(asked, terminal, usable_cores())
-    output = console.stdout()
-    output.print(f"{comparison.title(found)}\n", soft_wrap=True)
+    console.say(f"{comparison.title(found)}\n")
     table = Table(box=box.SIMPLE_HEAD, header_style="bold")
     table.add_column(overflow="fold", min_width=16)  # names have the width that is left
     for name in comparison.HEADER[2:]:
@@ -54,12 +49,12 @@ def compare(asked: CompareConfig, _call: options.Call) -> None:
         if metric:
             table.add_row(metric, style="bold")
         table.add_row(f"  {cells[0]}", *cells[1:])
-    output.print(table)
+    console.say(table)
     for line in comparison.explanations(found):
-        output.print(line)
+        console.say(line)
     if asked.out is not None:
         comparison.write(Path(asked.out), found)
-        output.print(f"\nresults: {asked.out}.md, .csv, .png", soft_wrap=True)
+        console.say(f"\nresults: {asked.out}.md, .csv, .png")
 
 
 def _check_out(out: str) -> None:

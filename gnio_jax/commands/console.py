@@ -11,7 +11,7 @@ import signal
 import sys
 import typing
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -25,6 +25,7 @@ from rich.progress import (
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
+from rich.table import Table
 from rich.text import Text
 
 import gnio_jax
@@ -135,6 +136,40 @@ def stdout() -> Console:
     """The console of results. Into a file or a pipe, lines are not cut to a terminal's width."""
     console = _Plain()
     return console if console.is_terminal else _Plain(width=200)
+
+
+def say(result: Any) -> None:
+    """Print a line of any length, or a table, on the console of results."""
+    stdout().print(result, soft_wrap=isinstance(result, str))
+
+
+def columns(*names: str, **options: Any) -> Table:
+    """A table with these columns, whose long words are folded."""
+    table = Table(**options)
+    for name in names:
+        table.add_column(name, overflow="fold")
+    return table
+
+
+def pairs(rows: Iterable[tuple[str, str]]) -> Table:
+    """A table of names and what they stand for, without lines."""
+    grid = Table.grid(padding=(0, 2))
+    grid.add_column(no_wrap=True)
+    grid.add_column(overflow="fold")
+    for row in rows:
+        grid.add_row(*row)
+    return grid
+
+
+def prepare_filter() -> None:
+    """JAX as the filter of many recordings takes it: with float64, while the network states its
+    float32, and a device for each core. It imports JAX, for which a mistake should not wait."""
+    import jax
+
+    from gnio_jax import filtering
+
+    jax.config.update("jax_enable_x64", True)
+    filtering.cores_as_devices()
 
 
 class Terminal:

@@ -5,16 +5,14 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
-from rich.table import Table
-
 from gnio_jax.commands import console, options
-from gnio_jax.config.schema import UNNAMED
+from gnio_jax.config.schema import UNNAMED, Rate
 from gnio_jax.errors import InputError
 from gnio_jax.files import write_text
 
@@ -51,7 +49,7 @@ class ConvertOptions(_Dataset):
 
     out: Annotated[Path, UNNAMED]
     """Folder for the result."""
-    rate: float | None = None
+    rate: Rate | None = None
     """Rate of the result, Hz; by default each recording's own."""
 
 
@@ -66,32 +64,27 @@ def show_list(asked: ListOptions, _call: options.Call) -> None:
     """
     from gnio_jax import data  # late: mistakes do not wait for JAX
 
-    grid = Table.grid(padding=(0, 2))
-    grid.add_column(no_wrap=True)
-    grid.add_column(overflow="fold")
-    for name in data.names():
-        dataset = data.get(name)
+    rows = []
+    for dataset in map(data.get, data.names()):
         splits = ", ".join(dataset.splits)
-        about = f"{dataset.rate:g} Hz; splits {splits}; {dataset.licence}"
-        grid.add_row(name, about, style="bold")
-        grid.add_row("  here", _found_here(dataset))
-        grid.add_row("  source", dataset.source)
-        if dataset.needs_root:
-            grid.add_row("  layout", dataset.layout)
-    output = console.stdout()
-    output.print(grid)
+        rows += [
+            (dataset.name, f"{dataset.rate:g} Hz; splits {splits}; {dataset.licence}"),
+            ("  here", _found_here(dataset)),
+            ("  source", dataset.source),
+            *([("  layout", dataset.layout)] if dataset.needs_root else []),
+        ]
+    console.say(console.pairs(rows))
     bases = [os.environ["GNIO_DATA"]] if os.environ.get("GNIO_DATA") else []
     other = "another place is named by --data-root, or GNIO_DATA for all of them"
-    output.print(f"looked in {' and '.join([*bases, 'data'])}; {other}")
+    console.say(f"looked in {' and '.join([*bases, 'data'])}; {other}")
 
 
 def _found_here(dataset: Any) -> str:
     """Of a `Dataset`: its folder and the recordings of each split."""
-    from gnio_jax import data
     from gnio_jax.data.loading import find_recordings
 
     try:
-        root = data.find_root(dataset.name) if dataset.needs_root else Path(".")
+        _, root = _find(dataset.name, None)
     except InputError:
         return "not found"
     place = f"{root}: " if dataset.needs_root else "computed: "
@@ -126,20 +119,19 @@ def check(asked: CheckOptions, _call: options.Call) -> None:
         progress = partial(terminal.progress, "checking")
         rows, notes = loading.check(dataset, root, asked.split, asked.plots, None, progress)
     place = f" at {root}" if dataset.needs_root else ""
-    table = Table(title=f"{dataset.name}{place}, split {asked.split}", title_justify="left")
-    for column in ("sequence", "split"):
-        table.add_column(column, overflow="fold")
-    for column in _FIGURES:
+    title = f"{dataset.name}{place}, split {asked.split}"
+    table = console.columns("sequence", "split", title=title, title_justify="left")
+    for column in (*_FIGURES, ""):
         table.add_column(column, justify="right", no_wrap=True)
-    table.add_column("", no_wrap=True)
-    output = console.stdout()
     for row in rows:
-        table.add_row(*_figures(row), style="red" if row.reason else None)
-    output.print(table)
+        cells = (figure(row.check) if row.check else "–" for figure in _FIGURES.values())
+        state, style = ("left out", "red") if row.reason else ("used", None)
+        table.add_row(row.name, ", ".join(row.splits), *cells, state, style=style)
+    console.say(table)
     _print_reasons({row.name: row.reason for row in rows if row.reason}, notes)
     used, count = [row for row in rows if not row.reason], len(rows)
     hours = sum(row.check.duration for row in used if row.check) / 3600
-    output.print(f"{len(used)} of {count} sequences are used, {hours:.2f} h")
+    console.say(f"{len(used)} of {count} sequences are used, {hours:.2f} h")
     if asked.json:
         found = {
             "dataset": dataset.name,
@@ -150,45 +142,27 @@ def check(asked: CheckOptions, _call: options.Call) -> None:
         }
         write_text(asked.json, json.dumps(found, indent=2, ensure_ascii=False) + "\n")
     if asked.plots:
-        output.print(f"pictures: {asked.plots}", soft_wrap=True)
+        console.say(f"pictures: {asked.plots}")
     if not used:
         raise InputError(root, f"none of {count} sequences can be used", "see the reasons above")
 
 
-_FIGURES = (
-    "s",
-    "Hz",
-    "mean of R·accel\nm/s²",
-    "gyro\n°/10 s",
-    "speed\nm/s",
-    "accel\ncorr.",
-    "valid",
-)
+def _two_digits(*values: float) -> str:
+    if any(map(math.isnan, values)):
+        return "–"
+    return " ".join(f"{round(value, 2) + 0.0:.2f}" for value in values)  # no −0.00
 
 
-def _figures(row: Any) -> list[str]:
-    """The cells of a `loading.Checked`."""
-    found, splits = row.check, ", ".join(row.splits)
-    if found is None:
-        return [row.name, splits, *["–"] * len(_FIGURES), "left out"]
-
-    def cell(*values: float) -> str:
-        if any(map(math.isnan, values)):
-            return "–"
-        return " ".join(f"{round(value, 2) + 0.0:.2f}" for value in values)  # no −0.00
-
-    return [
-        row.name,
-        splits,
-        f"{found.duration:.1f}",
-        f"{found.rate:.1f}",
-        cell(*found.gravity_mean),
-        cell(found.gyro_consistency_degrees),
-        cell(found.median_speed),
-        cell(found.accel_correlation_horizontal),
-        f"{found.share_valid:.1%}",
-        "left out" if row.reason else "used",
-    ]
+_FIGURES: dict[str, Callable[[Any], str]] = {
+    "s": lambda found: f"{found.duration:.1f}",
+    "Hz": lambda found: f"{found.rate:.1f}",
+    "mean of R·accel\nm/s²": lambda found: _two_digits(*found.gravity_mean),
+    "gyro\n°/10 s": lambda found: _two_digits(found.gyro_consistency_degrees),
+    "speed\nm/s": lambda found: _two_digits(found.median_speed),
+    "accel\ncorr.": lambda found: _two_digits(found.accel_correlation_horizontal),
+    "valid": lambda found: f"{found.share_valid:.1%}",
+}
+"""Columns of a `SelfCheck`."""
 
 
 def _json(row: Any) -> dict[str, Any]:
@@ -215,9 +189,6 @@ def convert(asked: ConvertOptions, _call: options.Call) -> None:
       {prog} tlio ~/converted/tlio_100 --data-root ~/tlio --rate 100
       gnio train --dataset csv --data-root ~/converted/oxiod
     """
-    if asked.rate is not None and not 1.0 <= asked.rate <= 10000.0:
-        problem = f"{asked.rate:g} Hz is no rate to resample to"
-        raise InputError("--rate", problem, "give 1 to 10000 Hz")
     from gnio_jax.data import loading  # late: mistakes do not wait for JAX
 
     dataset, root = _find(asked.name, asked.data_root)
@@ -226,12 +197,10 @@ def convert(asked: ConvertOptions, _call: options.Call) -> None:
         result = loading.convert(dataset, root, asked.out, asked.split, asked.rate, None, progress)
     _print_reasons(result.left_out, result.notes)
     counts = ", ".join(f"{split} {len(stems)}" for split, stems in result.sequences.items())
-    output = console.stdout()
-    summary = f"{asked.out}: {result.files} sequences, {result.hours:.2f} h ({counts})"
-    output.print(summary, soft_wrap=True)
+    console.say(f"{asked.out}: {result.files} sequences, {result.hours:.2f} h ({counts})")
     learnable = {"train", "val"} <= result.sequences.keys()
     following = "gnio train --dataset csv" if learnable else "gnio data check csv"
-    output.print(f"next: {following} --data-root {asked.out}", soft_wrap=True)
+    console.say(f"next: {following} --data-root {asked.out}")
 
 
 def _find(name: str, data_root: str | None) -> tuple[Any, Path]:
@@ -243,8 +212,7 @@ def _find(name: str, data_root: str | None) -> tuple[Any, Path]:
 
 
 def _print_reasons(left_out: dict[str, str], notes: list[str]) -> None:
-    output = console.stdout()
     for name, reason in left_out.items():
-        output.print(f"left out: {name}: {reason}", soft_wrap=True)
+        console.say(f"left out: {name}: {reason}")
     for note in dict.fromkeys(notes):
-        output.print(f"note: {note}", soft_wrap=True)
+        console.say(f"note: {note}")

@@ -9,8 +9,6 @@ import platform
 from dataclasses import dataclass
 from pathlib import Path
 
-from rich.table import Table
-
 from gnio_jax.commands import console, options
 from gnio_jax.errors import InputError
 
@@ -46,12 +44,7 @@ def doctor(asked: DoctorOptions, _call: options.Call) -> None:
     if asked.json:
         print(json_format.dumps(found, indent=2, ensure_ascii=False))
         return
-    grid = Table.grid(padding=(0, 2))
-    grid.add_column(no_wrap=True)
-    grid.add_column(overflow="fold")
-    for name, text in found.items():
-        grid.add_row(name, text)
-    console.stdout().print(grid)
+    console.say(console.pairs(found.items()))
 
 
 def _version(name: str) -> str:

@@ -24,31 +24,26 @@ def evaluate(asked: EvaluateConfig, call: options.Call) -> None:
       {prog} --workdir runs/tlio --estimator integrate --orientation device
       {prog} --workdir runs/tlio --set filter.noise.measurement_scale=1
     """
-    import jax  # late: mistakes do not wait for it
-
-    from gnio_jax import evaluation, filtering
+    from gnio_jax import evaluation  # late: mistakes do not wait for JAX
     from gnio_jax.apps import rerun
     from gnio_jax.evaluation import tabulate
     from gnio_jax.evaluation.estimate import in_one_frame
 
     if asked.rerun:
         rerun.check(asked.rerun)
-    jax.config.update("jax_enable_x64", True)  # for the filter; the network states its float32
-    filtering.cores_as_devices()
+    console.prepare_filter()
     with console.terminal() as terminal:
         found = evaluation.evaluate(asked, terminal, usable_cores(), str(call))
-    output = console.stdout()
-    output.print(tabulate.render(found.report))
-    output.print(f"results: {found.folder}", soft_wrap=True)
+    console.say(tabulate.render(found.report))
+    console.say(f"results: {found.folder}")
     if asked.rerun:
-        pairs = zip(found.estimates, found.recordings, strict=True)
         logged = [
             rerun.Logged(in_one_frame(estimate, asked.alignment), recording)
-            for estimate, recording in pairs
+            for estimate, recording in zip(found.estimates, found.recordings, strict=True)
         ]
         rerun.write(Path(asked.rerun), logged)
-        output.print(f"for Rerun: {asked.rerun}", soft_wrap=True)
+        console.say(f"for Rerun: {asked.rerun}")
     if asked.plots:
-        output.print(f"page: {found.folder / 'report.html'} (open it in a browser)", soft_wrap=True)
+        console.say(f"page: {found.folder / 'report.html'} (open it in a browser)")
         pictures = found.folder / "plots" / "error_cdf.png"
-        output.print(f"pictures: {pictures}, and there <name>.png of each sequence", soft_wrap=True)
+        console.say(f"pictures: {pictures}, and there <name>.png of each sequence")

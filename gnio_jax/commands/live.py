@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import io
 import math
-import signal
 import socket
 import sys
 import threading
@@ -19,11 +18,14 @@ import numpy as np
 
 from gnio_jax.commands import console, options
 from gnio_jax.config import ImportOptions
-from gnio_jax.config.schema import UNNAMED
+from gnio_jax.config.schema import UNNAMED, Bound, NonNegative, Positive
 from gnio_jax.errors import InputError
 from gnio_jax.files import check_writable
 
 UDP = "udp:"
+Waiting = Annotated[
+    float, Bound(lambda value: 0 <= value <= threading.TIMEOUT_MAX, "must be a time to wait, s")
+]
 DRAWN_EVERY = 0.125
 """s. A drawing looks at the whole path: one for each pose would fall behind a long stream."""
 
@@ -45,13 +47,13 @@ class LiveOptions:
     """Unit of the gyro; rad/s of a stream, of a recording what it says."""
     accel_unit: Literal["m/s2", "g", "mg"] | None = None
     """Unit of the accelerometer; m/s2 of a stream, of a recording what it says."""
-    imu_rate: float | None = None
+    imu_rate: Positive | None = None
     """Samples per second that will come, Hz; by default it is measured."""
     rest_seconds: float = 1.0
     """How long the device lies still at the start, s."""
-    speed: float = 1.0
+    speed: NonNegative = 1.0
     """Of a recording: how many times as fast as it was taken; 0 as fast as can be."""
-    silence: float | None = None
+    silence: Waiting | None = None
     """Of datagrams: end when after the first nothing has come for so many seconds."""
 
 
@@ -71,8 +73,6 @@ def live(asked: LiveOptions, _call: options.Call) -> None:
       {prog} walk.zip --speed 4                      a recording or bag, four times as fast
     """
     inbox = _listen(asked) if asked.source.startswith(UDP) else None  # before all that takes time
-    if asked.speed < 0:
-        raise InputError("--speed", f"must not be negative, found {asked.speed:g}")
     console.compile_quickly()
     import jax  # late: mistakes do not wait for it
 
@@ -87,11 +87,7 @@ def live(asked: LiveOptions, _call: options.Call) -> None:
     if asked.rerun:
         rerun.check(asked.rerun)
     weights = packages.choose(asked.weights)
-    run, output = weights.run, console.stdout()
-
-    def say(line: str) -> None:
-        output.print(line, soft_wrap=True)
-
+    run, say = weights.run, console.say
     say(f"following {asked.source} with {weights.name}; Ctrl-C ends it")
     stream, rate = None, 0.0
     if datagrams is None and asked.source != "-":
@@ -128,18 +124,20 @@ def live(asked: LiveOptions, _call: options.Call) -> None:
         stream = following.measured(stream, begin, asked.imu_rate)
     else:
         following.expect(tracker, found, run, rate)
-    stopped: list[tuple[str, int]] = []
+    stopped: BaseException | None = None
     with contextlib.ExitStack() as running:
         sent = running.enter_context(rerun.streaming(asked.rerun)) if asked.rerun else None
-        show = running.enter_context(_shown(output))
-        running.enter_context(_signals(stopped))
+        show = running.enter_context(_shown())
 
         def on_pose(found: Any) -> None:
             if sent is not None:
                 sent.add(found.pose)
             show(found)
 
-        following.follow(tracker.push, stream, found, on_pose)
+        try:
+            following.follow(tracker.push, stream, found, on_pose)
+        except (KeyboardInterrupt, SystemExit) as leaving:  # Ctrl-C, SIGTERM: of the stream alone
+            stopped = leaving
     for warning in found.warnings():
         say(f"warning: {warning}")
     if found.pose is not None:
@@ -147,9 +145,8 @@ def live(asked: LiveOptions, _call: options.Call) -> None:
         if asked.out:
             following.write_trajectory(asked.out, found)
             say(f"trajectory: {asked.out}")
-    for word, status in stopped:
-        print(word, file=sys.stderr)
-        raise SystemExit(status)
+    if stopped is not None:
+        raise stopped
     if found.pose is None:
         raise _no_start(found, stream.name, asked.rest_seconds)
 
@@ -159,8 +156,6 @@ def _listen(asked: LiveOptions) -> socket.socket:
     host, _, port = asked.source.removeprefix(UDP).rpartition(":")
     if not (port.isascii() and port.isdecimal() and 0 < int(port[:6]) < 2**16):
         raise InputError(asked.source, "names no port", "write udp:5555 or udp:0.0.0.0:5555")
-    if asked.silence is not None and not 0 <= asked.silence <= threading.TIMEOUT_MAX:
-        raise InputError("--silence", f"{asked.silence:g} s is no time to wait")
     inbox = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     try:
         inbox.bind((host or "127.0.0.1", int(port)))
@@ -185,12 +180,12 @@ def _no_start(found: Any, name: str, rest_seconds: float) -> InputError:
 
 
 @contextlib.contextmanager
-def _shown(output: Any) -> Iterator[Callable[[Any], None]]:
-    """What is called after each clone step: it draws on the `rich` console of a terminal, and
-    prints a line each second on another one."""
+def _shown() -> Iterator[Callable[[Any], None]]:
+    """What is called after each clone step: in a terminal it draws the path, elsewhere it prints a
+    line each second."""
     from gnio_jax.apps import live as following
 
-    shown = -math.inf
+    output, shown = console.stdout(), -math.inf
 
     def print_each_second(found: Any) -> None:
         nonlocal shown
@@ -216,16 +211,3 @@ def _shown(output: Any) -> Iterator[Callable[[Any], None]]:
             shown = time.monotonic()
 
         yield draw
-
-
-@contextlib.contextmanager
-def _signals(stopped: list[tuple[str, int]]) -> Iterator[None]:
-    """Ctrl-C and SIGTERM end the block alone; `stopped` has then what to say and the status."""
-    try:
-        yield
-    except KeyboardInterrupt:
-        stopped.append(("interrupted", 128 + signal.SIGINT))
-    except SystemExit as leaving:  # of the handler of `console.run`
-        if leaving.code != 128 + signal.SIGTERM:
-            raise
-        stopped.append(("terminated", 128 + signal.SIGTERM))

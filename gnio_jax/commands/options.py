@@ -200,7 +200,10 @@ def _parser(
     text = (inspect.getdoc(command) or "").format(prog=prog, configs=configs)
     about, _, examples = text.partition("\nexamples:\n")
     width = min(WIDTH, shutil.get_terminal_size().columns)
-    words = [option.name for option in options.values() if not option.words.named]
+    words = (option for option in options.values() if not option.words.named)
+    usage = (
+        each.name if each.default is dataclasses.MISSING else f"[{each.name}]" for each in words
+    )
 
     def paragraphs(text: str) -> str:
         filled = (" ".join(each.split()) for each in text.strip().split("\n\n"))
@@ -210,11 +213,13 @@ def _parser(
 
     parser = argparse.ArgumentParser(
         prog=prog,
-        usage=" ".join([prog, *words, "[OPTIONS]"]),
+        usage=" ".join([prog, *usage, "[OPTIONS]"]),
         description=paragraphs(about),
         epilog=(f"{prog} -H explains the options.\n\n" if brief else "") + f"examples:\n{examples}",
         formatter_class=partial(
-            argparse.RawDescriptionHelpFormatter, width=width, max_help_position=28
+            argparse.RawDescriptionHelpFormatter,
+            width=width,
+            max_help_position=44 if brief else 28,
         ),
         argument_default=argparse.SUPPRESS,
         allow_abbrev=False,

@@ -8,7 +8,7 @@ from typing import Annotated
 
 from gnio_jax.commands import console, options
 from gnio_jax.config import ImportOptions
-from gnio_jax.config.schema import UNNAMED
+from gnio_jax.config.schema import UNNAMED, Rate
 from gnio_jax.errors import InputError
 
 HDF5 = (".h5", ".hdf5")
@@ -22,7 +22,7 @@ class ImportFile:
     """The recording: a file or folder; of two CSVs the gyro's."""
     out: Path
     """HDF5 file to write, NAME.h5."""
-    rate: float | None = None
+    rate: Rate | None = None
     """Rate of the result, Hz; by default that of the faster sensor."""
     name: str | None = None
     """Name of the sequence; by default that of the file OUT."""
@@ -81,13 +81,12 @@ def import_file(asked: ImportFile, _call: options.Call) -> None:
             f"{folder} holds CSV files too: gnio evaluate would read them as recordings; write "
             "the imported ones to a folder of their own"
         )
-    output = console.stdout()
-    output.print(f"{asked.out}: {sequence.name}", soft_wrap=True)
+    console.say(f"{asked.out}: {sequence.name}")
     for line in lines:
-        output.print(f"  {line}", soft_wrap=True)
+        console.say(f"  {line}")
     for warning in recording.warnings:
-        output.print(f"warning: {warning}", soft_wrap=True)
-    output.print(f"next: {following}", soft_wrap=True)
+        console.say(f"warning: {warning}")
+    console.say(f"next: {following}")
 
 
 def export_file(asked: ExportFile, _call: options.Call) -> None:
@@ -105,4 +104,4 @@ def export_file(asked: ExportFile, _call: options.Call) -> None:
     trajectory = read_tum(asked.trajectory)
     count = export(asked.out, trajectory)
     seconds = trajectory.time[-1] - trajectory.time[0]
-    console.stdout().print(f"{asked.out}: {count} poses, {seconds:.1f} s", soft_wrap=True)
+    console.say(f"{asked.out}: {count} poses, {seconds:.1f} s")

@@ -27,18 +27,13 @@ def tables(asked: TablesConfig, _call: options.Call) -> None:
       {prog} trajectories --base ...                 all methods over the reference, one picture
       {prog} standing --base ...                     errors at rest and in slow walking
     """
-    import jax  # late: mistakes do not wait for it
+    from gnio_jax.tables import make, runs  # late: mistakes do not wait for JAX
 
-    from gnio_jax import filtering
-    from gnio_jax.tables import make, runs
-
-    # For the filter; training and the networks state their float32.
-    jax.config.update("jax_enable_x64", True)
-    filtering.cores_as_devices()
+    console.prepare_filter()
     try:
         with console.terminal() as terminal:
             text = make.make(asked, terminal, usable_cores())
     except runs.Interrupted as stopped:
         print("stopped and saved; the same command goes on from here", file=sys.stderr)
         sys.exit(128 + stopped.signum)
-    console.stdout().print(text, soft_wrap=True)
+    console.say(text)

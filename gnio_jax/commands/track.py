@@ -65,14 +65,13 @@ def track(asked: TrackOptions, call: options.Call) -> None:
         terminal.progress("compiling and tracking", 0.0)
         how = {"command": str(call), "rerun_file": asked.rerun}
         found = tracking.track(recording, weights, out, asked.format, **how)
-    output = console.stdout()
     for note in found.summary.notes:
-        output.print(f"  {note}", soft_wrap=True)
-    output.print(_table(found.summary))
+        console.say(f"  {note}")
+    console.say(_table(found.summary))
     for warning in found.summary.warnings:
-        output.print(f"warning: {warning}", soft_wrap=True)
-    output.print(found.summary.limits, soft_wrap=True)
-    output.print(f"results: {found.folder} (look at track.png, report.html)", soft_wrap=True)
+        console.say(f"warning: {warning}")
+    console.say(found.summary.limits)
+    console.say(f"results: {found.folder} (look at track.png, report.html)")
 
 
 def _folder_name(name: str) -> str:

@@ -54,8 +54,6 @@ def train(asked: TrainOptions, call: options.Call) -> None:
       {prog} --config quickstart --set filter.noise.gyro_density=1e-3 --set optim.clip_norm=null
       {prog} --config through_filter_oxiod --init-from runs/oxiod_calibrated --workdir runs/through
     """
-    if "--seeds" in call.argv and not asked.seeds:
-        configuration.with_seeds(asked, asked.seeds)  # says so
     config = experiment(asked, call)
     from gnio_jax import filtering, parallel  # late: mistakes do not wait for JAX
     from gnio_jax.apps import packages

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Annotated
 
 from rich import box
-from rich.table import Table
 
 from gnio_jax.commands import console, options
 from gnio_jax.config.schema import UNNAMED
@@ -69,25 +68,16 @@ def weights(asked: WeightsOptions, _call: options.Call) -> None:
         raise InputError(f"--out {asked.out}", "is for one package", "name it before --out")
     from gnio_jax.apps import packages  # late: mistakes do not wait for JAX
 
-    output = console.stdout()
-    if asked.name is None:
-        _list_packages()
-    elif asked.out is None:
-        output.print(packages.card_of(asked.name), soft_wrap=True)
-    else:
+    if asked.name is not None and asked.out is not None:
         packages.write_run(asked.name, asked.out)
         following = f"gnio evaluate --workdir {asked.out} --dataset ..."
-        output.print(f"run: {asked.out}; next: {following}", soft_wrap=True)
-
-
-def _list_packages() -> None:
-    """A line per package; one that is damaged has its fault in its line."""
-    from gnio_jax.apps import packages
-
-    output, damaged = console.stdout(), []
-    grid = Table(box=box.SIMPLE_HEAD)
-    for heading in ("name", "size", "network", "trained on", "licence", "measured"):
-        grid.add_column(heading, overflow="fold")
+        console.say(f"run: {asked.out}; next: {following}")
+        return
+    if asked.name is not None:
+        console.say(packages.card_of(asked.name))
+        return
+    damaged, headings = [], ("name", "size", "network", "trained on", "licence", "measured")
+    grid = console.columns(*headings, box=box.SIMPLE_HEAD)
     for name, place in packages.packages().items():
         try:
             about = packages.read_about(place)
@@ -97,11 +87,11 @@ def _list_packages() -> None:
         size, measured = f"{about.weights['bytes'] / 1e6:.2f} MB", about.measured or "–"
         grid.add_row(name, size, about.network, about.data, about.license, measured)
     if grid.row_count:
-        output.print(grid)
+        console.say(grid)
     elif not damaged:
-        output.print("no packages; gnio publish makes one of a run, $GNIO_WEIGHTS says where")
+        console.say("no packages; gnio publish makes one of a run, $GNIO_WEIGHTS says where")
     for line in damaged:
-        output.print(line, soft_wrap=True)
+        console.say(line)
 
 
 def publish(asked: PublishOptions, _call: options.Call) -> None:
@@ -121,13 +111,12 @@ def publish(asked: PublishOptions, _call: options.Call) -> None:
     name = asked.name or asked.out.name.removesuffix(".zip")
     said = packages.Description(name, asked.data, asked.license, asked.fails)
     about = packages.publish(asked.run, asked.out, said)
-    output = console.stdout()
     size = f"{about.weights['bytes'] / 1e6:.2f} MB"
-    output.print(f"{asked.out}: {about.name}, network {about.network}, {size}", soft_wrap=True)
+    console.say(f"{asked.out}: {about.name}, network {about.network}, {size}")
     if not about.measured:
         line = "the run holds no evaluation, so the card has no figures: gnio evaluate"
-        output.print(f"warning: {line} --workdir {asked.run}", soft_wrap=True)
-    output.print(f"next: gnio track RECORDING --weights {asked.out}", soft_wrap=True)
+        console.say(f"warning: {line} --workdir {asked.run}")
+    console.say(f"next: gnio track RECORDING --weights {asked.out}")
 
 
 def export(asked: ExportOptions, _call: options.Call) -> None:
@@ -152,16 +141,13 @@ def export(asked: ExportOptions, _call: options.Call) -> None:
     with console.terminal() as terminal:
         terminal.progress("exporting and measuring", 0.0)
         found = onnx.export_run(asked.run, out)
-    output = console.stdout()
     for file, size in found.bytes.items():
-        output.print(f"  {out / file}  {size / 1e6:.2f} MB", soft_wrap=True)
-    deviation = found.deviation
-    for line in (
-        "against gnio-jax, over a simulated walk:",
-        f"  displacement of a window  rms {deviation.displacement_rms:.2g} m, "
-        f"largest {deviation.displacement_largest:.2g} m",
-        f"  position                  largest {deviation.position_largest:.2g} m",
-        f"  ATE                       {deviation.ate:.3f} m "
-        f"(gnio-jax {deviation.ate_of_package:.3f} m)",
-    ):
-        output.print(f"  {line}", soft_wrap=True)
+        console.say(f"  {out / file}  {size / 1e6:.2f} MB")
+    far = found.deviation
+    rms, largest = f"rms {far.displacement_rms:.2g} m", f"{far.displacement_largest:.2g} m"
+    console.say("  against gnio-jax, over a simulated walk:")
+    console.say(f"    displacement of a window  {rms}, largest {largest}")
+    console.say(f"    position                  largest {far.position_largest:.2g} m")
+    console.say(
+        f"    ATE                       {far.ate:.3f} m (gnio-jax {far.ate_of_package:.3f} m)"
+    )

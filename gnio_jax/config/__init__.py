@@ -30,7 +30,6 @@ from gnio_jax.config.requests import (
     TablesConfig,
 )
 from gnio_jax.config.schema import (
-    FILE_ONLY,
     AugmentConfig,
     ConsideredStd,
     CorrelatedError,
@@ -46,7 +45,6 @@ from gnio_jax.config.schema import (
 )
 
 __all__ = [
-    "FILE_ONLY",
     "AugmentConfig",
     "CalibrateConfig",
     "CompareConfig",

@@ -136,7 +136,7 @@ def parse(content: str, source: str, base: TrainConfig | None = None) -> TrainCo
     fields = _yaml(content, source)
     if fields is None:
         raise InputError(source, "is empty", "write settings into it, e.g. seed: 0")
-    if isinstance(fields, dict) and _is_of_earlier_version(fields):
+    if _is_of_earlier_version(fields):
         fields = _of_earlier_version(fields, source)
     return _section(base or TrainConfig(), fields, Place(source))
 
@@ -409,11 +409,12 @@ _GONE = {
 """Settings that are no more, and the value with which each changed nothing; `...` is any."""
 
 
-def _is_of_earlier_version(fields: dict[str, Any]) -> bool:
+def _is_of_earlier_version(fields: Any) -> bool:
     """Whether it is the config.yaml that an earlier version left: a whole one."""
-    sections = [name for name, value in vars(TrainConfig()).items() if is_section(type(value))]
-    whole = all(isinstance(fields.get(name), dict) for name in sections)
-    return whole and "checkpoint_every_seconds" in fields
+    if not isinstance(fields, dict) or "checkpoint_every_seconds" not in fields:
+        return False
+    sections = (name for name, value in vars(TrainConfig()).items() if is_section(type(value)))
+    return all(isinstance(fields.get(name), dict) for name in sections)
 
 
 def _of_earlier_version(old: dict[str, Any], source: str) -> dict[str, Any]:
@@ -438,10 +439,10 @@ def _of_earlier_version(old: dict[str, Any], source: str) -> dict[str, Any]:
     sections["noise"]["std_factor"] = [flat.pop(f"std_factor_{axis}", 1.0) for axis in "xyz"]
     if share:
         sections["noise"]["correlation"] = {"share": share, "seconds": seconds}
-    for name, value in zip(map(str, flat), flat.values(), strict=True):
-        path = _MOVED.get(name.removesuffix("_degrees")) or name
+    for name, value in flat.items():
+        path = _MOVED.get(str(name).removesuffix("_degrees"), str(name))
         section, _, field = path.rpartition(".")
-        if name.endswith("_degrees"):
+        if str(name).endswith("_degrees"):
             value = checked_value(float, value, Place(source, f"filter.{name}")) * (math.pi / 180)
         (sections[section] if section else sections)[field] = value
     return new

@@ -71,6 +71,7 @@ NonNegativeCount = Annotated[
     int, Bound(lambda value: 0 <= value < 2**31, "must not be negative and below 2^31")
 ]
 Seed = Annotated[int, Bound(lambda value: 0 <= value < 2**32, "must be from 0 to 2^32 - 1")]
+Rate = Annotated[float, Bound(lambda value: 1 <= value <= 10000, "must be from 1 to 10000 Hz")]
 TwoOrThree = Annotated[int, Bound(lambda value: value in (2, 3), "must be 2 or 3")]
 
 

@@ -49,6 +49,8 @@ def refuse_other_run(config: TrainConfig, resume: bool) -> Path:
     if not parallel.is_first():
         return workdir
     if not resume:
+        if workdir.is_file():
+            raise InputError(workdir, "is a file", "name a folder with --workdir")
         if kept.exists():
             remedy = "continue it with --resume, or choose another --workdir"
             raise InputError(workdir, "already holds a run", remedy)

@@ -47,13 +47,7 @@ def mistake(monkeypatch, capsys, tmp_path, *arguments):
         (["--dataset", "tlio"], "github.com/CathIAS/TLIO"),
         (["--dataset", "tlio", "--data-root", "nowhere"], "nowhere"),
         (["--dataset", "oxiod"], "deepio.cs.ox.ac.uk"),
-        (
-            ["--dataset", "oxoid"],
-            (
-                "did you mean 'oxiod'? known datasets: blackbird, csv, euroc, idol, kitti, "
-                "oxiod, randomised, ridi, ronin, synthetic, tlio, tumvi"
-            ),
-        ),
+        (["--dataset", "oxoid"], "did you mean 'oxiod'? known datasets: blackbird, csv, euroc"),
         (["--config", ""], ".: cannot be read"),
         (["--devices", "0"], "--devices: must be at least 1, found 0"),
         (["--seeds"], "--seeds: expected at least one"),
@@ -71,6 +65,7 @@ def mistake(monkeypatch, capsys, tmp_path, *arguments):
         ),
         (["--data.train-split", "trian"], "trian"),
         (["--config", "none.yaml"], "none.yaml: no such config file"),
+        (["--workdir", __file__], "test_train.py: is a file; name a folder with --workdir"),
         (["--resume", "--workdir", "none"], "none: holds no run to resume"),
     ],
 )
