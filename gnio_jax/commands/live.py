@@ -102,7 +102,8 @@ def live(asked: LiveOptions, _call: options.Call) -> None:
         try:
             tracker = following.create_tracker(run, rest_seconds=asked.rest_seconds)
         except ValueError as error:
-            raise InputError("--rest-seconds", str(error)) from None
+            problem = str(error).removeprefix("rest_seconds: ")
+            raise InputError("--rest-seconds", problem) from None
     found = following.Followed()
 
     def begin(imu_rate: float) -> None:

@@ -231,7 +231,7 @@ def checked_value(hint: Any, content: Any, place: Place, base: Any = None) -> An
 
 def _shown(value: Any) -> str:
     """A value in a message, however long or deep it is."""
-    return reprlib.repr(list(value) if isinstance(value, tuple) else value)
+    return "null" if value is None else reprlib.repr(list(value) if type(value) is tuple else value)
 
 
 def _spelled(kind: Any) -> str:

@@ -293,7 +293,7 @@ def test_noise_on_the_line_is_no_text(gnio, run, recorded, monkeypatch, tmp_path
         (
             [],
             ["--rest-seconds", "0"],
-            "--rest-seconds: rest_seconds: must be a number of",
+            "--rest-seconds: must be a number of",
         ),
     ],
 )

@@ -96,37 +96,35 @@ def test_another_copy_of_the_package_in_the_working_folder_is_told(tmp_path):
     assert (shown.returncode, shown.stdout) == (0, "ran\n")
 
 
-CACHED = (
-    "import jax, jax.numpy as jnp; "
-    "jax.config.update('jax_persistent_cache_min_compile_time_secs', 0); "
-    "print(jax.config.jax_compilation_cache_dir, jax.jit(lambda x: x + 1)(1.0))"
-)
-
-
-def compiling(**variables):
-    """A command that compiles, with these variables and no word of a cache besides."""
+def test_what_is_compiled_is_kept(tmp_path):
+    body = "import jax; jax.config.update('jax_persistent_cache_min_compile_time_secs', 0); "
+    body += "print(jax.config.jax_compilation_cache_dir, jax.jit(lambda x: x + 1)(1.0))"
     kept = {name: value for name, value in os.environ.items() if "CACHE" not in name}
-    return outcome(CACHED, env={**kept, **variables})
-
-
-def test_what_is_compiled_is_kept_in_the_users_cache(tmp_path):
-    shown = compiling(XDG_CACHE_HOME=str(tmp_path))
+    shown = outcome(body, env={**kept, "XDG_CACHE_HOME": str(tmp_path)})
     place = tmp_path / "gnio-jax" / "compiled"
     assert shown.stdout == f"{place} 2.0\n" and shown.stderr == ""
     assert any(place.iterdir())
-    home = compiling(HOME=str(tmp_path / "home"))
-    assert home.stdout == f"{tmp_path / 'home' / '.cache' / 'gnio-jax' / 'compiled'} 2.0\n"
 
 
-def test_the_user_says_where_compiled_programs_are_kept(tmp_path):
-    own = tmp_path / "own"
-    shown = compiling(XDG_CACHE_HOME=str(tmp_path), JAX_COMPILATION_CACHE_DIR=str(own))
-    assert shown.stdout == f"{own} 2.0\n" and any(own.iterdir())
-
-
-def test_no_cache_makes_a_command_fail(tmp_path):
-    """A file where the folder would be, and a folder that nobody may write into."""
-    (tmp_path / "gnio-jax").write_text("")
-    for base in (tmp_path, Path("/proc")):
-        shown = compiling(XDG_CACHE_HOME=str(base))
-        assert (shown.returncode, shown.stdout, shown.stderr) == (0, "None 2.0\n", "")
+def test_where_compiled_programs_are_kept(tmp_path, monkeypatch):
+    """In the user's cache, or where the user says, and nowhere if that cannot be written: a file in
+    its place, a folder into which nobody may write."""
+    (tmp_path / "file" / "gnio-jax").mkdir(parents=True)
+    (tmp_path / "file" / "gnio-jax" / "compiled").write_text("")
+    below = Path("gnio-jax") / "compiled"
+    for given, place in (
+        ({"XDG_CACHE_HOME": str(tmp_path)}, tmp_path / below),
+        ({"HOME": str(tmp_path / "home")}, tmp_path / "home" / ".cache" / below),
+        ({"XDG_CACHE_HOME": str(tmp_path), "JAX_COMPILATION_CACHE_DIR": "own"}, "own"),
+        ({"XDG_CACHE_HOME": str(tmp_path / "file")}, None),
+        ({"XDG_CACHE_HOME": "/proc"}, None),
+    ):
+        with monkeypatch.context() as patch:
+            for name in ("XDG_CACHE_HOME", "JAX_COMPILATION_CACHE_DIR"):
+                patch.setenv(name, "")
+                patch.delenv(name)
+            for name, value in given.items():
+                patch.setenv(name, value)
+            console.keep_compiled_programs()
+            found = os.environ.get("JAX_COMPILATION_CACHE_DIR")
+        assert found == (None if place is None else str(place)), given

@@ -319,6 +319,7 @@ def test_a_conversion_is_whole_or_not_there(root, reads, monkeypatch, capsys):
         run(*command)
 
 
+@pytest.mark.slow
 def test_processes_convert_the_same(root):
     (root / "train_list.txt").write_text("fair\nalso\n")
     for workers in (1, 2):
