@@ -117,7 +117,7 @@ def options_of(kind: type, path: tuple[str, ...] = (), prefix: str = "--") -> It
         hint, word = hints[field.name], field.name.replace("_", "-")
         markers = getattr(hint, "__metadata__", ())
         words = next((each for each in markers if isinstance(each, Words)), Words())
-        inner, here = kind_of(hint)[0], (*path, field.name)
+        inner, here = kind_of(hint), (*path, field.name)
         if FILE_ONLY in markers:
             continue
         if dataclasses.is_dataclass(inner):
@@ -237,9 +237,9 @@ def _parser(
 
 def _add(group: Any, option: Option, dest: str, brief: bool) -> None:
     """Add an option to the group of its section."""
-    kind, _ = kind_of(option.hint)
+    kind = kind_of(option.hint)
     items = typing.get_args(kind) if typing.get_origin(kind) is tuple else ()
-    item = kind_of(items[0])[0] if items else kind
+    item = kind_of(items[0]) if items else kind
     text = "" if brief else comment(option)
     if option.negation:
         text += f" (on by default; {option.negation} takes it away)"

@@ -37,6 +37,7 @@ _SPELLING = {
     str: "text",
     Path: "text",
     bool: "true or false",
+    type(None): "null",
 }
 
 # The experiments and the runs
@@ -161,19 +162,21 @@ def assign(config: Section, assignments: Sequence[str]) -> Section:
 
 def value_from_words(hint: Any, words: Sequence[str], name: str) -> Any:
     """The value of a field of the type `hint` from the words of a command line behind the option
-    `name`: a word for each value of a tuple, else one. Words are texts as they are, and numbers as
-    YAML writes them; null is none.
+    `name`, one or as many as a tuple has values. Texts are the words as they are, numbers are as in
+    YAML, and null is none.
 
     Raises `InputError` that names the option.
     """
-    kind, may_be_none = kind_of(hint)
+    kind = kind_of(hint)
     several = typing.get_origin(kind) is tuple
-    item = kind_of(typing.get_args(kind)[0])[0] if several else kind
+    item = kind_of(typing.get_args(kind)[0]) if several else kind
     if item in (str, Path) or typing.get_origin(item) is Literal:
+        may_be_none = type(None) in kinds_of(hint)
         content = [None if word == "null" and may_be_none else word for word in words]
     else:
         content = [_yaml(word, name) for word in words]
-    return checked_value(hint, content if several else content[0], Place(name))
+    one = len(content) == 1 and (not several or item in kinds_of(hint))
+    return checked_value(hint, content[0] if one else content, Place(name))
 
 
 def _section(base: Any, content: Any, place: Place) -> Any:
@@ -200,13 +203,14 @@ def _section(base: Any, content: Any, place: Place) -> Any:
 def checked_value(hint: Any, content: Any, place: Place, base: Any = None) -> Any:
     """The value of a field of the type `hint`, if it has this type and is within its bounds; a
     section takes what is not in `content` from `base`. Raises `InputError`."""
-    kind, may_be_none = kind_of(hint)
-    origin, members = typing.get_origin(kind), typing.get_args(kind)
-    if content is None and may_be_none:
+    kinds, is_list = kinds_of(hint), isinstance(content, list | tuple)
+    if content is None and type(None) in kinds:
         return None
+    kind = next((each for each in kinds if (typing.get_origin(each) is tuple) == is_list), kinds[0])
+    origin, members = typing.get_origin(kind), typing.get_args(kind)
     if is_section(kind):
         return _section(kind() if base is None else base, content, place)
-    if origin is tuple and isinstance(content, list | tuple):
+    if origin is tuple and is_list:
         if ... not in members and len(content) != len(members):
             place.refuse("", f"must be a list of {len(members)} values, found {_shown(content)}")
         value = tuple(checked_value(members[0], each, place) for each in content)
@@ -220,8 +224,7 @@ def checked_value(hint: Any, content: Any, place: Place, base: Any = None) -> An
     elif content in members if origin is Literal else type(content) is kind:
         value = content
     else:
-        or_null = " or null" if may_be_none else ""
-        place.refuse("", f"must be {_spelled(kind)}{or_null}, found {_shown(content)}")
+        place.refuse("", f"must be {' or '.join(map(_spelled, kinds))}, found {_shown(content)}")
     for bound in bounds(hint):
         for number in value if isinstance(value, tuple) else (value,):
             if not bound.holds(number):
@@ -246,15 +249,21 @@ def _spelled(kind: Any) -> str:
 # ------------------------------------------------------------------------------------------------
 
 
-def kind_of(hint: Any) -> tuple[Any, bool]:
-    """The type of a field's value without what is annotated to it, and whether it may be None."""
+def kinds_of(hint: Any) -> list[Any]:
+    """The types that the value of a field may have, without what is annotated to them."""
     if typing.get_origin(hint) is Annotated:
-        return kind_of(typing.get_args(hint)[0])
+        return kinds_of(typing.get_args(hint)[0])
     # `Literal[...] | None` is a typing.Union, `int | None` is a types.UnionType.
     if typing.get_origin(hint) in (types.UnionType, typing.Union):
-        first, _ = typing.get_args(hint)  # the other one is None
-        return kind_of(first)[0], True
-    return hint, False
+        return [kind for member in typing.get_args(hint) for kind in kinds_of(member)]
+    return [hint]
+
+
+def kind_of(hint: Any) -> Any:
+    """The type of a field's value where it has one; of what may be one or several, that of
+    several."""
+    kinds = [kind for kind in kinds_of(hint) if kind is not type(None)]
+    return next((kind for kind in kinds if typing.get_origin(kind) is tuple), kinds[0])
 
 
 def is_section(kind: Any) -> bool:

@@ -4,6 +4,7 @@ import dataclasses
 import math
 import os
 import threading
+from pathlib import Path
 
 import pytest
 
@@ -195,6 +196,9 @@ def test_an_assignment_that_makes_no_sense_is_named(assignment, problem):
         (tuple[str, ...], ["1", "true"], ("1", "true")),
         (tuple[int, ...], [], ()),
         (bool, ["false"], False),
+        (str | tuple[str, ...], ["one"], "one"),
+        (str | tuple[str, ...], ["one", "two"], ("one", "two")),
+        (Path, ["010"], Path("010")),
     ],
 )
 def test_words_of_a_command_line_are_values(hint, words, value):
@@ -206,6 +210,7 @@ def test_words_of_a_command_line_are_values(hint, words, value):
     ("hint", "words", "problem"),
     [
         (int, ["3.5"], "--x: must be a whole number, found 3.5"),
+        (str | tuple[int, ...], ["1", "x"], "--x: must be a whole number, found 'x'"),
         (int, ["0x10"], "--x: must be a whole number, found '0x10'"),
         (float, [".inf"], "--x: must be a number, found '.inf'"),
         (tuple[int, ...], ["1", "a"], "--x: must be a whole number, found 'a'"),
