@@ -161,36 +161,6 @@ def test_float64_keeps_its_digits_and_no_windows_make_none():
     assert convolve_three(jnp.zeros((0, 9, 3)), kernel.astype(jnp.float32)).shape == (0, 9, 2)
 
 
-@pytest.mark.parametrize(
-    "size, stride, length", [(7, 2, 200), (3, 1, 25), (3, 2, 25), (1, 2, 13), (3, 2, 50)]
-)
-def test_convolution_and_its_gradients_against_xla(size, stride, length):
-    random = np.random.default_rng(0)
-    x, kernel = random.standard_normal((3, length, 4)), random.standard_normal((size, 4, 5))
-    x, kernel = jnp.asarray(x, jnp.float32), jnp.asarray(kernel, jnp.float32)
-    padding = [((size - 1) // 2, (size - 1) // 2)]
-    axes = ("NWC", "WIO", "NWC")
-
-    def oracle(x, k):
-        return jax.lax.conv_general_dilated(x, k, (stride,), padding, dimension_numbers=axes)
-
-    def ours(x, k):
-        return convolution.convolve(x, k, (stride,), padding)
-
-    shape = jax.eval_shape(oracle, x, kernel).shape
-    weight = jnp.asarray(random.standard_normal(shape), jnp.float32)
-
-    def with_gradient(function, x, kernel):
-        value, pull_back = jax.vjp(function, x, kernel)
-        return value, *pull_back(weight)
-
-    both = quick(lambda *given: [with_gradient(function, *given) for function in (ours, oracle)])
-    found, wanted = both(x, kernel)
-    np.testing.assert_allclose(found[0], wanted[0], rtol=1e-5, atol=1e-5)
-    for a, b in zip(found[1:], wanted[1:], strict=True):
-        np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4)
-
-
 @pytest.mark.parametrize("length", [100, 50, 25, 13])
 def test_max_pool_against_torch_convention(length):
     x = -1 - np.random.default_rng(0).random((2, length, 3)).astype(
@@ -204,11 +174,13 @@ def test_max_pool_against_torch_convention(length):
     )
 
 
-@pytest.mark.parametrize("size,stride", [(7, 2), (3, 2), (3, 1), (1, 2)])
-def test_both_convolutions_are_one_function(size, stride):
+@pytest.mark.parametrize(
+    "size, stride, length", [(7, 2, 11), (7, 2, 12), (3, 2, 11), (3, 2, 12), (3, 1, 5), (1, 2, 12)]
+)
+def test_both_convolutions_are_one_function(size, stride, length):
     """Values, forward and reverse derivatives, against plain NumPy and against each other."""
     rng = np.random.default_rng(0)
-    x, kernel = rng.normal(size=(2, 11, 3)), rng.normal(size=(size, 3, 4))
+    x, kernel = rng.normal(size=(2, length, 3)), rng.normal(size=(size, 3, 4))
     padding = [((size - 1) // 2,) * 2]
     padded = np.pad(x, ((0, 0), padding[0], (0, 0)))
     wanted = np.stack(

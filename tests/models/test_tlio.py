@@ -1,46 +1,19 @@
-"""TLIO's network: its sizes, its output against the recorded one, and how it trains."""
+"""TLIO's network and RoNIN's, which has its encoder and head: their outputs against the recorded
+ones, and how the head trains."""
 
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 from flax import linen as nn
 
 from gnio_jax import interop, models
 from gnio_jax.models.tlio import FullyConnectedHead
 from tests.support import tlio_weights
-from tests.support.networks import count
+from tests.support.compiling import quick
 
 RECORDED = Path(__file__).parents[1] / "recorded" / "tlio_tracker" / "pipeline.npz"
-ENCODER = 3_846_144
-
-
-@pytest.mark.parametrize("samples, rows, total", [(200, 7, 5_424_646), (100, 4, 5_031_430)])
-def test_parameters_of_the_published_network_block_by_block(samples, rows, total):
-    params = models.variable_shapes(models.create("tlio"), samples)["params"]
-    assert count(params) == total
-    assert params.keys() == {"encoder", "displacement", "log_std"}
-    assert count(params["encoder"]) == ENCODER
-    for head in (params["displacement"], params["log_std"]):
-        assert {name: count(part) for name, part in head.items()} == {
-            "neck_conv": 512 * 128,
-            "neck_bn": 2 * 128,
-            "fc1": 128 * rows * 512 + 512,
-            "fc2": 512 * 512 + 512,
-            "fc3": 512 * 3 + 3,
-        }
-
-
-def test_other_widths_scale_the_heads_too():
-    params = models.variable_shapes(models.create("tlio", width=8))["params"]["log_std"]
-    assert {name: part["kernel"].shape for name, part in params.items() if name != "neck_bn"} == {
-        "neck_conv": (1, 64, 16),
-        "fc1": (7 * 16, 64),
-        "fc2": (64, 64),
-        "fc3": (64, 3),
-    }
 
 
 def test_output_is_the_recorded_one():
@@ -56,6 +29,27 @@ def test_output_is_the_recorded_one():
         variables, np.concatenate([gyro, accel], axis=-1)
     )  # what the comparison would say of channels in the other order
     assert np.abs(swapped.displacement - recorded["net_displacement"]).max() > 1e-3
+
+
+def test_ronins_displacement_is_that_of_tlio_with_the_same_weights():
+    """Of two axes; the vertical is 0, and the uncertainty a constant."""
+    recorded = np.load(RECORDED, allow_pickle=False)
+    gyro, accel = np.split(recorded["net_input_gyro_accel"], 2, axis=-1)
+    tlio = interop.load_tlio_state_dict(tlio_weights.weights())
+    variables = {
+        kind: {name: part for name, part in tree.items() if name != "log_std"}
+        for kind, tree in tlio.items()
+    }
+    head = variables["params"]["displacement"]
+    fc3 = {name: array[..., :2] for name, array in head["fc3"].items()}
+    variables["params"]["displacement"] = head | {"fc3": fc3}
+    constant = np.array([-1.0, -2.0, -3.0], np.float32)
+    variables["batch_stats"]["uncertainty"] = {"log_std": constant}
+    model = models.create("ronin_resnet", output_dim=2)
+    found = quick(model.apply)(variables, np.concatenate([accel, gyro], axis=-1))
+    wanted = recorded["net_displacement"] * [1, 1, 0]
+    np.testing.assert_allclose(found.displacement, wanted, atol=1e-5)
+    np.testing.assert_array_equal(found.log_std, np.tile(constant, (len(wanted), 1)))
 
 
 def test_dropout_keeps_its_share_in_training_alone():

@@ -17,7 +17,6 @@ SMALL = {
         "heads": 4,
         "particles": 5,
     },
-    "imot_text": {"ffn_ratio": 1.5, "heads": 4, "particles": 5},
     "ronin_resnet": {"width": 4},
     "tlio": {"width": 4},
 }
