@@ -161,6 +161,7 @@ def test_processes_and_devices_change_nothing_but_rounding(
     assert_same_run(tmp_path / "run", alone)
 
 
+@pytest.mark.slow
 def test_processes_that_do_not_belong_together_are_refused(run, tmp_path):
     """One has other settings: none of them trains."""
     ends = run(tmp_path / "run", 2, 1, more_of={1: ("--optim.epochs", "3")}).end()
@@ -198,6 +199,7 @@ def latest(workdir):
     return int(step.name)
 
 
+@pytest.mark.slow
 def test_processes_share_sequences_and_each_has_all_results(server, tmp_path):
     """Four devices in two processes, and five sequences: in order, and the same ones."""
     coordinator = free_address()

@@ -62,6 +62,7 @@ def test_gradient_of_what_is_shared_sums_over_the_sequences():
     np.testing.assert_allclose(of_each, 0.25 * np.array(x), rtol=1e-14)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "flags, devices",
     [("", "len(os.sched_getaffinity(0))"), ("--xla_force_host_platform_device_count=3", "3")],

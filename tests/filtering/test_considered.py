@@ -346,6 +346,7 @@ def added_by_considering():
     return found, found.covariance[:HALF] - alone.covariance
 
 
+@pytest.mark.slow
 def test_what_the_smoother_adds_is_its_change():
     found, added = added_by_considering()
     changed = smoothed()(np.zeros(HALF, int), steps_of_each()[:HALF])
@@ -361,6 +362,7 @@ def test_what_the_smoother_adds_is_its_change():
     np.testing.assert_allclose(found.covariance_diagonal, whole, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_the_smoothers_covariance_is_that_of_its_errors():
     runs, _ = walks()
     found, added = added_by_considering()

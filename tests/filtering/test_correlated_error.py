@@ -153,6 +153,7 @@ def test_taken_for_white_they_make_it_too_certain():
     assert squares[0] < squares[1]
 
 
+@pytest.mark.slow
 def test_the_smoother_is_consistent_with_them():
     config = filtering.FilterConfig(0.01, 10, 10, gate_threshold=1e9, history="core")
     runs, spread = simulated(), np.tile(SIGMA**2 * np.eye(3), (LONG, 1, 1))

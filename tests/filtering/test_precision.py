@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from scipy.spatial.transform import Rotation
 
 from gnio_jax import filtering
@@ -51,6 +52,7 @@ def hour():
     return attitude[0].as_matrix(), velocity[0], gyro, accel, displacement, position[ends]
 
 
+@pytest.mark.slow
 def test_float32_holds_for_an_hour():
     rotation, velocity, gyro, accel, displacement, truth = hour()
     found = {}

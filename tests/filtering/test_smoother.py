@@ -310,6 +310,7 @@ RUNS, LONG, STEP, WINDOW, RATE, SIGMA = 16, 300, 10, 10, 0.01, 0.03
 DENSITIES = filtering.NoiseModel(5e-4, 5e-3, 1e-6, 2e-5, measurement_scale=1.0)
 
 
+@pytest.mark.slow
 def test_long_walks_come_closer_to_the_truth_and_say_by_how_much():
     """Under jit and vmap; IMU samples and measurements are missing, the last held or coasted."""
     std = filtering.InitialStd()

@@ -233,6 +233,7 @@ def test_constants_of_the_uncertainty_are_left_alone():
     )
 
 
+@pytest.mark.slow
 def test_the_uncertainty_fits_the_errors_after_training(trained):
     """(e/σ)² per axis on the validation split, over two seeds: with a start that poisons Adam one
     axis comes out at a tenth."""
@@ -269,7 +270,8 @@ def norms_of_the_head(state, source, orders, key, count, training):
 @pytest.mark.parametrize(
     "width, seeds, count",
     [
-        (16, range(4), 200),
+        (16, range(1), 200),
+        pytest.param(16, range(1, 4), 200, marks=pytest.mark.slow),
         pytest.param(32, range(1), 200, marks=pytest.mark.slow),
         pytest.param(64, range(1), 60, marks=pytest.mark.slow),
     ],
