@@ -160,7 +160,7 @@ _FIGURES: dict[str, Callable[[Any], str]] = {
     "gyro\n°/10 s": lambda found: _two_digits(found.gyro_consistency_degrees),
     "speed\nm/s": lambda found: _two_digits(found.median_speed),
     "accel\ncorr.": lambda found: _two_digits(found.accel_correlation_horizontal),
-    "valid": lambda found: f"{found.share_valid:.1%}",
+    "valid": lambda found: "–" if math.isnan(found.share_valid) else f"{found.share_valid:.1%}",
 }
 """Columns of a `SelfCheck`."""
 

@@ -3,6 +3,7 @@ imported when one is asked for."""
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,8 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from gnio_jax.data.self_check import SelfCheck, gyro_windows
+from gnio_jax.data.waypoints import with_poses
+from gnio_jax.errors import InputError
 from gnio_jax.files import replacing, shown_name
 from gnio_jax.numerics import finite_rows, spans
 from gnio_jax.types import Sequence
@@ -41,10 +44,17 @@ def save(path: Path, figure: Figure) -> None:
 
 def overview(sequence: Sequence, check: SelfCheck) -> Figure:
     """Trajectory from above, and over time: speed, |accel|, angle between integrated gyro and
-    reference. Shaded: not valid."""
+    reference. Shaded: not valid. Waypoints are drawn with the poses that training takes."""
+    waypoints = sequence.waypoints
+    if waypoints is not None:
+        with suppress(InputError):
+            sequence = with_poses(sequence)
     figure = Figure(figsize=(11.0, 5.4), dpi=90, layout="constrained")
     grid = figure.add_gridspec(3, 2, width_ratios=(1.0, 1.25))
-    _plan(figure.add_subplot(grid[:, 0]), sequence)
+    plan = figure.add_subplot(grid[:, 0])
+    if waypoints is not None:
+        plan.plot(*waypoints.position.T, "o", ls="none", color=VERMILION, ms=4, label="waypoint")
+    _plan(plan, sequence)
     speed = figure.add_subplot(grid[0, 1])
     accel, gyro = (figure.add_subplot(grid[row, 1], sharex=speed) for row in (1, 2))
     _speed(speed, sequence)
@@ -57,7 +67,9 @@ def overview(sequence: Sequence, check: SelfCheck) -> Figure:
         _finish(panel)
     gyro.set_xlabel("time (s)")
     gyro.set_xlim(0.0, float(sequence.time[-1] - sequence.time[0]))
-    used = f"left out: {check.failures[0]}" if check.failures else f"{check.share_valid:.1%} valid"
+    used = f"{sequence.valid.mean():.1%} valid"
+    if check.failures:
+        used = f"left out: {check.failures[0]}"
     dataset = shown_name(str(sequence.attributes.get("dataset", "")))
     recorded = f"{check.duration:.0f} s at {check.rate:.4g} Hz"
     title = f"{dataset} {shown_name(sequence.name)}: {recorded}, {used}".strip()

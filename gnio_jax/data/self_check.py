@@ -56,7 +56,7 @@ class SelfCheck(NamedTuple):
     accel_correlation_horizontal: float
     """Correlation of the second difference of the position with R·accel + g, x and y together."""
     share_valid: float
-    """Share of the samples whose reference can be trusted."""
+    """Share of the samples whose reference can be trusted; NaN of waypoints."""
     failures: tuple[str, ...]
     """What is implausible, one sentence each; empty when the sequence may be used."""
 
@@ -169,7 +169,8 @@ def _with_waypoints(check: SelfCheck, sequence: Sequence, step: float) -> SelfCh
     means = np.linalg.norm((summed[length:] - summed[:-length]) / length, axis=1)
     legs = np.linalg.norm(np.diff(position, axis=0), axis=1) / np.diff(stamps)
     gravity = np.array([0.0, 0.0, np.median(means)])
-    return check._replace(gravity_mean=gravity, median_speed=float(np.median(legs)))
+    speed = float(np.median(legs))
+    return check._replace(gravity_mean=gravity, median_speed=speed, share_valid=np.nan)
 
 
 def _held_attitude(sequence: Sequence) -> Float[np.ndarray, "n 4"]:

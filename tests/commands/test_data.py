@@ -18,6 +18,7 @@ from gnio_jax.data import loading
 from gnio_jax.data.readers import DATASETS, tlio
 from gnio_jax.data.readers import csv_files as csv
 from gnio_jax.errors import InputError
+from tests.support import indoor_location_files
 from tests.support import known_walk as walk
 from tests.support.command_lines import run
 from tests.support.tlio_files import write_sequence
@@ -195,6 +196,17 @@ def test_check_of_one_split_of_a_computed_set(place, capsys):
             row(out, sequence.name)[5]
             == f"{data.self_check(sequence).gyro_consistency_degrees:.2f}"
         )
+
+
+def test_check_of_a_walk_with_waypoints_asks_for_gravity_and_speed(place, capsys):
+    path = indoor_location_files.write(place / "mall")
+    run("data", "check", "indoor_location", "--data-root", "mall", "--plots", "pictures")
+    out = capsys.readouterr().out
+    name = f"site1_F4_{path.stem}"
+    _, split, seconds, rate, gravity, gyro, _, correlation, valid, used = row(out, name)
+    assert split == "test" and rate == "50.0" and gravity.startswith("0.00 0.00 9.")
+    assert (gyro, correlation, valid, used) == ("–", "–", "–", "used") and float(seconds) > 30.0
+    assert (place / "pictures" / f"{name}.png").is_file()
 
 
 def test_check_of_recordings_without_a_reference_draws_them_all_the_same(place, capsys):
