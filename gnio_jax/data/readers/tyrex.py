@@ -81,13 +81,14 @@ LAG_KNOTS = 60.0
 
 # What a fit of phone and tracker may find. In brackets: the largest figure of the 84 walks.
 MOST_UNEXPLAINED = {"turning": 0.1, "acceleration": 0.5}
-"""Shares of the signals' power that a fit may leave."""
+"""Shares of the signals' power that a fit may leave (0.011; 0.057, of a phone held up, which hardly
+moves)."""
 LIMITS = {
-    "lever arm": (0.3, "m"),
-    "world's tilt": (5.0, "°"),
-    "handle's turn": (20.0, "°"),
-    "gyro's bias": (0.2, "rad/s"),
-    "accel's delay": (0.15, "s"),
+    "lever arm": (0.3, "m"),  # the handle is on the phone (0.07)
+    "world's tilt": (5.0, "°"),  # the world of a calibrated tracker (0.3)
+    "handle's turn": (20.0, "°"),  # its axes are the phone's (2)
+    "gyro's bias": (0.2, "rad/s"),  # raw gyros (0.104)
+    "accel's delay": (0.15, "s"),  # phones filter the accelerometer (0.046)
 }
 
 _NAME = re.compile(rf"(\w+?)_({'|'.join(DEVICES)})_(Dist|NoDist)_(\w+)")
