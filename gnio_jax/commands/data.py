@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from gnio_jax.commands import console, options
-from gnio_jax.config.schema import UNNAMED, Rate
+from gnio_jax.config.schema import UNNAMED, Folder, NewFile, Rate
 from gnio_jax.errors import InputError
 from gnio_jax.files import write_text
 
@@ -36,10 +36,10 @@ class _Dataset:
 class CheckOptions(_Dataset):
     """What `gnio data check` is asked for."""
 
-    plots: Path | None = None
+    plots: Folder | None = None
     """Folder for a picture of each recording: trajectory, speed, |accel|, gyro against reference,
     and where it is not valid."""
-    json: Path | None = None
+    json: NewFile | None = None
     """File for the figures."""
 
 
@@ -108,10 +108,6 @@ def check(asked: CheckOptions, _call: options.Call) -> None:
       {prog} tlio --data-root ~/tlio --split test
       {prog} csv --data-root ~/walks --plots pictures --json figures.json
     """
-    if asked.json is not None and asked.json.is_dir():
-        raise InputError("--json", f"{asked.json} is a folder", "name a file")
-    if asked.plots is not None and asked.plots.exists() and not asked.plots.is_dir():
-        raise InputError("--plots", f"{asked.plots} is a file", "name a folder")
     from gnio_jax.data import loading  # late: mistakes do not wait for JAX
 
     dataset, root = _find(asked.name, asked.data_root)

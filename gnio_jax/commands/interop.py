@@ -8,7 +8,7 @@ from typing import Annotated
 
 from gnio_jax.commands import options
 from gnio_jax.config import DataConfig
-from gnio_jax.config.schema import UNNAMED
+from gnio_jax.config.schema import UNNAMED, Positive
 
 
 @dataclass(frozen=True)
@@ -19,12 +19,12 @@ class InteropOptions:
     """File of the weights."""
     workdir: Annotated[Path, UNNAMED]
     """Folder of the run, which is made."""
-    rate: float = 200.0
+    rate: Positive = 200.0
     """Samples per second that the network was trained with, Hz (imu_freq in TLIO's
     parameters.json)."""
-    window_seconds: float = 1.0
+    window_seconds: Positive = 1.0
     """Length of its window, s (past_time + window_time there)."""
-    stride_seconds: float = 0.05
+    stride_seconds: Positive = 0.05
     """Distance between window starts, and between the filter's clones, s (TLIO's filter: 0.05; the
     paper: 0.1)."""
     dataset: str = "tlio"

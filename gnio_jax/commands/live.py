@@ -18,7 +18,7 @@ import numpy as np
 
 from gnio_jax.commands import console, options
 from gnio_jax.config import ImportOptions
-from gnio_jax.config.schema import UNNAMED, Bound, NonNegative, Positive
+from gnio_jax.config.schema import UNNAMED, Bound, NewFile, NonNegative, Positive
 from gnio_jax.errors import InputError
 from gnio_jax.files import check_writable
 
@@ -39,7 +39,7 @@ class LiveOptions:
     weights: str | None = None
     """Name, package or run folder; by default the network that comes with gnio-jax, else the newest
     run below runs/."""
-    out: Path | None = None
+    out: NewFile | None = None
     """File for the trajectory, in TUM format, when the stream has ended."""
     rerun: str | None = None
     """File for the viewer Rerun, NAME.rrd, or the word viewer to look at it now."""

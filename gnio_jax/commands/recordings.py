@@ -8,7 +8,7 @@ from typing import Annotated
 
 from gnio_jax.commands import console, options
 from gnio_jax.config import ImportOptions
-from gnio_jax.config.schema import UNNAMED, Rate
+from gnio_jax.config.schema import UNNAMED, NewFile, Rate
 from gnio_jax.errors import InputError
 
 HDF5 = (".h5", ".hdf5")
@@ -20,7 +20,7 @@ class ImportFile:
 
     file: Annotated[Path, UNNAMED]
     """The recording: a file or folder; of two CSVs the gyro's."""
-    out: Path
+    out: NewFile
     """HDF5 file to write, NAME.h5."""
     rate: Rate | None = None
     """Rate of the result, Hz; by default that of the faster sensor."""
@@ -35,7 +35,7 @@ class ExportFile:
 
     trajectory: Annotated[Path, UNNAMED]
     """File in TUM format."""
-    out: Annotated[Path, UNNAMED]
+    out: Annotated[NewFile, UNNAMED]
     """File to write; its ending tells the format: .mcap, .csv or .tum."""
 
 
@@ -59,8 +59,6 @@ def import_file(asked: ImportFile, _call: options.Call) -> None:
     """
     if asked.out.suffix.lower() not in HDF5:
         raise InputError("--out", f"'{asked.out}' is no name of an HDF5 file", "name it NAME.h5")
-    if asked.out.is_dir():
-        raise InputError("--out", f"'{asked.out}' is a folder", "name a file in it, NAME.h5")
     from gnio_jax.apps import importing  # late: mistakes do not wait for JAX
     from gnio_jax.data.readers import csv_files
 
@@ -96,8 +94,6 @@ def export_file(asked: ExportFile, _call: options.Call) -> None:
       {prog} trajectories/walk.txt walk.mcap        Foxglove, ROS 2
       {prog} trajectories/walk.txt walk.csv
     """
-    if asked.out.is_dir():
-        raise InputError("OUT", f"'{asked.out}' is a folder", "name a file in it")
     from gnio_jax.apps.export import export  # late: mistakes do not wait for JAX
     from gnio_jax.evaluation.trajectory import read_tum
 

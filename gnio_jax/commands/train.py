@@ -10,7 +10,7 @@ from typing import Annotated
 from gnio_jax import config as configuration
 from gnio_jax.commands import console, options
 from gnio_jax.config import ConsideredStd, TrainConfig
-from gnio_jax.config.schema import Words
+from gnio_jax.config.schema import Count, Seed, Words
 from gnio_jax.cores import usable_cores
 
 
@@ -24,9 +24,9 @@ class TrainOptions(TrainConfig):
     """A setting by its name in YAML; it may be given several times."""
     resume: bool = False
     """Continue the run in the work folder from its latest checkpoint."""
-    seeds: tuple[int, ...] = ()
+    seeds: tuple[Seed, ...] = ()
     """Seeds to train one after the other, in the place of --seed: WORKDIR_s0, WORKDIR_s1, ..."""
-    devices: int | None = None
+    devices: Count | None = None
     """Devices of each process that share a batch; by default all of its GPUs, or the one that a CPU
     is."""
     distributed: Annotated[str | None, Words("HOST:PORT,PROCESSES,ID")] = None

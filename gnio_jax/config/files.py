@@ -210,7 +210,7 @@ def checked_value(hint: Any, content: Any, place: Place, base: Any = None) -> An
     origin, members = typing.get_origin(kind), typing.get_args(kind)
     if is_section(kind):
         return _section(kind() if base is None else base, content, place)
-    if origin is tuple and is_list:
+    if origin is tuple and isinstance(content, list | tuple):
         if ... not in members and len(content) != len(members):
             place.refuse("", f"must be a list of {len(members)} values, found {_shown(content)}")
         value = tuple(checked_value(members[0], each, place) for each in content)
@@ -234,7 +234,9 @@ def checked_value(hint: Any, content: Any, place: Place, base: Any = None) -> An
 
 def _shown(value: Any) -> str:
     """A value in a message, however long or deep it is."""
-    return "null" if value is None else reprlib.repr(list(value) if type(value) is tuple else value)
+    if isinstance(value, tuple | Path):
+        value = list(value) if isinstance(value, tuple) else str(value)
+    return "null" if value is None else reprlib.repr(value)
 
 
 def _spelled(kind: Any) -> str:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-from gnio_jax.config.schema import FILE_ONLY, FilterSettings, Words
+from gnio_jax.config.schema import FILE_ONLY, Count, FilterSettings, Folder, Words
 
 Table = Literal[
     "complexity",
@@ -56,7 +56,7 @@ class EvaluateConfig:
     not at all, or least squares."""
     checkpoint: Literal["best", "latest"] = "best"
     """Which checkpoint of the run."""
-    batch_size: Annotated[int, FILE_ONLY] = 16
+    batch_size: Annotated[Count, FILE_ONLY] = 16
     """Recordings estimated side by side."""
     plots: bool = True
     """Draw every sequence and the errors' distribution, and write report.html. Those of an earlier
@@ -113,16 +113,16 @@ class TablesConfig:
     """The paper's filter, or the sum of the displacements with the reference's orientation."""
     calibrate: bool = False
     """Calibrate every run on its validation split before it is measured."""
-    seeds: int = 3
+    seeds: Count = 3
     """Runs of every row: seeds 0, 1, 2, ..."""
-    epochs: int | None = None
+    epochs: Count | None = None
     """Epochs of every run, instead of the config's."""
     methods: str = "tlio,ronin_resnet,deepils,ctin,imot,gnio"
     """Networks of comparison, trajectories and standing, separated by commas; the first is the one
     that the others are compared with."""
     sequences: str | None = None
     """Sequences that trajectories draws, separated by commas; by default the first eight."""
-    out: str = "runs/tables"
+    out: Folder = Path("runs/tables")
     """Folder of the runs and the tables."""
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, NoReturn
 
 from gnio_jax.errors import InputError
@@ -72,6 +73,8 @@ NonNegativeCount = Annotated[
 ]
 Seed = Annotated[int, Bound(lambda value: 0 <= value < 2**32, "must be from 0 to 2^32 - 1")]
 Rate = Annotated[float, Bound(lambda value: 1 <= value <= 10000, "must be from 1 to 10000 Hz")]
+NewFile = Annotated[Path, Bound(lambda path: not path.is_dir(), "must not be a folder")]
+Folder = Annotated[Path, Bound(lambda path: not path.is_file(), "must be a folder")]
 TwoOrThree = Annotated[int, Bound(lambda value: value in (2, 3), "must be 2 or 3")]
 
 

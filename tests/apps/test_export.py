@@ -136,7 +136,7 @@ def test_the_command_writes_what_the_suffix_says(trajectory, tmp_path, capsys):
         (["walk.txt"], "OUT: is missing"),
         (["gone.txt", "a.csv"], "gone.txt: cannot be read (No such file or directory)"),
         (["walk.txt", "a.dat"], "a.dat: its name tells no format; known: .tum, .txt, .csv"),
-        (["walk.txt", "folder"], "OUT: 'folder' is a folder; name a file in it"),
+        (["walk.txt", "folder"], "OUT: must not be a folder, found 'folder'"),
         (["words.txt", "a.csv"], "words.txt: "),
         (["short.txt", "a.csv"], "short.txt: has 4 columns, not the 8 of the TUM format"),
         (["back.txt", "a.csv"], "back.txt: field 'time' does not increase"),

@@ -533,10 +533,13 @@ OUT, HEADS = ["--out", "x.h5"], ["--data-root", "heads"]
         ),
         (["check", "ridi", *HEADS], "heads: holds no recording of RIDI"),
         (["check", "tlio", "--plot", "x"], "--plot: unknown option; did you mean '--plots'?"),
-        (["check", "tlio", *HEADS, "--json", "heads"], "--json: heads is a folder"),
+        (
+            ["check", "tlio", *HEADS, "--json", "heads"],
+            "--json: must not be a folder, found 'heads'",
+        ),
         (
             ["check", "tlio", *HEADS, "--plots", "heads/test_list.txt"],
-            "--plots: heads/test_list.txt is a file",
+            "--plots: must be a folder, found 'heads/test_list.txt'",
         ),
         (["check", "tlio", "heads"], "'heads': is not an option"),
         (["convert", "tlio"], "OUT: is missing"),
@@ -574,7 +577,10 @@ OUT, HEADS = ["--out", "x.h5"], ["--data-root", "heads"]
             ["import", "walk.csv", "--out", "x.csv"],
             "--out: 'x.csv' is no name of an HDF5 file; name it NAME.h5",
         ),
-        (["import", "walk.csv", "--out", "folder.h5"], "--out: 'folder.h5' is a folder"),
+        (
+            ["import", "walk.csv", "--out", "folder.h5"],
+            "--out: must not be a folder, found 'folder.h5'",
+        ),
         (
             ["import", "walk.csv", *OUT, "--columns", "gyro_x=wx"],
             "walk.csv: column 'wx' is missing; found: time, gyro_x",
