@@ -167,15 +167,14 @@ def value_from_words(hint: Any, words: Sequence[str], name: str) -> Any:
 
     Raises `InputError` that names the option.
     """
-    kind = kind_of(hint)
+    kinds, kind = kinds_of(hint), kind_of(hint)
+    if list(words) == ["null"] and type(None) in kinds:
+        return None
     several = typing.get_origin(kind) is tuple
     item = kind_of(typing.get_args(kind)[0]) if several else kind
-    if item in (str, Path) or typing.get_origin(item) is Literal:
-        may_be_none = type(None) in kinds_of(hint)
-        content = [None if word == "null" and may_be_none else word for word in words]
-    else:
-        content = [_yaml(word, name) for word in words]
-    one = len(content) == 1 and (not several or item in kinds_of(hint))
+    is_text = item in (str, Path) or typing.get_origin(item) is Literal
+    content = [word if is_text else _yaml(word, name) for word in words]
+    one = len(content) == 1 and item in kinds
     return checked_value(hint, content[0] if one else content, Place(name))
 
 
