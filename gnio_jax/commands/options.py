@@ -145,8 +145,10 @@ def read(command: Command, call: Call, default: Any = None) -> Any:
     kind = options_type(command)
     options = {".".join(option.path): option for option in options_of(kind)}
     verbose = any(word in HELP_VERBOSE for word in call.argv)
-    parser = _parser(command, call.prog, options, len(options) > MANY and not verbose)
-    if verbose or any(word in HELP for word in call.argv):
+    explained = verbose or any(word in HELP for word in call.argv)
+    brief = not explained or (len(options) > MANY and not verbose)
+    parser = _parser(command, call.prog, options, brief)
+    if explained:
         print(parser.format_help(), end="")
         raise SystemExit(0)
     known = {name for each in options.values() for name in (each.name, each.negation)}

@@ -223,7 +223,9 @@ def checked_value(hint: Any, content: Any, place: Place, base: Any = None) -> An
     elif content in members if origin is Literal else type(content) is kind:
         value = content
     else:
-        place.refuse("", f"must be {' or '.join(map(_spelled, kinds))}, found {_shown(content)}")
+        remedy = did_you_mean(str(content), members) if origin is Literal else ""
+        problem = f"must be {' or '.join(map(_spelled, kinds))}, found {_shown(content)}"
+        place.refuse("", problem, remedy.strip())
     for bound in bounds(hint):
         for number in value if isinstance(value, tuple) else (value,):
             if not bound.holds(number):
