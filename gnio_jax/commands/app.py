@@ -51,5 +51,8 @@ GNIO = options.Group(
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Run a command, by default that of the process, and leave with its exit status."""
-    words = sys.argv[1:] if argv is None else argv
+    words = list(sys.argv[1:] if argv is None else argv)
+    if words == ["--completion"]:
+        print(options.completion(GNIO, "gnio"))
+        return
     console.run(lambda: options.run(GNIO, options.Call("gnio", words)))

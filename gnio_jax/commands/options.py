@@ -27,7 +27,7 @@ from gnio_jax.config.files import kind_of
 from gnio_jax.config.schema import FILE_ONLY, Words
 from gnio_jax.errors import InputError, did_you_mean
 
-HELP, HELP_VERBOSE, COMPLETION = ("-h", "--help"), ("-H", "--help-verbose"), "--completion"
+HELP, HELP_VERBOSE = ("-h", "--help"), ("-H", "--help-verbose")
 MANY = 24
 """Options of which the help lists names and defaults alone; --help-verbose explains them."""
 WIDTH = 100
@@ -86,9 +86,8 @@ def run(program: Group | str | Command, call: Call) -> None:
     command that is unknown or missing, and as `read`."""
     while isinstance(program, Group):
         word = call.argv[0] if call.argv else ""
-        if word in HELP or word == COMPLETION:
-            text = _overview if word in HELP else _completion
-            print(text(program, call.prog))
+        if word in HELP:
+            print(_overview(program, call.prog))
             return
         if word not in program.commands:
             known = f"give one of {', '.join(program.commands)}; --help explains them"
@@ -249,7 +248,7 @@ def _add(group: Any, option: Option, dest: str, brief: bool) -> None:
     elif option.default is dataclasses.MISSING:
         text += " (required)"
     elif not any(option.default is nothing for nothing in (None, False, ())):
-        shown = option.default if items else (option.default,)
+        shown = option.default if isinstance(option.default, tuple) else (option.default,)
         text += f" (default: {' '.join(map(str, shown))})"
     if kind is bool:
         group.add_argument(option.name, action="store_true", dest=dest, help=text.strip())
@@ -311,8 +310,9 @@ def _overview(group: Group, prog: str) -> str:
     )
 
 
-def _completion(group: Group, prog: str) -> str:
-    """A script by which bash completes commands and options by name, and values as files."""
+def completion(group: Group, prog: str) -> str:
+    """A script by which bash completes the commands and options of a program by name, and values as
+    files."""
 
     def cases(group: Group, words: str) -> Iterator[str]:
         for name, command in group.commands.items():

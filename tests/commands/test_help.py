@@ -8,7 +8,7 @@ import subprocess
 import pytest
 
 from gnio_jax import config
-from gnio_jax.commands import options
+from gnio_jax.commands import app, options
 from tests.support.command_lines import commands, run, understood
 
 WORDS = [words for words, _ in commands()]
@@ -76,11 +76,12 @@ def test_help_of_the_overviews_names_every_command(capsys):
 def test_help_of_train_names_the_configs(capsys):
     text = joined(shown(capsys, "train", "-H"))
     assert all(name in text for name in config.names())
+    assert "(default: synthetic)" in text
     assert "--optim.epochs INT Passes over the training windows. (default: 200)" in text
 
 
 def test_bash_completes_commands_and_options(capsys):
-    run("--completion")
+    app.main(["--completion"])
     script = capsys.readouterr().out
     for typed, completed in (
         (["tr"], ["track", "train"]),
