@@ -17,14 +17,6 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    Progress,
-    TaskProgressColumn,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
 from rich.table import Table
 from rich.text import Text
 
@@ -175,7 +167,7 @@ def prepare_filter() -> None:
 class Terminal:
     """A `Reporter`: lines and one progress bar on stderr; on a file or a pipe the lines alone."""
 
-    def __init__(self, bars: Progress):
+    def __init__(self, bars: Any):
         self._bars = bars
         self._task = bars.add_task("starting", total=None, numbers="")
         self._stage = "starting"
@@ -195,17 +187,19 @@ class Terminal:
 @contextlib.contextmanager
 def terminal(shown: bool = True) -> Iterator[Terminal]:
     """A `Terminal` whose bar is removed at the end, or one without a bar."""
+    from rich import progress  # late: no help and no mistake needs it
+
     console = _Plain(stderr=True)
     columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TaskProgressColumn(),
-        TextColumn("{task.fields[numbers]}"),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(elapsed_when_finished=True),
+        progress.TextColumn("{task.description}"),
+        progress.BarColumn(),
+        progress.TaskProgressColumn(),
+        progress.TextColumn("{task.fields[numbers]}"),
+        progress.TimeElapsedColumn(),
+        progress.TimeRemainingColumn(elapsed_when_finished=True),
     )
     disable = not (shown and console.is_terminal)
-    with Progress(
+    with progress.Progress(
         *columns, console=console, transient=True, disable=disable, speed_estimate_period=120
     ) as bars:
         yield Terminal(bars)

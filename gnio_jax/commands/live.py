@@ -14,8 +14,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import numpy as np
-
 from gnio_jax.commands import console, options
 from gnio_jax.config import ImportOptions
 from gnio_jax.config.schema import UNNAMED, Bound, NewFile, NonNegative, Positive
@@ -75,6 +73,7 @@ def live(asked: LiveOptions, _call: options.Call) -> None:
     inbox = _listen(asked) if asked.source.startswith(UDP) else None  # before all that takes time
     console.compile_quickly()
     import jax  # late: mistakes do not wait for it
+    import numpy as np
 
     from gnio_jax.apps import live as following
     from gnio_jax.apps import packages, rerun
