@@ -11,10 +11,11 @@ from scipy.spatial.transform import Rotation
 from gnio_jax.data.dataset import Dataset
 from gnio_jax.numerics import (
     convolved,
-    cumulative_rotation,
     integrate_gyro,
     last_true,
     midpoints,
+    quaternion_product,
+    quaternions,
     rotations,
     spans,
 )
@@ -193,8 +194,9 @@ def gyro_windows(
     """
     time, valid = sequence.time, sequence.valid
     step = float(np.median(np.diff(time)))
-    length = max(min(round(window_seconds / step), len(time) - 1), 1)
-    starts = np.arange(0, len(time) - length, max(length // 2, 1))
+    half = max(min(round(window_seconds / step), len(time) - 1) // 2, 1)
+    length = 2 * half
+    starts = np.arange(0, len(time) - length, half)
     starts = starts[valid[starts] & valid[starts + length]]
     if not starts.size:
         return np.zeros(0), np.zeros(0)
@@ -205,17 +207,27 @@ def gyro_windows(
     summed = np.concatenate([np.zeros((1, 3, 3)), np.cumsum(rotation * step, axis=0)])
     jacobian = np.einsum("wji,wjk->wik", rotation[starts], summed[starts + length] - summed[starts])
     # A rate sampled at the stamps is worth most at the middle of the interval it drives.
-    middle = midpoints(sequence.gyro)
+    middle, halves = midpoints(sequence.gyro), starts // half
+    middle = middle[: len(middle) // half * half]
 
     def error(bias: np.ndarray) -> np.ndarray:
-        turned = cumulative_rotation(Rotation.from_rotvec((middle - bias) * step))
-        turned = turned[starts].inv() * turned[starts + length]
-        return (turned * reference.inv()).as_rotvec()
+        turns = quaternions(Rotation.from_rotvec((middle - bias) * step))
+        turned = rotations(_product(turns.reshape(-1, half, 4)))
+        return (turned[halves] * turned[halves + 1] * reference.inv()).as_rotvec()
 
     bias = np.zeros(3)
     for _ in range(2):
         bias = bias + _bias_correction(error(bias), jacobian)
     return time[starts], np.degrees(np.linalg.norm(error(bias), axis=1))
+
+
+def _product(turns: Float[np.ndarray, "w n 4"]) -> Float[np.ndarray, "w 4"]:
+    """Products of n quaternions (wxyz): of pairs, and then of these."""
+    turns = np.ascontiguousarray(turns.T)
+    while (count := turns.shape[1]) > 1:
+        paired = quaternion_product(turns[:, : count - 1 : 2], turns[:, 1::2], axis=0)
+        turns = np.concatenate([paired, turns[:, count - count % 2 :]], axis=1)
+    return turns[:, 0].T
 
 
 def _bias_correction(
