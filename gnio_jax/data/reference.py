@@ -162,11 +162,11 @@ def _fused(
     runs = stretches(np.diff(poses.time) > usual)
     sure = [np.arange(run.start, run.stop) for run in runs if run.stop - run.start >= SHORTEST_RUN]
     poses = poses.rows(np.concatenate(sure)) if sure else poses
-    stamps, everywhere = poses.time, np.ones(len(poses.time), dtype=bool)
-    measured = known_at(stamps, everywhere, clock, usual)
+    stamps, nothing = poses.time, np.full((len(clock), 4), np.nan)
+    unknown = Reference(nothing, nothing[:, :3], nothing[:, :3], np.zeros(len(clock), dtype=bool))
+    measured = known_at(stamps, np.ones(len(stamps), dtype=bool), clock, usual)
     if measured.sum() < SHORTEST_RUN:
-        nothing = np.full((len(clock), 4), np.nan)
-        return Reference(nothing, nothing[:, :3], nothing[:, :3], np.zeros(len(clock), dtype=bool))
+        return unknown
     turned = slerp(clock, stamps, poses.attitude)
     # The gyro's constant bias would bend the correction at its ends.
     both = measured[:-1] & measured[1:]
@@ -176,12 +176,16 @@ def _fused(
     arm = fused.apply(poses.lever)
     place = splined(stamps, poses.position, clock, np.diff(stamps) > usual) + arm
     smoothed, velocity, kept = smooth_positions(place, measured & believed, step)
-    # Where few poses are left between gaps the smoother may swing; it must stay with what was seen.
-    straight = interpolate(clock, stamps, poses.position) + arm
-    close = np.linalg.norm(smoothed - straight, axis=1) < LARGEST_JUMP
-    bridged = known_at(stamps, everywhere, clock, bridge)
-    valid = np.asarray(bridged & close & (believed & kept | ~measured))
-    return Reference(quaternions(fused), smoothed, velocity, valid)
+    # What the smoother does not believe is no pose, and is bridged as a lost one is. Where few
+    # poses are left between gaps the smoother may swing; it must stay with what was seen.
+    sure = np.flatnonzero(kept)
+    if len(sure) < SHORTEST_RUN:
+        return unknown
+    close = np.linalg.norm(smoothed - interpolate(clock, clock[sure], place[sure]), axis=1)
+    gap = bridge + 2.0 * step  # between rows of the clock that lie beside the poses
+    bridged = known_at(clock[sure], np.ones(len(sure), dtype=bool), clock, gap)
+    bridged &= known_at(stamps, np.ones(len(stamps), dtype=bool), clock, bridge)
+    return Reference(quaternions(fused), smoothed, velocity, bridged & (close < LARGEST_JUMP))
 
 
 def longest_trusted(stamps: Float[np.ndarray, " n"]) -> float:

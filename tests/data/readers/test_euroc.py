@@ -145,7 +145,7 @@ def test_a_trackers_gaps_are_not_valid_and_its_attitudes_come_back(tmp_path):
     assert self_check(sequence).failures == ()
 
 
-def test_a_noisy_tracker_is_smoothed_and_its_flips_are_masked(tmp_path):
+def test_a_noisy_tracker_is_smoothed_and_its_flips_are_bridged(tmp_path):
     mav = tmp_path / "dataset-room2_512_16" / "mav0"
     mount = files.Mount(
         Rotation.from_euler("ZXY", [80, -10, 15], degrees=True), np.array([0.03, 0.06, -0.04])
@@ -168,8 +168,8 @@ def test_a_noisy_tracker_is_smoothed_and_its_flips_are_masked(tmp_path):
     assert place.max() < 0.01 and np.median(place) < 2e-3
     speed = np.abs(sequence.velocity - known_walk.velocity(time))[valid]
     assert np.sqrt((speed**2).mean()) < 0.02  # differences of neighbours would make 0.07
-    for flip in flips:
-        assert not valid[np.argmin(np.abs(time - flip))]
+    for flip in flips:  # of one pose each
+        assert valid[np.abs(time - flip) < 0.1].all()
     assert self_check(sequence).failures == ()
 
 
