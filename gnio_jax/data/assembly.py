@@ -104,7 +104,7 @@ def assemble(
     Raises `InputError` naming the file where one is damaged, and `Refusal` for a recording of no
     use: without a window of IMU and reference.
     """
-    streams = _in_order(streams)
+    streams = ordered(streams)
     gyro, accel = streams.gyro, streams.accel
     for sensor in (gyro, accel):
         _check_rate(sensor, native)
@@ -138,25 +138,27 @@ def assemble(
     return [validate(piece, streams.source) for piece in kept]
 
 
-def _in_order(streams: Streams) -> Streams:
+def ordered(streams: Streams) -> Streams:
     """Every stream by increasing stamps, and the counts of the gyro's repaired rows."""
 
-    def ordered(samples: Samples) -> tuple[Samples, dict[str, float]]:
+    def by_stamps(samples: Samples) -> tuple[Samples, dict[str, float]]:
         rows, repairs = in_order(samples.time, samples.values, samples.source)
-        return samples._replace(time=samples.time[rows], values=samples.values[rows]), repairs
+        if repairs:
+            samples = samples._replace(time=samples.time[rows], values=samples.values[rows])
+        return samples, repairs
 
-    gyro, repairs = ordered(streams.gyro)
+    gyro, repairs = by_stamps(streams.gyro)
     poses, device = streams.poses, streams.device
     if poses is not None:
-        rows = in_order(poses.time, poses.position, poses.source).rows
+        rows, changed = in_order(poses.time, poses.position, poses.source)
         if len(rows) < 2:
             raise InputError(poses.source, f"holds {len(rows)} poses", "copy it again")
-        poses = poses.rows(rows)
+        poses = poses.rows(rows) if changed else poses
     return streams._replace(
         gyro=gyro,
-        accel=ordered(streams.accel)[0],
+        accel=by_stamps(streams.accel)[0],
         poses=poses,
-        device=device and ordered(device)[0],
+        device=device and by_stamps(device)[0],
         attributes=streams.attributes | repairs,
     )
 

@@ -27,14 +27,14 @@ from contextlib import suppress
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Real
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d
 from scipy.optimize import fminbound, least_squares
 from scipy.spatial.transform import Rotation
 
-from gnio_jax.data.assembly import Samples, Streams
-from gnio_jax.data.reference import LONGEST_BRIDGE, LOST_POSES, Poses, one_sign
+from gnio_jax.data.assembly import Samples, Streams, ordered
+from gnio_jax.data.reference import LOST_POSES, Poses, longest_trusted, one_sign
 from gnio_jax.data.resampling import known_at, splined
 from gnio_jax.numerics import (
     hat,
@@ -127,6 +127,9 @@ class BodyFit(NamedTuple):
     runner_up: float
     """What this fit leaves unexplained over what the best fit with another lag does; 0 where there
     is no other, 1 where both are as good."""
+    turn_std: float
+    """Standard deviation of the extrinsic rotation about the axis that the motion tells least of,
+    rad: large where the body rests, or turns about the vertical alone."""
     poses: Poses
     """The tracker's poses as those of the IMU, noisy still: its attitude in a level world on its
     own clock, with the lever to it. Poses that contradict its acceleration grossly are left out."""
@@ -142,12 +145,15 @@ def align(
     """The mounting of an IMU on a body whose noisy poses are `track`, both on clocks of their own.
 
     `knot_seconds` is the spacing of the lag's knots; first guesses of the lag lie within
-    `search_seconds` of `around` (s). Raises `TooLittle` where too little of the track is usable.
-    Whether the best fit is a good one is the caller's to judge, by `gyro_unexplained`,
-    `accel_unexplained` and `runner_up`.
+    `search_seconds` of `around` (s). Raises `TooLittle` where too little of the track is usable,
+    and `InputError` for stamps that are damaged. Whether the best fit is a good one is the caller's
+    to judge, by `gyro_unexplained`, `accel_unexplained`, `runner_up` and `turn_std`.
     """
-    felt = _Felt(_filtered(imu.gyro), _filtered(imu.accel))
-    seen = _seen(track)
+    imu = ordered(imu._replace(poses=track))
+    assert imu.poses is not None
+    track = imu.poses
+    check_lengths(SHORTEST_OVERLAP, imu.gyro, imu.accel, track)
+    felt, seen = _felt(imu), _seen(track)
     thinned, knots = seen.rows(slice(None, None, THINNED)), uniform_knots(track.time, 30.0)
     candidates = []
     for lag, extrinsic in _first_guesses(seen, felt, around, search_seconds)[:STARTS]:
@@ -181,6 +187,7 @@ def align(
         gyro_unexplained=unexplained(fit.gyro, fit.seen.rate),
         accel_unexplained=unexplained(fit.accel, fit.seen.acceleration),
         runner_up=best.unexplained / min(others) if others else 0.0,
+        turn_std=fit.turn_std,
         poses=_poses_of_the_imu(fit, finer, track, levelling(up)),
     )
 
@@ -191,8 +198,7 @@ def _poses_of_the_imu(
     # A track that contradicts the accelerometer grossly has jumped.
     contradiction = np.linalg.norm(fit.accel, axis=1)
     jumps = fit.seen.time[contradiction > max(6.0, 8.0 * robust_std(fit.accel))]
-    near = np.searchsorted(jumps, track.time - 0.1) < np.searchsorted(jumps, track.time + 0.1)
-    kept = track.rows(np.flatnonzero(~near))
+    kept = track.rows(np.flatnonzero(~near_any(track.time, jumps, jumps, 0.1)))
     return kept._replace(
         time=kept.time + np.interp(kept.time, knots, fit.unknowns[LAG]),
         attitude=level * kept.attitude * fit.extrinsic,
@@ -209,10 +215,8 @@ def without_jumps(poses: Poses, fastest_turn: float, fastest: float, around: flo
     angle = np.linalg.norm(turns_between(poses.attitude), axis=1)
     distance = np.linalg.norm(np.diff(poses.position, axis=0), axis=1)
     jumps = np.flatnonzero((angle > fastest_turn * steps) | (distance > fastest * steps))
-    # A pose is near a jump that has not ended long before it and begins before long.
-    ended = np.searchsorted(poses.time[jumps + 1], poses.time - around)
-    begun = np.searchsorted(poses.time[jumps], poses.time + around, side="right")
-    return poses.rows(np.flatnonzero(ended == begun))
+    near = near_any(poses.time, poses.time[jumps], poses.time[jumps + 1], around)
+    return poses.rows(np.flatnonzero(~near))
 
 
 # --- both sides of the equations, filtered
@@ -243,11 +247,12 @@ class _Felt(NamedTuple):
     """rad/s."""
     accel: CubicSpline
     """m/s²."""
+    unknown: list[tuple[np.ndarray, np.ndarray]]
+    """Of each sensor: where its gaps begin and end, with what lies before and after its samples."""
 
     def covers(self, time: Float[np.ndarray, " m"]) -> Bool[np.ndarray, " m"]:
-        first = max(self.gyro.x[0], self.accel.x[0]) + MARGIN
-        last = min(self.gyro.x[-1], self.accel.x[-1]) - MARGIN
-        return (time > first) & (time < last)
+        """Where both sensors were measured, and `MARGIN` around."""
+        return ~np.any([near_any(time, *gaps, MARGIN) for gaps in self.unknown], axis=0)
 
 
 def _seen(track: Poses) -> _Seen:
@@ -271,11 +276,16 @@ def _seen(track: Poses) -> _Seen:
     return _Seen(clock[rows], *(smooth(side, sigma)[rows] for side in sides))
 
 
-def _filtered(samples: Samples) -> CubicSpline:
-    """Samples as a function of time, filtered on a uniform clock."""
-    clock = np.arange(samples.time[0], samples.time[-1], 1.0 / RATE)
-    values = splined(samples.time, samples.values, clock, np.diff(samples.time) > LONGEST_BRIDGE)
-    return CubicSpline(clock, smooth(values, FILTER_SECONDS * RATE), axis=0)
+def _felt(imu: Streams) -> _Felt:
+    """Both sensors filtered on uniform clocks."""
+    splines, unknown = [], []
+    for time, values, _ in (imu.gyro, imu.accel):
+        clock, broken = np.arange(time[0], time[-1], 1.0 / RATE), gaps(time)
+        filtered = smooth(splined(time, values, clock, broken), FILTER_SECONDS * RATE)
+        splines.append(CubicSpline(clock, filtered, axis=0))
+        begun = np.concatenate([[-np.inf], time[:-1][broken], time[-1:]])
+        unknown.append((begun, np.concatenate([time[:1], time[1:][broken], [np.inf]])))
+    return _Felt(*splines, unknown)
 
 
 # --- first guesses
@@ -295,8 +305,7 @@ def _first_guesses(
     from scipy.signal import correlate, correlation_lags, find_peaks
 
     shifted = felt.gyro.x - around
-    first, last = min(seen.time[0], shifted[0]), max(seen.time[-1], shifted[-1])
-    grid = np.arange(first, last, 1.0 / RATE)
+    grid = np.arange(seen.time[0] - search_seconds, seen.time[-1] + search_seconds, 1.0 / RATE)
     tracked, own = (
         np.interp(grid, time, np.minimum(np.linalg.norm(rate, axis=1), FASTEST_TURN), 0.0, 0.0)
         for time, rate in ((seen.time, seen.rate), (shifted, felt.gyro(felt.gyro.x)))
@@ -312,7 +321,9 @@ def _first_guesses(
         rows = felt.covers(seen.time + lag)
         if rows.sum() * ROW_SECONDS >= SHORTEST_OVERLAP:
             rate, turning = felt.gyro(seen.time[rows] + lag), seen.rate[rows]
-            rotation = Rotation.align_vectors(turning, rate)[0]
+            left, _, right = np.linalg.svd(turning.T @ rate)
+            left[:, 2] *= np.linalg.det(left @ right)  # a rotation, no reflection
+            rotation = Rotation.from_matrix(left @ right)
             guesses.append((unexplained(turning - rotation.apply(rate), turning), lag, rotation))
     guesses.sort(key=lambda guess: guess[0])
     return [(lag, rotation) for _, lag, rotation in guesses]
@@ -331,6 +342,8 @@ class _Fit(NamedTuple):
     """Errors of the angular rate in these rows, rad/s."""
     accel: Float[np.ndarray, "n 3"]
     """Errors of the acceleration, m/s²."""
+    turn_std: float
+    """As in `BodyFit`."""
 
     @property
     def unexplained(self) -> float:
@@ -362,26 +375,43 @@ def _fit(
     for _ in range(2):
         scales = max(robust_std(found[0]), 1e-4), max(robust_std(found[1]), 1e-3)
         off = [np.linalg.norm(e, axis=1) / s for e, s in zip(found, scales, strict=True)]
-        kept = np.maximum(*off) < OUTLIER
+        kept = np.maximum(*off) <= max(OUTLIER, np.median(np.maximum(*off)))
         noises = [_noise(seen.time[kept], e[kept], s) for e, s in zip(found, scales, strict=True)]
         problem = _Problem(seen.rows(kept), felt, hats[kept], extrinsic, noises, unknowns)
-        unknowns = (
-            unknowns
-            + least_squares(
-                problem.residuals,
-                np.zeros(len(unknowns)),
-                problem.derivatives,
-                loss="cauchy",
-                f_scale=3.0,
-                x_scale=reach,
-                ftol=1e-5,
-                max_nfev=20,
-            ).x
+        result = least_squares(
+            problem.residuals,
+            np.zeros(len(unknowns)),
+            problem.derivatives,
+            loss="cauchy",
+            f_scale=3.0,
+            x_scale=reach,
+            ftol=1e-5,
+            max_nfev=20,
         )
+        unknowns = unknowns + result.x
         extrinsic = extrinsic * Rotation.from_rotvec(unknowns[TURN])
         unknowns[TURN] = 0.0
         found = errors(seen, felt, hats, extrinsic, unknowns)
-    return _Fit(extrinsic, unknowns, seen, *found)
+    return _Fit(extrinsic, unknowns, seen, *found, _turn_std(result.jac, int(kept.sum())))
+
+
+def _turn_std(jacobian: Float[np.ndarray, "r u"], rows: int) -> float:
+    """Standard deviation of the turn about its least certain axis, rad, whatever the other unknowns
+    are: by the derivatives of residuals of unit variance.
+
+    The sensors' own noise seems to tell of the turn, too, by 2 a row and sensor, and does not.
+    """
+    information = jacobian.T @ jacobian
+    turn, mixed, others = (
+        information[rows, columns]
+        for rows, columns in (
+            (TURN, TURN),
+            (TURN, slice(TURN.stop, None)),
+            (slice(TURN.stop, None), slice(TURN.stop, None)),
+        )
+    )
+    known = turn - mixed @ np.linalg.pinv(others, hermitian=True) @ mixed.T
+    return float(1.0 / np.sqrt(max(np.linalg.eigvalsh(known)[0] - 4.0 * rows, 1e-12)))
 
 
 class _Problem(NamedTuple):
@@ -523,20 +553,20 @@ def pose_lag(
     bias and rate(t + lag) differ least in the mean of their sizes, both smoothed over 0.05 s (σ).
     """
     steps, middle = np.diff(stamps), midpoints(stamps)
-    near = steps <= LOST_POSES / RATE
-    if not near.any():
+    margin = round((LONGEST_POSE_LAG + 0.1) * RATE)
+    if not steps.any():
         return PoseLag(0.0, 1.0)
-    turning = (turns_between(attitude) / steps[:, None])[near]
+    near = (steps > 0.0) & (steps <= LOST_POSES * np.median(steps[steps > 0.0]))
     clock = np.arange(max(time[0], middle[0]), min(time[-1], middle[-1]), 1.0 / RATE)
+    if len(clock) < 5 * RATE + 2 * margin:
+        return PoseLag(0.0, 1.0)
+    turning = turns_between(attitude)[near] / steps[near, None]
     felt, tracked = (
         smooth(interpolate(clock, own, rate), POSE_LAG_FILTER_SECONDS * RATE)
         for own, rate in ((time, gyro), (middle[near], turning))
     )
-    margin = round((LONGEST_POSE_LAG + 0.1) * RATE)
     tracked = CubicSpline(clock, tracked, axis=0)
     clock, felt = clock[margin:-margin], felt[margin:-margin]
-    if len(clock) < 5 * RATE:
-        return PoseLag(0.0, 1.0)
     if float(np.median(np.linalg.norm(felt - np.median(felt, axis=0), axis=1))) < 0.02:
         return PoseLag(0.0, 1.0)
 
@@ -553,6 +583,30 @@ def pose_lag(
 
 
 # --- shared with `positions`
+
+
+def check_lengths(seconds: float, *streams: Samples | Poses) -> None:
+    """Raise `TooLittle` where one of the streams is shorter than this."""
+    for each in streams:
+        if len(each.time) < 2 or each.time[-1] - each.time[0] < seconds:
+            raise TooLittle(f"less than {seconds:g} s are recorded in {each.source}")
+
+
+def gaps(time: Float[np.ndarray, " n"]) -> Bool[np.ndarray, " i"]:
+    """Which intervals between samples are too long to be followed."""
+    return np.diff(time) > longest_trusted(time)
+
+
+def near_any(
+    time: Real[np.ndarray, " n"],
+    starts: Real[np.ndarray, " k"],
+    ends: Real[np.ndarray, " k"],
+    around: float,
+) -> Bool[np.ndarray, " n"]:
+    """Where a time is within an interval from one of `starts` to its end, or `around` it: a start
+    is passed by then, and its end is not. Both increase."""
+    begun = np.searchsorted(starts, time + around, side="right")
+    return begun != np.searchsorted(ends, time - around)
 
 
 def smooth(values: np.ndarray, sigma: float) -> np.ndarray:

@@ -25,13 +25,16 @@ from gnio_jax.data.alignment.body import (
     RATE,
     SAME_LAG,
     TooLittle,
+    check_lengths,
+    gaps,
     hat_functions,
     second_difference,
     smooth,
     uniform_knots,
 )
-from gnio_jax.data.assembly import Samples, Streams
-from gnio_jax.data.reference import LONGEST_BRIDGE, Poses, smooth_positions
+from gnio_jax.data.assembly import Samples, Streams, ordered
+from gnio_jax.data.parsing.stamps import in_order
+from gnio_jax.data.reference import Poses, longest_trusted, smooth_positions
 from gnio_jax.data.resampling import known_at, slerped, splined
 from gnio_jax.numerics import (
     about_z,
@@ -122,23 +125,27 @@ def align_positions(imu: Streams, track: Samples, search_seconds: float = 4.0) -
     drifts in yaw. Over minutes, though, gravity tells it the gyro's bias in tilt. Raises
     `TooLittle` where both share less than 20 s.
     """
+    imu = ordered(imu)
+    rows = in_order(track.time, track.values, track.source).rows
+    stamps, values = track.time[rows], track.values[rows]
     assert imu.device is not None
     streams = (imu.gyro, imu.accel, imu.device)
+    check_lengths(SHORTEST_OVERLAP, *streams, track._replace(time=stamps))
     first, last = max(each.time[0] for each in streams), min(each.time[-1] for each in streams)
+    if last - first < SHORTEST_OVERLAP:
+        raise TooLittle(f"gyro, accelerometer and attitude share less than {SHORTEST_OVERLAP:g} s")
     clock = np.arange(first, last, 1.0 / RATE)
-    gyro, accel = (
-        splined(each.time, each.values, clock, np.diff(each.time) > LONGEST_BRIDGE)
-        for each in streams[:2]
-    )
+    gyro, accel = (splined(each.time, each.values, clock, gaps(each.time)) for each in streams[:2])
     device = rotations(slerped(imu.device.time, imu.device.values, clock))
 
-    grid = np.arange(track.time[0], track.time[-1], 1.0 / RATE)
-    position = splined(track.time, track.values, grid, np.diff(track.time) > LONGEST_BRIDGE)
-    seen = known_at(track.time, np.ones(len(track.time), dtype=bool), grid, LONGEST_BRIDGE)
+    grid = np.arange(stamps[0], stamps[-1], 1.0 / RATE)
+    position = splined(stamps, values, grid, gaps(stamps))
+    seen = known_at(stamps, np.ones(len(stamps), dtype=bool), grid, longest_trusted(stamps))
     tracked = second_difference(position, 1.0 / RATE)
     # Accelerations that no pedestrian makes are jumps.
     strength = np.linalg.norm(smooth(tracked, STEP_FILTER_SECONDS * RATE), axis=1)
-    jumps = strength > 8.0 * max(float(np.median(strength)), 0.1)
+    usual = float(np.median(strength[seen])) if seen.any() else 0.0
+    jumps = strength > 8.0 * max(usual, 0.1)
     good = ~within(~seen | jumps, round(2 * SLOW_FILTER_SECONDS * RATE))
     signals = _Signals(clock, device.apply(accel) - UPWARD, grid, tracked, good)
     lag, correlation, runner_up = _constant_lag(signals, search_seconds)
@@ -158,7 +165,7 @@ def align_positions(imu: Streams, track: Samples, search_seconds: float = 4.0) -
     there = clock - np.interp(clock, lag_knots, lags)
     shared = np.flatnonzero((there >= grid[0]) & (there <= grid[-1]))
     place, velocity, kept = smooth_positions(
-        splined(grid, position, there[shared], np.diff(grid) > LONGEST_BRIDGE),
+        splined(grid, position, there[shared], gaps(grid)),
         np.interp(there[shared], grid, (seen & ~jumps).astype(float)) > 0.99,
         1.0 / RATE,
         CUTOFF,
@@ -198,14 +205,16 @@ def _constant_lag(signals: _Signals, search_seconds: float) -> tuple[float, floa
             np.bincount(stretch[rows], values) for values in (*_both_ways(own, seen), *powers)
         )
         level = (along**2 + across**2) / np.maximum(power * other, 1e-12)
-        vertical = float(np.corrcoef(own[:, 2], seen[:, 2])[0, 1])
+        up, risen = (each[:, 2] - each[:, 2].mean() for each in (own, seen))
+        vertical = float(up @ risen / max(np.linalg.norm(up) * np.linalg.norm(risen), 1e-12))
         return vertical, float(np.average(level, weights=np.bincount(stretch[rows]) + 1e-9))
 
     most = round(search_seconds / LAG_STEP)
     lags = np.arange(-most, most + 1) * LAG_STEP
     found = np.array([correlations(lag) for lag in lags])
     if not found.any():
-        raise TooLittle(f"less than {SHORTEST_OVERLAP:g} s of positions overlap the IMU's samples")
+        problem = f"less than {SHORTEST_OVERLAP:g} s of moving positions overlap the IMU's samples"
+        raise TooLittle(problem)
     # A negative correlation explains nothing.
     explained = 0.5 * (np.maximum(found[:, 0], 0.0) ** 2 + found[:, 1])
     best = int(np.argmax(explained))
@@ -227,7 +236,9 @@ def _yaw(signals: _Signals, knots: Float[np.ndarray, " k"], lag: float) -> Float
     rows, own, seen = signals.filtered(SLOW_FILTER_SECONDS).in_step(lag)
     near = np.abs(signals.grid[rows, None] + lag - knots) < 1.5 * STRETCH_SECONDS
     along, across = _both_ways(own, seen)
-    return np.unwrap(np.arctan2(across @ near, along @ near))
+    told = near.any(axis=0)  # in a gap of the tracker nothing tells the yaw
+    yaw = np.unwrap(np.arctan2(across @ near, along @ near)[told])
+    return np.interp(knots, knots[told], yaw)
 
 
 def _fit(

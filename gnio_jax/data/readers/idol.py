@@ -28,6 +28,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from gnio_jax.data.alignment import pose_lag
+from gnio_jax.data.alignment.body import LONGEST_POSE_LAG
 from gnio_jax.data.assembly import Poses, Samples, Streams, assemble
 from gnio_jax.data.dataset import Dataset, Recording, Refusal
 from gnio_jax.data.parsing.stamps import distinct
@@ -159,6 +160,9 @@ def read(path: str | os.PathLike[str]) -> list[Sequence]:
     fit = pose_lag(closed, gyro, closed[known], attitude)
     if not fit.correlation >= 0.5:  # NaN when the poses do not turn at all
         problem = f"do not turn as 'iphoneGyro' does (they correlate by {fit.correlation:.2f})"
+        raise Refusal(path, f"columns 'orient' {problem}")
+    if abs(fit.lag) >= LONGEST_POSE_LAG:
+        problem = f"are out of step with 'iphoneGyro' by {LONGEST_POSE_LAG:g} s or more"
         raise Refusal(path, f"columns 'orient' {problem}")
     about = {
         "dataset": "idol",

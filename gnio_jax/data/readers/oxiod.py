@@ -36,7 +36,7 @@ from gnio_jax.data.alignment import (
     align_positions,
     without_jumps,
 )
-from gnio_jax.data.alignment.body import hat_functions, uniform_knots
+from gnio_jax.data.alignment.body import hat_functions, near_any, uniform_knots
 from gnio_jax.data.assembly import Poses, Samples, Streams, assemble
 from gnio_jax.data.dataset import Dataset, Recording, Refusal
 from gnio_jax.data.parsing.tables import Table, damaged, read_text, shortened
@@ -89,6 +89,7 @@ LONGEST_LAG = {"raw": 5.0, "syn": 1.0}
 """s. The clocks of raw files were set apart (0.29 here, 1.7 in others of the set, and as far as the
 search goes); the rows of syn files were matched by the authors (0.29)."""
 LIMITS = {
+    "mounting's uncertainty": (2.0, "°"),  # what hardly turns or moves tells none (0.1)
     "lag's drift": (1.0, "s"),  # clocks drift by 1 ms in some seconds (0.26)
     "accel's delay": (0.15, "s"),  # phones filter the accelerometer over some samples (0.052)
     "lever arm": (0.3, "m"),  # the marker body is the phone with markers on it (0.12)
@@ -327,6 +328,7 @@ def _on_vicon(phone: Streams, path: Path, kind: str) -> Streams:
         )
     found = {
         "lag": float(np.abs(fit.lag).max()),
+        "mounting's uncertainty": float(np.degrees(fit.turn_std)),
         "lag's drift": float(np.ptp(fit.lag)),
         "accel's delay": abs(fit.accel_delay),
         "lever arm": float(np.linalg.norm(fit.lever)),
@@ -358,6 +360,7 @@ def _figures(fit: BodyFit) -> dict[str, str | float]:
         "gyro_unexplained": fit.gyro_unexplained,
         "accel_unexplained": fit.accel_unexplained,
         "runner_up": fit.runner_up,
+        "extrinsic_uncertainty_degrees": float(np.degrees(fit.turn_std)),
         "extrinsic_yaw_degrees": float(fit.extrinsic.as_euler("ZXY", degrees=True)[0]),
         "extrinsic_tilt_degrees": _degrees_off(fit.extrinsic.as_matrix()[2, 2]),
         "tilt_x": float(fit.up[0] / fit.up[2]),
@@ -545,9 +548,7 @@ def read_tango(path: Path) -> Samples:
     steps = np.linalg.norm(np.diff(values[rows], axis=0), axis=1)
     jumps = np.flatnonzero(steps > FASTEST_TANGO * np.diff(rows) / RATE)
     # The rows on both sides of a jump, and 0.1 s around them.
-    ended = np.searchsorted(rows[jumps + 1], rows - 10)
-    begun = np.searchsorted(rows[jumps], rows + 10, "right")
-    rows = rows[ended == begun]
+    rows = rows[~near_any(rows, rows[jumps], rows[jumps + 1], 10.0)]
     return Samples(rows / RATE, values[rows], str(path))
 
 

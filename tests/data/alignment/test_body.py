@@ -43,7 +43,8 @@ def tracked(hz=100.0):
 
 
 @pytest.mark.parametrize(
-    ("gyro_hz", "accel_hz", "track_hz"), [(100.0, 100.0, 100.0), (90.3, 107.1, 60.0)]
+    ("gyro_hz", "accel_hz", "track_hz"),
+    [(100.0, 100.0, 100.0), (90.3, 107.1, 60.0), (10.0, 10.0, 40.0)],
 )
 def test_a_known_mounting_is_found_on_a_late_clock(gyro_hz, accel_hz, track_hz):
     bias = np.array([0.01, -0.005, 0.02])
@@ -57,7 +58,7 @@ def test_a_known_mounting_is_found_on_a_late_clock(gyro_hz, accel_hz, track_hz):
     np.testing.assert_allclose(found.lag, 0.7, atol=3e-3)
     assert found.accel_delay == pytest.approx(0.02, abs=3e-3)
     assert found.gyro_unexplained < 0.01 and found.accel_unexplained < 0.01
-    assert found.runner_up < 0.5
+    assert found.runner_up < 0.5 and np.degrees(found.turn_std) < 0.1
     # The poses are those of the IMU, in a level world, on its clock.
     poses = found.poses
     assert poses.noisy and len(poses.time) == len(track.time)
@@ -88,9 +89,53 @@ def test_a_jump_of_the_tracker_bends_nothing_and_its_poses_are_left_out():
     assert len(track.time) - 150 < len(kept) < len(track.time) - 20
 
 
-def test_too_short_an_overlap_is_refused():
-    with pytest.raises(alignment.TooLittle, match="less than 10 s of the track overlap"):
-        alignment.align(imu(stop=7.0), tracked())
+def test_what_the_imu_did_not_measure_is_no_evidence():
+    streams, kept = imu(), []
+    for sensor in (streams.gyro, streams.accel):
+        measured = (sensor.time % 4.0 > 1.9) | (sensor.time < 1.0)
+        kept.append(sensor._replace(time=sensor.time[measured], values=sensor.values[measured]))
+    found = alignment.align(streams._replace(gyro=kept[0], accel=kept[1]), tracked())
+    np.testing.assert_allclose(found.lever, LEVER, atol=5e-3)
+    assert found.gyro_unexplained < 0.001 and found.accel_unexplained < 0.001
+
+
+def test_rows_out_of_order_and_stamps_that_are_there_twice_change_nothing():
+    streams, track = imu(), tracked()
+    rows = np.repeat(np.arange(len(streams.gyro.time)), 2)
+    rows[100:120] = rows[100:120][::-1]
+    gyro = Samples(streams.gyro.time[rows], streams.gyro.values[rows], "gyro")
+    found = alignment.align(streams._replace(gyro=gyro), track.rows(np.arange(8000) // 2))
+    np.testing.assert_allclose(found.lever, LEVER, atol=5e-3)
+    np.testing.assert_allclose(found.lag, 0.0, atol=3e-3)
+
+
+@pytest.mark.parametrize(
+    ("streams", "problem"),
+    [
+        (imu(start=-20.0, stop=7.0), "less than 10 s of the track overlap"),
+        (imu(lag=60.0), "less than 10 s of the track overlap"),
+        (imu(stop=7.0), "less than 10 s are recorded in gyro"),
+        (imu(accel_hz=0.01), "less than 10 s are recorded in accel"),
+    ],
+)
+def test_too_short_an_overlap_is_refused(streams, problem):
+    with pytest.raises(alignment.TooLittle, match=problem):
+        alignment.align(streams, tracked())
+
+
+@pytest.mark.parametrize("strength", [0.5, 0.0])
+@pytest.mark.filterwarnings("error")
+def test_a_mounting_that_the_motion_does_not_tell_is_uncertain(strength):
+    """A body that turns about the vertical alone on its place, or rests: all is explained, whatever
+    the yaw of the mounting."""
+    time, axis = np.arange(0.0, 40.0, 0.01), np.array([0.0, 0.0, 1.0])
+    attitude = Rotation.from_rotvec(np.multiply.outer(strength * np.sin(3.0 * time), axis))
+    gyro = np.multiply.outer(3.0 * strength * np.cos(3.0 * time), axis)
+    noise = 1e-3 * np.random.default_rng(0).standard_normal((2, len(time), 3))
+    up = np.array([0.0, 0.0, 9.81])
+    streams = Streams.of_imu("still", "still", time, gyro + noise[0], up + noise[1])
+    poses = Poses(time, attitude * EXTRINSIC.inv(), np.zeros((len(time), 3)), noisy=True)
+    assert np.degrees(alignment.align(streams, poses).turn_std) > 10.0
 
 
 def test_a_track_of_single_poses_is_refused():
@@ -121,7 +166,7 @@ def test_poses_near_flips_and_jumps_are_dropped():
 
 def test_the_jacobians_are_the_differences_of_the_errors():
     streams, seen = imu(), body._seen(tracked())
-    felt = body._Felt(body._filtered(streams.gyro), body._filtered(streams.accel))
+    felt = body._felt(streams)
     knots = body.uniform_knots(seen.time, 15.0)
     rows = slice(10, -10, 7)
     seen, hats = seen.rows(rows), body.hat_functions(seen.time, knots)[rows]
@@ -196,6 +241,20 @@ def test_lag_from_noisy_rates_with_a_bias(lag):
     keep = (time < 30) | (time > 30.4)
     fit = alignment.pose_lag(time, gyro, time[keep], poses[keep])
     assert fit.lag == pytest.approx(lag, abs=3e-3) and fit.correlation > 0.5
+
+
+@pytest.mark.parametrize("hz", [30.0, 60.0])
+def test_poses_of_every_rate_have_a_lag(hz):
+    time, stamps = np.arange(0, 40, 0.01), np.arange(0, 40, 1.0 / hz)
+    fit = alignment.pose_lag(time, walk.rate(time), stamps, walk.attitude(stamps - 0.1))
+    assert fit.lag == pytest.approx(0.1, abs=3e-3) and fit.correlation > 0.99
+
+
+def test_poses_of_another_time_tell_nothing_of_a_lag():
+    time = np.arange(0, 40, 0.01)
+    for stamps in (time + 100.0, time[:1], np.zeros(2)):
+        attitude = walk.attitude(stamps)
+        assert alignment.pose_lag(time, walk.rate(time), stamps, attitude).correlation == 1.0
 
 
 def test_what_stands_still_has_no_lag():

@@ -50,13 +50,39 @@ def test_clock_and_attitude_are_found_and_a_relocalisation_does_not_matter():
     assert np.abs(poses.velocity - walk.velocity(event))[inner].max() < 0.2
 
 
+def test_a_minute_that_the_tracker_lost_bends_nothing():
+    time = np.arange(0.0, 120.0, 0.01)
+    time = np.repeat(time[(time < 30.0) | (time > 95.0)], 2)  # each row is there twice
+    track = Samples(time, walk.position(time), "track")
+    found = alignment.align_positions(phone(125.0, lag=0.8, drift=0.003), track)
+    np.testing.assert_allclose(found.lag, 0.8, atol=0.01)
+    assert found.yaw_drift == pytest.approx(0.003 * 120, abs=0.1)
+    poses = found.poses
+    error = (poses.attitude * walk.attitude(poses.time - 0.8).inv()).as_rotvec()
+    inner = (poses.time > 5.0) & (poses.time < 115.0)
+    assert np.degrees(np.abs(error[inner, :2])).max() < 0.5
+
+
 def test_positions_of_another_walk_do_not_correlate():
     time = np.arange(0.0, 100.0, 0.01)
     other = Samples(time, walk.position(1.3 * time), "track")
     assert alignment.align_positions(phone(100.0), other).correlation < 0.5
 
 
-def test_too_short_an_overlap_is_refused():
-    time = np.arange(0.0, 19.0, 0.01)
-    with pytest.raises(alignment.TooLittle, match="less than 20 s"):
-        alignment.align_positions(phone(19.0), Samples(time, walk.position(time), "track"))
+@pytest.mark.parametrize(
+    ("seconds", "lag", "device", "gain", "problem"),
+    [
+        (19.0, 0.0, 0.0, 1.0, "less than 20 s are recorded"),
+        (60.0, 50.0, 0.0, 1.0, "less than 20 s of moving positions overlap"),
+        (60.0, 0.0, 0.0, 0.0, "less than 20 s of moving positions overlap"),
+        (60.0, 0.0, 50.0, 1.0, "gyro, accelerometer and attitude share less than 20 s"),
+    ],
+)
+@pytest.mark.filterwarnings("error")
+def test_too_little_is_refused(seconds, lag, device, gain, problem):
+    time = np.arange(0.0, seconds, 0.01)
+    streams = phone(seconds, lag)
+    own = streams.device._replace(time=streams.device.time + device)
+    track = Samples(time, gain * walk.position(time), "track")
+    with pytest.raises(alignment.TooLittle, match=problem):
+        alignment.align_positions(streams._replace(device=own), track)

@@ -88,6 +88,11 @@ def test_the_rig_is_not_the_phone(tmp_path):
         read_whole(write(tmp_path, frame(mount=Rotation.identity())))
 
 
+def test_poses_that_are_later_than_the_search_goes_are_refused(tmp_path):
+    with pytest.raises(Refusal, match="out of step with 'iphoneGyro'"):
+        read_whole(write(tmp_path, frame(lag=0.43)))
+
+
 def test_columns_are_found_by_name_among_strays_and_rows_put_in_order(tmp_path):
     table = frame()
     table.insert(3, "level_0", np.arange(len(table))[::-1])
