@@ -16,6 +16,7 @@ from jaxtyping import Float
 
 from gnio_jax.errors import InputError, require_packages
 from gnio_jax.evaluation import Estimate, Recording
+from gnio_jax.evaluation.colours import AXES, BLUE, REFERENCE, SIGMAS
 from gnio_jax.evaluation.report import file_names
 from gnio_jax.files import replacing
 from gnio_jax.filtering import Pose
@@ -23,9 +24,6 @@ from gnio_jax.numerics import finite_rows, quaternion_from_matrix, xyzw_from_wxy
 
 OPTION, VIEWER = "--rerun", "viewer"
 """The viewer stands in the place of a file's name: show it now."""
-BLACK, BLUE, VERMILION, GREEN = (0, 0, 0), (0, 114, 178), (213, 94, 0), (0, 158, 115)
-SIGMAS = 3.0
-"""Size of the ellipsoids, in standard deviations."""
 LINE_EVERY = 10
 """Poses between two drawings of the newest piece of a path that grows."""
 LONGEST_PIECE = 600
@@ -87,10 +85,10 @@ def _log_paths(log: Any, stem: str, estimate: Estimate) -> None:
     import rerun
 
     path, reference = estimate.trajectory, estimate.reference
-    for kind, line, colour in (("reference", reference, BLACK), ("estimate", path, BLUE)):
+    for kind, line, colour in (("reference", reference, REFERENCE), ("estimate", path, BLUE)):
         points = line.position[finite_rows(line.position)]
         if len(points):
-            strip = rerun.LineStrips3D([points], colors=[colour])
+            strip = rerun.LineStrips3D([points], colors=[_rgb(colour)])
             log.log(f"{stem}/{kind}", strip, static=True)
     rows = path.known
     if not rows.any():
@@ -124,11 +122,16 @@ def _log_curves(log: Any, place: str, time: Float[np.ndarray, "n"], values: Any)
 
     if values is None or not (known := finite_rows(values)).any():
         return
-    names = ["x", "y", "z"] if values.shape[1] == 3 else [place.rpartition("/")[2]]
-    colours = [BLUE, VERMILION, GREEN][: len(names)]
-    log.log(place, rerun.SeriesLines(names=names, colors=colours), static=True)
+    colours = AXES if values.shape[1] == 3 else {place.rpartition("/")[2]: BLUE}
+    lines = rerun.SeriesLines(names=list(colours), colors=[*map(_rgb, colours.values())])
+    log.log(place, lines, static=True)
     column = rerun.TimeColumn("time", duration=time[known])
     log.send_columns(place, [column], rerun.Scalars.columns(scalars=values[known]))
+
+
+def _rgb(colour: str) -> tuple[int, ...]:
+    """The three channels of #RRGGBB."""
+    return tuple(bytes.fromhex(colour.removeprefix("#")))
 
 
 # While a trajectory grows
@@ -194,7 +197,7 @@ class RerunStream:
     def _draw(self) -> None:
         import rerun
 
-        line = rerun.LineStrips3D([np.array(self._piece)], colors=[BLUE])
+        line = rerun.LineStrips3D([np.array(self._piece)], colors=[_rgb(BLUE)])
         self._log.log(f"live/estimate/{self._pieces:04d}", line, static=True)
         if len(self._piece) >= LONGEST_PIECE:
             self._piece, self._pieces = self._piece[-1:], self._pieces + 1

@@ -11,6 +11,7 @@ import math
 from pathlib import Path
 from typing import NamedTuple
 
+import jax
 import numpy as np
 
 from gnio_jax import config as configuration
@@ -27,10 +28,11 @@ from gnio_jax.evaluation.prepare import ROUGH_START, measured_rows
 from gnio_jax.evaluation.trajectory import write_tum
 from gnio_jax.files import check_writable_folder, replacing_folder, shown_name
 from gnio_jax.filtering.settings import FilterSetup, filter_setup
+from gnio_jax.filtering.zero_velocity import quiet_samples
 from gnio_jax.models import Network
 from gnio_jax.reporting import Progress, silent
 from gnio_jax.training.checkpoint import Run
-from gnio_jax.types import GRAVITY, Sequence
+from gnio_jax.types import Sequence
 
 ZERO_VELOCITY_STD = 0.02
 """m/s that the filter measures while the IMU is quiet (ours): what lies on a table stays there."""
@@ -119,7 +121,7 @@ def track(
     for the page, `rerun_file` a file to write for the viewer Rerun. The folder is written whole or
     not at all and takes the place of an earlier track. Raises `InputError`.
     """
-    sequence, config = recording.sequence, weights.run.config
+    sequence = recording.sequence
     start_time = float(sequence.attributes.get("start_time", 0.0))
     _check(out)
     for kind in formats:
@@ -127,7 +129,7 @@ def track(
     if rerun_file is not None:
         rerun.check(rerun_file)
     _check_bridged(sequence)
-    ekf = tracking_filter(weights.run)
+    config, ekf = weights.run.config, tracking_filter(weights.run)
     how = {"init": "static", "gyro_bias": "rest", "from_first": True}
     ready, left_out = prepare([sequence], config.data, ekf.initial_std, **how)
     if not ready:
@@ -238,9 +240,9 @@ def _warnings(summary: Summary, own_rate: float, rate: float) -> list[str]:
 def _share_at_rest(ready: Recording, ekf: FilterSetup) -> float:
     """Share of the strides in which the IMU is as quiet as the filter's rest; a line across a gap
     is not."""
-    turn = np.linalg.norm(ready.gyro - ready.start.gyro_bias, axis=1)
-    pull = np.abs(np.linalg.norm(ready.accel, axis=1) - GRAVITY)
-    quiet = (turn < ekf.config.rest_gyro) & (pull < ekf.config.rest_accel)
+    rate = ready.gyro - ready.start.gyro_bias
+    one_program = jax.jit(quiet_samples, static_argnames="config")
+    quiet = np.asarray(one_program(rate, ready.accel, config=ekf.config))
     if ready.imu_valid is not None:
         quiet = quiet & ready.imu_valid
     return float(quiet.reshape(-1, ekf.config.samples_per_clone).all(axis=1).mean())

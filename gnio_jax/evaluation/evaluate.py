@@ -61,20 +61,22 @@ def evaluate(
     reporter: Reporter = SILENCE,
     workers: int = 1,
     command: str = "",
+    run: Any = None,
 ) -> Evaluation:
     """Estimate every sequence of a split with the network of a run, measure the errors, and leave
     the results in a folder of the run.
 
     The folder is written whole or not at all, and replaces that of an earlier evaluation with the
     same options. `workers` processes read what is slow to read; `command` is how this was called,
-    for the page. Raises `InputError` for options that do not fit together, a run without the
-    checkpoint, missing data, and a split of which no sequence can be estimated.
+    for the page; `run` is the `training.checkpoint.Run` of `config`, where it is restored already.
+    Raises `InputError` for options that do not fit together, a run without the checkpoint, missing
+    data, and a split of which no sequence can be estimated.
     """
     _check(config)
     from gnio_jax.training.checkpoint import load_run  # Orbax takes seconds to import
 
     workdir = Path(config.workdir or configuration.newest_run())
-    run = load_run(workdir, config.checkpoint)
+    run = run or load_run(workdir, config.checkpoint)
     config = resolve(config, run.config)
     windows, ekf = run.config.data, filter_setup(run.config.data, config.filter)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 from gnio_jax import config as configuration
 from gnio_jax.config import EvaluateConfig, TrainConfig, plain
@@ -26,6 +26,9 @@ class Kept(NamedTuple):
     """What is there, if it is what is asked for."""
     problem: str
     """Why it has to be made; empty where it is there."""
+    run: Any = None
+    """The `training.checkpoint.Run`, where it is restored already and the evaluation has to be
+    made."""
 
 
 def look(config: EvaluateConfig) -> Kept:
@@ -34,9 +37,9 @@ def look(config: EvaluateConfig) -> Kept:
     Raises `InputError` for one that is not there and cannot be made.
     """
     workdir = Path(config.workdir or "")
-    run = run_config(workdir, config.checkpoint)
-    config = resolve(config, run)
-    folder = workdir / "eval" / folder_name(config, run)
+    trained, run = settings_of(workdir, config.checkpoint)
+    config = resolve(config, trained)
+    folder = workdir / "eval" / folder_name(config, trained)
     report, problem = None, "it is not evaluated yet"
     if (folder / "metrics.json").exists():
         try:
@@ -47,20 +50,24 @@ def look(config: EvaluateConfig) -> Kept:
     best = workdir / "checkpoints" / config.checkpoint
     if problem and not any(best.glob("[0-9]*")):
         raise InputError(best, "holds no checkpoint", "let gnio train finish its first epoch")
-    return Kept(config, folder, None if problem else report, problem)
+    return Kept(config, folder, None, problem, run) if problem else Kept(config, folder, report, "")
 
 
-def run_config(workdir: Path, which: Literal["best", "latest"] = "best") -> TrainConfig:
-    """The settings of a run; the filter's as this checkpoint has learnt them, if they did.
+def settings_of(
+    workdir: Path, which: Literal["best", "latest"] = "best"
+) -> tuple[TrainConfig, Any]:
+    """The settings of a run, and None. Where its filter was trained, they are in the checkpoint,
+    and the `training.checkpoint.Run` that is restored for them comes along.
 
-    Raises `InputError` if they did and there is no checkpoint.
+    Raises `InputError` if they are and there is no checkpoint.
     """
     config = configuration.load(workdir / "config.yaml")
     if not config.through_filter.learn:
-        return config
+        return config, None
     from gnio_jax.training import checkpoint  # Orbax takes seconds to import
 
-    return checkpoint.load_run(workdir, which).config
+    run = checkpoint.load_run(workdir, which)
+    return run.config, run
 
 
 def made(kept: Kept, reporter: Reporter, workers: int = 1) -> Report:
@@ -70,7 +77,7 @@ def made(kept: Kept, reporter: Reporter, workers: int = 1) -> Report:
     config = kept.config
     run = Path(config.workdir or "").name
     reporter.line(f"evaluating {run} on {config.split} ({config.estimator}): {kept.problem}")
-    evaluate(config, reporter, workers)
+    evaluate(config, reporter, workers, run=kept.run)
     return read(kept.folder)
 
 

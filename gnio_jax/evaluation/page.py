@@ -24,7 +24,16 @@ from jinja2 import Environment
 
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import plots, tabulate
-from gnio_jax.evaluation.plots import AXES, BLUE, COLOURS, GREEN, VERMILION, View
+from gnio_jax.evaluation.colours import (
+    AXES,
+    BLUE,
+    COLOURS,
+    GREEN,
+    REFERENCE,
+    SIGMAS,
+    VERMILION,
+)
+from gnio_jax.evaluation.plots import View
 from gnio_jax.evaluation.report import Report, read, read_estimates
 from gnio_jax.evaluation.tabulate import COLUMNS
 from gnio_jax.files import write_text
@@ -39,7 +48,7 @@ STRIPS = {"gate": "gate γ (–)", "scale": "scale (–)", "std": "σ of network
 LEVELS = (("mean", 3.0, GREEN), ("refused above", 11.345, VERMILION))
 """Of the NIS of three axes: the mean of χ², and what the filter refuses by default."""
 MAP_HEIGHT, STRIP_HEIGHT, LABEL_HEIGHT, LEFT = 560, 158, 30, 62
-WAYPOINT = {"marker": "x", "color": "black", "line_width": 2.0}
+WAYPOINT = {"marker": "x", "color": REFERENCE, "line_width": 2.0}
 LONG = 1e6
 """Longer than a recording, s."""
 GO_THERE = """
@@ -241,7 +250,7 @@ def frame(runs: list[Run], sequence: str) -> dict[str, list[float]]:
     low, high = points.min(0), points.max(0)
     size = max(float((high - low).max()), 1.0)
     variance = np.diagonal(views[0].covariance, axis1=1, axis2=2)[:, :2]
-    reach = np.nan_to_num(plots.SIGMAS * np.sqrt(np.maximum(variance, 0.0)))
+    reach = np.nan_to_num(SIGMAS * np.sqrt(np.maximum(variance, 0.0)))
     ends = [np.nan_to_num(views[0].position[:, :2] + side * reach) for side in (-1.0, 1.0)]
     low = np.maximum(np.minimum(ends[0].min(0), low), low - size)
     high = np.minimum(np.maximum(ends[1].max(0), high), high + size)
@@ -336,7 +345,7 @@ def _draw_map(
     corners = plan.scatter("x", "y", source=sources.corners, alpha=0.0)
     plan.x_range, plan.y_range = DataRange1d(renderers=[corners]), DataRange1d(renderers=[corners])
     if known:
-        black = {"color": "black", "line_width": 2.0, "legend_label": "reference"}
+        black = {"color": REFERENCE, "line_width": 2.0, "legend_label": "reference"}
         plan.line("reference_x", "reference_y", source=sources.paths[0], **black)
     if tapped:
         ends = {"x0": "x", "y0": "y", "x1": "waypoint_x", "y1": "waypoint_y"}
@@ -353,7 +362,7 @@ def _draw_map(
     now = {"source": sources.marks, "line_color": "white", "line_width": 2.0}
     plan.scatter("x", "y", size=11, fill_color="colour", **now)
     if known:
-        plan.scatter("reference_x", "reference_y", size=9, fill_color="black", **now)
+        plan.scatter("reference_x", "reference_y", size=9, fill_color=REFERENCE, **now)
     return _finish(plan, grid_x=True)
 
 

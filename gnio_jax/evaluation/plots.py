@@ -1,7 +1,6 @@
 """Pictures of results. Every function returns a `Figure` and keeps no state.
 
-Colours are those of Okabe and Ito, which the colour-blind can tell apart; the reference is black
-throughout. Matplotlib is imported here, so import this module only where something is drawn.
+Matplotlib is imported here, so import this module only where something is drawn.
 """
 
 from __future__ import annotations
@@ -21,6 +20,16 @@ from matplotlib.patches import Ellipse
 from matplotlib.ticker import PercentFormatter
 
 from gnio_jax.evaluation import metrics, statistics, tabulate
+from gnio_jax.evaluation.colours import (
+    AXES,
+    BLUE,
+    COLOURS,
+    GREEN,
+    GREY,
+    REFERENCE,
+    SIGMAS,
+    VERMILION,
+)
 from gnio_jax.evaluation.estimate import Estimate, in_one_frame
 from gnio_jax.evaluation.infer import Displacements
 from gnio_jax.evaluation.metrics import Filtered
@@ -31,12 +40,6 @@ from gnio_jax.numerics import finite_rows, spans
 from gnio_jax.reporting import Progress, silent
 from gnio_jax.types import Waypoints
 
-BLUE, VERMILION, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#8C8C8C"
-PURPLE, ORANGE, SKY, YELLOW = "#CC79A7", "#E69F00", "#56B4E9", "#F0E442"
-COLOURS = (BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY)
-"""One for each run, method or row."""
-AXES = {"x": BLUE, "y": VERMILION, "z": GREEN}
-REFERENCE = "black"
 STANDING = "#E8E8E8"
 GRID = "#DDDDDD"
 DOTS_PER_INCH = 120
@@ -45,8 +48,6 @@ END: dict[str, Any] = {"marker": "s", "ls": "", "ms": 7}
 TAP: dict[str, Any] = {"marker": "x", "ls": "", "ms": 7, "mew": 1.8}
 MARKERS = "os^Dv"
 """Where there are more rows than colours, the next marker."""
-SIGMAS = 3.0
-"""Size of the ellipses and bands, in standard deviations."""
 ELLIPSES = 12
 """On a map, at even times."""
 TITLE = {"ate": "ATE", "ate_2d": "in 2-D", "waypoint_rms": "rms at waypoints"}

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 
 from gnio_jax.filtering.config import FilterConfig
 from gnio_jax.filtering.gaps import Imu
@@ -53,15 +53,22 @@ def detect_rest(
     """Whether the IMU has been quiet for `rest_seconds` (ours), and the state with the count of
     quiet intervals in a row.
 
-    An interval is quiet where no sample is missing, no |gyro − b_g| reaches `rest_gyro` and no
-    | |accel − b_a| − g | `rest_accel`.
+    An interval is quiet where no sample is missing and all are those of `quiet_samples`.
     """
     rate, force = imu.gyro - state.gyro_bias[None], imu.accel - state.accel_bias[None]
-    size = jnp.sqrt(jnp.maximum(jnp.sum(force**2, axis=1), 1e-12))
-    still = jnp.all(jnp.sum(rate**2, axis=1) < config.rest_gyro**2)
-    quiet = still & jnp.all(jnp.abs(size - GRAVITY) < config.rest_accel)
+    quiet = jnp.all(quiet_samples(rate, force, config))
     if imu.gap is not None:
         quiet = quiet & jnp.all(imu.gap.gyro_variance == 0)
     count = jnp.where(quiet, state.imu.quiet + 1, 0).astype(state.imu.quiet.dtype)
     enough = int(np.ceil(config.rest_seconds / config.clone_seconds - 1e-6))
     return state._replace(imu=state.imu._replace(quiet=count)), count >= max(enough, 1)
+
+
+def quiet_samples(
+    rate: Float[Array, "n 3"], force: Float[Array, "n 3"], config: FilterConfig
+) -> Bool[Array, "n"]:
+    """Which samples are quiet: the turn rate without its bias, rad/s, is below `rest_gyro` and the
+    specific force, m/s², is off gravity by less than `rest_accel`."""
+    size = jnp.sqrt(jnp.maximum(jnp.sum(force**2, axis=1), 1e-12))
+    still = jnp.sum(rate**2, axis=1) < config.rest_gyro**2
+    return still & (jnp.abs(size - GRAVITY) < config.rest_accel)

@@ -8,8 +8,7 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.figure import Figure
 
-from gnio_jax.evaluation import plots as style
-from gnio_jax.evaluation import statistics
+from gnio_jax.evaluation import colours, plots, statistics
 from gnio_jax.evaluation.plots import View, finish, save
 from gnio_jax.evaluation.statistics import Cell
 from gnio_jax.tables.activities import ACTIVITIES, HORIZONTAL, PredictedWindows
@@ -19,13 +18,13 @@ from gnio_jax.tables.runs import Result
 __all__ = ["attention", "gate", "gradients", "save", "standing", "table", "trajectories"]
 
 METHODS = {
-    "tlio": style.BLUE,
-    "gnio": style.GREEN,
-    "ronin_resnet": style.ORANGE,
-    "deepils": style.PURPLE,
-    "ctin": style.VERMILION,
-    "imot": style.SKY,
-    "imot_text": style.YELLOW,
+    "tlio": colours.BLUE,
+    "gnio": colours.GREEN,
+    "ronin_resnet": colours.ORANGE,
+    "deepils": colours.PURPLE,
+    "ctin": colours.VERMILION,
+    "imot": colours.SKY,
+    "imot_text": colours.YELLOW,
 }
 """TLIO blue and GNIO green, as in the paper's figure."""
 
@@ -45,9 +44,9 @@ def table(experiment: Experiment, results: list[Result], ates: list[Cell]) -> Fi
         found = statistics.values(result.seeds, "ate")
         sequences = [own.mean() for name, own in found.items() if name not in lost]
         labels = ("sequence", "seed, mean over sequences") if place == 0 else (None, None)
-        ours.barh(place, mean.mean or 0.0, color=style.GREEN, alpha=0.35, height=0.6)
+        ours.barh(place, mean.mean or 0.0, color=colours.GREEN, alpha=0.35, height=0.6)
         above = np.full(len(sequences), place) + 0.2
-        ours.plot(sequences, above, "|", color=style.GREY, ms=7, label=labels[0])
+        ours.plot(sequences, above, "|", color=colours.GREY, ms=7, label=labels[0])
         seeds = np.full(len(mean.seeds), place)
         ours.plot(mean.seeds, seeds, "o", color="black", ms=4, label=labels[1])
         diverged = f"\n({mean.diverged} of {mean.estimates} diverged)" if mean.diverged else ""
@@ -58,7 +57,7 @@ def table(experiment: Experiment, results: list[Result], ates: list[Cell]) -> Fi
     ours.set_xlim(left=0)
     for place, value in enumerate(published):
         if value is not None:
-            panels[1].barh(place, value, color=style.BLUE, alpha=0.35, height=0.6)
+            panels[1].barh(place, value, color=colours.BLUE, alpha=0.35, height=0.6)
             panels[1].text(value, place, f" {value:.2f}", va="center", fontsize=8)
     if beside:
         panels[1].set(xlabel="published (m), on other data", title="paper")
@@ -75,7 +74,7 @@ def gradients(results: list[Result], norms: Sequence[Float[np.ndarray, "seeds ep
     seeds, their range shaded."""
     figure = Figure(figsize=(6.8, 4.2), layout="constrained")
     axes = figure.add_subplot()
-    for result, own, colour in zip(results, norms, style.COLOURS, strict=False):
+    for result, own, colour in zip(results, norms, colours.COLOURS, strict=False):
         epochs = np.arange(1, own.shape[1] + 1)
         axes.semilogy(epochs, own.mean(0), color=colour, label=result.row.label)
         axes.fill_between(epochs, own.min(0), own.max(0), color=colour, alpha=0.15, lw=0)
@@ -103,12 +102,12 @@ def trajectories(
     for axes, name in zip(panels, names, strict=False):
         views = {x: seen for x, own in methods.items() for seen in own if seen.name == name}
         reference = next(iter(views.values())).reference[:, :2]
-        (handles["reference"],) = axes.plot(*reference.T, color=style.REFERENCE, lw=1.8)
+        (handles["reference"],) = axes.plot(*reference.T, color=colours.REFERENCE, lw=1.8)
         for number, (method, seen) in enumerate(views.items()):
-            colour = METHODS.get(method, style.COLOURS[number % len(style.COLOURS)])
+            colour = METHODS.get(method, colours.COLOURS[number % len(colours.COLOURS)])
             (handles[method],) = axes.plot(*seen.position[:, :2].T, color=colour, lw=1.1)
         first = reference[np.isfinite(reference).all(1)][0]
-        axes.plot(*first, color=style.REFERENCE, zorder=4, **style.START)
+        axes.plot(*first, color=colours.REFERENCE, zorder=4, **plots.START)
         axes.set_aspect("equal", adjustable="datalim")
         axes.set_title(name, fontsize=9)
         finish(axes)
@@ -133,9 +132,9 @@ def gate(windows: PredictedWindows) -> Figure:
     }
     standing_still, slow = (ACTIVITIES.index(name) for name in ("standing", "slow"))
     rows = {
-        "standing": (windows.activity == standing_still, style.VERMILION),
-        "slow": (windows.activity == slow, style.GREY),
-        "moving": (windows.activity > slow, style.BLUE),
+        "standing": (windows.activity == standing_still, colours.VERMILION),
+        "slow": (windows.activity == slow, colours.GREY),
+        "moving": (windows.activity > slow, colours.BLUE),
     }
     for axes, (name, values) in zip(figure.subplots(1, 3), quantities.items(), strict=True):
         horizontal = values[:, HORIZONTAL]
@@ -181,7 +180,7 @@ def standing(by_method: dict[str, dict[str, dict[str, float]]]) -> Figure:
     for number, (method, figures) in enumerate(by_method.items()):
         places = np.arange(len(names)) + 0.1 * (number - (len(by_method) - 1) / 2)
         values = [figures.get(name, {}).get("error", np.nan) for name in names]
-        axes.semilogy(places, values, "o", color=METHODS.get(method, style.GREY), label=method)
+        axes.semilogy(places, values, "o", color=METHODS.get(method, colours.GREY), label=method)
     axes.set_xticks(range(len(names)), names)
     axes.set(ylabel="rms error of a window's displacement (m)", title="By what the walker did")
     axes.legend(fontsize=8, frameon=False)

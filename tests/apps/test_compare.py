@@ -168,16 +168,16 @@ def test_a_name_may_look_like_a_seed(tmp_path):
 
 
 def test_runs_are_evaluated_where_they_are_not_yet_and_read_once(runs, monkeypatch):
-    made, read, run_config = [], [], kept.run_config
+    made, read, settings_of = [], [], kept.settings_of
 
-    def evaluate(config, progress, workers):
+    def evaluate(config, progress, workers, **_):
         made.append((config.workdir, config.split, config.estimator, workers))
         name = config.workdir.removeprefix(f"{runs}/")
         write(runs / name, {"a": 4.0}, "synthetic_val_ekf", split="val")
 
     monkeypatch.setattr(kept, "evaluate", evaluate)
     monkeypatch.setattr(
-        kept, "run_config", lambda run, which: read.append(run.name) or run_config(run, which)
+        kept, "settings_of", lambda run, which: read.append(run.name) or settings_of(run, which)
     )
     config = CompareConfig((f"{runs}/plain", f"{runs}/new"), split="val", metrics=("ate",))
     found = comparison.compare(config, workers=3)
@@ -229,7 +229,7 @@ def test_figures_of_other_recordings_are_never_compared(tmp_path, monkeypatch):
     def asked(run, root):
         return EvaluateConfig(str(tmp_path / run), data_root=str(tmp_path / root))
 
-    def evaluate(config, *_):
+    def evaluate(config, *_, **__):
         made = {"dataset": "tlio", "data_root": config.data_root, "filter": FILTER}
         ate = 1.0 if config.data_root.endswith("A") else 2.0
         write_report(kept.look(config).folder, report_of({"a": ate}, GROUPS, **made))

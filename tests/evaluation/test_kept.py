@@ -9,6 +9,9 @@ from gnio_jax.config import EvaluateConfig
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import kept, report
 from gnio_jax.reporting import Lines
+from gnio_jax.training import checkpoint
+from gnio_jax.training.checkpoint import Run
+from tests.support.filter_settings import changed
 from tests.support.reports import BASE, report_of, write_report, write_run
 
 
@@ -63,7 +66,7 @@ def test_what_means_something_else_is_made_anew(run, monkeypatch, settings, prob
     folder = evaluation(run, **settings)
     lines, made = [], []
 
-    def evaluate(config, progress, workers):
+    def evaluate(config, progress, workers, **_):
         made.append(config)
         evaluation(run)
 
@@ -98,6 +101,28 @@ def test_integrate_takes_no_filter(run):
     """An evaluation of `integrate` with other options of the filter means the same."""
     evaluation(run, estimator="integrate", filter={"gravity": 9.0})
     assert look(run, estimator="integrate").problem == ""
+
+
+def test_a_run_whose_filter_was_trained_is_restored_once(run, monkeypatch):
+    """Its settings are in the checkpoint, and so is what an evaluation needs."""
+    config = configuration.load(run / "config.yaml")
+    through = dataclasses.replace(config.through_filter, learn=("noise",))
+    configuration.save(
+        run / "config.yaml", dataclasses.replace(config, through_filter=through, init_from="walks")
+    )
+    own = Run(dataclasses.replace(config, filter=changed(noise={"gyro_density": 0.5})), *[None] * 4)
+    restored, given = [], []
+    monkeypatch.setattr(checkpoint, "load_run", lambda *asked: restored.append(asked) or own)
+
+    def evaluate(config, progress, workers, run):
+        given.append((config.filter, run))
+        evaluation(folder, filter=configuration.plain(own.config.filter))
+
+    folder = run
+    monkeypatch.setattr(kept, "evaluate", evaluate)
+    kept.made(look(run), Lines())
+    assert given == [(own.config.filter, own)] and restored == [(run, "best")]
+    assert look(run).run is None  # nothing is left to be made
 
 
 def test_a_run_without_a_checkpoint_is_refused_before_the_work(run):

@@ -21,6 +21,7 @@ from gnio_jax.apps.onnx.programs import Program, programs
 from gnio_jax.apps.track import tracking_filter
 from gnio_jax.config.files import plain
 from gnio_jax.errors import InputError, require_packages
+from gnio_jax.evaluation import estimate
 from gnio_jax.files import fingerprint, replacing_folder
 from gnio_jax.filtering import initial_state
 from gnio_jax.filtering.settings import FilterSetup
@@ -72,12 +73,13 @@ def export_run(which: str | Path, out: Path, seconds: float = SECONDS) -> Export
             content = conversion.to_model(program, setup)
             (folder / f"{program.name}.onnx").write_bytes(content)
             files[f"{program.name}.onnx"] = {**fingerprint(content), **_tensors(program)}
-        walk = accuracy.draw_walk(run.config.data, seconds)
-        start = initial_state(setup.config, **walk.start, std=setup.initial_std)
+        windows = run.config.data
+        walk = accuracy.draw_walk(windows, setup, seconds)
+        start = initial_state(setup.config, *walk.start[:-1], std=walk.start.std)
         models = driver.open_models(folder)
         found = driver.walk(models, start_arrays(start, setup), walk.gyro, walk.accel)
-        history = accuracy.package_history(network, setup, walk)
-        deviation = accuracy.deviation(found.position, found.displacement, history, walk)
+        (own,) = estimate([walk], network, windows, setup._replace(considered=None))
+        deviation = accuracy.deviation(found.position, found.displacement, own)
         accuracy.check(deviation, place.name)
         manifest = {
             "format": FORMAT,
