@@ -45,6 +45,8 @@ LARGEST_MANIFEST, LARGEST_WEIGHTS = 2**20, 2**32
 """Bytes (ours): a zip of some megabytes may say that it unpacks to any size."""
 SHOWN = ("ate_2d", "rte_60s_2d", "path_length_ratio_2d", "yaw_rmse", "nees_coverage_2d")
 """Metrics of the card. Networks are listed by the first."""
+AT_WAYPOINTS = ("leg_ratio", "waypoint_rms")
+"""Further ones, of evaluations of walks with waypoints."""
 _DAMAGED = "the package is damaged: fetch or publish it again"
 
 
@@ -395,13 +397,15 @@ def _card(
     steps += [f"gnio calibrate --workdir runs/{name}"] if calibrated else []
     recipe = "\n".join(("```", *steps, "```"))
     considered = [each for each, std in config.filter.considered._asdict().items() if std > 0]
-    header = ["evaluation", "sequences", "groups", *(tabulate.column(x).title for x in SHOWN)]
+    tapped = any(AT_WAYPOINTS[0] in found.summary() for found in figures.values())
+    shown = SHOWN + AT_WAYPOINTS * tapped
+    header = ["evaluation", "sequences", "groups", *(tabulate.column(x).title for x in shown)]
     rows = [
         [
             place,
             str(len(found.scores)),
             str(len(set(found.groups.values()))),
-            *(_cell(found, metric) for metric in SHOWN),
+            *(_cell(found, metric) for metric in shown),
         ]
         for place, found in figures.items()
     ]

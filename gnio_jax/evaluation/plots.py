@@ -259,7 +259,8 @@ def _draw_error(axes: Axes, seen: View, vertical: bool = False) -> None:
         axes.plot(seen.time, error, color=colour, lw=1.2, label="error")
     tapped = len(seen.taps.time) > 0 and not vertical
     if tapped:
-        axes.plot(seen.taps.time, seen.taps.error, color=REFERENCE, label="at waypoints", **TAP)
+        style = {"color": REFERENCE, "label": "at waypoints", "clip_on": False, **TAP}
+        axes.plot(seen.taps.time, seen.taps.error, **style)
     axes.axhline(0, color=REFERENCE, lw=0.6)
     axes.set_ylabel(f"{name}\n{'error' if seen.known or tapped else '3σ'} (m)")
 
@@ -302,10 +303,18 @@ def error_cdf(views: list[View], report: Report) -> Figure:
     figure = Figure(figsize=(9.6, 4.4), layout="constrained")
     left, right = figure.subplots(1, 2, sharey=True)
     errors = [seen.errors for seen in views if len(seen.errors)]
+    posed = any(seen.known for seen in views)
+    tapped = any(len(seen.taps.time) for seen in views)
     for error in errors:
         _step(left, error, color=BLUE, lw=0.7, alpha=0.25)
     if errors:
-        _step(left, np.concatenate(errors), color=BLUE, lw=2.2, label="all samples")
+        _step(
+            left,
+            np.concatenate(errors),
+            color=BLUE,
+            lw=2.2,
+            label="all samples" if posed else "all waypoints",
+        )
     left.plot([], [], color=BLUE, lw=0.7, alpha=0.5, label="one sequence")
     left.set_xlabel("horizontal position error (m)")
     left.set_ylabel("share with at most this error")
@@ -318,9 +327,8 @@ def error_cdf(views: list[View], report: Report) -> Figure:
         if len(values):
             label = f"{name.replace('_', ' ')} (median {np.median(values):.2f} m)"
             _step(right, values, color=colour, lw=1.8, ls=style, label=label)
-    tapped = any(len(seen.taps.time) for seen in views)
-    at_waypoints = ", or rms at waypoints" if tapped else ""
-    right.set_xlabel(f"ATE in 2-D{at_waypoints} of a sequence (m)")
+    found = filter(None, ("ATE in 2-D" * posed, "rms at waypoints" * tapped))
+    right.set_xlabel(f"{', or '.join(found)} of a sequence (m)")
     for axes in (left, right):
         axes.set_ylim(0, 1.02)
         axes.set_xlim(left=0)

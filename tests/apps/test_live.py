@@ -539,6 +539,22 @@ def test_it_is_said_where_nothing_comes(port, monkeypatch):
     assert len(found) == 1 and all(f"nothing has come on udp:{port} for" in each for each in said)
 
 
+def test_what_is_sent_while_it_compiles_is_not_lost(gnio, run, port, monkeypatch, tmp_path):
+    """It listens before it compiles: the rest that it starts from may be over by then."""
+    create = live.create_tracker
+    lines = [f"{k / RATE},0,0,0,0,0,9.81".encode() for k in range(round(2 * RATE))]
+
+    def meanwhile(*given, **options):
+        send(port, lines)
+        return create(*given, **options)
+
+    monkeypatch.setattr(live, "create_tracker", meanwhile)
+    given = ("--weights", run, "--silence", "0.5", "--out", tmp_path / "live.txt")
+    told = gnio([], f"udp:{port}", *given)
+    assert "ready: hold still now, for 1 s" in told
+    assert read_tum(tmp_path / "live.txt").time[0] == pytest.approx(1.0, abs=1.5 / RATE)
+
+
 # Hours
 # --------------------------------------------------------------------------------------------------
 

@@ -24,6 +24,7 @@ from gnio_jax.training import checkpoint
 from tests.support import tiny_run
 from tests.support.compiling import quick
 from tests.support.filter_settings import changed
+from tests.support.reports import write_report
 
 CONFIG = TrainConfig(
     dataset="synthetic",
@@ -135,6 +136,22 @@ def test_the_card_has_what_the_publisher_and_the_evaluations_say(published):
     ):
         assert words in card
     assert "calibrate" not in card
+
+
+def test_the_card_has_the_legs_of_walks_with_waypoints(run, tmp_path):
+    own = shutil.copytree(run, tmp_path / "run")
+    scores = {
+        name: Measures({"leg_ratio": ratio, "waypoint_rms": 2.0}, {}, False)
+        for name, ratio in (("a", 0.75), ("b", 0.85))
+    }
+    figures = report.Report(SETTINGS, scores, {}, {"a": "F1", "b": "F2"}, {}, {})
+    write_report(own / "eval" / "mall_test_ekf", figures)
+    packages.publish(own, tmp_path / "walk", SAID)
+    lines = packages.card_of(tmp_path / "walk").splitlines()
+    (line,) = (each for each in lines if each.startswith("| mall_test_ekf"))
+    assert line.endswith("| – | – | 0.80 (0.16 to 1.44) | 2.00 (2.00 to 2.00) |")
+    (line,) = (each for each in lines if each.startswith("| synthetic_test_ekf"))
+    assert line.endswith("| – | – |")
 
 
 @pytest.mark.parametrize("name", [packages.WEIGHTS, packages.MANIFEST])

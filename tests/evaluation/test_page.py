@@ -144,6 +144,7 @@ def test_without_a_reference_nothing_is_called_an_error(estimates):
     assert "error (m)" not in text and "distance walked" not in text
     assert r"3\\u03c3 (m)" in text  # as JSON in a script has it
     assert re.search(r"<label hidden>sequence", text)
+    assert '"start"' in text  # where it begins is marked, as its legend says
     assert "refused above 11.3" in text and '"gate (11' not in text
 
 

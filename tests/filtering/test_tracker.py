@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from gnio_jax import config as configuration
 from gnio_jax import filtering
+from gnio_jax.apps import packages
 from gnio_jax.commands import console
 from gnio_jax.filtering import Tracker
 from gnio_jax.filtering import tracker as online
@@ -493,6 +494,18 @@ def test_a_recording_is_replayed(workdir, replay, tmp_path, capsys):
     np.testing.assert_allclose(np.linalg.norm(found[:, 4:], axis=1), 1, atol=1e-6)
     assert (tmp_path / "out" / "found.png").read_bytes()[:4] == b"\x89PNG"
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["found.png", "found.txt"]
+
+
+def test_a_replay_takes_the_default_weights(workdir, replay, tmp_path, monkeypatch, capsys):
+    """Those of gnio-jax, else the newest run, as every command."""
+    asked = []
+    load = packages.load_pretrained
+    monkeypatch.setattr(
+        packages, "load_pretrained", lambda which: asked.append(which) or load(workdir)
+    )
+    write_walk(tmp_path / "walk.csv")
+    replay("--csv", "walk.csv")
+    assert asked == [None] and "real-time factor" in capsys.readouterr().out
 
 
 def test_a_faster_recording_is_replayed_through_the_low_pass(workdir, replay, tmp_path, capsys):

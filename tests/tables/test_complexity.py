@@ -1,5 +1,8 @@
 """Operations of the networks against a count by hand."""
 
+import math
+
+import jax
 import pytest
 
 from gnio_jax import models
@@ -53,6 +56,11 @@ def test_complexity_against_a_hand_count(network, parameters, published):
         2 * by_hand, rel=0.02
     )  # additions, ReLUs and the like besides
     assert found.latency[0] > 0
+
+
+def test_a_compiler_that_counts_nothing_leaves_the_figure_out(monkeypatch):
+    monkeypatch.setattr(jax.stages.Compiled, "cost_analysis", lambda self: {"bytes": 1.0})
+    assert math.isnan(make.measure("tlio", batches=(1,), seconds=0.05).gflops)
 
 
 def test_the_table_names_every_network(tmp_path, monkeypatch):
