@@ -398,7 +398,7 @@ def _card(
     recipe = "\n".join(("```", *steps, "```"))
     considered = [each for each, std in config.filter.considered._asdict().items() if std > 0]
     tapped = any(AT_WAYPOINTS[0] in found.summary() for found in figures.values())
-    shown = SHOWN + AT_WAYPOINTS * tapped
+    shown = (*SHOWN, *AT_WAYPOINTS) if tapped else SHOWN
     header = ["evaluation", "sequences", "groups", *(tabulate.column(x).title for x in shown)]
     rows = [
         [

@@ -198,7 +198,7 @@ def summarise(
         f"{error:.1f} m{share} by the filter, {counted}; trained on {weights.about}; place and "
         "heading are relative to the start",
     )
-    if np.isfinite(found.reference.position).any():
+    if np.isfinite(found.reference.position).any() or found.waypoints is not None:
         summary = summary._replace(errors=metrics.score([found])[found.name].values)
     own_rate = 1.0 / float(np.median(np.diff(sequence.time)))
     warnings = [*recording.warnings, *_warnings(summary, own_rate, 1.0 / ekf.config.dt)]
@@ -282,13 +282,14 @@ def _draw(
     expected = f"{summary.expected_error:.1f} m"
     title = f"{shown_name(summary.recording)}: {length}, expected error at the end {expected}"
     plots.save(folder / "track.png", plots.sequence(seen, title))
+    aligned = "start position and yaw" if found.waypoints is None else tabulate.TO_WAYPOINTS
     about = {
         "command": command,
         "walked": f"{length}, ends {summary.from_start:.1f} m from the start",
         "expected error at the end": f"{expected} by the filter",
         "weights": f"{summary.weights}, trained on {summary.trained_on}",
         "window orientation": "filter",
-        "alignment": "start position and yaw" if summary.errors else "",
+        "alignment": aligned if summary.errors else "",
         "windows": tabulate.windows(dataclasses.asdict(config.data)),
     }
     figures = summary.errors or {

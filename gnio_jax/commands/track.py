@@ -15,7 +15,9 @@ from gnio_jax.config.schema import UNNAMED
 from gnio_jax.files import file_stem
 
 ERRORS = ("ate", "ate_2d", "rte_60s", "rpe_1s", "yaw_rmse", "path_length_ratio")
-"""What is shown of the errors against a reference; summary.json has them all."""
+ERRORS += ("leg_ratio", "leg_error", "waypoint_rms")
+"""What is shown of the errors against a reference, as far as there are any; summary.json has them
+all."""
 
 
 @dataclass(frozen=True)
@@ -94,7 +96,7 @@ def _table(summary: Any) -> Table:
     grid.add_row("at rest (quieter than a hand)", f"{summary.rest:.0%}")
     if summary.accepted is not None:
         grid.add_row("displacements used", f"{summary.accepted:.0%}")
-    for name in ERRORS if summary.errors else ():
+    for name in [each for each in ERRORS if each in summary.errors]:
         column = tabulate.column(name)
         text = tabulate.number(summary.errors.get(name), column.digits)
         grid.add_row(f"{column.heading} (against the reference)", f"{text} {column.unit}".strip())

@@ -327,8 +327,9 @@ def error_cdf(views: list[View], report: Report) -> Figure:
         if len(values):
             label = f"{name.replace('_', ' ')} (median {np.median(values):.2f} m)"
             _step(right, values, color=colour, lw=1.8, ls=style, label=label)
-    found = filter(None, ("ATE in 2-D" * posed, "rms at waypoints" * tapped))
-    right.set_xlabel(f"{', or '.join(found)} of a sequence (m)")
+    errors_of = {"ATE in 2-D": posed, "rms at waypoints": tapped}
+    shown = " or ".join(text for text, there in errors_of.items() if there)
+    right.set_xlabel(f"{shown} of a sequence (m)")
     for axes in (left, right):
         axes.set_ylim(0, 1.02)
         axes.set_xlim(left=0)

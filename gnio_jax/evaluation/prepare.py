@@ -130,6 +130,7 @@ def prepare(
         tapped = whole.waypoints is not None
         own_init = "static" if tapped else init
         start, start_note = _start(whole, measured, windows, bias, std, own_init)
+        reference_note = OF_WAYPOINTS if tapped else ""
         trusted = whole.valid[:, None]
         poses = [np.where(trusted, part, np.nan) for part in (whole.position, whole.orientation)]
         ends = slice(None, None, windows.stride)
@@ -150,7 +151,7 @@ def prepare(
                     window_starts(len(whole.time), windows.window, windows.stride),
                     windows.window,
                 ),
-                notes=tuple(filter(None, (OF_WAYPOINTS * tapped, bias_note, start_note))),
+                notes=tuple(filter(None, (reference_note, bias_note, start_note))),
                 waypoints=whole.waypoints,
             )
         )

@@ -69,6 +69,7 @@ WAYPOINT_SCREEN = (
 """The same of sequences with waypoints in the place of poses."""
 MIXED_SCREEN = (*SCREEN[:3], *WAYPOINT_SCREEN[-3:])
 """The same where a split has both."""
+TO_WAYPOINTS = "one turn and one shift to the waypoints"
 LONGEST_HEADING = 9
 """Letters; a longer one is broken on the screen."""
 DIVERGED = (
@@ -223,7 +224,7 @@ def about(settings: Mapping[str, Any]) -> dict[str, str]:
         "alignment": settings["alignment"],
     }
     if settings.get("reference") == "waypoints":
-        found["alignment"] = "one turn and one shift to the waypoints"
+        found["alignment"] = TO_WAYPOINTS
     if settings.get("model"):
         network = f"{settings['model']}, checkpoint {settings['checkpoint']}"
         found["network"] = f"{network}, step {settings['step']}"

@@ -16,7 +16,7 @@ from gnio_jax.config import DataConfig, ModelConfig, TrainConfig
 from gnio_jax.data.hdf5 import write_hdf5
 from gnio_jax.data.resampling import resample
 from gnio_jax.evaluation.trajectory import read_tum
-from gnio_jax.types import Sequence
+from gnio_jax.types import Sequence, Waypoints
 from tests.support import bag_files, known_walk, logger_files, tiny_run
 
 CONFIG = TrainConfig(data=DataConfig(rate=50.0), model=ModelConfig(name="tiny"))
@@ -217,6 +217,38 @@ def test_our_own_file_with_holes(gnio, mistake, runs, tmp_path):
             # The same on a clock that runs through the hole.
             write_hdf5(tmp_path / "walk.h5", resample(sequence, 100.0))
             assert "walk: field 'time' has a gap of 3.210 s" in mistake(*given)
+
+
+def test_a_recording_with_waypoints_is_compared_with_them(gnio, runs, tmp_path):
+    time = np.arange(600) / 100
+    nothing = np.full((600, 4), np.nan)
+    taps = Waypoints(time[[0, 200, 400, 599]], known_walk.position(time[[0, 200, 400, 599]])[:, :2])
+    sequence = Sequence(
+        name="mall",
+        time=time,
+        gyro=known_walk.rate(time),
+        accel=known_walk.force(time),
+        orientation=nothing,
+        position=nothing[:, :3],
+        velocity=nothing[:, :3],
+        valid=np.zeros(600, bool),
+        waypoints=taps,
+    )
+    write_hdf5(tmp_path / "mall.h5", sequence)
+    told = gnio(
+        "track", tmp_path / "mall.h5", "--weights", runs / "walker", "--out", tmp_path / "t"
+    )
+    errors = summary_of(tmp_path / "t")["errors"]
+    # By hand: the lengths of the legs do not depend on the alignment.
+    path = read_tum(tmp_path / "t" / "trajectory.txt")
+    there = [np.interp(taps.time, path.time - path.time[0], path.position[:, k]) for k in (0, 1)]
+    ours, true = (np.linalg.norm(np.diff(x, axis=0), axis=1) for x in (np.array(there).T, taps[1]))
+    assert errors["leg_path_ratio"] == pytest.approx(ours.sum() / true.sum(), rel=1e-3)
+    shown = f"waypoint rms (against the reference) {errors['waypoint_rms']:.2f} m"
+    assert shown in " ".join(told.split())
+    assert "ate" not in errors and "ATE" not in told
+    page = (tmp_path / "t" / "report.html").read_text(encoding="utf-8")
+    assert "at waypoints" in page and "one turn and one shift" in page
 
 
 def test_what_cannot_be_written_is_found_before_the_work(mistake, runs, tmp_path, monkeypatch):
