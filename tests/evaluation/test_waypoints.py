@@ -101,6 +101,7 @@ def test_positions_lie_between_rows_and_not_beyond_the_ends():
     between = 0.75 * path.position[0, :2] + 0.25 * path.position[1, :2]
     np.testing.assert_allclose(found[:3], [path.position[0, :2], between, path.position[-1, :2]])
     assert np.isnan(found[3]).all()
+    assert np.isnan(positions_at(path, np.array([begin - 0.3]))).all()
     late = Waypoints(np.array([begin, end + 1.0, end + 2.0]), np.zeros((3, 2)))
     with pytest.raises(Undefined, match="fewer than two waypoints"):
         align_to_waypoints(path, late)
