@@ -27,6 +27,7 @@ from gnio_jax.apps import packages  # noqa: E402
 from gnio_jax.apps.onnx import accuracy, driver, export_run  # noqa: E402
 from gnio_jax.apps.onnx.flat_state import start_arrays  # noqa: E402
 from gnio_jax.apps.track import tracking_filter  # noqa: E402
+from gnio_jax.evaluation import Recording  # noqa: E402
 from gnio_jax.models import Network  # noqa: E402
 
 
@@ -42,8 +43,8 @@ def main() -> None:
         out = Path(folder) / "models"
         export_run(arguments.run, out)
         models = driver.open_models(out, arguments.threads)
-        drawn = accuracy.draw_walk(run.config.data, arguments.seconds)
         setup = tracking_filter(run)
+        drawn = accuracy.draw_walk(run.config.data, setup, arguments.seconds)
         times = measure(run, models, drawn)
     period = 1e3 * setup.config.clone_seconds
     print(f"\n{'part':>34} {'p50 ms':>8} {'p99 ms':>8} {'of the period':>14}")
@@ -56,14 +57,14 @@ def main() -> None:
     print(f"ONNX / gnio-jax, network:        {theirs / ours:.2f}")
 
 
-def measure(run: Any, models: driver.Models, drawn: accuracy.Walk) -> dict[str, list[float]]:
+def measure(run: Any, models: driver.Models, drawn: Recording) -> dict[str, list[float]]:
     """Seconds of each part of each clone interval that has a window."""
     setup = tracking_filter(run)
     network = Network.of(run.model, run.variables)
     apply = jax.jit(
         lambda window: network.apply(network.variables, window)._replace(diagnostics={})
     )
-    state = filtering.initial_state(setup.config, **drawn.start, std=setup.initial_std)
+    state = filtering.initial_state(setup.config, *drawn.start[:-1], std=drawn.start.std)
     tracker = filtering.Tracker(apply, setup.config, setup.noise, state)
     arrays, dt = start_arrays(state, setup), setup.config.dt
     times: dict[str, list[float]] = defaultdict(list)
