@@ -30,9 +30,9 @@ from gnio_jax.tables.runs import Result, run_row
 
 METRICS = (
     *("ate", "ate_2d", "ate_ronin_2d", "rpe_1s", "rte_60s", "path_length_ratio"),
-    *("stationary_drift", "nis", "nees"),
+    *("stationary_drift", "leg_ratio", "waypoint_rms", "nis", "nees"),
 )
-"""Of every table. The first is what rows are compared by."""
+"""Of every table, as far as rows have them. The first is what rows are compared by."""
 
 
 def make(options: TablesConfig, reporter: Reporter | None = None, workers: int = 1) -> str:
