@@ -226,11 +226,15 @@ def checked_value(hint: Any, content: Any, place: Place, base: Any = None) -> An
         remedy = did_you_mean(str(content), members) if origin is Literal else ""
         problem = f"must be {' or '.join(map(_spelled, kinds))}, found {_shown(content)}"
         place.refuse("", problem, remedy.strip())
+    _check_bounds(hint, value, place)
+    return value
+
+
+def _check_bounds(hint: Any, value: Any, place: Place) -> None:
     for bound in bounds(hint):
         for number in value if isinstance(value, tuple) else (value,):
-            if not bound.holds(number):
+            if number is not None and not bound.holds(number):
                 place.refuse("", f"{bound.problem}, found {_shown(value)}")
-    return value
 
 
 def _shown(value: Any) -> str:
@@ -305,7 +309,7 @@ def validate(config: TrainConfig, source: str = "config") -> TrainConfig:
     """
     place = Place(source)
     for name, hint, value in named(config):
-        checked_value(hint, value, place.below(name))
+        _check_bounds(hint, value, place.below(name))
     config.data.check(place.below("data"))
     config.augment.check(place.below("augment"))
     config.check(place)

@@ -6,6 +6,7 @@ import os
 import threading
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from gnio_jax import config as configuration
@@ -239,6 +240,14 @@ def test_words_that_are_no_values_are_named(hint, words, problem):
     with pytest.raises(InputError) as refused:
         configuration.value_from_words(hint, words, "--x")
     assert str(refused.value) == problem
+
+
+def test_settings_of_a_program_may_be_numbers_of_numpy():
+    """They are what a calibration gives; their bounds hold for them too."""
+    config = TrainConfig(filter=changed(noise={"gyro_density": np.float32(1e-3)}))
+    assert configuration.validate(config) is config
+    with pytest.raises(InputError, match=r"config: field 'filter\.noise\.gyro_density'"):
+        configuration.validate(TrainConfig(filter=changed(noise={"gyro_density": np.float32(0)})))
 
 
 # Files of earlier versions
