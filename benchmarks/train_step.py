@@ -86,7 +86,7 @@ def ours(config: TrainConfig):
         return 1
 
     def statistics():
-        order = statistics_order(key, source, config)
+        order = statistics_order(key, source, task)
         estimated = estimate_statistics(holder[0], source, order, key, task=task)
         jax.block_until_ready(estimated.batch_stats)
         return len(order) // size

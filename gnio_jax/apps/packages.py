@@ -134,9 +134,12 @@ def choose(which: str | Path | None = None) -> Weights:
     else:
         run = checkpoint.load_run(place)
         data = run.config.data
-        name, trained_on = place.name, f"dataset {run.config.dataset}, split {data.train_split}"
+        name, trained_on = (
+            place.name,
+            f"dataset {', '.join(run.config.datasets)}, split {data.train_split}",
+        )
         try:
-            measured = _measured(_figures(place), run.config.dataset)
+            measured = _measured(_figures(place), run.config.datasets)
         except InputError:
             measured = ""  # a damaged evaluation keeps nobody from tracking
     return Weights(name, run, f"{trained_on}, whose {measured}" if measured else trained_on)
@@ -324,7 +327,7 @@ def publish(workdir: Path, out: Path, said: Description, which: Which = "best") 
         said.license,
         run.epoch,
         run.step,
-        _measured(figures, run.config.dataset),
+        _measured(figures, run.config.datasets),
         made_by,
         _card(said, run, made_by, figures, (workdir / "calibration.json").is_file()).split("\n"),
         configuration.plain(own),
@@ -360,14 +363,14 @@ def _figures(workdir: Path) -> dict[str, Report]:
     return {place.name: report.read(place) for place in places}
 
 
-def _measured(figures: dict[str, Report], dataset: str) -> str:
+def _measured(figures: dict[str, Report], datasets: tuple[str, ...]) -> str:
     """The error by which networks are listed, in words, of the first evaluation that has it: with
-    the filter before without, on the run's own dataset before others, on a test split before
+    the filter before without, on the run's own datasets before others, on a test split before
     others. Empty where none has it."""
 
     def rank(name: str) -> tuple[bool, bool, bool, int, str]:
         how = figures[name].settings
-        own, tested = how["dataset"] == dataset, "test" in how["split"]
+        own, tested = how["dataset"] in datasets, "test" in how["split"]
         return how["estimator"] != "ekf", not own, not tested, len(name), name
 
     for name in sorted(figures, key=rank):
@@ -432,9 +435,9 @@ Licence: {said.license}
 
 {recipe}
 
-Dataset `{config.dataset}`, seed {config.seed}; `gnio weights {name} --out runs/{name}` writes \
-config.yaml with all settings, those of the filter as they are used. Consider covariance of the \
-filter: {", ".join(considered) or "none"}.
+Dataset `{", ".join(config.datasets)}`, seed {config.seed}; `gnio weights {name} --out \
+runs/{name}` writes config.yaml with all settings, those of the filter as they are used. Consider \
+covariance of the filter: {", ".join(considered) or "none"}.
 
 ## Figures
 

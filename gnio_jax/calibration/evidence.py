@@ -101,16 +101,20 @@ def gather(
     """
     own = asked[0].run.config
     root = config.data_root or own.data_root
-    sequences = data.load(
-        own.dataset, root, split, workers, lambda share: progress("reading", share)
-    )
+    loaded = [
+        data.load(name, root, split, workers, lambda share: progress("reading", share))
+        for name in own.datasets
+    ]
     found = Evidence([], [])
     for number, source in enumerate(asked):
-        trained, where = source.run.config.data, f"dataset {own.dataset}, split '{split}'"
-        recordings = sequences
+        trained, where = (
+            source.run.config.data,
+            f"dataset {', '.join(own.datasets)}, split '{split}'",
+        )
+        recordings = [each for sequences in loaded for each in sequences]
         if source.fold is not None:
             where = f"{where}, fold {source.fold.number}"
-            recordings = source.fold.select(sequences)
+            recordings = [each for some in loaded for each in source.fold.select(some)]
         with_reference = [each for each in recordings if each.valid.any()]
         prepared, _ = prepare(with_reference, trained, settings.start)
         if not prepared:

@@ -79,7 +79,7 @@ def _packaged() -> dict[str, Path]:
 
 def default_workdir(config: TrainConfig) -> Path:
     """Where a run goes: its `workdir`, else runs/<dataset>_<model>."""
-    return Path(config.workdir or f"runs/{config.dataset}_{config.model.name}")
+    return Path(config.workdir or f"runs/{'_'.join(config.datasets)}_{config.model.name}")
 
 
 def with_seeds(config: TrainConfig, seeds: Sequence[int]) -> list[TrainConfig]:

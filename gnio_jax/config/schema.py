@@ -108,6 +108,9 @@ class DataConfig:
     were not learnt from (ours)."""
     val_split: str = "val"
     """Split of the dataset for validation, which chooses the best checkpoint."""
+    weights: tuple[Positive, ...] = ()
+    """Of several datasets, how often an epoch visits the windows of each: 0.5 a half of them, drawn
+    anew in every epoch, 2 all of them twice. By default once each (ours)."""
 
     @property
     def window(self) -> int:
@@ -414,10 +417,12 @@ class ThroughFilter:
 class TrainConfig:
     """One experiment: everything `gnio train` needs, kept with the run as config.yaml."""
 
-    dataset: str = "synthetic"
-    """Dataset to learn from; `gnio data list` shows the known ones."""
+    dataset: str | tuple[str, ...] = "synthetic"
+    """Dataset to learn from, or several; `gnio data list` shows the known ones. Of several the
+    splits have the same names, and the mean of their validation chooses the best checkpoint."""
     data_root: str | None = None
-    """Folder of the dataset; by default $GNIO_DATA/<dataset>, then data/<dataset>."""
+    """Folder of the dataset; by default, and for each of several, $GNIO_DATA/<dataset>, then
+    data/<dataset>."""
     workdir: str | None = None
     """Folder for checkpoints and logs; by default runs/<dataset>_<model>."""
     init_from: str | None = None
@@ -434,10 +439,26 @@ class TrainConfig:
     filter: Annotated[FilterSettings, FILE_ONLY] = field(default_factory=FilterSettings)
     through_filter: ThroughFilter = field(default_factory=ThroughFilter)
 
+    @property
+    def datasets(self) -> tuple[str, ...]:
+        """The datasets to learn from, one or several."""
+        return (self.dataset,) if isinstance(self.dataset, str) else self.dataset
+
     def check(self, at: Place) -> None:
-        """Four headings are averaged only if training shows windows of every heading. A network
-        that learns through the filter has weights, and its segments are whole strides and longer
-        than a window and its context. A network that predicts every sample takes no context."""
+        """Several datasets differ, lie in their usual folders and have a weight each, or none. Four
+        headings are averaged only if training shows windows of every heading. A network that learns
+        through the filter has weights, and its segments are whole strides and longer than a window
+        and its context. A network that predicts every sample takes no context."""
+        names, weights = self.datasets, self.data.weights
+        if len(set(names)) < len(names) or not names:
+            at.refuse("dataset", "names none, or one of them twice", "name each once")
+        if len(names) > 1 and self.data_root is not None:
+            problem = f"is the folder of one dataset, and there are {len(names)}"
+            remedy = "leave it out and set $GNIO_DATA to the folder that holds theirs"
+            at.refuse("data_root", problem, remedy)
+        if weights and len(weights) != len(names):
+            problem = f"has {len(weights)} values for {len(names)} datasets"
+            at.refuse("data.weights", problem, "give one for each, or none")
         if self.data.context and self.model.name == "ctin":
             remedy = "it predicts every sample it sees: set it to 0"
             at.refuse("data.context_seconds", "is not for ctin", remedy)

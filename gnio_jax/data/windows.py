@@ -70,25 +70,33 @@ def window_source(
     Raises `InputError` when not a single window fits.
     """
     found: list[WindowSource] = []
-    rows = windows = 0
     for sequence in sequences:
         if sequence.waypoints is not None:
             problem = "has waypoints, no poses"
             raise InputError(sequence.name, problem, "windows need a pose at every sample")
         part = _recording_windows(sequence, config, stride, 1 if shift else stride)
         if part.start.size:
-            found.append(
-                part._replace(
-                    start=part.start + np.int32(rows),
-                    recording=part.recording + np.int32(rows),
-                    visited=part.visited + np.int32(windows),
-                )
-            )
-            rows += len(part.imu)
-            windows += len(part.start)
+            found.append(part)
     if not found:
         length = f"{config.context_seconds + config.window_seconds:g} s"
         raise InputError("data", f"no window of {length} with a valid reference in any sequence")
+    return joined(found)
+
+
+def joined(sources: list[WindowSource]) -> WindowSource:
+    """The recordings of each after those of the one before, as host arrays."""
+    found: list[WindowSource] = []
+    rows = windows = 0
+    for source in sources:
+        found.append(
+            source._replace(
+                start=source.start + np.int32(rows),
+                recording=source.recording + np.int32(rows),
+                visited=source.visited + np.int32(windows),
+            )
+        )
+        rows += len(source.imu)
+        windows += len(source.start)
     return WindowSource(*(np.concatenate(field) for field in zip(*found, strict=True)))
 
 

@@ -157,9 +157,14 @@ def resolve(config: EvaluateConfig, run: TrainConfig) -> EvaluateConfig:
     of the run. Raises `InputError` for an unknown dataset, missing data and impossible settings."""
     changed = dataclasses.replace(run, filter=config.filter or run.filter)
     changed = configuration.validate(configuration.assign(changed, config.set), "command line")
-    dataset, root = config.dataset or run.dataset, None
+    dataset, root = config.dataset or run.datasets[0], None
+    if config.dataset is None and len(run.datasets) > 1:
+        remedy = f"give --dataset, e.g. {dataset}"
+        raise InputError(
+            config.workdir or "the run", f"has learnt from {', '.join(run.datasets)}", remedy
+        )
     if data.get(dataset).needs_root:
-        given = config.data_root or (run.data_root if dataset == run.dataset else None)
+        given = config.data_root or (run.data_root if dataset in run.datasets else None)
         root = str(data.find_root(dataset, given).resolve())
     return dataclasses.replace(
         config,
@@ -206,7 +211,7 @@ def _is_usual_root(dataset: str, root: str, run: TrainConfig) -> bool:
     """Whether a folder of data is the one that an evaluation takes where none is named, or bears
     the name of its dataset where there is no such folder."""
     try:
-        own = run.data_root if dataset == run.dataset else None
+        own = run.data_root if dataset in run.datasets else None
         return Path(root) == data.find_root(dataset, own).resolve()
     except InputError:
         return Path(root).name in (data.get(dataset).folders or (dataset,))

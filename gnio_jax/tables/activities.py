@@ -41,7 +41,7 @@ def predict_split(workdir: Path, split: str) -> PredictedWindows:
     """What the best checkpoint of a run predicts for the windows of a split of its dataset."""
     run = checkpoint.load_run(workdir)
     config = run.config.data
-    sequences = data.load(run.config.dataset, run.config.data_root, split)
+    sequences = data.load(run.config.datasets[0], run.config.data_root, split)
     recordings, _ = evaluation.prepare(sequences, config, orientation="reference")
     network = Network.of(run.model, run.variables)
     predicted = evaluation.infer(network, recordings, config, diagnostics=DIAGNOSTICS)

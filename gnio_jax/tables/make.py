@@ -81,6 +81,8 @@ def base_config(options: TablesConfig) -> TrainConfig:
     if base.model.name != "gnio":
         remedy = "give a config of gnio: the others are made from it"
         raise InputError(options.base, f"is of the network '{base.model.name}'", remedy)
+    if len(base.datasets) > 1:
+        raise InputError(options.base, "has several datasets", "give a config of one")
     return configuration.validate(base, options.base)
 
 

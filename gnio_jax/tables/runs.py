@@ -95,9 +95,10 @@ def _state(config: TrainConfig) -> str:
     if not file.exists():
         return "new"
     run_folder.refuse_other_run(config, resume=True)
-    if data.get(config.dataset).needs_root:
-        theirs = Path(configuration.load(file).data_root or data.find_root(config.dataset))
-        ours = data.find_root(config.dataset, config.data_root)
+    (dataset,) = config.datasets
+    if data.get(dataset).needs_root:
+        theirs = Path(configuration.load(file).data_root or data.find_root(dataset))
+        ours = data.find_root(dataset, config.data_root)
         if theirs.is_dir() and theirs.resolve() != ours.resolve():  # else the folder has moved
             problem = f"was trained on the recordings of {theirs}, not of {ours}"
             raise InputError(file, problem, "give another --out")

@@ -50,6 +50,7 @@ from gnio_jax.training.segments import (
     StartErrors,
     cut_segment,
     draw_start_errors,
+    joined,
     random_starts,
     segment_source,
     start_rotation,
@@ -196,6 +197,8 @@ class FilterTask(Task):
     ) -> SegmentSource:
         return segment_source(sequences, intervals(config) * config.data.stride)
 
+    joined = staticmethod(joined)
+
     @staticmethod
     def count(source: SegmentSource) -> int:
         return source.earliest.shape[0]
@@ -217,7 +220,15 @@ class FilterTask(Task):
 
     def order(self, key: PRNGKeyArray, epoch: int, source: SegmentSource) -> Int[jax.Array, "p"]:
         """First rows of the segments."""
-        return random_starts(jax.random.fold_in(key, epoch), source)
+        key = jax.random.fold_in(key, epoch)
+        which = self.weighted(key, jnp.arange(self.count(source)))
+        return random_starts(
+            key,
+            source._replace(
+                earliest=jnp.asarray(source.earliest)[which],
+                latest=jnp.asarray(source.latest)[which],
+            ),
+        )
 
     def draw(
         self, key: PRNGKeyArray, source: SegmentSource, which: Int[jax.Array, "b"]
@@ -305,9 +316,7 @@ class FilterTask(Task):
             state = jax.tree.map(parallel.fresh_copy, state)
         return state, progress
 
-    def validate(
-        self, state: TrainState, held_out: SegmentSource, key: PRNGKeyArray
-    ) -> tuple[TrainState, Row]:
+    def figures_of(self, state: TrainState, held_out: SegmentSource, key: PRNGKeyArray) -> Row:
         """The loss is infinite where the filter diverges."""
         found = validate(state, held_out, key, task=self)
         losses = jax.device_get(found.losses)
@@ -323,7 +332,7 @@ class FilterTask(Task):
         for name in ("displacement", "yaw"):
             for seconds, square in zip(HORIZON_SECONDS, getattr(losses, name), strict=False):
                 row[f"val_{name}_error/{seconds:g}s"] = math.sqrt(square)
-        return state, row | {"val_nis": float(found.nis), "val_nees": float(found.nees)}
+        return row | {"val_nis": float(found.nis), "val_nees": float(found.nees)}
 
     def remark(self, row: Row) -> str:
         skipped = f"{row['skipped']} skipped  " if row["skipped"] else ""

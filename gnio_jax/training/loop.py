@@ -268,9 +268,12 @@ def _figures(task: Task, at: Position, rate: float) -> str:
 
 def _summary(task: Task, row: Row) -> str:
     """The line of a finished epoch."""
+    names = [name for name in task.config.datasets if f"val_rmse/{name}" in row]
+    own = ", ".join(f"{name} {row[f'val_rmse/{name}']:.4f}" for name in names)
     return (
         f"epoch {row['epoch'] + 1:4d}/{task.config.optim.epochs}  "
         f"loss {row['loss']:.4g}  val {row['val_loss']:.4g}  val rmse {row['val_rmse']:.4f} m  "
+        f"{f'({own})  ' if own else ''}"
         f"{task.remark(row)}lr {row['learning_rate']:.2e}  "
         f"{_speed(task, row[f'{task.unit}_per_second'])}"
     )

@@ -86,17 +86,22 @@ def segment_source(sequences: Iterable[Sequence], samples: int) -> SegmentSource
     that every epoch meets the whole stretch, cut elsewhere. Raises `InputError` when not a single
     segment fits.
     """
-    parts: list[SegmentSource] = []
-    rows = 0
-    for sequence in sequences:
-        part = _source_of(sequence, samples)
-        if not part.earliest.size:
-            continue
-        parts.append(part._replace(earliest=part.earliest + rows, latest=part.latest + rows))
-        rows += len(part.gyro)
+    parts = [_source_of(sequence, samples) for sequence in sequences]
+    parts = [part for part in parts if part.earliest.size]
     if not parts:
         problem = f"no segment of {samples} samples has a valid reference in any sequence"
         raise InputError("data", problem, "lower through_filter.piece_seconds")
+    return joined(parts)
+
+
+def joined(sources: list[SegmentSource]) -> SegmentSource:
+    """The recordings of each after those of the one before, as host arrays."""
+    parts: list[SegmentSource] = []
+    rows = 0
+    for source in sources:
+        earliest, latest = source.earliest + np.int32(rows), source.latest + np.int32(rows)
+        parts.append(source._replace(earliest=earliest, latest=latest))
+        rows += len(source.gyro)
     return SegmentSource(*(np.concatenate(field) for field in zip(*parts, strict=True)))
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import itertools
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -93,10 +94,10 @@ class Recordings(NamedTuple):
 
     source: Any
     """Windows or segments of the training split, on the devices."""
-    held_out: Any
-    """Those of the validation split, likewise."""
+    held_out: dict[str, Any]
+    """Those of the validation split of each dataset by its name, likewise."""
     splits: dict[str, list[str]]
-    """Names of the recordings of each split."""
+    """Names of the recordings of each split; of several datasets, with theirs before them."""
 
 
 @dataclass(frozen=True)
@@ -108,6 +109,8 @@ class Task(ABC):
     config: TrainConfig
     """Settings without seed and folders."""
     steps_per_epoch: int
+    parts: tuple[int, ...] = ()
+    """How many windows or segments of training each dataset has."""
 
     unit: ClassVar[str]
     """What a batch consists of, in the plural."""
@@ -125,8 +128,13 @@ class Task(ABC):
 
     @staticmethod
     @abstractmethod
+    def joined(sources: list[Any]) -> Any:
+        """Those of several datasets one after the other, on the host."""
+
+    @staticmethod
+    @abstractmethod
     def count(source: Any) -> int:
-        """How many of them an epoch visits."""
+        """How many of them an epoch visits, unless datasets have weights."""
 
     @abstractmethod
     def description(self, state: TrainState, workdir: Path) -> Iterator[str]:
@@ -162,16 +170,47 @@ class Task(ABC):
         estimated anew, if asked for."""
         return state
 
+    def calibrated(self, state: TrainState, held_out: dict[str, Any]) -> TrainState:
+        """The state with its uncertainty calibrated, where it has constants for that."""
+        return state
+
     @abstractmethod
+    def figures_of(self, state: TrainState, held_out: Any, key: PRNGKeyArray) -> Row:
+        """The figures of a state on the validation split of one dataset."""
+
     def validate(
-        self, state: TrainState, held_out: Any, key: PRNGKeyArray
+        self, state: TrainState, held_out: dict[str, Any], key: PRNGKeyArray
     ) -> tuple[TrainState, Row]:
-        """The state as it is kept, with its uncertainty calibrated where it has constants for that,
-        and its figures on the validation split."""
+        """The state as it is kept, calibrated, and its figures on the validation split. Of several
+        datasets these are means over them, beside the losses and errors of each."""
+        state = self.calibrated(state, held_out)
+        rows = {name: self.figures_of(state, each, key) for name, each in held_out.items()}
+        first, *others = rows.values()
+        if not others:
+            return state, first
+        row: Row = {name: sum(each[name] for each in rows.values()) / len(rows) for name in first}
+        for figure in ("val_loss", "val_mse", "val_rmse"):
+            row |= {f"{figure}/{name}": each[figure] for name, each in rows.items()}
+        return state, row
 
     @abstractmethod
     def remark(self, row: Row) -> str:
         """What the line of an epoch says besides loss, speed and rate."""
+
+    def weighted(self, key: PRNGKeyArray, entries: Int[jax.Array, "m"]) -> Int[jax.Array, "n"]:
+        """Those of `entries`, one for each window or segment, that an epoch visits: of each dataset
+        as many as its weight says, in no order. Which of them, where it is not all of them alike,
+        depends on `key`."""
+        weights, found = self.config.data.weights, []
+        if not weights:
+            return entries
+        ends = itertools.accumulate(self.parts)
+        for number, (end, count, weight) in enumerate(zip(ends, self.parts, weights, strict=True)):
+            own = entries[end - count : end]
+            times, rest = divmod(visits(count, weight), count)
+            drawn = jax.random.permutation(jax.random.fold_in(key, number), own)
+            found += [own] * times + [drawn[:rest]]
+        return jnp.concatenate(found)
 
     def initial_state(self, key: PRNGKeyArray, start: Any | None) -> TrainState:
         """The state at step 0: with drawn parameters, or with the variables `start` of a run."""
@@ -330,18 +369,24 @@ def set_up(
         remedy = f"make it a multiple of {devices}, or use fewer --devices"
         raise InputError("optim.batch_size", problem, remedy)
     train, val = config.data.train_split, config.data.val_split
-    reporter.line(f"reading {config.dataset}: {train} and {val}")
-    sources, counts, splits = [], [], {}
-    for split in (train, val):
-        samples: dict[str, int] = {}
-        sequences = read_split(config, split, reporter, workers, samples)
-        source = task.source_of(sequences, config, training=not sources)
-        sources.append(parallel.everywhere(source))
-        counts.append(task.count(source))
-        splits[split] = list(samples)
-        hours = sum(samples.values()) / config.data.rate / 3600
-        contents = f"{hours:.2f} h, {counts[-1]:,} {task.unit}"
-        reporter.line(f"  {split}: {len(samples)} sequences, {contents}")
+    names = config.datasets
+    reporter.line(f"reading {', '.join(names)}: {train} and {val}")
+    sources, held_out, splits = [], {}, {}
+    for split, training in ((train, True), (val, False)):
+        splits[split] = []
+        for name in names:
+            label = f"{name}/" if len(names) > 1 else ""
+            samples: dict[str, int] = {}
+            sequences = read_split(config, name, split, reporter, workers, samples)
+            source = task.source_of(sequences, config, training)
+            if training:
+                sources.append(source)
+            else:
+                held_out[name] = parallel.everywhere(source)
+            splits[split] += [label + each for each in samples]
+            hours = sum(samples.values()) / config.data.rate / 3600
+            contents = f"{hours:.2f} h, {task.count(source):,} {task.unit}"
+            reporter.line(f"  {label}{split}: {len(samples)} sequences, {contents}")
     both = sorted(set(splits[train]) & set(splits[val]))
     if both:
         reporter.line(
@@ -349,11 +394,19 @@ def set_up(
             "the best checkpoint is chosen by recordings that it was trained on; separate the two "
             "splits"
         )
-    if counts[0] < size:
-        problem = f"is {size}, but there are only {counts[0]} {task.unit}"
+    parts = tuple(map(task.count, sources))
+    epoch = sum(map(visits, parts, config.data.weights or [1.0] * len(parts)))
+    if epoch < size:
+        problem = f"is {size}, but there are only {epoch} {task.unit}"
         raise InputError("optim.batch_size", problem, "lower it")
+    recordings = Recordings(parallel.everywhere(task.joined(sources)), held_out, splits)
     anywhere = dataclasses.replace(config, workdir=None, data_root=None, init_from=None, seed=0)
-    return task(model, anywhere, counts[0] // size), Recordings(sources[0], sources[1], splits)
+    return task(model, anywhere, epoch // size, parts), recordings
+
+
+def visits(count: int, weight: float) -> int:
+    """How many windows or segments an epoch visits of a dataset that has `count`."""
+    return round(weight * count)
 
 
 def create_model(config: TrainConfig) -> nn.Module:
@@ -373,12 +426,18 @@ def overlaid(tree: dict[str, Any], other: dict[str, Any]) -> dict[str, Any]:
 
 
 def read_split(
-    config: TrainConfig, split: str, reporter: Reporter, workers: int, samples: dict[str, int]
+    config: TrainConfig,
+    dataset: str,
+    split: str,
+    reporter: Reporter,
+    workers: int,
+    samples: dict[str, int],
 ) -> Iterator[Sequence]:
-    """The recordings of a split at the network's rate, one after another, with poses where they
-    come with waypoints. The number of samples of each is noted in `samples` by its name."""
+    """The recordings of a split of a dataset at the network's rate, one after another, with poses
+    where they come with waypoints. The number of samples of each is noted in `samples` by its
+    name."""
     for sequence in data.load_each(
-        config.dataset,
+        dataset,
         config.data_root,
         split,
         workers,

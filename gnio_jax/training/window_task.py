@@ -24,6 +24,7 @@ from gnio_jax.data.windows import (
     WindowSource,
     augment,
     gather,
+    joined,
     low_pass,
     low_pass_margin,
     shift_windows,
@@ -49,6 +50,8 @@ class WindowTask(Task):
             shift = config.augment.shift_samples
             return window_source(sequences, config.data, config.data.train_stride, shift)
         return window_source(sequences, config.data, config.data.stride)
+
+    joined = staticmethod(joined)
 
     @staticmethod
     def count(source: WindowSource) -> int:
@@ -83,7 +86,8 @@ class WindowTask(Task):
 
     def order(self, key: PRNGKeyArray, epoch: int, source: WindowSource) -> Int[jax.Array, "m"]:
         """Numbers of the windows, permuted."""
-        return jax.random.permutation(jax.random.fold_in(key, epoch), jnp.asarray(source.visited))
+        key = jax.random.fold_in(key, epoch)
+        return jax.random.permutation(key, self.weighted(key, jnp.asarray(source.visited)))
 
     def draw(
         self, key: PRNGKeyArray, source: WindowSource, which: Int[jax.Array, "b"]
@@ -114,22 +118,28 @@ class WindowTask(Task):
     ) -> TrainState:
         if not self.config.optim.statistics_windows or not normalises(state):
             return state
-        order = statistics_order(key, source, self.config)
+        order = statistics_order(key, source, self)
         return estimate_statistics(state, source, order, key, task=self)
 
-    def validate(
-        self, state: TrainState, held_out: WindowSource, key: PRNGKeyArray
-    ) -> tuple[TrainState, Row]:
-        stage = loss_stage(self.config.loss, state.step - 1, self.steps_per_epoch)
-        found = validate(state, held_out, stage, task=self)
-        if calibrates(state):
-            equivariant = self.config.model.equivariance != "none"
-            state = calibrated(state, isotropic(found) if equivariant else found)
-            found = validate(state, held_out, stage, task=self)
+    def calibrated(self, state: TrainState, held_out: dict[str, WindowSource]) -> TrainState:
+        if not calibrates(state):
+            return state
+        stage = self.last_stage(state)
+        each = [validate(state, source, stage, task=self) for source in held_out.values()]
+        found = jax.tree.map(lambda *figures: sum(figures) / len(each), *each)
+        equivariant = self.config.model.equivariance != "none"
+        return calibrated(state, isotropic(found) if equivariant else found)
+
+    def figures_of(self, state: TrainState, held_out: WindowSource, key: PRNGKeyArray) -> Row:
+        found = validate(state, held_out, self.last_stage(state), task=self)
         loss, mse, nll = (float(each) for each in found.losses)
         row: Row = {"val_loss": loss, "val_mse": mse, "val_nll": nll, "val_rmse": math.sqrt(mse)}
         normalised = zip("xyz", found.axis_normalised, strict=True)
-        return state, row | {f"val_normalised/{axis}": float(each) for axis, each in normalised}
+        return row | {f"val_normalised/{axis}": float(each) for axis, each in normalised}
+
+    def last_stage(self, state: TrainState) -> Stage:
+        """The stage of the step that led to `state`."""
+        return loss_stage(self.config.loss, state.step - 1, self.steps_per_epoch)
 
     def remark(self, row: Row) -> str:
         """The parts of both losses, which compare between networks where the losses do not."""
@@ -174,14 +184,16 @@ def normalises(state: TrainState) -> bool:
 
 
 def statistics_order(
-    key: PRNGKeyArray, source: WindowSource, config: TrainConfig
+    key: PRNGKeyArray, source: WindowSource, task: WindowTask
 ) -> Int[jax.Array, "m"]:
     """The windows of `estimate_statistics`: whole batches for `optim.statistics_windows`, but no
     more than an epoch has, drawn from `key` alone."""
-    size = config.optim.batch_size
-    batches = min(-(-config.optim.statistics_windows // size), source.visited.shape[0] // size)
+    optim = task.config.optim
     order_key, _ = jax.random.split(key)
-    return jax.random.permutation(order_key, jnp.asarray(source.visited))[: batches * size]
+    visited = task.weighted(order_key, jnp.asarray(source.visited))
+    size = optim.batch_size
+    batches = min(-(-optim.statistics_windows // size), len(visited) // size)
+    return jax.random.permutation(order_key, visited)[: batches * size]
 
 
 @functools.partial(jax.jit, static_argnames="task")

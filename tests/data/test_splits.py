@@ -86,7 +86,7 @@ def test_a_split_may_be_a_fold_or_all_but_that(monkeypatch, number):
 def test_training_reads_the_fold_that_its_split_names(monkeypatch):
     monkeypatch.setattr(loading, "read_split", lambda *_: iter(RECORDINGS))
     config = TrainConfig(data=DataConfig(rate=50.0, train_split="train-1of3"))
-    read = [s.name for s in read_split(config, "train-1of3", Lines(), 1, {})]
+    read = [s.name for s in read_split(config, "synthetic", "train-1of3", Lines(), 1, {})]
     assert read == [s.name for s in data.load("synthetic", None, "train-1of3")]
     assert 0 < len(read) < len(RECORDINGS)
 

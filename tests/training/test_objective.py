@@ -279,7 +279,7 @@ def test_constants_of_an_equivariant_network_are_the_same_along_both_axes(
     config = TrainConfig(model=ModelConfig(equivariance=equivariance))
     task = window_task.WindowTask(Tiny(), config, 7)
     held_out = WindowSource(*[jnp.zeros(0)] * len(WindowSource._fields))
-    kept, _ = task.validate(state, held_out, jax.random.key(0))
+    kept, _ = task.validate(state, {"some": held_out}, jax.random.key(0))
     constants = kept.batch_stats["uncertainty"]["log_std"]
     wanted = [1.0, 4.0, 9.0] if equivariance == "none" else [2.5, 2.5, 9.0]
     np.testing.assert_allclose(np.exp(2 * constants), wanted, rtol=1e-6)

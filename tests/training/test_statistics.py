@@ -79,7 +79,7 @@ def trainer(config, source, seed=0):
 
     @functools.cache
     def order(epoch):
-        return WindowTask.order(None, key, epoch, source)
+        return WindowTask(create_model(config), config, steps).order(key, epoch, source)
 
     def take(state, epoch, first, count):
         with jax.enable_x64(False):
@@ -118,10 +118,9 @@ def run(seed):
 def estimated(model, state, source, config=CONFIG, key=0):
     with jax.enable_x64(False):
         key = jax.random.key(key)
-        order = window_task.statistics_order(key, source, config)
-        return window_task.estimate_statistics(
-            state, source, order, key, task=WindowTask(model, config, 1)
-        )
+        training = WindowTask(model, config, 1)
+        order = window_task.statistics_order(key, source, training)
+        return window_task.estimate_statistics(state, source, order, key, task=training)
 
 
 def squared_errors(model, state, source, config=CONFIG):
@@ -168,12 +167,13 @@ def test_training_windows_err_in_inference_mode_as_in_training_mode(trained):
 def test_statistics_are_means_over_batches(trained):
     """Of the first normalisation, against NumPy: its input is a convolution of drawn windows."""
     model, _, state, source = trained
-    assert len(window_task.statistics_order(jax.random.key(7), source, FEW)) == 3 * 64
+    training = WindowTask(model, FEW, 1)
+    assert len(window_task.statistics_order(jax.random.key(7), source, training)) == 3 * 64
     found = estimated(model, state, source, FEW, key=7).batch_stats["encoder"]["stem_bn"]
     kernel = np.asarray(state.params["encoder"]["stem_conv"]["kernel"], np.float64)
     order_key, draw_key = jax.random.split(jax.random.key(7))
     order = np.asarray(jax.random.permutation(order_key, source.visited))[: 3 * 64].reshape(3, 64)
-    draw = jax.jit(WindowTask(model, FEW, 1).draw)
+    draw = jax.jit(training.draw)
     means, variances = [], []
     for number, which in enumerate(order):
         with jax.enable_x64(False):
@@ -210,9 +210,8 @@ def test_an_estimate_depends_on_parameters_and_key_alone(trained):
         third.batch_stats["encoder"]["stem_bn"]["mean"],
     )
     optim = dataclasses.replace(FEW.optim, statistics_windows=10**9)
-    most = window_task.statistics_order(
-        jax.random.key(0), source, dataclasses.replace(FEW, optim=optim)
-    )
+    training = WindowTask(model, dataclasses.replace(FEW, optim=optim), 1)
+    most = window_task.statistics_order(jax.random.key(0), source, training)
     assert len(most) == source.visited.shape[0] // 64 * 64  # no more than an epoch has
 
 
