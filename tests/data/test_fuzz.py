@@ -32,6 +32,8 @@ def _copies_are_removed() -> Iterator[None]:
     remove_copies()
 
 
+FEW = 6
+"""Examples of every layout among the quick tests."""
 EXAMPLES = {
     "oxiod raw": 12,
     "oxiod syn": 12,
@@ -44,7 +46,7 @@ EXAMPLES = {
     "tyrex Nexus": 8,
     "tyrex iPhone": 8,
 }
-"""Of the slower layouts; 60 of the others."""
+"""Among the slow tests, of the slower layouts; 60 of the others."""
 
 
 @pytest.mark.parametrize("name", LAYOUTS)
@@ -55,14 +57,15 @@ def test_an_undamaged_recording_is_read(name):
     assert (sequence.valid.mean() > 0.9 or sequence.waypoints is not None) and said == ""
 
 
+@pytest.mark.parametrize("few", [True, pytest.param(False, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", LAYOUTS)
-def test_a_damaged_recording_is_plausible_or_refused_by_name(name):
+def test_a_damaged_recording_is_plausible_or_refused_by_name(name, few):
     layout = LAYOUTS[name]
     files = list(layout.targets or written(name))
     one = damages(files)
 
     @settings(
-        max_examples=EXAMPLES.get(name, 60),
+        max_examples=FEW if few else EXAMPLES.get(name, 60),
         derandomize=True,
         database=None,
         deadline=timedelta(seconds=SECONDS_PER_EXAMPLE),
