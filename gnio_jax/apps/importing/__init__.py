@@ -129,7 +129,7 @@ def _recognised(path: Path) -> str:
         raise InputError(path, f"cannot be read ({error.strerror})") from None
     found = next((name for magic, name in _MAGIC.items() if head.startswith(magic)), None)
     if found == "hdf5":
-        remedy = "check it with gnio data check FOLDER --dataset csv"
+        remedy = "check it with gnio data check csv --data-root FOLDER"
         raise InputError(path, "is HDF5 already", remedy)
     return found or ("logger" if loggers.is_phyphox(table_layout(path).labels) else "csv")
 

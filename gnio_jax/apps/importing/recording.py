@@ -136,7 +136,8 @@ def table_layout(path: Path, content: bytes | None = None) -> Layout:
 def read_table(path: Path, columns: tuple[str, ...] = (), content: bytes | None = None) -> Table:
     """A logger's table; without a header where all `columns` that are wanted are places."""
     layout = table_layout(path, content)
-    header = not (columns and all(name.isdigit() for name in columns))
+    parts = [part.strip() for name in columns for part in name.split("+")]
+    header = not (parts and all(part.isdigit() for part in parts))
     table = read_text(path, layout.separator, header, content, layout.decimal)
     return table.renamed(_label(label) for label in table.columns)
 

@@ -262,6 +262,9 @@ def test_files_without_a_header_are_read_by_the_places_of_their_columns(tmp_path
     columns = {"time": "0"} | {name: "123"[n % 3] for n, name in enumerate(AXES)}
     sequence, _ = import_recording(paths[0], columns, accel_path=paths[1])
     compare_imu(sequence)
+    stated = {"accel_path": paths[1], "gyro_unit": "rad/s"}
+    summed, _ = import_recording(paths[0], columns | {"gyro_x": "1+2"}, **stated)
+    np.testing.assert_allclose(summed.gyro[:, 0], sequence.gyro[:, :2].sum(axis=1), atol=1e-9)
     words = r"gyro\.txt: column '4' is missing; found: 0, 1, 2, 3"
     refused(paths[0], words, columns | {"gyro_z": "4"}, accel_path=paths[1])
     words = "has 4 columns of numbers and no header; .* time=0 gyro_x=1 gyro_y=2 gyro_z=3$"
