@@ -9,6 +9,7 @@ from gnio_jax.data.alignment.body import (
     PoseLag,
     TooLittle,
     align,
+    check_fit,
     pose_lag,
     without_jumps,
 )
@@ -21,6 +22,7 @@ __all__ = [
     "TooLittle",
     "align",
     "align_positions",
+    "check_fit",
     "pose_lag",
     "without_jumps",
 ]

@@ -23,6 +23,7 @@ the choice of the fit are ours.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from contextlib import suppress
 from typing import NamedTuple
 
@@ -34,6 +35,7 @@ from scipy.optimize import fminbound, least_squares
 from scipy.spatial.transform import Rotation
 
 from gnio_jax.data.assembly import Samples, Streams, ordered
+from gnio_jax.data.dataset import Refusal
 from gnio_jax.data.reference import LOST_POSES, Poses, longest_trusted, one_sign
 from gnio_jax.data.resampling import known_at, splined
 from gnio_jax.numerics import (
@@ -84,6 +86,10 @@ LONGEST_POSE_LAG = 0.4
 """s, to either side, by which poses of the IMU's own body may be late."""
 POSE_LAG_FILTER_SECONDS = 0.05
 """Standard deviation of the Gaussian filter of both angular rates in `pose_lag`."""
+MOST_UNEXPLAINED = {"turning": 0.1, "acceleration": 0.5}
+"""Shares of the signals' power that the fit of a phone to its own tracker may leave. The largest of
+OxIOD and Tyrex are 0.011, and 0.19 on a trolley, which shakes more than it accelerates. Another
+walk's tracker leaves 0.6 of the turning and more."""
 OUTLIER = 10.0
 """Robust standard deviations beyond which a row takes no part in the next fit."""
 
@@ -190,6 +196,39 @@ def align(
         turn_std=fit.turn_std,
         poses=_poses_of_the_imu(fit, finer, track, levelling(up)),
     )
+
+
+def check_fit(fit: BodyFit, source: object, limits: Mapping[str, tuple[float, str]]) -> None:
+    """Raise `Refusal` naming the tracker's file `source` where a fit does not explain the motion
+    (`MOST_UNEXPLAINED`), or finds more than `limits` (most, unit) allow: no phone on its body."""
+    remedy = "check that both files are of one walk"
+    shares = {"turning": fit.gyro_unexplained, "acceleration": fit.accel_unexplained}
+    for what, share in shares.items():
+        if not share <= MOST_UNEXPLAINED[what]:
+            problem = f"does not move as the phone does: {share:.0%} of the power of its {what}"
+            most = f"stays unexplained, at most {MOST_UNEXPLAINED[what]:.0%} is plausible"
+            raise Refusal(source, f"{problem} {most}", remedy)
+    found = {
+        "lag": np.abs(fit.lag).max(),
+        "lag's drift": np.ptp(fit.lag),
+        "accel's delay": abs(fit.accel_delay),
+        "lever arm": np.linalg.norm(fit.lever),
+        "mounting's turn": np.degrees(fit.extrinsic.magnitude()),
+        "mounting's uncertainty": np.degrees(fit.turn_std),
+        "world's tilt": degrees_off(fit.up[2]),
+        "gyro's bias": np.linalg.norm(fit.gyro_bias),
+        "accel's bias": np.linalg.norm(fit.accel_bias),
+    }
+    for what, (most, unit) in limits.items():
+        if not found[what] <= most:
+            value = f"the {what} would be {found[what]:.3g} {unit}, at most {most:g} {unit}"
+            problem = f"fits the phone only with what cannot be: {value} is plausible"
+            raise Refusal(source, problem, remedy)
+
+
+def degrees_off(cosine: float) -> float:
+    """Angle of this cosine, degrees."""
+    return float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
 
 
 def _poses_of_the_imu(

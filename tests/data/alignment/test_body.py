@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from gnio_jax.data import alignment
 from gnio_jax.data.alignment import body
 from gnio_jax.data.assembly import Poses, Samples, Streams
+from gnio_jax.data.dataset import Refusal
 from tests.support import known_walk as walk
 from tests.support.idol_files import BIAS
 
@@ -112,7 +113,7 @@ def test_rows_out_of_order_and_stamps_that_are_there_twice_change_nothing():
 @pytest.mark.parametrize(
     ("streams", "problem"),
     [
-        (imu(start=-20.0, stop=7.0), "less than 10 s of the track overlap"),
+        (imu(start=-20.0, stop=4.0), "less than 10 s of the track overlap"),
         (imu(lag=60.0), "less than 10 s of the track overlap"),
         (imu(stop=7.0), "less than 10 s are recorded in gyro"),
         (imu(accel_hz=0.01), "less than 10 s are recorded in accel"),
@@ -135,7 +136,10 @@ def test_a_mounting_that_the_motion_does_not_tell_is_uncertain(strength):
     up = np.array([0.0, 0.0, 9.81])
     streams = Streams.of_imu("still", "still", time, gyro + noise[0], up + noise[1])
     poses = Poses(time, attitude * EXTRINSIC.inv(), np.zeros((len(time), 3)), noisy=True)
-    assert np.degrees(alignment.align(streams, poses).turn_std) > 10.0
+    fit = alignment.align(streams, poses)
+    assert np.degrees(fit.turn_std) > 10.0
+    with pytest.raises(Refusal, match=r"mounting's uncertainty|does not move as"):
+        alignment.check_fit(fit, "track", {"mounting's uncertainty": (2.0, "°")})
 
 
 def test_a_track_of_single_poses_is_refused():
