@@ -189,9 +189,17 @@ def path_length(position: Positions, step: float, seconds: float = 1.0) -> float
     """
     if len(position) < 2:
         raise Undefined("a single row")
+    return float(np.nansum(path_sides(position, step, seconds)[1]))
+
+
+def path_sides(
+    position: Positions, step: float, seconds: float = 1.0
+) -> tuple[Int[np.ndarray, "c"], Float[np.ndarray, "c1"]]:
+    """Corners of the polygon of `path_length`, as rows, and the lengths of its c − 1 sides, m; NaN
+    where a side touches an untrusted row."""
     apart = max(1, round(seconds / step))
     corners = np.unique(np.append(np.arange(0, len(position), apart), len(position) - 1))
-    return float(np.nansum(np.linalg.norm(np.diff(position[corners], axis=0), axis=1)))
+    return corners, np.linalg.norm(np.diff(position[corners], axis=0), axis=1)
 
 
 def path_length_ratio(estimate: Positions, reference: Positions, step: float) -> float:

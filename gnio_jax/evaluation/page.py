@@ -23,7 +23,7 @@ from jaxtyping import Float
 from jinja2 import Environment
 
 from gnio_jax.errors import InputError
-from gnio_jax.evaluation import plots, tabulate
+from gnio_jax.evaluation import metrics, plots, tabulate
 from gnio_jax.evaluation.colours import (
     AXES,
     BLUE,
@@ -227,11 +227,9 @@ def columns(seen: View, rows: int) -> Columns:
 def walked(
     position: Float[np.ndarray, "n 3"], time: Float[np.ndarray, "n"], step: float
 ) -> Float[np.ndarray, "n"]:
-    """Horizontal distance along a path, m: through points 1 s apart, as `metrics.path_length`, so
-    that the noise of positions is not counted as walking. A stretch that is not known adds none."""
-    apart = max(1, round(1.0 / step))
-    corners = np.unique(np.append(np.arange(0, len(time), apart), len(time) - 1))
-    sides = np.linalg.norm(np.diff(position[corners, :2], axis=0), axis=1)
+    """Horizontal distance along a path, m, that of `metrics.path_length`. A stretch that is not
+    known adds none."""
+    corners, sides = metrics.path_sides(position[:, :2], step)
     total = np.concatenate([[0.0], np.cumsum(np.nan_to_num(sides))])
     return np.interp(time, time[corners], total)
 
