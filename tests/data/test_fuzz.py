@@ -24,6 +24,7 @@ from tests.support.damaged_recordings import (
     written,
 )
 from tests.support.layouts import LAYOUTS
+from tests.support.tyrex_files import IPHONE
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -43,8 +44,8 @@ EXAMPLES = {
     "euroc": 40,
     "tumvi": 40,
     "kitti packets": 40,
-    "tyrex Nexus": 8,
-    "tyrex iPhone": 8,
+    "tyrex Nexus": 24,
+    "tyrex iPhone": 24,
 }
 """Among the slow tests, of the slower layouts; 60 of the others."""
 
@@ -84,6 +85,11 @@ _EURO = "MH_04_difficult/mav0/imu0"
 _OXTS = LAYOUTS["kitti packets"].targets
 _FLIGHT = "clover/yawForward/maxSpeed5p0/test/stamped_groundtruth_imu.txt"
 ONCE_WRONG = {
+    "stamps of another phone": (
+        "tyrex iPhone",
+        [Damage(f"datasets/ios/{IPHONE}/accelerometer.txt", "scale column", 0.0, 0.0, 1.03)],
+        "accelerometer.txt: field 'time' (column 0) ends 2.46e+03 s after the record's start",
+    ),
     "gyro that begins before the world": (
         "ridi text",
         [Damage("hang_leg1/gyro.txt", "cell", 0.5, 0.0, "-1e30")],

@@ -66,8 +66,8 @@ WAYS = {
 }
 """Names of the folders, and the ways to carry as the attribute `placement` has them."""
 
-LONGEST_RECORD = 3600.0
-"""s; a record lasts two minutes."""
+LONGEST_RECORD, LATEST_START = 600.0, 60.0
+"""s; a record lasts two minutes, and the sensors start within a second of it."""
 CLIPS = (1.95, 2.15)
 """G between which the accelerometers of Nexus 5 and iPhone 4S clip; the iPhone 5's reaches 6 G."""
 WIDEST = (0.2, 100.0)
@@ -196,8 +196,8 @@ def _recorded(track: Poses, phone: Streams) -> Poses:
         for shift in (-LAG_SEARCH, 0.0, LAG_SEARCH):
             covered &= known_at(sensor.time, own, track.time + shift, LONGEST_BRIDGE)
     if covered.sum() < 2:
-        problem = "field 'time' shares nothing with the phone's"
-        raise InputError(track.source, problem, "check that both files are of one walk")
+        problem = "field 'time' shares nothing with gyroscope.txt and accelerometer.txt"
+        raise InputError(track.source, problem, "check that all three are of one walk")
     return track.rows(np.flatnonzero(covered))
 
 
@@ -222,11 +222,13 @@ def read_phone(walk: Walk) -> Streams:
         stamps, values = table.take(0), table.take(1, 2, 3)
         rows = distinct(stamps, path)
         time = stamps[rows] - start
-        if not np.abs(time).max() <= LONGEST_RECORD:
-            farthest = time[np.argmax(np.abs(time))]
-            problem = f"field 'time' (column 0) lies {farthest:.3g} s from the record's start"
-            remedy = "check that its stamps and BootTime are of one phone" if apple else ""
-            raise InputError(path, problem, remedy or "cut the rows of other times")
+        remedy = "cut the rows of other times, or check that all files are of one phone"
+        if not abs(time[0]) <= LATEST_START:
+            problem = f"field 'time' (column 0) begins {time[0]:.3g} s after the record"
+            raise InputError(path, problem, remedy)
+        if not time[-1] <= LONGEST_RECORD:
+            problem = f"field 'time' (column 0) ends {time[-1]:.3g} s after the record's start"
+            raise InputError(path, problem, remedy)
         sensors.append(Samples(time, values[rows], str(path)))
     gyro, accel = sensors
     if apple:
