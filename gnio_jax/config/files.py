@@ -181,13 +181,13 @@ def value_from_words(hint: Any, words: Sequence[str], name: str) -> Any:
 def _section(base: Any, content: Any, place: Place) -> Any:
     """The section `base` with the fields of a mapping in it."""
     if not isinstance(content, dict):
-        problem = f"{place.section or 'the file'} must be a mapping of fields"
+        problem = f"{place.field or 'the file'} must be a mapping of fields"
         raise InputError(place.source, f"{problem}, found {_shown(content)}")
     hints = typing.get_type_hints(type(base), include_extras=True)
     for key in content:
         if key not in hints:
-            hint = did_you_mean(str(key), hints, lambda name: place.below(name).section)
-            name = place.below(_shown(key).strip("'")).section
+            hint = did_you_mean(str(key), hints, lambda name: place.below(name).field)
+            name = place.below(_shown(key).strip("'")).field
             known = f"known fields: {', '.join(hints)}"
             raise InputError(place.source, f"unknown field '{name}'", hint.strip() or known)
     fields = {
@@ -211,13 +211,13 @@ def checked_value(hint: Any, content: Any, place: Place, base: Any = None) -> An
         return _section(kind() if base is None else base, content, place)
     if origin is tuple and isinstance(content, list | tuple):
         if ... not in members and len(content) != len(members):
-            place.refuse("", f"must be a list of {len(members)} values, found {_shown(content)}")
+            place.refuse(f"must be a list of {len(members)} values, found {_shown(content)}")
         value = tuple(checked_value(members[0], each, place) for each in content)
     elif kind in (float, Any) and type(content) in (int, float):
         try:
             value = float(content)
         except OverflowError:
-            place.refuse("", "is larger than any number of floating point")
+            place.refuse("is larger than any number of floating point")
     elif kind is Path and isinstance(content, str):
         value = Path(content)
     elif content in members if origin is Literal else type(content) is kind:
@@ -225,7 +225,7 @@ def checked_value(hint: Any, content: Any, place: Place, base: Any = None) -> An
     else:
         remedy = did_you_mean(str(content), members) if origin is Literal else ""
         problem = f"must be {' or '.join(map(_spelled, kinds))}, found {_shown(content)}"
-        place.refuse("", problem, remedy.strip())
+        place.refuse(problem, remedy.strip())
     _check_bounds(hint, value, place)
     return value
 
@@ -234,7 +234,7 @@ def _check_bounds(hint: Any, value: Any, place: Place) -> None:
     for bound in bounds(hint):
         for number in value if isinstance(value, tuple) else (value,):
             if number is not None and not bound.holds(number):
-                place.refuse("", f"{bound.problem}, found {_shown(value)}")
+                place.refuse(f"{bound.problem}, found {_shown(value)}")
 
 
 def _shown(value: Any) -> str:
@@ -443,7 +443,7 @@ def _of_earlier_version(old: dict[str, Any], source: str) -> dict[str, Any]:
         value = new[section].pop(field, neutral)
         if neutral is not ... and value != neutral:
             problem = f"is {_shown(value)}, and there is no such setting any more"
-            Place(source, section).refuse(field, problem, "train the run again without it")
+            Place(source, path).refuse(problem, "train the run again without it")
     data, augment, flat = new["data"], new["augment"], new["filter"]
     count, left_out = data.pop("folds", 1), data.pop("left_out", 0)
     if count != 1:

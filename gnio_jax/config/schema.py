@@ -16,20 +16,20 @@ from gnio_jax.errors import InputError
 
 
 class Place(NamedTuple):
-    """Where settings stand: in a file or on the command line, and in which section."""
+    """Where a setting or a section stands in a file or on the command line."""
 
     source: str
-    section: str = ""
+    field: str = ""
     """Names joined by dots; empty at the top."""
 
     def below(self, name: str) -> Place:
-        """The section or the field `name` of this section."""
-        return Place(self.source, f"{self.section}.{name}" if self.section else name)
+        """The field `name` of this section."""
+        return Place(self.source, f"{self.field}.{name}" if self.field else name)
 
-    def refuse(self, field: str, problem: str, remedy: str = "") -> NoReturn:
-        """Raise the `InputError` of a field of this section; of the place itself if it is empty."""
-        name = self.below(field).section if field else self.section
-        raise InputError(self.source, f"field '{name}' {problem}" if name else problem, remedy)
+    def refuse(self, problem: str, remedy: str = "") -> NoReturn:
+        """Raise the `InputError` of what stands here."""
+        named = f"field '{self.field}' {problem}" if self.field else problem
+        raise InputError(self.source, named, remedy)
 
 
 class Bound(NamedTuple):
@@ -143,11 +143,15 @@ class DataConfig:
             samples = getattr(self, name) * self.rate
             if not _is_whole(samples):
                 problem = f"is not a whole number of samples at {self.rate:g} Hz ({samples:g})"
-                at.refuse(name, problem)
+                at.below(name).refuse(problem)
         if self.window % self.stride:
-            at.refuse("stride_seconds", f"must divide the window of {self.window_seconds:g} s")
+            at.below("stride_seconds").refuse(
+                f"must divide the window of {self.window_seconds:g} s"
+            )
         if self.context % self.stride:
-            at.refuse("stride_seconds", f"must divide the context of {self.context_seconds:g} s")
+            at.below("stride_seconds").refuse(
+                f"must divide the context of {self.context_seconds:g} s"
+            )
 
 
 @dataclass(frozen=True)
@@ -179,7 +183,9 @@ class AugmentConfig:
     def check(self, at: Place) -> None:
         """The lowest cut-off is no higher than the highest."""
         if self.low_pass_hertz[0] > self.low_pass_hertz[1]:
-            at.refuse("low_pass_hertz", "begins above its end", "give the lower frequency first")
+            at.below("low_pass_hertz").refuse(
+                "begins above its end", "give the lower frequency first"
+            )
 
 
 @dataclass(frozen=True)
@@ -451,21 +457,21 @@ class TrainConfig:
         and its context. A network that predicts every sample takes no context."""
         names, weights = self.datasets, self.data.weights
         if len(set(names)) < len(names) or not names:
-            at.refuse("dataset", "names none, or one of them twice", "name each once")
+            at.below("dataset").refuse("names none, or one of them twice", "name each once")
         if len(names) > 1 and self.data_root is not None:
             problem = f"is the folder of one dataset, and there are {len(names)}"
             remedy = "leave it out and set $GNIO_DATA to the folder that holds theirs"
-            at.refuse("data_root", problem, remedy)
+            at.below("data_root").refuse(problem, remedy)
         if weights and len(weights) != len(names):
             problem = f"has {len(weights)} values for {len(names)} datasets"
-            at.refuse("data.weights", problem, "give one for each, or none")
+            at.below("data.weights").refuse(problem, "give one for each, or none")
         if self.data.context and self.model.name == "ctin":
             remedy = "it predicts every sample it sees: set it to 0"
-            at.refuse("data.context_seconds", "is not for ctin", remedy)
+            at.below("data.context_seconds").refuse("is not for ctin", remedy)
         if self.model.equivariance == "four_headings" and not self.augment.yaw:
             problem = "is four_headings without augment.yaw"
             remedy = "training must show every heading: set augment.yaw to true"
-            at.refuse("model.equivariance", problem, remedy)
+            at.below("model.equivariance").refuse(problem, remedy)
         self._check_through_filter(at)
 
     def _check_through_filter(self, at: Place) -> None:
@@ -474,14 +480,14 @@ class TrainConfig:
             return
         if not _is_whole(through.piece_seconds / self.data.stride_seconds):
             problem = f"is not a whole number of strides of {self.data.stride_seconds:g} s"
-            at.refuse("through_filter.piece_seconds", problem)
+            at.below("through_filter.piece_seconds").refuse(problem)
         if through.piece_seconds < SHORTEST_HORIZON:
             problem = f"must be at least {SHORTEST_HORIZON:g} s, the shortest horizon of its losses"
-            at.refuse("through_filter.piece_seconds", problem)
+            at.below("through_filter.piece_seconds").refuse(problem)
         if self.filter.mahalanobis_fail_scale > 0:
             problem = "makes no sense beside the soft gate of training through the filter"
-            at.refuse("filter.mahalanobis_fail_scale", problem, "set it to 0")
+            at.below("filter.mahalanobis_fail_scale").refuse(problem, "set it to 0")
         seen = self.data.context_seconds + self.data.window_seconds
         if through.piece_seconds < seen + 2 * self.data.stride_seconds:
             problem = f"must be longer than the {seen:g} s that the network sees"
-            at.refuse("through_filter.piece_seconds", problem)
+            at.below("through_filter.piece_seconds").refuse(problem)

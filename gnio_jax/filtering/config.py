@@ -98,7 +98,7 @@ class FilterConfig:
             object.__setattr__(self, name, checked_value(hint, value, Place("FilterConfig", name)))
         if self.gate_softness and self.mahalanobis_fail_scale:
             problem = "makes no sense beside mahalanobis_fail_scale"
-            Place("FilterConfig").refuse("gate_softness", problem, "set one of them to 0")
+            Place("FilterConfig", "gate_softness").refuse(problem, "set one of them to 0")
 
     @property
     def window(self) -> int:
