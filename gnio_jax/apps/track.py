@@ -131,7 +131,8 @@ def track(
     _check_bridged(sequence)
     config, ekf = weights.run.config, tracking_filter(weights.run)
     how = {"init": "static", "gyro_bias": "rest", "from_first": True}
-    ready, left_out = prepare([sequence], config.data, ekf.initial_std, **how)
+    raw = ekf.raw_gyro_bias
+    ready, left_out = prepare([sequence], config.data, ekf.initial_std, raw_gyro_bias=raw, **how)
     if not ready:
         raise InputError(sequence.name, left_out[sequence.name], "record for longer")
     network = Network.of(weights.run.model, weights.run.variables)

@@ -116,7 +116,9 @@ def gather(
             where = f"{where}, fold {source.fold.number}"
             recordings = [each for some in loaded for each in source.fold.select(some)]
         with_reference = [each for each in recordings if each.valid.any()]
-        prepared, _ = prepare(with_reference, trained, settings.start)
+        prepared, _ = prepare(
+            with_reference, trained, settings.start, raw_gyro_bias=settings.raw_gyro_bias
+        )
         if not prepared:
             problem = "has no recording with a reference that is long enough to be fitted"
             raise InputError(where, problem)

@@ -249,7 +249,10 @@ def _repeated(
 ) -> tuple[Callable[[FilterState, Array], FilterHistory], FilterState, Array]:
     """The run over one walk without the network, from a start and the displacements; its start and
     its displacements."""
-    state = initial_state(config, *walk.start[:-1], std=settings.start)
+    # Of a raw gyro the walk's own start is the wider one.
+    std = settings.start
+    std = std._replace(gyro_bias=jnp.maximum(std.gyro_bias, walk.start.std.gyro_bias))
+    state = initial_state(config, *walk.start[:-1], std=std)
     assert walk.given is not None
     covariance = jax.vmap(jnp.diag)(walk.given.std**2)
     fixed = config, settings.noise, walk.imu_valid, config.displacement_frame

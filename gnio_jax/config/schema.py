@@ -176,7 +176,8 @@ class AugmentConfig:
     """Share of the windows of which both sensors pass a random low-pass, drawn anew for every
     window: a phone's bandwidth must not tell the network whose walk it sees (ours, e.g. 0.5)."""
     low_pass_hertz: Annotated[tuple[Positive, Positive], FILE_ONLY] = (4.0, 25.0)
-    """Lowest and highest cut-off of that low-pass, a Butterworth of order 1 to 3, Hz."""
+    """Lowest and highest cut-off of that low-pass, a Butterworth of order 1 to 3 that is passed
+    forward and back, Hz."""
     scale: Annotated[tuple[Probability, Probability], FILE_ONLY] = (0.0, 0.0)
     """Half-widths of a window's uniform scale errors of gyro and accelerometer (ours)."""
 
@@ -373,6 +374,9 @@ class FilterSettings:
     """Noise of the IMU and of the network's displacements."""
     start: InitialStd = TLIO_STD
     """Standard deviations of the initial state."""
+    raw_gyro_bias: NonNegative | None = None
+    """Standard deviation of the gyro's first bias where its phone takes none off, rad/s: the
+    recording then says `imu_compensated: no` (ours). By default that of `start` for every IMU."""
     considered: ConsideredStd = field(default_factory=ConsideredStd)
     """Errors in the covariance that are not estimated (Schmidt's consider states)."""
     mahalanobis_fail_scale: NonNegative = 0.0

@@ -170,8 +170,8 @@ def low_pass(key: PRNGKeyArray, windows: Windows, config: AugmentConfig, rate: f
     """Windows without the margins of `low_pass_margin`, a random share of them low-passed (ours).
 
     What the filter of a phone leaves of the spectrum must not tell the network which dataset it
-    looks at. Accelerometer and gyro pass the same Butterworth magnitude
-    |H(f)| = 1/√(1 + (f/f_c)^2n), of order n from 1 to 3 and cut-off f_c uniform in its logarithm,
+    looks at. Accelerometer and gyro pass the same Butterworth filter forward and back,
+    |H(f)|² = 1/(1 + (f/f_c)^2n), of order n from 1 to 3 and cut-off f_c uniform in its logarithm,
     drawn anew for every window. Its phase is zero although a phone's filter is causal: readers
     align the clocks of IMU and reference by their motion, which takes out a constant delay, and a
     delay of the IMU alone would set the window against its displacement. The samples are those of
@@ -190,7 +190,7 @@ def low_pass(key: PRNGKeyArray, windows: Windows, config: AugmentConfig, rate: f
     cutoff = jnp.exp(_uniform(cutoff_key, (count,), low, high))
     frequency = np.fft.rfftfreq(length, 1 / rate).astype(np.float32)
     power = (frequency[None] / cutoff[:, None]) ** (2 * order[:, None])
-    spectrum = jnp.fft.rfft(imu, axis=1) * jax.lax.rsqrt(1 + power)[:, :, None]
+    spectrum = jnp.fft.rfft(imu, axis=1) / (1 + power)[:, :, None]
     smooth = jnp.fft.irfft(spectrum, length, axis=1)
     imu = jnp.where(chosen[:, None, None], smooth, imu)
     return windows._replace(imu=imu[:, margin:-margin])

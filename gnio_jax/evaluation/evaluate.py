@@ -92,6 +92,7 @@ def evaluate(
         init=config.init,
         gyro_bias=config.gyro_bias,
         orientation=config.orientation if _infers(config) else None,
+        raw_gyro_bias=ekf.raw_gyro_bias,
     )
     if not recordings:
         name, reason = next(iter(left_out.items()))

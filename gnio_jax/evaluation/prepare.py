@@ -101,15 +101,18 @@ def prepare(
     gyro_bias: BiasSource = "zero",
     orientation: Orientation | None = None,
     from_first: bool = False,
+    raw_gyro_bias: float | None = None,
 ) -> tuple[list[Recording], dict[str, str]]:
     """Recordings to estimate, and the names of the sequences that are left out with the reason.
 
     A recording begins at the first sample with a trusted reference; with `from_first`, and where
     there is no reference, at its first sample. `std` is the filter's initial uncertainty, of which
     a static start replaces tilt and velocity by what it finds. A sequence with waypoints has no
-    pose to start from, and its start is static whatever `init` is. `orientation` is the source of
-    `Recording.attitude`; None makes none. Raises `InputError` for a sequence that lacks what these
-    choices need.
+    pose to start from, and its start is static whatever `init` is. `raw_gyro_bias` takes the place
+    of the standard deviation of the gyro's bias where neither the phone nor a rest gives a first
+    estimate of it: where `imu_compensated` is "no" and the bias starts from zero. `orientation`
+    is the source of `Recording.attitude`; None makes none. Raises `InputError` for a sequence that
+    lacks what these choices need.
     """
     recordings, left_out = [], {}
     for sequence in sequences:
@@ -128,8 +131,11 @@ def prepare(
             continue
         bias, bias_note = _gyro_bias(whole, measured, windows.rate, gyro_bias)
         tapped = whole.waypoints is not None
-        own_init = "static" if tapped else init
-        start, start_note = _start(whole, measured, windows, bias, std, own_init)
+        own_init, own_std = "static" if tapped else init, std
+        raw = sequence.attributes.get("imu_compensated") == "no" and not bias.any()
+        if raw and raw_gyro_bias is not None:
+            own_std = std._replace(gyro_bias=raw_gyro_bias)
+        start, start_note = _start(whole, measured, windows, bias, own_std, own_init)
         reference_note = OF_WAYPOINTS if tapped else ""
         trusted = whole.valid[:, None]
         poses = [np.where(trusted, part, np.nan) for part in (whole.position, whole.orientation)]

@@ -16,7 +16,7 @@ from gnio_jax.filtering.config import FilterConfig
 jax.tree_util.register_dataclass(
     FilterSettings,
     data_fields=["noise", "start", "considered"],
-    meta_fields=["mahalanobis_fail_scale", "window_rotation"],
+    meta_fields=["raw_gyro_bias", "mahalanobis_fail_scale", "window_rotation"],
 )
 
 SHARE = "noise.correlation.share"
@@ -33,13 +33,15 @@ class FilterSetup(NamedTuple):
     initial_std: InitialStd
     considered: ConsideredStd | None = None
     """Of errors that the filter does not estimate; None: there are none."""
+    raw_gyro_bias: float | None = None
+    """Standard deviation of the first bias of a gyro whose phone takes none off, rad/s."""
 
 
 def filter_setup(windows: DataConfig, settings: FilterSettings) -> FilterSetup:
     """The filter for the windows and strides that a network was trained with."""
     considered = settings.considered if any(settings.considered) else None
     config = filter_config(windows, settings)
-    return FilterSetup(config, settings.noise, settings.start, considered)
+    return FilterSetup(config, settings.noise, settings.start, considered, settings.raw_gyro_bias)
 
 
 def filter_config(windows: DataConfig, settings: FilterSettings) -> FilterConfig:

@@ -74,6 +74,22 @@ def test_short_sequences_are_left_out_by_name(walks):
     assert left_out == {"short": f"{problem}, too short for a window and a stride"}
 
 
+@pytest.mark.parametrize("compensated", ["no", "Android's gyro bias"])
+def test_a_raw_gyro_starts_with_a_wider_bias(walks, swaying, compensated):
+    """Not where the phone takes a bias off, nor where a rest has shown it."""
+    attributes = {"imu_compensated": compensated}
+    walk = walks[0]._replace(attributes=attributes)
+    (recording,) = ready([walk], raw_gyro_bias=0.05)
+    own = evaluation.prepare([walk], CONFIG)[0][0].start.std.gyro_bias
+    expected = 0.05 if compensated == "no" else own
+    assert recording.start.std.gyro_bias == expected and own < 0.01
+    resting = swaying._replace(gyro=swaying.gyro.copy(), attributes=attributes)
+    resting.gyro[:120] = [0.01, -0.02, 0.005]
+    resting.accel[:120] = swaying.accel[:120].mean(0)
+    (recording,) = ready([resting], gyro_bias="rest", raw_gyro_bias=0.05)
+    assert recording.start.std.gyro_bias == own
+
+
 def test_other_rates_are_resampled():
     walk = simulated.pedestrian(1, 1, "handheld", 6.0, 200.0)
     (recording,) = ready([walk])

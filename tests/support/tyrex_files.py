@@ -22,7 +22,9 @@ HANDLE = Rotation.from_euler("xyz", [1.5, -2.0, 1.0], degrees=True)
 LEVER = np.array([0.01, -0.06, -0.008])
 """From the handle's origin to the phone's IMU, in the handle, m."""
 BIAS = np.array([0.06, -0.02, 0.01])
-"""Of the raw gyro, rad/s."""
+"""Of the gyro as it is read, rad/s."""
+SYSTEM_BIAS = np.array([0.012, -0.005, 0.07])
+"""What Android takes off a gyro's raw rate besides, rad/s."""
 LOST = slice(300, 309)
 """Frames in which the handle was not seen."""
 
@@ -45,9 +47,9 @@ def write_phone(folder: Path, seconds: float) -> None:
         return
     (folder / "record.properties").write_text("[Device]\nModel = Nexus 5\nStartTime = 1464965086")
     felt, turned = np.arange(0.36, seconds, 1 / 200.0), np.arange(0.41, seconds, 1 / 200.0)
-    style, bias = " ".join(["%.9f"] * 4), np.tile([0.012, -0.005, 0.07], (len(turned), 1))
-    _write(folder / "accelerometer.txt", [felt, walk.force(felt)], style)
-    gyro = [turned, walk.rate(turned) + BIAS, bias]
+    bias = np.tile(SYSTEM_BIAS, (len(turned), 1))
+    _write(folder / "accelerometer.txt", [felt, walk.force(felt)], " ".join(["%.9f"] * 4))
+    gyro = [turned, walk.rate(turned) + BIAS + bias, bias]
     _write(folder / "gyroscope.txt", gyro, " ".join(["%.9f"] * 7))
 
 

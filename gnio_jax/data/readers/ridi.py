@@ -135,7 +135,7 @@ def read(folder: str | os.PathLike[str]) -> list[Sequence]:
         "device": "Android phone" if arcore and not table else "Tango phone",
         "placement": _PLACEMENTS[words[0]] if words else "unknown",
         "truth": f"{'ARCore' if arcore and not table else 'Tango'} VIO of the phone itself",
-        "imu_compensated": "no",
+        "imu_compensated": "Android's gyro bias" if arcore and not table else "no",
         "licence": DATASET.licence,
     }
     pieces = assemble(

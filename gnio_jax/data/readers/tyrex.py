@@ -7,7 +7,8 @@ Layout: `datasets/{android,ios}/<Person>_<Device>_<Dist|NoDist>_<Way>/` with `ac
 `datasets/qualisys/<same name>.mat` (MATLAB 5). `Dist` walks pass magnets, which no IMU minds.
 
 - Nexus 5: stamps in s of the record, both sensors at 200 Hz, the accelerometer in m/s² with
-  Android's sign; the gyro's file has the system's estimate of the bias beside the raw rate.
+  Android's sign; the gyro's file has the system's estimate of the bias beside the raw rate. It is
+  taken off, as for any program that asks Android for a gyro.
 - iPhone 4S and 5: stamps in s since the phone was booted, the record begins at `BootTime`; each
   sensor at a rate of its own (90 to 107 Hz); the accelerometer in G with Apple's sign.
 - Qualisys: 60 Hz, mm, rotations body → world column by column, NaN where the body was lost. Its
@@ -174,7 +175,7 @@ def read(folder: str | os.PathLike[str]) -> list[Sequence]:
         "placement": WAYS.get(walk.way, walk.way),
         "gait": "running" if walk.way.startswith("Running") else "walking",
         "truth": "Qualisys",
-        "imu_compensated": "no",
+        "imu_compensated": "no" if walk.device.startswith("iPhone") else "Android's gyro bias",
         "licence": DATASET.licence,
         "accel_clipped": clipped(phone.accel.values),
         "lag": float(np.mean(fit.lag)),
@@ -220,6 +221,8 @@ def read_phone(walk: Walk) -> Streams:
         path = walk.folder / name
         table = read_text(path, separator=" ", header=False, widths=widths)
         stamps, values = table.take(0), table.take(1, 2, 3)
+        if 7 in widths:
+            values = values - table.take(4, 5, 6)
         rows = distinct(stamps, path)
         time = stamps[rows] - start
         remedy = "cut the rows of other times, or check that all files are of one phone"

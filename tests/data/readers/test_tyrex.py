@@ -53,7 +53,8 @@ def test_names_say_who_carried_what_and_how(tmp_path):
     ):
         assert about.items() <= sequence.attributes.items()
         assert sequence.attributes["group"] == about["subject"]
-        assert sequence.attributes["imu_compensated"] == "no"
+    assert texting.attributes["imu_compensated"] == "Android's gyro bias"
+    assert running.attributes["imu_compensated"] == "no"
     assert texting.attributes["placement"] == "texting"
     assert running.attributes["placement"] == "running, in the hand"
 
