@@ -16,6 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Complex, Float
+from scipy.interpolate import PchipInterpolator
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
@@ -90,13 +91,11 @@ def with_poses(sequence: Sequence) -> Sequence:
 
     Raises `Refusal` where that is above `MOST_RESIDUAL`, or too little of the walk is left.
     """
-    tapped = sequence.waypoints
-    assert tapped is not None
+    waypoints = sequence.waypoints
+    assert waypoints is not None
     time, step = sequence.time, float(np.median(np.diff(sequence.time)))
     level = levelled(sequence.gyro, sequence.accel, step)
-    walk = reckoned(level, sequence.accel, time)
-    waypoints = settled(walk, tapped)
-    legs = legs_on(walk, waypoints)
+    legs = legs_on(reckoned(level, sequence.accel, time), waypoints)
     if legs.fits.sum() < FEWEST_LEGS:
         problem = f"somebody walked {legs.fits.sum()} of its {len(legs.fits)} legs with the phone"
         raise Refusal(sequence.name, f"{problem} ahead, at least {FEWEST_LEGS} are needed")
@@ -110,19 +109,17 @@ def with_poses(sequence: Sequence) -> Sequence:
     starts, stops = spans(valid).T
     if (stops - starts).max(initial=0) * step < SHORTEST_SECONDS:
         raise Refusal(sequence.name, f"no {SHORTEST_SECONDS:g} s of it lie on a leg")
-    start = _plane(waypoints.position)[:-1] - legs.ratio * walk.at(waypoints.time, walk.way)[:-1]
-    place, velocity = start[leg] + legs.ratio[leg] * walk.way, legs.ratio[leg] * walk.velocity
+    course = PchipInterpolator(waypoints.time, waypoints.position, extrapolate=True)
+    place, velocity = (np.pad(course(time, order), ((0, 0), (0, 1))) for order in (0, 1))
     known = valid[:, None]
     orientation = quaternions(about_z(np.full(len(time), legs.yaw)) * level)
-    moved = float(np.sqrt(np.mean((waypoints.time - tapped.time) ** 2)))
-    about = {"yaw_residual_degrees": legs.residual, "taps_moved_seconds": moved}
     return sequence._replace(
         orientation=np.where(known, orientation, np.nan),
-        position=np.where(known, _space(place), np.nan),
-        velocity=np.where(known, _space(velocity), np.nan),
+        position=np.where(known, place, np.nan),
+        velocity=np.where(known, velocity, np.nan),
         valid=valid,
         waypoints=None,
-        attributes=sequence.attributes | about,
+        attributes=sequence.attributes | {"yaw_residual_degrees": legs.residual},
     )
 
 
@@ -184,35 +181,6 @@ def legs_on(walk: Walk, waypoints: Waypoints) -> Legs:
     return Legs(ratio, fits, yaw, residual)
 
 
-def settled(walk: Walk, waypoints: Waypoints) -> Waypoints:
-    """The waypoints when the walker passed them, rather than when they were tapped.
-
-    Whoever taps late makes one leg long and the next one short. Taps move by as much as lets one
-    scale and one turn explain the walk's legs best, by robust least squares; `TAP_STD` holds them.
-    Those of a walk whose legs do not fit stay.
-    """
-    from scipy.optimize import least_squares  # it takes a fifth of a second to import
-
-    legs, (stamps, position) = legs_on(walk, waypoints), waypoints
-    if legs.fits.sum() < FEWEST_LEGS:
-        return waypoints
-    chord, first, last = np.diff(_plane(position)), walk.time[0], walk.time[-1]
-    std = LEG_STD[0] + LEG_STD[1] * np.abs(chord)
-
-    def errors(unknowns: np.ndarray) -> np.ndarray:
-        """Of the legs that fit, and of the taps, in standard deviations."""
-        (log_scale, turn), moved = unknowns[:2], unknowns[2:]
-        passed = walk.at(np.clip(stamps + moved, first, last), walk.way)
-        off = (chord - np.exp(log_scale + 1j * turn) * np.diff(passed)) / std
-        return np.concatenate([off.real[legs.fits], off.imag[legs.fits], moved / TAP_STD])
-
-    scale = float(np.median(np.abs(legs.ratio[legs.fits])))
-    guess = np.concatenate([[np.log(scale), legs.yaw], np.zeros(len(stamps))])
-    found = least_squares(errors, guess, loss="soft_l1", max_nfev=30).x
-    time = np.clip(stamps + found[2:], first, last)
-    return Waypoints(time, position) if (np.diff(time) > 0).all() else waypoints
-
-
 def _speed(vertical: Float[np.ndarray, " n"], step: float) -> Float[np.ndarray, " n"]:
     """Speed over the walk's usual one, by the bounce of the vertical specific force (m/s²): an
     inverted pendulum's grows with the square of the speed."""
@@ -231,10 +199,6 @@ def _integral(values: np.ndarray, step: float) -> np.ndarray:
 
 def _plane(values: Float[np.ndarray, "n w"]) -> Complex[np.ndarray, " n"]:
     return values[:, 0] + 1j * values[:, 1]
-
-
-def _space(values: Complex[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
-    return np.stack([values.real, values.imag, np.zeros(len(values))], axis=1)
 
 
 def _wrapped(angle: np.ndarray) -> np.ndarray:
