@@ -10,7 +10,7 @@ runs=${1:-runs}
 gnio train --config pedestrian --workdir "$runs/pedestrian" --resume
 for half in 0 1; do
   gnio train --config pedestrian --data.train-split "all-${half}of2" \
-    --workdir "$runs/pedestrian_half$half" --resume
+    --workdir "$runs/pedestrian_half$half" --optim.epochs 4 --resume
 done
 gnio calibrate --workdir "$runs/pedestrian" --out "$runs/pedestrian_calibrated" \
   --out-of-fold "$runs/pedestrian_half0" "$runs/pedestrian_half1"

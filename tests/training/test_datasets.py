@@ -109,7 +109,7 @@ def test_each_dataset_is_validated_on_all_of_its_own_windows(finished, monkeypat
         (walk,) = data.load("tlio", split="val")
         walk = data.resample(walk._replace(position=factor * walk.position), 50.0)
         source = windows.window_source([walk], config.data, config.data.stride)
-        every = windows.gather(jax.device_put(source), np.arange(len(source.start)), 50)
+        every = windows.gather(jax.device_put(source), jax.numpy.arange(len(source.start)), 50)
         said = training.model.apply(state.variables, every.imu).displacement
         mse = np.mean(np.sum((np.asarray(said, float) - every.displacement) ** 2, axis=1))
         assert row[f"val_mse/{name}"] == pytest.approx(mse, rel=1e-4)
