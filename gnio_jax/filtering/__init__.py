@@ -18,6 +18,7 @@ from gnio_jax.filtering.start import initial_state, level_state
 from gnio_jax.filtering.state import FilterState, GateState
 from gnio_jax.filtering.tracker import Pose, Tracker
 from gnio_jax.filtering.update import Linearised, Outcome, Step, linearise, measure
+from gnio_jax.filtering.waypoints import WaypointPoses, waypoint_poses
 
 __all__ = [
     "ConsideredStd",
@@ -37,6 +38,7 @@ __all__ = [
     "SmoothedHistory",
     "Step",
     "Tracker",
+    "WaypointPoses",
     "considered_covariance",
     "cores_as_devices",
     "displacements",
@@ -51,4 +53,5 @@ __all__ = [
     "run_odometry",
     "sensitivity",
     "smooth",
+    "waypoint_poses",
 ]

@@ -24,7 +24,7 @@ from gnio_jax.filtering.update import Correction, Outcome, Step, linearise, meas
 from gnio_jax.types import Array
 
 THRESHOLDS = {2: 9.210, 3: 11.345}
-"""Largest rᵀ S⁻¹ r that passes: 99 % of χ² with 2 and with 3 degrees of freedom."""
+"""99 % of χ² with 2 and with 3 degrees of freedom."""
 
 
 class Fix(NamedTuple):
@@ -40,11 +40,13 @@ class Fix(NamedTuple):
     Finite also where there is no fix."""
     time_std: Float[Array, "*k"]
     """σ_t, s. Finite also where there is no fix."""
+    threshold: Float[Array, "*k"]
+    """Largest rᵀ S⁻¹ r that passes; inf: every fix does."""
 
     def update(self, state: FilterState, step: Step) -> tuple[FilterState, Outcome, Correction]:
-        """Refused where it fails the χ² test of 99 % against what the filter expects. So a fix that
-        jumps by a kilometre changes nothing; neither does a good one where the covariance of the
-        filter is much too small."""
+        """Refused where it fails the χ² test against what the filter expects. So a fix that jumps
+        by a kilometre changes nothing; neither does a good one where the covariance of the filter
+        is much too small."""
         axes = self.position.shape[0]
         by_position = np.eye(3)[:axes]
         velocity = state.velocity[:axes]
@@ -57,7 +59,7 @@ class Fix(NamedTuple):
             position=by_position,
             velocity=-self.before_end * by_position,
         )
-        return measure(state, linear, step, THRESHOLDS[axes])
+        return measure(state, linear, step, self.threshold)
 
 
 def fixes_on_intervals(
@@ -67,16 +69,17 @@ def fixes_on_intervals(
     intervals: int,
     config: FilterConfig,
     start: float = 0.0,
-    time_std: float = 0.0,
+    time_std: Any = 0.0,
+    threshold: float | None = None,
 ) -> Fix:
     """f fixes in any order, each in the row of the clone interval whose end is nearest.
 
     time (f,) s, on the clock on which `start` is the stamp of the first IMU sample; position (f, m)
-    m in the world frame, m = 2 or 3; covariance (f, m, m) m²; intervals K; time_std s, of all of
-    them. A fix whose position has a NaN is none. Several in one row become their mean, weighted by
-    the inverse traces of their covariances, with the covariance that this has. Raises `InputError`
-    for another shape, for a covariance that is not symmetric and positive definite, and for a fix
-    outside of the recording.
+    m in the world frame, m = 2 or 3; covariance (f, m, m) m²; intervals K; time_std s, one or (f,);
+    threshold of the χ² test, by default 99 %. A fix whose position has a NaN is none. Several in
+    one row become their mean, weighted by the inverse traces of their covariances, with the
+    covariance that this has. Raises `InputError` for another shape, for a covariance that is not
+    symmetric and positive definite, for a time_std below 0, and for a fix outside of the recording.
     """
     time, position, covariance = (np.asarray(x, np.float64) for x in (time, position, covariance))
     count, axes = position.shape if position.ndim == 2 else (-1, 0)
@@ -85,6 +88,7 @@ def fixes_on_intervals(
         problem = "time, position and covariance must be (f,), (f, m) and (f, m, m), m = 2 or 3"
         raise InputError("fixes", f"{problem}, {found}")
     there = np.isfinite(position).all(1)
+    late = np.broadcast_to(time_std, time.shape)[there]
     time, position, covariance = time[there], position[there], covariance[there]
     end = intervals * config.clone_seconds
     after = time - start
@@ -92,6 +96,8 @@ def fixes_on_intervals(
         problem = f"{len(outside)} of {count} are outside of the recording, one at {outside[0]:g} s"
         remedy = f"it lasts from {start:g} to {start + end:g} s: are both on one clock?"
         raise InputError("fixes", problem, remedy)
+    if not (late >= 0).all():
+        raise InputError("fixes", "time_std must be at least 0")
     symmetric = np.isclose(covariance, covariance.transpose(0, 2, 1), rtol=1e-6, atol=0).all((1, 2))
     if not symmetric.all() or (np.linalg.eigvalsh(covariance) <= 0).any():
         raise InputError("fixes", "a covariance is not symmetric and positive definite")
@@ -103,12 +109,12 @@ def fixes_on_intervals(
     laid = Fix(
         position=np.zeros((intervals, axes)),
         covariance=np.zeros((intervals, axes, axes)),
-        before_end=np.zeros(intervals),
-        time_std=np.full(intervals, time_std),
+        before_end=np.bincount(row, weight * before_end, intervals),
+        time_std=np.sqrt(np.bincount(row, (weight * late) ** 2, intervals)),
+        threshold=np.full(intervals, THRESHOLDS[axes] if threshold is None else threshold),
     )
     np.add.at(laid.position, row, weight[:, None] * position)
     np.add.at(laid.covariance, row, (weight**2)[:, None, None] * covariance)
-    np.add.at(laid.before_end, row, weight * before_end)
     empty = np.bincount(row, minlength=intervals) == 0
     laid.position[empty], laid.covariance[empty] = np.nan, np.eye(axes)
     return laid

@@ -180,7 +180,7 @@ def since_oldest(state: FilterState, oldest: Array | int) -> Float[Array, "3"]:
 
 
 def measure(
-    state: FilterState, linear: Linearised, step: Step, threshold: float = math.inf
+    state: FilterState, linear: Linearised, step: Step, threshold: Array | float = math.inf
 ) -> tuple[FilterState, Outcome, Correction]:
     """One EKF update. A residual or covariance with a NaN is no measurement, and one whose
     rᵀ S⁻¹ r is above `threshold` is refused (e.g. a quantile of χ² with m degrees of freedom)."""

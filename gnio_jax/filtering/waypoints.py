@@ -1,0 +1,225 @@
+"""A walk with waypoints as one with poses (ours): filter and smoother make a reference of positions
+that are known at a few moments, e.g. because somebody tapped on a map where he was.
+
+The world of the filter is level, and its yaw is 0 at the start; how it lies on the map is not
+known. So the filter runs without the waypoints first, and the rotation and shift that lay its path
+over them (`geometry.planar_alignment`) turn its start. From there, with an uncertain yaw and
+position, the smoother takes the waypoints and the displacements of the first run. Somebody may tap
+too early, too late or in the wrong place: a waypoint far off the smoothed path gets a larger
+covariance, as Student's t with `FREEDOM` degrees of freedom weighs it, and it is smoothed again
+from the start that was found.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from gnio_jax import geometry
+from gnio_jax.config import CorrelatedError
+from gnio_jax.errors import InputError
+from gnio_jax.filtering.batch import padded_masks, padded_signals
+from gnio_jax.filtering.config import FilterConfig
+from gnio_jax.filtering.fix import fixes_on_intervals
+from gnio_jax.filtering.network import Predict
+from gnio_jax.filtering.scan import run_odometry
+from gnio_jax.filtering.settings import FilterSetup
+from gnio_jax.filtering.smoother import SmoothedHistory, smooth
+from gnio_jax.filtering.start import initial_state, level_state
+from gnio_jax.filtering.state import Mean
+from gnio_jax.numerics import interpolate, quaternion_from_matrix, rotation_z
+from gnio_jax.types import GRAVITY, Array, Sequence
+
+PLACE_STD, TIME_STD = 0.3, 0.4
+"""Standard deviations of where, m, and of when, s, somebody taps."""
+START_STD = {"tilt": 0.1, "yaw": 0.5, "velocity": 1.0, "position": 10.0, "gyro_bias": 2e-3}
+"""Of the start that was turned: rad, rad, m/s, m, rad/s."""
+CORRELATION = CorrelatedError(share=0.95, seconds=5.0)
+"""Of the displacements' errors: a network takes a walker for too fast or too slow leg by leg. Their
+standard deviation is that by which the first path misses the legs, beside the network's own."""
+FREEDOM, PASSES = 4.0, 4
+"""Of the weights, and how often the path is smoothed."""
+START_SECONDS = 1.0
+"""s from which the level start is made."""
+LONGER = 2.0
+"""Recordings are filled up to lengths this factor apart, since each length is a compilation."""
+
+
+class WaypointPoses(NamedTuple):
+    """A walk with its poses, and what is known of them."""
+
+    sequence: Sequence
+    """With a pose and a velocity at every sample in the frame of the map, z from the start; valid
+    from the first waypoint to the last, and without waypoints."""
+    smoothed: SmoothedHistory
+    """The same at the end of every clone interval, with covariances."""
+    weight: Float[np.ndarray, "f"]
+    """Of each waypoint: above 1 where it is on the path, towards 0 where it is far off."""
+
+
+def waypoint_poses(
+    sequence: Sequence,
+    predict: Predict,
+    setup: FilterSetup,
+    place_std: float = PLACE_STD,
+    time_std: float = TIME_STD,
+) -> WaypointPoses:
+    """Poses of a walk with waypoints.
+
+    predict: the displacements, as in `run_odometry`; setup: the filter, at the rate of `sequence`;
+    place_std m, time_std s: the standard deviations of a waypoint. Programs are compiled for each
+    `predict` and for a few lengths. Raises `InputError` for a sequence of another rate, shorter
+    than `START_SECONDS`, or with fewer than two waypoints or one outside, and where the filter
+    fails.
+    """
+    config, noise, waypoints = setup.config, setup.noise, sequence.waypoints
+    if waypoints is None or len(waypoints.time) < 2:
+        raise InputError(sequence.name, "has fewer than two waypoints")
+    first, step = round(START_SECONDS / config.dt), float(np.median(np.diff(sequence.time)))
+    if len(sequence.time) < first or abs(step / config.dt - 1) > 1e-3:
+        found = f"has {len(sequence.time)} samples at {1 / step:.4g} Hz"
+        problem = f"{found}, at least {first} at {1 / config.dt:.4g} Hz are needed"
+        raise InputError(sequence.name, problem, "resample it")
+    if waypoints.time[0] < sequence.time[0] or waypoints.time[-1] > sequence.time[-1]:
+        raise InputError(sequence.name, "has waypoints before its start or after its end")
+    count = -(-len(sequence.time) // config.samples_per_clone)
+    padded = math.ceil(LONGER ** math.ceil(math.log(count, LONGER)))
+    samples = padded * config.samples_per_clone
+    gyro, accel = (x[0] for x in padded_signals([(sequence.gyro, sequence.accel)], samples))
+    masks = padded_masks([sequence.imu_valid], samples)
+    signals, valid = (gyro, accel), None if masks is None else masks[0]
+
+    level = level_state(config, gyro[:first], accel[:first], setup.initial_std)
+    _, history = _odometry(predict, level, *signals, config, noise, valid)
+    displacement, covariance = history.given(noise)
+    displacement = jnp.where(jnp.arange(padded)[:, None] < count, displacement, jnp.nan)
+
+    after, place = waypoints.time - sequence.time[0], waypoints.position
+    at_taps = functools.partial(interpolate, after, config.clone_seconds * np.arange(1, padded + 1))
+    turn, shift, weight, missed = _aligned(
+        at_taps(np.asarray(history.position)[:, :2]), place, after, place_std
+    )
+    covariance = covariance + missed**2 * jnp.eye(3)[None]
+    noise = noise._replace(
+        measurement_scale=1.0, std_factor=(1.0, 1.0, 1.0), correlation=CORRELATION
+    )
+    given = displacement, covariance, config, noise, valid, config.displacement_frame
+    std = setup.initial_std._replace(**START_STD)
+    yaw, origin = np.arctan2(turn[1, 0], turn[0, 0]), shift
+    for _ in range(PASSES):
+        rotation, position = rotation_z(yaw) @ level.rotation, np.append(origin, 0.0)
+        start = initial_state(config, rotation, np.zeros(3), position, level.gyro_bias, std=std)
+        spread = (place_std**2 / weight)[:, None, None] * np.eye(2)
+        late = time_std / np.sqrt(weight)
+        fixes = fixes_on_intervals(
+            after, place, spread, padded, config, time_std=late, threshold=math.inf
+        )
+        smoothed = _smooth(start, *signals, *given, (fixes,))
+        off = place - at_taps(np.asarray(smoothed.position)[:, :2])
+        late = time_std * at_taps(np.asarray(smoothed.velocity)[:, :2])
+        spread = place_std**2 * np.eye(2) + late[:, :, None] * late[:, None]
+        squares = np.einsum("fi,fij,fj->f", off, np.linalg.inv(spread), off)
+        if not np.isfinite(squares).all():
+            raise InputError(sequence.name, "the filter fails on it")
+        weight = (FREEDOM + 2) / (FREEDOM + squares)
+        poses = jax.device_get(_between_clones(smoothed, *signals, config=config))
+        rotation, velocity, position = (each[: len(sequence.time)] for each in poses)
+        turn = rotation[0] @ np.asarray(level.rotation).T
+        yaw = np.arctan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1])
+        origin = position[0, :2]
+    inside = (sequence.time >= waypoints.time[0]) & (sequence.time <= waypoints.time[-1])
+    smoothed = jax.tree.map(lambda rows: np.asarray(rows)[:count], smoothed)
+    poses = sequence._replace(
+        orientation=quaternion_from_matrix(rotation),
+        position=position,
+        velocity=velocity,
+        valid=inside,
+        waypoints=None,
+        attributes=sequence.attributes | {"reference": "waypoints, smoothed"},
+    )
+    return WaypointPoses(poses, smoothed, weight)
+
+
+_odometry = jax.jit(run_odometry, static_argnames=("predict", "config"))
+_smooth = jax.jit(smooth, static_argnames=("config", "frame"))
+_planar_alignment = jax.jit(geometry.planar_alignment)
+
+
+def _aligned(
+    path: Float[np.ndarray, "f 2"],
+    place: Float[np.ndarray, "f 2"],
+    time: Float[np.ndarray, "f"],
+    least: float,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+    """The turn and shift that lay a path over the waypoints, weights of these (Cauchy's, with the
+    median distance as the scale, or `least` m where that is larger), and by how much the path
+    misses the legs between them (median), m/s."""
+    weight = np.ones(len(place))
+    for _ in range(10):
+        turn, shift = jax.device_get(_planar_alignment(path, place, weight))
+        off = path @ turn.T + shift - place
+        size = np.linalg.norm(off, axis=1)
+        weight = 1 / (1 + (size / max(np.median(size), least)) ** 2)
+    missed = np.linalg.norm(np.diff(off, axis=0), axis=1) / np.diff(time)
+    return turn, shift, weight, float(np.median(missed))
+
+
+@functools.partial(jax.jit, static_argnames="config")
+def _between_clones(
+    smoothed: SmoothedHistory, gyro: Array, accel: Array, config: FilterConfig
+) -> tuple[Array, Array, Array]:
+    """Rotation, velocity and position at the stamp of every sample.
+
+    The IMU is integrated from the smoothed pose before an interval. What it misses of that at the
+    end is spread over the interval: the turn evenly, the position by the cubic that also mends the
+    velocity.
+    """
+    n, dt, seconds = config.samples_per_clone, config.dt, config.clone_seconds
+    ends = Mean(*(getattr(smoothed, name) for name in Mean._fields))
+
+    def integrated(rotation: Array, velocity: Array, position: Array, gyro: Array, push: Array):
+        """At the n stamps of an interval, and at its end."""
+        rotations = geometry.integrate_turns(rotation, gyro * dt)
+        force = jnp.einsum("ijn,nj->ni", rotations[:, :, :-1], push)
+        steps = (force - jnp.array([[0.0, 0.0, GRAVITY]])) * dt
+        velocities = velocity[None] + jnp.cumsum(jnp.pad(steps, ((1, 0), (0, 0))), axis=0)
+        moved = (velocities[:-1] + 0.5 * steps) * dt
+        positions = position[None] + jnp.cumsum(jnp.pad(moved, ((1, 0), (0, 0))), axis=0)
+        return jnp.moveaxis(rotations, 2, 0), velocities, positions
+
+    def interval(before: tuple, end: Mean, gyro: Array, accel: Array) -> tuple:
+        imu = gyro - end.gyro_bias[None], accel - end.accel_bias[None]
+        rotation, velocity, position = integrated(*before, *imu)
+        missed = end.rotation @ rotation[-1].T
+        angle = 0.5 * jnp.stack(
+            [missed[2, 1] - missed[1, 2], missed[0, 2] - missed[2, 0], missed[1, 0] - missed[0, 1]]
+        )
+        speed = (end.velocity - velocity[-1])[None]
+        place = (end.position - position[-1])[None]
+        s = (jnp.arange(n) / n)[:, None]
+        turns = jax.vmap(geometry.exp)(s * angle[None])
+        by_velocity = place / seconds * 6 * s * (1 - s) + speed * s * (3 * s - 2)
+        by_position = place * s**2 * (3 - 2 * s) + speed * seconds * s**2 * (s - 1)
+        return turns @ rotation[:-1], velocity[:-1] + by_velocity, position[:-1] + by_position
+
+    # Before the first interval: back over it from its end.
+    first = jax.tree.map(lambda rows: rows[0], ends)
+    imu = gyro[:n] - first.gyro_bias[None], accel[:n] - first.accel_bias[None]
+    nothing = jnp.zeros(3)
+    turned, _, _ = integrated(jnp.eye(3), nothing, nothing, *imu)
+    rotation = first.rotation @ turned[-1].T
+    _, gained, moved = integrated(rotation, nothing, nothing, *imu)
+    velocity = first.velocity - gained[-1]
+    start = rotation, velocity, first.position - velocity * seconds - moved[-1]
+    before = tuple(
+        jnp.concatenate([row[None], rows[:-1]]) for row, rows in zip(start, ends[:3], strict=True)
+    )
+    rows = jax.vmap(interval)(before, ends, gyro.reshape(-1, n, 3), accel.reshape(-1, n, 3))
+    rotation, velocity, position = (x.reshape(-1, *x.shape[2:]) for x in rows)
+    return rotation, velocity, position
