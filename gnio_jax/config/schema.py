@@ -419,7 +419,7 @@ class ThroughFilter:
     state_weight: NonNegative = 0.1
     """Weight of the negative log-likelihood of the true velocity and position under the filter's
     covariance."""
-    window_weight: NonNegative = 100.0
+    window_weight: Annotated[NonNegative, FILE_ONLY] = 100.0
     """Weight of the squared error of each window's displacement."""
 
 

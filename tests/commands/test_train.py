@@ -49,7 +49,7 @@ def mistake(monkeypatch, capsys, tmp_path, *arguments):
         (["--dataset", "oxiod"], "deepio.cs.ox.ac.uk"),
         (["--dataset", "oxoid"], "did you mean 'oxiod'? known datasets: blackbird, csv, euroc"),
         (["--config", ""], ".: cannot be read"),
-        (["--devices", "0"], "--devices: must be at least 1, found 0"),
+        (["--devices", "0"], "--devices: must be at least 1"),
         (["--seeds"], "--seeds: expected at least one"),
         (["--model.name", "gnoi"], "model 'gnoi': unknown; did you mean 'gnio'?"),
         (
