@@ -25,6 +25,7 @@ from gnio_jax import config as configuration
 from gnio_jax import models, parallel
 from gnio_jax.config import TrainConfig
 from gnio_jax.errors import InputError
+from gnio_jax.training.epochs import Position
 from gnio_jax.training.filter_task import filter_numbers, trained_settings
 from gnio_jax.training.optimizer import Plateau
 from gnio_jax.training.task import TrainState, create_model
@@ -39,22 +40,6 @@ METADATA = 2**17
 logging.getLogger("absl").setLevel(logging.CRITICAL)
 # Parts of a save that failed after the first failure, which is raised.
 logging.getLogger("asyncio").addFilter(lambda record: "orbax" not in record.getMessage())
-
-
-class Position(NamedTuple):
-    """Where a run stands besides its `TrainState`: kept as JSON with the checkpoint."""
-
-    epoch: int = 0
-    """Epoch in progress, or finished if `step` is a multiple of the steps per epoch."""
-    step: int = 0
-    best: float | None = None
-    """Smallest value on the validation split, since the last switch of what is trained, of what
-    `optim.best_by` names."""
-    sums: dict[str, float] = {}
-    """Figures summed over the steps of the epoch in progress (`window_task.Progress`)."""
-    seconds: float = 0.0
-    """Time spent training so far."""
-    plateau: Plateau = Plateau()
 
 
 class Run(NamedTuple):

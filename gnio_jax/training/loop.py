@@ -1,9 +1,8 @@
 """The training loop, top to bottom: one run after another; epochs of dispatches, validation, log,
-checkpoints."""
+checkpoints. What follows from their figures is in `epochs`."""
 
 from __future__ import annotations
 
-import math
 import signal
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -19,18 +18,12 @@ from gnio_jax import parallel
 from gnio_jax.config import TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.reporting import Lines, Reporter, Silence
-from gnio_jax.training import checkpoint, optimizer, run_folder
-from gnio_jax.training.checkpoint import Position, Run, load_run
+from gnio_jax.training import checkpoint, epochs, run_folder
+from gnio_jax.training.checkpoint import Run, load_run
+from gnio_jax.training.epochs import Position
 from gnio_jax.training.filter_task import FilterTask
 from gnio_jax.training.run_folder import Log
-from gnio_jax.training.task import (
-    Progress,
-    Recordings,
-    Row,
-    Task,
-    keys_of,
-    set_up,
-)
+from gnio_jax.training.task import Recordings, Task, keys_of, set_up
 from gnio_jax.training.window_task import WindowTask
 
 DISPATCH_SECONDS = 0.5
@@ -38,8 +31,6 @@ DISPATCH_SECONDS = 0.5
 and a quick stop."""
 CHECKPOINT_SECONDS = 600.0
 """Longest time between checkpoints within an epoch; every epoch ends with one anyway."""
-NO_GRADIENT = 1e-9
-"""Norm of a gradient, mean of an epoch, of which Adam, whose ε is 1e-8, makes next to no step."""
 
 
 class Outcome(NamedTuple):
@@ -163,7 +154,7 @@ def _train(
                         at.plateau.factor,
                         keys.step,
                     )
-                    at = _after_steps(at, count, jax.device_get(progress), workdir)
+                    at = epochs.after_steps(at, count, jax.device_get(progress), workdir)
                     clock = time.perf_counter()
                     at = at._replace(seconds=before.seconds + clock - began)
                     rate = (at.step - first) * optim.batch_size / (clock - began)
@@ -174,9 +165,8 @@ def _train(
                         int(clock - saved > CHECKPOINT_SECONDS),
                         stop.received,
                     )
-                    reporter.progress(
-                        "training", at.step / (optim.epochs * steps), _figures(task, at, rate)
-                    )
+                    share = at.step / (optim.epochs * steps)
+                    reporter.progress("training", share, epochs.under_way(at, task, rate))
                     if at.step < end and (due or signum):
                         checkpoint.save(workdir, "latest", with_statistics(state), at)
                         saved = clock
@@ -186,119 +176,18 @@ def _train(
                 state, validation = task.validate(
                     with_statistics(state), recordings.held_out, keys.statistics
                 )
-                row = _row(task, at, validation, rate)
-                improved, at = _after_epoch(task, at, row)
-                log.add(row)
-                reporter.line(_summary(task, row) + ("  best" if improved else ""))
-                if warning := stuck_head(row):
-                    reporter.line(warning)
-                if improved:
+                done = epochs.finish(at, task, validation, rate)
+                at = done.at
+                log.add(done.row)
+                for line in epochs.lines(done, task):
+                    reporter.line(line)
+                if done.improved:
                     checkpoint.save(workdir, "best", state, at)
                 checkpoint.save(workdir, "latest", state, at)
                 (stop.signum,) = parallel.largest(stop.received)
                 if stop.signum and epoch + 1 < optim.epochs:
                     return Outcome(workdir, at.best, stop.signum)
     return Outcome(workdir, at.best, None)
-
-
-def _after_steps(at: Position, count: int, progress: Progress, workdir: Path) -> Position:
-    """Where a run stands after `count` more steps. Raises `FloatingPointError` where one of them
-    failed."""
-    if progress.failed_step >= 0:
-        raise FloatingPointError(
-            f"{workdir}: the loss or its gradient is not finite at step "
-            f"{int(progress.failed_step)} (epoch {at.epoch}); lower optim.learning_rate, set "
-            "optim.clip_norm, or look at the data"
-        )
-    sums = {name: at.sums.get(name, 0.0) + float(more) for name, more in progress.sums.items()}
-    return at._replace(step=at.step + count, sums=sums)
-
-
-def _after_epoch(task: Task, at: Position, row: Row) -> tuple[bool, Position]:
-    """Whether the epoch of `row` is the best one so far, and where the next one starts.
-
-    The choice begins anew with the epoch that changes what is trained, and again with the first
-    whole one after it: losses before and after do not compare, and what has just begun to learn has
-    learnt little. NaN and infinity are never the best.
-    """
-    optim = task.config.optim
-    merit = row["val_loss" if optim.best_by == "loss" else "val_mse"]
-    before = at.step - 2 * task.steps_per_epoch
-    changed = any(before < change < at.step for change in task.changes)
-    best = None if changed else at.best
-    improved = math.isfinite(merit) and (best is None or merit < best)
-    plateau = optimizer.watch(at.plateau, row["val_mse"], optim)
-    best = merit if improved else best
-    return improved, at._replace(epoch=at.epoch + 1, best=best, sums={}, plateau=plateau)
-
-
-def _means(sums: dict[str, float], steps: int) -> Row:
-    """Means over the steps that were not skipped, and the number of those that were."""
-    skipped = round(sums.get("skipped", 0))
-    means: Row = {name: total / max(1, steps - skipped) for name, total in sums.items()}
-    return means | ({"skipped": skipped} if "skipped" in sums else {})
-
-
-def _row(task: Task, at: Position, validation: Row, rate: float) -> Row:
-    """The log's row of a finished epoch: means of training (as its steps met them) and the figures
-    of validation."""
-    means = _means(at.sums, task.steps_per_epoch)
-    norms = {name: means.pop(name) for name in at.sums if name.startswith("gradient_norm/")}
-    return {
-        "epoch": at.epoch,
-        "step": at.step,
-        **means,
-        **validation,
-        "learning_rate": task.learning_rate(at.step) * at.plateau.factor,
-        f"{task.unit}_per_second": rate,
-        "seconds": at.seconds,
-        **norms,
-    }
-
-
-def _figures(task: Task, at: Position, rate: float) -> str:
-    """The figures beside the progress bar: the mean loss of the epoch so far, and the speed."""
-    steps = task.steps_per_epoch
-    loss = _means(at.sums, at.step - at.epoch * steps)["loss"]
-    return (
-        f"{at.step}/{task.config.optim.epochs * steps}  epoch {at.epoch + 1}  loss {loss:.4g}  "
-        f"lr {task.learning_rate(at.step) * at.plateau.factor:.2e}  {_speed(task, rate)}"
-    )
-
-
-def _summary(task: Task, row: Row) -> str:
-    """The line of a finished epoch."""
-    names = [name for name in task.config.datasets if f"val_rmse/{name}" in row]
-    own = ", ".join(f"{name} {row[f'val_rmse/{name}']:.4f}" for name in names)
-    return (
-        f"epoch {row['epoch'] + 1:4d}/{task.config.optim.epochs}  "
-        f"loss {row['loss']:.4g}  val {row['val_loss']:.4g}  val rmse {row['val_rmse']:.4f} m  "
-        f"{f'({own})  ' if own else ''}"
-        f"{task.remark(row)}lr {row['learning_rate']:.2e}  "
-        f"{_speed(task, row[f'{task.unit}_per_second'])}"
-    )
-
-
-def _speed(task: Task, rate: float) -> str:
-    return f"{rate:,.0f} {task.unit}/s" if rate >= 10 else f"{rate:.2g} {task.unit}/s"
-
-
-def stuck_head(row: Row) -> str | None:
-    """A warning where hardly a gradient reached a layer of the head in the epoch of `row`.
-
-    A training that diverges may leave the network there: where every scale s = softplus(·)
-    underflows to 0, so do the gradients of gate and encoder, and d̂ = 0 for good. A loss of 0 has
-    not begun yet (`LossConfig.nll_from_epoch`).
-    """
-    norms = {name: row[name] for name in row if name.startswith("gradient_norm/head/")}
-    layers = [name for name, norm in norms.items() if norm < NO_GRADIENT]
-    if not layers or row["loss"] == 0:
-        return None
-    named = ", ".join(name.removeprefix("gradient_norm/") for name in layers)
-    return (
-        f"warning: no gradient reached {named} in this epoch, the network learns no more; "
-        "start over with a lower optim.learning_rate, or with optim.clip_norm"
-    )
 
 
 class _Stop:

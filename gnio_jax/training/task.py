@@ -224,10 +224,6 @@ class Task(ABC):
         adam = optimizer.create(self.config, self.steps_per_epoch)
         return state._replace(opt_state=adam.init(trained))
 
-    def learning_rate(self, step: int) -> float:
-        """The network's learning rate of a step by the schedule."""
-        return float(optimizer.schedule(self.config.optim, self.steps_per_epoch)(step))
-
     def take_steps(
         self,
         state: TrainState,

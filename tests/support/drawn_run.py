@@ -8,6 +8,7 @@ import numpy as np
 from gnio_jax import config as configuration
 from gnio_jax import models
 from gnio_jax.training import checkpoint
+from gnio_jax.training.epochs import Position
 from gnio_jax.training.task import TrainState, create_model
 
 
@@ -26,5 +27,5 @@ def save(folder, config, draw):
         for kind, tree in shapes.items()
     }
     state = TrainState(jnp.int32(0), drawn["params"], drawn["batch_stats"], {})
-    checkpoint.save(folder, "best", state, checkpoint.Position(epoch=1, best=1.0))
+    checkpoint.save(folder, "best", state, Position(epoch=1, best=1.0))
     return folder

@@ -19,7 +19,7 @@ from gnio_jax.data import windows
 from gnio_jax.data.readers import DATASETS
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation.evaluate import resolve
-from gnio_jax.training import checkpoint, loop, segments, task, window_task
+from gnio_jax.training import checkpoint, epochs, loop, segments, task, window_task
 from gnio_jax.training.filter_task import FilterTask
 from gnio_jax.training.losses import Losses
 from gnio_jax.training.task import TrainState
@@ -133,11 +133,10 @@ def test_stopped_and_resumed_with_several_datasets_gives_the_same_bits(
     assert jax.tree.all(jax.tree.map(np.array_equal, *map(variables, (tmp_path / "run", finished))))
 
 
-def test_the_line_of_an_epoch_has_the_error_of_each(finished, tmp_path, capsys):
-    loop.train(tiny(finished, optim=tiny("").optim), resume=True)
+def test_the_line_of_an_epoch_has_the_error_of_each(finished):
     row = rows_of(finished)[-1]
-    training = WindowTask(Tiny(), tiny(finished), 1)
-    line = loop._summary(training, row)
+    done = epochs.Finished(row, True, epochs.Position())
+    (line,) = epochs.lines(done, WindowTask(Tiny(), tiny(finished), 1))
     assert f"(tlio {row['val_rmse/tlio']:.4f}, other {row['val_rmse/other']:.4f})" in line
 
 

@@ -13,6 +13,7 @@ import pytest
 
 from gnio_jax.errors import InputError
 from gnio_jax.training import checkpoint, run_folder
+from gnio_jax.training.epochs import Position
 from gnio_jax.training.run_folder import Log
 from gnio_jax.training.task import TrainState
 
@@ -36,7 +37,7 @@ def files_of_at_most(size):
 
 
 def save(run, step):
-    checkpoint.save(run, "latest", state(step), checkpoint.Position(step=step))
+    checkpoint.save(run, "latest", state(step), Position(step=step))
 
 
 @pytest.fixture

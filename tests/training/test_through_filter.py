@@ -31,7 +31,7 @@ from gnio_jax.errors import InputError
 from gnio_jax.filtering.settings import with_free_parameters
 from gnio_jax.models import registry
 from gnio_jax.reporting import Lines
-from gnio_jax.training import checkpoint, filter_task, loop, task
+from gnio_jax.training import checkpoint, epochs, filter_task, loop, task
 from gnio_jax.training.filter_task import FilterTask
 from gnio_jax.training.window_task import WindowTask
 from tests.support import drawn_run
@@ -278,7 +278,7 @@ def test_wild_steps_are_skipped_and_counted(training, start):
         assert same(before, (state.variables, state.opt_state))
         assert progress.sums.pop("skipped") == 1
         assert len(progress.sums) > 6 and all(each == 0 for each in progress.sums.values())
-        assert loop._means({"loss": 6.0, "skipped": 2.0}, 5) == {"loss": 2.0, "skipped": 2}
+        assert epochs.mean_figures({"loss": 6.0, "skipped": 2.0}, 5) == {"loss": 2.0, "skipped": 2}
 
 
 @pytest.mark.parametrize(
@@ -310,7 +310,7 @@ def test_a_skipped_step_does_not_shift_the_schedule(training, start):
     """The rate that the log gives for a step is the one that is in force, whatever was skipped
     before: the same step is taken after a skip."""
     training, source = training
-    rates = [training.learning_rate(step) for step in range(4)]
+    rates = [epochs.learning_rate(epochs.Position(step=step), training) for step in range(4)]
     assert len(set(rates)) == 4
     state, other = (begun(training, start) for _ in range(2))
     lost = source._replace(accel=source.accel.at[:].set(np.nan))
