@@ -118,10 +118,10 @@ def variant(base: TrainConfig, **options: Any) -> TrainConfig:
 
 def comparison(base: TrainConfig, split: str, networks: tuple[str, ...] = METHODS) -> Experiment:
     """The networks side by side; compared with the first."""
-    published = PUBLISHED.get((base.dataset, split), {})
+    published = PUBLISHED.get((base.datasets[0], split), {})
     source = "no published figure for this split"
     if published:
-        source = f"paper, table II: ATE on {base.dataset} {split}"
+        source = f"paper, table II: ATE on {base.datasets[0]} {split}"
     rows = [Row(name, name, method(name, base), published.get(name)) for name in networks]
     return Experiment("Networks", source, rows)
 

@@ -111,7 +111,7 @@ def notes(base: TrainConfig, options: TablesConfig, experiment: Experiment) -> s
         f"{options.seeds} seeds{calibrated}"
     )
     return (
-        f"{base.dataset} {options.split}, {options.estimator}; every row: {budget}; on "
+        f"{base.datasets[0]} {options.split}, {options.estimator}; every row: {budget}; on "
         f"{hardware()}. ± is the standard deviation over seeds; the difference to the first row "
         "is over sequences."
         f"\n\nPublished: {experiment.source}; the paper does not define its ATE."

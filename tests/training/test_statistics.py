@@ -269,7 +269,7 @@ def norms_of_the_head(state, source, orders, key, count, training):
 @pytest.mark.parametrize(
     "width, seeds, count",
     [
-        (16, range(1), 200),
+        (16, range(1), 60),
         pytest.param(16, range(1, 4), 200, marks=pytest.mark.slow),
         pytest.param(32, range(1), 200, marks=pytest.mark.slow),
         pytest.param(64, range(1), 60, marks=pytest.mark.slow),
