@@ -18,7 +18,14 @@ import pytest
 from jax.sharding import PartitionSpec
 
 from gnio_jax import parallel
-from gnio_jax.config import DataConfig, ModelConfig, OptimConfig, ThroughFilter, TrainConfig
+from gnio_jax.config import (
+    AugmentConfig,
+    DataConfig,
+    ModelConfig,
+    OptimConfig,
+    ThroughFilter,
+    TrainConfig,
+)
 from gnio_jax.errors import InputError
 from gnio_jax.reporting import Silence
 from gnio_jax.training import loop, run_folder
@@ -230,7 +237,8 @@ def small(tmp_path_factory):
     optim = OptimConfig(epochs=2, batch_size=16, learning_rate=1e-3, statistics_windows=32)
     model = ModelConfig(width=2, bank_size=3)
     data = DataConfig(rate=50.0)
-    return TrainConfig("tlio", str(root), data=data, model=model, optim=optim)
+    augment = AugmentConfig(low_pass_share=0.5)
+    return TrainConfig("tlio", str(root), data=data, augment=augment, model=model, optim=optim)
 
 
 def trained(config):
