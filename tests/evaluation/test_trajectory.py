@@ -7,7 +7,14 @@ from scipy.spatial.transform import Rotation
 
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import metrics
-from gnio_jax.evaluation.trajectory import Undefined, align, read_tum, relative_yaw, write_tum
+from gnio_jax.evaluation.trajectory import (
+    Undefined,
+    align,
+    read_tum,
+    relative_yaw,
+    turned_covariance,
+    write_tum,
+)
 from gnio_jax.numerics import matrix_from_quaternion
 from tests.support.trajectories import PITCHES, lost, masked, moved_by, perturbed, quaternions, walk
 
@@ -23,6 +30,20 @@ def test_origin_undoes_a_yaw_and_a_shift():
         atol=1e-9,
     )
     assert align(estimate, truth, "none") is estimate
+
+
+def test_a_covariance_is_turned_with_its_trajectory():
+    """That of points around each position, which the alignment moves alike."""
+    truth = walk(tilt=0.3)
+    estimate = moved_by(truth, Rotation.from_euler("z", -2.0), [5.0, -3.0, 1.0])
+    spread = np.random.default_rng(0).normal(size=(len(truth.time), 20, 3))
+    spread *= [3.0, 1.0, 0.5]
+    before = np.einsum("nki,nkj->nij", spread, spread)
+    turned = Rotation.from_euler("z", 2.0).apply(spread.reshape(-1, 3)).reshape(spread.shape)
+    wanted = np.einsum("nki,nkj->nij", turned, turned)
+    found = turned_covariance(before, estimate, align(estimate, truth))
+    np.testing.assert_allclose(found, wanted, atol=1e-9)
+    assert turned_covariance(before, estimate, estimate) is before
 
 
 def check_se3_against_scipy(estimate, truth):
