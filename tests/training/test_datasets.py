@@ -111,7 +111,8 @@ def test_each_dataset_is_validated_on_all_of_its_own_windows(finished, monkeypat
         source = windows.window_source([walk], config.data, config.data.stride)
         every = windows.gather(jax.device_put(source), jax.numpy.arange(len(source.start)), 50)
         said = training.model.apply(state.variables, every.imu).displacement
-        mse = np.mean(np.sum((np.asarray(said, float) - every.displacement) ** 2, axis=1))
+        error = np.asarray(said, float) - np.asarray(every.displacement)
+        mse = np.mean(np.sum(error**2, axis=1))
         assert row[f"val_mse/{name}"] == pytest.approx(mse, rel=1e-4)
 
 
@@ -174,10 +175,13 @@ def test_constants_of_the_uncertainty_are_those_of_the_mean_over_the_datasets(mo
     def found(mse):
         return Validation(Losses(*[jnp.float32(0)] * 3), *[jnp.full(3, mse, jnp.float32)] * 2)
 
-    monkeypatch.setattr(window_task, "validate", lambda _, mse, *__, **___: found(mse))
+    def source(mse):
+        return windows.WindowSource(*[jnp.full(1, mse)] * len(windows.WindowSource._fields))
+
+    monkeypatch.setattr(window_task, "validate", lambda _, of, *__, **___: found(of.imu[0]))
     state = TrainState(jnp.int32(7), {}, {"uncertainty": {"log_std": jnp.zeros(3)}}, ())
     training = WindowTask(Tiny(), TrainConfig(dataset=BOTH), 7)
-    kept = training.calibrated(state, {"tlio": 1.0, "other": 3.0})
+    kept = training.calibrated(state, {"tlio": source(1.0), "other": source(3.0)})
     np.testing.assert_allclose(np.exp(2 * kept.batch_stats["uncertainty"]["log_std"]), 2.0, 1e-6)
 
 
@@ -203,7 +207,10 @@ def test_names_stand_behind_the_option_and_one_is_as_before():
 
     assert parsed("--dataset", "tlio", "other", "--seed", "1").dataset == BOTH
     assert parsed("--dataset", "tlio").dataset == "tlio"
-    assert configuration.default_workdir(tiny(None, workdir=None)).name == "tlio_other_tiny"
+    assert (
+        configuration.default_workdir(dataclasses.replace(tiny(""), workdir=None)).name
+        == "tlio_other_tiny"
+    )
 
 
 def test_an_evaluation_says_of_which_dataset(finished):
