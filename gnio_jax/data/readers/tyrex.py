@@ -42,8 +42,6 @@ from gnio_jax.data.assembly import Poses, Samples, Streams, assemble
 from gnio_jax.data.dataset import Dataset, Recording, Refusal
 from gnio_jax.data.parsing.stamps import distinct
 from gnio_jax.data.parsing.tables import damaged, parsed_as, read_text, shortened
-from gnio_jax.data.reference import LONGEST_BRIDGE
-from gnio_jax.data.resampling import known_at
 from gnio_jax.data.splits import find_folders
 from gnio_jax.data.validation import check_accel, check_gyro
 from gnio_jax.errors import InputError
@@ -163,7 +161,7 @@ def read(folder: str | os.PathLike[str]) -> list[Sequence]:
         raise InputError(folder, problem, "give the folder its published name")
     phone, track = read_phone(walk), read_track(walk.track, _offset(folder))
     try:
-        fit = align(phone, _recorded(track, phone), LAG_KNOTS, search_seconds=LAG_SEARCH)
+        fit = align(phone, track, LAG_KNOTS, search_seconds=LAG_SEARCH)
     except TooLittle as error:
         raise Refusal(walk.track, f"cannot be aligned with the phone ({error})") from None
     check_fit(fit, walk.track, LIMITS)
@@ -187,19 +185,6 @@ def read(folder: str | os.PathLike[str]) -> list[Sequence]:
     accel = phone.accel._replace(time=phone.accel.time - fit.accel_delay)
     streams = phone._replace(accel=accel, poses=fit.poses, attributes=about)
     return assemble(streams, RATE, divide=True)
-
-
-def _recorded(track: Poses, phone: Streams) -> Poses:
-    """The poses that no gap of the phone touches: three records pause for 4 to 24 s."""
-    covered = np.ones(len(track.time), dtype=bool)
-    for sensor in (phone.gyro, phone.accel):
-        own = np.ones(len(sensor.time), dtype=bool)
-        for shift in (-LAG_SEARCH, 0.0, LAG_SEARCH):
-            covered &= known_at(sensor.time, own, track.time + shift, LONGEST_BRIDGE)
-    if covered.sum() < 2:
-        problem = "field 'time' shares nothing with gyroscope.txt and accelerometer.txt"
-        raise InputError(track.source, problem, "check that all three are of one walk")
-    return track.rows(np.flatnonzero(covered))
 
 
 def clipped(accel: Float[np.ndarray, "n 3"]) -> float:
