@@ -66,15 +66,12 @@ def test_a_loss_is_not_valid_and_does_not_reach_its_surroundings(noisy):
     compare(found, 2e-3, 0.5, 0.05)
 
 
-def test_single_jumps_of_a_tracker_are_bridged_and_long_ones_are_not_valid():
+def test_single_jumps_of_a_tracker_are_bridged():
     stamps = np.arange(0.0, 30.0, 1.0 / 60.0)
     poses = tracked(stamps, noisy=True)
     poses.position[::20] += [0.0, 0.05, 0.0]  # every third of a second
-    long = (stamps > 20.0) & (stamps < 20.5)
-    poses.position[long] += [0.2, 0.0, 0.3]
     found = reference_at(CLOCK, walk.rate(CLOCK), poses)
-    assert not found.valid[(CLOCK > 20.1) & (CLOCK < 20.4)].any()
-    assert found.valid[(CLOCK < 19.8) | (CLOCK > 20.7)][20:-20].all()
+    assert found.valid[20:-20].all()
     compare(found, 6e-3, 0.5, 0.05)
 
 
