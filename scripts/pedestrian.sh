@@ -1,16 +1,27 @@
 #!/usr/bin/env bash
 # Make the network that comes with gnio-jax anew: GNIO_DATA=recordings scripts/pedestrian.sh [RUNS]
 #
-# GNIO_DATA holds the folders tyrex and indoor_location. It trains on all of their walks, and a network
-# for each half of them, in which people and floors are whole, which has not seen the other half. The
-# filter is calibrated by what those say of walks that they have not seen.
+# GNIO_DATA holds the folders tyrex and indoor_location. The network is trained on all of their walks. A
+# second one has not seen one of the two people: its filter is calibrated on walks of that person, and
+# the network takes it over.
 set -euo pipefail
 runs=${1:-runs}
 
 gnio train --config pedestrian --workdir "$runs/pedestrian" --resume
-for half in 0 1; do
-  gnio train --config pedestrian --data.train-split "all-${half}of2" \
-    --workdir "$runs/pedestrian_half$half" --optim.epochs 4 --resume
-done
-gnio calibrate --workdir "$runs/pedestrian" --out "$runs/pedestrian_calibrated" \
-  --out-of-fold "$runs/pedestrian_half0" "$runs/pedestrian_half1"
+gnio train --config pedestrian --data.train-split all-1of2 --optim.epochs 4 \
+  --workdir "$runs/pedestrian_half" --resume
+gnio calibrate --workdir "$runs/pedestrian_half"
+python - "$runs" <<'PYTHON'
+import dataclasses
+import shutil
+import sys
+from pathlib import Path
+
+from gnio_jax import config
+
+runs = Path(sys.argv[1])
+out = shutil.copytree(runs / "pedestrian", runs / "pedestrian_calibrated", dirs_exist_ok=True)
+own, other = (config.load(runs / name / "config.yaml") for name in
+              ("pedestrian", "pedestrian_half_calibrated"))
+config.save(out / "config.yaml", dataclasses.replace(own, filter=other.filter, workdir=str(out)))
+PYTHON
