@@ -249,9 +249,10 @@ def _repeated(
 ) -> tuple[Callable[[FilterState, Array], FilterHistory], FilterState, Array]:
     """The run over one walk without the network, from a start and the displacements; its start and
     its displacements."""
-    # Of a raw gyro the walk's own start is the wider one.
-    std = settings.start
-    std = std._replace(gyro_bias=jnp.maximum(std.gyro_bias, walk.start.std.gyro_bias))
+    std, raw = settings.start, settings.raw_gyro_bias
+    if raw is not None:  # as the walk was prepared
+        own = jnp.where(walk.start.std.gyro_bias == raw, raw, std.gyro_bias)
+        std = std._replace(gyro_bias=own)
     state = initial_state(config, *walk.start[:-1], std=std)
     assert walk.given is not None
     covariance = jax.vmap(jnp.diag)(walk.given.std**2)

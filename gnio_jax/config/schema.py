@@ -374,9 +374,6 @@ class FilterSettings:
     """Noise of the IMU and of the network's displacements."""
     start: InitialStd = TLIO_STD
     """Standard deviations of the initial state."""
-    raw_gyro_bias: NonNegative | None = None
-    """Standard deviation of the gyro's first bias where its phone takes none off, rad/s: the
-    recording then says `imu_compensated: no` (ours). By default that of `start` for every IMU."""
     considered: ConsideredStd = field(default_factory=ConsideredStd)
     """Errors in the covariance that are not estimated (Schmidt's consider states)."""
     mahalanobis_fail_scale: NonNegative = 0.0
@@ -386,6 +383,9 @@ class FilterSettings:
     """How the tight coupling cuts and rotates the network's windows; by default as in training.
     `tlio` does it as TLIO's tracker: a sample earlier and without the filter's biases, for weights
     trained that way."""
+    raw_gyro_bias: NonNegative | None = None
+    """Standard deviation of the gyro's first bias where its phone takes none off, rad/s: the
+    recording then says `imu_compensated: no` (ours). By default that of `start` for every IMU."""
 
 
 SHORTEST_HORIZON = 1.0
