@@ -133,11 +133,8 @@ def choose(which: str | Path | None = None) -> Weights:
         run = _run_of(place, about, content)
     else:
         run = checkpoint.load_run(place)
-        data = run.config.data
-        name, trained_on = (
-            place.name,
-            f"dataset {', '.join(run.config.datasets)}, split {data.train_split}",
-        )
+        names, split = ", ".join(run.config.datasets), run.config.data.train_split
+        name, trained_on = place.name, f"dataset {names}, split {split}"
         try:
             measured = _measured(_figures(place), run.config.datasets)
         except InputError:

@@ -105,12 +105,9 @@ def gather(
         data.load(name, root, split, workers, lambda share: progress("reading", share))
         for name in own.datasets
     ]
-    found = Evidence([], [])
+    found, names = Evidence([], []), ", ".join(own.datasets)
     for number, source in enumerate(asked):
-        trained, where = (
-            source.run.config.data,
-            f"dataset {', '.join(own.datasets)}, split '{split}'",
-        )
+        trained, where = source.run.config.data, f"dataset {names}, split '{split}'"
         recordings = [each for sequences in loaded for each in sequences]
         if source.fold is not None:
             where = f"{where}, fold {source.fold.number}"

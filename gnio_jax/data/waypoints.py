@@ -19,6 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Complex, Float
+from scipy.integrate import cumulative_trapezoid
 from scipy.interpolate import PchipInterpolator
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
@@ -145,7 +146,8 @@ def reckoned(
     ahead = _plane(level.apply([0.0, 1.0, 0.0]))
     ahead = ahead / np.maximum(np.abs(ahead), 1e-9)
     speed = _speed(level.apply(accel)[:, 2], step)
-    return Walk(time, _integral(ahead * speed, step), _integral(speed, step))
+    way, length = (cumulative_trapezoid(v, dx=step, initial=0) for v in (ahead * speed, speed))
+    return Walk(time, way, length)
 
 
 def legs_on(walk: Walk, waypoints: Waypoints) -> Legs:
@@ -185,10 +187,6 @@ def _speed(vertical: Float[np.ndarray, " n"], step: float) -> Float[np.ndarray, 
         return np.zeros_like(bounce)
     relative = np.minimum(bounce / np.median(bounce[walking]), 2.0)
     return np.sqrt(relative) * np.clip(relative / STEPPING - 1.0, 0.0, 1.0)
-
-
-def _integral(values: np.ndarray, step: float) -> np.ndarray:
-    return np.concatenate([[0.0], np.cumsum(0.5 * step * (values[1:] + values[:-1]))])
 
 
 def _plane(values: Float[np.ndarray, "n w"]) -> Complex[np.ndarray, " n"]:

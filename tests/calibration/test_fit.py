@@ -26,6 +26,7 @@ from gnio_jax.config import CalibrateConfig, CorrelatedError, FilterSettings
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import Displacements
 from gnio_jax.filtering.settings import free_parameters
+from gnio_jax.filtering.state import GYRO_BIAS
 from tests.support.calibration_walks import (
     DATA,
     STRIDES,
@@ -86,6 +87,18 @@ def test_the_gradient_is_that_of_the_likelihood():
     for i, step in enumerate(1e-4 * np.eye(len(free))):
         ahead, behind = (float(both(free + off)[0][0]) for off in (step, -step))
         np.testing.assert_allclose(gradient[i], (ahead - behind) / 2e-4, rtol=1e-3, atol=1e-7)
+
+
+@pytest.mark.parametrize(("prepared", "expected"), [(0.05, 0.05), (1.0, 1e-3)])
+def test_a_raw_gyro_keeps_the_wide_start_that_its_walk_was_prepared_with(prepared, expected):
+    """Every other walk starts as the settings say, whatever it was prepared with."""
+    settings = dataclasses.replace(TRUE, raw_gyro_bias=0.05)
+    walk = jax.tree.map(lambda leaf: leaf[0], walks())
+    std = walk.start.std._replace(gyro_bias=np.float64(prepared))
+    walk = walk._replace(start=walk.start._replace(std=std))
+    _, state, _ = fitting._repeated(walk, settings, innovation_config(DATA, settings))
+    found = np.sqrt(np.diag(state.core_covariance))[GYRO_BIAS]
+    np.testing.assert_allclose(found, expected, rtol=1e-9)
 
 
 def test_a_second_calibration_compiles_nothing_and_a_fit_that_ends_early_is_told():
