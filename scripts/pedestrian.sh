@@ -20,7 +20,9 @@ from pathlib import Path
 from gnio_jax import config
 
 runs = Path(sys.argv[1])
-out = shutil.copytree(runs / "pedestrian", runs / "pedestrian_calibrated", dirs_exist_ok=True)
+out = runs / "pedestrian_calibrated"
+evaluated = shutil.ignore_patterns("eval")  # with the filter as it was
+shutil.copytree(runs / "pedestrian", out, ignore=evaluated, dirs_exist_ok=True)
 own, other = (config.load(runs / name / "config.yaml") for name in
               ("pedestrian", "pedestrian_half_calibrated"))
 config.save(out / "config.yaml", dataclasses.replace(own, filter=other.filter, workdir=str(out)))
