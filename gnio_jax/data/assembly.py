@@ -20,6 +20,7 @@ from gnio_jax.data.reference import Poses as Poses
 from gnio_jax.data.reference import Reference, reference_at
 from gnio_jax.data.resampling import is_uniform, resampled, slerped, uniform_clock
 from gnio_jax.data.validation import (
+    FARTHEST,
     FEWEST_WAYPOINTS,
     WINDOW_SECONDS,
     check_accel,
@@ -139,7 +140,8 @@ def assemble(
 
 
 def ordered(streams: Streams) -> Streams:
-    """Every stream by increasing stamps, and the counts of the gyro's repaired rows."""
+    """Every stream by increasing stamps, poses within `FARTHEST` alone, and the counts of the
+    gyro's repaired rows."""
 
     def by_stamps(samples: Samples) -> tuple[Samples, dict[str, float]]:
         rows, repairs = in_order(samples.time, samples.values, samples.source)
@@ -150,6 +152,12 @@ def ordered(streams: Streams) -> Streams:
     gyro, repairs = by_stamps(streams.gyro)
     poses, device = streams.poses, streams.device
     if poses is not None:
+        # A position that nobody can have would take the digits of every pose near it.
+        near = ~(np.abs(poses.position) > FARTHEST).any(axis=1)
+        if not near.any():
+            problem = f"field 'position' is beyond {FARTHEST:g} m in all rows"
+            raise InputError(poses.source, problem, "give positions in m")
+        poses = poses if near.all() else poses.rows(near)
         rows, changed = in_order(poses.time, poses.position, poses.source)
         if len(rows) < 2:
             raise InputError(poses.source, f"holds {len(rows)} poses", "copy it again")

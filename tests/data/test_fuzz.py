@@ -82,6 +82,7 @@ def test_a_damaged_recording_is_plausible_or_refused_by_name(name, few):
 # What was wrong once. Each is (layout, damages, what must be said; None: it must be read, and
 # plausible).
 _EURO = "MH_04_difficult/mav0/imu0"
+_MARKER = "dataset-room4_512_16/mav0/mocap0/data.csv"
 _OXTS = LAYOUTS["kitti packets"].targets
 _FLIGHT = "clover/yawForward/maxSpeed5p0/test/stamped_groundtruth_imu.txt"
 ONCE_WRONG = {
@@ -198,6 +199,16 @@ ONCE_WRONG = {
         "csv",
         [Damage("walk.csv", "column", 0.5, 0.5, "1e30")],
         "walk.csv: field 'position' is beyond",
+    ),
+    "marker at no place": (
+        "tumvi",
+        [Damage(_MARKER, "cell", 0.5, 0.2, "1e300")],
+        None,
+    ),  # left out as a pose that the tracker lost
+    "marker of no place": (
+        "tumvi",
+        [Damage(_MARKER, "column", 0.5, 0.2, "1e300")],
+        "mocap0/data.csv: field 'position' is beyond",
     ),
     "velocity of a flight": (
         "blackbird",
