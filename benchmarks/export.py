@@ -24,8 +24,9 @@ jax.config.update("jax_enable_x64", True)
 
 from gnio_jax import filtering  # noqa: E402
 from gnio_jax.apps import packages  # noqa: E402
-from gnio_jax.apps.onnx import accuracy, driver, export_run  # noqa: E402
-from gnio_jax.apps.onnx.flat_state import start_arrays  # noqa: E402
+from gnio_jax.apps.onnx import driver, export_run  # noqa: E402
+from gnio_jax.apps.onnx.programs import start_arrays  # noqa: E402
+from gnio_jax.apps.onnx.run import draw_walk  # noqa: E402
 from gnio_jax.apps.track import tracking_filter  # noqa: E402
 from gnio_jax.evaluation import Recording  # noqa: E402
 from gnio_jax.models import Network  # noqa: E402
@@ -44,7 +45,7 @@ def main() -> None:
         export_run(arguments.run, out)
         models = driver.open_models(out, arguments.threads)
         setup = tracking_filter(run)
-        drawn = accuracy.draw_walk(run.config.data, setup, arguments.seconds)
+        drawn = draw_walk(run.config.data, setup, arguments.seconds)
         times = measure(run, models, drawn)
     period = 1e3 * setup.config.clone_seconds
     print(f"\n{'part':>34} {'p50 ms':>8} {'p99 ms':>8} {'of the period':>14}")

@@ -26,4 +26,5 @@ shutil.copytree(runs / "pedestrian", out, ignore=evaluated, dirs_exist_ok=True)
 own, other = (config.load(runs / name / "config.yaml") for name in
               ("pedestrian", "pedestrian_half_calibrated"))
 config.save(out / "config.yaml", dataclasses.replace(own, filter=other.filter, workdir=str(out)))
+shutil.copy(runs / "pedestrian_half_calibrated" / "calibration.json", out)
 PYTHON

@@ -118,8 +118,7 @@ def _metrics(reports: list[Report], wanted: tuple[str, ...] | None) -> tuple[str
     return wanted or tuple(metric for metric in USUAL if metric in there)
 
 
-# The evaluations
-# --------------------------------------------------------------------------------------------------
+# --- the evaluations
 
 
 def find(word: str) -> list[Path]:
@@ -229,8 +228,7 @@ def _labels(words: tuple[str, ...]) -> list[str]:
     return [str(Path(*each)) for each in parts]
 
 
-# Text
-# --------------------------------------------------------------------------------------------------
+# --- text
 
 
 def title(found: Comparison) -> str:

@@ -42,8 +42,7 @@ from gnio_jax.numerics import quaternion_from_matrix
 from gnio_jax.training.checkpoint import Run
 from gnio_jax.types import FASTEST_TURN, STRONGEST_FORCE, Sequence
 
-# Samples
-# --------------------------------------------------------------------------------------------------
+# --- samples
 
 LONGEST_LINE = 4096
 """Characters; what is longer is no sample."""
@@ -139,8 +138,7 @@ def _is_missing(values: Iterable[float]) -> bool:
     return all(map(math.isnan, values))
 
 
-# Sensors with rows of their own
-# --------------------------------------------------------------------------------------------------
+# --- sensors with rows of their own
 
 LONGEST_WAIT = 0.1
 """s that a row of one sensor alone waits for what comes late (ours). Two readings of the
@@ -216,8 +214,7 @@ def _with_accelerometer(
     return row._replace(accel=(x, y, z))
 
 
-# Where samples come from
-# --------------------------------------------------------------------------------------------------
+# --- where samples come from
 
 LONGEST_QUEUE = 100_000
 """Datagrams that wait for the filter; later ones are lost."""
@@ -325,8 +322,7 @@ def _lines(messages: Iterable[bytes]) -> Iterator[str]:
             yield line[: LONGEST_LINE + 1]
 
 
-# The tracker, at the rate and in the units of the stream
-# --------------------------------------------------------------------------------------------------
+# --- the tracker, at the rate and in the units of the stream
 
 FIRST_SECONDS = 1.0
 """Of a stream, over which its rate is measured …"""
@@ -463,8 +459,7 @@ def _check_turning(samples: list[Sample], where: str) -> None:
     units.check_rad_per_second(motion, Path(where))
 
 
-# Following
-# --------------------------------------------------------------------------------------------------
+# --- following
 
 LINES_BEFORE_A_SAMPLE = 100
 """So many lines without a single sample are no stream of an IMU."""
@@ -607,8 +602,7 @@ def write_trajectory(path: Path, found: Followed) -> None:
         write_tum(temporary, found.trajectory)
 
 
-# The terminal
-# --------------------------------------------------------------------------------------------------
+# --- the terminal
 
 LEAST_EXTENT = 4.0
 """Metres that the drawing shows at least."""

@@ -80,10 +80,11 @@ class Weights(NamedTuple):
     run: Run
     about: str
     """What it was trained on, and the error that was measured of it."""
+    measured: str
+    """That error alone; empty where there is none."""
 
 
-# Where packages are found
-# --------------------------------------------------------------------------------------------------
+# --- where packages are found
 
 
 def is_package(place: Path) -> bool:
@@ -139,11 +140,11 @@ def choose(which: str | Path | None = None) -> Weights:
             measured = _measured(_figures(place), run.config.datasets)
         except InputError:
             measured = ""  # a damaged evaluation keeps nobody from tracking
-    return Weights(name, run, f"{trained_on}, whose {measured}" if measured else trained_on)
+    about = f"{trained_on}, whose {measured}" if measured else trained_on
+    return Weights(name, run, about, measured)
 
 
-# Reading
-# --------------------------------------------------------------------------------------------------
+# --- reading
 
 
 def load_pretrained(which: str | Path | None = None) -> Run:
@@ -281,8 +282,7 @@ def _named(tree: Any) -> dict[str, Any]:
     return {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in leaves}
 
 
-# Publishing
-# --------------------------------------------------------------------------------------------------
+# --- publishing
 
 
 class Description(NamedTuple):
@@ -326,7 +326,7 @@ def publish(workdir: Path, out: Path, said: Description, which: Which = "best") 
         run.step,
         _measured(figures, run.config.datasets),
         made_by,
-        _card(said, run, made_by, figures, (workdir / "calibration.json").is_file()).split("\n"),
+        _card(said, run, made_by, figures, workdir).split("\n"),
         configuration.plain(own),
         fingerprint(content),
     )
@@ -388,13 +388,19 @@ def _cell(figures: Report, metric: str) -> str:
 
 
 def _card(
-    said: Description, run: Run, made_by: str, figures: dict[str, Report], calibrated: bool
+    said: Description, run: Run, made_by: str, figures: dict[str, Report], workdir: Path
 ) -> str:
     """The model card, Markdown."""
     config, windows, name = run.config, run.config.data, said.name
     begun = f" --init-from runs/{Path(config.init_from).name}" if config.init_from else ""
-    steps = [f"gnio train --config config.yaml --workdir runs/{name}{begun}"]
-    steps += [f"gnio calibrate --workdir runs/{name}"] if calibrated else []
+    steps, fitted = [f"gnio train --config config.yaml --workdir runs/{name}{begun}"], ""
+    if (workdir / "calibration.json").is_file():
+        found = json.loads((workdir / "calibration.json").read_text(encoding="utf-8"))
+        fitted_run = Path(found["run"]).name
+        if fitted_run == workdir.name.removesuffix("_calibrated"):
+            fitted_run = name
+        steps.append(f"gnio calibrate --workdir runs/{fitted_run}")
+        fitted = f" The filter is fitted to split `{found['split']}` of run `{fitted_run}`."
     recipe = "\n".join(("```", *steps, "```"))
     considered = [each for each, std in config.filter.considered._asdict().items() if std > 0]
     tapped = any(AT_WAYPOINTS[0] in found.summary() for found in figures.values())
@@ -434,7 +440,7 @@ Licence: {said.license}
 
 Dataset `{", ".join(config.datasets)}`, seed {config.seed}; `gnio weights {name} --out \
 runs/{name}` writes config.yaml with all settings, those of the filter as they are used. Consider \
-covariance of the filter: {", ".join(considered) or "none"}.
+covariance of the filter: {", ".join(considered) or "none"}.{fitted}
 
 ## Figures
 

@@ -134,8 +134,7 @@ def _rgb(colour: str) -> tuple[int, ...]:
     return tuple(bytes.fromhex(colour.removeprefix("#")))
 
 
-# While a trajectory grows
-# --------------------------------------------------------------------------------------------------
+# --- while a trajectory grows
 
 
 @contextlib.contextmanager

@@ -181,6 +181,7 @@ def summarise(
     counted = "with consider covariance"
     if ekf.considered is None:
         counted = "without consider covariance (gnio calibrate fits it), so expect more"
+    measured = f", whose {weights.measured}" if weights.measured else ""
     summary = Summary(
         recording=sequence.name,
         weights=weights.name,
@@ -196,8 +197,8 @@ def summarise(
         warnings=(),
         notes=(*recording.notes, *ready.notes),
         limits=f"limits: {length:.1f} m in {seconds:.0f} s; expected error at the end "
-        f"{error:.1f} m{share} by the filter, {counted}; trained on {weights.about}; place and "
-        "heading are relative to the start",
+        f"{error:.1f} m{share} by the filter, {counted}; weights {weights.name}{measured}; place "
+        "and heading are relative to the start",
     )
     if np.isfinite(found.reference.position).any() or found.waypoints is not None:
         summary = summary._replace(errors=metrics.score([found])[found.name].values)

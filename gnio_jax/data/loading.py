@@ -90,14 +90,17 @@ def read_split(
     if not recordings:
         raise _nothing(dataset, root, split, "sequence")
     names, left_out = set(), []
+    refused: dict[str, list[str]] = {}  # why, without the file -> the whole line of each
     for recording, reading in zip(
         recordings, _read_all(recordings, workers, progress), strict=True
     ):
         for note in reading.notes:
             warnings.warn(note, stacklevel=2)
         for reason in reading.refusals:
-            warnings.warn(f"{recording.name}: left out: {reason}", stacklevel=2)
+            why = reason.partition(": ")[2]
+            refused.setdefault(why, []).append(f"{recording.name}: left out: {reason}")
         if reading.damage is not None:
+            _warn_of(refused)
             raise reading.damage
         for sequence in reading.sequences:
             if sequence.name in names:
@@ -111,6 +114,7 @@ def read_split(
                 left_out.append(sequence.name)
             else:
                 yield sequence
+    _warn_of(refused)
     if not names:
         problem = f"none of the {len(recordings)} recordings of split '{split}' can be used"
         raise InputError(root, problem, "see the warnings above")
@@ -118,6 +122,13 @@ def read_split(
         problem = f"none of {len(left_out)} sequences passes the physical self-check"
         remedy = "see the warnings above; check units, frames and time offset of the recordings"
         raise InputError(", ".join(left_out[:3]), problem, remedy)
+
+
+def _warn_of(refused: dict[str, list[str]]) -> None:
+    """A warning for each reason, with the number of recordings where it is that of several."""
+    for lines in refused.values():
+        count = f"{len(lines)} recordings are left out alike, the first: " if lines[1:] else ""
+        warnings.warn(f"{count}{lines[0]}", stacklevel=3)
 
 
 def _nothing(dataset: Dataset, root: Path, split: str, what: str) -> InputError:

@@ -142,8 +142,7 @@ def in_one_frame(estimate: Estimate, alignment: Alignment | None = "origin") -> 
     return estimate._replace(trajectory=aligned, filtered=filtered)
 
 
-# The filter over many recordings
-# --------------------------------------------------------------------------------------------------
+# --- the filter over many recordings
 
 
 class Inputs(NamedTuple):
@@ -304,8 +303,7 @@ def _stacked(trees: list[Any]) -> Any:
     return jax.tree.map(lambda *leaves: np.stack(leaves), *trees)
 
 
-# The sum of displacements
-# --------------------------------------------------------------------------------------------------
+# --- the sum of displacements
 
 
 def integrate(recording: Recording, found: Displacements, windows: DataConfig) -> Estimate:

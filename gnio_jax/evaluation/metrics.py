@@ -22,7 +22,6 @@ from gnio_jax.evaluation.trajectory import (
     Trajectory,
     Undefined,
     align,
-    align_to_waypoints,
     positions_at,
     relative_yaw,
 )
@@ -43,8 +42,7 @@ LEAST_SECONDS = 10.0
 """Time below which `yaw_drift` says nothing of an hour, s."""
 
 
-# Errors of positions
-# --------------------------------------------------------------------------------------------------
+# --- errors of positions
 
 
 def ate(estimate: Positions, reference: Positions) -> float:
@@ -111,9 +109,11 @@ def rpe(
     ψ is the yaw error at the start (`relative_yaw`), so a wrong heading of the whole trajectory
     costs nothing. With `dims` 2 it is of the horizontal part.
     """
-    apart = _rows_apart(estimate, step, seconds)
-    yaw = relative_yaw(estimate.orientation[:-apart], reference.orientation[:-apart])
-    return _rms_of_moves(rotation_z(-yaw), estimate, reference, apart, seconds, dims)
+
+    def turn(ours: Quaternions, true: Quaternions) -> Float[np.ndarray, "m 3 3"]:
+        return rotation_z(-relative_yaw(ours, true))
+
+    return _rms_of_moves(turn, estimate, reference, step, seconds, dims)
 
 
 def rpe_se3(
@@ -121,34 +121,32 @@ def rpe_se3(
 ) -> float:
     """The translation part of the relative pose error with the full attitude at the start aligned,
     over all pairs, m (TUM, evo): RMS of R_i R̂_iᵀ (p̂_j − p̂_i) − (p_j − p_i)."""
-    apart = _rows_apart(estimate, step, seconds)
-    ours, true = (matrix_from_quaternion(x.orientation[:-apart]) for x in (estimate, reference))
-    turn = true @ np.swapaxes(ours, 1, 2)
-    return _rms_of_moves(turn, estimate, reference, apart, seconds, dims)
+
+    def turn(ours: Quaternions, true: Quaternions) -> Float[np.ndarray, "m 3 3"]:
+        return matrix_from_quaternion(true) @ np.swapaxes(matrix_from_quaternion(ours), 1, 2)
+
+    return _rms_of_moves(turn, estimate, reference, step, seconds, dims)
 
 
 def _rms_of_moves(
-    turn: Float[np.ndarray, "m 3 3"],
+    turn: Callable[[Quaternions, Quaternions], Float[np.ndarray, "m 3 3"]],
     estimate: Trajectory,
     reference: Trajectory,
-    apart: int,
+    step: float,
     seconds: float,
     dims: int,
 ) -> float:
-    """RMS of the estimated displacements, turned, minus the true ones; over the pairs whose start
-    has a trusted orientation too."""
-    moved, true = (x.position[apart:] - x.position[:-apart] for x in (estimate, reference))
-    error = np.einsum("nij,nj->ni", turn, moved) - true
-    error = error[:, :dims]
-    oriented = finite_rows(reference.orientation[:-apart])
-    return _rms_of_pairs(error, finite_rows(reference.position), apart, seconds, oriented)
-
-
-def _rows_apart(estimate: Trajectory, step: float, seconds: float) -> int:
+    """RMS of the estimated displacements, turned by what the orientations at their starts say,
+    minus the true ones; over the pairs whose start has a trusted orientation too."""
     apart = round(seconds / step)
     if apart >= len(estimate.time):
         raise Undefined(f"no two trusted rows {seconds:g} s apart")
-    return apart
+    moved, true = (x.position[apart:] - x.position[:-apart] for x in (estimate, reference))
+    ours, theirs = (x.orientation[:-apart] for x in (estimate, reference))
+    error = (np.einsum("nij,nj->ni", turn(ours, theirs), moved) - true)[:, :dims]
+    return _rms_of_pairs(
+        error, finite_rows(reference.position), apart, seconds, finite_rows(theirs)
+    )
 
 
 def _rms_of_pairs(
@@ -176,8 +174,7 @@ def _trusted_errors(estimate: Positions, reference: Positions) -> Float[np.ndarr
     return (estimate - reference)[trusted]
 
 
-# Paths
-# --------------------------------------------------------------------------------------------------
+# --- paths
 
 
 def path_length(position: Positions, step: float, seconds: float = 1.0) -> float:
@@ -243,8 +240,7 @@ def stationary_drift(estimate: Positions, reference: Positions, step: float) -> 
     return float(walked / (seconds / 60))
 
 
-# Legs: the straight lines from a waypoint to the next
-# --------------------------------------------------------------------------------------------------
+# --- legs: the straight lines from a waypoint to the next
 
 
 def leg_ratio(estimate: Positions, waypoints: Positions) -> float:
@@ -276,8 +272,7 @@ def _length(corners: Positions) -> float:
     return float(np.linalg.norm(np.diff(corners, axis=0), axis=1).sum())
 
 
-# Yaw
-# --------------------------------------------------------------------------------------------------
+# --- yaw
 
 
 def yaw_rmse(estimate: Quaternions, reference: Quaternions) -> float:
@@ -304,8 +299,7 @@ def _oriented(reference: Quaternions) -> Int[np.ndarray, "m"]:
     return rows
 
 
-# Consistency of the filter
-# --------------------------------------------------------------------------------------------------
+# --- consistency of the filter
 
 
 def normalised_squared(
@@ -352,8 +346,7 @@ def _present(values: Float[np.ndarray, "n"]) -> Float[np.ndarray, "m"]:
     return present
 
 
-# All metrics of a sequence
-# --------------------------------------------------------------------------------------------------
+# --- all metrics of a sequence
 
 
 class Filtered(NamedTuple):
@@ -383,8 +376,14 @@ class Compared(NamedTuple):
     waypoints: Waypoints | None = None
     dims: int = 3
 
-    def of(self, path: Trajectory) -> Positions:
-        return path.position[:, : self.dims]
+    @property
+    def paths(self) -> tuple[Positions, Positions]:
+        """Of the aligned estimate and of the reference."""
+        return self.aligned.position[:, : self.dims], self.reference.position[:, : self.dims]
+
+    @property
+    def raw_paths(self) -> tuple[Positions, Positions]:
+        return self.raw.position[:, : self.dims], self.reference.position[:, : self.dims]
 
     def at_waypoints(self) -> tuple[Positions, Positions]:
         """The aligned estimate's positions, and the waypoints that are within it."""
@@ -412,20 +411,21 @@ class Compared(NamedTuple):
 
 Metric = Callable[[Compared], float]
 
+PATH: dict[str, Metric] = {"path_length": lambda c: path_length(c.paths[1], c.step)}
 SPATIAL: dict[str, Metric] = {
-    "ate": lambda c: ate(c.of(c.aligned), c.of(c.reference)),
-    "ate_ronin": lambda c: ate(c.of(c.aligned), c.of(c.reference)) / math.sqrt(c.dims),
-    "ate_mean": lambda c: ate_mean(c.of(c.aligned), c.of(c.reference)),
-    "rte_60s": lambda c: rte(c.of(c.aligned), c.of(c.reference), c.step),
-    "rte_60s_ronin": lambda c: rte(c.of(c.aligned), c.of(c.reference), c.step) / math.sqrt(c.dims),
-    "rte_1m": lambda c: rte_distance(c.of(c.aligned), c.of(c.reference), 1.0),
-    "rte_10m": lambda c: rte_distance(c.of(c.aligned), c.of(c.reference), 10.0),
+    "ate": lambda c: ate(*c.paths),
+    "ate_ronin": lambda c: ate(*c.paths) / math.sqrt(c.dims),
+    "ate_mean": lambda c: ate_mean(*c.paths),
+    "rte_60s": lambda c: rte(*c.paths, c.step),
+    "rte_60s_ronin": lambda c: rte(*c.paths, c.step) / math.sqrt(c.dims),
+    "rte_1m": lambda c: rte_distance(*c.paths, 1.0),
+    "rte_10m": lambda c: rte_distance(*c.paths, 10.0),
     "rpe_1s": lambda c: rpe(c.raw, c.reference, c.step, 1.0, c.dims),
     "rpe_10s": lambda c: rpe(c.raw, c.reference, c.step, 10.0, c.dims),
     "rpe_se3": lambda c: rpe_se3(c.raw, c.reference, c.step, 1.0, c.dims),
-    "drift": lambda c: drift(c.of(c.aligned), c.of(c.reference), c.step),
-    "path_length_ratio": lambda c: path_length_ratio(c.of(c.raw), c.of(c.reference), c.step),
-    "stationary_drift": lambda c: stationary_drift(c.of(c.raw), c.of(c.reference), c.step),
+    "drift": lambda c: drift(*c.paths, c.step),
+    "path_length_ratio": lambda c: path_length_ratio(*c.raw_paths, c.step),
+    "stationary_drift": lambda c: stationary_drift(*c.raw_paths, c.step),
 }
 """In 3-D, and in 2-D as `<name>_2d`. Those of `_ronin` average over components too: they are the
 others over √d (RoNIN, DeepILS)."""
@@ -444,6 +444,10 @@ OF_FILTER: dict[str, Metric] = {
     "accepted": lambda c: accepted_share(c.of_filter().accepted),
 }
 """They need no reference."""
+LEGS: dict[str, Metric] = {
+    "path_length": lambda c: _length(c.at_waypoints()[1]),
+    "legs": lambda c: float(len(c.at_waypoints()[1]) - 1),
+}
 OF_WAYPOINTS: dict[str, Metric] = {
     "leg_ratio": lambda c: leg_ratio(*c.at_waypoints()),
     "leg_path_ratio": lambda c: leg_path_ratio(*c.at_waypoints()),
@@ -459,6 +463,8 @@ NAMES = (
 )
 POSITION_ERRORS = ("ate", "waypoint_rms")
 """One of them is the error of the positions of a sequence."""
+OF_REFERENCE = {"path_length", "legs"}
+"""They are finite whatever the estimate is."""
 SHARES = {"nees_coverage", "nees_coverage_2d", "nis_coverage", "accepted"}
 """Metrics that are small when they are bad: 0 for an estimate that diverged."""
 
@@ -483,8 +489,7 @@ def measure(
     waypoints: Waypoints | None = None,
 ) -> Measures:
     """Every metric of one sequence. `reference` has the estimate's stamps. With `waypoints` there
-    is no other reference: the estimate is turned and shifted to them (`align_to_waypoints`), and
-    the metrics are those of `OF_WAYPOINTS` and of the filter.
+    is no other reference, and the metrics are those of `OF_WAYPOINTS` and of the filter.
 
     `ate*`, `rte*`, `drift` and `yaw_rmse` see the estimate under `alignment`, which is fitted in
     3-D for the horizontal ones too. NEES is taken with the start aligned, because the filter's
@@ -503,59 +508,45 @@ def measure(
         path = Trajectory(estimate.time, np.zeros_like(estimate.position), level)
     aligned, started, missing = path, path, ""
     try:
-        if waypoints is not None:
-            aligned = align_to_waypoints(path, waypoints)
-        else:
-            aligned, started = align(path, reference, alignment), align(path, reference)
+        aligned = align(path, waypoints or reference, alignment)
+        started = align(path, waypoints or reference)
     except Undefined as undefined:
         missing = str(undefined)
     step = float(np.median(np.diff(path.time))) if len(path.time) > 1 else 1.0
     compared = Compared(path, aligned, started, reference, step, filtered, waypoints)
     values: dict[str, float | None] = {"duration": float(path.time[-1] - path.time[0])}
     reasons: dict[str, str] = {}
-
-    def put(name: str, metric: Metric, seen: Compared, lost: str = lost) -> None:
+    for name, metric, seen in _metrics(compared):
         try:
             if missing and name not in OF_FILTER:
                 raise Undefined(missing)
             with np.errstate(over="ignore", invalid="ignore"):
                 value = metric(seen)
-            if reason := lost or ("" if math.isfinite(value) else _why_infinite(name)):
+            reason = "" if name in OF_REFERENCE else lost
+            if not reason and not math.isfinite(value):
+                reason = "the error is too large for a number"
+                if name.startswith("nees"):
+                    reason = "the filter's covariance is not positive definite"
+            if reason:
                 value, reasons[name] = (0.0 if name in SHARES else math.inf), reason
             values[name] = value
         except Undefined as undefined:
             values[name], reasons[name] = None, str(undefined)
-
-    if waypoints is None:
-        put("path_length", lambda c: path_length(c.of(c.reference), c.step), compared, lost="")
-    else:
-        put("path_length", lambda c: _length(c.at_waypoints()[1]), compared, lost="")
-        put("legs", lambda c: float(len(c.at_waypoints()[1]) - 1), compared, lost="")
-    for name, metric, seen in _metrics(compared):
-        put(name, metric, seen)
     far = any(values.get(name) == math.inf for name in POSITION_ERRORS)
     return Measures(values, reasons, bool(lost) or far)
 
 
 def _metrics(compared: Compared) -> Iterator[tuple[str, Metric, Compared]]:
     """Name, metric and what it is of, in the order of the files."""
-    has_filter = compared.filtered is not None
-    if compared.waypoints is not None:
-        for name, metric in (OF_WAYPOINTS | OF_FILTER if has_filter else OF_WAYPOINTS).items():
-            yield name, metric, compared
-        return
-    for dims, tag in ((3, ""), (2, "_2d")):
-        seen = compared._replace(dims=dims)
-        for name, metric in (SPATIAL | NEES if has_filter else SPATIAL).items():
-            yield name + tag, metric, seen
-    for name, metric in (OTHERS | OF_FILTER if has_filter else OTHERS).items():
-        yield name, metric, compared
-
-
-def _why_infinite(name: str) -> str:
-    if name.startswith("nees"):
-        return "the filter's covariance is not positive definite"
-    return "the error is too large for a number"
+    nees, of_filter = ({}, {}) if compared.filtered is None else (NEES, OF_FILTER)
+    if compared.waypoints is None:
+        spatial = SPATIAL | nees
+        groups = [(3, "", PATH | spatial), (2, "_2d", spatial), (3, "", OTHERS | of_filter)]
+    else:
+        groups = [(3, "", LEGS | OF_WAYPOINTS | of_filter)]
+    for dims, tag, metrics in groups:
+        for name, metric in metrics.items():
+            yield name + tag, metric, compared._replace(dims=dims)
 
 
 def score(estimates: Iterable[Any], alignment: Alignment = "origin") -> dict[str, Measures]:

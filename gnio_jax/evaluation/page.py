@@ -81,8 +81,7 @@ class Run(NamedTuple):
     """Everything that was configured, as text of several lines."""
 
 
-# What the page shows of an evaluation
-# --------------------------------------------------------------------------------------------------
+# --- what the page shows of an evaluation
 
 
 def of_report(
@@ -133,8 +132,7 @@ def beside(folder: Path, settings: Mapping[str, Any]) -> list[Run]:
     return [run for run in found.values() if run is not None]
 
 
-# The file
-# --------------------------------------------------------------------------------------------------
+# --- the file
 
 
 def write(path: Path, title: str, runs: list[Run]) -> None:
@@ -174,8 +172,7 @@ def _file(name: str) -> str:
     return resources.files(__package__).joinpath(name).read_text(encoding="utf-8")
 
 
-# Columns
-# --------------------------------------------------------------------------------------------------
+# --- columns
 
 
 def _held(run: Run, sequences: list[str], rows: int) -> list[Columns]:
@@ -255,8 +252,7 @@ def frame(runs: list[Run], sequence: str) -> dict[str, list[float]]:
     return {"x": [float(low[0]), float(high[0])], "y": [float(low[1]), float(high[1])]}
 
 
-# The figures
-# --------------------------------------------------------------------------------------------------
+# --- the figures
 
 
 class Sources(NamedTuple):

@@ -55,8 +55,7 @@ TITLE = {"ate": "ATE", "ate_2d": "in 2-D", "waypoint_rms": "rms at waypoints"}
 NO_WAYPOINTS = Waypoints(np.zeros(0), np.zeros((0, 2)))
 
 
-# What is drawn of an estimate
-# --------------------------------------------------------------------------------------------------
+# --- what is drawn of an estimate
 
 
 class Taps(NamedTuple):
@@ -177,8 +176,7 @@ def speed(position: Float[np.ndarray, "n 3"], step: float) -> Float[np.ndarray, 
     return found
 
 
-# One sequence
-# --------------------------------------------------------------------------------------------------
+# --- one sequence
 
 
 def sequence(seen: View, title: str = "") -> Figure:
@@ -292,8 +290,7 @@ def _draw_accepted(axes: Axes, seen: View) -> None:
     axes.set_ylabel("displacement")
 
 
-# A set of sequences
-# --------------------------------------------------------------------------------------------------
+# --- a set of sequences
 
 
 def error_cdf(views: list[View], report: Report) -> Figure:
@@ -416,8 +413,7 @@ def save_all(folder: Path, views: list[View], report: Report, progress: Progress
         save(folder / "error_cdf.png", error_cdf(views, report))
 
 
-# Parts of a picture
-# --------------------------------------------------------------------------------------------------
+# --- parts of a picture
 
 
 def save(path: Path, figure: Figure) -> None:

@@ -74,8 +74,7 @@ class Report(NamedTuple):
         return {name: statistics.summarise([scores], name, self.groups) for name in metrics}
 
 
-# Written
-# --------------------------------------------------------------------------------------------------
+# --- written
 
 
 def write(
@@ -181,8 +180,7 @@ def _finite(values: Mapping[str, float | None]) -> dict[str, float | None]:
     return {name: None if value == math.inf else value for name, value in values.items()}
 
 
-# Read back
-# --------------------------------------------------------------------------------------------------
+# --- read back
 
 
 def read(folder: Path) -> Report:

@@ -87,8 +87,7 @@ def column(metric: str) -> Column:
     return spatial if metric in COLUMNS else spatial._replace(heading=f"{spatial.heading} 2-D")
 
 
-# Cells
-# --------------------------------------------------------------------------------------------------
+# --- cells
 
 
 def number(value: float | None, digits: int) -> str:
@@ -194,8 +193,7 @@ def marks(cells: Sequence[Cell]) -> list[str]:
     return [line for line, there in applies.items() if there]
 
 
-# How the figures were made
-# --------------------------------------------------------------------------------------------------
+# --- how the figures were made
 
 
 def way(settings: Mapping[str, Any]) -> str:
@@ -254,8 +252,7 @@ def remarks(report: Report) -> list[str]:
     return lines + [f"{name}: the estimate diverged, and is in no mean" for name in report.diverged]
 
 
-# Files
-# --------------------------------------------------------------------------------------------------
+# --- files
 
 
 def markdown(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
@@ -271,8 +268,7 @@ def write(path: Path, text: str, rows: Sequence[Mapping[str, Any]]) -> None:
     write_csv(with_ending(path, ".csv"), [[*rows[0]], *([*row.values()] for row in rows)])
 
 
-# The table of an evaluation on the screen
-# --------------------------------------------------------------------------------------------------
+# --- the table of an evaluation on the screen
 
 
 def render(report: Report) -> Group:

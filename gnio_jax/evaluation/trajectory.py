@@ -8,7 +8,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from gnio_jax.data.parsing.tables import read_text
+from gnio_jax.data.parsing.tables import Table, read_text
 from gnio_jax.data.validation import check_increasing
 from gnio_jax.errors import InputError
 from gnio_jax.numerics import (
@@ -64,15 +64,27 @@ def relative_yaw(estimate: Quaternions, reference: Quaternions) -> Float[np.ndar
     return np.arctan2(2 * scalar * vertical, scalar**2 - vertical**2)
 
 
-def align(estimate: Trajectory, reference: Trajectory, how: Alignment = "origin") -> Trajectory:
+def align(
+    estimate: Trajectory, reference: Trajectory | Waypoints, how: Alignment = "origin"
+) -> Trajectory:
     """The estimate moved into the frame of the reference by one rigid motion.
 
     The motion is fitted to the rows that both trajectories know. `origin` matches position and yaw
     of the first of them, which is what a user of odometry knows. `yaw_position` is the
     least-squares motion of four degrees of freedom, which inertial odometry cannot observe. `se3`
-    is that of all six, without scale (Horn/Kabsch, as evo). `none` changes nothing. Raises
-    `Undefined` if there is no such row, or fewer than three for `se3`.
+    is that of all six, without scale (Horn/Kabsch, as evo). `none` changes nothing. To waypoints,
+    whatever `how` is, the estimate is turned about z and shifted horizontally so that it is nearest
+    to them at their times, in least squares. Raises `Undefined` if there is no such row, or fewer
+    than three for `se3` or two waypoints.
     """
+    if isinstance(reference, Waypoints):
+        passed = positions_at(estimate, reference.time)
+        known = finite_rows(passed)
+        if known.sum() < 2:
+            raise Undefined("fewer than two waypoints are within the estimate")
+        source, target = passed[known].mean(0), reference.position[known].mean(0)
+        turn = _best_turn(passed[known] - source, reference.position[known] - target)
+        return _moved(estimate, turn, np.append(source, 0.0), np.append(target, 0.0))
     if how == "none":
         return estimate
     trusted = reference.known if how == "origin" else finite_rows(reference.position)
@@ -97,22 +109,6 @@ def align(estimate: Trajectory, reference: Trajectory, how: Alignment = "origin"
     return _moved(estimate, turn, source, target)
 
 
-def align_to_waypoints(estimate: Trajectory, waypoints: Waypoints) -> Trajectory:
-    """The estimate turned about z and shifted horizontally so that it is nearest to the waypoints
-    at their times, in least squares.
-
-    Where all waypoints, or all estimated positions, are one place, no turn is better than another,
-    and none is made. Raises `Undefined` if fewer than two waypoints are within the estimate.
-    """
-    passed = positions_at(estimate, waypoints.time)
-    known = finite_rows(passed)
-    if known.sum() < 2:
-        raise Undefined("fewer than two waypoints are within the estimate")
-    source, target = passed[known].mean(0), waypoints.position[known].mean(0)
-    turn = _best_turn(passed[known] - source, waypoints.position[known] - target)
-    return _moved(estimate, turn, np.append(source, 0.0), np.append(target, 0.0))
-
-
 def positions_at(path: Trajectory, stamps: Float[np.ndarray, "k"]) -> Float[np.ndarray, "k 2"]:
     """Horizontal positions at moments, on straight lines between the rows, m. NaN beside a row that
     is not known and at moments further than `NEAR` from the trajectory."""
@@ -124,7 +120,8 @@ def positions_at(path: Trajectory, stamps: Float[np.ndarray, "k"]) -> Float[np.n
 def _best_turn(
     source: Float[np.ndarray, "k _"], target: Float[np.ndarray, "k _"]
 ) -> Float[np.ndarray, "3 3"]:
-    """The turn about z that brings centred points nearest to others, in least squares."""
+    """The turn about z that brings centred points nearest to others, in least squares; none where
+    all of either are one place."""
     sine = source[:, 0] @ target[:, 1] - source[:, 1] @ target[:, 0]
     cosine = source[:, 0] @ target[:, 0] + source[:, 1] @ target[:, 1]
     return rotation_z(np.arctan2(sine, cosine))
@@ -147,11 +144,9 @@ def _moved(
 def in_frame_of(
     path: Trajectory, other: Trajectory | Waypoints, how: Alignment = "origin"
 ) -> Trajectory:
-    """`align`, to look at a trajectory beside another or beside waypoints (`align_to_waypoints`):
-    `path` as it is where that is impossible."""
+    """`align`, to look at a trajectory beside a reference: `path` as it is where that is
+    impossible."""
     try:
-        if isinstance(other, Waypoints):
-            return align_to_waypoints(path, other)
         return align(path, other, how)
     except Undefined:
         return path
@@ -175,11 +170,7 @@ def write_waypoints(path: Path, waypoints: Waypoints) -> None:
 
 def read_waypoints(path: Path) -> Waypoints:
     """Read what `write_waypoints` wrote. Raises `InputError` for anything else."""
-    table = read_text(path, separator=" ", header=False)
-    if table.width() != 3:
-        raise InputError(path, f"has {table.width()} columns, not 3", f"they are {TXY}")
-    table = table.renamed(TXY.split())
-    check_increasing(table.take("t"), path)
+    table = _read_columns(path, TXY)
     return Waypoints(table.take("t"), np.stack([table.take("x"), table.take("y")], 1))
 
 
@@ -191,12 +182,17 @@ def write_tum(path: Path, trajectory: Trajectory) -> None:
 
 def read_tum(path: Path) -> Trajectory:
     """Read a file in TUM format. Raises `InputError` for anything else."""
-    table = read_text(path, separator=" ", header=False)
-    if table.width() != 8:
-        problem = f"has {table.width()} columns, not the 8 of the TUM format"
-        raise InputError(path, problem, f"they are {TUM}")
-    table = table.renamed(TUM.split())
-    time = table.take("t")
-    check_increasing(time, path)
+    table = _read_columns(path, TUM)
     attitude = table.rotations("qx", "qy", "qz", "qw", scalar_first=False)
-    return Trajectory(time, table.axes(""), quaternions(attitude))
+    return Trajectory(table.take("t"), table.axes(""), quaternions(attitude))
+
+
+def _read_columns(path: Path, names: str) -> Table:
+    """A file whose columns are these, the first with stamps that increase."""
+    table, known = read_text(path, separator=" ", header=False), names.split()
+    if table.width() != len(known):
+        problem = f"has {table.width()} columns, not {len(known)}"
+        raise InputError(path, problem, f"they are {names}")
+    table = table.renamed(known)
+    check_increasing(table.take("t"), path)
+    return table

@@ -59,8 +59,7 @@ class Experiment(NamedTuple):
     rows: list[Row]
 
 
-# One row
-# --------------------------------------------------------------------------------------------------
+# --- one row
 
 
 def method(network: str, base: TrainConfig) -> TrainConfig:
@@ -112,8 +111,7 @@ def variant(base: TrainConfig, **options: Any) -> TrainConfig:
     return dataclasses.replace(config, model=dataclasses.replace(config.model, **options))
 
 
-# The tables
-# --------------------------------------------------------------------------------------------------
+# --- the tables
 
 
 def comparison(base: TrainConfig, split: str, networks: tuple[str, ...] = METHODS) -> Experiment:

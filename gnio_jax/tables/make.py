@@ -126,8 +126,7 @@ def hardware() -> str:
     return f"{cores} CPU core{'s' if cores > 1 else ''}"
 
 
-# Rows side by side
-# --------------------------------------------------------------------------------------------------
+# --- rows side by side
 
 
 def make_table(
@@ -219,8 +218,7 @@ def arrow(gain: float | None) -> str:
     return f"{'↓' if gain > 0 else '↑'} {abs(gain):.1f} %"
 
 
-# All methods over the reference, and windows by what the walker did
-# --------------------------------------------------------------------------------------------------
+# --- all methods over the reference, and windows by what the walker did
 
 
 def make_trajectories(path: Path, options: TablesConfig, results: list[Result]) -> str:
@@ -275,8 +273,7 @@ def make_standing(
     return f"{text}\nresults: {path}.md, .png and the pictures beside them"
 
 
-# Complexity
-# --------------------------------------------------------------------------------------------------
+# --- complexity
 
 NETWORKS = ("tlio", "ronin_resnet", "deepils", "ctin", "imot", "imot_text", "gnio")
 PAPERS_COST = {

@@ -132,8 +132,7 @@ def test_without_metrics_the_usual_ones_that_are_there(runs):
     assert list(compare(runs / "plain", runs / "new", metrics=None).cells) == ["ate", "rpe_1s"]
 
 
-# Rows
-# --------------------------------------------------------------------------------------------------
+# --- rows
 
 
 def test_names_without_a_seed_stand_for_all_seeds(tmp_path):
@@ -291,8 +290,7 @@ def test_refusals(runs):
     assert "is there for 1 of 2 seeds; missing: " in refused("seen", f"plain/{own}")
 
 
-# The command
-# --------------------------------------------------------------------------------------------------
+# --- the command
 
 
 def test_the_command_shows_and_writes(runs, capsys):

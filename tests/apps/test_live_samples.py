@@ -1,5 +1,6 @@
 """What is a sample and what is not, rows of one sensor alone, and the drawing in the terminal."""
 
+import itertools
 import math
 
 import numpy as np
@@ -20,69 +21,8 @@ def accel(time, values=PULL):
     return Sample(time, MISSING, values)
 
 
-def test_the_accelerometer_is_interpolated_at_the_stamps_of_the_gyro():
-    """Two clocks, 100 and 60 Hz; rows as they were taken."""
-    random = np.random.default_rng(2)
-    turned, pulled = np.arange(0.02, 1.0, 0.01), np.arange(0.0, 1.02, 1 / 60)
-    forces = random.normal(size=(len(pulled), 3))
-    rows = [gyro(t, (t, 0.0, -t)) for t in turned]
-    rows += [accel(t, tuple(f)) for t, f in zip(pulled, forces.tolist(), strict=True)]
-    found = list(paired(sorted(rows, key=lambda row: row.time)))
-    assert [sample.time for sample in found] == list(turned)
-    assert [sample.gyro for sample in found] == [(t, 0.0, -t) for t in turned]
-    for axis in range(3):
-        wanted = np.interp(turned, pulled, forces[:, axis])
-        np.testing.assert_allclose([sample.accel[axis] for sample in found], wanted, atol=1e-12)
-
-
-def test_whole_rows_come_at_once_and_as_they_are():
-    rows = [Sample(0.1 * k, SPIN, PULL) for k in range(3)]
-    rows += [None, Sample(0.3, MISSING, MISSING), Sample(0.4, (math.nan, 0.0, 0.0), PULL)]
-    taken = []
-
-    def stream():
-        for row in rows:
-            yield row
-            taken.append(len(given))
-
-    given = []
-    for sample in paired(stream()):
-        given.append(sample)
-    assert repr(given) == repr(rows)  # NaN is not NaN
-    assert taken == list(range(1, len(rows) + 1))
-
-
-def test_a_value_that_one_row_lacks_lies_between_its_neighbours():
-    rows = [Sample(0.0, SPIN, (0.0, 0.0, 9.0)), gyro(0.01), Sample(0.02, SPIN, (0.0, 2.0, 10.0))]
-    found = list(paired(rows))
-    assert found[1].accel == pytest.approx((0.0, 1.0, 9.5)) and len(found) == 3
-
-
-def test_without_the_accelerometer_the_gyro_waits_no_longer_than_it_must():
-    """What it gets then is a gap."""
-    rows = [gyro(0.02 * k) for k in range(10)]
-    seen, given = [], paired(seen.append(row) or row for row in rows)
-    assert next(given) == rows[0] and seen[-1].time <= 2 * LONGEST_WAIT
-    assert [sample.time for sample in given] == [row.time for row in rows[1:]]
-    # Readings that are far apart enclose nothing either.
-    rows = [accel(0.0), gyro(0.05), accel(0.2), gyro(0.25), accel(0.29)]
-    found = list(paired(rows))
-    assert [np.isfinite(sample.accel).all() for sample in found] == [False, True]
-
-
-def test_a_reading_that_comes_twice_or_late_is_no_sample():
-    found = list(paired([accel(0.0), accel(0.0), gyro(0.01), accel(0.02), accel(0.01)]))
-    assert sorted(sample.time if sample else 0.0 for sample in found) == [0.0, 0.0, 0.01]
-
-
-def test_lines_of_either_sensor_make_a_stream():
-    lines = [
-        '{"time": 0, "accel": [0, 0, 9]}',
-        '{"time": 0.01, "gyro": [1, 2, 3]}',
-        "0.02,,,,0,0,10",
-    ]
-    found = list(lines_of(lines).samples)
-    assert found == [Sample(0.01, (1.0, 2.0, 3.0), (0.0, 0.0, 9.5))]
+def by_stamp(*rows):
+    return sorted(itertools.chain(*rows), key=lambda row: row.time)
 
 
 def at_100_hz(seconds=5.0):
@@ -95,51 +35,6 @@ def whole(found):
     return [row for row in found if row is not None and np.isfinite([row.gyro, row.accel]).all()]
 
 
-@pytest.mark.parametrize("late", [0.0, 0.006, 0.011, 0.05, 0.09, -0.006, -0.02, -0.05, -0.09])
-def test_either_sensor_may_come_late(late):
-    """In the order of arrival, the gyro `late` s after the accelerometer."""
-    pulled, turned = at_100_hz()
-    rows = [(row.time, row) for row in pulled] + [(row.time + late, row) for row in turned]
-    found = whole(paired(row for _, row in sorted(rows, key=lambda pair: pair[0])))
-    assert [row.time for row in found] == [row.time for row in turned[:-1]]
-
-
-@pytest.mark.parametrize("first", ["accel", "gyro"])
-def test_rows_may_come_in_batches(first):
-    pulled, turned = at_100_hz()
-    rows = []
-    for k in range(0, len(pulled), 5):
-        both = (pulled[k : k + 5], turned[k : k + 5])
-        for batch in both if first == "accel" else both[::-1]:
-            rows += batch
-    assert len(whole(paired(rows))) == len(turned) - 1
-
-
-@pytest.mark.parametrize("sensor", [gyro, accel])
-@pytest.mark.parametrize("off", [1e6, 5.0, -5.0])
-def test_one_wrong_stamp_holds_nothing_up(sensor, off):
-    """What a tracker makes of one that comes through is its own matter."""
-    pulled, turned = at_100_hz()
-    wrong = sensor(2.0 + off)
-    rows = sorted([*pulled, *turned], key=lambda row: row.time)
-    rows.insert(400, wrong)
-    taken = []
-    found = []
-    for row in paired(taken.append(row) or row for row in rows):
-        found.append(row)
-        assert len(taken) - 2 * len(found) < 50
-    assert len([row for row in whole(found) if row.time != wrong.time]) > len(turned) - 25
-
-
-@pytest.mark.parametrize(
-    "then",
-    [gyro(1.0), Sample(1.0, MISSING, (math.nan, 0.0, 0.0)), Sample(1.0, MISSING, MISSING)],
-)
-def test_a_clock_that_stands_still_gives_no_samples(then):
-    found = list(paired([gyro(1.0), *[then] * 999]))
-    assert found.count(None) >= 998
-
-
 def taken_by_a_tracker(rows):
     """What comes out, less what comes too late for a tracker, which wants increasing stamps."""
     found, newest = [], -math.inf
@@ -150,10 +45,125 @@ def taken_by_a_tracker(rows):
     return found
 
 
+# --- sensors with rows of their own
+
+
+def test_the_accelerometer_is_interpolated_at_the_stamps_of_the_gyro():
+    """Two clocks, 100 and 60 Hz; rows as they were taken."""
+    random = np.random.default_rng(2)
+    turned, pulled = np.arange(0.02, 1.0, 0.01), np.arange(0.0, 1.02, 1 / 60)
+    forces = random.normal(size=(len(pulled), 3))
+    rows = [gyro(t, (t, 0.0, -t)) for t in turned]
+    rows += [accel(t, tuple(f)) for t, f in zip(pulled, forces.tolist(), strict=True)]
+    found = list(paired(by_stamp(rows)))
+    assert [sample.time for sample in found] == list(turned)
+    assert [sample.gyro for sample in found] == [(t, 0.0, -t) for t in turned]
+    for axis in range(3):
+        wanted = np.interp(turned, pulled, forces[:, axis])
+        np.testing.assert_allclose([sample.accel[axis] for sample in found], wanted, atol=1e-12)
+
+
+def test_whole_rows_come_at_once_and_as_they_are():
+    rows = [Sample(0.1 * k, SPIN, PULL) for k in range(3)]
+    rows += [None, Sample(0.3, MISSING, MISSING), Sample(0.4, (math.nan, 0.0, 0.0), PULL)]
+    taken, given = [], []
+
+    def stream():
+        for row in rows:
+            yield row
+            taken.append(len(given))
+
+    for sample in paired(stream()):
+        given.append(sample)
+    assert repr(given) == repr(rows)  # NaN is not NaN
+    assert taken == list(range(1, len(rows) + 1))
+
+
+@pytest.mark.parametrize(
+    "rows, samples",
+    [
+        (  # a value that one row lacks lies between its neighbours
+            [Sample(0.0, SPIN, (0.0, 0.0, 9.0)), gyro(0.01), Sample(0.02, SPIN, (0.0, 2.0, 10.0))],
+            [(0.0, (0.0, 0.0, 9.0)), (0.01, (0.0, 1.0, 9.5)), (0.02, (0.0, 2.0, 10.0))],
+        ),
+        (  # readings that are far apart enclose nothing
+            [accel(0.0), gyro(0.05), accel(0.2), gyro(0.25), accel(0.29)],
+            [(0.05, MISSING), (0.25, PULL)],
+        ),
+        # A reading at the same stamp needs no other.
+        ([accel(0.0), gyro(0.5), accel(0.5)], [(0.5, PULL)]),
+        # One that comes twice or late is no sample.
+        (
+            [accel(0.0), accel(0.0), gyro(0.01), accel(0.02), accel(0.01)],
+            [None, None, (0.01, PULL)],
+        ),
+    ],
+)
+def test_few_rows_by_hand(rows, samples):
+    found = [each and (each.time, each.accel) for each in paired(rows)]
+    assert [*map(str, found)] == [*map(str, samples)]
+
+
+def test_without_the_accelerometer_the_gyro_waits_no_longer_than_it_must():
+    """What it gets then is a gap."""
+    rows = [gyro(0.02 * k) for k in range(10)]
+    seen, given = [], paired(seen.append(row) or row for row in rows)
+    assert next(given) == rows[0] and seen[-1].time <= 2 * LONGEST_WAIT
+    assert [sample.time for sample in given] == [row.time for row in rows[1:]]
+
+
+@pytest.mark.parametrize("late", [0.0, 0.006, 0.011, 0.05, 0.09, -0.006, -0.02, -0.05, -0.09])
+@pytest.mark.parametrize("between", [None, 0.02])
+def test_either_sensor_may_come_late(late, between):
+    """In the order of arrival, the gyro `late` s after the accelerometer: where rows of it are
+    missing, and where empty ones come between, as of a third sensor, none is overtaken."""
+    pulled, turned = at_100_hz()
+    turned = [*turned[:200], *turned[203:]]
+    rows = [(row.time, row) for row in pulled] + [(row.time + late, row) for row in turned]
+    if between:
+        times = np.arange(1.001, 5.0, between)  # once the gyro has rows of its own
+        rows += [(time, Sample(time, MISSING, MISSING)) for time in times]
+    arrived = [row for _, row in sorted(rows, key=lambda pair: pair[0])]
+    found = whole(taken_by_a_tracker(arrived))
+    assert [row.time for row in found] == [row.time for row in turned[:-1]]
+
+
+@pytest.mark.parametrize("length", [5, 8, 10])
+@pytest.mark.parametrize("first", ["accel", "gyro"])
+def test_rows_may_come_in_batches(first, length):
+    pulled, turned = at_100_hz()
+    rows = []
+    for k in range(0, len(pulled), length):
+        both = (pulled[k : k + length], turned[k : k + length])
+        rows += itertools.chain(*(both if first == "accel" else both[::-1]))
+    assert len(whole(taken_by_a_tracker(rows))) >= len(turned) - 1
+
+
+@pytest.mark.parametrize("sensor", [gyro, accel])
+@pytest.mark.parametrize("off", [1e6, 5.0, -5.0])
+def test_one_wrong_stamp_holds_nothing_up(sensor, off):
+    """What a tracker makes of one that comes through is its own matter."""
+    pulled, turned = at_100_hz()
+    wrong, rows = sensor(2.0 + off), by_stamp(pulled, turned)
+    rows.insert(400, wrong)
+    taken, found = [], []
+    for row in paired(taken.append(row) or row for row in rows):
+        found.append(row)
+        assert len(taken) - 2 * len(found) < 50
+    assert len([row for row in whole(found) if row.time != wrong.time]) > len(turned) - 25
+
+
+@pytest.mark.parametrize("then", [SPIN, (math.nan, 0.0, 0.0), MISSING])
+def test_a_clock_that_stands_still_gives_no_samples(then):
+    then = gyro(1.0) if then == SPIN else Sample(1.0, MISSING, then)
+    found = list(paired([gyro(1.0), *[then] * 999]))
+    assert found.count(None) >= 998
+
+
 def test_where_the_gyro_falls_silent_time_passes():
     """Also after a clock that was set back, and after a first stamp that was wrong."""
     pulled, turned = at_100_hz(2.0)
-    rows = sorted([*pulled, *turned[:100]], key=lambda row: row.time)
+    rows = by_stamp(pulled, turned[:100])
     found = taken_by_a_tracker(rows)
     silent = found[-1]
     assert silent.time == pytest.approx(1.88, abs=0.02) and math.isnan(silent.gyro[0])
@@ -164,54 +174,14 @@ def test_where_the_gyro_falls_silent_time_passes():
     assert len(list(paired([*rows, *back]))) == pytest.approx(len(found) + 189, abs=3)
 
 
-@pytest.mark.parametrize("late", [0.0, 0.02, 0.05, 0.09])
-@pytest.mark.parametrize("between", [None, 0.02])
-def test_no_row_overtakes_a_late_gyro(late, between):
-    """Where rows of it are missing, and where empty ones come between, as of a third sensor."""
-    pulled, turned = at_100_hz()
-    turned = [*turned[:200], *turned[203:]]
-    rows = [(row.time, row) for row in pulled] + [(row.time + late, row) for row in turned]
-    if between:
-        times = np.arange(1.001, 5.0, between)  # once the gyro has rows of its own
-        rows += [(time, Sample(time, MISSING, MISSING)) for time in times]
-    arrived = [row for _, row in sorted(rows, key=lambda pair: pair[0])]
-    found = taken_by_a_tracker(arrived)
-    assert [row.time for row in whole(found)] == [row.time for row in turned[:-1]]
-
-
-@pytest.mark.parametrize("length", [8, 10])
-def test_batches_of_the_accelerometer_overtake_nothing(length):
-    pulled, turned = at_100_hz()
-    rows = []
-    for k in range(0, len(pulled), length):
-        rows += pulled[k : k + length] + turned[k : k + length]
-    assert len(whole(taken_by_a_tracker(rows))) >= len(turned) - 1
-
-
-def test_an_empty_row_lets_others_wait():
-    """As the third sensor of a log has them."""
-    pulled, turned = at_100_hz(1.0)
-    rows = sorted([*pulled, *turned], key=lambda row: row.time)
-    rows = [each for row in rows for each in (row, Sample(row.time + 1e-3, MISSING, MISSING))]
-    assert len(whole(paired(rows))) == len(turned) - 1
-
-
 @pytest.mark.parametrize("start", [0.0, 1.7e9])
 def test_an_accelerometer_of_10_hz_is_enough(start):
     pulled = [accel(start + k / 10) for k in range(50)]
     turned = [gyro(start + k / 100 + 0.001) for k in range(490)]
-    rows = sorted([*pulled, *turned], key=lambda row: row.time)
-    assert len(whole(paired(rows))) == 490
+    assert len(whole(paired(by_stamp(pulled, turned)))) == 490
 
 
-def test_a_reading_at_the_same_stamp_needs_no_other():
-    assert list(paired([accel(0.0), gyro(0.5), accel(0.5)])) == [Sample(0.5, SPIN, PULL)]
-
-
-# Lines, and the drawing
-# --------------------------------------------------------------------------------------------------
-
-SAMPLE = Sample(1.5, (0.1, -0.2, 0.3), (0.0, 1.0, 9.81))
+# --- lines
 
 
 @pytest.mark.parametrize(
@@ -225,13 +195,16 @@ SAMPLE = Sample(1.5, (0.1, -0.2, 0.3), (0.0, 1.0, 9.81))
     ],
 )
 def test_a_sample_may_be_written_in_several_ways(line):
-    assert parse_line(line) == SAMPLE
+    assert parse_line(line) == Sample(1.5, (0.1, -0.2, 0.3), (0.0, 1.0, 9.81))
 
 
 def test_what_is_missing_is_nan():
     for line in ("2,,0,0,1,1,nan", '{"time": 2, "gyro": [null, 0, 0], "accel": [1, 1, null]}'):
         found = parse_line(line)
         assert found is not None and math.isnan(found.gyro[0]) and math.isnan(found.accel[2])
+    lines = ['{"time": 0, "accel": [0, 0, 9]}', '{"time": 0.01, "gyro": [1, 2, 3]}']
+    (found,) = lines_of([*lines, "0.02,,,,0,0,10"]).samples
+    assert found == Sample(0.01, (1.0, 2.0, 3.0), (0.0, 0.0, 9.5))
 
 
 @pytest.mark.parametrize(
@@ -262,34 +235,35 @@ def test_what_is_no_sample(line):
 
 
 @given(st.text(max_size=200))
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=100, deadline=None)
 def test_no_text_at_all_is_an_error(text):
     found = parse_line(text)
     assert found is None or math.isfinite(found.time)
 
 
+# --- the drawing
+
+
 def dots(text):
     """Set dots of a drawing, (row, column) from the top left."""
-    bits = {0: (0, 0), 1: (1, 0), 2: (2, 0), 3: (0, 1), 4: (1, 1), 5: (2, 1), 6: (3, 0), 7: (3, 1)}
-    found = set()
-    for row, line in enumerate(text.split("\n")):
-        for column, character in enumerate(line):
-            if 0x2800 <= ord(character) <= 0x28FF:
-                for bit, (down, across) in bits.items():
-                    if ord(character) - 0x2800 >> bit & 1:
-                        found.add((4 * row + down, 2 * column + across))
-    return found
+    bits = [(0, 0), (1, 0), (2, 0), (0, 1), (1, 1), (2, 1), (3, 0), (3, 1)]
+    return {
+        (4 * row + down, 2 * column + across)
+        for row, line in enumerate(text.split("\n"))
+        for column, character in enumerate(line)
+        if 0x2800 <= ord(character) <= 0x28FF
+        for bit, (down, across) in enumerate(bits)
+        if ord(character) - 0x2800 >> bit & 1
+    }
 
 
 def test_the_drawing_has_one_scale_and_y_up():
     corner = np.array([[0.0, 0, 0]] * 3 + [[k, 0, 0] for k in range(30)])
     corner = np.concatenate([corner, [[29.0, k, 0] for k in range(30)]])
-    text = drawing(corner, 40, 20)
-    assert [len(line) for line in text.split("\n")] == [40] * 20
-    row, column = next(
-        (r, line.index("●")) for r, line in enumerate(text.split("\n")) if "●" in line
-    )
-    found = dots(text)
+    lines = drawing(corner, 40, 20).split("\n")
+    assert [len(line) for line in lines] == [40] * 20
+    row, column = next((r, line.index("●")) for r, line in enumerate(lines) if "●" in line)
+    found = dots("\n".join(lines))
     lowest, leftmost = max(down for down, _ in found), min(across for _, across in found)
     # From the bottom left to the right, then up to the marker; as high as it is wide.
     assert (lowest, leftmost) in found

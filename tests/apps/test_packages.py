@@ -98,11 +98,19 @@ def with_changes(package, **changes):
 
 
 @pytest.mark.parametrize("name", ["walk", "small.zip"])
-def test_a_package_is_the_run(run, published, name):
+def test_a_package_is_the_run(run, published, name, tmp_path, gnio):
+    """And the run that is made of it is the same network."""
     own, loaded = checkpoint.load_run(run), gnio_jax.load_pretrained(published / name)
-    jax.tree.map(np.testing.assert_array_equal, loaded.variables, own.variables)
     assert loaded.config == dataclasses.replace(CONFIG, data_root=None, init_from=None)
-    assert loaded.model == own.model and (loaded.epoch, loaded.step) == (own.epoch, own.step)
+    out = tmp_path / "runs" / "made"
+    assert f"gnio evaluate --workdir {out}" in gnio("weights", published / name, "--out", out)
+    made = checkpoint.load_run(out)
+    assert made.config == dataclasses.replace(loaded.config, workdir=str(out))
+    for each in (loaded, made):
+        jax.tree.map(np.testing.assert_array_equal, each.variables, own.variables)
+        assert each.model == own.model and (each.epoch, each.step) == (own.epoch, own.step)
+    with pytest.raises(InputError, match="is there already; name another folder"):
+        packages.write_run(published / name, out)
 
 
 def test_the_files_are_what_other_programs_read(run, published):
@@ -135,7 +143,20 @@ def test_the_card_has_what_the_publisher_and_the_evaluations_say(published):
         "| synthetic_test_ekf | 2 | 2 | 1.25 (0.61 to 1.89) | – |",
     ):
         assert words in card
-    assert "calibrate" not in card
+    assert "calibrate" not in card and "fitted" not in card
+
+
+@pytest.mark.parametrize(
+    "calibrated, shown", [("walk", "walk"), ("runs/half", "half"), ("other/run", "run")]
+)
+def test_the_card_says_to_what_the_filter_was_fitted(run, tmp_path, calibrated, shown):
+    """By the network itself, or by another one whose filter it has taken over."""
+    own = shutil.copytree(run, tmp_path / "walk_calibrated")
+    (own / "calibration.json").write_text(json.dumps({"run": calibrated, "split": "val"}))
+    packages.publish(own, tmp_path / "package", SAID)
+    card = packages.card_of(tmp_path / "package")
+    assert f"gnio calibrate --workdir runs/{shown}\n" in card
+    assert f"The filter is fitted to split `val` of run `{shown}`." in card
 
 
 def test_the_card_has_the_legs_of_walks_with_waypoints(run, tmp_path):
@@ -263,8 +284,7 @@ def test_the_command(run, tmp_path, gnio, capsys):
     assert (tmp_path / "other" / "thesis.txt").read_text() == "mine"
 
 
-# The network that comes with gnio-jax
-# --------------------------------------------------------------------------------------------------
+# --- the network that comes with gnio-jax
 
 
 def test_the_shipped_network_is_the_default_and_small(monkeypatch):
@@ -274,7 +294,13 @@ def test_the_shipped_network_is_the_default_and_small(monkeypatch):
     assert sum(file.stat().st_size for file in place.iterdir()) < 5e6
     about = packages.read_about(place)
     assert "Tyrex" in about.data and "CeCILL 2.1" in about.license
-    for words in ("gnio train", "seed 0", "oxiod_sessions_test_ekf | 7 | 3 |", "Runs come out"):
+    for words in (
+        "gnio train",
+        "gnio calibrate",
+        "seed 0",
+        "oxiod_sessions_test_ekf | 7 | 3 |",
+        "Runs come out",
+    ):
         assert words in packages.card_of("pedestrian")
 
 
@@ -288,17 +314,6 @@ def test_the_shipped_network_answers():
     still[..., 2] = 9.81
     prediction = quick(run.model.apply)(run.variables, still)
     assert np.linalg.norm(prediction.displacement) < 0.1
-
-
-def test_a_run_of_a_package_is_the_same_network(tmp_path, gnio):
-    out = tmp_path / "runs" / "pedestrian"
-    assert f"gnio evaluate --workdir {out}" in gnio("weights", "pedestrian", "--out", out)
-    found, packed = checkpoint.load_run(out), gnio_jax.load_pretrained("pedestrian")
-    assert found.config == dataclasses.replace(packed.config, workdir=str(out))
-    assert (found.epoch, found.step) == (packed.epoch, packed.step)
-    jax.tree.map(np.testing.assert_array_equal, found.variables, packed.variables)
-    with pytest.raises(InputError, match="is there already; name another folder"):
-        packages.write_run("pedestrian", out)
 
 
 def test_a_card_is_shown(gnio, capsys, tmp_path):

@@ -117,7 +117,7 @@ def test_a_bag_with_a_reference(gnio, runs, tmp_path):
     assert f"{ate:.2f} m" in told and "against the reference" in told
     limits = next(line for line in told.splitlines() if line.startswith("limits:"))
     assert limits == summary["limits"]
-    for words in (f"{length:.1f} m in 6 s", "expect more", "dataset synthetic, split train"):
+    for words in (f"{length:.1f} m in 6 s", "expect more", "weights walker;"):
         assert words in limits
     assert "IMU /imu/data" in told and f"results: {out}" in told
 

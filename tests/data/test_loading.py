@@ -119,19 +119,27 @@ def test_sequences_warnings_and_errors_do_not_depend_on_the_workers(tmp_path, da
         found += [outcome(dataset(*recordings), workers) for _ in range(2)]  # cold and cached
     names, notes, error = found[0]
     assert found == [found[0]] * 4
-    told = [
-        "b.csv: a gap was cut off",
-        "c: left out: c.csv: its clock is ruined; leave it out",
-        "d.csv: is short",
-    ]
+    told = ["b.csv: a gap was cut off", "d.csv: is short"]
+    refused = "c: left out: c.csv: its clock is ruined; leave it out"
     if damage:
         assert names == [] and error == "g.csv: field 'gyro' is NaN; copy it again"
     else:
         assert names == ["a", "b", "d", "e2"] and error == ""
         told.append("e: syn is used: e.csv: field 'time' is ruined; leave it out")
-        assert notes[-1][0].startswith("f: left out by the self-check: mean of R·accel")
-        notes = notes[:-1]
-    assert notes == [(text, UserWarning) for text in told]
+        assert notes[-2][0].startswith("f: left out by the self-check: mean of R·accel")
+        del notes[-2]
+    assert notes == [(text, UserWarning) for text in [*told, refused]]
+
+
+def test_recordings_that_are_left_out_for_one_reason_are_one_line(tmp_path):
+    alike = [slow(tmp_path, name, refusal="holds 2 waypoints") for name in "bcd"]
+    about = dataset(slow(tmp_path, "a"), *alike, slow(tmp_path, "e", refusal="its clock is ruined"))
+    _, notes, _ = outcome(about, 1)
+    assert [text for text, _ in notes] == [
+        "3 recordings are left out alike, the first: b: left out: b.csv: holds 2 waypoints; leave "
+        "it out",
+        "e: left out: e.csv: its clock is ruined; leave it out",
+    ]
 
 
 def test_only_what_is_slow_to_read_is_given_to_processes(tmp_path):

@@ -14,9 +14,8 @@ from tests.support.estimators import CONFIG, NETWORK, RATE, ready, rotations, su
 def test_windows_are_cut_with_the_given_attitude(walks, reading, context):
     config = DataConfig(rate=RATE, window_rotation=reading, context_seconds=context)
     recordings = ready(walks[:2], config, orientation="reference")
-    for walk, found, each in zip(
-        walks[:2], infer(NETWORK, recordings, config), recordings, strict=True
-    ):
+    predicted = infer(NETWORK, recordings, config)
+    for walk, found, each in zip(walks[:2], predicted, recordings, strict=True):
         turns = rotations(walk.orientation).as_matrix()
         assert found.value.shape == found.std.shape == (each.strides, 3)
         first = config.seen // config.stride - 1  # the stride in which the first window ends
@@ -24,16 +23,9 @@ def test_windows_are_cut_with_the_given_attitude(walks, reading, context):
         for row in range(first, each.strides, 17):
             end = (row + 1) * config.stride
             start, rows = end - config.window, range(end - config.seen, end)
+            at = [j if reading == "per_sample" else start for j in rows]
             means = [
-                np.mean(
-                    [
-                        unyaw(turns[start])
-                        @ turns[j if reading == "per_sample" else start]
-                        @ signal[j]
-                        for j in rows
-                    ],
-                    axis=0,
-                )
+                unyaw(turns[start]) @ np.einsum("tij,tj->ti", turns[at], signal[rows]).mean(0)
                 for signal in (walk.accel, walk.gyro)
             ]
             np.testing.assert_allclose(found.value[row], 0.05 * means[0], atol=2e-6)

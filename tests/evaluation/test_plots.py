@@ -17,8 +17,7 @@ def labels(axes):
     return [text.get_text() for text in axes.get_legend().get_texts()]
 
 
-# What is drawn
-# --------------------------------------------------------------------------------------------------
+# --- what is drawn
 
 
 def test_ellipses_are_contours_of_their_covariance():
@@ -68,8 +67,7 @@ def test_the_speed_is_a_mean_over_a_second():
     assert np.isnan(plots.speed(path[:3], 0.1)).all()
 
 
-# One sequence
-# --------------------------------------------------------------------------------------------------
+# --- one sequence
 
 
 def test_the_picture_of_a_sequence(estimates):
@@ -122,8 +120,7 @@ def test_an_estimate_lost_before_the_reference_begins_is_drawn(estimates):
         assert np.isfinite(axes.collections[0].get_paths()[0].vertices).all()
 
 
-# A set of sequences
-# --------------------------------------------------------------------------------------------------
+# --- a set of sequences
 
 
 @pytest.mark.parametrize("alignment", ["origin", "yaw_position", "se3"])

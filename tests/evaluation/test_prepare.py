@@ -11,15 +11,18 @@ from gnio_jax.numerics import yaw
 from tests.support.estimators import CONFIG, RATE, ready, rotations
 
 
-def test_start_is_the_first_trusted_sample(walks):
+def test_start_is_the_first_trusted_sample_or_the_first_of_all(walks):
     hidden = walks[0]._replace(valid=np.arange(len(walks[0].time)) >= 137)
     (recording,) = ready([hidden])
     assert recording.time[0] == walks[0].time[137]
     np.testing.assert_array_equal(recording.start.position, walks[0].position[137])
-    np.testing.assert_allclose(
-        recording.start.rotation, rotations(walks[0].orientation[137]).as_matrix(), atol=1e-12
-    )
+    attitude = rotations(walks[0].orientation[137]).as_matrix()
+    np.testing.assert_allclose(recording.start.rotation, attitude, atol=1e-12)
     assert len(recording.gyro) == recording.strides * CONFIG.stride
+    (recording,) = ready([hidden], init="static", from_first=True)
+    assert recording.time[0] == walks[0].time[0] and not recording.start.position.any()
+    known = np.isfinite(recording.reference.position).all(1)
+    np.testing.assert_array_equal(known, recording.time >= walks[0].time[137])
 
 
 @pytest.fixture(scope="module")
@@ -34,11 +37,8 @@ def test_static_start_is_level(clean):
     truth = rotations(clean.orientation[0]).as_matrix()
     assert np.degrees(np.arccos(recording.start.rotation[2] @ truth[2])) < 3.0  # it sways
     assert abs(np.arctan2(recording.start.rotation[1, 0], recording.start.rotation[0, 0])) < 1e-12
-    assert (
-        not recording.start.velocity.any()
-        and not recording.start.position.any()
-        and not recording.notes
-    )
+    assert not recording.start.velocity.any() and not recording.start.position.any()
+    assert not recording.notes
     moving = clean._replace(valid=np.arange(len(clean.time)) > 600)
     (recording,) = ready([moving], init="static")
     assert "not standing still" in recording.notes[0]
@@ -46,12 +46,15 @@ def test_static_start_is_level(clean):
 
 def test_gyro_bias_from_reference_and_from_rest(walks, swaying):
     true = np.array([walks[0].attributes[f"gyro_bias_{axis}"] for axis in "xyz"])
-    biased = walks[0]._replace(gyro=walks[0].gyro + np.array([0.004, -0.02, 0.01]))
+    more = np.array([0.004, -0.02, 0.01])
+    biased = walks[0]._replace(gyro=walks[0].gyro + more)
     (recording,) = ready([biased], gyro_bias="reference")
-    np.testing.assert_allclose(
-        recording.start.gyro_bias, true + np.array([0.004, -0.02, 0.01]), atol=1e-4
-    )
+    np.testing.assert_allclose(recording.start.gyro_bias, true + more, atol=1e-4)
     assert "10 s against the reference" in recording.notes[0]
+    biased = with_hole(biased, slice(100, 150))  # where the reference is there, the gyro is not
+    biased.gyro[100:150] += 3.0
+    (recording,) = ready([biased], gyro_bias="reference")
+    np.testing.assert_allclose(recording.start.gyro_bias, true + more, atol=1e-4)
 
     (recording,) = ready([swaying], gyro_bias="rest")
     assert not recording.start.gyro_bias.any() and "no rest" in recording.notes[0]
@@ -65,13 +68,15 @@ def test_gyro_bias_from_reference_and_from_rest(walks, swaying):
 
 
 def test_short_sequences_are_left_out_by_name(walks):
+    """Also what was hardly measured."""
     short = walks[0]._replace(
         name="short", valid=np.arange(len(walks[0].time)) > len(walks[0].time) - 52
     )
-    prepared, left_out = evaluation.prepare([short, walks[1]], CONFIG)
+    lost = with_hole(walks[0], slice(30, None))._replace(name="lost")
+    prepared, left_out = evaluation.prepare([short, lost, walks[1]], CONFIG)
     assert [each.name for each in prepared] == [walks[1].name]
-    problem = "1.02 s measured from its first trusted sample on"
-    assert left_out == {"short": f"{problem}, too short for a window and a stride"}
+    problem = "s measured from its first trusted sample on, too short for a window and a stride"
+    assert left_out == {"short": f"1.02 {problem}", "lost": f"0.60 {problem}"}
 
 
 @pytest.mark.parametrize("compensated", ["no", "Android's gyro bias"])
@@ -98,14 +103,12 @@ def test_other_rates_are_resampled():
 
 def with_hole(sequence, rows):
     """The IMU follows lines over the rows, and says so."""
-    there = np.ones(len(sequence.time), bool)
+    there, row = np.ones(len(sequence.time), bool), np.arange(len(sequence.time))
     there[rows] = False
-    before = np.flatnonzero(there)
-    lines = (
-        np.column_stack([np.interp(np.arange(len(there)), before, c[there]) for c in each.T])
+    gyro, accel = (
+        np.column_stack([np.interp(row, row[there], axis[there]) for axis in each.T])
         for each in (sequence.gyro, sequence.accel)
     )
-    gyro, accel = lines
     return sequence._replace(gyro=gyro, accel=accel, imu_valid=there)
 
 
@@ -131,21 +134,6 @@ def test_a_rest_that_lacks_some_samples_is_a_rest(swaying):
     assert "mean of 1 s of rest" in recording.notes[0] and recording.start.std.velocity < 0.1
 
 
-def test_a_gap_says_nothing_of_the_bias(walks):
-    """The reference is there, the gyro is not."""
-    true = np.array([walks[0].attributes[f"gyro_bias_{axis}"] for axis in "xyz"])
-    holed = with_hole(walks[0], slice(100, 150))
-    holed.gyro[100:150] += 3.0
-    (recording,) = ready([holed], gyro_bias="reference")
-    np.testing.assert_allclose(recording.start.gyro_bias, true, atol=1e-4)
-
-
-def test_what_was_hardly_measured_is_left_out(walks):
-    lost = with_hole(walks[0], slice(30, None))
-    prepared, left_out = evaluation.prepare([lost], CONFIG)
-    assert not prepared and "0.60 s measured from its first" in left_out[lost.name]
-
-
 def test_a_static_start_is_as_far_off_level_as_the_accelerometer_may_be(clean):
     """By the standard deviation of its bias that the filter has, not by another."""
     tilts = []
@@ -155,14 +143,6 @@ def test_a_static_start_is_as_far_off_level_as_the_accelerometer_may_be(clean):
         assert recording.start.std.accel_bias == bias
     spread = np.sqrt(tilts[0] ** 2 - (0.02 / 9.81) ** 2)
     assert tilts[1] == pytest.approx(np.hypot(spread, 0.2 / 9.81), rel=1e-3)
-
-
-def test_a_recording_begins_at_its_first_sample_if_that_is_asked_for(walks):
-    hidden = walks[0]._replace(valid=np.arange(len(walks[0].time)) >= 137)
-    (recording,) = ready([hidden], init="static", from_first=True)
-    assert recording.time[0] == walks[0].time[0] and not recording.start.position.any()
-    known = np.isfinite(recording.reference.position).all(1)
-    np.testing.assert_array_equal(known, recording.time >= walks[0].time[137])
 
 
 def test_what_a_sequence_lacks_is_named_with_the_remedy(walks):

@@ -20,27 +20,19 @@ def seeds_of(ates, names=None):
 ALONE = {name: name for name in "abcdefgh"}
 
 
-# The interval
-# --------------------------------------------------------------------------------------------------
+# --- the interval
 
 
-def test_with_a_group_for_each_value_it_is_students_interval():
+def test_it_is_students_interval_of_the_groups_means():
+    """Of groups of one size, in any order; there is none of one group, nor of what is infinite."""
     values = np.random.default_rng(0).normal(5.0, 2.0, 7)
     wanted = stats.t.interval(0.95, 6, values.mean(), stats.sem(values))
     assert interval(values, range(7)) == pytest.approx(wanted)
-
-
-def test_groups_of_one_size_count_by_their_means_in_any_order():
-    values = np.array([1.0, 5.0, 1.2, 5.2, 2.0, 2.2])
-    means = np.array([1.1, 5.1, 2.1])
+    values, means = np.array([1.0, 5.0, 1.2, 5.2, 2.0, 2.2]), np.array([1.1, 5.1, 2.1])
     wanted = stats.t.interval(0.95, 2, means.mean(), stats.sem(means))
-    assert interval(values, ["x", "y", "x", "y", "z", "z"]) == pytest.approx(wanted)
-    assert interval(values[::-1], ["z", "z", "y", "x", "y", "x"]) == pytest.approx(wanted)
-
-
-def test_where_there_is_none():
-    values = np.array([1.0, 5.0, 1.2, 5.2])
-    assert interval(values, ["x"] * 4) is None
+    assert interval(values, "xyxyzz") == pytest.approx(wanted)
+    assert interval(values[::-1], "zzyxyx") == pytest.approx(wanted)
+    assert interval(values, ["x"] * 6) is None
     assert interval(values[:0], []) is None
     assert interval(np.array([1.0, np.inf]), "xy") is None
     assert interval(np.array([1e308, -1e308, 1e308]), "xyz") is None
@@ -59,8 +51,7 @@ def test_it_covers_the_mean_as_often_as_it_says(groups):
     assert 0.03 < missed / trials < 0.07
 
 
-# Means
-# --------------------------------------------------------------------------------------------------
+# --- means
 
 
 def test_divergence_never_improves_a_summary():
@@ -95,13 +86,7 @@ def test_divergence_is_of_the_sequence_and_leaves_every_mean():
     scores = {name: measures(**dict(zip(fields, row, strict=True))) for name, row in rows.items()}
     scores["d"] = Measures({"ate": None, "nis": LOST, "accepted": 3.0}, {}, True)
     found = {metric: summarise([scores], metric, ALONE) for metric in (*fields, "nis")}
-    means = {
-        "ate": 2.0,
-        "nees": np.inf,
-        "nees_coverage": 45.0,
-        "accepted": 75.0,
-        "path_length": 15.0,
-    }
+    means = dict(zip(fields, (2.0, np.inf, 45.0, 75.0, 15.0), strict=True))
     assert {metric: of.mean for metric, of in found.items()} == means | {"nis": None}
     assert {m: of.sequences for m, of in found.items()} == dict.fromkeys(fields, 2) | {"nis": 0}
     lost = dict.fromkeys(fields, 1) | {"nis": 1, "accepted": 2}
@@ -110,18 +95,6 @@ def test_divergence_is_of_the_sequence_and_leaves_every_mean():
     reach = 12.7062 * 5  # t of one degree of freedom
     assert found["accepted"].interval == pytest.approx((75 - reach, 75 + reach), rel=1e-4)
     assert found["ate"].median == 3.0 and found["nees"].median == np.inf
-
-
-def test_groups_are_what_is_independent():
-    names = [f"{group}{k}" for group in "xy" for k in range(5)]
-    ates = [value + 0.001 * k for value in (1.0, 3.0) for k in range(5)]
-    seeds = seeds_of([ates], names)
-    found = summarise(seeds, "ate", {name: name[0] for name in names})
-    assert found.mean == pytest.approx(2.002) == found.median and found.groups == 2
-    # The means of the groups are 1.002 and 3.002; their standard error is 1.
-    assert found.interval == pytest.approx((2.002 - 12.7062, 2.002 + 12.7062), rel=1e-5)
-    assert summarise(seeds, "ate", dict.fromkeys(names, "one")).interval is None
-    assert summarise(seeds, "rte", ALONE).mean is None
 
 
 def test_seeds_are_averaged_over_the_sequences_that_all_have():
@@ -146,8 +119,7 @@ def test_the_median_is_infinite_where_half_diverged(ates, median):
     assert summarise(seeds_of(ates), "ate", ALONE).median == median
 
 
-# Differences
-# --------------------------------------------------------------------------------------------------
+# --- differences
 
 
 def test_a_difference_by_hand():

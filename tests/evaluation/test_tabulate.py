@@ -22,18 +22,9 @@ def rows(report, width=80):
 
 def test_the_table_says_what_matters(made):
     shown = " ".join(text(made).split())
-    for words in (
-        "made test: ekf",
-        "room 1/walk",
-        "never_moves",
-        "window orientation: filter",
-        "initial state: reference",
-        "gyro bias: zero",
-        "IMU compensated: no",
-        "blind: start: rough",
-        "left out: short",
-        "–",
-    ):
+    for words in ("made test: ekf", "room 1/walk", "never_moves", "window orientation: filter"):
+        assert words in shown
+    for words in ("IMU compensated: no", "blind: start: rough", "left out: short", "–"):
         assert words in shown
     table, summary = rows(made), made.summary()
     assert f"{summary['ate'].mean:.2f}" in table["mean"]
@@ -73,10 +64,9 @@ def test_divergence_is_in_the_table(made, with_divergence):
     assert "diverged" not in text(made)
 
 
-def test_headings_are_words_on_the_console_of_results(made, capsys):
+def test_headings_are_no_markup_on_the_console_of_results(made, capsys):
     stdout().print(tabulate.render(made))
-    shown = capsys.readouterr().out
-    assert "ATE" in shown and "[dim]" not in shown and "[bold]" not in shown
+    assert "[" not in capsys.readouterr().out
 
 
 def test_how_the_trajectories_were_estimated_in_words(made):
@@ -91,13 +81,6 @@ def test_how_the_trajectories_were_estimated_in_words(made):
     assert way(**summed) == "integrate, reference orientation"
     told = way(initial_state="static", gyro_bias="rest", alignment="se3", checkpoint="latest")
     assert told == "ekf, static start, gyro bias: rest, se3 alignment, latest checkpoint"
-
-
-def test_the_windows_are_told_with_their_context():
-    windows = {"window_seconds": 1.0, "rate": 100.0, "context_seconds": 0.0}
-    assert tabulate.windows(windows) == "1 s at 100 Hz"
-    with_context = tabulate.windows({**windows, "context_seconds": 0.5})
-    assert with_context == "1 s at 100 Hz, and 0.5 s before"
 
 
 def test_a_difference_has_the_digits_of_its_interval():

@@ -9,35 +9,41 @@ deployed filter is
 
 with covariance = diag(exp(2 max(log_std, log_std_min))). The window is cut before the step: a step
 corrects neither the attitude of the oldest clone nor the biases before it measures.
+
+Other programs know no NamedTuples: the name of an array of the state is its path in it, e.g.
+`state.gate.converged`. The clones are a ring, as in `filtering.scan`: clone step k writes slot
+k mod (W + 1).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
 
-from gnio_jax.apps.onnx import flat_state
-from gnio_jax.apps.onnx.flat_state import PREFIX, DeployedState, from_arrays, to_arrays
-from gnio_jax.filtering import Pose, level_state
+from gnio_jax.filtering import FilterState, Pose, level_state
+from gnio_jax.filtering.checks import checked_state
 from gnio_jax.filtering.displacement import scaled_displacement
 from gnio_jax.filtering.gaps import Imu
 from gnio_jax.filtering.network import network_window
 from gnio_jax.filtering.resampler import ACCEL, GYRO
 from gnio_jax.filtering.settings import FilterSetup
 from gnio_jax.filtering.start import REST_SECONDS
+from gnio_jax.filtering.state import state_shapes
 from gnio_jax.filtering.tracker import advance_filter
 from gnio_jax.models import Network
 from gnio_jax.types import Array
 
-NETWORK, START, WINDOW, STEP = "network", "filter_start", "filter_window", "filter_step"
-NEXT = "next."
-"""Begins the name of an array of the state after a step."""
-POSE = "pose."
-"""Begins the name of what a step returns besides the state: the fields of `filtering.Pose`."""
+STATE, NEXT, POSE = "state.", "next.", "pose."
+"""Begin the names of arrays of the state, of the state after a step, and of the fields of
+`filtering.Pose`."""
 _READ_BY_WINDOW = ("clone_rotation", "gyro_bias", "accel_bias", "step", "samples")
+_OF_GAPS = ("imu.gyro", "imu.accel", "imu.missing")
+"""What bridges holes; the stream of a deployed filter has none."""
 
 Arrays = Mapping[str, Array]
 
@@ -55,10 +61,20 @@ class Program(NamedTuple):
         return jax.eval_shape(self.function, self.inputs)
 
 
+class DeployedState(NamedTuple):
+    """What one clone step hands to the next."""
+
+    filter: FilterState
+    """Its clones are a ring."""
+    samples: Float[Array, "r 6"]
+    """The last `FilterConfig.reach` samples, gyro rad/s and accel m/s², raw; zeros at first."""
+
+
 def programs(network: Network, setup: FilterSetup) -> list[Program]:
     """The four programs of a network and its filter. JAX's x64 must be on."""
     config, noise = setup.config, setup.noise
-    shape, n = flat_state.state_shape(setup), config.samples_per_clone
+    samples = jax.ShapeDtypeStruct((config.reach, 6), jnp.float64)
+    shape = DeployedState(state_shapes(config, noise, jnp.float64), samples)
 
     def infer(arrays: Arrays) -> dict[str, Array]:
         prediction = network.apply(network.variables, arrays["window"])
@@ -67,11 +83,11 @@ def programs(network: Network, setup: FilterSetup) -> list[Program]:
     def start(arrays: Arrays) -> dict[str, Array]:
         """`level_state` of a second at rest."""
         state = level_state(config, arrays["gyro"], arrays["accel"], setup.initial_std)
-        return to_arrays(flat_state.started(state, setup))
+        return _to_arrays(_started(state, setup))
 
     def window(arrays: Arrays) -> dict[str, Array]:
         """`network_window` between the oldest clone that the next step will have and its end."""
-        state = from_arrays(arrays, shape)
+        state = _from_arrays(arrays, shape)
         samples = _with_latest(state.samples, arrays)
         oldest = (state.filter.step + 1) % config.clones
         signals = samples[:, GYRO], samples[:, ACCEL]
@@ -79,7 +95,7 @@ def programs(network: Network, setup: FilterSetup) -> list[Program]:
 
     def step(arrays: Arrays) -> dict[str, Array]:
         """`advance_filter` with a given displacement."""
-        state = from_arrays(arrays, shape)
+        state = _from_arrays(arrays, shape)
         given = arrays["displacement"], arrays["covariance"]
         measurement = scaled_displacement(*given, noise, config.displacement_frame)
         filtered, history = advance_filter(
@@ -91,30 +107,70 @@ def programs(network: Network, setup: FilterSetup) -> list[Program]:
             config,
             noise,
         )
-        after = to_arrays(DeployedState(filtered, _with_latest(state.samples, arrays)))
-        state_after = {NEXT + name.removeprefix(PREFIX): value for name, value in after.items()}
+        after = _to_arrays(DeployedState(filtered, _with_latest(state.samples, arrays)))
+        state_after = {NEXT + name.removeprefix(STATE): value for name, value in after.items()}
         fields = (name for name in Pose._fields if name != "time")
         return state_after | {POSE + name: getattr(history, name)[0] for name in fields}
 
-    state = to_arrays(shape)
-    read_by_window = {PREFIX + name: state[PREFIX + name] for name in _READ_BY_WINDOW}
-    interval = {"gyro": _float64(n, 3), "accel": _float64(n, 3)}
-    rest = round(REST_SECONDS / config.dt)
-    measured = {"displacement": _float64(3), "covariance": _float64(3, 3)}
+    def float64(*shape: int) -> jax.ShapeDtypeStruct:
+        return jax.ShapeDtypeStruct(shape, jnp.float64)
+
+    state, n, rest = _to_arrays(shape), config.samples_per_clone, round(REST_SECONDS / config.dt)
+    read_by_window = {STATE + name: state[STATE + name] for name in _READ_BY_WINDOW}
+    interval = {"gyro": float64(n, 3), "accel": float64(n, 3)}
+    measured = {"displacement": float64(3), "covariance": float64(3, 3)}
     network_input = jax.ShapeDtypeStruct((1, config.seen, 6), jnp.float32)
     return [
-        Program(NETWORK, infer, {"window": network_input}),
-        Program(START, start, {"gyro": _float64(rest, 3), "accel": _float64(rest, 3)}),
-        Program(WINDOW, window, read_by_window | interval),
-        Program(STEP, step, state | interval | measured),
+        Program("network", infer, {"window": network_input}),
+        Program("filter_start", start, {"gyro": float64(rest, 3), "accel": float64(rest, 3)}),
+        Program("filter_window", window, read_by_window | interval),
+        Program("filter_step", step, state | interval | measured),
     ]
 
 
-def _float64(*shape: int) -> jax.ShapeDtypeStruct:
-    return jax.ShapeDtypeStruct(shape, jnp.float64)
+def start_arrays(state: FilterState, setup: FilterSetup) -> dict[str, np.ndarray]:
+    """The arrays of a filter that begins with `state`, of `initial_state` or `level_state`.
+
+    Raises `ValueError` for a state that a run has left: its clones are ordered by age and measured
+    from the present anchor, and are not the ring that the next step writes into.
+    """
+    if state.step > 0:
+        problem = f"is one after {int(state.step)} clone intervals of a run"
+        raise ValueError(f"state: {problem}; a deployed filter begins with one without clones")
+    return {name: np.asarray(value) for name, value in _to_arrays(_started(state, setup)).items()}
+
+
+def _started(state: FilterState, setup: FilterSetup) -> DeployedState:
+    """A deployed filter before its first sample."""
+    state = checked_state(state, setup.config, setup.noise)
+    return DeployedState(state, jnp.zeros((setup.config.reach, 6)))
 
 
 def _with_latest(samples: Array, arrays: Arrays) -> Array:
     """The stored samples moved on by those of a clone interval."""
     latest = jnp.concatenate([arrays["gyro"], arrays["accel"]], axis=1)
     return jnp.concatenate([samples, latest])[len(latest) :]
+
+
+def _to_arrays(state: DeployedState) -> dict[str, Any]:
+    """The arrays of a state, or their shapes, by name: those that have entries and that a step
+    reads."""
+    unread = {STATE + name for name in _OF_GAPS}
+    leaves = _named_leaves(state).items()
+    return {name: leaf for name, leaf in leaves if leaf.size > 0 and name not in unread}
+
+
+def _from_arrays(arrays: Arrays, shape: DeployedState) -> DeployedState:
+    """The state of these arrays. Those that are left out are zero: nothing may need them."""
+    leaves = [
+        arrays[name] if name in arrays else jnp.zeros(leaf.shape, leaf.dtype)
+        for name, leaf in _named_leaves(shape).items()
+    ]
+    return jax.tree.unflatten(jax.tree.structure(shape), leaves)
+
+
+def _named_leaves(state: DeployedState) -> dict[str, Any]:
+    leaves = jax.tree_util.tree_leaves_with_path(state)
+    paths = [jax.tree_util.keystr(path, simple=True, separator=".") for path, _ in leaves]
+    names = [STATE + path.removeprefix("filter.") for path in paths]
+    return {name: leaf for name, (_, leaf) in zip(names, leaves, strict=True)}

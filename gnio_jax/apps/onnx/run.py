@@ -1,27 +1,30 @@
-"""One run to a folder of ONNX models that other programs read, with `export.json` about them."""
+"""One run to a folder of ONNX models that other programs read, with `export.json` about them and
+about how far they are from the package, over one synthetic walk of fixed seed."""
 
 from __future__ import annotations
 
 import dataclasses
 import json
 import logging
-from collections.abc import Mapping
 from contextlib import ExitStack
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
+import numpy as np
 
 from gnio_jax.apps import packages
-from gnio_jax.apps.onnx import accuracy, conversion, driver
-from gnio_jax.apps.onnx.accuracy import Deviation
-from gnio_jax.apps.onnx.flat_state import start_arrays
-from gnio_jax.apps.onnx.programs import Program, programs
+from gnio_jax.apps.onnx import conversion, driver
+from gnio_jax.apps.onnx.driver import Walked
+from gnio_jax.apps.onnx.programs import programs, start_arrays
 from gnio_jax.apps.track import tracking_filter
+from gnio_jax.config import DataConfig
 from gnio_jax.config.files import plain
+from gnio_jax.data.simulated.walks import pedestrian
 from gnio_jax.errors import InputError, require_packages
-from gnio_jax.evaluation import estimate
+from gnio_jax.evaluation import Estimate, Recording, estimate, prepare
+from gnio_jax.evaluation.metrics import ate
 from gnio_jax.files import fingerprint, replacing_folder
 from gnio_jax.filtering import initial_state
 from gnio_jax.filtering.settings import FilterSetup
@@ -30,6 +33,10 @@ from gnio_jax.models import Network
 PACKAGES = ("jax2onnx", "onnx", "onnxruntime")
 SECONDS = 60.0
 """Of the walk over which an export is measured."""
+SEED, PERSON, PLACEMENT = 9000, 900, "handheld"
+"""What that walk is drawn from; no split has these."""
+DISPLACEMENT_LIMIT, POSITION_LIMIT = 1e-5, 1e-3
+"""How far an export may be from the package, m: more is a fault of the conversion."""
 FORMAT, VERSION = "gnio-export", 3
 CONVENTIONS = (
     "SI units. The world is z-up with gravity (0, 0, -9.81) m/s². Rotations are matrices body → "
@@ -39,6 +46,21 @@ CONVENTIONS = (
     "log_std_min))), m²; a displacement of NaN is no measurement. Errors of rotations are in the "
     "world frame, left-multiplied."
 )
+
+
+class Deviation(NamedTuple):
+    """Of what was exported from the package's own odometry."""
+
+    displacement_rms: float
+    """Of the network, over the windows of the walk, m."""
+    displacement_largest: float
+    """m."""
+    position_largest: float
+    """Of the filter, m."""
+    ate: float
+    """Error of the exported odometry against the truth, m …"""
+    ate_of_package: float
+    """… and of the package's own."""
 
 
 class Exported(NamedTuple):
@@ -72,15 +94,19 @@ def export_run(which: str | Path, out: Path, seconds: float = SECONDS) -> Export
         for program in programs(network, setup):
             content = conversion.to_model(program, setup)
             (folder / f"{program.name}.onnx").write_bytes(content)
-            files[f"{program.name}.onnx"] = {**fingerprint(content), **_tensors(program)}
+            files[f"{program.name}.onnx"] = {
+                **fingerprint(content),
+                "inputs": _described(program.inputs),
+                "outputs": _described(program.outputs),
+            }
         windows = run.config.data
-        walk = accuracy.draw_walk(windows, setup, seconds)
+        walk = draw_walk(windows, setup, seconds)
         start = initial_state(setup.config, *walk.start[:-1], std=walk.start.std)
         models = driver.open_models(folder)
         found = driver.walk(models, start_arrays(start, setup), walk.gyro, walk.accel)
         (own,) = estimate([walk], network, windows, setup._replace(considered=None))
-        deviation = accuracy.deviation(found.position, found.displacement, own)
-        accuracy.check(deviation, place.name)
+        deviation = deviation_of(found, own)
+        check(deviation, place.name)
         manifest = {
             "format": FORMAT,
             "version": VERSION,
@@ -99,14 +125,12 @@ def export_run(which: str | Path, out: Path, seconds: float = SECONDS) -> Export
     return Exported(out, {name: each["bytes"] for name, each in files.items()}, deviation)
 
 
-def _tensors(program: Program) -> dict[str, list[dict[str, Any]]]:
-    """Name, shape and type of what a model takes and gives."""
-
-    def described(arrays: Mapping[str, jax.ShapeDtypeStruct]) -> list[dict[str, Any]]:
-        shapes = ((name, list(each.shape), str(each.dtype)) for name, each in arrays.items())
-        return [{"name": name, "shape": shape, "dtype": dtype} for name, shape, dtype in shapes]
-
-    return {"inputs": described(program.inputs), "outputs": described(program.outputs)}
+def _described(arrays: dict[str, jax.ShapeDtypeStruct]) -> list[dict[str, Any]]:
+    """Name, shape and type of what a model takes or gives."""
+    return [
+        {"name": name, "shape": list(each.shape), "dtype": str(each.dtype)}
+        for name, each in arrays.items()
+    ]
 
 
 def _filter(setup: FilterSetup) -> dict[str, Any]:
@@ -126,3 +150,34 @@ def _filter(setup: FilterSetup) -> dict[str, Any]:
             "initial_std": plain(setup.initial_std),
         },
     }
+
+
+def draw_walk(windows: DataConfig, setup: FilterSetup, seconds: float) -> Recording:
+    """A pedestrian at the network's rate, with its true start."""
+    length = seconds + 1.0 / windows.rate  # a stride ends with the sample after it
+    drawn = pedestrian(SEED, PERSON, PLACEMENT, seconds=length, rate=windows.rate)
+    (walk,), _ = prepare([drawn], windows, setup.initial_std)
+    return walk
+
+
+def deviation_of(found: Walked, own: Estimate) -> Deviation:
+    """Of the walk by the models from the package's own."""
+    ours, true = (each.position[1:] for each in (own.trajectory, own.reference))
+    assert own.displacements is not None
+    given = own.displacements.value[-len(found.displacement) :]
+    apart = np.linalg.norm(found.displacement - given, axis=1)
+    return Deviation(
+        displacement_rms=float(np.sqrt(np.mean(apart**2))),
+        displacement_largest=float(apart.max()),
+        position_largest=float(np.linalg.norm(found.position - ours, axis=1).max()),
+        ate=ate(found.position, true),
+        ate_of_package=ate(ours, true),
+    )
+
+
+def check(found: Deviation, where: Any) -> None:
+    """Raise `InputError` where an export is not the package's odometry."""
+    largest = found.displacement_largest, found.position_largest
+    if not (largest[0] <= DISPLACEMENT_LIMIT and largest[1] <= POSITION_LIMIT):
+        problem = f"the conversion is off by {largest[0]:.2g} m a window, {largest[1]:.2g} m a walk"
+        raise InputError(where, problem, "another version of jax2onnx may do better")

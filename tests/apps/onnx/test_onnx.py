@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 
 from gnio_jax import filtering
-from gnio_jax.apps.onnx import accuracy, driver
-from gnio_jax.apps.onnx.flat_state import start_arrays
-from gnio_jax.apps.onnx.run import PACKAGES
+from gnio_jax.apps.onnx import driver
+from gnio_jax.apps.onnx.programs import start_arrays
+from gnio_jax.apps.onnx.run import PACKAGES, Deviation, check
 from gnio_jax.apps.track import tracking_filter
 from gnio_jax.commands import app, console
 from gnio_jax.training.checkpoint import load_run
@@ -108,9 +108,9 @@ def test_the_command_prints_how_far_it_is_from_the_package(models):
 
 
 def test_a_conversion_that_is_off_is_refused():
-    off = accuracy.Deviation(1e-4, 1e-4, 0.0, 1.0, 1.0)
+    off = Deviation(1e-4, 1e-4, 0.0, 1.0, 1.0)
     with pytest.raises(ValueError, match=r"walk: .* off by 0\.0001 m a window"):
-        accuracy.check(off, "walk")
+        check(off, "walk")
 
 
 @pytest.mark.parametrize(
