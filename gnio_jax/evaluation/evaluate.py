@@ -28,7 +28,6 @@ from gnio_jax.evaluation.infer import given_displacements, infer, no_displacemen
 from gnio_jax.evaluation.metrics import score
 from gnio_jax.evaluation.prepare import Orientation, Recording, prepare
 from gnio_jax.evaluation.report import DEFINITIONS, Report, write
-from gnio_jax.evaluation.trajectory import Alignment
 from gnio_jax.filtering.settings import filter_setup
 from gnio_jax.models import Network
 from gnio_jax.reporting import Progress, Reporter, Silence
@@ -44,6 +43,8 @@ NAMED = {
     "checkpoint": "{}",
 }
 """Choices that are part of a folder's name where they are not the default."""
+WINDOWS = ("rate", "window_seconds", "context_seconds", "stride_seconds", "window_rotation")
+"""Settings of `DataConfig` that figures depend on."""
 
 
 class Evaluation(NamedTuple):
@@ -84,7 +85,11 @@ def evaluate(
         return functools.partial(reporter.progress, name)
 
     sequences = data.load(config.dataset, config.data_root, config.split, workers, stage("reading"))
-    _check_alignment(sequences, config.alignment)
+    for each in sequences:
+        if each.waypoints is not None and config.alignment not in ("origin", "yaw_position"):
+            problem = f"has waypoints, and no --alignment {config.alignment}"
+            remedy = "leave it out: one turn about z and one shift are fitted"
+            raise InputError(each.name, problem, remedy)
     recordings, left_out = prepare(
         sequences,
         windows,
@@ -142,14 +147,6 @@ def _check(config: EvaluateConfig) -> None:
         if not assignment.startswith("filter."):
             remedy = "write filter.FIELD=VALUE, e.g. filter.noise.measurement_scale=1"
             raise InputError(f"--set {assignment}", "is no setting of the filter", remedy)
-
-
-def _check_alignment(sequences: list[Sequence], alignment: Alignment) -> None:
-    """Raise `InputError` where waypoints cannot be compared with in the way that is asked for."""
-    for each in sequences:
-        if each.waypoints is not None and alignment not in ("origin", "yaw_position"):
-            remedy = "leave it out: one turn about z and one shift are fitted"
-            raise InputError(each.name, f"has waypoints, and no --alignment {alignment}", remedy)
 
 
 def resolve(config: EvaluateConfig, run: TrainConfig) -> EvaluateConfig:
@@ -223,7 +220,6 @@ def _settings(
 ) -> dict[str, Any]:
     """What changes the meaning of the figures, and what they are of."""
     compensated = {str(each.attributes.get("imu_compensated", "no")) for each in sequences}
-    windows = run.data
     tapped = all(each.waypoints is not None for each in sequences)
     return {
         "dataset": config.dataset,
@@ -240,11 +236,7 @@ def _settings(
         "alignment": config.alignment,
         "model": run.model.name,
         "checkpoint": config.checkpoint,
-        "rate": windows.rate,
-        "window_seconds": windows.window_seconds,
-        "context_seconds": windows.context_seconds,
-        "stride_seconds": windows.stride_seconds,
-        "window_rotation": windows.window_rotation,
+        **{name: getattr(run.data, name) for name in WINDOWS},
         "filter": configuration.plain(config.filter),
         "perfect_displacements_std": PERFECT_STD if config.estimator != "integrate" else None,
         "definitions": DEFINITIONS,

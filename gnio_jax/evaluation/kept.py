@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 from gnio_jax import config as configuration
-from gnio_jax.config import EvaluateConfig, TrainConfig, plain
+from gnio_jax.config import EvaluateConfig, plain
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation.evaluate import evaluate, folder_name, resolve
 from gnio_jax.evaluation.report import Report, read
@@ -36,8 +36,13 @@ def look(config: EvaluateConfig) -> Kept:
 
     Raises `InputError` for one that is not there and cannot be made.
     """
-    workdir = Path(config.workdir or "")
-    trained, run = settings_of(workdir, config.checkpoint)
+    workdir, run = Path(config.workdir or ""), None
+    trained = configuration.load(workdir / "config.yaml")
+    if trained.through_filter.learn:  # the settings of its filter are in the checkpoint
+        from gnio_jax.training import checkpoint  # Orbax takes seconds to import
+
+        run = checkpoint.load_run(workdir, config.checkpoint)
+        trained = run.config
     config = resolve(config, trained)
     folder = workdir / "eval" / folder_name(config, trained)
     report, problem = None, "it is not evaluated yet"
@@ -51,23 +56,6 @@ def look(config: EvaluateConfig) -> Kept:
     if problem and not any(best.glob("[0-9]*")):
         raise InputError(best, "holds no checkpoint", "let gnio train finish its first epoch")
     return Kept(config, folder, None, problem, run) if problem else Kept(config, folder, report, "")
-
-
-def settings_of(
-    workdir: Path, which: Literal["best", "latest"] = "best"
-) -> tuple[TrainConfig, Any]:
-    """The settings of a run, and None. Where its filter was trained, they are in the checkpoint,
-    and the `training.checkpoint.Run` that is restored for them comes along.
-
-    Raises `InputError` if they are and there is no checkpoint.
-    """
-    config = configuration.load(workdir / "config.yaml")
-    if not config.through_filter.learn:
-        return config, None
-    from gnio_jax.training import checkpoint  # Orbax takes seconds to import
-
-    run = checkpoint.load_run(workdir, which)
-    return run.config, run
 
 
 def made(kept: Kept, reporter: Reporter, workers: int = 1) -> Report:

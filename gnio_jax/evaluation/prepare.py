@@ -130,13 +130,14 @@ def prepare(
             left_out[sequence.name] = f"{problem}, too short for a window and a stride"
             continue
         bias, bias_note = _gyro_bias(whole, measured, windows.rate, gyro_bias)
-        tapped = whole.waypoints is not None
-        own_init, own_std = "static" if tapped else init, std
         raw = sequence.attributes.get("imu_compensated") == "no" and not bias.any()
+        own_std = std
         if raw and raw_gyro_bias is not None:
             own_std = std._replace(gyro_bias=raw_gyro_bias)
+        own_init, reference_note = init, ""
+        if whole.waypoints is not None:
+            own_init, reference_note = "static", OF_WAYPOINTS
         start, start_note = _start(whole, measured, windows, bias, own_std, own_init)
-        reference_note = OF_WAYPOINTS if tapped else ""
         trusted = whole.valid[:, None]
         poses = [np.where(trusted, part, np.nan) for part in (whole.position, whole.orientation)]
         ends = slice(None, None, windows.stride)
@@ -147,7 +148,7 @@ def prepare(
                 time=whole.time[ends],
                 gyro=whole.gyro[:-1],
                 accel=whole.accel[:-1],
-                imu_valid=_mask(whole),
+                imu_valid=None if len(measured) == len(whole.time) else whole.imu_valid[:-1],
                 start=start,
                 attitude=orientation and _attitude(whole, start, windows.rate, orientation),
                 reference=Trajectory(whole.time[ends], *(part[ends] for part in poses)),
@@ -179,29 +180,22 @@ def _check(
         raise InputError(sequence.name, "has no device orientation", remedy)
     if sequence.valid.any():
         return
-    if sequence.waypoints is not None:
-        wanted = "--gyro-bias zero" if gyro_bias == "reference" else ""
-        wanted = "--orientation filter" if orientation == "reference" else wanted
-        if wanted:
-            raise InputError(sequence.name, "has waypoints, no poses", f"give {wanted}")
-        return
-    if init == "reference" or gyro_bias == "reference":
-        wanted = "--init static" if init == "reference" else "--gyro-bias zero"
-        raise InputError(sequence.name, "has no reference to start from", f"give {wanted}")
-    if orientation == "reference":
-        remedy = "give --orientation filter or device"
-        raise InputError(sequence.name, "has no reference orientation", remedy)
+    tapped = sequence.waypoints is not None
+    wanted = {
+        "--init static": init == "reference" and not tapped,
+        "--gyro-bias zero": gyro_bias == "reference",
+        "--orientation filter": orientation == "reference",
+    }
+    for remedy, needed in wanted.items():
+        if needed:
+            problem = "has waypoints, no poses" if tapped else "has no reference"
+            raise InputError(sequence.name, problem, f"give {remedy}")
 
 
 def _cut(sequence: Sequence, rows: slice) -> Sequence:
     """Some samples of a sequence."""
     arrays = {k: v[rows] for k, v in sequence._asdict().items() if isinstance(v, np.ndarray)}
     return sequence._replace(**arrays)
-
-
-def _mask(sequence: Sequence) -> Bool[np.ndarray, "t"] | None:
-    mask = sequence.imu_valid
-    return None if mask is None or mask.all() else mask[:-1]
 
 
 def _start(

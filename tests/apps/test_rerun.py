@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from gnio_jax.apps import rerun
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import Recording
-from tests.support.estimates import estimate
+from tests.support.estimates import estimate, with_covariance
 from tests.support.rerun_files import columns_of
 
 
@@ -30,9 +30,7 @@ def test_the_file_is_read_back(tmp_path):
     pytest.importorskip("rerun", reason="needs rerun-sdk")
     walk, blind = estimate("room 1/walk", 0), estimate("blind", 1, truth=False)
     covariance = np.array([[4.0, 1.5, 0.2], [1.5, 1.0, 0.1], [0.2, 0.1, 0.5]])
-    walk = walk._replace(
-        filtered=walk.filtered._replace(covariance=np.tile(covariance, (400, 1, 1)))
-    )
+    walk = with_covariance(walk, np.tile(covariance, (400, 1, 1)))
     path = tmp_path / "walks.rrd"
     logged = [rerun.Logged(each, recording_of(each)) for each in (walk, blind)]
     rerun.write(path, logged)
@@ -43,17 +41,14 @@ def test_the_file_is_read_back(tmp_path):
         ((line,),) = found[f"/room_1_walk/{kind}"]["LineStrips3D:strips"]
         np.testing.assert_allclose(line, of.position, atol=1e-5)
     ellipsoid = found["/room_1_walk/ellipsoid"]
-    (size,), (turn,) = (
-        ellipsoid[f"Ellipsoids3D:{name}"][7] for name in ("half_sizes", "quaternions")
-    )
+    (size,), (turn,) = (ellipsoid[f"Ellipsoids3D:{x}"][7] for x in ("half_sizes", "quaternions"))
     axes = Rotation.from_quat(turn).as_matrix()
     np.testing.assert_allclose(axes @ np.diag(np.square(size) / 9) @ axes.T, covariance, atol=1e-5)
     gate = found["/room_1_walk/gate"]
     rows = ~np.isnan(walk.displacements.value[:, 0])
     np.testing.assert_allclose(seconds(gate["time"]), 0.1 * np.flatnonzero(rows), atol=1e-6)
-    np.testing.assert_allclose(
-        gate["Scalars:scalars"], walk.displacements.diagnostics["gate"][rows]
-    )
+    own = walk.displacements.diagnostics["gate"][rows]
+    np.testing.assert_allclose(gate["Scalars:scalars"], own)
     gyro = found["/room_1_walk/imu/gyro"]
     np.testing.assert_allclose(seconds(gyro["time"])[[0, -1]], [0.0, 39.88], atol=1e-6)
     np.testing.assert_allclose(gyro["Scalars:scalars"], recording_of(walk).gyro)

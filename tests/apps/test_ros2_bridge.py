@@ -37,11 +37,9 @@ class Recorder:
         self.samples.append((time, gyro, accel))
         if len(self.samples) % 2:
             return None
-        zero = np.zeros(3)
-        velocity, position = np.array([1.0, 2.0, 3.0]), np.array([4.0, 5.0, 6.0])
-        return Pose(
-            time, TURN.as_matrix(), velocity, position, BIAS, zero, COVARIANCE, 1.0, 1.0, True
-        )
+        moved = np.array([1.0, 2.0, 3.0]), np.array([4.0, 5.0, 6.0])
+        known = BIAS, np.zeros(3), COVARIANCE, 1.0, 1.0, True
+        return Pose(time, TURN.as_matrix(), *moved, *known)
 
 
 def message(sec, nanosec, gyro=(0.1, 0.2, 0.3), accel=(0.0, 1.0, 9.8)):
@@ -60,11 +58,8 @@ def test_messages_become_odometry(bridge):
     # Unix time in float64 would keep 0.24 µs.
     assert found.take(message(1_700_000_000, 999_999_999)) is None
     odometry = found.take(message(1_700_000_001, 4_999_999))
-    assert tracker.samples[1][0] == 5e-3 and tracker.samples[0] == (
-        0.0,
-        (0.1, 0.2, 0.3),
-        (0.0, 1.0, 9.8),
-    )
+    first = (0.0, (0.1, 0.2, 0.3), (0.0, 1.0, 9.8))
+    assert tracker.samples[0] == first and tracker.samples[1][0] == 5e-3
     assert odometry.stamp == (1_700_000_001, 4_999_999)
     assert odometry.position == (4.0, 5.0, 6.0)
     turned = Rotation.from_quat(odometry.orientation)

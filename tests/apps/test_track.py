@@ -104,11 +104,9 @@ def test_a_bag_with_a_reference(gnio, runs, tmp_path):
     # The error with the starts aligned, by hand.
     rows = np.isin(np.round(path.time, 3), np.round(reference.time, 3))
     moved = path.position[rows] - path.position[rows][0]
-    yaws = [
-        Rotation.from_quat(each.orientation[k], scalar_first=True).as_matrix()
-        for each, k in ((reference, 0), (path, np.flatnonzero(rows)[0]))
-    ]
-    turn = yaws[0] @ yaws[1].T
+    firsts = [reference.orientation[0], path.orientation[np.flatnonzero(rows)[0]]]
+    true, own = Rotation.from_quat(firsts, scalar_first=True).as_matrix()
+    turn = true @ own.T
     angle = np.arctan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1])
     moved = Rotation.from_euler("z", angle).apply(moved)
     error = (moved - (reference.position - reference.position[0]))[:, :2]
@@ -188,22 +186,21 @@ def test_what_is_refused(mistake, runs, tmp_path):
     assert not list(runs.parent.glob("tracks/.*"))
 
 
+def without_poses(name, time):
+    nothing, signals = (
+        np.full((len(time), 3), np.nan),
+        (known_walk.rate(time), known_walk.force(time)),
+    )
+    level, valid = np.full((len(time), 4), np.nan), np.zeros(len(time), bool)
+    return Sequence(name, time, *signals, level, nothing, nothing, valid)
+
+
 def test_our_own_file_with_holes(gnio, mistake, runs, tmp_path):
     """It comes to the tracker as it is: nobody has looked for holes yet."""
     given = ("track", tmp_path / "walk.h5", "--weights", runs / "walker")
     for lost, name in ((70, "../../walk"), (320, "walk")):
         time = np.delete(np.arange(900), np.s_[200 : 200 + lost])[:530] / 100
-        nothing = np.full((len(time), 3), np.nan)
-        sequence = Sequence(
-            name=name,
-            time=time,
-            gyro=known_walk.rate(time),
-            accel=known_walk.force(time),
-            orientation=np.full((len(time), 4), np.nan),
-            position=nothing,
-            velocity=nothing,
-            valid=np.zeros(len(time), bool),
-        )
+        sequence = without_poses(name, time)
         write_hdf5(tmp_path / "walk.h5", sequence)
         if lost == 70:
             # Whatever the file says of itself, the folder lies in tracks/.
@@ -221,20 +218,8 @@ def test_our_own_file_with_holes(gnio, mistake, runs, tmp_path):
 
 def test_a_recording_with_waypoints_is_compared_with_them(gnio, runs, tmp_path):
     time = np.arange(600) / 100
-    nothing = np.full((600, 4), np.nan)
     taps = Waypoints(time[[0, 200, 400, 599]], known_walk.position(time[[0, 200, 400, 599]])[:, :2])
-    sequence = Sequence(
-        name="mall",
-        time=time,
-        gyro=known_walk.rate(time),
-        accel=known_walk.force(time),
-        orientation=nothing,
-        position=nothing[:, :3],
-        velocity=nothing[:, :3],
-        valid=np.zeros(600, bool),
-        waypoints=taps,
-    )
-    write_hdf5(tmp_path / "mall.h5", sequence)
+    write_hdf5(tmp_path / "mall.h5", without_poses("mall", time)._replace(waypoints=taps))
     told = gnio(
         "track", tmp_path / "mall.h5", "--weights", runs / "walker", "--out", tmp_path / "t"
     )

@@ -1,11 +1,12 @@
 """The table on the screen names what matters, and fits into it."""
 
+import numpy as np
 import pytest
 from rich.console import Console
 
 from gnio_jax.commands.console import stdout
 from gnio_jax.evaluation import tabulate
-from gnio_jax.evaluation.statistics import Difference, Summary
+from gnio_jax.evaluation.statistics import Cell, Difference, Summary
 
 
 def text(report, width=80):
@@ -96,6 +97,28 @@ def test_a_mean_has_its_seeds_and_what_diverged():
     assert tabulate.mean(found, 2) == "2.25 ± 1.06"
     assert tabulate.mean(found._replace(seeds=[2.25], diverged=1), 2) == "2.25 † 1/8"
     assert tabulate.mean(found._replace(mean=None, seeds=[]), 2) == "–"
+
+
+MEAN, LESS = Summary(1.0, [1.0], 1.0, None, 3, 2, 0, 3), Difference(-1, (-2, 0), 50, 2, 3, 3, 2)
+
+
+@pytest.mark.parametrize(
+    "mean, difference, beginnings",
+    [
+        (MEAN, LESS, ["The interval is Student's t over people or sessions; there are 2."]),
+        (MEAN, LESS._replace(interval=None, groups=1), ["No interval"]),
+        (MEAN, LESS._replace(compared=2), ["The interval", "A difference is over"]),
+        (MEAN, Difference(None, None, None, 0, 0, 2, 0), ["A difference is over"]),
+        (MEAN._replace(diverged=1), LESS, ["The interval", "† So many"]),
+        (MEAN, Difference(None, None, None, 0, 3, 3, 1, True), ["‡ Would be better"]),
+        (MEAN._replace(seeds=[np.inf]), None, ["∞"]),
+        (MEAN._replace(mean=None, seeds=[]), None, ["–"]),
+    ],
+)
+def test_marks_are_explained(mean, difference, beginnings):
+    found = tabulate.marks([Cell(MEAN, None), Cell(mean, difference)])
+    assert len(found) == len(beginnings)
+    assert all(line.startswith(words) for line, words in zip(found, beginnings, strict=True))
 
 
 def test_metrics_are_written_alike_in_3d_and_2d():
