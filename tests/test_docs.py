@@ -40,8 +40,12 @@ HELP = {"--help", "--completion", "COMMAND"}
 NEW_FILES = {"gnio_jax/data/readers/mine.py", "tests/support/mine_files.py"}
 """What CONTRIBUTING asks a reader to write."""
 RUN = [block for block in pages.python_blocks() if not block.reason]
-NOT_RUN = [block for block in pages.python_blocks() if block.reason]
-NOTEBOOKS = sorted((pages.ROOT / "docs" / "notebooks").glob("*.py"))
+NOT_RUN = {
+    f"{block.page}:{block.line} {block.reason}": block.code
+    for block in pages.python_blocks()
+    if block.reason
+} | {"notebooks/walk.py": (pages.ROOT / "docs/notebooks/walk.py").read_text(encoding="utf-8")}
+"""Where it stands, and why it is not run: code that must compile and name what there is."""
 
 
 @pytest.fixture(scope="module")
@@ -147,30 +151,10 @@ def test_every_block_that_runs_has_a_test():
     assert {block.page for block in RUN} == tested
 
 
-@pytest.mark.parametrize("block", NOT_RUN, ids=lambda b: f"{b.page}:{b.line} {b.reason}")
-def test_a_block_that_is_not_run_names_what_there_is(block):
-    check_names(block.code, block.page)
-
-
-@pytest.mark.parametrize("notebook", NOTEBOOKS, ids=lambda path: path.stem)
-def test_a_notebook_names_what_there_is(notebook):
-    check_names(notebook.read_text(encoding="utf-8"), notebook.name)
-
-
-def test_the_notebook_that_learns(one_walk, capsys):
-    """Two seconds, two steps: the gradient is the difference quotient that is printed beside it."""
-    pytest.importorskip("matplotlib").use("Agg")
-    page = "docs/notebooks/learn_noise.py"
-    run(page, (pages.ROOT / page).read_text(encoding="utf-8"))
-    printed = capsys.readouterr().out
-    gradient = [float(word) for word in re.search(r"gradient \[(.*)\]", printed)[1].split()]
-    quotient = [float(re.search(rf"{name}: (.*)", printed)[1]) for name in ("gyro", "accel.*")]
-    np.testing.assert_allclose(gradient, quotient, atol=2e-4)
-
-
-def check_names(code, page):
-    """The code compiles, and what it takes from gnio_jax is there."""
-    tree = ast.parse(code, page)
+@pytest.mark.parametrize("place", NOT_RUN)
+def test_code_that_is_not_run_names_what_there_is(place):
+    """It compiles, and what it takes from gnio_jax is there."""
+    tree = ast.parse(NOT_RUN[place], place)
     modules = {}
     for node in ast.walk(tree):
         if isinstance(node, ast.ImportFrom) and node.module.split(".")[0] == "gnio_jax":
@@ -183,7 +167,7 @@ def check_names(code, page):
         if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
             owner = modules.get(node.value.id)
             if owner is not None:
-                assert hasattr(owner, node.attr), f"{page}: {node.value.id}.{node.attr}"
+                assert hasattr(owner, node.attr), f"{place}: {node.value.id}.{node.attr}"
 
 
 def member(module, name):
@@ -192,6 +176,17 @@ def member(module, name):
         return importlib.import_module(f"{module}.{name}")
     except ModuleNotFoundError:
         return getattr(importlib.import_module(module), name)
+
+
+def test_the_notebook_that_learns(one_walk, capsys):
+    """Two seconds, two steps: the gradient is the difference quotient that is printed beside it."""
+    pytest.importorskip("matplotlib").use("Agg")
+    page = "docs/notebooks/learn_noise.py"
+    run(page, (pages.ROOT / page).read_text(encoding="utf-8"))
+    printed = capsys.readouterr().out
+    gradient = [float(word) for word in re.search(r"gradient \[(.*)\]", printed)[1].split()]
+    quotient = [float(re.search(rf"{name}: (.*)", printed)[1]) for name in ("gyro", "accel.*")]
+    np.testing.assert_allclose(gradient, quotient, atol=2e-4)
 
 
 @pytest.mark.parametrize(
@@ -261,35 +256,26 @@ def test_make_installs_what_it_needs(words, installed, tmp_path):
     assert len(steps) > 1
 
 
-def rooms_with_public_names():
-    """Packages of gnio_jax that say what is public, and those names."""
-    for path in sorted((pages.ROOT / "gnio_jax").glob("*/__init__.py")):
-        for node in ast.parse(path.read_text(encoding="utf-8")).body:
-            if isinstance(node, ast.Assign) and node.targets[0].id == "__all__":
-                yield path.parent.name, ast.literal_eval(node.value)
-
-
-@pytest.mark.parametrize("room", [room for room, _ in rooms_with_public_names()])
-def test_a_room_has_its_page_in_the_reference(room):
-    """The whole room is asked for, so every name of its `__all__` is there (`make docs` counts
-    them)."""
-    page = pages.ROOT / "docs" / "api" / f"{room}.md"
-    assert f"\n::: gnio_jax.{room}\n" in page.read_text(encoding="utf-8")
-    assert f"api/{room}.md" in (pages.ROOT / "mkdocs.yml").read_text(encoding="utf-8")
-
-
-@pytest.mark.parametrize("name", models.names())
-def test_every_network_is_named_where_people_look(name):
-    assert f"`{name}`" in (pages.ROOT / "README.md").read_text(encoding="utf-8")
-
-
-def test_the_names_of_the_package_are_those_of_the_reference():
-    """All rooms with public names, and a line for each in the table."""
-    table = (pages.ROOT / "docs" / "api" / "index.md").read_text(encoding="utf-8")
+def test_the_reference_has_every_room():
+    """A page for each room that says what is public, with all of it (`make docs` counts the names),
+    and a line of the table for each name of the package."""
+    docs = pages.ROOT / "docs"
+    table = (docs / "api/index.md").read_text(encoding="utf-8")
     named = re.findall(r"^\| \[?`gnio_jax\.(\w+)`", table, re.MULTILINE)
     assert sorted(named) == sorted(gnio_jax.__all__)
-    assert {room for room, _ in rooms_with_public_names()} <= {*gnio_jax.__all__}
     assert all(hasattr(gnio_jax, name) for name in gnio_jax.__all__)
+    navigation = (pages.ROOT / "mkdocs.yml").read_text(encoding="utf-8")
+    for path in sorted((pages.ROOT / "gnio_jax").glob("*/__init__.py")):
+        room = path.parent.name
+        if "\n__all__ = " in path.read_text(encoding="utf-8"):
+            page = (docs / "api" / f"{room}.md").read_text(encoding="utf-8")
+            assert f"\n::: gnio_jax.{room}\n" in page
+            assert f"api/{room}.md" in navigation and room in gnio_jax.__all__
+
+
+def test_every_network_is_named_where_people_look():
+    readme = (pages.ROOT / "README.md").read_text(encoding="utf-8")
+    assert [name for name in models.names() if f"`{name}`" not in readme] == []
 
 
 @pytest.mark.parametrize("page", pages.pages(), ids=lambda page: page.name)
@@ -301,6 +287,20 @@ def test_a_file_that_a_page_names_is_there(page):
     assert {*lost} <= NEW_FILES, lost
 
 
-def test_no_page_needs_a_script_from_a_network():
-    for page in (pages.ROOT / "docs").rglob("*.md"):
-        assert "```mermaid" not in page.read_text(encoding="utf-8"), page
+@pytest.mark.parametrize("page", pages.pages(), ids=lambda page: page.name)
+def test_a_link_within_the_repository_leads_somewhere(page):
+    """To a file or folder, and of a page to one of its headings."""
+    for target in re.findall(r"\]\(([^)\s]+)\)", page.read_text(encoding="utf-8")):
+        if re.match(r"https?:", target):
+            continue
+        name, _, heading = target.partition("#")
+        place = page.parent / name if name else page
+        assert place.exists(), target
+        if heading:
+            assert heading in headings(place), target
+
+
+def headings(page):
+    """The anchors of a page, as MkDocs and GitHub name them."""
+    found = re.findall(r"^#+ (.*)$", page.read_text(encoding="utf-8"), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", title).lower().replace(" ", "-") for title in found}
