@@ -26,8 +26,8 @@ jax.config.update("jax_enable_x64", True)  # the filter runs in float64
 # %% [markdown]
 # ## A walk with known noises
 #
-# The IMU of a simulated walk, with white noise added: we know what the filter should find. In the
-# place of a network stand the true displacements with an error of 2 cm.
+# We add white noise to the IMU of a simulated walk, so we know what the filter should find. The
+# true displacements with an error of 2 cm take the place of a network.
 
 # %%
 SECONDS = 30
@@ -54,8 +54,8 @@ covariance = np.tile(std**2 * np.eye(3), (len(displacement), 1, 1))
 # %% [markdown]
 # ## A loss, and its gradient
 #
-# The likelihood of the innovations needs no reference: noises that are too small make the filter
-# surprised, noises that are too large make it vague. We learn logarithms, so that noises stay
+# The likelihood of the innovations needs no reference. It is low if the noises are too small for
+# the innovations, and also if they are too large. We learn logarithms, so that noises stay
 # positive.
 
 # %%
@@ -124,9 +124,9 @@ figure.tight_layout()
 print("learnt / added:", (path[-1] / true_density).round(2))
 
 # %% [markdown]
-# The noises end within a quarter of what we added (dotted), from values that were 16 and 100
-# times too small. Thirty seconds of one walk do not say it better: a wrong tilt at the start and a
-# drifting gyro look much alike. More recordings side by side, with `jax.vmap`, do.
+# The noises begin 16 and 100 times too small and end within a quarter of what we added (dotted).
+# Thirty seconds of one walk do not determine them better, because a wrong tilt at the start and a
+# drifting gyro have similar effects. More recordings do, side by side with `jax.vmap`.
 #
 # The same gradient reaches the start, the displacements and the parameters of a network:
 # [The differentiable filter](../differentiable_filter.md).

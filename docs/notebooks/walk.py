@@ -9,8 +9,8 @@
 # # A walk and its filter
 #
 # One simulated walk, from its samples to a trajectory: the recording, the windows that the network
-# sees, the displacements it predicts, and what the filter makes of them. Nothing is downloaded. It
-# takes two minutes on two CPU cores, most of which a small network learns.
+# sees, the displacements that it predicts, and the filter that fuses them. Nothing is downloaded.
+# It takes two minutes on two CPU cores, most of them for the training of a small network.
 
 # %%
 import dataclasses
@@ -47,8 +47,8 @@ right.set(xlabel="x (m)", ylabel="y (m)", aspect="equal", title="true path")
 figure.tight_layout()
 
 # %% [markdown]
-# The accelerometer reads gravity and steps, in the axes of the phone. No double integral of this
-# stays on the path for long.
+# The accelerometer measures gravity and steps, in the axes of the phone. If one integrates this
+# twice, the result soon leaves the path.
 #
 # ## The windows
 #
@@ -79,8 +79,9 @@ print("moved in this second:", np.asarray(batch.displacement[number]).round(2), 
 # %% [markdown]
 # ## The network
 #
-# A small network learns from other walkers: an eighth of the paper's width, some epochs. With a
-# package of weights, `run = gnio_jax.load_pretrained(NAME)` takes the place of this cell.
+# A small network learns from other walkers, with an eighth of the paper's width and ten epochs. If
+# you have a package of weights, `run = gnio_jax.load_pretrained(NAME)` takes the place of this
+# cell.
 
 # %%
 workdir = tempfile.mkdtemp()
@@ -163,9 +164,9 @@ right.legend()
 figure.tight_layout()
 
 # %% [markdown]
-# The band is what the filter says of itself. `NIS / 3` asks the same of the displacements: 1 is
-# consistent, and a smaller figure says that the factor of 10 on the network's covariance is too
-# careful. `gnio calibrate` fits it ([Read the tables](../tables.md)).
+# The band shows the errors that the filter expects. `NIS / 3` compares the errors of the
+# displacements with their covariance: 1 is consistent. If it is smaller, the factor of 10 on the
+# network's covariance is too large. `gnio calibrate` fits it ([Read the tables](../tables.md)).
 
 # %%
 ate = evaluation.metrics.ate(np.asarray(history.position), truth)
