@@ -89,17 +89,12 @@ def compare(
     found = [[_source(path, config) for path in find(word)] for word in config.rows]
     sources = [source for row in found for source in row]
     _check_sources(sources)
+
+    def report_of(each: Report | kept.Kept) -> Report:
+        return each if isinstance(each, Report) else kept.made(each, reporter, workers)
+
     rows = [
-        Row(
-            label,
-            [source.run.name for source in row],
-            [
-                each.found
-                if isinstance(each.found, Report)
-                else kept.made(each.found, reporter, workers)
-                for each in row
-            ],
-        )
+        Row(label, [each.run.name for each in row], [report_of(each.found) for each in row])
         for label, row in zip(_labels(config.rows), found, strict=True)
     ]
     reports = [report for row in rows for report in row.reports]
@@ -157,15 +152,8 @@ def find(word: str) -> list[Path]:
 def _source(path: Path, config: CompareConfig) -> Source:
     """The evaluation of a run with all options as by default, or the one that is named itself."""
     if (path / "config.yaml").is_file():
-        asked = kept.look(
-            EvaluateConfig(
-                str(path),
-                data_root=config.data_root,
-                split=config.split,
-                estimator=config.estimator,
-                plots=False,
-            )
-        )
+        how = {"split": config.split, "estimator": config.estimator, "plots": False}
+        asked = kept.look(EvaluateConfig(str(path), data_root=config.data_root, **how))
         identity = {name: getattr(asked.config, name) for name in IDENTITY}
         return Source(path, path, asked.folder, identity, asked)
     report = read(path)
@@ -248,15 +236,8 @@ def lines(found: Comparison) -> list[list[str]]:
             better = ""
             if difference and difference.compared and not difference.withheld:
                 better = f"{difference.better} of {difference.compared}"
-            table.append(
-                [
-                    "" if place else column.title,
-                    row.label,
-                    tabulate.mean(mean, column.digits),
-                    tabulate.difference(difference, column.digits),
-                    better,
-                ]
-            )
+            head = ["" if place else column.title, row.label, tabulate.mean(mean, column.digits)]
+            table.append([*head, tabulate.difference(difference, column.digits), better])
     return table
 
 

@@ -161,8 +161,7 @@ def load_pretrained(which: str | Path | None = None) -> Run:
 
 
 def card_of(which: str | Path) -> str:
-    """The model card of a package, Markdown. Raises `InputError`, also for a run, which has
-    none."""
+    """The model card of a package, Markdown. Raises `InputError`, also for a run."""
     place = find(which)
     if not is_package(place):
         raise InputError(place, "is a run and has no model card", "gnio publish makes a package")

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator
-from datetime import timedelta
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from gnio_jax.errors import InputError, require_packages
-from gnio_jax.evaluation import Estimate, Recording
+from gnio_jax.evaluation import Estimate, Recording, Trajectory
 from gnio_jax.evaluation.colours import AXES, BLUE, REFERENCE, SIGMAS
 from gnio_jax.evaluation.report import file_names
 from gnio_jax.files import replacing
@@ -90,30 +89,32 @@ def _log_paths(log: Any, stem: str, estimate: Estimate) -> None:
         if len(points):
             strip = rerun.LineStrips3D([points], colors=[_rgb(colour)])
             log.log(f"{stem}/{kind}", strip, static=True)
-    rows = path.known
-    if not rows.any():
+    if (rows := path.known).any():
+        covariance = estimate.filtered and estimate.filtered.covariance[rows]
+        poses = Trajectory(*(part[rows] for part in path))
+        _log_poses(log, stem, poses._replace(time=poses.time - path.time[0]), covariance)
+
+
+def _log_poses(
+    log: Any, place: str, poses: Trajectory, covariance: Float[np.ndarray, "k 3 3"] | None
+) -> None:
+    """Poses over time, and the contours of the covariances of their positions (m²) at `SIGMAS`."""
+    import rerun
+
+    time = rerun.TimeColumn("time", duration=poses.time)
+    quaternion = xyzw_from_wxyz(poses.orientation)
+    pose = rerun.Transform3D.columns(translation=poses.position, quaternion=quaternion)
+    log.send_columns(f"{place}/pose", [time], pose)
+    if covariance is None:
         return
-    pose = rerun.Transform3D.columns(
-        translation=path.position[rows], quaternion=xyzw_from_wxyz(path.orientation[rows])
-    )
-    time = rerun.TimeColumn("time", duration=path.time[rows] - path.time[0])
-    log.send_columns(f"{stem}/pose", [time], pose)
-    if estimate.filtered is not None:
-        sizes, axes = _ellipsoids(estimate.filtered.covariance[rows])
-        contour = rerun.Ellipsoids3D.columns(
-            centers=path.position[rows], half_sizes=sizes, quaternions=axes
-        )
-        log.send_columns(f"{stem}/ellipsoid", [time], contour)
-
-
-def _ellipsoids(
-    covariance: Float[np.ndarray, "k 3 3"],
-) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k 4"]]:
-    """Half sizes, m, and attitudes (xyzw) of the contours of covariances (m²) at `SIGMAS`."""
     variance, axes = np.linalg.eigh(covariance)
     axes = axes * np.linalg.det(axes)[:, None, None]  # rotations, no reflections
-    attitudes = xyzw_from_wxyz(quaternion_from_matrix(axes))
-    return SIGMAS * np.sqrt(np.maximum(variance, 0.0)), attitudes
+    contour = rerun.Ellipsoids3D.columns(
+        centers=poses.position,
+        half_sizes=SIGMAS * np.sqrt(np.maximum(variance, 0.0)),
+        quaternions=xyzw_from_wxyz(quaternion_from_matrix(axes)),
+    )
+    log.send_columns(f"{place}/ellipsoid", [time], contour)
 
 
 def _log_curves(log: Any, place: str, time: Float[np.ndarray, "n"], values: Any) -> None:
@@ -174,16 +175,14 @@ class RerunStream:
 
         if not pose.healthy:
             return
-        log = self._log
         self._start = pose.time if self._start is None else self._start
-        log.set_time("time", duration=timedelta(seconds=pose.time - self._start))
-        quaternion = xyzw_from_wxyz(quaternion_from_matrix(pose.rotation[None]))[0]
-        log.log("live/pose", rerun.Transform3D(translation=pose.position, quaternion=quaternion))
-        sizes, axes = _ellipsoids(pose.covariance[None, 6:9, 6:9])
-        contour = rerun.Ellipsoids3D(centers=[pose.position], half_sizes=sizes, quaternions=axes)
-        log.log("live/ellipsoid", contour)
+        time, attitude = np.array([pose.time - self._start]), pose.rotation[None]
+        one = Trajectory(time, pose.position[None], quaternion_from_matrix(attitude))
+        _log_poses(self._log, "live", one, pose.covariance[None, 6:9, 6:9])
         if np.isfinite(pose.nis):
-            log.log("live/nis", rerun.Scalars([pose.nis]))
+            column = rerun.TimeColumn("time", duration=time)
+            nis = rerun.Scalars.columns(scalars=[pose.nis])
+            self._log.send_columns("live/nis", [column], nis)
         self._piece.append(np.array(pose.position))
         if len(self._piece) % LINE_EVERY == 0:
             self._draw()

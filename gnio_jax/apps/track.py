@@ -123,7 +123,10 @@ def track(
     """
     sequence = recording.sequence
     start_time = float(sequence.attributes.get("start_time", 0.0))
-    _check(out)
+    track = all((out / name).is_file() for name in NAMES)
+    if out.exists() and not (track or (out.is_dir() and not any(out.iterdir()))):
+        raise InputError(out, "is there already and is no track", "name another --out")
+    check_writable_folder(out.parent)
     for kind in formats:
         export.check("--format", kind, sequence.time + start_time)
     if rerun_file is not None:
@@ -144,14 +147,6 @@ def track(
     if rerun_file is not None:
         rerun.write(rerun_file, [rerun.Logged(in_one_frame(found, alignment=None), ready[0])])
     return Tracked(found, summary, out)
-
-
-def _check(out: Path) -> None:
-    """Refuse a folder that is neither an earlier track nor empty, and one that cannot be made."""
-    track = all((out / name).is_file() for name in NAMES)
-    if out.exists() and not (track or (out.is_dir() and not any(out.iterdir()))):
-        raise InputError(out, "is there already and is no track", "name another --out")
-    check_writable_folder(out.parent)
 
 
 def _check_bridged(sequence: Sequence) -> None:

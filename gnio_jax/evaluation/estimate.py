@@ -42,7 +42,7 @@ from gnio_jax.filtering.settings import FilterSetup
 from gnio_jax.models import Network
 from gnio_jax.numerics import filled_up, finite_rows, quaternion_from_matrix, yaw_rotation
 from gnio_jax.reporting import Progress, silent
-from gnio_jax.types import Array, Waypoints
+from gnio_jax.types import Array, Prediction, Waypoints
 
 PERFECT_STD = 0.01
 """Standard deviation of the true displacements that a `perfect` filter is given, m per axis."""
@@ -93,14 +93,22 @@ def estimate(
     if ekf is None:
         assert not isinstance(source, Network)
         return [integrate(*pair, windows) for pair in zip(recordings, source, strict=True)]
+    network, given = (
+        (source, None) if isinstance(source, Network) else (Network(None, None), source)
+    )
     found: dict[int, Estimate] = {}
     strides = [each.strides for each in recordings]
     for batch in _batches(strides, batch_size):
-        history = jax.device_get(_filter_batch(batch, recordings, source, ekf))
+        displacements = None if given is None else [given[i] for i in batch.members]
+        members = [recordings[i] for i in batch.members]
+        inputs = filter_inputs(members, displacements, batch.intervals, ekf.config)
+        fixed = {"apply": network.apply, "config": ekf.config}
+        history = _run(network.variables, inputs, ekf.noise, ekf.considered, **fixed)
+        history = jax.device_get(history)
         for place, i in enumerate(dict.fromkeys(batch.members)):
             own = jax.tree.map(lambda leaf, p=place, k=strides[i]: leaf[p, :k], history)
-            if not isinstance(source, Network):
-                own = own._replace(diagnostics=source[i].diagnostics)
+            if given is not None:
+                own = own._replace(diagnostics=given[i].diagnostics)
             found[i] = _of_history(recordings[i], own, ekf)
         progress(sum(strides[i] for i in found) / sum(strides))
     return [found[i] for i in range(len(recordings))]
@@ -128,14 +136,11 @@ def in_one_frame(estimate: Estimate, alignment: Alignment | None = "origin") -> 
     """Estimate and reference in one frame, to be looked at together: the estimate with its
     covariance aligned, or without an `alignment` the reference moved so that both start alike. To
     waypoints it is aligned in their own way. Unchanged where that is impossible."""
+    if alignment is None and estimate.waypoints is None:
+        return estimate._replace(reference=in_frame_of(estimate.reference, estimate.trajectory))
+    reference = estimate.waypoints or estimate.reference
+    aligned = in_frame_of(estimate.trajectory, reference, alignment or "origin")
     filtered = None
-    if estimate.waypoints is not None:
-        aligned = in_frame_of(estimate.trajectory, estimate.waypoints)
-    elif alignment is None:
-        reference = in_frame_of(estimate.reference, estimate.trajectory)
-        return estimate._replace(reference=reference)
-    else:
-        aligned = in_frame_of(estimate.trajectory, estimate.reference, alignment)
     if estimate.filtered is not None:
         covariance = turned_covariance(estimate.filtered.covariance, estimate.trajectory, aligned)
         filtered = estimate.filtered._replace(covariance=covariance)
@@ -171,21 +176,6 @@ def _batches(strides: list[int], batch_size: int) -> list[Batch]:
         return length
 
     return batches(strides, max(1, math.ceil(len(strides) / count)), padded)
-
-
-def _filter_batch(
-    batch: Batch,
-    recordings: list[Recording],
-    source: Network | list[Displacements],
-    ekf: FilterSetup,
-) -> FilterHistory:
-    """The filter over one batch, whose recordings are padded to a common length."""
-    network = source if isinstance(source, Network) else Network(None, None)
-    given = None if isinstance(source, Network) else [source[i] for i in batch.members]
-    members = [recordings[i] for i in batch.members]
-    inputs = filter_inputs(members, given, batch.intervals, ekf.config)
-    fixed = {"apply": network.apply, "config": ekf.config}
-    return _run(network.variables, inputs, ekf.noise, ekf.considered, **fixed)
 
 
 def filter_inputs(
@@ -234,7 +224,10 @@ def _run(
             history = run_filter(state, *signals, own.given.value, covariance, *fixed)[1]
         else:
             frame = config.displacement_frame
-            predict = functools.partial(_predict, apply, variables)
+
+            def predict(windows: Array) -> Prediction:
+                return keep(apply(variables, windows))
+
             history = run_odometry(predict, state, *signals, *fixed)[1]
         diagonal, whole = history.covariance_diagonal, history.covariance
         assert whole is not None
@@ -252,10 +245,6 @@ def _run(
         return history._replace(covariance_diagonal=diagonal, covariance=position)
 
     return over_sequences(run)(inputs)
-
-
-def _predict(apply: Callable, variables: Any, windows: Array) -> Any:
-    return keep(apply(variables, windows))
 
 
 def _of_history(recording: Recording, history: FilterHistory, ekf: FilterSetup) -> Estimate:

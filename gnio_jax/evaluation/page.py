@@ -23,16 +23,7 @@ from jaxtyping import Float
 from jinja2 import Environment
 
 from gnio_jax.errors import InputError
-from gnio_jax.evaluation import metrics, plots, tabulate
-from gnio_jax.evaluation.colours import (
-    AXES,
-    BLUE,
-    COLOURS,
-    GREEN,
-    REFERENCE,
-    SIGMAS,
-    VERMILION,
-)
+from gnio_jax.evaluation import colours, metrics, plots, tabulate
 from gnio_jax.evaluation.plots import View
 from gnio_jax.evaluation.report import Report, read, read_estimates
 from gnio_jax.evaluation.tabulate import COLUMNS
@@ -45,10 +36,10 @@ SAME = ("dataset", "split", "data_root", "recordings", "model", "checkpoint", "s
 """Settings in which evaluations are alike that stand side by side."""
 STRIPS = {"gate": "gate γ (–)", "scale": "scale (–)", "std": "σ of network (m)"}
 """Curves with a value for each axis of the window's yaw frame, and their labels."""
-LEVELS = (("mean", 3.0, GREEN), ("refused above", 11.345, VERMILION))
+LEVELS = (("mean", 3.0, colours.GREEN), ("refused above", 11.345, colours.VERMILION))
 """Of the NIS of three axes: the mean of χ², and what the filter refuses by default."""
 MAP_HEIGHT, STRIP_HEIGHT, LABEL_HEIGHT, LEFT = 560, 158, 30, 62
-WAYPOINT = {"marker": "x", "color": REFERENCE, "line_width": 2.0}
+WAYPOINT = {"marker": "x", "color": colours.REFERENCE, "line_width": 2.0}
 LONG = 1e6
 """Longer than a recording, s."""
 GO_THERE = """
@@ -89,13 +80,9 @@ def of_report(
 ) -> Run:
     """An evaluation; `settings` is the configuration of its run."""
     made, own = report.settings, report.summary()
-    rows = {
-        "mean": {metric: of.mean for metric, of in own.items()},
-        "median": {metric: of.median for metric, of in own.items()},
-    }
+    rows = {name: {x: getattr(of, name) for x, of in own.items()} for name in ("mean", "median")}
     for row in report.reference_rows:
-        means = {metric: of.mean for metric, of in report.summary(row).items()}
-        rows[row.replace("_", " ")] = means
+        rows[row.replace("_", " ")] = {x: of.mean for x, of in report.summary(row).items()}
     recordings = {"recordings": f"{made['dataset']}, split {made['split']}"}
     return Run(
         name or tabulate.way(made),
@@ -141,7 +128,7 @@ def write(path: Path, title: str, runs: list[Run]) -> None:
     The first run gives the sequences and the curves of network and filter; of the others there are
     paths, errors and figures. At most `len(COLOURS)` runs are shown.
     """
-    write_text(path, render(title, runs[: len(COLOURS)]))
+    write_text(path, render(title, runs[: len(colours.COLOURS)]))
 
 
 def render(title: str, runs: list[Run]) -> str:
@@ -158,7 +145,7 @@ def render(title: str, runs: list[Run]) -> str:
         subtitle="; ".join(f"{name}: {text}" for name, text in about.items() if name != "command"),
         command=about.get("command"),
         sequences=sequences,
-        runs=[run._asdict() | {"colour": COLOURS[place]} for place, run in enumerate(runs)],
+        runs=[run._asdict() | {"colour": colours.COLOURS[place]} for place, run in enumerate(runs)],
         below=list(dict.fromkeys(name for run in runs for name in run.summary)),
         columns={metric: COLUMNS[metric] for metric in shown},
         number=tabulate.number,
@@ -203,7 +190,7 @@ def columns(seen: View, rows: int) -> Columns:
     for name in STRIPS:
         values = getattr(seen, name)
         if np.isfinite(values).any():
-            found |= {f"{name}_{axis}": values[:, k] for k, axis in enumerate(AXES)}
+            found |= {f"{name}_{axis}": values[:, k] for k, axis in enumerate(colours.AXES)}
     found = {name: values[::step] for name, values in found.items()}
     if len(seen.taps.time):
         # In the row that is nearest in time: a row without a waypoint is NaN.
@@ -245,7 +232,7 @@ def frame(runs: list[Run], sequence: str) -> dict[str, list[float]]:
     low, high = points.min(0), points.max(0)
     size = max(float((high - low).max()), 1.0)
     variance = np.diagonal(views[0].covariance, axis1=1, axis2=2)[:, :2]
-    reach = np.nan_to_num(SIGMAS * np.sqrt(np.maximum(variance, 0.0)))
+    reach = np.nan_to_num(colours.SIGMAS * np.sqrt(np.maximum(variance, 0.0)))
     ends = [np.nan_to_num(views[0].position[:, :2] + side * reach) for side in (-1.0, 1.0)]
     low = np.maximum(np.minimum(ends[0].min(0), low), low - size)
     high = np.minimum(np.maximum(ends[1].max(0), high), high + size)
@@ -271,12 +258,12 @@ class Sources(NamedTuple):
 def _document(runs: list[Run], held: list[list[Columns]]) -> tuple[Document, list[str]]:
     """Bokeh's document, with the script that fills its figures when they are drawn, and the names
     of its figures."""
-    colours, one = list(COLOURS[: len(runs)]), [1.0] * len(runs)
+    palette, one = list(colours.COLOURS[: len(runs)]), [1.0] * len(runs)
     marks = ("time", "distance", "x", "y", "reference_x", "reference_y", "width", "height", "angle")
     sources = Sources(
         [ColumnDataSource({name: [1.0, 2.0] for name in of_run[0]}) for of_run in held],
-        ColumnDataSource(dict.fromkeys(marks, one) | {"colour": colours}),
-        ColumnDataSource({"x": one, "y": one, "colour": colours}),
+        ColumnDataSource(dict.fromkeys(marks, one) | {"colour": palette}),
+        ColumnDataSource({"x": one, "y": one, "colour": palette}),
         ColumnDataSource({"x": [0.0, 1.0], "y": [0.0, 1.0]}),
     )
     first, there = sources.paths[0], held[0][0].keys()
@@ -284,7 +271,7 @@ def _document(runs: list[Run], held: list[list[Columns]]) -> tuple[Document, lis
     tapped = "waypoint_x" in there
     times, distances = Range1d(0.0, 1.0), Range1d(0.0, 1.0)
     drawn = [
-        (path, run.name, own) for path, run, own in zip(sources.paths, runs, colours, strict=True)
+        (path, run.name, own) for path, run, own in zip(sources.paths, runs, palette, strict=True)
     ]
     figures: dict[str, Any] = {"map": _draw_map(drawn, sources, known, tapped)}
     errors = [(path, "error", name, colour) for path, name, colour in drawn if known]
@@ -294,10 +281,12 @@ def _document(runs: list[Run], held: list[list[Columns]]) -> tuple[Document, lis
     strips = [_draw_strip(sources, times, label, errors, band=True, tapped=tapped)]
     for name, label in STRIPS.items():
         if f"{name}_x" in there:
-            curves = [(first, f"{name}_{axis}", axis, colour) for axis, colour in AXES.items()]
+            curves = [
+                (first, f"{name}_{axis}", axis, colour) for axis, colour in colours.AXES.items()
+            ]
             strips.append(_draw_strip(sources, times, label, curves))
     if "nis" in there:
-        curve = [(first, "nis", "NIS", BLUE)]
+        curve = [(first, "nis", "NIS", colours.BLUE)]
         strips.append(_draw_strip(sources, times, "NIS (–)", curve, levels=LEVELS))
     strips[-1].xaxis.axis_label, strips[-1].height = "time (s)", STRIP_HEIGHT + LABEL_HEIGHT
     figures["strips"] = gridplot(
@@ -339,12 +328,12 @@ def _draw_map(
     corners = plan.scatter("x", "y", source=sources.corners, alpha=0.0)
     plan.x_range, plan.y_range = DataRange1d(renderers=[corners]), DataRange1d(renderers=[corners])
     if known:
-        black = {"color": REFERENCE, "line_width": 2.0, "legend_label": "reference"}
+        black = {"color": colours.REFERENCE, "line_width": 2.0, "legend_label": "reference"}
         plan.line("reference_x", "reference_y", source=sources.paths[0], **black)
     if tapped:
         ends = {"x0": "x", "y0": "y", "x1": "waypoint_x", "y1": "waypoint_y"}
         label = {"source": sources.paths[0], "legend_label": "waypoint, error"}
-        plan.segment(**ends, color=VERMILION, line_width=1.2, **label)
+        plan.segment(**ends, color=colours.VERMILION, line_width=1.2, **label)
         plan.scatter("waypoint_x", "waypoint_y", size=9, **WAYPOINT, **label)
     for path, name, colour in drawn:
         plan.line("x", "y", source=path, color=colour, line_width=1.8, legend_label=name)
@@ -356,7 +345,7 @@ def _draw_map(
     now = {"source": sources.marks, "line_color": "white", "line_width": 2.0}
     plan.scatter("x", "y", size=11, fill_color="colour", **now)
     if known:
-        plan.scatter("reference_x", "reference_y", size=9, fill_color=REFERENCE, **now)
+        plan.scatter("reference_x", "reference_y", size=9, fill_color=colours.REFERENCE, **now)
     return _finish(plan, grid_x=True)
 
 

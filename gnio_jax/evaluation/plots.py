@@ -19,17 +19,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Ellipse
 from matplotlib.ticker import PercentFormatter
 
-from gnio_jax.evaluation import metrics, statistics, tabulate
-from gnio_jax.evaluation.colours import (
-    AXES,
-    BLUE,
-    COLOURS,
-    GREEN,
-    GREY,
-    REFERENCE,
-    SIGMAS,
-    VERMILION,
-)
+from gnio_jax.evaluation import colours, metrics, statistics, tabulate
 from gnio_jax.evaluation.estimate import Estimate, in_one_frame
 from gnio_jax.evaluation.infer import Displacements
 from gnio_jax.evaluation.metrics import Filtered
@@ -161,7 +151,7 @@ def ellipses(covariance: Float[np.ndarray, "n 3 3"]) -> Ellipses:
     horizontal = covariance[:, :2, :2]
     known = finite_rows(horizontal.reshape(-1, 4))
     variance, axes = np.linalg.eigh(np.where(known[:, None, None], horizontal, np.eye(2)))
-    minor, major = SIGMAS * np.sqrt(np.maximum(variance, 0.0)).T
+    minor, major = colours.SIGMAS * np.sqrt(np.maximum(variance, 0.0)).T
     angle = np.arctan2(axes[:, 1, 1], axes[:, 0, 1])
     return Ellipses(*(np.where(known, part, np.nan) for part in (major, minor, angle)))
 
@@ -212,29 +202,29 @@ def sequence(seen: View, title: str = "") -> Figure:
 def _draw_map(axes: Axes, seen: View) -> None:
     """Plan view, both axes to the same scale."""
     if seen.known:
-        axes.plot(*seen.reference[:, :2].T, color=REFERENCE, lw=1.6, label="reference")
-    axes.plot(*seen.position[:, :2].T, color=BLUE, lw=1.4, label="estimate")
+        axes.plot(*seen.reference[:, :2].T, color=colours.REFERENCE, lw=1.6, label="reference")
+    axes.plot(*seen.position[:, :2].T, color=colours.BLUE, lw=1.4, label="estimate")
     if len(seen.taps.time):
-        axes.plot(*seen.taps.position.T, color=REFERENCE, zorder=5, label="waypoint", **TAP)
+        axes.plot(*seen.taps.position.T, color=colours.REFERENCE, zorder=5, label="waypoint", **TAP)
         for ends in np.stack([seen.taps.position, seen.taps.passed], 1):
-            axes.plot(*ends.T, color=VERMILION, lw=1.0, zorder=3)
-        axes.plot([], [], color=VERMILION, lw=1.0, label="error at its time")
+            axes.plot(*ends.T, color=colours.VERMILION, lw=1.0, zorder=3)
+        axes.plot([], [], color=colours.VERMILION, lw=1.0, label="error at its time")
     shapes = ellipses(seen.covariance)
     there = np.flatnonzero(np.isfinite(shapes.major) & finite_rows(seen.position))
     if len(there):
         for row in there[np.linspace(0, len(there) - 1, ELLIPSES).astype(int)]:
             size, angle = (2 * shapes.major[row], 2 * shapes.minor[row]), shapes.angle[row]
             shape = Ellipse(tuple(seen.position[row, :2]), *size, angle=float(np.degrees(angle)))
-            shape.set(facecolor=BLUE, edgecolor=BLUE, alpha=0.13)
+            shape.set(facecolor=colours.BLUE, edgecolor=colours.BLUE, alpha=0.13)
             axes.add_patch(shape)
-        axes.plot([], [], color=BLUE, lw=6, alpha=0.2, label="3σ")
-    for path, colour in ((seen.reference, REFERENCE), (seen.position, BLUE)):
+        axes.plot([], [], color=colours.BLUE, lw=6, alpha=0.2, label="3σ")
+    for path, colour in ((seen.reference, colours.REFERENCE), (seen.position, colours.BLUE)):
         good = path[finite_rows(path)]
         if len(good):
             axes.plot(*good[0, :2], color=colour, zorder=4, **START)
             axes.plot(*good[-1, :2], color=colour, zorder=4, **END)
-    axes.plot([], [], color=GREY, label="start", **START)
-    axes.plot([], [], color=GREY, label="end", **END)
+    axes.plot([], [], color=colours.GREY, label="start", **START)
+    axes.plot([], [], color=colours.GREY, label="end", **END)
     axes.set_aspect("equal", adjustable="datalim")
     axes.margins(0.08)
     axes.set_xlabel("x (m)")
@@ -245,11 +235,11 @@ def _draw_map(axes: Axes, seen: View) -> None:
 
 def _draw_error(axes: Axes, seen: View, vertical: bool = False) -> None:
     """Of the position, with the filter's 3σ behind it; without a reference the 3σ alone."""
-    bound, colour, name = ellipses(seen.covariance).major, BLUE, "horizontal"
+    bound, colour, name = ellipses(seen.covariance).major, colours.BLUE, "horizontal"
     error = np.linalg.norm((seen.position - seen.reference)[:, :2], axis=1)
     if vertical:
-        bound = SIGMAS * np.sqrt(np.maximum(seen.covariance[:, 2, 2], 0.0))
-        error, colour, name = (seen.position - seen.reference)[:, 2], GREEN, "vertical"
+        bound = colours.SIGMAS * np.sqrt(np.maximum(seen.covariance[:, 2, 2], 0.0))
+        error, colour, name = (seen.position - seen.reference)[:, 2], colours.GREEN, "vertical"
     if np.isfinite(bound).any():
         low = -bound if vertical else np.zeros_like(bound)
         axes.fill_between(seen.time, low, bound, color=colour, alpha=0.16, lw=0, label="3σ")
@@ -257,35 +247,36 @@ def _draw_error(axes: Axes, seen: View, vertical: bool = False) -> None:
         axes.plot(seen.time, error, color=colour, lw=1.2, label="error")
     tapped = len(seen.taps.time) > 0 and not vertical
     if tapped:
-        style = {"color": REFERENCE, "label": "at waypoints", "clip_on": False, **TAP}
+        style = {"color": colours.REFERENCE, "label": "at waypoints", "clip_on": False, **TAP}
         axes.plot(seen.taps.time, seen.taps.error, **style)
-    axes.axhline(0, color=REFERENCE, lw=0.6)
+    axes.axhline(0, color=colours.REFERENCE, lw=0.6)
     axes.set_ylabel(f"{name}\n{'error' if seen.known or tapped else '3σ'} (m)")
 
 
 def _draw_speed(axes: Axes, seen: View) -> None:
+    black = {"color": colours.REFERENCE, "lw": 1.4}
     if seen.known:
-        true = speed(seen.reference, seen.step)
-        axes.plot(seen.time, true, color=REFERENCE, lw=1.4, label="reference")
+        axes.plot(seen.time, speed(seen.reference, seen.step), label="reference", **black)
     if len(seen.taps.time):
         lengths = np.linalg.norm(np.diff(seen.taps.position, axis=0), axis=1)
         legs = lengths / np.diff(seen.taps.time)
-        axes.stairs(legs, seen.taps.time, baseline=None, color=REFERENCE, lw=1.4, label="legs")
-    axes.plot(seen.time, speed(seen.position, seen.step), color=BLUE, lw=1.1, label="estimate")
+        axes.stairs(legs, seen.taps.time, baseline=None, label="legs", **black)
+    own = speed(seen.position, seen.step)
+    axes.plot(seen.time, own, color=colours.BLUE, lw=1.1, label="estimate")
     axes.set_ylabel("horizontal\nspeed (m/s)")
     axes.set_ylim(bottom=0)
 
 
 def _draw_gate(axes: Axes, seen: View) -> None:
-    for k, (name, colour) in enumerate(AXES.items()):
+    for k, (name, colour) in enumerate(colours.AXES.items()):
         axes.plot(seen.time, seen.gate[:, k], color=colour, lw=1.1, label=name)
-    axes.axhline(0, color=REFERENCE, lw=0.6)
+    axes.axhline(0, color=colours.REFERENCE, lw=0.6)
     axes.set_ylim(-1.05 if np.nanmin(seen.gate) < 0 else -0.05, 1.05)
     axes.set_ylabel("gate γ (–)")
 
 
 def _draw_accepted(axes: Axes, seen: View) -> None:
-    axes.plot(seen.time, seen.accepted, color=BLUE, lw=1.0, label="used")
+    axes.plot(seen.time, seen.accepted, color=colours.BLUE, lw=1.0, label="used")
     axes.set_ylim(-0.05, 1.05)
     axes.set_ylabel("displacement")
 
@@ -303,21 +294,16 @@ def error_cdf(views: list[View], report: Report) -> Figure:
     posed = any(seen.known for seen in views)
     tapped = any(len(seen.taps.time) for seen in views)
     for error in errors:
-        _step(left, error, color=BLUE, lw=0.7, alpha=0.25)
+        _step(left, error, color=colours.BLUE, lw=0.7, alpha=0.25)
     if errors:
-        _step(
-            left,
-            np.concatenate(errors),
-            color=BLUE,
-            lw=2.2,
-            label="all samples" if posed else "all waypoints",
-        )
-    left.plot([], [], color=BLUE, lw=0.7, alpha=0.5, label="one sequence")
+        label = "all samples" if posed else "all waypoints"
+        _step(left, np.concatenate(errors), color=colours.BLUE, lw=2.2, label=label)
+    left.plot([], [], color=colours.BLUE, lw=0.7, alpha=0.5, label="one sequence")
     left.set_xlabel("horizontal position error (m)")
     left.set_ylabel("share with at most this error")
     left.yaxis.set_major_formatter(PercentFormatter(1.0))
     scored = {"this network": report.scores, **report.reference_rows}
-    styles = ((BLUE, "-"), (VERMILION, "--"), (GREEN, "-."))
+    styles = ((colours.BLUE, "-"), (colours.VERMILION, "--"), (colours.GREEN, "-."))
     for (name, scores), (colour, style) in zip(scored.items(), styles, strict=False):
         found = [own.values.get(x) for own in scores.values() for x in ("ate_2d", "waypoint_rms")]
         values = np.array([value for value in found if value is not None])
@@ -363,7 +349,7 @@ def paired(rows: Mapping[str, Sequence[Report]], metric: str) -> Figure:
     height = 0.24 + 0.08 * len(rows)
     figure = Figure(figsize=(8.0, 2.0 + height * len(names)), layout="constrained")
     axes, legend = figure.add_subplot(), {}
-    palette = (GREY, *COLOURS)
+    palette = (colours.GREY, *colours.COLOURS)
     for number, (label, table, diverged) in enumerate(zip(rows, tables, lost, strict=True)):
         colour = palette[number % len(palette)]
         marker = MARKERS[number // len(palette) % len(MARKERS)]
@@ -379,9 +365,9 @@ def paired(rows: Mapping[str, Sequence[Report]], metric: str) -> Figure:
         text = shown_name(label, 100)
         legend["\u200b" + text if text.startswith("_") else text] = dots
     marked = {name for diverged in lost for name in diverged}
-    ticks = [f"{shown_name(name, 40)}  ({shown_name(groups[name], 20)})" for name in names]
     ticks = [
-        tick + (" †" if name in marked else "") for tick, name in zip(ticks, names, strict=True)
+        f"{shown_name(name, 40)}  ({shown_name(groups[name], 20)}){' †' if name in marked else ''}"
+        for name in names
     ]
     axes.set_yticks(range(len(names)), ticks, fontsize=8)
     axes.set_xlabel(tabulate.column(metric).title)
@@ -402,11 +388,8 @@ def save_all(folder: Path, views: list[View], report: Report, progress: Progress
     for done, (stem, seen) in enumerate(zip(stems, views, strict=True)):
         progress(done / len(views))
         values = report.scores[seen.name].values
-        errors = [
-            f"{heading} {values[name]:.2f} m"
-            for name, heading in TITLE.items()
-            if values.get(name) is not None
-        ]
+        known = {x: text for x, text in TITLE.items() if values.get(x) is not None}
+        errors = [f"{heading} {values[name]:.2f} m" for name, heading in known.items()]
         title = ": ".join(filter(None, (shown_name(seen.name), ", ".join(errors))))
         save(folder / f"{stem}.png", sequence(seen, title))
     if any(len(seen.errors) for seen in views):

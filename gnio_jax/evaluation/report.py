@@ -165,18 +165,15 @@ def _sequences(scores: Scores) -> dict[str, dict[str, Any]]:
 
 def _summaries(found: Mapping[str, Summary]) -> dict[str, dict[str, Any]]:
     """Each statistic of all metrics."""
-    names = {"interval": "interval", "n": "sequences", "groups": "groups", "diverged": "diverged"}
+    names = {"mean": "mean", "median": "median", "interval": "interval", "n": "sequences"}
+    names |= {"groups": "groups", "diverged": "diverged"}
     return {
-        "mean": _finite({metric: of.mean for metric, of in found.items()}),
-        "median": _finite({metric: of.median for metric, of in found.items()}),
-        **{
-            key: {metric: getattr(of, field) for metric, of in found.items()}
-            for key, field in names.items()
-        },
+        key: _finite({metric: getattr(of, field) for metric, of in found.items()})
+        for key, field in names.items()
     }
 
 
-def _finite(values: Mapping[str, float | None]) -> dict[str, float | None]:
+def _finite(values: Mapping[str, Any]) -> dict[str, Any]:
     return {name: None if value == math.inf else value for name, value in values.items()}
 
 

@@ -8,6 +8,7 @@ all its metrics and all seeds, and is counted beside them.
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -84,12 +85,7 @@ def values(seeds: Sequence[Scores], metric: str) -> dict[str, Float[np.ndarray, 
 
 def lost(seeds: Sequence[Scores]) -> dict[str, int]:
     """Sequence → number of seeds with which its estimate diverged, where there are any."""
-    found: dict[str, int] = {}
-    for scores in seeds:
-        for name, own in scores.items():
-            if own.diverged:
-                found[name] = found.get(name, 0) + 1
-    return found
+    return Counter(name for scores in seeds for name, own in scores.items() if own.diverged)
 
 
 def summarise(seeds: Sequence[Scores], metric: str, groups: Mapping[str, Any]) -> Summary:
@@ -157,8 +153,7 @@ def compare(
         if measures.values.get(metric) is not None
     }
     drawn = [groups[name] for name in shared]
-    counts = {"compared": len(shared), "sequences": len(either), "groups": len(set(drawn))}
-    nothing = Difference(None, None, None, 0, **counts)
+    nothing = Difference(None, None, None, 0, len(shared), len(either), len(set(drawn)))
     if not shared:
         return nothing
     rows = [[of[name] for name in shared] for of in (of_own, of_other)]

@@ -89,12 +89,10 @@ def base_config(options: TablesConfig) -> TrainConfig:
 def networks(options: TablesConfig) -> tuple[str, ...]:
     """The networks named by --methods."""
     names = _words(options.methods)
-    known = f"known: {', '.join(models.names())}"
-    for name in names:
-        if name not in models.names():
-            raise InputError("--methods", f"no network '{name}'", known)
-    if not names:
-        raise InputError("--methods", "names no network", known)
+    unknown = [f"no network '{name}'" for name in names if name not in models.names()]
+    if unknown or not names:
+        problem = unknown[0] if unknown else "names no network"
+        raise InputError("--methods", problem, f"known: {', '.join(models.names())}")
     return names
 
 

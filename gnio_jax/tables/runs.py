@@ -59,13 +59,9 @@ def run_row(row: Row, options: TablesConfig, reporter: Reporter, workers: int = 
     runs = [Path(each.workdir or "") for each in configuration.with_seeds(config, seeds)]
     if options.calibrate:
         runs = [calibrated(run, reporter, workers) for run in runs]
-    root, split, estimator = config.data_root, options.split, options.estimator
-    looked = [
-        kept.look(
-            EvaluateConfig(str(run), data_root=root, split=split, estimator=estimator, plots=False)
-        )
-        for run in runs
-    ]
+    how = {"split": options.split, "estimator": options.estimator, "plots": False}
+    asked = [EvaluateConfig(str(run), data_root=config.data_root, **how) for run in runs]
+    looked = [kept.look(each) for each in asked]
     reports = [kept.made(each, reporter, workers) for each in looked]
     return Result(row, reports, runs, [each.folder for each in looked])
 

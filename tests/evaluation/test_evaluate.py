@@ -3,6 +3,7 @@
 import dataclasses
 import importlib.util
 import json
+import runpy
 import shutil
 import sys
 from pathlib import Path
@@ -11,31 +12,27 @@ import numpy as np
 import pytest
 
 from gnio_jax import data
-from gnio_jax.commands import console
 from gnio_jax.config import DataConfig, EvaluateConfig, ModelConfig, TrainConfig
 from gnio_jax.data.simulated import walks as simulated
 from gnio_jax.errors import InputError
-from gnio_jax.evaluation import evaluate, plots, report
+from gnio_jax.evaluation import evaluate, report
 from gnio_jax.evaluation.evaluate import folder_name, resolve
-from tests.support import drawn_run
+from tests.support import tiny_run
 from tests.support.estimators import with_waypoints
 from tests.support.filter_settings import changed
 
 ROOT = Path(__file__).parents[2]
 TRAINED = TrainConfig(
     data=DataConfig(rate=50.0),
-    model=ModelConfig(width=2, bank_size=4),
+    model=ModelConfig(name="tiny"),
     filter=changed(start={"velocity": 0.7}),
 )
 
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
-    def draw(random, kind, shape):
-        statistics = kind == "batch_stats"
-        return random.uniform(0.9, 1.1, shape) if statistics else random.normal(0, 0.2, shape)
-
-    return drawn_run.save(tmp_path_factory.mktemp("trained") / "run", TRAINED, draw)
+    with tiny_run.known():
+        yield tiny_run.save(tmp_path_factory.mktemp("trained") / "run", TRAINED)
 
 
 @pytest.fixture
@@ -43,27 +40,30 @@ def workdir(trained, tmp_path):
     return Path(shutil.copytree(trained, tmp_path / "run"))
 
 
+def walk(seed, seconds):
+    return simulated.pedestrian(seed, seed, "handheld", seconds, 50.0)
+
+
+@pytest.fixture(scope="module")
+def pair():
+    """One program serves all tests."""
+    return [walk(1, 15.0), walk(2, 14.0)]
+
+
 @pytest.fixture
-def command(monkeypatch):
-    """evaluate.py's own main on short walks: (arguments) -> None."""
-    lengths = {1: 15.0, 2: 14.0, 3: 0.5}
-    walks = [
-        simulated.pedestrian(seed, seed, "handheld", seconds, 50.0)
-        for seed, seconds in lengths.items()
-    ]
+def command(monkeypatch, pair):
+    """evaluate.py on short walks: (arguments) -> None."""
     load = data.load
 
     def short(name, root=None, split="test", workers=1, progress=None):
-        return walks if (name, split) == ("synthetic", "test") else load(name, root, split)
+        given = (name, split) == ("synthetic", "test")
+        return [*pair, walk(3, 0.5)] if given else load(name, root, split)
 
     monkeypatch.setattr(data, "load", short)
-    spec = importlib.util.spec_from_file_location("evaluate_command", ROOT / "evaluate.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
 
     def call(*arguments):
         monkeypatch.setattr(sys, "argv", ["evaluate.py", *map(str, arguments)])
-        console.run(module.main)
+        runpy.run_path(str(ROOT / "evaluate.py"), run_name="__main__")
 
     return call
 
@@ -110,13 +110,9 @@ def test_end_to_end(workdir, command, capsys, tmp_path):
     assert not list((workdir / "eval").glob("synthetic_test_i*/report.html"))
 
 
-def test_a_void_filter_is_in_the_files(workdir, monkeypatch):
+def test_a_void_filter_is_in_the_files(workdir, pair, monkeypatch):
     """Accelerations in the wrong unit: the sequence says so, and no figure is of it."""
-    walks = [
-        simulated.pedestrian(seed, seed, "handheld", seconds, 50.0)
-        for seed, seconds in ((1, 15.0), (2, 14.0))  # one program with those of the command
-    ]
-    walks[0] = walks[0]._replace(accel=1e3 * walks[0].accel)
+    walks = [pair[0]._replace(accel=1e3 * pair[0].accel), pair[1]]
     monkeypatch.setattr(data, "load", lambda *_: walks)
     done = evaluate(EvaluateConfig(str(workdir), estimator="imu_only", plots=False))
     found = json.loads((done.folder / "metrics.json").read_text())
@@ -129,14 +125,10 @@ def test_a_void_filter_is_in_the_files(workdir, monkeypatch):
     assert [len(each) for each in rows] == [1, 140]
 
 
-def test_walks_with_waypoints_beside_one_with_poses_and_alone(workdir, monkeypatch, tmp_path):
-    posed, other = (
-        simulated.pedestrian(seed, seed, "handheld", seconds, 50.0)
-        for seed, seconds in ((1, 15.0), (2, 14.0))  # one program with those of the command
-    )
-    tapped, walks = with_waypoints(other), [posed, with_waypoints(other)]
+def test_walks_with_waypoints_beside_one_with_poses_and_alone(workdir, pair, monkeypatch):
+    posed, tapped = pair[0], with_waypoints(pair[1])
+    walks = [posed, tapped]
     monkeypatch.setattr(data, "load", lambda *_: walks)
-    monkeypatch.setattr(plots, "DOTS_PER_INCH", 30)
     done = evaluate(EvaluateConfig(str(workdir)))
     found = json.loads((done.folder / "metrics.json").read_text())
     first, second = found["sequences"].values()

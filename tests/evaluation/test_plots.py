@@ -8,11 +8,6 @@ from tests.support.estimates import SETTINGS, estimate, with_covariance
 from tests.support.reports import LOST, report_of
 
 
-@pytest.fixture(autouse=True)
-def few_dots(monkeypatch):
-    monkeypatch.setattr(plots, "DOTS_PER_INCH", 30)
-
-
 def labels(axes):
     return [text.get_text() for text in axes.get_legend().get_texts()]
 
@@ -136,13 +131,11 @@ def test_the_distribution_of_errors_counts_what_diverged(with_divergence, alignm
     assert right.get_lines()[0].get_ydata()[-1] == pytest.approx(2 / 3)
 
 
-def test_one_picture_for_each_sequence(tmp_path, estimates, made, with_divergence):
+def test_one_picture_for_each_sequence(tmp_path, estimates, made):
     plots.save_all(tmp_path / "a", [plots.view(each) for each in estimates], made)
     names = {path.name for path in (tmp_path / "a").iterdir()}
     assert names == {"error_cdf.png", "room_1_walk.png", "room_1_walk_.png", "blind.png"}
     assert all((tmp_path / "a" / name).read_bytes()[:4] == b"\x89PNG" for name in names)
-    of, lost = with_divergence
-    plots.save_all(tmp_path / "b", [plots.view(each) for each in of], lost)
 
 
 def test_a_short_walk_and_a_name_of_any_bytes_are_drawn(tmp_path):

@@ -12,10 +12,8 @@ def test_activities_by_speed():
     )
     names = [activities.ACTIVITIES[k] for k in activities.activity(truth, 1.0)]
     assert names == ["standing", "slow", "walking", "running", "stairs", "slow"]
-    assert [activities.ACTIVITIES[k] for k in activities.activity(truth, 2.0)[[1, 3]]] == [
-        "slow",
-        "walking",
-    ]  # the same way in twice the time
+    names = [activities.ACTIVITIES[k] for k in activities.activity(truth, 2.0)[[1, 3]]]
+    assert names == ["slow", "walking"]  # the same way in twice the time
 
 
 def test_figures_of_windows_by_hand():
@@ -29,12 +27,9 @@ def test_figures_of_windows_by_hand():
     )
     found = activities.by_activity(predicted)
     assert set(found) == {"standing", "walking"}
-    assert found["standing"]["error"] == pytest.approx(0.5) and found["standing"][
-        "gate"
-    ] == pytest.approx(0.3)
-    assert found["standing"]["normalised"] == pytest.approx(np.sqrt((9 + 16) / 3)) and found[
-        "walking"
-    ]["length"] == pytest.approx(0.1)
+    wanted = {"error": 0.5, "gate": 0.3, "normalised": np.sqrt((9 + 16) / 3)}
+    assert {name: found["standing"][name] for name in wanted} == pytest.approx(wanted)
+    assert found["walking"]["length"] == pytest.approx(0.1)
     # First head certain and different, second undecided: half the entropy in a window, all of it in
     # their mean.
     assert activities.entropy(attention) == pytest.approx((0.5, 1.0))
@@ -45,13 +40,11 @@ def test_information_of_prototypes():
     activity = rng.integers(0, 4, 4000)
     attention = np.full((4000, 2, 8), 0.05)
     attention[np.arange(4000), :, activity] = 0.65
-    predicted = activities.PredictedWindows(
-        *[np.zeros((4000, 3))] * 3, {"attention": attention}, activity
-    )
+    nothing = [np.zeros((4000, 3))] * 3
+    predicted = activities.PredictedWindows(*nothing, {"attention": attention}, activity)
     told, chance = activities.information(predicted)
-    assert (
-        told == pytest.approx(2.0, abs=0.01) and chance < 0.01
-    )  # four equally frequent activities: two bits
+    # Four equally frequent activities: two bits.
+    assert told == pytest.approx(2.0, abs=0.01) and chance < 0.01
     names, lifts = activities.attention_by_activity(predicted)
     assert names == ["standing", "slow", "walking", "running"]
     np.testing.assert_array_equal(lifts.argmax(1), [0, 1, 2, 3])
