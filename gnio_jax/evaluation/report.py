@@ -124,12 +124,9 @@ def write(
 def as_json(report: Report) -> dict[str, Any]:
     """The report as plain values. JSON has no infinity: what is not finite is null, and `infinite`
     names those metrics of a sequence that are infinite."""
-    sequences = _sequences(report.scores)
-    for name, sequence in sequences.items():
-        sequence |= {"group": report.groups[name], "notes": report.notes.get(name, [])}
     return {
         "settings": report.settings,
-        "sequences": sequences,
+        "sequences": _of_estimates(report),
         **_summaries(report.summary()),
         "reference_rows": {
             row: {"sequences": _sequences(scores), **_summaries(report.summary(row))}
@@ -149,6 +146,13 @@ def file_names(names: list[str]) -> list[str]:
             stem += "_"
         stems.append(stem)
     return stems
+
+
+def _of_estimates(report: Report) -> dict[str, dict[str, Any]]:
+    return {
+        name: {**own, "group": report.groups[name], "notes": report.notes.get(name, [])}
+        for name, own in _sequences(report.scores).items()
+    }
 
 
 def _sequences(scores: Scores) -> dict[str, dict[str, Any]]:
@@ -199,17 +203,21 @@ def read(folder: Path) -> Report:
         known += [math.isfinite(settings["recordings"][name]) for name in sequences]
         if not sequences or not all(known) or not isinstance(settings["filter"], dict):
             raise ValueError
-        return Report(
+        rows = {row: of["sequences"] for row, of in found["reference_rows"].items()}
+        report = Report(
             settings,
-            {name: _measures(own) for name, own in sequences.items()},
-            {
-                row: {name: _measures(own) for name, own in of["sequences"].items()}
-                for row, of in found["reference_rows"].items()
-            },
-            {name: _text(own["group"]) for name, own in sequences.items()},
-            {name: [*map(_text, own["notes"])] for name, own in sequences.items() if own["notes"]},
-            {name: _text(reason) for name, reason in found["left_out"].items()},
+            _scores(sequences),
+            {row: _scores(own) for row, own in rows.items()},
+            {name: str(own["group"]) for name, own in sequences.items()},
+            {name: [*map(str, own["notes"])] for name, own in sequences.items() if own["notes"]},
+            {name: str(reason) for name, reason in found["left_out"].items()},
         )
+        # What is not as it is written is no report: a text in the place of a number, say.
+        again = {row: _sequences(own) for row, own in report.reference_rows.items()}
+        written = _of_estimates(report), again, report.left_out
+        if written != (sequences, rows, found["left_out"]):
+            raise ValueError
+        return report
     except InputError:
         raise
     except (FileNotFoundError, NotADirectoryError):
@@ -243,28 +251,13 @@ def read_estimates(folder: Path, names: list[str]) -> list[Estimate]:
     return found
 
 
-def _measures(sequence: Mapping[str, Any]) -> Measures:
-    """Raises `ValueError` and others for what `_sequences` does not write."""
-    values: dict[str, float | None] = {}
-    for name in sequence.keys() - set(BESIDE):
-        value = sequence[name]
-        if value is not None and not (type(value) in (int, float) and math.isfinite(value)):
-            raise ValueError
-        values[name] = value
-    for name in sequence["infinite"]:
-        if values[name] is not None:
-            raise ValueError
-        values[name] = math.inf
-    reasons = {name: _text(reason) for name, reason in sequence["reasons"].items()}
-    if not isinstance(sequence["diverged"], bool):
-        raise ValueError
-    # In the order of the file.
-    return Measures(
-        {name: values[name] for name in sequence if name in values}, reasons, sequence["diverged"]
-    )
-
-
-def _text(value: Any) -> str:
-    if not isinstance(value, str):
-        raise ValueError
-    return value
+def _scores(sequences: Mapping[str, Any]) -> dict[str, Measures]:
+    """What `_sequences` was made of."""
+    scores = {}
+    for name, own in sequences.items():
+        found = {metric: own[metric] for metric in own if metric not in BESIDE}
+        values = {metric: None if x is None else float(x) for metric, x in found.items()}
+        values |= dict.fromkeys(own["infinite"], math.inf)
+        reasons = {metric: str(reason) for metric, reason in own["reasons"].items()}
+        scores[name] = Measures(values, reasons, bool(own["diverged"]))
+    return scores

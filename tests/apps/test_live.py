@@ -1,6 +1,7 @@
 """`gnio live`: the trajectory of a stream is that of the tracker, and nonsense is refused."""
 
 import dataclasses
+import importlib.util
 import io
 import signal
 import socket
@@ -64,10 +65,13 @@ def recorded():
 
 
 @pytest.fixture
-def gnio(monkeypatch, capsys):
+def gnio(monkeypatch, capsys, run):
+    """What `gnio live` prints of lines on standard input."""
+
     def call(lines, *arguments):
-        monkeypatch.setattr(sys, "stdin", io.StringIO("\n".join(lines)))
-        console.run(lambda: app.main(["live", *map(str, arguments)]))
+        content = "\n".join(lines).encode("utf-8", "surrogateescape")
+        monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(content)))
+        console.run(lambda: app.main(["live", *map(str, arguments), "--weights", str(run)]))
         return capsys.readouterr().out
 
     return call
@@ -78,12 +82,16 @@ def as_lines(recorded):
     return [",".join(map(repr, row)) for row in rows]
 
 
-def test_a_stream_gives_the_trackers_poses(gnio, run, recorded, tmp_path):
-    out = tmp_path / "live.txt"
-    lines = as_lines(recorded)
+def test_a_stream_gives_the_trackers_poses(gnio, run, recorded, monkeypatch, tmp_path):
+    """In the file of the trajectory and in that for Rerun, whose path comes in pieces."""
+    monkeypatch.setattr(rerun, "LINE_EVERY", 3)
+    monkeypatch.setattr(rerun, "LONGEST_PIECE", 9)
+    shown = ["--rerun", tmp_path / "live.rrd"] if importlib.util.find_spec("rerun") else []
+    out, lines = tmp_path / "live.txt", as_lines(recorded)
     # A header, noise on the line and a repeated sample are refused and counted.
-    lines = ["time,gx,gy,gz,ax,ay,az", *lines[:70], "garbage", lines[69], *lines[70:]]
-    told = gnio(lines, "--weights", run, "--out", out)
+    lines = ["time,gx,gy,gz,ax,ay,az", *lines[:70], "\udcff\udcfe", lines[69], *lines[70:]]
+    told = gnio(lines, "--out", out, *shown)
+    assert {path.name for path in tmp_path.iterdir()} == {"live.txt", *(["live.rrd"] * bool(shown))}
     assert "\x1b" not in told and "warning: 3 lines refused, the first: is no sample" in told
     # A line a second, the last one repeated at the end.
     assert sum(line.lstrip()[0].isdigit() for line in told.splitlines()) == 6
@@ -92,9 +100,23 @@ def test_a_stream_gives_the_trackers_poses(gnio, run, recorded, tmp_path):
     for sample in zip(*recorded, strict=True):
         pose = tracker.push(*sample)
         expected += [] if pose is None else [pose]
-    found = read_tum(out)
-    np.testing.assert_allclose(found.time, [pose.time for pose in expected], atol=1e-8)
-    np.testing.assert_allclose(found.position, [p.position for p in expected], atol=1e-8)
+    path = read_tum(out)
+    np.testing.assert_allclose(path.time, [pose.time for pose in expected], atol=1e-8)
+    np.testing.assert_allclose(path.position, [p.position for p in expected], atol=1e-8)
+    if not shown:
+        return
+    found = columns_of(tmp_path / "live.rrd")
+    moved = np.array(found["/live/pose"]["Transform3D:translation"])[:, 0]
+    np.testing.assert_allclose(moved, path.position, atol=1e-5)
+    seconds = [each.total_seconds() for each in found["/live/pose"]["time"]]
+    np.testing.assert_allclose(seconds, path.time - path.time[0], atol=1e-6)
+    pieces = [
+        found[f"/live/estimate/{number:04d}"]["LineStrips3D:strips"][-1][0] for number in range(5)
+    ]
+    # Each begins where the one before ended.
+    line = np.concatenate([pieces[0], *(piece[1:] for piece in pieces[1:])])
+    np.testing.assert_allclose(line, path.position, atol=1e-5)
+    assert len(found["/live/ellipsoid"]["Ellipsoids3D:half_sizes"]) == len(path.time)
 
 
 def test_the_tracker_of_a_calibrated_run_considers_what_its_track_does(run, monkeypatch):
@@ -161,23 +183,23 @@ def test_a_clock_that_is_set_back_ends_the_stream():
     assert found.reasons[1].startswith("time: must increase")
 
 
-def test_gaps_are_told(gnio, run, recorded):
+def test_gaps_are_told(gnio, recorded):
     lines = as_lines(recorded)
-    told = gnio([*lines[:100], *lines[115:150], *lines[151:]], "--weights", run)
+    told = gnio([*lines[:100], *lines[115:150], *lines[151:]])
     assert "warning: gaps: 1, the longest of 0.32 s: samples are missing" in told
     empty = [f"{line.split(',')[0]},,,,,," for line in lines[100:115]]
-    told = gnio([*lines[:100], *empty, *lines[115:]], "--weights", run)
+    told = gnio([*lines[:100], *empty, *lines[115:]])
     assert "warning: gaps: 1, the longest of 0.32 s: samples are missing" in told
-    assert "gaps" not in gnio([*lines[:20], *lines[50:]], "--weights", run)  # before the start
+    assert "gaps" not in gnio([*lines[:20], *lines[50:]])  # before the start
 
 
-def test_one_stamp_in_the_future_costs_its_sample_alone(run, recorded, gnio):
+def test_one_stamp_in_the_future_costs_its_sample_alone(recorded, gnio):
     lines = as_lines(recorded)
     time, values = lines[150].split(",", 1)
     leaping = [*lines[:150], f"{float(time) + 30},{values}", *lines[151:]]
-    printed = gnio(leaping, "--weights", run)
+    printed = gnio(leaping)
     assert "gaps" not in printed and "refused" not in printed
-    newest = [text.splitlines()[-1].split()[0] for text in (printed, gnio(lines, "--weights", run))]
+    newest = [text.splitlines()[-1].split()[0] for text in (printed, gnio(lines))]
     assert newest[0] == newest[1]  # s
 
 
@@ -225,34 +247,26 @@ def test_the_rate_is_measured_over_the_first_second(rate):
         rate_of(lines, 2.0 * rate)
 
 
-@pytest.mark.parametrize("rate", [25])
-def test_a_stream_slower_than_the_network_is_followed(gnio, run, rate, tmp_path):
+def test_a_stream_slower_than_the_network_is_followed(gnio, tmp_path):
     """Its poses are those of the same walk at the network's own rate, as far as lines can be."""
     found = {}
-    for each in (rate, 50):
-        told = gnio(as_lines(walked(each)), "--weights", run, "--out", tmp_path / "live.txt")
+    for each in (25, 50):
+        told = gnio(as_lines(walked(each)), "--out", tmp_path / "live.txt")
         assert f"samples come at {each} Hz" in told
         assert ("trained at 50 Hz" in told) == (each < 50)
         found[each] = read_tum(tmp_path / "live.txt")
-    rows = np.searchsorted(found[50].time, found[rate].time - 1e-3)
-    error = found[rate].position - found[50].position[rows]
+    rows = np.searchsorted(found[50].time, found[25].time - 1e-3)
+    error = found[25].position - found[50].position[rows]
     assert len(rows) > 35 and np.abs(error).max() < 0.3
 
 
-def test_what_cannot_be_written_is_found_before_the_stream(gnio, capsys, run, tmp_path):
+def test_what_cannot_be_written_is_found_before_the_stream(gnio, capsys, tmp_path):
     (tmp_path / "file").write_text("")
     for out in (tmp_path, tmp_path / "file" / "x.txt", tmp_path / "file" / "x" / "y.txt"):
         with pytest.raises(SystemExit, match="2"):
-            gnio(["0,0,0,0,0,0,9.81"], "--weights", run, "--out", out)
+            gnio(["0,0,0,0,0,0,9.81"], "--out", out)
         told = capsys.readouterr()
         assert told.err.count("\n") == 1 and "following" not in told.out
-
-
-def test_noise_on_the_line_is_no_text(gnio, run, recorded, monkeypatch, tmp_path):
-    noisy = "\n".join(as_lines(recorded)).encode().replace(b"\n", b"\n\xff\xfe\n", 1)
-    stream = io.TextIOWrapper(io.BytesIO(noisy), encoding="utf-8")
-    monkeypatch.setattr(io, "StringIO", lambda _: stream)
-    assert "warning: 1 lines refused" in gnio([], "--weights", run)
 
 
 @pytest.mark.parametrize(
@@ -271,9 +285,9 @@ def test_noise_on_the_line_is_no_text(gnio, run, recorded, monkeypatch, tmp_path
         ([], [], "standard input: ended without a single sample; is it sent to this place?"),
     ],
 )
-def test_mistakes_are_one_line(gnio, capsys, run, lines, arguments, problem):
+def test_mistakes_are_one_line(gnio, capsys, lines, arguments, problem):
     with pytest.raises(SystemExit, match="2"):
-        gnio(lines, *arguments, "--weights", run)
+        gnio(lines, *arguments)
     told = capsys.readouterr().err
     assert told.count("\n") == 1 and problem in told
 
@@ -282,12 +296,12 @@ def test_mistakes_are_one_line(gnio, capsys, run, lines, arguments, problem):
     ("samples", "problem"),
     [(30, "ended after 30 samples in 0.6 s, before 1 s of rest"), (200, "has no 1 s without a")],
 )
-def test_a_stream_without_a_start_is_told_why(gnio, capsys, run, recorded, samples, problem):
+def test_a_stream_without_a_start_is_told_why(gnio, capsys, recorded, samples, problem):
     lines = as_lines(recorded)[:samples]
     if samples == 200:  # every second lacks three samples
         lines = [line for k, line in enumerate(lines) if k % 40 > 2]
     with pytest.raises(SystemExit, match="2"):
-        gnio(lines, "--weights", run)
+        gnio(lines)
     assert f"standard input: {problem}" in capsys.readouterr().err
 
 
@@ -303,10 +317,11 @@ def test_a_recording_played_gives_the_track_of_it(gnio, run, recorded, monkeypat
     rows = np.delete(rows, np.s_[150:175], axis=0)
     header = "time,gyro_x,gyro_y,gyro_z,accel_x,accel_y,accel_z"
     np.savetxt(walk, rows, delimiter=",", header=header, comments="", fmt="%.12f")
-    given = ("--weights", run, "--gyro-unit", "rad/s")
+    given = ("--gyro-unit", "rad/s")
     told = gnio([], walk, "--speed", "0", "--out", tmp_path / "live.txt", *given)
     monkeypatch.chdir(tmp_path)
-    console.run(lambda: app.main(["track", str(walk), "--out", "track", *map(str, given)]))
+    asked = ["track", str(walk), "--out", "track", "--weights", str(run), *given]
+    console.run(lambda: app.main(asked))
     followed, tracked = read_tum(tmp_path / "live.txt"), read_tum(tmp_path / "track/trajectory.txt")
     assert told.startswith(f"following {walk} with run") and "walked" in told
     assert "lacks samples 1 times" in told and "in the quietest second" in told
@@ -351,11 +366,11 @@ def test_a_signal_ends_the_stream_and_nothing_is_lost(
     np.testing.assert_allclose(time, np.arange(10, 32) / 10, atol=1e-6)
 
 
-def test_a_stream_of_degrees_and_g(gnio, run, recorded, tmp_path):
+def test_a_stream_of_degrees_and_g(gnio, recorded):
     time, gyro, accel = recorded
     other = as_lines((time, np.degrees(gyro), accel / 9.80665))
-    si = gnio(as_lines(recorded), "--weights", run)
-    assert gnio(other, "--weights", run, "--gyro-unit", "deg/s", "--accel-unit", "g") == si
+    si = gnio(as_lines(recorded))
+    assert gnio(other, "--gyro-unit", "deg/s", "--accel-unit", "g") == si
 
 
 def test_a_gyro_that_turns_gravity_as_degrees_would_is_told():
@@ -368,12 +383,12 @@ def test_a_gyro_that_turns_gravity_as_degrees_would_is_told():
     np.testing.assert_allclose([s.gyro for s in found], known_walk.rate(time), atol=1e-9)
 
 
-def test_a_start_in_motion_is_told(gnio, run, recorded):
+def test_a_start_in_motion_is_told(gnio, recorded):
     """As a track tells it."""
     lines = as_lines(recorded)
     warning = "warning: start: it moved while it should lie still"
-    assert warning not in gnio(lines[:75], "--weights", run)
-    assert warning in gnio(lines[50:125], "--weights", run)
+    assert warning not in gnio(lines[:75])
+    assert warning in gnio(lines[50:125])
 
 
 class Diverging:
@@ -388,9 +403,9 @@ class Diverging:
 
 
 @pytest.mark.filterwarnings("error")
-def test_what_a_diverged_filter_says_is_not_kept(gnio, run, recorded, monkeypatch, tmp_path):
+def test_what_a_diverged_filter_says_is_not_kept(gnio, recorded, monkeypatch, tmp_path):
     monkeypatch.setattr(live, "create_tracker", lambda *_, **__: Diverging())
-    told = gnio(as_lines(recorded)[:9], "--weights", run, "--out", tmp_path / "live.txt")
+    told = gnio(as_lines(recorded)[:9], "--out", tmp_path / "live.txt")
     assert "THE FILTER DIVERGED" in told and "nan" not in told
     np.testing.assert_allclose(read_tum(tmp_path / "live.txt").position[:, 0], np.arange(1, 6))
 
@@ -411,27 +426,6 @@ def test_a_diverged_filter_is_not_shown(tmp_path, monkeypatch, target):
     np.testing.assert_allclose(np.array(moved)[:, 0, 0], np.arange(1, 6))
     drawn = found["/live/estimate/0000"]["LineStrips3D:strips"][-1][0]
     np.testing.assert_allclose(np.array(drawn)[:, 0], np.arange(1, 6))
-
-
-def test_the_file_for_rerun(gnio, run, recorded, monkeypatch, tmp_path):
-    pytest.importorskip("rerun", reason="needs rerun-sdk")
-    monkeypatch.setattr(rerun, "LINE_EVERY", 3)
-    monkeypatch.setattr(rerun, "LONGEST_PIECE", 9)
-    given = ("--weights", run, "--out", tmp_path / "live.txt", "--rerun", tmp_path / "live.rrd")
-    gnio(as_lines(recorded), *given)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["live.rrd", "live.txt"]
-    found, path = columns_of(tmp_path / "live.rrd"), read_tum(tmp_path / "live.txt")
-    moved = np.array(found["/live/pose"]["Transform3D:translation"])[:, 0]
-    np.testing.assert_allclose(moved, path.position, atol=1e-5)
-    seconds = [each.total_seconds() for each in found["/live/pose"]["time"]]
-    np.testing.assert_allclose(seconds, path.time - path.time[0], atol=1e-6)
-    pieces = [
-        found[f"/live/estimate/{number:04d}"]["LineStrips3D:strips"][-1][0] for number in range(5)
-    ]
-    # Each begins where the one before ended.
-    line = np.concatenate([pieces[0], *(piece[1:] for piece in pieces[1:])])
-    np.testing.assert_allclose(line, path.position, atol=1e-5)
-    assert len(found["/live/ellipsoid"]["Ellipsoids3D:half_sizes"]) == len(path.time)
 
 
 # --- datagrams
@@ -495,7 +489,7 @@ def test_it_is_said_where_nothing_comes(port, monkeypatch):
     assert len(found) == 1 and all(f"nothing has come on udp:{port} for" in each for each in said)
 
 
-def test_what_is_sent_while_it_compiles_is_not_lost(gnio, run, port, monkeypatch, tmp_path):
+def test_what_is_sent_while_it_compiles_is_not_lost(gnio, port, monkeypatch, tmp_path):
     """It listens before it compiles: the rest that it starts from may be over by then."""
     create = live.create_tracker
     lines = [f"{k / RATE},0,0,0,0,0,9.81".encode() for k in range(round(2 * RATE))]
@@ -505,7 +499,7 @@ def test_what_is_sent_while_it_compiles_is_not_lost(gnio, run, port, monkeypatch
         return create(*given, **options)
 
     monkeypatch.setattr(live, "create_tracker", meanwhile)
-    given = ("--weights", run, "--silence", "0.5", "--out", tmp_path / "live.txt")
+    given = ("--silence", "0.5", "--out", tmp_path / "live.txt")
     told = gnio([], f"udp:{port}", *given)
     assert "ready: hold still now, for 1 s" in told
     assert read_tum(tmp_path / "live.txt").time[0] == pytest.approx(1.0, abs=1.5 / RATE)
