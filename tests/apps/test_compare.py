@@ -8,7 +8,7 @@ import pytest
 from gnio_jax import config as configuration
 from gnio_jax.apps import compare as comparison
 from gnio_jax.commands import app
-from gnio_jax.config import CompareConfig, EvaluateConfig, TrainConfig
+from gnio_jax.config import CompareConfig, TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import kept, tabulate
 from tests.support.reports import LOST, report_of, write_report, write_run
@@ -172,36 +172,6 @@ def test_options_of_the_filter_that_differ_are_told(runs):
     assert comparison.filter_options(found) == []
 
 
-def test_figures_of_other_recordings_are_never_compared(tmp_path, monkeypatch):
-    """A run that was evaluated on the folder A is evaluated anew for a comparison on B, and
-    evaluations of A and B are refused, though their recordings have the same names."""
-    for name in ("A", "B"):
-        (tmp_path / name).mkdir()
-    config = TrainConfig(dataset="tlio", data_root=str(tmp_path / "A"))
-    for name in ("one", "two"):
-        write_run(tmp_path / name)
-        configuration.save(tmp_path / name / "config.yaml", config)
-
-    def asked(run, root):
-        return EvaluateConfig(str(tmp_path / run), data_root=str(tmp_path / root))
-
-    def evaluate(config, *_, **__):
-        made = {"dataset": "tlio", "data_root": config.data_root, "filter": FILTER}
-        ate = 1.0 if config.data_root.endswith("A") else 2.0
-        write_report(kept.look(config).folder, report_of({"a": ate}, GROUPS, **made))
-
-    monkeypatch.setattr(kept, "evaluate", evaluate)
-    evaluate(asked("one", "A"))
-    found = compare(tmp_path / "one", tmp_path / "two", data_root=str(tmp_path / "B"))
-    assert [cell.mean.mean for cell in found.cells["ate"]] == [2.0, 2.0]
-    evaluate(asked("one", "A"))
-    folders = [kept.look(asked(*of)).folder for of in (("one", "A"), ("two", "B"))]
-    with pytest.raises(InputError, match=r"is of data root .*B, the first row of .*A"):
-        compare(*folders)
-    with pytest.raises(InputError, match=r"give --data-root .*B for the runs"):
-        compare(tmp_path / "one", folders[1])
-
-
 def test_refusals(runs):
     def refused(*words, metrics=None, **options):
         with pytest.raises(InputError) as error:
@@ -222,6 +192,10 @@ def test_refusals(runs):
     assert "plain_s0: is of split test, the first row of seen; give --split seen" in refused(
         seen, "plain"
     )
+    write(runs / "B", {"a": 1.0}, data_root="/B")  # though the recordings have the same names
+    told = refused("plain", f"B/{own}")
+    assert "is of data root /B, the first row of None; give --data-root /B for the runs" in told
+    assert "compare evaluations of one data root" in refused(f"new_s0/{own}", f"B/{own}")
     write(runs / "groups", {"a": 1.0, "b": 1.0}, groups={**GROUPS, "b": "eve"})
     assert f"sequence b is of eve here, of ann in {runs}/plain_s0/" in refused("plain", "groups")
     for name, seconds in (("short", 60.0), ("long", 60.1), ("mix_s0", 60.0), ("mix_s1", 600.0)):
