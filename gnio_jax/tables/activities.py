@@ -149,14 +149,10 @@ def attention_by_activity(
     """Activities that occur in at least five windows, and for each how much more attention each
     prototype gets than on average (1: as on average)."""
     attention = windows.diagnostics["attention"].mean(1)
-    usual = attention.mean(0)
-    names, lifts = [], []
-    for number, name in enumerate(ACTIVITIES):
-        rows = windows.activity == number
-        if rows.sum() >= 5:
-            names.append(name)
-            lifts.append(attention[rows].mean(0) / usual)
-    return names, np.array(lifts)
+    counts = np.bincount(windows.activity, minlength=len(ACTIVITIES))
+    common = np.flatnonzero(counts >= 5)
+    means = [attention[windows.activity == number].mean(0) for number in common]
+    return [ACTIVITIES[number] for number in common], np.array(means) / attention.mean(0)
 
 
 def information(windows: PredictedWindows, draws: int = 20) -> tuple[float, float]:

@@ -34,6 +34,12 @@ METRICS = (
 )
 """Of every table, as far as rows have them. The first is what rows are compared by."""
 
+ABLATIONS = {
+    "components": experiments.components,
+    "gates": experiments.gates,
+    "bank-size": experiments.bank_sizes,
+}
+
 
 def make(options: TablesConfig, reporter: Reporter | None = None, workers: int = 1) -> str:
     """Make a table: train and evaluate what is missing, write the files, return what to show.
@@ -47,15 +53,10 @@ def make(options: TablesConfig, reporter: Reporter | None = None, workers: int =
     if options.seeds < 1:
         raise InputError("--seeds", f"must be at least 1, found {options.seeds}")
     base = base_config(options)
-    match options.table:
-        case "components":
-            experiment = experiments.components(base)
-        case "gates":
-            experiment = experiments.gates(base)
-        case "bank-size":
-            experiment = experiments.bank_sizes(base)
-        case _:
-            experiment = experiments.comparison(base, options.split, networks(options))
+    if options.table in ABLATIONS:
+        experiment = ABLATIONS[options.table](base)
+    else:
+        experiment = experiments.comparison(base, options.split, networks(options))
     if options.table == "trajectories":
         options = dataclasses.replace(options, seeds=1)
     results = [run_row(row, options, reporter, workers) for row in experiment.rows]
@@ -103,16 +104,13 @@ def _words(text: str) -> tuple[str, ...]:
 def notes(base: TrainConfig, options: TablesConfig, experiment: Experiment) -> str:
     """What a reader must know of the figures."""
     calibrated = f", gnio calibrate on {base.data.val_split}" if options.calibrate else ""
-    budget = (
+    return (
+        f"{base.datasets[0]} {options.split}, {options.estimator}; every row: "
         f"{base.optim.epochs} epochs of batches of {base.optim.batch_size}, learning rate "
         f"{base.optim.learning_rate:g}, width {base.model.width or 64}, {base.data.rate:g} Hz, "
-        f"{options.seeds} seeds{calibrated}"
-    )
-    return (
-        f"{base.datasets[0]} {options.split}, {options.estimator}; every row: {budget}; on "
-        f"{hardware()}. ± is the standard deviation over seeds; the difference to the first row "
-        "is over sequences."
-        f"\n\nPublished: {experiment.source}; the paper does not define its ATE."
+        f"{options.seeds} seeds{calibrated}; on {hardware()}. ± is the standard deviation over "
+        "seeds; the difference to the first row is over sequences.\n\n"
+        f"Published: {experiment.source}; the paper does not define its ATE."
     )
 
 
@@ -161,10 +159,10 @@ def scale_gradients(run: Path) -> list[float]:
 
 def _entropies(result: Result, split: str) -> Float[np.ndarray, "seeds 2"]:
     """Entropies of the attention of each run; none of a network without a bank."""
-    if result.row.config.model.bank_size == 0:
-        return np.zeros((0, 2))
-    windows = [activities.predict_split(run, split) for run in result.runs]
-    return np.array([activities.entropy(each.diagnostics["attention"]) for each in windows])
+    runs = result.runs if result.row.config.model.bank_size != 0 else []
+    windows = [activities.predict_split(run, split) for run in runs]
+    found = [activities.entropy(each.diagnostics["attention"]) for each in windows]
+    return np.array(found).reshape(-1, 2)
 
 
 def _over_seeds(name: str, rows: list[Float[np.ndarray, "_"]]) -> dict[str, list[Cell]]:
@@ -304,16 +302,10 @@ def make_complexity(out: Path, reporter: Reporter) -> str:
         reporter.line(f"timing {network}")
         found = measure(network)
         millions, gflops = PAPERS_COST.get(network, (None, None))
-        table.append(
-            [
-                network,
-                f"{found.parameters:,}",
-                tabulate.number(found.gflops, 3),
-                *(tabulate.number(each, 2) for each in found.latency),
-                "–" if millions is None else f"{millions:.2f} M",
-                tabulate.number(gflops, 2),
-            ]
-        )
+        measured = [f"{found.parameters:,}", tabulate.number(found.gflops, 3)]
+        measured += [tabulate.number(each, 2) for each in found.latency]
+        printed = "–" if millions is None else f"{millions:.2f} M"
+        table.append([network, *measured, printed, tabulate.number(gflops, 2)])
     header = ["", "parameters", "GFLOP / window"]
     header += [f"ms / window, batch {batch}" for batch in BATCHES]
     text = (
@@ -337,8 +329,7 @@ def measure(
     model = models.create(network)
     variables = models.initialise(model, jax.random.key(0), SAMPLES)
     frozen, inference = models.inference_variables(model, variables), models.Inference(model)
-    latency: list[float] = []
-    operations = math.nan
+    latency, operations = [], math.nan
     for batch in batches:
         drawn = np.random.default_rng(0).standard_normal((batch, SAMPLES, 6))
         windows = jnp.asarray(drawn, jnp.float32)

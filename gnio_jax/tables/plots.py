@@ -78,11 +78,8 @@ def gradients(results: list[Result], norms: Sequence[Float[np.ndarray, "seeds ep
         epochs = np.arange(1, own.shape[1] + 1)
         axes.semilogy(epochs, own.mean(0), color=colour, label=result.row.label)
         axes.fill_between(epochs, own.min(0), own.max(0), color=colour, alpha=0.15, lw=0)
-    axes.set(
-        xlabel="epoch",
-        ylabel="norm of the gradient of the scale's layer",
-        title="How steadily the scale learns",
-    )
+    axes.set(xlabel="epoch", ylabel="norm of the gradient of the scale's layer")
+    axes.set_title("How steadily the scale learns")
     axes.yaxis.set_major_formatter("{x:g}")
     axes.yaxis.set_minor_formatter("{x:g}")
     axes.legend(fontsize=8, frameon=False)
@@ -158,13 +155,8 @@ def attention(names: list[str], lifts: Float[np.ndarray, "a p"], words: str) -> 
     figure = Figure(figsize=(9.0, 1.6 + 0.4 * len(names)), layout="constrained")
     axes = figure.add_subplot()
     limit = max(abs(np.log2(np.clip(lifts, 0.25, 4))).max(), 1e-3)
-    image = axes.imshow(
-        np.log2(np.maximum(lifts[:, order], 1e-6)),
-        aspect="auto",
-        cmap="RdBu_r",
-        vmin=-limit,
-        vmax=limit,
-    )
+    shown, colour = np.log2(np.maximum(lifts[:, order], 1e-6)), {"vmin": -limit, "vmax": limit}
+    image = axes.imshow(shown, aspect="auto", cmap="RdBu_r", **colour)
     axes.set_yticks(range(len(names)), names)
     axes.set(xlabel="prototype, sorted by the activity it favours", title=words)
     axes.title.set_fontsize(9)
