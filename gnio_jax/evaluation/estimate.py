@@ -224,10 +224,7 @@ def _run(
             history = run_filter(state, *signals, own.given.value, covariance, *fixed)[1]
         else:
             frame = config.displacement_frame
-
-            def predict(windows: Array) -> Prediction:
-                return keep(apply(variables, windows))
-
+            predict = functools.partial(_predict, apply, variables)
             history = run_odometry(predict, state, *signals, *fixed)[1]
         diagonal, whole = history.covariance_diagonal, history.covariance
         assert whole is not None
@@ -245,6 +242,10 @@ def _run(
         return history._replace(covariance_diagonal=diagonal, covariance=position)
 
     return over_sequences(run)(inputs)
+
+
+def _predict(apply: Callable, variables: Any, windows: Array) -> Prediction:
+    return keep(apply(variables, windows))
 
 
 def _of_history(recording: Recording, history: FilterHistory, ekf: FilterSetup) -> Estimate:

@@ -377,8 +377,8 @@ def _draw_strip(
         style = {"color": colour, "line_width": 1.3, "legend_label": text}
         strip.line(along, name, source=source, **style)
     if tapped:
-        label = {"source": sources.paths[0], "legend_label": "at waypoints"}
-        strip.scatter(along, "waypoint_error", size=8, **WAYPOINT, **label)
+        marks = {"source": sources.paths[0], "legend_label": "at waypoints"}
+        strip.scatter(along, "waypoint_error", size=8, **WAYPOINT, **marks)
     for text, level, colour in levels:
         style = {"color": colour, "legend_label": f"{text} {level:.3g}"}
         strip.line([0.0, LONG], [level, level], **style)

@@ -138,7 +138,7 @@ def prepare(
         if whole.waypoints is not None:
             own_init, reference_note = "static", OF_WAYPOINTS
         start, start_note = _start(whole, measured, windows, bias, own_std, own_init)
-        trusted = whole.valid[:, None]
+        trusted, mask = whole.valid[:, None], whole.imu_valid
         poses = [np.where(trusted, part, np.nan) for part in (whole.position, whole.orientation)]
         ends = slice(None, None, windows.stride)
         recordings.append(
@@ -148,7 +148,7 @@ def prepare(
                 time=whole.time[ends],
                 gyro=whole.gyro[:-1],
                 accel=whole.accel[:-1],
-                imu_valid=None if len(measured) == len(whole.time) else whole.imu_valid[:-1],
+                imu_valid=None if mask is None or mask.all() else mask[:-1],
                 start=start,
                 attitude=orientation and _attitude(whole, start, windows.rate, orientation),
                 reference=Trajectory(whole.time[ends], *(part[ends] for part in poses)),
