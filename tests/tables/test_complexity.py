@@ -36,23 +36,12 @@ def encoder():
     return layers
 
 
-HEADS = {
-    "tlio": ([(7, 1, 1, 512, 128)] * 2, [(896, 512), (512, 512), (512, 3)] * 2),
-    "gnio": ([], [(512, 512), (512, 64), (512, 64), (512, 512), *[(512, 3)] * 3]),
-}
-
-
-@pytest.mark.parametrize(
-    "network, parameters, published", [("tlio", 5_424_646, 39.15e6), ("gnio", 4_934_153, 37.4e6)]
-)
-def test_complexity_against_a_hand_count(network, parameters, published):
-    convolutions, dense = HEADS[network]
-    padded, by_hand = (
-        multiply_adds([*encoder(), *convolutions], dense, padding) for padding in (True, False)
-    )
-    assert padded == pytest.approx(published, rel=2e-3)
-    found = make.measure(network, batches=(1,), seconds=0.05)
-    assert found.parameters == parameters
+def test_complexity_of_gnio_against_a_hand_count():
+    dense = [(512, 512), (512, 64), (512, 64), (512, 512), *[(512, 3)] * 3]
+    padded, by_hand = (multiply_adds(encoder(), dense, padding) for padding in (True, False))
+    assert padded == pytest.approx(37.4e6, rel=2e-3)
+    found = make.measure("gnio", batches=(1,), seconds=0.05)
+    assert found.parameters == 4_934_153
     # Additions, ReLUs and the like besides.
     assert 1e9 * found.gflops == pytest.approx(2 * by_hand, rel=0.02)
     assert found.latency[0] > 0
