@@ -44,7 +44,7 @@ NOT_RUN = {
     f"{block.page}:{block.line} {block.reason}": block.code
     for block in pages.python_blocks()
     if block.reason
-} | {"notebooks/walk.py": (pages.ROOT / "docs/notebooks/walk.py").read_text(encoding="utf-8")}
+} | {path.name: path.read_text(encoding="utf-8") for path in pages.ROOT.glob("docs/notebooks/*.py")}
 """Where it stands, and why it is not run: code that must compile and name what there is."""
 
 
@@ -178,6 +178,7 @@ def member(module, name):
         return getattr(importlib.import_module(module), name)
 
 
+@pytest.mark.slow
 def test_the_notebook_that_learns(one_walk, capsys):
     """Two seconds, two steps: the gradient is the difference quotient that is printed beside it."""
     pytest.importorskip("matplotlib").use("Agg")
