@@ -161,12 +161,7 @@ def check_accel(
 
 
 def _check_range(
-    field: str,
-    values: np.ndarray,
-    most: float,
-    unit: str,
-    source: object,
-    time: np.ndarray | None,
+    field: str, values: np.ndarray, most: float, unit: str, source: object, time: np.ndarray | None
 ) -> None:
     size = np.abs(values)
     if size.max() > most:

@@ -153,26 +153,17 @@ def test_check_shows_every_recording_with_its_figures_and_reasons(root, capsys):
     assert "2 of 5 sequences are used, 0.01 h" in out
 
     figures = json.loads((root.parent / "out" / "figures.json").read_text())
-    assert (figures["dataset"], figures["root"], figures["split"]) == (
-        "tlio",
-        str(root),
-        "all",
-    ) and len(figures["notes"]) == 1
+    assert (figures["dataset"], figures["root"], figures["split"]) == ("tlio", str(root), "all")
+    assert len(figures["notes"]) == 1
     assert list(figures["sequences"]) == ["fair", "tilted", "mirrored", "cut", "also"]
     ours = figures["sequences"]["fair"]
-    assert (
-        ours["used"]
-        and ours["gravity_mean"] == fair.gravity_mean.tolist()
-        and ours["gyro_consistency_degrees"] is None
-    )
-    assert (
-        ours["accel_correlation_horizontal"] == fair.accel_correlation_horizontal
-        and ours["failures"] == []
-    )
-    assert (
-        not figures["sequences"]["cut"]["used"]
-        and "cut short" in figures["sequences"]["cut"]["reason"]
-    )
+    assert ours["used"]
+    assert ours["gravity_mean"] == fair.gravity_mean.tolist()
+    assert ours["gyro_consistency_degrees"] is None
+    assert ours["accel_correlation_horizontal"] == fair.accel_correlation_horizontal
+    assert ours["failures"] == []
+    assert not figures["sequences"]["cut"]["used"]
+    assert "cut short" in figures["sequences"]["cut"]["reason"]
     pictures = {path.stem: image.imread(path) for path in (root.parent / "pictures").iterdir()}
     assert set(pictures) == {
         "fair",
@@ -256,9 +247,9 @@ def reads(monkeypatch):
 def test_convert_keeps_every_figure_and_the_splits(root, capsys):
     run("data", "convert", "tlio", "converted", "--data-root", str(root))
     out = capsys.readouterr().out
-    assert (
-        "left out: tilted: mean of R·accel" in out and "left out: cut: " in out and "absent" in out
-    )
+    assert "left out: tilted: mean of R·accel" in out
+    assert "left out: cut: " in out
+    assert "absent" in out
     assert "note: split 'val' has no list: none of its 1 recordings can be used" in out
     assert "converted: 2 sequences, 0.01 h (train 1, val 0, test 1)" in out
     converted = root.parent / "converted"
@@ -545,14 +536,8 @@ OUT, HEADS = ["--out", "x.h5"], ["--data-root", "heads"]
             ["convert", "tlio", "x", *HEADS, "--rate", "0"],
             "--rate: must be from 1 to 10000 Hz, found 0",
         ),
-        (
-            ["convert", "tlio", "x", "--rate"],
-            "--rate: expected one argument",
-        ),
-        (
-            ["convert", "tlio", "x", *HEADS, "--split", "tset"],
-            "dataset tlio: unknown split 'tset'",
-        ),
+        (["convert", "tlio", "x", "--rate"], "--rate: expected one argument"),
+        (["convert", "tlio", "x", *HEADS, "--split", "tset"], "dataset tlio: unknown split 'tset'"),
         (["convert", "tlio", "heads/test_list.txt", *HEADS], "heads/test_list.txt: is a file"),
         (
             ["convert", "tlio", "taken", *HEADS],

@@ -25,9 +25,8 @@ def test_a_layout_survives_its_conversion(name, tmp_path, monkeypatch, capsys):
     at = [layout.dataset, "--data-root", str(root)]
     run("data", "check", *at, "--json", str(tmp_path / "figures.json"))
     rows = json.loads((tmp_path / "figures.json").read_text())["sequences"]
-    assert set(rows) == {sequence.name for sequence in expected} and all(
-        row["used"] for row in rows.values()
-    )
+    assert set(rows) == {sequence.name for sequence in expected}
+    assert all(row["used"] for row in rows.values())
     for sequence in expected:
         assert rows[sequence.name]["split"].split(", ").count(layout.split) == 1
         assert rows[sequence.name]["duration"] == sequence.time[-1] - sequence.time[0]

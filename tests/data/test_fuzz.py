@@ -17,12 +17,7 @@ from hypothesis import strategies as st
 from gnio_jax.errors import InputError
 from tests.support.damage import Damage, damages
 from tests.support.damage_values import YAMLS
-from tests.support.damaged_recordings import (
-    SECONDS_PER_EXAMPLE,
-    check,
-    remove_copies,
-    written,
-)
+from tests.support.damaged_recordings import SECONDS_PER_EXAMPLE, check, remove_copies, written
 from tests.support.layouts import LAYOUTS
 from tests.support.tyrex_files import IPHONE
 
@@ -190,11 +185,7 @@ ONCE_WRONG = {
         [Damage("walk.csv", "cell", 0.5, 0.01, "1e30")],
         None,
     ),  # it contradicts the position, hence not valid
-    "position that jumps": (
-        "csv",
-        [Damage("walk.csv", "cell", 0.5, 0.5, "1e6")],
-        None,
-    ),
+    "position that jumps": ("csv", [Damage("walk.csv", "cell", 0.5, 0.5, "1e6")], None),
     "position far away": (
         "csv",
         [Damage("walk.csv", "column", 0.5, 0.5, "1e30")],

@@ -168,9 +168,8 @@ def test_a_recording_carries_what_lists_say_of_it(tmp_path):
 def test_a_split_of_which_nothing_is_left(tmp_path):
     about = dataset(slow(tmp_path, "c", refusal="ruined"), Recording("none", list))
     names, notes, error = outcome(about, 1)
-    assert names == [] and [text for text, _ in notes] == [
-        "c: left out: c.csv: ruined; leave it out"
-    ]
+    assert names == []
+    assert [text for text, _ in notes] == ["c: left out: c.csv: ruined; leave it out"]
     assert (
         error
         == "root: none of the 2 recordings of split 'test' can be used; see the warnings above"
@@ -207,10 +206,7 @@ def test_the_recordings_of_all_splits_are_found_once(tmp_path):
     found = find_recordings(about, Path("root"), "all")
     assert list(found.recordings) == ["shared", "own"]
     assert found.splits == {"train": ("shared", "own"), "test": ("shared",)}
-    assert found.notes == [
-        "root: is incomplete",
-        "nothing in split val: root: has no list val",
-    ]
+    assert found.notes == ["root: is incomplete", "nothing in split val: root: has no list val"]
     with pytest.raises(InputError, match="has no list val"):
         find_recordings(about, Path("root"), "val")
     with pytest.raises(

@@ -27,19 +27,17 @@ def test_resampling_returns_the_signal_at_the_new_stamps(native, rate):
     start = 12.5  # stamps need not start at zero
     result = resample(sequence._replace(time=sequence.time + start), rate)
     np.testing.assert_allclose(np.diff(result.time), 1 / rate, rtol=1e-9)
-    assert (
-        result.time[0] == start
-        and result.time[-1] <= sequence.time[-1] + start < result.time[-1] + 1 / rate + 1e-9
-    )
+    assert result.time[0] == start
+    assert result.time[-1] <= sequence.time[-1] + start < result.time[-1] + 1 / rate + 1e-9
     truth = circle(stamps=result.time - start)
     edge = slice(round(0.3 * rate), -round(0.3 * rate))  # the FIR mirrors the signal at its ends
     np.testing.assert_allclose(result.accel[edge], truth.accel[edge], atol=3e-3)
     np.testing.assert_allclose(result.gyro[edge], truth.gyro[edge], atol=1e-4)
     for field, tolerance in (("position", 1e-6), ("velocity", 1e-4), ("orientation", 1e-12)):
         np.testing.assert_allclose(getattr(result, field), getattr(truth, field), atol=tolerance)
-    assert (
-        result.valid.all() and result.name == "circle" and result.attributes == sequence.attributes
-    )
+    assert result.valid.all()
+    assert result.name == "circle"
+    assert result.attributes == sequence.attributes
 
 
 def test_resampling_accepts_uneven_stamps():

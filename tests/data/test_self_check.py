@@ -31,11 +31,9 @@ def test_self_check_of_a_consistent_walk():
     check = self_check(circle())
     assert check.failures == ()
     np.testing.assert_allclose(check.gravity_mean, [0, 0, 9.81], atol=0.05)
-    assert (
-        check.duration == pytest.approx(29.99)
-        and check.rate == pytest.approx(100.0)
-        and check.share_valid == 1.0
-    )
+    assert check.duration == pytest.approx(29.99)
+    assert check.rate == pytest.approx(100.0)
+    assert check.share_valid == 1.0
     assert check.gyro_consistency_degrees < 1e-6
     assert check.median_speed == pytest.approx(1.2, abs=0.1)
     assert check.accel_correlation_horizontal > 0.999
@@ -135,11 +133,9 @@ def test_self_check_looks_at_valid_samples_only():
     ):
         sequence = changed(sequence, field, slice(700, 760), value)
     check = self_check(sequence)
-    assert (
-        check.failures == ()
-        and check.share_valid == pytest.approx(0.98)
-        and check.accel_correlation_horizontal > 0.99
-    )
+    assert check.failures == ()
+    assert check.share_valid == pytest.approx(0.98)
+    assert check.accel_correlation_horizontal > 0.99
     np.testing.assert_allclose(check.gravity_mean, [0, 0, 9.81], atol=0.05)
 
 

@@ -162,19 +162,17 @@ def outcome(name: str, happened: list[Damage]) -> tuple[list[Sequence] | InputEr
 def check_sequence(sequence: Sequence, name: str) -> None:
     dataset = data.get(LAYOUTS[name].dataset)
     count = len(sequence.time)
+    assert count >= 2
     assert (
-        count >= 2
-        and sequence.gyro.shape
+        sequence.gyro.shape
         == sequence.accel.shape
         == sequence.position.shape
         == sequence.velocity.shape
         == (count, 3)
     )
-    assert (
-        sequence.orientation.shape == (count, 4)
-        and sequence.valid.shape == (count,)
-        and sequence.valid.dtype == np.bool_
-    )
+    assert sequence.orientation.shape == (count, 4)
+    assert sequence.valid.shape == (count,)
+    assert sequence.valid.dtype == np.bool_
     for values in (sequence.time, sequence.gyro, sequence.accel):
         assert values.dtype == np.float64 and np.isfinite(values).all()
     steps = np.diff(sequence.time)
@@ -201,9 +199,8 @@ def check_sequence(sequence: Sequence, name: str) -> None:
         assert sequence.device_orientation.shape == (count, 4)
         norm = np.linalg.norm(sequence.device_orientation, axis=1)
         np.testing.assert_allclose(norm[np.isfinite(norm)], 1.0, atol=1e-9)
-    assert (
-        np.isfinite(sequence.position[valid]).all() and np.isfinite(sequence.velocity[valid]).all()
-    )
+    assert np.isfinite(sequence.position[valid]).all()
+    assert np.isfinite(sequence.velocity[valid]).all()
     speed = np.abs(sequence.velocity[valid]).max(initial=0.0)
     assert speed < 330.0, f"velocity reaches {speed:.3g} m/s"
     moved = (

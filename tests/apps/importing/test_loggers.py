@@ -113,10 +113,7 @@ def test_gravity_of_other_stamps_is_interpolated(tmp_path):
 @pytest.mark.parametrize(
     ("members", "words"),
     [
-        (
-            without(sensor_logger(), "Gyroscope.csv"),
-            "has no gyro .found: Accelerometer.csv, .*; ",
-        ),
+        (without(sensor_logger(), "Gyroscope.csv"), "has no gyro .found: Accelerometer.csv, .*; "),
         (
             {"Gyroscope.csv": sensor_logger()["Gyroscope.csv"]},
             "walk.zip: has no accelerometer .found: Gyroscope.csv.; record the gyroscope",

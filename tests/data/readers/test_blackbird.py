@@ -49,10 +49,8 @@ def test_lists_with_comments_absent_entries_and_no_last_newline(tmp_path):
         UserWarning, match=r"train\.txt: 1 of 2 listed sequences are absent: star/yawForward"
     ):
         (sequence,) = data.load("blackbird", tmp_path, "train")
-    assert (
-        sequence.name == "clover_yawForward_maxSpeed5p0_train"
-        and sequence.attributes["session"] == entry
-    )
+    assert sequence.name == "clover_yawForward_maxSpeed5p0_train"
+    assert sequence.attributes["session"] == entry
     assert [s.name for s in data.load("blackbird", tmp_path, "test")] == [
         "clover_yawForward_maxSpeed5p0_test"
     ]
@@ -106,8 +104,6 @@ def test_the_real_flight_is_physical(recordings, split, seconds):
         sequence.attributes["native_world"] == "z-up" and sequence.accel[:, 2].mean() < -9.0
     )  # the body's z points down
     np.testing.assert_allclose(check.gravity_mean, [0, 0, 9.81], atol=0.3)
-    assert (
-        check.gyro_consistency_degrees < 1.5
-        and check.accel_correlation_horizontal > 0.99
-        and 2.0 < check.median_speed < 3.5
-    )
+    assert check.gyro_consistency_degrees < 1.5
+    assert check.accel_correlation_horizontal > 0.99
+    assert 2.0 < check.median_speed < 3.5

@@ -33,11 +33,9 @@ def test_a_recording_with_a_reference_comes_back_at_its_own_rate(tmp_path, rate,
     time = np.arange(round(SECONDS * rate)) / rate + jitter
     (sequence,) = csv.read(write_native(tmp_path / "walk.csv", time, velocity=velocity))
     intervals = np.diff(sequence.time)
-    assert (
-        np.ptp(intervals) < 1e-9
-        and 1 / intervals[0] == pytest.approx(rate, rel=2e-2)
-        and sequence.name == "walk"
-    )
+    assert np.ptp(intervals) < 1e-9
+    assert 1 / intervals[0] == pytest.approx(rate, rel=2e-2)
+    assert sequence.name == "walk"
     start = sequence.attributes["start_time"]
     assert sequence.time[0] == 0.0 and start == pytest.approx(100.0 + time[0], abs=1e-8)
     compare_imu(sequence, start=start - 100.0)
@@ -51,11 +49,9 @@ def test_a_recording_without_a_reference_is_read_and_passes_no_check(tmp_path):
     bare, turned = data.load("csv", tmp_path, "test")
     for sequence in (bare, turned):
         compare_imu(sequence, start=0.0)
-        assert (
-            not sequence.valid.any()
-            and np.isnan(sequence.position).all()
-            and np.isnan(sequence.velocity).all()
-        )
+        assert not sequence.valid.any()
+        assert np.isnan(sequence.position).all()
+        assert np.isnan(sequence.velocity).all()
     # An attitude alone is no reference, but the device's own.
     assert bare.device_orientation is None and turned.device_orientation is not None
     turn = rotations(turned.device_orientation).inv() * known_walk.attitude(turned.time)
@@ -69,11 +65,9 @@ def test_rows_without_a_reference_are_not_valid(tmp_path):
             columns[name][500:620] = np.nan
 
     (sequence,) = csv.read(write_native(tmp_path / "walk.csv", spoil=hole))
-    assert (
-        not sequence.valid[500:620].any()
-        and sequence.valid[:500].all()
-        and sequence.valid[620:].all()
-    )
+    assert not sequence.valid[500:620].any()
+    assert sequence.valid[:500].all()
+    assert sequence.valid[620:].all()
     compare_reference(sequence, start=0.0)
 
 

@@ -40,9 +40,8 @@ def compare(sequence, degrees=0.1, metres=1e-3, speed=2e-3, bias=0.0):
     np.testing.assert_allclose(sequence.gyro - bias, known_walk.rate(time), atol=1e-3)
     np.testing.assert_allclose(sequence.accel, known_walk.force(time), atol=1e-3)
     np.testing.assert_allclose(np.diff(sequence.time), 0.005, atol=1e-9)
-    assert (
-        np.isnan(sequence.position[~valid]).all() and np.isnan(sequence.orientation[~valid]).all()
-    )
+    assert np.isnan(sequence.position[~valid]).all()
+    assert np.isnan(sequence.orientation[~valid]).all()
 
 
 @pytest.mark.parametrize(
@@ -62,14 +61,11 @@ def test_an_estimate_comes_back_at_the_stamps_of_the_imu(tmp_path, header, step,
     compare(sequence)
     time = known_time(sequence)
     # What the reference does not cover is cut off.
-    assert time[0] == pytest.approx(1.005, abs=1e-6) and time[-1] == pytest.approx(
-        11.0 - step, abs=step + 0.005
-    )
-    assert (
-        sequence.valid.all()
-        and sequence.name == "V1_01_easy"
-        and sequence.attributes["dataset"] == "euroc"
-    )
+    assert time[0] == pytest.approx(1.005, abs=1e-6)
+    assert time[-1] == pytest.approx(11.0 - step, abs=step + 0.005)
+    assert sequence.valid.all()
+    assert sequence.name == "V1_01_easy"
+    assert sequence.attributes["dataset"] == "euroc"
     assert self_check(sequence, pedestrian=False).failures == ()
 
 
@@ -106,10 +102,8 @@ def test_gaps_and_jumps_of_an_estimate_are_not_valid(tmp_path):
     time, valid = known_time(sequence), sequence.valid
     broken = (time > 7.994) & (time < 8.506)
     np.testing.assert_array_equal(valid[~broken & (np.abs(time - 6.0) > 0.006)], True)
-    assert (
-        not valid[(time > 8.005) & (time < 8.495)].any()
-        and 1 <= (~valid[np.abs(time - 6.0) < 0.006]).sum() <= 2
-    )
+    assert not valid[(time > 8.005) & (time < 8.495)].any()
+    assert 1 <= (~valid[np.abs(time - 6.0) < 0.006]).sum() <= 2
     shift = np.where(time > 6.0, 0.1, 0.0)[:, None]
     compare(sequence._replace(position=sequence.position - shift), metres=2e-3)
 
@@ -138,9 +132,8 @@ def test_a_trackers_gaps_are_not_valid_and_its_attitudes_come_back(tmp_path):
     for start, end in ((5.0, 8.2), (15.0, 15.3)):
         assert not sequence.valid[(time > start + 0.01) & (time < end - 0.01)].any()
     gap = (time > 4.98) & (time < 8.22) | (time > 14.98) & (time < 15.32)
-    assert (
-        sequence.valid[~gap].mean() > 0.995 and sequence.valid[(time > 12.0) & (time < 12.07)].all()
-    )
+    assert sequence.valid[~gap].mean() > 0.995
+    assert sequence.valid[(time > 12.0) & (time < 12.07)].all()
     assert sequence.name == "room1" and sequence.attributes["dataset"] == "tumvi"
     assert self_check(sequence).failures == ()
 
@@ -202,10 +195,8 @@ def test_truth_at_both_ends_alone_is_kept(tmp_path):
     files.write_mocap(mav, last=59.0, gaps=((14.0, 46.0),))
     (sequence,) = data.load("tumvi", tmp_path, "unseen")
     time = known_time(sequence)
-    assert (
-        not sequence.valid[(time > 14.02) & (time < 45.98)].any()
-        and sequence.valid[(time < 13.9) | (time > 46.1)].mean() > 0.99
-    )
+    assert not sequence.valid[(time > 14.02) & (time < 45.98)].any()
+    assert sequence.valid[(time < 13.9) | (time > 46.1)].mean() > 0.99
     assert time[-1] > 58.9
     compare(sequence, speed=0.02)
 
@@ -343,17 +334,13 @@ def test_real_recordings_are_physical(recordings, name, split, expected, correla
         pytest.skip(f"real recordings: no {name}/")
     (sequence,) = data.load(name, recordings / name, split)
     check = self_check(sequence, pedestrian=name == "tumvi")
-    assert (
-        sequence.name == expected
-        and check.rate == pytest.approx(200.0, rel=1e-4)
-        and 80 < check.duration < 150
-    )
+    assert sequence.name == expected
+    assert check.rate == pytest.approx(200.0, rel=1e-4)
+    assert 80 < check.duration < 150
     np.testing.assert_allclose(check.gravity_mean, [0, 0, 9.81], atol=0.15)
-    assert (
-        check.gyro_consistency_degrees < 1.0
-        and check.accel_correlation_horizontal > correlation
-        and 0.3 < check.median_speed < 1.3
-    )
+    assert check.gyro_consistency_degrees < 1.0
+    assert check.accel_correlation_horizontal > correlation
+    assert 0.3 < check.median_speed < 1.3
     assert check.share_valid > 0.88
     # The velocities are those of the positions.
     whole = sequence.valid[2:] & sequence.valid[1:-1] & sequence.valid[:-2]

@@ -116,10 +116,8 @@ def test_a_gap_is_marked(tmp_path):
     time = table["timestamp"] - EPOCH
     sequence = read_whole(write(tmp_path, table[(time < 20.0) | (time > 20.5)]))
     hole = np.abs(sequence.time - 20.25) < 0.2
-    assert (
-        not sequence.valid[hole].any()
-        and sequence.valid[np.abs(sequence.time - 20.25) > 0.45].all()
-    )
+    assert not sequence.valid[hole].any()
+    assert sequence.valid[np.abs(sequence.time - 20.25) > 0.45].all()
     assert sequence.attributes["lag"] == pytest.approx(0.06, abs=3e-3)
 
 
@@ -130,10 +128,8 @@ def test_a_piece_shorter_than_a_window_is_lost_and_the_other_keeps_the_name(tmp_
     with pytest.warns(UserWarning, match=message):
         sequence = read_whole(write(tmp_path, table, "building3/known", 14))
     time = compare(sequence)
-    assert (
-        sequence.attributes["start_time"] - EPOCH == pytest.approx(16.02, abs=0.02)
-        and len(time) > 3550
-    )
+    assert sequence.attributes["start_time"] - EPOCH == pytest.approx(16.02, abs=0.02)
+    assert len(time) > 3550
     assert sequence.name == "building3_known_14"
 
 
@@ -241,11 +237,9 @@ def test_splits(copy, monkeypatch):
         f"building1_train_{number}" for number in range(10)
     ]
     people = {sequence.attributes["subject"] for sequence in val}
-    assert (
-        len(val) == 2
-        and len(people) == 1
-        and not people & {sequence.attributes["subject"] for sequence in train}
-    )
+    assert len(val) == 2
+    assert len(people) == 1
+    assert not people & {sequence.attributes["subject"] for sequence in train}
     assert {sequence.attributes["held_out"] for sequence in [*train, *val]} == people
     assert {sequence.attributes["calibration"] for sequence in train} == {"start"}
     with pytest.raises(InputError, match="known splits: train, val, seen, known"):
@@ -253,9 +247,8 @@ def test_splits(copy, monkeypatch):
     # What was aligned once is not aligned again.
     monkeypatch.setattr(idol, "read", lambda path: pytest.fail("built again"))
     again = data.load("idol", copy, "val")
-    assert names(again) == names(val) and all(
-        np.array_equal(a.position, b.position) for a, b in zip(again, val, strict=True)
-    )
+    assert names(again) == names(val)
+    assert all(np.array_equal(a.position, b.position) for a, b in zip(again, val, strict=True))
     assert again[0].attributes == val[0].attributes
 
 

@@ -50,22 +50,18 @@ def test_packets_with_every_trap_come_back(tmp_path):
         compare(sequence, time, known_walk.position(np.zeros(1)))
         assert sequence.valid.all() and self_check(sequence, pedestrian=False).failures == ()
     a = first.attributes
-    assert (
-        a["group"] == TRAIN
-        and a["imu_compensated"] == "reference"
-        and a["rows_repeated"] == 2
-        and a["rows_sorted"] > 10
-    )
+    assert a["group"] == TRAIN
+    assert a["imu_compensated"] == "reference"
+    assert a["rows_repeated"] == 2
+    assert a["rows_sorted"] > 10
 
 
 def test_npz_pieces_come_back(tmp_path):
     path = files.write_piece(tmp_path / f"train__{TRAIN}_extract2.npz")
     (sequence,) = kitti.read_piece(path)
-    assert (
-        sequence.name == f"{TRAIN}_extract2"
-        and sequence.time.dtype == np.float64
-        and sequence.attributes["group"] == TRAIN
-    )
+    assert sequence.name == f"{TRAIN}_extract2"
+    assert sequence.time.dtype == np.float64
+    assert sequence.attributes["group"] == TRAIN
     compare(sequence, sequence.time + sequence.attributes["start_time"], np.zeros(3))
 
 
@@ -76,8 +72,7 @@ def test_a_drive_in_both_layouts_is_read_once_and_the_slow_export_is_named(tmp_p
     files.write_drive(tmp_path, TRAIN, export="sync", rate=10.0)
     files.write_drive(tmp_path, TEST, export="sync", rate=10.0)
     with pytest.warns(
-        UserWarning,
-        match=rf"1 drives are there only as the 10 Hz export \(_sync\): {TEST}",
+        UserWarning, match=rf"1 drives are there only as the 10 Hz export \(_sync\): {TEST}"
     ):
         (sequence,) = data.load("kitti", tmp_path, "train")
     assert "start_time" in sequence.attributes  # of the packets
@@ -216,12 +211,7 @@ def test_wrong_rates_are_refused(tmp_path):
         lambda: kitti.read_packets(slow), slow / "timestamps.txt", "'time'", "10 Hz", "_extract"
     )
     odd = files.write_drive(tmp_path / "odd", TRAIN, rate=50.0)
-    refused(
-        lambda: kitti.read_packets(odd),
-        odd,
-        "'time'",
-        "50 Hz, expected about 100 Hz",
-    )
+    refused(lambda: kitti.read_packets(odd), odd, "'time'", "50 Hz, expected about 100 Hz")
 
 
 @pytest.mark.parametrize(

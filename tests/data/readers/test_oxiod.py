@@ -223,10 +223,8 @@ def test_syn_walk_comes_back(tmp_path):
     assert attitude.max() < 0.5
     rms, shift = imu_error(sequence.gyro - truth.gyro_bias, files.rate, time, truth)
     assert rms < 1e-3 and shift < 2e-3
-    assert (
-        sequence.attributes["placement"] == "pocket"
-        and sequence.attributes["session"] == "pocket/data1"
-    )
+    assert sequence.attributes["placement"] == "pocket"
+    assert sequence.attributes["session"] == "pocket/data1"
 
 
 def test_nexus_events_come_back(tmp_path):
@@ -560,10 +558,8 @@ def test_real_splits_share_no_walk(recordings):
         split: {walk.session for walk in found if walk.name in splits[f"sessions_{split}"]}
         for split in ("train", "val", "test")
     }
-    assert (
-        not sessions["train"] & (sessions["val"] | sessions["test"])
-        and not sessions["val"] & sessions["test"]
-    )
+    assert not sessions["train"] & (sessions["val"] | sessions["test"])
+    assert not sessions["val"] & sessions["test"]
     assert splits["test"] == {"running_data1_7", "trolley_data2_6"}
     assert sessions["val"] == {"multi users/user4"}
     assert sessions["test"] == {"multi users/user2", "multi devices/nexus 5", "trolley/data1"}

@@ -16,12 +16,7 @@ from gnio_jax.errors import InputError
 from gnio_jax.numerics import rotations
 from tests.support import known_walk as walk
 from tests.support.refusals import refused
-from tests.support.ridi_files import (
-    BOOT,
-    names,
-    write_table,
-    write_text,
-)
+from tests.support.ridi_files import BOOT, names, write_table, write_text
 
 
 @pytest.fixture(autouse=True)
@@ -168,10 +163,8 @@ def test_a_lost_odometry_ends_a_piece_and_a_short_loss_is_marked(tmp_path):
         sequence, later = ridi.read(write_text(tmp_path, "hang_leg1", pose_time=pose_time))
     compare(sequence)
     compare(later)
-    assert (
-        later.time[-1] == pytest.approx(walk.SECONDS - 0.4 - 25.6, abs=0.1)
-        and later.valid.mean() > 0.99
-    )
+    assert later.time[-1] == pytest.approx(walk.SECONDS - 0.4 - 25.6, abs=0.1)
+    assert later.valid.mean() > 0.99
     assert sequence.time[-1] == pytest.approx(24.0, abs=0.05)
     assert not sequence.valid[(sequence.time > 10.01) & (sequence.time < 10.39)].any()
     assert sequence.valid[(sequence.time < 9.9) | (sequence.time > 10.5)].all()
@@ -252,9 +245,8 @@ def test_the_hold_out_depends_on_the_list_alone(tmp_path):
     path.write_text("\n".join(reversed(TRAIN)) + "\n\n")
     assert ridi.held_out_of_train(path) == held
     subjects = {name.split("_")[0] for name in held}
-    assert (
-        held == {name for name in TRAIN if name.split("_")[0] in subjects} and 1 <= len(held) <= 2
-    )
+    assert held == {name for name in TRAIN if name.split("_")[0] in subjects}
+    assert 1 <= len(held) <= 2
     # One person, many walks: whole walks then; too few to part with: none.
     path.write_text("\n".join(f"dan_bag{n}" for n in range(20)))
     assert len(ridi.held_out_of_train(path)) == 2

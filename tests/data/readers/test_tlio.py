@@ -9,13 +9,7 @@ import pytest
 from gnio_jax import data
 from gnio_jax.data.readers import tlio
 from tests.support.refusals import refused
-from tests.support.tlio_files import (
-    COLUMNS,
-    N,
-    body_values,
-    spoil,
-    write_sequence,
-)
+from tests.support.tlio_files import COLUMNS, N, body_values, spoil, write_sequence
 
 SHUFFLED = [
     "vel_World(3)",
@@ -40,10 +34,8 @@ def test_imu_comes_back_in_the_body_frame_and_attitude_wxyz(tmp_path, columns):
     np.testing.assert_array_equal(sequence.position, position)
     np.testing.assert_array_equal(sequence.velocity, velocity)
     assert sequence.valid.all() and sequence.name == "walk"
-    assert (
-        sequence.attributes["imu_compensated"] == "reference"
-        and sequence.attributes["licence"] == "CC BY-NC 4.0"
-    )
+    assert sequence.attributes["imu_compensated"] == "reference"
+    assert sequence.attributes["licence"] == "CC BY-NC 4.0"
     assert data.self_check(sequence).failures == ()
 
 
