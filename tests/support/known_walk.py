@@ -92,3 +92,22 @@ def force(time: np.ndarray) -> np.ndarray:
 def walked(time: np.ndarray) -> float:
     """Length of the path over the stamps `time`, m."""
     return float(np.linalg.norm(np.diff(position(time), axis=0), axis=1).sum())
+
+
+def compare(
+    sequence, time, metres=1e-3, degrees=0.1, speed=0.02, imu=1e-3, bias=0.0, edge=0, origin=0.0
+):
+    """`sequence` tells of the walk at `time` (s), its positions from `origin`: the reference where
+    it is valid, IMU and velocity but for `edge` samples at either end, where splines err more."""
+    inner, valid = slice(edge, len(time) - edge), sequence.valid
+    np.testing.assert_allclose((sequence.gyro - bias)[inner], rate(time)[inner], atol=imu)
+    np.testing.assert_allclose(sequence.accel[inner], force(time)[inner], atol=imu)
+    off = np.linalg.norm(sequence.position - (position(time) - origin), axis=1)
+    assert off[valid].max() < metres
+    wxyz = sequence.orientation[valid]
+    turned = Rotation.from_quat(wxyz, scalar_first=True) * attitude(time[valid]).inv()
+    assert np.degrees(turned.magnitude()).max() < degrees
+    assert np.abs(sequence.velocity - velocity(time))[inner][valid[inner]].max() < speed
+    assert (
+        np.isnan(sequence.position[~valid]).all() and np.isnan(sequence.orientation[~valid]).all()
+    )

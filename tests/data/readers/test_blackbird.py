@@ -90,20 +90,3 @@ def test_a_text_that_is_not_of_its_table_is_refused(tmp_path):
     fails("has 10 columns")
     truth.write_text("\n".join([*lines[:5], lines[5].rsplit(" ", 1)[0] + " nan", *lines[6:]]))
     fails("column '10' is NaN", "row 6")
-
-
-@pytest.mark.recordings
-@pytest.mark.parametrize(("split", "seconds"), [("train", 91.0), ("val", 30.0), ("test", 30.0)])
-def test_the_real_flight_is_physical(recordings, split, seconds):
-    if not (recordings / "blackbird").is_dir():
-        pytest.skip("real recordings: no blackbird/")
-    (sequence,) = data.load("blackbird", recordings / "blackbird", split)
-    check = self_check(sequence, pedestrian=False)
-    assert check.duration == pytest.approx(seconds, abs=0.1) and check.rate == pytest.approx(100.0)
-    assert (
-        sequence.attributes["native_world"] == "z-up" and sequence.accel[:, 2].mean() < -9.0
-    )  # the body's z points down
-    np.testing.assert_allclose(check.gravity_mean, [0, 0, 9.81], atol=0.3)
-    assert check.gyro_consistency_degrees < 1.5
-    assert check.accel_correlation_horizontal > 0.99
-    assert 2.0 < check.median_speed < 3.5

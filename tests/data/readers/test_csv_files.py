@@ -19,11 +19,7 @@ G = 9.80665
 
 
 def compare_reference(sequence, start=0.0):
-    time, valid = (sequence.time + start)[sequence.valid], sequence.valid
-    turn = (rotations(sequence.orientation[valid]).inv() * known_walk.attitude(time)).magnitude()
-    assert np.degrees(turn).max() < 0.1
-    assert np.linalg.norm(sequence.position[valid] - known_walk.position(time), axis=1).max() < 1e-3
-    assert np.abs(sequence.velocity[valid] - known_walk.velocity(time)).max() < 0.015
+    known_walk.compare(sequence, sequence.time + start, speed=0.015)
 
 
 @pytest.mark.parametrize("rate", [50.0, 100.0, 202.3])

@@ -17,31 +17,14 @@ from tests.support import known_walk
 from tests.support.refusals import refused
 
 
-@pytest.fixture(autouse=True)
-def own_cache(tmp_path_factory, monkeypatch):
-    monkeypatch.setenv("GNIO_CACHE", str(tmp_path_factory.mktemp("cache")))
-
-
 def known_time(sequence):
     """s on the known walk's clock; unix seconds alone would lose the nanoseconds' digits."""
     return sequence.time + (sequence.attributes["start_time"] - files.EPOCH * 1e-9)
 
 
 def compare(sequence, degrees=0.1, metres=1e-3, speed=2e-3, bias=0.0):
-    time, valid = known_time(sequence), sequence.valid
-    turn = (
-        rotations(sequence.orientation[valid]).inv() * known_walk.attitude(time[valid])
-    ).magnitude()
-    assert np.degrees(turn).max() < degrees
-    assert (
-        np.linalg.norm(sequence.position - known_walk.position(time), axis=1)[valid].max() < metres
-    )
-    assert np.abs(sequence.velocity - known_walk.velocity(time))[valid].max() < speed
-    np.testing.assert_allclose(sequence.gyro - bias, known_walk.rate(time), atol=1e-3)
-    np.testing.assert_allclose(sequence.accel, known_walk.force(time), atol=1e-3)
+    known_walk.compare(sequence, known_time(sequence), metres, degrees, speed, bias=bias)
     np.testing.assert_allclose(np.diff(sequence.time), 0.005, atol=1e-9)
-    assert np.isnan(sequence.position[~valid]).all()
-    assert np.isnan(sequence.orientation[~valid]).all()
 
 
 @pytest.mark.parametrize(
@@ -312,40 +295,3 @@ def test_a_column_a_mount_or_a_truth_that_is_none_is_named(tmp_path):
     compare(*euroc.read(folder))
     (mav / "state_groundtruth_estimate0" / "data.csv").unlink()
     refused(lambda: euroc.read(folder), mav, "has no reference", "csv")
-
-
-# --- real recordings
-
-
-@pytest.mark.recordings
-@pytest.mark.parametrize(
-    ("name", "split", "expected", "correlation"),
-    [
-        ("euroc", "train", "V1_01_easy", 0.9),
-        ("euroc", "val", "V1_02_medium", 0.98),
-        ("euroc", "test", "MH_04_difficult", 0.6),
-        ("euroc", "unseen", "V2_01_easy", 0.9),
-        ("tumvi", "val", "room3", 0.98),
-        ("tumvi", "test", "room4", 0.98),
-    ],
-)
-def test_real_recordings_are_physical(recordings, name, split, expected, correlation):
-    if not (recordings / name).is_dir():
-        pytest.skip(f"real recordings: no {name}/")
-    (sequence,) = data.load(name, recordings / name, split)
-    check = self_check(sequence, pedestrian=name == "tumvi")
-    assert sequence.name == expected
-    assert check.rate == pytest.approx(200.0, rel=1e-4)
-    assert 80 < check.duration < 150
-    np.testing.assert_allclose(check.gravity_mean, [0, 0, 9.81], atol=0.15)
-    assert check.gyro_consistency_degrees < 1.0
-    assert check.accel_correlation_horizontal > correlation
-    assert 0.3 < check.median_speed < 1.3
-    assert check.share_valid > 0.88
-    # The velocities are those of the positions.
-    whole = sequence.valid[2:] & sequence.valid[1:-1] & sequence.valid[:-2]
-    differenced = (sequence.position[2:] - sequence.position[:-2]) / 0.01
-    assert (
-        np.percentile(np.linalg.norm(differenced - sequence.velocity[1:-1], axis=1)[whole], 99)
-        < 0.05
-    )

@@ -3,6 +3,7 @@ not the rig's."""
 
 from __future__ import annotations
 
+import json
 import sys
 import warnings
 
@@ -19,11 +20,6 @@ from gnio_jax.numerics import rotations
 from tests.support import known_walk as walk
 from tests.support.idol_files import BIAS, EPOCH, RIG_OF_PHONE, frame, write
 from tests.support.refusals import refused
-
-
-@pytest.fixture(autouse=True)
-def own_cache(tmp_path, monkeypatch):
-    monkeypatch.setenv("GNIO_CACHE", str(tmp_path / "cache"))
 
 
 def read_whole(path):
@@ -100,14 +96,6 @@ def test_columns_are_found_by_name_among_strays_and_rows_put_in_order(tmp_path):
     rows = np.arange(len(table))
     rows[[100, 101]] = rows[[101, 100]]
     compare(read_whole(write(tmp_path, table.iloc[np.insert(rows, 500, [500, 500])])))
-
-
-def test_an_accelerometer_that_reads_high_is_left_as_it_is(tmp_path):
-    table = frame()
-    for axis in "XYZ":
-        table[f"iphoneAcc{axis}"] *= 1.019
-    sequence = read_whole(write(tmp_path, table))
-    compare(sequence._replace(accel=sequence.accel / 1.019))
 
 
 @pytest.mark.filterwarnings("error")
@@ -205,14 +193,19 @@ def test_rows_without_core_motion_are_bridged(tmp_path, value):
 
 @pytest.fixture
 def copy(tmp_path):
+    """A copy of which nothing is read: people of two walks each in the training set."""
     root = tmp_path / "downloaded" / "IDOL"
-    table = frame(seconds=14.0)
-    for number in range(10):
-        write(root, table, "building1/train", number, subject=number // 2)
-    write(root, table, "building1/known", 0, subject=1)
-    write(root, table, "building2/known", 10, subject=2)
-    write(root, table, "building2/known", 9, subject=2)
-    write(root, table, "building3/unknown", 0, subject=14)
+    for folder, people in {
+        "building1/train": {number: number // 2 for number in range(10)},
+        "building1/known": {0: 1},
+        "building2/known": {10: 2, 9: 2},
+        "building3/unknown": {0: 14},
+    }.items():
+        (root / folder).mkdir(parents=True)
+        about = {k: {"subjectID": who, "calibration": "start"} for k, who in people.items()}
+        (root / folder / "metadata.json").write_text(json.dumps(about))
+        for number in people:
+            (root / folder / f"{number}.feather").touch()
     return tmp_path
 
 
@@ -220,68 +213,36 @@ def names(sequences):
     return [sequence.name for sequence in sequences]
 
 
-def test_splits(copy, monkeypatch):
+def test_splits(copy):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        splits = {split: data.load("idol", copy, split) for split in idol.DATASET.splits}
+        splits = {split: idol.recordings(copy, split) for split in idol.DATASET.splits}
     known = ["building1_known_0", "building2_known_9", "building2_known_10"]
     assert names(splits["known"]) == names(splits["seen"]) == names(splits["test"]) == known
     assert names(splits["unknown"]) == names(splits["unseen"]) == ["building3_unknown_0"]
-    assert (
-        splits["unseen"][0].attributes["subject"]
-        == splits["unseen"][0].attributes["group"]
-        == "subject14"
-    )
+    about = splits["unseen"][0].attributes
+    assert about["subject"] == about["group"] == "subject14"
     train, val = splits["train"], splits["val"]
-    assert sorted(names(train) + names(val)) == [
-        f"building1_train_{number}" for number in range(10)
-    ]
-    people = {sequence.attributes["subject"] for sequence in val}
-    assert len(val) == 2
-    assert len(people) == 1
-    assert not people & {sequence.attributes["subject"] for sequence in train}
-    assert {sequence.attributes["held_out"] for sequence in [*train, *val]} == people
-    assert {sequence.attributes["calibration"] for sequence in train} == {"start"}
-    with pytest.raises(InputError, match="known splits: train, val, seen, known"):
-        data.load("idol", copy, "tests")
-    # What was aligned once is not aligned again.
-    monkeypatch.setattr(idol, "read", lambda path: pytest.fail("built again"))
-    again = data.load("idol", copy, "val")
-    assert names(again) == names(val)
-    assert all(np.array_equal(a.position, b.position) for a, b in zip(again, val, strict=True))
-    assert again[0].attributes == val[0].attributes
+    assert {*names(train), *names(val)} == {f"building1_train_{number}" for number in range(10)}
+    people, others = ({each.attributes["subject"] for each in part} for part in (val, train))
+    assert len(val) == 2 and len(people) == 1 and not people & others
+    assert {each.attributes["held_out"] for each in [*train, *val]} == people
+    assert {each.attributes["calibration"] for each in train} == {"start"}
+    assert all(each.slow and each.files for each in train)  # what is aligned is kept in the cache
 
 
 def test_recordings_without_a_named_subject_count_as_people_of_their_own(copy):
     (copy / "downloaded" / "IDOL" / "building1" / "train" / "metadata.json").unlink()
-    with pytest.warns(
-        UserWarning,
-        match=r"metadata\.json does not name the subject of 10 recordings, e\.g\. .*0\.feather",
-    ):
-        val = data.load("idol", copy, "val")
-    assert len(val) == 1 and val[0].attributes["subject"] == val[0].name
+    nameless = r"metadata\.json does not name the subject of 10 recordings, e\.g\. .*0\.feather"
+    with pytest.warns(UserWarning, match=nameless):
+        (val,) = idol.recordings(copy, "val")
+    assert val.attributes["subject"] == val.name
 
 
-def test_a_recording_that_is_of_no_use_is_left_out(copy):
-    root = copy / "downloaded" / "IDOL"
-    write(root, frame(seconds=14.0, mount=Rotation.identity()), "building3/known", 2)
-    write(
-        root,
-        frame(seconds=14.0, tilt=Rotation.from_euler("x", 40, degrees=True)),
-        "building3/known",
-        3,
-    )
-    with pytest.warns(UserWarning) as caught:
-        assert len(data.load("idol", copy, "known")) == 3
-    texts = [str(warning.message) for warning in caught]
-    assert any(
-        text.startswith("building3_known_2: left out:") and "do not turn as" in text
-        for text in texts
-    )
-    assert any(
-        text.startswith("building3_known_3: left out:") and "40° off the vertical" in text
-        for text in texts
-    )
+def test_a_map_that_lies_on_its_side_is_refused(tmp_path):
+    tilted = frame(seconds=14.0, tilt=Rotation.from_euler("x", 40, degrees=True))
+    with pytest.raises(Refusal, match="40° off the vertical"):
+        read_whole(write(tmp_path, tilted))
 
 
 def test_copies_gone_wrong(copy):
@@ -289,14 +250,13 @@ def test_copies_gone_wrong(copy):
     for path in sorted((root / "building1" / "train").glob("*.feather"))[2:]:
         path.unlink()
     with pytest.raises(InputError, match="split 'val' would be empty"):
-        data.load("idol", copy, "val")
+        idol.recordings(copy, "val")
     (root / "building3" / "unknown" / "metadata.json").write_text("{")
     with pytest.raises(InputError, match=r"metadata\.json: is no JSON"):
-        data.load("idol", copy, "unseen")
-    with pytest.raises(
-        InputError, match=r"holds no recording in building\*/known; get it from .*expected layout"
-    ):
-        data.load("idol", root / "building3", "known")
+        idol.recordings(copy, "unseen")
+    nothing = r"holds no recording in building\*/known; get it from .*expected layout"
+    with pytest.raises(InputError, match=nothing):
+        idol.recordings(root / "building3", "known")
 
 
 # --- mistakes
@@ -342,11 +302,6 @@ def scaling(prefix, factor):
 def test_a_bad_table_is_refused_by_file_and_column(tmp_path, change, problem):
     path = write(tmp_path, change(frame(seconds=15.0)))
     refused(lambda: idol.read(path), path, problem)
-
-
-def test_the_wrong_sign_of_the_accelerometer_fails_the_self_check(tmp_path):
-    path = write(tmp_path, scaling("iphoneAcc", -1.0)(frame(seconds=15.0)))
-    assert "mean of R·accel" in data.self_check(read_whole(path)).failures[0]
 
 
 def test_without_pyarrow_it_says_what_to_install(tmp_path, monkeypatch):

@@ -113,18 +113,3 @@ def test_a_walk_of_few_waypoints_is_of_no_use(tmp_path, count):
 def test_a_damaged_file_is_refused_by_its_field(tmp_path, change, words):
     path = write(tmp_path, change(lines(12.0)))
     refused(lambda: indoor_location.read(path), path, *words)
-
-
-@pytest.mark.recordings
-def test_real_walks_are_physical(recordings):
-    root = recordings / "indoor_location"
-    if not root.is_dir():
-        pytest.skip("real recordings: no indoor_location/")
-    for each in indoor_location.recordings(root, "val")[:5]:
-        try:
-            (sequence,) = each.read()
-        except Refusal:
-            continue
-        check = self_check(sequence)
-        assert check.failures == () and 0.3 < check.median_speed < 1.6
-        assert np.linalg.norm(check.gravity_mean) == pytest.approx(9.81, abs=0.3)

@@ -21,17 +21,9 @@ from tests.support.refusals import refused
 TRAIN, VAL, TEST = "2011_09_26_drive_0014", "2011_09_26_drive_0009", "2011_09_26_drive_0018"
 
 
-def compare(sequence, time, origin, tolerance=1.0):
+def compare(sequence, time, origin):
     """The sequence tells of the known walk at `time` s, its positions from the walk's `origin`."""
-    turn = (rotations(sequence.orientation).inv() * known_walk.attitude(time)).magnitude()
-    assert np.degrees(turn).max() < 0.1 * tolerance
-    assert (
-        np.linalg.norm(sequence.position - (known_walk.position(time) - origin), axis=1).max()
-        < 1e-3 * tolerance
-    )
-    np.testing.assert_allclose(sequence.velocity, known_walk.velocity(time), atol=2e-3 * tolerance)
-    np.testing.assert_allclose(sequence.gyro, known_walk.rate(time), atol=1e-3 * tolerance)
-    np.testing.assert_allclose(sequence.accel, known_walk.force(time), atol=1e-3 * tolerance)
+    known_walk.compare(sequence, time, speed=2e-3, origin=origin)
 
 
 def test_packets_with_every_trap_come_back(tmp_path):
@@ -239,9 +231,6 @@ def test_a_root_without_drives_is_refused(tmp_path):
         TRAIN,
         "_extract",
     )
-
-
-# --- real recordings
 
 
 @pytest.mark.recordings

@@ -3,11 +3,7 @@ be physically plausible."""
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 import warnings
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,11 +17,6 @@ from gnio_jax.data.self_check import self_check
 from gnio_jax.errors import InputError
 from gnio_jax.numerics import rotations
 from tests.support import oxiod_files as files
-
-
-@pytest.fixture(autouse=True)
-def quiet(tmp_path, monkeypatch):
-    monkeypatch.setenv("GNIO_CACHE", str(tmp_path / "cache"))
 
 
 def dataset(tmp_path, scene, folder):
@@ -474,92 +465,3 @@ def test_reading_again_uses_the_cache_and_spawned_workers_agree(copy, monkeypatc
         np.allclose(a.position, b.position, atol=1e-9, equal_nan=True)
         for a, b in zip(alone, spawned, strict=True)
     )
-
-
-SCRIPT = """
-import sys
-from gnio_jax import data
-
-for sequence in data.load("oxiod", sys.argv[1], "test"):
-    print(sequence.name)
-"""
-
-
-def test_a_plain_script_starts_no_processes(copy, tmp_path):
-    """A script without a main guard, which a spawned process would run again."""
-    script = tmp_path / "plain.py"
-    script.write_text(SCRIPT)
-    environment = os.environ | {"PYTHONPATH": str(Path(data.__file__).parents[2])}
-    done = subprocess.run(
-        [sys.executable, str(script), str(copy)], env=environment, capture_output=True, text=True
-    )
-    assert done.stderr == "" and done.returncode == 0
-    assert done.stdout.split() == ["handheld_data5_1", "running_data1_7"]
-
-
-# --- real recordings
-
-
-@pytest.mark.recordings
-@pytest.mark.parametrize(
-    ("name", "kind", "yaw", "lever_y"),
-    [
-        ("handheld_data1_7", "raw", -169, 0.062),
-        ("multi-users_user3_5", "syn", -174.7, 0.106),
-        ("multi-devices_nexus-5_7", "raw", -173.6, 0.056),
-    ],
-)
-def test_real_recordings_are_plausible(recordings, name, kind, yaw, lever_y):
-    if not (recordings / "oxiod").is_dir():
-        pytest.skip("no oxiod below GNIO_DATA")
-    (walk,) = [walk for walk in oxiod.find_walks(recordings / "oxiod") if walk.name == name]
-    (sequence,) = oxiod.build(walk, kind)
-    check = self_check(sequence)
-    assert check.failures == ()
-    assert check.gravity_mean == pytest.approx([0, 0, 9.81], abs=0.12)
-    assert check.gyro_consistency_degrees < 1.8
-    assert check.accel_correlation_horizontal > 0.92
-    assert 0.5 < check.median_speed < 1.2 and check.share_valid > 0.95
-    assert sequence.attributes["extrinsic_yaw_degrees"] == pytest.approx(yaw, abs=1)
-    assert sequence.attributes["lever_y"] == pytest.approx(lever_y, abs=0.01)
-    assert sequence.attributes["accel_residual"] < 0.12
-    # Delayed or mirrored truth would show here: the phone's gravity is that of the reference.
-    reference, own = sequence.orientation, sequence.device_orientation
-    own, reference = (
-        rotations(each[sequence.valid]) for each in (reference if own is None else own, reference)
-    )
-    up = np.array([0.0, 0.0, 1.0])
-    angle = np.degrees(
-        np.arccos(np.clip((own.inv().apply(up) * reference.inv().apply(up)).sum(axis=1), -1, 1))
-    )
-    assert np.median(angle) < 4
-
-
-@pytest.mark.recordings
-def test_real_splits_share_no_walk(recordings):
-    if not (recordings / "oxiod").is_dir():
-        pytest.skip("no oxiod below GNIO_DATA")
-    root = recordings / "oxiod"
-    found = oxiod.find_walks(root)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        splits = {
-            split: {walk.name for walk in oxiod.select(found, split, root)}
-            for split in oxiod.SPLITS
-        }
-    for protocol in (
-        ("train", "val", "test", "unseen", "large_scale"),
-        ("sessions_train", "sessions_val", "sessions_test", "large_scale"),
-    ):
-        for first in protocol:
-            assert splits[first]
-            assert all(not splits[first] & splits[other] for other in protocol if other != first)
-    sessions = {
-        split: {walk.session for walk in found if walk.name in splits[f"sessions_{split}"]}
-        for split in ("train", "val", "test")
-    }
-    assert not sessions["train"] & (sessions["val"] | sessions["test"])
-    assert not sessions["val"] & sessions["test"]
-    assert splits["test"] == {"running_data1_7", "trolley_data2_6"}
-    assert sessions["val"] == {"multi users/user4"}
-    assert sessions["test"] == {"multi users/user2", "multi devices/nexus 5", "trolley/data1"}

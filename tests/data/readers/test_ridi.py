@@ -3,7 +3,6 @@ recording must be physically plausible."""
 
 from __future__ import annotations
 
-import shutil
 import warnings
 
 import numpy as np
@@ -11,17 +10,11 @@ import pytest
 
 from gnio_jax import data
 from gnio_jax.data.readers import ridi
-from gnio_jax.data.self_check import self_check
 from gnio_jax.errors import InputError
 from gnio_jax.numerics import rotations
 from tests.support import known_walk as walk
 from tests.support.refusals import refused
 from tests.support.ridi_files import BOOT, names, write_table, write_text
-
-
-@pytest.fixture(autouse=True)
-def own_cache(tmp_path_factory, monkeypatch):
-    monkeypatch.setenv("GNIO_CACHE", str(tmp_path_factory.mktemp("cache")))
 
 
 def read_whole(path):
@@ -30,21 +23,11 @@ def read_whole(path):
     return sequence
 
 
-def compare(sequence, edge=20):
-    """The sequence against the walk at its own stamps; splines err more at the first and last
-    samples, which have one neighbour."""
+def compare(sequence):
+    """The sequence against the walk at its own stamps."""
     time = sequence.time + (sequence.attributes["start_time"] - BOOT * 1e-9)
-    inner, valid = slice(edge, -edge), sequence.valid
     np.testing.assert_allclose(np.diff(sequence.time), 1 / 200, rtol=1e-6)
-    np.testing.assert_allclose(sequence.gyro[inner], walk.rate(time)[inner], atol=1e-3)
-    np.testing.assert_allclose(sequence.accel[inner], walk.force(time)[inner], atol=1e-3)
-    np.testing.assert_allclose(sequence.position[valid], walk.position(time)[valid], atol=1e-3)
-    error = rotations(sequence.orientation[valid]) * walk.attitude(time[valid]).inv()
-    assert np.degrees(error.magnitude()).max() < 0.1
-    assert np.isnan(sequence.orientation[~valid]).all()
-    np.testing.assert_allclose(
-        sequence.velocity[inner][valid[inner]], walk.velocity(time)[inner][valid[inner]], atol=0.02
-    )
+    walk.compare(sequence, time, edge=20)
     assert data.self_check(sequence).failures == ()
     return time
 
@@ -57,26 +40,10 @@ def check_device(sequence, begin=0.0):
     assert begin == pytest.approx(time[0], abs=0.02)
 
 
-SHUFFLED = [
-    "rv_z",
-    "pos_z",
-    "ori_y",
-    "time",
-    "acce_x",
-    "gyro_z",
-    "ori_w",
-    "rv_w",
-    "pos_x",
-    "gyro_x",
-    "acce_z",
-    "acce_y",
-    "gyro_y",
-    "rv_x",
-    "rv_y",
-    "pos_y",
-    "ori_x",
-    "ori_z",
-]
+SHUFFLED = (
+    "rv_z pos_z ori_y time acce_x gyro_z ori_w rv_w pos_x gyro_x acce_z acce_y gyro_y rv_x rv_y "
+    "pos_y ori_x ori_z"
+).split()
 
 
 @pytest.mark.parametrize("order", [None, SHUFFLED], ids=["native", "shuffled"])
@@ -121,24 +88,17 @@ def test_of_a_recording_with_a_gap_both_pieces_are_kept(tmp_path):
     assert {piece.attributes["group"] for piece in pieces} == {"huayi"}
 
 
-def test_the_cache_is_used_and_keyed_by_the_files_that_are_read(tmp_path, monkeypatch):
-    folder = write_text(tmp_path, "hang_leg1", "android_sensor_pose.txt")
-    first = data.load("ridi", tmp_path, "all")[0]
-    calls = []
-    monkeypatch.setattr(ridi, "read", lambda folder: calls.append(folder) or [first])
-    np.testing.assert_array_equal(data.load("ridi", tmp_path, "all")[0].gyro, first.gyro)
-    assert not calls
-    for number, name in enumerate(
-        ("acce.txt", "gyro.txt", "orientation.txt", "pose.txt", "android_sensor_pose.txt"), 1
-    ):
-        path = folder / name
-        path.write_text(path.read_text() + "\n")
-        data.load("ridi", tmp_path, "all")
-        data.load("ridi", tmp_path, "all")
-        assert len(calls) == number, name
-    write_table(tmp_path, "hang_leg1").touch()  # the table, once it is there, is what is read
-    data.load("ridi", tmp_path, "all")
-    assert len(calls) == 6
+def test_the_cache_is_keyed_by_the_files_that_are_read(tmp_path):
+    write_text(tmp_path, "hang_leg1", "android_sensor_pose.txt")
+
+    def read():
+        (recording,) = ridi.recordings(tmp_path, "all")
+        return {path.name for path in recording.files}
+
+    sensors = {"acce.txt", "gyro.txt", "orientation.txt", "pose.txt"}
+    assert read() == sensors | {"android_sensor_pose.txt"}
+    write_table(tmp_path, "hang_leg1")  # once it is there, it is what is read
+    assert read() == {"data.csv"}
 
 
 @pytest.mark.parametrize("poses", ["pose.txt", "android_sensor_pose.txt"])
@@ -182,60 +142,43 @@ def test_a_jump_of_the_odometry_is_marked(tmp_path):
 
 # --- splits
 
-TRAIN = [
-    "dan_bag1",
-    "dan_body1",
-    "dan_leg2",
-    "hang_bag1",
-    "hang_handheld1",
-    "hao_bag1",
-    "hao_body1",
-    "ma_bag1",
-    "yajie_leg1",
-    "zhicheng_bag1",
-]
+TRAIN = (
+    "dan_bag1 dan_body1 dan_leg2 hang_bag1 hang_handheld1 hao_bag1 hao_body1 ma_bag1 yajie_leg1 "
+    "zhicheng_bag1"
+).split()
 
 
 @pytest.fixture
 def copy(tmp_path):
     """A copy whose lists have no newline at the end, name what is not there, and leave out what is
-    (`dan_bag9`)."""
+    (`dan_bag9`). Nothing is read."""
     root = tmp_path / "downloaded" / "data_publish_v2"
-    time = np.arange(int(11 * 202.3)) / 202.3
-    write_table(root, TRAIN[0], time=time)
-    for name in [*TRAIN[1:-1], "hang_leg7", "shali_bag1", "dan_bag9"]:
-        shutil.copytree(root / TRAIN[0], root / name)
-    (root / "list_train_publish_v2.txt").write_text(
-        "\n".join(f"{name},{name.split('_')[1][:-1]}" for name in TRAIN)
-    )
-    (root / "list_test_publish_v2.txt").write_text(
-        "hang_leg7,leg\nhang_leg_new3,leg\nhuayi_handheld_test1,handheld"
-    )
-    (root / "list_crosssubject.txt").write_text("# others\nshali_bag1\nruixuan_bag1")
+    for name in [*TRAIN[:-1], "hang_leg7", "shali_bag1", "dan_bag9"]:
+        (root / name / "processed").mkdir(parents=True)
+        (root / name / "processed" / "data.csv").touch()
+    for name, entries in (
+        ("train_publish_v2", [f"{name},{name.split('_')[1][:-1]}" for name in TRAIN]),
+        ("test_publish_v2", ["hang_leg7,leg", "hang_leg_new3,leg", "huayi_handheld_test1,bag"]),
+        ("crosssubject", ["# others", "shali_bag1", "ruixuan_bag1"]),
+    ):
+        (root / f"list_{name}.txt").write_text("\n".join(entries))
     return tmp_path
 
 
 def test_splits(copy):
-    with pytest.warns(
-        UserWarning,
-        match=r"list_train_publish_v2\.txt: 1 of 10 listed sequences are absent: zhicheng_bag1,bag",
-    ):
-        train = data.load("ridi", copy, "train")
+    absent = r"list_train_publish_v2\.txt: 1 of 10 listed sequences are absent: zhicheng_bag1,bag"
+    with pytest.warns(UserWarning, match=absent):
+        train = ridi.recordings(copy, "train")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        val, test, seen, unseen = (
-            data.load("ridi", copy, split) for split in ("val", "test", "seen", "unseen")
-        )
-    assert names(test) == names(seen) == {"hang_leg7"} and names(unseen) == {"shali_bag1"}
-    assert names(train) | names(val) == set(TRAIN[:-1]) and val and not names(train) & names(val)
+        val, *others = (ridi.recordings(copy, s) for s in ("val", "test", "seen", "unseen"))
+    assert [names(other) for other in others] == [{"hang_leg7"}, {"hang_leg7"}, {"shali_bag1"}]
+    assert names(train) | names(val) == set(TRAIN[:-1])
     # Whole people are held out, and every sequence says which.
-    people = {sequence.attributes["subject"] for sequence in val}
-    assert not people & {sequence.attributes["subject"] for sequence in train}
-    assert {sequence.attributes["held_out"] for sequence in [*train, *val]} == {
-        ", ".join(sorted(people))
-    }
-    with pytest.raises(InputError, match="known splits: train, val"):
-        data.load("ridi", copy, "tset")
+    people, others = ({each.name.split("_")[0] for each in part} for part in (val, train))
+    assert people and not people & others
+    held = {each.attributes["held_out"] for each in [*train, *val]}
+    assert held == {", ".join(sorted(people))}
 
 
 def test_the_hold_out_depends_on_the_list_alone(tmp_path):
@@ -257,20 +200,24 @@ def test_the_hold_out_depends_on_the_list_alone(tmp_path):
 def test_a_list_too_short_to_hold_anybody_out_is_named(copy):
     (copy / "downloaded" / "data_publish_v2" / "list_train_publish_v2.txt").write_text("dan_bag1")
     with pytest.raises(InputError, match="split 'val' would be empty"):
-        data.load("ridi", copy, "val")
+        ridi.recordings(copy, "val")
 
 
 def test_every_recording_below_the_root_needs_no_list(copy):
-    listed = {*TRAIN[:-1], "hang_leg7", "shali_bag1"}
     for _ in range(2):
-        assert names(data.load("ridi", copy, "all")) == {*listed, "dan_bag9"}
+        assert names(ridi.recordings(copy, "all")) == {
+            *TRAIN[:-1],
+            "hang_leg7",
+            "shali_bag1",
+            "dan_bag9",
+        }
         for path in copy.rglob("list_*.txt"):
             path.unlink()
     with pytest.raises(InputError, match=r"list_test_publish_v2\.txt: the list cannot be read"):
-        data.load("ridi", copy, "test")
+        ridi.recordings(copy, "test")
     (copy / "elsewhere").mkdir()
     with pytest.raises(InputError, match="elsewhere: holds no recording of RIDI; expected layout"):
-        data.load("ridi", copy / "elsewhere", "all")
+        ridi.recordings(copy / "elsewhere", "all")
 
 
 # --- mistakes
@@ -337,33 +284,3 @@ def test_without_the_phones_own_filter_there_is_no_device_orientation(tmp_path):
     )
     assert sequence.device_orientation is None
     compare(sequence)
-
-
-# --- a real recording
-
-
-@pytest.mark.recordings
-def test_real_recording_is_plausible(recordings):
-    folder = recordings / "kiod" / "01"
-    if not folder.is_dir():
-        pytest.skip("no kiod below GNIO_DATA")
-    with pytest.warns(
-        UserWarning,
-        match=r"kiod/01: field 'time' has gaps longer than 1 s \(1, up to 1\.5 s\)"
-        r".*103\.\d of 105\.2 s",
-    ):
-        pieces = ridi.read(folder)
-    assert [self_check(piece).failures for piece in pieces] == [(), ()]
-    sequence = max(pieces, key=lambda piece: len(piece.time))
-    check = self_check(sequence)
-    assert check.share_valid > 0.99
-    assert check.duration == pytest.approx(54.8, abs=0.1) and check.rate == pytest.approx(200.0)
-    np.testing.assert_allclose(check.gravity_mean, [0, 0, 9.81], atol=0.1)
-    assert check.gyro_consistency_degrees < 2.0 and 1.2 < check.median_speed < 1.6
-    assert check.accel_correlation_horizontal > 0.55
-    # The phone's own filter, laid on the reference at the first row, stays near it.
-    apart = (
-        rotations(sequence.device_orientation[sequence.valid])
-        * rotations(sequence.orientation[sequence.valid]).inv()
-    ).magnitude()
-    assert np.degrees(np.median(apart)) < 5.0

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from gnio_jax import data
 from gnio_jax.data.readers import ronin
-from gnio_jax.errors import InputError
+from gnio_jax.data.self_check import check_sequence
 from gnio_jax.numerics import rotations
 from tests.support import known_walk as walk
 from tests.support.refusals import refused
@@ -76,14 +76,6 @@ def test_a_walk_comes_back_in_the_phones_frame(tmp_path, start_frame):
     assert "non-commercial" in a["licence"]
 
 
-def test_the_chest_taken_for_the_phone_would_not_pass(tmp_path):
-    """What this file guards against, seen from outside: with the chest's attitude the very same
-    numbers are implausible."""
-    (sequence,) = ronin.read(write(tmp_path / "a011_2"))
-    mistaken = sequence._replace(orientation=wxyz(chest(own_time(sequence))))
-    assert any("mean of R·accel" in failure for failure in data.self_check(mistaken).failures)
-
-
 @pytest.mark.parametrize(
     ("errors", "ekf", "chosen"),
     [
@@ -109,17 +101,18 @@ def test_the_source_of_the_orientation(tmp_path, errors, ekf, chosen):
 
 
 @pytest.fixture
-def copy(tmp_path):
+def copy(tmp_path, monkeypatch):
     """Recordings in archives that do not follow the lists, which have no newline at the end and
-    name what is not public."""
-    big = {"seconds": 20.0, "start_frame": 0, "drifts": (25.0, 6.0)}
-    write(tmp_path / "train_dataset_1" / "a001_1", **big)
-    write(
-        tmp_path / "seen_subjects_test_set" / "a000_1", **big
-    )  # one to train on, in the test's archive
-    write(tmp_path / "train_dataset_2" / "a009_2", **big)
-    write(tmp_path / "seen_subjects_test_set" / "a011_2", **big)
-    write(tmp_path / "unseen_subjects_test_set" / "deeper" / "a006_2", **big)
+    name what is not public. Reading one tells its folder, and whether the truth may choose."""
+    for place in (
+        "train_dataset_1/a001_1",
+        "seen_subjects_test_set/a000_1",  # one to train on, in the test's archive
+        "train_dataset_2/a009_2",
+        "seen_subjects_test_set/a011_2",
+        "unseen_subjects_test_set/deeper/a006_2",
+    ):
+        (tmp_path / place).mkdir(parents=True)
+        (tmp_path / place / "data.hdf5").touch()
     lists = tmp_path / "ronin" / "lists"
     lists.mkdir(parents=True)
     for name, entries in (
@@ -129,48 +122,40 @@ def copy(tmp_path):
         ("test_unseen", "a006_2"),
     ):
         (lists / f"list_{name}.txt").write_text(entries)
+    monkeypatch.setattr(ronin, "read", lambda folder, choose: (folder.name, choose))
     return tmp_path
 
 
+def names(root, split):
+    return [recording.name for recording in ronin.recordings(root, split)]
+
+
 def test_splits(copy):
-    with pytest.warns(
-        UserWarning, match=r"list_train\.txt: 1 of 3 listed sequences are absent: a007_3"
-    ):
-        train = data.load("ronin", copy, "train")
-    assert [sequence.name for sequence in train] == ["a001_1", "a000_1"]
+    absent = r"list_train\.txt: 1 of 3 listed sequences are absent: a007_3"
+    with pytest.warns(UserWarning, match=absent):
+        assert names(copy, "train") == ["a001_1", "a000_1"]
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        others = {
-            split: data.load("ronin", copy, split) for split in ("val", "seen", "unseen", "test")
+        found = {
+            split: [recording.read() for recording in ronin.recordings(copy, split)]
+            for split in ("val", "seen", "unseen", "test")
         }
-    named = {
-        split: [sequence.name for sequence in sequences] for split, sequences in others.items()
-    }
-    assert named == {
-        "val": ["a009_2"],
-        "seen": ["a011_2"],
-        "unseen": ["a006_2"],
-        "test": ["a011_2"],
-    }
     # The truth may choose the orientation's source where one trains and validates, never where one
     # is tested.
-    assert {s.attributes["orientation_source"] for s in [*train, *others["val"]]} == {"ekf"}
-    assert {
-        s.attributes["orientation_source"]
-        for split in ("seen", "unseen", "test")
-        for s in others[split]
-    } == {"game_rv"}
-    with pytest.raises(InputError, match="known splits: train, val, seen, unseen, test"):
-        data.load("ronin", copy, "tests")
+    assert found == {
+        "val": [("a009_2", True)],
+        "seen": [("a011_2", False)],
+        "unseen": [("a006_2", False)],
+        "test": [("a011_2", False)],
+    }
 
 
 def test_of_copies_the_first_is_taken(copy):
-    write(copy / "train_dataset_2" / "a006_2", seconds=20.0)
-    with pytest.warns(
-        UserWarning,
-        match=r"1 recordings are there twice, e\.g\. .*unseen_subjects_test_set/deeper/a006_2",
-    ):
-        assert [sequence.name for sequence in data.load("ronin", copy, "unseen")] == ["a006_2"]
+    (copy / "unseen_subjects_test_set" / "later" / "a006_2").mkdir(parents=True)
+    (copy / "unseen_subjects_test_set" / "later" / "a006_2" / "data.hdf5").touch()
+    twice = r"1 recordings are there twice, e\.g\. .*later/a006_2; .*deeper/a006_2 is used"
+    with pytest.warns(UserWarning, match=twice):
+        assert names(copy, "unseen") == ["a006_2"]
 
 
 def test_links_to_archives_elsewhere_are_followed(copy, tmp_path):
@@ -179,36 +164,31 @@ def test_links_to_archives_elsewhere_are_followed(copy, tmp_path):
     (root / "unseen").symlink_to(copy / "unseen_subjects_test_set")
     (root / "unseen" / "round").symlink_to(root)  # a circle must not hang it
     (root / "list_test_unseen.txt").write_text("a006_2")
-    assert [sequence.name for sequence in data.load("ronin", root, "unseen")] == ["a006_2"]
+    assert names(root, "unseen") == ["a006_2"]
 
 
-def test_a_tilted_reference_is_left_out_by_name(copy):
+def test_a_tilted_reference_fails_the_self_check(tmp_path):
     def tilt(info):
         calibration = rotations(np.array(info["start_calibration"]))
-        info["start_calibration"] = list(
-            wxyz(calibration * Rotation.from_euler("x", 6, degrees=True))
-        )
+        tilted = calibration * Rotation.from_euler("x", 6, degrees=True)
+        info["start_calibration"] = list(wxyz(tilted))
 
-    write(copy / "more" / "a019_3", seconds=20.0, start_frame=0, spoil_info=tilt)
-    (copy / "ronin" / "lists" / "list_test_unseen.txt").write_text("a006_2\na019_3")
-    with pytest.warns(UserWarning, match=r"a019_3: left out by the self-check: mean of R·accel"):
-        assert [sequence.name for sequence in data.load("ronin", copy, "unseen")] == ["a006_2"]
+    (sequence,) = ronin.read(write(tmp_path / "a019_3", seconds=20.0, spoil_info=tilt))
+    assert "mean of R·accel" in check_sequence(sequence, ronin.DATASET).failures[0]
 
 
-def test_the_chest_may_move_as_the_phone_does_not(copy):
+def test_the_chest_may_move_as_the_phone_does_not(tmp_path):
     """A phone in a swinging hand accelerates otherwise than the chest: that is no reason to leave
     the walk out."""
 
     def steady(fields):
         time = fields["synced/time"] - FIRST
-        fields["pose/tango_pos"] = np.stack(
-            [0.9 * time, 0.02 * np.sin(2 * np.pi * 1.3 * time), 0.0 * time], axis=1
-        )
+        sway = 0.02 * np.sin(2 * np.pi * 1.3 * time)
+        fields["pose/tango_pos"] = np.stack([0.9 * time, sway, 0.0 * time], axis=1)
 
-    write(copy / "more" / "a019_3", seconds=20.0, start_frame=0, spoil=steady)
-    (copy / "ronin" / "lists" / "list_test_unseen.txt").write_text("a019_3")
-    (sequence,) = data.load("ronin", copy, "unseen")
-    assert data.self_check(sequence).accel_correlation_horizontal < 0.3
+    (sequence,) = ronin.read(write(tmp_path / "a019_3", seconds=20.0, spoil=steady))
+    check = check_sequence(sequence, ronin.DATASET)
+    assert check.failures == () and check.accel_correlation_horizontal < 0.3
 
 
 # --- mistakes

@@ -90,31 +90,3 @@ def test_a_table_that_is_not_as_described_is_refused(tmp_path):
         fails(description, words)
     description.unlink()
     fails(description, "cannot be read")
-
-
-@pytest.mark.recordings
-@pytest.mark.parametrize(
-    ("split", "names"),
-    [
-        ("train", ["room1", "room2", "V1_01_easy", "V1_02_medium"]),
-        ("val", ["room3", "V2_01_easy"]),
-        ("test", ["room4", "MH_04_difficult"]),
-    ],
-)
-def test_real_recordings_are_physical(recordings, split, names):
-    sequences = data.load("tlio", recordings / "tlio_layout", split)
-    assert sorted(sequence.name for sequence in sequences) == sorted(names)
-    for sequence in sequences:
-        check = data.self_check(sequence)
-        assert 80 < check.duration < 150 and check.rate == pytest.approx(200.0, rel=1e-3)
-        np.testing.assert_allclose(check.gravity_mean, [0, 0, 9.81], atol=0.08)
-        assert check.gyro_consistency_degrees < 1.0 and 0.3 < check.median_speed < 1.3
-        assert check.accel_correlation_horizontal > (
-            0.65 if sequence.name == "MH_04_difficult" else 0.8
-        )
-        assert data.resample(sequence, 200.0) is sequence
-        slower = data.self_check(data.resample(sequence, 100.0))
-        assert slower.rate == pytest.approx(100.0) and slower.failures == ()
-        assert slower.gyro_consistency_degrees == pytest.approx(
-            check.gyro_consistency_degrees, abs=0.1
-        )
