@@ -419,16 +419,6 @@ def test_where_the_cache_lies(monkeypatch, tmp_path):
 # --- names, roots and splits
 
 
-def test_every_dataset_says_what_a_user_must_know():
-    assert data.names() == sorted(data.names())
-    assert {"oxiod", "synthetic", "tlio"} <= set(data.names())
-    for name in data.names():
-        dataset = data.get(name)
-        assert dataset.name == name and dataset.splits and dataset.rate > 0
-        assert callable(dataset.recordings)
-        assert dataset.source and dataset.layout and dataset.licence
-
-
 def test_unknown_names_and_splits_list_the_known_ones():
     unknown = r"unknown name 'tloi'; did you mean 'tlio'\? known datasets: .*synthetic, tlio"
     with pytest.raises(InputError, match=unknown):
@@ -475,9 +465,3 @@ def test_two_sequences_of_one_name_are_refused(tmp_path, monkeypatch):
     monkeypatch.setitem(DATASETS, "tlio", dataset(*twice))
     with pytest.raises(InputError, match="two sequences of split 'test' have the name 'walk'"):
         data.load("tlio", tmp_path)
-
-
-def test_the_computed_set_needs_no_folder(monkeypatch, tmp_path):
-    monkeypatch.delenv("GNIO_DATA", raising=False)
-    monkeypatch.chdir(tmp_path)
-    assert len(data.load("synthetic", split="val")) == 4

@@ -429,20 +429,3 @@ def test_a_reference_that_cannot_be_one_is_left_out_with_a_note(tmp_path):
         assert not sequence.valid.any() and sequence.attributes["truth"] == "none"
         (note,) = (note for note in notes if note.startswith("no reference is taken: "))
         assert words in note
-
-
-@pytest.mark.recordings
-def test_a_real_logger_s_files_are_imported(recordings):
-    """An Android phone's raw text, one file per sensor at 388 Hz."""
-    folder = recordings / "kiod" / "01"
-    if not folder.is_dir():
-        pytest.skip("real recordings: no kiod/")
-    columns = {"time": "0"} | {name: "123"[n % 3] for n, name in enumerate(AXES)}
-    given = {"accel_path": folder / "acce.txt", "rate": 200.0}
-    sequence, notes = import_recording(folder / "gyro.txt", columns, **given)
-    assert 100 < sequence.time[-1] < 110
-    size = np.median(np.linalg.norm(sequence.accel, axis=1))
-    assert size == pytest.approx(9.8, abs=0.2)
-    text = " | ".join(notes)
-    assert "time of gyro taken as ns, by which it runs at 388 Hz" in text
-    assert "gyro taken as rad/s" in text and "accel taken as m/s2" in text

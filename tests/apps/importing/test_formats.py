@@ -25,22 +25,15 @@ def compare(sequence, atol):
     compare_reference(sequence, rows, atol)
 
 
-@pytest.mark.parametrize("mount", [None, LEVER])
-def test_an_estimate_is_moved_to_the_imu(tmp_path, mount):
+def test_an_estimate_is_moved_to_the_imu(tmp_path):
     """At 100 Hz, which no published set has."""
     asl_files.write_imu(tmp_path / "mav0", step=0.01)
-    asl_files.write_estimate(tmp_path / "mav0", mount=mount)
+    asl_files.write_estimate(tmp_path / "mav0", mount=LEVER)
     sequence, notes = import_recording(tmp_path)
     compare(sequence, 1e-4)
     assert sequence.attributes["start_time"] == pytest.approx(EPOCH * 1e-9, abs=1e-6)
     assert "EuRoC's layout (ns, rad/s, m/s2), reference state_groundtruth_estimate0" in notes[0]
     assert sequence.attributes["truth"] == "state_groundtruth_estimate0"
-
-
-def test_mocap_without_velocities(tmp_path):
-    asl_files.write_imu(tmp_path / "mav0")
-    asl_files.write_mocap(tmp_path / "mav0", mount=LEVER)
-    compare(import_recording(tmp_path / "mav0")[0], 2e-3)
 
 
 def test_no_reference_and_no_column(tmp_path):

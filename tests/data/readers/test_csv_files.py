@@ -94,26 +94,6 @@ def test_lists_name_files_with_or_without_suffix(tmp_path):
         data.load("csv", tmp_path, "seen")
 
 
-def test_a_reference_that_contradicts_the_imu_is_left_out(tmp_path):
-    write_native(tmp_path / "good.csv")
-    write_native(tmp_path / "bare.csv", reference=False)
-    write_native(
-        tmp_path / "turned.csv",
-        spoil=lambda columns: columns.update(px=-columns["px"], py=-columns["py"]),
-    )
-    with pytest.warns(UserWarning, match="turned: left out by the self-check"):
-        assert [s.name for s in data.load("csv", tmp_path, "test")] == ["bare", "good"]
-    (tmp_path / "good.csv").unlink()
-    with pytest.warns(UserWarning, match="turned: left out by the self-check"):
-        assert [s.name for s in data.load("csv", tmp_path, "test")] == ["bare"]
-    (tmp_path / "bare.csv").unlink()
-    with (
-        pytest.warns(UserWarning, match="turned: left out"),
-        pytest.raises(InputError, match="none of 1 sequences passes"),
-    ):
-        data.load("csv", tmp_path, "test")
-
-
 def set_value(name, row, value):
     def change(columns):
         columns[name] = columns[name].astype(

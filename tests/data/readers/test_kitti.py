@@ -127,32 +127,6 @@ def test_packets_whose_names_have_no_leading_zeros_come_back(tmp_path):
     assert len(sequence.time) == 400 and sequence.valid.all()
 
 
-def test_a_car_that_speeds_up_is_no_tilt_but_a_tilt_is(tmp_path):
-    """From 0 to 12 m/s in 12 s: the specific force has 1 m/s² forward in the mean, more than a tilt
-    of 5° would make."""
-
-    def accelerate(arrays, roll=0.0):
-        time = np.arange(1200) / 100
-        arrays["p_gt"][:] = np.stack([0.5 * time**2, 0 * time, 0 * time], axis=1)
-        arrays["v_gt"][:] = np.stack([time, 0 * time, 0 * time], axis=1)
-        arrays["ang_gt"][:] = [roll, 0.0, 0.0]
-        arrays["u"][:] = [0.0, 0.0, 0.0, 1.0, 0.0, 9.81]
-
-    files.write_piece(tmp_path / f"train__{TRAIN}_extract0.npz", accelerate)
-    files.write_piece(
-        tmp_path / f"train__{TRAIN}_extract1.npz",
-        lambda arrays: accelerate(arrays, np.radians(5.0)),
-    )
-    with pytest.warns(
-        UserWarning, match=rf"{TRAIN}_extract1: left out by the self-check: mean of R·accel"
-    ):
-        (sequence,) = data.load("kitti", tmp_path, "train")
-    assert sequence.name == f"{TRAIN}_extract0"
-    np.testing.assert_allclose(
-        sequence.accel, np.tile([1.0, 0.0, 9.81], (1200, 1)), atol=1e-6
-    )  # what is given is what was read
-
-
 # --- errors
 
 

@@ -181,25 +181,24 @@ def test_a_walk_that_fits_at_two_lags_is_refused_by_name(tmp_path):
     assert "fits the phone at two lags alike" in refused(tmp_path)
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"lever": np.array([0.1, 0.5, -0.2])}, "the lever arm would be 0.5"),
+def test_what_no_phone_on_a_marker_body_can_be_is_refused_by_name(tmp_path, monkeypatch):
+    files.write_raw(dataset(tmp_path, "handheld", "data1"), 1, files.Truth(), seconds=25)
+    (walk,) = oxiod.find_walks(tmp_path)
+    phone = oxiod.read_phone(walk.files["raw"][0], "raw")
+    fit = oxiod.align(phone, oxiod.read_vicon(walk.files["raw"][1], "raw", phone.start))
+    for change, message in (
+        ({"lever": np.array([0.1, 0.5, -0.2])}, "the lever arm would be 0.548 m"),
         ({"accel_delay": 0.2}, "the accel's delay would be 0.2 s"),
-        ({"up": np.array([np.sin(0.15), 0.0, np.cos(0.15)])}, "the world's tilt would be 8.6"),
+        ({"up": np.array([np.sin(0.15), 0.0, np.cos(0.15)])}, "the world's tilt would be 8.59"),
         ({"gyro_bias": np.array([0.1, -0.1, 0.1])}, "the gyro's bias would be 0.17"),
-    ],
-    ids=["lever", "delay", "tilt", "bias"],
-)
-def test_what_no_phone_on_a_marker_body_can_be_is_refused_by_name(tmp_path, change, message):
-    files.write_raw(dataset(tmp_path, "handheld", "data1"), 1, files.Truth(**change), seconds=30)
-    assert message in refused(tmp_path)
-
-
-def test_rows_that_the_authors_cannot_have_matched_are_refused_by_name(tmp_path):
-    truth = files.Truth(lag_rows=-250.0)
-    files.write_syn(dataset(tmp_path, "handheld", "data1"), 1, truth, seconds=25)
-    assert "the lag would be 2.5 s, at most 1 s is plausible" in refused(tmp_path, "syn")
+        ({"lag": fit.lag - 6.0}, "s, at most 5 s is plausible"),
+    ):
+        monkeypatch.setattr(oxiod, "align", lambda *_, c=change, **__: fit._replace(**c))
+        assert message in refused(tmp_path)
+    walk = walk._replace(files={"syn": walk.files["raw"]})  # whose rows the authors have matched
+    monkeypatch.setattr(oxiod, "align", lambda *_, **__: fit._replace(lag=fit.lag - 2.5))
+    with pytest.raises(Refusal, match="s, at most 1 s is plausible"):
+        oxiod.build(walk, "syn")
 
 
 def test_large_scale_takes_positions_of_tango_and_attitude_of_gyro(tmp_path):

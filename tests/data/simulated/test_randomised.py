@@ -47,6 +47,11 @@ KNOWN = {
         [2188.972821880198, 19507.96905872019, 2362.0737368805467],
         [674.5280856928983, 1185.0200491000644, 700.2600224902284],
     ),
+    3001: (  # of `synthetic`, a pocket
+        [8.268985122117613, -22.153815669098634, 3.3990187167441333],
+        [6570.717909661941, 43481.49970855106, 8982.95660633462],
+        [2304.07557312174, 2838.0901640423767, 3220.1150007217034],
+    ),
     200005: (
         [17.12432209650229, -16.86730792811519, -0.010144025394450723],
         [6223.273728834688, 14162.67213369514, 17453.21575709797],
@@ -58,7 +63,10 @@ KNOWN = {
 @pytest.mark.parametrize("seed", list(KNOWN))
 def test_a_seed_is_the_walk_that_it_has_always_been(seed):
     """Published networks were trained on these walks."""
-    walk = simulated.random_walk(seed, 20.0)
+    if seed == 3001:
+        walk = simulated.pedestrian(seed, 201, "pocket", 20.0)
+    else:
+        walk = simulated.random_walk(seed, 20.0)
     end, accel, gyro = KNOWN[seed]
     np.testing.assert_allclose(walk.position[-1], end, rtol=1e-9)
     np.testing.assert_allclose(np.abs(walk.accel).sum(axis=0), accel, rtol=1e-9)
