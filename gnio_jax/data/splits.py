@@ -76,16 +76,14 @@ def held_out(people: Mapping[str, str], share: float = 0.1, most: float = 0.25) 
     return set()
 
 
-def listed(
-    path: str | os.PathLike[str], find: Callable[[str], Path | None], root: Path, layout: str
-) -> list[Path]:
+def listed(path: Path, find: Callable[[str], Path | None], root: Path, layout: str) -> list[Path]:
     """What `find` says of the entries of a list file, one a line: the place of a recording, or None
     where this copy lacks it.
 
     Absent entries are warned of with their count. Raises `InputError` when the list cannot be read
     or names nothing that is present.
     """
-    path, layout = Path(path), f"expected layout: {layout}"
+    layout = f"expected layout: {layout}"
     try:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:

@@ -174,6 +174,16 @@ class Table(NamedTuple):
 # --- text
 
 
+def text_of(path: Path) -> str:
+    """What a file of text holds, without a byte order mark."""
+    try:
+        return path.read_text(encoding="utf-8-sig")
+    except OSError as error:
+        raise InputError(path, f"cannot be read ({error.strerror})") from None
+    except UnicodeDecodeError as error:
+        raise damaged(path, f"is no text ({shortened(error)})") from None
+
+
 def open_text(path: Path, content: bytes | None = None) -> io.TextIOWrapper:
     """The text of a file, or `content` in its place; a byte order mark is dropped."""
     if content is None:

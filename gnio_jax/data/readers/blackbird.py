@@ -14,7 +14,6 @@ specific force in it: a world whose z points down is turned by a half turn about
 
 from __future__ import annotations
 
-import os
 from functools import partial
 from pathlib import Path
 
@@ -38,7 +37,6 @@ _TRUTH = "stamped_groundtruth_imu.txt"
 
 def recordings(root: Path, split: str) -> list[Recording]:
     """The recordings of a split's list that are present."""
-    root = Path(root)
     folders = listed(
         root / f"{split}.txt",
         lambda entry: root / entry if (root / entry / _TABLE).is_file() else None,
@@ -52,9 +50,8 @@ def recordings(root: Path, split: str) -> list[Recording]:
     ]
 
 
-def read(folder: str | os.PathLike[str], name: str | None = None) -> list[Sequence]:
+def read(folder: Path, name: str | None = None) -> list[Sequence]:
     """One sequence of its folder, in a z-up world. Raises `InputError` naming file and field."""
-    folder = Path(folder)
     path = folder / _TABLE
     table = read_hdf5_fields(path, ("ts", "gyro_calib", "accel_calib", "traj_target"))
     stamps = table.take("ts")

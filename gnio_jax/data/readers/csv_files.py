@@ -11,7 +11,6 @@ leave the reference empty: up to 0.1 s of that are bridged, more is not valid.
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Iterable, Mapping
 from functools import partial
@@ -53,7 +52,6 @@ def recordings(root: Path, split: str) -> list[Recording]:
 
     Raises `InputError` where two files would go by the same name.
     """
-    root = Path(root)
     if split not in SPLITS and not _is_list(root / f"{split}.txt"):
         known = f"known splits: {', '.join(SPLITS)}, or that of a list {split}.txt there"
         raise InputError(root, f"unknown split '{split}'", known)
@@ -103,10 +101,9 @@ def _find(root: Path, entry: str) -> Path | None:
 # --- how one is read
 
 
-def read(path: str | os.PathLike[str]) -> list[Sequence]:
+def read(path: Path) -> list[Sequence]:
     """One recording, on a uniform clock of its own rate, named after its file. Raises `InputError`
     naming file and field."""
-    path = Path(path)
     if path.suffix.lower() not in _HDF5:
         return assemble(_streams(read_text(path)), whole=True)
     sequence = read_hdf5(path)._replace(name=path.stem)

@@ -27,7 +27,6 @@ other names, one's own in this layout, are in `test` alone.
 
 from __future__ import annotations
 
-import os
 import re
 from functools import partial
 from pathlib import Path
@@ -91,7 +90,7 @@ def recordings(root: Path, split: str, dataset: str = "euroc") -> list[Recording
     wanted = "test" if split == "seen" else split
     chosen = [
         folder
-        for name, folder in find_sequences(Path(root), about).items()
+        for name, folder in find_sequences(root, about).items()
         if _split_of(name, known) == wanted
     ]
     if not chosen:
@@ -153,10 +152,10 @@ def _split_of(name: str, splits: dict[str, tuple[str, ...]]) -> str:
 # --- one sequence
 
 
-def read(folder: str | os.PathLike[str], about: Dataset | None = None) -> list[Sequence]:
+def read(folder: Path, about: Dataset | None = None) -> list[Sequence]:
     """One sequence of its folder (the one that holds `mav0`). Raises `InputError` naming file and
     field."""
-    folder, about = Path(folder), about or EUROC
+    about = about or EUROC
     mav, name = folder / "mav0", short_name(folder.name)
     path = mav / "imu0" / "data.csv"
     table = read_table(path)

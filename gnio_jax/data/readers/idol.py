@@ -18,7 +18,6 @@ The folders are the splits: `known` (also `seen`, `test`) are people of `train`,
 
 from __future__ import annotations
 
-import os
 import warnings
 from functools import partial
 from pathlib import Path
@@ -63,7 +62,6 @@ _BUILDINGS = ("building1", "building2", "building3")
 
 def recordings(root: Path, split: str) -> list[Recording]:
     """The walks of a split."""
-    root = Path(root)
     chosen = find_walks(root, _SPLITS[split])
     if split not in ("train", "val"):
         return chosen
@@ -119,14 +117,13 @@ def _name(path: Path) -> str:
 # --- one walk
 
 
-def read(path: str | os.PathLike[str]) -> list[Sequence]:
+def read(path: Path) -> list[Sequence]:
     """One walk at 100 Hz: levelled, the reference turned to the phone and shifted onto its clock.
 
     Level and lag are those of the whole walk, which is divided where a gap is longer than a window.
     Raises `InputError` naming file and column, and `Refusal` when its reference cannot be that of
     the phone.
     """
-    path = Path(path)
     table = read_feather(path)
     stamps = table.take("timestamp")
     rows, start = distinct(stamps, path, "timestamp"), float(np.median(stamps))

@@ -17,7 +17,6 @@ sample. A tap within a second of the IMU's ends is taken at the end.
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Iterator
 from functools import partial
@@ -28,7 +27,7 @@ import numpy as np
 from gnio_jax.data.assembly import Samples, Streams, assemble
 from gnio_jax.data.dataset import Dataset, Recording, Refusal
 from gnio_jax.data.parsing.stamps import distinct, first_stamp, seconds
-from gnio_jax.data.parsing.tables import damaged, shortened
+from gnio_jax.data.parsing.tables import damaged, shortened, text_of
 from gnio_jax.data.validation import FARTHEST, FEWEST_WAYPOINTS
 from gnio_jax.errors import InputError
 from gnio_jax.types import Sequence
@@ -49,7 +48,6 @@ _MERGED = re.compile(r"(?<!^)(?=\d{13}\tTYPE_)")
 
 def recordings(root: Path, split: str) -> list[Recording]:
     """The recordings of a split: whole floors. `all` is every walk below the root."""
-    root = Path(root)
     paths = sorted(root.glob("**/path_data_files/*.txt"), key=lambda path: path.parts[-3:])
     if not paths:
         layout = f"expected layout: {DATASET.layout}"
@@ -75,13 +73,12 @@ def _name(path: Path) -> str:
 # --- one walk
 
 
-def read(path: str | os.PathLike[str]) -> list[Sequence]:
+def read(path: Path) -> list[Sequence]:
     """One walk of its file, at 50 Hz, with waypoints in the place of poses.
 
     Raises `InputError` naming file and field, and `Refusal` for a walk of fewer waypoints than can
     be used.
     """
-    path = Path(path)
     header, rows = read_lines(path)
     sensors = {}
     for kind in (_GYRO, _ACCEL):
@@ -146,13 +143,7 @@ def read_lines(path: Path) -> tuple[str, dict[str, tuple[np.ndarray, np.ndarray]
 
     Raises `InputError` where a line is cut short, or the file holds two recordings.
     """
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except OSError as error:
-        raise InputError(path, f"cannot be read ({error.strerror})") from None
-    except UnicodeDecodeError as error:
-        raise damaged(path, f"is no text ({shortened(error)})") from None
-    lines = [*_lines(text)]
+    lines = [*_lines(text_of(path))]
     header = "\n".join(line for _, line in lines if line.startswith("#"))
     starts = header.count("startTime:")
     if starts > 1:

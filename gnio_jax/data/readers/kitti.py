@@ -42,7 +42,7 @@ from scipy.spatial.transform import Rotation
 from gnio_jax.data.assembly import Poses, Streams, assemble
 from gnio_jax.data.dataset import Dataset, Recording
 from gnio_jax.data.parsing.stamps import in_order
-from gnio_jax.data.parsing.tables import damaged, read_npz, shortened
+from gnio_jax.data.parsing.tables import damaged, read_npz, shortened, text_of
 from gnio_jax.data.validation import FASTEST, check_increasing
 from gnio_jax.errors import InputError
 from gnio_jax.numerics import stretches
@@ -82,7 +82,7 @@ _MOST = np.array(
 def recordings(root: Path, split: str) -> list[Recording]:
     """The drives of a split, or their pieces where these are files of their own."""
     found = []
-    for drive, paths in find_drives(Path(root)).items():
+    for drive, paths in find_drives(root).items():
         if share_of(drive) == split and paths[0].is_dir():
             found.append(Recording(drive, partial(read_packets, paths[0])))
         elif share_of(drive) == split:
@@ -129,13 +129,12 @@ def find_drives(root: Path) -> dict[str, list[Path]]:
 # --- one drive
 
 
-def read_packets(oxts: str | os.PathLike[str]) -> list[Sequence]:
+def read_packets(oxts: Path) -> list[Sequence]:
     """The pieces of a drive of its folder `oxts`.
 
     Packets without a stamp are left out, rows are sorted, of equal stamps the first is kept. World:
     east, north, up from the first packet (`project`). Raises `InputError` naming file and field.
     """
-    oxts = Path(oxts)
     times, drive = oxts / "timestamps.txt", _drive_of(oxts.parent.name)
     rows, packets = _packets(oxts / "data")
     stamps = _stamps(times)
@@ -175,9 +174,8 @@ def read_packets(oxts: str | os.PathLike[str]) -> list[Sequence]:
     return sequences
 
 
-def read_piece(path: str | os.PathLike[str]) -> list[Sequence]:
+def read_piece(path: Path) -> list[Sequence]:
     """The sequence of one npz. Raises `InputError` naming file and field."""
-    path = Path(path)
     table = read_npz(path)
     time, imu = table.take("t"), table.take("u", width=6)
     check_increasing(time, path)
@@ -257,11 +255,7 @@ def _packet(path: str) -> list[float]:
 
 def _stamps(path: Path) -> np.ndarray:
     """datetime64[ns] of each line, NaT for an empty one (a packet without a stamp)."""
-    try:
-        lines = [line.strip() for line in path.read_text(encoding="utf-8").rstrip().splitlines()]
-    except (OSError, UnicodeDecodeError) as error:
-        problem = f"cannot be read ({getattr(error, 'strerror', None) or error})"
-        raise InputError(path, problem) from None
+    lines = [line.strip() for line in text_of(path).rstrip().splitlines()]
     stamps = np.full(len(lines), np.datetime64("NaT"), dtype="datetime64[ns]")
     for row, line in enumerate(lines):
         try:

@@ -18,7 +18,6 @@ out of train (`held_out_of_train`).
 
 from __future__ import annotations
 
-import os
 import re
 from functools import partial
 from pathlib import Path
@@ -60,7 +59,6 @@ def recordings(root: Path, split: str) -> list[Recording]:
     `unseen` is the authors' cross-subject list. Recordings that are in no list are in no split but
     `all`, every recording below the root, which needs no list.
     """
-    root = Path(root)
     folders = find_folders(root, _is_recording)
     if split == "all":
         if not folders:
@@ -92,10 +90,10 @@ def _recording(folder: Path, attributes: dict[str, str]) -> Recording:
     )
 
 
-def held_out_of_train(path: str | os.PathLike[str]) -> set[str]:
+def held_out_of_train(path: Path) -> set[str]:
     """Names in the training list that validate: whole people, about a tenth of the list, the same
     in every copy of the data."""
-    folders = listed(path, lambda entry: Path(_name(entry)), Path(path).parent, DATASET.layout)
+    folders = listed(path, lambda entry: Path(_name(entry)), path.parent, DATASET.layout)
     return held_out({folder.name: _subject(folder.name) for folder in folders})
 
 
@@ -117,14 +115,13 @@ def _subject(name: str) -> str:
 # --- one recording
 
 
-def read(folder: str | os.PathLike[str]) -> list[Sequence]:
+def read(folder: Path) -> list[Sequence]:
     """One recording of its folder, at 200 Hz, from its table or else from the recorder's text
     files, divided where its IMU or odometry has a gap longer than a window.
 
     `device_orientation` is the game rotation vector, turned to begin at the reference's attitude,
     since its yaw is arbitrary. Raises `InputError` naming file and field.
     """
-    folder = Path(folder)
     table, arcore = (folder / _TABLE).is_file(), (folder / _ARCORE).is_file()
     streams = _from_table(folder) if table else _from_text_files(folder, arcore)
     words = re.findall("|".join(_PLACEMENTS), folder.name)

@@ -16,7 +16,6 @@ the game rotation vector. The position is the chest's.
 
 from __future__ import annotations
 
-import os
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -61,21 +60,19 @@ _ERRORS = {
 def recordings(root: Path, split: str) -> list[Recording]:
     """The recordings of a split's list that are present, wherever below the root; `test` is
     `seen`."""
-    root = Path(root)
     folders = find_folders(root, lambda folder: (folder / _TABLE).is_file())
     chosen = listed(find_list(root, _LISTS[split]), folders.get, root, DATASET.layout)
     choose = split in ("train", "val")
     return [Recording(folder.name, partial(read, folder, choose)) for folder in chosen]
 
 
-def read(folder: str | os.PathLike[str], choose: bool = False) -> list[Sequence]:
+def read(folder: Path, choose: bool = False) -> list[Sequence]:
     """One recording of its folder, from its `start_frame` on.
 
     `choose` lets the errors against the truth decide which source the orientation follows, as in
     training; without it that is the game rotation vector. `device_orientation` is the game rotation
     vector as the phone gave it. Raises `InputError` naming file and field.
     """
-    folder = Path(folder)
     path, about = folder / _TABLE, folder / _INFO
     info = json_object(about, f"it belongs beside {_TABLE}")
     table = read_hdf5_fields(path, (_TIME, _GYRO, _ACCEL, _GAME, _POSITION, _CHEST, _EKF))

@@ -9,7 +9,6 @@ filter will find it in the field: `imu_compensated` among the attributes says so
 
 from __future__ import annotations
 
-import os
 import re
 from functools import partial
 from pathlib import Path
@@ -36,7 +35,6 @@ _LISTS = {"train": "train_list.txt", "val": "val_list.txt", "test": "test_list.t
 
 def recordings(root: Path, split: str) -> list[Recording]:
     """The recordings of a split's list that are present."""
-    root = Path(root)
     folders = listed(
         root / _LISTS[split],
         lambda entry: root / entry if (root / entry / _TABLE).is_file() else None,
@@ -46,9 +44,8 @@ def recordings(root: Path, split: str) -> list[Recording]:
     return [Recording(folder.name, partial(read, folder)) for folder in folders]
 
 
-def read(folder: str | os.PathLike[str]) -> list[Sequence]:
+def read(folder: Path) -> list[Sequence]:
     """One sequence of its folder. Raises `InputError` naming file and field."""
-    folder = Path(folder)
     path = folder / _TABLE
     table = read_npy(path, *_columns(folder / _DESCRIPTION))
     stamps = table.take(_STAMPS, width=1)[:, 0]

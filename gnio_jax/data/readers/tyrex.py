@@ -27,7 +27,6 @@ Everything comes back at 100 Hz.
 
 from __future__ import annotations
 
-import os
 import re
 from functools import partial
 from pathlib import Path
@@ -41,7 +40,7 @@ from gnio_jax.data.alignment import TooLittle, align, check_fit, without_jumps
 from gnio_jax.data.assembly import Poses, Samples, Streams, assemble
 from gnio_jax.data.dataset import Dataset, Recording, Refusal
 from gnio_jax.data.parsing.stamps import distinct
-from gnio_jax.data.parsing.tables import damaged, parsed_as, read_text, shortened
+from gnio_jax.data.parsing.tables import damaged, parsed_as, read_text, shortened, text_of
 from gnio_jax.data.splits import find_folders
 from gnio_jax.data.validation import check_accel, check_gyro
 from gnio_jax.errors import InputError
@@ -122,7 +121,6 @@ def recordings(root: Path, split: str) -> list[Recording]:
     (`val`), and test where none do (`test`, running included). `all` is every walk, and
     `all-0of2`, `all+0of2` divide it by person.
     """
-    root = Path(root)
     found = find_folders(root, lambda folder: walk_of(folder) is not None)
     walks = [walk for folder in found.values() if (walk := walk_of(folder)) is not None]
     if not walks:
@@ -151,10 +149,9 @@ def _recording(walk: Walk) -> Recording:
 # --- one walk
 
 
-def read(folder: str | os.PathLike[str]) -> list[Sequence]:
+def read(folder: Path) -> list[Sequence]:
     """One walk of its phone's folder. Raises `InputError` naming file and field, and `Refusal`
     where phone and tracker do not move alike."""
-    folder = Path(folder)
     walk = walk_of(folder)
     if walk is None:
         problem = "is not named <Person>_<Device>_<Dist|NoDist>_<Way>"
@@ -228,7 +225,7 @@ def read_phone(walk: Walk) -> Streams:
 
 def _boot_time(path: Path) -> float:
     """s since boot at which an iPhone's record began."""
-    found = re.search(r"BootTime\s*=\s*(\d{1,12}(?:\.\d{1,9})?)", _text(path))
+    found = re.search(r"BootTime\s*=\s*(\d{1,12}(?:\.\d{1,9})?)", text_of(path))
     if found is None:
         raise damaged(path, "field 'BootTime' is missing")
     return float(found[1])
@@ -237,7 +234,7 @@ def _boot_time(path: Path) -> float:
 def _offset(folder: Path) -> float:
     """s by which the tracker's time is ahead of the record's."""
     path = folder / "timeAlignment.txt"
-    text = _text(path).strip()
+    text = text_of(path).strip()
     try:
         offset = float(text)
     except ValueError:
@@ -245,13 +242,6 @@ def _offset(folder: Path) -> float:
     if not abs(offset) <= LONGEST_RECORD:
         raise damaged(path, f"holds '{shortened(text)}', expected one number of seconds")
     return offset
-
-
-def _text(path: Path) -> str:
-    try:
-        return path.read_text(encoding="utf-8-sig", errors="replace")
-    except OSError as error:
-        raise InputError(path, f"cannot be read ({error.strerror})") from None
 
 
 # --- the tracker's MATLAB file
