@@ -36,6 +36,7 @@ def runs(tmp_path_factory):
 @pytest.fixture
 def gnio(monkeypatch, capsys, runs):
     monkeypatch.chdir(runs.parent)
+    monkeypatch.setattr("gnio_jax.evaluation.plots.DOTS_PER_INCH", 30)
 
     def call(*arguments):
         monkeypatch.setattr("sys.argv", ["gnio", *map(str, arguments)])
@@ -59,9 +60,12 @@ def mistake(gnio, capsys):
     return call
 
 
-def csv(path, time, gyro, accel):
+def csv(path, time, gyro=None, accel=None, start=0.0):
+    """By default of the known walk."""
     header = "time,gyro_x,gyro_y,gyro_z,accel_x,accel_y,accel_z"
-    rows = np.column_stack([time, gyro, accel])
+    gyro = known_walk.rate(time) if gyro is None else gyro
+    accel = known_walk.force(time) if accel is None else accel
+    rows = np.column_stack([time + start, gyro, accel])
     np.savetxt(path, rows, delimiter=",", header=header, comments="", fmt="%.9f")
     return path
 
@@ -140,7 +144,7 @@ def test_a_phone_on_a_table_stays_there(gnio, runs, tmp_path):
 
 def test_the_newest_run_a_slow_logger_and_our_own_file(gnio, runs, tmp_path, monkeypatch):
     time = np.delete(np.arange(120), np.s_[60:70]) / 20
-    slow = csv(tmp_path / "slow.csv", time, known_walk.rate(time), known_walk.force(time))
+    slow = csv(tmp_path / "slow.csv", time)
     monkeypatch.setattr("gnio_jax.apps.packages.SHIPPED", tmp_path)
     told = gnio("track", slow)
     folder = runs.parent / "tracks" / "slow"
@@ -154,20 +158,15 @@ def test_the_newest_run_a_slow_logger_and_our_own_file(gnio, runs, tmp_path, mon
     of_gaps = [line for line in told.splitlines() if "lacks samples" in line or "gaps" in line]
     assert len(of_gaps) == 3 and set(of_gaps) <= set(again.splitlines())
     assert summary_of(tmp_path / "again")["notes"] == summary_of(folder)["notes"]
-    ours, theirs = (
-        read_tum(place / "trajectory.txt").position for place in (tmp_path / "again", folder)
-    )
+    ours, theirs = (read_tum(x / "trajectory.txt").position for x in (tmp_path / "again", folder))
     np.testing.assert_allclose(ours, theirs, atol=1e-4)
 
 
 def test_what_is_refused(mistake, runs, tmp_path):
-    time = np.arange(50) / 100
-    short = csv(tmp_path / "short.csv", time, known_walk.rate(time), known_walk.force(time))
     weights = ("--weights", runs / "walker")
-    assert "were recorded for 0.49 s" in mistake("track", short, *weights)
-    time = np.arange(104) / 100
-    short = csv(tmp_path / "short.csv", time, known_walk.rate(time), known_walk.force(time))
-    assert "too short for a window and a stride" in mistake("track", short, *weights)
+    for samples, words in ((50, "were recorded for 0.49 s"), (104, "too short for a window and a")):
+        short = csv(tmp_path / "short.csv", np.arange(samples) / 100)
+        assert words in mistake("track", short, *weights)
     members = logger_files.sensor_logger()
     walk = logger_files.zipped(tmp_path / "walk.zip", members)
     given = ("track", walk, *weights)
@@ -187,9 +186,9 @@ def test_what_is_refused(mistake, runs, tmp_path):
 
 
 def without_poses(name, time):
-    nothing, signals = (
-        np.full((len(time), 3), np.nan),
+    signals, nothing = (
         (known_walk.rate(time), known_walk.force(time)),
+        np.full((len(time), 3), np.nan),
     )
     level, valid = np.full((len(time), 4), np.nan), np.zeros(len(time), bool)
     return Sequence(name, time, *signals, level, nothing, nothing, valid)
@@ -220,9 +219,8 @@ def test_a_recording_with_waypoints_is_compared_with_them(gnio, runs, tmp_path):
     time = np.arange(600) / 100
     taps = Waypoints(time[[0, 200, 400, 599]], known_walk.position(time[[0, 200, 400, 599]])[:, :2])
     write_hdf5(tmp_path / "mall.h5", without_poses("mall", time)._replace(waypoints=taps))
-    told = gnio(
-        "track", tmp_path / "mall.h5", "--weights", runs / "walker", "--out", tmp_path / "t"
-    )
+    given = ("--weights", runs / "walker", "--out", tmp_path / "t")
+    told = gnio("track", tmp_path / "mall.h5", *given)
     errors = summary_of(tmp_path / "t")["errors"]
     # By hand: the lengths of the legs do not depend on the alignment.
     path = read_tum(tmp_path / "t" / "trajectory.txt")
@@ -244,8 +242,7 @@ def test_what_cannot_be_written_is_found_before_the_work(mistake, runs, tmp_path
     assert f"{tmp_path / 'walk.zip'}: " in mistake("track", walk, *weights, "--out", walk / "track")
     time = np.arange(300) / 100
     for start, words in ((-5.0, "stamps begin at -5 s"), (3e9, "ROS counts seconds in 32 bits")):
-        rows = time + start, known_walk.rate(time), known_walk.force(time)
-        odd = csv(tmp_path / "odd.csv", *rows)
+        odd = csv(tmp_path / "odd.csv", time, start=start)
         assert words in mistake("track", odd, *weights, "--format", "mcap", "--time-unit", "s")
 
 
