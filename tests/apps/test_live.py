@@ -320,6 +320,7 @@ def test_a_recording_played_gives_the_track_of_it(gnio, run, recorded, monkeypat
     given = ("--gyro-unit", "rad/s")
     told = gnio([], walk, "--speed", "0", "--out", tmp_path / "live.txt", *given)
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("gnio_jax.evaluation.plots.DOTS_PER_INCH", 30)
     asked = ["track", str(walk), "--out", "track", "--weights", str(run), *given]
     console.run(lambda: app.main(asked))
     followed, tracked = read_tum(tmp_path / "live.txt"), read_tum(tmp_path / "track/trajectory.txt")

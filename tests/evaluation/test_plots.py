@@ -132,10 +132,10 @@ def test_the_distribution_of_errors_counts_what_diverged(with_divergence, alignm
 
 
 def test_one_picture_for_each_sequence(tmp_path, estimates, made):
-    plots.save_all(tmp_path / "a", [plots.view(each) for each in estimates], made)
-    names = {path.name for path in (tmp_path / "a").iterdir()}
-    assert names == {"error_cdf.png", "room_1_walk.png", "room_1_walk_.png", "blind.png"}
-    assert all((tmp_path / "a" / name).read_bytes()[:4] == b"\x89PNG" for name in names)
+    plots.save_all(tmp_path, [plots.view(each) for each in estimates[:2]], made)
+    pictures = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    assert pictures.keys() == {"error_cdf.png", "room_1_walk.png", "room_1_walk_.png"}
+    assert all(each.startswith(b"\x89PNG") for each in pictures.values())
 
 
 def test_a_short_walk_and_a_name_of_any_bytes_are_drawn(tmp_path):
