@@ -271,7 +271,7 @@ def scaling(prefix, factor):
             "field 'timestamp' holds only 1 different stamps",
         ),
         (
-            lambda table: table.assign(timestamp=EPOCH + 1e3 * (table["timestamp"] - EPOCH)),
+            lambda table: table.assign(timestamp=EPOCH + 10.0 * (table["timestamp"] - EPOCH)),
             "expected about 100 Hz",
         ),
         (

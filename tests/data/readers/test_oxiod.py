@@ -204,8 +204,8 @@ def test_what_no_phone_on_a_marker_body_can_be_is_refused_by_name(tmp_path, monk
 def test_large_scale_takes_positions_of_tango_and_attitude_of_gyro(tmp_path):
     truth = files.Truth()
     folder = dataset(tmp_path, "large scale", "floor1")
-    files.write_large_scale(folder, 1, truth, offset=0.2, seconds=50)
-    files.write_large_scale(folder, 2, truth, broken=True, seconds=50)
+    files.write_large_scale(folder, 1, truth, offset=0.2, seconds=36)
+    files.write_large_scale(folder, 2, truth, broken=True, seconds=36)
     with pytest.warns(UserWarning, match=r"floor1_2: left out.*out of step"):
         (sequence,) = data.load("oxiod", tmp_path, "large_scale")
     assert sequence.attributes["truth"] == "tango"
