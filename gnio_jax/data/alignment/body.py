@@ -410,13 +410,13 @@ def _fit(
     if np.minimum(np.diff(seen.time, append=np.inf), 1.0).sum() < SHORTEST_OVERLAP:
         raise TooLittle(f"less than {SHORTEST_OVERLAP:g} s of the track overlap the IMU's samples")
     reach = np.concatenate([np.full(3, TURN_STEP), PRIOR_STD, np.full(len(knots), LAG_STEP)])
-    found = errors(seen, felt, hats, extrinsic, unknowns)
+    found = Problem(seen, felt, hats, extrinsic).errors(unknowns)
     for _ in range(2):
         scales = max(robust_std(found[0]), 1e-4), max(robust_std(found[1]), 1e-3)
         off = [np.linalg.norm(e, axis=1) / s for e, s in zip(found, scales, strict=True)]
         kept = np.maximum(*off) <= max(OUTLIER, np.median(np.maximum(*off)))
         noises = [_noise(seen.time[kept], e[kept], s) for e, s in zip(found, scales, strict=True)]
-        problem = _Problem(seen.rows(kept), felt, hats[kept], extrinsic, noises, unknowns)
+        problem = Problem(seen.rows(kept), felt, hats[kept], extrinsic, noises, unknowns)
         result = least_squares(
             problem.residuals,
             np.zeros(len(unknowns)),
@@ -430,7 +430,7 @@ def _fit(
         unknowns = unknowns + result.x
         extrinsic = extrinsic * Rotation.from_rotvec(unknowns[TURN])
         unknowns[TURN] = 0.0
-        found = errors(seen, felt, hats, extrinsic, unknowns)
+        found = Problem(seen, felt, hats, extrinsic).errors(unknowns)
     return _Fit(extrinsic, unknowns, seen, *found, _turn_std(result.jac, int(kept.sum())))
 
 
@@ -453,75 +453,66 @@ def _turn_std(jacobian: Float[np.ndarray, "r u"], rows: int) -> float:
     return float(1.0 / np.sqrt(max(np.linalg.eigvalsh(known)[0] - 4.0 * rows, 1e-12)))
 
 
-class _Problem(NamedTuple):
-    """One round of least squares, whose unknowns are changes from `start`."""
+class Problem(NamedTuple):
+    """Both equations in some rows, and one round of least squares, whose unknowns are changes from
+    `start`."""
 
     seen: _Seen
     felt: _Felt
     hats: Float[np.ndarray, "n k"]
     guess: Rotation
-    noises: list[_Noise]
-    start: Float[np.ndarray, " u"]
+    noises: list[_Noise] = []
+    start: Float[np.ndarray, " u"] = np.zeros(0)
+
+    def errors(
+        self, x: Float[np.ndarray, " u"]
+    ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+        """In the marker body, the tracker's side minus the IMU's: rad/s and m/s²."""
+        extrinsic = self.guess * Rotation.from_rotvec(x[TURN])
+        there = self.seen.time + self.hats @ x[LAG]
+        rate = self.felt.gyro(there) - x[GYRO_BIAS]
+        force = self.felt.accel(there + x[DELAY]) - x[ACCEL_BIAS]
+        tracked = self.seen.acceleration + self.seen.lever_gain @ x[LEVER]
+        tracked = tracked + GRAVITY * self.seen.to_body @ upward(x[TILT])
+        return self.seen.rate - extrinsic.apply(rate), tracked - extrinsic.apply(force)
+
+    def jacobians(
+        self, x: Float[np.ndarray, " u"]
+    ) -> tuple[Float[np.ndarray, "n 3 u"], Float[np.ndarray, "n 3 u"]]:
+        """Derivatives of `errors` by the unknowns: differences would take three times as long."""
+        rotation = (self.guess * Rotation.from_rotvec(x[TURN])).as_matrix()
+        # Of the rotation vector, to the second order of the turn.
+        turned = np.eye(3) - hat(x[TURN]) / 2.0 + hat(x[TURN]) @ hat(x[TURN]) / 6.0
+        there = self.seen.time + self.hats @ x[LAG]
+        late = there + x[DELAY]
+        gyro, accel = (np.zeros((len(self.hats), 3, len(x))) for _ in range(2))
+        gyro[:, :, TURN] = rotation @ hat(self.felt.gyro(there) - x[GYRO_BIAS]) @ turned
+        gyro[:, :, GYRO_BIAS] = rotation
+        turning = self.felt.gyro(there, 1) @ rotation.T
+        gyro[:, :, LAG] = -turning[:, :, None] * self.hats[:, None, :]
+        accel[:, :, TURN] = rotation @ hat(self.felt.accel(late) - x[ACCEL_BIAS]) @ turned
+        accel[:, :, ACCEL_BIAS] = rotation
+        accel[:, :, LEVER] = self.seen.lever_gain
+        up = upward(x[TILT])
+        by_tilt = up[2] * np.eye(3)[:, :2] - up[2] * np.outer(up, up[:2])
+        accel[:, :, TILT] = GRAVITY * self.seen.to_body @ by_tilt
+        accel[:, :, DELAY] = -self.felt.accel(late, 1) @ rotation.T
+        accel[:, :, LAG] = accel[:, :, DELAY, None] * self.hats[:, None, :]
+        return gyro, accel
 
     def residuals(self, change: Float[np.ndarray, " u"]) -> Float[np.ndarray, " r"]:
         x = self.start + change
-        return self._whitened(errors(*self[:4], x), x)
+        return self._whitened(self.errors(x), x)
 
     def derivatives(self, change: Float[np.ndarray, " u"]) -> Float[np.ndarray, "r u"]:
         x = self.start + change
-        return self._whitened(jacobians(*self[:4], x), np.eye(len(x)))
+        return self._whitened(self.jacobians(x), np.eye(len(x)))
 
     def _whitened(self, sides: tuple[np.ndarray, np.ndarray], x: np.ndarray) -> np.ndarray:
         """Rows of both sides and of the priors: of the errors, or of their derivatives."""
         rows = (noise.whitened(side) for noise, side in zip(self.noises, sides, strict=True))
         prior = (x[3:15].T / PRIOR_STD).T
         return np.concatenate([*rows, prior, np.diff(x[LAG], 2, axis=0) / LAG_BEND_STD])
-
-
-def errors(
-    seen: _Seen,
-    felt: _Felt,
-    hats: Float[np.ndarray, "n k"],
-    guess: Rotation,
-    x: Float[np.ndarray, " u"],
-) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
-    """Errors of both equations in the marker body, the tracker's side minus the IMU's: rad/s and
-    m/s²."""
-    extrinsic = guess * Rotation.from_rotvec(x[TURN])
-    there = seen.time + hats @ x[LAG]
-    rate = felt.gyro(there) - x[GYRO_BIAS]
-    force = felt.accel(there + x[DELAY]) - x[ACCEL_BIAS]
-    tracked = seen.acceleration + seen.lever_gain @ x[LEVER]
-    tracked = tracked + GRAVITY * seen.to_body @ upward(x[TILT])
-    return seen.rate - extrinsic.apply(rate), tracked - extrinsic.apply(force)
-
-
-def jacobians(
-    seen: _Seen,
-    felt: _Felt,
-    hats: Float[np.ndarray, "n k"],
-    guess: Rotation,
-    x: Float[np.ndarray, " u"],
-) -> tuple[Float[np.ndarray, "n 3 u"], Float[np.ndarray, "n 3 u"]]:
-    """Derivatives of `errors` by the unknowns: differences would take three times as long."""
-    rotation = (guess * Rotation.from_rotvec(x[TURN])).as_matrix()
-    # Of the rotation vector, to the second order of the turn.
-    turned = np.eye(3) - hat(x[TURN]) / 2.0 + hat(x[TURN]) @ hat(x[TURN]) / 6.0
-    there = seen.time + hats @ x[LAG]
-    late = there + x[DELAY]
-    gyro, accel = (np.zeros((len(hats), 3, len(x))) for _ in range(2))
-    gyro[:, :, TURN] = rotation @ hat(felt.gyro(there) - x[GYRO_BIAS]) @ turned
-    gyro[:, :, GYRO_BIAS] = rotation
-    gyro[:, :, LAG] = -(felt.gyro(there, 1) @ rotation.T)[:, :, None] * hats[:, None, :]
-    accel[:, :, TURN] = rotation @ hat(felt.accel(late) - x[ACCEL_BIAS]) @ turned
-    accel[:, :, ACCEL_BIAS] = rotation
-    accel[:, :, LEVER] = seen.lever_gain
-    up = upward(x[TILT])
-    by_tilt = up[2] * np.eye(3)[:, :2] - up[2] * np.outer(up, up[:2])
-    accel[:, :, TILT] = GRAVITY * seen.to_body @ by_tilt
-    accel[:, :, DELAY] = -felt.accel(late, 1) @ rotation.T
-    accel[:, :, LAG] = accel[:, :, DELAY, None] * hats[:, None, :]
-    return gyro, accel
 
 
 class _Noise(NamedTuple):

@@ -177,14 +177,10 @@ def test_the_jacobians_are_the_differences_of_the_errors():
     lag = np.array([0.01, -0.02, 0.03, 0.0])
     turn, biases = np.array([0.1, -0.2, 0.1]), np.array([0.01, -0.02, 0.005, 0.1, 0.05, -0.08])
     x = np.concatenate([turn, biases, LEVER + 0.03, [0.2, -0.1], [0.013], lag])
-    found = body.jacobians(seen, felt, hats, EXTRINSIC, x)
+    problem = body.Problem(seen, felt, hats, EXTRINSIC)
+    found = problem.jacobians(x)
     for column, step in enumerate(1e-5 * np.eye(len(x))):
-        pairs = zip(
-            found,
-            body.errors(seen, felt, hats, EXTRINSIC, x + step),
-            body.errors(seen, felt, hats, EXTRINSIC, x - step),
-            strict=True,
-        )
+        pairs = zip(found, problem.errors(x + step), problem.errors(x - step), strict=True)
         for jacobian, after, before in pairs:
             expected = (after - before) / 2e-5
             tolerance = 2e-3 * np.abs(expected).max() + 1e-6
