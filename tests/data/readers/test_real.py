@@ -93,7 +93,8 @@ def test_a_real_recording_is_physical(recordings, real):
     for attribute, (value, margin) in bounds.about.items():
         assert sequence.attributes[attribute] == pytest.approx(value, abs=margin)
     valid = sequence.valid
-    if bounds is not HELD:  # a runner's hand is too fast for differences of 100 Hz
+    # A runner's hand is too fast for differences of 100 Hz, and a phone's own odometry steps.
+    if name not in ("tyrex", "ridi"):
         # The velocities are those of the positions.
         whole = valid[2:] & valid[1:-1] & valid[:-2]
         differenced = (sequence.position[2:] - sequence.position[:-2]) * check.rate / 2
