@@ -30,9 +30,9 @@ import numpy as np
 from flax import linen as nn
 
 from benchmarks.train_step import recordings
-from gnio_jax import parallel
+from gnio_jax import models, parallel
 from gnio_jax.config import ModelConfig, OptimConfig, TrainConfig
-from gnio_jax.training.task import create_model, train_steps
+from gnio_jax.training.task import train_steps
 from gnio_jax.training.window_task import WindowTask
 
 STEPS = 8
@@ -75,7 +75,7 @@ def work(arguments: argparse.Namespace) -> None:
     parallel.initialise(arguments.worker, arguments.devices)
     with parallel.sharing(arguments.devices):
         config = configuration(arguments.width, arguments.batch)
-        run, state, _ = prepared(config, create_model(config))
+        run, state, _ = prepared(config, models.from_config(config.model))
         best = math.inf
         for _ in range(arguments.repeats + 1):  # the first compiles
             began = time.perf_counter()
@@ -132,7 +132,7 @@ def model(batch: int) -> None:
     parallel.initialise(devices=2)
     # A small batch compiles in seconds; operations of a window and sums of a step are the same.
     config = configuration(64, 16)
-    network = create_model(config).clone(winograd=False)  # as on a GPU
+    network = models.from_config(config.model).clone(winograd=False)  # as on a GPU
     flops = flops_per_window(config, network)
     with parallel.sharing(2):
         _, state, (given, static) = prepared(config, network)

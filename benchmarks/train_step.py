@@ -21,10 +21,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks import baseline
+from gnio_jax import models
 from gnio_jax.config import DataConfig, ModelConfig, OptimConfig, TrainConfig
 from gnio_jax.data.windows import WindowSource, gather
 from gnio_jax.training.losses import loss_stage, losses
-from gnio_jax.training.task import create_model, train_steps
+from gnio_jax.training.task import train_steps
 from gnio_jax.training.window_task import WindowTask, estimate_statistics, statistics_order
 
 STEPS, STEPS_PER_EPOCH = 4, 1000
@@ -55,7 +56,7 @@ def ours(config: TrainConfig):
     The whole step runs STEPS steps in one dispatch, as the training loop does.
     """
     size, samples = config.optim.batch_size, config.data.seen
-    source, model = recordings(samples, size), create_model(config)
+    source, model = recordings(samples, size), models.from_config(config.model)
     task = WindowTask(model, config, STEPS_PER_EPOCH)
     holder = [task.initial_state(jax.random.key(0), None)]
     order, key = jnp.arange(source.start.shape[0], dtype=jnp.int32), jax.random.key(1)
@@ -79,7 +80,9 @@ def ours(config: TrainConfig):
         return losses(prediction, windows, config.loss, stage).total, changed
 
     gradient = jax.jit(jax.grad(objective, has_aux=True))
-    params, batch_stats = jax.tree.map(jnp.copy, (holder[0].params, holder[0].batch_stats))
+    params, batch_stats = jax.tree.map(
+        jnp.copy, (holder[0].variables["params"], holder[0].variables["batch_stats"])
+    )
 
     def bare():
         jax.block_until_ready(gradient(params, batch_stats, fixed))
@@ -88,7 +91,7 @@ def ours(config: TrainConfig):
     def statistics():
         order = statistics_order(key, source, task)
         estimated = estimate_statistics(holder[0], source, order, key, task=task)
-        jax.block_until_ready(estimated.batch_stats)
+        jax.block_until_ready(estimated.variables)
         return len(order) // size
 
     return {"whole step": whole, "bare gradient": bare, "batch of statistics": statistics}

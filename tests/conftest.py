@@ -50,7 +50,6 @@ LONGEST = (
     "test_parallel.py",
     "test_installed.py",
     "tables/test_make.py",
-    "training/test_statistics.py",
     "training/test_through_filter.py",
     "calibration/test_fit.py",
     "calibration/test_calibrate.py",

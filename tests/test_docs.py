@@ -19,7 +19,6 @@ from gnio_jax.apps import packages
 from gnio_jax.config import DataConfig, ModelConfig, TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.models import registry
-from gnio_jax.training.task import create_model
 from tests.support import pages, tiny_run
 from tests.support.command_lines import understood
 
@@ -111,7 +110,7 @@ def test_a_head_of_ones_own(monkeypatch):
     """The network is known to a configuration, and its head has the place of GNIO's."""
     monkeypatch.setattr(registry, "_MODELS", dict(registry._MODELS))
     run("docs/networks.md", code_of("docs/networks.md"))
-    model = create_model(TrainConfig(model=ModelConfig(name="deeper", width=2)))
+    model = models.from_config(ModelConfig(name="deeper", width=2))
     shapes = models.variable_shapes(model, 64)
     assert shapes["params"]["head"].keys() == {"hidden", "displacement"}
     assert shapes["params"]["bank"] and shapes["params"]["uncertainty"]

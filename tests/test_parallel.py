@@ -18,21 +18,15 @@ import pytest
 from jax.sharding import PartitionSpec
 
 from gnio_jax import parallel
-from gnio_jax.config import (
-    AugmentConfig,
-    DataConfig,
-    ModelConfig,
-    OptimConfig,
-    ThroughFilter,
-    TrainConfig,
-)
+from gnio_jax.config import AugmentConfig, ThroughFilter, TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.reporting import Silence
 from gnio_jax.training import loop, run_folder
-from gnio_jax.training.task import Recordings, keys_of, set_up
+from gnio_jax.training.task import Recordings, set_up
 from gnio_jax.training.window_task import WindowTask
+from tests.support import tiny_run
 from tests.support.drawn_state import drawn_state
-from tests.support.tlio_files import write_sequence, write_splits
+from tests.support.tlio_files import write_splits
 
 ROOT = Path(__file__).parents[1]
 OPTIONS = (
@@ -133,13 +127,9 @@ def run(recording, server):
     return start
 
 
-def rows(workdir):
-    return [json.loads(line) for line in (workdir / "metrics.jsonl").read_text().splitlines()]
-
-
 def assert_same_run(workdir, other):
     """The losses of both, and what they have learnt."""
-    ours, theirs = rows(workdir), rows(other)
+    ours, theirs = tiny_run.rows(workdir), tiny_run.rows(other)
     assert [row["step"] for row in ours] == [row["step"] for row in theirs]
     for name in ("loss", "val_loss", "val_mse", "val_nll"):
         np.testing.assert_allclose(
@@ -228,30 +218,24 @@ def test_processes_share_sequences_and_each_has_all_results(server, tmp_path):
 
 
 @pytest.fixture(scope="module")
-def small(tmp_path_factory):
-    root = tmp_path_factory.mktemp("tlio")
-    for name in "ab":
-        write_sequence(root / name)
-    for split, name in (("train", "a"), ("val", "b"), ("test", "b")):
-        (root / f"{split}_list.txt").write_text(f"{name}\n")
-    optim = OptimConfig(epochs=2, batch_size=16, learning_rate=1e-3, statistics_windows=32)
-    model = ModelConfig(width=2, bank_size=3)
-    data = DataConfig(rate=50.0)
-    augment = AugmentConfig(low_pass_share=0.5)
-    return TrainConfig("tlio", str(root), data=data, augment=augment, model=model, optim=optim)
+def small(recording):
+    with tiny_run.known():
+        augment = AugmentConfig(low_pass_share=0.5)
+        yield tiny_run.config(recording, "", augment=augment, statistics_windows=32)
 
 
 def trained(config):
     """Losses and gradient norms of each of five steps, figures of validation, parameters."""
     task, (source, held_out, _) = set_up(WindowTask, config, Silence())
-    drawn, keys = drawn_state(task.model, config, task.steps_per_epoch), keys_of(config.seed)
-    state, order, found = parallel.everywhere(drawn), task.order(keys.order, 0, source), []
+    key, drawn = jax.random.key(0), drawn_state(task.model, config, task.steps_per_epoch)
+    state, order, found = parallel.everywhere(drawn), task.order(key, 0, source), []
     for first in range(5):
-        state, progress = task.take_steps(state, source, order, first, 1, 1.0, keys.step)
+        numbers = jnp.int32(first), jnp.int32(1), jnp.float32(1)
+        state, progress = task.take_steps(state, source, order, *numbers, key)
         found.append(progress.sums)
-    state = task.with_statistics(state, source, keys.statistics)
-    state, row = task.validate(state, held_out, keys.statistics)
-    return jax.device_get((found, row, state.batch_stats)), state
+    state = task.with_statistics(state, source, key)
+    state, row = task.validate(state, held_out, key)
+    return jax.device_get((found, row, state.variables["batch_stats"])), state
 
 
 @pytest.fixture(scope="module")

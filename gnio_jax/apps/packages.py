@@ -32,8 +32,7 @@ from gnio_jax.evaluation.statistics import summarise
 from gnio_jax.files import file_stem, fingerprint, replacing, replacing_folder
 from gnio_jax.training import checkpoint
 from gnio_jax.training.checkpoint import Run, Which
-from gnio_jax.training.filter_task import filter_numbers
-from gnio_jax.training.task import create_model
+from gnio_jax.training.optimizer import filter_numbers
 
 SHIPPED = Path(__file__).parents[1] / "weights"
 """The packages that come with gnio-jax."""
@@ -243,12 +242,11 @@ def _run_of(place: Path, about: About, content: bytes) -> Run:
     source = str(place / MANIFEST)
     config = configuration.parse(json.dumps(about.config), source)
     config = configuration.validate(config, source)
-    model = create_model(config)
+    model = models.from_config(config.model)
     shapes = models.variable_shapes(model, config.data.seen)
     template = {"params": shapes["params"], "batch_stats": shapes.get("batch_stats", {})}
     variables = from_bytes(content, template, place / WEIGHTS)
-    numbers = filter_numbers(config.filter) if config.through_filter.learn else {}
-    return Run(config, model, variables, about.epoch, about.step, numbers)
+    return Run(config, model, variables, about.epoch, about.step, filter_numbers(config))
 
 
 def to_bytes(variables: Any) -> bytes:

@@ -100,12 +100,16 @@ def gather(
     The network runs in the loop of the filter with `settings`, whose attitude turns the windows.
     """
     own = asked[0].run.config
-    root = config.data_root or own.data_root
+    names = ", ".join(own.datasets)
+    roots = config.data_root or (own.data_root,) * len(own.datasets)
+    if len(roots) != len(own.datasets):
+        problem = f"names {len(roots)} folders, and the run has learnt from {names}"
+        raise InputError("--data-root", problem, "name one for each dataset")
     loaded = [
         data.load(name, root, split, workers, lambda share: progress("reading", share))
-        for name in own.datasets
+        for name, root in zip(own.datasets, roots, strict=True)
     ]
-    found, names = Evidence([], []), ", ".join(own.datasets)
+    found = Evidence([], [])
     for number, source in enumerate(asked):
         trained, where = source.run.config.data, f"dataset {names}, split '{split}'"
         recordings = [each for sequences in loaded for each in sequences]

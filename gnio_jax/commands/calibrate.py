@@ -20,7 +20,8 @@ def calibrate(asked: CalibrateConfig, _call: options.Call) -> None:
     validation split. Then the filter's noises are those that make its innovations most likely.
     Last, the errors that the filter reports but does not estimate (its consider covariance) are
     fitted to the errors of its positions. The result is a run that gnio evaluate takes as any
-    other; test splits are refused.
+    other; test splits are refused. A run that has learnt from several datasets is fitted to the
+    walks of all of them.
 
     examples:
       {prog}                                    the newest run below runs/

@@ -20,7 +20,7 @@ import typing
 from collections.abc import Callable, Iterator, Sequence
 from functools import cache, partial
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 from gnio_jax import config as configuration
 from gnio_jax.config.files import kind_of
@@ -253,8 +253,12 @@ def _add(group: Any, option: Option, dest: str, brief: bool) -> None:
     if kind is bool:
         group.add_argument(option.name, action="store_true", dest=dest, help=text.strip())
         return
-    choices = f"{{{','.join(typing.get_args(item))}}}" if typing.get_origin(item) is Literal else ""
-    shown = choices or {int: "INT", float: "FLOAT", Path: "PATH"}.get(item, "TEXT")
+    choices = ",".join(map(str, typing.get_args(item)))
+    shown = (
+        f"{{{choices}}}"
+        if choices
+        else {int: "INT", float: "FLOAT", Path: "PATH"}.get(item, "TEXT")
+    )
     how = {"help": text.strip().replace("%", "%%"), "metavar": option.words.metavar or shown}
     if not option.words.named:
         group.add_argument(dest, nargs="*" if items else "?", **how | {"metavar": option.name})

@@ -172,7 +172,7 @@ def value_from_words(hint: Any, words: Sequence[str], name: str) -> Any:
         return None
     several = typing.get_origin(kind) is tuple
     item = kind_of(typing.get_args(kind)[0]) if several else kind
-    is_text = item in (str, Path) or typing.get_origin(item) is Literal
+    is_text = item in (str, Path) or any(isinstance(each, str) for each in typing.get_args(item))
     content = [word if is_text else _yaml(word, name) for word in words]
     one = len(content) == 1 and item in kinds
     return checked_value(hint, content[0] if one else content, Place(name))
@@ -220,10 +220,10 @@ def checked_value(hint: Any, content: Any, place: Place, base: Any = None) -> An
             place.refuse("is larger than any number of floating point")
     elif kind is Path and isinstance(content, str):
         value = Path(content)
-    elif content in members if origin is Literal else type(content) is kind:
+    elif type(content) is kind or any(content == m and type(content) is type(m) for m in members):
         value = content
     else:
-        remedy = did_you_mean(str(content), members) if origin is Literal else ""
+        remedy = did_you_mean(str(content), map(str, members)) if origin is Literal else ""
         problem = f"must be {' or '.join(map(_spelled, kinds))}, found {_shown(content)}"
         place.refuse(problem, remedy.strip())
     _check_bounds(hint, value, place)
@@ -249,7 +249,7 @@ def _spelled(kind: Any) -> str:
     origin, members = typing.get_origin(kind), typing.get_args(kind)
     if origin is tuple:
         return "a list"
-    return f"one of {', '.join(members)}" if origin is Literal else _SPELLING[kind]
+    return f"one of {', '.join(map(str, members))}" if origin is Literal else _SPELLING[kind]
 
 
 # Types of fields

@@ -30,7 +30,8 @@ class EvaluateConfig:
     """Folder of the run, with its config.yaml and checkpoints; by default the newest below runs/.
     Results go to its folder eval/."""
     dataset: str | None = None
-    """Dataset to evaluate on; by default the run's own."""
+    """Dataset to evaluate on; by default the run's own. Of a run that has learnt from several, name
+    one."""
     data_root: str | None = None
     """Folder of the dataset; by default the run's (for its own dataset), $GNIO_DATA/<dataset>, or
     data/<dataset>."""
@@ -77,9 +78,9 @@ class CalibrateConfig:
     """Folder of the run; by default the newest below runs/."""
     out: str | None = None
     """Folder of the calibrated run; by default the run's with _calibrated behind its name."""
-    data_root: str | None = None
-    """Folder of the run's dataset; by default the run's, $GNIO_DATA/<dataset>, or data/<dataset>.
-    """
+    data_root: tuple[str, ...] = ()
+    """Folder of the run's dataset, of several one for each; by default the run's,
+    $GNIO_DATA/<dataset>, or data/<dataset>."""
     split: str | None = None
     """Split whose recordings are fitted: the run's validation split (default) or its training
     split. Others are refused: what is tested must not have been fitted."""

@@ -75,7 +75,6 @@ Seed = Annotated[int, Bound(lambda value: 0 <= value < 2**32, "must be from 0 to
 Rate = Annotated[float, Bound(lambda value: 1 <= value <= 10000, "must be from 1 to 10000 Hz")]
 NewFile = Annotated[Path, Bound(lambda path: not path.is_dir(), "must not be a folder")]
 Folder = Annotated[Path, Bound(lambda path: not path.is_file(), "must be a folder")]
-TwoOrThree = Annotated[int, Bound(lambda value: value in (2, 3), "must be 2 or 3")]
 
 
 def _is_whole(number: float) -> bool:
@@ -214,7 +213,7 @@ class ModelConfig:
     """Source of the standard deviation: a head (paper), a head times one factor per axis, or one
     constant per axis. Factor and constant are fitted to the errors on the validation split
     (gnio: head)."""
-    output_dim: TwoOrThree | None = None
+    output_dim: Literal[2, 3] | None = None
     """Dimensions of the displacement: 3, or 2 without the vertical, as published (ronin_resnet,
     deepils, ctin, imot)."""
     equivariance: Literal["none", "four_headings", "canonical_frame"] = "none"

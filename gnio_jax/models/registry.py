@@ -9,13 +9,16 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Iterable
-from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, get_origin, get_type_hints
 
 import jax
 import jax.numpy as jnp
 from flax import linen as nn
 from jaxtyping import PRNGKeyArray
 
+from gnio_jax.config import ModelConfig
+from gnio_jax.config.files import checked_value
+from gnio_jax.config.schema import Place
 from gnio_jax.errors import InputError, did_you_mean
 from gnio_jax.models.convolution import winograd_pays
 from gnio_jax.models.ctin import CTIN
@@ -63,12 +66,16 @@ def register(name: str, network: type[nn.Module]) -> None:
 def options(name: str) -> dict[str, Any]:
     """The options of the network `name` and their types. Raises `InputError` for an unknown
     name."""
-    if name not in _MODELS:
-        raise InputError(f"model '{name}'", "unknown", _remedy(name, names(), "known models"))
-    types = get_type_hints(_MODELS[name], include_extras=True)
-    fields = [field.name for field in dataclasses.fields(_MODELS[name])]
-    own = {option: types[option] for option in fields if option not in ("parent", "name")}
-    return own | {"equivariance": Literal["none", *_EQUIVARIANT]}
+    network = _MODELS[_known(name, names(), f"model '{name}'", "unknown", "models")]
+    types = get_type_hints(network, include_extras=True)
+    own = {field.name: types[field.name] for field in dataclasses.fields(network)}
+    own |= {"equivariance": Literal["none", *_EQUIVARIANT]}
+    return {option: kind for option, kind in own.items() if option not in ("parent", "name")}
+
+
+def from_config(config: ModelConfig) -> nn.Module:
+    """The network that these settings describe; what they leave open is the network's own."""
+    return create(**{option: value for option, value in vars(config).items() if value is not None})
 
 
 def create(name: str, **given: Any) -> nn.Module:
@@ -83,10 +90,9 @@ def create(name: str, **given: Any) -> nn.Module:
     """
     place, known = f"model '{name}'", options(name)
     for option, value in given.items():
-        if option not in known:
-            remedy = _remedy(option, known, "known options")
-            raise InputError(place, f"unknown option '{option}'", remedy)
-        _check(place, option, known[option], value)
+        kind = known[_known(option, known, place, f"unknown option '{option}'", "options")]
+        if get_origin(kind) in (Literal, Annotated):
+            given[option] = checked_value(kind, value, Place(place, option))
     if "winograd" in known:
         given.setdefault("winograd", winograd_pays())
     equivariance = given.pop("equivariance", "none")
@@ -97,23 +103,13 @@ def create(name: str, **given: Any) -> nn.Module:
     return network if equivariance == "none" else _EQUIVARIANT[equivariance](network)
 
 
-def _check(place: str, option: str, kind: Any, value: Any) -> None:
-    """Raise `InputError` unless the value is one of the choices of the type `kind`, or within its
-    bounds."""
-    if get_origin(kind) is Literal and value not in get_args(kind):
-        raise InputError(place, f"{option} is {value!r}", _remedy(value, get_args(kind), "choices"))
-    if get_origin(kind) is Annotated:
-        number, *bounds = get_args(kind)
-        fits = isinstance(value, (int, float) if number is float else number)
-        for bound in bounds:
-            if not fits or not bound.holds(value):
-                raise InputError(place, f"{option} {bound.problem}, found {value!r}")
-
-
-def _remedy(given: object, known: Iterable[Any], title: str) -> str:
-    """The known names, the closest to what was given first."""
-    known = [str(each) for each in known]
-    return did_you_mean(str(given), known) + f"{title}: {', '.join(known)}"
+def _known(word: str, known: Iterable[str], place: str, problem: str, title: str) -> str:
+    """The word, if it is one of the known ones. Raises `InputError` that names them, the closest
+    first."""
+    if word not in known:
+        remedy = f"{did_you_mean(word, known)}known {title}: {', '.join(known)}"
+        raise InputError(place, problem, remedy)
+    return word
 
 
 def initialise(model: nn.Module, key: PRNGKeyArray, window: int = 200) -> Any:

@@ -25,10 +25,8 @@ from gnio_jax import config as configuration
 from gnio_jax import models, parallel
 from gnio_jax.config import TrainConfig
 from gnio_jax.errors import InputError
-from gnio_jax.training.epochs import Position
-from gnio_jax.training.filter_task import filter_numbers, trained_settings
-from gnio_jax.training.optimizer import Plateau
-from gnio_jax.training.task import TrainState, create_model
+from gnio_jax.training.optimizer import Plateau, filter_numbers, trained_settings
+from gnio_jax.training.task import TrainState
 
 Which = Literal["best", "latest"]
 VERSION = 2
@@ -42,6 +40,22 @@ logging.getLogger("absl").setLevel(logging.CRITICAL)
 logging.getLogger("asyncio").addFilter(lambda record: "orbax" not in record.getMessage())
 
 
+class Position(NamedTuple):
+    """Where a run stands besides its `TrainState`: kept as JSON with the checkpoint."""
+
+    epoch: int = 0
+    """Epoch in progress, or finished if `step` is a multiple of the steps per epoch."""
+    step: int = 0
+    best: float | None = None
+    """Smallest value on the validation split, since the last switch of what is trained, of what
+    `optim.best_by` names."""
+    sums: dict[str, float] = {}
+    """Figures summed over the steps of the epoch in progress (`task.Progress`)."""
+    seconds: float = 0.0
+    """Time spent training so far."""
+    plateau: Plateau = Plateau()
+
+
 class Run(NamedTuple):
     """A trained network as evaluation needs it."""
 
@@ -52,7 +66,7 @@ class Run(NamedTuple):
     epoch: int
     step: int
     filter: dict[str, Any] = {}
-    """Numbers of the filter (`filter_task.filter_numbers`), where they were trained."""
+    """Numbers of the filter (`optimizer.filter_numbers`), where they were trained."""
 
 
 def exists(workdir: Path, which: Which = "latest") -> bool:
@@ -71,11 +85,8 @@ def save(workdir: Path, which: Which, state: TrainState, position: Position) -> 
     it has no room; the checkpoint before stays.
     """
     folder, state = _folder(workdir, which), jax.device_get(state)
-    meta = {
-        "version": VERSION,
-        "position": position._asdict(),
-        "shapes": _shapes(state.variables),
-    }
+    shapes = _shapes(state.variables)
+    meta = {"version": VERSION, "position": position._asdict(), "shapes": shapes}
     items: dict[str, Any] = {
         "variables": ocp.args.StandardSave(state.variables),
         "meta": ocp.args.JsonSave(meta),
@@ -99,9 +110,10 @@ def save(workdir: Path, which: Which, state: TrainState, position: Position) -> 
 def write_best(workdir: Path, run: Run) -> None:
     """A checkpoint `best` with the variables of a run, and with the filter of its config where one
     was trained."""
-    numbers = filter_numbers(run.config.filter) if run.config.through_filter.learn else {}
-    network = run.variables["params"], run.variables.get("batch_stats", {})
-    state = TrainState(jnp.int32(run.step), *network, opt_state=(), filter=numbers)
+    variables = {"batch_stats": {}, **run.variables}
+    if numbers := filter_numbers(run.config):
+        variables["filter"] = numbers
+    state = TrainState(jnp.int32(run.step), variables, opt_state=())
     save(workdir, "best", state, Position(run.epoch, run.step))
 
 
@@ -114,9 +126,7 @@ def restore(workdir: Path, template: TrainState) -> tuple[TrainState, Position]:
     wanted = {"variables": template.variables, "optimizer": template.opt_state}
     remedy = f"begin another run from its weights: --init-from {workdir} --workdir ..."
     position, found = _read(workdir, "latest", wanted, remedy)
-    network = found["variables"]["params"], found["variables"]["batch_stats"]
-    numbers = found["variables"].get("filter", {})
-    state = TrainState(jnp.int32(position.step), *network, found["optimizer"], numbers)
+    state = TrainState(jnp.int32(position.step), found["variables"], found["optimizer"])
     chex.assert_trees_all_equal_shapes_and_dtypes(state, template)
     return parallel.everywhere(state), position
 
@@ -127,18 +137,15 @@ def load_run(workdir: Path | str, which: Which = "best") -> Run:
     Raises `InputError` for a folder without a run or checkpoint, one whose arrays do not fit the
     run's config.yaml, and one with arrays that are not finite.
     """
-    workdir = Path(workdir)
-    if not (workdir / "config.yaml").is_file():
+    workdir, file = Path(workdir), Path(workdir) / "config.yaml"
+    if not file.is_file():
         problem = "holds no run (config.yaml is missing)"
         raise InputError(workdir, problem, "train one with gnio train --workdir ...")
-    config = configuration.validate(
-        configuration.load(workdir / "config.yaml"), str(workdir / "config.yaml")
-    )
-    model = create_model(config)
-    template = models.variable_shapes(model, config.data.seen)
-    template = {"params": template["params"], "batch_stats": template.get("batch_stats", {})}
-    if config.through_filter.learn:
-        template["filter"] = filter_numbers(config.filter)
+    config = configuration.validate(configuration.load(file), str(file))
+    model = models.from_config(config.model)
+    template = {"batch_stats": {}, **models.variable_shapes(model, config.data.seen)}
+    if numbers := filter_numbers(config):
+        template["filter"] = numbers
     remedy = f"train it again from the run that it began with, {config.init_from}"
     position, found = _read(workdir, which, {"variables": template}, remedy)
     variables = found["variables"]
@@ -182,19 +189,14 @@ def initial_run(config: TrainConfig, load: Callable[[str], Run]) -> Run | None:
 
 def _description(config: TrainConfig) -> dict[str, Any]:
     """What makes a network the same: its name and options, and the windows that it reads."""
-    model = create_model(config)
+    model: Any = models.from_config(config.model)
     model = getattr(model, "network", model)  # what an equivariant construction is made around
-    options = {
-        f"model.{field.name}": getattr(model, field.name)
-        for field in dataclasses.fields(model)
-        if field.name not in ("parent", "name")
-    }
-    windows = {
-        f"data.{name}": getattr(config.data, name)
-        for name in ("rate", "window_seconds", "context_seconds", "window_rotation")
-    }
-    named = {f"model.{name}": getattr(config.model, name) for name in ("name", "equivariance")}
-    return {**named, **options, **windows}
+    fields = (field.name for field in dataclasses.fields(model))
+    options = {name: getattr(model, name) for name in fields if name not in ("parent", "name")}
+    options = {"name": config.model.name, "equivariance": config.model.equivariance, **options}
+    of_windows = ("rate", "window_seconds", "context_seconds", "window_rotation")
+    windows = {f"data.{name}": getattr(config.data, name) for name in of_windows}
+    return {f"model.{name}": value for name, value in options.items()} | windows
 
 
 def averaged_over_headings(run: Run, source: str) -> Run:
@@ -206,7 +208,7 @@ def averaged_over_headings(run: Run, source: str) -> Run:
     averaged = dataclasses.replace(run.config.model, equivariance="four_headings")
     config = dataclasses.replace(run.config, model=averaged)
     configuration.validate(config, source)
-    return run._replace(config=config, model=create_model(config))
+    return run._replace(config=config, model=models.from_config(averaged))
 
 
 def _folder(workdir: Path, which: Which) -> Path:

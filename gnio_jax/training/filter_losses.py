@@ -13,7 +13,7 @@ from typing import NamedTuple
 import chex
 import jax
 import jax.numpy as jnp
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from gnio_jax import geometry
 from gnio_jax.config import ThroughFilter
@@ -45,12 +45,12 @@ class FilterLosses(NamedTuple):
     """`gaussian_nll` of the true velocity (m/s) and position (m)."""
     window: Float[Array, ""]
     """`window_error`, m²."""
-
-
-def horizons(config: FilterConfig, intervals: int) -> list[int]:
-    """The horizons within a segment of `intervals` clone intervals, in clone intervals."""
-    counts = [round(seconds / config.clone_seconds) for seconds in HORIZON_SECONDS]
-    return [count for count in counts if 1 <= count <= intervals]
+    nis: Float[Array, ""]
+    """Mean normalised innovation squared over its degrees of freedom; no part of the total."""
+    nees: Float[Array, ""]
+    """Mean normalised error squared of the position over its degrees of freedom, likewise."""
+    healthy: Bool[Array, ""]
+    """Whether the filter never diverged."""
 
 
 def filter_losses(
@@ -67,7 +67,8 @@ def filter_losses(
     intervals = len(truth.position) - 1
     chex.assert_shape(history.covariance, (intervals, 15, 15))
     assert history.covariance is not None  # for type checkers
-    counts = horizons(config, intervals)
+    counts = [round(seconds / config.clone_seconds) for seconds in HORIZON_SECONDS]
+    counts = [count for count in counts if 1 <= count <= intervals]
     displacement = jnp.stack([relative_displacement(estimate, truth, count) for count in counts])
     yaw = jnp.stack([relative_yaw(estimate, truth, count) for count in counts])
     innovation = innovation_nll(history.log_likelihood)
@@ -86,7 +87,13 @@ def filter_losses(
         + weights.state_weight * state
         + weights.window_weight * window
     )
-    return FilterLosses(total, displacement, yaw, innovation, state, window)
+    of_position = history.covariance[:, POSITION, POSITION]
+    squares = normalised_squares(error[1:, 3:], of_position)
+    nis, healthy = jnp.nanmean(history.nis) / 3, history.healthy[-1] > 0
+    return FilterLosses(
+        *(total, displacement, yaw, innovation, state, window),
+        *(nis, jnp.mean(squares) / 3, healthy),
+    )
 
 
 def yaw_errors(

@@ -1,8 +1,9 @@
 """The training loop, top to bottom: one run after another; epochs of dispatches, validation, log,
-checkpoints. What follows from their figures is in `epochs`."""
+checkpoints. Below it stands what follows from the figures of an epoch."""
 
 from __future__ import annotations
 
+import math
 import signal
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -12,18 +13,18 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 
 from gnio_jax import config as configuration
 from gnio_jax import parallel
 from gnio_jax.config import TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.reporting import Lines, Reporter, Silence
-from gnio_jax.training import checkpoint, epochs, run_folder
-from gnio_jax.training.checkpoint import Run, load_run
-from gnio_jax.training.epochs import Position
+from gnio_jax.training import checkpoint, optimizer, run_folder
+from gnio_jax.training.checkpoint import Position, Run, load_run
 from gnio_jax.training.filter_task import FilterTask
 from gnio_jax.training.run_folder import Log
-from gnio_jax.training.task import Recordings, Task, keys_of, set_up
+from gnio_jax.training.task import Progress, Recordings, Row, Task, set_up
 from gnio_jax.training.window_task import WindowTask
 
 DISPATCH_SECONDS = 0.5
@@ -31,6 +32,8 @@ DISPATCH_SECONDS = 0.5
 and a quick stop."""
 CHECKPOINT_SECONDS = 600.0
 """Longest time between checkpoints within an epoch; every epoch ends with one anyway."""
+NO_GRADIENT = 1e-9
+"""Norm of a gradient, mean of an epoch, of which Adam, whose ε is 1e-8, makes next to no step."""
 
 
 class Outcome(NamedTuple):
@@ -43,14 +46,7 @@ class Outcome(NamedTuple):
     """Signal that ended it early, or the seeds after it; its state is saved."""
 
 
-def train(
-    config: TrainConfig,
-    resume: bool = False,
-    reporter: Reporter | None = None,
-    workers: int = 1,
-    devices: int | None = None,
-    load_initial: Callable[[str], Run] = load_run,
-) -> Outcome:
+def train(config: TrainConfig, resume: bool = False, **options: Any) -> Outcome:
     """Train the network of `config` and leave checkpoints and logs in its work folder: on windows,
     or through the filter where `config.through_filter` names what is trained.
 
@@ -59,15 +55,10 @@ def train(
     step. Resume rules, in order: the settings must be those of config.yaml; without a checkpoint
     yet the run starts over; log rows after the checkpoint are dropped. SIGTERM and Ctrl-C save and
     return; a loss or gradient that is not finite raises `FloatingPointError` naming the step
-    (through the filter such a step is skipped). `workers` processes read recordings that are slow
-    to read (`data.load`). A batch of windows is shared out among `devices` devices of each process
-    (`parallel.sharing`); how many there are changes the results by rounding alone, also in a run
-    that is resumed. `load_initial` reads what `config.init_from` names, by default the folder of a
-    run; `gnio_jax.load_pretrained` also takes packages of weights. Raises `InputError` where that
-    is not of the same network, for settings that do not fit together, for a folder that holds
-    another run, and where the devices cannot share a batch evenly.
+    (through the filter such a step is skipped). The other options are those of `train_all`, which
+    says what it raises.
     """
-    (outcome,) = train_all([config], resume, reporter, workers, devices, load_initial)
+    (outcome,) = train_all([config], resume, **options)
     return outcome
 
 
@@ -84,7 +75,13 @@ def train_all(
 
     With `resume` finished runs are skipped, begun ones continue from their latest checkpoint,
     missing ones start. A signal ends the run that it interrupts, and those after it do not begin:
-    they have no outcome.
+    they have no outcome. `workers` processes read recordings that are slow to read. A batch of
+    windows is shared out among `devices` devices of each process (`parallel.sharing`); how many
+    there are changes the results by rounding alone, also in a run that is resumed. `load_initial`
+    reads what `config.init_from` names, by default the folder of a run; `gnio_jax.load_pretrained`
+    also takes packages of weights. Raises `InputError` where that is not of the same network, for
+    settings that do not fit together, for a folder that holds another run, and where the devices
+    cannot share a batch evenly.
     """
     reporter = (reporter or Lines()) if parallel.is_first() else Silence()
     begun = [(configuration.default_workdir(each) / "config.yaml").exists() for each in configs]
@@ -103,15 +100,16 @@ def train_all(
     # Segments are shared out by `filtering.over_sequences`, not as a batch of windows is. Whatever
     # the process has set: no float64 but for the filter.
     sharing = parallel.sharing(1 if through_filter else devices)
-    with jax.enable_x64(through_filter), sharing, _stop_signals() as stop:
+    with jax.enable_x64(through_filter), sharing, _signals() as received:
         resumed = all(resumes) and all(map(checkpoint.exists, workdirs))
         start = None if resumed else checkpoint.initial_run(configs[0], load_initial)
         chosen = FilterTask if through_filter else WindowTask
         task, recordings = set_up(chosen, configs[0], reporter, workers)
         for config, resume in zip(configs, resumes, strict=True):
-            outcomes.append(_train(task, recordings, config, start, resume, stop, reporter))
-            if stop.signum and len(outcomes) < len(configs):
-                outcomes[-1] = outcomes[-1]._replace(stopped_by=stop.signum)  # others are missing
+            outcomes.append(_train(task, recordings, config, start, resume, received, reporter))
+            (signum,) = parallel.largest(max(received))
+            if signum and len(outcomes) < len(configs):
+                outcomes[-1] = outcomes[-1]._replace(stopped_by=signum)  # others are missing
                 break
     return outcomes
 
@@ -122,14 +120,17 @@ def _train(
     config: TrainConfig,
     start: Run | None,
     resume: bool,
-    stop: _Stop,
+    received: list[int],
     reporter: Reporter,
 ) -> Outcome:
     """One run, to its end or until a signal."""
-    optim, steps, keys = config.optim, task.steps_per_epoch, keys_of(config.seed)
-    with_statistics = partial(task.with_statistics, source=recordings.source, key=keys.statistics)
+    epochs, steps, source = config.optim.epochs, task.steps_per_epoch, recordings.source
+    key = jax.random.key(config.seed)
+    of_init, of_order, of_steps = jax.random.split(key, 3)
+    of_statistics = jax.random.fold_in(key, 3)
+    with_statistics = partial(task.with_statistics, source=source, key=of_statistics)
     # Copies: steps take the memory of their state, and the next seed starts from `start` too.
-    state = parallel.everywhere(task.initial_state(keys.init, start and start.variables))
+    state = parallel.everywhere(task.initial_state(of_init, start and start.variables))
     at = Position()
     with run_folder.opened(config, recordings, state.variables, resume) as workdir:
         for line in task.description(state, workdir):
@@ -139,81 +140,168 @@ def _train(
             reporter.line(f"resuming at step {at.step}")
         with Log(workdir, at.epoch, at.step) as log:
             saved = time.perf_counter()
-            for epoch in range(at.epoch, optim.epochs):
-                order = task.order(keys.order, epoch, recordings.source)
-                end = (epoch + 1) * steps
-                began, before, first, dispatch, rate = time.perf_counter(), at, at.step, 1, 0.0
+            for epoch in range(at.epoch, epochs):
+                order, end = task.order(of_order, epoch, source), (epoch + 1) * steps
+                began, before, dispatch, rate = time.perf_counter(), at, 1, 0.0
                 while at.step < end:
                     count, tick = min(dispatch, end - at.step), time.perf_counter()
-                    state, progress = task.take_steps(
-                        state,
-                        recordings.source,
-                        order,
-                        at.step - epoch * steps,
-                        count,
-                        at.plateau.factor,
-                        keys.step,
-                    )
-                    at = epochs.after_steps(at, count, jax.device_get(progress), workdir)
+                    numbers = jnp.int32(at.step - epoch * steps), jnp.int32(count)
+                    given = *numbers, jnp.float32(at.plateau.factor), of_steps
+                    state, progress = task.take_steps(state, source, order, *given)
+                    at = after_steps(at, count, jax.device_get(progress), workdir)
                     clock = time.perf_counter()
                     at = at._replace(seconds=before.seconds + clock - began)
-                    rate = (at.step - first) * optim.batch_size / (clock - began)
+                    rate = (at.step - before.step) * config.optim.batch_size / (clock - began)
                     wished = round(DISPATCH_SECONDS * count / (clock - tick))
                     # Clocks differ between processes, and a signal reaches one of them.
                     dispatch, due, signum = parallel.largest(
                         max(1, min(2 * dispatch, wished)),
                         int(clock - saved > CHECKPOINT_SECONDS),
-                        stop.received,
+                        max(received),
                     )
-                    share = at.step / (optim.epochs * steps)
-                    reporter.progress("training", share, epochs.under_way(at, task, rate))
+                    reporter.progress("training", at.step / (epochs * steps), _now(at, task, rate))
                     if at.step < end and (due or signum):
                         checkpoint.save(workdir, "latest", with_statistics(state), at)
                         saved = clock
-                    if at.step < end and signum:
-                        stop.signum = signum
-                        return Outcome(workdir, at.best, signum)
+                        if signum:
+                            return Outcome(workdir, at.best, signum)
                 state, validation = task.validate(
-                    with_statistics(state), recordings.held_out, keys.statistics
+                    with_statistics(state), recordings.held_out, of_statistics
                 )
-                done = epochs.finish(at, task, validation, rate)
-                at = done.at
-                log.add(done.row)
-                for line in epochs.lines(done, task):
+                at, row, improved = finished(at, task, validation, rate)
+                log.add(row)
+                for line in lines(row, improved, task):
                     reporter.line(line)
-                if done.improved:
-                    checkpoint.save(workdir, "best", state, at)
-                checkpoint.save(workdir, "latest", state, at)
-                (stop.signum,) = parallel.largest(stop.received)
-                if stop.signum and epoch + 1 < optim.epochs:
-                    return Outcome(workdir, at.best, stop.signum)
+                for which in ("best", "latest") if improved else ("latest",):
+                    checkpoint.save(workdir, which, state, at)
+                (signum,) = parallel.largest(max(received))
+                if signum and epoch + 1 < epochs:
+                    return Outcome(workdir, at.best, signum)
     return Outcome(workdir, at.best, None)
 
 
-class _Stop:
-    """Whether a signal has asked the run to stop; 0 where none has."""
-
-    received = 0
-    """The signal that this process has been sent."""
-    signum = 0
-    """The signal that one of the processes has been sent, once all of them know."""
-
-
 @contextmanager
-def _stop_signals() -> Iterator[_Stop]:
-    """Note SIGTERM and Ctrl-C instead of leaving; a second Ctrl-C leaves at once."""
-    stop = _Stop()
+def _signals() -> Iterator[list[int]]:
+    """Note SIGTERM and Ctrl-C behind a first 0 instead of leaving; a second Ctrl-C leaves."""
+    received = [0]
 
     def note(signum: int, _: object) -> None:
-        if stop.received == signal.SIGINT == signum:
+        if received[-1] == signal.SIGINT == signum:
             raise KeyboardInterrupt
-        stop.received = signum
+        received.append(signum)
 
-    before: dict[Any, Any] = {
+    handlers: dict[Any, Any] = {
         signum: signal.signal(signum, note) for signum in (signal.SIGTERM, signal.SIGINT)
     }
     try:
-        yield stop
+        yield received
     finally:
-        for signum, handler in before.items():
+        for signum, handler in handlers.items():
             signal.signal(signum, handler)
+
+
+# What follows from the figures
+# ------------------------------------------------------------------------------------------------
+
+
+def after_steps(at: Position, count: int, progress: Progress, workdir: Path) -> Position:
+    """Where the run in `workdir` stands after `count` more steps. Raises `FloatingPointError` where
+    one of them failed."""
+    if progress.failed_step >= 0:
+        raise FloatingPointError(
+            f"{workdir}: the loss or its gradient is not finite at step "
+            f"{int(progress.failed_step)} (epoch {at.epoch}); lower optim.learning_rate, set "
+            "optim.clip_norm, or look at the data"
+        )
+    sums = {name: at.sums.get(name, 0.0) + float(more) for name, more in progress.sums.items()}
+    return at._replace(step=at.step + count, sums=sums)
+
+
+def finished(at: Position, task: Task, validation: Row, rate: float) -> tuple[Position, Row, bool]:
+    """Of the epoch that ends at `at`, trained at `rate` windows or segments per second: where the
+    next one starts, the log's row, and whether it is the best one so far.
+
+    The choice of the best begins anew with the epoch that changes what is trained, and again with
+    the first whole one after it: losses before and after do not compare, and what has just begun to
+    learn has learnt little. NaN and infinity are never the best.
+    """
+    optim, means = task.config.optim, mean_figures(at.sums, task.steps_per_epoch)
+    norms = {name: means.pop(name) for name in at.sums if name.startswith("gradient_norm/")}
+    row: Row = {
+        "epoch": at.epoch,
+        "step": at.step,
+        **means,
+        **validation,
+        "learning_rate": learning_rate(at, task),
+        f"{task.unit}_per_second": rate,
+        "seconds": at.seconds,
+        **norms,
+    }
+    merit = row["val_loss" if optim.best_by == "loss" else "val_mse"]
+    before = at.step - 2 * task.steps_per_epoch
+    best = None if any(before < change < at.step for change in task.changes) else at.best
+    improved = math.isfinite(merit) and (best is None or merit < best)
+    plateau = optimizer.watch(at.plateau, row["val_mse"], optim)
+    best = merit if improved else best
+    return at._replace(epoch=at.epoch + 1, best=best, sums={}, plateau=plateau), row, improved
+
+
+def learning_rate(at: Position, task: Task) -> float:
+    """The network's, of the step that comes next."""
+    schedule = optimizer.schedule(task.config.optim, task.steps_per_epoch)
+    return float(schedule(at.step)) * at.plateau.factor
+
+
+def mean_figures(sums: dict[str, float], steps: int) -> Row:
+    """Means over the steps that were not skipped, and the number of those that were."""
+    skipped = round(sums.get("skipped", 0))
+    means: Row = {name: total / max(1, steps - skipped) for name, total in sums.items()}
+    return means | ({"skipped": skipped} if "skipped" in sums else {})
+
+
+def _now(at: Position, task: Task, rate: float) -> str:
+    """The figures beside the progress bar: the mean loss of the epoch so far, and the speed."""
+    steps = task.steps_per_epoch
+    loss = mean_figures(at.sums, at.step - at.epoch * steps)["loss"]
+    return (
+        f"{at.step}/{task.config.optim.epochs * steps}  epoch {at.epoch + 1}  loss {loss:.4g}  "
+        f"lr {learning_rate(at, task):.2e}  {_speed(task, rate)}"
+    )
+
+
+def lines(row: Row, improved: bool, task: Task) -> Iterator[str]:
+    """The line of a finished epoch, with the error of each of several datasets, and a warning where
+    a layer of the head has stopped to learn."""
+    names = task.config.datasets
+    own = ", ".join(f"{name} {row[f'val_rmse/{name}']:.4f}" for name in names if len(names) > 1)
+    yield (
+        f"epoch {row['epoch'] + 1:4d}/{task.config.optim.epochs}  "
+        f"loss {row['loss']:.4g}  val {row['val_loss']:.4g}  val rmse {row['val_rmse']:.4f} m  "
+        f"{f'({own})  ' if own else ''}"
+        f"{task.remark(row)}lr {row['learning_rate']:.2e}  "
+        f"{_speed(task, row[f'{task.unit}_per_second'])}{'  best' if improved else ''}"
+    )
+    if stuck := stuck_layers(row):
+        yield (
+            f"warning: no gradient reached {', '.join(stuck)} in this epoch, the network learns no "
+            "more; start over with a lower optim.learning_rate, or with optim.clip_norm"
+        )
+
+
+def _speed(task: Task, rate: float) -> str:
+    return f"{rate:,.0f} {task.unit}/s" if rate >= 10 else f"{rate:.2g} {task.unit}/s"
+
+
+def stuck_layers(row: Row) -> list[str]:
+    """Layers of the head that hardly a gradient reached in the epoch of `row`.
+
+    A training that diverges may leave the network there: where every scale s = softplus(·)
+    underflows to 0, so do the gradients of gate and encoder, and d̂ = 0 for good. A loss of 0 has
+    not begun yet (`LossConfig.nll_from_epoch`).
+    """
+    prefix = "gradient_norm/"
+    return [
+        name.removeprefix(prefix)
+        for name, norm in row.items()
+        if name.startswith(f"{prefix}head/") and norm < NO_GRADIENT and row["loss"] != 0
+    ]

@@ -1,20 +1,25 @@
-"""Adam with linear warm-up and cosine decay (paper §IV-A), and the schedules of the networks that
-GNIO is compared with.
+"""What is trained, and by which steps: Adam with linear warm-up and cosine decay (paper §IV-A), and
+the schedules of the networks that GNIO is compared with.
 
 A learning rate is a function of the step, and the optimizer's state holds Adam's moments alone: a
-step that is skipped does not shift the schedule.
+step that is skipped does not shift the schedule. The filter's settings are trained as numbers
+without bounds (`filtering.settings`), beside the network's variables as the collection "filter".
 """
 
 from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import optax
+from jaxtyping import Float
 
-from gnio_jax.config import LossConfig, OptimConfig, TrainConfig
+from gnio_jax.config import FilterSettings, LossConfig, OptimConfig, TrainConfig
+from gnio_jax.filtering.settings import free_parameters, is_below, with_written_parameters
 from gnio_jax.training.losses import switches
 
 END_LEARNING_RATE = 1e-6
@@ -23,7 +28,69 @@ PLATEAU_EPOCHS, PLATEAU_FACTOR = 10, 0.1
 """The learning rate is multiplied by this factor after more than so many epochs without a smaller
 squared error on the validation split (RoNIN, DeepILS)."""
 UNCERTAINTY = ("uncertainty", "log_std")
-"""Names of the networks' modules from which nothing but the uncertainty comes."""
+"""Names of the networks' modules from which nothing but the uncertainty comes …"""
+HEADS = ("head", "displacement")
+"""… and of those from which the displacement comes."""
+FILTER_PARTS = {
+    "noise": (
+        "noise.gyro_density",
+        "noise.accel_density",
+        "noise.gyro_bias_walk",
+        "noise.accel_bias_walk",
+    ),
+    "measurement": ("noise.measurement_scale", "noise.std_factor", "noise.correlation"),
+    "start": ("start",),
+}
+"""Numbers of `FilterSettings` that each part of the filter has, by their paths."""
+DIGITS = 5
+"""That float32 keeps of a value whose logarithm it holds."""
+
+Trainable = dict[str, dict[str, Any]]
+"""Variables that are trained, by collection: "params" and "filter"; none of them empty."""
+
+# What is trained
+# ------------------------------------------------------------------------------------------------
+
+
+def filter_numbers(config: TrainConfig) -> dict[str, Float[jax.Array, ""]]:
+    """The collection "filter": a number for each setting that is not switched off; none where
+    training is on windows."""
+    if not config.through_filter.learn:
+        return {}
+    paths = [path for of_part in FILTER_PARTS.values() for path in of_part]
+    return {name: jnp.float32(each) for name, each in free_parameters(config.filter, paths).items()}
+
+
+def trained_settings(settings: FilterSettings, numbers: dict[str, Any]) -> FilterSettings:
+    """The filter's settings with the values that were trained, as five digits."""
+    return with_written_parameters(settings, numbers, DIGITS)
+
+
+def trainable(variables: Any, learn: Iterable[str]) -> Trainable:
+    """The variables that the parts `learn` consist of; without any, the network's parameters."""
+    parts = set(learn)
+    if not parts:
+        return {"params": variables["params"]}
+    if "all" in parts:
+        parts = {*FILTER_PARTS, "uncertainty", "head", "encoder"}
+    paths = [path for part in parts for path in FILTER_PARTS.get(part, ())]
+
+    def is_trained(collection: str, name: str) -> bool:
+        if collection == "filter":
+            return any(is_below(name, path) for path in paths)
+        part = "head" if name in HEADS else "encoder"
+        return ("uncertainty" if name in UNCERTAINTY else part) in parts
+
+    found = {
+        collection: {name: leaf for name, leaf in tree.items() if is_trained(collection, name)}
+        for collection, tree in variables.items()
+        if collection != "batch_stats"
+    }
+    return {collection: tree for collection, tree in found.items() if tree}
+
+
+# By which steps
+# ------------------------------------------------------------------------------------------------
 
 
 def schedule(config: OptimConfig, steps_per_epoch: int, scale: float = 1.0) -> optax.Schedule:
@@ -64,7 +131,8 @@ def adam(
         held = optax.conditionally_mask(
             moments, lambda step, log_std_learns: log_std_learns, forward_extra_args=True
         )
-        parts = [optax.partition({"learns": moments, "held": held}, _labels_of_modules)]
+        labels = _by_path(lambda path: "held" if path[1].key in UNCERTAINTY else "learns")
+        parts = [optax.partition({"learns": moments, "held": held}, labels)]
     if config.weight_decay:
         parts.insert(0, optax.add_decayed_weights(config.weight_decay))
     if config.clip_norm is not None:
@@ -82,10 +150,7 @@ def create(config: TrainConfig, steps_per_epoch: int) -> optax.GradientTransform
         "params": adam(config.optim, LossConfig(), 1),
         "filter": adam(dataclasses.replace(config.optim, weight_decay=0.0), LossConfig(), 1),
     }
-    return optax.partition(
-        each,
-        lambda trained: jax.tree_util.tree_map_with_path(lambda path, _: path[0].key, trained),
-    )
+    return optax.partition(each, _by_path(lambda path: path[0].key))
 
 
 def learning_rates(config: TrainConfig, steps_per_epoch: int) -> dict[str, optax.Schedule]:
@@ -97,11 +162,9 @@ def learning_rates(config: TrainConfig, steps_per_epoch: int) -> dict[str, optax
     }
 
 
-def _labels_of_modules(trained: Any) -> Any:
-    def label(path: tuple, _: jax.Array) -> str:
-        return "held" if path[1].key in UNCERTAINTY else "learns"  # after the collection
-
-    return jax.tree_util.tree_map_with_path(label, trained)
+def _by_path(label: Callable[[tuple], Any]) -> Callable[[Any], Any]:
+    """A function that labels each leaf of a tree by its path."""
+    return lambda tree: jax.tree_util.tree_map_with_path(lambda path, _: label(path), tree)
 
 
 class Plateau(NamedTuple):

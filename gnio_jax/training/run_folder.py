@@ -58,10 +58,10 @@ def refuse_other_run(config: TrainConfig, resume: bool) -> Path:
     if not kept.exists():
         problem = "holds no run to resume (config.yaml is missing)"
         raise InputError(workdir, problem, "start it without --resume")
-    ours, theirs = (dataclasses.asdict(c) for c in (config, configuration.load(kept)))
-    for name in ours:
-        if name not in MAY_CHANGE and ours[name] != theirs[name]:
-            problem = f"'{name}' was {theirs[name]} and is now {ours[name]}"
+    ours, theirs = (configuration.flat(each) for each in (config, configuration.load(kept)))
+    for name in ours | theirs:
+        if name not in MAY_CHANGE and ours.get(name) != theirs.get(name):
+            problem = f"'{name}' was {theirs.get(name)} and is now {ours.get(name)}"
             raise InputError(kept, problem, "resume with the same settings")
     return workdir
 

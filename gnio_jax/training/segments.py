@@ -62,19 +62,9 @@ class Segment(NamedTuple):
     """The reference."""
 
 
-class StartErrors(NamedTuple):
-    """What is added to the truth for the filter's first estimate."""
-
-    rotation: Float[Array, "3"]
-    """θ of exp(θ) R, world frame, rad."""
-    velocity: Float[Array, "3"]
-    """m/s."""
-    position: Float[Array, "3"]
-    """m."""
-    gyro_bias: Float[Array, "3"]
-    """Added to a first estimate of zero, rad/s."""
-    accel_bias: Float[Array, "3"]
-    """The same, m/s²."""
+Start = tuple[jax.Array, jax.Array, jax.Array, jax.Array, jax.Array]
+"""The filter's first estimates: attitude body → world (3, 3), velocity m/s, position m, gyro bias
+rad/s and accelerometer bias m/s² (3,)."""
 
 
 def segment_source(sequences: Iterable[Sequence], samples: int) -> SegmentSource:
@@ -169,19 +159,15 @@ def turned_segment(segment: Segment, angle: Float[jax.Array, ""]) -> Segment:
     return segment._replace(truth=truth)
 
 
-def draw_start_errors(key: PRNGKeyArray, std: InitialStd, spread: float) -> StartErrors:
-    """Errors of a start as uncertain as `spread` times `std`. Jittable."""
+def draw_start(key: PRNGKeyArray, truth: Path, std: InitialStd, spread: float) -> Start:
+    """First estimates that are off the truth, and the biases off zero, by errors as uncertain as
+    `spread` times `std`. The attitude is exp(θ) R, with θ in the world frame. Jittable."""
     draws = spread * jax.random.normal(key, (5, 3), jnp.float64)
     tilt_tilt_yaw = jnp.stack([jnp.asarray(each) for each in (std.tilt, std.tilt, std.yaw)])
-    return StartErrors(
-        rotation=tilt_tilt_yaw * draws[0],
-        velocity=std.velocity * draws[1],
-        position=std.position * draws[2],
-        gyro_bias=std.gyro_bias * draws[3],
-        accel_bias=std.accel_bias * draws[4],
+    return (
+        geometry.matmul(geometry.exp(tilt_tilt_yaw * draws[0]), truth.rotation[0]),
+        truth.velocity[0] + std.velocity * draws[1],
+        truth.position[0] + std.position * draws[2],
+        std.gyro_bias * draws[3],
+        std.accel_bias * draws[4],
     )
-
-
-def start_rotation(truth: Path, errors: StartErrors) -> Float[jax.Array, "3 3"]:
-    """The filter's first attitude: exp(θ) R of the reference."""
-    return geometry.matmul(geometry.exp(errors.rotation), truth.rotation[0])

@@ -10,7 +10,7 @@ import dataclasses
 import functools
 import itertools
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
@@ -28,29 +28,21 @@ from gnio_jax.errors import InputError
 from gnio_jax.reporting import Reporter
 from gnio_jax.training import optimizer
 from gnio_jax.training.losses import loss_stage
+from gnio_jax.training.optimizer import Trainable
 from gnio_jax.types import Sequence
 
 Row = dict[str, int | float]
 """Figures of an epoch by name, as the log keeps them."""
-Trainable = dict[str, dict[str, Any]]
-"""Variables that are trained, by collection: "params" and "filter"; none of them empty."""
 
 
 class TrainState(NamedTuple):
     """All that changes from step to step. Random numbers are functions of the seed and `step`."""
 
     step: Int[jax.Array, ""]
-    params: Any
-    batch_stats: Any
+    variables: dict[str, Any]
+    """By collection: the network's "params" and "batch_stats", and through the filter its numbers
+    that may be trained, "filter" (`optimizer.filter_numbers`)."""
     opt_state: Any
-    filter: Any = {}
-    """Numbers of the filter that may be trained (`filter_task.filter_numbers`); none on windows."""
-
-    @property
-    def variables(self) -> dict[str, Any]:
-        """Variables by collection: the network's, and "filter" where there are any."""
-        network = {"params": self.params, "batch_stats": self.batch_stats}
-        return network | ({"filter": self.filter} if self.filter else {})
 
 
 class BatchLosses(NamedTuple):
@@ -72,21 +64,6 @@ class Progress(NamedTuple):
     of a task that skips steps, their number `skipped`, and no figures of them."""
     failed_step: Int[jax.Array, ""]
     """First step whose loss or gradient was not finite, and was not skipped; −1: none."""
-
-
-class Keys(NamedTuple):
-    """Random keys of a run: functions of its seed alone."""
-
-    init: jax.Array
-    order: jax.Array
-    step: jax.Array
-    statistics: jax.Array
-
-
-def keys_of(seed: int) -> Keys:
-    """The keys of a run."""
-    key = jax.random.key(seed)
-    return Keys(*jax.random.split(key, 3), statistics=jax.random.fold_in(key, 3))
 
 
 class Recordings(NamedTuple):
@@ -120,16 +97,13 @@ class Task(ABC):
     """Norm of the gradient above which a step is skipped, as is one whose loss or gradient is not
     finite, or for which the filter diverged. None: the first step that is not finite ends the run.
     """
+    joined: ClassVar[Callable[[list[Any]], Any]]
+    """The windows or segments of several datasets one after the other, on the host."""
 
     @staticmethod
     @abstractmethod
     def source_of(sequences: Iterable[Sequence], config: TrainConfig, training: bool) -> Any:
         """The windows or segments of recordings at the network's rate, on the host."""
-
-    @staticmethod
-    @abstractmethod
-    def joined(sources: list[Any]) -> Any:
-        """Those of several datasets one after the other, on the host."""
 
     @staticmethod
     @abstractmethod
@@ -139,14 +113,6 @@ class Task(ABC):
     @abstractmethod
     def description(self, state: TrainState, workdir: Path) -> Iterator[str]:
         """Lines about what will be trained, and a warning where a part of it never will be."""
-
-    def filter_numbers(self) -> dict[str, Any]:
-        """The collection "filter" at step 0, whatever run training starts from."""
-        return {}
-
-    @abstractmethod
-    def trainable(self, variables: Any) -> Trainable:
-        """Those of the variables that are trained."""
 
     @property
     def changes(self) -> tuple[int, ...]:
@@ -178,6 +144,14 @@ class Task(ABC):
     def figures_of(self, state: TrainState, held_out: Any, key: PRNGKeyArray) -> Row:
         """The figures of a state on the validation split of one dataset."""
 
+    @abstractmethod
+    def remark(self, row: Row) -> str:
+        """What the line of an epoch says besides loss, speed and rate."""
+
+    def trainable(self, variables: Any) -> Trainable:
+        """Those of the variables that are trained."""
+        return optimizer.trainable(variables, self.config.through_filter.learn)
+
     def validate(
         self, state: TrainState, held_out: dict[str, Any], key: PRNGKeyArray
     ) -> tuple[TrainState, Row]:
@@ -192,10 +166,6 @@ class Task(ABC):
         for figure in ("val_loss", "val_mse", "val_rmse"):
             row |= {f"{figure}/{name}": each[figure] for name, each in rows.items()}
         return state, row
-
-    @abstractmethod
-    def remark(self, row: Row) -> str:
-        """What the line of an epoch says besides loss, speed and rate."""
 
     def weighted(self, key: PRNGKeyArray, entries: Int[jax.Array, "m"]) -> Int[jax.Array, "n"]:
         """Those of `entries`, one for each window or segment, that an epoch visits: of each dataset
@@ -213,30 +183,21 @@ class Task(ABC):
         return jnp.concatenate(found)
 
     def initial_state(self, key: PRNGKeyArray, start: Any | None) -> TrainState:
-        """The state at step 0: with drawn parameters, or with the variables `start` of a run."""
-        variables = models.initialise(self.model, key, self.config.data.seen)
+        """The state at step 0: with drawn parameters, or with the variables `start` of a run. The
+        filter's numbers are those of the settings, whatever run training starts from."""
+        variables = {"batch_stats": {}, **models.initialise(self.model, key, self.config.data.seen)}
         if start is not None:
             variables = overlaid(variables, start)
-        statistics = variables.get("batch_stats", {})
-        state = TrainState(jnp.int32(0), variables["params"], statistics, (), self.filter_numbers())
-        trained = self.trainable(state.variables)
+        if numbers := optimizer.filter_numbers(self.config):
+            variables["filter"] = numbers
+        trained = self.trainable(variables)
         chex.assert_type(jax.tree.leaves(trained), jnp.float32)
         adam = optimizer.create(self.config, self.steps_per_epoch)
-        return state._replace(opt_state=adam.init(trained))
+        return TrainState(jnp.int32(0), variables, adam.init(trained))
 
-    def take_steps(
-        self,
-        state: TrainState,
-        source: Any,
-        order: Int[jax.Array, "m"],
-        first: int,
-        count: int,
-        factor: float,
-        key: PRNGKeyArray,
-    ) -> tuple[TrainState, Progress]:
-        """`train_steps`. The old state is used up."""
-        numbers = jnp.int32(first), jnp.int32(count), jnp.float32(factor)
-        return train_steps(state, source, order, *numbers, key, task=self)
+    def take_steps(self, *given: Any) -> tuple[TrainState, Progress]:
+        """`train_steps` of this task. The old state is used up."""
+        return train_steps(*given, task=self)
 
 
 # The step
@@ -272,9 +233,8 @@ def train_steps(
         state, progress = carry
         which = jax.lax.dynamic_slice(order, ((first + i) * size,), (size,))
         batch = task.draw(jax.random.fold_in(key, state.step), source, which)
-        variables = state.variables
-        trained = task.trainable(variables)
-        gradient, found = gradient_of(trained, variables, batch, state.step, task)
+        trained = task.trainable(state.variables)
+        gradient, found = gradient_of(trained, state.variables, batch, state.step, task)
         stage = loss_stage(task.config.loss, state.step, task.steps_per_epoch)
         update: Any
         update, opt_state = adam.update(
@@ -283,10 +243,9 @@ def train_steps(
         for name, direction in update.items():
             rate = -jnp.float32(learning_rates[name](state.step))
             update[name] = optax.tree.scale(factor, optax.tree.scale(rate, direction))
-        taken = merged(variables, optax.apply_updates(trained, update))
-        new = TrainState(
-            state.step, taken["params"], found.batch_stats, opt_state, taken.get("filter", {})
-        )
+        variables = merged(state.variables, optax.apply_updates(trained, update))
+        variables["batch_stats"] = found.batch_stats
+        new = TrainState(state.step, variables, opt_state)
 
         # Loss and gradient are looked at before the update is kept: a gradient that is not finite
         # must not reach a checkpoint, though its loss is.
@@ -326,10 +285,7 @@ def gradient_of(
 
 def merged(variables: Any, trained: Trainable) -> Any:
     """All variables, with those that are trained in their places."""
-    return {
-        collection: {**tree, **trained.get(collection, {})}
-        for collection, tree in variables.items()
-    }
+    return {name: {**tree, **trained.get(name, {})} for name, tree in variables.items()}
 
 
 def gradient_norms(gradient: Trainable) -> dict[str, Float[jax.Array, ""]]:
@@ -358,7 +314,7 @@ def set_up(
     are too short, a batch that is larger than the split, and one that the devices cannot share
     evenly. `workers` processes read recordings that are slow to read.
     """
-    model = create_model(config)  # a mistake in its options does not wait for the data
+    model = models.from_config(config.model)  # a mistake in its options does not wait for the data
     size, devices = config.optim.batch_size, parallel.count()
     if size % devices:
         problem = f"is {size}, which {devices} devices cannot share evenly"
@@ -405,12 +361,6 @@ def visits(count: int, weight: float) -> int:
     return round(weight * count)
 
 
-def create_model(config: TrainConfig) -> nn.Module:
-    """The network that `config.model` describes; what that leaves open is the network's own."""
-    given = {key: value for key, value in vars(config.model).items() if value is not None}
-    return models.create(**given)
-
-
 def overlaid(tree: dict[str, Any], other: dict[str, Any]) -> dict[str, Any]:
     """`tree` with the leaves that `other` has in the same places."""
     return {
@@ -432,13 +382,8 @@ def read_split(
     """The recordings of a split of a dataset at the network's rate, one after another, with poses
     where they come with waypoints. The number of samples of each is noted in `samples` by its
     name."""
-    for sequence in data.load_each(
-        dataset,
-        config.data_root,
-        split,
-        workers,
-        lambda share: reporter.progress(f"reading {split}", share),
-    ):
+    progress = functools.partial(reporter.progress, f"reading {split}")
+    for sequence in data.load_each(dataset, config.data_root, split, workers, progress):
         resampled = data.resample(sequence, config.data.rate)
         if resampled.waypoints is not None:
             try:

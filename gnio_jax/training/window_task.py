@@ -32,7 +32,7 @@ from gnio_jax.data.windows import (
 )
 from gnio_jax.models.layers import MOMENTUM
 from gnio_jax.training.losses import Losses, Stage, loss_stage, losses, switches
-from gnio_jax.training.task import BatchLosses, Row, Task, Trainable, TrainState, size_of
+from gnio_jax.training.task import BatchLosses, Row, Task, TrainState, size_of
 from gnio_jax.types import Prediction, Sequence, Windows
 
 
@@ -41,17 +41,15 @@ class WindowTask(Task):
 
     unit = "windows"
     figures = ("loss", "mse", "nll")
+    joined = staticmethod(joined)
 
     @staticmethod
     def source_of(
         sequences: Iterable[Sequence], config: TrainConfig, training: bool
     ) -> WindowSource:
-        if training:
-            shift = config.augment.shift_samples
-            return window_source(sequences, config.data, config.data.train_stride, shift)
-        return window_source(sequences, config.data, config.data.stride)
-
-    joined = staticmethod(joined)
+        data, shift = config.data, config.augment.shift_samples
+        steps = (data.train_stride, shift) if training else (data.stride, 0)
+        return window_source(sequences, data, *steps)
 
     @staticmethod
     def count(source: WindowSource) -> int:
@@ -60,25 +58,20 @@ class WindowTask(Task):
     def description(self, state: TrainState, workdir: Path) -> Iterator[str]:
         optim, steps = self.config.optim, self.steps_per_epoch
         yield (
-            f"{self.config.model.name}: {size_of(state.params):,} parameters on "
+            f"{self.config.model.name}: {size_of(state.variables['params']):,} parameters on "
             f"{parallel.described()}, {steps} steps of {optim.batch_size} windows an epoch, "
             f"{optim.epochs} epochs → {workdir}"
         )
         total = optim.epochs * steps
-        names = ("the likelihood counts", "the uncertainty learns")
-        for what, step in zip(names, self.changes, strict=True):
+        parts = ("the likelihood counts", "nll"), ("the uncertainty learns", "log_std")
+        for (what, field), step in zip(parts, self.changes, strict=True):
             if step >= total:
-                field = "nll_from_epoch" if what == names[0] else "log_std_from_epoch"
                 yield (
                     f"warning: {what} only from step {step:,} on, and the run ends at step "
-                    f"{total:,}; raise optim.epochs or lower loss.{field}"
+                    f"{total:,}; raise optim.epochs or lower loss.{field}_from_epoch"
                 )
             elif step > 0:
                 yield f"{what} from step {step:,} of {total:,} on"
-
-    def trainable(self, variables: Any) -> Trainable:
-        """All parameters of the network."""
-        return {"params": variables["params"]}
 
     @property
     def changes(self) -> tuple[int, ...]:
@@ -106,9 +99,9 @@ class WindowTask(Task):
     def losses(
         self, variables: Any, batch: tuple[Windows, PRNGKeyArray], step: Int[jax.Array, ""]
     ) -> BatchLosses:
-        windows, dropout_key = batch
+        windows, _ = batch
         stage = loss_stage(self.config.loss, step, self.steps_per_epoch)
-        prediction, changed = apply_training(self.model, variables, windows, dropout_key)
+        prediction, changed = apply_training(self.model, variables, batch)
         found = losses(prediction, windows, self.config.loss, stage, predicted_axes(self.model))
         figures = {"loss": found.total, "mse": found.mse, "nll": found.nll}
         return BatchLosses(figures, changed.get("batch_stats", {}), jnp.bool_(True))
@@ -116,19 +109,18 @@ class WindowTask(Task):
     def with_statistics(
         self, state: TrainState, source: WindowSource, key: PRNGKeyArray
     ) -> TrainState:
-        if not self.config.optim.statistics_windows or not normalises(state):
+        if not self.config.optim.statistics_windows or not has_statistics(state, "mean"):
             return state
         order = statistics_order(key, source, self)
         return estimate_statistics(state, source, order, key, task=self)
 
     def calibrated(self, state: TrainState, held_out: dict[str, WindowSource]) -> TrainState:
-        if not calibrates(state):
+        if not has_statistics(state, "log_std", "log_factor"):
             return state
         stage = self.last_stage(state)
         each = [validate(state, source, stage, task=self) for source in held_out.values()]
         found = jax.tree.map(lambda *figures: sum(figures) / len(each), *each)
-        equivariant = self.config.model.equivariance != "none"
-        return calibrated(state, isotropic(found) if equivariant else found)
+        return calibrated(state, found, isotropic=self.config.model.equivariance != "none")
 
     def figures_of(self, state: TrainState, held_out: WindowSource, key: PRNGKeyArray) -> Row:
         found = validate(state, held_out, self.last_stage(state), task=self)
@@ -154,16 +146,12 @@ class WindowTask(Task):
 
 
 def apply_training(
-    model: nn.Module, variables: Any, windows: Windows, dropout_key: PRNGKeyArray
+    model: nn.Module, variables: Any, batch: tuple[Windows, PRNGKeyArray]
 ) -> tuple[Prediction, Any]:
     """The prediction in training mode, and the variables that changed: statistics of the batch."""
-    return model.apply(
-        variables,
-        windows.imu,
-        train=True,
-        mutable=["batch_stats"],
-        rngs={"dropout": dropout_key},
-    )  # type: ignore[return-value]
+    windows, dropout_key = batch
+    options = {"mutable": ["batch_stats"], "rngs": {"dropout": dropout_key}}
+    return model.apply(variables, windows.imu, train=True, **options)  # type: ignore[return-value]
 
 
 def predicted_axes(model: nn.Module) -> int:
@@ -176,11 +164,11 @@ def predicted_axes(model: nn.Module) -> int:
 # ------------------------------------------------------------------------------------------------
 
 
-def normalises(state: TrainState) -> bool:
-    """Whether the network has batch normalisations."""
-    return any(
-        path[-1].key == "mean" for path, _ in jax.tree_util.tree_leaves_with_path(state.batch_stats)
-    )
+def has_statistics(state: TrainState, *names: str) -> bool:
+    """Whether the network has statistics of one of these names: "mean" of a normalisation,
+    "log_std" or "log_factor" of an uncertainty that validation calibrates (`models.heads`)."""
+    found = jax.tree_util.tree_leaves_with_path(state.variables["batch_stats"])
+    return any(path[-1].key in names for path, _ in found)
 
 
 def statistics_order(
@@ -212,18 +200,18 @@ def estimate_statistics(
     what those miss is an offset of the displacement (ours; Wu and Johnson 2021, "Rethinking 'Batch'
     in BatchNorm"). Nothing else of `batch_stats` changes.
     """
-    size = task.config.optim.batch_size
+    size, before = task.config.optim.batch_size, state.variables["batch_stats"]
     batches = order.shape[0] // size
     _, draw_key = jax.random.split(key)
     # A normalisation adds 1 − MOMENTUM of the batch's statistics to the MOMENTUM-fold of its own:
     # of zeros, that alone is left.
-    zeros = jax.tree.map(jnp.zeros_like, state.batch_stats)
+    zeros = jax.tree.map(jnp.zeros_like, before)
+    variables = state.variables | {"batch_stats": zeros}
 
     def add_batch(total: Any, number_which: tuple[jax.Array, jax.Array]) -> tuple[Any, None]:
         number, which = number_which
-        windows, dropout_key = task.draw(jax.random.fold_in(draw_key, number), source, which)
-        variables = {"params": state.params, "batch_stats": zeros}
-        _, changed = apply_training(task.model, variables, windows, dropout_key)
+        batch = task.draw(jax.random.fold_in(draw_key, number), source, which)
+        _, changed = apply_training(task.model, variables, batch)
         return jax.tree.map(jnp.add, total, changed["batch_stats"]), None
 
     parts = order.reshape(batches, size)
@@ -232,8 +220,10 @@ def estimate_statistics(
     def statistic(path: tuple, total: jax.Array, before: jax.Array) -> jax.Array:
         return total / (batches * (1 - MOMENTUM)) if path[-1].key in ("mean", "var") else before
 
-    estimated = jax.tree_util.tree_map_with_path(statistic, total, state.batch_stats)
-    return parallel.replicated(state._replace(batch_stats=estimated))
+    estimated = jax.tree_util.tree_map_with_path(statistic, total, before)
+    return parallel.replicated(
+        state._replace(variables=state.variables | {"batch_stats": estimated})
+    )
 
 
 # Validation
@@ -278,10 +268,7 @@ def validate(
 
     def one_batch(which_weight: tuple[jax.Array, jax.Array]) -> Validation:
         windows = parallel.split(gather(source, parallel.split(which_weight[0]), config.data.seen))
-        prediction: Any = model.apply(
-            {"params": state.params, "batch_stats": state.batch_stats}, windows.imu
-        )
-        each = jax.vmap(one_window)(prediction, windows)
+        each = jax.vmap(one_window)(model.apply(state.variables, windows.imu), windows)
         return jax.tree.map(lambda x: jnp.tensordot(which_weight[1], x, 1), each)
 
     return jax.tree.map(
@@ -289,39 +276,27 @@ def validate(
     )
 
 
-def calibrates(state: TrainState) -> bool:
-    """Whether the network has constants or factors of the uncertainty that validation sets."""
-    found = jax.tree_util.tree_leaves_with_path(state.batch_stats)
-    return any(path[-1].key in ("log_std", "log_factor") for path, _ in found)
-
-
-def isotropic(found: Validation) -> Validation:
-    """The same, with the mean of the two horizontal axes in the place of each. Constants of the
-    uncertainty of an equivariant network cannot tell one from the other."""
-
-    def mean(axes: Float[jax.Array, "3"]) -> Float[jax.Array, "3"]:
-        return axes.at[:2].set(axes[:2].mean())
-
-    return found._replace(
-        axis_mse=mean(found.axis_mse), axis_normalised=mean(found.axis_normalised)
-    )
-
-
-def calibrated(state: TrainState, found: Validation) -> TrainState:
+def calibrated(state: TrainState, found: Validation, isotropic: bool = False) -> TrainState:
     """The state whose constants and factors of the uncertainty (`models.heads`) fit the errors that
     validation found with it.
 
-    Errors below 0.1 mm count as 0.1 mm, and a σ changes by no more than a factor of 1000 at once:
-    nothing becomes infinite.
+    `isotropic`: the horizontal axes share the mean of both, since constants of an equivariant
+    network cannot tell one from the other. Errors below 0.1 mm count as 0.1 mm, and a σ changes by
+    no more than a factor of 1000 at once: nothing becomes infinite.
     """
+    mse, normalised = (
+        axes.at[:2].set(axes[:2].mean()) if isotropic else axes
+        for axes in (found.axis_mse, found.axis_normalised)
+    )
 
     def fitted(path: tuple, leaf: jax.Array) -> jax.Array:
         match path[-1].key:
             case "log_std":
-                return 0.5 * jnp.log(jnp.maximum(found.axis_mse, 1e-8))
+                return 0.5 * jnp.log(jnp.maximum(mse, 1e-8))
             case "log_factor":
-                return leaf + 0.5 * jnp.log(jnp.clip(found.axis_normalised, 1e-6, 1e6))
+                return leaf + 0.5 * jnp.log(jnp.clip(normalised, 1e-6, 1e6))
             case _:
                 return leaf
 
-    return state._replace(batch_stats=jax.tree_util.tree_map_with_path(fitted, state.batch_stats))
+    statistics = jax.tree_util.tree_map_with_path(fitted, state.variables["batch_stats"])
+    return state._replace(variables=state.variables | {"batch_stats": statistics})

@@ -73,6 +73,16 @@ def test_a_file_without_fields_is_refused(text):
     ("field", "texts"),
     {
         "<<": ["<<: {seed: 3}"],
+        "dataset": ["dataset: [tlio, tlio]", "dataset: []"],
+        "data_root": ["dataset: [a, b]\ndata_root: here"],
+        "data.weights": [
+            *("dataset: [a, b]\ndata: {weights: [1]}", "dataset: [a, b]\ndata: {weights: [1, 0]}"),
+        ],
+        "model.equivariance": [
+            "model: {equivariance: so3}",
+            "model: {equivariance: four_headings}\naugment: {yaw: false}",
+        ],
+        "model.output_dim": ["model: {output_dim: 4}", "model: {output_dim: 2.0}"],
         "seed": [
             *("seed: 010", "seed: 1:30", "seed: 0b_", "seed: 0x1f", "seed: 2020-13-45"),
             *("seed: " + "9" * 400, "seed: 99999999999999999999999", "seed: -1", "seed: 1e0"),

@@ -30,58 +30,30 @@ def prepared(name, **options):
     model = models.create(name, **SMALL[name] | options)
     windows = np.random.default_rng(1).standard_normal((4, samples, 6))
     variables = drawn(models.variable_shapes(model, samples))
-    return model, variables, jnp.asarray(windows, jnp.float32)
+    return model, variables, jnp.asarray(windows)
 
 
 @pytest.mark.parametrize(
     "name, samples, options, wanted",
     [
         ("gnio", 200, {}, 4_934_153),
-        ("gnio", 200, {"bank_size": 16}, 4_909_577),
-        ("gnio", 200, {"bank_size": 32}, 4_917_769),
         ("gnio", 200, {"bank_size": 128}, 4_966_921),
         ("gnio", 200, {"bank_size": 0}, 3_846_144 + 3 * (512 * 3 + 3)),
         ("tlio", 200, {}, 5_424_646),
         ("tlio", 100, {}, 5_031_430),
         ("ronin_resnet", 200, {"output_dim": 2}, 4_634_882),
-        ("ronin_resnet", 200, {}, 4_635_395),
         ("deepils", 200, {"output_dim": 2}, 2_290_226),
         ("deepils", 200, {}, 2_290_739),
         ("deepils", 100, {}, 2_290_739 - 3 * 128 * 512),  # four time steps are left of seven
         ("ctin", 200, {"output_dim": 2}, 555_364 + 2),  # the publication's 557,100 to 1 %
-        ("ctin", 200, {}, 555_366 + 2 * 49),
         ("ctin", 100, {"output_dim": 2}, 555_366 - 100 * 96),
         ("ctin", 200, {"output_dim": 2, "decoder_layers": 3}, 555_366 - 112_224),
         ("imot", 200, {"output_dim": 2}, 14_492_810),
-        ("imot", 200, {}, 14_492_810 + 128 + 201),  # a particle and an output more
         ("imot_text", 200, {"output_dim": 2}, 7_137_482),
     ],
 )
 def test_networks_have_as_many_parameters_as_published(name, samples, options, wanted):
     assert count(shapes(name, samples, **options)["params"]) == wanted
-
-
-@NETWORKS
-def test_parameters_and_outputs_are_float32_whatever_comes_in(name):
-    model, variables, windows = prepared(name)
-    assert {leaf.dtype for leaf in jax.tree.leaves(models.variable_shapes(model, 64))} == {
-        jnp.dtype("float32")
-    }
-    statistics = variables["batch_stats"]
-    for train in (False, True):
-        found, changed = jax.eval_shape(
-            lambda variables, windows, key, train=train: model.apply(
-                variables, windows, train, rngs={"dropout": key}, mutable=["batch_stats"]
-            ),
-            variables,
-            jax.ShapeDtypeStruct(windows.shape, jnp.float64),
-            jax.random.key(0),
-        )
-        assert {leaf.dtype for leaf in jax.tree.leaves(found)} == {jnp.dtype("float32")}
-        assert found.displacement.shape == found.log_std.shape == (4, 3)
-        assert all(value.shape[0] == 4 for value in found.diagnostics.values())
-        same = jax.tree.map(lambda a, b: a.shape == b.shape, changed, {"batch_stats": statistics})
-        assert all(jax.tree.leaves(same))  # nothing comes or goes
 
 
 SOFTMAX = {("key", "bias"), ("key_content", "bias"), ("key_position", "bias")}
@@ -92,35 +64,42 @@ attends to makes no difference."""
 
 
 @NETWORKS
-def test_every_parameter_that_can_be_is_trained_and_dropout_is_drawn(name):
+def test_every_parameter_that_can_be_is_trained_in_float32_and_dropout_is_drawn(name):
+    """Whatever the windows come in."""
     model, variables, windows = prepared(name)
+    statistics = variables["batch_stats"]
 
     def loss(params, key):
-        given = {"params": params, "batch_stats": variables["batch_stats"]}
+        given = {"params": params, "batch_stats": statistics}
         prediction, changed = model.apply(
             given, windows, train=True, mutable=["batch_stats"], rngs={"dropout": key}
         )
         balance = prediction.diagnostics.get("task_log_std", jnp.zeros((1, 2), jnp.float32))
         value = jnp.sum((prediction.displacement - 1) ** 2) + jnp.sum(prediction.log_std**2)
-        return value + jnp.sum(balance**2), (prediction.displacement, changed["batch_stats"])
+        return value + jnp.sum(balance**2), (prediction, changed["batch_stats"])
 
     gradient = quick(jax.grad(loss, has_aux=True))
     (grads, (one, changed)), (others, (other, _)) = (
         jax.device_get(gradient(variables["params"], jax.random.key(seed))) for seed in (0, 1)
     )
+    everything = jax.tree.leaves((variables, grads, one, changed))
+    assert {leaf.dtype for leaf in everything} == {np.dtype("float32")}
+    assert one.displacement.shape == one.log_std.shape == (4, 3)
+    assert all(value.shape[0] == 4 for value in one.diagnostics.values())
     for (path, leaf), another in zip(
         jax.tree.leaves_with_path(grads), jax.tree.leaves(others), strict=True
     ):
         names = tuple(key.key for key in path)
         trained = np.abs(leaf).max() + np.abs(another).max()
-        assert leaf.dtype == jnp.float32 and np.isfinite(leaf).all(), path
+        assert np.isfinite(leaf).all(), path
         if names[:2] == ("decoder_1", "self") and name != "ctin" and names[2:] not in FIRST:
             assert trained < 1e-5, path
         elif names[-2:] not in SOFTMAX:
             assert trained > 1e-6, path
-    assert (np.abs(one - other).max() > 1e-3) == (name != "gnio")  # which drops nothing
-    before = jax.tree.leaves_with_path(variables["batch_stats"])
-    assert jax.tree.structure(changed) == jax.tree.structure(variables["batch_stats"])
+    dropped = np.abs(one.displacement - other.displacement).max() > 1e-3
+    assert dropped == (name != "gnio")  # which drops nothing
+    assert jax.tree.structure(changed) == jax.tree.structure(statistics)
+    before = jax.tree.leaves_with_path(statistics)
     for (path, old), new in zip(before, jax.tree.leaves(changed), strict=True):
         if path[-1].key in ("mean", "var"):
             assert np.abs(old - new).max() > 0, path
@@ -131,6 +110,7 @@ def test_every_parameter_that_can_be_is_trained_and_dropout_is_drawn(name):
 @NETWORKS
 def test_frozen_it_gives_the_same_numbers_and_windows_do_not_know_of_each_other(name):
     model, variables, windows = prepared(name)
+    windows = windows.astype(jnp.float32)
     frozen, apply = models.inference_variables(model, variables), models.Inference(model)
     program = quick(apply.__call__)
     plain = models.InferenceVariables(variables, {})
@@ -156,38 +136,20 @@ def test_frozen_it_gives_the_same_numbers_and_windows_do_not_know_of_each_other(
     [
         ("gnoi", {}, r"unknown; did you mean 'gnio'\? known models: ctin, deepils, gnio"),
         ("gnio", {"bank_sise": 3}, r"unknown option 'bank_sise'; did you mean 'bank_size'\?"),
-        (
-            "tlio",
-            {"equivarience": "none"},
-            r"unknown option 'equivarience'; did you mean 'equivariance'\?",
-        ),
-        ("gnio", {"head": "gatd"}, r"head is 'gatd'; did you mean 'gated'\? choices: gated, line"),
-        ("gnio", {"gate": "relu"}, "gate is 'relu'; choices: tanh, sigmoid"),
-        (
-            "gnio",
-            {"scale": "softpluss"},
-            r"scale is 'softpluss'; did you mean 'softplus'\? choices",
-        ),
-        ("gnio", {"uncertainty": "x"}, "uncertainty is 'x'; choices: head, calibrated, constant"),
-        ("tlio", {"equivariance": "so3"}, "equivariance is 'so3'; choices: none, four_headings"),
-        ("gnio", {"width": 0}, "width must be at least 1.*, found 0"),
-        ("gnio", {"width": "8"}, "width must be at least 1.*, found '8'"),
-        ("gnio", {"bank_size": -1}, "bank_size must not be negative.*, found -1"),
-        ("tlio", {"dropout": 1.0}, "dropout must be at least 0 and below 1, found 1.0"),
-        ("ronin_resnet", {"dropout": float("nan")}, "dropout must be at least 0 and below 1"),
-        ("deepils", {"dropout": -0.1}, "dropout must be at least 0 and below 1, found -0.1"),
-        ("deepils", {"output_dim": 1}, "output_dim is 1; choices: 2, 3"),
-        ("imot_text", {"particles": 0}, "particles must be at least 1.*, found 0"),
-        ("imot_text", {"heads": 0}, "heads must be at least 1.*, found 0"),
-        ("imot", {"ffn_ratio": 0.0}, "ffn_ratio must be positive.*, found 0.0"),
-        ("ctin", {"heads": 0}, "heads must be at least 1.*, found 0"),
+        ("tlio", {"equivarience": "none"}, r"unknown option .* did you mean 'equivariance'\?"),
+        ("gnio", {"head": "gatd"}, "'head' must be one of gated, linear, found 'gatd'; did you me"),
+        ("tlio", {"equivariance": "so3"}, "'equivariance' must be one of none, four_headings"),
+        ("gnio", {"width": 0}, "'width' must be at least 1.*, found 0"),
+        ("gnio", {"width": "8"}, "'width' must be a whole number, found '8'"),
+        ("tlio", {"dropout": 1.0}, "'dropout' must be at least 0 and below 1, found 1.0"),
+        ("deepils", {"output_dim": 1}, "'output_dim' must be one of 2, 3, found 1"),
+        ("imot", {"ffn_ratio": 0.0}, "'ffn_ratio' must be positive.*, found 0.0"),
         ("ctin", {"width": 90}, "width must be even and a multiple of the 8 heads, found 90"),
         ("ctin", {"encoder_width": 20}, "encoder_width must be a multiple of the 8 heads and of 4"),
-        ("ctin", {"encoder_dropout": -0.1}, "encoder_dropout must be at least 0 and below 1"),
     ],
 )
 def test_options_that_cannot_be_are_refused(name, options, problem):
-    with pytest.raises(InputError, match=f"^model '{name}': {problem}"):
+    with pytest.raises(InputError, match=f"^model '{name}': (field )?{problem}"):
         models.create(name, **options)
 
 
@@ -205,18 +167,7 @@ def test_the_settings_have_the_options_and_choices_of_the_networks():
         if option == "name":
             continue
         kinds = [known[option] for known in networks if option in known]
-        assert kinds, option
-        if option != "output_dim":  # numbers, which YAML checks by a bound
-            assert choices(kind) == set().union(*map(choices, kinds)), option
-
-
-@pytest.mark.parametrize("option", ["head", "gate", "scale", "uncertainty"])
-def test_every_choice_makes_a_network(option):
-    windows = jax.ShapeDtypeStruct((2, 64, 6), jnp.float32)
-    for choice in choices(registry.options("gnio")[option]):
-        model = models.create("gnio", **SMALL["gnio"], **{option: choice})
-        variables = models.variable_shapes(model, 64)
-        assert jax.eval_shape(model.apply, variables, windows).displacement.shape == (2, 3)
+        assert kinds and choices(kind) == set().union(*map(choices, kinds)), option
 
 
 class Mean(nn.Module):
@@ -234,7 +185,7 @@ def test_a_network_of_ones_own_is_created_by_its_name(monkeypatch):
     monkeypatch.setattr(registry, "_MODELS", dict(registry._MODELS))
     models.register("mean", Mean)
     assert "mean" in models.names() and models.create("mean", size="large") == Mean("large")
-    with pytest.raises(InputError, match=r"size is 'lage'; did you mean 'large'\?"):
+    with pytest.raises(InputError, match=r"found 'lage'; did you mean 'large'\?"):
         models.create("mean", size="lage")
     models.register("mean", Mean)  # a cell of a notebook that runs again
     with pytest.raises(InputError, match="model 'gnio': is a network of gnio-jax"):

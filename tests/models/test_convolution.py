@@ -27,7 +27,7 @@ def by_definition(x, kernel):
     return np.stack([np.einsum("bkc,kcd->bd", padded[:, n : n + 3], kernel) for n in samples], 1)
 
 
-@pytest.mark.parametrize("length", [1, 3, 4, 5, 8, 13])
+@pytest.mark.parametrize("length", [1, 4, 13])
 def test_values_and_gradients_are_those_of_the_definition(length):
     x, kernel = drawn(length)
     weight = np.random.default_rng(9).standard_normal((2, length, 2)).astype(np.float32)
@@ -161,7 +161,7 @@ def test_float64_keeps_its_digits_and_no_windows_make_none():
     assert convolve_three(jnp.zeros((0, 9, 3)), kernel.astype(jnp.float32)).shape == (0, 9, 2)
 
 
-@pytest.mark.parametrize("length", [100, 50, 25, 13])
+@pytest.mark.parametrize("length", [50, 13])
 def test_max_pool_against_torch_convention(length):
     x = -1 - np.random.default_rng(0).random((2, length, 3)).astype(
         np.float32
@@ -174,9 +174,7 @@ def test_max_pool_against_torch_convention(length):
     )
 
 
-@pytest.mark.parametrize(
-    "size, stride, length", [(7, 2, 11), (7, 2, 12), (3, 2, 11), (3, 2, 12), (3, 1, 5), (1, 2, 12)]
-)
+@pytest.mark.parametrize("size, stride, length", [(7, 2, 11), (3, 2, 12), (3, 1, 5), (1, 2, 12)])
 def test_both_convolutions_are_one_function(size, stride, length):
     """Values, forward and reverse derivatives, against plain NumPy and against each other."""
     rng = np.random.default_rng(0)

@@ -1,6 +1,5 @@
 """Networks that turn with their window, against rotations and covariances in plain NumPy."""
 
-import dataclasses
 import functools
 
 import jax
@@ -9,18 +8,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from gnio_jax import config as configuration
 from gnio_jax import models
-from gnio_jax.config import AugmentConfig, ModelConfig, TrainConfig
-from gnio_jax.errors import InputError
+from gnio_jax.config import ModelConfig
 from gnio_jax.models import equivariance
-from gnio_jax.training.task import create_model
 from tests.support.compiling import quick
 
 SAMPLES = 32
 OPTIONS = {
     "gnio": {"width": 2, "bank_size": 3},
-    "tlio": {"width": 2},
     "ctin": {"width": 4, "encoder_width": 4, "ffn": 4, "heads": 2, "decoder_layers": 1},
 }
 WINDOWS = np.random.default_rng(0).normal([0, 0, 9.8, 0, 0, 0], 2.0, (3, SAMPLES, 6))
@@ -142,28 +137,28 @@ def test_the_network_sees_the_window_in_its_frame(name):
         np.testing.assert_allclose(found, variance, rtol=1e-3)
 
 
-@pytest.mark.parametrize("name, kind", [("gnio", KINDS[0]), ("gnio", KINDS[1]), ("tlio", KINDS[1])])
-def test_frozen_it_gives_the_same_numbers(name, kind):
-    model = network(name, kind)
-    frozen = models.inference_variables(model, variables(name, kind))
-    assert frozen.constants.keys() == ({"memory"} if name == "gnio" else set())
+@pytest.mark.parametrize("kind", KINDS)
+def test_frozen_it_gives_the_same_numbers(kind):
+    model = network("gnio", kind)
+    frozen = models.inference_variables(model, variables("gnio", kind))
+    assert frozen.constants.keys() == {"memory"}
     found = quick(models.Inference(model).__call__)(frozen, EVERY)
-    wanted = predictions(name, kind)
+    wanted = predictions("gnio", kind)
     for ours, theirs in zip(found[:2], wanted[:2], strict=True):
         theirs = theirs.reshape(ours.shape)
         np.testing.assert_allclose(ours, theirs, rtol=1e-3, atol=1e-4 * np.abs(theirs).max())
     if kind == "canonical_frame":
         normalisation = frozen.variables["batch_stats"]["frame"]["bn1"]
         assert not np.any(normalisation["mean"])
-    assert hash(models.Inference(model)) == hash(models.Inference(network(name, kind)))
+    assert hash(models.Inference(model)) == hash(models.Inference(network("gnio", kind)))
 
 
 def test_training_applies_the_network_once():
     """The same numbers as without, dropout included."""
-    given = variables("tlio", "four_headings")
+    given = variables("ctin", "four_headings")
 
     def train(kind):
-        model = network("tlio", kind)
+        model = network("ctin", kind)
         key = {"dropout": jax.random.key(2)}
         options = {"train": True, "mutable": ["batch_stats"], "rngs": key}
         return quick(lambda windows: model.apply(given, windows, **options))(EVERY)
@@ -173,19 +168,13 @@ def test_training_applies_the_network_once():
 
 def test_parameters_keep_their_names():
     shape = lambda tree: jax.tree.map(np.shape, tree)  # noqa: E731
-    for name in OPTIONS:
-        alone = shape(variables(name, "none"))
-        assert shape(variables(name, "four_headings")) == alone
-        framed = shape(variables(name, "canonical_frame"))
-        frame = {part: tree.pop("frame") for part, tree in framed.items()}
-        assert framed == alone
-        assert frame["params"].keys() == {"conv1", "bn1", "conv2", "bn2", "weights"}
-
-
-def test_without_it_the_network_is_the_network():
-    assert network("gnio") == models.create("gnio", **OPTIONS["gnio"])
-    plain = TrainConfig(model=ModelConfig(**OPTIONS["gnio"]))
-    assert create_model(plain) == network("gnio")
+    alone = shape(variables("gnio", "none"))
+    assert shape(variables("gnio", "four_headings")) == alone
+    framed = shape(variables("gnio", "canonical_frame"))
+    frame = {part: tree.pop("frame") for part, tree in framed.items()}
+    assert framed == alone
+    assert frame["params"].keys() == {"conv1", "bn1", "conv2", "bn2", "weights"}
+    assert models.from_config(ModelConfig(**OPTIONS["gnio"])) == network("gnio")
 
 
 def test_turned_variances_against_covariances():
@@ -222,19 +211,3 @@ def test_a_window_without_horizontal_vectors_has_a_heading_and_finite_derivative
     lengths, slope = jax.vjp(equivariance.length, vectors)
     np.testing.assert_array_equal(lengths, [5, 0])
     np.testing.assert_allclose(slope(jnp.ones(2, jnp.float32))[0], [[0.6, -0.8], [0, 0]], rtol=1e-6)
-
-
-def test_the_option_is_kept_and_refused_where_it_makes_no_sense(tmp_path):
-    config = TrainConfig(model=ModelConfig(equivariance="canonical_frame"))
-    configuration.save(tmp_path / "config.yaml", config)
-    assert configuration.load(tmp_path / "config.yaml") == config
-    (tmp_path / "old.yaml").write_text("model: {width: 8}\n")
-    assert configuration.load(tmp_path / "old.yaml").model.equivariance == "none"
-    (tmp_path / "wrong.yaml").write_text("model: {equivariance: so3}\n")
-    with pytest.raises(InputError, match=r"model\.equivariance' must be one of none, four_heading"):
-        configuration.load(tmp_path / "wrong.yaml")
-    unturned = dataclasses.replace(config, augment=AugmentConfig(yaw=False))
-    assert configuration.validate(unturned) == unturned
-    four = dataclasses.replace(unturned, model=ModelConfig(equivariance="four_headings"))
-    with pytest.raises(InputError, match=r"set augment\.yaw to true"):
-        configuration.validate(four)

@@ -8,8 +8,8 @@ import numpy as np
 from gnio_jax import config as configuration
 from gnio_jax import models
 from gnio_jax.training import checkpoint
-from gnio_jax.training.epochs import Position
-from gnio_jax.training.task import TrainState, create_model
+from gnio_jax.training.checkpoint import Position
+from gnio_jax.training.task import TrainState
 
 
 def save(folder, config, draw):
@@ -19,13 +19,13 @@ def save(folder, config, draw):
     """
     configuration.save(folder / "config.yaml", config)
     random = np.random.default_rng(0)
-    shapes = models.variable_shapes(create_model(config), config.data.window)
+    shapes = models.variable_shapes(models.from_config(config.model), config.data.window)
     drawn = {
         kind: jax.tree.map(
             lambda leaf, kind=kind: jnp.asarray(np.float32(draw(random, kind, leaf.shape))), tree
         )
         for kind, tree in shapes.items()
     }
-    state = TrainState(jnp.int32(0), drawn["params"], drawn["batch_stats"], {})
+    state = TrainState(jnp.int32(0), drawn, opt_state={})
     checkpoint.save(folder, "best", state, Position(epoch=1, best=1.0))
     return folder

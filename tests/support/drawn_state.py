@@ -31,11 +31,11 @@ def drawn_state(model, config, steps_per_epoch):
     def statistic(path, leaf):
         return np.full(leaf.shape, path[-1].key == "var", leaf.dtype)
 
-    params = jax.tree_util.tree_map_with_path(parameter, shapes.params)
-    drawn = shapes._replace(
-        step=np.int32(0),
-        params=params,
-        batch_stats=jax.tree_util.tree_map_with_path(statistic, shapes.batch_stats),
-        opt_state=jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), shapes.opt_state),
+    variables = {
+        "params": jax.tree_util.tree_map_with_path(parameter, shapes.variables["params"]),
+        "batch_stats": jax.tree_util.tree_map_with_path(statistic, shapes.variables["batch_stats"]),
+    }
+    opt_state = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), shapes.opt_state)
+    return jax.device_put(
+        shapes._replace(step=np.int32(0), variables=variables, opt_state=opt_state)
     )
-    return jax.device_put(drawn)

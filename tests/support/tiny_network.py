@@ -4,7 +4,7 @@ import jax.numpy as jnp
 from flax import linen as nn
 
 from gnio_jax.models.heads import CalibratedUncertainty, UncertaintyHead
-from gnio_jax.models.layers import linear
+from gnio_jax.models.layers import FLOAT32, MOMENTUM, linear
 from gnio_jax.types import Prediction
 
 
@@ -18,7 +18,7 @@ class Tiny(nn.Module):
         # steps of, and two machines, or two orders of a sum, would not agree on it.
         mean = windows.mean(axis=1)
         h = linear(self.width, "encoder", use_bias=False)(mean)
-        norm = nn.BatchNorm(not train, dtype=jnp.float32, param_dtype=jnp.float32, name="norm")
+        norm = nn.BatchNorm(not train, momentum=MOMENTUM, name="norm", **FLOAT32)
         h = jnp.tanh(norm(h))
         displacement = linear(3, "head")(h)
         if self.uncertainty == "calibrated":

@@ -1,19 +1,27 @@
 """Runs of the smallest network, as `gnio train` leaves them."""
 
 import contextlib
+import dataclasses
+import json
+import signal
+from pathlib import Path
 
+import jax
+import numpy as np
 import pytest
 
+from gnio_jax.config import DataConfig, ModelConfig, OptimConfig, TrainConfig
 from gnio_jax.models import registry
+from gnio_jax.training import checkpoint, loop
 from tests.support import drawn_run
 from tests.support.tiny_network import Tiny
 
 
 @contextlib.contextmanager
-def known():
+def known(network=Tiny):
     """The registry of networks has `tiny`."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(registry._MODELS, "tiny", Tiny)
+        patch.setitem(registry._MODELS, "tiny", network)
         yield
 
 
@@ -25,3 +33,69 @@ def save(folder, config, size=0.2):
         return random.uniform(0.5, 1.5, shape) if statistics else random.normal(0, size, shape)
 
     return drawn_run.save(folder, config, draw)
+
+
+STEPS = 13
+"""Of an epoch of `config`: two walks of 12 s at 50 Hz have 110 windows of 1 s each."""
+
+
+def config(root, workdir, **changes):
+    """Three epochs on walks that `tlio_files.write_splits` wrote. `changes` are fields of the
+    experiment, or of its section `optim`."""
+    of_optim = {field.name for field in dataclasses.fields(OptimConfig)}
+    optim = OptimConfig(epochs=3, batch_size=16, learning_rate=1e-3, warmup_epochs=1.0)
+    found = TrainConfig(
+        dataset="tlio",
+        data_root=root and str(root),
+        workdir=str(workdir),
+        data=DataConfig(rate=50.0),
+        model=ModelConfig("tiny", uncertainty="calibrated"),
+        optim=dataclasses.replace(optim, **{k: v for k, v in changes.items() if k in of_optim}),
+    )
+    rest = {name: value for name, value in changes.items() if name not in of_optim}
+    return dataclasses.replace(found, **rest)
+
+
+def rows(workdir):
+    """The log of a run, without what the clock says."""
+    lines = (Path(workdir) / "metrics.jsonl").read_text().splitlines()
+    return [
+        {name: value for name, value in json.loads(line).items() if "second" not in name}
+        for line in lines
+    ]
+
+
+def arrays(workdir, which="latest"):
+    """What a run has learnt: its network's variables and its filter's numbers."""
+    run = checkpoint.load_run(Path(workdir), which)
+    return jax.tree.map(np.asarray, (run.variables, run.filter))
+
+
+def same(a, b):
+    """Whether two trees hold the same bits."""
+    return all(jax.tree.leaves(jax.tree.map(np.array_equal, a, b)))
+
+
+def assert_same_runs(workdir, other):
+    """To the bit; sums over an epoch are made of fewer or more parts: equal but for rounding."""
+    for which in ("latest", "best"):
+        assert same(arrays(workdir, which), arrays(other, which)), which
+    for ours, theirs in zip(rows(workdir), rows(other), strict=True):
+        assert ours == pytest.approx(theirs, rel=1e-6)
+
+
+@contextlib.contextmanager
+def stopped_at(step, act=lambda: signal.raise_signal(signal.SIGTERM)):
+    """One step a dispatch, and `act` once a run has reached this one."""
+    real = loop.after_steps
+
+    def after_steps(*given):
+        at = real(*given)
+        if at.step == step:
+            act()
+        return at
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(loop, "DISPATCH_SECONDS", 0)
+        patch.setattr(loop, "after_steps", after_steps)
+        yield

@@ -12,12 +12,12 @@ import sys
 
 from gnio_jax.commands import app
 from gnio_jax.models import registry
-from gnio_jax.training import epochs, loop
+from gnio_jax.training import loop
 from tests.support.tiny_network import Tiny
 
 
 def main(name, step, every, *arguments):
-    after_steps = epochs.after_steps
+    after_steps = loop.after_steps
     loop.DISPATCH_SECONDS = 0  # one step at a time
     if every == "1":
         loop.CHECKPOINT_SECONDS = 0
@@ -29,7 +29,7 @@ def main(name, step, every, *arguments):
             os.kill(os.getpid(), signal.Signals[name])
         return at
 
-    epochs.after_steps = interrupted
+    loop.after_steps = interrupted
     app.main(["train", *arguments])
 
 

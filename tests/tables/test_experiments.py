@@ -5,9 +5,9 @@ import dataclasses
 import pytest
 
 from gnio_jax import config as configuration
+from gnio_jax import models
 from gnio_jax.config import LossConfig
 from gnio_jax.tables import experiments
-from gnio_jax.training.task import create_model
 from tests.support.reports import BASE
 
 
@@ -21,7 +21,7 @@ def test_rows_differ_in_the_network_alone():
     rows, seen = [row for table in tables for row in table.rows], {}
     for row in rows:
         own = row.config
-        assert create_model(own) is not None
+        assert models.from_config(own.model) is not None
         assert seen.setdefault(row.name, own) == own
         decay = {name: getattr(chosen, name) for name in ("clip_norm", "weight_decay")}
         optim = dataclasses.replace(own.optim, **decay)
@@ -45,7 +45,7 @@ def test_rows_are_the_published_configurations():
     gates = {row.label: row.config.model for row in experiments.gates(BASE).rows}
     assert all(model.bank_size == 0 for model in gates.values())
     assert gates["tanh × exp"].scale == "exp"
-    banks = [create_model(row.config) for row in experiments.bank_sizes(BASE).rows]
+    banks = [models.from_config(row.config.model) for row in experiments.bank_sizes(BASE).rows]
     assert all(bank.head == "linear" for bank in banks)
     assert [bank.bank_size for bank in banks] == [0, 16, 32, 64, 128]
     parts = [(row.config.model.name, row.published) for row in experiments.components(BASE).rows]
@@ -62,4 +62,4 @@ def test_losses_and_regularisation_are_those_of_the_published_recipes(network):
     assert experiments.loss(network, published) == recipe.loss
     for name in ("clip_norm", "weight_decay"):
         assert getattr(row.optim, name) == getattr(recipe.optim, name)
-    assert create_model(recipe) is not None
+    assert models.from_config(recipe.model) is not None

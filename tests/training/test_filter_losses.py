@@ -161,6 +161,8 @@ def test_the_sum_has_the_weights_and_the_horizons_that_fit():
         covariance=roots @ roots.transpose(0, 2, 1),
         log_likelihood=rng.standard_normal(K),
         displacement=windows_told(estimate, truth) + 0.1,
+        nis=np.where(np.arange(K) < 5, np.nan, 6.0),
+        healthy=np.ones(K),
     )
     weights = ThroughFilter(
         displacement_weight=2.0,
@@ -191,3 +193,9 @@ def test_the_sum_has_the_weights_and_the_horizons_that_fit():
         + 11 * found.window
     )
     np.testing.assert_allclose(found.total, total, rtol=1e-12)
+    squares = [
+        e[3:] @ np.linalg.solve(p[6:9, 6:9], e[3:])
+        for e, p in zip(error, history.covariance, strict=True)
+    ]
+    np.testing.assert_allclose(found.nees, np.mean(squares) / 3, rtol=1e-9)
+    assert found.nis == 2.0 and found.healthy

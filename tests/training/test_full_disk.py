@@ -13,7 +13,7 @@ import pytest
 
 from gnio_jax.errors import InputError
 from gnio_jax.training import checkpoint, run_folder
-from gnio_jax.training.epochs import Position
+from gnio_jax.training.checkpoint import Position
 from gnio_jax.training.run_folder import Log
 from gnio_jax.training.task import TrainState
 
@@ -22,7 +22,7 @@ def state(step):
     """Random numbers, which do not compress."""
     rng = np.random.default_rng(step)
     draw = lambda: {"weights": jnp.asarray(rng.normal(size=9000).astype(np.float32))}  # noqa: E731
-    return TrainState(jnp.int32(step), draw(), {}, draw())
+    return TrainState(jnp.int32(step), {"params": draw(), "batch_stats": {}}, draw())
 
 
 @contextmanager

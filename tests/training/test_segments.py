@@ -92,22 +92,21 @@ def test_no_segment_at_all_is_a_mistake():
         segments.segment_source([sequence(SAMPLES)], SAMPLES)
 
 
-def test_start_errors_have_the_priors_deviations():
-    std = InitialStd(0.1, 0.2, 0.3, 0.4, 0.5, 0.6)
-    keys = jax.random.split(jax.random.key(0), 20_000)
-    draw = jax.jit(jax.vmap(lambda key: segments.draw_start_errors(key, std, 2.0)))
-    found = jax.tree.map(lambda x: np.asarray(x).std(0), draw(keys))
-    np.testing.assert_allclose(found.rotation, [0.2, 0.2, 0.4], rtol=0.03)
-    for name, value in (("velocity", 0.3), ("position", 0.4), ("gyro_bias", 0.5)):
-        np.testing.assert_allclose(getattr(found, name), 3 * [2 * value], rtol=0.03)
-    np.testing.assert_allclose(found.accel_bias, 3 * [1.2], rtol=0.03)
-
-
-def test_a_start_is_turned_in_the_world():
-    whole = sequence(40, seed=3)
-    source = segments.segment_source([whole], SAMPLES)
+def test_a_start_is_off_the_truth_by_the_priors_deviations():
+    """The attitude's error turns it in the world."""
+    std = InitialStd(0.001, 0.002, 0.3, 0.4, 0.5, 0.6)
+    source = segments.segment_source([sequence(40, seed=3)], SAMPLES)
     truth = segments.cut_segment(source, jnp.int32(0), 5, 4).truth
-    nothing = jnp.zeros(3)
-    errors = segments.StartErrors(jnp.array([0.1, -0.2, 0.3]), nothing, nothing, nothing, nothing)
-    expected = Rotation.from_rotvec([0.1, -0.2, 0.3]).as_matrix() @ np.asarray(truth.rotation[0])
-    np.testing.assert_allclose(segments.start_rotation(truth, errors), expected, atol=1e-12)
+    keys = jax.random.split(jax.random.key(0), 20_000)
+    draw = jax.jit(jax.vmap(lambda key: segments.draw_start(key, truth, std, 2.0)))
+    rotation, velocity, position, gyro_bias, accel_bias = map(np.asarray, draw(keys))
+    error = Rotation.from_matrix(rotation @ np.asarray(truth.rotation[0]).T).as_rotvec()
+    np.testing.assert_allclose(error.std(0), [0.002, 0.002, 0.004], rtol=0.03)
+    for found, centre, value in (
+        (velocity, truth.velocity[0], 0.3),
+        (position, truth.position[0], 0.4),
+        (gyro_bias, np.zeros(3), 0.5),
+        (accel_bias, np.zeros(3), 0.6),
+    ):
+        np.testing.assert_allclose(found.std(0), 3 * [2 * value], rtol=0.03)
+        np.testing.assert_allclose(found.mean(0), centre, atol=0.06)

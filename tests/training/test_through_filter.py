@@ -3,7 +3,6 @@
 import dataclasses
 import functools
 import json
-import os
 import shutil
 import signal
 
@@ -29,16 +28,15 @@ from gnio_jax.config import (
 )
 from gnio_jax.errors import InputError
 from gnio_jax.filtering.settings import with_free_parameters
-from gnio_jax.models import registry
-from gnio_jax.reporting import Lines
-from gnio_jax.training import checkpoint, epochs, filter_task, loop, task
+from gnio_jax.reporting import Silence
+from gnio_jax.training import checkpoint, filter_task, loop, optimizer, task
 from gnio_jax.training.filter_task import FilterTask
 from gnio_jax.training.window_task import WindowTask
-from tests.support import drawn_run
+from tests.support import tiny_run
 from tests.support.command_lines import run as gnio
 from tests.support.compiling import quick
 from tests.support.filter_settings import changed
-from tests.support.tiny_network import Tiny
+from tests.support.tiny_run import rows, same
 from tests.support.tlio_files import SPEED, TURN, write_splits
 
 LEARN = ("noise", "measurement", "start", "head")
@@ -58,11 +56,13 @@ THROUGH = ThroughFilter(
     window_weight=1.0,
 )
 
+THROUGH_FILTER = TrainConfig(filter=OPTIONS, through_filter=THROUGH)
+
 
 @pytest.fixture(scope="module", autouse=True)
-def registered():
+def truncated():
+    """The gradient is cut within a segment."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(registry._MODELS, "tiny", Tiny)
         patch.setattr(filter_task, "TRUNCATE_SECONDS", 1.0)
         yield
 
@@ -71,18 +71,8 @@ def registered():
 def recording(tmp_path_factory):
     """A TLIO folder of three walks round a circle, and a run to start from."""
     root = write_splits(tmp_path_factory.mktemp("tlio"))
-    config = TrainConfig(
-        data=DataConfig(rate=50.0, window_seconds=WINDOW), model=ModelConfig(name="tiny")
-    )
-
-    def draw(random, kind, shape):
-        return (
-            random.uniform(0.9, 1.1, shape)
-            if kind == "batch_stats"
-            else random.normal(0, 0.1, shape)
-        )
-
-    drawn_run.save(root / "initial", config, draw)
+    of_data = DataConfig(rate=50.0, window_seconds=WINDOW)
+    tiny_run.save(root / "initial", TrainConfig(data=of_data, model=ModelConfig("tiny")), 0.1)
     return root
 
 
@@ -109,14 +99,6 @@ def finished(recording, tmp_path_factory):
     return workdir
 
 
-def rows(workdir):
-    return [json.loads(line) for line in (workdir / "metrics.jsonl").read_text().splitlines()]
-
-
-def same(a, b):
-    return all(jax.tree.leaves(jax.tree.map(np.array_equal, a, b)))
-
-
 def test_a_run_logs_its_losses_and_what_the_filter_knows_of_its_errors(finished):
     found = rows(finished)
     # 12 s have five segments of 2 s, since the sample at the end of each is needed; two walks.
@@ -124,7 +106,7 @@ def test_a_run_logs_its_losses_and_what_the_filter_knows_of_its_errors(finished)
     for row in found:
         parts = ("displacement", "yaw", "innovation", "state", "mse")
         assert row["loss"] == pytest.approx(sum(row[part] for part in parts), rel=1e-6)
-        assert row["skipped"] == 0 and row["segments_per_second"] > 0
+        assert row["skipped"] == 0
         assert row["val_rmse"] == pytest.approx(row["val_mse"] ** 0.5)
         assert row["val_nis"] > 0 and row["val_nees"] > 0
         assert (
@@ -150,42 +132,24 @@ def test_what_is_not_to_learn_stays_to_the_bit(recording, finished):
     assert configuration.load(finished / "config.yaml").filter == OPTIONS
 
 
-def test_stopped_and_resumed_gives_the_same_bits(recording, finished, tmp_path, monkeypatch):
-    real = task.train_steps
-
-    def stopping(*arguments, **options):
-        os.kill(os.getpid(), signal.SIGTERM)
-        return real(*arguments, **options)
-
-    monkeypatch.setattr(task, "train_steps", stopping)
+def test_stopped_and_resumed_gives_the_same_bits(recording, finished, tmp_path):
     run = tmp_path / "run"
-    assert loop.train(tiny(recording, run)).stopped_by == signal.SIGTERM
-    assert checkpoint.load_run(run, "latest").step == 1
-    monkeypatch.setattr(task, "train_steps", real)
+    with tiny_run.stopped_at(1):
+        assert loop.train(tiny(recording, run)).stopped_by == signal.SIGTERM
     # The weights that it started from are not needed any more.
     resumed = tiny(recording, run, init_from="gone")
     assert loop.train(resumed, resume=True).stopped_by is None
-    for which in ("latest", "best"):
-        ours, theirs = (checkpoint.load_run(folder, which) for folder in (run, finished))
-        assert ours.step == theirs.step
-        assert same(ours.variables, theirs.variables) and same(ours.filter, theirs.filter)
-    for ours, theirs in zip(rows(run), rows(finished), strict=True):
-        for row in (ours, theirs):
-            row.pop("segments_per_second"), row.pop("seconds")
-        assert ours == pytest.approx(theirs, rel=1e-9)
+    tiny_run.assert_same_runs(run, finished)
 
 
-def test_evaluation_takes_what_the_filter_has_learnt(finished, capsys):
-    gnio("evaluate", "--workdir", str(finished), "--no-plots")
-    learnt_values = configuration.plain(checkpoint.load_run(finished).config.filter)
-    metrics = json.loads((finished / "eval" / "tlio_test_ekf" / "metrics.json").read_text())
-    assert metrics["settings"]["filter"] == learnt_values
-    assert learnt_values["noise"]["gyro_density"] != OPTIONS.noise.gyro_density
-    # The latest checkpoint's are taken where that is asked for.
-    latest = configuration.plain(checkpoint.load_run(finished, "latest").config.filter)
-    gnio("evaluate", "--workdir", str(finished), "--no-plots", "--checkpoint", "latest")
-    metrics = (finished / "eval" / "tlio_test_ekf_latest" / "metrics.json").read_text()
-    assert json.loads(metrics)["settings"]["filter"] == latest
+def test_evaluation_takes_what_the_filter_has_learnt(finished):
+    """By the checkpoint that is asked for."""
+    given = ("--split", "val", "--estimator", "imu_only", "--no-plots", "--checkpoint", "latest")
+    gnio("evaluate", "--workdir", str(finished), *given)
+    metrics = finished / "eval" / "tlio_val_imu_only_latest" / "metrics.json"
+    learnt = configuration.plain(checkpoint.load_run(finished, "latest").config.filter)
+    assert json.loads(metrics.read_text())["settings"]["filter"] == learnt
+    assert learnt["noise"]["gyro_density"] != OPTIONS.noise.gyro_density
 
 
 def test_a_copy_with_other_options_has_them(finished, tmp_path):
@@ -219,7 +183,7 @@ def test_what_an_earlier_version_has_trained_is_told(finished, tmp_path):
 def training(recording):
     """Task and segments of a run that is never written."""
     with jax.enable_x64(True):
-        found, recordings = task.set_up(FilterTask, tiny(recording, "unused"), Lines())
+        found, recordings = task.set_up(FilterTask, tiny(recording, "unused"), Silence())
     return found, recordings.source
 
 
@@ -234,30 +198,31 @@ def oracle(state):
     with σ = 5 cm."""
     angle = TURN * WINDOW
     truth = SPEED / TURN * np.array([np.sin(angle), 1 - np.cos(angle), 0.0])
-    params = jax.tree.map(lambda leaf: 0.01 * leaf, state.params)
+    params = jax.tree.map(lambda leaf: 0.01 * leaf, state.variables["params"])
     params["head"]["bias"] = jnp.float32(truth)
     params["uncertainty"]["log_std"]["bias"] = jnp.full(3, np.log(0.05), jnp.float32)
-    return state._replace(params=params)
+    return state._replace(variables=state.variables | {"params": params})
 
 
-KEYS = task.keys_of(0)
+KEY = jax.random.key(0)
 
 
 def begun(training, start):
     """The oracle at step 0, in memory of its own."""
-    return oracle(parallel.everywhere(training.initial_state(KEYS.init, start)))
+    return oracle(parallel.everywhere(training.initial_state(KEY, start)))
 
 
 def take(training, state, source, first, count=1):
     """Steps of an epoch as long as the task's, with the first five segments: compiled once."""
     order = jnp.repeat(source.earliest[:5], 2)
-    return training.take_steps(state, source, order, first, count, 1.0, KEYS.step)
+    numbers = jnp.int32(first), jnp.int32(count), jnp.float32(1)
+    return training.take_steps(state, source, order, *numbers, KEY)
 
 
 def test_each_seed_has_the_weights_of_the_run(training, start):
     """The steps take the memory of their state; that of the weights, which the next seed starts
     from, is another."""
-    state = parallel.everywhere(training[0].initial_state(KEYS.init, start))
+    state = parallel.everywhere(training[0].initial_state(KEY, start))
     for leaf in jax.tree.leaves(state):
         leaf.delete()
     assert not any(leaf.is_deleted() for leaf in jax.tree.leaves(start))
@@ -278,7 +243,7 @@ def test_wild_steps_are_skipped_and_counted(training, start):
         assert same(before, (state.variables, state.opt_state))
         assert progress.sums.pop("skipped") == 1
         assert len(progress.sums) > 6 and all(each == 0 for each in progress.sums.values())
-        assert epochs.mean_figures({"loss": 6.0, "skipped": 2.0}, 5) == {"loss": 2.0, "skipped": 2}
+    assert loop.mean_figures({"loss": 6.0, "skipped": 2.0}, 5) == {"loss": 2.0, "skipped": 2}
 
 
 @pytest.mark.parametrize(
@@ -291,10 +256,11 @@ def test_a_step_is_skipped_where_the_filter_diverged_or_the_loss_is_infinite(
     """Whatever its gradient."""
     training, source = training
 
-    def found(trained, *_):
+    def found(trained, variables, *_):
         figures = dict.fromkeys(FilterTask.figures, jnp.float64(0)) | {"loss": jnp.float64(total)}
         gradient = jax.tree.map(jnp.ones_like, trained)
-        return gradient, task.BatchLosses(figures, state.batch_stats, jnp.bool_(healthy))
+        statistics = variables["batch_stats"]
+        return gradient, task.BatchLosses(figures, statistics, jnp.bool_(healthy))
 
     monkeypatch.setattr(task, "gradient_of", found)
     optim = dataclasses.replace(training.config.optim, epochs=100 + number)  # compiled for itself
@@ -310,7 +276,7 @@ def test_a_skipped_step_does_not_shift_the_schedule(training, start):
     """The rate that the log gives for a step is the one that is in force, whatever was skipped
     before: the same step is taken after a skip."""
     training, source = training
-    rates = [epochs.learning_rate(epochs.Position(step=step), training) for step in range(4)]
+    rates = [loop.learning_rate(checkpoint.Position(step=step), training) for step in range(4)]
     assert len(set(rates)) == 4
     state, other = (begun(training, start) for _ in range(2))
     lost = source._replace(accel=source.accel.at[:].set(np.nan))
@@ -330,7 +296,7 @@ def test_training_segments_are_turned_by_any_yaw(training):
         found.append(draw(jax.random.key(0), source, jnp.zeros(64, jnp.int32)))
     as_walked, turned = found
     np.testing.assert_array_equal(as_walked[0].gyro, turned[0].gyro)
-    np.testing.assert_array_equal(as_walked[1].velocity, turned[1].velocity)
+    np.testing.assert_array_equal(as_walked[1][3], turned[1][3])  # the gyro's first bias
     before, after = (np.asarray(found[0].truth.velocity[:, 0]) for found in (as_walked, turned))
     np.testing.assert_allclose(np.linalg.norm(after, axis=1), np.linalg.norm(before, axis=1))
     assert (before == before[0]).all()
@@ -341,9 +307,9 @@ def test_training_segments_are_turned_by_any_yaw(training):
 def test_no_call_to_lapack_waits_for_a_worker(training, start):
     """Where each core is a device, its batched calls in the step deadlock."""
     training, source = training
-    state, order = training.initial_state(KEYS.init, start), jnp.resize(source.earliest, 10)
+    state, order = training.initial_state(KEY, start), jnp.resize(source.earliest, 10)
     numbers = jnp.int32(0), jnp.int32(1), jnp.float32(1)
-    lowered = task.train_steps.trace(state, source, order, *numbers, KEYS.step, task=training)
+    lowered = task.train_steps.trace(state, source, order, *numbers, KEY, task=training)
     assert "cholesky" not in str(lowered.jaxpr) and "triangular_solve" not in str(lowered.jaxpr)
 
 
@@ -358,10 +324,11 @@ def test_noise_is_recovered(training, start):
         noisy = source._replace(gyro=gyro, accel=accel)
         state = begun(training, start)
         for epoch in range(2):
-            order = training.order(KEYS.order, epoch, noisy)
-            state, progress = training.take_steps(state, noisy, order, 0, 2, 1.0, KEYS.step)
+            order = training.order(KEY, epoch, noisy)
+            numbers = jnp.int32(0), jnp.int32(2), jnp.float32(1)
+            state, progress = training.take_steps(state, noisy, order, *numbers, KEY)
             assert progress.sums["skipped"] == 0
-        found = filter_task.trained_settings(OPTIONS, state.filter)
+        found = optimizer.trained_settings(OPTIONS, state.variables["filter"])
         for name in ("gyro_density", "accel_density"):
             ratio = getattr(found.noise, name) / getattr(OPTIONS.noise, name)
             assert ratio > 1.2 if share > 1 else ratio < 0.8, (name, share, ratio)
@@ -376,8 +343,9 @@ def test_gradient_against_differences(training, start, monkeypatch):
     config = dataclasses.replace(training.config, through_filter=through)
     state = begun(training, start)
     of_all = dataclasses.replace(training, config=config)
-    batch = jax.jit(of_all.segments)(jax.random.key(5), source, source.earliest[:2])
-    chosen = filter_task.trainable(state.variables, through.learn)
+    segments = jax.jit(of_all.segments, static_argnums=3)
+    batch = segments(jax.random.key(5), source, source.earliest[:2], False)
+    chosen = optimizer.trainable(state.variables, through.learn)
     # The network computes in float32 whatever it is given.
     chosen["filter"] = {name: jnp.float64(number) for name, number in chosen["filter"].items()}
     evaluated = quick(functools.partial(task.gradient_of, step=jnp.int32(0), task=of_all))
@@ -402,29 +370,36 @@ def test_gradient_against_differences(training, start, monkeypatch):
         np.testing.assert_allclose(slope, expected, rtol=tolerance, atol=1e-7, err_msg=str(path))
 
 
-def test_parts_are_modules_and_options_by_name(training, start):
-    variables = training[0].initial_state(KEYS.init, start).variables
-    assert filter_task.trainable(variables, ("uncertainty",)).keys() == {"params"}
-    chosen = {
-        name: filter_task.trainable(variables, (name,)) for name in ("encoder", "head", "noise")
+@pytest.mark.parametrize(
+    "learn, params, numbers",
+    [
+        ("encoder", {"encoder", "norm", "bank"}, ()),
+        ("head", {"head", "displacement"}, ()),  # TLIO's name, too
+        ("uncertainty", {"uncertainty", "log_std"}, ()),
+        ("noise", set(), optimizer.FILTER_PARTS["noise"]),
+        ("measurement", set(), ("noise.measurement_scale", "noise.std_factor.0")),
+        ("start", set(), ("start.yaw", "start.velocity")),
+    ],
+)
+def test_parts_are_modules_and_options_by_name(learn, params, numbers):
+    modules = ("encoder", "norm", "bank", "head", "displacement", "uncertainty", "log_std")
+    given = {
+        "params": dict.fromkeys(modules, 0),
+        "filter": optimizer.filter_numbers(THROUGH_FILTER),
     }
-    assert chosen["encoder"]["params"].keys() == {"encoder", "norm"}
-    assert chosen["head"]["params"].keys() == {"head"}
-    assert chosen["noise"] == {
-        "filter": {n: variables["filter"][n] for n in filter_task.FILTER_PARTS["noise"]}
-    }
-    assert filter_task.trainable(variables, ("measurement",)).keys() == {"filter"}
-    everything = filter_task.trainable(variables, ("all",))
-    assert everything["params"].keys() == variables["params"].keys()
-    assert everything["filter"].keys() == variables["filter"].keys()
-    parts = {filter_task.module_part(name) for name in ("log_std", "displacement", "bank")}
-    assert parts == {"uncertainty", "head", "encoder"}  # TLIO's names, and the bank
+    found = optimizer.trainable(given | {"batch_stats": {}}, (learn,))
+    assert (
+        found.get("params", {}).keys() == params and set(numbers) <= found.get("filter", {}).keys()
+    )
+    assert all(each for each in found.values())
+    assert optimizer.trainable(given, ("all", "head")) == given
+    assert optimizer.trainable(given, ()) == {"params": given["params"]}
 
 
 def test_options_survive_their_unconstrained_numbers():
-    numbers = filter_task.filter_numbers(OPTIONS)
+    numbers = optimizer.filter_numbers(THROUGH_FILTER)
     assert "start.tilt" not in numbers and "considered.scale" not in numbers
-    assert filter_task.trained_settings(OPTIONS, numbers) == OPTIONS
+    assert optimizer.trained_settings(OPTIONS, numbers) == OPTIONS
     given, found = (
         dict(jax.tree_util.tree_leaves_with_path(each))
         for each in (OPTIONS, with_free_parameters(OPTIONS, numbers))
@@ -438,7 +413,7 @@ def test_options_survive_their_unconstrained_numbers():
     assert moved.noise.correlation.share == 0.5
     np.testing.assert_allclose(moved.start.velocity, np.e, rtol=1e-7)
     # A share is never rounded to 1, which no setting may be.
-    nearly = filter_task.trained_settings(OPTIONS, {"noise.correlation.share": jnp.float32(20)})
+    nearly = optimizer.trained_settings(OPTIONS, {"noise.correlation.share": jnp.float32(20)})
     assert nearly.noise.correlation.share == 0.9999
 
 
@@ -452,11 +427,11 @@ def test_a_later_stage_starts_from_what_the_filter_has_learnt(recording, finishe
     assert begins == run.config.filter != OPTIONS
     config = tiny(recording, "unused", filter=changed(begins, start={"velocity": 0.3}))
     later = dataclasses.replace(training[0], config=config)
-    state = later.initial_state(KEYS.init, run.variables)
-    assert same(state.params, run.variables["params"])
-    other = state.filter.pop("start.velocity")
+    state = later.initial_state(KEY, run.variables)
+    assert same(state.variables["params"], run.variables["params"])
+    other = state.variables["filter"].pop("start.velocity")
     np.testing.assert_allclose(other, np.log(0.3), rtol=1e-6)
-    for name, number in state.filter.items():
+    for name, number in state.variables["filter"].items():
         np.testing.assert_allclose(number, run.filter[name], atol=1e-4, err_msg=name)
 
 
@@ -464,12 +439,14 @@ def test_training_on_windows_starts_from_a_runs_weights(recording):
     config = tiny(recording, "unused", through_filter=ThroughFilter())
     with jax.enable_x64(False):
         start = checkpoint.initial_run(config, checkpoint.load_run)
-        training, _ = task.set_up(WindowTask, config, Lines())
-        state = training.initial_state(KEYS.init, start.variables)
+        training, _ = task.set_up(WindowTask, config, Silence())
+        state = training.initial_state(KEY, start.variables)
     theirs = checkpoint.load_run(recording / "initial").variables
-    assert same(state.params, theirs["params"]) and state.filter == {}
-    assert same(state.batch_stats["norm"], theirs["batch_stats"]["norm"])
-    assert (np.asarray(state.batch_stats["uncertainty"]["log_factor"]) == 0).all()
+    assert same(state.variables["params"], theirs["params"])
+    statistics = state.variables["batch_stats"]
+    assert same(statistics["norm"], theirs["batch_stats"]["norm"])
+    assert state.variables.keys() == {"params", "batch_stats"}
+    assert (np.asarray(statistics["uncertainty"]["log_factor"]) == 0).all()
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,75 @@
+"""Layers in plain NumPy, for one window at a time: direct sums, no matrix tricks. `q` are the
+parameters of a layer, `s` its statistics."""
+
+import jax
+import numpy as np
+
+
+def float64(variables):
+    """Parameters and statistics."""
+    whole = jax.tree.map(lambda x: np.asarray(x, np.float64), variables)
+    return whole["params"], whole["batch_stats"]
+
+
+def linear(x, q):
+    return x @ q["kernel"] + q.get("bias", 0)
+
+
+def relu(x):
+    return np.maximum(x, 0)
+
+
+def sigmoid(x):
+    return 1 / (1 + np.exp(-x))
+
+
+def softmax(x, axis=-1):
+    e = np.exp(x - x.max(axis=axis, keepdims=True))
+    return e / e.sum(axis=axis, keepdims=True)
+
+
+def layer_norm(x, q):
+    spread = np.sqrt(x.var(-1, keepdims=True) + 1e-5)
+    return (x - x.mean(-1, keepdims=True)) / spread * q["scale"] + q["bias"]
+
+
+def conv(x, kernel, stride=1, padding=0):
+    x, size = np.pad(x, ((padding, padding), (0, 0))), len(kernel)
+    rows = range(0, len(x) - size + 1, stride)
+    return np.array([sum(x[r + k] @ kernel[k] for k in range(size)) for r in rows])
+
+
+def batch_norm(x, q, s):
+    return (x - s["mean"]) / np.sqrt(s["var"] + 1e-5) * q["scale"] + q["bias"]
+
+
+def conv_norm(x, name, q, s, stride=1, padding=0):
+    """The convolution `name` and its normalisation."""
+    norm = name.replace("conv", "bn")
+    return batch_norm(conv(x, q[name]["kernel"], stride, padding), q[norm], s[norm])
+
+
+def resnet(x, q, s, block):
+    """Stem, max-pool and four groups of two blocks `block(x, q, s, stride)`."""
+    x = relu(conv_norm(x, "stem_conv", q, s, 2, 3))
+    x = np.array([x[max(0, r - 1) : r + 2].max(axis=0) for r in range(0, len(x), 2)])
+    for group in range(4):
+        for number in range(2):
+            name = f"group{group + 1}_block{number + 1}"
+            x = block(x, q[name], s[name], 2 if group and not number else 1)
+    return x
+
+
+def attention(query, key, value, q, causal=False):
+    """Step by step, head by head; causal: a step sees no later one."""
+    out = np.zeros((len(query), q["out"]["kernel"].shape[-1])) + q["out"]["bias"]
+    for h in range(q["query"]["kernel"].shape[1]):
+        a, b, c = (
+            x @ q[name]["kernel"][:, h] + q[name]["bias"][h]
+            for name, x in (("query", query), ("key", key), ("value", value))
+        )
+        for i in range(len(a)):
+            seen = i + 1 if causal else len(b)
+            weights = softmax(b[:seen] @ a[i] / np.sqrt(a.shape[1]))
+            out[i] += weights @ c[:seen] @ q["out"]["kernel"][h]
+    return out
