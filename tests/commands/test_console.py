@@ -1,6 +1,7 @@
 """The terminal: exit statuses and one-line errors, no control characters, the compilers' cache."""
 
 import os
+import signal
 import subprocess
 import sys
 import warnings
@@ -9,44 +10,51 @@ from pathlib import Path
 import pytest
 from rich.table import Table
 
-import gnio_jax
 from gnio_jax.commands import console
 from gnio_jax.errors import InputError
 
 
-def outcome(body, **options):
-    program = (
-        "from gnio_jax.commands import console\nfrom gnio_jax.errors import InputError\n"
-        f"def main():\n    {body}\nconsole.run(main)\n"
-    )
-    return subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, timeout=60, **options
-    )
+@pytest.fixture(autouse=True)
+def handlers(monkeypatch):
+    """The signal's handler as it was, and the caches' places."""
+    before = signal.getsignal(signal.SIGTERM)
+    for name in ("JAX_COMPILATION_CACHE_DIR", "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"):
+        monkeypatch.setenv(name, os.environ.get(name, "0"))
+    yield
+    signal.signal(signal.SIGTERM, before)
+
+
+def mistaken():
+    raise InputError("file.csv", "has no column x", "add\nit")
+
+
+def interrupted():
+    raise KeyboardInterrupt
 
 
 @pytest.mark.parametrize(
-    "body, status, line",
+    "main, status, line",
     [
-        (
-            "raise InputError('file.csv', 'has no column x', 'add\\nit')",
-            2,
-            "file.csv: has no column x; add it\n",
-        ),
-        ("raise KeyboardInterrupt", 130, "interrupted\n"),
-        ("open('/dev/null/x', 'w')", 2, "/dev/null/x: Not a directory\n"),
-        ("import os; os.kill(os.getpid(), 15)", 143, ""),
-        ("import warnings; warnings.warn('two\\nlines')", 0, "warning: two lines\n"),
-        ("print('fine')", 0, ""),
+        (mistaken, 2, "file.csv: has no column x; add it\n"),
+        (interrupted, 130, "interrupted\n"),
+        (lambda: open("/dev/null/x", "w"), 2, "/dev/null/x: Not a directory\n"),
+        (lambda: os.kill(os.getpid(), signal.SIGTERM), 143, ""),
+        (lambda: warnings.warn("two\nlines", stacklevel=1), None, "warning: two lines\n"),
     ],
 )
-def test_run_ends_in_one_line_and_a_status(body, status, line):
-    result = outcome(body)
-    assert (result.returncode, result.stderr) == (status, line)
+def test_run_ends_in_one_line_and_a_status(main, status, line, capsys):
+    if status is None:
+        console.run(main)
+    else:
+        with pytest.raises(SystemExit) as left:
+            console.run(main)
+        assert left.value.code == status
+    assert capsys.readouterr() == ("", line)
 
 
 def test_faults_of_the_program_keep_their_traceback():
-    result = outcome("1 / 0")
-    assert result.returncode == 1 and "Traceback" in result.stderr
+    with pytest.raises(ZeroDivisionError):
+        console.run(lambda: 1 / 0)
 
 
 def test_names_of_files_are_no_controls_of_the_terminal(capsys):
@@ -71,36 +79,30 @@ def test_names_of_files_are_no_controls_of_the_terminal(capsys):
     assert err.count(r"walk\x1b]0;mine") == 3
 
 
-def test_another_copy_of_the_package_in_the_working_folder_is_told(tmp_path):
+def test_another_copy_of_the_package_in_the_working_folder_is_told(tmp_path, monkeypatch, capsys):
     """What is changed there would have no effect on `gnio`."""
-    environment = {**os.environ, "PYTHONPATH": str(Path(gnio_jax.__file__).parents[1])}
+    monkeypatch.chdir(tmp_path)
+    console.warn_of_other_sources()
     (tmp_path / "gnio_jax").mkdir()
-    # `gnio` is a script in another folder; a program that is given by -c looks here first.
-    body = "print('ran')"
-    (tmp_path / "bin").mkdir()
-    (tmp_path / "bin" / "gnio.py").write_text(
-        f"from gnio_jax.commands import console\nconsole.run(lambda: {body})\n"
-    )
-    command = [sys.executable, str(tmp_path / "bin" / "gnio.py")]
-
-    def run():
-        return subprocess.run(
-            command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=60
-        )
-
-    assert (run().stderr, run().stdout) == ("", "ran\n")
     (tmp_path / "gnio_jax" / "__init__.py").write_text("")
-    shown = run()
-    (line,) = shown.stderr.splitlines()
+    assert capsys.readouterr().err == ""
+    console.warn_of_other_sources()
+    (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("warning: ") and "pip install -e ." in line
-    assert (shown.returncode, shown.stdout) == (0, "ran\n")
 
 
 def test_what_is_compiled_is_kept(tmp_path):
-    body = "import jax; jax.config.update('jax_persistent_cache_min_compile_time_secs', 0); "
-    body += "print(jax.config.jax_compilation_cache_dir, jax.jit(lambda x: x + 1)(1.0))"
+    program = (
+        "from gnio_jax.commands import console\n"
+        "def main():\n    import jax\n"
+        "    jax.config.update('jax_persistent_cache_min_compile_time_secs', 0)\n"
+        "    print(jax.config.jax_compilation_cache_dir, jax.jit(lambda x: x + 1)(1.0))\n"
+        "console.run(main)\n"
+    )
     kept = {name: value for name, value in os.environ.items() if "CACHE" not in name}
-    shown = outcome(body, env={**kept, "XDG_CACHE_HOME": str(tmp_path)})
+    given = {"capture_output": True, "text": True, "timeout": 60}
+    environment = {**kept, "XDG_CACHE_HOME": str(tmp_path)}
+    shown = subprocess.run([sys.executable, "-c", program], env=environment, **given)
     place = tmp_path / "gnio-jax" / "compiled"
     assert shown.stdout == f"{place} 2.0\n" and shown.stderr == ""
     assert any(place.iterdir())

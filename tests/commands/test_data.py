@@ -269,18 +269,6 @@ def test_a_conversion_is_whole_or_not_there(root, reads, monkeypatch, capsys):
         run(*command)
 
 
-@pytest.mark.slow
-def test_processes_convert_the_same(root):
-    (root / "train_list.txt").write_text("fair\nalso\n")
-    for workers in (1, 2):
-        out = root.parent / f"by{workers}"
-        loading.convert(data.get("tlio"), root, out, "train", workers=workers)
-    found = (data.load("csv", root.parent / f"by{workers}", "train") for workers in (1, 2))
-    for one, two in zip(*found, strict=True):
-        same(one, two)
-        assert one.attributes == two.attributes
-
-
 def test_what_a_dataset_asks_of_its_recordings_goes_with_them(root, monkeypatch):
     """Positions of another body do not correlate; the converted ones must not be refused for it,
     nor let pass who runs too fast."""
@@ -384,21 +372,6 @@ def test_what_follows_an_import_beside_its_own_csv_can_be_followed(place, capsys
     with pytest.raises(InputError, match="has the name of"):
         data.load("csv", place, "test")
     assert read_imported(place / "walk.h5").sequence.name == "walk"
-
-
-def test_import_of_a_file_for_each_sensor(place, capsys):
-    time = write_phone(place / "gyro.csv", csv.GYRO)
-    write_phone(place / "accel.csv", csv.ACCEL, time=time[:-100] + 0.004)
-    units = ["--gyro-unit", "rad/s", "--time-unit", "s"]
-    out = ["--out", "own/two.h5", "--name", "walk 2"]
-    run("data", "import", "gyro.csv", "--accel-path", "accel.csv", *out, *units)
-    noted = "gyro and accel have stamps of their own: both are interpolated"
-    assert noted in capsys.readouterr().out
-    (sequence,) = data.load("csv", place / "own", "test")
-    assert sequence.name == "two" and len(sequence.time) == 1899  # that of its file
-    inner = slice(20, -20)
-    force = walk.force(sequence.time + 0.01)
-    np.testing.assert_allclose(sequence.accel[inner], force[inner], atol=2e-3)
 
 
 # --- mistakes

@@ -59,7 +59,7 @@ def test_the_projections_start_as_those_of_pytorch():
 
 
 def test_a_new_head_predicts_that_it_stands_still():
-    h = 3 * np.random.default_rng(0).standard_normal((16, 64)).astype(np.float32)
+    h = 3 * jnp.float32(np.random.default_rng(0).standard_normal((16, 64)))
     (displacement, _), _ = GatedHead().init_with_output(jax.random.key(0), h)
     assert 0 < np.abs(displacement).max() < 0.2
     for head in (heads.UncertaintyHead(), heads.CalibratedUncertainty()):
@@ -143,7 +143,7 @@ GATES = {"tanh": np.tanh, "sigmoid": sigmoid}
 def test_gates_and_scales():
     assert heads.SCALES.keys() == SCALES.keys() and heads.GATES.keys() == GATES.keys()
     random = np.random.default_rng(0)
-    h = random.standard_normal((4, 16)).astype(np.float32)
+    h = jnp.float32(random.standard_normal((4, 16)))
     for gate, scale in [*((name, "abs") for name in GATES), *(("tanh", name) for name in SCALES)]:
         head = GatedHead(gate, scale)
         shape = jax.eval_shape(head.init, jax.random.key(1), h)
