@@ -300,23 +300,21 @@ def render(report: Report) -> Group:
     for place, (name, own) in enumerate(report.scores.items(), start=1):
         add(name, numbers(own.values), last=place == len(report.scores))
     lost = report.diverged
+    intervals = {name: of.interval or (None, None) for name, of in summary.items()}
     add(_mean_of(lost), numbers({name: of.mean for name, of in summary.items()}), "bold")
     add("median", numbers({name: of.median for name, of in summary.items()}))
-    intervals = {name: of.interval or (None, None) for name, of in summary.items()}
-    add("95 % from", numbers({name: low for name, (low, _) in intervals.items()}))
-    add("95 % to", numbers({name: high for name, (_, high) in intervals.items()}))
+    for end, label in enumerate(("95 % from", "95 % to")):
+        add(label, numbers({name: of[end] for name, of in intervals.items()}))
     add("n", [str(summary[name].sequences) for name in shown], "dim")
     add("groups", [str(summary[name].groups) for name in shown], "dim", last=True)
     for row, scores in report.reference_rows.items():
         own = [name for name, measures in scores.items() if measures.diverged]
         label = f"{row} ({_mean_of(own)})" if own else row
         add(label, numbers({name: of.mean for name, of in report.summary(row).items()}), "italic")
+        lost = lost + own
     how = "; ".join(f"{name}: {text}" for name, text in about(report.settings).items())
     signs = "reference rows are means; – is not defined (the reason is in metrics.json)"
-    any_lost = lost or any(
-        own.diverged for of in report.reference_rows.values() for own in of.values()
-    )
-    warnings = [DIVERGED] if any_lost else []
+    warnings = [DIVERGED] if lost else []
     return Group(
         grid,
         *(Text(line, style="dim") for line in (how, signs)),

@@ -165,6 +165,7 @@ def library(folder):
     return headers[0], folder / "libonnxruntime.so"
 
 
+@pytest.mark.slow
 def test_the_example_in_c(models, walked, found, tmp_path):
     headers, shared = library(tmp_path)
     build, csv, out = tmp_path / "build", tmp_path / "walk.csv", tmp_path / "positions.csv"
