@@ -14,25 +14,13 @@ def quaternions(rotation):
 
 def walk(seed=0, n=900, tilt=0.0):
     """A wandering path at about 1.2 m/s whose yaw follows it, with a stop in the middle."""
-    random = np.random.default_rng(seed)
+    random, k = np.random.default_rng(seed), np.arange(n)
     heading = np.cumsum(random.normal(0, 0.08, n))
-    speed = np.where(
-        (np.arange(n) > 400) & (np.arange(n) < 480), 0.0, 1.2 + 0.2 * np.sin(np.arange(n) * 0.3)
-    )
-    steps = (
-        np.stack(
-            [speed * np.cos(heading), speed * np.sin(heading), 0.1 * np.sin(np.arange(n) * 0.05)], 1
-        )
-        * STEP
-    )
-    angles = np.stack(
-        [heading, tilt * np.sin(np.arange(n) * 0.07), tilt * np.cos(np.arange(n) * 0.11)], 1
-    )
-    return Trajectory(
-        np.arange(n) * STEP + 5.0,
-        np.cumsum(steps, 0),
-        quaternions(Rotation.from_euler("ZYX", angles)),
-    )
+    speed = np.where((k > 400) & (k < 480), 0.0, 1.2 + 0.2 * np.sin(k * 0.3))
+    velocity = [speed * np.cos(heading), speed * np.sin(heading), 0.1 * np.sin(k * 0.05)]
+    position = np.cumsum(np.stack(velocity, 1) * STEP, 0)
+    angles = np.stack([heading, tilt * np.sin(k * 0.07), tilt * np.cos(k * 0.11)], 1)
+    return Trajectory(k * STEP + 5.0, position, quaternions(Rotation.from_euler("ZYX", angles)))
 
 
 def perturbed(truth, seed=1, scale=0.05):
@@ -40,17 +28,17 @@ def perturbed(truth, seed=1, scale=0.05):
     n = len(truth.time)
     turn = Rotation.from_rotvec(np.cumsum(random.normal(0, 0.004, (n, 3)), 0))
     moved = truth.position + np.cumsum(random.normal(0, scale, (n, 3)), 0)
-    return Trajectory(
-        truth.time, moved, quaternions(turn * Rotation.from_quat(np.roll(truth.orientation, -1, 1)))
-    )
+    return Trajectory(truth.time, moved, turned(truth, turn))
 
 
 def moved_by(trajectory, rotation, shift):
-    return Trajectory(
-        trajectory.time,
-        rotation.apply(trajectory.position) + shift,
-        quaternions(rotation * Rotation.from_quat(np.roll(trajectory.orientation, -1, 1))),
-    )
+    position = rotation.apply(trajectory.position) + shift
+    return Trajectory(trajectory.time, position, turned(trajectory, rotation))
+
+
+def turned(trajectory, rotation):
+    attitude = Rotation.from_quat(trajectory.orientation, scalar_first=True)
+    return quaternions(rotation * attitude)
 
 
 def masked(trajectory, rows):
@@ -66,7 +54,7 @@ def pitched(pitch, n=900):
     """A walk whose phone is held at a constant pitch (°), its body x axis vertical at 90."""
     path = walk(n=n)
     held = Rotation.from_euler("y", pitch, degrees=True)
-    heading = Rotation.from_quat(np.roll(path.orientation, -1, 1))
+    heading = Rotation.from_quat(path.orientation, scalar_first=True)
     return path._replace(orientation=quaternions(heading * held))
 
 
