@@ -35,5 +35,5 @@ def tables(asked: TablesConfig, _call: options.Call) -> None:
             text = make.make(asked, terminal, usable_cores())
     except runs.Interrupted as stopped:
         print("stopped and saved; the same command goes on from here", file=sys.stderr)
-        sys.exit(128 + stopped.signum)
+        sys.exit(128 + stopped.args[0])
     console.say(text)

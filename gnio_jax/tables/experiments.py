@@ -48,6 +48,9 @@ PUBLISHED_GATES = {
 }
 """The same of gate and scale, RMSE on TLIO's set, m."""
 
+PUBLISHED_BANKS = {0: None, 16: 2.07, 32: None, 64: 1.98, 128: 2.07}
+"""The same of prototypes in the bank."""
+
 
 class Row(NamedTuple):
     """One row of a table before it is run."""
@@ -164,20 +167,12 @@ def gates(base: TrainConfig) -> Experiment:
 
 def bank_sizes(base: TrainConfig) -> Experiment:
     """Prototypes in the bank, with the linear head: the paper's m = 64 equals its bank-only row."""
-
-    def row(size: int, published: float | None) -> Row:
-        config = variant(base, head="linear", bank_size=size)
-        return Row(f"gnio_bank-{size}_linear", f"m = {size}", config, published)
-
-    return Experiment(
-        "Bank size",
-        "paper, size of the bank: RMSE on TLIO's set, with the linear head",
-        [
-            Row("gnio_bank-0_linear", "no bank", variant(base, bank_size=0, head="linear")),
-            row(16, 2.07),
-            row(32, None),
-            # The default size: the row of `components`.
-            Row("gnio_linear", "m = 64", variant(base, head="linear"), 1.98),
-            row(128, 2.07),
-        ],
-    )
+    rows = []
+    for size, published in PUBLISHED_BANKS.items():
+        name, options = f"gnio_bank-{size}_linear", {"bank_size": size}
+        if size == 64:  # the default: the row of `components`
+            name, options = "gnio_linear", {}
+        config = variant(base, head="linear", **options)
+        rows.append(Row(name, f"m = {size}" if size else "no bank", config, published))
+    source = "paper, size of the bank: RMSE on TLIO's set, with the linear head"
+    return Experiment("Bank size", source, rows)

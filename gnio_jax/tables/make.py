@@ -188,18 +188,12 @@ def render(experiment: Experiment, figures: Mapping[str, list[Cell]]) -> str:
     table, first = [], experiment.rows[0].published
     for place, row in enumerate(experiment.rows):
         mean, difference = figures["ate"][place]
-        published = 100 * (1 - row.published / first) if row.published and first else None
-        table.append(
-            [
-                row.label,
-                *(tabulate.mean(figures[x][place].mean, own.digits) for x, own in columns.items()),
-                tabulate.number(mean.median, 2),
-                arrow(difference and difference.gain) if place else "",
-                tabulate.difference(difference, 2),
-                tabulate.number(row.published, 2),
-                arrow(published) if place else "",
-            ]
-        )
+        means = [tabulate.mean(figures[x][place].mean, own.digits) for x, own in columns.items()]
+        gain = arrow(difference and difference.gain) if place else ""
+        theirs = 100 * (1 - row.published / first) if row.published and first else None
+        ours = [tabulate.number(mean.median, 2), gain, tabulate.difference(difference, 2)]
+        printed = [tabulate.number(row.published, 2), arrow(theirs) if place else ""]
+        table.append([row.label, *means, *ours, *printed])
     marks = "".join(f"\n{line}\n" for line in tabulate.marks(figures["ate"]))
     return tabulate.markdown(header, table) + marks
 
@@ -224,15 +218,14 @@ def make_trajectories(path: Path, options: TablesConfig, results: list[Result]) 
     from gnio_jax.tables import plots
 
     runs = [page.of_folder(each.folders[0], each.reports[0], each.row.label) for each in results]
-    known = {seen.name: seen for seen in runs[0].views if seen.known}
-    wanted = _words(options.sequences) if options.sequences else tuple(known)[:8]
+    known = [seen.name for seen in runs[0].views if seen.known]
+    wanted = _words(options.sequences) if options.sequences else known[:8]
     for name in wanted:
         if name not in known:
             problem = f"no sequence '{name}' in split '{options.split}'"
             raise InputError("--sequences", problem, f"there are: {', '.join(known)}")
-    plots.save(
-        with_ending(path, ".png"), plots.trajectories(wanted, {run.name: run.views for run in runs})
-    )
+    drawn = plots.trajectories(wanted, {run.name: run.views for run in runs})
+    plots.save(with_ending(path, ".png"), drawn)
     made = results[0].reports[0].settings
     title = f"{made['dataset']} {options.split}: {options.estimator} of all methods"
     page.write(with_ending(path, ".html"), title, runs)
@@ -254,10 +247,8 @@ def make_standing(
             plots.save(path.with_name(f"{beside}_gate.png"), plots.gate(seeds[0]))
         if "attention" in seeds[0].diagnostics:
             bits, chance = np.mean([activities.information(seed) for seed in seeds], axis=0)
-            words = (
-                f"the most attended prototype carries {bits:.2f} bits about the activity, "
-                f"by chance it would be {chance:.2f}"
-            )
+            words = f"the most attended prototype carries {bits:.2f} bits about the activity, "
+            words += f"by chance it would be {chance:.2f}"
             lines.append(f"{result.row.label}: {words}.\n\n")
             picture = plots.attention(*activities.attention_by_activity(seeds[0]), words)
             plots.save(path.with_name(f"{beside}_attention.png"), picture)

@@ -22,11 +22,8 @@ from gnio_jax.training import loop, run_folder
 
 
 class Interrupted(Exception):
-    """A signal asked a training run to stop; it is saved, and the same command continues it."""
-
-    def __init__(self, signum: int):
-        super().__init__(signum)
-        self.signum = signum
+    """A signal, whose number is the argument, asked a training run to stop; it is saved, and the
+    same command continues it."""
 
 
 class Result(NamedTuple):
