@@ -1,13 +1,11 @@
 """Walks, estimates and reports that the tests of evaluation share."""
 
-import numpy as np
 import pytest
 
 from gnio_jax.data.simulated import walks as simulated
-from gnio_jax.evaluation import Trajectory, never_moves, score
-from gnio_jax.evaluation.report import Report
-from tests.support.estimates import SETTINGS, estimate
+from tests.support.estimates import estimate, reported
 from tests.support.estimators import RATE
+from tests.support.trajectories import lost
 
 
 @pytest.fixture(autouse=True)
@@ -43,23 +41,14 @@ def estimates():
 
 @pytest.fixture(scope="module")
 def made(estimates):
-    return Report(
-        SETTINGS,
-        score(estimates),
-        {"never_moves": score(never_moves(estimates))},
-        {e.name: e.name[:4] for e in estimates},
-        {"blind": ["start: rough"]},
-        {"short": "0.5 s"},
-    )
+    groups = {each.name: each.name[:4] for each in estimates}
+    return reported(estimates, groups, {"blind": ["start: rough"]}, {"short": "0.5 s"})
 
 
 @pytest.fixture(scope="module")
 def with_divergence(estimates):
     """The walks again, the second lost after 20 s, and a third that is whole."""
-    lost = estimates[1].trajectory
-    there = np.arange(400)[:, None] < 200
-    lost = Trajectory(lost.time, *(np.where(there, part, np.nan) for part in lost[1:]))
-    of = [estimates[0], estimates[1]._replace(trajectory=lost), estimates[2], estimate("room 3", 3)]
+    second = estimates[1]._replace(trajectory=lost(estimates[1].trajectory, 200))
+    of = [estimates[0], second, estimates[2], estimate("room 3", 3)]
     groups = {"room 1/walk": "A", "room 1:walk": "B", "blind": "C", "room 3": "D"}
-    still = {"never_moves": score(never_moves(of))}
-    return of, Report(SETTINGS, score(of), still, groups, {}, {})
+    return of, reported(of, groups)

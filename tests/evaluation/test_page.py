@@ -7,24 +7,17 @@ import numpy as np
 import pytest
 
 from gnio_jax.config import TrainConfig
-from gnio_jax.evaluation import Estimate, Trajectory, never_moves, page, plots, report, score
-from gnio_jax.evaluation.report import Report
+from gnio_jax.evaluation import Estimate, Trajectory, page, plots, report
 from tests.support import browser
-from tests.support.estimates import SETTINGS, estimate, with_covariance
+from tests.support.estimates import SETTINGS, estimate, reported, with_covariance
 
 EVIL = "</script><script>alert('x')</script><b onmouseover=alert(1)>&amp; $$x$$"
 BLUE, BLACK = (0, 114, 178), (0, 0, 0)
 
 
-def report_of(estimates, settings=SETTINGS):
-    rows = {"never_moves": score(never_moves(estimates))}
-    notes = {estimates[0].name: ["start: rough"]}
-    groups = {e.name: e.name for e in estimates}
-    return Report(settings, score(estimates), rows, groups, notes, {})
-
-
 def run_of(estimates, *more, **named):
-    return page.of_report(report_of(estimates), [plots.view(e) for e in estimates], *more, **named)
+    made = reported(estimates, notes={estimates[0].name: ["start: rough"]})
+    return page.of_report(made, [plots.view(each) for each in estimates], *more, **named)
 
 
 @pytest.fixture(scope="module")

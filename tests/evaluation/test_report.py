@@ -12,7 +12,7 @@ from gnio_jax import evaluation
 from gnio_jax.config import TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import Trajectory, report, score
-from tests.support.estimates import SETTINGS, with_covariance
+from tests.support.estimates import reported, with_covariance
 
 
 def write(folder, made, estimates, **options):
@@ -110,8 +110,7 @@ def test_a_bad_covariance_is_no_divergence(tmp_path, estimates):
     bad = estimates[0].filtered.covariance.copy()
     bad[200:] = np.nan
     of = [with_covariance(estimates[0], bad), estimates[1]]
-    groups = {e.name: e.name for e in of}
-    made = report.Report(SETTINGS, score(of), {}, groups, {}, {})
+    made = reported(of)
     assert made.diverged == [] and made.summary()["ate"].sequences == 2
     found = write(tmp_path / "e", made, of)
     first = found["sequences"]["room 1/walk"]

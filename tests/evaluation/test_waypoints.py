@@ -25,10 +25,9 @@ from gnio_jax.evaluation import (
 )
 from gnio_jax.evaluation.estimate import in_one_frame
 from gnio_jax.evaluation.metrics import OF_FILTER, OF_WAYPOINTS
-from gnio_jax.evaluation.report import Report
 from gnio_jax.evaluation.trajectory import positions_at
 from gnio_jax.types import Waypoints
-from tests.support.estimates import SETTINGS, estimate
+from tests.support.estimates import SETTINGS, estimate, reported
 from tests.support.estimators import CONFIG, NETWORK, loose, summed, tight, with_waypoints
 from tests.support.reports import BASE
 from tests.support.trajectories import lost, moved_by, perturbed, walk
@@ -209,8 +208,7 @@ def unseen_ones():
 def made(unseen_ones):
     groups = {"a/b": "F1", "c": "F2"}
     settings = SETTINGS | {"recordings": dict.fromkeys(groups, 40.0), "reference": "waypoints"}
-    still = {"never_moves": score(never_moves(unseen_ones))}
-    return Report(settings, score(unseen_ones), still, groups, {}, {})
+    return reported(unseen_ones, groups, settings=settings)
 
 
 def test_the_folder_holds_the_waypoints_and_gives_them_back(unseen_ones, made, tmp_path):

@@ -3,13 +3,28 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from gnio_jax.evaluation import Displacements, Estimate, Filtered, Trajectory
+from gnio_jax.evaluation import (
+    Displacements,
+    Estimate,
+    Filtered,
+    Report,
+    Trajectory,
+    never_moves,
+    score,
+)
 from tests.support import reports
 
 SETTINGS = reports.SETTINGS | {
     "dataset": "made",
     "recordings": dict.fromkeys(("room 1/walk", "room 1:walk", "blind", "room 3"), 40.0),
 }
+
+
+def reported(estimates, groups=None, notes=None, left_out=None, settings=SETTINGS):
+    """The report about estimates, each a group of its own."""
+    groups = groups or {each.name: each.name for each in estimates}
+    still = {"never_moves": score(never_moves(estimates))}
+    return Report(settings, score(estimates), still, groups, notes or {}, left_out or {})
 
 
 def with_covariance(estimate, covariance):
