@@ -383,6 +383,7 @@ class Compared(NamedTuple):
 
     @property
     def raw_paths(self) -> tuple[Positions, Positions]:
+        """The same, of the estimate as the estimator gives it."""
         return self.raw.position[:, : self.dims], self.reference.position[:, : self.dims]
 
     def at_waypoints(self) -> tuple[Positions, Positions]:
