@@ -190,6 +190,8 @@ def test_the_hold_out_depends_on_the_list_alone(tmp_path):
     subjects = {name.split("_")[0] for name in held}
     assert held == {name for name in TRAIN if name.split("_")[0] in subjects}
     assert 1 <= len(held) <= 2
+    path.write_text("\n".join(f"p{n // 2}_bag{n}" for n in range(20)))
+    assert len({name.split("_")[0] for name in ridi.held_out_of_train(path)}) == 1
     # One person, many walks: whole walks then; too few to part with: none.
     path.write_text("\n".join(f"dan_bag{n}" for n in range(20)))
     assert len(ridi.held_out_of_train(path)) == 2
