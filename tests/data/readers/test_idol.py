@@ -15,10 +15,11 @@ from scipy.spatial.transform import Rotation
 from gnio_jax import data
 from gnio_jax.data.dataset import Refusal
 from gnio_jax.data.readers import idol
+from gnio_jax.data.self_check import check_sequence
 from gnio_jax.errors import InputError
 from gnio_jax.numerics import rotations
 from tests.support import known_walk as walk
-from tests.support.idol_files import BIAS, EPOCH, RIG_OF_PHONE, frame, write
+from tests.support.idol_files import BIAS, EPOCH, frame, write
 from tests.support.refusals import refused
 
 
@@ -68,20 +69,12 @@ def test_a_walk_comes_back_level_in_the_phones_frame_and_on_its_clock(tmp_path, 
     assert (a["building"], a["imu_compensated"], a["licence"]) == ("building1", "no", "CC BY 4.0")
 
 
-def test_the_rig_is_not_the_phone(tmp_path):
-    """Half a turn apart: the rig's attitude in place of the phone's makes the same numbers
-    implausible."""
-    sequence = read_whole(write(tmp_path, frame()))
-    time = sequence.time + (sequence.attributes["start_time"] - EPOCH)
-    rig = walk.attitude(time) * RIG_OF_PHONE.inv()
-    assert np.degrees((rotations(sequence.orientation) * rig.inv()).magnitude()).min() > 170
-    mistaken = sequence._replace(orientation=np.roll(rig.as_quat(), 1, axis=1))
-    assert data.self_check(mistaken).failures
-    # A file whose attitude already is the phone's turns the other way about x and y.
-    with pytest.raises(
-        Refusal, match=r"3\.feather: columns 'orient' do not turn as 'iphoneGyro' does"
-    ):
-        read_whole(write(tmp_path, frame(mount=Rotation.identity())))
+def test_an_attitude_that_is_the_phones_already_is_refused(tmp_path):
+    """It turns the other way about x and y than a rig's."""
+    path = write(tmp_path, frame(mount=Rotation.identity()))
+    words = r"3\.feather: columns 'orient' do not turn as 'iphoneGyro' does"
+    with pytest.raises(Refusal, match=words):
+        read_whole(path)
 
 
 def test_poses_that_are_later_than_the_search_goes_are_refused(tmp_path):
@@ -145,14 +138,10 @@ def test_smoothed_positions_are_no_reason_to_leave_a_walk_out(tmp_path):
     as a wrong time would."""
     table = frame()
     time = table["timestamp"] - EPOCH
-    table["processedPosX"], table["processedPosY"], table["processedPosZ"] = (
-        0.9 * time,
-        0.3 * np.sin(time / 4.0),
-        1.0,
-    )
-    write(tmp_path, table)
-    (sequence,) = data.load("idol", tmp_path, "known")
-    assert data.self_check(sequence).accel_correlation_horizontal < 0.3
+    for axis, place in zip("XYZ", (0.9 * time, 0.3 * np.sin(time / 4.0), 1.0), strict=True):
+        table[f"processedPos{axis}"] = place
+    check = check_sequence(read_whole(write(tmp_path, table)), idol.DATASET)
+    assert check.failures == () and check.accel_correlation_horizontal < 0.3
 
 
 def test_without_core_motion_there_is_no_device_orientation(tmp_path):
@@ -300,10 +289,7 @@ def test_without_pyarrow_it_says_what_to_install(tmp_path, monkeypatch):
 def test_one_wild_stamp_costs_one_row(tmp_path):
     """A stamp of 0 among unix seconds is a gap of decades, which nothing may span."""
     table = frame()
-    first = table.iloc[:1].assign(timestamp=0.0)
-    write(tmp_path, pd.concat([first, table], ignore_index=True))
-    (piece,) = data.load(
-        "idol", tmp_path, "known"
-    )  # the row has no pose near it, and is cut off as such
+    first = table.iloc[:1].assign(timestamp=0.0)  # has no pose near it, and is cut off as such
+    piece = read_whole(write(tmp_path, pd.concat([first, table], ignore_index=True)))
     compare(piece)
     assert piece.attributes["lag"] == pytest.approx(0.0, abs=3e-3)
