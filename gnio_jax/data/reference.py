@@ -40,9 +40,9 @@ LARGEST_JUMP = 0.02
 positions the seen ones."""
 JUMP_MARGIN = 0.1
 """s around a jump of the position that are not believed."""
-COURSE_SECONDS, FLIP_DEGREES = 3.0, 15.0
-"""Filter (standard deviation, s) of the correction's median course, and how far off it a sample
-is a flip of the tracker."""
+COURSE_SECONDS, FLIP_DEGREES, CORRECTION_SECONDS = 3.0, 15.0, 0.3
+"""Filter (standard deviation, s) of the correction's median course, how far off it a sample is a
+flip of the tracker, and the filter of the rest."""
 
 
 class Poses(NamedTuple):
@@ -201,14 +201,13 @@ def fuse_attitude(
     measured: Rotation,
     good: Bool[np.ndarray, " n"],
     step: float,
-    seconds: float = 0.3,
 ) -> tuple[Rotation, Bool[np.ndarray, " n"]]:
     """Integrated attitude times a smooth correction towards the measured one, and where the
     measured one was believed.
 
     The correction measured · integrated⁻¹ moves as slowly as the gyro's bias does. Samples more
     than 15° off its median course (σ 3 s) are flips of the tracker; the rest is smoothed over
-    `seconds` (σ), with weights that fall with the residual. Where nothing was measured the
+    0.3 s (σ), with weights that fall with the residual. Where nothing was measured the
     correction is interpolated, so that the gyro bridges the gap.
     """
     correction = quaternions(measured * integrated.inv())
@@ -221,7 +220,7 @@ def fuse_attitude(
     course, believed = filled(good), good
     for flip, sigma, least in [
         *[(np.radians(FLIP_DEGREES), COURSE_SECONDS / step, np.radians(1.0))] * 4,
-        *[(np.pi, seconds / step, np.radians(0.3))] * 3,
+        *[(np.pi, CORRECTION_SECONDS / step, np.radians(0.3))] * 3,
     ]:
         correction *= np.where((correction * course).sum(axis=1) < 0, -1.0, 1.0)[:, None]
         angle = 2.0 * np.arccos(np.clip((correction * course).sum(axis=1), -1.0, 1.0))

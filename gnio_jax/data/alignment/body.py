@@ -145,13 +145,12 @@ def align(
     imu: Streams,
     track: Poses,
     knot_seconds: float = 30.0,
-    around: float = 0.0,
     search_seconds: float = 5.0,
 ) -> BodyFit:
     """The mounting of an IMU on a body whose noisy poses are `track`, both on clocks of their own.
 
     `knot_seconds` is the spacing of the lag's knots; first guesses of the lag lie within
-    `search_seconds` of `around` (s). Raises `TooLittle` where too little of the track is usable,
+    ± `search_seconds`. Raises `TooLittle` where too little of the track is usable,
     and `InputError` for stamps that are damaged. Whether the best fit is a good one is the caller's
     to judge, by `gyro_unexplained`, `accel_unexplained`, `runner_up` and `turn_std`.
     """
@@ -162,7 +161,7 @@ def align(
     felt, seen = _felt(imu), _seen(track)
     thinned, knots = seen.rows(slice(None, None, THINNED)), uniform_knots(track.time, 30.0)
     candidates = []
-    for lag, extrinsic in _first_guesses(seen, felt, around, search_seconds)[:STARTS]:
+    for lag, extrinsic in _first_guesses(seen, felt, search_seconds)[:STARTS]:
         with suppress(TooLittle):
             unknowns = np.concatenate([np.zeros(LAG.start), np.full(len(knots), lag)])
             candidates.append(_fit(thinned, felt, knots, extrinsic, unknowns))
@@ -247,14 +246,14 @@ def _poses_of_the_imu(
     )
 
 
-def without_jumps(poses: Poses, fastest_turn: float, fastest: float, around: float = 0.1) -> Poses:
-    """The poses that are not within `around` (s) of a step faster than `fastest_turn` (rad/s) or
-    `fastest` (m/s), which nobody makes."""
+def without_jumps(poses: Poses, fastest_turn: float, fastest: float) -> Poses:
+    """The poses that are not within 0.1 s of a step faster than `fastest_turn` (rad/s) or `fastest`
+    (m/s), which nobody makes."""
     steps = np.diff(poses.time)
     angle = np.linalg.norm(turns_between(poses.attitude), axis=1)
     distance = np.linalg.norm(np.diff(poses.position, axis=0), axis=1)
     jumps = np.flatnonzero((angle > fastest_turn * steps) | (distance > fastest * steps))
-    near = near_any(poses.time, poses.time[jumps], poses.time[jumps + 1], around)
+    near = near_any(poses.time, poses.time[jumps], poses.time[jumps + 1], 0.1)
     return poses.rows(np.flatnonzero(~near))
 
 
@@ -324,15 +323,14 @@ def _felt(imu: Streams) -> _Felt:
         splines.append(CubicSpline(clock, filtered, axis=0))
         begun = np.concatenate([[-np.inf], time[:-1][broken], time[-1:]])
         unknown.append((begun, np.concatenate([time[:1], time[1:][broken], [np.inf]])))
-    return _Felt(*splines, unknown)
+    gyro, accel = splines
+    return _Felt(gyro, accel, unknown)
 
 
 # --- first guesses
 
 
-def _first_guesses(
-    seen: _Seen, felt: _Felt, around: float, search_seconds: float
-) -> list[tuple[float, Rotation]]:
+def _first_guesses(seen: _Seen, felt: _Felt, search_seconds: float) -> list[tuple[float, Rotation]]:
     """(lag s, extrinsic rotation) where the magnitudes of both angular rates correlate better than
     nearby, the most plausible first.
 
@@ -343,11 +341,10 @@ def _first_guesses(
     # It takes half a second to import.
     from scipy.signal import correlate, correlation_lags, find_peaks
 
-    shifted = felt.gyro.x - around
     grid = np.arange(seen.time[0] - search_seconds, seen.time[-1] + search_seconds, 1.0 / RATE)
     tracked, own = (
         np.interp(grid, time, np.minimum(np.linalg.norm(rate, axis=1), FASTEST_TURN), 0.0, 0.0)
-        for time, rate in ((seen.time, seen.rate), (shifted, felt.gyro(felt.gyro.x)))
+        for time, rate in ((seen.time, seen.rate), (felt.gyro.x, felt.gyro(felt.gyro.x)))
     )
     score = correlate(own - own.mean(), tracked - tracked.mean(), method="fft")
     lags = correlation_lags(len(grid), len(grid)) / RATE
@@ -356,7 +353,7 @@ def _first_guesses(
     padded = np.pad(score[near], 1, constant_values=-np.inf)
     peaks, _ = find_peaks(padded, distance=max(round(SAME_LAG * RATE), 1))
     guesses = []
-    for lag in lags[near][peaks - 1] + around:
+    for lag in lags[near][peaks - 1]:
         rows = felt.covers(seen.time + lag)
         if rows.sum() * ROW_SECONDS >= SHORTEST_OVERLAP:
             rate, turning = felt.gyro(seen.time[rows] + lag), seen.rate[rows]

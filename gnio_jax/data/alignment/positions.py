@@ -57,8 +57,8 @@ SHORTEST_OVERLAP = 20.0
 STRETCH_SECONDS = 15.0
 """Length of the stretches whose horizontal accelerations are compared: in it the yaw hardly
 drifts."""
-LAG_STEP = 0.02
-"""s between the constant lags that are tried."""
+LAG_STEP, SEARCH_SECONDS = 0.02, 4.0
+"""s between the constant lags that are tried, and how far they go to either side."""
 TURN_KNOT_SECONDS, LAG_KNOT_SECONDS = 10.0, 30.0
 """Spacing of the knots of the rotation and of the lag."""
 DRIFT_STD = np.array([0.05, 0.05, 0.02])
@@ -117,7 +117,7 @@ class _Signals(NamedTuple):
         return rows, interpolate(there[rows], self.clock, self.felt), self.tracked[rows]
 
 
-def align_positions(imu: Streams, track: Samples, search_seconds: float = 4.0) -> PositionsFit:
+def align_positions(imu: Streams, track: Samples) -> PositionsFit:
     """Attitude and clock of an IMU, whose device gives an attitude of its own, against positions
     (m) in a level world.
 
@@ -148,7 +148,7 @@ def align_positions(imu: Streams, track: Samples, search_seconds: float = 4.0) -
     jumps = strength > 8.0 * max(usual, 0.1)
     good = ~within(~seen | jumps, round(2 * SLOW_FILTER_SECONDS * RATE))
     signals = _Signals(clock, device.apply(accel) - UPWARD, grid, tracked, good)
-    lag, correlation, runner_up = _constant_lag(signals, search_seconds)
+    lag, correlation, runner_up = _constant_lag(signals)
 
     integrated = integrate_gyro(gyro - _gyro_bias(gyro, device), 1.0 / RATE)
     knots = uniform_knots(clock, TURN_KNOT_SECONDS)
@@ -186,7 +186,7 @@ def _gyro_bias(gyro: Float[np.ndarray, "n 3"], device: Rotation) -> Float[np.nda
     return np.linalg.lstsq(system, right, rcond=1e-6)[0][:3]
 
 
-def _constant_lag(signals: _Signals, search_seconds: float) -> tuple[float, float, float]:
+def _constant_lag(signals: _Signals) -> tuple[float, float, float]:
     """(best constant lag, correlation of the vertical accelerations at it, what it leaves
     unexplained over what the next best peak leaves)."""
     from scipy.signal import find_peaks  # takes half a second to import
@@ -209,7 +209,7 @@ def _constant_lag(signals: _Signals, search_seconds: float) -> tuple[float, floa
         vertical = float(up @ risen / max(np.linalg.norm(up) * np.linalg.norm(risen), 1e-12))
         return vertical, float(np.average(level, weights=np.bincount(stretch[rows]) + 1e-9))
 
-    most = round(search_seconds / LAG_STEP)
+    most = round(SEARCH_SECONDS / LAG_STEP)
     lags = np.arange(-most, most + 1) * LAG_STEP
     found = np.array([correlations(lag) for lag in lags])
     if not found.any():
