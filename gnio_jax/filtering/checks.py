@@ -43,34 +43,35 @@ class Inputs(NamedTuple):
 # ------------------------------------------------------------------------------------------------
 
 
-def checked_array(name: str, value: Any, shape: tuple[int, ...], config: FilterConfig) -> jax.Array:
-    """`value` as a JAX array of this shape and of the precision that `config` asks for."""
-    value = on_device(value)
-    check_shape(name, value, shape)
+def checked_array(
+    name: str, value: Any, shape: tuple[int, ...], config: FilterConfig, finite: bool = True
+) -> jax.Array:
+    """`value` as a JAX array of this shape and of the precision that `config` asks for, whose rows
+    are `finite`."""
+    value = checked_shape(name, value, shape)
     single = value.dtype == jnp.float32
-    if value.dtype == jnp.float64 or (single and config.allow_float32):
-        return value
-    remedy = "call jax.config.update('jax_enable_x64', True) first"
-    if jax.config.read("jax_enable_x64"):
-        remedy = "cast it"
-    if single:
-        remedy += ", or ask for FilterConfig(allow_float32=True)"
-    raise ValueError(f"{name}: the filter runs in float64, found {value.dtype}; {remedy}")
+    if value.dtype != jnp.float64 and not (single and config.allow_float32):
+        remedy = "call jax.config.update('jax_enable_x64', True) first"
+        if jax.config.read("jax_enable_x64"):
+            remedy = "cast it"
+        if single:
+            remedy += ", or ask for FilterConfig(allow_float32=True)"
+        raise ValueError(f"{name}: the filter runs in float64, found {value.dtype}; {remedy}")
+    if finite and value.size:
+        axes = tuple(range(1, value.ndim))
+        check_rows(name, value, lambda rows: ~np.isfinite(rows).all(axes), "are not finite")
+    return value
 
 
-def check_shape(name: str, value: Any, shape: tuple[int, ...]) -> None:
-    """Refuse an array of another shape."""
-    if (found := jnp.shape(value)) != shape:
+def checked_shape(name: str, value: Any, shape: tuple[int, ...]) -> jax.Array:
+    """`value` as a JAX array of this shape, which shares no memory with it. `jnp.asarray` would
+    compile a program for each shape of NumPy's arrays."""
+    array = isinstance(value, np.ndarray)
+    value = jax.device_put(np.array(value)) if array else jnp.asarray(value)
+    if value.shape != shape:
         remedy = "for a batch of sequences use jax.vmap"
-        raise ValueError(f"{name}: the shape must be {shape}, found {found}; {remedy}")
-
-
-def on_device(value: Any) -> jax.Array:
-    """`value` as a JAX array, which shares no memory with it. `jnp.asarray` would compile a program
-    for each shape of NumPy's arrays."""
-    if isinstance(value, np.ndarray):
-        return jax.device_put(np.array(value))
-    return jnp.asarray(value)
+        raise ValueError(f"{name}: the shape must be {shape}, found {value.shape}; {remedy}")
+    return value
 
 
 def check_rows(
@@ -82,12 +83,6 @@ def check_rows(
         if rows.any():
             found = f"{rows.sum()} of {len(rows)} rows {problem}"
             raise ValueError(f"{name}: {found}, the first is row {rows.argmax()}")
-
-
-def check_finite(name: str, value: jax.Array) -> None:
-    """Refuse rows that are not finite."""
-    axes = tuple(range(1, value.ndim))
-    check_rows(name, value, lambda rows: ~np.isfinite(rows).all(axes), "are not finite")
 
 
 def check_rotation(name: str, value: jax.Array) -> None:
@@ -139,16 +134,13 @@ def checked_inputs(
             f"gyro: the samples must be a multiple of samples_per_clone = {n}, found {samples}"
         )
     if imu_valid is not None:
-        imu_valid = on_device(imu_valid)
-        if imu_valid.shape != (samples,) or imu_valid.dtype != jnp.bool_:
-            found = f"{imu_valid.dtype} of shape {imu_valid.shape}"
-            raise ValueError(f"imu_valid: must be {samples} booleans, found {found}")
+        imu_valid = checked_shape("imu_valid", imu_valid, (samples,))
+        if imu_valid.dtype != jnp.bool_:
+            raise ValueError(f"imu_valid: must be booleans, found {imu_valid.dtype}")
 
     def checked_signal(name: str, value: Any, largest: float, unit: str) -> jax.Array:
         """Finite where there is no mask, and what an IMU can measure where a sample is there."""
-        value = checked_array(name, value, (samples, 3), config)
-        if imu_valid is None:
-            check_finite(name, value)
+        value = checked_array(name, value, (samples, 3), config, finite=imu_valid is None)
         if not isinstance(imu_valid, Tracer):
             there = True if imu_valid is None else np.asarray(imu_valid)
             problem = f"are beyond {largest:g} {unit}"
@@ -159,8 +151,8 @@ def checked_inputs(
     accel = checked_signal("accel", accel, STRONGEST_FORCE, "m/s²")
 
     def checked_rows(path: Any, value: Any) -> jax.Array:
-        value = on_device(value)
-        check_shape(f"measurements{keystr(path)}", value, (samples // n, *value.shape[1:]))
+        shape = (samples // n, *np.shape(value)[1:])
+        value = checked_shape(f"measurements{keystr(path)}", value, shape)
         return value.astype(dtype) if jnp.issubdtype(value.dtype, jnp.floating) else value
 
     measurements = tree_map_with_path(checked_rows, measurements)
@@ -189,24 +181,21 @@ def checked_state(state: FilterState, config: FilterConfig, noise: NoiseModel) -
 
     def checked_leaf(path: Any, value: Any, like: jax.ShapeDtypeStruct) -> jax.Array:
         name = f"state{keystr(path)}"
-        if jnp.issubdtype(like.dtype, jnp.floating):
-            return checked_array(name, value, like.shape, config).astype(state.offset.dtype)
-        check_shape(name, value, like.shape)
-        return jnp.asarray(value, like.dtype)
+        if not jnp.issubdtype(like.dtype, jnp.floating):
+            return checked_shape(name, value, like.shape).astype(like.dtype)
+        # The memory of the IMU may hold anything.
+        finite = not name.startswith("state.imu")
+        return checked_array(name, value, like.shape, config, finite).astype(state.offset.dtype)
 
-    checked = tree_map_with_path(checked_leaf, state, wanted)
-    if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(checked)):
-        return checked
-    for name, value in checked._asdict().items():
-        # The memories of the gate and the IMU may hold anything, NaN too.
-        if isinstance(value, jax.Array) and value.ndim and value.size:
-            check_finite(f"state.{name}", value)
-    core = np.asarray(checked.core_covariance, np.float64)
-    scale = np.sqrt(np.abs(np.diag(core))) + 1e-150
-    if np.linalg.eigvalsh(core / np.outer(scale, scale))[0] < -1e-5 or (np.diag(core) < 0).any():
-        raise ValueError("state.core_covariance: is not positive definite")
-    check_rotation("state.rotation", checked.rotation)
-    return checked
+    state = tree_map_with_path(checked_leaf, state, wanted)
+    check_rotation("state.rotation", state.rotation)
+    if not isinstance(state.core_covariance, Tracer):
+        core = np.asarray(state.core_covariance, np.float64)
+        scale = np.sqrt(np.abs(np.diag(core))) + 1e-150
+        least = np.linalg.eigvalsh(core / np.outer(scale, scale))[0]
+        if least < -1e-5 or (np.diag(core) < 0).any():
+            raise ValueError("state.core_covariance: is not positive definite")
+    return state
 
 
 def checked_displacements(
@@ -223,7 +212,7 @@ def checked_displacements(
         asymmetric = skew > 1e-6 * np.abs(clean).max((1, 2))
         return asymmetric | (np.linalg.eigvalsh(clean)[:, 0] <= 0)
 
-    displacement = checked_array("displacement", displacement, (count, 3), config).astype(dtype)
-    covariance = checked_array("covariance", covariance, (count, 3, 3), config).astype(dtype)
+    displacement = checked_array("displacement", displacement, (count, 3), config, finite=False)
+    covariance = checked_array("covariance", covariance, (count, 3, 3), config, finite=False)
     check_rows("covariance", covariance, improper, "are not symmetric and positive definite")
-    return displacement, covariance
+    return displacement.astype(dtype), covariance.astype(dtype)

@@ -28,19 +28,17 @@ from jaxtyping import Bool, Float
 from gnio_jax import geometry, numerics
 from gnio_jax.config import NoiseModel
 from gnio_jax.filtering.config import FilterConfig, YawFrame
-from gnio_jax.filtering.gate import innovation_gate
-from gnio_jax.filtering.state import FilterState
+from gnio_jax.filtering.state import FilterState, GateState
 from gnio_jax.filtering.update import (
     Correction,
     Linearised,
     Outcome,
     Step,
-    cholesky,
     correct,
     linearise,
-    lower_triangular,
     project,
     since_oldest,
+    whiten,
 )
 from gnio_jax.types import Array
 
@@ -73,19 +71,22 @@ class Displacement:
         config = step.config
         linear, defined = linearise_displacement(self, state, step)
         present = self.present & (state.step >= config.clones)
-        tested = present & defined
-        outcome, correction = project(state, linear, step.oldest, present)
-        now = state.step * config.samples_per_clone
-        nis, oldest = outcome.nis, now - config.window
-        gate, weight = innovation_gate(state.gate, config, now, oldest, nis, tested)
-        accepted, factor = weight > 0, _covariance_factor(weight, tested, config)
-        if factor is not None:
+        linear = linear._replace(residual=jnp.where(present, linear.residual, jnp.nan))
+        outcome, correction = project(state, linear, step.oldest)
+        tested = outcome.present & defined
+        gate, weight = innovation_gate(state.gate, config, state.step, outcome.nis, tested)
+        accepted, factor = weight > 0, None
+        if config.mahalanobis_fail_scale > 0:
+            failed = tested & ~accepted
+            factor = jnp.where(failed, config.mahalanobis_fail_scale, 1.0).astype(weight.dtype)
+        elif config.gate_softness > 0:
+            factor = 1 / jnp.clip(jnp.where(tested, weight, 1.0), LEAST_WEIGHT)
+        if factor is not None:  # applied all the same
             weaker = linear._replace(covariance=linear.covariance + (factor - 1) * self.covariance)
-            _, correction = project(state, weaker, step.oldest, present)
+            _, correction = project(state, weaker, step.oldest)
             accepted = tested
         outcome = outcome._replace(tested=tested, weight=weight, accepted=accepted)
-        state, correction = correct(state, correction, accepted, step.newest)
-        return state._replace(gate=gate), outcome, correction
+        return correct(state._replace(gate=gate), outcome, correction, step.newest)
 
 
 def scaled_displacement(
@@ -151,23 +152,11 @@ def linearise_displacement(
     residual, covariance = measurement.displacement - moved, measurement.covariance
     correlation = step.noise.correlation
     if correlation is not None:
-        jacobian["correlated"] = correlation.share * lower_triangular(cholesky(covariance))
+        (transposed,), _ = whiten(covariance, (covariance,))  # L⁻¹ Σ = Lᵀ
+        jacobian["correlated"] = correlation.share * transposed.T
         predicted = geometry.matmul(jacobian["correlated"], state.correlated[:, None])[:, 0]
         residual, covariance = residual - predicted, (1 - correlation.share**2) * covariance
     return linearise(state, residual, covariance, **jacobian), defined
-
-
-def _covariance_factor(
-    weight: Float[Array, ""], tested: Bool[Array, ""], config: FilterConfig
-) -> Float[Array, ""] | None:
-    """Factor of the measurement's covariance by which a gated measurement is applied all the same;
-    None where the gate accepts or rejects."""
-    if config.mahalanobis_fail_scale > 0:
-        failed = tested & ~(weight > 0)
-        return jnp.where(failed, config.mahalanobis_fail_scale, 1.0).astype(weight.dtype)
-    if config.gate_softness > 0:
-        return 1 / jnp.clip(jnp.where(tested, weight, 1.0), LEAST_WEIGHT)
-    return None
 
 
 def displacements(
@@ -187,3 +176,54 @@ def displacements(
     moved = position[1 + window :] - position[oldest]
     found[window:] = np.einsum("kji,kj->ki", numerics.yaw_rotation(rotation[oldest]), moved)
     return found
+
+
+# TLIO's χ² gate: which displacements the filter accepts. It has nothing to do with the gate of the
+# network's head, which scales a displacement.
+# ------------------------------------------------------------------------------------------------
+
+
+def gate_activity(
+    memory: GateState, config: FilterConfig, now: Array
+) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
+    """Whether the gate judges at sample `now`, and whether it would but for a last success that is
+    too old."""
+    ready = memory.converged & (now >= memory.pause_end)
+    old = now - memory.last_success > config.whole_samples(config.success_seconds)
+    stale = ready & (memory.last_success >= 0) & old
+    return ready & ~stale, stale
+
+
+def innovation_gate(
+    memory: GateState,
+    config: FilterConfig,
+    step: Array,
+    nis: Float[Array, ""],
+    tested: Array,
+) -> tuple[GateState, Float[Array, ""]]:
+    """The gate's memory after clone interval `step`, counted from 1, and the weight of its
+    measurement: 1 if it passes as it is and 0 if not.
+
+    Where no measurement is `tested`, an earlier last success moves along (ours): absence is not
+    staleness, or the first second after any hole would pass unchecked. TLIO has a measurement at
+    every clone. Comparisons are strict ("more than", "older"); at the very end of a pause the gate
+    is active again. With `gate_softness` the active gate weighs instead (ours); its memory still
+    takes what is above the threshold for a failure.
+    """
+    now = step * config.samples_per_clone
+    old_enough = now - config.window > config.whole_samples(config.convergence_seconds)
+    memory = memory._replace(converged=memory.converged | (tested & old_enough))
+    active, stale = gate_activity(memory, config, now)
+    passed = tested & (~active | (nis <= config.gate_threshold))
+    weight = passed.astype(nis.dtype)
+    if config.gate_softness > 0:
+        slope = jax.nn.sigmoid((config.gate_threshold - nis) / config.gate_softness)
+        weight = jnp.where(tested, jnp.where(active, slope, 1.0), 0.0)
+    waited = jnp.where(~tested & (memory.last_success >= 0), config.samples_per_clone, 0)
+    # Until a pause is over, rounded up whatever rounding does to pause / dt.
+    pause_end = now - int(np.floor(-config.pause_seconds / config.dt + 1e-6))
+    memory = memory._replace(
+        last_success=jnp.where(passed, now, memory.last_success + waited.astype(jnp.int32)),
+        pause_end=jnp.where(tested & stale, pause_end, memory.pause_end),
+    )
+    return memory, weight

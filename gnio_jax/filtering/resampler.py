@@ -99,76 +99,53 @@ def grid_rows(
     grid: Grid,
     slack: float,
 ) -> Float[np.ndarray, "count 7"]:
-    """Grid samples `first` … `first + count − 1`.
+    """Grid samples `first` … `first + count − 1`: the FIR about each, run by run of samples.
 
     `stamps` (s since that of grid sample 0, increasing) and `samples` (gyro, accel) are those that
     were there, as far as the grid samples depend on them. Stamps closer than `slack` (s) to a time
     are that time.
     """
-    values = np.full((count, 6), np.nan)
-    if len(stamps) and count:
-        of_rows = _interpolated if grid.factor == 1 else _low_passed
-        values = of_rows(stamps, samples, first + np.arange(count), grid, slack)
-    return np.concatenate([values, np.isfinite(values[:, :1])], axis=1)
-
-
-def _interpolated(
-    stamps: np.ndarray, samples: np.ndarray, numbers: np.ndarray, grid: Grid, slack: float
-) -> np.ndarray:
-    """The samples at the times of these grid samples: those that lie there, or lines between two
-    that are no hole apart, else NaN."""
-    times = numbers * grid.dt
-    after = np.searchsorted(stamps, times - slack)
-    before, inner = np.maximum(after - 1, 0), np.minimum(after, len(stamps) - 1)
-    apart, ended = stamps[inner] - stamps[before], after == len(stamps)
-    equal = (stamps[inner] <= times + slack) & ~ended
-    between = (after > 0) & (apart <= grid.hole) & ~ended
-    share = (times - stamps[before]) / np.where(apart > 0, apart, 1.0)
-    values = samples[before] + share[:, None] * (samples[inner] - samples[before])
-    values[equal] = samples[inner[equal]]
-    values[~(equal | between)] = np.nan
-    return values
-
-
-def _low_passed(
-    stamps: np.ndarray, samples: np.ndarray, numbers: np.ndarray, grid: Grid, slack: float
-) -> np.ndarray:
-    """The FIR about these grid samples, run by run of samples; NaN between the runs."""
-    half, step, centres = len(grid.taps) // 2, grid.dt / grid.factor, numbers * grid.factor
+    half, step = len(grid.taps) // 2, grid.dt / grid.factor
+    centres = (first + np.arange(count)) * grid.factor
     # The points of the fine grid that all centres depend on.
-    lowest, highest = centres[0] - half, centres[-1] + half
-    values = np.full((len(centres), 6), np.nan)
-    for run in numerics.stretches(np.diff(stamps) > grid.longest):
+    lowest, highest = first * grid.factor - half, (first + count - 1) * grid.factor + half
+    rows = np.concatenate([np.full((count, 6), np.nan), np.zeros((count, 1))], axis=1)
+    for run in numerics.stretches(np.diff(stamps) > grid.longest) if len(stamps) else ():
         time = stamps[run]
         begin, end = math.ceil((time[0] - slack) / step), math.floor((time[-1] + slack) / step)
         low, high = max(begin, lowest), min(end, highest)
         inside = (begin <= centres) & (centres <= end)
         if not inside.any():
             continue
-        points = np.clip(np.arange(low, high + 1) * step, time[0], time[-1])
-        fine = _curve(time, samples[run], points, grid.imu_rate)
+        fine = _curve(time, samples[run], np.arange(low, high + 1) * step, grid, slack)
         if begin == 0:  # the stream's start, as far as there is something to reflect
             reflected = min(low - lowest, high - low)
             fine = np.concatenate([2 * fine[0] - fine[reflected:0:-1], fine])
             low -= reflected
         weighted = np.zeros((highest - lowest + 1, 7))  # samples, and 1 where there is one
-        in_run = slice(low - lowest, high - lowest + 1)
-        weighted[in_run, :6], weighted[in_run, 6] = fine, 1.0
+        weighted[low - lowest : high - lowest + 1] = np.pad(
+            fine, ((0, 0), (0, 1)), constant_values=1
+        )
         windows = np.lib.stride_tricks.sliding_window_view(weighted, len(grid.taps), axis=0)
         sums = (windows[:: grid.factor] @ grid.taps)[inside]
         # From the centre on to either side the taps never sum to less than half the middle one.
-        values[inside] = sums[:, :6] / sums[:, 6:]
-    return values
+        rows[inside] = sums / sums[:, 6:]
+    return rows
 
 
 def _curve(
-    time: np.ndarray, samples: np.ndarray, points: np.ndarray, imu_rate: float
+    time: np.ndarray, samples: np.ndarray, points: np.ndarray, grid: Grid, slack: float
 ) -> np.ndarray:
-    """A run read at some points of it: a spline, and lines where samples are far apart."""
+    """A run read at some points of it: lines, and a spline before a low-pass where samples are not
+    far apart."""
+    points = np.clip(points, time[0], time[-1])
+    if grid.factor == 1:
+        nearest = time[np.minimum(np.searchsorted(time, points - slack), len(time) - 1)]
+        points = np.where(nearest <= points + slack, nearest, points)
     lines = numerics.interpolate(points, time, samples)
-    if len(time) < 4:
+    if grid.factor == 1 or len(time) < 4:
         return lines
-    wide = np.diff(time) > _LINE / imu_rate
+    wide = np.diff(time) > _LINE / grid.imu_rate
     on_line = wide[np.searchsorted(time[1:-1], points, side="right")]
     return np.where(on_line[:, None], lines, CubicSpline(time, samples)(points))
 

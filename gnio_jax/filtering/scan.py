@@ -5,10 +5,11 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Float
 
 from gnio_jax.config import NoiseModel
 from gnio_jax.filtering.checks import Inputs, checked_displacements, checked_inputs
@@ -28,6 +29,8 @@ from gnio_jax.filtering.state import FilterState, core_covariance, move_anchor, 
 from gnio_jax.filtering.update import Correction, Measurement, Outcome, Step
 from gnio_jax.filtering.zero_velocity import ZeroVelocity
 from gnio_jax.types import Array
+
+T = TypeVar("T")
 
 
 def run_filter(
@@ -75,7 +78,7 @@ def _run_filter(
     inputs: Inputs, displacement: Array, covariance: Array, config: FilterConfig, frame: YawFrame
 ) -> tuple[FilterState, FilterHistory]:
     given = scaled_displacement(displacement, covariance, inputs.noise, frame)
-    return _scan(lambda number, stream, given, *_: (given, {}), inputs, given, config)
+    return _run(as_given, inputs, given, config)
 
 
 def run_odometry(
@@ -120,47 +123,63 @@ def run_odometry(
         # stays a branch under vmap.
         return of_window(number >= config.first_measured, latest, state, oldest)
 
-    return _scan(measure, inputs, None, config)
+    return _run(measure, inputs, None, config)
 
 
-def _scan(
+def _run(
     measure: Callable[..., tuple[Displacement, dict]],
     inputs: Inputs,
     given: Displacement | None,
     config: FilterConfig,
 ) -> tuple[FilterState, FilterHistory]:
-    """Bridge holes of the stream, take a clone step for every interval, collect the history.
+    """The state and the history of `clone_steps`."""
+    state, records, age = clone_steps(
+        measure, inputs, given, config, lambda slot, _, record, __: record
+    )
+    history = finished_history(records, age, inputs.state.healthy, config)
+    state = state._replace(healthy=history.healthy[-1] > 0)
+    return unroll_clones(state, len(age) % config.clones), history
+
+
+def as_given(_: Array, __: Imu, given: Displacement, *___: Any) -> tuple[Displacement, dict]:
+    """`measure` of `clone_steps` where the displacements are given."""
+    return given, {}
+
+
+def clone_steps(
+    measure: Callable[..., tuple[Displacement, dict]],
+    inputs: Inputs,
+    given: Displacement | None,
+    config: FilterConfig,
+    keep: Callable[[Array, FilterState, StepRecord, StepTrace], T],
+) -> tuple[FilterState, T, Float[Array, "k"]]:
+    """Bridge holes of the stream and take a clone step for every interval. Returns the state at the
+    end, whose clones are a ring, what `keep` has made of each step, and the age of the oldest held
+    sample of each interval, s.
 
     measure(number, stream, given, state, oldest) returns the displacement of an interval and the
     network's diagnostics: `number` counts the intervals from 0, `stream` is the whole stream,
-    `given` the interval's row, `oldest` the slot of the oldest clone.
+    `given` the interval's row, `oldest` the slot of the oldest clone. keep(slot, state, record,
+    trace) takes the slot of the newest clone and what `clone_step` returns.
     """
     signals = inputs.gyro, inputs.accel, inputs.imu_valid
     stream, age, memory = bridge(*signals, inputs.state.imu, config)
-    numbers, by_interval = intervals(stream, config)
+    n = config.samples_per_clone
+    by_interval = jax.tree.map(lambda x: x.reshape(-1, n, *x.shape[1:]), stream)
+    age = age.reshape(-1, n).max(1)
 
-    def step(state: FilterState, row: tuple) -> tuple[FilterState, StepRecord]:
+    def step(state: FilterState, row: tuple) -> tuple[FilterState, T]:
         number, imu, given, others = row
         at_step = functools.partial(measure, number, stream, given)
         slot = number % config.clones
-        state, record, _ = clone_step(state, imu, slot, at_step, config, inputs.noise, others)
-        return state, record
+        taken = clone_step(state, imu, slot, at_step, config, inputs.noise, others)
+        return taken[0], keep(slot, *taken)
 
-    rows = numbers, by_interval, given, inputs.measurements
-    bounds = config.checkpoint_every, config.truncate_every
-    state, records = blocked_scan(step, inputs.state, rows, *bounds)
-    oldest_held = age.reshape(len(numbers), config.samples_per_clone).max(1)
-    history = finished_history(records, oldest_held, inputs.state.healthy, config)
-    memory = memory._replace(quiet=state.imu.quiet)
-    state = state._replace(imu=memory, healthy=history.healthy[-1] > 0)
-    return unroll_clones(state, len(numbers) % config.clones), history
-
-
-def intervals(stream: Imu, config: FilterConfig) -> tuple[Array, Imu]:
-    """Numbers of the K clone intervals, and their samples (K, n, …)."""
-    n = config.samples_per_clone
-    count = stream.gyro.shape[0] // n
-    return jnp.arange(count), jax.tree.map(lambda x: x.reshape(count, n, *x.shape[1:]), stream)
+    rows = jnp.arange(len(age)), by_interval, given, inputs.measurements
+    state, kept = blocked_scan(
+        step, inputs.state, rows, config.checkpoint_every, config.truncate_every
+    )
+    return state._replace(imu=memory._replace(quiet=state.imu.quiet)), kept, age
 
 
 # One clone interval
@@ -195,8 +214,7 @@ def clone_step(
     dtype, oldest = state.offset.dtype, (slot + 1) % config.clones
     anchored = jnp.where(jnp.asarray(slot) == 0, 1.0, 0.0).astype(dtype)
     state = move_anchor(state, anchored)
-    local = state.mean._replace(position=state.offset)
-    interval = _integrate(local, imu, noise, config.dt)
+    interval = _integrate(state.mean._replace(position=state.offset), imu, noise, config.dt)
     decay = correlation_decay(noise.correlation, config.clone_seconds, dtype)
     transition = core_transition(interval, decay, anchored)
     state = _propagate(state, interval, transition, slot)
@@ -207,7 +225,12 @@ def clone_step(
     corrections: tuple[Correction, ...] = ()
     for measurement in (displacement, *at_rest, *measurements):
         step = Step(imu, slot, oldest, config, noise, outcomes)
-        state, outcome, correction = _take(measurement, state, step)
+        update = jax.checkpoint(
+            lambda measurement, state, step=step: measurement.update(state, step),
+            policy=_keep,
+            prevent_cse=False,
+        )
+        state, outcome, correction = update(measurement, state)
         outcomes, corrections = (*outcomes, outcome), (*corrections, correction)
 
     covariance = core_covariance(state.core_covariance)
@@ -217,33 +240,20 @@ def clone_step(
     return state, record, StepTrace(transition, corrections)
 
 
+_OTHER_FORMS = {
+    *("broadcast_in_dim", "convert_element_type", "neg", "reshape", "squeeze", "transpose")
+}
+
+
 def _keep(primitive: Any, *_: Any, **__: Any) -> bool:
     """What the backward pass keeps of a step: all but other forms of what it has."""
-    return primitive.name not in {
-        "broadcast_in_dim",
-        "convert_element_type",
-        "neg",
-        "reshape",
-        "squeeze",
-        "transpose",
-    }
+    return primitive.name not in _OTHER_FORMS
 
 
 # To write, and on the way back to read, the numbers that a backward pass keeps costs more than to
 # compute the interval again.
 _integrate = jax.checkpoint(integrate, static_argnums=3, prevent_cse=False)
 _propagate = jax.checkpoint(propagate, policy=_keep, prevent_cse=False)
-
-
-def _take(
-    measurement: Measurement, state: FilterState, step: Step
-) -> tuple[FilterState, Outcome, Correction]:
-    """The measurement's update."""
-
-    def update(measurement: Measurement, state: FilterState) -> tuple:
-        return measurement.update(state, step)
-
-    return jax.checkpoint(update, policy=_keep, prevent_cse=False)(measurement, state)
 
 
 # A scan whose backward pass is bounded

@@ -40,17 +40,14 @@ from gnio_jax.config import NoiseModel
 from gnio_jax.filtering.checks import Inputs, checked_displacements, checked_inputs
 from gnio_jax.filtering.config import FilterConfig, YawFrame
 from gnio_jax.filtering.displacement import scaled_displacement
-from gnio_jax.filtering.gaps import bridge
+from gnio_jax.filtering.history import StepRecord
 from gnio_jax.filtering.propagation import Transition, put
-from gnio_jax.filtering.scan import StepTrace, clone_step, intervals
+from gnio_jax.filtering.scan import StepTrace, as_given, clone_steps
 from gnio_jax.filtering.state import (
-    ACCEL_BIAS,
     CLONE,
     CORE,
-    GYRO_BIAS,
     OFFSET,
     THETA,
-    VELOCITY,
     FilterState,
     Mean,
     with_position,
@@ -129,25 +126,15 @@ class _ForwardStep(NamedTuple):
 def _smooth(
     inputs: Inputs, displacement: Array, covariance: Array, config: FilterConfig, frame: YawFrame
 ) -> SmoothedHistory:
-    state, gyro, accel, imu_valid, measurements, noise = inputs
-    given = scaled_displacement(displacement, covariance, noise, frame)
-    stream, _, _ = bridge(gyro, accel, imu_valid, state.imu, config)
-    numbers, by_interval = intervals(stream, config)
-    rows = numbers % config.clones, by_interval, given, measurements
+    given = scaled_displacement(displacement, covariance, inputs.noise, frame)
+
+    def keep(slot: Array, state: FilterState, record: StepRecord, trace: StepTrace) -> _ForwardStep:
+        whole = jnp.concatenate([state.core_covariance, state.cross_covariance], axis=1)
+        return _ForwardStep(slot, record.mean, record.covariance, with_position(whole), trace)
+
+    state, steps, _ = clone_steps(as_given, inputs, given, config, keep)
     size, dtype = sum(state.cross_covariance.shape), state.offset.dtype
     nothing = Adjoint(jnp.zeros(size, dtype), jnp.zeros((size, size), dtype))
-
-    def forward(state: FilterState, row: tuple) -> tuple[FilterState, _ForwardStep]:
-        slot, imu, given, others = row
-        state, record, trace = clone_step(
-            state, imu, slot, lambda *_: (given, {}), config, noise, others
-        )
-        cross = with_position(
-            jnp.concatenate([state.core_covariance, state.cross_covariance], axis=1)
-        )
-        return state, _ForwardStep(slot, record.mean, record.covariance, cross, trace)
-
-    _, steps = jax.lax.scan(forward, state, rows)
     backward = functools.partial(_backward, config=config)
     _, (mean, found) = jax.lax.scan(backward, nothing, steps, reverse=True)
     whole = config.history == "core"
@@ -165,13 +152,9 @@ def _backward(
         covariance = step.covariance - over @ step.cross.T
     else:
         covariance = step.covariance - jnp.sum(over * step.cross, axis=1)
-    mean = Mean(
-        rotation=matmul(geometry.exp(error[THETA]), step.mean.rotation),
-        velocity=step.mean.velocity + error[VELOCITY],
-        position=step.mean.position + error[OFFSET],
-        gyro_bias=step.mean.gyro_bias + error[GYRO_BIAS],
-        accel_bias=step.mean.accel_bias + error[ACCEL_BIAS],
-    )
+    turn, *others = jnp.split(error, 5)
+    rotation = matmul(geometry.exp(turn), step.mean.rotation)
+    mean = Mean(rotation, *map(jnp.add, step.mean[1:], others))
     oldest = (step.slot + 1) % config.clones
     for correction in reversed(step.trace.corrections):
         adjoint = _before_update(adjoint, correction, oldest)

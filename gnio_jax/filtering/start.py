@@ -25,7 +25,7 @@ from jaxtyping import Float
 from gnio_jax import geometry
 from gnio_jax.config import InitialStd
 from gnio_jax.config.schema import TLIO_STD
-from gnio_jax.filtering.checks import check_finite, check_numbers, check_rotation, checked_array
+from gnio_jax.filtering.checks import check_numbers, check_rotation, checked_array
 from gnio_jax.filtering.config import FilterConfig
 from gnio_jax.filtering.state import FilterState, Mean, without_clones
 from gnio_jax.numerics import finite_rows
@@ -67,19 +67,14 @@ def initial_state(
     """
     rotation = checked_array("rotation", rotation, (3, 3), config)
     check_rotation("rotation", rotation)
-    dtype = rotation.dtype
-
-    vectors = []
-    for name, value in [
-        ("velocity", velocity),
-        ("position", position),
-        ("gyro_bias", gyro_bias),
-        ("accel_bias", accel_bias),
-    ]:
-        if name.endswith("bias") and jnp.ndim(value) == 0:
-            value = jnp.full(3, value, dtype)
-        vectors.append(checked_array(name, value, (3,), config).astype(dtype))
-        check_finite(name, vectors[-1])
+    given = {"velocity": velocity, "position": position}
+    biases = {"gyro_bias": gyro_bias, "accel_bias": accel_bias}
+    for name, value in biases.items():
+        given[name] = value if jnp.ndim(value) else jnp.full(3, value, rotation.dtype)
+    vectors = [
+        checked_array(name, value, (3,), config).astype(rotation.dtype)
+        for name, value in given.items()
+    ]
     check_numbers("std", std)
     return without_clones(Mean(rotation, *vectors), std, config.clones)
 
@@ -107,8 +102,6 @@ def level_state(
     accel = checked_array("accel", accel, (samples, 3), config)
     if samples < 2:
         raise ValueError(f"accel: at least two samples are needed, found {samples}")
-    check_finite("gyro", gyro)
-    check_finite("accel", accel)
     rotation, gyro_bias, tilt_std, velocity_std, up = _levelled(
         gyro, accel, jnp.asarray(std.accel_bias), config
     )

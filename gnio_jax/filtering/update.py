@@ -183,21 +183,22 @@ def measure(
     state: FilterState, linear: Linearised, step: Step, threshold: Array | float = math.inf
 ) -> tuple[FilterState, Outcome, Correction]:
     """One EKF update. A residual or covariance with a NaN is no measurement, and one whose
-    rᵀ S⁻¹ r is above `threshold` is refused (e.g. a quantile of χ² with m degrees of freedom)."""
-    finite = [jnp.all(jnp.isfinite(part)) for part in (linear.residual, linear.covariance)]
-    present = finite[0] & finite[1]
-    outcome, correction = project(state, linear, step.oldest, present)
-    accepted = present & (outcome.nis <= threshold)
-    outcome = outcome._replace(weight=accepted.astype(outcome.nis.dtype), accepted=accepted)
-    state, correction = correct(state, correction, accepted, step.newest)
-    return state, outcome, correction
+    rᵀ S⁻¹ r is above a finite `threshold` is refused (e.g. a quantile of χ² with m degrees of
+    freedom)."""
+    outcome, correction = project(state, linear, step.oldest)
+    tested = outcome.present & jnp.isfinite(threshold)
+    accepted = outcome.present & (outcome.nis <= threshold)
+    weight = accepted.astype(outcome.nis.dtype)
+    outcome = outcome._replace(tested=tested, weight=weight, accepted=accepted)
+    return correct(state, outcome, correction, step.newest)
 
 
 def project(
-    state: FilterState, linear: Linearised, oldest: Array | int, present: Bool[Array, ""]
+    state: FilterState, linear: Linearised, oldest: Array | int
 ) -> tuple[Outcome, Correction]:
-    """What becomes of a measurement that is accepted where it is `present`. Where it is not, r is
+    """What becomes of a measurement that is accepted where there is one. Where there is none, r is
     zero and S the identity: NaN stays out of the arithmetic, and out of the derivatives."""
+    present = jnp.isfinite(linear.residual).all() & jnp.isfinite(linear.covariance).all()
     jacobian = jnp.concatenate(list(linear.jacobian.values()), axis=1)
 
     def touched(core: Array, clones: Array) -> Array:
@@ -220,11 +221,11 @@ def project(
 
 
 def correct(
-    state: FilterState, correction: Correction, accepted: Bool[Array, ""], newest: Array | int
-) -> tuple[FilterState, Correction]:
-    """Mean and covariance after an update, and the correction, which is zero where it is not
-    `accepted`. `newest` is the slot of the newest clone."""
-    correction = jax.tree.map(lambda rows: jnp.where(accepted, rows, 0.0), correction)
+    state: FilterState, outcome: Outcome, correction: Correction, newest: Array | int
+) -> tuple[FilterState, Outcome, Correction]:
+    """Mean and covariance after an update, and its correction, which is zero where it was not
+    accepted. `newest` is the slot of the newest clone."""
+    correction = jax.tree.map(lambda rows: jnp.where(outcome.accepted, rows, 0.0), correction)
     # A reduction on purpose: it is kept, where the sum spelt out would be computed anew for every
     # entry that the correction of the mean reads.
     core, clones = (
@@ -236,7 +237,7 @@ def correct(
         cross_covariance=state.cross_covariance - matmul(correction.core.T, correction.clones),
         clone_covariance=downdate(state.clone_covariance, correction.clones),
     )
-    return corrected, correction
+    return corrected, outcome, correction
 
 
 def retract(
@@ -265,45 +266,25 @@ def retract(
 # ------------------------------------------------------------------------------------------------
 
 
-def cholesky(s: Float[Array, "m m"]) -> list[list[Array]]:
-    """The lower triangle of L with L Lᵀ = S, row by row, written out: a call to LAPACK costs more
-    than the whole update. NaN where S is not positive definite."""
-    root: list[list[Array]] = []
-    for i in range(s.shape[0]):
-        row: list[Array] = []
-        for j, above in enumerate(root):
-            row.append((s[i, j] - _dot(row, above)) / above[j])
-        row.append(jnp.sqrt(s[i, i] - _dot(row, row)))
-        root.append(row)
-    return root
-
-
-def _dot(left: list[Array], right: list[Array]) -> Array | float:
-    return sum((x * y for x, y in zip(left, right, strict=False)), start=0.0)
-
-
-def lower_triangular(root: list[list[Array]]) -> Float[Array, "m m"]:
-    """L as a matrix."""
-    zero = jnp.zeros_like(root[0][0])
-    entries = [entry for row in root for entry in [*row, *[zero] * (len(root) - len(row))]]
-    return jnp.stack(entries).reshape(len(root), len(root))
-
-
 @jax.custom_jvp
 def whiten(
     s: Float[Array, "m m"], rows: tuple[Float[Array, "m _"], ...]
 ) -> tuple[tuple[Float[Array, "m _"], ...], Float[Array, ""]]:
-    """L⁻¹ of each of the rows, for a symmetric S = L Lᵀ, and √det S."""
-    root = cholesky(s)
+    """L⁻¹ of each of the rows, for a symmetric S = L Lᵀ, and √det S; NaN where S is not positive
+    definite.
 
-    def solve(part: Array) -> Array:
-        solved: list[Array] = []
-        for i, row in enumerate(root):
-            solved.append((part[i] - _dot(row[:-1], solved)) / row[-1])
-        return jnp.stack(solved)
-
-    volume = math.prod((row[-1] for row in root[1:]), start=root[0][-1])
-    return tuple(solve(part) for part in rows), volume
+    Gauss's elimination of the rows beside S, which becomes Lᵀ, written out: a call to LAPACK costs
+    more than the whole update.
+    """
+    solved: list[list[Array]] = []
+    for i in range(len(s)):
+        row = [part[i] for part in (s, *rows)]
+        for above in solved:
+            row = [x - above[0][i] * y for x, y in zip(row, above, strict=True)]
+        root = jnp.sqrt(row[0][i])
+        solved.append([x / root for x in row])
+    volume = math.prod((row[0][i] for i, row in enumerate(solved)), start=jnp.ones((), s.dtype))
+    return tuple(map(jnp.stack, list(zip(*solved, strict=True))[1:])), volume
 
 
 @whiten.defjvp

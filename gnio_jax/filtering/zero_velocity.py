@@ -12,10 +12,10 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from gnio_jax.filtering.config import FilterConfig
+from gnio_jax.filtering.displacement import gate_activity
 from gnio_jax.filtering.gaps import Imu
-from gnio_jax.filtering.gate import gate_activity
 from gnio_jax.filtering.state import FilterState
-from gnio_jax.filtering.update import Correction, Outcome, Step, correct, linearise, project
+from gnio_jax.filtering.update import Correction, Outcome, Step, linearise, measure
 from gnio_jax.types import GRAVITY, Array
 
 
@@ -34,17 +34,11 @@ class ZeroVelocity(NamedTuple):
         config = step.config
         state, quiet = detect_rest(state, step.imu, config)
         eye = np.eye(3, dtype=state.velocity.dtype)
-        covariance = config.zero_velocity_std**2 * eye
-        linear = linearise(state, -state.velocity, covariance, velocity=eye)
-        outcome, correction = project(state, linear, step.oldest, quiet)
-        fits = outcome.nis <= config.gate_threshold
-        active = gate_activity(state.gate, config, state.step * config.samples_per_clone).active
-        tested = quiet & active & step.before[0].tested
-        accepted = quiet & (~tested | fits)
-        weight = accepted.astype(outcome.nis.dtype)
-        outcome = outcome._replace(tested=tested, weight=weight, accepted=accepted)
-        state, correction = correct(state, correction, accepted, step.newest)
-        return state, outcome, correction
+        residual = jnp.where(quiet, -state.velocity, jnp.nan)
+        linear = linearise(state, residual, config.zero_velocity_std**2 * eye, velocity=eye)
+        active, _ = gate_activity(state.gate, config, state.step * config.samples_per_clone)
+        tested = active & step.before[0].tested
+        return measure(state, linear, step, jnp.where(tested, config.gate_threshold, jnp.inf))
 
 
 def detect_rest(

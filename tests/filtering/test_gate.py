@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 
 from gnio_jax import filtering
-from gnio_jax.filtering.gate import innovation_gate
+from gnio_jax.filtering.displacement import innovation_gate
 
 
 def test_gate_boundaries_count_samples():
