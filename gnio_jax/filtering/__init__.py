@@ -6,13 +6,12 @@ Needs only JAX and the geometry: the network is any function from windows to a `
 
 from gnio_jax.config import ConsideredStd, CorrelatedError, FilterSettings, InitialStd, NoiseModel
 from gnio_jax.filtering.batch import cores_as_devices, over_sequences
-from gnio_jax.filtering.config import FilterConfig
 from gnio_jax.filtering.consider import considered_covariance, sensitivity
 from gnio_jax.filtering.displacement import displacements
 from gnio_jax.filtering.fix import Fix, fixes_on_intervals
 from gnio_jax.filtering.history import FilterHistory
 from gnio_jax.filtering.scan import run_filter, run_odometry
-from gnio_jax.filtering.settings import FilterSetup, filter_setup
+from gnio_jax.filtering.settings import FilterConfig, FilterSetup, filter_setup
 from gnio_jax.filtering.smoother import SmoothedHistory, smooth
 from gnio_jax.filtering.start import initial_state, level_state
 from gnio_jax.filtering.state import FilterState, GateState

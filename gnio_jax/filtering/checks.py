@@ -19,7 +19,7 @@ from jax.tree_util import keystr, tree_map_with_path
 
 from gnio_jax.config import NoiseModel
 from gnio_jax.config.files import bounds, named
-from gnio_jax.filtering.config import FilterConfig
+from gnio_jax.filtering.settings import FilterConfig
 from gnio_jax.filtering.state import FilterState, state_shapes, with_correlated_error
 from gnio_jax.types import FASTEST_TURN, STRONGEST_FORCE, Array
 

@@ -27,7 +27,7 @@ from jaxtyping import Bool, Float
 
 from gnio_jax import geometry, numerics
 from gnio_jax.config import NoiseModel
-from gnio_jax.filtering.config import FilterConfig, YawFrame
+from gnio_jax.filtering.settings import FilterConfig, YawFrame
 from gnio_jax.filtering.state import FilterState, GateState
 from gnio_jax.filtering.update import (
     Correction,

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float
 
 from gnio_jax.errors import InputError
-from gnio_jax.filtering.config import FilterConfig
+from gnio_jax.filtering.settings import FilterConfig
 from gnio_jax.filtering.state import FilterState
 from gnio_jax.filtering.update import Correction, Outcome, Step, linearise, measure
 from gnio_jax.types import Array

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from gnio_jax.filtering.config import FilterConfig
+from gnio_jax.filtering.settings import FilterConfig
 from gnio_jax.filtering.state import ImuMemory
 from gnio_jax.types import Array
 

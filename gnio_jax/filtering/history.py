@@ -10,8 +10,8 @@ import jax.numpy as jnp
 from jaxtyping import Bool, Float
 
 from gnio_jax.config import NoiseModel
-from gnio_jax.filtering.config import FilterConfig
 from gnio_jax.filtering.displacement import Displacement
+from gnio_jax.filtering.settings import FilterConfig
 from gnio_jax.filtering.state import Mean
 from gnio_jax.filtering.update import Outcome
 from gnio_jax.types import Array

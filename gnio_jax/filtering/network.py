@@ -10,9 +10,9 @@ import jax.numpy as jnp
 from jaxtyping import Bool, Float
 
 from gnio_jax.config import NoiseModel
-from gnio_jax.filtering.config import FilterConfig
 from gnio_jax.filtering.displacement import Displacement, scaled_displacement
 from gnio_jax.filtering.gaps import Imu
+from gnio_jax.filtering.settings import FilterConfig
 from gnio_jax.filtering.state import FilterState
 from gnio_jax.types import Array, Prediction
 from gnio_jax.windows import cut_window

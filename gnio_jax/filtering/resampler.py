@@ -182,15 +182,14 @@ class Stream:
             self.origin = time
             self._append(0.0, sample)
             return
-        stamp, newest, come = time - self.origin, self._newest, [(time - self.origin, sample)]
+        stamp, newest = time - self.origin, self._newest
         if stamp <= newest:
             raise ValueError(f"time: must increase, found {time!r} after {self.origin + newest!r}")
         if stamp - newest > LONGEST_GAP:
-            raise ValueError(
-                f"time: {time!r} is {stamp - newest:g} s after the sample before, more than "
-                f"{LONGEST_GAP:g} s; stamps are in seconds, and after a long stop a new tracker "
-                "starts better"
-            )
+            problem = f"{time!r} is {stamp - newest:g} s after the sample before, more than"
+            remedy = "stamps are in seconds, and after a long stop a new tracker starts better"
+            raise ValueError(f"time: {problem} {LONGEST_GAP:g} s; {remedy}")
+        come = [(stamp, sample)]
         if stamp - newest > LONGEST_TRUSTED:
             waiting = self._unproven
             if waiting is None or not 0 < stamp - waiting[0] <= LONGEST_TRUSTED:

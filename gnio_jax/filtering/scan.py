@@ -13,7 +13,6 @@ from jaxtyping import Float
 
 from gnio_jax.config import NoiseModel
 from gnio_jax.filtering.checks import Inputs, checked_displacements, checked_inputs
-from gnio_jax.filtering.config import FilterConfig, YawFrame
 from gnio_jax.filtering.displacement import Displacement, scaled_displacement
 from gnio_jax.filtering.gaps import Imu, bridge
 from gnio_jax.filtering.history import FilterHistory, StepRecord, finished_history
@@ -25,6 +24,7 @@ from gnio_jax.filtering.propagation import (
     integrate,
     propagate,
 )
+from gnio_jax.filtering.settings import FilterConfig, YawFrame
 from gnio_jax.filtering.state import FilterState, core_covariance, move_anchor, unroll_clones
 from gnio_jax.filtering.update import Correction, Measurement, Outcome, Step
 from gnio_jax.filtering.zero_velocity import ZeroVelocity

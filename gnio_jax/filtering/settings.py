@@ -1,17 +1,24 @@
-"""The filter that an experiment's settings describe, and its numbers as free parameters."""
+"""The filter's settings: what is fixed when it is compiled, what an experiment asks for, and its
+numbers as free parameters."""
 
 from __future__ import annotations
 
+import dataclasses
+import inspect
 import math
 from collections.abc import Iterable, Mapping
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple, no_type_check
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.tree_util import keystr, tree_leaves_with_path
 
 from gnio_jax.config import ConsideredStd, DataConfig, FilterSettings, InitialStd, NoiseModel
-from gnio_jax.filtering.config import FilterConfig
+from gnio_jax.config.files import checked_value
+from gnio_jax.config.schema import Count, Finite, NonNegative, NonNegativeCount, Place, Positive
+from gnio_jax.windows import WINDOW_CUTS, WindowCut
 
 jax.tree_util.register_dataclass(
     FilterSettings,
@@ -19,10 +26,145 @@ jax.tree_util.register_dataclass(
     meta_fields=["raw_gyro_bias", "mahalanobis_fail_scale", "window_rotation"],
 )
 
-SHARE = "noise.correlation.share"
-"""The number that lies between 0 and 1; the others are positive."""
-LARGEST_SHARE = 0.9999
-"""Largest share that is written down: rounding must not make it 1."""
+YawFrame = Literal["own", "given"]
+"""Whose yaw frame a displacement is expressed in: that of the filter's own attitude of the oldest
+clone, with which the network's window was cut, or that of another attitude."""
+
+
+@no_type_check  # The tests' run-time checker would refuse what __post_init__ converts or names.
+@dataclass(frozen=True)
+class FilterConfig:
+    """Static settings of the filter. The defaults are TLIO's.
+
+    Numbers may come as 0-d arrays, as NumPy files give them. Raises `InputError`, a `ValueError`,
+    naming a field that makes no sense.
+    """
+
+    dt: Positive
+    """Time between IMU samples, s."""
+    samples_per_clone: Count
+    """IMU samples n in one clone interval."""
+    clones_per_window: Count
+    """Clone intervals W in one measurement; W + 1 poses are cloned."""
+    context_samples: NonNegativeCount = dataclasses.field(default=0, kw_only=True)
+    """IMU samples C before a measurement's window that the network sees too (ours)."""
+    mahalanobis_fail_scale: NonNegative = 0.0
+    """0 skips a rejected measurement; above 0 it is applied with its covariance multiplied by
+    this."""
+    history: Literal["diagonal", "core"] = "diagonal"
+    """Keep the diagonal of the core covariance at every interval, or the whole 15×15 block too."""
+    log_std_min: Finite = -4.0
+    """The network's log standard deviation is raised to at least this (`run_odometry` only)."""
+    gate_threshold: Positive = 11.345
+    """Largest rᵀ S⁻¹ r that passes, of a displacement and of a velocity at rest: 99 % of χ² with
+    three degrees of freedom."""
+    convergence_seconds: NonNegative = 10.0
+    """The gate stays open until the oldest clone is more than this after initialisation, s."""
+    success_seconds: NonNegative = 0.5
+    """When the last success is older than this, the gate pauses: everything passes, s."""
+    pause_seconds: NonNegative = 1.0
+    """Length of such a pause, s."""
+    gate_softness: NonNegative = 0.0
+    """0 accepts or rejects; above 0 the gate has a slope, for training: a measurement's information
+    is weighted by the logistic function of (gate_threshold − rᵀ S⁻¹ r) / gate_softness."""
+    zero_velocity_std: NonNegative = 0.0
+    """Standard deviation of the velocity at rest, m/s, used as a measurement while the IMU is
+    quiet; 0 for no such update. Where a displacement is tested in the same interval and its gate is
+    active, a rest that does not fit is refused, whatever `mahalanobis_fail_scale` and
+    `gate_softness`."""
+    rest_gyro: NonNegative = 0.05
+    """Bound of |gyro − b_g| in every sample of a quiet IMU, rad/s."""
+    rest_accel: NonNegative = 0.3
+    """Bound of | |accel − b_a| − g | in every sample of a quiet IMU, m/s²."""
+    rest_seconds: NonNegative = 0.5
+    """How long the IMU is quiet before its velocity is measured as zero, s."""
+    bridge_seconds: NonNegative = 0.1
+    """Missing IMU samples hold the last one for this long, s; after it attitude and velocity coast,
+    and windows are no measurements."""
+    gap_gyro_std: NonNegative = 1.0
+    """Standard deviation of the rate that a gap may hide, rad/s. That of a held sample grows with
+    its age to this, at `bridge_seconds`."""
+    gap_accel_std: NonNegative = 3.0
+    """Standard deviation of the acceleration that a gap may hide, m/s²."""
+    checkpoint_every: NonNegativeCount = 0
+    """Clone intervals between the states kept for the backward pass, all else being computed again:
+    memory for time. 0 keeps everything."""
+    truncate_every: NonNegativeCount = 0
+    """Clone intervals after which the state is carried on without gradient, for training on long
+    recordings: values stay as they are. The final state has no gradient then. 0 never."""
+    window_rotation: Literal["per_sample", "single", "tlio"] = "per_sample"
+    """Rotate each sample of the network's window with its own attitude, or all with that of the
+    start (paper eq. 1 read literally), or cut and rotate it as TLIO's tracker does: one sample
+    earlier, the network's input with the biases that the IMU comes with."""
+    speed_limit: Positive = 100.0
+    """No carrier is faster, m/s: an estimate that exceeds it has diverged, and is not `healthy`
+    from then on (ours)."""
+    allow_float32: bool = False
+    """Run in float32 where the state is float32: every standard deviation keeps about four digits
+    over an hour. Without this float32 is refused. Smoothing and derivatives want float64 anyway."""
+
+    def __post_init__(self) -> None:
+        for name, hint in inspect.get_annotations(type(self), eval_str=True).items():
+            value = getattr(self, name)
+            if isinstance(value, np.ndarray | np.generic) and value.ndim == 0:
+                value = value.item()
+            object.__setattr__(self, name, checked_value(hint, value, Place("FilterConfig", name)))
+        if self.gate_softness and self.mahalanobis_fail_scale:
+            problem = "makes no sense beside mahalanobis_fail_scale"
+            Place("FilterConfig", "gate_softness").refuse(problem, "set one of them to 0")
+
+    @property
+    def window(self) -> int:
+        """IMU samples N = n·W in the network's window."""
+        return self.samples_per_clone * self.clones_per_window
+
+    @property
+    def seen(self) -> int:
+        """IMU samples C + N that the network sees: the context and the window."""
+        return self.context_samples + self.window
+
+    @property
+    def first_measured(self) -> int:
+        """Number of the first clone interval that ends with a measurement: the samples that it
+        depends on are there, and W intervals lie before it, as in TLIO's tracker."""
+        before_window = -(-(self.context_samples + self.cut.lead) // self.samples_per_clone)
+        return self.clones_per_window + max(before_window - 1, 0)
+
+    @property
+    def clone_seconds(self) -> float:
+        """Length of a clone interval, s."""
+        return self.dt * self.samples_per_clone
+
+    @property
+    def clones(self) -> int:
+        """Cloned poses W + 1."""
+        return self.clones_per_window + 1
+
+    @property
+    def cut(self) -> WindowCut:
+        """How the network's window is cut: that of `window_rotation`."""
+        return WINDOW_CUTS[self.window_rotation]
+
+    @property
+    def reach(self) -> int:
+        """IMU samples, the newest included, that a measurement depends on."""
+        return self.seen + self.cut.lead
+
+    @property
+    def displacement_frame(self) -> YawFrame:
+        """Yaw frame of the network's displacement, as the measurement's Jacobian takes it.
+
+        TLIO's Jacobian takes a given frame, though it is the filter's own.
+        """
+        return "given" if self.window_rotation == "tlio" else "own"
+
+    def whole_samples(self, seconds: float) -> int:
+        """t·dt > seconds ⇔ t > this number, whatever rounding does to seconds / dt."""
+        return int(np.floor(seconds / self.dt + 1e-6))
+
+
+# The filter of an experiment
+# ------------------------------------------------------------------------------------------------
 
 
 class FilterSetup(NamedTuple):
@@ -55,6 +197,12 @@ def filter_config(windows: DataConfig, settings: FilterSettings) -> FilterConfig
         history="core",
         window_rotation=settings.window_rotation or windows.window_rotation,
     )
+
+
+SHARE = "noise.correlation.share"
+"""The number that lies between 0 and 1; the others are positive."""
+LARGEST_SHARE = 0.9999
+"""Largest share that is written down: rounding must not make it 1."""
 
 
 def free_parameters(settings: FilterSettings, paths: Iterable[str]) -> dict[str, float]:

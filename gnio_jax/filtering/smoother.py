@@ -38,11 +38,11 @@ from jaxtyping import Float, Int
 from gnio_jax import geometry
 from gnio_jax.config import NoiseModel
 from gnio_jax.filtering.checks import Inputs, checked_displacements, checked_inputs
-from gnio_jax.filtering.config import FilterConfig, YawFrame
 from gnio_jax.filtering.displacement import scaled_displacement
 from gnio_jax.filtering.history import StepRecord
 from gnio_jax.filtering.propagation import Transition, put
 from gnio_jax.filtering.scan import StepTrace, as_given, clone_steps
+from gnio_jax.filtering.settings import FilterConfig, YawFrame
 from gnio_jax.filtering.state import (
     CLONE,
     CORE,

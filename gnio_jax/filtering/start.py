@@ -26,7 +26,7 @@ from gnio_jax import geometry
 from gnio_jax.config import InitialStd
 from gnio_jax.config.schema import TLIO_STD
 from gnio_jax.filtering.checks import check_numbers, check_rotation, checked_array
-from gnio_jax.filtering.config import FilterConfig
+from gnio_jax.filtering.settings import FilterConfig
 from gnio_jax.filtering.state import FilterState, Mean, without_clones
 from gnio_jax.numerics import finite_rows
 from gnio_jax.types import GRAVITY, Array

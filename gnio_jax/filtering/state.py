@@ -26,7 +26,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from gnio_jax.config import InitialStd, NoiseModel
-from gnio_jax.filtering.config import FilterConfig
+from gnio_jax.filtering.settings import FilterConfig
 from gnio_jax.types import Array
 
 CORE, CLONE = 21, 6

@@ -1,14 +1,10 @@
 """The filter online: IMU samples as they come, a pose after every clone interval, or at any time.
 
-A stream has a present, so `Tracker` is an object that changes. It holds the samples that are not
-yet used (`resampler.Stream`), and on the device the filter with the last window of samples
-(`Core`). The samples reach the filter on its own uniform clock, and every n of them make the clone
-step that `run_odometry` makes, in one compiled program.
-
-Grid sample k, at t_0 + k·dt, drives the interval up to t_0 + (k + 1)·dt. It is known when the first
-stamp at or after its own has come, so the latency is at most one sample; the pose is that of the
-end of its interval. Where the IMU is faster than the filter, the low-pass adds its delay to the
-latency: `Tracker.delay`, some 22 samples of the filter, 0.11 s at 200 Hz.
+The samples reach the filter on its own uniform clock (`resampler.Stream`). Grid sample k, at
+t_0 + k·dt, drives the interval up to t_0 + (k + 1)·dt. It is known when the first stamp at or after
+its own has come, so the latency is at most one sample; the pose is that of the end of its interval.
+Where the IMU is faster than the filter, a low-pass adds its delay to the latency: `Tracker.delay`,
+some 22 samples of the filter, 0.11 s at 200 Hz.
 """
 
 from __future__ import annotations
@@ -26,7 +22,6 @@ from jaxtyping import Float, Int
 from gnio_jax.config import ConsideredStd, InitialStd, NoiseModel
 from gnio_jax.config.schema import TLIO_STD
 from gnio_jax.filtering.checks import check_number, checked_noise, checked_state
-from gnio_jax.filtering.config import FilterConfig
 from gnio_jax.filtering.consider import (
     Tangents,
     considered_covariance,
@@ -41,6 +36,7 @@ from gnio_jax.filtering.network import Predict, network_measurement
 from gnio_jax.filtering.propagation import integrate
 from gnio_jax.filtering.resampler import ACCEL, GYRO, VALID, Stream, create_grid
 from gnio_jax.filtering.scan import Measure, clone_step
+from gnio_jax.filtering.settings import FilterConfig
 from gnio_jax.filtering.start import initial_state, level_state
 from gnio_jax.filtering.state import (
     BIASES,
@@ -156,8 +152,8 @@ class Tracker:
             self._core = None
 
     def expect(self, imu_rate: float, hole: float | None = None) -> None:
-        """Take samples of another `imu_rate` and `hole`, before the first of them: a stream may
-        tell its rate only when it has begun. Nothing is compiled again."""
+        """Take samples of another `imu_rate` and `hole`, before the first of them. Nothing is
+        compiled again."""
         self._stream = Stream(create_grid(self._config.dt, hole, imu_rate))
 
     def push(self, time: Any, gyro: Any, accel: Any) -> Pose | None:
@@ -265,15 +261,13 @@ def compile_programs(
     considered: ConsideredStd | None,
 ) -> tuple[Callable[..., tuple[Core, Estimate]], Callable[..., tuple[Estimate, ImuMemory]]]:
     """`advance` and `look_ahead`, compiled for cores like this one."""
-    of_type = functools.partial(jax.ShapeDtypeStruct, dtype=core.window.dtype)
-    step = functools.partial(
-        advance, predict=predict, config=config, noise=noise, considered=considered
-    )
-    ahead = functools.partial(look_ahead, config=config, noise=noise)
-    compiled = jax.jit(step, donate_argnums=0).lower(core, of_type((config.samples_per_clone, 7)))
-    _, estimate = compiled.out_info
-    of_row = jax.jit(ahead).lower(estimate, core.filter.imu, of_type((7,)))
-    return compiled.compile(), of_row.compile()
+    rows = jax.ShapeDtypeStruct((config.samples_per_clone, 7), core.window.dtype)
+    fixed = {"config": config, "noise": noise}
+    step = functools.partial(advance, predict=predict, considered=considered, **fixed)
+    advancing = jax.jit(step, donate_argnums=0).lower(core, rows)
+    ahead, row = functools.partial(look_ahead, **fixed), rows.update(shape=(7,))
+    looking = jax.jit(ahead).lower(advancing.out_info[1], core.filter.imu, row)
+    return advancing.compile(), looking.compile()
 
 
 def advance(
@@ -293,12 +287,10 @@ def advance(
     window = jnp.concatenate([core.window[config.samples_per_clone :], newest])
     complete = (core.intervals >= config.clones_per_window) & jnp.all(window[:, VALID] > 0)
     of_window = network_measurement(predict, config, noise)
-
-    def latest() -> Imu:
-        return Imu(window[:, GYRO], window[:, ACCEL], None)
+    latest = Imu(window[:, GYRO], window[:, ACCEL], None)
 
     def measure(state: FilterState, oldest: Array | int) -> tuple[Displacement, dict]:
-        return of_window(complete, latest, state, oldest)[0], {}
+        return of_window(complete, lambda: latest, state, oldest)[0], {}
 
     def step(state: FilterState, measure: Measure) -> tuple[FilterState, FilterHistory]:
         slot = core.intervals % config.clones
@@ -366,29 +358,28 @@ def estimated(
 
 def _checked_sample(time: Any, gyro: Any, accel: Any) -> tuple[float, tuple[float, ...]]:
     """The time, and gyro and accel in one tuple."""
-    try:
-        seconds = float(time)
-    except (TypeError, ValueError):
-        seconds = math.nan
+    (seconds,) = _numbers("time", time, (), "a finite number of seconds", math.inf)
     if not math.isfinite(seconds):
         raise ValueError(f"time: must be a finite number of seconds, found {time!r}")
-    numbers: list[float] = []
-    for name, value, largest, unit in [
-        ("gyro", gyro, FASTEST_TURN, "rad/s"),
-        ("accel", accel, STRONGEST_FORCE, "m/s²"),
-    ]:
-        try:
-            three = np.asarray(value, np.float64)
-        except (TypeError, ValueError):
-            three = np.empty(0)
-        if three.shape != (3,):
-            raise ValueError(f"{name}: must be three numbers, found {value!r}")
-        numbers += three.tolist()
-        size = max((abs(each) for each in numbers[-3:] if math.isfinite(each)), default=0.0)
-        if size > largest:
-            problem = f"no IMU measures more than {largest:g} {unit}"
-            raise ValueError(f"{name}: {problem}, found {size:g}")
-    return seconds, tuple(numbers)
+    rate = _numbers("gyro", gyro, (3,), "three numbers", FASTEST_TURN, "rad/s")
+    return seconds, rate + _numbers("accel", accel, (3,), "three numbers", STRONGEST_FORCE, "m/s²")
+
+
+def _numbers(
+    name: str, value: Any, shape: tuple[int, ...], wanted: str, largest: float, unit: str = ""
+) -> tuple[float, ...]:
+    """The numbers of an array of this shape, which are as small as those of an IMU."""
+    try:
+        array = np.asarray(value, np.float64)
+    except (TypeError, ValueError):
+        array = np.empty(0)
+    if array.shape != shape:
+        raise ValueError(f"{name}: must be {wanted}, found {value!r}")
+    numbers = tuple(array.reshape(-1).tolist())
+    size = max((abs(each) for each in numbers if math.isfinite(each)), default=0.0)
+    if size > largest:
+        raise ValueError(f"{name}: no IMU measures more than {largest:g} {unit}, found {size:g}")
+    return numbers
 
 
 def _copied(tree: Any) -> Any:

@@ -30,8 +30,8 @@ from jaxtyping import Bool, Float
 
 from gnio_jax import geometry
 from gnio_jax.config import NoiseModel
-from gnio_jax.filtering.config import FilterConfig
 from gnio_jax.filtering.gaps import Imu
+from gnio_jax.filtering.settings import FilterConfig
 from gnio_jax.filtering.state import (
     ACCEL_BIAS,
     ANCHOR,

@@ -25,11 +25,10 @@ from gnio_jax import geometry
 from gnio_jax.config import CorrelatedError
 from gnio_jax.errors import InputError
 from gnio_jax.filtering.batch import padded_masks, padded_signals
-from gnio_jax.filtering.config import FilterConfig
 from gnio_jax.filtering.fix import fixes_on_intervals
 from gnio_jax.filtering.network import Predict
 from gnio_jax.filtering.scan import run_odometry
-from gnio_jax.filtering.settings import FilterSetup
+from gnio_jax.filtering.settings import FilterConfig, FilterSetup
 from gnio_jax.filtering.smoother import SmoothedHistory, smooth
 from gnio_jax.filtering.start import initial_state, level_state
 from gnio_jax.filtering.state import Mean

@@ -11,9 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
-from gnio_jax.filtering.config import FilterConfig
 from gnio_jax.filtering.displacement import gate_activity
 from gnio_jax.filtering.gaps import Imu
+from gnio_jax.filtering.settings import FilterConfig
 from gnio_jax.filtering.state import FilterState
 from gnio_jax.filtering.update import Correction, Outcome, Step, linearise, measure
 from gnio_jax.types import GRAVITY, Array
