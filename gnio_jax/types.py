@@ -8,6 +8,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -89,3 +90,17 @@ class Prediction(NamedTuple):
     diagnostics: dict[str, Array] = {}
     """Internal values to look at: `gate`, `scale` (b, 3), `attention` (b, heads, m), if the model
     has them."""
+
+    def covariance(self, least: float, dtype: Any) -> Float[jax.Array, "*b 3 3"]:
+        """Covariance of `displacement`, m²: diag(exp 2u), u raised to `least`."""
+        log_std = jnp.maximum(self.log_std.astype(dtype), least)
+        return jnp.exp(2 * log_std)[..., None] * np.eye(3, dtype=dtype)
+
+    def normalised(
+        self, error: Float[jax.Array, "*b d"], least: float | None
+    ) -> tuple[Float[jax.Array, "*b d"], Float[jax.Array, "*b d"]]:
+        """(e/σ)² of errors of the first d axes, m, and log σ, raised to `least`: with the same
+        covariance, −log N(e) is their sum Σ ½ (e/σ)² + log σ, without its constant."""
+        log_std = self.log_std[..., : error.shape[-1]]
+        log_std = log_std if least is None else jnp.maximum(log_std, least)
+        return error**2 * jnp.exp(-2 * log_std), log_std

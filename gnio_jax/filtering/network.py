@@ -22,23 +22,6 @@ Predict = Callable[[Any], Prediction]
 `Prediction` with the same leading axis."""
 
 
-def prediction_shapes(predict: Predict, config: FilterConfig) -> Prediction:
-    """Shapes of what `predict` returns for one window; `ValueError` if that is not what the filter
-    needs."""
-    found = jax.eval_shape(predict, jax.ShapeDtypeStruct((1, config.seen, 6), jnp.float32))
-    if not isinstance(found, Prediction):
-        kind = type(found).__name__
-        raise ValueError(f"predict: must return a gnio_jax.types.Prediction, found {kind}")
-    for name, value in [("displacement", found.displacement), ("log_std", found.log_std)]:
-        if value.shape != (1, 3):
-            raise ValueError(f"predict: {name} must be (1, 3) for one window, found {value.shape}")
-    for name, value in found.diagnostics.items():
-        if value.shape[:1] != (1,):
-            problem = f"must have a leading axis of one window, found {value.shape}"
-            raise ValueError(f"predict: diagnostics['{name}'] {problem}")
-    return found
-
-
 def network_measurement(
     predict: Predict, config: FilterConfig, noise: NoiseModel
 ) -> Callable[..., tuple[Displacement, dict[str, Array]]]:
@@ -48,9 +31,19 @@ def network_measurement(
 
     where `latest()` gives the last `config.reach` raw samples, and `oldest` is the slot of the
     oldest clone. The network is called where `has_window`. There is no measurement elsewhere, nor
-    from a window in which the filter coasted.
+    from a window in which the filter coasted. Raises `ValueError` if `predict` does not return what
+    the filter needs.
     """
-    shapes = prediction_shapes(predict, config)
+
+    def of_one(window: Float[Array, "1 n 6"]) -> Prediction:
+        found = predict(window)
+        _check(found)
+        return jax.tree.map(lambda leaf: _as_floating(leaf[0]), found)
+
+    shapes = jax.eval_shape(of_one, jax.ShapeDtypeStruct((1, config.seen, 6), jnp.float32))
+
+    def nothing() -> Prediction:
+        return jax.tree.map(lambda leaf: jnp.full(leaf.shape, jnp.nan, leaf.dtype), shapes)
 
     def measure(
         has_window: Bool[Array, ""],
@@ -60,28 +53,30 @@ def network_measurement(
     ) -> tuple[Displacement, dict[str, Array]]:
         def infer() -> Prediction:
             gyro, accel, gap = latest()
-            found = predict(network_window(state, oldest, gyro, accel, config))
-            found = jax.tree.map(lambda leaf: _as_floating(leaf[0]), found)
-            if gap is None:
-                return found
-            whole = jnp.all(gap.used > 0)
+            found = of_one(network_window(state, oldest, gyro, accel, config))
+            whole = gap is None or jnp.all(gap.used > 0)
             return found._replace(displacement=jnp.where(whole, found.displacement, jnp.nan))
 
-        def nothing() -> Prediction:
-            return jax.tree.map(
-                lambda leaf: jnp.full(leaf.shape[1:], jnp.nan, _as_floating(leaf).dtype), shapes
-            )
-
         found = jax.lax.cond(has_window, infer, nothing)
-        # The covariance is diag(exp 2u), u raised to `log_std_min`.
-        dtype = state.offset.dtype
-        log_std = jnp.maximum(found.log_std.astype(dtype), config.log_std_min)
-        covariance = jnp.diag(jnp.exp(2 * log_std))
+        dtype, frame = state.offset.dtype, config.displacement_frame
+        covariance = found.covariance(config.log_std_min, dtype)
         displacement = found.displacement.astype(dtype)
-        frame = config.displacement_frame
         return scaled_displacement(displacement, covariance, noise, frame), found.diagnostics
 
     return measure
+
+
+def _check(found: Any) -> None:
+    """Refuse what is no prediction of one window."""
+    if not isinstance(found, Prediction):
+        kind = type(found).__name__
+        raise ValueError(f"predict: must return a gnio_jax.types.Prediction, found {kind}")
+    for name, value in {**found._asdict(), **found.diagnostics}.items():
+        if name in ("displacement", "log_std") and value.shape != (1, 3):
+            raise ValueError(f"predict: {name} must be (1, 3) for one window, found {value.shape}")
+        if name in found.diagnostics and value.shape[:1] != (1,):
+            problem = f"must have a leading axis of one window, found {value.shape}"
+            raise ValueError(f"predict: diagnostics['{name}'] {problem}")
 
 
 def network_window(

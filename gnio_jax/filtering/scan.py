@@ -266,22 +266,21 @@ def blocked_scan(
     """`lax.scan` whose backward pass keeps the carry of every `checkpoint_every`-th step only, and
     computes the steps between them again, and which hands the carry on without gradient after
     every `truncate_every`-th step. 0: it keeps every carry, and never cuts the gradient."""
-    run = functools.partial(jax.lax.scan, step)
+    run = within = functools.partial(jax.lax.scan, step)
     rows = len(jax.tree.leaves(inputs)[0])
     if 0 < checkpoint_every < min(truncate_every or rows, rows):
-        run = in_blocks(jax.checkpoint(run, prevent_cse=False), checkpoint_every)
-    if truncate_every:
-        within = run
+        within = _in_blocks(jax.checkpoint(run, prevent_cse=False), checkpoint_every)
+    if not truncate_every:
+        return within(carry, inputs)
 
-        def cut(carry: Any, block: Any) -> tuple[Any, Any]:
-            carry, out = within(carry, block)
-            return jax.lax.stop_gradient(carry), out
+    def cut(carry: Any, block: Any) -> tuple[Any, Any]:
+        carry, out = within(carry, block)
+        return jax.lax.stop_gradient(carry), out
 
-        run = in_blocks(cut, min(truncate_every, rows))
-    return run(carry, inputs)
+    return _in_blocks(cut, min(truncate_every, rows))(carry, inputs)
 
 
-def in_blocks(run: Callable, every: int) -> Callable:
+def _in_blocks(run: Callable, every: int) -> Callable:
     """A scan by `run(carry, block)` over blocks of `every` rows of its inputs, and then over the
     rows that are left over."""
 

@@ -58,23 +58,15 @@ from gnio_jax.types import Array
 
 
 class SmoothedHistory(NamedTuple):
-    """The smoothed estimates of K clone intervals: row k is at t_0 + (k + 1)·n·dt, as in
-    `FilterHistory`."""
+    """The smoothed estimates of K clone intervals: rows, frames and units as in `FilterHistory`."""
 
     rotation: Float[Array, "k 3 3"]
-    """Body → world."""
     velocity: Float[Array, "k 3"]
-    """World frame, m/s."""
     position: Float[Array, "k 3"]
-    """World frame, m."""
     gyro_bias: Float[Array, "k 3"]
-    """rad/s"""
     accel_bias: Float[Array, "k 3"]
-    """m/s²"""
     covariance_diagonal: Float[Array, "k 15"]
-    """Variances of θ, v, p, b_g, b_a."""
     covariance: Float[Array, "k 15 15"] | None
-    """The whole block where `FilterConfig.history` is "core", else None."""
 
 
 def smooth(
@@ -93,8 +85,7 @@ def smooth(
     all measurements of the K intervals.
 
     Arguments and `ValueError`s as of `run_filter`, whose updates are smoothed exactly as they were
-    made: gate, scaled or weighted covariances, zero velocity, the caller's own `measurements` and
-    bridged samples included. A run of `run_odometry` that left `history` is smoothed without its
+    made. A run of `run_odometry` that left `history` is smoothed without its
     network by `smooth(state, gyro, accel, *history.given(noise), config, noise,
     frame=config.displacement_frame)`. `state` is the prior, and what was measured before it is not
     touched. Works under `jax.jit`, `jax.vmap` and `jax.grad`.

@@ -73,18 +73,14 @@ class ImuMemory(NamedTuple):
 
 
 class Mean(NamedTuple):
-    """Estimates of one time, or stacked over K of them."""
+    """Estimates of one time, or stacked over K of them, in the frames and units of
+    `FilterState`."""
 
     rotation: Float[Array, "*k 3 3"]
-    """Body → world."""
     velocity: Float[Array, "*k 3"]
-    """World frame, m/s."""
     position: Float[Array, "*k 3"]
-    """World frame, m."""
     gyro_bias: Float[Array, "*k 3"]
-    """rad/s"""
     accel_bias: Float[Array, "*k 3"]
-    """m/s²"""
 
 
 class FilterState(NamedTuple):
@@ -146,12 +142,10 @@ def without_clones(pose: Mean, std: InitialStd, clones: int) -> FilterState:
     """
     dtype = pose.rotation.dtype
     nothing, unknown = jnp.zeros(3, dtype), jnp.full(3, jnp.nan, dtype)
-    tilt, yaw, velocity, position, gyro_bias, accel_bias = range(len(std))
-    index = np.full(CORE, len(std))  # the zero behind them
-    index[THETA] = tilt, tilt, yaw
-    index[VELOCITY], index[ANCHOR] = velocity, position
-    index[GYRO_BIAS], index[ACCEL_BIAS] = gyro_bias, accel_bias
-    values = jnp.stack([*(jnp.asarray(value, dtype) for value in std), jnp.zeros((), dtype)])
+    # Of tilt, yaw, v, o, b_g, b_a, a, s.
+    parts = (*std[:3], 0.0, std.gyro_bias, std.accel_bias, std.position, 0.0)
+    each = jnp.stack([jnp.asarray(part, dtype) for part in parts])
+    core_std = jnp.repeat(each, np.array([2, 1, 3, 3, 3, 3, 3, 3]), total_repeat_length=CORE)
     return FilterState(
         rotation=pose.rotation,
         velocity=pose.velocity,
@@ -163,7 +157,7 @@ def without_clones(pose: Mean, std: InitialStd, clones: int) -> FilterState:
         correlated=jnp.zeros(0, dtype),
         clone_rotation=jnp.tile(jnp.eye(3, dtype=dtype)[None], (clones, 1, 1)),
         clone_offset=jnp.zeros((clones, 3), dtype),
-        core_covariance=jnp.diag(values[index] ** 2),
+        core_covariance=jnp.diag(core_std**2),
         cross_covariance=jnp.zeros((CORE, CLONE * clones), dtype),
         clone_covariance=jnp.zeros((CLONE * clones, CLONE * clones), dtype),
         step=jnp.int32(0),
@@ -189,8 +183,7 @@ def state_shapes(config: FilterConfig, noise: NoiseModel, dtype: Any) -> FilterS
     """Shapes and types of the filter's state."""
 
     def start() -> FilterState:
-        zero = jnp.zeros(3, dtype)
-        pose = Mean(jnp.eye(3, dtype=dtype), *[zero] * 4)
+        pose = Mean(jnp.eye(3, dtype=dtype), *[jnp.zeros(3, dtype)] * 4)
         state = without_clones(pose, InitialStd(), config.clones)
         return state if noise.correlation is None else with_correlated_error(state)
 

@@ -50,20 +50,15 @@ from gnio_jax.types import FASTEST_TURN, STRONGEST_FORCE, Array
 
 
 class Pose(NamedTuple):
-    """The estimate at one time. Host arrays."""
+    """The estimate at one time, in the frames and units of `FilterHistory`. Host arrays."""
 
     time: float
     """s, on the clock of the stamps."""
     rotation: Float[np.ndarray, "3 3"]
-    """Body → world."""
     velocity: Float[np.ndarray, "3"]
-    """World frame, m/s."""
     position: Float[np.ndarray, "3"]
-    """World frame, m."""
     gyro_bias: Float[np.ndarray, "3"]
-    """rad/s"""
     accel_bias: Float[np.ndarray, "3"]
-    """m/s²"""
     covariance: Float[np.ndarray, "15 15"]
     """Of the error in θ (world frame, left), v, p, b_g, b_a, consider covariance included."""
     accepted: float
