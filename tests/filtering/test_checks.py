@@ -44,8 +44,8 @@ def wrong():
     yield "covariance: the shape", {"covariance": COVARIANCE[:, 0]}
     yield "covariance: 1 of 60 rows", {"covariance": put(COVARIANCE, 10, -np.eye(3))}
     yield "covariance: 1 of 60 rows", {"covariance": put(COVARIANCE, (10, 0, 1), 1.0)}
-    yield "imu_valid: must be 300 booleans", {"imu_valid": np.ones(SAMPLES, int)}
-    yield "imu_valid", {"imu_valid": np.ones(3, bool)}
+    yield "imu_valid: must be booleans", {"imu_valid": np.ones(SAMPLES, int)}
+    yield "imu_valid: the shape", {"imu_valid": np.ones(3, bool)}
     yield "noise.accel_density", {"noise": NOISE._replace(accel_density=-1.0)}
     yield "noise.gyro_bias_walk", {"noise": NOISE._replace(gyro_bias_walk=NAN)}
     yield "noise.gyro_density", {"noise": NOISE._replace(gyro_density=np.zeros(3))}

@@ -11,6 +11,7 @@ import pytest
 
 from gnio_jax import filtering
 from gnio_jax.filtering.scan import blocked_scan
+from gnio_jax.filtering.state import with_correlated_error
 from gnio_jax.types import Prediction
 from tests.support.compiling import quick
 from tests.support.odometry import (
@@ -27,6 +28,10 @@ from tests.support.odometry import (
 
 MEASURED = 0.1 * np.random.default_rng(4).standard_normal((INTERVALS, 3))
 PLAIN = filtering.FilterConfig(DT, N, CLONES)
+FIX = filtering.fixes_on_intervals(
+    [0.1, 0.5, 0.93], np.eye(3)[:, :2], np.tile(0.3 * np.eye(2), (3, 1, 1)), INTERVALS, PLAIN
+)
+"""In the first half."""
 
 
 class Felt(NamedTuple):
@@ -65,56 +70,73 @@ class Carried(NamedTuple):
 
 
 def loss(x, felt=WHOLE, carried=None, config=PLAIN):
-    """x: noise (4,) log factors, std (6,) log factors of the start's, state (12,) added to the
-    start, measured (K, 3), gyro, accel."""
-    noise = filtering.NoiseModel(*(jnp.array([1e-2, 1e-1, 1e-2, 1e-1]) * jnp.exp(x["noise"])))
+    """The scalar and the history. x: noise (4,) log factors, correlation (2,) share and seconds,
+    factor (3,) of the axes, std (6,) log factors of the start's, state (12,) added to the start,
+    measured (K, 3), gyro, accel, fix (4,): a shift, changes of the covariance, of the moment and of
+    its spread."""
+    noise = filtering.NoiseModel(
+        *(jnp.array([1e-2, 1e-1, 1e-2, 1e-1]) * jnp.exp(x["noise"])),
+        std_factor=tuple(x["factor"]),
+        correlation=filtering.CorrelatedError(*x["correlation"]),
+    )
     std = filtering.InitialStd(*(jnp.array(filtering.InitialStd()) * jnp.exp(x["std"])))
-    first = start()
+    first, (velocity, position, *biases) = start(), jnp.split(x["state"], 4)
     state = filtering.initial_state(
         config,
         first.rotation,
-        first.velocity + x["state"][:3],
-        first.position + x["state"][3:6],
-        first.gyro_bias + x["state"][6:9],
-        first.accel_bias + x["state"][9:],
+        first.velocity + velocity,
+        first.position + position,
+        first.gyro_bias + biases[0],
+        first.accel_bias + biases[1],
         std,
     )
     if carried is not None:
         choose = functools.partial(jnp.where, carried.taken)
-        state = jax.tree.map(choose, carried.state, state)
+        state = jax.tree.map(choose, carried.state, with_correlated_error(state))
     spread = jnp.tile(0.01 * jnp.eye(3)[None], (INTERVALS, 1, 1))
-    _, history = filtering.run_filter(
-        state, x["gyro"], x["accel"], x["measured"], spread, config, noise
+    shift, larger, later, spread_of_time = x["fix"]
+    fix = filtering.Fix(
+        jnp.asarray(FIX.position) + shift,
+        jnp.asarray(FIX.covariance) * (1 + larger),
+        jnp.asarray(FIX.before_end) + later,
+        jnp.asarray(FIX.time_std) + spread_of_time,
+        FIX.threshold,
     )
-    return of_history(history, felt)
+    given = state, x["gyro"], x["accel"], x["measured"], spread, config, noise
+    _, history = filtering.run_filter(*given, measurements=(fix,))
+    return of_history(history, felt), history
 
 
 def point(measured=MEASURED):
     gyro, accel = recording(2)
     return dict(
         noise=np.zeros(4),
+        correlation=np.array([0.6, 0.3]),
+        factor=np.array([1.5, 0.7, 1.2]),
         std=np.zeros(6),
         state=np.zeros(12),
         measured=measured,
         gyro=gyro,
         accel=accel,
+        fix=np.array([0.0, 0.0, 0.0, 0.1]),
     )
 
 
 BATCH = 3
-GRADIENT = quick(jax.vmap(jax.value_and_grad(loss), in_axes=(0, None, None)))
-RUN = quick(filtering.run_filter, static_argnums=5)
+GRADIENT = quick(jax.vmap(jax.value_and_grad(loss, has_aux=True), in_axes=(0, None, None)))
 
 
 def gradients(points, felt=WHOLE, carried=None):
     """Values and gradients at all of the points, from one program for batches."""
-    carried = Carried(False, start()) if carried is None else carried
+    if carried is None:
+        carried = Carried(False, with_correlated_error(start()))
     found = []
     for first in range(0, len(points), BATCH):
         some = points[first : first + BATCH]
         some = some + [some[-1]] * (BATCH - len(some))
         stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *some)
-        found.append(jax.device_get(GRADIENT(stacked, felt, carried)))
+        (value, _), gradient = jax.device_get(GRADIENT(stacked, felt, carried))
+        found.append((value, gradient))
     return jax.tree.map(lambda *parts: np.concatenate(parts)[: len(points)], *found)
 
 
@@ -131,15 +153,16 @@ def differences(x, name, step, row=...):
 
 
 def test_gradient_against_differences():
-    """Over a run with missing rows, with respect to everything but the network."""
+    """Over a run with missing rows and fixes, with respect to everything but the network; of the
+    correlated errors also where they have no size."""
     measured = MEASURED.copy()
     measured[[7, 8]] = np.nan
     x = point(measured)
     _, found = gradients([x])
-    for name in ("noise", "std", "state"):
-        expected = differences(x, name, 1e-4)
+    for name in ("noise", "correlation", "factor", "std", "state", "fix"):
+        expected = differences(x, name, 1e-5 if name == "correlation" else 1e-4)
         np.testing.assert_allclose(
-            found[name][0], expected, rtol=1e-5, atol=1e-6 * np.abs(expected).max(), err_msg=name
+            found[name][0], expected, rtol=1e-4, atol=1e-6 * np.abs(expected).max(), err_msg=name
         )
         assert (np.abs(expected) > 0).all()
     for name, k in (
@@ -152,29 +175,8 @@ def test_gradient_against_differences():
         np.testing.assert_allclose(
             found[name][0][k], differences(x, name, 1e-5, k), rtol=1e-5, atol=1e-8
         )
-
-
-def test_jvp_against_differences_and_vmap_of_grad_against_jvp():
-    rng = np.random.default_rng(0)
-    direction = jax.tree.map(lambda x: rng.standard_normal(x.shape), point())
-    along = quick(lambda x, d: jax.jvp(loss, (x,), (d,)))
-    step = 1e-6
-    ahead, behind = (
-        float(along(jax.tree.map(lambda x, d, h=h: x + h * d, point(), direction), direction)[0])
-        for h in (step, -step)
-    )
-    np.testing.assert_allclose(
-        along(point(), direction)[1], (ahead - behind) / (2 * step), rtol=1e-5
-    )
-
-    points = [point(), point(MEASURED + 0.02), point(-MEASURED)]
-    _, many = gradients(points)
-    for index, one in enumerate(points):
-        inner = sum(
-            np.sum(g[index] * d)
-            for g, d in zip(jax.tree.leaves(many), jax.tree.leaves(direction), strict=True)
-        )
-        np.testing.assert_allclose(inner, along(one, direction)[1], rtol=1e-8)
+    _, without = gradients([x | {"correlation": np.array([0.0, 0.3])}])
+    assert all(np.isfinite(leaf).all() for leaf in without.values())
 
 
 def scanned(scan, start, inputs):
@@ -237,8 +239,7 @@ def test_checkpoints_bound_the_memory():
     assert temporary(32) < temporary(0) / 4
 
 
-# One program for all of it, since compiling is what these tests cost; the hard gate's rejection is
-# tested with the update.
+# One program for all of it, since compiling is what these tests cost.
 HOSTILE = quick(
     jax.value_and_grad(
         functools.partial(
@@ -253,7 +254,8 @@ HOSTILE = quick(
                 gate_softness=2.0,
                 gate_threshold=8.0,
             ),
-        )
+        ),
+        has_aux=True,
     )
 )
 
@@ -279,19 +281,11 @@ def hostile(kind):
 
 def test_gradients_are_finite_for_hostile_input():
     for kind in ("rest", "rejected", "missing", "gimbal"):
-        value, gradient = HOSTILE(hostile(kind))
+        (value, _), gradient = HOSTILE(hostile(kind))
         assert np.isfinite(value), kind
         for name, leaf in gradient.items():
             assert np.isfinite(leaf).all(), (kind, name)
             assert np.abs(leaf).max() > 0, (kind, name)
-
-
-def behind_a_gate(softness, measured, noise):
-    config = filtering.FilterConfig(
-        DT, N, CLONES, convergence_seconds=0.1, gate_softness=softness, gate_threshold=8.0
-    )
-    spread = np.tile(0.01 * np.eye(3), (INTERVALS, 1, 1))
-    return RUN(start(config), *recording(2), measured, spread, config, noise)[1]
 
 
 def test_a_gate_with_a_slope_lets_the_gradient_through():
@@ -303,24 +297,18 @@ def test_a_gate_with_a_slope_lets_the_gradient_through():
         rows[14, 0] += float(value)
         return HOSTILE(point(rows))
 
-    slope = float(at(0.0)[1]["measured"][14, 0])
+    (_, history), gradient = at(0.0)
+    slope = float(gradient["measured"][14, 0])
     np.testing.assert_allclose(
-        slope, central(lambda x: float(at(x)[0]), np.zeros(()), 1e-5), rtol=1e-5
+        slope, central(lambda x: float(at(x)[0][0]), np.zeros(()), 1e-5), rtol=1e-5
     )
     assert abs(slope) > 0  # behind the hard gate it would be zero where the row is rejected
-
-    noise = filtering.NoiseModel(1e-2, 1e-1, 1e-2, 1e-1)
-    hard, soft = (behind_a_gate(softness, measured, noise) for softness in (0.0, 2.0))
-    weights, nis = np.asarray(soft.gate_passed), np.asarray(soft.nis)
-    watched = np.asarray(soft.gate_passed) < 1
+    weights, nis = np.asarray(history.gate_passed), np.asarray(history.nis)
+    watched = weights < 1
     np.testing.assert_allclose(
         weights[watched], 1 / (1 + np.exp((nis[watched] - 8.0) / 2.0)), rtol=1e-9
     )
-    assert (
-        (np.asarray(soft.accepted)[CLONES:] == 1).all()
-        and watched.sum() > 5
-        and (np.asarray(hard.accepted) == 0).any()
-    )
+    assert (np.asarray(history.accepted)[CLONES:] == 1).all() and watched.sum() > 5
 
 
 def test_gradient_reaches_the_network():
@@ -343,13 +331,15 @@ def test_gradient_reaches_the_network():
         )
         return of_history(history)
 
-    of, gradient = quick(value), quick(jax.grad(value))
-    expected = central(lambda p: float(of(p, 0.0)), PARAMETERS, 1e-4)
-    np.testing.assert_allclose(gradient(PARAMETERS, 0.0), expected, rtol=1e-5, atol=1e-7)
-    coarse, fine = (central(lambda p: float(of(p, 1.0)), PARAMETERS, step) for step in (1e-2, 5e-3))
+    both = quick(jax.value_and_grad(value))
+    expected = central(lambda p: float(both(p, 0.0)[0]), PARAMETERS, 1e-4)
+    np.testing.assert_allclose(both(PARAMETERS, 0.0)[1], expected, rtol=1e-5, atol=1e-7)
+    coarse, fine = (
+        central(lambda p: float(both(p, 1.0)[0]), PARAMETERS, step) for step in (1e-2, 5e-3)
+    )
     expected = (4 * fine - coarse) / 3
     np.testing.assert_allclose(
-        gradient(PARAMETERS, 1.0), expected, rtol=2e-3, atol=2e-3 * np.abs(expected).max()
+        both(PARAMETERS, 1.0)[1], expected, rtol=2e-3, atol=2e-3 * np.abs(expected).max()
     )
 
 
@@ -359,25 +349,25 @@ def test_a_truncated_gradient_is_that_of_two_runs():
     truncated = functools.partial(
         loss, config=filtering.FilterConfig(DT, N, CLONES, truncate_every=half)
     )
-    value, gradient = quick(jax.value_and_grad(truncated))(x)
+    (value, _), gradient = quick(jax.value_and_grad(truncated, has_aux=True))(x)
 
     # Runs of full length, of which the first half alone is felt.
     rows, samples = slice(half), slice(half * N)
     first = 1.0 * (np.arange(INTERVALS) < half)
     felt = Felt(WEIGHTS * first[:, None], first, np.zeros(INTERVALS))
     one, of_one = gradients([x], felt)
-    noise, spread = filtering.NoiseModel(1e-2, 1e-1, 1e-2, 1e-1), 0.01 * np.eye(3)
-    state, _ = filtering.run_filter(
-        start(),
-        x["gyro"][samples],
-        x["accel"][samples],
-        MEASURED[rows],
-        np.tile(spread, (half, 1, 1)),
-        PLAIN,
-        noise,
+    noise = filtering.NoiseModel(
+        *(1e-2, 1e-1, 1e-2, 1e-1),
+        std_factor=tuple(x["factor"]),
+        correlation=filtering.CorrelatedError(*x["correlation"]),
     )
+    spread = np.tile(0.01 * np.eye(3), (half, 1, 1))
+    given = x["gyro"][samples], x["accel"][samples], MEASURED[rows], spread, PLAIN, noise
+    fix = jax.tree.map(lambda leaf: leaf[rows], FIX._replace(time_std=FIX.time_std + 0.1))
+    state, _ = filtering.run_filter(start(), *given, measurements=(fix,))
     turned = {name: np.roll(x[name], -half * N, axis=0) for name in ("gyro", "accel")}
-    later = x | turned | {"measured": np.roll(MEASURED, -half, axis=0)}
+    no_fix = np.array([np.nan, 0.0, 0.0, 0.1])
+    later = x | turned | {"measured": np.roll(MEASURED, -half, axis=0), "fix": no_fix}
     end = np.eye(INTERVALS)[half - 1]
     felt = Felt(np.roll(WEIGHTS, -half, axis=0) * first[:, None], first, end)
     other, of_other = gradients([later], felt, Carried(True, state))
@@ -387,7 +377,7 @@ def test_a_truncated_gradient_is_that_of_two_runs():
     wanted |= {name: of_one[name][0] for name in ("std", "state")}
     for name, part in (("measured", rows), ("gyro", samples), ("accel", samples)):
         wanted[name] = np.concatenate([of_one[name][0][part], of_other[name][0][part]])
-    for name in x:
+    for name in wanted:
         size = np.abs(wanted[name]).max()
         np.testing.assert_allclose(
             gradient[name], wanted[name], rtol=1e-9, atol=1e-12 * size, err_msg=name

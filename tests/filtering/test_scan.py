@@ -1,7 +1,7 @@
-"""The filter against recorded runs of TLIO's tracker and against a plain NumPy filter."""
+"""The filter against recorded runs of TLIO's tracker and against a plain NumPy filter, which has
+fixes of position and temporally correlated errors too."""
 
 import functools
-import itertools
 from pathlib import Path
 
 import jax
@@ -10,6 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from gnio_jax import filtering
+from gnio_jax.filtering.state import CORRELATED
 from tests.support import scekf_numpy, whole_covariance
 from tests.support.random_walk import random_walk
 
@@ -73,34 +74,65 @@ def test_recorded_runs(name):
         )
 
 
+N, CLONES, INTERVALS, DT = 5, 4, 80, 0.02
 STD = filtering.InitialStd(
     tilt=0.02, yaw=0.01, velocity=0.3, position=0.02, gyro_bias=2e-3, accel_bias=0.05
 )
+BIASES = np.array([1e-4, -2e-4, 3e-4]), np.array([0.01, 0.02, -0.01])
+"""Where the filter begins, wrongly."""
+GATED = functools.partial(
+    filtering.FilterConfig,
+    convergence_seconds=1.0,
+    success_seconds=0.3,
+    pause_seconds=0.5,
+    history="core",
+)
+# One rejected row; ten in a row, so that the gate gives up and pauses; rejected rows around missing
+# ones.
+OUTLIERS = (20, *range(30, 41), 48, 52)
+MISSING = (7, 22, 23, 49, 50, 51, 60, 61, 62, 63, 64, 65)
+WALK = random_walk(
+    1, n=N, clones=CLONES, intervals=INTERVALS, dt=DT, nan_rows=MISSING, outliers=OUTLIERS
+)
+ERRORS = filtering.CorrelatedError(0.8, 0.3)
+FAR = 23
+"""The interval whose fix is a kilometre off."""
 
 
-def both(walk, config, chunks=()):
-    """The filter (in pieces, where `chunks` says so) and the oracle over one walk, from wrong
-    initial biases."""
-    pose, *signals = walk
-    start = filtering.initial_state(
-        config, *pose, np.array([1e-4, -2e-4, 3e-4]), np.array([0.01, 0.02, -0.01]), STD
-    )
+def noise_of(config, correlation=None):
     noise = filtering.NoiseModel.per_sample(4e-3, 2e-2, config.dt, 2e-3, 3e-3)
-    n, state, histories = config.samples_per_clone, start, []
-    for begin, end in itertools.pairwise([0, *chunks, len(signals[2])]):
-        samples, rows = slice(begin * n, end * n), slice(begin, end)
-        cut = [each[part] for each, part in zip(signals, [samples] * 2 + [rows] * 2, strict=True)]
-        state, history = filtering.run_filter(state, *cut, config, noise)
+    return noise._replace(correlation=correlation)
+
+
+def ours(config, noise, walk=WALK, measurements=(), every=None):
+    """The filter over a walk, in pieces of `every` intervals."""
+    pose, gyro, accel, *measured = walk
+    state, histories = filtering.initial_state(config, *pose, *BIASES, STD), []
+    every, n = every or len(measured[0]), config.samples_per_clone
+    for begin in range(0, len(measured[0]), every):
+        rows, samples = slice(begin, begin + every), slice(begin * n, (begin + every) * n)
+        given = gyro[samples], accel[samples], *(each[rows] for each in measured)
+        others = jax.tree.map(lambda leaf, rows=rows: leaf[rows], measurements)
+        state, history = filtering.run_filter(state, *given, config, noise, measurements=others)
         histories.append(history)
-    history = jax.tree.map(lambda *parts: np.concatenate(parts), *histories)
-    return state, history, scekf_numpy.run_from(start, noise, config, *signals, std=STD._asdict())
+    return state, jax.tree.map(lambda *parts: np.concatenate(parts), *histories)
 
 
-def assert_same(history, wanted, absolute=1e-9):
+def oracle(config, noise, walk=WALK, **others):
+    start = filtering.initial_state(config, *walk[0], *BIASES, STD)
+    return scekf_numpy.run_from(start, noise, config, *walk[1:], std=STD._asdict(), **others)
+
+
+@functools.cache
+def plain():
+    return ours(GATED(DT, N, CLONES), noise_of(GATED(DT, N, CLONES)))
+
+
+def assert_same(history, wanted):
     for field in DECISIONS:
         np.testing.assert_array_equal(getattr(history, field), wanted[field], err_msg=field)
     for field in (*MEAN, "innovation", "displacement"):
-        assert_close(getattr(history, field), wanted[field], absolute)
+        assert_close(getattr(history, field), wanted[field], 1e-9)
     assert_close(history.nis, wanted["nis"], 0, 1e-6)
     measured = np.isfinite(wanted["nis"])
     spread = wanted["innovation_covariance"][measured]
@@ -114,26 +146,44 @@ def assert_same(history, wanted, absolute=1e-9):
         assert_close(history.covariance / scale, wanted["covariance"] / scale, 1e-7)
 
 
-GATED = functools.partial(
-    filtering.FilterConfig,
-    0.02,
-    5,
-    4,
-    convergence_seconds=1.0,
-    success_seconds=0.3,
-    pause_seconds=0.5,
-    history="core",
+def drawn_fixes(axes):
+    """{k: (position, covariance, seconds before the end, standard deviation of the time)} near to
+    where the filter without fixes is, before the ring is full and after each move of the anchor."""
+    rng, (_, history) = np.random.default_rng(axes), plain()
+    fixes = {}
+    for k in (0, 2, 7, 8, 11, FAR, 24, 30, 38, 66):
+        root = 0.2 * (np.eye(axes) + 0.3 * rng.normal(size=(axes, axes)))
+        before = rng.uniform(-0.5, 0.5) * N * DT * (k > 0)
+        z = np.asarray(history.position[k] - before * history.velocity[k])[:axes]
+        z = z + root @ rng.normal(size=axes)
+        z[0] += 1000.0 * (k == FAR)
+        fixes[k] = z, root @ root.T, before, 0.1
+    return fixes
+
+
+def laid(fixes):
+    """As the filter takes them, on a clock that begins at 100 s."""
+    time = [100.0 + (k + 1) * N * DT - before for k, (_, _, before, _) in fixes.items()]
+    position, covariance, _, late = (np.stack(x) for x in zip(*fixes.values(), strict=True))
+    config = GATED(DT, N, CLONES)
+    return filtering.fixes_on_intervals(
+        time, position, covariance, INTERVALS, config, 100.0, late[0]
+    )
+
+
+@pytest.mark.parametrize(
+    "fail_scale, correlation, axes, every",
+    [(0.0, None, 0, None), (8.0, ERRORS, 2, None), (0.0, ERRORS, 3, None), (0.0, ERRORS, 3, 8)],
+    ids=["plain", "scaled, correlated, fixes", "correlated, whole fixes", "the same in pieces"],
 )
-# One rejected row; ten in a row, so that the gate gives up and pauses; rejected rows around missing
-# ones.
-OUTLIERS = (20, *range(30, 41), 48, 52)
-MISSING = (7, 22, 23, 49, 50, 51, 60, 61, 62, 63, 64, 65)
-
-
-@pytest.mark.parametrize("fail_scale", [0.0, 8.0])
-def test_random_walk_with_missing_and_rejected_rows(fail_scale):
-    walk = random_walk(1, n=5, clones=4, intervals=80, dt=0.02, nan_rows=MISSING, outliers=OUTLIERS)
-    _, history, wanted = both(walk, GATED(mahalanobis_fail_scale=fail_scale))
+def test_random_walk(fail_scale, correlation, axes, every):
+    """With missing and rejected rows. A run goes on from the state that another returned: ring,
+    gate and clock included; pieces of 8 intervals end at every slot of a ring of 5."""
+    config = GATED(DT, N, CLONES, mahalanobis_fail_scale=fail_scale)
+    noise, fixes = noise_of(config, correlation), drawn_fixes(axes) if axes else {}
+    measurements = (laid(fixes),) if axes else ()
+    final, history = ours(config, noise, measurements=measurements, every=every)
+    wanted = oracle(config, noise, fixes=fixes)
     assert np.isnan(wanted["accepted"]).sum() == 4 + len(MISSING)
     rejected = wanted["gate_passed"] == 0
     assert (
@@ -141,38 +191,53 @@ def test_random_walk_with_missing_and_rejected_rows(fail_scale):
     )  # the gate worked, and a pause let outliers pass
     assert (wanted["accepted"][rejected] == float(fail_scale > 0)).all()
     assert_same(history, wanted)
+    if correlation is not None:
+        assert np.abs(wanted["correlated"][-1]).min() > 1e-3
+        assert_close(final.correlated, wanted["correlated"][-1], 1e-9)
+        spread = final.core_covariance[CORRELATED, CORRELATED]
+        assert_close(spread, wanted["correlated_covariance"][-1], 1e-12, 1e-7)
+    if axes:
+        (outcome,) = history.others
+        there = np.isfinite(wanted["fix_nis"])
+        np.testing.assert_array_equal(outcome.present, there)
+        refused = np.flatnonzero(there & ~np.asarray(outcome.accepted))
+        assert FAR in refused and len(refused) < len(fixes) / 2
+        assert_close(outcome.nis[there], wanted["fix_nis"][there], 0, 1e-6)
 
 
-@pytest.mark.parametrize("cut", [40, 53])
-def test_runs_in_pieces(cut):
-    """A run goes on from the state that another returned: ring, gate and clock included. After 40
-    intervals all clones have the core's anchor, after 53 three of them have the one before."""
-    walk = random_walk(1, n=5, clones=4, intervals=80, dt=0.02, nan_rows=MISSING, outliers=OUTLIERS)
-    _, history, wanted = both(walk, GATED(), chunks=[cut])
-    assert_same(history, wanted)
+def test_without_size_and_without_fixes_nothing_changes():
+    """Also where the only fix is refused. The variance of a correlated error is 1 at all times."""
+    config, (_, wanted) = GATED(DT, N, CLONES), plain()
+    none = laid(drawn_fixes(3))
+    none.position[:] = np.nan
+    none.position[FAR] = 1e6
+    nothing = noise_of(config, ERRORS._replace(share=0.0))
+    final, found = ours(config, nothing, measurements=(none,))
+    for name in found._fields:
+        if name not in ("others", "diagnostics"):
+            assert_close(getattr(found, name), getattr(wanted, name), 1e-12, 1e-9)
+    assert_close(final.core_covariance[CORRELATED, CORRELATED], np.eye(3), 1e-12)
 
 
 @pytest.mark.parametrize("n,clones", [(1, 1), (7, 2)])
 def test_other_intervals(n, clones):
     walk = random_walk(2, n=n, clones=clones, intervals=30, dt=0.05, nan_rows=(9, 10))
-    _, history, wanted = both(
-        walk, filtering.FilterConfig(0.05, n, clones, convergence_seconds=0.5)
-    )
+    config = filtering.FilterConfig(0.05, n, clones, convergence_seconds=0.5)
+    _, history = ours(config, noise_of(config), walk)
     assert history.covariance is None
-    assert_same(history, wanted)
+    assert_same(history, oracle(config, noise_of(config), walk))
 
 
 def test_gimbal_lock_is_no_update():
-    (R, v, p), gyro, accel, displacement, covariance = random_walk(
-        3, n=5, clones=4, intervals=40, dt=0.02
-    )
+    (R, v, p), gyro, accel, displacement, covariance = jax.tree.map(np.copy, WALK)
     R = Rotation.from_euler("y", 90, degrees=True).as_matrix()
-    gyro[:] = np.array(
-        [1e-4, -2e-4, 3e-4]
-    )  # cancelled by the initial bias: the device stays on its nose until an update turns it
-    accel[:] = R.T @ -scekf_numpy.G + np.array([0.01, 0.02, -0.01])
+    # Cancelled by the initial bias: the device stays on its nose until an update turns it.
+    gyro[:], accel[:] = BIASES[0], R.T @ -scekf_numpy.G + BIASES[1]
     displacement[4:] = 0.1
-    _, history, wanted = both(((R, 0 * v, p), gyro, accel, displacement, covariance), GATED())
+    walk = (R, 0 * v, p), gyro, accel, displacement, covariance
+    config = GATED(DT, N, CLONES)
+    _, history = ours(config, noise_of(config), walk)
+    wanted = oracle(config, noise_of(config), walk)
     assert (wanted["accepted"][4:] == 0).all() and (np.asarray(history.accepted)[4:] == 0).all()
     assert (np.asarray(history.gate_passed)[4:] == 0).all()
     assert np.isfinite(history.innovation[4:]).all() and np.isfinite(history.nis[4:]).all()
@@ -181,8 +246,7 @@ def test_gimbal_lock_is_no_update():
 
 
 def test_covariance_stays_symmetric_and_positive():
-    walk = random_walk(1, n=5, clones=4, intervals=80, dt=0.02, nan_rows=MISSING, outliers=OUTLIERS)
-    state, _, _ = both(walk, GATED())
+    state, _ = plain()
     whole = np.asarray(covariance(state))
     assert whole.shape == (45, 45)
     assert_close(whole, whole.T, 1e-14)
