@@ -58,7 +58,6 @@ LONGEST = (
     "filtering/test_tracker.py",
     "filtering/test_considered.py",
     "filtering/test_smoother.py",
-    "filtering/test_correlated_error.py",
     "filtering/test_consistency.py",
     "training/test_loop.py",
     "test_docs.py",

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from gnio_jax import filtering
-from gnio_jax.filtering import scan, smoother
-from gnio_jax.filtering import tracker as online
+from gnio_jax.filtering import scan
 from gnio_jax.types import Prediction
 from tests.support.compiling import quick
 
@@ -78,28 +77,3 @@ def test_run_odometry():
     final, history = program(state, *signals(1), NOISE)
     chex.assert_trees_all_equal_shapes_and_dtypes(final, start())
     chex.assert_tree_all_finite((history.position, history.covariance_diagonal))
-
-
-def test_smooth(monkeypatch):
-    program = once(smoother._smooth.__wrapped__, static_argnames=("config", "frame"))
-    monkeypatch.setattr(smoother, "_smooth", program)
-    for seed in range(2):
-        given = start(), *signals(seed), *measurements(seed)
-        smoothed = filtering.smooth(*given, CONFIG, NOISE)
-        chex.assert_tree_all_finite(smoothed.position)
-
-
-def test_tracker(monkeypatch):
-    """Neither clone steps, nor looks ahead, nor holes, nor a new start compile anything."""
-    for name in ("advance", "look_ahead"):
-        monkeypatch.setattr(online, name, chex.assert_max_traces(getattr(online, name), n=1))
-    tracker = filtering.Tracker(predict, CONFIG, NOISE, start())
-    gyro, accel = signals(0, intervals=10)
-    poses = []
-    for k in range(len(gyro)):
-        time = k * DT + (0.1 if k > 9 else 0.0)
-        poses.append(tracker.push(time, gyro[k], accel[k]))
-        assert np.isfinite(tracker.pose().position).all()
-    assert sum(pose is not None for pose in poses) > 5
-    tracker._start(tracker.filter_state())
-    assert np.isfinite(tracker.pose().position).all()

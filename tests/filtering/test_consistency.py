@@ -18,7 +18,7 @@ from gnio_jax.types import Prediction
 from gnio_jax.windows import cut_window
 from tests.support.compiling import optimised, quick
 from tests.support.measured import NO_IMU, displacement_residual
-from tests.support.walks import errors, simulate
+from tests.support.walks import errors, simulate, yaw_matrix
 from tests.support.whole_covariance import covariance
 
 RUNS, INTERVALS, N, CLONES, DT = 64, 900, 10, 10, 0.01
@@ -33,18 +33,22 @@ PARTS = {
 }
 
 
+CONFIG = filtering.FilterConfig(DT, N, CLONES, gate_threshold=1e9, history="core")
+ERRORS = filtering.CorrelatedError(0.9, 0.5)
+
+
 @functools.cache
 def program():
-    """(std, covariance of a measurement, start and signals of each run) -> final states and
-    histories."""
-    config = filtering.FilterConfig(DT, N, CLONES, gate_threshold=1e9, history="core")
+    """(std, correlated error, covariance of a measurement, start and signals of each run) -> final
+    states and histories. A correlated error without size changes nothing (`test_scan`)."""
 
-    def run(std, spread, rotation, velocity, position, gyro, accel, displacement):
-        start = filtering.initial_state(config, rotation, velocity, position, std=std)
+    def run(std, correlation, spread, rotation, velocity, position, gyro, accel, displacement):
+        start = filtering.initial_state(CONFIG, rotation, velocity, position, std=std)
         covariance = jnp.tile(spread[None], (len(displacement), 1, 1))
-        return filtering.run_filter(start, gyro, accel, displacement, covariance, config, NOISE)
+        noise = NOISE._replace(correlation=correlation)
+        return filtering.run_filter(start, gyro, accel, displacement, covariance, CONFIG, noise)
 
-    return optimised(jax.vmap(run, in_axes=(None, None, *6 * [0])))
+    return optimised(jax.vmap(run, in_axes=(None, None, None, *6 * [0])))
 
 
 WIDE = filtering.InitialStd(gyro_bias=1e-2, accel_bias=0.1)
@@ -55,20 +59,13 @@ def walks(std, sigma):
     return simulate(1, RUNS, INTERVALS, N, CLONES, DT, NOISE, std, sigma)
 
 
-@functools.lru_cache(1)
-def monte_carlo(std, sigma):
+def monte_carlo(runs, std, sigma, share=0.0):
     """Errors (r, K, 15), covariances (r, K, 15, 15), NIS (r, K) and the final states of simulated
     runs from the prior."""
-    runs = walks(std, sigma)
-    final, history = program()(std, sigma**2 * np.eye(3), *runs[:6])
+    given = std, ERRORS._replace(share=share), sigma**2 * np.eye(3)
+    final, history = program()(*given, *runs[:6])
     assert (np.asarray(history.healthy) == 1).all()
-    return (
-        runs,
-        errors(runs, history),
-        np.asarray(history.covariance),
-        np.asarray(history.nis),
-        final,
-    )
+    return errors(runs, history), np.asarray(history.covariance), np.asarray(history.nis), final
 
 
 def nees(error, spread):
@@ -85,7 +82,9 @@ def bounds(freedoms, level=0.95):
 
 def test_certainty_agrees_with_the_errors():
     """NEES of every part and NIS lie in the 95 % bounds of the average over 64 runs."""
-    runs, error, spread, nis, final = monte_carlo(filtering.InitialStd(), 0.03)
+    std = filtering.InitialStd()
+    runs = walks(std, 0.03)
+    error, spread, nis, final = monte_carlo(runs, std, 0.03)
     for name, index in PARTS.items():
         found = nees(error[..., index], spread[:, :, index][..., index])
         low, high = bounds(len(index) * RUNS)
@@ -121,7 +120,7 @@ def test_biases_converge_from_a_wide_prior():
 
     z takes longer where it is the gyro's, since yaw is seen by turning only; the whole run moves in
     every direction here."""
-    _, error, spread, _, _ = monte_carlo(WIDE, 0.02)
+    error, spread, _, _ = monte_carlo(walks(WIDE, 0.02), WIDE, 0.02)
     sigma = np.sqrt(spread[:, -1].diagonal(axis1=1, axis2=2)).mean(0)
     found = np.sqrt((error[:, -1] ** 2).mean(0))
     for values in (sigma, found):
@@ -129,6 +128,59 @@ def test_biases_converge_from_a_wide_prior():
         assert (gyro[:2] < 0.1).all() and (accel < 0.1).all(), (gyro, accel)
         assert gyro[2] < 0.2, gyro
         print(f"\nbias, share of the prior: gyro {gyro.round(3)}, accel {accel.round(3)}")
+
+
+CORRELATED_SIGMA = 0.05
+
+
+@functools.cache
+def correlated():
+    """Walks whose displacements have errors as the model has them, drawn in NumPy."""
+    sigma, share, decay = CORRELATED_SIGMA, ERRORS.share, np.exp(-N * DT / ERRORS.seconds)
+    runs, rng = walks(filtering.InitialStd(), 0.03), np.random.default_rng(3)
+    seen, state = np.full_like(runs.displacement, np.nan), rng.normal(size=(RUNS, 3))
+    for k in range(INTERVALS):
+        state = decay * state + np.sqrt(1 - decay**2) * rng.normal(size=(RUNS, 3))
+        if k >= CLONES:
+            moved = runs.position[:, k] - runs.position[:, k - CLONES]
+            seen[:, k] = np.einsum("rji,rj->ri", yaw_matrix(runs.rotation[:, k - CLONES]), moved)
+        white = np.sqrt(1 - share**2) * rng.normal(size=(RUNS, 3))
+        seen[:, k] += sigma * (share * state + white)
+    return runs._replace(displacement=seen)
+
+
+def test_it_is_as_certain_as_it_may_be_with_correlated_errors():
+    """Taken for white they make the filter too certain, and worse."""
+    runs, std, sigma = correlated(), filtering.InitialStd(), CORRELATED_SIGMA
+    error, spread, nis, _ = monte_carlo(runs, std, sigma, ERRORS.share)
+    assert 0.9 < nis[:, 100:].mean() / 3 < 1.1
+    for name, index in PARTS.items():
+        found = nees(error[..., index], spread[:, :, index][..., index])[100:].mean()
+        assert 0.7 < found < 1.4, (name, found)
+    position = PARTS["position"]
+    white, too_small, _, _ = monte_carlo(runs, std, sigma)
+    assert nees(white[..., position], too_small[:, :, position][..., position])[100:].mean() > 4
+    squares = [np.mean(e[:, -1, position] ** 2) for e in (error, white)]
+    assert squares[0] < squares[1]
+
+
+@pytest.mark.slow
+def test_the_smoother_is_consistent_with_correlated_errors():
+    runs = correlated()
+    spread = np.tile(CORRELATED_SIGMA**2 * np.eye(3), (INTERVALS, 1, 1))
+    noise = NOISE._replace(correlation=ERRORS)
+
+    @optimised
+    @jax.vmap
+    def run(rotation, velocity, position, *signals):
+        state = filtering.initial_state(CONFIG, rotation, velocity, position)
+        return filtering.smooth(state, *signals, spread, CONFIG, noise)
+
+    smoothed = jax.device_get(run(*(part[:16] for part in runs[:6])))
+    error = errors(jax.tree.map(lambda leaf: leaf[:16], runs), smoothed)
+    for index in list(PARTS.values())[:4]:
+        block = smoothed.covariance[:, :, index][..., index]
+        assert 0.6 < nees(error[..., index], block)[100:-100].mean() < 1.5, index
 
 
 def random_state(config, seed=0):
@@ -252,7 +304,6 @@ def tight():
     """(tables, start, gyro, accel) -> history of `run_odometry`, batched over runs, with a network
     that knows the truth, but for its noise, and tells it in the frame of its window, which it finds
     out from the window alone."""
-    config = filtering.FilterConfig(DT, N, CLONES, gate_threshold=1e9, history="core")
     length = N * CLONES
 
     @optimised
@@ -270,8 +321,8 @@ def tight():
             said = geometry.rotation_z(angle) @ displacement[k] + noise[k]
             return Prediction(said[None], jnp.full((1, 3), np.log(SIGMA)))
 
-        state = filtering.initial_state(config, rotation, velocity, position)
-        return filtering.run_odometry(predict, state, gyro, accel, config, NOISE)[1]
+        state = filtering.initial_state(CONFIG, rotation, velocity, position)
+        return filtering.run_odometry(predict, state, gyro, accel, CONFIG, NOISE)[1]
 
     return run
 

@@ -1,7 +1,5 @@
 """Drop-outs of the IMU: bridged, coasted through, and what they cost."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,7 +7,6 @@ import pytest
 
 from gnio_jax import filtering
 from gnio_jax.filtering import gaps
-from gnio_jax.types import Prediction
 from tests.support.short_walk import CLONES, CONFIG, DT, INTERVALS, NOISE, WALK, N, run, start
 
 # One program in place of one for every operation.
@@ -137,27 +134,3 @@ def test_a_gap_across_two_runs_is_one_gap():
         np.testing.assert_allclose(
             both, getattr(together, name), atol=1e-9, rtol=1e-8, err_msg=name
         )
-
-
-@pytest.mark.parametrize("window_rotation, last", [("per_sample", 34), ("tlio", 35)])
-def test_windows_with_a_long_hole_are_no_measurements(window_rotation, last):
-    _, gyro, accel, _, _ = WALK
-    valid = np.ones(N * INTERVALS, bool)
-    valid[150:160], valid[220:222] = False, False
-
-    def predict(windows):
-        return Prediction(
-            jnp.mean(windows[:, :, :3], axis=1) * 0.01, jnp.full((1, 3), -1.0, jnp.float32)
-        )
-
-    @jax.jit
-    def odometry(state):
-        return filtering.run_odometry(predict, state, gyro, accel, config, NOISE, valid)
-
-    config = dataclasses.replace(CONFIG, window_rotation=window_rotation)
-    _, history = odometry(start())
-    missing = np.isnan(np.asarray(history.accepted))
-    # Coasting are samples 153 … 159, in intervals 30 and 31: in the windows that end with intervals
-    # 30 … 34, and in that which begins a sample early. The short hole is bridged.
-    np.testing.assert_array_equal(np.flatnonzero(missing), [*range(4), *range(30, last + 1)])
-    assert np.isfinite(history.position).all()

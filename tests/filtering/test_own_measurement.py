@@ -140,34 +140,6 @@ def test_a_height_is_the_textbooks_update():
             np.testing.assert_allclose(outcome.nis[0], residual**2 / spread, rtol=1e-9)
 
 
-def test_the_smoother_knows_a_height():
-    """At the end it is the filter; before, the heights that come later are known already."""
-    measured = (Height(heights(), np.full(INTERVALS, 0.05)),)
-    _, filtered = run()(DISPLACEMENT, measured)
-    smoothed, without = run(True)(DISPLACEMENT, measured), run(True)(DISPLACEMENT, ())
-    np.testing.assert_allclose(smoothed.position[-1], filtered.position[-1], atol=1e-10)
-    of_height = np.asarray(smoothed.covariance_diagonal)[:, 8]
-    assert (of_height <= np.asarray(filtered.covariance_diagonal)[:, 8] * (1 + 1e-9)).all()
-    assert (of_height < 0.5 * np.asarray(without.covariance_diagonal)[:, 8])[5:].all()
-
-
-def test_odometry_takes_it_with_a_gradient():
-    """Of a height's standard deviation, against differences; NaN rows have none."""
-    height = heights()
-
-    def loss(std):
-        measured = (Height(jnp.asarray(height), jnp.full(INTERVALS, std)),)
-        given = DISPLACEMENT, SPREAD, CONFIG, NOISE
-        _, history = filtering.run_filter(start(), GYRO, ACCEL, *given, measurements=measured)
-        return jnp.sum(history.position[:, 2] ** 2)
-
-    value_and_slope = quick(jax.value_and_grad(loss))
-    ahead, behind = (float(value_and_slope(0.05 + step)[0]) for step in (1e-5, -1e-5))
-    slope = float(value_and_slope(0.05)[1])
-    assert abs(slope) > 1e-3
-    np.testing.assert_allclose(slope, (ahead - behind) / 2e-5, rtol=1e-5)
-
-
 def test_rows_that_are_missing_are_refused_by_name():
     measured = (Height(np.zeros(INTERVALS - 1), np.ones(INTERVALS)),)
     with pytest.raises(ValueError, match=r"^measurements\[0\]\.height: the shape must be \(30,\)"):

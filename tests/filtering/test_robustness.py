@@ -1,93 +1,20 @@
-"""What a stream may bring: holes, knocks, wrong units; and what the filter says of itself."""
+"""Any stream: holes, knocks, wrong units; and what the filter says of itself."""
 
 import dataclasses
 
-import jax.numpy as jnp
 import numpy as np
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from gnio_jax import filtering
-from gnio_jax.filtering import Tracker
-from gnio_jax.types import Prediction
 from tests.support.compiling import quick
 from tests.support.random_walk import random_walk
 
-N, CLONES, DT = 4, 4, 0.02
-CONFIG = filtering.FilterConfig(DT, N, CLONES, convergence_seconds=0.6)
-NOISE = filtering.NoiseModel(2e-3, 2e-2, measurement_scale=2.0)
-
-
-def start():
-    return filtering.initial_state(CONFIG, np.eye(3), np.array([1.0, 0.0, 0.0]), np.zeros(3))
-
-
-def predict(windows):
-    """About 1 m/s."""
-    about = jnp.asarray([[N * CLONES * DT, 0.0, 0.0]], jnp.float32)
-    seen = jnp.mean(windows, axis=1)[:, :3] - jnp.asarray([[0, 0, 9.81]], jnp.float32)
-    return Prediction(about + 0.01 * seen, jnp.full((1, 3), -4.0, jnp.float32))
-
-
-def recording(leap=False):
-    """Straight on at 1 m/s; with a leap to some 140 m/s and back, long before its end."""
-    rng = np.random.default_rng(0)
-    gyro = 0.01 * rng.standard_normal((280, 3))
-    accel = [0.0, 0.0, 9.81] + 0.1 * rng.standard_normal((280, 3))
-    if leap:
-        accel[98:106] += [900.0, 0, 0]
-        accel[106:114] -= [900.0, 0, 0]
-    return gyro, accel
-
-
-@quick
-def odometry(state, gyro, accel):
-    return filtering.run_odometry(predict, state, gyro, accel, CONFIG, NOISE)
-
-
-def run(gyro, accel, state=None):
-    final, history = odometry(start() if state is None else state, gyro, accel)
-    return final, history, np.linalg.norm(history.velocity, axis=1)
-
-
-# Health -------------------------------------------------------------------------------------------
-
-
-def test_unhealthy_once_is_unhealthy_for_good():
-    final, history, speed = run(*recording(leap=True))
-    plausible = speed <= CONFIG.speed_limit
-    bad = int(np.argmin(plausible))
-    # It comes back, so that nothing but memory can tell.
-    assert bad == 100 // N and plausible[-1] and np.isfinite(speed).all()
-    np.testing.assert_array_equal(history.healthy, np.arange(len(speed)) < bad)
-    assert not final.healthy
-    _, history, speed = run(*recording(), state=final)
-    assert (speed <= CONFIG.speed_limit).all() and (np.asarray(history.healthy) == 0).all()
-    state, history, _ = run(*recording())
-    assert bool(state.healthy) and (np.asarray(history.healthy) == 1).all()
-
-
-def test_online_too():
-    gyro, accel = recording(leap=True)
-    _, history, _ = run(gyro, accel)
-    tracker = Tracker(predict, CONFIG, NOISE, start())
-    found = [tracker.push(k * DT, gyro[k], accel[k]) for k in range(len(gyro))]
-    np.testing.assert_array_equal(
-        [pose.healthy for pose in found if pose is not None], np.asarray(history.healthy) > 0
-    )
-    assert tracker.pose().healthy is False and not tracker.filter_state().healthy
-    tracker._start(tracker.filter_state())  # another one, from what this one left
-    assert tracker.pose().healthy is False
-
-
-# Any input ----------------------------------------------------------------------------------------
-
+DT = 0.02
 ROWS = 60
 PLAIN = filtering.FilterConfig(DT, 5, 4, convergence_seconds=1.0, rest_seconds=0.2)
 CONFIGS = [
     dataclasses.replace(PLAIN, zero_velocity_std=0.02),
-    PLAIN,
-    dataclasses.replace(PLAIN, allow_float32=True),
     dataclasses.replace(PLAIN, zero_velocity_std=0.02, allow_float32=True),
 ]
 WALK = random_walk(21, n=5, clones=4, intervals=ROWS, dt=DT, bias=False)
@@ -170,7 +97,7 @@ RUN_AWAY = dict(
 
 @settings(max_examples=60, deadline=None, derandomize=True, database=None)
 @example(**RUN_AWAY)
-@example(**{**RUN_AWAY, "config": CONFIGS[2]})
+@example(**{**RUN_AWAY, "config": CONFIGS[1]})
 @runs()
 def test_errors_do_not_feed_themselves(**disturbances):
     """What is put in is up to 100 m wrong in a window of 0.4 s; what comes out is of that order."""

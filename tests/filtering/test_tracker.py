@@ -21,12 +21,15 @@ from gnio_jax.filtering import Tracker
 from gnio_jax.filtering import tracker as online
 from gnio_jax.filtering.resampler import Stream, create_grid
 from gnio_jax.filtering.state import Mean
+from gnio_jax.filtering.tracker import compile_programs
 from gnio_jax.types import Prediction
 from tests.support import drawn_run, scekf_numpy
 
 N, CLONES, INTERVALS, DT = 4, 4, 70, 0.02
 CONFIG = filtering.FilterConfig(DT, N, CLONES, convergence_seconds=0.6, bridge_seconds=0.05)
-NOISE = filtering.NoiseModel(2e-3, 2e-2, measurement_scale=2.0)
+NOISE = filtering.NoiseModel(
+    2e-3, 2e-2, measurement_scale=2.0, correlation=filtering.CorrelatedError(0.5, 0.3)
+)
 WEIGHTS = np.random.default_rng(5).standard_normal((6, 3)) * 0.02
 HIT = slice(180, 184)
 """Samples of a knock that the network takes for a leap: its measurement is rejected."""
@@ -157,6 +160,39 @@ def test_equals_the_scan(config, missing):
         final,
     )
     jax.tree.map(np.asarray, state)  # the caller's own start is still his
+
+
+@pytest.mark.parametrize("window_rotation, last", [("per_sample", 34), ("tlio", 35)])
+def test_windows_with_a_long_hole_are_no_measurements(window_rotation, last):
+    """Coasting are samples 122 … 127, in intervals 30 and 31: in the windows that end with
+    intervals 30 … 34, and in that which begins a sample early. The short hole is bridged."""
+    gyro, accel = recording()
+    config = dataclasses.replace(CONFIG, window_rotation=window_rotation)
+    valid = ~np.isin(np.arange(len(gyro)), [*range(120, 128), 170, 171])
+    _, history = scan(start(config), gyro, accel, valid, config)
+    missing = np.flatnonzero(np.isnan(np.asarray(history.accepted)))
+    np.testing.assert_array_equal(missing, [*range(4), *range(30, last + 1)])
+    assert np.isfinite(history.position).all()
+
+
+def test_unhealthy_once_is_unhealthy_for_good(tracker):
+    """A knock to some 140 m/s and back: the filter comes back, so nothing but memory can tell. What
+    begins with its state is unhealthy, too."""
+    gyro, accel = (signal.copy() for signal in recording())
+    accel[98:106] += [900.0, 0, 0]
+    accel[106:114] -= [900.0, 0, 0]
+    final, history = scan(start(), gyro, accel, np.ones(len(gyro), bool))
+    speed = np.linalg.norm(history.velocity, axis=1)
+    bad = int(np.argmax(speed > CONFIG.speed_limit))
+    assert 0 < bad < 30 and np.isfinite(speed).all()
+    np.testing.assert_array_equal(history.healthy, np.arange(len(speed)) < bad)
+    found = feed(tracker, gyro, accel, np.arange(len(gyro)) * DT)
+    np.testing.assert_array_equal([p.healthy for p in found], np.asarray(history.healthy) > 0)
+    assert not final.healthy and not tracker.filter_state().healthy
+    tracker._start(tracker.filter_state())
+    assert tracker.pose().healthy is False
+    _, again = scan(final, *recording(), np.ones(len(gyro), bool))
+    assert (np.asarray(again.healthy) == 0).all()
 
 
 def oracle(stamps, values, dt, hole):
@@ -444,6 +480,16 @@ def workdir(tmp_path_factory):
     )
 
 
+COMPILED = []
+
+
+def compile_once(*arguments):
+    """All replays are of one network and filter."""
+    if not COMPILED:
+        COMPILED.append(compile_programs(*arguments))
+    return COMPILED[0]
+
+
 @pytest.fixture
 def replay(monkeypatch, tmp_path):
     """examples/replay_csv.py's own main: (arguments) -> None, in an empty folder."""
@@ -451,6 +497,7 @@ def replay(monkeypatch, tmp_path):
     module = importlib.util.module_from_spec(spec)
     monkeypatch.setitem(sys.modules, "replay_csv", module)
     spec.loader.exec_module(module)
+    monkeypatch.setattr(online, "compile_programs", compile_once)
     monkeypatch.chdir(tmp_path)
 
     def call(*arguments):
@@ -496,22 +543,18 @@ def test_a_recording_is_replayed(workdir, replay, tmp_path, capsys):
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["found.png", "found.txt"]
 
 
-def test_a_replay_takes_the_default_weights(workdir, replay, tmp_path, monkeypatch, capsys):
-    """Those of gnio-jax, else the newest run, as every command."""
-    asked = []
-    load = packages.load_pretrained
+def test_a_faster_recording_is_replayed_with_the_default_weights(
+    workdir, replay, tmp_path, monkeypatch, capsys
+):
+    """Through the low-pass; with those of gnio-jax, else the newest run, as every command."""
+    asked, load = [], packages.load_pretrained
     monkeypatch.setattr(
         packages, "load_pretrained", lambda which: asked.append(which) or load(workdir)
     )
-    write_walk(tmp_path / "walk.csv")
-    replay("--csv", "walk.csv")
-    assert asked == [None] and "real-time factor" in capsys.readouterr().out
-
-
-def test_a_faster_recording_is_replayed_through_the_low_pass(workdir, replay, tmp_path, capsys):
     time = write_walk(tmp_path / "walk.csv", rate=120)
-    replay("--weights", workdir, "--csv", "walk.csv")
+    replay("--csv", "walk.csv")
     out, err = capsys.readouterr()
+    assert asked == [None]
     assert err == "" and "DIVERGED" not in out and "Hz to 50 Hz: poses come 433 ms later" in out
     found = np.loadtxt(tmp_path / "walk_trajectory.txt")
     # Of the steps of the rest the last one counts; the poses are behind by the low-pass.
