@@ -249,11 +249,11 @@ def _repeated(
 ) -> tuple[Callable[[FilterState, Array], FilterHistory], FilterState, Array]:
     """The run over one walk without the network, from a start and the displacements; its start and
     its displacements."""
-    std, raw = settings.start, settings.raw_gyro_bias
-    if raw is not None:  # as the walk was prepared
-        own = jnp.where(walk.start.std.gyro_bias == raw, raw, std.gyro_bias)
+    std = settings.start
+    if settings.raw_gyro_bias is not None:  # as the walk was prepared
+        own = jnp.where(walk.start.raw_gyro, settings.raw_gyro_bias, std.gyro_bias)
         std = std._replace(gyro_bias=own)
-    state = initial_state(config, *walk.start[:-1], std=std)
+    state = initial_state(config, *walk.start[:4], std=std)
     assert walk.given is not None
     covariance = jax.vmap(jnp.diag)(walk.given.std**2)
     fixed = config, settings.noise, walk.imu_valid, config.displacement_frame

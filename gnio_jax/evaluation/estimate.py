@@ -217,7 +217,7 @@ def _run(
 
     def run(own: Inputs) -> FilterHistory:
         signals, fixed = (own.gyro, own.accel), (config, noise, own.imu_valid)
-        state = initial_state(config, *own.start[:-1], std=own.start.std)
+        state = initial_state(config, *own.start[:4], std=own.start.std)
         if apply is None:
             assert own.given is not None
             frame, covariance = "given", jax.vmap(jnp.diag)(own.given.std**2)

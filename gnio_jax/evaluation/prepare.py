@@ -56,6 +56,8 @@ class Start(NamedTuple):
     gyro_bias: Float[np.ndarray, "3"]
     """First estimate, rad/s."""
     std: InitialStd
+    raw_gyro: bool
+    """Whether neither the phone nor a rest gave a first estimate of the gyro's bias."""
 
 
 class Recording(NamedTuple):
@@ -138,6 +140,7 @@ def prepare(
         if whole.waypoints is not None:
             own_init, reference_note = "static", OF_WAYPOINTS
         start, start_note = _start(whole, measured, windows, bias, own_std, own_init)
+        start = start._replace(raw_gyro=bool(raw))
         trusted, mask = whole.valid[:, None], whole.imu_valid
         poses = [np.where(trusted, part, np.nan) for part in (whole.position, whole.orientation)]
         ends = slice(None, None, windows.stride)
@@ -211,7 +214,7 @@ def _start(
         velocity = sequence.velocity[0]
         velocity = velocity if np.isfinite(velocity).all() else np.zeros(3)
         rotation = matrix_from_quaternion(sequence.orientation[0])
-        return Start(rotation, velocity, sequence.position[0], gyro_bias, std), ""
+        return Start(rotation, velocity, sequence.position[0], gyro_bias, std, False), ""
     second = measured[measured < round(windows.rate)]
     if 2 * len(second) < round(windows.rate):  # most of the first second was not measured
         second = measured[: round(windows.rate)]
@@ -220,7 +223,7 @@ def _start(
     found = np.sqrt(np.diag(level.core_covariance))
     tilt_std, velocity_std = float(found[0]), float(found[3])
     std = std._replace(tilt=tilt_std, velocity=velocity_std)
-    start = Start(np.asarray(level.rotation), np.zeros(3), np.zeros(3), gyro_bias, std)
+    start = Start(np.asarray(level.rotation), np.zeros(3), np.zeros(3), gyro_bias, std, False)
     if velocity_std <= ROUGH_START:
         return start, ""
     tilt = float(f"{np.degrees(tilt_std):.1g}")  # of many sequences few different notes

@@ -51,18 +51,17 @@ def two_walks(monkeypatch):
     return read
 
 
-def test_the_run_differs_in_the_filter_alone(run, two_walks, tmp_path, capsys):
+def test_the_run_differs_in_the_filter_and_its_average_alone(run, two_walks, tmp_path, capsys):
     out = tmp_path / "calibrated"
-    words = ["calibrate", "--workdir", str(run), "--out", str(out)]
+    words = ["calibrate", "--workdir", str(run), "--out", str(out), "--average-headings"]
     app.main([*words, "--fit", "measurement", "window"])
     told = capsys.readouterr().out
     assert "noise.std_factor" in told and f"gnio evaluate --workdir {out}" in told
     assert two_walks == ["val"]
     before, after = (checkpoint.load_run(folder) for folder in (run, out))
-    changed = dataclasses.replace(
-        after.config, workdir=before.config.workdir, filter=before.config.filter
-    )
-    assert changed == before.config
+    assert after.config.model.equivariance == "four_headings"
+    same = {name: getattr(before.config, name) for name in ("workdir", "filter", "model")}
+    assert dataclasses.replace(after.config, **same) == before.config
     jax.tree.map(np.testing.assert_array_equal, after.variables, before.variables)
     found = after.config.filter
     assert found.start == TRAINED.filter.start
@@ -77,7 +76,7 @@ def test_the_run_differs_in_the_filter_alone(run, two_walks, tmp_path, capsys):
     assert about["split"] == "val" and about["filter"] == plain(found)
 
 
-def test_the_network_is_averaged_over_four_headings(run, two_walks, tmp_path):
+def test_the_network_is_averaged_over_four_headings(run):
     asked = CalibrateConfig(str(run), average_headings=True)
     plain = evidence.load_run(run, CalibrateConfig(str(run)))
     averaged = evidence.load_run(run, asked)
@@ -95,11 +94,6 @@ def test_the_network_is_averaged_over_four_headings(run, two_walks, tmp_path):
         rtol=1e-4,
         atol=1e-6,
     )
-    out = tmp_path / "out"
-    fit = dataclasses.replace(asked, out=str(out), fit=("measurement", "window"))
-    calibration.calibrate(fit)
-    written = checkpoint.load_run(out)
-    assert written.config.model.equivariance == "four_headings"
 
 
 @pytest.mark.parametrize(
@@ -141,10 +135,11 @@ def test_a_calibrated_run_is_not_calibrated_again(run, two_walks, tmp_path):
         calibration.calibrate(CalibrateConfig(workdir=str(tmp_path / "run")))
 
 
-def test_the_split_may_be_that_of_training(run, two_walks, tmp_path):
-    options = CalibrateConfig(str(run), str(tmp_path / "out"), split="train")
-    calibration.calibrate(dataclasses.replace(options, fit=("measurement", "window")))
-    assert two_walks == ["train"]
+@pytest.mark.parametrize(("asked", "split"), [(None, "val"), ("val", "val"), ("train", "train")])
+def test_the_split_is_that_of_validation_or_of_training(run, asked, split):
+    loaded = checkpoint.load_run(run)
+    found, ((source, fold),) = evidence.sources(loaded, CalibrateConfig(str(run), split=asked))
+    assert found == split and source is loaded and fold is None
 
 
 def estimate(error, std):

@@ -77,25 +77,29 @@ def test_the_noises_of_simulated_walks_are_found():
 
 
 def test_the_gradient_is_that_of_the_likelihood():
-    paths = [path for group in GROUPS.values() for path in group]
-    settings = start_of_fit(TRUE, paths)
-    two = jax.tree.map(lambda rows: rows[:2], first_strides(walks(), 110))
-    both = objective(two, settings, paths, functools.partial(jax.value_and_grad, has_aux=True))
-    free = start(settings, paths)
-    gradient = np.asarray(both(free)[1])
+    """Of the numbers that the searches here fit; those of a correlated error and of the start are
+    differentiated in `filtering/test_derivatives`."""
+    names, config = tuple(free_parameters(TRUE, PATHS)), innovation_config(DATA, TRUE)
+    free = start(TRUE, PATHS)
+
+    def at(free):
+        return jax.device_get(
+            SEARCH(free, walks(), start(TRUE, PATHS), TRUE, names=names, config=config)
+        )
+
+    gradient = np.asarray(at(free)[1])
     assert (gradient != 0).all()
     for i, step in enumerate(1e-4 * np.eye(len(free))):
-        ahead, behind = (float(both(free + off)[0][0]) for off in (step, -step))
+        ahead, behind = (float(at(free + off)[0][0]) for off in (step, -step))
         np.testing.assert_allclose(gradient[i], (ahead - behind) / 2e-4, rtol=1e-3, atol=1e-7)
 
 
-@pytest.mark.parametrize(("prepared", "expected"), [(0.05, 0.05), (1.0, 1e-3)])
-def test_a_raw_gyro_keeps_the_wide_start_that_its_walk_was_prepared_with(prepared, expected):
+@pytest.mark.parametrize(("raw", "expected"), [(True, 0.05), (False, 1e-3)])
+def test_a_raw_gyro_keeps_the_wide_start_that_its_walk_was_prepared_with(raw, expected):
     """Every other walk starts as the settings say, whatever it was prepared with."""
     settings = dataclasses.replace(TRUE, raw_gyro_bias=0.05)
     walk = jax.tree.map(lambda leaf: leaf[0], walks())
-    std = walk.start.std._replace(gyro_bias=np.float64(prepared))
-    walk = walk._replace(start=walk.start._replace(std=std))
+    walk = walk._replace(start=walk.start._replace(raw_gyro=np.bool_(raw)))
     _, state, _ = fitting._repeated(walk, settings, innovation_config(DATA, settings))
     found = np.sqrt(np.diag(state.core_covariance))[GYRO_BIAS]
     np.testing.assert_allclose(found, expected, rtol=1e-9)

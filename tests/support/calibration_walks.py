@@ -32,7 +32,9 @@ def walks():
     """Their displacements err by `SIGMA`, while the network says a third of it."""
     runs = _simulated()
     std = filtering.InitialStd(*np.ones((6, 8)))  # a fit takes that of the settings
-    start = Start(runs.rotation0, runs.velocity0, runs.position0, np.zeros((8, 3)), std)
+    start = Start(
+        runs.rotation0, runs.velocity0, runs.position0, np.zeros((8, 3)), std, np.zeros(8, bool)
+    )
     given = Displacements(runs.displacement, np.full_like(runs.displacement, SIGMA / 3))
     return Inputs(start, runs.gyro, runs.accel, None, given)
 

@@ -101,7 +101,7 @@ def export_run(which: str | Path, out: Path, seconds: float = SECONDS) -> Export
             }
         windows = run.config.data
         walk = draw_walk(windows, setup, seconds)
-        start = initial_state(setup.config, *walk.start[:-1], std=walk.start.std)
+        start = initial_state(setup.config, *walk.start[:4], std=walk.start.std)
         models = driver.open_models(folder)
         found = driver.walk(models, start_arrays(start, setup), walk.gyro, walk.accel)
         (own,) = estimate([walk], network, windows, setup._replace(considered=None))
