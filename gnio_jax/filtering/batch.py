@@ -37,12 +37,9 @@ def batches(intervals: Sequence[int], size: int, padded: Callable[[int], int]) -
     have `size` members.
     """
     longest_first = sorted(range(len(intervals)), key=lambda i: -intervals[i])
-    found = []
-    for begin in range(0, len(intervals), size):
-        members = longest_first[begin : begin + size]
-        filled = members + members[-1:] * (size - len(members))
-        found.append(Batch(filled, padded(intervals[members[0]])))
-    return found
+    parts = [longest_first[i : i + size] for i in range(0, len(intervals), size)]
+    filled = [part + part[-1:] * (size - len(part)) for part in parts]
+    return [Batch(part, padded(intervals[part[0]])) for part in filled]
 
 
 def padded_signals(

@@ -33,7 +33,7 @@ from gnio_jax.filtering.smoother import SmoothedHistory, smooth
 from gnio_jax.filtering.start import initial_state, level_state
 from gnio_jax.filtering.state import Mean
 from gnio_jax.numerics import interpolate, quaternion_from_matrix, rotation_z
-from gnio_jax.types import GRAVITY, Array, Sequence
+from gnio_jax.types import GRAVITY, Array, Sequence, Waypoints
 
 PLACE_STD, TIME_STD = 0.3, 0.4
 """Standard deviations of where, m, and of when, s, somebody taps."""
@@ -77,72 +77,80 @@ def waypoint_poses(
     than `START_SECONDS`, or with fewer than two waypoints or one outside, and where the filter
     fails.
     """
-    config, noise, waypoints = setup.config, setup.noise, sequence.waypoints
-    if waypoints is None or len(waypoints.time) < 2:
-        raise InputError(sequence.name, "has fewer than two waypoints")
-    first, step = round(START_SECONDS / config.dt), float(np.median(np.diff(sequence.time)))
-    if len(sequence.time) < first or abs(step / config.dt - 1) > 1e-3:
-        found = f"has {len(sequence.time)} samples at {1 / step:.4g} Hz"
-        problem = f"{found}, at least {first} at {1 / config.dt:.4g} Hz are needed"
-        raise InputError(sequence.name, problem, "resample it")
-    if waypoints.time[0] < sequence.time[0] or waypoints.time[-1] > sequence.time[-1]:
-        raise InputError(sequence.name, "has waypoints before its start or after its end")
+    config, noise = setup.config, setup.noise
+    waypoints = _checked_waypoints(sequence, config)
     count = -(-len(sequence.time) // config.samples_per_clone)
     padded = math.ceil(LONGER ** math.ceil(math.log(count, LONGER)))
     samples = padded * config.samples_per_clone
-    gyro, accel = (x[0] for x in padded_signals([(sequence.gyro, sequence.accel)], samples))
+    signals = [x[0] for x in padded_signals([(sequence.gyro, sequence.accel)], samples)]
     masks = padded_masks([sequence.imu_valid], samples)
-    signals, valid = (gyro, accel), None if masks is None else masks[0]
+    valid = None if masks is None else masks[0]
+    after, place = waypoints.time - sequence.time[0], waypoints.position
+    ends = config.clone_seconds * np.arange(1, padded + 1)
 
-    level = level_state(config, gyro[:first], accel[:first], setup.initial_std)
+    def at_taps(rows: Array) -> np.ndarray:
+        """Horizontal ones of rows at the ends of intervals."""
+        return interpolate(after, ends, np.asarray(rows)[:, :2])
+
+    # The path without the waypoints, laid over them.
+    level = level_state(config, *(x[: _first(config)] for x in signals), setup.initial_std)
     _, history = _odometry(predict, level, *signals, config, noise, valid)
     displacement, covariance = history.given(noise)
     displacement = jnp.where(jnp.arange(padded)[:, None] < count, displacement, jnp.nan)
+    turn, origin, weight, missed = _aligned(at_taps(history.position), place, after, place_std)
+    yaw = np.arctan2(turn[1, 0], turn[0, 0])
 
-    after, place = waypoints.time - sequence.time[0], waypoints.position
-    at_taps = functools.partial(interpolate, after, config.clone_seconds * np.arange(1, padded + 1))
-    turn, shift, weight, missed = _aligned(
-        at_taps(np.asarray(history.position)[:, :2]), place, after, place_std
-    )
     covariance = covariance + missed**2 * jnp.eye(3)[None]
-    noise = noise._replace(
-        measurement_scale=1.0, std_factor=(1.0, 1.0, 1.0), correlation=CORRELATION
-    )
+    given_noise = {"measurement_scale": 1.0, "std_factor": (1.0, 1.0, 1.0)}
+    noise = noise._replace(**given_noise, correlation=CORRELATION)
     given = displacement, covariance, config, noise, valid, config.displacement_frame
     std = setup.initial_std._replace(**START_STD)
-    yaw, origin = np.arctan2(turn[1, 0], turn[0, 0]), shift
     for _ in range(PASSES):
         rotation, position = rotation_z(yaw) @ level.rotation, np.append(origin, 0.0)
         start = initial_state(config, rotation, np.zeros(3), position, level.gyro_bias, std=std)
         spread = (place_std**2 / weight)[:, None, None] * np.eye(2)
-        late = time_std / np.sqrt(weight)
-        fixes = fixes_on_intervals(
-            after, place, spread, padded, config, time_std=late, threshold=math.inf
-        )
+        late = {"time_std": time_std / np.sqrt(weight), "threshold": math.inf}
+        fixes = fixes_on_intervals(after, place, spread, padded, config, **late)
         smoothed = _smooth(start, *signals, *given, (fixes,))
-        off = place - at_taps(np.asarray(smoothed.position)[:, :2])
-        late = time_std * at_taps(np.asarray(smoothed.velocity)[:, :2])
-        spread = place_std**2 * np.eye(2) + late[:, :, None] * late[:, None]
+        off, speed = place - at_taps(smoothed.position), time_std * at_taps(smoothed.velocity)
+        spread = place_std**2 * np.eye(2) + speed[:, :, None] * speed[:, None]
         squares = np.einsum("fi,fij,fj->f", off, np.linalg.inv(spread), off)
         if not np.isfinite(squares).all():
             raise InputError(sequence.name, "the filter fails on it")
         weight = (FREEDOM + 2) / (FREEDOM + squares)
         poses = jax.device_get(_between_clones(smoothed, *signals, config=config))
         rotation, velocity, position = (each[: len(sequence.time)] for each in poses)
-        turn = rotation[0] @ np.asarray(level.rotation).T
+        turn, origin = rotation[0] @ np.asarray(level.rotation).T, position[0, :2]
         yaw = np.arctan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1])
-        origin = position[0, :2]
-    inside = (sequence.time >= waypoints.time[0]) & (sequence.time <= waypoints.time[-1])
-    smoothed = jax.tree.map(lambda rows: np.asarray(rows)[:count], smoothed)
     poses = sequence._replace(
         orientation=quaternion_from_matrix(rotation),
         position=position,
         velocity=velocity,
-        valid=inside,
+        valid=(sequence.time >= waypoints.time[0]) & (sequence.time <= waypoints.time[-1]),
         waypoints=None,
         attributes=sequence.attributes | {"reference": "waypoints, smoothed"},
     )
+    smoothed = jax.tree.map(lambda rows: np.asarray(rows)[:count], smoothed)
     return WaypointPoses(poses, smoothed, weight)
+
+
+def _first(config: FilterConfig) -> int:
+    """Samples from which the level start is made."""
+    return round(START_SECONDS / config.dt)
+
+
+def _checked_waypoints(sequence: Sequence, config: FilterConfig) -> Waypoints:
+    """Those of a sequence that can have poses. Raises `InputError`."""
+    waypoints, step = sequence.waypoints, float(np.median(np.diff(sequence.time)))
+    if waypoints is None or len(waypoints.time) < 2:
+        raise InputError(sequence.name, "has fewer than two waypoints")
+    if len(sequence.time) < _first(config) or abs(step / config.dt - 1) > 1e-3:
+        found = f"has {len(sequence.time)} samples at {1 / step:.4g} Hz"
+        problem = f"{found}, at least {_first(config)} at {1 / config.dt:.4g} Hz are needed"
+        raise InputError(sequence.name, problem, "resample it")
+    if waypoints.time[0] < sequence.time[0] or waypoints.time[-1] > sequence.time[-1]:
+        raise InputError(sequence.name, "has waypoints before its start or after its end")
+    return waypoints
 
 
 _odometry = jax.jit(run_odometry, static_argnames=("predict", "config"))
@@ -182,23 +190,20 @@ def _between_clones(
     n, dt, seconds = config.samples_per_clone, config.dt, config.clone_seconds
     ends = Mean(*(getattr(smoothed, name) for name in Mean._fields))
 
-    def integrated(rotation: Array, velocity: Array, position: Array, gyro: Array, push: Array):
+    def integrated(rotation: Array, velocity: Array, position: Array, gyro: Array, accel: Array):
         """At the n stamps of an interval, and at its end."""
         rotations = geometry.integrate_turns(rotation, gyro * dt)
-        force = jnp.einsum("ijn,nj->ni", rotations[:, :, :-1], push)
+        force = jnp.einsum("ijn,nj->ni", rotations[:, :, :-1], accel)
         steps = (force - jnp.array([[0.0, 0.0, GRAVITY]])) * dt
         velocities = velocity[None] + jnp.cumsum(jnp.pad(steps, ((1, 0), (0, 0))), axis=0)
         moved = (velocities[:-1] + 0.5 * steps) * dt
         positions = position[None] + jnp.cumsum(jnp.pad(moved, ((1, 0), (0, 0))), axis=0)
         return jnp.moveaxis(rotations, 2, 0), velocities, positions
 
-    def interval(before: tuple, end: Mean, gyro: Array, accel: Array) -> tuple:
-        imu = gyro - end.gyro_bias[None], accel - end.accel_bias[None]
+    def interval(before: tuple, end: Mean, imu: tuple[Array, Array]) -> tuple:
         rotation, velocity, position = integrated(*before, *imu)
         missed = end.rotation @ rotation[-1].T
-        angle = 0.5 * jnp.stack(
-            [missed[2, 1] - missed[1, 2], missed[0, 2] - missed[2, 0], missed[1, 0] - missed[0, 1]]
-        )
+        angle = 0.5 * jnp.stack([(missed - missed.T)[place] for place in ((2, 1), (0, 2), (1, 0))])
         speed = (end.velocity - velocity[-1])[None]
         place = (end.position - position[-1])[None]
         s = (jnp.arange(n) / n)[:, None]
@@ -207,18 +212,18 @@ def _between_clones(
         by_position = place * s**2 * (3 - 2 * s) + speed * seconds * s**2 * (s - 1)
         return turns @ rotation[:-1], velocity[:-1] + by_velocity, position[:-1] + by_position
 
+    signals = (gyro, ends.gyro_bias), (accel, ends.accel_bias)
+    imu = tuple(signal.reshape(-1, n, 3) - bias[:, None] for signal, bias in signals)
     # Before the first interval: back over it from its end.
-    first = jax.tree.map(lambda rows: rows[0], ends)
-    imu = gyro[:n] - first.gyro_bias[None], accel[:n] - first.accel_bias[None]
+    first, of_first = jax.tree.map(lambda rows: rows[0], (ends, imu))
     nothing = jnp.zeros(3)
-    turned, _, _ = integrated(jnp.eye(3), nothing, nothing, *imu)
+    turned, _, _ = integrated(jnp.eye(3), nothing, nothing, *of_first)
     rotation = first.rotation @ turned[-1].T
-    _, gained, moved = integrated(rotation, nothing, nothing, *imu)
+    _, gained, moved = integrated(rotation, nothing, nothing, *of_first)
     velocity = first.velocity - gained[-1]
     start = rotation, velocity, first.position - velocity * seconds - moved[-1]
     before = tuple(
         jnp.concatenate([row[None], rows[:-1]]) for row, rows in zip(start, ends[:3], strict=True)
     )
-    rows = jax.vmap(interval)(before, ends, gyro.reshape(-1, n, 3), accel.reshape(-1, n, 3))
-    rotation, velocity, position = (x.reshape(-1, *x.shape[2:]) for x in rows)
-    return rotation, velocity, position
+    rows = jax.vmap(interval)(before, ends, imu)
+    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), rows)

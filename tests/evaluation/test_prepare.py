@@ -88,6 +88,7 @@ def test_a_raw_gyro_starts_with_a_wider_bias(walks, swaying, compensated):
     own = evaluation.prepare([walk], CONFIG)[0][0].start.std.gyro_bias
     expected = 0.05 if compensated == "no" else own
     assert recording.start.std.gyro_bias == expected and own < 0.01
+    assert recording.start.raw_gyro == (compensated == "no")
     resting = swaying._replace(gyro=swaying.gyro.copy(), attributes=attributes)
     resting.gyro[:120] = [0.01, -0.02, 0.005]
     resting.accel[:120] = swaying.accel[:120].mean(0)
