@@ -84,13 +84,6 @@ def test_right_jacobian_and_its_derivative(angle):
     np.testing.assert_allclose(slope_of_right_jacobian(phi), expected, atol=1e-8)
 
 
-def test_right_jacobian_by_its_definition():
-    phi, delta = np.array([0.5, -1.2, 0.8]), 1e-6 * np.array([1.0, -2.0, 0.5])
-    turned = np.asarray(exp(phi)).T @ np.asarray(exp(phi + delta))
-    wanted = np.asarray(right_jacobian(phi)) @ delta
-    np.testing.assert_allclose(Rotation.from_matrix(turned).as_rotvec(), wanted, atol=1e-11)
-
-
 @pytest.mark.parametrize("dtype,tolerance", [(jnp.float64, 1e-14), (jnp.float32, 1e-6)])
 def test_dtype_is_kept(dtype, tolerance):
     phi = jnp.asarray([0.02, 0.01, -0.03], dtype)

@@ -1,5 +1,5 @@
-"""Is the filter as certain as it may be? Monte Carlo with noises as it assumes them, what is
-unobservable, Jacobians by autodiff."""
+"""Is the filter as certain as it may be? Monte Carlo with noises as it assumes them, correlated
+errors among them, and the Jacobian of the network's own frame by autodiff."""
 
 import functools
 
@@ -11,13 +11,11 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from gnio_jax import filtering, geometry
-from gnio_jax.filtering.displacement import Displacement, linearise_displacement
-from gnio_jax.filtering.state import CLONE, OFFSET
-from gnio_jax.filtering.update import Step, measurable_errors, retract
+from gnio_jax.filtering.state import CLONE
 from gnio_jax.types import Prediction
 from gnio_jax.windows import cut_window
 from tests.support.compiling import optimised, quick
-from tests.support.measured import NO_IMU, displacement_residual
+from tests.support.measured import displacement_residual
 from tests.support.walks import errors, simulate, yaw_matrix
 from tests.support.whole_covariance import covariance
 
@@ -181,55 +179,6 @@ def test_the_smoother_is_consistent_with_correlated_errors():
     for index in list(PARTS.values())[:4]:
         block = smoothed.covariance[:, :, index][..., index]
         assert 0.6 < nees(error[..., index], block)[100:-100].mean() < 1.5, index
-
-
-def random_state(config, seed=0):
-    rng = np.random.default_rng(seed)
-    clones = config.clones_per_window + 1
-    rotations = Rotation.from_rotvec(0.8 * rng.normal(size=(clones, 3))).as_matrix()
-    velocity, position, gyro_bias, accel_bias = rng.normal(size=(4, 3))
-    state = filtering.initial_state(
-        config, rotations[-1], velocity, position, 0.1 * gyro_bias, accel_bias
-    )
-    offsets = rng.normal(size=(clones, 3))
-    return state._replace(
-        clone_rotation=jnp.asarray(rotations),
-        clone_offset=jnp.asarray(offsets),
-        offset=jnp.asarray(offsets[-1]),
-        move=jnp.asarray(rng.normal(size=3)),
-        step=jnp.int32(clones),
-    )
-
-
-def test_measurement_jacobian_is_the_derivative_of_the_retraction():
-    config = filtering.FilterConfig(0.05, 6, 3)
-    state = random_state(config, 2)
-    newest, oldest = 3, 1
-
-    def predicted(errors):
-        core = jnp.zeros(21).at[OFFSET.start :].set(errors[-15:])
-        moved = retract(state, core, errors[:-15].reshape(-1, CLONE), newest)
-        return geometry.yaw_rotation(moved.clone_rotation[oldest]).T @ (
-            moved.offset + moved.move - moved.clone_offset[oldest]
-        )
-
-    measured = Displacement(jnp.zeros(3), jnp.eye(3), jnp.bool_(True), "given")
-    step = Step(NO_IMU, newest, oldest, config, filtering.NoiseModel())
-    linear, _ = quick(lambda: linearise_displacement(measured, state, step))()
-    assert set(linear.jacobian) == {"since_oldest", "oldest_rotation"}
-
-    def linearised(errors):
-        # The core's offset is that of the newest clone.
-        clones = errors[:-15]
-        core = jnp.zeros(21).at[OFFSET.start :].set(errors[-15:])
-        core = core.at[OFFSET].set(clones[CLONE * newest + 3 : CLONE * (newest + 1)])
-        parts = measurable_errors(core[:, None], clones[:, None], oldest)
-        return sum(block @ parts[name][:, 0] for name, block in linear.jacobian.items())
-
-    found = jax.jacfwd(linearised)(jnp.zeros(4 * CLONE + 15))
-    np.testing.assert_allclose(
-        found, quick(jax.jacfwd(predicted))(jnp.zeros(4 * CLONE + 15)), atol=1e-6
-    )
 
 
 # The network in the loop --------------------------------------------------------------------------
