@@ -323,7 +323,8 @@ def test_the_sensitivity_of_the_smoother_is_its_change():
     def changed(more):
         return run(start(more), disturbed(displacement, more))
 
-    found = jax.jit(lambda more: filtering.sensitivity(run, start(more), displacement))(np.zeros(6))
-    for entry, wanted in enumerate(central(changed(steps_of_each()[:HALF]))):
+    sensitivity = jax.jit(lambda more: filtering.sensitivity(run, start(more), displacement))
+    found = np.asarray(sensitivity(np.zeros(6)))
+    for entry, wanted in enumerate(central(jax.device_get(changed(steps_of_each()[:HALF])))):
         size = np.abs(wanted).max(axis=0) + 1e-6
         np.testing.assert_allclose(found[:, :, entry] / size, wanted / size, atol=1e-5)
