@@ -99,8 +99,8 @@ class Prediction(NamedTuple):
     def normalised(
         self, error: Float[jax.Array, "*b d"], least: float | None
     ) -> tuple[Float[jax.Array, "*b d"], Float[jax.Array, "*b d"]]:
-        """(e/σ)² of errors of the first d axes, m, and log σ, raised to `least`: with the same
-        covariance, −log N(e) is their sum Σ ½ (e/σ)² + log σ, without its constant."""
-        log_std = self.log_std[..., : error.shape[-1]]
+        """(e/σ)² of errors of the first d axes, m, and log σ, with the same covariance: without its
+        constant −log N(e) is Σ ½ (e/σ)² + log σ."""
+        log_std = jnp.asarray(self.log_std)[..., : error.shape[-1]]
         log_std = log_std if least is None else jnp.maximum(log_std, least)
         return error**2 * jnp.exp(-2 * log_std), log_std

@@ -93,7 +93,8 @@ def waypoint_poses(
         return interpolate(after, ends, np.asarray(rows)[:, :2])
 
     # The path without the waypoints, laid over them.
-    level = level_state(config, *(x[: _first(config)] for x in signals), setup.initial_std)
+    first = slice(_first(config))
+    level = level_state(config, signals[0][first], signals[1][first], setup.initial_std)
     _, history = _odometry(predict, level, *signals, config, noise, valid)
     displacement, covariance = history.given(noise)
     displacement = jnp.where(jnp.arange(padded)[:, None] < count, displacement, jnp.nan)
@@ -200,7 +201,9 @@ def _between_clones(
         positions = position[None] + jnp.cumsum(jnp.pad(moved, ((1, 0), (0, 0))), axis=0)
         return jnp.moveaxis(rotations, 2, 0), velocities, positions
 
-    def interval(before: tuple, end: Mean, imu: tuple[Array, Array]) -> tuple:
+    def interval(
+        before: tuple[Array, Array, Array], end: Mean, imu: tuple[Array, Array]
+    ) -> tuple[Array, Array, Array]:
         rotation, velocity, position = integrated(*before, *imu)
         missed = end.rotation @ rotation[-1].T
         angle = 0.5 * jnp.stack([(missed - missed.T)[place] for place in ((2, 1), (0, 2), (1, 0))])

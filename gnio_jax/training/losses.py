@@ -74,9 +74,9 @@ def losses(
     chex.assert_equal_shape(given)
     chex.assert_shape(given, (None, 3))
     error = (windows.displacement - prediction.displacement)[:, :axes]
-    log_std = _held(prediction.log_std, stage)[:, :axes]
+    held = prediction._replace(log_std=_held(prediction.log_std, stage))
     mse = jnp.mean(jnp.sum(error**2, axis=-1))
-    nll = gaussian_nll(error, log_std, config)
+    nll = gaussian_nll(held, error, config)
     if config.name == "velocity_and_covariance":
         total = _velocity_and_covariance(prediction, windows, config, stage, axes)
         return Losses(total, mse, nll)
@@ -106,8 +106,8 @@ def _velocity_and_covariance(
     error = (windows.steps * windows.steps.shape[1] - found["velocity"])[..., :axes]
     position = (windows.displacement - prediction.displacement)[:, :axes]
     velocity_loss = jnp.mean(jnp.sum(error**2, axis=-1)) + jnp.mean(jnp.sum(position**2, axis=-1))
-    log_std = _held(found["velocity_log_std"], stage)[..., :axes]
-    covariance_loss = gaussian_nll(error, log_std, config)
+    held = Prediction(found["velocity"], _held(found["velocity_log_std"], stage))
+    covariance_loss = gaussian_nll(held, error, config)
     log_v, log_c = jnp.maximum(found["task_log_std"][0], TASK_LOG_STD_FLOOR)
     return (
         0.5 * jnp.exp(-2 * log_v) * velocity_loss
@@ -118,7 +118,7 @@ def _velocity_and_covariance(
 
 
 def gaussian_nll(
-    error: Float[jax.Array, "*b d"], log_std: Float[jax.Array, "*b d"], config: LossConfig
+    prediction: Prediction, error: Float[jax.Array, "*b d"], config: LossConfig
 ) -> Float[jax.Array, ""]:
     """Mean over the windows of ½ (e/σ)² + log σ, summed over the axes (paper §III-F, L_NLL).
 
@@ -126,9 +126,7 @@ def gaussian_nll(
     a tiny σ has else a gradient without bound, which Adam's second moment remembers for a thousand
     steps.
     """
-    if config.log_std_floor is not None:
-        log_std = jnp.maximum(log_std, config.log_std_floor)
-    normalised = error**2 * jnp.exp(-2 * log_std)
+    normalised, log_std = prediction.normalised(error, config.log_std_floor)
     if config.outlier_sigmas is not None:
         bound = config.outlier_sigmas**2
         beyond = bound * (1 + jnp.log(jnp.maximum(normalised, bound) / bound))
