@@ -179,6 +179,8 @@ class AugmentConfig:
     forward and back, Hz."""
     scale: Annotated[tuple[Probability, Probability], FILE_ONLY] = (0.0, 0.0)
     """Half-widths of a window's uniform scale errors of gyro and accelerometer (ours)."""
+    rest_share: Annotated[Probability, FILE_ONLY] = 0.0
+    """Share of the windows that are replaced by those of a phone at rest (ours)."""
 
     def check(self, at: Place) -> None:
         """The lowest cut-off is no higher than the highest."""

@@ -21,7 +21,7 @@ from gnio_jax import geometry
 from gnio_jax.config import AugmentConfig, DataConfig
 from gnio_jax.errors import InputError
 from gnio_jax.numerics import rotations, yaw
-from gnio_jax.types import Array, Sequence, Windows
+from gnio_jax.types import GRAVITY, Array, Sequence, Windows
 from gnio_jax.windows import (
     align_recording,
     rotate_channels,
@@ -207,12 +207,15 @@ def augment(key: PRNGKeyArray, windows: Windows, config: AugmentConfig) -> Windo
     """The random changes that `config` (static) switches on, in TLIO's order, each by its own key;
     GNIO's paper is silent on them.
 
-    A scale factor of each sensor (ours). A constant bias for each window, uniform in ± its
-    half-width on each axis. A tilt by up to `tilt_degrees` about a random horizontal axis, a wrong
-    direction of gravity, under which the target stays. A uniform yaw of window and target together:
-    the network must not depend on the choice of heading. White noise last. float32 throughout.
+    A share of the windows is of a phone at rest, and each sensor has a scale factor (both ours). A
+    constant bias for each window, uniform in ± its half-width on each axis. A tilt by up to
+    `tilt_degrees` about a random horizontal axis, a wrong direction of gravity, under which the
+    target stays. A uniform yaw of window and target together: the network must not depend on the
+    choice of heading. White noise last. float32 throughout.
     """
     bias_key, tilt_key, yaw_key, noise_key = jax.random.split(key, 4)
+    if config.rest_share:
+        windows = _at_rest(jax.random.fold_in(key, 5), windows, config.rest_share)
     imu, count = windows.imu, len(windows.imu)
     if any(config.scale):
         error = _uniform(jax.random.fold_in(key, 4), (count, 1, 2), -1.0, 1.0)
@@ -238,6 +241,17 @@ def augment(key: PRNGKeyArray, windows: Windows, config: AugmentConfig) -> Windo
         noise = jax.random.normal(noise_key, imu.shape, jnp.float32)
         windows = windows._replace(imu=windows.imu + noise * _channels(*config.noise))
     return windows
+
+
+def _at_rest(key: PRNGKeyArray, windows: Windows, share: float) -> Windows:
+    """A random share of the windows as of a phone that lies still, which measures gravity alone."""
+    lies = jax.random.bernoulli(key, jnp.float32(share), (len(windows.imu), 1, 1))
+    still = jnp.array([[[0, 0, GRAVITY, 0, 0, 0]]], jnp.float32)
+    return Windows(
+        jnp.where(lies, still, windows.imu),
+        jnp.where(lies[:, 0], 0, windows.displacement),
+        jnp.where(lies, 0, windows.steps),
+    )
 
 
 def _channels(gyro: float, accel: float) -> Float[jax.Array, "1 1 6"]:

@@ -213,6 +213,18 @@ def test_scale_is_common_to_the_axes_of_a_sensor_and_spares_the_target():
     np.testing.assert_array_equal(after.displacement, before.displacement)
 
 
+def test_a_window_at_rest_has_gravity_alone_and_no_displacement():
+    before = batch()
+    after = augmented(before, rest_share=0.2)
+    lies = np.asarray((after.displacement == 0).all(axis=1))
+    assert 0.17 < lies.mean() < 0.23
+    still = np.broadcast_to(np.float32([0, 0, 9.81, 0, 0, 0]), after.imu[lies].shape)
+    np.testing.assert_array_equal(after.imu[lies], still)
+    assert not after.steps[lies].any()
+    for new, old in zip(after, before, strict=True):
+        np.testing.assert_array_equal(new[~lies], old[~lies])
+
+
 def magnitude(order, cutoff, frequency):
     """Of an analog Butterworth, by SciPy."""
     return abs(signal.freqs(*signal.butter(order, cutoff, analog=True), worN=frequency)[1])

@@ -50,7 +50,7 @@ RATE = 100.0
 """Hz."""
 DEVICES = {"Nexus5": "Nexus 5", "iPhone4S": "iPhone 4S", "iPhone5": "iPhone 5"}
 """Names of the folders, and of the phones."""
-TRAINS = "Guillaume"
+TRAINS = "Thibaud"
 """The person whose walks are `train`."""
 WAYS = {
     "AR": "held up",
