@@ -51,9 +51,9 @@ def test_names_say_who_carried_what_and_how(tmp_path):
 
 def test_one_person_trains_and_the_other_validates_and_tests(tmp_path):
     names = {
-        "train": ["Guillaume_Nexus5_Dist_AR", "Guillaume_iPhone5_NoDist_AR"],
-        "val": ["Thibaud_iPhone5_Dist_AR"],
-        "test": ["Thibaud_Nexus5_NoDist_RunningHand"],
+        "train": ["Thibaud_Nexus5_Dist_AR", "Thibaud_iPhone5_NoDist_AR"],
+        "val": ["Guillaume_iPhone5_Dist_AR"],
+        "test": ["Guillaume_Nexus5_NoDist_RunningHand"],
     }
     for name in (name for each in names.values() for name in each):
         (tmp_path / "android" / name).mkdir(parents=True)
