@@ -1,5 +1,5 @@
 """Writes walk.csv, the recording that `gnio track examples/walk.csv` is tried with: a minute of a
-computed person with the phone in the hand, of a seed that no split has.
+computed person who strolls with the phone in the hand. No split has this person or this seed.
 
     python examples/make_walk.py
 
@@ -10,14 +10,14 @@ from pathlib import Path
 
 import numpy as np
 
-from gnio_jax.data.simulated.walks import random_walk
+from gnio_jax.data.simulated.walks import pedestrian
 
-SEED = 32
+SEED, WHO = 30, 330
 HEADER = "time,gyro_x,gyro_y,gyro_z,accel_x,accel_y,accel_z"
 
 
 def main() -> None:
-    walk = random_walk(SEED)
+    walk = pedestrian(SEED, WHO, seconds=60.0, rate=100.0)
     rows = np.column_stack([walk.time, walk.gyro, walk.accel])
     out = Path(__file__).with_name("walk.csv")
     formats = ["%.3f"] + ["%.5f"] * 3 + ["%.4f"] * 3
