@@ -3,7 +3,7 @@ computed person who strolls with the phone in the hand. No split has this person
 
     python examples/make_walk.py
 
-The true path is 76.3 m long and ends 13.0 m from its start.
+The true path is 44.7 m long and ends 20.9 m from its start.
 """
 
 from pathlib import Path

@@ -332,13 +332,17 @@ def filtered_positions(
 ) -> Positions:
     """The positions of a filter over the walks, where it is healthy.
 
-    `truth` has the true ones after each stride, m; NaN where there is none.
+    `truth` has the true ones after each stride, m; NaN where there is none. Walks with a raw gyro
+    are left out, unless all have one: such a gyro loses the yaw, which would pass for an error of
+    the network's headings (ours).
     """
     healthy, position, covariance, of_position = jax.device_get(
         _filtered(walks, settings, config=filter_config(windows, settings))
     )
     error = truth - position
-    known = np.isfinite(error).all(axis=2) & (healthy > 0)
+    raw = np.asarray(walks.start.raw_gyro)
+    shown = ~raw | raw.all()
+    known = np.isfinite(error).all(axis=2) & (healthy > 0) & shown[:, None]
     return Positions(error[known], covariance[known], of_position[known])
 
 

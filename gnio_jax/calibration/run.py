@@ -59,7 +59,8 @@ def calibrate(
     those of its errors, window by window against the reference. Then the settings of `config.fit`
     are those that make the innovations of the filter most likely, in which the reference has no
     part but the start. Last, the consider covariance is the one that makes the errors of the
-    filter's positions most likely; it changes no trajectory.
+    filter's positions most likely; it changes no trajectory. Recordings with a raw gyro
+    have no part in this step, unless all have one.
 
     The recordings are those of the validation split, or those of the training split, each with the
     displacements of a network whose training left it out. Raises `InputError` for a split that is

@@ -236,6 +236,11 @@ def test_positions_are_compared_with_the_truth_of_their_time():
     accel[1, 100:] += 1e4
     broken = filtered_positions(walks._replace(accel=accel), truth, DATA, options)
     assert len(broken.error) < len(found.error) - 75 and np.abs(broken.error).max() < 50
+    raw = np.arange(len(truth)) == 0  # a walk that is left out, unless all are alike
+    for flag, shown in ((raw, truth[1:]), (raw | True, truth)):
+        marked = walks._replace(start=walks.start._replace(raw_gyro=flag))
+        known = filtered_positions(marked, truth, DATA, options)
+        assert len(known.error) == np.isfinite(shown).all(axis=2).sum()
 
 
 def test_no_positions_and_no_likelihood_are_named():
