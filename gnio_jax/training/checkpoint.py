@@ -167,7 +167,8 @@ def initial_run(config: TrainConfig, load: Callable[[str], Run]) -> Run | None:
 
     Raises `InputError` for a folder without a run, and for one whose network is not that of
     `config`; also if training through the filter has none to start from. A calibrated uncertainty
-    may follow a plain head, since its parameters are the same.
+    may follow a plain head, and an average over headings a network without, or the other way round,
+    since their parameters are the same.
     """
     if config.init_from is None and config.through_filter.learn:
         problem = "needs the weights of a network that has been trained on windows"
@@ -193,7 +194,9 @@ def _description(config: TrainConfig) -> dict[str, Any]:
     model = getattr(model, "network", model)  # what an equivariant construction is made around
     fields = (field.name for field in dataclasses.fields(model))
     options = {name: getattr(model, name) for name in fields if name not in ("parent", "name")}
-    options = {"name": config.model.name, "equivariance": config.model.equivariance, **options}
+    # The average over headings is taken of any network, and adds no parameters.
+    framed = config.model.equivariance == "canonical_frame"
+    options = {"name": config.model.name, "canonical_frame": framed, **options}
     of_windows = ("rate", "window_seconds", "context_seconds", "window_rotation")
     windows = {f"data.{name}": getattr(config.data, name) for name in of_windows}
     return {f"model.{name}": value for name, value in options.items()} | windows

@@ -5,6 +5,7 @@ import functools
 import json
 import shutil
 import signal
+from contextlib import nullcontext
 
 import jax
 import jax.numpy as jnp
@@ -437,6 +438,11 @@ def test_a_later_stage_starts_from_what_the_filter_has_learnt(recording, finishe
 
 def test_training_on_windows_starts_from_a_runs_weights(recording):
     config = tiny(recording, "unused", through_filter=ThroughFilter())
+    for equivariance, fits in (("four_headings", True), ("canonical_frame", False)):
+        model = dataclasses.replace(config.model, equivariance=equivariance)
+        other = dataclasses.replace(config, model=model)
+        with nullcontext() if fits else pytest.raises(InputError, match="canonical_frame"):
+            assert checkpoint.initial_run(other, checkpoint.load_run) is not None
     with jax.enable_x64(False):
         start = checkpoint.initial_run(config, checkpoint.load_run)
         training, _ = task.set_up(WindowTask, config, Silence())
