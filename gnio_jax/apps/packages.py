@@ -396,7 +396,7 @@ def _card(
         fitted_run = Path(found["run"]).name
         if fitted_run == workdir.name.removesuffix("_calibrated"):
             fitted_run = name
-        averaged = " --average-headings" if found["average_headings"] else ""
+        averaged = " --average-headings" if found.get("average_headings") else ""
         steps.append(f"gnio calibrate --workdir runs/{fitted_run}{averaged}")
         fitted = f" The filter is fitted to split `{found['split']}` of run `{fitted_run}`."
     recipe = "\n".join(("```", *steps, "```"))
