@@ -78,7 +78,7 @@ def test_a_real_recording_is_physical(recordings, real):
         warnings.simplefilter("ignore")
         found = {each.name: each for each in dataset.recordings(root, split)}[walk]
         if form == "syn":
-            found = found.fallback
+            found = found.fallback or found  # some walks have this form alone
         pieces = found.read()
     checks = [check_sequence(piece, dataset) for piece in pieces]
     assert [check.failures for check in checks] == [()] * len(pieces)
@@ -93,8 +93,9 @@ def test_a_real_recording_is_physical(recordings, real):
     for attribute, (value, margin) in bounds.about.items():
         assert sequence.attributes[attribute] == pytest.approx(value, abs=margin)
     valid = sequence.valid
-    # A runner's hand is too fast for differences of 100 Hz, and a phone's own odometry steps.
-    if name not in ("tyrex", "ridi"):
+    # A runner's hand is too fast for differences of 100 Hz, a phone's own odometry steps, and the
+    # files of TLIO have velocities of their own.
+    if name not in ("tyrex", "ridi", "tlio"):
         # The velocities are those of the positions.
         whole = valid[2:] & valid[1:-1] & valid[:-2]
         differenced = (sequence.position[2:] - sequence.position[:-2]) * check.rate / 2
