@@ -78,10 +78,12 @@ def compare(
     """
     reporter = reporter or Lines()
     if config.metrics == ():
-        raise InputError("--metrics", "names no metric", "leave it out for the usual ones")
+        raise InputError(
+            "--metrics", "names no metric", "without --metrics the usual ones are compared"
+        )
     for word in config.metrics or ():
         if word not in NAMES:
-            remedy = f"name RUNS before it; there are: {', '.join(NAMES)}"
+            remedy = f"write the runs before --metrics; the metrics are: {', '.join(NAMES)}"
             raise InputError("--metrics", f"no metric '{word}'", remedy)
     if len(config.rows) < 2:
         remedy = "name the run to compare with first, and all of them before --metrics"
@@ -139,7 +141,7 @@ def find(word: str) -> list[Path]:
     paths = [seeds[seed].joinpath(*rest) for seed in sorted(seeds)]
     missing = [each for each in paths if not each.exists()]
     if missing and len(missing) < len(paths):
-        problem = f"is there for {len(paths) - len(missing)} of {len(paths)} seeds"
+        problem = f"exists for {len(paths) - len(missing)} of {len(paths)} seeds only"
         raise InputError(word, problem, f"missing: {', '.join(map(str, missing))}")
     if not paths or missing:
         remedy = "name a run, the folder of an evaluation, or a run of several seeds without _s0"
@@ -244,7 +246,7 @@ def lines(found: Comparison) -> list[list[str]]:
 def explanations(found: Comparison) -> list[str]:
     """What a reader must know of the figures."""
     rows, cells = found.rows, [cell for of in found.cells.values() for cell in of]
-    remarks = ["One seed each: what another seed would give is not known."]
+    remarks = ["There is one seed of each run, so the variation between seeds is not known."]
     if any(len(row.runs) > 1 for row in rows):
         seeds = "; ".join(
             f"{row.label}: {', '.join(row.runs) if len(row.runs) > 1 else 'one'}" for row in rows
@@ -252,7 +254,7 @@ def explanations(found: Comparison) -> list[str]:
         remarks = [f"Seeds of {seeds}. ± is their standard deviation."]
     if len({row.way for row in rows}) > 1:
         ways = "; ".join(f"{row.label}: {row.way}" for row in rows)
-        remarks.append(f"The rows are not estimated alike. {ways}.")
+        remarks.append(f"The rows were estimated with different settings: {ways}.")
     if options := filter_options(found):
         remarks.append(f"The rows differ in options of the filter: {', '.join(options)}.")
     return remarks + tabulate.marks(cells)

@@ -48,7 +48,9 @@ def export(
     """
     kind = kind or SUFFIXES.get(path.suffix.lower())
     if kind not in FORMATS:
-        raise InputError(path, "its name tells no format", f"known: {', '.join(SUFFIXES)}")
+        raise InputError(
+            path, "the ending of its name is not a known format", f"known: {', '.join(SUFFIXES)}"
+        )
     known = trajectory.known & np.isfinite(trajectory.time)
     if not known.any():
         raise InputError(path, "the trajectory has no pose", "evaluate the recording again")

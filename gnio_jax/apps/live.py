@@ -287,7 +287,7 @@ class Datagrams:
         samples = list(paired(parse_line(line, scale) for line in _lines(come)))
         whole = [each for each in samples if each is not None and each.whole]
         if come and not at_rest(whole):
-            say(f"{len(come)} datagrams came before, while it moved, and are left out")
+            say(f"{len(come)} datagrams came before the device was still and are left out")
             come = []
         lines = itertools.chain(_lines(come), _lines(messages))
         return Source(paired(parse_line(line, scale) for line in lines), self.name)
@@ -521,7 +521,7 @@ class Followed:
             found.append(f"start: {problem}")
         if self.gaps:
             longest = f"the longest of {max(length for _, length in self.gaps):.2g} s"
-            guessed = "what happened there is guessed, and the filter is surer than it should be"
+            guessed = "the motion there is guessed, and the reported covariance is too small"
             found.append(f"gaps: {len(self.gaps)}, {longest}: samples are missing, {guessed}")
         if self.refused:
             found.append(f"{self.refused} lines refused, the first: {self.reasons[0]}")
@@ -553,7 +553,7 @@ def follow(
             found.reasons = found.reasons[0] or str(error), str(error)
             if found.samples == 0 and found.refused >= LINES_BEFORE_A_SAMPLE:
                 problem = f"has no sample in its first {LINES_BEFORE_A_SAMPLE} lines"
-                raise InputError(source.name, problem, f"the first one {error}") from None
+                raise InputError(source.name, problem, f"the last of them {error}") from None
             if found.lost:
                 break
             continue
@@ -597,7 +597,7 @@ def _add(found: Followed, pose: Pose) -> None:
 def write_trajectory(path: Path, found: Followed) -> None:
     """Write the healthy poses in TUM format. Raises `InputError` where there is none."""
     if not found.path:
-        raise InputError(path, "there is no sound pose to write", "the filter diverged at once")
+        raise InputError(path, "no pose could be written, because the filter diverged at once")
     with replacing(path) as temporary:
         write_tum(temporary, found.trajectory)
 

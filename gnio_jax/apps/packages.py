@@ -98,7 +98,9 @@ def packages() -> dict[str, Path]:
     found: dict[str, Path] = {}
     for folder in (SHIPPED, *folders):
         if not folder.is_dir():
-            raise InputError(f"${VARIABLE}", f"'{folder}' is no folder", "name folders of packages")
+            raise InputError(
+                f"${VARIABLE}", f"'{folder}' is not a folder", "name folders that contain packages"
+            )
         for place in filter(is_package, sorted(folder.iterdir())):
             found.setdefault(place.name.removesuffix(".zip"), place)
     return found
@@ -202,7 +204,9 @@ def read_about(place: Path) -> About:
         raise InputError(place, f"'{MANIFEST}' is not that of a package", _DAMAGED)
     if found.get("version") != VERSION:
         problem = f"has format version {found.get('version')!r}; this program reads {VERSION}"
-        raise InputError(place, problem, "publish its run again, or install the other gnio-jax")
+        raise InputError(
+            place, problem, "publish its run again, or install the gnio-jax that made it"
+        )
     if _digest(found) != found.get("sha256"):
         raise InputError(place, f"'{MANIFEST}' was changed (SHA-256 differs)", _DAMAGED)
     for name, kind in get_type_hints(About).items():
@@ -307,7 +311,8 @@ def publish(workdir: Path, out: Path, said: Description, which: Which = "best") 
         raise InputError("--name", f"'{said.name}' is no name of a folder", remedy)
     for option in ("data", "license"):
         if not getattr(said, option).strip():
-            raise InputError(f"--{option}", "is empty", "say it in a sentence: others rely on it")
+            remedy = "describe it in a sentence, because other people rely on it"
+            raise InputError(f"--{option}", "is empty", remedy)
     if out.exists() and not (out.is_dir() and not any(out.iterdir())) and not _has_manifest(out):
         raise InputError(out, "is there already and is no package", "name another --out")
     run = checkpoint.load_run(workdir, which)

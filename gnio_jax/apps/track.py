@@ -125,7 +125,7 @@ def track(
     start_time = float(sequence.attributes.get("start_time", 0.0))
     track = all((out / name).is_file() for name in NAMES)
     if out.exists() and not (track or (out.is_dir() and not any(out.iterdir()))):
-        raise InputError(out, "is there already and is no track", "name another --out")
+        raise InputError(out, "exists and is not an earlier track", "name another --out")
     check_writable_folder(out.parent)
     for kind in formats:
         export.check("--format", kind, sequence.time + start_time)
@@ -175,7 +175,8 @@ def summarise(
     share = f" ({error / length:.1%} of the path)" if length >= 1.0 else ""
     counted = "with consider covariance"
     if ekf.considered is None:
-        counted = "without consider covariance (gnio calibrate fits it), so expect more"
+        counted = "without consider covariance (gnio calibrate fits it), "
+        counted += "so the real error is probably larger"
     measured = f", whose {weights.measured}" if weights.measured else ""
     summary = Summary(
         recording=sequence.name,
@@ -218,9 +219,9 @@ def _warnings(summary: Summary, own_rate: float, rate: float) -> list[str]:
     covered = summary.errors.get("nees_coverage_2d")
     speed = summary.path_length / max(summary.seconds, 1e-9)
     found = {
-        f"rate: recorded at {own_rate:.4g} Hz, the network was trained at {rate:g} Hz: what lies "
-        f"above {own_rate / 2.0:.3g} Hz is guessed": own_rate < 0.99 * rate,
-        f"rest: it lies still {summary.rest:.0%} of the time, and is held there": (
+        f"rate: recorded at {own_rate:.4g} Hz, the network was trained at {rate:g} Hz: the "
+        f"content above {own_rate / 2.0:.3g} Hz is unknown": own_rate < 0.99 * rate,
+        f"rest: it lies still {summary.rest:.0%} of the time, and the filter holds it there": (
             summary.rest >= LYING
         ),
         f"gate: the filter refused {1.0 - accepted:.0%} of the network's displacements: the motion "

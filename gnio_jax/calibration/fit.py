@@ -181,8 +181,10 @@ def fit_innovations(
     evaluate(np.array(list(free_parameters(fitted, names).values())))
     warnings = []
     if found.nit >= most_steps:
-        limit = f"the fit ended at its limit of {most_steps} steps"
-        warnings.append(f"{limit}, short of the best settings; name fewer groups in --fit")
+        limit = f"the fit stopped after {most_steps} steps"
+        warnings.append(
+            f"{limit}, before it had found the best settings; give fewer groups to --fit"
+        )
     warnings += unphysical(fitted, names)
     return Fit(fitted, before, evidences[-1], int(found.nit), tuple(warnings))
 
@@ -318,7 +320,7 @@ def fit_considered(
         lambda free: jax.device_get(compiled(free)), start, jac=True, method="L-BFGS-B"
     )
     if not np.isfinite(found.fun):
-        raise InputError("the filter", "has a covariance on these recordings that is not one")
+        raise InputError("the filter", "has no positive definite covariance on these recordings")
     fitted = with_written_parameters(settings, dict(zip(names, found.x, strict=True)), DIGITS)
     before, after = (
         float(jnp.mean(normalised_squares(positions.error, each))) / 3

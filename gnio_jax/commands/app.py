@@ -13,7 +13,7 @@ examples:
   {prog} track walk.zip                                    the path of your own recording
   {prog} train --config quickstart --workdir runs/demo     a first network, without a download
   {prog} evaluate --workdir runs/demo                      its trajectories, errors and pictures
-  {prog} data list                                         the datasets, and where they are had"""
+  {prog} data list                                         the datasets, and where to get them"""
 DATA_HELP = """Datasets and recordings.
 
 examples:

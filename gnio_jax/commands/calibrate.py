@@ -15,13 +15,13 @@ from gnio_jax.cores import usable_cores
 def calibrate(asked: CalibrateConfig, _call: options.Call) -> None:
     """Fit the filter of a run to its validation split, and write a run with it.
 
-    A network learns the errors of the walks that it has fitted, which are smaller than those of
-    others. First its standard deviations get a factor for each axis, from the errors on the
-    validation split. Then the filter's noises are those that make its innovations most likely.
-    Last, the errors that the filter reports but does not estimate (its consider covariance) are
-    fitted to the errors of its positions. The result is a run that gnio evaluate takes as any
-    other; test splits are refused. A run that has learnt from several datasets is fitted to the
-    walks of all of them.
+    On the walks that it was trained on, a network's errors are smaller than on other walks, so the
+    filter is fitted to others. First, each axis gets a factor for the network's standard
+    deviations, from the errors on the validation split. Then the filter's noises are chosen that
+    make its innovations most likely. Last, the errors that the filter reports but does not estimate
+    (its consider covariance) are fitted to the errors of its positions. The result is a run that
+    gnio evaluate takes as any other; test splits are refused. A run that has learnt from several
+    datasets is fitted to the walks of all of them.
 
     examples:
       {prog}                                    the newest run below runs/
@@ -40,9 +40,9 @@ def calibrate(asked: CalibrateConfig, _call: options.Call) -> None:
             table.add_row(name, _spelled(before.get(name)), _spelled(value))
     console.say(table)
     console.say(
-        "-log-likelihood of an innovation, from the factors of the axes to the end of the fit: "
-        f"{found.fit.before:.4f} -> {found.fit.after:.4f} "
-        f"({found.recordings} recordings, {found.fit.steps} steps)"
+        f"negative log-likelihood of an innovation: {found.fit.before:.4f} after the factors of "
+        f"the axes, {found.fit.after:.4f} after the fit ({found.recordings} recordings, "
+        f"{found.fit.steps} steps)"
     )
     console.say(
         "squared error of the position over the variance that the filter reports, per axis: "

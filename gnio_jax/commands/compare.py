@@ -17,16 +17,17 @@ ENDINGS = (".md", ".csv", ".png")
 
 
 def compare(asked: CompareConfig, _call: options.Call) -> None:
-    """Compare runs sequence by sequence: what a change has changed, and how sure that is.
+    """Compare runs sequence by sequence: by how much they differ, with intervals.
 
-    The first run is what the others are compared with. Runs are evaluated where they are not yet.
-    Seeds of a run are averaged, and the name of a run without its seed stands for all of them:
-    runs/plain for runs/plain_s0, runs/plain_s1, ..., runs/plain_calibrated for
+    The others are compared with the first run. Runs that have no evaluation yet are evaluated
+    first. Seeds of a run are averaged, and the name of a run without its seed stands for all of
+    them: runs/plain for runs/plain_s0, runs/plain_s1, ..., runs/plain_calibrated for
     runs/plain_s0_calibrated, ...
 
     Walks of one person or session are not independent, so the 95 % interval of a difference is
-    Student's t over people or sessions. Where it holds zero, the recordings do not show which of
-    the two is better. It knows nothing of other seeds: ± is their standard deviation.
+    Student's t over people or sessions. If it contains zero, the recordings do not show which of
+    the two is better. It does not include the variation between seeds; ± is their standard
+    deviation.
 
     examples:
       {prog} runs/plain runs/context --split sessions_test

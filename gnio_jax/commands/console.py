@@ -70,8 +70,8 @@ def warn_of_other_sources() -> None:
     there would have no effect."""
     running = Path(gnio_jax.__file__)
     if os.path.isfile("gnio_jax/__init__.py") and not running.samefile("gnio_jax/__init__.py"):
-        there = f"runs gnio_jax of {running.parent}, not that of this folder"
-        warn(f"gnio {there}; pip install -e . makes them one")
+        there = f"runs the gnio_jax of {running.parent} and not that of this folder"
+        warn(f"gnio {there}; install this folder with pip install -e .")
 
 
 def keep_compiled_programs() -> None:

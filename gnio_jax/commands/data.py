@@ -54,7 +54,7 @@ class ConvertOptions(_Dataset):
 
 
 def show_list(asked: ListOptions, _call: options.Call) -> None:
-    """Every dataset that is read: rate, splits, licence, where it is had, what is found here.
+    """Every dataset that is read: rate, splits, licence, where to get it, what is found here.
 
     A dataset is looked for in $GNIO_DATA/NAME, then in data/NAME. Its recordings are not read.
 
@@ -75,7 +75,7 @@ def show_list(asked: ListOptions, _call: options.Call) -> None:
         ]
     console.say(console.pairs(rows))
     bases = [os.environ["GNIO_DATA"]] if os.environ.get("GNIO_DATA") else []
-    other = "another place is named by --data-root, or GNIO_DATA for all of them"
+    other = "--data-root names another folder, and GNIO_DATA the parent of all folders"
     console.say(f"looked in {' and '.join([*bases, 'data'])}; {other}")
 
 
@@ -99,9 +99,10 @@ def _found_here(dataset: Any) -> str:
 def check(asked: CheckOptions, _call: options.Call) -> None:
     """Do IMU and reference of each recording describe one motion?
 
-    The mean of R·accel must be gravity, the gyro must turn as the reference does, nobody walks
-    faster than 3 m/s, and the positions must accelerate as the accelerometer says. Every loader
-    leaves out a recording that fails; here it is shown with its figures and the reason.
+    The mean of R·accel must be gravity, and the gyro must turn as the reference does. A walker's
+    median speed must be at most 3 m/s, and the accelerations of the positions must agree with the
+    accelerometer's. Every loader leaves out a recording that fails; here it is shown with its
+    figures and the reason.
 
     examples:
       {prog} oxiod                                        in $GNIO_DATA/oxiod, else data/oxiod
@@ -177,8 +178,8 @@ def _json(row: Any) -> dict[str, Any]:
 def convert(asked: ConvertOptions, _call: options.Call) -> None:
     """A dataset as the package's HDF5: a file for each recording, a list for each split.
 
-    What fails the self-check is left out. A conversion that was stopped goes on with the same
-    command.
+    Recordings that fail the self-check are left out. The same command continues a conversion that
+    was stopped.
 
     examples:
       {prog} oxiod ~/converted/oxiod

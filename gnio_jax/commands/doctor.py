@@ -26,8 +26,8 @@ class DoctorOptions:
 def doctor(asked: DoctorOptions, _call: options.Call) -> None:
     """What is installed here and what is found: packages, devices, datasets, weights, caches.
 
-    What is missing is no error. Show the output where you ask for help. A dataset is looked for in
-    $GNIO_DATA/NAME, then in data/NAME.
+    A missing part is not an error. Show the output where you ask for help. A dataset is looked for
+    in $GNIO_DATA/NAME, then in data/NAME.
 
     examples:
       {prog}

@@ -16,8 +16,8 @@ def evaluate(asked: EvaluateConfig, call: options.Call) -> None:
     trajectories/ and references/ in TUM format (for evo), plots/, and report.html, a page with map,
     curves and a time slider. Every table has two rows to compare with: never_moves, the start pose
     throughout, and perfect_displacements, the same estimator fed with the reference's
-    displacements. A walk with waypoints in the place of poses is compared with them alone. A run
-    that has learnt from several datasets is evaluated on one of them, which --dataset names.
+    displacements. A walk that has waypoints and no poses is compared with its waypoints. A run that
+    has learnt from several datasets is evaluated on one of them, which --dataset names.
 
     examples:
       {prog}                       the newest run below runs/

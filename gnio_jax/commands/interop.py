@@ -32,7 +32,7 @@ class InteropOptions:
 
 
 def interop(asked: InteropOptions, _call: options.Call) -> None:
-    """Make a run of TLIO's trained weights, which gnio evaluate reads like one of gnio train.
+    """Make a run of weights that were trained with TLIO's code, for gnio evaluate.
 
     CHECKPOINT is a checkpoint of TLIO's training, its model_torchscript.pt, or an .npz of its state
     dict; files of PyTorch need pip install 'gnio-jax[torch]'. The run's filter cuts the network's

@@ -42,17 +42,20 @@ class LiveOptions:
     rerun: str | None = None
     """File for the viewer Rerun, NAME.rrd, or the word viewer to look at it now."""
     gyro_unit: Literal["rad/s", "deg/s"] | None = None
-    """Unit of the gyro; rad/s of a stream, of a recording what it says."""
+    """Unit of the gyro. By default it is rad/s for a stream, and the recording's own for a
+    recording."""
     accel_unit: Literal["m/s2", "g", "mg"] | None = None
-    """Unit of the accelerometer; m/s2 of a stream, of a recording what it says."""
+    """Unit of the accelerometer. By default it is m/s2 for a stream, and the recording's own for a
+    recording."""
     imu_rate: Positive | None = None
     """Samples per second that will come, Hz; by default it is measured."""
     rest_seconds: float = 1.0
     """How long the device lies still at the start, s."""
     speed: NonNegative = 1.0
-    """Of a recording: how many times as fast as it was taken; 0 as fast as can be."""
+    """For a recording: replay it this many times as fast as it was recorded; 0 means as fast as
+    possible."""
     silence: Waiting | None = None
-    """Of datagrams: end when after the first nothing has come for so many seconds."""
+    """For datagrams: end when, after the first one, none has come for this many seconds."""
 
 
 def live(asked: LiveOptions, _call: options.Call) -> None:
@@ -60,10 +63,10 @@ def live(asked: LiveOptions, _call: options.Call) -> None:
 
     A stream has a line for each sample, time,gyro x,y,z,accel x,y,z, or a JSON object with time,
     gyro and accel, in s, rad/s and m/s², +9.81 upwards at rest. Its rate is measured. When it says
-    ready, keep the device still for a second: tilt, velocity and the gyro's bias are taken from
-    it. In a terminal the path is drawn, elsewhere a line is printed each second. Ctrl-C or SIGTERM
-    ends it (status 130, 143); the trajectory is written all the same. A recording whose units or
-    columns must be named goes through gnio data import first.
+    ready, keep the device still for a second: tilt, velocity and the gyro's bias are taken from it.
+    In a terminal the path is drawn, elsewhere a line is printed each second. Ctrl-C or SIGTERM ends
+    it (status 130, 143); the trajectory is written all the same. If the units or columns of a
+    recording must be named, import it first (gnio data import).
 
     examples:
       phone_stream | {prog} --weights runs/mine      lines on standard input
@@ -169,7 +172,9 @@ def _listen(asked: LiveOptions) -> socket.socket:
 def _no_start(found: Any, name: str, rest_seconds: float) -> InputError:
     """Why there is no pose."""
     if found.samples == 0:
-        return InputError(name, "ended without a single sample", "is it sent to this place?")
+        return InputError(
+            name, "ended without a single sample", "check that samples are sent to it"
+        )
     seconds, samples = found.last - found.first, found.samples
     problem = f"ended after {samples} samples in {seconds:.1f} s, before {rest_seconds:g} s of rest"
     remedy = "let it run longer, or lower --rest-seconds"

@@ -243,7 +243,7 @@ def _add(group: Any, option: Option, dest: str, brief: bool) -> None:
     item = kind_of(items[0]) if items else kind
     text = "" if brief else comment(option)
     if option.negation:
-        text += f" (on by default; {option.negation} takes it away)"
+        text += f" (on by default; {option.negation} switches it off)"
         group.add_argument(option.negation, action="store_false", dest=dest, help=argparse.SUPPRESS)
     elif option.default is dataclasses.MISSING:
         text += " (required)"

@@ -19,7 +19,7 @@ class ImportFile:
     """What `gnio data import` is asked for."""
 
     file: Annotated[Path, UNNAMED]
-    """The recording: a file or folder; of two CSVs the gyro's."""
+    """The recording, a file or a folder. If each sensor has its own CSV, give the gyro's."""
     out: NewFile
     """HDF5 file to write, NAME.h5."""
     rate: Rate | None = None
@@ -36,7 +36,7 @@ class ExportFile:
     trajectory: Annotated[Path, UNNAMED]
     """File in TUM format."""
     out: Annotated[NewFile, UNNAMED]
-    """File to write; its ending tells the format: .mcap, .csv or .tum."""
+    """File to write. Its ending chooses the format: .mcap, .csv or .tum."""
 
 
 def import_file(asked: ImportFile, _call: options.Call) -> None:
@@ -71,8 +71,10 @@ def import_file(asked: ImportFile, _call: options.Call) -> None:
     following = f"gnio evaluate --dataset csv --data-root {folder} --split test{start}"
     lists = [split for split in csv_files.SPLITS if (folder / f"{split}.txt").is_file()]
     if lists:
-        line = f"add the line {asked.out.name} to {lists[-1]}.txt, or it is not read"
-        lines.append(f"{folder} has lists: {line}")
+        line = f"add the line {asked.out.name} to {lists[-1]}.txt"
+        lines.append(
+            f"{folder} has lists of its splits: {line}, otherwise this recording is not read"
+        )
     elif any(folder.glob("*.csv")):
         following = f"gnio track {asked.out}"
         lines.append(

@@ -10,13 +10,13 @@ from gnio_jax.cores import usable_cores
 
 
 def tables(asked: TablesConfig, _call: options.Call) -> None:
-    """Make one of the paper's tables anew: train and evaluate its rows, side by side.
+    """Reproduce a table of the paper: train and evaluate its rows under equal conditions.
 
     Every row is trained with the same recordings, batches, epochs, learning rate and augmentation,
     each network with its own published loss, clipping and weight decay. Runs are kept below
-    OUT/runs and shared by the tables: a command that was interrupted goes on where it stopped, one
-    that is finished only writes its summary anew. Results: OUT/<table>_<split>_<estimator>.md, .csv
-    and .png.
+    OUT/runs and shared by the tables. An interrupted command continues where it stopped when it is
+    called again. A finished one only writes its summary again. Results:
+    OUT/<table>_<split>_<estimator>.md, .csv and .png.
 
     examples:
       {prog} complexity                              parameters, operations, latency

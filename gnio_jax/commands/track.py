@@ -25,7 +25,7 @@ class TrackOptions:
     """What `gnio track` is asked for."""
 
     file: Annotated[Path, UNNAMED]
-    """The recording: a file or folder; of two CSVs the gyro's."""
+    """The recording, a file or a folder. If each sensor has its own CSV, give the gyro's."""
     weights: str | None = None
     """Name, package or run folder; by default the network that comes with gnio-jax, else the newest
     run below runs/."""
@@ -39,11 +39,11 @@ class TrackOptions:
 
 
 def track(asked: TrackOptions, call: options.Call) -> None:
-    """The trajectory of a recording: where its carrier walked, and how far to trust it.
+    """The trajectory of a recording: where its carrier walked, and how far it can be trusted.
 
-    FILE is what gnio data import reads, or its HDF5. Stand still for a second at the beginning. The
-    folder OUT gets trajectory.txt (TUM format), track.png, report.html and summary.json. gnio
-    weights lists the networks that are found by name.
+    FILE is anything that gnio data import reads, or an HDF5 file that it has written. Stand still
+    for a second at the beginning. The folder OUT gets trajectory.txt (TUM format), track.png,
+    report.html and summary.json. gnio weights lists the networks that are found by name.
 
     examples:
       {prog} walk.zip                              of Sensor Logger or phyphox

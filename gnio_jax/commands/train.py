@@ -37,12 +37,12 @@ class TrainOptions(TrainConfig):
 def train(asked: TrainOptions, call: options.Call) -> None:
     """Train a network and leave a run: config.yaml, checkpoints, logs in its work folder.
 
-    Settings come from the paper's defaults, then from --config (or the config.yaml of the run that
-    is resumed), then from the options below, last from --set, which reaches every setting of a YAML
-    file; the later wins. --resume goes on from the latest checkpoint as if the run had never
-    stopped. --init-from starts from the weights of a run or package (gnio weights) of the same
-    network. With --through-filter.learn, network and filter then learn as one program, from the
-    filter of that run (gnio calibrate).
+    Settings come from four places, and the later one wins: the paper's defaults; --config, or the
+    config.yaml of the run that is resumed; the options below; --set, which reaches every setting of
+    a YAML file. --resume continues from the latest checkpoint. The result is that of a run that
+    never stopped. --init-from starts from the weights of a run or package (gnio weights) of the
+    same network. With --through-filter.learn, network and filter are trained together, and the
+    filter begins with the settings of that run (gnio calibrate).
 
     These come with the package, for --config: {configs}.
 
@@ -82,7 +82,7 @@ def train(asked: TrainOptions, call: options.Call) -> None:
         for outcome in outcomes:
             following = f"{call.prog.replace('train', 'evaluate')} --workdir {outcome.workdir}"
             if outcome.best_loss is None:
-                problem = "no epoch had a figure on validation that is a number"
+                problem = "no epoch had a finite figure on validation"
                 print(f"{outcome.workdir}: {problem}", file=sys.stderr)
             else:
                 print(f"best on validation {outcome.best_loss:.4g}; look at it with: {following}")

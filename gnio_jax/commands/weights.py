@@ -34,9 +34,9 @@ class PublishOptions:
     data: str
     """What it was trained on: recordings, devices, people, carrying positions."""
     license: str
-    """Under which the data may be used and the weights passed on."""
+    """Terms under which the data may be used and the weights passed on."""
     fails: tuple[str, ...] = ()
-    """Where it is known to fail, a sentence each."""
+    """Cases in which it is known to fail, one sentence each."""
     name: str | None = None
     """Name of the package; by default that of OUT."""
 
@@ -89,7 +89,8 @@ def weights(asked: WeightsOptions, _call: options.Call) -> None:
     if grid.row_count:
         console.say(grid)
     elif not damaged:
-        console.say("no packages; gnio publish makes one of a run, $GNIO_WEIGHTS says where")
+        remedy = "gnio publish makes one of a run, and $GNIO_WEIGHTS names folders to look in"
+        console.say(f"no packages found; {remedy}")
     for line in damaged:
         console.say(line)
 

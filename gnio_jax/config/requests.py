@@ -53,15 +53,15 @@ class EvaluateConfig:
     """Initial gyro bias: zero, the mean of a rest at the start, or the first 10 s against the
     reference orientation."""
     alignment: Literal["origin", "none", "yaw_position", "se3"] = "origin"
-    """How an estimate is aligned with the reference before absolute errors: start position and yaw,
-    not at all, or least squares."""
+    """How an estimate is aligned with the reference before absolute errors are computed: by
+    position and yaw at the start, not at all, or by least squares."""
     checkpoint: Literal["best", "latest"] = "best"
     """Which checkpoint of the run."""
     batch_size: Annotated[Count, FILE_ONLY] = 16
     """Recordings estimated side by side."""
     plots: bool = True
-    """Draw every sequence and the errors' distribution, and write report.html. Those of an earlier
-    evaluation are made anew in any case."""
+    """Draw every sequence and the distribution of the errors, and write report.html. If an earlier
+    evaluation has them, they are made again even with --no-plots."""
     rerun: str | None = None
     """File to write for the viewer Rerun, NAME.rrd: paths, covariances, IMU, gate."""
     filter: Annotated[FilterSettings | None, FILE_ONLY] = None
@@ -83,16 +83,17 @@ class CalibrateConfig:
     $GNIO_DATA/<dataset>, or data/<dataset>."""
     split: str | None = None
     """Split whose recordings are fitted: the run's validation split (default) or its training
-    split. Others are refused: what is tested must not have been fitted."""
+    split. Other splits are refused, because a filter must not be tested on recordings to which it
+    was fitted."""
     out_of_fold: tuple[str, ...] = ()
     """Folders of runs, one for each fold: gnio train --data.train-split train-0of4, then train-1of4
-    and so on. The filter is then fitted to the training split, each session seen by the network
-    that left it out."""
+    and so on. The filter is then fitted to the training split, and for each session the network is
+    used that was trained without it."""
     fit: tuple[CalibratedGroup, ...] = ("measurement", "noise", "window")
     """What is fitted by the likelihood of the innovations: `measurement`, the factor of the
     network's covariance; `noise`, the IMU's; `start`, the standard deviations of the initial
     biases; `window`, the part of a window's error that is temporally correlated. The factors of the
-    axes and the errors that are considered are always fitted."""
+    axes and the consider covariance are always fitted."""
     average_headings: bool = False
     """Average the network over four headings, as model.equivariance: four_headings does, whatever
     the run says. The network must have learnt from walks turned by a random yaw."""
@@ -115,7 +116,7 @@ class TablesConfig:
     calibrate: bool = False
     """Calibrate every run on its validation split before it is measured."""
     seeds: Count = 3
-    """Runs of every row: seeds 0, 1, 2, ..."""
+    """Number of runs of every row. Their seeds are 0, 1, 2, ..."""
     epochs: Count | None = None
     """Epochs of every run, instead of the config's."""
     methods: str = "tlio,ronin_resnet,deepils,ctin,imot,gnio"
@@ -142,8 +143,8 @@ class CompareConfig:
     """Folder of the dataset, for runs that are not evaluated yet; by default the run's,
     $GNIO_DATA/<dataset>, or data/<dataset>."""
     metrics: tuple[str, ...] | None = None
-    """Metrics that are compared, as metrics.json names them; by default ate, rpe_1s, yaw_rmse,
-    path_length_ratio, nis and nees, as far as they are there."""
+    """Metrics to compare, by their names in metrics.json; by default those of ate, rpe_1s,
+    yaw_rmse, path_length_ratio, nis and nees that the evaluations have."""
     out: str | None = None
     """Name of files to write: OUT.md and OUT.csv, the table, and OUT.png, the first metric of every
     sequence. By default the table is only shown."""
@@ -151,16 +152,16 @@ class CompareConfig:
 
 @dataclass(frozen=True)
 class ImportOptions:
-    """What a recording does not say of itself. By default its format or its header says it, or it
-    is detected; what is ambiguous is refused."""
+    """Facts that a recording may lack. By default they come from its format or header, or they are
+    detected. An ambiguous recording is refused."""
 
     columns: Annotated[tuple[str, ...], Words("OURS=THEIRS")] = ()
-    """Of a CSV, our name and the file's of each column that has another: time=stamp gyro_x=wx ...
-    Ours are time, gyro_x..z, accel_x..z, and accel_time if the accelerometer's time is another
-    column. "a+b" is the sum of two columns (gravity and user acceleration). Without a header, the
-    file's names are places counted from 0."""
+    """For a CSV: our name and the file's name of each column that is named otherwise: time=stamp
+    gyro_x=wx ... Our names are time, gyro_x..z, accel_x..z, and accel_time if the accelerometer's
+    time is another column. "a+b" is the sum of two columns (gravity and user acceleration). In a
+    file without a header, columns are numbered from 0."""
     accel_path: Path | None = None
-    """The accelerometer's CSV, where it is not the gyro's."""
+    """CSV of the accelerometer, if it is another file than the gyro's."""
     time_unit: Literal["s", "ms", "us", "ns"] | None = None
     """Unit of the stamps; detected by the rate of an IMU, 10 to 2000 Hz."""
     gyro_unit: Literal["rad/s", "deg/s"] | None = None
@@ -169,11 +170,11 @@ class ImportOptions:
     """Unit of the accelerometer; detected by the magnitude of gravity."""
     accel_sign: Literal["android", "ios", "detect"] | None = None
     """At rest, level, the up axis reads +1 g (android) or −1 g (ios, everything is negated); detect
-    assumes that the screen points up more than down. A CSV has android's by default: nothing in
-    the data alone tells it."""
+    assumes that the screen points up more than down. A CSV has android's by default: the data alone
+    do not show it."""
     imu_topic: str | None = None
-    """Topic of sensor_msgs/Imu in a bag that has several."""
+    """Topic of sensor_msgs/Imu, if the bag has several."""
     accel_topic: str | None = None
-    """The accelerometer's topic, where it has one of its own."""
+    """Topic of the accelerometer, if it has its own."""
     reference_topic: str | None = None
     """Topic of poses, odometry or transforms in a bag that has several; /tf:CHILD_FRAME for TF."""

@@ -96,8 +96,8 @@ class DataConfig:
     stride_seconds: Positive = 0.1
     """Distance between window starts, and between the filter's clones, s (paper: 0.1 s)."""
     train_stride_seconds: Positive = 0.1
-    """Distance between window starts in training, s (paper: 0.1 s). A shorter one shows more phases
-    of the same steps."""
+    """Distance between window starts in training, s (paper: 0.1 s). With a shorter distance the
+    network sees the same steps at more phases."""
     window_rotation: Literal["per_sample", "single"] = "per_sample"
     """Rotate each sample with its own attitude, or the whole window with the attitude at its start
     (eq. 1 read literally)."""
@@ -108,8 +108,8 @@ class DataConfig:
     val_split: str = "val"
     """Split of the dataset for validation, which chooses the best checkpoint."""
     weights: tuple[Positive, ...] = ()
-    """Of several datasets, how often an epoch visits the windows of each: 0.5 a half of them, drawn
-    anew in every epoch, 2 all of them twice. By default once each (ours)."""
+    """For several datasets: how often an epoch visits the windows of each. 0.5 visits half of them,
+    drawn again in every epoch; 2 visits all of them twice. The default is 1 for each (ours)."""
 
     @property
     def window(self) -> int:
@@ -155,8 +155,8 @@ class DataConfig:
 
 @dataclass(frozen=True)
 class AugmentConfig:
-    """Random changes of a training window (TLIO's; the paper is silent). Zero or false switches one
-    off. In training through the filter `yaw` alone plays a part (ours)."""
+    """Random changes of a training window, as in TLIO (the paper names none). Zero or false
+    switches a change off. Training through the filter uses only `yaw` (ours)."""
 
     gyro_bias: NonNegative = 0.05
     """Half-width of the uniform constant gyro bias, rad/s."""
@@ -172,8 +172,8 @@ class AugmentConfig:
     """Shift a training window by up to this many samples either way, where the recording allows it
     (RoNIN, DeepILS)."""
     low_pass_share: Probability = 0.0
-    """Share of the windows of which both sensors pass a random low-pass, drawn anew for every
-    window: a phone's bandwidth must not tell the network whose walk it sees (ours, e.g. 0.5)."""
+    """Share of the windows whose two sensors pass a random low-pass, drawn for every window.
+    Otherwise the network may recognise a phone by its bandwidth (ours, e.g. 0.5)."""
     low_pass_hertz: Annotated[tuple[Positive, Positive], FILE_ONLY] = (4.0, 25.0)
     """Lowest and highest cut-off of that low-pass, a Butterworth of order 1 to 3 that is passed
     forward and back, Hz."""
@@ -186,7 +186,7 @@ class AugmentConfig:
         """The lowest cut-off is no higher than the highest."""
         if self.low_pass_hertz[0] > self.low_pass_hertz[1]:
             at.below("low_pass_hertz").refuse(
-                "begins above its end", "give the lower frequency first"
+                "has the higher frequency first", "give the lower one first"
             )
 
 
@@ -219,9 +219,10 @@ class ModelConfig:
     """Dimensions of the displacement: 3, or 2 without the vertical, as published (ronin_resnet,
     deepils, ctin, imot)."""
     equivariance: Literal["none", "four_headings", "canonical_frame"] = "none"
-    """A window turned about the vertical gives the displacement turned alike, for every network:
-    the mean over four headings of the window, at inference, or a frame that a small network finds
-    in the window (EqNIO)."""
+    """How any network is made equivariant: if a window is turned about the vertical, its
+    displacement turns by the same angle. four_headings is the mean over four headings of the
+    window, at inference; canonical_frame uses a frame that a small network finds in the window
+    (EqNIO)."""
 
 
 @dataclass(frozen=True)
@@ -239,7 +240,8 @@ class LossConfig:
     nll_weight: NonNegative = 1e-4
     """λ_NLL."""
     nll_from_epoch: NonNegative = 0.0
-    """Epochs before the likelihood counts. Above 0: the two-stage reading of the paper's text."""
+    """Epochs at the start without the likelihood. A value above 0 is the two-stage training that
+    the paper's text can also mean."""
     log_std_from_epoch: NonNegative = 0.0
     """Epochs before the likelihood trains the uncertainty; until then it trains the displacement
     alone (TLIO: 10)."""
@@ -256,8 +258,8 @@ class OptimConfig:
     networks."""
 
     schedule: Literal["cosine", "constant", "plateau"] = "cosine"
-    """Learning rate after the warm-up: cosine decay to 1e-6 at the last step, constant, or a tenth
-    whenever the squared error on the validation split has not fallen for 10 epochs (RoNIN,
+    """Learning rate after the warm-up: cosine decay to 1e-6 at the last step, constant, or divided
+    by ten whenever the squared error on the validation split has not fallen for 10 epochs (RoNIN,
     DeepILS)."""
     epochs: Count = 200
     """Passes over the training windows."""
@@ -402,10 +404,11 @@ class ThroughFilter:
     and so is `augment` but for its `yaw`."""
 
     learn: Annotated[tuple[Part, ...], Words("PART")] = ()
-    """Parts that learn; none: the network is trained on windows. noise: the filter's densities and
-    bias walks; measurement: the factors of the network's covariance and the correlation of its
-    errors; start: the standard deviations at the start; uncertainty, head, encoder: the network's;
-    all: everything. A filter option that is 0 stays 0."""
+    """Parts that are trained through the filter. Without this option the network is trained on
+    windows. noise: the filter's densities and bias walks; measurement: the factors of the network's
+    covariance and the correlation of its errors; start: the standard deviations at the start;
+    uncertainty, head, encoder: the network's; all: everything. A filter option that is 0 stays
+    0."""
     piece_seconds: Positive = 60.0
     """Length of the segments of recordings that are filtered, s."""
     filter_learning_rate: Positive = 0.03
@@ -429,17 +432,18 @@ class TrainConfig:
     """One experiment: everything `gnio train` needs, kept with the run as config.yaml."""
 
     dataset: str | tuple[str, ...] = "synthetic"
-    """Dataset to learn from, or several; `gnio data list` shows the known ones. Of several the
-    splits have the same names, and the mean of their validation chooses the best checkpoint."""
+    """Dataset to learn from, or several; `gnio data list` shows the known ones. Several datasets
+    must have splits of the same names, and the mean of their validation figures chooses the best
+    checkpoint."""
     data_root: str | None = None
     """Folder of the dataset; by default, and for each of several, $GNIO_DATA/<dataset>, then
     data/<dataset>."""
     workdir: str | None = None
     """Folder for checkpoints and logs; by default runs/<dataset>_<model>."""
     init_from: str | None = None
-    """Run, or package of weights (see gnio weights), with the same network, whose best weights
-    training starts from; by default they are drawn. Through the filter, `gnio train` also begins
-    with its filter options."""
+    """Run, or package of weights (see gnio weights), of the same network; training starts from its
+    best weights, by default from random ones. Through the filter, `gnio train` also begins with its
+    filter options."""
     seed: Seed = 0
     """Seed of the initial parameters, the shuffling and the augmentation."""
     data: DataConfig = field(default_factory=DataConfig)
@@ -462,7 +466,7 @@ class TrainConfig:
         and its context. A network that predicts every sample takes no context."""
         names, weights = self.datasets, self.data.weights
         if len(set(names)) < len(names) or not names:
-            at.below("dataset").refuse("names none, or one of them twice", "name each once")
+            at.below("dataset").refuse("is empty, or names a dataset twice", "name each once")
         if len(names) > 1 and self.data_root is not None:
             problem = f"is the folder of one dataset, and there are {len(names)}"
             remedy = "leave it out and set $GNIO_DATA to the folder that holds theirs"

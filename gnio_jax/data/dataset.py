@@ -123,6 +123,6 @@ def find_root(name: str, root: str | os.PathLike[str] | None = None) -> Path:
         if candidate.is_dir():
             return candidate
     looked = ", ".join(dict.fromkeys(str(candidate) for candidate in candidates))
-    remedy = f"give --data-root, or set GNIO_DATA to its parent; get it from {dataset.source}"
+    remedy = f"give --data-root, or set GNIO_DATA to its parent; source: {dataset.source}"
     layout = f"expected layout: {dataset.layout}"
     raise InputError(looked, f"no folder of dataset '{name}'", f"{remedy}; {layout}")

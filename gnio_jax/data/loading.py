@@ -127,8 +127,8 @@ def read_split(
 def _warn_of(refused: dict[str, list[str]]) -> None:
     """A warning for each reason, with the number of recordings where it is that of several."""
     for lines in refused.values():
-        count = f"{len(lines)} recordings are left out alike, the first: " if lines[1:] else ""
-        warnings.warn(f"{count}{lines[0]}", stacklevel=3)
+        several = f"{len(lines)} recordings are left out for the same reason, the first: "
+        warnings.warn(f"{several if lines[1:] else ''}{lines[0]}", stacklevel=3)
 
 
 def _nothing(dataset: Dataset, root: Path, split: str, what: str) -> InputError:
@@ -261,7 +261,7 @@ def in_processes(
                 progress(number / len(items))
                 yield result
         except BrokenProcessPool:
-            problem = "a process died, perhaps for want of memory"
+            problem = "a process died, perhaps because memory ran out"
             raise ProcessDied("--workers", problem, "try --workers 1") from None
         finally:
             pool.shutdown(wait=False, cancel_futures=True)

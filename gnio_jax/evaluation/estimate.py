@@ -255,7 +255,7 @@ def _of_history(recording: Recording, history: FilterHistory, ekf: FilterSetup) 
     healthy = _after(1.0, history.healthy) > 0
     if not healthy.all():
         since = recording.time[np.argmin(healthy)] - recording.time[0]
-        notes = (*notes, f"filter: not healthy from {since:.1f} s on, and all after it is void")
+        notes = (*notes, f"filter: diverged at {since:.1f} s; the poses from then on are invalid")
     position = _after(start.position, history.position)
     orientation = quaternion_from_matrix(_after(start.rotation, history.rotation))
     poses = (np.where(healthy[:, None], part, np.nan) for part in (position, orientation))

@@ -227,8 +227,8 @@ def _start(
     if velocity_std <= ROUGH_START:
         return start, ""
     tilt = float(f"{np.degrees(tilt_std):.1g}")  # of many sequences few different notes
-    known = f"velocity to {velocity_std:.1f} m/s, tilt to {tilt:g}°"
-    return start, f"start: not standing still, known to one sigma: {known}"
+    sigma = f"one sigma: velocity {velocity_std:.1f} m/s, tilt {tilt:g}°"
+    return start, f"start: it moves, so the start is uncertain ({sigma})"
 
 
 def _gyro_bias(

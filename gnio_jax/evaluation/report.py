@@ -195,7 +195,7 @@ def read(folder: Path) -> Report:
         found = json.loads(path.read_text(encoding="utf-8"))
         settings, sequences = found["settings"], found["sequences"]
         if settings.get("definitions") != DEFINITIONS:
-            problem = "was written by another version, whose figures mean something else"
+            problem = "was written by another version that defines its figures otherwise"
             raise InputError(path, problem, REMEDY)
         known = [
             isinstance(settings[x], str) for x in ("dataset", "split", "estimator", "alignment")

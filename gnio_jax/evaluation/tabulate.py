@@ -179,14 +179,13 @@ def marks(cells: Sequence[Cell]) -> list[str]:
         "error is infinite; a mean is over all that a row has with every seed.": any(
             each.compared < each.sequences for each in found
         ),
-        "† So many of all estimates diverged. A mean leaves out their sequences.": any(
+        "† This number of all estimates diverged. Their sequences are not in the mean.": any(
             each.diverged for each in means
         ),
-        "‡ Would be better than the first row, but diverged more often: it is not better.": any(
-            each.withheld for each in found
-        ),
+        "‡ Its remaining walks would be better than those of the first row, but it diverged more "
+        "often, so no difference is shown.": any(each.withheld for each in found),
         "∞: an error is too large for a number.": any(np.isinf(each.seeds).any() for each in means),
-        "–: there is no such value with every seed, or nothing to compare it with.": any(
+        "–: this value does not exist for every seed, or there is nothing to compare it with.": any(
             each.mean is None for each in means
         ),
     }

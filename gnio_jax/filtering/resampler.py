@@ -187,7 +187,7 @@ class Stream:
             raise ValueError(f"time: must increase, found {time!r} after {self.origin + newest!r}")
         if stamp - newest > LONGEST_GAP:
             problem = f"{time!r} is {stamp - newest:g} s after the sample before, more than"
-            remedy = "stamps are in seconds, and after a long stop a new tracker starts better"
+            remedy = "stamps must be in seconds; after a long stop make a new tracker"
             raise ValueError(f"time: {problem} {LONGEST_GAP:g} s; {remedy}")
         come = [(stamp, sample)]
         if stamp - newest > LONGEST_TRUSTED:

@@ -80,7 +80,7 @@ def base_config(options: TablesConfig) -> TrainConfig:
         optim=dataclasses.replace(base.optim, epochs=options.epochs or base.optim.epochs),
     )
     if base.model.name != "gnio":
-        remedy = "give a config of gnio: the others are made from it"
+        remedy = "give a config of the network gnio; those of the others are derived from it"
         raise InputError(options.base, f"is of the network '{base.model.name}'", remedy)
     if len(base.datasets) > 1:
         raise InputError(options.base, "has several datasets", "give a config of one")

@@ -283,8 +283,8 @@ def lines(row: Row, improved: bool, task: Task) -> Iterator[str]:
     )
     if stuck := stuck_layers(row):
         yield (
-            f"warning: no gradient reached {', '.join(stuck)} in this epoch, the network learns no "
-            "more; start over with a lower optim.learning_rate, or with optim.clip_norm"
+            f"warning: no gradient reached {', '.join(stuck)} in this epoch, so the network no "
+            "longer learns; train again with a lower optim.learning_rate, or with optim.clip_norm"
         )
 
 

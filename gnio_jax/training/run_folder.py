@@ -110,7 +110,7 @@ def _refuse_other_recordings(path: Path, splits: dict[str, list[str]]) -> None:
         before = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
         problem = f"cannot be read ({' '.join(str(error).split())})"
-        remedy = "remove it, and the recordings are noted anew"
+        remedy = "remove it, and it is written again from the recordings"
         raise InputError(path, problem, remedy) from None
     for split, names in splits.items():
         theirs = before.get(split) if isinstance(before, dict) else None
@@ -145,7 +145,7 @@ def compare_processes(config: TrainConfig, recordings: Recordings, variables: An
             (recordings.splits, sampled(recordings[:2])),
             "give all of them the same data",
         ),
-        ("weights to begin with", sampled(variables), "give all the same run in --init-from"),
+        ("weights to begin with", sampled(variables), "start all with the same --init-from"),
     ):
         digest = hashlib.sha256(repr(value).encode()).digest()
         number = int.from_bytes(digest[:4], "big") >> 1

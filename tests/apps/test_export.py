@@ -134,7 +134,7 @@ LEVEL, WHOLE = "0 0 0 0 0 0 1\n", "0 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n"
     [
         (WHOLE, None, "OUT: is missing"),
         (None, "a.csv", "walk.txt: cannot be read (No such file or directory)"),
-        (WHOLE, "a.dat", "a.dat: its name tells no format; known: .tum, .txt, .csv"),
+        (WHOLE, "a.dat", "a.dat: the ending of its name is not a known format; known"),
         (WHOLE, "folder", "OUT: must not be a folder, found 'folder'"),
         ("the quick brown fox\njumps over it\n", "a.csv", "walk.txt: "),
         ("0 1 2 3\n1 1 2 3\n", "a.csv", "walk.txt: has 4 columns, not 8"),

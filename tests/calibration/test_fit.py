@@ -110,7 +110,7 @@ def test_a_second_calibration_compiles_nothing_and_a_fit_that_ends_early_is_told
     given = walks()
     first = fit(given, DATA, TRUE, PATHS, lambda calls: None, most_steps=1)
     (warning,) = first.warnings
-    assert warning.startswith("the fit ended at its limit of 1 steps, ") and "--fit" in warning
+    assert warning.startswith("the fit stopped after 1 steps, ") and "--fit" in warning
     options = {f"--{field.name.replace('_', '-')}" for field in dataclasses.fields(CalibrateConfig)}
     assert set(re.findall(r"--[a-z-]+", warning)) <= options  # no remedy that there is not
     programs = SEARCH._cache_size()
@@ -248,5 +248,5 @@ def test_no_positions_and_no_likelihood_are_named():
     with pytest.raises(InputError, match="not healthy where these recordings have a reference"):
         fit_considered(none, 0.1, FilterSettings())
     lost = Positions(np.ones((9, 3)), np.full((9, 3, 3), np.nan), np.ones((9, 3, 6)))
-    with pytest.raises(InputError, match="a covariance on these recordings that is not one"):
+    with pytest.raises(InputError, match="no positive definite covariance"):
         fit_considered(lost, 0.1, FilterSettings())

@@ -356,7 +356,7 @@ def test_import_of_a_phones_file_returns_the_walk(place, capsys):
     (place / "own" / "test.txt").write_text("walk\n")
     again = ["--out", "own/again.h5", "--rate", "50"]
     run("data", "import", "ios.csv", *again, *columns, *units)
-    noted = "own has lists: add the line again.h5 to test.txt, or it is not read"
+    noted = "add the line again.h5 to test.txt"
     assert noted in capsys.readouterr().out
     assert data.read_hdf5(place / "own" / "again.h5").time.shape == (1000,)
 

@@ -62,4 +62,4 @@ def test_it_fits_a_screen_and_says_what_is_wrong(home, capsys, monkeypatch):
     assert len(text.splitlines()) <= 45 and "\x1b" not in text
     assert "runs/mine" in text
     (line,) = [line for line in text.splitlines() if line.startswith("weights")]
-    assert "$GNIO_WEIGHTS" in line and "is no folder" in line
+    assert "$GNIO_WEIGHTS" in line and "is not a folder" in line

@@ -75,7 +75,7 @@ def test_a_mistake_of_ours_and_a_lack_of_memory_are_no_damage(tmp_path):
     for error in (AssertionError, NameError, ImportError):
         with pytest.raises(error), parsed_as(path, "npz"):
             raise error("ours")
-    with pytest.raises(InputError, match="does not fit the memory as npz"), parsed_as(path, "npz"):
+    with pytest.raises(InputError, match="does not fit into memory as npz"), parsed_as(path, "npz"):
         raise MemoryError
     with pytest.raises(InputError, match="may be cut short"), parsed_as(path, "npz"):
         raise EOFError

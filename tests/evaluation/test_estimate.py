@@ -219,7 +219,7 @@ def test_what_the_filter_calls_void_has_diverged(walks, disturbed, factor, row):
     assert np.argmax(np.linalg.norm(void.velocity, axis=1) > 100) == row
     for field in void.trajectory[1:]:
         assert np.isfinite(field[:row]).all() and np.isnan(field[row:]).all()
-    words = f"filter: not healthy from {row / 10:.1f} s on, and all after it is void"
+    words = f"filter: diverged at {row / 10:.1f} s; the poses from then on are invalid"
     assert void.notes == (words,) and whole.notes == ()
     scores = evaluation.score([void, whole])
     assert [name for name, own in scores.items() if own.diverged] == [void.name]

@@ -117,7 +117,7 @@ def test_a_void_filter_is_in_the_files(workdir, pair, monkeypatch):
     done = evaluate(EvaluateConfig(str(workdir), estimator="imu_only", plots=False))
     found = json.loads((done.folder / "metrics.json").read_text())
     void, whole = found["sequences"].values()
-    assert void["notes"] == ["filter: not healthy from 0.1 s on, and all after it is void"]
+    assert void["notes"] == ["filter: diverged at 0.1 s; the poses from then on are invalid"]
     assert void["ate"] is None and "not finite from 0.1 s on" in void["reasons"]["ate"]
     assert found["diverged"]["ate"] == 1 and found["mean"]["ate"] == whole["ate"]
     assert found["settings"]["definitions"] == report.DEFINITIONS

@@ -41,7 +41,7 @@ def test_static_start_is_level(clean):
     assert not recording.notes
     moving = clean._replace(valid=np.arange(len(clean.time)) > 600)
     (recording,) = ready([moving], init="static")
-    assert "not standing still" in recording.notes[0]
+    assert "it moves, so the start is uncertain" in recording.notes[0]
 
 
 def test_gyro_bias_from_reference_and_from_rest(walks, swaying):

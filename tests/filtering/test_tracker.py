@@ -337,7 +337,7 @@ def test_between_clones_it_coasts_through_a_gap(tracker):
         ((1.0, np.zeros(3), np.zeros(3)), r"^time: must increase, found 1\.0 after 1\.0"),
         ((float("nan"), np.zeros(3), np.zeros(3)), r"^time: must be a finite number"),
         (("soon", np.zeros(3), np.zeros(3)), r"^time: must be a finite number"),
-        ((1020.0, np.zeros(3), np.zeros(3)), r"^time: .* more than 60 s; stamps are in seconds"),
+        ((1020.0, np.zeros(3), np.zeros(3)), r"^time: .* more than 60 s; stamps must be"),
         ((1.1, np.zeros(4), np.zeros(3)), r"^gyro: must be three numbers"),
         ((1.1, np.zeros(3), "up"), r"^accel: must be three numbers"),
         ((1.1, np.full(3, 1e6), np.zeros(3)), r"^gyro: no IMU measures more than 100 rad/s"),

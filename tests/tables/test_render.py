@@ -54,7 +54,7 @@ def test_what_diverged_is_in_the_files_and_the_picture(tmp_path):
     text = make.render(experiment, figures)
     assert "| B | 8.00 † 2/3 |" in text and "| ↑ 100.0 % | +4.00 over 1 |" in text
     assert "| C | – † 3/3 | – † 3/3 | ∞ | – | – |" in text and "| – | – ‡ |" in text
-    for mark in ("† So many", "‡ Would be better", "A difference is over"):
+    for mark in ("† This number", "‡ Its remaining", "A difference is over"):
         assert mark in text
     heads = [{"row": each.row.name} for each in results]
     tabulate.write(tmp_path / "t", text, tabulate.records(heads, figures))

@@ -91,7 +91,7 @@ def import_recording(
             raise InputError(option, f"unknown value '{value}'", f"known: {', '.join(known)}")
     if rate is not None and not 1.0 <= rate <= RATES[1]:
         raise InputError(
-            "rate", f"{rate:g} Hz is no rate to resample to", f"give 1 to {RATES[1]:g} Hz"
+            "rate", f"{rate:g} Hz is out of range", f"give a rate of 1 to {RATES[1]:g} Hz"
         )
     path = Path(path)
     for file in (path, options.accel_path):
@@ -109,7 +109,9 @@ def _read(path: Path, options: ImportOptions) -> Recording:
     if kind in ros.KINDS:
         return ros.read_bag(path, kind, topics)
     if any(topics):
-        raise InputError(path, "has no topics", "a topic is one of a ROS bag or an MCAP")
+        raise InputError(
+            path, "has no topics", "--imu-topic and the like are for ROS bags and MCAP"
+        )
     if kind == "csv":
         return _read_csv(path, options)
     return _read_euroc(path) if kind == "euroc" else loggers.read_logger(path)

@@ -183,8 +183,8 @@ def as_sequence(source: Recording, stated: Units, rate: float | None, name: str)
     if not np.array_equal(gyro.time, accel.time):
         both = max(gyro.time[-1], accel.time[-1]) - min(gyro.time[0], accel.time[0])
         notes.append(
-            "gyro and accel have stamps of their own: both are interpolated, "
-            f"{both - (last - first):.2f} s cut that only one of them covers"
+            "gyro and accel have different stamps: both are interpolated to one clock, and "
+            f"{both - (last - first):.2f} s that only one of them covers are cut off"
         )
     rates, forces = _in_si(source, stated, gyro, accel, notes, warnings)
     own = max(rounded_rate(gyro.time), rounded_rate(accel.time))
@@ -229,8 +229,8 @@ def _clocked(sensor: Sensor, unit: str | None, notes: list[str]) -> _Clocked:
     if empty.any() and not empty.all():
         # Loggers that write every sensor into one table leave the others' columns empty.
         notes.append(
-            f"{file.name}: {empty.sum()} of {len(empty)} rows have no {name} and are not its "
-            "samples"
+            f"{file.name}: {empty.sum()} of {len(empty)} rows have no value of {name} and "
+            "are left out for it"
         )
         stamps, values = stamps[~empty], values[~empty]
     if (count := len(np.unique(stamps))) < 2:

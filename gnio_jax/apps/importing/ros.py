@@ -81,7 +81,9 @@ def read_bag(path: Path, kind: str, topics: Topics) -> Recording:
     gyro, accel = of_gyro.sensor("gyro", imu.name, path), of_accel.sensor("accel", other.name, path)
     if of_gyro.by_headers != of_accel.by_headers:
         raise InputError(
-            path, f"topics {imu.name} and {other.name} have other clocks", "name other topics"
+            path,
+            f"topics {imu.name} and {other.name} are stamped by different clocks",
+            "name other topics",
         )
     clock = "headers" if of_gyro.by_headers else "bag: its headers have no time"
     named = f"{imu.name} ({imu.count} messages)"
@@ -401,8 +403,8 @@ def _track(
     stamps = np.array([pose.stamp if stamped else pose.logged for pose in rows], dtype=np.int64)
     if imu.by_headers and not stamped:
         notes.append(
-            f"{path.name}: {topic} has no stamps of its own and is stamped by the bag, the IMU by "
-            "its headers: the reference is off by the delay between these two clocks"
+            f"{path.name}: {topic} has no stamps in its headers, so those of the bag are taken. "
+            "The IMU has its own. The reference is off by the delay between both clocks"
         )
     name = f"{topic}:{child}" if child else topic
     source, start = f"{path}: topic {name}", int(stamps.min())

@@ -221,7 +221,7 @@ def check_fit(fit: BodyFit, source: object, limits: Mapping[str, tuple[float, st
     for what, (most, unit) in limits.items():
         if not found[what] <= most:
             value = f"the {what} would be {found[what]:.3g} {unit}, at most {most:g} {unit}"
-            problem = f"fits the phone only with what cannot be: {value} is plausible"
+            problem = f"fits the phone only with impossible values: {value} is plausible"
             raise Refusal(source, problem, remedy)
 
 

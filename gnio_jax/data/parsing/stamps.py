@@ -116,12 +116,14 @@ def in_order(
         row = int(np.argmin(steps))
         problem = f"field 'time' jumps back by {-steps[row]:.2f} s after {time[row]:.6f} s"
         problem += ", and what follows overlaps what was before"
-        raise InputError(source, problem, "its clock was set: cut the recording there")
+        remedy = "its clock was changed during the recording: cut the recording there"
+        raise InputError(source, problem, remedy)
     again = np.concatenate([[False], np.diff(time[order]) == 0])
     other = np.concatenate([[False], (np.diff(values[order], axis=0) != 0).any(axis=1)]) & again
     if other.sum() > max(MOST_REPEATED * len(time), 1):
-        problem = f"gives {other.sum()} of {len(time)} rows the stamp of another row with other"
-        problem = f"field 'time' {problem} values, first at {time[order][other][0]:.6f} s"
+        problem = f"gives {other.sum()} of {len(time)} rows the same stamp as another row with"
+        problem += f" different values, first at {time[order][other][0]:.6f} s"
+        problem = f"field 'time' {problem}"
         raise InputError(source, problem, "give stamps fine enough to tell the samples apart")
     counts = {"rows_sorted": float(backward), "rows_repeated": float(again.sum())}
     return InOrder(order[~again], {name: count for name, count in counts.items() if count})

@@ -49,8 +49,8 @@ def parsed_as(path: Path, kind: str) -> Iterator[None]:
     except (InputError, *OURS):
         raise
     except MemoryError:
-        problem = f"does not fit the memory as {kind}"
-        raise InputError(path, problem, "if it should, copy it again") from None
+        problem = f"does not fit into memory as {kind}"
+        raise InputError(path, problem, "if it should be smaller, copy it again") from None
     except Exception as error:  # a damaged file makes a parser fail in any other way
         reason = f"it may be cut short ({shortened(error, 200)})"
         raise damaged(path, f"cannot be read as {kind}, {reason}") from None

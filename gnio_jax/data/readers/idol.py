@@ -105,7 +105,7 @@ def find_walks(root: Path, folder: str) -> list[Recording]:
         raise InputError(root, f"holds no recording in building*/{folder}", remedy)
     if nameless:
         problem = f"metadata.json does not name the subject of {len(nameless)} recordings"
-        each = "each counts as a person of its own"
+        each = "each is treated as a different person"
         warnings.warn(f"{root}: {problem}, e.g. {nameless[0]}; {each}", stacklevel=3)
     return walks
 

@@ -314,10 +314,9 @@ def _on_vicon(phone: Streams, path: Path, kind: str) -> Streams:
     fit = align(phone, read_vicon(path, kind, phone.start), knot_seconds=LAG_KNOTS[kind])
     check_fit(fit, path, {"lag": (LONGEST_LAG[kind], "s")} | LIMITS)
     if not fit.runner_up <= CLOSEST_RUNNER_UP:
-        problem = "fits the phone at two lags alike, for the walk repeats itself"
-        raise Refusal(
-            path, f"{problem} ({fit.runner_up:.0%} as unexplained by one as by the other)"
-        )
+        problem = "fits the phone about as well at a second lag, because the walk repeats itself"
+        share = f"the best lag leaves {fit.runner_up:.0%} of what the second leaves unexplained"
+        raise Refusal(path, f"{problem} ({share})")
     accel = phone.accel._replace(time=phone.accel.time - fit.accel_delay)
     return phone._replace(accel=accel, poses=fit.poses, attributes=phone.attributes | _figures(fit))
 
@@ -347,7 +346,7 @@ def _figures(fit: BodyFit) -> dict[str, str | float]:
 def _on_tango(phone: Streams, path: Path, kind: str) -> Streams:
     """The phone with Tango's positions as its own."""
     if phone.device is None:
-        raise Refusal(path, "goes with a phone that gives no attitude")
+        raise Refusal(path, "belongs to a phone that recorded no attitude")
     fit: PositionsFit = align_positions(phone, read_tango(path))
     lag, problem = float(np.abs(fit.lag).max()), ""
     if not fit.correlation >= MIN_CORRELATION:
@@ -494,7 +493,7 @@ def read_vicon(path: Path, kind: str, start: float) -> Poses:
     if kind == "raw":
         time = table.take("time") / 1e9 - start
         if not abs(float(np.median(time))) < 3600.0 or np.ptp(time) < SHORTEST:
-            problem = "field 'time' is ruined or not of the phone's hour"
+            problem = "field 'time' is damaged or more than an hour away from the phone's"
             raise InputError(path, problem, "use the syn files")
         order = np.argsort(time, kind="stable")
         time, values = time[order], values[order]

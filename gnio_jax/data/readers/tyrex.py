@@ -128,7 +128,7 @@ def recordings(root: Path, split: str) -> list[Recording]:
         raise InputError(root, "holds no recording of Tyrex", layout)
     walks = sorted((w for w in walks if split in ("all", _split(w))), key=lambda w: w.folder.name)
     if not walks:
-        people = f"'{TRAINS}' trains, everybody else validates and tests"
+        people = f"'{TRAINS}' trains, and the other people validate and test"
         raise InputError(root, f"holds no walk of split '{split}'", f"complete the data: {people}")
     return [_recording(walk) for walk in walks]
 

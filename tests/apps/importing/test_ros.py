@@ -54,7 +54,7 @@ def test_every_kind_of_reference(tmp_path, kind):
     else:
         compare_reference(sequence, INNER, 2e-3)
     text = " | ".join(notes)
-    mixed = "/pose has no stamps of its own and is stamped by the bag, the IMU by its headers"
+    mixed = "/pose has no stamps in its headers, so those of the bag are taken"
     assert (mixed in text) == (kind == "Pose")
     assert ("taken as one" in text) == (kind != "TransformStamped")
 
