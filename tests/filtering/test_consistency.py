@@ -178,7 +178,9 @@ def test_the_smoother_is_consistent_with_correlated_errors():
     error = errors(jax.tree.map(lambda leaf: leaf[:16], runs), smoothed)
     for index in list(PARTS.values())[:4]:
         block = smoothed.covariance[:, :, index][..., index]
-        assert 0.6 < nees(error[..., index], block)[100:-100].mean() < 1.5, index
+        # The yaw's error hardly changes along a walk: a mean over time is no narrower.
+        low, high = bounds(len(index) * 16, 0.999)
+        assert low < nees(error[..., index], block)[100:-100].mean() < high, index
 
 
 # The network in the loop --------------------------------------------------------------------------

@@ -83,7 +83,7 @@ def test_a_table_from_nothing_and_again_without_training(made, monkeypatch, caps
     changed = yaml.safe_load((root / "base.yaml").read_text())
     changed["optim"]["learning_rate"] = 2e-3
     (root / "other.yaml").write_text(yaml.safe_dump(changed))
-    with pytest.raises(InputError, match=r"'optim' was .* and is now"):
+    with pytest.raises(InputError, match=r"'optim\.learning_rate' was .* and is now"):
         gnio("tables", "comparison", *arguments, "--base", str(root / "other.yaml"))
 
 
