@@ -51,8 +51,8 @@ class WindowSource(NamedTuple):
     has none."""
     unyaw: Float[Array, "m 2"]
     """Cosine and sine of the yaw that `rotation` removes: from the world to the window's frame."""
-    recording: Int[Array, "m 2"]
-    """First and last row of the recording that each window is cut from."""
+    stretch: Int[Array, "m 2"]
+    """First and last row of the stretch without an invalid sample that each window is cut from."""
     visited: Int[Array, "v"]
     """Numbers of the windows an epoch visits: all of them, unless they are to be shifted (see
     `shift_windows`)."""
@@ -91,7 +91,7 @@ def joined(sources: list[WindowSource]) -> WindowSource:
         found.append(
             source._replace(
                 start=source.start + np.int32(rows),
-                recording=source.recording + np.int32(rows),
+                stretch=source.stretch + np.int32(rows),
                 visited=source.visited + np.int32(windows),
             )
         )
@@ -107,9 +107,15 @@ def _recording_windows(
     rows and numbers count from 0."""
     start = window_starts(len(sequence.time), config.seen, spacing)
     start = start[without_any(~sequence.valid, start, config.seen + 1)]
+    usable = sequence.valid
     if sequence.imu_valid is not None:
         start = start[without_any(~sequence.imu_valid, start, config.seen)]
-    # An invalid row may hold NaN; no window touches it, so any rotation will do there.
+        usable = usable & sequence.imu_valid
+    # Stretches without an invalid sample begin and end where this changes.
+    changes = np.flatnonzero(np.diff(usable, prepend=False, append=False)).reshape(-1, 2)
+    stretch = changes[np.searchsorted(changes[:, 0], start, "right") - 1] - [0, 1]
+    # An invalid row may hold NaN. No window touches it, nor does the margin of one, so any rotation
+    # will do there.
     orientation = np.where(sequence.valid[:, None], sequence.orientation, [1.0, 0.0, 0.0, 0.0])
     attitude, after_context = rotations(orientation).as_matrix(), start + config.context
     imu, rotation = align_recording(
@@ -124,7 +130,7 @@ def _recording_windows(
         displacement=displacement.astype(np.float32),
         step=np.diff(sequence.position, axis=0, append=np.nan).astype(np.float32),
         unyaw=np.column_stack([np.cos(heading), np.sin(heading)]).astype(np.float32),
-        recording=np.tile(np.int32([0, len(imu) - 1]), (len(start), 1)),
+        stretch=stretch.astype(np.int32).reshape(-1, 2),
         visited=np.flatnonzero(start % stride == 0).astype(np.int32),
     )
 
@@ -134,12 +140,12 @@ def gather(
 ) -> Windows:
     """Windows number `which` of `source`, each `length` samples, in their own frames. Jittable.
 
-    `imu` has `margin` more samples on either side, for `low_pass`; where the recording ends, its
-    last sample is repeated.
+    `imu` has `margin` more samples on either side, for `low_pass`; where the valid samples end, the
+    last one is repeated.
     """
     start = source.start[which]
     rows = window_rows(start - margin, margin + length + margin)
-    first, last = source.recording[which].T[:, :, None]
+    first, last = source.stretch[which].T[:, :, None]
     imu = source.imu[jnp.clip(rows, first, last) if margin else rows]
     cosine, sine = source.unyaw[which][:, :, None].swapaxes(0, 1)
     # The compiler drops the steps where nobody looks at them.

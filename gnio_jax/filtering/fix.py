@@ -88,6 +88,8 @@ def fixes_on_intervals(
         problem = "time, position and covariance must be (f,), (f, m) and (f, m, m), m = 2 or 3"
         raise InputError("fixes", f"{problem}, {found}")
     there = np.isfinite(position).all(1)
+    if np.shape(time_std) not in ((), time.shape):
+        raise InputError("fixes", f"time_std must be one or (f,), found {np.shape(time_std)}")
     late = np.broadcast_to(time_std, time.shape)[there]
     time, position, covariance = time[there], position[there], covariance[there]
     end = intervals * config.clone_seconds
@@ -96,11 +98,14 @@ def fixes_on_intervals(
         problem = f"{len(outside)} of {count} are outside of the recording, one at {outside[0]:g} s"
         remedy = f"it lasts from {start:g} to {start + end:g} s: are both on one clock?"
         raise InputError("fixes", problem, remedy)
-    if not (late >= 0).all():
-        raise InputError("fixes", "time_std must be at least 0")
+    if not ((late >= 0) & (late < np.inf)).all():
+        raise InputError("fixes", "time_std must be at least 0 and finite")
+    if threshold is not None and not threshold > 0:
+        raise InputError("fixes", f"threshold must be above 0, found {threshold}")
     symmetric = np.isclose(covariance, covariance.transpose(0, 2, 1), rtol=1e-6, atol=0).all((1, 2))
-    if not symmetric.all() or (np.linalg.eigvalsh(covariance) <= 0).any():
-        raise InputError("fixes", "a covariance is not symmetric and positive definite")
+    finite = np.isfinite(covariance).all()
+    if not finite or not symmetric.all() or (np.linalg.eigvalsh(covariance) <= 0).any():
+        raise InputError("fixes", "a covariance is not finite, symmetric and positive definite")
 
     row = np.clip(np.rint(after / config.clone_seconds).astype(int) - 1, 0, intervals - 1)
     weight = 1 / np.trace(covariance, axis1=1, axis2=2)

@@ -83,9 +83,11 @@ def waypoint_poses(
     padded = math.ceil(LONGER ** math.ceil(math.log(count, LONGER)))
     samples = padded * config.samples_per_clone
     signals = [x[0] for x in padded_signals([(sequence.gyro, sequence.accel)], samples)]
+    signals[0][len(sequence.time) :] = 1.0  # rad/s: no rest behind the end is smoothed back into it
     masks = padded_masks([sequence.imu_valid], samples)
     valid = None if masks is None else masks[0]
-    after, place = waypoints.time - sequence.time[0], waypoints.position
+    time = np.clip(waypoints.time, sequence.time[0], sequence.time[-1])
+    after, place = time - sequence.time[0], waypoints.position
     ends = config.clone_seconds * np.arange(1, padded + 1)
 
     def at_taps(rows: Array) -> np.ndarray:
@@ -96,16 +98,22 @@ def waypoint_poses(
     first = slice(_first(config))
     level = level_state(config, signals[0][first], signals[1][first], setup.initial_std)
     _, history = _odometry(predict, level, *signals, config, noise, valid)
-    displacement, covariance = history.given(noise)
+    displacement, _ = history.given(noise)
+    covariance = jax.vmap(jnp.diag)(history.measurement_std**2)  # with the factors of `noise`
     displacement = jnp.where(jnp.arange(padded)[:, None] < count, displacement, jnp.nan)
     turn, origin, weight, missed = _aligned(at_taps(history.position), place, after, place_std)
     yaw = np.arctan2(turn[1, 0], turn[0, 0])
 
-    covariance = covariance + missed**2 * jnp.eye(3)[None]
+    # m/s of the path that the legs lack, in the displacement of a window.
+    short = missed * config.clones_per_window * config.clone_seconds
+    covariance = covariance + jnp.diag(jnp.array([short, short, 0.0]) ** 2)[None]
     given_noise = {"measurement_scale": 1.0, "std_factor": (1.0, 1.0, 1.0)}
     noise = noise._replace(**given_noise, correlation=CORRELATION)
     given = displacement, covariance, config, noise, valid, config.displacement_frame
     std = setup.initial_std._replace(**START_STD)
+    raw = sequence.attributes.get("imu_compensated") == "no" and not level.gyro_bias.any()
+    if raw and setup.raw_gyro_bias is not None:
+        std = std._replace(gyro_bias=setup.raw_gyro_bias)
     for _ in range(PASSES):
         rotation, position = rotation_z(yaw) @ level.rotation, np.append(origin, 0.0)
         start = initial_state(config, rotation, np.zeros(3), position, level.gyro_bias, std=std)
@@ -149,7 +157,9 @@ def _checked_waypoints(sequence: Sequence, config: FilterConfig) -> Waypoints:
         found = f"has {len(sequence.time)} samples at {1 / step:.4g} Hz"
         problem = f"{found}, at least {_first(config)} at {1 / config.dt:.4g} Hz are needed"
         raise InputError(sequence.name, problem, "resample it")
-    if waypoints.time[0] < sequence.time[0] or waypoints.time[-1] > sequence.time[-1]:
+    # A tap beside the first or the last stamp of the phone may be a sample off the uniform clock.
+    first, last = sequence.time[0] - config.dt, sequence.time[-1] + config.dt
+    if waypoints.time[0] < first or waypoints.time[-1] > last:
         raise InputError(sequence.name, "has waypoints before its start or after its end")
     return waypoints
 

@@ -283,6 +283,30 @@ def test_low_pass_of_a_window_is_that_of_its_whole_recording():
     assert error.min(axis=0).max() < 0.1 and len(set(error.argmin(axis=0))) == 3
 
 
+def test_the_margin_of_the_low_pass_ends_where_the_reference_does():
+    """A phone upright at rest: what it measures, seen in the world, is gravity up to the edge."""
+    count, before = 400, 150
+    upright = np.tile([np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0], (count, 1))  # wxyz, 90° about x
+    upright[:before] = np.nan
+    valid = np.arange(count) >= before
+    phone = Sequence(
+        name="upright",
+        time=np.arange(count) / 100.0,
+        gyro=np.zeros((count, 3)),
+        accel=np.tile([0.0, 9.81, 0.0], (count, 1)),
+        orientation=upright,
+        position=np.zeros((count, 3)),
+        velocity=np.zeros((count, 3)),
+        valid=valid,
+    )
+    source = jax.tree.map(jnp.asarray, windows.window_source([phone], DataConfig(rate=100.0), 10))
+    margin = windows.low_pass_margin(AugmentConfig(low_pass_share=1.0), 100.0)
+    found = windows.gather(source, jnp.arange(len(source.start)), 100, margin)
+    assert source.start[0] == before and found.imu.shape[1] == 100 + 2 * margin
+    expected = np.broadcast_to(np.float32([0, 0, 9.81, 0, 0, 0]), found.imu.shape)
+    np.testing.assert_allclose(found.imu, expected, atol=1e-5)
+
+
 def test_switched_off_augmentation_changes_nothing_and_draws_depend_on_the_key_alone():
     before = batch(10)
     np.testing.assert_array_equal(augment(KEY, before, OFF).imu, before.imu)

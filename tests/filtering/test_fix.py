@@ -52,10 +52,17 @@ def test_two_in_an_interval_become_one():
         (dict(position=np.zeros((2, 4))), "fixes: time, position and covariance must be"),
         (dict(position=np.zeros((2, 3))), "fixes: time, position and covariance must be"),
         (dict(time_std=[0.1, -0.1]), "fixes: time_std must be at least 0"),
-        (dict(covariance=np.zeros((2, 2, 2))), "fixes: a covariance is not symmetric and positive"),
+        (dict(time_std=np.inf), "fixes: time_std must be at least 0 and finite"),
+        (dict(time_std=[0.1, 0.1, 0.1]), "fixes: time_std must be one or"),
+        (dict(threshold=np.nan), "fixes: threshold must be above 0, found nan"),
+        (dict(covariance=np.full((2, 2, 2), np.inf)), "fixes: a covariance is not finite"),
+        (
+            dict(covariance=np.zeros((2, 2, 2))),
+            "fixes: a covariance is not finite, symmetric and positive",
+        ),
         (
             dict(covariance=np.array([np.eye(2), [[1.0, 0.5], [0.0, 1.0]]])),
-            "fixes: a covariance is not symmetric and positive",
+            "fixes: a covariance is not finite, symmetric and positive",
         ),
     ],
 )

@@ -1,5 +1,6 @@
 """Poses of a computed walk that is known at a few moments, against the truth between these."""
 
+import dataclasses
 import functools
 
 import jax.numpy as jnp
@@ -16,7 +17,7 @@ RATE, N, SECONDS, LEGS = 50.0, 10, 25.6, 4
 BEGIN, YAW = 50.0, 0.4
 SETUP = filtering.FilterSetup(
     filtering.FilterConfig(1 / RATE, N, 5),
-    filtering.NoiseModel(3e-3, 3e-2),
+    filtering.NoiseModel(3e-3, 3e-2, measurement_scale=1.0),
     filtering.InitialStd(),
 )
 
@@ -129,3 +130,29 @@ def test_truer_than_curves_between_the_waypoints(taken, wrong):
 def test_what_has_no_poses_is_refused_in_one_line(change, text):
     with pytest.raises(InputError, match=f"^{text}"):
         filtering.waypoint_poses(tapped(ALL)._replace(**change), predict, SETUP)
+
+
+def test_a_network_that_is_trusted_less_and_a_tap_beside_the_last_stamp():
+    """The uniform clock ends up to a sample before the tap that ended the recording."""
+    sequence = tapped(ALL)
+    late = np.append(sequence.waypoints.time[:-1], sequence.time[-1] + 0.5 / RATE)
+    sequence = sequence._replace(waypoints=sequence.waypoints._replace(time=late))
+    spread = []
+    for scale in (1.0, 9.0):
+        setup = SETUP._replace(noise=SETUP.noise._replace(measurement_scale=scale))
+        _, smoothed, _ = filtering.waypoint_poses(sequence, predict, setup, 0.1, 0.2)
+        spread.append(smoothed.covariance_diagonal[:, 6:8].mean())  # of the horizontal position
+    assert spread[1] > 1.02 * spread[0]
+
+
+@pytest.mark.slow
+def test_what_is_behind_the_end_is_no_rest():
+    whole, end = tapped(ALL), 827  # in the middle of a leg
+    fields = ("time", "gyro", "accel", "orientation", "position", "velocity", "valid")
+    arrays = {name: getattr(whole, name)[:end] for name in fields}
+    known = whole.waypoints.time < whole.time[end - 1]
+    waypoints = Waypoints(whole.waypoints.time[known], whole.waypoints.position[known])
+    setup = SETUP._replace(config=dataclasses.replace(SETUP.config, zero_velocity_std=0.02))
+    cut = whole._replace(**arrays, waypoints=waypoints)
+    found, _, _ = filtering.waypoint_poses(cut, predict, setup, 0.1, 0.2)
+    np.testing.assert_allclose(found.velocity[-1, :2], walk().velocity[end - 1, :2], atol=0.2)

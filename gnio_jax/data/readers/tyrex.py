@@ -14,8 +14,8 @@ Layout: `datasets/{android,ios}/<Person>_<Device>_<Dist|NoDist>_<Way>/` with `ac
 - Qualisys: 60 Hz, mm, rotations body → world column by column, NaN where the body was lost. Its
   time is the record's plus the number in `timeAlignment.txt`, to 0.03 s.
 
-**Every gyro is raw**: no bias is taken off, and 0.1 rad/s remain on an iPhone 5. Runners reach the
-2 G at which two of the accelerometers clip (`accel_clipped`).
+**The iPhones' gyros are raw**: no bias is taken off, and 0.1 rad/s remain on an iPhone 5. Runners
+reach the 2 G at which two of the accelerometers clip (`accel_clipped`).
 
 The tracked body is a handle on the phone, whose axes are the phone's to a few degrees and whose
 origin is some cm away. `alignment.align` finds the mounting, the level and the clocks from each
@@ -160,7 +160,8 @@ def read(folder: Path) -> list[Sequence]:
     try:
         fit = align(phone, track, LAG_KNOTS, search_seconds=LAG_SEARCH)
     except TooLittle as error:
-        raise Refusal(walk.track, f"cannot be aligned with the phone ({error})") from None
+        phone_files = "accelerometer.txt and gyroscope.txt at the time of timeAlignment.txt"
+        raise Refusal(walk.track, f"cannot be aligned with {phone_files} ({error})") from None
     check_fit(fit, walk.track, LIMITS)
     about = {
         "dataset": "tyrex",
