@@ -157,12 +157,13 @@ def read(folder: Path) -> list[Sequence]:
         problem = "is not named <Person>_<Device>_<Dist|NoDist>_<Way>"
         raise InputError(folder, problem, "give the folder its published name")
     phone, track = read_phone(walk), read_track(walk.track, _offset(folder))
+    # Whichever is damaged, they do not fit together.
+    both = f"{walk.track} and accelerometer.txt, gyroscope.txt, timeAlignment.txt of the phone"
     try:
         fit = align(phone, track, LAG_KNOTS, search_seconds=LAG_SEARCH)
     except TooLittle as error:
-        phone_files = "accelerometer.txt and gyroscope.txt at the time of timeAlignment.txt"
-        raise Refusal(walk.track, f"cannot be aligned with {phone_files} ({error})") from None
-    check_fit(fit, walk.track, LIMITS)
+        raise Refusal(both, f"cannot be aligned with the phone ({error})") from None
+    check_fit(fit, both, LIMITS)
     about = {
         "dataset": "tyrex",
         "group": walk.person,
