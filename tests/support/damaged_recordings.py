@@ -229,9 +229,9 @@ def check_refusal(said: str, name: str, happened: list[Damage]) -> None:
         if damage.what in ("drop field", "rename field", "value", "type", "shape")
     ]
     if len(happened) == 1 and fields and not happened[0].file.endswith(".npy"):
-        assert re.search(r"(field|column)s? '", said) or "self-check" in said, (
-            f"names no field: {said}"
-        )
+        # Numbers cut to integers are numbers still: the recording as a whole is not trusted.
+        whole = "self-check" in said or "can be trusted" in said
+        assert re.search(r"(field|column)s? '", said) or whole, f"names no field: {said}"
 
 
 def check(name: str, happened: list[Damage]) -> tuple[list[Sequence] | InputError, str]:
