@@ -164,7 +164,7 @@ def test_the_track_of_another_walk_is_refused(tmp_path):
     path = tyrex.walk_of(folder).track
     with pytest.raises(Refusal, match=r"(stays unexplained|impossible values)") as caught:
         tyrex.read(folder)
-    assert str(caught.value).startswith(f"{path}: ")
+    assert str(caught.value).startswith(f"{path} and ")
     # The IMU of another phone's record has other stamps.
     (other / "accelerometer.txt").write_text((folder / "accelerometer.txt").read_text())
     refused(lambda: tyrex.read(other), other / "accelerometer.txt", "of one phone")
