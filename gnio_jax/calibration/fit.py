@@ -39,16 +39,12 @@ from gnio_jax.filtering.settings import (
     with_written_parameters,
 )
 from gnio_jax.training.filter_losses import gaussian_nll, normalised_squares
+from gnio_jax.training.optimizer import FILTER_PARTS
 from gnio_jax.types import Array
 
 GROUPS = {
     "measurement": ("noise.measurement_scale",),
-    "noise": (
-        "noise.gyro_density",
-        "noise.accel_density",
-        "noise.gyro_bias_walk",
-        "noise.accel_bias_walk",
-    ),
+    "noise": FILTER_PARTS["noise"],
     "start": ("start.gyro_bias", "start.accel_bias"),
     "window": ("noise.correlation",),
 }

@@ -145,6 +145,16 @@ def test_a_network_that_is_trusted_less_and_a_tap_beside_the_last_stamp():
     assert spread[1] > 1.02 * spread[0]
 
 
+def test_a_raw_gyro_starts_with_the_wide_prior_of_its_bias():
+    setup, walked = SETUP._replace(raw_gyro_bias=0.05), tapped(ALL)
+    first = {}
+    for compensated in ("no", "yes"):
+        sequence = walked._replace(attributes={"imu_compensated": compensated})
+        _, smoothed, _ = filtering.waypoint_poses(sequence, predict, setup, 0.1, 0.2)
+        first[compensated] = smoothed.covariance_diagonal[0, 11]  # the gyro's bias about z
+    assert first["no"] > 1.5 * first["yes"]
+
+
 @pytest.mark.slow
 def test_what_is_behind_the_end_is_no_rest():
     whole, end = tapped(ALL), 827  # in the middle of a leg

@@ -230,7 +230,8 @@ def check_refusal(said: str, name: str, happened: list[Damage]) -> None:
     ]
     if len(happened) == 1 and fields and not happened[0].file.endswith(".npy"):
         # Numbers cut to integers are numbers still: the recording as a whole is not trusted.
-        whole = "self-check" in said or "can be trusted" in said
+        cut = happened[0].what == "type" and "can be trusted" in said
+        whole = "self-check" in said or cut
         assert re.search(r"(field|column)s? '", said) or whole, f"names no field: {said}"
 
 

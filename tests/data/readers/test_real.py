@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from gnio_jax import data
+from gnio_jax.data.readers import oxiod
 from gnio_jax.data.self_check import check_sequence
 from gnio_jax.numerics import rotations
 
@@ -54,9 +55,15 @@ REAL = {
     ("tumvi", "val", "room3", ""): ROOM._replace(correlation=0.98),
     ("tumvi", "test", "room4", ""): ROOM._replace(correlation=0.98),
     ("tlio", "train", "room1", ""): GOLDEN,
+    ("tlio", "train", "room2", ""): GOLDEN,
+    ("tlio", "train", "V1_01_easy", ""): GOLDEN,
+    ("tlio", "train", "V1_02_medium", ""): GOLDEN,
+    ("tlio", "val", "room3", ""): GOLDEN,
     ("tlio", "val", "V2_01_easy", ""): GOLDEN,
+    ("tlio", "test", "room4", ""): GOLDEN,
     ("tlio", "test", "MH_04_difficult", ""): GOLDEN._replace(correlation=0.65),
     ("blackbird", "train", "clover_yawForward_maxSpeed5p0_train", ""): FLIGHT,
+    ("blackbird", "val", "clover_yawForward_maxSpeed5p0_val", ""): FLIGHT,
     ("blackbird", "test", "clover_yawForward_maxSpeed5p0_test", ""): FLIGHT,
     ("tyrex", "all", "Guillaume_Nexus5_Dist_AR", ""): HELD,
     ("tyrex", "all", "Thibaud_iPhone4S_Dist_Swinging", ""): HELD,
@@ -101,12 +108,45 @@ def test_a_real_recording_is_physical(recordings, real):
         differenced = (sequence.position[2:] - sequence.position[:-2]) * check.rate / 2
         error = np.linalg.norm(differenced - sequence.velocity[1:-1], axis=1)[whole]
         assert np.percentile(error, 99) < 0.05
+    slower = check_sequence(data.resample(sequence, check.rate / 2), dataset)
+    assert slower.failures == () and slower.rate == pytest.approx(check.rate / 2, rel=1e-3)
+    turned = check.gyro_consistency_degrees
+    assert slower.gyro_consistency_degrees == pytest.approx(turned, abs=0.1)
     if sequence.device_orientation is not None:
         # Delayed or mirrored truth would show here: the phone's up is that of the reference.
         own, known = sequence.device_orientation[valid], sequence.orientation[valid]
         up, own = (rotations(each).inv().apply([0.0, 0.0, 1.0]) for each in (known, own))
         angle = np.degrees(np.arccos(np.clip((own * up).sum(axis=1), -1, 1)))
         assert np.median(angle) < 4
+
+
+@pytest.mark.recordings
+def test_real_splits_share_no_walk(recordings):
+    root = recordings / "oxiod"
+    if not root.is_dir():
+        pytest.skip("real recordings: no oxiod/")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        found = oxiod.find_walks(root)
+        splits = {
+            split: {walk.name for walk in oxiod.select(found, split, root)}
+            for split in oxiod.SPLITS
+        }
+    for protocol in (
+        ("train", "val", "test", "unseen", "large_scale"),
+        ("sessions_train", "sessions_val", "sessions_test", "large_scale"),
+    ):
+        for first in protocol:
+            assert splits[first]
+            assert all(not splits[first] & splits[other] for other in protocol if other != first)
+    train, val, test = (
+        {walk.session for walk in found if walk.name in splits[f"sessions_{split}"]}
+        for split in ("train", "val", "test")
+    )
+    assert not train & (val | test) and not val & test
+    assert splits["test"] == {"running_data1_7", "trolley_data2_6"}
+    assert val == {"multi users/user4"}
+    assert test == {"multi users/user2", "multi devices/nexus 5", "trolley/data1"}
 
 
 @pytest.mark.recordings
