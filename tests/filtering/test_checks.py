@@ -10,10 +10,18 @@ import pytest
 from gnio_jax import filtering
 from gnio_jax.filtering.checks import checked_inputs
 from gnio_jax.filtering.state import with_correlated_error
-from tests.support.short_walk import CONFIG, DT, INTERVALS, NOISE, WALK, N, start
+from tests.support.random_walk import random_walk
 
+N, CLONES, DT, INTERVALS = 5, 4, 0.02, 60
+CONFIG = filtering.FilterConfig(DT, N, CLONES, history="core")
+NOISE = filtering.NoiseModel(measurement_scale=2.0)
+WALK = random_walk(11, n=N, clones=CLONES, intervals=INTERVALS, dt=DT, bias=False)
 POSE, GYRO, ACCEL, DISPLACEMENT, COVARIANCE = WALK
 SAMPLES, NAN = len(GYRO), float("nan")
+
+
+def start():
+    return filtering.initial_state(CONFIG, *POSE)
 
 
 def put(array, at, value):
@@ -91,8 +99,6 @@ def test_arguments_that_cannot_be_are_refused_by_name():
         ("rotation", 2 * np.eye(3)),
         ("rotation", np.eye(4)),
         ("velocity", np.full(3, NAN)),
-        ("velocity", np.zeros(2)),
-        ("position", np.full(3, np.inf)),
         ("position", np.zeros((1, 3))),
         ("gyro_bias", np.full(3, NAN)),
         ("accel_bias", np.zeros((3, 1))),
@@ -117,12 +123,7 @@ def test_settings_that_make_no_sense_are_refused_by_name():
         "history": ("all",),
         "log_std_min": (float("-inf"),),
         "gate_threshold": (0.0,),
-        "convergence_seconds": (-1.0,),
-        "success_seconds": (-1.0,),
-        "pause_seconds": (-1.0,),
         "speed_limit": (0.0, np.inf),
-        "window_rotation": ("none",),
-        "allow_float32": (1,),
     }.items():
         for value in values:
             given = {"dt": 0.01, "samples_per_clone": 2, "clones_per_window": 3, name: value}

@@ -7,33 +7,36 @@ import pytest
 
 from gnio_jax import filtering
 from gnio_jax.filtering import gaps
-from tests.support.short_walk import CLONES, CONFIG, DT, INTERVALS, NOISE, WALK, N, run, start
+from tests.support.random_walk import random_walk
+
+N, CLONES, DT, INTERVALS = 5, 4, 0.02, 60
+CONFIG = filtering.FilterConfig(DT, N, CLONES, bridge_seconds=0.06, history="core")
+NOISE = filtering.NoiseModel(measurement_scale=2.0)
+WALK = random_walk(11, n=N, clones=CLONES, intervals=INTERVALS, dt=DT, bias=False)
+
+
+def start():
+    return filtering.initial_state(CONFIG, *WALK[0])
+
+
+def run(valid=None, gyro=WALK[1], displacement=WALK[3]):
+    given = gyro, WALK[2], displacement, WALK[4], CONFIG, NOISE, valid
+    return filtering.run_filter(start(), *given)
+
 
 # One program in place of one for every operation.
 bridge = jax.jit(gaps.bridge, static_argnums=4)
 
 
-def gap_of(valid, memory, limit):
-    """By hand, one sample after the other: age, index held (−1 the memory, None nothing), the extra
-    variance in units of the gap's."""
-    ages, held, variances, age, last, before = (
-        [],
-        [],
-        [],
-        memory[0],
-        (-1 if memory[1] else None),
-        0.0,
-    )
+def gap_of(valid, missing_before, limit):
+    """By hand, one sample after the other: age, index held (−1: the memory), the extra variance in
+    units of the gap's."""
+    rows, age, last = [], missing_before, -1
     for j, good in enumerate(valid):
-        age = 0 if good else age + 1
-        last = j if good else last
-        error = lambda a: min(a / limit, 1.0)  # noqa: E731
-        total = sum(error(a) for a in range(1, age + 1))
-        before = sum(error(a) for a in range(1, age))
-        ages.append(age)
-        held.append(last)
-        variances.append(total**2 - before**2)
-    return ages, held, variances
+        age, last = (0, j) if good else (age + 1, last)
+        errors = [min(a / limit, 1.0) for a in range(1, age + 1)]
+        rows.append((age, last, sum(errors) ** 2 - sum(errors[:-1]) ** 2))
+    return zip(*rows, strict=True)
 
 
 @pytest.mark.parametrize("missing_before", [0, 2])
@@ -50,7 +53,7 @@ def test_holes_are_filled_with_the_last_sample(missing_before):
         gyro=jnp.full(3, 5.0), accel=jnp.full(3, 6.0), missing=jnp.int32(missing_before)
     )
     imu, age, after = bridge(gyro, accel, valid, memory, CONFIG)
-    ages, held, variances = gap_of(good, (missing_before, True), 3)
+    ages, held, variances = gap_of(good, missing_before, 3)
     np.testing.assert_allclose(age, np.array(ages) * DT)
     for found, signal, remembered in ((imu.gyro, gyro, 5.0), (imu.accel, accel, 6.0)):
         np.testing.assert_array_equal(
@@ -62,6 +65,14 @@ def test_holes_are_filled_with_the_last_sample(missing_before):
     )
     np.testing.assert_array_equal(imu.gap.used, np.array(ages) <= 3)
     assert after.missing == 1 and (after.gyro == gyro[28]).all()
+    # A gap across two streams is one gap.
+    first, age_of_first, between = bridge(gyro[:15], accel[:15], valid[:15], memory, CONFIG)
+    second, age_of_second, end = bridge(gyro[15:], accel[15:], valid[15:], between, CONFIG)
+    parts = jax.tree.map(
+        lambda *x: np.concatenate(x), (first, age_of_first), (second, age_of_second)
+    )
+    jax.tree.map(np.testing.assert_array_equal, parts, (imu, age))
+    jax.tree.map(np.testing.assert_array_equal, end, after)
 
 
 def test_nothing_held_before_the_first_sample():
@@ -81,15 +92,10 @@ def test_all_samples_there_is_the_plain_filter():
 
 
 def test_a_short_hole_is_bridged_a_long_one_costs_certainty():
-    gyro = WALK[1]
-    valid = np.ones(N * INTERVALS, bool)
-    valid[100:103] = False
-    valid[200:240] = False
-    broken = gyro.copy()
+    valid, broken = np.ones(N * INTERVALS, bool), WALK[1].copy()
+    valid[[*range(100, 103), *range(200, 240)]] = False
     broken[~valid] = np.nan
-    config = filtering.FilterConfig(DT, N, CLONES, bridge_seconds=0.06, history="core")
-    _, whole = run(config)
-    _, found = run(config, valid, gyro=broken)
+    (_, whole), (_, found) = run(), run(valid=valid, gyro=broken)
     gap = np.asarray(found.imu_gap)
     np.testing.assert_allclose(gap[[19, 20, 21]], [0, 0.06, 0])
     np.testing.assert_allclose(gap[39:49], [0, *(0.1 * np.arange(1, 9)), 0], atol=1e-12)
@@ -105,9 +111,8 @@ def test_a_short_hole_is_bridged_a_long_one_costs_certainty():
 def test_the_filter_coasts_where_nothing_is_known():
     """No turn, no change of velocity: constant velocity for the whole gap, whatever the attitude is
     believed to be."""
-    (R, v, p), gyro, accel, _, c = WALK
-    valid, missing = np.zeros(N * INTERVALS, bool), np.full((INTERVALS, 3), np.nan)
-    _, history = filtering.run_filter(start(), gyro, accel, missing, c, CONFIG, NOISE, valid)
+    R, v, p = WALK[0]
+    _, history = run(np.zeros(N * INTERVALS, bool), displacement=np.full((INTERVALS, 3), np.nan))
     history = jax.tree.map(lambda leaf: np.asarray(leaf)[:6], history)
     np.testing.assert_allclose(history.velocity, np.tile(v, (6, 1)), atol=1e-12)
     np.testing.assert_allclose(history.rotation, np.tile(R, (6, 1, 1)), atol=1e-12)
@@ -115,22 +120,5 @@ def test_the_filter_coasts_where_nothing_is_known():
     # Nothing was there to hold, so every sample has the variance of one just beyond the limit: e_4
     # = 1, Σ e = 3, of which 3² − 2² is its.
     growth = history.covariance_diagonal[-1, 0] - np.radians(1.0) ** 2
-    np.testing.assert_allclose(
-        growth,
-        30 * DT**2 * ((3**2 - 2**2) * CONFIG.gap_gyro_std**2 + NOISE.gyro_density**2 / DT),
-        rtol=1e-6,
-    )
-
-
-def test_a_gap_across_two_runs_is_one_gap():
-    valid = np.ones(N * INTERVALS, bool)
-    half = INTERVALS // 2
-    valid[N * half - 4 : N * half + 8] = False
-    _, together = run(valid=valid)
-    state, first = run(valid=valid, rows=slice(0, half))
-    _, second = run(valid=valid, rows=slice(half, INTERVALS), state=state)
-    for name in ("position", "velocity", "covariance_diagonal", "imu_gap"):
-        both = np.concatenate([getattr(first, name), getattr(second, name)])
-        np.testing.assert_allclose(
-            both, getattr(together, name), atol=1e-9, rtol=1e-8, err_msg=name
-        )
+    each = (3**2 - 2**2) * CONFIG.gap_gyro_std**2 + NOISE.gyro_density**2 / DT
+    np.testing.assert_allclose(growth, 30 * DT**2 * each, rtol=1e-6)

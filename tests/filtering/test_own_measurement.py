@@ -1,4 +1,4 @@
-"""Measurements of the caller's own: in the filter, in the smoother, and as they are refused."""
+"""Measurements of the caller's own: in the filter, and as they are refused."""
 
 import functools
 from typing import NamedTuple
@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from gnio_jax import filtering, geometry
 from gnio_jax.filtering.update import since_oldest
@@ -64,70 +65,54 @@ class Between(NamedTuple):
         return filtering.measure(state, linear, step)
 
 
-def start(config=CONFIG):
-    return filtering.initial_state(config, *START)
+def start():
+    return filtering.initial_state(CONFIG, *START)
 
 
-@functools.cache
-def run(smoothed=False):
-    """(displacements, measurements) -> the run, or the smoothed one; one program for each tree."""
-    function = filtering.smooth if smoothed else filtering.run_filter
-    return quick(
-        lambda displacement, measurements: function(
-            start(), GYRO, ACCEL, displacement, SPREAD, CONFIG, NOISE, measurements=measurements
-        )
+@functools.partial(quick, static_argnames="config")
+def run(state, gyro, accel, displacement, covariance, config, measurements):
+    given = state, gyro, accel, displacement, covariance, config, NOISE
+    return filtering.run_filter(*given, measurements=measurements)
+
+
+def test_a_displacement_from_the_outside_is_the_one_from_the_inside():
+    """Over both anchors of the ring, with the rows that have no measurement."""
+    (state, wanted), (own, found) = (
+        run(start(), GYRO, ACCEL, inside, SPREAD, CONFIG, (Between(outside, SPREAD),))
+        for inside, outside in ((DISPLACEMENT, NONE), (NONE, DISPLACEMENT))
     )
-
-
-@pytest.mark.parametrize("smoothed", [False, True])
-def test_a_displacement_from_the_outside_is_the_one_from_the_inside(smoothed):
-    """Over both anchors of the ring, with the rows that have no measurement; smoothed, too."""
-    wanted = run(smoothed)(DISPLACEMENT, ())
-    found = run(smoothed)(NONE, (Between(DISPLACEMENT, SPREAD),))
-    if not smoothed:
-        (state, wanted), (own, found) = wanted, found
-        jax.tree.map(
-            lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-11),
-            state._replace(gate=None),
-            own._replace(gate=None),
-        )
-        (outcome,) = found.others
-        np.testing.assert_array_equal(outcome.present, np.isfinite(wanted.nis))
-        np.testing.assert_allclose(outcome.nis[outcome.present], wanted.nis[outcome.present])
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-11),
+        state._replace(gate=None),
+        own._replace(gate=None),
+    )
+    (outcome,) = found.others
+    np.testing.assert_array_equal(outcome.present, np.isfinite(wanted.nis))
+    np.testing.assert_allclose(outcome.nis[outcome.present], wanted.nis[outcome.present])
     for name in ("rotation", "velocity", "position", "gyro_bias", "accel_bias", "covariance"):
         np.testing.assert_allclose(
             getattr(found, name), getattr(wanted, name), rtol=1e-8, atol=1e-11, err_msg=name
         )
 
 
-def heights():
-    """Those of the filter with displacements, but for some decimetres, where there is one."""
-    _, history = run()(DISPLACEMENT, ())
-    height = np.asarray(history.position)[:, 2] + 0.1 * np.sin(np.arange(INTERVALS))
-    height[::3], height[20] = np.nan, 100.0
-    return height
-
-
 def test_a_height_is_the_textbooks_update():
     """In the whole covariance, clones and all, for every interval; one that is 100 m off fails its
     χ² test, and a NaN is none."""
-    height, std, state = heights(), 0.05, start()
-    step = quick(
-        lambda state, *given: filtering.run_filter(
-            state, *given[:4], CONFIG, NOISE, measurements=given[4]
-        )
-    )
+    std, state = 0.05, start()
     whole = jax.jit(covariance)
     for k in range(INTERVALS):
         rows, row = slice(N * k, N * (k + 1)), slice(k, k + 1)
         given = GYRO[rows], ACCEL[rows], DISPLACEMENT[row], SPREAD[row]
-        without, _ = step(state, *given, (Height(np.full(1, np.nan), np.full(1, std)),))
-        state, history = step(state, *given, (Height(height[row], np.full(1, std)),))
+        none = Height(np.full(1, np.nan), np.full(1, std))
+        without, _ = run(state, *given, CONFIG, (none,))
+        height = np.nan if k % 3 == 0 else without.position[2] + 0.1 * np.sin(k)
+        height = np.asarray(100.0 if k == 20 else height)
+        state, history = run(state, *given, CONFIG, (none._replace(height=height[None]),))
         (outcome,) = history.others
-        assert outcome.present[0] == np.isfinite(height[k])
-        assert outcome.accepted[0] == (np.isfinite(height[k]) and k != 20)
+        assert outcome.present[0] == np.isfinite(height)
+        assert outcome.accepted[0] == (np.isfinite(height) and k != 20)
         before = np.asarray(whole(without))
-        spread, residual = before[8, 8] + std**2, height[k] - without.position[2]
+        spread, residual = before[8, 8] + std**2, height - without.position[2]
         gain = before[:, 8] / spread * float(outcome.accepted[0])
         np.testing.assert_allclose(
             whole(state), before - np.outer(gain, before[8]), rtol=1e-9, atol=1e-12
@@ -143,7 +128,7 @@ def test_a_height_is_the_textbooks_update():
 def test_rows_that_are_missing_are_refused_by_name():
     measured = (Height(np.zeros(INTERVALS - 1), np.ones(INTERVALS)),)
     with pytest.raises(ValueError, match=r"^measurements\[0\]\.height: the shape must be \(30,\)"):
-        run.__wrapped__()(DISPLACEMENT, measured)
+        run(start(), GYRO, ACCEL, DISPLACEMENT, SPREAD, CONFIG, measured)
     with pytest.raises(ValueError, match=r"^linearise: height: is none of rotation, velocity"):
         filtering.linearise(start(), [0.0], [[1.0]], height=[[0.0, 0.0, 1.0]])
 
@@ -153,7 +138,7 @@ def test_known_displacements_are_those_of_the_filter():
     rng = np.random.default_rng(0)
     (rotation, _, _), turn = START, rng.normal(size=3)
     angles = np.arange(INTERVALS + 1)[:, None] * 0.1 * turn
-    rotations = np.asarray(jax.vmap(geometry.exp)(jnp.asarray(angles))) @ rotation
+    rotations = Rotation.from_rotvec(angles).as_matrix() @ rotation
     position = rng.normal(size=(INTERVALS + 1, 3))
     found = filtering.displacements(rotations, position, CONFIG)
     assert np.isnan(found[:CLONES]).all() and found.shape == (INTERVALS, 3)

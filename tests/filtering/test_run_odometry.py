@@ -1,5 +1,4 @@
-"""The network in the loop against windows cut by brute force, and derivatives of the whole filter
-against central differences."""
+"""The network in the loop against windows cut by brute force."""
 
 import dataclasses
 import functools
@@ -14,8 +13,12 @@ from gnio_jax import filtering
 from gnio_jax.filtering.state import Mean
 from gnio_jax.types import Prediction
 from tests.support import scekf_numpy
-from tests.support.odometry import CLONES, CONFIG, DT, INTERVALS, PARAMETERS, N, recording, start
+from tests.support.odometry import DT, INTERVALS, PARAMETERS, N, recording, start
 
+CLONES = 4
+CONFIG = filtering.FilterConfig(DT, N, CLONES, convergence_seconds=0.6, context_samples=6)
+FIRST = 5
+"""Interval that ends with a measurement: the first with its context."""
 NOISE = filtering.NoiseModel(measurement_scale=2.0, std_factor=(1.5, 0.5, 2.0))
 FACTOR = np.array(NOISE.std_factor)
 ROOT_SCALE = np.sqrt(2.0) * FACTOR
@@ -53,7 +56,7 @@ def predict_numpy(window):
     return pooled, np.diag(FACTOR**2 * np.exp(2 * np.maximum(-2.0 + 0.1 * pooled, -4.0)))
 
 
-CUTS = {"per_sample": (0, True, False), "single": (0, True, False), "tlio": (1, False, True)}
+CUTS = {"per_sample": (0, True, False), "tlio": (1, False, True)}
 """By how many samples windows begin early, whether they are without biases, and whether a sample is
 turned by its own rate or by that of the one before."""
 
@@ -73,7 +76,7 @@ def by_hand(config, cut, gyro, accel):
         for turn in turns[:context][::-1]:
             R = R @ turn.T
         for j, (w, a) in enumerate(zip(*seen, strict=True)):
-            if j and config.window_rotation != "single":
+            if j:
                 R = R @ turns[j if own else j - 1]
             rows.append(np.concatenate([unyaw @ R @ a, unyaw @ R @ w]))
         return predict_numpy(np.array(rows))
@@ -83,14 +86,15 @@ def by_hand(config, cut, gyro, accel):
 
 
 @pytest.mark.parametrize(
-    "window_rotation, context, first",
-    [("per_sample", 6, 5), ("single", 0, 4), ("tlio", 0, 4)],
+    "window_rotation, context, first", [("per_sample", 6, FIRST), ("tlio", 0, CLONES)]
 )
 def test_windows_are_cut_with_the_state_of_the_filter(window_rotation, context, first):
     gyro, accel = recording(0)
     config = dataclasses.replace(CONFIG, window_rotation=window_rotation, context_samples=context)
     assert config.first_measured == first
-    _, history = program(config)(start(config), gyro, accel, BASE, SLOPE)
+    state, history = program(config)(start(config), gyro, accel, BASE, SLOPE)
+    program(config)(state, gyro, accel, BASE, SLOPE)
+    assert program(config)._cache_size() == 1  # a state that a run leaves compiles nothing
     wanted = by_hand(config, CUTS[window_rotation], gyro, accel)
     assert np.nansum(wanted["accepted"]) > 5
     for name in ("accepted", "gate_passed"):
@@ -101,14 +105,9 @@ def test_windows_are_cut_with_the_state_of_the_filter(window_rotation, context, 
         )  # the network is float32
     std = ROOT_SCALE * np.exp(np.maximum(-2.0 + 0.1 * wanted["displacement"], -4.0))
     np.testing.assert_allclose(history.measurement_std, std, rtol=1e-5)
-    np.testing.assert_allclose(
-        history.diagnostics["gate"], np.tanh(wanted["displacement"]), atol=3e-6
-    )
-    assert history.diagnostics["attention"].shape == (INTERVALS, 2, 3)
-    assert (
-        np.isnan(history.diagnostics["attention"][:first]).all()
-        and (history.diagnostics["attention"][first:] == 1).all()
-    )
+    gate, attention = (np.asarray(history.diagnostics[name]) for name in ("gate", "attention"))
+    np.testing.assert_allclose(gate, np.tanh(wanted["displacement"]), atol=3e-6)
+    assert np.isnan(attention[:first]).all() and (attention[first:] == 1).all()
     if window_rotation == "tlio":  # each of the three differences is large enough to be seen
         for cut in [(0, False, True), (1, True, True), (1, False, False)]:
             other = by_hand(config, cut, gyro, accel)["displacement"]
@@ -116,11 +115,12 @@ def test_windows_are_cut_with_the_state_of_the_filter(window_rotation, context, 
 
 
 def test_given_its_own_measurements_the_filter_repeats_itself_and_is_smoothed():
-    """With `history.given`, which takes the factors of the axes off again."""
+    """With `history.given`, which takes the factors of the axes off again. The network's log
+    standard deviation is raised to a floor."""
     gyro, accel = recording(1)
-    final, history = program(CONFIG)(start(), gyro, accel, BASE, SLOPE)
+    final, history = program(CONFIG)(start(CONFIG), gyro, accel, BASE, SLOPE)
     fixed = CONFIG, NOISE, None, CONFIG.displacement_frame
-    given = start(), gyro, accel, *history.given(NOISE)
+    given = start(CONFIG), gyro, accel, *history.given(NOISE)
     again_final, again = filtering.run_filter(*given, *fixed)
     assert again.diagnostics == {}
     for wanted, found in [(history._replace(diagnostics={}), again), (final, again_final)]:
@@ -129,17 +129,11 @@ def test_given_its_own_measurements_the_filter_repeats_itself_and_is_smoothed():
     np.testing.assert_allclose(smoothed.position[-1], final.position, atol=1e-10)
     variances = history.covariance_diagonal[-1]
     np.testing.assert_allclose(smoothed.covariance_diagonal[-1], variances, rtol=1e-6)
-    assert np.abs(smoothed.position[CLONES] - history.position[CLONES]).max() > 1e-6
-
-
-def test_log_std_is_raised_to_its_floor():
-    gyro, accel = recording(1)
-
+    assert np.abs(smoothed.position[FIRST] - history.position[FIRST]).max() > 1e-6
     sure = np.array([-9.0, -4.5, 1.0], np.float32), np.float32(0.0)
-    _, history = program(CONFIG)(start(), gyro, accel, *sure)
-    np.testing.assert_allclose(
-        history.measurement_std[-1], ROOT_SCALE * np.exp([-4.0, -4.0, 1.0]), rtol=1e-12
-    )
+    _, history = program(CONFIG)(start(CONFIG), gyro, accel, *sure)
+    floor = np.exp([-4.0, -4.0, 1.0])
+    np.testing.assert_allclose(history.measurement_std[-1], ROOT_SCALE * floor, rtol=1e-12)
 
 
 def test_vmap_keeps_the_branch_and_equals_single():
@@ -151,17 +145,15 @@ def test_vmap_keeps_the_branch_and_equals_single():
         return predict(windows)
 
     def run(gyro, accel):
-        return filtering.run_odometry(counting, start(), gyro, accel, CONFIG, NOISE)
+        return filtering.run_odometry(counting, start(CONFIG), gyro, accel, CONFIG, NOISE)
 
-    many = jax.jit(jax.vmap(run))(*signals)
+    many = jax.device_get(jax.jit(jax.vmap(run))(*signals))
     jax.effects_barrier()
-    assert len(calls) in (
-        INTERVALS - CLONES,
-        2 * (INTERVALS - CLONES),
-    )  # once a step (or once a sequence), never before there is a window
-    many = jax.device_get(many)  # indexed in JAX, every leaf would be two programs
+    # once a step (or once a sequence), never before there is a window
+    assert len(calls) in (INTERVALS - FIRST, 2 * (INTERVALS - FIRST))
     for index in range(2):
-        one = program(CONFIG)(start(), *(signal[index] for signal in signals), BASE, SLOPE)
+        given = (signal[index] for signal in signals)
+        one = program(CONFIG)(start(CONFIG), *given, BASE, SLOPE)
         jax.tree.map(
             lambda a, b, index=index: np.testing.assert_allclose(a[index], b, atol=3e-6), many, one
         )
@@ -169,7 +161,7 @@ def test_vmap_keeps_the_branch_and_equals_single():
 
 def test_predict_is_asked_for_what_it_must_return():
     gyro, accel = recording(0)
-    good = predict(jnp.zeros((1, N * CLONES, 6), jnp.float32))
+    good = predict(jnp.zeros((1, CONFIG.seen, 6), jnp.float32))
     for bad in (
         (good.displacement, good.log_std),
         good._replace(displacement=good.displacement[0]),
@@ -177,4 +169,6 @@ def test_predict_is_asked_for_what_it_must_return():
         good._replace(diagnostics={"gate": jnp.zeros(3)}),
     ):
         with pytest.raises(ValueError, match=r"^predict: "):
-            filtering.run_odometry(lambda _, bad=bad: bad, start(), gyro, accel, CONFIG, NOISE)
+            filtering.run_odometry(
+                lambda _, bad=bad: bad, start(CONFIG), gyro, accel, CONFIG, NOISE
+            )

@@ -5,9 +5,7 @@ from scipy.spatial.transform import Rotation
 
 from gnio_jax import filtering
 
-N, CLONES, INTERVALS, DT = 4, 4, 26, 0.02
-
-CONFIG = filtering.FilterConfig(DT, N, CLONES, convergence_seconds=0.6)
+N, INTERVALS, DT = 4, 20, 0.02
 
 PARAMETERS = np.random.default_rng(5).standard_normal((6, 3)) * 0.02
 
@@ -22,21 +20,8 @@ def recording(seed):
     return gyro, accel
 
 
-def start(config=CONFIG):
+def start(config):
     rotation = Rotation.from_euler("xyz", [0.3, -0.2, 1.0]).as_matrix()
     return filtering.initial_state(
         config, rotation, np.array([0.5, 0.0, 0.0]), np.zeros(3), np.array([0.02, -0.01, 0.03]), 0.1
     )
-
-
-def central(function, x, step):
-    x = np.asarray(x, float)
-    out = np.empty(x.size)
-    for i in range(x.size):
-        e = np.zeros(x.size)
-        e[i] = step
-        out[i] = (function(x + e.reshape(x.shape)) - function(x - e.reshape(x.shape))) / (2 * step)
-    return out.reshape(x.shape)
-
-
-WEIGHTS = np.random.default_rng(3).standard_normal((INTERVALS, 3))
