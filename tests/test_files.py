@@ -12,11 +12,9 @@ def test_a_folder_is_replaced_whole_or_not_at_all(tmp_path):
     with pytest.raises(RuntimeError), replacing_folder(folder) as new:
         (new / "a").write_text("2")
         raise RuntimeError
-    assert (folder / "a").read_text() == "1" and [p.name for p in folder.parent.iterdir()] == [
-        "result"
-    ]
+    assert (folder / "a").read_text() == "1"
+    assert [path.name for path in folder.parent.iterdir()] == ["result"]
     with replacing_folder(folder) as new:
         (new / "b").write_text("3")
-    assert [p.name for p in folder.iterdir()] == ["b"] and [
-        p.name for p in folder.parent.iterdir()
-    ] == ["result"]
+    assert [path.name for path in folder.iterdir()] == ["b"]
+    assert [path.name for path in folder.parent.iterdir()] == ["result"]

@@ -1,13 +1,11 @@
-"""CTIN against a plain NumPy forward pass of the whole network, and its causality."""
+"""CTIN against a plain NumPy forward pass of the whole network, causality included."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 from gnio_jax import models
-from gnio_jax.models import ctin, heads
-from tests.support.compiling import quick
-from tests.support.networks import SMALL, drawn, shapes
+from gnio_jax.models import heads
+from tests.support.networks import SMALL, drawn, predicted, shapes
 from tests.support.numpy_layers import (
     attention,
     batch_norm,
@@ -87,38 +85,20 @@ def numpy_forward(variables, windows):
 def test_forward_against_numpy():
     model = models.create("ctin", **OPTIONS)
     variables = drawn(shapes("ctin", 11, **OPTIONS), size=0.4)
-    windows = jax.random.normal(jax.random.key(1), (2, 11, 6), jnp.float32)
-    found, (velocity, log_std) = (
-        quick(model.apply)(variables, windows),
-        numpy_forward(variables, windows),
-    )
+    windows = np.random.default_rng(6).standard_normal((2, 11, 6)).astype(np.float32)
+    velocity, log_std = numpy_forward(variables, windows)
     for values in (velocity[..., :2], log_std[..., :2]):  # windows and steps are told apart
         assert np.ptp(values, axis=0).max() > 0.1 and np.ptp(values, axis=1).min() > 0.05
     task = variables["params"]["task_log_std"]
-    for ours, wanted in (
-        (found.diagnostics["velocity"], velocity),
-        (found.diagnostics["velocity_log_std"], log_std),
-        (found.diagnostics["task_log_std"], np.stack([task, task])),
-        (found.displacement, velocity.mean(axis=1)),
-        (found.log_std, 0.5 * np.log(np.mean(np.exp(2 * log_std), axis=1))),
-    ):
-        np.testing.assert_allclose(ours, wanted, rtol=1e-3, atol=1e-4)
-
-
-def test_a_decoded_step_depends_on_no_later_one():
-    layer = ctin.DecoderLayer(2, 10, 0.0)
-    x, memory = np.random.default_rng(0).standard_normal((2, 1, 9, 12)).astype(np.float32)
-    key = jax.random.key(0)
-    init = lambda key, x, memory: layer.init(key, x, memory, False)  # noqa: E731
-    variables = drawn(jax.eval_shape(init, key, x, memory), size=0.4)
-    program = quick(lambda x, memory: layer.apply(variables, x, memory, False))
-    apply = lambda x, memory: np.asarray(program(x, memory))  # noqa: E731
-    later, last = (np.float32(np.arange(9) == row)[None, :, None] for row in (5, 8))
-    still, changed = apply(x, memory), apply(x + later, memory)
-    np.testing.assert_array_equal(still[:, :5], changed[:, :5])
-    assert (np.abs(still - changed)[:, 5:].max(axis=-1) > 1e-4).all()  # and every later one does
-    # The encoder is seen whole.
-    assert (np.abs(still - apply(x, memory + last)).max(axis=-1) > 1e-5).all()
+    for found in predicted(model, variables, windows):
+        for ours, wanted in (
+            (found.diagnostics["velocity"], velocity),
+            (found.diagnostics["velocity_log_std"], log_std),
+            (found.diagnostics["task_log_std"], np.stack([task, task])),
+            (found.displacement, velocity.mean(axis=1)),
+            (found.log_std, 0.5 * np.log(np.mean(np.exp(2 * log_std), axis=1))),
+        ):
+            np.testing.assert_allclose(ours, wanted, rtol=1e-3, atol=1e-4)
 
 
 def test_the_mean_of_variances_does_not_overflow():

@@ -5,6 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from gnio_jax import models
+from gnio_jax.models.layers import EPSILON
+from tests.support.compiling import quick
 
 SMALL = {
     "ctin": {"width": 12, "encoder_width": 8, "ffn": 10, "heads": 2, "decoder_layers": 2},
@@ -52,3 +54,21 @@ def drawn(tree, seed=3, size=None):
         return jnp.asarray(values, jnp.float32)
 
     return jax.tree.map_with_path(draw, tree)
+
+
+def predicted(model, variables, windows):
+    """What a network predicts: as it is, and made ready for inference, with its normalisations
+    folded. One program, unless it has constants."""
+    frozen, program = models.inference_variables(model, variables), quick(models.Inference(model))
+    for path, leaf in jax.tree.leaves_with_path(frozen.variables["batch_stats"]):
+        if path[-1].key in ("mean", "var"):
+            folded = np.float32(0 if path[-1].key == "mean" else 1 - EPSILON)
+            np.testing.assert_array_equal(leaf, folded, err_msg=str(path))
+    plain = models.InferenceVariables(variables, {})
+    given = [plain, frozen]
+    if frozen.constants:  # they are used, not computed again
+        given.append(frozen._replace(constants=jax.tree.map(lambda x: 2 * x, frozen.constants)))
+    found = [jax.device_get(program(each, jnp.asarray(windows))) for each in given]
+    for other in found[2:]:
+        assert np.abs(other.displacement - found[1].displacement).max() > 1e-3
+    return found[:2]

@@ -10,10 +10,13 @@ import jax
 import numpy as np
 import pytest
 
+from gnio_jax import data
 from gnio_jax.config import DataConfig, ModelConfig, OptimConfig, TrainConfig
+from gnio_jax.data import windows
 from gnio_jax.models import registry
 from gnio_jax.training import checkpoint, loop
 from tests.support import drawn_run
+from tests.support.numpy_layers import batch_norm, float64, linear
 from tests.support.tiny_network import Tiny
 
 
@@ -56,6 +59,24 @@ def config(root, workdir, **changes):
     return dataclasses.replace(found, **rest)
 
 
+GATHER = jax.jit(windows.gather, static_argnums=2)
+
+
+def mean_square_error(run, walk):
+    """Of the displacements that a run's network predicts for every window of a walk, m², in plain
+    NumPy."""
+    walk = data.resample(walk, 50.0)
+    source = jax.device_put(windows.window_source([walk], run.config.data, 5))
+    which = np.arange(source.start.shape[0], dtype=np.int32)
+    assert len(which) % 16 != 0  # so that the filled-up last batch is part of the test
+    every = jax.device_get(GATHER(source, which, 50))
+    params, statistics = float64(run.variables)
+    h = np.float64(every.imu).mean(axis=1) @ params["encoder"]["kernel"]
+    h = np.tanh(batch_norm(h, params["norm"], statistics["norm"]))
+    error = linear(h, params["head"]) - every.displacement
+    return np.mean(np.sum(error**2, axis=1))
+
+
 def rows(workdir):
     """The log of a run, without what the clock says."""
     lines = (Path(workdir) / "metrics.jsonl").read_text().splitlines()
@@ -82,6 +103,14 @@ def assert_same_runs(workdir, other):
         assert same(arrays(workdir, which), arrays(other, which)), which
     for ours, theirs in zip(rows(workdir), rows(other), strict=True):
         assert ours == pytest.approx(theirs, rel=1e-6)
+
+
+def age(run):
+    """Make the checkpoints of a run those of an earlier version."""
+    for file in Path(run).glob("checkpoints/*/*/meta/metadata"):
+        meta = json.loads(file.read_text())
+        assert meta.pop("version") == checkpoint.VERSION
+        file.write_text(json.dumps(meta))
 
 
 @contextlib.contextmanager

@@ -1,56 +1,36 @@
-"""Operations of the networks against a count by hand."""
+"""What the networks cost, on paper and measured."""
 
 import math
 
 import jax
 import pytest
+from flax import linen as nn
 
 from gnio_jax import models
+from gnio_jax.models.layers import linear
 from gnio_jax.reporting import Lines
 from gnio_jax.tables import make
-from tests.support.tiny_network import Tiny
+from gnio_jax.types import Prediction
 
 
-def multiply_adds(convolutions, dense, padding):
-    """By hand: every output of a convolution costs its kernel, with or without its taps in the
-    padding, every dense layer its matrix."""
-    total = sum(i * o for i, o in dense)
-    for length, stride, size, i, o in convolutions:
-        for output in range(-(-length // stride)):
-            first = output * stride - size // 2
-            total += sum(padding or 0 <= first + tap < length for tap in range(size)) * i * o
-    return total
+class Flat(nn.Module):
+    """One product of every sample with 16 rows."""
+
+    @nn.compact
+    def __call__(self, windows, train=False):
+        both = linear(16, "all")(windows.reshape(windows.shape[0], -1))
+        return Prediction(both[:, :3], both[:, 3:6])
 
 
-def encoder():
-    """(length of the input, stride, kernel, channels in, out) of each convolution; 200 samples."""
-    layers, before, length = [(200, 2, 7, 6, 64)], 64, 50
-    for group, width in enumerate((64, 128, 256, 512)):
-        stride = 2 if group else 1
-        layers.append((length, stride, 3, before, width))
-        if group:
-            layers.append((length, stride, 1, before, width))
-        length = -(-length // stride)
-        layers += [(length, 1, 3, width, width)] * 3
-        before = width
-    return layers
-
-
-def test_complexity_of_gnio_against_a_hand_count():
-    dense = [(512, 512), (512, 64), (512, 64), (512, 512), *[(512, 3)] * 3]
-    padded, by_hand = (multiply_adds(encoder(), dense, padding) for padding in (True, False))
-    assert padded == pytest.approx(37.4e6, rel=2e-3)
-    found = make.measure("gnio", batches=(1,), seconds=0.05)
-    assert found.parameters == 4_934_153
-    # Additions, ReLUs and the like besides.
-    assert 1e9 * found.gflops == pytest.approx(2 * by_hand, rel=0.02)
-    assert found.latency[0] > 0
-
-
-def test_a_compiler_that_counts_nothing_leaves_the_figure_out(monkeypatch):
+def test_cost_of_a_network_by_hand(monkeypatch):
+    monkeypatch.setattr(models, "create", lambda name: Flat())
+    found = make.measure("flat", batches=(1, 2), seconds=0.01)
+    assert found.parameters == 1200 * 16 + 16
+    assert 1e9 * found.gflops == pytest.approx(2 * 1200 * 16, rel=0.01)
+    assert len(found.latency) == 2 and min(found.latency) > 0
+    # A compiler that counts nothing leaves the figure out.
     monkeypatch.setattr(jax.stages.Compiled, "cost_analysis", lambda self: {"bytes": 1.0})
-    monkeypatch.setattr(models, "create", lambda name: Tiny())
-    assert math.isnan(make.measure("tiny", batches=(1,), seconds=0.05).gflops)
+    assert math.isnan(make.measure("flat", batches=(1,), seconds=0.01).gflops)
 
 
 def test_the_table_names_every_network(tmp_path, monkeypatch):

@@ -1,8 +1,6 @@
 """Training through the filter, with a network of one layer on walks of a few seconds."""
 
 import dataclasses
-import functools
-import json
 import shutil
 import signal
 from contextlib import nullcontext
@@ -19,6 +17,7 @@ from gnio_jax.commands.train import experiment, train
 from gnio_jax.config import (
     CorrelatedError,
     DataConfig,
+    EvaluateConfig,
     FilterSettings,
     InitialStd,
     ModelConfig,
@@ -28,14 +27,14 @@ from gnio_jax.config import (
     TrainConfig,
 )
 from gnio_jax.errors import InputError
+from gnio_jax.evaluation.evaluate import resolve
 from gnio_jax.filtering.settings import with_free_parameters
 from gnio_jax.reporting import Silence
-from gnio_jax.training import checkpoint, filter_task, loop, optimizer, task
+from gnio_jax.training import checkpoint, loop, optimizer, task
 from gnio_jax.training.filter_task import FilterTask
+from gnio_jax.training.task import TrainState
 from gnio_jax.training.window_task import WindowTask
 from tests.support import tiny_run
-from tests.support.command_lines import run as gnio
-from tests.support.compiling import quick
 from tests.support.filter_settings import changed
 from tests.support.tiny_run import rows, same
 from tests.support.tlio_files import SPEED, TURN, write_splits
@@ -58,14 +57,6 @@ THROUGH = ThroughFilter(
 )
 
 THROUGH_FILTER = TrainConfig(filter=OPTIONS, through_filter=THROUGH)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def truncated():
-    """The gradient is cut within a segment."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(filter_task, "TRUNCATE_SECONDS", 1.0)
-        yield
 
 
 @pytest.fixture(scope="module")
@@ -144,13 +135,8 @@ def test_stopped_and_resumed_gives_the_same_bits(recording, finished, tmp_path):
 
 
 def test_evaluation_takes_what_the_filter_has_learnt(finished):
-    """By the checkpoint that is asked for."""
-    given = ("--split", "val", "--estimator", "imu_only", "--no-plots", "--checkpoint", "latest")
-    gnio("evaluate", "--workdir", str(finished), *given)
-    metrics = finished / "eval" / "tlio_val_imu_only_latest" / "metrics.json"
-    learnt = configuration.plain(checkpoint.load_run(finished, "latest").config.filter)
-    assert json.loads(metrics.read_text())["settings"]["filter"] == learnt
-    assert learnt["noise"]["gyro_density"] != OPTIONS.noise.gyro_density
+    learnt = checkpoint.load_run(finished, "latest").config
+    assert resolve(EvaluateConfig(str(finished)), learnt).filter == learnt.filter != OPTIONS
 
 
 def test_a_copy_with_other_options_has_them(finished, tmp_path):
@@ -170,12 +156,8 @@ def test_a_copy_with_other_options_has_them(finished, tmp_path):
 
 def test_what_an_earlier_version_has_trained_is_told(finished, tmp_path):
     """The filter's numbers had other names then."""
-    run = tmp_path / "run"
-    shutil.copytree(finished, run)
-    for file in run.glob("checkpoints/best/*/meta/metadata"):
-        meta = json.loads(file.read_text())
-        del meta["version"]
-        file.write_text(json.dumps(meta))
+    run = shutil.copytree(finished, tmp_path / "run")
+    tiny_run.age(run)
     with pytest.raises(InputError, match=r"is of an earlier version of .*; train it again from"):
         checkpoint.load_run(run)
 
@@ -247,30 +229,27 @@ def test_wild_steps_are_skipped_and_counted(training, start):
     assert loop.mean_figures({"loss": 6.0, "skipped": 2.0}, 5) == {"loss": 2.0, "skipped": 2}
 
 
-@pytest.mark.parametrize(
-    "number, healthy, total, skipped",
-    [(1, True, 1.0, 0), (2, False, 1.0, 1), (3, True, np.inf, 1)],
-)
 def test_a_step_is_skipped_where_the_filter_diverged_or_the_loss_is_infinite(
-    training, start, monkeypatch, number, healthy, total, skipped
+    training, start, monkeypatch
 ):
-    """Whatever its gradient."""
+    """Whatever its gradient: the filter diverges in step 1, the loss is infinite in step 2."""
     training, source = training
 
-    def found(trained, variables, *_):
-        figures = dict.fromkeys(FilterTask.figures, jnp.float64(0)) | {"loss": jnp.float64(total)}
+    def found(trained, variables, batch, step, task_):
+        loss = jnp.where(step == 2, jnp.inf, jnp.float64(1))
+        figures = dict.fromkeys(FilterTask.figures, jnp.float64(0)) | {"loss": loss}
         gradient = jax.tree.map(jnp.ones_like, trained)
-        statistics = variables["batch_stats"]
-        return gradient, task.BatchLosses(figures, statistics, jnp.bool_(healthy))
+        return gradient, task.BatchLosses(figures, variables["batch_stats"], step != 1)
 
     monkeypatch.setattr(task, "gradient_of", found)
-    optim = dataclasses.replace(training.config.optim, epochs=100 + number)  # compiled for itself
+    optim = dataclasses.replace(training.config.optim, epochs=100)  # compiled for itself
     other = dataclasses.replace(training, config=dataclasses.replace(training.config, optim=optim))
-    state = begun(training, start)
-    before = jax.tree.map(np.array, (state.variables, state.opt_state))
-    state, progress = take(other, state, source, 0)
-    assert progress.sums["skipped"] == skipped
-    assert same(before, (state.variables, state.opt_state)) == bool(skipped)
+    for number, skipped in ((0, 0), (1, 1), (2, 1)):
+        state = begun(training, start)._replace(step=jnp.int32(number))
+        before = jax.tree.map(np.array, (state.variables, state.opt_state))
+        state, progress = take(other, state, source, 0)
+        assert progress.sums["skipped"] == skipped
+        assert same(before, (state.variables, state.opt_state)) == bool(skipped)
 
 
 def test_a_skipped_step_does_not_shift_the_schedule(training, start):
@@ -335,40 +314,47 @@ def test_noise_is_recovered(training, start):
             assert ratio > 1.2 if share > 1 else ratio < 0.8, (name, share, ratio)
 
 
-def test_gradient_against_differences(training, start, monkeypatch):
-    """Without truncation; by a number of each kind and a weight of the network."""
+def test_gradient_against_differences(training, start):
+    """Of each number of the filter and of a weight of the network, in a step as a run takes it;
+    after one step Adam's first moment is a tenth of the gradient."""
     training, source = training
-    assert training.softened().truncate_every == 10
-    monkeypatch.setattr(filter_task, "TRUNCATE_SECONDS", 2.0)
-    through = dataclasses.replace(THROUGH, learn=("all",))
-    config = dataclasses.replace(training.config, through_filter=through)
-    state = begun(training, start)
-    of_all = dataclasses.replace(training, config=config)
-    segments = jax.jit(of_all.segments, static_argnums=3)
-    batch = segments(jax.random.key(5), source, source.earliest[:2], False)
-    chosen = optimizer.trainable(state.variables, through.learn)
-    # The network computes in float32 whatever it is given.
-    chosen["filter"] = {name: jnp.float64(number) for name, number in chosen["filter"].items()}
-    evaluated = quick(functools.partial(task.gradient_of, step=jnp.int32(0), task=of_all))
-    gradient, found = evaluated(chosen, state.variables, batch)
-    assert bool(found.healthy) and np.isfinite(found.figures["loss"])
-    places = [(("filter", name), (), 1e-4, 1e-4) for name in sorted(chosen["filter"])]
-    places += [(("params", "head", "bias"), (0,), 3e-3, 1e-2)]
-    for path, index, step, tolerance in places:
+    begin = begun(training, start)
 
-        def at(value, path=path, index=index):
-            moved = jax.tree_util.tree_map_with_path(
-                lambda place, leaf: (
-                    leaf.at[index].add(value) if tuple(key.key for key in place) == path else leaf
-                ),
-                chosen,
-            )
-            return float(evaluated(moved, state.variables, batch)[1].figures["loss"])
+    def taken(name="", by=0.0):
+        """The step with one number moved."""
 
-        slope = functools.reduce(lambda tree, key: tree[key], path, gradient)[index]
-        expected = (at(step) - at(-step)) / (2 * step)
-        assert expected != 0, path
-        np.testing.assert_allclose(slope, expected, rtol=tolerance, atol=1e-7, err_msg=str(path))
+        def moved(path, leaf):
+            leaf = np.array(leaf)
+            if name_of(path) == name:
+                leaf.flat[0] += np.float32(by)
+            return jax.device_put(leaf)
+
+        variables = jax.tree_util.tree_map_with_path(moved, begin.variables)
+        others = jax.tree.map(parallel.fresh_copy, (begin.step, begin.opt_state))
+        state, progress = take(training, TrainState(others[0], variables, others[1]), source, 0)
+        assert progress.sums["skipped"] == 0
+        return state, float(progress.sums["loss"])
+
+    moments = {
+        name_of(path).partition("/mu/")[2]: np.asarray(leaf).flat[0]
+        for path, leaf in jax.tree_util.tree_leaves_with_path(taken()[0].opt_state)
+    }
+    names = [f"filter/{name}" for name in begin.variables["filter"]]
+    assert len(names) == 15
+    for name in [*names, "params/head/bias"]:
+        step = 1e-3
+        expected = (taken(name, step)[1] - taken(name, -step)[1]) / (2 * step)
+        assert expected != 0, name
+        np.testing.assert_allclose(10 * moments[name], expected, 1e-3, 1e-6, err_msg=name)
+
+
+def name_of(path):
+    return jax.tree_util.keystr(path, simple=True, separator="/")
+
+
+def test_the_filter_in_training_has_a_slope_at_its_gate_and_its_gradient_is_cut(training):
+    found = training[0].softened()
+    assert (found.gate_softness, found.checkpoint_every, found.truncate_every) == (2.0, 20, 100)
 
 
 @pytest.mark.parametrize(
