@@ -51,7 +51,6 @@ LONGEST = (
     "test_installed.py",
     "tables/test_make.py",
     "training/test_through_filter.py",
-    "calibration/test_fit.py",
     "calibration/test_calibrate.py",
     "data/readers/test_oxiod.py",
     "filtering/test_derivatives.py",

@@ -1,30 +1,63 @@
-"""A calibrated run: what is written, what is refused, and what evaluation makes of it."""
+"""A calibrated run: what is written, what is refused, and what is fitted to what: settings against
+the noises that simulated walks were made with, consider covariances against the errors that
+positions were drawn with, the gradient against differences.
+
+Fits and calibrations here are of walks, windows and settings of one shape: each of their programs
+is compiled once.
+"""
 
 import dataclasses
+import functools
 import json
+import re
 import shutil
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
-from gnio_jax import calibration, data
+from gnio_jax import calibration, data, filtering, models
 from gnio_jax.calibration import evidence
+from gnio_jax.calibration import fit as fitting
 from gnio_jax.calibration import run as calibrating
-from gnio_jax.calibration.fit import std_factors
+from gnio_jax.calibration.fit import (
+    CONSIDERED,
+    GROUPS,
+    Positions,
+    filtered_positions,
+    fit_considered,
+    fit_innovations,
+    innovation_config,
+    start_of_fit,
+    std_factors,
+    unphysical,
+)
 from gnio_jax.commands import app
-from gnio_jax.config import CalibrateConfig, DataConfig, ModelConfig, TrainConfig, plain
+from gnio_jax.config import (
+    CalibrateConfig,
+    CorrelatedError,
+    DataConfig,
+    FilterSettings,
+    ModelConfig,
+    TrainConfig,
+    plain,
+)
 from gnio_jax.data.simulated import walks as simulated
 from gnio_jax.errors import InputError
 from gnio_jax.evaluation import Displacements, Estimate, Trajectory
+from gnio_jax.evaluation.estimate import Inputs
+from gnio_jax.evaluation.prepare import Start
+from gnio_jax.filtering.settings import free_parameters
+from gnio_jax.filtering.state import GYRO_BIAS
 from gnio_jax.training import checkpoint
 from tests.support import tiny_run
 from tests.support.filter_settings import changed
+from tests.support.walks import simulate, with_correlated_errors
 
+DATA = DataConfig(rate=50.0, window_seconds=0.4, stride_seconds=0.1)
+WALKS, STRIDES, N, CLONES, SIGMA = 4, 200, 5, 4, 0.05
 TRAINED = TrainConfig(
-    data=DataConfig(rate=50.0),
+    data=DATA,
     model=ModelConfig(name="tiny", width=4),
     filter=changed(start={"velocity": 0.7}),
 )
@@ -36,28 +69,26 @@ def run(tmp_path_factory):
         yield tiny_run.save(tmp_path_factory.mktemp("trained") / "run", TRAINED)
 
 
-@pytest.fixture(autouse=True)
-def few_steps(monkeypatch):
-    """What the search finds is told elsewhere; here it only has to have run."""
-    monkeypatch.setattr(calibrating, "MOST_STEPS", 2)
-
-
 @pytest.fixture
-def two_walks(monkeypatch):
-    """Every split has two short walks; the splits that were read."""
-    walks = [simulated.pedestrian(seed, seed, "handheld", 14.0, 50.0) for seed in (1, 2)]
-    read = []
+def splits_read(monkeypatch):
+    """Every split has short walks; the splits that were read."""
+    seconds = STRIDES * DATA.stride_seconds
+    seeds, read = range(1, WALKS + 1), []
+    walks = [simulated.pedestrian(seed, seed, "handheld", seconds, 50.0) for seed in seeds]
     monkeypatch.setattr(data, "load", lambda name, root, split, *_: read.append(split) or walks)
     return read
 
 
-def test_the_run_differs_in_the_filter_and_its_average_alone(run, two_walks, tmp_path, capsys):
+def test_the_run_differs_in_the_filter_and_its_average_alone(
+    run, splits_read, tmp_path, capsys, monkeypatch
+):
+    monkeypatch.setattr(calibrating, "MOST_STEPS", 2)  # what the search finds is told below
     out = tmp_path / "calibrated"
     words = ["calibrate", "--workdir", str(run), "--out", str(out), "--average-headings"]
-    app.main([*words, "--fit", "measurement", "window"])
+    app.main([*words, "--fit", "measurement", "noise", "window"])
     told = capsys.readouterr().out
     assert "noise.std_factor" in told and f"gnio evaluate --workdir {out}" in told
-    assert two_walks == ["val"]
+    assert splits_read == ["val"]
     before, after = (checkpoint.load_run(folder) for folder in (run, out))
     assert after.config.model.equivariance == "four_headings"
     same = {name: getattr(before.config, name) for name in ("workdir", "filter", "model")}
@@ -65,7 +96,6 @@ def test_the_run_differs_in_the_filter_and_its_average_alone(run, two_walks, tmp
     jax.tree.map(np.testing.assert_array_equal, after.variables, before.variables)
     found = after.config.filter
     assert found.start == TRAINED.filter.start
-    assert found.noise.gyro_density == TRAINED.filter.noise.gyro_density
     assert found.noise.correlation.share > 0 and found.noise.std_factor[0] != 1
     about = json.loads((out / "calibration.json").read_text())
     likelihood = about["negative_log_likelihood_per_innovation"]
@@ -77,23 +107,9 @@ def test_the_run_differs_in_the_filter_and_its_average_alone(run, two_walks, tmp
 
 
 def test_the_network_is_averaged_over_four_headings(run):
-    asked = CalibrateConfig(str(run), average_headings=True)
-    plain = evidence.load_run(run, CalibrateConfig(str(run)))
-    averaged = evidence.load_run(run, asked)
+    averaged = evidence.load_run(run, CalibrateConfig(str(run), average_headings=True))
     assert averaged.config.model.equivariance == "four_headings"
-    jax.tree.map(np.testing.assert_array_equal, averaged.variables, plain.variables)
-    windows = np.random.default_rng(0).normal(size=(1, 50, 6)).astype(np.float32)
-    predict, answers = jax.jit(plain.model.apply), []
-    for quarter in range(4):
-        turn = np.float32(Rotation.from_euler("z", 90 * quarter, degrees=True).as_matrix())
-        turned = (windows.reshape(1, 50, 2, 3) @ turn.T).reshape(1, 50, 6)
-        answers.append(predict(plain.variables, jnp.asarray(turned)).displacement @ turn)
-    np.testing.assert_allclose(
-        jax.jit(averaged.model.apply)(averaged.variables, jnp.asarray(windows)).displacement,
-        np.mean(answers, axis=0),
-        rtol=1e-4,
-        atol=1e-6,
-    )
+    assert averaged.model == models.from_config(averaged.config.model)
 
 
 @pytest.mark.parametrize(
@@ -105,11 +121,9 @@ def test_the_network_is_averaged_over_four_headings(run):
 )
 def test_a_network_that_cannot_be_averaged(run, model, augment, problem):
     loaded = checkpoint.load_run(run)
-    config = dataclasses.replace(
-        loaded.config,
-        model=dataclasses.replace(loaded.config.model, **model),
-        augment=dataclasses.replace(loaded.config.augment, **augment),
-    )
+    model = dataclasses.replace(loaded.config.model, **model)
+    augment = dataclasses.replace(loaded.config.augment, **augment)
+    config = dataclasses.replace(loaded.config, model=model, augment=augment)
     with pytest.raises(InputError, match=f"the run.*{problem}"):
         checkpoint.averaged_over_headings(loaded._replace(config=config), "the run")
 
@@ -122,13 +136,13 @@ def test_a_network_that_cannot_be_averaged(run, model, augment, problem):
         ({"fit": ()}, "--fit: names nothing; name some of measurement, noise"),
     ],
 )
-def test_what_is_refused(run, two_walks, options, problem):
+def test_what_is_refused(run, splits_read, options, problem):
     with pytest.raises(InputError, match=problem):
         calibration.calibrate(CalibrateConfig(workdir=str(run), **options))
-    assert two_walks == []
+    assert splits_read == []
 
 
-def test_a_calibrated_run_is_not_calibrated_again(run, two_walks, tmp_path):
+def test_a_calibrated_run_is_not_calibrated_again(run, tmp_path):
     shutil.copytree(run, tmp_path / "run")
     (tmp_path / "run" / "calibration.json").write_text("{}")
     with pytest.raises(InputError, match="is a calibrated run; calibrate the run that it was"):
@@ -169,60 +183,273 @@ def fold_runs(run, tmp_path_factory):
     folders, loaded, parent = [], checkpoint.load_run(run), tmp_path_factory.mktemp("folds")
     for fold in (0, 1):
         windows = dataclasses.replace(loaded.config.data, train_split=f"train-{fold}of2")
-        folders.append(
-            tiny_run.save(
-                parent / f"fold{fold}",
-                dataclasses.replace(loaded.config, data=windows, workdir=None),
-                size=0.2 + fold,
-            )
-        )
-    return [str(folder) for folder in folders]
+        config = dataclasses.replace(loaded.config, data=windows, workdir=None)
+        folders.append(str(tiny_run.save(parent / f"fold{fold}", config, size=0.2 + fold)))
+    return folders
 
 
-def test_each_session_is_judged_by_the_network_that_left_it_out(run, two_walks, fold_runs):
+def test_each_session_is_judged_by_the_network_that_left_it_out(
+    run, splits_read, fold_runs, monkeypatch
+):
+    def asked_about(prepared, network, *_, **__):
+        return [(each.name, network.variables) for each in prepared]
+
+    monkeypatch.setattr(evidence, "estimate", asked_about)
     loaded = checkpoint.load_run(run)
     config = CalibrateConfig(workdir=str(run), out_of_fold=tuple(fold_runs))
     split, asked = evidence.sources(loaded, config)
     found = evidence.gather(split, asked, config, loaded.config.filter, lambda *_: None, 1)
-    assert two_walks == ["train"] and len(found.estimates) == 2
-    walks = data.load("synthetic", None, "train")
-    fold_of = data.folds(walks, 2)
-    assert sorted(fold_of.values()) == [0, 1]
-    for recording, estimate in zip(*found, strict=True):
-        fold = fold_of[recording.group]
-        alone = evidence.Source(asked[fold].run, None)
-        both = evidence.gather("train", [alone], config, loaded.config.filter, lambda *_: None, 1)
-        expected = {p.name: e for p, e in zip(*both, strict=True)}[recording.name]
-        # To rounding: batches of other sizes are other programs. The networks differ by far more.
-        own, wanted = estimate.displacements.value, expected.displacements.value
-        np.testing.assert_allclose(own, wanted, atol=1e-5)
+    assert splits_read == ["train"] and len(found.estimates) == WALKS
+    fold_of = data.folds(data.load("synthetic", None, "train"), 2)
+    assert sorted(set(fold_of.values())) == [0, 1]
+    for recording, (name, variables) in zip(*found, strict=True):
+        of_fold = checkpoint.load_run(fold_runs[fold_of[recording.group]])
+        network = models.Network.of(of_fold.model, of_fold.variables)
+        assert recording.name == name and tiny_run.same(variables, network.variables)
 
 
 @pytest.mark.parametrize(
     ("folders", "split", "problem"),
     [
-        (
-            [0],
-            None,
-            "--out-of-fold: were trained on the splits train-0of2; train one run for each of",
-        ),
+        ([0], None, "--out-of-fold: were trained on the splits train-0of2; train one run for each"),
         ([0, 0], None, "were trained on the splits train-0of2, train-0of2"),
         ([0, 1], "train", "--split train: is of no use with --out-of-fold"),
     ],
 )
 def test_folds_that_do_not_make_a_whole_are_refused(
-    run, two_walks, fold_runs, folders, split, problem
+    run, splits_read, fold_runs, folders, split, problem
 ):
     chosen = tuple(fold_runs[fold] for fold in folders)
     with pytest.raises(InputError, match=problem):
         calibration.calibrate(CalibrateConfig(workdir=str(run), out_of_fold=chosen, split=split))
-    assert two_walks == []
+    assert splits_read == []
 
 
-def test_folds_of_another_experiment_are_refused(run, two_walks, fold_runs):
+def test_folds_of_another_experiment_are_refused(run, fold_runs):
     config = CalibrateConfig(workdir=str(run), out_of_fold=tuple(fold_runs))
     loaded = checkpoint.load_run(run)
     other = dataclasses.replace(loaded.config.model, width=5)
     changed = loaded._replace(config=dataclasses.replace(loaded.config, model=other))
     with pytest.raises(InputError, match="fold0: differs from the calibrated run in 'model'"):
         evidence.sources(changed, config)
+
+
+# What is fitted
+# ------------------------------------------------------------------------------------------------
+
+PATHS = (*GROUPS["measurement"], *GROUPS["noise"], *GROUPS["window"])
+ERRORS = CorrelatedError(0.8, 0.5)
+TRUE = changed(
+    noise={
+        "gyro_density": 2e-3,
+        "accel_density": 2e-2,
+        "measurement_scale": 1.0,
+        "correlation": ERRORS,
+    },
+    start={"gyro_bias": 1e-3},
+)
+
+
+@functools.cache
+def walks_and_truth():
+    """Their displacements err by `SIGMA`, while the network says a third of it, and the true
+    positions after each stride."""
+    noise, std = filtering.NoiseModel(2e-3, 2e-2, 1e-6, 1e-4), filtering.InitialStd(gyro_bias=1e-3)
+    runs = simulate(5, WALKS, STRIDES, N, CLONES, 1 / DATA.rate, noise, std, SIGMA)
+    runs = with_correlated_errors(runs, CLONES, SIGMA, ERRORS, DATA.stride_seconds)
+    std = filtering.InitialStd(*np.ones((6, WALKS)))  # a fit takes that of the settings
+    raw = np.zeros(WALKS, bool)
+    start = Start(*runs[:3], np.zeros((WALKS, 3)), std, raw)
+    given = Displacements(runs.displacement, np.full_like(runs.displacement, SIGMA / 3))
+    return Inputs(start, runs.gyro, runs.accel, None, given), runs.position
+
+
+def fit(walks, settings, **options):
+    return fit_innovations(walks, DATA, settings, PATHS, lambda calls: None, **options)
+
+
+def test_the_noises_and_errors_of_simulated_walks_are_found():
+    wrong = {"gyro_density": 3e-4, "accel_density": 2e-1, "correlation": CorrelatedError(0.5, 1.0)}
+    found = fit(walks_and_truth()[0], changed(TRUE, noise=wrong))
+    noise = found.settings.noise
+    assert found.after < found.before - 0.1
+    assert noise.measurement_scale == pytest.approx(9.0, rel=0.15)
+    assert noise.gyro_density == pytest.approx(2e-3, rel=0.4)
+    assert noise.accel_density == pytest.approx(2e-2, rel=0.4)
+    assert noise.correlation.share == pytest.approx(0.8, abs=0.1)
+    assert noise.correlation.seconds == pytest.approx(0.5, rel=0.4)
+    assert found.warnings == () and found.steps < 60
+
+
+def test_the_gradient_is_that_of_the_likelihood():
+    """Along two directions, in which all of the numbers change."""
+    free = free_parameters(TRUE, PATHS)
+    fixed = {"names": tuple(free), "config": innovation_config(DATA, TRUE)}
+    free, rng = np.array(list(free.values())), np.random.default_rng(0)
+
+    def at(vector):
+        given = vector, walks_and_truth()[0], free, TRUE
+        return jax.device_get(fitting._value_and_gradient(*given, **fixed))
+
+    gradient = np.asarray(at(free)[1])
+    assert (gradient != 0).all()
+    for _ in range(2):
+        step = 1e-4 * rng.uniform(0.5, 1.5, len(free)) * rng.choice([-1.0, 1.0], len(free))
+        ahead, behind = (float(at(free + off)[0][0]) for off in (step, -step))
+        np.testing.assert_allclose(2 * gradient @ step, ahead - behind, rtol=1e-3, atol=1e-11)
+
+
+@pytest.mark.parametrize(("raw", "expected"), [(True, 0.05), (False, 1e-3)])
+def test_a_raw_gyro_keeps_the_wide_start_that_its_walk_was_prepared_with(raw, expected):
+    """Every other walk starts as the settings say, whatever it was prepared with."""
+    settings = dataclasses.replace(TRUE, raw_gyro_bias=0.05)
+    walk = jax.tree.map(lambda leaf: leaf[0], walks_and_truth()[0])
+    walk = walk._replace(start=walk.start._replace(raw_gyro=np.bool_(raw)))
+    _, state, _ = fitting._repeated(walk, settings, innovation_config(DATA, settings))
+    found = np.sqrt(np.diag(state.core_covariance))[GYRO_BIAS]
+    np.testing.assert_allclose(found, expected, rtol=1e-9)
+
+
+def test_a_second_calibration_compiles_nothing_and_a_fit_that_ends_early_is_told():
+    """Of other walks, with other factors of the axes and another start."""
+    given, _ = walks_and_truth()
+    (warning,) = fit(given, TRUE, most_steps=1).warnings
+    assert warning.startswith("the fit stopped after 1 steps, ") and "--fit" in warning
+    options = {f"--{field.name.replace('_', '-')}" for field in dataclasses.fields(CalibrateConfig)}
+    assert set(re.findall(r"--[a-z-]+", warning)) <= options  # no remedy that there is not
+    programs = fitting._value_and_gradient._cache_size()
+    others = given._replace(given=given.given._replace(value=1.01 * given.given.value))
+    settings = changed(TRUE, noise={"std_factor": (0.7, 1.0, 1.0)}, start={"velocity": 0.2})
+    fit(others, settings, most_steps=1)
+    assert programs > 0 and fitting._value_and_gradient._cache_size() == programs
+
+
+def test_values_outside_what_is_physical_are_named():
+    noise = {"accel_bias_walk": 2.656, "correlation": CorrelatedError(0.9999, 5.9e4)}
+    names = ("noise.gyro_density", "noise.accel_bias_walk", "noise.correlation.share")
+    told = unphysical(changed(TRUE, noise=noise), (*names, "noise.correlation.seconds"))
+    assert [line.split(" came out as ")[0] for line in told] == [
+        "filter.noise.accel_bias_walk",
+        "filter.noise.correlation.share",
+        "filter.noise.correlation.seconds",
+    ]
+    assert "5.9e+04, outside 0.05 to 60: these recordings do not determine it" in told[2]
+
+
+def test_what_is_switched_off_and_has_no_start_cannot_be_fitted():
+    off = changed(TRUE, start={"gyro_bias": 0.0})
+    begun = start_of_fit(off, (*GROUPS["noise"], *GROUPS["window"]))
+    assert begun.noise.correlation == CorrelatedError(0.8, 0.5)
+    own = changed(TRUE, noise={"correlation": CorrelatedError(0.3, 0.7)})
+    assert start_of_fit(own, GROUPS["window"]) == own
+    with pytest.raises(InputError, match=r"filter.start.gyro_bias: is 0 .*leave its group out"):
+        start_of_fit(off, GROUPS["start"])
+
+
+def test_a_walk_may_be_filled_up_and_a_filter_that_fails_is_named():
+    given, known = walks_and_truth()[0], STRIDES - 40
+    after = np.arange(N * STRIDES)[:, None] >= N * known
+    nothing = np.arange(STRIDES)[:, None] >= known
+    rows = Displacements(
+        np.where(nothing, np.nan, given.given.value), np.where(nothing, 1.0, given.given.std)
+    )
+    still, falling = [0.0, 0.0, 9.81], [90.0, 0.0, 9.81]  # to 360 m/s, beyond the filter's bound
+    evidences = [
+        fit(
+            given._replace(
+                gyro=np.where(after, 0.0, given.gyro),
+                accel=np.where(after, force, given.accel),
+                given=rows,
+            ),
+            TRUE,
+            most_steps=1,
+        ).before
+        for force in (still, falling)
+    ]
+    np.testing.assert_allclose(*evidences, rtol=1e-9)
+    knock = np.arange(STRIDES * N)[:, None] == 900
+    broken = given._replace(accel=np.where(knock, 1e6, given.accel))
+    with pytest.raises(InputError, match="the filter: fails on these recordings"):
+        fit(broken, TRUE)
+
+
+def test_what_the_errors_were_drawn_with_is_found():
+    rng = np.random.default_rng(0)
+    rows = 4000
+    root = 0.1 * rng.standard_normal((rows, 3, 3)) + 0.3 * np.eye(3)
+    covariance = root @ root.transpose(0, 2, 1)
+    # Metres for a unit of each: bias rad/s, log scale, heading rad, slope.
+    sensitivity = rng.standard_normal((rows, 3, 6)) * [200.0, 200.0, 5.0, 5.0, 5.0, 40.0]
+    wanted = np.array([2e-3, 2e-3, 2e-3, 0.1, np.deg2rad(8.0), 0.01])
+    drawn = np.einsum("kij,kj->ki", root, rng.standard_normal((rows, 3)))
+    error = drawn + np.einsum("kic,kc->ki", sensitivity, wanted * rng.standard_normal((rows, 6)))
+    positions = Positions(error, covariance, sensitivity)
+    options = changed(considered={"scale": 0.7})  # of an earlier calibration
+    found = fit_considered(positions, 0.1, options)
+    assert found.before > 2 and found.after == pytest.approx(1, abs=0.05)
+    np.testing.assert_allclose(
+        found.settings.considered, [2e-3, 0.1, np.deg2rad(8.0), 0.01], rtol=0.1
+    )
+
+
+def test_the_prior_counts_as_many_independent_errors_as_there_are():
+    """Of positions that say nothing of an error: its std stays where the search begins. Of few that
+    do, it lies between that and what they say, as far as Bayes' rule has it."""
+    rows, stride = 4000, 0.01  # 40 s: four independent errors
+    error = np.zeros((rows, 3))
+    error[:, 0] = 0.3 * np.where(np.arange(rows) % 2, 1.0, -1.0)
+    covariance, sensitivity = np.tile(1e-4 * np.eye(3), (rows, 1, 1)), np.zeros((rows, 3, 6))
+    sensitivity[:, 0, 5] = 1.0  # the slope alone, in metres for a unit
+    found = fit_considered(Positions(error, covariance, sensitivity), stride, FilterSettings())
+    for name in ("gyro_bias", "scale", "heading"):
+        assert getattr(found.settings.considered, name) == pytest.approx(
+            getattr(CONSIDERED, name), rel=1e-3
+        )
+
+    def negative_log_posterior(log_std):
+        variance = 1e-4 + np.exp(2 * log_std)
+        likelihood = 4 * 0.5 * (0.3**2 / variance + np.log(variance))
+        return likelihood + 0.5 * ((log_std - np.log(CONSIDERED.slope)) / 2.0) ** 2
+
+    grid = np.linspace(np.log(0.05), np.log(0.5), 20001)
+    wanted = np.exp(grid[np.argmin(negative_log_posterior(grid))])
+    assert wanted < 0.28  # what the positions alone would say is 0.3
+    assert found.settings.considered.slope == pytest.approx(wanted, rel=2e-3)
+
+
+def nees(found):
+    """Mean over all positions of eᵀ P⁻¹ e / 3."""
+    inverse = np.linalg.inv(found.covariance)
+    return np.einsum("ki,kij,kj->k", found.error, inverse, found.error).mean() / 3
+
+
+def test_positions_are_compared_with_the_truth_of_their_time():
+    """Of simulated walks that are as the filter has them: their errors are those it reports, but
+    against the truth of a stride later they are not. A filter that fails is left out, and so is a
+    walk with a raw gyro, unless all are alike."""
+    walks, truth = walks_and_truth()
+    truth = truth.copy()
+    options = changed(TRUE, noise={"measurement_scale": 9.0})  # σ is three times what is said
+    truth[0, 50:] = np.nan
+    found = filtered_positions(walks, truth, DATA, options)
+    assert len(found.error) == np.isfinite(truth).all(2).sum()
+    assert nees(found) == pytest.approx(1, abs=0.5)
+    off = filtered_positions(walks, np.roll(truth, -1, axis=1), DATA, options)
+    assert nees(off) > 3 * nees(found)
+
+    accel, raw = walks.accel.copy(), np.arange(WALKS) == 0
+    accel[1, 100:] += 1e4
+    marked = walks._replace(start=walks.start._replace(raw_gyro=raw), accel=accel)
+    some = filtered_positions(marked, truth, DATA, options)
+    assert 0 <= len(some.error) - (WALKS - 2) * STRIDES < 50 and np.abs(some.error).max() < 50
+    marked = walks._replace(start=walks.start._replace(raw_gyro=raw | True))
+    assert len(filtered_positions(marked, truth, DATA, options).error) == len(found.error)
+
+
+def test_no_positions_and_no_likelihood_are_named():
+    none = Positions(np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, 3, 6)))
+    with pytest.raises(InputError, match="not healthy where these recordings have a reference"):
+        fit_considered(none, 0.1, FilterSettings())
+    lost = Positions(np.ones((9, 3)), np.full((9, 3, 3), np.nan), np.ones((9, 3, 6)))
+    with pytest.raises(InputError, match="no positive definite covariance"):
+        fit_considered(lost, 0.1, FilterSettings())

@@ -54,31 +54,20 @@ def simulate(seed, runs, intervals, n, clones, dt, noise, std, measurement_std, 
     def smooth(amplitude, lowest, highest):
         out = np.zeros((runs, samples, 3))
         for _ in range(3):
-            size, rate, phase = (
-                rng.normal(size=(runs, 3)),
-                rng.uniform(lowest, highest, (runs, 3)),
-                rng.uniform(0, 2 * np.pi, (runs, 3)),
-            )
-            out += (
-                amplitude
-                * size[:, None]
-                * np.sin(2 * np.pi * rate[:, None] * t[None, :, None] + phase[:, None])
-            )
+            size, rate = rng.normal(size=(runs, 3)), rng.uniform(lowest, highest, (runs, 3))
+            phase = rng.uniform(0, 2 * np.pi, (runs, 3))
+            angle = 2 * np.pi * rate[:, None] * t[None, :, None] + phase[:, None]
+            out += amplitude * size[:, None] * np.sin(angle)
         return out
 
     rate, force = smooth(0.4, 0.05, 1.0), smooth(1.5, 0.2, 1.5)
-    turns = (
-        Rotation.from_rotvec((rate * dt).reshape(-1, 3)).as_matrix().reshape(runs, samples, 3, 3)
-    )
-    rotation = Rotation.from_euler(
-        "ZYX", rng.uniform(-1, 1, (runs, 3)) * [3.0, 0.3, 0.5]
-    ).as_matrix()
+    angles = rng.uniform(-1, 1, (runs, 3)) * [3.0, 0.3, 0.5]
     if pitch is not None:
         rate = 0.1 * smooth(1.0, 0.5, 1.5)
-        turns = Rotation.from_rotvec((rate * dt).reshape(-1, 3)).as_matrix().reshape(turns.shape)
         angles = np.stack([rng.uniform(-3, 3, runs), np.full(runs, pitch), np.zeros(runs)], 1)
-        rotation = Rotation.from_euler("ZYX", angles).as_matrix()
-    attitude0 = rotation
+    turns = Rotation.from_rotvec((rate * dt).reshape(-1, 3)).as_matrix()
+    turns = turns.reshape(runs, samples, 3, 3)
+    attitude0 = rotation = Rotation.from_euler("ZYX", angles).as_matrix()
     velocity, position = np.tile([1.0, 0.5, 0.0], (runs, 1)), rng.normal(size=(runs, 3))
     start = rng.normal(size=(runs, 9)) * np.repeat(
         [std.tilt, std.yaw, std.velocity, std.position], [2, 1, 3, 3]
@@ -89,8 +78,7 @@ def simulate(seed, runs, intervals, n, clones, dt, noise, std, measurement_std, 
         position - start[:, 6:9],
     )
     gyro_bias, accel_bias = (
-        std.gyro_bias * rng.normal(size=(runs, 3)),
-        std.accel_bias * rng.normal(size=(runs, 3)),
+        size * rng.normal(size=(runs, 3)) for size in (std.gyro_bias, std.accel_bias)
     )
     walk, white = (
         np.reshape(pair, (2, 1, 1, 1)) * rng.normal(size=(2, runs, samples, 3))
@@ -117,6 +105,22 @@ def simulate(seed, runs, intervals, n, clones, dt, noise, std, measurement_std, 
     displacement[:, clones:] = np.einsum("rkji,rkj->rki", yaw_matrix(truth[0][:, :-clones]), moved)
     displacement += measurement_std * rng.normal(size=displacement.shape)
     return Runs(*first, gyro, accel, displacement, *truth, attitude0, rate)
+
+
+def with_correlated_errors(runs, clones, sigma, correlation, interval):
+    """The runs with displacements whose errors, of standard deviation `sigma`, are as the model
+    has correlated ones; interval: s of a clone interval."""
+    rng, shape = np.random.default_rng(3), runs.velocity.shape
+    share, decay = correlation.share, np.exp(-interval / correlation.seconds)
+    seen, state = np.full(shape, np.nan), rng.normal(size=shape[::2])
+    for k in range(shape[1]):
+        state = decay * state + np.sqrt(1 - decay**2) * rng.normal(size=state.shape)
+        if k >= clones:
+            moved = runs.position[:, k] - runs.position[:, k - clones]
+            seen[:, k] = np.einsum("rji,rj->ri", yaw_matrix(runs.rotation[:, k - clones]), moved)
+        white = np.sqrt(1 - share**2) * rng.normal(size=state.shape)
+        seen[:, k] += sigma * (share * state + white)
+    return runs._replace(displacement=seen)
 
 
 def errors(runs, history):
