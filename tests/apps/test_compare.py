@@ -9,7 +9,7 @@ from gnio_jax import config as configuration
 from gnio_jax.apps import compare as comparison
 from gnio_jax.config import CompareConfig, TrainConfig
 from gnio_jax.errors import InputError
-from gnio_jax.evaluation import kept
+from gnio_jax.evaluation import kept, tabulate
 from tests.support.reports import LOST, report_of, write_report, write_run
 
 GROUPS = {"a": "ann", "b": "ann", "c": "bob"}
@@ -75,6 +75,13 @@ def test_what_diverged_is_counted_and_in_no_difference(runs):
     found = compare(runs / "new_s0", runs / "lost")
     assert comparison.lines(found)[1] == ["", "lost", "1.75 † 1/3", "– ‡", ""]
     assert any(said.startswith("‡ ") for said in comparison.explanations(found))
+
+
+def test_a_comparison_knows_which_value_is_best(runs, monkeypatch):
+    column = tabulate.COLUMNS["ate"]._replace(best=4.0)
+    monkeypatch.setitem(tabulate.COLUMNS, "ate", column)
+    found = compare(runs / "plain_s0", runs / "new")  # |1, 2, 5 − 4| against |1, 3, 3 − 4|
+    assert comparison.lines(found)[0][0] == "ATE (m, best 4)" and second(found).better == 1
 
 
 # --- rows

@@ -172,6 +172,12 @@ def test_where_the_gyro_falls_silent_time_passes():
     assert len(list(paired([*rows, *back]))) == pytest.approx(len(found) + 189, abs=3)
 
 
+def test_an_accelerometer_of_10_hz_is_enough_also_by_unix_time():
+    pulled = [accel(1.7e9 + k / 10) for k in range(50)]
+    turned = [gyro(1.7e9 + k / 100 + 0.001) for k in range(490)]
+    assert len(whole(paired(by_stamp(pulled, turned)))) == 490
+
+
 # --- lines
 
 

@@ -125,6 +125,9 @@ def test_without_a_reference_nothing_is_called_an_error(estimates):
     text = page.render("blind", [run_of([estimates[2]])])
     assert "error (m)" not in text and "distance walked" not in text
     assert r"3\\u03c3 (m)" in text  # as JSON in a script has it
+    assert re.search(r"<label hidden>sequence", text)  # of a single one none is chosen
+    # χ² does not go by the name of the network's gate.
+    assert "refused above 11.3" in text and '"gate (11' not in text
 
 
 def test_evaluations_beside_are_read_back(tmp_path, estimates, made):

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from gnio_jax.commands.console import stdout
 from gnio_jax.evaluation import tabulate
 from gnio_jax.evaluation.metrics import OF_WAYPOINTS
 from gnio_jax.evaluation.statistics import Cell, Difference, Summary
@@ -64,6 +65,11 @@ def test_divergence_is_in_the_table(made, with_divergence):
     assert "∞: the estimate diverged" in shown
     assert "room 1:walk: the estimate diverged, and is in no mean" in shown
     assert "diverged" not in text(made)
+
+
+def test_headings_are_no_markup_on_the_console_of_results(made, capsys):
+    stdout().print(tabulate.render(made))
+    assert "[" not in capsys.readouterr().out
 
 
 def test_how_the_trajectories_were_estimated_in_words(made):

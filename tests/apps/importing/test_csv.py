@@ -261,9 +261,20 @@ def test_what_is_repaired_of_the_stamps_is_noted(tmp_path):
     compare_imu(sequence)
     assert "mixed.csv: gyro had 2 steps back in time; its rows were sorted" in notes
     assert "mixed.csv: 1 rows of accel repeat a stamp and were dropped" in notes
+    moved = np.r_[1000:1600, 0:1000, 1600:2800]  # a block in the wrong place
+    compare_imu(import_recording(write_logger(tmp_path / "moved.csv", rows=moved), MAPPED)[0])
     path = write_logger(tmp_path / "holes.csv", rows=np.r_[0:1000, 1079:2800])
     _, notes = import_recording(path, MAPPED)
     assert "holes.csv: gyro lacks samples 1 times, for up to 0.40 s; bridged linearly" in notes
+
+
+def test_a_slow_clock_that_jitters_has_no_holes(tmp_path):
+    """At 10.5 Hz two samples lie more than 0.1 s apart half of the time."""
+    time = np.arange(150) / 10.5 + np.random.default_rng(3).uniform(-0.02, 0.02, 150)
+    path = write(tmp_path / "slow.csv", ["time", *AXES], [time, *imu(time).T])
+    sequence, notes = import_recording(path, gyro_unit="rad/s")
+    assert sequence.imu_valid is None and not any("lacks samples" in note for note in notes)
+    assert any("which is slow" in note for note in notes)
 
 
 @pytest.mark.parametrize(("gyro_rate", "accel_rate"), [(208.0, 100.0), (100.0, 197.0)])

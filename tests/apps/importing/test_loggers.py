@@ -98,6 +98,16 @@ def test_the_metadata_tell_the_sign_or_it_must_be_stated(tmp_path):
     refused(zipped(path, members), unknown)
 
 
+def test_gravity_of_other_stamps_is_interpolated(tmp_path):
+    members = without(sensor_logger("android"), "TotalAcceleration.csv")
+    time = logger_files.clock(50.0) + 0.007
+    members["Gravity.csv"] = sensor_table(time, logger_files.gravity(time))
+    sequence, _ = import_recording(zipped(tmp_path / "walk.zip", members))
+    place = sequence.attributes["start_time"] - EPOCH * 1e-9
+    force = known_walk.force(sequence.time + place)
+    np.testing.assert_allclose(sequence.accel[20:-20], force[20:-20], atol=0.03)
+
+
 @pytest.mark.parametrize(
     ("members", "words"),
     [
