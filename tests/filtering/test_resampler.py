@@ -1,34 +1,22 @@
-"""The low-pass of a stream: pure tones, a slow resampler of SciPy's parts, the trajectory of the
-batch path, the rate of the IMU."""
+"""The low-pass of a stream against pure tones and a slow resampler of SciPy's parts. The tracker
+behind it is in `test_tracker`."""
 
-import functools
 import itertools
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
 from scipy.signal import firwin
 
-from gnio_jax import filtering, geometry
-from gnio_jax.data.resampling import resample
-from gnio_jax.data.simulated import walks as simulated
-from gnio_jax.filtering import Tracker
-from gnio_jax.filtering import tracker as online
 from gnio_jax.filtering.resampler import Stream, create_grid
-from gnio_jax.types import Prediction
 from tests.support.checks import checked_at_first
 
 DT = 0.005
-CONFIG = filtering.FilterConfig(DT, samples_per_clone=20, clones_per_window=10)
-NOISE = filtering.NoiseModel()
-WEIGHTS = np.random.default_rng(5).standard_normal((6, 3)) * 0.02
 
 
 def through(stamps, values, imu_rate, dt=DT, hole=None):
     """The rows (gyro, accel, valid) that the filter gets, and the newest stamp when each came."""
-    stream, rows, known = Stream(create_grid(dt, hole, float(imu_rate))), [], []
+    stream, rows, known = Stream(create_grid(dt, hole, imu_rate and float(imu_rate))), [], []
     samples = zip(stamps.tolist(), values.tolist(), strict=True)
     for time, row in checked_at_first(samples, 60):  # 400 Hz: a row from 46 on
         stream.push(time, tuple(row))
@@ -75,7 +63,6 @@ def amplitudes(columns):
         (416, 0.005, 0, 80),
         (1000, 0.005, 0, 80),
         (250, 0.005, 0, 55),
-        (208, 0.01, 0, 40),
         (400, 0.01, 0.2, 40),
     ],
 )
@@ -85,21 +72,19 @@ def test_pure_tones(rate, dt, jitter, highest):
     delay = create_grid(dt, imu_rate=float(rate)).delay
     assert 21 * dt < delay < 22.01 * dt
     inside = slice(round(0.3 / dt), None)  # at the start the FIR's reach is filled by reflection
-    for passed in np.reshape([0.0, 1.0, *np.linspace(0.25, 1, 4) * highest], (2, 3)):
-        rows, known = through(stamps, pairs(passed, stamps - stamps[0]), rate, dt)
-        grid = np.arange(len(rows)) * dt
-        off = amplitudes(rows[:, :6] - pairs(passed, grid))
-        assert off[inside].max() < 0.01, passed
-        np.testing.assert_array_equal(rows[:, 6], 1.0)
-        late = known - stamps[0] - grid - delay
-        assert -1e-6 < late.min() and late.max() < 1.5 / rate
+    passed = np.array([0.0, 0.5, 1.0]) * highest
+    rows, known = through(stamps, pairs(passed, stamps - stamps[0]), rate, dt)
+    grid = np.arange(len(rows)) * dt
+    assert amplitudes(rows[:, :6] - pairs(passed, grid))[inside].max() < 0.01
+    np.testing.assert_array_equal(rows[:, 6], 1.0)
+    late = known - stamps[0] - grid - delay
+    assert -1e-6 < late.min() and late.max() < 1.5 / rate
     # Where stamps jitter, no interpolation can read tones near the IMU's own Nyquist frequency.
-    stopped = np.linspace(0.5 / dt, (0.2 if jitter else 0.49) * rate, 6)
-    for three in stopped.reshape(2, 3):
-        vibration = pairs(three, stamps - stamps[0])
-        rows, _ = through(stamps, vibration, rate, dt)
-        assert amplitudes(rows[inside, :6]).max() < 0.01, three
-        assert (amplitudes(linear(stamps, vibration, dt)[inside]).max(axis=0) > 0.1).all()
+    stopped = np.linspace(0.5 / dt, (0.2 if jitter else 0.49) * rate, 3)
+    vibration = pairs(stopped, stamps - stamps[0])
+    rows, _ = through(stamps, vibration, rate, dt)
+    assert amplitudes(rows[inside, :6]).max() < 0.01
+    assert (amplitudes(linear(stamps, vibration, dt)[inside]).max(axis=0) > 0.1).all()
 
 
 def slow(stamps, values, rate, factor, half):
@@ -171,6 +156,60 @@ def test_against_a_slow_resampler(kind):
     assert late.min() > -1e-6 and late[rows[:, 6] == 1].max() < 0.11 + 0.16
 
 
+def interpolated(stamps, values, dt, hole):
+    """The grid by its definition, without a low-pass: every point on its own, looking for its
+    neighbours among the samples that are there."""
+    there = np.isfinite(values).all(1)
+    known, rows = stamps[there], values[there]
+    grid = []
+    for k in range(int(np.floor((stamps[-1] - stamps[0]) / dt + 1e-9)) + 1):
+        point = stamps[0] + k * dt
+        equal = np.flatnonzero(np.abs(known - point) < 1e-9)
+        before, after = np.flatnonzero(known < point), np.flatnonzero(known > point)
+        if len(equal):
+            grid.append((*rows[equal[0]], 1.0))
+        elif len(before) and len(after) and known[after[0]] - known[before[-1]] <= hole:
+            grid.append((*[np.interp(point, known, column) for column in rows.T], 1.0))
+        elif len(before) and not len(after) and stamps[-1] - known[before[-1]] <= hole:
+            break  # a sample to come may still fill it
+        else:
+            grid.append((*[np.nan] * 6, 0.0))
+    return np.array(grid)
+
+
+@pytest.mark.parametrize(
+    "kind", ["jitter", "fast", "slow", "holes", "missing", "missing from the start", "uniform"]
+)
+def test_clock_without_a_low_pass(kind):
+    rng = np.random.default_rng(len(kind))
+    spacing = {"fast": 0.004, "slow": 0.027}.get(kind, 0.01)
+    stamps = 100.0 + np.cumsum(spacing * (1 + rng.uniform(-0.3, 0.3, 400)))
+    values = rng.standard_normal((400, 6))
+    hole = 0.05 if kind == "slow" else 0.015
+    if kind == "holes":
+        stamps[50:] += 0.2
+        stamps[51:] += 0.012
+        stamps[300:] += 0.9
+    elif kind == "uniform":
+        stamps = 100.0 + np.arange(400) * 0.01
+    elif kind.startswith("missing"):
+        values[rng.integers(0, 400, 60), rng.integers(0, 6, 60)] = np.nan
+        values[200:240] = np.inf
+        if kind.endswith("start"):
+            values[:30, 2] = np.nan
+    if kind == "fast":  # so fast an IMU is refused after a second
+        stamps, values = stamps[:240], values[:240]
+    assert create_grid(0.01, hole).delay == 0
+    rows, known = through(stamps, values, None, 0.01, hole)
+    wanted = interpolated(stamps, values, 0.01, hole)
+    np.testing.assert_allclose(rows, wanted, atol=1e-9)
+    assert (wanted[:, 6] == 0).any() == (kind.startswith("missing") or kind == "holes")
+    if not kind.startswith("missing"):
+        # at most one sample late: all of the grid that the stamps have reached is there
+        points = stamps[0] + 0.01 * np.arange(len(rows)) - 1e-8
+        np.testing.assert_array_equal(known, stamps[np.searchsorted(stamps, points)])
+
+
 def test_two_stamps_almost_alike_do_no_harm():
     """A spline through the noise of both would swing by thousands of its size."""
     stamps = stamps_of(400, 1.0, 0.2)
@@ -192,136 +231,14 @@ def test_a_lost_sample_of_a_slower_imu_is_no_hole(share, most):
         """140 Hz and 10 Hz, each in three phases."""
         return np.concatenate([tones(140.0, time)[:, ::2], tones(10.0, time)[:, ::2]], axis=1)
 
-    off = []
-    for seed in range(2):
-        stamps = stamps_of(250, 5.0)
-        lost = np.random.default_rng(seed).uniform(size=len(stamps)) < share
-        lost[[0, -1]] = False
-        alone = lost & ~np.roll(lost, 1) & ~np.roll(lost, -1)
-        rows, _ = through(stamps[~lost], both(stamps - stamps[0])[~lost], 250)
-        assert int((rows[:, 6] == 0).sum()) <= 2 * (lost & ~alone).sum()
-        last = np.maximum.accumulate(np.where(rows[:, 6] == 1, np.arange(len(rows)), 0))
-        wanted = both(np.arange(len(rows)) * DT) * [0, 0, 0, 1, 1, 1]
-        off.append((rows[last, :6] - wanted)[60:])
-    squares = np.concatenate(off).reshape(-1, 2, 3) ** 2
+    stamps = stamps_of(250, 5.0)
+    lost = np.random.default_rng(0).uniform(size=len(stamps)) < share
+    lost[[0, -1]] = False
+    alone = lost & ~np.roll(lost, 1) & ~np.roll(lost, -1)
+    rows, _ = through(stamps[~lost], both(stamps - stamps[0])[~lost], 250)
+    assert int((rows[:, 6] == 0).sum()) <= 2 * (lost & ~alone).sum()
+    last = np.maximum.accumulate(np.where(rows[:, 6] == 1, np.arange(len(rows)), 0))
+    wanted = both(np.arange(len(rows)) * DT) * [0, 0, 0, 1, 1, 1]
+    squares = (rows[last, :6] - wanted)[60:].reshape(-1, 2, 3) ** 2
     vibration, gait = np.sqrt(squares.mean(axis=(0, 2)))
     assert vibration < most and gait < 0.02
-
-
-# The tracker --------------------------------------------------------------------------------------
-
-
-def predict(windows):
-    pooled = jnp.mean(windows, axis=1) @ jnp.asarray(WEIGHTS, jnp.float32)
-    return Prediction(pooled, -2.0 + 0.1 * pooled, {})
-
-
-@functools.cache
-def walk(rate):
-    """17 s on foot, shaken at 180, 188 and 199 Hz: at 200 Hz aliases to 20, 12 and 1 Hz."""
-    made = simulated.pedestrian(4, 4, seconds=17.0, rate=float(rate))
-    shake = np.sin(2 * np.pi * made.time[:, None] * [188.0, 199.0, 180.0] + [1.0, 2.0, 0.5])
-    return made._replace(gyro=made.gyro + 2.0 * shake, accel=made.accel + 15.0 * shake[:, ::-1])
-
-
-def start(walked):
-    rotation = geometry.matrix_from_quaternion(jnp.asarray(walked.orientation[0]))
-    return filtering.initial_state(CONFIG, rotation, walked.velocity[0], walked.position[0])
-
-
-@functools.cache
-def program():
-    def history(state, gyro, accel):
-        return filtering.run_odometry(predict, state, gyro, accel, CONFIG, NOISE)[1]
-
-    return jax.jit(history)
-
-
-def feed(tracker, walked, rows=slice(None)):
-    """(stamp with which it came, pose)"""
-    columns = walked.time[rows], walked.gyro[rows], walked.accel[rows]
-    samples = checked_at_first(zip(*columns, strict=True))
-    pushed = [(sample[0], tracker.push(*sample)) for sample in samples]
-    return [(time, pose) for time, pose in pushed if pose is not None]
-
-
-@functools.cache
-def compiled():
-    tracker = Tracker(predict, CONFIG, NOISE, start(walk(400)), imu_rate=400.0)
-    return tracker._advance, tracker._look_ahead
-
-
-@pytest.fixture
-def built(monkeypatch):
-    """Trackers take their programs from `compiled`."""
-    ready = compiled()
-    monkeypatch.setattr(online, "compile_programs", lambda *_: ready)
-
-
-@pytest.mark.parametrize("rate", [400, 416])
-def test_a_faster_imu_gives_the_trajectory_of_the_batch_path(built, rate):
-    """To 1 µm at a multiple of the filter's rate, else 1 mm; mere interpolation is 10 cm off."""
-    walked, state, steps = walk(rate), start(walk(rate)), 150
-    n = 20 * steps
-    even = resample(walked, 200.0)
-    wanted = np.asarray(program()(state, even.gyro[:n], even.accel[:n]).position)
-    tracker = Tracker(predict, CONFIG, NOISE, state, imu_rate=float(rate))
-    found = feed(tracker, walked)
-    assert 0.105 < tracker.delay < 0.1101
-    times = [pose.time for _, pose in found[:steps]]
-    np.testing.assert_allclose(times, np.arange(1, steps + 1) * 0.1, atol=1e-9)
-    for stamp, pose in found:  # the last sample of its interval is stamped DT before its time
-        assert -1e-6 < stamp - (pose.time - DT) - tracker.delay < 1.01 / rate
-    off = np.abs(np.array([pose.position for _, pose in found[:steps]]) - wanted).max()
-    assert off < (1e-6 if rate == 400 else 1e-3)
-    rows = linear(walked.time, np.concatenate([walked.gyro, walked.accel], axis=1))[:n]
-    aliased = np.asarray(program()(state, rows[:, :3], rows[:, 3:]).position)
-    assert np.linalg.norm(aliased - wanted, axis=1).max() > 0.1
-
-
-def test_an_imu_faster_than_told_is_refused_before_it_aliases_for_long(built):
-    tracker = Tracker(predict, CONFIG, NOISE, start(walk(400)))
-    feed(tracker, walk(400), slice(200))
-    before = tracker.pose()
-    words = r"^imu_rate: the samples come at 400 Hz, .* for 200 Hz: .* make it with imu_rate=400"
-    for _ in range(2):
-        with pytest.raises(ValueError, match=words):
-            tracker.push(0.5, np.zeros(3), np.zeros(3))
-        jax.tree.map(np.testing.assert_array_equal, tracker.pose(), before)
-
-
-@pytest.mark.parametrize("hole", [0.3, 0.04])
-def test_no_hole_hides_that_the_imu_is_faster(built, hole):
-    """400 Hz for 0.1 s, nothing, then 400 Hz again; or so with a hole after every 0.1 s. The time
-    in the holes does not count: half a second of samples is enough."""
-    count = np.arange(400)
-    stops = np.minimum(count // 40, 1) if hole == 0.3 else count // 40
-    stamps = 1.7e9 + count / 400 + stops * hole
-    tracker, still = Tracker(predict, CONFIG, NOISE, start(walk(400))), (np.zeros(3), [0, 0, 9.81])
-    taken = 0
-    with pytest.raises(ValueError, match=r"^imu_rate: the samples come at 400 Hz"):
-        for time in stamps:
-            tracker.push(time, *still)
-            taken += 1
-    assert 0.49 < (taken - len(np.unique(stops[:taken]))) / 400 < 0.5
-
-
-@pytest.mark.parametrize("kind", ["jitter", "a slower IMU", "lost", "a change"])
-def test_the_rate_is_measured_as_long_as_the_stream_lasts(built, kind):
-    tracker, random = Tracker(predict, CONFIG, NOISE, start(walk(400))), np.random.default_rng(0)
-    stamps = np.arange(1000) * DT
-    if kind == "jitter":
-        stamps = stamps + DT * random.uniform(0, 0.99, len(stamps))
-    elif kind == "lost":
-        stamps = stamps[random.uniform(size=len(stamps)) > 0.3]
-    elif kind == "a slower IMU":
-        stamps = stamps[::7]
-    else:
-        stamps = np.append(stamps[:300], stamps[300] + np.arange(400) * DT / 2)
-    for k, time in checked_at_first(enumerate(stamps)):
-        try:
-            tracker.push(time, np.zeros(3), [0, 0, 9.81])
-        except ValueError as error:
-            assert kind == "a change" and str(error).startswith("imu_rate") and 300 < k < 520
-            return
-    assert kind != "a change"
