@@ -33,9 +33,8 @@ def known(gyro_time, accel_time, **options):
 
 
 def tracked(stamps, **options):
-    return Poses(
-        stamps, walk.attitude(stamps), walk.position(stamps), source="poses.csv", **options
-    )
+    place = walk.position(stamps)
+    return Poses(stamps, walk.attitude(stamps), place, source="poses.csv", **options)
 
 
 def test_two_sensors_and_a_tracker_each_on_its_own_clock_come_back():
@@ -64,11 +63,10 @@ def test_two_sensors_and_a_tracker_each_on_its_own_clock_come_back():
     assert sequence.attributes["device"] == "phone"
 
 
-@pytest.mark.parametrize("rate", [40.0, 50.4, 60.0])
-def test_slow_phones_are_read_as_they_are(rate):
-    time = np.arange(round(20 * rate)) / rate
+def test_slow_phones_are_read_as_they_are():
+    time = np.arange(800) / 40.0
     (sequence,) = assemble(known(time, time))
-    assert 1.0 / np.diff(sequence.time).mean() == pytest.approx(rate, rel=1e-3)
+    assert 1.0 / np.diff(sequence.time).mean() == pytest.approx(40.0, rel=1e-3)
     np.testing.assert_allclose(sequence.gyro, walk.rate(sequence.time), atol=1e-3)
     assert not sequence.valid.any() and np.isnan(sequence.position).all()
 
@@ -120,28 +118,29 @@ def test_rows_out_of_order_are_sorted_and_counted_but_no_two_clocks():
         assemble(known(time, time)._replace(accel=coarse), 100.0)
 
 
+def gyro(change):
+    return lambda streams: streams._replace(gyro=change(streams.gyro))
+
+
+def accel(change):
+    return lambda streams: streams._replace(accel=change(streams.accel))
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (
-            lambda s: s._replace(accel=s.accel._replace(time=s.accel.time + 99.0)),
-            "accel.csv: field",
-        ),
+        (accel(lambda each: each._replace(time=each.time + 99.0)), "accel.csv: field"),
+        (gyro(lambda each: each._replace(time=each.time * 1e3)), "gyro.csv: field"),
         (
             lambda s: s._replace(poses=s.poses._replace(time=s.poses.time - 99.0)),
             "poses.csv: field",
         ),
-        (lambda s: s._replace(gyro=s.gyro._replace(time=s.gyro.time * 1e3)), "gyro.csv: field"),
         (
-            lambda s: s._replace(accel=s.accel._replace(values=s.accel.values / 9.81)),
+            accel(lambda each: each._replace(values=each.values / 9.81)),
             "accel.csv: field 'accel' looks like G",
         ),
         (
-            lambda s: s._replace(
-                gyro=s.gyro._replace(
-                    values=np.where(s.gyro.time[:, None] == 3.0, 1e3, s.gyro.values)
-                )
-            ),
+            gyro(lambda e: e._replace(values=np.where(e.time[:, None] == 3.0, 1e3, e.values))),
             "gyro.csv: field 'gyro' is beyond 100 rad/s in 1 rows, first 3.000 s after the start",
         ),
     ],
@@ -166,10 +165,8 @@ def test_a_pose_that_contradicts_its_velocity_is_not_valid_and_spoils_no_neighbo
 
 
 def test_waypoints_stand_in_the_place_of_poses_and_are_refused_where_a_pose_is_needed():
-    time = np.arange(1500) / 50.0
-    taps = Samples(
-        np.array([2.0, 9.0, 17.0, 25.0]), walk.position(np.array([2.0, 9, 17, 25]))[:, :2], "taps"
-    )
+    time, tapped = np.arange(1500) / 50.0, np.array([2.0, 9.0, 17.0, 25.0])
+    taps = Samples(tapped, walk.position(tapped)[:, :2], "taps")
     streams = known(1.0 + time, 1.0 + time, waypoints=taps)
     (sequence,) = assemble(streams)
     assert sequence.waypoints is not None
@@ -181,23 +178,15 @@ def test_waypoints_stand_in_the_place_of_poses_and_are_refused_where_a_pose_is_n
     few = taps._replace(time=taps.time[:2], values=taps.values[:2])
     with pytest.raises(Refusal):
         assemble(streams._replace(waypoints=few))
-
-
-@pytest.mark.parametrize(
-    ("time", "problem"),
-    [
+    for wrong, problem in (
         ([1.0, 2.0], "are 2, at least 3"),
         ([1.0, 2.0, 2.0], "do not increase"),
         ([1.0, np.nan, 2.0], "not all finite"),
         ([1.0, 2.0, 99.0], "not all on the IMU's clock"),
-    ],
-)
-def test_waypoints_that_cannot_be_are_refused(time, problem):
-    clock = np.arange(500) / 50.0
-    (sequence,) = assemble(known(clock, clock))
-    waypoints = Waypoints(np.array(time), np.zeros((len(time), 2)))
-    with pytest.raises(InputError, match=f"^file: field 'waypoints' .*{problem}"):
-        validate(sequence._replace(waypoints=waypoints), "file")
+    ):
+        waypoints = Waypoints(np.array(wrong), np.zeros((len(wrong), 2)))
+        with pytest.raises(InputError, match=f"^file: field 'waypoints' .*{problem}"):
+            validate(sequence._replace(waypoints=waypoints), "file")
 
 
 # --- gaps
@@ -205,24 +194,13 @@ def test_waypoints_that_cannot_be_are_refused(time, problem):
 
 def level(time, tracked_at=None):
     """Somebody who walks straight on, with a pose wherever `tracked_at` is."""
-    count = len(time)
-    poses = None
+    poses, velocity = None, np.array([1.0, 0.5, 0.0])
     if tracked_at is not None:
-        poses = Poses(
-            tracked_at,
-            Rotation.identity(len(tracked_at)),
-            np.outer(tracked_at, [1.0, 0.5, 0.0]),
-            np.tile([1.0, 0.5, 0.0], (len(tracked_at), 1)),
-        )
-    return Streams(
-        "walk",
-        "walk.csv",
-        Samples(time, np.zeros((count, 3)), "walk.csv"),
-        Samples(time, np.tile([0, 0, 9.81], (count, 1)), "walk.csv"),
-        {"group": "someone"},
-        100.0,
-        poses,
-    )
+        place, same = np.outer(tracked_at, velocity), np.tile(velocity, (len(tracked_at), 1))
+        poses = Poses(tracked_at, Rotation.identity(len(tracked_at)), place, same)
+    still, up = np.zeros((len(time), 3)), np.tile([0, 0, 9.81], (len(time), 1))
+    streams = Streams.of_imu("walk", "walk.csv", time, still, up)
+    return streams._replace(attributes={"group": "someone"}, start=100.0, poses=poses)
 
 
 def stamps(*spans):

@@ -140,6 +140,12 @@ def test_recordings_that_are_left_out_for_one_reason_are_one_line(tmp_path):
         "holds 2 waypoints; leave it out",
         "e: left out: e.csv: its clock is ruined; leave it out",
     ]
+    nothing = dataset(slow(tmp_path, "f", refusal="ruined"), Recording("none", list))
+    names, notes, error = outcome(nothing, 1)
+    assert names == [] and [text for text, _ in notes] == [
+        "f: left out: f.csv: ruined; leave it out"
+    ]
+    assert error.startswith("root: none of the 2 recordings of split 'test' can be used")
 
 
 def test_only_what_is_slow_to_read_is_given_to_processes(tmp_path):
@@ -157,23 +163,6 @@ def test_only_what_is_slow_to_read_is_given_to_processes(tmp_path):
     again = read_split(dataset(local, *kept), tmp_path, "test", 2, shares.append)
     assert len(list(again)) == 3
     assert shares == [0.5, 1.0]
-
-
-def test_a_recording_carries_what_lists_say_of_it(tmp_path):
-    for _ in range(2):
-        (sequence,) = read_recording(slow(tmp_path, "a")).sequences
-        assert sequence.attributes == {"dataset": "test", "lists": "three"}
-
-
-def test_a_split_of_which_nothing_is_left(tmp_path):
-    about = dataset(slow(tmp_path, "c", refusal="ruined"), Recording("none", list))
-    names, notes, error = outcome(about, 1)
-    assert names == []
-    assert [text for text, _ in notes] == ["c: left out: c.csv: ruined; leave it out"]
-    assert (
-        error
-        == "root: none of the 2 recordings of split 'test' can be used; see the warnings above"
-    )
 
 
 def test_a_check_tells_what_is_wrong_and_raises_nothing(tmp_path):
@@ -209,26 +198,21 @@ def test_the_recordings_of_all_splits_are_found_once(tmp_path):
     assert found.notes == ["root: is incomplete", "nothing in split val: root: has no list val"]
     with pytest.raises(InputError, match="has no list val"):
         find_recordings(about, Path("root"), "val")
-    with pytest.raises(
-        InputError, match="unknown split 'dev'; known splits: train, val, test, all"
-    ):
+    unknown = "unknown split 'dev'; known splits: train, val, test, all"
+    with pytest.raises(InputError, match=unknown):
         find_recordings(about, Path("root"), "dev")
     with pytest.raises(InputError, match="split 'all' of dataset 'tlio' holds no recording"):
         find_recordings(dataset(), Path("root"), "all")
 
 
-def test_work_by_processes_comes_back_in_order():
-    shares = []
+def test_work_by_processes_comes_back_in_order_and_few_results_are_held():
+    """Who takes one result after the other never makes more than two beyond the workers."""
+    shares, begun = [], []
     items = [(base, 2) for base in range(5)]
     for workers in (1, 2, 7):
         assert list(in_processes(pow, items, workers, shares.append)) == [0, 1, 4, 9, 16]
     np.testing.assert_allclose(shares, [0.2, 0.4, 0.6, 0.8, 1.0] * 3)
     assert list(in_processes(pow, [], 2)) == []
-
-
-def test_few_results_are_held_however_slow_the_reader_is():
-    """Who takes one result after the other never makes more than two beyond the workers."""
-    begun = []
 
     class Items(list):
         def __iter__(self):
@@ -241,20 +225,20 @@ def test_few_results_are_held_however_slow_the_reader_is():
         assert next(results) == 2 ** (taken - 1)
         assert len(begun) <= taken + 3
     assert len(begun) == 12
+    results.close()
 
 
-def test_a_process_that_dies_is_told_in_one_line():
+def test_a_process_that_dies_is_told_in_one_line(monkeypatch, tmp_path):
     items = [(partial(os._exit, 3),), (partial(int, 1),)]
     # What is called needs no import of the package in a process.
     with pytest.raises(InputError, match=r"--workers: a process died, .*memory"):
         list(in_processes(operator.call, items, 2))
-
-
-def test_a_process_that_dies_while_the_next_one_starts_is_told_too(monkeypatch):
+    with pytest.raises(FileNotFoundError, match="nowhere"):  # the function's own error
+        list(in_processes(os.stat, [(tmp_path / "nowhere",), (tmp_path,)], 2))
     submit, started = ProcessPoolExecutor.submit, []
 
     def once(pool, *item):
-        if started:
+        if started:  # it dies while the next one starts
             raise OSError("handle is closed")
         started.append(item)
         return submit(pool, *item)
@@ -262,11 +246,6 @@ def test_a_process_that_dies_while_the_next_one_starts_is_told_too(monkeypatch):
     monkeypatch.setattr(ProcessPoolExecutor, "submit", once)
     with pytest.raises(InputError, match="--workers: a process died"):
         list(in_processes(pow, [(2, 2), (3, 2)], 2))
-
-
-def test_what_the_function_cannot_open_is_its_own_error(tmp_path):
-    with pytest.raises(FileNotFoundError, match="nowhere"):
-        list(in_processes(os.stat, [(tmp_path / "nowhere",), (tmp_path,)], 2))
 
 
 def die_in_a_child(name):
@@ -322,11 +301,14 @@ def call(reader, *files, name="walk"):
     return round(float(sequence.position[0, 0] - circle(seconds=1.0).position[0, 0]))
 
 
-def test_the_second_reading_is_what_the_first_made(source, cache):
+def test_the_second_reading_is_what_the_first_made_and_says_what_lists_say(source, cache, tmp_path):
     reader = Reader()
     assert call(reader, source) == 1 and len(list(cache.iterdir())) == 1
     assert call(reader, source) == 1 and reader.calls == 1
     assert call(reader, source, name="other") == 2
+    for _ in range(2):
+        (sequence,) = read_recording(slow(tmp_path, "a")).sequences
+        assert sequence.attributes == {"dataset": "test", "lists": "three"}
 
 
 def test_a_changed_file_or_package_is_read_again(source, tmp_path, monkeypatch):
@@ -345,7 +327,7 @@ def test_a_changed_file_or_package_is_read_again(source, tmp_path, monkeypatch):
     assert call(reader, source, other) == 5
 
 
-def test_the_sources_that_decide_what_is_read_are_part_of_the_key(monkeypatch, tmp_path):
+def test_the_sources_that_decide_what_is_read_are_part_of_the_key(monkeypatch):
     hdf5._sources.cache_clear()
     before, read = hdf5._sources(), Path.read_bytes
     for name in ("resampling.py", "numerics.py", "tlio.py"):
@@ -358,13 +340,17 @@ def test_the_sources_that_decide_what_is_read_are_part_of_the_key(monkeypatch, t
     assert hdf5._sources() == before
 
 
-def test_a_damaged_entry_is_made_anew(source, cache):
+def test_an_entry_that_is_damaged_or_cannot_be_written_is_made_anew(source, cache, monkeypatch):
     reader = Reader()
     call(reader, source)
     (entry,) = cache.iterdir()
     entry.write_bytes(entry.read_bytes()[:300])
     assert call(reader, source) == 2
     assert call(reader, source) == 2 and reader.calls == 2
+    monkeypatch.setenv("GNIO_CACHE", str(source / "below a file"))
+    assert call(reader, source) == 3 and call(reader, source) == 4
+    reading = read_recording(Recording("walk", reader, (cache / "nowhere.csv",), slow=True))
+    assert "nowhere.csv: cannot be read" in str(reading.damage)
 
 
 def test_a_refusal_is_remembered_and_damage_is_not(source, cache):
@@ -392,17 +378,6 @@ def test_what_the_reader_warned_of_is_kept_with_every_segment(source):
         assert reading.notes == ("imu.csv: a gap was cut off",) and reader.calls == 1
         assert [sequence.name for sequence in reading.sequences] == ["b", "a", "c"]
         assert all(each.attributes == {"dataset": "test"} for each in reading.sequences)
-
-
-def test_a_cache_that_cannot_be_written_is_no_error(source, monkeypatch):
-    monkeypatch.setenv("GNIO_CACHE", str(source / "below a file"))
-    reader = Reader()
-    assert call(reader, source) == 1 and call(reader, source) == 2
-
-
-def test_a_missing_file_is_named(cache, tmp_path):
-    reading = read_recording(Recording("walk", Reader(), (tmp_path / "nowhere.csv",), slow=True))
-    assert "nowhere.csv: cannot be read" in str(reading.damage)
 
 
 def test_where_the_cache_lies(monkeypatch, tmp_path):
@@ -454,13 +429,10 @@ def test_the_root_is_the_argument_then_the_environment_then_the_working_folder(
         data.find_root("tlio", tmp_path / "nowhere")
 
 
-def test_a_split_without_a_sequence_is_an_error(tmp_path, monkeypatch):
+def test_a_split_without_a_sequence_or_with_two_of_one_name_is_an_error(tmp_path, monkeypatch):
     monkeypatch.setitem(DATASETS, "tlio", dataset())
     with pytest.raises(InputError, match="split 'test' of dataset 'tlio' holds no sequence"):
         data.load("tlio", tmp_path)
-
-
-def test_two_sequences_of_one_name_are_refused(tmp_path, monkeypatch):
     twice = [single(name, walk, "walk") for name in ("monday", "tuesday")]
     monkeypatch.setitem(DATASETS, "tlio", dataset(*twice))
     with pytest.raises(InputError, match="two sequences of split 'test' have the name 'walk'"):

@@ -5,9 +5,7 @@ from __future__ import annotations
 import io
 import os
 import pickle
-from collections.abc import Callable, Iterator
 from pathlib import Path, PurePosixPath
-from typing import Any
 
 import h5py
 import numpy as np
@@ -15,13 +13,7 @@ import pytest
 
 from gnio_jax.errors import InputError
 from tests.support.damage import Damage
-from tests.support.damaged_recordings import check, remove_copies, written
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _copies_are_removed() -> Iterator[None]:
-    yield
-    remove_copies()
+from tests.support.damaged_recordings import check, written
 
 
 class Bomb:
@@ -30,8 +22,12 @@ class Bomb:
     def __init__(self, folder: Path):
         self.folder = folder
 
-    def __reduce__(self) -> tuple[Any, ...]:
+    def __reduce__(self):
         return os.mkdir, (str(self.folder),)
+
+
+def file_of(layout: str, ending: str) -> str:
+    return next(file for file in written(layout) if file.endswith(ending))
 
 
 def objects(bomb: Bomb, count: int = 1) -> np.ndarray:
@@ -49,31 +45,36 @@ def of_numpy(bomb: Bomb) -> bytes:
 def of_numpy_zip(bomb: Bomb) -> bytes:
     """The gyro and accelerometer of an otherwise sound piece."""
     out = io.BytesIO()
-    with np.load(io.BytesIO(next(iter(written("kitti npz").values())))) as file:
-        arrays = {field: file[field] for field in file.files}
+    with np.load(io.BytesIO(written("kitti npz")[file_of("kitti npz", ".npz")])) as file:
+        arrays = dict(file)
     arrays["u"] = objects(bomb, len(arrays["t"]))
     np.savez(out, allow_pickle=True, **arrays)
     return out.getvalue()
 
 
-def of_hdf5(bomb: Bomb, name: str, field: str) -> bytes:
+def of_hdf5(layout: str, ending: str, field: str):
     """Pickled bytes in place of a field, and as its attribute: what PyTables and pandas load."""
-    content = next(
-        content for file, content in written(name).items() if file.endswith((".h5", ".hdf5"))
-    )
-    out = io.BytesIO(content)
-    with h5py.File(out, "r+") as file:
-        del file[field]
-        file[field] = np.void(pickle.dumps(bomb))
-        file[field].attrs["TITLE"] = np.void(pickle.dumps(bomb))
-        file.attrs["pandas_type"] = np.void(pickle.dumps(bomb))
-    return out.getvalue()
+
+    def make(bomb: Bomb) -> bytes:
+        out = io.BytesIO(written(layout)[file_of(layout, ending)])
+        with h5py.File(out, "r+") as file:
+            del file[field]
+            file[field] = np.void(pickle.dumps(bomb))
+            file[field].attrs["TITLE"] = np.void(pickle.dumps(bomb))
+            file.attrs["pandas_type"] = np.void(pickle.dumps(bomb))
+        return out.getvalue()
+
+    return layout, ending, make
+
+
+def of_yaml(bomb: Bomb) -> bytes:
+    return f"T_BS: !!python/object/apply:os.mkdir ['{bomb.folder}']\n".encode()
 
 
 def of_feather(bomb: Bomb) -> bytes:
     """A column of the extension type that old versions of pyarrow unpickled."""
     pyarrow, feather = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.feather")
-    table = feather.read_table(io.BytesIO(written("idol")["building1/known/3.feather"]))
+    table = feather.read_table(io.BytesIO(written("idol")[file_of("idol", ".feather")]))
     about = {
         "ARROW:extension:name": "arrow.py_extension_type",
         "ARROW:extension:metadata": pickle.dumps(bomb),
@@ -85,55 +86,34 @@ def of_feather(bomb: Bomb) -> bytes:
     return out.getvalue()
 
 
-PICKLES: dict[str, tuple[str, str, Callable[[Bomb], bytes]]] = {
-    "npy of objects": ("tlio", "walk/imu0_resampled.npy", of_numpy),
-    "npy": ("tlio", "walk/imu0_resampled.npy", pickle.dumps),
-    "npz of objects": ("kitti npz", "train__2011_09_26_drive_0014_extract0.npz", of_numpy_zip),
-    "npz": ("kitti npz", "train__2011_09_26_drive_0014_extract0.npz", pickle.dumps),
-    "field of RoNIN": (
-        "ronin",
-        "a011_2/data.hdf5",
-        lambda bomb: of_hdf5(bomb, "ronin", "synced/acce"),
-    ),
-    "RoNIN": ("ronin", "a011_2/data.hdf5", pickle.dumps),
-    "field of Blackbird": (
-        "blackbird",
-        "clover/yawForward/maxSpeed5p0/test/data.hdf5",
-        lambda bomb: of_hdf5(bomb, "blackbird", "traj_target"),
-    ),
-    "field of our own": ("hdf5", "walk.h5", lambda bomb: of_hdf5(bomb, "hdf5", "gyro")),
-    "device of our own": (
-        "hdf5",
-        "walk.h5",
-        lambda bomb: of_hdf5(bomb, "hdf5", "device_orientation"),
-    ),
-    "our own": ("hdf5", "walk.h5", pickle.dumps),
-    "feather": ("idol", "building1/known/3.feather", pickle.dumps),
-    "table of text": ("csv", "walk.csv", pickle.dumps),
-    "JSON": ("ronin", "a011_2/info.json", pickle.dumps),
-    "YAML": (
-        "euroc",
-        "MH_04_difficult/mav0/imu0/sensor.yaml",
-        lambda bomb: f"T_BS: !!python/object/apply:os.mkdir ['{bomb.folder}']\n".encode(),
-    ),
-}
+WHOLE = [("tlio", ".npy"), ("kitti npz", ".npz"), ("ronin", ".hdf5"), ("ronin", ".json")]
+WHOLE += [("hdf5", ".h5"), ("idol", ".feather"), ("csv", ".csv")]
+PICKLES = [
+    *((*place, pickle.dumps) for place in WHOLE),
+    ("tlio", ".npy", of_numpy),
+    ("kitti npz", ".npz", of_numpy_zip),
+    ("euroc", "imu0/sensor.yaml", of_yaml),
+    of_hdf5("ronin", ".hdf5", "synced/acce"),
+    of_hdf5("blackbird", ".hdf5", "traj_target"),
+    of_hdf5("hdf5", ".h5", "gyro"),
+    of_hdf5("hdf5", ".h5", "device_orientation"),
+]
 
 
-@pytest.mark.parametrize("kind", PICKLES)
-def test_what_would_execute_is_refused_unexecuted(tmp_path, kind):
-    name, file, make = PICKLES[kind]
-    trap = tmp_path / "trap"
+@pytest.mark.parametrize(("layout", "ending", "make"), PICKLES)
+def test_what_would_execute_is_refused_unexecuted(tmp_path, layout, ending, make):
+    file, trap = file_of(layout, ending), tmp_path / "trap"
     content = make(Bomb(trap))
-    assert not trap.exists() and content != written(name)[file]
-    result, said = check(name, [Damage(file, "content", token=content)])
+    assert not trap.exists() and content != written(layout)[file]
+    result, said = check(layout, [Damage(file, "content", token=content)])
     assert not trap.exists(), "it was executed"
     assert isinstance(result, InputError) and PurePosixPath(file).name in said
 
 
 def test_an_extension_type_of_feather_is_not_unpickled(tmp_path):
-    trap = tmp_path / "trap"
-    check("idol", [Damage("building1/known/3.feather", "content", token=of_feather(Bomb(trap)))])
-    assert not trap.exists()
+    content, file = of_feather(Bomb(tmp_path / "trap")), file_of("idol", ".feather")
+    check("idol", [Damage(file, "content", token=content)])
+    assert not (tmp_path / "trap").exists()
 
 
 def test_the_trap_works(tmp_path):

@@ -11,9 +11,8 @@ from tests.support.circle import changed, circle
 def test_resampling_what_is_uniform_already_changes_nothing():
     sequence = circle(200.0, 2.0)
     assert resample(sequence, 200.0) is sequence
-    stamped = sequence._replace(
-        time=np.round(sequence.time * 0.99999, 6)
-    )  # µs stamps of a clock off by 10 ppm, as TLIO's
+    # µs stamps of a clock off by 10 ppm, as TLIO's
+    stamped = sequence._replace(time=np.round(sequence.time * 0.99999, 6))
     assert resample(stamped, 200.0) is stamped
     slow = sequence._replace(time=sequence.time * 1.0005)  # half a per mille of every displacement
     assert resample(slow, 200.0) is not slow
@@ -52,24 +51,17 @@ def test_resampling_accepts_uneven_stamps():
     assert result.valid.all()
 
 
-def test_a_vibration_above_the_new_nyquist_frequency_does_not_fold_into_the_gait_band():
+def test_what_the_new_rate_cannot_carry_does_not_fold_into_the_gait_band():
     sequence = circle(200.0, 10.0)
-    vibration = (
-        5.0 * np.sin(2 * np.pi * 70.0 * sequence.time)[:, None]
-    )  # taken at 100 Hz it would look like 30 Hz
-    result = resample(
-        sequence._replace(accel=sequence.accel + vibration, gyro=sequence.gyro + vibration), 100.0
-    )
-    truth = circle(stamps=result.time)
-    edge = slice(50, -50)
-    assert (
-        np.abs(result.accel[edge] - truth.accel[edge]).max() < 5e-3
-    )  # 60 dB down, and no delay of the gait
-    assert np.abs(result.gyro[edge] - truth.gyro[edge]).max() < 5e-3
-
-
-def test_at_no_multiple_of_the_rate_images_of_the_spline_do_not_fold_back():
-    """The spline's image of 205 Hz, at 621 Hz, would alias to 21 Hz at 600 Hz."""
+    # Taken at 100 Hz it would look like 30 Hz.
+    vibration = 5.0 * np.sin(2 * np.pi * 70.0 * sequence.time)[:, None]
+    shaken = sequence._replace(accel=sequence.accel + vibration, gyro=sequence.gyro + vibration)
+    result = resample(shaken, 100.0)
+    truth, edge = circle(stamps=result.time), slice(50, -50)
+    for field in ("accel", "gyro"):  # 60 dB down, and no delay of the gait
+        off = getattr(result, field)[edge] - getattr(truth, field)[edge]
+        assert np.abs(off).max() < 5e-3
+    # The spline's image of 205 Hz, at 621 Hz, would alias to 21 Hz at 600 Hz.
     sequence = circle(416.0, 4.0)
     tone = np.sin(2 * np.pi * 205.0 * sequence.time[:, None] + [0.0, 1.0, 2.0])
     result = resample(sequence._replace(gyro=tone), 200.0)
@@ -77,34 +69,31 @@ def test_at_no_multiple_of_the_rate_images_of_the_spline_do_not_fold_back():
 
 
 def test_what_the_new_rate_can_carry_is_kept_up_to_the_ends():
+    def tones(time):
+        waves = np.sin(2 * np.pi * 35.0 * time), 0.1 * time, 1.0 + 0.02 * time
+        return np.stack(waves, axis=1)
+
     sequence = circle(200.0, 10.0)
-    time = sequence.time
-    tone = np.stack([np.sin(2 * np.pi * 35.0 * time), 0.1 * time, 1.0 + 0.02 * time], axis=1)
-    result = resample(sequence._replace(gyro=tone), 100.0)
-    kept = np.stack(
-        [np.sin(2 * np.pi * 35.0 * result.time), 0.1 * result.time, 1.0 + 0.02 * result.time],
-        axis=1,
-    )
+    result = resample(sequence._replace(gyro=tones(sequence.time)), 100.0)
+    kept = tones(result.time)
     np.testing.assert_allclose(result.gyro[50:-50, 0], kept[50:-50, 0], atol=5e-3)
     np.testing.assert_allclose(result.gyro[:, 1:], kept[:, 1:], atol=1e-4)
 
 
 def test_attitudes_are_slerped_whatever_the_signs_of_the_quaternions():
-    rng = np.random.default_rng(1)
-    time = np.arange(300) / 100
+    rng, time = np.random.default_rng(1), np.arange(300) / 100
     axis = np.array([1.0, 2.0, -2.0]) / 3.0
 
     def attitude(t):
-        angle = 3.0 * t[:, None]
-        return np.concatenate([np.cos(angle / 2), np.sin(angle / 2) * axis], axis=1)
+        half = 1.5 * t[:, None]
+        return np.concatenate([np.cos(half), np.sin(half) * axis], axis=1)
 
     flipped = attitude(time) * rng.choice([-1.0, 1.0], size=(300, 1))
     sequence = circle(stamps=time)._replace(orientation=flipped, device_orientation=flipped)
     result = resample(sequence, 330.0)
     for got in (result.orientation, result.device_orientation):
-        np.testing.assert_allclose(
-            np.abs((got * attitude(result.time)).sum(axis=1)), 1.0, atol=1e-12
-        )
+        along = (got * attitude(result.time)).sum(axis=1)
+        np.testing.assert_allclose(np.abs(along), 1.0, atol=1e-12)
 
 
 def test_a_hole_is_bridged_in_the_imu_and_marked_in_the_reference():
@@ -121,31 +110,24 @@ def test_a_hole_is_bridged_in_the_imu_and_marked_in_the_reference():
 
 
 def test_an_outlier_marked_invalid_does_not_reach_its_valid_neighbours():
-    sequence = circle(100.0, 4.0)
-    rows = slice(200, 210)
-    for field, value in (("position", 1e4), ("velocity", 1e4), ("valid", False)):
-        sequence = changed(sequence, field, rows, value)
+    sequence = changed(circle(100.0, 4.0), "valid", slice(200, 210), False)
+    for field in ("position", "velocity"):
+        sequence = changed(sequence, field, slice(200, 210), 1e4)
     result = resample(sequence, 130.0)
-    truth = circle(stamps=result.time)
     near = (result.time > 1.99 + 1e-6) & (result.time < 2.10 - 1e-6)
     np.testing.assert_array_equal(result.valid, ~near)
-    np.testing.assert_allclose(
-        result.position[result.valid], truth.position[result.valid], atol=1e-5
-    )
+    off = result.position - circle(stamps=result.time).position
+    np.testing.assert_allclose(off[result.valid], 0.0, atol=1e-5)
 
 
 @pytest.mark.parametrize("rows", [2, 20])
 def test_a_missing_reference_stays_missing(rows):
-    sequence = circle(100.0, 4.0)
-    for field, value in (
-        ("position", np.nan),
-        ("velocity", np.nan),
-        ("orientation", np.nan),
-        ("valid", False),
-    ):
-        sequence = changed(sequence, field, slice(200, 200 + rows), value)
+    gone, fields = slice(200, 200 + rows), ("position", "velocity", "orientation")
+    sequence = changed(circle(100.0, 4.0), "valid", gone, False)
+    for field in fields:
+        sequence = changed(sequence, field, gone, np.nan)
     result = resample(sequence, 130.0)
-    for field in ("position", "velocity", "orientation"):
+    for field in fields:
         np.testing.assert_array_equal(np.isfinite(getattr(result, field)).all(axis=1), result.valid)
     assert np.isfinite(result.accel).all()
     validate(result, "walk")

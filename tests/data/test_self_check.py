@@ -39,20 +39,12 @@ def test_self_check_of_a_consistent_walk():
     assert check.accel_correlation_horizontal > 0.999
 
 
-def test_self_check_removes_one_constant_gyro_bias():
-    sequence = circle()
-    assert (
-        self_check(
-            sequence._replace(gyro=sequence.gyro + np.array([0.02, -0.03, 0.05]))
-        ).gyro_consistency_degrees
-        < 0.1
-    )
-
-
-def test_self_check_judges_gyro_by_the_median_window():
+def test_self_check_removes_one_constant_gyro_bias_and_judges_by_the_median_window():
     sequence = circle(seconds=100.0)
+    biased = sequence._replace(gyro=sequence.gyro + np.array([0.02, -0.03, 0.05]))
     spoilt = changed(sequence, "gyro", slice(3000, 4000), [1.0, 0.5, 0.0])
-    assert self_check(spoilt).gyro_consistency_degrees < 0.1
+    for each in (biased, spoilt):
+        assert self_check(each).gyro_consistency_degrees < 0.1
     drifting = sequence._replace(gyro=sequence.gyro + 0.1 * np.sin(0.3 * sequence.time)[:, None])
     assert any("gyro" in failure for failure in self_check(drifting).failures)
 
@@ -95,12 +87,8 @@ def test_a_clipped_accelerometer_is_named_as_the_reason():
     assert "mean of R·accel" in failure and "clips in 21% of the samples" in failure
 
 
-def test_self_check_spares_the_fast_who_do_not_walk_and_those_who_stand():
+def test_self_check_spares_those_who_stand():
     sequence = circle()
-    assert (
-        self_check(sequence._replace(velocity=sequence.velocity * 4), pedestrian=False).failures
-        == ()
-    )
     still = sequence._replace(
         gyro=0 * sequence.gyro,
         accel=0 * sequence.accel + [0, 0, 9.81],
@@ -123,16 +111,10 @@ def test_self_check_spares_the_fast_who_do_not_walk_and_those_who_stand():
 
 
 def test_self_check_looks_at_valid_samples_only():
-    sequence = circle()
-    for field, value in (
-        ("position", np.nan),
-        ("velocity", np.nan),
-        ("orientation", np.nan),
-        ("accel", 90.0),
-        ("valid", False),
-    ):
-        sequence = changed(sequence, field, slice(700, 760), value)
-    check = self_check(sequence)
+    sequence = changed(circle(), "accel", slice(700, 760), 90.0)
+    for field in ("position", "velocity", "orientation"):
+        sequence = changed(sequence, field, slice(700, 760), np.nan)
+    check = self_check(changed(sequence, "valid", slice(700, 760), False))
     assert check.failures == ()
     assert check.share_valid == pytest.approx(0.98)
     assert check.accel_correlation_horizontal > 0.99
@@ -159,32 +141,23 @@ def test_who_ends_faster_than_he_began_is_not_tilted():
     assert check.failures == ()
     steady = speeding(push=0.0)  # the same force without the gain in speed is a tilt
     tilted = steady._replace(accel=steady.accel + np.array([1.5, 0, 0]))
-    np.testing.assert_allclose(
-        self_check(tilted, pedestrian=False).gravity_mean, [1.5, 0, 9.81], atol=1e-9
-    )
-    assert (
-        "mean of R·accel is (1.50, 0.00, 9.81)" in self_check(tilted, pedestrian=False).failures[0]
-    )
+    check = self_check(tilted, pedestrian=False)
+    np.testing.assert_allclose(check.gravity_mean, [1.5, 0, 9.81], atol=1e-9)
+    assert "mean of R·accel is (1.50, 0.00, 9.81)" in check.failures[0]
 
 
 def test_the_gain_in_speed_is_that_of_the_valid_stretches():
     sequence = speeding(seconds=12.0, push=0.5)
+    time = sequence.time
     # A stop and start in the middle that nobody has seen: speeds before and after say nothing of
     # each other.
-    velocity = np.where(
-        sequence.time[:, None] >= 6.0, sequence.velocity - [4.0, 0, 0], sequence.velocity
-    )
-    sequence = sequence._replace(
-        velocity=velocity, valid=(sequence.time < 5.0) | (sequence.time >= 7.0)
-    )
-    np.testing.assert_allclose(
-        self_check(sequence, pedestrian=False).gravity_mean, [0, 0, 9.81], atol=1e-9
-    )
+    velocity = np.where(time[:, None] >= 6.0, sequence.velocity - [4.0, 0, 0], sequence.velocity)
+    sequence = sequence._replace(velocity=velocity, valid=(time < 5.0) | (time >= 7.0))
+    check = self_check(sequence, pedestrian=False)
+    np.testing.assert_allclose(check.gravity_mean, [0, 0, 9.81], atol=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("seconds", "judged"), [(4.0, False), (15.0, False), (19.9, False), (20.1, True), (30.0, True)]
-)
+@pytest.mark.parametrize(("seconds", "judged"), [(4.0, False), (19.9, False), (20.1, True)])
 def test_one_window_says_nothing_of_the_gyro_since_a_bias_explains_it(seconds, judged):
     sequence = circle(seconds=seconds)
     wrong = sequence._replace(gyro=sequence.gyro[:, [1, 2, 0]] * np.sin(sequence.time)[:, None])
@@ -193,12 +166,11 @@ def test_one_window_says_nothing_of_the_gyro_since_a_bias_explains_it(seconds, j
     assert any("gyro" in failure for failure in check.failures) == judged
     assert not any("no window" in failure for failure in check.failures)
     assert self_check(sequence).failures == ()
-
-
-def test_one_valid_window_of_a_long_recording_says_nothing_either():
-    sequence = circle(seconds=60.0)
-    check = self_check(sequence._replace(valid=(sequence.time >= 20.0) & (sequence.time < 31.0)))
-    assert np.isnan(check.gyro_consistency_degrees) and check.failures == ()
+    if judged:  # one valid window of a long recording says nothing either
+        sequence = circle(seconds=60.0)
+        seen = (sequence.time >= 20.0) & (sequence.time < 31.0)
+        check = self_check(sequence._replace(valid=seen))
+        assert np.isnan(check.gyro_consistency_degrees) and check.failures == ()
 
 
 def test_windows_of_the_gyro_tell_when_it_is_off():
@@ -212,49 +184,31 @@ def test_windows_of_the_gyro_tell_when_it_is_off():
     assert degrees[~touched].max() < 0.2  # one ends between two samples of which one is touched
 
 
-def test_positions_of_another_body_need_not_correlate():
-    sequence = circle()
-    mirrored = sequence._replace(position=sequence.position * [-1, 1, 1])
-    assert self_check(mirrored, correlates=False).failures == ()
-    (kept,) = keep_plausible([mirrored], asking(correlates=False))
-    assert kept.name == mirrored.name
-    with (
-        pytest.warns(UserWarning, match="correlates by only"),
-        pytest.raises(InputError, match="none of 1"),
-    ):
-        keep_plausible([mirrored], asking())
-    # A converted recording brings along what its own dataset asks.
-    chest = mirrored._replace(attributes={"check_correlation": False, "check_pedestrian": True})
-    assert len(keep_plausible([chest], asking())) == 1
-    running = chest._replace(velocity=chest.velocity * 4)
-    assert any(
-        "too fast" in failure
-        for failure in check_sequence(running, asking(pedestrian=False)).failures
-    )
-
-
-def test_a_recording_without_a_reference_is_kept_where_none_is_needed():
-    sequence = circle()
-    bare = sequence._replace(
-        valid=np.zeros_like(sequence.valid), position=sequence.position * np.nan
-    )
-    assert len(keep_plausible([bare], asking(needs_reference=False))) == 1
-    assert check_sequence(bare, asking()).failures == ("no sample has a valid reference",)
-
-
-def test_keep_plausible_names_what_it_leaves_out():
+def test_what_is_implausible_is_left_out_and_named_unless_the_dataset_does_not_ask():
     good = circle()
     upside = good._replace(name="upside", accel=-good.accel)
     with pytest.warns(UserWarning, match=r"upside: left out .* mean of R·accel") as caught:
         assert [each.name for each in keep_plausible([upside, good], asking())] == [good.name]
     assert len(caught) == 1
-    with (
-        pytest.warns(UserWarning, match="upside"),
-        pytest.raises(InputError, match="upside: none of 1 sequences"),
-    ):
-        keep_plausible([upside], asking())
+    nothing = pytest.raises(InputError, match="none of 1 sequences")
+    mirrored = good._replace(position=good.position * [-1, 1, 1])
+    with nothing, pytest.warns(UserWarning, match="correlates by only"):
+        keep_plausible([mirrored], asking())
+    bare = good._replace(valid=np.zeros_like(good.valid), position=good.position * np.nan)
+    assert check_sequence(bare, asking()).failures == ("no sample has a valid reference",)
+    # A converted recording brings along what its own dataset asks.
+    chest = mirrored._replace(attributes={"check_correlation": False, "check_pedestrian": True})
     fast = good._replace(velocity=good.velocity * 4)
-    assert len(keep_plausible([fast], asking(pedestrian=False))) == 1
+    for sequence, options in (
+        (mirrored, {"correlates": False}),  # of another body
+        (fast, {"pedestrian": False}),
+        (bare, {"needs_reference": False}),
+        (chest, {}),
+    ):
+        assert len(keep_plausible([sequence], asking(**options))) == 1
+    running = chest._replace(velocity=chest.velocity * 4)
+    failures = check_sequence(running, asking(pedestrian=False)).failures
+    assert any("too fast" in failure for failure in failures)
 
 
 def test_waypoints_are_asked_for_gravity_and_speed_alone():

@@ -7,7 +7,7 @@ import h5py
 import numpy as np
 import pytest
 
-from gnio_jax.data.parsing.tables import Table, parsed_as, read_hdf5_fields, read_npz, read_text
+from gnio_jax.data.parsing.tables import parsed_as, read_hdf5_fields, read_npz, read_text
 from gnio_jax.errors import InputError
 
 
@@ -58,16 +58,6 @@ def test_fields_of_binary_files_have_one_length_and_hold_numbers(tmp_path):
         ):
             with pytest.raises(InputError, match=f"field '{prefix}{name}' {words}"):
                 table.take(f"{prefix}{name}", width=width)
-
-
-def test_rotations_name_the_row_that_is_none(tmp_path):
-    wxyz = np.tile([1.0, 0.0, 0.0, 0.0], (5, 1))
-    wxyz[3] = 0.0
-    table = Table(tmp_path / "a.npz", {"q": wxyz}, "field")
-    with pytest.raises(InputError, match=r"field 'q' is not a unit quaternion in 1 rows.* row 4 "):
-        table.rotations("q", width=4)
-    known = wxyz.any(axis=1)
-    assert len(table.rotations("q", width=4, rows=known)) == 4
 
 
 def test_a_mistake_of_ours_and_a_lack_of_memory_are_no_damage(tmp_path):

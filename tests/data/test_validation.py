@@ -62,10 +62,8 @@ def test_validate_lets_the_reference_be_missing_where_it_is_marked_invalid():
 
 def test_validate_normalizes_rounded_quaternions_and_keeps_exact_ones_bit_for_bit():
     assert validate(GOOD, "walk.csv").orientation is GOOD.orientation
-    rounded = GOOD._replace(orientation=np.round(GOOD.orientation, 4))
-    np.testing.assert_allclose(
-        np.linalg.norm(validate(rounded, "walk.csv").orientation, axis=1), 1.0, atol=1e-14
-    )
+    rounded = validate(GOOD._replace(orientation=np.round(GOOD.orientation, 4)), "walk.csv")
+    np.testing.assert_allclose(np.linalg.norm(rounded.orientation, axis=1), 1.0, atol=1e-14)
 
 
 def test_a_gap_longer_than_a_window_is_refused():

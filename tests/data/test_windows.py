@@ -46,25 +46,17 @@ def tumbling(count, seed, invalid=()):
 def cut(sequences, rotation, stride, context=0):
     imu, target, steps = [], [], []
     for s in sequences:
+        attitude = Rotation.from_quat(s.orientation, scalar_first=True)
         for i in range(0, len(s.time), stride):
             end, after_context = i + context + 20, i + context
             if end >= len(s.time) or not all(s.valid[j] for j in range(i, end + 1)):
                 continue
-            start = Rotation.from_quat(s.orientation[after_context], scalar_first=True)
-            heading = np.arctan2(start.as_matrix()[1, 0], start.as_matrix()[0, 0])
-            back = Rotation.from_euler("z", -heading)
+            heading = attitude[after_context].as_matrix()[:2, 0]
+            back = Rotation.from_euler("z", -np.arctan2(heading[1], heading[0]))
             rows = []
             for j in range(i, end):
-                attitude = (
-                    Rotation.from_quat(s.orientation[j], scalar_first=True)
-                    if rotation == "per_sample"
-                    else start
-                )
-                rows.append(
-                    np.concatenate(
-                        [(back * attitude).apply(s.accel[j]), (back * attitude).apply(s.gyro[j])]
-                    )
-                )
+                turn = back * attitude[j if rotation == "per_sample" else after_context]
+                rows.append(np.concatenate([turn.apply(s.accel[j]), turn.apply(s.gyro[j])]))
             imu.append(rows)
             target.append(back.apply(s.position[end] - s.position[after_context]))
             steps.append([back.apply(s.position[j + 1] - s.position[j]) for j in range(i, end)])
@@ -76,19 +68,14 @@ def cut(sequences, rotation, stride, context=0):
     [("per_sample", 2, 0), ("single", 2, 0), ("per_sample", 1, 0), ("per_sample", 2, 6)],
 )
 def test_gather_against_a_brute_force_cutter(rotation, stride, context):
-    sequences = [
-        tumbling(57, 1),
-        tumbling(61, 2, invalid=[0, 33]),
-        tumbling(15, 3),
-        tumbling(21, 4),
-        tumbling(20, 5),
-    ]
+    sequences = [tumbling(57, 1), tumbling(61, 2, invalid=[0, 33])]
+    sequences += [tumbling(15, 3), tumbling(21, 4), tumbling(20, 5)]
     config = DataConfig(rate=20.0, window_rotation=rotation, context_seconds=context / 20)
     source = windows.window_source(sequences, config, stride)
     imu, target, steps = cut(sequences, rotation, stride, context)
     assert source.start.shape == (len(target),)
     order = np.random.default_rng(0).permutation(len(target)).astype(np.int32)
-    found = gather(jax.device_put(source), jnp.asarray(order), config.seen)
+    found = gather(jax.device_put(source), order, config.seen)
     np.testing.assert_allclose(found.imu, imu[order], atol=1e-5)
     np.testing.assert_allclose(found.displacement, target[order], atol=1e-5)
     np.testing.assert_allclose(found.steps, steps[order], atol=1e-5)
@@ -98,39 +85,32 @@ def test_gather_against_a_brute_force_cutter(rotation, stride, context):
 
 def test_shifted_windows_are_those_of_the_neighbouring_samples_in_the_same_recording():
     sequences = [tumbling(57, 1), tumbling(61, 2, invalid=[33]), tumbling(31, 3)]
-    source = jax.device_put(windows.window_source(sequences, CONFIG, 4, shift=3))
+    source = windows.window_source(sequences, CONFIG, 4, shift=3)
     plain = windows.window_source(sequences, CONFIG, 4)
     np.testing.assert_array_equal(source.start[source.visited], plain.start)
-    which = jnp.tile(jnp.asarray(source.visited), 200)
+    which, start = np.tile(source.visited, 200), np.asarray(source.start)
+    source, which = jax.device_put((source, which))
     there = np.asarray(shift_windows(KEY, source, which, 3))
-    start = np.asarray(source.start)
     moved = start[there] - start[which]
     assert set(moved) == set(range(-3, 4))
     recording = np.searchsorted([57, 118], start, side="right")
     np.testing.assert_array_equal(recording[there], recording[which])
-    first = (
-        np.asarray(which) == 0
-    )  # the first window of all cannot begin earlier: 3 of 7 draws leave it where it is
+    # The first window of all cannot begin earlier: 3 of 7 draws leave it where it is.
+    first = which == 0
     assert moved[first].min() == 0 and np.mean(moved[first] == 0) == pytest.approx(4 / 7, abs=0.12)
     np.testing.assert_array_equal(windows.shift_windows(KEY, source, which, 0), which)
 
 
-def test_a_window_of_exactly_its_length_lacks_the_pose_after_it():
+def test_windows_have_a_pose_after_them_and_lie_across_no_gap():
     with pytest.raises(InputError, match="no window of 1 s"):
         windows.window_source([tumbling(20, 0)], CONFIG, 2)
     assert windows.window_source([tumbling(21, 0)], CONFIG, 2).start.shape == (1,)
-
-
-def test_no_window_lies_across_a_gap_of_the_imu():
-    """The reference sees through it."""
     there = np.ones(60, bool)
-    there[[0, 33]] = False
+    there[[0, 33]] = False  # of the IMU: the reference sees through it
     source = windows.window_source([tumbling(60, 0)._replace(imu_valid=there)], CONFIG, 1)
     starts = [i for i in range(40) if there[i : i + 20].all()]
     np.testing.assert_array_equal(source.start, starts)
-
-
-def test_samples_without_a_reference_may_hold_nan():
+    # Samples without a reference may hold NaN.
     sequence = tumbling(60, 0, invalid=range(25, 30))
     for field in (sequence.orientation, sequence.position):
         field[25:30] = np.nan
@@ -142,13 +122,13 @@ def test_samples_without_a_reference_may_hold_nan():
 
 def batch(count=4000, length=5):
     rng = np.random.default_rng(7)
-    draw = lambda *shape: jnp.asarray(rng.standard_normal(shape), jnp.float32)  # noqa: E731
+    draw = lambda *shape: rng.standard_normal(shape).astype(np.float32)  # noqa: E731
     return Windows(draw(count, length, 6), draw(count, 3), draw(count, length, 3))
 
 
 def augmented(before, **options):
     """With these changes alone."""
-    return augment(KEY, before, dataclasses.replace(OFF, **options))
+    return jax.device_get(augment(KEY, before, dataclasses.replace(OFF, **options)))
 
 
 def test_bias_is_constant_in_a_window_uniform_over_windows_and_spares_the_target():
@@ -236,8 +216,8 @@ def test_low_pass_draws_order_and_cutoff_for_each_window_and_both_sensors_alike(
     config = dataclasses.replace(OFF, low_pass_share=0.6, low_pass_hertz=(4.0, 25.0))
     time, frequency = np.arange(100) / 100, np.array([10, 20, 0, 20, 10, 0])
     sines = np.sin(2 * np.pi * frequency * time[:, None] + 1)
-    imu = jnp.asarray(np.tile(sines, (3000, 1, 1)), jnp.float32)
-    before = Windows(imu, jnp.ones((3000, 3)), jnp.ones((3000, 50, 3)))
+    imu = np.tile(sines.astype(np.float32), (3000, 1, 1))
+    before = Windows(imu, np.ones((3000, 3), np.float32), np.ones((3000, 50, 3), np.float32))
     after = low_pass(KEY, before, config, 100.0)
     np.testing.assert_array_equal(after.displacement, before.displacement)
     inner = sines[25:-25]
@@ -265,7 +245,7 @@ def test_low_pass_of_a_window_is_that_of_its_whole_recording():
     parts = [tumbling(90, seed)._replace(orientation=level) for seed in range(2)]
     parts[1] = parts[1]._replace(accel=parts[1].accel + 100)
     source = jax.device_put(windows.window_source(parts, CONFIG, 2))
-    which = jnp.arange(len(source.start), dtype=jnp.int32)
+    which = np.arange(len(source.start), dtype=np.int32)
     config = dataclasses.replace(OFF, low_pass_share=0.999999, low_pass_hertz=(4.0, 4.0))
     margin = windows.low_pass_margin(config, 20.0)
     found = low_pass(KEY, gather(source, which, 20, margin), config, 20.0)
@@ -285,24 +265,17 @@ def test_low_pass_of_a_window_is_that_of_its_whole_recording():
 
 def test_the_margin_of_the_low_pass_ends_where_the_reference_does():
     """A phone upright at rest: what it measures, seen in the world, is gravity up to the edge."""
-    count, before = 400, 150
-    upright = np.tile([np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0], (count, 1))  # wxyz, 90° about x
+    before, still = 150, np.zeros((400, 3))
+    upright = np.tile([np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0], (400, 1))  # wxyz, 90° about x
     upright[:before] = np.nan
-    valid = np.arange(count) >= before
-    phone = Sequence(
-        name="upright",
-        time=np.arange(count) / 100.0,
-        gyro=np.zeros((count, 3)),
-        accel=np.tile([0.0, 9.81, 0.0], (count, 1)),
-        orientation=upright,
-        position=np.zeros((count, 3)),
-        velocity=np.zeros((count, 3)),
-        valid=valid,
+    phone = tumbling(400, 0, invalid=range(before))._replace(
+        gyro=still, accel=np.tile([0.0, 9.81, 0.0], (400, 1)), orientation=upright, position=still
     )
-    source = jax.tree.map(jnp.asarray, windows.window_source([phone], DataConfig(rate=100.0), 10))
-    margin = windows.low_pass_margin(AugmentConfig(low_pass_share=1.0), 100.0)
-    found = windows.gather(source, jnp.arange(len(source.start)), 100, margin)
-    assert source.start[0] == before and found.imu.shape[1] == 100 + 2 * margin
+    source = windows.window_source([phone], CONFIG, 10)
+    margin = windows.low_pass_margin(AugmentConfig(low_pass_share=1.0), 20.0)
+    which = np.arange(len(source.start), dtype=np.int32)
+    found = gather(jax.device_put(source), which, 20, margin)
+    assert source.start[0] == before and found.imu.shape[1] == 20 + 2 * margin
     expected = np.broadcast_to(np.float32([0, 0, 9.81, 0, 0, 0]), found.imu.shape)
     np.testing.assert_allclose(found.imu, expected, atol=1e-5)
 

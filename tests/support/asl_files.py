@@ -16,38 +16,21 @@ from scipy.spatial.transform import Rotation
 from tests.support import known_walk
 
 EPOCH = 1_520_530_308_181_901_469
+
+
+def _names(*blocks: tuple[str, str, str]) -> list[str]:
+    return [f" {name}_{axis} [{unit}]" for name, axes, unit in blocks for axis in axes]
+
+
 IMU_HEADER = [
     "#timestamp [ns]",
-    *(f"w_RS_S_{a} [rad s^-1]" for a in "xyz"),
-    *(f"a_RS_S_{a} [m s^-2]" for a in "xyz"),
+    *_names(("w_RS_S", "xyz", "rad s^-1"), ("a_RS_S", "xyz", "m s^-2")),
 ]
-LONG_HEADER = [
-    "#timestamp",
-    *(f" p_RS_R_{a} [m]" for a in "xyz"),
-    *(f" q_RS_{a} []" for a in "wxyz"),
-    *(f" v_RS_R_{a} [m s^-1]" for a in "xyz"),
-    *(f" b_w_RS_S_{a} [rad s^-1]" for a in "xyz"),
-    *(f" b_a_RS_S_{a} [m s^-2]" for a in "xyz"),
-]
-SHORT_HEADER = [
-    "#time(ns)",
-    "px",
-    "py",
-    "pz",
-    "qw",
-    "qx",
-    "qy",
-    "qz",
-    "vx",
-    "vy",
-    "vz",
-    "bwx",
-    "bwy",
-    "bwz",
-    "bax",
-    "bay",
-    "baz",
-]
+IMU_HEADER = [name.strip() for name in IMU_HEADER]
+POSE_HEADER = ["#timestamp", *_names(("p_RS_R", "xyz", "m"), ("q_RS", "wxyz", ""))]
+LONG_HEADER = [*POSE_HEADER, *_names(("v_RS_R", "xyz", "m s^-1"), ("b_w_RS_S", "xyz", "rad s^-1"))]
+LONG_HEADER += _names(("b_a_RS_S", "xyz", "m s^-2"))
+SHORT_HEADER = "#time(ns) px py pz qw qx qy qz vx vy vz bwx bwy bwz bax bay baz".split()
 
 
 class Mount(NamedTuple):
@@ -57,25 +40,32 @@ class Mount(NamedTuple):
     translation: np.ndarray = np.zeros(3)
 
 
+def mount(axes: str, degrees: list[float], translation: list[float]) -> Mount:
+    return Mount(Rotation.from_euler(axes, degrees, degrees=True), np.array(translation))
+
+
 def write_table(
     path: Path,
     header: list[str],
-    stamps: np.ndarray,
+    time: np.ndarray,
     values: np.ndarray,
     style: str = "%.9f",
     shuffle: bool = False,
+    spoil=None,
 ) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    columns = (
-        np.random.default_rng(3).permutation(len(header)) if shuffle else np.arange(len(header))
-    )
+    """`spoil(stamps, values) -> (stamps, values)` may damage the rows."""
+    stamps = EPOCH + np.round(time * 1e9).astype(np.int64)
+    if spoil:
+        stamps, values = spoil(stamps, values)
+    columns = np.arange(len(header))
+    if shuffle:
+        columns = np.random.default_rng(3).permutation(len(header))
+        header = [header[i].strip().lstrip("#") for i in columns]
+        header[0] = "#" + header[0]
     styles = ",".join("%s" if i == 0 else style for i in columns)
     cells = zip(stamps.tolist(), *values.T.tolist(), strict=True)
-    names = [header[i].strip().lstrip("#") for i in columns] if shuffle else header
-    text = [
-        ("#" if shuffle else "") + ",".join(names),
-        *(styles % tuple(row[i] for i in columns) for row in cells),
-    ]
+    text = [",".join(header), *(styles % tuple(row[i] for i in columns) for row in cells)]
+    path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text("\n".join(text) + "\n")
 
 
@@ -92,33 +82,23 @@ def write_yaml(path: Path, mount: Mount, opencv: bool = False) -> None:
 
 
 def write_imu(
-    mav: Path,
-    seconds: float = 12.0,
-    step: float = 0.005,
-    bias: float = 0.0,
-    spoil=None,
-    shuffle: bool = False,
+    mav: Path, seconds: float = 12.0, step: float = 0.005, bias: float = 0.0, shuffle: bool = False
 ) -> None:
-    """`spoil(stamps, values) -> (stamps, values)` may damage the rows."""
     time = np.arange(round(seconds / step)) * step
-    stamps = EPOCH + np.round(time * 1e9).astype(np.int64)
     values = np.concatenate([known_walk.rate(time) + bias, known_walk.force(time)], axis=1)
-    if spoil:
-        stamps, values = spoil(stamps, values)
-    write_table(mav / "imu0" / "data.csv", IMU_HEADER, stamps, values, shuffle=shuffle)
+    write_table(mav / "imu0" / "data.csv", IMU_HEADER, time, values, shuffle=shuffle)
 
 
 def poses(
     time: np.ndarray, mount: Mount, imu_mount: Mount
 ) -> tuple[np.ndarray, Rotation, np.ndarray]:
     """(position, attitude, velocity) of the reference's sensor: world ← IMU ← body ← sensor."""
-    attitude, h = known_walk.attitude, 1e-5
+    attitude = known_walk.attitude(time)
     turn = imu_mount.rotation.inv() * mount.rotation
     lever = imu_mount.rotation.inv().apply(mount.translation - imu_mount.translation)
-    speed = known_walk.velocity(time) + (
-        attitude(time + h).apply(lever) - attitude(time - h).apply(lever)
-    ) / (2 * h)
-    return known_walk.position(time) + attitude(time).apply(lever), attitude(time) * turn, speed
+    swing = attitude.apply(np.cross(known_walk.rate(time), lever))
+    place = known_walk.position(time) + attitude.apply(lever)
+    return place, attitude * turn, known_walk.velocity(time) + swing
 
 
 def write_estimate(
@@ -135,15 +115,10 @@ def write_estimate(
     """state_groundtruth_estimate0, at stamps of its own."""
     time = np.arange(first + 0.0013, last, step)
     place, attitude, speed = poses(time, mount or Mount(), imu_mount or Mount())
-    x, y, z, w = attitude.as_quat().T
-    values = np.concatenate(
-        [place, np.stack([w, x, y, z], axis=1), speed, np.full((len(time), 6), 0.07)], axis=1
-    )
-    stamps = EPOCH + np.round(time * 1e9).astype(np.int64)
-    if spoil:
-        stamps, values = spoil(stamps, values)
+    biases = np.full((len(time), 6), 0.07)
+    values = np.concatenate([place, attitude.as_quat(scalar_first=True), speed, biases], axis=1)
     folder = mav / "state_groundtruth_estimate0"
-    write_table(folder / "data.csv", header, stamps, values, shuffle=shuffle)
+    write_table(folder / "data.csv", header, time, values, shuffle=shuffle, spoil=spoil)
     if mount is not None:
         write_yaml(folder / "sensor.yaml", mount)
 
@@ -163,27 +138,17 @@ def write_mocap(
     random = np.random.default_rng(11)
     time = np.arange(first, last, 1 / 120.0)
     place, attitude, _ = poses(time, mount or Mount(), Mount())
-    attitude = attitude * Rotation.from_rotvec(
-        random.normal(0, np.radians(0.1), (len(time), 3)) * noise
-    )
-    place = place + random.normal(0, 4e-4, place.shape) * noise
-    x, y, z, w = attitude.as_quat().T
-    sign = np.where(np.arange(len(time)) % 50 < 25, 1.0, -1.0)[:, None]  # q and −q are one rotation
-    values = np.concatenate([place, np.stack([w, x, y, z], axis=1) * sign], axis=1)
+    shaken = noise * random.normal(0, np.radians(0.1), (len(time), 3))
+    attitude = attitude * Rotation.from_rotvec(shaken)
+    place = place + noise * random.normal(0, 4e-4, place.shape)
     for when in flips:
         row = int(np.argmin(np.abs(time - when)))
-        values[row, 3:] = (attitude[row] * Rotation.from_euler("x", 120, degrees=True)).as_quat()[
-            [3, 0, 1, 2]
-        ]
-        values[row, :3] += 0.3
-    keep = (
-        ~np.any([(time > start) & (time < end) for start, end in gaps], axis=0)
-        if gaps
-        else np.ones(len(time), dtype=bool)
-    )
-    stamps, values = (EPOCH + np.round(time * 1e9).astype(np.int64))[keep], values[keep]
-    if spoil:
-        stamps, values = spoil(stamps, values)
-    write_table(mav / "mocap0" / "data.csv", LONG_HEADER[:8], stamps, values, "%.10f")
+        attitude[row] = attitude[row] * Rotation.from_euler("x", 120, degrees=True)
+        place[row] += 0.3
+    sign = np.where(np.arange(len(time)) % 50 < 25, 1.0, -1.0)[:, None]  # q and −q are one rotation
+    values = np.concatenate([place, attitude.as_quat(scalar_first=True) * sign], axis=1)
+    keep = np.all([(time <= start) | (time >= end) for start, end in ((0, 0), *gaps)], axis=0)
+    path = mav / "mocap0" / "data.csv"
+    write_table(path, POSE_HEADER, time[keep], values[keep], "%.10f", spoil=spoil)
     if mount is not None:
         write_yaml(mav / "mocap0" / "sensor.yaml", mount, opencv=True)

@@ -28,19 +28,10 @@ def write(
     pose = np.concatenate([place, Rotation.from_matrix(body).as_quat()], axis=1)
     gyro, accel = known_walk.rate(time) @ FLIP, known_walk.force(time) @ FLIP
     bias = np.array([0.01, -0.02, 0.005])
-    fields = {
-        "ts": START + time,
-        "gyro_calib": gyro,
-        "accel_calib": accel,
-        "traj_target": pose,
-        "gyro_raw": gyro + bias,
-        "accel_raw": accel + bias,
-        "gyro_bias": bias,
-        "accel_bias": bias,
-        "thrust": 0 * gyro,
-        "i_thrust": 0 * gyro,
-        "traj_target_oris_from_imu": np.ones((1, 10)),
-    }
+    fields = {"ts": START + time, "gyro_calib": gyro, "accel_calib": accel, "traj_target": pose}
+    fields |= {"gyro_raw": gyro + bias, "accel_raw": accel + bias, "thrust": 0 * gyro}
+    fields |= {"gyro_bias": bias, "accel_bias": bias, "i_thrust": 0 * gyro}
+    fields["traj_target_oris_from_imu"] = np.ones((1, 10))
     if spoil:
         spoil(fields)
     folder.mkdir(parents=True, exist_ok=True)
@@ -50,8 +41,6 @@ def write(
     if text:
         table = np.concatenate([(START + time)[:, None], pose, speed], axis=1)[:, :text]
         style = " ".join(["%.12f"] * text)
-        rows = [style % tuple(row) for row in table.tolist()]
-        (folder / "stamped_groundtruth_imu.txt").write_text(
-            "\n".join(["# ts x y z qx qy qz qw", *rows]) + "\n"
-        )
+        rows = ["# ts x y z qx qy qz qw", *(style % tuple(row) for row in table.tolist())]
+        (folder / "stamped_groundtruth_imu.txt").write_text("\n".join(rows) + "\n")
     return folder

@@ -22,23 +22,14 @@ def pose(time):
 
 def write(path, names, columns, separator=",", head="", style="%.9f"):
     """Columns of numbers; integers are written as such, NaN as nothing."""
+
+    def text(value):
+        return ("" if value != value else style % value) if isinstance(value, float) else str(value)
+
     path.parent.mkdir(parents=True, exist_ok=True)
-    cells = [
-        [
-            ("" if value != value else style % value)
-            if np.asarray(column).dtype.kind == "f"
-            else str(value)
-            for value in column
-        ]
-        for column in columns
-    ]
-    path.write_text(
-        head
-        + "\n".join(
-            [separator.join(names), *(separator.join(row) for row in zip(*cells, strict=True))]
-        )
-        + "\n"
-    )
+    rows = zip(*(np.asarray(column).tolist() for column in columns), strict=True)
+    lines = [separator.join(names), *(separator.join(map(text, row)) for row in rows)]
+    path.write_text(head + "\n".join(lines) + "\n")
     return path
 
 

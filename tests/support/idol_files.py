@@ -25,32 +25,22 @@ def frame(seconds=walk.SECONDS, lag=0.0, tilt=TILT, mount=RIG_OF_PHONE, start=0.
     map's world."""
     time = start + np.arange(round(seconds * 100)) / 100
     then = time - lag
+    own = Rotation.from_euler("z", 0.9) * walk.attitude(time)
     rig = tilt * walk.attitude(then) * mount.inv()
     blocks = {
-        "index": np.arange(len(time)),
-        "timestamp": EPOCH + time,
-        "orient": np.roll(rig.as_quat(), 1, axis=1),
+        "orient": rig.as_quat(scalar_first=True),
         "processedPos": tilt.apply(walk.position(then)),
-        "iphoneOrient": np.roll(
-            (Rotation.from_euler("z", 0.9) * walk.attitude(time)).as_quat(), 1, axis=1
-        ),
+        "iphoneOrient": own.as_quat(scalar_first=True),
         "iphoneAcc": -walk.force(time) / 9.80665,
         "iphoneGyro": walk.rate(time) + BIAS,
         "iphoneMag": np.full((len(time), 3), 30.0),
         "stencilAcc": mount.apply(walk.force(then)),
         "stencilGyro": mount.apply(walk.rate(then)),
     }
-    columns = {}
+    columns = {"index": np.arange(len(time)), "timestamp": EPOCH + time}
     for name, values in blocks.items():
-        if values.ndim == 1:
-            columns[name] = values
-        else:
-            columns |= {
-                name + axis: column
-                for axis, column in zip(
-                    "WXYZ" if values.shape[1] == 4 else "XYZ", values.T, strict=True
-                )
-            }
+        axes = "WXYZ" if values.shape[1] == 4 else "XYZ"
+        columns |= {name + axis: row for axis, row in zip(axes, values.T, strict=True)}
     return pd.DataFrame(columns)
 
 

@@ -27,30 +27,12 @@ def packets(time: np.ndarray) -> np.ndarray:
     east, north, up = known_walk.velocity(time).T
     heading = np.stack([np.cos(yaw), np.sin(yaw)])
     forward, left = heading[0] * east + heading[1] * north, heading[0] * north - heading[1] * east
-    level = np.full(
-        (3, len(time)), 7.7
-    )  # accelerations and rates in the level frame: not what is asked for
-    return np.stack(
-        [
-            latitude,
-            longitude,
-            HOME[2] + place[:, 2],
-            roll,
-            pitch,
-            yaw,
-            north,
-            east,
-            forward,
-            left,
-            up,
-            *known_walk.force(time).T,
-            *level,
-            *known_walk.rate(time).T,
-            *level,
-            *np.tile([[0.05], [0.01], [4], [9], [4], [4], [0]], len(time)),
-        ],
-        axis=1,
-    )
+    # Accelerations and rates in the level frame: not what is asked for.
+    level = np.full((3, len(time)), 7.7)
+    accuracy = np.tile([[0.05], [0.01], [4], [9], [4], [4], [0]], len(time))
+    rows = [latitude, longitude, HOME[2] + place[:, 2], roll, pitch, yaw]
+    rows += [north, east, forward, left, up, *known_walk.force(time).T, *level]
+    return np.stack([*rows, *known_walk.rate(time).T, *level, *accuracy], axis=1)
 
 
 def stamp(seconds: float) -> str:
@@ -68,21 +50,12 @@ def write_rows(oxts: Path, stamps: list[str], values: np.ndarray) -> Path:
 
 
 def write_drive(
-    root: Path,
-    drive: str,
-    spoil=None,
-    seconds: float = 12.0,
-    export: str = "extract",
-    rate: float = 100.0,
+    root: Path, drive: str, seconds: float = 12.0, export: str = "extract", rate: float = 100.0
 ) -> Path:
-    """A drive without traps. `spoil(time, values)` may damage the rows."""
+    """A drive without traps."""
     time = np.arange(round(seconds * rate)) / rate
-    values = packets(time)
-    if spoil:
-        spoil(time, values)
-    return write_rows(
-        root / drive[:10] / f"{drive}_{export}" / "oxts", [stamp(t) for t in time], values
-    )
+    oxts = root / drive[:10] / f"{drive}_{export}" / "oxts"
+    return write_rows(oxts, [stamp(t) for t in time], packets(time))
 
 
 def write_published(root: Path, drive: str) -> tuple[Path, np.ndarray]:
@@ -97,9 +70,8 @@ def write_published(root: Path, drive: str) -> tuple[Path, np.ndarray]:
     time = np.arange(1600) / 100 + noise.uniform(-1e-3, 1e-3, 1600)
     time[0] = 0.0
     time = np.delete(time, [*range(600, 630), 200, 900, *range(1430, 1450)])
-    pieces = np.array(
-        [time[0], time[time < 5.995].max(), time[time > 6.1].min(), time[time < 14.295].max()]
-    )
+    first = time[0], time[time < 5.995].max()
+    pieces = np.array([*first, time[time > 6.1].min(), time[time < 14.295].max()])
     written = time.copy()
     written[301] = written[300]  # its values are its own, its stamp is not
     order = np.arange(len(time))
@@ -108,9 +80,8 @@ def write_published(root: Path, drive: str) -> tuple[Path, np.ndarray]:
     order = np.insert(order, 400, order[400])
     stamps = [stamp(t) for t in written[order]]
     stamps[700] = ""
-    return write_rows(
-        root / drive[:10] / f"{drive}_extract" / "oxts", stamps, packets(time[order])
-    ), pieces
+    oxts = root / drive[:10] / f"{drive}_extract" / "oxts"
+    return write_rows(oxts, stamps, packets(time[order])), pieces
 
 
 def write_piece(path: Path, spoil=None, first: float = 25.0, seconds: float = 12.0) -> Path:

@@ -10,11 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from tests.support import known_walk as walk
 
-BIAS, FORCE_BIAS, SCALE = (
-    [0.0056, 0.0092, -0.0102],
-    [-0.157, -0.026, 0.057],
-    [0.9988, 0.9971, 0.9933],
-)
+BIAS, FORCE_BIAS = [0.0056, 0.0092, -0.0102], [-0.157, -0.026, 0.057]
+SCALE = [0.9988, 0.9971, 0.9933]
 
 FIRST = 3610.94
 
@@ -22,7 +19,7 @@ GAME_YAW, EKF_YAW = Rotation.from_euler("z", 2.1), Rotation.from_euler("z", -0.4
 
 
 def wxyz(rotation):
-    return rotation.as_quat()[..., [3, 0, 1, 2]]
+    return rotation.as_quat(scalar_first=True)
 
 
 def chest(time):
@@ -82,17 +79,11 @@ def write(
         "start_calibration": list(start_calibration),
         "align_tango_to_body": [0.5, 0.5, 0.5, 0.5],
         "length": seconds,
-        "start_frame": start_frame,
-        **dict(
-            zip(
-                ("gyro_integration_error", "grv_ori_error", "ekf_ori_error"),
-                errors or (30.0, *drifts),
-                strict=True,
-            )
-        ),
     }
-    if start_frame is None:
-        del info["start_frame"]
+    kinds = ("gyro_integration_error", "grv_ori_error", "ekf_ori_error")
+    info |= dict(zip(kinds, errors or (30.0, *drifts), strict=True))
+    if start_frame is not None:
+        info["start_frame"] = start_frame
     if spoil:
         spoil(fields)
     if spoil_info:

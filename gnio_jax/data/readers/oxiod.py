@@ -495,6 +495,7 @@ def read_vicon(path: Path, kind: str, start: float) -> Poses:
         if not abs(float(np.median(time))) < 3600.0 or np.ptp(time) < SHORTEST:
             problem = "field 'time' is damaged or more than an hour away from the phone's"
             raise InputError(path, problem, "use the syn files")
+        values[np.abs(time) > 3600.0] = np.nan  # poses of another time
         order = np.argsort(time, kind="stable")
         time, values = time[order], values[order]
     known = np.isfinite(values).all(axis=1) & _is_fresh(values)

@@ -7,14 +7,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from gnio_jax import data
 from gnio_jax.data.readers import blackbird
 from gnio_jax.data.self_check import self_check
 from gnio_jax.numerics import rotations
 from tests.support import known_walk
 from tests.support.blackbird_files import FLIP, START, write
-from tests.support.changes import one, put
 from tests.support.refusals import refused
+from tests.support.tlio_files import spoil
 
 
 @pytest.mark.parametrize("text", [11, 8, 0])
@@ -37,30 +36,11 @@ def test_a_flight_comes_back_in_a_world_whose_z_points_up(tmp_path, down, text):
     assert sequence.attributes["start_time"] == pytest.approx(START, abs=1e-6)
 
 
-def test_lists_with_comments_absent_entries_and_no_last_newline(tmp_path):
-    for split in ("train", "val", "test"):
-        write(tmp_path / "clover" / "yawForward" / "maxSpeed5p0" / split)
-    entry = "clover/yawForward/maxSpeed5p0"
-    (tmp_path / "train.txt").write_text(
-        f"# clover\n{entry}/train\nstar/yawForward/maxSpeed1p0/train"
-    )
-    (tmp_path / "test.txt").write_text(f"# clover\n\n{entry}/test\n")
-    with pytest.warns(
-        UserWarning, match=r"train\.txt: 1 of 2 listed sequences are absent: star/yawForward"
-    ):
-        (sequence,) = data.load("blackbird", tmp_path, "train")
-    assert sequence.name == "clover_yawForward_maxSpeed5p0_train"
-    assert sequence.attributes["session"] == entry
-    assert [s.name for s in data.load("blackbird", tmp_path, "test")] == [
-        "clover_yawForward_maxSpeed5p0_test"
-    ]
-
-
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (put("traj_target", one((7, slice(3, 7)), 0.0)), ("not a unit quaternion", "row 8")),
-        (put("ts", one(8, START)), ("field 'time'", "does not increase", "row 9")),
+        (spoil("traj_target", (7, slice(3, 7)), 0.0), ("not a unit quaternion", "row 8")),
+        (spoil("ts", 8, START), ("field 'time'", "does not increase", "row 9")),
     ],
 )
 def test_a_bad_table_is_refused_by_file_and_field(tmp_path, change, words):
@@ -69,24 +49,6 @@ def test_a_bad_table_is_refused_by_file_and_field(tmp_path, change, words):
 
 
 def test_rounded_quaternions_are_mended(tmp_path):
-    change = put("traj_target", one((7, slice(3, 7)), 0.5001 + np.zeros(4)))
+    change = spoil("traj_target", (7, slice(3, 7)), 0.5001)
     (sequence,) = blackbird.read(write(tmp_path / "flight", spoil=change, text=0))
     np.testing.assert_allclose(np.linalg.norm(sequence.orientation, axis=1), 1.0, atol=1e-9)
-
-
-def test_a_text_that_is_not_of_its_table_is_refused(tmp_path):
-    folder = write(tmp_path / "flight")
-    truth = folder / "stamped_groundtruth_imu.txt"
-
-    def fails(*words):
-        refused(lambda: blackbird.read(folder), truth, *words)
-
-    lines = truth.read_text().splitlines()
-    truth.write_text("\n".join(lines[:-5]))
-    fails("'ts'", "1195 and 1200 rows")
-    truth.write_text("\n".join([lines[0], *lines[2:], lines[1]]))
-    fails("'ts'")
-    truth.write_text("\n".join([lines[0], *(line.rsplit(" ", 1)[0] for line in lines[1:])]))
-    fails("has 10 columns")
-    truth.write_text("\n".join([*lines[:5], lines[5].rsplit(" ", 1)[0] + " nan", *lines[6:]]))
-    fails("column '10' is NaN", "row 6")

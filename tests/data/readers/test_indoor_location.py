@@ -13,7 +13,6 @@ from gnio_jax.data.self_check import self_check
 from gnio_jax.errors import InputError
 from tests.support import known_walk as walk
 from tests.support.indoor_location_files import NAME, START, TAPS, lines, write
-from tests.support.refusals import refused
 
 
 def check_walk(sequence):
@@ -40,25 +39,6 @@ def test_a_walk_comes_back_with_its_waypoints(tmp_path):
     assert check.failures == () and np.isnan(check.accel_correlation_horizontal)
 
 
-def test_floors_make_the_splits(tmp_path):
-    for number, floor in enumerate(("B1", "F1", "F2", "F3", "F4", "F9")):
-        write(tmp_path, ["#"], floor, str(number))
-    found = {
-        split: [each.name.split("_")[1] for each in indoor_location.recordings(tmp_path, split)]
-        for split in ("train", "val", "test", "all")
-    }
-    assert found == {
-        "train": ["B1", "F1", "F2"],
-        "val": ["F3"],
-        "test": ["F4"],
-        "all": ["B1", "F1", "F2", "F3", "F4", "F9"],
-    }
-    (tmp_path / "site1" / "F3" / "path_data_files" / "3.txt").unlink()
-    refused(lambda: indoor_location.recordings(tmp_path, "val"), tmp_path, "'val'", "F3")
-    nothing = tmp_path / "site1" / "F3"
-    refused(lambda: indoor_location.recordings(nothing, "all"), nothing, "expected layout")
-
-
 def test_lines_without_a_newline_between_them_are_divided(tmp_path):
     text = lines()
     tap = next(i for i, line in enumerate(text[50:], 50) if "WAYPOINT" in line)
@@ -83,33 +63,3 @@ def test_a_walk_of_few_waypoints_is_of_no_use(tmp_path, count):
         indoor_location.read(path)
     with pytest.raises(InputError), pytest.warns(UserWarning, match=f"left out: .*{NAME}"):
         data.load("indoor_location", tmp_path, "test")
-
-
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        (lambda text: [*text[:99], text[99][:-20]], ("is cut short", "in line 100")),
-        (lambda text: [*text[:99], "15746"], ("line 100 is '15746'",)),
-        (lambda text: text + text, ("'startTime' is there 2 times",)),
-        (lambda text: [x for x in text if "GYRO" not in x], ("0 lines of TYPE_GYROSCOPE",)),
-        (
-            lambda text: [
-                x.replace(str(START)[:7], "1574999") if "WAYPOINT" in x else x for x in text
-            ],
-            ("'TYPE_WAYPOINT' has 2 of 2 stamps", "one phone"),
-        ),
-        (
-            lambda text: [
-                x.replace(str(START)[:7], "1574999") if "ACCEL" in x else x for x in text
-            ],
-            ("'TYPE_WAYPOINT'", "one phone"),
-        ),
-        (
-            lambda text: [x.replace("\t0.", "\tnan\t0.") if "GYRO" in x else x for x in text],
-            ("'TYPE_GYROSCOPE' holds NaN",),
-        ),
-    ],
-)
-def test_a_damaged_file_is_refused_by_its_field(tmp_path, change, words):
-    path = write(tmp_path, change(lines(12.0)))
-    refused(lambda: indoor_location.read(path), path, *words)

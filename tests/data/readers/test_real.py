@@ -55,18 +55,13 @@ REAL = {
     ("tumvi", "val", "room3", ""): ROOM._replace(correlation=0.98),
     ("tumvi", "test", "room4", ""): ROOM._replace(correlation=0.98),
     ("tlio", "train", "room1", ""): GOLDEN,
-    ("tlio", "train", "room2", ""): GOLDEN,
-    ("tlio", "train", "V1_01_easy", ""): GOLDEN,
-    ("tlio", "train", "V1_02_medium", ""): GOLDEN,
-    ("tlio", "val", "room3", ""): GOLDEN,
     ("tlio", "val", "V2_01_easy", ""): GOLDEN,
-    ("tlio", "test", "room4", ""): GOLDEN,
     ("tlio", "test", "MH_04_difficult", ""): GOLDEN._replace(correlation=0.65),
-    ("blackbird", "train", "clover_yawForward_maxSpeed5p0_train", ""): FLIGHT,
-    ("blackbird", "val", "clover_yawForward_maxSpeed5p0_val", ""): FLIGHT,
-    ("blackbird", "test", "clover_yawForward_maxSpeed5p0_test", ""): FLIGHT,
+    **{
+        ("blackbird", split, f"clover_yawForward_maxSpeed5p0_{split}", ""): FLIGHT
+        for split in ("train", "val", "test")
+    },
     ("tyrex", "all", "Guillaume_Nexus5_Dist_AR", ""): HELD,
-    ("tyrex", "all", "Thibaud_iPhone4S_Dist_Swinging", ""): HELD,
     ("tyrex", "all", "Thibaud_iPhone5_NoDist_RunningHand", ""): HELD,
     ("ridi", "all", "01", ""): Bounds(0.55, 2.0, (1.2, 1.6), 0.1, 0.99, (54.7, 54.9)),
 }

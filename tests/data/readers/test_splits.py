@@ -1,0 +1,315 @@
+"""Which recordings of a copy make a split, in every dataset: one table. Nothing is read."""
+
+from __future__ import annotations
+
+import json
+import warnings
+from pathlib import Path
+
+import pytest
+
+from gnio_jax import data
+from gnio_jax.data.readers import csv_files, euroc, kitti, oxiod, ronin
+from gnio_jax.errors import InputError
+
+PEOPLE = [{"subjectID": who, "calibration": "start"} for who in (*range(5), 14)]
+"""Of IDOL."""
+TRAINING = {str(n): PEOPLE[n // 2] for n in range(10)}
+COPIES = {
+    "tlio": r"""
+        files {}/imu0_resampled.npy a b c
+        text train_list.txt a|not_here|b|nor_this
+        text test_list.txt c||
+        split train a b
+        split test c
+        warns train train_list.txt: 2 of 4 listed sequences are absent: not_here, nor_this""",
+    "blackbird": r"""
+        files clover/yawForward/maxSpeed5p0/{}/data.hdf5 train test
+        text train.txt # clover|clover/yawForward/maxSpeed5p0/train|star/train
+        text test.txt |clover/yawForward/maxSpeed5p0/test|
+        split train clover_yawForward_maxSpeed5p0_train
+        split test clover_yawForward_maxSpeed5p0_test
+        warns train train.txt: 1 of 2 listed sequences are absent: star/train""",
+    "ronin": r"""
+        files {}/data.hdf5 train_dataset_1/a001_1 train_dataset_2/a009_2
+        files seen_subjects_test_set/{}/data.hdf5 a000_1 a011_2
+        files unseen_subjects_test_set/{}/data.hdf5 deeper/a006_2
+        text ronin/lists/list_train.txt a001_1|a007_3|a000_1
+        text ronin/lists/list_val.txt a009_2
+        text ronin/lists/list_test_seen.txt a011_2|
+        text ronin/lists/list_test_unseen.txt a006_2
+        split train a001_1 a000_1
+        split val a009_2
+        split test a011_2
+        split seen a011_2
+        split unseen a006_2
+        warns train list_train.txt: 1 of 3 listed sequences are absent: a007_3""",
+    "ridi": r"""
+        files deep/{}/processed/data.csv dan_bag1 dan_bag9 dan_leg2 hang_bag1 hao_bag1 hao_body1
+        files deep/{}/processed/data.csv ma_bag1 yajie_leg1 hang_leg7 shali_bag1
+        text deep/list_train_publish_v2.txt dan_bag1,bag|dan_leg2,leg|hang_bag1,bag|hao_bag1,bag\
+|hao_body1,body|ma_bag1,bag|yajie_leg1,leg|zhicheng_bag1,bag
+        text deep/list_test_publish_v2.txt hang_leg7,leg|hang_leg_new3,leg
+        text deep/list_crosssubject.txt # others|shali_bag1|ruixuan_bag1
+        split train dan_bag1 dan_leg2 hang_bag1 hao_bag1 hao_body1 yajie_leg1
+        split val ma_bag1
+        split test hang_leg7
+        split seen hang_leg7
+        split unseen shali_bag1
+        split all dan_bag1 dan_bag9 dan_leg2 hang_bag1 hang_leg7 hao_bag1 hao_body1 ma_bag1 \
+shali_bag1 yajie_leg1
+        warns train 1 of 8 listed sequences are absent: zhicheng_bag1,bag
+        warns val absent: zhicheng_bag1
+        warns test absent: hang_leg_new3
+        warns seen absent: hang_leg_new3
+        warns unseen absent: ruixuan_bag1""",
+    "idol": rf"""
+        files deep/building1/train/{{}}.feather 0 1 2 3 4 5 6 7 8 9
+        files deep/{{}}.feather building1/known/0 building2/known/10 building2/known/9
+        files deep/{{}}.feather building3/unknown/0
+        text deep/building1/train/metadata.json {json.dumps(TRAINING)}
+        text deep/building1/known/metadata.json {{"0": {{"subjectID": 1}}}}
+        text deep/building2/known/metadata.json {{"9": {{"subjectID": 2}},"10": {{"subjectID": 2}}}}
+        text deep/building3/unknown/metadata.json {{"0": {json.dumps(PEOPLE[-1])}}}
+        split train building1_train_0 building1_train_1 building1_train_2 building1_train_3 \
+building1_train_4 building1_train_5 building1_train_8 building1_train_9
+        split val building1_train_6 building1_train_7
+        split known building1_known_0 building2_known_9 building2_known_10
+        split seen building1_known_0 building2_known_9 building2_known_10
+        split test building1_known_0 building2_known_9 building2_known_10
+        split unknown building3_unknown_0
+        split unseen building3_unknown_0""",
+    "euroc": r"""
+        files {}/mav0/imu0/data.csv machine_hall/MH_01_easy machine_hall/MH_05_difficult
+        files {}/mav0/imu0/data.csv V1_02_medium V2_03_difficult my_flight
+        split train MH_01_easy
+        split val V1_02_medium
+        split test MH_05_difficult my_flight
+        split seen MH_05_difficult my_flight
+        split unseen V2_03_difficult""",
+    "tumvi": r"""
+        files dataset-{}_16/mav0/imu0/data.csv room1_512 room1_1024 room2_1024 room3_512
+        files dataset-{}_16/mav0/imu0/data.csv calib-imu1_512
+        split train room1 room2
+        split val room3""",
+    "kitti": r"""
+        files train__2011_09_26_drive_{}.npz 0014_extract0 0014_extract1 0009_extract0 0018_extract3
+        split train 2011_09_26_drive_0014_extract0 2011_09_26_drive_0014_extract1
+        split val 2011_09_26_drive_0009_extract0
+        split test 2011_09_26_drive_0018_extract3""",
+    "tyrex": r"""
+        files android/Thibaud_{}/ Nexus5_Dist_AR iPhone5_NoDist_AR
+        files android/Guillaume_{}/ iPhone5_Dist_AR Nexus5_NoDist_RunningHand
+        files android/{}/ notes
+        split train Thibaud_Nexus5_Dist_AR Thibaud_iPhone5_NoDist_AR
+        split val Guillaume_iPhone5_Dist_AR
+        split test Guillaume_Nexus5_NoDist_RunningHand
+        split all Guillaume_Nexus5_NoDist_RunningHand Guillaume_iPhone5_Dist_AR \
+Thibaud_Nexus5_Dist_AR Thibaud_iPhone5_NoDist_AR""",
+    "indoor_location": r"""
+        files site1/{}/path_data_files/x.txt B1 F1 F2 F3 F4 F9
+        split train site1_B1_x site1_F1_x site1_F2_x
+        split val site1_F3_x
+        split test site1_F4_x
+        split all site1_B1_x site1_F1_x site1_F2_x site1_F3_x site1_F4_x site1_F9_x""",
+    "csv": r"""
+        files {} a.csv b.csv c.csv d.h5 notes.md
+        text train.txt # mine|a|b.csv|gone.csv
+        text test.txt d|
+        text winter.txt c
+        text readme.txt walk through the park, phone in the hand
+        split train a b
+        split test d
+        split winter c
+        warns train train.txt: 1 of 3 listed sequences are absent: gone.csv""",
+    "oxiod": r"""
+        files deep/deeper/handheld/{}.csv data1/syn/imu2 data1/syn/vi2 data5/syn/imu1 data5/syn/vi1
+        files deep/deeper/running/data1/syn/{}.csv imu7 vi7
+        text deep/deeper/handheld/Train.txt data1|data2
+        text deep/deeper/handheld/Test.txt data5
+        text deep/deeper/running/Train.txt data1/imu1.csv
+        text deep/deeper/running/Test.txt data1/imu7.csv
+        split train handheld_data1_2
+        split test handheld_data5_1 running_data1_7
+        split seen handheld_data5_1 running_data1_7
+        warns train 2 entries of the lists Train.txt are not in this copy""",
+}
+"""What lies below a root: files by a path and what stands in it for `{}` (folders, where it ends
+with /), and texts, with | for the end of a line, which the last one may lack, as published. Then
+the names of each split, and what is said of entries of its list that the copy lacks."""
+
+
+def entries(name, kind):
+    """(name, rest) of the lines of this kind."""
+    lines = (
+        line.split(maxsplit=2) for line in COPIES[name].replace("\\\n", "").strip().splitlines()
+    )
+    return [(each[1], each[2]) for each in lines if each[0] == kind]
+
+
+@pytest.fixture
+def copied(tmp_path):
+    """Lays a copy of a dataset below the root, and gives the root."""
+
+    def lay(name: str) -> Path:
+        for template, places in entries(name, "files"):
+            for place in places.split():
+                path = tmp_path / template.format(place)
+                path.parent.mkdir(parents=True, exist_ok=True)
+                path.mkdir() if template.endswith("/") else path.touch()
+        for place, text in entries(name, "text"):
+            (tmp_path / place).parent.mkdir(parents=True, exist_ok=True)
+            (tmp_path / place).write_text(text.replace("|", "\n"))
+        return tmp_path
+
+    return lay
+
+
+def names(name, root, split):
+    return " ".join(each.name for each in data.get(name).recordings(root, split))
+
+
+@pytest.mark.parametrize("name", COPIES)
+def test_splits(copied, name):
+    root, absent = copied(name), dict(entries(name, "warns"))
+    for split, wanted in entries(name, "split"):
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            assert names(name, root, split) == wanted, split
+        said = [str(each.message) for each in caught]
+        assert len(said) == (split in absent) and all(absent[split] in each for each in said)
+
+
+WRONG = [
+    # dataset, what becomes of files (None: gone), split, problem
+    ("ridi", {"deep/list_train_publish_v2.txt": "dan_bag1"}, "val", "would be empty"),
+    ("ridi", {"deep/list_test_publish_v2.txt": None}, "test", "the list cannot be read"),
+    ("idol", {f"deep/building1/train/{n}.feather": None for n in range(2, 10)}, "val", "empty"),
+    ("idol", {"deep/building3/unknown/0.feather": None}, "unseen", "holds no recording in"),
+    ("euroc", {"V1_02_medium/mav0/imu0/data.csv": None}, "val", "sequences are V1_02_medium"),
+    ("tumvi", {}, "test", "holds no sequence of split 'test'"),
+    ("kitti", {"train__2011_09_26_drive_0009_extract0.npz": None}, "val", "none of its drives"),
+    ("tyrex", {"android/Guillaume_iPhone5_Dist_AR": None}, "val", "no walk of split 'val'"),
+    ("indoor_location", {"site1/F3/path_data_files/x.txt": None}, "val", "the floors F3"),
+    ("csv", {}, "val", "val.txt: the list cannot be read"),
+    ("csv", {"train.txt": None, "test.txt": None}, "train", "has no list train.txt; "),
+    ("csv", {}, "readme", "unknown split 'readme'"),
+    ("oxiod", {}, "unseen", "no recording of split 'unseen'"),
+    ("oxiod", {"deep/deeper/handheld/Train.txt": "data1/vi3.csv"}, "train", "'data1/vi3.csv'"),
+    ("oxiod", {"deep/deeper/handheld/Train.txt": "\n"}, "train", "Train.txt: the list is empty"),
+    ("oxiod", {f"deep/deeper/{s}/Test.txt": None for s in ("handheld", "running")}, "test", "list"),
+    *((name, None, data.get(name).splits[-1], "expected layout: ") for name in COPIES),
+]
+
+
+@pytest.mark.parametrize(("name", "changes", "split", "problem"), WRONG)
+def test_a_split_that_is_not_there_is_refused(copied, tmp_path, name, changes, split, problem):
+    root = tmp_path if changes is None else copied(name)
+    for place, text in (changes or {}).items():
+        if text is not None:
+            (root / place).write_text(text)
+        else:
+            (root / place).rmdir() if (root / place).is_dir() else (root / place).unlink()
+    with pytest.raises(InputError) as caught:
+        data.get(name).recordings(root, split)
+    assert str(caught.value).startswith(str(root)) and problem in str(caught.value)
+
+
+@pytest.mark.filterwarnings("ignore:.*absent")
+def test_who_is_held_out_is_written_in_every_sequence(copied):
+    for name, who in (("ridi", "ma"), ("idol", "subject3")):
+        root = copied(name)
+        for split in ("train", "val"):
+            for each in data.get(name).recordings(root, split):
+                assert each.attributes["held_out"] == who
+                assert each.slow and each.files  # what is aligned is kept in the cache
+    (about,) = (each.attributes for each in data.get("idol").recordings(root, "unseen"))
+    assert about["subject"] == about["group"] == "subject14" and about["calibration"] == "start"
+    (root / "deep/building1/train/metadata.json").unlink()
+    nameless = r"metadata\.json does not name the subject of 10 recordings, e\.g\. .*0\.feather"
+    with pytest.warns(UserWarning, match=nameless):
+        (val,) = data.get("idol").recordings(root, "val")
+    assert val.attributes["subject"] == val.name
+
+
+def test_the_truth_chooses_an_orientation_where_one_trains_alone(copied, monkeypatch):
+    monkeypatch.setattr(ronin, "read", lambda _, choose: choose)
+    root = copied("ronin")
+    for split, choose in (("val", True), ("seen", False), ("unseen", False), ("test", False)):
+        assert [each.read() for each in ronin.recordings(root, split)] == [choose]
+
+
+def test_of_copies_the_first_is_taken_and_links_are_followed(copied, tmp_path):
+    root = copied("ronin") / "unseen_subjects_test_set"
+    (root / "later" / "a006_2").mkdir(parents=True)
+    (root / "later" / "a006_2" / "data.hdf5").touch()
+    twice = r"1 recordings are there twice, e\.g\. .*later/a006_2; .*deeper/a006_2 is used"
+    with pytest.warns(UserWarning, match=twice):
+        assert names("ronin", tmp_path, "unseen") == "a006_2"
+    (root / "later" / "a006_2" / "data.hdf5").unlink()
+    linked = tmp_path / "linked"
+    linked.mkdir()
+    (linked / "unseen").symlink_to(root)
+    (root / "round").symlink_to(linked)  # a circle must not hang it
+    (linked / "list_test_unseen.txt").write_text("a006_2")
+    assert names("ronin", linked, "unseen") == "a006_2"
+
+
+def test_published_names_are_in_one_split_each_and_rooms_of_the_unseen_in_none():
+    for splits in (euroc.EUROC_SPLITS, euroc.TUMVI_SPLITS):
+        every = [name for chosen in splits.values() for name in chosen]
+        assert len(every) == len(set(every)) == {"V2_01_easy": 11}.get(splits["unseen"][0], 28)
+    rooms = {split: {name[:2] for name in names} for split, names in euroc.EUROC_SPLITS.items()}
+    assert not rooms.pop("unseen") & set.union(*rooms.values())
+
+
+def test_drives_are_shared_out_by_their_names():
+    drives = [f"2011_{month:02d}_26_drive_{n:04d}" for month in (9, 10) for n in range(500)]
+    shares = [kitti.share_of(drive) for drive in drives]
+    for split, share in (("train", 0.7), ("val", 0.1), ("test", 0.2)):
+        assert shares.count(split) / len(drives) == pytest.approx(share, abs=0.04)
+
+
+def test_a_text_that_names_no_recording_is_no_list(copied):
+    assert csv_files.list_splits(copied("csv")) == ("train", "test", "winter")
+
+
+# --- the sessions of OxIOD
+
+
+def walks(*names):
+    """Walks without files, by their "scene/session/number"."""
+    parts = [name.split("/") for name in names]
+    return [oxiod.Walk(scene, folder, int(number), {}, "") for scene, folder, number in parts]
+
+
+ROOM = walks(
+    *(f"handheld/data{n}/{k}" for n in range(1, 6) for k in (1, 2)),
+    *("pocket/data1/1", "handbag/data2/4", "trolley/data1/7", "trolley/data2/3", "running/data1/6"),
+    *(f"multi users/user{n}/4" for n in range(2, 6)),
+    *(f"multi devices/{device}/1" for device in ("iPhone 5", "iPhone 6", "nexus 5")),
+)
+
+
+def test_sessions_are_shared_out_whole_whatever_a_copy_holds(tmp_path):
+    for scene, entries in (("handheld", "data1\ndata4"), ("trolley", "data1/imu7.csv\ndata2")):
+        (tmp_path / scene).mkdir()
+        (tmp_path / scene / "Train.txt").write_text(entries)
+    found = {}
+    for split in ("sessions_train", "sessions_val", "sessions_test", "train", "val"):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            whole = oxiod.select(ROOM, split, tmp_path)
+            for part in (ROOM[::2], ROOM[1::2], ROOM[:7], ROOM[7:]):
+                here = oxiod.select(part, split, tmp_path)
+                assert here == [walk for walk in whole if walk in part], split
+        found[split] = {walk.session for walk in whole}
+    train, val, test = (found[f"sessions_{split}"] for split in ("train", "val", "test"))
+    assert train | val | test == {walk.session for walk in ROOM}
+    assert len(train) + len(val) + len(test) == len(train | val | test)
+    scenes = {session.partition("/")[0] for session in train}
+    assert {"handheld", "trolley", "multi users", "multi devices"} <= scenes
+    assert val == {"multi users/user4", "handheld/data4"}
+    assert {"multi users/user2", "multi devices/nexus 5", "trolley/data1"} < test
+    assert found["val"] == {"handheld/data4", "trolley/data1"}
+    assert found["train"] == {"handheld/data1", "trolley/data2"}
