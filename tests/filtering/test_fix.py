@@ -39,37 +39,31 @@ def test_two_in_an_interval_become_one():
     np.testing.assert_allclose(fix.before_end[9], 0.75 * 0.02 - 0.25 * 0.03)
 
 
+OUTSIDE, SHAPES = "are outside of the recording, one at ", "time, position and covariance must be"
+NOT_POSITIVE = "a covariance is not finite, symmetric and positive definite"
+
+
 @pytest.mark.parametrize(
     "change, text",
     [
-        (
-            dict(time=[0.5, 99.0]),
-            "fixes: 1 of 2 are outside of the recording, one at 99 s; it lasts",
-        ),
-        (dict(time=[0.5, np.nan]), "fixes: 1 of 2 are outside of the recording, one at nan s"),
-        (dict(start=-1e9), "fixes: 2 of 2 are outside of the recording"),
-        (dict(time=[0.5]), "fixes: time, position and covariance must be"),
-        (dict(position=np.zeros((2, 4))), "fixes: time, position and covariance must be"),
-        (dict(position=np.zeros((2, 3))), "fixes: time, position and covariance must be"),
-        (dict(time_std=[0.1, -0.1]), "fixes: time_std must be at least 0"),
-        (dict(time_std=np.inf), "fixes: time_std must be at least 0 and finite"),
-        (dict(time_std=[0.1, 0.1, 0.1]), "fixes: time_std must be one or"),
-        (dict(threshold=np.nan), "fixes: threshold must be above 0, found nan"),
-        (dict(covariance=np.full((2, 2, 2), np.inf)), "fixes: a covariance is not finite"),
-        (
-            dict(covariance=np.zeros((2, 2, 2))),
-            "fixes: a covariance is not finite, symmetric and positive",
-        ),
-        (
-            dict(covariance=np.array([np.eye(2), [[1.0, 0.5], [0.0, 1.0]]])),
-            "fixes: a covariance is not finite, symmetric and positive",
-        ),
+        (dict(time=[0.5, 99.0]), f"1 of 2 {OUTSIDE}99 s; it lasts"),
+        (dict(time=[0.5, np.nan]), f"1 of 2 {OUTSIDE}nan s"),
+        (dict(start=-1e9), f"2 of 2 {OUTSIDE}"),
+        (dict(time=[0.5]), SHAPES),
+        (dict(position=np.zeros((2, 4))), SHAPES),
+        (dict(position=np.zeros((2, 3))), SHAPES),
+        (dict(time_std=[0.1, -0.1]), "time_std must be at least 0"),
+        (dict(time_std=np.inf), "time_std must be at least 0 and finite"),
+        (dict(time_std=[0.1, 0.1, 0.1]), "time_std must be one or"),
+        (dict(threshold=np.nan), "threshold must be above 0, found nan"),
+        (dict(covariance=np.full((2, 2, 2), np.inf)), NOT_POSITIVE),
+        (dict(covariance=np.zeros((2, 2, 2))), NOT_POSITIVE),
+        (dict(covariance=np.array([np.eye(2), [[1.0, 0.5], [0.0, 1.0]]])), NOT_POSITIVE),
     ],
 )
 def test_what_is_no_fix_is_refused_in_one_line(change, text):
-    good = dict(
-        time=[0.5, 1.0], position=np.zeros((2, 2)), covariance=np.tile(np.eye(2), (2, 1, 1))
-    )
-    with pytest.raises(InputError, match=f"^{text}") as caught:
+    eyes = np.tile(np.eye(2), (2, 1, 1))
+    good = {"time": [0.5, 1.0], "position": np.zeros((2, 2)), "covariance": eyes}
+    with pytest.raises(InputError, match=f"^fixes: {text}") as caught:
         filtering.fixes_on_intervals(**(good | change), intervals=INTERVALS, config=CONFIG)
     assert "\n" not in str(caught.value)

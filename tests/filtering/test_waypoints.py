@@ -82,15 +82,24 @@ def rms(error):
 
 
 ALL = np.arange(3 * LEGS + 1)
-WRONG = 5
 
 
-@pytest.mark.parametrize("taken, wrong", [(ALL, None), (ALL[ALL % 3 != 1], None), (ALL, WRONG)])
+@functools.cache
+def plain():
+    """Poses with all waypoints."""
+    return filtering.waypoint_poses(tapped(ALL), predict, SETUP, 0.1, 0.2)
+
+
+@pytest.mark.parametrize("taken, wrong", [(ALL, None), (ALL[ALL % 3 != 1], None), (ALL, 5)])
 def test_truer_than_curves_between_the_waypoints(taken, wrong):
     """In place and speed, also of legs whose waypoints within are left out, and with one waypoint
     in a wrong place, which loses its weight. The attitude is that of the map."""
     truth, sequence = walk(), tapped(taken, wrong)
-    found, smoothed, weight = filtering.waypoint_poses(sequence, predict, SETUP, 0.1, 0.2)
+    found, smoothed, weight = (
+        plain()
+        if taken is ALL and wrong is None
+        else filtering.waypoint_poses(sequence, predict, SETUP, 0.1, 0.2)
+    )
     stamps, place = sequence.waypoints
     line = np.stack([np.interp(truth.time, stamps, x) for x in place.T], axis=1)
     paths = [found.position[:, :2], PchipInterpolator(stamps, place)(truth.time), line]
@@ -121,10 +130,7 @@ def test_truer_than_curves_between_the_waypoints(taken, wrong):
         (dict(waypoints=None), "walk: has fewer than two waypoints"),
         (dict(waypoints=Waypoints(np.array([51.0]), np.zeros((1, 2)))), "walk: has fewer than two"),
         (dict(time=np.arange(1280) / 100.0), "walk: has 1280 samples at 100 Hz, at least 50 at 50"),
-        (
-            dict(waypoints=Waypoints(np.array([51.0, 99.0]), np.eye(2))),
-            "walk: has waypoints before",
-        ),
+        (dict(waypoints=Waypoints(np.array([51.0, 99.0]), np.eye(2))), "walk: has waypoints bef"),
     ],
 )
 def test_what_has_no_poses_is_refused_in_one_line(change, text):
@@ -132,27 +138,21 @@ def test_what_has_no_poses_is_refused_in_one_line(change, text):
         filtering.waypoint_poses(tapped(ALL)._replace(**change), predict, SETUP)
 
 
-def test_a_network_that_is_trusted_less_and_a_tap_beside_the_last_stamp():
-    """The uniform clock ends up to a sample before the tap that ended the recording."""
-    sequence = tapped(ALL)
+def test_less_trust_in_network_or_gyro_and_a_tap_beside_the_last_stamp():
+    """The uniform clock ends up to a sample before the tap that ended the recording; a raw gyro
+    starts with the wide prior of its bias."""
+    sequence, variances = tapped(ALL), plain().smoothed.covariance_diagonal
     late = np.append(sequence.waypoints.time[:-1], sequence.time[-1] + 0.5 / RATE)
-    sequence = sequence._replace(waypoints=sequence.waypoints._replace(time=late))
-    spread = []
-    for scale in (1.0, 9.0):
-        setup = SETUP._replace(noise=SETUP.noise._replace(measurement_scale=scale))
-        _, smoothed, _ = filtering.waypoint_poses(sequence, predict, setup, 0.1, 0.2)
-        spread.append(smoothed.covariance_diagonal[:, 6:8].mean())  # of the horizontal position
-    assert spread[1] > 1.02 * spread[0]
-
-
-def test_a_raw_gyro_starts_with_the_wide_prior_of_its_bias():
-    setup, walked = SETUP._replace(raw_gyro_bias=0.05), tapped(ALL)
-    first = {}
-    for compensated in ("no", "yes"):
-        sequence = walked._replace(attributes={"imu_compensated": compensated})
-        _, smoothed, _ = filtering.waypoint_poses(sequence, predict, setup, 0.1, 0.2)
-        first[compensated] = smoothed.covariance_diagonal[0, 11]  # the gyro's bias about z
-    assert first["no"] > 1.5 * first["yes"]
+    raw = sequence._replace(attributes={"imu_compensated": "no"})
+    late = sequence._replace(waypoints=sequence.waypoints._replace(time=late))
+    less = SETUP._replace(noise=SETUP.noise._replace(measurement_scale=9.0))
+    horizontal, bias = slice(6, 8), 11  # of the position, and of the gyro about z
+    _, smoothed, _ = filtering.waypoint_poses(late, predict, less, 0.1, 0.2)
+    found = smoothed.covariance_diagonal[:, horizontal].mean()
+    assert found > 1.02 * variances[:, horizontal].mean()
+    wide = SETUP._replace(raw_gyro_bias=0.05)
+    _, smoothed, _ = filtering.waypoint_poses(raw, predict, wide, 0.1, 0.2)
+    assert smoothed.covariance_diagonal[0, bias] > 1.5 * variances[0, bias]
 
 
 @pytest.mark.slow

@@ -18,16 +18,10 @@ def random_walk(seed, *, n, clones, intervals, dt, nan_rows=(), outliers=(), pit
         for _ in range(2)
     ]
     gyro, accel_world = wave[0], 2 * wave[1]
-    bg, ba = (
-        (5e-4 * rng.standard_normal(3), 0.02 * rng.standard_normal(3))
-        if bias
-        else (np.zeros(3), np.zeros(3))
-    )
-    R, v, p = (
-        Rotation.from_euler("xyz", [0.3, pitch, 2.0]).as_matrix(),
-        np.array([1.0, -0.5, 0.1]),
-        np.array([2.0, 1.0, -1.0]),
-    )
+    bg = 5e-4 * rng.standard_normal(3) if bias else np.zeros(3)
+    ba = 0.02 * rng.standard_normal(3) if bias else np.zeros(3)
+    R = Rotation.from_euler("xyz", [0.3, pitch, 2.0]).as_matrix()
+    v, p = np.array([1.0, -0.5, 0.1]), np.array([2.0, 1.0, -1.0])
     start, poses, accel = (R, v, p), [], np.empty((samples, 3))
     for k in range(samples):
         accel[k] = R.T @ (accel_world[k] - scekf_numpy.G)
@@ -44,8 +38,6 @@ def random_walk(seed, *, n, clones, intervals, dt, nan_rows=(), outliers=(), pit
             displacement[k] += 4.0
         if k in nan_rows:
             displacement[k, rng.integers(3)] = np.nan
-    gyro, accel = (
-        gyro + bg + 1e-3 * rng.standard_normal(gyro.shape),
-        accel + ba + 1e-2 * rng.standard_normal(gyro.shape),
-    )
+    gyro = gyro + bg + 1e-3 * rng.standard_normal(gyro.shape)
+    accel = accel + ba + 1e-2 * rng.standard_normal(gyro.shape)
     return start, gyro, accel, displacement, covariance

@@ -128,31 +128,14 @@ def run(
     fixes: {k: (position (2,) or (3,), covariance, seconds before the end of step k, standard
     deviation of its time)}, refused above the 99 % of χ²."""
     bg, ba = np.zeros(3) if bg is None else bg, np.zeros(3) if ba is None else ba
-    P = np.diag(
-        np.repeat(
-            [
-                std["tilt"],
-                std["yaw"],
-                std["velocity"],
-                std["position"],
-                std["gyro_bias"],
-                std["accel_bias"],
-            ],
-            [2, 1, 3, 3, 3, 3],
-        )
-        ** 2
-    )
+    parts = ("tilt", "yaw", "velocity", "position", "gyro_bias", "accel_bias")
+    first = np.repeat([std[part] for part in parts], [2, 1, 3, 3, 3, 3])
     errors = np.zeros(0 if correlated is None else 3)
-    decay, spread = np.ones(len(errors)), np.ones(len(errors))
+    decay = np.ones(len(errors))
     if correlated is not None:
         decay = np.exp(-n * dt / correlated["seconds"]) * np.ones(3)
     core = 15 + len(errors)
-    P = np.block(
-        [
-            [P, np.zeros((15, len(errors)))],
-            [np.zeros((len(errors), 15)), np.diag(spread**2)],
-        ]
-    )
+    P = np.diag(np.concatenate([first**2, np.ones(len(errors))]))
     ring, out = [], {}
     converged, last_success, pause_end = False, None, None
     for k in range(len(gyro) // n):
@@ -163,11 +146,8 @@ def run(
             R, v, p = step_mean(R, v, p, bg, ba, gyro[j], accel[j], dt)
             A = np.eye(15)
             A[3:6, 0:3], A[6:9, 0:3], A[6:9, 3:6] = -skew(dv), -skew(0.5 * dv * dt), np.eye(3) * dt
-            A[0:3, 9:12], A[3:6, 12:15], A[6:9, 12:15] = (
-                -R @ right_jacobian(phi) * dt,
-                -R_old * dt,
-                -0.5 * R_old * dt**2,
-            )
+            A[0:3, 9:12] = -R @ right_jacobian(phi) * dt
+            A[3:6, 12:15], A[6:9, 12:15] = -R_old * dt, -0.5 * R_old * dt**2
             B = -A[:, 9:15]
             B[9:] = 0
             Q = B @ np.diag([sigma_gyro**2] * 3 + [sigma_accel**2] * 3) @ B.T
@@ -179,26 +159,20 @@ def run(
         errors = decay * errors
         P[15:core] *= decay[:, None]
         P[:, 15:core] *= decay
-        P[15:core, 15:core] += np.diag((1 - decay**2) * spread**2)
+        P[15:core, 15:core] += np.diag(1 - decay**2)
         ring.append([R, p])
         pick = np.concatenate([np.eye(len(P)), np.eye(len(P))[[0, 1, 2, 6, 7, 8]]])
         P = pick @ P @ pick.T
 
         tried = False
-        row = dict(
-            accepted=np.nan,
-            gate_passed=np.nan,
-            nis=np.nan,
-            innovation=np.full(3, np.nan),
-            displacement=np.full(3, np.nan),
-            innovation_covariance=np.full((3, 3), np.nan),
-        )
+        row = dict(accepted=np.nan, gate_passed=np.nan, nis=np.nan)
+        row |= dict(innovation=np.full(3, np.nan), displacement=np.full(3, np.nan))
+        row |= dict(innovation_covariance=np.full((3, 3), np.nan))
         if len(ring) == clones + 1:
-            d, C = (
-                (displacement[k], covariance[k])
-                if measure is None
-                else measure(k, ring[0][0], bg, ba)
-            )
+            if measure is None:
+                d, C = displacement[k], covariance[k]
+            else:
+                d, C = measure(k, ring[0][0], bg, ba)
             if np.isfinite(d).all() and np.isfinite(C).all():
                 Ri, pi = ring[0]
                 Ry = yaw_matrix(Ri)
@@ -222,23 +196,14 @@ def run(
                 r = d - expected
                 S = H @ P @ H.T + noise - correlated_part
                 nis = r @ np.linalg.solve(S, r)
-                row.update(
-                    nis=nis,
-                    innovation=r,
-                    innovation_covariance=S,
-                    displacement=d,
-                    accepted=0.0,
-                    gate_passed=0.0,
-                )
+                row.update(nis=nis, innovation=r, innovation_covariance=S, displacement=d)
+                row.update(accepted=0.0, gate_passed=0.0)
                 if not gimbal:
                     now, oldest = (k + 1) * n, (k + 1 - clones) * n  # samples since the start
                     converged = converged or oldest > round(convergence / dt)
                     active = converged and (pause_end is None or now >= pause_end)
-                    if (
-                        active
-                        and last_success is not None
-                        and now - last_success > round(success / dt)
-                    ):
+                    since = 0 if last_success is None else now - last_success
+                    if active and since > round(success / dt):
                         last_success, pause_end, active = None, now + round(pause / dt), False
                     if active and nis > threshold:
                         if fail_scale > 0:
