@@ -18,7 +18,7 @@ import pytest
 from jax.sharding import PartitionSpec
 
 from gnio_jax import parallel
-from gnio_jax.config import AugmentConfig, ThroughFilter, TrainConfig
+from gnio_jax.config import ThroughFilter, TrainConfig
 from gnio_jax.errors import InputError
 from gnio_jax.reporting import Silence
 from gnio_jax.training import loop, run_folder
@@ -208,10 +208,10 @@ def test_processes_share_sequences_and_each_has_all_results(server, tmp_path):
 @pytest.fixture(scope="module")
 def small(recording):
     with tiny_run.known():
-        augment = AugmentConfig(low_pass_share=0.5)
-        yield tiny_run.config(recording, "", augment=augment, statistics_windows=32)
+        yield tiny_run.config(recording, "")
 
 
+@jax.enable_x64(False)
 def trained(config):
     """Losses and gradient norms of each of five steps, figures of validation, parameters."""
     task, (source, held_out, _) = set_up(WindowTask, config, Silence())

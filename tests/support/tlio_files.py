@@ -55,11 +55,10 @@ def spoil(name, rows, value):
     return change
 
 
-def write_splits(root):
+def write_splits(root, train="ab", **options):
     """A folder of three short walks: two to train with, one for validation and test."""
     for name in "abc":
-        write_sequence(root / name)
-    (root / "train_list.txt").write_text("a\nb\n")
-    for split in ("val", "test"):
-        (root / f"{split}_list.txt").write_text("c\n")
+        write_sequence(root / name, **options)
+    for split, names in {"train": train, "val": "c", "test": "c"}.items():
+        (root / f"{split}_list.txt").write_text("".join(f"{name}\n" for name in names))
     return root
